@@ -1,0 +1,135 @@
+"""What a 3D asset is once it is loaded: triangles, materials and textures as plain arrays.
+
+Readers (`warpir.gltf`, `warpir.obj`) fill these records after checking the file; nothing behind
+them checks again. Frame: the asset's own, right-handed, +Y up, front +Z, in metres.
+"""
+
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from warpir.errors import InputError
+
+FloatArray = NDArray[np.float32]
+
+
+@dataclass(frozen=True)
+class Texture:
+    """An image in memory; whether it is colour or plain numbers is decided by the slot using it."""
+
+    pixels: NDArray[np.uint8]
+    """RGBA codes, row 0 at the top (v = 0), shape [height, width, 4]."""
+    wrap_u: str = "repeat"
+    """``repeat``, ``clamp`` or ``mirror``."""
+    wrap_v: str = "repeat"
+    """``repeat``, ``clamp`` or ``mirror``."""
+
+
+@dataclass(frozen=True)
+class TextureSlot:
+    """How a material reads one texture."""
+
+    texture: int
+    """Index into ``Asset.textures``."""
+    uv_set: int = 0
+    """0 or 1: which texture coordinates of the primitive."""
+    transform: tuple[float, float, float, float, float, float] = (1.0, 0.0, 0.0, 0.0, 1.0, 0.0)
+    """Affine map (a, b, c, d, e, f): ``u' = a u + b v + c``, ``v' = d u + e v + f``."""
+
+
+@dataclass(frozen=True)
+class Material:
+    """glTF 2.0 metallic-roughness, with its defaults; textures multiply the factors."""
+
+    name: str = ""
+    base_color: tuple[float, float, float] = (1.0, 1.0, 1.0)
+    """Linear Rec.709 reflectance [1]."""
+    alpha: float = 1.0
+    """Opacity factor [1]."""
+    metallic: float = 1.0
+    """0 dielectric to 1 metal [1]."""
+    roughness: float = 1.0
+    """Perceptual roughness [1]."""
+    emission: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    """Emitted radiance, ``emissiveStrength`` included, relative [W/(m^2 sr)]."""
+    alpha_mode: str = "OPAQUE"
+    """``OPAQUE``, ``MASK`` or ``BLEND``."""
+    alpha_cutoff: float = 0.5
+    """Coverage threshold of ``MASK`` [1]."""
+    double_sided: bool = False
+    """When false, back faces are invisible to camera rays (solid to all other rays)."""
+    normal_scale: float = 1.0
+    """Factor on the x and y of the normal map [1]."""
+    base_color_texture: TextureSlot | None = None
+    """sRGB-encoded RGB, linear alpha."""
+    metallic_roughness_texture: TextureSlot | None = None
+    """G roughness, B metallic, linear."""
+    normal_texture: TextureSlot | None = None
+    """Tangent space, linear, +Y up."""
+    emission_texture: TextureSlot | None = None
+    """sRGB-encoded RGB."""
+
+
+@dataclass(frozen=True)
+class Primitive:
+    """Triangles of one material, already in the asset's frame (node transforms applied)."""
+
+    positions: NDArray[np.float64]
+    """Asset frame [m], shape [vertex, 3]; float64 so that recentring loses nothing."""
+    indices: NDArray[np.int32]
+    """Counter-clockwise seen from outside, shape [triangle, 3]."""
+    material: int
+    """Index into ``Asset.materials``."""
+    normals: FloatArray | None = None
+    """Unit shading normals, asset frame, shape [vertex, 3]; absent means flat."""
+    tangents: FloatArray | None = None
+    """Unit tangent xyz and handedness w, shape [vertex, 4]; absent means from the UVs."""
+    uv0: FloatArray | None = None
+    """First texture coordinates, v down from the image's top, shape [vertex, 2]."""
+    uv1: FloatArray | None = None
+    """Second texture coordinates, shape [vertex, 2]."""
+    colors: FloatArray | None = None
+    """Linear RGBA that multiplies base colour and alpha, shape [vertex, 4]."""
+
+
+@dataclass(frozen=True)
+class Asset:
+    """One loaded asset."""
+
+    name: str
+    primitives: tuple[Primitive, ...]
+    materials: tuple[Material, ...]
+    textures: tuple[Texture, ...] = ()
+    notices: tuple[str, ...] = field(default=())
+    """What was repaired, assumed or left out, one line each; printed and kept in ``run.json``."""
+
+    def bounds(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Return the lowest and highest corner of all vertices, asset frame [m], shape [3] each."""
+        low = np.min([p.positions.min(axis=0) for p in self.primitives], axis=0)
+        high = np.max([p.positions.max(axis=0) for p in self.primitives], axis=0)
+        return low, high
+
+
+def load_asset(path: str | Path) -> Asset:
+    """Read an asset of any supported kind.
+
+    Args:
+        path: A ``.glb``, ``.gltf``, ``.obj``, ``.ply`` or ``.stl`` file.
+
+    Raises:
+        InputError: The file is missing, of another kind, or cannot be represented faithfully.
+    """
+    path = Path(path)
+    suffix = path.suffix.lower()
+    if suffix in {".glb", ".gltf"}:
+        from warpir.gltf import read_gltf
+
+        return read_gltf(path)
+    if suffix in {".obj", ".ply", ".stl"}:
+        from warpir.obj import read_mesh
+
+        return read_mesh(path)
+    raise InputError(path, f"not a mesh that warpir reads (found {suffix or 'no extension'}; "
+                     "expected .glb, .gltf, .obj, .ply or .stl)", "convert it to GLB")
