@@ -396,8 +396,8 @@ def _rigid(path: Path, name: str, rows: Any) -> Float64Array:
         if scale > 0.0 and np.abs(product / scale - np.eye(3)).max() <= RIGID_TOLERANCE:
             raise InputError(path, f"/{name}: scaled (found a factor of {np.sqrt(scale):.6g}; "
                              "expected 1)", "remove the scale from the camera")
-        raise InputError(path, f"/{name}: not orthonormal (found axes off by {deviation:.3g}; expected "
-                         f"at most {RIGID_TOLERANCE})")
+        raise InputError(path, f"/{name}: not orthonormal (found axes off by {deviation:.3g}; "
+                         f"expected at most {RIGID_TOLERANCE})")
     if np.linalg.det(rotation) < 0.0:
         raise InputError(path, f"/{name}: left-handed (found determinant -1; expected +1)",
                          "export it with right-handed axes: camera along -Z, +Y up, +X right")
