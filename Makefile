@@ -1,0 +1,31 @@
+# `make demo` and `make test` work from a fresh clone: the first call makes .venv and installs into
+# it, later calls find the stamp and go straight on. PYTHON chooses the interpreter (3.11 or newer).
+PYTHON ?= python3
+VENV := .venv
+BIN := $(VENV)/bin
+STAMP := $(VENV)/.installed
+
+.PHONY: demo test lint types clean
+
+demo: $(STAMP)
+	$(BIN)/python -m warpir.insert --demo --out out/demo --overwrite
+
+test: $(STAMP)
+	$(BIN)/python -m pytest -q $(PYTEST_ARGS)
+
+lint: $(STAMP)
+	$(BIN)/ruff check .
+	$(BIN)/ruff format --check .
+
+# On the installed wheel and from another folder: inside the checkout mypy mixes the sources of
+# warpir/ with the mapped packages and checks only a part of them.
+types: $(STAMP)
+	.ci/check-wheel types
+
+$(STAMP): pyproject.toml constraints.txt
+	test -x $(BIN)/python || $(PYTHON) -m venv $(VENV)
+	$(BIN)/python -m pip install --quiet -c constraints.txt -e '.[dev]'
+	touch $@
+
+clean:
+	rm -rf $(VENV) build dist out *.egg-info
