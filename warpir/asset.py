@@ -112,11 +112,12 @@ class Asset:
         return low, high
 
 
-def load_asset(path: str | Path) -> Asset:
+def load_asset(path: str | Path, missing_textures: str = "error") -> Asset:
     """Read an asset of any supported kind.
 
     Args:
         path: A ``.glb``, ``.gltf``, ``.obj``, ``.ply`` or ``.stl`` file.
+        missing_textures: ``error``, or ``grey`` to put mid grey in a missing texture's place.
 
     Raises:
         InputError: The file is missing, of another kind, or cannot be represented faithfully.
@@ -126,10 +127,10 @@ def load_asset(path: str | Path) -> Asset:
     if suffix in {".glb", ".gltf"}:
         from warpir.gltf import read_gltf
 
-        return read_gltf(path)
+        return read_gltf(path, missing_textures)
     if suffix in {".obj", ".ply", ".stl"}:
         from warpir.obj import read_mesh
 
-        return read_mesh(path)
+        return read_mesh(path, missing_textures)
     raise InputError(path, f"not a mesh that warpir reads (found {suffix or 'no extension'}; "
                      "expected .glb, .gltf, .obj, .ply or .stl)", "convert it to GLB")

@@ -1,5 +1,6 @@
 """The one error a user can cause, and the exit codes that tell schedulers the truth."""
 
+from collections.abc import Sequence
 from enum import IntEnum
 from pathlib import Path
 
@@ -46,3 +47,17 @@ class InputError(Exception):
         self.what = what
         self.advice = advice
         self.code = code
+        self.also: tuple[InputError, ...] = ()
+        """Further problems found in the same pass; printed, but they decide nothing."""
+
+
+def raise_all(problems: Sequence[InputError]) -> None:
+    """Raise the first problem with the others attached; do nothing when there is none.
+
+    Raises:
+        InputError: The first of ``problems``, the others in its ``also``.
+    """
+    if problems:
+        first = problems[0]
+        first.also = (*first.also, *(p for later in problems[1:] for p in (later, *later.also)))
+        raise first

@@ -1,0 +1,369 @@
+"""The command line and configuration files: both become one `InsertConfig`.
+
+Flags are made from the fields of `InsertConfig`; their help is the line below each field. Values
+from both sources pass through one conversion by the field's type, so that ``--place -1,0,-3``,
+``place: [-1, 0, -3]`` and ``"place": "-1,0,-3"`` mean the same.
+"""
+
+import argparse
+import ast
+import difflib
+import inspect
+import json
+import stat
+import types
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, fields
+from pathlib import Path
+from typing import Any, NoReturn, Union, get_args, get_origin, get_type_hints
+
+import warpir
+from warpir.config import InsertConfig, flag, usage
+from warpir.errors import ExitCode, InputError, raise_all
+from warpir.record import RUN_FORMAT
+from warpir.strict_json import read_json_object
+
+CONFIG_BYTES_LIMIT = 16 * 2**20
+
+FLAGS = {
+    "input and output": {
+        "photo": "FILE",
+        "asset": "FILE",
+        "out": "DIR",
+        "overwrite": "",
+        "demo": "",
+    },
+    "camera and ground": {
+        "camera": "FILE",
+        "fov": "DEG",
+        "pitch": "DEG",
+        "horizon": "ROW",
+        "camera_height": "M",
+        "up": "AXIS",
+        "ground": "A,B,C,D",
+    },
+    "placement": {
+        "place": "X,Y,Z",
+        "at": "U,V",
+        "rotate_y": "DEG",
+        "scale": "S",
+        "size": "METRES",
+    },
+    "light": {
+        "light": "FILE",
+        "light_rotate": "DEG",
+        "fit_lobes": "N",
+        "sun": "AZIMUTH,ELEVATION[,STRENGTH]",
+        "sky": "NAME|R,G,B",
+        "exposure": "EV",
+    },
+    "rendering": {
+        "guidance": "NAME",
+        "samples": "N",
+        "rays": "N",
+        "depth": "D",
+        "width": "W",
+        "device": "NAME",
+        "threads": "N",
+        "seed": "N",
+    },
+    "rules for the files": {
+        "alpha": "RULE",
+        "max_pixels": "N",
+        "missing_textures": "RULE",
+        "mark": "",
+    },
+}
+"""Every field of `InsertConfig` by its heading in ``--help``, with what stands for its value."""
+
+DESCRIPTION = "Put a 3D object into a photograph so that it looks as if it had stood there."
+EXAMPLES = """\
+examples:
+  python -m warpir.insert --demo --out out/demo
+  python -m warpir.insert --photo street.jpg --asset car.glb --light street.hdr \\
+      --fov 60 --pitch -8 --camera-height 1.6 --at 640,610 --size 4.2 --out out/street
+"""
+
+
+@dataclass(frozen=True)
+class Command:
+    """A parsed command line."""
+
+    config: InsertConfig
+    validate: bool = False
+    """Stop after all inputs were read and checked."""
+    notices: tuple[str, ...] = ()
+    """Where a flag replaced a value of the configuration file, one line each."""
+
+
+def parse(argv: Sequence[str]) -> Command:
+    """Read a command line, and the configuration file it names.
+
+    ``--help`` and ``--version`` print and raise `SystemExit`.
+
+    Raises:
+        InputError: The command line or the configuration file is wrong (`ExitCode.USAGE`).
+    """
+    parser = _make_parser()
+    try:
+        given, unknown = parser.parse_known_args(_join_minus_values(argv))
+    except argparse.ArgumentError as error:
+        raise usage(error.argument_name or "command line", error.message) from None
+    if unknown:
+        known = [flag(name) for forms in FLAGS.values() for name in forms]
+        known += ["--config", "--validate", "--debug", "--version", "--help"]
+        raise usage(unknown[0], "no such flag", _closest(unknown[0].split("=")[0], known))
+
+    texts = vars(given)
+    validate, path = texts.pop("validate", False), texts.pop("config", None)
+    texts.pop("debug", None)
+    filed = _read_config_file(path) if path is not None else {}
+    config = _make_config({name: (text, flag(name)) for name, text in texts.items()}, filed)
+    notices = tuple(
+        f"{flag(name)} given at the command line replaces the value in {path}"
+        for name in texts
+        if name in filed
+    )
+    config.require_inputs()
+    return Command(config, validate, notices)
+
+
+def _make_config(given: Mapping[str, tuple[Any, str]], filed: Mapping[str, Any]) -> InsertConfig:
+    """Convert each value by its field's type; ``given`` wins over ``filed``."""
+    hints = get_type_hints(InsertConfig)
+    values, problems = {}, []
+    for name, (value, where) in {**{n: (v, flag(n)) for n, v in filed.items()}, **given}.items():
+        try:
+            values[name] = _convert(value, hints[name])
+        except ValueError:
+            expected = _expected(name, hints[name])
+            problems.append(usage(where, f"expected {expected} (found {_shown(value)})"))
+    raise_all(problems)
+    return InsertConfig(**values)
+
+
+def _convert(value: Any, hint: Any) -> Any:
+    """Turn a flag's text or a file's value into the field's type.
+
+    Raises:
+        ValueError: It cannot be read as that type.
+    """
+    if get_origin(hint) in (Union, types.UnionType):
+        if value is None and type(None) in get_args(hint):
+            return None
+        # The narrow forms come first: any text would pass as str.
+        arms = sorted((arm for arm in get_args(hint) if arm is not type(None)), key=_width)
+        for arm in arms:
+            try:
+                return _convert(value, arm)
+            except ValueError:
+                continue
+        raise ValueError
+    if get_origin(hint) is tuple:
+        parts = value.split(",") if isinstance(value, str) else value
+        if not isinstance(parts, list | tuple) or len(parts) != len(get_args(hint)):
+            raise ValueError
+        return tuple(_convert(part, arm) for part, arm in zip(parts, get_args(hint), strict=True))
+    if isinstance(value, bool) or hint is bool:
+        if isinstance(value, bool) and hint is bool:
+            return value
+        raise ValueError
+    if hint is str:
+        if isinstance(value, str):
+            return value
+        raise ValueError
+    if not isinstance(value, str | int | float) or (hint is int and isinstance(value, float)):
+        raise ValueError
+    try:
+        return hint(value)
+    except OverflowError:
+        raise ValueError from None
+
+
+def _width(hint: Any) -> int:
+    return 1 if hint is str else 0
+
+
+def _expected(name: str, hint: Any) -> str:
+    kinds = {int: "a whole number", float: "a number", bool: "true or false"}
+    arms = [arm for arm in (get_args(hint) or (hint,)) if arm is not type(None)]
+    if len(arms) == 1 and arms[0] in kinds:
+        return kinds[arms[0]]
+    form = next(group[name] for group in FLAGS.values() if name in group)
+    return form if name != "mark" else kinds[bool]
+
+
+def _shown(value: Any) -> str:
+    # Not repr(): a YAML file of aliases can hold 10^9 entries in a few lines.
+    return ascii(value[:60]) if isinstance(value, str) else _kind(value)
+
+
+def _kind(value: Any) -> str:
+    if value is None or isinstance(value, bool | int | float):
+        return json.dumps(value)[:60]
+    if isinstance(value, list):
+        return f"a list of {len(value)}"
+    return "a mapping" if isinstance(value, dict) else "another kind"
+
+
+class _Parser(argparse.ArgumentParser):
+    def error(self, message: str) -> NoReturn:
+        raise usage("command line", message)
+
+
+def _make_parser() -> argparse.ArgumentParser:
+    parser = _Parser(
+        prog="python -m warpir.insert",
+        description=DESCRIPTION,
+        epilog=EXAMPLES,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+        argument_default=argparse.SUPPRESS,
+        allow_abbrev=False,
+        exit_on_error=False,
+    )
+    about, defaults = _field_docs(), {field.name: field.default for field in fields(InsertConfig)}
+    for heading, forms in FLAGS.items():
+        group = parser.add_argument_group(heading)
+        for name, form in forms.items():
+            default = defaults[name]
+            # An optional value says in its own words what happens without it.
+            shown = "" if default is None or isinstance(default, bool) else f" (default: {default})"
+            text = (about[name] + shown).replace("%", "%%")
+            if form:
+                group.add_argument(flag(name), dest=name, metavar=form, help=text)
+            else:
+                action = "store_false" if name == "mark" else "store_true"
+                group.add_argument(flag(name), dest=name, action=action, help=text)
+    group = parser.add_argument_group("the run itself")
+    group.add_argument(
+        "--config",
+        metavar="FILE",
+        help="YAML or JSON with these flags' names as keys, or a run.json",
+    )
+    group.add_argument(
+        "--validate", action="store_true", help="Read and check all inputs, render nothing"
+    )
+    group.add_argument("--debug", action="store_true", help="Show tracebacks")
+    group.add_argument("--version", action="version", version=f"warpir {warpir.__version__}")
+    return parser
+
+
+def _field_docs() -> dict[str, str]:
+    """Read the line below each field of `InsertConfig` from its source."""
+    body = ast.parse(inspect.getsource(InsertConfig)).body[0]
+    assert isinstance(body, ast.ClassDef)
+    docs = {}
+    for field, below in zip(body.body, body.body[1:], strict=False):
+        if isinstance(field, ast.AnnAssign) and isinstance(below, ast.Expr):
+            assert isinstance(field.target, ast.Name) and isinstance(below.value, ast.Constant)
+            docs[field.target.id] = inspect.cleandoc(str(below.value.value)).replace("\n", " ")
+    return docs
+
+
+def _join_minus_values(argv: Sequence[str]) -> list[str]:
+    """Write ``--place -1,0,-3`` as ``--place=-1,0,-3``.
+
+    argparse takes ``-1,0,-3`` (and a file named ``-x.png``) for a flag of its own.
+    """
+    takes_value = {flag(name) for forms in FLAGS.values() for name, form in forms.items() if form}
+    takes_value.add("--config")
+    joined: list[str] = []
+    for argument in argv:
+        is_value = argument.startswith("-") and not argument.startswith("--") and argument != "-h"
+        if is_value and joined and joined[-1] in takes_value:
+            joined[-1] += "=" + argument
+        else:
+            joined.append(argument)
+    return joined
+
+
+def _read_config_file(path: str) -> dict[str, Any]:
+    """Read the keys of a configuration file or the ``config`` of a ``run.json``.
+
+    Relative paths in it mean what they mean at the command line: they start at the working
+    directory.
+
+    Raises:
+        InputError: The file cannot be read or holds an unknown key (`ExitCode.USAGE`).
+    """
+    content = _load(path)
+    if not isinstance(content, dict):
+        raise usage(path, f"keys and values expected (found {_kind(content)})")
+    if isinstance(content.get("config"), dict):
+        found = content.get("format")
+        if isinstance(found, bool) or not isinstance(found, int) or not 1 <= found <= RUN_FORMAT:
+            raise usage(
+                path,
+                f"run.json of unknown format (found {_kind(found)}; expected 1 to {RUN_FORMAT})",
+                "use the warpir version that wrote it",
+            )
+        content = content["config"]
+    names = [field.name for field in fields(InsertConfig)]
+    filed, problems = {}, []
+    for key, value in content.items():
+        name = str(key).replace("-", "_") if isinstance(key, str) else ""
+        if name in names:
+            filed[name] = value
+        else:
+            problems.append(usage(path, f"unknown key {_shown(key)}", _closest(name, names)))
+    raise_all(problems)
+    return filed
+
+
+def _load(path: str) -> Any:
+    """Parse a file into plain values: JSON by its extension, anything else as YAML."""
+    if Path(path).suffix.lower() == ".json":
+        try:
+            return read_json_object(path, CONFIG_BYTES_LIMIT)
+        except InputError as error:
+            error.code = ExitCode.USAGE
+            raise
+    import yaml
+
+    try:
+        loader = yaml.SafeLoader(_read_text(path))
+        try:
+            node = loader.get_single_node()
+            _refuse_double_keys(path, node)
+            return loader.construct_document(node) if node is not None else {}
+        finally:
+            loader.dispose()
+    except yaml.MarkedYAMLError as error:
+        mark = error.problem_mark
+        line = f"line {mark.line + 1}: " if mark is not None else ""
+        raise usage(path, f"{line}not YAML ({error.problem})") from None
+    except RecursionError:
+        raise usage(path, "nested too deeply") from None
+    except (yaml.YAMLError, ValueError, TypeError) as error:
+        raise usage(path, f"not usable YAML ({str(error).splitlines()[0][:120]})") from None
+
+
+def _read_text(path: str) -> str:
+    try:
+        status = Path(path).stat()
+        if not stat.S_ISREG(status.st_mode):
+            raise usage(path, "not a regular file")
+        if status.st_size > CONFIG_BYTES_LIMIT:
+            expected = f"at most {CONFIG_BYTES_LIMIT}"
+            raise usage(path, f"too large (found {status.st_size} bytes; expected {expected})")
+        return Path(path).read_text(encoding="utf-8-sig")
+    except UnicodeDecodeError:
+        raise usage(path, "not UTF-8 text") from None
+    except (OSError, ValueError) as error:
+        reason = error.strerror if isinstance(error, OSError) else "not a file name"
+        raise usage(path, f"cannot be read ({reason})") from None
+
+
+def _refuse_double_keys(path: str, node: Any) -> None:
+    """Refuse a key given twice, of which PyYAML would silently keep the last."""
+    seen: set[str] = set()
+    for key, _ in node.value if node is not None and node.id == "mapping" else ():
+        name = str(key.value)
+        if name in seen:
+            raise usage(path, f"line {key.start_mark.line + 1}: key {_shown(name)} twice")
+        seen.add(name)
+
+
+def _closest(name: str, names: Sequence[str]) -> str:
+    close = difflib.get_close_matches(name, names, n=1)
+    return f"did you mean {close[0]}?" if close else "see --help"

@@ -1,0 +1,141 @@
+"""All inputs of one insertion, read and checked; torch and Warp are not needed here."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TypeVar
+
+from warpir.asset import Asset, load_asset
+from warpir.camera import Camera, camera_from_exif, camera_from_fov, read_camera
+from warpir.config import InsertConfig, usage
+from warpir.errors import InputError, raise_all
+from warpir.files import FloatArray, Photo, read_envmap, read_photo
+from warpir.lobes_file import LobesFile, read_lobes
+from warpir.placement import Placement, place_asset
+
+DEFAULT_FOV = 60.0
+"""Horizontal field of view without --camera, --fov and EXIF [deg]: a phone's main camera."""
+DEFAULT_CAMERA_HEIGHT = 1.6
+"""Height of a photographer's eyes [m]."""
+
+Read = TypeVar("Read")
+
+
+@dataclass(frozen=True)
+class Inputs:
+    """What was read from disk, and where the object stands."""
+
+    photo: Photo
+    asset: Asset
+    camera: Camera
+    """At the photo's resolution."""
+    placement: Placement
+    envmap: FloatArray | None = None
+    """The panorama of --light, turned by --light-rotate, shape [He, We, 3]."""
+    lobes: LobesFile | None = None
+    """The lobes of --light, turned by --light-rotate."""
+    assumed: tuple[str, ...] = ()
+    """What was chosen because nothing was given, one line each."""
+    notices: tuple[str, ...] = ()
+    """What was repaired, converted, left out or looks odd, one line each."""
+
+
+def read_inputs(config: InsertConfig) -> Inputs:
+    """Read and check every input, so that all problems are known before anything is rendered.
+
+    Raises:
+        InputError: The first problem; the others are in its ``also``.
+    """
+    config.require_inputs()
+    problems: list[InputError] = []
+
+    def attempt(read: Callable[[], Read]) -> Read | None:
+        try:
+            return read()
+        except InputError as error:
+            problems.append(error)
+            return None
+
+    assert config.photo is not None and config.asset is not None
+    photo_path, asset_path = config.photo, config.asset
+    notices: list[str] = []
+    assumed: list[str] = []
+    photo = attempt(
+        lambda: read_photo(
+            photo_path,
+            max_pixels=config.max_pixels,
+            alpha="ignore" if config.alpha == "ignore" else "refuse",
+        )
+    )
+    asset = attempt(lambda: load_asset(asset_path, missing_textures=config.missing_textures))
+    light = attempt(lambda: _read_light(config, notices))
+    camera = attempt(lambda: _make_camera(config, photo, assumed)) if photo is not None else None
+    if camera is None or asset is None or photo is None or light is None or problems:
+        raise_all(problems)
+        raise AssertionError("an input is missing without an error")
+
+    placement = place_asset(
+        *asset.bounds(),
+        camera,
+        config.ground,
+        place=config.place,
+        at=config.at,
+        rotate_y=config.rotate_y,
+        scale=config.scale,
+        size=config.size,
+    )
+    notices = [
+        *_about(photo_path, photo.notices),
+        *_about(asset_path, asset.notices),
+        *notices,
+        *_split_assumed(camera.notices, assumed),
+        *placement.warnings,
+    ]
+    assumed += placement.assumed
+    return Inputs(photo, asset, camera, placement, *light, tuple(assumed), tuple(notices))
+
+
+def _make_camera(config: InsertConfig, photo: Photo, assumed: list[str]) -> Camera:
+    height, width = photo.codes.shape[:2]
+    if config.camera is not None:
+        return read_camera(config.camera, (width, height), config.up)
+    camera_height, pitch = config.camera_height, config.pitch
+    if camera_height is None:
+        camera_height = DEFAULT_CAMERA_HEIGHT
+        assumed.append(f"the camera is {camera_height} m above the ground (--camera-height)")
+    if pitch is None:
+        pitch = 0.0
+        if config.horizon is None:
+            assumed.append("the camera is level (--pitch, --horizon)")
+    pose = (pitch, camera_height, config.horizon)
+    if config.fov is None and photo.focal_35mm is not None:
+        return camera_from_exif(photo.focal_35mm, width, height, *pose)
+    if config.fov is None:
+        assumed.append(f"the horizontal field of view is {DEFAULT_FOV:g} degrees (--fov)")
+    return camera_from_fov(width, height, config.fov or DEFAULT_FOV, *pose)
+
+
+def _read_light(
+    config: InsertConfig, notices: list[str]
+) -> tuple[FloatArray | None, LobesFile | None]:
+    if config.light is None:
+        return None, None
+    if Path(config.light).suffix.lower() == ".json":
+        if config.fit_lobes is not None:
+            raise usage("--fit-lobes", f"needs a panorama to fit (found lobes: {config.light})")
+        return None, read_lobes(config.light, config.light_rotate)
+    found: list[str] = []
+    envmap = read_envmap(config.light, config.light_rotate, notices=found)
+    notices += _about(config.light, found)
+    return envmap, None
+
+
+def _about(path: str, notices: tuple[str, ...] | list[str]) -> list[str]:
+    return [f"{Path(path).name}: {notice}" for notice in notices]
+
+
+def _split_assumed(notices: tuple[str, ...], assumed: list[str]) -> list[str]:
+    """Move the lines that begin with ``assumed:`` to `assumed`; return the others."""
+    mark = "assumed: "
+    assumed += [line.removeprefix(mark) for line in notices if line.startswith(mark)]
+    return [line for line in notices if not line.startswith(mark)]

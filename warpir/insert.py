@@ -1,0 +1,250 @@
+"""Put an object into a photograph: the program, from the command line to the files written.
+
+    python -m warpir.insert --photo street.jpg --asset car.glb --light street.hdr --out out
+
+or from Python, where the module itself can be called:
+
+    from warpir import insert
+    from warpir.config import InsertConfig
+
+    insertion = insert(InsertConfig(photo="street.jpg", asset="car.glb", out="out"))
+
+torch and Warp are imported when all inputs are known to be good, so ``--help``, wrong arguments
+and ``--validate`` answer without them.
+"""
+
+import errno
+import logging
+import os
+import signal
+import sys
+import threading
+import traceback
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from types import FrameType, ModuleType
+from typing import Any
+
+from warpir.command import parse
+from warpir.config import InsertConfig, usage
+from warpir.errors import ExitCode, InputError
+
+__all__ = ["InsertConfig", "Insertion", "insert", "main"]
+
+INTERRUPTED = 130
+TERMINATED = 143
+EXTRA_OF = {
+    "accelerate": "diffusion",
+    "diffusers": "diffusion",
+    "peft": "diffusion",
+    "transformers": "diffusion",
+    "ray": "ray",
+    "mitsuba": "bench",
+    "matplotlib": "bench",
+}
+"""Which extra brings a package that a plain install does not have."""
+
+
+@dataclass(frozen=True)
+class Insertion:
+    """A finished insertion."""
+
+    out: Path
+    """Folder that holds the files."""
+    files: tuple[str, ...]
+    """Names of the files in `out`, ``run.json`` last."""
+    record: dict[str, Any]
+    """Content of ``run.json``: inputs, settings, what was assumed, device, seconds."""
+
+
+def insert(config: InsertConfig) -> Insertion:
+    """Insert one object into one photograph and write the files.
+
+    Args:
+        config: What to do. Assumptions and notices are printed on standard output.
+
+    Raises:
+        InputError: An input or the output folder cannot be used; nothing was written then.
+    """
+    from warpir.record import Timings, run_record
+
+    config.require_inputs()
+    timings = Timings()
+    with timings.stage("read"):
+        config, inputs = _read(config)
+
+    from warpir.files import OutputFolder
+
+    assert config.out is not None
+    with OutputFolder(Path(config.out), overwrite=config.overwrite) as output:
+        # torch and Warp are loaded here, after everything that can be wrong was looked at.
+        with timings.stage("load"):
+            from warpir import render
+
+            device = render.choose_device(config.device, config.threads)
+            _say(f"device: {device}")
+        with timings.stage("scene"):
+            scene = render.make_scene(inputs, config, device)
+        with timings.stage("light"):
+            light = render.make_light(inputs, config, device)
+        with timings.stage("render"):
+            layers = render.render_layers(scene, light, config)
+        with timings.stage("compose"):
+            picture = render.compose(inputs.photo, layers)
+        with timings.stage("write"):
+            measured = render.write(output, inputs, light, layers, picture, config)
+        record = run_record(
+            config,
+            device=str(device),
+            timings=timings,
+            assumed=(*inputs.assumed, *light.assumed),
+            notices=inputs.notices,
+            measured=measured,
+        )
+        output.write_json("run.json", record)
+    return Insertion(Path(config.out), tuple(output.names), record)
+
+
+def _read(config: InsertConfig) -> tuple[InsertConfig, Any]:
+    """Read and check all inputs and say what was assumed; the demo brings its own."""
+    from warpir.inputs import read_inputs
+
+    if config.demo:
+        from warpir.demo import demo_config
+
+        config = demo_config(config)
+    inputs = read_inputs(config)
+    for line in inputs.assumed:
+        _say(f"assumed: {line}")
+    for line in inputs.notices:
+        _say(f"notice: {line}")
+    return config, inputs
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Run the command line; the one place that prints errors.
+
+    Args:
+        argv: Arguments without the program's name; ``sys.argv`` when absent.
+
+    Returns:
+        The exit status, an `ExitCode` or 128 plus the number of a signal.
+    """
+    arguments = list(sys.argv[1:] if argv is None else argv)
+    debug = "--debug" in arguments
+    if debug:
+        logging.basicConfig(level=logging.DEBUG, format="debug: %(name)s: %(message)s")
+    for stream in (sys.stdout, sys.stderr):
+        # A terminal without UTF-8 shows escapes; it must not end the run.
+        if hasattr(stream, "reconfigure"):
+            stream.reconfigure(errors="backslashreplace")
+    try:
+        with _terminate_as_exception():
+            return _run(arguments)
+    except BaseException as error:
+        status, lines = _explain(error)
+        if debug and not isinstance(error, SystemExit):
+            traceback.print_exc()
+        elif status == ExitCode.BUG:
+            # Without --debug too: without it nobody could repair what is our fault.
+            traceback.print_exc()
+        for line in lines:
+            print(line, file=sys.stderr)
+        return status
+
+
+def _run(arguments: list[str]) -> int:
+    command = parse(arguments)
+    for notice in command.notices:
+        _say(f"notice: {notice}")
+    if command.validate:
+        _read(command.config)
+        _say("inputs are valid")
+        return ExitCode.DONE
+    insertion = insert(command.config)
+    for name in insertion.files:
+        _say(str(insertion.out / name))
+    return ExitCode.DONE
+
+
+def _explain(error: BaseException) -> tuple[int, list[str]]:
+    """Return the exit status of an exception and the lines that tell the user about it."""
+    if isinstance(error, SystemExit):
+        return error.code if isinstance(error.code, int) else ExitCode.DONE, []
+    if isinstance(error, _Terminated):
+        return TERMINATED, ["stopped"]
+    if isinstance(error, KeyboardInterrupt):
+        return INTERRUPTED, ["stopped"]
+    missing = (getattr(error, "name", None) or "").split(".")[0]
+    if isinstance(error, ModuleNotFoundError) and missing in EXTRA_OF:
+        error = usage(
+            missing, "not installed", f"pip install 'warpir[{EXTRA_OF[missing]}]' brings it"
+        )
+    elif isinstance(error, MemoryError) or type(error).__name__ == "OutOfMemoryError":
+        error = InputError(
+            "memory",
+            "not enough of it",
+            "lower --width, --samples or --rays, or use --device cpu",
+            ExitCode.RESOURCES,
+        )
+    elif isinstance(error, OSError) and error.errno in (errno.ENOSPC, errno.EDQUOT, errno.EFBIG):
+        name = error.filename or "--out"
+        error = InputError(name, f"cannot be written ({error.strerror})", code=ExitCode.RESOURCES)
+    if isinstance(error, InputError):
+        lines = [_one_line(f"error: {error.where}: {error.what}")]
+        lines += [_one_line(error.advice)] if error.advice else []
+        return error.code, lines + [_one_line(f"also: {o.where}: {o.what}") for o in error.also]
+    kind = _one_line(f"{type(error).__name__}: {error}")
+    return ExitCode.BUG, [
+        f"error: warpir: a fault of its own ({kind})",
+        "please report it with the lines above and the command that was run",
+    ]
+
+
+def _one_line(text: str) -> str:
+    # File names may hold line breaks and control characters.
+    return "".join(c if c.isprintable() else repr(c)[1:-1] for c in text)
+
+
+def _say(line: str) -> None:
+    """Print on standard output; a reader that went away (``| head``) does not end the run."""
+    try:
+        print(_one_line(line), flush=True)
+    except BrokenPipeError:
+        # Python flushes once more at exit: give it somewhere to write to.
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+
+
+class _Terminated(BaseException):
+    """SIGTERM, turned into an exception so that staged files and locks are removed."""
+
+
+@contextmanager
+def _terminate_as_exception() -> Iterator[None]:
+    def terminate(signum: int, frame: FrameType | None) -> None:
+        raise _Terminated
+
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+    previous = signal.signal(signal.SIGTERM, terminate)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGTERM, previous)
+
+
+class _CallableModule(ModuleType):
+    """Lets ``from warpir import insert; insert(config)`` work: the module calls its function."""
+
+    def __call__(self, config: InsertConfig) -> Insertion:
+        """Insert one object; see `insert`."""
+        return insert(config)
+
+
+sys.modules[__name__].__class__ = _CallableModule
+
+if __name__ == "__main__":
+    sys.exit(main())
