@@ -1,0 +1,286 @@
+"""Materials and textures of glTF 2.0, and the extensions that are honoured.
+
+Textures keep their stored codes: base colour and emission are sRGB-encoded, all others are plain
+numbers. Occlusion maps are not read, since a path tracer makes its own.
+"""
+
+import math
+from dataclasses import replace
+
+from warpir.asset import Material, Texture, TextureSlot
+from warpir.asset_files import Pixels, TextureDecoder, grey_pixels, locate, read_uri
+from warpir.errors import InputError
+from warpir.gltf_file import RE_EXPORT_MESH, Entry, GltfFile
+
+HONOURED = {
+    "EXT_texture_webp",
+    "KHR_materials_emissive_strength",
+    "KHR_materials_pbrSpecularGlossiness",
+    "KHR_materials_unlit",
+    "KHR_mesh_quantization",
+    "KHR_node_visibility",
+    "KHR_texture_transform",
+}
+"""Extensions whose meaning reaches the picture."""
+BASE_MATERIAL = {
+    f"KHR_materials_{name}"
+    for name in (
+        "anisotropy", "clearcoat", "diffuse_transmission", "dispersion", "ior", "iridescence",
+        "sheen", "specular", "transmission", "variants", "volume",
+    )
+}  # fmt: skip
+"""Extensions that refine a material; the material below them is used, with a notice."""
+LEFT_OUT = {
+    "KHR_animation_pointer": "animations are not played",
+    "KHR_lights_punctual": "the lights of the file are not used",
+    "KHR_xmp_json_ld": "metadata is not read",
+}
+"""Extensions that can be ignored even when required, and the notice."""
+ADVICE = {
+    "EXT_mesh_gpu_instancing": "re-export with instances as nodes",
+    "EXT_meshopt_compression": RE_EXPORT_MESH,
+    "KHR_draco_mesh_compression": RE_EXPORT_MESH,
+    "KHR_meshopt_compression": RE_EXPORT_MESH,
+    "KHR_texture_basisu": "re-export with PNG or JPEG textures instead of KTX2",
+}
+"""What to do about an extension that is refused when required."""
+
+WRAPS = {10497: "repeat", 33071: "clamp", 33648: "mirror"}
+NEAREST = (9728, 9984, 9986)
+
+
+def check_extensions(root: Entry, notices: list[str]) -> None:
+    """Refuse required extensions that are not honoured; mention the others that are ignored."""
+    names = {}
+    for key in ("extensionsRequired", "extensionsUsed"):
+        listed = root.value.get(key, [])
+        if not isinstance(listed, list) or not all(isinstance(name, str) for name in listed):
+            raise root.error(f"{key} is not a list of names")
+        names[key] = dict.fromkeys(listed)
+    for name in names["extensionsRequired"]:
+        if name not in HONOURED | BASE_MATERIAL and name not in LEFT_OUT:
+            raise InputError(
+                root.path,
+                f"/extensionsRequired: {name} is not supported",
+                ADVICE.get(name, f"re-export without {name}"),
+            )
+    for name in names["extensionsUsed"]:
+        if name in LEFT_OUT:
+            notices.append(f"{name}: {LEFT_OUT[name]}")
+        elif name not in HONOURED | BASE_MATERIAL:
+            notices.append(f"{name} is not supported: what the file holds without it is used")
+
+
+class MaterialReader:
+    """Reads the materials that are drawn, and their textures, each once.
+
+    Args:
+        file: The file.
+        missing_textures: ``error`` or ``grey``.
+        notices: Receives what was assumed or left out.
+    """
+
+    def __init__(self, file: GltfFile, missing_textures: str, notices: list[str]) -> None:
+        self.file = file
+        self.missing_textures = missing_textures
+        self.notices = notices
+        self.materials: list[Material] = []
+        self.textures: list[Texture] = []
+        self._decoder = TextureDecoder(file.path, notices)
+        self._material_index: dict[int, int] = {}
+        self._texture_index: dict[tuple[int, str, str], int] = {}
+        self._pixels: dict[int, Pixels | None] = {}
+
+    def index(self, primitive: Entry) -> int:
+        """Return the index in ``materials`` of what a primitive is made of."""
+        stated = primitive.integer("material", -1, low=-1)
+        if stated not in self._material_index:
+            if stated == -1:
+                material = Material(name="default")
+                self.notices.append("no material: glTF's default (white, fully metallic, rough)")
+            else:
+                material = self._read(
+                    self.file.root.item("materials", stated, primitive, "material")
+                )
+            self._material_index[stated] = len(self.materials)
+            self.materials.append(material)
+        return self._material_index[stated]
+
+    def uv_sets(self, index: int) -> set[int]:
+        """Return the texture coordinate sets that material ``index`` reads."""
+        material = self.materials[index]
+        slots = (
+            material.base_color_texture,
+            material.metallic_roughness_texture,
+            material.normal_texture,
+            material.emission_texture,
+        )
+        return {slot.uv_set for slot in slots if slot is not None}
+
+    def _read(self, entry: Entry) -> Material:
+        name = entry.text("name", "") or entry.pointer
+        pbr = entry.child("pbrMetallicRoughness")
+        *base_color, alpha = self._factors(pbr, "baseColorFactor", (1.0,) * 4, 0.0, 1.0)
+        mode = entry.text("alphaMode", "OPAQUE")
+        if mode not in ("OPAQUE", "MASK", "BLEND"):
+            raise entry.error(f"alphaMode is {mode!r}, expected OPAQUE, MASK or BLEND")
+        strength = entry.extension("KHR_materials_emissive_strength")
+        gain = 1.0 if strength is None else strength.number("emissiveStrength", 1.0)
+        if gain < 0:
+            self.notices.append(f"{entry.pointer}: emissiveStrength {gain:g} clamped to 0")
+        emission = self._factors(entry, "emissiveFactor", (0.0,) * 3, 0.0, math.inf)
+        material = Material(
+            name=name,
+            base_color=(base_color[0], base_color[1], base_color[2]),
+            alpha=alpha,
+            metallic=self._factor(pbr, "metallicFactor", 1.0),
+            roughness=self._factor(pbr, "roughnessFactor", 1.0),
+            emission=(
+                emission[0] * max(gain, 0.0),
+                emission[1] * max(gain, 0.0),
+                emission[2] * max(gain, 0.0),
+            ),
+            alpha_mode=mode,
+            alpha_cutoff=self._factor(entry, "alphaCutoff", 0.5),
+            double_sided=entry.flag("doubleSided"),
+            normal_scale=entry.child("normalTexture").number("scale", 1.0),
+            base_color_texture=self._slot(pbr, "baseColorTexture"),
+            metallic_roughness_texture=self._slot(pbr, "metallicRoughnessTexture"),
+            normal_texture=self._slot(entry, "normalTexture"),
+            emission_texture=self._slot(entry, "emissiveTexture") if any(emission) else None,
+        )
+        if "occlusionTexture" in entry:
+            self.notices.append("occlusion textures are not used: occlusion is traced")
+        return self._extend(material, entry)
+
+    def _extend(self, material: Material, entry: Entry) -> Material:
+        """Apply the material extensions that replace the model; mention those left out."""
+        glossiness = entry.extension("KHR_materials_pbrSpecularGlossiness")
+        if glossiness is not None and "pbrMetallicRoughness" not in entry:
+            *diffuse, alpha = self._factors(glossiness, "diffuseFactor", (1.0,) * 4, 0.0, 1.0)
+            material = replace(
+                material,
+                base_color=(diffuse[0], diffuse[1], diffuse[2]),
+                alpha=alpha,
+                metallic=0.0,
+                roughness=1.0 - self._factor(glossiness, "glossinessFactor", 1.0),
+                base_color_texture=self._slot(glossiness, "diffuseTexture"),
+            )
+            self.notices.append(
+                f"material {material.name!r}: specular-glossiness read as a dielectric of its "
+                "diffuse colour and glossiness factor"
+            )
+        if entry.extension("KHR_materials_unlit") is not None:
+            material = replace(
+                material,
+                metallic=0.0,
+                roughness=1.0,
+                emission=(0.0, 0.0, 0.0),
+                metallic_roughness_texture=None,
+                normal_texture=None,
+                emission_texture=None,
+            )
+            self.notices.append(f"material {material.name!r}: unlit, shown as a lit matte surface")
+        left_out = [name for name in entry.child("extensions").value if name not in HONOURED]
+        if left_out:
+            self.notices.append(
+                f"material {material.name!r}: {', '.join(left_out)} not supported, "
+                "its base material is used"
+            )
+        return material
+
+    def _factor(self, entry: Entry, key: str, default: float) -> float:
+        value = entry.number(key, default)
+        if not 0.0 <= value <= 1.0:
+            self.notices.append(f"{entry.pointer}: {key} {value:g} clamped to 0 ... 1")
+        return min(max(value, 0.0), 1.0)
+
+    def _factors(
+        self, entry: Entry, key: str, default: tuple[float, ...], low: float, high: float
+    ) -> tuple[float, ...]:
+        values = entry.numbers(key, default)
+        if any(not low <= value <= high for value in values):
+            self.notices.append(f"{entry.pointer}: {key} clamped to {low:g} ... {high:g}")
+        return tuple(min(max(value, low), high) for value in values)
+
+    def _slot(self, owner: Entry, key: str) -> TextureSlot | None:
+        """Return how ``owner`` reads texture ``key``, or None when it has none."""
+        if key not in owner:
+            return None
+        entry = owner.child(key)
+        texture = self._texture(entry, key in ("baseColorTexture", "diffuseTexture"))
+        if texture is None:
+            return None
+        uv_set = entry.integer("texCoord", 0)
+        affine = (1.0, 0.0, 0.0, 0.0, 1.0, 0.0)
+        transform = entry.extension("KHR_texture_transform")
+        if transform is not None:
+            uv_set = transform.integer("texCoord", uv_set)
+            (ox, oy), (sx, sy) = (
+                transform.numbers("offset", (0.0, 0.0)),
+                transform.numbers("scale", (1.0, 1.0)),
+            )
+            angle = transform.number("rotation", 0.0)
+            c, s = math.cos(angle), math.sin(angle)
+            # translation * rotation * scale, as in the extension's own GLSL.
+            affine = (c * sx, s * sy, ox, -s * sx, c * sy, oy)
+        if uv_set > 1:
+            raise entry.error(f"texCoord {uv_set}, but only sets 0 and 1 are supported")
+        return TextureSlot(texture, uv_set, affine)
+
+    def _texture(self, user: Entry, is_base_color: bool) -> int | None:
+        """Return the index in ``textures``, or None when a missing image is left out."""
+        root = self.file.root
+        entry = root.item("textures", user.integer("index"), user, "index")
+        webp = entry.extension("EXT_texture_webp")
+        source = entry.integer("source", -1, low=-1) if webp is None else webp.integer("source")
+        wraps = ["repeat", "repeat"]
+        if "sampler" in entry:
+            sampler = root.item("samplers", entry.integer("sampler"), entry, "sampler")
+            for k, key in enumerate(("wrapS", "wrapT")):
+                code = sampler.integer(key, 10497)
+                if code not in WRAPS:
+                    raise sampler.error(f"{key} is {code}, expected one of {sorted(WRAPS)}")
+                wraps[k] = WRAPS[code]
+            if sampler.integer("magFilter", 9729) in NEAREST:
+                self.notices.append(f"{sampler.pointer}: nearest filter replaced by bilinear")
+        use = (source, wraps[0], wraps[1])
+        if use not in self._texture_index:
+            if source not in self._pixels:
+                self._pixels[source] = self._load(source, entry)
+            pixels = self._pixels[source]
+            if pixels is None and not is_base_color:
+                return None
+            texture = Texture(grey_pixels() if pixels is None else pixels, *wraps)
+            self._texture_index[use] = len(self.textures)
+            self.textures.append(texture)
+        return self._texture_index[use]
+
+    def _load(self, source: int, texture: Entry) -> Pixels | None:
+        """Return the pixels of an image; None when it is missing and that is allowed."""
+        if source == -1 and texture.extension("KHR_texture_basisu") is None:
+            raise texture.error("no image source")
+        image = texture
+        if source != -1:
+            image = self.file.root.item("images", source, texture, "source")
+        where = f"{image.pointer}: "
+        uri = image.text("uri", "")
+        if "uri" in image and not uri.startswith("data:"):
+            locate(uri, self.file.path, where)  # outside the folder is refused in any case
+        try:
+            if source == -1:
+                raise texture.error("only a KTX2 image", ADVICE["KHR_texture_basisu"])
+            if "uri" in image:
+                encoded = read_uri(uri, self.file.path, where)
+            else:
+                encoded = bytes(self.file.view(image.integer("bufferView"), image)[0])
+            return self._decoder.decode(encoded, where)
+        except InputError as error:
+            if self.missing_textures != "grey":
+                raise InputError(
+                    error.where,
+                    error.what,
+                    error.advice or "add the image, or pass --missing-textures grey",
+                ) from None
+            self.notices.append(f"{error.what}: replaced by grey, or left out where no colour")
+            return None

@@ -1,0 +1,473 @@
+"""Reads OBJ, PLY and STL into an `Asset`.
+
+OBJ is parsed here: every number has to be checked before a library sees it, and then the arrays
+are already there. PLY and STL go through trimesh, from memory and without its processing.
+Materials of OBJ come from `warpir.mtl`. The texture coordinate v is turned from up to down.
+"""
+
+import contextlib
+import re
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from io import BytesIO
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from warpir.asset import Asset, FloatArray, Material, Primitive
+from warpir.asset_files import (
+    TRIANGLES,
+    keep_area,
+    nothing_to_render,
+    plain_material,
+    read_regular,
+    repair_normals,
+)
+from warpir.errors import InputError
+from warpir.mtl import MaterialLibrary
+
+GREY = (0.8, 0.8, 0.8)
+"""Base colour of what has no material."""
+IGNORED = {"o", "g", "s", "vp", "shadow_obj", "trace_obj", "lod", "bevel", "c_interp", "d_interp"}
+Triangles = NDArray[np.int32]
+
+
+def read_mesh(path: str | Path, missing_textures: str = "error") -> Asset:
+    """Read an ``.obj``, ``.ply`` or ``.stl`` file.
+
+    Args:
+        path: The file; material files and textures must lie in its folder.
+        missing_textures: ``error``, or ``grey``: a missing material file or base colour texture
+            becomes grey, other textures are left out, with a notice.
+
+    Returns:
+        Double-sided materials; grey, rough and dielectric where the file states none.
+
+    Raises:
+        InputError: The file is damaged or holds no triangles.
+    """
+    path = Path(path)
+    content = read_regular(path, path)
+    if path.suffix.lower() == ".obj":
+        return read_obj(path, content, missing_textures)
+    return read_ply_stl(path, content)
+
+
+@dataclass
+class ObjText:
+    """The statements of an OBJ file, sorted by kind; line numbers start at 1."""
+
+    positions: list[tuple[int, list[str]]] = field(default_factory=list)
+    uvs: list[tuple[int, list[str]]] = field(default_factory=list)
+    normals: list[tuple[int, list[str]]] = field(default_factory=list)
+    faces: dict[str, list[tuple[int, list[str]]]] = field(default_factory=dict)
+    """Corners as written, made absolute, per material name."""
+    libraries: list[str] = field(default_factory=list)
+
+
+def read_obj(path: Path, content: bytes, missing_textures: str) -> Asset:
+    """Read an OBJ file; one primitive per material.
+
+    Raises:
+        InputError: With the line at fault.
+    """
+    notices: list[str] = []
+    text = split_statements(path, content, notices)
+    positions = float_rows(path, "v", text.positions, 3)
+    colors = vertex_colors(path, text.positions, notices)
+    uvs = float_rows(path, "vt", text.uvs, 1)
+    normals = float_rows(path, "vn", text.normals, 3)
+    if uvs.shape[1] == 1:
+        uvs = np.column_stack([uvs, np.zeros(len(uvs))])
+    library = MaterialLibrary(path, missing_textures, notices)
+    for name in text.libraries:
+        library.add(name)
+    if sum(len(c) - 2 for faces in text.faces.values() for _, c in faces) > TRIANGLES:
+        raise InputError(path, f"too many triangles (limit {TRIANGLES})", "decimate the mesh")
+
+    primitives: list[Primitive] = []
+    for name, faces in text.faces.items():
+        corners, polygons = unique_corners(path, faces, (len(positions), len(uvs), len(normals)))
+        points = positions[corners[:, 0]]
+        indices = triangulate(points, polygons, notices)
+        indices, flat, repeated = keep_area(points, indices)
+        if flat or repeated:
+            notices.append(
+                f"material {name!r}: dropped {flat} triangles of zero area and {repeated} "
+                "repeated ones"
+            )
+        if not len(indices):
+            continue
+        shading: FloatArray | None = None
+        if (corners[:, 2] >= 0).all():
+            shading, lost = repair_normals(normals[corners[:, 2]], points, indices)
+            if lost:
+                notices.append(f"{lost} normals of length zero taken from the faces")
+        else:
+            notices.append("no normals: shaded flat")
+        uv0: FloatArray | None = None
+        if (corners[:, 1] >= 0).any():
+            stated = uvs[np.maximum(corners[:, 1], 0)] * (corners[:, 1:2] >= 0)
+            uv0 = np.column_stack([stated[:, 0], 1.0 - stated[:, 1]]).astype(np.float32)
+        material = library.index(name, white=colors is not None)
+        if uv0 is None and library.is_textured(material):
+            notices.append(f"material {name!r}: no texture coordinates, zero is used")
+            uv0 = np.zeros((len(points), 2), dtype=np.float32)
+        primitives.append(
+            Primitive(
+                positions=points,
+                indices=indices,
+                material=material,
+                normals=shading,
+                uv0=uv0,
+                colors=None if colors is None else colors[corners[:, 0]],
+            )
+        )
+    nothing_to_render(path, primitives, f"{len(positions)} vertices")
+    return Asset(
+        name=path.stem,
+        primitives=tuple(primitives),
+        materials=tuple(library.materials),
+        textures=tuple(library.textures),
+        notices=tuple(dict.fromkeys(notices)),
+    )
+
+
+def split_statements(path: Path, content: bytes, notices: list[str]) -> ObjText:
+    """Sort the lines of an OBJ file by statement; corners become absolute indices from 1."""
+    if b"\0" in content[:4096]:
+        raise InputError(path, "not an OBJ text file", "convert it to GLB")
+    try:
+        whole = content.decode("utf-8-sig")
+    except UnicodeDecodeError:
+        whole = content.decode("latin-1")
+    text = ObjText()
+    material = ""
+    left_out: dict[str, int] = {}
+    for line, statement in logical_lines(whole):
+        word, *values = statement.split()
+        match word:
+            case "v":
+                text.positions.append((line, values))
+            case "vt":
+                text.uvs.append((line, values))
+            case "vn":
+                text.normals.append((line, values))
+            case "f":
+                if len(values) < 3:
+                    raise InputError(path, f"line {line}: face with {len(values)} corners")
+                if "-" in statement:
+                    counts = len(text.positions), len(text.uvs), len(text.normals)
+                    values = [absolute_corner(path, line, v, counts) for v in values]
+                text.faces.setdefault(material, []).append((line, values))
+            case "usemtl":
+                material = statement[len(word) :].strip()
+            case "mtllib":
+                text.libraries.append(statement[len(word) :].strip())
+            case _ if word not in IGNORED:
+                left_out[word] = left_out.get(word, 0) + 1
+    if not (text.positions or text.faces):
+        raise InputError(path, "not an OBJ file (no v and no f statements)", "convert it to GLB")
+    for word, count in left_out.items():
+        notices.append(f"{count} {word[:20]!r} statements ignored")
+    return text
+
+
+def logical_lines(text: str) -> Iterator[tuple[int, str]]:
+    """Yield line numbers and statements, comments removed and continued lines joined."""
+    pending, start = "", 0
+    for number, line in enumerate(re.split(r"\r\n|\n|\r", text), 1):
+        start = start if pending else number
+        line = pending + line.partition("#")[0].strip()
+        if line.endswith("\\"):
+            pending = line[:-1] + " "
+            continue
+        pending = ""
+        if line:
+            yield start, line
+    if pending.strip():
+        yield start, pending
+
+
+def absolute_corner(path: Path, line: int, corner: str, counts: tuple[int, int, int]) -> str:
+    """Rewrite ``-1/-2/-3`` as indices from 1, counted from the statements read so far."""
+    parts = corner.split("/")
+    for k, part in enumerate(parts[:3]):
+        if part.startswith("-"):
+            with contextlib.suppress(ValueError):  # reported with all other corners
+                value = counts[k] + 1 + int(part)
+                if value < 1:
+                    raise InputError(
+                        path, f"line {line}: index {part}, but {counts[k]} {'v vt vn'.split()[k]}"
+                    )
+                parts[k] = str(value)
+    return "/".join(parts)
+
+
+def float_rows(
+    path: Path, word: str, rows: list[tuple[int, list[str]]], least: int
+) -> NDArray[np.float64]:
+    """Return the first numbers of ``v``, ``vt`` or ``vn`` statements.
+
+    Args:
+        path: The file.
+        word: The statement.
+        rows: Line number and words of each.
+        least: How many numbers it needs; a ``vt`` may have a second one.
+
+    Returns:
+        Shape [statement, 3], or [statement, 1 or 2] for ``vt``.
+
+    Raises:
+        InputError: With the line at fault.
+    """
+    width = least if word != "vt" or not all(len(v) >= 2 for _, v in rows) else 2
+    try:
+        numbers = np.array([v[:width] for _, v in rows], dtype=np.float64).reshape(-1, width)
+        if np.isfinite(numbers).all():
+            return numbers
+    except (ValueError, OverflowError):
+        pass
+    for line, values in rows:
+        try:
+            if len(values) >= width and np.isfinite([float(v) for v in values[:width]]).all():
+                continue
+        except ValueError:
+            pass
+        found = " ".join([word, *values])[:60]
+        advice = "write numbers with decimal points" if "," in found else ""
+        raise InputError(path, f"line {line}: {found!r}, expected {width} finite numbers", advice)
+    raise InputError(path, f"{word} statements cannot be read")
+
+
+def vertex_colors(
+    path: Path, rows: list[tuple[int, list[str]]], notices: list[str]
+) -> FloatArray | None:
+    """Return the colours after the positions (``v x y z r g b``), shape [vertex, 4]."""
+    colored = [len(values) >= 6 for _, values in rows]
+    if not any(colored):
+        return None
+    notices.append("vertex colours read as linear Rec.709")
+    tails = [
+        (line, values[3:6] if has else ["1"] * 3)
+        for (line, values), has in zip(rows, colored, strict=True)
+    ]
+    colors = np.ones((len(rows), 4), dtype=np.float32)
+    colors[:, :3] = np.clip(float_rows(path, "v ... r g b", tails, 3), 0.0, 1.0)
+    return colors
+
+
+def unique_corners(
+    path: Path, faces: list[tuple[int, list[str]]], counts: tuple[int, int, int]
+) -> tuple[NDArray[np.int64], dict[int, Triangles]]:
+    """Make one vertex of every different ``v/vt/vn`` corner.
+
+    Args:
+        path: The file.
+        faces: Line number and corners of each face.
+        counts: How many positions, texture coordinates and normals there are.
+
+    Returns:
+        Zero-based indices of position, texture coordinate and normal, -1 where absent, shape
+        [vertex, 3]; and the polygons as vertex indices, by number of corners, shape
+        [polygon, corner].
+
+    Raises:
+        InputError: With the line at fault.
+    """
+    seen: dict[str, int] = {}
+    by_size: dict[int, list[list[int]]] = {}
+    for _, corners in faces:
+        polygon = [seen.setdefault(corner, len(seen)) for corner in corners]
+        by_size.setdefault(len(polygon), []).append(polygon)
+    triples = np.full((len(seen), 3), -1, dtype=np.int64)
+    for corner, row in seen.items():
+        for k, part in enumerate(corner.split("/")):
+            if k and not part:
+                continue
+            try:
+                value = int(part) if k < 3 else 0
+            except ValueError:
+                value = 0
+            if not 1 <= value <= counts[k % 3]:
+                line = next(line for line, corners in faces if corner in corners)
+                word = ("v", "vt", "vn")[k % 3]
+                raise InputError(
+                    path, f"line {line}: corner {corner[:40]!r}, but {counts[k % 3]} {word} "
+                    "(indices start at 1)"
+                )  # fmt: skip
+            triples[row, k] = value - 1
+    return triples, {size: np.array(p, dtype=np.int32) for size, p in by_size.items()}
+
+
+def triangulate(
+    points: NDArray[np.float64], polygons: dict[int, Triangles], notices: list[str]
+) -> Triangles:
+    """Cut polygons into triangles: fans where convex, ears where not.
+
+    Args:
+        points: Shape [vertex, 3].
+        polygons: Vertex indices by number of corners, shape [polygon, corner].
+        notices: Receives the number of concave polygons.
+
+    Returns:
+        Shape [triangle, 3], the winding kept.
+    """
+    triangles = []
+    concave_count = 0
+    for size, polygon in polygons.items():
+        concave = np.zeros(len(polygon), dtype=bool)
+        if size > 3:
+            corner = points[polygon]
+            edge = np.roll(corner, -1, axis=1) - corner
+            turn = np.cross(np.roll(edge, 1, axis=1), edge)
+            normal = np.cross(corner, np.roll(corner, -1, axis=1)).sum(axis=1, keepdims=True)
+            along = (turn * normal).sum(axis=2)
+            concave = (along < -1e-9 * np.abs(along).max(axis=1, keepdims=True)).any(axis=1)
+        fan = np.stack([np.array([0, k, k + 1]) for k in range(1, size - 1)])
+        triangles.append(polygon[~concave][:, fan].reshape(-1, 3))
+        for row in polygon[concave]:
+            triangles.append(row[clip_ears(points[row])])
+        concave_count += int(concave.sum())
+    if concave_count:
+        notices.append(f"{concave_count} concave polygons triangulated by ear clipping")
+    return np.concatenate(triangles).astype(np.int32)
+
+
+def clip_ears(points: NDArray[np.float64]) -> Triangles:
+    """Triangulate one simple polygon (Meisters 1975), seen along its mean normal.
+
+    Args:
+        points: Corners in order, shape [corner, 3].
+
+    Returns:
+        Indices of the corners, shape [corner - 2, 3].
+    """
+    normal = np.cross(points, np.roll(points, -1, axis=0)).sum(axis=0)
+    axis = int(np.abs(normal).argmax())
+    flat = np.delete(points, axis, axis=1)
+    if (normal[axis] < 0) != (axis == 1):  # dropping y mirrors the plane
+        flat = flat * [1.0, -1.0]
+
+    def side(a: int, b: int, c: int) -> float:
+        (ax, ay), (bx, by), (cx, cy) = flat[a], flat[b], flat[c]
+        return float((bx - ax) * (cy - ay) - (by - ay) * (cx - ax))
+
+    rest = list(range(len(points)))
+    triangles = []
+    while len(rest) > 3:
+        for k in range(len(rest)):
+            a, b, c = rest[k - 1], rest[k], rest[(k + 1) % len(rest)]
+            others = (p for p in rest if p not in (a, b, c))
+            if side(a, b, c) > 0 and not any(
+                side(a, b, p) >= 0 and side(b, c, p) >= 0 and side(c, a, p) >= 0 for p in others
+            ):
+                break
+        else:
+            k = 1  # self-intersecting: any cut is as good as another
+            a, b, c = rest[0], rest[1], rest[2]
+        triangles.append((a, b, c))
+        del rest[k]
+    return np.array([*triangles, tuple(rest)], dtype=np.int32)
+
+
+def read_ply_stl(path: Path, content: bytes) -> Asset:
+    """Read a PLY or STL file through trimesh, from memory; one grey primitive.
+
+    Raises:
+        InputError: The file is damaged or holds no triangles.
+    """
+    import trimesh
+
+    kind = path.suffix.lower()[1:]
+    check_promised_size(path, content, kind)
+    try:
+        mesh: Any = trimesh.load(BytesIO(content), file_type=kind, process=False)
+    except MemoryError:
+        raise
+    except Exception as error:  # trimesh raises whatever its parsers hit
+        short = str(error).splitlines()[0][:80] if str(error) else type(error).__name__
+        raise InputError(
+            path, f"damaged or not a {kind.upper()} file ({short})", "export it again, or as GLB"
+        ) from None
+    notices: list[str] = []
+    primitives: list[Primitive] = []
+    material: Material = plain_material("grey", GREY)
+    if isinstance(mesh, trimesh.Trimesh) and len(mesh.faces):
+        positions = np.array(mesh.vertices, dtype=np.float64)
+        if not np.isfinite(positions).all():
+            raise InputError(path, "vertices are NaN or infinite")
+        faces = np.array(mesh.faces)
+        if faces.min() < 0 or faces.max() >= len(positions):
+            raise InputError(path, f"index {faces.max()}, but {len(positions)} vertices")
+        if len(faces) > TRIANGLES:
+            raise InputError(path, f"too many triangles (found {len(faces)}; limit {TRIANGLES})")
+        indices, flat, repeated = keep_area(positions, faces.astype(np.int32))
+        if flat or repeated:
+            notices.append(f"dropped {flat} triangles of zero area and {repeated} repeated ones")
+        normals, colors = None, None
+        if kind == "ply":
+            normals = ply_normals(path, mesh, positions, indices)
+            colors = ply_colors(mesh)
+        if normals is None:
+            notices.append("no normals: shaded flat")
+        if colors is not None:
+            notices.append("vertex colours read as linear Rec.709")
+            material = plain_material("vertex colours", (1.0, 1.0, 1.0))
+        notices.append("no material: grey 0.8, roughness 0.5" if colors is None
+                       else "no material: roughness 0.5")  # fmt: skip
+        if len(indices):
+            primitives.append(Primitive(positions, indices, 0, normals=normals, colors=colors))
+            size = np.ptp(positions, axis=0)
+            notices.append(
+                f"no unit in the file: read as metres, size {size[0]:g} x {size[1]:g} x {size[2]:g}"
+            )
+    nothing_to_render(path, primitives, type(mesh).__name__)
+    return Asset(path.stem, tuple(primitives), (material,), notices=tuple(notices))
+
+
+def check_promised_size(path: Path, content: bytes, kind: str) -> None:
+    """Refuse headers that promise more than the file can hold, before trimesh allocates it."""
+    if kind == "stl" and not content.lstrip().startswith(b"solid"):
+        promised = int.from_bytes(content[80:84], "little") if len(content) >= 84 else 0
+        if len(content) < 84 or len(content) < 84 + 50 * promised:
+            raise InputError(
+                path,
+                f"damaged STL: {promised} triangles need {84 + 50 * promised} bytes "
+                f"(found {len(content)})",
+                "export it again, or as GLB",
+            )
+    if kind == "ply":
+        if not content.startswith(b"ply"):
+            raise InputError(path, "not a PLY file (does not start with 'ply')", "convert to GLB")
+        header = content[: content.find(b"end_header") + 1]
+        for count in re.findall(rb"^element\s+\S+\s+(\d+)", header, re.MULTILINE):
+            if len(count) > 12 or int(count) > len(content):
+                raise InputError(
+                    path, f"damaged PLY: {count[:20].decode()} elements in {len(content)} bytes"
+                )
+
+
+def ply_normals(
+    path: Path, mesh: Any, positions: NDArray[np.float64], indices: Triangles
+) -> FloatArray | None:
+    """Return the normals that a PLY file itself holds, shape [vertex, 3]."""
+    rows = mesh.metadata.get("_ply_raw", {}).get("vertex", {}).get("data")
+    try:
+        stored = np.column_stack([np.ravel(rows[key]) for key in ("nx", "ny", "nz")])
+    except (KeyError, ValueError, TypeError, IndexError):
+        return None
+    if stored.shape != positions.shape:
+        return None
+    if not np.isfinite(stored).all():
+        raise InputError(path, "normals are NaN or infinite")
+    return repair_normals(stored.astype(np.float64), positions, indices)[0]
+
+
+def ply_colors(mesh: Any) -> FloatArray | None:
+    """Return the vertex colours of a PLY file, shape [vertex, 4]."""
+    if mesh.visual.kind != "vertex":
+        return None
+    return (np.array(mesh.visual.vertex_colors, dtype=np.float32) / 255.0).astype(np.float32)
