@@ -59,8 +59,15 @@ class Camera:
     def scaled(self, width: int, height: int) -> "Camera":
         """Return the same view at another resolution."""
         sx, sy = width / self.width, height / self.height
-        return replace(self, width=width, height=height, fx=self.fx * sx, fy=self.fy * sy,
-                       cx=self.cx * sx, cy=self.cy * sy)
+        return replace(
+            self,
+            width=width,
+            height=height,
+            fx=self.fx * sx,
+            fy=self.fy * sy,
+            cx=self.cx * sx,
+            cy=self.cy * sy,
+        )
 
     def project(self, points: Float64Array) -> Float64Array:
         """Project world points [m], shape [point, 3], to pixels, shape [point, 2].
@@ -70,8 +77,10 @@ class Camera:
         w2c = np.linalg.inv(self.c2w)
         local = points @ w2c[:3, :3].T + w2c[:3, 3]
         depth = np.where(local[:, 2] < 0.0, -local[:, 2], np.nan)
-        return np.stack([self.cx + self.fx * local[:, 0] / depth,
-                         self.cy - self.fy * local[:, 1] / depth], axis=1)
+        return np.stack(
+            [self.cx + self.fx * local[:, 0] / depth, self.cy - self.fy * local[:, 1] / depth],
+            axis=1,
+        )
 
     def ray(self, u: float, v: float) -> tuple[Float64Array, Float64Array]:
         """Return origin [m] and unit direction, world frame, through pixel position (u, v)."""
@@ -81,8 +90,15 @@ class Camera:
 
     def record(self) -> dict[str, Any]:
         """Return the content of ``camera.json``, which `read_camera` takes back."""
-        return {"w": self.width, "h": self.height, "fx": self.fx, "fy": self.fy,
-                "cx": self.cx, "cy": self.cy, "c2w": self.c2w.tolist()}
+        return {
+            "w": self.width,
+            "h": self.height,
+            "fx": self.fx,
+            "fy": self.fy,
+            "cx": self.cx,
+            "cy": self.cy,
+            "c2w": self.c2w.tolist(),
+        }
 
 
 def exr_matrices(camera: Camera) -> tuple[Float64Array, Float64Array]:
@@ -93,10 +109,14 @@ def exr_matrices(camera: Camera) -> tuple[Float64Array, Float64Array]:
     """
     w2c = np.linalg.inv(camera.c2w)
     width, height = camera.width, camera.height
-    projection = np.array([[camera.fx / width, 0.0, -camera.cx / width, 0.0],
-                           [0.0, -camera.fy / height, -camera.cy / height, 0.0],
-                           [0.0, 0.0, 0.0, 1.0],
-                           [0.0, 0.0, -1.0, 0.0]])
+    projection = np.array(
+        [
+            [camera.fx / width, 0.0, -camera.cx / width, 0.0],
+            [0.0, -camera.fy / height, -camera.cy / height, 0.0],
+            [0.0, 0.0, 0.0, 1.0],
+            [0.0, 0.0, -1.0, 0.0],
+        ]
+    )
     return (np.diag([1.0, 1.0, -1.0, 1.0]) @ w2c).T, (projection @ w2c).T
 
 
@@ -126,8 +146,11 @@ def camera_from_fov(
     """
     notices = []
     if not (np.isfinite(fov_deg) and 0.0 < fov_deg < 180.0):
-        raise InputError("--fov", f"not a field of view (found {fov_deg}; expected degrees between "
-                         "0 and 180)", code=ExitCode.USAGE)
+        raise InputError(
+            "--fov",
+            f"not a field of view (found {fov_deg}; expected degrees between 0 and 180)",
+            code=ExitCode.USAGE,
+        )
     if fov_deg < 3.2:
         notices.append(f"--fov: {fov_deg} degrees is very narrow; was it meant in radians?")
     fx = width / 2.0 / np.tan(np.radians(fov_deg) / 2.0)
@@ -144,30 +167,46 @@ def camera_from_exif(
 ) -> Camera:
     """As `camera_from_fov`, from EXIF's 35 mm equivalent focal length [mm], by the diagonal."""
     if not (np.isfinite(focal_35mm) and focal_35mm > 0.0):
-        raise InputError("--focal-mm", f"not a focal length (found {focal_35mm}; expected a "
-                         "positive number of millimetres)", code=ExitCode.USAGE)
+        raise InputError(
+            "--photo",
+            f"EXIF focal length is not one (found {focal_35mm}; expected millimetres > 0)",
+            "give --fov",
+        )
     fx = focal_35mm * float(np.hypot(width, height)) / FILM_DIAGONAL_35MM
     fov_deg = 2.0 * float(np.degrees(np.arctan(width / 2.0 / fx)))
-    notices = [f"assumed: field of view {fov_deg:.1f} degrees, from the EXIF focal length "
-               f"{focal_35mm:g} mm (35 mm equivalent, by the diagonal); wrong if cropped"]
+    notices = [
+        f"assumed: field of view {fov_deg:.1f} degrees, from the EXIF focal length "
+        f"{focal_35mm:g} mm (35 mm equivalent, by the diagonal); wrong if cropped"
+    ]
     return _level_camera(width, height, fx, pitch_deg, camera_height, horizon, notices)
 
 
 def _level_camera(
-    width: int, height: int, focal: float, pitch_deg: float, camera_height: float,
-    horizon: float | None, notices: list[str],
+    width: int,
+    height: int,
+    focal: float,
+    pitch_deg: float,
+    camera_height: float,
+    horizon: float | None,
+    notices: list[str],
 ) -> Camera:
     """Return a camera without roll whose principal point is the image centre."""
     if width < 1 or height < 1:
         raise InputError("--photo", f"no pixels (found {width} x {height})")
     if not (np.isfinite(camera_height) and camera_height > 0.0):
-        raise InputError("--camera-height", f"not above the ground (found {camera_height}; "
-                         "expected metres > 0)", code=ExitCode.USAGE)
+        raise InputError(
+            "--camera-height",
+            f"not above the ground (found {camera_height}; expected metres > 0)",
+            code=ExitCode.USAGE,
+        )
     cx, cy = width / 2.0, height / 2.0
     if horizon is None:
         if not (np.isfinite(pitch_deg) and -90.0 <= pitch_deg <= 90.0):
-            raise InputError("--pitch", f"not a tilt (found {pitch_deg}; expected degrees between "
-                             "-90 and 90)", code=ExitCode.USAGE)
+            raise InputError(
+                "--pitch",
+                f"not a tilt (found {pitch_deg}; expected degrees between -90 and 90)",
+                code=ExitCode.USAGE,
+            )
         pitch = float(np.radians(pitch_deg))
     else:
         if not np.isfinite(horizon):
@@ -176,10 +215,14 @@ def _level_camera(
         # A level direction straight ahead projects to row cy + f tan(pitch).
         pitch = float(np.arctan2(row - cy, focal))
     cos, sin = np.cos(pitch), np.sin(pitch)
-    c2w = np.array([[1.0, 0.0, 0.0, 0.0],
-                    [0.0, cos, -sin, camera_height],
-                    [0.0, sin, cos, 0.0],
-                    [0.0, 0.0, 0.0, 1.0]])
+    c2w = np.array(
+        [
+            [1.0, 0.0, 0.0, 0.0],
+            [0.0, cos, -sin, camera_height],
+            [0.0, sin, cos, 0.0],
+            [0.0, 0.0, 0.0, 1.0],
+        ]
+    )
     return Camera(width, height, focal, focal, cx, cy, c2w, tuple(notices))
 
 
@@ -200,17 +243,23 @@ def ground_point(
     normal = np.asarray(plane[:3], dtype=np.float64)
     length = float(np.linalg.norm(normal))
     if len(plane) != 4 or not np.isfinite(plane).all() or length < 1e-12:
-        raise InputError("--ground", f"not a plane (found {', '.join(map(str, plane))}; expected "
-                         "a,b,c,d with a normal that is not 0)", code=ExitCode.USAGE)
+        raise InputError(
+            "--ground",
+            f"not a plane (found {', '.join(map(str, plane))}; expected "
+            "a,b,c,d with a normal that is not 0)",
+            code=ExitCode.USAGE,
+        )
     origin, direction = camera.ray(u, v)
     distance = float(normal @ origin + plane[3]) / length
     if abs(distance) < 1e-9:
         raise InputError("--ground", "the plane passes through the camera")
     approach = float(normal @ direction) / length
     if approach * distance >= -1e-9 * abs(distance):
-        raise InputError("--place", f"pixel ({u:g}, {v:g}) shows no ground: it lies at or above "
-                         "the horizon", "choose a pixel lower in the image, or check the "
-                         "camera's pitch and field of view")
+        raise InputError(
+            "--at",
+            f"pixel ({u:g}, {v:g}) shows no ground: it lies at or above the horizon",
+            "choose a pixel lower in the image, or check the camera's pitch and field of view",
+        )
     point: Float64Array = origin - direction * (distance / approach)
     return point
 
@@ -218,9 +267,7 @@ def ground_point(
 # ------------------------------------------------------------------------------ camera files
 
 
-def read_camera(
-    path: str | Path, photo_size: tuple[int, int], up: str | None = None
-) -> Camera:
+def read_camera(path: str | Path, photo_size: tuple[int, int], up: str | None = None) -> Camera:
     """Read a camera: our ``camera.json``, an fSpy project (``.fspy``) or fSpy's JSON export.
 
     Args:
@@ -241,9 +288,12 @@ def read_camera(
     elif "fx" in content or "c2w" in content:
         camera = _read_own(path, content, axis)
     else:
-        raise InputError(path, f"not a camera that warpir reads (found keys "
-                         f"{', '.join(list(content)[:8]) or 'none'}; expected fx fy cx cy w h c2w, "
-                         "or an fSpy file)")
+        raise InputError(
+            path,
+            f"not a camera that warpir reads (found keys "
+            f"{', '.join(list(content)[:8]) or 'none'}; expected fx fy cx cy w h c2w, "
+            "or an fSpy file)",
+        )
     return _fit(path, camera, photo_size)
 
 
@@ -251,8 +301,9 @@ def _up_axis(up: str) -> str:
     axis = up.strip().lower()
     axis = axis if axis[:1] in ("+", "-") else f"+{axis}"
     if axis not in _UP_TO_Y:
-        raise InputError("--up", f"not an axis (found {up}; expected x, y, z, -x, -y or -z)",
-                         code=ExitCode.USAGE)
+        raise InputError(
+            "--up", f"not an axis (found {up}; expected x, y, z, -x, -y or -z)", code=ExitCode.USAGE
+        )
     return axis
 
 
@@ -276,20 +327,26 @@ def _fspy_project(path: Path) -> dict[str, Any]:
     with path.open("rb") as stream:
         header = stream.read(16)
         if len(header) < 16:
-            raise InputError(path, f"truncated fSpy project (found {len(header)} bytes; expected "
-                             "a header of 16)")
+            raise InputError(
+                path, f"truncated fSpy project (found {len(header)} bytes; expected a header of 16)"
+            )
         version, state_size, image_size = struct.unpack("<3I", header[4:])
         if version != 1:
-            raise InputError(path, f"fSpy project of another version (found {version}; expected "
-                             "1)")
+            raise InputError(path, f"fSpy project of another version (found {version}; expected 1)")
         if state_size > JSON_BYTES_MAX:
-            raise InputError(path, f"fSpy state too large (found {state_size} bytes; expected at "
-                             f"most {JSON_BYTES_MAX})")
+            raise InputError(
+                path,
+                f"fSpy state too large (found {state_size} bytes; expected at "
+                f"most {JSON_BYTES_MAX})",
+            )
         state = stream.read(state_size)
     found = path.stat().st_size
     if len(state) < state_size or found < 16 + state_size + image_size:
-        raise InputError(path, f"truncated fSpy project (found {found} bytes; expected "
-                         f"{16 + state_size + image_size})")
+        raise InputError(
+            path,
+            f"truncated fSpy project (found {found} bytes; expected "
+            f"{16 + state_size + image_size})",
+        )
     return parse_json_object(path, state)
 
 
@@ -297,16 +354,22 @@ def _read_fspy(path: Path, content: dict[str, Any], axis: str | None) -> Camera:
     """Read fSpy's camera parameters; its camera axes are ours, its world may stand otherwise."""
     parameters = content.get("cameraParameters", content)
     if parameters is None:
-        raise InputError(path, "fSpy found no camera in this project (cameraParameters is null)",
-                         "place the vanishing lines in fSpy until it shows a camera, save again")
+        raise InputError(
+            path,
+            "fSpy found no camera in this project (cameraParameters is null)",
+            "place the vanishing lines in fSpy until it shows a camera, save again",
+        )
     width = _count(path, parameters, "imageWidth")
     height = _count(path, parameters, "imageHeight")
     centre = _member(path, parameters, "principalPoint")
     px, py = _number(path, centre, "x"), _number(path, centre, "y")
     angle = _number(path, parameters, "horizontalFieldOfView")
     if not 0.0 < angle < np.pi:
-        raise InputError(path, f"not a field of view (found horizontalFieldOfView {angle}; "
-                         "expected radians between 0 and pi)")
+        raise InputError(
+            path,
+            f"not a field of view (found horizontalFieldOfView {angle}; "
+            "expected radians between 0 and pi)",
+        )
     # fSpy's "horizontal" angle spans the longer side; its principal point has y up.
     focal = max(width, height) / 2.0 / float(np.tan(angle / 2.0))
     aspect = width / height
@@ -314,8 +377,7 @@ def _read_fspy(path: Path, content: dict[str, Any], axis: str | None) -> Camera:
         cx, cy = width / 2.0 * (px + 1.0), height / 2.0 * (1.0 - py * aspect)
     else:
         cx, cy = width / 2.0 * (px / aspect + 1.0), height / 2.0 * (1.0 - py)
-    c2w = _rigid(path, "cameraTransform",
-                 _member(path, parameters, "cameraTransform").get("rows"))
+    c2w = _rigid(path, "cameraTransform", _member(path, parameters, "cameraTransform").get("rows"))
     notices = []
     if axis is None:
         camera_up = c2w[:3, 1]
@@ -332,9 +394,15 @@ def _read_own(path: Path, content: dict[str, Any], axis: str | None) -> Camera:
         if value <= 0.0:
             raise InputError(path, f"/{key}: not a focal length (found {value}; expected > 0)")
     c2w = _rigid(path, "c2w", content.get("c2w"))
-    return Camera(_count(path, content, "w"), _count(path, content, "h"), focal["fx"],
-                  focal["fy"], _number(path, content, "cx"), _number(path, content, "cy"),
-                  _turned_up(c2w, axis or "+y"))
+    return Camera(
+        _count(path, content, "w"),
+        _count(path, content, "h"),
+        focal["fx"],
+        focal["fy"],
+        _number(path, content, "cx"),
+        _number(path, content, "cy"),
+        _turned_up(c2w, axis or "+y"),
+    )
 
 
 def _turned_up(c2w: Float64Array, axis: str) -> Float64Array:
@@ -350,18 +418,24 @@ def _fit(path: Path, camera: Camera, photo_size: tuple[int, int]) -> Camera:
     width, height = photo_size
     # The other side may have been rounded to a whole pixel, once in each size.
     slack = max(width / camera.width, height / camera.height, 1.0)
-    if (abs(camera.width * height / camera.height - width) > slack
-            and abs(camera.height * width / camera.width - height) > slack):
-        raise InputError(path, f"made for a picture of another shape (found {camera.width} x "
-                         f"{camera.height}; expected the aspect of {width} x {height})",
-                         "use the camera of this photograph, before cropping or turning it")
+    if (
+        abs(camera.width * height / camera.height - width) > slack
+        and abs(camera.height * width / camera.width - height) > slack
+    ):
+        raise InputError(
+            path,
+            f"made for a picture of another shape (found {camera.width} x "
+            f"{camera.height}; expected the aspect of {width} x {height})",
+            "use the camera of this photograph, before cropping or turning it",
+        )
     notices = list(camera.notices)
     if (camera.width, camera.height) != photo_size:
-        notices.append(f"camera scaled from {camera.width} x {camera.height} to the photograph's "
-                       f"{width} x {height}")
+        notices.append(
+            f"camera scaled from {camera.width} x {camera.height} to the photograph's "
+            f"{width} x {height}"
+        )
     if not (0.0 <= camera.cx <= camera.width and 0.0 <= camera.cy <= camera.height):
-        notices.append(f"principal point ({camera.cx:.1f}, {camera.cy:.1f}) lies outside the "
-                       "image")
+        notices.append(f"principal point ({camera.cx:.1f}, {camera.cy:.1f}) lies outside the image")
     return replace(camera.scaled(width, height), notices=tuple(notices))
 
 
@@ -377,30 +451,46 @@ def _rigid(path: Path, name: str, rows: Any) -> Float64Array:
     if matrix.shape == (3, 4):
         matrix = np.vstack([matrix, [0.0, 0.0, 0.0, 1.0]])
     if matrix.shape != (4, 4):
-        raise InputError(path, f"/{name}: not a matrix (found shape {matrix.shape}; expected 4 x 4 "
-                         "or 3 x 4)")
+        raise InputError(
+            path, f"/{name}: not a matrix (found shape {matrix.shape}; expected 4 x 4 or 3 x 4)"
+        )
     if not np.isfinite(matrix).all():
         raise InputError(path, f"/{name}: numbers that are not finite")
     last = np.array([0.0, 0.0, 0.0, 1.0])
     if np.abs(matrix[3] - last).max() > RIGID_TOLERANCE:
         if np.abs(matrix[:, 3] - last).max() <= RIGID_TOLERANCE:
-            raise InputError(path, f"/{name}: transposed (found the translation in the last row; "
-                             "expected it in the last column)", "transpose the matrix")
-        raise InputError(path, f"/{name}: last row is not 0 0 0 1 (found "
-                         f"{' '.join(f'{x:g}' for x in matrix[3])})")
+            raise InputError(
+                path,
+                f"/{name}: transposed (found the translation in the last row; "
+                "expected it in the last column)",
+                "transpose the matrix",
+            )
+        raise InputError(
+            path,
+            f"/{name}: last row is not 0 0 0 1 (found {' '.join(f'{x:g}' for x in matrix[3])})",
+        )
     rotation = matrix[:3, :3]
     product = rotation.T @ rotation
     scale = float(np.trace(product)) / 3.0
     deviation = float(np.abs(product - np.eye(3)).max())
     if deviation > RIGID_TOLERANCE:
         if scale > 0.0 and np.abs(product / scale - np.eye(3)).max() <= RIGID_TOLERANCE:
-            raise InputError(path, f"/{name}: scaled (found a factor of {np.sqrt(scale):.6g}; "
-                             "expected 1)", "remove the scale from the camera")
-        raise InputError(path, f"/{name}: not orthonormal (found axes off by {deviation:.3g}; "
-                         f"expected at most {RIGID_TOLERANCE})")
+            raise InputError(
+                path,
+                f"/{name}: scaled (found a factor of {np.sqrt(scale):.6g}; expected 1)",
+                "remove the scale from the camera",
+            )
+        raise InputError(
+            path,
+            f"/{name}: not orthonormal (found axes off by {deviation:.3g}; "
+            f"expected at most {RIGID_TOLERANCE})",
+        )
     if np.linalg.det(rotation) < 0.0:
-        raise InputError(path, f"/{name}: left-handed (found determinant -1; expected +1)",
-                         "export it with right-handed axes: camera along -Z, +Y up, +X right")
+        raise InputError(
+            path,
+            f"/{name}: left-handed (found determinant -1; expected +1)",
+            "export it with right-handed axes: camera along -Z, +Y up, +X right",
+        )
     left, _, right = np.linalg.svd(rotation)
     rigid = np.eye(4)
     rigid[:3, :3] = left @ right
@@ -418,14 +508,14 @@ def _member(path: Path, content: Any, key: str) -> dict[str, Any]:
 def _number(path: Path, content: Any, key: str) -> float:
     value = content.get(key) if isinstance(content, dict) else None
     if isinstance(value, bool) or not isinstance(value, int | float) or abs(value) > 1e15:
-        raise InputError(path, f"/{key}: not a number that can be used (found "
-                         f"{str(value)[:40]})")
+        raise InputError(path, f"/{key}: not a number that can be used (found {str(value)[:40]})")
     return float(value)
 
 
 def _count(path: Path, content: Any, key: str) -> int:
     value = _number(path, content, key)
     if value != int(value) or not 1 <= value <= 1_000_000:
-        raise InputError(path, f"/{key}: not an image size (found {value:g}; expected whole "
-                         "pixels)")
+        raise InputError(
+            path, f"/{key}: not an image size (found {value:g}; expected whole pixels)"
+        )
     return int(value)

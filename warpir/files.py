@@ -6,22 +6,34 @@ checks again. Writing: `OutputFolder` stages everything and renames at the end, 
 The image libraries are imported inside the functions that need them, to keep start-up short.
 """
 
+import errno
+import fcntl
 import hashlib
+import io
+import json
 import logging
 import os
+import re
+import shutil
+import socket
 import stat
+import struct
 import tempfile
-from collections.abc import Iterator
-from contextlib import contextmanager
+import zlib
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+import warpir
 from warpir import color
+from warpir.camera import Camera, exr_matrices
 from warpir.errors import ExitCode, InputError
+from warpir.strict_json import read_json_object
 
 FloatArray = NDArray[np.float32]
 Pixels = NDArray[Any]
@@ -93,31 +105,32 @@ def read_photo(
     path: str | Path,
     *,
     max_pixels: int = PHOTO_PIXELS_MAX,
-    alpha: Literal["refuse", "ignore"] = "refuse",
-    layer: str = "",
+    alpha: str = "refuse",
 ) -> Photo:
     """Read a photograph: JPEG, PNG, TIFF or WebP, or a linear plate in EXR, HDR or float TIFF.
 
     Args:
         path: The file; recognised by content, not by name.
         max_pixels: Largest image decoded [px] (``--max-pixels``).
-        alpha: Whether a transparent image is refused or its alpha dropped (``--alpha``).
-        layer: EXR layer to read, such as ``beauty`` for ``beauty.R``; empty for the plain RGB.
+        alpha: ``refuse`` a transparent image, or ``ignore`` its alpha (``--alpha``).
 
     Raises:
         InputError: Missing, not an image, truncated, too large, transparent, or in a colour
             space that cannot be converted.
     """
     path = Path(path)
-    image = _decode(path, max_pixels, layer)
+    image = _decode(path, max_pixels)
     notices = list(image.notices)
     codes = image.pixels
     if image.alpha is not None:
         opaque = 1.0 if codes.dtype.kind == "f" else np.iinfo(codes.dtype).max
         if not bool(np.all(image.alpha >= opaque)):
-            if alpha == "refuse":
-                raise InputError(path, "partly transparent (found an alpha channel; expected an "
-                                 "opaque photograph)", "flatten it, or pass --alpha ignore")
+            if alpha != "ignore":
+                raise InputError(
+                    path,
+                    "partly transparent (found an alpha channel; expected an opaque photograph)",
+                    "flatten it, or pass --alpha ignore",
+                )
             notices.append("alpha channel ignored")
     codes = _upright(codes, image.orientation)
     if codes.shape[-1] == 1:
@@ -139,8 +152,14 @@ def read_photo(
         if image.icc is not None:
             codes, srgb, icc, notice = _convert_profile(path, codes, srgb, image.icc)
             notices += [notice] if notice else []
-    return Photo(np.ascontiguousarray(codes), np.ascontiguousarray(srgb), image.kind, icc,
-                 image.focal_35mm, tuple(notices))
+    return Photo(
+        np.ascontiguousarray(codes),
+        np.ascontiguousarray(srgb),
+        image.kind,
+        icc,
+        image.focal_35mm,
+        tuple(notices),
+    )
 
 
 def read_envmap(
@@ -172,30 +191,36 @@ def read_envmap(
     """
     path = Path(path)
     if convention not in ENVMAP_ROLLS:
-        raise InputError("--env-convention", f"unknown convention (found {convention}; expected "
-                         f"{', '.join(ENVMAP_ROLLS)})", code=ExitCode.USAGE)
+        raise ValueError(f"convention {convention!r} is not one of {', '.join(ENVMAP_ROLLS)}")
     if not np.isfinite(rotate_deg):
-        raise InputError("--env-rotate", f"not a number of degrees (found {rotate_deg})",
-                         code=ExitCode.USAGE)
-    image = _decode(path, ENVMAP_WIDTH_MAX * ENVMAP_WIDTH_MAX // 2, "", kinds=("exr", "hdr"))
+        raise InputError(
+            "--light-rotate", f"not a number of degrees (found {rotate_deg})", code=ExitCode.USAGE
+        )
+    image = _decode(path, ENVMAP_WIDTH_MAX * ENVMAP_WIDTH_MAX // 2, kinds=("exr", "hdr"))
     texels = _upright(image.pixels, image.orientation).astype(np.float32)
     if texels.shape[-1] == 1:
         texels = np.repeat(texels, 3, axis=-1)
     height, width = texels.shape[:2]
     if width != 2 * height or height < 2:
-        raise InputError(path, f"not a lat-long map (found {width} x {height}; expected 2:1)",
-                         "resize it to twice as wide as high")
+        raise InputError(
+            path,
+            f"not a lat-long map (found {width} x {height}; expected 2:1)",
+            "resize it to twice as wide as high",
+        )
     texels /= np.float32(image.exposure)
     messages = list(image.notices)
     bad = ~np.isfinite(texels)
     negative = texels < 0.0
     negative &= ~bad
     if bad.any() or negative.any():
-        found = (f"{int(np.isnan(texels).sum())} NaN, {int(np.isinf(texels).sum())} infinite, "
-                 f"{int(negative.sum())} negative values")
+        found = (
+            f"{int(np.isnan(texels).sum())} NaN, {int(np.isinf(texels).sum())} infinite, "
+            f"{int(negative.sum())} negative values"
+        )
         if strict:
-            raise InputError(path, f"not clean radiance (found {found}; expected finite values "
-                             ">= 0)")
+            raise InputError(
+                path, f"not clean radiance (found {found}; expected finite values >= 0)"
+            )
         brightest = float(texels[~bad].max(initial=0.0))
         texels[np.isposinf(texels)] = brightest
         texels[~(texels >= 0.0)] = 0.0
@@ -278,23 +303,32 @@ def _sniff(path: Path) -> tuple[str, bytes]:
     advice = ""
     if head[4:8] == b"ftyp" and head[8:12] in (b"heic", b"heix", b"mif1", b"avif", b"crx "):
         advice = "export it as JPEG or 16-bit TIFF"
-    raise InputError(path, "not an image that warpir reads (expected JPEG, PNG, TIFF, WebP, EXR "
-                     "or Radiance HDR)", advice)
+    raise InputError(
+        path,
+        "not an image that warpir reads (expected JPEG, PNG, TIFF, WebP, EXR or Radiance HDR)",
+        advice,
+    )
 
 
-_OIIO_NAMES = {"jpeg": "jpeg", "png": "png", "tiff": "tiff", "webp": "webp", "exr": "openexr",
-               "hdr": "hdr"}
+_OIIO_NAMES = {
+    "jpeg": "jpeg",
+    "png": "png",
+    "tiff": "tiff",
+    "webp": "webp",
+    "exr": "openexr",
+    "hdr": "hdr",
+}
 
 
-def _decode(
-    path: Path, max_pixels: int, layer: str, kinds: tuple[str, ...] = tuple(_OIIO_NAMES)
-) -> _Image:
+def _decode(path: Path, max_pixels: int, kinds: tuple[str, ...] = tuple(_OIIO_NAMES)) -> _Image:
     """Read the pixels of one file through OpenImageIO, with every check it leaves to us."""
     check_regular_file(path)
     kind, head = _sniff(path)
     if kind not in kinds:
-        raise InputError(path, f"not of a kind that can be used here (found {kind}; expected "
-                         f"{' or '.join(kinds)})")
+        raise InputError(
+            path,
+            f"not of a kind that can be used here (found {kind}; expected {' or '.join(kinds)})",
+        )
     import OpenImageIO as oiio
 
     # 64 bytes a pixel leave room for EXR layers; sizes are compared exactly below.
@@ -307,29 +341,39 @@ def _decode(
             raise _unreadable(path, kind, _library_error(oiio), max_pixels)
         try:
             if reader.format_name() != _OIIO_NAMES[kind]:
-                raise InputError(path, f"content contradicts itself (found {kind} magic bytes, "
-                                 f"read as {reader.format_name()})")
+                raise InputError(
+                    path,
+                    f"content contradicts itself (found {kind} magic bytes, "
+                    f"read as {reader.format_name()})",
+                )
             spec = reader.spec()
             for width, height in ((spec.width, spec.height), (spec.full_width, spec.full_height)):
                 if width * height > max_pixels:
-                    raise InputError(path, f"too large (found {width} x {height} pixels; expected "
-                                     f"at most {max_pixels})", "raise --max-pixels")
+                    raise InputError(
+                        path,
+                        f"too large (found {width} x {height} pixels; expected "
+                        f"at most {max_pixels})",
+                        "raise --max-pixels",
+                    )
             if spec.deep:
                 raise InputError(path, "deep EXR images are not supported", "flatten it first")
             if spec.depth > 1:
                 raise InputError(path, "volume images are not supported")
-            if spec.format.basetype in (oiio.INT8, oiio.INT16, oiio.INT32, oiio.INT64,
-                                        oiio.UINT64):
-                raise InputError(path, f"pixel type not supported (found {spec.format}; expected "
-                                 "unsigned integers or floats)")
-            first, count = _choose_channels(path, spec.channelnames, layer)
-            has_alpha = not layer and spec.alpha_channel >= 0
+            if spec.format.basetype in (oiio.INT8, oiio.INT16, oiio.INT32, oiio.INT64, oiio.UINT64):
+                raise InputError(
+                    path,
+                    f"pixel type not supported (found {spec.format}; expected "
+                    "unsigned integers or floats)",
+                )
+            first, count = _choose_channels(path, spec.channelnames)
+            has_alpha = spec.alpha_channel >= 0
             last = max(first + count, spec.alpha_channel + 1 if has_alpha else 0)
             try:
                 pixels = reader.read_image(0, 0, first, last, spec.format)
             except MemoryError as error:
-                raise InputError(path, "not enough memory to decode it",
-                                 code=ExitCode.RESOURCES) from error
+                raise InputError(
+                    path, "not enough memory to decode it", code=ExitCode.RESOURCES
+                ) from error
             error_text = _library_error(reader)
             if pixels is None or error_text:
                 raise _unreadable(path, kind, error_text, max_pixels)
@@ -357,34 +401,29 @@ def _decode(
     )
 
 
-def _choose_channels(path: Path, names: tuple[str, ...], layer: str) -> tuple[int, int]:
-    """Return the first channel and the count (1 or 3) of the colour to read.
-
-    OpenImageIO puts R, G, B next to each other, within layers too.
-    """
-    wanted = [f"{layer}.{c}" if layer else c for c in "RGB"]
-    if all(name in names for name in wanted):
-        first = names.index(wanted[0])
-        if list(names[first:first + 3]) == wanted:
-            return first, 3
-    grey = f"{layer}.Y" if layer else "Y"
-    if grey in names and not layer and ("RY" in names or "BY" in names):
+def _choose_channels(path: Path, names: tuple[str, ...]) -> tuple[int, int]:
+    """Return the first colour channel and their count, 1 or 3; OpenImageIO puts RGB first."""
+    if names[:3] == ("R", "G", "B"):
+        return 0, 3
+    if "RY" in names or "BY" in names:
         raise InputError(path, "luminance/chroma EXR is not supported", "save it as RGB")
-    if grey in names:
-        return names.index(grey), 1
-    if not layer and len(names) == 1:
-        return 0, 1
+    if "Y" in names or len(names) == 1:
+        return (names.index("Y") if "Y" in names else 0), 1
     layers = sorted({name.rpartition(".")[0] for name in names if "." in name})
-    raise InputError(path, f"no RGB channels{f' in layer {layer}' if layer else ''} (found "
-                     f"{', '.join(names[:24])}; expected {', '.join(wanted)})",
-                     f"choose a layer with --layer: {', '.join(layers[:12])}" if layers else "")
+    raise InputError(
+        path,
+        f"no RGB channels (found {', '.join(names[:24])}; expected R, G, B)",
+        f"save one layer as plain RGB: {', '.join(layers[:12])}" if layers else "",
+    )
 
 
 def _header_notices(spec: Any, kind: str, head: bytes) -> list[str]:
     """Say what the header tells about colour and content that is not followed."""
     notices = []
-    if spec.getattribute("jpeg:ColorSpace") in ("CMYK", "YCCK") or spec.getattribute(
-            "tiff:ColorSpace") == "CMYK":
+    if (
+        spec.getattribute("jpeg:ColorSpace") in ("CMYK", "YCCK")
+        or spec.getattribute("tiff:ColorSpace") == "CMYK"
+    ):
         notices.append("CMYK converted without its profile; export as RGB for exact colours")
     if spec.getattribute("Exif:ColorSpace") == 65535:
         notices.append("EXIF says uncalibrated colour; its profile, or else sRGB, is used")
@@ -392,8 +431,7 @@ def _header_notices(spec: Any, kind: str, head: bytes) -> list[str]:
     if kind == "png" and spec.getattribute("ICCProfile") is None and space not in _SRGB_NAMES:
         notices.append(f"colour space {space} of the header is not followed: taken as sRGB")
     primaries = spec.getattribute("chromaticities")
-    if primaries is not None and not np.allclose(primaries, color.REC709_CHROMATICITIES,
-                                                 atol=2e-3):
+    if primaries is not None and not np.allclose(primaries, color.REC709_CHROMATICITIES, atol=2e-3):
         notices.append("chromaticities of the header are not Rec.709 and are not followed")
     if kind == "jpeg" and (b"hdrgm:" in head or b"hdr-gain-map" in head):
         notices.append("gain map ignored: read as its base image")
@@ -415,8 +453,9 @@ def _check_parts(path: Path, reader: Any, spec: Any, kind: str) -> list[str]:
         if not reader.seek_subimage(part, 0):
             break
         other = reader.spec()
-        planes = None if other.deep else reader.read_image(part, 0, 0, other.nchannels,
-                                                           other.format)
+        planes = (
+            None if other.deep else reader.read_image(part, 0, 0, other.nchannels, other.format)
+        )
         readable += planes is not None and not _library_error(reader)
     if readable < parts:
         raise InputError(path, f"truncated or corrupt ({readable} of {parts} parts readable)")
@@ -426,15 +465,20 @@ def _check_parts(path: Path, reader: Any, spec: Any, kind: str) -> list[str]:
 def _place_in_display_window(pixels: Pixels, spec: Any) -> Pixels:
     """Crop or pad the data window of an EXR, with zeros, to its display window."""
     if (spec.x, spec.y, spec.width, spec.height) == (
-            spec.full_x, spec.full_y, spec.full_width, spec.full_height):
+        spec.full_x,
+        spec.full_y,
+        spec.full_width,
+        spec.full_height,
+    ):
         return pixels
     placed = np.zeros((spec.full_height, spec.full_width, pixels.shape[-1]), pixels.dtype)
     x0, y0 = max(spec.x, spec.full_x), max(spec.y, spec.full_y)
     x1 = min(spec.x + spec.width, spec.full_x + spec.full_width)
     y1 = min(spec.y + spec.height, spec.full_y + spec.full_height)
     if x1 > x0 and y1 > y0:
-        placed[y0 - spec.full_y:y1 - spec.full_y, x0 - spec.full_x:x1 - spec.full_x] = pixels[
-            y0 - spec.y:y1 - spec.y, x0 - spec.x:x1 - spec.x]
+        placed[y0 - spec.full_y : y1 - spec.full_y, x0 - spec.full_x : x1 - spec.full_x] = pixels[
+            y0 - spec.y : y1 - spec.y, x0 - spec.x : x1 - spec.x
+        ]
     return placed
 
 
@@ -465,15 +509,24 @@ def _finite(codes: Pixels) -> tuple[Pixels, int]:
 def _unreadable(path: Path, kind: str, text: str, max_pixels: int) -> InputError:
     """Word a failure of the decoder."""
     if any(word in text for word in ("exceed", "claims a", "claimed to be")):
-        return InputError(path, f"the header claims too large an image ({_one_line(text)}; "
-                          f"expected at most {max_pixels} pixels)",
-                          "raise --max-pixels if the file is sound")
+        return InputError(
+            path,
+            f"the header claims too large an image ({_one_line(text)}; "
+            f"expected at most {max_pixels} pixels)",
+            "raise --max-pixels if the file is sound",
+        )
     if kind == "hdr" and "FORMAT" in text:
-        return InputError(path, "not 32-bit_rle_rgbe (XYZE files are not supported)",
-                          "save it as RGBE .hdr or as EXR")
+        return InputError(
+            path,
+            "not 32-bit_rle_rgbe (XYZE files are not supported)",
+            "save it as RGBE .hdr or as EXR",
+        )
     reason = _one_line(text) or "the decoder gave no reason"
-    return InputError(path, f"truncated, corrupt or of an unsupported variant of {kind} "
-                      f"({reason})", "check that the file was copied or downloaded completely")
+    return InputError(
+        path,
+        f"truncated, corrupt or of an unsupported variant of {kind} ({reason})",
+        "check that the file was copied or downloaded completely",
+    )
 
 
 def _library_error(source: Any) -> str:
@@ -536,8 +589,6 @@ def _convert_lut_profile(
     path: Path, codes: Pixels, srgb: FloatArray, icc: bytes
 ) -> tuple[Pixels, FloatArray, bytes | None, str]:
     """Convert by Pillow what OpenColorIO does not read: profiles with tables, 8 bits only."""
-    import io
-
     from PIL import Image, ImageCms
 
     try:
@@ -548,18 +599,27 @@ def _convert_lut_profile(
     if space != "RGB":
         return codes, srgb, None, f"colour profile is for {space} images: taken as sRGB"
     if codes.dtype != np.uint8:
-        raise InputError(path, "colour profile with tables on a 16-bit image is not supported",
-                         "convert the image to sRGB or Display P3")
+        raise InputError(
+            path,
+            "colour profile with tables on a 16-bit image is not supported",
+            "convert the image to sRGB or Display P3",
+        )
     try:
         picture = ImageCms.profileToProfile(
-            Image.fromarray(np.ascontiguousarray(codes)), profile,
-            ImageCms.ImageCmsProfile(ImageCms.createProfile("sRGB")))
+            Image.fromarray(np.ascontiguousarray(codes)),
+            profile,
+            ImageCms.ImageCmsProfile(ImageCms.createProfile("sRGB")),
+        )
     except ImageCms.PyCMSError:
         return codes, srgb, None, "colour profile is broken: taken as sRGB"
     assert picture is not None
     codes = np.asarray(picture)
-    return (codes, codes.astype(np.float32) / np.float32(255.0), None,
-            "colours converted in 8 bits from the embedded table profile to sRGB")
+    return (
+        codes,
+        codes.astype(np.float32) / np.float32(255.0),
+        None,
+        "colours converted in 8 bits from the embedded table profile to sRGB",
+    )
 
 
 def _profile_to_srgb(encoded: FloatArray, icc: bytes) -> FloatArray | None:
@@ -594,10 +654,595 @@ def _apply_profile(values: FloatArray, icc: bytes, inverse: bool) -> FloatArray 
         profile_path.write_bytes(icc)
         source = oiio.ImageBuf(np.ascontiguousarray(values, dtype=np.float32))
         target = oiio.ImageBuf()
-        done = oiio.ImageBufAlgo.ociofiletransform(target, source, str(profile_path), False,
-                                                   inverse)
+        done = oiio.ImageBufAlgo.ociofiletransform(
+            target, source, str(profile_path), False, inverse
+        )
         if not done:
             target.geterror()
             return None
         pixels = np.asarray(target.get_pixels(oiio.FLOAT), dtype=np.float32)
         return pixels.reshape(values.shape)
+
+
+# ------------------------------------------------------------------------------------- output
+
+HALF_MAX = 65504.0
+"""Largest finite half-precision number."""
+
+BACKGROUND_DEPTH = 1e10
+"""``Z`` where no object is [m]."""
+
+_PLAIN_NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_.-]{0,99}")
+_RUN_JSON = "run.json"
+
+_XMP = """<?xpacket begin="\ufeff" id="W5M0MpCehiHzreSzNTczkc9d"?>
+<x:xmpmeta xmlns:x="adobe:ns:meta/">
+ <rdf:RDF xmlns:rdf="http://www.w3.org/1999/02/22-rdf-syntax-ns#">
+  <rdf:Description rdf:about=""
+    xmlns:Iptc4xmpExt="http://iptc.org/std/Iptc4xmpExt/2008-02-29/">
+   <Iptc4xmpExt:DigitalSourceType>\
+http://cv.iptc.org/newscodes/digitalsourcetype/compositeSynthetic\
+</Iptc4xmpExt:DigitalSourceType>
+  </rdf:Description>
+ </rdf:RDF>
+</x:xmpmeta>
+<?xpacket end="w"?>"""
+
+
+class OutputFolder:
+    """The folder a run writes: all of it, or nothing.
+
+    A context manager. Files are staged in ``.partial-<pid>/`` inside the folder, so on the same
+    file system; leaving the block without an exception renames them into place, ``run.json``
+    last. A folder with ``run.json`` therefore holds a complete result, and after a failure the
+    earlier files are what they were, byte for byte. ``.lock`` keeps a second run out; the
+    kernel releases it with the process, so it is never stale.
+    """
+
+    def __init__(self, path: str | Path, overwrite: bool = False) -> None:
+        """Name the folder; nothing is touched before the block is entered.
+
+        Args:
+            path: The folder; made when missing.
+            overwrite: Whether results that are already there are replaced.
+        """
+        self.path = Path(path)
+        self.overwrite = overwrite
+        self._staging = self.path / f".partial-{os.getpid()}"
+        self._lock = -1
+        self._made = False
+        self._hashes: dict[str, str] = {}
+        self._run: dict[str, Any] = {}
+
+    def __enter__(self) -> "OutputFolder":
+        """Make and lock the folder.
+
+        Raises:
+            InputError: Locked or holding results (exit 7), or not writable (exit 5).
+        """
+        self._make()
+        try:
+            self._take_lock()
+            for abandoned in self.path.glob(".partial-*"):  # of killed runs: the lock is ours
+                shutil.rmtree(abandoned, ignore_errors=True)
+            self._refuse_results()
+            try:
+                self._staging.mkdir()
+            except OSError as error:
+                raise self._disk_error(self._staging.name, error) from error
+        except BaseException:
+            self._release()
+            raise
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, *rest: object) -> None:
+        """Move the staged files into place, or on an exception remove them."""
+        try:
+            if kind is None:
+                self._commit()
+        finally:
+            shutil.rmtree(self._staging, ignore_errors=True)
+            self._release()
+
+    # What is written. Each writer ends in `write_bytes` or does the same checks.
+
+    def write_bytes(self, name: str, content: bytes) -> None:
+        """Stage one file and see that all of it reached the disk."""
+        path = self._staged(name)
+        try:
+            with path.open("wb") as stream:
+                stream.write(content)
+                stream.flush()
+                os.fsync(stream.fileno())
+            written = path.stat().st_size
+        except OSError as error:
+            raise self._disk_error(name, error) from error
+        if written != len(content):
+            raise InputError(
+                self.path / name,
+                f"written incompletely (found {written} bytes; expected {len(content)})",
+                code=ExitCode.RESOURCES,
+            )
+        self._hashes[name] = hashlib.sha256(content).hexdigest()
+
+    def write_json(self, name: str, content: Mapping[str, Any]) -> None:
+        """Stage a JSON file; ``run.json`` gets the sha256 of all others and is written last.
+
+        Raises:
+            ValueError: A number is not finite.
+        """
+        if name == _RUN_JSON:
+            self._run = dict(content)
+            _json_bytes(self._run)
+        else:
+            self.write_bytes(name, _json_bytes(content))
+
+    def write_png(
+        self,
+        name: str,
+        codes: Pixels,
+        *,
+        icc: bytes | None = None,
+        mark: bool = True,
+        description: str = "",
+    ) -> None:
+        """Stage a PNG.
+
+        Args:
+            name: File name inside the folder.
+            codes: uint8 or uint16, shape [H, W, 3], or [H, W] for grey.
+            icc: Profile the codes are in; sRGB is stated when absent.
+            mark: Whether to say in XMP that the picture is a composite (IPTC digital source
+                type ``compositeSynthetic``).
+            description: Text for the ``Description`` field.
+        """
+        self.write_bytes(name, _png_bytes(codes, icc, mark, description))
+
+    def write_exr(
+        self, name: str, channels: Mapping[str, Pixels], header: Mapping[str, Any] | None = None
+    ) -> None:
+        """Stage a single-part scanline EXR with ZIP compression.
+
+        Args:
+            name: File name inside the folder.
+            channels: One plane per full channel name (``shadow.R``), shape [H, W]; float16
+                planes become half channels, float32 planes float channels.
+            header: Attributes; text, numbers, tuples, or float32 arrays for matrices.
+
+        Raises:
+            InputError: A value is not finite (exit 6), or the disk is full (exit 5).
+        """
+        import OpenEXR
+
+        planes = {}
+        for channel, plane in channels.items():
+            if plane.dtype not in (np.float16, np.float32) or plane.ndim != 2:
+                raise ValueError(
+                    f"{channel}: float16 or float32 planes [H, W] are needed, got "
+                    f"{plane.dtype} {plane.shape}"
+                )
+            bad = int(plane.size - np.isfinite(plane).sum())
+            if bad:
+                raise InputError(
+                    self.path / name,
+                    f"channel {channel} is not finite (found {bad} bad values)",
+                    code=ExitCode.NUMERIC,
+                )
+            planes[channel] = np.ascontiguousarray(plane)
+        attributes: dict[str, Any] = {
+            "compression": OpenEXR.ZIP_COMPRESSION,
+            "type": OpenEXR.scanlineimage,
+        }
+        for key, value in (header or {}).items():
+            # OpenEXR reads a matrix's memory in order, whatever its strides say.
+            is_array = isinstance(value, np.ndarray)
+            attributes[key] = np.ascontiguousarray(value) if is_array else value
+        # In memory first: a stream cannot run full, and the size to check is known.
+        stream = io.BytesIO()
+        OpenEXR.File(attributes, planes).write(stream)
+        self.write_bytes(name, stream.getvalue())
+
+    def write_envmap(self, texels: FloatArray, stem: str = "envmap") -> None:
+        """Stage an environment map: ``.exr`` (float32), ``.hdr`` (RGBE) and ``_preview.png``.
+
+        Args:
+            texels: Radiance in our orientation, relative [W/(m^2 sr)], shape [He, 2 He, 3].
+            stem: First part of the names.
+
+        Raises:
+            InputError: A value is negative or not finite (exit 6), or the disk is full (exit 5).
+        """
+        import OpenEXR
+
+        if texels.ndim != 3 or texels.shape[2] != 3 or texels.shape[1] != 2 * texels.shape[0]:
+            raise ValueError(f"texels [He, 2 He, 3] are needed, got {texels.shape}")
+        if not bool((np.isfinite(texels) & (texels >= 0.0)).all()):
+            raise InputError(
+                self.path / f"{stem}.exr",
+                "the light is negative or not finite",
+                code=ExitCode.NUMERIC,
+            )
+        texels = np.ascontiguousarray(texels, dtype=np.float32)
+        self.write_exr(
+            f"{stem}.exr",
+            {c: texels[..., k] for k, c in enumerate("RGB")},
+            {**_color_header(), "envmap": OpenEXR.ENVMAP_LATLONG},
+        )
+        self._write_hdr(f"{stem}.hdr", texels)
+        # A person expects the viewing direction -Z, our seam, in the middle.
+        seen = np.roll(texels, texels.shape[1] // 2, axis=1)
+        white = float(np.percentile(color.luminance(seen), 95.0)) / 0.8
+        shown = color.linear_to_srgb(np.clip(seen / np.float32(white or 1.0), 0.0, 1.0))
+        self.write_png(
+            f"{stem}_preview.png",
+            np.round(shown * 255.0).astype(np.uint8),
+            mark=False,
+            description="Preview: rolled by half its width, so that -Z is in the "
+            "middle; scaled and clipped to 8 bits",
+        )
+
+    def _write_hdr(self, name: str, texels: FloatArray) -> None:
+        """Stage a Radiance file; the library's last flush is unchecked, so it is read back."""
+        import OpenImageIO as oiio
+
+        path = self._staged(name)
+        height, width = texels.shape[:2]
+        spec = oiio.ImageSpec(width, height, 3, oiio.FLOAT)
+        spec.attribute("DateTime", "")
+        writer = oiio.ImageOutput.create(str(path))
+        assert writer is not None, "OpenImageIO is built with Radiance HDR"
+        done = writer.open(str(path), spec) and writer.write_image(texels)
+        text = _library_error(writer)
+        done = writer.close() and done and not text
+        try:
+            if not done:
+                raise InputError(path, text)
+            _decode(path, width * height, kinds=("hdr",))
+            with path.open("rb+") as stream:
+                os.fsync(stream.fileno())
+                self._hashes[name] = hashlib.file_digest(stream, "sha256").hexdigest()
+        except (InputError, OSError) as error:
+            raise InputError(
+                self.path / name,
+                f"cannot be written ({_one_line(str(error))})",
+                "free some disk space",
+                ExitCode.RESOURCES,
+            ) from error
+
+    # How it is kept whole.
+
+    def _staged(self, name: str) -> Path:
+        """Return where a file is staged; names are ours, never a path."""
+        if not _PLAIN_NAME.fullmatch(name):
+            raise ValueError(f"not a plain file name: {name!r}")
+        return self._staging / name
+
+    def _make(self) -> None:
+        if self.path.resolve() == Path(self.path.resolve().anchor):
+            raise InputError(
+                "--out", f"{self.path} is the root of the file system", code=ExitCode.USAGE
+            )
+        try:
+            self._made = not self.path.exists()
+            self.path.mkdir(parents=True, exist_ok=True)
+        except (FileExistsError, NotADirectoryError) as error:
+            self._made = False
+            raise InputError(
+                self.path,
+                "not a folder (found a file in its place)",
+                "choose another --out",
+                ExitCode.OUTPUT,
+            ) from error
+        except OSError as error:
+            self._made = False
+            raise InputError(
+                self.path, f"cannot be made ({error.strerror})", code=ExitCode.RESOURCES
+            ) from error
+
+    def _take_lock(self) -> None:
+        path = self.path / ".lock"
+        while True:
+            try:
+                lock = os.open(path, os.O_RDWR | os.O_CREAT | os.O_NOFOLLOW, 0o644)
+            except OSError as error:
+                raise self._disk_error(path.name, error) from error
+            try:
+                fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+                if os.fstat(lock).st_ino == os.stat(path).st_ino:
+                    break  # else the holder before us removed this file after we opened it
+                os.close(lock)
+            except FileNotFoundError:
+                os.close(lock)
+            except BlockingIOError as error:
+                holder = os.read(lock, 200).decode("utf-8", "replace").strip() or "unknown"
+                os.close(lock)
+                raise InputError(
+                    self.path,
+                    f"locked by pid {holder}",
+                    "wait for that run, or choose another --out",
+                    ExitCode.OUTPUT,
+                ) from error
+            except OSError as error:
+                os.close(lock)
+                raise self._disk_error(path.name, error) from error
+        self._lock = lock
+        try:
+            os.ftruncate(lock, 0)
+            os.write(lock, f"{os.getpid()} on {socket.gethostname()}\n".encode())
+        except OSError as error:
+            raise self._disk_error(path.name, error) from error
+
+    def _release(self) -> None:
+        if self._lock >= 0:
+            with suppress(OSError):
+                (self.path / ".lock").unlink()
+            os.close(self._lock)
+            self._lock = -1
+        if self._made:
+            with suppress(OSError):
+                self.path.rmdir()  # only succeeds when nothing was written
+
+    def _refuse_results(self) -> None:
+        """Refuse a folder in use; hidden files and checkpoints do not count as results."""
+        found = sorted(
+            entry.name
+            for entry in self.path.iterdir()
+            if not entry.name.startswith((".", "ckpt-")) and entry.name != "latest"
+        )
+        if found and not self.overwrite:
+            shown = _RUN_JSON if _RUN_JSON in found else found[0]
+            raise InputError(
+                self.path,
+                f"already holds files (found {shown}"
+                f"{f' and {len(found) - 1} more' if len(found) > 1 else ''}; "
+                "expected an empty folder)",
+                "pass --overwrite to replace results",
+                ExitCode.OUTPUT,
+            )
+
+    def _commit(self) -> None:
+        """Move the old results away and the new ones in; undo all of it if a step fails."""
+        names = sorted(self._hashes)
+        leftover = [name for name in self._old_results() if name not in self._hashes]
+        self.write_bytes(_RUN_JSON, _json_bytes({**self._run, "files": dict(self._hashes)}))
+        old = self._staging / "old"
+        moved: list[tuple[Path, Path]] = []
+
+        def move(source: Path, target: Path) -> None:
+            source.rename(target)
+            moved.append((source, target))
+
+        try:
+            _sync_folder(self._staging)
+            old.mkdir()
+            for name in (_RUN_JSON, *names, *leftover):
+                if (self.path / name).exists():
+                    move(self.path / name, old / name)
+            for name in names:
+                move(self._staging / name, self.path / name)
+            _sync_folder(self.path)
+            move(self._staging / _RUN_JSON, self.path / _RUN_JSON)
+            _sync_folder(self.path)
+        except BaseException as error:
+            for source, target in reversed(moved):
+                target.rename(source)
+            if isinstance(error, OSError):
+                raise self._disk_error("results", error) from error
+            raise
+
+    def _old_results(self) -> list[str]:
+        """Return the files of the result being replaced, as far as nobody has changed them."""
+        try:
+            listed = read_json_object(self.path / _RUN_JSON).get("files")
+        except InputError:
+            return []
+        unchanged = []
+        for name, digest in listed.items() if isinstance(listed, dict) else ():
+            path = self.path / name
+            if _PLAIN_NAME.fullmatch(name) and path.is_file() and not path.is_symlink():
+                with path.open("rb") as stream:
+                    if hashlib.file_digest(stream, "sha256").hexdigest() == digest:
+                        unchanged.append(name)
+        return unchanged
+
+    def _disk_error(self, name: str, error: OSError) -> InputError:
+        full = error.errno in (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
+        return InputError(
+            self.path / name,
+            f"cannot be written ({error.strerror})",
+            "free some disk space" if full else "check the folder's permissions",
+            ExitCode.RESOURCES,
+        )
+
+
+def _sync_folder(path: Path) -> None:
+    """Make renames in a folder survive a power cut."""
+    descriptor = os.open(path, os.O_RDONLY | os.O_DIRECTORY)
+    try:
+        os.fsync(descriptor)
+    finally:
+        os.close(descriptor)
+
+
+def _json_bytes(content: Mapping[str, Any]) -> bytes:
+    """Serialise as strict JSON; NumPy scalars and arrays and paths become plain values."""
+
+    def plain(value: Any) -> Any:
+        if isinstance(value, np.generic | np.ndarray):
+            return value.tolist()
+        if isinstance(value, Path):
+            return str(value)
+        raise TypeError(f"{type(value).__name__} does not belong in JSON")
+
+    return (json.dumps(content, indent=2, allow_nan=False, default=plain) + "\n").encode()
+
+
+def _png_bytes(codes: Pixels, icc: bytes | None, mark: bool, description: str) -> bytes:
+    """Serialise a PNG.
+
+    Written out here because Pillow has no 16-bit RGB, and OpenImageIO states sRGB beside any
+    profile and adds EXIF.
+    """
+    if (
+        codes.dtype not in (np.uint8, np.uint16)
+        or codes.ndim not in (2, 3)
+        or (codes.ndim == 3 and codes.shape[2] != 3)
+    ):
+        raise ValueError(
+            f"uint8 or uint16 codes [H, W, 3] or [H, W] are needed, got {codes.dtype} {codes.shape}"
+        )
+    height, width = codes.shape[:2]
+    # Samples are big-endian; each row is preceded by its filter: 2, difference to the row above.
+    big_endian = np.ascontiguousarray(codes, dtype=codes.dtype.newbyteorder(">"))
+    rows = big_endian.view(np.uint8).reshape(height, -1)
+    filtered = np.empty((height, rows.shape[1] + 1), np.uint8)
+    filtered[:, 0] = 2
+    filtered[0, 1:] = rows[0]
+    np.subtract(rows[1:], rows[:-1], out=filtered[1:, 1:])
+
+    def chunk(name: bytes, content: bytes) -> bytes:
+        body = name + content
+        return struct.pack(">I", len(content)) + body + struct.pack(">I", zlib.crc32(body))
+
+    header = struct.pack(
+        ">IIBBBBB", width, height, 8 * codes.dtype.itemsize, 2 if codes.ndim == 3 else 0, 0, 0, 0
+    )
+    parts = [b"\x89PNG\r\n\x1a\n", chunk(b"IHDR", header)]
+    if icc is not None:
+        parts.append(chunk(b"iCCP", b"ICC profile\0\0" + zlib.compress(icc)))
+    else:
+        parts.append(chunk(b"sRGB", b"\0"))
+    texts = {"XML:com.adobe.xmp": _XMP if mark else "", "Description": description}
+    for keyword, text in texts.items():
+        if text:
+            parts.append(chunk(b"iTXt", keyword.encode() + b"\0\0\0\0\0" + text.encode()))
+    parts += [chunk(b"IDAT", zlib.compress(filtered.data, 6)), chunk(b"IEND", b"")]
+    return b"".join(parts)
+
+
+def _color_header() -> dict[str, Any]:
+    """Return the EXR attributes that state our working space."""
+    return {
+        "chromaticities": color.REC709_CHROMATICITIES,
+        "colorInteropID": "lin_rec709_scene",
+        "software": f"warpir {warpir.__version__}",
+    }
+
+
+@dataclass(frozen=True)
+class Layers:
+    """What ``layers.exr`` holds, all linear Rec.709; buffers that a run has not made are absent."""
+
+    composite: Pixels
+    """``foreground.rgb + (1 - foreground.a) * plate * shadow_ratio`` [1], shape [H, W, 3]."""
+    foreground: Pixels
+    """Object alone, premultiplied by coverage [1], shape [H, W, 4]."""
+    shadow_ratio: Pixels
+    """Multiplies the plate; 1 where the object changes nothing [1], shape [H, W, 3]."""
+    plate: Pixels
+    """Linearised photograph [1], shape [H, W, 3]."""
+    matte: Pixels
+    """Object coverage, 0 to 1, shape [H, W]."""
+    depth: Pixels | None = None
+    """Distance along the viewing axis [m], infinite on the background, shape [H, W]."""
+    position: Pixels | None = None
+    """World position [m], shape [H, W, 3]."""
+    normal: Pixels | None = None
+    """World unit normal, shape [H, W, 3]."""
+    albedo: Pixels | None = None
+    """Base colour [1], shape [H, W, 3]."""
+    roughness: Pixels | None = None
+    """Perceptual roughness [1], shape [H, W]."""
+    emission: Pixels | None = None
+    """Part of `foreground` that the object emits [1], shape [H, W, 3]."""
+    diffuse: Pixels | None = None
+    """Part of `foreground` reflected diffusely [1], shape [H, W, 3]."""
+    specular: Pixels | None = None
+    """Part of `foreground` reflected specularly [1], shape [H, W, 3]."""
+
+
+def write_layers(
+    folder: OutputFolder,
+    layers: Layers,
+    camera: Camera,
+    *,
+    config: Mapping[str, Any] | None = None,
+    inputs: Mapping[str, str] | None = None,
+) -> int:
+    """Stage ``layers.exr``: half channels, float32 for depth, position and normal.
+
+    Args:
+        folder: Where.
+        layers: The image planes.
+        camera: The camera that made them, at their resolution.
+        config: Resolved configuration, kept as JSON in the attribute ``warpir/config``.
+        inputs: sha256 of the input files by name, kept as JSON in ``warpir/inputs``.
+
+    Returns:
+        How many values were beyond the half range and clamped; for ``run.json``.
+
+    Raises:
+        ValueError: Shapes disagree, or the composite is not what its layers compute.
+        InputError: A value is not finite (exit 6), or the disk is full (exit 5).
+    """
+    height, width = camera.height, camera.width
+    recomputed = (
+        layers.foreground[..., :3]
+        + (1.0 - layers.foreground[..., 3:]) * layers.plate * layers.shadow_ratio
+    )
+    if not np.allclose(layers.composite, recomputed, rtol=2e-3, atol=2e-3, equal_nan=True):
+        worst = float(np.nanmax(np.abs(layers.composite - recomputed)))
+        raise ValueError(f"composite differs from fg + (1 - a) plate shadow by up to {worst:g}")
+
+    channels: dict[str, Pixels] = {}
+    clamped = 0
+
+    def add(prefix: str, suffixes: str, plane: Pixels | None, whole_floats: bool = False) -> None:
+        nonlocal clamped
+        if plane is None:
+            return
+        plane = plane[..., None] if plane.ndim == 2 else plane
+        if plane.shape != (height, width, len(suffixes)):
+            raise ValueError(
+                f"layer {prefix or 'composite'}: shape {plane.shape}, expected "
+                f"{(height, width, len(suffixes))}"
+            )
+        if not whole_floats:
+            clamped += int((np.isfinite(plane) & (np.abs(plane) > HALF_MAX)).sum())
+            # NaN and Inf pass through, and the writer refuses them.
+            plane = np.where(np.isfinite(plane), np.clip(plane, -HALF_MAX, HALF_MAX), plane)
+        for k, suffix in enumerate(suffixes):
+            name = f"{prefix}.{suffix}" if prefix else suffix
+            channels[name] = plane[..., k].astype(np.float32 if whole_floats else np.float16)
+
+    add("", "RGB", layers.composite)
+    add("", "A", np.ones((height, width), np.float32))
+    add("fg", "RGBA", layers.foreground)
+    add("shadow", "RGB", layers.shadow_ratio)
+    add("plate", "RGB", layers.plate)
+    add("matte", "A", layers.matte)
+    if layers.depth is not None:
+        depth = np.where(np.isposinf(layers.depth), BACKGROUND_DEPTH, layers.depth)
+        add("", "Z", depth, whole_floats=True)
+    add("position", "XYZ", layers.position, whole_floats=True)
+    add("normal", "XYZ", layers.normal, whole_floats=True)
+    add("albedo", "RGB", layers.albedo)
+    add("roughness", "Y", layers.roughness)
+    add("emission", "RGB", layers.emission)
+    add("diffuse", "RGB", layers.diffuse)
+    add("specular", "RGB", layers.specular)
+
+    world_to_camera, world_to_ndc = exr_matrices(camera)
+    folder.write_exr(
+        "layers.exr",
+        channels,
+        {
+            **_color_header(),
+            "worldToCamera": world_to_camera.astype(np.float32),
+            "worldToNDC": world_to_ndc.astype(np.float32),
+            "warpir/formula": "RGB = fg.RGB + (1 - fg.A) * plate.RGB * shadow.RGB",
+            "warpir/config": json.dumps(config or {}, sort_keys=True, default=str),
+            "warpir/inputs": json.dumps(inputs or {}, sort_keys=True),
+        },
+    )
+    return clamped

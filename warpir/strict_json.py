@@ -61,8 +61,10 @@ def parse_json_object(where: str | Path, raw: bytes) -> dict[str, Any]:
         for key, value in pairs:
             if key in record:
                 shown = json.dumps(key)
-                raise _Refused(f"key {shown[:60]} appears twice",
-                               rf"{re.escape(shown)}\s*:[\s\S]*?{re.escape(shown)}\s*(?=:)")
+                raise _Refused(
+                    f"key {shown[:60]} appears twice",
+                    rf"{re.escape(shown)}\s*:[\s\S]*?{re.escape(shown)}\s*(?=:)",
+                )
             record[key] = value
         return record
 
@@ -72,8 +74,9 @@ def parse_json_object(where: str | Path, raw: bytes) -> dict[str, Any]:
         line = raw.count(b"\n", 0, error.start) + 1
         raise InputError(where, f"line {line}: not UTF-8 text") from error
     try:
-        root = json.loads(text, parse_constant=constant, parse_float=number,
-                          object_pairs_hook=unique)
+        root = json.loads(
+            text, parse_constant=constant, parse_float=number, object_pairs_hook=unique
+        )
     except json.JSONDecodeError as error:
         raise InputError(where, f"line {error.lineno}: not JSON ({error.msg})") from error
     except _Refused as refused:
@@ -81,9 +84,11 @@ def parse_json_object(where: str | Path, raw: bytes) -> dict[str, Any]:
         line = text.count("\n", 0, found.end()) + 1 if found else 1
         raise InputError(where, f"line {line}: {refused.what}") from refused
     except (RecursionError, ValueError) as error:  # deep nesting; integers of 5000 digits
-        raise InputError(where, "not JSON that can be read (nested or long beyond reason)"
-                         ) from error
+        raise InputError(
+            where, "not JSON that can be read (nested or long beyond reason)"
+        ) from error
     if not isinstance(root, dict):
-        raise InputError(where, f"line 1: not a JSON object (found {type(root).__name__}; "
-                         "expected an object)")
+        raise InputError(
+            where, f"line 1: not a JSON object (found {type(root).__name__}; expected an object)"
+        )
     return root
