@@ -1,4 +1,21 @@
-"""Warp kernels: what is computed, per thread."""
+"""Warp kernels: what is computed, per thread.
+
+Frames and units
+    World right-handed, +Y up, metres, **recentred on the object** so that float32 keeps its
+    precision; directions are unit vectors. ``wo`` points toward the camera, ``wi`` toward the light.
+    Radiance is linear Rec.709, relative [W/(m^2 sr)]. Densities are per solid angle and 0 outside
+    their support.
+
+Two kinds of files
+    *Detached* files (``trace``, ``path``, ``proxy``) trace rays and draw samples and have no backward
+    pass. *Attached* files (``shade``, ``rasterize``, ``shadow_ratio``, ``composite``) evaluate what
+    those samples see and are differentiated by ``wp.Tape``.
+
+Rules that Warp 1.19 does not enforce, and that give silently wrong gradients when broken
+    A func or kernel with a loop ends in its raw sums; only ``+=`` is carried between iterations; no
+    ``break`` in a differentiated loop; each output element is written once per launch; whatever is
+    optimised is an array argument; no ray query in a differentiated kernel.
+"""
 
 if __name__ != "warpir.kernels":
     raise ImportError("this folder is the package warpir.kernels; import it by that name")

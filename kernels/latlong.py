@@ -1,0 +1,95 @@
+"""Lat-long environment maps: direction to texture coordinates and back, bilinear lookup.
+
+OpenEXR orientation (``ImfEnvmap.h``): image centre = +Z, left quarter = +X. Texel (i, j) has its
+centre at ``u = (j + 0.5) / We``, ``v = (i + 0.5) / He``; longitude wraps, latitude is clamped.
+"""
+
+import warp as wp
+
+PI = wp.constant(3.14159265358979)
+
+
+@wp.func
+def direction_to_uv(d: wp.vec3) -> wp.vec2:
+    """Map a unit direction, world frame, to (u, v) in [0, 1)^2."""
+    u = 0.5 - 0.5 * wp.atan2(d[0], d[2]) / PI
+    # acos(y) loses all digits near the poles; atan2 of the horizontal part does not.
+    v = wp.atan2(wp.sqrt(d[0] * d[0] + d[2] * d[2]), d[1]) / PI
+    if u >= 1.0:
+        u = u - 1.0
+    return wp.vec2(u, v)
+
+
+@wp.func
+def uv_to_direction(u: float, v: float) -> wp.vec3:
+    """Map (u, v) to a unit direction, world frame."""
+    lon = PI * (1.0 - 2.0 * u)
+    theta = PI * v
+    s = wp.sin(theta)
+    return wp.vec3(wp.sin(lon) * s, wp.cos(theta), wp.cos(lon) * s)
+
+
+@wp.func
+def texel_solid_angle(i: int, height: int, width: int) -> float:
+    """Return the solid angle of a texel in row ``i`` [sr]; all texels sum to 4 pi.
+
+    ``(2 pi / W)(cos(pi i / H) - cos(pi (i + 1) / H))``, as a product that keeps small differences.
+    """
+    middle = PI * (float(i) + 0.5) / float(height)
+    half = 0.5 * PI / float(height)
+    return (2.0 * PI / float(width)) * 2.0 * wp.sin(middle) * wp.sin(half)
+
+
+@wp.struct
+class BilinearTap:
+    """The four texels around a direction and their weights."""
+
+    i0: int
+    i1: int
+    j0: int
+    j1: int
+    wi: float
+    """Weight of row ``i1``."""
+    wj: float
+    """Weight of column ``j1``."""
+
+
+@wp.func
+def bilinear_tap(uv: wp.vec2, height: int, width: int) -> BilinearTap:
+    """Find the texels and weights that every lookup of a map uses."""
+    x = uv[0] * float(width) - 0.5
+    y = uv[1] * float(height) - 0.5
+    xf = wp.floor(x)
+    yf = wp.floor(y)
+    j = int(xf)
+    i = int(yf)
+    tap = BilinearTap()
+    tap.wj = x - xf
+    tap.wi = y - yf
+    j0 = j
+    if j0 < 0:
+        j0 = j0 + width
+    j1 = j + 1
+    if j1 >= width:
+        j1 = j1 - width
+    tap.j0 = wp.clamp(j0, 0, width - 1)
+    tap.j1 = wp.clamp(j1, 0, width - 1)
+    tap.i0 = wp.clamp(i, 0, height - 1)
+    tap.i1 = wp.clamp(i + 1, 0, height - 1)
+    return tap
+
+
+@wp.func
+def map_radiance(texels: wp.array2d[wp.vec3], tap: BilinearTap) -> wp.vec3:
+    """Interpolate radiance at ``tap``; differentiable in ``texels``."""
+    top = texels[tap.i0, tap.j0] * (1.0 - tap.wj) + texels[tap.i0, tap.j1] * tap.wj
+    bottom = texels[tap.i1, tap.j0] * (1.0 - tap.wj) + texels[tap.i1, tap.j1] * tap.wj
+    return top * (1.0 - tap.wi) + bottom * tap.wi
+
+
+@wp.func
+def map_scalar(values: wp.array2d[float], tap: BilinearTap) -> float:
+    """Interpolate a scalar map at ``tap``."""
+    top = values[tap.i0, tap.j0] * (1.0 - tap.wj) + values[tap.i0, tap.j1] * tap.wj
+    bottom = values[tap.i1, tap.j0] * (1.0 - tap.wj) + values[tap.i1, tap.j1] * tap.wj
+    return top * (1.0 - tap.wi) + bottom * tap.wi

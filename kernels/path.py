@@ -1,0 +1,332 @@
+"""Path tracing of the object under a light at infinity: ``I_fg = PathTrace(X, L_fg, D)`` (DiPIR, eq. 4).
+
+Each vertex draws one direction from the light and one from the BRDF and combines them with the power
+heuristic; the BRDF's direction continues the path. `trace_foreground` sums radiance;
+`record_paths` draws the very same paths and writes down what the attached pass in
+`warpir.kernels.shade` evaluates. Detached: no backward pass.
+"""
+
+import warp as wp
+
+from warpir.kernels.brdf import brdf_eval, brdf_pdf, brdf_sample
+from warpir.kernels.frame import basis, to_local, to_world
+from warpir.kernels.rng import hash_pair, pixel_seed, sobol_pair
+from warpir.kernels.sampling import light_eval, light_sample, power_heuristic
+from warpir.kernels.trace import (
+    INFINITY,
+    Hit,
+    Surface,
+    camera_ray,
+    closest_hit,
+    offset_origin,
+    proxy_distance,
+    surface_at,
+    visibility,
+)
+from warpir.kernels.types import (
+    CameraArgs,
+    LightArgs,
+    MaterialArgs,
+    MeshArgs,
+    ProxyArgs,
+    TextureArgs,
+)
+
+wp.set_module_options({"enable_backward": False})
+
+
+@wp.struct
+class Scatter:
+    """One scattering event: both light estimates, and how the path goes on."""
+
+    direct: wp.vec3
+    """Light gathered here, both techniques [radiance]."""
+    direct_diffuse: wp.vec3
+    """The diffuse lobe's part of it."""
+    throughput: wp.vec3
+    """``f cos / pdf`` of the continued path."""
+    throughput_diffuse: wp.vec3
+    """The diffuse lobe's part of it."""
+    wi_light: wp.vec3
+    weight_light: float
+    """``cos visible mis / pdf`` of the light's direction, without f."""
+    wi_brdf: wp.vec3
+    weight_brdf: float
+    """The same of the BRDF's direction; 0 when it met the object."""
+    weight_next: float
+    """``cos / pdf`` of the BRDF's direction when it met the object, else 0."""
+    next: Hit
+
+
+@wp.func
+def scatter(
+    mesh: MeshArgs,
+    material: MaterialArgs,
+    texture: TextureArgs,
+    light: LightArgs,
+    surface: Surface,
+    wo: wp.vec3,
+    is_last: int,
+    index: int,
+    key: wp.uint32,
+    vertex: int,
+) -> Scatter:
+    """Draw, weigh and trace the two directions of one path vertex.
+
+    A direction counts only if it leaves both the shading and the geometric surface. ``is_last`` says
+    that nothing after this vertex can add light, so that any hit serves as well as the closest.
+    """
+    out = Scatter()
+    out.direct = wp.vec3(0.0)
+    out.direct_diffuse = wp.vec3(0.0)
+    out.throughput = wp.vec3(0.0)
+    out.throughput_diffuse = wp.vec3(0.0)
+    out.weight_light = 0.0
+    out.weight_brdf = 0.0
+    out.weight_next = 0.0
+    out.next.valid = 0
+    frame = basis(surface.n)
+    wo_local = to_local(wo, frame)
+    pick = sobol_pair(index, key, 3 * vertex + 1)
+
+    # Next-event estimation from the light's proposal
+    wi = light_sample(light, sobol_pair(index, key, 3 * vertex + 2), pick[0])
+    wi_local = to_local(wi, frame)
+    out.wi_light = wi
+    if wi_local[2] > 0.0 and wp.dot(wi, surface.ng) > 0.0 and wo_local[2] > 0.0:
+        f = brdf_eval(wo_local, wi_local, surface.base_color, surface.metallic, surface.roughness)
+        Li = light_eval(light, wi)
+        unshadowed = wp.cw_mul(f.diffuse + f.specular, Li.radiance)
+        if wp.max(unshadowed) > 0.0 and Li.pdf > 0.0:
+            pdf = brdf_pdf(
+                wo_local, wi_local, surface.base_color, surface.metallic, surface.roughness
+            )
+            weight = wi_local[2] * power_heuristic(Li.pdf, pdf) / Li.pdf
+            origin = offset_origin(surface.position, surface.ng, wi, mesh.epsilon)
+            weight = weight * visibility(mesh, material, texture, origin, wi)
+            out.weight_light = weight
+            out.direct = unshadowed * weight
+            out.direct_diffuse = wp.cw_mul(f.diffuse, Li.radiance) * weight
+
+    # The BRDF's own direction: it sees the light, or the path goes on
+    wi_local = brdf_sample(
+        wo_local,
+        sobol_pair(index, key, 3 * vertex + 3),
+        pick[1],
+        surface.base_color,
+        surface.metallic,
+        surface.roughness,
+    )
+    wi = to_world(wi_local, frame)
+    out.wi_brdf = wi
+    if wi_local[2] > 0.0 and wp.dot(wi, surface.ng) > 0.0 and wo_local[2] > 0.0:
+        pdf = brdf_pdf(wo_local, wi_local, surface.base_color, surface.metallic, surface.roughness)
+        if pdf > 0.0:
+            f = brdf_eval(
+                wo_local, wi_local, surface.base_color, surface.metallic, surface.roughness
+            )
+            origin = offset_origin(surface.position, surface.ng, wi, mesh.epsilon)
+            escaped = float(0.0)
+            if is_last == 1:
+                escaped = visibility(mesh, material, texture, origin, wi)
+            else:
+                ray_key = hash_pair(hash_pair(key, wp.uint32(index)), wp.uint32(vertex + 1))
+                out.next = closest_hit(mesh, material, texture, origin, wi, INFINITY, 0, ray_key)
+                if out.next.valid == 0:
+                    escaped = 1.0
+            slope = wi_local[2] / pdf
+            if escaped > 0.0:
+                Li = light_eval(light, wi)
+                weight = slope * escaped * power_heuristic(pdf, Li.pdf)
+                out.weight_brdf = weight
+                out.direct += wp.cw_mul(f.diffuse + f.specular, Li.radiance) * weight
+                out.direct_diffuse += wp.cw_mul(f.diffuse, Li.radiance) * weight
+            if out.next.valid == 1:
+                out.weight_next = slope
+                out.throughput = (f.diffuse + f.specular) * slope
+                out.throughput_diffuse = f.diffuse * slope
+    return out
+
+
+@wp.kernel
+def trace_foreground(
+    pixels: wp.array[int],
+    camera: CameraArgs,
+    mesh: MeshArgs,
+    material: MaterialArgs,
+    texture: TextureArgs,
+    proxy: ProxyArgs,
+    light: LightArgs,
+    spp: int,
+    rays: int,
+    depth: int,
+    seed: int,
+    foreground: wp.array[wp.vec3],
+    diffuse: wp.array[wp.vec3],
+    emission: wp.array[wp.vec3],
+    coverage: wp.array[float],
+):
+    """Path-trace the object in each listed pixel; the plane hides it but is not lit.
+
+    Args:
+        pixels: Row-major pixel indices, shape [object_pixel].
+        camera: The view.
+        mesh: The object's triangles.
+        material: Their materials.
+        texture: Their textures.
+        proxy: The ground plane, which hides what is below it from the camera.
+        light: The light.
+        spp: Camera samples per pixel.
+        rays: Paths that share one camera sample.
+        depth: Surface interactions.
+        seed: Base seed.
+        foreground: Radiance premultiplied by coverage, shape [object_pixel].
+        diffuse: The part of it that the first hit's diffuse lobe reflects, shape [object_pixel].
+        emission: The part of it that the first hit emits, shape [object_pixel].
+        coverage: Share of samples that see the object, shape [object_pixel].
+    """
+    i = wp.tid()
+    pixel = pixels[i]
+    key = pixel_seed(seed, pixel)
+    radiance = wp.vec3(0.0)
+    radiance_diffuse = wp.vec3(0.0)
+    radiance_emission = wp.vec3(0.0)
+    count = float(0.0)
+    for s in range(spp):
+        ray_dir = camera_ray(camera, pixel, sobol_pair(s, key, 0))
+        reach = proxy_distance(proxy, camera.origin, ray_dir)
+        if reach < 0.0:
+            reach = INFINITY
+        first = closest_hit(
+            mesh, material, texture, camera.origin, ray_dir, reach, 1, hash_pair(key, wp.uint32(s))
+        )
+        if first.valid == 1:
+            count += 1.0
+            for r in range(rays):
+                surface = surface_at(mesh, material, texture, first, -ray_dir)
+                radiance_emission += surface.emission / float(rays)
+                wo = -ray_dir
+                throughput = wp.vec3(1.0, 1.0, 1.0)
+                throughput_diffuse = wp.vec3(0.0)
+                sum_all = surface.emission
+                sum_diffuse = wp.vec3(0.0)
+                for k in range(depth):
+                    is_last = int(0)
+                    if k == depth - 1 and material.any_emission == 0:
+                        is_last = 1
+                    event = scatter(
+                        mesh,
+                        material,
+                        texture,
+                        light,
+                        surface,
+                        wo,
+                        is_last,
+                        s * rays + r,
+                        key,
+                        k,
+                    )
+                    sum_all += wp.cw_mul(throughput, event.direct)
+                    if k == 0:
+                        sum_diffuse += event.direct_diffuse
+                        throughput_diffuse = event.throughput_diffuse
+                    else:
+                        sum_diffuse += wp.cw_mul(throughput_diffuse, event.direct)
+                        throughput_diffuse = wp.cw_mul(throughput_diffuse, event.throughput)
+                    if event.next.valid == 0:
+                        break
+                    throughput = wp.cw_mul(throughput, event.throughput)
+                    wo = -event.wi_brdf
+                    surface = surface_at(mesh, material, texture, event.next, wo)
+                    sum_all += wp.cw_mul(throughput, surface.emission)
+                    sum_diffuse += wp.cw_mul(throughput_diffuse, surface.emission)
+                radiance += sum_all / float(rays)
+                radiance_diffuse += sum_diffuse / float(rays)
+    foreground[i] = radiance / float(spp)
+    diffuse[i] = radiance_diffuse / float(spp)
+    emission[i] = radiance_emission / float(spp)
+    coverage[i] = count / float(spp)
+
+
+@wp.struct
+class PathRecord:
+    """What the attached pass needs of each path vertex; arrays of shape [depth + 1, path]."""
+
+    material: wp.array2d[int]
+    """Material index, or -1 where the path has ended."""
+    n: wp.array2d[wp.vec3]
+    wo: wp.array2d[wp.vec3]
+    wi_light: wp.array2d[wp.vec3]
+    weight_light: wp.array2d[float]
+    wi_brdf: wp.array2d[wp.vec3]
+    weight_brdf: wp.array2d[float]
+    weight_next: wp.array2d[float]
+    texture_color: wp.array2d[wp.vec3]
+    texture_metallic: wp.array2d[float]
+    texture_roughness: wp.array2d[float]
+    texture_emission: wp.array2d[wp.vec3]
+
+
+@wp.kernel
+def record_paths(
+    pixels: wp.array[int],
+    camera: CameraArgs,
+    mesh: MeshArgs,
+    material: MaterialArgs,
+    texture: TextureArgs,
+    proxy: ProxyArgs,
+    light: LightArgs,
+    spp: int,
+    rays: int,
+    depth: int,
+    seed: int,
+    record: PathRecord,
+):
+    """Draw the paths of `trace_foreground` again and write down their vertices.
+
+    One thread a path: ``path = (pixel * spp + s) * rays + r``.
+    """
+    path = wp.tid()
+    r = path % rays
+    s = (path // rays) % spp
+    pixel = pixels[path // (rays * spp)]
+    key = pixel_seed(seed, pixel)
+    for k in range(depth + 1):
+        record.material[k, path] = -1
+    ray_dir = camera_ray(camera, pixel, sobol_pair(s, key, 0))
+    reach = proxy_distance(proxy, camera.origin, ray_dir)
+    if reach < 0.0:
+        reach = INFINITY
+    hit = closest_hit(
+        mesh, material, texture, camera.origin, ray_dir, reach, 1, hash_pair(key, wp.uint32(s))
+    )
+    wo = -ray_dir
+    for k in range(depth + 1):
+        if hit.valid == 0:
+            break
+        surface = surface_at(mesh, material, texture, hit, wo)
+        record.material[k, path] = surface.material
+        record.n[k, path] = surface.n
+        record.wo[k, path] = wo
+        record.texture_color[k, path] = surface.texture_color
+        record.texture_metallic[k, path] = surface.texture_metallic
+        record.texture_roughness[k, path] = surface.texture_roughness
+        record.texture_emission[k, path] = surface.texture_emission
+        record.weight_light[k, path] = 0.0
+        record.weight_brdf[k, path] = 0.0
+        record.weight_next[k, path] = 0.0
+        hit.valid = 0
+        if k < depth:
+            is_last = int(0)
+            if k == depth - 1 and material.any_emission == 0:
+                is_last = 1
+            event = scatter(
+                mesh, material, texture, light, surface, wo, is_last, s * rays + r, key, k
+            )
+            record.wi_light[k, path] = event.wi_light
+            record.weight_light[k, path] = event.weight_light
+            record.wi_brdf[k, path] = event.wi_brdf
+            record.weight_brdf[k, path] = event.weight_brdf
+            record.weight_next[k, path] = event.weight_next
+            wo = -event.wi_brdf
+            hit = event.next

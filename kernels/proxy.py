@@ -1,0 +1,232 @@
+"""The ground plane with and without the object: numerator and denominator of the shadow ratio.
+
+``beta = PathTrace(X + P, L, 1) / PathTrace(P, L, 1)`` per channel (DiPIR, eq. 5). Both use the same
+directions, so the ratio lies in [0, 1] and is exactly 1 where nothing is blocked. Detached.
+"""
+
+import warp as wp
+
+from warpir.kernels.frame import basis, to_world
+from warpir.kernels.rng import hash_pair, pixel_seed, sobol_pair
+from warpir.kernels.sampling import (
+    cosine_sample,
+    light_eval,
+    light_sample,
+    power_heuristic,
+)
+from warpir.kernels.trace import camera_ray, closest_hit, proxy_distance, visibility
+from warpir.kernels.types import (
+    CameraArgs,
+    LightArgs,
+    MaterialArgs,
+    MeshArgs,
+    ProxyArgs,
+    TextureArgs,
+)
+
+wp.set_module_options({"enable_backward": False})
+
+INV_PI = wp.constant(0.318309886183791)
+
+
+@wp.struct
+class ProxySample:
+    """Two directions from one point of the plane; ``weight`` is ``cos / pi * mis / pdf``."""
+
+    wi_light: wp.vec3
+    weight_light: float
+    visible_light: float
+    radiance_light: wp.vec3
+    wi_cosine: wp.vec3
+    weight_cosine: float
+    visible_cosine: float
+    radiance_cosine: wp.vec3
+
+
+@wp.func
+def proxy_sample(
+    mesh: MeshArgs,
+    material: MaterialArgs,
+    texture: TextureArgs,
+    proxy: ProxyArgs,
+    light: LightArgs,
+    position: wp.vec3,
+    index: int,
+    key: wp.uint32,
+) -> ProxySample:
+    """Draw one direction from the light and one from the cosine, and trace both."""
+    out = ProxySample()
+    out.weight_light = 0.0
+    out.visible_light = 1.0
+    out.weight_cosine = 0.0
+    out.visible_cosine = 1.0
+    origin = position + proxy.normal * mesh.epsilon
+    pick = sobol_pair(index, key, 1)
+    wi = light_sample(light, sobol_pair(index, key, 2), pick[0])
+    cos_i = wp.dot(wi, proxy.normal)
+    out.wi_light = wi
+    if cos_i > 0.0:
+        Li = light_eval(light, wi)
+        if Li.pdf > 0.0 and wp.max(Li.radiance) > 0.0:
+            pdf = cos_i * INV_PI
+            out.weight_light = pdf * power_heuristic(Li.pdf, pdf) / Li.pdf
+            out.radiance_light = Li.radiance
+            out.visible_light = visibility(mesh, material, texture, origin, wi)
+    wi = to_world(cosine_sample(sobol_pair(index, key, 3)), basis(proxy.normal))
+    cos_i = wp.dot(wi, proxy.normal)
+    out.wi_cosine = wi
+    if cos_i > 0.0:
+        Li = light_eval(light, wi)
+        if wp.max(Li.radiance) > 0.0:
+            out.weight_cosine = power_heuristic(cos_i * INV_PI, Li.pdf)
+            out.radiance_cosine = Li.radiance
+            out.visible_cosine = visibility(mesh, material, texture, origin, wi)
+    return out
+
+
+@wp.func
+def proxy_point(
+    camera: CameraArgs,
+    mesh: MeshArgs,
+    material: MaterialArgs,
+    texture: TextureArgs,
+    proxy: ProxyArgs,
+    pixel: int,
+    may_see_object: int,
+    s: int,
+    key: wp.uint32,
+) -> wp.vec4:
+    """Return the plane's point (xyz) that camera sample ``s`` sees; w is 0 when it sees none."""
+    ray_dir = camera_ray(camera, pixel, sobol_pair(s, key, 0))
+    t = proxy_distance(proxy, camera.origin, ray_dir)
+    if t <= 0.0:
+        return wp.vec4(0.0)
+    if may_see_object == 1:
+        hit = closest_hit(
+            mesh, material, texture, camera.origin, ray_dir, t, 1, hash_pair(key, wp.uint32(s))
+        )
+        if hit.valid == 1:
+            return wp.vec4(0.0)
+    p = camera.origin + ray_dir * t
+    # Back onto the plane: far hits lose digits along the ray.
+    p = p - proxy.normal * (wp.dot(proxy.normal, p) - proxy.offset)
+    return wp.vec4(p[0], p[1], p[2], 1.0)
+
+
+@wp.kernel
+def trace_proxy(
+    pixels: wp.array[int],
+    may_see_object: wp.array[int],
+    camera: CameraArgs,
+    mesh: MeshArgs,
+    material: MaterialArgs,
+    texture: TextureArgs,
+    proxy: ProxyArgs,
+    light: LightArgs,
+    spp: int,
+    rays: int,
+    seed: int,
+    lit: wp.array[wp.vec3],
+    unoccluded: wp.array[wp.vec3],
+):
+    """Sum the radiance of a white plane with and without the object in each listed pixel.
+
+    Args:
+        pixels: Row-major pixel indices, shape [proxy_pixel].
+        may_see_object: 1 where the object may hide the plane from the camera, shape [proxy_pixel].
+        camera: The view.
+        mesh: The object's triangles.
+        material: Their materials.
+        texture: Their textures.
+        proxy: The plane.
+        light: The light.
+        spp: Camera samples per pixel.
+        rays: Directions per technique that share one camera sample.
+        seed: Base seed.
+        lit: Mean radiance with the object over the samples that see the plane.
+        unoccluded: The same without the object.
+    """
+    i = wp.tid()
+    pixel = pixels[i]
+    key = pixel_seed(seed, pixel)
+    sum_lit = wp.vec3(0.0)
+    sum_all = wp.vec3(0.0)
+    count = float(0.0)
+    for s in range(spp):
+        point = proxy_point(
+            camera, mesh, material, texture, proxy, pixel, may_see_object[i], s, key
+        )
+        if point[3] > 0.0:
+            count += 1.0
+            p = wp.vec3(point[0], point[1], point[2])
+            for r in range(rays):
+                x = proxy_sample(mesh, material, texture, proxy, light, p, s * rays + r, key)
+                from_light = x.radiance_light * x.weight_light
+                from_cosine = x.radiance_cosine * x.weight_cosine
+                sum_all += from_light + from_cosine
+                sum_lit += from_light * x.visible_light + from_cosine * x.visible_cosine
+    scale = 1.0 / wp.max(count * float(rays), 1.0)
+    lit[i] = sum_lit * scale
+    unoccluded[i] = sum_all * scale
+
+
+@wp.struct
+class ProxyRecord:
+    """What the attached pass needs of each plane sample; arrays of shape [2, sample].
+
+    Row 0 holds the light's directions, row 1 the cosine's; ``sample = (pixel * spp + s) * rays + r``.
+    """
+
+    wi: wp.array2d[wp.vec3]
+    weight: wp.array2d[float]
+    """``cos / pi * mis / pdf`` over the pixel's sample count."""
+    visible: wp.array2d[float]
+
+
+@wp.kernel
+def record_proxy(
+    pixels: wp.array[int],
+    may_see_object: wp.array[int],
+    camera: CameraArgs,
+    mesh: MeshArgs,
+    material: MaterialArgs,
+    texture: TextureArgs,
+    proxy: ProxyArgs,
+    light: LightArgs,
+    spp: int,
+    rays: int,
+    seed: int,
+    record: ProxyRecord,
+):
+    """Draw the directions of `trace_proxy` again and write them down; one thread a pixel."""
+    i = wp.tid()
+    pixel = pixels[i]
+    key = pixel_seed(seed, pixel)
+    count = float(0.0)
+    for s in range(spp):
+        point = proxy_point(
+            camera, mesh, material, texture, proxy, pixel, may_see_object[i], s, key
+        )
+        p = wp.vec3(point[0], point[1], point[2])
+        for r in range(rays):
+            path = (i * spp + s) * rays + r
+            if point[3] > 0.0:
+                x = proxy_sample(mesh, material, texture, proxy, light, p, s * rays + r, key)
+                record.wi[0, path] = x.wi_light
+                record.weight[0, path] = x.weight_light
+                record.visible[0, path] = x.visible_light
+                record.wi[1, path] = x.wi_cosine
+                record.weight[1, path] = x.weight_cosine
+                record.visible[1, path] = x.visible_cosine
+            else:
+                record.wi[0, path] = proxy.normal
+                record.weight[0, path] = 0.0
+                record.visible[0, path] = 1.0
+                record.wi[1, path] = proxy.normal
+                record.weight[1, path] = 0.0
+                record.visible[1, path] = 1.0
+        count += point[3]
+    scale = 1.0 / wp.max(count * float(rays), 1.0)
+    for path in range(i * spp * rays, (i + 1) * spp * rays):
+        record.weight[0, path] = record.weight[0, path] * scale
+        record.weight[1, path] = record.weight[1, path] * scale

@@ -1,0 +1,114 @@
+"""Stateless low-discrepancy numbers: Owen-scrambled Sobol' points, in shuffled pairs of dimensions.
+
+Burley 2020, "Practical Hash-based Owen Scrambling" (JCGT 9(4)), with the Laine-Karras permutation.
+A number depends on (seed, sample index, pair) only, so results do not depend on threads or tiles.
+"""
+
+import warp as wp
+
+INDEX_BITS = wp.constant(16)
+"""Sample indices are taken modulo 2^16; more samples repeat the pattern under another seed."""
+
+# Literals above 2^31 would pass through a signed integer in the generated code.
+MIX_1 = wp.constant(wp.uint32(0x7FEB352D))
+MIX_2 = wp.constant(wp.uint32(0x846CA68B))
+GOLDEN = wp.constant(wp.uint32(0x9E3779B9))
+MASK_8_LOW = wp.constant(wp.uint32(0x00FF00FF))
+MASK_8_HIGH = wp.constant(wp.uint32(0xFF00FF00))
+MASK_4_LOW = wp.constant(wp.uint32(0x0F0F0F0F))
+MASK_4_HIGH = wp.constant(wp.uint32(0xF0F0F0F0))
+MASK_2_LOW = wp.constant(wp.uint32(0x33333333))
+MASK_2_HIGH = wp.constant(wp.uint32(0xCCCCCCCC))
+MASK_1_LOW = wp.constant(wp.uint32(0x55555555))
+MASK_1_HIGH = wp.constant(wp.uint32(0xAAAAAAAA))
+LK_1 = wp.constant(wp.uint32(0x3D20ADEA))
+LK_2 = wp.constant(wp.uint32(0x05526C56))
+LK_3 = wp.constant(wp.uint32(0x53A22864))
+TOP_BIT = wp.constant(wp.uint32(0x80000000))
+
+
+@wp.func
+def hash_uint(x: wp.uint32) -> wp.uint32:
+    """Mix the bits of ``x`` (lowbias32, Wellons 2018)."""
+    x = x ^ (x >> wp.uint32(16))
+    x = x * MIX_1
+    x = x ^ (x >> wp.uint32(15))
+    x = x * MIX_2
+    x = x ^ (x >> wp.uint32(16))
+    return x
+
+
+@wp.func
+def hash_pair(a: wp.uint32, b: wp.uint32) -> wp.uint32:
+    """Combine two numbers into one hash."""
+    return hash_uint(a ^ (hash_uint(b) + GOLDEN + (a << wp.uint32(6))))
+
+
+@wp.func
+def reverse_bits(x: wp.uint32) -> wp.uint32:
+    """Reverse the 32 bits of ``x``."""
+    x = (x >> wp.uint32(16)) | (x << wp.uint32(16))
+    x = ((x & MASK_8_LOW) << wp.uint32(8)) | ((x & MASK_8_HIGH) >> wp.uint32(8))
+    x = ((x & MASK_4_LOW) << wp.uint32(4)) | ((x & MASK_4_HIGH) >> wp.uint32(4))
+    x = ((x & MASK_2_LOW) << wp.uint32(2)) | ((x & MASK_2_HIGH) >> wp.uint32(2))
+    x = ((x & MASK_1_LOW) << wp.uint32(1)) | ((x & MASK_1_HIGH) >> wp.uint32(1))
+    return x
+
+
+@wp.func
+def laine_karras(x: wp.uint32, seed: wp.uint32) -> wp.uint32:
+    """Permute so that each bit depends on the lower bits only (Vegdahl's constants)."""
+    x = x ^ (x * LK_1)
+    x = x + seed
+    x = x * ((seed >> wp.uint32(16)) | wp.uint32(1))
+    x = x ^ (x * LK_2)
+    x = x ^ (x * LK_3)
+    return x
+
+
+@wp.func
+def owen_scramble(x: wp.uint32, seed: wp.uint32) -> wp.uint32:
+    """Owen-scramble the binary fraction ``x / 2^32``."""
+    return reverse_bits(laine_karras(reverse_bits(x), seed))
+
+
+@wp.func
+def to_unit(x: wp.uint32) -> float:
+    """Turn 32 bits into a float in [0, 1)."""
+    return float(x >> wp.uint32(8)) * 5.9604644775390625e-08
+
+
+@wp.func
+def sobol_pair(index: int, seed: wp.uint32, pair: int) -> wp.vec2:
+    """Return point ``index`` of the pair of dimensions number ``pair``, in [0, 1)^2.
+
+    Any aligned run of 2^k indices is a (0, k, 2)-net in each pair; different pairs are shuffled
+    independently, so they are uncorrelated.
+    """
+    block = wp.uint32(index >> INDEX_BITS)
+    key = hash_pair(
+        seed, wp.uint32(pair) * wp.uint32(3) + wp.uint32(1) + block * wp.uint32(0x10001)
+    )
+    # Shuffle: Owen-scrambling the index as an integer lets each bit depend on the higher bits only,
+    # which maps every aligned block of 2^k indices onto an aligned block.
+    shuffled = owen_scramble(wp.uint32(index & 0xFFFF), key) & wp.uint32(0xFFFF)
+    first = reverse_bits(shuffled)
+    # Second Sobol' dimension: direction numbers v_k = v_{k-1} ^ (v_{k-1} >> 1).
+    second = wp.uint32(0)
+    v = TOP_BIT
+    bits = shuffled
+    for _ in range(INDEX_BITS):
+        if (bits & wp.uint32(1)) != wp.uint32(0):
+            second = second ^ v
+        v = v ^ (v >> wp.uint32(1))
+        bits = bits >> wp.uint32(1)
+    return wp.vec2(
+        to_unit(owen_scramble(first, hash_pair(key, wp.uint32(1)))),
+        to_unit(owen_scramble(second, hash_pair(key, wp.uint32(2)))),
+    )
+
+
+@wp.func
+def pixel_seed(seed: int, pixel: int) -> wp.uint32:
+    """Return the key of a pixel's sequences."""
+    return hash_pair(wp.uint32(seed), wp.uint32(pixel))

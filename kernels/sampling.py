@@ -1,0 +1,174 @@
+"""Samplers and their densities per solid angle; the power heuristic; the light's proposal."""
+
+import warp as wp
+
+from warpir.kernels.frame import basis, to_world
+from warpir.kernels.latlong import (
+    bilinear_tap,
+    direction_to_uv,
+    map_radiance,
+    map_scalar,
+    uv_to_direction,
+)
+from warpir.kernels.sg import sg_shape
+from warpir.kernels.types import LightArgs
+
+PI = wp.constant(3.14159265358979)
+
+
+@wp.func
+def power_heuristic(pdf: float, pdf_other: float) -> float:
+    """MIS weight of a technique with density ``pdf`` (Veach 1997, eq. 9.13, power 2, equal counts)."""
+    # The ratio form neither overflows nor loses the small density when one is huge.
+    if pdf <= 0.0:
+        return 0.0
+    r = pdf_other / pdf
+    return 1.0 / (1.0 + r * r)
+
+
+@wp.func
+def cosine_sample(u: wp.vec2) -> wp.vec3:
+    """Draw a direction with density ``cos / pi`` around local z."""
+    r = wp.sqrt(u[0])
+    phi = 2.0 * PI * u[1]
+    return wp.vec3(r * wp.cos(phi), r * wp.sin(phi), wp.sqrt(wp.max(1.0 - u[0], 0.0)))
+
+
+@wp.func
+def one_minus_exp(x: float) -> float:
+    """Return ``1 - exp(-x)`` for x >= 0 without cancellation at small x."""
+    if x < 1.0e-2:
+        return x * (1.0 - x * (0.5 - x * (1.0 / 6.0 - x / 24.0)))
+    return 1.0 - wp.exp(-x)
+
+
+@wp.func
+def minus_log_one_minus(x: float) -> float:
+    """Return ``-log(1 - x)`` for 0 <= x < 1 without cancellation at small x."""
+    if x < 1.0e-2:
+        return x * (1.0 + x * (0.5 + x * (1.0 / 3.0 + x * 0.25)))
+    return -wp.log(1.0 - x)
+
+
+@wp.func
+def lobe_sample(u: wp.vec2, axis: wp.vec3, sharpness: float) -> wp.vec3:
+    """Draw a direction from one spherical Gaussian, exactly, at any sharpness.
+
+    Inverts the CDF of ``t = 1 - cos``: ``t = -log(1 - u (1 - exp(-2 s))) / s`` (a von Mises-Fisher
+    distribution; Jakob 2012, "Numerically stable sampling of the von Mises-Fisher distribution").
+    """
+    t = minus_log_one_minus(u[0] * one_minus_exp(2.0 * sharpness)) / sharpness
+    t = wp.clamp(t, 0.0, 2.0)
+    s = wp.sqrt(t * (2.0 - t))
+    phi = 2.0 * PI * u[1]
+    local = wp.vec3(s * wp.cos(phi), s * wp.sin(phi), 1.0 - t)
+    return wp.normalize(to_world(local, basis(axis)))
+
+
+@wp.struct
+class LightValue:
+    """What the light sends along one direction, and how likely the proposal draws it."""
+
+    radiance: wp.vec3
+    pdf: float
+
+
+@wp.func
+def light_eval(light: LightArgs, wi: wp.vec3) -> LightValue:
+    """Evaluate radiance and proposal density together, since they share every exponential."""
+    value = LightValue()
+    L = wp.vec3(0.0)
+    pdf = float(0.0)
+    for k in range(light.lobe_count):
+        g = sg_shape(wi, light.axis[k], light.sharpness[k])
+        L += light.amplitude[k] * g
+        pdf += light.lobe_prob[k] * light.lobe_pdf_peak[k] * g
+    if light.map_height > 0:
+        uv = direction_to_uv(wi)
+        tap = bilinear_tap(uv, light.map_height, light.map_width)
+        L += map_radiance(light.texels, tap)
+        if light.map_prob > 0.0:
+            # The sampler is uniform in (u, v) within a texel's tent: d_omega = 2 pi^2 sin(theta) du dv.
+            s = wp.max(wp.sqrt(wi[0] * wi[0] + wi[2] * wi[2]), 1.0e-7)
+            density = map_scalar(light.texel_prob, tap) * float(light.map_height * light.map_width)
+            pdf += light.map_prob * density / (2.0 * PI * PI * s)
+    value.radiance = L
+    value.pdf = pdf
+    return value
+
+
+@wp.func
+def tent(u: float) -> float:
+    """Map a uniform number to the tent density ``1 - |x|`` on [-1, 1]."""
+    if u < 0.5:
+        return wp.sqrt(2.0 * u) - 1.0
+    return 1.0 - wp.sqrt(wp.max(2.0 - 2.0 * u, 0.0))
+
+
+@wp.func
+def row_search(cdf: wp.array[float], count: int, u: float) -> int:
+    """Return the largest i < count with ``cdf[i] <= u``."""
+    low = int(0)
+    high = int(count)
+    while high - low > 1:
+        middle = (low + high) // 2
+        if cdf[middle] <= u:
+            low = middle
+        else:
+            high = middle
+    return low
+
+
+@wp.func
+def column_search(cdf: wp.array2d[float], row: int, count: int, u: float) -> int:
+    """Return the largest j < count with ``cdf[row, j] <= u``."""
+    low = int(0)
+    high = int(count)
+    while high - low > 1:
+        middle = (low + high) // 2
+        if cdf[row, middle] <= u:
+            low = middle
+        else:
+            high = middle
+    return low
+
+
+@wp.func
+def map_sample(light: LightArgs, u: wp.vec2) -> wp.vec3:
+    """Draw a direction from the map in proportion to its *bilinear* luminance times solid angle.
+
+    A texel is drawn from the table, then a point from its tent: the sum of tents is the bilinear
+    interpolant, so the neighbours of a sun that interpolation brightens are drawn as often as they
+    shine, and no firefly remains.
+    """
+    i = row_search(light.row_cdf, light.map_height, u[1])
+    j = column_search(light.column_cdf, i, light.map_width, u[0])
+    # What is left of each number within its cell is uniform again.
+    row_width = light.row_cdf[i + 1] - light.row_cdf[i]
+    column_width = light.column_cdf[i, j + 1] - light.column_cdf[i, j]
+    ri = wp.clamp((u[1] - light.row_cdf[i]) / wp.max(row_width, 1.0e-30), 0.0, 0.99999994)
+    rj = wp.clamp((u[0] - light.column_cdf[i, j]) / wp.max(column_width, 1.0e-30), 0.0, 0.99999994)
+    x = (float(j) + 0.5 + tent(rj)) / float(light.map_width)
+    y = (float(i) + 0.5 + tent(ri)) / float(light.map_height)
+    x = x - wp.floor(x)
+    # Folding at the poles is what clamping the lookup means: the two halves add up to weight 1.
+    if y < 0.0:
+        y = -y
+    if y > 1.0:
+        y = 2.0 - y
+    return uv_to_direction(x, y)
+
+
+@wp.func
+def light_sample(light: LightArgs, u: wp.vec2, u_pick: float) -> wp.vec3:
+    """Draw a direction from the light's proposal; its density is `light_eval`'s."""
+    if u_pick < light.map_prob or light.lobe_count == 0:
+        return map_sample(light, u)
+    rest = u_pick - light.map_prob
+    pick = int(light.lobe_count - 1)
+    for k in range(light.lobe_count):
+        rest -= light.lobe_prob[k]
+        if rest < 0.0:
+            pick = k
+            break
+    return lobe_sample(u, light.axis[pick], light.sharpness[pick])

@@ -1,0 +1,21 @@
+"""Shadow ratio of the ground plane, apart from the sums it divides (Warp does not replay loops)."""
+
+import warp as wp
+
+
+@wp.func
+def safe_ratio(numerator: float, denominator: float) -> float:
+    """Return the ratio, or 1 where the plane receives no light at all."""
+    ratio = float(1.0)
+    if denominator > 0.0:
+        ratio = numerator / denominator
+    return ratio
+
+
+@wp.kernel
+def shadow_ratio(lit: wp.array[wp.vec3], unoccluded: wp.array[wp.vec3], ratio: wp.array[wp.vec3]):
+    """``beta = lit / unoccluded`` per channel (DiPIR, eq. 5), shape [proxy_pixel] each."""
+    i = wp.tid()
+    a = lit[i]
+    b = unoccluded[i]
+    ratio[i] = wp.vec3(safe_ratio(a[0], b[0]), safe_ratio(a[1], b[1]), safe_ratio(a[2], b[2]))

@@ -1,0 +1,59 @@
+"""Monotone rational-quadratic tone curves on [0, 1].
+
+Durkan et al. 2019, "Neural Spline Flows", eq. 4. The host's half, raw parameters to knots, is
+`warpir.tone`.
+"""
+
+import warp as wp
+
+
+@wp.func
+def find_bin(x: float, curve: int, knot_x: wp.array2d[float], bin_count: int) -> int:
+    """Return the bin that holds ``x``; apart from the curve because Warp does not replay loops."""
+    b = int(0)
+    for k in range(1, bin_count):
+        if x >= knot_x[curve, k]:
+            b += 1
+    return b
+
+
+@wp.func
+def tone_curve(
+    x: float,
+    curve: int,
+    knot_x: wp.array2d[float],
+    knot_y: wp.array2d[float],
+    knot_slope: wp.array2d[float],
+    bin_count: int,
+) -> float:
+    """Evaluate one curve; values outside [0, 1] are clamped first.
+
+    Differentiable in ``x`` and the knots.
+
+    Args:
+        x: Linear value [1].
+        curve: Which curve.
+        knot_x: Increasing from 0 to 1, shape [curve, bin_count + 1].
+        knot_y: Increasing from 0 to 1, same shape.
+        knot_slope: Positive slopes at the knots, same shape.
+        bin_count: Number of bins.
+    """
+    x = wp.clamp(x, 0.0, 1.0)
+    b = find_bin(x, curve, knot_x, bin_count)
+    x0 = knot_x[curve, b]
+    y0 = knot_y[curve, b]
+    width = knot_x[curve, b + 1] - x0
+    rise = knot_y[curve, b + 1] - y0
+    m = rise / width
+    q = (x - x0) / width
+    d0 = knot_slope[curve, b]
+    d1 = knot_slope[curve, b + 1]
+    r = q * (1.0 - q)
+    return y0 + rise * (m * q * q + d0 * r) / (m + (d1 + d0 - 2.0 * m) * r)
+
+
+@wp.func
+def reinhard(x: float) -> float:
+    """Map radiance [0, inf) to [0, 1): ``x / (1 + x)`` (Reinhard et al. 2002, eq. 3)."""
+    x = wp.max(x, 0.0)
+    return x / (1.0 + x)

@@ -1,0 +1,461 @@
+"""Rays against the scene: camera rays, hits, surfaces, visibility, and the G-buffer.
+
+Detached: no backward pass.
+"""
+
+import warp as wp
+
+from warpir.kernels.rng import hash_pair, pixel_seed, sobol_pair, to_unit
+from warpir.kernels.types import CameraArgs, MaterialArgs, MeshArgs, ProxyArgs, TextureArgs
+
+wp.set_module_options({"enable_backward": False})
+
+INFINITY = wp.constant(1.0e30)
+ULP = wp.constant(1.1920929e-07)
+LAYERS_MAX = wp.constant(64)
+"""Surfaces that one ray may pass through; a safety bound, not a quality setting."""
+SLOT_BASE_COLOR = wp.constant(0)
+SLOT_METALLIC_ROUGHNESS = wp.constant(1)
+SLOT_NORMAL = wp.constant(2)
+SLOT_EMISSION = wp.constant(3)
+
+
+@wp.struct
+class Hit:
+    """Where a ray met the mesh."""
+
+    valid: int
+    face: int
+    u: float
+    v: float
+    """Barycentric weights of the first and second corner."""
+
+
+@wp.struct
+class Surface:
+    """Everything that shading needs at a hit; normals face ``wo``."""
+
+    position: wp.vec3
+    ng: wp.vec3
+    """Geometric normal."""
+    n: wp.vec3
+    """Shading normal."""
+    material: int
+    texture_color: wp.vec3
+    """What multiplies the base colour factor: texture and vertex colour."""
+    texture_metallic: float
+    texture_roughness: float
+    texture_emission: wp.vec3
+    base_color: wp.vec3
+    metallic: float
+    roughness: float
+    emission: wp.vec3
+
+
+@wp.func
+def camera_ray(camera: CameraArgs, pixel: int, jitter: wp.vec2) -> wp.vec3:
+    """Return the unit direction through ``pixel`` (row-major index) at a position inside it."""
+    x = float(pixel % camera.width) + jitter[0]
+    y = float(pixel // camera.width) + jitter[1]
+    local = wp.vec3((x - camera.cx) / camera.fx, -(y - camera.cy) / camera.fy, -1.0)
+    return wp.normalize(camera.rotation * local)
+
+
+@wp.func
+def proxy_distance(proxy: ProxyArgs, origin: wp.vec3, direction: wp.vec3) -> float:
+    """Return the distance to the plane's lit side [m], or a negative number."""
+    slope = wp.dot(proxy.normal, direction)
+    if slope > -1.0e-9:
+        return -1.0
+    return (proxy.offset - wp.dot(proxy.normal, origin)) / slope
+
+
+@wp.func
+def offset_origin(p: wp.vec3, ng: wp.vec3, direction: wp.vec3, epsilon: float) -> wp.vec3:
+    """Move a ray's start off the surface, to the side it leaves on.
+
+    The offset is a few units in the last place of the coordinates plus a share of the scene's size.
+    """
+    largest = wp.max(wp.max(wp.abs(p[0]), wp.abs(p[1])), wp.abs(p[2]))
+    amount = 4.0 * ULP * largest + epsilon
+    if wp.dot(ng, direction) < 0.0:
+        amount = -amount
+    return p + ng * amount
+
+
+@wp.func
+def wrap(x: int, count: int, mode: int) -> int:
+    """Bring a texel index into range: 0 repeat, 1 clamp, 2 mirror."""
+    if mode == 1:
+        return wp.clamp(x, 0, count - 1)
+    if mode == 2:
+        period = 2 * count
+        m = x % period
+        if m < 0:
+            m = m + period
+        if m >= count:
+            m = period - 1 - m
+        return m
+    m = x % count
+    if m < 0:
+        m = m + count
+    return m
+
+
+@wp.func
+def texel(texture: TextureArgs, k: int, i: int, j: int, is_color: int) -> wp.vec4:
+    """Read one texel of texture ``k``; colour is decoded from sRGB, alpha never."""
+    code = texture.texels[texture.offset[k] + i * texture.width[k] + j]
+    mask = wp.uint32(255)
+    r = int(code & mask)
+    g = int((code >> wp.uint32(8)) & mask)
+    b = int((code >> wp.uint32(16)) & mask)
+    a = float(int((code >> wp.uint32(24)) & mask)) / 255.0
+    if is_color == 1:
+        return wp.vec4(texture.decode[r], texture.decode[g], texture.decode[b], a)
+    return wp.vec4(float(r) / 255.0, float(g) / 255.0, float(b) / 255.0, a)
+
+
+@wp.func
+def sample_texture(texture: TextureArgs, k: int, uv: wp.vec2, is_color: int) -> wp.vec4:
+    """Bilinear lookup of texture ``k``; colour is decoded before it is filtered (glTF 2.0, 3.8)."""
+    width = texture.width[k]
+    height = texture.height[k]
+    # Far texture coordinates would overflow the integers below and carry no detail anyway.
+    x = wp.clamp(uv[0] * float(width) - 0.5, -1.0e9, 1.0e9)
+    y = wp.clamp(uv[1] * float(height) - 0.5, -1.0e9, 1.0e9)
+    xf = wp.floor(x)
+    yf = wp.floor(y)
+    fx = x - xf
+    fy = y - yf
+    j0 = wrap(int(xf), width, texture.wrap_u[k])
+    j1 = wrap(int(xf) + 1, width, texture.wrap_u[k])
+    i0 = wrap(int(yf), height, texture.wrap_v[k])
+    i1 = wrap(int(yf) + 1, height, texture.wrap_v[k])
+    top = (
+        texel(texture, k, i0, j0, is_color) * (1.0 - fx) + texel(texture, k, i0, j1, is_color) * fx
+    )
+    bottom = (
+        texel(texture, k, i1, j0, is_color) * (1.0 - fx) + texel(texture, k, i1, j1, is_color) * fx
+    )
+    return top * (1.0 - fy) + bottom * fy
+
+
+@wp.func
+def slot_uv(mesh: MeshArgs, material: MaterialArgs, m: int, slot: int, hit: Hit) -> wp.vec2:
+    """Interpolate and transform the texture coordinates that a slot uses."""
+    a = mesh.indices[3 * hit.face]
+    b = mesh.indices[3 * hit.face + 1]
+    c = mesh.indices[3 * hit.face + 2]
+    w = 1.0 - hit.u - hit.v
+    uv = mesh.uv0[a] * hit.u + mesh.uv0[b] * hit.v + mesh.uv0[c] * w
+    if material.slot_uv_set[m, slot] == 1:
+        uv = mesh.uv1[a] * hit.u + mesh.uv1[b] * hit.v + mesh.uv1[c] * w
+    row_u = material.slot_u[m, slot]
+    row_v = material.slot_v[m, slot]
+    return wp.vec2(
+        row_u[0] * uv[0] + row_u[1] * uv[1] + row_u[2],
+        row_v[0] * uv[0] + row_v[1] * uv[1] + row_v[2],
+    )
+
+
+@wp.func
+def hit_alpha(mesh: MeshArgs, material: MaterialArgs, texture: TextureArgs, hit: Hit) -> float:
+    """Return the opacity at a hit: 1 for opaque materials, 0 or 1 for masked ones."""
+    m = mesh.face_material[hit.face]
+    if material.alpha_mode[m] == 0:
+        return 1.0
+    a = mesh.colors[mesh.indices[3 * hit.face]][3]
+    b = mesh.colors[mesh.indices[3 * hit.face + 1]][3]
+    c = mesh.colors[mesh.indices[3 * hit.face + 2]][3]
+    alpha = material.alpha[m] * (a * hit.u + b * hit.v + c * (1.0 - hit.u - hit.v))
+    k = material.slot_texture[m, SLOT_BASE_COLOR]
+    if k >= 0:
+        uv = slot_uv(mesh, material, m, SLOT_BASE_COLOR, hit)
+        alpha = alpha * sample_texture(texture, k, uv, 0)[3]
+    if material.alpha_mode[m] == 1:
+        if alpha >= material.alpha_cutoff[m]:
+            return 1.0
+        return 0.0
+    return wp.clamp(alpha, 0.0, 1.0)
+
+
+@wp.func
+def hit_position(mesh: MeshArgs, hit: Hit) -> wp.vec3:
+    """Interpolate the position from the corners, which is more precise than ``o + t d``."""
+    a = mesh.positions[mesh.indices[3 * hit.face]]
+    b = mesh.positions[mesh.indices[3 * hit.face + 1]]
+    c = mesh.positions[mesh.indices[3 * hit.face + 2]]
+    return a * hit.u + b * hit.v + c * (1.0 - hit.u - hit.v)
+
+
+@wp.func
+def face_normal(mesh: MeshArgs, face: int) -> wp.vec3:
+    """Return the unit geometric normal of a triangle."""
+    a = mesh.positions[mesh.indices[3 * face]]
+    b = mesh.positions[mesh.indices[3 * face + 1]]
+    c = mesh.positions[mesh.indices[3 * face + 2]]
+    return wp.normalize(wp.cross(b - a, c - a))
+
+
+@wp.func
+def closest_hit(
+    mesh: MeshArgs,
+    material: MaterialArgs,
+    texture: TextureArgs,
+    ray_origin: wp.vec3,
+    ray_dir: wp.vec3,
+    max_t: float,
+    is_camera_ray: int,
+    key: wp.uint32,
+) -> Hit:
+    """Find the first surface that the ray does not pass through.
+
+    A camera ray passes the back of a single-sided material; any ray passes a point of opacity alpha
+    with probability ``1 - alpha``, drawn from ``key``.
+    """
+    hit = Hit()
+    hit.valid = 0
+    if mesh.id == wp.uint64(0):
+        return hit
+    origin = ray_origin
+    for layer in range(LAYERS_MAX):
+        query = wp.mesh_query_ray(mesh.id, origin, ray_dir, max_t)
+        if not query.result:
+            return hit
+        hit.face = query.face
+        hit.u = query.u
+        hit.v = query.v
+        accept = int(1)
+        if is_camera_ray == 1 and material.any_culled == 1:
+            if material.double_sided[mesh.face_material[query.face]] == 0:
+                if wp.dot(face_normal(mesh, query.face), ray_dir) > 0.0:
+                    accept = 0
+        if accept == 1 and material.any_alpha == 1:
+            alpha = hit_alpha(mesh, material, texture, hit)
+            if alpha < 1.0:
+                if to_unit(hash_pair(key, wp.uint32(layer))) >= alpha:
+                    accept = 0
+        if accept == 1:
+            hit.valid = 1
+            return hit
+        # Bounds on max_t apply to the whole ray; what is left of it shrinks with each layer.
+        position = hit_position(mesh, hit)
+        max_t = max_t - wp.length(position - origin)
+        origin = offset_origin(position, face_normal(mesh, query.face), ray_dir, mesh.epsilon)
+    return hit
+
+
+@wp.func
+def visibility(
+    mesh: MeshArgs,
+    material: MaterialArgs,
+    texture: TextureArgs,
+    ray_origin: wp.vec3,
+    ray_dir: wp.vec3,
+) -> float:
+    """Return the share of light that reaches ``ray_origin`` from infinity along ``ray_dir``."""
+    if mesh.id == wp.uint64(0):
+        return 1.0
+    if material.any_alpha == 0:
+        if wp.mesh_query_ray_anyhit(mesh.id, ray_origin, ray_dir, INFINITY):
+            return 0.0
+        return 1.0
+    transmitted = float(1.0)
+    origin = ray_origin
+    hit = Hit()
+    for _layer in range(LAYERS_MAX):
+        query = wp.mesh_query_ray(mesh.id, origin, ray_dir, INFINITY)
+        if not query.result:
+            return transmitted
+        hit.face = query.face
+        hit.u = query.u
+        hit.v = query.v
+        transmitted = transmitted * (1.0 - hit_alpha(mesh, material, texture, hit))
+        if transmitted <= 0.0:
+            return 0.0
+        origin = offset_origin(
+            hit_position(mesh, hit), face_normal(mesh, query.face), ray_dir, mesh.epsilon
+        )
+    return 0.0
+
+
+@wp.func
+def mapped_normal(
+    mesh: MeshArgs,
+    material: MaterialArgs,
+    texture: TextureArgs,
+    m: int,
+    hit: Hit,
+    n: wp.vec3,
+) -> wp.vec3:
+    """Apply the normal map of material ``m`` to the interpolated normal ``n``.
+
+    Tangents come from the asset, or from the triangle's UVs. The map's green axis points to the top
+    of the image, that is against v.
+    """
+    k = material.slot_texture[m, SLOT_NORMAL]
+    if k < 0:
+        return n
+    a = mesh.indices[3 * hit.face]
+    b = mesh.indices[3 * hit.face + 1]
+    c = mesh.indices[3 * hit.face + 2]
+    w = 1.0 - hit.u - hit.v
+    given = mesh.tangents[a] * hit.u + mesh.tangents[b] * hit.v + mesh.tangents[c] * w
+    t = wp.vec3(given[0], given[1], given[2])
+    handedness = mesh.tangents[a][3]
+    if handedness == 0.0:
+        uv_a = mesh.uv0[a]
+        uv_b = mesh.uv0[b]
+        uv_c = mesh.uv0[c]
+        if material.slot_uv_set[m, SLOT_NORMAL] == 1:
+            uv_a = mesh.uv1[a]
+            uv_b = mesh.uv1[b]
+            uv_c = mesh.uv1[c]
+        e1 = mesh.positions[b] - mesh.positions[a]
+        e2 = mesh.positions[c] - mesh.positions[a]
+        d1 = uv_b - uv_a
+        d2 = uv_c - uv_a
+        det = d1[0] * d2[1] - d1[1] * d2[0]
+        if wp.abs(det) < 1.0e-20:
+            return n
+        inv = 1.0
+        if det < 0.0:
+            inv = -1.0
+        t = (e1 * d2[1] - e2 * d1[1]) * inv
+        up = (e1 * d2[0] - e2 * d1[0]) * inv  # -dp/dv, up to a positive factor
+        handedness = 1.0
+        if wp.dot(wp.cross(n, t), up) < 0.0:
+            handedness = -1.0
+    t = t - n * wp.dot(n, t)
+    if wp.dot(t, t) < 1.0e-20:
+        return n
+    t = wp.normalize(t)
+    bitangent = wp.cross(n, t) * handedness
+    code = sample_texture(texture, k, slot_uv(mesh, material, m, SLOT_NORMAL, hit), 0)
+    scale = material.normal_scale[m]
+    x = (2.0 * code[0] - 1.0) * scale
+    y = (2.0 * code[1] - 1.0) * scale
+    z = 2.0 * code[2] - 1.0
+    mapped = t * x + bitangent * y + n * z
+    if wp.dot(mapped, mapped) < 1.0e-12:
+        return n
+    return wp.normalize(mapped)
+
+
+@wp.func
+def surface_at(
+    mesh: MeshArgs, material: MaterialArgs, texture: TextureArgs, hit: Hit, wo: wp.vec3
+) -> Surface:
+    """Gather everything that shading needs at a hit."""
+    a = mesh.indices[3 * hit.face]
+    b = mesh.indices[3 * hit.face + 1]
+    c = mesh.indices[3 * hit.face + 2]
+    w = 1.0 - hit.u - hit.v
+    m = mesh.face_material[hit.face]
+    s = Surface()
+    s.position = hit_position(mesh, hit)
+    s.material = m
+    s.ng = face_normal(mesh, hit.face)
+    n = mesh.normals[a] * hit.u + mesh.normals[b] * hit.v + mesh.normals[c] * w
+    if wp.dot(n, n) > 1.0e-12:
+        n = wp.normalize(n)
+    else:
+        n = s.ng
+    n = mapped_normal(mesh, material, texture, m, hit, n)
+    if wp.dot(s.ng, wo) < 0.0:
+        s.ng = -s.ng
+        n = -n
+    # Interpolated and mapped normals may face away from a viewer who sees the triangle.
+    if wp.dot(n, wo) <= 0.0:
+        n = s.ng
+    s.n = n
+
+    color = mesh.colors[a] * hit.u + mesh.colors[b] * hit.v + mesh.colors[c] * w
+    s.texture_color = wp.vec3(color[0], color[1], color[2])
+    k = material.slot_texture[m, SLOT_BASE_COLOR]
+    if k >= 0:
+        uv = slot_uv(mesh, material, m, SLOT_BASE_COLOR, hit)
+        code = sample_texture(texture, k, uv, 1)
+        s.texture_color = wp.cw_mul(s.texture_color, wp.vec3(code[0], code[1], code[2]))
+    s.texture_metallic = 1.0
+    s.texture_roughness = 1.0
+    k = material.slot_texture[m, SLOT_METALLIC_ROUGHNESS]
+    if k >= 0:
+        uv = slot_uv(mesh, material, m, SLOT_METALLIC_ROUGHNESS, hit)
+        code = sample_texture(texture, k, uv, 0)
+        s.texture_roughness = code[1]
+        s.texture_metallic = code[2]
+    s.texture_emission = wp.vec3(1.0, 1.0, 1.0)
+    k = material.slot_texture[m, SLOT_EMISSION]
+    if k >= 0:
+        uv = slot_uv(mesh, material, m, SLOT_EMISSION, hit)
+        code = sample_texture(texture, k, uv, 1)
+        s.texture_emission = wp.vec3(code[0], code[1], code[2])
+    s.base_color = wp.cw_mul(material.base_color[m], s.texture_color)
+    s.metallic = material.metallic[m] * s.texture_metallic
+    s.roughness = material.roughness[m] * s.texture_roughness
+    s.emission = wp.cw_mul(material.emission[m], s.texture_emission)
+    return s
+
+
+@wp.kernel
+def trace_gbuffer(
+    pixels: wp.array[int],
+    camera: CameraArgs,
+    mesh: MeshArgs,
+    material: MaterialArgs,
+    texture: TextureArgs,
+    proxy: ProxyArgs,
+    spp: int,
+    seed: int,
+    coverage: wp.array[float],
+    position: wp.array[wp.vec3],
+    normal: wp.array[wp.vec3],
+    base_color: wp.array[wp.vec3],
+    roughness: wp.array[float],
+    emission: wp.array[wp.vec3],
+):
+    """Average what the camera sees of the object in each listed pixel.
+
+    ``coverage`` is the share of samples that see the object; the others are means over those.
+    """
+    i = wp.tid()
+    pixel = pixels[i]
+    key = pixel_seed(seed, pixel)
+    count = float(0.0)
+    p = wp.vec3(0.0)
+    n = wp.vec3(0.0)
+    color = wp.vec3(0.0)
+    rough = float(0.0)
+    emitted = wp.vec3(0.0)
+    for s in range(spp):
+        ray_dir = camera_ray(camera, pixel, sobol_pair(s, key, 0))
+        reach = proxy_distance(proxy, camera.origin, ray_dir)
+        if reach < 0.0:
+            reach = INFINITY
+        hit = closest_hit(
+            mesh,
+            material,
+            texture,
+            camera.origin,
+            ray_dir,
+            reach,
+            1,
+            hash_pair(key, wp.uint32(s)),
+        )
+        if hit.valid == 1:
+            surface = surface_at(mesh, material, texture, hit, -ray_dir)
+            count += 1.0
+            p += surface.position
+            n += surface.n
+            color += surface.base_color
+            rough += surface.roughness
+            emitted += surface.emission
+    if count > 0.0:
+        coverage[i] = count / float(spp)
+        position[i] = p / count
+        normal[i] = wp.normalize(n)
+        base_color[i] = color / count
+        roughness[i] = rough / count
+        emission[i] = emitted / count

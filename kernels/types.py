@@ -1,0 +1,130 @@
+"""Structs that carry the scene into kernels; none of their fields is ever differentiated."""
+
+import warp as wp
+
+
+@wp.struct
+class CameraArgs:
+    """Pinhole camera in the recentred world."""
+
+    origin: wp.vec3
+    """Camera centre [m]."""
+    rotation: wp.mat33
+    """Camera axes as columns: right, up, backward."""
+    fx: float
+    fy: float
+    cx: float
+    cy: float
+    """Intrinsics [px]."""
+    width: int
+    """Image width [px]."""
+
+
+@wp.struct
+class ProxyArgs:
+    """The ground plane ``dot(normal, x) = offset``, analytic and unbounded."""
+
+    normal: wp.vec3
+    """Unit normal, toward the side that receives light."""
+    offset: float
+    """Distance from the recentred origin along ``normal`` [m]."""
+
+
+@wp.struct
+class MeshArgs:
+    """All triangles of the object, with their attributes."""
+
+    id: wp.uint64
+    """Handle of the ``wp.Mesh``; 0 when there are no triangles."""
+    epsilon: float
+    """Ray offset that depends on the scene's size alone [m]."""
+    indices: wp.array[int]
+    """Vertex of each corner, shape [3 * triangle]."""
+    positions: wp.array[wp.vec3]
+    """Shape [vertex]."""
+    normals: wp.array[wp.vec3]
+    """Unit shading normals, shape [vertex]."""
+    tangents: wp.array[wp.vec4]
+    """Unit tangents and handedness; w = 0 where they follow from the UVs. Shape [vertex]."""
+    uv0: wp.array[wp.vec2]
+    uv1: wp.array[wp.vec2]
+    """Texture coordinates, v down, shape [vertex]."""
+    colors: wp.array[wp.vec4]
+    """Linear RGBA factors, shape [vertex]."""
+    face_material: wp.array[int]
+    """Shape [triangle]."""
+
+
+@wp.struct
+class MaterialArgs:
+    """Material factors and texture slots; four slots a material: color, rough, normal, emission."""
+
+    base_color: wp.array[wp.vec3]
+    metallic: wp.array[float]
+    roughness: wp.array[float]
+    emission: wp.array[wp.vec3]
+    alpha: wp.array[float]
+    alpha_mode: wp.array[int]
+    """0 opaque, 1 mask, 2 blend."""
+    alpha_cutoff: wp.array[float]
+    double_sided: wp.array[int]
+    normal_scale: wp.array[float]
+    """All of shape [material]."""
+    slot_texture: wp.array2d[int]
+    """Texture index or -1, shape [material, 4]."""
+    slot_uv_set: wp.array2d[int]
+    """0 or 1, shape [material, 4]."""
+    slot_u: wp.array2d[wp.vec3]
+    slot_v: wp.array2d[wp.vec3]
+    """Rows of the affine UV transform, shape [material, 4]."""
+    any_alpha: int
+    """1 when some material is not opaque, so that rays must look at what they hit."""
+    any_culled: int
+    """1 when some material is single sided."""
+    any_emission: int
+    """1 when some material emits."""
+
+
+@wp.struct
+class TextureArgs:
+    """All textures, packed behind each other."""
+
+    texels: wp.array[wp.uint32]
+    """RGBA codes, R in the lowest byte, row-major, shape [sum of sizes]."""
+    offset: wp.array[int]
+    width: wp.array[int]
+    height: wp.array[int]
+    wrap_u: wp.array[int]
+    wrap_v: wp.array[int]
+    """0 repeat, 1 clamp, 2 mirror; all of shape [texture]."""
+    decode: wp.array[float]
+    """sRGB code to linear value, shape [256]."""
+
+
+@wp.struct
+class LightArgs:
+    """Light at infinity: a sum of spherical Gaussians and of one lat-long map, either may be empty.
+
+    The proposal draws a lobe with ``lobe_prob`` or the map with ``map_prob``; the sum is 1.
+    """
+
+    lobe_count: int
+    amplitude: wp.array[wp.vec3]
+    axis: wp.array[wp.vec3]
+    sharpness: wp.array[float]
+    lobe_prob: wp.array[float]
+    """Probability of each lobe, shape [lobe]."""
+    lobe_pdf_peak: wp.array[float]
+    """Density of a lobe's own sampler at its axis [1/sr], shape [lobe]."""
+    map_prob: float
+    """Probability of sampling the map; 0 without a map or for a black one."""
+    map_height: int
+    map_width: int
+    texels: wp.array2d[wp.vec3]
+    """Radiance, shape [He, We]."""
+    texel_prob: wp.array2d[float]
+    """Probability of each texel given the map, shape [He, We]."""
+    row_cdf: wp.array[float]
+    """Shape [He + 1]."""
+    column_cdf: wp.array2d[float]
+    """Shape [He, We + 1]."""

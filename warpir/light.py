@@ -1,0 +1,286 @@
+"""Light at infinity: spherical Gaussians plus a lat-long map, as plain arrays.
+
+Frame: world, +Y up. Map: OpenEXR lat-long orientation (image centre = +Z, left quarter = +X).
+Radiance is linear Rec.709, relative [W/(m^2 sr)].
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from warpir.color import luminance
+
+FloatArray = NDArray[np.float32]
+Float64Array = NDArray[np.float64]
+
+SUN_RADIUS_DEG = 0.2665
+"""Mean angular radius of the sun [deg]."""
+
+
+@dataclass(frozen=True)
+class Lobes:
+    """Spherical Gaussians ``amplitude * exp(sharpness * (dot(v, axis) - 1))``."""
+
+    amplitude: FloatArray
+    """Peak radiance, shape [lobe, 3]."""
+    axis: FloatArray
+    """Unit axes, world frame, shape [lobe, 3]."""
+    sharpness: FloatArray
+    """Concentration, 1 / sigma^2 [1], shape [lobe]."""
+
+    def flux(self) -> Float64Array:
+        """Integrate each lobe over the sphere: ``2 pi c / s (1 - exp(-2 s))``, shape [lobe, 3]."""
+        s = self.sharpness.astype(np.float64)
+        return self.amplitude * (2.0 * np.pi * -np.expm1(-2.0 * s) / s)[:, None]
+
+
+@dataclass(frozen=True)
+class Light:
+    """The sum of some lobes and at most one map."""
+
+    lobes: Lobes | None = None
+    texels: FloatArray | None = None
+    """Shape [He, We, 3]."""
+
+    def scaled(self, factor: float) -> Light:
+        """Return the light times ``factor``."""
+        lobes = self.lobes
+        if lobes is not None:
+            lobes = replace(lobes, amplitude=(lobes.amplitude * factor).astype(np.float32))
+        texels = self.texels
+        if texels is not None:
+            texels = (texels * np.float32(factor)).astype(np.float32)
+        return Light(lobes, texels)
+
+    def rotated(self, degrees: float) -> Light:
+        """Turn the light about +Y, counter-clockwise seen from above."""
+        lobes = self.lobes
+        if lobes is not None:
+            a = np.radians(degrees)
+            turn = np.array(
+                [[np.cos(a), 0.0, np.sin(a)], [0.0, 1.0, 0.0], [-np.sin(a), 0.0, np.cos(a)]]
+            )
+            lobes = replace(lobes, axis=(lobes.axis @ turn.T).astype(np.float32))
+        texels = self.texels
+        if texels is not None:
+            texels = rotate_map(texels, degrees)
+        return Light(lobes, texels)
+
+    def irradiance(self, normal: Float64Array) -> Float64Array:
+        """Irradiance of a surface [W/m^2], RGB, by quadrature over a map of the whole light."""
+        total = np.zeros(3)
+        if self.texels is not None:
+            height, width = self.texels.shape[:2]
+            cosine = np.maximum(map_directions(height, width) @ normal, 0.0)
+            weight = cosine * texel_solid_angles(height, width)[:, None]
+            total += np.einsum("ij,ijc->c", weight, self.texels.astype(np.float64))
+        if self.lobes is not None:
+            for flux, axis, s in zip(
+                self.lobes.flux(), self.lobes.axis, self.lobes.sharpness, strict=True
+            ):
+                total += flux * lobe_cosine(float(np.dot(axis, normal)), float(s))
+        return total
+
+
+def lobe_cosine(cos_axis: float, sharpness: float) -> float:
+    """Return the mean clamped cosine over a lobe's directions, by quadrature in its own frame.
+
+    Args:
+        cos_axis: Cosine between the lobe's axis and the surface normal.
+        sharpness: Concentration of the lobe.
+    """
+    # Equal-probability rings of the lobe: t = 1 - cos of the angle to the axis.
+    u = (np.arange(256) + 0.5) / 256.0
+    t = np.clip(-np.log1p(u * np.expm1(-2.0 * sharpness)) / sharpness, 0.0, 2.0)
+    phi = (np.arange(256) + 0.5) / 256.0 * 2.0 * np.pi
+    sin_axis = np.sqrt(max(0.0, 1.0 - cos_axis * cos_axis))
+    radial = np.sqrt(t * (2.0 - t))[:, None] * np.cos(phi)[None, :]
+    cosine = (1.0 - t)[:, None] * cos_axis + radial * sin_axis
+    return float(np.maximum(cosine, 0.0).mean())
+
+
+def texel_solid_angles(height: int, width: int) -> Float64Array:
+    """Return the solid angle of a texel in each row [sr], shape [height]; the map sums to 4 pi."""
+    edges = np.cos(np.pi * np.arange(height + 1) / height)
+    return (2.0 * np.pi / width) * (edges[:-1] - edges[1:])
+
+
+def map_directions(height: int, width: int) -> Float64Array:
+    """Return the unit direction of each texel centre, world frame, shape [height, width, 3]."""
+    lon = np.pi * (1.0 - 2.0 * (np.arange(width) + 0.5) / width)
+    lat = np.pi * (0.5 - (np.arange(height) + 0.5) / height)
+    return np.stack(
+        [
+            np.cos(lat)[:, None] * np.sin(lon)[None, :],
+            np.broadcast_to(np.sin(lat)[:, None], (height, width)),
+            np.cos(lat)[:, None] * np.cos(lon)[None, :],
+        ],
+        axis=-1,
+    )
+
+
+def rotate_map(texels: FloatArray, degrees: float) -> FloatArray:
+    """Turn a map about +Y, counter-clockwise seen from above; energy is kept.
+
+    The map's u falls with longitude (``lon = pi (1 - 2u)``), so content moves to smaller columns.
+    """
+    width = texels.shape[1]
+    shift = -(degrees / 360.0) * width
+    whole = int(np.floor(shift))
+    part = np.float32(shift - whole)
+    rolled = np.roll(texels, whole, axis=1)
+    if part == 0.0:
+        return rolled
+    return (rolled * (1.0 - part) + np.roll(rolled, 1, axis=1) * part).astype(np.float32)
+
+
+def axis_from_angles(azimuth_deg: float, elevation_deg: float) -> Float64Array:
+    """Return the unit direction toward (azimuth, elevation), world frame.
+
+    Azimuth is measured from -Z (straight ahead of an unturned camera) clockwise seen from above, so
+    +90 is to the right (+X).
+    """
+    a, e = np.radians(azimuth_deg), np.radians(elevation_deg)
+    return np.array([np.cos(e) * np.sin(a), np.sin(e), -np.cos(e) * np.cos(a)])
+
+
+def angles_from_axis(axis: Float64Array) -> tuple[float, float]:
+    """Return (azimuth, elevation) [deg] of a direction; the inverse of `axis_from_angles`."""
+    x, y, z = (float(c) for c in axis)
+    return float(np.degrees(np.arctan2(x, -z))), float(np.degrees(np.arctan2(y, np.hypot(x, z))))
+
+
+def sun_and_sky(
+    azimuth_deg: float,
+    elevation_deg: float,
+    sun_to_sky: float,
+    sky: tuple[float, float, float],
+    ground: tuple[float, float, float],
+) -> Light:
+    """Return a plain sky of one colour over one ground, and a sun of real angular size.
+
+    Args:
+        azimuth_deg: Of the sun, see `axis_from_angles` [deg].
+        elevation_deg: Of the sun above the horizon [deg].
+        sun_to_sky: Irradiance of a horizontal surface from the sun over that from the sky [1]. At a
+            low sun this is still what the horizontal surface receives.
+        sky: Radiance of the upper hemisphere, linear RGB.
+        ground: Radiance of the lower hemisphere, linear RGB.
+    """
+    height, width = 64, 128
+    texels = np.empty((height, width, 3), np.float32)
+    texels[: height // 2] = sky
+    texels[height // 2 :] = ground
+    axis = axis_from_angles(azimuth_deg, elevation_deg)
+    # A uniform disc of radius r has the per-axis variance r^2 / 4; a lobe has 1 / sharpness.
+    sharpness = 4.0 / np.radians(SUN_RADIUS_DEG) ** 2
+    sky_irradiance = np.pi * float(luminance(np.asarray(sky, np.float64)))
+    per_amplitude = 2.0 * np.pi / sharpness * max(np.sin(np.radians(elevation_deg)), 1e-3)
+    amplitude = sun_to_sky * sky_irradiance / per_amplitude
+    color = np.array([1.0, 0.95, 0.88]) / float(luminance(np.array([1.0, 0.95, 0.88])))
+    lobes = Lobes(
+        (amplitude * color)[None].astype(np.float32),
+        axis[None].astype(np.float32),
+        np.array([sharpness], np.float32),
+    )
+    return Light(lobes, texels)
+
+
+@dataclass(frozen=True)
+class LightSummary:
+    """What a person wants to know of a light."""
+
+    peak_luminance: float
+    mean_luminance: float
+    """Solid-angle weighted."""
+    azimuth_deg: float
+    elevation_deg: float
+    """Direction of the brightest part."""
+    peak_share: float
+    """Share of the total flux within 5 degrees of it [1]."""
+
+
+def rasterize_lobes(lobes: Lobes, height: int, width: int, side: int = 4) -> FloatArray:
+    """Return the mean radiance of the lobes in each texel, shape [height, width, 3].
+
+    The NumPy twin of `warpir.kernels.rasterize`, for files and summaries. A lobe narrower than a
+    texel is put into its texel with its flux.
+    """
+    texels = np.zeros((height, width, 3))
+    omega = texel_solid_angles(height, width)
+    narrow = lobes.sharpness > 1.0 / (np.pi / height / side) ** 2
+    big = map_directions(height * side, width * side)
+    for amplitude, axis, s in zip(
+        lobes.amplitude[~narrow], lobes.axis[~narrow], lobes.sharpness[~narrow], strict=True
+    ):
+        shape = np.exp(s * (big @ axis.astype(np.float64) - 1.0))
+        fine = shape.reshape(height, side, width, side).mean(axis=(1, 3))
+        texels += fine[..., None] * amplitude
+    for flux, axis in zip(lobes.flux()[narrow], lobes.axis[narrow], strict=True):
+        x, y, z = (float(c) for c in axis)
+        j = int((0.5 - 0.5 * np.arctan2(x, z) / np.pi) * width) % width
+        i = min(int(np.arctan2(np.hypot(x, z), y) / np.pi * height), height - 1)
+        texels[i, j] += flux / omega[i]
+    return texels.astype(np.float32)
+
+
+def as_map(light: Light, height: int) -> FloatArray:
+    """Return the whole light as one map of ``height`` rows, for files and previews.
+
+    A given map is resampled only if its size differs: averaged down, or repeated up.
+    """
+    width = 2 * height
+    texels = np.zeros((height, width, 3), np.float32)
+    if light.texels is not None:
+        texels += resize_map(light.texels, height)
+    if light.lobes is not None:
+        texels += rasterize_lobes(light.lobes, height, width)
+    return texels
+
+
+def resize_map(texels: FloatArray, height: int) -> FloatArray:
+    """Resample a map to ``height`` rows by area, keeping its energy.
+
+    Exact for whole factors either way; otherwise boxes overlap in proportion.
+    """
+
+    def along(values: Float64Array, count: int, axis: int) -> Float64Array:
+        old = values.shape[axis]
+        moved = np.moveaxis(values, axis, 0)
+        total = np.concatenate([np.zeros((1, *moved.shape[1:])), np.cumsum(moved, axis=0)])
+        edges = np.arange(count + 1) * old / count
+        low = np.minimum(edges.astype(int), old - 1)
+        part = (edges - low).reshape(-1, *([1] * (moved.ndim - 1)))
+        at = total[low] + part * (total[low + 1] - total[low])
+        return np.moveaxis((at[1:] - at[:-1]) * count / old, 0, axis)
+
+    if texels.shape[0] == height and texels.shape[1] == 2 * height:
+        return texels
+    omega = texel_solid_angles(texels.shape[0], texels.shape[1])
+    energy = along(texels.astype(np.float64) * omega[:, None, None], height, 0)
+    energy = along(energy, 2 * height, 1)
+    solid = along(np.broadcast_to(omega[:, None], (len(omega), 1)).astype(np.float64), height, 0)
+    return (energy / solid[..., None]).astype(np.float32)
+
+
+def summarize(light: Light) -> LightSummary:
+    """Measure a light for printing and ``run.json``."""
+    texels = as_map(light, 128).astype(np.float64)
+    omega = texel_solid_angles(128, 256)[:, None]
+    lum = luminance(texels)
+    i, j = np.unravel_index(np.argmax(lum), lum.shape)
+    directions = map_directions(128, 256)
+    axis = directions[i, j]
+    near = directions @ axis > np.cos(np.radians(5.0))
+    flux = float((lum * omega).sum())
+    azimuth, elevation = angles_from_axis(axis)
+    return LightSummary(
+        peak_luminance=float(lum.max()),
+        mean_luminance=flux / (4.0 * np.pi),
+        azimuth_deg=azimuth,
+        elevation_deg=elevation,
+        peak_share=float((lum * omega)[near].sum()) / flux if flux > 0.0 else 0.0,
+    )

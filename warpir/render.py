@@ -1,0 +1,551 @@
+"""Renderer: launches the stages in order. Pure Warp, no torch.
+
+On the CPU a Warp launch runs on one core, so every launch is cut into row slices that a thread pool
+works through; on CUDA it is one launch. A pixel's numbers depend on (seed, pixel, sample) alone, so
+slices and threads do not change a result.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+
+import numpy as np
+import warp as wp
+from numpy.typing import NDArray
+
+from warpir.camera import Camera
+from warpir.color import luminance
+from warpir.kernels.composite import compose, tone_foreground, tone_shadow
+from warpir.kernels.path import trace_foreground
+from warpir.kernels.proxy import trace_proxy
+from warpir.kernels.shadow_ratio import shadow_ratio
+from warpir.kernels.trace import trace_gbuffer
+from warpir.kernels.types import CameraArgs, LightArgs
+from warpir.light import Light, texel_solid_angles
+from warpir.scene import Scene
+
+IntArray = NDArray[np.int32]
+FloatArray = NDArray[np.float32]
+
+SAMPLES_PER_SLICE = 1 << 16
+"""CPU work of one launch; keeps launches under half a second, so that Ctrl-C is answered."""
+PILOT_SCALE = 4
+"""Edge of the pixel blocks that decide where the plane's shadow is worth tracing [px]."""
+PILOT_SAMPLES = 32
+
+
+@dataclass(frozen=True)
+class Rows:
+    """An array whose first axis is the launch's; it is cut along with the launch."""
+
+    array: wp.array
+
+
+def default_threads() -> int:
+    """Return the number of cores this process may use."""
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+
+
+def light_args(light: Light, device: wp.Device) -> LightArgs:
+    """Upload a light with its proposal: lobes and texels by their share of the luminous flux.
+
+    The map's table is normalised in float64; densities are taken from the float32 table that the
+    sampler searches, so both agree exactly.
+
+    Raises:
+        ValueError: The light has neither lobes nor a map, or negative or non-finite values.
+    """
+    args = LightArgs()
+    lobes, texels = light.lobes, light.texels
+    if texels is None and (lobes is None or len(lobes.sharpness) == 0):
+        raise ValueError("a light needs lobes or a map")
+    flux = np.zeros(0)
+    if lobes is not None and len(lobes.sharpness):
+        values = np.concatenate(
+            [lobes.amplitude.reshape(-1), lobes.axis.reshape(-1), lobes.sharpness]
+        )
+        if not np.isfinite(values).all() or lobes.amplitude.min() < 0.0:
+            raise ValueError("lobes must be finite with amplitudes >= 0")
+        flux = luminance(lobes.flux())
+        s = lobes.sharpness.astype(np.float64)
+        args.lobe_count = len(s)
+        args.amplitude = wp.array(lobes.amplitude, dtype=wp.vec3, device=device)
+        args.axis = wp.array(lobes.axis, dtype=wp.vec3, device=device)
+        args.sharpness = wp.array(lobes.sharpness, dtype=float, device=device)
+        peak = s / (2.0 * np.pi * -np.expm1(-2.0 * s))
+        args.lobe_pdf_peak = wp.array(peak.astype(np.float32), dtype=float, device=device)
+    else:
+        args.lobe_count = 0
+        args.amplitude = wp.zeros(1, dtype=wp.vec3, device=device)
+        args.axis = wp.zeros(1, dtype=wp.vec3, device=device)
+        args.sharpness = wp.zeros(1, dtype=float, device=device)
+        args.lobe_pdf_peak = wp.zeros(1, dtype=float, device=device)
+
+    map_flux = 0.0
+    if texels is not None:
+        if not np.isfinite(texels).all() or texels.min() < 0.0:
+            raise ValueError("a light's map must be finite and >= 0")
+        height, width = texels.shape[:2]
+        weight = luminance(texels.astype(np.float64)) * texel_solid_angles(height, width)[:, None]
+        map_flux = float(weight.sum())
+        if map_flux <= 0.0:
+            weight = np.broadcast_to(texel_solid_angles(height, width)[:, None], (height, width))
+        row = weight.sum(axis=1)
+        row_cdf = np.concatenate([[0.0], np.cumsum(row) / row.sum()])
+        column = np.where(row[:, None] > 0.0, weight, 1.0)
+        column_cdf = np.concatenate(
+            [np.zeros((height, 1)), np.cumsum(column, axis=1) / column.sum(axis=1, keepdims=True)],
+            axis=1,
+        )
+        row_cdf = np.minimum(row_cdf, 1.0).astype(np.float32)
+        column_cdf = np.minimum(column_cdf, 1.0).astype(np.float32)
+        row_cdf[-1] = 1.0
+        column_cdf[:, -1] = 1.0
+        prob = np.diff(row_cdf.astype(np.float64))[:, None] * np.diff(
+            column_cdf.astype(np.float64), axis=1
+        )
+        args.map_height, args.map_width = height, width
+        args.texels = wp.array(np.ascontiguousarray(texels), dtype=wp.vec3, device=device)
+        args.texel_prob = wp.array(prob.astype(np.float32), dtype=float, device=device)
+        args.row_cdf = wp.array(row_cdf, dtype=float, device=device)
+        args.column_cdf = wp.array(column_cdf, dtype=float, device=device)
+    else:
+        args.map_height = args.map_width = 0
+        args.texels = wp.zeros((1, 1), dtype=wp.vec3, device=device)
+        args.texel_prob = wp.zeros((1, 1), dtype=float, device=device)
+        args.row_cdf = wp.zeros(2, dtype=float, device=device)
+        args.column_cdf = wp.zeros((1, 2), dtype=float, device=device)
+
+    total = float(flux.sum()) + map_flux
+    if total > 0.0:
+        lobe_prob, args.map_prob = flux / total, map_flux / total
+    elif args.lobe_count:
+        lobe_prob, args.map_prob = np.full(args.lobe_count, 1.0 / args.lobe_count), 0.0
+    else:
+        lobe_prob, args.map_prob = flux, 1.0
+    prob32 = lobe_prob.astype(np.float32) if len(lobe_prob) else np.zeros(1, np.float32)
+    args.lobe_prob = wp.array(prob32, dtype=float, device=device)
+    return args
+
+
+@dataclass(frozen=True)
+class GBuffer:
+    """What the camera sees of the object, averaged over each pixel; rows are ``object_pixels``."""
+
+    object_pixels: IntArray
+    """Row-major pixel indices, shape [object_pixel]."""
+    coverage: FloatArray
+    """Share of the pixel that shows the object [1]; a first, coarse estimate of the mask."""
+    position: FloatArray
+    """World frame [m], shape [object_pixel, 3]."""
+    normal: FloatArray
+    """Unit shading normal, world frame, shape [object_pixel, 3]."""
+    base_color: FloatArray
+    """Linear RGB [1], shape [object_pixel, 3]."""
+    roughness: FloatArray
+    """Perceptual [1], shape [object_pixel]."""
+    emission: FloatArray
+    """Relative [W/(m^2 sr)], shape [object_pixel, 3]."""
+
+
+@dataclass(frozen=True)
+class Foreground:
+    """The object alone under its light; rows are the traced pixels."""
+
+    radiance: FloatArray
+    """Premultiplied by ``mask``, relative [W/(m^2 sr)], shape [object_pixel, 3]."""
+    diffuse: FloatArray
+    """The part that the first hit's diffuse lobe reflects, shape [object_pixel, 3]."""
+    emission: FloatArray
+    """The part that the first hit emits, shape [object_pixel, 3]."""
+    mask: FloatArray
+    """Coverage [1], shape [object_pixel]."""
+
+
+@dataclass(frozen=True)
+class ProxyRadiance:
+    """A white plane with and without the object; rows are the traced pixels."""
+
+    lit: FloatArray
+    """With the object, relative [W/(m^2 sr)], shape [proxy_pixel, 3]."""
+    unoccluded: FloatArray
+    """Without it, shape [proxy_pixel, 3]."""
+
+
+class Renderer:
+    """Launches the kernels over one scene.
+
+    Args:
+        scene: What to render.
+        threads: CPU threads; 0 means one per core. Ignored on CUDA.
+        progress: Called with the share of a stage that is done, 0 to 1, from worker threads.
+    """
+
+    def __init__(
+        self,
+        scene: Scene,
+        threads: int = 0,
+        progress: Callable[[str, float], None] | None = None,
+    ) -> None:
+        self.scene = scene
+        self.device = scene.device
+        self.threads = threads or default_threads()
+        self._progress = progress or (lambda stage, share: None)
+
+    def launch(
+        self, kernel: wp.Kernel, count: int, args: Sequence[object], work: int, stage: str = ""
+    ) -> None:
+        """Run ``kernel`` over ``count`` threads; `Rows` among ``args`` are cut with the launch.
+
+        Args:
+            kernel: A kernel without backward pass.
+            count: Number of Warp threads.
+            args: Kernel arguments in order.
+            work: Samples that one thread takes, for sizing the slices.
+            stage: What to call this in progress reports.
+        """
+        if count == 0:
+            return
+        wp.load_module(kernel.module, device=self.device)
+        size = count
+        if self.device.is_cpu:
+            size = max(16, min(SAMPLES_PER_SLICE // max(work, 1), -(-count // (4 * self.threads))))
+        starts = range(0, count, size)
+
+        def one(start: int) -> None:
+            stop = min(start + size, count)
+            cut = [a.array[start:stop] if isinstance(a, Rows) else a for a in args]
+            wp.launch(kernel, dim=stop - start, inputs=cut, device=self.device, record_tape=False)
+
+        if len(starts) == 1 or self.threads == 1:
+            for start in starts:
+                one(start)
+                self._progress(stage, min(start + size, count) / count)
+            return
+        with ThreadPoolExecutor(self.threads) as pool:
+            futures = [pool.submit(one, start) for start in starts]
+            try:
+                for done, future in enumerate(futures):
+                    future.result()
+                    self._progress(stage, (done + 1) / len(futures))
+            except BaseException:
+                pool.shutdown(cancel_futures=True)
+                raise
+
+    def _array(self, values: NDArray[np.generic], dtype: type) -> wp.array:
+        return wp.array(values, dtype=dtype, device=self.device)
+
+    def candidate_pixels(self, camera: Camera) -> IntArray:
+        """Return the pixels that the object's bounding box may cover, row-major, conservative."""
+        low, high = self.scene.bounds
+        corners = np.array(np.meshgrid(*zip(low, high, strict=True))).reshape(3, -1).T
+        uv = camera.project(corners)
+        if np.isnan(uv).any():
+            left, top, right, bottom = 0, 0, camera.width, camera.height
+        else:
+            left, top = np.maximum(np.floor(uv.min(axis=0)).astype(int) - 1, 0)
+            right, bottom = np.ceil(uv.max(axis=0)).astype(int) + 1
+            right, bottom = min(right, camera.width), min(bottom, camera.height)
+        if right <= left or bottom <= top or self.scene.triangle_count == 0:
+            return np.zeros(0, np.int32)
+        rows = np.arange(top, bottom, dtype=np.int64)[:, None] * camera.width
+        return (rows + np.arange(left, right)[None]).reshape(-1).astype(np.int32)
+
+    def gbuffer(self, seed: int, spp: int = 8) -> GBuffer:
+        """Trace what the camera sees of the object.
+
+        ``object_pixels`` are those that a sample hits and their neighbours, so that a pixel whose
+        corner alone is covered is still traced.
+        """
+        scene, camera = self.scene, self.scene.camera
+        candidates = self.candidate_pixels(camera)
+        count = len(candidates)
+        names = ("coverage", "position", "normal", "base_color", "roughness", "emission")
+        vectors = {"position", "normal", "base_color", "emission"}
+        out = {
+            name: wp.zeros(
+                max(count, 1), dtype=wp.vec3 if name in vectors else float, device=self.device
+            )
+            for name in names
+        }
+        self.launch(
+            trace_gbuffer,
+            count,
+            [
+                Rows(self._array(candidates, wp.int32)),
+                scene.camera_args,
+                scene.mesh_args,
+                scene.material_args,
+                scene.texture_args,
+                scene.proxy_args,
+                spp,
+                seed,
+                *(Rows(out[name]) for name in names),
+            ],
+            spp,
+            "geometry",
+        )
+        host = {name: array.numpy()[:count] for name, array in out.items()}
+        hit = np.zeros((camera.height, camera.width), bool)
+        hit.reshape(-1)[candidates] = host["coverage"] > 0.0
+        near = _dilate(hit)
+        keep = near.reshape(-1)[candidates]
+        host = {name: values[keep] for name, values in host.items()}
+        host["position"] = host["position"] + self.scene.origin.astype(np.float32)
+        return GBuffer(object_pixels=candidates[keep], **host)
+
+    def foreground(
+        self, light: LightArgs, pixels: IntArray, spp: int, rays: int, depth: int, seed: int
+    ) -> Foreground:
+        """Path-trace the object alone (DiPIR, eq. 4).
+
+        Args:
+            light: From `light_args`.
+            pixels: Row-major pixel indices, shape [object_pixel].
+            spp: Camera samples per pixel.
+            rays: Paths per camera sample, each with one direction per technique.
+            depth: Surface interactions.
+            seed: Base seed.
+        """
+        scene, count = self.scene, len(pixels)
+        radiance, diffuse, emission = (
+            wp.zeros(max(count, 1), dtype=wp.vec3, device=self.device) for _ in range(3)
+        )
+        mask = wp.zeros(max(count, 1), dtype=float, device=self.device)
+        self.launch(
+            trace_foreground,
+            count,
+            [
+                Rows(self._array(pixels, wp.int32)),
+                scene.camera_args,
+                scene.mesh_args,
+                scene.material_args,
+                scene.texture_args,
+                scene.proxy_args,
+                light,
+                spp,
+                rays,
+                depth,
+                seed,
+                *(Rows(a) for a in (radiance, diffuse, emission, mask)),
+            ],
+            spp * rays,
+            "object",
+        )
+        return Foreground(*(a.numpy()[:count] for a in (radiance, diffuse, emission, mask)))
+
+    def proxy(
+        self,
+        light: LightArgs,
+        pixels: IntArray,
+        may_see_object: IntArray,
+        spp: int,
+        rays: int,
+        seed: int,
+        camera_args: CameraArgs | None = None,
+    ) -> ProxyRadiance:
+        """Radiance of a white plane with and without the object (the two halves of DiPIR, eq. 5).
+
+        Args:
+            light: From `light_args`.
+            pixels: Row-major pixel indices, shape [proxy_pixel].
+            may_see_object: 1 where the object may hide the plane, shape [proxy_pixel].
+            spp: Camera samples per pixel.
+            rays: Directions per technique and camera sample.
+            seed: Base seed.
+            camera_args: Another resolution of the view, or the scene's own.
+        """
+        scene, count = self.scene, len(pixels)
+        lit, unoccluded = (
+            wp.zeros(max(count, 1), dtype=wp.vec3, device=self.device) for _ in range(2)
+        )
+        self.launch(
+            trace_proxy,
+            count,
+            [
+                Rows(self._array(pixels, wp.int32)),
+                Rows(self._array(may_see_object, wp.int32)),
+                camera_args if camera_args is not None else scene.camera_args,
+                scene.mesh_args,
+                scene.material_args,
+                scene.texture_args,
+                scene.proxy_args,
+                light,
+                spp,
+                rays,
+                seed,
+                Rows(lit),
+                Rows(unoccluded),
+            ],
+            spp * rays,
+            "shadow",
+        )
+        return ProxyRadiance(lit.numpy()[:count], unoccluded.numpy()[:count])
+
+    def shaded_pixels(self, light: LightArgs, seed: int) -> IntArray:
+        """Return the pixels where the object may change the plane's light, row-major.
+
+        A pilot pass traces the same shadow rays over blocks of `PILOT_SCALE` pixels, each sample at
+        a position of its own in the block. A block in whose 3 x 3 neighbourhood no ray was blocked
+        (288 samples, drawn in proportion to the light) is left alone and stays the photo.
+        """
+        camera = self.scene.camera
+        width, height = -(-camera.width // PILOT_SCALE), -(-camera.height // PILOT_SCALE)
+        # Blocks at the right and lower border reach past the photo; the intrinsics are the photo's.
+        coarse = Camera(
+            width,
+            height,
+            camera.fx / PILOT_SCALE,
+            camera.fy / PILOT_SCALE,
+            camera.cx / PILOT_SCALE,
+            camera.cy / PILOT_SCALE,
+            camera.c2w,
+        )
+        if self.scene.triangle_count == 0:
+            return np.zeros(0, np.int32)
+        pixels = np.arange(width * height, dtype=np.int32)
+        pilot = self.proxy(
+            light,
+            pixels,
+            np.zeros(len(pixels), np.int32),
+            PILOT_SAMPLES,
+            1,
+            seed,
+            self.scene.camera_args_at(coarse),
+        )
+        changed = (pilot.lit != pilot.unoccluded).any(axis=1).reshape(height, width)
+        blocks = _dilate(changed)
+        full = np.repeat(np.repeat(blocks, PILOT_SCALE, axis=0), PILOT_SCALE, axis=1)
+        return np.flatnonzero(full[: camera.height, : camera.width]).astype(np.int32)
+
+    def ratio(self, radiance: ProxyRadiance) -> FloatArray:
+        """Return the shadow ratio per channel, shape [proxy_pixel, 3]."""
+        count = len(radiance.lit)
+        out = wp.zeros(max(count, 1), dtype=wp.vec3, device=self.device)
+        self.launch(
+            shadow_ratio,
+            count,
+            [
+                Rows(self._array(radiance.lit, wp.vec3)),
+                Rows(self._array(radiance.unoccluded, wp.vec3)),
+                Rows(out),
+            ],
+            1,
+        )
+        ratio: FloatArray = out.numpy()[:count]
+        return ratio
+
+    def tone(
+        self,
+        foreground: Foreground,
+        ratio: FloatArray,
+        curve_fg: ToneKnots,
+        curve_shadow: ToneKnots,
+        is_reinhard: bool,
+    ) -> tuple[FloatArray, FloatArray]:
+        """Map object radiance and shadow ratio to display-linear values, shapes [row, 3]."""
+        objects, proxies = len(foreground.mask), len(ratio)
+        fg = wp.zeros(max(objects, 1), dtype=wp.vec3, device=self.device)
+        shadow = wp.zeros(max(proxies, 1), dtype=wp.vec3, device=self.device)
+        self.launch(
+            tone_foreground,
+            objects,
+            [
+                Rows(self._array(foreground.radiance, wp.vec3)),
+                Rows(self._array(foreground.mask, wp.float32)),
+                int(is_reinhard),
+                *(self._array(k, wp.float32) for k in curve_fg.arrays()),
+                curve_fg.bin_count,
+                Rows(fg),
+            ],
+            1,
+        )
+        self.launch(
+            tone_shadow,
+            proxies,
+            [
+                Rows(self._array(ratio, wp.vec3)),
+                *(self._array(k, wp.float32) for k in curve_shadow.arrays()),
+                curve_shadow.bin_count,
+                Rows(shadow),
+            ],
+            1,
+        )
+        return fg.numpy()[:objects], shadow.numpy()[:proxies]
+
+    def compose(
+        self,
+        photo_lin: FloatArray,
+        object_pixels: IntArray,
+        proxy_pixels: IntArray,
+        mask: FloatArray,
+        foreground_display: FloatArray,
+        ratio_display: FloatArray,
+    ) -> FloatArray:
+        """Put the object over the shaded photo and encode (DiPIR, eq. 6); shape [H, W, 3]."""
+        height, width = photo_lin.shape[:2]
+        image = wp.zeros(height * width, dtype=wp.vec3, device=self.device)
+
+        def rows(values: FloatArray, dtype: type) -> wp.array:
+            return self._array(values if len(values) else np.zeros((1, 3), np.float32), dtype)
+
+        self.launch(
+            compose,
+            height * width,
+            [
+                Rows(self._array(photo_lin.reshape(-1, 3).astype(np.float32), wp.vec3)),
+                Rows(self._array(index_of(object_pixels, height * width), wp.int32)),
+                Rows(self._array(index_of(proxy_pixels, height * width), wp.int32)),
+                self._array(mask if len(mask) else np.zeros(1, np.float32), wp.float32),
+                rows(foreground_display, wp.vec3),
+                rows(ratio_display, wp.vec3),
+                Rows(image),
+            ],
+            1,
+        )
+        composed: FloatArray = image.numpy().reshape(height, width, 3)
+        return composed
+
+
+@dataclass(frozen=True)
+class ToneKnots:
+    """Knots of one or several tone curves, shape [curve, bin + 1] each."""
+
+    x: FloatArray
+    y: FloatArray
+    slope: FloatArray
+
+    @property
+    def bin_count(self) -> int:
+        """Number of bins."""
+        return self.x.shape[1] - 1
+
+    def arrays(self) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """Return the arrays in the kernels' order."""
+        return self.x, self.y, self.slope
+
+    @staticmethod
+    def identity(curves: int, bins: int = 5) -> ToneKnots:
+        """Return curves that change nothing."""
+        x = np.tile(np.linspace(0.0, 1.0, bins + 1, dtype=np.float32), (curves, 1))
+        return ToneKnots(x, x.copy(), np.ones_like(x))
+
+
+def index_of(pixels: IntArray, count: int) -> IntArray:
+    """Return the row of each pixel in ``pixels``, or -1, shape [count]."""
+    index = np.full(count, -1, np.int32)
+    index[pixels] = np.arange(len(pixels), dtype=np.int32)
+    return index
+
+
+def _dilate(mask: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    """Grow a mask by one pixel in all eight directions."""
+    padded = np.pad(mask, 1)
+    grown = np.zeros_like(mask)
+    for dy in range(3):
+        for dx in range(3):
+            grown |= padded[dy : dy + mask.shape[0], dx : dx + mask.shape[1]]
+    return grown
