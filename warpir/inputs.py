@@ -9,8 +9,9 @@ from warpir.asset import Asset, load_asset
 from warpir.camera import Camera, camera_from_exif, camera_from_fov, read_camera
 from warpir.config import InsertConfig, usage
 from warpir.errors import InputError, raise_all
-from warpir.files import FloatArray, Photo, read_envmap, read_photo
-from warpir.lobes_file import LobesFile, read_lobes
+from warpir.files import Photo, read_envmap, read_photo
+from warpir.light import Light
+from warpir.lobes_file import read_lobes
 from warpir.placement import Placement, place_asset
 
 DEFAULT_FOV = 60.0
@@ -30,10 +31,8 @@ class Inputs:
     camera: Camera
     """At the photo's resolution."""
     placement: Placement
-    envmap: FloatArray | None = None
-    """The panorama of --light, turned by --light-rotate, shape [He, We, 3]."""
-    lobes: LobesFile | None = None
-    """The lobes of --light, turned by --light-rotate."""
+    light: Light | None = None
+    """What --light holds, turned by --light-rotate; absent: --sun and --sky describe it."""
     assumed: tuple[str, ...] = ()
     """What was chosen because nothing was given, one line each."""
     notices: tuple[str, ...] = ()
@@ -70,9 +69,8 @@ def read_inputs(config: InsertConfig) -> Inputs:
     asset = attempt(lambda: load_asset(asset_path, missing_textures=config.missing_textures))
     light = attempt(lambda: _read_light(config, notices))
     camera = attempt(lambda: _make_camera(config, photo, assumed)) if photo is not None else None
-    if camera is None or asset is None or photo is None or light is None or problems:
-        raise_all(problems)
-        raise AssertionError("an input is missing without an error")
+    raise_all(problems)
+    assert photo is not None and asset is not None and camera is not None
 
     placement = place_asset(
         *asset.bounds(),
@@ -92,7 +90,7 @@ def read_inputs(config: InsertConfig) -> Inputs:
         *placement.warnings,
     ]
     assumed += placement.assumed
-    return Inputs(photo, asset, camera, placement, *light, tuple(assumed), tuple(notices))
+    return Inputs(photo, asset, camera, placement, light, tuple(assumed), tuple(notices))
 
 
 def _make_camera(config: InsertConfig, photo: Photo, assumed: list[str]) -> Camera:
@@ -115,19 +113,17 @@ def _make_camera(config: InsertConfig, photo: Photo, assumed: list[str]) -> Came
     return camera_from_fov(width, height, config.fov or DEFAULT_FOV, *pose)
 
 
-def _read_light(
-    config: InsertConfig, notices: list[str]
-) -> tuple[FloatArray | None, LobesFile | None]:
+def _read_light(config: InsertConfig, notices: list[str]) -> Light | None:
     if config.light is None:
-        return None, None
+        return None
     if Path(config.light).suffix.lower() == ".json":
         if config.fit_lobes is not None:
             raise usage("--fit-lobes", f"needs a panorama to fit (found lobes: {config.light})")
-        return None, read_lobes(config.light, config.light_rotate)
+        return Light(lobes=read_lobes(config.light)).rotated(config.light_rotate)
     found: list[str] = []
-    envmap = read_envmap(config.light, config.light_rotate, notices=found)
+    texels = read_envmap(config.light, notices=found)
     notices += _about(config.light, found)
-    return envmap, None
+    return Light(texels=texels).rotated(config.light_rotate)
 
 
 def _about(path: str, notices: tuple[str, ...] | list[str]) -> list[str]:

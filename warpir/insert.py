@@ -69,6 +69,7 @@ def insert(config: InsertConfig) -> Insertion:
         InputError: An input or the output folder cannot be used; nothing was written then.
     """
     from warpir.record import Timings, run_record
+    from warpir.strict_json import read_json_object
 
     config.require_inputs()
     timings = Timings()
@@ -104,7 +105,8 @@ def insert(config: InsertConfig) -> Insertion:
             measured=measured,
         )
         output.write_json("run.json", record)
-    return Insertion(Path(config.out), tuple(output.names), record)
+    record = read_json_object(output.path / "run.json")
+    return Insertion(output.path, (*record["files"], "run.json"), record)
 
 
 def _read(config: InsertConfig) -> tuple[InsertConfig, Any]:

@@ -7,44 +7,29 @@ eq. 2, with ``sharpness = 1 / sigma^2``); axes are in the world frame. The file 
      "lobes": [{"amplitude": [r, g, b], "axis": [x, y, z], "sharpness": s}, ...]}
 """
 
-import math
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from warpir.errors import InputError
+from warpir.light import Lobes
 from warpir.strict_json import read_json_object
-
-Float64Array = NDArray[np.float64]
 
 FORMAT = "warpir-lobes"
 VERSION = 1
 LOBE_COUNT_LIMIT = 4096
+AMPLITUDE_LIMIT = 1e12
+"""The sun over its sky is 10^5; float32 products overflow from 10^19 on."""
 SHARPNESS_LIMIT = 1e6
-"""The real sun has a sharpness near 90 000; float32 lobes lose their shape beyond this."""
+"""The real sun has a sharpness near 190 000; float32 lobes lose their shape beyond this."""
 
 
-@dataclass(frozen=True)
-class LobesFile:
-    """The lobes of one file."""
-
-    amplitude: Float64Array
-    """Lobe peak radiance, linear Rec.709, relative [W/(m^2 sr)], shape [lobe, 3]."""
-    axis: Float64Array
-    """Unit lobe axes, world frame, shape [lobe, 3]."""
-    sharpness: Float64Array
-    """Lobe concentration [1], shape [lobe]."""
-
-
-def read_lobes(path: str | Path, rotate_deg: float = 0.0) -> LobesFile:
+def read_lobes(path: str | Path) -> Lobes:
     """Read and check a lobes file.
 
     Args:
         path: The JSON file.
-        rotate_deg: Turns the light about +Y, counter-clockwise seen from above [deg].
 
     Raises:
         InputError: Missing, of another format, or a lobe is out of range; names the lobe.
@@ -63,37 +48,28 @@ def read_lobes(path: str | Path, rotate_deg: float = 0.0) -> LobesFile:
         amplitude[i] = _numbers(path, f"/lobes/{i}/amplitude", lobe.get("amplitude"), 3)
         axis[i] = _numbers(path, f"/lobes/{i}/axis", lobe.get("axis"), 3)
         sharpness += _numbers(path, f"/lobes/{i}/sharpness", [lobe.get("sharpness")], 1)
-        if amplitude[i].min() < 0.0:
-            raise InputError(path, f"/lobes/{i}/amplitude: at least 0 (found {amplitude[i].min()})")
-        if not 0.0 <= sharpness[i] <= SHARPNESS_LIMIT:
-            expected = f"0 to {SHARPNESS_LIMIT:g}"
+        if amplitude[i].min() < 0.0 or amplitude[i].max() > AMPLITUDE_LIMIT:
+            expected = f"0 to {AMPLITUDE_LIMIT:g}"
+            raise InputError(path, f"/lobes/{i}/amplitude: {expected} (found {lobe['amplitude']})")
+        if not 0.0 < sharpness[i] <= SHARPNESS_LIMIT:
+            expected = f"more than 0 and at most {SHARPNESS_LIMIT:g}"
             raise InputError(path, f"/lobes/{i}/sharpness: {expected} (found {sharpness[i]:g})")
         length = float(np.linalg.norm(axis[i]))
         if not 1e-6 < length < 1e6:
             raise InputError(path, f"/lobes/{i}/axis: a direction expected (found {lobe['axis']})")
         axis[i] /= length
-    angle = math.radians(rotate_deg)
-    x, z = axis[:, 0].copy(), axis[:, 2].copy()
-    axis[:, 0] = math.cos(angle) * x + math.sin(angle) * z
-    axis[:, 2] = math.cos(angle) * z - math.sin(angle) * x
-    return LobesFile(amplitude, axis, np.array(sharpness))
+    return Lobes(
+        amplitude.astype(np.float32), axis.astype(np.float32), np.array(sharpness, np.float32)
+    )
 
 
-def lobes_to_json(amplitude: Any, axis: Any, sharpness: Any) -> dict[str, Any]:
-    """Return what `read_lobes` reads, from arrays of the shapes of `LobesFile`."""
-    rows = zip(amplitude, axis, sharpness, strict=True)
-    return {
-        "format": FORMAT,
-        "version": VERSION,
-        "lobes": [
-            {
-                "amplitude": [float(c) for c in a],
-                "axis": [float(c) for c in d],
-                "sharpness": float(s),
-            }
-            for a, d, s in rows
-        ],
-    }
+def lobes_to_json(lobes: Lobes) -> dict[str, Any]:
+    """Return what `read_lobes` reads."""
+    rows = [
+        {"amplitude": [float(c) for c in a], "axis": [float(c) for c in v], "sharpness": float(s)}
+        for a, v, s in zip(lobes.amplitude, lobes.axis, lobes.sharpness, strict=True)
+    ]
+    return {"format": FORMAT, "version": VERSION, "lobes": rows}
 
 
 def _numbers(path: str | Path, pointer: str, value: Any, count: int) -> list[float]:

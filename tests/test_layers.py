@@ -1,0 +1,121 @@
+"""The import table of the project: who may import whom, lazy imports included."""
+
+import ast
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).resolve().parent.parent
+
+# Each module of warpir/ imports modules of lower levels only; a module that is on no level fails.
+LEVELS = (
+    {"errors", "color"},
+    {"config", "asset", "strict_json"},
+    {"camera", "asset_files", "record", "light", "tone"},
+    {"gltf_file", "mtl", "files", "command", "placement", "lobes_file"},
+    {"gltf_material", "obj"},
+    {"gltf"},
+    {"inputs", "scene"},
+    {"render"},
+    {"bridge"},
+    {"integrator", "mis", "transport"},
+    {"optimize", "fit"},
+    {"demo"},
+    {"insert", "prior_images"},
+)
+# A dispatcher by file extension: it calls the readers, and they fill its records.
+UPWARD = {("asset", "gltf"), ("asset", "obj")}
+
+# Where a package may be imported at all. A folder stands for all modules in it.
+ONLY_IN = {
+    "warp": {"kernels", "scene", "render", "bridge"},
+    "torch": {
+        "diffusion", "bridge", "integrator", "mis", "transport", "optimize", "fit", "insert",
+        "prior_images",
+    },
+    "trimesh": {"gltf", "obj", "demo"},
+    "OpenImageIO": {"files"},
+    "OpenEXR": {"files"},
+    "PIL": {"files", "asset_files", "demo"},
+    "diffusers": {"diffusion"},
+    "transformers": {"diffusion"},
+    "peft": {"diffusion"},
+    "safetensors": {"diffusion", "optimize"},
+    "colour": {"color"},
+    "yaml": {"command"},
+    "rich": {"record"},
+}  # fmt: skip
+NOT_IN_KERNELS = {"numpy", "warpir"}
+"""``warpir.kernels`` sees Warp and itself."""
+
+
+def sources() -> list[Path]:
+    folders = ("warpir", "kernels", "diffusion", "notebooks", "benchmarks", "tests")
+    return sorted(path for folder in folders for path in (ROOT / folder).rglob("*.py"))
+
+
+def imports(path: Path) -> list[tuple[int, str]]:
+    """Return (line, absolute dotted name) of every import, wherever it stands."""
+    found: list[tuple[int, str]] = []
+    for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+        if isinstance(node, ast.Import):
+            found += [(node.lineno, alias.name) for alias in node.names]
+        elif isinstance(node, ast.ImportFrom):
+            dots = "." * node.level
+            found += [(node.lineno, f"{dots}{node.module or ''}.{a.name}") for a in node.names]
+    return found
+
+
+def module_of(name: str) -> str:
+    """Return the part of a dotted name that the table knows: ``warpir.gltf.read`` is ``gltf``."""
+    parts = name.split(".")
+    return parts[1] if parts[0] == "warpir" and len(parts) > 1 else ""
+
+
+def level(module: str) -> int:
+    return next((i for i, names in enumerate(LEVELS) if module in names), -1)
+
+
+def place_of(path: Path) -> str:
+    """Return the folder for kernels/ and diffusion/, the module's name within warpir/."""
+    parts = path.relative_to(ROOT).parts
+    return parts[0] if parts[0] != "warpir" else Path(parts[1]).stem
+
+
+@pytest.mark.parametrize("path", sources(), ids=lambda p: str(p.relative_to(ROOT)))
+def test_imports_follow_the_table(path: Path) -> None:
+    """Every import is absolute, never of top-level kernels or diffusion, and only downward."""
+    folder, place = path.relative_to(ROOT).parts[0], place_of(path)
+    for line, name in imports(path):
+        where, top, target = f"{path.relative_to(ROOT)}:{line}: {name}", "", module_of(name)
+        assert not name.startswith("."), f"{where}: relative import"
+        top = name.split(".")[0]
+        assert top not in ("kernels", "diffusion"), f"{where}: import it as warpir.{top}"
+        if folder == "notebooks":
+            assert target != "kernels", f"{where}: notebooks use warpir alone"
+        if folder not in ("warpir", "kernels", "diffusion"):
+            continue
+        if top in ONLY_IN:
+            assert place in ONLY_IN[top], f"{where}: {top} is imported in {sorted(ONLY_IN[top])}"
+        if folder == "kernels":
+            assert top not in NOT_IN_KERNELS or target == "kernels", f"{where}: kernels see Warp"
+        elif folder == "diffusion":
+            assert top != "warpir" or target == "diffusion", f"{where}: diffusion stands alone"
+        elif top == "warpir" and target and target != place and place != "__init__":
+            if target == "kernels":
+                assert place in ONLY_IN["warp"], f"{where}: only Warp's callers see the kernels"
+            elif target == "diffusion":
+                assert place in ("optimize", "prior_images"), f"{where}: optimize imports diffusion"
+            elif (place, target) not in UPWARD and level(target) >= 0:
+                assert level(target) < level(place), f"{where}: imports its own level or higher"
+
+
+def test_layers_name_every_module() -> None:
+    """A new module must be put on a level before it is used."""
+    modules = {place_of(p) for p in (ROOT / "warpir").rglob("*.py")} - {"__init__"}
+    assert {m for m in modules if level(m) < 0} == set()
+
+
+def test_layers_package_imports_nothing() -> None:
+    """``import warpir`` costs nothing."""
+    assert imports(ROOT / "warpir" / "__init__.py") == []
