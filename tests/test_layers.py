@@ -17,9 +17,11 @@ LEVELS = (
     {"gltf"},
     {"inputs", "scene"},
     {"render"},
+    {"integrator"},
     {"bridge"},
-    {"integrator", "mis", "transport"},
+    {"mis", "transport"},
     {"optimize", "fit"},
+    {"stages"},
     {"demo"},
     {"insert", "prior_images"},
 )
@@ -30,7 +32,7 @@ UPWARD = {("asset", "gltf"), ("asset", "obj")}
 ONLY_IN = {
     "warp": {"kernels", "scene", "render", "bridge"},
     "torch": {
-        "diffusion", "bridge", "integrator", "mis", "transport", "optimize", "fit", "insert",
+        "diffusion", "tone", "bridge", "integrator", "mis", "transport", "optimize", "fit", "insert",
         "prior_images",
     },
     "trimesh": {"gltf", "obj", "demo"},

@@ -1,5 +1,6 @@
 """All inputs of one insertion, read and checked; torch and Warp are not needed here."""
 
+import os
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
@@ -57,6 +58,7 @@ def read_inputs(config: InsertConfig) -> Inputs:
 
     assert config.photo is not None and config.asset is not None
     photo_path, asset_path = config.photo, config.asset
+    problems += _inputs_in_out(config)
     notices: list[str] = []
     assumed: list[str] = []
     photo = attempt(
@@ -91,6 +93,18 @@ def read_inputs(config: InsertConfig) -> Inputs:
     ]
     assumed += placement.assumed
     return Inputs(photo, asset, camera, placement, light, tuple(assumed), tuple(notices))
+
+
+def _inputs_in_out(config: InsertConfig) -> list[InputError]:
+    """Refuse an --out that holds an input: --overwrite could replace it."""
+    if config.out is None:
+        return []
+    out = os.path.realpath(config.out)
+    named = (config.photo, config.asset, config.camera, config.light)
+    for path in named:
+        if path is not None and os.path.realpath(os.path.dirname(path)) == out:
+            return [usage("--out", f"holds the input {path}", "choose a folder of its own")]
+    return []
 
 
 def _make_camera(config: InsertConfig, photo: Photo, assumed: list[str]) -> Camera:

@@ -82,20 +82,20 @@ def insert(config: InsertConfig) -> Insertion:
     with OutputFolder(Path(config.out), overwrite=config.overwrite) as output:
         # torch and Warp are loaded here, after everything that can be wrong was looked at.
         with timings.stage("load"):
-            from warpir import render
+            from warpir import stages
 
-            device = render.choose_device(config.device, config.threads)
+            device = stages.choose_device(config.device, config.threads)
             _say(f"device: {device}")
         with timings.stage("scene"):
-            scene = render.make_scene(inputs, config, device)
+            scene = stages.make_scene(inputs, config, device)
         with timings.stage("light"):
-            light = render.make_light(inputs, config, device)
+            light = stages.make_light(inputs, config, device)
         with timings.stage("render"):
-            layers = render.render_layers(scene, light, config)
+            layers = stages.render_layers(scene, light, config)
         with timings.stage("compose"):
-            picture = render.compose(inputs.photo, layers)
+            picture = stages.compose(inputs.photo, layers)
         with timings.stage("write"):
-            measured = render.write(output, inputs, light, layers, picture, config)
+            measured = stages.write(output, inputs, light, layers, picture, config)
         record = run_record(
             config,
             device=str(device),

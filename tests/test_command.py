@@ -1,0 +1,469 @@
+"""The command line: flags, configuration files, errors, exit codes, and what is not imported."""
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Sequence
+from dataclasses import asdict, fields
+from itertools import pairwise
+from pathlib import Path
+
+import pytest
+
+import warpir.command
+import warpir.insert
+from warpir.command import FLAGS, parse
+from warpir.config import EXCLUSIVE, InsertConfig, flag
+from warpir.errors import ExitCode, InputError
+from warpir.record import RUN_FORMAT
+
+# The slowest start that still feels immediate. Measured: 0.07 s; the rest is a busy machine.
+ANSWER_SECONDS = 1.0
+HEAVY = ("torch", "warp", "PIL", "OpenImageIO", "OpenEXR", "trimesh", "numpy", "yaml", "colour")
+NEEDED = ["--photo", "p.png", "--asset", "a.glb", "--out", "o"]
+
+
+def run(argv: Sequence[str], cwd: Path, after: str = "") -> subprocess.CompletedProcess[str]:
+    """Run ``main`` in a child, then the statements of `after`."""
+    code = f"import sys\nfrom warpir.insert import main\nstatus = main({list(argv)!r})\n{after}\n"
+    return subprocess.run(
+        [sys.executable, "-c", code + "sys.exit(status)"],
+        cwd=cwd,
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+
+
+def assert_fails(
+    capsys: pytest.CaptureFixture[str], argv: Sequence[str], code: int, *words: str
+) -> list[str]:
+    """Check status, exactly one ``error:`` line that holds the words, no traceback."""
+    status = warpir.insert.main(argv)
+    captured = capsys.readouterr()
+    lines = captured.err.splitlines()
+    errors = [line for line in lines if line.startswith("error:")]
+    assert status == code, captured.err
+    assert len(errors) == 1 and lines[0] == errors[0]
+    for word in words:
+        assert word in errors[0]
+    assert "Traceback" not in captured.err
+    return lines
+
+
+def refused(argv: Sequence[str]) -> InputError:
+    with pytest.raises(InputError) as caught:
+        parse(argv)
+    assert caught.value.code == ExitCode.USAGE
+    return caught.value
+
+
+@pytest.mark.parametrize(
+    ("argv", "status"),
+    [(["--help"], 0), (["--version"], 0), (["--samples", "0"], 2), (["--nonsense"], 2)],
+    ids=["help", "version", "range", "unknown"],
+)
+def test_command_answers_at_once(argv: list[str], status: int, tmp_path: Path) -> None:
+    """Help and wrong arguments take under a second and import nothing heavy."""
+    loaded = f"print([m for m in {HEAVY!r} if m in sys.modules])"
+    fastest = float("inf")
+    for _ in range(3):
+        start = time.perf_counter()
+        done = run(argv, tmp_path, loaded)
+        fastest = min(fastest, time.perf_counter() - start)
+        if fastest < ANSWER_SECONDS:
+            break
+    assert done.returncode == status, done.stderr
+    assert done.stdout.splitlines()[-1] == "[]"
+    assert fastest < ANSWER_SECONDS
+
+
+def test_command_runs_as_a_module(tmp_path: Path) -> None:
+    """``python -m warpir.insert`` is the same program, and its status is the process's."""
+    command = [sys.executable, "-m", "warpir.insert", "--fovv", "3"]
+    done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, check=False)
+    assert done.returncode == ExitCode.USAGE
+    assert done.stderr == "error: --fovv: no such flag\ndid you mean --fov?\n"
+
+
+def test_command_help_tells_every_field(capsys: pytest.CaptureFixture[str]) -> None:
+    """Each field of the configuration is a flag with a help text."""
+    assert warpir.insert.main(["--help"]) == 0
+    text = capsys.readouterr().out
+    docs = warpir.command._field_docs()
+    listed = [name for forms in FLAGS.values() for name in forms]
+    assert sorted(listed) == sorted(field.name for field in fields(InsertConfig)) == sorted(docs)
+    assert all(flag(name) in text and docs[name] for name in listed)
+
+
+@pytest.mark.parametrize(
+    ("argv", "name", "value"),
+    [
+        (["--place", "-1,0,-3"], "place", (-1.0, 0.0, -3.0)),
+        (["--place=-1,0,-3"], "place", (-1.0, 0.0, -3.0)),
+        (["--ground", "-.5,1,0,2e-3"], "ground", (-0.5, 1.0, 0.0, 0.002)),
+        (["--pitch", "-8"], "pitch", -8.0),
+        (["--light-rotate", "-90.5"], "light_rotate", -90.5),
+        (["--exposure", "-2"], "exposure", -2.0),
+        (["--camera", "f.fspy", "--up", "-z"], "up", "-z"),
+        (["--sun", "-30,40"], "sun", (-30.0, 40.0)),
+        (["--sun", "120,40,2.5"], "sun", (120.0, 40.0, 2.5)),
+        (["--sky", "overcast"], "sky", "overcast"),
+        (["--sky", "0.1,0.2,0.3"], "sky", (0.1, 0.2, 0.3)),
+        (["--no-mark"], "mark", False),
+        (["--overwrite"], "overwrite", True),
+        (["--device", "cuda:1"], "device", "cuda:1"),
+        (["--photo", "-x.png"], "photo", "-x.png"),
+        (["--width", "8"], "width", 8),
+    ],
+)
+def test_command_reads_values(argv: list[str], name: str, value: object) -> None:
+    """Flags arrive as their field's type, values with a leading minus too."""
+    assert getattr(parse([*NEEDED, *argv]).config, name) == value
+
+
+@pytest.mark.parametrize(
+    ("argv", "where", "words"),
+    [
+        (["--samples", "0"], "--samples", "at least 1 (found 0)"),
+        (["--samples", "many"], "--samples", "expected a whole number (found 'many')"),
+        (["--samples", "1.5"], "--samples", "whole number"),
+        (["--fov", "180"], "--fov", "between 0 and 180 (found 180.0)"),
+        (["--fov", "nan"], "--fov", "finite"),
+        (["--fov", "1e400"], "--fov", "finite"),
+        (["--place", "1,2"], "--place", "expected X,Y,Z (found '1,2')"),
+        (["--place", "1,2,inf"], "--place", "finite"),
+        (["--ground", "0,0,0,1"], "--ground", "normal"),
+        (["--scale", "0"], "--scale", "more than 0"),
+        (["--size", "-1"], "--size", "more than 0"),
+        (["--seed", "-1"], "--seed", "at least 0"),
+        (["--seed", str(2**64)], "--seed", "at most"),
+        (["--device", "tpu"], "--device", "cuda"),
+        (["--sky", "purple"], "--sky", "overcast"),
+        (["--sun", "0,91"], "--sun", "elevation"),
+        (["--guidance", "lds"], "--guidance", "none"),
+        (["--photo", ""], "--photo", "not empty"),
+        (["--fit-lobes", "4"], "--fit-lobes", "--light"),
+        (["--up", "z"], "--up", "--camera"),
+        (["--photo"], "--photo", "expected one argument"),
+        (["--overwrite=yes"], "--overwrite", "ignored explicit argument"),
+        (["stray"], "stray", "no such flag"),
+        (["--sample", "4"], "--sample", "no such flag"),
+    ],
+)
+def test_command_refuses_values(argv: list[str], where: str, words: str) -> None:
+    """A value that cannot be used names its flag, what was found and what was expected (F1, F8)."""
+    error = refused([*NEEDED, *argv])
+    assert error.where == where
+    assert words in error.what
+
+
+@pytest.mark.parametrize(("first", "second"), EXCLUSIVE)
+def test_command_refuses_flags_that_exclude_each_other(first: str, second: str) -> None:
+    """At most one of each pair may be given."""
+    values = {
+        "photo": "p.png", "asset": "a.glb", "camera": "c.json", "fov": "50", "pitch": "1",
+        "horizon": "5", "camera_height": "2", "place": "0,0,1", "at": "1,2", "scale": "1",
+        "size": "1", "light": "l.hdr", "sun": "1,2", "sky": "clear",
+    }  # fmt: skip
+    argv = ["--out", "o"]
+    for name in (first, second):
+        argv += [flag(name)] if name == "demo" else [flag(name), values[name]]
+    error = refused(argv)
+    assert error.where == flag(second)
+    assert error.what == f"cannot be used with {flag(first)}"
+
+
+def test_command_lists_all_problems(capsys: pytest.CaptureFixture[str]) -> None:
+    """The first problem is the error, the others follow as also: lines."""
+    argv = [*NEEDED, "--samples", "0", "--depth", "0", "--fov", "0"]
+    lines = assert_fails(capsys, argv, 2, "--fov")
+    assert [line.split(":")[1].strip() for line in lines[1:]] == ["--samples", "--depth"]
+    assert all(line.startswith("also: ") for line in lines[1:])
+
+
+def test_command_names_what_is_needed(capsys: pytest.CaptureFixture[str]) -> None:
+    """Without --demo photo, asset and out are needed; with it only out."""
+    lines = assert_fails(capsys, [], 2, "--photo: needed")
+    assert lines[1:] == [
+        "--demo needs neither --photo nor --asset",
+        "also: --asset: needed",
+        "also: --out: needed",
+    ]
+    assert_fails(capsys, ["--demo"], 2, "--out: needed")
+    assert parse(["--demo", "--out", "o"]).config.demo
+
+
+YAML = """\
+photo: p.png
+asset: "a.glb"
+out: o
+camera-height: 1.5   # a flag's spelling
+rotate_y: 30         # a field's spelling
+place: [-1, 0, -3.5]
+sky: 0.1,0.2,0.3
+samples: 16
+mark: false
+width: null
+"""
+
+
+def test_config_file_gives_the_same_as_flags(tmp_path: Path) -> None:
+    """YAML and JSON, lists and comma-separated text, both spellings of a name."""
+    expected = parse(
+        ["--photo", "p.png", "--asset", "a.glb", "--out", "o", "--camera-height", "1.5",
+         "--rotate-y", "30", "--place", "-1,0,-3.5", "--sky", "0.1,0.2,0.3", "--samples", "16",
+         "--no-mark"]
+    ).config  # fmt: skip
+    path = tmp_path / "run.yaml"
+    path.write_text(YAML)
+    assert parse(["--config", str(path)]).config == expected
+    other = tmp_path / "c.json"
+    other.write_text(json.dumps(asdict(expected)))
+    assert parse(["--config", str(other)]).config == expected
+
+
+def test_config_file_replays_a_run(tmp_path: Path) -> None:
+    """``run.json`` of an earlier run is a configuration; an unknown layout is refused (F2)."""
+    config = InsertConfig(photo="p.png", asset="a.glb", out="o", sun=(10.0, 20.0), seed=7)
+    path = tmp_path / "run.json"
+    path.write_text(json.dumps({"format": RUN_FORMAT, "config": asdict(config), "seconds": {}}))
+    assert parse(["--config", str(path)]).config == config
+    path.write_text(json.dumps({"format": RUN_FORMAT + 1, "config": asdict(config)}))
+    assert "format" in refused(["--config", str(path)]).what
+
+
+def test_config_file_yields_to_flags(tmp_path: Path) -> None:
+    """A flag wins over the file, and says so (F3)."""
+    path = tmp_path / "c.yaml"
+    path.write_text(YAML)
+    command = parse(["--config", str(path), "--samples", "8"])
+    assert command.config.samples == 8
+    assert len(command.notices) == 1 and "--samples" in command.notices[0]
+
+
+@pytest.mark.parametrize(
+    ("name", "text", "words"),
+    [
+        ("c.yaml", "sampels: 3\n", "unknown key 'sampels'"),
+        ("c.yaml", "samples: .nan\n", "whole number"),
+        ("c.yaml", "fov: .nan\n", "finite"),
+        ("c.yaml", "fov: 1e400\n", "finite"),
+        ("c.yaml", "samples: true\n", "whole number"),
+        ("c.yaml", "samples: -3\n", "at least 1"),
+        ("c.yaml", "samples: null\n", "whole number"),
+        ("c.yaml", "seed: 1.5\n", "whole number"),
+        ("c.yaml", "overwrite: 1\n", "true or false"),
+        ("c.yaml", "place: {x: 1}\n", "X,Y,Z"),
+        ("c.yaml", "camera: [a]\n", "FILE"),
+        ("c.yaml", "photo: !!python/object/apply:os.system ['touch x']\n", "not YAML"),
+        ("c.yaml", "samples: 3\nsamples: 4\n", "line 2: key 'samples' twice"),
+        ("c.yaml", "a: [\n", "not YAML"),
+        ("c.yaml", "- 1\n", "keys and values"),
+        ("c.yaml", "[" * 3000, "nested too deeply"),
+        ("c.yaml", "a: &a [x,x]\nb: &b [*a,*a,*a]\nplace: [*b,*b,*b]\n", "unknown key 'a'"),
+        ("c.json", '{"fov": NaN}', "NaN"),
+        ("c.json", '{"samples": 3, "samples": 4}', "twice"),
+        ("c.json", '{"samples": 3,}', "line 1: not JSON"),
+        ("c.json", "[]", "object"),
+        ("c.json", "\xff", "not UTF-8"),
+    ],
+)
+def test_config_file_refused(tmp_path: Path, name: str, text: str, words: str) -> None:
+    """A bad file ends with status 2 and names its key or line; no code from it runs (F1)."""
+    path = tmp_path / name
+    path.write_bytes(text.encode("latin-1"))
+    error = refused([*NEEDED, "--config", str(path)])
+    assert words in f"{error.where}: {error.what}"
+    assert list(tmp_path.iterdir()) == [path]
+
+
+def test_config_file_of_aliases_is_refused_at_once(tmp_path: Path) -> None:
+    """Ten lines of aliases that stand for 10^9 entries neither hang nor print them (F1)."""
+    names = "abcdefghi"
+    lines = ["a: &a [x, x, x, x, x, x, x, x, x]"]
+    lines += [f"{b}: &{b} [{', '.join(['*' + a] * 9)}]" for a, b in pairwise(names)]
+    path = tmp_path / "bomb.yaml"
+    path.write_text("\n".join([*lines, "place: *i", "photo: *i"]))
+    start = time.perf_counter()
+    error = refused(["--config", str(path)])
+    assert time.perf_counter() - start < 5.0
+    assert len(str(error)) < 500
+
+
+@pytest.mark.parametrize("kind", ["missing", "folder", "pipe"])
+def test_config_file_that_is_no_file(tmp_path: Path, kind: str) -> None:
+    """A missing file, a folder and a pipe are refused without waiting."""
+    path = tmp_path / "c.yaml"
+    if kind == "folder":
+        path.mkdir()
+    elif kind == "pipe":
+        os.mkfifo(path)
+    assert refused(["--config", str(path)]).where == str(path)
+
+
+def test_command_reports_bad_inputs_together(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """--validate looks at every input before it stops; the first decides the status."""
+    argv = ["--photo", str(tmp_path / "no.jpg"), "--asset", str(tmp_path / "no.glb"), "--out",
+            str(tmp_path / "o"), "--light", str(tmp_path / "no.hdr"), "--validate"]  # fmt: skip
+    lines = assert_fails(capsys, argv, ExitCode.INPUT, "no.jpg")
+    also = [line for line in lines if line.startswith("also: ")]
+    assert len(also) == 2 and "no.glb" in also[0] and "no.hdr" in also[1]
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_command_never_writes_over_its_inputs(scene: list[str], tmp_path: Path) -> None:
+    """--out may not be the folder of an input: --overwrite could replace the photo (F5)."""
+    from warpir.inputs import read_inputs
+
+    scene[scene.index("--out") + 1] = str(tmp_path / "x" / "..")
+    with pytest.raises(InputError, match="--out: holds the input") as caught:
+        read_inputs(parse([*scene, "--overwrite"]).config)
+    assert caught.value.code == ExitCode.USAGE
+
+
+OBJ = "v 0 0 0\nv 1 0 0\nv 0 1 0\nv 0 0 1\nf 1 2 3\nf 1 2 4\n"
+LOBES = {
+    "format": "warpir-lobes",
+    "version": 1,
+    "lobes": [{"amplitude": [1, 2, 3], "axis": [0, 2, 0], "sharpness": 5}],
+}
+
+
+@pytest.fixture
+def scene(tmp_path: Path) -> list[str]:
+    """Arguments of a valid run: a small photo, four triangles' corners, one lobe."""
+    import numpy as np
+    from PIL import Image
+
+    ramp = np.arange(48 * 64 * 3, dtype=np.uint32).reshape(48, 64, 3) % 251
+    Image.fromarray(ramp.astype(np.uint8)).save(tmp_path / "photo.png")
+    (tmp_path / "asset.obj").write_text(OBJ)
+    (tmp_path / "lobes.json").write_text(json.dumps(LOBES))
+    return ["--photo", str(tmp_path / "photo.png"), "--asset", str(tmp_path / "asset.obj"),
+            "--light", str(tmp_path / "lobes.json"), "--out", str(tmp_path / "out"),
+            "--pitch", "-20"]  # fmt: skip
+
+
+def test_validate_reads_everything_without_torch_or_warp(scene: list[str], tmp_path: Path) -> None:
+    """--validate says what is assumed, writes nothing and loads no renderer."""
+    loaded = "print([m for m in ('torch', 'warp', 'colour', 'diffusers') if m in sys.modules])"
+    done = run([*scene, "--validate"], tmp_path, loaded)
+    lines = done.stdout.splitlines()
+    assert done.returncode == 0, done.stderr
+    assert lines[-2:] == ["inputs are valid", "[]"]
+    assert any(line.startswith("assumed: ") and "--fov" in line for line in lines)
+    assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        ({"format": "x"}, "not lobes"),
+        ({"lobes": []}, "/lobes"),
+        ({"lobes": [{"amplitude": [1, 2], "axis": [0, 1, 0], "sharpness": 1}]}, "amplitude"),
+        ({"lobes": [{"amplitude": [1, 2, -3], "axis": [0, 1, 0], "sharpness": 1}]}, "amplitude"),
+        ({"lobes": [{"amplitude": [1, 2, 3], "axis": [0, 0, 0], "sharpness": 1}]}, "axis"),
+        ({"lobes": [{"amplitude": [1, 2, 3], "axis": [0, 1, 0], "sharpness": 0}]}, "sharpness"),
+        ({"lobes": [{"amplitude": [1, 2, 3], "axis": [0, 1, 0]}]}, "sharpness"),
+    ],
+)
+def test_validate_refuses_lobes(
+    scene: list[str],
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+    change: dict[str, object],
+    words: str,
+) -> None:
+    """A lobe out of range is named by its pointer."""
+    (tmp_path / "lobes.json").write_text(json.dumps({**LOBES, **change}))
+    assert_fails(capsys, [*scene, "--validate"], ExitCode.INPUT, "lobes.json", words)
+
+
+def test_main_reports_its_own_faults(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], scene: list[str]
+) -> None:
+    """What nobody foresaw ends with status 1, a traceback and a request to report it."""
+
+    def fail(config: InsertConfig) -> None:
+        raise ZeroDivisionError("none\nof it")
+
+    monkeypatch.setattr(warpir.insert, "insert", fail)
+    assert warpir.insert.main(scene) == ExitCode.BUG
+    text = capsys.readouterr().err
+    assert "Traceback" in text and "report" in text
+    assert "error: warpir: a fault of its own (ZeroDivisionError: none\\nof it)\n" in text
+
+
+@pytest.mark.parametrize(
+    ("raised", "status", "words"),
+    [
+        (KeyboardInterrupt(), 130, "stopped"),
+        (MemoryError(), ExitCode.RESOURCES, "error: memory:"),
+        (OSError(28, "No space left on device", "o/x.exr"), ExitCode.RESOURCES, "error: o/x.exr:"),
+        (ModuleNotFoundError("", name="diffusers"), ExitCode.USAGE, "warpir[diffusion]"),
+        (InputError("a\nb.png", "x\x1b[31m"), ExitCode.INPUT, "error: a\\nb.png: x\\x1b[31m"),
+    ],
+    ids=["interrupt", "memory", "disk", "R15", "control-characters"],
+)
+def test_main_tells_the_truth_by_status(
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+    scene: list[str],
+    raised: BaseException,
+    status: int,
+    words: str,
+) -> None:
+    """Each class of fault has its exit status and no traceback."""
+
+    def fail(config: InsertConfig) -> None:
+        raise raised
+
+    monkeypatch.setattr(warpir.insert, "insert", fail)
+    assert warpir.insert.main(scene) == status
+    text = capsys.readouterr().err
+    assert words in text and "Traceback" not in text
+    assert text.count("error:") == (0 if status == 130 else 1)
+    assert warpir.insert.main([*scene, "--debug"]) == status
+    assert "Traceback" in capsys.readouterr().err
+
+
+def test_main_stops_on_sigterm(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], scene: list[str]
+) -> None:
+    """SIGTERM unwinds like Ctrl-C, with status 143, and the old handler comes back."""
+
+    def terminate(config: InsertConfig) -> None:
+        signal.raise_signal(signal.SIGTERM)
+
+    before = signal.getsignal(signal.SIGTERM)
+    monkeypatch.setattr(warpir.insert, "insert", terminate)
+    assert warpir.insert.main(scene) == 143
+    assert signal.getsignal(signal.SIGTERM) == before
+
+
+def test_main_survives_a_closed_stdout(scene: list[str], tmp_path: Path) -> None:
+    """``| head`` ends neither the run nor its status (R11)."""
+    code = (
+        "import os, sys\nread, write = os.pipe()\nos.close(read)\nos.dup2(write, 1)\n"
+        f"from warpir.insert import main\nsys.exit(main({[*scene, '--validate']!r}))"
+    )
+    done = subprocess.run(
+        [sys.executable, "-c", code], cwd=tmp_path, capture_output=True, text=True, check=False
+    )
+    assert (done.returncode, done.stderr) == (0, "")
+
+
+def test_insert_is_called_through_the_module() -> None:
+    """``from warpir import insert; insert(config)`` reaches the same function."""
+    from warpir import insert
+
+    with pytest.raises(InputError, match="--photo: needed"):
+        insert(InsertConfig(out="o"))
+    with pytest.raises(InputError, match="--photo: needed"):
+        insert.insert(InsertConfig(out="o"))

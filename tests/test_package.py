@@ -1,0 +1,69 @@
+"""What the wheel holds; .ci/check-wheel also installs, imports and types it elsewhere."""
+
+import shutil
+import subprocess
+import sys
+import tomllib
+import zipfile
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).resolve().parent.parent
+
+
+@pytest.fixture(scope="module")
+def wheel(tmp_path_factory: pytest.TempPathFactory) -> zipfile.ZipFile:
+    """Build the wheel from a copy, so that no stale build/ folder adds to it."""
+    if not (ROOT / "pyproject.toml").is_file():
+        pytest.skip("needs the checkout: pyproject.toml is not beside tests/")
+    folder = tmp_path_factory.mktemp("wheel")
+    source = folder / "source"
+    source.mkdir()
+    for name in ("pyproject.toml", "README.md", "LICENSE"):
+        shutil.copy(ROOT / name, source)
+    for name in ("warpir", "kernels", "diffusion"):
+        ignored = shutil.ignore_patterns("__pycache__")
+        shutil.copytree(ROOT / name, source / name, ignore=ignored)
+    command = [sys.executable, "-m", "build", "--wheel", "--no-isolation", "--outdir", str(folder)]
+    built = subprocess.run([*command, str(source)], capture_output=True, text=True, check=False)
+    assert built.returncode == 0, built.stdout + built.stderr
+    return zipfile.ZipFile(next(folder.glob("warpir-*.whl")))
+
+
+@pytest.mark.slow
+def test_wheel_holds_only_warpir(wheel: zipfile.ZipFile) -> None:
+    """Hugging Face's kernels owns that top-level name, so ours is inside warpir/."""
+    tops = {name.split("/")[0] for name in wheel.namelist()}
+    assert {top for top in tops if not top.endswith(".dist-info")} == {"warpir"}
+
+
+@pytest.mark.slow
+def test_wheel_holds_every_module(wheel: zipfile.ZipFile) -> None:
+    """Nothing that the checkout imports is left behind, the licence and py.typed included."""
+    names = set(wheel.namelist())
+    for folder, prefix in (("warpir", ""), ("kernels", "warpir/"), ("diffusion", "warpir/")):
+        for path in (ROOT / folder).rglob("*.py"):
+            assert prefix + path.relative_to(ROOT).as_posix() in names
+    assert "warpir/py.typed" in names
+    assert any(name.endswith("licenses/LICENSE") for name in names)
+
+
+@pytest.mark.slow
+def test_wheel_installs_the_command(wheel: zipfile.ZipFile) -> None:
+    """``warpir-insert`` is the same program as ``python -m warpir.insert``."""
+    entry = next(name for name in wheel.namelist() if name.endswith("entry_points.txt"))
+    assert "warpir-insert = warpir.insert:main" in wheel.read(entry).decode()
+
+
+def test_constraints_fit_the_requirements() -> None:
+    """Every direct requirement is pinned once, without a local version suffix."""
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
+    lines = (ROOT / "constraints.txt").read_text().splitlines()
+    pins = [line for line in lines if line and not line.startswith("#")]
+    names = [pin.split("==")[0].lower() for pin in pins]
+    assert len(names) == len(set(names))
+    assert not any("+" in pin for pin in pins)
+    wanted = [*project["dependencies"], *project["optional-dependencies"]["dev"]]
+    for requirement in wanted:
+        assert requirement.split(">")[0].lower() in names, requirement
