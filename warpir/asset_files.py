@@ -25,6 +25,8 @@ TRIANGLES = 20_000_000
 """Most triangles of an asset, instances counted."""
 TEXTURE_PIXELS = 512_000_000
 """Most pixels of all textures together."""
+NOTICES = 40
+"""Most notices of an asset."""
 GREY = 188
 """sRGB code that stands for a missing base colour texture: linear 0.5."""
 
@@ -265,3 +267,12 @@ def plain_material(name: str, base_color: tuple[float, float, float]) -> Materia
     return Material(
         name=name, base_color=base_color, metallic=0.0, roughness=0.5, double_sided=True
     )
+
+
+def concise(notices: list[str]) -> tuple[str, ...]:
+    """Return the different notices in order, cut to ``NOTICES`` lines with a count of the rest."""
+    different = list(dict.fromkeys(notices))
+    if len(different) > NOTICES:
+        rest = len(different) - NOTICES + 1
+        different[NOTICES - 1 :] = [f"and {rest} more notices"]
+    return tuple(different)

@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 from warpir.asset import Asset, FloatArray, Primitive
 from warpir.asset_files import (
     TRIANGLES,
+    concise,
     keep_area,
     nothing_to_render,
     repair_normals,
@@ -75,7 +76,7 @@ def read_gltf(path: str | Path, missing_textures: str = "error") -> Asset:
         primitives=tuple(primitives),
         materials=tuple(materials.materials),
         textures=tuple(materials.textures),
-        notices=tuple(dict.fromkeys(notices)),
+        notices=concise(notices),
     )
 
 
@@ -93,21 +94,23 @@ def placed_primitives(root: Entry, notices: list[str]) -> Iterator[tuple[Entry, 
         InputError: The nodes are not a forest, or a drawn transform is singular.
     """
     nodes, parents = read_forest(root)
-    starts = scene_roots(root, nodes, parents, notices)
-    stack = [(index, ancestor_matrix(nodes, parents, index)) for index in reversed(starts)]
+    listed = scene_nodes(root, nodes, parents, notices)
     if root.size("animations"):
         notices.append("animations are not played: the rest pose is used")
     instance_count = 0
+    stack = [(index, np.eye(4), False) for index in range(len(nodes)) if index not in parents]
+    stack.reverse()
     while stack:
-        index, parent = stack.pop()
+        index, parent, drawn = stack.pop()
         node = nodes[index]
         visibility = node.extension("KHR_node_visibility")
         if visibility is not None and "visible" in visibility and not visibility.flag("visible"):
             notices.append(f"{node.pointer}: hidden by KHR_node_visibility")
             continue
         world = parent @ local_matrix(node)
-        stack += [(child, world) for child in reversed(node.integers("children"))]
-        if "mesh" not in node:
+        drawn = drawn or index in listed
+        stack += [(child, world, drawn) for child in reversed(node.integers("children"))]
+        if not drawn or "mesh" not in node:
             continue
         check_invertible(node, world)
         if "skin" in node:
@@ -152,44 +155,25 @@ def read_forest(root: Entry) -> tuple[list[Entry], dict[int, int]]:
     return nodes, parents
 
 
-def scene_roots(
+def scene_nodes(
     root: Entry, nodes: list[Entry], parents: dict[int, int], notices: list[str]
-) -> list[int]:
-    """Return where drawing starts: the nodes of ``scene``, else of the first, else all roots."""
+) -> set[int]:
+    """Return the nodes that ``scene`` lists, else the first scene, else all without a parent."""
     if not root.size("scenes"):
         if "scene" in root:
             raise root.error(f"scene {root.value['scene']}, but 0 scenes")
         notices.append("the file has no scenes: all root nodes are drawn")
-        return [index for index in range(len(nodes)) if index not in parents]
+        return {index for index in range(len(nodes)) if index not in parents}
     scene = root.item("scenes", root.integer("scene", 0), root, "scene")
     listed = scene.integers("nodes")
-    starts = []
     for index in listed:
         if index >= len(nodes):
             raise scene.error(f"node {index}, but {len(nodes)} nodes")
-        ancestors = set(ancestor_indices(parents, index))
-        if ancestors:
+        if index in parents:
             notices.append(f"{scene.pointer}: node {index} is not a root; drawn below its parents")
-        if not ancestors.intersection(listed):
-            starts.append(index)
-    if len(set(starts)) < len(starts):
+    if len(set(listed)) < len(listed):
         raise scene.error("the same node twice")
-    return starts
-
-
-def ancestor_indices(parents: dict[int, int], index: int) -> Iterator[int]:
-    """Yield the parent of a node, the parent's parent and so on."""
-    while index in parents:
-        index = parents[index]
-        yield index
-
-
-def ancestor_matrix(nodes: list[Entry], parents: dict[int, int], index: int) -> Matrix:
-    """Return the matrix from the frame of a node's parent to the asset's, shape [4, 4]."""
-    matrix = np.eye(4)
-    for ancestor in ancestor_indices(parents, index):
-        matrix = local_matrix(nodes[ancestor]) @ matrix
-    return matrix
+    return set(listed)
 
 
 def local_matrix(node: Entry) -> Matrix:

@@ -244,13 +244,13 @@ class MaterialReader:
                 wraps[k] = WRAPS[code]
             if sampler.integer("magFilter", 9729) in NEAREST:
                 self.notices.append(f"{sampler.pointer}: nearest filter replaced by bilinear")
+        if source not in self._pixels:
+            self._pixels[source] = self._load(source, entry)
+        pixels = self._pixels[source]
+        if pixels is None and not is_base_color:
+            return None
         use = (source, wraps[0], wraps[1])
         if use not in self._texture_index:
-            if source not in self._pixels:
-                self._pixels[source] = self._load(source, entry)
-            pixels = self._pixels[source]
-            if pixels is None and not is_base_color:
-                return None
             texture = Texture(grey_pixels() if pixels is None else pixels, *wraps)
             self._texture_index[use] = len(self.textures)
             self.textures.append(texture)

@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 from warpir.asset import Asset, FloatArray, Material, Primitive
 from warpir.asset_files import (
     TRIANGLES,
+    concise,
     keep_area,
     nothing_to_render,
     plain_material,
@@ -131,7 +132,7 @@ def read_obj(path: Path, content: bytes, missing_textures: str) -> Asset:
         primitives=tuple(primitives),
         materials=tuple(library.materials),
         textures=tuple(library.textures),
-        notices=tuple(dict.fromkeys(notices)),
+        notices=concise(notices),
     )
 
 
@@ -425,7 +426,7 @@ def read_ply_stl(path: Path, content: bytes) -> Asset:
                 f"no unit in the file: read as metres, size {size[0]:g} x {size[1]:g} x {size[2]:g}"
             )
     nothing_to_render(path, primitives, type(mesh).__name__)
-    return Asset(path.stem, tuple(primitives), (material,), notices=tuple(notices))
+    return Asset(path.stem, tuple(primitives), (material,), notices=concise(notices))
 
 
 def check_promised_size(path: Path, content: bytes, kind: str) -> None:
