@@ -1,0 +1,1 @@
+"""Questions about speed and error, one module each: ``python -m benchmarks.<question>``."""
