@@ -1,0 +1,455 @@
+"""The OBJ, PLY and STL readers against small files written by the test, faults included.
+
+The ids are the rows of the project's fault table (M20, M21). Files of the development data are
+read where they exist.
+"""
+
+import io
+import struct
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from warpir.asset import Asset, load_asset
+from warpir.errors import ExitCode, InputError
+from warpir.obj import clip_ears
+
+DATA = Path(__file__).parents[2] / "shared" / "data" / "mesh"
+
+SQUARE = """\
+v 0 0 0
+v 1 0 0
+v 1 1 0
+v 0 1 0
+vt 0 0
+vt 1 0
+vt 1 1
+vt 0 1
+vn 0 0 1
+"""
+FACES = "f 1/1/1 2/2/1 3/3/1\nf 1/1/1 3/3/1 4/4/1\n"
+
+
+def png(path: Path, color: tuple[int, ...], size: int = 2) -> None:
+    """Write an image of one colour."""
+    Image.new({1: "L", 3: "RGB", 4: "RGBA"}[len(color)], (size, size), color).save(path)
+
+
+def write(folder: Path, text: str | bytes, name: str = "asset.obj") -> Path:
+    path = folder / name
+    path.write_bytes(text if isinstance(text, bytes) else text.encode())
+    return path
+
+
+def fails(path: Path, *words: str) -> None:
+    """Assert that loading ends in one sentence with the file and the words."""
+    with pytest.raises(InputError) as caught:
+        load_asset(path)
+    error = caught.value
+    assert (error.code, error.where) == (ExitCode.INPUT, str(path))
+    assert "\n" not in str(error)
+    for word in words:
+        assert word in f"{error.what} / {error.advice}"
+
+
+def area(asset: Asset) -> np.ndarray:
+    """Return the area vectors of all triangles, shape [triangle, 3]."""
+    corners = [p.positions[p.indices].transpose(1, 0, 2) for p in asset.primitives]
+    return np.concatenate([np.cross(b - a, c - a) / 2 for a, b, c in corners])
+
+
+def test_square_loads(tmp_path: Path) -> None:
+    """Positions, winding, normals, v turned down, and grey where nothing is stated."""
+    asset = load_asset(write(tmp_path, SQUARE + FACES))
+    (square,) = asset.primitives
+    np.testing.assert_array_equal(area(asset), [[0, 0, 0.5]] * 2)
+    assert square.positions.dtype == np.float64 and len(square.positions) == 4
+    np.testing.assert_array_equal(square.normals, [[0, 0, 1]] * 4)
+    np.testing.assert_array_equal(square.uv0, [[0, 1], [1, 1], [1, 0], [0, 0]])
+    (material,) = asset.materials
+    assert (material.base_color, material.metallic, material.roughness) == ((0.8,) * 3, 0.0, 0.5)
+    assert material.double_sided
+    assert any("0.8" in notice and "0.5" in notice for notice in asset.notices)
+
+
+SAME = {
+    "M20-bom": lambda t: "\ufeff" + t,
+    "M20-crlf": lambda t: t.replace("\n", "\r\n"),
+    "M20-cr": lambda t: t.replace("\n", "\r"),
+    "M20-comments": lambda t: "# a\n\n" + t.replace("\nf", " # b\n  f"),
+    "M20-continued-lines": lambda t: t.replace("f 1/1/1 ", "f 1/1/1 \\\n"),
+    "M20-negative-indices": lambda t: SQUARE + "f -4/-4/-1 -3/-3/-1 -2/-2/-1 -1/-1/-1\n",
+    "M20-quad": lambda t: SQUARE + "f 1/1/1 2/2/1 3/3/1 4/4/1\n",
+    "M20-groups": lambda t: t.replace("f 1", "o a b\ng c\ns 1\nf 1"),
+    "M20-extra-numbers": lambda t: t.replace("v 0 0 0", "v 0 0 0 1").replace("vt 0 0", "vt 0 0 0"),
+    "M20-exponents": lambda t: t.replace("v 1 0 0", "v 1e0 -0.0 +0"),
+}
+
+
+@pytest.mark.parametrize("case", SAME)
+def test_spellings_of_the_square_agree(case: str, tmp_path: Path) -> None:
+    """Byte-order marks, line ends, negative indices and polygons change nothing."""
+    asset = load_asset(write(tmp_path, SAME[case](SQUARE + FACES)))
+    np.testing.assert_array_equal(area(asset), [[0, 0, 0.5]] * 2)
+    (square,) = asset.primitives
+    assert len(square.positions) == 4 and square.normals is not None
+    assert square.uv0 is not None
+    np.testing.assert_array_equal(square.uv0[:, 1], 1 - square.positions[:, 1])
+
+
+FAULTS: dict[str, tuple[str, tuple[str, ...]]] = {
+    "M20-index-0": (SQUARE + "f 0 1 2\n", ("line 10", "'0'", "start at 1")),
+    "M20-index-too-large": (SQUARE + "f 1 2 3\nf 1 2 5\n", ("line 11", "'5'", "4 v")),
+    "M20-uv-index-too-large": (SQUARE + "f 1/9 2/1 3/1\n", ("line 10", "'1/9'", "4 vt")),
+    "M20-normal-index-0": (SQUARE + "f 1//0 2//1 3//1\n", ("line 10", "'1//0'", "1 vn")),
+    "M20-negative-too-far": (SQUARE + "f -5 -1 -2\n", ("line 10", "-5", "4 v")),
+    "M20-decimal-comma": ("v 0,5 0 0\n" + SQUARE + FACES, ("line 1", "0,5", "decimal points")),
+    "M20-nan": (SQUARE.replace("v 1 1 0", "v 1 nan 0") + FACES, ("line 3", "finite")),
+    "M20-inf-uv": (SQUARE.replace("vt 1 1", "vt 1 inf") + FACES, ("line 7", "finite")),
+    "M20-short-vertex": (SQUARE.replace("v 1 1 0", "v 1 1") + FACES, ("line 3", "3 finite")),
+    "M20-two-corners": (SQUARE + "f 1 2\n", ("line 10", "2 corners")),
+    "M20-word-as-index": (SQUARE + "f a b c\n", ("line 10", "'a'")),
+    "M20-missing-mtl": ("mtllib gone.mtl\n" + SQUARE + FACES, ("gone.mtl", "--missing-textures")),
+    "M20-mtllib-outside": ("mtllib ../x.mtl\n" + SQUARE + FACES, ("outside the asset folder",)),
+    "M20-mtllib-absolute": ("mtllib /etc/x.mtl\n" + SQUARE + FACES, ("outside the asset folder",)),
+    "M12-no-faces": (SQUARE, ("nothing to render",)),
+    "M12-lines-only": (SQUARE + "l 1 2\np 1\n", ("nothing to render",)),
+    "M13-only-zero-area": (SQUARE + "f 1 1 2\n", ("nothing to render",)),
+    "M21-text": ("hello\n", ("not an OBJ file", "convert it to GLB")),
+}
+
+
+@pytest.mark.parametrize("case", FAULTS)
+def test_fault_is_refused_with_its_line(case: str, tmp_path: Path) -> None:
+    """One sentence names the file and the line."""
+    text, words = FAULTS[case]
+    (tmp_path / "asset").mkdir()
+    (tmp_path / "x.mtl").write_text("newmtl a\n")
+    fails(write(tmp_path / "asset", text), *words)
+
+
+@pytest.mark.parametrize("name", ["asset.obj", "asset.ply", "asset.stl"])
+@pytest.mark.parametrize("content", ["png", "empty", "noise"])
+def test_M21_other_content_is_refused(name: str, content: str, tmp_path: Path) -> None:
+    """A PNG, nothing or noise under a mesh's name is refused."""
+    stream = io.BytesIO()
+    Image.new("RGB", (8, 8)).save(stream, "PNG")
+    noise = np.random.default_rng(1).bytes(300)
+    path = write(tmp_path, {"png": stream.getvalue(), "empty": b"", "noise": noise}[content], name)
+    fails(path, *(["empty file"] if content == "empty" else []))
+
+
+def test_M20_concave_polygon_is_cut_by_ears(tmp_path: Path) -> None:
+    """An L-shape keeps its area, seen from every side: no triangle lies outside or is turned."""
+    shape = np.array([[0, 0], [2, 0], [2, 1], [1, 1], [1, 2], [0, 2]], dtype=float)
+    for axes in ((0, 1, 2), (1, 2, 0), (2, 0, 1), (1, 0, 2), (0, 2, 1), (2, 1, 0)):
+        for start in range(6):
+            points = np.column_stack([np.roll(shape, start, axis=0), np.zeros(6)])[:, axes]
+            lines = ["v {} {} {}".format(*p) for p in points] + ["f 1 2 3 4 5 6"]
+            asset = load_asset(write(tmp_path, "\n".join(lines)))
+            areas = area(asset)
+            normal = areas.sum(axis=0)
+            assert np.linalg.norm(normal) == pytest.approx(3.0)
+            assert (areas @ normal > 0).all() and len(areas) == 4
+            assert any("1 concave" in notice for notice in asset.notices)
+
+
+def test_clip_ears_survives_a_crossing_polygon() -> None:
+    """A self-intersecting polygon ends in some triangulation, never in a loop."""
+    bow_tie = np.array([[0, 0, 0], [1, 1, 0], [1, 0, 0], [0, 1, 0], [0.5, 2, 0]])
+    assert clip_ears(bow_tie).shape == (3, 3)
+
+
+def test_M20_vertex_colors_are_linear_and_noted(tmp_path: Path) -> None:
+    """``v x y z r g b`` gives linear colours on white."""
+    text = SQUARE.replace("v 1 1 0", "v 1 1 0 0.5 0.25 2") + FACES
+    asset = load_asset(write(tmp_path, text))
+    colors = asset.primitives[0].colors
+    np.testing.assert_array_equal(colors, [[1, 1, 1, 1]] * 2 + [[0.5, 0.25, 1, 1], [1, 1, 1, 1]])
+    assert asset.materials[0].base_color == (1.0, 1.0, 1.0)
+    assert any("linear" in notice for notice in asset.notices)
+
+
+def with_mtl(folder: Path, mtl: str) -> Asset:
+    (folder / "asset.mtl").write_text("newmtl a b\n" + mtl)
+    return load_asset(write(folder, "mtllib asset.mtl\n" + SQUARE + "usemtl a b\n" + FACES))
+
+
+def test_mtl_pbr_keys(tmp_path: Path) -> None:
+    """Kd, Pr, Pm, Ke and d are taken as they stand."""
+    asset = with_mtl(tmp_path, "Kd 0.1 0.2 0.3\nPr 0.4\nPm 0.5\nKe 6 7 8\nd 0.9\n")
+    (material,) = asset.materials
+    assert material.name == "a b"
+    assert material.base_color == (0.1, 0.2, 0.3)
+    assert (material.roughness, material.metallic, material.alpha) == (0.4, 0.5, 0.9)
+    assert material.emission == (6.0, 7.0, 8.0)
+    assert (material.alpha_mode, material.double_sided) == ("BLEND", True)
+    assert asset.notices == ()
+
+
+def test_mtl_roughness_from_the_exponent(tmp_path: Path) -> None:
+    """Ns gives roughness^2 = sqrt(2 / (Ns + 2)) where there is no Pr, and is noted as assumed."""
+    asset = with_mtl(tmp_path, "Kd 1 1 1\nNs 30\n")
+    assert asset.materials[0].roughness == pytest.approx((2 / 32) ** 0.25)
+    assert any("assumed from Ns" in notice for notice in asset.notices)
+    asset = with_mtl(tmp_path, "Kd 1 1 1\nTr 0.25\n")
+    assert (asset.materials[0].roughness, asset.materials[0].alpha) == (0.5, 0.75)
+    assert any("roughness 0.5 assumed" in notice for notice in asset.notices)
+
+
+def test_mtl_nvdiffrec_pbr(tmp_path: Path) -> None:
+    """``bsdf pbr``: Ks is (occlusion, roughness, metallic), map_Ks its texture."""
+    png(tmp_path / "c.png", (200, 100, 50))
+    asset = with_mtl(tmp_path, "bsdf pbr\nKs 0 0.25 1\nmap_Kd c.png\n")
+    (material,) = asset.materials
+    assert (material.roughness, material.metallic) == (0.25, 1.0)
+    assert material.base_color == (1.0, 1.0, 1.0)
+    assert asset.textures[0].pixels[0, 0].tolist() == [200, 100, 50, 255]
+    asset = with_mtl(tmp_path, "bsdf pbr\nKd 1 1 1\nmap_Ks c.png\n")
+    (material,) = asset.materials
+    assert (material.roughness, material.metallic) == (1.0, 1.0)
+    assert material.metallic_roughness_texture is not None
+
+
+def test_M20_map_options(tmp_path: Path) -> None:
+    """-s, -o and -clamp reach the slot; texture row 0 is the top."""
+    png(tmp_path / "a c.png", (200, 100, 50))
+    asset = with_mtl(tmp_path, "map_Kd -s 2 3 1 -o 0.1 0.2 -clamp on a c.png\nPr 1\n")
+    slot = asset.materials[0].base_color_texture
+    assert slot is not None and asset.textures[slot.texture].wrap_u == "clamp"
+    a, b, c, d, e, f = slot.transform
+    u, v = 0.3, 0.6  # v up, as OBJ means it
+    assert a * u + b * (1 - v) + c == pytest.approx(2 * u + 0.1)
+    assert d * u + e * (1 - v) + f == pytest.approx(1 - (3 * v + 0.2))
+
+
+def test_mtl_roughness_and_metallic_maps_are_packed(tmp_path: Path) -> None:
+    """map_Pr goes to G and map_Pm to B, at the larger size."""
+    png(tmp_path / "r.png", (80,), size=2)
+    png(tmp_path / "m.png", (160,), size=4)
+    asset = with_mtl(tmp_path, "Kd 1 1 1\nmap_Pr r.png\nmap_Pm m.png\n")
+    (material,) = asset.materials
+    assert (material.roughness, material.metallic) == (1.0, 1.0)
+    slot = material.metallic_roughness_texture
+    assert slot is not None
+    pixels = asset.textures[slot.texture].pixels
+    assert pixels.shape == (4, 4, 4) and pixels[3, 3].tolist() == [255, 80, 160, 255]
+
+
+def test_mtl_mask_becomes_alpha(tmp_path: Path) -> None:
+    """map_d fills the alpha of the base colour and switches to MASK; without it alpha is opaque."""
+    png(tmp_path / "c.png", (200, 100, 50, 7))
+    png(tmp_path / "d.png", (30,))
+    asset = with_mtl(tmp_path, "map_Kd c.png\nPr 1\n")
+    assert asset.materials[0].alpha_mode == "OPAQUE"
+    assert asset.textures[0].pixels[0, 0].tolist() == [200, 100, 50, 255]
+    asset = with_mtl(tmp_path, "map_Kd c.png\nmap_d d.png\nPr 1\n")
+    assert asset.materials[0].alpha_mode == "MASK"
+    assert asset.textures[0].pixels[0, 0].tolist() == [200, 100, 50, 30]
+    asset = with_mtl(tmp_path, "map_Kd c.png\nmap_d c.png\nPr 1\n")
+    assert asset.textures[0].pixels[0, 0].tolist() == [200, 100, 50, 7]
+
+
+def test_mtl_normal_and_height_maps(tmp_path: Path) -> None:
+    """A coloured map_Bump is a normal map with -bm as scale; a grey one is left out."""
+    png(tmp_path / "n.png", (128, 128, 255))
+    png(tmp_path / "h.png", (99,))
+    asset = with_mtl(tmp_path, "Kd 1 1 1\nPr 1\nmap_Bump -bm 0.5 n.png\n")
+    assert asset.materials[0].normal_texture is not None
+    assert asset.materials[0].normal_scale == 0.5
+    asset = with_mtl(tmp_path, "Kd 1 1 1\nPr 1\nbump h.png\n")
+    assert asset.materials[0].normal_texture is None
+    assert any("height map" in notice for notice in asset.notices)
+
+
+MTL_FAULTS = {
+    "M3-missing-texture": ("map_Kd gone.png\n", ("gone.png", "--missing-textures grey")),
+    "M4-texture-outside": ("map_Kd ../c.png\n", ("outside the asset folder",)),
+    "M4-texture-absolute": ("map_Kd /etc/c.png\n", ("outside the asset folder",)),
+    "M4-texture-url": ("map_Kd http://127.0.0.1/c.png\n", ("outside the asset folder",)),
+    "M18-nan": ("Kd nan 0 0\n", ("asset.mtl line 2", "finite")),
+    "M18-two-numbers": ("Kd 1 2\n", ("asset.mtl line 2", "RGB")),
+    "M18-spectral": ("Kd spectral x.rfl\n", ("asset.mtl line 2", "RGB")),
+    "M18-decimal-comma": ("Pr 0,5\n", ("asset.mtl line 2", "finite")),
+    "M18-map-without-name": ("map_Kd -s 1 1 1\n", ("asset.mtl line 2", "file name")),
+}
+
+
+@pytest.mark.parametrize("case", MTL_FAULTS)
+def test_mtl_fault_is_refused(case: str, tmp_path: Path) -> None:
+    """Faults of the material file name its line, or the texture."""
+    mtl, words = MTL_FAULTS[case]
+    folder = tmp_path / "asset"
+    folder.mkdir()
+    png(tmp_path / "c.png", (1, 2, 3))
+    with pytest.raises(InputError) as caught:
+        with_mtl(folder, mtl)
+    for word in words:
+        assert word in f"{caught.value.what} / {caught.value.advice}"
+
+
+def test_M3_missing_files_become_grey_on_request(tmp_path: Path) -> None:
+    """A missing texture is one grey texel, a missing library a grey material, both noted."""
+    (tmp_path / "asset.mtl").write_text("newmtl a\nmap_Kd gone.png\nPr 1\n")
+    path = write(tmp_path, "mtllib asset.mtl\n" + SQUARE + "usemtl a\n" + FACES)
+    asset = load_asset(path, missing_textures="grey")
+    assert asset.textures[0].pixels.shape == (1, 1, 4)
+    (tmp_path / "asset.mtl").unlink()
+    asset = load_asset(path, missing_textures="grey")
+    assert asset.textures == () and asset.materials[0].base_color == (0.8, 0.8, 0.8)
+    assert any("asset.mtl" in notice for notice in asset.notices)
+
+
+def test_one_primitive_per_material(tmp_path: Path) -> None:
+    """Faces are gathered by material name, whatever the groups."""
+    (tmp_path / "asset.mtl").write_text("newmtl a\nPr 0.1\nnewmtl b\nPr 0.2\n")
+    text = "mtllib asset.mtl\n" + SQUARE
+    for name, corners in (("a", "1 2 3"), ("b", "1 3 4"), ("a", "1 2 4")):
+        text += f"usemtl {name}\ng x\nf {corners}\n"
+    asset = load_asset(write(tmp_path, text))
+    assert [len(p.indices) for p in asset.primitives] == [2, 1]
+    assert [asset.materials[p.material].roughness for p in asset.primitives] == [0.1, 0.2]
+    assert asset.primitives[0].normals is None
+
+
+def ply(kind: str) -> bytes:
+    """Return the square with normals and colours as ASCII or binary PLY."""
+    rows = [(x, y, 0.0, 0.0, 0.0, 1.0, 51, 102, 255) for x, y in ((0, 0), (1, 0), (1, 1), (0, 1))]
+    header = f"ply\nformat {'ascii' if kind == 'ascii' else 'binary_little_endian'} 1.0\n"
+    header += "element vertex 4\n" + "".join(
+        f"property float {k}\n" for k in "x y z nx ny nz".split()
+    )
+    header += "".join(f"property uchar {k}\n" for k in ("red", "green", "blue"))
+    header += "element face 2\nproperty list uchar int vertex_indices\nend_header\n"
+    faces = [(0, 1, 2), (0, 2, 3)]
+    if kind == "ascii":
+        body = "".join(" ".join(map(str, row)) + "\n" for row in rows)
+        body += "".join("3 {} {} {}\n".format(*f) for f in faces)
+        return (header + body).encode()
+    packed = b"".join(struct.pack("<6f3B", *row) for row in rows)
+    return header.encode() + packed + b"".join(struct.pack("<B3i", 3, *f) for f in faces)
+
+
+@pytest.mark.parametrize("kind", ["ascii", "binary"])
+def test_ply_square(kind: str, tmp_path: Path) -> None:
+    """Positions, normals and linear colours of a PLY."""
+    asset = load_asset(write(tmp_path, ply(kind), "asset.ply"))
+    (square,) = asset.primitives
+    np.testing.assert_array_equal(area(asset), [[0, 0, 0.5]] * 2)
+    np.testing.assert_array_equal(square.normals, [[0, 0, 1]] * 4)
+    assert square.colors is not None
+    np.testing.assert_allclose(square.colors[0], [0.2, 0.4, 1, 1], rtol=1e-6)
+    assert asset.materials[0].double_sided
+    assert any("size 1 x 1 x 0" in notice for notice in asset.notices)
+
+
+@pytest.mark.parametrize("kind", ["ascii", "binary"])
+@pytest.mark.parametrize("fault", ["cut", "count", "index", "nan", "points"])
+def test_ply_faults(kind: str, fault: str, tmp_path: Path) -> None:
+    """Cut, lying, out-of-range and non-finite PLY files are refused."""
+    content = ply(kind)
+    if fault == "cut":
+        content = content[:-14]
+    elif fault == "count":
+        content = content.replace(b"element vertex 4", b"element vertex 2147483648")
+    elif fault == "index":
+        old, new = {
+            "ascii": (b"3 0 2 3", b"3 0 2 9"),
+            "binary": (struct.pack("<B3i", 3, 0, 2, 3), struct.pack("<B3i", 3, 0, 2, 9)),
+        }[kind]
+        content = content.replace(old, new)
+    elif fault == "nan":
+        old, new = {
+            "ascii": (b"\n1 1 0.0", b"\n1 nan 0.0"),
+            "binary": (struct.pack("<2f", 1, 1), struct.pack("<2f", 1, np.nan)),
+        }[kind]
+        content = content.replace(old, new)
+    else:
+        content = content.replace(b"element face 2", b"element face 0")
+    fails(write(tmp_path, content, "asset.ply"))
+
+
+def stl() -> bytes:
+    """Return the square as binary STL."""
+    triangles = [(0, 0, 0, 1, 0, 0, 1, 1, 0), (0, 0, 0, 1, 1, 0, 0, 1, 0)]
+    body = b"".join(struct.pack("<12fH", 0, 0, 1, *t, 0) for t in triangles)
+    return bytes(80) + struct.pack("<I", 2) + body
+
+
+def test_stl_square(tmp_path: Path) -> None:
+    """A binary STL is flat, grey and of unknown unit."""
+    asset = load_asset(write(tmp_path, stl(), "asset.STL"))
+    np.testing.assert_array_equal(area(asset), [[0, 0, 0.5]] * 2)
+    assert asset.primitives[0].normals is None
+    assert any("no unit" in notice for notice in asset.notices)
+    assert any("grey 0.8" in notice for notice in asset.notices)
+
+
+def test_stl_ascii_square(tmp_path: Path) -> None:
+    """An ASCII STL holds the same triangles."""
+    facets = "".join(
+        f"facet normal 0 0 1\nouter loop\n{corners}endloop\nendfacet\n"
+        for corners in (
+            "vertex 0 0 0\nvertex 1 0 0\nvertex 1 1 0\n",
+            "vertex 0 0 0\nvertex 1 1 0\nvertex 0 1 0\n",
+        )
+    )
+    asset = load_asset(write(tmp_path, f"solid a\n{facets}endsolid a\n", "asset.stl"))
+    np.testing.assert_array_equal(area(asset), [[0, 0, 0.5]] * 2)
+
+
+@pytest.mark.parametrize("fault", ["cut", "count", "nan", "empty"])
+def test_stl_faults(fault: str, tmp_path: Path) -> None:
+    """Cut, lying, non-finite and empty STL files are refused."""
+    content = {
+        "cut": stl()[:-9],
+        "count": stl()[:80] + struct.pack("<I", 2**31) + stl()[84:],
+        "nan": stl().replace(struct.pack("<3f", 1, 1, 0), struct.pack("<3f", 1, np.nan, 0)),
+        "empty": bytes(84),
+    }[fault]
+    fails(write(tmp_path, content, "asset.stl"))
+
+
+@pytest.mark.parametrize("name", ["asset.obj", "asset.ply", "asset.stl"])
+def test_byte_flips_give_an_asset_or_our_error(
+    name: str, tmp_path: Path, rng: np.random.Generator
+) -> None:
+    """Damaged bytes anywhere end in an asset or in one InputError."""
+    content = {
+        "asset.obj": (SQUARE + FACES).encode(),
+        "asset.ply": ply("binary"),
+        "asset.stl": stl(),
+    }
+    original = np.frombuffer(content[name], np.uint8)
+    for _ in range(150):
+        damaged = original.copy()
+        at = rng.integers(0, len(damaged), size=rng.integers(1, 4))
+        damaged[at] = rng.integers(0, 256, size=len(at))
+        path = write(tmp_path, damaged.tobytes(), name)
+        try:
+            load_asset(path)
+        except InputError as error:
+            assert error.where == str(path)
+
+
+REAL = {  # triangles, textures
+    "spot/spot.obj": (5856, 1),
+    "hard/negative_indices.obj": (12, 0),
+    "hard/featuretype.STL": (3476, 0),
+    "hard/soup.stl": (100, 0),
+}
+
+
+@pytest.mark.parametrize("name", REAL)
+def test_real_file_has_the_published_counts(name: str) -> None:
+    """Files of the development data have the triangles that their table states."""
+    if not DATA.is_dir():
+        pytest.skip("no development data beside the repository")
+    asset = load_asset(DATA / name)
+    counts = sum(len(p.indices) for p in asset.primitives), len(asset.textures)
+    assert counts == REAL[name]
+    if name == "spot/spot.obj":
+        (material,) = asset.materials
+        assert (material.roughness, material.metallic) == (0.25, 0.0)
