@@ -12,11 +12,12 @@ LEVELS = (
     {"errors", "color"},
     {"config", "asset", "strict_json"},
     {"camera", "asset_files", "record", "light", "tone"},
-    {"gltf_file", "mtl", "files", "command", "placement", "lobes_file"},
+    {"gltf_file", "mtl", "files", "command", "placement", "lobes_file", "lobe_fit"},
     {"gltf_material", "obj"},
     {"gltf"},
     {"inputs", "scene"},
-    {"render"},
+    {"render", "lighting"},
+    {"picture"},
     {"integrator"},
     {"bridge"},
     {"mis", "transport"},
@@ -32,8 +33,8 @@ UPWARD = {("asset", "gltf"), ("asset", "obj")}
 ONLY_IN = {
     "warp": {"kernels", "scene", "render", "bridge"},
     "torch": {
-        "diffusion", "tone", "bridge", "integrator", "mis", "transport", "optimize", "fit", "insert",
-        "prior_images",
+        "diffusion", "tone", "bridge", "integrator", "mis", "transport", "optimize", "fit",
+        "stages", "insert", "prior_images",
     },
     "trimesh": {"gltf", "obj", "demo"},
     "OpenImageIO": {"files"},
@@ -57,9 +58,13 @@ def sources() -> list[Path]:
 
 
 def imports(path: Path) -> list[tuple[int, str]]:
-    """Return (line, absolute dotted name) of every import, wherever it stands."""
+    """Return (line, absolute dotted name) of every import that can run, wherever it stands."""
     found: list[tuple[int, str]] = []
-    for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+    tree = ast.parse(path.read_text(encoding="utf-8"))
+    for block in ast.walk(tree):
+        if isinstance(block, ast.If) and ast.unparse(block.test) == "TYPE_CHECKING":
+            block.body = []
+    for node in ast.walk(tree):
         if isinstance(node, ast.Import):
             found += [(node.lineno, alias.name) for alias in node.names]
         elif isinstance(node, ast.ImportFrom):
