@@ -25,6 +25,7 @@ from warpir.files import (
     ENVMAP_ROLLS,
     Layers,
     OutputFolder,
+    Photo,
     read_envmap,
     read_photo,
     write_layers,
@@ -369,10 +370,20 @@ def test_srgb_profile_changes_nothing(tmp_path: Path, rng: np.random.Generator) 
     np.testing.assert_array_equal(photo.srgb, codes.astype(np.float32) / np.float32(255))
 
 
-@pytest.mark.parametrize("icc", [b"rubbish" * 30, b"lab"])
-def test_unusable_profiles_are_noted(tmp_path: Path, rng: np.random.Generator, icc: bytes) -> None:
-    if icc == b"lab":
-        icc = ImageCms.ImageCmsProfile(ImageCms.createProfile("LAB")).tobytes()
+@pytest.mark.parametrize("case", ["rubbish", "lab", "tag-count", "curve-count", "cut", "singular"])
+def test_unusable_profiles_are_noted(tmp_path: Path, rng: np.random.Generator, case: str) -> None:
+    icc = matrix_profile("p3")
+    many = struct.pack(">I", 2**31)
+    icc = {
+        "rubbish": b"rubbish" * 30,
+        "lab": ImageCms.ImageCmsProfile(ImageCms.createProfile("LAB")).tobytes(),
+        "tag-count": icc[:128] + many + icc[132:],
+        "curve-count": icc.replace(b"curv\0\0\0\0\0\0\0\x01", b"curv\0\0\0\0" + many),
+        "cut": icc[:300],
+        "singular": icc.replace(struct.pack(">i", round(0.51512 * 65536)), bytes(4)).replace(
+            struct.pack(">i", round(0.29198 * 65536)), bytes(4)
+        ),
+    }[case]
     Image.fromarray(codes8(rng)).save(tmp_path / "p.jpg", icc_profile=icc)
     assert any("taken as sRGB" in notice for notice in read_photo(tmp_path / "p.jpg").notices)
 
@@ -851,6 +862,33 @@ def test_non_finite_layer_is_a_numeric_failure(tmp_path: Path, rng: np.random.Ge
             write_layers(out, layers, camera)
     assert caught.value.code == ExitCode.NUMERIC
     assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.parametrize("kind", ["jpg", "png", "tif", "webp", "exr", "hdr"])
+def test_flipped_bytes_give_a_picture_or_our_error(
+    tmp_path: Path, rng: np.random.Generator, kind: str
+) -> None:
+    path = tmp_path / f"p.{kind}"
+    if kind in ("exr", "hdr"):
+        write_image(path, rng.random((16, 32, 3), dtype=np.float32))
+    else:
+        Image.fromarray(codes8(rng)).save(path, icc_profile=matrix_profile("p3"))
+    sound = path.read_bytes()
+    for trial in range(60):
+        content = bytearray(sound)
+        # Half of the flips hit the header, where counts and sizes are.
+        places = rng.integers(0, len(sound) if trial % 2 else min(300, len(sound)), 3)
+        for place in places:
+            content[place] = rng.integers(0, 256)
+        path.write_bytes(content)
+        for read in (read_photo, read_envmap):
+            try:
+                pixels = read(path)
+            except InputError as error:
+                assert "\n" not in str(error)
+            else:
+                values = pixels.srgb if isinstance(pixels, Photo) else pixels
+                assert np.isfinite(values).all()
 
 
 # ------------------------------------------------------------------------- real data, imports

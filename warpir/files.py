@@ -95,7 +95,11 @@ class Photo:
         """
         if self.is_linear:
             return np.round(np.clip(srgb, 0.0, 1.0) * 65535.0).astype(np.uint16)
-        own = _srgb_to_profile(srgb, self.icc) if self.icc is not None else srgb
+        own = srgb
+        if self.icc is not None:
+            in_profile = _srgb_to_profile(srgb, self.icc)
+            assert in_profile is not None, "read_photo keeps only profiles that work both ways"
+            own = in_profile
         top = np.iinfo(self.codes.dtype).max
         edited = np.round(np.clip(own.astype(np.float64), 0.0, 1.0) * top).astype(self.codes.dtype)
         return np.where(changed[..., None], edited, self.codes)
@@ -569,20 +573,47 @@ def _convert_profile(
     path: Path, codes: Pixels, srgb: FloatArray, icc: bytes
 ) -> tuple[Pixels, FloatArray, bytes | None, str]:
     """Return (codes, srgb, profile to keep, notice) of an image that carries a profile."""
+    broken = "colour profile is broken: taken as sRGB"
+    if not _profile_is_whole(icc):
+        return codes, srgb, None, broken
     probe = np.stack(np.meshgrid(*[np.linspace(0.0, 1.0, 9, dtype=np.float32)] * 3), axis=-1)
     probe = probe.reshape(27, 27, 3)
     expected = _profile_to_srgb(probe, icc)
-    if expected is not None:
-        if float(np.abs(expected - probe).max()) < 2e-3:  # the profile is sRGB
-            return codes, srgb, None, ""
-        converted = _profile_to_srgb(srgb, icc)
-        assert converted is not None
-        outside = int(((converted < -1e-3) | (converted > 1.0 + 1e-3)).any(axis=-1).sum())
-        notice = "colours converted from the embedded profile to sRGB"
-        if outside:
-            notice += f"; {outside} pixels lie outside sRGB and are clipped for the renderer"
-        return codes, np.clip(converted, 0.0, 1.0), icc, notice
-    return _convert_lut_profile(path, codes, srgb, icc)
+    if expected is None:
+        return _convert_lut_profile(path, codes, srgb, icc)
+    if float(np.abs(expected - probe).max()) < 2e-3:  # the profile is sRGB
+        return codes, srgb, None, ""
+    back = _srgb_to_profile(expected, icc)
+    if back is None or not np.allclose(back, probe, atol=0.01):  # a NaN is not close either
+        return codes, srgb, None, broken
+    converted = _profile_to_srgb(srgb, icc)
+    if converted is None or not np.isfinite(converted).all():
+        return codes, srgb, None, broken
+    outside = int(((converted < -1e-3) | (converted > 1.0 + 1e-3)).any(axis=-1).sum())
+    notice = "colours converted from the embedded profile to sRGB"
+    if outside:
+        notice += f"; {outside} pixels lie outside sRGB and are clipped for the renderer"
+    return codes, np.clip(converted, 0.0, 1.0), icc, notice
+
+
+def _profile_is_whole(icc: bytes) -> bool:
+    """Check that the tags of a profile lie inside it.
+
+    OpenColorIO believes the counts: a flipped byte in them costs a minute and gigabytes.
+    """
+    if len(icc) < 132 or icc[36:40] != b"acsp":
+        return False
+    (tag_count,) = struct.unpack_from(">I", icc, 128)
+    if 132 + 12 * tag_count > len(icc):
+        return False
+    for k in range(tag_count):
+        offset, size = struct.unpack_from(">4xII", icc, 132 + 12 * k)
+        if size < 8 or offset + size > len(icc):
+            return False
+        if icc[offset : offset + 4] == b"curv":
+            if size < 12 or 12 + 2 * struct.unpack_from(">I", icc, offset + 8)[0] > size:
+                return False
+    return True
 
 
 def _convert_lut_profile(
@@ -594,7 +625,7 @@ def _convert_lut_profile(
     try:
         profile = ImageCms.ImageCmsProfile(io.BytesIO(icc))
         space = str(profile.profile.xcolor_space).strip()
-    except (OSError, ImageCms.PyCMSError):
+    except (OSError, ValueError, ImageCms.PyCMSError):
         return codes, srgb, None, "colour profile is broken: taken as sRGB"
     if space != "RGB":
         return codes, srgb, None, f"colour profile is for {space} images: taken as sRGB"
@@ -635,13 +666,11 @@ def _profile_to_srgb(encoded: FloatArray, icc: bytes) -> FloatArray | None:
     return srgb
 
 
-def _srgb_to_profile(srgb: FloatArray, icc: bytes) -> FloatArray:
+def _srgb_to_profile(srgb: FloatArray, icc: bytes) -> FloatArray | None:
     """Encode display-encoded Rec.709 into a matrix profile, shape [H, W, 3], in [0, 1]."""
     linear = color.srgb_to_linear(srgb)
     xyz = linear @ np.linalg.inv(color.XYZ_TO_REC709).T.astype(np.float32)
-    encoded = _apply_profile(xyz, icc, inverse=False)
-    assert encoded is not None, "a profile that was read can be written"
-    return encoded
+    return _apply_profile(xyz, icc, inverse=False)
 
 
 def _apply_profile(values: FloatArray, icc: bytes, inverse: bool) -> FloatArray | None:
@@ -654,9 +683,10 @@ def _apply_profile(values: FloatArray, icc: bytes, inverse: bool) -> FloatArray 
         profile_path.write_bytes(icc)
         source = oiio.ImageBuf(np.ascontiguousarray(values, dtype=np.float32))
         target = oiio.ImageBuf()
-        done = oiio.ImageBufAlgo.ociofiletransform(
-            target, source, str(profile_path), False, inverse
-        )
+        with _captured_stderr():
+            done = oiio.ImageBufAlgo.ociofiletransform(
+                target, source, str(profile_path), False, inverse
+            )
         if not done:
             target.geterror()
             return None
