@@ -56,6 +56,8 @@ FLAGS = {
         "sun": "AZIMUTH,ELEVATION[,STRENGTH]",
         "sky": "NAME|R,G,B",
         "exposure": "EV",
+        "tone": "NAME",
+        "ground_albedo": "SHARE",
     },
     "rendering": {
         "guidance": "NAME",

@@ -81,6 +81,12 @@ class InsertConfig:
     exposure: float | None = None
     """Factor on the light, in stops [EV] (default: chosen from the photo)"""
 
+    tone: str = "reinhard"
+    """How the object's radiance becomes display values: reinhard, or linear (clipped), which is
+    right when --exposure is the photo's own"""
+    ground_albedo: float = 0.25
+    """Reflectance assumed of the ground, for the automatic exposure [1]"""
+
     guidance: str = "none"
     """What recovers the light from the photo; none: the light is used as given"""
     samples: int = 64
@@ -183,6 +189,8 @@ def _values_out_of_range(config: InsertConfig) -> Iterator[InputError]:
         presets = f"{', '.join(SKY_PRESETS)} or R,G,B"
         yield from check("sky", config.sky in SKY_PRESETS, presets)
     yield from at_least("exposure", -30, 30)
+    yield from one_of("tone", ("reinhard", "linear"))
+    yield from check("ground_albedo", 0.0 < config.ground_albedo <= 1.0, "more than 0, at most 1")
     yield from one_of("guidance", ("none",))
     yield from at_least("samples", 1, 2**20)
     yield from at_least("rays", 1, 2**10)

@@ -22,14 +22,22 @@ import threading
 import traceback
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from types import FrameType, ModuleType
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from warpir.command import parse
 from warpir.config import InsertConfig, usage
 from warpir.errors import ExitCode, InputError
+
+if TYPE_CHECKING:
+    from warpir.camera import Camera
+    from warpir.files import OutputFolder
+    from warpir.inputs import Inputs
+    from warpir.lighting import SceneLight
+    from warpir.picture import Picture
+    from warpir.render import ToneKnots
 
 __all__ = ["InsertConfig", "Insertion", "insert", "main"]
 
@@ -68,61 +76,154 @@ def insert(config: InsertConfig) -> Insertion:
     Raises:
         InputError: An input or the output folder cannot be used; nothing was written then.
     """
-    from warpir.record import Timings, run_record
+    from warpir.record import Timings, progress_bar, run_record
     from warpir.strict_json import read_json_object
 
     config.require_inputs()
     timings = Timings()
     with timings.stage("read"):
-        config, inputs = _read(config)
+        config, inputs, light = _read(config)
 
     from warpir.files import OutputFolder
 
     assert config.out is not None
-    with OutputFolder(Path(config.out), overwrite=config.overwrite) as output:
-        # torch and Warp are loaded here, after everything that can be wrong was looked at.
+    with OutputFolder(config.out, overwrite=config.overwrite) as output:
+        # Warp is loaded here, after everything that can be wrong was looked at.
         with timings.stage("load"):
-            from warpir import stages
+            from warpir.picture import Quality, make_picture
+            from warpir.render import Renderer, ToneKnots, choose_device
+            from warpir.scene import Placed, Proxy, Scene
 
-            device = stages.choose_device(config.device, config.threads)
+            device = choose_device(config.device)
             _say(f"device: {device}")
         with timings.stage("scene"):
-            scene = stages.make_scene(inputs, config, device)
-        with timings.stage("light"):
-            light = stages.make_light(inputs, config, device)
-        with timings.stage("render"):
-            layers = stages.render_layers(scene, light, config)
-        with timings.stage("compose"):
-            picture = stages.compose(inputs.photo, layers)
+            ground = inputs.placement.ground
+            scene = Scene(
+                [Placed(inputs.asset, inputs.placement.asset_to_world)],
+                _rendering_camera(inputs.camera, config),
+                Proxy(ground[:3], -float(ground[3])),
+                device,
+            )
+        with timings.stage("render"), progress_bar() as report:
+            curves = ToneKnots.identity(1), ToneKnots.identity(3)
+            picture = make_picture(
+                Renderer(scene, config.threads or 0, report),
+                light.light,
+                light.light,
+                inputs.photo,
+                Quality(config.samples, config.rays, config.depth, config.seed),
+                *curves,
+                is_reinhard=config.tone == "reinhard",
+            )
         with timings.stage("write"):
-            measured = stages.write(output, inputs, light, layers, picture, config)
+            measured = _write(output, config, inputs, light, picture, curves)
         record = run_record(
             config,
-            device=str(device),
+            device=str(scene.device),
             timings=timings,
             assumed=(*inputs.assumed, *light.assumed),
             notices=inputs.notices,
-            measured=measured,
+            measured={"triangles": scene.triangle_count, **measured},
         )
         output.write_json("run.json", record)
     record = read_json_object(output.path / "run.json")
     return Insertion(output.path, (*record["files"], "run.json"), record)
 
 
-def _read(config: InsertConfig) -> tuple[InsertConfig, Any]:
+def _rendering_camera(camera: "Camera", config: InsertConfig) -> "Camera":
+    """Return the photo's camera, or the same view at --width."""
+    if config.width is None:
+        return camera
+    return camera.scaled(config.width, max(1, round(config.width * camera.height / camera.width)))
+
+
+def _write(
+    output: "OutputFolder",
+    config: InsertConfig,
+    inputs: "Inputs",
+    light: "SceneLight",
+    picture: "Picture",
+    curves: "tuple[ToneKnots, ToneKnots]",
+) -> dict[str, Any]:
+    """Stage all files but ``run.json``; return the numbers that belong into it."""
+    from warpir.files import write_layers
+    from warpir.light import summarize
+    from warpir.lobes_file import lobes_to_json
+    from warpir.picture import as_file_map, balls
+    from warpir.record import input_hashes
+
+    photo, camera = inputs.photo, inputs.camera
+    codes = photo.encode(picture.image, picture.changed)
+    output.write_png("composite.png", codes, icc=photo.icc, mark=config.mark)
+    clamped = write_layers(
+        output, picture.layers, camera, config=asdict(config), inputs=input_hashes(config)
+    )
+    output.write_envmap(as_file_map(light.light))
+    if light.light.lobes is not None:
+        output.write_json("lobes.json", lobes_to_json(light.light.lobes))
+    names = ("foreground", "shadow_ratio")
+    output.write_json(
+        "curves.json",
+        {
+            "format": "warpir-curves",
+            "version": 1,
+            "tone": config.tone,
+            **{
+                name: {"x": knots.x.tolist(), "y": knots.y.tolist(), "slope": knots.slope.tolist()}
+                for name, knots in zip(names, curves, strict=True)
+            },
+        },
+    )
+    output.write_json("camera.json", camera.record())
+    output.write_png(
+        "balls.png",
+        balls(light.light, camera, config.tone == "reinhard"),
+        mark=False,
+        description="Mirror ball and white diffuse ball under the light",
+    )
+    summary = summarize(light.light)
+    _say(
+        f"light: brightest toward azimuth {summary.azimuth_deg:.0f}, elevation "
+        f"{summary.elevation_deg:.0f} degrees; {100.0 * summary.peak_share:.0f} % of its flux "
+        "comes from there"
+    )
+    if not (picture.layers.matte > 0.0).any():
+        _say("notice: the object is not seen in the photo")
+    fit = light.fit
+    return {
+        "prior": "none",
+        "integrator": "mis",
+        "exposure_ev": light.exposure,
+        "light": asdict(summary),
+        "lobe_fit": fit
+        and {
+            "irradiance_error": fit.irradiance_error,
+            "flux_error": fit.flux_error,
+            "lamps": fit.lamp_count,
+        },
+        "object_pixels": picture.object_pixel_count,
+        "shadow_pixels": picture.proxy_pixel_count,
+        "changed_pixels": int(picture.changed.sum()),
+        "values_clamped_to_half": clamped,
+    }
+
+
+def _read(config: InsertConfig) -> "tuple[InsertConfig, Inputs, SceneLight]":
     """Read and check all inputs and say what was assumed; the demo brings its own."""
     from warpir.inputs import read_inputs
+    from warpir.lighting import make_light
 
     if config.demo:
         from warpir.demo import demo_config
 
         config = demo_config(config)
     inputs = read_inputs(config)
-    for line in inputs.assumed:
+    light = make_light(inputs, config)
+    for line in (*inputs.assumed, *light.assumed):
         _say(f"assumed: {line}")
     for line in inputs.notices:
         _say(f"notice: {line}")
-    return config, inputs
+    return config, inputs, light
 
 
 def main(argv: Sequence[str] | None = None) -> int:

@@ -153,40 +153,38 @@ def angles_from_axis(axis: Float64Array) -> tuple[float, float]:
     return float(np.degrees(np.arctan2(x, -z))), float(np.degrees(np.arctan2(y, np.hypot(x, z))))
 
 
-def sun_and_sky(
-    azimuth_deg: float,
-    elevation_deg: float,
-    sun_to_sky: float,
-    sky: tuple[float, float, float],
-    ground: tuple[float, float, float],
-) -> Light:
-    """Return a plain sky of one colour over one ground, and a sun of real angular size.
+def sun_lobe(
+    azimuth_deg: float, elevation_deg: float, irradiance: tuple[float, float, float]
+) -> Lobes:
+    """Return one lobe with the sun's angular size.
 
     Args:
-        azimuth_deg: Of the sun, see `axis_from_angles` [deg].
-        elevation_deg: Of the sun above the horizon [deg].
-        sun_to_sky: Irradiance of a horizontal surface from the sun over that from the sky [1]. At a
-            low sun this is still what the horizontal surface receives.
-        sky: Radiance of the upper hemisphere, linear RGB.
-        ground: Radiance of the lower hemisphere, linear RGB.
+        azimuth_deg: See `axis_from_angles` [deg].
+        elevation_deg: Above the horizon [deg].
+        irradiance: Of a surface that faces the sun, linear RGB, relative [W/m^2].
     """
-    height, width = 64, 128
-    texels = np.empty((height, width, 3), np.float32)
-    texels[: height // 2] = sky
-    texels[height // 2 :] = ground
-    axis = axis_from_angles(azimuth_deg, elevation_deg)
     # A uniform disc of radius r has the per-axis variance r^2 / 4; a lobe has 1 / sharpness.
     sharpness = 4.0 / np.radians(SUN_RADIUS_DEG) ** 2
-    sky_irradiance = np.pi * float(luminance(np.asarray(sky, np.float64)))
-    per_amplitude = 2.0 * np.pi / sharpness * max(np.sin(np.radians(elevation_deg)), 1e-3)
-    amplitude = sun_to_sky * sky_irradiance / per_amplitude
-    color = np.array([1.0, 0.95, 0.88]) / float(luminance(np.array([1.0, 0.95, 0.88])))
-    lobes = Lobes(
-        (amplitude * color)[None].astype(np.float32),
+    amplitude = np.asarray(irradiance) * sharpness / (2.0 * np.pi)
+    axis = axis_from_angles(azimuth_deg, elevation_deg)
+    return Lobes(
+        amplitude[None].astype(np.float32),
         axis[None].astype(np.float32),
         np.array([sharpness], np.float32),
     )
-    return Light(lobes, texels)
+
+
+def plain_sky(sky: tuple[float, float, float], ground: tuple[float, float, float]) -> FloatArray:
+    """Return a map of one colour above the horizon and another below, shape [64, 128, 3].
+
+    Args:
+        sky: Radiance of the upper hemisphere, linear RGB.
+        ground: Radiance of the lower hemisphere, linear RGB.
+    """
+    texels = np.empty((64, 128, 3), np.float32)
+    texels[:32] = sky
+    texels[32:] = ground
+    return texels
 
 
 @dataclass(frozen=True)

@@ -18,7 +18,8 @@ from numpy.typing import NDArray
 
 from warpir.camera import Camera
 from warpir.color import luminance
-from warpir.kernels.composite import compose, tone_foreground, tone_shadow
+from warpir.errors import ExitCode, InputError
+from warpir.kernels.composite import tone_foreground, tone_shadow
 from warpir.kernels.path import trace_foreground
 from warpir.kernels.proxy import trace_proxy
 from warpir.kernels.shadow_ratio import shadow_ratio
@@ -35,6 +36,8 @@ SAMPLES_PER_SLICE = 1 << 16
 PILOT_SCALE = 4
 """Edge of the pixel blocks that decide where the plane's shadow is worth tracing [px]."""
 PILOT_SAMPLES = 32
+UNSEEN_SHADOW = 1e-3
+"""Loss of the plane's light that is not worth tracing [1]: an eighth of an 8-bit code at white."""
 
 
 @dataclass(frozen=True)
@@ -42,6 +45,28 @@ class Rows:
     """An array whose first axis is the launch's; it is cut along with the launch."""
 
     array: wp.array
+
+
+def choose_device(name: str | None) -> str:
+    """Return the Warp device to use: the one asked for, else CUDA where there is one, else CPU.
+
+    Raises:
+        InputError: The device does not exist.
+    """
+    wp.config.quiet = True
+    wp.init()
+    known = [d.alias for d in wp.get_devices()]
+    if name is None:
+        return "cuda:0" if wp.is_cuda_available() else "cpu"
+    alias = "cuda:0" if name == "cuda" else name
+    if alias not in known:
+        raise InputError(
+            "--device",
+            f"no device {name} here (found {', '.join(known)})",
+            "use --device cpu",
+            ExitCode.USAGE,
+        )
+    return alias
 
 
 def default_threads() -> int:
@@ -389,8 +414,8 @@ class Renderer:
         """Return the pixels where the object may change the plane's light, row-major.
 
         A pilot pass traces the same shadow rays over blocks of `PILOT_SCALE` pixels, each sample at
-        a position of its own in the block. A block in whose 3 x 3 neighbourhood no ray was blocked
-        (288 samples, drawn in proportion to the light) is left alone and stays the photo.
+        a position of its own in the block. A block whose 3 x 3 neighbourhood loses less than
+        `UNSEEN_SHADOW` of its light is left alone and stays the photo, bit for bit.
         """
         camera = self.scene.camera
         width, height = -(-camera.width // PILOT_SCALE), -(-camera.height // PILOT_SCALE)
@@ -416,8 +441,10 @@ class Renderer:
             seed,
             self.scene.camera_args_at(coarse),
         )
-        changed = (pilot.lit != pilot.unoccluded).any(axis=1).reshape(height, width)
-        blocks = _dilate(changed)
+        with np.errstate(divide="ignore", invalid="ignore"):
+            lost = np.where(pilot.unoccluded > 0.0, 1.0 - pilot.lit / pilot.unoccluded, 0.0)
+        lost = lost.max(axis=1).reshape(height, width)
+        blocks = _dilate(_mean_of_neighbours(lost) > UNSEEN_SHADOW)
         full = np.repeat(np.repeat(blocks, PILOT_SCALE, axis=0), PILOT_SCALE, axis=1)
         return np.flatnonzero(full[: camera.height, : camera.width]).astype(np.int32)
 
@@ -476,39 +503,6 @@ class Renderer:
         )
         return fg.numpy()[:objects], shadow.numpy()[:proxies]
 
-    def compose(
-        self,
-        photo_lin: FloatArray,
-        object_pixels: IntArray,
-        proxy_pixels: IntArray,
-        mask: FloatArray,
-        foreground_display: FloatArray,
-        ratio_display: FloatArray,
-    ) -> FloatArray:
-        """Put the object over the shaded photo and encode (DiPIR, eq. 6); shape [H, W, 3]."""
-        height, width = photo_lin.shape[:2]
-        image = wp.zeros(height * width, dtype=wp.vec3, device=self.device)
-
-        def rows(values: FloatArray, dtype: type) -> wp.array:
-            return self._array(values if len(values) else np.zeros((1, 3), np.float32), dtype)
-
-        self.launch(
-            compose,
-            height * width,
-            [
-                Rows(self._array(photo_lin.reshape(-1, 3).astype(np.float32), wp.vec3)),
-                Rows(self._array(index_of(object_pixels, height * width), wp.int32)),
-                Rows(self._array(index_of(proxy_pixels, height * width), wp.int32)),
-                self._array(mask if len(mask) else np.zeros(1, np.float32), wp.float32),
-                rows(foreground_display, wp.vec3),
-                rows(ratio_display, wp.vec3),
-                Rows(image),
-            ],
-            1,
-        )
-        composed: FloatArray = image.numpy().reshape(height, width, 3)
-        return composed
-
 
 @dataclass(frozen=True)
 class ToneKnots:
@@ -539,6 +533,14 @@ def index_of(pixels: IntArray, count: int) -> IntArray:
     index = np.full(count, -1, np.int32)
     index[pixels] = np.arange(len(pixels), dtype=np.int32)
     return index
+
+
+def _mean_of_neighbours(values: FloatArray) -> FloatArray:
+    """Average each value with its eight neighbours."""
+    padded = np.pad(values, 1, mode="edge")
+    rows, columns = values.shape
+    total = sum(padded[dy : dy + rows, dx : dx + columns] for dy in range(3) for dx in range(3))
+    return np.asarray(total / 9.0, np.float32)
 
 
 def _dilate(mask: NDArray[np.bool_]) -> NDArray[np.bool_]:

@@ -1,0 +1,136 @@
+"""From what the user said about the light to one `Light` at the photo's exposure."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from warpir.color import luminance
+from warpir.config import InsertConfig
+from warpir.errors import InputError
+from warpir.inputs import Inputs
+from warpir.light import Light, plain_sky, sun_lobe
+from warpir.lobe_fit import LobeFit, fit_lobes
+
+SKIES = {
+    # Radiance of the sky, and the colour of the sun that goes with it.
+    "clear": ((0.45, 0.62, 1.0), (1.0, 0.94, 0.85)),
+    "overcast": ((1.0, 1.0, 1.0), (1.0, 1.0, 1.0)),
+    "sunset": ((0.75, 0.62, 0.72), (1.0, 0.62, 0.32)),
+}
+"""Relative radiances by preset, linear RGB; only their proportions matter."""
+SUN_TO_SKY = 5.0
+"""Irradiance of a surface facing the sun over that from a clear sky on the ground [1]."""
+DEFAULT_SUN = (-120.0, 40.0)
+"""Azimuth and elevation when nothing is said about the light [deg]: from the left, behind."""
+LIT_PERCENTILE = 75.0
+"""The brighter quarter of the ground round the object stands for ground that is not in shadow."""
+
+
+@dataclass(frozen=True)
+class SceneLight:
+    """The light of the scene, at the photo's exposure."""
+
+    light: Light
+    exposure: float
+    """What the given light was multiplied with, in stops [EV]."""
+    assumed: tuple[str, ...]
+    """What was chosen because nothing was given, one line each."""
+    fit: LobeFit | None = None
+    """How well the lobes fit the panorama, when they were fitted."""
+
+
+def make_light(inputs: Inputs, config: InsertConfig) -> SceneLight:
+    """Build the light and set its exposure.
+
+    Raises:
+        InputError: The light is black, so no exposure can be chosen.
+    """
+    assumed: list[str] = []
+    light = inputs.light if inputs.light is not None else _described(config, assumed)
+    fit = None
+    if config.fit_lobes is not None and light.texels is not None:
+        fit = fit_lobes(light.texels, config.fit_lobes)
+        light = Light(lobes=fit.lobes)
+    exposure = config.exposure
+    if exposure is None:
+        exposure = _automatic_exposure(light, inputs, config)
+        assumed.append(
+            f"the light is {exposure:+.2f} EV, so that ground of albedo {config.ground_albedo:g} "
+            "looks as bright as the photo's lit ground (--exposure, --ground-albedo)"
+        )
+    return SceneLight(light.scaled(2.0**exposure), exposure, tuple(assumed), fit)
+
+
+def _described(config: InsertConfig, assumed: list[str]) -> Light:
+    """Return the sun and sky of the flags."""
+    sun, sky = config.sun, config.sky
+    if sun is None and sky is None:
+        sun = DEFAULT_SUN
+        assumed.append(
+            f"a sun at azimuth {sun[0]:g}, elevation {sun[1]:g} in a clear sky "
+            "(--light, --sun, --sky)"
+        )
+    preset = sky if isinstance(sky, str) else "clear"
+    sky_color, sun_color = SKIES[preset]
+    if isinstance(sky, tuple):
+        sky_color = sky
+    # What the ground sends back up, by the same albedo that sets the exposure.
+    from_sky = np.pi * np.asarray(sky_color)
+    lobes = None
+    horizontal = from_sky.copy()
+    if sun is not None:
+        strength = sun[2] if len(sun) == 3 else SUN_TO_SKY * float(luminance(from_sky))
+        tint = np.asarray(sun_color) / float(luminance(np.asarray(sun_color)))
+        r, g, b = (float(strength * c) for c in tint)
+        lobes = sun_lobe(sun[0], sun[1], (r, g, b))
+        horizontal += strength * tint * max(np.sin(np.radians(sun[1])), 0.0)
+    r, g, b = (float(c) for c in config.ground_albedo * horizontal / np.pi)
+    return Light(lobes, plain_sky(sky_color, (r, g, b)))
+
+
+def _automatic_exposure(light: Light, inputs: Inputs, config: InsertConfig) -> float:
+    """Choose the light's scale so that Lambertian ground appears as the photo shows it.
+
+    The tone curve's start is the identity, so display value = Reinhard(albedo * E / pi), or the
+    value itself with ``--tone linear``.
+    """
+    normal = inputs.placement.ground[:3]
+    irradiance = float(luminance(light.irradiance(normal)))
+    if not irradiance > 0.0:
+        raise InputError(
+            config.light or "--sun",
+            "no light reaches the ground, so no exposure follows from the photo",
+            "give --exposure",
+        )
+    level = np.clip(_ground_level(inputs), 1e-3, 0.9)
+    wanted = level / (1.0 - level) if config.tone == "reinhard" else level
+    return float(np.log2(wanted * np.pi / (config.ground_albedo * irradiance)))
+
+
+def _ground_level(inputs: Inputs) -> float:
+    """Return the photo's linear luminance of lit ground round the object's foot [1]."""
+    camera, placement = inputs.camera, inputs.placement
+    low, high = inputs.asset.bounds()
+    size = float(np.linalg.norm((high - low) * np.linalg.norm(placement.asset_to_world[:3, 0])))
+    foot = placement.asset_to_world @ np.array(
+        [(low[0] + high[0]) / 2.0, low[1], (low[2] + high[2]) / 2.0, 1.0]
+    )
+    rings = np.linspace(0.2, 1.5, 16) * size
+    angles = np.linspace(0.0, 2.0 * np.pi, 64, endpoint=False)
+    side = np.cross(placement.ground[:3], camera.c2w[:3, 0])
+    across = np.cross(side, placement.ground[:3])
+    circle = np.cos(angles)[:, None] * _unit(across) + np.sin(angles)[:, None] * _unit(side)
+    points = (foot[:3] + rings[:, None, None] * circle[None]).reshape(-1, 3)
+    uv = camera.project(points)
+    inside = (uv >= 0.0).all(axis=1) & (uv[:, 0] < camera.width) & (uv[:, 1] < camera.height)
+    photo = luminance(inputs.photo.linear().astype(np.float64))
+    if not inside.any():
+        return float(np.percentile(photo, LIT_PERCENTILE))
+    columns, rows = uv[inside].astype(int).T
+    return float(np.percentile(photo[rows, columns], LIT_PERCENTILE))
+
+
+def _unit(v: NDArray[np.float64]) -> NDArray[np.float64]:
+    unit: NDArray[np.float64] = v / np.linalg.norm(v)
+    return unit

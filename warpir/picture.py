@@ -1,0 +1,225 @@
+"""From rendered radiance to the picture: layers at the photo's resolution, codes, ball preview."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from warpir.camera import Camera
+from warpir.color import linear_to_gamma
+from warpir.files import Layers, Photo
+from warpir.light import Light, as_map, map_directions, texel_solid_angles
+from warpir.render import Foreground, GBuffer, Renderer, ToneKnots, light_args
+
+FloatArray = NDArray[np.float32]
+Float64Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Quality:
+    """How finely a picture is sampled."""
+
+    samples: int
+    """Per pixel."""
+    rays: int
+    """Per sample and technique."""
+    depth: int
+    """Surface interactions."""
+    seed: int
+
+
+@dataclass(frozen=True)
+class Picture:
+    """A finished composite and its layers, at the photo's resolution."""
+
+    layers: Layers
+    image: FloatArray
+    """The composite, display-encoded, shape [H, W, 3]."""
+    changed: NDArray[np.bool_]
+    """Pixels that differ from the photo, shape [H, W]."""
+    object_pixel_count: int
+    """Pixels whose object was traced, at the rendering resolution."""
+    proxy_pixel_count: int
+    """Pixels whose shadow was traced, at the rendering resolution."""
+
+
+def make_picture(
+    renderer: Renderer,
+    light_fg: Light,
+    light_shadow: Light,
+    photo: Photo,
+    quality: Quality,
+    curve_fg: ToneKnots,
+    curve_shadow: ToneKnots,
+    is_reinhard: bool = True,
+) -> Picture:
+    """Render object and shadow at the scene camera's resolution and put them into the photo.
+
+    Args:
+        renderer: The scene; its camera may be smaller than the photo, never of another aspect.
+        light_fg: Lights the object.
+        light_shadow: Casts its shadow; often the same object as ``light_fg``.
+        photo: The photograph.
+        quality: Samples, rays, depth, seed.
+        curve_fg: One tone curve.
+        curve_shadow: Three tone curves.
+        is_reinhard: Whether Reinhard's operator precedes the foreground curve.
+    """
+    camera = renderer.scene.camera
+    args_fg = light_args(light_fg, renderer.device)
+    args_shadow = args_fg
+    if light_shadow is not light_fg:
+        args_shadow = light_args(light_shadow, renderer.device)
+    gbuffer = renderer.gbuffer(quality.seed)
+    foreground = renderer.foreground(
+        args_fg, gbuffer.object_pixels, quality.samples, quality.rays, quality.depth, quality.seed
+    )
+    proxy_pixels = renderer.shaded_pixels(args_shadow, quality.seed)
+    is_object = np.zeros(camera.width * camera.height, np.int32)
+    is_object[gbuffer.object_pixels] = 1
+    radiance = renderer.proxy(
+        args_shadow,
+        proxy_pixels,
+        is_object[proxy_pixels],
+        quality.samples,
+        quality.rays,
+        quality.seed,
+    )
+    fg_display, ratio_display = renderer.tone(
+        foreground, renderer.ratio(radiance), curve_fg, curve_shadow, is_reinhard
+    )
+
+    # Planes of the rendering's size, then of the photo's
+    size = (camera.height, camera.width)
+    objects, mask = gbuffer.object_pixels, foreground.mask
+    premultiplied = fg_display * mask[:, None]
+    parts = _parts(foreground, premultiplied)
+    planes = {
+        "foreground": _plane(size, objects, premultiplied),
+        "matte": _plane(size, objects, mask),
+        "shadow_ratio": _plane(size, proxy_pixels, ratio_display, outside=1.0),
+        **{name: _plane(size, objects, values) for name, values in parts.items()},
+        **_geometry(size, gbuffer, camera),
+    }
+    height, width = photo.srgb.shape[:2]
+    if size != (height, width):
+        planes = {name: _resize(plane, height, width) for name, plane in planes.items()}
+        planes["depth"][planes["matte"] <= 0.0] = np.inf
+    matte = planes["matte"]
+    plate = photo.linear()
+    composite = planes["foreground"] + (1.0 - matte)[..., None] * plate * planes["shadow_ratio"]
+    layers = Layers(
+        composite=composite,
+        foreground=np.concatenate([planes["foreground"], matte[..., None]], axis=-1),
+        plate=plate,
+        **{k: v for k, v in planes.items() if k != "foreground"},
+    )
+    changed = (matte > 0.0) | (planes["shadow_ratio"] != 1.0).any(axis=-1)
+    return Picture(
+        layers,
+        linear_to_gamma(composite).astype(np.float32),
+        changed,
+        len(objects),
+        len(proxy_pixels),
+    )
+
+
+def _parts(foreground: Foreground, premultiplied: FloatArray) -> dict[str, FloatArray]:
+    """Split the tone-mapped object so that diffuse + specular + emission = foreground.
+
+    A curve is not additive: each part keeps its share of the radiance.
+    """
+    whole = np.maximum(foreground.radiance, 1e-30)
+    diffuse = premultiplied * (foreground.diffuse / whole)
+    emission = premultiplied * (foreground.emission / whole)
+    return {
+        "diffuse": diffuse,
+        "emission": emission,
+        "specular": np.maximum(premultiplied - diffuse - emission, 0.0),
+    }
+
+
+def _geometry(size: tuple[int, int], gbuffer: GBuffer, camera: Camera) -> dict[str, FloatArray]:
+    seen = gbuffer.coverage > 0.0
+    pixels = gbuffer.object_pixels[seen]
+    position = gbuffer.position[seen]
+    depth = (camera.c2w[:3, 3] - position) @ camera.c2w[:3, 2]
+    return {
+        "depth": _plane(size, pixels, depth.astype(np.float32), outside=np.inf),
+        "position": _plane(size, pixels, position),
+        "normal": _plane(size, pixels, gbuffer.normal[seen]),
+        "albedo": _plane(size, pixels, gbuffer.base_color[seen]),
+        "roughness": _plane(size, pixels, gbuffer.roughness[seen]),
+    }
+
+
+def _plane(
+    size: tuple[int, int], pixels: NDArray[np.int32], values: FloatArray, outside: float = 0.0
+) -> FloatArray:
+    """Spread rows of values over an image."""
+    plane = np.full((size[0] * size[1], *values.shape[1:]), outside, np.float32)
+    plane[pixels] = values
+    return plane.reshape(*size, *values.shape[1:])
+
+
+def _resize(plane: FloatArray, height: int, width: int) -> FloatArray:
+    """Bring a plane to the photo's size: bilinear up, area-filtered down."""
+    from skimage.transform import resize
+
+    finite = np.where(np.isfinite(plane), plane, 0.0)
+    down = plane.shape[0] > height
+    resized = resize(
+        finite, (height, width, *plane.shape[2:]), order=1, anti_aliasing=down, preserve_range=True
+    )
+    return np.asarray(resized, dtype=np.float32)
+
+
+def balls(light: Light, camera: Camera, is_reinhard: bool, size: int = 192) -> NDArray[np.uint8]:
+    """Return a mirror ball and a white diffuse ball under the light, as the camera sees them.
+
+    Args:
+        light: At the photo's exposure.
+        camera: Gives the viewing direction.
+        is_reinhard: The tone operator of the picture.
+        size: Height of the preview [px]; it is twice as wide.
+
+    Returns:
+        Display codes, shape [size, 2 size, 3].
+    """
+    axis = (np.arange(size) + 0.5) / size * 2.0 - 1.0
+    x, y = np.meshgrid(axis * 1.06, -axis * 1.06)
+    inside = x * x + y * y < 1.0
+    z = np.sqrt(np.maximum(1.0 - x * x - y * y, 0.0))
+    normal = np.stack([x, y, z], axis=-1) @ camera.c2w[:3, :3].T
+    view = camera.c2w[:3, 2]
+    reflected = 2.0 * (normal @ view)[..., None] * normal - view
+    sharp = as_map(light, 256)
+    lon = np.arctan2(reflected[..., 0], reflected[..., 2])
+    lat = np.arcsin(np.clip(reflected[..., 1], -1.0, 1.0))
+    column = ((0.5 - 0.5 * lon / np.pi) * sharp.shape[1]).astype(int) % sharp.shape[1]
+    row = np.minimum((0.5 - lat / np.pi) * sharp.shape[0], sharp.shape[0] - 1).astype(int)
+    mirror = sharp[row, column].astype(np.float64)
+    coarse = as_map(light, 32).astype(np.float64)
+    weighted = (coarse * texel_solid_angles(32, 64)[:, None, None]).reshape(-1, 3)
+    cosine = np.maximum(normal.reshape(-1, 3) @ map_directions(32, 64).reshape(-1, 3).T, 0.0)
+    diffuse = (cosine @ weighted / np.pi).reshape(size, size, 3)
+    pair = []
+    for ball in (mirror, diffuse):
+        shown = ball / (1.0 + ball) if is_reinhard else np.minimum(ball, 1.0)
+        shown = np.where(inside[..., None], shown, 0.18)
+        pair.append(linear_to_gamma(shown))
+    return np.round(np.concatenate(pair, axis=1) * 255.0).astype(np.uint8)
+
+
+def as_file_map(light: Light) -> FloatArray:
+    """Return the light as a map for files: a given map's own size, lobes on 512 rows or more."""
+    height = 256
+    if light.texels is not None:
+        height = max(light.texels.shape[0], 16)
+    if light.lobes is not None:
+        height = max(height, 512)
+    if light.texels is not None and light.lobes is None:
+        return light.texels
+    return as_map(light, height)

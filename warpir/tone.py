@@ -1,0 +1,71 @@
+"""Tone curves, the host's half: raw parameters to the knots of a monotone rational-quadratic spline.
+
+Durkan et al. 2019, "Neural Spline Flows", with the constants of the authors' code `nflows`; the
+device's half, evaluation, is `warpir.kernels.tone`. Zero parameters are the identity.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+MIN_BIN = 1e-3
+"""Least width, height and slope of a bin [1]."""
+
+
+@dataclass(frozen=True)
+class Knots:
+    """Knots of one or several curves, shape [curve, bin + 1] each; differentiable."""
+
+    x: Tensor
+    y: Tensor
+    slope: Tensor
+
+    @property
+    def bin_count(self) -> int:
+        """Number of bins."""
+        return int(self.x.shape[1]) - 1
+
+
+def _edges(raw: Tensor) -> Tensor:
+    """Turn raw bin sizes, shape [curve, bin], into increasing edges from 0 to 1."""
+    bins = raw.shape[1]
+    size = MIN_BIN + (1.0 - MIN_BIN * bins) * torch.softmax(raw, dim=1)
+    inner = torch.cumsum(size, dim=1)[:, :-1]
+    zero = torch.zeros_like(inner[:, :1])
+    return torch.cat([zero, inner, zero + 1.0], dim=1)
+
+
+class ToneCurve(torch.nn.Module):
+    """One or several tone curves; 16 raw numbers a curve at 5 bins.
+
+    Args:
+        curves: 1 for the foreground, 3 for the shadow ratio's channels.
+        bins: Bins of the spline.
+
+    Attributes:
+        widths: Raw bin widths, shape [curve, bin].
+        heights: Raw bin heights, shape [curve, bin].
+        slopes: Raw slopes, shape [curve, bin + 1].
+    """
+
+    def __init__(self, curves: int, bins: int = 5) -> None:
+        super().__init__()
+        self.widths = torch.nn.Parameter(torch.zeros(curves, bins))
+        self.heights = torch.nn.Parameter(torch.zeros(curves, bins))
+        self.slopes = torch.nn.Parameter(torch.zeros(curves, bins + 1))
+
+    def forward(self) -> Knots:
+        """Return the knots that the current parameters mean."""
+        # This beta makes softplus(0) = 1 - MIN_BIN, so that a zero parameter is slope 1.
+        beta = float(np.log(2.0) / (1.0 - MIN_BIN))
+        slope = MIN_BIN + torch.nn.functional.softplus(self.slopes, beta=beta)
+        return Knots(_edges(self.widths), _edges(self.heights), slope)
+
+    def arrays(self) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.float32]]:
+        """Return the knots as plain arrays x, y, slope, for files and the final render."""
+        with torch.no_grad():
+            knots = self.forward()
+        return knots.x.cpu().numpy(), knots.y.cpu().numpy(), knots.slope.cpu().numpy()
