@@ -2,12 +2,12 @@
 
 Frames and units
     World right-handed, +Y up, metres, **recentred on the object** so that float32 keeps its
-    precision; directions are unit vectors. ``wo`` points toward the camera, ``wi`` toward the light.
+    precision; directions are unit vectors. ``wo`` points toward the camera, ``wi`` to the light.
     Radiance is linear Rec.709, relative [W/(m^2 sr)]. Densities are per solid angle and 0 outside
     their support.
 
 Two kinds of files
-    *Detached* files (``trace``, ``path``, ``proxy``) trace rays and draw samples and have no backward
+    *Detached* files (``trace``, ``path``, ``proxy``) trace rays and draw samples, with no backward
     pass. *Attached* files (``shade``, ``rasterize``, ``shadow_ratio``, ``composite``) evaluate what
     those samples see and are differentiated by ``wp.Tape``.
 

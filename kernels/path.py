@@ -1,7 +1,7 @@
-"""Path tracing of the object under a light at infinity: ``I_fg = PathTrace(X, L_fg, D)`` (DiPIR, eq. 4).
+"""Path tracing of the object under a light at infinity, ``PathTrace(X, L_fg, D)`` (DiPIR, eq. 4).
 
-Each vertex draws one direction from the light and one from the BRDF and combines them with the power
-heuristic; the BRDF's direction continues the path. `trace_foreground` sums radiance;
+Each vertex draws one direction from the light and one from the BRDF and combines them with the
+power heuristic; the BRDF's direction continues the path. `trace_foreground` sums radiance;
 `record_paths` draws the very same paths and writes down what the attached pass in
 `warpir.kernels.shade` evaluates. Detached: no backward pass.
 """
@@ -73,8 +73,8 @@ def scatter(
 ) -> Scatter:
     """Draw, weigh and trace the two directions of one path vertex.
 
-    A direction counts only if it leaves both the shading and the geometric surface. ``is_last`` says
-    that nothing after this vertex can add light, so that any hit serves as well as the closest.
+    A direction counts only if it leaves both the shading and the geometric surface. ``is_last``
+    says that nothing after this vertex can add light, so that any hit serves as well as the closest.
     """
     out = Scatter()
     out.direct = wp.vec3(0.0)

@@ -174,7 +174,8 @@ def trace_proxy(
 class ProxyRecord:
     """What the attached pass needs of each plane sample; arrays of shape [2, sample].
 
-    Row 0 holds the light's directions, row 1 the cosine's; ``sample = (pixel * spp + s) * rays + r``.
+    Row 0 holds the light's directions, row 1 the cosine's; a sample is number
+    ``(pixel * spp + s) * rays + r``.
     """
 
     wi: wp.array2d[wp.vec3]

@@ -18,7 +18,7 @@ PI = wp.constant(3.14159265358979)
 
 @wp.func
 def power_heuristic(pdf: float, pdf_other: float) -> float:
-    """MIS weight of a technique with density ``pdf`` (Veach 1997, eq. 9.13, power 2, equal counts)."""
+    """MIS weight of the technique with density ``pdf``; equal counts (Veach 1997, eq. 9.13)."""
     # The ratio form neither overflows nor loses the small density when one is huge.
     if pdf <= 0.0:
         return 0.0
@@ -88,7 +88,7 @@ def light_eval(light: LightArgs, wi: wp.vec3) -> LightValue:
         tap = bilinear_tap(uv, light.map_height, light.map_width)
         L += map_radiance(light.texels, tap)
         if light.map_prob > 0.0:
-            # The sampler is uniform in (u, v) within a texel's tent: d_omega = 2 pi^2 sin(theta) du dv.
+            # The sampler works in (u, v): d_omega = 2 pi^2 sin(theta) du dv.
             s = wp.max(wp.sqrt(wi[0] * wi[0] + wi[2] * wi[2]), 1.0e-7)
             density = map_scalar(light.texel_prob, tap) * float(light.map_height * light.map_width)
             pdf += light.map_prob * density / (2.0 * PI * PI * s)

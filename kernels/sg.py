@@ -29,8 +29,8 @@ def sg_radiance(
 ) -> wp.vec3:
     """Radiance arriving from direction ``v``, summed over the lobes.
 
-    Differentiable in ``amplitude``, ``axis`` and ``sharpness``; ``v`` stays detached. Returns the raw
-    sum: callers scale or divide it, since Warp does not replay this loop in the backward pass.
+    Differentiable in ``amplitude``, ``axis`` and ``sharpness``; ``v`` stays detached. Returns the
+    raw sum: callers scale or divide it, since Warp does not replay this loop in the backward pass.
 
     Args:
         v: Unit direction from the shaded point toward the light, world frame.

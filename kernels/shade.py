@@ -1,7 +1,8 @@
-"""The attached half of `mis`: recorded samples times light and material, differentiated by the tape.
+"""The attached half of `mis`: recorded samples times light and material, for the tape.
 
 Samples, densities, MIS weights and visibility are constants here (detached sampling), so gradients
-flow through the light's radiance and the BRDF's value alone, as in path replay (Vicini et al. 2021).
+flow through the light's radiance and the BRDF's value alone, as in path replay (Vicini et al.
+2021).
 One launch per path vertex: Warp does not replay what a loop multiplies.
 """
 

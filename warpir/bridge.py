@@ -6,6 +6,7 @@ Tensors are detached before Warp sees them and gradients are read from arrays of
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -66,7 +67,7 @@ def host_light(light: LightTensors) -> Light:
     return Light(lobes, plain(light.texels) if light.texels is not None else None)
 
 
-class _Leaves:
+class Leaves:
     """The differentiable inputs of a shading pass as Warp arrays, and their gradients as tensors.
 
     ``tensors`` holds (tensor or None, dtype, fallback array); an absent tensor is a constant.
@@ -82,15 +83,17 @@ class _Leaves:
         ]
 
     def gradients(self) -> tuple[Tensor | None, ...]:
+        """Return what the tapes have added up, in the tensors' shapes."""
         return tuple(
             None if t is None else _to_torch(a.grad, t).reshape(t.shape)
             for t, a in zip(self.tensors, self.arrays, strict=True)
         )
 
 
-def _light_leaves(
+def light_leaves(
     tensors: tuple[Tensor | None, ...], args: LightArgs
 ) -> list[tuple[Tensor | None, Any, wp.array]]:
+    """Return the light's four inputs with their types; what is absent stays a constant."""
     amplitude, axis, sharpness, texels = tensors
     return [
         (amplitude, wp.vec3, args.amplitude),
@@ -137,72 +140,98 @@ class ShadeForeground(torch.autograd.Function):
     @staticmethod
     def backward(ctx: Any, *d_outputs: Tensor) -> tuple[Tensor | None, ...]:
         """Replay the samples chunk by chunk and differentiate the attached kernels."""
-        (d_foreground,) = d_outputs
         mis: MisIntegrator = ctx.mis
-        renderer, args = mis.renderer, ctx.args
-        device = renderer.device
-        with scene_materials(renderer, ctx.tensors[4:]):
-            material = renderer.scene.material_args
-            leaves = _Leaves(
-                [
-                    *_light_leaves(ctx.tensors[:4], args),
-                    (ctx.tensors[4], wp.vec3, material.base_color),
-                    (ctx.tensors[5], wp.float32, material.metallic),
-                    (ctx.tensors[6], wp.float32, material.roughness),
-                    (ctx.tensors[7], wp.vec3, material.emission),
-                ],
-                device,
-            )
-            amplitude, axis, sharpness, texels, *factors = leaves.arrays
-            per_pixel = mis.spp * mis.rays
-            vertices = mis.depth + 1
-            size = max(1, CHUNK_BYTES // (BYTES_PER_VERTEX * vertices * per_pixel))
-            for start in range(0, len(mis.object_pixels), size):
-                pixels = mis.object_pixels[start : start + size]
-                paths = len(pixels) * per_pixel
-                record = _path_record(vertices, paths, device)
-                _record_foreground(mis, args, ctx.seed, pixels, record)
-                tape = wp.Tape()
-                radiance = wp.zeros(len(pixels), dtype=wp.vec3, device=device, requires_grad=True)
-                with tape:
-                    throughput = wp.full(
-                        paths, wp.vec3(1.0), dtype=wp.vec3, device=device, requires_grad=True
-                    )
-                    for k in range(vertices):
-                        gathered, onward = (
-                            wp.zeros(paths, dtype=wp.vec3, device=device, requires_grad=True)
-                            for _ in range(2)
-                        )
-                        wp.launch(
-                            shade_kernels.shade_vertex,
-                            dim=paths,
-                            inputs=[
-                                record,
-                                k,
-                                *factors,
-                                amplitude,
-                                axis,
-                                sharpness,
-                                args.lobe_count,
-                                texels,
-                                args.map_height,
-                                args.map_width,
-                                throughput,
-                            ],
-                            outputs=[gathered, onward],
-                            device=device,
-                        )
-                        wp.launch(
-                            shade_kernels.sum_paths,
-                            dim=len(pixels),
-                            inputs=[gathered, per_pixel, 1.0 / per_pixel],
-                            outputs=[radiance],
-                            device=device,
-                        )
-                        throughput = onward
-                chunk = d_foreground[start : start + size]
-                tape.backward(grads={radiance: _from_torch(chunk, wp.vec3, device)})
+        device = mis.renderer.device
+        with scene_materials(mis.renderer, ctx.tensors[4:]):
+            leaves = foreground_leaves(mis, ctx.args, ctx.tensors)
+            for rows, tape, radiance in replay_foreground(mis, ctx.args, ctx.seed, leaves.arrays):
+                tape.backward(grads={radiance: _from_torch(d_outputs[0][rows], wp.vec3, device)})
         return (None, None, None, *leaves.gradients())
+
+
+def foreground_leaves(
+    mis: MisIntegrator, args: LightArgs, tensors: tuple[Tensor | None, ...]
+) -> Leaves:
+    """Return the inputs of the object's attached pass: four of the light, four of the materials."""
+    material = mis.renderer.scene.material_args
+    return Leaves(
+        [
+            *light_leaves(tensors[:4], args),
+            (tensors[4], wp.vec3, material.base_color),
+            (tensors[5], wp.float32, material.metallic),
+            (tensors[6], wp.float32, material.roughness),
+            (tensors[7], wp.vec3, material.emission),
+        ],
+        mis.renderer.device,
+    )
+
+
+def replay_foreground(
+    mis: MisIntegrator, args: LightArgs, seed: int, arrays: list[wp.array]
+) -> Iterator[tuple[slice, wp.Tape, wp.array]]:
+    """Draw the object's samples again and evaluate the attached kernels over them.
+
+    Samples, densities and visibility are those of ``args`` and the scene's materials; radiance is
+    evaluated at ``arrays``, which need not hold the same values: then it is a pinned-sample render.
+
+    Args:
+        mis: The integrator.
+        args: The light that the samples are drawn from.
+        seed: Base seed.
+        arrays: From `foreground_leaves`.
+
+    Yields:
+        The rows of ``object_pixels``, the tape, and their radiance [object_pixel].
+    """
+    device = mis.renderer.device
+    amplitude, axis, sharpness, texels, *factors = arrays
+    per_pixel = mis.spp * mis.rays
+    vertices = mis.depth + 1
+    size = max(1, CHUNK_BYTES // (BYTES_PER_VERTEX * vertices * per_pixel))
+    for start in range(0, len(mis.object_pixels), size):
+        pixels = mis.object_pixels[start : start + size]
+        paths = len(pixels) * per_pixel
+        record = _path_record(vertices, paths, device)
+        _record_foreground(mis, args, seed, pixels, record)
+        tape = wp.Tape()
+        radiance = wp.zeros(len(pixels), dtype=wp.vec3, device=device, requires_grad=True)
+        with tape:
+            throughput = wp.full(
+                paths, wp.vec3(1.0), dtype=wp.vec3, device=device, requires_grad=True
+            )
+            for k in range(vertices):
+                gathered, onward = (
+                    wp.zeros(paths, dtype=wp.vec3, device=device, requires_grad=True)
+                    for _ in range(2)
+                )
+                wp.launch(
+                    shade_kernels.shade_vertex,
+                    dim=paths,
+                    inputs=[
+                        record,
+                        k,
+                        *factors,
+                        amplitude,
+                        axis,
+                        sharpness,
+                        args.lobe_count,
+                        texels,
+                        args.map_height,
+                        args.map_width,
+                        throughput,
+                    ],
+                    outputs=[gathered, onward],
+                    device=device,
+                )
+                wp.launch(
+                    shade_kernels.sum_paths,
+                    dim=len(pixels),
+                    inputs=[gathered, per_pixel, 1.0 / per_pixel],
+                    outputs=[radiance],
+                    device=device,
+                )
+                throughput = onward
+        yield slice(start, start + len(pixels)), tape, radiance
 
 
 def _record_foreground(
@@ -252,71 +281,82 @@ class ShadeProxy(torch.autograd.Function):
         """Replay the samples chunk by chunk and differentiate the attached kernel."""
         d_lit, d_unoccluded = d_outputs
         mis: MisIntegrator = ctx.mis
-        args, scene = ctx.args, mis.renderer.scene
-        device = scene.device
-        leaves = _Leaves(_light_leaves(ctx.tensors, args), device)
-        amplitude, axis, sharpness, texels = leaves.arrays
-        per_pixel = mis.spp * mis.rays
-        size = max(1, CHUNK_BYTES // (2 * BYTES_PER_DIRECTION * per_pixel))
-        for start in range(0, len(mis.proxy_pixels), size):
-            pixels = mis.proxy_pixels[start : start + size]
-            paths = len(pixels) * per_pixel
-            record = ProxyRecord()
-            record.wi = wp.zeros((2, paths), dtype=wp.vec3, device=device)
-            record.weight = wp.zeros((2, paths), dtype=float, device=device)
-            record.visible = wp.zeros((2, paths), dtype=float, device=device)
-            wp.launch(
-                record_proxy,
-                dim=len(pixels),
-                inputs=[
-                    wp.array(pixels, dtype=wp.int32, device=device),
-                    wp.array(
-                        mis.may_see_object[start : start + size], dtype=wp.int32, device=device
-                    ),
-                    scene.camera_args,
-                    scene.mesh_args,
-                    scene.material_args,
-                    scene.texture_args,
-                    scene.proxy_args,
-                    args,
-                    mis.spp,
-                    mis.rays,
-                    ctx.seed,
-                    record,
-                ],
-                device=device,
-                record_tape=False,
-            )
-            tape = wp.Tape()
-            lit, unoccluded = (
-                wp.zeros(len(pixels), dtype=wp.vec3, device=device, requires_grad=True)
-                for _ in range(2)
-            )
-            with tape:
-                wp.launch(
-                    shade_kernels.shade_proxy,
-                    dim=len(pixels),
-                    inputs=[
-                        record,
-                        per_pixel,
-                        amplitude,
-                        axis,
-                        sharpness,
-                        args.lobe_count,
-                        texels,
-                        args.map_height,
-                        args.map_width,
-                    ],
-                    outputs=[lit, unoccluded],
-                    device=device,
-                )
+        device = mis.renderer.device
+        leaves = Leaves(light_leaves(ctx.tensors, ctx.args), device)
+        for rows, tape, lit, unoccluded in replay_proxy(mis, ctx.args, ctx.seed, leaves.arrays):
             tape.backward(
                 grads={
-                    lit: _from_torch(d_lit[start : start + size], wp.vec3, device),
-                    unoccluded: _from_torch(d_unoccluded[start : start + size], wp.vec3, device),
+                    lit: _from_torch(d_lit[rows], wp.vec3, device),
+                    unoccluded: _from_torch(d_unoccluded[rows], wp.vec3, device),
                 }
             )
         return (None, None, None, *leaves.gradients())
+
+
+def replay_proxy(
+    mis: MisIntegrator, args: LightArgs, seed: int, arrays: list[wp.array]
+) -> Iterator[tuple[slice, wp.Tape, wp.array, wp.array]]:
+    """Draw the plane's samples again and evaluate the attached kernel; see `replay_foreground`.
+
+    Yields:
+        The rows of ``proxy_pixels``, the tape, ``lit`` and ``unoccluded`` [proxy_pixel].
+    """
+    scene, device = mis.renderer.scene, mis.renderer.device
+    amplitude, axis, sharpness, texels = arrays
+    per_pixel = mis.spp * mis.rays
+    size = max(1, CHUNK_BYTES // (2 * BYTES_PER_DIRECTION * per_pixel))
+    for start in range(0, len(mis.proxy_pixels), size):
+        pixels = mis.proxy_pixels[start : start + size]
+        may_see_object = mis.may_see_object[start : start + size]
+        paths = len(pixels) * per_pixel
+        record = ProxyRecord()
+        record.wi = wp.zeros((2, paths), dtype=wp.vec3, device=device)
+        record.weight = wp.zeros((2, paths), dtype=float, device=device)
+        record.visible = wp.zeros((2, paths), dtype=float, device=device)
+        wp.launch(
+            record_proxy,
+            dim=len(pixels),
+            inputs=[
+                wp.array(pixels, dtype=wp.int32, device=device),
+                wp.array(may_see_object, dtype=wp.int32, device=device),
+                scene.camera_args,
+                scene.mesh_args,
+                scene.material_args,
+                scene.texture_args,
+                scene.proxy_args,
+                args,
+                mis.spp,
+                mis.rays,
+                seed,
+                record,
+            ],
+            device=device,
+            record_tape=False,
+        )
+        tape = wp.Tape()
+        lit, unoccluded = (
+            wp.zeros(len(pixels), dtype=wp.vec3, device=device, requires_grad=True)
+            for _ in range(2)
+        )
+        with tape:
+            wp.launch(
+                shade_kernels.shade_proxy,
+                dim=len(pixels),
+                inputs=[
+                    record,
+                    per_pixel,
+                    amplitude,
+                    axis,
+                    sharpness,
+                    args.lobe_count,
+                    texels,
+                    args.map_height,
+                    args.map_width,
+                ],
+                outputs=[lit, unoccluded],
+                device=device,
+            )
+        yield slice(start, start + len(pixels)), tape, lit, unoccluded
 
 
 def _device_of(tensors: tuple[Tensor | None, ...]) -> torch.device:
@@ -326,7 +366,7 @@ def _device_of(tensors: tuple[Tensor | None, ...]) -> torch.device:
     return torch.device("cpu")
 
 
-class scene_materials:  # noqa: N801 - reads as a context
+class scene_materials:
     """Within the context the scene's material factors are those of the tensors that are given."""
 
     NAMES = (

@@ -1,4 +1,4 @@
-"""Tone curves, the host's half: raw parameters to the knots of a monotone rational-quadratic spline.
+"""Tone curves, the host's half: raw parameters to knots of a monotone rational-quadratic spline.
 
 Durkan et al. 2019, "Neural Spline Flows", with the constants of the authors' code `nflows`; the
 device's half, evaluation, is `warpir.kernels.tone`. Zero parameters are the identity.
