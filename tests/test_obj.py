@@ -6,6 +6,7 @@ read where they exist.
 
 import io
 import struct
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -74,7 +75,7 @@ def test_square_loads(tmp_path: Path) -> None:
     assert any("0.8" in notice and "0.5" in notice for notice in asset.notices)
 
 
-SAME = {
+SAME: dict[str, Callable[[str], str]] = {
     "M20-bom": lambda t: "\ufeff" + t,
     "M20-crlf": lambda t: t.replace("\n", "\r\n"),
     "M20-cr": lambda t: t.replace("\n", "\r"),
@@ -94,6 +95,7 @@ def test_spellings_of_the_square_agree(case: str, tmp_path: Path) -> None:
     asset = load_asset(write(tmp_path, SAME[case](SQUARE + FACES)))
     np.testing.assert_array_equal(area(asset), [[0, 0, 0.5]] * 2)
     (square,) = asset.primitives
+    assert square.indices.flags.c_contiguous
     assert len(square.positions) == 4 and square.normals is not None
     assert square.uv0 is not None
     np.testing.assert_array_equal(square.uv0[:, 1], 1 - square.positions[:, 1])
@@ -108,6 +110,7 @@ FAULTS: dict[str, tuple[str, tuple[str, ...]]] = {
     "M20-decimal-comma": ("v 0,5 0 0\n" + SQUARE + FACES, ("line 1", "0,5", "decimal points")),
     "M20-nan": (SQUARE.replace("v 1 1 0", "v 1 nan 0") + FACES, ("line 3", "finite")),
     "M20-inf-uv": (SQUARE.replace("vt 1 1", "vt 1 inf") + FACES, ("line 7", "finite")),
+    "M20-1e300": (SQUARE.replace("v 1 1 0", "v 1 1e300 0") + FACES, ("1e+300", "1e+18")),
     "M20-short-vertex": (SQUARE.replace("v 1 1 0", "v 1 1") + FACES, ("line 3", "3 finite")),
     "M20-two-corners": (SQUARE + "f 1 2\n", ("line 10", "2 corners")),
     "M20-word-as-index": (SQUARE + "f a b c\n", ("line 10", "'a'")),
@@ -448,6 +451,7 @@ def test_real_file_has_the_published_counts(name: str) -> None:
     if not DATA.is_dir():
         pytest.skip("no development data beside the repository")
     asset = load_asset(DATA / name)
+    assert all(p.indices.flags.c_contiguous for p in asset.primitives)
     counts = sum(len(p.indices) for p in asset.primitives), len(asset.textures)
     assert counts == REAL[name]
     if name == "spot/spot.obj":

@@ -23,12 +23,14 @@ FILE_BYTES = 2 << 30
 """Largest mesh, buffer or image file [byte]."""
 TRIANGLES = 20_000_000
 """Most triangles of an asset, instances counted."""
+EXTENT = 1e18
+"""Largest coordinate [m]; its square still fits float32."""
 TEXTURE_PIXELS = 512_000_000
 """Most pixels of all textures together."""
-NOTICES = 40
-"""Most notices of an asset."""
 GREY = 188
 """sRGB code that stands for a missing base colour texture: linear 0.5."""
+NOTICES = 40
+"""Most notices of an asset."""
 
 Pixels = NDArray[np.uint8]
 
@@ -200,14 +202,16 @@ def keep_area(
         indices: Shape [triangle, 3].
 
     Returns:
-        The remaining triangles, the number without area, and the number of repetitions (the same
-        three vertices in the same cyclic order).
+        The remaining triangles, C-contiguous, the number without area, and the number of
+        repetitions (the same three vertices in the same cyclic order).
     """
     a, b, c = (positions[indices[:, k]] for k in range(3))
-    area_squared = np.square(np.cross(b - a, c - a)).sum(axis=1)
-    longest_squared = np.maximum(np.square(b - a).sum(axis=1), np.square(c - a).sum(axis=1))
-    # Collinear corners leave rounding errors of float64, relative to the longest side.
-    flat = area_squared <= np.square(1e-12 * longest_squared)
+    with np.errstate(over="ignore", invalid="ignore"):  # `check_drawable` refuses such sizes
+        area_squared = np.square(np.cross(b - a, c - a)).sum(axis=1)
+        longest_squared = np.maximum(np.square(b - a).sum(axis=1), np.square(c - a).sum(axis=1))
+        # Collinear corners leave rounding errors of float64, relative to the longest side.
+        flat = area_squared <= np.square(1e-12 * longest_squared)
+        flat &= np.isfinite(area_squared)
     kept = indices[~flat] if flat.any() else indices
     # Start each triangle at its lowest vertex, so that equal triangles are equal rows.
     first = kept.argmin(axis=1)
@@ -220,7 +224,7 @@ def keep_area(
     repeated = np.sort(order[1:][same])
     if len(repeated):
         kept = np.delete(kept, repeated, axis=0)
-    return kept, int(flat.sum()), len(repeated)
+    return np.ascontiguousarray(kept), int(flat.sum()), len(repeated)
 
 
 def repair_normals(
@@ -252,14 +256,24 @@ def repair_normals(
     return (normals / length).astype(np.float32), int(lost.sum())
 
 
-def nothing_to_render(where: Path, primitives: list[Primitive], found: str) -> None:
-    """Refuse an asset without triangles.
+def check_drawable(where: Path, primitives: list[Primitive], found: str) -> None:
+    """Refuse an asset without triangles, or beyond what float32 kernels can place.
+
+    Args:
+        where: The asset.
+        primitives: What was read.
+        found: What the file has instead of triangles.
 
     Raises:
-        InputError: ``primitives`` is empty.
+        InputError: ``primitives`` is empty or a coordinate is not below ``EXTENT``.
     """
     if not primitives:
         raise InputError(where, f"nothing to render (found {found}; expected triangles)")
+    largest = max(float(np.abs(p.positions).max()) for p in primitives)
+    if not largest < EXTENT:
+        raise InputError(
+            where, f"coordinates up to {largest:g} (expected below {EXTENT:g})", "scale it down"
+        )
 
 
 def plain_material(name: str, base_color: tuple[float, float, float]) -> Material:

@@ -17,10 +17,11 @@ from numpy.typing import NDArray
 
 from warpir.asset import Asset, FloatArray, Primitive
 from warpir.asset_files import (
+    EXTENT,
     TRIANGLES,
+    check_drawable,
     concise,
     keep_area,
-    nothing_to_render,
     repair_normals,
 )
 from warpir.gltf_file import Entry, GltfFile
@@ -70,7 +71,7 @@ def read_gltf(path: str | Path, missing_textures: str = "error") -> Asset:
         geometry = geometries[key]
         if geometry is not None:
             primitives.append(place(geometry, world, material_of[key]))
-    nothing_to_render(path, primitives, f"{len(placed)} placed primitives, none with triangles")
+    check_drawable(path, primitives, f"{len(placed)} placed primitives, none with triangles")
     return Asset(
         name=path.stem,
         primitives=tuple(primitives),
@@ -107,7 +108,8 @@ def placed_primitives(root: Entry, notices: list[str]) -> Iterator[tuple[Entry, 
         if visibility is not None and "visible" in visibility and not visibility.flag("visible"):
             notices.append(f"{node.pointer}: hidden by KHR_node_visibility")
             continue
-        world = parent @ local_matrix(node)
+        with np.errstate(over="ignore", invalid="ignore"):  # `check_invertible` refuses such sizes
+            world = parent @ local_matrix(node)
         drawn = drawn or index in listed
         stack += [(child, world, drawn) for child in reversed(node.integers("children"))]
         if not drawn or "mesh" not in node:
@@ -207,8 +209,10 @@ def local_matrix(node: Entry) -> Matrix:
 def check_invertible(node: Entry, world: Matrix) -> None:
     """Refuse a transform that flattens the mesh or overflows."""
     linear = world[:3, :3]
+    if not (np.abs(world) < EXTENT).all():
+        raise node.error(f"transform with numbers beyond {EXTENT:g}")
     volume = np.linalg.norm(linear, axis=0).prod()
-    if not np.isfinite(world).all() or abs(np.linalg.det(linear)) <= 1e-9 * volume:
+    if abs(np.linalg.det(linear)) <= 1e-9 * volume:
         raise node.error(
             "singular transform (a scale of zero?)", "give the object a thickness, or remove it"
         )
@@ -359,7 +363,7 @@ def place(geometry: Geometry, world: Matrix, material: int) -> Primitive:
         ).astype(np.float32)
     return Primitive(
         positions=geometry.positions @ linear.T + world[:3, 3],
-        indices=indices[:, ::-1] if mirrored else indices,
+        indices=np.ascontiguousarray(indices[:, ::-1]) if mirrored else indices,
         material=material,
         normals=normals,
         tangents=tangents,

@@ -8,7 +8,6 @@ pointer. Sizes are checked before anything is allocated.
 import json
 import math
 import struct
-from collections import Counter
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -18,6 +17,7 @@ from numpy.typing import NDArray
 
 from warpir.asset_files import read_regular, read_uri
 from warpir.errors import InputError
+from warpir.strict_json import parse_json_object
 
 JSON_BYTES = 64 << 20
 """Largest glTF JSON [byte]."""
@@ -167,7 +167,11 @@ class GltfFile:
             text = self._open_container(content)
         else:
             text = content
-        self.root = Entry(path, "", parse_json(path, text))
+        if len(text) > JSON_BYTES:
+            raise InputError(
+                path, f"glTF JSON is too large (found {len(text)} bytes; limit {JSON_BYTES})"
+            )
+        self.root = Entry(path, "", parse_json_object(path, text.rstrip(b"\0")))
         version = self.root.child("asset").text("version", "")
         if version.split(".")[0] != "2":
             raise self.root.error(
@@ -296,46 +300,3 @@ class GltfFile:
             raise entry.error(
                 f"{int((~finite).sum())} elements are NaN or infinite, first is {bad}"
             )
-
-
-def parse_json(path: Path, text: bytes) -> dict[str, Any]:
-    """Parse glTF JSON strictly: no NaN, no repeated keys, an object at the root.
-
-    Raises:
-        InputError: With line and column of the fault.
-    """
-    if len(text) > JSON_BYTES:
-        raise InputError(
-            path, f"glTF JSON is too large (found {len(text)} bytes; limit {JSON_BYTES})"
-        )
-
-    def refuse_constant(name: str) -> float:
-        raise ValueError(f"{name} is not JSON")
-
-    def unique(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
-        entries = dict(pairs)
-        if len(entries) != len(pairs):
-            name = Counter(name for name, _ in pairs).most_common(1)[0][0]
-            raise ValueError(f"key {name[:40]!r} twice")
-        return entries
-
-    try:
-        root = json.loads(
-            text.decode("utf-8-sig").rstrip("\0"),
-            parse_constant=refuse_constant,
-            object_pairs_hook=unique,
-        )
-    except UnicodeDecodeError as error:
-        raise InputError(path, f"glTF JSON is not UTF-8 at byte {error.start}") from None
-    except json.JSONDecodeError as error:
-        raise InputError(
-            path,
-            f"glTF JSON is damaged at line {error.lineno} column {error.colno} ({error.msg})",
-            "export or copy it again",
-        ) from None
-    except (ValueError, RecursionError) as error:
-        reason = "nested too deeply" if isinstance(error, RecursionError) else str(error)
-        raise InputError(path, f"glTF JSON cannot be read ({reason})") from None
-    if not isinstance(root, dict):
-        raise InputError(path, "glTF JSON is not an object")
-    return root

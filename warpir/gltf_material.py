@@ -26,12 +26,13 @@ BASE_MATERIAL = {
     f"KHR_materials_{name}"
     for name in (
         "anisotropy", "clearcoat", "diffuse_transmission", "dispersion", "ior", "iridescence",
-        "sheen", "specular", "transmission", "variants", "volume",
+        "sheen", "specular", "transmission", "volume",
     )
 }  # fmt: skip
 """Extensions that refine a material; the material below them is used, with a notice."""
 LEFT_OUT = {
     "KHR_animation_pointer": "animations are not played",
+    "KHR_materials_variants": "the default variant is used",
     "KHR_lights_punctual": "the lights of the file are not used",
     "KHR_xmp_json_ld": "metadata is not read",
 }

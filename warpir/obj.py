@@ -6,6 +6,7 @@ Materials of OBJ come from `warpir.mtl`. The texture coordinate v is turned from
 """
 
 import contextlib
+import logging
 import re
 from collections.abc import Iterator
 from dataclasses import dataclass, field
@@ -19,9 +20,9 @@ from numpy.typing import NDArray
 from warpir.asset import Asset, FloatArray, Material, Primitive
 from warpir.asset_files import (
     TRIANGLES,
+    check_drawable,
     concise,
     keep_area,
-    nothing_to_render,
     plain_material,
     read_regular,
     repair_normals,
@@ -32,6 +33,7 @@ from warpir.mtl import MaterialLibrary
 GREY = (0.8, 0.8, 0.8)
 """Base colour of what has no material."""
 IGNORED = {"o", "g", "s", "vp", "shadow_obj", "trace_obj", "lod", "bevel", "c_interp", "d_interp"}
+logging.getLogger("trimesh").addHandler(logging.NullHandler())  # it warns on stderr otherwise
 Triangles = NDArray[np.int32]
 
 
@@ -126,7 +128,7 @@ def read_obj(path: Path, content: bytes, missing_textures: str) -> Asset:
                 colors=None if colors is None else colors[corners[:, 0]],
             )
         )
-    nothing_to_render(path, primitives, f"{len(positions)} vertices")
+    check_drawable(path, primitives, f"{len(positions)} vertices")
     return Asset(
         name=path.stem,
         primitives=tuple(primitives),
@@ -425,7 +427,7 @@ def read_ply_stl(path: Path, content: bytes) -> Asset:
             notices.append(
                 f"no unit in the file: read as metres, size {size[0]:g} x {size[1]:g} x {size[2]:g}"
             )
-    nothing_to_render(path, primitives, type(mesh).__name__)
+    check_drawable(path, primitives, type(mesh).__name__)
     return Asset(path.stem, tuple(primitives), (material,), notices=concise(notices))
 
 
