@@ -1,0 +1,40 @@
+"""Fixtures that every test shares."""
+
+import socket
+from typing import NoReturn
+
+import numpy as np
+import pytest
+import warp as wp
+
+wp.config.quiet = True
+
+
+def _devices() -> list[str]:
+    return ["cpu", "cuda"] if wp.is_cuda_available() else ["cpu"]
+
+
+@pytest.fixture(params=_devices())
+def device(request: pytest.FixtureRequest) -> str:
+    """Name of the Warp device: the CPU, and a CUDA device where there is one."""
+    return str(request.param)
+
+
+@pytest.fixture
+def rng() -> np.random.Generator:
+    """Random numbers that are the same in every run and for every test."""
+    return np.random.default_rng(12345)
+
+
+@pytest.fixture(autouse=True)
+def _no_network(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Raise as soon as a test opens a socket or resolves a name."""
+
+    def refuse(*args: object, **kwargs: object) -> NoReturn:
+        raise RuntimeError("a test must not use the network")
+
+    monkeypatch.setattr(socket.socket, "connect", refuse)
+    monkeypatch.setattr(socket.socket, "connect_ex", refuse)
+    monkeypatch.setattr(socket.socket, "bind", refuse)
+    monkeypatch.setattr(socket, "create_connection", refuse)
+    monkeypatch.setattr(socket, "getaddrinfo", refuse)

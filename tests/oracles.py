@@ -1,0 +1,640 @@
+"""Plain float64 restatements of the papers and specifications that the kernels implement.
+
+Nothing here imports the package: every function is written from its source, so that a test
+compares two independent readings of the same equation. Directions are arrays of shape
+[..., 3] in a right-handed frame with +Y up; "local" means the shading frame with the normal
+along +Z. Radiance is linear and relative, angles are in radians.
+
+Sources, cited below by name:
+    OpenEXR: "Technical Introduction to OpenEXR", latitude-longitude environment maps.
+    DiPIR: Liang et al. 2024, https://arxiv.org/abs/2408.09702; (M n) main paper, (S n)
+        supplement.
+    glTF: glTF 2.0 specification, appendix B "BRDF implementation".
+    Heitz 2014: "Understanding the Masking-Shadowing Function in Microfacet-Based BRDFs".
+    Heitz 2018: "Sampling the GGX Distribution of Visible Normals".
+    Durkan 2019: "Neural Spline Flows", https://arxiv.org/abs/1906.04032, with the constants
+        of the authors' package nflows.
+    Howell: "A Catalog of Radiation Heat Transfer Configuration Factors".
+"""
+
+from collections.abc import Callable
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+Float64Array = NDArray[np.float64]
+Int64Array = NDArray[np.int64]
+
+LUMINANCE_WEIGHTS = np.array([0.2126, 0.7152, 0.0722])
+"""Rec. 709 luminance of linear RGB."""
+DIELECTRIC_F0 = 0.04
+"""Reflectance of an index of refraction of 1.5 at normal incidence (glTF B.3.5)."""
+ALPHA_MIN = 1e-3
+"""Least GGX width, ours: below it a float32 lobe is a spike."""
+GAMMA = 2.2
+"""Display exponent (DiPIR, supplement B)."""
+SPLINE_BINS = 5
+"""Bins of a tone curve (DiPIR, sec. 4.1.4)."""
+SPLINE_MIN = 1e-3
+"""Least bin width, bin height and slope (nflows)."""
+CONSISTENCY_EPSILON = 1e-8
+"""Added inside the logarithm of the consistency term, ours."""
+
+
+def normalize(v: ArrayLike) -> Float64Array:
+    """Return ``v`` at unit length, shape [..., 3]."""
+    v = np.asarray(v, float)
+    return v / np.linalg.norm(v, axis=-1, keepdims=True)
+
+
+def dot(a: ArrayLike, b: ArrayLike) -> Float64Array:
+    """Return the inner product over the last axis."""
+    return np.sum(np.asarray(a, float) * np.asarray(b, float), axis=-1)
+
+
+def one_minus_cos(a: ArrayLike, b: ArrayLike) -> Float64Array:
+    """Return ``1 - cos`` of the angle of two directions without cancellation.
+
+    Half the squared chord of the unit vectors; ``1 - dot`` loses all digits of a narrow lobe.
+    """
+    return 0.5 * np.sum((normalize(a) - normalize(b)) ** 2, axis=-1)
+
+
+def angle_between(a: ArrayLike, b: ArrayLike) -> Float64Array:
+    """Return the angle of two directions [rad], exact near 0 and near pi (Kahan)."""
+    a, b = normalize(a), normalize(b)
+    return 2.0 * np.arctan2(np.linalg.norm(a - b, axis=-1), np.linalg.norm(a + b, axis=-1))
+
+
+def frame_of(axis: ArrayLike) -> Float64Array:
+    """Return a rotation whose columns are two tangents and ``axis``, shape [3, 3]."""
+    z = normalize(axis)
+    helper = np.eye(3)[np.argmin(np.abs(z))]
+    x = normalize(np.cross(helper, z))
+    return np.stack([x, np.cross(z, x), z], axis=-1)
+
+
+def spherical(cos_theta: ArrayLike, phi: ArrayLike) -> Float64Array:
+    """Return local directions at polar cosine about +Z and azimuth from +X, shape [..., 3]."""
+    cos_theta, phi = np.broadcast_arrays(np.asarray(cos_theta, float), np.asarray(phi, float))
+    sin_theta = np.sqrt(np.maximum(0.0, 1.0 - cos_theta**2))
+    return np.stack([sin_theta * np.cos(phi), sin_theta * np.sin(phi), cos_theta], axis=-1)
+
+
+def gauss_legendre(edges: ArrayLike, order: int) -> tuple[Float64Array, Float64Array]:
+    """Return nodes and weights of a composite Gauss-Legendre rule, shape [panel * order]."""
+    edges = np.asarray(edges, float)
+    x, w = np.polynomial.legendre.leggauss(order)
+    half = 0.5 * np.diff(edges)[:, None]
+    middle = 0.5 * (edges[1:] + edges[:-1])[:, None]
+    return (middle + half * x).ravel(), (half * w).ravel()
+
+
+# ------------------------------------------------------------------------- lat-long maps
+
+
+def latlong_direction(uv: ArrayLike) -> Float64Array:
+    """Return the unit direction of map coordinates (OpenEXR), shape [..., 3].
+
+    ``u`` runs right over the width and ``v`` down over the height, both in [0, 1]: the image
+    centre is +Z, its left quarter +X, its top +Y.
+    """
+    uv = np.asarray(uv, float)
+    lon = np.pi * (1.0 - 2.0 * uv[..., 0])
+    lat = np.pi * (0.5 - uv[..., 1])
+    return np.stack([np.sin(lon) * np.cos(lat), np.sin(lat), np.cos(lon) * np.cos(lat)], axis=-1)
+
+
+def latlong_uv(direction: ArrayLike) -> Float64Array:
+    """Return map coordinates of a direction of any length (OpenEXR), shape [..., 2].
+
+    The inverse of :func:`latlong_direction`, with ``u`` in [0, 1).
+    """
+    d = np.asarray(direction, float)
+    lon = np.arctan2(d[..., 0], d[..., 2])
+    lat = np.arctan2(d[..., 1], np.hypot(d[..., 0], d[..., 2]))
+    return np.stack([np.mod(0.5 - lon / (2.0 * np.pi), 1.0), 0.5 - lat / np.pi], axis=-1)
+
+
+def texel_solid_angle(height: int, width: int) -> Float64Array:
+    """Return the solid angle of one texel per row [sr], shape [height].
+
+    ``(2 pi / W) (cos(pi i / H) - cos(pi (i + 1) / H))`` written as a product of sines, which
+    keeps its digits at the poles.
+    """
+    middle = np.pi * (np.arange(height) + 0.5) / height
+    return (2.0 * np.pi / width) * 2.0 * np.sin(middle) * np.sin(0.5 * np.pi / height)
+
+
+def texel_direction(height: int, width: int) -> Float64Array:
+    """Return the directions of the texel centres, shape [height, width, 3]."""
+    v, u = np.meshgrid(
+        (np.arange(height) + 0.5) / height, (np.arange(width) + 0.5) / width, indexing="ij"
+    )
+    return latlong_direction(np.stack([u, v], axis=-1))
+
+
+def bilinear_weights(
+    uv: ArrayLike, height: int, width: int
+) -> tuple[Int64Array, Int64Array, Float64Array]:
+    """Return rows, columns and weights of the four texels round ``uv``, each [..., 4].
+
+    Texel centres lie at +0.5; columns wrap in longitude, rows are clamped in latitude. The
+    order is (top, left), (top, right), (bottom, left), (bottom, right).
+    """
+    uv = np.asarray(uv, float)
+    x = uv[..., 0] * width - 0.5
+    y = uv[..., 1] * height - 0.5
+    x0, y0 = np.floor(x), np.floor(y)
+    fx, fy = x - x0, y - y0
+    columns = np.stack([x0, x0 + 1, x0, x0 + 1], axis=-1).astype(np.int64) % width
+    rows = np.clip(np.stack([y0, y0, y0 + 1, y0 + 1], axis=-1).astype(np.int64), 0, height - 1)
+    weights = np.stack([(1 - fx) * (1 - fy), fx * (1 - fy), (1 - fx) * fy, fx * fy], axis=-1)
+    return rows, columns, weights
+
+
+def bilinear_lookup(texels: ArrayLike, uv: ArrayLike) -> Float64Array:
+    """Return the map's value at ``uv``, shape [..., channel]."""
+    texels = np.asarray(texels, float)
+    rows, columns, weights = bilinear_weights(uv, *texels.shape[:2])
+    return np.einsum("...kc,...k->...c", texels[rows, columns], weights)
+
+
+# -------------------------------------------------------------------- spherical Gaussians
+
+
+def sg_radiance(
+    v: ArrayLike, amplitude: ArrayLike, axis: ArrayLike, sharpness: ArrayLike
+) -> Float64Array:
+    """Return the radiance of a sum of lobes from direction ``v`` (M 2, M 3).
+
+    ``sum_k amplitude_k exp(sharpness_k (v . axis_k - 1))`` with ``sharpness = 1 / sigma^2``.
+
+    Args:
+        v: Unit directions, shape [..., 3].
+        amplitude: Peak radiance, relative, shape [lobe, 3].
+        axis: Unit lobe axes, shape [lobe, 3].
+        sharpness: Lobe concentration, shape [lobe].
+
+    Returns:
+        Linear RGB, shape [..., 3].
+    """
+    v = np.asarray(v, float)[..., None, :]
+    shape = np.exp(-np.asarray(sharpness, float) * one_minus_cos(v, np.asarray(axis, float)))
+    return shape @ np.asarray(amplitude, float)
+
+
+def sg_flux(sharpness: ArrayLike) -> Float64Array:
+    """Return the integral of a lobe of amplitude 1 over the sphere [sr].
+
+    ``2 pi / sharpness (1 - exp(-2 sharpness))``: integrate (M 2) over ``cos`` from -1 to 1.
+    """
+    sharpness = np.asarray(sharpness, float)
+    return 2.0 * np.pi * -np.expm1(-2.0 * sharpness) / sharpness
+
+
+def sg_pdf(v: ArrayLike, axis: ArrayLike, sharpness: ArrayLike) -> Float64Array:
+    """Return the density proportional to one lobe [1/sr] (von Mises-Fisher)."""
+    return np.exp(-np.asarray(sharpness, float) * one_minus_cos(v, axis)) / sg_flux(sharpness)
+
+
+def sg_irradiance(n: ArrayLike, axis: ArrayLike, sharpness: float) -> float:
+    """Return the irradiance of a plane with normal ``n`` under a lobe of amplitude 1.
+
+    ``int G(v) max(0, n . v) dv`` in polar coordinates about the lobe. The azimuth is closed
+    form, the polar angle Gauss-Legendre with panels broken where the horizon begins and ends
+    to cut the circle.
+    """
+    tilt = float(angle_between(n, axis))
+    end = 2.0 * np.arcsin(np.sqrt(min(1.0, 0.5 * 745.0 / sharpness)))
+    breaks = np.array(
+        [0.5 * np.pi - tilt, tilt - 0.5 * np.pi, 1.5 * np.pi - tilt, 0.5 * np.pi + tilt]
+    )
+    edges = np.unique(
+        np.concatenate([np.linspace(0.0, end, 65), breaks[(breaks > 0) & (breaks < end)]])
+    )
+    theta, weight = gauss_legendre(edges, 24)
+    a = np.cos(tilt) * np.cos(theta)
+    b = np.sin(tilt) * np.sin(theta)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        half = np.where(a >= b, np.pi, np.where(a <= -b, 0.0, np.arccos(np.clip(-a / b, -1, 1))))
+    ring = 2.0 * (a * half + b * np.sin(half))
+    lobe = np.exp(-2.0 * sharpness * np.sin(0.5 * theta) ** 2)
+    return float(np.sum(weight * np.sin(theta) * lobe * ring))
+
+
+# ------------------------------------------------------------------------------ the BRDF
+
+
+def ggx_alpha(roughness: ArrayLike) -> Float64Array:
+    """Return the GGX width ``roughness^2`` (glTF B.3.5), at least ``ALPHA_MIN`` (ours)."""
+    return np.maximum(np.asarray(roughness, float) ** 2, ALPHA_MIN)
+
+
+def ggx_d(wm: ArrayLike, alpha: ArrayLike) -> Float64Array:
+    """Return the GGX density of normals [1/sr] about +Z (Heitz 2014, isotropic; glTF B.3.2).
+
+    ``alpha^2 / (pi (cos^2 (alpha^2 - 1) + 1)^2)`` with the bracket as ``alpha^2 cos^2 +
+    sin^2``, which keeps its digits at small alpha; 0 below the surface.
+    """
+    wm, alpha = np.asarray(wm, float), np.asarray(alpha, float)
+    sin2 = wm[..., 0] ** 2 + wm[..., 1] ** 2
+    d = alpha**2 / (np.pi * (alpha**2 * wm[..., 2] ** 2 + sin2) ** 2)
+    return np.where(wm[..., 2] > 0.0, d, 0.0)
+
+
+def smith_lambda(w: ArrayLike, alpha: ArrayLike) -> Float64Array:
+    """Return Smith's Lambda of GGX, ``(sqrt(1 + alpha^2 tan^2) - 1) / 2`` (Heitz 2014, eq. 72)."""
+    w, alpha = np.asarray(w, float), np.asarray(alpha, float)
+    tan2 = (w[..., 0] ** 2 + w[..., 1] ** 2) / w[..., 2] ** 2
+    x = alpha**2 * tan2
+    return 0.5 * x / (np.sqrt(1.0 + x) + 1.0)
+
+
+def smith_g1(w: ArrayLike, wm: ArrayLike, alpha: ArrayLike) -> Float64Array:
+    """Return the masking of one direction, ``1 / (1 + Lambda)`` (Heitz 2014, eq. 43)."""
+    return np.where(dot(w, wm) > 0.0, 1.0 / (1.0 + smith_lambda(w, alpha)), 0.0)
+
+
+def smith_g2(wo: ArrayLike, wi: ArrayLike, wm: ArrayLike, alpha: ArrayLike) -> Float64Array:
+    """Return height-correlated masking and shadowing (Heitz 2014, eq. 99; glTF B.3.2)."""
+    g = 1.0 / (1.0 + smith_lambda(wo, alpha) + smith_lambda(wi, alpha))
+    return np.where((dot(wo, wm) > 0.0) & (dot(wi, wm) > 0.0), g, 0.0)
+
+
+def schlick(f0: ArrayLike, cos_theta: ArrayLike) -> Float64Array:
+    """Return Schlick's Fresnel term ``f0 + (1 - f0) (1 - |cos|)^5`` (glTF B.3.4)."""
+    f0 = np.asarray(f0, float)
+    return f0 + (1.0 - f0) * (1.0 - np.abs(np.asarray(cos_theta, float))) ** 5
+
+
+def specular_brdf(wo: ArrayLike, wi: ArrayLike, f0: ArrayLike, alpha: ArrayLike) -> Float64Array:
+    """Return ``F D G / (4 |VN| |LN|)`` [1/sr], shape [..., channel] (glTF B.3.2).
+
+    Args:
+        wo: Local direction toward the camera, shape [..., 3].
+        wi: Local direction toward the light, shape [..., 3].
+        f0: Reflectance at normal incidence, shape [..., channel].
+        alpha: GGX width, shape [...].
+    """
+    wo, wi = np.broadcast_arrays(np.asarray(wo, float), np.asarray(wi, float))
+    above = (wo[..., 2] > 0.0) & (wi[..., 2] > 0.0)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        wm = normalize(wo + wi)
+        fresnel = schlick(f0, dot(wo, wm)[..., None])
+        rest = ggx_d(wm, alpha) * smith_g2(wo, wi, wm, alpha) / (4.0 * wo[..., 2] * wi[..., 2])
+    return np.where(above[..., None], fresnel * rest[..., None], 0.0)
+
+
+def gltf_brdf(
+    wo: ArrayLike,
+    wi: ArrayLike,
+    base_color: ArrayLike,
+    metallic: ArrayLike,
+    roughness: ArrayLike,
+) -> Float64Array:
+    """Return the metallic-roughness BRDF [1/sr], no cosine, shape [..., 3] (glTF B.3.5).
+
+    The single-lobe form of the ratified specification::
+
+        c_diff     = lerp(baseColor, 0, metallic)
+        f0         = lerp(0.04, baseColor, metallic)
+        f_diffuse  = (1 - F) c_diff / pi
+        f_specular = F D G / (4 |VN| |LN|)
+
+    Args:
+        wo: Local direction toward the camera, shape [..., 3].
+        wi: Local direction toward the light, shape [..., 3].
+        base_color: Linear RGB, shape [..., 3].
+        metallic: 0 dielectric to 1 metal, shape [...].
+        roughness: Perceptual roughness, shape [...].
+    """
+    wo, wi = np.broadcast_arrays(np.asarray(wo, float), np.asarray(wi, float))
+    base_color = np.asarray(base_color, float)
+    metallic = np.asarray(metallic, float)[..., None]
+    c_diff = (1.0 - metallic) * base_color
+    f0 = DIELECTRIC_F0 + (base_color - DIELECTRIC_F0) * metallic
+    with np.errstate(divide="ignore", invalid="ignore"):
+        fresnel = schlick(f0, dot(wo, normalize(wo + wi))[..., None])
+    above = ((wo[..., 2] > 0.0) & (wi[..., 2] > 0.0))[..., None]
+    diffuse = np.where(above, (1.0 - fresnel) * c_diff / np.pi, 0.0)
+    return diffuse + specular_brdf(wo, wi, f0, ggx_alpha(roughness))
+
+
+def gltf_brdf_mixed(
+    wo: ArrayLike,
+    wi: ArrayLike,
+    base_color: ArrayLike,
+    metallic: ArrayLike,
+    roughness: ArrayLike,
+) -> Float64Array:
+    """Return the metallic-roughness BRDF as a mix of two materials (glTF B.2, normative).
+
+    ``mix(dielectric_brdf, metal_brdf, metallic)``. Later revisions of appendix B.3.5 print
+    this form only. It equals :func:`gltf_brdf` at metallic 0 and 1, not in between.
+    """
+    metallic = np.asarray(metallic, float)
+    dielectric = gltf_brdf(wo, wi, base_color, np.zeros_like(metallic), roughness)
+    metal = gltf_brdf(wo, wi, base_color, np.ones_like(metallic), roughness)
+    return dielectric + (metal - dielectric) * metallic[..., None]
+
+
+def vndf(wo: ArrayLike, wm: ArrayLike, alpha: ArrayLike) -> Float64Array:
+    """Return the density of normals visible from ``wo`` [1/sr] (Heitz 2018)."""
+    wo = np.asarray(wo, float)
+    cos = np.maximum(0.0, dot(wo, wm))
+    return smith_g1(wo, wm, alpha) * cos * ggx_d(wm, alpha) / wo[..., 2]
+
+
+def vndf_reflection_pdf(wo: ArrayLike, wi: ArrayLike, alpha: ArrayLike) -> Float64Array:
+    """Return the density of reflecting ``wo`` at a visible normal [1/sr] (Heitz 2018).
+
+    ``D_visible / (4 wo . wm)``. Directions below the surface are included: their integral is
+    the share of samples that a single bounce loses.
+    """
+    with np.errstate(divide="ignore", invalid="ignore"):
+        wm = normalize(np.asarray(wo, float) + np.asarray(wi, float))
+        pdf = vndf(wo, wm, alpha) / (4.0 * dot(wo, wm))
+    return np.where(dot(wo, wm) > 0.0, pdf, 0.0)
+
+
+def cosine_pdf(wi: ArrayLike) -> Float64Array:
+    """Return the cosine-weighted density about +Z [1/sr], 0 below the surface."""
+    return np.maximum(0.0, np.asarray(wi, float)[..., 2]) / np.pi
+
+
+def specular_albedo(cos_o: float, alpha: float, f0: float, count: int = 1024) -> float:
+    """Return the share of light that the specular lobe reflects, by quadrature.
+
+    ``int F D G2 / (4 cos_o cos_i) cos_i dwi`` over half vectors: ``dwi = 4 (wo . wm) dwm``
+    and ``tan^2 theta_m = alpha^2 u / (1 - u)``, whose density is ``D cos theta_m``, so that
+    the nodes follow the lobe at any width. Midpoint in azimuth, Gauss-Legendre in ``u``.
+    """
+    # Graded towards u = 1, where grazing normals lie.
+    s, weight = gauss_legendre(np.linspace(0.0, 1.0, count // 16 + 1), 16)
+    u, weight = 1.0 - (1.0 - s) ** 3, weight * 3.0 * (1.0 - s) ** 2
+    phi = 2.0 * np.pi * (np.arange(count) + 0.5) / count
+    tan2 = alpha**2 * u / (1.0 - u)
+    cos_m = 1.0 / np.sqrt(1.0 + tan2)
+    wo = np.array([np.sqrt(1.0 - cos_o**2), 0.0, cos_o])
+    wm = spherical(cos_m[:, None], phi[None, :])
+    cos_om = wm @ wo
+    wi = 2.0 * cos_om[..., None] * wm - wo
+    with np.errstate(divide="ignore", invalid="ignore"):
+        value = schlick(f0, cos_om) * smith_g2(wo, wi, wm, alpha) * cos_om / (cos_o * wm[..., 2])
+    value = np.where((cos_om > 0.0) & (wi[..., 2] > 0.0), value, 0.0)
+    return float(np.mean(value, axis=1) @ weight)
+
+
+def diffuse_albedo(cos_o: float, f0: float, count: int = 256) -> float:
+    """Return ``int (1 - F(V . H)) cos_i / pi dwi`` of a white diffuse base, by quadrature."""
+    cos_i, weight = gauss_legendre(np.linspace(0.0, 1.0, count // 16 + 1), 16)
+    phi = 2.0 * np.pi * (np.arange(count) + 0.5) / count
+    wo = np.array([np.sqrt(1.0 - cos_o**2), 0.0, cos_o])
+    wi = spherical(cos_i[:, None], phi[None, :])
+    cos_om = np.sqrt(np.maximum(0.0, 0.5 * (1.0 + wi @ wo)))
+    ring = np.mean(1.0 - schlick(f0, cos_om), axis=1)
+    return float(2.0 * np.sum(ring * cos_i * weight))
+
+
+def gltf_albedo(cos_o: float, base_color: float, metallic: float, roughness: float) -> float:
+    """Return the directional albedo of :func:`gltf_brdf` for one channel, by quadrature.
+
+    Exceeds 1 for a bright dielectric at grazing angles: the diffuse term is weighted by
+    ``1 - F(V . H)``, whose mean over ``L`` stays near 0.96 while the specular lobe, at the
+    mirror direction, already reflects almost everything.
+    """
+    f0 = DIELECTRIC_F0 + (base_color - DIELECTRIC_F0) * metallic
+    diffuse = (1.0 - metallic) * base_color * diffuse_albedo(cos_o, f0)
+    return diffuse + specular_albedo(cos_o, float(ggx_alpha(roughness)), f0)
+
+
+# ------------------------------------------------------------------------- tone mapping
+
+
+def reinhard(x: ArrayLike) -> Float64Array:
+    """Return ``x / (1 + x)`` per channel (Reinhard et al. 2002, eq. 3)."""
+    x = np.asarray(x, float)
+    return x / (1.0 + x)
+
+
+def softmax(x: ArrayLike) -> Float64Array:
+    """Return ``exp(x) / sum exp(x)`` over the last axis."""
+    x = np.asarray(x, float)
+    e = np.exp(x - np.max(x, axis=-1, keepdims=True))
+    return e / np.sum(e, axis=-1, keepdims=True)
+
+
+def spline_knots(raw: ArrayLike) -> tuple[Float64Array, Float64Array, Float64Array]:
+    """Return knots ``x_k``, ``y_k`` and slopes from 16 raw numbers, each [..., 6].
+
+    Durkan 2019, appendix A.1, with nflows' constants: softmax over 5 widths and 5 heights
+    with least size 1e-3, slopes ``1e-3 + softplus`` at ``beta = ln 2 / (1 - 1e-3)``, which
+    makes zero parameters the identity. The order is widths, heights, slopes.
+    """
+    raw = np.asarray(raw, float)
+    widths = SPLINE_MIN + (1.0 - SPLINE_MIN * SPLINE_BINS) * softmax(raw[..., :SPLINE_BINS])
+    heights = SPLINE_MIN + (1.0 - SPLINE_MIN * SPLINE_BINS) * softmax(
+        raw[..., SPLINE_BINS : 2 * SPLINE_BINS]
+    )
+    beta = np.log(2.0) / (1.0 - SPLINE_MIN)
+    slopes = SPLINE_MIN + np.logaddexp(0.0, beta * raw[..., 2 * SPLINE_BINS :]) / beta
+    zero = np.zeros((*raw.shape[:-1], 1))
+    x = np.concatenate([zero, np.cumsum(widths, axis=-1)], axis=-1)
+    y = np.concatenate([zero, np.cumsum(heights, axis=-1)], axis=-1)
+    x[..., -1] = 1.0
+    y[..., -1] = 1.0
+    return x, y, slopes
+
+
+def spline(
+    t: ArrayLike, x: ArrayLike, y: ArrayLike, slope: ArrayLike
+) -> tuple[Float64Array, Float64Array]:
+    """Return a monotone rational-quadratic spline and its derivative (Durkan 2019, eqs. 4, 5).
+
+    Args:
+        t: Where to evaluate, clipped to [0, 1], shape [...].
+        x: Knot positions, rising from 0 to 1, shape [knot].
+        y: Knot values, rising from 0 to 1, shape [knot].
+        slope: Derivatives at the knots, > 0, shape [knot].
+
+    Returns:
+        ``f(t)`` and ``f'(t)``, each of shape [...].
+    """
+    x, y, slope = (np.asarray(a, float) for a in (x, y, slope))
+    t = np.clip(np.asarray(t, float), 0.0, 1.0)
+    k = np.clip(np.searchsorted(x, t, side="right") - 1, 0, len(x) - 2)
+    width, rise = x[k + 1] - x[k], y[k + 1] - y[k]
+    m, q = rise / width, (t - x[k]) / width
+    p = q * (1.0 - q)
+    denominator = m + (slope[k + 1] + slope[k] - 2.0 * m) * p
+    f = y[k] + rise * (m * q**2 + slope[k] * p) / denominator
+    numerator = m**2 * (slope[k + 1] * q**2 + 2.0 * m * p + slope[k] * (1.0 - q) ** 2)
+    return f, numerator / denominator**2
+
+
+# ------------------------------------------------- fusion, regularisers, composite (DiPIR)
+
+
+def luminance(rgb: ArrayLike) -> Float64Array:
+    """Return Rec. 709 luminance of linear RGB, shape [...]."""
+    return np.asarray(rgb, float) @ LUMINANCE_WEIGHTS
+
+
+def fuse_literal(texels_fg: ArrayLike, texels_shadow: ArrayLike) -> Float64Array:
+    """Return the fused map as printed, in three steps (S 1, S 2, S 3)."""
+    texels_fg = np.asarray(texels_fg, float)
+    fg, shadow = luminance(texels_fg), luminance(texels_shadow)
+    r = (fg / np.max(fg)) * (shadow / (fg + shadow))
+    fused = (1.0 - r) * fg + r * shadow
+    return texels_fg * (fused / fg)[..., None]
+
+
+def fuse_factor(texels_fg: ArrayLike, texels_shadow: ArrayLike) -> Float64Array:
+    """Return the factor on the foreground map, ``1 + S (S - F) / (M (F + S))``, shape [...].
+
+    (S 1-3) with the division by ``F`` cancelled; ``M`` is the largest ``F``. Its least value
+    over ``F <= M`` is ``2 sqrt 2 - 2``.
+    """
+    fg, shadow = luminance(texels_fg), luminance(texels_shadow)
+    total = fg + shadow
+    quotient = np.divide(shadow * (shadow - fg), total, out=np.zeros_like(total), where=total > 0)
+    return 1.0 + quotient / np.max(fg)
+
+
+def fuse(
+    texels_fg: ArrayLike, texels_shadow: ArrayLike, fusion: float
+) -> tuple[Float64Array, Float64Array]:
+    """Return both maps, blended toward the fused one (S 6, S 7).
+
+    Args:
+        texels_fg: Foreground map, shape [height, width, 3].
+        texels_shadow: Shadow map, shape [height, width, 3].
+        fusion: 0 separate to 1 one light.
+    """
+    texels_fg, texels_shadow = np.asarray(texels_fg, float), np.asarray(texels_shadow, float)
+    fused = texels_fg * fuse_factor(texels_fg, texels_shadow)[..., None]
+    return (
+        fusion * fused + (1.0 - fusion) * texels_fg,
+        fusion * fused + (1.0 - fusion) * texels_shadow,
+    )
+
+
+def consistency(texels_fg: ArrayLike, texels_shadow: ArrayLike) -> float:
+    """Return the cross entropy of the two normalised luminance maps (M 10)."""
+    fg, shadow = luminance(texels_fg), luminance(texels_shadow)
+    d_omega = texel_solid_angle(*fg.shape)[:, None]
+    fg = fg / np.sum(fg * d_omega)
+    shadow = shadow / np.sum(shadow * d_omega)
+    return float(-np.sum(shadow * np.log(fg + CONSISTENCY_EPSILON) * d_omega))
+
+
+def cauchy(texels: ArrayLike) -> float:
+    """Return ``sum log(1 + 2 L^2) dOmega`` over texels and channels (M 11)."""
+    texels = np.asarray(texels, float)
+    d_omega = texel_solid_angle(*texels.shape[:2])[:, None, None]
+    return float(np.sum(np.log1p(2.0 * texels**2) * d_omega))
+
+
+def composite(
+    photo_lin: ArrayLike, mask: ArrayLike, foreground: ArrayLike, shadow_ratio: ArrayLike
+) -> Float64Array:
+    """Return ``(1 - V) ratio photo + V foreground``, all linear RGB (M 6).
+
+    Args:
+        photo_lin: Photograph, shape [..., 3].
+        mask: Coverage of the object, 0 to 1, shape [...].
+        foreground: Object after its tone curve, not premultiplied, shape [..., 3].
+        shadow_ratio: After the tone curves, shape [..., 3].
+    """
+    mask = np.asarray(mask, float)[..., None]
+    shadowed = np.asarray(shadow_ratio, float) * np.asarray(photo_lin, float)
+    return (1.0 - mask) * shadowed + mask * np.asarray(foreground, float)
+
+
+def encode(linear: ArrayLike) -> Float64Array:
+    """Return ``x^(1/2.2)`` (DiPIR, supplement B)."""
+    return np.asarray(linear, float) ** (1.0 / GAMMA)
+
+
+# --------------------------------------------------------------- shadows in closed form
+
+
+def half_plane_ratio(x: ArrayLike, height: float) -> Float64Array:
+    """Return the shadow ratio of a horizontal half-plane under a constant sky.
+
+    The occluder is ``{X > 0, Y = height}``, the receiver the point ``(x, 0, z)`` of the plane
+    ``Y = 0``. The edge is seen at elevation ``psi`` above the open horizon, ``cos psi = x /
+    sqrt(x^2 + height^2)``, and the open lune sends ``(1 - cos psi) / 2`` of the sky's
+    irradiance (Nusselt's analogue; Howell).
+    """
+    x = np.asarray(x, float)
+    return 0.5 * (1.0 - x / np.hypot(x, height))
+
+
+def lune_irradiance(psi: float, radiance: Callable[[Float64Array], Float64Array]) -> float:
+    """Return the irradiance of the plane ``Y = 0`` from the lune ``0 < angle < psi``.
+
+    The angle is the elevation above -X in the X-Y plane and the lune's corners are +Z and -Z:
+    ``d = cos rho (-cos a, sin a, 0) + sin rho (0, 0, 1)``, ``d_omega = cos rho d_rho d_a`` and
+    the cosine is ``cos rho sin a``.
+
+    Args:
+        psi: Where the lune ends [rad], 0 to pi.
+        radiance: Scalar radiance of unit directions of shape [..., 3].
+    """
+    a, weight_a = gauss_legendre(np.linspace(0.0, psi, 65), 16)
+    rho, weight_rho = gauss_legendre(np.linspace(-0.5 * np.pi, 0.5 * np.pi, 65), 16)
+    a, rho = a[:, None], rho[None, :]
+    d = np.stack(
+        np.broadcast_arrays(-np.cos(rho) * np.cos(a), np.cos(rho) * np.sin(a), np.sin(rho)), -1
+    )
+    value = radiance(d) * np.cos(rho) ** 2 * np.sin(a)
+    return float(weight_a @ value @ weight_rho)
+
+
+def half_plane_ratio_lobe(x: float, height: float, axis: ArrayLike, sharpness: float) -> float:
+    """Return the shadow ratio of :func:`half_plane_ratio`'s occluder under one lobe.
+
+    By quadrature over the lune of open sky; good for sharpness up to about 1e4.
+    """
+    psi = float(np.arctan2(height, x))
+
+    def radiance(d: Float64Array) -> Float64Array:
+        return np.exp(-sharpness * one_minus_cos(d, np.asarray(axis, float)))
+
+    return lune_irradiance(psi, radiance) / sg_irradiance([0.0, 1.0, 0.0], axis, sharpness)
+
+
+def rectangle_ratio(x: ArrayLike, z: ArrayLike, height: float, half: float) -> Float64Array:
+    """Return the shadow ratio of a horizontal square under a constant sky.
+
+    The occluder is ``{|X| < half, |Z| < half, Y = height}``, the receiver ``(x, 0, z)``: one
+    minus the configuration factor of a point to a parallel rectangle, the signed sum of its
+    four corner rectangles (Howell).
+    """
+
+    def corner(a: Float64Array, b: Float64Array) -> Float64Array:
+        p, q = a / height, b / height
+        rp, rq = np.sqrt(1.0 + p**2), np.sqrt(1.0 + q**2)
+        return (p / rp * np.arctan(q / rp) + q / rq * np.arctan(p / rq)) / (2.0 * np.pi)
+
+    x, z = np.asarray(x, float), np.asarray(z, float)
+    x0, x1, z0, z1 = -half - x, half - x, -half - z, half - z
+    return 1.0 - (corner(x1, z1) - corner(x0, z1) - corner(x1, z0) + corner(x0, z0))
+
+
+def sphere_ratio(distance: ArrayLike, height: float, radius: float) -> Float64Array:
+    """Return the shadow ratio of a sphere over a plane under a constant sky.
+
+    ``1 - radius^2 height / D^3`` with ``D^2 = distance^2 + height^2``: the configuration factor
+    of a tilted element to a sphere wholly above its horizon, ``height >= radius`` (Howell).
+
+    Args:
+        distance: Horizontal distance of the point from the centre's foot.
+        height: Of the centre over the plane.
+        radius: Of the sphere.
+    """
+    if height < radius:
+        raise ValueError("the sphere must not cut the plane")
+    return 1.0 - radius**2 * height / np.hypot(np.asarray(distance, float), height) ** 3

@@ -1,0 +1,439 @@
+"""The glTF metallic-roughness BRDF: values, sampling, energy, gradients."""
+
+import numpy as np
+import pytest
+import warp as wp
+
+from tests import oracles as o
+from tests.statistics import chi_square, compare_gradients, graded_edges
+from warpir.kernels.brdf import brdf_eval, brdf_pdf, brdf_sample, specular_probability
+
+VALUE_RTOL = 1e-4
+"""float32, few operations."""
+VALUE_ATOL = 1e-7
+"""Below this a BRDF value [1/sr] contributes nothing."""
+SAMPLE_COUNT = 100_000
+"""Cells of the lobe's core hold a few hundred samples; a million where marked slow."""
+FURNACE_MAX = 1.0 + 1e-4
+"""float32 round-off of a mean of weights that are at most 1."""
+Z_MAX = 4.0
+"""Standard errors; 6e-5 per case at a fixed seed."""
+GRADIENT_RELATIVE_L2 = 1e-3
+"""float32 adjoint against central differences of the float64 oracle."""
+
+ROUGHNESS = [0.0, 0.05, 0.15, 0.3, 0.6, 1.0]
+COS_O = [1.0, 0.7, 0.3, 0.1, 0.02]
+
+
+@wp.kernel
+def eval_kernel(
+    wo: wp.array[wp.vec3],
+    wi: wp.array[wp.vec3],
+    base_color: wp.array[wp.vec3],
+    metallic: wp.array[float],
+    roughness: wp.array[float],
+    diffuse: wp.array[wp.vec3],
+    specular: wp.array[wp.vec3],
+):
+    i = wp.tid()
+    value = brdf_eval(wo[i], wi[i], base_color[i], metallic[i], roughness[i])
+    diffuse[i] = value.diffuse
+    specular[i] = value.specular
+
+
+@wp.kernel
+def pdf_kernel(
+    wo: wp.array[wp.vec3],
+    wi: wp.array[wp.vec3],
+    base_color: wp.array[wp.vec3],
+    metallic: wp.array[float],
+    roughness: wp.array[float],
+    pdf: wp.array[float],
+    p_specular: wp.array[float],
+):
+    i = wp.tid()
+    pdf[i] = brdf_pdf(wo[i], wi[i], base_color[i], metallic[i], roughness[i])
+    p_specular[i] = specular_probability(wo[i], base_color[i], metallic[i])
+
+
+@wp.kernel
+def sample_kernel(
+    wo: wp.vec3,
+    u: wp.array[wp.vec2],
+    u_lobe: wp.array[float],
+    base_color: wp.vec3,
+    metallic: float,
+    roughness: float,
+    wi: wp.array[wp.vec3],
+):
+    i = wp.tid()
+    wi[i] = brdf_sample(wo, u[i], u_lobe[i], base_color, metallic, roughness)
+
+
+def upload(values: np.ndarray, dtype: type, device: str, requires_grad: bool = False) -> wp.array:
+    values = np.ascontiguousarray(values, np.float32)
+    return wp.array(values, dtype=dtype, device=device, requires_grad=requires_grad)
+
+
+class Case:
+    """Directions and materials, one row each, as float32 arrays."""
+
+    def __init__(
+        self,
+        wo: np.ndarray,
+        wi: np.ndarray,
+        base_color: np.typing.ArrayLike = 1.0,
+        metallic: np.typing.ArrayLike = 0.0,
+        roughness: np.typing.ArrayLike = 0.5,
+    ) -> None:
+        wo, wi = np.broadcast_arrays(np.asarray(wo, np.float32), np.asarray(wi, np.float32))
+        self.wo, self.wi = wo.reshape(-1, 3), wi.reshape(-1, 3)
+        count = len(self.wo)
+        self.base_color = np.broadcast_to(np.asarray(base_color, np.float32), (count, 3))
+        self.metallic = np.broadcast_to(np.asarray(metallic, np.float32), (count,))
+        self.roughness = np.broadcast_to(np.asarray(roughness, np.float32), (count,))
+
+    def arrays(self, device: str, requires_grad: bool = False) -> list[wp.array]:
+        return [
+            upload(self.wo, wp.vec3, device),
+            upload(self.wi, wp.vec3, device),
+            upload(self.base_color, wp.vec3, device, requires_grad),
+            upload(self.metallic, float, device, requires_grad),
+            upload(self.roughness, float, device, requires_grad),
+        ]
+
+    def evaluate(self, device: str) -> tuple[np.ndarray, np.ndarray]:
+        """Return the kernel's diffuse and specular parts, shape [row, 3]."""
+        out = [wp.zeros(len(self.wo), dtype=wp.vec3, device=device) for _ in range(2)]
+        wp.launch(eval_kernel, len(self.wo), inputs=self.arrays(device), outputs=out, device=device)
+        diffuse, specular = (a.numpy().astype(np.float64) for a in out)
+        return diffuse, specular
+
+    def density(self, device: str) -> tuple[np.ndarray, np.ndarray]:
+        """Return the kernel's density and its probability of the specular lobe."""
+        out = [wp.zeros(len(self.wo), dtype=float, device=device) for _ in range(2)]
+        wp.launch(pdf_kernel, len(self.wo), inputs=self.arrays(device), outputs=out, device=device)
+        pdf, p = (a.numpy().astype(np.float64) for a in out)
+        return pdf, p
+
+    def oracle(self) -> np.ndarray:
+        """Return the specification's value, shape [row, 3]."""
+        return o.gltf_brdf(self.wo, self.wi, self.base_color, self.metallic, self.roughness)
+
+
+def outgoing(cos_o: float, phi: float = 0.0) -> np.ndarray:
+    """Return a unit float32 direction toward the camera at azimuth ``phi``."""
+    return o.spherical(cos_o, phi).astype(np.float32)
+
+
+def draw(
+    wo: np.ndarray,
+    base_color: float,
+    metallic: float,
+    roughness: float,
+    rng: np.random.Generator,
+    device: str,
+    count: int = SAMPLE_COUNT,
+) -> np.ndarray:
+    wi = wp.zeros(count, dtype=wp.vec3, device=device)
+    u = upload(rng.random((count, 2), dtype=np.float32), wp.vec2, device)
+    u_lobe = upload(rng.random(count, dtype=np.float32), float, device)
+    inputs = [wp.vec3(*map(float, wo)), u, u_lobe, wp.vec3(base_color), metallic, roughness]
+    wp.launch(sample_kernel, count, inputs=inputs, outputs=[wi], device=device)
+    return wi.numpy().astype(np.float64)
+
+
+def random_case(rng: np.random.Generator, count: int, cos_min: float = 1e-3) -> Case:
+    """Random directions above the surface, a third of them near the mirror direction."""
+    wo = o.spherical(np.exp(rng.uniform(np.log(cos_min), 0.0, count)), rng.uniform(0, 6.28, count))
+    wi = o.spherical(np.exp(rng.uniform(np.log(cos_min), 0.0, count)), rng.uniform(0, 6.28, count))
+    roughness = rng.random(count)
+    near = slice(0, count // 3)
+    mirror = wo[near] * [-1, -1, 1] + 0.5 * roughness[near, None] ** 2 * rng.normal(
+        size=(count // 3, 3)
+    )
+    wi[near] = o.normalize(np.stack([mirror[:, 0], mirror[:, 1], np.abs(mirror[:, 2])], axis=-1))
+    return Case(wo, wi, rng.random((count, 3)), rng.random(count), roughness)
+
+
+# ------------------------------------------------------------------------------- values
+
+
+def test_brdf_matches_oracle(device: str, rng: np.random.Generator) -> None:
+    """Diffuse plus specular is glTF B.3.5 for any material, also at grazing angles."""
+    case = random_case(rng, 30000)
+    diffuse, specular = case.evaluate(device)
+    np.testing.assert_allclose(diffuse + specular, case.oracle(), rtol=VALUE_RTOL, atol=VALUE_ATOL)
+
+
+@pytest.mark.parametrize("roughness", [0.0, 0.01, 0.03, 0.1])
+def test_brdf_matches_oracle_on_smooth_surfaces(
+    device: str, rng: np.random.Generator, roughness: float
+) -> None:
+    """Near-mirrors keep their digits in the core of the lobe, down to the least alpha."""
+    alpha = float(o.ggx_alpha(roughness))
+    wm = o.spherical(np.cos(np.arctan(alpha * rng.uniform(0, 3, 5000))), rng.uniform(0, 6.28, 5000))
+    wo = o.spherical(rng.uniform(0.05, 1.0, 5000), rng.uniform(0, 6.28, 5000))
+    wi = 2 * o.dot(wo, wm)[:, None] * wm - wo
+    keep = wi[:, 2] > 0.01
+    case = Case(wo[keep], wi[keep], rng.random((int(keep.sum()), 3)), 1.0, roughness)
+    _, specular = case.evaluate(device)
+    np.testing.assert_allclose(specular, case.oracle(), rtol=VALUE_RTOL, atol=VALUE_ATOL)
+
+
+def test_brdf_parts(device: str, rng: np.random.Generator) -> None:
+    """The split is the specification's: ``(1 - F) c_diff / pi`` and ``F D G / (4 |VN| |LN|)``."""
+    case = random_case(rng, 5000)
+    diffuse, specular = case.evaluate(device)
+    f0 = (
+        o.DIELECTRIC_F0
+        + (case.base_color.astype(np.float64) - o.DIELECTRIC_F0) * case.metallic[:, None]
+    )
+    expected = o.specular_brdf(case.wo, case.wi, f0, o.ggx_alpha(case.roughness))
+    np.testing.assert_allclose(specular, expected, rtol=VALUE_RTOL, atol=VALUE_ATOL)
+    np.testing.assert_allclose(diffuse, case.oracle() - expected, rtol=VALUE_RTOL, atol=2e-6)
+
+
+def test_brdf_is_reciprocal(device: str, rng: np.random.Generator) -> None:
+    """``f(wo, wi) = f(wi, wo)`` (Helmholtz)."""
+    case = random_case(rng, 20000)
+    swapped = Case(case.wi, case.wo, case.base_color, case.metallic, case.roughness)
+    there, back = (np.add(*c.evaluate(device)) for c in (case, swapped))
+    # float32 directions are not quite unit vectors, so wo . wm and wi . wm differ by 1e-7; near
+    # grazing Schlick's fifth power turns that into a share of the whole term.
+    wm = o.normalize(case.wo.astype(np.float64) + case.wi)
+    rtol = 1e-5 + 5e-7 / o.dot(case.wo, wm)
+    error = np.abs(there - back) / np.maximum(there, VALUE_ATOL / rtol.min())
+    assert np.all(error <= rtol[:, None])
+
+
+def test_brdf_is_zero_below_the_surface(device: str) -> None:
+    """Neither value nor density below the horizon, nor exactly on it."""
+    up, down, flat = [0.6, 0, 0.8], [0.6, 0, -0.8], [1.0, 0, 0]
+    pairs = [(up, down), (down, up), (down, down), (up, flat), (flat, up)]
+    case = Case(np.array([p[0] for p in pairs]), np.array([p[1] for p in pairs]), 0.8, 0.3, 0.4)
+    assert np.all(np.add(*case.evaluate(device)) == 0.0)
+    assert np.all(case.density(device)[0] == 0.0)
+
+
+@pytest.mark.parametrize("cos_min", [1e-12, 1e-18, 1e-30])
+def test_brdf_is_finite_at_extreme_angles(device: str, cos_min: float) -> None:
+    """Grazing and retro directions, down to any positive cosine, give finite values >= 0."""
+    cos = np.array([1.0, 0.5, 1e-2, 1e-4, 1e-6, cos_min], np.float32)
+    wo, wi = (a.ravel() for a in np.meshgrid(cos, cos))
+    for phi in (0.0, np.pi, 1.0):
+        for roughness in (0.0, 0.5, 1.0):
+            case = Case(o.spherical(wo, 0.0), o.spherical(wi, phi), 1.0, 0.5, roughness)
+            diffuse, specular = case.evaluate(device)
+            pdf, _ = case.density(device)
+            for values in (diffuse, specular, pdf):
+                assert np.all(np.isfinite(values)) and np.all(values >= 0.0)
+
+
+# ------------------------------------------------------------------------------ sampling
+
+
+def test_brdf_pdf_matches_oracle(device: str, rng: np.random.Generator) -> None:
+    """A mix of visible-normal reflection (Heitz 2018) and the cosine, with a proper probability."""
+    case = random_case(rng, 20000)
+    pdf, p = case.density(device)
+    assert p.min() > 0.0 and p.max() <= 1.0
+    expected = p * o.vndf_reflection_pdf(case.wo, case.wi, o.ggx_alpha(case.roughness))
+    expected += (1.0 - p) * o.cosine_pdf(case.wi)
+    np.testing.assert_allclose(pdf, expected, rtol=VALUE_RTOL, atol=VALUE_ATOL)
+
+
+def check_sampling(
+    device: str,
+    rng: np.random.Generator,
+    metallic: float,
+    roughness: float,
+    cos_o: float,
+    count: int,
+    case_count: int,
+) -> None:
+    """Compare samples with the oracle's density on cells graded toward the mirror direction."""
+    # The camera's azimuth is a general one; cells are taken about the mirror direction's.
+    wo = outgoing(cos_o, 0.8)
+    wi = draw(wo, 0.7, metallic, roughness, rng, device, count)
+    _, p = Case(wo[None], wo[None], 0.7, metallic, roughness).density(device)
+    alpha = float(o.ggx_alpha(roughness))
+
+    def pdf(d: np.ndarray) -> np.ndarray:
+        value = p[0] * o.vndf_reflection_pdf(wo, d, alpha) + (1.0 - p[0]) * o.cosine_pdf(d)
+        return np.where(d[..., 2] > 0.0, value, 0.0)
+
+    theta_o = float(np.arccos(cos_o))
+    sin_o = max(np.sin(theta_o), alpha)
+    theta = graded_edges(theta_o, 2 * alpha, 0.0, 0.5 * np.pi, 40)
+    phi = (
+        0.8
+        + np.pi
+        + graded_edges(0.0, min(2 * alpha * max(cos_o, 0.1) / sin_o, 1.5), -np.pi, np.pi, 40)
+    )
+    # Below the horizon the renderer drops samples: they are the cell that the density lacks.
+    above = wi[wi[:, 2] > 0.0]
+    verdict = chi_square(
+        above, pdf, theta, phi, sample_count=count, case_count=case_count, order=12
+    )
+    assert verdict.passed, verdict
+
+
+@pytest.mark.parametrize("metallic", [1.0, 0.2])
+@pytest.mark.parametrize(
+    "roughness, cos_o",
+    [(0.0, 0.7), (0.05, 0.3), (0.15, 0.02), (0.3, 1.0), (0.6, 0.1), (1.0, 0.7), (1.0, 0.02)],
+)
+def test_brdf_sample(
+    device: str, rng: np.random.Generator, metallic: float, roughness: float, cos_o: float
+) -> None:
+    """Samples follow the density, for a metal and for a mix, from mirror to rough and grazing."""
+    check_sampling(device, rng, metallic, roughness, cos_o, SAMPLE_COUNT, 14)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("metallic", [1.0, 0.5, 0.0])
+@pytest.mark.parametrize("cos_o", COS_O)
+@pytest.mark.parametrize("roughness", ROUGHNESS)
+def test_brdf_sample_million(
+    device: str, rng: np.random.Generator, metallic: float, roughness: float, cos_o: float
+) -> None:
+    """The same over the whole grid with a million samples."""
+    check_sampling(
+        device, rng, metallic, roughness, cos_o, 1_000_000, 3 * len(COS_O) * len(ROUGHNESS)
+    )
+
+
+# ------------------------------------------------------------------------------- furnace
+
+
+def albedo_samples(
+    device: str,
+    rng: np.random.Generator,
+    cos_o: float,
+    metallic: float,
+    roughness: float,
+    base: float,
+) -> np.ndarray:
+    """Return one estimate ``f cos / pdf`` of the directional albedo per sample."""
+    wo = outgoing(cos_o)
+    wi = draw(wo, base, metallic, roughness, rng, device)
+    case = Case(wo, wi, base, metallic, roughness)
+    value = np.add(*case.evaluate(device))[:, 0] * np.maximum(wi[:, 2], 0.0)
+    pdf, _ = case.density(device)
+    return np.divide(value, pdf, out=np.zeros_like(value), where=pdf > 0.0)
+
+
+@pytest.mark.parametrize("roughness", ROUGHNESS)
+def test_specular_furnace(device: str, rng: np.random.Generator, roughness: float) -> None:
+    """A white metal (F0 = 1) reflects at most what it receives, sample by sample, at every angle.
+
+    With F = 1 a visible-normal sample weighs ``G2 / G1 <= 1`` (Heitz 2018); the mean is the
+    oracle's directional albedo.
+    """
+    for cos_o in COS_O:
+        weight = albedo_samples(device, rng, cos_o, 1.0, roughness, 1.0)
+        assert weight.max() <= 1.0 + VALUE_RTOL
+        assert weight.mean() <= FURNACE_MAX
+        expected = o.specular_albedo(cos_o, float(o.ggx_alpha(roughness)), 1.0, count=512)
+        assert weight.mean() == pytest.approx(
+            expected, abs=Z_MAX * float(weight.std()) / 316 + 2e-4
+        )
+
+
+def test_lambert_furnace(device: str) -> None:
+    """The white base alone, divided by what Fresnel leaves to it, reflects 1 within 1 %."""
+    cos_i, weight = o.gauss_legendre(np.linspace(0, 1, 9), 8)
+    phi = 2 * np.pi * (np.arange(64) + 0.5) / 64
+    wi = o.spherical(cos_i[:, None], phi).reshape(-1, 3)
+    for cos_o in COS_O:
+        wo = outgoing(cos_o)
+        diffuse, _ = Case(wo, wi, 1.0, 0.0, 1.0).evaluate(device)
+        left = 1.0 - o.schlick(o.DIELECTRIC_F0, o.dot(wo, o.normalize(wo + wi)))
+        lambert = (diffuse[:, 0] / left).reshape(len(cos_i), 64).mean(axis=1)
+        assert 2 * np.pi * np.sum(lambert * cos_i * weight) == pytest.approx(1.0, abs=1e-4)
+
+
+@pytest.mark.parametrize(
+    "roughness, base", [(0.0, 1.0), (0.3, 1.0), (0.6, 1.0), (1.0, 1.0), (0.3, 0.5)]
+)
+def test_dielectric_albedo_is_the_specification_s(
+    device: str, rng: np.random.Generator, roughness: float, base: float
+) -> None:
+    """Where glTF's coupling gains energy, at grazing angles, the kernel gains exactly as much."""
+    for cos_o in (1.0, 0.5, 0.1, 0.02):
+        weight = albedo_samples(device, rng, cos_o, 0.0, roughness, base)
+        error = float(weight.std()) / np.sqrt(len(weight))
+        expected = o.gltf_albedo(cos_o, base, 0.0, roughness)
+        assert weight.mean() == pytest.approx(expected, abs=Z_MAX * error + 5e-4), (cos_o, expected)
+
+
+@pytest.mark.parametrize("metallic", [0.0, 0.3, 1.0])
+def test_sample_weights_are_bounded(device: str, rng: np.random.Generator, metallic: float) -> None:
+    """No material gives a sample weight above 10: a lobe keeps a tenth of the samples."""
+    for roughness in ROUGHNESS:
+        for cos_o in COS_O:
+            weight = albedo_samples(device, rng, cos_o, metallic, roughness, 0.9)
+            assert weight.max() <= 10.0
+
+
+# ------------------------------------------------------------------------------ gradients
+
+
+def test_brdf_gradient(device: str, rng: np.random.Generator) -> None:
+    """Adjoints of base colour, metallic and roughness against float64 central differences."""
+    case = random_case(rng, 400, cos_min=0.02)
+    case.roughness = rng.uniform(0.1, 1.0, 400).astype(np.float32)
+    case.metallic = rng.uniform(0.05, 0.95, 400).astype(np.float32)
+    arrays = case.arrays(device, requires_grad=True)
+    out = [wp.zeros(400, dtype=wp.vec3, device=device, requires_grad=True) for _ in range(2)]
+    y = rng.normal(size=(400, 3)).astype(np.float32)
+    # Peaks would drown everything else: each row is scaled to a value of about 1.
+    y /= (1.0 + case.oracle().max(axis=1, keepdims=True)).astype(np.float32)
+    with wp.Tape() as tape:
+        wp.launch(eval_kernel, 400, inputs=arrays, outputs=out, device=device)
+    tape.backward(grads={a: upload(y, wp.vec3, device) for a in out})
+
+    def rows(base: np.ndarray, metallic: np.ndarray, roughness: np.ndarray) -> np.ndarray:
+        value = o.gltf_brdf(case.wo, case.wi, base, metallic, roughness)
+        return np.sum(value * y, axis=-1)
+
+    base, metallic, roughness = (
+        a.astype(np.float64) for a in (case.base_color, case.metallic, case.roughness)
+    )
+    h = 1e-5
+    d_metallic = (rows(base, metallic + h, roughness) - rows(base, metallic - h, roughness)) / (
+        2 * h
+    )
+    d_roughness = (rows(base, metallic, roughness + h) - rows(base, metallic, roughness - h)) / (
+        2 * h
+    )
+    d_base = np.stack(
+        [
+            (rows(base + h * e, metallic, roughness) - rows(base - h * e, metallic, roughness))
+            / (2 * h)
+            for e in np.eye(3)
+        ],
+        axis=-1,
+    )
+    for array, expected in zip(arrays[2:], (d_base, d_metallic, d_roughness), strict=True):
+        match = compare_gradients(array.grad.numpy(), expected)
+        assert match.relative_l2 < GRADIENT_RELATIVE_L2, match
+
+
+def test_brdf_gradient_is_finite_everywhere(device: str) -> None:
+    """Below the horizon, on it, at grazing and at roughness 0 the adjoints are finite numbers."""
+    wo = np.array(
+        [[0, 0, 1], [0.6, 0, 0.8], [0.6, 0, -0.8], [1, 0, 0], [1, 0, 1e-6], [0.6, 0, 0.8]], float
+    )
+    wi = np.array(
+        [[0, 0, 1], [0.6, 0, -0.8], [-0.6, 0, 0.8], [0, 0, 1], [-1, 0, 1e-6], [-0.6, 0, 0.8]], float
+    )
+    case = Case(wo, wi, 0.0, 1.0, 0.0)
+    arrays = case.arrays(device, requires_grad=True)
+    out = [wp.zeros(len(wo), dtype=wp.vec3, device=device, requires_grad=True) for _ in range(2)]
+    with wp.Tape() as tape:
+        wp.launch(eval_kernel, len(wo), inputs=arrays, outputs=out, device=device)
+    tape.backward(grads={a: upload(np.ones((len(wo), 3)), wp.vec3, device) for a in out})
+    for array in arrays[2:]:
+        assert np.all(np.isfinite(array.grad.numpy()))

@@ -1,0 +1,314 @@
+"""Shadow ratio, tone stages, composite and encoding: values and gradients (DiPIR, eqs. 5 and 6)."""
+
+import numpy as np
+import pytest
+import warp as wp
+from warp import autograd
+
+from tests import oracles as o
+from tests.statistics import central_differences, compare_gradients
+from warpir.kernels.composite import compose, tone_foreground, tone_shadow
+from warpir.kernels.shadow_ratio import shadow_ratio
+
+VALUE_ABS = 2e-6
+"""float32 values in [0, 1] after a curve, a product and a power."""
+GRADIENT_RELATIVE_L2 = 1e-3
+"""float32 adjoint against central differences of the float64 oracle."""
+
+
+def vec3s(values: np.ndarray, device: str, requires_grad: bool = False) -> wp.array:
+    values = np.ascontiguousarray(values, np.float32)
+    return wp.array(values, dtype=wp.vec3, device=device, requires_grad=requires_grad)
+
+
+def floats(values: np.ndarray, device: str, requires_grad: bool = False) -> wp.array:
+    values = np.ascontiguousarray(values, np.float32)
+    return wp.array(values, dtype=float, device=device, requires_grad=requires_grad)
+
+
+def ints(values: np.ndarray, device: str) -> wp.array:
+    return wp.array(np.ascontiguousarray(values, np.int32), dtype=int, device=device)
+
+
+def empty(count: int, device: str) -> wp.array:
+    return wp.zeros(count, dtype=wp.vec3, device=device, requires_grad=True)
+
+
+class Scene:
+    """A 96-pixel photo: object with partial coverage, shaded plane, untouched background."""
+
+    def __init__(self, rng: np.random.Generator, raw_scale: float = 0.7) -> None:
+        self.photo = rng.uniform(0.05, 0.8, (96, 3)).astype(np.float32)
+        object_pixels, proxy_pixels = np.arange(0, 40), np.arange(24, 80)
+        self.object_index = np.full(96, -1)
+        self.object_index[object_pixels] = rng.permutation(40)
+        self.proxy_index = np.full(96, -1)
+        self.proxy_index[proxy_pixels] = rng.permutation(56)
+        self.mask = rng.uniform(0.05, 1.0, 40).astype(np.float32)
+        self.mask[::3] = 1.0
+        self.foreground = (rng.gamma(1.0, 1.0, (40, 3)) * self.mask[:, None]).astype(np.float32)
+        self.unoccluded = rng.uniform(0.5, 3.0, (56, 3)).astype(np.float32)
+        self.lit = (self.unoccluded * rng.uniform(0.05, 0.95, (56, 3))).astype(np.float32)
+        raw = rng.normal(scale=raw_scale, size=(4, 16))
+        self.knots_fg = tuple(k.astype(np.float32) for k in o.spline_knots(raw[:1]))
+        self.knots_shadow = tuple(k.astype(np.float32) for k in o.spline_knots(raw[1:]))
+
+    def oracle(
+        self,
+        foreground: np.ndarray,
+        lit: np.ndarray,
+        unoccluded: np.ndarray,
+        knots_fg: tuple[np.ndarray, ...],
+        knots_shadow: tuple[np.ndarray, ...],
+    ) -> np.ndarray:
+        """Return the encoded image from (M 5), (M 6) and the tone stages of method 2.4."""
+        ratio = lit / unoccluded
+        ratio = np.stack(
+            [o.spline(ratio[:, c], *(k[c] for k in knots_shadow))[0] for c in range(3)], -1
+        )
+        tone = o.spline(o.reinhard(foreground / self.mask[:, None]), *(k[0] for k in knots_fg))[0]
+        on_object, on_proxy = self.object_index >= 0, self.proxy_index >= 0
+        mask, ratio_image, tone_image = np.zeros(96), np.ones((96, 3)), np.zeros((96, 3))
+        mask[on_object] = self.mask[self.object_index[on_object]]
+        tone_image[on_object] = tone[self.object_index[on_object]]
+        ratio_image[on_proxy] = ratio[self.proxy_index[on_proxy]]
+        return o.encode(o.composite(self.photo, mask, tone_image, ratio_image))
+
+    def free(self) -> list[np.ndarray]:
+        return [self.foreground, self.lit, self.unoccluded, *self.knots_fg, *self.knots_shadow]
+
+    def launch(self, device: str, is_reinhard: int = 1) -> tuple[list[wp.array], wp.array, wp.Tape]:
+        """Run the four kernels; return the free arrays, the image and the tape."""
+        free = [vec3s(a, device, True) for a in self.free()[:3]]
+        free += [floats(a, device, True) for a in self.free()[3:]]
+        foreground, lit, unoccluded = free[:3]
+        mask = floats(self.mask, device)
+        ratio, ratio_display = empty(56, device), empty(56, device)
+        display, image = empty(40, device), empty(96, device)
+        with wp.Tape() as tape:
+            wp.launch(shadow_ratio, 56, inputs=[lit, unoccluded], outputs=[ratio], device=device)
+            wp.launch(
+                tone_shadow,
+                56,
+                inputs=[ratio, *free[6:], 5],
+                outputs=[ratio_display],
+                device=device,
+            )
+            wp.launch(
+                tone_foreground,
+                40,
+                inputs=[foreground, mask, is_reinhard, *free[3:6], 5],
+                outputs=[display],
+                device=device,
+            )
+            index = [ints(self.object_index, device), ints(self.proxy_index, device)]
+            wp.launch(
+                compose,
+                96,
+                inputs=[vec3s(self.photo, device), *index, mask, display, ratio_display],
+                outputs=[image],
+                device=device,
+            )
+        return free, image, tape
+
+
+def test_composite_matches_oracle(device: str, rng: np.random.Generator) -> None:
+    """Ratio, curves, composite and encoding together equal the equations."""
+    scene = Scene(rng)
+    _, image, _ = scene.launch(device)
+    expected = scene.oracle(
+        scene.foreground, scene.lit, scene.unoccluded, scene.knots_fg, scene.knots_shadow
+    )
+    np.testing.assert_allclose(image.numpy(), expected, atol=VALUE_ABS)
+
+
+def test_composite_gradient(device: str, rng: np.random.Generator) -> None:
+    """Adjoints of radiance, both sums and all knots against central differences of the oracle."""
+    scene = Scene(rng)
+    free, image, tape = scene.launch(device)
+    y = rng.normal(size=(96, 3)).astype(np.float32)
+    tape.backward(grads={image: vec3s(y, device)})
+    values = [a.astype(np.float64) for a in scene.free()]
+
+    def loss(k: int, x: np.ndarray) -> float:
+        moved = [x if i == k else v for i, v in enumerate(values)]
+        return float(np.sum(y * scene.oracle(*moved[:3], tuple(moved[3:6]), tuple(moved[6:]))))
+
+    names = [
+        "foreground",
+        "lit",
+        "unoccluded",
+        "x_fg",
+        "y_fg",
+        "slope_fg",
+        "x_sh",
+        "y_sh",
+        "slope_sh",
+    ]
+    for k, name in enumerate(names):
+        reference = central_differences(lambda x, k=k: loss(k, x), values[k], 1e-6)
+        gradient = free[k].grad.numpy().astype(np.float64)
+        if name.startswith("x_"):
+            # The outermost x knots are the ends of the interval, never free.
+            gradient, reference = gradient[:, 1:-1], reference[:, 1:-1]
+        match = compare_gradients(gradient, reference)
+        assert match.relative_l2 < GRADIENT_RELATIVE_L2, (name, match)
+
+
+def test_untouched_photo_depends_on_nothing_but_the_photo(
+    device: str, rng: np.random.Generator
+) -> None:
+    """Neither object nor plane: the photo's encoding alone (method 2.5)."""
+    scene = Scene(rng)
+    image = scene.launch(device)[1].numpy()
+    free = (scene.object_index < 0) & (scene.proxy_index < 0)
+    np.testing.assert_allclose(image[free], o.encode(scene.photo[free]), atol=5e-7)
+
+
+def test_ratio_of_one_leaves_the_photo_alone(device: str, rng: np.random.Generator) -> None:
+    """``lit = unoccluded`` gives bit for bit the pixel of a photo without plane, for any curve."""
+    scene = Scene(rng, raw_scale=2.0)
+    scene.lit = scene.unoccluded.copy()
+    with_plane = scene.launch(device)[1].numpy()
+    scene.proxy_index[:] = -1
+    assert np.array_equal(with_plane, scene.launch(device)[1].numpy())
+
+
+def test_full_coverage_hides_the_photo(device: str, rng: np.random.Generator) -> None:
+    """Where the object covers a pixel, photo and shadow have no influence (M 6)."""
+    scene = Scene(rng)
+    covered = np.isin(scene.object_index, np.flatnonzero(scene.mask == 1.0))
+    first = scene.launch(device)[1].numpy()
+    scene.photo = 1.0 - scene.photo
+    scene.lit = 0.5 * scene.lit
+    assert np.array_equal(first[covered], scene.launch(device)[1].numpy()[covered])
+
+
+def test_linear_foreground_without_reinhard(device: str, rng: np.random.Generator) -> None:
+    """With the operator off and the identity curve the object's radiance is shown clipped at 1."""
+    scene = Scene(rng, raw_scale=0.0)
+    scene.mask[:] = 1.0
+    image = scene.launch(device, is_reinhard=0)[1].numpy()
+    on_object = scene.object_index >= 0
+    expected = o.encode(np.clip(scene.foreground[scene.object_index[on_object]], 0.0, 1.0))
+    np.testing.assert_allclose(image[on_object], expected, atol=VALUE_ABS)
+
+
+def test_shadow_ratio_of_special_values(device: str) -> None:
+    """No occluder: exactly 1; full occluder: 0; a plane without light: 1, and no NaN gradient."""
+    lit = np.array(
+        [[1.0, 0.3, 7e4], [0.0, 0.0, 0.0], [0.0, 0.0, 0.5], [1e-30, 0.0, 1e30]], np.float32
+    )
+    unoccluded = np.array(
+        [[1.0, 0.3, 7e4], [1.0, 2.0, 1e9], [0.0, 0.0, 1.0], [1e-30, 0.0, 1e30]], np.float32
+    )
+    expected = [[1, 1, 1], [0, 0, 0], [1, 1, 0.5], [1, 1, 1]]
+    arrays = [vec3s(lit, device, True), vec3s(unoccluded, device, True)]
+    out = empty(4, device)
+    with wp.Tape() as tape:
+        wp.launch(shadow_ratio, 4, inputs=arrays, outputs=[out], device=device)
+    assert np.array_equal(out.numpy(), np.array(expected, np.float32))
+    tape.backward(grads={out: vec3s(np.ones((4, 3)), device)})
+    d_lit, d_unoccluded = (a.grad.numpy() for a in arrays)
+    assert np.all(np.isfinite(d_lit)) and np.all(np.isfinite(d_unoccluded[:3]))
+    assert d_lit[2, 2] == 1.0 and d_unoccluded[2, 2] == -0.5
+    assert np.all(d_lit[2, :2] == 0.0) and np.all(d_unoccluded[2, :2] == 0.0)
+
+
+def test_shadow_ratio_ignores_the_scale_of_the_light(device: str, rng: np.random.Generator) -> None:
+    """``ratio(a L) = ratio(L)`` (method 2.3), exactly for powers of two."""
+    unoccluded = rng.uniform(0.1, 2.0, (64, 3)).astype(np.float32)
+    lit = unoccluded * rng.random((64, 3), dtype=np.float32)
+    ratios = []
+    for scale in (1.0, 2.0**20, 2.0**-20):
+        out = empty(64, device)
+        inputs = [vec3s(lit * scale, device), vec3s(unoccluded * scale, device)]
+        wp.launch(shadow_ratio, 64, inputs=inputs, outputs=[out], device=device)
+        ratios.append(out.numpy())
+    assert np.array_equal(ratios[0], ratios[1]) and np.array_equal(ratios[0], ratios[2])
+    assert ratios[0].min() >= 0.0 and ratios[0].max() <= 1.0
+
+
+def photo_only(photo: np.ndarray, device: str) -> tuple[wp.array, wp.array, wp.Tape]:
+    """Encode a photo by the composite kernel without object or plane."""
+    count = len(photo)
+    source, image = vec3s(photo, device, True), empty(count, device)
+    none = ints(np.full(count, -1), device)
+    dummy = [
+        floats(np.zeros(1), device),
+        vec3s(np.zeros((1, 3)), device),
+        vec3s(np.zeros((1, 3)), device),
+    ]
+    with wp.Tape() as tape:
+        wp.launch(
+            compose, count, inputs=[source, none, none, *dummy], outputs=[image], device=device
+        )
+    return source, image, tape
+
+
+def test_encode_every_8_bit_code(device: str) -> None:
+    """Decoding and encoding returns each of 256 codes exactly after rounding (``x^2.2``)."""
+    code = np.arange(256)
+    linear = np.repeat(((code / 255.0) ** 2.2)[:, None], 3, axis=1)
+    image = photo_only(linear, device)[1].numpy()
+    assert np.array_equal(np.round(255.0 * image[:, 0]).astype(int), code)
+    assert np.abs(image[:, 0] - code / 255.0).max() < 1e-6
+
+
+def test_encode_is_finite_and_monotone(device: str) -> None:
+    """Black and negative give 0, more than 1 gives 1, slopes stay finite, below half a code too."""
+    x = np.concatenate([[-1.0, -1e-9, 0.0], np.geomspace(1e-30, 10.0, 2000)])
+    source, image, tape = photo_only(np.repeat(x[:, None], 3, axis=1), device)
+    y = image.numpy()[:, 0].astype(np.float64)
+    assert np.all(y[:3] == 0.0) and y[-1] == 1.0
+    assert np.diff(y).min() >= -1e-7
+    tape.backward(grads={image: vec3s(np.ones((len(x), 3)), device)})
+    gradient = source.grad.numpy()[:, 0]
+    assert np.all(np.isfinite(gradient)) and np.all(gradient >= 0.0)
+    # Half of one 8-bit code is the most that the linear foot may change.
+    assert np.abs(y - o.encode(np.clip(x, 0.0, 1.0))).max() < 0.5 / 255.0
+    inside = (x > 1e-5) & (x < 0.999)
+    np.testing.assert_allclose(gradient[inside], x[inside] ** (1 / 2.2 - 1) / 2.2, rtol=1e-4)
+
+
+@pytest.mark.parametrize("kernel", ["tone_foreground", "tone_shadow", "shadow_ratio"])
+def test_gradcheck(device: str, rng: np.random.Generator, kernel: str) -> None:
+    """Warp's own finite differences agree with each kernel's adjoint."""
+    scene = Scene(rng, raw_scale=0.2)
+    # Mid-bin values, so that a step does not cross a knot.
+    middle = lambda knots, c: 0.5 * (knots[0][c, 1:] + knots[0][c, :-1])  # noqa: E731
+    out = empty(5, device)
+    if kernel == "shadow_ratio":
+        inputs = [vec3s(scene.lit[:5], device, True), vec3s(scene.unoccluded[:5], device, True)]
+    elif kernel == "tone_shadow":
+        ratio = np.stack([middle(scene.knots_shadow, c) for c in range(3)], axis=-1)
+        inputs = [
+            vec3s(ratio, device, True),
+            *(floats(k, device, True) for k in scene.knots_shadow),
+            5,
+        ]
+    else:
+        x = np.repeat(middle(scene.knots_fg, 0)[:, None], 3, axis=1)
+        inputs = [
+            vec3s(x * 0.5, device, True),
+            floats(np.full(5, 0.5), device),
+            0,
+            *(floats(k, device, True) for k in scene.knots_fg),
+            5,
+        ]
+    function = {
+        "tone_foreground": tone_foreground,
+        "tone_shadow": tone_shadow,
+        "shadow_ratio": shadow_ratio,
+    }
+    assert autograd.gradcheck(
+        function[kernel],
+        dim=(5,),
+        inputs=inputs,
+        outputs=[out],
+        device=device,
+        eps=3e-3,
+        atol=5e-3,
+        raise_exception=False,
+        show_summary=False,
+    )

@@ -1,0 +1,203 @@
+"""Tone curves: the rational-quadratic spline and Reinhard's operator, values and gradients."""
+
+import numpy as np
+import pytest
+import warp as wp
+from warp import autograd
+
+from tests import oracles as o
+from tests.statistics import central_differences, compare_gradients
+from warpir.kernels.tone import reinhard, tone_curve
+
+VALUE_ABS = 1e-6
+"""float32 values in [0, 1] after about ten operations."""
+STEEP_ULPS = 8.0
+"""Rounding of ``x`` and of the knots, 2^-24 each, is amplified by the slope of the curve."""
+GRADIENT_RELATIVE_L2 = 1e-3
+"""float32 adjoint against central differences of the float64 oracle."""
+
+
+@wp.kernel
+def curve_kernel(
+    x: wp.array[float],
+    curve: wp.array[int],
+    knot_x: wp.array2d[float],
+    knot_y: wp.array2d[float],
+    knot_slope: wp.array2d[float],
+    bin_count: int,
+    y: wp.array[float],
+):
+    i = wp.tid()
+    y[i] = tone_curve(x[i], curve[i], knot_x, knot_y, knot_slope, bin_count)
+
+
+@wp.kernel
+def reinhard_kernel(x: wp.array[float], y: wp.array[float]):
+    i = wp.tid()
+    y[i] = reinhard(x[i])
+
+
+def upload(values: np.ndarray, device: str, requires_grad: bool = False) -> wp.array:
+    values = np.ascontiguousarray(values, np.float32)
+    return wp.array(values, dtype=float, device=device, requires_grad=requires_grad)
+
+
+def apply_curve(
+    x: np.ndarray, curve: np.ndarray, knots: tuple[np.ndarray, ...], device: str
+) -> np.ndarray:
+    out = wp.zeros(len(x), dtype=float, device=device)
+    index = wp.array(np.asarray(curve, np.int32), dtype=int, device=device)
+    inputs = [upload(x, device), index, *(upload(k, device) for k in knots), knots[0].shape[1] - 1]
+    wp.launch(curve_kernel, len(x), inputs=inputs, outputs=[out], device=device)
+    return out.numpy().astype(np.float64)
+
+
+def float32_knots(raw: np.ndarray) -> tuple[np.ndarray, ...]:
+    """Return the oracle's knots of raw parameters [curve, 16], rounded as the kernel reads them."""
+    x, y, slope = (k.astype(np.float32) for k in o.spline_knots(raw))
+    return x, y, slope
+
+
+def test_identity_curve(device: str) -> None:
+    """Zero parameters leave every value alone; values outside [0, 1] are clamped."""
+    x = np.concatenate([np.linspace(0.0, 1.0, 1001), [-1.0, -1e-9, 1.0 + 1e-6, 5.0, 1e30]])
+    y = apply_curve(x, np.zeros(len(x)), float32_knots(np.zeros((1, 16))), device)
+    np.testing.assert_allclose(y, np.clip(x, 0.0, 1.0), atol=2e-7)
+
+
+@pytest.mark.parametrize("scale", [0.3, 1.0, 3.0])
+def test_curve_matches_oracle(device: str, rng: np.random.Generator, scale: float) -> None:
+    """Three curves of random parameters equal the spline of Durkan 2019, eq. 4."""
+    knots = float32_knots(rng.normal(scale=scale, size=(3, 16)))
+    x = rng.random(6000, dtype=np.float32)
+    curve = rng.integers(0, 3, 6000)
+    y = apply_curve(x, curve, knots, device)
+    for c in range(3):
+        expected, slope = o.spline(x[curve == c], *(k[c] for k in knots))
+        tolerance = VALUE_ABS + STEEP_ULPS * slope * 2.0**-24
+        assert np.all(np.abs(y[curve == c] - expected) <= tolerance)
+
+
+def test_curve_ends_are_exact(device: str, rng: np.random.Generator) -> None:
+    """``f(0) = 0`` and ``f(1) = 1`` exactly: a shadow ratio of 1 leaves the photo alone."""
+    knots = float32_knots(rng.normal(scale=2.0, size=(50, 16)))
+    curve = np.arange(50)
+    assert np.all(apply_curve(np.zeros(50), curve, knots, device) == 0.0)
+    assert np.all(apply_curve(np.ones(50), curve, knots, device) == 1.0)
+
+
+def test_curve_is_monotone(device: str, rng: np.random.Generator) -> None:
+    """Curves rise, across knots too, up to round-off (Durkan 2019, sec. 3.1)."""
+    knots = float32_knots(rng.normal(scale=3.0, size=(20, 16)))
+    for c in range(20):
+        x = np.sort(
+            np.concatenate([np.linspace(0, 1, 4001), np.nextafter(knots[0][c], 0), knots[0][c]])
+        )
+        y = apply_curve(x, np.full(len(x), c), knots, device)
+        assert np.diff(y).min() >= -VALUE_ABS and y.min() >= 0.0 and y.max() <= 1.0
+
+
+@pytest.mark.parametrize("bin_count", [1, 2, 5, 8, 20])
+def test_curve_of_other_bin_counts(device: str, rng: np.random.Generator, bin_count: int) -> None:
+    """The number of bins is an argument: 1, 2, 8 and 20 work as 5 does."""
+    step = rng.uniform(0.2, 1.0, (2, bin_count))
+    knot_x, knot_y = (np.append(0.0, np.cumsum(s) / s.sum()).astype(np.float32)[None] for s in step)
+    slope = rng.uniform(0.2, 3.0, (1, bin_count + 1)).astype(np.float32)
+    x = rng.random(2000, dtype=np.float32)
+    y = apply_curve(x, np.zeros(2000), (knot_x, knot_y, slope), device)
+    np.testing.assert_allclose(y, o.spline(x, knot_x[0], knot_y[0], slope[0])[0], atol=1e-5)
+
+
+def curve_gradients(
+    x: np.ndarray, curve: np.ndarray, knots: tuple[np.ndarray, ...], y: np.ndarray, device: str
+) -> list[np.ndarray]:
+    """Return gradients of ``sum(y * curve(x))`` by ``x`` and the three knot arrays."""
+    arrays = [upload(x, device, True), *(upload(k, device, True) for k in knots)]
+    index = wp.array(np.asarray(curve, np.int32), dtype=int, device=device)
+    out = wp.zeros(len(x), dtype=float, device=device, requires_grad=True)
+    with wp.Tape() as tape:
+        inputs = [arrays[0], index, *arrays[1:], knots[0].shape[1] - 1]
+        wp.launch(curve_kernel, len(x), inputs=inputs, outputs=[out], device=device)
+    tape.backward(grads={out: upload(y, device)})
+    return [a.grad.numpy().astype(np.float64) for a in arrays]
+
+
+def test_curve_gradient(device: str, rng: np.random.Generator) -> None:
+    """Adjoints of ``x`` and of all knots against central differences; ``f'`` is eq. 5."""
+    knots = float32_knots(rng.normal(scale=0.8, size=(3, 16)))
+    x = rng.uniform(0.01, 0.99, 600).astype(np.float32)
+    curve = rng.integers(0, 3, 600)
+    y = rng.normal(size=600).astype(np.float32)
+    gradients = curve_gradients(x, curve, knots, y, device)
+
+    def loss(knot_x: np.ndarray, knot_y: np.ndarray, slope: np.ndarray) -> float:
+        return sum(
+            float(y[curve == c] @ o.spline(x[curve == c], knot_x[c], knot_y[c], slope[c])[0])
+            for c in range(3)
+        )
+
+    wide = [k.astype(np.float64) for k in knots]
+    slope_at = np.empty(600)
+    for c in range(3):
+        slope_at[curve == c] = o.spline(x[curve == c], *(k[c] for k in wide))[1]
+    expected = [y * slope_at]
+    for k in range(3):
+        moved = lambda a, k=k: loss(*[a if i == k else w for i, w in enumerate(wide)])  # noqa: E731
+        expected.append(central_differences(moved, wide[k], 1e-7))
+    # The outermost x knots are the ends of the interval, never free.
+    gradients[1], expected[1] = gradients[1][:, 1:-1], expected[1][:, 1:-1]
+    for gradient, reference in zip(gradients, expected, strict=True):
+        match = compare_gradients(gradient, reference)
+        assert match.relative_l2 < GRADIENT_RELATIVE_L2, match
+
+
+def test_curve_gradient_at_the_ends(device: str, rng: np.random.Generator) -> None:
+    """At 0 and 1 the gradient is finite; outside the interval it is 0 (the value is clamped)."""
+    knots = float32_knots(rng.normal(size=(1, 16)))
+    x = np.array([-0.5, 0.0, 1.0, 1.5])
+    d_x, *d_knots = curve_gradients(x, np.zeros(4), knots, np.ones(4), device)
+    assert np.all(np.isfinite(d_x)) and all(np.all(np.isfinite(d)) for d in d_knots)
+    assert d_x[0] == 0.0 and d_x[3] == 0.0
+
+
+def test_curve_gradcheck(device: str, rng: np.random.Generator) -> None:
+    """Warp's own finite differences agree with the adjoint."""
+    knots = float32_knots(rng.normal(scale=0.3, size=(1, 16)))
+    # Mid-bin, so that a step does not cross a knot.
+    x = 0.5 * (knots[0][0, 1:] + knots[0][0, :-1])
+    index = wp.zeros(5, dtype=int, device=device)
+    out = wp.zeros(5, dtype=float, device=device, requires_grad=True)
+    inputs = [upload(x, device, True), index, *(upload(k, device, True) for k in knots), 5]
+    assert autograd.gradcheck(
+        curve_kernel,
+        dim=(5,),
+        inputs=inputs,
+        outputs=[out],
+        device=device,
+        eps=3e-3,
+        atol=5e-3,
+        raise_exception=False,
+        show_summary=False,
+    )
+
+
+def test_reinhard(device: str) -> None:
+    """``x / (1 + x)`` for radiance from 0 to suns; finite and at most 1 beyond (2002, eq. 3)."""
+    x = np.array([0.0, 1e-8, 0.18, 1.0, 16.0, 1e4, 1e9, 1e30, 3e38], np.float32)
+    out = wp.zeros(len(x), dtype=float, device=device)
+    wp.launch(reinhard_kernel, len(x), inputs=[upload(x, device)], outputs=[out], device=device)
+    np.testing.assert_allclose(out.numpy(), o.reinhard(x), rtol=1e-6)
+
+
+def test_reinhard_gradient(device: str) -> None:
+    """The adjoint is ``1 / (1 + x)^2``."""
+    x = np.array([1e-6, 0.18, 1.0, 16.0, 1e3], np.float32)
+    source = upload(x, device, True)
+    out = wp.zeros(len(x), dtype=float, device=device, requires_grad=True)
+    with wp.Tape() as tape:
+        wp.launch(reinhard_kernel, len(x), inputs=[source], outputs=[out], device=device)
+    tape.backward(grads={out: upload(np.ones(len(x)), device)})
+    # The kernel differentiates a quotient: 1/(1+x) - x/(1+x)^2 cancels at bright values.
+    np.testing.assert_allclose(
+        source.grad.numpy(), 1.0 / (1.0 + x.astype(np.float64)) ** 2, rtol=2e-4
+    )
