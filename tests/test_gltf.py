@@ -629,6 +629,16 @@ def test_G6_normalised_uv_equals_float(kind: str, tmp_path: Path) -> None:
     np.testing.assert_allclose(uv0, np.asarray(codes / scale), rtol=FLOAT32_RTOL)
 
 
+@pytest.mark.parametrize(("code", "lowest"), [("b", -128), ("h", -32768)])
+def test_G6_lowest_signed_code_is_minus_one(code: str, lowest: int, tmp_path: Path) -> None:
+    """The two lowest signed codes both mean -1: max(c / 127, -1)."""
+    builder = Builder()
+    codes = np.array([[lowest, lowest + 1], [0, -1 - lowest]] * 2, code)
+    builder.attribute("TEXCOORD_0", codes, normalized=True)
+    uv0 = load(tmp_path, builder).primitives[0].uv0
+    np.testing.assert_array_equal(uv0, [[-1, -1], [0, 1]] * 2)
+
+
 def test_G6_normalised_colors_equal_float(tmp_path: Path) -> None:
     """Normalised u8 RGBA and u16 RGB vertex colours equal their float version."""
     builder = Builder()
@@ -1027,6 +1037,11 @@ def test_M18_values_out_of_range_are_clamped(tmp_path: Path) -> None:
         "emissiveFactor",
         "alphaCutoff",
     )
+    builder.material["extensions"] = {"KHR_materials_emissive_strength": {"emissiveStrength": -2}}
+    builder.material["emissiveFactor"] = [1, 1, 1]
+    dark = load(tmp_path, builder)
+    assert dark.materials[0].emission == (0.0, 0.0, 0.0)
+    assert any("emissiveStrength -2 clamped" in notice for notice in dark.notices)
     for word in words:
         assert any(word in notice and "clamped" in notice for notice in asset.notices)
 
