@@ -4,6 +4,10 @@ Mitsuba's own ``envmap`` puts its rows from pole to pole (row i at latitude
 ``pi/2 - pi i/(H-1)``), ours are texel-centred: on the same array the two differ by up to half
 a texel. This emitter reads the array as warpir does: bilinear between texel centres, wrap in
 longitude, clamp at the poles, image centre = +Z and left quarter = +X.
+
+Measured on a 256 x 512 map with a sun: the array handed to ``envmap`` as it is, irradiance is up
+to 1.1 % off; resampled to its rows at twice the resolution 2e-5, at four times 7e-6. This emitter
+equals the float64 formula to 5e-6 of the peak, and JIT-compiled it takes half ``envmap``'s time.
 """
 
 import drjit as dr
