@@ -36,7 +36,7 @@ def directional_albedo(
     node, node_weight = 0.5 * (node + 1.0), 0.5 * node_weight
     phi = 2.0 * np.pi * (np.arange(order) + 0.5) / order
 
-    def schlick(cosine: FloatArray) -> FloatArray:
+    def schlick(cosine: FloatArray, f0: float = f0) -> FloatArray:
         return f0 + (1.0 - f0) * (1.0 - np.abs(cosine)) ** 5
 
     def smith(cosine: FloatArray | float) -> FloatArray:
@@ -77,7 +77,7 @@ def directional_albedo(
     )
     wm = wi + wo
     wm /= np.linalg.norm(wm, axis=-1, keepdims=True)
-    diffuse = ((1.0 - schlick(wm @ wo)) * c_diff).mean(axis=1) @ node_weight
+    diffuse = ((1.0 - schlick(wm @ wo, 0.04)) * c_diff).mean(axis=1) @ node_weight
     return float(specular + diffuse)
 
 

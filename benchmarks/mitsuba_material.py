@@ -330,7 +330,9 @@ class GltfBSDF(mi.BSDF):
         root_i = dr.sqrt(alpha2 + (1.0 - alpha2) * dr.square(cos_i))
         visibility = 0.5 / (cos_i * root_o + cos_o * root_i)
 
-        f = (1.0 - fresnel) * surface.c_diff * dr.inv_pi + fresnel * D * visibility
+        # The base receives what the dielectric's Fresnel term leaves, whatever the metallic
+        rest = 1.0 - schlick(mi.Color3f(0.04), dr.abs(dr.dot(wo_local, wm)))
+        f = rest * surface.c_diff * dr.inv_pi + fresnel * D * visibility
         share = self._specular_share(surface, cos_o)
         # G1(wo) D / (4 cos_o), with G1 = 2 cos_o / (cos_o + root_o)
         pdf = share * D * 0.5 / (cos_o + root_o) + (1.0 - share) * cos_i * dr.inv_pi

@@ -1,8 +1,12 @@
 """The glTF 2.0 metallic-roughness BRDF, in the local frame of the shading normal (z).
 
-glTF 2.0 specification, appendix B.3: GGX (Trowbridge-Reitz) with height-correlated Smith masking,
-Schlick's Fresnel term, and a Lambert base that receives what the Fresnel term leaves. Sampling
-draws visible normals (Heitz 2018; Dupuy & Benyoub 2023, "Sampling Visible GGX Normals with
+glTF 2.0 specification, appendix B: ``mix(dielectric_brdf, metal_brdf, metallic)`` with GGX
+(Trowbridge-Reitz), height-correlated Smith masking, Schlick's Fresnel term, and a Lambert base that
+receives what the dielectric's Fresnel term leaves. Schlick's term is affine in F0, so the two
+specular lobes are one with ``f0 = mix(0.04, base_color, metallic)``. (An older, single-lobe sample
+code took that F0 for the base as well; Khronos corrected it in glTF issue 2386.)
+
+Sampling draws visible normals (Heitz 2018; Dupuy & Benyoub 2023, "Sampling Visible GGX Normals with
 Spherical Caps"). The trio `brdf_eval`, `brdf_sample`, `brdf_pdf` shares one argument order.
 """
 
@@ -90,10 +94,13 @@ def brdf_eval(
         alpha = roughness_to_alpha(roughness)
         weight = schlick(wp.abs(wp.dot(wo, wm)))
         f0 = wp.vec3(F0_DIELECTRIC) * (1.0 - metallic) + base_color * metallic
-        one = wp.vec3(1.0, 1.0, 1.0)
-        F = f0 + (one - f0) * weight
-        value.diffuse = wp.cw_mul(one - F, base_color) * ((1.0 - metallic) * INV_PI)
-        value.specular = F * (ggx_d(wm, alpha) * smith_g2(wo, wi, alpha) / (4.0 * wo[2] * wi[2]))
+        F = f0 + (wp.vec3(1.0, 1.0, 1.0) - f0) * weight
+        F_dielectric = F0_DIELECTRIC + (1.0 - F0_DIELECTRIC) * weight
+        value.diffuse = base_color * ((1.0 - metallic) * (1.0 - F_dielectric) * INV_PI)
+        # The floor only matters where the product of the cosines leaves float32.
+        value.specular = F * (
+            ggx_d(wm, alpha) * smith_g2(wo, wi, alpha) / wp.max(4.0 * wo[2] * wi[2], 1.0e-30)
+        )
     return value
 
 

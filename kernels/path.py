@@ -74,7 +74,7 @@ def scatter(
     """Draw, weigh and trace the two directions of one path vertex.
 
     A direction counts only if it leaves both the shading and the geometric surface. ``is_last``
-    says that nothing after this vertex can add light, so that any hit serves as well as the closest.
+    says that nothing behind this vertex can add light, so that any hit will do.
     """
     out = Scatter()
     out.direct = wp.vec3(0.0)

@@ -293,14 +293,13 @@ def gltf_brdf(
     metallic: ArrayLike,
     roughness: ArrayLike,
 ) -> Float64Array:
-    """Return the metallic-roughness BRDF [1/sr], no cosine, shape [..., 3] (glTF B.3.5).
+    """Return the metallic-roughness BRDF [1/sr], no cosine, shape [..., 3] (glTF 2.0, B.2, B.3).
 
-    The single-lobe form of the ratified specification::
+    Literally the specification's composition::
 
-        c_diff     = lerp(baseColor, 0, metallic)
-        f0         = lerp(0.04, baseColor, metallic)
-        f_diffuse  = (1 - F) c_diff / pi
-        f_specular = F D G / (4 |VN| |LN|)
+        dielectric_brdf = mix(base_color / pi, specular_brdf, 0.04 + 0.96 (1 - |VH|)^5)
+        metal_brdf      = specular_brdf (base_color + (1 - base_color) (1 - |VH|)^5)
+        material        = mix(dielectric_brdf, metal_brdf, metallic)
 
     Args:
         wo: Local direction toward the camera, shape [..., 3].
@@ -312,31 +311,14 @@ def gltf_brdf(
     wo, wi = np.broadcast_arrays(np.asarray(wo, float), np.asarray(wi, float))
     base_color = np.asarray(base_color, float)
     metallic = np.asarray(metallic, float)[..., None]
-    c_diff = (1.0 - metallic) * base_color
-    f0 = DIELECTRIC_F0 + (base_color - DIELECTRIC_F0) * metallic
+    alpha = ggx_alpha(roughness)
     with np.errstate(divide="ignore", invalid="ignore"):
-        fresnel = schlick(f0, dot(wo, normalize(wo + wi))[..., None])
+        fresnel = schlick(DIELECTRIC_F0, dot(wo, normalize(wo + wi)))[..., None]
     above = ((wo[..., 2] > 0.0) & (wi[..., 2] > 0.0))[..., None]
-    diffuse = np.where(above, (1.0 - fresnel) * c_diff / np.pi, 0.0)
-    return diffuse + specular_brdf(wo, wi, f0, ggx_alpha(roughness))
-
-
-def gltf_brdf_mixed(
-    wo: ArrayLike,
-    wi: ArrayLike,
-    base_color: ArrayLike,
-    metallic: ArrayLike,
-    roughness: ArrayLike,
-) -> Float64Array:
-    """Return the metallic-roughness BRDF as a mix of two materials (glTF B.2, normative).
-
-    ``mix(dielectric_brdf, metal_brdf, metallic)``. Later revisions of appendix B.3.5 print
-    this form only. It equals :func:`gltf_brdf` at metallic 0 and 1, not in between.
-    """
-    metallic = np.asarray(metallic, float)
-    dielectric = gltf_brdf(wo, wi, base_color, np.zeros_like(metallic), roughness)
-    metal = gltf_brdf(wo, wi, base_color, np.ones_like(metallic), roughness)
-    return dielectric + (metal - dielectric) * metallic[..., None]
+    lambert = np.where(above, (1.0 - fresnel) * base_color / np.pi, 0.0)
+    dielectric = lambert + specular_brdf(wo, wi, np.full(3, DIELECTRIC_F0), alpha)
+    metal = specular_brdf(wo, wi, base_color, alpha)
+    return dielectric + (metal - dielectric) * metallic
 
 
 def vndf(wo: ArrayLike, wm: ArrayLike, alpha: ArrayLike) -> Float64Array:
@@ -405,7 +387,7 @@ def gltf_albedo(cos_o: float, base_color: float, metallic: float, roughness: flo
     mirror direction, already reflects almost everything.
     """
     f0 = DIELECTRIC_F0 + (base_color - DIELECTRIC_F0) * metallic
-    diffuse = (1.0 - metallic) * base_color * diffuse_albedo(cos_o, f0)
+    diffuse = (1.0 - metallic) * base_color * diffuse_albedo(cos_o, DIELECTRIC_F0)
     return diffuse + specular_albedo(cos_o, float(ggx_alpha(roughness)), f0)
 
 

@@ -35,6 +35,8 @@ SEED = 3
 RELATIVE_L2 = 0.02
 """Asked of the whole pipeline; float32 differences with these steps are good to about 0.5 %."""
 COSINE = 0.999
+RASTERIZE_L2 = 1e-2
+"""Three directions per standard deviation of a lobe leave about 0.5 %."""
 STEP = {"sharpness": 2e-2, "texels": 5e-2}
 """Steps of the central differences where 1e-2 is lost in float32 noise."""
 
@@ -225,15 +227,15 @@ def test_gradient_is_the_same_when_asked_again(
 
 
 def test_rasterize_gradient_reaches_every_lobe() -> None:
-    """Match float64 torch autograd of the same average over directions."""
+    """Match float64 torch autograd of each texel's mean over many more directions."""
     generator = torch.Generator().manual_seed(1)
     amplitude = torch.rand(5, 3, generator=generator) + 0.1
     axis = torch.nn.functional.normalize(torch.randn(5, 3, generator=generator), dim=1)
     sharpness = torch.tensor([0.5, 2.0, 8.0, 30.0, 100.0])
-    height, side = 8, 4
+    height, side = 8, 24
     weights = torch.rand(height, 2 * height, 3, generator=generator, dtype=torch.float64)
     ours = [t.clone().requires_grad_(True) for t in (amplitude, axis, sharpness)]
-    (rasterize(*ours, height, "cpu", side).double() * weights).sum().backward()
+    (rasterize(*ours, height, "cpu").double() * weights).sum().backward()
 
     rows, columns = height * side, 2 * height * side
     edge = torch.cos(torch.pi * torch.arange(height + 1, dtype=torch.float64) / height)
@@ -251,4 +253,4 @@ def test_rasterize_gradient_reaches_every_lobe() -> None:
     for found, expected in zip(ours, truth, strict=True):
         assert found.grad is not None and expected.grad is not None
         match = compare_gradients(found.grad.double().numpy(), expected.grad.numpy())
-        assert match.relative_l2 <= 1e-4, match
+        assert match.relative_l2 <= RASTERIZE_L2, match

@@ -14,6 +14,8 @@ VALUE_RTOL = 1e-4
 """float32, few operations; the exponent is at most 20 where it is compared."""
 GRADIENT_RELATIVE_L2 = 1e-4
 """float32 adjoint against the float64 derivative."""
+TEXEL_RTOL = 5e-3
+"""The midpoint rule with three directions per standard deviation, as the kernel states."""
 POWER_RTOL = 0.01
 """Energy of a lobe on the map, up to the sharpness that its sub-texels resolve."""
 
@@ -144,7 +146,6 @@ def run_rasterize(
     device: str,
     height: int,
     width: int,
-    side: int,
     arrays: list[wp.array],
     lobe_count: int,
     grad: bool = False,
@@ -153,7 +154,7 @@ def run_rasterize(
     wp.launch(
         rasterize,
         (height, width),
-        inputs=[height, width, side, *arrays, lobe_count],
+        inputs=[height, width, *arrays, lobe_count],
         outputs=[texels],
         device=device,
     )
@@ -180,16 +181,16 @@ def mean_radiance(
 
 
 def test_rasterize_is_the_mean_over_each_texel(device: str, rng: np.random.Generator) -> None:
-    """Texels hold the mean radiance over their solid angle; 8 x 8 directions within 0.2 %."""
+    """Texels hold the mean radiance over their solid angle, broad and narrow lobes alike."""
     amplitude, axis, sharpness = random_lobes(rng, 5, 200.0)
     arrays = [
         upload(amplitude, wp.vec3, device),
         upload(axis, wp.vec3, device),
         upload(sharpness, float, device),
     ]
-    texels = run_rasterize(device, 16, 32, 8, arrays, 5).numpy().astype(np.float64)
+    texels = run_rasterize(device, 16, 32, arrays, 5).numpy().astype(np.float64)
     expected = mean_radiance(16, 32, 8, amplitude, axis, sharpness)
-    assert np.abs(texels - expected).max() < 2e-3 * expected.max()
+    assert np.abs(texels - expected).max() < TEXEL_RTOL * expected.max()
 
 
 def test_rasterize_orientation(device: str) -> None:
@@ -200,19 +201,17 @@ def test_rasterize_orientation(device: str) -> None:
             upload(np.array([axis]), wp.vec3, device),
             upload(np.array([50.0]), float, device),
         ]
-        texels = run_rasterize(device, 17, 33, 4, arrays, 1).numpy()[..., 0]
+        texels = run_rasterize(device, 17, 33, arrays, 1).numpy()[..., 0]
         i, j = np.unravel_index(np.argmax(texels), texels.shape)
         assert (row is None or i == row) and (column is None or abs(j - column) <= 1)
 
 
-@pytest.mark.parametrize("sharpness, side", [(0.01, 1), (10.0, 2), (1e3, 4), (2e4, 8)])
+@pytest.mark.parametrize("sharpness", [0.01, 10.0, 1e3, 2e4, 4e4])
 @pytest.mark.parametrize("axis", [[0.3, 0.8, -0.5], [0.0, 1.0, 0.0], [0.02, -0.99, 0.05]])
-def test_rasterize_keeps_the_power(
-    device: str, sharpness: float, side: int, axis: list[float]
-) -> None:
+def test_rasterize_keeps_the_power(device: str, sharpness: float, axis: list[float]) -> None:
     """Texels times solid angle sum to ``2 pi c / s (1 - exp(-2 s))``, next to the poles too.
 
-    On 32 x 64 texels; ``side`` is what each sharpness needs (a lobe of 2e4 has a width of 0.4 deg).
+    On 32 x 64 texels, whose side is 25 times the width of the narrowest lobe.
     """
     unit = o.normalize([axis])
     arrays = [
@@ -220,13 +219,13 @@ def test_rasterize_keeps_the_power(
         upload(unit, wp.vec3, device),
         upload(np.array([sharpness]), float, device),
     ]
-    texels = run_rasterize(device, 32, 64, side, arrays, 1).numpy().astype(np.float64)
+    texels = run_rasterize(device, 32, 64, arrays, 1).numpy().astype(np.float64)
     power = np.einsum("ijc,i->c", texels, o.texel_solid_angle(32, 64))
     assert power == pytest.approx(2.0 * float(o.sg_flux(sharpness)), rel=POWER_RTOL)
 
 
 def rasterize_gradient(
-    device: str, side: int, lobes: tuple[np.ndarray, ...], y: np.ndarray
+    device: str, lobes: tuple[np.ndarray, ...], y: np.ndarray
 ) -> list[np.ndarray]:
     """Return the kernel's gradient of ``sum(y * texels)``; the axis' part in its tangent plane."""
     amplitude, axis, sharpness = lobes
@@ -236,7 +235,7 @@ def rasterize_gradient(
         upload(sharpness, float, device, True),
     ]
     with wp.Tape() as tape:
-        texels = run_rasterize(device, *y.shape[:2], side, arrays, len(axis), grad=True)
+        texels = run_rasterize(device, *y.shape[:2], arrays, len(axis), grad=True)
     tape.backward(grads={texels: upload(y, wp.vec3, device)})
     gradients = [a.grad.numpy().astype(np.float64) for a in arrays]
     gradients[1] = tangential(gradients[1], o.normalize(axis))
@@ -247,7 +246,7 @@ def test_rasterize_gradient(device: str, rng: np.random.Generator) -> None:
     """The adjoint of the map is the derivative of the mean radiance over each texel."""
     lobes = random_lobes(rng, 5, 20.0)
     y = rng.normal(size=(6, 12, 3)).astype(np.float32)
-    gradients = rasterize_gradient(device, 12, lobes, y)
+    gradients = rasterize_gradient(device, lobes, y)
     amplitude, axis, sharpness = (a.astype(np.float64) for a in lobes)
 
     def loss(amplitude: np.ndarray, axis: np.ndarray, sharpness: np.ndarray) -> float:
@@ -260,18 +259,17 @@ def test_rasterize_gradient(device: str, rng: np.random.Generator) -> None:
     ]
     for gradient, reference in zip(gradients, expected, strict=True):
         match = compare_gradients(gradient, reference)
-        # 12 x 12 directions against the exact mean.
+        # Three directions per standard deviation of a lobe against the exact mean.
         assert match.relative_l2 < 1e-2 and match.cosine > 0.9999, match
 
 
-@pytest.mark.parametrize("side", [1, 3, 5])
 def test_rasterize_gradient_is_that_of_its_own_directions(
-    device: str, rng: np.random.Generator, side: int
+    device: str, rng: np.random.Generator
 ) -> None:
-    """Finite differences of the forward kernel agree with its adjoint, however few directions."""
+    """Finite differences of the forward kernel agree with its adjoint."""
     lobes = random_lobes(rng, 3, 20.0)
     y = rng.normal(size=(4, 7, 3)).astype(np.float32)
-    gradients = rasterize_gradient(device, side, lobes, y)
+    gradients = rasterize_gradient(device, lobes, y)
 
     def loss(k: int, x: np.ndarray) -> float:
         moved = list(lobes)
@@ -279,9 +277,7 @@ def test_rasterize_gradient_is_that_of_its_own_directions(
         arrays = [
             upload(a, t, device) for a, t in zip(moved, (wp.vec3, wp.vec3, float), strict=True)
         ]
-        return float(
-            np.sum(y * run_rasterize(device, 4, 7, side, arrays, 3).numpy().astype(np.float64))
-        )
+        return float(np.sum(y * run_rasterize(device, 4, 7, arrays, 3).numpy().astype(np.float64)))
 
     for k, gradient in enumerate(gradients):
         x = lobes[k].astype(np.float64)
@@ -300,7 +296,6 @@ def test_rasterize_gradcheck(device: str, rng: np.random.Generator) -> None:
     inputs = [
         3,
         4,
-        2,
         upload(amplitude, wp.vec3, device, True),
         upload(axis, wp.vec3, device, True),
         upload(sharpness, float, device, True),

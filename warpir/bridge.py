@@ -401,7 +401,6 @@ class _Rasterize(torch.autograd.Function):
     def forward(
         ctx: Any,
         height: int,
-        side: int,
         device: wp.Device,
         amplitude: Tensor,
         axis: Tensor,
@@ -418,7 +417,7 @@ class _Rasterize(torch.autograd.Function):
             wp.launch(
                 rasterize_kernel,
                 dim=(height, 2 * height),
-                inputs=[height, 2 * height, side, *arrays, len(amplitude)],
+                inputs=[height, 2 * height, *arrays, len(amplitude)],
                 outputs=[texels],
                 device=device,
             )
@@ -430,11 +429,11 @@ class _Rasterize(torch.autograd.Function):
         ctx.tape.backward(grads={ctx.texels: _from_torch(d_outputs[0], wp.vec3, ctx.texels.device)})
         grads = [_to_torch(a.grad, t) for a, t in zip(ctx.arrays, ctx.like, strict=True)]
         ctx.tape.zero()
-        return (None, None, None, *grads)
+        return (None, None, *grads)
 
 
 def rasterize(
-    amplitude: Tensor, axis: Tensor, sharpness: Tensor, height: int, device: str, side: int = 4
+    amplitude: Tensor, axis: Tensor, sharpness: Tensor, height: int, device: str
 ) -> Tensor:
     """Average lobes over the texels of a lat-long map; differentiable in all three.
 
@@ -444,12 +443,11 @@ def rasterize(
         sharpness: Lobe concentration [1], shape [lobe].
         height: Rows of the map; it is twice as wide.
         device: Warp device.
-        side: Directions along each side of a texel.
 
     Returns:
         Radiance, shape [height, 2 height, 3].
     """
-    out: Tensor = _Rasterize.apply(height, side, wp.get_device(device), amplitude, axis, sharpness)
+    out: Tensor = _Rasterize.apply(height, wp.get_device(device), amplitude, axis, sharpness)
     return out
 
 

@@ -1,0 +1,88 @@
+"""How long does one full frame take, and how much memory?
+
+    python -m benchmarks.frame [--assets DIR] [--device cpu|cuda] [--samples 64] [--json FILE]
+
+ToyCar at 1280 x 853 under a sunny 1k panorama, five surface interactions: G-buffer, object, pilot,
+shadow and tone, everything behind reading and before writing files.
+"""
+
+import argparse
+import time
+from pathlib import Path
+
+import numpy as np
+
+from benchmarks.measure import context, peak_mib, report
+from warpir.asset import load_asset
+from warpir.camera import camera_from_fov
+from warpir.color import linear_to_gamma
+from warpir.files import Photo, read_envmap
+from warpir.light import Light
+from warpir.picture import Quality, make_picture
+from warpir.placement import place_asset
+from warpir.render import Renderer, ToneKnots, choose_device
+from warpir.scene import Placed, Proxy, Scene
+
+WIDTH, HEIGHT = 1280, 853
+
+
+def main() -> None:
+    """Render the frame twice: cold, with compilation, and warm."""
+    parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
+    parser.add_argument("--assets", type=Path, default=Path("../shared/data"))
+    parser.add_argument("--device", default=None)
+    parser.add_argument("--samples", type=int, default=64)
+    parser.add_argument("--depth", type=int, default=5)
+    parser.add_argument("--repeats", type=int, default=3)
+    parser.add_argument("--json", default=None)
+    parser.add_argument("--preview", default=None, help="write the measured image here (PNG)")
+    options = parser.parse_args()
+    asset = load_asset(options.assets / "mesh/ToyCar.glb")
+    light = Light(texels=read_envmap(options.assets / "hdri/modern_buildings_2_1k.hdr"))
+    camera = camera_from_fov(WIDTH, HEIGHT, 40.0, -12.0, 1.4)
+    placement = place_asset(
+        *asset.bounds(), camera, None, place=(0.0, 0.0, -5.5), rotate_y=-35.0, size=3.2
+    )
+    grey = np.full((HEIGHT, WIDTH, 3), 0.45, np.float32)
+    photo = Photo(codes=np.round(grey * 255.0).astype(np.uint8), srgb=grey, kind="png")
+    start = time.perf_counter()
+    device = choose_device(options.device)
+    ground = placement.ground
+    scene = Scene(
+        [Placed(asset, placement.asset_to_world)],
+        camera,
+        Proxy(ground[:3], -float(ground[3])),
+        device,
+    )
+    renderer = Renderer(scene)
+    quality = Quality(options.samples, 1, options.depth, 0)
+    curves = ToneKnots.identity(1), ToneKnots.identity(3)
+    times = []
+    for _ in range(1 + options.repeats):
+        picture = make_picture(renderer, light, light, photo, quality, *curves)
+        times.append(time.perf_counter() - start)
+        start = time.perf_counter()
+    report(
+        {
+            "question": "frame",
+            "scene": "ToyCar, modern_buildings_2, 1280x853",
+            "samples": options.samples,
+            "depth": options.depth,
+            "object_pixels": picture.object_pixel_count,
+            "shadow_pixels": picture.proxy_pixel_count,
+            "first_s": round(times[0], 3),
+            "warm_s": [round(t, 3) for t in times[1:]],
+            "peak_mib": round(peak_mib(scene.device)),
+            **context(scene.device, renderer.threads),
+        },
+        options.json,
+    )
+    if options.preview is not None:
+        from PIL import Image
+
+        codes = np.round(np.clip(linear_to_gamma(picture.layers.composite), 0, 1) * 255)
+        Image.fromarray(codes.astype(np.uint8)).save(options.preview)
+
+
+if __name__ == "__main__":
+    main()

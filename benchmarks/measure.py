@@ -1,0 +1,58 @@
+"""What every benchmark shares: timing, peak memory, and the line that says what was measured."""
+
+import json
+import platform
+import resource
+import subprocess
+import time
+from collections.abc import Callable
+from importlib.metadata import version
+from typing import Any
+
+import numpy as np
+import warp as wp
+
+
+def seconds(work: Callable[[], object], device: wp.Device, repeats: int = 7) -> tuple[float, float]:
+    """Return median and half the interquartile range of run times [s], after a warm-up."""
+    work()
+    wp.synchronize_device(device)
+    times = []
+    for _ in range(repeats):
+        start = time.perf_counter()
+        work()
+        wp.synchronize_device(device)
+        times.append(time.perf_counter() - start)
+    low, middle, high = np.percentile(times, [25, 50, 75])
+    return float(middle), float(0.5 * (high - low))
+
+
+def peak_mib(device: wp.Device) -> float:
+    """Return the peak memory of the process [MiB]: of the card on CUDA, else resident."""
+    if device.is_cuda:
+        return float(wp.get_mempool_used_mem_high(device)) / 2**20
+    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024.0
+
+
+def context(device: wp.Device, threads: int) -> dict[str, Any]:
+    """Return what a figure depends on besides the code."""
+    commit = subprocess.run(
+        ["git", "rev-parse", "--short", "HEAD"], capture_output=True, text=True, check=False
+    ).stdout.strip()
+    return {
+        "commit": commit or "unknown",
+        "date": time.strftime("%Y-%m-%d"),
+        "device": device.name if device.is_cuda else platform.machine() + " CPU",
+        "threads": threads if device.is_cpu else None,
+        "warp": version("warp-lang"),
+        "python": platform.python_version(),
+    }
+
+
+def report(line: dict[str, Any], path: str | None) -> None:
+    """Print a figure as one JSON line and append it to ``path``."""
+    text = json.dumps(line)
+    print(text, flush=True)
+    if path is not None:
+        with open(path, "a", encoding="utf-8") as stream:
+            stream.write(text + "\n")

@@ -1,0 +1,137 @@
+"""How many rays per second: primary (closest hit) and shadow (any hit)?
+
+    python -m benchmarks.trace [--assets DIR] [--device cpu|cuda] [--json FILE]
+
+The object fills the view; shadow rays start on its surface in cosine-distributed directions.
+"""
+
+import argparse
+from pathlib import Path
+
+import numpy as np
+import warp as wp
+
+from benchmarks.measure import context, report, seconds
+from warpir.asset import load_asset
+from warpir.camera import Camera
+from warpir.kernels.frame import basis, to_world
+from warpir.kernels.rng import hash_pair, pixel_seed, sobol_pair
+from warpir.kernels.sampling import cosine_sample
+from warpir.kernels.trace import (
+    INFINITY,
+    camera_ray,
+    closest_hit,
+    offset_origin,
+    surface_at,
+    visibility,
+)
+from warpir.kernels.types import CameraArgs, MaterialArgs, MeshArgs, TextureArgs
+from warpir.render import Renderer, Rows, choose_device
+from warpir.scene import Placed, Proxy, Scene
+
+wp.set_module_options({"enable_backward": False})
+
+SIDE = 768
+SHADOW_RAYS = 8
+"""Per primary ray; the primary ray's time is subtracted."""
+
+
+@wp.kernel
+def cast(
+    pixels: wp.array[int],
+    camera: CameraArgs,
+    mesh: MeshArgs,
+    material: MaterialArgs,
+    texture: TextureArgs,
+    shadow_rays: int,
+    hits: wp.array[float],
+):
+    """Cast one primary ray a thread and ``shadow_rays`` from where it hits."""
+    i = wp.tid()
+    pixel = pixels[i]
+    key = pixel_seed(0, pixel)
+    ray_dir = camera_ray(camera, pixel, sobol_pair(0, key, 0))
+    hit = closest_hit(
+        mesh,
+        material,
+        texture,
+        camera.origin,
+        ray_dir,
+        INFINITY,
+        1,
+        hash_pair(key, wp.uint32(0)),
+    )
+    total = float(hit.valid)
+    if hit.valid == 1 and shadow_rays > 0:
+        surface = surface_at(mesh, material, texture, hit, -ray_dir)
+        frame = basis(surface.ng)
+        for s in range(shadow_rays):
+            wi = to_world(cosine_sample(sobol_pair(s, key, 1)), frame)
+            origin = offset_origin(surface.position, surface.ng, wi, mesh.epsilon)
+            total += visibility(mesh, material, texture, origin, wi)
+    hits[i] = total
+
+
+def main() -> None:
+    """Measure the assets of the referee's presets."""
+    parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
+    parser.add_argument("--assets", type=Path, default=Path("../shared/data"))
+    parser.add_argument("--device", default=None)
+    parser.add_argument("--json", default=None)
+    options = parser.parse_args()
+    device = choose_device(options.device)
+    for name in (
+        "mesh/ToyCar.glb",
+        "mesh/spot/spot.obj",
+        "mesh/kenney_trucks/vehicle-truck-red.glb",
+    ):
+        asset = load_asset(options.assets / name)
+        low, high = asset.bounds()
+        radius = 0.5 * float(np.linalg.norm(high - low))
+        pose = np.eye(4)
+        pose[:3, 3] = 0.5 * (low + high) + [0.0, 0.0, 4.0 * radius]
+        focal = 0.5 * SIDE * 3.9
+        camera = Camera(SIDE, SIDE, focal, focal, 0.5 * SIDE, 0.5 * SIDE, pose)
+        proxy = Proxy(np.array([0.0, 1.0, 0.0]), float(low[1]) - radius)
+        renderer = Renderer(Scene([Placed(asset, np.eye(4))], camera, proxy, device))
+        scene = renderer.scene
+        pixels = wp.array(np.arange(SIDE * SIDE, dtype=np.int32), dtype=int, device=device)
+        hits = wp.zeros(SIDE * SIDE, dtype=float, device=device)
+
+        def run(shadow_rays: int) -> None:
+            renderer.launch(  # noqa: B023
+                cast,
+                SIDE * SIDE,
+                [
+                    Rows(pixels),  # noqa: B023
+                    scene.camera_args,  # noqa: B023
+                    scene.mesh_args,  # noqa: B023
+                    scene.material_args,  # noqa: B023
+                    scene.texture_args,  # noqa: B023
+                    shadow_rays,
+                    Rows(hits),  # noqa: B023
+                ],
+                1 + shadow_rays,
+            )
+
+        primary, primary_spread = seconds(lambda: run(0), scene.device)
+        share = float(hits.numpy().mean())
+        both, both_spread = seconds(lambda: run(SHADOW_RAYS), scene.device)
+        shadow_count = share * SIDE * SIDE * SHADOW_RAYS
+        report(
+            {
+                "question": "trace",
+                "asset": name,
+                "triangles": scene.triangle_count,
+                "hit_share": round(share, 3),
+                "primary_mrays_per_s": round(SIDE * SIDE / primary / 1e6, 2),
+                "shadow_mrays_per_s": round(shadow_count / (both - primary) / 1e6, 2),
+                "spread_s": [primary_spread, both_spread],
+                **context(scene.device, renderer.threads),
+            },
+            options.json,
+        )
+
+
+if __name__ == "__main__":
+    main()
