@@ -10,6 +10,7 @@ from warpir.asset import Asset, load_asset
 from warpir.camera import read_camera
 from warpir.config import InsertConfig
 from warpir.demo.car import car
+from warpir.demo.make import without_fireflies
 from warpir.demo.mesh import ellipsoid, lathe, mesh_distance, rounded_box, split, tube
 from warpir.demo.place import HEIGHT, WIDTH, camera, placement
 from warpir.demo.sky import (
@@ -126,6 +127,14 @@ def test_demo_config_names_files_that_exist() -> None:
     for name in (config.photo, config.asset, config.light, config.camera):
         assert name is not None and Path(name).is_file()
     assert (config.exposure, config.tone) == (0.0, "linear")
+
+
+def test_fireflies_are_left_out_and_light_is_kept() -> None:
+    """One blown-up batch does not count; an even pixel is its plain mean."""
+    batches = np.ones((8, 2, 3), dtype=np.float32)
+    batches[3, 0] = 1000.0
+    batches[:, 1] = np.linspace(0.5, 1.5, 8)[:, None]
+    np.testing.assert_allclose(without_fireflies(batches), 1.0, rtol=1e-6)
 
 
 def test_meshed_sphere_lies_on_the_sphere() -> None:

@@ -1,0 +1,33 @@
+"""The scene that ships with warpir: a square in the sun, a small car, and the light itself.
+
+Everything is made by ``python -m warpir.demo.make``; nothing is downloaded or scanned.
+"""
+
+from dataclasses import replace
+from pathlib import Path
+
+from warpir.config import InsertConfig
+
+FOLDER = Path(__file__).parent
+PHOTO, ASSET, LIGHT, CAMERA = (
+    FOLDER / name for name in ("photo.png", "car.glb", "sky.exr", "camera.json")
+)
+
+
+def demo_config(config: InsertConfig) -> InsertConfig:
+    """Return the configuration with the demo's files and its known exposure filled in."""
+    from warpir.demo.place import placement
+
+    where = placement()
+    return replace(
+        config,
+        demo=False,
+        photo=str(PHOTO),
+        asset=str(ASSET),
+        camera=str(CAMERA),
+        light=str(LIGHT),
+        place=where.place,
+        rotate_y=where.rotate_y,
+        exposure=0.0,
+        tone="linear",
+    )
