@@ -7,7 +7,7 @@ specular lobes are one with ``f0 = mix(0.04, base_color, metallic)``. (An older,
 code took that F0 for the base as well; Khronos corrected it in glTF issue 2386.)
 
 Sampling draws visible normals (Heitz 2018; Dupuy & Benyoub 2023, "Sampling Visible GGX Normals with
-Spherical Caps"). The trio `brdf_eval`, `brdf_sample`, `brdf_pdf` shares one argument order.
+Spherical Caps"). `brdf_eval` returns value and density of `brdf_sample`.
 """
 
 import warp as wp
@@ -23,10 +23,14 @@ F0_DIELECTRIC = wp.constant(0.04)
 
 @wp.struct
 class BrdfValue:
-    """A BRDF value split as the renderer's layers need it, without the cosine [1/sr]."""
+    """A BRDF value split as the renderer's layers need it, without the cosine, and its density."""
 
     diffuse: wp.vec3
+    """[1/sr]."""
     specular: wp.vec3
+    """[1/sr]."""
+    pdf: float
+    """Density of `brdf_sample` [1/sr]; zero outside its support."""
 
 
 @wp.func
@@ -58,50 +62,11 @@ def smith_lambda(w: wp.vec3, alpha: float) -> float:
 
 
 @wp.func
-def smith_g2(wo: wp.vec3, wi: wp.vec3, alpha: float) -> float:
-    """Height-correlated masking-shadowing (Heitz 2014, eq. 99)."""
-    return 1.0 / (1.0 + smith_lambda(wo, alpha) + smith_lambda(wi, alpha))
-
-
-@wp.func
 def schlick(cos_d: float) -> float:
     """Schlick's ``(1 - cos)^5``."""
     x = wp.clamp(1.0 - cos_d, 0.0, 1.0)
     x2 = x * x
     return x2 * x2 * x
-
-
-@wp.func
-def brdf_eval(
-    wo: wp.vec3, wi: wp.vec3, base_color: wp.vec3, metallic: float, roughness: float
-) -> BrdfValue:
-    """Evaluate the BRDF, without the cosine; zero unless both directions are above the surface.
-
-    Differentiable in ``base_color``, ``metallic`` and ``roughness``.
-
-    Args:
-        wo: Unit direction toward the camera, local frame.
-        wi: Unit direction toward the light, local frame.
-        base_color: Linear RGB [1].
-        metallic: 0 dielectric to 1 metal [1].
-        roughness: Perceptual roughness [1].
-    """
-    value = BrdfValue()
-    value.diffuse = wp.vec3(0.0)
-    value.specular = wp.vec3(0.0)
-    if wo[2] > 0.0 and wi[2] > 0.0:
-        wm = wp.normalize(wo + wi)
-        alpha = roughness_to_alpha(roughness)
-        weight = schlick(wp.abs(wp.dot(wo, wm)))
-        f0 = wp.vec3(F0_DIELECTRIC) * (1.0 - metallic) + base_color * metallic
-        F = f0 + (wp.vec3(1.0, 1.0, 1.0) - f0) * weight
-        F_dielectric = F0_DIELECTRIC + (1.0 - F0_DIELECTRIC) * weight
-        value.diffuse = base_color * ((1.0 - metallic) * (1.0 - F_dielectric) * INV_PI)
-        # The floor only matters where the product of the cosines leaves float32.
-        value.specular = F * (
-            ggx_d(wm, alpha) * smith_g2(wo, wi, alpha) / wp.max(4.0 * wo[2] * wi[2], 1.0e-30)
-        )
-    return value
 
 
 @wp.func
@@ -125,19 +90,44 @@ def specular_probability(wo: wp.vec3, base_color: wp.vec3, metallic: float) -> f
 
 
 @wp.func
-def brdf_pdf(
+def brdf_eval(
     wo: wp.vec3, wi: wp.vec3, base_color: wp.vec3, metallic: float, roughness: float
-) -> float:
-    """Density of `brdf_sample` [1/sr]; zero outside its support."""
-    if wo[2] <= 0.0 or wi[2] <= 0.0:
-        return 0.0
-    alpha = roughness_to_alpha(roughness)
-    wm = wp.normalize(wo + wi)
-    p = specular_probability(wo, base_color, metallic)
-    # Visible normals: G1(wo) max(0, wo.wm) D(wm) / cos_o, over the Jacobian 4 wo.wm.
-    g1 = 1.0 / (1.0 + smith_lambda(wo, alpha))
-    specular = g1 * ggx_d(wm, alpha) / (4.0 * wo[2])
-    return p * specular + (1.0 - p) * wi[2] * INV_PI
+) -> BrdfValue:
+    """Evaluate the BRDF, without the cosine; zero unless both directions are above the surface.
+
+    Value and density share half of their terms, so both are returned. The value is differentiable
+    in ``base_color``, ``metallic`` and ``roughness``.
+
+    Args:
+        wo: Unit direction toward the camera, local frame.
+        wi: Unit direction toward the light, local frame.
+        base_color: Linear RGB [1].
+        metallic: 0 dielectric to 1 metal [1].
+        roughness: Perceptual roughness [1].
+    """
+    value = BrdfValue()
+    value.diffuse = wp.vec3(0.0)
+    value.specular = wp.vec3(0.0)
+    value.pdf = 0.0
+    if wo[2] > 0.0 and wi[2] > 0.0:
+        wm = wp.normalize(wo + wi)
+        alpha = roughness_to_alpha(roughness)
+        weight = schlick(wp.abs(wp.dot(wo, wm)))
+        f0 = wp.vec3(F0_DIELECTRIC) * (1.0 - metallic) + base_color * metallic
+        F = f0 + (wp.vec3(1.0, 1.0, 1.0) - f0) * weight
+        F_dielectric = F0_DIELECTRIC + (1.0 - F0_DIELECTRIC) * weight
+        value.diffuse = base_color * ((1.0 - metallic) * (1.0 - F_dielectric) * INV_PI)
+        D = ggx_d(wm, alpha)
+        lambda_o = smith_lambda(wo, alpha)
+        # Height-correlated masking-shadowing (Heitz 2014, eq. 99). The floor only matters where the
+        # product of the cosines leaves float32.
+        G2 = 1.0 / (1.0 + lambda_o + smith_lambda(wi, alpha))
+        value.specular = F * (D * G2 / wp.max(4.0 * wo[2] * wi[2], 1.0e-30))
+        # Visible normals: G1(wo) max(0, wo.wm) D(wm) / cos_o, over the Jacobian 4 wo.wm.
+        p = specular_probability(wo, base_color, metallic)
+        G1 = 1.0 / (1.0 + lambda_o)
+        value.pdf = p * G1 * D / wp.max(4.0 * wo[2], 1.0e-30) + (1.0 - p) * wi[2] * INV_PI
+    return value
 
 
 @wp.func

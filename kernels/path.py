@@ -8,7 +8,7 @@ power heuristic; the BRDF's direction continues the path. `trace_foreground` sum
 
 import warp as wp
 
-from warpir.kernels.brdf import brdf_eval, brdf_pdf, brdf_sample
+from warpir.kernels.brdf import brdf_eval, brdf_sample
 from warpir.kernels.frame import basis, to_local, to_world
 from warpir.kernels.rng import hash_pair, pixel_seed, sobol_pair
 from warpir.kernels.sampling import light_eval, light_sample, power_heuristic
@@ -98,10 +98,7 @@ def scatter(
         Li = light_eval(light, wi)
         unshadowed = wp.cw_mul(f.diffuse + f.specular, Li.radiance)
         if wp.max(unshadowed) > 0.0 and Li.pdf > 0.0:
-            pdf = brdf_pdf(
-                wo_local, wi_local, surface.base_color, surface.metallic, surface.roughness
-            )
-            weight = wi_local[2] * power_heuristic(Li.pdf, pdf) / Li.pdf
+            weight = wi_local[2] * power_heuristic(Li.pdf, f.pdf) / Li.pdf
             origin = offset_origin(surface.position, surface.ng, wi, mesh.epsilon)
             weight = weight * visibility(mesh, material, texture, origin, wi)
             out.weight_light = weight
@@ -120,11 +117,8 @@ def scatter(
     wi = to_world(wi_local, frame)
     out.wi_brdf = wi
     if wi_local[2] > 0.0 and wp.dot(wi, surface.ng) > 0.0 and wo_local[2] > 0.0:
-        pdf = brdf_pdf(wo_local, wi_local, surface.base_color, surface.metallic, surface.roughness)
-        if pdf > 0.0:
-            f = brdf_eval(
-                wo_local, wi_local, surface.base_color, surface.metallic, surface.roughness
-            )
+        f = brdf_eval(wo_local, wi_local, surface.base_color, surface.metallic, surface.roughness)
+        if f.pdf > 0.0:
             origin = offset_origin(surface.position, surface.ng, wi, mesh.epsilon)
             escaped = float(0.0)
             if is_last == 1:
@@ -134,10 +128,10 @@ def scatter(
                 out.next = closest_hit(mesh, material, texture, origin, wi, INFINITY, 0, ray_key)
                 if out.next.valid == 0:
                     escaped = 1.0
-            slope = wi_local[2] / pdf
+            slope = wi_local[2] / f.pdf
             if escaped > 0.0:
                 Li = light_eval(light, wi)
-                weight = slope * escaped * power_heuristic(pdf, Li.pdf)
+                weight = slope * escaped * power_heuristic(f.pdf, Li.pdf)
                 out.weight_brdf = weight
                 out.direct += wp.cw_mul(f.diffuse + f.specular, Li.radiance) * weight
                 out.direct_diffuse += wp.cw_mul(f.diffuse, Li.radiance) * weight
@@ -146,6 +140,15 @@ def scatter(
                 out.throughput = (f.diffuse + f.specular) * slope
                 out.throughput_diffuse = f.diffuse * slope
     return out
+
+
+@wp.func
+def limited(radiance: wp.vec3, limit: float) -> float:
+    """Return the factor that brings the largest channel down to ``limit``; 1 without a limit."""
+    largest = wp.max(radiance)
+    if limit > 0.0 and largest > limit:
+        return limit / largest
+    return 1.0
 
 
 @wp.kernel
@@ -160,6 +163,7 @@ def trace_foreground(
     spp: int,
     rays: int,
     depth: int,
+    indirect_limit: float,
     seed: int,
     foreground: wp.array[wp.vec3],
     diffuse: wp.array[wp.vec3],
@@ -179,6 +183,9 @@ def trace_foreground(
         spp: Camera samples per pixel.
         rays: Paths that share one camera sample.
         depth: Surface interactions.
+        indirect_limit: Most radiance that one path may add behind its first vertex; 0 for no limit.
+            It takes the fireflies of light that a mirror throws onto a matte surface, and with them
+            some of that light.
         seed: Base seed.
         foreground: Radiance premultiplied by coverage, shape [object_pixel].
         diffuse: The part of it that the first hit's diffuse lobe reflects, shape [object_pixel].
@@ -226,12 +233,15 @@ def trace_foreground(
                         key,
                         k,
                     )
-                    sum_all += wp.cw_mul(throughput, event.direct)
                     if k == 0:
+                        sum_all += event.direct
                         sum_diffuse += event.direct_diffuse
                         throughput_diffuse = event.throughput_diffuse
                     else:
-                        sum_diffuse += wp.cw_mul(throughput_diffuse, event.direct)
+                        gathered = wp.cw_mul(throughput, event.direct)
+                        kept = limited(gathered, indirect_limit)
+                        sum_all += gathered * kept
+                        sum_diffuse += wp.cw_mul(throughput_diffuse, event.direct) * kept
                         throughput_diffuse = wp.cw_mul(throughput_diffuse, event.throughput)
                     if event.next.valid == 0:
                         break

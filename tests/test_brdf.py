@@ -6,7 +6,7 @@ import warp as wp
 
 from tests import oracles as o
 from tests.statistics import chi_square, compare_gradients, graded_edges
-from warpir.kernels.brdf import brdf_eval, brdf_pdf, brdf_sample, specular_probability
+from warpir.kernels.brdf import brdf_eval, brdf_sample, specular_probability
 
 VALUE_RTOL = 1e-4
 """float32, few operations."""
@@ -52,7 +52,7 @@ def pdf_kernel(
     p_specular: wp.array[float],
 ):
     i = wp.tid()
-    pdf[i] = brdf_pdf(wo[i], wi[i], base_color[i], metallic[i], roughness[i])
+    pdf[i] = brdf_eval(wo[i], wi[i], base_color[i], metallic[i], roughness[i]).pdf
     p_specular[i] = specular_probability(wo[i], base_color[i], metallic[i])
 
 

@@ -132,5 +132,9 @@ def load_asset(path: str | Path, missing_textures: str = "error") -> Asset:
         from warpir.obj import read_mesh
 
         return read_mesh(path, missing_textures)
-    raise InputError(path, f"not a mesh that warpir reads (found {suffix or 'no extension'}; "
-                     "expected .glb, .gltf, .obj, .ply or .stl)", "convert it to GLB")
+    raise InputError(
+        path,
+        f"not a mesh that warpir reads (found {suffix or 'no extension'}; "
+        "expected .glb, .gltf, .obj, .ply or .stl)",
+        "convert it to GLB",
+    )

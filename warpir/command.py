@@ -64,6 +64,7 @@ FLAGS = {
         "samples": "N",
         "rays": "N",
         "depth": "D",
+        "indirect_limit": "RADIANCE",
         "width": "W",
         "device": "NAME",
         "threads": "N",

@@ -95,6 +95,9 @@ class InsertConfig:
     """Rays per sample of each sampling strategy, light and surface"""
     depth: int = 5
     """Longest light path, in surface hits"""
+    indirect_limit: float = 8.0
+    """Most radiance that one light path may add after its first bounce; 0: no limit (the limit
+    removes bright specks where a mirror throws sunlight onto the object)"""
     width: int | None = None
     """Width at which the object is rendered [px] (default: the photo's)"""
     device: str | None = None
@@ -195,6 +198,7 @@ def _values_out_of_range(config: InsertConfig) -> Iterator[InputError]:
     yield from at_least("samples", 1, 2**20)
     yield from at_least("rays", 1, 2**10)
     yield from at_least("depth", 1, 2**10)
+    yield from at_least("indirect_limit", 0)
     yield from at_least("width", 8, WIDTH_LIMIT)
     if config.device is not None:
         known = DEVICE_FORM.fullmatch(config.device) is not None

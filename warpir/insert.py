@@ -111,7 +111,13 @@ def insert(config: InsertConfig) -> Insertion:
                 light.light,
                 light.light,
                 inputs.photo,
-                Quality(config.samples, config.rays, config.depth, config.seed),
+                Quality(
+                    config.samples,
+                    config.rays,
+                    config.depth,
+                    config.seed,
+                    config.indirect_limit,
+                ),
                 *curves,
                 is_reinhard=config.tone == "reinhard",
             )

@@ -28,6 +28,8 @@ class Quality:
     depth: int
     """Surface interactions."""
     seed: int
+    indirect_limit: float = 0.0
+    """Most radiance that one path may add behind its first vertex; 0 for no limit, unbiased."""
 
 
 @dataclass(frozen=True)
@@ -74,7 +76,13 @@ def make_picture(
         args_shadow = light_args(light_shadow, renderer.device)
     gbuffer = renderer.gbuffer(quality.seed)
     foreground = renderer.foreground(
-        args_fg, gbuffer.object_pixels, quality.samples, quality.rays, quality.depth, quality.seed
+        args_fg,
+        gbuffer.object_pixels,
+        quality.samples,
+        quality.rays,
+        quality.depth,
+        quality.seed,
+        quality.indirect_limit,
     )
     proxy_pixels = renderer.shaded_pixels(args_shadow, quality.seed)
     is_object = np.zeros(camera.width * camera.height, np.int32)

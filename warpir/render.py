@@ -323,7 +323,14 @@ class Renderer:
         return GBuffer(object_pixels=candidates[keep], **host)
 
     def foreground(
-        self, light: LightArgs, pixels: IntArray, spp: int, rays: int, depth: int, seed: int
+        self,
+        light: LightArgs,
+        pixels: IntArray,
+        spp: int,
+        rays: int,
+        depth: int,
+        seed: int,
+        indirect_limit: float = 0.0,
     ) -> Foreground:
         """Path-trace the object alone (DiPIR, eq. 4).
 
@@ -334,6 +341,8 @@ class Renderer:
             rays: Paths per camera sample, each with one direction per technique.
             depth: Surface interactions.
             seed: Base seed.
+            indirect_limit: Most radiance that one path may add behind its first vertex, or 0: no
+                limit, unbiased.
         """
         scene, count = self.scene, len(pixels)
         radiance, diffuse, emission = (
@@ -354,6 +363,7 @@ class Renderer:
                 spp,
                 rays,
                 depth,
+                indirect_limit,
                 seed,
                 *(Rows(a) for a in (radiance, diffuse, emission, mask)),
             ],
