@@ -31,7 +31,7 @@ class Ratio(NamedTuple):
     mean: FloatArray
     variance: FloatArray
     coverage: FloatArray
-    """Share of camera samples that see the plane is not kept: zeros, shape [H, W]."""
+    """1 where the plane is seen, shape [H, W]."""
 
 
 def renderer(asset: Asset, matrix: FloatArray, camera: Camera, device: str = "cpu") -> Renderer:
@@ -105,4 +105,8 @@ def quotient(lit: FloatArray, unoccluded: FloatArray, size: tuple[int, int]) -> 
     ratio = np.where(seen, a / np.where(seen, u, 1.0), 1.0)
     residual = (lit - ratio * unoccluded) / np.where(seen, u, 1.0)
     variance = np.where(seen, residual.var(axis=0, ddof=1) / len(lit), 0.0)
-    return Ratio(ratio.reshape(*size, 3), variance.reshape(*size, 3), np.zeros(size))
+    return Ratio(
+        ratio.reshape(*size, 3),
+        variance.reshape(*size, 3),
+        seen.any(-1).astype(float).reshape(size),
+    )

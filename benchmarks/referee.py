@@ -15,18 +15,20 @@ import time
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import mitsuba as mi
 import numpy as np
+import warp as wp
 from numpy.typing import NDArray
 
 if mi.variant() is None:
-    mi.set_variant("llvm_ad_rgb")
+    mi.set_variant("cuda_ad_rgb" if wp.is_cuda_available() else "llvm_ad_rgb")
 
 import drjit as dr
 from mitsuba.python.ad.integrators.common import mis_weight
 
+from benchmarks import ours
 from benchmarks.mitsuba_light import LatlongEmitter
 from benchmarks.mitsuba_material import GltfBSDF
 from benchmarks.mitsuba_path import GltfPath, intersect
@@ -34,6 +36,7 @@ from benchmarks.presets import PRESETS, ScenePreset
 from benchmarks.sheet import compare_images, write_sheet
 from warpir.asset import Asset, load_asset
 from warpir.camera import Camera
+from warpir.render import choose_device
 
 FloatArray = NDArray[np.float64]
 
@@ -250,17 +253,115 @@ def foreground_gradient(
     return d_texels / spp
 
 
-def ours(preset: ScenePreset, depth: int, samples: int, seed: int) -> Foreground:
-    """Render the preset's object with warpir.
+def shadow_ratio(
+    asset: Asset,
+    matrix: FloatArray,
+    camera: Camera,
+    texels: NDArray[np.float32],
+    spp: int,
+    seed: int,
+) -> ours.Ratio:
+    """Return the quotient of `shadow`'s two radiances, 1 where the plane is not seen."""
+    plane = shadow(asset, matrix, camera, texels, spp, seed)
+    seen = np.isfinite(plane.lit) & (plane.unoccluded > 0.0)
+    u = np.where(seen, plane.unoccluded, 1.0)
+    ratio = np.where(seen, np.where(seen, plane.lit, 0.0) / u, 1.0)
+    residual = (
+        plane.lit_variance - 2.0 * ratio * plane.covariance + ratio**2 * plane.unoccluded_variance
+    )
+    variance = np.where(seen & np.isfinite(residual), np.maximum(residual, 0.0) / u**2, 0.0)
+    return ours.Ratio(ratio, variance, plane.seen)
 
-    Raises:
-        NotImplementedError: Until `warpir.render` is wired in here.
+
+def comparable(image: ours.Ratio, seen: FloatArray, floor: float = 1e-4) -> ours.Ratio:
+    """Keep the pixels that see the plane with half of their samples or more.
+
+    ``floor`` is added to the standard errors: a handful of rare events has no honest variance.
     """
-    raise NotImplementedError("warpir.render is not wired into benchmarks.referee.ours yet")
+    used = (seen >= 0.5)[..., None]
+    touched = image.variance > 0.0
+    return image._replace(
+        mean=np.where(used, image.mean, 1.0),
+        variance=np.where(used, image.variance + touched * floor**2, 0.0),
+        coverage=used[..., 0].astype(float),
+    )
+
+
+def gradient_line(
+    preset: ScenePreset, assets: Path, depth: int, spp: int, seed: int, device: str
+) -> dict[str, Any]:
+    """Compare lobe gradients through a rasterised map: ours against path replay in Mitsuba.
+
+    The loss is ``sum(foreground * d_image)`` with a fixed random ``d_image``; the map's gradient of
+    both is carried to the lobes by the same adjoint of `warpir.bridge.rasterize`.
+    """
+    import torch
+
+    from warpir.bridge import rasterize
+    from warpir.integrator import LightTensors
+    from warpir.lobe_fit import fit_lobes
+    from warpir.mis import MisIntegrator
+
+    asset = load_asset(assets / preset.asset)
+    lobes = fit_lobes(preset.texels(assets), 32).lobes
+    leaves = [
+        torch.tensor(a, requires_grad=True)
+        for a in (lobes.amplitude, lobes.axis, np.minimum(lobes.sharpness, 2000.0))
+    ]
+    texels = rasterize(*leaves, 64, device)
+    camera = preset.camera()
+    d_image = np.random.default_rng(seed).normal(size=(camera.height, camera.width, 3))
+    setting = asset, preset.matrix(asset), camera
+
+    def to_lobes(d_texels: NDArray[np.floating[Any]]) -> list[FloatArray]:
+        grads = torch.autograd.grad(
+            texels, leaves, torch.tensor(d_texels, dtype=torch.float32), retain_graph=True
+        )
+        return [g.double().numpy() for g in grads]
+
+    fixed = texels.detach().numpy()
+    half = spp // 2
+    start = time.perf_counter()
+    theirs = [
+        to_lobes(foreground_gradient(*setting, fixed, depth, half, seed + k, d_image))
+        for k in range(2)
+    ]
+    theirs_s = time.perf_counter() - start
+    renderer = ours.renderer(*setting, device)
+    pixels = renderer.candidate_pixels(camera)
+    mis = MisIntegrator(renderer, pixels, np.zeros(0, np.int32), spp=64, rays=1, depth=depth)
+    weight = torch.tensor(d_image.reshape(-1, 3)[pixels], dtype=torch.float32)
+    own: list[list[FloatArray]] = []
+    start = time.perf_counter()
+    for k in range(2):
+        total = np.zeros(fixed.shape)
+        for run in range(max(1, half // 64)):
+            leaf = torch.tensor(fixed, requires_grad=True)
+            light = LightTensors(texels=leaf)
+            image = mis.radiance(light, light, seed=1000 * (k + 1) + run).foreground
+            (image * weight).sum().backward()
+            assert leaf.grad is not None
+            total += leaf.grad.double().numpy()
+        own.append(to_lobes(total / max(1, half // 64)))
+    ours_s = time.perf_counter() - start
+    line: dict[str, Any] = {"scene": preset.name, "what": "gradient", "depth": depth, "spp": spp}
+    for name, k in (("amplitude", 0), ("axis", 1), ("sharpness", 2)):
+        a = 0.5 * (own[0][k] + own[1][k]).ravel()
+        b = 0.5 * (theirs[0][k] + theirs[1][k]).ravel()
+        noise = 0.25 * (
+            np.square(own[0][k] - own[1][k]).sum() + np.square(theirs[0][k] - theirs[1][k]).sum()
+        )
+        size = float(np.linalg.norm(b))
+        line[name] = {
+            "relative_l2": float(np.linalg.norm(a - b)) / size,
+            "noise_l2": float(np.sqrt(noise)) / size,
+            "cosine": float(a @ b / np.linalg.norm(a) / size),
+        }
+    return {**line, "mitsuba_s": round(theirs_s, 2), "ours_s": round(ours_s, 2)}
 
 
 def main(arguments: list[str] | None = None) -> None:
-    """Compare on the presets; write ``referee.png`` per scene and depth and ``referee.json``."""
+    """Compare on the presets; write one sheet per scene and quantity, and ``referee.json``."""
     parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
     parser.add_argument(
         "--assets",
@@ -268,44 +369,63 @@ def main(arguments: list[str] | None = None) -> None:
         default=Path("../shared/data"),
         help="folder that holds mesh/ and hdri/",
     )
-    parser.add_argument("--output", type=Path, default=Path("runs/referee"))
+    parser.add_argument("--output", type=Path, default=Path("out/referee"))
     parser.add_argument("--scenes", nargs="*", default=[p.name for p in PRESETS])
     parser.add_argument("--depths", nargs="*", type=int, default=[1, 4])
-    parser.add_argument("--spp", type=int, default=256, help="camera samples per pixel")
+    parser.add_argument("--spp", type=int, default=1024, help="camera samples per pixel")
+    parser.add_argument("--gradients", nargs="*", default=["spot_night", "truck_sunny"])
     parser.add_argument("--seed", type=int, default=1)
-    parser.add_argument(
-        "--self-check",
-        action="store_true",
-        help="compare Mitsuba with itself at another seed: the statistics' null",
-    )
+    parser.add_argument("--device", default=None)
     options = parser.parse_args(arguments)
+    device = choose_device(options.device)
     options.output.mkdir(parents=True, exist_ok=True)
-    lines = []
+    lines: list[dict[str, Any]] = []
+
+    def keep(line: dict[str, Any]) -> None:
+        line |= {"mitsuba": mi.__version__, "variant": mi.variant(), "device": device}
+        lines.append(line)
+        print(json.dumps(line), flush=True)
+
     for preset in (p for p in PRESETS if p.name in options.scenes):
         asset = load_asset(options.assets / preset.asset)
-        texels = preset.texels(options.assets)
-        setting = asset, preset.matrix(asset), preset.camera(), texels
+        setting = asset, preset.matrix(asset), preset.camera(), preset.texels(options.assets)
+        size = [preset.width, preset.height]
         for depth in options.depths:
             start = time.perf_counter()
             reference = foreground(*setting, depth, options.spp, options.seed)
-            seconds = time.perf_counter() - start
-            if options.self_check:
-                candidate = foreground(*setting, depth, options.spp, options.seed + 1)
-            else:
-                candidate = ours(preset, depth, options.spp, options.seed + 1)
-            line = {
-                "scene": preset.name,
-                "depth": depth,
-                "spp": options.spp,
-                "size": [preset.width, preset.height],
-                "mitsuba": mi.__version__,
-                "variant": mi.variant(),
-                "reference_s": round(seconds, 2),
-                **compare_images(candidate, reference),
-            }
+            middle = time.perf_counter()
+            candidate = ours.foreground(*setting, depth, options.spp, options.seed + 1, device)
+            end = time.perf_counter()
+            keep(
+                {
+                    "scene": preset.name,
+                    "what": "foreground",
+                    "depth": depth,
+                    "spp": options.spp,
+                    "size": size,
+                    "mitsuba_s": round(middle - start, 2),
+                    "ours_s": round(end - middle, 2),
+                    **compare_images(candidate, reference),
+                }
+            )
             write_sheet(options.output / f"{preset.name}_d{depth}.png", candidate, reference)
-            lines.append(line)
-            print(json.dumps(line), flush=True)
+        ratio = shadow_ratio(*setting, options.spp, options.seed)
+        own = ours.shadow_ratio(*setting, options.spp, options.seed + 1, device)
+        seen = ratio.coverage
+        ratio, own = comparable(ratio, seen), comparable(own, seen)
+        keep(
+            {
+                "scene": preset.name,
+                "what": "shadow_ratio",
+                "spp": options.spp,
+                "size": size,
+                **compare_images(own, ratio),
+            }
+        )
+        write_sheet(options.output / f"{preset.name}_ratio.png", own, ratio)
+    for preset in (p for p in PRESETS if p.name in options.gradients):
+        for depth in options.depths:
+            keep(gradient_line(preset, options.assets, depth, options.spp, options.seed, device))
     (options.output / "referee.json").write_text("\n".join(map(json.dumps, lines)) + "\n")
 
 

@@ -1,5 +1,6 @@
 """Fixtures that every test shares."""
 
+import os
 import socket
 from typing import NoReturn
 
@@ -10,11 +11,18 @@ import warp as wp
 wp.config.quiet = True
 
 
-def _devices() -> list[str]:
+def devices() -> list[str]:
+    """Return the Warp devices to test on: the CPU, and CUDA where there is one.
+
+    Without Warp's CPU compiler (``WARPIR_TEST_DEVICES=cuda``) the CPU is left out.
+    """
+    chosen = os.environ.get("WARPIR_TEST_DEVICES")
+    if chosen:
+        return chosen.split(",")
     return ["cpu", "cuda"] if wp.is_cuda_available() else ["cpu"]
 
 
-@pytest.fixture(params=_devices())
+@pytest.fixture(params=devices())
 def device(request: pytest.FixtureRequest) -> str:
     """Name of the Warp device: the CPU, and a CUDA device where there is one."""
     return str(request.param)

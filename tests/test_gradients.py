@@ -9,6 +9,7 @@ import trimesh
 from torch import Tensor
 from torch.func import functional_call
 
+from tests.conftest import devices
 from tests.statistics import compare_gradients
 from warpir.asset import Asset, Material, Primitive
 from warpir.bridge import (
@@ -128,9 +129,13 @@ class Pipeline:
             return float(self.loss(raw, radiance))
 
 
-@pytest.fixture(scope="module", params=[1, 3], ids=["depth1", "depth3"])
+@pytest.fixture(
+    scope="module",
+    params=[(device, depth) for device in devices() for depth in (1, 3)],
+    ids=lambda p: f"{p[0]}-depth{p[1]}",
+)
 def pipeline(request: pytest.FixtureRequest) -> Pipeline:
-    device = "cuda:0" if torch.cuda.is_available() else "cpu"
+    device, depth = request.param
     focal = 40.0
     pose = np.eye(4)
     pose[1, 3] = 1.0
@@ -164,7 +169,7 @@ def pipeline(request: pytest.FixtureRequest) -> Pipeline:
     args = light_args(host_light(light), renderer.device)
     objects = renderer.gbuffer(0).object_pixels
     shaded = renderer.shaded_pixels(args, 0)
-    mis = MisIntegrator(renderer, objects, shaded, spp=4, rays=2, depth=request.param)
+    mis = MisIntegrator(renderer, objects, shaded, spp=4, rays=2, depth=depth)
     mask = renderer.foreground(args, objects, mis.spp, mis.rays, 1, SEED).mask
     photo = np.random.default_rng(0).uniform(0.2, 0.7, (HEIGHT, WIDTH, 3)).astype(np.float32)
     constants = ComposeConstants(photo, objects, shaded, mask, device)
@@ -226,7 +231,7 @@ def test_gradient_is_the_same_when_asked_again(
         assert torch.equal(leaf.grad, gradient[name]), name
 
 
-def test_rasterize_gradient_reaches_every_lobe() -> None:
+def test_rasterize_gradient_reaches_every_lobe(device: str) -> None:
     """Match float64 torch autograd of each texel's mean over many more directions."""
     generator = torch.Generator().manual_seed(1)
     amplitude = torch.rand(5, 3, generator=generator) + 0.1
@@ -235,7 +240,7 @@ def test_rasterize_gradient_reaches_every_lobe() -> None:
     height, side = 8, 24
     weights = torch.rand(height, 2 * height, 3, generator=generator, dtype=torch.float64)
     ours = [t.clone().requires_grad_(True) for t in (amplitude, axis, sharpness)]
-    (rasterize(*ours, height, "cpu").double() * weights).sum().backward()
+    (rasterize(*ours, height, device).double() * weights).sum().backward()
 
     rows, columns = height * side, 2 * height * side
     edge = torch.cos(torch.pi * torch.arange(height + 1, dtype=torch.float64) / height)
