@@ -17,9 +17,9 @@ from warpir.kernels.trace import (
     Hit,
     Surface,
     camera_ray,
+    camera_reach,
     closest_hit,
     offset_origin,
-    proxy_distance,
     surface_at,
     visibility,
 )
@@ -201,9 +201,7 @@ def trace_foreground(
     count = float(0.0)
     for s in range(spp):
         ray_dir = camera_ray(camera, pixel, sobol_pair(s, key, 0))
-        reach = proxy_distance(proxy, camera.origin, ray_dir)
-        if reach < 0.0:
-            reach = INFINITY
+        reach = camera_reach(proxy, camera.origin, ray_dir)
         first = closest_hit(
             mesh, material, texture, camera.origin, ray_dir, reach, 1, hash_pair(key, wp.uint32(s))
         )
@@ -304,9 +302,7 @@ def record_paths(
     for k in range(depth + 1):
         record.material[k, path] = -1
     ray_dir = camera_ray(camera, pixel, sobol_pair(s, key, 0))
-    reach = proxy_distance(proxy, camera.origin, ray_dir)
-    if reach < 0.0:
-        reach = INFINITY
+    reach = camera_reach(proxy, camera.origin, ray_dir)
     hit = closest_hit(
         mesh, material, texture, camera.origin, ray_dir, reach, 1, hash_pair(key, wp.uint32(s))
     )

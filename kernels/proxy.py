@@ -14,7 +14,13 @@ from warpir.kernels.sampling import (
     light_sample,
     power_heuristic,
 )
-from warpir.kernels.trace import camera_ray, closest_hit, proxy_distance, visibility
+from warpir.kernels.trace import (
+    camera_ray,
+    camera_reach,
+    closest_hit,
+    proxy_distance,
+    visibility,
+)
 from warpir.kernels.types import (
     CameraArgs,
     LightArgs,
@@ -102,8 +108,9 @@ def proxy_point(
     if t <= 0.0:
         return wp.vec4(0.0)
     if may_see_object == 1:
+        reach = camera_reach(proxy, camera.origin, ray_dir)
         hit = closest_hit(
-            mesh, material, texture, camera.origin, ray_dir, t, 1, hash_pair(key, wp.uint32(s))
+            mesh, material, texture, camera.origin, ray_dir, reach, 1, hash_pair(key, wp.uint32(s))
         )
         if hit.valid == 1:
             return wp.vec4(0.0)

@@ -71,6 +71,18 @@ def proxy_distance(proxy: ProxyArgs, origin: wp.vec3, direction: wp.vec3) -> flo
 
 
 @wp.func
+def camera_reach(proxy: ProxyArgs, origin: wp.vec3, direction: wp.vec3) -> float:
+    """Return how far a camera ray sees [m]: to the plane and to what lies on it.
+
+    Without the tolerance a sheet on the ground would be seen in a random part of its samples.
+    """
+    reach = proxy_distance(proxy, origin, direction)
+    if reach < 0.0:
+        return INFINITY
+    return reach - proxy.tolerance / wp.dot(proxy.normal, direction)
+
+
+@wp.func
 def offset_origin(p: wp.vec3, ng: wp.vec3, direction: wp.vec3, epsilon: float) -> wp.vec3:
     """Move a ray's start off the surface, to the side it leaves on.
 
@@ -431,9 +443,7 @@ def trace_gbuffer(
     emitted = wp.vec3(0.0)
     for s in range(spp):
         ray_dir = camera_ray(camera, pixel, sobol_pair(s, key, 0))
-        reach = proxy_distance(proxy, camera.origin, ray_dir)
-        if reach < 0.0:
-            reach = INFINITY
+        reach = camera_reach(proxy, camera.origin, ray_dir)
         hit = closest_hit(
             mesh,
             material,

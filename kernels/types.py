@@ -28,6 +28,8 @@ class ProxyArgs:
     """Unit normal, toward the side that receives light."""
     offset: float
     """Distance from the recentred origin along ``normal`` [m]."""
+    tolerance: float
+    """How far below the plane the object still counts as lying on it [m]."""
 
 
 @wp.struct

@@ -151,6 +151,10 @@ class Scene:
         self.proxy_args = ProxyArgs()
         self.proxy_args.normal = wp.vec3(*proxy.normal.astype(np.float32))
         self.proxy_args.offset = float(proxy.offset - proxy.normal @ self.origin)
+        # A sheet that lies on the plane is hit before or behind it by a few units in the last place
+        # of the camera's coordinates.
+        eye = np.abs(camera.c2w[:3, 3] - self.origin).max()
+        self.proxy_args.tolerance = float(1e-5 * self.diagonal + 5e-7 * eye)
 
     def camera_args_at(self, camera: Camera) -> CameraArgs:
         """Return ``camera`` in the recentred frame."""
