@@ -156,7 +156,7 @@ def _geometry(size: tuple[int, int], gbuffer: GBuffer, camera: Camera) -> dict[s
     depth = (camera.c2w[:3, 3] - position) @ camera.c2w[:3, 2]
     return {
         "depth": _plane(size, pixels, depth.astype(np.float32), outside=np.inf),
-        "position": _plane(size, pixels, position),
+        "position": _plane(size, pixels, position.astype(np.float32)),
         "normal": _plane(size, pixels, gbuffer.normal[seen]),
         "albedo": _plane(size, pixels, gbuffer.base_color[seen]),
         "roughness": _plane(size, pixels, gbuffer.roughness[seen]),

@@ -30,6 +30,7 @@ from warpir.scene import Scene
 
 IntArray = NDArray[np.int32]
 FloatArray = NDArray[np.float32]
+Float64Array = NDArray[np.float64]
 
 SAMPLES_PER_SLICE = 1 << 16
 """CPU work of one launch; keeps launches under half a second, so that Ctrl-C is answered."""
@@ -164,7 +165,7 @@ class GBuffer:
     """Row-major pixel indices, shape [object_pixel]."""
     coverage: FloatArray
     """Share of the pixel that shows the object [1]; a first, coarse estimate of the mask."""
-    position: FloatArray
+    position: Float64Array
     """World frame [m], shape [object_pixel, 3]."""
     normal: FloatArray
     """Unit shading normal, world frame, shape [object_pixel, 3]."""
@@ -319,7 +320,8 @@ class Renderer:
         near = _dilate(hit)
         keep = near.reshape(-1)[candidates]
         host = {name: values[keep] for name, values in host.items()}
-        host["position"] = host["position"] + self.scene.origin.astype(np.float32)
+        # In float64: float32 is 8 mm coarse 100 km from the origin, and depth follows from this.
+        host["position"] = host["position"].astype(np.float64) + self.scene.origin
         return GBuffer(object_pixels=candidates[keep], **host)
 
     def foreground(
