@@ -145,6 +145,18 @@ def test_placement_warns(size: float, distance: float, words: str) -> None:
     assert words in placed.warnings[0]
 
 
+def test_placement_tells_distance_size_and_pixels() -> None:
+    """A wrong horizon, height or unit shows in one line before anything is rendered."""
+    camera = camera_from_fov(800, 600, 90.0, 0.0, 3.0)
+    low, high = np.array([-1.0, 0.0, 0.0]), np.array([1.0, 1.0, 0.0])
+    placed = place_asset(low, high, camera, place=(0.0, 0.0, -4.0), scale=2.0)
+    # 400 px of focal length: 4 m at a distance of 4 m is 400 px wide, its foot 300 px below the eye
+    assert placed.summary == (
+        "the object of 4 x 2 x 0 m stands 5 m from the camera, in columns 200 to 600, "
+        "rows 400 to 600"
+    )
+
+
 def test_placement_plane_needs_a_normal() -> None:
     """A plane of zeros is refused."""
     with pytest.raises(InputError, match="--ground"):

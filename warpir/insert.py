@@ -225,6 +225,7 @@ def _read(config: InsertConfig) -> "tuple[InsertConfig, Inputs, SceneLight]":
         config = demo_config(config)
     inputs = read_inputs(config)
     light = make_light(inputs, config)
+    _say(f"placement: {inputs.placement.summary}")
     for line in (*inputs.assumed, *light.assumed):
         _say(f"assumed: {line}")
     for line in inputs.notices:

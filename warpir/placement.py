@@ -35,6 +35,8 @@ class Placement:
     """What was chosen because nothing was given, one line each."""
     warnings: tuple[str, ...] = ()
     """What may not be meant, one line each."""
+    summary: str = ""
+    """How far away, how large and where in the photo the object is, one line."""
 
 
 def place_asset(
@@ -102,8 +104,12 @@ def place_asset(
     asset_to_world[:3, :3] = scale * rotation
     asset_to_world[:3, 3] = stand - scale * (rotation @ foot)
 
-    warnings += _check_in_view(where, _corners(low, high), asset_to_world, camera)
-    return Placement(asset_to_world, plane, tuple(assumed), tuple(warnings))
+    seen, cut = _check_in_view(where, _corners(low, high), asset_to_world, camera)
+    warnings += cut
+    away = float(np.linalg.norm(stand - origin))
+    shown = " x ".join(f"{scale * side:.3g}" for side in sides)
+    summary = f"the object of {shown} m stands {away:.3g} m from the camera, {seen}"
+    return Placement(asset_to_world, plane, tuple(assumed), tuple(warnings), summary)
 
 
 def upright_plane(
@@ -183,8 +189,11 @@ def _corners(low: Float64Array, high: Float64Array) -> Float64Array:
 
 def _check_in_view(
     where: str, corners: Float64Array, asset_to_world: Float64Array, camera: Camera
-) -> list[str]:
-    """Refuse an object that the camera cannot see; warn about one that is cut by the frame."""
+) -> tuple[str, list[str]]:
+    """Refuse an object that the camera cannot see; return where in the photo it is, and warnings.
+
+    The bounding box is looked at, so an object may be reported as cut that just fits.
+    """
     eye = np.linalg.solve(asset_to_world, camera.c2w[:, 3])[:3]
     if np.all((eye > corners[0]) & (eye < corners[-1])):
         raise InputError(where, "the camera is inside the object", "move it away, or use --size")
@@ -193,12 +202,12 @@ def _check_in_view(
     if len(seen) == 0:
         raise InputError(where, "the object is behind the camera", "the camera looks along -Z")
     if len(seen) < len(pixels):
-        return ["the object reaches behind the camera"]
+        return "partly behind it", ["the object reaches behind the camera"]
     (left, top), (right, bottom) = seen.min(axis=0), seen.max(axis=0)
     box = f"columns {left:.0f} to {right:.0f}, rows {top:.0f} to {bottom:.0f}"
     frame = f"the photo is {camera.width} x {camera.height}"
     if right <= 0.0 or bottom <= 0.0 or left >= camera.width or top >= camera.height:
         raise InputError(where, f"the object is outside the photo ({box}; {frame})")
     if left < 0.0 or top < 0.0 or right > camera.width or bottom > camera.height:
-        return [f"the object is cut by the photo's edge ({box}; {frame})"]
-    return []
+        return f"in {box}", [f"the object may be cut by the photo's edge ({box}; {frame})"]
+    return f"in {box}", []
