@@ -144,13 +144,12 @@ def sample_texture(texture: TextureArgs, k: int, uv: wp.vec2, is_color: int) -> 
     j1 = wrap(int(xf) + 1, width, texture.wrap_u[k])
     i0 = wrap(int(yf), height, texture.wrap_v[k])
     i1 = wrap(int(yf) + 1, height, texture.wrap_v[k])
-    top = (
-        texel(texture, k, i0, j0, is_color) * (1.0 - fx) + texel(texture, k, i0, j1, is_color) * fx
-    )
-    bottom = (
-        texel(texture, k, i1, j0, is_color) * (1.0 - fx) + texel(texture, k, i1, j1, is_color) * fx
-    )
-    return top * (1.0 - fy) + bottom * fy
+    # Equal texels give exactly their value: an opaque texture must not let 1e-7 of the light pass.
+    top = texel(texture, k, i0, j0, is_color)
+    top = top + (texel(texture, k, i0, j1, is_color) - top) * fx
+    bottom = texel(texture, k, i1, j0, is_color)
+    bottom = bottom + (texel(texture, k, i1, j1, is_color) - bottom) * fx
+    return top + (bottom - top) * fy
 
 
 @wp.func
@@ -180,7 +179,8 @@ def hit_alpha(mesh: MeshArgs, material: MaterialArgs, texture: TextureArgs, hit:
     a = mesh.colors[mesh.indices[3 * hit.face]][3]
     b = mesh.colors[mesh.indices[3 * hit.face + 1]][3]
     c = mesh.colors[mesh.indices[3 * hit.face + 2]][3]
-    alpha = material.alpha[m] * (a * hit.u + b * hit.v + c * (1.0 - hit.u - hit.v))
+    # Written so that equal corners give exactly their value: the cutoff compares with it.
+    alpha = material.alpha[m] * (c + (a - c) * hit.u + (b - c) * hit.v)
     k = material.slot_texture[m, SLOT_BASE_COLOR]
     if k >= 0:
         uv = slot_uv(mesh, material, m, SLOT_BASE_COLOR, hit)
