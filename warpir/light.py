@@ -211,11 +211,15 @@ def rasterize_lobes(lobes: Lobes, height: int, width: int, side: int = 4) -> Flo
     omega = texel_solid_angles(height, width)
     narrow = lobes.sharpness > 1.0 / (np.pi / height / side) ** 2
     big = map_directions(height * side, width * side)
+    # Within the texels at a pole, the points nearer to it stand for less of the sphere.
+    share = texel_solid_angles(height * side, width * side).reshape(height, side)
+    share /= share.sum(axis=1, keepdims=True)
     for amplitude, axis, s in zip(
         lobes.amplitude[~narrow], lobes.axis[~narrow], lobes.sharpness[~narrow], strict=True
     ):
         shape = np.exp(s * (big @ axis.astype(np.float64) - 1.0))
-        fine = shape.reshape(height, side, width, side).mean(axis=(1, 3))
+        fine = shape.reshape(height, side, width, side).mean(axis=3)
+        fine = (fine * share[:, :, None]).sum(axis=1)
         texels += fine[..., None] * amplitude
     for flux, axis in zip(lobes.flux()[narrow], lobes.axis[narrow], strict=True):
         x, y, z = (float(c) for c in axis)
@@ -240,28 +244,32 @@ def as_map(light: Light, height: int) -> FloatArray:
 
 
 def resize_map(texels: FloatArray, height: int) -> FloatArray:
-    """Resample a map to ``height`` rows by area, keeping its energy.
+    """Resample a map to ``height`` rows: each texel is the mean over its solid angle.
 
-    Exact for whole factors either way; otherwise boxes overlap in proportion.
+    Texels are taken as constant, so energy is kept exactly at any size.
     """
 
-    def along(values: Float64Array, count: int, axis: int) -> Float64Array:
-        old = values.shape[axis]
-        moved = np.moveaxis(values, axis, 0)
-        total = np.concatenate([np.zeros((1, *moved.shape[1:])), np.cumsum(moved, axis=0)])
-        edges = np.arange(count + 1) * old / count
-        low = np.minimum(edges.astype(int), old - 1)
-        part = (edges - low).reshape(-1, *([1] * (moved.ndim - 1)))
-        at = total[low] + part * (total[low + 1] - total[low])
-        return np.moveaxis((at[1:] - at[:-1]) * count / old, 0, axis)
+    def boxes(values: Float64Array, old: Float64Array, new: Float64Array) -> Float64Array:
+        """Average rows between rising ``old`` edges over rising ``new`` ones."""
+        sums = values * np.diff(old)[:, None, None]
+        total = np.concatenate([np.zeros((1, *values.shape[1:])), np.cumsum(sums, axis=0)])
+        low = np.clip(np.searchsorted(old, new, side="right") - 1, 0, len(values) - 1)
+        at = total[low] + (new - old[low])[:, None, None] * values[low]
+        averaged: Float64Array = np.diff(at, axis=0) / np.diff(new)[:, None, None]
+        return averaged
+
+    def heights(rows: int) -> Float64Array:
+        # Solid angle is proportional to the height on the sphere (Archimedes).
+        edges: Float64Array = -np.cos(np.pi * np.arange(rows + 1) / rows)
+        return edges
 
     if texels.shape[0] == height and texels.shape[1] == 2 * height:
         return texels
-    omega = texel_solid_angles(texels.shape[0], texels.shape[1])
-    energy = along(texels.astype(np.float64) * omega[:, None, None], height, 0)
-    energy = along(energy, 2 * height, 1)
-    solid = along(np.broadcast_to(omega[:, None], (len(omega), 1)).astype(np.float64), height, 0)
-    return (energy / solid[..., None]).astype(np.float32)
+    old_height, old_width = texels.shape[:2]
+    rows = boxes(texels.astype(np.float64), heights(old_height), heights(height))
+    columns = (np.linspace(0.0, 1.0, count + 1) for count in (old_width, 2 * height))
+    resized = boxes(np.moveaxis(rows, 1, 0), *columns)
+    return np.maximum(np.moveaxis(resized, 0, 1), 0.0).astype(np.float32)
 
 
 def summarize(light: Light) -> LightSummary:
