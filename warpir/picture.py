@@ -16,6 +16,9 @@ from warpir.render import Foreground, GBuffer, Renderer, ToneKnots, light_args
 FloatArray = NDArray[np.float32]
 Float64Array = NDArray[np.float64]
 
+SLIVER = 1e-4
+"""Share of a pixel [1] below which the object's surface is not described there."""
+
 
 @dataclass(frozen=True)
 class Quality:
@@ -113,8 +116,7 @@ def make_picture(
     }
     height, width = photo.srgb.shape[:2]
     if size != (height, width):
-        planes = {name: _resize(plane, height, width) for name, plane in planes.items()}
-        planes["depth"][planes["matte"] <= 0.0] = np.inf
+        planes = _resize_planes(planes, height, width)
     matte = planes["matte"]
     plate = photo.linear()
     composite = planes["foreground"] + (1.0 - matte)[..., None] * plate * planes["shadow_ratio"]
@@ -170,6 +172,26 @@ def _plane(
     plane = np.full((size[0] * size[1], *values.shape[1:]), outside, np.float32)
     plane[pixels] = values
     return plane.reshape(*size, *values.shape[1:])
+
+
+def _resize_planes(planes: dict[str, FloatArray], height: int, width: int) -> dict[str, FloatArray]:
+    """Bring all planes to the photo's size.
+
+    What describes the object's surface is averaged over the object alone: mixed with the empty
+    background, its depth would fall to 0 along the outline.
+    """
+    seen = np.isfinite(planes["depth"])
+    share = _resize(seen.astype(np.float32), height, width)
+    resized = {name: _resize(plane, height, width) for name, plane in planes.items()}
+    shown = (share > SLIVER) & (resized["matte"] > 0.0)
+    weight = np.where(shown, share, 1.0)
+    for name in ("depth", "position", "normal", "albedo", "roughness"):
+        plane = resized[name]
+        plane /= weight if plane.ndim == 2 else weight[..., None]
+        plane[~shown] = np.inf if name == "depth" else 0.0
+    length = np.linalg.norm(resized["normal"], axis=-1, keepdims=True)
+    resized["normal"] /= np.where(length > 0.0, length, 1.0)
+    return resized
 
 
 def _resize(plane: FloatArray, height: int, width: int) -> FloatArray:
