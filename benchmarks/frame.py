@@ -3,7 +3,7 @@
     python -m benchmarks.frame [--assets DIR] [--device cpu|cuda] [--samples 64] [--json FILE]
 
 ToyCar at 1280 x 853 under a sunny 1k panorama, five surface interactions: G-buffer, object, pilot,
-shadow and tone, everything behind reading and before writing files.
+shadow, tone and all layers; everything behind reading files and before writing them.
 """
 
 import argparse
@@ -33,6 +33,9 @@ def main() -> None:
     parser.add_argument("--device", default=None)
     parser.add_argument("--samples", type=int, default=64)
     parser.add_argument("--depth", type=int, default=5)
+    parser.add_argument(
+        "--size", type=float, default=2.0, help="2 m fills half of the width, 3.2 m nearly all"
+    )
     parser.add_argument("--repeats", type=int, default=3)
     parser.add_argument("--json", default=None)
     parser.add_argument("--preview", default=None, help="write the measured image here (PNG)")
@@ -41,7 +44,7 @@ def main() -> None:
     light = Light(texels=read_envmap(options.assets / "hdri/modern_buildings_2_1k.hdr"))
     camera = camera_from_fov(WIDTH, HEIGHT, 40.0, -12.0, 1.4)
     placement = place_asset(
-        *asset.bounds(), camera, None, place=(0.0, 0.0, -5.5), rotate_y=-35.0, size=3.2
+        *asset.bounds(), camera, None, place=(0.0, 0.0, -5.5), rotate_y=-35.0, size=options.size
     )
     grey = np.full((HEIGHT, WIDTH, 3), 0.45, np.float32)
     photo = Photo(codes=np.round(grey * 255.0).astype(np.uint8), srgb=grey, kind="png")
@@ -68,6 +71,7 @@ def main() -> None:
             "scene": "ToyCar, modern_buildings_2, 1280x853",
             "samples": options.samples,
             "depth": options.depth,
+            "size_m": options.size,
             "object_pixels": picture.object_pixel_count,
             "shadow_pixels": picture.proxy_pixel_count,
             "first_s": round(times[0], 3),

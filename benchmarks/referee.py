@@ -292,8 +292,8 @@ def gradient_line(
 ) -> dict[str, Any]:
     """Compare lobe gradients through a rasterised map: ours against path replay in Mitsuba.
 
-    The loss is ``sum(foreground * d_image)`` with a fixed random ``d_image``; the map's gradient of
-    both is carried to the lobes by the same adjoint of `warpir.bridge.rasterize`.
+    The loss is ``sum(foreground * d_image)`` with colour ramps for ``d_image``; the map's gradient
+    of both is carried to the lobes by the same adjoint of `warpir.bridge.rasterize`.
     """
     import torch
 
@@ -310,7 +310,8 @@ def gradient_line(
     ]
     texels = rasterize(*leaves, 64, device)
     camera = preset.camera()
-    d_image = np.random.default_rng(seed).normal(size=(camera.height, camera.width, 3))
+    row, column = np.mgrid[0 : camera.height, 0 : camera.width] / camera.height
+    d_image = np.stack([0.5 + row, 0.5 + column, 1.5 - row], axis=-1)
     setting = asset, preset.matrix(asset), camera
 
     def to_lobes(d_texels: NDArray[np.floating[Any]]) -> list[FloatArray]:
@@ -373,7 +374,7 @@ def main(arguments: list[str] | None = None) -> None:
     parser.add_argument("--scenes", nargs="*", default=[p.name for p in PRESETS])
     parser.add_argument("--depths", nargs="*", type=int, default=[1, 4])
     parser.add_argument("--spp", type=int, default=1024, help="camera samples per pixel")
-    parser.add_argument("--gradients", nargs="*", default=["spot_night", "truck_sunny"])
+    parser.add_argument("--gradients", nargs="*", default=["spot_night", "truck_overcast"])
     parser.add_argument("--seed", type=int, default=1)
     parser.add_argument("--device", default=None)
     options = parser.parse_args(arguments)

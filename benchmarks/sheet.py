@@ -53,9 +53,27 @@ def compare_images(candidate: Any, reference: Any, block: int = 8) -> dict[str, 
         "relative_bias": float(difference.sum() / power),
         # One sample's channels vary together: their errors add, not their variances
         "relative_bias_error": float(np.sqrt(variance.sum(axis=(0, 1))).sum() / power),
+        "display_rmse": display_rmse(candidate.mean, reference.mean),
         "silent_differences": int(silent.sum()),
         "coverage_difference": float(np.abs(candidate.coverage - reference.coverage).max()),
     }
+
+
+def display_rmse(candidate: FloatArray, reference: FloatArray) -> float:
+    """RMSE of display values over the reference's own RMS [1]: what a viewer sees of fireflies.
+
+    Both images are divided by the reference's mean over lit pixels, then Reinhard and gamma 2.2.
+    """
+    lit = reference.sum(axis=-1) > 0.0
+    level = float(reference[lit].mean()) if lit.any() else 1.0
+
+    def shown(image: FloatArray) -> FloatArray:
+        x = np.maximum(image, 0.0) / level
+        values: FloatArray = (x / (1.0 + x)) ** (1.0 / 2.2)
+        return values
+
+    a, b = shown(candidate), shown(reference)
+    return float(np.sqrt(np.square(a - b).mean() / np.square(b).mean()))
 
 
 def write_sheet(path: Path, candidate: Any, reference: Any) -> None:

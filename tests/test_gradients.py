@@ -36,6 +36,8 @@ SEED = 3
 RELATIVE_L2 = 0.02
 """Asked of the whole pipeline; float32 differences with these steps are good to about 0.5 %."""
 COSINE = 0.999
+ATOMICS_L2 = 1e-5
+"""float32 sums of about 1e4 terms in another order."""
 RASTERIZE_L2 = 1e-2
 """Three directions per standard deviation of a lobe leave about 0.5 %."""
 STEP = {"sharpness": 2e-2, "texels": 5e-2}
@@ -223,12 +225,19 @@ def test_gradient_is_that_of_the_pinned_pipeline(
 def test_gradient_is_the_same_when_asked_again(
     pipeline: Pipeline, gradient: dict[str, Tensor]
 ) -> None:
-    """A second backward neither doubles nor drifts: nothing is kept between calls."""
+    """A second backward neither doubles nor drifts: nothing is kept between calls.
+
+    The same bytes on the CPU; CUDA adds up in an order of its own.
+    """
     leaves = {name: value.clone().requires_grad_(True) for name, value in pipeline.raw.items()}
     pipeline.free(leaves).backward()
     for name, leaf in leaves.items():
         assert leaf.grad is not None
-        assert torch.equal(leaf.grad, gradient[name]), name
+        if pipeline.mis.renderer.device.is_cpu:
+            assert torch.equal(leaf.grad, gradient[name]), name
+        else:
+            match = compare_gradients(leaf.grad.numpy(), gradient[name].numpy())
+            assert match.relative_l2 <= ATOMICS_L2, (name, match)
 
 
 def test_rasterize_gradient_reaches_every_lobe(device: str) -> None:

@@ -81,9 +81,9 @@ class InsertConfig:
     exposure: float | None = None
     """Factor on the light, in stops [EV] (default: chosen from the photo)"""
 
-    tone: str = "reinhard"
-    """How the object's radiance becomes display values: reinhard, or linear (clipped), which is
-    right when --exposure is the photo's own"""
+    tone: str = "linear"
+    """How the object's radiance becomes display values: linear (clipped, as the photo was), or
+    reinhard (x / (1 + x), paler, nothing clips)"""
     ground_albedo: float = 0.25
     """Reflectance assumed of the ground, for the automatic exposure [1]"""
 

@@ -339,7 +339,7 @@ def _decode(path: Path, max_pixels: int, kinds: tuple[str, ...] = tuple(_OIIO_NA
     oiio.attribute("limits:imagesize_MB", max(64, max_pixels * 64 // 2**20))
     hints = oiio.ImageSpec()
     hints.attribute("oiio:UnassociatedAlpha", 1)
-    with _captured_stderr():
+    with captured_stderr():
         reader = oiio.ImageInput.open(str(path), hints)
         if reader is None:
             raise _unreadable(path, kind, _library_error(oiio), max_pixels)
@@ -546,7 +546,7 @@ def _one_line(text: str) -> str:
 
 
 @contextmanager
-def _captured_stderr() -> Iterator[None]:
+def captured_stderr() -> Iterator[None]:
     """Keep what C libraries print (libpng does) off the terminal; it goes to the debug log."""
     try:
         saved = os.dup(2)
@@ -683,7 +683,7 @@ def _apply_profile(values: FloatArray, icc: bytes, inverse: bool) -> FloatArray 
         profile_path.write_bytes(icc)
         source = oiio.ImageBuf(np.ascontiguousarray(values, dtype=np.float32))
         target = oiio.ImageBuf()
-        with _captured_stderr():
+        with captured_stderr():
             done = oiio.ImageBufAlgo.ociofiletransform(
                 target, source, str(profile_path), False, inverse
             )

@@ -76,12 +76,14 @@ def insert(config: InsertConfig) -> Insertion:
     Raises:
         InputError: An input or the output folder cannot be used; nothing was written then.
     """
-    from warpir.record import Timings, progress_bar, run_record
+    from warpir.record import Timings, input_hashes, progress_bar, run_record
     from warpir.strict_json import read_json_object
 
     config.require_inputs()
     timings = Timings()
     with timings.stage("read"):
+        # The demo fills in its files; what was asked for is what run.json repeats.
+        asked = config
         config, inputs, light = _read(config)
 
     from warpir.files import OutputFolder
@@ -95,7 +97,7 @@ def insert(config: InsertConfig) -> Insertion:
             from warpir.scene import Placed, Proxy, Scene
 
             device = choose_device(config.device)
-            _say(f"device: {device}")
+            _say(f"device: {device} (the first run compiles the kernels)")
         with timings.stage("scene"):
             ground = inputs.placement.ground
             scene = Scene(
@@ -124,7 +126,8 @@ def insert(config: InsertConfig) -> Insertion:
         with timings.stage("write"):
             measured = _write(output, config, inputs, light, picture, curves)
         record = run_record(
-            config,
+            asked,
+            inputs=input_hashes(config),
             device=str(scene.device),
             timings=timings,
             assumed=(*inputs.assumed, *light.assumed),

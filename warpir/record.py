@@ -63,6 +63,7 @@ def progress_bar() -> Iterator[Callable[[str, float], None]]:
 def run_record(
     config: InsertConfig,
     *,
+    inputs: Mapping[str, str],
     device: str,
     timings: Timings,
     assumed: Sequence[str] = (),
@@ -73,6 +74,7 @@ def run_record(
 
     Args:
         config: What was asked for.
+        inputs: sha256 of the files that were read, from `input_hashes`.
         device: What computed it, such as ``cpu`` or the name of a card.
         timings: Seconds by stage.
         assumed: What was chosen because nothing was given, one line each.
@@ -83,7 +85,7 @@ def run_record(
         "format": RUN_FORMAT,
         "warpir": warpir.__version__,
         "config": asdict(config),
-        "inputs": input_hashes(config),
+        "inputs": dict(inputs),
         "assumed": list(assumed),
         "notices": list(notices),
         "measured": dict(measured or {}),

@@ -7,6 +7,7 @@ slices and threads do not change a result.
 
 from __future__ import annotations
 
+import logging
 import os
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
@@ -19,6 +20,7 @@ from numpy.typing import NDArray
 from warpir.camera import Camera
 from warpir.color import luminance
 from warpir.errors import ExitCode, InputError
+from warpir.files import captured_stderr
 from warpir.kernels.composite import tone_foreground, tone_shadow
 from warpir.kernels.path import trace_foreground
 from warpir.kernels.proxy import trace_proxy
@@ -54,8 +56,11 @@ def choose_device(name: str | None) -> str:
     Raises:
         InputError: The device does not exist.
     """
-    wp.config.quiet = True
-    wp.init()
+    # The banner, the lines of each loaded module and "no CUDA driver" are for `--debug`.
+    if not logging.getLogger().isEnabledFor(logging.DEBUG):
+        wp.config.log_level = wp.LOG_ERROR
+    with captured_stderr():
+        wp.init()
     known = [d.alias for d in wp.get_devices()]
     if name is None:
         return "cuda:0" if wp.is_cuda_available() else "cpu"

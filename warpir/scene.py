@@ -206,7 +206,8 @@ class Scene:
             np.concatenate([np.full(len(v.indices), m, np.int32) for v, m in parts]), wp.int32
         )
         # The handle is a pointer and the points are referenced: both must outlive every launch.
-        self.mesh = wp.Mesh(points=args.positions, indices=args.indices)
+        # Warp's default on CUDA builds faster and traces 12 % slower; this tree is built once.
+        self.mesh = wp.Mesh(points=args.positions, indices=args.indices, bvh_constructor="sah")
         args.id = self.mesh.id
         self.mesh_args = args
 
