@@ -438,9 +438,9 @@ def inputs_for(level: float | FloatArray, light: Light | None = None) -> Inputs:
     return Inputs(Photo(codes, srgb, "png"), asset, view, placement, light)
 
 
-def config_for(**values: object) -> InsertConfig:
+def config_for(tone: str = "reinhard", **values: object) -> InsertConfig:
     """A configuration that names its files but reads none."""
-    return InsertConfig(photo="p", asset="a", out="o", **values)  # type: ignore[arg-type]
+    return InsertConfig(photo="p", asset="a", out="o", tone=tone, **values)  # type: ignore[arg-type]
 
 
 def ground_level(light: Light, albedo: float) -> float:
