@@ -49,7 +49,8 @@ def _from_torch(tensor: Tensor, dtype: Any, device: wp.Device, grad: bool = Fals
 def _to_torch(array: wp.array, like: Tensor) -> Tensor:
     """Copy a Warp array into a tensor on ``like``'s device, with its dtype."""
     if array.device.is_cuda and like.is_cuda:
-        return wp.to_torch(array).clone().to(like.dtype)
+        copied: Tensor = wp.to_torch(array).clone().to(like.dtype)
+        return copied
     # On the CPU `numpy()` is a view of the array, which the next `tape.zero()` would clear.
     return torch.from_numpy(array.numpy().copy()).to(like.device, like.dtype)
 

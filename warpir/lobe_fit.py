@@ -77,7 +77,9 @@ def _lamps(
     flux = lum * omega
     total = flux.sum()
     left = lum.copy()
-    axes, sharpnesses, covered = [], [], []
+    axes: list[Float64Array] = []
+    sharpnesses: list[float] = []
+    covered: list[NDArray[np.bool_]] = []
     while len(axes) < limit and total > 0.0:
         peak = directions[np.unravel_index(np.argmax(left), left.shape)]
         cosine = directions @ peak

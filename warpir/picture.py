@@ -200,7 +200,7 @@ def _resize(plane: FloatArray, height: int, width: int) -> FloatArray:
 
     finite = np.where(np.isfinite(plane), plane, 0.0)
     down = plane.shape[0] > height
-    resized = resize(
+    resized = resize(  # type: ignore[no-untyped-call]
         finite, (height, width, *plane.shape[2:]), order=1, anti_aliasing=down, preserve_range=True
     )
     return np.asarray(resized, dtype=np.float32)

@@ -12,6 +12,7 @@ import os
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import warp as wp
@@ -93,7 +94,7 @@ def light_args(light: Light, device: wp.Device) -> LightArgs:
     lobes, texels = light.lobes, light.texels
     if texels is None and (lobes is None or len(lobes.sharpness) == 0):
         raise ValueError("a light needs lobes or a map")
-    flux = np.zeros(0)
+    flux: NDArray[np.floating[Any]] = np.zeros(0)
     if lobes is not None and len(lobes.sharpness):
         values = np.concatenate(
             [lobes.amplitude.reshape(-1), lobes.axis.reshape(-1), lobes.sharpness]
@@ -532,7 +533,7 @@ class ToneKnots:
     @property
     def bin_count(self) -> int:
         """Number of bins."""
-        return self.x.shape[1] - 1
+        return int(self.x.shape[1]) - 1
 
     def arrays(self) -> tuple[FloatArray, FloatArray, FloatArray]:
         """Return the arrays in the kernels' order."""

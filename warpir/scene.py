@@ -13,7 +13,7 @@ import numpy as np
 import warp as wp
 from numpy.typing import NDArray
 
-from warpir.asset import Asset, Primitive, TextureSlot
+from warpir.asset import Asset, Material, Primitive, Texture, TextureSlot
 from warpir.camera import Camera
 from warpir.color import srgb_to_linear
 from warpir.kernels.types import CameraArgs, MaterialArgs, MeshArgs, ProxyArgs, TextureArgs
@@ -124,8 +124,8 @@ class Scene:
         self.camera = camera
         self.proxy = proxy
         parts: list[tuple[_Vertices, int]] = []
-        materials = []
-        textures = []
+        materials: list[tuple[Material, int]] = []
+        textures: list[Texture] = []
         for placed in objects:
             for primitive in placed.asset.primitives:
                 vertices = _to_world(primitive, placed.asset_to_world)
@@ -211,11 +211,9 @@ class Scene:
         args.id = self.mesh.id
         self.mesh_args = args
 
-    def _upload_materials(self, materials: list[tuple[object, int]]) -> None:
-        from warpir.asset import Material
-
+    def _upload_materials(self, materials: Sequence[tuple[Material, int]]) -> None:
         rows = materials or [(Material(), 0)]
-        plain: list[Material] = [m for m, _ in rows]  # type: ignore[misc]
+        plain = [m for m, _ in rows]
         slots = [
             [
                 _slot(slot, first)
@@ -260,11 +258,8 @@ class Scene:
         args.any_emission = int(any(max(m.emission) > 0.0 for m in plain))
         self.material_args = args
 
-    def _upload_textures(self, textures: Sequence[object]) -> None:
-        from warpir.asset import Texture
-
-        white = Texture(np.full((1, 1, 4), 255, np.uint8))
-        rows: list[Texture] = list(textures) or [white]  # type: ignore[arg-type]
+    def _upload_textures(self, textures: Sequence[Texture]) -> None:
+        rows = textures or [Texture(np.full((1, 1, 4), 255, np.uint8))]
         packed = [np.ascontiguousarray(t.pixels).view("<u4").reshape(-1) for t in rows]
         args = TextureArgs()
         args.texels = self._array(np.concatenate(packed), wp.uint32)
