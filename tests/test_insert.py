@@ -889,10 +889,12 @@ def test_validate_of_a_whole_scene_loads_no_renderer(inputs: Path, tmp_path: Pat
 
 
 def test_demo_runs_small(tmp_path: Path, device: str) -> None:
-    """--demo at width 64 and one sample writes everything at the demo photo's size."""
+    """--demo at width 64 and one sample writes everything at the photo's size, and replays."""
     out = tmp_path / "demo"
     argv = ["--demo", "--out", str(out), "--width", "64", "--samples", "1", "--device", device]
     demo = go(argv, out)
     assert set(demo.record["files"]) >= set(ALWAYS)
     assert demo.image().shape == (853, 1280, 3)
     assert demo.record["measured"]["object_pixels"] > 100
+    replayed = go(["--config", str(out / "run.json"), "--out", str(tmp_path / "r")], tmp_path / "r")
+    assert replayed.record["files"]["composite.png"] == demo.record["files"]["composite.png"]
