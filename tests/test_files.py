@@ -30,6 +30,7 @@ from warpir.files import (
     read_photo,
     write_layers,
 )
+from warpir.light import rotate_map
 
 SHARED = Path(__file__).resolve().parents[2] / "shared" / "data"
 needs_shared = pytest.mark.skipif(not SHARED.is_dir(), reason=f"no development data at {SHARED}")
@@ -473,14 +474,14 @@ def test_foreign_conventions_by_their_own_formula(tmp_path: Path, convention: st
 
 def test_rotation_is_counter_clockwise_from_above(tmp_path: Path) -> None:
     path = write_image(tmp_path / "m.exr", four_lobes(directions(32)))
-    turned = read_envmap(path, rotate_deg=90.0)
+    turned = rotate_map(read_envmap(path), 90.0)
     for axis, rgb in LOBES.items():
         x, _, z = axis
         # Seen from above +X is right and +Z is down: a quarter turn takes +X to -Z, +Z to +X.
         assert brightest(turned, rgb) @ (z, 0, -x) > 0.99
     np.testing.assert_array_equal(turned, np.roll(read_envmap(path), -16, axis=1))
-    np.testing.assert_array_equal(read_envmap(path, rotate_deg=-270.0), turned)
-    np.testing.assert_array_equal(read_envmap(path, rotate_deg=720.0), read_envmap(path))
+    np.testing.assert_array_equal(rotate_map(read_envmap(path), -270.0), turned)
+    np.testing.assert_array_equal(rotate_map(read_envmap(path), 720.0), read_envmap(path))
 
 
 @pytest.mark.parametrize("degrees", [1.0, 33.3, -187.77])
@@ -488,7 +489,7 @@ def test_rotation_by_part_columns_keeps_energy(
     tmp_path: Path, rng: np.random.Generator, degrees: float
 ) -> None:
     texels = (rng.random((16, 32, 3)) ** 8 * 1e5).astype(np.float32)
-    turned = read_envmap(write_image(tmp_path / "m.exr", texels), rotate_deg=degrees)
+    turned = rotate_map(read_envmap(write_image(tmp_path / "m.exr", texels)), degrees)
     np.testing.assert_allclose(turned.sum(axis=1), texels.sum(axis=1), rtol=1e-5)
 
 

@@ -406,6 +406,8 @@ def test_width_changes_the_rendering_alone(
     np.testing.assert_array_equal(sized.image()[outside], photo[outside])
     camera = json.loads((out / "camera.json").read_text())
     assert (camera["w"], camera["h"]) == (WIDTH, HEIGHT)
+    notices = json.loads((out / "run.json").read_text())["notices"]
+    assert any("a preview" in line for line in notices) == (int(width) < WIDTH)
 
 
 @pytest.mark.parametrize("size", [(1, 1), (7, 5), (3, 400)])

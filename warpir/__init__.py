@@ -1,3 +1,15 @@
-"""warpir: put a 3D object into a photograph so that it looks as if it had stood there."""
+"""warpir: put a 3D object into a photograph so that it looks as if it had stood there.
+
+Conventions, one for the whole project:
+
+* World right-handed, +Y up, metres; a camera looks along its own -Z with +Y up (glTF).
+* Images are indexed [y, x] with y down; pixel (column j, row i) has its centre at
+  (j + 0.5, i + 0.5).
+* Environment maps are OpenEXR lat-long: image centre = +Z, left quarter = +X, texel centres at
+  +0.5; what a level camera sees lies at the map's left and right edge.
+* Radiance is linear Rec.709, relative [W/(m^2 sr)]; display values are linear^(1/2.2).
+* ``wo`` points toward the camera, ``wi`` toward the light.
+* Angles are degrees at the command line and in files, radians inside.
+"""
 
 __version__ = "0.1.0"

@@ -33,6 +33,7 @@ import warpir
 from warpir import color
 from warpir.camera import Camera, exr_matrices
 from warpir.errors import ExitCode, InputError
+from warpir.light import rotate_map
 from warpir.strict_json import read_json_object
 
 FloatArray = NDArray[np.float32]
@@ -168,7 +169,6 @@ def read_photo(
 
 def read_envmap(
     path: str | Path,
-    rotate_deg: float = 0.0,
     *,
     convention: str = "openexr",
     strict: bool = False,
@@ -181,8 +181,6 @@ def read_envmap(
 
     Args:
         path: A 2:1 ``.hdr`` or ``.exr`` file, recognised by content.
-        rotate_deg: Turns the light about +Y, counter-clockwise seen from above [deg]; whole
-            columns are moved exactly, parts of a column keep each row's sum.
         convention: Who made the map: a key of `ENVMAP_ROLLS`.
         strict: Refuse NaN, infinite and negative values instead of repairing them.
         notices: One line per repair is appended here.
@@ -196,10 +194,6 @@ def read_envmap(
     path = Path(path)
     if convention not in ENVMAP_ROLLS:
         raise ValueError(f"convention {convention!r} is not one of {', '.join(ENVMAP_ROLLS)}")
-    if not np.isfinite(rotate_deg):
-        raise InputError(
-            "--light-rotate", f"not a number of degrees (found {rotate_deg})", code=ExitCode.USAGE
-        )
     image = _decode(path, ENVMAP_WIDTH_MAX * ENVMAP_WIDTH_MAX // 2, kinds=("exr", "hdr"))
     texels = _upright(image.pixels, image.orientation).astype(np.float32)
     if texels.shape[-1] == 1:
@@ -231,20 +225,8 @@ def read_envmap(
         messages.append(f"{found} repaired: +Inf to the brightest finite value, the others to 0")
     if notices is not None:
         notices += messages
-    columns = width * (ENVMAP_ROLLS[convention] - rotate_deg / 360.0)
-    return _roll_columns(texels, columns)
-
-
-def _roll_columns(texels: FloatArray, columns: float) -> FloatArray:
-    """Move a map to the right by any number of columns, with wrap; each row keeps its sum."""
-    if abs(columns - round(columns)) < 1e-6:  # what 360 degrees in float64 leave behind
-        columns = round(columns)
-    whole = int(np.floor(columns))
-    part = np.float32(columns - whole)
-    moved = np.roll(texels, whole, axis=1)
-    if part > 0.0:
-        moved = (np.float32(1.0) - part) * moved + part * np.roll(texels, whole + 1, axis=1)
-    return np.ascontiguousarray(moved)
+    # Longitude falls with u: rolling to the right by a share of the width is a clockwise turn.
+    return rotate_map(texels, -360.0 * ENVMAP_ROLLS[convention])
 
 
 # ----------------------------------------------------------------------------------- decoding

@@ -91,6 +91,11 @@ def read_inputs(config: InsertConfig) -> Inputs:
         *_split_assumed(camera.notices, assumed),
         *placement.warnings,
     ]
+    if config.width is not None and config.width < camera.width:
+        notices.append(
+            f"a preview: object and shadow are rendered {config.width} px wide and enlarged to the "
+            f"photo's {camera.width} px (--width)"
+        )
     assumed += placement.assumed
     return Inputs(photo, asset, camera, placement, light, tuple(assumed), tuple(notices))
 

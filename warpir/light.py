@@ -123,18 +123,21 @@ def map_directions(height: int, width: int) -> Float64Array:
 
 
 def rotate_map(texels: FloatArray, degrees: float) -> FloatArray:
-    """Turn a map about +Y, counter-clockwise seen from above; energy is kept.
+    """Turn a map about +Y, counter-clockwise seen from above; each row keeps its sum.
+
+    Whole columns are moved exactly.
 
     The map's u falls with longitude (``lon = pi (1 - 2u)``), so content moves to smaller columns.
     """
-    width = texels.shape[1]
-    shift = -(degrees / 360.0) * width
-    whole = int(np.floor(shift))
-    part = np.float32(shift - whole)
-    rolled = np.roll(texels, whole, axis=1)
-    if part == 0.0:
-        return rolled
-    return (rolled * (1.0 - part) + np.roll(rolled, 1, axis=1) * part).astype(np.float32)
+    columns = -(degrees / 360.0) * texels.shape[1]
+    if abs(columns - round(columns)) < 1e-6:  # what 360 degrees in float64 leave behind
+        columns = round(columns)
+    whole = int(np.floor(columns))
+    part = np.float32(columns - whole)
+    moved = np.roll(texels, whole, axis=1)
+    if part > 0.0:
+        moved = (np.float32(1.0) - part) * moved + part * np.roll(texels, whole + 1, axis=1)
+    return np.ascontiguousarray(moved, dtype=np.float32)
 
 
 def axis_from_angles(azimuth_deg: float, elevation_deg: float) -> Float64Array:
