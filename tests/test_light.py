@@ -534,7 +534,9 @@ def test_sun_and_sky_flags_are_taken_as_given() -> None:
 
 def test_sun_below_the_horizon_lights_no_ground() -> None:
     """A set sun adds nothing to what the ground sends back."""
-    light = make_light(inputs_for(0.2), config_for(sun=(0.0, -10.0), exposure=0.0)).light
+    made = make_light(inputs_for(0.2), config_for(sun=(0.0, -10.0), exposure=0.0))
+    assert any("below the horizon" in line for line in made.assumed)
+    light = made.light
     assert light.texels is not None
     expected = 0.25 * np.array(SKIES["clear"][0])
     np.testing.assert_allclose(light.texels[-1, 0], expected, rtol=FLOAT32)

@@ -79,6 +79,8 @@ def _described(config: InsertConfig, assumed: list[str]) -> Light:
     from_sky = np.pi * np.asarray(sky_color)
     lobes = None
     horizontal = from_sky.copy()
+    if sun is not None and sun[1] <= 0.0:
+        assumed.append("a sun below the horizon is meant: it lights from underneath (--sun)")
     if sun is not None:
         strength = sun[2] if len(sun) == 3 else SUN_TO_SKY * float(luminance(from_sky))
         tint = np.asarray(sun_color) / float(luminance(np.asarray(sun_color)))
