@@ -18,7 +18,7 @@ LEVELS = (
     {"inputs", "scene"},
     {"render", "lighting"},
     {"picture"},
-    {"integrator"},
+    {"integrator", "fusion"},
     {"bridge"},
     {"mis", "transport"},
     {"optimize", "fit"},
@@ -33,8 +33,8 @@ UPWARD = {("asset", "gltf"), ("asset", "obj")}
 ONLY_IN = {
     "warp": {"kernels", "scene", "render", "bridge"},
     "torch": {
-        "diffusion", "tone", "bridge", "integrator", "mis", "transport", "optimize", "fit",
-        "stages", "insert", "prior_images",
+        "diffusion", "tone", "bridge", "integrator", "fusion", "mis", "transport", "optimize",
+        "fit", "stages", "insert", "prior_images",
     },
     "trimesh": {"gltf", "obj", "demo"},
     "OpenImageIO": {"files"},
