@@ -259,6 +259,27 @@ def closest_hit(
 
 
 @wp.func
+def camera_hit(
+    camera: CameraArgs,
+    mesh: MeshArgs,
+    material: MaterialArgs,
+    texture: TextureArgs,
+    proxy: ProxyArgs,
+    s: int,
+    key: wp.uint32,
+    ray_dir: wp.vec3,
+) -> Hit:
+    """Find what a pixel's camera sample ``s`` sees of the object; the plane hides what is below.
+
+    ``ray_dir`` is `camera_ray` at ``sobol_pair(s, key, 0)``.
+    """
+    reach = camera_reach(proxy, camera.origin, ray_dir)
+    return closest_hit(
+        mesh, material, texture, camera.origin, ray_dir, reach, 1, hash_pair(key, wp.uint32(s))
+    )
+
+
+@wp.func
 def visibility(
     mesh: MeshArgs,
     material: MaterialArgs,
@@ -443,17 +464,7 @@ def trace_gbuffer(
     emitted = wp.vec3(0.0)
     for s in range(spp):
         ray_dir = camera_ray(camera, pixel, sobol_pair(s, key, 0))
-        reach = camera_reach(proxy, camera.origin, ray_dir)
-        hit = closest_hit(
-            mesh,
-            material,
-            texture,
-            camera.origin,
-            ray_dir,
-            reach,
-            1,
-            hash_pair(key, wp.uint32(s)),
-        )
+        hit = camera_hit(camera, mesh, material, texture, proxy, s, key, ray_dir)
         if hit.valid == 1:
             surface = surface_at(mesh, material, texture, hit, -ray_dir)
             count += 1.0

@@ -27,7 +27,7 @@ from warpir.kernels.path import trace_foreground
 from warpir.kernels.proxy import trace_proxy
 from warpir.kernels.shadow_ratio import shadow_ratio
 from warpir.kernels.trace import trace_gbuffer
-from warpir.kernels.types import CameraArgs, LightArgs
+from warpir.kernels.types import CameraArgs, LightArgs, LightRecord, VertexRecord
 from warpir.light import Light, texel_solid_angles
 from warpir.scene import Scene
 
@@ -46,9 +46,18 @@ UNSEEN_SHADOW = 1e-3
 
 @dataclass(frozen=True)
 class Rows:
-    """An array whose first axis is the launch's; it is cut along with the launch."""
+    """An array whose first axis is the launch's, or a struct of such arrays; cut with the launch."""
 
-    array: wp.array
+    array: Any
+
+    def cut(self, start: int, stop: int) -> Any:
+        """Return the part of rows ``start`` to ``stop``."""
+        if isinstance(self.array, wp.array):
+            return self.array[start:stop]
+        part = type(self.array)()
+        for name in self.array._cls.vars:
+            setattr(part, name, getattr(self.array, name)[start:stop])
+        return part
 
 
 def choose_device(name: str | None) -> str:
@@ -228,7 +237,13 @@ class Renderer:
         self._progress = progress or (lambda stage, share: None)
 
     def launch(
-        self, kernel: wp.Kernel, count: int, args: Sequence[object], work: int, stage: str = ""
+        self,
+        kernel: wp.Kernel,
+        count: int,
+        args: Sequence[object],
+        work: int,
+        stage: str = "",
+        width: int | None = None,
     ) -> None:
         """Run ``kernel`` over ``count`` threads; `Rows` among ``args`` are cut with the launch.
 
@@ -236,21 +251,24 @@ class Renderer:
             kernel: A kernel without backward pass.
             count: Number of Warp threads.
             args: Kernel arguments in order.
-            work: Samples that one thread takes, for sizing the slices.
+            work: Samples that one row of the launch takes, for sizing the slices.
             stage: What to call this in progress reports.
+            width: Threads of each row, for kernels of two indices.
         """
         if count == 0:
             return
         wp.load_module(kernel.module, device=self.device)
         size = count
         if self.device.is_cpu:
-            size = max(16, min(SAMPLES_PER_SLICE // max(work, 1), -(-count // (4 * self.threads))))
+            rows = min(SAMPLES_PER_SLICE // max(work, 1), -(-count // (4 * self.threads)))
+            size = max(16 if width is None else 1, rows)
         starts = range(0, count, size)
 
         def one(start: int) -> None:
             stop = min(start + size, count)
-            cut = [a.array[start:stop] if isinstance(a, Rows) else a for a in args]
-            wp.launch(kernel, dim=stop - start, inputs=cut, device=self.device, record_tape=False)
+            cut = [a.cut(start, stop) if isinstance(a, Rows) else a for a in args]
+            dim = stop - start if width is None else (stop - start, width)
+            wp.launch(kernel, dim=dim, inputs=cut, device=self.device, record_tape=False)
 
         if len(starts) == 1 or self.threads == 1:
             for start in starts:
@@ -339,6 +357,8 @@ class Renderer:
         depth: int,
         seed: int,
         indirect_limit: float = 0.0,
+        light_record: LightRecord | None = None,
+        vertex_record: VertexRecord | None = None,
     ) -> Foreground:
         """Path-trace the object alone (DiPIR, eq. 4).
 
@@ -351,6 +371,8 @@ class Renderer:
             seed: Base seed.
             indirect_limit: Most radiance that one path may add behind its first vertex, or 0: no
                 limit, unbiased.
+            light_record: Filled on the way where given; rows are ``pixels``. Without a limit only.
+            vertex_record: The same.
         """
         scene, count = self.scene, len(pixels)
         radiance, diffuse, emission = (
@@ -374,6 +396,8 @@ class Renderer:
                 indirect_limit,
                 seed,
                 *(Rows(a) for a in (radiance, diffuse, emission, mask)),
+                LightRecord() if light_record is None else Rows(light_record),
+                VertexRecord() if vertex_record is None else Rows(vertex_record),
             ],
             spp * rays,
             "object",
@@ -389,6 +413,7 @@ class Renderer:
         rays: int,
         seed: int,
         camera_args: CameraArgs | None = None,
+        record: LightRecord | None = None,
     ) -> ProxyRadiance:
         """Radiance of a white plane with and without the object (the two halves of DiPIR, eq. 5).
 
@@ -400,6 +425,7 @@ class Renderer:
             rays: Directions per technique and camera sample.
             seed: Base seed.
             camera_args: Another resolution of the view, or the scene's own.
+            record: Filled on the way where given; rows are ``pixels``.
         """
         scene, count = self.scene, len(pixels)
         lit, unoccluded = (
@@ -422,6 +448,7 @@ class Renderer:
                 seed,
                 Rows(lit),
                 Rows(unoccluded),
+                LightRecord() if record is None else Rows(record),
             ],
             spp * rays,
             "shadow",
