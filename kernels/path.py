@@ -1,9 +1,9 @@
 """Path tracing of the object under a light at infinity, ``PathTrace(X, L_fg, D)`` (DiPIR, eq. 4).
 
 Each vertex draws one direction from the light and one from the BRDF and combines them with the
-power heuristic; the BRDF's direction continues the path. `trace_foreground` sums radiance;
-`record_paths` draws the very same paths and writes down what the attached pass in
-`warpir.kernels.shade` evaluates. Detached: no backward pass.
+power heuristic; the BRDF's direction continues the path. `trace_foreground` sums radiance and, if
+asked, writes down what the two adjoints need: `warpir.kernels.light_gradient` for the light,
+`warpir.kernels.shade` for the materials. Detached: no backward pass.
 """
 
 import warp as wp
@@ -26,10 +26,12 @@ from warpir.kernels.trace import (
 from warpir.kernels.types import (
     CameraArgs,
     LightArgs,
+    LightRecord,
     MaterialArgs,
     MeshArgs,
     ProxyArgs,
     TextureArgs,
+    VertexRecord,
 )
 
 wp.set_module_options({"enable_backward": False})
@@ -48,9 +50,15 @@ class Scatter:
     throughput_diffuse: wp.vec3
     """The diffuse lobe's part of it."""
     wi_light: wp.vec3
+    f_light: wp.vec3
+    """BRDF value of the light's direction [1/sr]."""
+    L_light: wp.vec3
+    """Radiance from there."""
     weight_light: float
-    """``cos visible mis / pdf`` of the light's direction, without f."""
+    """``cos visible mis / pdf`` of it, without f."""
     wi_brdf: wp.vec3
+    f_brdf: wp.vec3
+    L_brdf: wp.vec3
     weight_brdf: float
     """The same of the BRDF's direction; 0 when it met the object."""
     weight_next: float
@@ -67,6 +75,7 @@ def scatter(
     surface: Surface,
     wo: wp.vec3,
     is_last: int,
+    keep_dark: int,
     index: int,
     key: wp.uint32,
     vertex: int,
@@ -74,14 +83,19 @@ def scatter(
     """Draw, weigh and trace the two directions of one path vertex.
 
     A direction counts only if it leaves both the shading and the geometric surface. ``is_last``
-    says that nothing behind this vertex can add light, so that any hit will do.
+    says that nothing behind this vertex can add light, so that any hit will do. ``keep_dark`` asks
+    for the weight of directions that bring nothing now: a gradient needs them.
     """
     out = Scatter()
     out.direct = wp.vec3(0.0)
     out.direct_diffuse = wp.vec3(0.0)
     out.throughput = wp.vec3(0.0)
     out.throughput_diffuse = wp.vec3(0.0)
+    out.f_light = wp.vec3(0.0)
+    out.L_light = wp.vec3(0.0)
     out.weight_light = 0.0
+    out.f_brdf = wp.vec3(0.0)
+    out.L_brdf = wp.vec3(0.0)
     out.weight_brdf = 0.0
     out.weight_next = 0.0
     out.next.valid = 0
@@ -96,8 +110,10 @@ def scatter(
     if wi_local[2] > 0.0 and wp.dot(wi, surface.ng) > 0.0 and wo_local[2] > 0.0:
         f = brdf_eval(wo_local, wi_local, surface.base_color, surface.metallic, surface.roughness)
         Li = light_eval(light, wi)
-        unshadowed = wp.cw_mul(f.diffuse + f.specular, Li.radiance)
-        if wp.max(unshadowed) > 0.0 and Li.pdf > 0.0:
+        out.f_light = f.diffuse + f.specular
+        out.L_light = Li.radiance
+        unshadowed = wp.cw_mul(out.f_light, Li.radiance)
+        if Li.pdf > 0.0 and (wp.max(unshadowed) > 0.0 or keep_dark == 1):
             weight = wi_local[2] * power_heuristic(Li.pdf, f.pdf) / Li.pdf
             origin = offset_origin(surface.position, surface.ng, wi, mesh.epsilon)
             weight = weight * visibility(mesh, material, texture, origin, wi)
@@ -129,15 +145,17 @@ def scatter(
                 if out.next.valid == 0:
                     escaped = 1.0
             slope = wi_local[2] / f.pdf
+            out.f_brdf = f.diffuse + f.specular
             if escaped > 0.0:
                 Li = light_eval(light, wi)
                 weight = slope * escaped * power_heuristic(f.pdf, Li.pdf)
+                out.L_brdf = Li.radiance
                 out.weight_brdf = weight
-                out.direct += wp.cw_mul(f.diffuse + f.specular, Li.radiance) * weight
+                out.direct += wp.cw_mul(out.f_brdf, Li.radiance) * weight
                 out.direct_diffuse += wp.cw_mul(f.diffuse, Li.radiance) * weight
             if out.next.valid == 1:
                 out.weight_next = slope
-                out.throughput = (f.diffuse + f.specular) * slope
+                out.throughput = out.f_brdf * slope
                 out.throughput_diffuse = f.diffuse * slope
     return out
 
@@ -149,6 +167,31 @@ def limited(radiance: wp.vec3, limit: float) -> float:
     if limit > 0.0 and largest > limit:
         return limit / largest
     return 1.0
+
+
+@wp.func
+def keep_surface(record: VertexRecord, i: int, j: int, surface: Surface, wo: wp.vec3):
+    """Write down where a path is; what it gathers there is 0 until `keep_event`."""
+    record.material[i, j] = surface.material
+    record.n[i, j] = surface.n
+    record.wo[i, j] = wo
+    record.texture_color[i, j] = surface.texture_color
+    record.texture_metallic[i, j] = surface.texture_metallic
+    record.texture_roughness[i, j] = surface.texture_roughness
+    record.texture_emission[i, j] = surface.texture_emission
+    record.incident_light[i, j] = wp.vec3(0.0)
+    record.incident_brdf[i, j] = wp.vec3(0.0)
+    record.weight_next[i, j] = 0.0
+
+
+@wp.func
+def keep_event(record: VertexRecord, i: int, j: int, event: Scatter):
+    """Write down what a path gathers at a vertex and how it goes on."""
+    record.wi_light[i, j] = event.wi_light
+    record.incident_light[i, j] = event.L_light * event.weight_light
+    record.wi_brdf[i, j] = event.wi_brdf
+    record.incident_brdf[i, j] = event.L_brdf * event.weight_brdf
+    record.weight_next[i, j] = event.weight_next
 
 
 @wp.kernel
@@ -169,6 +212,8 @@ def trace_foreground(
     diffuse: wp.array[wp.vec3],
     emission: wp.array[wp.vec3],
     coverage: wp.array[float],
+    light_record: LightRecord,
+    vertex_record: VertexRecord,
 ):
     """Path-trace the object in each listed pixel; the plane hides it but is not lit.
 
@@ -191,10 +236,18 @@ def trace_foreground(
         diffuse: The part of it that the first hit's diffuse lobe reflects, shape [object_pixel].
         emission: The part of it that the first hit emits, shape [object_pixel].
         coverage: Share of samples that see the object, shape [object_pixel].
+        light_record: Output: the weight of each direction that saw the light, or without arrays.
+        vertex_record: Output: every vertex; ``material`` must come filled with -1. Or without
+            arrays.
     """
     i = wp.tid()
     pixel = pixels[i]
     key = pixel_seed(seed, pixel)
+    scale = 1.0 / float(spp * rays)
+    keep_dark = int(0)
+    if light_record.wi.shape[1] > 0 or vertex_record.material.shape[1] > 0:
+        keep_dark = 1
+    entries = int(0)
     radiance = wp.vec3(0.0)
     radiance_diffuse = wp.vec3(0.0)
     radiance_emission = wp.vec3(0.0)
@@ -239,11 +292,28 @@ def trace_foreground(
             throughput_diffuse = wp.vec3(0.0)
             radiance += surface.emission
             radiance_emission += surface.emission
+            if vertex_record.material.shape[1] > 0:
+                keep_surface(vertex_record, i, index, surface, wo)
 
         is_last = int(0)
         if k == depth - 1 and material.any_emission == 0:
             is_last = 1
-        event = scatter(mesh, material, texture, light, surface, wo, is_last, index, key, k)
+        event = scatter(
+            mesh, material, texture, light, surface, wo, is_last, keep_dark, index, key, k
+        )
+        if vertex_record.material.shape[1] > 0:
+            keep_event(vertex_record, i, k * spp * rays + index, event)
+        if light_record.wi.shape[1] > 0:
+            if event.weight_light > 0.0:
+                light_record.wi[i, entries] = event.wi_light
+                gain = wp.cw_mul(throughput, event.f_light)
+                light_record.weight[i, entries] = gain * (event.weight_light * scale)
+                entries += 1
+            if event.weight_brdf > 0.0:
+                light_record.wi[i, entries] = event.wi_brdf
+                gain = wp.cw_mul(throughput, event.f_brdf)
+                light_record.weight[i, entries] = gain * (event.weight_brdf * scale)
+                entries += 1
         if k == 0:
             radiance += event.direct
             radiance_diffuse += event.direct_diffuse
@@ -262,95 +332,16 @@ def trace_foreground(
             surface = surface_at(mesh, material, texture, event.next, wo)
             radiance += wp.cw_mul(throughput, surface.emission)
             radiance_diffuse += wp.cw_mul(throughput_diffuse, surface.emission)
+            if vertex_record.material.shape[1] > 0:
+                keep_surface(vertex_record, i, k * spp * rays + index, surface, wo)
         if k == depth:
             alive = 0
         if alive == 0:
             index += 1
 
-    scale = 1.0 / float(spp * rays)
+    if light_record.wi.shape[1] > 0:
+        light_record.count[i] = entries
     foreground[i] = radiance * scale
     diffuse[i] = radiance_diffuse * scale
     emission[i] = radiance_emission * scale
     coverage[i] = count / float(spp)
-
-
-@wp.struct
-class PathRecord:
-    """What the attached pass needs of each path vertex; arrays of shape [depth + 1, path]."""
-
-    material: wp.array2d[int]
-    """Material index, or -1 where the path has ended."""
-    n: wp.array2d[wp.vec3]
-    wo: wp.array2d[wp.vec3]
-    wi_light: wp.array2d[wp.vec3]
-    weight_light: wp.array2d[float]
-    wi_brdf: wp.array2d[wp.vec3]
-    weight_brdf: wp.array2d[float]
-    weight_next: wp.array2d[float]
-    texture_color: wp.array2d[wp.vec3]
-    texture_metallic: wp.array2d[float]
-    texture_roughness: wp.array2d[float]
-    texture_emission: wp.array2d[wp.vec3]
-
-
-@wp.kernel
-def record_paths(
-    pixels: wp.array[int],
-    camera: CameraArgs,
-    mesh: MeshArgs,
-    material: MaterialArgs,
-    texture: TextureArgs,
-    proxy: ProxyArgs,
-    light: LightArgs,
-    spp: int,
-    rays: int,
-    depth: int,
-    seed: int,
-    record: PathRecord,
-):
-    """Draw the paths of `trace_foreground` again and write down their vertices.
-
-    One thread a path: ``path = (pixel * spp + s) * rays + r``.
-    """
-    path = wp.tid()
-    r = path % rays
-    s = (path // rays) % spp
-    pixel = pixels[path // (rays * spp)]
-    key = pixel_seed(seed, pixel)
-    for k in range(depth + 1):
-        record.material[k, path] = -1
-    ray_dir = camera_ray(camera, pixel, sobol_pair(s, key, 0))
-    reach = camera_reach(proxy, camera.origin, ray_dir)
-    hit = closest_hit(
-        mesh, material, texture, camera.origin, ray_dir, reach, 1, hash_pair(key, wp.uint32(s))
-    )
-    wo = -ray_dir
-    for k in range(depth + 1):
-        if hit.valid == 0:
-            break
-        surface = surface_at(mesh, material, texture, hit, wo)
-        record.material[k, path] = surface.material
-        record.n[k, path] = surface.n
-        record.wo[k, path] = wo
-        record.texture_color[k, path] = surface.texture_color
-        record.texture_metallic[k, path] = surface.texture_metallic
-        record.texture_roughness[k, path] = surface.texture_roughness
-        record.texture_emission[k, path] = surface.texture_emission
-        record.weight_light[k, path] = 0.0
-        record.weight_brdf[k, path] = 0.0
-        record.weight_next[k, path] = 0.0
-        hit.valid = 0
-        if k < depth:
-            is_last = int(0)
-            if k == depth - 1 and material.any_emission == 0:
-                is_last = 1
-            event = scatter(
-                mesh, material, texture, light, surface, wo, is_last, s * rays + r, key, k
-            )
-            record.wi_light[k, path] = event.wi_light
-            record.weight_light[k, path] = event.weight_light
-            record.wi_brdf[k, path] = event.wi_brdf
-            record.weight_brdf[k, path] = event.weight_brdf
-            record.weight_next[k, path] = event.weight_next
-            wo = -event.wi_brdf
-            hit = event.next

@@ -24,6 +24,7 @@ from warpir.kernels.trace import (
 from warpir.kernels.types import (
     CameraArgs,
     LightArgs,
+    LightRecord,
     MaterialArgs,
     MeshArgs,
     ProxyArgs,
@@ -57,10 +58,14 @@ def proxy_sample(
     proxy: ProxyArgs,
     light: LightArgs,
     position: wp.vec3,
+    keep_dark: int,
     index: int,
     key: wp.uint32,
 ) -> ProxySample:
-    """Draw one direction from the light and one from the cosine, and trace both."""
+    """Draw one direction from the light and one from the cosine, and trace both.
+
+    ``keep_dark`` asks for directions that bring no light now, too: a gradient needs them.
+    """
     out = ProxySample()
     out.weight_light = 0.0
     out.visible_light = 1.0
@@ -73,7 +78,7 @@ def proxy_sample(
     out.wi_light = wi
     if cos_i > 0.0:
         Li = light_eval(light, wi)
-        if Li.pdf > 0.0 and wp.max(Li.radiance) > 0.0:
+        if Li.pdf > 0.0 and (wp.max(Li.radiance) > 0.0 or keep_dark == 1):
             pdf = cos_i * INV_PI
             out.weight_light = pdf * power_heuristic(Li.pdf, pdf) / Li.pdf
             out.radiance_light = Li.radiance
@@ -83,7 +88,7 @@ def proxy_sample(
     out.wi_cosine = wi
     if cos_i > 0.0:
         Li = light_eval(light, wi)
-        if wp.max(Li.radiance) > 0.0:
+        if wp.max(Li.radiance) > 0.0 or keep_dark == 1:
             out.weight_cosine = power_heuristic(cos_i * INV_PI, Li.pdf)
             out.radiance_cosine = Li.radiance
             out.visible_cosine = visibility(mesh, material, texture, origin, wi)
@@ -120,6 +125,12 @@ def proxy_point(
     return wp.vec4(p[0], p[1], p[2], 1.0)
 
 
+@wp.func
+def plane_weight(weight: float, visible: float) -> wp.vec3:
+    """Return what a direction adds to ``lit`` and to ``unoccluded``."""
+    return wp.vec3(weight * visible, weight, 0.0)
+
+
 @wp.kernel
 def trace_proxy(
     pixels: wp.array[int],
@@ -135,6 +146,7 @@ def trace_proxy(
     seed: int,
     lit: wp.array[wp.vec3],
     unoccluded: wp.array[wp.vec3],
+    record: LightRecord,
 ):
     """Sum the radiance of a white plane with and without the object in each listed pixel.
 
@@ -152,8 +164,13 @@ def trace_proxy(
         seed: Base seed.
         lit: Mean radiance with the object over the samples that see the plane.
         unoccluded: The same without the object.
+        record: Output: the weights of each direction in both, or without arrays.
     """
     i = wp.tid()
+    keep_dark = int(0)
+    if record.wi.shape[1] > 0:
+        keep_dark = 1
+    entries = int(0)
     pixel = pixels[i]
     key = pixel_seed(seed, pixel)
     sum_lit = wp.vec3(0.0)
@@ -167,74 +184,26 @@ def trace_proxy(
             count += 1.0
             p = wp.vec3(point[0], point[1], point[2])
             for r in range(rays):
-                x = proxy_sample(mesh, material, texture, proxy, light, p, s * rays + r, key)
+                x = proxy_sample(
+                    mesh, material, texture, proxy, light, p, keep_dark, s * rays + r, key
+                )
                 from_light = x.radiance_light * x.weight_light
                 from_cosine = x.radiance_cosine * x.weight_cosine
                 sum_all += from_light + from_cosine
                 sum_lit += from_light * x.visible_light + from_cosine * x.visible_cosine
+                if keep_dark == 1:
+                    if x.weight_light > 0.0:
+                        record.wi[i, entries] = x.wi_light
+                        record.weight[i, entries] = plane_weight(x.weight_light, x.visible_light)
+                        entries += 1
+                    if x.weight_cosine > 0.0:
+                        record.wi[i, entries] = x.wi_cosine
+                        record.weight[i, entries] = plane_weight(x.weight_cosine, x.visible_cosine)
+                        entries += 1
     scale = 1.0 / wp.max(count * float(rays), 1.0)
     lit[i] = sum_lit * scale
     unoccluded[i] = sum_all * scale
-
-
-@wp.struct
-class ProxyRecord:
-    """What the attached pass needs of each plane sample; arrays of shape [2, sample].
-
-    Row 0 holds the light's directions, row 1 the cosine's; a sample is number
-    ``(pixel * spp + s) * rays + r``.
-    """
-
-    wi: wp.array2d[wp.vec3]
-    weight: wp.array2d[float]
-    """``cos / pi * mis / pdf`` over the pixel's sample count."""
-    visible: wp.array2d[float]
-
-
-@wp.kernel
-def record_proxy(
-    pixels: wp.array[int],
-    may_see_object: wp.array[int],
-    camera: CameraArgs,
-    mesh: MeshArgs,
-    material: MaterialArgs,
-    texture: TextureArgs,
-    proxy: ProxyArgs,
-    light: LightArgs,
-    spp: int,
-    rays: int,
-    seed: int,
-    record: ProxyRecord,
-):
-    """Draw the directions of `trace_proxy` again and write them down; one thread a pixel."""
-    i = wp.tid()
-    pixel = pixels[i]
-    key = pixel_seed(seed, pixel)
-    count = float(0.0)
-    for s in range(spp):
-        point = proxy_point(
-            camera, mesh, material, texture, proxy, pixel, may_see_object[i], s, key
-        )
-        p = wp.vec3(point[0], point[1], point[2])
-        for r in range(rays):
-            path = (i * spp + s) * rays + r
-            if point[3] > 0.0:
-                x = proxy_sample(mesh, material, texture, proxy, light, p, s * rays + r, key)
-                record.wi[0, path] = x.wi_light
-                record.weight[0, path] = x.weight_light
-                record.visible[0, path] = x.visible_light
-                record.wi[1, path] = x.wi_cosine
-                record.weight[1, path] = x.weight_cosine
-                record.visible[1, path] = x.visible_cosine
-            else:
-                record.wi[0, path] = proxy.normal
-                record.weight[0, path] = 0.0
-                record.visible[0, path] = 1.0
-                record.wi[1, path] = proxy.normal
-                record.weight[1, path] = 0.0
-                record.visible[1, path] = 1.0
-        count += point[3]
-    scale = 1.0 / wp.max(count * float(rays), 1.0)
-    for path in range(i * spp * rays, (i + 1) * spp * rays):
-        record.weight[0, path] = record.weight[0, path] * scale
-        record.weight[1, path] = record.weight[1, path] * scale
+    if keep_dark == 1:
+        record.count[i] = entries
+        for j in range(entries):
+            record.weight[i, j] = record.weight[i, j] * scale

@@ -1,4 +1,4 @@
-"""Structs that carry the scene into kernels; none of their fields is ever differentiated."""
+"""Structs that carry the scene into kernels and samples out of them; no field is differentiated."""
 
 import warp as wp
 
@@ -130,3 +130,46 @@ class LightArgs:
     """Shape [He + 1]."""
     column_cdf: wp.array2d[float]
     """Shape [He, We + 1]."""
+
+
+@wp.struct
+class LightRecord:
+    """How each pixel depends on the light: ``radiance = sum_j weight[j] * L(wi[j])``.
+
+    Rows are pixels; the first ``count`` entries of a row are filled. Without arrays nothing is
+    recorded.
+    """
+
+    count: wp.array[int]
+    """Shape [pixel]."""
+    wi: wp.array2d[wp.vec3]
+    """Directions that saw the light, world frame, shape [pixel, capacity]."""
+    weight: wp.array2d[wp.vec3]
+    """Of the object: RGB. Of the plane: (lit, unoccluded, 0). Shape [pixel, capacity]."""
+
+
+@wp.struct
+class VertexRecord:
+    """The vertices of a pixel's paths as the attached pass needs them; the light is a constant.
+
+    Rows are pixels; vertex k of path p is at ``k * path_count + p`` of ``depth + 1`` times
+    ``path_count``. Without arrays nothing is recorded.
+    """
+
+    material: wp.array2d[int]
+    """Material index, or -1 where the path has ended."""
+    n: wp.array2d[wp.vec3]
+    """Shading normal, world frame; so are the directions."""
+    wo: wp.array2d[wp.vec3]
+    texture_color: wp.array2d[wp.vec3]
+    texture_metallic: wp.array2d[float]
+    texture_roughness: wp.array2d[float]
+    texture_emission: wp.array2d[wp.vec3]
+    wi_light: wp.array2d[wp.vec3]
+    incident_light: wp.array2d[wp.vec3]
+    """``L cos visible mis / pdf`` of the light's direction, without f."""
+    wi_brdf: wp.array2d[wp.vec3]
+    incident_brdf: wp.array2d[wp.vec3]
+    """The same of the BRDF's direction; 0 when it met the object."""
+    weight_next: wp.array2d[float]
+    """``cos / pdf`` of the BRDF's direction when it met the object, else 0."""

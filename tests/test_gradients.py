@@ -1,35 +1,41 @@
 """The gradient that an optimiser reads, over the whole pipeline, against central differences."""
 
 from dataclasses import dataclass
+from functools import cached_property
+from typing import Any
 
 import numpy as np
 import pytest
 import torch
 import trimesh
+import warp as wp
+from numpy.typing import NDArray
 from torch import Tensor
 from torch.func import functional_call
 
+from tests import oracles
 from tests.conftest import devices
 from tests.statistics import compare_gradients
 from warpir.asset import Asset, Material, Primitive
 from warpir.bridge import (
     ComposeConstants,
-    Leaves,
+    ObjectSamples,
+    PlaneSamples,
+    SceneMaterials,
     compose,
-    foreground_leaves,
     host_light,
-    light_leaves,
     rasterize,
-    replay_foreground,
-    replay_proxy,
-    scene_materials,
 )
 from warpir.camera import Camera
 from warpir.integrator import LightTensors, MaterialTensors, Radiance
+from warpir.kernels.shade import shade_vertex
+from warpir.kernels.types import LightRecord, VertexRecord
 from warpir.mis import MisIntegrator
 from warpir.render import Renderer, light_args
 from warpir.scene import Placed, Proxy, Scene
 from warpir.tone import ToneCurve
+
+Float64Array = NDArray[np.float64]
 
 WIDTH, HEIGHT = 48, 32
 SEED = 3
@@ -101,34 +107,94 @@ class Pipeline:
         light = self.light(raw)
         return self.loss(raw, self.mis.radiance(light, light, SEED, self.materials(raw)))
 
-    def pinned(self, raw: dict[str, Tensor]) -> float:
-        """The loss at ``raw`` with the samples that were drawn at ``self.raw``."""
+    @cached_property
+    def samples(self) -> tuple[ObjectSamples, PlaneSamples]:
+        """What is drawn at `raw`."""
         with torch.no_grad():
-            drawn = self.light(self.raw)
-            args = light_args(host_light(drawn), self.mis.renderer.device)
-            at, light = self.materials(raw), self.light(raw)
-            tensors = (light.amplitude, light.axis, light.sharpness, light.texels)
-            factors = (at.base_color, at.metallic, at.roughness, at.emission)
-            leaves = foreground_leaves(self.mis, args, (*tensors, *factors))
-            own = self.materials(self.raw)
-            with scene_materials(
-                self.mis.renderer, (own.base_color, own.metallic, own.roughness, own.emission)
-            ):
-                foreground = [
-                    r.numpy().copy()
-                    for _, _, r in replay_foreground(self.mis, args, SEED, leaves.arrays)
-                ]
-            plane = Leaves(light_leaves(tensors, args), self.mis.renderer.device)
-            halves = [
-                (lit.numpy().copy(), unoccluded.numpy().copy())
-                for _, _, lit, unoccluded in replay_proxy(self.mis, args, SEED, plane.arrays)
-            ]
-            radiance = Radiance(
-                torch.from_numpy(np.concatenate(foreground)),
-                torch.from_numpy(np.concatenate([lit for lit, _ in halves])),
-                torch.from_numpy(np.concatenate([u for _, u in halves])),
+            args = light_args(host_light(self.light(self.raw)), self.mis.renderer.device)
+            at = self.materials(self.raw)
+            materials = SceneMaterials(
+                self.mis.renderer, (at.base_color, at.metallic, at.roughness, at.emission)
             )
-            return float(self.loss(raw, radiance))
+            of_object = ObjectSamples(self.mis, args, SEED, materials, True, True)
+            return of_object, PlaneSamples(self.mis, args, SEED, True)
+
+    @cached_property
+    def drawn(self) -> tuple[Any, Any]:
+        """Radiance and records of `samples`."""
+        of_object, of_plane = self.samples
+        return of_object.draw(slice(None)), of_plane.draw(slice(None))
+
+    def pinned(self, raw: dict[str, Tensor]) -> float:
+        """The loss at ``raw`` with the samples that were drawn at `raw` of this pipeline.
+
+        Either the light or the materials may have moved, since each record holds the other fixed.
+        """
+        (radiance, light_record, vertex_record), (_, plane_record) = self.drawn
+        light, before = (incident(light_record, self.light(at)) for at in (raw, self.raw))
+        moved = pixel_sums(light_record, light) - pixel_sums(light_record, before)
+        of_object = self.samples[0]
+        with torch.no_grad():
+            factors = self.materials(raw)
+            arrays = SceneMaterials(
+                self.mis.renderer,
+                (factors.base_color, factors.metallic, factors.roughness, factors.emission),
+            ).arrays
+            shaded = shade_vertices(of_object, vertex_record, arrays)
+        assert not moved.any() or np.allclose(shaded, radiance, rtol=1e-5, atol=1e-6)
+        Li = incident(plane_record, self.light(raw))
+        lit, unoccluded = (pixel_sums(plane_record, Li, column=column) for column in (0, 1))
+        halves = (torch.from_numpy(a.astype(np.float32)) for a in (shaded + moved, lit, unoccluded))
+        with torch.no_grad():
+            return float(self.loss(raw, Radiance(*halves)))
+
+
+def incident(record: LightRecord, light: LightTensors) -> Float64Array:
+    """Radiance from each recorded direction, 0 behind the last, shape [pixel, capacity, 3]."""
+    wi = record.wi.numpy().astype(np.float64)
+    used = np.arange(wi.shape[1]) < record.count.numpy()[:, None]
+    out = np.zeros(wi.shape)
+    lobes = (light.amplitude, light.axis, light.sharpness)
+    amplitude, axis, sharpness = (t.detach().double().numpy() for t in lobes if t is not None)
+    assert light.texels is not None
+    # As the kernel, also where the axis is not of unit length
+    distance = ((wi[used][:, None] - axis) ** 2).sum(axis=-1)
+    out[used] = np.exp(-0.5 * sharpness * distance) @ amplitude
+    uv = oracles.latlong_uv(wi[used])
+    out[used] += oracles.bilinear_lookup(light.texels.detach().double().numpy(), uv)
+    return out
+
+
+def pixel_sums(
+    record: LightRecord, Li: Float64Array, column: int | slice = slice(None)
+) -> Float64Array:
+    """Pixels under incident radiance ``Li``, shape [pixel, 3]; weights are in ``column``."""
+    used = np.arange(Li.shape[1]) < record.count.numpy()[:, None]
+    weight = np.where(used[..., None], record.weight.numpy(), 0.0).astype(np.float64)
+    weight = weight[..., column, None] if isinstance(column, int) else weight
+    return np.asarray((weight * Li).sum(axis=1))
+
+
+def shade_vertices(
+    samples: ObjectSamples, record: VertexRecord, factors: list[wp.array]
+) -> Float64Array:
+    """The object's pixels by the attached kernel, shape [pixel, 3]."""
+    pixels, device = record.material.shape[0], samples.mis.renderer.device
+    paths = pixels * samples.path_count
+    throughput = wp.full(paths, wp.vec3(1.0), dtype=wp.vec3, device=device)
+    total = np.zeros((paths, 3))
+    for k in range(samples.mis.depth + 1):
+        contribution, onward = (wp.empty(paths, dtype=wp.vec3, device=device) for _ in range(2))
+        wp.launch(
+            shade_vertex,
+            dim=paths,
+            inputs=[record, samples.path_count, k, *factors, throughput],
+            outputs=[contribution, onward],
+            device=device,
+        )
+        total += contribution.numpy()
+        throughput = onward
+    return np.asarray(total.reshape(pixels, samples.path_count, 3).mean(axis=1))
 
 
 @pytest.fixture(

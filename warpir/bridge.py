@@ -6,33 +6,41 @@ Tensors are detached before Warp sees them and gradients are read from arrays of
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import torch
 import warp as wp
+from numpy.typing import NDArray
 from torch import Tensor
 
 from warpir.integrator import LightTensors
 from warpir.kernels import composite as composite_kernels
+from warpir.kernels import light_gradient as light_kernels
 from warpir.kernels import shade as shade_kernels
-from warpir.kernels.path import PathRecord, record_paths
-from warpir.kernels.proxy import ProxyRecord, record_proxy
 from warpir.kernels.rasterize import rasterize as rasterize_kernel
 from warpir.kernels.shadow_ratio import shadow_ratio as ratio_kernel
-from warpir.kernels.types import LightArgs, MaterialArgs
+from warpir.kernels.types import LightArgs, LightRecord, MaterialArgs, VertexRecord
 from warpir.light import Light, Lobes
-from warpir.render import Renderer, index_of
+from warpir.render import SAMPLES_PER_SLICE, ProxyRadiance, Renderer, Rows, index_of
 from warpir.tone import Knots
 
 if TYPE_CHECKING:
     from warpir.mis import IntArray, MisIntegrator
 
-CHUNK_BYTES = 256 << 20
-"""Memory that recorded samples may take at once."""
-BYTES_PER_VERTEX = 150
-BYTES_PER_DIRECTION = 20
+FloatArray = NDArray[np.float32]
+Gradients = list[NDArray[np.float64] | None]
+"""Sums of loss gradients, one for each input of a shading pass; None where none is asked for."""
+
+RECORD_BYTES = 1 << 30
+"""Memory that the recorded samples of one call may take; beyond it they are drawn again, in parts.
+What is not filled is not touched: about a tenth of it on a convex object at five interactions."""
+ENTRY_BYTES = 24
+VERTEX_BYTES = 112
+LOBE_BLOCK = 4096
+"""Directions that one thread of `lobe_gradient` adds up; on the CPU they stay in its cache."""
+PART_COUNT = 16
+"""Private gradients of texels and materials; fixed, so that sums do not depend on threads."""
 
 
 def _from_torch(tensor: Tensor, dtype: Any, device: wp.Device, grad: bool = False) -> wp.array:
@@ -68,58 +76,80 @@ def host_light(light: LightTensors) -> Light:
     return Light(lobes, plain(light.texels) if light.texels is not None else None)
 
 
-class Leaves:
-    """The differentiable inputs of a shading pass as Warp arrays, and their gradients as tensors.
+def _new_light_record(pixels: int, capacity: int, device: wp.Device) -> LightRecord:
+    record = LightRecord()
+    record.count = wp.zeros(pixels, dtype=wp.int32, device=device)
+    record.wi = wp.empty((pixels, capacity), dtype=wp.vec3, device=device)
+    record.weight = wp.empty((pixels, capacity), dtype=wp.vec3, device=device)
+    return record
 
-    ``tensors`` holds (tensor or None, dtype, fallback array); an absent tensor is a constant.
+
+def _new_vertex_record(pixels: int, capacity: int, device: wp.Device) -> VertexRecord:
+    record = VertexRecord()
+    vectors = (
+        "n", "wo", "texture_color", "texture_emission",
+        "wi_light", "incident_light", "wi_brdf", "incident_brdf",
+    )  # fmt: skip
+    for name in vectors:
+        setattr(record, name, wp.empty((pixels, capacity), dtype=wp.vec3, device=device))
+    for name in ("texture_metallic", "texture_roughness", "weight_next"):
+        setattr(record, name, wp.empty((pixels, capacity), dtype=wp.float32, device=device))
+    record.material = wp.full((pixels, capacity), -1, dtype=wp.int32, device=device)
+    return record
+
+
+def _parts(count: int, bytes_per_row: int) -> list[slice]:
+    """Cut rows so that each part's record fits; one part where all fit."""
+    size = max(1, RECORD_BYTES // max(bytes_per_row, 1))
+    return [slice(start, min(start + size, count)) for start in range(0, count, size)]
+
+
+class ObjectSamples:
+    """The object's samples at one light, material and seed, written down while they are traced.
+
+    Args:
+        mis: The integrator.
+        args: The light that samples are drawn from, and whose radiance they carry.
+        seed: Base seed.
+        materials: Factors that replace the scene's.
+        of_light: Whether to record what the light's gradient needs.
+        of_materials: Whether to record what the materials' gradient needs.
     """
 
     def __init__(
-        self, tensors: list[tuple[Tensor | None, Any, wp.array]], device: wp.Device
+        self,
+        mis: MisIntegrator,
+        args: LightArgs,
+        seed: int,
+        materials: SceneMaterials,
+        of_light: bool,
+        of_materials: bool,
     ) -> None:
-        self.tensors = [t for t, _, _ in tensors]
-        self.arrays = [
-            fallback if t is None else _from_torch(t, dtype, device, grad=True)
-            for t, dtype, fallback in tensors
-        ]
+        self.mis, self.args, self.seed, self.materials = mis, args, seed, materials
+        self.path_count = mis.spp * mis.rays
+        self.entries = 2 * self.path_count * mis.depth if of_light else 0
+        self.vertices = self.path_count * (mis.depth + 1) if of_materials else 0
+        row_bytes = ENTRY_BYTES * self.entries + VERTEX_BYTES * self.vertices
+        self.parts = _parts(len(mis.object_pixels), row_bytes)
 
-    def gradients(self) -> tuple[Tensor | None, ...]:
-        """Return what the tapes have added up, in the tensors' shapes."""
-        return tuple(
-            None if t is None else _to_torch(a.grad, t).reshape(t.shape)
-            for t, a in zip(self.tensors, self.arrays, strict=True)
-        )
-
-
-def light_leaves(
-    tensors: tuple[Tensor | None, ...], args: LightArgs
-) -> list[tuple[Tensor | None, Any, wp.array]]:
-    """Return the light's four inputs with their types; what is absent stays a constant."""
-    amplitude, axis, sharpness, texels = tensors
-    return [
-        (amplitude, wp.vec3, args.amplitude),
-        (axis, wp.vec3, args.axis),
-        (sharpness, wp.float32, args.sharpness),
-        (texels, wp.vec3, args.texels),
-    ]
-
-
-def _path_record(vertices: int, paths: int, device: wp.Device) -> PathRecord:
-    record = PathRecord()
-    vectors = ("n", "wo", "wi_light", "wi_brdf", "texture_color", "texture_emission")
-    scalars = (
-        "weight_light",
-        "weight_brdf",
-        "weight_next",
-        "texture_metallic",
-        "texture_roughness",
-    )
-    record.material = wp.zeros((vertices, paths), dtype=wp.int32, device=device)
-    for name in vectors:
-        setattr(record, name, wp.zeros((vertices, paths), dtype=wp.vec3, device=device))
-    for name in scalars:
-        setattr(record, name, wp.zeros((vertices, paths), dtype=float, device=device))
-    return record
+    def draw(self, rows: slice) -> tuple[FloatArray, LightRecord | None, VertexRecord | None]:
+        """Trace the paths of some object pixels: radiance [pixel, 3] and the records asked for."""
+        mis, device = self.mis, self.mis.renderer.device
+        pixels = mis.object_pixels[rows]
+        light = _new_light_record(len(pixels), self.entries, device) if self.entries else None
+        vertex = _new_vertex_record(len(pixels), self.vertices, device) if self.vertices else None
+        with self.materials:
+            out = mis.renderer.foreground(
+                self.args,
+                pixels,
+                mis.spp,
+                mis.rays,
+                mis.depth,
+                self.seed,
+                light_record=light,
+                vertex_record=vertex,
+            )
+        return out.radiance, light, vertex
 
 
 class ShadeForeground(torch.autograd.Function):
@@ -127,138 +157,46 @@ class ShadeForeground(torch.autograd.Function):
 
     @staticmethod
     def forward(
-        ctx: Any, mis: MisIntegrator, args: LightArgs, seed: int, *tensors: Tensor | None
+        ctx: Any,
+        mis: MisIntegrator,
+        args: LightArgs,
+        seed: int,
+        is_recording: bool,
+        *tensors: Tensor | None,
     ) -> Tensor:
         """Render with the detached kernels; materials given as tensors replace the scene's."""
-        ctx.mis, ctx.args, ctx.seed = mis, args, seed
-        ctx.tensors = tensors
-        with scene_materials(mis.renderer, tensors[4:]):
-            out = mis.renderer.foreground(
-                args, mis.object_pixels, mis.spp, mis.rays, mis.depth, seed
-            )
-        return torch.from_numpy(out.radiance).to(_device_of(tensors))
+        ctx.like = tensors
+        free = ctx.needs_input_grad[4:] if is_recording else (False,) * len(tensors)
+        materials = SceneMaterials(mis.renderer, tensors[4:])
+        ctx.samples = ObjectSamples(mis, args, seed, materials, any(free[:4]), any(free[4:]))
+        ctx.drawn = None
+        if len(ctx.samples.parts) == 1:
+            ctx.drawn = ctx.samples.draw(ctx.samples.parts[0])
+            radiance = ctx.drawn[0]
+        else:
+            radiance = ObjectSamples(mis, args, seed, materials, False, False).draw(slice(None))[0]
+        return torch.from_numpy(radiance).to(_device_of(tensors))
 
     @staticmethod
     def backward(ctx: Any, *d_outputs: Tensor) -> tuple[Tensor | None, ...]:
-        """Replay the samples chunk by chunk and differentiate the attached kernels."""
-        mis: MisIntegrator = ctx.mis
-        device = mis.renderer.device
-        with scene_materials(mis.renderer, ctx.tensors[4:]):
-            leaves = foreground_leaves(mis, ctx.args, ctx.tensors)
-            for rows, tape, radiance in replay_foreground(mis, ctx.args, ctx.seed, leaves.arrays):
-                tape.backward(grads={radiance: _from_torch(d_outputs[0][rows], wp.vec3, device)})
-        return (None, None, None, *leaves.gradients())
-
-
-def foreground_leaves(
-    mis: MisIntegrator, args: LightArgs, tensors: tuple[Tensor | None, ...]
-) -> Leaves:
-    """Return the inputs of the object's attached pass: four of the light, four of the materials."""
-    material = mis.renderer.scene.material_args
-    return Leaves(
-        [
-            *light_leaves(tensors[:4], args),
-            (tensors[4], wp.vec3, material.base_color),
-            (tensors[5], wp.float32, material.metallic),
-            (tensors[6], wp.float32, material.roughness),
-            (tensors[7], wp.vec3, material.emission),
-        ],
-        mis.renderer.device,
-    )
-
-
-def replay_foreground(
-    mis: MisIntegrator, args: LightArgs, seed: int, arrays: list[wp.array]
-) -> Iterator[tuple[slice, wp.Tape, wp.array]]:
-    """Draw the object's samples again and evaluate the attached kernels over them.
-
-    Samples, densities and visibility are those of ``args`` and the scene's materials; radiance is
-    evaluated at ``arrays``, which need not hold the same values: then it is a pinned-sample render.
-
-    Args:
-        mis: The integrator.
-        args: The light that the samples are drawn from.
-        seed: Base seed.
-        arrays: From `foreground_leaves`.
-
-    Yields:
-        The rows of ``object_pixels``, the tape, and their radiance [object_pixel].
-    """
-    device = mis.renderer.device
-    amplitude, axis, sharpness, texels, *factors = arrays
-    per_pixel = mis.spp * mis.rays
-    vertices = mis.depth + 1
-    size = max(1, CHUNK_BYTES // (BYTES_PER_VERTEX * vertices * per_pixel))
-    for start in range(0, len(mis.object_pixels), size):
-        pixels = mis.object_pixels[start : start + size]
-        paths = len(pixels) * per_pixel
-        record = _path_record(vertices, paths, device)
-        _record_foreground(mis, args, seed, pixels, record)
-        tape = wp.Tape()
-        radiance = wp.zeros(len(pixels), dtype=wp.vec3, device=device, requires_grad=True)
-        with tape:
-            throughput = wp.full(
-                paths, wp.vec3(1.0), dtype=wp.vec3, device=device, requires_grad=True
-            )
-            for k in range(vertices):
-                gathered, onward = (
-                    wp.zeros(paths, dtype=wp.vec3, device=device, requires_grad=True)
-                    for _ in range(2)
-                )
-                wp.launch(
-                    shade_kernels.shade_vertex,
-                    dim=paths,
-                    inputs=[
-                        record,
-                        k,
-                        *factors,
-                        amplitude,
-                        axis,
-                        sharpness,
-                        args.lobe_count,
-                        texels,
-                        args.map_height,
-                        args.map_width,
-                        throughput,
-                    ],
-                    outputs=[gathered, onward],
-                    device=device,
-                )
-                wp.launch(
-                    shade_kernels.sum_paths,
-                    dim=len(pixels),
-                    inputs=[gathered, per_pixel, 1.0 / per_pixel],
-                    outputs=[radiance],
-                    device=device,
-                )
-                throughput = onward
-        yield slice(start, start + len(pixels)), tape, radiance
-
-
-def _record_foreground(
-    mis: MisIntegrator, args: LightArgs, seed: int, pixels: IntArray, record: PathRecord
-) -> None:
-    scene = mis.renderer.scene
-    wp.launch(
-        record_paths,
-        dim=len(pixels) * mis.spp * mis.rays,
-        inputs=[
-            wp.array(pixels, dtype=wp.int32, device=scene.device),
-            scene.camera_args,
-            scene.mesh_args,
-            scene.material_args,
-            scene.texture_args,
-            scene.proxy_args,
-            args,
-            mis.spp,
-            mis.rays,
-            mis.depth,
-            seed,
-            record,
-        ],
-        device=scene.device,
-        record_tape=False,
-    )
+        """Go through the recorded samples, which are drawn again if they did not fit."""
+        samples: ObjectSamples = ctx.samples
+        renderer = samples.mis.renderer
+        free = ctx.needs_input_grad[4:]
+        total: Gradients = [None] * 8
+        for rows in samples.parts:
+            _, light_record, vertex_record = ctx.drawn or samples.draw(rows)
+            # A record serves one backward pass, so that two steps' never live side by side.
+            ctx.drawn = None
+            d_radiance = d_outputs[0][rows]
+            found: Gradients = [None] * 8
+            if light_record is not None:
+                d_pixel = torch.diag_embed(d_radiance)
+                found[:4] = light_gradient(renderer, samples.args, light_record, d_pixel, free[:4])
+            if vertex_record is not None:
+                found[4:] = material_gradient(samples, vertex_record, d_radiance, free[4:])
+            total = _add(total, found)
+        return (None, None, None, None, *_tensors(total, ctx.like))
 
 
 class ShadeProxy(torch.autograd.Function):
@@ -266,98 +204,251 @@ class ShadeProxy(torch.autograd.Function):
 
     @staticmethod
     def forward(
-        ctx: Any, mis: MisIntegrator, args: LightArgs, seed: int, *tensors: Tensor | None
+        ctx: Any,
+        mis: MisIntegrator,
+        args: LightArgs,
+        seed: int,
+        is_recording: bool,
+        *tensors: Tensor | None,
     ) -> tuple[Tensor, Tensor]:
         """Render with the detached kernels."""
-        ctx.mis, ctx.args, ctx.seed = mis, args, seed
-        ctx.tensors = tensors
-        out = mis.renderer.proxy(
-            args, mis.proxy_pixels, mis.may_see_object, mis.spp, mis.rays, seed
-        )
+        ctx.like = tensors
+        is_free = is_recording and any(ctx.needs_input_grad[4:])
+        ctx.samples = PlaneSamples(mis, args, seed, is_free)
+        ctx.drawn = None
+        if len(ctx.samples.parts) == 1:
+            ctx.drawn = ctx.samples.draw(ctx.samples.parts[0])
+            out = ctx.drawn[0]
+        else:
+            out = PlaneSamples(mis, args, seed, False).draw(slice(None))[0]
         where = _device_of(tensors)
         return torch.from_numpy(out.lit).to(where), torch.from_numpy(out.unoccluded).to(where)
 
     @staticmethod
     def backward(ctx: Any, *d_outputs: Tensor) -> tuple[Tensor | None, ...]:
-        """Replay the samples chunk by chunk and differentiate the attached kernel."""
-        d_lit, d_unoccluded = d_outputs
-        mis: MisIntegrator = ctx.mis
-        device = mis.renderer.device
-        leaves = Leaves(light_leaves(ctx.tensors, ctx.args), device)
-        for rows, tape, lit, unoccluded in replay_proxy(mis, ctx.args, ctx.seed, leaves.arrays):
-            tape.backward(
-                grads={
-                    lit: _from_torch(d_lit[rows], wp.vec3, device),
-                    unoccluded: _from_torch(d_unoccluded[rows], wp.vec3, device),
-                }
+        """Go through the recorded samples, which are drawn again if they did not fit."""
+        samples: PlaneSamples = ctx.samples
+        total: Gradients = [None] * 4
+        for rows in samples.parts:
+            _, record = ctx.drawn or samples.draw(rows)
+            ctx.drawn = None
+            d_lit, d_unoccluded = (d[rows] for d in d_outputs)
+            d_pixel = torch.stack([d_lit, d_unoccluded, torch.zeros_like(d_lit)], dim=-1)
+            assert record is not None
+            found = light_gradient(
+                samples.mis.renderer, samples.args, record, d_pixel, ctx.needs_input_grad[4:]
             )
-        return (None, None, None, *leaves.gradients())
+            total = _add(total, found)
+        return (None, None, None, None, *_tensors(total, ctx.like))
 
 
-def replay_proxy(
-    mis: MisIntegrator, args: LightArgs, seed: int, arrays: list[wp.array]
-) -> Iterator[tuple[slice, wp.Tape, wp.array, wp.array]]:
-    """Draw the plane's samples again and evaluate the attached kernel; see `replay_foreground`.
+class PlaneSamples:
+    """The plane's samples, as `ObjectSamples`."""
 
-    Yields:
-        The rows of ``proxy_pixels``, the tape, ``lit`` and ``unoccluded`` [proxy_pixel].
+    def __init__(self, mis: MisIntegrator, args: LightArgs, seed: int, of_light: bool) -> None:
+        self.mis, self.args, self.seed = mis, args, seed
+        self.entries = 2 * mis.spp * mis.rays if of_light else 0
+        self.parts = _parts(len(mis.proxy_pixels), ENTRY_BYTES * self.entries)
+
+    def draw(self, rows: slice) -> tuple[ProxyRadiance, LightRecord | None]:
+        """Trace the samples of some plane pixels."""
+        mis = self.mis
+        pixels = mis.proxy_pixels[rows]
+        record = None
+        if self.entries:
+            record = _new_light_record(len(pixels), self.entries, mis.renderer.device)
+        out = mis.renderer.proxy(
+            self.args,
+            pixels,
+            mis.may_see_object[rows],
+            mis.spp,
+            mis.rays,
+            self.seed,
+            record=record,
+        )
+        return out, record
+
+
+def light_gradient(
+    renderer: Renderer,
+    args: LightArgs,
+    record: LightRecord,
+    d_pixel: Tensor,
+    free: tuple[bool, ...],
+) -> Gradients:
+    """Return the loss gradient of a light over recorded directions.
+
+    Args:
+        renderer: Whose device and threads are used.
+        args: The light.
+        record: Directions and weights, rows are pixels.
+        d_pixel: See `warpir.kernels.light_gradient.lobe_gradient`, shape [pixel, 3, 3].
+        free: Which of amplitude, axis, sharpness and texels are asked for.
+
+    Returns:
+        Gradients of the four, shapes [lobe, 3], [lobe, 3], [lobe] and [He, We, 3].
     """
-    scene, device = mis.renderer.scene, mis.renderer.device
-    amplitude, axis, sharpness, texels = arrays
-    per_pixel = mis.spp * mis.rays
-    size = max(1, CHUNK_BYTES // (2 * BYTES_PER_DIRECTION * per_pixel))
-    for start in range(0, len(mis.proxy_pixels), size):
-        pixels = mis.proxy_pixels[start : start + size]
-        may_see_object = mis.may_see_object[start : start + size]
-        paths = len(pixels) * per_pixel
-        record = ProxyRecord()
-        record.wi = wp.zeros((2, paths), dtype=wp.vec3, device=device)
-        record.weight = wp.zeros((2, paths), dtype=float, device=device)
-        record.visible = wp.zeros((2, paths), dtype=float, device=device)
-        wp.launch(
-            record_proxy,
-            dim=len(pixels),
-            inputs=[
-                wp.array(pixels, dtype=wp.int32, device=device),
-                wp.array(may_see_object, dtype=wp.int32, device=device),
-                scene.camera_args,
-                scene.mesh_args,
-                scene.material_args,
-                scene.texture_args,
-                scene.proxy_args,
-                args,
-                mis.spp,
-                mis.rays,
-                seed,
+    device = renderer.device
+    pixels, capacity = record.wi.shape
+    d_array = _from_torch(d_pixel, wp.mat33, device)
+    out: Gradients = [None] * 4
+    if any(free[:3]) and args.lobe_count > 0:
+        block_size = max(1, LOBE_BLOCK // capacity)
+        first = np.arange(0, pixels, block_size, dtype=np.int32)
+        shape = (len(first), args.lobe_count)
+        sums = [wp.empty(shape, dtype=t, device=device) for t in (wp.vec3, wp.vec3, wp.float32)]
+        renderer.launch(
+            light_kernels.lobe_gradient,
+            len(first),
+            [
                 record,
+                d_array,
+                Rows(wp.array(first, dtype=wp.int32, device=device)),
+                block_size,
+                args.amplitude,
+                args.axis,
+                args.sharpness,
+                *map(Rows, sums),
             ],
+            block_size * capacity,
+            "light",
+            width=args.lobe_count,
+        )
+        out[:3] = [a.numpy().sum(axis=0, dtype=np.float64) for a in sums]
+    if free[3]:
+        height, width = args.map_height, args.map_width
+        # A private map pays where it is smaller than what is added into it.
+        parts = max(1, min(PART_COUNT, pixels * capacity // (height * width)))
+        parts = parts if device.is_cpu else 1
+        texels = wp.zeros((parts, height, width), dtype=wp.vec3, device=device)
+        bounds = [pixels * part // parts for part in range(parts + 1)]
+
+        def one(part: int) -> None:
+            start, stop = bounds[part], bounds[part + 1]
+            wp.launch(
+                light_kernels.map_gradient,
+                dim=stop - start,
+                inputs=[
+                    Rows(record).cut(start, stop),
+                    d_array[start:stop],
+                    height,
+                    width,
+                    texels[part],
+                ],
+                device=device,
+                record_tape=False,
+            )
+
+        wp.load_module(light_kernels, device=device)
+        renderer.in_threads(one, range(parts), "light")
+        out[3] = texels.numpy().sum(axis=0, dtype=np.float64)
+    return out
+
+
+def material_gradient(
+    samples: ObjectSamples, record: VertexRecord, d_radiance: Tensor, free: tuple[bool, ...]
+) -> Gradients:
+    """Return the loss gradient of the material factors over recorded vertices.
+
+    Args:
+        samples: Where ``record`` comes from.
+        record: Vertices, rows are pixels.
+        d_radiance: Loss gradient of the pixels' radiance, shape [pixel, 3].
+        free: Which of base colour, metallic, roughness and emission are asked for.
+
+    Returns:
+        Gradients of the four, shapes [material, 3], [material], [material] and [material, 3].
+    """
+    mis, path_count = samples.mis, samples.path_count
+    renderer, device = mis.renderer, mis.renderer.device
+    factors = samples.materials.arrays
+    pixels = record.material.shape[0]
+    # One private gradient for each part; on the CPU a part is gone through in short launches.
+    parts = min(PART_COUNT, pixels) if device.is_cpu else 1
+    size = max(1, SAMPLES_PER_SLICE // path_count) if device.is_cpu else pixels
+    d_path = _from_torch(
+        (d_radiance / path_count).repeat_interleave(path_count, dim=0), wp.vec3, device
+    )
+    d_factors = [
+        wp.zeros((parts, len(a)), dtype=a.dtype, device=device) if is_free else None
+        for a, is_free in zip(factors, free, strict=True)
+    ]
+
+    def one(part: int) -> None:
+        own = [None if d is None else d[part] for d in d_factors]
+        stop = pixels * (part + 1) // parts
+        for start in range(pixels * part // parts, stop, size):
+            end = min(start + size, stop)
+            d_rows = d_path[start * path_count : end * path_count]
+            differentiate_vertices(
+                Rows(record).cut(start, end), path_count, mis.depth, factors, d_rows, own
+            )
+
+    wp.load_module(shade_kernels, device=device)
+    renderer.in_threads(one, range(parts), "materials")
+    return [None if d is None else d.numpy().sum(axis=0, dtype=np.float64) for d in d_factors]
+
+
+def differentiate_vertices(
+    record: VertexRecord,
+    path_count: int,
+    depth: int,
+    factors: list[wp.array],
+    d_path: wp.array,
+    d_factors: list[wp.array | None],
+) -> None:
+    """Add the gradient of some paths to ``d_factors``: vertices forward, adjoints backward.
+
+    Launched by hand: ``wp.Tape`` belongs to one thread.
+
+    Args:
+        record: Vertices, rows are pixels.
+        path_count: Paths of a pixel.
+        depth: Surface interactions; there is one vertex more, which may emit.
+        factors: Base colour, metallic, roughness and emission, shape [material] each.
+        d_path: Loss gradient of each path's radiance, shape [path].
+        d_factors: Where to add, or None, as ``factors``.
+    """
+    device, paths = d_path.device, len(d_path)
+    throughput = [wp.full(paths, wp.vec3(1.0), dtype=wp.vec3, device=device)]
+    throughput += [wp.empty(paths, dtype=wp.vec3, device=device) for _ in range(depth + 1)]
+    unused = wp.empty(paths, dtype=wp.vec3, device=device)
+    for k in range(depth):
+        wp.launch(
+            shade_kernels.shade_vertex,
+            dim=paths,
+            inputs=[record, path_count, k, *factors, throughput[k]],
+            outputs=[unused, throughput[k + 1]],
             device=device,
             record_tape=False,
         )
-        tape = wp.Tape()
-        lit, unoccluded = (
-            wp.zeros(len(pixels), dtype=wp.vec3, device=device, requires_grad=True)
-            for _ in range(2)
+    d_next = wp.zeros(paths, dtype=wp.vec3, device=device)
+    for k in range(depth, -1, -1):
+        d_throughput = wp.zeros(paths, dtype=wp.vec3, device=device)
+        wp.launch(
+            shade_kernels.shade_vertex,
+            dim=paths,
+            inputs=[record, path_count, k, *factors, throughput[k]],
+            outputs=[unused, throughput[k + 1]],
+            adj_inputs=[VertexRecord(), 0, 0, *d_factors, d_throughput],
+            adj_outputs=[d_path, d_next],
+            adjoint=True,
+            device=device,
+            record_tape=False,
         )
-        with tape:
-            wp.launch(
-                shade_kernels.shade_proxy,
-                dim=len(pixels),
-                inputs=[
-                    record,
-                    per_pixel,
-                    amplitude,
-                    axis,
-                    sharpness,
-                    args.lobe_count,
-                    texels,
-                    args.map_height,
-                    args.map_width,
-                ],
-                outputs=[lit, unoccluded],
-                device=device,
-            )
-        yield slice(start, start + len(pixels)), tape, lit, unoccluded
+        d_next = d_throughput
+
+
+def _add(total: Gradients, found: Gradients) -> Gradients:
+    return [f if t is None else t + f for t, f in zip(total, found, strict=True)]
+
+
+def _tensors(gradients: Gradients, like: tuple[Tensor | None, ...]) -> tuple[Tensor | None, ...]:
+    """Return gradients in the tensors' shapes, types and places."""
+    return tuple(
+        None if g is None or t is None else torch.from_numpy(g).to(t).reshape(t.shape)
+        for g, t in zip(gradients, like, strict=True)
+    )
 
 
 def _device_of(tensors: tuple[Tensor | None, ...]) -> torch.device:
@@ -367,8 +458,13 @@ def _device_of(tensors: tuple[Tensor | None, ...]) -> torch.device:
     return torch.device("cpu")
 
 
-class scene_materials:
-    """Within the context the scene's material factors are those of the tensors that are given."""
+class SceneMaterials:
+    """Material factors on the device; within the context the scene renders with them.
+
+    Args:
+        renderer: Whose scene.
+        tensors: Base colour, metallic, roughness and emission; the scene's own where None.
+    """
 
     NAMES = (
         ("base_color", wp.vec3),
@@ -378,23 +474,24 @@ class scene_materials:
     )
 
     def __init__(self, renderer: Renderer, tensors: tuple[Tensor | None, ...]) -> None:
-        self.scene, self.tensors = renderer.scene, tensors
+        self.args: MaterialArgs = renderer.scene.material_args
+        self.own = [getattr(self.args, name) for name, _ in self.NAMES]
+        self.arrays = [
+            own if tensor is None else _from_torch(tensor, dtype, renderer.device)
+            for own, tensor, (_, dtype) in zip(self.own, tensors, self.NAMES, strict=True)
+        ]
+        self.own_any_emission = self.args.any_emission
+        self.any_emission = self.own_any_emission if tensors[3] is None else 1
 
     def __enter__(self) -> None:
-        args: MaterialArgs = self.scene.material_args
-        self.kept = {name: getattr(args, name) for name, _ in self.NAMES}
-        self.any_emission = args.any_emission
-        for tensor, (name, dtype) in zip(self.tensors, self.NAMES, strict=True):
-            if tensor is not None:
-                setattr(args, name, _from_torch(tensor, dtype, self.scene.device))
-                if name == "emission":
-                    args.any_emission = 1
+        for (name, _), array in zip(self.NAMES, self.arrays, strict=True):
+            setattr(self.args, name, array)
+        self.args.any_emission = self.any_emission
 
     def __exit__(self, *_: object) -> None:
-        args = self.scene.material_args
-        for name, array in self.kept.items():
-            setattr(args, name, array)
-        args.any_emission = self.any_emission
+        for (name, _), array in zip(self.NAMES, self.own, strict=True):
+            setattr(self.args, name, array)
+        self.args.any_emission = self.own_any_emission
 
 
 class _Rasterize(torch.autograd.Function):

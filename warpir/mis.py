@@ -1,8 +1,10 @@
 """`mis`, the reference integrator: multiple importance sampling of light and BRDF at any depth.
 
-The forward pass draws samples with the detached kernels. The backward pass draws the same samples
-again from the seed, writes them down chunk by chunk, and lets ``wp.Tape`` differentiate the
-attached kernels over them, so memory does not grow with the sample count.
+The forward pass traces with the detached kernels; if a gradient will be asked for, it writes its
+samples down. Radiance is linear in the light, so the light's gradient is a sum over the recorded
+directions; the materials' goes through the attached kernels over the recorded vertices. Beyond
+`warpir.bridge.RECORD_BYTES` the samples are drawn again from the seed, part by part, so memory does
+not grow with the sample count.
 """
 
 from __future__ import annotations
@@ -66,10 +68,13 @@ class MisIntegrator:
         with torch.no_grad():
             args_fg = light_args(host_light(light_fg), scene.device)
             args_shadow = light_args(host_light(light_shadow), scene.device)
+        is_recording = torch.is_grad_enabled()
         foreground: Tensor = ShadeForeground.apply(
-            self, args_fg, seed, *_light(light_fg), *_material(materials)
+            self, args_fg, seed, is_recording, *_light(light_fg), *_material(materials)
         )
-        lit, unoccluded = ShadeProxy.apply(self, args_shadow, seed, *_light(light_shadow))
+        lit, unoccluded = ShadeProxy.apply(
+            self, args_shadow, seed, is_recording, *_light(light_shadow)
+        )
         return Radiance(foreground, lit, unoccluded)
 
 

@@ -46,7 +46,7 @@ UNSEEN_SHADOW = 1e-3
 
 @dataclass(frozen=True)
 class Rows:
-    """An array whose first axis is the launch's, or a struct of such arrays; cut with the launch."""
+    """An array, or a struct of arrays, whose first axis is the launch's; both are cut alike."""
 
     array: Any
 
@@ -270,10 +270,17 @@ class Renderer:
             dim = stop - start if width is None else (stop - start, width)
             wp.launch(kernel, dim=dim, inputs=cut, device=self.device, record_tape=False)
 
+        self.in_threads(one, starts, stage)
+
+    def in_threads(self, one: Callable[[int], object], starts: Sequence[int], stage: str) -> None:
+        """Call ``one`` for each of ``starts``, on as many threads as the renderer has.
+
+        Within ``one``, launches go with ``record_tape=False``: a tape belongs to one thread.
+        """
         if len(starts) == 1 or self.threads == 1:
-            for start in starts:
+            for done, start in enumerate(starts):
                 one(start)
-                self._progress(stage, min(start + size, count) / count)
+                self._progress(stage, (done + 1) / len(starts))
             return
         with ThreadPoolExecutor(self.threads) as pool:
             futures = [pool.submit(one, start) for start in starts]
