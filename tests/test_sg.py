@@ -224,6 +224,22 @@ def test_rasterize_keeps_the_power(device: str, sharpness: float, axis: list[flo
     assert power == pytest.approx(2.0 * float(o.sg_flux(sharpness)), rel=POWER_RTOL)
 
 
+@pytest.mark.parametrize("sharpness", [30.0, 1e3, 6e3, 1e5])
+def test_rasterize_keeps_the_power_at_a_pole(device: str, sharpness: float) -> None:
+    """A lobe straight above keeps its power within 0.1 % at three directions per deviation.
+
+    Midpoints in latitude gave it 0.4 % too much: the integrand starts at the pole with a slope.
+    """
+    arrays = [
+        upload(np.ones((1, 3)), wp.vec3, device),
+        upload(np.array([[0.0, 1.0, 0.0]]), wp.vec3, device),
+        upload(np.array([sharpness]), float, device),
+    ]
+    texels = run_rasterize(device, 64, 128, arrays, 1).numpy().astype(np.float64)
+    power = np.einsum("ijc,i->c", texels, o.texel_solid_angle(64, 128))
+    assert power == pytest.approx(float(o.sg_flux(sharpness)), rel=1e-3)
+
+
 def rasterize_gradient(
     device: str, lobes: tuple[np.ndarray, ...], y: np.ndarray
 ) -> list[np.ndarray]:

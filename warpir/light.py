@@ -204,18 +204,36 @@ class LightSummary:
     """Share of the total flux within 5 degrees of it [1]."""
 
 
-def rasterize_lobes(lobes: Lobes, height: int, width: int, side: int = 4) -> FloatArray:
+def rasterize_lobes(lobes: Lobes, height: int, width: int, side: int = 6) -> FloatArray:
     """Return the mean radiance of the lobes in each texel, shape [height, width, 3].
 
-    The NumPy twin of `warpir.kernels.rasterize`, for files and summaries. A lobe narrower than a
-    texel is put into its texel with its flux.
+    The NumPy twin of `warpir.kernels.rasterize`, for files and summaries; power within 1 %. A lobe
+    whose standard deviation is below a quarter of a texel is put into its texel with its flux.
+
+    Args:
+        lobes: The lobes.
+        height: Rows of the map.
+        width: Columns of the map.
+        side: Directions along a texel's side, even.
     """
     texels = np.zeros((height, width, 3))
     omega = texel_solid_angles(height, width)
-    narrow = lobes.sharpness > 1.0 / (np.pi / height / side) ** 2
-    big = map_directions(height * side, width * side)
+    narrow = lobes.sharpness > (4.0 * height / np.pi) ** 2
+    # Rows at the two-point Gauss-Legendre nodes of even bands, as in the kernel: midpoints misjudge
+    # a lobe at a pole by up to 4 %.
+    step = np.pi / (height * side)
+    theta = (np.arange(height * side) // 2 * 2 + 1.0) * step
+    theta += np.tile([-1.0, 1.0], height * side // 2) * step / np.sqrt(3.0)
+    lon = np.pi * (1.0 - 2.0 * (np.arange(width * side) + 0.5) / (width * side))
+    sin_theta = np.sin(theta)[:, None]
+    big = np.stack(
+        np.broadcast_arrays(
+            sin_theta * np.sin(lon), np.cos(theta)[:, None], sin_theta * np.cos(lon)
+        ),
+        axis=-1,
+    )
     # Within the texels at a pole, the points nearer to it stand for less of the sphere.
-    share = texel_solid_angles(height * side, width * side).reshape(height, side)
+    share = np.sin(theta).reshape(height, side)
     share /= share.sum(axis=1, keepdims=True)
     for amplitude, axis, s in zip(
         lobes.amplitude[~narrow], lobes.axis[~narrow], lobes.sharpness[~narrow], strict=True
