@@ -1,0 +1,590 @@
+"""Light transport without a light: what each texel of a lat-long map sends into each pixel.
+
+Light at infinity enters linearly, so a pixel's radiance is a row of numbers times the map's texels.
+`trace_points` finds what the camera sees; `trace_direct` and `trace_paths` make the rows of
+``T_fg``, `trace_blocked` those of ``T_shadow``. The host's half is `warpir.transport`. Detached: no
+backward pass.
+
+A texel stands for the tent of bilinear interpolation around it (`bilinear_tap`). Directions are
+drawn from that tent, evenly in solid angle, and belong to that texel alone: spread over the four
+texels around it, a direction would let a sun in one texel flicker by its interpolation weight.
+"""
+
+import warp as wp
+
+from warpir.kernels.brdf import brdf_eval, brdf_sample, roughness_to_alpha
+from warpir.kernels.frame import basis, to_local, to_world
+from warpir.kernels.latlong import BilinearTap, bilinear_tap, direction_to_uv, uv_to_direction
+from warpir.kernels.proxy import proxy_point
+from warpir.kernels.rng import hash_pair, hash_uint, pixel_seed, sobol_pair, to_unit
+from warpir.kernels.sampling import light_eval, light_sample, power_heuristic, tent
+from warpir.kernels.trace import (
+    INFINITY,
+    Hit,
+    Surface,
+    camera_hit,
+    camera_ray,
+    closest_hit,
+    offset_origin,
+    surface_at,
+    visibility,
+)
+from warpir.kernels.types import (
+    CameraArgs,
+    LightArgs,
+    MaterialArgs,
+    MeshArgs,
+    ProxyArgs,
+    TextureArgs,
+)
+
+wp.set_module_options({"enable_backward": False})
+
+PI = wp.constant(3.14159265358979)
+TRIES_MAX = wp.constant(32)
+"""Draws until one is accepted; a texel at the horizon accepts about every third."""
+TENT_REACH = wp.constant(1.5)
+"""No direction of a tent is farther than this many texel heights from the texel's centre."""
+NARROW = wp.constant(4.0)
+"""Specular lobes with ``alpha`` below this many texel sides are sampled by the BRDF too."""
+GOLDEN_ROW = wp.constant(0.5698402909980532)
+GOLDEN_COLUMN = wp.constant(0.7548776662466927)
+"""Steps of the R2 sequence (Roberts 2018): neighbouring texels use different points of a pixel."""
+
+
+@wp.struct
+class SurfacePoints:
+    """What the camera samples of each pixel met; the first ``count`` of each row are filled."""
+
+    count: wp.array[int]
+    """Shape [pixel]."""
+    position: wp.array2d[wp.vec3]
+    """Recentred world [m], shape [pixel, subsample]; so are the others."""
+    ng: wp.array2d[wp.vec3]
+    n: wp.array2d[wp.vec3]
+    wo: wp.array2d[wp.vec3]
+    base_color: wp.array2d[wp.vec3]
+    metallic: wp.array2d[float]
+    roughness: wp.array2d[float]
+
+
+@wp.struct
+class TexelArgs:
+    """The map whose texels are the columns of the transport."""
+
+    height: int
+    width: int
+    d_omega: wp.array[float]
+    """Solid angle of a texel's tent in each row [sr], shape [He]."""
+    direction_count: wp.array[int]
+    """Directions drawn for each texel, shape [He * We]."""
+
+
+@wp.kernel
+def trace_points(
+    pixels: wp.array[int],
+    camera: CameraArgs,
+    mesh: MeshArgs,
+    material: MaterialArgs,
+    texture: TextureArgs,
+    proxy: ProxyArgs,
+    subsamples: int,
+    seed: int,
+    points: SurfacePoints,
+    emission: wp.array[wp.vec3],
+):
+    """Find the object's surface under ``subsamples`` positions of each listed pixel.
+
+    ``emission`` is the mean radiance that these points emit, premultiplied by coverage.
+    """
+    i = wp.tid()
+    pixel = pixels[i]
+    key = pixel_seed(seed, pixel)
+    count = int(0)
+    emitted = wp.vec3(0.0)
+    for s in range(subsamples):
+        ray_dir = camera_ray(camera, pixel, sobol_pair(s, key, 0))
+        hit = camera_hit(camera, mesh, material, texture, proxy, s, key, ray_dir)
+        if hit.valid == 1:
+            surface = surface_at(mesh, material, texture, hit, -ray_dir)
+            points.position[i, count] = surface.position
+            points.ng[i, count] = surface.ng
+            points.n[i, count] = surface.n
+            points.wo[i, count] = -ray_dir
+            points.base_color[i, count] = surface.base_color
+            points.metallic[i, count] = surface.metallic
+            points.roughness[i, count] = surface.roughness
+            emitted += surface.emission
+            count += 1
+    points.count[i] = count
+    emission[i] = emitted / float(subsamples)
+
+
+@wp.func
+def random_pair(key: wp.uint32, draw: int) -> wp.vec2:
+    """Return draw number ``draw`` of an independent sequence, in [0, 1)^2."""
+    a = hash_pair(key, wp.uint32(draw))
+    return wp.vec2(to_unit(a), to_unit(hash_uint(a)))
+
+
+@wp.func
+def tent_uv(i: int, j: int, height: int, width: int, u: wp.vec2) -> wp.vec2:
+    """Draw texture coordinates from the tent of texel (i, j), folded at the poles."""
+    x = (float(j) + 0.5 + tent(u[0])) / float(width)
+    y = (float(i) + 0.5 + tent(u[1])) / float(height)
+    x = x - wp.floor(x)
+    # Clamping the lookup beyond a pole is the same as folding the tent back.
+    if y < 0.0:
+        y = -y
+    if y > 1.0:
+        y = 2.0 - y
+    return wp.vec2(x, y)
+
+
+@wp.func
+def sine_max(i: int, height: int) -> float:
+    """Return the largest sine of the polar angle within the tents of row ``i``."""
+    first = (float(i) - 0.5) / float(height)
+    last = (float(i) + 1.5) / float(height)
+    if first < 0.5 and last > 0.5:
+        return 1.0
+    return wp.max(wp.sin(PI * wp.max(first, 0.0)), wp.sin(PI * wp.min(last, 1.0)))
+
+
+@wp.func
+def tent_direction(texels: TexelArgs, i: int, j: int, u: wp.vec2, key: wp.uint32) -> wp.vec3:
+    """Draw a direction from texel (i, j)'s tent with density ``weight / d_omega`` [1/sr].
+
+    ``u`` makes the first try, so that its stratification survives wherever that is accepted.
+    """
+    bound = sine_max(i, texels.height)
+    uv = tent_uv(i, j, texels.height, texels.width, u)
+    for draw in range(TRIES_MAX):
+        more = random_pair(key, 2 * draw)
+        if more[0] * bound <= wp.sin(PI * uv[1]):
+            return uv_to_direction(uv[0], uv[1])
+        uv = tent_uv(i, j, texels.height, texels.width, random_pair(key, 2 * draw + 1))
+    return uv_to_direction(uv[0], uv[1])
+
+
+@wp.func
+def tent_weight(tap: BilinearTap, i: int, j: int) -> float:
+    """Return the interpolation weight of texel (i, j) at ``tap``."""
+    weight = float(0.0)
+    if tap.j0 == j:
+        weight += 1.0 - tap.wj
+    if tap.j1 == j:
+        weight += tap.wj
+    across = float(0.0)
+    if tap.i0 == i:
+        across += 1.0 - tap.wi
+    if tap.i1 == i:
+        across += tap.wi
+    return weight * across
+
+
+@wp.func
+def texel_pdf(texels: TexelArgs, tap: BilinearTap, i: int, j: int) -> float:
+    """Return the expected density of all directions drawn for texel (i, j) at ``tap`` [1/sr]."""
+    count = float(texels.direction_count[i * texels.width + j])
+    return count * tent_weight(tap, i, j) / texels.d_omega[i]
+
+
+@wp.func
+def is_narrow(roughness: float, height: int) -> int:
+    """Return 1 when a specular lobe may be too narrow for one direction per texel."""
+    if roughness_to_alpha(roughness) < NARROW * PI / float(height):
+        return 1
+    return 0
+
+
+@wp.kernel
+def trace_direct(
+    pixels: wp.array[int],
+    points: SurfacePoints,
+    mesh: MeshArgs,
+    material: MaterialArgs,
+    texture: TextureArgs,
+    texels: TexelArgs,
+    subsamples: int,
+    path_count: int,
+    seed: int,
+    T: wp.array2d[wp.vec3],
+):
+    """Write the light that reaches the camera by one interaction; thread = (pixel, texel).
+
+    Args:
+        pixels: Row-major pixel indices, shape [pixel].
+        points: From `trace_points`.
+        mesh: The object's triangles.
+        material: Their materials.
+        texture: Their textures.
+        texels: The map and how many directions each texel gets.
+        subsamples: Camera samples per pixel.
+        path_count: Paths that `trace_paths` will add, for the weights of narrow lobes.
+        seed: Base seed.
+        T: Pixel radiance per texel radiance [1], shape [pixel, texel].
+    """
+    p, t = wp.tid()
+    count = points.count[p]
+    if count == 0:
+        T[p, t] = wp.vec3(0.0)
+        return
+    i = t // texels.width
+    j = t % texels.width
+    pixel_key = pixel_seed(seed, pixels[p])
+    key = hash_pair(pixel_key, wp.uint32(t))
+    directions = texels.direction_count[t]
+    shift = to_unit(hash_uint(pixel_key))
+    total = wp.vec3(0.0)
+    for r in range(directions):
+        # Which of the pixel's points
+        spot = shift + GOLDEN_ROW * float(i) + GOLDEN_COLUMN * float(j)
+        spot = spot - wp.floor(spot)
+        s = wp.min(int(spot * float(count)), count - 1)
+        s = (s + r) % count
+        u = random_pair(key, -1)
+        if directions > 1:
+            u = sobol_pair(r, key, 0)
+        wi = tent_direction(texels, i, j, u, hash_pair(key, wp.uint32(r)))
+        ng = points.ng[p, s]
+        n = points.n[p, s]
+        if wp.dot(wi, n) > 0.0 and wp.dot(wi, ng) > 0.0:
+            frame = basis(n)
+            roughness = points.roughness[p, s]
+            f = brdf_eval(
+                to_local(points.wo[p, s], frame),
+                to_local(wi, frame),
+                points.base_color[p, s],
+                points.metallic[p, s],
+                roughness,
+            )
+            specular = f.specular
+            if path_count > 0 and is_narrow(roughness, texels.height) == 1:
+                tap = bilinear_tap(direction_to_uv(wi), texels.height, texels.width)
+                pdf = texel_pdf(texels, tap, i, j)
+                specular = specular * power_heuristic(pdf, float(path_count) * f.pdf)
+            throughput = (f.diffuse + specular) * wp.dot(wi, n)
+            if wp.max(throughput) > 0.0:
+                origin = offset_origin(points.position[p, s], ng, wi, mesh.epsilon)
+                total += throughput * visibility(mesh, material, texture, origin, wi)
+    scale = texels.d_omega[i] * float(count) / float(subsamples * directions)
+    T[p, t] = total * scale
+
+
+@wp.func
+def add_to_texels(
+    T: wp.array2d[wp.vec3],
+    p: int,
+    texels: TexelArgs,
+    wi: wp.vec3,
+    diffuse: wp.vec3,
+    specular: wp.vec3,
+    pdf: float,
+):
+    """Spread what arrives from ``wi`` over the four texels that interpolation reads there.
+
+    ``specular`` competes with the directions drawn for each of those texels; a ``pdf`` of 0 says
+    that it does not.
+    """
+    tap = bilinear_tap(direction_to_uv(wi), texels.height, texels.width)
+    for corner in range(4):
+        i = tap.i0
+        across = 1.0 - tap.wi
+        if corner >= 2:
+            i = tap.i1
+            across = tap.wi
+        j = tap.j0
+        along = 1.0 - tap.wj
+        if corner % 2 == 1:
+            j = tap.j1
+            along = tap.wj
+        value = diffuse
+        if pdf > 0.0:
+            value = value + specular * power_heuristic(pdf, texel_pdf(texels, tap, i, j))
+        else:
+            value = value + specular
+        wp.atomic_add(T, p, i * texels.width + j, value * (across * along))
+
+
+@wp.kernel
+def trace_paths(
+    pixels: wp.array[int],
+    points: SurfacePoints,
+    mesh: MeshArgs,
+    material: MaterialArgs,
+    texture: TextureArgs,
+    texels: TexelArgs,
+    proposal: LightArgs,
+    subsamples: int,
+    path_count: int,
+    depth: int,
+    seed: int,
+    T: wp.array2d[wp.vec3],
+    emission: wp.array[wp.vec3],
+):
+    """Add narrow specular lobes and all light of two or more interactions; (pixel, path).
+
+    Args:
+        pixels: Row-major pixel indices, shape [pixel].
+        points: From `trace_points`.
+        mesh: The object's triangles.
+        material: Their materials.
+        texture: Their textures.
+        texels: The map.
+        proposal: Where light is expected, for the second and later vertices; any positive map.
+        subsamples: Camera samples per pixel.
+        path_count: Paths per pixel.
+        depth: Surface interactions.
+        seed: Base seed.
+        T: From `trace_direct`, shape [pixel, texel].
+        emission: Radiance that does not depend on the light, shape [pixel].
+    """
+    p, q = wp.tid()
+    count = points.count[p]
+    if count == 0:
+        return
+    key = hash_pair(pixel_seed(seed, pixels[p]), wp.uint32(0x51ED27))
+    s = (q + int(hash_uint(key) >> wp.uint32(8))) % count
+    surface = Surface()
+    surface.position = points.position[p, s]
+    surface.ng = points.ng[p, s]
+    surface.n = points.n[p, s]
+    surface.base_color = points.base_color[p, s]
+    surface.metallic = points.metallic[p, s]
+    surface.roughness = points.roughness[p, s]
+    wo = points.wo[p, s]
+    scale = float(count) / float(subsamples * path_count)
+    throughput = wp.vec3(scale, scale, scale)
+    for k in range(depth):
+        hit = Hit()
+        hit.valid = 0
+        frame = basis(surface.n)
+        wo_local = to_local(wo, frame)
+        if wo_local[2] <= 0.0:
+            break
+        is_last = int(0)
+        if k == depth - 1 and material.any_emission == 0:
+            is_last = 1
+        pick = sobol_pair(q, key, 3 * k + 1)
+
+        # Toward where light is expected; the first vertex has its directions already
+        if k > 0:
+            wi = light_sample(proposal, sobol_pair(q, key, 3 * k + 2), pick[0])
+            wi_local = to_local(wi, frame)
+            if wi_local[2] > 0.0 and wp.dot(wi, surface.ng) > 0.0:
+                f = brdf_eval(
+                    wo_local, wi_local, surface.base_color, surface.metallic, surface.roughness
+                )
+                expected = light_eval(proposal, wi)
+                value = wp.cw_mul(throughput, f.diffuse + f.specular)
+                if wp.max(value) > 0.0 and expected.pdf > 0.0:
+                    origin = offset_origin(surface.position, surface.ng, wi, mesh.epsilon)
+                    weight = wi_local[2] * power_heuristic(expected.pdf, f.pdf) / expected.pdf
+                    weight = weight * visibility(mesh, material, texture, origin, wi)
+                    if weight > 0.0:
+                        add_to_texels(T, p, texels, wi, value * weight, wp.vec3(0.0), 0.0)
+
+        # The BRDF's own direction: it leaves the scene, or the path goes on
+        wi_local = brdf_sample(
+            wo_local,
+            sobol_pair(q, key, 3 * k + 3),
+            pick[1],
+            surface.base_color,
+            surface.metallic,
+            surface.roughness,
+        )
+        wi = to_world(wi_local, frame)
+        if wi_local[2] <= 0.0 or wp.dot(wi, surface.ng) <= 0.0:
+            break
+        f = brdf_eval(wo_local, wi_local, surface.base_color, surface.metallic, surface.roughness)
+        if f.pdf <= 0.0:
+            break
+        slope = wi_local[2] / f.pdf
+        origin = offset_origin(surface.position, surface.ng, wi, mesh.epsilon)
+        escaped = float(0.0)
+        if is_last == 1:
+            if k > 0 or is_narrow(surface.roughness, texels.height) == 1:
+                escaped = visibility(mesh, material, texture, origin, wi)
+        else:
+            ray_key = hash_pair(hash_pair(key, wp.uint32(q)), wp.uint32(k + 1))
+            hit = closest_hit(mesh, material, texture, origin, wi, INFINITY, 0, ray_key)
+            if hit.valid == 0:
+                escaped = 1.0
+        if escaped > 0.0:
+            if k == 0:
+                if is_narrow(surface.roughness, texels.height) == 1:
+                    specular = wp.cw_mul(throughput, f.specular) * (slope * escaped)
+                    drawn = float(path_count) * f.pdf
+                    add_to_texels(T, p, texels, wi, wp.vec3(0.0), specular, drawn)
+            else:
+                expected = light_eval(proposal, wi)
+                weight = slope * escaped * power_heuristic(f.pdf, expected.pdf)
+                value = wp.cw_mul(throughput, f.diffuse + f.specular) * weight
+                add_to_texels(T, p, texels, wi, value, wp.vec3(0.0), 0.0)
+        if is_last == 1 or hit.valid == 0:
+            break
+        throughput = wp.cw_mul(throughput, (f.diffuse + f.specular) * slope)
+        wo = -wi
+        surface = surface_at(mesh, material, texture, hit, wo)
+        if material.any_emission == 1:
+            wp.atomic_add(emission, p, wp.cw_mul(throughput, surface.emission))
+
+
+@wp.kernel
+def trace_proxy_points(
+    pixels: wp.array[int],
+    may_see_object: wp.array[int],
+    camera: CameraArgs,
+    mesh: MeshArgs,
+    material: MaterialArgs,
+    texture: TextureArgs,
+    proxy: ProxyArgs,
+    radius: float,
+    reach: float,
+    subsamples: int,
+    seed: int,
+    count: wp.array[int],
+    position: wp.array2d[wp.vec3],
+    cone: wp.array[wp.vec4],
+):
+    """Find the ground plane under ``subsamples`` positions of each listed pixel.
+
+    Args:
+        pixels: Row-major pixel indices, shape [pixel].
+        may_see_object: 1 where the object may hide the plane from the camera, shape [pixel].
+        camera: The view.
+        mesh: The object's triangles.
+        material: Their materials.
+        texture: Their textures.
+        proxy: The plane.
+        radius: Of a sphere around the recentred origin that holds the object [m].
+        reach: Largest angle between a texel's centre and a direction of its tent [rad].
+        subsamples: Camera samples per pixel.
+        seed: Base seed.
+        count: Filled points of each pixel, shape [pixel].
+        position: Points of the plane, recentred [m], shape [pixel, subsample].
+        cone: Axis, and the cosine of the angle beyond which no texel's tent meets the object, shape
+            [pixel].
+    """
+    i = wp.tid()
+    pixel = pixels[i]
+    key = pixel_seed(seed, pixel)
+    found = int(0)
+    spread = float(0.0)
+    for s in range(subsamples):
+        point = proxy_point(
+            camera, mesh, material, texture, proxy, pixel, may_see_object[i], s, key
+        )
+        if point[3] > 0.0:
+            p = wp.vec3(point[0], point[1], point[2])
+            position[i, found] = p
+            spread = wp.max(spread, wp.length(p - position[i, 0]))
+            found += 1
+    count[i] = found
+    axis = wp.vec3(0.0, 1.0, 0.0)
+    limit = float(-2.0)
+    if found > 0:
+        distance = wp.length(position[i, 0])
+        if distance > 1.001 * (radius + spread):
+            axis = -position[i, 0] / distance
+            limit = wp.cos(wp.min(wp.asin((radius + spread) / distance) + reach, PI)) - 1.0e-5
+    cone[i] = wp.vec4(axis[0], axis[1], axis[2], limit)
+
+
+@wp.func
+def meets_box(origin: wp.vec3, wi: wp.vec3, low: wp.vec3, high: wp.vec3) -> int:
+    """Return 1 when the ray may meet the box; most rays from a plane do not."""
+    near = float(0.0)
+    far = float(INFINITY)
+    for axis in range(3):
+        if wp.abs(wi[axis]) > 1.0e-12:
+            a = (low[axis] - origin[axis]) / wi[axis]
+            b = (high[axis] - origin[axis]) / wi[axis]
+            near = wp.max(near, wp.min(a, b))
+            far = wp.min(far, wp.max(a, b))
+        elif origin[axis] < low[axis] or origin[axis] > high[axis]:
+            return 0
+    if near <= far:
+        return 1
+    return 0
+
+
+@wp.kernel
+def trace_blocked(
+    pixels: wp.array[int],
+    count: wp.array[int],
+    position: wp.array2d[wp.vec3],
+    cone: wp.array[wp.vec4],
+    mesh: MeshArgs,
+    material: MaterialArgs,
+    texture: TextureArgs,
+    proxy: ProxyArgs,
+    low: wp.vec3,
+    high: wp.vec3,
+    texels: TexelArgs,
+    columns: wp.array[int],
+    centres: wp.array[wp.vec3],
+    seed: int,
+    blocked: wp.array2d[float],
+):
+    """Write which share of a texel's irradiance the object keeps from the plane; (pixel, column).
+
+    Directions follow the tent times the cosine, so the share is exactly 0 where nothing is in the
+    way and exactly 1 where everything is.
+
+    Args:
+        pixels: Row-major pixel indices, shape [pixel].
+        count: Filled points of each pixel, shape [pixel].
+        position: Points of the plane [m], shape [pixel, subsample].
+        cone: From `trace_proxy_points`, shape [pixel].
+        mesh: The object's triangles.
+        material: Their materials.
+        texture: Their textures.
+        proxy: The plane.
+        low: Lower corner of the object's bounding box, recentred [m].
+        high: Upper corner [m].
+        texels: The map and how many directions each texel gets.
+        columns: Texels whose tents rise above the plane, shape [column].
+        centres: Their centres, shape [column].
+        seed: Base seed.
+        blocked: Share [1], shape [pixel, column].
+    """
+    p, c = wp.tid()
+    filled = count[p]
+    blocked[p, c] = 0.0
+    axis = cone[p]
+    centre = centres[c]
+    toward = axis[0] * centre[0] + axis[1] * centre[1] + axis[2] * centre[2]
+    if filled == 0 or toward < axis[3]:
+        return
+    t = columns[c]
+    i = t // texels.width
+    j = t % texels.width
+    reach = TENT_REACH * PI / float(texels.height)
+    angle = wp.acos(wp.clamp(wp.dot(centre, proxy.normal), -1.0, 1.0))
+    bound = wp.cos(wp.max(angle - reach, 0.0)) * sine_max(i, texels.height)
+    pixel_key = pixel_seed(seed, pixels[p])
+    key = hash_pair(pixel_key, wp.uint32(t))
+    directions = texels.direction_count[t]
+    shift = to_unit(hash_uint(pixel_key))
+    spot = shift + GOLDEN_ROW * float(i) + GOLDEN_COLUMN * float(j)
+    spot = spot - wp.floor(spot)
+    first = wp.min(int(spot * float(filled)), filled - 1)
+    total = float(0.0)
+    for r in range(directions):
+        ray_key = hash_pair(key, wp.uint32(r))
+        uv = tent_uv(i, j, texels.height, texels.width, random_pair(key, -1))
+        if directions > 1:
+            uv = tent_uv(i, j, texels.height, texels.width, sobol_pair(r, key, 0))
+        wi = uv_to_direction(uv[0], uv[1])
+        for draw in range(TRIES_MAX):
+            more = random_pair(ray_key, 2 * draw)
+            if more[0] * bound <= wp.sin(PI * uv[1]) * wp.dot(wi, proxy.normal):
+                break
+            uv = tent_uv(i, j, texels.height, texels.width, random_pair(ray_key, 2 * draw + 1))
+            wi = uv_to_direction(uv[0], uv[1])
+        origin = position[p, (first + r) % filled] + proxy.normal * mesh.epsilon
+        if wp.dot(wi, proxy.normal) > 0.0 and meets_box(origin, wi, low, high) == 1:
+            total += 1.0 - visibility(mesh, material, texture, origin, wi)
+    blocked[p, c] = total / float(directions)
