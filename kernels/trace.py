@@ -211,6 +211,38 @@ def face_normal(mesh: MeshArgs, face: int) -> wp.vec3:
 
 
 @wp.func
+def facing_twin(mesh: MeshArgs, position: wp.vec3, ray_dir: wp.vec3) -> Hit:
+    """Find a triangle in the place of a culled one that faces the ray; ``valid`` is 0 without one.
+
+    Sheets are often modelled as two single-sided ones in one place, and a query returns either. A
+    ray that goes on from the culled one starts beyond both.
+    """
+    twin = Hit()
+    twin.valid = 0
+    largest = wp.max(wp.max(wp.abs(position[0]), wp.abs(position[1])), wp.abs(position[2]))
+    reach = 4.0 * ULP * largest + mesh.epsilon
+    margin = wp.vec3(reach, reach, reach)
+    query = wp.mesh_query_aabb(mesh.id, position - margin, position + margin)
+    face = int(0)
+    while wp.mesh_query_aabb_next(query, face):
+        a = mesh.positions[mesh.indices[3 * face]]
+        b = mesh.positions[mesh.indices[3 * face + 1]]
+        c = mesh.positions[mesh.indices[3 * face + 2]]
+        n = wp.cross(b - a, c - a)
+        area = wp.length(n)
+        if wp.dot(n, ray_dir) < 0.0 and wp.abs(wp.dot(position - a, n)) <= reach * area:
+            u = wp.dot(wp.cross(c - b, position - b), n) / (area * area)
+            v = wp.dot(wp.cross(a - c, position - c), n) / (area * area)
+            # Rounding must not drop a point between two halves of the twin.
+            if wp.min(wp.min(u, v), 1.0 - u - v) >= -1.0e-5:
+                twin.valid = 1
+                twin.face = face
+                twin.u = wp.clamp(u, 0.0, 1.0)
+                twin.v = wp.clamp(v, 0.0, 1.0 - twin.u)
+    return twin
+
+
+@wp.func
 def closest_hit(
     mesh: MeshArgs,
     material: MaterialArgs,
@@ -242,7 +274,10 @@ def closest_hit(
         if is_camera_ray == 1 and material.any_culled == 1:
             if material.double_sided[mesh.face_material[query.face]] == 0:
                 if wp.dot(face_normal(mesh, query.face), ray_dir) > 0.0:
-                    accept = 0
+                    twin = facing_twin(mesh, hit_position(mesh, hit), ray_dir)
+                    accept = twin.valid
+                    if twin.valid == 1:
+                        hit = twin
         if accept == 1 and material.any_alpha == 1:
             alpha = hit_alpha(mesh, material, texture, hit)
             if alpha < 1.0:

@@ -676,6 +676,33 @@ def test_culled_card_shows_what_is_behind_it(device: str) -> None:
     np.testing.assert_allclose(out.radiance, np.tile([0.5, 1.0, 2.0], (64, 1)), rtol=FLOAT32)
 
 
+@pytest.mark.parametrize("diagonal", ["same", "other"])
+def test_two_single_sided_cards_in_one_place_are_seen_from_both_sides(
+    device: str, diagonal: str
+) -> None:
+    """A sheet modelled as two, wound against each other: each side shows its own material.
+
+    A ray meets both at once and a query returns either; what it would cull must not hide the other.
+    """
+    front = quad((0, 0, -5.0), (1, 0, 0), (0, 1, 0), 0)
+    if diagonal == "other":
+        back = quad((0, 0, -5.0), (-1, 0, 0), (0, 1, 0), 1)
+    else:
+        back = Primitive(front.positions, front.indices[:, ::-1].copy(), 1, uv0=front.uv0)
+    glow = [
+        Material(base_color=(0, 0, 0), metallic=1.0, emission=e)
+        for e in ((3.0, 1.0, 2.0), (0.5, 4.0, 0.25))
+    ]
+    half_turn = np.diag([-1.0, 1.0, -1.0, 1.0])
+    half_turn[2, 3] = -10.0
+    for matrix, emission in ((None, glow[0].emission), (half_turn, glow[1].emission)):
+        for parts in ([front, back], [back, front]):
+            renderer = make(placed(parts, *glow, matrix=matrix), CARD_VIEW, device)
+            out = render(renderer, constant((0, 0, 0)), 64)
+            np.testing.assert_array_equal(out.mask, 1.0)
+            np.testing.assert_allclose(out.radiance, np.tile(emission, (64, 1)), rtol=FLOAT32)
+
+
 def test_emission_is_seen_as_it_is(device: str) -> None:
     """Without light a lamp shows its emission times its texture, all of it in that layer."""
     pixels = np.full((2, 2, 4), 255, np.uint8)
