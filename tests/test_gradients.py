@@ -1,6 +1,6 @@
 """The gradient that an optimiser reads, over the whole pipeline, against central differences."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any
 
@@ -8,34 +8,26 @@ import numpy as np
 import pytest
 import torch
 import trimesh
-import warp as wp
-from numpy.typing import NDArray
 from torch import Tensor
 from torch.func import functional_call
 
-from tests import oracles
 from tests.conftest import devices
+from tests.records import object_sums, path_means, plain_factors, plane_sums, shade_vertices
 from tests.statistics import compare_gradients
 from warpir.asset import Asset, Material, Primitive
 from warpir.bridge import (
     ComposeConstants,
-    ObjectSamples,
-    PlaneSamples,
-    SceneMaterials,
     compose,
     host_light,
     rasterize,
 )
 from warpir.camera import Camera
 from warpir.integrator import LightTensors, MaterialTensors, Radiance
-from warpir.kernels.shade import shade_vertex
-from warpir.kernels.types import LightRecord, VertexRecord
 from warpir.mis import MisIntegrator
 from warpir.render import Renderer, light_args
+from warpir.samples import ObjectSamples, PlaneSamples, SceneMaterials
 from warpir.scene import Placed, Proxy, Scene
 from warpir.tone import ToneCurve
-
-Float64Array = NDArray[np.float64]
 
 WIDTH, HEIGHT = 48, 32
 SEED = 3
@@ -46,6 +38,8 @@ ATOMICS_L2 = 1e-5
 """float32 sums of about 1e4 terms in another order."""
 RASTERIZE_L2 = 1e-2
 """Three directions per standard deviation of a lobe leave about 0.5 %."""
+LIGHT = ("amplitude", "axis", "sharpness", "texels")
+MATERIAL = ("base_color", "metallic", "roughness", "emission")
 STEP = {"sharpness": 2e-2, "texels": 5e-2}
 """Steps of the central differences where 1e-2 is lost in float32 noise."""
 
@@ -110,14 +104,10 @@ class Pipeline:
     @cached_property
     def samples(self) -> tuple[ObjectSamples, PlaneSamples]:
         """What is drawn at `raw`."""
-        with torch.no_grad():
-            args = light_args(host_light(self.light(self.raw)), self.mis.renderer.device)
-            at = self.materials(self.raw)
-            materials = SceneMaterials(
-                self.mis.renderer, (at.base_color, at.metallic, at.roughness, at.emission)
-            )
-            of_object = ObjectSamples(self.mis, args, SEED, materials, True, True)
-            return of_object, PlaneSamples(self.mis, args, SEED, True)
+        args = light_args(host_light(self.light(self.raw)), self.mis.renderer.device)
+        factors = plain_factors(self.materials(self.raw))
+        of_object = ObjectSamples(self.mis, args, SEED, factors, (True,) * 8)
+        return of_object, PlaneSamples(self.mis, args, SEED, (True,) * 4)
 
     @cached_property
     def drawn(self) -> tuple[Any, Any]:
@@ -130,71 +120,20 @@ class Pipeline:
 
         Either the light or the materials may have moved, since each record holds the other fixed.
         """
-        (radiance, light_record, vertex_record), (_, plane_record) = self.drawn
-        light, before = (incident(light_record, self.light(at)) for at in (raw, self.raw))
-        moved = pixel_sums(light_record, light) - pixel_sums(light_record, before)
-        of_object = self.samples[0]
+        (radiance, light_record, vertex_record), (plane, plane_record) = self.drawn
+        foreground = torch.from_numpy(radiance).double()
+        lit, unoccluded = torch.from_numpy(plane.lit), torch.from_numpy(plane.unoccluded)
+        if any(not torch.equal(raw[name], self.raw[name]) for name in LIGHT):
+            after, before = (object_sums(light_record, self.light(at)) for at in (raw, self.raw))
+            foreground += after - before
+            lit, unoccluded = plane_sums(plane_record, self.light(raw))
+        if any(not torch.equal(raw[name], self.raw[name]) for name in MATERIAL):
+            factors = plain_factors(self.materials(raw))
+            arrays = SceneMaterials(self.mis.renderer, factors).arrays
+            shaded = shade_vertices(self.samples[0], vertex_record, arrays)
+            foreground = torch.from_numpy(path_means(self.samples[0], shaded))
         with torch.no_grad():
-            factors = self.materials(raw)
-            arrays = SceneMaterials(
-                self.mis.renderer,
-                (factors.base_color, factors.metallic, factors.roughness, factors.emission),
-            ).arrays
-            shaded = shade_vertices(of_object, vertex_record, arrays)
-        assert not moved.any() or np.allclose(shaded, radiance, rtol=1e-5, atol=1e-6)
-        Li = incident(plane_record, self.light(raw))
-        lit, unoccluded = (pixel_sums(plane_record, Li, column=column) for column in (0, 1))
-        halves = (torch.from_numpy(a.astype(np.float32)) for a in (shaded + moved, lit, unoccluded))
-        with torch.no_grad():
-            return float(self.loss(raw, Radiance(*halves)))
-
-
-def incident(record: LightRecord, light: LightTensors) -> Float64Array:
-    """Radiance from each recorded direction, 0 behind the last, shape [pixel, capacity, 3]."""
-    wi = record.wi.numpy().astype(np.float64)
-    used = np.arange(wi.shape[1]) < record.count.numpy()[:, None]
-    out = np.zeros(wi.shape)
-    lobes = (light.amplitude, light.axis, light.sharpness)
-    amplitude, axis, sharpness = (t.detach().double().numpy() for t in lobes if t is not None)
-    assert light.texels is not None
-    # As the kernel, also where the axis is not of unit length
-    distance = ((wi[used][:, None] - axis) ** 2).sum(axis=-1)
-    out[used] = np.exp(-0.5 * sharpness * distance) @ amplitude
-    uv = oracles.latlong_uv(wi[used])
-    out[used] += oracles.bilinear_lookup(light.texels.detach().double().numpy(), uv)
-    return out
-
-
-def pixel_sums(
-    record: LightRecord, Li: Float64Array, column: int | slice = slice(None)
-) -> Float64Array:
-    """Pixels under incident radiance ``Li``, shape [pixel, 3]; weights are in ``column``."""
-    used = np.arange(Li.shape[1]) < record.count.numpy()[:, None]
-    weight = np.where(used[..., None], record.weight.numpy(), 0.0).astype(np.float64)
-    weight = weight[..., column, None] if isinstance(column, int) else weight
-    return np.asarray((weight * Li).sum(axis=1))
-
-
-def shade_vertices(
-    samples: ObjectSamples, record: VertexRecord, factors: list[wp.array]
-) -> Float64Array:
-    """The object's pixels by the attached kernel, shape [pixel, 3]."""
-    pixels, device = record.material.shape[0], samples.mis.renderer.device
-    paths = pixels * samples.path_count
-    throughput = wp.full(paths, wp.vec3(1.0), dtype=wp.vec3, device=device)
-    total = np.zeros((paths, 3))
-    for k in range(samples.mis.depth + 1):
-        contribution, onward = (wp.empty(paths, dtype=wp.vec3, device=device) for _ in range(2))
-        wp.launch(
-            shade_vertex,
-            dim=paths,
-            inputs=[record, samples.path_count, k, *factors, throughput],
-            outputs=[contribution, onward],
-            device=device,
-        )
-        total += contribution.numpy()
-        throughput = onward
-    return np.asarray(total.reshape(pixels, samples.path_count, 3).mean(axis=1))
+            return float(self.loss(raw, Radiance(foreground, lit, unoccluded)))
 
 
 @pytest.fixture(
@@ -253,13 +192,31 @@ def gradient(pipeline: Pipeline) -> dict[str, Tensor]:
 
 
 def test_pinned_render_equals_the_free_one(pipeline: Pipeline) -> None:
-    """Recorded samples evaluated by the attached kernels give what the path tracer gave."""
-    free = float(pipeline.free(pipeline.raw))
-    assert pipeline.pinned(pipeline.raw) == pytest.approx(free, rel=1e-6)
+    """Records hold the picture: its light summed in float64, its materials by the kernel."""
+    (radiance, light_record, vertex_record), (plane, plane_record) = pipeline.drawn
+    with torch.no_grad():
+        light, materials = pipeline.light(pipeline.raw), pipeline.materials(pipeline.raw)
+        free = pipeline.mis.radiance(light, light, SEED, materials)
+        lit, unoccluded = plane_sums(plane_record, light)
+        reflected = object_sums(light_record, light)
+        arrays = SceneMaterials(pipeline.mis.renderer, plain_factors(materials)).arrays
+    shaded = path_means(
+        pipeline.samples[0], shade_vertices(pipeline.samples[0], vertex_record, arrays)
+    )
+    np.testing.assert_array_equal(radiance, free.foreground)
+    np.testing.assert_array_equal(plane.lit, free.lit)
+    np.testing.assert_allclose(shaded, radiance, rtol=1e-5, atol=1e-6)
+    np.testing.assert_allclose(lit, plane.lit, rtol=1e-5, atol=1e-6)
+    np.testing.assert_allclose(unoccluded, plane.unoccluded, rtol=1e-5, atol=1e-6)
+    dark = replace(materials, emission=torch.zeros_like(pipeline.raw["emission"]))
+    with torch.no_grad():
+        unlit = pipeline.mis.radiance(light, light, SEED, dark).foreground
+    np.testing.assert_allclose(reflected, unlit, rtol=1e-5, atol=1e-6)
 
 
 PARAMETERS = (
-    "amplitude", "axis", "sharpness", "texels", "base_color", "metallic", "roughness", "emission",
+    *LIGHT,
+    *MATERIAL,
     "curve_fg_widths", "curve_fg_heights", "curve_fg_slopes",
     "curve_shadow_widths", "curve_shadow_heights", "curve_shadow_slopes",
 )  # fmt: skip

@@ -17,10 +17,11 @@ LEVELS = (
     {"gltf"},
     {"inputs", "scene"},
     {"render", "lighting"},
-    {"picture"},
+    {"picture", "samples"},
     {"integrator", "fusion"},
     {"bridge"},
-    {"mis", "transport"},
+    {"mis"},
+    {"transport"},
     {"optimize", "fit"},
     {"stages"},
     {"demo"},
@@ -31,7 +32,7 @@ UPWARD = {("asset", "gltf"), ("asset", "obj")}
 
 # Where a package may be imported at all. A folder stands for all modules in it.
 ONLY_IN = {
-    "warp": {"kernels", "scene", "render", "bridge"},
+    "warp": {"kernels", "scene", "render", "samples", "bridge", "transport"},
     "torch": {
         "diffusion", "tone", "bridge", "integrator", "fusion", "mis", "transport", "optimize",
         "fit", "stages", "insert", "prior_images",
