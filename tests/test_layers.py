@@ -20,8 +20,10 @@ LEVELS = (
     {"picture", "samples"},
     {"integrator", "fusion"},
     {"bridge"},
-    {"mis"},
+    {"mis", "transport_rows", "transport_matrix"},
+    {"transport_cache"},
     {"transport"},
+    {"transport_choice"},
     {"optimize", "fit"},
     {"stages"},
     {"demo"},
@@ -32,9 +34,12 @@ UPWARD = {("asset", "gltf"), ("asset", "obj")}
 
 # Where a package may be imported at all. A folder stands for all modules in it.
 ONLY_IN = {
-    "warp": {"kernels", "scene", "render", "samples", "bridge", "transport"},
+    "warp": {
+        "kernels", "scene", "render", "samples", "bridge", "transport", "transport_rows",
+    },
     "torch": {
-        "diffusion", "tone", "bridge", "integrator", "fusion", "mis", "transport", "optimize",
+        "diffusion", "tone", "bridge", "integrator", "fusion", "mis", "transport",
+        "transport_cache", "transport_choice", "transport_matrix", "optimize",
         "fit", "stages", "insert", "prior_images",
     },
     "trimesh": {"gltf", "obj", "demo"},
@@ -44,7 +49,7 @@ ONLY_IN = {
     "diffusers": {"diffusion"},
     "transformers": {"diffusion"},
     "peft": {"diffusion"},
-    "safetensors": {"diffusion", "optimize"},
+    "safetensors": {"diffusion", "optimize", "transport_cache"},
     "colour": {"color"},
     "yaml": {"command"},
     "rich": {"record"},

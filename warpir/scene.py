@@ -6,7 +6,7 @@ become float32, so an object 100 km from the origin keeps its precision.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -164,6 +164,21 @@ class Scene:
         args.fx, args.fy, args.cx, args.cy = camera.fx, camera.fy, camera.cx, camera.cy
         args.width = camera.width
         return args
+
+    def contents(self) -> Iterator[NDArray[np.generic]]:
+        """Yield every number that a ray can depend on, in a fixed order, for hashing."""
+        structs = (
+            self.mesh_args,
+            self.material_args,
+            self.texture_args,
+            self.camera_args,
+            self.proxy_args,
+        )
+        for args in structs:
+            for name in args._cls.vars:
+                value = getattr(args, name)
+                if name != "id":  # a pointer
+                    yield value.numpy() if isinstance(value, wp.array) else np.asarray(value)
 
     def _array(self, values: NDArray[np.generic], dtype: type) -> wp.array:
         return wp.array(values, dtype=dtype, device=self.device)

@@ -1,21 +1,19 @@
 """`transport`, the integrator inside the optimisation: trace once, then every step is a product.
 
-Light transport is linear in the light, and geometry, camera and materials stand still. `trace`
+Light transport is linear in the light, and geometry, camera and materials stand still. Tracing
 writes for each pixel what each texel of a lat-long map sends into it (``T_fg``: object, any depth)
-or how much of it the object keeps from the ground plane (``T_shadow``). A step is then
-``T L`` and its gradient ``T^T d``; no ray is cast. The kernels are `warpir.kernels.transport`.
+or how much of it the object keeps from the ground plane (``T_shadow``). A step is then ``T L`` and
+its gradient ``T^T d``; no ray is cast. The kernels are `warpir.kernels.transport`.
 
 What the numbers are unbiased for is the map they are handed: lobes are averaged over its texels
-first. `edge_width` says what that costs a shadow's edge; lobes too narrow for the texels can be
-left to `warpir.mis` (`TransportSettings.sharp_samples`).
+first. `edge_width` says what that costs a shadow's edge. Lobes too narrow for the texels are left
+to `warpir.mis` (`TransportSettings.sharp_samples`), so that a sun is never blurred silently.
 """
 
 from __future__ import annotations
 
 import time
-from collections.abc import Iterator
-from dataclasses import dataclass
-from typing import Any
+from pathlib import Path
 
 import numpy as np
 import torch
@@ -24,41 +22,23 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from warpir.bridge import rasterize
-from warpir.color import luminance
+from warpir.errors import ExitCode, InputError
 from warpir.integrator import LightTensors, MaterialTensors, Radiance
-from warpir.kernels import transport as kernels
-from warpir.light import Light, as_map, map_directions, texel_solid_angles
+from warpir.light import Light
 from warpir.mis import MisIntegrator
-from warpir.render import Renderer, Rows, index_of, light_args
+from warpir.render import Renderer, index_of
+from warpir.transport_cache import content_key, load_rows, save_rows
+from warpir.transport_matrix import DenseRows, SparseRows, product
+from warpir.transport_rows import (
+    TransportSettings,
+    object_rows,
+    proxy_rows,
+    sharpness_limit,
+    tent_irradiance,
+)
 
 IntArray = NDArray[np.int32]
-FloatArray = NDArray[np.float32]
 Float64Array = NDArray[np.float64]
-
-CHUNK_BYTES = 64 << 20
-"""Memory of the rows that are traced at once, before they are stored in the small type."""
-
-
-@dataclass(frozen=True)
-class TransportSettings:
-    """How finely light transport is traced and stored."""
-
-    height_fg: int = 32
-    """Rows of the map that lights the object; it is twice as wide."""
-    height_shadow: int = 32
-    """Rows of the map that casts the shadow."""
-    subsamples: int = 32
-    """Positions within each pixel."""
-    paths: int = 64
-    """Paths per pixel, for narrow specular lobes and for all light of two or more interactions."""
-    bright_directions: int = 1024
-    """Directions per pixel and map that are shared out by where light is expected, on top of one
-    per texel."""
-    sharp_samples: int = 0
-    """Camera samples per step with which `warpir.mis` adds lobes narrower than half a texel; with 0
-    they are averaged over their texels like all others."""
-    dtype: torch.dtype = torch.bfloat16
-    """Type in which the rows are stored."""
 
 
 class TransportIntegrator:
@@ -69,15 +49,20 @@ class TransportIntegrator:
         object_pixels: Row-major pixels that may show the object, shape [object_pixel].
         proxy_pixels: Row-major pixels whose plane the object may shade, shape [proxy_pixel].
         depth: Surface interactions of the object's paths.
-        settings: Resolution and counts.
+        settings: Resolution and counts; `warpir.transport_choice` finds them from an error target.
         expected: Light that is likely, for putting directions where they matter; what is stored is
             right for every light.
         seed: Base seed of the frozen samples.
+        cache: Folder in which traced rows are kept and found again, or None.
 
     Attributes:
         mask: Coverage of the object pixels [1], shape [object_pixel].
-        seconds_traced: What tracing took [s].
+        seconds_traced: What tracing took, or reading the cache [s].
+        is_cached: Whether the rows came from the cache.
         bytes: Memory that the rows take.
+
+    Raises:
+        InputError: The rows need more memory than the settings allow.
     """
 
     differentiates = frozenset({"light"})
@@ -91,68 +76,106 @@ class TransportIntegrator:
         settings: TransportSettings | None = None,
         expected: Light | None = None,
         seed: int = 0,
+        cache: Path | None = None,
     ) -> None:
         self.renderer = renderer
         self.object_pixels = object_pixels
         self.proxy_pixels = proxy_pixels
         self.depth = depth
         self.settings = settings or TransportSettings()
-        self.device = _torch_device(renderer.device)
+        self.device = torch.device(str(wp.device_to_torch(renderer.device)))
+        expected = expected or Light(texels=np.ones((8, 16, 3), np.float32))
+        height = self.settings.height_shadow
+        irradiance = tent_irradiance(renderer.scene.proxy.normal, height).reshape(-1)
+        above = np.flatnonzero(irradiance > 0.0).astype(np.int32)
+        self.above = torch.from_numpy(above.astype(np.int64)).to(self.device)
+        self.irradiance = torch.from_numpy(irradiance[above].astype(np.float32)).to(self.device)
+
         start = time.perf_counter()
-        self._trace(expected or Light(texels=np.ones((8, 16, 3), np.float32)), seed)
+        stored = None
+        if cache is not None:
+            key = content_key(
+                renderer.scene, object_pixels, proxy_pixels, depth, self.settings, expected, seed
+            )
+            stored = load_rows(cache / f"{key}.safetensors", self.device)
+        self.is_cached = stored is not None
+        if stored is None:
+            self._check_memory(0)
+            stored = self._trace_object(expected, seed) | self._trace_proxy(above, expected, seed)
+            if cache is not None:
+                save_rows(cache / f"{key}.safetensors", stored)
+        self.T_fg = DenseRows(stored["T_fg"])
+        self.T_shadow = SparseRows(
+            stored["row"], stored["column"], stored["blocked"], (len(proxy_pixels), len(above))
+        )
+        self.emission = stored["emission"]
+        self.mask = stored["mask"].cpu().numpy()
         wp.synchronize_device(renderer.device)
         self.seconds_traced = time.perf_counter() - start
         self.bytes = self.T_fg.bytes + self.T_shadow.bytes
-
-    def _trace(self, expected: Light, seed: int) -> None:
-        settings = self.settings
-        objects, height = len(self.object_pixels), settings.height_fg
-        T_fg = torch.empty(
-            (3, objects, 2 * height * height), dtype=settings.dtype, device=self.device
+        self.sharp = MisIntegrator(
+            renderer,
+            object_pixels,
+            proxy_pixels,
+            spp=max(self.settings.sharp_samples, 1),
+            rays=1,
+            depth=depth,
         )
-        self.T_fg = DenseRows(T_fg)
-        self.emission = torch.empty((objects, 3), device=self.device)
-        self.mask = np.zeros(objects, np.float32)
-        for rows, T, emission, mask in _object_rows(
+
+    def _check_memory(self, entries: int) -> None:
+        """Compare the size of both matrices, with so many sparse entries, with the limit."""
+        settings = self.settings
+        texels = 2 * settings.height_fg**2
+        wide = 2 if settings.dtype == "bfloat16" else 4
+        needed = 3 * wide * len(self.object_pixels) * texels + SparseRows.BYTES * entries
+        if needed > settings.memory_mib << 20:
+            raise InputError(
+                "memory_mib",
+                f"light transport of {len(self.object_pixels)} object pixels and {texels} texels "
+                f"needs {needed / 2**20:.0f} MiB or more, the limit is {settings.memory_mib} MiB",
+                "lower the map's height or the resolution, or raise the limit",
+                ExitCode.RESOURCES,
+            )
+
+    def _trace_object(self, expected: Light, seed: int) -> dict[str, Tensor]:
+        settings, count = self.settings, len(self.object_pixels)
+        dtype = {"bfloat16": torch.bfloat16, "float32": torch.float32}[settings.dtype]
+        shape = (3, count, 2 * settings.height_fg**2)
+        T_fg = torch.empty(shape, dtype=dtype, device=self.device)
+        emission = torch.empty((count, 3), device=self.device)
+        mask = torch.empty(count, device=self.device)
+        for rows, T, emitted, coverage in object_rows(
             self.renderer, self.object_pixels, self.depth, settings, expected, seed
         ):
-            T_fg[:, rows] = wp.to_torch(T).permute(2, 0, 1)
-            self.emission[rows] = wp.to_torch(emission)
-            self.mask[rows] = mask
+            T_fg[:, rows] = wp.to_torch(T).permute(2, 0, 1).to(dtype)
+            emission[rows] = wp.to_torch(emitted)
+            mask[rows] = wp.to_torch(coverage).to(torch.float32) / settings.subsamples
+        return {"T_fg": T_fg, "emission": emission, "mask": mask}
 
-        # Of the plane only texels above its horizon and pixels that lose some light are kept.
-        scene, height = self.renderer.scene, settings.height_shadow
-        irradiance = tent_irradiance(scene.proxy.normal, height).reshape(-1)
-        above = np.flatnonzero(irradiance > 0.0)
-        self.above = torch.from_numpy(above).to(self.device)
-        self.irradiance = torch.from_numpy(irradiance[above].astype(np.float32)).to(self.device)
+    def _trace_proxy(self, above: IntArray, expected: Light, seed: int) -> dict[str, Tensor]:
+        """Keep what is not zero: most of the plane loses little of the sky."""
+        scene = self.renderer.scene
         index = index_of(self.object_pixels, scene.camera.width * scene.camera.height)
         may_see_object = (index[self.proxy_pixels] >= 0).astype(np.int32)
-        chunks = []
-        first = 0
-        for blocked in _proxy_rows(
-            self.renderer,
-            self.proxy_pixels,
-            may_see_object,
-            above.astype(np.int32),
-            settings,
-            expected,
-            seed,
+        none = torch.zeros(0, dtype=torch.int32, device=self.device)
+        rows, columns, values = [none], [none], [none.to(torch.float32)]
+        first = entries = 0
+        for share in proxy_rows(
+            self.renderer, self.proxy_pixels, may_see_object, above, self.settings, expected, seed
         ):
-            share = wp.to_torch(blocked)
-            row, column = torch.nonzero(share, as_tuple=True)
-            values = share[row, column] * self.irradiance[column]
-            chunks.append(((row + first).to(torch.int32), column.to(torch.int32), values))
-            first += len(share)
-        self.T_shadow = SparseRows(chunks, (len(self.proxy_pixels), len(above)), self.device)
-        self.sharp = MisIntegrator(
-            self.renderer,
-            self.object_pixels,
-            self.proxy_pixels,
-            spp=max(settings.sharp_samples, 1),
-            rays=1,
-            depth=self.depth,
-        )
+            dense = wp.to_torch(share)
+            row, column = torch.nonzero(dense, as_tuple=True)
+            rows.append((row + first).to(torch.int32))
+            columns.append(column.to(torch.int32))
+            values.append(dense[row, column] * self.irradiance[column])
+            first += len(dense)
+            entries += len(row)
+            self._check_memory(entries)
+        return {
+            "row": torch.cat(rows),
+            "column": torch.cat(columns),
+            "blocked": torch.cat(values),
+        }
 
     def radiance(
         self,
@@ -168,7 +191,7 @@ class TransportIntegrator:
         Raises:
             ValueError: Materials are given: the stored rows hold the scene's own.
         """
-        if materials is not None and materials != MaterialTensors():
+        if materials is not None and any(v is not None for v in vars(materials).values()):
             raise ValueError("transport is frozen for the scene's materials: use mis")
         settings = self.settings
         sharp_fg, broad_fg = self._split(light_fg, settings.height_fg)
@@ -183,8 +206,9 @@ class TransportIntegrator:
         if sharp_fg is not None or sharp_shadow is not None:
             dark = _dark(light_fg)
             own = self.sharp.radiance(sharp_fg or dark, sharp_shadow or dark, seed)
-            foreground = foreground + own.foreground
-            lit, unoccluded = lit + own.lit, unoccluded + own.unoccluded
+            foreground = foreground + own.foreground.to(self.device)
+            lit = lit + own.lit.to(self.device)
+            unoccluded = unoccluded + own.unoccluded.to(self.device)
         where = _device_of(light_fg)
         return Radiance(foreground.to(where), lit.to(where), unoccluded.to(where))
 
@@ -193,7 +217,8 @@ class TransportIntegrator:
         if light.sharpness is None or self.settings.sharp_samples == 0:
             return None, light
         assert light.amplitude is not None and light.axis is not None
-        is_sharp = light.sharpness.detach() > sharpness_limit(height)
+        limit = self.settings.sharpness_max or sharpness_limit(height)
+        is_sharp = light.sharpness.detach() > limit
         if not bool(is_sharp.any()):
             return None, light
 
@@ -217,11 +242,6 @@ class TransportIntegrator:
         return texels
 
 
-def sharpness_limit(height: int) -> float:
-    """Return the sharpness whose standard deviation is half a texel of a map of that height."""
-    return 4.0 * (height / np.pi) ** 2
-
-
 def edge_width(sharpness: float, height: int) -> tuple[float, float]:
     """Return the standard deviation of a lobe and of its image on a map [rad].
 
@@ -230,48 +250,6 @@ def edge_width(sharpness: float, height: int) -> tuple[float, float]:
     """
     texel = np.pi / height
     return 1.0 / np.sqrt(sharpness), float(np.sqrt(1.0 / sharpness + 0.25 * texel * texel))
-
-
-def tent_solid_angles(height: int) -> Float64Array:
-    """Return the solid angle of a texel's tent in each row [sr], shape [height].
-
-    That is what bilinear interpolation weighs a texel with; all texels sum to 4 pi. Within the map
-    ``2 (1 - cos d) / d sin(theta)``, in the polar rows the lookup is clamped.
-    """
-    step = np.pi / height
-    centre = (np.arange(height) + 0.5) * step
-    rows = np.sin(centre) * 2.0 * (1.0 - np.cos(step)) / step
-    polar = 1.0 - np.cos(0.5 * step)
-    beyond = np.cos(0.5 * step) - (np.sin(1.5 * step) - np.sin(0.5 * step)) / step
-    rows[0] = rows[-1] = polar + beyond
-    return rows * np.pi / height
-
-
-def tent_irradiance(normal: Float64Array, height: int) -> Float64Array:
-    """Return what a texel of radiance 1 makes a white plane reflect [1], shape [height, 2 height].
-
-    ``integral of tent cos / pi`` by quadrature; all texels of a constant sky sum to 1.
-    """
-    side = max(4, 1024 // height)
-    fine = side * height
-    cosine = np.maximum(map_directions(fine, 2 * fine) @ normal, 0.0) / np.pi
-    cosine *= texel_solid_angles(fine, 2 * fine)[:, None]
-
-    def tents(count: int, wraps: bool) -> Float64Array:
-        """Interpolation weights of ``side * count`` positions, shape [side * count, count]."""
-        x = (np.arange(side * count) + 0.5) / side - 0.5
-        low = np.floor(x).astype(int)
-        weight = x - low
-        first, second = low % count, (low + 1) % count
-        if not wraps:
-            first, second = np.clip(low, 0, count - 1), np.clip(low + 1, 0, count - 1)
-        matrix = np.zeros((side * count, count))
-        np.add.at(matrix, (np.arange(side * count), first), 1.0 - weight)
-        np.add.at(matrix, (np.arange(side * count), second), weight)
-        return matrix
-
-    irradiance: Float64Array = tents(height, False).T @ cosine @ tents(2 * height, True)
-    return irradiance
 
 
 def resize(texels: Tensor, height: int) -> Tensor:
@@ -303,134 +281,6 @@ def resize(texels: Tensor, height: int) -> Tensor:
     return torch.einsum("ai,bj,ijc->abc", by_row, by_column, texels)
 
 
-def direction_counts(expected: Light, height: int, budget: int) -> NDArray[np.int32]:
-    """Return how many directions each texel gets: one, and more where light is expected.
-
-    A texel's noise is proportional to its flux, so equal-cost directions are best shared out in
-    proportion to it (Neyman's allocation); powers of two keep the sequences stratified.
-    """
-    flux = luminance(as_map(expected, height).astype(np.float64))
-    flux = flux * tent_solid_angles(height)[:, None]
-    share = budget * flux / max(float(flux.sum()), 1e-30)
-    counts = np.exp2(np.floor(np.log2(np.maximum(share, 1.0)))).astype(np.int32)
-    flat: NDArray[np.int32] = counts.reshape(-1)
-    return flat
-
-
-class SparseRows:
-    """A float32 matrix that is mostly zero, stored by rows and, for the transpose, by columns.
-
-    Args:
-        parts: Row, column (int32) and value of the entries, sorted by row, then column.
-        shape: Rows and columns.
-        device: Where to keep them.
-    """
-
-    def __init__(
-        self,
-        parts: list[tuple[Tensor, Tensor, Tensor]],
-        shape: tuple[int, int],
-        device: torch.device,
-    ) -> None:
-        empty = torch.zeros(0, dtype=torch.int32), torch.zeros(0, dtype=torch.int32), torch.zeros(0)
-        columns_of = zip(*(parts or [empty]), strict=True)
-        row, column, values = (torch.cat(c).to(device) for c in columns_of)
-        self.by_row = _csr(row, column, values, shape)
-        order = torch.argsort(column, stable=True)
-        self.by_column = _csr(column[order], row[order], values[order], shape[::-1])
-
-    @property
-    def bytes(self) -> int:
-        """Memory of both copies."""
-        parts = [
-            part
-            for m in (self.by_row, self.by_column)
-            for part in (m.values(), m.crow_indices(), m.col_indices())
-        ]
-        return sum(part.numel() * part.element_size() for part in parts)
-
-    def times(self, x: Tensor) -> Tensor:
-        """Return the product with ``x``, shape [column, k]."""
-        return self.by_row @ x
-
-    def transposed_times(self, d: Tensor) -> Tensor:
-        """Return the transpose's product with ``d``, shape [row, k]."""
-        return self.by_column @ d
-
-
-def _csr(rows: Tensor, columns: Tensor, values: Tensor, shape: tuple[int, int]) -> Tensor:
-    """Build a CSR matrix from entries sorted by row; int32 indices are what MKL is fast with."""
-    start = torch.zeros(shape[0] + 1, dtype=torch.int32, device=values.device)
-    start[1:] = torch.cumsum(torch.bincount(rows, minlength=shape[0]), 0)
-    return torch.sparse_csr_tensor(start, columns, values, shape, check_invariants=False)
-
-
-class DenseRows:
-    """A matrix per channel in a small type.
-
-    Args:
-        T: Shape [3, row, column].
-    """
-
-    def __init__(self, T: Tensor) -> None:
-        self.T = T
-
-    @property
-    def bytes(self) -> int:
-        """Memory."""
-        return self.T.numel() * self.T.element_size()
-
-    def times(self, x: Tensor) -> Tensor:
-        """Return each channel's product with its column of ``x``, shape [column, 3]."""
-        columns = [_multiply(self.T[c], x[:, c : c + 1]) for c in range(3)]
-        return torch.cat(columns, dim=1)
-
-    def transposed_times(self, d: Tensor) -> Tensor:
-        """Return the transposes' products with the columns of ``d``, shape [row, 3]."""
-        columns = [_multiply(self.T[c].t(), d[:, c : c + 1]) for c in range(3)]
-        return torch.cat(columns, dim=1)
-
-
-class _Product(torch.autograd.Function):
-    @staticmethod
-    def forward(ctx: Any, T: DenseRows | SparseRows, x: Tensor) -> Tensor:
-        ctx.T = T
-        return T.times(x)
-
-    @staticmethod
-    def backward(ctx: Any, *d_outputs: Tensor) -> tuple[Tensor | None, ...]:
-        return None, ctx.T.transposed_times(d_outputs[0].contiguous())
-
-
-def product(T: DenseRows | SparseRows, x: Tensor) -> Tensor:
-    """Return ``T x`` in float32; the gradient reaches ``x`` alone.
-
-    Args:
-        T: Stored rows.
-        x: float32, shape [column, 3].
-    """
-    out: Tensor = _Product.apply(T, x)  # type: ignore[no-untyped-call]
-    return out
-
-
-def _multiply(T: Tensor, x: Tensor) -> Tensor:
-    """Multiply a matrix of small type with float32 columns.
-
-    Two columns of the small type hold a float32 number to 16 bits, so that rounding the light does
-    not scale a whole picture; reading ``T`` is what takes the time.
-    """
-    if T.dtype == torch.float32:
-        return T @ x
-    high = x.to(T.dtype)
-    low = (x - high.to(x.dtype)).to(T.dtype)
-    both = (T @ torch.cat([high, low], dim=1)).to(x.dtype)
-    return both[:, : x.shape[1]] + both[:, x.shape[1] :]
-
-
-def _torch_device(device: wp.Device) -> torch.device:
-    return torch.device(str(wp.device_to_torch(device)))
-
-
 def _device_of(light: LightTensors) -> torch.device:
     tensors = (light.amplitude, light.texels)
     return next(t.device for t in tensors if t is not None)
@@ -444,186 +294,3 @@ def _dark(like: LightTensors) -> LightTensors:
         torch.tensor([[0.0, 1.0, 0.0]], device=where),
         torch.ones(1, device=where),
     )
-
-
-def _texel_args(counts: NDArray[np.int32], height: int, device: wp.Device) -> kernels.TexelArgs:
-    args = kernels.TexelArgs()
-    args.height, args.width = height, 2 * height
-    args.d_omega = wp.array(
-        tent_solid_angles(height).astype(np.float32), dtype=float, device=device
-    )
-    args.direction_count = wp.array(counts, dtype=int, device=device)
-    return args
-
-
-def _object_rows(
-    renderer: Renderer,
-    pixels: IntArray,
-    depth: int,
-    settings: TransportSettings,
-    expected: Light,
-    seed: int,
-) -> Iterator[tuple[slice, wp.array, wp.array, FloatArray]]:
-    """Trace the object's rows chunk by chunk: rows, T [row, texel], emission, coverage."""
-    scene, device, height = renderer.scene, renderer.device, settings.height_fg
-    counts = direction_counts(expected, height, settings.bright_directions)
-    texels = _texel_args(counts, height, device)
-    texel_count = 2 * height * height
-    # Half of the later vertices' directions look for the expected light, half everywhere.
-    map_ = as_map(expected, height)
-    flux = luminance(map_.astype(np.float64))
-    mean = float((flux * texel_solid_angles(height, 2 * height)[:, None]).sum()) / (4.0 * np.pi)
-    flat = 0.5 + 0.5 * flux / mean if mean > 0.0 else np.ones_like(flux)
-    proposal = light_args(
-        Light(texels=np.repeat(flat[..., None], 3, axis=2).astype(np.float32)), device
-    )
-    size = max(1, CHUNK_BYTES // (12 * texel_count))
-    for start in range(0, len(pixels), size):
-        chunk = pixels[start : start + size]
-        count = len(chunk)
-        rows = Rows(wp.array(chunk, dtype=wp.int32, device=device))
-        geometry = (scene.mesh_args, scene.material_args, scene.texture_args)
-        points = kernels.SurfacePoints()
-        shape = (count, settings.subsamples)
-        points.count = wp.zeros(count, dtype=int, device=device)
-        for name in ("position", "ng", "n", "wo", "base_color"):
-            setattr(points, name, wp.empty(shape, dtype=wp.vec3, device=device))
-        for name in ("metallic", "roughness"):
-            setattr(points, name, wp.empty(shape, dtype=float, device=device))
-        emission = wp.zeros(count, dtype=wp.vec3, device=device)
-        T = wp.empty((count, texel_count), dtype=wp.vec3, device=device)
-        renderer.launch(
-            kernels.trace_points,
-            count,
-            [
-                rows,
-                scene.camera_args,
-                *geometry,
-                scene.proxy_args,
-                settings.subsamples,
-                seed,
-                Rows(points),
-                Rows(emission),
-            ],
-            settings.subsamples,
-            "transport",
-        )
-        renderer.launch(
-            kernels.trace_direct,
-            count,
-            [
-                rows,
-                Rows(points),
-                *geometry,
-                texels,
-                settings.subsamples,
-                settings.paths,
-                seed,
-                Rows(T),
-            ],
-            int(counts.sum()),
-            "transport",
-            texel_count,
-        )
-        if settings.paths > 0:
-            renderer.launch(
-                kernels.trace_paths,
-                count,
-                [
-                    rows,
-                    Rows(points),
-                    *geometry,
-                    texels,
-                    proposal,
-                    settings.subsamples,
-                    settings.paths,
-                    depth,
-                    seed,
-                    Rows(T),
-                    Rows(emission),
-                ],
-                settings.paths * depth,
-                "transport",
-                settings.paths,
-            )
-        coverage = points.count.numpy().astype(np.float32) / settings.subsamples
-        yield slice(start, start + count), T, emission, coverage
-
-
-def _proxy_rows(
-    renderer: Renderer,
-    pixels: IntArray,
-    may_see_object: IntArray,
-    columns: IntArray,
-    settings: TransportSettings,
-    expected: Light,
-    seed: int,
-) -> Iterator[wp.array]:
-    """Trace the plane's rows chunk by chunk: blocked share, shape [row, column]."""
-    scene, device, height = renderer.scene, renderer.device, settings.height_shadow
-    counts = direction_counts(expected, height, settings.bright_directions)
-    texels = _texel_args(counts, height, device)
-    centres = map_directions(height, 2 * height).reshape(-1, 3)[columns].astype(np.float32)
-    low, high = (b - scene.origin for b in scene.bounds)
-    margin = scene.mesh_args.epsilon
-    corners = (
-        wp.vec3(*(low - margin).astype(np.float32)),
-        wp.vec3(*(high + margin).astype(np.float32)),
-    )
-    radius = 0.5 * scene.diagonal + 2.0 * margin
-    reach = 1.5 * np.pi / height
-    size = max(1, CHUNK_BYTES // (4 * len(columns)))
-    if scene.triangle_count == 0:
-        return
-    geometry = (scene.mesh_args, scene.material_args, scene.texture_args, scene.proxy_args)
-    wp_columns = wp.array(columns, dtype=int, device=device)
-    wp_centres = wp.array(centres, dtype=wp.vec3, device=device)
-    for start in range(0, len(pixels), size):
-        chunk = pixels[start : start + size]
-        count = len(chunk)
-        rows = Rows(wp.array(chunk, dtype=wp.int32, device=device))
-        may_see = wp.array(may_see_object[start : start + size], dtype=int, device=device)
-        filled = wp.zeros(count, dtype=int, device=device)
-        position = wp.empty((count, settings.subsamples), dtype=wp.vec3, device=device)
-        cone = wp.zeros(count, dtype=wp.vec4, device=device)
-        renderer.launch(
-            kernels.trace_proxy_points,
-            count,
-            [
-                rows,
-                Rows(may_see),
-                scene.camera_args,
-                *geometry,
-                radius,
-                reach,
-                settings.subsamples,
-                seed,
-                Rows(filled),
-                Rows(position),
-                Rows(cone),
-            ],
-            settings.subsamples,
-            "transport",
-        )
-        blocked = wp.empty((count, len(columns)), dtype=float, device=device)
-        renderer.launch(
-            kernels.trace_blocked,
-            count,
-            [
-                rows,
-                Rows(filled),
-                Rows(position),
-                Rows(cone),
-                *geometry,
-                *corners,
-                texels,
-                wp_columns,
-                wp_centres,
-                seed,
-                Rows(blocked),
-            ],
-            len(columns) // 4,
-            "transport",
-            len(columns),
-        )
-        yield blocked

@@ -1,0 +1,118 @@
+"""Stored light transport: a dense matrix in a small type, a sparse one, and their products."""
+
+from __future__ import annotations
+
+import warnings
+from typing import Any
+
+import torch
+from torch import Tensor
+
+
+class SparseRows:
+    """A float32 matrix that is mostly zero, stored by rows and, for the transpose, by columns.
+
+    Args:
+        row: Of each entry, int32, rising, shape [entry].
+        column: Of each entry, int32, rising within a row, shape [entry].
+        values: float32, shape [entry].
+        shape: Rows and columns.
+    """
+
+    BYTES = 16
+    """Memory of one entry: value and int32 index, twice."""
+
+    def __init__(self, row: Tensor, column: Tensor, values: Tensor, shape: tuple[int, int]) -> None:
+        self.by_row = _csr(row, column, values, shape)
+        order = torch.argsort(column, stable=True)
+        self.by_column = _csr(column[order], row[order], values[order], (shape[1], shape[0]))
+
+    @property
+    def bytes(self) -> int:
+        """Memory of both copies."""
+        parts = [
+            part
+            for m in (self.by_row, self.by_column)
+            for part in (m.values(), m.crow_indices(), m.col_indices())
+        ]
+        return sum(part.numel() * part.element_size() for part in parts)
+
+    def times(self, x: Tensor) -> Tensor:
+        """Return the product with ``x``, shape [column, k]."""
+        return self.by_row @ x
+
+    def transposed_times(self, d: Tensor) -> Tensor:
+        """Return the transpose's product with ``d``, shape [row, k]."""
+        return self.by_column @ d
+
+
+def _csr(rows: Tensor, columns: Tensor, values: Tensor, shape: tuple[int, int]) -> Tensor:
+    """Build a CSR matrix from entries sorted by row; int32 indices are what MKL is fast with."""
+    start = torch.zeros(shape[0] + 1, dtype=torch.int32, device=values.device)
+    start[1:] = torch.cumsum(torch.bincount(rows, minlength=shape[0]), 0)
+    with warnings.catch_warnings():
+        # Torch calls its CSR layout a beta feature.
+        warnings.simplefilter("ignore", UserWarning)
+        return torch.sparse_csr_tensor(start, columns, values, shape, check_invariants=False)
+
+
+class DenseRows:
+    """A matrix per channel in a small type.
+
+    Args:
+        T: Shape [3, row, column].
+    """
+
+    def __init__(self, T: Tensor) -> None:
+        self.T = T
+
+    @property
+    def bytes(self) -> int:
+        """Memory."""
+        return self.T.numel() * self.T.element_size()
+
+    def times(self, x: Tensor) -> Tensor:
+        """Return each channel's product with its column of ``x``, shape [column, 3]."""
+        columns = [_multiply(self.T[c], x[:, c : c + 1]) for c in range(3)]
+        return torch.cat(columns, dim=1)
+
+    def transposed_times(self, d: Tensor) -> Tensor:
+        """Return the transposes' products with the columns of ``d``, shape [row, 3]."""
+        columns = [_multiply(self.T[c].t(), d[:, c : c + 1]) for c in range(3)]
+        return torch.cat(columns, dim=1)
+
+
+class _Product(torch.autograd.Function):
+    @staticmethod
+    def forward(ctx: Any, T: DenseRows | SparseRows, x: Tensor) -> Tensor:
+        ctx.T = T
+        return T.times(x)
+
+    @staticmethod
+    def backward(ctx: Any, *d_outputs: Tensor) -> tuple[Tensor | None, ...]:
+        return None, ctx.T.transposed_times(d_outputs[0].contiguous())
+
+
+def product(T: DenseRows | SparseRows, x: Tensor) -> Tensor:
+    """Return ``T x`` in float32; the gradient reaches ``x`` alone.
+
+    Args:
+        T: Stored rows.
+        x: float32, shape [column, 3].
+    """
+    out: Tensor = _Product.apply(T, x)  # type: ignore[no-untyped-call]
+    return out
+
+
+def _multiply(T: Tensor, x: Tensor) -> Tensor:
+    """Multiply a matrix of small type with float32 columns.
+
+    Two columns of the small type hold a float32 number to 16 bits, so that rounding the light does
+    not scale a whole picture; reading ``T`` is what takes the time.
+    """
+    if T.dtype == torch.float32:
+        return T @ x
+    high = x.to(T.dtype)
+    low = (x - high.to(x.dtype)).to(T.dtype)
+    both = (T @ torch.cat([high, low], dim=1)).to(x.dtype)
+    return both[:, : x.shape[1]] + both[:, x.shape[1] :]

@@ -1,0 +1,299 @@
+"""Trace the rows of light transport, chunk by chunk: launches `warpir.kernels.transport`."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import numpy as np
+import warp as wp
+from numpy.typing import NDArray
+
+from warpir.color import luminance
+from warpir.kernels import transport as kernels
+from warpir.light import Light, as_map, map_directions, texel_solid_angles
+from warpir.render import Renderer, Rows, light_args
+
+IntArray = NDArray[np.int32]
+FloatArray = NDArray[np.float32]
+Float64Array = NDArray[np.float64]
+
+CHUNK_BYTES = 64 << 20
+"""Memory of the rows that are traced at once, before they are stored in a small type."""
+
+
+@dataclass(frozen=True)
+class TransportSettings:
+    """How finely light transport is traced and stored."""
+
+    height_fg: int = 32
+    """Rows of the map that lights the object; it is twice as wide."""
+    height_shadow: int = 32
+    """Rows of the map that casts the shadow."""
+    subsamples: int = 32
+    """Positions within each pixel."""
+    paths: int = 64
+    """Paths per pixel, for narrow specular lobes and for all light of two or more interactions."""
+    bright_directions: int = 1024
+    """Directions per pixel and map that are shared out by where light is expected, on top of one
+    per texel."""
+    sharpness_max: float | None = None
+    """Lobes sharper than this are left to `warpir.mis`; None: those narrower than half a texel."""
+    sharp_samples: int = 4
+    """Camera samples per step of those lobes; with 0 they are averaged over texels like all."""
+    dtype: str = "bfloat16"
+    """Type in which the object's rows are stored, ``bfloat16`` or ``float32``."""
+    memory_mib: int = 1024
+    """Most memory that the stored rows may take [MiB]."""
+
+
+def sharpness_limit(height: int) -> float:
+    """Return the sharpness whose standard deviation is half a texel of a map of that height."""
+    return 4.0 * (height / np.pi) ** 2
+
+
+def tent_solid_angles(height: int) -> Float64Array:
+    """Return the solid angle of a texel's tent in each row [sr], shape [height].
+
+    That is what bilinear interpolation weighs a texel with; all texels sum to 4 pi. Within the map
+    ``2 (1 - cos d) / d sin(theta)``, in the polar rows the lookup is clamped.
+    """
+    step = np.pi / height
+    centre = (np.arange(height) + 0.5) * step
+    rows = np.sin(centre) * 2.0 * (1.0 - np.cos(step)) / step
+    polar = 1.0 - np.cos(0.5 * step)
+    beyond = np.cos(0.5 * step) - (np.sin(1.5 * step) - np.sin(0.5 * step)) / step
+    rows[0] = rows[-1] = polar + beyond
+    return rows * np.pi / height
+
+
+def tent_irradiance(normal: Float64Array, height: int) -> Float64Array:
+    """Return what a texel of radiance 1 makes a white plane reflect [1], shape [height, 2 height].
+
+    ``integral of tent cos / pi`` by quadrature; all texels of a constant sky sum to 1.
+    """
+    side = max(4, 1024 // height)
+    fine = side * height
+    cosine = np.maximum(map_directions(fine, 2 * fine) @ normal, 0.0) / np.pi
+    cosine *= texel_solid_angles(fine, 2 * fine)[:, None]
+
+    def tents(count: int, wraps: bool) -> Float64Array:
+        """Interpolation weights of ``side * count`` positions, shape [side * count, count]."""
+        x = (np.arange(side * count) + 0.5) / side - 0.5
+        low = np.floor(x).astype(int)
+        weight = x - low
+        first, second = low % count, (low + 1) % count
+        if not wraps:
+            first, second = np.clip(low, 0, count - 1), np.clip(low + 1, 0, count - 1)
+        matrix = np.zeros((side * count, count))
+        np.add.at(matrix, (np.arange(side * count), first), 1.0 - weight)
+        np.add.at(matrix, (np.arange(side * count), second), weight)
+        return matrix
+
+    irradiance: Float64Array = tents(height, False).T @ cosine @ tents(2 * height, True)
+    return irradiance
+
+
+def direction_counts(expected: Light, height: int, budget: int) -> NDArray[np.int32]:
+    """Return how many directions each texel gets: one, and more where light is expected.
+
+    A texel's noise is proportional to its flux, so equal-cost directions are best shared out in
+    proportion to it (Neyman's allocation); powers of two keep the sequences stratified.
+    """
+    flux = luminance(as_map(expected, height).astype(np.float64))
+    flux = flux * tent_solid_angles(height)[:, None]
+    share = budget * flux / max(float(flux.sum()), 1e-30)
+    counts = np.exp2(np.floor(np.log2(np.maximum(share, 1.0)))).astype(np.int32)
+    flat: NDArray[np.int32] = counts.reshape(-1)
+    return flat
+
+
+def _texel_args(counts: NDArray[np.int32], height: int, device: wp.Device) -> kernels.TexelArgs:
+    args = kernels.TexelArgs()
+    args.height, args.width = height, 2 * height
+    args.d_omega = wp.array(
+        tent_solid_angles(height).astype(np.float32), dtype=float, device=device
+    )
+    args.direction_count = wp.array(counts, dtype=int, device=device)
+    return args
+
+
+def object_rows(
+    renderer: Renderer,
+    pixels: IntArray,
+    depth: int,
+    settings: TransportSettings,
+    expected: Light,
+    seed: int,
+) -> Iterator[tuple[slice, wp.array, wp.array, wp.array]]:
+    """Trace the object's rows chunk by chunk.
+
+    Yields:
+        Which rows; radiance per texel radiance [1], shape [row, texel] vec3; emitted radiance,
+        shape [row] vec3; how many subsamples met the object, shape [row].
+    """
+    scene, device, height = renderer.scene, renderer.device, settings.height_fg
+    counts = direction_counts(expected, height, settings.bright_directions)
+    texels = _texel_args(counts, height, device)
+    texel_count = 2 * height * height
+    # Half of the later vertices' directions look for the expected light, half everywhere.
+    map_ = as_map(expected, height)
+    flux = luminance(map_.astype(np.float64))
+    mean = float((flux * texel_solid_angles(height, 2 * height)[:, None]).sum()) / (4.0 * np.pi)
+    flat = 0.5 + 0.5 * flux / mean if mean > 0.0 else np.ones_like(flux)
+    proposal = light_args(
+        Light(texels=np.repeat(flat[..., None], 3, axis=2).astype(np.float32)), device
+    )
+    size = max(1, CHUNK_BYTES // (12 * texel_count))
+    for start in range(0, len(pixels), size):
+        chunk = pixels[start : start + size]
+        count = len(chunk)
+        rows = Rows(wp.array(chunk, dtype=wp.int32, device=device))
+        geometry = (scene.mesh_args, scene.material_args, scene.texture_args)
+        points = kernels.SurfacePoints()
+        shape = (count, settings.subsamples)
+        points.count = wp.zeros(count, dtype=int, device=device)
+        for name in ("position", "ng", "n", "wo", "base_color"):
+            setattr(points, name, wp.empty(shape, dtype=wp.vec3, device=device))
+        for name in ("metallic", "roughness"):
+            setattr(points, name, wp.empty(shape, dtype=float, device=device))
+        emission = wp.zeros(count, dtype=wp.vec3, device=device)
+        T = wp.empty((count, texel_count), dtype=wp.vec3, device=device)
+        renderer.launch(
+            kernels.trace_points,
+            count,
+            [
+                rows,
+                scene.camera_args,
+                *geometry,
+                scene.proxy_args,
+                settings.subsamples,
+                seed,
+                Rows(points),
+                Rows(emission),
+            ],
+            settings.subsamples,
+            "transport",
+        )
+        renderer.launch(
+            kernels.trace_direct,
+            count,
+            [
+                rows,
+                Rows(points),
+                *geometry,
+                texels,
+                settings.subsamples,
+                settings.paths,
+                seed,
+                Rows(T),
+            ],
+            int(counts.sum()),
+            "transport",
+            texel_count,
+        )
+        if settings.paths > 0:
+            renderer.launch(
+                kernels.trace_paths,
+                count,
+                [
+                    rows,
+                    Rows(points),
+                    *geometry,
+                    texels,
+                    proposal,
+                    settings.subsamples,
+                    settings.paths,
+                    depth,
+                    seed,
+                    Rows(T),
+                    Rows(emission),
+                ],
+                settings.paths * depth,
+                "transport",
+                settings.paths,
+            )
+        yield slice(start, start + count), T, emission, points.count
+
+
+def proxy_rows(
+    renderer: Renderer,
+    pixels: IntArray,
+    may_see_object: IntArray,
+    columns: IntArray,
+    settings: TransportSettings,
+    expected: Light,
+    seed: int,
+) -> Iterator[wp.array]:
+    """Trace the plane's rows chunk by chunk.
+
+    Yields:
+        Share of each texel's irradiance that the object keeps away [1], shape [row, column].
+    """
+    scene, device, height = renderer.scene, renderer.device, settings.height_shadow
+    counts = direction_counts(expected, height, settings.bright_directions)
+    texels = _texel_args(counts, height, device)
+    centres = map_directions(height, 2 * height).reshape(-1, 3)[columns].astype(np.float32)
+    low, high = (b - scene.origin for b in scene.bounds)
+    margin = scene.mesh_args.epsilon
+    corners = (
+        wp.vec3(*(low - margin).astype(np.float32)),
+        wp.vec3(*(high + margin).astype(np.float32)),
+    )
+    radius = 0.5 * scene.diagonal + 2.0 * margin
+    reach = 1.5 * np.pi / height
+    size = max(1, CHUNK_BYTES // (4 * len(columns)))
+    if scene.triangle_count == 0:
+        return
+    geometry = (scene.mesh_args, scene.material_args, scene.texture_args, scene.proxy_args)
+    wp_columns = wp.array(columns, dtype=int, device=device)
+    wp_centres = wp.array(centres, dtype=wp.vec3, device=device)
+    for start in range(0, len(pixels), size):
+        chunk = pixels[start : start + size]
+        count = len(chunk)
+        rows = Rows(wp.array(chunk, dtype=wp.int32, device=device))
+        may_see = wp.array(may_see_object[start : start + size], dtype=int, device=device)
+        filled = wp.zeros(count, dtype=int, device=device)
+        position = wp.empty((count, settings.subsamples), dtype=wp.vec3, device=device)
+        cone = wp.zeros(count, dtype=wp.vec4, device=device)
+        renderer.launch(
+            kernels.trace_proxy_points,
+            count,
+            [
+                rows,
+                Rows(may_see),
+                scene.camera_args,
+                *geometry,
+                radius,
+                reach,
+                settings.subsamples,
+                seed,
+                Rows(filled),
+                Rows(position),
+                Rows(cone),
+            ],
+            settings.subsamples,
+            "transport",
+        )
+        blocked = wp.empty((count, len(columns)), dtype=float, device=device)
+        renderer.launch(
+            kernels.trace_blocked,
+            count,
+            [
+                rows,
+                Rows(filled),
+                Rows(position),
+                Rows(cone),
+                *geometry,
+                *corners,
+                texels,
+                wp_columns,
+                wp_centres,
+                seed,
+                Rows(blocked),
+            ],
+            len(columns) // 4,
+            "transport",
+            len(columns),
+        )
+        yield blocked
