@@ -35,6 +35,8 @@ ENTRY_BYTES = 24
 VERTEX_BYTES = 112
 LOBE_BLOCK = 4096
 """Directions that one thread of `lobe_gradient` adds up; on the CPU they stay in its cache."""
+PART_PATHS = 4096
+"""Least paths of a part: a path costs about 1 us, the launches of a part about 1 ms."""
 PART_COUNT = 16
 """Private sums of texels and materials; fixed, so that their order does not depend on threads."""
 
@@ -156,7 +158,7 @@ class ObjectSamples:
         renderer, device = self.mis.renderer, self.mis.renderer.device
         pixels, count = len(d_radiance), self.path_count
         # On the CPU each part has a sum of its own and is gone through in short launches.
-        parts = min(PART_COUNT, pixels) if device.is_cpu else 1
+        parts = max(1, min(PART_COUNT, pixels * count // PART_PATHS)) if device.is_cpu else 1
         size = max(1, SAMPLES_PER_SLICE // count) if device.is_cpu else pixels
         d_path = wp.array(
             np.repeat(d_radiance / count, count, axis=0), dtype=wp.vec3, device=device
@@ -175,7 +177,7 @@ class ObjectSamples:
                 self.differentiate(vertices, d_path[start * count : end * count], own)
 
         wp.load_module(shade_kernels, device=device)
-        renderer.in_threads(one, range(parts), "materials")
+        renderer.in_threads(one, range(parts if pixels else 0), "materials")
         return [None if d is None else d.numpy().sum(axis=0, dtype=np.float64) for d in d_factors]
 
     def differentiate(
