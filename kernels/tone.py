@@ -44,6 +44,9 @@ def tone_curve(
     y0 = knot_y[curve, b]
     width = knot_x[curve, b + 1] - x0
     rise = knot_y[curve, b + 1] - y0
+    # A bin of no height is flat; one of no width is met at the right end alone.
+    if width <= 0.0 or rise <= 0.0:
+        return knot_y[curve, b + 1]
     m = rise / width
     q = (x - x0) / width
     d0 = knot_slope[curve, b]
@@ -57,3 +60,11 @@ def reinhard(x: float) -> float:
     """Map radiance [0, inf) to [0, 1): ``x / (1 + x)`` (Reinhard et al. 2002, eq. 3)."""
     x = wp.max(x, 0.0)
     return x / (1.0 + x)
+
+
+@wp.func_grad(reinhard)
+def adj_reinhard(x: float, adj_ret: float):
+    """Slope ``1 / (1 + x)^2``: that of the quotient, ``1 / (1 + x) - x / (1 + x)^2``, cancels."""
+    if x >= 0.0:
+        r = 1.0 / (1.0 + x)
+        wp.adjoint[x] += adj_ret * r * r

@@ -190,14 +190,25 @@ def test_reinhard(device: str) -> None:
 
 
 def test_reinhard_gradient(device: str) -> None:
-    """The adjoint is ``1 / (1 + x)^2``."""
-    x = np.array([1e-6, 0.18, 1.0, 16.0, 1e3], np.float32)
+    """The adjoint is ``1 / (1 + x)^2``, for suns too; none below 0."""
+    x = np.array([-1.0, 0.0, 1e-6, 0.18, 1.0, 16.0, 1e3, 1e5, 1e8, 1e15], np.float32)
     source = upload(x, device, True)
     out = wp.zeros(len(x), dtype=float, device=device, requires_grad=True)
     with wp.Tape() as tape:
         wp.launch(reinhard_kernel, len(x), inputs=[source], outputs=[out], device=device)
     tape.backward(grads={out: upload(np.ones(len(x)), device)})
-    # The kernel differentiates a quotient: 1/(1+x) - x/(1+x)^2 cancels at bright values.
-    np.testing.assert_allclose(
-        source.grad.numpy(), 1.0 / (1.0 + x.astype(np.float64)) ** 2, rtol=2e-4
-    )
+    expected = np.append(0.0, 1.0 / (1.0 + x[1:].astype(np.float64)) ** 2)
+    np.testing.assert_allclose(source.grad.numpy(), expected, rtol=1e-6)
+
+
+@pytest.mark.parametrize("x", [[0, 0.5, 0.5, 1], [0, 0.5, 1, 1], [0, 0, 0.5, 1], [0, 0.3, 0.7, 1]])
+@pytest.mark.parametrize("y", [[0, 0.5, 0.5, 1], [0, 0, 0.5, 1], [0, 0.5, 1, 1], [0, 0.3, 0.7, 1]])
+def test_curve_of_empty_bins(device: str, x: list[float], y: list[float]) -> None:
+    """Bins of no width or no height are finite and rise, at their knots too, and end at 1."""
+    knots = tuple(np.array([k], np.float32) for k in (x, y, [1, 1, 1, 1]))
+    at = np.sort(np.concatenate([np.linspace(0, 1, 101), x])).astype(np.float32)
+    values = apply_curve(at, np.zeros(len(at)), knots, device)
+    assert np.all(np.isfinite(values)) and np.diff(values).min() >= -VALUE_ABS
+    assert values[-1] == 1.0 and values.min() >= 0.0
+    gradients = curve_gradients(at, np.zeros(len(at)), knots, np.ones(len(at)), device)
+    assert all(np.all(np.isfinite(g)) for g in gradients)
