@@ -2,12 +2,16 @@
 
 import warp as wp
 
+DARK = wp.constant(1.0e-30)
+"""Radiance that counts as none. Less is what underflow leaves of a lobe's tail: the ratio of such
+numbers is noise, and its slope ``1 / denominator`` leaves float32."""
+
 
 @wp.func
 def safe_ratio(numerator: float, denominator: float) -> float:
     """Return the ratio, or 1 where the plane receives no light at all."""
     ratio = float(1.0)
-    if denominator > 0.0:
+    if denominator > DARK:
         ratio = numerator / denominator
     return ratio
 

@@ -215,6 +215,18 @@ def test_shadow_ratio_of_special_values(device: str) -> None:
     assert np.all(d_lit[2, :2] == 0.0) and np.all(d_unoccluded[2, :2] == 0.0)
 
 
+def test_shadow_ratio_of_underflowing_light_is_one(device: str) -> None:
+    """What underflow leaves of a lobe's tail is no light: ratio 1, gradients 0 and not infinite."""
+    unoccluded = np.repeat(np.array([[1e-45], [1e-40], [1e-38], [1e-31]], np.float32), 3, axis=1)
+    arrays = [vec3s(x, device, True) for x in (0.5 * unoccluded, unoccluded)]
+    out = empty(4, device)
+    with wp.Tape() as tape:
+        wp.launch(shadow_ratio, 4, inputs=arrays, outputs=[out], device=device)
+    tape.backward(grads={out: vec3s(np.ones((4, 3)), device)})
+    assert np.all(out.numpy() == 1.0)
+    assert all(np.all(a.grad.numpy() == 0.0) for a in arrays)
+
+
 def test_shadow_ratio_ignores_the_scale_of_the_light(device: str, rng: np.random.Generator) -> None:
     """``ratio(a L) = ratio(L)`` (method 2.3), exactly for powers of two."""
     unoccluded = rng.uniform(0.1, 2.0, (64, 3)).astype(np.float32)
