@@ -14,6 +14,16 @@ from warpir.kernels.types import LightRecord
 wp.set_module_options({"enable_backward": False})
 
 
+@wp.func
+def keep_direction(record: LightRecord, i: int, j: int, wi: wp.vec3, weight: wp.vec3) -> int:
+    """Write entry ``j`` of pixel ``i`` unless its weight is 0; return how many that makes."""
+    if wp.max(weight) <= 0.0:
+        return 0
+    record.wi[i, j] = wi
+    record.weight[i, j] = weight
+    return 1
+
+
 @wp.kernel
 def lobe_gradient(
     record: LightRecord,

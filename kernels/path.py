@@ -10,14 +10,15 @@ import warp as wp
 
 from warpir.kernels.brdf import brdf_eval, brdf_sample
 from warpir.kernels.frame import basis, to_local, to_world
+from warpir.kernels.light_gradient import keep_direction
 from warpir.kernels.rng import hash_pair, pixel_seed, sobol_pair
 from warpir.kernels.sampling import light_eval, light_sample, power_heuristic
 from warpir.kernels.trace import (
     INFINITY,
     Hit,
     Surface,
+    camera_hit,
     camera_ray,
-    camera_reach,
     closest_hit,
     offset_origin,
     surface_at,
@@ -268,17 +269,7 @@ def trace_foreground(
             s = index // rays
             ray_dir = camera_ray(camera, pixel, sobol_pair(s, key, 0))
             if index % rays == 0:
-                reach = camera_reach(proxy, camera.origin, ray_dir)
-                first = closest_hit(
-                    mesh,
-                    material,
-                    texture,
-                    camera.origin,
-                    ray_dir,
-                    reach,
-                    1,
-                    hash_pair(key, wp.uint32(s)),
-                )
+                first = camera_hit(camera, mesh, material, texture, proxy, s, key, ray_dir)
                 if first.valid == 1:
                     count += 1.0
             if first.valid == 0:
@@ -304,16 +295,10 @@ def trace_foreground(
         if vertex_record.material.shape[1] > 0:
             keep_event(vertex_record, i, k * spp * rays + index, event)
         if light_record.wi.shape[1] > 0:
-            if event.weight_light > 0.0:
-                light_record.wi[i, entries] = event.wi_light
-                gain = wp.cw_mul(throughput, event.f_light)
-                light_record.weight[i, entries] = gain * (event.weight_light * scale)
-                entries += 1
-            if event.weight_brdf > 0.0:
-                light_record.wi[i, entries] = event.wi_brdf
-                gain = wp.cw_mul(throughput, event.f_brdf)
-                light_record.weight[i, entries] = gain * (event.weight_brdf * scale)
-                entries += 1
+            gain = wp.cw_mul(throughput, event.f_light) * (event.weight_light * scale)
+            entries += keep_direction(light_record, i, entries, event.wi_light, gain)
+            gain = wp.cw_mul(throughput, event.f_brdf) * (event.weight_brdf * scale)
+            entries += keep_direction(light_record, i, entries, event.wi_brdf, gain)
         if k == 0:
             radiance += event.direct
             radiance_diffuse += event.direct_diffuse

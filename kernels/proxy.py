@@ -8,7 +8,8 @@ cancels, which a closed form of the denominator would undo. Detached.
 import warp as wp
 
 from warpir.kernels.frame import basis, to_world
-from warpir.kernels.rng import hash_pair, pixel_seed, sobol_pair
+from warpir.kernels.light_gradient import keep_direction
+from warpir.kernels.rng import pixel_seed, sobol_pair
 from warpir.kernels.sampling import (
     cosine_sample,
     light_eval,
@@ -16,9 +17,8 @@ from warpir.kernels.sampling import (
     power_heuristic,
 )
 from warpir.kernels.trace import (
+    camera_hit,
     camera_ray,
-    camera_reach,
-    closest_hit,
     proxy_distance,
     visibility,
 )
@@ -114,11 +114,7 @@ def proxy_point(
     if t <= 0.0:
         return wp.vec4(0.0)
     if may_see_object == 1:
-        reach = camera_reach(proxy, camera.origin, ray_dir)
-        hit = closest_hit(
-            mesh, material, texture, camera.origin, ray_dir, reach, 1, hash_pair(key, wp.uint32(s))
-        )
-        if hit.valid == 1:
+        if camera_hit(camera, mesh, material, texture, proxy, s, key, ray_dir).valid == 1:
             return wp.vec4(0.0)
     p = camera.origin + ray_dir * t
     # Back onto the plane: far hits lose digits along the ray.
@@ -193,14 +189,10 @@ def trace_proxy(
                 sum_all += from_light + from_cosine
                 sum_lit += from_light * x.visible_light + from_cosine * x.visible_cosine
                 if keep_dark == 1:
-                    if x.weight_light > 0.0:
-                        record.wi[i, entries] = x.wi_light
-                        record.weight[i, entries] = plane_weight(x.weight_light, x.visible_light)
-                        entries += 1
-                    if x.weight_cosine > 0.0:
-                        record.wi[i, entries] = x.wi_cosine
-                        record.weight[i, entries] = plane_weight(x.weight_cosine, x.visible_cosine)
-                        entries += 1
+                    weight = plane_weight(x.weight_light, x.visible_light)
+                    entries += keep_direction(record, i, entries, x.wi_light, weight)
+                    weight = plane_weight(x.weight_cosine, x.visible_cosine)
+                    entries += keep_direction(record, i, entries, x.wi_cosine, weight)
     scale = 1.0 / wp.max(count * float(rays), 1.0)
     lit[i] = sum_lit * scale
     unoccluded[i] = sum_all * scale
