@@ -7,6 +7,8 @@ Radiance is linear Rec.709, relative [W/(m^2 sr)].
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from itertools import pairwise
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -270,13 +272,17 @@ def resize_map(texels: FloatArray, height: int) -> FloatArray:
     Texels are taken as constant, so energy is kept exactly at any size.
     """
 
-    def boxes(values: Float64Array, old: Float64Array, new: Float64Array) -> Float64Array:
+    def boxes(
+        values: NDArray[np.floating[Any]], old: Float64Array, new: Float64Array
+    ) -> Float64Array:
         """Average rows between rising ``old`` edges over rising ``new`` ones."""
-        sums = values * np.diff(old)[:, None, None]
-        total = np.concatenate([np.zeros((1, *values.shape[1:])), np.cumsum(sums, axis=0)])
-        low = np.clip(np.searchsorted(old, new, side="right") - 1, 0, len(values) - 1)
-        at = total[low] + (new - old[low])[:, None, None] * values[low]
-        averaged: Float64Array = np.diff(at, axis=0) / np.diff(new)[:, None, None]
+        averaged = np.empty((len(new) - 1, *values.shape[1:]))
+        # One row at a time: a float64 copy of an 8k map and its running sum would take 3 GiB.
+        for k, (low, high) in enumerate(pairwise(new)):
+            first = max(int(np.searchsorted(old, low, side="right")) - 1, 0)
+            last = max(int(np.searchsorted(old, high, side="left")), first + 1)
+            share = np.diff(np.clip(old[first : last + 1], low, high)) / (high - low)
+            averaged[k] = np.tensordot(share, values[first:last], axes=1)
         return averaged
 
     def heights(rows: int) -> Float64Array:
@@ -287,10 +293,10 @@ def resize_map(texels: FloatArray, height: int) -> FloatArray:
     if texels.shape[0] == height and texels.shape[1] == 2 * height:
         return texels
     old_height, old_width = texels.shape[:2]
-    rows = boxes(texels.astype(np.float64), heights(old_height), heights(height))
+    rows = boxes(texels, heights(old_height), heights(height))
     columns = (np.linspace(0.0, 1.0, count + 1) for count in (old_width, 2 * height))
     resized = boxes(np.moveaxis(rows, 1, 0), *columns)
-    return np.maximum(np.moveaxis(resized, 0, 1), 0.0).astype(np.float32)
+    return np.moveaxis(resized, 0, 1).astype(np.float32)
 
 
 def summarize(light: Light) -> LightSummary:
