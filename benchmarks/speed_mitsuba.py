@@ -1,0 +1,330 @@
+"""Mitsuba 3 as fast as we know how to drive it: foreground by ``prb``, shadow ratio by Dr.Jit AD.
+
+The film is cropped to the object's pixels, the plane's rays start only from the pixels compared,
+and both radiances of the plane share their samples, so that the ratio is exactly 1 where nothing
+is blocked. Set the variant before importing this module.
+"""
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+from mitsuba.python.ad.integrators.common import mis_weight
+from numpy.typing import NDArray
+
+from benchmarks import referee
+from benchmarks.mitsuba_light import LatlongEmitter
+from benchmarks.speed_scenes import SpeedScene
+from warpir.camera import Camera
+
+FloatArray = NDArray[np.float64]
+IntArray = NDArray[np.int32]
+
+SAMPLER = "ldsampler"
+"""Mitsuba's best here: measured on the ball at 256 samples, ``independent`` takes 1.9 times as long
+for twice the error, ``multijitter`` 1.9 times as long for 0.9 of it."""
+PASS_SAMPLES = {"llvm_ad_rgb": 1 << 25, "cuda_ad_rgb": 1 << 28}
+"""Camera samples traced at once; bounds memory. Passes are long, as only samples of one pass are
+stratified together."""
+KEPT_SAMPLES = PASS_SAMPLES
+"""Plane samples that the backward pass keeps at 34 bytes each; beyond them it traces again."""
+
+
+@dataclass
+class PlaneSamples:
+    """What the lookups of one pass need: two directions per camera sample, detached."""
+
+    d_light: Any
+    """Direction of the emitter sample, world frame."""
+    weight_light: Any
+    """Factor on its radiance without the object [1]."""
+    free_light: Any
+    """Whether it passes the object."""
+    d_cosine: Any
+    """Direction of the cosine sample, world frame."""
+    weight_cosine: Any
+    """Factor on its radiance without the object [1]."""
+    free_cosine: Any
+    """Whether it passes the object."""
+
+
+class MitsubaScene:
+    """One scene under one map.
+
+    Args:
+        scene: What to render.
+        texels: Lat-long radiance, relative [W/(m^2 sr)], shape [He, We, 3].
+        integrator: ``prb``, or ``gltf_path``, the referee's path replay.
+    """
+
+    def __init__(
+        self, scene: SpeedScene, texels: NDArray[np.float32], integrator: str = "prb"
+    ) -> None:
+        self.setup = referee.build(scene.asset, scene.matrix, scene.camera, texels, scene.depth)
+        width = scene.camera.width
+        rows, columns = scene.object_pixels // width, scene.object_pixels % width
+        top, left = int(rows.min()), int(columns.min())
+        height = int(rows.max()) + 1 - top
+        self.crop = (height, int(columns.max()) + 1 - left)
+        self.rows_of_objects = (rows - top) * self.crop[1] + columns - left
+        self.sensor = _sensor(scene.camera, self.setup, (left, top, self.crop[1], height))
+        self.plane_height = float(-self.setup.center[1] / self.setup.radius)
+        self.crop_offset = (left, top)
+        self.width = scene.camera.width
+        self.integrator = mi.load_dict(
+            {"type": integrator, "max_depth": scene.depth + 1, "hide_emitters": True}
+        )
+        self.plane_pixels = mi.UInt32(scene.proxy_pixels.astype(np.uint32))
+        self.plane_count = len(scene.proxy_pixels)
+        self.parameters = mi.traverse(self.setup.scene)
+        dr.enable_grad(self.parameters["light.texels"])
+        self.parameters.update()
+        self.emitter: LatlongEmitter = self.setup.scene.environment()
+        d_image = np.zeros((self.crop[0] * self.crop[1], 3), np.float32)
+        d_image[self.rows_of_objects] = scene.weight_fg
+        self.d_image = mi.TensorXf(d_image.reshape(*self.crop, 3))
+        self.weight_ratio = color(scene.weight_ratio)
+        dr.eval(self.d_image, self.plane_pixels, self.weight_ratio)
+
+    def largest_pass(self, part: str, spp: int) -> int:
+        """Samples per pixel of the longest pass, which decide what is compiled."""
+        pixels = self.plane_count if part == "ratio" else self.crop[0] * self.crop[1]
+        return max(pass_spp for _, pass_spp in self._passes(pixels, spp, 0))
+
+    def foreground(self, spp: int, seed: int) -> mi.TensorXf:
+        """Render the object alone, premultiplied by coverage, crop's shape."""
+        total = None
+        for pass_seed, pass_spp in self._passes(self.crop[0] * self.crop[1], spp, seed):
+            with dr.suspend_grad():
+                image = self.integrator.render(self.setup.scene, self.sensor, pass_seed, pass_spp)
+            image = image * (pass_spp / spp)
+            total = image if total is None else total + image
+            dr.eval(total)
+        return total
+
+    def foreground_gradient(self, spp: int, seed: int) -> mi.TensorXf:
+        """Gradient of the weighted foreground with respect to the texels, by path replay."""
+        total = None
+        texels = self.parameters["light.texels"]
+        for pass_seed, pass_spp in self._passes(self.crop[0] * self.crop[1], spp, seed):
+            dr.set_grad(texels, 0.0)
+            self.integrator.render_backward(
+                self.setup.scene,
+                self.parameters,
+                self.d_image,
+                self.sensor,
+                pass_seed,
+                pass_spp,
+            )
+            gradient = dr.grad(texels) * (pass_spp / spp)
+            total = gradient if total is None else total + gradient
+            dr.eval(total)
+        return total
+
+    @staticmethod
+    def synchronize() -> None:
+        """Wait for everything that was queued."""
+        dr.sync_thread()
+
+    def objects(self, image: mi.TensorXf) -> FloatArray:
+        """Return the object pixels of `foreground`, shape [object_pixel, 3]."""
+        return np.asarray(image, np.float64).reshape(-1, 3)[self.rows_of_objects]
+
+    def ratio(self, spp: int, seed: int) -> mi.Color3f:
+        """Render the shadow ratio."""
+        return ratio_adjoint(*self.plane(spp, seed), self.weight_ratio)[2]
+
+    def plane(self, spp: int, seed: int) -> tuple[mi.Color3f, mi.Color3f]:
+        """Sum the plane's radiance with and without the object over all samples per pixel."""
+        lit, unoccluded = (dr.zeros(mi.Color3f, self.plane_count) for _ in range(2))
+        with dr.suspend_grad():
+            for pass_seed, pass_spp in self._passes(self.plane_count, spp, seed):
+                a, b = self._radiance(self._trace(pass_seed, pass_spp), pass_spp)
+                lit += a
+                unoccluded += b
+                dr.eval(lit, unoccluded)
+        return lit, unoccluded
+
+    def ratio_step(self, spp: int, seed: int) -> tuple[mi.Color3f, mi.TensorXf]:
+        """Shadow ratio and the gradient of its weighted sum with respect to the texels."""
+        passes = list(self._passes(self.plane_count, spp, seed))
+        keep = self.plane_count * spp <= KEPT_SAMPLES[mi.variant()]
+        kept: list[PlaneSamples] = []
+        lit, unoccluded = (dr.zeros(mi.Color3f, self.plane_count) for _ in range(2))
+        with dr.suspend_grad():
+            for pass_seed, pass_spp in passes:
+                samples = self._trace(pass_seed, pass_spp)
+                if keep:
+                    dr.eval(samples.__dict__)
+                    kept.append(samples)
+                a, b = self._radiance(samples, pass_spp)
+                lit += a
+                unoccluded += b
+                dr.eval(lit, unoccluded)
+        d_lit, d_unoccluded, ratio = ratio_adjoint(lit, unoccluded, self.weight_ratio)
+        return ratio, self._plane_backward(passes, kept, d_lit, d_unoccluded)
+
+    def plane_gradient(
+        self, spp: int, seed: int, d_lit: mi.Color3f, d_unoccluded: mi.Color3f
+    ) -> mi.TensorXf:
+        """Gradient through the sums of `plane` for given adjoints."""
+        passes = list(self._passes(self.plane_count, spp, seed))
+        return self._plane_backward(passes, [], d_lit, d_unoccluded)
+
+    def _plane_backward(
+        self,
+        passes: list[tuple[int, int]],
+        kept: list[PlaneSamples],
+        d_lit: mi.Color3f,
+        d_unoccluded: mi.Color3f,
+    ) -> mi.TensorXf:
+        texels = self.parameters["light.texels"]
+        dr.set_grad(texels, 0.0)
+        for k, (pass_seed, pass_spp) in enumerate(passes):
+            if kept:
+                samples = kept[k]
+            else:
+                with dr.suspend_grad():
+                    samples = self._trace(pass_seed, pass_spp)
+            index = dr.arange(mi.UInt32, self.plane_count * pass_spp) // pass_spp
+            a = dr.gather(mi.Color3f, d_lit, index)
+            b = dr.gather(mi.Color3f, d_unoccluded, index)
+            loss = self._lookup(samples.d_light) * (
+                samples.weight_light * (b + dr.select(samples.free_light, a, 0.0))
+            )
+            loss += self._lookup(samples.d_cosine) * (
+                samples.weight_cosine * (b + dr.select(samples.free_cosine, a, 0.0))
+            )
+            dr.backward_from(loss)
+            dr.eval(dr.grad(texels))
+        return mi.TensorXf(dr.grad(texels))
+
+    def _lookup(self, d: mi.Vector3f) -> mi.Color3f:
+        return self.emitter.radiance(d, mi.Bool(True))
+
+    def _radiance(self, samples: PlaneSamples, spp: int) -> tuple[mi.Color3f, mi.Color3f]:
+        by_light = self._lookup(samples.d_light) * samples.weight_light
+        by_cosine = self._lookup(samples.d_cosine) * samples.weight_cosine
+        lit = dr.select(samples.free_light, by_light, 0.0)
+        lit += dr.select(samples.free_cosine, by_cosine, 0.0)
+        unoccluded = by_light + by_cosine
+        # In one kernel: each reduction alone would evaluate, and trace, its input again
+        dr.eval(lit, unoccluded)
+
+        def reduce(value: mi.Color3f) -> mi.Color3f:
+            return mi.Color3f(
+                *(dr.block_reduce(dr.ReduceOp.Add, channel, spp) for channel in value)
+            )
+
+        return reduce(lit), reduce(unoccluded)
+
+    def _trace(self, seed: int, spp: int) -> PlaneSamples:
+        """Draw one emitter and one cosine direction per camera sample and test both."""
+        scene = self.setup.scene
+        count = self.plane_count * spp
+        sampler = mi.load_dict({"type": SAMPLER, "sample_count": spp})
+        sampler.set_samples_per_wavefront(spp)
+        sampler.seed(seed, count)
+        pixel = dr.gather(mi.UInt32, self.plane_pixels, dr.arange(mi.UInt32, count) // spp)
+        width = self.width
+        offset = sampler.next_2d()
+        # Positions are shares of the crop
+        position = mi.Point2f(
+            (pixel % width + offset.x - self.crop_offset[0]) / self.crop[1],
+            (pixel // width + offset.y - self.crop_offset[1]) / self.crop[0],
+        )
+        ray, _ = self.sensor.sample_ray(0.0, 0.5, position, mi.Point2f(0.5))
+
+        # Which comes first
+        t = (self.plane_height - ray.o.y) / ray.d.y
+        meets = (t > 0.0) & dr.isfinite(t)
+        ray.maxt = dr.select(meets, t, 0.0)
+        seen = meets & ~scene.ray_test(ray, True, active=meets)
+
+        # Direct light on white: f cos_i = cos_i / pi, upper side
+        it = dr.zeros(mi.SurfaceInteraction3f, count)
+        it.p = ray(dr.select(seen, t, 0.0))
+        it.p.y = self.plane_height
+        start = mi.Point3f(it.p.x, it.p.y + 1e-5, it.p.z)
+
+        def free(d: mi.Vector3f, active: mi.Bool) -> mi.Bool:
+            return ~scene.ray_test(mi.Ray3f(start, d), False, active=active)
+
+        ds, _ = self.emitter.sample_direction(it, sampler.next_2d(), seen)
+        cos_i = dr.maximum(ds.d.y, 0.0)
+        active = seen & (cos_i > 0.0) & (ds.pdf > 0.0)
+        by_light = dr.select(
+            active,
+            cos_i * dr.inv_pi / ds.pdf * mis_weight(ds.pdf, cos_i * dr.inv_pi),
+            0.0,
+        )
+        free_light = free(ds.d, active)
+
+        local = mi.warp.square_to_cosine_hemisphere(sampler.next_2d())
+        d = mi.Vector3f(local.y, local.z, local.x)
+        other = dr.zeros(mi.DirectionSample3f, count)
+        other.d = d
+        by_cosine = mis_weight(d.y * dr.inv_pi, self.emitter.pdf_direction(it, other, seen))
+        by_cosine = dr.select(seen & (d.y > 0.0), by_cosine, 0.0)
+        return PlaneSamples(ds.d, by_light, free_light, d, by_cosine, free(d, seen))
+
+    @staticmethod
+    def _passes(pixels: int, spp: int, seed: int) -> Iterator[tuple[int, int]]:
+        """Seed and samples per pixel of each pass; powers of four, as the sampler wants."""
+        largest = 4 ** ((max(1, PASS_SAMPLES[mi.variant()] // pixels).bit_length() - 1) // 2)
+        for k, start in enumerate(range(0, spp, largest)):
+            yield (seed * 65537 + k) % (1 << 32), min(largest, spp - start)
+
+
+def _sensor(
+    camera: Camera, setup: referee.RefereeScene, crop: tuple[int, int, int, int]
+) -> mi.Sensor:
+    """Mitsuba camera in the unit frame, see `benchmarks.referee`; crop is left, top, size."""
+    c2w = camera.c2w.copy()
+    c2w[:3, 3] = (c2w[:3, 3] - setup.center) / setup.radius
+    width, height = camera.width, camera.height
+    left, top, crop_width, crop_height = crop
+    return mi.load_dict(
+        {
+            "type": "perspective",
+            "to_world": mi.ScalarTransform4f(c2w @ np.diag([-1.0, 1.0, -1.0, 1.0])),
+            "fov_axis": "x",
+            "fov": float(np.degrees(2.0 * np.arctan(0.5 * width / camera.fx))),
+            "principal_point_offset_x": (0.5 * width - camera.cx) / width,
+            "principal_point_offset_y": (0.5 * height - camera.cy) / height,
+            "film": {
+                "type": "hdrfilm",
+                "width": width,
+                "height": height,
+                "crop_offset_x": left,
+                "crop_offset_y": top,
+                "crop_width": crop_width,
+                "crop_height": crop_height,
+                "pixel_format": "rgb",
+                "component_format": "float32",
+                "rfilter": {"type": "box"},
+            },
+            "sampler": {"type": SAMPLER},
+        }
+    )
+
+
+def ratio_adjoint(
+    lit: mi.Color3f, unoccluded: mi.Color3f, weight: mi.Color3f
+) -> tuple[mi.Color3f, mi.Color3f, mi.Color3f]:
+    """Return the adjoints of both sums for ``sum(weight * ratio)``, and the ratio."""
+    seen = unoccluded > 0.0
+    inverse = dr.select(seen, dr.rcp(dr.select(seen, unoccluded, 1.0)), 0.0)
+    ratio = dr.select(seen, lit * inverse, 1.0)
+    d_lit = weight * inverse
+    d_unoccluded = dr.select(seen, -d_lit * ratio, 0.0)
+    dr.eval(d_lit, d_unoccluded, ratio)
+    return d_lit, d_unoccluded, ratio
+
+
+def color(values: NDArray[Any]) -> mi.Color3f:
+    """Upload rows of RGB."""
+    return mi.Color3f(*(mi.Float(np.ascontiguousarray(c, np.float32)) for c in values.T))
