@@ -86,7 +86,8 @@ class TransportIntegrator:
         self.device = torch.device(str(wp.device_to_torch(renderer.device)))
         expected = expected or Light(texels=np.ones((8, 16, 3), np.float32))
         height = self.settings.height_shadow
-        irradiance = tent_irradiance(renderer.scene.proxy.normal, height).reshape(-1)
+        x, y, z = (float(c) for c in renderer.scene.proxy.normal)
+        irradiance = tent_irradiance((x, y, z), height).reshape(-1)
         above = np.flatnonzero(irradiance > 0.0).astype(np.int32)
         self.above = torch.from_numpy(above.astype(np.int64)).to(self.device)
         self.irradiance = torch.from_numpy(irradiance[above].astype(np.float32)).to(self.device)

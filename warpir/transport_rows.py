@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass
+from functools import lru_cache
 
 import numpy as np
 import warp as wp
@@ -67,14 +68,15 @@ def tent_solid_angles(height: int) -> Float64Array:
     return rows * np.pi / height
 
 
-def tent_irradiance(normal: Float64Array, height: int) -> Float64Array:
+@lru_cache(maxsize=8)
+def tent_irradiance(normal: tuple[float, float, float], height: int) -> Float64Array:
     """Return what a texel of radiance 1 makes a white plane reflect [1], shape [height, 2 height].
 
     ``integral of tent cos / pi`` by quadrature; all texels of a constant sky sum to 1.
     """
     side = max(4, 1024 // height)
     fine = side * height
-    cosine = np.maximum(map_directions(fine, 2 * fine) @ normal, 0.0) / np.pi
+    cosine = np.maximum(map_directions(fine, 2 * fine) @ np.array(normal), 0.0) / np.pi
     cosine *= texel_solid_angles(fine, 2 * fine)[:, None]
 
     def tents(count: int, wraps: bool) -> Float64Array:
