@@ -113,10 +113,17 @@ class MisPart:
 
     def forward(self, seed: int) -> None:
         """Render."""
+        self._forward(seed)
+        self.bench.synchronize()
+
+    def image(self, seed: int) -> FloatArray:
+        """Return what `forward` renders, shape [pixel, 3]."""
+        return numpy(self._forward(seed))
+
+    def _forward(self, seed: int) -> Tensor:
         light = LightTensors(texels=self.bench.leaf(self.height, grad=False))
         with torch.no_grad():
-            self._image(self.mis.radiance(light, light, seed))
-        self.bench.synchronize()
+            return self._image(self.mis.radiance(light, light, seed))
 
     def step(self, seed: int) -> Callable[[], Step]:
         """Render and differentiate."""

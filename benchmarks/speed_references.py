@@ -8,7 +8,6 @@ import hashlib
 import json
 from collections.abc import Callable
 from dataclasses import astuple, dataclass
-from functools import cached_property
 from pathlib import Path
 from typing import Any
 
@@ -24,9 +23,12 @@ from warpir.integrator import LightTensors
 FloatArray = NDArray[np.float64]
 
 TRIMMED = 0.02
-"""Share of pixels left out of an image's error: those whose truth both references know worst. A
-handful of mirrored suns holds 99 % of ToyCar's squared error in every renderer, and drowns the
-rest; the error with them is stated beside."""
+"""Share of pixels left out of an image's error: those in which `mis` is noisiest. A handful of
+mirrored suns holds 99 % of ToyCar's squared error in every renderer, and drowns the rest; the error
+with them is stated beside."""
+PILOT_RUNS, PILOT_SPP = 32, 16
+"""Runs that tell which pixels these are. The references' own halves may not: where they happen to
+agree, their products are no longer free of noise."""
 SEED = 10_000
 CHUNK = 64
 """Samples per pixel of one run of `mis`."""
@@ -40,16 +42,8 @@ class Reference:
     """Our image, shape [2, pixel, 3], and gradient, shape [2, He, We, 3]."""
     mitsuba: tuple[FloatArray, FloatArray]
     """Mitsuba's."""
-
-    @cached_property
-    def kept(self) -> NDArray[np.bool_]:
-        """The pixels that count, shape [pixel]."""
-        noise = sum(
-            np.square(half[0] - half[1]).sum(axis=-1) for half in (self.own[0], self.mitsuba[0])
-        )
-        kept = np.ones(len(noise), bool)
-        kept[np.argsort(noise)[len(noise) - int(TRIMMED * len(noise)) :]] = False
-        return kept
+    kept: NDArray[np.bool_]
+    """The pixels that count, shape [pixel]."""
 
     def rmse(self, values: tuple[FloatArray, FloatArray]) -> dict[str, float]:
         """Return relative RMSEs of an image and a gradient, free of the references' noise."""
@@ -110,6 +104,7 @@ class References:
         self.spp = {"own": own_spp, "mitsuba": spp}
         self.by_map: dict[tuple[str, int], Reference] = {}
         for part in PARTS:
+            self.kept = self._quiet(part)
             for k, height in enumerate(bench.heights[part]):
                 self.by_map[part, height] = self._converge(part, height, 1 if k == 0 else 4)
 
@@ -125,7 +120,17 @@ class References:
             )
             image, gradient = np.split(flat, [3 * pixels], axis=1)
             made.append((image.reshape(2, -1, 3), gradient.reshape(2, height, 2 * height, 3)))
-        return Reference(*made)
+        return Reference(made[0], made[1], self.kept)
+
+    def _quiet(self, part: str) -> NDArray[np.bool_]:
+        """Return which pixels are not among the noisiest, shape [pixel]."""
+        height = self.bench.heights[part][0]
+        variance = self._cached(
+            f"noise, {part}",
+            {"pilot": [PILOT_RUNS, PILOT_SPP], "part": part, "map": self._hash(part, height)},
+            lambda: _variance(self.bench, part, height),
+        )
+        return quiet(variance)
 
     def resolution(self) -> dict[tuple[str, int], float]:
         """Relative RMSE between images under the map and under the lobes it was made of."""
@@ -183,6 +188,23 @@ class References:
         for array in arrays:
             digest.update(np.ascontiguousarray(array).tobytes())
         return digest.hexdigest()
+
+
+def quiet(variance: FloatArray) -> NDArray[np.bool_]:
+    """Return which pixels are not among the noisiest, shape [pixel]."""
+    kept = np.ones(len(variance), bool)
+    kept[np.argsort(variance, kind="stable")[len(variance) - int(TRIMMED * len(variance)) :]] = (
+        False
+    )
+    return kept
+
+
+def _variance(bench: Bench, part: str, height: int) -> FloatArray:
+    """Variance of `mis` over seeds, summed over channels, shape [pixel]."""
+    run = MisPart(bench, part, height, PILOT_SPP)
+    images = np.stack([run.image(SEED // 2 + k) for k in range(PILOT_RUNS)])
+    variance: FloatArray = images.var(axis=0).sum(axis=-1)
+    return variance
 
 
 def _flat(image: FloatArray, gradient: FloatArray) -> FloatArray:

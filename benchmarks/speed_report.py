@@ -36,9 +36,9 @@ the clock runs.
 Errors are relative RMSE against references of both renderers; products of differences to two
 independent references free them of the references' noise. `image` joins foreground and shadow
 ratio, `gradient` the gradients of their weighted sums with respect to the texels, as
-`sqrt((e_fg^2 + e_ratio^2) / 2)`. 2 % of the pixels, those that the references know worst, are left
-out of `image`: a handful of mirrored suns holds 99 % of ToyCar's squared error in every renderer.
-The error with them is the column `all`.
+`sqrt((e_fg^2 + e_ratio^2) / 2)`. 2 % of the pixels, those in which a pilot of `mis` is noisiest,
+are left out of `image`: a handful of mirrored suns holds 99 % of ToyCar's squared error in every
+renderer. The error with them is the column `all`.
 
 The ratios say how many times longer Mitsuba takes when its error has come down to ours, in image or
 in gradient, whichever it reaches sooner. It may split its samples between object and plane as suits
