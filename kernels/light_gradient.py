@@ -25,9 +25,22 @@ def keep_direction(record: LightRecord, i: int, j: int, wi: wp.vec3, weight: wp.
 
 
 @wp.kernel
+def radiance_gradient(d_pixel: wp.array[wp.mat33], record: LightRecord):
+    """Turn each weight into the loss gradient of the radiance from there; a thread a pixel.
+
+    Args:
+        d_pixel: What a weight is multiplied by, shape [pixel].
+        record: Directions and weights, rows are pixels; overwritten.
+    """
+    i = wp.tid()
+    d = d_pixel[i]
+    for j in range(record.count[i]):
+        record.weight[i, j] = d * record.weight[i, j]
+
+
+@wp.kernel
 def lobe_gradient(
     record: LightRecord,
-    d_pixel: wp.array[wp.mat33],
     first: wp.array[int],
     block_size: int,
     amplitude: wp.array[wp.vec3],
@@ -40,9 +53,7 @@ def lobe_gradient(
     """Add up one lobe's gradient over a block of pixels, in registers; one thread each.
 
     Args:
-        record: Directions and weights, rows are pixels.
-        d_pixel: Times an entry's weight it is the loss gradient of the radiance from there, RGB,
-            shape [pixel].
+        record: Directions, and what `radiance_gradient` left; rows are pixels.
         first: First pixel of each block, shape [block].
         block_size: Pixels of a block; the last may have fewer.
         amplitude: Lobe peaks, shape [lobe].
@@ -59,15 +70,16 @@ def lobe_gradient(
     sum_amplitude = wp.vec3(0.0)
     sum_axis = wp.vec3(0.0)
     sum_sharpness = float(0.0)
-    for i in range(first[block], wp.min(first[block] + block_size, d_pixel.shape[0])):
-        d = d_pixel[i]
+    for i in range(first[block], wp.min(first[block] + block_size, record.count.shape[0])):
         for j in range(record.count[i]):
             wi = record.wi[i, j]
-            d_L = (d * record.weight[i, j]) * sg_shape(wi, a, s)
+            d_L = record.weight[i, j]
+            shape = sg_shape(wi, a, s)
+            d_exponent = wp.dot(d_L, c) * shape
             difference = wi - a
-            sum_amplitude += d_L
-            sum_axis += difference * wp.dot(d_L, c)
-            sum_sharpness += wp.dot(d_L, c) * wp.dot(difference, difference)
+            sum_amplitude += d_L * shape
+            sum_axis += difference * d_exponent
+            sum_sharpness += wp.dot(difference, difference) * d_exponent
     d_amplitude[block, k] = sum_amplitude
     d_axis[block, k] = sum_axis * s
     d_sharpness[block, k] = -0.5 * sum_sharpness
@@ -76,7 +88,6 @@ def lobe_gradient(
 @wp.kernel
 def map_gradient(
     record: LightRecord,
-    d_pixel: wp.array[wp.mat33],
     map_height: int,
     map_width: int,
     d_texels: wp.array2d[wp.vec3],
@@ -86,9 +97,8 @@ def map_gradient(
     Arguments are those of `lobe_gradient`; ``d_texels`` has shape [He, We].
     """
     i = wp.tid()
-    d = d_pixel[i]
     for j in range(record.count[i]):
-        d_L = d * record.weight[i, j]
+        d_L = record.weight[i, j]
         tap = bilinear_tap(direction_to_uv(record.wi[i, j]), map_height, map_width)
         top = d_L * (1.0 - tap.wi)
         bottom = d_L * tap.wi

@@ -286,13 +286,17 @@ def light_gradient(
     Args:
         renderer: Whose device and threads are used.
         args: The light.
-        record: Directions and weights, rows are pixels.
-        d_pixel: See `warpir.kernels.light_gradient.lobe_gradient`, shape [pixel, 3, 3].
+        record: Directions and weights, rows are pixels; used up.
+        d_pixel: Times a weight it is the loss gradient of the radiance from there, shape
+            [pixel, 3, 3].
         free: Which of the four are asked for.
     """
     device = renderer.device
     pixels, capacity = record.wi.shape
     d_array = wp.array(d_pixel, dtype=wp.mat33, device=device)
+    renderer.launch(
+        light_kernels.radiance_gradient, pixels, [Rows(d_array), Rows(record)], capacity, "light"
+    )
     out: Gradients = [None] * 4
     if any(free[:3]):
         block_size = max(1, LOBE_BLOCK // capacity)
@@ -304,7 +308,6 @@ def light_gradient(
             len(first),
             [
                 record,
-                d_array,
                 Rows(wp.array(first, dtype=wp.int32, device=device)),
                 block_size,
                 args.amplitude,
@@ -329,7 +332,7 @@ def light_gradient(
             wp.launch(
                 light_kernels.map_gradient,
                 dim=stop - start,
-                inputs=[Rows(record).cut(start, stop), d_array[start:stop], height, width],
+                inputs=[Rows(record).cut(start, stop), height, width],
                 outputs=[texels[part]],
                 device=device,
                 record_tape=False,
