@@ -17,7 +17,7 @@ import json
 import sys
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
@@ -273,7 +273,7 @@ def _sweep_rows(
         by_part = {part: _part(found[part, spp], part) for part in PARTS}
         settings: dict[str, Any] = {"spp": spp}
         if which == MitsubaPart.integrator:
-            settings["integrator"] = bench.mitsuba_integrator
+            settings |= {"integrator": bench.mitsuba_integrator, "sampler": bench.sampler}
         rows.append(
             {
                 "integrator": which,
@@ -341,6 +341,19 @@ def disagreements(agreement: Sequence[dict[str, Any]], rows: Sequence[dict[str, 
     return found
 
 
+def command(options: argparse.Namespace) -> str:
+    """Return the command that measures the same again; where it writes does not matter."""
+    words = ["python -m benchmarks.speed_against_error"]
+    words += ["--quick"] if options.quick else []
+    words += ["--scenes", *options.scenes] if options.scenes != list(NAMES) else []
+    for name in ("device", "reference_spp", "own_reference_spp", "rounds", "budget"):
+        value = getattr(options, name)
+        words += [] if value is None else [f"--{name.replace('_', '-')} {value}"]
+    words += [f"--threads {options.threads}"] if options.threads else []
+    words += [f"--sampler {options.sampler}"] if options.sampler != "ldsampler" else []
+    return " ".join(words)
+
+
 def main(arguments: list[str] | None = None) -> None:
     """Measure, write the JSON and, after a full run, the documents."""
     parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
@@ -354,7 +367,10 @@ def main(arguments: list[str] | None = None) -> None:
     )
     parser.add_argument("--device", default=None, help="cpu or cuda")
     parser.add_argument("--threads", type=int, default=0, help="CPU threads of every renderer")
-    parser.add_argument("--reference-spp", type=int, default=None, help="of Mitsuba's reference")
+    parser.add_argument("--sampler", default="ldsampler", help="of Mitsuba")
+    parser.add_argument(
+        "--reference-spp", type=int, default=None, help="of Mitsuba's reference, twice a power of 4"
+    )
     parser.add_argument("--own-reference-spp", type=int, default=None, help="of mis's reference")
     parser.add_argument("--rounds", type=int, default=None)
     parser.add_argument("--budget", type=float, default=None, help="seconds per candidate")
@@ -365,6 +381,13 @@ def main(arguments: list[str] | None = None) -> None:
     )
     options = parser.parse_args(arguments)
     plan = QUICK if options.quick else FULL
+    plan = replace(
+        plan,
+        reference_spp=options.reference_spp or plan.reference_spp,
+        own_reference_spp=options.own_reference_spp or plan.own_reference_spp,
+        rounds=options.rounds or plan.rounds,
+        budget_s=options.budget or plan.budget_s,
+    )
     device = choose_device(options.device)
     threads = options.threads or default_threads()
     use_device("cpu" if device == "cpu" else "cuda", threads)
@@ -383,11 +406,11 @@ def main(arguments: list[str] | None = None) -> None:
             reasons.append(f"{name}: {error} (--assets)")
             log(f"skipped {reasons[-1]}")
             continue
-        bench = Bench(scene, plan.maps)
+        bench = Bench(scene, plan.maps, options.sampler)
         references = References(
             bench,
-            options.reference_spp or plan.reference_spp,
-            options.own_reference_spp or plan.own_reference_spp,
+            plan.reference_spp,
+            plan.own_reference_spp,
             options.cache,
             log,
         )

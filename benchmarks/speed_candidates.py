@@ -36,12 +36,15 @@ class Bench:
     Args:
         scene: What is rendered.
         maps: Rows of the map for the foreground and for the shadow, by pair.
+        sampler: Of Mitsuba.
     """
 
-    def __init__(self, scene: SpeedScene, maps: Sequence[tuple[int, int]]) -> None:
+    def __init__(
+        self, scene: SpeedScene, maps: Sequence[tuple[int, int]], sampler: str = "ldsampler"
+    ) -> None:
         from benchmarks.speed_mitsuba import MitsubaScene
 
-        self.scene = scene
+        self.scene, self.sampler = scene, sampler
         # Stock prb does not see ToyCar's emission texture, and takes twice gltf_path's time there
         self.mitsuba_integrator = "gltf_path" if scene.name == "toycar" else "prb"
         self.heights = {
@@ -50,7 +53,7 @@ class Bench:
         every = sorted({height for pair in maps for height in pair})
         self.texels = {height: scene.texels(height) for height in every}
         self.mitsuba = {
-            height: MitsubaScene(scene, texels, self.mitsuba_integrator)
+            height: MitsubaScene(scene, texels, self.mitsuba_integrator, sampler)
             for height, texels in self.texels.items()
         }
         self.memory = PeakMemory(scene.renderer.device)
@@ -264,7 +267,7 @@ def use_device(device: str, threads: int) -> None:
 
     if device == "cpu" and "DRJIT_LIBLLVM_PATH" not in os.environ:
         # LLVM 15, which Dr.Jit may find first, aborts in code generation
-        found = sorted(Path("/usr/lib/x86_64-linux-gnu").glob("libLLVM.so.2?.*"))
+        found = sorted(Path("/usr/lib").glob("*/libLLVM.so.2?.*"))
         if found:
             os.environ["DRJIT_LIBLLVM_PATH"] = str(found[-1])
     import mitsuba as mi

@@ -1,5 +1,8 @@
 """Peak memory of one stretch of a process, over what was there before."""
 
+import ctypes
+import gc
+
 import warp as wp
 
 
@@ -21,6 +24,7 @@ class PeakMemory:
         import drjit as dr
         import torch
 
+        gc.collect()
         dr.sync_thread()
         dr.flush_malloc_cache()
         if self.device.is_cuda:
@@ -31,6 +35,7 @@ class PeakMemory:
             self.warp_before = wp.get_mempool_used_mem_current(self.device)
             self.before = self._cuda_bytes()
         else:
+            ctypes.CDLL(None).malloc_trim(0)
             with open("/proc/self/clear_refs", "w", encoding="ascii") as stream:
                 stream.write("5")
             self.before = _status("VmRSS")

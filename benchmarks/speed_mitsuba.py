@@ -23,9 +23,6 @@ from warpir.camera import Camera
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int32]
 
-SAMPLER = "ldsampler"
-"""Mitsuba's best here: measured on the ball at 256 samples, ``independent`` takes 1.9 times as long
-for twice the error, ``multijitter`` 1.9 times as long for 0.9 of it."""
 PASS_SAMPLES = {"llvm_ad_rgb": 1 << 25, "cuda_ad_rgb": 1 << 28}
 """Camera samples traced at once; bounds memory. Passes are long, as only samples of one pass are
 stratified together."""
@@ -58,11 +55,19 @@ class MitsubaScene:
         scene: What to render.
         texels: Lat-long radiance, relative [W/(m^2 sr)], shape [He, We, 3].
         integrator: ``prb``, or ``gltf_path``, the referee's path replay.
+        sampler: ``ldsampler`` is Mitsuba's best here: measured on the ball at 256 samples,
+            ``independent`` takes 1.9 times as long for twice the error, ``multijitter`` 1.9 times
+            as long for 0.9 of it.
     """
 
     def __init__(
-        self, scene: SpeedScene, texels: NDArray[np.float32], integrator: str = "prb"
+        self,
+        scene: SpeedScene,
+        texels: NDArray[np.float32],
+        integrator: str = "prb",
+        sampler: str = "ldsampler",
     ) -> None:
+        self.sampler = sampler
         self.setup = referee.build(scene.asset, scene.matrix, scene.camera, texels, scene.depth)
         width = scene.camera.width
         rows, columns = scene.object_pixels // width, scene.object_pixels % width
@@ -70,7 +75,7 @@ class MitsubaScene:
         height = int(rows.max()) + 1 - top
         self.crop = (height, int(columns.max()) + 1 - left)
         self.rows_of_objects = (rows - top) * self.crop[1] + columns - left
-        self.sensor = _sensor(scene.camera, self.setup, (left, top, self.crop[1], height))
+        self.sensor = _sensor(scene.camera, self.setup, (left, top, self.crop[1], height), sampler)
         self.plane_height = float(-self.setup.center[1] / self.setup.radius)
         self.crop_offset = (left, top)
         self.width = scene.camera.width
@@ -225,7 +230,7 @@ class MitsubaScene:
         """Draw one emitter and one cosine direction per camera sample and test both."""
         scene = self.setup.scene
         count = self.plane_count * spp
-        sampler = mi.load_dict({"type": SAMPLER, "sample_count": spp})
+        sampler = mi.load_dict({"type": self.sampler, "sample_count": spp})
         sampler.set_samples_per_wavefront(spp)
         sampler.seed(seed, count)
         pixel = dr.gather(mi.UInt32, self.plane_pixels, dr.arange(mi.UInt32, count) // spp)
@@ -280,7 +285,7 @@ class MitsubaScene:
 
 
 def _sensor(
-    camera: Camera, setup: referee.RefereeScene, crop: tuple[int, int, int, int]
+    camera: Camera, setup: referee.RefereeScene, crop: tuple[int, int, int, int], sampler: str
 ) -> mi.Sensor:
     """Mitsuba camera in the unit frame, see `benchmarks.referee`; crop is left, top, size."""
     c2w = camera.c2w.copy()
@@ -307,7 +312,7 @@ def _sensor(
                 "component_format": "float32",
                 "rfilter": {"type": "box"},
             },
-            "sampler": {"type": SAMPLER},
+            "sampler": {"type": sampler},
         }
     )
 

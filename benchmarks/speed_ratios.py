@@ -162,7 +162,10 @@ def mis_ratio(
 
 
 def ratios(rows: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
-    """Return one record per scene and map: ``mis``, and one entry of ``transport`` per setting."""
+    """Return one record per scene and map: ``mis``, and one entry of ``transport`` per setting.
+
+    ``step`` and ``run_600`` are those of the first setting, the defaults.
+    """
     keys = list(dict.fromkeys((r["scene"], r["map"]) for r in rows))
     records = []
     for scene, size in keys:
@@ -180,9 +183,8 @@ def ratios(rows: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
             record["transport"].append(
                 {"settings": row["settings"], **transport_ratio(row, by["mitsuba"])}
             )
-        for name in ("step", "run_600"):
-            values = [t[name] for t in record["transport"]]
-            record[name] = max(values) if values else None
+        for name in ("step", "run_600", "at_least"):
+            record[name] = record["transport"][0][name] if record["transport"] else None
         records.append(record)
     return records
 

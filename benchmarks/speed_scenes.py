@@ -64,7 +64,8 @@ class SpeedScene:
         """Return the light as a map, relative [W/(m^2 sr)], shape [height, 2 height, 3]."""
         parts = (self.lobes.amplitude, self.lobes.axis, self.lobes.sharpness)
         leaves = [torch.tensor(a) for a in parts]
-        made: NDArray[np.float32] = rasterize(*leaves, height, "cpu").numpy()
+        device = str(self.renderer.device.alias)
+        made: NDArray[np.float32] = rasterize(*leaves, height, device).cpu().numpy()
         return made
 
 
