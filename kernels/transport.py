@@ -78,6 +78,11 @@ class TexelArgs:
     """Solid angle of a texel's tent in each row [sr], shape [He]."""
     direction_count: wp.array[int]
     """Directions drawn for each texel, shape [He * We]."""
+    centre: wp.array[wp.vec3]
+    """Direction of each texel's centre, shape [He * We]."""
+    lanes: int
+    """Threads of a pixel; each takes every ``lanes``-th texel. A thread costs as much as a texel on
+    the CPU, where one per pixel is best."""
 
 
 @wp.kernel
@@ -198,6 +203,66 @@ def is_narrow(roughness: float, height: int) -> int:
     return 0
 
 
+@wp.func
+def direct_row(
+    points: SurfacePoints,
+    mesh: MeshArgs,
+    material: MaterialArgs,
+    texture: TextureArgs,
+    texels: TexelArgs,
+    subsamples: int,
+    path_count: int,
+    p: int,
+    t: int,
+    count: int,
+    pixel_key: wp.uint32,
+    shift: float,
+) -> wp.vec3:
+    """Return what texel ``t`` sends into row ``p`` by one interaction, per texel radiance [1]."""
+    total = wp.vec3(0.0)
+    if count == 0:
+        return total
+    i = t // texels.width
+    j = t % texels.width
+    directions = texels.direction_count[t]
+    below = -wp.sin(TENT_REACH * PI / float(texels.height))
+    key = hash_pair(pixel_key, wp.uint32(t))
+    # Which of the pixel's points
+    spot = shift + GOLDEN_ROW * float(i) + GOLDEN_COLUMN * float(j)
+    spot = spot - wp.floor(spot)
+    first = wp.min(int(spot * float(count)), count - 1)
+    for r in range(directions):
+        s = (first + r) % count
+        n = points.n[p, s]
+        # Half of the texels are behind the surface: say so before a direction is drawn.
+        if wp.dot(texels.centre[t], n) > below:
+            u = random_pair(key, -1)
+            if directions > 1:
+                u = sobol_pair(r, key, 0)
+            wi = tent_direction(texels, i, j, u, hash_pair(key, wp.uint32(r)))
+            ng = points.ng[p, s]
+            if wp.dot(wi, n) > 0.0 and wp.dot(wi, ng) > 0.0:
+                frame = basis(n)
+                roughness = points.roughness[p, s]
+                f = brdf_eval(
+                    to_local(points.wo[p, s], frame),
+                    to_local(wi, frame),
+                    points.base_color[p, s],
+                    points.metallic[p, s],
+                    roughness,
+                )
+                specular = f.specular
+                if path_count > 0 and is_narrow(roughness, texels.height) == 1:
+                    tap = bilinear_tap(direction_to_uv(wi), texels.height, texels.width)
+                    pdf = texel_pdf(texels, tap, i, j)
+                    specular = specular * power_heuristic(pdf, float(path_count) * f.pdf)
+                throughput = (f.diffuse + specular) * wp.dot(wi, n)
+                if wp.max(throughput) > 0.0:
+                    origin = offset_origin(points.position[p, s], ng, wi, mesh.epsilon)
+                    total += throughput * visibility(mesh, material, texture, origin, wi)
+    return total * (texels.d_omega[i] * float(count) / float(subsamples * directions))
+
+
 @wp.kernel
 def trace_direct(
     pixels: wp.array[int],
@@ -211,7 +276,7 @@ def trace_direct(
     seed: int,
     T: wp.array2d[wp.vec3],
 ):
-    """Write the light that reaches the camera by one interaction; thread = (pixel, texel).
+    """Write the light that reaches the camera by one interaction; thread = (pixel, lane).
 
     Args:
         pixels: Row-major pixel indices, shape [pixel].
@@ -225,51 +290,14 @@ def trace_direct(
         seed: Base seed.
         T: Pixel radiance per texel radiance [1], shape [pixel, texel].
     """
-    p, t = wp.tid()
+    p, lane = wp.tid()
     count = points.count[p]
-    if count == 0:
-        T[p, t] = wp.vec3(0.0)
-        return
-    i = t // texels.width
-    j = t % texels.width
-    pixel_key = pixel_seed(seed, pixels[p])
-    key = hash_pair(pixel_key, wp.uint32(t))
-    directions = texels.direction_count[t]
-    shift = to_unit(hash_uint(pixel_key))
-    total = wp.vec3(0.0)
-    for r in range(directions):
-        # Which of the pixel's points
-        spot = shift + GOLDEN_ROW * float(i) + GOLDEN_COLUMN * float(j)
-        spot = spot - wp.floor(spot)
-        s = wp.min(int(spot * float(count)), count - 1)
-        s = (s + r) % count
-        u = random_pair(key, -1)
-        if directions > 1:
-            u = sobol_pair(r, key, 0)
-        wi = tent_direction(texels, i, j, u, hash_pair(key, wp.uint32(r)))
-        ng = points.ng[p, s]
-        n = points.n[p, s]
-        if wp.dot(wi, n) > 0.0 and wp.dot(wi, ng) > 0.0:
-            frame = basis(n)
-            roughness = points.roughness[p, s]
-            f = brdf_eval(
-                to_local(points.wo[p, s], frame),
-                to_local(wi, frame),
-                points.base_color[p, s],
-                points.metallic[p, s],
-                roughness,
-            )
-            specular = f.specular
-            if path_count > 0 and is_narrow(roughness, texels.height) == 1:
-                tap = bilinear_tap(direction_to_uv(wi), texels.height, texels.width)
-                pdf = texel_pdf(texels, tap, i, j)
-                specular = specular * power_heuristic(pdf, float(path_count) * f.pdf)
-            throughput = (f.diffuse + specular) * wp.dot(wi, n)
-            if wp.max(throughput) > 0.0:
-                origin = offset_origin(points.position[p, s], ng, wi, mesh.epsilon)
-                total += throughput * visibility(mesh, material, texture, origin, wi)
-    scale = texels.d_omega[i] * float(count) / float(subsamples * directions)
-    T[p, t] = total * scale
+    key = pixel_seed(seed, pixels[p])
+    shift = to_unit(hash_uint(key))
+    for t in range(lane, texels.height * texels.width, texels.lanes):
+        T[p, t] = direct_row(
+            points, mesh, material, texture, texels, subsamples, path_count, p, t, count, key, shift
+        )
 
 
 @wp.func
@@ -440,13 +468,11 @@ def trace_proxy_points(
     material: MaterialArgs,
     texture: TextureArgs,
     proxy: ProxyArgs,
-    radius: float,
-    reach: float,
     subsamples: int,
     seed: int,
     count: wp.array[int],
     position: wp.array2d[wp.vec3],
-    cone: wp.array[wp.vec4],
+    spread: wp.array[float],
 ):
     """Find the ground plane under ``subsamples`` positions of each listed pixel.
 
@@ -458,20 +484,17 @@ def trace_proxy_points(
         material: Their materials.
         texture: Their textures.
         proxy: The plane.
-        radius: Of a sphere around the recentred origin that holds the object [m].
-        reach: Largest angle between a texel's centre and a direction of its tent [rad].
         subsamples: Camera samples per pixel.
         seed: Base seed.
         count: Filled points of each pixel, shape [pixel].
         position: Points of the plane, recentred [m], shape [pixel, subsample].
-        cone: Axis, and the cosine of the angle beyond which no texel's tent meets the object, shape
-            [pixel].
+        spread: Largest distance of a pixel's points from its first one [m], shape [pixel].
     """
     i = wp.tid()
     pixel = pixels[i]
     key = pixel_seed(seed, pixel)
     found = int(0)
-    spread = float(0.0)
+    farthest = float(0.0)
     for s in range(subsamples):
         point = proxy_point(
             camera, mesh, material, texture, proxy, pixel, may_see_object[i], s, key
@@ -479,17 +502,10 @@ def trace_proxy_points(
         if point[3] > 0.0:
             p = wp.vec3(point[0], point[1], point[2])
             position[i, found] = p
-            spread = wp.max(spread, wp.length(p - position[i, 0]))
+            farthest = wp.max(farthest, wp.length(p - position[i, 0]))
             found += 1
     count[i] = found
-    axis = wp.vec3(0.0, 1.0, 0.0)
-    limit = float(-2.0)
-    if found > 0:
-        distance = wp.length(position[i, 0])
-        if distance > 1.001 * (radius + spread):
-            axis = -position[i, 0] / distance
-            limit = wp.cos(wp.min(wp.asin((radius + spread) / distance) + reach, PI)) - 1.0e-5
-    cone[i] = wp.vec4(axis[0], axis[1], axis[2], limit)
+    spread[i] = farthest
 
 
 @wp.func
@@ -510,12 +526,9 @@ def meets_box(origin: wp.vec3, wi: wp.vec3, low: wp.vec3, high: wp.vec3) -> int:
     return 0
 
 
-@wp.kernel
-def trace_blocked(
-    pixels: wp.array[int],
-    count: wp.array[int],
+@wp.func
+def blocked_share(
     position: wp.array2d[wp.vec3],
-    cone: wp.array[wp.vec4],
     mesh: MeshArgs,
     material: MaterialArgs,
     texture: TextureArgs,
@@ -523,60 +536,30 @@ def trace_blocked(
     low: wp.vec3,
     high: wp.vec3,
     texels: TexelArgs,
-    columns: wp.array[int],
-    centres: wp.array[wp.vec3],
-    seed: int,
-    blocked: wp.array2d[float],
-):
-    """Write which share of a texel's irradiance the object keeps from the plane; (pixel, column).
-
-    Directions follow the tent times the cosine, so the share is exactly 0 where nothing is in the
-    way and exactly 1 where everything is.
-
-    Args:
-        pixels: Row-major pixel indices, shape [pixel].
-        count: Filled points of each pixel, shape [pixel].
-        position: Points of the plane [m], shape [pixel, subsample].
-        cone: From `trace_proxy_points`, shape [pixel].
-        mesh: The object's triangles.
-        material: Their materials.
-        texture: Their textures.
-        proxy: The plane.
-        low: Lower corner of the object's bounding box, recentred [m].
-        high: Upper corner [m].
-        texels: The map and how many directions each texel gets.
-        columns: Texels whose tents rise above the plane, shape [column].
-        centres: Their centres, shape [column].
-        seed: Base seed.
-        blocked: Share [1], shape [pixel, column].
-    """
-    p, c = wp.tid()
-    filled = count[p]
-    blocked[p, c] = 0.0
-    axis = cone[p]
-    centre = centres[c]
-    toward = axis[0] * centre[0] + axis[1] * centre[1] + axis[2] * centre[2]
-    if filled == 0 or toward < axis[3]:
-        return
-    t = columns[c]
+    p: int,
+    t: int,
+    filled: int,
+    pixel_key: wp.uint32,
+    shift: float,
+) -> float:
+    """Return the share of texel ``t``'s irradiance that does not reach row ``p`` [1]."""
     i = t // texels.width
     j = t % texels.width
     reach = TENT_REACH * PI / float(texels.height)
-    angle = wp.acos(wp.clamp(wp.dot(centre, proxy.normal), -1.0, 1.0))
+    angle = wp.acos(wp.clamp(wp.dot(texels.centre[t], proxy.normal), -1.0, 1.0))
     bound = wp.cos(wp.max(angle - reach, 0.0)) * sine_max(i, texels.height)
-    pixel_key = pixel_seed(seed, pixels[p])
     key = hash_pair(pixel_key, wp.uint32(t))
     directions = texels.direction_count[t]
-    shift = to_unit(hash_uint(pixel_key))
     spot = shift + GOLDEN_ROW * float(i) + GOLDEN_COLUMN * float(j)
     spot = spot - wp.floor(spot)
     first = wp.min(int(spot * float(filled)), filled - 1)
     total = float(0.0)
     for r in range(directions):
         ray_key = hash_pair(key, wp.uint32(r))
-        uv = tent_uv(i, j, texels.height, texels.width, random_pair(key, -1))
+        u = random_pair(key, -1)
         if directions > 1:
-            uv = tent_uv(i, j, texels.height, texels.width, sobol_pair(r, key, 0))
+            u = sobol_pair(r, key, 0)
+        uv = tent_uv(i, j, texels.height, texels.width, u)
         wi = uv_to_direction(uv[0], uv[1])
         for draw in range(TRIES_MAX):
             more = random_pair(ray_key, 2 * draw)
@@ -587,4 +570,76 @@ def trace_blocked(
         origin = position[p, (first + r) % filled] + proxy.normal * mesh.epsilon
         if wp.dot(wi, proxy.normal) > 0.0 and meets_box(origin, wi, low, high) == 1:
             total += 1.0 - visibility(mesh, material, texture, origin, wi)
-    blocked[p, c] = total / float(directions)
+    return total / float(directions)
+
+
+@wp.kernel
+def trace_blocked(
+    pixels: wp.array[int],
+    count: wp.array[int],
+    position: wp.array2d[wp.vec3],
+    spread: wp.array[float],
+    mesh: MeshArgs,
+    material: MaterialArgs,
+    texture: TextureArgs,
+    proxy: ProxyArgs,
+    low: wp.vec3,
+    high: wp.vec3,
+    texels: TexelArgs,
+    columns: wp.array[int],
+    column_count: int,
+    seed: int,
+    blocked: wp.array2d[float],
+):
+    """Write which share of a texel's irradiance the object keeps from the plane; (pixel, lane).
+
+    Directions follow the tent times the cosine, so the share is exactly 0 where nothing is in the
+    way and exactly 1 where everything is.
+
+    Args:
+        pixels: Row-major pixel indices, shape [pixel].
+        count: Filled points of each pixel, shape [pixel].
+        position: Points of the plane [m], shape [pixel, subsample].
+        spread: From `trace_proxy_points` [m], shape [pixel].
+        mesh: The object's triangles.
+        material: Their materials.
+        texture: Their textures.
+        proxy: The plane.
+        low: Lower corner of the object's bounding box, recentred [m].
+        high: Upper corner [m].
+        texels: The map and how many directions each texel gets.
+        columns: Texels whose tents rise above the plane, shape [column].
+        column_count: Their number.
+        seed: Base seed.
+        blocked: Share [1], shape [pixel, column].
+    """
+    p, lane = wp.tid()
+    filled = count[p]
+    key = pixel_seed(seed, pixels[p])
+    shift = to_unit(hash_uint(key))
+    start = position[p, 0]
+    # A tent's direction that meets the box passes the centre's ray at less than this distance.
+    reach = TENT_REACH * PI / float(texels.height)
+    far = wp.length(wp.max(wp.abs(low - start), wp.abs(high - start))) + spread[p]
+    margin = reach * far + spread[p]
+    inflate = wp.vec3(margin, margin, margin)
+    for c in range(lane, column_count, texels.lanes):
+        t = columns[c]
+        share = float(0.0)
+        if filled > 0 and meets_box(start, texels.centre[t], low - inflate, high + inflate) == 1:
+            share = blocked_share(
+                position,
+                mesh,
+                material,
+                texture,
+                proxy,
+                low,
+                high,
+                texels,
+                p,
+                t,
+                filled,
+                key,
+                shift,
+            )
+        blocked[p, c] = share

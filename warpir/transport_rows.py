@@ -19,6 +19,8 @@ IntArray = NDArray[np.int32]
 FloatArray = NDArray[np.float32]
 Float64Array = NDArray[np.float64]
 
+LANES = 256
+"""Threads of a pixel on CUDA."""
 CHUNK_BYTES = 64 << 20
 """Memory of the rows that are traced at once, before they are stored in a small type."""
 
@@ -117,6 +119,9 @@ def _texel_args(counts: NDArray[np.int32], height: int, device: wp.Device) -> ke
         tent_solid_angles(height).astype(np.float32), dtype=float, device=device
     )
     args.direction_count = wp.array(counts, dtype=int, device=device)
+    centres = map_directions(height, 2 * height).reshape(-1, 3).astype(np.float32)
+    args.centre = wp.array(centres, dtype=wp.vec3, device=device)
+    args.lanes = 1 if device.is_cpu else LANES
     return args
 
 
@@ -192,7 +197,7 @@ def object_rows(
             ],
             int(counts.sum()),
             "transport",
-            texel_count,
+            texels.lanes,
         )
         if settings.paths > 0:
             renderer.launch(
@@ -235,21 +240,17 @@ def proxy_rows(
     scene, device, height = renderer.scene, renderer.device, settings.height_shadow
     counts = direction_counts(expected, height, settings.bright_directions)
     texels = _texel_args(counts, height, device)
-    centres = map_directions(height, 2 * height).reshape(-1, 3)[columns].astype(np.float32)
     low, high = (b - scene.origin for b in scene.bounds)
     margin = scene.mesh_args.epsilon
     corners = (
         wp.vec3(*(low - margin).astype(np.float32)),
         wp.vec3(*(high + margin).astype(np.float32)),
     )
-    radius = 0.5 * scene.diagonal + 2.0 * margin
-    reach = 1.5 * np.pi / height
     size = max(1, CHUNK_BYTES // (4 * len(columns)))
     if scene.triangle_count == 0:
         return
     geometry = (scene.mesh_args, scene.material_args, scene.texture_args, scene.proxy_args)
     wp_columns = wp.array(columns, dtype=int, device=device)
-    wp_centres = wp.array(centres, dtype=wp.vec3, device=device)
     for start in range(0, len(pixels), size):
         chunk = pixels[start : start + size]
         count = len(chunk)
@@ -257,7 +258,7 @@ def proxy_rows(
         may_see = wp.array(may_see_object[start : start + size], dtype=int, device=device)
         filled = wp.zeros(count, dtype=int, device=device)
         position = wp.empty((count, settings.subsamples), dtype=wp.vec3, device=device)
-        cone = wp.zeros(count, dtype=wp.vec4, device=device)
+        spread = wp.zeros(count, dtype=float, device=device)
         renderer.launch(
             kernels.trace_proxy_points,
             count,
@@ -266,13 +267,11 @@ def proxy_rows(
                 Rows(may_see),
                 scene.camera_args,
                 *geometry,
-                radius,
-                reach,
                 settings.subsamples,
                 seed,
                 Rows(filled),
                 Rows(position),
-                Rows(cone),
+                Rows(spread),
             ],
             settings.subsamples,
             "transport",
@@ -285,17 +284,17 @@ def proxy_rows(
                 rows,
                 Rows(filled),
                 Rows(position),
-                Rows(cone),
+                Rows(spread),
                 *geometry,
                 *corners,
                 texels,
                 wp_columns,
-                wp_centres,
+                len(columns),
                 seed,
                 Rows(blocked),
             ],
             len(columns) // 4,
             "transport",
-            len(columns),
+            texels.lanes,
         )
         yield blocked
