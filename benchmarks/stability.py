@@ -9,6 +9,7 @@ where it is not installed. ``--quick`` takes only cases of less than a second.
 """
 
 import argparse
+import math
 import time
 from importlib.metadata import version
 from importlib.util import find_spec
@@ -46,7 +47,8 @@ def measure(case: Case, device: str, has_mitsuba: bool) -> dict[str, Any]:
     if isinstance(case.mitsuba, str):
         mitsuba = case.mitsuba
     elif has_mitsuba:
-        mitsuba = case.mitsuba()
+        error = case.mitsuba()
+        mitsuba = error if math.isfinite(error) else "numbers that are not finite"
     else:
         mitsuba = "not installed"
     return {
@@ -61,7 +63,6 @@ def measure(case: Case, device: str, has_mitsuba: bool) -> dict[str, Any]:
         "finite": measured.is_finite,
         "mitsuba": mitsuba,
         "seconds": round(seconds, 3),
-        "defect": case.defect,
     }
 
 
@@ -120,9 +121,8 @@ def document(records: list[dict[str, Any]], where: dict[str, Any], command: str)
         if r["gradient_error"] is not None:
             gradient = f"{number(r['gradient_error'])} / {number(r['gradient_bound'])}"
         mitsuba = r["mitsuba"] if isinstance(r["mitsuba"], str) else number(r["mitsuba"])
-        name = r["case"] + (f" (**known fault**: {r['defect']})" if r["defect"] else "")
         lines.append(
-            f"| {TITLES[r['group']]} | {name} | {r['quantity']} | {r['measure']} "
+            f"| {TITLES[r['group']]} | {r['case']} | {r['quantity']} | {r['measure']} "
             f"| {number(r['error'])} / {number(r['bound'])} | {gradient} "
             f"| {'yes' if r['finite'] else '**no**'} | {mitsuba.replace('|', '/')} |"
         )

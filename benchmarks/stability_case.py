@@ -49,8 +49,6 @@ class Case:
     """Mitsuba's error in the same measure, or why it cannot run the case."""
     cost: str = "quick"
     """``quick`` takes less than a second, ``medium`` a few, ``slow`` up to a minute."""
-    defect: str = ""
-    """A known fault that keeps the case above its bound; empty when there is none."""
 
     @property
     def id(self) -> str:

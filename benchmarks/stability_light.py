@@ -448,12 +448,13 @@ def bright(device: str) -> Measured:
     tape.backward(grads={out: upload(np.ones(len(x)), float, device)})
     gradient = download(source.grad)
     x64 = x.astype(np.float64)
-    # Beyond 1e18 the slope, 1 / x^2, leaves float32's normal numbers and may be 0.
+    # Beyond 1e19 the slope, 1 / x^2, leaves float32's normal numbers, and CUDA makes it 0: what
+    # is below 1e-32 is compared absolutely, to 1e-37.
     slope = 1.0 / (1.0 + x64) ** 2
     return Measured(
         max_relative(download(out), o.reinhard(x64)),
         finite(out.numpy(), gradient),
-        max_relative(gradient, slope, 1e-36),
+        max_relative(gradient, slope, 1e-32),
     )
 
 
