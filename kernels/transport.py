@@ -80,6 +80,9 @@ class TexelArgs:
     """Directions drawn for each texel, shape [He * We]."""
     centre: wp.array[wp.vec3]
     """Direction of each texel's centre, shape [He * We]."""
+    bound: wp.array[float]
+    """Largest sine of the polar angle within each texel's tent; of the plane, times the largest
+    cosine with its normal. Shape [He * We]."""
     lanes: int
     """Threads of a pixel; each takes every ``lanes``-th texel. A thread costs as much as a texel on
     the CPU, where one per pixel is best."""
@@ -147,29 +150,26 @@ def tent_uv(i: int, j: int, height: int, width: int, u: wp.vec2) -> wp.vec2:
 
 
 @wp.func
-def sine_max(i: int, height: int) -> float:
-    """Return the largest sine of the polar angle within the tents of row ``i``."""
-    first = (float(i) - 0.5) / float(height)
-    last = (float(i) + 1.5) / float(height)
-    if first < 0.5 and last > 0.5:
-        return 1.0
-    return wp.max(wp.sin(PI * wp.max(first, 0.0)), wp.sin(PI * wp.min(last, 1.0)))
+def tent_direction(
+    texels: TexelArgs, i: int, j: int, u: wp.vec2, key: wp.uint32, weigh: int, normal: wp.vec3
+) -> wp.vec3:
+    """Draw a direction from texel (i, j)'s tent, evenly in solid angle.
 
-
-@wp.func
-def tent_direction(texels: TexelArgs, i: int, j: int, u: wp.vec2, key: wp.uint32) -> wp.vec3:
-    """Draw a direction from texel (i, j)'s tent with density ``weight / d_omega`` [1/sr].
-
-    ``u`` makes the first try, so that its stratification survives wherever that is accepted.
+    The density is ``weight / d_omega`` [1/sr]; with ``weigh`` 1 it also follows the cosine with
+    ``normal``. ``u`` makes the first try, so its stratification survives where that is accepted.
     """
-    bound = sine_max(i, texels.height)
+    bound = texels.bound[i * texels.width + j]
     uv = tent_uv(i, j, texels.height, texels.width, u)
+    wi = uv_to_direction(uv[0], uv[1])
     for draw in range(TRIES_MAX):
-        more = random_pair(key, 2 * draw)
-        if more[0] * bound <= wp.sin(PI * uv[1]):
-            return uv_to_direction(uv[0], uv[1])
+        share = wp.sqrt(wi[0] * wi[0] + wi[2] * wi[2])
+        if weigh == 1:
+            share = share * wp.dot(wi, normal)
+        if random_pair(key, 2 * draw)[0] * bound <= share:
+            break
         uv = tent_uv(i, j, texels.height, texels.width, random_pair(key, 2 * draw + 1))
-    return uv_to_direction(uv[0], uv[1])
+        wi = uv_to_direction(uv[0], uv[1])
+    return wi
 
 
 @wp.func
@@ -239,7 +239,8 @@ def direct_row(
             u = random_pair(key, -1)
             if directions > 1:
                 u = sobol_pair(r, key, 0)
-            wi = tent_direction(texels, i, j, u, hash_pair(key, wp.uint32(r)))
+            ray_key = hash_pair(key, wp.uint32(r))
+            wi = tent_direction(texels, i, j, u, ray_key, 0, n)
             ng = points.ng[p, s]
             if wp.dot(wi, n) > 0.0 and wp.dot(wi, ng) > 0.0:
                 frame = basis(n)
@@ -545,9 +546,6 @@ def blocked_share(
     """Return the share of texel ``t``'s irradiance that does not reach row ``p`` [1]."""
     i = t // texels.width
     j = t % texels.width
-    reach = TENT_REACH * PI / float(texels.height)
-    angle = wp.acos(wp.clamp(wp.dot(texels.centre[t], proxy.normal), -1.0, 1.0))
-    bound = wp.cos(wp.max(angle - reach, 0.0)) * sine_max(i, texels.height)
     key = hash_pair(pixel_key, wp.uint32(t))
     directions = texels.direction_count[t]
     spot = shift + GOLDEN_ROW * float(i) + GOLDEN_COLUMN * float(j)
@@ -559,14 +557,7 @@ def blocked_share(
         u = random_pair(key, -1)
         if directions > 1:
             u = sobol_pair(r, key, 0)
-        uv = tent_uv(i, j, texels.height, texels.width, u)
-        wi = uv_to_direction(uv[0], uv[1])
-        for draw in range(TRIES_MAX):
-            more = random_pair(ray_key, 2 * draw)
-            if more[0] * bound <= wp.sin(PI * uv[1]) * wp.dot(wi, proxy.normal):
-                break
-            uv = tent_uv(i, j, texels.height, texels.width, random_pair(ray_key, 2 * draw + 1))
-            wi = uv_to_direction(uv[0], uv[1])
+        wi = tent_direction(texels, i, j, u, ray_key, 1, proxy.normal)
         origin = position[p, (first + r) % filled] + proxy.normal * mesh.epsilon
         if wp.dot(wi, proxy.normal) > 0.0 and meets_box(origin, wi, low, high) == 1:
             total += 1.0 - visibility(mesh, material, texture, origin, wi)

@@ -112,15 +112,28 @@ def direction_counts(expected: Light, height: int, budget: int) -> NDArray[np.in
     return flat
 
 
-def _texel_args(counts: NDArray[np.int32], height: int, device: wp.Device) -> kernels.TexelArgs:
+def _texel_args(
+    counts: NDArray[np.int32],
+    height: int,
+    device: wp.Device,
+    normal: Float64Array | None = None,
+) -> kernels.TexelArgs:
+    """Describe a map's texels; directions follow the cosine with ``normal`` where it is given."""
     args = kernels.TexelArgs()
     args.height, args.width = height, 2 * height
-    args.d_omega = wp.array(
-        tent_solid_angles(height).astype(np.float32), dtype=float, device=device
-    )
+    step = np.pi / height
+    rows = np.arange(height)
+    low, high = np.maximum(rows - 0.5, 0.0) * step, np.minimum(rows + 1.5, height) * step
+    across = np.where((low < 0.5 * np.pi) & (high > 0.5 * np.pi), 1.0, np.sin([low, high]).max(0))
+    bound = np.repeat(across[:, None], 2 * height, axis=1)
+    centres = map_directions(height, 2 * height)
+    if normal is not None:
+        angle = np.arccos(np.clip(centres @ normal, -1.0, 1.0))
+        bound *= np.cos(np.clip(angle - kernels.TENT_REACH * step, 0.0, 0.5 * np.pi))
+    for name, values in (("d_omega", tent_solid_angles(height)), ("bound", bound.reshape(-1))):
+        setattr(args, name, wp.array(values.astype(np.float32), dtype=float, device=device))
     args.direction_count = wp.array(counts, dtype=int, device=device)
-    centres = map_directions(height, 2 * height).reshape(-1, 3).astype(np.float32)
-    args.centre = wp.array(centres, dtype=wp.vec3, device=device)
+    args.centre = wp.array(centres.reshape(-1, 3).astype(np.float32), dtype=wp.vec3, device=device)
     args.lanes = 1 if device.is_cpu else LANES
     return args
 
@@ -239,7 +252,7 @@ def proxy_rows(
     """
     scene, device, height = renderer.scene, renderer.device, settings.height_shadow
     counts = direction_counts(expected, height, settings.bright_directions)
-    texels = _texel_args(counts, height, device)
+    texels = _texel_args(counts, height, device, scene.proxy.normal)
     low, high = (b - scene.origin for b in scene.bounds)
     margin = scene.mesh_args.epsilon
     corners = (
