@@ -350,6 +350,7 @@ def command(options: argparse.Namespace) -> str:
         value = getattr(options, name)
         words += [] if value is None else [f"--{name.replace('_', '-')} {value}"]
     words += [f"--threads {options.threads}"] if options.threads else []
+    words += ["--no-freeze"] if options.no_freeze else []
     words += [f"--sampler {options.sampler}"] if options.sampler != "ldsampler" else []
     return " ".join(words)
 
@@ -368,6 +369,9 @@ def main(arguments: list[str] | None = None) -> None:
     parser.add_argument("--device", default=None, help="cpu or cuda")
     parser.add_argument("--threads", type=int, default=0, help="CPU threads of every renderer")
     parser.add_argument("--sampler", default="ldsampler", help="of Mitsuba")
+    parser.add_argument(
+        "--no-freeze", action="store_true", help="let Mitsuba's Python trace every call anew"
+    )
     parser.add_argument(
         "--reference-spp", type=int, default=None, help="of Mitsuba's reference, twice a power of 4"
     )
@@ -406,7 +410,7 @@ def main(arguments: list[str] | None = None) -> None:
             reasons.append(f"{name}: {error} (--assets)")
             log(f"skipped {reasons[-1]}")
             continue
-        bench = Bench(scene, plan.maps, options.sampler)
+        bench = Bench(scene, plan.maps, options.sampler, not options.no_freeze)
         references = References(
             bench,
             plan.reference_spp,

@@ -37,10 +37,15 @@ class Bench:
         scene: What is rendered.
         maps: Rows of the map for the foreground and for the shadow, by pair.
         sampler: Of Mitsuba.
+        freeze: Whether Mitsuba's functions are traced once.
     """
 
     def __init__(
-        self, scene: SpeedScene, maps: Sequence[tuple[int, int]], sampler: str = "ldsampler"
+        self,
+        scene: SpeedScene,
+        maps: Sequence[tuple[int, int]],
+        sampler: str = "ldsampler",
+        freeze: bool = True,
     ) -> None:
         from benchmarks.speed_mitsuba import MitsubaScene
 
@@ -53,7 +58,7 @@ class Bench:
         every = sorted({height for pair in maps for height in pair})
         self.texels = {height: scene.texels(height) for height in every}
         self.mitsuba = {
-            height: MitsubaScene(scene, texels, self.mitsuba_integrator, sampler)
+            height: MitsubaScene(scene, texels, self.mitsuba_integrator, sampler, freeze)
             for height, texels in self.texels.items()
         }
         self.memory = PeakMemory(scene.renderer.device)
@@ -153,28 +158,29 @@ class MitsubaPart:
         self.warm_key = (self.integrator, part, height, self.pass_spp)
 
     def warm(self) -> None:
-        """Compile, with the samples of one pass."""
+        """Compile, with the samples of one pass; recorded anew until nothing is new."""
         one = MitsubaPart(self.bench, self.part, self.height, self.pass_spp)
-        one.forward(WARM_SEED)
-        one.step(WARM_SEED)
+        for seed in range(WARM_SEED, WARM_SEED + 3):
+            one.forward(seed)
+            one.step(seed)
 
     def forward(self, seed: int) -> None:
         """Render."""
         render = self.target.foreground if self.part == "foreground" else self.target.ratio
         render(self.spp, seed)
-        self.target.synchronize()
+        mitsuba_synchronize()
 
     def step(self, seed: int) -> Callable[[], Step]:
         """Render and differentiate; the foreground's two passes have seeds of their own."""
         if self.part == "foreground":
             image = self.target.foreground(self.spp, seed)
             gradient = self.target.foreground_gradient(self.spp, seed + 50_000)
-            self.target.synchronize()
+            mitsuba_synchronize()
             return lambda: {
                 self.part: (self.target.objects(image), np.asarray(gradient, dtype=np.float64))
             }
         ratio, gradient = self.target.ratio_step(self.spp, seed)
-        self.target.synchronize()
+        mitsuba_synchronize()
         return lambda: {
             self.part: (np.asarray(ratio, np.float64).T, np.asarray(gradient, dtype=np.float64))
         }
@@ -243,6 +249,13 @@ class Transport:
             part: (numpy(image), numpy(leaf.grad))
             for part, image, leaf in zip(PARTS, images, leaves, strict=True)
         }
+
+
+def mitsuba_synchronize() -> None:
+    """Wait for what Dr.Jit has queued."""
+    import drjit as dr
+
+    dr.sync_thread()
 
 
 def shadow_ratio(radiance: Radiance) -> Tensor:

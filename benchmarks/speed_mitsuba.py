@@ -5,7 +5,7 @@ and both radiances of the plane share their samples, so that the ratio is exactl
 is blocked. Set the variant before importing this module.
 """
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from typing import Any
 
@@ -26,8 +26,6 @@ IntArray = NDArray[np.int32]
 PASS_SAMPLES = {"llvm_ad_rgb": 1 << 25, "cuda_ad_rgb": 1 << 28}
 """Camera samples traced at once; bounds memory. Passes are long, as only samples of one pass are
 stratified together."""
-KEPT_SAMPLES = PASS_SAMPLES
-"""Plane samples that the backward pass keeps at 34 bytes each; beyond them it traces again."""
 
 
 @dataclass
@@ -58,6 +56,8 @@ class MitsubaScene:
         sampler: ``ldsampler`` is Mitsuba's best here: measured on the ball at 256 samples,
             ``independent`` takes 1.9 times as long for twice the error, ``multijitter`` 1.9 times
             as long for 0.9 of it.
+        freeze: Whether Python traces each function once (``dr.freeze``), which saves up to 70 ms
+            of a call, or each time.
     """
 
     def __init__(
@@ -66,6 +66,7 @@ class MitsubaScene:
         texels: NDArray[np.float32],
         integrator: str = "prb",
         sampler: str = "ldsampler",
+        freeze: bool = True,
     ) -> None:
         self.sampler = sampler
         self.setup = referee.build(scene.asset, scene.matrix, scene.camera, texels, scene.depth)
@@ -75,64 +76,47 @@ class MitsubaScene:
         height = int(rows.max()) + 1 - top
         self.crop = (height, int(columns.max()) + 1 - left)
         self.rows_of_objects = (rows - top) * self.crop[1] + columns - left
-        self.sensor = _sensor(scene.camera, self.setup, (left, top, self.crop[1], height), sampler)
         self.plane_height = float(-self.setup.center[1] / self.setup.radius)
         self.crop_offset = (left, top)
         self.width = scene.camera.width
         self.integrator = mi.load_dict(
             {"type": integrator, "max_depth": scene.depth + 1, "hide_emitters": True}
         )
-        self.plane_pixels = mi.UInt32(scene.proxy_pixels.astype(np.uint32))
         self.plane_count = len(scene.proxy_pixels)
         self.parameters = mi.traverse(self.setup.scene)
         dr.enable_grad(self.parameters["light.texels"])
         self.parameters.update()
-        self.emitter: LatlongEmitter = self.setup.scene.environment()
         d_image = np.zeros((self.crop[0] * self.crop[1], 3), np.float32)
         d_image[self.rows_of_objects] = scene.weight_fg
-        self.d_image = mi.TensorXf(d_image.reshape(*self.crop, 3))
         self.weight_ratio = color(scene.weight_ratio)
-        dr.eval(self.d_image, self.plane_pixels, self.weight_ratio)
+        self.given: dict[str, Any] = {
+            "scene": self.setup.scene,
+            "sensor": _sensor(scene.camera, self.setup, (left, top, self.crop[1], height), sampler),
+            "texels": self.parameters["light.texels"],
+            "d_image": mi.TensorXf(d_image.reshape(*self.crop, 3)),
+            "pixels": mi.UInt32(scene.proxy_pixels.astype(np.uint32)),
+            "weight_ratio": self.weight_ratio,
+        }
+        """All arrays that a frozen function reads."""
+        dr.eval(self.given)
+        wrap = dr.freeze(warn_after=1000) if freeze else (lambda function: function)
+        self.render = wrap(self._render)
+        self.render_backward = wrap(self._render_backward)
+        self.render_plane = wrap(self._render_plane)
+        self.plane_step = wrap(self._plane_step)
 
     def largest_pass(self, part: str, spp: int) -> int:
         """Samples per pixel of the longest pass, which decide what is compiled."""
         pixels = self.plane_count if part == "ratio" else self.crop[0] * self.crop[1]
-        return max(pass_spp for _, pass_spp in self._passes(pixels, spp, 0))
+        return max(pass_spp for _, pass_spp in _passes(pixels, spp, 0))
 
     def foreground(self, spp: int, seed: int) -> mi.TensorXf:
         """Render the object alone, premultiplied by coverage, crop's shape."""
-        total = None
-        for pass_seed, pass_spp in self._passes(self.crop[0] * self.crop[1], spp, seed):
-            with dr.suspend_grad():
-                image = self.integrator.render(self.setup.scene, self.sensor, pass_seed, pass_spp)
-            image = image * (pass_spp / spp)
-            total = image if total is None else total + image
-            dr.eval(total)
-        return total
+        return self._mean(self.render, spp, seed)
 
     def foreground_gradient(self, spp: int, seed: int) -> mi.TensorXf:
         """Gradient of the weighted foreground with respect to the texels, by path replay."""
-        total = None
-        texels = self.parameters["light.texels"]
-        for pass_seed, pass_spp in self._passes(self.crop[0] * self.crop[1], spp, seed):
-            dr.set_grad(texels, 0.0)
-            self.integrator.render_backward(
-                self.setup.scene,
-                self.parameters,
-                self.d_image,
-                self.sensor,
-                pass_seed,
-                pass_spp,
-            )
-            gradient = dr.grad(texels) * (pass_spp / spp)
-            total = gradient if total is None else total + gradient
-            dr.eval(total)
-        return total
-
-    @staticmethod
-    def synchronize() -> None:
-        """Wait for everything that was queued."""
-        dr.sync_thread()
+        return self._mean(self.render_backward, spp, seed)
 
     def objects(self, image: mi.TensorXf) -> FloatArray:
         """Return the object pixels of `foreground`, shape [object_pixel, 3]."""
@@ -145,70 +129,94 @@ class MitsubaScene:
     def plane(self, spp: int, seed: int) -> tuple[mi.Color3f, mi.Color3f]:
         """Sum the plane's radiance with and without the object over all samples per pixel."""
         lit, unoccluded = (dr.zeros(mi.Color3f, self.plane_count) for _ in range(2))
-        with dr.suspend_grad():
-            for pass_seed, pass_spp in self._passes(self.plane_count, spp, seed):
-                a, b = self._radiance(self._trace(pass_seed, pass_spp), pass_spp)
-                lit += a
-                unoccluded += b
-                dr.eval(lit, unoccluded)
+        for pass_seed, pass_spp in _passes(self.plane_count, spp, seed):
+            a, b = self.render_plane(self.given, pass_seed, pass_spp)
+            lit += a
+            unoccluded += b
+            dr.eval(lit, unoccluded)
         return lit, unoccluded
 
     def ratio_step(self, spp: int, seed: int) -> tuple[mi.Color3f, mi.TensorXf]:
-        """Shadow ratio and the gradient of its weighted sum with respect to the texels."""
-        passes = list(self._passes(self.plane_count, spp, seed))
-        keep = self.plane_count * spp <= KEPT_SAMPLES[mi.variant()]
-        kept: list[PlaneSamples] = []
-        lit, unoccluded = (dr.zeros(mi.Color3f, self.plane_count) for _ in range(2))
-        with dr.suspend_grad():
-            for pass_seed, pass_spp in passes:
-                samples = self._trace(pass_seed, pass_spp)
-                if keep:
-                    dr.eval(samples.__dict__)
-                    kept.append(samples)
-                a, b = self._radiance(samples, pass_spp)
-                lit += a
-                unoccluded += b
-                dr.eval(lit, unoccluded)
-        d_lit, d_unoccluded, ratio = ratio_adjoint(lit, unoccluded, self.weight_ratio)
-        return ratio, self._plane_backward(passes, kept, d_lit, d_unoccluded)
+        """Shadow ratio and the gradient of its weighted sum with respect to the texels.
+
+        Samples of a single pass are kept for the backward pass, those of several traced again.
+        """
+        passes = list(_passes(self.plane_count, spp, seed))
+        if len(passes) == 1:
+            ratio, gradient = self.plane_step(self.given, *passes[0])
+            dr.eval(ratio, gradient)
+            return ratio, gradient
+        d_lit, d_unoccluded, ratio = ratio_adjoint(*self.plane(spp, seed), self.weight_ratio)
+        return ratio, self.plane_gradient(spp, seed, d_lit, d_unoccluded)
 
     def plane_gradient(
         self, spp: int, seed: int, d_lit: mi.Color3f, d_unoccluded: mi.Color3f
     ) -> mi.TensorXf:
         """Gradient through the sums of `plane` for given adjoints."""
-        passes = list(self._passes(self.plane_count, spp, seed))
-        return self._plane_backward(passes, [], d_lit, d_unoccluded)
-
-    def _plane_backward(
-        self,
-        passes: list[tuple[int, int]],
-        kept: list[PlaneSamples],
-        d_lit: mi.Color3f,
-        d_unoccluded: mi.Color3f,
-    ) -> mi.TensorXf:
-        texels = self.parameters["light.texels"]
+        texels = self.given["texels"]
         dr.set_grad(texels, 0.0)
-        for k, (pass_seed, pass_spp) in enumerate(passes):
-            if kept:
-                samples = kept[k]
-            else:
-                with dr.suspend_grad():
-                    samples = self._trace(pass_seed, pass_spp)
-            index = dr.arange(mi.UInt32, self.plane_count * pass_spp) // pass_spp
-            a = dr.gather(mi.Color3f, d_lit, index)
-            b = dr.gather(mi.Color3f, d_unoccluded, index)
-            loss = self._lookup(samples.d_light) * (
-                samples.weight_light * (b + dr.select(samples.free_light, a, 0.0))
-            )
-            loss += self._lookup(samples.d_cosine) * (
-                samples.weight_cosine * (b + dr.select(samples.free_cosine, a, 0.0))
-            )
-            dr.backward_from(loss)
+        for pass_seed, pass_spp in _passes(self.plane_count, spp, seed):
+            with dr.suspend_grad():
+                samples = self._trace(self.given, pass_seed, pass_spp)
+            self._backward(samples, d_lit, d_unoccluded, pass_spp)
             dr.eval(dr.grad(texels))
         return mi.TensorXf(dr.grad(texels))
 
+    def _mean(self, make: Callable[..., mi.TensorXf], spp: int, seed: int) -> mi.TensorXf:
+        """Average an image or gradient over passes."""
+        total = None
+        for pass_seed, pass_spp in _passes(self.crop[0] * self.crop[1], spp, seed):
+            part = make(self.given, pass_seed, pass_spp) * (pass_spp / spp)
+            total = part if total is None else total + part
+            dr.eval(total)
+        return total
+
+    def _render(self, given: dict[str, Any], seed: mi.UInt32, spp: int) -> mi.TensorXf:
+        with dr.suspend_grad():
+            return self.integrator.render(given["scene"], given["sensor"], seed, spp)
+
+    def _render_backward(self, given: dict[str, Any], seed: mi.UInt32, spp: int) -> mi.TensorXf:
+        dr.clear_grad(given["texels"])
+        self.integrator.render_backward(
+            given["scene"], self.parameters, given["d_image"], given["sensor"], seed, spp
+        )
+        return dr.grad(given["texels"])
+
+    def _render_plane(
+        self, given: dict[str, Any], seed: mi.UInt32, spp: int
+    ) -> tuple[mi.Color3f, mi.Color3f]:
+        with dr.suspend_grad():
+            return self._radiance(self._trace(given, seed, spp), spp)
+
+    def _plane_step(
+        self, given: dict[str, Any], seed: mi.UInt32, spp: int
+    ) -> tuple[mi.Color3f, mi.TensorXf]:
+        dr.clear_grad(given["texels"])
+        with dr.suspend_grad():
+            samples = self._trace(given, seed, spp)
+            dr.eval(samples.__dict__)
+            sums = self._radiance(samples, spp)
+            d_lit, d_unoccluded, ratio = ratio_adjoint(*sums, given["weight_ratio"])
+        self._backward(samples, d_lit, d_unoccluded, spp)
+        return ratio, dr.grad(given["texels"])
+
+    def _backward(
+        self, samples: PlaneSamples, d_lit: mi.Color3f, d_unoccluded: mi.Color3f, spp: int
+    ) -> None:
+        """Add one pass's gradient to the texels'."""
+        index = dr.arange(mi.UInt32, self.plane_count * spp) // spp
+        a = dr.gather(mi.Color3f, d_lit, index)
+        b = dr.gather(mi.Color3f, d_unoccluded, index)
+        loss = self._lookup(samples.d_light) * (
+            samples.weight_light * (b + dr.select(samples.free_light, a, 0.0))
+        )
+        loss += self._lookup(samples.d_cosine) * (
+            samples.weight_cosine * (b + dr.select(samples.free_cosine, a, 0.0))
+        )
+        dr.backward_from(loss)
+
     def _lookup(self, d: mi.Vector3f) -> mi.Color3f:
-        return self.emitter.radiance(d, mi.Bool(True))
+        return self.setup.scene.environment().radiance(d, mi.Bool(True))
 
     def _radiance(self, samples: PlaneSamples, spp: int) -> tuple[mi.Color3f, mi.Color3f]:
         by_light = self._lookup(samples.d_light) * samples.weight_light
@@ -226,14 +234,15 @@ class MitsubaScene:
 
         return reduce(lit), reduce(unoccluded)
 
-    def _trace(self, seed: int, spp: int) -> PlaneSamples:
+    def _trace(self, given: dict[str, Any], seed: mi.UInt32, spp: int) -> PlaneSamples:
         """Draw one emitter and one cosine direction per camera sample and test both."""
-        scene = self.setup.scene
+        scene = given["scene"]
+        emitter: LatlongEmitter = scene.environment()
         count = self.plane_count * spp
         sampler = mi.load_dict({"type": self.sampler, "sample_count": spp})
         sampler.set_samples_per_wavefront(spp)
         sampler.seed(seed, count)
-        pixel = dr.gather(mi.UInt32, self.plane_pixels, dr.arange(mi.UInt32, count) // spp)
+        pixel = dr.gather(mi.UInt32, given["pixels"], dr.arange(mi.UInt32, count) // spp)
         width = self.width
         offset = sampler.next_2d()
         # Positions are shares of the crop
@@ -241,7 +250,7 @@ class MitsubaScene:
             (pixel % width + offset.x - self.crop_offset[0]) / self.crop[1],
             (pixel // width + offset.y - self.crop_offset[1]) / self.crop[0],
         )
-        ray, _ = self.sensor.sample_ray(0.0, 0.5, position, mi.Point2f(0.5))
+        ray, _ = given["sensor"].sample_ray(0.0, 0.5, position, mi.Point2f(0.5))
 
         # Which comes first
         t = (self.plane_height - ray.o.y) / ray.d.y
@@ -258,7 +267,7 @@ class MitsubaScene:
         def free(d: mi.Vector3f, active: mi.Bool) -> mi.Bool:
             return ~scene.ray_test(mi.Ray3f(start, d), False, active=active)
 
-        ds, _ = self.emitter.sample_direction(it, sampler.next_2d(), seen)
+        ds, _ = emitter.sample_direction(it, sampler.next_2d(), seen)
         cos_i = dr.maximum(ds.d.y, 0.0)
         active = seen & (cos_i > 0.0) & (ds.pdf > 0.0)
         by_light = dr.select(
@@ -272,16 +281,17 @@ class MitsubaScene:
         d = mi.Vector3f(local.y, local.z, local.x)
         other = dr.zeros(mi.DirectionSample3f, count)
         other.d = d
-        by_cosine = mis_weight(d.y * dr.inv_pi, self.emitter.pdf_direction(it, other, seen))
+        by_cosine = mis_weight(d.y * dr.inv_pi, emitter.pdf_direction(it, other, seen))
         by_cosine = dr.select(seen & (d.y > 0.0), by_cosine, 0.0)
         return PlaneSamples(ds.d, by_light, free_light, d, by_cosine, free(d, seen))
 
-    @staticmethod
-    def _passes(pixels: int, spp: int, seed: int) -> Iterator[tuple[int, int]]:
-        """Seed and samples per pixel of each pass; powers of four, as the sampler wants."""
-        largest = 4 ** ((max(1, PASS_SAMPLES[mi.variant()] // pixels).bit_length() - 1) // 2)
-        for k, start in enumerate(range(0, spp, largest)):
-            yield (seed * 65537 + k) % (1 << 32), min(largest, spp - start)
+
+def _passes(pixels: int, spp: int, seed: int) -> Iterator[tuple[mi.UInt32, int]]:
+    """Seed and samples per pixel of each pass; powers of four, as the sampler wants."""
+    largest = 4 ** ((max(1, PASS_SAMPLES[mi.variant()] // pixels).bit_length() - 1) // 2)
+    for k, start in enumerate(range(0, spp, largest)):
+        pass_seed = dr.opaque(mi.UInt32, (seed * 65537 + k) % (1 << 32))
+        yield pass_seed, min(largest, spp - start)
 
 
 def _sensor(

@@ -30,7 +30,8 @@ Mitsuba renders the object with its own `prb`, film cropped to the object (ToyCa
 texture `prb` does not see: with the referee's path replay, which takes half the time there), and
 the shadow ratio from rays of the compared pixels alone, both radiances from the same samples, the
 gradient by Dr.Jit's automatic differentiation. Its sampler is `ldsampler`, with which it takes an
-eighth of `independent`'s time to an image of equal error here, a third to a gradient. Kernels are
+eighth of `independent`'s time to an image of equal error here, a third to a gradient; its functions
+are frozen (`dr.freeze`), so that Python does not trace them again in each step. Kernels are
 compiled and scenes built before the clock runs.
 
 Errors are relative RMSE against references of both renderers; products of differences to two
