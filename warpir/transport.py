@@ -145,12 +145,13 @@ class TransportIntegrator:
         T_fg = torch.empty(shape, dtype=dtype, device=self.device)
         emission = torch.empty((count, 3), device=self.device)
         mask = torch.empty(count, device=self.device)
-        for rows, T, emitted, coverage in object_rows(
+        for part in object_rows(
             self.renderer, self.object_pixels, self.depth, settings, expected, seed
         ):
-            T_fg[:, rows] = wp.to_torch(T).permute(2, 0, 1).to(dtype)
-            emission[rows] = wp.to_torch(emitted)
-            mask[rows] = wp.to_torch(coverage).to(torch.float32) / settings.subsamples
+            rows = torch.from_numpy(part.rows.astype(np.int64)).to(self.device)
+            T_fg[:, rows] = wp.to_torch(part.T).permute(2, 0, 1).to(dtype)
+            emission[rows] = wp.to_torch(part.emission)
+            mask[rows] = wp.to_torch(part.count).to(torch.float32) / part.subsamples
         return {"T_fg": T_fg, "emission": emission, "mask": mask}
 
     def _trace_proxy(self, above: IntArray, expected: Light, seed: int) -> dict[str, Tensor]:

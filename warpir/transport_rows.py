@@ -25,6 +25,27 @@ CHUNK_BYTES = 64 << 20
 """Memory of the rows that are traced at once, before they are stored in a small type."""
 
 
+PILOT_SUBSAMPLES = 8
+PILOT_SEED = 0x2F6E2B1
+"""Of the samples that find mirrors."""
+
+
+@dataclass(frozen=True)
+class ObjectRows:
+    """Traced rows of ``T_fg``."""
+
+    rows: IntArray
+    """Which, shape [row]."""
+    T: wp.array
+    """Pixel radiance per texel radiance [1], vec3, shape [row, texel]."""
+    emission: wp.array
+    """Radiance that does not depend on the light, vec3, shape [row]."""
+    count: wp.array
+    """Subsamples that met the object, shape [row]."""
+    subsamples: int
+    """Of how many."""
+
+
 @dataclass(frozen=True)
 class TransportSettings:
     """How finely light transport is traced and stored."""
@@ -37,6 +58,9 @@ class TransportSettings:
     """Positions within each pixel."""
     paths: int = 64
     """Paths per pixel, for narrow specular lobes and for all light of two or more interactions."""
+    mirror_factor: int = 16
+    """Times as many of both for pixels that mirror: there the light that they see changes with
+    every normal in the pixel."""
     bright_directions: int = 1024
     """Directions per pixel and map that are shared out by where light is expected, on top of one
     per texel."""
@@ -145,95 +169,113 @@ def object_rows(
     settings: TransportSettings,
     expected: Light,
     seed: int,
-) -> Iterator[tuple[slice, wp.array, wp.array, wp.array]]:
-    """Trace the object's rows chunk by chunk.
-
-    Yields:
-        Which rows; radiance per texel radiance [1], shape [row, texel] vec3; emitted radiance,
-        shape [row] vec3; how many subsamples met the object, shape [row].
-    """
+) -> Iterator[ObjectRows]:
+    """Trace the object's rows chunk by chunk, pixels that mirror with more samples than others."""
     scene, device, height = renderer.scene, renderer.device, settings.height_fg
     counts = direction_counts(expected, height, settings.bright_directions)
     texels = _texel_args(counts, height, device)
     texel_count = 2 * height * height
     # Half of the later vertices' directions look for the expected light, half everywhere.
-    map_ = as_map(expected, height)
-    flux = luminance(map_.astype(np.float64))
+    flux = luminance(as_map(expected, height).astype(np.float64))
     mean = float((flux * texel_solid_angles(height, 2 * height)[:, None]).sum()) / (4.0 * np.pi)
     flat = 0.5 + 0.5 * flux / mean if mean > 0.0 else np.ones_like(flux)
     proposal = light_args(
         Light(texels=np.repeat(flat[..., None], 3, axis=2).astype(np.float32)), device
     )
-    size = max(1, CHUNK_BYTES // (12 * texel_count))
-    for start in range(0, len(pixels), size):
-        chunk = pixels[start : start + size]
-        count = len(chunk)
-        rows = Rows(wp.array(chunk, dtype=wp.int32, device=device))
-        geometry = (scene.mesh_args, scene.material_args, scene.texture_args)
-        points = kernels.SurfacePoints()
-        shape = (count, settings.subsamples)
-        points.count = wp.zeros(count, dtype=int, device=device)
-        for name in ("position", "ng", "n", "wo", "base_color"):
-            setattr(points, name, wp.empty(shape, dtype=wp.vec3, device=device))
-        for name in ("metallic", "roughness"):
-            setattr(points, name, wp.empty(shape, dtype=float, device=device))
-        emission = wp.zeros(count, dtype=wp.vec3, device=device)
-        T = wp.empty((count, texel_count), dtype=wp.vec3, device=device)
-        renderer.launch(
-            kernels.trace_points,
-            count,
-            [
-                rows,
-                scene.camera_args,
-                *geometry,
-                scene.proxy_args,
-                settings.subsamples,
-                seed,
-                Rows(points),
-                Rows(emission),
-            ],
-            settings.subsamples,
-            "transport",
-        )
+    geometry = (scene.mesh_args, scene.material_args, scene.texture_args)
+    for rows, factor in _groups(renderer, pixels, settings, seed):
+        subsamples, paths = factor * settings.subsamples, factor * settings.paths
+        chunk = pixels[rows]
+        points, emission = _surface_points(renderer, chunk, subsamples, seed)
+        T = wp.empty((len(chunk), texel_count), dtype=wp.vec3, device=device)
+        launched = Rows(wp.array(chunk, dtype=wp.int32, device=device))
         renderer.launch(
             kernels.trace_direct,
-            count,
-            [
-                rows,
-                Rows(points),
-                *geometry,
-                texels,
-                settings.subsamples,
-                settings.paths,
-                seed,
-                Rows(T),
-            ],
+            len(chunk),
+            [launched, Rows(points), *geometry, texels, subsamples, paths, seed, Rows(T)],
             int(counts.sum()),
             "transport",
             texels.lanes,
         )
-        if settings.paths > 0:
+        if paths > 0:
             renderer.launch(
                 kernels.trace_paths,
-                count,
+                len(chunk),
                 [
-                    rows,
+                    launched,
                     Rows(points),
                     *geometry,
                     texels,
                     proposal,
-                    settings.subsamples,
-                    settings.paths,
+                    subsamples,
+                    paths,
                     depth,
                     seed,
                     Rows(T),
                     Rows(emission),
                 ],
-                settings.paths * depth,
+                paths * depth,
                 "transport",
-                settings.paths,
+                paths,
             )
-        yield slice(start, start + count), T, emission, points.count
+        yield ObjectRows(rows, T, emission, points.count, subsamples)
+
+
+def _groups(
+    renderer: Renderer, pixels: IntArray, settings: TransportSettings, seed: int
+) -> Iterator[tuple[IntArray, int]]:
+    """Yield chunks of rows, and by how much the counts of each are to be multiplied.
+
+    A pixel counts as mirroring when any of a few samples, which are not used again, meets a lobe
+    narrower than half a texel: what it shows is decided by normals, not by directions.
+    """
+    alpha = 0.5 * np.pi / settings.height_fg
+    mirrors = np.zeros(len(pixels), bool)
+    size = max(1, CHUNK_BYTES // (24 * settings.height_fg**2))
+    for start in range(0, len(pixels), size):
+        points, _ = _surface_points(
+            renderer, pixels[start : start + size], PILOT_SUBSAMPLES, seed ^ PILOT_SEED
+        )
+        filled = np.arange(PILOT_SUBSAMPLES)[None] < points.count.numpy()[:, None]
+        narrow = filled & (points.roughness.numpy() ** 2 < alpha)
+        mirrors[start : start + size] = narrow.any(axis=1)
+    for chosen, factor in ((~mirrors, 1), (mirrors, settings.mirror_factor)):
+        rows = np.flatnonzero(chosen).astype(np.int32)
+        for start in range(0, len(rows), size):
+            yield rows[start : start + size], factor
+
+
+def _surface_points(
+    renderer: Renderer, pixels: IntArray, subsamples: int, seed: int
+) -> tuple[kernels.SurfacePoints, wp.array]:
+    """Find what the camera sees in each pixel: points, and mean emitted radiance."""
+    scene, device, count = renderer.scene, renderer.device, len(pixels)
+    points = kernels.SurfacePoints()
+    points.count = wp.zeros(count, dtype=int, device=device)
+    for name in ("position", "ng", "n", "wo", "base_color"):
+        setattr(points, name, wp.empty((count, subsamples), dtype=wp.vec3, device=device))
+    for name in ("metallic", "roughness"):
+        setattr(points, name, wp.zeros((count, subsamples), dtype=float, device=device))
+    emission = wp.zeros(count, dtype=wp.vec3, device=device)
+    renderer.launch(
+        kernels.trace_points,
+        count,
+        [
+            Rows(wp.array(pixels, dtype=wp.int32, device=device)),
+            scene.camera_args,
+            scene.mesh_args,
+            scene.material_args,
+            scene.texture_args,
+            scene.proxy_args,
+            subsamples,
+            seed,
+            Rows(points),
+            Rows(emission),
+        ],
+        subsamples,
+        "transport",
+    )
+    return points, emission
 
 
 def proxy_rows(
