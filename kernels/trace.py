@@ -315,6 +315,24 @@ def camera_hit(
 
 
 @wp.func
+def meets_box(origin: wp.vec3, wi: wp.vec3, low: wp.vec3, high: wp.vec3) -> int:
+    """Return 1 when the ray may meet the box; most rays from a plane do not."""
+    near = float(0.0)
+    far = float(INFINITY)
+    for axis in range(3):
+        if wp.abs(wi[axis]) > 1.0e-12:
+            a = (low[axis] - origin[axis]) / wi[axis]
+            b = (high[axis] - origin[axis]) / wi[axis]
+            near = wp.max(near, wp.min(a, b))
+            far = wp.min(far, wp.max(a, b))
+        elif origin[axis] < low[axis] or origin[axis] > high[axis]:
+            return 0
+    if near <= far:
+        return 1
+    return 0
+
+
+@wp.func
 def visibility(
     mesh: MeshArgs,
     material: MaterialArgs,

@@ -25,6 +25,7 @@ from warpir.kernels.trace import (
     camera_hit,
     camera_ray,
     closest_hit,
+    meets_box,
     offset_origin,
     surface_at,
     visibility,
@@ -510,32 +511,12 @@ def trace_proxy_points(
 
 
 @wp.func
-def meets_box(origin: wp.vec3, wi: wp.vec3, low: wp.vec3, high: wp.vec3) -> int:
-    """Return 1 when the ray may meet the box; most rays from a plane do not."""
-    near = float(0.0)
-    far = float(INFINITY)
-    for axis in range(3):
-        if wp.abs(wi[axis]) > 1.0e-12:
-            a = (low[axis] - origin[axis]) / wi[axis]
-            b = (high[axis] - origin[axis]) / wi[axis]
-            near = wp.max(near, wp.min(a, b))
-            far = wp.min(far, wp.max(a, b))
-        elif origin[axis] < low[axis] or origin[axis] > high[axis]:
-            return 0
-    if near <= far:
-        return 1
-    return 0
-
-
-@wp.func
 def blocked_share(
     position: wp.array2d[wp.vec3],
     mesh: MeshArgs,
     material: MaterialArgs,
     texture: TextureArgs,
     proxy: ProxyArgs,
-    low: wp.vec3,
-    high: wp.vec3,
     texels: TexelArgs,
     p: int,
     t: int,
@@ -559,7 +540,7 @@ def blocked_share(
             u = sobol_pair(r, key, 0)
         wi = tent_direction(texels, i, j, u, ray_key, 1, proxy.normal)
         origin = position[p, (first + r) % filled] + proxy.normal * mesh.epsilon
-        if wp.dot(wi, proxy.normal) > 0.0 and meets_box(origin, wi, low, high) == 1:
+        if wp.dot(wi, proxy.normal) > 0.0 and meets_box(origin, wi, mesh.low, mesh.high) == 1:
             total += 1.0 - visibility(mesh, material, texture, origin, wi)
     return total / float(directions)
 
@@ -574,8 +555,6 @@ def trace_blocked(
     material: MaterialArgs,
     texture: TextureArgs,
     proxy: ProxyArgs,
-    low: wp.vec3,
-    high: wp.vec3,
     texels: TexelArgs,
     columns: wp.array[int],
     column_count: int,
@@ -596,8 +575,6 @@ def trace_blocked(
         material: Their materials.
         texture: Their textures.
         proxy: The plane.
-        low: Lower corner of the object's bounding box, recentred [m].
-        high: Upper corner [m].
         texels: The map and how many directions each texel gets.
         columns: Texels whose tents rise above the plane, shape [column].
         column_count: Their number.
@@ -611,21 +588,20 @@ def trace_blocked(
     start = position[p, 0]
     # A tent's direction that meets the box passes the centre's ray at less than this distance.
     reach = TENT_REACH * PI / float(texels.height)
-    far = wp.length(wp.max(wp.abs(low - start), wp.abs(high - start))) + spread[p]
+    far = wp.length(wp.max(wp.abs(mesh.low - start), wp.abs(mesh.high - start))) + spread[p]
     margin = reach * far + spread[p]
-    inflate = wp.vec3(margin, margin, margin)
+    low = mesh.low - wp.vec3(margin, margin, margin)
+    high = mesh.high + wp.vec3(margin, margin, margin)
     for c in range(lane, column_count, texels.lanes):
         t = columns[c]
         share = float(0.0)
-        if filled > 0 and meets_box(start, texels.centre[t], low - inflate, high + inflate) == 1:
+        if filled > 0 and meets_box(start, texels.centre[t], low, high) == 1:
             share = blocked_share(
                 position,
                 mesh,
                 material,
                 texture,
                 proxy,
-                low,
-                high,
                 texels,
                 p,
                 t,

@@ -40,6 +40,9 @@ class MeshArgs:
     """Handle of the ``wp.Mesh``; 0 when there are no triangles."""
     epsilon: float
     """Ray offset that depends on the scene's size alone [m]."""
+    low: wp.vec3
+    high: wp.vec3
+    """Corners of the bounding box, wider by `epsilon`, recentred [m]."""
     indices: wp.array[int]
     """Vertex of each corner, shape [3 * triangle]."""
     positions: wp.array[wp.vec3]

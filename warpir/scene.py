@@ -186,6 +186,9 @@ class Scene:
     def _upload_mesh(self, parts: list[tuple[_Vertices, int]]) -> None:
         args = MeshArgs()
         args.epsilon = 1e-5 * self.diagonal
+        low, high = (b - self.origin for b in self.bounds)
+        args.low = wp.vec3(*(low - args.epsilon).astype(np.float32))
+        args.high = wp.vec3(*(high + args.epsilon).astype(np.float32))
         # Kernels look at the handle before they read anything, but arrays may not be empty.
         if not parts:
             args.id = 0

@@ -295,12 +295,6 @@ def proxy_rows(
     scene, device, height = renderer.scene, renderer.device, settings.height_shadow
     counts = direction_counts(expected, height, settings.bright_directions)
     texels = _texel_args(counts, height, device, scene.proxy.normal)
-    low, high = (b - scene.origin for b in scene.bounds)
-    margin = scene.mesh_args.epsilon
-    corners = (
-        wp.vec3(*(low - margin).astype(np.float32)),
-        wp.vec3(*(high + margin).astype(np.float32)),
-    )
     size = max(1, CHUNK_BYTES // (4 * len(columns)))
     if scene.triangle_count == 0:
         return
@@ -341,7 +335,6 @@ def proxy_rows(
                 Rows(position),
                 Rows(spread),
                 *geometry,
-                *corners,
                 texels,
                 wp_columns,
                 len(columns),
