@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import warp as wp
@@ -167,7 +168,7 @@ class Scene:
 
     def contents(self) -> Iterator[NDArray[np.generic]]:
         """Yield every number that a ray can depend on, in a fixed order, for hashing."""
-        structs = (
+        structs: tuple[Any, ...] = (
             self.mesh_args,
             self.material_args,
             self.texture_args,

@@ -30,9 +30,9 @@ PILOT_SAMPLES = 128
 HEIGHTS = (16, 24, 32, 48, 64, 96, 128)
 """Maps to choose from; T grows with the square."""
 LEVELS = (
-    {"subsamples": 16, "paths": 32, "bright_directions": 256},
-    {"subsamples": 32, "paths": 64, "bright_directions": 1024},
-    {"subsamples": 64, "paths": 256, "bright_directions": 4096},
+    TransportSettings(subsamples=16, paths=32, bright_directions=256),
+    TransportSettings(subsamples=32, paths=64, bright_directions=1024),
+    TransportSettings(subsamples=64, paths=128, bright_directions=4096),
 )
 """Counts to choose from, each several times as costly as the one before."""
 
@@ -90,7 +90,12 @@ def choose_settings(
     settings = replace(settings, memory_mib=memory_mib)
     noise, fill = (0.0, 0.0), 0.0
     for level in LEVELS:
-        settings = replace(settings, **level)
+        settings = replace(
+            settings,
+            subsamples=level.subsamples,
+            paths=level.paths,
+            bright_directions=level.bright_directions,
+        )
         noise, fill = pilot.noise(settings, light)
         if max(noise) < share:
             break

@@ -91,7 +91,8 @@ def tent_solid_angles(height: int) -> Float64Array:
     polar = 1.0 - np.cos(0.5 * step)
     beyond = np.cos(0.5 * step) - (np.sin(1.5 * step) - np.sin(0.5 * step)) / step
     rows[0] = rows[-1] = polar + beyond
-    return rows * np.pi / height
+    solid: Float64Array = rows * np.pi / height
+    return solid
 
 
 @lru_cache(maxsize=8)
