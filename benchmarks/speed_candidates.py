@@ -158,9 +158,9 @@ class MitsubaPart:
         self.warm_key = (self.integrator, part, height, self.pass_spp)
 
     def warm(self) -> None:
-        """Compile, with the samples of one pass; recorded anew until nothing is new."""
+        """Compile and record, with the samples of one pass; a scene's first call records twice."""
         one = MitsubaPart(self.bench, self.part, self.height, self.pass_spp)
-        for seed in range(WARM_SEED, WARM_SEED + 3):
+        for seed in range(WARM_SEED, WARM_SEED + (2 if self.pass_spp < 100 else 1)):
             one.forward(seed)
             one.step(seed)
 

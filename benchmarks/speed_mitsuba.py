@@ -130,7 +130,7 @@ class MitsubaScene:
         """Sum the plane's radiance with and without the object over all samples per pixel."""
         lit, unoccluded = (dr.zeros(mi.Color3f, self.plane_count) for _ in range(2))
         for pass_seed, pass_spp in _passes(self.plane_count, spp, seed):
-            a, b = self.render_plane(self.given, pass_seed, pass_spp)
+            a, b = self.render_plane(self._inputs(), pass_seed, pass_spp)
             lit += a
             unoccluded += b
             dr.eval(lit, unoccluded)
@@ -143,7 +143,7 @@ class MitsubaScene:
         """
         passes = list(_passes(self.plane_count, spp, seed))
         if len(passes) == 1:
-            ratio, gradient = self.plane_step(self.given, *passes[0])
+            ratio, gradient = self.plane_step(self._inputs(), *passes[0])
             dr.eval(ratio, gradient)
             return ratio, gradient
         d_lit, d_unoccluded, ratio = ratio_adjoint(*self.plane(spp, seed), self.weight_ratio)
@@ -162,11 +162,16 @@ class MitsubaScene:
             dr.eval(dr.grad(texels))
         return mi.TensorXf(dr.grad(texels))
 
+    def _inputs(self) -> dict[str, Any]:
+        """Return `given` in the one state that is recorded: without a gradient."""
+        dr.clear_grad(self.given["texels"])
+        return self.given
+
     def _mean(self, make: Callable[..., mi.TensorXf], spp: int, seed: int) -> mi.TensorXf:
         """Average an image or gradient over passes."""
         total = None
         for pass_seed, pass_spp in _passes(self.crop[0] * self.crop[1], spp, seed):
-            part = make(self.given, pass_seed, pass_spp) * (pass_spp / spp)
+            part = make(self._inputs(), pass_seed, pass_spp) * (pass_spp / spp)
             total = part if total is None else total + part
             dr.eval(total)
         return total
@@ -176,7 +181,6 @@ class MitsubaScene:
             return self.integrator.render(given["scene"], given["sensor"], seed, spp)
 
     def _render_backward(self, given: dict[str, Any], seed: mi.UInt32, spp: int) -> mi.TensorXf:
-        dr.clear_grad(given["texels"])
         self.integrator.render_backward(
             given["scene"], self.parameters, given["d_image"], given["sensor"], seed, spp
         )
@@ -191,7 +195,6 @@ class MitsubaScene:
     def _plane_step(
         self, given: dict[str, Any], seed: mi.UInt32, spp: int
     ) -> tuple[mi.Color3f, mi.TensorXf]:
-        dr.clear_grad(given["texels"])
         with dr.suspend_grad():
             samples = self._trace(given, seed, spp)
             dr.eval(samples.__dict__)
