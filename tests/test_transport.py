@@ -407,11 +407,34 @@ def test_transport_edge_width_is_that_of_the_map() -> None:
 def test_transport_puts_directions_where_light_is_expected() -> None:
     """Each texel gets one direction; a sun gets a power of two of the budget."""
     sun = as_map(lobe((0.0, 1.0, 0.3), 500.0), 16)
-    counts = direction_counts(Light(texels=sun), 16, 256)
+    counts = direction_counts(sun, 256)
     assert counts.min() == 1 and counts.sum() <= 256 + counts.size
     assert counts.argmax() == sun[..., 0].argmax()
     assert set(np.unique(counts)) <= {2**k for k in range(9)}
-    assert (direction_counts(Light(texels=np.zeros((16, 32, 3), np.float32)), 16, 256) == 1).all()
+    assert (direction_counts(np.zeros((16, 32, 3), np.float32), 256) == 1).all()
+
+
+def test_transport_splits_directions_between_texels_that_share_a_sun(device: str) -> None:
+    """A lobe on the border of two texels gives both the same number of directions."""
+    renderer = scene_of(device)
+    objects, proxies = pixels_of(renderer)
+    angle = np.pi * (1.0 - 2.0 * 10 / (2 * HEIGHT))  # where columns 9 and 10 meet
+    sun = lobe((np.sin(angle), 0.13, np.cos(angle)), 3000.0)
+    made = TransportIntegrator(renderer, objects, proxies, 1, SMALL, sun)
+    counts = direction_counts(made.expected[0], 100).reshape(HEIGHT, -1)
+    row = counts.max(axis=1).argmax()
+    assert counts[row, 9] == counts[row, 10] > 8
+
+
+def test_transport_says_when_the_light_has_moved(device: str) -> None:
+    """Staleness is 1 for the light that was expected and large for a sun elsewhere."""
+    renderer = scene_of(device)
+    objects, proxies = pixels_of(renderer)
+    expected = Light(lobes=lights(400.0))
+    made = TransportIntegrator(renderer, objects, proxies, 1, SMALL, expected)
+    assert made.staleness(expected, expected) == pytest.approx(1.0)
+    moved = expected.rotated(90.0)
+    assert made.staleness(expected, moved) > 2.0 and made.staleness(moved, expected) > 2.0
 
 
 def test_transport_cache_is_keyed_by_content(

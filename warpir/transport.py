@@ -31,6 +31,8 @@ from warpir.transport_cache import content_key, load_rows, save_rows
 from warpir.transport_matrix import DenseRows, SparseRows, product
 from warpir.transport_rows import (
     TransportSettings,
+    direction_counts,
+    flux_noise,
     object_rows,
     proxy_rows,
     sharpness_limit,
@@ -38,6 +40,7 @@ from warpir.transport_rows import (
 )
 
 IntArray = NDArray[np.int32]
+FloatArray = NDArray[np.float32]
 Float64Array = NDArray[np.float64]
 
 
@@ -85,6 +88,10 @@ class TransportIntegrator:
         self.settings = settings or TransportSettings()
         self.device = torch.device(str(wp.device_to_torch(renderer.device)))
         expected = expected or Light(texels=np.ones((8, 16, 3), np.float32))
+        self.expected = tuple(
+            to_texels(expected, h, renderer.device)
+            for h in (self.settings.height_fg, self.settings.height_shadow)
+        )
         height = self.settings.height_shadow
         x, y, z = (float(c) for c in renderer.scene.proxy.normal)
         irradiance = tent_irradiance((x, y, z), height).reshape(-1)
@@ -102,7 +109,7 @@ class TransportIntegrator:
         self.is_cached = stored is not None
         if stored is None:
             self._check_memory(0)
-            stored = self._trace_object(expected, seed) | self._trace_proxy(above, expected, seed)
+            stored = self._trace_object(seed) | self._trace_proxy(above, seed)
             if cache is not None:
                 save_rows(cache / f"{key}.safetensors", stored)
         self.T_fg = DenseRows(stored["T_fg"])
@@ -138,7 +145,7 @@ class TransportIntegrator:
                 ExitCode.RESOURCES,
             )
 
-    def _trace_object(self, expected: Light, seed: int) -> dict[str, Tensor]:
+    def _trace_object(self, seed: int) -> dict[str, Tensor]:
         settings, count = self.settings, len(self.object_pixels)
         dtype = {"bfloat16": torch.bfloat16, "float32": torch.float32}[settings.dtype]
         shape = (3, count, 2 * settings.height_fg**2)
@@ -146,7 +153,7 @@ class TransportIntegrator:
         emission = torch.empty((count, 3), device=self.device)
         mask = torch.empty(count, device=self.device)
         for part in object_rows(
-            self.renderer, self.object_pixels, self.depth, settings, expected, seed
+            self.renderer, self.object_pixels, self.depth, settings, self.expected[0], seed
         ):
             rows = torch.from_numpy(part.rows.astype(np.int64)).to(self.device)
             T_fg[:, rows] = wp.to_torch(part.T).permute(2, 0, 1).to(dtype)
@@ -154,7 +161,7 @@ class TransportIntegrator:
             mask[rows] = wp.to_torch(part.count).to(torch.float32) / part.subsamples
         return {"T_fg": T_fg, "emission": emission, "mask": mask}
 
-    def _trace_proxy(self, above: IntArray, expected: Light, seed: int) -> dict[str, Tensor]:
+    def _trace_proxy(self, above: IntArray, seed: int) -> dict[str, Tensor]:
         """Keep what is not zero: most of the plane loses little of the sky."""
         scene = self.renderer.scene
         index = index_of(self.object_pixels, scene.camera.width * scene.camera.height)
@@ -163,7 +170,13 @@ class TransportIntegrator:
         rows, columns, values = [none], [none], [none.to(torch.float32)]
         first = entries = 0
         for share in proxy_rows(
-            self.renderer, self.proxy_pixels, may_see_object, above, self.settings, expected, seed
+            self.renderer,
+            self.proxy_pixels,
+            may_see_object,
+            above,
+            self.settings,
+            self.expected[1],
+            seed,
         ):
             dense = wp.to_torch(share)
             row, column = torch.nonzero(dense, as_tuple=True)
@@ -178,6 +191,20 @@ class TransportIntegrator:
             "column": torch.cat(columns),
             "blocked": torch.cat(values),
         }
+
+    def staleness(self, light_fg: Light, light_shadow: Light) -> float:
+        """Return how much noisier the rows are under these lights than under the expected one [1].
+
+        1 when nothing has changed; a sun that has moved to texels of one direction each shows by
+        the square root of the directions that it had. Trace again when this is large.
+        """
+        budget, worst = self.settings.bright_directions, 0.0
+        for light, expected in zip((light_fg, light_shadow), self.expected, strict=True):
+            counts = direction_counts(expected, budget)
+            texels = to_texels(light, len(expected), self.renderer.device)
+            own = direction_counts(texels, budget)
+            worst = max(worst, flux_noise(texels, counts) / max(flux_noise(texels, own), 1e-30))
+        return worst
 
     def radiance(
         self,
@@ -242,6 +269,22 @@ class TransportIntegrator:
             lobes = rasterize(light.amplitude, light.axis, light.sharpness, height, name)
             texels = texels + lobes.to(self.device).reshape(-1, 3)
         return texels
+
+
+def to_texels(light: Light, height: int, device: wp.Device) -> FloatArray:
+    """Return a light as the map that the rows are multiplied with, shape [height, 2 height, 3].
+
+    Lobes are averaged over texels exactly as `TransportIntegrator.radiance` does.
+    """
+    texels = torch.zeros((height, 2 * height, 3))
+    if light.texels is not None:
+        texels += resize(torch.from_numpy(np.ascontiguousarray(light.texels)), height)
+    if light.lobes is not None and len(light.lobes.sharpness):
+        parts = (light.lobes.amplitude, light.lobes.axis, light.lobes.sharpness)
+        amplitude, axis, sharpness = (torch.from_numpy(np.ascontiguousarray(p)) for p in parts)
+        texels += rasterize(amplitude, axis, sharpness, height, str(device.alias))
+    averaged: FloatArray = texels.numpy()
+    return averaged
 
 
 def edge_width(sharpness: float, height: int) -> tuple[float, float]:

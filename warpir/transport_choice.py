@@ -13,9 +13,9 @@ import torch
 from numpy.typing import NDArray
 
 from warpir.integrator import LightTensors
-from warpir.light import Light, Lobes, as_map
+from warpir.light import Light, Lobes
 from warpir.render import Renderer, light_args
-from warpir.transport import TransportIntegrator
+from warpir.transport import TransportIntegrator, to_texels
 from warpir.transport_matrix import SparseRows
 from warpir.transport_rows import TransportSettings, sharpness_limit
 
@@ -119,7 +119,7 @@ def _choose_height(
     """Return settings with a map's height, what averaging costs, and the light of the last map."""
 
     def costs(light: Light, exact: _Runs, height: int) -> tuple[float, float]:
-        averaged = pilot.render(Light(texels=as_map(light, height)), 4)
+        averaged = pilot.render(pilot.averaged(light, height), 4)
         return _difference(exact[0], averaged[0]), _difference(exact[1], averaged[1])
 
     exact = pilot.render(expected, 2)
@@ -132,12 +132,12 @@ def _choose_height(
                 height_shadow=height,
                 sharpness_max=max(sharpest, sharpness_limit(height)),
             )
-            return settings, cost, Light(texels=as_map(expected, height))
+            return settings, cost, pilot.averaged(expected, height)
     height = min(heights[-1], TransportSettings.height_fg)
     broad = _broad(expected, height)
     cost = costs(broad, pilot.render(broad, 2), height)
     settings = TransportSettings(height_fg=height, height_shadow=height)
-    return settings, cost, Light(texels=as_map(broad, height))
+    return settings, cost, pilot.averaged(broad, height)
 
 
 def _sharpness(light: Light) -> NDArray[np.float32]:
@@ -182,6 +182,10 @@ class _Pilot:
         # Where the object may hide the plane, only part of a pixel is plane: left to the real run.
         self.objects, self.proxies = objects, np.setdiff1d(proxies, object_pixels)
         self.proxies = self.proxies.astype(np.int32)
+
+    def averaged(self, light: Light, height: int) -> Light:
+        """Return the light as a map of that height."""
+        return Light(texels=to_texels(light, height, self.renderer.device))
 
     def render(self, light: Light, first: int) -> _Runs:
         """Return two runs of the tone-mapped object and two of what the shadow takes."""

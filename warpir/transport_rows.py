@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from warpir.color import luminance
 from warpir.kernels import transport as kernels
-from warpir.light import Light, as_map, map_directions, texel_solid_angles
+from warpir.light import Light, map_directions, texel_solid_angles
 from warpir.render import Renderer, Rows, light_args
 
 IntArray = NDArray[np.int32]
@@ -123,18 +123,35 @@ def tent_irradiance(normal: tuple[float, float, float], height: int) -> Float64A
     return irradiance
 
 
-def direction_counts(expected: Light, height: int, budget: int) -> NDArray[np.int32]:
+def direction_counts(expected: FloatArray, budget: int) -> NDArray[np.int32]:
     """Return how many directions each texel gets: one, and more where light is expected.
 
     A texel's noise is proportional to its flux, so equal-cost directions are best shared out in
     proportion to it (Neyman's allocation); powers of two keep the sequences stratified.
+
+    Args:
+        expected: Likely radiance of the map, shape [He, 2 He, 3].
+        budget: Directions to share out.
+
+    Returns:
+        Shape [He * 2 He].
     """
-    flux = luminance(as_map(expected, height).astype(np.float64))
-    flux = flux * tent_solid_angles(height)[:, None]
+    flux = luminance(expected.astype(np.float64)) * tent_solid_angles(len(expected))[:, None]
     share = budget * flux / max(float(flux.sum()), 1e-30)
     counts = np.exp2(np.floor(np.log2(np.maximum(share, 1.0)))).astype(np.int32)
     flat: NDArray[np.int32] = counts.reshape(-1)
     return flat
+
+
+def flux_noise(texels: FloatArray, counts: NDArray[np.int32]) -> float:
+    """Return how much of a pixel's noise is left with these directions, under this light [1].
+
+    ``sqrt(sum flux_t^2 / count_t)`` over the whole flux: the standard deviation of a pixel if each
+    direction's light were as uncertain as it is strong. A light that has moved shows by it.
+    """
+    flux = luminance(texels.astype(np.float64)) * tent_solid_angles(len(texels))[:, None]
+    total = max(float(flux.sum()), 1e-30)
+    return float(np.sqrt((np.square(flux.reshape(-1)) / counts).sum()) / total)
 
 
 def _texel_args(
@@ -168,16 +185,16 @@ def object_rows(
     pixels: IntArray,
     depth: int,
     settings: TransportSettings,
-    expected: Light,
+    expected: FloatArray,
     seed: int,
 ) -> Iterator[ObjectRows]:
     """Trace the object's rows chunk by chunk, pixels that mirror with more samples than others."""
     scene, device, height = renderer.scene, renderer.device, settings.height_fg
-    counts = direction_counts(expected, height, settings.bright_directions)
+    counts = direction_counts(expected, settings.bright_directions)
     texels = _texel_args(counts, height, device)
     texel_count = 2 * height * height
     # Half of the later vertices' directions look for the expected light, half everywhere.
-    flux = luminance(as_map(expected, height).astype(np.float64))
+    flux = luminance(expected.astype(np.float64))
     mean = float((flux * texel_solid_angles(height, 2 * height)[:, None]).sum()) / (4.0 * np.pi)
     flat = 0.5 + 0.5 * flux / mean if mean > 0.0 else np.ones_like(flux)
     proposal = light_args(
@@ -285,7 +302,7 @@ def proxy_rows(
     may_see_object: IntArray,
     columns: IntArray,
     settings: TransportSettings,
-    expected: Light,
+    expected: FloatArray,
     seed: int,
 ) -> Iterator[wp.array]:
     """Trace the plane's rows chunk by chunk.
@@ -294,7 +311,7 @@ def proxy_rows(
         Share of each texel's irradiance that the object keeps away [1], shape [row, column].
     """
     scene, device, height = renderer.scene, renderer.device, settings.height_shadow
-    counts = direction_counts(expected, height, settings.bright_directions)
+    counts = direction_counts(expected, settings.bright_directions)
     texels = _texel_args(counts, height, device, scene.proxy.normal)
     size = max(1, CHUNK_BYTES // (4 * len(columns)))
     if scene.triangle_count == 0:
