@@ -73,21 +73,20 @@ class Plan:
 FULL = Plan(
     384,
     256,
-    ((32, 32), (32, 64), (16, 16), (64, 64)),
-    (1, 4, 16, 64, 256),
-    (4, 16, 64, 256, 1024, 4096),
+    ((32, 32), (16, 16), (64, 64)),
+    (4, 16, 64, 256),
+    (4, 16, 64, 256, 1024),
     (
         {},
-        {"bright_directions": 0},
-        {"subsamples": 16, "bright_directions": 256},
-        {"subsamples": 64, "bright_directions": 4096, "paths": 256},
+        {"subsamples": 16, "paths": 32, "bright_directions": 256},
+        {"subsamples": 64, "paths": 128, "bright_directions": 4096},
         {"expects_light": False},
     ),
-    8192,
-    1024,
-    7,
-    3,
-    60.0,
+    2048,
+    512,
+    5,
+    2,
+    30.0,
 )
 QUICK = Plan(
     96,
@@ -346,6 +345,7 @@ def command(options: argparse.Namespace) -> str:
     words = ["python -m benchmarks.speed_against_error"]
     words += ["--quick"] if options.quick else []
     words += ["--scenes", *options.scenes] if options.scenes != list(NAMES) else []
+    words += [f"--maps {' '.join(options.maps)}"] if options.maps else []
     for name in ("device", "reference_spp", "own_reference_spp", "rounds", "budget"):
         value = getattr(options, name)
         words += [] if value is None else [f"--{name.replace('_', '-')} {value}"]
@@ -376,6 +376,9 @@ def main(arguments: list[str] | None = None) -> None:
         "--reference-spp", type=int, default=None, help="of Mitsuba's reference, twice a power of 4"
     )
     parser.add_argument("--own-reference-spp", type=int, default=None, help="of mis's reference")
+    parser.add_argument(
+        "--maps", nargs="*", default=None, help="rows of the object's map and the shadow's: 32:32"
+    )
     parser.add_argument("--rounds", type=int, default=None)
     parser.add_argument("--budget", type=float, default=None, help="seconds per candidate")
     parser.add_argument("--cache", type=Path, default=Path("out/speed"), help="of references")
@@ -392,6 +395,9 @@ def main(arguments: list[str] | None = None) -> None:
         rounds=options.rounds or plan.rounds,
         budget_s=options.budget or plan.budget_s,
     )
+    if options.maps:
+        pairs = [tuple(int(h) for h in pair.split(":")) for pair in options.maps]
+        plan = replace(plan, maps=tuple((pair[0], pair[-1]) for pair in pairs))
     device = choose_device(options.device)
     threads = options.threads or default_threads()
     use_device("cpu" if device == "cpu" else "cuda", threads)

@@ -218,10 +218,7 @@ class Transport:
             scene.proxy_pixels,
             depth=scene.depth,
             settings=TransportSettings(height_fg=heights[0], height_shadow=heights[1], **fields),
-            # The map, not the lobes: it is what all are handed
-            expected=Light(texels=bench.texels[max(heights)])
-            if settings.get("expects_light", True)
-            else None,
+            expected=Light(scene.lobes) if settings.get("expects_light", True) else None,
             seed=seed,
         )
         self.seconds_traced = float(made.seconds_traced)
