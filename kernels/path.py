@@ -206,6 +206,7 @@ def trace_foreground(
     light: LightArgs,
     spp: int,
     rays: int,
+    lanes: int,
     depth: int,
     indirect_limit: float,
     seed: int,
@@ -218,25 +219,29 @@ def trace_foreground(
 ):
     """Path-trace the object in each listed pixel; the plane hides it but is not lit.
 
+    A pixel may stand in the list ``lanes`` times, one after the other: each row then takes its
+    share of the samples, and the rows' results add up to the pixel's.
+
     Args:
-        pixels: Row-major pixel indices, shape [object_pixel].
+        pixels: Row-major pixel indices, shape [row].
         camera: The view.
         mesh: The object's triangles.
         material: Their materials.
         texture: Their textures.
         proxy: The ground plane, which hides what is below it from the camera.
         light: The light.
-        spp: Camera samples per pixel.
+        spp: Camera samples per row.
         rays: Paths that share one camera sample.
+        lanes: Rows per pixel; the launch starts with a pixel's first.
         depth: Surface interactions.
         indirect_limit: Most radiance that one path may add behind its first vertex; 0 for no limit.
             It takes the fireflies of light that a mirror throws onto a matte surface, and with them
             some of that light.
         seed: Base seed.
-        foreground: Radiance premultiplied by coverage, shape [object_pixel].
-        diffuse: The part of it that the first hit's diffuse lobe reflects, shape [object_pixel].
-        emission: The part of it that the first hit emits, shape [object_pixel].
-        coverage: Share of samples that see the object, shape [object_pixel].
+        foreground: Radiance premultiplied by coverage, shape [row].
+        diffuse: The part of it that the first hit's diffuse lobe reflects, shape [row].
+        emission: The part of it that the first hit emits, shape [row].
+        coverage: Share of samples that see the object, shape [row].
         light_record: Output: the weight of each direction that saw the light, or without arrays.
         vertex_record: Output: every vertex; ``material`` must come filled with -1. Or without
             arrays.
@@ -244,7 +249,8 @@ def trace_foreground(
     i = wp.tid()
     pixel = pixels[i]
     key = pixel_seed(seed, pixel)
-    scale = 1.0 / float(spp * rays)
+    scale = 1.0 / float(spp * rays * lanes)
+    before = (i % lanes) * spp
     keep_dark = int(0)
     if light_record.wi.shape[1] > 0 or vertex_record.material.shape[1] > 0:
         keep_dark = 1
@@ -266,7 +272,7 @@ def trace_foreground(
     throughput_diffuse = wp.vec3(0.0)
     while index < spp * rays:
         if alive == 0:
-            s = index // rays
+            s = before + index // rays
             ray_dir = camera_ray(camera, pixel, sobol_pair(s, key, 0))
             if index % rays == 0:
                 first = camera_hit(camera, mesh, material, texture, proxy, s, key, ray_dir)
@@ -290,7 +296,17 @@ def trace_foreground(
         if k == depth - 1 and material.any_emission == 0:
             is_last = 1
         event = scatter(
-            mesh, material, texture, light, surface, wo, is_last, keep_dark, index, key, k
+            mesh,
+            material,
+            texture,
+            light,
+            surface,
+            wo,
+            is_last,
+            keep_dark,
+            before * rays + index,
+            key,
+            k,
         )
         if vertex_record.material.shape[1] > 0:
             keep_event(vertex_record, i, k * spp * rays + index, event)
@@ -329,4 +345,4 @@ def trace_foreground(
     foreground[i] = radiance * scale
     diffuse[i] = radiance_diffuse * scale
     emission[i] = radiance_emission * scale
-    coverage[i] = count / float(spp)
+    coverage[i] = count / float(spp * lanes)

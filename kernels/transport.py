@@ -84,8 +84,14 @@ class TexelArgs:
     bound: wp.array[float]
     """Largest sine of the polar angle within each texel's tent; of the plane, times the largest
     cosine with its normal. Shape [He * We]."""
+    item_column: wp.array[int]
+    """Columns of the rows cut into pieces of work of `item_size` directions; shape [item]."""
+    item_first: wp.array[int]
+    """First direction of each piece, shape [item]."""
+    item_count: int
+    item_size: int
     lanes: int
-    """Threads of a pixel; each takes every ``lanes``-th texel. A thread costs as much as a texel on
+    """Threads of a pixel; each takes every ``lanes``-th piece. A thread costs as much as a texel on
     the CPU, where one per pixel is best."""
 
 
@@ -215,11 +221,15 @@ def direct_row(
     path_count: int,
     p: int,
     t: int,
+    first: int,
     count: int,
     pixel_key: wp.uint32,
     shift: float,
 ) -> wp.vec3:
-    """Return what texel ``t`` sends into row ``p`` by one interaction, per texel radiance [1]."""
+    """Return what texel ``t`` sends into row ``p`` by one interaction, per texel radiance [1].
+
+    Only the part of one piece of work, whose directions start at ``first``.
+    """
     total = wp.vec3(0.0)
     if count == 0:
         return total
@@ -231,9 +241,9 @@ def direct_row(
     # Which of the pixel's points
     spot = shift + GOLDEN_ROW * float(i) + GOLDEN_COLUMN * float(j)
     spot = spot - wp.floor(spot)
-    first = wp.min(int(spot * float(count)), count - 1)
-    for r in range(directions):
-        s = (first + r) % count
+    start = wp.min(int(spot * float(count)), count - 1)
+    for r in range(first, wp.min(first + texels.item_size, directions)):
+        s = (start + r) % count
         n = points.n[p, s]
         # Half of the texels are behind the surface: say so before a direction is drawn.
         if wp.dot(texels.centre[t], n) > below:
@@ -290,16 +300,30 @@ def trace_direct(
         subsamples: Camera samples per pixel.
         path_count: Paths that `trace_paths` will add, for the weights of narrow lobes.
         seed: Base seed.
-        T: Pixel radiance per texel radiance [1], shape [pixel, texel].
+        T: Pixel radiance per texel radiance [1], zero, shape [pixel, texel].
     """
     p, lane = wp.tid()
     count = points.count[p]
     key = pixel_seed(seed, pixels[p])
     shift = to_unit(hash_uint(key))
-    for t in range(lane, texels.height * texels.width, texels.lanes):
-        T[p, t] = direct_row(
-            points, mesh, material, texture, texels, subsamples, path_count, p, t, count, key, shift
+    for item in range(lane, texels.item_count, texels.lanes):
+        t = texels.item_column[item]
+        part = direct_row(
+            points,
+            mesh,
+            material,
+            texture,
+            texels,
+            subsamples,
+            path_count,
+            p,
+            t,
+            texels.item_first[item],
+            count,
+            key,
+            shift,
         )
+        wp.atomic_add(T, p, t, part)
 
 
 @wp.func
@@ -520,26 +544,30 @@ def blocked_share(
     texels: TexelArgs,
     p: int,
     t: int,
+    first: int,
     filled: int,
     pixel_key: wp.uint32,
     shift: float,
 ) -> float:
-    """Return the share of texel ``t``'s irradiance that does not reach row ``p`` [1]."""
+    """Return the share of texel ``t``'s irradiance that does not reach row ``p`` [1].
+
+    Only the part of one piece of work, whose directions start at ``first``.
+    """
     i = t // texels.width
     j = t % texels.width
     key = hash_pair(pixel_key, wp.uint32(t))
     directions = texels.direction_count[t]
     spot = shift + GOLDEN_ROW * float(i) + GOLDEN_COLUMN * float(j)
     spot = spot - wp.floor(spot)
-    first = wp.min(int(spot * float(filled)), filled - 1)
+    start = wp.min(int(spot * float(filled)), filled - 1)
     total = float(0.0)
-    for r in range(directions):
+    for r in range(first, wp.min(first + texels.item_size, directions)):
         ray_key = hash_pair(key, wp.uint32(r))
         u = random_pair(key, -1)
         if directions > 1:
             u = sobol_pair(r, key, 0)
         wi = tent_direction(texels, i, j, u, ray_key, 1, proxy.normal)
-        origin = position[p, (first + r) % filled] + proxy.normal * mesh.epsilon
+        origin = position[p, (start + r) % filled] + proxy.normal * mesh.epsilon
         if wp.dot(wi, proxy.normal) > 0.0 and meets_box(origin, wi, mesh.low, mesh.high) == 1:
             total += 1.0 - visibility(mesh, material, texture, origin, wi)
     return total / float(directions)
@@ -557,7 +585,6 @@ def trace_blocked(
     proxy: ProxyArgs,
     texels: TexelArgs,
     columns: wp.array[int],
-    column_count: int,
     seed: int,
     blocked: wp.array2d[float],
 ):
@@ -577,9 +604,8 @@ def trace_blocked(
         proxy: The plane.
         texels: The map and how many directions each texel gets.
         columns: Texels whose tents rise above the plane, shape [column].
-        column_count: Their number.
         seed: Base seed.
-        blocked: Share [1], shape [pixel, column].
+        blocked: Share [1], zero, shape [pixel, column].
     """
     p, lane = wp.tid()
     filled = count[p]
@@ -592,9 +618,9 @@ def trace_blocked(
     margin = reach * far + spread[p]
     low = mesh.low - wp.vec3(margin, margin, margin)
     high = mesh.high + wp.vec3(margin, margin, margin)
-    for c in range(lane, column_count, texels.lanes):
+    for item in range(lane, texels.item_count, texels.lanes):
+        c = texels.item_column[item]
         t = columns[c]
-        share = float(0.0)
         if filled > 0 and meets_box(start, texels.centre[t], low, high) == 1:
             share = blocked_share(
                 position,
@@ -605,8 +631,9 @@ def trace_blocked(
                 texels,
                 p,
                 t,
+                texels.item_first[item],
                 filled,
                 key,
                 shift,
             )
-        blocked[p, c] = share
+            wp.atomic_add(blocked, p, c, share)

@@ -37,6 +37,8 @@ Float64Array = NDArray[np.float64]
 
 SAMPLES_PER_SLICE = 1 << 16
 """CPU work of one launch; keeps launches under half a second, so that Ctrl-C is answered."""
+FULL_THREADS = 1 << 18
+"""Threads that fill a CUDA device; with fewer pixels, several threads share a pixel's samples."""
 PILOT_SCALE = 4
 """Edge of the pixel blocks that decide where the plane's shadow is worth tracing [px]."""
 PILOT_SAMPLES = 32
@@ -355,6 +357,14 @@ class Renderer:
         host["position"] = host["position"].astype(np.float64) + self.scene.origin
         return GBuffer(object_pixels=candidates[keep], **host)
 
+    def lanes(self, count: int, spp: int) -> int:
+        """Return how many threads share the camera samples of each of ``count`` pixels."""
+        lanes = 1
+        if self.device.is_cuda:
+            while 0 < count * lanes * 2 <= FULL_THREADS and spp % (2 * lanes) == 0:
+                lanes *= 2
+        return lanes
+
     def foreground(
         self,
         light: LightArgs,
@@ -378,10 +388,12 @@ class Renderer:
             seed: Base seed.
             indirect_limit: Most radiance that one path may add behind its first vertex, or 0: no
                 limit, unbiased.
-            light_record: Filled on the way where given; rows are ``pixels``. Without a limit only.
+            light_record: Filled on the way where given; rows are ``pixels``, `lanes` of each.
+                Without a limit only.
             vertex_record: The same.
         """
-        scene, count = self.scene, len(pixels)
+        scene, lanes = self.scene, self.lanes(len(pixels), spp)
+        count = len(pixels) * lanes
         radiance, diffuse, emission = (
             wp.zeros(max(count, 1), dtype=wp.vec3, device=self.device) for _ in range(3)
         )
@@ -390,15 +402,16 @@ class Renderer:
             trace_foreground,
             count,
             [
-                Rows(self._array(pixels, wp.int32)),
+                Rows(self._array(np.repeat(pixels, lanes), wp.int32)),
                 scene.camera_args,
                 scene.mesh_args,
                 scene.material_args,
                 scene.texture_args,
                 scene.proxy_args,
                 light,
-                spp,
+                spp // lanes,
                 rays,
+                lanes,
                 depth,
                 indirect_limit,
                 seed,
@@ -406,10 +419,11 @@ class Renderer:
                 LightRecord() if light_record is None else Rows(light_record),
                 VertexRecord() if vertex_record is None else Rows(vertex_record),
             ],
-            spp * rays,
+            spp // lanes * rays,
             "object",
         )
-        return Foreground(*(a.numpy()[:count] for a in (radiance, diffuse, emission, mask)))
+        parts = (a.numpy()[:count] for a in (radiance, diffuse, emission, mask))
+        return Foreground(*(p.reshape(-1, lanes, *p.shape[1:]).sum(axis=1) for p in parts))
 
     def proxy(
         self,

@@ -119,11 +119,12 @@ class ObjectSamples:
         """Trace some of the object's pixels: radiance [pixel, 3] and the records asked for."""
         mis, device = self.mis, self.mis.renderer.device
         pixels = mis.object_pixels[rows]
+        lanes = mis.renderer.lanes(len(pixels), mis.spp)
         light, vertex = None, None
         if is_recording and self.entries:
-            light = _new_light_record(len(pixels), self.entries, device)
+            light = _new_light_record(len(pixels) * lanes, self.entries // lanes, device)
         if is_recording and self.vertices:
-            vertex = _new_vertex_record(len(pixels), self.vertices, device)
+            vertex = _new_vertex_record(len(pixels) * lanes, self.vertices // lanes, device)
         with self.materials:
             out = mis.renderer.foreground(
                 self.args,
@@ -144,24 +145,29 @@ class ObjectSamples:
             light, vertex = self.kept or self.draw(rows)[1:]
             # Records serve one backward pass, so that two steps' never live side by side.
             self.kept = None
-            d_rows = d_radiance[rows]
+            lanes = self.mis.renderer.lanes(len(d_radiance[rows]), self.mis.spp)
+            d_rows = np.repeat(d_radiance[rows], lanes, axis=0)
             if light is not None:
                 d_pixel = d_rows[:, :, None] * np.eye(3, dtype=np.float32)
                 found = light_gradient(self.mis.renderer, self.args, light, d_pixel, self.free[:4])
                 total[:4] = _add(total[:4], found)
             if vertex is not None:
-                total[4:] = _add(total[4:], self.material_gradient(vertex, d_rows))
+                total[4:] = _add(
+                    total[4:], self.material_gradient(vertex, d_rows, self.path_count // lanes)
+                )
         return total
 
-    def material_gradient(self, record: VertexRecord, d_radiance: FloatArray) -> Gradients:
-        """Return the gradient of the four factors over the vertices of some pixels."""
+    def material_gradient(
+        self, record: VertexRecord, d_radiance: FloatArray, count: int
+    ) -> Gradients:
+        """Return the gradient of the four factors over rows of ``count`` paths each."""
         renderer, device = self.mis.renderer, self.mis.renderer.device
-        pixels, count = len(d_radiance), self.path_count
+        pixels = len(d_radiance)
         # On the CPU each part has a sum of its own and is gone through in short launches.
         parts = max(1, min(PART_COUNT, pixels * count // PART_PATHS)) if device.is_cpu else 1
         size = max(1, SAMPLES_PER_SLICE // count) if device.is_cpu else pixels
         d_path = wp.array(
-            np.repeat(d_radiance / count, count, axis=0), dtype=wp.vec3, device=device
+            np.repeat(d_radiance / self.path_count, count, axis=0), dtype=wp.vec3, device=device
         )
         d_factors = [
             wp.zeros((parts, len(a)), dtype=a.dtype, device=device) if is_free else None
@@ -174,14 +180,18 @@ class ObjectSamples:
             for start in range(pixels * part // parts, stop, size):
                 end = min(start + size, stop)
                 vertices = Rows(record).cut(start, end)
-                self.differentiate(vertices, d_path[start * count : end * count], own)
+                self.differentiate(vertices, d_path[start * count : end * count], count, own)
 
         wp.load_module(shade_kernels, device=device)
         renderer.in_threads(one, range(parts if pixels else 0), "materials")
         return [None if d is None else d.numpy().sum(axis=0, dtype=np.float64) for d in d_factors]
 
     def differentiate(
-        self, record: VertexRecord, d_path: wp.array, d_factors: Sequence[wp.array | None]
+        self,
+        record: VertexRecord,
+        d_path: wp.array,
+        count: int,
+        d_factors: Sequence[wp.array | None],
     ) -> None:
         """Add the gradient of some paths to ``d_factors``: vertices forward, adjoints backward.
 
@@ -190,6 +200,7 @@ class ObjectSamples:
         Args:
             record: Vertices, rows are pixels.
             d_path: Loss gradient of each path's radiance, shape [path].
+            count: Paths of a row.
             d_factors: Where to add, shape [material] each, or None.
         """
         device, paths, depth = d_path.device, len(d_path), self.mis.depth
@@ -202,7 +213,7 @@ class ObjectSamples:
             wp.launch(
                 shade_kernels.shade_vertex,
                 dim=paths,
-                inputs=[record, self.path_count, k, *self.materials.arrays, throughput[k]],
+                inputs=[record, count, k, *self.materials.arrays, throughput[k]],
                 outputs=[unused, throughput[k + 1]],
                 device=device,
                 record_tape=False,

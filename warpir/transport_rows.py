@@ -21,6 +21,8 @@ Float64Array = NDArray[np.float64]
 
 LANES = 256
 """Threads of a pixel on CUDA."""
+ITEM_SIZE = 16
+"""Directions that one of them draws in a row."""
 CHUNK_BYTES = 64 << 20
 """Memory of the rows that are traced at once, before they are stored in a small type."""
 
@@ -158,9 +160,13 @@ def _texel_args(
     counts: NDArray[np.int32],
     height: int,
     device: wp.Device,
+    columns: IntArray,
     normal: Float64Array | None = None,
 ) -> kernels.TexelArgs:
-    """Describe a map's texels; directions follow the cosine with ``normal`` where it is given."""
+    """Describe a map's texels; directions follow the cosine with ``normal`` where it is given.
+
+    ``columns`` are the texels that the rows hold.
+    """
     args = kernels.TexelArgs()
     args.height, args.width = height, 2 * height
     step = np.pi / height
@@ -176,7 +182,14 @@ def _texel_args(
         setattr(args, name, wp.array(values.astype(np.float32), dtype=float, device=device))
     args.direction_count = wp.array(counts, dtype=int, device=device)
     args.centre = wp.array(centres.reshape(-1, 3).astype(np.float32), dtype=wp.vec3, device=device)
-    args.lanes = 1 if device.is_cpu else LANES
+    # On CUDA one thread must not draw a sun's directions while its neighbours wait.
+    args.lanes, args.item_size = (1, 1 << 30) if device.is_cpu else (LANES, ITEM_SIZE)
+    pieces = -(-counts[columns] // args.item_size)
+    which = np.repeat(np.arange(len(columns)), pieces)
+    first = np.arange(len(which)) - np.repeat(np.cumsum(pieces) - pieces, pieces)
+    args.item_count = len(which)
+    for name, values in (("item_column", which), ("item_first", first * args.item_size)):
+        setattr(args, name, wp.array(values.astype(np.int32), dtype=int, device=device))
     return args
 
 
@@ -191,8 +204,8 @@ def object_rows(
     """Trace the object's rows chunk by chunk, pixels that mirror with more samples than others."""
     scene, device, height = renderer.scene, renderer.device, settings.height_fg
     counts = direction_counts(expected, settings.bright_directions)
-    texels = _texel_args(counts, height, device)
     texel_count = 2 * height * height
+    texels = _texel_args(counts, height, device, np.arange(texel_count, dtype=np.int32))
     # Half of the later vertices' directions look for the expected light, half everywhere.
     flux = luminance(expected.astype(np.float64))
     mean = float((flux * texel_solid_angles(height, 2 * height)[:, None]).sum()) / (4.0 * np.pi)
@@ -205,7 +218,7 @@ def object_rows(
         subsamples, paths = factor * settings.subsamples, factor * settings.paths
         chunk = pixels[rows]
         points, emission = _surface_points(renderer, chunk, subsamples, seed)
-        T = wp.empty((len(chunk), texel_count), dtype=wp.vec3, device=device)
+        T = wp.zeros((len(chunk), texel_count), dtype=wp.vec3, device=device)
         launched = Rows(wp.array(chunk, dtype=wp.int32, device=device))
         renderer.launch(
             kernels.trace_direct,
@@ -312,7 +325,7 @@ def proxy_rows(
     """
     scene, device, height = renderer.scene, renderer.device, settings.height_shadow
     counts = direction_counts(expected, settings.bright_directions)
-    texels = _texel_args(counts, height, device, scene.proxy.normal)
+    texels = _texel_args(counts, height, device, columns, scene.proxy.normal)
     size = max(1, CHUNK_BYTES // (4 * len(columns)))
     if scene.triangle_count == 0:
         return
@@ -343,7 +356,7 @@ def proxy_rows(
             settings.subsamples,
             "transport",
         )
-        blocked = wp.empty((count, len(columns)), dtype=float, device=device)
+        blocked = wp.zeros((count, len(columns)), dtype=float, device=device)
         renderer.launch(
             kernels.trace_blocked,
             count,
@@ -355,7 +368,6 @@ def proxy_rows(
                 *geometry,
                 texels,
                 wp_columns,
-                len(columns),
                 seed,
                 Rows(blocked),
             ],
