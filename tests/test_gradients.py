@@ -14,6 +14,7 @@ from torch.func import functional_call
 from tests.conftest import devices
 from tests.records import object_sums, path_means, plain_factors, plane_sums, shade_vertices
 from tests.statistics import compare_gradients
+from warpir import render
 from warpir.asset import Asset, Material, Primitive
 from warpir.bridge import (
     ComposeConstants,
@@ -42,6 +43,12 @@ LIGHT = ("amplitude", "axis", "sharpness", "texels")
 MATERIAL = ("base_color", "metallic", "roughness", "emission")
 STEP = {"sharpness": 2e-2, "texels": 5e-2}
 """Steps of the central differences where 1e-2 is lost in float32 noise."""
+
+
+@pytest.fixture(autouse=True)
+def one_thread_a_pixel(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Rows of a record are pixels then, on CUDA too."""
+    monkeypatch.setattr(render, "FULL_THREADS", 0)
 
 
 def two_objects() -> Asset:

@@ -13,6 +13,7 @@ from torch import Tensor
 from tests.records import object_sums, plain_factors, plane_sums, shade_vertices
 from tests.statistics import compare_gradients
 from tests.test_gradients import two_objects
+from warpir import render
 from warpir import samples as samples_module
 from warpir.bridge import host_light
 from warpir.camera import Camera
@@ -32,6 +33,12 @@ CAMERA_SHARE = 0.03
 """Three standard errors of the white-plane test's 10^4 samples."""
 MEMORY_GROWTH = 16 << 20
 """What twenty steps may add to the process [B]; one record of theirs has 30 MiB."""
+
+
+@pytest.fixture(autouse=True)
+def one_thread_a_pixel(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Rows of a record are pixels then, on CUDA too."""
+    monkeypatch.setattr(render, "FULL_THREADS", 0)
 
 
 def integrator(device: str, threads: int = 0, spp: int = 4, depth: int = 3) -> MisIntegrator:
@@ -306,3 +313,18 @@ def test_steps_keep_no_memory(device: str) -> None:
         check=True,
     )
     assert int(child.stdout.split()[-1]) < MEMORY_GROWTH
+
+
+def test_threads_that_share_a_pixel_change_nothing(
+    device: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """On CUDA a pixel's samples are shared out: same picture and gradient but for the order."""
+    results = []
+    for threads in (0, 1 << 12):
+        monkeypatch.setattr(render, "FULL_THREADS", threads)
+        light, materials = some_light(), some_materials()
+        out = integrator(device).radiance(light, light, SEED, materials)
+        gradients = torch.autograd.grad(loss(out), leaves(light, materials))
+        results.append([out.foreground.detach(), out.lit.detach(), *gradients])
+    for one, shared in zip(*results, strict=True):
+        assert torch.allclose(one, shared, rtol=1e-3, atol=1e-5 * float(one.abs().max()))

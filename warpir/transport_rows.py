@@ -258,22 +258,25 @@ def _groups(
     """Yield chunks of rows, and by how much the counts of each are to be multiplied.
 
     A pixel counts as mirroring when any of a few samples, which are not used again, meets a lobe
-    narrower than half a texel: what it shows is decided by normals, not by directions.
+    narrower than half a texel: what it shows is decided by normals, not by directions. Lobes up to
+    two texels wide take the square root of that factor.
     """
-    alpha = 0.5 * np.pi / settings.height_fg
-    mirrors = np.zeros(len(pixels), bool)
+    texel = np.pi / settings.height_fg
+    middle = round(settings.mirror_factor**0.5)
+    factors = np.ones(len(pixels), np.int32)
     size = max(1, CHUNK_BYTES // (24 * settings.height_fg**2))
     for start in range(0, len(pixels), size):
         points, _ = _surface_points(
             renderer, pixels[start : start + size], PILOT_SUBSAMPLES, seed ^ PILOT_SEED
         )
         filled = np.arange(PILOT_SUBSAMPLES)[None] < points.count.numpy()[:, None]
-        narrow = filled & (points.roughness.numpy() ** 2 < alpha)
-        mirrors[start : start + size] = narrow.any(axis=1)
-    for chosen, factor in ((~mirrors, 1), (mirrors, settings.mirror_factor)):
-        rows = np.flatnonzero(chosen).astype(np.int32)
+        alpha = np.where(filled, points.roughness.numpy() ** 2, 1.0).min(axis=1)
+        found = np.where(alpha < 0.5 * texel, settings.mirror_factor, middle)
+        factors[start : start + size] = np.where(alpha < 2.0 * texel, found, 1)
+    for factor in np.unique(factors):
+        rows = np.flatnonzero(factors == factor).astype(np.int32)
         for start in range(0, len(rows), size):
-            yield rows[start : start + size], factor
+            yield rows[start : start + size], int(factor)
 
 
 def _surface_points(
