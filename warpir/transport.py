@@ -87,6 +87,7 @@ class TransportIntegrator:
         self.depth = depth
         self.settings = settings or TransportSettings()
         self.device = torch.device(str(wp.device_to_torch(renderer.device)))
+        start = time.perf_counter()
         expected = expected or Light(texels=np.ones((8, 16, 3), np.float32))
         self.expected = tuple(
             to_texels(expected, h, renderer.device)
@@ -99,7 +100,6 @@ class TransportIntegrator:
         self.above = torch.from_numpy(above.astype(np.int64)).to(self.device)
         self.irradiance = torch.from_numpy(irradiance[above].astype(np.float32)).to(self.device)
 
-        start = time.perf_counter()
         stored = None
         if cache is not None:
             key = content_key(
@@ -234,7 +234,10 @@ class TransportIntegrator:
         lit = (unoccluded - blocked).clamp(min=0.0)
         if sharp_fg is not None or sharp_shadow is not None:
             dark = _dark(light_fg)
-            own = self.sharp.radiance(sharp_fg or dark, sharp_shadow or dark, seed)
+            # The rows hold what the object emits.
+            count = len(self.renderer.scene.material_names)
+            unlit = MaterialTensors(emission=torch.zeros((max(count, 1), 3)))
+            own = self.sharp.radiance(sharp_fg or dark, sharp_shadow or dark, seed, unlit)
             foreground = foreground + own.foreground.to(self.device)
             lit = lit + own.lit.to(self.device)
             unoccluded = unoccluded + own.unoccluded.to(self.device)
