@@ -31,10 +31,10 @@ texture `prb` does not see: with the referee's path replay, which takes half the
 the shadow ratio from rays of the compared pixels alone, both radiances from the same samples, the
 gradient by Dr.Jit's automatic differentiation. Its sampler is `ldsampler`, with which it takes an
 eighth of `independent`'s time to an image of equal error here, a third to a gradient; its functions
-are frozen (`dr.freeze`), so that Python does not trace them again in each step; where Dr.Jit refuses
-that (ToyCar on CUDA, run with `--no-freeze`), some 80 ms of tracing are in each of Mitsuba's steps,
-and the ratios flatter us by up to a half. Kernels are compiled and scenes built before the clock
-runs.
+are frozen (`dr.freeze`), so that Python does not trace them again in each step; where Dr.Jit
+refuses that (ToyCar on CUDA, run with `--no-freeze`), each of Mitsuba's steps holds some 80 ms of
+tracing, and the ratios flatter us by up to a half. Kernels are compiled and scenes built before the
+clock runs.
 
 Errors are relative RMSE against references of both renderers; products of differences to two
 independent references free them of the references' noise. `image` joins foreground and shadow
