@@ -32,7 +32,8 @@ IDENTITY = 1e-5
 CAMERA_SHARE = 0.03
 """Three standard errors of the white-plane test's 10^4 samples."""
 MEMORY_GROWTH = 16 << 20
-"""What twenty steps may add to the process [B]; one record of theirs has 30 MiB."""
+"""What forty steps may add to the process [B]; one record of theirs has 30 MiB. The heap settles
+within the first steps, 10 to 25 MiB above the fifth, and stays there for 400."""
 
 
 @pytest.fixture(autouse=True)
@@ -295,17 +296,18 @@ def used():
     with open("/proc/self/statm") as stream:
         return int(stream.read().split()[1]) * 4096
 light, materials = some_light(), some_materials()
-for step in range(25):
+before = 0
+for step in range(65):
     loss(mis.radiance(light, light, step, materials)).backward()
-    if step == 4:
-        before = used()
+    if step < 25:
+        before = max(before, used())
 print(used() - before)
 """
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="reads /proc")
 def test_steps_keep_no_memory(device: str) -> None:
-    """Twenty steps of an optimisation leave the process as large as it was."""
+    """Forty steps of an optimisation leave the process as large as the first ones made it."""
     child = subprocess.run(
         [sys.executable, "-c", MEMORY_CHILD.format(device=device)],
         capture_output=True,
