@@ -1,0 +1,112 @@
+"""What every diffusion prior promises, and what it is told about the picture it judges.
+
+A prior is a frozen denoiser: it turns pictures into latents, knows its noise schedule, and predicts
+the noise in noisy latents for a prompt, with or without an adapter (a LoRA). Guidance
+(`warpir.diffusion.guidance`) asks nothing else of it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from typing import Protocol
+
+import torch
+from torch import Tensor
+
+from warpir.diffusion.schedule import NoiseSchedule
+
+
+class ModelError(Exception):
+    """A model folder or LoRA file cannot be used; the program prints one line and exits with 4.
+
+    Args:
+        where: The folder, file or flag at fault.
+        what: What is wrong, with what was found and what was expected.
+        advice: What to do about it, or an empty string.
+    """
+
+    def __init__(self, where: str, what: str, advice: str = "") -> None:
+        super().__init__(f"{where}: {what}")
+        self.where, self.what, self.advice = str(where), what, advice
+
+
+@dataclass(frozen=True)
+class Condition:
+    """What a picture is to be judged by."""
+
+    prompt: str
+    """What the adapted model is asked for."""
+    base_prompt: str = ""
+    """What the unadapted model is asked for in its conditional term; empty: `prompt`."""
+    negative_prompt: str = ""
+    """What the picture is to move away from; empty: the null prompt."""
+    background: Tensor | None = None
+    """The photo without the object, display-encoded, in [0, 1], shape [1, 3, H, W]."""
+    gbuffer: Tensor | None = None
+    """Mask, albedo and camera-space normals of the object, shape [1, 7, H, W]."""
+
+
+class Prior(Protocol):
+    """A denoiser and its schedule; weights never change, adapters are added beside them."""
+
+    name: str
+    """``stable-diffusion`` or ``embedded``; goes into every run's record."""
+    digest: str
+    """sha256 of the weights."""
+    resolution: int
+    """Side of the square pictures it judges [px]."""
+    schedule: NoiseSchedule
+    device: torch.device
+    adapters: set[str]
+    """Names of the LoRAs that were loaded or trained."""
+
+    def embed(self, prompts: Sequence[str]) -> Tensor:
+        """Return the prompts' embeddings, shape [prompt, token, channel]; each is computed once.
+
+        Raises:
+            ModelError: The text encoder was freed and a prompt is new.
+        """
+
+    def encode(self, image: Tensor) -> Tensor:
+        """Return latents, float32, shape [B, C, h, w]; differentiable, without sampling noise.
+
+        Args:
+            image: Display-encoded, in [0, 1], shape [B, 3, resolution, resolution].
+        """
+
+    def predict(
+        self,
+        latents_noisy: Tensor,
+        t: Tensor,
+        embeddings: Tensor,
+        adapters: Sequence[str | None],
+        background: Tensor | None = None,
+        gbuffer: Tensor | None = None,
+    ) -> Tensor:
+        """Return the predicted noise (epsilon, whatever the network predicts), float32, detached.
+
+        One batched call; each sample has its own prompt and adapter.
+
+        Args:
+            latents_noisy: ``a z + s noise``, shape [B, C, h, w].
+            t: Times in [0, 1], shape [B].
+            embeddings: From `embed`, one per sample, shape [B, token, channel].
+            adapters: Per sample the name of its adapter, or None for the base weights.
+            background: Crop of `Condition.background`, or None; Stable Diffusion ignores it.
+            gbuffer: Crop of `Condition.gbuffer`, or None; Stable Diffusion ignores it.
+
+        Raises:
+            ModelError: An adapter is unknown.
+        """
+
+
+@dataclass
+class Counts:
+    """What happened during a run that the user is told about."""
+
+    skipped_steps: int = 0
+    """Steps without a finite gradient."""
+    clipped_steps: int = 0
+    """Steps whose gradient was shortened."""
+    notices: list[str] = field(default_factory=list)
