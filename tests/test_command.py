@@ -10,14 +10,26 @@ from collections.abc import Sequence
 from dataclasses import asdict, fields
 from itertools import pairwise
 from pathlib import Path
+from typing import Any
 
 import pytest
 
 import warpir.command
 import warpir.insert
 from warpir.command import FLAGS, parse
-from warpir.config import EXCLUSIVE, InsertConfig, flag
+from warpir.config import (
+    ABOVE_ZERO,
+    CHOICES,
+    DEFAULTS,
+    EXCLUSIVE,
+    PROMPTS,
+    RANGES,
+    InsertConfig,
+    flag,
+)
+from warpir.diffusion.settings import GuidanceSettings, ModelSettings, PersonalizeSettings
 from warpir.errors import ExitCode, InputError
+from warpir.optimize_settings import OptimizeSettings
 from warpir.record import RUN_FORMAT
 
 # The slowest start that still feels immediate. Measured: 0.07 s; the rest is a busy machine.
@@ -96,7 +108,43 @@ def test_command_help_tells_every_field(capsys: pytest.CaptureFixture[str]) -> N
     docs = warpir.command._field_docs()
     listed = [name for forms in FLAGS.values() for name in forms]
     assert sorted(listed) == sorted(field.name for field in fields(InsertConfig)) == sorted(docs)
-    assert all(flag(name) in text and docs[name] for name in listed)
+    assert all(f"  {flag(name)}" in text and docs[name] for name in listed)
+    assert all(isinstance(DEFAULTS[name], bool) == (not form) for name, form in forms_of_flags())
+
+
+def forms_of_flags() -> list[tuple[str, str]]:
+    return [pair for forms in FLAGS.values() for pair in forms.items()]
+
+
+def test_every_value_has_a_rule() -> None:
+    """No number without a range, no name that may be anything (F1, F8)."""
+    free = {  # checked in words of their own, free by nature, or text
+        "fov", "horizon", "ground", "place", "at", "rotate_y", "light_rotate", "sun", "sky",
+        "device", "refine_parts", "refine_materials", "lora_layers",
+        "photo", "asset", "out", "camera", "light", "lora", "model", "reuse", "sequence",
+    }  # fmt: skip
+    ruled = {*RANGES, *ABOVE_ZERO, *CHOICES, *PROMPTS}
+    valued = {name for name, form in forms_of_flags() if form}
+    assert valued == ruled | free and not ruled & free
+    defaults = InsertConfig()
+    for name, (low, high) in RANGES.items():
+        # Just outside is refused and both ends are accepted.
+        kind = type(getattr(defaults, name) or low)
+        for value, accepted in ((low, True), (high, True), (low - 1, False)):
+            if value is None or (value == 0 and name in ABOVE_ZERO):
+                continue
+            problems = problems_of(**{name: kind(value)})
+            assert any(p.where == flag(name) and "at least" in p.what for p in problems) != accepted
+        if high is not None:
+            assert any("at most" in p.what for p in problems_of(**{name: kind(high + 1)}))
+
+
+def problems_of(**values: Any) -> list[InputError]:
+    try:
+        InsertConfig(**values)
+    except InputError as error:
+        return [error, *error.also]
+    return []
 
 
 @pytest.mark.parametrize(
@@ -118,6 +166,27 @@ def test_command_help_tells_every_field(capsys: pytest.CaptureFixture[str]) -> N
         (["--device", "cuda:1"], "device", "cuda:1"),
         (["--photo", "-x.png"], "photo", "-x.png"),
         (["--width", "8"], "width", 8),
+        (["--no-personalize"], "personalize", False),
+        (["--no-tone-curve"], "tone_curve", False),
+        (["--allow-download"], "allow_download", True),
+        (["--lora-layers", "to_q, to_k"], "lora_layers", ("to_q", "to_k")),
+        (["--negative-prompt", ""], "negative_prompt", ""),
+        (["--prompt", "a car, \U0001f697\nred"], "prompt", "a car, \U0001f697\nred"),
+        (
+            [
+                "--guidance",
+                "stable-diffusion",
+                "--model",
+                "m",
+                "--prompt",
+                "p",
+                "--show-prior",
+                "a red car, new | a cat",
+            ],
+            "show_prior",
+            ("a red car, new", "a cat"),
+        ),
+        (["--steps", "0"], "steps", 0),
     ],
 )
 def test_command_reads_values(argv: list[str], name: str, value: object) -> None:
@@ -144,7 +213,35 @@ def test_command_reads_values(argv: list[str], name: str, value: object) -> None
         (["--device", "tpu"], "--device", "cuda"),
         (["--sky", "purple"], "--sky", "overcast"),
         (["--sun", "0,91"], "--sun", "elevation"),
-        (["--guidance", "lds"], "--guidance", "none"),
+        (["--guidance", "lds"], "--guidance", "none or stable-diffusion (found lds)"),
+        (["--guidance", "stable-diffusion", "--prompt", "p"], "--model", "needed"),
+        (["--guidance", "stable-diffusion", "--model", "m"], "--prompt", "needed"),
+        (["--prompt", "p\0"], "--prompt", "NUL"),
+        (["--prompt", "\u00e9" * 2049], "--prompt", "4098 bytes"),
+        (["--show-prior", "a||b"], "--show-prior", "not empty"),
+        (["--show-prior", "a"], "--show-prior", "needs --guidance"),
+        (["--loss", "vsd"], "--loss", "lds-lora-both"),
+        (["--loss", "lds-negative"], "--loss", "--negative-prompt"),
+        (["--time-min", "0.7"], "--time-min", "at most --time-max (found 0.7 and 0.6)"),
+        (["--crop-min", "4"], "--crop-min", "at most --crop-max"),
+        (["--lora-rate", "0"], "--lora-rate", "more than 0"),
+        (["--lora-layers", "to_q,"], "--lora-layers", "not empty"),
+        (["--adam-beta2", "1"], "--adam-beta2", "at most 0.999999 (found 1.0)"),
+        (["--rate-axis", "inf"], "--rate-axis", "finite"),
+        (["--steps", "-1"], "--steps", "at least 0"),
+        (["--class-images", "1.5"], "--class-images", "whole number"),
+        (["--sequence", "f"], "--sequence", "needs --reuse"),
+        (["--resume"], "--resume", "needs --guidance"),
+        (["--refine", "light"], "--refine", "material or emission or tone"),
+        (["--refine", "tone", "--prompt", "p"], "--refine", "known light"),
+        (["--refine", "tone", "--prompt", "p", "--reuse", "r"], "--refine", "needs --guidance"),
+        (["--refine-parts", "metallic"], "--refine-parts", "--refine material"),
+        (
+            ["--reuse", "r", "--guidance", "stable-diffusion", "--model", "m", "--prompt", "p"],
+            "--guidance",
+            "cannot be used with --reuse",
+        ),
+        (["--personalize"], "--personalize", "no such flag"),
         (["--photo", ""], "--photo", "not empty"),
         (["--fit-lobes", "4"], "--fit-lobes", "--light"),
         (["--up", "z"], "--up", "--camera"),
@@ -165,13 +262,14 @@ def test_command_refuses_values(argv: list[str], where: str, words: str) -> None
 def test_command_refuses_flags_that_exclude_each_other(first: str, second: str) -> None:
     """At most one of each pair may be given."""
     values = {
-        "photo": "p.png", "asset": "a.glb", "camera": "c.json", "fov": "50", "pitch": "1",
+        "photo": "p.png", "asset": "a.glb", "camera": "c.json", "fov": "50", "pitch": "0",
         "horizon": "5", "camera_height": "2", "place": "0,0,1", "at": "1,2", "scale": "1",
-        "size": "1", "light": "l.hdr", "sun": "1,2", "sky": "clear",
+        "size": "1", "light": "l.hdr", "sun": "1,2", "sky": "clear", "reuse": "r", "refine": "tone",
+        "sequence": "s.jsonl", "lora": "l.safetensors",
     }  # fmt: skip
     argv = ["--out", "o"]
     for name in (first, second):
-        argv += [flag(name)] if name == "demo" else [flag(name), values[name]]
+        argv += [flag(name), values[name]] if name in values else [flag(name)]
     error = refused(argv)
     assert error.where == flag(second)
     assert error.what == f"cannot be used with {flag(first)}"
@@ -208,6 +306,8 @@ sky: 0.1,0.2,0.3
 samples: 16
 mark: false
 width: null
+lora-layers: [to_q, to_out.0]
+graphs: false
 """
 
 
@@ -216,7 +316,7 @@ def test_config_file_gives_the_same_as_flags(tmp_path: Path) -> None:
     expected = parse(
         ["--photo", "p.png", "--asset", "a.glb", "--out", "o", "--camera-height", "1.5",
          "--rotate-y", "30", "--place", "-1,0,-3.5", "--sky", "0.1,0.2,0.3", "--samples", "16",
-         "--no-mark"]
+         "--no-mark", "--lora-layers", "to_q,to_out.0", "--no-graphs"]
     ).config  # fmt: skip
     path = tmp_path / "run.yaml"
     path.write_text(YAML)
@@ -228,12 +328,26 @@ def test_config_file_gives_the_same_as_flags(tmp_path: Path) -> None:
 
 def test_config_file_replays_a_run(tmp_path: Path) -> None:
     """``run.json`` of an earlier run is a configuration; an unknown layout is refused (F2)."""
-    config = InsertConfig(photo="p.png", asset="a.glb", out="o", sun=(10.0, 20.0), seed=7)
+    config = InsertConfig(
+        photo="p.png", asset="a.glb", out="o", sun=(10.0, 20.0), seed=7, lora_layers=("to_q",)
+    )
     path = tmp_path / "run.json"
     path.write_text(json.dumps({"format": RUN_FORMAT, "config": asdict(config), "seconds": {}}))
     assert parse(["--config", str(path)]).config == config
     path.write_text(json.dumps({"format": RUN_FORMAT + 1, "config": asdict(config)}))
     assert "format" in refused(["--config", str(path)]).what
+
+
+def test_config_file_of_an_older_version_replays(tmp_path: Path) -> None:
+    """``run.json`` of a version that knew none of guidance's settings means their defaults (F2)."""
+    settings = (ModelSettings, PersonalizeSettings, GuidanceSettings, OptimizeSettings)
+    newer = {field.name for kind in settings for field in fields(kind)}
+    newer |= set(FLAGS["applications"]) | set(FLAGS["guidance"]) - {"guidance"}
+    config = InsertConfig(photo="p.png", asset="a.glb", out="o", sky="clear", depth=2)
+    known = {name: value for name, value in asdict(config).items() if name not in newer}
+    path = tmp_path / "run.json"
+    path.write_text(json.dumps({"format": 1, "warpir": "0.1.0", "config": known}))
+    assert len(known) < 45 and parse(["--config", str(path)]).config == config
 
 
 def test_config_file_yields_to_flags(tmp_path: Path) -> None:

@@ -10,22 +10,24 @@ ROOT = Path(__file__).resolve().parent.parent
 # Each module of warpir/ imports modules of lower levels only; a module that is on no level fails.
 LEVELS = (
     {"errors", "color"},
-    {"config", "asset", "strict_json"},
+    {"optimize_settings", "asset", "strict_json"},
+    {"config"},
     {"camera", "asset_files", "record", "light", "tone"},
     {"gltf_file", "mtl", "files", "command", "placement", "lobes_file", "lobe_fit"},
     {"gltf_material", "obj"},
     {"gltf"},
     {"inputs", "scene"},
-    {"render", "lighting"},
+    {"render", "lighting", "reuse", "sequence"},
     {"picture", "samples"},
-    {"integrator", "fusion"},
+    {"integrator", "fusion", "sg_light"},
     {"bridge"},
-    {"mis", "transport_rows", "transport_matrix"},
+    {"mis", "transport_rows", "transport_matrix", "regularizers"},
     {"transport_cache"},
     {"transport"},
-    {"transport_choice"},
-    {"optimize", "fit"},
-    {"stages"},
+    {"transport_choice", "view"},
+    {"checkpoint"},
+    {"optimize"},
+    {"recover", "refine"},
     {"demo"},
     {"insert", "prior_images"},
 )
@@ -38,9 +40,9 @@ ONLY_IN = {
         "kernels", "scene", "render", "samples", "bridge", "transport", "transport_rows",
     },
     "torch": {
-        "diffusion", "tone", "bridge", "integrator", "fusion", "mis", "transport",
-        "transport_cache", "transport_choice", "transport_matrix", "optimize",
-        "fit", "stages", "insert", "prior_images",
+        "diffusion", "tone", "bridge", "integrator", "fusion", "sg_light", "regularizers", "view",
+        "mis", "transport", "transport_cache", "transport_choice", "transport_matrix", "checkpoint",
+        "optimize", "recover", "refine", "insert", "prior_images",
     },
     "trimesh": {"gltf", "obj", "demo"},
     "OpenImageIO": {"files"},
@@ -49,11 +51,15 @@ ONLY_IN = {
     "diffusers": {"diffusion"},
     "transformers": {"diffusion"},
     "peft": {"diffusion"},
-    "safetensors": {"diffusion", "optimize", "transport_cache"},
+    "safetensors": {"diffusion", "checkpoint", "transport_cache"},
     "colour": {"color"},
     "yaml": {"command"},
     "rich": {"record"},
 }  # fmt: skip
+DIFFUSION_IN = {"recover", "refine", "prior_images"}
+"""Who drives the diffusion model; everyone else sees its settings, which are plain values."""
+SETTINGS = "warpir.diffusion.settings"
+SETTINGS_IN = {"config", "command", *DIFFUSION_IN}
 NOT_IN_KERNELS = {"numpy", "warpir"}
 """``warpir.kernels`` sees Warp and itself."""
 
@@ -118,7 +124,9 @@ def test_imports_follow_the_table(path: Path) -> None:
             if target == "kernels":
                 assert place in ONLY_IN["warp"], f"{where}: only Warp's callers see the kernels"
             elif target == "diffusion":
-                assert place in ("optimize", "prior_images"), f"{where}: optimize imports diffusion"
+                is_settings = name == SETTINGS or name.startswith(SETTINGS + ".")
+                allowed = SETTINGS_IN if is_settings else DIFFUSION_IN
+                assert place in allowed, f"{where}: imported in {sorted(allowed)}"
             elif (place, target) not in UPWARD and level(target) >= 0:
                 assert level(target) < level(place), f"{where}: imports its own level or higher"
 
@@ -127,6 +135,12 @@ def test_layers_name_every_module() -> None:
     """A new module must be put on a level before it is used."""
     modules = {place_of(p) for p in (ROOT / "warpir").rglob("*.py")} - {"__init__"}
     assert {m for m in modules if level(m) < 0} == set()
+
+
+def test_layers_settings_are_plain() -> None:
+    """What the command line reads of the diffusion model and the loop costs nothing to import."""
+    for path in (ROOT / "diffusion" / "settings.py", ROOT / "warpir" / "optimize_settings.py"):
+        assert {name for _, name in imports(path)} == {"dataclasses.dataclass"}
 
 
 def test_layers_package_imports_nothing() -> None:

@@ -18,7 +18,7 @@ from pathlib import Path
 from typing import Any, NoReturn, Union, get_args, get_origin, get_type_hints
 
 import warpir
-from warpir.config import InsertConfig, flag, usage
+from warpir.config import DEFAULTS, InsertConfig, flag, usage
 from warpir.errors import ExitCode, InputError, raise_all
 from warpir.record import RUN_FORMAT
 from warpir.strict_json import read_json_object
@@ -60,7 +60,6 @@ FLAGS = {
         "ground_albedo": "SHARE",
     },
     "rendering": {
-        "guidance": "NAME",
         "samples": "N",
         "rays": "N",
         "depth": "D",
@@ -70,6 +69,88 @@ FLAGS = {
         "threads": "N",
         "seed": "N",
     },
+    "guidance": {
+        "guidance": "NAME",
+        "prompt": "TEXT",
+        "show_prior": "TEXT|TEXT",
+        "loss": "NAME",
+        "guidance_scale": "G",
+        "negative_prompt": "TEXT",
+        "time_min": "SHARE",
+        "time_max": "SHARE",
+        "time_max_end": "SHARE",
+        "weight": "NAME",
+        "literal_alpha": "",
+        "noises": "N",
+        "crop_min": "SIDES",
+        "crop_max": "SIDES",
+        "gradient_clip": "MEDIANS",
+        "update_every": "N",
+        "update_steps": "N",
+        "update_scale": "G",
+    },
+    "diffusion model": {
+        "model": "DIR|ID",
+        "allow_download": "",
+        "precision": "NAME",
+        "vae_precision": "NAME",
+        "vae_checkpointing": "",
+        "graphs": "",
+    },
+    "personalisation": {
+        "personalize": "",
+        "token": "WORD",
+        "class_noun": "WORD",
+        "class_images": "N",
+        "indoors": "",
+        "class_steps": "N",
+        "class_scale": "G",
+        "class_batch": "N",
+        "lora": "FILE",
+        "lora_rank": "N",
+        "lora_layers": "NAME,NAME",
+        "lora_steps": "N",
+        "lora_rate": "R",
+        "lora_class_batch": "N",
+        "lora_class_weight": "W",
+        "lora_crop": "SHARE",
+    },
+    "optimisation": {
+        "steps": "N",
+        "guidance_width": "W",
+        "lobes": "N",
+        "light_height": "ROWS",
+        "object_light_height": "ROWS",
+        "fusion": "NAME",
+        "tone_curve": "",
+        "integrator": "NAME",
+        "mis_samples": "N",
+        "retrace_at": "FACTOR",
+        "rate_intensity": "R",
+        "rate_axis": "R",
+        "rate_width": "R",
+        "rate_chroma": "R",
+        "rate_tone": "R",
+        "adam_beta1": "B",
+        "adam_beta2": "B",
+        "consistency": "W",
+        "spread": "W",
+        "chroma": "W",
+        "bend": "W",
+        "chroma_limit": "LOG",
+        "intensity_limit": "RADIANCE",
+        "score_every": "N",
+        "preview_every": "N",
+        "checkpoint_every": "N",
+        "resume": "",
+    },
+    "applications": {
+        "reuse": "DIR",
+        "sequence": "FILE",
+        "refine": "WHAT",
+        "refine_parts": "NAME,NAME",
+        "refine_materials": "NAME,NAME",
+    },
     "rules for the files": {
         "alpha": "RULE",
         "max_pixels": "N",
@@ -78,7 +159,10 @@ FLAGS = {
     },
 }
 """Every field of `InsertConfig` by its heading in ``--help``, with what stands for its value."""
+SEPARATORS = {"show_prior": "|"}
+"""What parts the texts of a list, where they may hold commas."""
 
+USAGE = "python -m warpir.insert --photo FILE --asset FILE --out DIR [FLAG ...]"
 DESCRIPTION = "Put a 3D object into a photograph so that it looks as if it had stood there."
 EXAMPLES = """\
 examples:
@@ -137,7 +221,7 @@ def _make_config(given: Mapping[str, tuple[Any, str]], filed: Mapping[str, Any])
     values, problems = {}, []
     for name, (value, where) in {**{n: (v, flag(n)) for n, v in filed.items()}, **given}.items():
         try:
-            values[name] = _convert(value, hints[name])
+            values[name] = _convert(value, hints[name], SEPARATORS.get(name, ","))
         except ValueError:
             expected = _expected(name, hints[name])
             problems.append(usage(where, f"expected {expected} (found {_shown(value)})"))
@@ -145,7 +229,7 @@ def _make_config(given: Mapping[str, tuple[Any, str]], filed: Mapping[str, Any])
     return InsertConfig(**values)
 
 
-def _convert(value: Any, hint: Any) -> Any:
+def _convert(value: Any, hint: Any, separator: str = ",") -> Any:
     """Turn a flag's text or a file's value into the field's type.
 
     Raises:
@@ -158,15 +242,20 @@ def _convert(value: Any, hint: Any) -> Any:
         arms = sorted((arm for arm in get_args(hint) if arm is not type(None)), key=_width)
         for arm in arms:
             try:
-                return _convert(value, arm)
+                return _convert(value, arm, separator)
             except ValueError:
                 continue
         raise ValueError
     if get_origin(hint) is tuple:
-        parts = value.split(",") if isinstance(value, str) else value
-        if not isinstance(parts, list | tuple) or len(parts) != len(get_args(hint)):
+        parts = value.split(separator) if isinstance(value, str) else value
+        kinds = get_args(hint)
+        if not isinstance(parts, list | tuple):
             raise ValueError
-        return tuple(_convert(part, arm) for part, arm in zip(parts, get_args(hint), strict=True))
+        if kinds[-1] is Ellipsis:
+            return tuple(_convert(part, kinds[0]).strip() for part in parts)
+        if len(parts) != len(kinds):
+            raise ValueError
+        return tuple(_convert(part, kind) for part, kind in zip(parts, kinds, strict=True))
     if isinstance(value, bool) or hint is bool:
         if isinstance(value, bool) and hint is bool:
             return value
@@ -193,7 +282,7 @@ def _expected(name: str, hint: Any) -> str:
     if len(arms) == 1 and arms[0] in kinds:
         return kinds[arms[0]]
     form = next(group[name] for group in FLAGS.values() if name in group)
-    return form if name != "mark" else kinds[bool]
+    return form
 
 
 def _shown(value: Any) -> str:
@@ -217,6 +306,7 @@ class _Parser(argparse.ArgumentParser):
 def _make_parser() -> argparse.ArgumentParser:
     parser = _Parser(
         prog="python -m warpir.insert",
+        usage=USAGE,
         description=DESCRIPTION,
         epilog=EXAMPLES,
         formatter_class=argparse.RawDescriptionHelpFormatter,
@@ -224,18 +314,15 @@ def _make_parser() -> argparse.ArgumentParser:
         allow_abbrev=False,
         exit_on_error=False,
     )
-    about, defaults = _field_docs(), {field.name: field.default for field in fields(InsertConfig)}
+    about = _field_docs()
     for heading, forms in FLAGS.items():
         group = parser.add_argument_group(heading)
         for name, form in forms.items():
-            default = defaults[name]
-            # An optional value says in its own words what happens without it.
-            shown = "" if default is None or isinstance(default, bool) else f" (default: {default})"
-            text = (about[name] + shown).replace("%", "%%")
+            text = _help_of(name, about[name]).replace("%", "%%")
             if form:
                 group.add_argument(flag(name), dest=name, metavar=form, help=text)
             else:
-                action = "store_false" if name == "mark" else "store_true"
+                action = "store_false" if DEFAULTS[name] else "store_true"
                 group.add_argument(flag(name), dest=name, action=action, help=text)
     group = parser.add_argument_group("the run itself")
     group.add_argument(
@@ -251,15 +338,27 @@ def _make_parser() -> argparse.ArgumentParser:
     return parser
 
 
+def _help_of(name: str, about: str) -> str:
+    default = DEFAULTS[name]
+    if default is True:
+        return f"Leave out: {about[0].lower()}{about[1:]}"
+    # An optional value says in its own words what happens without it.
+    if default is None or default is False or default == "":
+        return about
+    shown = ",".join(default) if isinstance(default, tuple) else default
+    return f"{about} (default: {shown})"
+
+
 def _field_docs() -> dict[str, str]:
-    """Read the line below each field of `InsertConfig` from its source."""
-    body = ast.parse(inspect.getsource(InsertConfig)).body[0]
-    assert isinstance(body, ast.ClassDef)
+    """Read the line below each field of `InsertConfig` and its base classes from their sources."""
     docs = {}
-    for field, below in zip(body.body, body.body[1:], strict=False):
-        if isinstance(field, ast.AnnAssign) and isinstance(below, ast.Expr):
-            assert isinstance(field.target, ast.Name) and isinstance(below.value, ast.Constant)
-            docs[field.target.id] = inspect.cleandoc(str(below.value.value)).replace("\n", " ")
+    for settings in InsertConfig.__mro__[:-1]:
+        body = ast.parse(inspect.getsource(settings)).body[0]
+        assert isinstance(body, ast.ClassDef)
+        for field, below in zip(body.body, body.body[1:], strict=False):
+            if isinstance(field, ast.AnnAssign) and isinstance(below, ast.Expr):
+                assert isinstance(field.target, ast.Name) and isinstance(below.value, ast.Constant)
+                docs[field.target.id] = inspect.cleandoc(str(below.value.value)).replace("\n", " ")
     return docs
 
 

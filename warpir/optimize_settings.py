@@ -1,0 +1,64 @@
+"""What a user may choose about the optimisation loop; plain values, importable without torch.
+
+Each field is one flag of `warpir.insert`, and the line below it is its ``--help``. Defaults are the
+authors' (DiPIR, Liang et al. 2024) where they state one, else ours.
+"""
+
+from dataclasses import dataclass
+
+
+@dataclass(frozen=True)
+class OptimizeSettings:
+    """How light and tone curves are recovered from the guidance's gradient."""
+
+    steps: int = 600
+    """Steps of the optimisation"""
+    guidance_width: int = 384
+    """Width of the picture inside the loop [px]; its height follows the photo's shape"""
+    lobes: int = 64
+    """Spherical-Gaussian lobes of each light, the object's and the shadow's"""
+    light_height: int = 64
+    """Rows of the maps in which the two lights are fused"""
+    object_light_height: int = 32
+    """Rows of the map that lights the object while its light transport is stored"""
+    fusion: str = "schedule"
+    """How the two lights become one: schedule (blended from none to all over the run), single (one
+    light from the start) or none (two lights to the end)"""
+    tone_curve: bool = True
+    """Recover tone curves for the object and its shadow"""
+    integrator: str = "transport"
+    """What renders inside the loop: transport (light transport is traced once and then reused) or
+    mis (every step is traced)"""
+    mis_samples: int = 16
+    """Samples per pixel of --integrator mis"""
+    retrace_at: float = 3.0
+    """Light transport is traced again when the lights have changed so much that its noise has grown
+    by this factor"""
+    rate_intensity: float = 0.03
+    """Learning rate of the lobes' log intensities"""
+    rate_axis: float = 0.02
+    """Learning rate of the lobes' directions; 0.02 is about one degree per step"""
+    rate_width: float = 0.02
+    """Learning rate of the lobes' log widths"""
+    rate_chroma: float = 0.01
+    """Learning rate of the lobes' log colour ratios"""
+    rate_tone: float = 0.01
+    """Learning rate of the tone curves"""
+    adam_beta1: float = 0.9
+    """Adam's decay of the gradient's mean"""
+    adam_beta2: float = 0.99
+    """Adam's decay of the gradient's square"""
+    consistency: float = 0.03
+    """Weight of the term that gives the object's light the shape of the shadow's (eq. 10)"""
+    spread: float = 0.01
+    """Weight of the Cauchy term that keeps the shadow's light in few directions (eq. 11)"""
+    chroma: float = 0.1
+    """Weight of the prior that keeps the light's colour near white"""
+    bend: float = 0.1
+    """Weight of the prior that keeps tone curves near the identity"""
+    chroma_limit: float = 1.5
+    """Greatest log colour ratio of a lobe"""
+    intensity_limit: float = 1e6
+    """Greatest intensity of a lobe, relative [W/(m^2 sr)]"""
+    score_every: int = 25
+    """Steps between two scores, of which the best state is kept; 0: the last state is kept"""
