@@ -1,6 +1,6 @@
 """Noise schedules: how much noise a time stands for, and the three things a network may predict.
 
-    z_t = a z + s noise,   a^2 = alphas_cumprod,   s^2 = 1 - a^2
+z_t = a z + s noise,   a^2 = alphas_cumprod,   s^2 = 1 - a^2
 """
 
 from __future__ import annotations
@@ -36,8 +36,9 @@ class NoiseSchedule:
 
     def alpha_sigma(self, t: Tensor) -> tuple[Tensor, Tensor]:
         """Return ``a`` and ``s``, float32 on t's device, same shape as ``t``."""
-        bar = self.alphas_cumprod[self.timestep(t).cpu()]
-        return bar.sqrt().float().to(t.device), (1.0 - bar).sqrt().float().to(t.device)
+        # The table goes to the times: the other way round would wait for the device's queue.
+        bar = self.alphas_cumprod.to(t.device)[self.timestep(t)]
+        return bar.sqrt().float(), (1.0 - bar).sqrt().float()
 
     def add_noise(self, latents: Tensor, noise: Tensor, t: Tensor) -> Tensor:
         """Return ``z_t``, shape [B, C, h, w]."""
