@@ -1,0 +1,408 @@
+"""Does the loop find light and tone curves again when the guidance is right?
+
+    python -m benchmarks.recovery [--quick] --assets DIR --json FILE
+
+A photo is cut out of a panorama, an object is set into it under that very panorama and unknown tone
+curves, and the optimisation is guided by the squared distance to this true composite, in place of a
+diffusion model. What is left is renderer, fusion, curves and optimiser. The truth is path-traced
+with `mis` under the full panorama; the loop knows lobes, coarse maps and `transport` only.
+"""
+
+import argparse
+import json
+import time
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+import warp as wp
+from numpy.typing import NDArray
+from torch import Tensor
+
+from benchmarks.measure import context
+from benchmarks.panorama_crop import crop_camera, crop_radiance, expose
+from warpir.asset import Asset, load_asset
+from warpir.bridge import ComposeConstants, compose
+from warpir.color import gamma_to_linear, luminance
+from warpir.files import read_envmap
+from warpir.integrator import LightTensors
+from warpir.light import (
+    Light,
+    angles_from_axis,
+    map_directions,
+    resize_map,
+    texel_solid_angles,
+)
+from warpir.mis import MisIntegrator
+from warpir.optimize import Optimization, Recovered, Unknowns
+from warpir.optimize_settings import OptimizeSettings
+from warpir.placement import place_asset
+from warpir.render import Renderer, light_args
+from warpir.scene import Placed, Proxy, Scene
+from warpir.tone import Knots, ToneCurve
+from warpir.view import Frame
+
+FloatArray = NDArray[np.float32]
+Float64Array = NDArray[np.float64]
+
+MEASURE_HEIGHT = 128
+"""Rows of the maps on which lights are compared."""
+SMOOTHING = 200.0
+"""Sharpness of the lobe that smooths a map before its brightest direction is sought: 4 degrees."""
+SUN_RADIUS_DEG = 20.0
+"""What lies within this of the brightest direction and above its surroundings is the sun."""
+
+
+@dataclass(frozen=True)
+class RecoveryScene:
+    """One photo with a known light."""
+
+    name: str
+    panorama: str
+    asset: str
+    size: float
+    """Longest side of the object [m]."""
+    azimuth: float
+    """Where the camera looks, clockwise from -Z seen from above [deg]."""
+    distance: float
+    """From the camera to the object along the ground [m]."""
+    camera_height: float
+    """Above the ground [m]."""
+    rotate_y: float = 0.0
+    """Turn of the object [deg]."""
+    contrast: float = 0.0
+    """Raw height of the true foreground curve: its bend."""
+
+
+SCENES = (
+    RecoveryScene(
+        "plaza_spot", "modern_buildings_2", "mesh/spot/spot.obj", 1.6, 100.0, 4.5, 1.6, 200.0, 0.4
+    ),
+    RecoveryScene(
+        "park_truck",
+        "rooitou_park",
+        "mesh/kenney_trucks/vehicle-truck-red.glb",
+        4.0,
+        300.0,
+        9.0,
+        2.2,
+        35.0,
+        -0.3,
+    ),
+    RecoveryScene(
+        "clouds_ball", "pmndrs_sky", "mesh/shaderball.glb", 1.2, 150.0, 4.5, 1.6, 20.0, 0.2
+    ),
+    RecoveryScene(
+        "hills_truck",
+        "hilly_terrain_01",
+        "mesh/kenney_trucks/vehicle-truck-yellow.glb",
+        4.0,
+        120.0,
+        9.0,
+        2.2,
+        -60.0,
+        0.5,
+    ),
+    RecoveryScene(
+        "noon_spot", "noon_grass", "mesh/spot/spot.obj", 1.6, 20.0, 4.5, 1.6, 130.0, -0.4
+    ),
+    RecoveryScene(
+        "meadow_ball", "pmndrs_sunrise", "mesh/shaderball.glb", 1.2, 330.0, 4.5, 1.6, -70.0, 0.0
+    ),
+)
+"""Six places with a sun between 8 and 86 degrees high, seen from different sides of it."""
+
+
+@dataclass(frozen=True)
+class Truth:
+    """A photo, what it would look like with the object, and why."""
+
+    scene: RecoveryScene
+    frame: Frame
+    image: Tensor
+    """Composite under the panorama and the true curves, display-encoded, shape [1, 3, H, W]."""
+    texels: FloatArray
+    """The panorama at the photo's exposure, shape [He, We, 3]."""
+    curve_fg: Knots
+    curve_shadow: Knots
+
+
+def true_curves(contrast: float) -> tuple[ToneCurve, ToneCurve]:
+    """Return an S-shaped (or, below 0, flattened) foreground curve and three shadow curves."""
+    curve_fg, curve_shadow = ToneCurve(1), ToneCurve(3)
+    bend = torch.tensor([-1.0, 0.3, 1.0, 0.5, -0.8])
+    with torch.no_grad():
+        curve_fg.heights += contrast * bend
+        tint = torch.tensor([[-0.15], [0.0], [0.15]])
+        curve_shadow.heights += (0.5 * contrast + tint) * torch.linspace(1.0, -1.0, 5)
+    return curve_fg, curve_shadow
+
+
+def make_truth(
+    scene: RecoveryScene,
+    panorama: FloatArray,
+    asset: Asset,
+    width: int,
+    height: int,
+    samples: int,
+    device: str,
+) -> Truth:
+    """Cut the photo and render the true composite.
+
+    Args:
+        scene: What stands where.
+        panorama: Lat-long radiance, shape [He, We, 3].
+        asset: The object.
+        width: Photo width [px].
+        height: Photo height [px].
+        samples: Camera samples per pixel of the truth.
+        device: Warp device.
+    """
+    camera = crop_camera(width, height, 45.0, scene.azimuth, -8.0, scene.camera_height)
+    display, exposure = expose(crop_radiance(panorama, camera))
+    photo_lin = gamma_to_linear(display.astype(np.float32))
+    texels = (panorama * 2.0**exposure).astype(np.float32)
+    forward = -camera.c2w[:3, 2] * np.array([1.0, 0.0, 1.0])
+    x, y, z = (float(c) for c in scene.distance * forward / np.linalg.norm(forward))
+    placement = place_asset(
+        *asset.bounds(),
+        camera,
+        None,
+        place=(x, y, z),
+        rotate_y=scene.rotate_y,
+        size=scene.size,
+    )
+    placed = Placed(asset, placement.asset_to_world)
+    renderer = Renderer(Scene([placed], camera, Proxy(np.array([0.0, 1.0, 0.0]), 0.0), device))
+    frame = Frame(renderer, photo_lin, True, 3, seed=1)
+    curves = true_curves(scene.contrast)
+    with torch.no_grad():
+        knots = curves[0](), curves[1]()
+        image = reference(frame, texels, *knots, samples)
+    return Truth(scene, frame, image, texels, *knots)
+
+
+def reference(
+    frame: Frame, texels: FloatArray, curve_fg: Knots, curve_shadow: Knots, samples: int
+) -> Tensor:
+    """Return the composite by `mis` under a full map, shape [1, 3, H, W]."""
+    renderer = frame.renderer
+    args = light_args(Light(texels=texels), renderer.device)
+    objects = renderer.gbuffer(99).object_pixels
+    proxies = renderer.shaded_pixels(args, 99)
+    mask = renderer.foreground(args, objects, 64, 1, 1, 99).mask
+    mis = MisIntegrator(renderer, objects, proxies, samples, 2, frame.depth)
+    light = LightTensors(texels=torch.from_numpy(texels))
+    radiance = mis.radiance(light, light, 99)
+    constants = ComposeConstants(
+        frame.photo_lin, objects, proxies, mask, str(renderer.device.alias), frame.is_reinhard
+    )
+    return compose(
+        constants,
+        radiance.foreground,
+        radiance.lit,
+        radiance.unoccluded,
+        curve_fg,
+        curve_shadow,
+    )
+
+
+class TowardTruth:
+    """Guidance that knows the answer: the gradient of half the squared distance to the truth.
+
+    The sum is scaled to the pixels of a 384 x 256 picture, so that the regularisers weigh the same
+    at every size.
+    """
+
+    def __init__(self, image: Tensor) -> None:
+        self.image = image
+        self.scale = 384 * 256 / (image.shape[2] * image.shape[3])
+
+    def gradient(self, image: Tensor, step: int) -> Tensor:
+        """Return the residual, scaled."""
+        return self.scale * (image - self.image.to(image.device))
+
+    def score(self, image: Tensor) -> float:
+        """Return the mean squared error."""
+        return float((image - self.image.to(image.device)).square().mean())
+
+    def state_dict(self) -> dict[str, Any]:
+        """Nothing to remember."""
+        return {}
+
+    def load_state_dict(self, state: Mapping[str, Any]) -> None:
+        """Nothing to remember."""
+
+
+def brightest_direction(texels: FloatArray) -> Float64Array:
+    """Return the centroid of what stands out round the brightest smoothed direction, unit."""
+    grid, grey, weight = _measured(texels)
+    coarse = map_directions(32, 64).reshape(-1, 3)
+    smooth = np.array([(weight * np.exp(SMOOTHING * (grid @ v - 1.0))).sum() for v in coarse])
+    axis: Float64Array = coarse[int(np.argmax(smooth))]
+    for _ in range(3):  # the cap follows its own centroid
+        excess = _excess(axis, grid, grey, weight)
+        axis = (excess[:, None] * grid).sum(axis=0)
+        axis = axis / np.linalg.norm(axis)
+    return axis
+
+
+def sun_sky_ratio(texels: FloatArray, axis: Float64Array) -> float:
+    """Return the flux of the sun over that of the rest of the upper hemisphere [1]."""
+    grid, grey, weight = _measured(texels)
+    sun = float(_excess(axis, grid, grey, weight).sum())
+    upper = float(weight[grid[:, 1] > 0.0].sum())
+    return sun / max(upper - sun, 1e-12)
+
+
+def _measured(texels: FloatArray) -> tuple[Float64Array, Float64Array, Float64Array]:
+    """Return directions, luminance and luminous flux by texel, flat."""
+    grey = luminance(resize_map(texels, MEASURE_HEIGHT).astype(np.float64)).reshape(-1)
+    omega = np.repeat(texel_solid_angles(MEASURE_HEIGHT, 2 * MEASURE_HEIGHT), 2 * MEASURE_HEIGHT)
+    grid = map_directions(MEASURE_HEIGHT, 2 * MEASURE_HEIGHT).reshape(-1, 3)
+    return grid, grey, grey * omega
+
+
+def _excess(
+    axis: Float64Array, grid: Float64Array, grey: Float64Array, weight: Float64Array
+) -> Float64Array:
+    """Return the flux within the sun's cap that exceeds the median of the ring round it."""
+    cosine = grid @ axis
+    near = cosine > np.cos(np.radians(SUN_RADIUS_DEG))
+    ring = ~near & (cosine > np.cos(np.radians(1.5 * SUN_RADIUS_DEG))) & (grid[:, 1] > 0.0)
+    level = float(np.median(grey[ring])) if ring.any() else 0.0
+    above = np.maximum(grey - level, 0.0) / np.maximum(grey, 1e-30)
+    excess: Float64Array = np.where(near, weight * above, 0.0)
+    return excess
+
+
+def response(knots: Knots, radiance: Float64Array) -> Float64Array:
+    """Return display-linear values of some radiances under Reinhard and a foreground curve."""
+    x, y, d = (k.detach().double().numpy()[0] for k in (knots.x, knots.y, knots.slope))
+    value = radiance / (1.0 + radiance)
+    k = np.clip(np.searchsorted(x, value, side="right") - 1, 0, len(x) - 2)
+    w, h = np.diff(x)[k], np.diff(y)[k]
+    q, m = (value - x[k]) / w, h / w
+    rise = m * q * q + d[k] * q * (1.0 - q)
+    shown: Float64Array = y[k] + h * rise / (m + (d[k + 1] + d[k] - 2.0 * m) * q * (1.0 - q))
+    return shown
+
+
+def measure(truth: Truth, found: Recovered, loop: Optimization) -> dict[str, Any]:
+    """Compare what was recovered with what is true."""
+    light = loop.final_lights(MEASURE_HEIGHT)[0].texels
+    assert light is not None
+    axis, true_axis = brightest_direction(light), brightest_direction(truth.texels)
+    error = (delivered(truth, loop) - truth.image).cpu().numpy()[0]
+    photo = (truth.frame.photo_lin ** (1.0 / 2.2)).transpose(2, 0, 1)
+    changed = np.abs(truth.image.cpu().numpy()[0] - photo).max(axis=0) > 2.0 / 255.0
+    # The scale of the light and the curve are one unknown: radiances are matched by total flux.
+    ratio = float(_measured(light)[2].sum() / _measured(truth.texels)[2].sum())
+    radiance = np.geomspace(0.02, 2.0, 64)
+    curves = response(found.curve_fg(), ratio * radiance) - response(truth.curve_fg, radiance)
+    ratios = sun_sky_ratio(light, axis), sun_sky_ratio(truth.texels, true_axis)
+    return {
+        "name": truth.scene.name,
+        "angle_deg": float(np.degrees(np.arccos(np.clip(axis @ true_axis, -1.0, 1.0)))),
+        "sun_sky_log_error": float(abs(np.log(max(ratios[0], 1e-6) / max(ratios[1], 1e-6)))),
+        "rmse": float(np.sqrt(np.square(error).mean())),
+        "rmse_changed": float(np.sqrt(np.square(error[:, changed]).mean())),
+        "tone_rmse": float(np.sqrt(np.square(curves).mean())),
+        "direction_deg": angles_from_axis(axis),
+        "true_direction_deg": angles_from_axis(true_axis),
+        "sun_sky": ratios[0],
+        "true_sun_sky": ratios[1],
+        "retraced": loop.state.retraced,
+        "step": found.step,
+    }
+
+
+def delivered(truth: Truth, loop: Optimization, samples: int = 64) -> Tensor:
+    """Return the composite as a user gets it: by `mis`, under finer maps, at an unseen seed."""
+    texels = loop.final_lights(256)[0].texels
+    assert texels is not None
+    with torch.no_grad():
+        curves = loop.unknowns.curve_fg(), loop.unknowns.curve_shadow()
+        return reference(truth.frame, texels, *curves, samples)
+
+
+def recover(truth: Truth, settings: OptimizeSettings, cache: Path | None = None) -> Optimization:
+    """Run the loop toward the truth from an even light at the photo's level."""
+    level = float(np.median(luminance(truth.frame.photo_lin)))
+    unknowns = Unknowns.start(None, level / (1.0 - min(level, 0.95)), settings)
+    loop = Optimization(truth.frame, TowardTruth(truth.image), settings, unknowns, cache)
+    loop.run()
+    return loop
+
+
+def show(truth: Truth, loop: Optimization, path: Path) -> None:
+    """Write truth, result and five times their difference side by side."""
+    from PIL import Image
+
+    image = delivered(truth, loop).cpu().numpy()[0].transpose(1, 2, 0)
+    true = truth.image.cpu().numpy()[0].transpose(1, 2, 0)
+    difference = np.clip(0.5 + 5.0 * (image - true), 0.0, 1.0)
+    panel = np.concatenate([true, image, difference], axis=1)
+    Image.fromarray(np.round(255.0 * panel).astype(np.uint8)).save(path)
+
+
+def main() -> None:
+    """Recover six scenes and write what was found."""
+    parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
+    parser.add_argument("--assets", type=Path, required=True, help="folder with mesh/ and hdri/")
+    parser.add_argument("--quick", action="store_true", help="96 x 64, 200 steps")
+    parser.add_argument("--json", type=Path, help="file for the figures")
+    parser.add_argument("--pictures", type=Path, help="folder for truth, result, difference")
+    parser.add_argument("--scenes", default="", help="names, separated by commas")
+    parser.add_argument("--device", default="cpu")
+    parser.add_argument("--set", action="append", default=[], help="field=value of the settings")
+    options = parser.parse_args()
+    settings = OptimizeSettings()
+    width, height, samples = 384, 256, 128
+    if options.quick:
+        settings = replace(settings, steps=200, lobes=48, light_height=48, object_light_height=24)
+        width, height, samples = 96, 64, 128
+    for text in options.set:
+        name, _, value = text.partition("=")
+        kind = type(getattr(settings, name))
+        settings = replace(settings, **{name: kind(value)})
+    chosen = [s for s in SCENES if not options.scenes or s.name in options.scenes.split(",")]
+    lines = []
+    for scene in chosen:
+        started = time.perf_counter()
+        panorama = (
+            read_envmap(options.assets / "hdri" / f"{scene.panorama}_1k.hdr")
+            if (options.assets / "hdri" / f"{scene.panorama}_1k.hdr").exists()
+            else read_envmap(options.assets / "hdri" / f"{scene.panorama}.hdr")
+        )
+        asset = load_asset(options.assets / scene.asset)
+        truth = make_truth(scene, panorama, asset, width, height, samples, options.device)
+        made = time.perf_counter()
+        loop = recover(truth, settings)
+        line = measure(truth, loop.recovered(), loop)
+        line["seconds"] = {
+            "truth": round(made - started, 1),
+            "recovery": round(time.perf_counter() - made, 1),
+        }
+        lines.append(line)
+        print(json.dumps(line), flush=True)
+        if options.pictures is not None:
+            options.pictures.mkdir(parents=True, exist_ok=True)
+            show(truth, loop, options.pictures / f"{scene.name}.png")
+    record = {
+        **context(wp.get_device(options.device), 0),
+        "size": [width, height],
+        "settings": vars(settings) if not hasattr(settings, "__slots__") else {},
+        "scenes": lines,
+        "max_angle_deg": max(line["angle_deg"] for line in lines),
+        "max_sun_sky_log_error": max(line["sun_sky_log_error"] for line in lines),
+    }
+    if options.json is not None:
+        options.json.write_text(json.dumps(record, indent=1) + "\n", encoding="utf-8")
+
+
+if __name__ == "__main__":
+    main()
