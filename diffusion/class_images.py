@@ -1,0 +1,213 @@
+"""Pictures of the object's class by the unadapted model: what keeps the concept while it adapts.
+
+The model learns the photo and, beside it, its own pictures of the class (DiPIR, section 4.2.1), so
+that added words still count and the photo's colours stay out of the object. Each picture is kept on
+disk under a hash of all that it depends on: a run that was stopped makes the missing ones only.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import hashlib
+import io
+import logging
+import os
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+import torch
+from PIL import Image, PngImagePlugin
+from torch import Tensor
+
+from warpir.diffusion.cache import content_key, make_room, model_key, seed_of, write_file
+from warpir.diffusion.prior import ModelError
+from warpir.diffusion.prompts import Prompts, draw_class_prompts
+from warpir.diffusion.settings import PersonalizeSettings
+
+if TYPE_CHECKING:
+    from warpir.diffusion.stable_diffusion import StableDiffusion
+
+FORMAT = 1
+"""Meaning of a stored picture; part of every key."""
+COUNT_OUTDOORS, COUNT_INDOORS = 200, 40
+"""Numbers of class images (DiPIR, section 4.2.1: about 200, and 30 to 40)."""
+
+Report = Callable[[str, int, int], None]
+"""Is told a stage, the steps done and the steps in all."""
+
+log = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True)
+class ClassImages:
+    """Pictures of the class, and how they came about."""
+
+    images: Tensor
+    """Display-encoded, uint8 on the CPU, shape [N, 3, resolution, resolution]."""
+    prompts: tuple[str, ...]
+    seeds: tuple[int, ...]
+    made: int
+    """How many were made now; the others were found on disk."""
+    notices: tuple[str, ...]
+    """What the user is told about, such as files that could not be read."""
+
+
+def class_image_count(settings: PersonalizeSettings) -> int:
+    """Return how many class images the settings ask for."""
+    if settings.class_images is not None:
+        return settings.class_images
+    return COUNT_INDOORS if settings.indoors else COUNT_OUTDOORS
+
+
+def make_class_images(
+    prior: StableDiffusion,
+    prompts: Prompts,
+    settings: PersonalizeSettings,
+    seed: int,
+    cache: Path | None,
+    report: Report | None = None,
+) -> ClassImages:
+    """Return the class images, from disk where they are there and else from the unadapted model.
+
+    Each depends on its own prompt and seed alone, not on the batch or on how many there are.
+
+    Args:
+        prior: The model.
+        prompts: Gives the noun.
+        settings: Number, sampler and batch.
+        seed: The run's seed; prompts, attributes and noise are functions of it.
+        cache: Folder that keeps the pictures, or None to keep none.
+        report: Is told "class images", the number there is, and the number wanted.
+
+    Raises:
+        ModelError: A picture is not finite, or the text encoder was freed.
+    """
+    count = class_image_count(settings)
+    texts = draw_class_prompts(prompts.noun, count, seed)
+    seeds = tuple(seed_of(seed, "class image", index) for index in range(count))
+    side = prior.resolution
+    images = torch.zeros(count, 3, side, side, dtype=torch.uint8)
+    model = model_key(prior)
+    keys = [
+        content_key(FORMAT, model, text, noise, settings.class_steps, settings.class_scale)
+        for text, noise in zip(texts, seeds, strict=True)
+    ]
+    files = [cache / f"{key}.png" if cache else None for key in keys]
+    notices = []
+    missing = []
+    for index, file in enumerate(files):
+        try:
+            found = _read_png(file, side) if file and file.is_file() else None
+        except Exception as error:  # Pillow says in a dozen ways that a file is damaged
+            notices.append(f"{file}: not readable, made again ({error})")
+            log.warning("%s", notices[-1])
+            found = None
+        if found is None:
+            missing.append(index)
+        else:
+            images[index] = found
+    if report:
+        report("class images", count - len(missing), count)
+
+    for start in range(0, len(missing), settings.class_batch):
+        batch = missing[start : start + settings.class_batch]
+        made = prior.sample(
+            [texts[index] for index in batch],
+            [seeds[index] for index in batch],
+            steps=settings.class_steps,
+            scale=settings.class_scale,
+            batch=settings.class_batch,
+        )
+        for index, picture in zip(batch, to_bytes(made), strict=True):
+            images[index] = picture
+            file = files[index]
+            if file is None or cache is None:
+                continue
+            try:
+                write_file(file, _png(picture, texts[index], seeds[index]))
+            except OSError as error:  # without a cache the run still ends as it would have
+                notices.append(f"{cache}: class images are not kept ({error})")
+                log.warning("%s", notices[-1])
+                cache = None
+        if report:
+            report("class images", count - len(missing) + start + len(batch), count)
+    if cache is not None and missing:
+        make_room(cache, "*.png")
+    return ClassImages(images, texts, seeds, len(missing), tuple(notices))
+
+
+def to_bytes(pictures: Tensor) -> Tensor:
+    """Round pictures in [0, 1] to uint8 on the CPU.
+
+    Raises:
+        ModelError: A value is not finite, as when half precision overflows.
+    """
+    if not bool(torch.isfinite(pictures).all()):
+        raise ModelError(
+            "model", "its pictures are not finite (found nan or inf)", "try --precision fp32"
+        )
+    return (pictures.detach().float().clamp(0.0, 1.0) * 255.0).round().to("cpu", torch.uint8)
+
+
+def from_bytes(pictures: Tensor, device: torch.device) -> Tensor:
+    """Return uint8 pictures as float32 in [0, 1] on the device."""
+    return pictures.to(device).float() / 255.0
+
+
+def encode_pictures(
+    prior: StableDiffusion, pictures: Tensor, batch: int, report: Callable[[int], None] | None
+) -> Tensor:
+    """Return the pictures' latents, float32 on the CPU, shape [N, C, h, w].
+
+    Args:
+        prior: Encodes; the posterior's mean, no sampling noise.
+        pictures: uint8, shape [N, 3, resolution, resolution].
+        batch: Pictures at once.
+        report: Is told how many are done.
+    """
+    latents = []
+    with torch.no_grad():
+        for start in range(0, len(pictures), batch):
+            part = from_bytes(pictures[start : start + batch], prior.device)
+            latents.append(prior.encode(part).cpu())
+            if report:
+                report(start + len(part))
+    return torch.cat(latents)
+
+
+def _pixel_hash(pixels: bytes) -> str:
+    return hashlib.sha256(pixels).hexdigest()
+
+
+def _png(picture: Tensor, prompt: str, seed: int) -> bytes:
+    """Return a PNG that names what it shows; [3, H, W] uint8."""
+    pixels = np.ascontiguousarray(picture.permute(1, 2, 0).numpy())
+    texts = PngImagePlugin.PngInfo()
+    texts.add_itxt("prompt", prompt)
+    texts.add_text("seed", str(seed))
+    texts.add_text("sha256", _pixel_hash(pixels.tobytes()))
+    file = io.BytesIO()
+    # Fast rather than small: the model waits meanwhile.
+    Image.fromarray(pixels).save(file, "PNG", pnginfo=texts, compress_level=1)
+    return file.getvalue()
+
+
+def _read_png(path: Path, side: int) -> Tensor:
+    """Return a stored picture, uint8 [3, side, side].
+
+    Raises:
+        Exception: Pillow cannot read it, or it is not the picture that was stored.
+    """
+    with Image.open(path, formats=["PNG"]) as file:
+        if file.size != (side, side):
+            raise ValueError(f"found {file.size} pixels, expected {(side, side)}")
+        pixels = np.array(file)
+        # Decoders forgive a flipped bit in the pixels.
+        if _pixel_hash(pixels.tobytes()) != file.info.get("sha256"):
+            raise ValueError("its pixels were changed")
+    with contextlib.suppress(OSError):  # a cache that is only read is one too
+        os.utime(path)
+    return torch.from_numpy(pixels).permute(2, 0, 1).contiguous()
