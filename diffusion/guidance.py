@@ -1,0 +1,618 @@
+"""Guidance: what a diffusion prior thinks of a picture, as a gradient on that picture.
+
+A loss is a row of coefficients of one formula; `coefficients` is the table (DiPIR, eq. 7 and 8):
+
+    delta   = k_p e(prompt; adapter) + k_c e(prompt) + k_0 e(null) + k_n e(negative) + k_e noise
+    d_image = mean over noises of (d latents / d image)^T  w(t) delta
+
+with ``latents = encode(crop(image))`` and all ``e`` at ``z_t = a latents + s noise``. The residual
+``w(t) delta`` is summed over the latents, not averaged: that fixes what the weights of the other
+terms mean, and a mean underflows in a half-precision autoencoder.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import math
+from collections import deque
+from collections.abc import Mapping, Sequence
+from contextlib import AbstractContextManager
+from dataclasses import dataclass
+from statistics import median
+from typing import Any, Protocol, cast
+
+import torch
+from torch import Tensor
+
+from warpir.diffusion.crop import Crop, box_of, draw_crop
+from warpir.diffusion.prior import Condition, Counts, ModelError, Prior
+from warpir.diffusion.schedule import time_range, weight
+from warpir.diffusion.settings import GuidanceSettings
+
+DATASET_UPDATE = "dataset-update"
+"""The loss that has no row: the picture is edited, and the edit is the target."""
+BAD_STEPS_MAX = 5
+"""Steps in a row without a finite gradient that end the run."""
+NORM_WINDOW = 101
+"""Past steps whose median norm tells what an outlier is."""
+NORM_COUNT_MIN = 10
+"""Past steps before anything is clipped: the norm varies tenfold with the time alone."""
+PAIR_COUNT = 8
+"""Crops, times and noises of a score."""
+EDIT_COUNT = 4
+"""Edited crops of a score of `DatasetUpdate`, each of which costs many passes."""
+CHECK_COUNT = 4
+"""Crops, times and noises of a check of the precision."""
+VALUES_PER_LATENT = 48
+"""Values of a picture for each of its latents: Stable Diffusion makes 4 of 8 x 8 x 3."""
+
+
+class NonFiniteError(Exception):
+    """No finite gradient in several steps in a row; the program says so and exits with 6."""
+
+
+class Guide(Protocol):
+    """What turns a picture into a gradient."""
+
+    counts: Counts
+    """What the user is told in the end."""
+
+    def gradient(self, image: Tensor, step: int) -> Tensor | None:
+        """Return the loss gradient of an image, same shape, dtype and device; see `Guidance`.
+
+        Args:
+            image: Display-encoded, in [0, 1], shape [1, 3, H, W].
+            step: From 0.
+
+        Returns:
+            None when this step has no finite gradient.
+
+        Raises:
+            NonFiniteError: It is the fifth in a row.
+        """
+
+    def score(self, image: Tensor, seed: int | None = None) -> float | None:
+        """Return how wrong an image looks, lower is better; None when that is not finite.
+
+        The same times, noises and crops every time, so that states of a run can be compared.
+
+        Args:
+            image: Display-encoded, in [0, 1], shape [1, 3, H, W].
+            seed: Of what is drawn; the guidance's own by default.
+        """
+
+    def state_dict(self) -> dict[str, Any]:
+        """Return what a later run needs to go on: tensors, numbers and lists of numbers."""
+
+    def load_state_dict(self, state: Mapping[str, Any]) -> None:
+        """Go on from `state_dict`."""
+
+
+class EditingPrior(Prior, Protocol):
+    """A prior that can also change a picture."""
+
+    def edit(
+        self,
+        image: Tensor,
+        prompt: str,
+        seed: int,
+        strength: float,
+        steps: int,
+        scale: float,
+        adapter: str | None,
+    ) -> Tensor:
+        """Return the picture after noise and denoising (SDEdit), in [0, 1], of the same shape."""
+
+
+class PrecisePrior(Prior, Protocol):
+    """A prior that computes in less than full precision, and can be asked not to."""
+
+    def in_full_precision(self) -> AbstractContextManager[Any]:
+        """Within this context `predict` computes in float32."""
+
+
+@dataclass(frozen=True)
+class Coefficients:
+    """A loss: what each prediction counts."""
+
+    k_p: float = 0.0
+    """Of the prompt, with the adapter."""
+    k_c: float = 0.0
+    """Of the prompt, by the base model."""
+    k_0: float = 0.0
+    """Of the null prompt."""
+    k_n: float = 0.0
+    """Of the negative prompt."""
+    k_e: float = 0.0
+    """Of the noise itself."""
+    null_adapter: bool = False
+    """Null and negative terms have the adapter too."""
+
+
+def coefficients(settings: GuidanceSettings) -> Coefficients:
+    """Return the row of a loss (DiPIR, eq. 7 and 8, figure S3; CSD: arXiv 2310.19415).
+
+    Raises:
+        ValueError: The loss has no row.
+    """
+    g = settings.guidance_scale
+    rows = {
+        "lds": Coefficients(k_p=1.0, k_0=-1.0),
+        "sds": Coefficients(k_p=g, k_0=1.0 - g, k_e=-1.0, null_adapter=True),
+        "sds-base": Coefficients(k_c=g, k_0=1.0 - g, k_e=-1.0),
+        "csd": Coefficients(k_c=1.0, k_0=-1.0),
+        "lds-lora-both": Coefficients(k_p=1.0, k_0=-1.0, null_adapter=True),
+        "lds-negative": Coefficients(k_p=1.0, k_n=-1.0),
+    }
+    if settings.loss not in rows:
+        names = ", ".join([*rows, DATASET_UPDATE])
+        raise ValueError(f"loss: {names} (found {settings.loss!r})")
+    return rows[settings.loss]
+
+
+@dataclass(frozen=True)
+class Term:
+    """One prediction of the residual."""
+
+    scale: float
+    prompt: str
+    adapter: str | None
+
+
+def terms_of(settings: GuidanceSettings, condition: Condition, adapter: str | None) -> list[Term]:
+    """Return the terms of a loss that count, those whose coefficient is not 0.
+
+    The negative prompt is the condition's, else the settings', else the null prompt.
+
+    Raises:
+        ValueError: The loss is unknown, or its adapter is missing.
+    """
+    row = coefficients(settings)
+    if adapter is None and (row.k_p or row.null_adapter):
+        raise ValueError(f"loss: {settings.loss} needs an adapter; csd and sds-base do without")
+    other = adapter if row.null_adapter else None
+    negative_prompt = condition.negative_prompt or settings.negative_prompt
+    terms = [
+        Term(row.k_p, condition.prompt, adapter),
+        Term(row.k_c, condition.base_prompt or condition.prompt, None),
+        Term(row.k_0, "", other),
+        Term(row.k_n, negative_prompt, other),
+    ]
+    return [term for term in terms if term.scale]
+
+
+class GradientGate:
+    """Lets finite gradients pass, shortens outliers, and counts both.
+
+    Args:
+        clip: Greatest norm in running medians; 0 for no limit.
+    """
+
+    def __init__(self, clip: float) -> None:
+        self.clip = clip
+        self.counts = Counts()
+        self.norms: deque[float] = deque(maxlen=NORM_WINDOW)
+        self.bad_steps = 0
+
+    def passed(self, d_image: Tensor | None) -> Tensor | None:
+        """Return the gradient, no longer than allowed; None when it is not finite.
+
+        Args:
+            d_image: Any shape; None when it is known not to be finite.
+
+        Raises:
+            NonFiniteError: The fifth in a row is not finite.
+        """
+        norm = math.nan
+        if d_image is not None:
+            # In float64 the norm is finite exactly when every element is.
+            norm = float(torch.linalg.vector_norm(d_image, dtype=torch.float64))
+        if d_image is None or not math.isfinite(norm):
+            self.counts.skipped_steps += 1
+            self.bad_steps += 1
+            if self.bad_steps >= BAD_STEPS_MAX:
+                raise NonFiniteError(
+                    f"guidance: no finite gradient in {BAD_STEPS_MAX} steps in a row"
+                )
+            return None
+        self.bad_steps = 0
+        limit = self.clip * median(self.norms) if len(self.norms) >= NORM_COUNT_MIN else 0.0
+        self.norms.append(norm)
+        if not 0.0 < limit < norm:
+            return d_image
+        self.counts.clipped_steps += 1
+        return d_image * (limit / norm)
+
+    def state_dict(self) -> dict[str, Any]:
+        """Return numbers and lists of numbers."""
+        return {
+            "norms": list(self.norms),
+            "bad_steps": self.bad_steps,
+            "skipped_steps": self.counts.skipped_steps,
+            "clipped_steps": self.counts.clipped_steps,
+        }
+
+    def load_state_dict(self, state: Mapping[str, Any]) -> None:
+        """Go on from `state_dict`."""
+        self.norms = deque(state["norms"], maxlen=NORM_WINDOW)
+        self.bad_steps = int(state["bad_steps"])
+        self.counts.skipped_steps = int(state["skipped_steps"])
+        self.counts.clipped_steps = int(state["clipped_steps"])
+
+
+@dataclass(frozen=True)
+class NoisyCrops:
+    """Crops of a picture, as the prior sees them at some times."""
+
+    latents: Tensor
+    """Differentiable, float32, shape [noise, C, h, w]."""
+    noise: Tensor
+    """Same shape."""
+    latents_noisy: Tensor
+    """z_t, detached, same shape."""
+    t: Tensor
+    """Shape [noise]."""
+    weight: Tensor
+    """w(t), shape [noise, 1, 1, 1]."""
+    background: Tensor | None
+    """The photo's crops, shape [noise, 3, R, R]."""
+    gbuffer: Tensor | None
+    """The G-buffer's crops, shape [noise, 7, R, R]."""
+
+
+class Guidance:
+    """Score distillation with one row of coefficients (DiPIR, eq. 7 and 8).
+
+    Each noise has a crop and a time of its own, so several of them also average over places and
+    sizes; they share one batch of the autoencoder, and with all terms one batch of the denoiser.
+    What is drawn is a function of seed, step and noise alone: resumed runs continue with it, and
+    all losses of an ablation share it.
+
+    Args:
+        prior: The frozen denoiser.
+        condition: What the picture is to be judged by.
+        settings: Loss, weights, times and crops.
+        mask: Coverage of the object, shape [H, W].
+        steps: Length of the run, over which the times fall.
+        seed: Of what is drawn.
+        adapter: Name of the LoRA of this photo, or None where the loss does without.
+
+    Raises:
+        ValueError: The loss is unknown, needs an adapter, or the mask is empty.
+    """
+
+    def __init__(
+        self,
+        prior: Prior,
+        condition: Condition,
+        settings: GuidanceSettings,
+        mask: Tensor,
+        steps: int,
+        seed: int,
+        adapter: str | None,
+    ) -> None:
+        self.prior, self.condition, self.settings = prior, condition, settings
+        self.box, self.steps, self.seed = box_of(mask), steps, seed
+        self.row = coefficients(settings)
+        self.terms = terms_of(settings, condition, adapter)
+        self.embeddings = prior.embed([term.prompt for term in self.terms])
+        self.gate = GradientGate(settings.gradient_clip)
+
+    @property
+    def counts(self) -> Counts:
+        """What the user is told in the end."""
+        return self.gate.counts
+
+    def gradient(self, image: Tensor, step: int) -> Tensor | None:
+        """Return the gradient of ``< stopgrad(w(t) delta), latents >``, averaged over the noises.
+
+        Args:
+            image: Display-encoded, in [0, 1], shape [1, 3, H, W].
+            step: From 0.
+
+        Returns:
+            Same shape, dtype and device; None when it is not finite.
+
+        Raises:
+            NonFiniteError: It is the fifth in a row.
+        """
+        s = self.settings
+        low, high = time_range(step, self.steps, s.time_min, s.time_max, s.time_max_end)
+        generators = [generator_of(self.seed, step, k) for k in range(s.noises)]
+        t = torch.cat([low + (high - low) * torch.rand(1, generator=g) for g in generators])
+        leaf = image.detach().requires_grad_()
+        crops = self._noisy_crops(leaf, t, generators)
+        residual = crops.weight * self._delta(crops, self._predictions(crops)) / s.noises
+        # A half-precision autoencoder keeps its backward pass in range when the greatest residual
+        # is about 1; a power of two is taken out and put back without rounding.
+        scale = torch.exp2(torch.frexp(residual.abs().amax()).exponent.float())
+        (d_image,) = torch.autograd.grad(crops.latents, leaf, residual / scale)
+        return self.gate.passed(d_image * scale.to(d_image))
+
+    @torch.no_grad()
+    def score(
+        self, image: Tensor, seed: int | None = None, pairs: int = PAIR_COUNT
+    ) -> float | None:
+        """Return how wrong an image looks, lower is better; None when that is not finite.
+
+        Which of the prompts explains the picture better: the mean of
+        ``w(t) (|e_first - noise|^2 - |e_second - noise|^2)`` for a difference of two predictions
+        (Diffusion Classifier, arXiv 2303.16203), of ``w(t) |delta|^2`` for the losses with noise.
+        Times lie in the middle of equal parts of the whole run's range.
+
+        Args:
+            image: Display-encoded, in [0, 1], shape [1, 3, H, W].
+            seed: Of noises and crops; the guidance's own by default.
+            pairs: Noises.
+        """
+        scores = []
+        for crops in self._fixed_crops(image, "score", seed, pairs):
+            predictions = self._predictions(crops).double()
+            if self.row.k_e:
+                errors = self._delta(crops, predictions).square()
+            else:
+                squares = (predictions - crops.noise).square()
+                errors = self._weighted_sum(squares)
+            scores.append((crops.weight * errors).sum(dim=(1, 2, 3)))
+        score = float(torch.cat(scores).mean())
+        return score if math.isfinite(score) else None
+
+    @torch.no_grad()
+    def check_precision(self, image: Tensor) -> float | None:
+        """Return the cosine between delta as the prior computes it and in full precision.
+
+        Two predictions that nearly cancel keep little of a half-precision network's bits.
+
+        Args:
+            image: Display-encoded, in [0, 1], shape [1, 3, H, W].
+
+        Returns:
+            None when the prior has only one precision; NaN when delta vanishes.
+        """
+        if not hasattr(self.prior, "in_full_precision"):
+            return None
+        prior = cast(PrecisePrior, self.prior)
+        low, full = [], []
+        for crops in self._fixed_crops(image, "precision", self.seed, CHECK_COUNT):
+            low.append(self._delta(crops, self._predictions(crops)).double().flatten())
+            with prior.in_full_precision():
+                full.append(self._delta(crops, self._predictions(crops)).double().flatten())
+        first, second = torch.cat(low), torch.cat(full)
+        return float(first @ second / (first.norm() * second.norm()))
+
+    def state_dict(self) -> dict[str, Any]:
+        """Return numbers and lists of numbers."""
+        return self.gate.state_dict()
+
+    def load_state_dict(self, state: Mapping[str, Any]) -> None:
+        """Go on from `state_dict`."""
+        self.gate.load_state_dict(state)
+
+    def _fixed_crops(
+        self, image: Tensor, purpose: str, seed: int | None, count: int
+    ) -> Sequence[NoisyCrops]:
+        """Return crops at fixed times, in batches of the size of a step's."""
+        s = self.settings
+        low, high = time_range(0, self.steps, s.time_min, s.time_max, s.time_max_end)
+        times = low + (high - low) * (torch.arange(count) + 0.5) / count
+        seed = self.seed if seed is None else seed
+        generators = [generator_of(seed, purpose, k) for k in range(count)]
+        return [
+            self._noisy_crops(image, times[k : k + s.noises], generators[k : k + s.noises])
+            for k in range(0, count, s.noises)
+        ]
+
+    def _noisy_crops(
+        self, image: Tensor, t: Tensor, generators: Sequence[torch.Generator]
+    ) -> NoisyCrops:
+        """Return one crop for each time and generator, encoded and noised."""
+        prior, settings, device = self.prior, self.settings, self.prior.device
+        height, width = image.shape[-2:]
+        crops = [draw_crop(self.box, (height, width), settings, g) for g in generators]
+
+        def cropped(whole: Tensor) -> Tensor:
+            return torch.cat([c.apply(whole, prior.resolution) for c in crops]).to(device)
+
+        w = weight(settings.weight, *prior.schedule.alpha_sigma(t), settings.literal_alpha)
+        t = t.to(device)
+        latents = prior.encode(cropped(image))
+        shape = latents.shape[1:]
+        noise = torch.stack([torch.randn(shape, generator=g) for g in generators]).to(device)
+        background, gbuffer = self.condition.background, self.condition.gbuffer
+        return NoisyCrops(
+            latents,
+            noise,
+            prior.schedule.add_noise(latents.detach(), noise, t),
+            t,
+            w.view(-1, 1, 1, 1).to(device),
+            None if background is None else cropped(background),
+            None if gbuffer is None else cropped(gbuffer),
+        )
+
+    @torch.no_grad()
+    def _predictions(self, crops: NoisyCrops) -> Tensor:
+        """Return each term's noise, by one call of the prior, shape [term, noise, C, h, w]."""
+        term_count, noise_count = len(self.terms), len(crops.t)
+
+        def repeated(per_noise: Tensor) -> Tensor:
+            return per_noise.repeat(term_count, *[1] * (per_noise.ndim - 1))
+
+        predicted = self.prior.predict(
+            repeated(crops.latents_noisy),
+            repeated(crops.t),
+            self.embeddings.repeat_interleave(noise_count, dim=0),
+            [term.adapter for term in self.terms for _ in range(noise_count)],
+            None if crops.background is None else repeated(crops.background),
+            None if crops.gbuffer is None else repeated(crops.gbuffer),
+        )
+        return predicted.view(term_count, *crops.noise.shape)
+
+    def _delta(self, crops: NoisyCrops, predictions: Tensor) -> Tensor:
+        """Return the sum of predictions and noise, each by its coefficient."""
+        delta = self._weighted_sum(predictions)
+        return delta + self.row.k_e * crops.noise if self.row.k_e else delta
+
+    def _weighted_sum(self, per_term: Tensor) -> Tensor:
+        """Return the sum over the terms, each by its coefficient.
+
+        Not a matrix product: two terms nearly cancel, and TensorFloat32 would round them before.
+        """
+        return torch.stack(
+            [term.scale * x for term, x in zip(self.terms, per_term, strict=True)]
+        ).sum(dim=0)
+
+
+class DatasetUpdate:
+    """The picture is edited now and then, and drawn towards its edit (DiPIR, table 3).
+
+    Every ``update_every`` steps a crop is edited by SDEdit with the adapted model; its strength is
+    the greatest time of that step. Until the next edit the gradient is that of the L1 distance
+    between this crop and its edit: its mean times the number of latents, so that it counts as much
+    as a sum over latents does in the other losses. One crop at a time, however many noises.
+
+    Args:
+        prior: Must also be able to edit.
+        condition: What the picture is to be judged by; its prompt alone counts.
+        settings: Times, crops and edits.
+        mask: Coverage of the object, shape [H, W].
+        steps: Length of the run, over which the strength falls.
+        seed: Of what is drawn.
+        adapter: Name of the LoRA of this photo, or None for the base model.
+
+    Raises:
+        ValueError: The mask is empty.
+        ModelError: The prior cannot edit pictures.
+    """
+
+    def __init__(
+        self,
+        prior: Prior,
+        condition: Condition,
+        settings: GuidanceSettings,
+        mask: Tensor,
+        steps: int,
+        seed: int,
+        adapter: str | None,
+    ) -> None:
+        if not hasattr(prior, "edit"):
+            raise ModelError(prior.name, f"cannot edit pictures, as {DATASET_UPDATE} needs")
+        self.prior = cast(EditingPrior, prior)
+        self.condition, self.settings, self.adapter = condition, settings, adapter
+        self.box, self.steps, self.seed = box_of(mask), steps, seed
+        self.gate = GradientGate(settings.gradient_clip)
+        self.crop: Crop | None = None
+        self.edited: Tensor | None = None
+
+    @property
+    def counts(self) -> Counts:
+        """What the user is told in the end."""
+        return self.gate.counts
+
+    def gradient(self, image: Tensor, step: int) -> Tensor | None:
+        """Return the gradient of the L1 distance between the crop and its edit.
+
+        Args:
+            image: Display-encoded, in [0, 1], shape [1, 3, H, W].
+            step: From 0.
+
+        Returns:
+            Same shape, dtype and device; None when it is not finite.
+
+        Raises:
+            NonFiniteError: It is the fifth in a row.
+        """
+        s = self.settings
+        if self.crop is None or self.edited is None or step % s.update_every == 0:
+            strength = time_range(step, self.steps, s.time_min, s.time_max, s.time_max_end)[1]
+            self.crop = self._draw(image, self.seed, step)
+            self.edited = self._edit(image, self.crop, strength, self.seed, step)
+        leaf = image.detach().requires_grad_()
+        distance = self._distance(leaf, self.crop, self.edited)
+        # The derivative of |x| is a sign, and that of NaN is 0: only the distance tells.
+        if not math.isfinite(distance.item()):
+            self.edited = None
+            return self.gate.passed(None)
+        (d_image,) = torch.autograd.grad(distance, leaf)
+        return self.gate.passed(d_image)
+
+    @torch.no_grad()
+    def score(
+        self, image: Tensor, seed: int | None = None, edits: int = EDIT_COUNT
+    ) -> float | None:
+        """Return how much the model would change an image; None when that is not finite.
+
+        The mean distance between crops and their edits, all of the run's greatest strength.
+
+        Args:
+            image: Display-encoded, in [0, 1], shape [1, 3, H, W].
+            seed: Of edits and crops; the guidance's own by default.
+            edits: Crops.
+        """
+        seed = self.seed if seed is None else seed
+        distances = []
+        for k in range(edits):
+            crop = self._draw(image, seed, "score", k)
+            edited = self._edit(image, crop, self.settings.time_max, seed, "score", k)
+            distances.append(self._distance(image, crop, edited).item())
+        score = sum(distances) / edits
+        return score if math.isfinite(score) else None
+
+    def state_dict(self) -> dict[str, Any]:
+        """Return numbers, lists of numbers and the edited crop."""
+        state = self.gate.state_dict()
+        if self.crop is not None and self.edited is not None:
+            state["crop"] = [self.crop.x, self.crop.y, self.crop.side]
+            state["edited"] = self.edited.cpu()
+        return state
+
+    def load_state_dict(self, state: Mapping[str, Any]) -> None:
+        """Go on from `state_dict`."""
+        self.gate.load_state_dict(state)
+        self.crop = Crop(*state["crop"]) if "crop" in state else None
+        self.edited = state["edited"].to(self.prior.device) if "edited" in state else None
+
+    def _draw(self, image: Tensor, *key: int | str) -> Crop:
+        height, width = image.shape[-2:]
+        return draw_crop(self.box, (height, width), self.settings, generator_of(*key))
+
+    @torch.no_grad()
+    def _edit(self, image: Tensor, crop: Crop, strength: float, *key: int | str) -> Tensor:
+        """Return the edited crop, shape [1, 3, R, R]."""
+        return self.prior.edit(
+            crop.apply(image, self.prior.resolution).to(self.prior.device),
+            self.condition.prompt,
+            seed_of(*key, "edit"),
+            strength=strength,
+            steps=self.settings.update_steps,
+            scale=self.settings.update_scale,
+            adapter=self.adapter,
+        )
+
+    def _distance(self, image: Tensor, crop: Crop, edited: Tensor) -> Tensor:
+        difference = crop.apply(image, self.prior.resolution) - edited.to(image)
+        return difference.abs().sum() / VALUES_PER_LATENT
+
+
+def make_guidance(
+    prior: Prior,
+    condition: Condition,
+    settings: GuidanceSettings,
+    mask: Tensor,
+    steps: int,
+    seed: int,
+    adapter: str | None,
+) -> Guidance | DatasetUpdate:
+    """Return the guidance that the settings' loss asks for; arguments and errors are theirs."""
+    kind = DatasetUpdate if settings.loss == DATASET_UPDATE else Guidance
+    return kind(prior, condition, settings, mask, steps, seed, adapter)
+
+
+def seed_of(*key: int | str) -> int:
+    """Return a seed of 63 bits that is a function of the key alone."""
+    digest = hashlib.sha256(repr(key).encode()).digest()
+    return int.from_bytes(digest[:8], "little") >> 1
+
+
+def generator_of(*key: int | str) -> torch.Generator:
+    """Return random numbers that are a function of the key alone, drawn on the CPU."""
+    return torch.Generator().manual_seed(seed_of(*key))
