@@ -16,11 +16,12 @@ from benchmarks.measure import context, peak_mib, report
 from warpir.asset import load_asset
 from warpir.camera import camera_from_fov
 from warpir.color import linear_to_gamma
+from warpir.curves import ToneKnots
 from warpir.files import Photo, read_envmap
 from warpir.light import Light
 from warpir.picture import Quality, make_picture
 from warpir.placement import place_asset
-from warpir.render import Renderer, ToneKnots, choose_device
+from warpir.render import Renderer, choose_device
 from warpir.scene import Placed, Proxy, Scene
 
 WIDTH, HEIGHT = 1280, 853

@@ -13,10 +13,11 @@ from tests.shapes import box, camera, constant, ground, lobe, placed, quad, sphe
 from warpir.asset import Material
 from warpir.bridge import ComposeConstants, compose
 from warpir.camera import Camera
+from warpir.curves import ToneKnots
 from warpir.files import Photo
 from warpir.light import Light, axis_from_angles, plain_sky
 from warpir.picture import Picture, Quality, _resize, as_file_map, balls, make_picture
-from warpir.render import Renderer, ToneKnots, light_args
+from warpir.render import Renderer, light_args
 from warpir.scene import Scene
 from warpir.tone import Knots, ToneCurve
 

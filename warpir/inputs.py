@@ -14,6 +14,7 @@ from warpir.files import Photo, read_envmap, read_photo
 from warpir.light import Light
 from warpir.lobes_file import read_lobes
 from warpir.placement import Placement, place_asset
+from warpir.reuse import EarlierRun, read_run
 
 DEFAULT_FOV = 60.0
 """Horizontal field of view without --camera, --fov and EXIF [deg]: a phone's main camera."""
@@ -34,14 +35,25 @@ class Inputs:
     placement: Placement
     light: Light | None = None
     """What --light holds, turned by --light-rotate; absent: --sun and --sky describe it."""
+    run: EarlierRun | None = None
+    """What --reuse holds, as the run left it; in place of any other light."""
     assumed: tuple[str, ...] = ()
     """What was chosen because nothing was given, one line each."""
     notices: tuple[str, ...] = ()
     """What was repaired, converted, left out or looks odd, one line each."""
 
 
-def read_inputs(config: InsertConfig) -> Inputs:
+def read_inputs(
+    config: InsertConfig,
+    load_asset: Callable[[str, str], Asset] = load_asset,
+    read_run: Callable[[str], EarlierRun] = read_run,
+) -> Inputs:
     """Read and check every input, so that all problems are known before anything is rendered.
+
+    Args:
+        config: Names the files.
+        load_asset: Reads --asset; a caller with many insertions gives one that remembers.
+        read_run: Reads --reuse; likewise.
 
     Raises:
         InputError: The first problem; the others are in its ``also``.
@@ -68,8 +80,10 @@ def read_inputs(config: InsertConfig) -> Inputs:
             alpha="ignore" if config.alpha == "ignore" else "refuse",
         )
     )
-    asset = attempt(lambda: load_asset(asset_path, missing_textures=config.missing_textures))
+    asset = attempt(lambda: load_asset(asset_path, config.missing_textures))
     light = attempt(lambda: _read_light(config, notices))
+    reuse = config.reuse
+    run = attempt(lambda: read_run(reuse)) if reuse is not None else None
     camera = attempt(lambda: _make_camera(config, photo, assumed)) if photo is not None else None
     raise_all(problems)
     assert photo is not None and asset is not None and camera is not None
@@ -97,7 +111,9 @@ def read_inputs(config: InsertConfig) -> Inputs:
             f"photo's {camera.width} px (--width)"
         )
     assumed += placement.assumed
-    return Inputs(photo, asset, camera, placement, light, tuple(assumed), tuple(notices))
+    if run is not None and (assumption := run.assumption(camera.c2w, config.camera)):
+        assumed.append(assumption)
+    return Inputs(photo, asset, camera, placement, light, run, tuple(assumed), tuple(notices))
 
 
 def _inputs_in_out(config: InsertConfig) -> list[InputError]:
@@ -105,9 +121,12 @@ def _inputs_in_out(config: InsertConfig) -> list[InputError]:
     if config.out is None:
         return []
     out = os.path.realpath(config.out)
-    named = (config.photo, config.asset, config.camera, config.light)
-    for path in named:
-        if path is not None and os.path.realpath(os.path.dirname(path)) == out:
+    named = (config.photo, config.asset, config.camera, config.light, config.lora)
+    folders = {path: os.path.dirname(path) for path in named if path is not None}
+    if config.reuse is not None:
+        folders[config.reuse] = config.reuse
+    for path, folder in folders.items():
+        if os.path.realpath(folder) == out:
             return [usage("--out", f"holds the input {path}", "choose a folder of its own")]
     return []
 

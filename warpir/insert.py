@@ -37,7 +37,6 @@ if TYPE_CHECKING:
     from warpir.inputs import Inputs
     from warpir.lighting import SceneLight
     from warpir.picture import Picture
-    from warpir.render import ToneKnots
 
 __all__ = ["InsertConfig", "Insertion", "insert", "main"]
 
@@ -93,7 +92,7 @@ def insert(config: InsertConfig) -> Insertion:
         # Warp is loaded here, after everything that can be wrong was looked at.
         with timings.stage("load"):
             from warpir.picture import Quality, make_picture
-            from warpir.render import Renderer, ToneKnots, choose_device
+            from warpir.render import Renderer, choose_device
             from warpir.scene import Placed, Proxy, Scene
 
             device = choose_device(config.device)
@@ -107,11 +106,10 @@ def insert(config: InsertConfig) -> Insertion:
                 device,
             )
         with timings.stage("render"), progress_bar() as report:
-            curves = ToneKnots.identity(1), ToneKnots.identity(3)
             picture = make_picture(
                 Renderer(scene, config.threads or 0, report),
                 light.light,
-                light.light,
+                light.light_shadow,
                 inputs.photo,
                 Quality(
                     config.samples,
@@ -120,11 +118,12 @@ def insert(config: InsertConfig) -> Insertion:
                     config.seed,
                     config.indirect_limit,
                 ),
-                *curves,
-                is_reinhard=config.tone == "reinhard",
+                light.curves.foreground,
+                light.curves.shadow_ratio,
+                is_reinhard=light.curves.tone == "reinhard",
             )
         with timings.stage("write"):
-            measured = _write(output, config, inputs, light, picture, curves)
+            measured = _write(output, config, inputs, light, picture)
         record = run_record(
             asked,
             inputs=input_hashes(config),
@@ -152,9 +151,9 @@ def _write(
     inputs: "Inputs",
     light: "SceneLight",
     picture: "Picture",
-    curves: "tuple[ToneKnots, ToneKnots]",
 ) -> dict[str, Any]:
     """Stage all files but ``run.json``; return the numbers that belong into it."""
+    from warpir.curves import curves_to_json
     from warpir.files import write_layers
     from warpir.light import summarize
     from warpir.lobes_file import lobes_to_json
@@ -168,25 +167,15 @@ def _write(
         output, picture.layers, camera, config=asdict(config), inputs=input_hashes(config)
     )
     output.write_envmap(as_file_map(light.light))
+    if light.light_shadow is not light.light:
+        output.write_envmap(as_file_map(light.light_shadow), "envmap_shadow")
     if light.light.lobes is not None:
         output.write_json("lobes.json", lobes_to_json(light.light.lobes))
-    names = ("foreground", "shadow_ratio")
-    output.write_json(
-        "curves.json",
-        {
-            "format": "warpir-curves",
-            "version": 1,
-            "tone": config.tone,
-            **{
-                name: {"x": knots.x.tolist(), "y": knots.y.tolist(), "slope": knots.slope.tolist()}
-                for name, knots in zip(names, curves, strict=True)
-            },
-        },
-    )
+    output.write_json("curves.json", curves_to_json(light.curves))
     output.write_json("camera.json", camera.record())
     output.write_png(
         "balls.png",
-        balls(light.light, camera, config.tone == "reinhard"),
+        balls(light.light, camera, light.curves.tone == "reinhard"),
         mark=False,
         description="Mirror ball and white diffuse ball under the light",
     )

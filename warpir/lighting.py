@@ -6,11 +6,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from warpir.color import luminance
-from warpir.config import InsertConfig
+from warpir.config import DEFAULTS, InsertConfig, usage
+from warpir.curves import Curves
 from warpir.errors import InputError
 from warpir.inputs import Inputs
 from warpir.light import Light, plain_sky, sun_lobe
 from warpir.lobe_fit import LobeFit, fit_lobes
+from warpir.reuse import EarlierRun
 
 SKIES = {
     # Radiance of the sky, and the colour of the sun that goes with it.
@@ -29,9 +31,13 @@ LIT_PERCENTILE = 75.0
 
 @dataclass(frozen=True)
 class SceneLight:
-    """The light of the scene, at the photo's exposure."""
+    """The light of the scene, at the photo's exposure, and the tone curves that go with it."""
 
     light: Light
+    """Lights the object."""
+    light_shadow: Light
+    """Casts its shadow; the same object as `light` where there is one light."""
+    curves: Curves
     exposure: float
     """What the given light was multiplied with, in stops [EV]."""
     assumed: tuple[str, ...]
@@ -44,8 +50,11 @@ def make_light(inputs: Inputs, config: InsertConfig) -> SceneLight:
     """Build the light and set its exposure.
 
     Raises:
-        InputError: The light is black, so no exposure can be chosen.
+        InputError: The light is black, so no exposure can be chosen; or --tone contradicts the run
+            whose light is used again.
     """
+    if inputs.run is not None:
+        return _reused(inputs.run, config)
     assumed: list[str] = []
     light = inputs.light if inputs.light is not None else _described(config, assumed)
     fit = None
@@ -59,7 +68,24 @@ def make_light(inputs: Inputs, config: InsertConfig) -> SceneLight:
             f"the light is {exposure:+.2f} EV, so that ground of albedo {config.ground_albedo:g} "
             "looks as bright as the photo's lit ground (--exposure, --ground-albedo)"
         )
-    return SceneLight(light.scaled(2.0**exposure), exposure, tuple(assumed), fit)
+    light = light.scaled(2.0**exposure)
+    return SceneLight(light, light, Curves.identity(config.tone), exposure, tuple(assumed), fit)
+
+
+def _reused(run: EarlierRun, config: InsertConfig) -> SceneLight:
+    """Return an earlier run's light and curves; they are at the exposure of that run's photo."""
+    if config.tone not in (DEFAULTS["tone"], run.curves.tone):
+        found = f"the curves of {run.path} are made for {run.curves.tone}"
+        raise usage("--tone", f"cannot be {config.tone}: {found}", "leave --tone out")
+    exposure = config.exposure or 0.0
+
+    def adapted(light: Light) -> Light:
+        return light.rotated(config.light_rotate).scaled(2.0**exposure)
+
+    light = light_shadow = adapted(run.light_fg)
+    if run.light_shadow is not run.light_fg:
+        light_shadow = adapted(run.light_shadow)
+    return SceneLight(light, light_shadow, run.curves, exposure, ())
 
 
 def _described(config: InsertConfig, assumed: list[str]) -> Light:

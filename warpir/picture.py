@@ -9,9 +9,10 @@ from numpy.typing import NDArray
 
 from warpir.camera import Camera
 from warpir.color import linear_to_gamma
+from warpir.curves import ToneKnots
 from warpir.files import Layers, Photo
 from warpir.light import Light, as_map, map_directions, texel_solid_angles
-from warpir.render import Foreground, GBuffer, Renderer, ToneKnots, light_args
+from warpir.render import Foreground, GBuffer, Renderer, light_args
 
 FloatArray = NDArray[np.float32]
 Float64Array = NDArray[np.float64]

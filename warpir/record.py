@@ -96,13 +96,18 @@ def run_record(
 
 
 def input_hashes(config: InsertConfig) -> dict[str, str]:
-    """Return the sha256 of every input file, by the name of its field."""
+    """Return the sha256 of every input file, by the name of its field.
+
+    An earlier run is known by its ``run.json``, which holds the sha256 of its other files.
+    """
+    names = ("photo", "asset", "camera", "light", "lora", "reuse")
+    paths = {name: Path(path) for name in names if (path := getattr(config, name)) is not None}
+    if config.reuse is not None:
+        paths["reuse"] /= "run.json"
     hashes = {}
-    for name in ("photo", "asset", "camera", "light"):
-        path = getattr(config, name)
-        if path is not None:
-            with Path(path).open("rb") as stream:
-                hashes[name] = hashlib.file_digest(stream, "sha256").hexdigest()
+    for name, path in paths.items():
+        with path.open("rb") as stream:
+            hashes[name] = hashlib.file_digest(stream, "sha256").hexdigest()
     return hashes
 
 

@@ -20,6 +20,7 @@ from numpy.typing import NDArray
 
 from warpir.camera import Camera
 from warpir.color import luminance
+from warpir.curves import ToneKnots
 from warpir.errors import ExitCode, InputError
 from warpir.files import captured_stderr
 from warpir.kernels.composite import tone_foreground, tone_shadow
@@ -568,30 +569,6 @@ class Renderer:
             1,
         )
         return fg.numpy()[:objects], shadow.numpy()[:proxies]
-
-
-@dataclass(frozen=True)
-class ToneKnots:
-    """Knots of one or several tone curves, shape [curve, bin + 1] each."""
-
-    x: FloatArray
-    y: FloatArray
-    slope: FloatArray
-
-    @property
-    def bin_count(self) -> int:
-        """Number of bins."""
-        return int(self.x.shape[1]) - 1
-
-    def arrays(self) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """Return the arrays in the kernels' order."""
-        return self.x, self.y, self.slope
-
-    @staticmethod
-    def identity(curves: int, bins: int = 5) -> ToneKnots:
-        """Return curves that change nothing."""
-        x = np.tile(np.linspace(0.0, 1.0, bins + 1, dtype=np.float32), (curves, 1))
-        return ToneKnots(x, x.copy(), np.ones_like(x))
 
 
 def index_of(pixels: IntArray, count: int) -> IntArray:
