@@ -199,7 +199,7 @@ def parse(argv: Sequence[str]) -> Command:
     if unknown:
         known = [flag(name) for forms in FLAGS.values() for name in forms]
         known += ["--config", "--validate", "--debug", "--version", "--help"]
-        raise usage(unknown[0], "no such flag", _closest(unknown[0].split("=")[0], known))
+        raise usage(unknown[0], "no such flag", closest(unknown[0].split("=")[0], known))
 
     texts = vars(given)
     validate, path = texts.pop("validate", False), texts.pop("config", None)
@@ -217,16 +217,28 @@ def parse(argv: Sequence[str]) -> Command:
 
 def _make_config(given: Mapping[str, tuple[Any, str]], filed: Mapping[str, Any]) -> InsertConfig:
     """Convert each value by its field's type; ``given`` wins over ``filed``."""
+    return InsertConfig(**read_values({**{n: (v, flag(n)) for n, v in filed.items()}, **given}))
+
+
+def read_values(given: Mapping[str, tuple[Any, str]]) -> dict[str, Any]:
+    """Convert flags' texts or a file's plain values by the types of their fields.
+
+    Args:
+        given: By the field's name, the value and where it stands.
+
+    Raises:
+        InputError: A value cannot be read as its field's type (`ExitCode.USAGE`).
+    """
     hints = get_type_hints(InsertConfig)
     values, problems = {}, []
-    for name, (value, where) in {**{n: (v, flag(n)) for n, v in filed.items()}, **given}.items():
+    for name, (value, where) in given.items():
         try:
             values[name] = _convert(value, hints[name], SEPARATORS.get(name, ","))
         except ValueError:
             expected = _expected(name, hints[name])
             problems.append(usage(where, f"expected {expected} (found {_shown(value)})"))
     raise_all(problems)
-    return InsertConfig(**values)
+    return values
 
 
 def _convert(value: Any, hint: Any, separator: str = ",") -> Any:
@@ -403,11 +415,11 @@ def _read_config_file(path: str) -> dict[str, Any]:
     names = [field.name for field in fields(InsertConfig)]
     filed, problems = {}, []
     for key, value in content.items():
-        name = str(key).replace("-", "_") if isinstance(key, str) else ""
+        name = key.replace("-", "_") if isinstance(key, str) else ""
         if name in names:
             filed[name] = value
         else:
-            problems.append(usage(path, f"unknown key {_shown(key)}", _closest(name, names)))
+            problems.append(usage(path, f"unknown key {_shown(key)}", closest(name, names)))
     raise_all(problems)
     return filed
 
@@ -466,6 +478,7 @@ def _refuse_double_keys(path: str, node: Any) -> None:
         seen.add(name)
 
 
-def _closest(name: str, names: Sequence[str]) -> str:
+def closest(name: str, names: Sequence[str]) -> str:
+    """Return advice for a name that is none of ``names``."""
     close = difflib.get_close_matches(name, names, n=1)
     return f"did you mean {close[0]}?" if close else "see --help"

@@ -3,6 +3,7 @@
 import os
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import lru_cache
 from pathlib import Path
 from typing import TypeVar
 
@@ -43,22 +44,26 @@ class Inputs:
     """What was repaired, converted, left out or looks odd, one line each."""
 
 
-def read_inputs(
-    config: InsertConfig,
-    load_asset: Callable[[str, str], Asset] = load_asset,
-    read_run: Callable[[str], EarlierRun] = read_run,
-) -> Inputs:
+class Loaders:
+    """Reads assets and earlier runs; the last of each is remembered, for many insertions."""
+
+    def __init__(self) -> None:
+        self.asset: Callable[[str, str], Asset] = lru_cache(maxsize=1)(load_asset)
+        self.run: Callable[[str], EarlierRun] = lru_cache(maxsize=1)(read_run)
+
+
+def read_inputs(config: InsertConfig, loaders: Loaders | None = None) -> Inputs:
     """Read and check every input, so that all problems are known before anything is rendered.
 
     Args:
         config: Names the files.
-        load_asset: Reads --asset; a caller with many insertions gives one that remembers.
-        read_run: Reads --reuse; likewise.
+        loaders: Of earlier insertions; what they remember is not read again.
 
     Raises:
         InputError: The first problem; the others are in its ``also``.
     """
     config.require_inputs()
+    loaders = loaders or Loaders()
     problems: list[InputError] = []
 
     def attempt(read: Callable[[], Read]) -> Read | None:
@@ -80,10 +85,10 @@ def read_inputs(
             alpha="ignore" if config.alpha == "ignore" else "refuse",
         )
     )
-    asset = attempt(lambda: load_asset(asset_path, config.missing_textures))
+    asset = attempt(lambda: loaders.asset(asset_path, config.missing_textures))
     light = attempt(lambda: _read_light(config, notices))
     reuse = config.reuse
-    run = attempt(lambda: read_run(reuse)) if reuse is not None else None
+    run = attempt(lambda: loaders.run(reuse)) if reuse is not None else None
     camera = attempt(lambda: _make_camera(config, photo, assumed)) if photo is not None else None
     raise_all(problems)
     assert photo is not None and asset is not None and camera is not None

@@ -34,7 +34,7 @@ from warpir.errors import ExitCode, InputError
 if TYPE_CHECKING:
     from warpir.camera import Camera
     from warpir.files import OutputFolder
-    from warpir.inputs import Inputs
+    from warpir.inputs import Inputs, Loaders
     from warpir.lighting import SceneLight
     from warpir.picture import Picture
 
@@ -61,13 +61,15 @@ class Insertion:
     out: Path
     """Folder that holds the files."""
     files: tuple[str, ...]
-    """Names of the files in `out`, ``run.json`` last."""
+    """Names of the files in `out`, ``run.json`` last; of a sequence the composites and
+    ``sequence.json``."""
     record: dict[str, Any]
-    """Content of ``run.json``: inputs, settings, what was assumed, device, seconds."""
+    """Content of the last file; ``run.json`` holds inputs, settings, what was assumed, device and
+    seconds."""
 
 
 def insert(config: InsertConfig) -> Insertion:
-    """Insert one object into one photograph and write the files.
+    """Insert one object into one photograph, or into a sequence of them, and write the files.
 
     Args:
         config: What to do. Assumptions and notices are printed on standard output.
@@ -75,15 +77,37 @@ def insert(config: InsertConfig) -> Insertion:
     Raises:
         InputError: An input or the output folder cannot be used; nothing was written then.
     """
+    config.require_inputs()
+    return _insert_one(config) if config.sequence is None else _insert_sequence(config)
+
+
+def _insert_sequence(config: InsertConfig) -> Insertion:
+    from warpir.inputs import Loaders
+    from warpir.sequence import SUMMARY, read_sequence, write_summary
+
+    loaders = Loaders()
+    frames = read_sequence(config, loaders)
+    for frame in frames:
+        if frame.is_done:
+            _say(f"frame {frame.folder.name}: done already")
+        else:
+            _say(f"frame {frame.folder.name}: line {frame.line} of {config.sequence}")
+            _insert_one(frame.config, loaders)
+    assert config.out is not None
+    record = write_summary(config, frames)
+    composites = (f"{frame.folder.name}/composite.png" for frame in frames)
+    return Insertion(Path(config.out), (*composites, SUMMARY), record)
+
+
+def _insert_one(config: InsertConfig, loaders: "Loaders | None" = None) -> Insertion:
     from warpir.record import Timings, input_hashes, progress_bar, run_record
     from warpir.strict_json import read_json_object
 
-    config.require_inputs()
     timings = Timings()
     with timings.stage("read"):
         # The demo fills in its files; what was asked for is what run.json repeats.
         asked = config
-        config, inputs, light = _read(config)
+        config, inputs, light = _read(config, loaders)
 
     from warpir.files import OutputFolder
 
@@ -206,7 +230,9 @@ def _write(
     }
 
 
-def _read(config: InsertConfig) -> "tuple[InsertConfig, Inputs, SceneLight]":
+def _read(
+    config: InsertConfig, loaders: "Loaders | None" = None
+) -> "tuple[InsertConfig, Inputs, SceneLight]":
     """Read and check all inputs and say what was assumed; the demo brings its own."""
     from warpir.inputs import read_inputs
     from warpir.lighting import make_light
@@ -215,7 +241,7 @@ def _read(config: InsertConfig) -> "tuple[InsertConfig, Inputs, SceneLight]":
         from warpir.demo import demo_config
 
         config = demo_config(config)
-    inputs = read_inputs(config)
+    inputs = read_inputs(config, loaders)
     light = make_light(inputs, config)
     _say(f"placement: {inputs.placement.summary}")
     for line in (*inputs.assumed, *light.assumed):
@@ -262,13 +288,24 @@ def _run(arguments: list[str]) -> int:
     for notice in command.notices:
         _say(f"notice: {notice}")
     if command.validate:
-        _read(command.config)
+        _validate(command.config)
         _say("inputs are valid")
         return ExitCode.DONE
     insertion = insert(command.config)
     for name in insertion.files:
         _say(str(insertion.out / name))
     return ExitCode.DONE
+
+
+def _validate(config: InsertConfig) -> None:
+    if config.sequence is None:
+        _read(config)
+        return
+    from warpir.inputs import Loaders
+    from warpir.sequence import read_sequence
+
+    frames = read_sequence(config, Loaders())
+    _say(f"frames: {len(frames)}, of which {sum(f.is_done for f in frames)} are done already")
 
 
 def _explain(error: BaseException) -> tuple[int, list[str]]:

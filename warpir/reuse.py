@@ -2,8 +2,8 @@
 
 The light is in the run's world frame, the one of its ``camera.json``. A photo of the same place
 with a camera in that world needs nothing else; for any other camera the light is taken as it is,
-which the run says, and ``--light-rotate`` turns it. The light is at the exposure of the run's photo;
-for a photo of another exposure ``--exposure`` scales it.
+which the run says, and ``--light-rotate`` turns it. The light is at the exposure of the run's
+photo; for a photo of another exposure ``--exposure`` scales it.
 """
 
 import hashlib
@@ -120,8 +120,9 @@ def check_files(path: Path, digests: dict[str, Any]) -> None:
         try:
             with (path / name).open("rb") as stream:
                 found = hashlib.file_digest(stream, "sha256").hexdigest()
-        except OSError as error:
-            raise InputError(path / name, f"cannot be read ({error.strerror})") from error
+        except (OSError, ValueError) as error:
+            reason = error.strerror if isinstance(error, OSError) else "not a file name"
+            raise InputError(path / name, f"cannot be read ({reason})") from error
         if found != digest:
             raise InputError(
                 path / name,

@@ -15,19 +15,23 @@ PHOTO, ASSET, LIGHT, CAMERA = (
 
 
 def demo_config(config: InsertConfig) -> InsertConfig:
-    """Return the configuration with the demo's files and its known exposure filled in."""
+    """Return the configuration with the demo's files filled in.
+
+    Its light and exposure are too, except where guidance is to recover them.
+    """
     from warpir.demo.place import placement
 
     where = placement()
+    is_recovered = config.guidance != "none" and config.refine is None
     return replace(
         config,
         demo=False,
         photo=str(PHOTO),
         asset=str(ASSET),
         camera=str(CAMERA),
-        light=str(LIGHT),
         place=where.place,
         rotate_y=where.rotate_y,
-        exposure=0.0,
-        tone="linear",
+        light=None if is_recovered else str(LIGHT),
+        exposure=config.exposure if is_recovered else 0.0,
+        tone=config.tone if is_recovered else "linear",
     )
