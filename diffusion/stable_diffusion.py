@@ -93,7 +93,7 @@ class StableDiffusion:
             vae.encoder.mid_block.gradient_checkpointing = False
         self.device: torch.device = unet.device
         self.unet_dtype: torch.dtype = unet.dtype
-        """Arithmetic of the UNet; adapters may keep their own."""
+        """Arithmetic of the UNet; an adapter in training may have its own."""
         self.latent_size: int = unet.config.sample_size
         """Side of the latents."""
         self.resolution = self.latent_size * 2 ** (len(vae.config.block_out_channels) - 1)
@@ -302,20 +302,19 @@ class StableDiffusion:
 
     def use_full_precision(self) -> None:
         """Let the UNet compute in fp32 from now on; its weights stay as rounded as they were."""
-        for weight in self._base_weights():
+        for weight in self.unet.parameters():
             weight.data = weight.data.float()
         self.unet_dtype = torch.float32
 
     @contextmanager
     def in_full_precision(self) -> Iterator[None]:
         """Let the UNet compute in fp32 within this context, then as before on the same memory."""
-        used, weights = self.unet_dtype, self._base_weights()
-        values = [weight.data for weight in weights]
+        used, values = self.unet_dtype, [(w, w.data) for w in self.unet.parameters()]
         self.use_full_precision()
         try:
             yield
         finally:
-            for weight, value in zip(weights, values, strict=True):
+            for weight, value in values:
                 weight.data = value
             self.unet_dtype = used
 
@@ -330,7 +329,7 @@ class StableDiffusion:
 
         Returns:
             ``noise_error``: mean squared error of the noise at time 0.5; a trained model stays well
-            below 1, which is that of predicting nothing. ``difference_0.1`` and so on: what the
+            below 1, which is that of predicting no noise. ``difference_0.1`` and so on: what the
             prompt changes in the prediction, root mean square, by time. ``precision``: see
             `precision_check`, with the differences at all times.
         """
@@ -387,50 +386,42 @@ class StableDiffusion:
         Batches of one kind take peft's plain way. Only mixed ones have their names handed to each
         layer, where they are split and joined again.
         """
-        if not self.adapters:
-            yield
-            return
-        if set(names) == {None}:
-            self.unet.disable_adapters()
-            try:
-                yield
-            finally:
-                self.unet.enable_adapters()
-            return
-        if len(set(names)) == 1:
-            before = self.unet.active_adapters()
-            self.unet.set_adapter(names[0])
-            try:
-                yield
-            finally:
-                self.unet.set_adapter(before)
-            return
-
         from peft.tuners.lora.layer import LoraLayer
 
+        layers = [module for module in self.unet.modules() if isinstance(module, LoraLayer)]
+        if not layers:
+            yield
+            return
+        states = [(layer, layer.active_adapters, layer.disable_adapters) for layer in layers]
+        # Both of peft's switches set these too, which would start or stop a training.
+        trained = [(weight, weight.requires_grad) for weight in self.unet.parameters()]
+        mixed = len(set(names)) > 1
         words = [name or "__base__" for name in names]  # peft's word for no adapter
 
         def hand_over(module: nn.Module, args: Any, kwargs: Any) -> tuple[Any, Any]:
             return args, {**kwargs, "adapter_names": words}
 
-        hooks = [
-            module.register_forward_pre_hook(hand_over, with_kwargs=True)
-            for module in self.unet.modules()
-            if isinstance(module, LoraLayer)
-        ]
+        hooks = []
         try:
+            for layer in layers:
+                layer.enable_adapters(set(names) != {None})
+                if mixed:
+                    hooks.append(layer.register_forward_pre_hook(hand_over, with_kwargs=True))
+                elif names[0] is not None:
+                    layer.set_adapter(names[0])
             yield
         finally:
             for hook in hooks:
                 hook.remove()
+            for layer, active, disabled in states:
+                layer.set_adapter(active)
+                layer.enable_adapters(not disabled)
+            for weight, flag in trained:
+                weight.requires_grad_(flag)
 
     def _exact_convolutions(self) -> AbstractContextManager[None]:
         """Keep cuDNN from rounding a UNet in fp32 to TF32, which has no more bits than fp16."""
         return _no_tf32() if self.unet_dtype is torch.float32 else contextlib.nullcontext()
-
-    def _base_weights(self) -> list[nn.Parameter]:
-        """Return the UNet's own weights, without the adapters'."""
-        return [weight for name, weight in self.unet.named_parameters() if "lora_" not in name]
 
     def _check_adapters(self, names: Sequence[str | None]) -> None:
         unknown = {name for name in names if name is not None} - self.adapters
