@@ -7,7 +7,6 @@ import os
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-import torch
 from torch import Tensor
 
 if TYPE_CHECKING:
@@ -17,11 +16,11 @@ CACHE_BYTES = 4 << 30
 """What a folder of the cache may hold; the files that were used longest ago go first."""
 
 
-def cache_folder(kind: str) -> Path:
-    """Return the folder for one kind of made things: in ``WARPIR_CACHE``, or the user's cache.
+def cache_folder(kind: str = "") -> Path:
+    """Return the folder for made things: ``WARPIR_CACHE``, or one in the user's cache.
 
     Args:
-        kind: ``lora`` or ``class-images``.
+        kind: ``lora`` or ``class-images``; empty: the folder of all kinds.
     """
     own = os.environ.get("WARPIR_CACHE")
     if own:
@@ -89,13 +88,3 @@ def model_key(prior: Prior) -> str:
     return content_key(
         prior.digest, schedule.prediction_type, schedule.alphas_cumprod, prior.resolution
     )
-
-
-def seed_of(seed: int, *purpose: str | int) -> int:
-    """Return the seed of one draw, in [0, 2^63): a function of the run's seed and the purpose."""
-    return int.from_bytes(hashlib.sha256(repr((seed, *purpose)).encode()).digest()[:8]) >> 1
-
-
-def generator(seed: int, *purpose: str | int) -> torch.Generator:
-    """Return random numbers for one draw, always drawn on the CPU so that devices agree."""
-    return torch.Generator().manual_seed(seed_of(seed, *purpose))

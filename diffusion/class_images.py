@@ -22,7 +22,8 @@ import torch
 from PIL import Image, PngImagePlugin
 from torch import Tensor
 
-from warpir.diffusion.cache import content_key, make_room, model_key, seed_of, write_file
+from warpir.diffusion.cache import content_key, make_room, model_key, write_file
+from warpir.diffusion.draws import seed_of
 from warpir.diffusion.prior import ModelError
 from warpir.diffusion.prompts import Prompts, draw_class_prompts
 from warpir.diffusion.settings import PersonalizeSettings

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 
 import torch
 
-from warpir.diffusion.cache import generator
+from warpir.diffusion.draws import generator_of
 from warpir.diffusion.settings import PersonalizeSettings
 
 SIZES = ("tiny", "small", "compact", "medium-sized", "large", "huge", "long", "tall", "wide", "low")
@@ -100,7 +100,7 @@ def draw_class_prompts(noun: str, count: int, seed: int) -> tuple[str, ...]:
     """
     prompts = []
     for index in range(count):
-        random = generator(seed, "class prompt", index)
+        random = generator_of(seed, "class prompt", index)
         size, colour, background, lighting = (
             words[int(torch.randint(len(words), (), generator=random))]
             for words in (SIZES, COLOURS, BACKGROUNDS, LIGHTINGS)
