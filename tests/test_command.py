@@ -7,7 +7,7 @@ import subprocess
 import sys
 import time
 from collections.abc import Sequence
-from dataclasses import asdict, fields
+from dataclasses import asdict, fields, replace
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
@@ -581,3 +581,19 @@ def test_insert_is_called_through_the_module() -> None:
         insert(InsertConfig(out="o"))
     with pytest.raises(InputError, match="--photo: needed"):
         insert.insert(InsertConfig(out="o"))
+
+
+def test_demo_leaves_its_light_to_guidance() -> None:
+    """The demo's own light and exposure are given, except where they are to be recovered."""
+    from warpir.demo import demo_config
+
+    plain = demo_config(InsertConfig(demo=True, out="o"))
+    assert plain.light is not None and plain.exposure == 0.0
+    guided = InsertConfig(
+        demo=True, out="o", guidance="stable-diffusion", model="m", prompt="a car", tone="reinhard"
+    )
+    recovered = demo_config(guided)
+    assert recovered.light is None and recovered.exposure is None and recovered.tone == "reinhard"
+    assert recovered.photo == plain.photo and recovered.place == plain.place
+    # Refinement changes the object under a light that is known.
+    assert demo_config(replace(guided, refine="material")).light == plain.light
