@@ -12,11 +12,9 @@ terms mean, and a mean underflows in a half-precision autoencoder.
 
 from __future__ import annotations
 
-import hashlib
 import math
 from collections import deque
-from collections.abc import Mapping, Sequence
-from contextlib import AbstractContextManager
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from statistics import median
 from typing import Any, Protocol, cast
@@ -25,6 +23,7 @@ import torch
 from torch import Tensor
 
 from warpir.diffusion.crop import Crop, box_of, draw_crop
+from warpir.diffusion.draws import generator_of, seed_of
 from warpir.diffusion.prior import Condition, Counts, ModelError, Prior
 from warpir.diffusion.schedule import time_range, weight
 from warpir.diffusion.settings import GuidanceSettings
@@ -96,19 +95,20 @@ class EditingPrior(Prior, Protocol):
         image: Tensor,
         prompt: str,
         seed: int,
+        *,
         strength: float,
         steps: int,
         scale: float,
-        adapter: str | None,
+        adapter: str | None = None,
     ) -> Tensor:
         """Return the picture after noise and denoising (SDEdit), in [0, 1], of the same shape."""
 
 
 class PrecisePrior(Prior, Protocol):
-    """A prior that computes in less than full precision, and can be asked not to."""
+    """A prior that may compute in less than full precision."""
 
-    def in_full_precision(self) -> AbstractContextManager[Any]:
-        """Within this context `predict` computes in float32."""
+    def ensure_precision(self, difference: Callable[[], Tensor]) -> float:
+        """Go on in full precision if the difference needs it; return its cosine with the exact."""
 
 
 @dataclass(frozen=True)
@@ -358,8 +358,8 @@ class Guidance:
         return score if math.isfinite(score) else None
 
     @torch.no_grad()
-    def check_precision(self, image: Tensor) -> float | None:
-        """Return the cosine between delta as the prior computes it and in full precision.
+    def ensure_precision(self, image: Tensor) -> float | None:
+        """Let the prior compute in full precision if this loss needs it.
 
         Two predictions that nearly cancel keep little of a half-precision network's bits.
 
@@ -367,18 +367,15 @@ class Guidance:
             image: Display-encoded, in [0, 1], shape [1, 3, H, W].
 
         Returns:
-            None when the prior has only one precision; NaN when delta vanishes.
+            Cosine between delta as computed before and in full precision; None when the prior has
+            but one.
         """
-        if not hasattr(self.prior, "in_full_precision"):
+        if not hasattr(self.prior, "ensure_precision"):
             return None
-        prior = cast(PrecisePrior, self.prior)
-        low, full = [], []
-        for crops in self._fixed_crops(image, "precision", self.seed, CHECK_COUNT):
-            low.append(self._delta(crops, self._predictions(crops)).double().flatten())
-            with prior.in_full_precision():
-                full.append(self._delta(crops, self._predictions(crops)).double().flatten())
-        first, second = torch.cat(low), torch.cat(full)
-        return float(first @ second / (first.norm() * second.norm()))
+        batches = self._fixed_crops(image, "precision", self.seed, CHECK_COUNT)
+        return cast(PrecisePrior, self.prior).ensure_precision(
+            lambda: torch.cat([self._delta(crops, self._predictions(crops)) for crops in batches])
+        )
 
     def state_dict(self) -> dict[str, Any]:
         """Return numbers and lists of numbers."""
@@ -497,6 +494,8 @@ class DatasetUpdate:
         if not hasattr(prior, "edit"):
             raise ModelError(prior.name, f"cannot edit pictures, as {DATASET_UPDATE} needs")
         self.prior = cast(EditingPrior, prior)
+        # An edit asks for the same two; by then the text encoder may be gone.
+        prior.embed([condition.prompt, ""])
         self.condition, self.settings, self.adapter = condition, settings, adapter
         self.box, self.steps, self.seed = box_of(mask), steps, seed
         self.gate = GradientGate(settings.gradient_clip)
@@ -605,14 +604,3 @@ def make_guidance(
     """Return the guidance that the settings' loss asks for; arguments and errors are theirs."""
     kind = DatasetUpdate if settings.loss == DATASET_UPDATE else Guidance
     return kind(prior, condition, settings, mask, steps, seed, adapter)
-
-
-def seed_of(*key: int | str) -> int:
-    """Return a seed of 63 bits that is a function of the key alone."""
-    digest = hashlib.sha256(repr(key).encode()).digest()
-    return int.from_bytes(digest[:8], "little") >> 1
-
-
-def generator_of(*key: int | str) -> torch.Generator:
-    """Return random numbers that are a function of the key alone, drawn on the CPU."""
-    return torch.Generator().manual_seed(seed_of(*key))
