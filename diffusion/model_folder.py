@@ -53,8 +53,8 @@ CONFIGS = {
     "text_encoder": "config.json",
     "scheduler": "scheduler_config.json",
 }
-TOKENIZER_FILES = ("vocab.json", "merges.txt")
-"""Enough without ``tokenizer.json``, which the real Stable Diffusion 2.1 lacks."""
+TOKENIZER_FILES = (("vocab.json", "merges.txt"), ("tokenizer.json",))
+"""Either of them: the published models have the former, transformers 5 writes the latter."""
 WEIGHTS = {
     "unet": "diffusion_pytorch_model",
     "vae": "diffusion_pytorch_model",
@@ -273,8 +273,10 @@ def _check_complete(folder: Path) -> None:
     """List everything that is missing, in one sentence."""
     missing, pickles = [], []
     for part in PARTS:
-        wanted = (CONFIGS[part],) if part in CONFIGS else TOKENIZER_FILES
-        missing += [f"{part}/{name}" for name in wanted if not (folder / part / name).is_file()]
+        choices = ((CONFIGS[part],),) if part in CONFIGS else TOKENIZER_FILES
+        lacks = [[n for n in names if not (folder / part / n).is_file()] for names in choices]
+        if all(lacks):
+            missing += [f"{part}/{name}" for name in lacks[0]]
         if part in WEIGHTS:
             names = {p.name for p in (folder / part).glob("*") if p.is_file()}
             if choose_weights(part, names) is None:

@@ -601,11 +601,11 @@ def _noise_schedule(config: dict[str, Any]) -> NoiseSchedule:
     if type(count) is not int or not 2 <= count <= 100_000:
         raise ModelError(where, f"num_train_timesteps {count!r} (expected 2 to 100000)")
     with _one_sentence(where):
-        bar = DDIMScheduler.from_config(config).alphas_cumprod.double()
-    falling = bool((bar.diff() <= 0.0).all()) and 0.0 <= float(bar[-1]) < float(bar[0]) < 1.0
-    if len(bar) != count or not falling:
-        raise ModelError(where, "no noise schedule (expected alphas that fall from 1 towards 0)")
-    return NoiseSchedule(bar, kind)
+        scheduler = DDIMScheduler.from_config(config)
+        betas: Tensor = scheduler.betas
+    if len(betas) != count or not bool(((betas > 0.0) & (betas <= 1.0)).all()):
+        raise ModelError(where, f"no noise schedule (expected {count} betas between 0 and 1)")
+    return NoiseSchedule(scheduler.alphas_cumprod.double(), kind)
 
 
 @contextmanager
