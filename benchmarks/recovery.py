@@ -36,8 +36,8 @@ from warpir.light import (
     resize_map,
     texel_solid_angles,
 )
+from warpir.light_optimization import LightOptimization, Unknowns
 from warpir.mis import MisIntegrator
-from warpir.optimize import Optimization, Recovered, Unknowns
 from warpir.optimize_settings import OptimizeSettings
 from warpir.placement import place_asset
 from warpir.render import Renderer, light_args
@@ -291,7 +291,7 @@ def response(knots: Knots, radiance: Float64Array) -> Float64Array:
     return shown
 
 
-def measure(truth: Truth, found: Recovered, loop: Optimization) -> dict[str, Any]:
+def measure(truth: Truth, loop: LightOptimization) -> dict[str, Any]:
     """Compare what was recovered with what is true."""
     light = loop.final_lights(MEASURE_HEIGHT)[0].texels
     assert light is not None
@@ -302,7 +302,9 @@ def measure(truth: Truth, found: Recovered, loop: Optimization) -> dict[str, Any
     # The scale of the light and the curve are one unknown: radiances are matched by total flux.
     ratio = float(_measured(light)[2].sum() / _measured(truth.texels)[2].sum())
     radiance = np.geomspace(0.02, 2.0, 64)
-    curves = response(found.curve_fg(), ratio * radiance) - response(truth.curve_fg, radiance)
+    curves = response(loop.unknowns.curve_fg(), ratio * radiance) - response(
+        truth.curve_fg, radiance
+    )
     ratios = sun_sky_ratio(light, axis), sun_sky_ratio(truth.texels, true_axis)
     return {
         "name": truth.scene.name,
@@ -315,12 +317,12 @@ def measure(truth: Truth, found: Recovered, loop: Optimization) -> dict[str, Any
         "true_direction_deg": angles_from_axis(true_axis),
         "sun_sky": ratios[0],
         "true_sun_sky": ratios[1],
-        "retraced": loop.state.retraced,
-        "step": found.step,
+        "retraced": loop.retraced,
+        "step": loop.state.best_step,
     }
 
 
-def delivered(truth: Truth, loop: Optimization, samples: int = 64) -> Tensor:
+def delivered(truth: Truth, loop: LightOptimization, samples: int = 64) -> Tensor:
     """Return the composite as a user gets it: by `mis`, under finer maps, at an unseen seed."""
     texels = loop.final_lights(256)[0].texels
     assert texels is not None
@@ -329,16 +331,18 @@ def delivered(truth: Truth, loop: Optimization, samples: int = 64) -> Tensor:
         return reference(truth.frame, texels, *curves, samples)
 
 
-def recover(truth: Truth, settings: OptimizeSettings, cache: Path | None = None) -> Optimization:
+def recover(
+    truth: Truth, settings: OptimizeSettings, cache: Path | None = None
+) -> LightOptimization:
     """Run the loop toward the truth from an even light at the photo's level."""
     level = float(np.median(luminance(truth.frame.photo_lin)))
     unknowns = Unknowns.start(None, level / (1.0 - min(level, 0.95)), settings)
-    loop = Optimization(truth.frame, TowardTruth(truth.image), settings, unknowns, cache)
+    loop = LightOptimization(truth.frame, TowardTruth(truth.image), settings, unknowns, cache)
     loop.run()
     return loop
 
 
-def show(truth: Truth, loop: Optimization, path: Path) -> None:
+def show(truth: Truth, loop: LightOptimization, path: Path) -> None:
     """Write truth, result and five times their difference side by side."""
     from PIL import Image
 
@@ -382,7 +386,7 @@ def main() -> None:
         truth = make_truth(scene, panorama, asset, width, height, samples, options.device)
         made = time.perf_counter()
         loop = recover(truth, settings)
-        line = measure(truth, loop.recovered(), loop)
+        line = measure(truth, loop)
         line["seconds"] = {
             "truth": round(made - started, 1),
             "recovery": round(time.perf_counter() - made, 1),

@@ -27,6 +27,7 @@ LEVELS = (
     {"transport_choice", "view"},
     {"checkpoint"},
     {"optimize"},
+    {"light_optimization"},
     {"recover", "refine"},
     {"demo"},
     {"insert", "prior_images"},
@@ -42,7 +43,7 @@ ONLY_IN = {
     "torch": {
         "diffusion", "tone", "bridge", "integrator", "fusion", "sg_light", "regularizers", "view",
         "mis", "transport", "transport_cache", "transport_choice", "transport_matrix", "checkpoint",
-        "optimize", "recover", "refine", "insert", "prior_images",
+        "optimize", "light_optimization", "recover", "refine", "insert", "prior_images",
     },
     "trimesh": {"gltf", "obj", "demo"},
     "OpenImageIO": {"files"},

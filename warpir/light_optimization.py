@@ -1,0 +1,214 @@
+"""Recovery of a scene's light and tone curves (DiPIR, sections 4.1 to 4.3, supplement S 1-7).
+
+Two sets of lobes, one that lights the object and one that casts its shadow, become one light over
+the run; a tone curve belongs to the object, three to the shadow ratio.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from warpir.fusion import fuse
+from warpir.light import Light, Lobes
+from warpir.optimize import Guide, Optimization
+from warpir.optimize_settings import OptimizeSettings
+from warpir.regularizers import bend, chroma, consistency, spread
+from warpir.sg_light import LightBounds, SGLight, narrowest
+from warpir.tone import ToneCurve
+from warpir.transport_rows import TransportSettings
+from warpir.view import Frame, View, expected_light
+
+RETRACE_EVERY = 25
+"""Steps between two looks at whether the light has left what was expected of it."""
+
+
+class Unknowns(torch.nn.Module):
+    """All that is recovered: two lights and four curves.
+
+    Args:
+        light_fg: Lights the object.
+        light_shadow: Casts its shadow.
+    """
+
+    def __init__(self, light_fg: SGLight, light_shadow: SGLight) -> None:
+        super().__init__()
+        self.light_fg, self.light_shadow = light_fg, light_shadow
+        self.curve_fg, self.curve_shadow = ToneCurve(1), ToneCurve(3)
+
+    @staticmethod
+    def start(lobes: Lobes | None, level: float, settings: OptimizeSettings) -> Unknowns:
+        """Return the unknowns at their start.
+
+        Args:
+            lobes: A light to start from, or None for an even one.
+            level: Radiance of that even light, relative [W/(m^2 sr)].
+            settings: Count and bounds of the lobes.
+        """
+        bounds = LightBounds(
+            narrowest(settings.light_height), settings.chroma_limit, settings.intensity_limit
+        )
+
+        def light() -> SGLight:
+            if lobes is not None:
+                return SGLight(lobes, level, bounds)
+            return SGLight.uniform(settings.lobes, level, bounds)
+
+        return Unknowns(light(), light())
+
+
+class LightOptimization(Optimization):
+    """Light and tone curves of one frame.
+
+    Args:
+        frame: Scene, photo, tone operator.
+        guide: What looks right.
+        settings: Steps, rates, weights, schedules.
+        unknowns: Where to start; changed in place.
+        cache: Folder for traced rows, or None.
+        transport: How finely light is traced; by default the heights are those of the settings.
+    """
+
+    unknowns: Unknowns
+
+    def __init__(
+        self,
+        frame: Frame,
+        guide: Guide,
+        settings: OptimizeSettings,
+        unknowns: Unknowns,
+        cache: Path | None = None,
+        transport: TransportSettings | None = None,
+    ) -> None:
+        super().__init__(unknowns, _groups(unknowns, settings), guide, settings, frame.seed)
+        self.frame, self.cache, self.rows = frame, cache, transport
+        if transport is None and settings.integrator == "transport":
+            self.rows = TransportSettings(
+                height_fg=settings.object_light_height, height_shadow=settings.light_height
+            )
+        self.retraced = 0
+        with torch.no_grad():
+            self.expected = expected_light(*self.lights(0.0))
+        self.view = self._trace()
+
+    def _trace(self) -> View:
+        return View(self.frame, self.expected, self.rows, self.settings.mis_samples, self.cache)
+
+    def fusion(self, step: int) -> float:
+        """Return ``s_fuse`` of a step: how far both lights have become one [1]."""
+        if self.settings.fusion == "schedule":
+            return step / max(self.settings.steps - 1, 1)
+        return 0.0
+
+    @property
+    def final_fusion(self) -> float:
+        """``s_fuse`` of what is delivered."""
+        return 1.0 if self.settings.fusion == "schedule" else 0.0
+
+    def lights(self, scale: float, height: int | None = None) -> tuple[Tensor, Tensor]:
+        """Return the maps that light the object and cast its shadow, shape [He, We, 3].
+
+        Args:
+            scale: ``s_fuse`` [1].
+            height: Rows; the settings' when absent.
+        """
+        height = height or self.settings.light_height
+        texels_fg = self.unknowns.light_fg.texels(height)
+        if self.settings.fusion == "single":
+            return texels_fg, texels_fg
+        return fuse(texels_fg, self.unknowns.light_shadow.texels(height), scale)
+
+    def _composite(self, scale: float, seed: int) -> Tensor:
+        curves = self.unknowns.curve_fg(), self.unknowns.curve_shadow()
+        return self.view.image(*self.lights(scale), *curves, seed)
+
+    def image(self, step: int) -> Tensor:
+        """Return the composite of a step under lights fused as far as the schedule says."""
+        return self._composite(self.fusion(step), self.seed + step)
+
+    def final_image(self, seed: int) -> Tensor:
+        """Return the composite under the light that would be delivered."""
+        return self._composite(self.final_fusion, seed)
+
+    def terms(self) -> dict[str, tuple[float, Tensor]]:
+        """Return the authors' terms (eq. 10, 11) and ours."""
+        settings, height = self.settings, self.settings.light_height
+        light_fg, light_shadow = self.unknowns.light_fg, self.unknowns.light_shadow
+        terms = {"chroma": (settings.chroma, 0.5 * (chroma(light_fg) + chroma(light_shadow)))}
+        if settings.fusion != "single":
+            texels_shadow = light_shadow.texels(height)
+            terms["consistency"] = (
+                settings.consistency,
+                consistency(light_fg.texels(height), texels_shadow),
+            )
+            terms["spread"] = settings.spread, spread(texels_shadow)
+        if settings.tone_curve:
+            curves = bend(self.unknowns.curve_fg()) + bend(self.unknowns.curve_shadow())
+            terms["bend"] = settings.bend, curves
+        return terms
+
+    def project(self) -> None:
+        """Keep both lights within their bounds."""
+        self.unknowns.light_fg.project()
+        self.unknowns.light_shadow.project()
+
+    def prepare(self, step: int) -> None:
+        """Trace light transport again once the light has left what was expected of it."""
+        if self.view.transport is None or step == 0 or step % RETRACE_EVERY:
+            return
+        with torch.no_grad():
+            texels = self.lights(self.fusion(step))
+            if self.view.staleness(*texels) > self.settings.retrace_at:
+                self.expected = expected_light(*texels)
+                self.view = self._trace()
+                self.retraced += 1
+
+    def final_lights(self, height: int) -> tuple[Light, Light]:
+        """Return the delivered lights as maps of ``height`` rows; one and the same when fused."""
+        with torch.no_grad():
+            fg, shadow = self.lights(self.final_fusion, height)
+        light_fg = Light(texels=fg.cpu().numpy())
+        if self.settings.fusion in ("schedule", "single"):
+            return light_fg, light_fg
+        return light_fg, Light(texels=shadow.cpu().numpy())
+
+    def state_dict(self) -> dict[str, Any]:
+        """Return the loop's state and the light that the rows were traced for."""
+        assert self.expected.texels is not None
+        return {
+            **super().state_dict(),
+            "expected": torch.from_numpy(self.expected.texels),
+            "retraced": self.retraced,
+        }
+
+    def load_state_dict(self, state: Mapping[str, Any]) -> None:
+        """Go on from `state_dict`; light transport is traced again, or found in the cache."""
+        super().load_state_dict(state)
+        self.retraced = state["retraced"]
+        expected = Light(texels=state["expected"].numpy())
+        if not torch.equal(state["expected"], torch.from_numpy(self.expected.texels)):
+            self.expected = expected
+            self.view = self._trace()
+
+
+def _groups(unknowns: Unknowns, settings: OptimizeSettings) -> list[dict[str, Any]]:
+    """Return each kind of parameter with its learning rate."""
+    groups = []
+    for light in (unknowns.light_fg, unknowns.light_shadow):
+        groups += [
+            {"params": [light.log_intensity], "rate": settings.rate_intensity},
+            {"params": [light.chroma], "rate": settings.rate_chroma},
+            {"params": [light.axis], "rate": settings.rate_axis},
+            {"params": [light.log_sigma], "rate": settings.rate_width},
+        ]
+    curves = [*unknowns.curve_fg.parameters(), *unknowns.curve_shadow.parameters()]
+    if settings.tone_curve:
+        groups.append({"params": curves, "rate": settings.rate_tone})
+    else:
+        for parameter in curves:
+            parameter.requires_grad_(False)
+    return groups
