@@ -159,7 +159,7 @@ def from_bytes(pictures: Tensor, device: torch.device) -> Tensor:
 
 
 def encode_pictures(
-    prior: StableDiffusion, pictures: Tensor, batch: int, report: Callable[[int], None] | None
+    prior: StableDiffusion, pictures: Tensor, batch: int, report: Report | None = None
 ) -> Tensor:
     """Return the pictures' latents, float32 on the CPU, shape [N, C, h, w].
 
@@ -167,7 +167,7 @@ def encode_pictures(
         prior: Encodes; the posterior's mean, no sampling noise.
         pictures: uint8, shape [N, 3, resolution, resolution].
         batch: Pictures at once.
-        report: Is told how many are done.
+        report: Is told "class latents", the number done and the number in all.
     """
     latents = []
     with torch.no_grad():
@@ -175,7 +175,7 @@ def encode_pictures(
             part = from_bytes(pictures[start : start + batch], prior.device)
             latents.append(prior.encode(part).cpu())
             if report:
-                report(start + len(part))
+                report("class latents", start + len(part), len(pictures))
     return torch.cat(latents)
 
 

@@ -271,7 +271,7 @@ def _parts(path: Path, tensors: dict[str, Tensor]) -> tuple[dict[str, Tensor], d
 
     def renamed(parts: dict[str, Any]) -> dict[str, Any]:
         parts = {key.removeprefix("unet."): value for key, value in parts.items()}
-        return dict(convert_unet_state_dict_to_peft(parts))  # type: ignore[no-untyped-call]
+        return dict(convert_unet_state_dict_to_peft(parts))
 
     weights = renamed(named)
     odd = [key for key in weights if not key.endswith((".lora_A.weight", ".lora_B.weight"))]
@@ -414,7 +414,7 @@ def save_lora(
     )
 
     config = lora.config()
-    keyed = convert_state_dict_to_diffusers(lora.weights)  # type: ignore[no-untyped-call]
+    keyed = convert_state_dict_to_diffusers(lora.weights)
     if any(".lora_A." in key for key in keyed):
         # It knows attention layers only, and readers take one way of naming for the whole file.
         keyed = lora.weights
@@ -429,7 +429,7 @@ def save_lora(
     )
 
     named = {f"unet.{key}": value for key, value in lora.weights.items()}
-    kohya = convert_state_dict_to_kohya(named)  # type: ignore[no-untyped-call]
+    kohya = convert_state_dict_to_kohya(named)
     for layer, alpha in lora.alphas.items():
         kohya[f"lora_unet_{layer.replace('.', '_')}.alpha"] = torch.tensor(alpha)
     first = cross_attention == 768

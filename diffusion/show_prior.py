@@ -1,0 +1,165 @@
+"""Pictures by the model before and after it was adapted, for a person to judge by looking.
+
+As in figures S1 and S2 of DiPIR (Liang et al. 2024): without class images the adapted model ignores
+added words and paints the object in the photo's colours.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+from PIL import Image, ImageDraw, ImageFont
+from torch import Tensor
+
+from warpir.diffusion.class_images import Report, to_bytes
+from warpir.diffusion.personalize import personalize
+from warpir.diffusion.prompts import Prompts
+from warpir.diffusion.settings import PersonalizeSettings
+
+if TYPE_CHECKING:
+    from warpir.diffusion.stable_diffusion import StableDiffusion
+
+WITH_CLASS, WITHOUT_CLASS = "scene", "scene-without-class"
+TITLES = {
+    None: "before",
+    WITH_CLASS: "adapted, with class images",
+    WITHOUT_CLASS: "adapted, without class images",
+}
+LABEL_SIZE = 14
+"""Height of the letters [px]."""
+MARGIN = 6
+LABEL_WIDTH = 180
+"""Width of the column with the prompts [px]."""
+
+
+def show_prior(
+    prior: StableDiffusion,
+    prompts: Sequence[str],
+    adapters: Sequence[str | None],
+    seeds: Sequence[int],
+    steps: int,
+    scale: float,
+    batch: int = 8,
+    report: Report | None = None,
+) -> NDArray[np.uint8]:
+    """Return a labelled sheet of samples, shape [H, W, 3]: a row per prompt, a column per adapter.
+
+    A cell has one picture per seed, side by side; the same seed starts from the same noise in every
+    cell.
+
+    Args:
+        prior: The model.
+        prompts: What is asked for.
+        adapters: Names of adapters of the prior; None is the model as it was.
+        seeds: Of the first noise.
+        steps: Denoising steps (DPM-Solver++).
+        scale: Classifier-free guidance.
+        batch: Pictures made at once.
+        report: Is told "samples", the number done and the number in all.
+
+    Raises:
+        ModelError: An adapter is unknown, the text encoder was freed, or a picture is not finite.
+        ValueError: There is no prompt, adapter or seed.
+    """
+    if not (prompts and adapters and seeds):
+        raise ValueError("show_prior: needs at least one prompt, one adapter and one seed")
+    asked = [prompt for prompt in prompts for _ in seeds]
+    columns = []
+    for place, adapter in enumerate(adapters):
+        made = prior.sample(
+            asked, [*seeds] * len(prompts), steps=steps, scale=scale, adapter=adapter, batch=batch
+        )
+        columns.append(to_bytes(made).reshape(len(prompts), len(seeds), *made.shape[1:]))
+        if report:
+            report("samples", (place + 1) * len(asked), len(adapters) * len(asked))
+    titles = [TITLES.get(adapter, str(adapter)) for adapter in adapters]
+    return contact_sheet(columns, titles, prompts)
+
+
+def show_personalization(
+    prior: StableDiffusion,
+    photo: Tensor,
+    prompts: Prompts,
+    settings: PersonalizeSettings,
+    seed: int,
+    cache: Path | None,
+    shown: Sequence[str],
+    seeds: Sequence[int],
+    report: Report | None = None,
+) -> NDArray[np.uint8]:
+    """Adapt the model to a photo with and without class images, and show what each has learnt.
+
+    Args:
+        prior: The model; it has the adapters `WITH_CLASS` and `WITHOUT_CLASS` afterwards.
+        photo: Display-encoded, in [0, 1], shape [1, 3, H, W].
+        prompts: Of the photo and the class.
+        settings: Of the training and of the samples.
+        seed: The run's seed.
+        cache: As for `personalize`: what an earlier run trained is found again.
+        shown: Prompts of the sheet's rows.
+        seeds: Of the pictures.
+        report: Is told stages, steps done and steps in all.
+
+    Returns:
+        The sheet, shape [H, W, 3].
+
+    Raises:
+        ModelError: As `personalize` and `show_prior`.
+    """
+    without = replace(settings, class_images=0)
+    for name, chosen in ((WITH_CLASS, settings), (WITHOUT_CLASS, without)):
+        personalize(prior, photo, prompts, chosen, seed, cache, name=name, report=report)
+    return show_prior(
+        prior, shown, tuple(TITLES), seeds, settings.class_steps, settings.class_scale,
+        settings.class_batch, report,
+    )  # fmt: skip
+
+
+def contact_sheet(
+    columns: Sequence[Tensor], titles: Sequence[str], prompts: Sequence[str]
+) -> NDArray[np.uint8]:
+    """Return a sheet with a row per prompt, its text on the left, and titles above the columns.
+
+    Args:
+        columns: Pictures of each column, uint8, shape [prompt, seed, 3, R, R].
+        titles: One per column.
+        prompts: One per row.
+    """
+    rows, seeds, _, side, _ = columns[0].shape
+    font = ImageFont.load_default(LABEL_SIZE)
+    cell = seeds * side + MARGIN
+    titled = [_wrapped(title, font, cell - MARGIN) for title in titles]
+    labels = [_wrapped(prompt, font, LABEL_WIDTH - 2 * MARGIN) for prompt in prompts]
+    line = round(LABEL_SIZE * 1.4)
+    head = MARGIN + line * max(text.count("\n") + 1 for text in titled)
+    height = max(side, *(line * (text.count("\n") + 1) for text in labels)) + MARGIN
+    sheet = Image.new("RGB", (LABEL_WIDTH + len(columns) * cell, head + rows * height), "white")
+    draw = ImageDraw.Draw(sheet)
+    for place, title in enumerate(titled):
+        draw.multiline_text((LABEL_WIDTH + place * cell, 2), title, "black", font)
+    for row, label in enumerate(labels):
+        top = head + row * height
+        draw.multiline_text((MARGIN, top), label, "black", font)
+        for place, column in enumerate(columns):
+            for seed in range(seeds):
+                pixels = column[row, seed].permute(1, 2, 0).contiguous().numpy()
+                left = LABEL_WIDTH + place * cell + seed * side
+                sheet.paste(Image.fromarray(pixels), (left, top))
+    return np.array(sheet)
+
+
+def _wrapped(text: str, font: ImageFont.FreeTypeFont | ImageFont.ImageFont, width: int) -> str:
+    """Break a text into lines of at most ``width`` pixels, between words."""
+    lines = [""]
+    for word in text.split():
+        longer = f"{lines[-1]} {word}".strip()
+        if lines[-1] and font.getlength(longer) > width:
+            lines.append(word)
+        else:
+            lines[-1] = longer
+    return "\n".join(lines)
