@@ -4,6 +4,8 @@ import json
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -12,6 +14,7 @@ from scipy import stats
 from torch import Tensor
 
 from tests.statistics import central_differences, compare_gradients
+from tests.tiny_stable_diffusion import make_tiny_stable_diffusion
 from warpir.diffusion.crop import Crop
 from warpir.diffusion.draws import seed_of
 from warpir.diffusion.guidance import (
@@ -28,7 +31,8 @@ from warpir.diffusion.guidance import (
 )
 from warpir.diffusion.prior import Condition, ModelError
 from warpir.diffusion.schedule import NoiseSchedule
-from warpir.diffusion.settings import GuidanceSettings
+from warpir.diffusion.settings import GuidanceSettings, ModelSettings
+from warpir.diffusion.stable_diffusion import StableDiffusion, load_stable_diffusion
 
 LOSSES = ("lds", "sds", "sds-base", "csd", "lds-lora-both", "lds-negative")
 FLOAT32 = 1e-5
@@ -780,3 +784,135 @@ def test_dataset_update_needs_a_prior_that_edits() -> None:
     """The error names the prior."""
     with pytest.raises(ModelError, match="gaussian: cannot edit"):
         update(GaussianPrior())
+
+
+@pytest.fixture(scope="module", params=["epsilon", "v_prediction"])
+def folder(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A tiny Stable Diffusion of each prediction type."""
+    kind = request.param
+    return make_tiny_stable_diffusion(tmp_path_factory.mktemp("model"), prediction_type=kind)
+
+
+def load_adapted(folder: Path, gain: float) -> StableDiffusion:
+    """Return the tiny model with a LoRA ``scene``; gain 0 adapts nothing."""
+    from peft import LoraConfig
+
+    prior = load_stable_diffusion(ModelSettings(model=str(folder)), "cpu")
+    layers = ["to_q", "to_k", "to_v", "to_out.0"]
+    prior.unet.add_adapter(LoraConfig(r=4, lora_alpha=4, target_modules=layers), "scene")
+    prior.adapters.add("scene")
+    g = torch.Generator().manual_seed(5)
+    for name, parameter in prior.unet.named_parameters():
+        if "lora_B" in name:
+            parameter.data = gain * torch.randn(parameter.shape, generator=g)
+    return prior
+
+
+SD_SETTINGS = replace(GuidanceSettings(), noises=2, weight="uniform")
+
+
+def photo(rng: np.random.Generator) -> tuple[Tensor, Tensor]:
+    """Return a picture of 40 x 60 and the mask of an object in it, of 20 x 16 pixels."""
+    mask = torch.zeros(40, 60)
+    mask[12:28, 20:40] = 1.0
+    return picture(rng, 40, 60).float(), mask
+
+
+def test_zero_lora_makes_lds_equal_csd_exactly(rng: np.random.Generator, folder: Path) -> None:
+    """On a real UNet: LoRAs of zero in a batch with base samples change no bit; others do."""
+    x, mask = photo(rng)
+    condition = Condition("a car in the style of sks rendering")
+    for gain in (0.0, 0.5):
+        prior = load_adapted(folder, gain)
+        lds, csd = (
+            Guidance(prior, condition, replace(SD_SETTINGS, loss=loss), mask, 10, 3, "scene")
+            for loss in ("lds", "csd")
+        )
+        first, second = lds.gradient(x, 4), csd.gradient(x, 4)
+        assert first is not None and second is not None and second.norm() > 0
+        assert torch.equal(first, second) is (gain == 0.0)
+
+
+def test_batch_of_terms_and_noises_equals_separate_calls(
+    rng: np.random.Generator, folder: Path
+) -> None:
+    """One sample at a time, the UNet predicts what it predicts in one batch."""
+    x, mask = photo(rng)
+    prior = load_adapted(folder, 0.5)
+    settings = replace(SD_SETTINGS, loss="sds", guidance_scale=7.5)
+    made = Guidance(prior, CONDITION, settings, mask, 10, 3, "scene")
+    together = made.gradient(x, 4)
+    predict = prior.predict
+    sizes = []
+
+    def one_by_one(
+        z: Tensor, t: Tensor, e: Tensor, adapters: Sequence[str | None], *_: None
+    ) -> Tensor:
+        sizes.append(len(z))
+        parts = [slice(i, i + 1) for i in range(len(z))]
+        return torch.cat([predict(z[p], t[p], e[p], adapters[p]) for p in parts])
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(prior, "predict", one_by_one)
+        separate = made.gradient(x, 4)
+    assert sizes == [4] and together is not None and separate is not None
+    assert compare_gradients(separate, together).relative_l2 < 2e-5  # float32, g = 7.5
+
+
+def test_gradient_passes_autoencoder_and_crop(rng: np.random.Generator, folder: Path) -> None:
+    """Central differences in float64 through the crop and diffusers' autoencoder.
+
+    The residual is held fixed; the latents are the posterior's mean of ``2 x - 1``, scaled.
+    """
+    x, mask = photo(rng)
+    x = x.double()
+    prior = load_adapted(folder, 0.5)
+    prior.vae.double()
+    settings = replace(SD_SETTINGS, noises=1)
+    made = Guidance(prior, CONDITION, settings, mask, 10, 3, "scene")
+    said: list[Tensor] = []
+    predict = prior.predict
+
+    def watched(*args: Any) -> Tensor:
+        said.append(predict(*args))
+        return said[-1]
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(prior, "predict", watched)
+        found = made.gradient(x, 0)
+    assert found is not None
+    residual = (said[0][:1] - said[0][1:]).double()
+    crop = draw_as_guidance_does(made, x, step=0)
+    directions = torch.linalg.qr(torch.tensor(rng.standard_normal((x.numel(), 12)))).Q
+
+    @torch.no_grad()
+    def surrogate(lengths: np.ndarray) -> float:
+        moved = x + (directions @ torch.tensor(lengths)).view_as(x)
+        mean = prior.vae.encode(2 * crop.apply(moved, 64) - 1).latent_dist.mean
+        return float((prior.vae.config.scaling_factor * mean * residual).sum())
+
+    match = compare_gradients(
+        directions.T @ found.flatten(), central_differences(surrogate, np.zeros(12), 1e-4)
+    )
+    assert match.relative_l2 < 1e-6  # latents and residual pass through float32
+
+
+def test_guidance_works_without_the_text_encoder(rng: np.random.Generator, folder: Path) -> None:
+    """Every loss embeds what it needs when it is made; score and precision need no more."""
+    x, mask = photo(rng)
+    prior = load_adapted(folder, 0.5)
+    made = [
+        make_guidance(
+            prior, CONDITION, replace(SD_SETTINGS, loss=loss, update_steps=2), mask, 10, 3, "scene"
+        )
+        for loss in (*LOSSES, "dataset-update")
+    ]
+    prior.free_text_encoder()
+    for each in made:
+        d_image = each.gradient(x, 0)
+        assert d_image is not None and d_image.shape == x.shape and d_image.norm() > 0
+        score = each.score(x)
+        assert score is not None and score == each.score(x)
+        assert each.counts.skipped_steps == 0
+        if isinstance(each, Guidance):
+            assert each.ensure_precision(x) == 1.0
