@@ -53,8 +53,9 @@ class NonFiniteError(Exception):
 class Guide(Protocol):
     """What turns a picture into a gradient."""
 
-    counts: Counts
-    """What the user is told in the end."""
+    @property
+    def counts(self) -> Counts:
+        """What the user is told in the end."""
 
     def gradient(self, image: Tensor, step: int) -> Tensor | None:
         """Return the loss gradient of an image, same shape, dtype and device; see `Guidance`.
