@@ -84,9 +84,9 @@ class InsertConfig(ModelSettings, PersonalizeSettings, GuidanceSettings, Optimiz
     exposure: float | None = None
     """Factor on the light, in stops [EV] (default: chosen from the photo)"""
 
-    tone: str = "linear"
+    tone: str | None = None
     """How the object's radiance becomes display values: linear (clipped, as the photo was), or
-    reinhard (x / (1 + x), paler, nothing clips)"""
+    reinhard (x / (1 + x), paler, nothing clips) (default: linear, with --guidance reinhard)"""
     ground_albedo: float = 0.25
     """Reflectance assumed of the ground, for the automatic exposure [1]"""
 
@@ -148,6 +148,11 @@ class InsertConfig(ModelSettings, PersonalizeSettings, GuidanceSettings, Optimiz
     def __post_init__(self) -> None:
         """Check everything that can be checked without opening a file."""
         raise_all([*_values_out_of_range(self), *_values_that_clash(self)])
+
+    @property
+    def tone_operator(self) -> str:
+        """`tone`, or what stands for it: recovered curves want an operator that never clips."""
+        return self.tone or ("linear" if self.guidance == "none" else "reinhard")
 
     def require_inputs(self) -> None:
         """Check that what every run needs is named.

@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from warpir.color import luminance
-from warpir.config import DEFAULTS, InsertConfig, usage
+from warpir.config import InsertConfig, usage
 from warpir.curves import Curves
 from warpir.errors import InputError
 from warpir.inputs import Inputs
@@ -69,12 +69,13 @@ def make_light(inputs: Inputs, config: InsertConfig) -> SceneLight:
             "looks as bright as the photo's lit ground (--exposure, --ground-albedo)"
         )
     light = light.scaled(2.0**exposure)
-    return SceneLight(light, light, Curves.identity(config.tone), exposure, tuple(assumed), fit)
+    curves = Curves.identity(config.tone_operator)
+    return SceneLight(light, light, curves, exposure, tuple(assumed), fit)
 
 
 def _reused(run: EarlierRun, config: InsertConfig) -> SceneLight:
     """Return an earlier run's light and curves; they are at the exposure of that run's photo."""
-    if config.tone not in (DEFAULTS["tone"], run.curves.tone):
+    if config.tone not in (None, run.curves.tone):
         found = f"the curves of {run.path} are made for {run.curves.tone}"
         raise usage("--tone", f"cannot be {config.tone}: {found}", "leave --tone out")
     exposure = config.exposure or 0.0
@@ -131,13 +132,18 @@ def _automatic_exposure(light: Light, inputs: Inputs, config: InsertConfig) -> f
             "no light reaches the ground, so no exposure follows from the photo",
             "give --exposure",
         )
-    level = np.clip(_ground_level(inputs), 1e-3, 0.9)
-    wanted = level / (1.0 - level) if config.tone == "reinhard" else level
+    level = np.clip(ground_level(inputs, LIT_PERCENTILE), 1e-3, 0.9)
+    wanted = level / (1.0 - level) if config.tone_operator == "reinhard" else level
     return float(np.log2(wanted * np.pi / (config.ground_albedo * irradiance)))
 
 
-def _ground_level(inputs: Inputs) -> float:
-    """Return the photo's linear luminance of lit ground round the object's foot [1]."""
+def ground_level(inputs: Inputs, percentile: float) -> float:
+    """Return the photo's linear luminance of the ground round the object's foot [1].
+
+    Args:
+        inputs: Photo, camera and placement.
+        percentile: Of the ground's pixels [%].
+    """
     camera, placement = inputs.camera, inputs.placement
     low, high = inputs.asset.bounds()
     size = float(np.linalg.norm((high - low) * np.linalg.norm(placement.asset_to_world[:3, 0])))
@@ -154,9 +160,9 @@ def _ground_level(inputs: Inputs) -> float:
     inside = (uv >= 0.0).all(axis=1) & (uv[:, 0] < camera.width) & (uv[:, 1] < camera.height)
     photo = luminance(inputs.photo.linear().astype(np.float64))
     if not inside.any():
-        return float(np.percentile(photo, LIT_PERCENTILE))
+        return float(np.percentile(photo, percentile))
     columns, rows = uv[inside].astype(int).T
-    return float(np.percentile(photo[rows, columns], LIT_PERCENTILE))
+    return float(np.percentile(photo[rows, columns], percentile))
 
 
 def _unit(v: NDArray[np.float64]) -> NDArray[np.float64]:
