@@ -141,12 +141,14 @@ def find_model(model: str | None, allow_download: bool) -> Path:
     from huggingface_hub import snapshot_download
 
     try:
-        return Path(snapshot_download(model, local_files_only=True))
+        cached = Path(snapshot_download(model, local_files_only=True))
     except (OSError, ValueError) as error:
         if not allow_download or model.startswith("stabilityai/stable-diffusion-2"):
             what = f"neither a folder nor in this machine's cache of the hub; {WITHDRAWN}"
             raise ModelError(model, what, ADVICE) from error
-    return _download(model)
+        return _download(model)
+    # A download that was stopped leaves a part of it.
+    return _download(model) if allow_download and missing_files(cached) else cached
 
 
 def _download(model: str) -> Path:
@@ -202,12 +204,17 @@ def check_model_folder(folder: Path) -> ModelFolder:
     _check_no_code(folder)
     _check_complete(folder)
     configs = {part: read_json(folder / part / name) for part, name in CONFIGS.items()}
+    for part in WEIGHTS:
+        if "quantization_config" in configs[part]:
+            raise ModelError(
+                str(folder / part), "quantised weights (expected fp16 or fp32)", ADVICE
+            )
     _check_unet(folder / "unet/config.json", configs["unet"])
     _check_vae(folder / "vae/config.json", configs["vae"])
     _check_width(folder / "text_encoder/config.json", configs)
     weights = {part: _find_weights(folder / part, part) for part in WEIGHTS}
-    for part in weights.values():
-        for file in part.files:
+    for held in weights.values():
+        for file in held.files:
             _check_header(file)
     return ModelFolder(folder, configs, weights)
 
@@ -269,24 +276,32 @@ def _check_no_code(folder: Path) -> None:
             )
 
 
-def _check_complete(folder: Path) -> None:
-    """List everything that is missing, in one sentence."""
-    missing, pickles = [], []
+def missing_files(folder: Path) -> list[str]:
+    """Return which of the files that are read are not there; shards are not counted."""
+    missing = [] if (folder / "model_index.json").is_file() else ["model_index.json"]
     for part in PARTS:
         choices = ((CONFIGS[part],),) if part in CONFIGS else TOKENIZER_FILES
         lacks = [[n for n in names if not (folder / part / n).is_file()] for names in choices]
         if all(lacks):
             missing += [f"{part}/{name}" for name in lacks[0]]
-        if part in WEIGHTS:
-            names = {p.name for p in (folder / part).glob("*") if p.is_file()}
-            if choose_weights(part, names) is None:
-                missing.append(f"{part}/{WEIGHTS[part]}.safetensors")
-                pickles += sorted(f"{part}/{name}" for name in names if name.endswith(PICKLES))
+        if part in WEIGHTS and choose_weights(part, _file_names(folder / part)) is None:
+            missing.append(f"{part}/{WEIGHTS[part]}.safetensors")
+    return missing
+
+
+def _file_names(folder: Path) -> set[str]:
+    return {path.name for path in folder.glob("*") if path.is_file()}
+
+
+def _check_complete(folder: Path) -> None:
+    """List everything that is missing, in one sentence."""
+    missing = missing_files(folder)
     if not missing:
         return
     what, advice = f"missing {', '.join(missing)}", ADVICE
+    pickles = [f"{p}/{n}" for p in WEIGHTS for n in _file_names(folder / p) if n.endswith(PICKLES)]
     if pickles:
-        what += f"; {', '.join(pickles)} are pickles, which can run code and are not read"
+        what += f"; {', '.join(sorted(pickles))} are pickles, which can run code and are not read"
         advice = "save the model as safetensors (diffusers: save_pretrained)"
     raise ModelError(str(folder), what, advice)
 
@@ -338,7 +353,7 @@ def _check_width(path: Path, configs: dict[str, dict[str, Any]]) -> None:
 
 def _find_weights(folder: Path, part: str) -> Weights:
     """Return the files of a part that `_check_complete` has seen."""
-    name, variant = choose_weights(part, {p.name for p in folder.iterdir()}) or ("", None)
+    name, variant = choose_weights(part, _file_names(folder)) or ("", None)
     path = folder / name
     if not name.endswith(".json"):
         return Weights((path,), variant)

@@ -526,7 +526,9 @@ def load_stable_diffusion(settings: ModelSettings, device: torch.device | str) -
         hashes = pool.map(folder.file_hash, (f for w in folder.weights.values() for f in w.files))
         unet = _load(UNet2DConditionModel, folder, "unet", unet_precision, device)
         vae = _load(AutoencoderKL, folder, "vae", vae_precision, device)
-        text_encoder = _load(CLIPTextModel, folder, "text_encoder", "fp32", device)
+        # The attention is named lest the configuration name code of the hub.
+        options = {"attn_implementation": "sdpa", "trust_remote_code": False}
+        text_encoder = _load(CLIPTextModel, folder, "text_encoder", "fp32", device, **options)
         tokenizer = _load_tokenizer(folder, text_encoder.config.vocab_size)
         prior = StableDiffusion(
             unet,
@@ -542,7 +544,14 @@ def load_stable_diffusion(settings: ModelSettings, device: torch.device | str) -
     return prior
 
 
-def _load(kind: Any, folder: ModelFolder, part: str, precision: str, device: torch.device) -> Any:
+def _load(
+    kind: Any,
+    folder: ModelFolder,
+    part: str,
+    precision: str,
+    device: torch.device,
+    **options: Any,
+) -> Any:
     """Load one part's network, with exactly the weights it needs, all of them finite.
 
     Raises:
@@ -557,6 +566,7 @@ def _load(kind: Any, folder: ModelFolder, part: str, precision: str, device: tor
             use_safetensors=True,
             local_files_only=True,
             output_loading_info=True,
+            **options,
         )
     for word, what in (("missing_keys", "lacks"), ("unexpected_keys", "has foreign")):
         if loaded[word]:

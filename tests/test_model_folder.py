@@ -4,7 +4,7 @@ import json
 import pickle
 import shutil
 import struct
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import pytest
@@ -29,6 +29,15 @@ from warpir.diffusion.stable_diffusion import load_stable_diffusion
 UNET = "unet/diffusion_pytorch_model.safetensors"
 VAE = "vae/diffusion_pytorch_model.safetensors"
 TEXT = "text_encoder/model.safetensors"
+
+
+@pytest.fixture(scope="module", autouse=True)
+def _one_thread() -> Iterator[None]:
+    """Networks this small lose more by waiting for a second thread than they gain."""
+    count = torch.get_num_threads()
+    torch.set_num_threads(1)
+    yield
+    torch.set_num_threads(count)
 
 
 @pytest.fixture(scope="module")
@@ -244,6 +253,14 @@ def test_adapter_in_the_text_encoder_is_refused(folder: Path) -> None:
     refuse(folder, "text_encoder", "adapter")
 
 
+def test_text_encoder_s_attention_is_not_chosen_by_its_file(folder: Path) -> None:
+    """A configuration may name attention code of the hub; ours is torch's."""
+    edit_json(folder / "text_encoder/config.json", attn_implementation="evil/attention")
+    prior = load_stable_diffusion(ModelSettings(model=str(folder)), "cpu")
+    assert prior.text_encoder is not None
+    assert prior.text_encoder.config._attn_implementation == "sdpa"
+
+
 # L5: other models
 
 
@@ -254,6 +271,7 @@ def test_other_models_are_told_by_their_configurations(folder: Path) -> None:
         ("unet/config.json", {"addition_embed_type": "text_time"}, ("text_time", "XL")),
         ("unet/config.json", {"sample_size": [8, 8]}, ("sample_size",)),
         ("unet/config.json", {"cross_attention_dim": 1024}, ("hidden_size 32", "1024")),
+        ("unet/config.json", {"quantization_config": {}}, ("unet", "quantised")),
         ("vae/config.json", {"latent_channels": 16}, ("latent_channels 16",)),
         ("vae/config.json", {"shift_factor": 0.1}, ("shift_factor",)),
         ("vae/config.json", {"scaling_factor": 0}, ("scaling_factor 0",)),
@@ -332,7 +350,7 @@ def test_cached_hub_id_is_found(
 def test_download_fetches_what_is_read_only(
     whole: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """One file of weights per part, no pickles, no other pipelines' files."""
+    """One file of weights per part, no pickles, no other pipelines' files; once is enough."""
     read = {p.relative_to(whole).as_posix() for p in whole.rglob("*") if p.is_file()}
     others = {
         "v2-1_512-ema-pruned.ckpt", "v2-1_512-ema-pruned.safetensors", "README.md",
@@ -356,6 +374,15 @@ def test_download_fetches_what_is_read_only(
     )
     assert find_model("owner/name", allow_download=True) == whole
     assert set(asked) == read
+    partial = tmp_path / "partial"
+    partial.mkdir()
+    monkeypatch.setattr(
+        "huggingface_hub.snapshot_download",
+        lambda model, **options: str(partial if options.get("local_files_only") else whole),
+    )
+    assert find_model("owner/name", allow_download=True) == whole
+    assert find_model("owner/name", allow_download=False) == partial
+    monkeypatch.setattr("huggingface_hub.snapshot_download", snapshot)
     with pytest.raises(ModelError, match="cache"):
         find_model("owner/name", allow_download=False)
 
