@@ -17,8 +17,10 @@ from __future__ import annotations
 import json
 import math
 import re
+import warnings
 from collections import Counter
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -322,12 +324,14 @@ def install_lora(prior: StableDiffusion, lora: Lora, name: str, where: str = "Lo
     """
     check_fit(prior.unet, lora, where)
     remove_lora(prior, name)
-    prior.unet.load_lora_adapter(
-        dict(lora.weights), prefix=None, adapter_name=name, metadata=lora.config()
-    )
+    with _without_warnings():
+        prior.unet.load_lora_adapter(
+            dict(lora.weights), prefix=None, adapter_name=name, metadata=lora.config()
+        )
     put_weights(prior, name, lora.weights, prior.unet_dtype)
     for parameter in lora_parameters(prior, name).values():
         parameter.requires_grad_(False)
+    prior.unet.eval()
     prior.adapters.add(name)
 
 
@@ -365,8 +369,17 @@ def check_fit(unet: nn.Module, lora: Lora, where: str) -> None:
 def remove_lora(prior: StableDiffusion, name: str) -> None:
     """Take an adapter away; nothing happens when there is none of that name."""
     if name in getattr(prior.unet, "peft_config", {}):
-        prior.unet.delete_adapters(name)
+        with _without_warnings():
+            prior.unet.delete_adapters(name)
     prior.adapters.discard(name)
+
+
+@contextmanager
+def _without_warnings() -> Iterator[None]:
+    """Hush peft, which warns whenever there are several adapters; here that is meant."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        yield
 
 
 def lora_parameters(prior: StableDiffusion, name: str) -> dict[str, nn.Parameter]:

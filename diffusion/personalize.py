@@ -142,6 +142,10 @@ def personalize(
     kept = crops[:0]
     if len(class_images.images):
         kept = encode_pictures(prior, class_images.images, ENCODE_BATCH, report)
+    if not bool(torch.isfinite(crops).all() and torch.isfinite(kept).all()):
+        raise ModelError(
+            "model", "its latents are not finite (found nan or inf)", "try --vae-precision fp32"
+        )
     clock.stop("encoding")
     before = evaluate(prior, crops, embeddings[:1], seed, None)
     lora = initial_lora(prior, settings.lora_layers, settings.lora_rank, seed)
@@ -474,13 +478,13 @@ def _read_stored(
             tensors = {key: file.get_tensor(key) for key in file.keys()}
         losses = tensors.pop("losses")
         before, after = header["errors"]
+        texts, told = tuple(header["class_prompts"]), tuple(header["notices"])
     except Exception as error:  # a damaged file makes libraries raise anything
         notices.append(f"{path}: not readable, trained again ({error})")
         log.warning("%s", notices[-1])
         return None
     layers = sorted({key.rsplit(".lora_", 1)[0] for key in tensors})
     lora = Lora(tensors, dict.fromkeys(layers, float(settings.lora_rank)), settings.lora_layers)
-    texts, told = tuple(header["class_prompts"]), tuple(header["notices"])
     return Personalization(name, lora, losses, (before, after), texts, {}, True, told)
 
 

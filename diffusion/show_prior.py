@@ -111,7 +111,7 @@ def show_personalization(
     Raises:
         ModelError: As `personalize` and `show_prior`.
     """
-    without = replace(settings, class_images=0)
+    without = replace(settings, class_images=0, lora=None)
     for name, chosen in ((WITH_CLASS, settings), (WITHOUT_CLASS, without)):
         personalize(prior, photo, prompts, chosen, seed, cache, name=name, report=report)
     return show_prior(
