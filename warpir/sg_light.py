@@ -16,15 +16,14 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from warpir.color import luminance
 from warpir.light import Lobes, map_directions
 
-UNIFORM_MEAN = 2.262
-"""Mean of the map that equal lobes of the start width make, in amplitudes, for any count."""
 WIDTH_FACTOR = 0.6
-"""Start width of a lobe in spacings of the lobes: their sum ripples by 1.8 %."""
+"""Start width of a lobe in spacings of the lobes: the sum of 64 ripples by 1.8 % (rms)."""
 TEXELS_PER_SIGMA = 1.25
-"""Narrowest lobe, in texels: its value at a texel's centre is then its mean (spectral accuracy of
-the midpoint rule for Gaussians), so maps need no supersampling and its flux is right."""
+"""Narrowest lobe, in texels: its values at texel centres then sum to its flux (spectral accuracy of
+the midpoint rule for Gaussians; 3 % too much at a pole), so maps need no supersampling."""
 WIDEST = 3.0
 """Widest lobe, sigma [rad]."""
 
@@ -36,16 +35,22 @@ class LightBounds:
     sigma_min: float
     """Narrowest lobe [rad]."""
     chroma: float = 1.5
-    """Largest log ratio of a channel to a lobe's mean, either way [1]."""
+    """Largest log ratio of a channel to the geometric mean of its lobe, either way; above 0 [1]."""
     intensity: float = 1e6
-    """Largest factor between an amplitude and the start level, either way [1]."""
+    """Largest factor between that mean and the start level, either way; at least 1 [1]."""
+
+    @property
+    def chroma_length(self) -> float:
+        """Bound on the length of a lobe's three log ratios; they sum to 0 [1]."""
+        return self.chroma * float(np.sqrt(1.5))
 
 
 class SGLight(torch.nn.Module):
     """One set of lobes, as the optimiser holds it.
 
     Args:
-        lobes: Where to start; amplitudes of 0 start at the least intensity.
+        lobes: Where to start; amplitudes of 0 start at the least intensity, and colours that the
+            bound excludes are drawn toward white at their luminance.
         level: Radiance that the intensity bound is relative to, relative [W/(m^2 sr)].
         bounds: What the lobes may not leave.
 
@@ -59,12 +64,15 @@ class SGLight(torch.nn.Module):
     def __init__(self, lobes: Lobes, level: float, bounds: LightBounds) -> None:
         super().__init__()
         self.level, self.bounds = float(level), bounds
-        amplitude = np.maximum(lobes.amplitude.astype(np.float64), level / bounds.intensity)
-        log = np.log(amplitude)
+        log = np.log(np.maximum(lobes.amplitude.astype(np.float64), level / bounds.intensity))
         intensity = log.mean(axis=1)
-        # The inverse of the bound; ratios at the bound itself have no raw value.
-        ratio = np.clip((log - intensity[:, None]) / bounds.chroma, -0.99, 0.99)
-        raw = bounds.chroma * np.arctanh(ratio)
+        ratio = log - intensity[:, None]
+        # The inverse of `log_ratios`; ratios at the bound itself have no raw value.
+        length, most = np.linalg.norm(ratio, axis=1), 0.99 * bounds.chroma_length
+        inside = ratio * (most / np.maximum(length, most))[:, None]
+        intensity += np.log(luminance(np.exp(ratio)) / luminance(np.exp(inside)))
+        share = (inside / bounds.chroma_length) ** 2
+        raw = inside / np.sqrt(1.0 - share.sum(axis=1, keepdims=True))
         sigma = 1.0 / np.sqrt(lobes.sharpness.astype(np.float64))
 
         def parameter(values: np.ndarray[tuple[int, ...], np.dtype[np.float64]]) -> Tensor:
@@ -80,11 +88,9 @@ class SGLight(torch.nn.Module):
     def uniform(count: int, level: float, bounds: LightBounds) -> SGLight:
         """Return grey lobes spread evenly whose map has the mean ``level``."""
         sigma = max(WIDTH_FACTOR * np.sqrt(4.0 * np.pi / count), bounds.sigma_min)
-        lobes = Lobes(
-            np.full((count, 3), level / UNIFORM_MEAN, np.float32),
-            fibonacci(count),
-            np.full(count, 1.0 / sigma**2, np.float32),
-        )
+        sharpness = np.full(count, 1.0 / sigma**2, np.float32)
+        lobes = Lobes(np.ones((count, 3), np.float32), fibonacci(count), sharpness)
+        lobes.amplitude[:] = 4.0 * np.pi * level / lobes.flux().sum(axis=0)
         return SGLight(lobes, level, bounds)
 
     def project(self) -> None:
@@ -98,9 +104,10 @@ class SGLight(torch.nn.Module):
             self.chroma -= self.chroma.mean(dim=1, keepdim=True)
 
     def log_ratios(self) -> Tensor:
-        """Return the bounded log colour ratios, shape [lobe, 3]."""
-        limit = self.bounds.chroma
-        return limit * torch.tanh(self.chroma / limit)
+        """Return the bounded log colour ratios, which sum to 0, shape [lobe, 3]."""
+        raw = self.chroma - self.chroma.mean(dim=1, keepdim=True)
+        size = (raw / self.bounds.chroma_length).square().sum(dim=1, keepdim=True)
+        return raw / torch.sqrt(1.0 + size)
 
     def amplitude(self) -> Tensor:
         """Return the lobes' peaks, relative [W/(m^2 sr)], shape [lobe, 3]."""
@@ -112,7 +119,7 @@ class SGLight(torch.nn.Module):
         Each texel holds the light at its centre, which is exact enough for lobes of at least
         `TEXELS_PER_SIGMA` texels; `warpir.bridge.rasterize` averages lobes of any width.
         """
-        directions = _directions(height).to(self.axis.device)
+        directions = _directions(height).to(self.axis)
         axis = self.axis / self.axis.norm(dim=1, keepdim=True)
         sharpness = torch.exp(-2.0 * self.log_sigma)
         exponent = (directions @ axis.T - 1.0) * sharpness
@@ -144,4 +151,4 @@ def fibonacci(count: int) -> np.ndarray[tuple[int, ...], np.dtype[np.float32]]:
 
 @lru_cache(maxsize=8)
 def _directions(height: int) -> Tensor:
-    return torch.from_numpy(map_directions(height, 2 * height).reshape(-1, 3).astype(np.float32))
+    return torch.from_numpy(map_directions(height, 2 * height).reshape(-1, 3))
