@@ -16,6 +16,8 @@ from warpir.tone import Knots
 
 LOG_FLOOR = 1e-8
 """Added to a normalised luminance before its logarithm [1/sr]."""
+FLUX_FLOOR = 1e-20
+"""Least flux that a map is normalised by; with less it is black, and its gradient stays finite."""
 
 
 def solid_angles(texels: Tensor) -> Tensor:
@@ -38,7 +40,7 @@ def consistency(texels_fg: Tensor, texels_shadow: Tensor) -> Tensor:
 
     def normalised(texels: Tensor) -> Tensor:
         grey = luminance(texels)
-        return grey / (grey * omega).sum().clamp(min=torch.finfo(grey.dtype).tiny)
+        return grey / (grey * omega).sum().clamp(min=FLUX_FLOOR)
 
     shadow = normalised(texels_shadow.detach())
     log_fg = torch.log(normalised(texels_fg) + LOG_FLOOR)
@@ -58,7 +60,8 @@ def chroma(light: SGLight) -> Tensor:
     light that is coloured as a whole is dear. The shares are detached: else a lobe would be dimmed
     for its colour.
     """
-    flux = light.amplitude().mean(dim=1) * torch.exp(2.0 * light.log_sigma)
+    variance = torch.exp(2.0 * light.log_sigma)
+    flux = light.amplitude().mean(dim=1) * variance * -torch.expm1(-2.0 / variance)
     share = (flux / flux.sum()).detach()
     return (share[:, None] * light.log_ratios().square()).sum()
 
