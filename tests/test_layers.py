@@ -12,7 +12,7 @@ LEVELS = (
     {"errors", "color"},
     {"optimize_settings", "asset", "strict_json"},
     {"config"},
-    {"camera", "asset_files", "record", "light", "tone", "curves"},
+    {"camera", "asset_files", "record", "progress", "light", "tone", "curves"},
     {"gltf_file", "mtl", "files", "command", "placement", "lobes_file", "lobe_fit"},
     {"gltf_material", "obj", "reuse"},
     {"gltf"},
@@ -55,7 +55,7 @@ ONLY_IN = {
     "safetensors": {"diffusion", "checkpoint", "transport_cache"},
     "colour": {"color"},
     "yaml": {"command"},
-    "rich": {"record"},
+    "rich": {"progress"},
 }  # fmt: skip
 DIFFUSION_IN = {"recover", "refine", "prior_images"}
 """Who drives the diffusion model; everyone else sees its settings, which are plain values."""

@@ -808,7 +808,7 @@ class OutputFolder:
                 type ``compositeSynthetic``).
             description: Text for the ``Description`` field.
         """
-        self.write_bytes(name, _png_bytes(codes, icc, mark, description))
+        self.write_bytes(name, png_bytes(codes, icc, mark, description))
 
     def write_exr(
         self, name: str, channels: Mapping[str, Pixels], header: Mapping[str, Any] | None = None
@@ -1089,7 +1089,7 @@ def _json_bytes(content: Mapping[str, Any]) -> bytes:
     return (json.dumps(content, indent=2, allow_nan=False, default=plain) + "\n").encode()
 
 
-def _png_bytes(codes: Pixels, icc: bytes | None, mark: bool, description: str) -> bytes:
+def png_bytes(codes: Pixels, icc: bytes | None, mark: bool, description: str) -> bytes:
     """Serialise a PNG.
 
     Written out here because Pillow has no 16-bit RGB, and OpenImageIO states sRGB beside any

@@ -16,6 +16,7 @@ and ``--validate`` answer without them.
 import errno
 import logging
 import os
+import shutil
 import signal
 import sys
 import threading
@@ -37,6 +38,7 @@ if TYPE_CHECKING:
     from warpir.inputs import Inputs, Loaders
     from warpir.lighting import SceneLight
     from warpir.picture import Picture
+    from warpir.record import Timings
 
 __all__ = ["InsertConfig", "Insertion", "insert", "main"]
 
@@ -100,7 +102,8 @@ def _insert_sequence(config: InsertConfig) -> Insertion:
 
 
 def _insert_one(config: InsertConfig, loaders: "Loaders | None" = None) -> Insertion:
-    from warpir.record import Timings, input_hashes, progress_bar, run_record
+    from warpir.progress import progress_bar
+    from warpir.record import Timings, input_hashes, run_record
     from warpir.strict_json import read_json_object
 
     timings = Timings()
@@ -115,20 +118,17 @@ def _insert_one(config: InsertConfig, loaders: "Loaders | None" = None) -> Inser
     with OutputFolder(config.out, overwrite=config.overwrite) as output:
         # Warp is loaded here, after everything that can be wrong was looked at.
         with timings.stage("load"):
-            from warpir.picture import Quality, make_picture
+            from warpir.picture import Quality, make_picture, scene_of
             from warpir.render import Renderer, choose_device
-            from warpir.scene import Placed, Proxy, Scene
 
             device = choose_device(config.device)
             _say(f"device: {device} (the first run compiles the kernels)")
+        recovered, notices = {}, inputs.notices
+        if config.guidance != "none":
+            light, recovered, found = _recover(config, inputs, light, device, output, timings)
+            notices = (*notices, *found)
         with timings.stage("scene"):
-            ground = inputs.placement.ground
-            scene = Scene(
-                [Placed(inputs.asset, inputs.placement.asset_to_world)],
-                _rendering_camera(inputs.camera, config),
-                Proxy(ground[:3], -float(ground[3])),
-                device,
-            )
+            scene = scene_of(inputs, _rendering_camera(inputs.camera, config), device)
         with timings.stage("render"), progress_bar() as report:
             picture = make_picture(
                 Renderer(scene, config.threads or 0, report),
@@ -154,12 +154,35 @@ def _insert_one(config: InsertConfig, loaders: "Loaders | None" = None) -> Inser
             device=str(scene.device),
             timings=timings,
             assumed=(*inputs.assumed, *light.assumed),
-            notices=inputs.notices,
-            measured={"triangles": scene.triangle_count, **measured},
+            notices=notices,
+            measured={"triangles": scene.triangle_count, **measured, **recovered},
         )
         output.write_json("run.json", record)
+    if config.guidance != "none":
+        # The results are in place: what was kept for a run that stops is not needed any more.
+        shutil.rmtree(output.path / "checkpoints", ignore_errors=True)
     record = read_json_object(output.path / "run.json")
     return Insertion(output.path, (*record["files"], "run.json"), record)
+
+
+def _recover(
+    config: InsertConfig,
+    inputs: "Inputs",
+    light: "SceneLight",
+    device: str,
+    output: "OutputFolder",
+    timings: "Timings",
+) -> "tuple[SceneLight, dict[str, Any], tuple[str, ...]]":
+    """Let the diffusion model find the light; return it with what run.json says of it."""
+    from warpir.progress import StepProgress
+    from warpir.recover import Run, recover
+
+    with StepProgress(_say) as progress:
+        run = Run(config, inputs, device, output, timings, _say, progress)
+        light, record, notices = recover(run, light)
+    for notice in notices:
+        _say(f"notice: {notice}")
+    return light, record, notices
 
 
 def _rendering_camera(camera: "Camera", config: InsertConfig) -> "Camera":

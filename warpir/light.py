@@ -317,3 +317,21 @@ def summarize(light: Light) -> LightSummary:
         elevation_deg=elevation,
         peak_share=float((lum * omega)[near].sum()) / flux if flux > 0.0 else 0.0,
     )
+
+
+def describe(summary: LightSummary, c2w: Float64Array) -> str:
+    """Return a light in words, as a person at the camera would point at it.
+
+    Args:
+        summary: Of the light, in the world frame.
+        c2w: Pose of the camera, shape [4, 4].
+    """
+    right, _, back = (np.asarray(c2w)[:3, k] * (1.0, 0.0, 1.0) for k in range(3))
+    axis = axis_from_angles(summary.azimuth_deg, summary.elevation_deg)
+    around = float(np.degrees(np.arctan2(axis @ right, -(axis @ back)))) % 360.0
+    sides = ("ahead", "ahead on the right", "the right", "behind on the right")
+    sides += ("behind", "behind on the left", "the left", "ahead on the left")
+    side = sides[round(around / 45.0) % 8]
+    height = "overhead" if summary.elevation_deg > 75.0 else f"{summary.elevation_deg:.0f} deg high"
+    where = height if height == "overhead" else f"from {side}, {height}"
+    return f"light {where}, {100.0 * summary.peak_share:.0f} % of it from there"

@@ -13,8 +13,9 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from warpir.camera import Camera
 from warpir.fusion import fuse
-from warpir.light import Light, Lobes
+from warpir.light import Light, Lobes, describe, summarize
 from warpir.optimize import Guide, Optimization
 from warpir.optimize_settings import OptimizeSettings
 from warpir.regularizers import bend, chroma, consistency, spread
@@ -150,6 +151,12 @@ class LightOptimization(Optimization):
             curves = bend(self.unknowns.curve_fg()) + bend(self.unknowns.curve_shadow())
             terms["bend"] = settings.bend, curves
         return terms
+
+    def describe(self, camera: Camera) -> str:
+        """Return where the light comes from, and how much of it."""
+        with torch.no_grad():
+            texels = self.lights(self.final_fusion)[1].cpu().numpy()
+        return describe(summarize(Light(texels=texels)), camera.c2w)
 
     def project(self) -> None:
         """Keep both lights within their bounds."""

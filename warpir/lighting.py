@@ -25,6 +25,8 @@ SUN_TO_SKY = 5.0
 """Irradiance of a surface facing the sun over that from a clear sky on the ground [1]."""
 DEFAULT_SUN = (-120.0, 40.0)
 """Azimuth and elevation when nothing is said about the light [deg]: from the left, behind."""
+GROUND_PERCENTILE = 50.0
+"""Of the ground round the object: the level of an even light (the authors state none)."""
 LIT_PERCENTILE = 75.0
 """The brighter quarter of the ground round the object stands for ground that is not in shadow."""
 
@@ -55,6 +57,8 @@ def make_light(inputs: Inputs, config: InsertConfig) -> SceneLight:
     """
     if inputs.run is not None:
         return _reused(inputs.run, config)
+    if config.guidance != "none" and not is_described(config) and inputs.light is None:
+        return _even(inputs, config)
     assumed: list[str] = []
     light = inputs.light if inputs.light is not None else _described(config, assumed)
     fit = None
@@ -71,6 +75,25 @@ def make_light(inputs: Inputs, config: InsertConfig) -> SceneLight:
     light = light.scaled(2.0**exposure)
     curves = Curves.identity(config.tone_operator)
     return SceneLight(light, light, curves, exposure, tuple(assumed), fit)
+
+
+def is_described(config: InsertConfig) -> bool:
+    """Return whether the user said anything about the light."""
+    return any(v is not None for v in (config.light, config.sun, config.sky))
+
+
+def _even(inputs: Inputs, config: InsertConfig) -> SceneLight:
+    """Return an even light at the ground's level, from which guidance starts (ours)."""
+    level = start_level(inputs, config)
+    light = Light(texels=np.full((8, 16, 3), level, np.float32))
+    assumed = "nothing about the light: the recovery starts from an even one (--light, --sun)"
+    return SceneLight(light, light, Curves.identity(config.tone_operator), 0.0, (assumed,))
+
+
+def start_level(inputs: Inputs, config: InsertConfig) -> float:
+    """Return the radiance of an even light under which white ground looks as the photo's does."""
+    level = float(np.clip(ground_level(inputs, GROUND_PERCENTILE), 1e-3, 0.9))
+    return level / (1.0 - level) if config.tone_operator == "reinhard" else level
 
 
 def _reused(run: EarlierRun, config: InsertConfig) -> SceneLight:

@@ -19,6 +19,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from warpir.camera import Camera
 from warpir.errors import ExitCode, InputError
 from warpir.optimize_settings import OptimizeSettings
 
@@ -107,6 +108,10 @@ class Optimization(ABC):
     @abstractmethod
     def terms(self) -> dict[str, tuple[float, Tensor]]:
         """Return the regularisers by name, each with its weight."""
+
+    @abstractmethod
+    def describe(self, camera: Camera) -> str:
+        """Return in a few words where the unknowns stand, for a person who waits."""
 
     @abstractmethod
     def project(self) -> None:

@@ -11,8 +11,10 @@ from warpir.camera import Camera
 from warpir.color import linear_to_gamma
 from warpir.curves import ToneKnots
 from warpir.files import Layers, Photo
+from warpir.inputs import Inputs
 from warpir.light import Light, as_map, map_directions, texel_solid_angles
 from warpir.render import Foreground, GBuffer, Renderer, light_args
+from warpir.scene import Placed, Proxy, Scene
 
 FloatArray = NDArray[np.float32]
 Float64Array = NDArray[np.float64]
@@ -137,6 +139,19 @@ def make_picture(
     )
 
 
+def scene_of(inputs: Inputs, camera: Camera, device: str) -> Scene:
+    """Put the object onto its plane.
+
+    Args:
+        inputs: Asset and placement.
+        camera: At the resolution that is to be rendered.
+        device: Warp device.
+    """
+    ground = inputs.placement.ground
+    placed = Placed(inputs.asset, inputs.placement.asset_to_world)
+    return Scene([placed], camera, Proxy(ground[:3], -float(ground[3])), device)
+
+
 def _parts(foreground: Foreground, premultiplied: FloatArray) -> dict[str, FloatArray]:
     """Split the tone-mapped object so that diffuse + specular + emission = foreground.
 
@@ -182,8 +197,8 @@ def _resize_planes(planes: dict[str, FloatArray], height: int, width: int) -> di
     background, its depth would fall to 0 along the outline.
     """
     seen = np.isfinite(planes["depth"])
-    share = _resize(seen.astype(np.float32), height, width)
-    resized = {name: _resize(plane, height, width) for name, plane in planes.items()}
+    share = resize(seen.astype(np.float32), height, width)
+    resized = {name: resize(plane, height, width) for name, plane in planes.items()}
     shown = (share > SLIVER) & (resized["matte"] > 0.0)
     weight = np.where(shown, share, 1.0)
     for name in ("depth", "position", "normal", "albedo", "roughness"):
@@ -195,13 +210,13 @@ def _resize_planes(planes: dict[str, FloatArray], height: int, width: int) -> di
     return resized
 
 
-def _resize(plane: FloatArray, height: int, width: int) -> FloatArray:
+def resize(plane: FloatArray, height: int, width: int) -> FloatArray:
     """Bring a plane to the photo's size: bilinear up, area-filtered down."""
-    from skimage.transform import resize
+    from skimage.transform import resize as resize_image
 
     finite = np.where(np.isfinite(plane), plane, 0.0)
     down = plane.shape[0] > height
-    resized = resize(  # type: ignore[no-untyped-call]
+    resized = resize_image(  # type: ignore[no-untyped-call]
         finite, (height, width, *plane.shape[2:]), order=1, anti_aliasing=down, preserve_range=True
     )
     return np.asarray(resized, dtype=np.float32)

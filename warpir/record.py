@@ -4,7 +4,7 @@ import hashlib
 import platform
 import sys
 import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import asdict
 from pathlib import Path
@@ -15,7 +15,10 @@ from warpir.config import InsertConfig
 
 RUN_FORMAT = 1
 """Layout number of ``run.json``; a newer one is refused: its keys may mean other things."""
-RECORDED_PACKAGES = ("warp-lang", "torch", "numpy", "trimesh", "OpenEXR", "OpenImageIO", "pillow")
+RECORDED_PACKAGES = (
+    *("warp-lang", "torch", "numpy", "trimesh", "OpenEXR", "OpenImageIO", "pillow"),
+    *("diffusers", "transformers", "peft", "safetensors"),
+)
 
 
 class Timings:
@@ -33,31 +36,6 @@ class Timings:
         finally:
             spent = time.perf_counter() - start
             self.seconds[name] = self.seconds.get(name, 0.0) + spent
-
-
-@contextmanager
-def progress_bar() -> Iterator[Callable[[str, float], None]]:
-    """Show the stages of a render on a terminal; nothing where output is not one.
-
-    Yields:
-        A function to be called with a stage's name and the share of it that is done.
-    """
-    if not sys.stderr.isatty():
-        yield lambda stage, share: None
-        return
-    from rich.console import Console
-    from rich.progress import Progress
-
-    with Progress(console=Console(stderr=True), transient=True) as progress:
-        tasks: dict[str, Any] = {}
-
-        def report(stage: str, share: float) -> None:
-            if stage:
-                if stage not in tasks:
-                    tasks[stage] = progress.add_task(stage, total=1.0)
-                progress.update(tasks[stage], completed=share)
-
-        yield report
 
 
 def run_record(

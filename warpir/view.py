@@ -46,6 +46,14 @@ class Frame:
     """Surface interactions of the object's paths."""
     seed: int
 
+    def coverage(self) -> FloatArray:
+        """Return the object's share of each pixel, from a few samples, shape [H, W]."""
+        height, width = self.photo_lin.shape[:2]
+        plane = np.zeros(height * width, np.float32)
+        gbuffer = self.renderer.gbuffer(self.seed)
+        plane[gbuffer.object_pixels] = gbuffer.coverage
+        return plane.reshape(height, width)
+
 
 class View:
     """Renders composites of a frame; gradients to the light (and with `mis` to materials).
@@ -58,8 +66,7 @@ class View:
         cache: Folder for traced rows, or None.
 
     Attributes:
-        mask: Coverage of the object, shape [H, W].
-        seconds_traced: What tracing took [s].
+        transport: The integrator whose rows were traced, or None.
     """
 
     def __init__(
@@ -76,21 +83,15 @@ class View:
         proxies = _shaded(renderer, expected, seed)
         self.integrator: Integrator
         self.transport: TransportIntegrator | None = None
-        self.seconds_traced = 0.0
         if transport is not None:
             self.transport = TransportIntegrator(
                 renderer, objects, proxies, frame.depth, transport, expected, seed, cache
             )
             self.integrator, coverage = self.transport, self.transport.mask
-            self.seconds_traced = self.transport.seconds_traced
         else:
             self.integrator = MisIntegrator(renderer, objects, proxies, mis_samples, 1, frame.depth)
             args = light_args(expected, renderer.device)
             coverage = renderer.foreground(args, objects, COVERAGE_SAMPLES, 1, 1, seed).mask
-        height, width = frame.photo_lin.shape[:2]
-        plane = np.zeros(height * width, np.float32)
-        plane[objects] = coverage
-        self.mask: FloatArray = plane.reshape(height, width)
         self.constants = ComposeConstants(
             frame.photo_lin,
             objects,

@@ -1,0 +1,118 @@
+"""What a waiting person sees: stages, steps, the time that is left."""
+
+from __future__ import annotations
+
+import sys
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from types import TracebackType
+from typing import Any, Self
+
+LINE_SECONDS = 10.0
+"""Least time between two lines where there is no terminal [s]."""
+
+
+@contextmanager
+def progress_bar() -> Iterator[Callable[[str, float], None]]:
+    """Show the stages of a render on a terminal; nothing where output is not one.
+
+    Yields:
+        A function to be called with a stage's name and the share of it that is done.
+    """
+    if not sys.stderr.isatty():
+        yield lambda stage, share: None
+        return
+    from rich.console import Console
+    from rich.progress import Progress
+
+    with Progress(console=Console(stderr=True), transient=True) as progress:
+        tasks: dict[str, Any] = {}
+
+        def report(stage: str, share: float) -> None:
+            if stage:
+                if stage not in tasks:
+                    tasks[stage] = progress.add_task(stage, total=1.0)
+                progress.update(tasks[stage], completed=share)
+
+        yield report
+
+
+class StepProgress:
+    """Steps of long stages: bars on a terminal, now and then a line where there is none.
+
+    Args:
+        say: Prints a line.
+    """
+
+    def __init__(self, say: Callable[[str], None]) -> None:
+        self.say = say
+        self._bars: Any = None
+        self._tasks: dict[str, Any] = {}
+        self._started: dict[str, tuple[float, int]] = {}
+        self._last_line = -LINE_SECONDS
+
+    def __enter__(self) -> Self:
+        """Open the bars where there is a terminal."""
+        if sys.stderr.isatty():
+            from rich.console import Console
+            from rich.progress import (
+                BarColumn,
+                MofNCompleteColumn,
+                Progress,
+                TextColumn,
+                TimeRemainingColumn,
+            )
+
+            self._bars = Progress(
+                TextColumn("{task.description}"),
+                BarColumn(),
+                MofNCompleteColumn(),
+                TimeRemainingColumn(),
+                TextColumn("{task.fields[words]}"),
+                console=Console(stderr=True),
+            )
+            self._bars.start()
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        """Close the bars."""
+        if self._bars is not None:
+            self._bars.stop()
+
+    def report(self, stage: str, done: int, total: int, words: str = "") -> None:
+        """Show how far a stage is.
+
+        Args:
+            stage: Name of the stage.
+            done: Steps that are done.
+            total: Steps in all.
+            words: What else is to be said, such as where the light comes from.
+        """
+        if self._bars is not None:
+            if stage not in self._tasks:
+                self._tasks[stage] = self._bars.add_task(stage, total=total, words=words)
+            self._bars.update(self._tasks[stage], completed=done, total=total, words=words)
+            return
+        now = time.monotonic()
+        # A resumed stage does not start at 0.
+        started, first = self._started.setdefault(stage, (now, done))
+        is_end = done >= total
+        if now - self._last_line < LINE_SECONDS and not is_end:
+            return
+        self._last_line = now
+        left = ""
+        if first < done < total:
+            left = f", {_duration((now - started) / (done - first) * (total - done))} left"
+        self.say(f"{stage}: {done} of {total}{left}{'; ' if words else ''}{words}")
+
+
+def _duration(seconds: float) -> str:
+    if seconds < 100.0:
+        return f"about {seconds:.0f} s"
+    return f"about {seconds / 60.0:.0f} min"

@@ -1,0 +1,381 @@
+"""Recover the light of a photograph: model, personalisation, guidance, optimisation, in that order.
+
+What comes out stands in the place of a light that the user gave (`warpir.lighting.SceneLight`), so
+that everything behind it, from the final render to the files, is one and the same.
+"""
+
+from __future__ import annotations
+
+import tempfile
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import asdict, dataclass, fields
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from warpir.checkpoint import Checkpoint, Checkpoints
+from warpir.color import linear_to_gamma
+from warpir.config import InsertConfig
+from warpir.curves import Curves, ToneKnots
+from warpir.diffusion.cache import cache_folder, write_file
+from warpir.diffusion.guidance import DatasetUpdate, Guidance, NonFiniteError, make_guidance
+from warpir.diffusion.lora_files import Lora, save_lora
+from warpir.diffusion.personalize import personalize
+from warpir.diffusion.prior import Condition, ModelError
+from warpir.diffusion.prompts import Prompts, make_prompts
+from warpir.diffusion.show_prior import show_personalization
+from warpir.diffusion.stable_diffusion import StableDiffusion, load_stable_diffusion
+from warpir.errors import ExitCode, InputError
+from warpir.files import OutputFolder, png_bytes
+from warpir.inputs import Inputs
+from warpir.light import Lobes, as_map
+from warpir.light_optimization import LightOptimization, Unknowns
+from warpir.lighting import SceneLight, is_described, start_level
+from warpir.lobe_fit import fit_lobes
+from warpir.lobes_file import lobes_to_json
+from warpir.optimize import Optimization
+from warpir.picture import resize, scene_of
+from warpir.progress import StepProgress
+from warpir.record import Timings, input_hashes, versions
+from warpir.render import Renderer
+from warpir.sg_light import narrowest
+from warpir.tone import ToneCurve
+from warpir.transport_cache import default_cache
+from warpir.view import Frame
+
+FloatArray = NDArray[np.float32]
+
+LIGHT_HEIGHT = 256
+"""Rows of the map that is delivered."""
+START_HEIGHT = 128
+"""Rows of the map to which a given light is fitted as a start."""
+SAY_EVERY = 25
+"""Steps between two looks at the light, for people."""
+SHOWN_SEEDS = (0, 1, 2)
+"""Of the pictures of --show-prior."""
+NOT_IDENTITY = frozenset(
+    {"out", "overwrite", "resume", "preview_every", "checkpoint_every", "threads", "mark"}
+    | {"allow_download", "show_prior", "samples", "rays", "indirect_limit", "width"}
+)
+"""Settings that an interrupted run may change: they do not reach the optimisation."""
+
+Say = Callable[[str], None]
+
+
+@dataclass(frozen=True)
+class Run:
+    """One guided run: what all of its stages share."""
+
+    config: InsertConfig
+    inputs: Inputs
+    device: str
+    """Warp device; torch uses the same."""
+    output: OutputFolder
+    timings: Timings
+    say: Say
+    progress: StepProgress
+
+    @property
+    def torch_device(self) -> torch.device:
+        """The device of model and unknowns."""
+        return torch.device("cpu" if self.device == "cpu" else self.device)
+
+
+@dataclass(frozen=True)
+class Guided:
+    """A model that has seen the photo, ready to judge composites of it."""
+
+    prior: StableDiffusion
+    prompts: Prompts
+    adapter: str | None
+    lora: Lora | None
+    record: dict[str, Any]
+    """What run.json says of model and personalisation."""
+    notices: tuple[str, ...]
+
+
+def recover(run: Run, start: SceneLight) -> tuple[SceneLight, dict[str, Any], tuple[str, ...]]:
+    """Recover light and tone curves.
+
+    Args:
+        run: Configuration, inputs, output folder.
+        start: The light that was given, or the one that stands for none.
+
+    Returns:
+        Light and curves, what run.json says about them, and notices.
+
+    Raises:
+        InputError: The model cannot be used (exit 4), memory is short (5), the numbers stayed
+            non-finite (6), or ``--resume`` finds no checkpoint of this run.
+    """
+    config = settings = run.config
+    with _as_input_errors():
+        checkpoints, resumed = open_checkpoints(run)
+        guided = prepare_guidance(run, checkpoints, resumed)
+        with run.timings.stage("scene"):
+            frame = make_frame(run)
+            unknowns = start_of(run, start).to(run.torch_device)
+        with run.timings.stage("trace"):
+            guide = make_guide(run, guided, frame)
+            loop = LightOptimization(frame, guide, settings, unknowns, default_cache())
+        with torch.no_grad():
+            first = loop.guide.score(loop.final_image(config.seed))
+        optimize(run, loop, checkpoints, resumed)
+        notices = (*guided.prior.notices, *guided.notices, *loop_notices(loop))
+        light_fg, light_shadow = loop.final_lights(LIGHT_HEIGHT)
+        unknowns = loop.unknowns
+        run.output.write_json("lobes.json", lobes_to_json(unknowns.light_fg.lobes()))
+        if settings.fusion != "single":
+            shadow = lobes_to_json(unknowns.light_shadow.lobes())
+            run.output.write_json("lobes_shadow.json", shadow)
+        run.output.write_json("optimization.json", convergence(loop, first))
+        write_lora(run, guided)
+        curves = Curves(
+            config.tone_operator, knots_of(unknowns.curve_fg), knots_of(unknowns.curve_shadow)
+        )
+    record = {
+        **guided.record,
+        "prior": guided.prior.name,
+        "loop_integrator": settings.integrator,
+        "optimization": summary_of(loop, first),
+    }
+    light = SceneLight(light_fg, light_shadow, curves, 0.0, start.assumed)
+    return light, record, notices
+
+
+def open_checkpoints(run: Run) -> tuple[Checkpoints, Checkpoint | None]:
+    """Return the run's checkpoints, and with --resume the one to go on from.
+
+    Raises:
+        InputError: --out holds an unfinished run that is neither resumed nor overwritten, or the
+            run to resume is not there or was another.
+    """
+    config = run.config
+    values = {f.name: getattr(config, f.name) for f in fields(config)}
+    identity = {
+        "config": {k: v for k, v in values.items() if k not in NOT_IDENTITY and v is not None},
+        "inputs": input_hashes(config),
+        "device": run.device,
+        "versions": versions(),
+    }
+    checkpoints = Checkpoints(run.output.path, identity)
+    if config.resume:
+        found = checkpoints.load(lambda text: run.say(f"notice: {text}"))
+        run.say(f"resumed: {found.stage}, step {found.step}")
+        return checkpoints, found
+    if checkpoints.newest is not None and not config.overwrite:
+        raise InputError(
+            run.output.path,
+            f"holds an unfinished run ({checkpoints.newest})",
+            "--resume goes on with it, --overwrite starts it again",
+            ExitCode.OUTPUT,
+        )
+    checkpoints.remove()
+    return checkpoints, None
+
+
+def prepare_guidance(
+    run: Run, checkpoints: Checkpoints, resumed: Checkpoint | None = None
+) -> Guided:
+    """Load the model and adapt it to the photo."""
+    config = run.config
+    assert config.prompt is not None
+    with run.timings.stage("model"):
+        prior = load_stable_diffusion(config, run.torch_device)
+        prompts = make_prompts(config.prompt, config)
+        shown = [*(config.show_prior or ())]
+        prior.embed([prompts.photo, prompts.class_, prompts.guidance, "", *shown])
+        if config.negative_prompt:
+            prior.embed([config.negative_prompt])
+    run.say(f"model: {prior.name} {config.model}, sha256 {prior.digest[:16]}...")
+    run.say(f'guidance asks for "{prompts.guidance}"')
+    record: dict[str, Any] = {
+        "model": {"name": prior.name, "sha256": prior.weight_hashes},
+        "prompts": asdict(prompts),
+    }
+    if not config.personalize:
+        prior.free_text_encoder()
+        return Guided(prior, prompts, None, None, record, ())
+    photo = torch.from_numpy(run.inputs.photo.srgb).permute(2, 0, 1)[None].contiguous()
+    cache = cache_folder()
+    with run.timings.stage("personalize"):
+        if shown:
+            sheet = show_personalization(
+                prior, photo, prompts, config, config.seed, cache, shown, SHOWN_SEEDS,
+                run.progress.report,
+            )  # fmt: skip
+            run.output.write_png("prior.png", sheet, mark=False, description="The model's idea")
+        every = config.checkpoint_every
+
+        def on_step(training: Any) -> None:
+            if every and training.step_count % every == 0:
+                checkpoints.save("personalize", training.step_count, training.state_dict())
+
+        made = personalize(
+            prior,
+            photo,
+            prompts,
+            config,
+            config.seed,
+            cache,
+            report=run.progress.report,
+            on_step=on_step,
+            resume=resumed.state if resumed and resumed.stage == "personalize" else None,
+        )
+    prior.free_text_encoder()
+    record["personalization"] = {
+        "reused": made.is_reused,
+        "class_prompts": list(made.class_prompts),
+        "error_before_after": made.evaluation and list(made.evaluation),
+        "seconds": made.seconds,
+    }
+    return Guided(prior, prompts, made.adapter, made.lora, record, made.notices)
+
+
+def make_frame(run: Run) -> Frame:
+    """Return scene and photo at the loop's resolution."""
+    config, camera = run.config, run.inputs.camera
+    width = min(config.guidance_width, camera.width)
+    small = camera.scaled(width, max(1, round(width * camera.height / camera.width)))
+    renderer = Renderer(scene_of(run.inputs, small, run.device), config.threads or 0)
+    photo = np.clip(resize(run.inputs.photo.linear(), small.height, small.width), 0.0, None)
+    return Frame(renderer, photo, config.tone_operator == "reinhard", config.depth, config.seed)
+
+
+def start_of(run: Run, start: SceneLight) -> Unknowns:
+    """Return the unknowns: lobes fitted to a light that was given, else an even light."""
+    config = run.config
+    lobes = None
+    if is_described(config):
+        fitted = fit_lobes(as_map(start.light, START_HEIGHT), config.lobes).lobes
+        lobes = widened(fitted, narrowest(config.light_height))
+    return Unknowns.start(lobes, start_level(run.inputs, config), config)
+
+
+def widened(lobes: Lobes, sigma_min: float) -> Lobes:
+    """Return lobes that are no narrower than ``sigma_min`` [rad], of the same flux."""
+    sharpness = np.minimum(lobes.sharpness, 1.0 / sigma_min**2).astype(np.float32)
+    wide = Lobes(np.ones_like(lobes.amplitude), lobes.axis, sharpness)
+    amplitude = (lobes.flux() / wide.flux()).astype(np.float32)
+    return Lobes(amplitude, lobes.axis, sharpness)
+
+
+def make_guide(run: Run, guided: Guided, frame: Frame) -> Guidance | DatasetUpdate:
+    """Return the guidance of the configured loss over a picture of the frame's size.
+
+    Raises:
+        InputError: The loss needs an adapter and there is none, or the object is not in the frame.
+    """
+    config = run.config
+    shown = linear_to_gamma(frame.photo_lin).astype(np.float32)
+    background = torch.from_numpy(shown).permute(2, 0, 1)[None].to(run.torch_device)
+    prompts = guided.prompts
+    condition = Condition(
+        prompts.guidance, negative_prompt=config.negative_prompt, background=background
+    )
+    seen = torch.from_numpy(frame.coverage())
+    try:
+        guide = make_guidance(
+            guided.prior, condition, config, seen, config.steps, config.seed, guided.adapter
+        )
+    except ValueError as error:
+        raise InputError("--guidance", str(error), code=ExitCode.USAGE) from None
+    if isinstance(guide, Guidance):
+        guide.ensure_precision(background)
+    return guide
+
+
+def optimize(
+    run: Run, loop: Optimization, checkpoints: Checkpoints, resumed: Checkpoint | None
+) -> None:
+    """Run a loop to its end, with checkpoints, previews and progress."""
+    config = run.config
+    if resumed is not None and resumed.stage == "optimize":
+        loop.load_state_dict(resumed.state)
+    words = ""
+
+    def on_step(loop: Optimization) -> None:
+        nonlocal words
+        step = loop.state.step
+        if step % SAY_EVERY == 0 or step == config.steps:
+            words = loop.describe(run.inputs.camera)
+        run.progress.report("optimisation", step, config.steps, words)
+        if config.preview_every and step % config.preview_every == 0:
+            write_preview(run, loop, step)
+        if config.checkpoint_every and step % config.checkpoint_every == 0:
+            checkpoints.save("optimize", step, loop.state_dict())
+
+    with run.timings.stage("optimize"):
+        loop.run(on_step)
+
+
+def write_preview(run: Run, loop: Optimization, step: int) -> None:
+    """Write the composite as it stands to ``progress/``; earlier results are not touched."""
+    with torch.no_grad():
+        image = loop.final_image(run.config.seed)[0].permute(1, 2, 0).cpu().numpy()
+    path = run.output.path / "progress" / f"preview-{step:06d}.png"
+    write_file(path, png_bytes(np.round(image * 255.0).astype(np.uint8), None, False, ""))
+    run.say(f"preview: {path}")
+
+
+def knots_of(curve: ToneCurve) -> ToneKnots:
+    """Return a curve as plain arrays."""
+    return ToneKnots(*curve.arrays())
+
+
+def loop_notices(loop: Optimization) -> Iterator[str]:
+    """Yield what the user should know of a finished loop."""
+    if loop.state.skipped:
+        yield f"{loop.state.skipped} steps had no finite gradient and were skipped"
+
+
+def summary_of(loop: Optimization, first: float | None) -> dict[str, Any]:
+    """Return the few numbers that say how a loop went."""
+    state = loop.state
+    return {
+        "steps": state.step,
+        "skipped_steps": state.skipped,
+        "score_at_start": first,
+        "best_score": state.best_score,
+        "best_step": state.best_step if state.best_step >= 0 else state.step,
+    }
+
+
+def convergence(loop: Optimization, first: float | None) -> dict[str, Any]:
+    """Return the content of ``optimization.json``: every step's numbers by name."""
+    names = sorted({name for entry in loop.state.history for name in entry})
+    columns = {name: [entry.get(name) for entry in loop.state.history] for name in names}
+    return {
+        "format": "warpir-optimization",
+        "version": 1,
+        **summary_of(loop, first),
+        "by_step": columns,
+    }
+
+
+def write_lora(run: Run, guided: Guided) -> None:
+    """Write the adapter in diffusers' and kohya's forms."""
+    lora, prior = guided.lora, guided.prior
+    if lora is None:
+        return
+    with tempfile.TemporaryDirectory() as folder:
+        for path in save_lora(
+            lora, folder, prior.unet.config.cross_attention_dim, prior.schedule.prediction_type,
+            guided.prompts.photo,
+        ):  # fmt: skip
+            run.output.write_bytes(path.name, path.read_bytes())
+
+
+@contextmanager
+def _as_input_errors() -> Iterator[None]:
+    """Turn the model's errors into the program's."""
+    try:
+        yield
+    except ModelError as error:
+        raise InputError(error.where, error.what, error.advice, ExitCode.MODEL) from None
+    except NonFiniteError as error:
+        advice = "try --precision fp32; the last checkpoint holds the state before"
+        raise InputError("guidance", str(error), advice, ExitCode.NUMERIC) from None
