@@ -368,6 +368,7 @@ def check_fit(unet: nn.Module, lora: Lora, where: str) -> None:
 
 def remove_lora(prior: StableDiffusion, name: str) -> None:
     """Take an adapter away; nothing happens when there is none of that name."""
+    prior.forget_graphs()
     if name in getattr(prior.unet, "peft_config", {}):
         with _without_warnings():
             prior.unet.delete_adapters(name)
@@ -398,6 +399,7 @@ def put_weights(
     prior: StableDiffusion, name: str, weights: Mapping[str, Tensor], dtype: torch.dtype
 ) -> None:
     """Give an adapter's parameters values and a precision."""
+    prior.forget_graphs()
     for key, parameter in lora_parameters(prior, name).items():
         parameter.data = weights[key].detach().to(parameter.device, dtype, copy=True)
 

@@ -113,8 +113,8 @@ def personalize(
         report: Is told a stage, the steps done and the steps in all.
         on_step: Sees the training after each step, to keep its `state_dict` or to stop the run.
         resume: `LoraTraining.state_dict` of a run that was stopped.
-        record: Given the training, returns what replaces its `update`, such as a CUDA graph's
-            replay.
+        record: Given the training, returns what replaces its `update`; by default a CUDA graph,
+            where the prior has them.
 
     Raises:
         ModelError: The LoRA cannot be loaded or trained, or ``resume`` is another training's.
@@ -154,7 +154,11 @@ def personalize(
     with LoraTraining(prior, lora, crops, kept, embeddings, settings, seed, key, name) as training:
         if resume is not None:
             training.load_state_dict(resume)
-        update = record(training) if record else training.update
+        update: Callable[[], None] = training.update
+        if record:
+            update = record(training)
+        elif prior.graphs is not None:
+            update = prior.graphs.recorded_step(training.update)
         while training.step_count < settings.lora_steps:
             training.prepare(training.step_count)
             update()

@@ -15,6 +15,7 @@ import logging
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import AbstractContextManager, contextmanager
+from functools import partial
 from typing import Any
 
 import torch
@@ -26,8 +27,10 @@ from diffusers import (
     UNet2DConditionModel,
 )
 from torch import Tensor, nn
+from torch.utils.checkpoint import checkpoint
 from transformers import CLIPTextModel, CLIPTokenizer
 
+from warpir.diffusion.cuda_graphs import Graphs
 from warpir.diffusion.model_folder import (
     LATENT_CHANNELS,
     ModelFolder,
@@ -69,6 +72,7 @@ class StableDiffusion:
         scheduler_config: The model's own; `SCHEDULE_WORDS` of it are used.
         weight_hashes: sha256 by name of a weight file.
         checkpoint_vae: Recompute the VAE's encoder in the backward pass instead of keeping it.
+        graphs: Record what is done often as CUDA graphs; the device must be one.
     """
 
     name = "stable-diffusion"
@@ -82,16 +86,21 @@ class StableDiffusion:
         scheduler_config: dict[str, Any],
         weight_hashes: dict[str, str],
         checkpoint_vae: bool = True,
+        graphs: bool = False,
     ) -> None:
         self.unet, self.vae, self.tokenizer = unet, vae, tokenizer
         self.text_encoder: CLIPTextModel | None = text_encoder
         for model in (unet, vae, text_encoder):
             model.requires_grad_(False).eval()
         if checkpoint_vae:
-            vae.enable_gradient_checkpointing()
+            # There is no randomness to repeat, and asking for its state would stop a recording.
+            vae.enable_gradient_checkpointing(
+                partial(checkpoint, use_reentrant=False, preserve_rng_state=False)
+            )
             # The encoder recomputes this block as a whole: once is enough.
             vae.encoder.mid_block.gradient_checkpointing = False
         self.device: torch.device = unet.device
+        self.graphs = Graphs(self.device) if graphs else None
         self.unet_dtype: torch.dtype = unet.dtype
         """Arithmetic of the UNet; an adapter in training may have its own."""
         self.latent_size: int = unet.config.sample_size
@@ -148,8 +157,16 @@ class StableDiffusion:
                 f"image: shape {tuple(image.shape)} (expected [B, 3, R, R], {expected})"
             )
         pixels = (2.0 * image - 1.0).to(self.device, self.vae.dtype)
-        mean: Tensor = self.vae.encode(pixels).latent_dist.mean
+        if self.graphs is not None and pixels.requires_grad and torch.is_grad_enabled():
+            mean = self.graphs.run_with_gradient("encode", self._mean, pixels)
+        else:
+            mean = self._mean(pixels)
         return mean.float() * self._latent_scale
+
+    def _mean(self, pixels: Tensor) -> Tensor:
+        """Return the mean of the posterior, shape [B, 4, h, w]."""
+        mean: Tensor = self.vae.encode(pixels).latent_dist.mean
+        return mean
 
     @torch.no_grad()
     def decode(self, latents: Tensor) -> Tensor:
@@ -288,7 +305,7 @@ class StableDiffusion:
     def ensure_precision(self, difference: Callable[[], Tensor]) -> float:
         """Go on in fp32 if the difference needs it, with a notice; return `precision_check`.
 
-        To be called before anything that holds on to the UNet's weights, such as a CUDA graph.
+        To be called before anything that holds on to the UNet's weights.
         """
         cosine = self.precision_check(difference)
         if not cosine >= LEAST_COSINE:  # nan, where half precision overflowed, counts as too small
@@ -302,6 +319,7 @@ class StableDiffusion:
 
     def use_full_precision(self) -> None:
         """Let the UNet compute in fp32 from now on; its weights stay as rounded as they were."""
+        self.forget_graphs()
         for weight in self.unet.parameters():
             weight.data = weight.data.float()
         self.unet_dtype = torch.float32
@@ -310,13 +328,19 @@ class StableDiffusion:
     def in_full_precision(self) -> Iterator[None]:
         """Let the UNet compute in fp32 within this context, then as before on the same memory."""
         used, values = self.unet_dtype, [(w, w.data) for w in self.unet.parameters()]
+        graphs, self.graphs = self.graphs, None  # recordings read this memory, and will again
         self.use_full_precision()
         try:
             yield
         finally:
             for weight, value in values:
                 weight.data = value
-            self.unet_dtype = used
+            self.unet_dtype, self.graphs = used, graphs
+
+    def forget_graphs(self) -> None:
+        """Free what was recorded: to be called before weights or adapters change."""
+        if self.graphs is not None:
+            self.graphs.clear()
 
     @torch.no_grad()
     def self_check(self, image: Tensor, prompt: str, seed: int = 0) -> dict[str, float]:
@@ -371,20 +395,26 @@ class StableDiffusion:
             adapters: One name per sample, or None.
         """
         kind = self.unet_dtype
-        with self._with_adapters(adapters), self._exact_convolutions():
-            predicted: Tensor = self.unet(
-                latents.to(self.device, kind),
-                timesteps.to(self.device),
-                encoder_hidden_states=embeddings.to(self.device, kind),
-            ).sample
-        return predicted.float()
+
+        def unet(latents: Tensor, timesteps: Tensor, embeddings: Tensor) -> Tensor:
+            with self._with_adapters(adapters), self._exact_convolutions():
+                predicted: Tensor = self.unet(
+                    latents.to(kind), timesteps, encoder_hidden_states=embeddings.to(kind)
+                ).sample
+            return predicted.float()
+
+        arguments = [x.to(self.device) for x in (latents, timesteps, embeddings)]
+        if self.graphs is None:
+            return unet(*arguments)
+        return self.graphs.run((kind, adapters), unet, *arguments)
 
     @contextmanager
     def _with_adapters(self, names: tuple[str | None, ...]) -> Iterator[None]:
         """Give each sample of a batch its adapter; afterwards all is as before.
 
-        Batches of one kind take peft's plain way. Only mixed ones have their names handed to each
-        layer, where they are split and joined again.
+        In mixed batches each adapter sees all samples, and what it makes of others' is erased
+        between its two layers. peft's own way picks samples by lists, which are uploaded in every
+        layer: slower, and a CUDA graph cannot hold it.
         """
         from peft.tuners.lora.layer import LoraLayer
 
@@ -395,20 +425,25 @@ class StableDiffusion:
         states = [(layer, layer.active_adapters, layer.disable_adapters) for layer in layers]
         # Both of peft's switches set these too, which would start or stop a training.
         trained = [(weight, weight.requires_grad) for weight in self.unet.parameters()]
-        mixed = len(set(names)) > 1
-        words = [name or "__base__" for name in names]  # peft's word for no adapter
+        wanted = sorted({name for name in names if name is not None})
 
-        def hand_over(module: nn.Module, args: Any, kwargs: Any) -> tuple[Any, Any]:
-            return args, {**kwargs, "adapter_names": words}
+        def erase_others(name: str) -> Callable[[nn.Module, Any, Tensor], None]:
+            others = [sample for sample, own in enumerate(names) if own != name]
+
+            def erase(module: nn.Module, args: Any, reduced: Tensor) -> None:
+                for sample in others:
+                    reduced[sample].zero_()
+
+            return erase
 
         hooks = []
         try:
             for layer in layers:
-                layer.enable_adapters(set(names) != {None})
-                if mixed:
-                    hooks.append(layer.register_forward_pre_hook(hand_over, with_kwargs=True))
-                elif names[0] is not None:
-                    layer.set_adapter(names[0])
+                layer.enable_adapters(bool(wanted))
+                layer.set_adapter(wanted)
+                for name in wanted if len(set(names)) > 1 else ():
+                    if name in layer.lora_A:
+                        hooks.append(layer.lora_A[name].register_forward_hook(erase_others(name)))
             yield
         finally:
             for hook in hooks:
@@ -538,6 +573,7 @@ def load_stable_diffusion(settings: ModelSettings, device: torch.device | str) -
             folder.configs["scheduler"],
             dict(hashes),
             settings.vae_checkpointing,
+            settings.graphs and device.type == "cuda",
         )
     if asked != (unet_precision, vae_precision):
         prior.notices = (f"the CPU computes in fp32 (asked for: {', '.join(sorted(set(asked)))})",)

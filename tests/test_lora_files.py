@@ -66,7 +66,9 @@ def tiny_unet(cross_attention: int = 32, seed: int = 0) -> nn.Module:
 def bare_prior(unet: nn.Module | None = None) -> Any:
     """Return as much of a prior as a LoRA touches."""
     unet = unet or tiny_unet()
-    return SimpleNamespace(unet=unet, adapters=set(), unet_dtype=unet.dtype)
+    return SimpleNamespace(
+        unet=unet, adapters=set(), unet_dtype=unet.dtype, forget_graphs=lambda: None
+    )
 
 
 def output(unet: nn.Module, cross_attention: int = 32) -> Tensor:
