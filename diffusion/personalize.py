@@ -15,7 +15,7 @@ import logging
 import time
 from collections.abc import Callable, Mapping
 from contextlib import AbstractContextManager, nullcontext
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, fields
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -440,7 +440,9 @@ def lora_key(
     seed: int,
 ) -> str:
     """Return a hash of all that a trained LoRA depends on."""
-    chosen = sorted(asdict(settings).items())
+    # The caller's settings may hold more, such as where results are written.
+    own = (field.name for field in fields(PersonalizeSettings))
+    chosen = [(name, getattr(settings, name)) for name in sorted(own)]
     return content_key(
         FORMAT, model_key(prior), photo.float(), sorted(asdict(prompts).items()), chosen, seed
     )
