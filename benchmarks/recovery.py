@@ -364,7 +364,7 @@ def main() -> None:
     parser.add_argument("--device", default="cpu")
     parser.add_argument("--set", action="append", default=[], help="field=value of the settings")
     options = parser.parse_args()
-    settings = OptimizeSettings()
+    settings = OptimizeSettings(steps=600)
     width, height, samples = 384, 256, 128
     if options.quick:
         settings = replace(settings, steps=200, lobes=48, light_height=48, object_light_height=24)

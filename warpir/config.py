@@ -15,6 +15,7 @@ from warpir.errors import ExitCode, InputError, raise_all
 from warpir.optimize_settings import OptimizeSettings
 
 SKY_PRESETS = ("clear", "overcast", "sunset")
+REFINE_STEPS = {"material": 300, "emission": 300, "tone": 200}
 REFINE_PARTS = ("base-color", "metallic", "roughness")
 SEED_LIMIT = 2**32
 """Seeds are the 32-bit words that the kernels hash."""
@@ -153,6 +154,13 @@ class InsertConfig(ModelSettings, PersonalizeSettings, GuidanceSettings, Optimiz
     def tone_operator(self) -> str:
         """`tone`, or what stands for it: recovered curves want an operator that never clips."""
         return self.tone or ("linear" if self.guidance == "none" else "reinhard")
+
+    @property
+    def step_count(self) -> int:
+        """`steps`, or what stands for it: a few unknowns under a known light need fewer."""
+        if self.steps is None and self.refine is not None:
+            return REFINE_STEPS[self.refine]
+        return super().step_count
 
     def require_inputs(self) -> None:
         """Check that what every run needs is named.

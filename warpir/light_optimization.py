@@ -102,7 +102,7 @@ class LightOptimization(Optimization):
     def fusion(self, step: int) -> float:
         """Return ``s_fuse`` of a step: how far both lights have become one [1]."""
         if self.settings.fusion == "schedule":
-            return step / max(self.settings.steps - 1, 1)
+            return step / max(self.settings.step_count - 1, 1)
         return 0.0
 
     @property

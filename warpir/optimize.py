@@ -127,7 +127,7 @@ class Optimization(ABC):
         Raises:
             InputError: The gradient stayed non-finite (`ExitCode.NUMERIC`).
         """
-        while self.state.step < self.settings.steps:
+        while self.state.step < self.settings.step_count:
             self.step()
             on_step(self)
         if self.best:
@@ -158,12 +158,12 @@ class Optimization(ABC):
         self.state.step = step + 1
         self.state.history.append(entry)
         every = self.settings.score_every
-        if every and (self.state.step % every == 0 or self.state.step == self.settings.steps):
+        if every and (self.state.step % every == 0 or self.state.step == self.settings.step_count):
             self._keep_if_best(entry)
 
     def _rate_factor(self, step: int) -> float:
         """Return 1 in the first half, then a cosine that falls to 0.1."""
-        share = max(2.0 * step / max(self.settings.steps, 1) - 1.0, 0.0)
+        share = max(2.0 * step / max(self.settings.step_count, 1) - 1.0, 0.0)
         return float(0.1 + 0.9 * 0.5 * (1.0 + np.cos(np.pi * share)))
 
     def _gradients_are_finite(self) -> bool:
@@ -193,7 +193,7 @@ class Optimization(ABC):
         if score is None:
             return
         entry["score"] = score
-        is_late = 2 * state.step >= self.settings.steps
+        is_late = 2 * state.step >= self.settings.step_count
         if is_late and (state.best_score is None or score < state.best_score):
             state.best_score, state.best_step = score, state.step
             self.best = {k: v.detach().clone() for k, v in self.unknowns.state_dict().items()}

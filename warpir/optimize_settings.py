@@ -11,8 +11,9 @@ from dataclasses import dataclass
 class OptimizeSettings:
     """How light and tone curves are recovered from the guidance's gradient."""
 
-    steps: int = 600
-    """Steps of the optimisation"""
+    steps: int | None = None
+    """Steps of the optimisation (default: 600; with --refine material or emission 300, with
+    --refine tone 200)"""
     guidance_width: int = 384
     """Width of the picture inside the loop [px]; its height follows the photo's shape"""
     lobes: int = 64
@@ -62,3 +63,8 @@ class OptimizeSettings:
     """Greatest intensity of a lobe, relative [W/(m^2 sr)]"""
     score_every: int = 25
     """Steps between two scores, of which the best state is kept; 0: the last state is kept"""
+
+    @property
+    def step_count(self) -> int:
+        """`steps`, or the authors' number."""
+        return 600 if self.steps is None else self.steps

@@ -279,7 +279,7 @@ def make_guide(run: Run, guided: Guided, frame: Frame) -> Guidance | DatasetUpda
     seen = torch.from_numpy(frame.coverage())
     try:
         guide = make_guidance(
-            guided.prior, condition, config, seen, config.steps, config.seed, guided.adapter
+            guided.prior, condition, config, seen, config.step_count, config.seed, guided.adapter
         )
     except ValueError as error:
         raise InputError("--guidance", str(error), code=ExitCode.USAGE) from None
@@ -300,9 +300,9 @@ def optimize(
     def on_step(loop: Optimization) -> None:
         nonlocal words
         step = loop.state.step
-        if step % SAY_EVERY == 0 or step == config.steps:
+        if step % SAY_EVERY == 0 or step == config.step_count:
             words = loop.describe(run.inputs.camera)
-        run.progress.report("optimisation", step, config.steps, words)
+        run.progress.report("optimisation", step, config.step_count, words)
         if config.preview_every and step % config.preview_every == 0:
             write_preview(run, loop, step)
         if config.checkpoint_every and step % config.checkpoint_every == 0:
