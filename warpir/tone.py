@@ -4,6 +4,8 @@ Durkan et al. 2019, "Neural Spline Flows", with the constants of the authors' co
 device's half, evaluation, is `warpir.kernels.tone`. Zero parameters are the identity.
 """
 
+from __future__ import annotations
+
 from dataclasses import dataclass
 
 import numpy as np
@@ -11,8 +13,14 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+FloatArray = NDArray[np.float32]
+
 MIN_BIN = 1e-3
 """Least width, height and slope of a bin [1]."""
+BETA = float(np.log(2.0) / (1.0 - MIN_BIN))
+"""Of the slopes' softplus: softplus(0) = 1 - MIN_BIN, so that a zero parameter is slope 1."""
+LEAST = 1e-6
+"""What stands for nothing above `MIN_BIN` where raw parameters are sought [1]."""
 
 
 @dataclass(frozen=True)
@@ -38,6 +46,13 @@ def _edges(raw: Tensor) -> Tensor:
     return torch.cat([zero, inner, zero + 1.0], dim=1)
 
 
+def _raw_bins(edges: FloatArray) -> Tensor:
+    """Return raw bin sizes whose `_edges` are these; even bins are zeros."""
+    sizes = torch.from_numpy(np.diff(edges.astype(np.float64), axis=1))
+    raw = torch.log((sizes - MIN_BIN).clamp(min=LEAST))
+    return raw - raw.mean(dim=1, keepdim=True)
+
+
 class ToneCurve(torch.nn.Module):
     """One or several tone curves; 16 raw numbers a curve at 5 bins.
 
@@ -57,14 +72,26 @@ class ToneCurve(torch.nn.Module):
         self.heights = torch.nn.Parameter(torch.zeros(curves, bins))
         self.slopes = torch.nn.Parameter(torch.zeros(curves, bins + 1))
 
+    @staticmethod
+    def from_knots(x: FloatArray, y: FloatArray, slope: FloatArray) -> ToneCurve:
+        """Return curves that start at given knots, shape [curve, bin + 1] each.
+
+        Bins and slopes below `MIN_BIN`, which no parameters mean, are raised to it.
+        """
+        curve = ToneCurve(x.shape[0], x.shape[1] - 1)
+        with torch.no_grad():
+            curve.widths.copy_(_raw_bins(x))
+            curve.heights.copy_(_raw_bins(y))
+            above = torch.from_numpy(slope.astype(np.float64) - MIN_BIN).clamp(min=LEAST)
+            curve.slopes.copy_(above + torch.log(-torch.expm1(-BETA * above)) / BETA)
+        return curve
+
     def forward(self) -> Knots:
         """Return the knots that the current parameters mean."""
-        # This beta makes softplus(0) = 1 - MIN_BIN, so that a zero parameter is slope 1.
-        beta = float(np.log(2.0) / (1.0 - MIN_BIN))
-        slope = MIN_BIN + torch.nn.functional.softplus(self.slopes, beta=beta)
+        slope = MIN_BIN + torch.nn.functional.softplus(self.slopes, beta=BETA)
         return Knots(_edges(self.widths), _edges(self.heights), slope)
 
-    def arrays(self) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.float32]]:
+    def arrays(self) -> tuple[FloatArray, FloatArray, FloatArray]:
         """Return the knots as plain arrays x, y, slope, for files and the final render."""
         with torch.no_grad():
             knots = self.forward()
