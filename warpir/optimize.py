@@ -139,6 +139,8 @@ class Optimization(ABC):
         self.prepare(step)
         image, terms = self.image(step), self.terms()
         d_image = self.guide.gradient(image.detach(), step)
+        if d_image is not None and not bool(d_image.isfinite().all()):
+            d_image = None
         self.optimizer.zero_grad()
         if d_image is not None:
             roots, gradients = [image], [d_image]
@@ -154,7 +156,9 @@ class Optimization(ABC):
         self._count(is_finite)
         entry = {name: float(term.detach()) for name, (_, term) in terms.items()}
         if d_image is not None:
-            entry["gradient"] = float(d_image.norm())
+            entry["gradient"] = float(d_image.double().norm())
+        # Checkpoints hold no number that JSON lacks.
+        entry = {name: value for name, value in entry.items() if np.isfinite(value)}
         self.state.step = step + 1
         self.state.history.append(entry)
         every = self.settings.score_every
@@ -190,7 +194,7 @@ class Optimization(ABC):
         state = self.state
         with torch.no_grad():
             score = self.guide.score(self.final_image(self.seed + SCORE_SEED))
-        if score is None:
+        if score is None or not np.isfinite(score):
             return
         entry["score"] = score
         is_late = 2 * state.step >= self.settings.step_count
