@@ -121,7 +121,8 @@ def test_every_value_has_a_rule() -> None:
     free = {  # checked in words of their own, free by nature, or text
         "fov", "horizon", "ground", "place", "at", "rotate_y", "light_rotate", "sun", "sky",
         "device", "refine_parts", "refine_materials", "lora_layers",
-        "photo", "asset", "out", "camera", "light", "lora", "model", "reuse", "sequence",
+        "photo", "asset", "materials", "out", "camera", "light", "lora", "model", "reuse",
+        "sequence",
     }  # fmt: skip
     ruled = {*RANGES, *ABOVE_ZERO, *CHOICES, *PROMPTS}
     valued = {name for name, form in forms_of_flags() if form}

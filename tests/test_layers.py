@@ -12,7 +12,7 @@ LEVELS = (
     {"errors", "color"},
     {"optimize_settings", "asset", "strict_json"},
     {"config"},
-    {"camera", "asset_files", "record", "progress", "light", "tone", "curves"},
+    {"camera", "asset_files", "record", "progress", "light", "tone", "curves", "materials_file"},
     {"gltf_file", "mtl", "files", "command", "placement", "lobes_file", "lobe_fit"},
     {"gltf_material", "obj", "reuse"},
     {"gltf"},
@@ -28,7 +28,8 @@ LEVELS = (
     {"checkpoint"},
     {"optimize"},
     {"light_optimization"},
-    {"recover", "refine"},
+    {"recover"},
+    {"refine"},
     {"demo"},
     {"insert", "prior_images"},
 )

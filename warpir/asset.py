@@ -4,6 +4,7 @@ Readers (`warpir.gltf`, `warpir.obj`) fill these records after checking the file
 them checks again. Frame: the asset's own, right-handed, +Y up, front +Z, in metres.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -110,6 +111,10 @@ class Asset:
         low = np.min([p.positions.min(axis=0) for p in self.primitives], axis=0)
         high = np.max([p.positions.max(axis=0) for p in self.primitives], axis=0)
         return low, high
+
+    def materials_named(self, names: Sequence[str] | None) -> list[int]:
+        """Return the indices of the materials that have one of these names; None: of all."""
+        return [i for i, m in enumerate(self.materials) if names is None or m.name in names]
 
 
 def load_asset(path: str | Path, missing_textures: str = "error") -> Asset:

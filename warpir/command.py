@@ -29,6 +29,7 @@ FLAGS = {
     "input and output": {
         "photo": "FILE",
         "asset": "FILE",
+        "materials": "FILE",
         "out": "DIR",
         "overwrite": "",
         "demo": "",
@@ -131,6 +132,8 @@ FLAGS = {
         "rate_width": "R",
         "rate_chroma": "R",
         "rate_tone": "R",
+        "rate_material": "R",
+        "rate_emission": "R",
         "adam_beta1": "B",
         "adam_beta2": "B",
         "consistency": "W",

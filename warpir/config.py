@@ -41,6 +41,8 @@ class InsertConfig(ModelSettings, PersonalizeSettings, GuidanceSettings, Optimiz
     """Folder for everything that is written"""
     overwrite: bool = False
     """Replace results that are already in --out"""
+    materials: str | None = None
+    """materials.json of a run with --refine: factors for the materials of --asset"""
     demo: bool = False
     """Use the scene that ships with warpir in place of --photo and --asset"""
 
@@ -244,6 +246,8 @@ RANGES: dict[str, tuple[float, float | None]] = {
     "rate_width": (0, 10),
     "rate_chroma": (0, 10),
     "rate_tone": (0, 10),
+    "rate_material": (0, 10),
+    "rate_emission": (0, 10),
     "adam_beta1": (0, 0.999999),
     "adam_beta2": (0, 0.999999),
     "consistency": (0, None),
@@ -395,6 +399,10 @@ def _values_that_clash(config: InsertConfig) -> Iterator[InputError]:
     yield from needs("refine_parts", config.refine == "material", "--refine material")
     with_materials = config.refine in ("material", "emission")
     yield from needs("refine_materials", with_materials, "--refine material or emission")
+    if config.refine == "tone" and not config.tone_curve:
+        yield usage(
+            "--no-tone-curve", "cannot be used with --refine tone, which changes nothing else"
+        )
     if config.loss == "lds-negative" and not config.negative_prompt:
         yield usage("--loss", "lds-negative needs --negative-prompt, which it moves away from")
     for low, high in (("time_min", "time_max"), ("crop_min", "crop_max")):

@@ -14,6 +14,7 @@ from warpir.errors import InputError, raise_all
 from warpir.files import Photo, read_envmap, read_photo
 from warpir.light import Light
 from warpir.lobes_file import read_lobes
+from warpir.materials_file import with_materials
 from warpir.placement import Placement, place_asset
 from warpir.reuse import EarlierRun, read_run
 
@@ -31,6 +32,7 @@ class Inputs:
 
     photo: Photo
     asset: Asset
+    """With the materials of --materials."""
     camera: Camera
     """At the photo's resolution."""
     placement: Placement
@@ -85,7 +87,7 @@ def read_inputs(config: InsertConfig, loaders: Loaders | None = None) -> Inputs:
             alpha="ignore" if config.alpha == "ignore" else "refuse",
         )
     )
-    asset = attempt(lambda: loaders.asset(asset_path, config.missing_textures))
+    asset = attempt(lambda: _read_asset(asset_path, config, loaders))
     light = attempt(lambda: _read_light(config, notices))
     reuse = config.reuse
     run = attempt(lambda: loaders.run(reuse)) if reuse is not None else None
@@ -118,6 +120,11 @@ def read_inputs(config: InsertConfig, loaders: Loaders | None = None) -> Inputs:
     assumed += placement.assumed
     if run is not None and (assumption := run.assumption(camera.c2w, config.camera)):
         assumed.append(assumption)
+    if run is not None and run.materials is not None and config.materials is None:
+        notices.append(
+            f"{run.path} had changed its object's materials, this run has not (--materials "
+            f"{run.materials} does the same to that object)"
+        )
     return Inputs(photo, asset, camera, placement, light, run, tuple(assumed), tuple(notices))
 
 
@@ -126,7 +133,7 @@ def _inputs_in_out(config: InsertConfig) -> list[InputError]:
     if config.out is None:
         return []
     out = os.path.realpath(config.out)
-    named = (config.photo, config.asset, config.camera, config.light, config.lora)
+    named = (config.photo, config.asset, config.materials, config.camera, config.light, config.lora)
     folders = {path: os.path.dirname(path) for path in named if path is not None}
     if config.reuse is not None:
         folders[config.reuse] = config.reuse
@@ -134,6 +141,18 @@ def _inputs_in_out(config: InsertConfig) -> list[InputError]:
         if os.path.realpath(folder) == out:
             return [usage("--out", f"holds the input {path}", "choose a folder of its own")]
     return []
+
+
+def _read_asset(path: str, config: InsertConfig, loaders: Loaders) -> Asset:
+    asset = loaders.asset(path, config.missing_textures)
+    if config.materials is not None:
+        asset = with_materials(asset, config.materials)
+    for name in config.refine_materials or ():
+        if not asset.materials_named([name]):
+            found = ", ".join(dict.fromkeys(ascii(m.name) for m in asset.materials))
+            what = f"no material {name[:60]!a} in {path} (found {found[:400]})"
+            raise usage("--refine-materials", what, "name some of these, or leave it out for all")
+    return asset
 
 
 def _make_camera(config: InsertConfig, photo: Photo, assumed: list[str]) -> Camera:

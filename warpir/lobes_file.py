@@ -14,7 +14,7 @@ import numpy as np
 
 from warpir.errors import InputError
 from warpir.light import Lobes
-from warpir.strict_json import read_json_object
+from warpir.strict_json import read_json_object, read_numbers
 
 FORMAT = "warpir-lobes"
 VERSION = 1
@@ -45,9 +45,9 @@ def read_lobes(path: str | Path) -> Lobes:
     for i, lobe in enumerate(lobes):
         if not isinstance(lobe, dict):
             raise InputError(path, f"/lobes/{i}: an object expected")
-        amplitude[i] = _numbers(path, f"/lobes/{i}/amplitude", lobe.get("amplitude"), 3)
-        axis[i] = _numbers(path, f"/lobes/{i}/axis", lobe.get("axis"), 3)
-        sharpness += _numbers(path, f"/lobes/{i}/sharpness", [lobe.get("sharpness")], 1)
+        amplitude[i] = read_numbers(path, f"/lobes/{i}/amplitude", lobe.get("amplitude"), 3)
+        axis[i] = read_numbers(path, f"/lobes/{i}/axis", lobe.get("axis"), 3)
+        sharpness += read_numbers(path, f"/lobes/{i}/sharpness", [lobe.get("sharpness")], 1)
         if amplitude[i].min() < 0.0 or amplitude[i].max() > AMPLITUDE_LIMIT:
             expected = f"0 to {AMPLITUDE_LIMIT:g}"
             raise InputError(path, f"/lobes/{i}/amplitude: {expected} (found {lobe['amplitude']})")
@@ -70,17 +70,3 @@ def lobes_to_json(lobes: Lobes) -> dict[str, Any]:
         for a, v, s in zip(lobes.amplitude, lobes.axis, lobes.sharpness, strict=True)
     ]
     return {"format": FORMAT, "version": VERSION, "lobes": rows}
-
-
-def _numbers(path: str | Path, pointer: str, value: Any, count: int) -> list[float]:
-    numeric = isinstance(value, list) and len(value) == count
-    if not numeric or any(isinstance(v, bool) or not isinstance(v, int | float) for v in value):
-        expected = "a number" if count == 1 else f"a list of {count} numbers"
-        raise InputError(path, f"{pointer}: {expected} expected")
-    numbers = []
-    for v in value:
-        try:
-            numbers.append(float(v))
-        except OverflowError:
-            raise InputError(path, f"{pointer}: a number beyond every use") from None
-    return numbers

@@ -45,6 +45,10 @@ class OptimizeSettings:
     """Learning rate of the lobes' log colour ratios"""
     rate_tone: float = 0.01
     """Learning rate of the tone curves"""
+    rate_material: float = 0.02
+    """Learning rate of --refine material"""
+    rate_emission: float = 0.05
+    """Learning rate of --refine emission, whose factors range over decades"""
     adam_beta1: float = 0.9
     """Adam's decay of the gradient's mean"""
     adam_beta2: float = 0.99

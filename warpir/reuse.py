@@ -18,6 +18,7 @@ from warpir.curves import Curves, read_curves
 from warpir.errors import InputError
 from warpir.files import read_envmap
 from warpir.light import Light
+from warpir.materials_file import MATERIALS
 from warpir.record import RUN_FORMAT
 from warpir.strict_json import read_json_object
 
@@ -43,6 +44,8 @@ class EarlierRun:
     curves: Curves
     c2w: NDArray[np.float64]
     """Pose of the run's camera, whose world is the light's, shape [4, 4]."""
+    materials: Path | None = None
+    """What --materials would give the run's object its materials by, if they were changed."""
 
     def assumption(self, c2w: NDArray[np.float64], camera_path: str | None) -> str:
         """Return what is assumed of another camera's world, or an empty text for the same pose."""
@@ -70,7 +73,11 @@ def read_run(path: str | Path) -> EarlierRun:
     """
     path = Path(path)
     names = [LIGHT, CURVES, CAMERA]
-    files = run_record(path)["files"]
+    record = run_record(path)
+    files, given = record["files"], record["config"].get("materials")
+    materials = path / MATERIALS if MATERIALS in files else None
+    if materials is None and isinstance(given, str):
+        materials = Path(given)
     if SHADOW_LIGHT in files:
         names.append(SHADOW_LIGHT)
     check_files(path, {name: files.get(name) for name in names})
@@ -78,7 +85,8 @@ def read_run(path: str | Path) -> EarlierRun:
     if SHADOW_LIGHT in files:
         light_shadow = Light(texels=read_envmap(path / SHADOW_LIGHT, strict=True))
     curves = read_curves(path / CURVES)
-    return EarlierRun(path, light_fg, light_shadow, curves, _read_pose(path / CAMERA))
+    pose = _read_pose(path / CAMERA)
+    return EarlierRun(path, light_fg, light_shadow, curves, pose, materials)
 
 
 def run_record(path: Path) -> dict[str, Any]:

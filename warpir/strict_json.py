@@ -92,3 +92,28 @@ def parse_json_object(where: str | Path, raw: bytes) -> dict[str, Any]:
             where, f"line 1: not a JSON object (found {type(root).__name__}; expected an object)"
         )
     return root
+
+
+def read_numbers(path: str | Path, pointer: str, value: Any, count: int) -> list[float]:
+    """Return a list of numbers that was read from a JSON file.
+
+    Args:
+        path: The file.
+        pointer: Where the list stands in it.
+        value: What stands there.
+        count: How many are expected; one stands by itself in the file.
+
+    Raises:
+        InputError: It is something else.
+    """
+    numeric = isinstance(value, list) and len(value) == count
+    if not numeric or any(isinstance(v, bool) or not isinstance(v, int | float) for v in value):
+        expected = "a number" if count == 1 else f"a list of {count} numbers"
+        raise InputError(path, f"{pointer}: {expected} expected")
+    numbers = []
+    for v in value:
+        try:
+            numbers.append(float(v))
+        except OverflowError:
+            raise InputError(path, f"{pointer}: a number beyond every use") from None
+    return numbers
