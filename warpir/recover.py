@@ -112,7 +112,7 @@ def recover(run: Run, start: SceneLight) -> tuple[SceneLight, dict[str, Any], tu
             non-finite (6), or ``--resume`` finds no checkpoint of this run.
     """
     config = settings = run.config
-    with _as_input_errors():
+    with as_input_errors():
         checkpoints, resumed = open_checkpoints(run)
         guided = prepare_guidance(run, checkpoints, resumed)
         with run.timings.stage("scene"):
@@ -370,7 +370,7 @@ def write_lora(run: Run, guided: Guided) -> None:
 
 
 @contextmanager
-def _as_input_errors() -> Iterator[None]:
+def as_input_errors() -> Iterator[None]:
     """Turn the model's errors into the program's."""
     try:
         yield
