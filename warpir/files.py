@@ -44,6 +44,9 @@ PHOTO_PIXELS_MAX = 64_000_000
 ENVMAP_WIDTH_MAX = 16384
 """Widest environment map accepted [px]."""
 
+UNFINISHED = ("checkpoints", "progress")
+"""Folders of an output folder that hold what a run needs, or shows, before it has results."""
+
 ENVMAP_ROLLS = {"openexr": 0.0, "nvdiffrec": -0.5, "threejs": -0.25, "blender": -0.25}
 """Columns to roll a map of each convention by, as a share of its width, to make it ours."""
 
@@ -995,11 +998,11 @@ class OutputFolder:
                 self.path.rmdir()  # only succeeds when nothing was written
 
     def _refuse_results(self) -> None:
-        """Refuse a folder in use; hidden files and checkpoints do not count as results."""
+        """Refuse a folder in use; hidden files and an unfinished run's do not count as results."""
         found = sorted(
             entry.name
             for entry in self.path.iterdir()
-            if not entry.name.startswith((".", "ckpt-")) and entry.name != "latest"
+            if not entry.name.startswith(".") and entry.name not in UNFINISHED
         )
         if found and not self.overwrite:
             shown = _RUN_JSON if _RUN_JSON in found else found[0]

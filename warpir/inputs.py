@@ -10,7 +10,7 @@ from typing import TypeVar
 from warpir.asset import Asset, load_asset
 from warpir.camera import Camera, camera_from_exif, camera_from_fov, read_camera
 from warpir.config import InsertConfig, usage
-from warpir.errors import InputError, raise_all
+from warpir.errors import ExitCode, InputError, raise_all
 from warpir.files import Photo, read_envmap, read_photo
 from warpir.light import Light
 from warpir.lobes_file import read_lobes
@@ -78,6 +78,8 @@ def read_inputs(config: InsertConfig, loaders: Loaders | None = None) -> Inputs:
     assert config.photo is not None and config.asset is not None
     photo_path, asset_path = config.photo, config.asset
     problems += _inputs_in_out(config)
+    if config.lora is not None and not Path(config.lora).is_file():
+        problems.append(InputError(config.lora, "no such file", code=ExitCode.MODEL))
     notices: list[str] = []
     assumed: list[str] = []
     photo = attempt(

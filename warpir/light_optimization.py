@@ -92,6 +92,7 @@ class LightOptimization(Optimization):
                 height_fg=settings.object_light_height, height_shadow=settings.light_height
             )
         self.retraced = 0
+        self._maps = self._separate(settings.light_height)
         with torch.no_grad():
             self.expected = expected_light(*self.lights(0.0))
         self.view = self._trace()
@@ -117,38 +118,42 @@ class LightOptimization(Optimization):
             scale: ``s_fuse`` [1].
             height: Rows; the settings' when absent.
         """
-        height = height or self.settings.light_height
+        return self._fused(self._separate(height or self.settings.light_height), scale)
+
+    def _separate(self, height: int) -> tuple[Tensor, Tensor]:
+        """Return the maps of both sets of lobes, before fusion."""
         texels_fg = self.unknowns.light_fg.texels(height)
         if self.settings.fusion == "single":
             return texels_fg, texels_fg
-        return fuse(texels_fg, self.unknowns.light_shadow.texels(height), scale)
+        return texels_fg, self.unknowns.light_shadow.texels(height)
 
-    def _composite(self, scale: float, seed: int) -> Tensor:
+    def _fused(self, maps: tuple[Tensor, Tensor], scale: float) -> tuple[Tensor, Tensor]:
+        return maps if self.settings.fusion == "single" else fuse(*maps, scale)
+
+    def _composite(self, maps: tuple[Tensor, Tensor], scale: float, seed: int) -> Tensor:
         curves = self.unknowns.curve_fg(), self.unknowns.curve_shadow()
-        return self.view.image(*self.lights(scale), *curves, seed)
+        return self.view.image(*self._fused(maps, scale), *curves, seed)
 
     def image(self, step: int) -> Tensor:
         """Return the composite of a step under lights fused as far as the schedule says."""
-        return self._composite(self.fusion(step), self.seed + step)
+        # The regularisers of this step look at the same maps.
+        self._maps = self._separate(self.settings.light_height)
+        return self._composite(self._maps, self.fusion(step), self.seed + step)
 
     def final_image(self, seed: int) -> Tensor:
         """Return the composite under the light that would be delivered."""
-        return self._composite(self.final_fusion, seed)
+        return self._composite(self._separate(self.settings.light_height), self.final_fusion, seed)
 
     def terms(self) -> dict[str, tuple[float, Tensor]]:
-        """Return the authors' terms (eq. 10, 11) and ours."""
-        settings, height = self.settings, self.settings.light_height
-        light_fg, light_shadow = self.unknowns.light_fg, self.unknowns.light_shadow
-        terms = {"chroma": (settings.chroma, 0.5 * (chroma(light_fg) + chroma(light_shadow)))}
+        """Return the authors' terms (eq. 10, 11) and ours, of the maps that `image` rendered."""
+        settings, unknowns = self.settings, self.unknowns
+        tint = 0.5 * (chroma(unknowns.light_fg) + chroma(unknowns.light_shadow))
+        terms = {"chroma": (settings.chroma, tint)}
         if settings.fusion != "single":
-            texels_shadow = light_shadow.texels(height)
-            terms["consistency"] = (
-                settings.consistency,
-                consistency(light_fg.texels(height), texels_shadow),
-            )
-            terms["spread"] = settings.spread, spread(texels_shadow)
+            terms["consistency"] = settings.consistency, consistency(*self._maps)
+            terms["spread"] = settings.spread, spread(self._maps[1])
         if settings.tone_curve:
-            curves = bend(self.unknowns.curve_fg()) + bend(self.unknowns.curve_shadow())
+            curves = bend(unknowns.curve_fg()) + bend(unknowns.curve_shadow())
             terms["bend"] = settings.bend, curves
         return terms
 

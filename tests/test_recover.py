@@ -1,0 +1,348 @@
+"""Guided runs end to end on a tiny Stable Diffusion: files, losses, ablations, stop and resume."""
+
+import json
+import os
+import random
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+
+from tests.test_insert import ALWAYS, arguments, digest, write_inputs
+from tests.tiny_stable_diffusion import make_tiny_stable_diffusion
+from warpir.errors import ExitCode
+from warpir.insert import main
+
+GUIDED = (
+    *("lobes.json", "lobes_shadow.json", "lora_diffusers.safetensors"),
+    *("lora_kohya.safetensors", "optimization.json"),
+)
+RESULTS = ("composite.png", "envmap.exr", "curves.json", *GUIDED)
+"""What must not depend on whether the run was stopped."""
+CHEAP = {
+    "guidance": "stable-diffusion",
+    "prompt": "a small box",
+    "class_images": "2",
+    "class_steps": "2",
+    "lora_steps": "6",
+    "steps": "8",
+    "guidance_width": "32",
+    "lobes": "8",
+    "light_height": "16",
+    "object_light_height": "8",
+    "checkpoint_every": "2",
+    "score_every": "2",
+    "samples": "2",
+    "light": None,
+}
+
+
+@pytest.fixture(scope="module", autouse=True)
+def _one_thread() -> Iterator[None]:
+    """Networks this small lose more by threads than they gain."""
+    before = torch.get_num_threads()
+    torch.set_num_threads(1)
+    yield
+    torch.set_num_threads(before)
+
+
+@pytest.fixture(autouse=True)
+def _own_cache(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("WARPIR_CACHE", str(tmp_path / "cache"))
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Photo, box and models, made once."""
+    made = tmp_path_factory.mktemp("guided")
+    write_inputs(made)
+    for kind in ("epsilon", "v_prediction"):
+        make_tiny_stable_diffusion(made / kind, kind)
+    return made
+
+
+@pytest.fixture(scope="module")
+def finished(folder: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The result of a run that nothing stopped, with a cache of its own."""
+    out = tmp_path_factory.mktemp("finished") / "out"
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("WARPIR_CACHE", str(out.parent / "cache"))
+        assert main(argv(folder, out)) == ExitCode.DONE
+    return out
+
+
+def argv(folder: Path, out: Path, kind: str = "epsilon", **changes: str | None) -> list[str]:
+    return arguments(folder, out, **{**CHEAP, "model": str(folder / kind), **changes})
+
+
+def results(out: Path) -> dict[str, str]:
+    found = digest(out)
+    return {name: found[name] for name in RESULTS if name in found}
+
+
+def record(out: Path) -> dict[str, Any]:
+    read: dict[str, Any] = json.loads((out / "run.json").read_text())
+    return read
+
+
+def test_guided_run_writes_every_file_and_says_who_spoke(finished: Path) -> None:
+    assert {p.name for p in finished.iterdir()} == {*ALWAYS, *GUIDED, "run.json"}
+    run = record(finished)
+    measured = run["measured"]
+    assert measured["prior"] == "stable-diffusion" and measured["loop_integrator"] == "transport"
+    assert set(measured["model"]["sha256"]) == {
+        "text_encoder/model.safetensors",
+        "unet/diffusion_pytorch_model.safetensors",
+        "vae/diffusion_pytorch_model.safetensors",
+    }
+    assert measured["prompts"]["guidance"].startswith("a photo of a small box in a scene")
+    assert measured["personalization"]["reused"] is False
+    assert measured["optimization"]["steps"] == 8
+    assert {"model", "personalize", "trace", "optimize", "render"} <= set(run["seconds"])
+    assert any("fp32" in notice for notice in run["notices"])
+    assert any("even one" in line for line in run["assumed"])
+    by_step = json.loads((finished / "optimization.json").read_text())["by_step"]
+    assert len(by_step["gradient"]) == 8 and all(v > 0.0 for v in by_step["gradient"])
+    assert sum(v is not None for v in by_step["score"]) == 4
+    curves = json.loads((finished / "curves.json").read_text())
+    assert curves["tone"] == "reinhard"
+
+
+def test_guided_run_again_reuses_the_lora_and_gives_the_same_bytes(
+    folder: Path, finished: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("WARPIR_CACHE", str(finished.parent / "cache"))
+    out = tmp_path / "again"
+    assert main(argv(folder, out)) == ExitCode.DONE
+    assert record(out)["measured"]["personalization"]["reused"] is True
+    assert results(out) == results(finished)
+
+
+class Killed(BaseException):
+    """Stands for SIGKILL: nothing of ours catches it."""
+
+
+def stop_at(monkeypatch: pytest.MonkeyPatch, place: str, count: int) -> None:
+    """Raise at the ``count``-th call of a function of the run."""
+    module, name = place.rsplit(".", 1)
+    owner = sys.modules["warpir." + module.split(":")[0]]
+    for part in module.split(":")[1:]:
+        owner = getattr(owner, part)
+    original, calls = getattr(owner, name), [0]
+
+    def stopping(*args: Any, **kwargs: Any) -> Any:
+        calls[0] += 1
+        if calls[0] == count:
+            raise Killed
+        return original(*args, **kwargs)
+
+    monkeypatch.setattr(owner, name, stopping)
+
+
+STOPS = {
+    "class images": ("diffusion.class_images._png", 2),
+    "lora before a checkpoint": ("diffusion.personalize:LoraTraining.update", 2),
+    "lora": ("diffusion.personalize:LoraTraining.update", 4),
+    "first trace": ("view:View.__init__", 1),
+    "optimisation before a checkpoint": ("optimize:Optimization.step", 2),
+    "optimisation": ("optimize:Optimization.step", 6),
+    "checkpoint": ("checkpoint._write", 13),
+    "last render": ("picture.make_picture", 1),
+    "final files": ("files:OutputFolder._commit", 1),
+}
+
+
+@pytest.mark.parametrize("where", STOPS)
+def test_stopped_run_resumes_as_if_it_had_not_been(
+    folder: Path, finished: Path, tmp_path: Path, where: str
+) -> None:
+    import warpir.recover  # noqa: F401  all modules that are to be stopped in
+
+    out = tmp_path / "out"
+    with pytest.MonkeyPatch.context() as patch:
+        stop_at(patch, *STOPS[where])
+        with pytest.raises(Killed):
+            stop_hard(argv(folder, out))
+    assert not (out / "run.json").exists()
+    has_checkpoint = any((out / "checkpoints").glob("0*"))
+    assert main([*argv(folder, out), *(["--resume"] if has_checkpoint else [])]) == ExitCode.DONE
+    assert results(out) == results(finished)
+    assert not (out / "checkpoints").exists()
+
+
+def stop_hard(arguments: list[str]) -> None:
+    """Run without the program's own explanation of exceptions."""
+    from warpir.command import parse
+    from warpir.insert import insert
+
+    insert(parse(arguments).config)
+
+
+@pytest.fixture
+def unfinished(folder: Path, tmp_path: Path) -> Path:
+    """A run that stopped in the optimisation."""
+    import warpir.recover  # noqa: F401
+
+    out = tmp_path / "out"
+    with pytest.MonkeyPatch.context() as patch:
+        stop_at(patch, "optimize:Optimization.step", 6)
+        with pytest.raises(Killed):
+            stop_hard(argv(folder, out))
+    return out
+
+
+def test_unfinished_run_is_not_overwritten_by_accident(
+    folder: Path, unfinished: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    before = digest(unfinished)
+    assert main(argv(folder, unfinished)) == ExitCode.OUTPUT
+    assert "holds an unfinished run" in capsys.readouterr().err
+    assert digest(unfinished) == before
+
+
+def test_resume_names_what_changed(
+    folder: Path, unfinished: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    before = digest(unfinished)
+    changed = argv(folder, unfinished, steps="9", prompt="a large box")
+    assert main([*changed, "--resume"]) == ExitCode.INPUT
+    error = capsys.readouterr().err
+    assert "config.steps: was 8, is 9" in error and "config.prompt" in error
+    assert "Traceback" not in error and digest(unfinished) == before
+
+
+def test_resume_without_a_checkpoint_says_so(
+    folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main([*argv(folder, tmp_path / "none"), "--resume"]) == ExitCode.INPUT
+    assert "nothing to go on from" in capsys.readouterr().err
+
+
+def test_overwrite_starts_an_unfinished_run_again(
+    folder: Path, finished: Path, unfinished: Path
+) -> None:
+    assert main([*argv(folder, unfinished), "--overwrite"]) == ExitCode.DONE
+    assert results(unfinished) == results(finished)
+
+
+@pytest.mark.parametrize(
+    "loss",
+    ["sds", "sds-base", "csd", "lds-lora-both", "lds-negative", "dataset-update"],
+)
+def test_every_loss_runs(folder: Path, tmp_path: Path, loss: str) -> None:
+    changes = {"loss": loss, "steps": "3", "score_every": "0", "lora_steps": "1"}
+    if loss == "lds-negative":
+        changes["negative_prompt"] = "a drawing"
+    if loss == "dataset-update":
+        changes |= {"update_every": "2", "update_steps": "2"}
+    out = tmp_path / "out"
+    assert main(argv(folder, out, **changes)) == ExitCode.DONE
+    by_step = json.loads((out / "optimization.json").read_text())["by_step"]
+    assert len(by_step["gradient"]) == 3 and all(v > 0.0 for v in by_step["gradient"])
+
+
+def test_ablations(folder: Path, tmp_path: Path) -> None:
+    """No tone curve, two lights, one light, no class images, no adapter, v-prediction."""
+    few = {"steps": "3", "score_every": "0", "lora_steps": "2"}
+    out = tmp_path / "apart"
+    assert main(argv(folder, out, fusion="none", no_tone_curve="", **few)) == ExitCode.DONE
+    assert (out / "envmap_shadow.exr").exists()
+    for curve in ("foreground", "shadow_ratio"):
+        knots = json.loads((out / "curves.json").read_text())[curve]
+        assert knots["x"] == knots["y"]
+    out = tmp_path / "single"
+    assert main(argv(folder, out, "v_prediction", fusion="single", **few)) == ExitCode.DONE
+    assert not (out / "envmap_shadow.exr").exists() and not (out / "lobes_shadow.json").exists()
+    out = tmp_path / "concept"
+    assert main(argv(folder, out, class_images="0", **few)) == ExitCode.DONE
+    assert record(out)["measured"]["personalization"]["class_prompts"] == []
+    out = tmp_path / "base"
+    changes = {"no_personalize": "", "loss": "csd", "integrator": "mis", "mis_samples": "2"}
+    assert main(argv(folder, out, **few, **changes)) == ExitCode.DONE
+    assert not (out / "lora_kohya.safetensors").exists()
+
+
+def test_start_from_a_given_light_preview_and_prior(folder: Path, tmp_path: Path) -> None:
+    out = tmp_path / "out"
+    changes = {"light": str(folder / "sky.hdr"), "preview_every": "2", "steps": "4"}
+    changes |= {"show_prior": "a photo of a red box", "lora_steps": "2"}
+    assert main(argv(folder, out, **changes)) == ExitCode.DONE
+    assert sorted(p.name for p in (out / "progress").iterdir()) == [
+        "preview-000002.png",
+        "preview-000004.png",
+    ]
+    assert (out / "prior.png").exists()
+    assert not any("even one" in line for line in record(out)["assumed"])
+
+
+def test_recovered_light_is_reused(folder: Path, finished: Path, tmp_path: Path) -> None:
+    out = tmp_path / "reused"
+    flags = arguments(folder, out, light=None, reuse=str(finished), place="0.3,0,-4")
+    assert main(flags) == ExitCode.DONE
+    assert digest(out)["envmap.exr"] == digest(finished)["envmap.exr"]
+    assert digest(out)["curves.json"] == digest(finished)["curves.json"]
+
+
+@pytest.mark.parametrize(
+    ("changes", "code", "words"),
+    [
+        ({"model": "/nowhere/at/all"}, ExitCode.MODEL, "/nowhere/at/all"),
+        ({"model": "stabilityai/stable-diffusion-2-1"}, ExitCode.MODEL, "November 2025"),
+        ({"no_personalize": ""}, ExitCode.USAGE, "adapter"),
+        ({"lora": "/nowhere.safetensors"}, ExitCode.MODEL, "nowhere.safetensors"),
+        ({"prompt": None}, ExitCode.USAGE, "--prompt"),
+    ],
+    ids=["no folder", "withdrawn", "lds without adapter", "no lora", "no prompt"],
+)
+def test_bad_models_are_one_line(
+    folder: Path,
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+    changes: dict[str, str | None],
+    code: ExitCode,
+    words: str,
+) -> None:
+    out = tmp_path / "out"
+    assert main(argv(folder, out, **changes)) == code
+    error = capsys.readouterr().err
+    assert words in error and "Traceback" not in error
+    assert error.count("error:") == 1
+    assert not (out / "run.json").exists()
+
+
+@pytest.mark.slow
+def test_killed_run_resumes_to_the_same_bytes(folder: Path, tmp_path: Path) -> None:
+    """SIGKILL at two random moments of a real process, whatever it was doing."""
+    chance = random.Random(7)
+    environment = {**os.environ, "OMP_NUM_THREADS": "1"}
+    # Bytes are those of one number of threads, so the run to compare with is a process like these.
+    whole = [sys.executable, "-m", "warpir.insert", *argv(folder, tmp_path / "whole")]
+    own_cache = {**environment, "WARPIR_CACHE": str(tmp_path / "other")}
+    assert subprocess.run(whole, env=own_cache, check=False).returncode == 0
+    command = [sys.executable, "-m", "warpir.insert", *argv(folder, tmp_path / "out")]
+    for resumed in (False, True, True):
+        child = subprocess.Popen(
+            [*command, *(["--resume"] if resumed else [])],
+            env=environment,
+            stdout=subprocess.PIPE,
+            stderr=subprocess.STDOUT,
+            text=True,
+        )
+        # From the first checkpoint on, so that there is something to resume.
+        while child.poll() is None and not any((tmp_path / "out" / "checkpoints").glob("0*")):
+            time.sleep(0.05)
+        time.sleep(chance.uniform(0.0, 3.0))
+        child.send_signal(signal.SIGKILL)
+        child.communicate()
+        if (tmp_path / "out" / "run.json").exists():
+            break
+    else:
+        done = subprocess.run([*command, "--resume"], env=environment, check=False)
+        assert done.returncode == 0
+    assert results(tmp_path / "out") == results(tmp_path / "whole")
