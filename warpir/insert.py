@@ -23,7 +23,7 @@ import threading
 import traceback
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from types import FrameType, ModuleType
 from typing import TYPE_CHECKING, Any
@@ -123,9 +123,10 @@ def _insert_one(config: InsertConfig, loaders: "Loaders | None" = None) -> Inser
 
             device = choose_device(config.device)
             _say(f"device: {device} (the first run compiles the kernels)")
-        recovered, notices = {}, inputs.notices
+        recovered: dict[str, Any] = {}
+        notices = inputs.notices
         if config.guidance != "none":
-            light, recovered, found = _recover(config, inputs, light, device, output, timings)
+            inputs, light, recovered, found = _guide(config, inputs, light, device, output, timings)
             notices = (*notices, *found)
         with timings.stage("scene"):
             scene = scene_of(inputs, _rendering_camera(inputs.camera, config), device)
@@ -165,24 +166,34 @@ def _insert_one(config: InsertConfig, loaders: "Loaders | None" = None) -> Inser
     return Insertion(output.path, (*record["files"], "run.json"), record)
 
 
-def _recover(
+def _guide(
     config: InsertConfig,
     inputs: "Inputs",
     light: "SceneLight",
     device: str,
     output: "OutputFolder",
     timings: "Timings",
-) -> "tuple[SceneLight, dict[str, Any], tuple[str, ...]]":
-    """Let the diffusion model find the light; return it with what run.json says of it."""
+) -> "tuple[Inputs, SceneLight, dict[str, Any], tuple[str, ...]]":
+    """Let the diffusion model find the light, or change the object under the light it has.
+
+    Returns:
+        Inputs and light as they are to be rendered, what run.json says of it, and notices.
+    """
     from warpir.progress import StepProgress
     from warpir.recover import Run, recover
 
     with StepProgress(_say) as progress:
         run = Run(config, inputs, device, output, timings, _say, progress)
-        light, record, notices = recover(run, light)
+        if config.refine is None:
+            light, record, notices = recover(run, light)
+        else:
+            from warpir.refine import refine
+
+            light, asset, record, notices = refine(run, light)
+            inputs = replace(inputs, asset=asset)
     for notice in notices:
         _say(f"notice: {notice}")
-    return light, record, notices
+    return inputs, light, record, notices
 
 
 def _rendering_camera(camera: "Camera", config: InsertConfig) -> "Camera":
