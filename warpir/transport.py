@@ -326,7 +326,9 @@ def resize(texels: Tensor, height: int) -> Tensor:
 
     by_row = overlaps(heights(rows), heights(height))
     by_column = overlaps(np.linspace(0, 1, columns + 1), np.linspace(0, 1, 2 * height + 1))
-    return torch.einsum("ai,bj,ijc->abc", by_row, by_column, texels)
+    # One after the other: all three at once go through a matrix of both sizes squared.
+    coarse = torch.einsum("ai,ijc->ajc", by_row, texels)
+    return torch.einsum("bj,ajc->abc", by_column, coarse)
 
 
 def _device_of(light: LightTensors) -> torch.device:
