@@ -7,7 +7,6 @@ the object too, whose steps then cost no ray.
 
 from __future__ import annotations
 
-from abc import abstractmethod
 from collections.abc import Sequence
 from dataclasses import replace
 from typing import Any
@@ -232,35 +231,7 @@ class LitFrame:
         )
 
 
-class Refinement(Optimization):
-    """A loop under a known light: its unknowns reach a `LitFrame`, and nothing regularises them."""
-
-    lit: LitFrame
-
-    @abstractmethod
-    def composite(self, seed: int) -> Tensor:
-        """Return the composite of the current unknowns, shape [1, 3, H, W]."""
-
-    def image(self, step: int) -> Tensor:
-        """Return the composite of a step, with samples of its own."""
-        return self.composite(self.seed + step)
-
-    def final_image(self, seed: int) -> Tensor:
-        """Return the composite as it stands."""
-        return self.composite(seed)
-
-    def terms(self) -> dict[str, tuple[float, Tensor]]:
-        """Return none: the bounds of the unknowns are all that holds them."""
-        return {}
-
-    def project(self) -> None:
-        """Nothing leaves its bounds."""
-
-    def prepare(self, step: int) -> None:
-        """Nothing is to be done."""
-
-
-class MaterialRefinement(Refinement):
+class MaterialRefinement(Optimization):
     """Material factors, or emission, of an object under a known light; by `mis`.
 
     Args:
@@ -295,7 +266,18 @@ class MaterialRefinement(Refinement):
             frame.renderer, lit.object_pixels, nowhere, settings.mis_samples, 1, frame.depth
         )
 
-    def composite(self, seed: int) -> Tensor:
+    def image(self, step: int) -> Tensor:
+        """Return the composite of a step; its gradient comes from other samples.
+
+        What is asked of a picture follows its noise too. With the same samples the gradient would
+        also lessen that noise: smoother metal, darker paint.
+        """
+        replayed = self.final_image(self.seed + 2 * step)
+        with torch.no_grad():
+            shown = self.final_image(self.seed + 2 * step + 1)
+        return replayed + (shown - replayed.detach())
+
+    def final_image(self, seed: int) -> Tensor:
         """Return the composite with the materials as they are."""
         found: MaterialTensors = self.unknowns()
         factors = found.base_color, found.metallic, found.roughness, found.emission
@@ -305,9 +287,16 @@ class MaterialRefinement(Refinement):
         )
         return self.lit.image(foreground, *self.curves)
 
+    def terms(self) -> dict[str, tuple[float, Tensor]]:
+        """Return none: their bounds are all that holds factors."""
+        return {}
+
     def project(self) -> None:
         """Keep the factors within their bounds."""
         self.unknowns.project()
+
+    def prepare(self, step: int) -> None:
+        """Nothing is to be done: the light stands still."""
 
     def describe(self, camera: Camera) -> str:
         """Return the factors of the first material that changes."""
@@ -318,7 +307,7 @@ class MaterialRefinement(Refinement):
         return f"{first.name}: {', '.join(words)}{more}"
 
 
-class ToneRefinement(Refinement):
+class ToneRefinement(Optimization):
     """Tone curves of a picture whose light and materials are known.
 
     Args:
@@ -337,8 +326,12 @@ class ToneRefinement(Refinement):
         super().__init__(unknowns, groups, guide, settings, lit.frame.seed)
         self.lit = lit
 
-    def composite(self, seed: int) -> Tensor:
-        """Return the composite with the curves as they are; no sample depends on them."""
+    def image(self, step: int) -> Tensor:
+        """Return the composite; nothing in it is drawn anew."""
+        return self.final_image(self.seed)
+
+    def final_image(self, seed: int) -> Tensor:
+        """Return the composite with the curves as they are; it has the samples of `LitFrame`."""
         curves = self.unknowns.curve_fg(), self.unknowns.curve_shadow()
         return self.lit.image(self.lit.foreground, *curves)
 
@@ -346,6 +339,12 @@ class ToneRefinement(Refinement):
         """Return the prior of plain curves, as in the recovery."""
         curves = self.unknowns.curve_fg(), self.unknowns.curve_shadow()
         return {"bend": (self.settings.bend, bend(curves[0]) + bend(curves[1]))}
+
+    def project(self) -> None:
+        """Nothing bounds the curves' parameters."""
+
+    def prepare(self, step: int) -> None:
+        """Nothing is to be done: the light stands still."""
 
     def describe(self, camera: Camera) -> str:
         """Return what becomes of mid tones, by straight lines between the knots."""
