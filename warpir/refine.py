@@ -158,8 +158,13 @@ class Factors(torch.nn.Module):
 
     def materials(self) -> tuple[Material, ...]:
         """Return the asset's materials with the factors as they are."""
-        with torch.no_grad():
-            found = {part: values().cpu().tolist() for part, values in self.parts.items()}
+        with torch.no_grad():  # on CUDA a start at a bound may be a rounding beyond it
+            found = {
+                part: values()
+                .clamp(LOWEST.get(part, 0.0), 1.0 if part in LOWEST else None)
+                .tolist()
+                for part, values in self.parts.items()
+            }
         materials = list(self.asset.materials)
         for row, index in enumerate(self.chosen):
             factors: dict[str, Any] = {
@@ -388,8 +393,8 @@ def refine(
         with run.timings.stage("scene"):
             # Curves of an earlier run are made for its operator.
             frame = replace(make_frame(run), is_reinhard=light.curves.tone == "reinhard")
-        guide = make_guide(run, guided, frame)
         with run.timings.stage("trace"):
+            guide = make_guide(run, guided, frame)
             lit = LitFrame(frame, light, run.torch_device)
         loop: MaterialRefinement | ToneRefinement
         if config.refine == "tone":
