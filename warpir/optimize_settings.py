@@ -35,11 +35,11 @@ class OptimizeSettings:
     retrace_at: float = 3.0
     """Light transport is traced again when the lights have changed so much that its noise has grown
     by this factor"""
-    rate_intensity: float = 0.06
+    rate_intensity: float = 0.12
     """Learning rate of the lobes' log intensities"""
-    rate_axis: float = 0.03
-    """Learning rate of the lobes' directions; 0.03 is at most two degrees per step"""
-    rate_width: float = 0.04
+    rate_axis: float = 0.04
+    """Learning rate of the lobes' directions; 0.04 is at most two degrees per step"""
+    rate_width: float = 0.06
     """Learning rate of the lobes' log widths"""
     rate_chroma: float = 0.01
     """Learning rate of the lobes' log colour ratios"""
