@@ -410,6 +410,7 @@ def refine(
         with torch.no_grad():
             first = loop.guide.score(loop.final_image(config.seed))
         optimize(run, loop, checkpoints, resumed)
+        write_lora(run, guided)
     notices = (*guided.prior.notices, *guided.notices, *loop_notices(loop))
     if isinstance(loop, ToneRefinement):
         curves = (knots_of(c) for c in (loop.unknowns.curve_fg, loop.unknowns.curve_shadow))
@@ -421,7 +422,6 @@ def refine(
         if config.refine == "emission":
             notices = (*notices, GROUND_IS_DARK)
     run.output.write_json("optimization.json", convergence(loop, first))
-    write_lora(run, guided)
     record = {
         **guided.record,
         "prior": guided.prior.name,
