@@ -11,7 +11,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Hashable, Iterator
 from contextlib import AbstractContextManager, contextmanager
-from typing import Any, cast
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -74,7 +74,7 @@ class Graphs:
             if self._is_rare(key):
                 return function(x)
             with self._recording():
-                self._gradients[key] = _Gradient(function, x)
+                self._gradients[key] = _Gradient(function, x, self._stream)
         return self._gradients[key](x)
 
     def recorded_step(self, update: Callable[[], None]) -> RecordedStep:
@@ -147,28 +147,52 @@ class _Gradient:
     Other recordings run between the two, so they must not share it.
     """
 
-    def __init__(self, function: Callable[[Tensor], Tensor], x: Tensor) -> None:
-        sample = x.detach().clone().requires_grad_()
-        with torch.enable_grad():
-            recorded = torch.cuda.make_graphed_callables(function, (sample,), num_warmup_iters=1)
-        self._function = cast(Callable[[Tensor], Tensor], recorded)
+    def __init__(
+        self, function: Callable[[Tensor], Tensor], x: Tensor, stream: torch.cuda.Stream
+    ) -> None:
+        self.x = x.detach().clone().requires_grad_()
+        self.forward, self.backward = torch.cuda.CUDAGraph(), torch.cuda.CUDAGraph()
         self.calls = 0
+        stream.wait_stream(torch.cuda.current_stream())
+        with torch.enable_grad():
+            with torch.cuda.stream(stream):
+                result = function(self.x)
+                self.d_result = torch.zeros_like(result)
+                torch.autograd.grad(result, self.x, self.d_result)
+                del result
+            with torch.cuda.graph(self.forward, stream=stream):
+                result = function(self.x)
+            with torch.cuda.graph(self.backward, pool=self.forward.pool(), stream=stream):
+                (self.d_x,) = torch.autograd.grad(result, self.x, self.d_result)
+        self.result = result.detach()
 
     def __call__(self, x: Tensor) -> Tensor:
-        self.calls += 1
-        own = self.calls
-
-        def check(gradient: Tensor) -> None:
-            if own != self.calls:
-                raise RuntimeError(
-                    f"the gradient of a recorded pass was asked for too late: {self.calls - own} "
-                    "passes came after it"
-                )
-
-        result: Tensor = self._function(x).clone()
-        if result.requires_grad:
-            result.register_hook(check)
+        result: Tensor = _Replay.apply(self, x)  # type: ignore[no-untyped-call]
         return result
+
+
+class _Replay(torch.autograd.Function):
+    """Both halves of a `_Gradient`; what leaves its memory is copied."""
+
+    @staticmethod
+    def forward(ctx: Any, recording: _Gradient, x: Tensor) -> Tensor:
+        recording.calls += 1
+        ctx.recording, ctx.call = recording, recording.calls
+        recording.x.detach().copy_(x)
+        recording.forward.replay()
+        return recording.result.clone()
+
+    @staticmethod
+    def backward(ctx: Any, *d_results: Tensor) -> tuple[None, Tensor]:
+        recording = ctx.recording
+        if ctx.call != recording.calls:
+            raise RuntimeError(
+                "the gradient of a recorded pass was asked for too late: "
+                f"{recording.calls - ctx.call} passes came after it"
+            )
+        recording.d_result.copy_(d_results[0])
+        recording.backward.replay()
+        return None, recording.d_x.clone()
 
 
 class RecordedStep:
