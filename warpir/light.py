@@ -329,8 +329,10 @@ def describe(summary: LightSummary, c2w: Float64Array) -> str:
     right, _, back = (np.asarray(c2w)[:3, k] * (1.0, 0.0, 1.0) for k in range(3))
     axis = axis_from_angles(summary.azimuth_deg, summary.elevation_deg)
     around = float(np.degrees(np.arctan2(axis @ right, -(axis @ back)))) % 360.0
-    sides = ("ahead", "ahead on the right", "the right", "behind on the right")
-    sides += ("behind", "behind on the left", "the left", "ahead on the left")
+    sides = (
+        *("ahead", "ahead on the right", "the right", "behind on the right"),
+        *("behind", "behind on the left", "the left", "ahead on the left"),
+    )
     side = sides[round(around / 45.0) % 8]
     height = "overhead" if summary.elevation_deg > 75.0 else f"{summary.elevation_deg:.0f} deg high"
     where = height if height == "overhead" else f"from {side}, {height}"
