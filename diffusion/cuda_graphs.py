@@ -9,9 +9,10 @@ functions stay the reference; a recording is nothing but faster.
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Hashable, Iterator
-from contextlib import AbstractContextManager, contextmanager
+from collections.abc import Callable, Hashable, Iterator, Sequence
+from contextlib import contextmanager
 from typing import Any
+from weakref import WeakSet
 
 import torch
 from torch import Tensor
@@ -35,11 +36,10 @@ class Graphs:
         """Time that recording took, in all [s]."""
         # A stream's libraries keep workspaces: with one stream they are made before a recording,
         # and not in its memory.
-        self._stream = torch.cuda.Stream(device)
+        self.stream = torch.cuda.Stream(device)
         self._calls: dict[Hashable, int] = {}
         self._passes: dict[Hashable, _Pass] = {}
-        self._gradients: dict[Hashable, _Gradient] = {}
-        self._steps: list[RecordedStep] = []
+        self._recorded: WeakSet[RecordedFunction | RecordedStep] = WeakSet()
 
     def run(self, key: Hashable, function: Callable[..., Tensor], *arguments: Tensor) -> Tensor:
         """Return ``function(*arguments)`` without a gradient.
@@ -49,33 +49,29 @@ class Graphs:
             function: Does the same to the same shapes; waits for nothing and uploads nothing.
             arguments: On the device.
         """
-        key = key, *((x.shape, x.dtype) for x in arguments)
+        key = key, *_kinds(arguments)
         if key not in self._passes:
-            if self._is_rare(key):
+            self._calls[key] = self._calls.get(key, 0) + 1
+            if self._calls[key] <= PLAIN_CALLS:
                 return function(*arguments)
-            with self._recording():
+            with self.recording():
                 pool = next(iter(self._passes.values())).graph.pool() if self._passes else None
-                self._passes[key] = _Pass(function, arguments, self._stream, pool)
+                self._passes[key] = _Pass(function, arguments, self.stream, pool)
         return self._passes[key](*arguments)
 
-    def run_with_gradient(
-        self, key: Hashable, function: Callable[[Tensor], Tensor], x: Tensor
-    ) -> Tensor:
-        """Return ``function(x)``, differentiable in ``x`` alone; its arguments are those of `run`.
+    def recorded_function(
+        self, function: Callable[..., tuple[Tensor, ...]], parameters: Sequence[Tensor] = ()
+    ) -> RecordedFunction:
+        """Return what computes a function and, when it is asked for, its gradient.
 
-        The gradient is that of the latest call of its kind: what it needs is overwritten by the
-        next.
-
-        Raises:
-            RuntimeError: In the backward pass, when there was another call of its kind since.
+        Args:
+            function: Does the same to the same shapes; waits for nothing and uploads nothing.
+            parameters: What it is differentiated by besides its arguments, each always in the same
+                memory.
         """
-        key = key, x.shape, x.dtype
-        if key not in self._gradients:
-            if self._is_rare(key):
-                return function(x)
-            with self._recording():
-                self._gradients[key] = _Gradient(function, x, self._stream)
-        return self._gradients[key](x)
+        made = RecordedFunction(self, function, parameters)
+        self._recorded.add(made)
+        return made
 
     def recorded_step(self, update: Callable[[], None]) -> RecordedStep:
         """Return what does ``update`` again and again.
@@ -83,34 +79,31 @@ class Graphs:
         Args:
             update: Reads and writes the same memory each time; waits for nothing.
         """
-        step = RecordedStep(update, self._stream, self._recording)
-        self._steps.append(step)
-        return step
+        made = RecordedStep(self, update)
+        self._recorded.add(made)
+        return made
 
     def clear(self) -> None:
         """Forget all recordings and free their memory; later calls record anew."""
-        if not (self._calls or self._steps):
-            return
         torch.cuda.synchronize(self.device)
         self._calls.clear()
         self._passes.clear()
-        self._gradients.clear()
-        for step in self._steps:
-            step.forget()
-        self._steps.clear()
+        for recorded in self._recorded:
+            recorded.forget()
         torch.cuda.empty_cache()
 
-    def _is_rare(self, key: Hashable) -> bool:
-        self._calls[key] = self._calls.get(key, 0) + 1
-        return self._calls[key] <= PLAIN_CALLS
-
     @contextmanager
-    def _recording(self) -> Iterator[None]:
+    def recording(self) -> Iterator[None]:
+        """Count the time within this context as that of recording."""
         start = time.perf_counter()
         with torch.cuda.device(self.device):
             yield
             torch.cuda.synchronize()
         self.seconds += time.perf_counter() - start
+
+
+def _kinds(arguments: Sequence[Tensor]) -> tuple[Hashable, ...]:
+    return tuple((x.shape, x.dtype) for x in arguments)
 
 
 class _Pass:
@@ -122,7 +115,7 @@ class _Pass:
     def __init__(
         self,
         function: Callable[..., Tensor],
-        arguments: tuple[Tensor, ...],
+        arguments: Sequence[Tensor],
         stream: torch.cuda.Stream,
         pool: Any,
     ) -> None:
@@ -141,88 +134,145 @@ class _Pass:
         return self.result.clone()
 
 
+class RecordedFunction:
+    """A function of some tensors with its gradient; made by `Graphs.recorded_function`.
+
+    The gradient is that of the latest call with its shapes: what it needs is overwritten by the
+    next, and then asking for it raises a RuntimeError.
+    """
+
+    def __init__(
+        self,
+        graphs: Graphs,
+        function: Callable[..., tuple[Tensor, ...]],
+        parameters: Sequence[Tensor],
+    ) -> None:
+        self._graphs, self._function, self._parameters = graphs, function, tuple(parameters)
+        self._calls: dict[Hashable, int] = {}
+        self._gradients: dict[Hashable, _Gradient] = {}
+
+    def __call__(self, *arguments: Tensor) -> tuple[Tensor, ...]:
+        """Return what the function returns."""
+        key = _kinds(arguments)
+        if key not in self._gradients:
+            self._calls[key] = self._calls.get(key, 0) + 1
+            if self._calls[key] <= PLAIN_CALLS:
+                return self._function(*arguments)
+            with self._graphs.recording():
+                self._gradients[key] = _Gradient(
+                    self._function, arguments, self._parameters, self._graphs.stream
+                )
+        results: tuple[Tensor, ...] = _Replay.apply(  # type: ignore[no-untyped-call]
+            self._gradients[key], *arguments, *self._parameters
+        )
+        return results
+
+    def forget(self) -> None:
+        """Free the recordings; the next calls start anew."""
+        self._calls.clear()
+        self._gradients.clear()
+
+
 class _Gradient:
-    """A function of one tensor and its gradient, recorded as two graphs with memory of their own.
+    """Both halves of a function, recorded as two graphs with memory of their own.
 
     Other recordings run between the two, so they must not share it.
     """
 
     def __init__(
-        self, function: Callable[[Tensor], Tensor], x: Tensor, stream: torch.cuda.Stream
+        self,
+        function: Callable[..., tuple[Tensor, ...]],
+        arguments: Sequence[Tensor],
+        parameters: Sequence[Tensor],
+        stream: torch.cuda.Stream,
     ) -> None:
-        self.x = x.detach().clone().requires_grad_()
+        self.arguments = [x.detach().clone().requires_grad_(x.requires_grad) for x in arguments]
         self.forward, self.backward = torch.cuda.CUDAGraph(), torch.cuda.CUDAGraph()
         self.calls = 0
         stream.wait_stream(torch.cuda.current_stream())
         with torch.enable_grad():
             with torch.cuda.stream(stream):
-                result = function(self.x)
-                self.d_result = torch.zeros_like(result)
-                torch.autograd.grad(result, self.x, self.d_result)
-                del result
+                results = function(*self.arguments)
+                self.is_free = [x.requires_grad for x in results]
+                self.d_results = [torch.zeros_like(x) for x in results if x.requires_grad]
+                self._differentiate(results, parameters)
+            del results
             with torch.cuda.graph(self.forward, stream=stream):
-                result = function(self.x)
+                results = function(*self.arguments)
             with torch.cuda.graph(self.backward, pool=self.forward.pool(), stream=stream):
-                (self.d_x,) = torch.autograd.grad(result, self.x, self.d_result)
-        self.result = result.detach()
+                self.d_inputs = self._differentiate(results, parameters)
+        self.results = [x.detach() for x in results]
 
-    def __call__(self, x: Tensor) -> Tensor:
-        result: Tensor = _Replay.apply(self, x)  # type: ignore[no-untyped-call]
-        return result
+    def _differentiate(
+        self, results: Sequence[Tensor], parameters: Sequence[Tensor]
+    ) -> list[Tensor | None]:
+        """Return the gradient of each argument and parameter, None where there is none."""
+        inputs = [*self.arguments, *parameters]
+        gradients = iter(
+            torch.autograd.grad(
+                [x for x in results if x.requires_grad],
+                [x for x in inputs if x.requires_grad],
+                self.d_results,
+                allow_unused=True,
+            )
+        )
+        return [next(gradients) if x.requires_grad else None for x in inputs]
 
 
 class _Replay(torch.autograd.Function):
     """Both halves of a `_Gradient`; what leaves its memory is copied."""
 
     @staticmethod
-    def forward(ctx: Any, recording: _Gradient, x: Tensor) -> Tensor:
-        recording.calls += 1
-        ctx.recording, ctx.call = recording, recording.calls
-        recording.x.detach().copy_(x)
-        recording.forward.replay()
-        return recording.result.clone()
+    def forward(ctx: Any, recorded: _Gradient, *inputs: Tensor) -> tuple[Tensor, ...]:
+        recorded.calls += 1
+        ctx.recorded, ctx.call = recorded, recorded.calls
+        for held, given in zip(recorded.arguments, inputs, strict=False):  # parameters stay
+            held.detach().copy_(given)
+        recorded.forward.replay()
+        results = tuple(x.clone() for x in recorded.results)
+        fixed = (x for x, is_free in zip(results, recorded.is_free, strict=True) if not is_free)
+        ctx.mark_non_differentiable(*fixed)
+        return results
 
     @staticmethod
-    def backward(ctx: Any, *d_results: Tensor) -> tuple[None, Tensor]:
-        recording = ctx.recording
-        if ctx.call != recording.calls:
+    def backward(ctx: Any, *d_results: Tensor) -> tuple[Tensor | None, ...]:
+        recorded = ctx.recorded
+        if ctx.call != recorded.calls:
             raise RuntimeError(
                 "the gradient of a recorded pass was asked for too late: "
-                f"{recording.calls - ctx.call} passes came after it"
+                f"{recorded.calls - ctx.call} passes came after it"
             )
-        recording.d_result.copy_(d_results[0])
-        recording.backward.replay()
-        return None, recording.d_x.clone()
+        given = (d for d, is_free in zip(d_results, recorded.is_free, strict=True) if is_free)
+        for held, d_result in zip(recorded.d_results, given, strict=True):
+            held.copy_(d_result)
+        recorded.backward.replay()
+        return None, *(None if d is None else d.clone() for d in recorded.d_inputs)
 
 
 class RecordedStep:
     """A training's step; the first are taken as they are, and later ones replayed."""
 
-    def __init__(
-        self,
-        update: Callable[[], None],
-        stream: torch.cuda.Stream,
-        recording: Callable[[], AbstractContextManager[None]],
-    ) -> None:
-        self._update, self._stream, self._recording = update, stream, recording
+    def __init__(self, graphs: Graphs, update: Callable[[], None]) -> None:
+        self._graphs, self._update = graphs, update
         self._graph: torch.cuda.CUDAGraph | None = None
         self._calls = 0
 
     def __call__(self) -> None:
         """Take one step."""
         self._calls += 1
+        stream = self._graphs.stream
         if self._graph is None and self._calls <= PLAIN_STEPS:
             # Gradients remember the stream they were first made in.
             current = torch.cuda.current_stream()
-            self._stream.wait_stream(current)
-            with torch.cuda.stream(self._stream):
+            stream.wait_stream(current)
+            with torch.cuda.stream(stream):
                 self._update()
-            current.wait_stream(self._stream)
+            current.wait_stream(stream)
             return
         if self._graph is None:
-            with self._recording():
+            with self._graphs.recording():
                 graph = torch.cuda.CUDAGraph()
-                with torch.cuda.graph(graph, stream=self._stream):
+                with torch.cuda.graph(graph, stream=stream):
                     self._update()
                 self._graph = graph
         self._graph.replay()

@@ -101,6 +101,8 @@ class StableDiffusion:
             vae.encoder.mid_block.gradient_checkpointing = False
         self.device: torch.device = unet.device
         self.graphs = Graphs(self.device) if graphs else None
+        self._mean = partial(_posterior_mean, vae)
+        self._recorded_mean = self.graphs.recorded_function(self._mean) if self.graphs else None
         self.unet_dtype: torch.dtype = unet.dtype
         """Arithmetic of the UNet; an adapter in training may have its own."""
         self.latent_size: int = unet.config.sample_size
@@ -157,16 +159,11 @@ class StableDiffusion:
                 f"image: shape {tuple(image.shape)} (expected [B, 3, R, R], {expected})"
             )
         pixels = (2.0 * image - 1.0).to(self.device, self.vae.dtype)
-        if self.graphs is not None and pixels.requires_grad and torch.is_grad_enabled():
-            mean = self.graphs.run_with_gradient("encode", self._mean, pixels)
-        else:
-            mean = self._mean(pixels)
+        mean_of: Callable[[Tensor], tuple[Tensor, ...]] = self._mean
+        if self.graphs and self._recorded_mean and pixels.requires_grad and torch.is_grad_enabled():
+            mean_of = self._recorded_mean
+        (mean,) = mean_of(pixels)
         return mean.float() * self._latent_scale
-
-    def _mean(self, pixels: Tensor) -> Tensor:
-        """Return the mean of the posterior, shape [B, 4, h, w]."""
-        mean: Tensor = self.vae.encode(pixels).latent_dist.mean
-        return mean
 
     @torch.no_grad()
     def decode(self, latents: Tensor) -> Tensor:
@@ -535,6 +532,11 @@ class StableDiffusion:
 
     def _notice(self, text: str) -> None:
         self.notices = (*self.notices, text)
+
+
+def _posterior_mean(vae: AutoencoderKL, pixels: Tensor) -> tuple[Tensor, ...]:
+    """Return the mean of the latents' distribution, shape [B, 4, h, w], and nothing else."""
+    return (vae.encode(pixels).latent_dist.mean,)
 
 
 def load_stable_diffusion(settings: ModelSettings, device: torch.device | str) -> StableDiffusion:
