@@ -44,10 +44,10 @@ def fused_light(texels_fg: Tensor, texels_shadow: Tensor) -> Tensor:
     share = S / torch.where(F + S > dark, F + S, one)
     rise = torch.where(F + S > dark, share * (S - F), torch.zeros_like(F))
     relative = texels_fg / torch.where(peak > dark, peak, torch.ones_like(peak))
-    return texels_fg + torch.where(peak > dark, 1.0, 0.0) * relative * rise[..., None]
+    return texels_fg + (peak > dark).to(F.dtype) * relative * rise[..., None]
 
 
-def fuse(texels_fg: Tensor, texels_shadow: Tensor, scale: float) -> tuple[Tensor, Tensor]:
+def fuse(texels_fg: Tensor, texels_shadow: Tensor, scale: float | Tensor) -> tuple[Tensor, Tensor]:
     """Return both lights, blended toward the fused one (S 6, S 7): ``L'_fg`` and ``L'_shadow``.
 
     Differentiable in both maps, with finite gradients where a map or a texel is black.
@@ -56,7 +56,8 @@ def fuse(texels_fg: Tensor, texels_shadow: Tensor, scale: float) -> tuple[Tensor
         texels_fg: Lat-long radiance >= 0 of the object's light, relative [W/(m^2 sr)], world frame,
             shape [He, We, 3].
         texels_shadow: The same for the shadow's light.
-        scale: ``s_fuse``, 0 two separate lights to 1 one light [1].
+        scale: ``s_fuse``, 0 two separate lights to 1 one light [1]; the value of a tensor, which
+            may be on a device, is not looked at.
 
     Returns:
         The two primed maps, shape [He, We, 3] each; exactly the given ones at scale 0, equal to
@@ -70,7 +71,7 @@ def fuse(texels_fg: Tensor, texels_shadow: Tensor, scale: float) -> tuple[Tensor
             "two maps of one shape [He, We, 3] are fused, got "
             f"{tuple(texels_fg.shape)} and {tuple(texels_shadow.shape)}"
         )
-    if not 0.0 <= scale <= 1.0:
+    if not isinstance(scale, Tensor) and not 0.0 <= scale <= 1.0:
         raise ValueError(f"scale: from 0 to 1, got {scale}")
     fused = fused_light(texels_fg, texels_shadow)
     return (

@@ -6,6 +6,8 @@ loss that is summed over its latents.
 
 from __future__ import annotations
 
+from functools import lru_cache
+
 import torch
 from torch import Tensor
 
@@ -22,8 +24,12 @@ FLUX_FLOOR = 1e-20
 
 def solid_angles(texels: Tensor) -> Tensor:
     """Return the solid angle of each row's texels [sr], shape [He, 1]."""
-    omega = texel_solid_angles(texels.shape[0], texels.shape[1])
-    return torch.from_numpy(omega).to(texels)[:, None]
+    return _solid_angles(texels.shape[0], texels.shape[1], texels.device, texels.dtype)
+
+
+@lru_cache(maxsize=8)
+def _solid_angles(rows: int, columns: int, device: torch.device, dtype: torch.dtype) -> Tensor:
+    return torch.from_numpy(texel_solid_angles(rows, columns)).to(device, dtype)[:, None]
 
 
 def consistency(texels_fg: Tensor, texels_shadow: Tensor) -> Tensor:

@@ -119,7 +119,7 @@ class SGLight(torch.nn.Module):
         Each texel holds the light at its centre, which is exact enough for lobes of at least
         `TEXELS_PER_SIGMA` texels; `warpir.bridge.rasterize` averages lobes of any width.
         """
-        directions = _directions(height).to(self.axis)
+        directions = _directions(height, self.axis.device, self.axis.dtype)
         axis = self.axis / self.axis.norm(dim=1, keepdim=True)
         sharpness = torch.exp(-2.0 * self.log_sigma)
         exponent = (directions @ axis.T - 1.0) * sharpness
@@ -150,5 +150,5 @@ def fibonacci(count: int) -> np.ndarray[tuple[int, ...], np.dtype[np.float32]]:
 
 
 @lru_cache(maxsize=8)
-def _directions(height: int) -> Tensor:
-    return torch.from_numpy(map_directions(height, 2 * height).reshape(-1, 3))
+def _directions(height: int, device: torch.device, dtype: torch.dtype) -> Tensor:
+    return torch.from_numpy(map_directions(height, 2 * height).reshape(-1, 3)).to(device, dtype)

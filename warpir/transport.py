@@ -13,6 +13,7 @@ to `warpir.mis` (`TransportSettings.sharp_samples`), so that a sun is never blur
 from __future__ import annotations
 
 import time
+from functools import lru_cache
 from pathlib import Path
 
 import numpy as np
@@ -313,22 +314,31 @@ def resize(texels: Tensor, height: int) -> Tensor:
     if (rows, columns) == (height, 2 * height):
         return texels
 
+    by_row, by_column = _shares(rows, columns, height, texels.device, texels.dtype)
+    # One after the other: all three at once go through a matrix of both sizes squared.
+    coarse = torch.einsum("ai,ijc->ajc", by_row, texels)
+    return torch.einsum("bj,ajc->abc", by_column, coarse)
+
+
+@lru_cache(maxsize=8)
+def _shares(
+    rows: int, columns: int, height: int, device: torch.device, dtype: torch.dtype
+) -> tuple[Tensor, Tensor]:
+    """Return the share of each old row in each new one, and the same of columns."""
+
     def overlaps(old: Float64Array, new: Float64Array) -> Tensor:
         """Share of each old interval in each new one, between rising edges."""
         low = np.maximum(new[:-1, None], old[None, :-1])
         high = np.minimum(new[1:, None], old[None, 1:])
         share = np.maximum(high - low, 0.0) / np.diff(new)[:, None]
-        return torch.from_numpy(share.astype(np.float32)).to(texels.device, texels.dtype)
+        return torch.from_numpy(share.astype(np.float32)).to(device, dtype)
 
     def heights(count: int) -> Float64Array:
         # Solid angle is proportional to the height on the sphere (Archimedes).
         return -np.cos(np.pi * np.arange(count + 1) / count)
 
-    by_row = overlaps(heights(rows), heights(height))
     by_column = overlaps(np.linspace(0, 1, columns + 1), np.linspace(0, 1, 2 * height + 1))
-    # One after the other: all three at once go through a matrix of both sizes squared.
-    coarse = torch.einsum("ai,ijc->ajc", by_row, texels)
-    return torch.einsum("bj,ajc->abc", by_column, coarse)
+    return overlaps(heights(rows), heights(height)), by_column
 
 
 def _device_of(light: LightTensors) -> torch.device:
