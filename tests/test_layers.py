@@ -14,7 +14,7 @@ LEVELS = (
     {"config"},
     {"camera", "asset_files", "record", "progress", "light", "tone", "curves", "materials_file"},
     {"gltf_file", "mtl", "files", "command", "placement", "lobes_file", "lobe_fit"},
-    {"gltf_material", "obj", "reuse"},
+    {"gltf_material", "obj", "reuse", "program"},
     {"gltf"},
     {"inputs", "scene"},
     {"render", "lighting"},

@@ -13,24 +13,18 @@ torch and Warp are imported when all inputs are known to be good, so ``--help``,
 and ``--validate`` answer without them.
 """
 
-import errno
-import logging
-import os
 import shutil
-import signal
 import sys
-import threading
-import traceback
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
-from types import FrameType, ModuleType
+from types import ModuleType
 from typing import TYPE_CHECKING, Any
 
 from warpir.command import parse
-from warpir.config import InsertConfig, usage
-from warpir.errors import ExitCode, InputError
+from warpir.config import InsertConfig
+from warpir.errors import ExitCode
+from warpir.program import run_program, say
 
 if TYPE_CHECKING:
     from warpir.camera import Camera
@@ -41,19 +35,6 @@ if TYPE_CHECKING:
     from warpir.record import Timings
 
 __all__ = ["InsertConfig", "Insertion", "insert", "main"]
-
-INTERRUPTED = 130
-TERMINATED = 143
-EXTRA_OF = {
-    "accelerate": "diffusion",
-    "diffusers": "diffusion",
-    "peft": "diffusion",
-    "transformers": "diffusion",
-    "ray": "ray",
-    "mitsuba": "bench",
-    "matplotlib": "bench",
-}
-"""Which extra brings a package that a plain install does not have."""
 
 
 @dataclass(frozen=True)
@@ -91,9 +72,9 @@ def _insert_sequence(config: InsertConfig) -> Insertion:
     frames = read_sequence(config, loaders)
     for frame in frames:
         if frame.is_done:
-            _say(f"frame {frame.folder.name}: done already")
+            say(f"frame {frame.folder.name}: done already")
         else:
-            _say(f"frame {frame.folder.name}: line {frame.line} of {config.sequence}")
+            say(f"frame {frame.folder.name}: line {frame.line} of {config.sequence}")
             _insert_one(frame.config, loaders)
     assert config.out is not None
     record = write_summary(config, frames)
@@ -122,7 +103,7 @@ def _insert_one(config: InsertConfig, loaders: "Loaders | None" = None) -> Inser
             from warpir.render import Renderer, choose_device
 
             device = choose_device(config.device)
-            _say(f"device: {device} (the first run compiles the kernels)")
+            say(f"device: {device} (the first run compiles the kernels)")
         recovered: dict[str, Any] = {}
         notices = inputs.notices
         if config.guidance != "none":
@@ -182,8 +163,8 @@ def _guide(
     from warpir.progress import StepProgress
     from warpir.recover import Run, recover
 
-    with StepProgress(_say) as progress:
-        run = Run(config, inputs, device, output, timings, _say, progress)
+    with StepProgress(say) as progress:
+        run = Run(config, inputs, device, output, timings, say, progress)
         if config.refine is None:
             light, record, notices = recover(run, light)
         else:
@@ -192,7 +173,7 @@ def _guide(
             light, asset, record, notices = refine(run, light)
             inputs = replace(inputs, asset=asset)
     for notice in notices:
-        _say(f"notice: {notice}")
+        say(f"notice: {notice}")
     return inputs, light, record, notices
 
 
@@ -238,13 +219,13 @@ def _write(
         description="Mirror ball and white diffuse ball under the light",
     )
     summary = summarize(light.light)
-    _say(
+    say(
         f"light: brightest toward azimuth {summary.azimuth_deg:.0f}, elevation "
         f"{summary.elevation_deg:.0f} degrees; {100.0 * summary.peak_share:.0f} % of its flux "
         "comes from there"
     )
     if not (picture.layers.matte > 0.0).any():
-        _say("notice: the object is not seen in the photo")
+        say("notice: the object is not seen in the photo")
     fit = light.fit
     return {
         "prior": "none",
@@ -277,16 +258,16 @@ def _read(
         config = demo_config(config)
     inputs = read_inputs(config, loaders)
     light = make_light(inputs, config)
-    _say(f"placement: {inputs.placement.summary}")
+    say(f"placement: {inputs.placement.summary}")
     for line in (*inputs.assumed, *light.assumed):
-        _say(f"assumed: {line}")
+        say(f"assumed: {line}")
     for line in inputs.notices:
-        _say(f"notice: {line}")
+        say(f"notice: {line}")
     return config, inputs, light
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Run the command line; the one place that prints errors.
+    """Run the command line.
 
     Args:
         argv: Arguments without the program's name; ``sys.argv`` when absent.
@@ -294,40 +275,20 @@ def main(argv: Sequence[str] | None = None) -> int:
     Returns:
         The exit status, an `ExitCode` or 128 plus the number of a signal.
     """
-    arguments = list(sys.argv[1:] if argv is None else argv)
-    debug = "--debug" in arguments
-    if debug:
-        logging.basicConfig(level=logging.DEBUG, format="debug: %(name)s: %(message)s")
-    for stream in (sys.stdout, sys.stderr):
-        # A terminal without UTF-8 shows escapes; it must not end the run.
-        if hasattr(stream, "reconfigure"):
-            stream.reconfigure(errors="backslashreplace")
-    try:
-        with _terminate_as_exception():
-            return _run(arguments)
-    except BaseException as error:
-        status, lines = _explain(error)
-        if debug and not isinstance(error, SystemExit):
-            traceback.print_exc()
-        elif status == ExitCode.BUG:
-            # Without --debug too: without it nobody could repair what is our fault.
-            traceback.print_exc()
-        for line in lines:
-            print(line, file=sys.stderr)
-        return status
+    return run_program(_run, argv)
 
 
 def _run(arguments: list[str]) -> int:
     command = parse(arguments)
     for notice in command.notices:
-        _say(f"notice: {notice}")
+        say(f"notice: {notice}")
     if command.validate:
         _validate(command.config)
-        _say("inputs are valid")
+        say("inputs are valid")
         return ExitCode.DONE
     insertion = insert(command.config)
     for name in insertion.files:
-        _say(str(insertion.out / name))
+        say(str(insertion.out / name))
     return ExitCode.DONE
 
 
@@ -339,74 +300,7 @@ def _validate(config: InsertConfig) -> None:
     from warpir.sequence import read_sequence
 
     frames = read_sequence(config, Loaders())
-    _say(f"frames: {len(frames)}, of which {sum(f.is_done for f in frames)} are done already")
-
-
-def _explain(error: BaseException) -> tuple[int, list[str]]:
-    """Return the exit status of an exception and the lines that tell the user about it."""
-    if isinstance(error, SystemExit):
-        return error.code if isinstance(error.code, int) else ExitCode.DONE, []
-    if isinstance(error, _Terminated):
-        return TERMINATED, ["stopped"]
-    if isinstance(error, KeyboardInterrupt):
-        return INTERRUPTED, ["stopped"]
-    missing = (getattr(error, "name", None) or "").split(".")[0]
-    if isinstance(error, ModuleNotFoundError) and missing in EXTRA_OF:
-        error = usage(
-            missing, "not installed", f"pip install 'warpir[{EXTRA_OF[missing]}]' brings it"
-        )
-    elif isinstance(error, MemoryError) or type(error).__name__ == "OutOfMemoryError":
-        error = InputError(
-            "memory",
-            "not enough of it",
-            "lower --width, --samples or --rays, or use --device cpu",
-            ExitCode.RESOURCES,
-        )
-    elif isinstance(error, OSError) and error.errno in (errno.ENOSPC, errno.EDQUOT, errno.EFBIG):
-        name = error.filename or "--out"
-        error = InputError(name, f"cannot be written ({error.strerror})", code=ExitCode.RESOURCES)
-    if isinstance(error, InputError):
-        lines = [_one_line(f"error: {error.where}: {error.what}")]
-        lines += [_one_line(error.advice)] if error.advice else []
-        return error.code, lines + [_one_line(f"also: {o.where}: {o.what}") for o in error.also]
-    kind = _one_line(f"{type(error).__name__}: {error}")
-    return ExitCode.BUG, [
-        f"error: warpir: a fault of its own ({kind})",
-        "please report it with the lines above and the command that was run",
-    ]
-
-
-def _one_line(text: str) -> str:
-    # File names may hold line breaks and control characters.
-    return "".join(c if c.isprintable() else repr(c)[1:-1] for c in text)
-
-
-def _say(line: str) -> None:
-    """Print on standard output; a reader that went away (``| head``) does not end the run."""
-    try:
-        print(_one_line(line), flush=True)
-    except BrokenPipeError:
-        # Python flushes once more at exit: give it somewhere to write to.
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
-
-
-class _Terminated(BaseException):
-    """SIGTERM, turned into an exception so that staged files and locks are removed."""
-
-
-@contextmanager
-def _terminate_as_exception() -> Iterator[None]:
-    def terminate(signum: int, frame: FrameType | None) -> None:
-        raise _Terminated
-
-    if threading.current_thread() is not threading.main_thread():
-        yield
-        return
-    previous = signal.signal(signal.SIGTERM, terminate)
-    try:
-        yield
-    finally:
-        signal.signal(signal.SIGTERM, previous)
+    say(f"frames: {len(frames)}, of which {sum(f.is_done for f in frames)} are done already")
 
 
 class _CallableModule(ModuleType):
