@@ -110,7 +110,7 @@ def make_class_images(
             missing.append(index)
         else:
             images[index] = found
-    if report:
+    if report and count:
         report("class images", count - len(missing), count)
 
     for start in range(0, len(missing), settings.class_batch):

@@ -24,7 +24,8 @@ from warpir.diffusion.settings import PersonalizeSettings
 if TYPE_CHECKING:
     from warpir.diffusion.stable_diffusion import StableDiffusion
 
-WITH_CLASS, WITHOUT_CLASS = "scene", "scene-without-class"
+# Neither is part of the other: diffusers would look for the one among the weights of the other.
+WITH_CLASS, WITHOUT_CLASS = "scene", "no-class"
 TITLES = {
     None: "before",
     WITH_CLASS: "adapted, with class images",

@@ -655,6 +655,8 @@ def test_the_model_is_shown_before_and_after(epsilon: StableDiffusion, tmp_path:
     arguments = (epsilon, PHOTO, PROMPTS, settings, 0, tmp_path, shown, [0, 1])
     sheet = show_personalization(*arguments)
     assert epsilon.adapters == {WITH_CLASS, WITHOUT_CLASS}
+    # Diffusers looks for an adapter by "name in key", and warns of weights that are another's.
+    assert WITH_CLASS not in WITHOUT_CLASS and WITHOUT_CLASS not in WITH_CLASS
     assert len(list((tmp_path / "lora").iterdir())) == 2
     side, width = epsilon.resolution, 2 * epsilon.resolution + 6
     assert sheet.shape[1] == LABEL_WIDTH + 3 * width

@@ -278,6 +278,7 @@ def test_start_from_a_given_light_preview_and_prior(folder: Path, tmp_path: Path
         "preview-000004.png",
     ]
     assert (out / "prior.png").exists()
+    assert record(out)["measured"]["personalization"]["reused"] is False
     assert not any("even one" in line for line in record(out)["assumed"])
 
 

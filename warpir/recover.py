@@ -202,12 +202,6 @@ def prepare_guidance(
     photo = torch.from_numpy(run.inputs.photo.srgb).permute(2, 0, 1)[None].contiguous()
     cache = cache_folder()
     with run.timings.stage("personalize"):
-        if shown:
-            sheet = show_personalization(
-                prior, photo, prompts, config, config.seed, cache, shown, SHOWN_SEEDS,
-                run.progress.report,
-            )  # fmt: skip
-            run.output.write_png("prior.png", sheet, mark=False, description="The model's idea")
         every = config.checkpoint_every
 
         def on_step(training: Any) -> None:
@@ -225,6 +219,12 @@ def prepare_guidance(
             on_step=on_step,
             resume=resumed.state if resumed and resumed.stage == "personalize" else None,
         )
+        if shown:
+            sheet = show_personalization(
+                prior, photo, prompts, config, config.seed, cache, shown, SHOWN_SEEDS,
+                run.progress.report,
+            )  # fmt: skip
+            run.output.write_png("prior.png", sheet, mark=False, description="The model's idea")
     prior.free_text_encoder()
     record["personalization"] = {
         "reused": made.is_reused,
