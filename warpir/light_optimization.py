@@ -6,7 +6,8 @@ the run; a tone curve belongs to the object, three to the shadow ratio.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -15,17 +16,23 @@ from torch import Tensor
 
 from warpir.camera import Camera
 from warpir.fusion import fuse
+from warpir.integrator import Radiance
 from warpir.light import Light, Lobes, describe, summarize
 from warpir.optimize import Guide, Optimization
 from warpir.optimize_settings import OptimizeSettings
 from warpir.regularizers import bend, chroma, consistency, spread
 from warpir.sg_light import LightBounds, SGLight, narrowest
-from warpir.tone import ToneCurve
+from warpir.tone import Knots, ToneCurve
 from warpir.transport_rows import TransportSettings
 from warpir.view import Frame, View, expected_light
 
 RETRACE_EVERY = 25
 """Steps between two looks at whether the light has left what was expected of it."""
+
+Function = Callable[..., tuple[Tensor, ...]]
+Record = Callable[[Function, Sequence[Tensor]], Function]
+"""Given a function of tensors and what it is differentiated by besides, returns one that does the
+same faster, such as a CUDA graph's replay."""
 
 
 class Unknowns(torch.nn.Module):
@@ -62,6 +69,29 @@ class Unknowns(torch.nn.Module):
         return Unknowns(light(), light())
 
 
+@dataclass(frozen=True)
+class Parts:
+    """What a step makes before it is composed."""
+
+    radiance: Radiance
+    curve_fg: Knots
+    curve_shadow: Knots
+    terms: dict[str, Tensor]
+    """Regularisers by name."""
+
+    def tensors(self) -> tuple[Tensor, ...]:
+        """Return all of them in a fixed order."""
+        groups = (self.radiance, self.curve_fg, self.curve_shadow)
+        return *(x for group in groups for x in vars(group).values()), *self.terms.values()
+
+    @staticmethod
+    def of(tensors: Sequence[Tensor], names: Sequence[str]) -> Parts:
+        """Return the parts again, with the names of their terms."""
+        radiance, curve_fg, curve_shadow = tensors[:3], tensors[3:6], tensors[6:9]
+        terms = dict(zip(names, tensors[9:], strict=True))
+        return Parts(Radiance(*radiance), Knots(*curve_fg), Knots(*curve_shadow), terms)
+
+
 class LightOptimization(Optimization):
     """Light and tone curves of one frame.
 
@@ -72,6 +102,7 @@ class LightOptimization(Optimization):
         unknowns: Where to start; changed in place.
         cache: Folder for traced rows, or None.
         transport: How finely light is traced; by default the heights are those of the settings.
+        record: Makes steps with `transport` faster; by default they are taken as they are.
     """
 
     unknowns: Unknowns
@@ -84,6 +115,7 @@ class LightOptimization(Optimization):
         unknowns: Unknowns,
         cache: Path | None = None,
         transport: TransportSettings | None = None,
+        record: Record | None = None,
     ) -> None:
         super().__init__(unknowns, _groups(unknowns, settings), guide, settings, frame.seed)
         self.frame, self.cache, self.rows = frame, cache, transport
@@ -92,13 +124,26 @@ class LightOptimization(Optimization):
                 height_fg=settings.object_light_height, height_shadow=settings.light_height
             )
         self.retraced = 0
-        self._maps = self._separate(settings.light_height)
+        self._record = record
+        self._terms: dict[str, Tensor] = {}
+        self._term_names: tuple[str, ...] = ()
         with torch.no_grad():
             self.expected = expected_light(*self.lights(0.0))
         self.view = self._trace()
 
     def _trace(self) -> View:
-        return View(self.frame, self.expected, self.rows, self.settings.mis_samples, self.cache)
+        view = View(self.frame, self.expected, self.rows, self.settings.mis_samples, self.cache)
+        # What was recorded reads the rows of the view before.
+        self._recorded = None
+        if self._record is not None and view.transport is not None:
+            self._recorded = self._record(self._tensors, list(self.unknowns.parameters()))
+        return view
+
+    def _tensors(self, scale: Tensor) -> tuple[Tensor, ...]:
+        """Return the parts of a step, for recording."""
+        parts = self._parts(scale)
+        self._term_names = tuple(parts.terms)
+        return parts.tensors()
 
     def fusion(self, step: int) -> float:
         """Return ``s_fuse`` of a step: how far both lights have become one [1]."""
@@ -127,35 +172,48 @@ class LightOptimization(Optimization):
             return texels_fg, texels_fg
         return texels_fg, self.unknowns.light_shadow.texels(height)
 
-    def _fused(self, maps: tuple[Tensor, Tensor], scale: float) -> tuple[Tensor, Tensor]:
+    def _parts(self, scale: float | Tensor, seed: int = 0) -> Parts:
+        """Return everything up to the composite; of torch alone with `transport`."""
+        unknowns, maps = self.unknowns, self._separate(self.settings.light_height)
+        curves = unknowns.curve_fg(), unknowns.curve_shadow()
+        radiance = self.view.radiance(*self._fused(maps, scale), seed)
+        return Parts(radiance, *curves, self._terms_of(maps, curves))
+
+    def _fused(self, maps: tuple[Tensor, Tensor], scale: float | Tensor) -> tuple[Tensor, Tensor]:
         return maps if self.settings.fusion == "single" else fuse(*maps, scale)
 
-    def _composite(self, maps: tuple[Tensor, Tensor], scale: float, seed: int) -> Tensor:
-        curves = self.unknowns.curve_fg(), self.unknowns.curve_shadow()
-        return self.view.image(*self._fused(maps, scale), *curves, seed)
+    def _terms_of(
+        self, maps: tuple[Tensor, Tensor], curves: tuple[Knots, Knots]
+    ) -> dict[str, Tensor]:
+        """Return the authors' terms (eq. 10, 11) and ours."""
+        unknowns = self.unknowns
+        terms = {"chroma": 0.5 * (chroma(unknowns.light_fg) + chroma(unknowns.light_shadow))}
+        if self.settings.fusion != "single":
+            terms |= {"consistency": consistency(*maps), "spread": spread(maps[1])}
+        if self.settings.tone_curve:
+            terms["bend"] = bend(curves[0]) + bend(curves[1])
+        return terms
 
     def image(self, step: int) -> Tensor:
         """Return the composite of a step under lights fused as far as the schedule says."""
-        # The regularisers of this step look at the same maps.
-        self._maps = self._separate(self.settings.light_height)
-        return self._composite(self._maps, self.fusion(step), self.seed + step)
+        scale = self.fusion(step)
+        if self._recorded is None:
+            parts = self._parts(scale, self.seed + step)
+        else:
+            device = self.unknowns.light_fg.axis.device
+            made = self._recorded(torch.full((), scale, device=device))
+            parts = Parts.of(made, self._term_names)
+        self._terms = parts.terms
+        return self.view.compose(parts.radiance, parts.curve_fg, parts.curve_shadow)
 
     def final_image(self, seed: int) -> Tensor:
         """Return the composite under the light that would be delivered."""
-        return self._composite(self._separate(self.settings.light_height), self.final_fusion, seed)
+        curves = self.unknowns.curve_fg(), self.unknowns.curve_shadow()
+        return self.view.image(*self.lights(self.final_fusion), *curves, seed)
 
     def terms(self) -> dict[str, tuple[float, Tensor]]:
-        """Return the authors' terms (eq. 10, 11) and ours, of the maps that `image` rendered."""
-        settings, unknowns = self.settings, self.unknowns
-        tint = 0.5 * (chroma(unknowns.light_fg) + chroma(unknowns.light_shadow))
-        terms = {"chroma": (settings.chroma, tint)}
-        if settings.fusion != "single":
-            terms["consistency"] = settings.consistency, consistency(*self._maps)
-            terms["spread"] = settings.spread, spread(self._maps[1])
-        if settings.tone_curve:
-            curves = bend(unknowns.curve_fg()) + bend(unknowns.curve_shadow())
-            terms["bend"] = settings.bend, curves
-        return terms
+        """Return the regularisers of what `image` rendered last."""
+        return {name: (getattr(self.settings, name), term) for name, term in self._terms.items()}
 
     def describe(self, camera: Camera) -> str:
         """Return where the light comes from, and how much of it."""

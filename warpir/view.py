@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from warpir.bridge import ComposeConstants, compose
-from warpir.integrator import Integrator, LightTensors, MaterialTensors
+from warpir.integrator import Integrator, LightTensors, MaterialTensors, Radiance
 from warpir.light import Light
 from warpir.mis import MisIntegrator
 from warpir.render import Renderer, light_args
@@ -120,9 +120,22 @@ class View:
             seed: Of this step's samples; `transport` has none.
             materials: Factors in place of the asset's (`mis` only).
         """
-        radiance = self.integrator.radiance(
-            LightTensors(texels=texels_fg), LightTensors(texels=texels_shadow), seed, materials
-        )
+        radiance = self.radiance(texels_fg, texels_shadow, seed, materials)
+        return self.compose(radiance, curve_fg, curve_shadow)
+
+    def radiance(
+        self,
+        texels_fg: Tensor,
+        texels_shadow: Tensor,
+        seed: int,
+        materials: MaterialTensors | None = None,
+    ) -> Radiance:
+        """Return what the integrator does; arguments are those of `image`."""
+        light_fg, light_shadow = LightTensors(texels=texels_fg), LightTensors(texels=texels_shadow)
+        return self.integrator.radiance(light_fg, light_shadow, seed, materials)
+
+    def compose(self, radiance: Radiance, curve_fg: Knots, curve_shadow: Knots) -> Tensor:
+        """Return the composite of rendered radiance, display-encoded, shape [1, 3, H, W]."""
         return compose(
             self.constants,
             radiance.foreground,
