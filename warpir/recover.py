@@ -301,7 +301,9 @@ def optimize(
         nonlocal words
         step = loop.state.step
         if step % SAY_EVERY == 0 or step == config.step_count:
+            score = loop.state.history[-1].get("score")
             words = loop.describe(run.inputs.camera)
+            words += f"; score {score:.4g}" if score is not None else ""
         run.progress.report("optimisation", step, config.step_count, words)
         if config.preview_every and step % config.preview_every == 0:
             write_preview(run, loop, step)
@@ -310,6 +312,8 @@ def optimize(
 
     with run.timings.stage("optimize"):
         loop.run(on_step)
+    if loop.state.best_score is not None:
+        run.say(f"kept: step {loop.state.best_step}, score {loop.state.best_score:.4g}")
 
 
 def write_preview(run: Run, loop: Optimization, step: int) -> None:
