@@ -32,9 +32,12 @@ def tone_foreground(
 ):
     """Object radiance, premultiplied, to display-linear values in [0, 1], not premultiplied.
 
-    Curves are not linear, so coverage is divided out first; one curve serves all channels.
+    Curves are not linear, so coverage is divided out first; one curve serves all channels. There
+    may be equal copies of it, which share the threads: gradients are added up one by one, and one
+    curve would make all threads wait for each other.
     """
     i = wp.tid()
+    curve = i % knot_x.shape[0]
     if mask[i] <= 0.0:
         display[i] = wp.vec3(0.0)
         return
@@ -47,9 +50,9 @@ def tone_foreground(
         g = reinhard(g)
         b = reinhard(b)
     display[i] = wp.vec3(
-        tone_curve(r, 0, knot_x, knot_y, knot_slope, bin_count),
-        tone_curve(g, 0, knot_x, knot_y, knot_slope, bin_count),
-        tone_curve(b, 0, knot_x, knot_y, knot_slope, bin_count),
+        tone_curve(r, curve, knot_x, knot_y, knot_slope, bin_count),
+        tone_curve(g, curve, knot_x, knot_y, knot_slope, bin_count),
+        tone_curve(b, curve, knot_x, knot_y, knot_slope, bin_count),
     )
 
 
@@ -62,13 +65,14 @@ def tone_shadow(
     bin_count: int,
     display: wp.array[wp.vec3],
 ):
-    """Shadow ratio through one curve per channel; 1 stays 1."""
+    """Shadow ratio through one curve per channel; 1 stays 1. Copies are as in the foreground."""
     i = wp.tid()
+    curve = 3 * (i % (knot_x.shape[0] // 3))
     x = ratio[i]
     display[i] = wp.vec3(
-        tone_curve(x[0], 0, knot_x, knot_y, knot_slope, bin_count),
-        tone_curve(x[1], 1, knot_x, knot_y, knot_slope, bin_count),
-        tone_curve(x[2], 2, knot_x, knot_y, knot_slope, bin_count),
+        tone_curve(x[0], curve, knot_x, knot_y, knot_slope, bin_count),
+        tone_curve(x[1], curve + 1, knot_x, knot_y, knot_slope, bin_count),
+        tone_curve(x[2], curve + 2, knot_x, knot_y, knot_slope, bin_count),
     )
 
 

@@ -155,6 +155,23 @@ def test_composite_gradient(device: str, rng: np.random.Generator) -> None:
         assert match.relative_l2 < GRADIENT_RELATIVE_L2, (name, match)
 
 
+def test_copies_of_the_curves_count_together(device: str, rng: np.random.Generator) -> None:
+    """Threads take turns with equal copies: same image, and their gradients sum up to the same."""
+    scene = Scene(rng)
+    y = vec3s(rng.normal(size=(96, 3)), device)
+    alone, image, tape = scene.launch(device)
+    tape.backward(grads={image: y})
+    scene.knots_fg = tuple(np.tile(k, (4, 1)) for k in scene.knots_fg)
+    scene.knots_shadow = tuple(np.tile(k, (4, 1)) for k in scene.knots_shadow)
+    free, again, tape = scene.launch(device)
+    tape.backward(grads={again: y})
+    assert (again.numpy() == image.numpy()).all()
+    for one, several in zip(alone, free, strict=True):
+        expected, found = one.grad.numpy(), several.grad.numpy()
+        summed = found.reshape(-1, *expected.shape).sum(axis=0)
+        np.testing.assert_allclose(summed, expected, rtol=1e-4, atol=1e-5)
+
+
 def test_untouched_photo_depends_on_nothing_but_the_photo(
     device: str, rng: np.random.Generator
 ) -> None:

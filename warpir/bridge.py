@@ -29,6 +29,10 @@ if TYPE_CHECKING:
 
 FloatArray = NDArray[np.float32]
 
+KNOT_COPIES = 32
+"""Copies of the tone curves on CUDA, so that threads add to gradients of their own; see
+`warpir.kernels.composite`."""
+
 
 def _from_torch(tensor: Tensor, dtype: Any, device: wp.Device, grad: bool = False) -> wp.array:
     """Copy a tensor into a Warp array of ``dtype`` on ``device``, with a gradient if asked."""
@@ -189,7 +193,10 @@ class _Compose(torch.autograd.Function):
         foreground, lit, unoccluded = (
             _from_torch(t, wp.vec3, device, grad=True) for t in tensors[:3]
         )
-        knots = [_from_torch(t, wp.float32, device, grad=True) for t in tensors[3:]]
+        copies = KNOT_COPIES if device.is_cuda else 1
+        knots = [
+            _from_torch(t.repeat(copies, 1), wp.float32, device, grad=True) for t in tensors[3:]
+        ]
         objects, proxies = len(tensors[0]), len(tensors[1])
         pixels = constants.height * constants.width
         new = [
@@ -247,6 +254,9 @@ class _Compose(torch.autograd.Function):
         ctx.tape.backward(grads={ctx.image: _from_torch(d_image, wp.vec3, ctx.image.device)})
         grads = [_to_torch(a.grad, t) for a, t in zip(ctx.arrays, ctx.like, strict=True)]
         ctx.tape.zero()
+        # The curves' copies count together.
+        shapes = [t.shape for t in ctx.like[3:]]
+        grads[3:] = [g.reshape(-1, *s).sum(0) for g, s in zip(grads[3:], shapes, strict=True)]
         return (None, *grads)
 
 
