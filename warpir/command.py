@@ -194,19 +194,8 @@ def parse(argv: Sequence[str]) -> Command:
     Raises:
         InputError: The command line or the configuration file is wrong (`ExitCode.USAGE`).
     """
-    parser = _make_parser()
-    try:
-        given, unknown = parser.parse_known_args(_join_minus_values(argv))
-    except argparse.ArgumentError as error:
-        raise usage(error.argument_name or "command line", error.message) from None
-    if unknown:
-        known = [flag(name) for forms in FLAGS.values() for name in forms]
-        known += ["--config", "--validate", "--debug", "--version", "--help"]
-        raise usage(unknown[0], "no such flag", closest(unknown[0].split("=")[0], known))
-
-    texts = vars(given)
+    texts = read_arguments(_make_parser(), argv)
     validate, path = texts.pop("validate", False), texts.pop("config", None)
-    texts.pop("debug", None)
     filed = _read_config_file(path) if path is not None else {}
     config = _make_config({name: (text, flag(name)) for name, text in texts.items()}, filed)
     notices = tuple(
@@ -319,26 +308,7 @@ class _Parser(argparse.ArgumentParser):
 
 
 def _make_parser() -> argparse.ArgumentParser:
-    parser = _Parser(
-        prog="python -m warpir.insert",
-        usage=USAGE,
-        description=DESCRIPTION,
-        epilog=EXAMPLES,
-        formatter_class=argparse.RawDescriptionHelpFormatter,
-        argument_default=argparse.SUPPRESS,
-        allow_abbrev=False,
-        exit_on_error=False,
-    )
-    about = _field_docs()
-    for heading, forms in FLAGS.items():
-        group = parser.add_argument_group(heading)
-        for name, form in forms.items():
-            text = _help_of(name, about[name]).replace("%", "%%")
-            if form:
-                group.add_argument(flag(name), dest=name, metavar=form, help=text)
-            else:
-                action = "store_false" if DEFAULTS[name] else "store_true"
-                group.add_argument(flag(name), dest=name, action=action, help=text)
+    parser = make_parser("insert", USAGE, DESCRIPTION, EXAMPLES, FLAGS)
     group = parser.add_argument_group("the run itself")
     group.add_argument(
         "--config",
@@ -348,9 +318,66 @@ def _make_parser() -> argparse.ArgumentParser:
     group.add_argument(
         "--validate", action="store_true", help="Read and check all inputs, render nothing"
     )
-    group.add_argument("--debug", action="store_true", help="Show tracebacks")
-    group.add_argument("--version", action="version", version=f"warpir {warpir.__version__}")
     return parser
+
+
+def make_parser(
+    program: str,
+    usage_line: str,
+    description: str,
+    epilog: str,
+    flags: Mapping[str, Mapping[str, str]],
+) -> argparse.ArgumentParser:
+    """Return a parser of some fields of `InsertConfig`, all of whose values stay texts.
+
+    Args:
+        program: Name of the module.
+        usage_line: How it is called.
+        description: What it does.
+        epilog: What follows the flags.
+        flags: As `FLAGS`.
+    """
+    parser = _Parser(
+        prog=f"python -m warpir.{program}",
+        usage=usage_line,
+        description=description,
+        epilog=epilog,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+        argument_default=argparse.SUPPRESS,
+        allow_abbrev=False,
+        exit_on_error=False,
+    )
+    about = _field_docs()
+    for heading, forms in flags.items():
+        group = parser.add_argument_group(heading)
+        for name, form in forms.items():
+            text = _help_of(name, about[name]).replace("%", "%%")
+            if form:
+                group.add_argument(flag(name), dest=name, metavar=form, help=text)
+            else:
+                action = "store_false" if DEFAULTS[name] else "store_true"
+                group.add_argument(flag(name), dest=name, action=action, help=text)
+    parser.add_argument("--debug", action="store_true", help="Show tracebacks")
+    parser.add_argument("--version", action="version", version=f"warpir {warpir.__version__}")
+    return parser
+
+
+def read_arguments(parser: argparse.ArgumentParser, argv: Sequence[str]) -> dict[str, Any]:
+    """Return the flags that were given and their texts, by the names of their fields.
+
+    Raises:
+        InputError: A flag is unknown or lacks its value (`ExitCode.USAGE`).
+    """
+    try:
+        given, unknown = parser.parse_known_args(_join_minus_values(argv))
+    except argparse.ArgumentError as error:
+        raise usage(error.argument_name or "command line", error.message) from None
+    if unknown:
+        known = [text for action in parser._actions for text in action.option_strings]
+        raise usage(unknown[0], "no such flag", closest(unknown[0].split("=")[0], known))
+    texts = vars(given)
+    texts.pop("debug", None)
+    return texts
 
 
 def _help_of(name: str, about: str) -> str:
