@@ -63,16 +63,19 @@ class Crop:
         Returns:
             Shape [B, C, size, size].
         """
-        rows = _filter(self.y, self.side, size, image.shape[-2]).to(image)
-        columns = _filter(self.x, self.side, size, image.shape[-1]).to(image)
+        height, width = image.shape[-2:]
+        rows = _filter(self.y, self.side, size, height, image.device).to(image)
+        columns = _filter(self.x, self.side, size, width, image.device).to(image)
         return rows @ image @ columns.T
 
 
-def _filter(start: float, side: float, size: int, length: int) -> Tensor:
+def _filter(start: float, side: float, size: int, length: int, device: torch.device) -> Tensor:
     """Return the weights of an axis' pixels in each pixel of the crop, float64 [size, length]."""
     pixel = side / size
-    centre = start + (torch.arange(size, dtype=torch.float64) + 0.5) * pixel
-    distance = (centre[:, None] - torch.arange(length, dtype=torch.float64) - 0.5).abs()
+    own, theirs = (
+        torch.arange(count, dtype=torch.float64, device=device) + 0.5 for count in (size, length)
+    )
+    distance = (start + own[:, None] * pixel - theirs).abs()
     weights = (1.0 - distance / max(pixel, 1.0)).clamp(min=0.0)
     return weights / weights.sum(dim=1, keepdim=True)
 

@@ -412,17 +412,18 @@ class Guidance:
             return torch.cat([c.apply(whole, prior.resolution) for c in crops]).to(device)
 
         w = weight(settings.weight, *prior.schedule.alpha_sigma(t), settings.literal_alpha)
-        t = t.to(device)
+        w, t = _upload(w.view(-1, 1, 1, 1), device), _upload(t, device)
         latents = prior.encode(cropped(image))
         shape = latents.shape[1:]
-        noise = torch.stack([torch.randn(shape, generator=g) for g in generators]).to(device)
+        drawn = torch.stack([torch.randn(shape, generator=g) for g in generators])
+        noise = _upload(drawn, device)
         background, gbuffer = self.condition.background, self.condition.gbuffer
         return NoisyCrops(
             latents,
             noise,
             prior.schedule.add_noise(latents.detach(), noise, t),
             t,
-            w.view(-1, 1, 1, 1).to(device),
+            w,
             None if background is None else cropped(background),
             None if gbuffer is None else cropped(gbuffer),
         )
@@ -458,6 +459,13 @@ class Guidance:
         return torch.stack(
             [term.scale * x for term, x in zip(self.terms, per_term, strict=True)]
         ).sum(dim=0)
+
+
+def _upload(values: Tensor, device: torch.device) -> Tensor:
+    """Return a copy on the device, without waiting for what the device still has to do."""
+    if device.type != "cuda":
+        return values.to(device)
+    return values.pin_memory().to(device, non_blocking=True)
 
 
 class DatasetUpdate:

@@ -37,7 +37,7 @@ class NoiseSchedule:
     def alpha_sigma(self, t: Tensor) -> tuple[Tensor, Tensor]:
         """Return ``a`` and ``s``, float32 on t's device, same shape as ``t``."""
         # The table goes to the times: the other way round would wait for the device's queue.
-        bar = self.alphas_cumprod.to(t.device)[self.timestep(t)]
+        bar = self.alphas_cumprod.to(t.device, non_blocking=True)[self.timestep(t)]
         return bar.sqrt().float(), (1.0 - bar).sqrt().float()
 
     def add_noise(self, latents: Tensor, noise: Tensor, t: Tensor) -> Tensor:
