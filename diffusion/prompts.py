@@ -1,7 +1,8 @@
 """What the model is asked for, before, during and after it is adapted to a photo.
 
 Wording of DiPIR (Liang et al. 2024, section 4.2.1). The attributes of the class prompts are of the
-kinds that the authors name (colour, background, lighting, size); the words are ours.
+kinds that the authors name (colour, background, lighting, size); the words are ours. Importable
+without torch, so that a prompt is checked before anything is loaded.
 """
 
 from __future__ import annotations
@@ -9,9 +10,6 @@ from __future__ import annotations
 import re
 from dataclasses import dataclass
 
-import torch
-
-from warpir.diffusion.draws import generator_of
 from warpir.diffusion.settings import PersonalizeSettings
 
 SIZES = ("tiny", "small", "compact", "medium-sized", "large", "huge", "long", "tall", "wide", "low")
@@ -78,13 +76,13 @@ def make_prompts(prompt: str, settings: PersonalizeSettings) -> Prompts:
         settings: Gives the token, and the class noun where it is not the prompt's last word.
 
     Raises:
-        ValueError: A prompt is empty.
+        ValueError: The prompt, the noun or the token has no word; begins with the field's name.
     """
     article, phrase = _split(prompt, "prompt")
     # The user's own article is right about sounds that spelling hides.
     named = f"{article} {phrase}" if article in ("a", "an") else with_article(phrase)
     noun = _split(settings.class_noun or phrase.split()[-1], "class_noun")[1]
-    photo = f"a scene in the style of {settings.token} rendering"
+    photo = f"a scene in the style of {_split(settings.token, 'token')[1]} rendering"
     return Prompts(
         photo, f"a photo of {with_article(noun)}", f"a photo of {named} in {photo}", noun
     )
@@ -98,6 +96,10 @@ def draw_class_prompts(noun: str, count: int, seed: int) -> tuple[str, ...]:
         count: How many.
         seed: The run's seed.
     """
+    import torch
+
+    from warpir.diffusion.draws import generator_of
+
     prompts = []
     for index in range(count):
         random = generator_of(seed, "class prompt", index)

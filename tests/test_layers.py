@@ -31,7 +31,8 @@ LEVELS = (
     {"recover"},
     {"refine"},
     {"demo"},
-    {"insert", "prior_images"},
+    {"insert", "prior_images", "model_check"},
+    {"check_model"},
 )
 # A dispatcher by file extension: it calls the readers, and they fill its records.
 UPWARD = {("asset", "gltf"), ("asset", "obj")}
@@ -44,7 +45,7 @@ ONLY_IN = {
     "torch": {
         "diffusion", "tone", "bridge", "integrator", "fusion", "sg_light", "regularizers", "view",
         "mis", "transport", "transport_cache", "transport_choice", "transport_matrix", "checkpoint",
-        "optimize", "light_optimization", "recover", "refine", "insert", "prior_images",
+        "optimize", "light_optimization", "recover", "refine", "insert", "prior_images", "model_check",
     },
     "trimesh": {"gltf", "obj", "demo"},
     "OpenImageIO": {"files"},
@@ -58,9 +59,9 @@ ONLY_IN = {
     "yaml": {"command"},
     "rich": {"progress"},
 }  # fmt: skip
-DIFFUSION_IN = {"recover", "refine", "prior_images"}
-"""Who drives the diffusion model; everyone else sees its settings, which are plain values."""
-SETTINGS = "warpir.diffusion.settings"
+DIFFUSION_IN = {"recover", "refine", "prior_images", "model_check"}
+"""Who drives the diffusion model; everyone else sees its settings and wording, which are plain."""
+SETTINGS = ("warpir.diffusion.settings", "warpir.diffusion.prompts")
 SETTINGS_IN = {"config", "command", *DIFFUSION_IN}
 NOT_IN_KERNELS = {"numpy", "warpir"}
 """``warpir.kernels`` sees Warp and itself."""
@@ -126,7 +127,7 @@ def test_imports_follow_the_table(path: Path) -> None:
             if target == "kernels":
                 assert place in ONLY_IN["warp"], f"{where}: only Warp's callers see the kernels"
             elif target == "diffusion":
-                is_settings = name == SETTINGS or name.startswith(SETTINGS + ".")
+                is_settings = name.startswith(SETTINGS)
                 allowed = SETTINGS_IN if is_settings else DIFFUSION_IN
                 assert place in allowed, f"{where}: imported in {sorted(allowed)}"
             elif (place, target) not in UPWARD and level(target) >= 0:

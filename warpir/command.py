@@ -141,7 +141,7 @@ FLAGS = {
         "chroma": "W",
         "bend": "W",
         "chroma_limit": "LOG",
-        "intensity_limit": "RADIANCE",
+        "intensity_limit": "FACTOR",
         "score_every": "N",
         "preview_every": "N",
         "checkpoint_every": "N",

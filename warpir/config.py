@@ -10,6 +10,7 @@ import re
 from collections.abc import Iterator
 from dataclasses import dataclass, fields
 
+from warpir.diffusion.prompts import make_prompts
 from warpir.diffusion.settings import GuidanceSettings, ModelSettings, PersonalizeSettings
 from warpir.errors import ExitCode, InputError, raise_all
 from warpir.optimize_settings import OptimizeSettings
@@ -255,14 +256,14 @@ RANGES: dict[str, tuple[float, float | None]] = {
     "chroma": (0, None),
     "bend": (0, None),
     "chroma_limit": (0, 20),
-    "intensity_limit": (1e-3, 1e12),
+    "intensity_limit": (1, 1e12),
     "score_every": (0, 10**6),
     "preview_every": (0, 10**6),
     "checkpoint_every": (0, 10**6),
 }
 """Least and greatest value of a field; None: no limit."""
 
-ABOVE_ZERO = ("camera_height", "scale", "size", "ground_albedo", "lora_rate")
+ABOVE_ZERO = ("camera_height", "scale", "size", "ground_albedo", "lora_rate", "chroma_limit")
 
 CHOICES = {
     "up": ("x", "+x", "-x", "y", "+y", "-y", "z", "+z", "-z"),
@@ -315,6 +316,12 @@ def _values_out_of_range(config: InsertConfig) -> Iterator[InputError]:
     if config.device is not None:
         known = DEVICE_FORM.fullmatch(config.device) is not None
         yield from check("device", known, "cpu, cuda or cuda:N")
+    if config.prompt and config.token:
+        try:
+            make_prompts(config.prompt, config)
+        except ValueError as error:
+            name, _, what = str(error).partition(": ")
+            yield usage(flag(name), what)
     if config.refine_parts is not None:
         known = set(config.refine_parts) <= set(REFINE_PARTS)
         yield from check("refine_parts", known, f"some of {', '.join(REFINE_PARTS)}")
@@ -392,6 +399,8 @@ def _values_that_clash(config: InsertConfig) -> Iterator[InputError]:
     yield from needs("up", given("camera"), "--camera; without a camera file the world is Y up")
     yield from needs("sequence", given("reuse"), "--reuse: one light for all frames")
     yield from needs("show_prior", guided, "--guidance and its --model")
+    if given("show_prior") and guided and not config.personalize:
+        yield usage("--no-personalize", "cannot be used with --show-prior, which shows its effect")
     yield from needs("resume", guided, "--guidance: nothing else has checkpoints")
     lit = any(map(given, ("reuse", "light", "sun", "sky", "demo")))
     yield from needs("refine", lit, "a known light: --reuse, --light, --sun or --sky")

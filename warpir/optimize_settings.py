@@ -64,7 +64,7 @@ class OptimizeSettings:
     chroma_limit: float = 1.5
     """Greatest log colour ratio of a lobe"""
     intensity_limit: float = 1e6
-    """Greatest intensity of a lobe, relative [W/(m^2 sr)]"""
+    """Greatest factor between a lobe's intensity and that of the start, either way"""
     score_every: int = 25
     """Steps between two scores, of which the best state is kept; 0: the last state is kept"""
 
