@@ -255,16 +255,16 @@ class Stopwatch:
 
 
 @contextmanager
-def with_graphs(prior: StableDiffusion, wanted: bool) -> Iterator[None]:
-    """Within this context the model's passes are replayed or not."""
+def with_graphs(prior: StableDiffusion, loop: LightOptimization, wanted: bool) -> Iterator[None]:
+    """Within this context the passes of model and loop are replayed or not."""
     prior.forget_graphs()
-    kept = prior.graphs
+    kept = prior.graphs, loop._recorded
     if not wanted:
-        prior.graphs = None
+        prior.graphs = loop._recorded = None
     try:
         yield
     finally:
-        prior.graphs = kept
+        prior.graphs, loop._recorded = kept
         prior.forget_graphs()
 
 
@@ -352,10 +352,10 @@ def measure_steps(watch: Watch, config: InsertConfig) -> dict[str, Any]:
     for word, wanted in (("eager", False), ("graphs", True)):
         if wanted and prior.graphs is None:
             continue
-        with with_graphs(prior, wanted):
+        with with_graphs(prior, loop, wanted):
             found["light"][word] = light_step_ms(loop, prior.device)
             found["light_split"][word] = light_step_split(loop, prior)
-        with with_graphs(prior, wanted):
+        with with_graphs(prior, loop, wanted):
             found["lora"][word] = lora_step_ms(prior, config)
     return found
 

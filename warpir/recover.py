@@ -120,7 +120,11 @@ def recover(run: Run, start: SceneLight) -> tuple[SceneLight, dict[str, Any], tu
             unknowns = start_of(run, start).to(run.torch_device)
         with run.timings.stage("trace"):
             guide = make_guide(run, guided, frame)
-            loop = LightOptimization(frame, guide, settings, unknowns, default_cache())
+            graphs = guided.prior.graphs
+            faster = graphs.recorded_function if graphs else None
+            loop = LightOptimization(
+                frame, guide, settings, unknowns, default_cache(), record=faster
+            )
         with torch.no_grad():
             first = loop.guide.score(loop.final_image(config.seed))
         optimize(run, loop, checkpoints, resumed)
