@@ -195,16 +195,26 @@ class LightOptimization(Optimization):
         return terms
 
     def image(self, step: int) -> Tensor:
-        """Return the composite of a step under lights fused as far as the schedule says."""
+        """Return the composite of a step under lights fused as far as the schedule says.
+
+        What is asked of a picture by `mis` follows its noise too, so its gradient comes from other
+        samples; with the same ones it would also lessen that noise, by a light that moves.
+        """
         scale = self.fusion(step)
         if self._recorded is None:
-            parts = self._parts(scale, self.seed + step)
+            parts = self._parts(scale, self.seed + 2 * step)
         else:
             device = self.unknowns.light_fg.axis.device
             made = self._recorded(torch.full((), scale, device=device))
             parts = Parts.of(made, self._term_names)
         self._terms = parts.terms
-        return self.view.compose(parts.radiance, parts.curve_fg, parts.curve_shadow)
+        curves = parts.curve_fg, parts.curve_shadow
+        replayed = self.view.compose(parts.radiance, *curves)
+        if self.view.transport is not None:
+            return replayed
+        with torch.no_grad():
+            shown = self.view.image(*self.lights(scale), *curves, self.seed + 2 * step + 1)
+        return replayed + (shown - replayed.detach())
 
     def final_image(self, seed: int) -> Tensor:
         """Return the composite under the light that would be delivered."""
