@@ -4,7 +4,7 @@ The plain functions are the reference. What cannot run without a CUDA device is 
 stays what makes a recording possible at all.
 """
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -15,6 +15,8 @@ from torch import Tensor
 from torch.utils._python_dispatch import TorchDispatchMode
 
 import warpir.diffusion.personalize as personalize_module
+from tests.test_optimize import SETTINGS as LOOP
+from tests.test_optimize import TRACED, Pull, a_frame, bent
 from tests.tiny_stable_diffusion import make_tiny_stable_diffusion
 from warpir.diffusion.cuda_graphs import PLAIN_CALLS, Graphs
 from warpir.diffusion.guidance import Guidance
@@ -24,6 +26,8 @@ from warpir.diffusion.prior import Condition
 from warpir.diffusion.prompts import make_prompts
 from warpir.diffusion.settings import GuidanceSettings, ModelSettings, PersonalizeSettings
 from warpir.diffusion.stable_diffusion import StableDiffusion, load_stable_diffusion
+from warpir.light_optimization import Function, LightOptimization, Record
+from warpir.view import expected_light
 
 needs_cuda = pytest.mark.skipif(not torch.cuda.is_available(), reason="CUDA graphs need CUDA")
 DEVICE = "cuda"
@@ -379,6 +383,85 @@ def test_a_recorded_step_takes_one_step_a_call(folder: Path) -> None:
             held = next(iter(training.optimizer.state.values()))
             assert float(held["step"]) == step + 1
     assert lora_parameters(prior, "scene") == {}
+
+
+# The loop over lights
+
+
+def loop_of(device: str, record: Record | None, **changes: Any) -> LightOptimization:
+    unknowns = bent().to(device)
+    rows = replace(TRACED, height_fg=TRACED.height_fg // 2)  # the map is resampled
+    settings = replace(LOOP, **changes)
+    return LightOptimization(
+        a_frame(device), Pull(), settings, unknowns, transport=rows, record=record
+    )
+
+
+def test_the_loops_torch_half_neither_waits_nor_uploads() -> None:
+    """Also its gradient; here it is taken as it is, which must change nothing."""
+    asked = []
+
+    def record(function: Function, parameters: Sequence[Tensor]) -> Function:
+        asked.append(len(parameters))
+        return function
+
+    plain, recorded = loop_of("cpu", None), loop_of("cpu", record)
+    assert asked == [len(list(recorded.unknowns.parameters()))]
+    scale = torch.tensor(0.3)
+    recorded._tensors(scale)  # constants are uploaded once
+    with Operations() as seen:
+        made = recorded._tensors(scale)
+        torch.autograd.grad(sum(x.sum() for x in made), list(recorded.unknowns.parameters()))
+    assert "exp" in seen.names
+    assert seen.names & (WAITING | RANDOM | {"lift_fresh"}) == set()
+    for _ in range(4):
+        plain.step()
+        recorded.step()
+    for name, value in plain.unknowns.state_dict().items():
+        # The fusion's scale is a number there and a float32 tensor here.
+        torch.testing.assert_close(
+            recorded.unknowns.state_dict()[name], value, rtol=1e-4, atol=1e-5, msg=name
+        )
+    assert [sorted(e) for e in recorded.state.history] == [sorted(e) for e in plain.state.history]
+
+
+@needs_cuda
+@pytest.mark.parametrize(
+    "changes", [{}, {"fusion": "single"}, {"fusion": "none"}, {"tone_curve": False}]
+)
+def test_replayed_light_steps_equal_plain_ones(changes: dict[str, Any]) -> None:
+    """Parameters and regularisers of a run, through recording and replays."""
+    graphs = Graphs(torch.device(DEVICE, 0))
+    plain = loop_of("cuda:0", None, **changes)
+    recorded = loop_of("cuda:0", graphs.recorded_function, **changes)
+    for _ in range(12):
+        plain.step()
+        recorded.step()
+    assert graphs.seconds > 0.0
+    for name, value in plain.unknowns.state_dict().items():
+        torch.testing.assert_close(
+            recorded.unknowns.state_dict()[name], value, rtol=1e-3, atol=2e-3, msg=name
+        )
+    for found, expected in zip(recorded.state.history, plain.state.history, strict=True):
+        assert found == pytest.approx(expected, rel=2e-3, abs=1e-5)
+
+
+@needs_cuda
+def test_rows_that_are_traced_again_are_recorded_again() -> None:
+    """The recording before read the old rows."""
+    graphs = Graphs(torch.device(DEVICE, 0))
+    recorded = loop_of("cuda:0", graphs.recorded_function)
+    for _ in range(CALLS):
+        recorded.step()
+    plain = loop_of("cuda:0", None)
+    for loop in (recorded, plain):
+        loop.unknowns.load_state_dict(bent().state_dict())
+        even = torch.ones(8, 16, 3)
+        loop.expected = expected_light(even, even)
+        loop.view = loop._trace()
+    for step in range(CALLS):
+        found, expected = recorded.image(step), plain.image(step)
+        torch.testing.assert_close(found, expected, rtol=0, atol=1e-4)
 
 
 # Memory
