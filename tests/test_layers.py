@@ -45,7 +45,8 @@ ONLY_IN = {
     "torch": {
         "diffusion", "tone", "bridge", "integrator", "fusion", "sg_light", "regularizers", "view",
         "mis", "transport", "transport_cache", "transport_choice", "transport_matrix", "checkpoint",
-        "optimize", "light_optimization", "recover", "refine", "insert", "prior_images", "model_check",
+        "optimize", "light_optimization", "recover", "refine", "insert", "prior_images",
+        "model_check",
     },
     "trimesh": {"gltf", "obj", "demo"},
     "OpenImageIO": {"files"},

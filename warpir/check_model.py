@@ -1,0 +1,74 @@
+"""Does a Stable Diffusion work here, and is it worth a guided run?
+
+    python -m warpir.check_model --model DIR [--photo FILE] [--prompt TEXT] [--json FILE]
+
+`warpir.model_check` says what is measured. Ends with status 0 when all is as expected of a trained
+model, with 4 when it is not, and otherwise as `warpir.insert`.
+"""
+
+import sys
+from collections.abc import Sequence
+
+from warpir.command import make_parser, read_arguments, read_values
+from warpir.config import InsertConfig, flag, usage
+from warpir.errors import ExitCode
+from warpir.program import run_program, say
+
+USAGE = "python -m warpir.check_model --model DIR|ID [FLAG ...]"
+DESCRIPTION = "Check that a Stable Diffusion works and guides as a trained one should."
+FLAGS = {
+    "the check": {
+        "model": "DIR|ID",
+        "allow_download": "",
+        "photo": "FILE",
+        "prompt": "TEXT",
+        "device": "NAME",
+        "precision": "NAME",
+        "vae_precision": "NAME",
+        "vae_checkpointing": "",
+        "graphs": "",
+        "seed": "N",
+    }
+}
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Run the command line.
+
+    Args:
+        argv: Arguments without the program's name; ``sys.argv`` when absent.
+
+    Returns:
+        The exit status: 0 when all is as expected, 4 when not or when there is no usable model.
+    """
+    return run_program(_run, argv)
+
+
+def _run(arguments: list[str]) -> int:
+    parser = make_parser("check_model", USAGE, DESCRIPTION, "", FLAGS)
+    parser.add_argument("--json", metavar="FILE", help="Write the figures to this file too")
+    texts = read_arguments(parser, arguments)
+    path = texts.pop("json", None)
+    values = read_values({name: (text, flag(name)) for name, text in texts.items()})
+    config = InsertConfig(**values)
+    if config.model is None:
+        raise usage("--model", "needed", "a folder in diffusers' layout, or a hub id")
+
+    from warpir.demo import PHOTO
+    from warpir.files import read_photo
+
+    photo = read_photo(config.photo or PHOTO, max_pixels=config.max_pixels, alpha=config.alpha).srgb
+
+    # torch, Warp and diffusers are loaded here, after everything else that can be wrong.
+    from warpir.model_check import load_and_check, write_report
+
+    report = load_and_check(config, photo, say)
+    good = sum(verdict.ok for verdict in report.verdicts)
+    say(f"{good} of {len(report.verdicts)} checks are as expected of a trained model")
+    if path is not None:
+        write_report(path, report)
+    return ExitCode.DONE if report.ok else ExitCode.MODEL
+
+
+if __name__ == "__main__":
+    sys.exit(main())
