@@ -3,6 +3,7 @@
 import json
 import os
 import random
+import shutil
 import signal
 import subprocess
 import sys
@@ -13,6 +14,7 @@ from typing import Any
 
 import pytest
 import torch
+from safetensors.torch import load_file, save_file
 
 from tests.test_insert import ALWAYS, arguments, digest, write_inputs
 from tests.tiny_stable_diffusion import make_tiny_stable_diffusion
@@ -170,8 +172,7 @@ def test_stopped_run_resumes_as_if_it_had_not_been(
         with pytest.raises(Killed):
             stop_hard(argv(folder, out))
     assert not (out / "run.json").exists()
-    has_checkpoint = any((out / "checkpoints").glob("0*"))
-    assert main([*argv(folder, out), *(["--resume"] if has_checkpoint else [])]) == ExitCode.DONE
+    assert main([*argv(folder, out), "--resume"]) == ExitCode.DONE
     assert results(out) == results(finished)
     assert not (out / "checkpoints").exists()
 
@@ -217,11 +218,38 @@ def test_resume_names_what_changed(
     assert "Traceback" not in error and digest(unfinished) == before
 
 
-def test_resume_without_a_checkpoint_says_so(
+def test_resume_without_a_checkpoint_starts_and_says_so(
+    folder: Path, finished: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """A run may be killed before its first checkpoint; what is finished stays."""
+    out = tmp_path / "none"
+    assert main([*argv(folder, out), "--resume"]) == ExitCode.DONE
+    assert "the run starts at its beginning" in capsys.readouterr().out
+    assert results(out) == results(finished)
+    assert main([*argv(folder, out), "--resume"]) == ExitCode.OUTPUT
+
+
+def test_resume_refuses_another_model(
     folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    assert main([*argv(folder, tmp_path / "none"), "--resume"]) == ExitCode.INPUT
-    assert "nothing to go on from" in capsys.readouterr().err
+    """Other weights and another noise schedule in the folder that is named as before."""
+    model = tmp_path / "model"
+    shutil.copytree(folder / "epsilon", model)
+    out = tmp_path / "other"
+    with pytest.MonkeyPatch.context() as patch:
+        stop_at(patch, "optimize:Optimization.step", 6)
+        with pytest.raises(Killed):
+            stop_hard(argv(folder, out, model=str(model)))
+    weights = model / "unet/diffusion_pytorch_model.safetensors"
+    tensors = load_file(weights)
+    tensors["conv_out.bias"] += 1e-3
+    save_file(tensors, weights, {"format": "pt"})
+    scheduler = model / "scheduler/scheduler_config.json"
+    scheduler.write_text(scheduler.read_text().replace("0.012", "0.011"))
+    assert main([*argv(folder, out, model=str(model)), "--resume"]) == ExitCode.INPUT
+    error = capsys.readouterr().err
+    assert "model.unet/diffusion_pytorch_model.safetensors: was" in error
+    assert "model.scheduler: was" in error and "text_encoder" not in error
 
 
 def test_overwrite_starts_an_unfinished_run_again(
@@ -229,6 +257,20 @@ def test_overwrite_starts_an_unfinished_run_again(
 ) -> None:
     assert main([*argv(folder, unfinished), "--overwrite"]) == ExitCode.DONE
     assert results(unfinished) == results(finished)
+
+
+def test_stopped_overwrite_resumes(folder: Path, finished: Path, tmp_path: Path) -> None:
+    """The results that were to be replaced do not stand in the way, and stay until the end."""
+    out = tmp_path / "out"
+    assert main(argv(folder, out, seed="5", steps="0", lora_steps="0")) == ExitCode.DONE
+    before = results(out)
+    with pytest.MonkeyPatch.context() as patch:
+        stop_at(patch, "optimize:Optimization.step", 6)
+        with pytest.raises(Killed):
+            stop_hard([*argv(folder, out), "--overwrite"])
+    assert results(out) == before
+    assert main([*argv(folder, out), "--resume"]) == ExitCode.DONE
+    assert results(out) == results(finished)
 
 
 @pytest.mark.parametrize(

@@ -13,7 +13,6 @@ torch and Warp are imported when all inputs are known to be good, so ``--help``,
 and ``--validate`` answer without them.
 """
 
-import shutil
 import sys
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
@@ -93,10 +92,14 @@ def _insert_one(config: InsertConfig, loaders: "Loaders | None" = None) -> Inser
         asked = config
         config, inputs, light = _read(config, loaders)
 
+    from warpir.checkpoint import Checkpoints
     from warpir.files import OutputFolder
 
     assert config.out is not None
-    with OutputFolder(config.out, overwrite=config.overwrite) as output:
+    checkpoints = Checkpoints(Path(config.out), {})
+    # A run to resume was allowed to replace what is there, or has made it.
+    overwrite = config.overwrite or (config.resume and checkpoints.newest is not None)
+    with OutputFolder(config.out, overwrite=overwrite) as output:
         # Warp is loaded here, after everything that can be wrong was looked at.
         with timings.stage("load"):
             from warpir.picture import Quality, make_picture, scene_of
@@ -142,7 +145,7 @@ def _insert_one(config: InsertConfig, loaders: "Loaders | None" = None) -> Inser
         output.write_json("run.json", record)
     if config.guidance != "none":
         # The results are in place: what was kept for a run that stops is not needed any more.
-        shutil.rmtree(output.path / "checkpoints", ignore_errors=True)
+        checkpoints.remove()
     record = read_json_object(output.path / "run.json")
     return Insertion(output.path, (*record["files"], "run.json"), record)
 

@@ -20,7 +20,7 @@ from warpir.checkpoint import Checkpoint, Checkpoints
 from warpir.color import linear_to_gamma
 from warpir.config import InsertConfig
 from warpir.curves import Curves, ToneKnots
-from warpir.diffusion.cache import cache_folder, write_file
+from warpir.diffusion.cache import cache_folder, content_key, write_file
 from warpir.diffusion.guidance import DatasetUpdate, Guidance, NonFiniteError, make_guidance
 from warpir.diffusion.lora_files import Lora, save_lora
 from warpir.diffusion.personalize import personalize
@@ -109,12 +109,12 @@ def recover(run: Run, start: SceneLight) -> tuple[SceneLight, dict[str, Any], tu
 
     Raises:
         InputError: The model cannot be used (exit 4), memory is short (5), the numbers stayed
-            non-finite (6), or ``--resume`` finds no checkpoint of this run.
+            non-finite (6), or what ``--resume`` finds is another run's.
     """
     config = settings = run.config
     with as_input_errors():
-        checkpoints, resumed = open_checkpoints(run)
-        guided = prepare_guidance(run, checkpoints, resumed)
+        checkpoints = open_checkpoints(run)
+        guided, resumed = prepare_guidance(run, checkpoints)
         with run.timings.stage("scene"):
             frame = make_frame(run)
             unknowns = start_of(run, start).to(run.torch_device)
@@ -150,12 +150,11 @@ def recover(run: Run, start: SceneLight) -> tuple[SceneLight, dict[str, Any], tu
     return light, record, notices
 
 
-def open_checkpoints(run: Run) -> tuple[Checkpoints, Checkpoint | None]:
-    """Return the run's checkpoints, and with --resume the one to go on from.
+def open_checkpoints(run: Run) -> Checkpoints:
+    """Return the run's checkpoints; the model is not among what they depend on yet.
 
     Raises:
-        InputError: --out holds an unfinished run that is neither resumed nor overwritten, or the
-            run to resume is not there or was another.
+        InputError: --out holds an unfinished run that is neither resumed nor overwritten.
     """
     config = run.config
     values = {f.name: getattr(config, f.name) for f in fields(config)}
@@ -166,10 +165,10 @@ def open_checkpoints(run: Run) -> tuple[Checkpoints, Checkpoint | None]:
         "versions": versions(),
     }
     checkpoints = Checkpoints(run.output.path, identity)
+    if config.resume and checkpoints.newest is not None:
+        return checkpoints
     if config.resume:
-        found = checkpoints.load(lambda text: run.say(f"notice: {text}"))
-        run.say(f"resumed: {found.stage}, step {found.step}")
-        return checkpoints, found
+        run.say(f"notice: no checkpoint in {checkpoints.folder}: the run starts at its beginning")
     if checkpoints.newest is not None and not config.overwrite:
         raise InputError(
             run.output.path,
@@ -178,13 +177,32 @@ def open_checkpoints(run: Run) -> tuple[Checkpoints, Checkpoint | None]:
             ExitCode.OUTPUT,
         )
     checkpoints.remove()
-    return checkpoints, None
+    return checkpoints
 
 
-def prepare_guidance(
-    run: Run, checkpoints: Checkpoints, resumed: Checkpoint | None = None
-) -> Guided:
-    """Load the model and adapt it to the photo."""
+def checkpoint_of(run: Run, checkpoints: Checkpoints, prior: StableDiffusion) -> Checkpoint | None:
+    """Return the checkpoint to go on from, which is of this very model; None: there is none.
+
+    Raises:
+        InputError: It is another run's; every difference is named.
+    """
+    schedule = prior.schedule
+    scheduler = content_key(schedule.prediction_type, schedule.alphas_cumprod)
+    checkpoints.identity["model"] = {**prior.weight_hashes, "scheduler": scheduler}
+    if checkpoints.newest is None:
+        return None
+    found = checkpoints.load(lambda text: run.say(f"notice: {text}"))
+    run.say(f"resumed: {found.stage}, step {found.step}")
+    return found
+
+
+def prepare_guidance(run: Run, checkpoints: Checkpoints) -> tuple[Guided, Checkpoint | None]:
+    """Load the model and adapt it to the photo; return it, and the checkpoint to go on from.
+
+    Raises:
+        InputError: As `checkpoint_of`.
+        ModelError: The model cannot be loaded or adapted.
+    """
     config = run.config
     assert config.prompt is not None
     with run.timings.stage("model"):
@@ -195,6 +213,7 @@ def prepare_guidance(
         if config.negative_prompt:
             prior.embed([config.negative_prompt])
     run.say(f"model: {prior.name} {config.model}, sha256 {prior.digest[:16]}...")
+    resumed = checkpoint_of(run, checkpoints, prior)
     run.say(f'guidance asks for "{prompts.guidance}"')
     record: dict[str, Any] = {
         "model": {"name": prior.name, "sha256": prior.weight_hashes},
@@ -202,7 +221,7 @@ def prepare_guidance(
     }
     if not config.personalize:
         prior.free_text_encoder()
-        return Guided(prior, prompts, None, None, record, ())
+        return Guided(prior, prompts, None, None, record, ()), resumed
     photo = torch.from_numpy(run.inputs.photo.srgb).permute(2, 0, 1)[None].contiguous()
     cache = cache_folder()
     with run.timings.stage("personalize"):
@@ -236,7 +255,7 @@ def prepare_guidance(
         "error_before_after": made.evaluation and list(made.evaluation),
         "seconds": made.seconds,
     }
-    return Guided(prior, prompts, made.adapter, made.lora, record, made.notices)
+    return Guided(prior, prompts, made.adapter, made.lora, record, made.notices), resumed
 
 
 def make_frame(run: Run) -> Frame:

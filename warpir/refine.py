@@ -388,8 +388,8 @@ def refine(
     """
     config, asset = run.config, run.inputs.asset
     with as_input_errors():
-        checkpoints, resumed = open_checkpoints(run)
-        guided = prepare_guidance(run, checkpoints, resumed)
+        checkpoints = open_checkpoints(run)
+        guided, resumed = prepare_guidance(run, checkpoints)
         with run.timings.stage("scene"):
             # Curves of an earlier run are made for its operator.
             frame = replace(make_frame(run), is_reinhard=light.curves.tone == "reinhard")
