@@ -254,13 +254,23 @@ class LoraTraining:
         self.embeddings = embeddings[which].to(prior.device)
         self.loss_pair = torch.zeros(2, device=prior.device)
         self._losses = torch.zeros(settings.lora_steps, 2, device=prior.device)
+        self._weights: list[tuple[torch.nn.Parameter, Tensor]] = []
 
     def __enter__(self) -> LoraTraining:
-        """Return the training."""
+        """Return the training; on CUDA the model's own weights are in bf16 until it ends."""
+        if self.prior.device.type == "cuda":
+            own = [w for w in self.prior.unet.parameters() if not w.requires_grad]
+            self._weights = [(weight, weight.data) for weight in own]
+            for weight in own:
+                # What autocast would make of it in every step.
+                weight.data = weight.data.bfloat16()
         return self
 
     def __exit__(self, *error: object) -> None:
         """Take the adapter away, with gradients and moments."""
+        for weight, value in self._weights:
+            weight.data = value
+        self._weights.clear()
         self.optimizer.zero_grad(set_to_none=True)
         self.optimizer.state.clear()
         remove_lora(self.prior, self.name)

@@ -371,6 +371,20 @@ def test_replayed_training_equals_plain_training(
 
 
 @needs_cuda
+def test_training_leaves_the_models_own_weights_alone(folder: Path) -> None:
+    """They are in bf16 meanwhile."""
+    prior = load(folder)
+    before = {name: weight.clone() for name, weight in prior.unet.state_dict().items()}
+    with training_of(prior) as training:
+        assert {w.dtype for w in prior.unet.parameters()} == {torch.bfloat16, torch.float32}
+        training.prepare(0)
+        training.update()
+    after = prior.unet.state_dict()
+    assert before.keys() == after.keys()
+    assert all(w.dtype == torch.float16 and torch.equal(w, after[k]) for k, w in before.items())
+
+
+@needs_cuda
 def test_a_recorded_step_takes_one_step_a_call(folder: Path) -> None:
     """Recording itself takes none: Adam's count says so."""
     prior = load(folder)
