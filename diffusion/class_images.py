@@ -98,7 +98,7 @@ def make_class_images(
     ]
     files = [cache / f"{key}.png" if cache else None for key in keys]
     notices = []
-    missing = []
+    missing: set[int] = set()
     for index, file in enumerate(files):
         try:
             found = _read_png(file, side) if file and file.is_file() else None
@@ -107,14 +107,19 @@ def make_class_images(
             log.warning("%s", notices[-1])
             found = None
         if found is None:
-            missing.append(index)
+            missing.add(index)
         else:
             images[index] = found
     if report and count:
         report("class images", count - len(missing), count)
 
-    for start in range(0, len(missing), settings.class_batch):
-        batch = missing[start : start + settings.class_batch]
+    # Always the same batches, so that a run that goes on makes each picture to the same bit.
+    size, done = settings.class_batch, count - len(missing)
+    for start in range(0, count, size):
+        batch = range(start, min(start + size, count))
+        wanted = [index for index in batch if index in missing]
+        if not wanted:
+            continue
         made = prior.sample(
             [texts[index] for index in batch],
             [seeds[index] for index in batch],
@@ -122,8 +127,9 @@ def make_class_images(
             scale=settings.class_scale,
             batch=settings.class_batch,
         )
-        for index, picture in zip(batch, to_bytes(made), strict=True):
-            images[index] = picture
+        pictures = to_bytes(made)
+        for index in wanted:
+            images[index] = picture = pictures[index - start]
             file = files[index]
             if file is None or cache is None:
                 continue
@@ -133,8 +139,9 @@ def make_class_images(
                 notices.append(f"{cache}: class images are not kept ({error})")
                 log.warning("%s", notices[-1])
                 cache = None
+        done += len(wanted)
         if report:
-            report("class images", count - len(missing) + start + len(batch), count)
+            report("class images", done, count)
     if cache is not None and missing:
         make_room(cache, "*.png")
     return ClassImages(images, texts, seeds, len(missing), tuple(notices))
