@@ -38,8 +38,19 @@ Float64Array = NDArray[np.float64]
 
 WIDTH, HEIGHT, ROWS = 36, 24, 12
 """Of the picture [px] and of the maps."""
+RATES = {"intensity": 0.06, "chroma": 0.01, "axis": 0.03, "width": 0.04, "tone": 0.02}
 SETTINGS = OptimizeSettings(
-    steps=12, lobes=3, light_height=ROWS, object_light_height=ROWS, score_every=0, mis_samples=4
+    steps=12,
+    lobes=3,
+    light_height=ROWS,
+    object_light_height=ROWS,
+    score_every=0,
+    mis_samples=4,
+    rate_intensity=RATES["intensity"],
+    rate_chroma=RATES["chroma"],
+    rate_axis=RATES["axis"],
+    rate_width=RATES["width"],
+    rate_tone=RATES["tone"],
 )
 TRACED = TransportSettings(
     height_fg=ROWS,
@@ -303,7 +314,7 @@ def test_steps_are_what_adam_makes_of_the_gradient(device: str) -> None:
     loop.step()
     torch.testing.assert_close(seen[0], image, rtol=0.0, atol=0.0)
     # Adam's first step has the length of the rate and the gradient's sign.
-    for name, rate in (("log_intensity", 0.06), ("log_sigma", 0.04)):
+    for name, rate in (("log_intensity", RATES["intensity"]), ("log_sigma", RATES["width"])):
         parameter = loop.unknowns.light_fg.get_parameter(name)
         assert parameter.grad is not None
         moved = parameter.detach() - before[f"light_fg.{name}"]
@@ -545,12 +556,12 @@ def test_rate_schedule(device: str) -> None:
     for _ in range(8):
         loop.step()
         rates.append([group["lr"] for group in loop.optimizer.param_groups])
-    kinds = [0.06, 0.01, 0.03, 0.04]
-    assert rates[0] == pytest.approx([*kinds, *kinds, 0.01])
+    kinds = [RATES[name] for name in ("intensity", "chroma", "axis", "width")]
+    assert rates[0] == pytest.approx([*kinds, *kinds, RATES["tone"]])
     share = np.maximum(2.0 * np.arange(8) / 8.0 - 1.0, 0.0)
     expected = 0.1 + 0.45 * (1.0 + np.cos(np.pi * share))
-    assert [r[0] / 0.06 for r in rates] == pytest.approx(expected.tolist())
-    assert [r[-1] / 0.01 for r in rates] == pytest.approx(expected.tolist())
+    assert [r[0] / RATES["intensity"] for r in rates] == pytest.approx(expected.tolist())
+    assert [r[-1] / RATES["tone"] for r in rates] == pytest.approx(expected.tolist())
 
 
 def test_no_tone_curve_leaves_the_curves_alone(device: str) -> None:
@@ -637,6 +648,26 @@ def test_mis_draws_other_samples_in_every_step(device: str) -> None:
     with torch.no_grad():
         first, again, other = loop.image(0), loop.image(0), loop.image(1)
     assert torch.equal(first, again) and not torch.equal(first, other)
+
+
+def test_mis_takes_its_gradient_from_other_samples(device: str) -> None:
+    """Guidance follows the noise of what it sees; the gradient must not know that noise."""
+    loop = a_loop(device, settings=replace(SETTINGS, integrator="mis"), unknowns=bent())
+    leaf = loop.unknowns.light_fg.log_intensity
+    weight = Pull().d_image
+
+    def picture(seed: int) -> tuple[Tensor, Tensor]:
+        curves = loop.unknowns.curve_fg(), loop.unknowns.curve_shadow()
+        image = loop.view.image(*loop.lights(loop.fusion(2)), *curves, seed)
+        return image.detach(), torch.autograd.grad((image.cpu() * weight).sum(), leaf)[0]
+
+    image = loop.image(2)
+    (gradient,) = torch.autograd.grad((image.cpu() * weight).sum(), leaf)
+    found = [picture(loop.seed + k) for k in range(10)]
+    same_image = [torch.allclose(image, other, rtol=0.0, atol=1e-6) for other, _ in found]
+    same_gradient = [torch.allclose(gradient, other, rtol=1e-5) for _, other in found]
+    assert sum(same_image) == sum(same_gradient) == 1
+    assert same_image.index(True) != same_gradient.index(True)
 
 
 def test_view_has_no_gradient_of_the_photo(device: str) -> None:
