@@ -12,6 +12,7 @@ from __future__ import annotations
 
 import json
 import logging
+import math
 import time
 from collections.abc import Callable, Mapping
 from contextlib import AbstractContextManager, nullcontext
@@ -424,6 +425,9 @@ def evaluate(
         embedding: Of the photo's prompt, shape [1, token, channel].
         seed: The run's seed.
         adapter: Its name, or None for the base weights.
+
+    Raises:
+        ModelError: The noise is not finite, as when half precision overflows.
     """
     random = generator_of(seed, "evaluation")
     shares = torch.arange(EVALUATION_COUNT) + torch.rand(EVALUATION_COUNT, generator=random)
@@ -439,7 +443,12 @@ def evaluate(
             noisy[part], t[part], embedding.expand(count, -1, -1), [adapter] * count
         )
         errors.append((predicted.cpu() - noise[part]).square().mean(dim=(1, 2, 3)))
-    return float(torch.cat(errors).mean())
+    error = float(torch.cat(errors).mean())
+    if not math.isfinite(error):
+        raise ModelError(
+            "model", "its predictions are not finite (found nan or inf)", "try --precision fp32"
+        )
+    return error
 
 
 def lora_key(

@@ -246,6 +246,15 @@ def test_latents_that_are_not_finite_end_the_run(
         personalize(epsilon, PHOTO, PROMPTS, SETTINGS, 0, None)
 
 
+def test_predictions_that_are_not_finite_end_the_run(
+    epsilon: StableDiffusion, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """As when half precision overflows in the UNet; no file could hold their error."""
+    monkeypatch.setattr(epsilon, "predict", lambda x, *_: torch.full_like(x, float("nan")))
+    with pytest.raises(ModelError, match="predictions are not finite"):
+        personalize(epsilon, PHOTO, PROMPTS, SETTINGS, 0, None)
+
+
 # One step
 
 
