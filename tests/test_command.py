@@ -526,16 +526,31 @@ def test_main_reports_its_own_faults(
     assert "error: warpir: a fault of its own (ZeroDivisionError: none\\nof it)\n" in text
 
 
+def short_of_memory() -> BaseException:
+    """Return what torch raises on the CPU."""
+    import torch
+
+    with pytest.raises(RuntimeError) as caught:
+        torch.empty(10**15)
+    return caught.value
+
+
 @pytest.mark.parametrize(
     ("raised", "status", "words"),
     [
         (KeyboardInterrupt(), 130, "stopped"),
         (MemoryError(), ExitCode.RESOURCES, "error: memory:"),
+        (short_of_memory(), ExitCode.RESOURCES, "error: memory:"),
+        (
+            RuntimeError("Failed to allocate 9 bytes on device 'cuda:0'"),
+            ExitCode.RESOURCES,
+            "error: memory:",
+        ),
         (OSError(28, "No space left on device", "o/x.exr"), ExitCode.RESOURCES, "error: o/x.exr:"),
         (ModuleNotFoundError("", name="diffusers"), ExitCode.USAGE, "warpir[diffusion]"),
         (InputError("a\nb.png", "x\x1b[31m"), ExitCode.INPUT, "error: a\\nb.png: x\\x1b[31m"),
     ],
-    ids=["interrupt", "memory", "disk", "R15", "control-characters"],
+    ids=["interrupt", "memory", "torch", "warp", "disk", "R15", "control-characters"],
 )
 def test_main_tells_the_truth_by_status(
     monkeypatch: pytest.MonkeyPatch,

@@ -26,6 +26,8 @@ EXTRA_OF = {
     "matplotlib": "bench",
 }
 """Which extra brings a package that a plain install does not have."""
+NO_MEMORY = ("allocate mem", "Failed to allocate", "out of memory", "ALLOC_FAILED")
+"""How torch, Warp and CUDA say in a RuntimeError that memory is short."""
 
 
 def run_program(run: Callable[[list[str]], int], argv: Sequence[str] | None = None) -> int:
@@ -74,11 +76,12 @@ def _explain(error: BaseException) -> tuple[int, list[str]]:
         error = usage(
             missing, "not installed", f"pip install 'warpir[{EXTRA_OF[missing]}]' brings it"
         )
-    elif isinstance(error, MemoryError) or type(error).__name__ == "OutOfMemoryError":
+    elif _is_short_of_memory(error):
         error = InputError(
             "memory",
             "not enough of it",
-            "lower --width, --samples or --rays, or use --device cpu",
+            "lower --width, --samples or --rays, with --guidance --class-batch, --noises or "
+            "--guidance-width, or use --device cpu",
             ExitCode.RESOURCES,
         )
     elif isinstance(error, OSError) and error.errno in (errno.ENOSPC, errno.EDQUOT, errno.EFBIG):
@@ -93,6 +96,11 @@ def _explain(error: BaseException) -> tuple[int, list[str]]:
         f"error: warpir: a fault of its own ({kind})",
         "please report it with the lines above and the command that was run",
     ]
+
+
+def _is_short_of_memory(error: BaseException) -> bool:
+    told = isinstance(error, RuntimeError) and any(words in str(error) for words in NO_MEMORY)
+    return told or isinstance(error, MemoryError)
 
 
 def _one_line(text: str) -> str:
