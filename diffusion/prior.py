@@ -8,7 +8,7 @@ the noise in noisy latents for a prompt, with or without an adapter (a LoRA). Gu
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Protocol
 
 import torch
@@ -109,4 +109,3 @@ class Counts:
     """Steps without a finite gradient."""
     clipped_steps: int = 0
     """Steps whose gradient was shortened."""
-    notices: list[str] = field(default_factory=list)

@@ -106,6 +106,8 @@ def test_guided_run_writes_every_file_and_says_who_spoke(finished: Path) -> None
     assert measured["prompts"]["guidance"].startswith("a photo of a small box in a scene")
     assert measured["personalization"]["reused"] is False
     assert measured["optimization"]["steps"] == 8
+    assert measured["optimization"]["skipped_steps"] == 0
+    assert measured["optimization"]["clipped_steps"] == 0
     assert {"model", "personalize", "trace", "optimize", "render"} <= set(run["seconds"])
     assert any("fp32" in notice for notice in run["notices"])
     assert any("even one" in line for line in run["assumed"])

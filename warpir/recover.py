@@ -144,7 +144,7 @@ def recover(run: Run, start: SceneLight) -> tuple[SceneLight, dict[str, Any], tu
         **guided.record,
         "prior": guided.prior.name,
         "loop_integrator": settings.integrator,
-        "optimization": summary_of(loop, first),
+        "optimization": summary_of(loop, first) | {"clipped_steps": guide.counts.clipped_steps},
     }
     light = SceneLight(light_fg, light_shadow, curves, 0.0, start.assumed)
     return light, record, notices

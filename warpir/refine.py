@@ -427,7 +427,7 @@ def refine(
         "prior": guided.prior.name,
         "loop_integrator": "mis",
         "refine": record,
-        "optimization": summary_of(loop, first),
+        "optimization": summary_of(loop, first) | {"clipped_steps": guide.counts.clipped_steps},
     }
     return light, asset, record, notices
 

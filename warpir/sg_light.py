@@ -4,7 +4,7 @@
 
 Amplitudes and widths are optimised as logarithms, because a sun is 10^3 to 10^5 times its sky: a
 step multiplies. Score distillation is known to let colours run away, so a lobe's colour ratios are
-bounded smoothly; the bound is far beyond any real lamp, and inside it nothing is held back.
+bounded smoothly: far beyond daylight and white lamps, and inside the bound nothing is held back.
 """
 
 from __future__ import annotations
