@@ -1,6 +1,6 @@
 """Does the loop find light and tone curves again when the guidance is right?
 
-    python -m benchmarks.recovery [--quick] --assets DIR --json FILE
+    python -m benchmarks.recovery [--quick] [--assets DIR] --json FILE
 
 A photo is cut out of a panorama, an object is set into it under that very panorama and unknown tone
 curves, and the optimisation is guided by the squared distance to this true composite, in place of a
@@ -385,7 +385,7 @@ def table(record: Mapping[str, Any]) -> str:
     lines = [
         "# Recovery of light and tone curves with guidance that is right",
         "",
-        "Made by `python -m benchmarks.recovery --assets DIR --markdown docs/recovery.md`: the",
+        "Made by `python -m benchmarks.recovery --markdown docs/recovery.md`: the",
         "optimisation is guided by the squared distance to the true composite in place of a",
         "diffusion model. The truth is path-traced under the full panorama, through tone curves",
         "that the loop does not know; the result is path-traced too, at an unseen seed.",
@@ -411,7 +411,9 @@ def table(record: Mapping[str, Any]) -> str:
 def main() -> None:
     """Recover six scenes and write what was found."""
     parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
-    parser.add_argument("--assets", type=Path, required=True, help="folder with mesh/ and hdri/")
+    parser.add_argument(
+        "--assets", type=Path, default=Path("../shared/data"), help="folder with mesh/ and hdri/"
+    )
     parser.add_argument("--quick", action="store_true", help="96 x 64, 200 steps")
     parser.add_argument("--json", type=Path, help="file for the figures")
     parser.add_argument("--pictures", type=Path, help="folder for truth, result, difference")
