@@ -6,6 +6,7 @@ its weights safetensors whose headers hold; every fault is one sentence that nam
 
 from __future__ import annotations
 
+import errno
 import hashlib
 import json
 import re
@@ -162,7 +163,9 @@ def _download(model: str) -> Path:
     try:
         names = HfApi().list_repo_files(model)
         return Path(snapshot_download(model, allow_patterns=needed_files(names)))
-    except (OSError, ValueError) as error:
+    except Exception as error:  # the hub's own, those of its HTTP client, and the system's
+        if isinstance(error, OSError) and error.errno in (errno.ENOSPC, errno.EDQUOT):
+            raise
         what = f"could not be downloaded ({type(error).__name__}); {WITHDRAWN}"
         raise ModelError(model, what, ADVICE) from error
 

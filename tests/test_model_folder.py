@@ -1,11 +1,13 @@
 """Model folders: what is refused before anything of it is believed, and what is taken."""
 
+import errno
 import json
 import pickle
 import shutil
 import struct
 from collections.abc import Callable, Iterator
 from pathlib import Path
+from typing import Any
 
 import pytest
 import torch
@@ -385,6 +387,33 @@ def test_download_fetches_what_is_read_only(
     monkeypatch.setattr("huggingface_hub.snapshot_download", snapshot)
     with pytest.raises(ModelError, match="cache"):
         find_model("owner/name", allow_download=False)
+
+
+class ConnectError(Exception):
+    """As the hub's HTTP client raises: no OSError."""
+
+
+@pytest.mark.parametrize(
+    ("error", "expected"),
+    [
+        (ConnectError("refused"), ModelError),
+        (ConnectionResetError(), ModelError),
+        (OSError(errno.ENOSPC, "full"), OSError),
+    ],
+)
+def test_a_download_that_fails_is_explained(
+    monkeypatch: pytest.MonkeyPatch, error: Exception, expected: type[Exception]
+) -> None:
+    """Only a full disk is left to the program, which has a status of its own for it."""
+
+    def fail(*args: Any, **options: Any) -> None:
+        raise OSError if options.get("local_files_only") else error
+
+    monkeypatch.setattr("huggingface_hub.snapshot_download", fail)
+    monkeypatch.setattr("huggingface_hub.HfApi.list_repo_files", fail)
+    with pytest.raises(expected) as caught:
+        find_model("owner/name", allow_download=True)
+    assert isinstance(error, OSError) or "ConnectError" in str(caught.value)
 
 
 def test_offline_refuses_every_request_and_is_undone() -> None:
