@@ -217,6 +217,11 @@ def test_command_reads_values(argv: list[str], name: str, value: object) -> None
         (["--guidance", "lds"], "--guidance", "none or stable-diffusion (found lds)"),
         (["--guidance", "stable-diffusion", "--prompt", "p"], "--model", "needed"),
         (["--guidance", "stable-diffusion", "--model", "m"], "--prompt", "needed"),
+        (
+            [*"--guidance stable-diffusion --model m --prompt p --no-personalize".split()],
+            "--no-personalize",
+            "--loss lds",
+        ),
         (["--prompt", "p\0"], "--prompt", "NUL"),
         (["--prompt", "\u00e9" * 2049], "--prompt", "4098 bytes"),
         (["--prompt", " "], "--prompt", "empty (found ' '"),

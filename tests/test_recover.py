@@ -254,6 +254,15 @@ def test_resume_refuses_another_model(
     assert "model.scheduler: was" in error and "text_encoder" not in error
 
 
+def test_a_finished_run_is_not_resumed(
+    folder: Path, finished: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    before = digest(finished)
+    assert main([*argv(folder, finished), "--resume"]) == ExitCode.OUTPUT
+    assert f"the run in {finished} is finished" in capsys.readouterr().err
+    assert digest(finished) == before
+
+
 def test_overwrite_starts_an_unfinished_run_again(
     folder: Path, finished: Path, unfinished: Path
 ) -> None:
@@ -339,11 +348,16 @@ def test_recovered_light_is_reused(folder: Path, finished: Path, tmp_path: Path)
     [
         ({"model": "/nowhere/at/all"}, ExitCode.MODEL, "/nowhere/at/all"),
         ({"model": "stabilityai/stable-diffusion-2-1"}, ExitCode.MODEL, "November 2025"),
-        ({"no_personalize": ""}, ExitCode.USAGE, "adapter"),
+        ({"model": "/nowhere/at/all", "validate": ""}, ExitCode.MODEL, "/nowhere/at/all"),
+        ({"no_personalize": ""}, ExitCode.USAGE, "--loss lds"),
+        ({"place": "0,0,-900"}, ExitCode.INPUT, "covers no pixel of the 32 x 21"),
         ({"lora": "/nowhere.safetensors"}, ExitCode.MODEL, "nowhere.safetensors"),
         ({"prompt": None}, ExitCode.USAGE, "--prompt"),
     ],
-    ids=["no folder", "withdrawn", "lds without adapter", "no lora", "no prompt"],
+    ids=[
+        *("no folder", "withdrawn", "no folder to validate", "lds without adapter"),
+        *("too far to be seen", "no lora", "no prompt"),
+    ],
 )
 def test_bad_models_are_one_line(
     folder: Path,

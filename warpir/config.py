@@ -287,6 +287,8 @@ CHOICES = {
     "integrator": ("transport", "mis"),
     "refine": ("material", "emission", "tone"),
 }
+LOSSES_OF_BASE = ("csd", "sds-base", "dataset-update")
+"""Losses that do without an adapter."""
 PROMPTS = ("prompt", "negative_prompt", "class_noun", "token", "show_prior")
 EMPTY_ALLOWED = ("negative_prompt",)
 
@@ -411,6 +413,12 @@ def _values_that_clash(config: InsertConfig) -> Iterator[InputError]:
     if config.refine == "tone" and not config.tone_curve:
         yield usage(
             "--no-tone-curve", "cannot be used with --refine tone, which changes nothing else"
+        )
+    if guided and not config.personalize and config.loss not in LOSSES_OF_BASE:
+        yield usage(
+            "--no-personalize",
+            f"cannot be used with --loss {config.loss}, which compares the adapted model",
+            f"add --loss {' or '.join(LOSSES_OF_BASE)}, or leave it out",
         )
     if config.loss == "lds-negative" and not config.negative_prompt:
         yield usage("--loss", "lds-negative needs --negative-prompt, which it moves away from")

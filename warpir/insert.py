@@ -22,7 +22,7 @@ from typing import TYPE_CHECKING, Any
 
 from warpir.command import parse
 from warpir.config import InsertConfig
-from warpir.errors import ExitCode
+from warpir.errors import ExitCode, InputError
 from warpir.program import run_program, say
 
 if TYPE_CHECKING:
@@ -97,6 +97,13 @@ def _insert_one(config: InsertConfig, loaders: "Loaders | None" = None) -> Inser
 
     assert config.out is not None
     checkpoints = Checkpoints(Path(config.out), {})
+    if config.resume and checkpoints.newest is None and Path(config.out, "run.json").exists():
+        raise InputError(
+            "--resume",
+            f"the run in {config.out} is finished",
+            "to run it again, give --overwrite in place of --resume",
+            ExitCode.OUTPUT,
+        )
     # A run to resume was allowed to replace what is there, or has made it.
     overwrite = config.overwrite or (config.resume and checkpoints.newest is not None)
     with OutputFolder(config.out, overwrite=overwrite) as output:
@@ -298,6 +305,10 @@ def _run(arguments: list[str]) -> int:
 def _validate(config: InsertConfig) -> None:
     if config.sequence is None:
         _read(config)
+        if config.guidance != "none" and not config.allow_download:
+            from warpir.recover import require_model
+
+            require_model(config)
         return
     from warpir.inputs import Loaders
     from warpir.sequence import read_sequence

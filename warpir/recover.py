@@ -23,6 +23,7 @@ from warpir.curves import Curves, ToneKnots
 from warpir.diffusion.cache import cache_folder, content_key, write_file
 from warpir.diffusion.guidance import DatasetUpdate, Guidance, NonFiniteError, make_guidance
 from warpir.diffusion.lora_files import Lora, save_lora
+from warpir.diffusion.model_folder import check_model_folder, find_model
 from warpir.diffusion.personalize import personalize
 from warpir.diffusion.prior import Condition, ModelError
 from warpir.diffusion.prompts import Prompts, make_prompts
@@ -114,10 +115,10 @@ def recover(run: Run, start: SceneLight) -> tuple[SceneLight, dict[str, Any], tu
     config = settings = run.config
     with as_input_errors():
         checkpoints = open_checkpoints(run)
-        guided, resumed = prepare_guidance(run, checkpoints)
         with run.timings.stage("scene"):
             frame = make_frame(run)
             unknowns = start_of(run, start).to(run.torch_device)
+        guided, resumed = prepare_guidance(run, checkpoints)
         with run.timings.stage("trace"):
             guide = make_guide(run, guided, frame)
             graphs = guided.prior.graphs
@@ -148,6 +149,16 @@ def recover(run: Run, start: SceneLight) -> tuple[SceneLight, dict[str, Any], tu
     }
     light = SceneLight(light_fg, light_shadow, curves, 0.0, start.assumed)
     return light, record, notices
+
+
+def require_model(config: InsertConfig) -> None:
+    """Check the model's folder, and load nothing.
+
+    Raises:
+        InputError: It is not there, or not what it should be (`ExitCode.MODEL`).
+    """
+    with as_input_errors():
+        check_model_folder(find_model(config.model, allow_download=False))
 
 
 def open_checkpoints(run: Run) -> Checkpoints:
@@ -259,13 +270,24 @@ def prepare_guidance(run: Run, checkpoints: Checkpoints) -> tuple[Guided, Checkp
 
 
 def make_frame(run: Run) -> Frame:
-    """Return scene and photo at the loop's resolution."""
+    """Return scene and photo at the loop's resolution.
+
+    Raises:
+        InputError: The object is not seen in it; better known before the model is adapted.
+    """
     config, camera = run.config, run.inputs.camera
     width = min(config.guidance_width, camera.width)
     small = camera.scaled(width, max(1, round(width * camera.height / camera.width)))
     renderer = Renderer(scene_of(run.inputs, small, run.device), config.threads or 0)
     photo = np.clip(resize(run.inputs.photo.linear(), small.height, small.width), 0.0, None)
-    return Frame(renderer, photo, config.tone_operator == "reinhard", config.depth, config.seed)
+    frame = Frame(renderer, photo, config.tone_operator == "reinhard", config.depth, config.seed)
+    if not frame.coverage().any():
+        raise InputError(
+            "--guidance",
+            f"the object covers no pixel of the {small.width} x {small.height} that are judged",
+            "bring it nearer, or raise --guidance-width",
+        )
+    return frame
 
 
 def start_of(run: Run, start: SceneLight) -> Unknowns:
@@ -287,11 +309,7 @@ def widened(lobes: Lobes, sigma_min: float) -> Lobes:
 
 
 def make_guide(run: Run, guided: Guided, frame: Frame) -> Guidance | DatasetUpdate:
-    """Return the guidance of the configured loss over a picture of the frame's size.
-
-    Raises:
-        InputError: The loss needs an adapter and there is none, or the object is not in the frame.
-    """
+    """Return the guidance of the configured loss over a picture of the frame's size."""
     config = run.config
     shown = linear_to_gamma(frame.photo_lin).astype(np.float32)
     background = torch.from_numpy(shown).permute(2, 0, 1)[None].to(run.torch_device)
@@ -300,12 +318,9 @@ def make_guide(run: Run, guided: Guided, frame: Frame) -> Guidance | DatasetUpda
         prompts.guidance, negative_prompt=config.negative_prompt, background=background
     )
     seen = torch.from_numpy(frame.coverage())
-    try:
-        guide = make_guidance(
-            guided.prior, condition, config, seen, config.step_count, config.seed, guided.adapter
-        )
-    except ValueError as error:
-        raise InputError("--guidance", str(error), code=ExitCode.USAGE) from None
+    guide = make_guidance(
+        guided.prior, condition, config, seen, config.step_count, config.seed, guided.adapter
+    )
     if isinstance(guide, Guidance):
         guide.ensure_precision(background)
     return guide

@@ -389,10 +389,10 @@ def refine(
     config, asset = run.config, run.inputs.asset
     with as_input_errors():
         checkpoints = open_checkpoints(run)
-        guided, resumed = prepare_guidance(run, checkpoints)
         with run.timings.stage("scene"):
             # Curves of an earlier run are made for its operator.
             frame = replace(make_frame(run), is_reinhard=light.curves.tone == "reinhard")
+        guided, resumed = prepare_guidance(run, checkpoints)
         with run.timings.stage("trace"):
             guide = make_guide(run, guided, frame)
             lit = LitFrame(frame, light, run.torch_device)
