@@ -9,13 +9,14 @@ functions stay the reference; a recording is nothing but faster.
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Hashable, Iterator, Sequence
+from collections.abc import Callable, Hashable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from typing import Any
 from weakref import WeakSet
 
 import torch
-from torch import Tensor
+from torch import Tensor, nn
+from torch.func import functional_call
 
 PLAIN_CALLS = 4
 """Calls of a kind before it is recorded: a recording takes as long as several of them."""
@@ -39,7 +40,7 @@ class Graphs:
         self.stream = torch.cuda.Stream(device)
         self._calls: dict[Hashable, int] = {}
         self._passes: dict[Hashable, _Pass] = {}
-        self._recorded: WeakSet[RecordedFunction | RecordedStep] = WeakSet()
+        self._recorded: WeakSet[RecordedModule | RecordedStep] = WeakSet()
 
     def run(self, key: Hashable, function: Callable[..., Tensor], *arguments: Tensor) -> Tensor:
         """Return ``function(*arguments)`` without a gradient.
@@ -59,17 +60,14 @@ class Graphs:
                 self._passes[key] = _Pass(function, arguments, self.stream, pool)
         return self._passes[key](*arguments)
 
-    def recorded_function(
-        self, function: Callable[..., tuple[Tensor, ...]], parameters: Sequence[Tensor] = ()
-    ) -> RecordedFunction:
-        """Return what computes a function and, when it is asked for, its gradient.
+    def recorded_module(self, module: nn.Module) -> RecordedModule:
+        """Return what computes a module and, when it is asked for, its gradient.
 
         Args:
-            function: Does the same to the same shapes; waits for nothing and uploads nothing.
-            parameters: What it is differentiated by besides its arguments, each always in the same
-                memory.
+            module: Returns a tuple of tensors; does the same to the same shapes, waits for nothing
+                and uploads nothing. Its free parameters always stay in the same memory.
         """
-        made = RecordedFunction(self, function, parameters)
+        made = RecordedModule(self, module)
         self._recorded.add(made)
         return made
 
@@ -134,36 +132,35 @@ class _Pass:
         return self.result.clone()
 
 
-class RecordedFunction:
-    """A function of some tensors with its gradient; made by `Graphs.recorded_function`.
+class RecordedModule:
+    """A function of some tensors with its gradient; made by `Graphs.recorded_module`.
 
     The gradient is that of the latest call with its shapes: what it needs is overwritten by the
     next, and then asking for it raises a RuntimeError.
     """
 
-    def __init__(
-        self,
-        graphs: Graphs,
-        function: Callable[..., tuple[Tensor, ...]],
-        parameters: Sequence[Tensor],
-    ) -> None:
-        self._graphs, self._function, self._parameters = graphs, function, tuple(parameters)
+    def __init__(self, graphs: Graphs, module: nn.Module) -> None:
+        self._graphs, self._module = graphs, module
+        free = {name: p for name, p in module.named_parameters() if p.requires_grad}
+        self._parameters = free
         self._calls: dict[Hashable, int] = {}
         self._gradients: dict[Hashable, _Gradient] = {}
 
     def __call__(self, *arguments: Tensor) -> tuple[Tensor, ...]:
-        """Return what the function returns."""
+        """Return what the module returns."""
         key = _kinds(arguments)
+        results: tuple[Tensor, ...]
         if key not in self._gradients:
             self._calls[key] = self._calls.get(key, 0) + 1
             if self._calls[key] <= PLAIN_CALLS:
-                return self._function(*arguments)
+                results = self._module(*arguments)
+                return results
             with self._graphs.recording():
                 self._gradients[key] = _Gradient(
-                    self._function, arguments, self._parameters, self._graphs.stream
+                    self._module, arguments, self._parameters, self._graphs.stream
                 )
-        results: tuple[Tensor, ...] = _Replay.apply(  # type: ignore[no-untyped-call]
-            self._gradients[key], *arguments, *self._parameters
+        results = _Replay.apply(  # type: ignore[no-untyped-call]
+            self._gradients[key], *arguments, *self._parameters.values()
         )
         return results
 
@@ -174,49 +171,51 @@ class RecordedFunction:
 
 
 class _Gradient:
-    """Both halves of a function, recorded as two graphs with memory of their own.
+    """Both halves of a module, recorded as two graphs with memory of their own.
 
     Other recordings run between the two, so they must not share it.
     """
 
     def __init__(
         self,
-        function: Callable[..., tuple[Tensor, ...]],
+        module: nn.Module,
         arguments: Sequence[Tensor],
-        parameters: Sequence[Tensor],
+        parameters: Mapping[str, nn.Parameter],
         stream: torch.cuda.Stream,
     ) -> None:
         self.arguments = [x.detach().clone().requires_grad_(x.requires_grad) for x in arguments]
+        # The same memory, but unknown to what was computed before, which may still wait for its
+        # gradient in another stream.
+        aliases = {name: p.detach().requires_grad_() for name, p in parameters.items()}
+        self.inputs = [*self.arguments, *aliases.values()]
         self.forward, self.backward = torch.cuda.CUDAGraph(), torch.cuda.CUDAGraph()
         self.calls = 0
+        results: tuple[Tensor, ...]
         stream.wait_stream(torch.cuda.current_stream())
         with torch.enable_grad():
             with torch.cuda.stream(stream):
-                results = function(*self.arguments)
+                results = functional_call(module, aliases, tuple(self.arguments))
                 self.is_free = [x.requires_grad for x in results]
                 self.d_results = [torch.zeros_like(x) for x in results if x.requires_grad]
-                self._differentiate(results, parameters)
+                self._differentiate(results)
             del results
             with torch.cuda.graph(self.forward, stream=stream):
-                results = function(*self.arguments)
+                results = functional_call(module, aliases, tuple(self.arguments))
             with torch.cuda.graph(self.backward, pool=self.forward.pool(), stream=stream):
-                self.d_inputs = self._differentiate(results, parameters)
+                self.d_inputs = self._differentiate(results)
         self.results = [x.detach() for x in results]
 
-    def _differentiate(
-        self, results: Sequence[Tensor], parameters: Sequence[Tensor]
-    ) -> list[Tensor | None]:
+    def _differentiate(self, results: Sequence[Tensor]) -> list[Tensor | None]:
         """Return the gradient of each argument and parameter, None where there is none."""
-        inputs = [*self.arguments, *parameters]
         gradients = iter(
             torch.autograd.grad(
                 [x for x in results if x.requires_grad],
-                [x for x in inputs if x.requires_grad],
+                [x for x in self.inputs if x.requires_grad],
                 self.d_results,
                 allow_unused=True,
             )
         )
-        return [next(gradients) if x.requires_grad else None for x in inputs]
+        return [next(gradients) if x.requires_grad else None for x in self.inputs]
 
 
 class _Replay(torch.autograd.Function):

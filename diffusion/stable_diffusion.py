@@ -101,8 +101,8 @@ class StableDiffusion:
             vae.encoder.mid_block.gradient_checkpointing = False
         self.device: torch.device = unet.device
         self.graphs = Graphs(self.device) if graphs else None
-        self._mean = partial(_posterior_mean, vae)
-        self._recorded_mean = self.graphs.recorded_function(self._mean) if self.graphs else None
+        self._mean = _PosteriorMean(vae)
+        self._recorded_mean = self.graphs.recorded_module(self._mean) if self.graphs else None
         self.unet_dtype: torch.dtype = unet.dtype
         """Arithmetic of the UNet; an adapter in training may have its own."""
         self.latent_size: int = unet.config.sample_size
@@ -534,9 +534,15 @@ class StableDiffusion:
         self.notices = (*self.notices, text)
 
 
-def _posterior_mean(vae: AutoencoderKL, pixels: Tensor) -> tuple[Tensor, ...]:
-    """Return the mean of the latents' distribution, shape [B, 4, h, w], and nothing else."""
-    return (vae.encode(pixels).latent_dist.mean,)
+class _PosteriorMean(nn.Module):
+    """The mean of the latents' distribution, shape [B, 4, h, w], and nothing else."""
+
+    def __init__(self, vae: AutoencoderKL) -> None:
+        super().__init__()
+        self.vae = vae
+
+    def forward(self, pixels: Tensor) -> tuple[Tensor, ...]:
+        return (self.vae.encode(pixels).latent_dist.mean,)
 
 
 def load_stable_diffusion(settings: ModelSettings, device: torch.device | str) -> StableDiffusion:

@@ -4,14 +4,15 @@ The plain functions are the reference. What cannot run without a CUDA device is 
 stays what makes a recording possible at all.
 """
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import pytest
 import torch
-from torch import Tensor
+from torch import Tensor, nn
+from torch.func import functional_call
 from torch.utils._python_dispatch import TorchDispatchMode
 
 import warpir.diffusion.personalize as personalize_module
@@ -374,14 +375,14 @@ def test_replayed_training_equals_plain_training(
 def test_training_leaves_the_models_own_weights_alone(folder: Path) -> None:
     """They are in bf16 meanwhile."""
     prior = load(folder)
-    before = {name: weight.clone() for name, weight in prior.unet.state_dict().items()}
+    before = [weight.clone() for weight in prior.unet.parameters()]
     with training_of(prior) as training:
         assert {w.dtype for w in prior.unet.parameters()} == {torch.bfloat16, torch.float32}
         training.prepare(0)
         training.update()
-    after = prior.unet.state_dict()
-    assert before.keys() == after.keys()
-    assert all(w.dtype == torch.float16 and torch.equal(w, after[k]) for k, w in before.items())
+    after = list(prior.unet.parameters())
+    assert {weight.dtype for weight in after} == {torch.float16}
+    assert all(torch.equal(a, b) for a, b in zip(after, before, strict=True))
 
 
 @needs_cuda
@@ -411,21 +412,27 @@ def loop_of(device: str, record: Record | None, **changes: Any) -> LightOptimiza
     )
 
 
-def test_the_loops_torch_half_neither_waits_nor_uploads() -> None:
+def test_the_loops_torch_half_neither_waits_nor_uploads(device: str) -> None:
     """Also its gradient; here it is taken as it is, which must change nothing."""
-    asked = []
+    asked: list[nn.Module] = []
 
-    def record(function: Function, parameters: Sequence[Tensor]) -> Function:
-        asked.append(len(parameters))
-        return function
+    def record(half: nn.Module) -> Function:
+        asked.append(half)
+        return half
 
-    plain, recorded = loop_of("cpu", None), loop_of("cpu", record)
-    assert asked == [len(list(recorded.unknowns.parameters()))]
-    scale = torch.tensor(0.3)
-    recorded._tensors(scale)  # constants are uploaded once
+    plain, recorded = loop_of(device, None), loop_of(device, record)
+    (half,) = asked
+    parameters = list(recorded.unknowns.parameters())
+    assert {id(p) for p in half.parameters()} == {id(p) for p in parameters}
+    scale = torch.tensor(0.3, device=parameters[0].device)
+    plain_parts = half(scale)  # constants are uploaded once
+    aliases = {name: p.detach().requires_grad_() for name, p in half.named_parameters()}
+    aliased_parts = functional_call(half, aliases, (scale,))
+    for found, expected in zip(aliased_parts, plain_parts, strict=True):
+        torch.testing.assert_close(found, expected)
+    torch.autograd.grad(sum(x.sum() for x in aliased_parts), list(aliases.values()))
     with Operations() as seen:
-        made = recorded._tensors(scale)
-        torch.autograd.grad(sum(x.sum() for x in made), list(recorded.unknowns.parameters()))
+        torch.autograd.grad(sum(x.sum() for x in half(scale)), parameters)
     assert "exp" in seen.names
     assert seen.names & (WAITING | RANDOM | {"lift_fresh"}) == set()
     for _ in range(4):
@@ -447,7 +454,7 @@ def test_replayed_light_steps_equal_plain_ones(changes: dict[str, Any]) -> None:
     """Parameters and regularisers of a run, through recording and replays."""
     graphs = Graphs(torch.device(DEVICE, 0))
     plain = loop_of("cuda:0", None, **changes)
-    recorded = loop_of("cuda:0", graphs.recorded_function, **changes)
+    recorded = loop_of("cuda:0", graphs.recorded_module, **changes)
     for _ in range(12):
         plain.step()
         recorded.step()
@@ -464,7 +471,7 @@ def test_replayed_light_steps_equal_plain_ones(changes: dict[str, Any]) -> None:
 def test_rows_that_are_traced_again_are_recorded_again() -> None:
     """The recording before read the old rows."""
     graphs = Graphs(torch.device(DEVICE, 0))
-    recorded = loop_of("cuda:0", graphs.recorded_function)
+    recorded = loop_of("cuda:0", graphs.recorded_module)
     for _ in range(CALLS):
         recorded.step()
     plain = loop_of("cuda:0", None)

@@ -30,9 +30,8 @@ RETRACE_EVERY = 25
 """Steps between two looks at whether the light has left what was expected of it."""
 
 Function = Callable[..., tuple[Tensor, ...]]
-Record = Callable[[Function, Sequence[Tensor]], Function]
-"""Given a function of tensors and what it is differentiated by besides, returns one that does the
-same faster, such as a CUDA graph's replay."""
+Record = Callable[[torch.nn.Module], Function]
+"""Given a module, returns what does the same faster, such as a CUDA graph's replay."""
 
 
 class Unknowns(torch.nn.Module):
@@ -126,7 +125,7 @@ class LightOptimization(Optimization):
         self.retraced = 0
         self._record = record
         self._terms: dict[str, Tensor] = {}
-        self._term_names: tuple[str, ...] = ()
+        self.term_names: tuple[str, ...] = ()
         with torch.no_grad():
             self.expected = expected_light(*self.lights(0.0))
         self.view = self._trace()
@@ -136,14 +135,8 @@ class LightOptimization(Optimization):
         # What was recorded reads the rows of the view before.
         self._recorded = None
         if self._record is not None and view.transport is not None:
-            self._recorded = self._record(self._tensors, list(self.unknowns.parameters()))
+            self._recorded = self._record(_TorchHalf(self))
         return view
-
-    def _tensors(self, scale: Tensor) -> tuple[Tensor, ...]:
-        """Return the parts of a step, for recording."""
-        parts = self._parts(scale)
-        self._term_names = tuple(parts.terms)
-        return parts.tensors()
 
     def fusion(self, step: int) -> float:
         """Return ``s_fuse`` of a step: how far both lights have become one [1]."""
@@ -172,7 +165,7 @@ class LightOptimization(Optimization):
             return texels_fg, texels_fg
         return texels_fg, self.unknowns.light_shadow.texels(height)
 
-    def _parts(self, scale: float | Tensor, seed: int = 0) -> Parts:
+    def parts(self, scale: float | Tensor, seed: int = 0) -> Parts:
         """Return everything up to the composite; of torch alone with `transport`."""
         unknowns, maps = self.unknowns, self._separate(self.settings.light_height)
         curves = unknowns.curve_fg(), unknowns.curve_shadow()
@@ -202,11 +195,11 @@ class LightOptimization(Optimization):
         """
         scale = self.fusion(step)
         if self._recorded is None:
-            parts = self._parts(scale, self.seed + 2 * step)
+            parts = self.parts(scale, self.seed + 2 * step)
         else:
             device = self.unknowns.light_fg.axis.device
             made = self._recorded(torch.full((), scale, device=device))
-            parts = Parts.of(made, self._term_names)
+            parts = Parts.of(made, self.term_names)
         self._terms = parts.terms
         curves = parts.curve_fg, parts.curve_shadow
         replayed = self.view.compose(parts.radiance, *curves)
@@ -273,6 +266,20 @@ class LightOptimization(Optimization):
         if not torch.equal(state["expected"], torch.from_numpy(self.expected.texels)):
             self.expected = expected
             self.view = self._trace()
+
+
+class _TorchHalf(torch.nn.Module):
+    """`LightOptimization.parts` as a module of its unknowns, for recording."""
+
+    def __init__(self, loop: LightOptimization) -> None:
+        super().__init__()
+        self.loop, self.unknowns = loop, loop.unknowns
+
+    def forward(self, scale: Tensor) -> tuple[Tensor, ...]:
+        """Return the parts of a step; ``scale`` is ``s_fuse`` [1]."""
+        parts = self.loop.parts(scale)
+        self.loop.term_names = tuple(parts.terms)
+        return parts.tensors()
 
 
 def _groups(unknowns: Unknowns, settings: OptimizeSettings) -> list[dict[str, Any]]:

@@ -122,7 +122,7 @@ def recover(run: Run, start: SceneLight) -> tuple[SceneLight, dict[str, Any], tu
         with run.timings.stage("trace"):
             guide = make_guide(run, guided, frame)
             graphs = guided.prior.graphs
-            faster = graphs.recorded_function if graphs else None
+            faster = graphs.recorded_module if graphs else None
             loop = LightOptimization(
                 frame, guide, settings, unknowns, default_cache(), record=faster
             )
