@@ -280,7 +280,7 @@ def test_stopped_overwrite_resumes(folder: Path, finished: Path, tmp_path: Path)
         with pytest.raises(Killed):
             stop_hard([*argv(folder, out), "--overwrite"])
     assert results(out) == before
-    assert main([*argv(folder, out), "--resume"]) == ExitCode.DONE
+    assert main([*argv(folder, out), "--resume", "--device", "cpu"]) == ExitCode.DONE
     assert results(out) == results(finished)
 
 

@@ -59,9 +59,10 @@ SHOWN_SEEDS = (0, 1, 2)
 """Of the pictures of --show-prior."""
 NOT_IDENTITY = frozenset(
     {"out", "overwrite", "resume", "preview_every", "checkpoint_every", "threads", "mark"}
-    | {"allow_download", "show_prior", "samples", "rays", "indirect_limit", "width"}
+    | {"allow_download", "show_prior", "samples", "rays", "indirect_limit", "width", "device"}
 )
-"""Settings that an interrupted run may change: they do not reach the optimisation."""
+"""Settings that an interrupted run may change: they do not reach the optimisation, or, as the
+device that was chosen, count by what came of them."""
 
 Say = Callable[[str], None]
 
