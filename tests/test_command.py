@@ -235,6 +235,7 @@ def test_command_reads_values(argv: list[str], name: str, value: object) -> None
             "--no-personalize",
             "--show-prior",
         ),
+        ("--guidance stable-diffusion --exposure 1".split(), "--exposure", "is recovered"),
         (["--loss", "vsd"], "--loss", "lds-lora-both"),
         (["--loss", "lds-negative"], "--loss", "--negative-prompt"),
         (["--time-min", "0.7"], "--time-min", "at most --time-max (found 0.7 and 0.6)"),

@@ -405,6 +405,8 @@ def _values_that_clash(config: InsertConfig) -> Iterator[InputError]:
         yield usage("--no-personalize", "cannot be used with --show-prior, which shows its effect")
     yield from needs("resume", guided, "--guidance: nothing else has checkpoints")
     lit = any(map(given, ("reuse", "light", "sun", "sky", "demo")))
+    level = "--light, --sun or --sky: with --guidance alone the light's level is recovered"
+    yield from needs("exposure", lit or not guided, level)
     yield from needs("refine", lit, "a known light: --reuse, --light, --sun or --sky")
     yield from needs("refine", guided, "--guidance, which judges the change")
     yield from needs("refine_parts", config.refine == "material", "--refine material")
