@@ -30,7 +30,7 @@ from warpir.optimize import BAD_STEPS_MAX, Guide
 from warpir.optimize_settings import OptimizeSettings
 from warpir.render import Renderer
 from warpir.scene import Scene
-from warpir.sg_light import LightBounds, SGLight, narrowest
+from warpir.sg_light import WIDEST, LightBounds, SGLight, narrowest
 from warpir.transport_rows import TransportSettings
 from warpir.view import Frame, View, expected_light
 
@@ -338,6 +338,26 @@ def test_steps_do_not_see_the_scale_of_the_gradient(device: str) -> None:
         torch.testing.assert_close(ends[1][name], value, rtol=1e-4, atol=1e-5, msg=name)
 
 
+def test_steps_keep_the_bounds(device: str) -> None:
+    """Rates far too high: after every step axes are unit and the lights within their bounds."""
+    settings = replace(
+        SETTINGS, rate_axis=3.0, rate_width=3.0, rate_intensity=30.0, intensity_limit=100.0
+    )
+    loop = a_loop(device, settings=settings)
+
+    def check(loop: LightOptimization) -> None:
+        for light in (loop.unknowns.light_fg, loop.unknowns.light_shadow):
+            reach = light.log_intensity.detach() - np.log(light.level)
+            assert float(reach.abs().max()) <= np.log(100.0) * (1.0 + 1e-5)
+            sigma = light.log_sigma.detach().exp()
+            assert light.bounds.sigma_min * 0.9999 < float(sigma.min())
+            assert float(sigma.max()) < WIDEST * 1.0001
+            assert float((light.axis.detach().norm(dim=1) - 1.0).abs().max()) < 1e-5
+
+    loop.run(check)
+    assert loop.state.skipped == 0
+
+
 @pytest.mark.parametrize("integrator", ["transport", "mis"])
 def test_resumed_run_ends_as_if_it_had_not_stopped(
     device: str, integrator: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
@@ -396,13 +416,13 @@ def test_run_takes_flat_memory(device: str, integrator: str) -> None:
         gc.collect()
         return int(STATM.read_text().split()[1]) * resource.getpagesize()
 
-    settings = replace(SETTINGS, steps=130, integrator=integrator)
+    settings = replace(SETTINGS, steps=120, integrator=integrator)
     loop = a_loop(device, settings=settings)
-    for _ in range(30):
+    for _ in range(20):
         loop.step()
     before = resident()
     loop.run()
-    assert loop.state.step == 130 and resident() - before < MEMORY_GROWTH
+    assert loop.state.step == 120 and resident() - before < MEMORY_GROWTH
 
 
 # ------------------------------------------------------------------------- what goes wrong
@@ -466,6 +486,22 @@ def test_best_state_is_kept(device: str) -> None:
     assert changed(loop, kept[8]) == set() and changed(loop, kept[12])
     scores = {k + 1: e["score"] for k, e in enumerate(loop.state.history) if "score" in e}
     assert scores == {2: 0.1, 4: 0.5, 6: 0.9, 8: 0.4, 10: 0.7, 12: 0.8}
+
+
+def test_best_state_survives_a_stop(device: str, tmp_path: Path) -> None:
+    """What was best before a stop is delivered if nothing better follows."""
+    settings, checkpoints = replace(SETTINGS, score_every=4), Checkpoints(tmp_path, {})
+    first = a_loop(device, Scored([0.9, 0.2]), settings, bent())
+    for _ in range(10):
+        first.step()
+        if first.state.step == 8:
+            best = values(first)
+    checkpoints.save("optimize", 10, first.state_dict())
+    resumed = a_loop(device, Scored([0.5]), settings)
+    resumed.load_state_dict(checkpoints.load(pytest.fail).state)
+    resumed.run()
+    assert (resumed.state.best_step, resumed.state.best_score) == (8, 0.2)
+    assert changed(resumed, best) == set() and resumed.state.step == 12
 
 
 def test_best_state_is_the_last_without_scores(device: str) -> None:
@@ -602,12 +638,11 @@ def test_transport_is_traced_again_when_the_light_has_moved(
         views.append(loop.view)
 
     for limit, expected in ((1e3, []), (2.0, [8])):
-        loop = a_loop(
-            device, settings=replace(SETTINGS, retrace_at=limit), unknowns=deepcopy(start)
-        )
+        settings = replace(SETTINGS, steps=14, retrace_at=limit)
+        loop = a_loop(device, settings=settings, unknowns=deepcopy(start))
         views = [loop.view]
         loop.run(jump)
-        assert [k for k in range(12) if views[k + 1] is not views[k]] == expected
+        assert [k for k in range(14) if views[k + 1] is not views[k]] == expected
         assert loop.retraced == len(expected)
 
 
