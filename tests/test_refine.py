@@ -669,6 +669,28 @@ def test_refinement_replays(refined: Path, tmp_path: Path) -> None:
         assert digest(out)[name] == digest(refined)[name]
 
 
+def test_refinement_judges_with_the_earlier_runs_operator(
+    folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A run without guidance is linear, and so is what is changed under its light."""
+    import warpir.refine
+
+    seen = []
+
+    def watched(frame: Frame, *rest: Any) -> LitFrame:
+        seen.append(frame.is_reinhard)
+        return LitFrame(frame, *rest)
+
+    monkeypatch.setattr(warpir.refine, "LitFrame", watched)
+    linear, out = tmp_path / "linear", tmp_path / "out"
+    flags = {"asset": str(folder / "box.obj"), "device": "cpu"}
+    assert main(arguments(folder, linear, **flags)) == ExitCode.DONE
+    changes = {"reuse": str(linear), "steps": "0", "loss": "csd", "no_personalize": ""}
+    assert main(argv(folder, out, "tone", **changes)) == ExitCode.DONE
+    assert seen == [False]
+    assert json.loads((out / "curves.json").read_text())["tone"] == "linear"
+
+
 def test_stopped_refinement_resumes(folder: Path, refined: Path, tmp_path: Path) -> None:
     """A run that stopped in the loop goes on from its checkpoint to the same bytes."""
     out = tmp_path / "out"
