@@ -10,16 +10,23 @@ import sys
 import time
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
+from types import SimpleNamespace
+from typing import Any, cast
 
+import numpy as np
 import pytest
 import torch
 from safetensors.torch import load_file, save_file
 
 from tests.test_insert import ALWAYS, arguments, digest, write_inputs
 from tests.tiny_stable_diffusion import make_tiny_stable_diffusion
+from warpir.config import InsertConfig
+from warpir.curves import Curves
 from warpir.errors import ExitCode
 from warpir.insert import main
+from warpir.light import Light, sun_lobe
+from warpir.lighting import SceneLight
+from warpir.sg_light import narrowest
 
 GUIDED = (
     *("lobes.json", "lobes_shadow.json", "lora_diffusers.safetensors"),
@@ -333,6 +340,23 @@ def test_start_from_a_given_light_preview_and_prior(folder: Path, tmp_path: Path
     assert (out / "prior.png").exists()
     assert record(out)["measured"]["personalization"]["reused"] is False
     assert not any("even one" in line for line in record(out)["assumed"])
+
+
+def test_start_keeps_the_flux_of_a_sun_that_is_too_narrow(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Lobes that the loop's maps cannot hold are widened, and dimmed as much."""
+    from warpir import recover
+
+    monkeypatch.setattr(recover, "start_level", lambda *_: 0.5)
+    config = InsertConfig(sun=(30.0, 40.0), lobes=4, light_height=16)
+    sun = Light(sun_lobe(30.0, 40.0, (5.0, 4.0, 3.0)))
+    run = cast(recover.Run, SimpleNamespace(config=config, inputs=None))
+    curves = Curves.identity("reinhard")
+    unknowns = recover.start_of(run, SceneLight(sun, sun, curves, 0.0, ()))
+    lobes = unknowns.light_fg.lobes()
+    assert (1.0 / np.sqrt(lobes.sharpness)).min() > 0.999 * narrowest(16)
+    assert sun.lobes is not None
+    expected = sun.lobes.flux().sum(axis=0)
+    np.testing.assert_allclose(lobes.flux().sum(axis=0), expected, rtol=0.05)
 
 
 def test_recovered_light_is_reused(folder: Path, finished: Path, tmp_path: Path) -> None:
