@@ -2,12 +2,15 @@
 
 import json
 from collections.abc import Iterator
+from pathlib import Path
 from typing import Any
 
 import pytest
 import torch
 
-from benchmarks.full_size_cost import EXTRA_STAGES, Stopwatch, full_size_parts, main
+from benchmarks.full_size_cost import EXTRA_STAGES, TARGETS, Stopwatch, full_size_parts, main
+
+ROOT = Path(__file__).resolve().parent.parent
 
 
 @pytest.fixture(scope="module", autouse=True)
@@ -76,6 +79,24 @@ def test_figures_say_what_they_depend_on(figures: dict[str, Any]) -> None:
     for name, target in figures["targets"].items():
         assert target["found"] == figures[name]
         assert target["met"] is (target["found"] <= target["limit"])
+
+
+@pytest.mark.slow
+def test_published_figures_are_this_programs(figures: dict[str, Any]) -> None:
+    """Same fields as a run today, the authors' setting, the real model's size, all targets met."""
+    published = json.loads((ROOT / "docs/full_size_cost.json").read_text())
+    assert set(published) == set(figures)
+    assert set(published["seconds"]) == set(figures["seconds"])
+    assert set(published["settings"]) == set(figures["settings"])
+    settings = published["settings"]
+    assert (settings["class_images"], settings["lora_steps"], settings["steps"]) == (200, 1000, 600)
+    assert settings["picture"] == [384, 256] and settings["graphs"] is True
+    assert published["parameters"] == {"unet": 865_910_724, "vae": 83_653_863}
+    assert published["command"].endswith(
+        "benchmarks.full_size_cost --json docs/full_size_cost.json"
+    )
+    assert {name: t["limit"] for name, t in published["targets"].items()} == TARGETS
+    assert all(t["met"] for t in published["targets"].values())
 
 
 def test_stopwatch_times_calls_and_backward_passes() -> None:
