@@ -175,8 +175,8 @@ def terms_of(settings: GuidanceSettings, condition: Condition, adapter: str | No
     negative_prompt = condition.negative_prompt or settings.negative_prompt
     terms = [
         Term(row.k_p, condition.prompt, adapter),
-        Term(row.k_c, condition.base_prompt or condition.prompt, None),
-        Term(row.k_0, "", other),
+        Term(row.k_c, condition.base_prompt or settings.base_prompt or condition.prompt, None),
+        Term(row.k_0, settings.null_prompt, other),
         Term(row.k_n, negative_prompt, other),
     ]
     return [term for term in terms if term.scale]

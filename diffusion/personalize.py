@@ -56,7 +56,7 @@ CROP_COUNT = 64
 ENCODE_BATCH = 4
 EVALUATION_COUNT = 16
 """Fixed draws of time, noise and crop by which a LoRA is judged."""
-BETAS, WEIGHT_DECAY, GRADIENT_NORM_MAX = (0.9, 0.999), 1e-2, 1.0
+BETAS = (0.9, 0.999)
 """Of AdamW; as in diffusers' example of DreamBooth with a LoRA."""
 
 log = logging.getLogger(__name__)
@@ -233,7 +233,7 @@ class LoraTraining:
             list(self.parameters.values()),
             lr=settings.lora_rate,
             betas=BETAS,
-            weight_decay=WEIGHT_DECAY,
+            weight_decay=settings.lora_decay,
             capturable=is_cuda,
             fused=is_cuda,
         )
@@ -307,7 +307,7 @@ class LoraTraining:
         loss_photo = error[0]
         loss_class = error[1:].mean() if self.class_count else torch.zeros_like(loss_photo)
         torch.autograd.backward(loss_photo + self.settings.lora_class_weight * loss_class)
-        torch.nn.utils.clip_grad_norm_(self.parameters.values(), GRADIENT_NORM_MAX)
+        torch.nn.utils.clip_grad_norm_(self.parameters.values(), self.settings.lora_clip)
         self.optimizer.step()
         self.loss_pair.copy_(torch.stack([loss_photo, loss_class]).detach())
 

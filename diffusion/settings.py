@@ -62,6 +62,10 @@ class PersonalizeSettings:
     """Class images beside the photo's crop in each training step"""
     lora_class_weight: float = 1.0
     """Weight of the class images' loss (prior preservation)"""
+    lora_decay: float = 1e-2
+    """Weight decay of the LoRA (AdamW)"""
+    lora_clip: float = 1.0
+    """Greatest norm of the LoRA's gradient"""
     lora_crop: float = 0.7
     """Smallest side of the photo's crops while training, as a share of its shorter side"""
 
@@ -76,6 +80,11 @@ class GuidanceSettings:
     """g of the SDS losses: g e(prompt) + (1 - g) e(null) - noise"""
     negative_prompt: str = ""
     """What lds-negative moves away from"""
+    base_prompt: str = ""
+    """What csd and sds-base ask the unadapted model for (default: what the adapted one is asked
+    for)"""
+    null_prompt: str = ""
+    """What the unconditional term is asked for"""
     time_min: float = 0.02
     """Least noise level, as a share of the schedule"""
     time_max: float = 0.6

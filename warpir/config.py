@@ -222,6 +222,8 @@ RANGES: dict[str, tuple[float, float | None]] = {
     "lora_class_batch": (1, 64),
     "lora_class_weight": (0, 1000),
     "lora_crop": (0.05, 1),
+    "lora_decay": (0, 1),
+    "lora_clip": (1e-9, None),
     # Guidance
     "guidance_scale": (0, 10_000),
     "time_min": (0, 1),
@@ -255,6 +257,11 @@ RANGES: dict[str, tuple[float, float | None]] = {
     "spread": (0, None),
     "chroma": (0, None),
     "bend": (0, None),
+    "tone_bins": (1, 64),
+    "fusion_start": (0, 1),
+    "fusion_end": (0, 1),
+    "rate_end": (0, 1),
+    "lobe_width": (0.05, 10),
     "chroma_limit": (0, 20),
     "intensity_limit": (1, 1e12),
     "score_every": (0, 10**6),
@@ -289,8 +296,16 @@ CHOICES = {
 }
 LOSSES_OF_BASE = ("csd", "sds-base", "dataset-update")
 """Losses that do without an adapter."""
-PROMPTS = ("prompt", "negative_prompt", "class_noun", "token", "show_prior")
-EMPTY_ALLOWED = ("negative_prompt",)
+PROMPTS = (
+    "prompt",
+    "negative_prompt",
+    "null_prompt",
+    "base_prompt",
+    "class_noun",
+    "token",
+    "show_prior",
+)
+EMPTY_ALLOWED = ("negative_prompt", "null_prompt", "base_prompt")
 
 
 def _values_out_of_range(config: InsertConfig) -> Iterator[InputError]:
@@ -304,6 +319,8 @@ def _values_out_of_range(config: InsertConfig) -> Iterator[InputError]:
     for name, value in values.items():
         yield from _not_plain(name, value)
     yield from check("fov", config.fov is None or 0.0 < config.fov < 180.0, "between 0 and 180")
+    in_order = config.fusion_end >= config.fusion_start
+    yield from check("fusion_end", in_order, "at least --fusion-start")
     yield from check("ground_albedo", config.ground_albedo <= 1.0, "at most 1")
     if config.ground is not None and all(map(math.isfinite, config.ground)):
         yield from check("ground", any(config.ground[:3]), "a normal a,b,c that is not 0")

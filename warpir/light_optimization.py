@@ -40,12 +40,13 @@ class Unknowns(torch.nn.Module):
     Args:
         light_fg: Lights the object.
         light_shadow: Casts its shadow.
+        bins: Bins of each tone curve.
     """
 
-    def __init__(self, light_fg: SGLight, light_shadow: SGLight) -> None:
+    def __init__(self, light_fg: SGLight, light_shadow: SGLight, bins: int = 5) -> None:
         super().__init__()
         self.light_fg, self.light_shadow = light_fg, light_shadow
-        self.curve_fg, self.curve_shadow = ToneCurve(1), ToneCurve(3)
+        self.curve_fg, self.curve_shadow = ToneCurve(1, bins), ToneCurve(3, bins)
 
     @staticmethod
     def start(lobes: Lobes | None, level: float, settings: OptimizeSettings) -> Unknowns:
@@ -63,9 +64,9 @@ class Unknowns(torch.nn.Module):
         def light() -> SGLight:
             if lobes is not None:
                 return SGLight(lobes, level, bounds)
-            return SGLight.uniform(settings.lobes, level, bounds)
+            return SGLight.uniform(settings.lobes, level, bounds, settings.lobe_width)
 
-        return Unknowns(light(), light())
+        return Unknowns(light(), light(), settings.tone_bins)
 
 
 @dataclass(frozen=True)
@@ -141,7 +142,9 @@ class LightOptimization(Optimization):
     def fusion(self, step: int) -> float:
         """Return ``s_fuse`` of a step: how far both lights have become one [1]."""
         if self.settings.fusion == "schedule":
-            return step / max(self.settings.step_count - 1, 1)
+            share = step / max(self.settings.step_count - 1, 1)
+            start, end = self.settings.fusion_start, self.settings.fusion_end
+            return min(max((share - start) / max(end - start, 1e-9), 0.0), 1.0)
         return 0.0
 
     @property

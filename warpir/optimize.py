@@ -166,9 +166,10 @@ class Optimization(ABC):
             self._keep_if_best(entry)
 
     def _rate_factor(self, step: int) -> float:
-        """Return 1 in the first half, then a cosine that falls to 0.1."""
+        """Return 1 in the first half, then a cosine that falls to ``rate_end``."""
         share = max(2.0 * step / max(self.settings.step_count, 1) - 1.0, 0.0)
-        return float(0.1 + 0.9 * 0.5 * (1.0 + np.cos(np.pi * share)))
+        end = self.settings.rate_end
+        return float(end + (1.0 - end) * 0.5 * (1.0 + np.cos(np.pi * share)))
 
     def _gradients_are_finite(self) -> bool:
         found = [p.grad for p in self.unknowns.parameters() if p.grad is not None]

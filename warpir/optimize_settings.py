@@ -18,6 +18,8 @@ class OptimizeSettings:
     """Width of the picture inside the loop [px]; its height follows the photo's shape"""
     lobes: int = 64
     """Spherical-Gaussian lobes of each light, the object's and the shadow's"""
+    lobe_width: float = 0.6
+    """Width of the lobes at the start of an even light, sigma in spacings of the lobes"""
     light_height: int = 64
     """Rows of the maps in which the two lights are fused"""
     object_light_height: int = 32
@@ -25,6 +27,10 @@ class OptimizeSettings:
     fusion: str = "schedule"
     """How the two lights become one: schedule (blended from none to all over the run), single (one
     light from the start) or none (two lights to the end)"""
+    fusion_start: float = 0.0
+    """Where in the run the lights begin to become one, as a share of the steps"""
+    fusion_end: float = 1.0
+    """Where in the run they are one, as a share of the steps"""
     tone_curve: bool = True
     """Recover tone curves for the object and its shadow"""
     integrator: str = "transport"
@@ -35,6 +41,8 @@ class OptimizeSettings:
     retrace_at: float = 3.0
     """Light transport is traced again when the lights have changed so much that its noise has grown
     by this factor"""
+    rate_end: float = 0.1
+    """Factor to which all learning rates fall over the second half of the run, by a cosine"""
     rate_intensity: float = 0.12
     """Learning rate of the lobes' log intensities"""
     rate_axis: float = 0.04
@@ -59,6 +67,8 @@ class OptimizeSettings:
     """Weight of the Cauchy term that keeps the shadow's light in few directions (eq. 11)"""
     chroma: float = 0.1
     """Weight of the prior that keeps the light's colour near white"""
+    tone_bins: int = 5
+    """Bins of each tone curve"""
     bend: float = 0.1
     """Weight of the prior that keeps tone curves near the identity"""
     chroma_limit: float = 1.5

@@ -57,6 +57,8 @@ SAY_EVERY = 25
 """Steps between two looks at the light, for people."""
 SHOWN_SEEDS = (0, 1, 2)
 """Of the pictures of --show-prior."""
+LOSSES_WITHOUT_LORA = ("csd", "sds-base")
+"""They ask the unadapted model alone."""
 NOT_IDENTITY = frozenset(
     {"out", "overwrite", "resume", "preview_every", "checkpoint_every", "threads", "mark"}
     | {"allow_download", "show_prior", "samples", "rays", "indirect_limit", "width", "device"}
@@ -222,8 +224,7 @@ def prepare_guidance(run: Run, checkpoints: Checkpoints) -> tuple[Guided, Checkp
         prompts = make_prompts(config.prompt, config)
         shown = [*(config.show_prior or ())]
         prior.embed([prompts.photo, prompts.class_, prompts.guidance, "", *shown])
-        if config.negative_prompt:
-            prior.embed([config.negative_prompt])
+        prior.embed([config.negative_prompt, config.null_prompt, config.base_prompt])
     run.say(f"model: {prior.name} {config.model}, sha256 {prior.digest[:16]}...")
     resumed = checkpoint_of(run, checkpoints, prior)
     run.say(f'guidance asks for "{prompts.guidance}"')
@@ -231,9 +232,13 @@ def prepare_guidance(run: Run, checkpoints: Checkpoints) -> tuple[Guided, Checkp
         "model": {"name": prior.name, "sha256": prior.weight_hashes},
         "prompts": asdict(prompts),
     }
-    if not config.personalize:
+    notices: tuple[str, ...] = ()
+    does_without = config.loss in LOSSES_WITHOUT_LORA and config.lora is None and not shown
+    if config.personalize and does_without:
+        notices = (f"--loss {config.loss} does without a LoRA: none was trained",)
+    if not config.personalize or does_without:
         prior.free_text_encoder()
-        return Guided(prior, prompts, None, None, record, ()), resumed
+        return Guided(prior, prompts, None, None, record, notices), resumed
     photo = torch.from_numpy(run.inputs.photo.srgb).permute(2, 0, 1)[None].contiguous()
     cache = cache_folder()
     with run.timings.stage("personalize"):

@@ -85,9 +85,18 @@ class SGLight(torch.nn.Module):
         self.project()
 
     @staticmethod
-    def uniform(count: int, level: float, bounds: LightBounds) -> SGLight:
-        """Return grey lobes spread evenly whose map has the mean ``level``."""
-        sigma = max(WIDTH_FACTOR * np.sqrt(4.0 * np.pi / count), bounds.sigma_min)
+    def uniform(
+        count: int, level: float, bounds: LightBounds, width: float = WIDTH_FACTOR
+    ) -> SGLight:
+        """Return grey lobes spread evenly whose map has the mean ``level``.
+
+        Args:
+            count: Number of lobes.
+            level: Relative [W/(m^2 sr)].
+            bounds: What the lobes may not leave.
+            width: Sigma in spacings of the lobes [1].
+        """
+        sigma = max(width * np.sqrt(4.0 * np.pi / count), bounds.sigma_min)
         sharpness = np.full(count, 1.0 / sigma**2, np.float32)
         lobes = Lobes(np.ones((count, 3), np.float32), fibonacci(count), sharpness)
         lobes.amplitude[:] = 4.0 * np.pi * level / lobes.flux().sum(axis=0)
