@@ -16,7 +16,7 @@ from warpir.camera import Camera
 from warpir.curves import ToneKnots
 from warpir.files import Photo
 from warpir.light import Light, axis_from_angles, plain_sky
-from warpir.picture import Picture, Quality, _resize, as_file_map, balls, make_picture
+from warpir.picture import Picture, Quality, as_file_map, balls, make_picture, resize
 from warpir.render import Renderer, light_args
 from warpir.scene import Scene
 from warpir.tone import Knots, ToneCurve
@@ -237,11 +237,11 @@ def test_resize_keeps_coverage_and_constants() -> None:
     plane = rng.uniform(0.0, 1.0, (20, 30)).astype(np.float32)
     plane[:, :10] = 0.0
     for height, width in ((10, 15), (40, 60), (7, 11), (33, 47)):
-        resized = _resize(plane, height, width)
+        resized = resize(plane, height, width)
         assert resized.shape == (height, width)
         assert resized.min() >= 0.0 and resized.max() <= 1.0
         assert resized.mean() == pytest.approx(float(plane.mean()), rel=0.05)
-        flat = _resize(np.full((20, 30, 3), 0.7, np.float32), height, width)
+        flat = resize(np.full((20, 30, 3), 0.7, np.float32), height, width)
         np.testing.assert_allclose(flat, 0.7, rtol=1e-5)
 
 
