@@ -305,6 +305,9 @@ def test_every_loss_runs(folder: Path, tmp_path: Path, loss: str) -> None:
     assert main(argv(folder, out, **changes)) == ExitCode.DONE
     by_step = json.loads((out / "optimization.json").read_text())["by_step"]
     assert len(by_step["gradient"]) == 3 and all(v > 0.0 for v in by_step["gradient"])
+    asks_base_alone = loss in ("csd", "sds-base")
+    assert (out / "lora_kohya.safetensors").exists() != asks_base_alone
+    assert any("does without a LoRA" in x for x in record(out)["notices"]) == asks_base_alone
 
 
 def test_ablations(folder: Path, tmp_path: Path) -> None:

@@ -132,6 +132,7 @@ FLAGS = {
         "fusion_end": "SHARE",
         "tone_curve": "",
         "integrator": "NAME",
+        "transport_memory": "MIB",
         "mis_samples": "N",
         "retrace_at": "FACTOR",
         "rate_end": "FACTOR",

@@ -242,6 +242,7 @@ RANGES: dict[str, tuple[float, float | None]] = {
     "lobes": (1, 4096),
     "light_height": (4, 512),
     "object_light_height": (4, 512),
+    "transport_memory": (1, 2**24),
     "mis_samples": (1, 2**20),
     "retrace_at": (1, None),
     "rate_intensity": (0, 10),

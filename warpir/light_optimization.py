@@ -121,7 +121,9 @@ class LightOptimization(Optimization):
         self.frame, self.cache, self.rows = frame, cache, transport
         if transport is None and settings.integrator == "transport":
             self.rows = TransportSettings(
-                height_fg=settings.object_light_height, height_shadow=settings.light_height
+                height_fg=settings.object_light_height,
+                height_shadow=settings.light_height,
+                memory_mib=settings.transport_memory,
             )
         self.retraced = 0
         self._record = record

@@ -36,6 +36,8 @@ class OptimizeSettings:
     integrator: str = "transport"
     """What renders inside the loop: transport (light transport is traced once and then reused) or
     mis (every step is traced)"""
+    transport_memory: int = 4096
+    """Most memory that the stored light transport may take [MiB]"""
     mis_samples: int = 16
     """Samples per pixel of --integrator mis"""
     retrace_at: float = 3.0

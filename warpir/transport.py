@@ -139,10 +139,10 @@ class TransportIntegrator:
         needed = 3 * wide * len(self.object_pixels) * texels + SparseRows.BYTES * entries
         if needed > settings.memory_mib << 20:
             raise InputError(
-                "memory_mib",
+                "--transport-memory",
                 f"light transport of {len(self.object_pixels)} object pixels and {texels} texels "
                 f"needs {needed / 2**20:.0f} MiB or more, the limit is {settings.memory_mib} MiB",
-                "lower the map's height or the resolution, or raise the limit",
+                "raise it (memory_mib), or lower --object-light-height or --guidance-width",
                 ExitCode.RESOURCES,
             )
 
