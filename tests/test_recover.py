@@ -171,7 +171,7 @@ STOPS = {
 
 @pytest.mark.parametrize("where", STOPS)
 def test_stopped_run_resumes_as_if_it_had_not_been(
-    folder: Path, finished: Path, tmp_path: Path, where: str
+    folder: Path, finished: Path, tmp_path: Path, where: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
     import warpir.recover  # noqa: F401  all modules that are to be stopped in
 
@@ -181,6 +181,8 @@ def test_stopped_run_resumes_as_if_it_had_not_been(
         with pytest.raises(Killed):
             stop_hard(argv(folder, out))
     assert not (out / "run.json").exists()
+    is_kept = any((out / "checkpoints").glob("0*"))
+    assert ("--resume goes on from there" in capsys.readouterr().out) == is_kept
     assert main([*argv(folder, out), "--resume"]) == ExitCode.DONE
     assert results(out) == results(finished)
     assert not (out / "checkpoints").exists()

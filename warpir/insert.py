@@ -60,7 +60,23 @@ def insert(config: InsertConfig) -> Insertion:
         InputError: An input or the output folder cannot be used; nothing was written then.
     """
     config.require_inputs()
-    return _insert_one(config) if config.sequence is None else _insert_sequence(config)
+    if config.sequence is not None:
+        return _insert_sequence(config)
+    try:
+        return _insert_one(config)
+    except BaseException as error:
+        _say_what_is_kept(config, error)
+        raise
+
+
+def _say_what_is_kept(config: InsertConfig, error: BaseException) -> None:
+    """Tell of the checkpoints that a run left when it was stopped or broke down on its way."""
+    if isinstance(error, InputError) and error.code not in (ExitCode.RESOURCES, ExitCode.NUMERIC):
+        return  # refused before it began
+    assert config.out is not None
+    kept = sorted((Path(config.out) / "checkpoints").glob("[0-9]*"))
+    if kept:
+        say(f"kept: {kept[-1]}; the same command with --resume goes on from there")
 
 
 def _insert_sequence(config: InsertConfig) -> Insertion:
