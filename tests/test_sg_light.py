@@ -8,13 +8,12 @@ from numpy.typing import NDArray
 from tests import oracles as o
 from tests.statistics import central_differences, compare_gradients
 from warpir.bridge import rasterize
-from warpir.light import Lobes
+from warpir.light import Lobes, fibonacci
 from warpir.sg_light import (
     TEXELS_PER_SIGMA,
     WIDEST,
     LightBounds,
     SGLight,
-    fibonacci,
     narrowest,
 )
 

@@ -124,6 +124,15 @@ def map_directions(height: int, width: int) -> Float64Array:
     )
 
 
+def fibonacci(count: int) -> Float64Array:
+    """Return evenly spread unit directions, world frame, shape [count, 3] (a Fibonacci spiral)."""
+    k = np.arange(count) + 0.5
+    y = 1.0 - 2.0 * k / count
+    lon = np.pi * (1.0 + np.sqrt(5.0)) * k
+    r = np.sqrt(1.0 - y * y)
+    return np.stack([r * np.sin(lon), y, r * np.cos(lon)], axis=1)
+
+
 def rotate_map(texels: FloatArray, degrees: float) -> FloatArray:
     """Turn a map about +Y, counter-clockwise seen from above; each row keeps its sum.
 

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from warpir.color import luminance
 from warpir.light import (
     Lobes,
+    fibonacci,
     map_directions,
     rasterize_lobes,
     resize_map,
@@ -59,7 +60,7 @@ def fit_lobes(texels: NDArray[np.float32], count: int) -> LobeFit:
     # Broad lobes spaced evenly; this width keeps their sum within 2 % of a constant.
     broad = count - lamps
     if broad > 0:
-        axes = np.concatenate([axes, _fibonacci(broad)])
+        axes = np.concatenate([axes, fibonacci(broad)])
         sharpness = 1.0 / (0.6 * np.sqrt(4.0 * np.pi / broad)) ** 2
         sharpnesses = np.concatenate([sharpnesses, np.full(broad, sharpness)])
     amplitudes = _solve(texels, axes, sharpnesses, covered)
@@ -144,7 +145,7 @@ def _solve(
 
 def _errors(texels: NDArray[np.float32], lobes: Lobes) -> tuple[float, float]:
     """Return relative RMSE of irradiance over normals, and relative flux error."""
-    normals = _fibonacci(512)
+    normals = fibonacci(512)
     coarse = resize_map(texels, FIT_HEIGHT)
     omega = texel_solid_angles(FIT_HEIGHT, 2 * FIT_HEIGHT)
     grid = map_directions(FIT_HEIGHT, 2 * FIT_HEIGHT).reshape(-1, 3)
@@ -164,12 +165,3 @@ def texel_flux(texels: NDArray[np.float32]) -> Float64Array:
     """Return radiance times solid angle of each texel, shape [He, We, 3]."""
     omega = texel_solid_angles(texels.shape[0], texels.shape[1])
     return texels.astype(np.float64) * omega[:, None, None]
-
-
-def _fibonacci(count: int) -> Float64Array:
-    """Return evenly spread unit directions, shape [count, 3]."""
-    k = np.arange(count) + 0.5
-    y = 1.0 - 2.0 * k / count
-    lon = np.pi * (1.0 + np.sqrt(5.0)) * k
-    r = np.sqrt(1.0 - y * y)
-    return np.stack([r * np.sin(lon), y, r * np.cos(lon)], axis=1)

@@ -17,7 +17,7 @@ import torch
 from torch import Tensor
 
 from warpir.color import luminance
-from warpir.light import Lobes, map_directions
+from warpir.light import Lobes, fibonacci, map_directions
 
 WIDTH_FACTOR = 0.6
 """Start width of a lobe in spacings of the lobes: the sum of 64 ripples by 1.8 % (rms)."""
@@ -98,7 +98,9 @@ class SGLight(torch.nn.Module):
         """
         sigma = max(width * np.sqrt(4.0 * np.pi / count), bounds.sigma_min)
         sharpness = np.full(count, 1.0 / sigma**2, np.float32)
-        lobes = Lobes(np.ones((count, 3), np.float32), fibonacci(count), sharpness)
+        lobes = Lobes(
+            np.ones((count, 3), np.float32), fibonacci(count).astype(np.float32), sharpness
+        )
         lobes.amplitude[:] = 4.0 * np.pi * level / lobes.flux().sum(axis=0)
         return SGLight(lobes, level, bounds)
 
@@ -147,15 +149,6 @@ class SGLight(torch.nn.Module):
 def narrowest(height: int) -> float:
     """Return the width of the narrowest lobe that a map of that height holds, sigma [rad]."""
     return TEXELS_PER_SIGMA * np.pi / height
-
-
-def fibonacci(count: int) -> np.ndarray[tuple[int, ...], np.dtype[np.float32]]:
-    """Return evenly spread unit directions, world frame, shape [count, 3]."""
-    k = np.arange(count) + 0.5
-    y = 1.0 - 2.0 * k / count
-    lon = np.pi * (1.0 + np.sqrt(5.0)) * k
-    r = np.sqrt(1.0 - y * y)
-    return np.stack([r * np.sin(lon), y, r * np.cos(lon)], axis=1).astype(np.float32)
 
 
 @lru_cache(maxsize=8)

@@ -2,7 +2,7 @@
 
 Two integrators can stand behind it. `transport` traces once for a light that is expected and makes
 each step a product; when the light has moved away from what was expected, it is traced again. `mis`
-traces in every step and differentiates materials as well.
+traces in every step.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from warpir.bridge import ComposeConstants, compose
-from warpir.integrator import Integrator, LightTensors, MaterialTensors, Radiance
+from warpir.integrator import Integrator, LightTensors, Radiance
 from warpir.light import Light
 from warpir.mis import MisIntegrator
 from warpir.render import Renderer, light_args
@@ -56,7 +56,7 @@ class Frame:
 
 
 class View:
-    """Renders composites of a frame; gradients to the light (and with `mis` to materials).
+    """Renders composites of a frame; gradients to the light.
 
     Args:
         frame: Scene, photo, tone operator.
@@ -108,7 +108,6 @@ class View:
         curve_fg: Knots,
         curve_shadow: Knots,
         seed: int,
-        materials: MaterialTensors | None = None,
     ) -> Tensor:
         """Return the composite, display-encoded, shape [1, 3, H, W]; differentiable.
 
@@ -118,21 +117,14 @@ class View:
             curve_fg: One tone curve.
             curve_shadow: Three tone curves.
             seed: Of this step's samples; `transport` has none.
-            materials: Factors in place of the asset's (`mis` only).
         """
-        radiance = self.radiance(texels_fg, texels_shadow, seed, materials)
+        radiance = self.radiance(texels_fg, texels_shadow, seed)
         return self.compose(radiance, curve_fg, curve_shadow)
 
-    def radiance(
-        self,
-        texels_fg: Tensor,
-        texels_shadow: Tensor,
-        seed: int,
-        materials: MaterialTensors | None = None,
-    ) -> Radiance:
+    def radiance(self, texels_fg: Tensor, texels_shadow: Tensor, seed: int) -> Radiance:
         """Return what the integrator does; arguments are those of `image`."""
         light_fg, light_shadow = LightTensors(texels=texels_fg), LightTensors(texels=texels_shadow)
-        return self.integrator.radiance(light_fg, light_shadow, seed, materials)
+        return self.integrator.radiance(light_fg, light_shadow, seed)
 
     def compose(self, radiance: Radiance, curve_fg: Knots, curve_shadow: Knots) -> Tensor:
         """Return the composite of rendered radiance, display-encoded, shape [1, 3, H, W]."""
