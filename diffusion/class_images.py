@@ -73,7 +73,8 @@ def make_class_images(
 ) -> ClassImages:
     """Return the class images, from disk where they are there and else from the unadapted model.
 
-    Each depends on its own prompt and seed alone, not on the batch or on how many there are.
+    Each depends on its own prompt and seed; the batch it is made in changes its last bits, so
+    batches are always the same ones.
 
     Args:
         prior: The model.
