@@ -23,7 +23,6 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from benchmarks.measure import context
-from benchmarks.panorama_crop import crop_camera, crop_radiance, expose
 from warpir.asset import Asset, load_asset
 from warpir.bridge import ComposeConstants, compose
 from warpir.color import gamma_to_linear, luminance
@@ -39,6 +38,7 @@ from warpir.light import (
 from warpir.light_optimization import LightOptimization, Unknowns
 from warpir.mis import MisIntegrator
 from warpir.optimize_settings import OptimizeSettings
+from warpir.panorama_crop import crop_camera, crop_radiance, expose
 from warpir.placement import place_asset
 from warpir.render import Renderer, light_args
 from warpir.scene import Placed, Proxy, Scene

@@ -7,10 +7,11 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from benchmarks.panorama_crop import crop_camera, crop_radiance, expose, look_up, write_crop
+from benchmarks.panorama_crop import write_crop
 from warpir.camera import read_camera
 from warpir.command import parse
 from warpir.light import angles_from_axis, axis_from_angles, map_directions
+from warpir.panorama_crop import crop_camera, crop_radiance, expose, look_up
 
 
 def one_texel(row: int, column: int) -> np.ndarray:
