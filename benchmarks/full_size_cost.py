@@ -271,7 +271,7 @@ def with_graphs(prior: StableDiffusion, loop: LightOptimization, wanted: bool) -
 def lora_step_ms(prior: StableDiffusion, config: InsertConfig) -> float:
     """Return the time of a training step on random latents [ms]."""
     watch = Stopwatch(prior.device)
-    latents = torch.randn(8, 4, prior.latent_size, prior.latent_size)
+    latents = torch.randn(8, *prior.latent_shape)
     assert config.prompt is not None
     prompts = make_prompts(config.prompt, config)
     embeddings = prior.embed([prompts.photo, prompts.class_])

@@ -29,7 +29,7 @@ from warpir.diffusion.prompts import Prompts, draw_class_prompts
 from warpir.diffusion.settings import PersonalizeSettings
 
 if TYPE_CHECKING:
-    from warpir.diffusion.stable_diffusion import StableDiffusion
+    from warpir.diffusion.network_prior import NetworkPrior
 
 FORMAT = 1
 """Meaning of a stored picture; part of every key."""
@@ -64,7 +64,7 @@ def class_image_count(settings: PersonalizeSettings) -> int:
 
 
 def make_class_images(
-    prior: StableDiffusion,
+    prior: NetworkPrior,
     prompts: Prompts,
     settings: PersonalizeSettings,
     seed: int,
@@ -168,7 +168,7 @@ def from_bytes(pictures: Tensor, device: torch.device) -> Tensor:
 
 
 def encode_pictures(
-    prior: StableDiffusion, pictures: Tensor, batch: int, report: Report | None = None
+    prior: NetworkPrior, pictures: Tensor, batch: int, report: Report | None = None
 ) -> Tensor:
     """Return the pictures' latents, float32 on the CPU, shape [N, C, h, w].
 

@@ -35,7 +35,7 @@ from warpir.diffusion.draws import generator_of
 from warpir.diffusion.prior import ModelError
 
 if TYPE_CHECKING:
-    from warpir.diffusion.stable_diffusion import StableDiffusion
+    from warpir.diffusion.network_prior import NetworkPrior
 
 HEADER_KEY = "lora_adapter_metadata"
 """Where diffusers keeps peft's configuration in a file's header."""
@@ -81,7 +81,7 @@ def _commonest(values: Iterable[float]) -> float:
     return Counter(values).most_common(1)[0][0]
 
 
-def initial_lora(prior: StableDiffusion, layers: tuple[str, ...], rank: int, seed: int) -> Lora:
+def initial_lora(prior: NetworkPrior, layers: tuple[str, ...], rank: int, seed: int) -> Lora:
     """Return a LoRA that changes nothing yet: A is Gaussian of deviation 1/rank, B is zero.
 
     Args:
@@ -297,7 +297,7 @@ def _foreign(path: Path, odd: list[str], count: int) -> ModelError:
 # Putting a LoRA beside a model's weights
 
 
-def load_lora(prior: StableDiffusion, path: str | Path, name: str = "scene") -> Lora:
+def load_lora(prior: NetworkPrior, path: str | Path, name: str = "scene") -> Lora:
     """Read a LoRA file and put it beside the prior's weights under a name.
 
     Raises:
@@ -308,7 +308,7 @@ def load_lora(prior: StableDiffusion, path: str | Path, name: str = "scene") -> 
     return lora
 
 
-def install_lora(prior: StableDiffusion, lora: Lora, name: str, where: str = "LoRA") -> None:
+def install_lora(prior: NetworkPrior, lora: Lora, name: str, where: str = "LoRA") -> None:
     """Put a LoRA beside the UNet's weights, in place of one of the same name.
 
     It is frozen and has the UNet's precision.
@@ -366,7 +366,7 @@ def check_fit(unet: nn.Module, lora: Lora, where: str) -> None:
         raise ModelError(where, f"not whole (found {found}; missing {absent[0]})")
 
 
-def remove_lora(prior: StableDiffusion, name: str) -> None:
+def remove_lora(prior: NetworkPrior, name: str) -> None:
     """Take an adapter away; nothing happens when there is none of that name."""
     prior.forget_graphs()
     if name in getattr(prior.unet, "peft_config", {}):
@@ -383,7 +383,7 @@ def _without_warnings() -> Iterator[None]:
         yield
 
 
-def lora_parameters(prior: StableDiffusion, name: str) -> dict[str, nn.Parameter]:
+def lora_parameters(prior: NetworkPrior, name: str) -> dict[str, nn.Parameter]:
     """Return an adapter's parameters under the names that `Lora` gives its weights, sorted."""
     from peft.tuners.lora.layer import LoraLayer
 
@@ -396,7 +396,7 @@ def lora_parameters(prior: StableDiffusion, name: str) -> dict[str, nn.Parameter
 
 
 def put_weights(
-    prior: StableDiffusion, name: str, weights: Mapping[str, Tensor], dtype: torch.dtype
+    prior: NetworkPrior, name: str, weights: Mapping[str, Tensor], dtype: torch.dtype
 ) -> None:
     """Give an adapter's parameters values and a precision."""
     prior.forget_graphs()

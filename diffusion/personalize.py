@@ -47,7 +47,7 @@ from warpir.diffusion.prompts import Prompts
 from warpir.diffusion.settings import PersonalizeSettings
 
 if TYPE_CHECKING:
-    from warpir.diffusion.stable_diffusion import StableDiffusion
+    from warpir.diffusion.network_prior import NetworkPrior
 
 FORMAT = 1
 """Meaning of a stored LoRA; part of every key."""
@@ -86,7 +86,7 @@ class Personalization:
 
 
 def personalize(
-    prior: StableDiffusion,
+    prior: NetworkPrior,
     photo: Tensor,
     prompts: Prompts,
     settings: PersonalizeSettings,
@@ -207,7 +207,7 @@ class LoraTraining:
 
     def __init__(
         self,
-        prior: StableDiffusion,
+        prior: NetworkPrior,
         lora: Lora,
         photo: Tensor,
         classes: Tensor,
@@ -300,9 +300,7 @@ class LoraTraining:
         """Take one step on what `prepare` uploaded; writes `loss_pair`, never waits."""
         self.optimizer.zero_grad(set_to_none=True)
         with self._arithmetic():
-            predicted: Tensor = self.prior.unet(
-                self.latents_noisy, self.timesteps, encoder_hidden_states=self.embeddings
-            ).sample
+            predicted = self.prior.denoise(self.latents_noisy, self.timesteps, self.embeddings)
         error = (predicted.float() - self.target).square().mean(dim=(1, 2, 3))
         loss_photo = error[0]
         loss_class = error[1:].mean() if self.class_count else torch.zeros_like(loss_photo)
@@ -398,7 +396,7 @@ def photo_crops(size: tuple[int, int], settings: PersonalizeSettings, seed: int)
 
 
 def photo_latents(
-    prior: StableDiffusion, photo: Tensor, settings: PersonalizeSettings, seed: int
+    prior: NetworkPrior, photo: Tensor, settings: PersonalizeSettings, seed: int
 ) -> Tensor:
     """Return the latents of `photo_crops`, float32 on the CPU, shape [crop, C, h, w]."""
     height, width = photo.shape[-2:]
@@ -413,7 +411,7 @@ def photo_latents(
 
 
 def evaluate(
-    prior: StableDiffusion, crops: Tensor, embedding: Tensor, seed: int, adapter: str | None
+    prior: NetworkPrior, crops: Tensor, embedding: Tensor, seed: int, adapter: str | None
 ) -> float:
     """Return the mean squared error of the noise on fixed draws from the photo.
 
@@ -452,7 +450,7 @@ def evaluate(
 
 
 def lora_key(
-    prior: StableDiffusion,
+    prior: NetworkPrior,
     photo: Tensor,
     prompts: Prompts,
     settings: PersonalizeSettings,

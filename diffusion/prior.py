@@ -83,6 +83,7 @@ class Prior(Protocol):
         adapters: Sequence[str | None],
         background: Tensor | None = None,
         gbuffer: Tensor | None = None,
+        keep_background: Sequence[bool] | None = None,
     ) -> Tensor:
         """Return the predicted noise (epsilon, whatever the network predicts), float32, detached.
 
@@ -95,6 +96,7 @@ class Prior(Protocol):
             adapters: Per sample the name of its adapter, or None for the base weights.
             background: Crop of `Condition.background`, or None; Stable Diffusion ignores it.
             gbuffer: Crop of `Condition.gbuffer`, or None; Stable Diffusion ignores it.
+            keep_background: Per sample whether the background is told; None: wherever it is given.
 
         Raises:
             ModelError: An adapter is unknown.

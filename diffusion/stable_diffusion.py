@@ -1,36 +1,26 @@
 """Stable Diffusion 2.x (or 1.5) as a prior: autoencoder, UNet and text encoder, all frozen.
 
 Weights and schedule are read by diffusers and transformers from a folder that was checked first.
-Differences between predictions are tiny beside the predictions, so the UNet computes in fp16 or
-fp32 rather than bf16, and `StableDiffusion.ensure_precision` tells whether fp16 is enough. The
-attention processors stay diffusers' own: replacing them loses the care that Stable Diffusion 2.1
-needs in fp16.
+The attention processors stay diffusers' own: replacing them loses the care that Stable Diffusion
+2.1 needs in fp16.
 """
 
 from __future__ import annotations
 
-import contextlib
-import hashlib
 import logging
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import AbstractContextManager, contextmanager
+from contextlib import contextmanager
 from functools import partial
 from typing import Any
 
 import torch
 import transformers.utils.logging
-from diffusers import (
-    AutoencoderKL,
-    DDIMScheduler,
-    DPMSolverMultistepScheduler,
-    UNet2DConditionModel,
-)
+from diffusers import AutoencoderKL, DDIMScheduler, UNet2DConditionModel
 from torch import Tensor, nn
 from torch.utils.checkpoint import checkpoint
 from transformers import CLIPTextModel, CLIPTokenizer
 
-from warpir.diffusion.cuda_graphs import Graphs
 from warpir.diffusion.model_folder import (
     LATENT_CHANNELS,
     ModelFolder,
@@ -38,11 +28,11 @@ from warpir.diffusion.model_folder import (
     find_model,
     hub_offline,
 )
+from warpir.diffusion.network_prior import DTYPES, NetworkPrior
 from warpir.diffusion.prior import ModelError
-from warpir.diffusion.schedule import PREDICTION_TYPES, TIME_LIMIT, NoiseSchedule
+from warpir.diffusion.schedule import PREDICTION_TYPES, NoiseSchedule
 from warpir.diffusion.settings import ModelSettings
 
-DTYPES = {"fp16": torch.float16, "bf16": torch.bfloat16, "fp32": torch.float32}
 SCHEDULE_WORDS = (
     "num_train_timesteps",
     "beta_start",
@@ -55,13 +45,11 @@ SCHEDULE_WORDS = (
     "steps_offset",
 )
 """What a scheduler's configuration says about the model, and not about a way of sampling it."""
-LEAST_COSINE = 0.98
-"""Between a difference in low precision and in fp32; below it, fp16 spoils the guidance."""
 CHECK_TIMES = (0.1, 0.3, 0.5, 0.7, 0.9)
 """Times at which `StableDiffusion.self_check` measures the prompt's effect."""
 
 
-class StableDiffusion:
+class StableDiffusion(NetworkPrior):
     """Stable Diffusion behind `warpir.diffusion.prior.Prior`; made by `load_stable_diffusion`.
 
     Args:
@@ -88,9 +76,9 @@ class StableDiffusion:
         checkpoint_vae: bool = True,
         graphs: bool = False,
     ) -> None:
-        self.unet, self.vae, self.tokenizer = unet, vae, tokenizer
+        self.vae, self.tokenizer = vae, tokenizer
         self.text_encoder: CLIPTextModel | None = text_encoder
-        for model in (unet, vae, text_encoder):
+        for model in (vae, text_encoder):
             model.requires_grad_(False).eval()
         if checkpoint_vae:
             # There is no randomness to repeat, and asking for its state would stop a recording.
@@ -99,41 +87,22 @@ class StableDiffusion:
             )
             # The encoder recomputes this block as a whole: once is enough.
             vae.encoder.mid_block.gradient_checkpointing = False
-        self.device: torch.device = unet.device
-        self.graphs = Graphs(self.device) if graphs else None
-        self._mean = _PosteriorMean(vae)
-        self._recorded_mean = self.graphs.recorded_module(self._mean) if self.graphs else None
-        self.unet_dtype: torch.dtype = unet.dtype
-        """Arithmetic of the UNet; an adapter in training may have its own."""
-        self.latent_size: int = unet.config.sample_size
-        """Side of the latents."""
-        self.resolution = self.latent_size * 2 ** (len(vae.config.block_out_channels) - 1)
-        self._latent_scale: float = vae.config.scaling_factor
-        self.weight_hashes = dict(sorted(weight_hashes.items()))
-        lines = "".join(f"{name} {sha256}\n" for name, sha256 in self.weight_hashes.items())
-        self.digest = hashlib.sha256(lines.encode()).hexdigest()
-        self.adapters: set[str] = set()
-        """Whoever adds an adapter to the UNet names it here."""
-        self.notices: tuple[str, ...] = ()
-        """What the user is told about: precision, shortened prompts."""
-        self._solver_config = {
+        solver_config = {
             word: scheduler_config[word] for word in SCHEDULE_WORDS if word in scheduler_config
         }
-        self.schedule = _noise_schedule(self._solver_config)
-        self._embeddings: dict[str, Tensor] = {}
-
-    def embed(self, prompts: Sequence[str]) -> Tensor:
-        """Return the prompts' embeddings, float32, shape [prompt, token, channel].
-
-        Each prompt is computed once and kept. One that is too long is cut, with a notice.
-
-        Raises:
-            ModelError: The text encoder was freed and a prompt is new.
-        """
-        for prompt in prompts:
-            if prompt not in self._embeddings:
-                self._embeddings[prompt] = self._encode_text(prompt)
-        return torch.stack([self._embeddings[prompt] for prompt in prompts])
+        side: int = unet.config.sample_size
+        super().__init__(
+            unet,
+            _noise_schedule(solver_config),
+            solver_config,
+            (LATENT_CHANNELS, side, side),
+            side * 2 ** (len(vae.config.block_out_channels) - 1),
+            weight_hashes,
+            graphs,
+        )
+        self._mean = _PosteriorMean(vae)
+        self._recorded_mean = self.graphs.recorded_module(self._mean) if self.graphs else None
+        self._latent_scale: float = vae.config.scaling_factor
 
     def free_text_encoder(self) -> None:
         """Drop the text encoder and its memory; embeddings that were made stay."""
@@ -175,170 +144,6 @@ class StableDiffusion:
         images = [self.vae.decode(latent[None]).sample.float() for latent in scaled]
         return (torch.cat(images) / 2.0 + 0.5).clamp(0.0, 1.0)
 
-    def predict(
-        self,
-        latents_noisy: Tensor,
-        t: Tensor,
-        embeddings: Tensor,
-        adapters: Sequence[str | None],
-        background: Tensor | None = None,
-        gbuffer: Tensor | None = None,
-    ) -> Tensor:
-        """Return the predicted noise, float32, detached; see `warpir.diffusion.prior.Prior`.
-
-        Raises:
-            ModelError: An adapter is unknown.
-        """
-        self._check_adapters(adapters)
-        latents_noisy, t = latents_noisy.detach().to(self.device), t.to(self.device)
-        predicted = self._denoise(
-            latents_noisy, self.schedule.timestep(t), embeddings, tuple(adapters)
-        )
-        return self.schedule.to_noise(predicted, latents_noisy, t)
-
-    def sample(
-        self,
-        prompts: Sequence[str],
-        seeds: Sequence[int],
-        *,
-        steps: int,
-        scale: float,
-        adapter: str | None = None,
-        negative_prompt: str = "",
-        batch: int = 8,
-    ) -> Tensor:
-        """Return pictures of the prompts, in [0, 1], shape [prompt, 3, resolution, resolution].
-
-        DPM-Solver++ of second order (arXiv 2211.01095). A picture depends on its own prompt and
-        seed, not on those made with it.
-
-        Args:
-            prompts: One per picture.
-            seeds: One per picture, of its first noise.
-            steps: Denoising steps.
-            scale: Of classifier-free guidance, ``null + scale (prompt - null)``; 1: none.
-            adapter: Name of the adapter, or None for the base weights.
-            negative_prompt: What stands for null.
-            batch: Pictures made at once.
-
-        Raises:
-            ModelError: The adapter is unknown, or the text encoder was freed.
-            ValueError: There are not as many seeds as prompts.
-        """
-        if len(prompts) != len(seeds):
-            raise ValueError(f"seeds: {len(seeds)} (expected {len(prompts)}, one per prompt)")
-        self._check_adapters([adapter])
-        wanted, null = self.embed(prompts), self.embed([negative_prompt])
-        images = []
-        for start in range(0, len(prompts), batch):
-            these = slice(start, start + batch)
-            solver = self._solver(order=2)
-            solver.set_timesteps(steps)
-            noise = self._noise(seeds[these])
-            latents = self._solve(solver, noise, wanted[these], null, scale, adapter)
-            images.append(self.decode(latents))
-        return torch.cat(images)
-
-    def edit(
-        self,
-        image: Tensor,
-        prompt: str,
-        seed: int,
-        *,
-        strength: float,
-        steps: int,
-        scale: float,
-        adapter: str | None = None,
-        negative_prompt: str = "",
-    ) -> Tensor:
-        """Return a picture that was noised and denoised again (SDEdit, arXiv 2108.01073).
-
-        DDIM, which is DPM-Solver++ of first order, with all its steps below ``strength``.
-
-        Args:
-            image: Display-encoded, in [0, 1], shape [1, 3, resolution, resolution].
-            prompt: What it is to become.
-            seed: Of the noise.
-            strength: Time in [0, 1] that it is noised to; 0: only through the VAE and back.
-            steps: Denoising steps.
-            scale: Of classifier-free guidance, ``null + scale (prompt - null)``; 1: none.
-            adapter: Name of the adapter, or None for the base weights.
-            negative_prompt: What stands for null.
-
-        Returns:
-            In [0, 1], of the image's shape.
-
-        Raises:
-            ModelError: The adapter is unknown, or the text encoder was freed.
-        """
-        self._check_adapters([adapter])
-        wanted, null = self.embed([prompt]), self.embed([negative_prompt])
-        with torch.no_grad():
-            latents = self.encode(image)
-        t = torch.tensor([min(strength, TIME_LIMIT)])
-        start = int(self.schedule.timestep(t))
-        if start > 0:
-            solver = self._solver(order=1)
-            times = torch.linspace(start, 0, steps + 1)[:-1].round().long().tolist()
-            solver.set_timesteps(timesteps=sorted(set(times), reverse=True))
-            noisy = self.schedule.add_noise(latents, self._noise([seed]), t.to(self.device))
-            latents = self._solve(solver, noisy, wanted, null, scale, adapter)
-        return self.decode(latents)
-
-    def precision_check(self, difference: Callable[[], Tensor]) -> float:
-        """Return the cosine between a difference of predictions as computed here and in fp32.
-
-        Args:
-            difference: Predicts and subtracts, such as guidance does with its own prompts and
-                adapters; called twice, with all else equal. 1 where the UNet is in fp32 anyway.
-        """
-        if self.unet_dtype is torch.float32:
-            return 1.0
-        low = difference().double().flatten()
-        with self.in_full_precision():
-            full = difference().double().flatten()
-        return float(torch.dot(low, full) / (low.norm() * full.norm()))
-
-    def ensure_precision(self, difference: Callable[[], Tensor]) -> float:
-        """Go on in fp32 if the difference needs it, with a notice; return `precision_check`.
-
-        To be called before anything that holds on to the UNet's weights.
-        """
-        cosine = self.precision_check(difference)
-        if not cosine >= LEAST_COSINE:  # nan, where half precision overflowed, counts as too small
-            used = next(name for name, dtype in DTYPES.items() if dtype is self.unet_dtype)
-            self._notice(
-                f"the UNet computes in fp32: in {used} the guidance has cosine {cosine:.3f} with "
-                f"the exact one (at least {LEAST_COSINE})"
-            )
-            self.use_full_precision()
-        return cosine
-
-    def use_full_precision(self) -> None:
-        """Let the UNet compute in fp32 from now on; its weights stay as rounded as they were."""
-        self.forget_graphs()
-        for weight in self.unet.parameters():
-            weight.data = weight.data.float()
-        self.unet_dtype = torch.float32
-
-    @contextmanager
-    def in_full_precision(self) -> Iterator[None]:
-        """Let the UNet compute in fp32 within this context, then as before on the same memory."""
-        used, values = self.unet_dtype, [(w, w.data) for w in self.unet.parameters()]
-        graphs, self.graphs = self.graphs, None  # recordings read this memory, and will again
-        self.use_full_precision()
-        try:
-            yield
-        finally:
-            for weight, value in values:
-                weight.data = value
-            self.unet_dtype, self.graphs = used, graphs
-
-    def forget_graphs(self) -> None:
-        """Free what was recorded: to be called before weights or adapters change."""
-        if self.graphs is not None:
-            self.graphs.clear()
-
     @torch.no_grad()
     def self_check(self, image: Tensor, prompt: str, seed: int = 0) -> dict[str, float]:
         """Return figures that tell a working model from a broken one, for a photo.
@@ -376,137 +181,6 @@ class StableDiffusion:
         return figures | {"precision": self.precision_check(difference)}
 
     @torch.no_grad()
-    def _denoise(
-        self,
-        latents: Tensor,
-        timesteps: Tensor,
-        embeddings: Tensor,
-        adapters: tuple[str | None, ...],
-    ) -> Tensor:
-        """Return what the UNet predicts, whatever that is, float32; its only call.
-
-        Args:
-            latents: Noisy, shape [B, 4, h, w].
-            timesteps: Shape [B], int64.
-            embeddings: Shape [B, token, channel].
-            adapters: One name per sample, or None.
-        """
-        kind = self.unet_dtype
-
-        def unet(latents: Tensor, timesteps: Tensor, embeddings: Tensor) -> Tensor:
-            with self._with_adapters(adapters), self._exact_convolutions():
-                predicted: Tensor = self.unet(
-                    latents.to(kind), timesteps, encoder_hidden_states=embeddings.to(kind)
-                ).sample
-            return predicted.float()
-
-        arguments = [x.to(self.device) for x in (latents, timesteps, embeddings)]
-        if self.graphs is None:
-            return unet(*arguments)
-        return self.graphs.run((kind, adapters), unet, *arguments)
-
-    @contextmanager
-    def _with_adapters(self, names: tuple[str | None, ...]) -> Iterator[None]:
-        """Give each sample of a batch its adapter; afterwards all is as before.
-
-        In mixed batches each adapter sees all samples, and what it makes of others' is erased
-        between its two layers. peft's own way picks samples by lists, which are uploaded in every
-        layer: slower, and a CUDA graph cannot hold it.
-        """
-        from peft.tuners.lora.layer import LoraLayer
-
-        layers = [module for module in self.unet.modules() if isinstance(module, LoraLayer)]
-        if not layers:
-            yield
-            return
-        states = [(layer, layer.active_adapters, layer.disable_adapters) for layer in layers]
-        # Both of peft's switches set these too, which would start or stop a training.
-        trained = [(weight, weight.requires_grad) for weight in self.unet.parameters()]
-        wanted = sorted({name for name in names if name is not None})
-
-        def erase_others(name: str) -> Callable[[nn.Module, Any, Tensor], None]:
-            others = [sample for sample, own in enumerate(names) if own != name]
-
-            def erase(module: nn.Module, args: Any, reduced: Tensor) -> None:
-                for sample in others:
-                    reduced[sample].zero_()
-
-            return erase
-
-        hooks = []
-        try:
-            for layer in layers:
-                layer.enable_adapters(bool(wanted))
-                layer.set_adapter(wanted)
-                for name in wanted if len(set(names)) > 1 else ():
-                    if name in layer.lora_A:
-                        hooks.append(layer.lora_A[name].register_forward_hook(erase_others(name)))
-            yield
-        finally:
-            for hook in hooks:
-                hook.remove()
-            for layer, active, disabled in states:
-                layer.set_adapter(active)
-                layer.enable_adapters(not disabled)
-            for weight, flag in trained:
-                weight.requires_grad_(flag)
-
-    def _exact_convolutions(self) -> AbstractContextManager[None]:
-        """Keep cuDNN from rounding a UNet in fp32 to TF32, which has no more bits than fp16."""
-        return _no_tf32() if self.unet_dtype is torch.float32 else contextlib.nullcontext()
-
-    def _check_adapters(self, names: Sequence[str | None]) -> None:
-        unknown = {name for name in names if name is not None} - self.adapters
-        if unknown:
-            known = ", ".join(sorted(self.adapters)) or "none"
-            raise ModelError(self.name, f"no adapter {min(unknown)!r} (there are: {known})")
-
-    def _noise(self, seeds: Sequence[int]) -> Tensor:
-        """Return one noise per seed, shape [seed, 4, h, w]; drawn on the CPU, alike everywhere."""
-        shape = (LATENT_CHANNELS, self.latent_size, self.latent_size)
-        draws = [torch.randn(shape, generator=torch.Generator().manual_seed(s)) for s in seeds]
-        return torch.stack(draws).to(self.device)
-
-    def _solver(self, order: int) -> DPMSolverMultistepScheduler:
-        """Return DPM-Solver++ on the model's schedule; of first order it is DDIM."""
-        return DPMSolverMultistepScheduler.from_config(self._solver_config, solver_order=order)
-
-    def _solve(
-        self,
-        solver: DPMSolverMultistepScheduler,
-        latents: Tensor,
-        wanted: Tensor,
-        null: Tensor,
-        scale: float,
-        adapter: str | None,
-    ) -> Tensor:
-        """Denoise latents through the solver's timesteps, with classifier-free guidance.
-
-        Args:
-            solver: Its timesteps are set.
-            latents: At the first timestep, shape [B, 4, h, w].
-            wanted: Embeddings, shape [B, token, channel].
-            null: Embedding of the null prompt, shape [1, token, channel].
-            scale: Of the guidance.
-            adapter: For all of them.
-        """
-        count = len(latents)
-        embeddings = wanted if scale == 1.0 else torch.cat([wanted, null.expand_as(wanted)])
-        repeats = len(embeddings) // count
-        for timestep in solver.timesteps:
-            predicted = self._denoise(
-                latents.repeat(repeats, 1, 1, 1),
-                timestep.expand(repeats * count),
-                embeddings,
-                (adapter,) * (repeats * count),
-            )
-            if repeats == 2:
-                prompted, unprompted = predicted.chunk(2)
-                predicted = unprompted + scale * (prompted - unprompted)
-            latents = solver.step(predicted, timestep, latents).prev_sample
-        return latents
-
-    @torch.no_grad()
     def _encode_text(self, prompt: str) -> Tensor:
         """Return a prompt's embedding, float32, shape [token, channel]."""
         if self.text_encoder is None:
@@ -529,9 +203,6 @@ class StableDiffusion:
         ).input_ids
         hidden: Tensor = self.text_encoder(padded.to(self.device))[0]
         return hidden[0].float()
-
-    def _notice(self, text: str) -> None:
-        self.notices = (*self.notices, text)
 
 
 class _PosteriorMean(nn.Module):
@@ -688,13 +359,3 @@ def _one_sentence(where: str) -> Iterator[None]:
             log.setLevel(level)
         if bars:
             transformers.utils.logging.enable_progress_bar()
-
-
-@contextmanager
-def _no_tf32() -> Iterator[None]:
-    before = torch.backends.cudnn.allow_tf32
-    torch.backends.cudnn.allow_tf32 = False
-    try:
-        yield
-    finally:
-        torch.backends.cudnn.allow_tf32 = before

@@ -16,9 +16,9 @@ from tests.tiny_stable_diffusion import make_tiny_stable_diffusion
 from warpir import model_check
 from warpir.check_model import main
 from warpir.config import InsertConfig
+from warpir.diffusion.network_prior import LEAST_COSINE
 from warpir.diffusion.stable_diffusion import (
     CHECK_TIMES,
-    LEAST_COSINE,
     StableDiffusion,
     load_stable_diffusion,
 )

@@ -23,12 +23,12 @@ from warpir.config import InsertConfig
 from warpir.diffusion.cache import write_file
 from warpir.diffusion.crop import Crop
 from warpir.diffusion.guidance import Guidance, NonFiniteError
+from warpir.diffusion.network_prior import LEAST_COSINE
 from warpir.diffusion.personalize import LoraTraining, personalize
 from warpir.diffusion.prior import Condition
 from warpir.diffusion.prompts import Prompts, make_prompts
 from warpir.diffusion.stable_diffusion import (
     CHECK_TIMES,
-    LEAST_COSINE,
     StableDiffusion,
     load_stable_diffusion,
 )
