@@ -152,7 +152,7 @@ def read_lora(path: str | Path) -> Lora:
             the UNet, has rank 0 or values that are not finite.
     """
     path = Path(path)
-    tensors, header = _read_safetensors(path)
+    tensors, header = read_safetensors(path)
     config = _own_config(path, header)
     weights, alphas = _parts(path, tensors)
     layers = sorted({key.rsplit(".lora_", 1)[0] for key in weights})
@@ -185,7 +185,7 @@ def read_lora(path: str | Path) -> Lora:
     return Lora(weights, alphas, tuple(sorted(targets)) if listed and targets else ())
 
 
-def _read_safetensors(path: Path) -> tuple[dict[str, Tensor], dict[str, str]]:
+def read_safetensors(path: Path) -> tuple[dict[str, Tensor], dict[str, str]]:
     """Return tensors and header of a safetensors file."""
     if path.is_dir():
         raise ModelError(str(path), "is a folder (expected a safetensors file)")

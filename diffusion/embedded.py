@@ -1,0 +1,592 @@
+"""The prior that warpir ships: a small UNet on pixels that is shown what it has to judge by.
+
+A crop of 64 x 64 pixels is its own latent, in [-1, 1]. Beside the noisy crop the network sees the
+photo without the object (blank where the mask covers it), and the object's mask, albedo and
+normals; each may be withheld, and a flag says so. It was trained on rendered scenes, half of them
+wrongly lit: the prompt says ``consistent`` or ``mismatched`` and what is wrong. The empty prompt
+means any of them, wrongly lit ones included, so that a difference of two prompts is a statement
+about the light.
+
+Folding 2 x 2 pixels into channels is orthonormal: white noise stays white, and this is exactly
+diffusion in pixel space at a quarter of the cost. Noise follows a cosine, ``s = sin(pi t / 2)``,
+and the network predicts ``v = a noise - s z`` (Salimans & Ho, arXiv 2202.00512).
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import math
+import re
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass
+from itertools import groupby
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import torch
+from torch import Tensor, nn
+from torch.nn import functional
+
+from warpir.diffusion.cache import write_file
+from warpir.diffusion.lora_files import read_safetensors, serialize
+from warpir.diffusion.network_prior import NetworkPrior
+from warpir.diffusion.prior import ModelError
+from warpir.diffusion.prompts import Prompts, make_prompts
+from warpir.diffusion.schedule import NoiseSchedule
+from warpir.diffusion.settings import PersonalizeSettings
+
+if TYPE_CHECKING:
+    from diffusers import UNet2DConditionModel
+
+RESOLUTION = 64
+"""Side of a crop [px]."""
+TIMESTEPS = 1000
+WEIGHTS = Path(__file__).parent / "weights" / "prior.safetensors"
+"""The weights that are part of the package."""
+HEADER_KEY = "warpir_prior"
+"""Where a file's header describes its weights."""
+FORMAT = 1
+
+# What LoRAs adapt here: guidance.md's choice for a small network that is new to photographs.
+LORA_RANK = 8
+LORA_LAYERS = ("to_q", "to_k", "to_v", "to_out.0", "conv1", "conv2")
+
+# Words
+
+NOUNS = (
+    "object", "car", "truck", "cow", "animal", "ball", "mug", "cup", "cake", "box", "chair",
+    "table", "lamp", "tree", "statue", "toy", "building", "bottle", "vase", "teapot", "plant",
+    "person", "wheel",
+)  # fmt: skip
+"""What is inserted; ``object`` stands for anything."""
+SETTINGS = ("outdoor", "indoor", "street", "yard", "room")
+WEATHERS = ("sunny", "overcast", "twilight", "night", "lamplit")
+KINDS = ("consistent", "direction", "exposure", "colour", "softness", "shadow")
+"""0: lit as its surroundings. The others say in what it is ``mismatched``."""
+RESERVED = ("sks", "zwx", "ohwx", "xjy", "qqv", "vrk", "hjx", "kdw")
+"""Never trained: a personalisation gives them a meaning."""
+PAD, UNKNOWN = "<pad>", "<unk>"
+VOCABULARY = (
+    PAD, UNKNOWN, "consistent", "mismatched", *KINDS[1:], *NOUNS, *SETTINGS, *WEATHERS, *RESERVED,
+)  # fmt: skip
+VOCABULARY_SIZE = 64
+"""Rows of the table of words; those beyond `VOCABULARY` are free."""
+TOKEN_COUNT = 16
+SYNONYMS = {
+    "suv": "car", "van": "car", "automobile": "car", "sedan": "car", "taxi": "car", "cab": "car",
+    "vehicle": "car", "jeep": "car", "lorry": "truck", "pickup": "truck", "bus": "truck",
+    "bull": "cow", "cattle": "cow", "dog": "animal", "cat": "animal", "horse": "animal",
+    "sphere": "ball", "globe": "ball", "shaderball": "ball", "football": "ball", "glass": "cup",
+    "teacup": "cup", "pie": "cake", "crate": "box", "cube": "box", "carton": "box", "parcel": "box",
+    "stool": "chair", "armchair": "chair", "desk": "table", "sculpture": "statue", "bust": "statue",
+    "figurine": "statue", "figure": "statue", "house": "building", "tower": "building",
+    "jug": "vase", "pot": "vase", "kettle": "teapot", "flower": "plant", "bush": "plant",
+    "shrub": "plant", "man": "person", "woman": "person", "human": "person", "thing": "object",
+    "outside": "outdoor", "outdoors": "outdoor", "inside": "indoor", "indoors": "indoor",
+    "interior": "indoor", "road": "street", "garden": "yard", "sun": "sunny", "sunlight": "sunny",
+    "sunlit": "sunny", "cloudy": "overcast", "clouds": "overcast", "dusk": "twilight",
+    "dawn": "twilight", "sunset": "twilight", "sunrise": "twilight", "evening": "twilight",
+    "lamplight": "lamplit", "color": "colour", "brightness": "exposure", "shadows": "shadow",
+}  # fmt: skip
+FILLERS = frozenset(
+    "a an the of in on at by to with and is as its under from photo photograph picture image scene "
+    "style rendering render lit light lighting".split()
+)
+"""Words of ordinary sentences that say nothing here."""
+
+_IDS = {word: place for place, word in enumerate(VOCABULARY)}
+_JUDGEMENTS = ("consistent", "mismatched")
+
+DROP_ATTRIBUTE, DROP_KIND, DROP_PROMPT = 0.2, 0.3, 0.2
+"""Chances that training leaves out a noun, setting or weather, a kind, or the whole prompt."""
+UNKNOWN_SHARE = 0.25
+"""Of the attributes that are left out, those that leave ``<unk>`` behind: an unknown word."""
+
+
+def known_words(prompt: str) -> list[str]:
+    """Return the words of a prompt that say something, unknown ones as ``<unk>``, in order.
+
+    Words are lower-case, synonyms become what they stand for, a plural its singular.
+    """
+    words = []
+    for word in re.findall(r"<unk>|[^\W_]+", prompt.lower()):
+        if word in FILLERS:
+            continue
+        word = SYNONYMS.get(word, word)
+        if word not in _IDS and word.endswith("s"):
+            word = SYNONYMS.get(word[:-1], word[:-1])
+        words.append(word if word in _IDS else UNKNOWN)
+    return words
+
+
+def tokenize(prompt: str) -> list[int]:
+    """Return the `TOKEN_COUNT` ids of a prompt; longer ones are cut.
+
+    A sentence that judges nothing asks for a consistent picture. The same word several times in a
+    row counts once, as do unknown ones. No word at all is the null prompt: any picture, wrongly lit
+    ones included.
+    """
+    words = known_words(prompt)
+    if prompt.strip() and not any(judgement in words for judgement in _JUDGEMENTS):
+        words.insert(0, "consistent")
+    kept = [word for word, _ in groupby(words)]
+    ids = [_IDS[word] for word in kept[:TOKEN_COUNT]]
+    return ids + [_IDS[PAD]] * (TOKEN_COUNT - len(ids))
+
+
+def training_tokens(
+    noun: Tensor,
+    setting: Tensor,
+    weather: Tensor,
+    kind: Tensor,
+    generator: torch.Generator | None = None,
+) -> Tensor:
+    """Return the ids of prompts such as ``mismatched direction car outdoor sunny``.
+
+    Args:
+        noun: Index into `NOUNS`, int64, shape [B]; -1, here and below: not said.
+        setting: Index into `SETTINGS`, shape [B].
+        weather: Index into `WEATHERS`, shape [B].
+        kind: Index into `KINDS`, shape [B].
+        generator: Leaves out words and prompts at random (`DROP_ATTRIBUTE` and so on), on the
+            tensors' device; None: every word is said.
+
+    Returns:
+        int64, shape [B, `TOKEN_COUNT`].
+    """
+    device, count = noun.device, len(noun)
+    mismatched = kind > 0
+    judgement = torch.where(mismatched, _IDS["mismatched"], _IDS["consistent"])
+    ids = torch.stack(
+        [
+            judgement,
+            kind + (_IDS[KINDS[1]] - 1),
+            noun + _IDS[NOUNS[0]],
+            setting + _IDS[SETTINGS[0]],
+            weather + _IDS[WEATHERS[0]],
+        ],
+        dim=1,
+    )
+    said = torch.stack(
+        [torch.ones_like(mismatched), mismatched, noun >= 0, setting >= 0, weather >= 0], dim=1
+    )
+    if generator is not None:
+        u = torch.rand(count, 6, device=device, generator=generator)
+        said[:, 1] &= u[:, 1] >= DROP_KIND
+        dropped = u[:, 2:5] < DROP_ATTRIBUTE
+        unknown = u[:, 2:5] < DROP_ATTRIBUTE * UNKNOWN_SHARE
+        ids[:, 2:] = torch.where(unknown, _IDS[UNKNOWN], ids[:, 2:])
+        said[:, 2:] &= ~dropped | unknown
+        said &= u[:, :1] >= DROP_PROMPT
+    # Words move up to where those before them are missing, as in `tokenize`.
+    order = torch.argsort((~said).to(torch.int8), dim=1, stable=True)
+    ids = torch.where(said, ids, _IDS[PAD]).gather(1, order)
+    return functional.pad(ids, (0, TOKEN_COUNT - ids.shape[1]), value=_IDS[PAD])
+
+
+@dataclass(frozen=True)
+class EmbeddedPrompts(Prompts):
+    """What the embedded prior is asked for in a run."""
+
+    negative: str
+    """The same picture, wrongly lit."""
+    unknown: tuple[str, ...]
+    """Words of the user's that the prior has never seen."""
+
+
+def embedded_prompts(
+    user_prompt: str, settings: PersonalizeSettings, personalized: bool = False
+) -> EmbeddedPrompts:
+    """Return the prompts for what the user calls the object, in words that the prior knows.
+
+    A noun that it does not know becomes ``object``. The null prompt is the empty one.
+
+    Args:
+        user_prompt: The object in words, such as "a black SUV car".
+        settings: Token, class noun, and whether the photo shows a room.
+        personalized: Guidance asks for the photo's style too.
+
+    Raises:
+        ValueError: The prompt, the noun or the token has no word.
+    """
+    plain = make_prompts(user_prompt, settings)
+    words = [*known_words(settings.class_noun or ""), *known_words(user_prompt)]
+    noun = next((word for word in words if word in NOUNS), NOUNS[0])
+    places = [word for word in dict.fromkeys(words) if word in SETTINGS]
+    if not places and settings.indoors:
+        places = ["indoor"]
+    weathers = [word for word in dict.fromkeys(words) if word in WEATHERS]
+    thing = " ".join([noun, *places, *weathers])
+    style = f" in the style of {settings.token} rendering" if personalized else ""
+    unknown = [word for word in user_prompt.split() if known_words(word) == [UNKNOWN]]
+    return EmbeddedPrompts(
+        photo=plain.photo,
+        class_=f"consistent {noun}",
+        guidance=f"consistent {thing}{style}",
+        noun=noun,
+        negative=f"mismatched {thing}{style}",
+        unknown=tuple(dict.fromkeys(unknown)),
+    )
+
+
+# The network
+
+
+@dataclass(frozen=True)
+class NetworkConfig:
+    """Size of the network; the default has 10.1 M parameters and takes 4.0 GFLOP a picture."""
+
+    widths: tuple[int, ...] = (64, 128, 128)
+    """Channels by level, at 32 x 32, 16 x 16 and 8 x 8."""
+    layers: int = 2
+    """Residual blocks by level."""
+    attention_from: int = 1
+    """First level with attention."""
+    head_width: int = 32
+    """Channels of an attention head."""
+    groups: int = 16
+    """Of the normalisation."""
+    embedding_width: int = 128
+    """Channels of a word."""
+
+
+CONDITIONS = ("background", "mask", "albedo", "normals")
+"""Each has a flag; the columns of ``present`` below."""
+
+
+class EmbeddedNetwork(nn.Module):
+    """Noisy crop, conditions and prompt to v.
+
+    Args:
+        config: Its size.
+    """
+
+    def __init__(self, config: NetworkConfig) -> None:
+        super().__init__()
+        # Imported here: it takes seconds.
+        from diffusers import UNet2DConditionModel
+
+        self.config = config
+        levels = range(len(config.widths))
+        attends = [level >= config.attention_from for level in levels]
+        self.unet: UNet2DConditionModel = UNet2DConditionModel(
+            sample_size=RESOLUTION // 2,
+            in_channels=4 * (3 + 3 + 7) + len(CONDITIONS),
+            out_channels=4 * 3,
+            down_block_types=tuple(f"{'CrossAttn' * a}DownBlock2D" for a in attends),
+            up_block_types=tuple(f"{'CrossAttn' * a}UpBlock2D" for a in reversed(attends)),
+            block_out_channels=config.widths,
+            layers_per_block=config.layers,
+            # diffusers calls the number of heads so.
+            attention_head_dim=tuple(max(w // config.head_width, 1) for w in config.widths),
+            cross_attention_dim=config.embedding_width,
+            norm_num_groups=config.groups,
+            use_linear_projection=True,
+        )
+        self.words = nn.Embedding(VOCABULARY_SIZE, config.embedding_width)
+        self.places = nn.Parameter(0.3 * torch.randn(TOKEN_COUNT, config.embedding_width))
+
+    def embed(self, ids: Tensor) -> Tensor:
+        """Return embeddings of `tokenize`'s ids, shape [B, `TOKEN_COUNT`, channel]."""
+        words: Tensor = self.words(ids)
+        return words + self.places
+
+    def forward(
+        self,
+        latents_noisy: Tensor,
+        timesteps: Tensor,
+        embeddings: Tensor,
+        background: Tensor,
+        gbuffer: Tensor,
+        present: Tensor,
+    ) -> Tensor:
+        """Return v, shape [B, 3, 64, 64].
+
+        Args:
+            latents_noisy: z_t, same shape.
+            timesteps: int64, shape [B].
+            embeddings: From `embed`.
+            background: The photo without the object, in [0, 1], shape [B, 3, 64, 64].
+            gbuffer: Mask, albedo and normals, shape [B, 7, 64, 64].
+            present: 1 for each of `CONDITIONS` that is shown, else 0; float, shape [B, 4].
+        """
+        packed = pack(latents_noisy, background, gbuffer, present)
+        predicted: Tensor = self.unet(packed, timesteps, encoder_hidden_states=embeddings).sample
+        return functional.pixel_shuffle(predicted, 2)
+
+
+def pack(latents_noisy: Tensor, background: Tensor, gbuffer: Tensor, present: Tensor) -> Tensor:
+    """Return the UNet's input, shape [B, 56, 32, 32]; arguments as in `EmbeddedNetwork.forward`.
+
+    What is not shown is 0. The background is blank where a mask that is shown covers it.
+    """
+    shown = present[:, :, None, None].to(latents_noisy)
+    mask = gbuffer[:, :1] * shown[:, 1:2]
+    planes = [
+        latents_noisy,
+        (2.0 * background - 1.0) * (1.0 - mask) * shown[:, :1],
+        mask,
+        gbuffer[:, 1:4] * shown[:, 2:3],
+        gbuffer[:, 4:] * shown[:, 3:],
+    ]
+    folded = functional.pixel_unshuffle(torch.cat(planes, dim=1), 2)
+    return torch.cat([folded, shown.expand(-1, -1, *folded.shape[-2:])], dim=1)
+
+
+def build_network(config: NetworkConfig | None = None, seed: int = 0) -> EmbeddedNetwork:
+    """Return a network with random weights; the global random numbers are left alone."""
+    with torch.random.fork_rng(devices=[]):
+        torch.manual_seed(seed)
+        return EmbeddedNetwork(config or NetworkConfig())
+
+
+def cosine_schedule() -> NoiseSchedule:
+    """Return the schedule ``a = cos(pi t / 2), s = sin(pi t / 2)``, t in the middle of a step."""
+    t = (torch.arange(TIMESTEPS, dtype=torch.float64) + 0.5) / TIMESTEPS
+    return NoiseSchedule(torch.cos(0.5 * math.pi * t).square(), "v_prediction")
+
+
+# The prior
+
+
+class EmbeddedPrior(NetworkPrior):
+    """The network behind `warpir.diffusion.prior.Prior`; made by `load_embedded`.
+
+    Always computes in fp32: it is small, and differences need it.
+
+    Args:
+        network: On its device, fp32; frozen from now on.
+        weight_hashes: sha256 by name of a weight file.
+        training: How the weights came about, from their file; empty for random ones.
+        graphs: Record what is done often as CUDA graphs; the device must be one.
+    """
+
+    name = "embedded"
+
+    def __init__(
+        self,
+        network: EmbeddedNetwork,
+        weight_hashes: Mapping[str, str],
+        training: Mapping[str, Any] | None = None,
+        graphs: bool = False,
+    ) -> None:
+        self.network = network.requires_grad_(False).eval()
+        self.training = dict(training or {})
+        schedule = cosine_schedule()
+        bar = schedule.alphas_cumprod
+        before = torch.cat([torch.ones(1, dtype=bar.dtype), bar[:-1]])
+        solver_config = {
+            "num_train_timesteps": TIMESTEPS,
+            "trained_betas": (1.0 - bar / before).tolist(),
+            "prediction_type": schedule.prediction_type,
+        }
+        shape = (3, RESOLUTION, RESOLUTION)
+        super().__init__(
+            network.unet, schedule, solver_config, shape, RESOLUTION, weight_hashes, graphs
+        )
+
+    def encode(self, image: Tensor) -> Tensor:
+        """Return the picture in [-1, 1], float32: a pixel is its own latent.
+
+        Args:
+            image: Display-encoded, in [0, 1], shape [B, 3, 64, 64].
+
+        Raises:
+            ValueError: The image has another shape.
+        """
+        if image.ndim != 4 or image.shape[1:] != self.latent_shape:
+            raise ValueError(
+                f"image: shape {tuple(image.shape)} (expected [B, 3, R, R], {self.latent_shape})"
+            )
+        return 2.0 * image.to(self.device, torch.float32) - 1.0
+
+    @torch.no_grad()
+    def decode(self, latents: Tensor) -> Tensor:
+        """Return pictures, float32, in [0, 1], shape [B, 3, 64, 64]."""
+        return (latents.to(self.device) / 2.0 + 0.5).clamp(0.0, 1.0)
+
+    def free_text_encoder(self) -> None:
+        """Keep the table of words: there is nothing to gain."""
+
+    def pack(
+        self,
+        latents_noisy: Tensor,
+        background: Tensor | None = None,
+        gbuffer: Tensor | None = None,
+        keep_background: Sequence[bool] | None = None,
+    ) -> Tensor:
+        """Return the UNet's input, see `pack`; what is None is not shown.
+
+        Raises:
+            ValueError: A condition is not of the latents' size.
+        """
+        count, size = len(latents_noisy), latents_noisy.shape[-2:]
+        device = latents_noisy.device
+        for name, given, channels in (("background", background, 3), ("gbuffer", gbuffer, 7)):
+            if given is not None and given.shape != (count, channels, *size):
+                expected = [count, channels, *size]
+                raise ValueError(f"{name}: shape {list(given.shape)} (expected {expected})")
+        if keep_background is not None and len(keep_background) != count:
+            raise ValueError(f"keep_background: {len(keep_background)} (expected {count})")
+        present = torch.zeros(count, len(CONDITIONS))
+        if background is not None:
+            keep = keep_background if keep_background is not None else [True] * count
+            present[:, 0] = torch.tensor(keep, dtype=present.dtype)
+        present[:, 1:] = gbuffer is not None
+        zeros = latents_noisy.new_zeros(count, 7, *size)
+        return pack(
+            latents_noisy,
+            zeros[:, :3] if background is None else background.to(device, torch.float32),
+            zeros if gbuffer is None else gbuffer.to(device, torch.float32),
+            present.to(device),
+        )
+
+    def unpack(self, predicted: Tensor) -> Tensor:
+        """Return what the UNet put out, shape [B, 3, 64, 64]."""
+        return functional.pixel_shuffle(predicted, 2)
+
+    @torch.no_grad()
+    def _encode_text(self, prompt: str) -> Tensor:
+        """Return a prompt's embedding, float32, shape [token, channel]."""
+        return self.network.embed(torch.tensor(tokenize(prompt), device=self.device))
+
+
+def random_embedded(
+    seed: int, device: torch.device | str, config: NetworkConfig | None = None
+) -> EmbeddedPrior:
+    """Return a prior that knows nothing: random weights, for tests and as a control."""
+    network = build_network(config, seed)
+    hashes = {f"random weights, seed {seed}": weight_hash(network.state_dict())}
+    return EmbeddedPrior(network.to(device), hashes)
+
+
+# Files
+
+
+def save_embedded(network: EmbeddedNetwork, path: Path, training: Mapping[str, Any]) -> None:
+    """Write a network's weights in fp16, always the same bytes.
+
+    Args:
+        network: The network.
+        path: A safetensors file; its folder is made.
+        training: How the weights came about, as plain JSON values.
+
+    Raises:
+        OSError: The file cannot be written; an older one is still whole.
+    """
+    weights = {name: value.detach().cpu().half() for name, value in network.state_dict().items()}
+    described = {
+        "format": FORMAT,
+        "network": asdict(network.config),
+        "vocabulary": VOCABULARY,
+        "schedule": "cosine",
+        "weights": weight_hash(weights),
+        "training": training,
+    }
+    header = {"format": "pt", HEADER_KEY: json.dumps(described, sort_keys=True)}
+    write_file(path, serialize(weights, header))
+
+
+def load_embedded(
+    weights: Path | str | None, device: torch.device | str, graphs: bool = False
+) -> EmbeddedPrior:
+    """Load a prior.
+
+    Args:
+        weights: A file of `save_embedded`; None: the one that is part of the package.
+        device: Where it computes.
+        graphs: Record what is done often as CUDA graphs; the device must be one.
+
+    Raises:
+        ModelError: The file is not there, is damaged or holds something else.
+    """
+    path = Path(weights) if weights is not None else WEIGHTS
+    if weights is None and not path.is_file():
+        what = "the embedded prior's weights are not in this installation"
+        raise ModelError(str(path), what, "install warpir again, or name a model by --model")
+    network, training = read_network(path)
+    with path.open("rb") as file:
+        digest = hashlib.file_digest(file, "sha256").hexdigest()
+    return EmbeddedPrior(network.to(device), {path.name: digest}, training, graphs)
+
+
+def read_network(path: Path) -> tuple[EmbeddedNetwork, dict[str, Any]]:
+    """Return the network of a file, fp32 on the CPU, and how its weights came about.
+
+    Raises:
+        ModelError: The file is not there, is damaged or holds something else.
+    """
+    weights, header = read_safetensors(path)
+    if HEADER_KEY not in header:
+        raise ModelError(str(path), f"holds no embedded prior (no {HEADER_KEY} in its header)")
+    try:
+        described = json.loads(header[HEADER_KEY])
+        if described["format"] != FORMAT:
+            what = f"format {described['format']!r} (expected {FORMAT})"
+            raise ModelError(str(path), what, "fetch the weights of this version of warpir")
+        config = config_of(described["network"])
+        words, digest = tuple(described["vocabulary"]), str(described["weights"])
+        training = dict(described["training"])
+    except (ValueError, TypeError, KeyError) as error:
+        raise ModelError(str(path), f"its header is damaged ({type(error).__name__})") from error
+    if words != VOCABULARY or described["schedule"] != "cosine":
+        what = "made for another vocabulary or schedule than this version of warpir has"
+        raise ModelError(str(path), what, "fetch the weights of this version")
+    if weight_hash(weights) != digest:
+        raise ModelError(str(path), "damaged (its weights are not those that were written)")
+    return network_of(config, weights, str(path)), training
+
+
+def config_of(described: Mapping[str, Any]) -> NetworkConfig:
+    """Return a network's size from JSON values.
+
+    Raises:
+        ValueError: A value makes no sense.
+        TypeError: A name is foreign.
+    """
+    config = NetworkConfig(**{**described, "widths": tuple(described["widths"])})
+    numbers = [*config.widths, *(v for k, v in asdict(config).items() if k != "widths")]
+    if not all(type(number) is int and 0 <= number <= 4096 for number in numbers):
+        raise ValueError(f"network: {described}")
+    return config
+
+
+def network_of(config: NetworkConfig, weights: Mapping[str, Tensor], where: str) -> EmbeddedNetwork:
+    """Return a network with these weights, as fp32.
+
+    Args:
+        config: Its size.
+        weights: By name, as in its ``state_dict``.
+        where: What an error names.
+
+    Raises:
+        ModelError: The weights are not this network's, or not finite.
+    """
+    try:
+        with torch.device("meta"):  # neither memory nor random numbers
+            network = EmbeddedNetwork(config)
+    except (ValueError, TypeError, ZeroDivisionError) as error:
+        raise ModelError(where, f"no such network ({config})") from error
+    expected = {name: tuple(value.shape) for name, value in network.state_dict().items()}
+    found = {name: tuple(value.shape) for name, value in weights.items()}
+    if found != expected:
+        odd = sorted(
+            name for name in {**expected, **found} if found.get(name) != expected.get(name)
+        )
+        what = f"{odd[0]}: shape {found.get(odd[0])} (expected {expected.get(odd[0])})"
+        raise ModelError(where, f"the weights do not fit the network; {what}")
+    for name, value in weights.items():
+        if not value.is_floating_point() or not bool(torch.isfinite(value).all()):
+            raise ModelError(where, f"{name}: values are not finite numbers")
+    network.load_state_dict({name: value.float() for name, value in weights.items()}, assign=True)
+    return network
+
+
+def weight_hash(weights: Mapping[str, Tensor]) -> str:
+    """Return the sha256 of weights as they are written: names and fp16 values in order."""
+    digest = hashlib.sha256()
+    for name in sorted(weights):
+        digest.update(name.encode())
+        digest.update(weights[name].detach().cpu().half().contiguous().numpy().tobytes())
+    return digest.hexdigest()
