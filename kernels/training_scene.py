@@ -1,0 +1,717 @@
+"""Small pictures of many made-up scenes at once, for training: one thread per pixel and scene.
+
+A scene is a ground plane, a few boxes, ellipsoids and cylinders, one inserted object (a triangle
+mesh), and a distant light for each of the two: what lights the scene need not be what lights the
+object. Nothing is drawn at random here. All pixels of a picture share the same directions, so that
+its light is exact up to a smooth error: grain would give an inserted object away at once.
+
+Frame: +Y up, ground ``y = 0``, the camera looks toward -Z (camera-yaw frame).
+"""
+
+import warp as wp
+
+from warpir.kernels.latlong import bilinear_tap, direction_to_uv
+
+wp.set_module_options({"enable_backward": False})
+
+PI = wp.constant(3.14159265358979)
+FAR = wp.constant(1.0e6)
+BOX = wp.constant(0)
+ELLIPSOID = wp.constant(1)
+CYLINDER = wp.constant(2)
+NO_HIT = wp.constant(-1)
+GROUND = wp.constant(-2)
+
+TILES = wp.constant(1)
+STRIPES = wp.constant(2)
+PLANKS = wp.constant(3)
+PHOTO = wp.constant(4)
+
+
+@wp.struct
+class ViewTable:
+    """Cameras, one per scene."""
+
+    origin: wp.array[wp.vec3]
+    """Position [m]."""
+    right: wp.array[wp.vec3]
+    up: wp.array[wp.vec3]
+    back: wp.array[wp.vec3]
+    window: wp.array[wp.vec4]
+    """Left, top, width and height of the picture on the plane at distance 1 (v grows downward)."""
+
+
+@wp.struct
+class LightTable:
+    """Distant lights, one per scene."""
+
+    map: wp.array[int]
+    """Index of the map of everything but the sun."""
+    yaw: wp.array[float]
+    """Turn from the world to the map about +Y [rad]."""
+    mirror: wp.array[float]
+    """-1: the map is mirrored in x, else 1."""
+    gain: wp.array[wp.vec3]
+    """Factor on the map [1]."""
+    direction: wp.array2d[wp.vec3]
+    """Unit directions, shape [scene, direction]."""
+    flux: wp.array2d[wp.vec3]
+    """Radiance times solid angle of each, gain included, shape [scene, direction]."""
+    sun_direction: wp.array2d[wp.vec3]
+    """Unit directions over the sun, of equal flux, shape [scene, sample]."""
+    sun_axis: wp.array[wp.vec3]
+    sun: wp.array[wp.vec3]
+    """Irradiance of a surface that faces the sun, gain included."""
+    sun_sigma: wp.array[float]
+    """Angular standard deviation of the sun [rad]."""
+
+
+@wp.struct
+class MapTable:
+    """Lat-long maps by index, each level half the size of the one before."""
+
+    fine: wp.array3d[wp.vec3]
+    middle: wp.array3d[wp.vec3]
+    coarse: wp.array3d[wp.vec3]
+    seen: wp.array3d[wp.vec3]
+    """Panoramas as a camera sees them, sun included."""
+
+
+@wp.struct
+class OccluderTable:
+    """Solids that stand in the scene, shape [scene, solid]."""
+
+    kind: wp.array2d[int]
+    """`BOX`, `ELLIPSOID` or `CYLINDER`; negative: none."""
+    centre: wp.array2d[wp.vec3]
+    half: wp.array2d[wp.vec3]
+    """Half sizes along the solid's own axes [m]."""
+    yaw: wp.array2d[float]
+    albedo: wp.array2d[wp.vec3]
+    texture: wp.array2d[int]
+    """Panorama of which a piece covers the solid; negative: none."""
+
+
+@wp.struct
+class GroundTable:
+    """Grounds, one per scene."""
+
+    is_seen: wp.array[int]
+    """0: the background is a panorama, whose own ground only catches shadows."""
+    seen: wp.array[int]
+    """Index of the panorama that is seen, negative: the light's own map and sun."""
+    albedo: wp.array[wp.vec3]
+    second: wp.array[wp.vec3]
+    """Albedo of the pattern's other part."""
+    pattern: wp.array[int]
+    texture: wp.array[int]
+    """Panorama of which a piece covers the ground where the pattern is `PHOTO`."""
+    size: wp.array[float]
+    """Of the pattern [m]."""
+    turn: wp.array[float]
+    """Of the pattern [rad]."""
+    roughen: wp.array[float]
+    """Amplitude of the noise on the albedo [1]."""
+    wetness: wp.array[float]
+    """Share of a mirror's Fresnel reflection [1]."""
+
+
+@wp.struct
+class ObjectTable:
+    """Inserted objects, one per scene; vertices and faces of all meshes in common arrays."""
+
+    mesh: wp.array[wp.uint64]
+    """0: nothing is inserted."""
+    place: wp.array[wp.vec3]
+    yaw: wp.array[float]
+    scale: wp.array[float]
+    sphere: wp.array[wp.vec4]
+    """Centre and radius of the mesh's bounding sphere, its own frame."""
+    first_face: wp.array[int]
+    normals: wp.array[wp.vec3]
+    """Normals of the corners, three per face, all meshes."""
+    albedos: wp.array[wp.vec3]
+    """One per face, all meshes."""
+    tint: wp.array[wp.vec3]
+    recolour: wp.array[float]
+    """0 the mesh's own albedo, 1 the tint alone."""
+    pattern: wp.array[float]
+    """Contrast of a checkered second tint [1]."""
+    roughness: wp.array[float]
+    metallic: wp.array[float]
+
+
+@wp.struct
+class Solid:
+    """A hit with a solid."""
+
+    index: int
+    t: float
+    normal: wp.vec3
+
+
+@wp.func
+def turned(v: wp.vec3, yaw: float) -> wp.vec3:
+    """Turn about +Y."""
+    c = wp.cos(yaw)
+    s = wp.sin(yaw)
+    return wp.vec3(c * v[0] + s * v[2], v[1], c * v[2] - s * v[0])
+
+
+@wp.func
+def solid_t(kind: int, o: wp.vec3, d: wp.vec3, half: wp.vec3) -> float:
+    """Return the distance to a solid at the origin from outside, `FAR` if it is missed."""
+    if kind == BOX:
+        near = float(-FAR)
+        far = float(FAR)
+        for k in range(3):
+            inverse = 1.0 / wp.where(wp.abs(d[k]) < 1.0e-8, 1.0e-8, d[k])
+            a = (-half[k] - o[k]) * inverse
+            b = (half[k] - o[k]) * inverse
+            near = wp.max(near, wp.min(a, b))
+            far = wp.min(far, wp.max(a, b))
+        if near < far and near > 0.0:
+            return near
+        return FAR
+    so = wp.cw_div(o, half)
+    sd = wp.cw_div(d, half)
+    if kind == CYLINDER:
+        # The curved side between both caps, and the upper cap; the lower one stands on the ground.
+        a = sd[0] * sd[0] + sd[2] * sd[2]
+        b = so[0] * sd[0] + so[2] * sd[2]
+        c = so[0] * so[0] + so[2] * so[2] - 1.0
+        best = float(FAR)
+        disc = b * b - a * c
+        if disc > 0.0 and a > 1.0e-12:
+            t = (-b - wp.sqrt(disc)) / a
+            y = so[1] + t * sd[1]
+            if t > 0.0 and wp.abs(y) < 1.0:
+                best = t
+        if sd[1] < 0.0:
+            t = (1.0 - so[1]) / sd[1]
+            x = so[0] + t * sd[0]
+            z = so[2] + t * sd[2]
+            if t > 0.0 and x * x + z * z < 1.0:
+                best = wp.min(best, t)
+        return best
+    a = wp.dot(sd, sd)
+    b = wp.dot(so, sd)
+    c = wp.dot(so, so) - 1.0
+    disc = b * b - a * c
+    if disc > 0.0:
+        t = (-b - wp.sqrt(disc)) / a
+        if t > 0.0:
+            return t
+    return FAR
+
+
+@wp.func
+def solid_normal(kind: int, p: wp.vec3, half: wp.vec3) -> wp.vec3:
+    """Return the outward normal of a solid at the origin in a point of its surface."""
+    q = wp.cw_div(p, half)
+    if kind == ELLIPSOID:
+        return wp.normalize(wp.cw_div(q, half))
+    if kind == CYLINDER:
+        if q[1] > 0.9999:
+            return wp.vec3(0.0, 1.0, 0.0)
+        return wp.normalize(wp.vec3(q[0] / half[0], 0.0, q[2] / half[2]))
+    a = wp.vec3(wp.abs(q[0]), wp.abs(q[1]), wp.abs(q[2]))
+    if a[0] >= a[1] and a[0] >= a[2]:
+        return wp.vec3(wp.sign(q[0]), 0.0, 0.0)
+    if a[1] >= a[2]:
+        return wp.vec3(0.0, wp.sign(q[1]), 0.0)
+    return wp.vec3(0.0, 0.0, wp.sign(q[2]))
+
+
+@wp.func
+def nearest_solid(solids: OccluderTable, scene: int, count: int, o: wp.vec3, d: wp.vec3) -> Solid:
+    """Return the nearest solid that a ray meets."""
+    hit = Solid()
+    hit.index = NO_HIT
+    hit.t = FAR
+    for k in range(count):
+        kind = solids.kind[scene, k]
+        if kind >= 0:
+            yaw = solids.yaw[scene, k]
+            half = solids.half[scene, k]
+            lo = turned(o - solids.centre[scene, k], -yaw)
+            ld = turned(d, -yaw)
+            t = solid_t(kind, lo, ld, half)
+            if t < hit.t:
+                hit.t = t
+                hit.index = k
+                hit.normal = turned(solid_normal(kind, lo + ld * t, half), yaw)
+    return hit
+
+
+@wp.func
+def is_open(solids: OccluderTable, scene: int, count: int, o: wp.vec3, d: wp.vec3) -> float:
+    """Return 1 if no solid stands in the way, else 0."""
+    for k in range(count):
+        kind = solids.kind[scene, k]
+        if kind >= 0:
+            yaw = solids.yaw[scene, k]
+            lo = turned(o - solids.centre[scene, k], -yaw)
+            if solid_t(kind, lo, turned(d, -yaw), solids.half[scene, k]) < FAR:
+                return 0.0
+    return 1.0
+
+
+@wp.func
+def misses_object(objects: ObjectTable, scene: int, o: wp.vec3, d: wp.vec3) -> float:
+    """Return 1 if the object does not stand in the way, else 0; ``o`` and ``d`` in its frame."""
+    sphere = objects.sphere[scene]
+    to = wp.vec3(sphere[0], sphere[1], sphere[2]) - o
+    along = wp.dot(to, d)
+    outside = wp.dot(to, to) - sphere[3] * sphere[3]
+    if outside > 0.0 and (along < 0.0 or along * along < outside):
+        return 1.0
+    if wp.mesh_query_ray_anyhit(objects.mesh[scene], o, d, 1.0e3):
+        return 0.0
+    return 1.0
+
+
+@wp.func
+def map_at(maps: wp.array3d[wp.vec3], index: int, d: wp.vec3) -> wp.vec3:
+    """Interpolate a map in a direction of its own frame."""
+    tap = bilinear_tap(direction_to_uv(d), maps.shape[1], maps.shape[2])
+    top = maps[index, tap.i0, tap.j0] * (1.0 - tap.wj) + maps[index, tap.i0, tap.j1] * tap.wj
+    low = maps[index, tap.i1, tap.j0] * (1.0 - tap.wj) + maps[index, tap.i1, tap.j1] * tap.wj
+    return top * (1.0 - tap.wi) + low * tap.wi
+
+
+@wp.func
+def into_map(lights: LightTable, scene: int, d: wp.vec3) -> wp.vec3:
+    """Turn a world direction into the frame of the light's map."""
+    return turned(wp.vec3(lights.mirror[scene] * d[0], d[1], d[2]), lights.yaw[scene])
+
+
+@wp.func
+def blurred(maps: MapTable, lights: LightTable, scene: int, d: wp.vec3, blur: float) -> wp.vec3:
+    """Return the light's map without its sun; blur 0 is the fine level, 2 the coarse one."""
+    m = into_map(lights, scene, d)
+    index = lights.map[scene]
+    low = map_at(maps.middle, index, m)
+    if blur < 1.0:
+        radiance = map_at(maps.fine, index, m) * (1.0 - blur) + low * blur
+    else:
+        share = wp.min(blur - 1.0, 1.0)
+        radiance = low * (1.0 - share) + map_at(maps.coarse, index, m) * share
+    return wp.cw_mul(radiance, lights.gain[scene])
+
+
+@wp.func
+def seen_sky(
+    maps: MapTable, lights: LightTable, ground: GroundTable, scene: int, d: wp.vec3
+) -> wp.vec3:
+    """Return what the camera sees where no surface is."""
+    panorama = ground.seen[scene]
+    if panorama >= 0:
+        m = into_map(lights, scene, d)
+        return wp.cw_mul(map_at(maps.seen, panorama, m), lights.gain[scene])
+    sigma = wp.max(lights.sun_sigma[scene], 0.005)
+    away = (1.0 - wp.dot(d, lights.sun_axis[scene])) / (sigma * sigma)
+    disc = lights.sun[scene] * (wp.exp(-away) / (2.0 * PI * sigma * sigma))
+    return blurred(maps, lights, scene, d, 0.0) + disc
+
+
+@wp.func
+def fbm(seed: wp.uint32, p: wp.vec2) -> float:
+    """Return noise of three octaves, about in [-1, 1]."""
+    total = float(0.0)
+    scale = float(1.0)
+    for _k in range(3):
+        total = total + wp.noise(seed, p * scale) / scale
+        scale = scale * 2.7
+    return total
+
+
+@wp.func
+def to_and_fro(x: float) -> float:
+    """Fold a number into [0, 1], back and forth, so that a repeated piece has no seams."""
+    return wp.abs(x - 2.0 * wp.floor(0.5 * x + 0.5))
+
+
+@wp.func
+def piece_of_panorama(maps: MapTable, panorama: int, place: wp.vec2, p: wp.vec2) -> wp.vec3:
+    """Return the albedo of a surface that a piece of a panorama's lower half is spread over.
+
+    Its radiance becomes an albedo between 0 and 1; what the sun drew on it stays, as stains.
+
+    Args:
+        maps: Holds the panoramas, of mean luminance 1.
+        panorama: Which of them.
+        place: Where the piece begins, in [0, 1]^2.
+        p: Point on the surface, in sizes of the piece.
+    """
+    height = maps.seen.shape[1]
+    width = maps.seen.shape[2]
+    side = float(height) * 0.22
+    x = (place[0] * float(width) + to_and_fro(p[0]) * side) % float(width)
+    y = float(height) * (0.56 + 0.16 * place[1]) + to_and_fro(p[1]) * side
+    column = wp.clamp(int(x), 0, width - 1)
+    row = wp.clamp(int(y), 0, height - 1)
+    t = maps.seen[panorama, row, column]
+    return wp.vec3(t[0] / (t[0] + 0.7), t[1] / (t[1] + 0.7), t[2] / (t[2] + 0.7))
+
+
+@wp.func
+def ground_albedo(maps: MapTable, ground: GroundTable, scene: int, p: wp.vec3) -> wp.vec3:
+    """Return the ground's albedo in a point."""
+    seed = wp.rand_init(17, scene)
+    size = ground.size[scene]
+    q = turned(p, ground.turn[scene]) / size
+    share = float(0.0)
+    pattern = ground.pattern[scene]
+    x = q[0] - wp.floor(q[0])
+    z = q[2] - wp.floor(q[2])
+    if pattern == TILES:
+        if x < 0.06 or z < 0.06:
+            share = 1.0
+    elif pattern == STRIPES:
+        if x < 0.12:
+            share = 1.0
+    elif pattern == PLANKS:
+        share = wp.randf(wp.rand_init(scene, int(wp.floor(q[0]))))
+    elif pattern == PHOTO:
+        place = wp.vec2(wp.randf(seed), wp.randf(seed))
+        return piece_of_panorama(maps, ground.texture[scene], place, wp.vec2(q[0], q[2]) * 0.3)
+    else:
+        share = wp.clamp(0.5 + 0.9 * fbm(seed, wp.vec2(q[0], q[2])), 0.0, 1.0)
+    base = ground.albedo[scene] * (1.0 - share) + ground.second[scene] * share
+    grain = wp.noise(seed, wp.vec2(q[0] * 9.0, q[2] * 9.0))
+    grain = grain + 0.6 * wp.noise(seed, wp.vec2(q[0] * 31.0, q[2] * 31.0))
+    return base * wp.clamp(1.0 + ground.roughen[scene] * grain, 0.2, 2.0)
+
+
+@wp.func
+def irradiance_among_solids(
+    lights: LightTable,
+    solids: OccluderTable,
+    scene: int,
+    solid_count: int,
+    first: int,
+    stride: int,
+    p: wp.vec3,
+    n: wp.vec3,
+    is_blocked: float,
+) -> wp.vec3:
+    """Return the irradiance that every ``stride``-th direction stands for.
+
+    Args:
+        lights: Which light.
+        solids: What stands in its way.
+        scene: Index of the scene.
+        solid_count: Solids per scene.
+        first: First direction.
+        stride: Step between directions.
+        p: Point, lifted off its surface.
+        n: Normal.
+        is_blocked: 1: solids cast shadows, 0: they do not.
+    """
+    total = wp.vec3(0.0, 0.0, 0.0)
+    for k in range(first, lights.direction.shape[1], stride):
+        d = lights.direction[scene, k]
+        cosine = wp.dot(n, d)
+        if cosine > 0.0:
+            if is_blocked == 0.0 or is_open(solids, scene, solid_count, p, d) > 0.0:
+                total = total + lights.flux[scene, k] * (cosine * float(stride))
+    count = float(lights.sun_direction.shape[1]) / float(stride)
+    for k in range(first, lights.sun_direction.shape[1], stride):
+        d = lights.sun_direction[scene, k]
+        cosine = wp.dot(n, d)
+        if cosine > 0.0:
+            if is_blocked == 0.0 or is_open(solids, scene, solid_count, p, d) > 0.0:
+                total = total + lights.sun[scene] * (cosine / count)
+    return total
+
+
+@wp.func
+def fresnel_mix(f0: wp.vec3, roughness: float, cosine: float) -> wp.vec3:
+    """Return the reflectance of GGX under an even light (Karis 2014, mobile approximation)."""
+    c0 = 1.0 - roughness
+    c1 = 0.0425 - 0.0275 * roughness
+    c2 = 1.04 - 0.572 * roughness
+    c3 = 0.022 * roughness - 0.04
+    a004 = wp.min(c0 * c0, wp.pow(2.0, -9.28 * cosine)) * c0 + c1
+    a = -1.04 * a004 + c2
+    b = 1.04 * a004 + c3
+    return f0 * a + wp.vec3(b, b, b)
+
+
+@wp.func
+def sun_highlight(
+    n: wp.vec3, wo: wp.vec3, wi: wp.vec3, f0: wp.vec3, roughness: float, sigma: float
+) -> wp.vec3:
+    """Return GGX's reflectance of the sun, widened by the sun's size (Heitz 2014, eq. 3 and 72)."""
+    alpha = wp.sqrt(roughness * roughness * roughness * roughness + sigma * sigma)
+    h = wp.normalize(wi + wo)
+    nh = wp.max(wp.dot(n, h), 0.0)
+    no = wp.max(wp.dot(n, wo), 1.0e-3)
+    ni = wp.max(wp.dot(n, wi), 1.0e-3)
+    a2 = alpha * alpha
+    q = nh * nh * (a2 - 1.0) + 1.0
+    density = a2 / (PI * q * q)
+    lambda_o = wp.sqrt(1.0 + a2 * (1.0 / (no * no) - 1.0))
+    lambda_i = wp.sqrt(1.0 + a2 * (1.0 / (ni * ni) - 1.0))
+    masking = 2.0 / (lambda_o + lambda_i)
+    c = 1.0 - wp.max(wp.dot(h, wo), 0.0)
+    c5 = c * c * c * c * c
+    fresnel = f0 * (1.0 - c5) + wp.vec3(c5, c5, c5)
+    return fresnel * (density * masking / (4.0 * no * ni))
+
+
+@wp.struct
+class Pixels:
+    """What is written, one value per pixel, all scenes."""
+
+    background: wp.array[wp.vec3]
+    """Radiance without the object."""
+    object: wp.array[wp.vec3]
+    """The object's radiance times its coverage."""
+    coverage: wp.array[float]
+    albedo: wp.array[wp.vec3]
+    """Times the coverage."""
+    normal: wp.array[wp.vec3]
+    """Camera frame (x right, y up, z toward the camera), times the coverage."""
+    ratio: wp.array[wp.vec3]
+    """Shadow ratio of what is not covered."""
+    solid: wp.array[float]
+    """Share that shows solids."""
+
+
+@wp.kernel
+def render_scenes(
+    width: int,
+    height: int,
+    side: int,
+    solid_count: int,
+    blur_min: wp.array[float],
+    views: ViewTable,
+    light: LightTable,
+    object_light: LightTable,
+    maps: MapTable,
+    solids: OccluderTable,
+    ground: GroundTable,
+    objects: ObjectTable,
+    out: Pixels,
+):
+    """Render a pixel of a scene from ``side`` times ``side`` points, each with its share of rays.
+
+    Args:
+        width: Of the picture [px].
+        height: Of the picture [px].
+        side: Rows and columns of points in a pixel.
+        solid_count: Solids per scene.
+        blur_min: Least blur of what an object reflects, by scene.
+        views: Cameras.
+        light: What lights the scene.
+        object_light: What lights the object and casts its shadow.
+        maps: Lat-long maps.
+        solids: What stands in the scene.
+        ground: What it stands on.
+        objects: What is inserted.
+        out: What is written.
+    """
+    thread = wp.tid()
+    scene = thread // (width * height)
+    pixel = thread % (width * height)
+    column = pixel % width
+    row = pixel // width
+    points = side * side
+    origin = views.origin[scene]
+    window = views.window[scene]
+    right = views.right[scene]
+    up = views.up[scene]
+    back = views.back[scene]
+    place = objects.place[scene]
+    turn = objects.yaw[scene]
+    scale = objects.scale[scene]
+    has_object = objects.mesh[scene] != wp.uint64(0)
+    background = wp.vec3(0.0, 0.0, 0.0)
+    inserted = wp.vec3(0.0, 0.0, 0.0)
+    albedo_sum = wp.vec3(0.0, 0.0, 0.0)
+    normal_sum = wp.vec3(0.0, 0.0, 0.0)
+    ratio_sum = wp.vec3(0.0, 0.0, 0.0)
+    covered = float(0.0)
+    solid_share = float(0.0)
+    for k in range(points):
+        across = (float(column) + (float(k % side) + 0.5) / float(side)) / float(width)
+        down = (float(row) + (float(k // side) + 0.5) / float(side)) / float(height)
+        d = wp.normalize(
+            right * (window[0] + across * window[2]) - up * (window[1] + down * window[3]) - back
+        )
+        # The scene itself.
+        ground_t = float(FAR)
+        if d[1] < -1.0e-4:
+            ground_t = -origin[1] / d[1]
+        hit = nearest_solid(solids, scene, solid_count, origin, d)
+        ground_point = origin + d * ground_t
+        lifted = ground_point + wp.vec3(0.0, 1.0e-4 * origin[1], 0.0)
+        shows_ground = ground_t < FAR and ground_t < hit.t
+        radiance = wp.vec3(0.0, 0.0, 0.0)
+        if hit.t < FAR and not shows_ground:
+            solid_share = solid_share + 1.0
+            p = origin + d * hit.t + hit.normal * (1.0e-3 * origin[1])
+            e = irradiance_among_solids(
+                light, solids, scene, solid_count, k, points, p, hit.normal, 1.0
+            )
+            albedo = solids.albedo[scene, hit.index]
+            if solids.texture[scene, hit.index] >= 0:
+                spread = 0.4 / wp.max(solids.half[scene, hit.index][1], 0.1 * origin[1])
+                state = wp.rand_init(hit.index, scene)
+                albedo = piece_of_panorama(
+                    maps, solids.texture[scene, hit.index],
+                    wp.vec2(wp.randf(state), wp.randf(state)),
+                    wp.vec2((p[0] + p[2]) * spread, p[1] * spread),
+                )  # fmt: skip
+            radiance = wp.cw_mul(albedo, e) / PI
+        elif shows_ground and ground.is_seen[scene] == 1:
+            n = wp.vec3(0.0, 1.0, 0.0)
+            e = irradiance_among_solids(
+                light, solids, scene, solid_count, k, points, lifted, n, 1.0
+            )
+            radiance = wp.cw_mul(ground_albedo(maps, ground, scene, ground_point), e) / PI
+            c = 1.0 + d[1]
+            gloss = ground.wetness[scene] * (0.02 + 0.98 * c * c * c * c * c)
+            radiance = radiance * (1.0 - gloss)
+            radiance = (
+                radiance + blurred(maps, light, scene, wp.vec3(d[0], -d[1], d[2]), 0.0) * gloss
+            )
+        else:
+            radiance = seen_sky(maps, light, ground, scene, d)
+            if shows_ground and solid_count > 0:
+                # The panorama's own ground, in the shadow of what was put there.
+                n = wp.vec3(0.0, 1.0, 0.0)
+                lit = irradiance_among_solids(
+                    light, solids, scene, solid_count, k, points, lifted, n, 1.0
+                )
+                all_of_it = irradiance_among_solids(
+                    light, solids, scene, solid_count, k, points, lifted, n, 0.0
+                )
+                radiance = wp.cw_mul(
+                    radiance, wp.cw_div(lit, all_of_it + wp.vec3(1.0e-9, 1.0e-9, 1.0e-9))
+                )
+        background = background + radiance
+        # The object.
+        is_covered = False
+        if has_object:
+            lo = turned(origin - place, -turn) / scale
+            ld = turned(d, -turn)
+            sphere = objects.sphere[scene]
+            to = wp.vec3(sphere[0], sphere[1], sphere[2]) - lo
+            along = wp.dot(to, ld)
+            if along * along > wp.dot(to, to) - sphere[3] * sphere[3]:
+                query = wp.mesh_query_ray(objects.mesh[scene], lo, ld, 1.0e3)
+                if query.result:
+                    is_covered = True
+                    covered = covered + 1.0
+                    face = objects.first_face[scene] + query.face
+                    shading = (
+                        objects.normals[3 * face] * query.u
+                        + objects.normals[3 * face + 1] * query.v
+                        + objects.normals[3 * face + 2] * (1.0 - query.u - query.v)
+                    )
+                    flat = query.normal
+                    if wp.dot(flat, ld) > 0.0:
+                        flat = -flat
+                    if wp.dot(shading, flat) < 0.0:
+                        shading = -shading
+                    local_n = wp.normalize(shading + flat * 1.0e-3)
+                    local_p = lo + ld * query.t
+                    start = local_p + flat * 2.0e-3
+                    n = turned(local_n, turn)
+                    base = objects.albedos[face] * (1.0 - objects.recolour[scene])
+                    base = base + objects.tint[scene] * objects.recolour[scene]
+                    checker = int(
+                        wp.floor(local_p[0] * 6.0)
+                        + wp.floor(local_p[1] * 6.0)
+                        + wp.floor(local_p[2] * 6.0)
+                    )
+                    if checker % 2 != 0:
+                        base = base * (1.0 - objects.pattern[scene])
+                    metallic = objects.metallic[scene]
+                    roughness = objects.roughness[scene]
+                    # Diffuse.
+                    e = wp.vec3(0.0, 0.0, 0.0)
+                    for j in range(k, object_light.direction.shape[1], points):
+                        w = object_light.direction[scene, j]
+                        cosine = wp.dot(n, w)
+                        if cosine > 0.0:
+                            if misses_object(objects, scene, start, turned(w, -turn)) > 0.0:
+                                e = e + object_light.flux[scene, j] * (cosine * float(points))
+                    sun_count = float(object_light.sun_direction.shape[1]) / float(points)
+                    sun_seen = float(0.0)
+                    for j in range(k, object_light.sun_direction.shape[1], points):
+                        w = object_light.sun_direction[scene, j]
+                        cosine = wp.dot(n, w)
+                        if cosine > 0.0:
+                            if misses_object(objects, scene, start, turned(w, -turn)) > 0.0:
+                                e = e + object_light.sun[scene] * (cosine / sun_count)
+                                sun_seen = sun_seen + cosine / sun_count
+                    shown = wp.cw_mul(base, e) * ((1.0 - metallic) / PI)
+                    # Specular.
+                    f0 = wp.vec3(0.04, 0.04, 0.04) * (1.0 - metallic) + base * metallic
+                    facing = wp.max(-wp.dot(n, d), 0.02)
+                    reflected = d + n * (2.0 * facing)
+                    blur = wp.max(2.5 * roughness, blur_min[scene])
+                    mirror = blurred(maps, object_light, scene, reflected, blur)
+                    if misses_object(objects, scene, start, turned(reflected, -turn)) == 0.0:
+                        mirror = wp.cw_mul(base, e) / PI
+                    shown = shown + wp.cw_mul(mirror, fresnel_mix(f0, roughness, facing))
+                    glint = sun_highlight(
+                        n, -d, object_light.sun_axis[scene], f0, roughness,
+                        object_light.sun_sigma[scene],
+                    )  # fmt: skip
+                    shown = shown + wp.cw_mul(glint, object_light.sun[scene]) * sun_seen
+                    inserted = inserted + shown
+                    albedo_sum = albedo_sum + base
+                    normal_sum = normal_sum + wp.vec3(
+                        wp.dot(n, right), wp.dot(n, up), wp.dot(n, back)
+                    )
+        if not is_covered:
+            shade = wp.vec3(1.0, 1.0, 1.0)
+            if has_object and shows_ground:
+                lit = wp.vec3(1.0e-9, 1.0e-9, 1.0e-9)
+                total = wp.vec3(1.0e-9, 1.0e-9, 1.0e-9)
+                start = turned(lifted - place, -turn) / scale
+                for j in range(k, object_light.direction.shape[1], points):
+                    w = object_light.direction[scene, j]
+                    if w[1] > 0.0:
+                        part = object_light.flux[scene, j] * (w[1] * float(points))
+                        total = total + part
+                        lit = lit + part * misses_object(objects, scene, start, turned(w, -turn))
+                sun_count = float(object_light.sun_direction.shape[1]) / float(points)
+                for j in range(k, object_light.sun_direction.shape[1], points):
+                    w = object_light.sun_direction[scene, j]
+                    if w[1] > 0.0:
+                        part = object_light.sun[scene] * (w[1] / sun_count)
+                        total = total + part
+                        lit = lit + part * misses_object(objects, scene, start, turned(w, -turn))
+                shade = wp.cw_div(lit, total)
+            ratio_sum = ratio_sum + shade
+    count = float(points)
+    open_count = wp.max(count - covered, 1.0)
+    out.background[thread] = background / count
+    out.object[thread] = inserted / count
+    out.coverage[thread] = covered / count
+    out.albedo[thread] = albedo_sum / count
+    out.normal[thread] = normal_sum / count
+    out.solid[thread] = solid_share / count
+    if covered < count:
+        out.ratio[thread] = ratio_sum / open_count
+    else:
+        out.ratio[thread] = wp.vec3(1.0, 1.0, 1.0)
+
+
+@wp.kernel
+def sun_reaches(
+    solid_count: int,
+    solids: OccluderTable,
+    point: wp.array[wp.vec3],
+    axis: wp.array[wp.vec3],
+    reached: wp.array[float],
+):
+    """Tell by scene whether no solid stands between a point and the sun: 1, else 0."""
+    scene = wp.tid()
+    reached[scene] = is_open(solids, scene, solid_count, point[scene], axis[scene])

@@ -1,0 +1,210 @@
+"""Train the networks that warpir ships: the embedded prior, and the regressor of the first light.
+
+    python -m warpir.train regressor --panoramas DIR --assets DIR --out DIR --minutes 9
+    python -m warpir.train prior --panoramas DIR --assets DIR --out DIR --minutes 9 \\
+        --total-minutes 18
+    python -m warpir.train prior ... --resume
+
+Scenes are rendered as they are needed; none is seen twice. A command stops after ``--minutes`` and
+``--resume`` goes on, until ``--total-minutes`` are used up. With torchrun the prior is trained on
+several cards. ``--without`` names panoramas and assets that must not be learned from; of those that
+``--validation`` names only the errors are looked at.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import sys
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from warpir.errors import ExitCode, InputError
+from warpir.program import run_program, say
+
+if TYPE_CHECKING:
+    import torch
+
+    from warpir.prior_images import SceneGenerator
+    from warpir.training_batches import PhotoBatch, PriorBatch
+
+MADE_UP_OBJECTS = 240
+"""Made-up objects to learn from."""
+VALIDATION_PICTURES = 768
+"""Of each kind."""
+VALIDATION_SEED = 10**6
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Run the command line; return the exit status."""
+    return run_program(_run, argv)
+
+
+def _parser() -> argparse.ArgumentParser:
+    parser = argparse.ArgumentParser("python -m warpir.train", description=_first_line())
+    parser.add_argument("network", choices=("prior", "regressor"))
+    parser.add_argument("--panoramas", type=Path, nargs="+", required=True, metavar="DIR")
+    parser.add_argument("--assets", type=Path, nargs="*", default=[], metavar="DIR")
+    parser.add_argument("--without", nargs="*", default=[], metavar="NAME")
+    parser.add_argument("--validation", nargs="*", default=[], metavar="NAME")
+    parser.add_argument("--out", type=Path, required=True, metavar="DIR")
+    parser.add_argument("--minutes", type=float, default=9.0)
+    parser.add_argument("--total-minutes", type=float, default=None)
+    parser.add_argument("--batch", type=int, default=None)
+    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--device", default=None)
+    parser.add_argument("--resume", action="store_true")
+    parser.add_argument("--no-compile", action="store_true", help="Do without torch.compile")
+    return parser
+
+
+def _first_line() -> str:
+    return (__doc__ or "").partition("\n")[0]
+
+
+def _run(arguments: list[str]) -> int:
+    options = _parser().parse_args(arguments)
+    panoramas = files_in(options.panoramas, (".hdr", ".exr"))
+    assets = files_in(options.assets, (".glb", ".gltf", ".obj", ".stl", ".ply"))
+    unknown = sorted({*options.without, *options.validation} - {p.stem for p in panoramas + assets})
+    if unknown:
+        say(f"notice: no panorama or asset is called {', '.join(unknown)}")
+
+    import torch
+
+    from warpir.prior_images import Mixture, SceneGenerator, Stock
+    from warpir.render import choose_device
+    from warpir.training_lights import load_panoramas
+    from warpir.training_meshes import make_meshes, read_meshes
+
+    rank = int(os.environ.get("LOCAL_RANK", "0"))
+    device = f"cuda:{rank}" if "LOCAL_RANK" in os.environ else choose_device(options.device)
+    kept_out = {*options.without, *options.validation}
+    learned = [p for p in panoramas if p.stem not in kept_out]
+    watched = [p for p in panoramas if p.stem in options.validation]
+    meshes = [*make_meshes(MADE_UP_OBJECTS, options.seed)]
+    meshes += read_meshes(p for p in assets if p.stem not in kept_out)
+    say(
+        f"device: {device}; {len(learned)} panoramas, {len(meshes)} objects; "
+        f"validation on {len(watched)} panoramas"
+    )
+    torch_device = torch.device("cpu" if device == "cpu" else device)
+    stock = Stock(meshes, load_panoramas(learned, torch_device), device)
+    scenes = SceneGenerator(stock, options.seed * 1000 + rank)
+    # What is validated on has other panoramas and other objects.
+    others = make_meshes(48, VALIDATION_SEED + options.seed)
+    unseen = Stock(others, load_panoramas(watched, torch_device), device)
+    made_up = Mixture(made_up=1.0, hybrid=0.0, proxies=0.0)
+    crops = Mixture(made_up=0.0, hybrid=0.0, proxies=0.0)
+    checks = {"procedural": SceneGenerator(unseen, VALIDATION_SEED, made_up)}
+    if watched:
+        checks["panoramas"] = SceneGenerator(unseen, VALIDATION_SEED + 1, crops)
+    record = {
+        "panoramas": [p.stem for p in learned],
+        "validation_panoramas": [p.stem for p in watched],
+        "kept_out": list(options.without),
+        "assets": [p.stem for p in assets if p.stem not in kept_out],
+        "made_up_objects": MADE_UP_OBJECTS,
+        "device": torch.cuda.get_device_name(torch_device) if device != "cpu" else "cpu",
+    }
+    train = _train_prior if options.network == "prior" else _train_regressor
+    result = train(options, scenes, checks, torch_device, record)
+    say(json.dumps(result))
+    return ExitCode.DONE
+
+
+def files_in(folders: Sequence[Path], suffixes: tuple[str, ...]) -> list[Path]:
+    """Return the files of these kinds in folders and the folders in them, sorted by name.
+
+    Raises:
+        InputError: A folder is not there.
+    """
+    found = []
+    for folder in folders:
+        if not folder.is_dir():
+            raise InputError(folder, "no such folder")
+        paths = (*folder.glob("*"), *folder.glob("*/*"))
+        found += [path for path in paths if path.suffix.lower() in suffixes]
+    return sorted(found, key=lambda path: path.stem)
+
+
+def _counted(
+    make: Callable[[int, int], Any],
+) -> Callable[[int, torch.Generator], Any]:
+    """Return a callable that gives new batches: it begins at an index that is drawn once."""
+    index: int | None = None
+
+    def batches(count: int, generator: torch.Generator) -> Any:
+        nonlocal index
+        if index is None:
+            import torch
+
+            drawn = torch.randint(2**30, (), generator=generator, device=generator.device)
+            index = int(drawn)
+        index += 1
+        return make(index, count)
+
+    return batches
+
+
+def _train_prior(
+    options: argparse.Namespace,
+    scenes: SceneGenerator,
+    checks: dict[str, SceneGenerator],
+    device: torch.device,
+    record: dict[str, Any],
+) -> dict[str, Any]:
+    from warpir.diffusion.train import TrainingSettings, train_prior
+
+    batch = options.batch or 256
+    validation: list[PriorBatch] = [
+        check.prior_batch(k, 128) for check in checks.values() for k in range(3)
+    ]
+    settings = TrainingSettings(batch=batch, compile=not options.no_compile)
+    return train_prior(
+        _counted(scenes.prior_batch),
+        options.out,
+        settings,
+        device,
+        options.minutes,
+        total_minutes=options.total_minutes or options.minutes,
+        resume=options.resume,
+        seed=options.seed,
+        validation=validation,
+        record=record,
+    )
+
+
+def _train_regressor(
+    options: argparse.Namespace,
+    scenes: SceneGenerator,
+    checks: dict[str, SceneGenerator],
+    device: torch.device,
+    record: dict[str, Any],
+) -> dict[str, Any]:
+    from warpir.regressor_training import TrainingSettings, train_regressor
+
+    validation: dict[str, list[PhotoBatch]] = {
+        name: [check.photo_batch(k, 128) for k in range(VALIDATION_PICTURES // 128)]
+        for name, check in checks.items()
+    }
+    settings = TrainingSettings(batch=options.batch or 256, compile=not options.no_compile)
+    end = train_regressor(
+        _counted(scenes.photo_batch),
+        validation,
+        options.out,
+        settings,
+        device,
+        options.minutes,
+        options.total_minutes or options.minutes,
+        resume=options.resume,
+        seed=options.seed,
+        record=record,
+    )
+    return vars(end)
+
+
+if __name__ == "__main__":
+    sys.exit(main())
