@@ -148,7 +148,7 @@ def training_tokens(
         noun: Index into `NOUNS`, int64, shape [B]; -1, here and below: not said.
         setting: Index into `SETTINGS`, shape [B].
         weather: Index into `WEATHERS`, shape [B].
-        kind: Index into `KINDS`, shape [B].
+        kind: Index into `KINDS`, shape [B]; -1: mismatched, not said in what.
         generator: Leaves out words and prompts at random (`DROP_ATTRIBUTE` and so on), on the
             tensors' device; None: every word is said.
 
@@ -156,7 +156,7 @@ def training_tokens(
         int64, shape [B, `TOKEN_COUNT`].
     """
     device, count = noun.device, len(noun)
-    mismatched = kind > 0
+    mismatched = kind != 0
     judgement = torch.where(mismatched, _IDS["mismatched"], _IDS["consistent"])
     ids = torch.stack(
         [
@@ -169,7 +169,7 @@ def training_tokens(
         dim=1,
     )
     said = torch.stack(
-        [torch.ones_like(mismatched), mismatched, noun >= 0, setting >= 0, weather >= 0], dim=1
+        [torch.ones_like(mismatched), kind > 0, noun >= 0, setting >= 0, weather >= 0], dim=1
     )
     if generator is not None:
         u = torch.rand(count, 6, device=device, generator=generator)

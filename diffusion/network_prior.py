@@ -373,7 +373,7 @@ class NetworkPrior(ABC):
 
     def _exact_convolutions(self) -> AbstractContextManager[None]:
         """Keep cuDNN from rounding a UNet in fp32 to TF32, which has no more bits than fp16."""
-        return _no_tf32() if self.unet_dtype is torch.float32 else contextlib.nullcontext()
+        return no_tf32() if self.unet_dtype is torch.float32 else contextlib.nullcontext()
 
     def _check_adapters(self, names: Sequence[str | None]) -> None:
         unknown = {name for name in names if name is not None} - self.adapters
@@ -435,7 +435,8 @@ class NetworkPrior(ABC):
 
 
 @contextmanager
-def _no_tf32() -> Iterator[None]:
+def no_tf32() -> Iterator[None]:
+    """Keep cuDNN from rounding fp32 to TF32 within this context."""
     before = torch.backends.cudnn.allow_tf32
     torch.backends.cudnn.allow_tf32 = False
     try:
