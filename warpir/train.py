@@ -27,7 +27,7 @@ from warpir.program import run_program, say
 if TYPE_CHECKING:
     import torch
 
-    from warpir.prior_images import SceneGenerator
+    from warpir.prior_images import Stock
     from warpir.training_batches import PhotoBatch, PriorBatch
 
 MADE_UP_OBJECTS = 240
@@ -74,7 +74,7 @@ def _run(arguments: list[str]) -> int:
 
     import torch
 
-    from warpir.prior_images import Mixture, SceneGenerator, Stock
+    from warpir.prior_images import Stock
     from warpir.render import choose_device
     from warpir.training_lights import load_panoramas
     from warpir.training_meshes import make_meshes, read_meshes
@@ -86,21 +86,18 @@ def _run(arguments: list[str]) -> int:
     watched = [p for p in panoramas if p.stem in options.validation]
     meshes = [*make_meshes(MADE_UP_OBJECTS, options.seed)]
     meshes += read_meshes(p for p in assets if p.stem not in kept_out)
-    say(
-        f"device: {device}; {len(learned)} panoramas, {len(meshes)} objects; "
-        f"validation on {len(watched)} panoramas"
-    )
+    if is_first():
+        say(
+            f"device: {device}; {len(learned)} panoramas, {len(meshes)} objects; "
+            f"validation on {len(watched)} panoramas"
+        )
     torch_device = torch.device("cpu" if device == "cpu" else device)
-    stock = Stock(meshes, load_panoramas(learned, torch_device), device)
-    scenes = SceneGenerator(stock, options.seed * 1000 + rank)
     # What is validated on has other panoramas and other objects.
     others = make_meshes(48, VALIDATION_SEED + options.seed)
-    unseen = Stock(others, load_panoramas(watched, torch_device), device)
-    made_up = Mixture(made_up=1.0, hybrid=0.0, proxies=0.0)
-    crops = Mixture(made_up=0.0, hybrid=0.0, proxies=0.0)
-    checks = {"procedural": SceneGenerator(unseen, VALIDATION_SEED, made_up)}
-    if watched:
-        checks["panoramas"] = SceneGenerator(unseen, VALIDATION_SEED + 1, crops)
+    stocks = (
+        Stock(meshes, load_panoramas(learned, torch_device), device),
+        Stock(others, load_panoramas(watched, torch_device), device),
+    )
     record = {
         "panoramas": [p.stem for p in learned],
         "validation_panoramas": [p.stem for p in watched],
@@ -110,8 +107,9 @@ def _run(arguments: list[str]) -> int:
         "device": torch.cuda.get_device_name(torch_device) if device != "cpu" else "cpu",
     }
     train = _train_prior if options.network == "prior" else _train_regressor
-    result = train(options, scenes, checks, torch_device, record)
-    say(json.dumps(result))
+    result = train(options, stocks, options.seed * 1000 + rank, torch_device, record)
+    if is_first():
+        say(json.dumps(result))
     return ExitCode.DONE
 
 
@@ -151,45 +149,83 @@ def _counted(
 
 def _train_prior(
     options: argparse.Namespace,
-    scenes: SceneGenerator,
-    checks: dict[str, SceneGenerator],
+    stocks: tuple[Stock, Stock],
+    seed: int,
     device: torch.device,
     record: dict[str, Any],
 ) -> dict[str, Any]:
-    from warpir.diffusion.train import TrainingSettings, train_prior
+    from warpir.diffusion.train import TrainSettings, export_prior, train_prior
+    from warpir.prior_images import Mixture, SceneGenerator
 
-    batch = options.batch or 256
-    validation: list[PriorBatch] = [
-        check.prior_batch(k, 128) for check in checks.values() for k in range(3)
-    ]
-    settings = TrainingSettings(batch=batch, compile=not options.no_compile)
-    return train_prior(
-        _counted(scenes.prior_batch),
+    learned, unseen = stocks
+
+    def drawn(mixture: Mixture) -> list[PriorBatch]:
+        scenes = SceneGenerator(unseen, VALIDATION_SEED, mixture)
+        return [scenes.prior_batch(k, 128) for k in range(3)]
+
+    kinds = {"procedural": {"made_up": 1.0, "hybrid": 0.0}}
+    if unseen.panoramas.panorama_count:
+        kinds["panoramas"] = {"made_up": 0.0, "hybrid": 0.0}
+    validation = {name: drawn(Mixture(**shares)) for name, shares in kinds.items()}
+    pairs = {
+        name: [
+            *zip(
+                drawn(Mixture(**shares, mismatched=0.0)),
+                drawn(Mixture(**shares, mismatched=1.0)),
+                strict=True,
+            )
+        ]
+        for name, shares in kinds.items()
+    }
+    settings = TrainSettings(batch=options.batch or 256, compile=not options.no_compile)
+    progress = train_prior(
+        _counted(SceneGenerator(learned, seed).prior_batch),
         options.out,
         settings,
         device,
         options.minutes,
-        total_minutes=options.total_minutes or options.minutes,
+        options.total_minutes or options.minutes,
         resume=options.resume,
         seed=options.seed,
         validation=validation,
-        record=record,
+        pairs=pairs,
+        say=say if is_first() else _nobody,
     )
+    if is_first():
+        export_prior(options.out, options.out / "prior.safetensors", record)
+    return {"step": progress.step, "samples": progress.samples, "seconds": progress.seconds}
+
+
+def is_first() -> bool:
+    """Return whether this process is the one that talks and writes."""
+    return os.environ.get("RANK", "0") == "0"
+
+
+def _nobody(text: str) -> None:
+    """Take what the other processes would say."""
 
 
 def _train_regressor(
     options: argparse.Namespace,
-    scenes: SceneGenerator,
-    checks: dict[str, SceneGenerator],
+    stocks: tuple[Stock, Stock],
+    seed: int,
     device: torch.device,
     record: dict[str, Any],
 ) -> dict[str, Any]:
+    from warpir.prior_images import Mixture, SceneGenerator
     from warpir.regressor_training import TrainingSettings, train_regressor
 
-    validation: dict[str, list[PhotoBatch]] = {
-        name: [check.photo_batch(k, 128) for k in range(VALIDATION_PICTURES // 128)]
-        for name, check in checks.items()
-    }
+    learned, unseen = stocks
+    # Fewer panorama crops than the prior sees: they are few places, and could be learned by heart.
+    scenes = SceneGenerator(learned, seed, Mixture(made_up=0.5, hybrid=0.25))
+
+    def drawn(**shares: float) -> list[PhotoBatch]:
+        made = SceneGenerator(unseen, VALIDATION_SEED, Mixture(**shares, proxies=0.0))
+        return [made.photo_batch(k, 128) for k in range(VALIDATION_PICTURES // 128)]
+
+    validation = {"procedural": drawn(made_up=1.0, hybrid=0.0)}
+    if unseen.panoramas.panorama_count:
+        validation["panoramas"] = drawn(made_up=0.0, hybrid=0.0)
     settings = TrainingSettings(batch=options.batch or 256, compile=not options.no_compile)
     end = train_regressor(
         _counted(scenes.photo_batch),
