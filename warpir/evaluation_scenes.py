@@ -26,7 +26,7 @@ from warpir.errors import InputError
 from warpir.files import read_envmap
 from warpir.light import Light, resize_map, rotate_map, summarize
 from warpir.panorama_crop import crop_camera, crop_radiance, expose
-from warpir.placement import place_asset, point_on_ground, upright_plane
+from warpir.placement import Placement, place_asset, point_on_ground, upright_plane
 
 FloatArray = NDArray[np.float32]
 Float64Array = NDArray[np.float64]
@@ -117,7 +117,7 @@ class Place:
     photo: FloatArray
     """Display-encoded, 8-bit codes as floats in [0, 1], shape [H, W, 3]."""
     exposure: float
-    """What brings the panorama to photo-linear radiance [EV]."""
+    """Photo-linear radiance over the panorama's [1]."""
     response: str
     """A key of `RESPONSES`."""
     radiance: FloatArray
@@ -128,7 +128,7 @@ class Place:
     @cached_property
     def texels(self) -> FloatArray:
         """The true light, world frame, photo-linear, shape [512, 1024, 3]."""
-        return (self.radiance * np.float32(2.0**self.exposure)).astype(np.float32)
+        return (self.radiance * np.float32(self.exposure)).astype(np.float32)
 
     @cached_property
     def photo_lin(self) -> FloatArray:
@@ -162,15 +162,17 @@ class Subject:
     place: Place
     asset: Asset
     """With the materials of `material`."""
+    asset_path: Path
+    """The file it was read from."""
     material: str
     """A key of `MATERIALS`."""
-    asset_to_world: Float64Array
-    """Rotation, uniform scale and translation, column vectors [m], shape [4, 4]."""
+    placement: Placement
+    """Where it stands: on y = 0."""
 
     @property
     def name(self) -> str:
         """Place, asset and material."""
-        return f"{self.place.name}-{Path(self.asset.name).stem}-{self.material}"
+        return f"{self.place.name}-{self.asset_path.stem}-{self.material}"
 
 
 def find_files(paths: Sequence[Path], suffixes: Sequence[str], where: str) -> list[Path]:
@@ -268,7 +270,7 @@ class Places:
         made = []
         for k in range(number):
             place = self._place(k, *next(self._panoramas))
-            made.append((place, self._stand(place, next(self._subjects)[1])))
+            made.append((place, self._stand(place, *next(self._subjects))))
         return made
 
     def _place(self, k: int, path: Path, panorama: FloatArray) -> Place:
@@ -281,10 +283,10 @@ class Places:
         seen = crop_radiance(panorama, camera)
         if not seen.any():
             raise InputError(path, f"all black toward azimuth {azimuth:g} degrees")
-        display, exposure = expose(seen)
+        display, ev = expose(seen)
+        exposure = 2.0**ev
         if self.response != "gamma":
-            shown = RESPONSES[self.response].show(seen * 2.0**exposure)
-            display = linear_to_gamma(shown)
+            display = linear_to_gamma(RESPONSES[self.response].show(seen * exposure))
         photo = (np.round(255.0 * display) / 255.0).astype(np.float32)
         return Place(
             name=f"{k:03d}-{path.stem}",
@@ -299,7 +301,7 @@ class Places:
             seed=seed,
         )
 
-    def _stand(self, place: Place, asset: Asset) -> list[Subject]:
+    def _stand(self, place: Place, path: Path, asset: Asset) -> list[Subject]:
         rng = np.random.default_rng([3, *place.seed])
         camera = place.camera
         horizon = camera.cy + camera.fy * np.tan(np.radians(place.pitch))
@@ -315,7 +317,7 @@ class Places:
         size = _largest(low, high, camera, stand, yaw, share)
         placement = place_asset(low, high, camera, at=at, rotate_y=yaw, size=size)
         return [
-            Subject(place, with_surface(asset, factors), name, placement.asset_to_world)
+            Subject(place, with_surface(asset, factors), path, name, placement)
             for name, factors in MATERIALS.items()
         ]
 

@@ -1,0 +1,60 @@
+"""One picture of many scenes: photo, ours, truth and their difference, the worst first."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from PIL import Image, ImageDraw
+
+Codes = NDArray[np.uint8]
+FloatArray = NDArray[np.float32]
+
+DIFFERENCE_GAIN = 4.0
+"""Factor on the difference, round mid grey."""
+CAPTION = 14
+"""Height of the line above each scene [px]."""
+COLUMNS = ("photo", "{row}", "truth", "4 x (difference) + grey")
+
+
+@dataclass(frozen=True)
+class Panel:
+    """One scene of the sheet, 8-bit codes, shape [H, W, 3] each."""
+
+    name: str
+    error: float
+    """What the scenes are sorted by."""
+    photo: Codes
+    image: Codes
+    truth: Codes
+
+
+def to_codes(picture: FloatArray) -> Codes:
+    """Return a display-encoded picture as 8-bit codes."""
+    codes: Codes = np.round(255.0 * np.clip(picture, 0.0, 1.0)).astype(np.uint8)
+    return codes
+
+
+def contact_sheet(panels: Sequence[Panel], row: str, count: int = 40) -> Codes:
+    """Return the sheet, worst scenes first.
+
+    Args:
+        panels: All of one size.
+        row: Whose pictures they are.
+        count: Most scenes that are shown.
+    """
+    strips = []
+    for panel in sorted(panels, key=lambda p: -p.error)[:count]:
+        width = panel.photo.shape[1]
+        difference = panel.image.astype(np.float32) - panel.truth.astype(np.float32)
+        shown = np.clip(128.0 + DIFFERENCE_GAIN * difference, 0.0, 255.0).astype(np.uint8)
+        caption = Image.new("RGB", (4 * width, CAPTION), "white")
+        draw = ImageDraw.Draw(caption)
+        for k, words in enumerate(COLUMNS):
+            text = words.format(row=row)
+            text = f"{text}: {panel.name}, RMSE of the box {panel.error:.4f}" if k == 0 else text
+            draw.text((k * width + 2, 1), text, fill="black")
+        pictures = np.concatenate([panel.photo, panel.image, panel.truth, shown], axis=1)
+        strips += [np.asarray(caption), pictures]
+    sheet: Codes = np.concatenate(strips, axis=0)
+    return sheet
