@@ -76,10 +76,11 @@ def test_angles_are_those_between_the_axes(azimuth: float, elevation: float) -> 
     assert errors["directional_deg"] == pytest.approx(expected, abs=0.5)
 
 
-def test_azimuth_and_elevation_errors_are_apart_signed_and_wrap() -> None:
-    errors = light_errors(sky(-170.0, 50.0), sky(170.0, 20.0))
-    assert errors["azimuth_error_deg"] == pytest.approx(20.0, abs=TEXEL_DEG)
-    assert errors["elevation_error_deg"] == pytest.approx(30.0, abs=TEXEL_DEG)
+def test_azimuth_and_elevation_errors_are_apart_absolute_and_wrap() -> None:
+    lights = sky(-170.0, 50.0), sky(170.0, 20.0)
+    for errors in (light_errors(*lights), light_errors(*reversed(lights))):
+        assert errors["azimuth_error_deg"] == pytest.approx(20.0, abs=TEXEL_DEG)
+        assert errors["elevation_error_deg"] == pytest.approx(30.0, abs=TEXEL_DEG)
 
 
 def test_blob_centre_is_not_drawn_by_a_second_light_but_the_bright_centre_is() -> None:
@@ -167,6 +168,25 @@ def test_lights_are_found_across_the_seam_brightest_first() -> None:
     assert len(found) == 3
     for direction, axis in zip(found, (axes[1], axes[2], axes[0]), strict=True):
         assert np.degrees(oracles.angle_between(direction, axis)) < 0.5
+
+
+@pytest.mark.parametrize(
+    ("first", "second", "count"),
+    [
+        ((60, 255), (60, 0), 1),  # over the seam
+        ((60, 255), (61, 0), 1),
+        ((0, 10), (0, 138), 1),  # over the pole
+        ((127, 200), (127, 72), 1),
+        ((60, 10), (60, 12), 2),
+        ((0, 10), (0, 100), 2),
+    ],
+)
+def test_texels_that_touch_on_the_sphere_are_one_light(
+    first: tuple[int, int], second: tuple[int, int], count: int
+) -> None:
+    texels = np.zeros((128, 256, 3))
+    texels[first] = texels[second] = 1.0
+    assert len(lights_of(texels)) == count
 
 
 def test_directional_error_is_the_symmetric_mean_of_the_nearest() -> None:

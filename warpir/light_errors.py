@@ -96,8 +96,8 @@ def light_errors(predicted: FloatArray, true: FloatArray) -> dict[str, float]:
         * ``peak_angle_deg``, ``bright_angle_deg``, ``blob_angle_deg``: angle between the brightest
           texels, between the luminance centroids above the 95th percentile of the sphere, and
           between the centroids of the connected texels above half the peak [deg].
-        * ``azimuth_error_deg``, ``elevation_error_deg``: of the brightest texel, signed, predicted
-          minus true [deg]; absent where either map has no direction.
+        * ``azimuth_error_deg``, ``elevation_error_deg``: of the brightest texel, absolute [deg];
+          absent where either map has no direction.
         * ``log_sun_sky_ratio_error``: signed, of the natural logarithm of the flux within 20
           degrees of the centroid of the true map's blob over the flux of the rest, in both maps.
         * ``log_own_sun_sky_ratio_error``: the same with each map's cap around its own blob, so
@@ -127,8 +127,9 @@ def light_errors(predicted: FloatArray, true: FloatArray) -> dict[str, float]:
     if found.peak is not None and wanted.peak is not None:
         azimuth, elevation = angles_from_axis(found.peak)
         true_azimuth, true_elevation = angles_from_axis(wanted.peak)
-        errors["azimuth_error_deg"] = (azimuth - true_azimuth + 180.0) % 360.0 - 180.0
-        errors["elevation_error_deg"] = elevation - true_elevation
+        turn = (azimuth - true_azimuth + 180.0) % 360.0 - 180.0
+        errors["azimuth_error_deg"] = abs(turn)
+        errors["elevation_error_deg"] = abs(elevation - true_elevation)
     shared = _sun_axis(wanted.blob, found.blob)
     errors["log_sun_sky_ratio_error"] = _log_ratio(lum[0], shared) - _log_ratio(lum[1], shared)
     errors["log_own_sun_sky_ratio_error"] = _log_ratio(
