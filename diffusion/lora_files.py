@@ -408,9 +408,16 @@ def put_weights(
 
 
 def save_lora(
-    lora: Lora, folder: str | Path, cross_attention: int, prediction_type: str, trigger: str
-) -> tuple[Path, Path]:
+    lora: Lora,
+    folder: str | Path,
+    cross_attention: int,
+    prediction_type: str,
+    trigger: str,
+    base: str = "stable-diffusion",
+) -> tuple[Path, ...]:
     """Write ``lora_diffusers.safetensors`` and ``lora_kohya.safetensors``, always the same bytes.
+
+    kohya's form knows versions of Stable Diffusion alone: for another base it is not written.
 
     Args:
         lora: What to write; exact at any alpha.
@@ -419,6 +426,7 @@ def save_lora(
             1024 in 2.
         prediction_type: Of the base model's schedule.
         trigger: Words that call up what was learnt.
+        base: Name of the prior that it belongs to.
 
     Raises:
         OSError: A file cannot be written; older ones are still whole.
@@ -443,6 +451,8 @@ def save_lora(
         ),
     )
 
+    if base != "stable-diffusion":
+        return (diffusers_file,)
     named = {f"unet.{key}": value for key, value in lora.weights.items()}
     kohya = convert_state_dict_to_kohya(named)
     for layer, alpha in lora.alphas.items():

@@ -268,7 +268,8 @@ class Objective(nn.Module):
         )
         error = (predicted.float() - (a * noise - s * latents)).square()
         weight = pixel_weight(image, background, gbuffer[:, :1], self.settings)
-        return (weight * error).mean(dim=(1, 2, 3))
+        losses: Tensor = (weight * error).mean(dim=(1, 2, 3))
+        return losses
 
 
 def pixel_weight(
@@ -315,9 +316,11 @@ class _Training:
             average = copy.deepcopy(network)
         self.progress.runs += 1
         self.first_step = self.progress.step
-        layout = {"memory_format": torch.channels_last} if is_cuda else {}
-        self.network = network.to(device, **layout).train()
-        self.average = average.to(device, **layout).requires_grad_(False).eval()
+        self.network = network.to(device).train()
+        self.average = average.to(device).requires_grad_(False).eval()
+        if is_cuda:
+            for each in (self.network, self.average):
+                each.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
         self.parameters = list(self.network.parameters())
         self.averages = list(self.average.parameters())
         objective: Any = Objective(self.network, settings)
