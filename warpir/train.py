@@ -1,7 +1,7 @@
-"""Train the networks that warpir ships: the embedded prior, and the regressor of the first light.
+r"""Train the networks that warpir ships: the embedded prior, and the regressor of the first light.
 
     python -m warpir.train regressor --panoramas DIR --assets DIR --out DIR --minutes 9
-    python -m warpir.train prior --panoramas DIR --assets DIR --out DIR --minutes 9 \\
+    python -m warpir.train prior --panoramas DIR --assets DIR --out DIR --minutes 9 \
         --total-minutes 18
     python -m warpir.train prior ... --resume
 
