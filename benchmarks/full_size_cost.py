@@ -411,8 +411,8 @@ def measure(config: InsertConfig, model: Path, room: Path, device: wp.Device) ->
         "batch": {
             "class_images": 2 * config.class_batch,
             "lora": 1 + config.lora_class_batch,
-            "unet": len(loop.guide.terms) * config.noises,
-            "vae": config.noises,
+            "unet": len(loop.guide.terms) * loop.guide.settings.noises,
+            "vae": loop.guide.settings.noises,
         },
         "settings": {
             "class_images": config.class_images,

@@ -15,7 +15,7 @@ from __future__ import annotations
 import math
 from collections import deque
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from statistics import median
 from typing import Any, Protocol, cast
 
@@ -130,13 +130,18 @@ class Coefficients:
     """Null and negative terms have the adapter too."""
 
 
-def coefficients(settings: GuidanceSettings) -> Coefficients:
+def coefficients(settings: GuidanceSettings, has_adapter: bool = False) -> Coefficients:
     """Return the row of a loss (DiPIR, eq. 7 and 8, figure S3; CSD: arXiv 2310.19415).
+
+    Args:
+        settings: Name the loss.
+        has_adapter: Whether there is one; sds-good-bad does with and without.
 
     Raises:
         ValueError: The loss has no row.
     """
     g = settings.guidance_scale
+    good = {"k_p": 3.0} if has_adapter else {"k_c": 3.0}
     rows = {
         "lds": Coefficients(k_p=1.0, k_0=-1.0),
         "sds": Coefficients(k_p=g, k_0=1.0 - g, k_e=-1.0, null_adapter=True),
@@ -144,6 +149,9 @@ def coefficients(settings: GuidanceSettings) -> Coefficients:
         "csd": Coefficients(k_c=1.0, k_0=-1.0),
         "lds-lora-both": Coefficients(k_p=1.0, k_0=-1.0, null_adapter=True),
         "lds-negative": Coefficients(k_p=1.0, k_n=-1.0),
+        "good-bad": Coefficients(k_c=1.0, k_n=-1.0),
+        # SDS without a null term, and twice good - bad.
+        "sds-good-bad": Coefficients(**good, k_n=-2.0, k_e=-1.0),
     }
     if settings.loss not in rows:
         names = ", ".join([*rows, DATASET_UPDATE])
@@ -158,6 +166,8 @@ class Term:
     scale: float
     prompt: str
     adapter: str | None
+    keeps_background: bool = True
+    """Whether it sees the photo."""
 
 
 def terms_of(settings: GuidanceSettings, condition: Condition, adapter: str | None) -> list[Term]:
@@ -168,16 +178,17 @@ def terms_of(settings: GuidanceSettings, condition: Condition, adapter: str | No
     Raises:
         ValueError: The loss is unknown, or its adapter is missing.
     """
-    row = coefficients(settings)
+    row = coefficients(settings, adapter is not None)
     if adapter is None and (row.k_p or row.null_adapter):
         raise ValueError(f"loss: {settings.loss} needs an adapter; csd and sds-base do without")
     other = adapter if row.null_adapter else None
+    keeps = settings.null_background == "keep"
     negative_prompt = condition.negative_prompt or settings.negative_prompt
     terms = [
         Term(row.k_p, condition.prompt, adapter),
         Term(row.k_c, condition.base_prompt or settings.base_prompt or condition.prompt, None),
-        Term(row.k_0, settings.null_prompt, other),
-        Term(row.k_n, negative_prompt, other),
+        Term(row.k_0, settings.null_prompt, other, keeps),
+        Term(row.k_n, negative_prompt, other, keeps),
     ]
     return [term for term in terms if term.scale]
 
@@ -293,8 +304,9 @@ class Guidance:
         adapter: str | None,
     ) -> None:
         self.prior, self.condition, self.settings = prior, condition, settings
+        self.mask, self.adapter = mask, adapter
         self.box, self.steps, self.seed = box_of(mask), steps, seed
-        self.row = coefficients(settings)
+        self.row = coefficients(settings, adapter is not None)
         self.terms = terms_of(settings, condition, adapter)
         self.embeddings = prior.embed([term.prompt for term in self.terms])
         self.gate = GradientGate(settings.gradient_clip)
@@ -330,6 +342,17 @@ class Guidance:
         (d_image,) = torch.autograd.grad(crops.latents, leaf, residual / scale)
         return self.gate.passed(d_image * scale.to(d_image))
 
+    def with_loss(self, loss: str) -> Guidance:
+        """Return the same guidance with another loss.
+
+        Raises:
+            ValueError: The loss is unknown, or needs an adapter.
+        """
+        other = replace(self.settings, loss=loss)
+        return Guidance(
+            self.prior, self.condition, other, self.mask, self.steps, self.seed, self.adapter
+        )
+
     @torch.no_grad()
     def score(
         self, image: Tensor, seed: int | None = None, pairs: int = PAIR_COUNT
@@ -357,6 +380,46 @@ class Guidance:
             scores.append((crops.weight * errors).sum(dim=(1, 2, 3)))
         score = float(torch.cat(scores).mean())
         return score if math.isfinite(score) else None
+
+    @torch.no_grad()
+    def work(self, start: Tensor, middle: Tensor, end: Tensor, draws: Sequence[int]) -> list[float]:
+        """Return how far a short way between two pictures leads uphill, by draw.
+
+        ``< w(t) delta, latents(end) - latents(start) >`` with the residual halfway: added up along
+        a path, and averaged over draws, this is what the potential rises by whose gradient the
+        guidance is. A draw is a time of the run's own distribution, a noise and a crop.
+
+        Args:
+            start: Display-encoded, in [0, 1], shape [1, 3, H, W].
+            middle: Halfway, same shape.
+            end: Same shape.
+            draws: Seeds; none of them is a step's.
+        """
+        s = self.settings
+        generators = [generator_of(self.seed, "work", draw) for draw in draws]
+        found: list[float] = []
+        for k in range(0, len(draws), s.noises):
+            batch = generators[k : k + s.noises]
+            t = torch.cat([self._time_of_a_run(g) for g in batch])
+            # Each picture meets the same crops and noises.
+            states = [g.get_state() for g in batch]
+            crops = []
+            for image in (middle, start, end):
+                for g, state in zip(batch, states, strict=True):
+                    g.set_state(state)
+                crops.append(self._noisy_crops(image, t, batch))
+            residual = crops[0].weight * self._delta(crops[0], self._predictions(crops[0]))
+            way = (crops[2].latents - crops[1].latents).double()
+            found += (residual.double() * way).sum(dim=(1, 2, 3)).tolist()
+        return found
+
+    def _time_of_a_run(self, generator: torch.Generator) -> Tensor:
+        """Return a time as some step of the run draws it, shape [1]."""
+        s = self.settings
+        u_step, u_time = torch.rand(2, generator=generator).tolist()
+        step = min(int(u_step * self.steps), max(self.steps - 1, 0))
+        low, high = time_range(step, self.steps, s.time_min, s.time_max, s.time_max_end)
+        return torch.tensor([low + (high - low) * u_time])
 
     @torch.no_grad()
     def ensure_precision(self, image: Tensor) -> float | None:
@@ -436,6 +499,7 @@ class Guidance:
         def repeated(per_noise: Tensor) -> Tensor:
             return per_noise.repeat(term_count, *[1] * (per_noise.ndim - 1))
 
+        keeps = [term.keeps_background for term in self.terms for _ in range(noise_count)]
         predicted = self.prior.predict(
             repeated(crops.latents_noisy),
             repeated(crops.t),
@@ -443,6 +507,7 @@ class Guidance:
             [term.adapter for term in self.terms for _ in range(noise_count)],
             None if crops.background is None else repeated(crops.background),
             None if crops.gbuffer is None else repeated(crops.gbuffer),
+            *(() if all(keeps) else (keeps,)),
         )
         return predicted.view(term_count, *crops.noise.shape)
 

@@ -1,7 +1,8 @@
 """What a user may choose about the diffusion model; plain values, importable without torch.
 
 Each field is one flag of `warpir.insert`, and the line below it is its ``--help``. Defaults are the
-authors' (DiPIR, Liang et al. 2024) where they state one, else ours.
+authors' (DiPIR, Liang et al. 2024) where they state one, else ours. What is None is open: the
+prior that guides decides it (`warpir.config.PRIOR_DEFAULTS`).
 """
 
 from dataclasses import dataclass
@@ -31,7 +32,7 @@ class ModelSettings:
 class PersonalizeSettings:
     """How the model is adapted to the photo (DiPIR, section 4.2.1)."""
 
-    personalize: bool = True
+    personalize: bool | None = None
     """Adapt the model to the photo by a LoRA before it guides"""
     token: str = "sks"
     """Rare word that stands for the photo's style in the prompts"""
@@ -71,36 +72,20 @@ class PersonalizeSettings:
 
 
 @dataclass(frozen=True)
-class GuidanceSettings:
-    """How the model's opinion becomes a gradient (DiPIR, eq. 7 and 8)."""
+class GuidanceOptions:
+    """What every prior is asked in the same way."""
 
-    loss: str = "lds"
-    """lds, sds, sds-base (no LoRA), csd, lds-lora-both, lds-negative, or dataset-update"""
     guidance_scale: float = 100.0
     """g of the SDS losses: g e(prompt) + (1 - g) e(null) - noise"""
     negative_prompt: str = ""
-    """What lds-negative moves away from"""
+    """What the losses with a negative term move away from (default: of the embedded prior, the same
+    words with another light)"""
     base_prompt: str = ""
-    """What csd and sds-base ask the unadapted model for (default: what the adapted one is asked
-    for)"""
+    """What the terms without the LoRA ask for (default: what the adapted model is asked for)"""
     null_prompt: str = ""
     """What the unconditional term is asked for"""
-    time_min: float = 0.02
-    """Least noise level, as a share of the schedule"""
-    time_max: float = 0.6
-    """Greatest noise level at the start, as a share of the schedule"""
-    time_max_end: float = 0.3
-    """Greatest noise level at the end; falls linearly"""
-    weight: str = "sigma2"
-    """Weight w(t) of the residual: sigma2 (1 - alpha_bar), sigma or uniform"""
     literal_alpha: bool = False
     """Multiply w(t) by sqrt(alpha_bar), as equations 7 and 8 read literally"""
-    noises: int = 1
-    """Noises and times per rendered picture"""
-    crop_min: float = 0.5
-    """Smallest side of a crop, in sides of the object's box"""
-    crop_max: float = 3.0
-    """Greatest side of a crop, in sides of the object's box"""
     gradient_clip: float = 10.0
     """Greatest norm of a gradient, in running medians; 0: no limit"""
     update_every: int = 10
@@ -109,3 +94,44 @@ class GuidanceSettings:
     """Denoising steps of such an edit (DDIM)"""
     update_scale: float = 7.5
     """Classifier-free guidance of such an edit"""
+
+
+@dataclass(frozen=True)
+class GuidanceSettings(GuidanceOptions):
+    """How a prior's opinion becomes a gradient (DiPIR, eq. 7, 8); Stable Diffusion's defaults."""
+
+    loss: str = "lds"
+    """lds, sds, sds-base (no LoRA), csd, lds-lora-both, lds-negative, good-bad, sds-good-bad, or
+    dataset-update"""
+    null_background: str = "keep"
+    """Whether the null and negative terms see the photo: keep or drop (Stable Diffusion sees only
+    the composite)"""
+    time_min: float = 0.02
+    """Least noise level, as a share of the schedule"""
+    time_max: float = 0.6
+    """Greatest noise level at the start, as a share of the schedule"""
+    time_max_end: float = 0.3
+    """Greatest noise level at the end; falls linearly"""
+    weight: str = "sigma2"
+    """Weight w(t) of the residual: sigma2 (1 - alpha_bar), sigma or uniform"""
+    noises: int = 1
+    """Noises and times per rendered picture"""
+    crop_min: float = 0.5
+    """Smallest side of a crop, in sides of the object's box"""
+    crop_max: float = 3.0
+    """Greatest side of a crop, in sides of the object's box"""
+
+
+@dataclass(frozen=True)
+class GuidanceChoices(GuidanceOptions):
+    """`GuidanceSettings` as a user may leave them open; their help is there."""
+
+    loss: str | None = None
+    null_background: str | None = None
+    time_min: float | None = None
+    time_max: float | None = None
+    time_max_end: float | None = None
+    weight: str | None = None
+    noises: int | None = None
+    crop_min: float | None = None
+    crop_max: float | None = None

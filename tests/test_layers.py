@@ -9,31 +9,40 @@ ROOT = Path(__file__).resolve().parent.parent
 
 # Each module of warpir/ imports modules of lower levels only; a module that is on no level fails.
 LEVELS = (
-    {"errors", "color"},
-    {"optimize_settings", "asset", "strict_json"},
+    {
+        "errors", "color", "acceptance", "contact_sheet", "evaluation_report", "photo_look",
+        "training_batches",
+    },
+    {"optimize_settings", "asset", "strict_json", "image_errors", "lpips"},
     {"config"},
     {"camera", "asset_files", "record", "progress", "light", "tone", "curves", "materials_file"},
-    {"gltf_file", "mtl", "files", "command", "placement", "lobes_file", "lobe_fit"},
-    {"gltf_material", "obj", "reuse", "program"},
-    {"gltf"},
+    {
+        "gltf_file", "mtl", "files", "command", "placement", "lobes_file", "lobe_fit", "regressor",
+        "light_errors",
+    },
+    {
+        "gltf_material", "obj", "reuse", "program", "regressor_training", "training_lights",
+        "training_meshes", "panorama_crop", "three_spheres",
+    },
+    {"gltf", "evaluation_scenes", "predictions"},
     {"inputs", "scene"},
     {"render", "lighting"},
-    {"picture", "samples", "sequence"},
+    {"picture", "samples", "sequence", "estimate"},
     {"integrator", "fusion", "sg_light"},
-    {"bridge"},
-    {"mis", "transport_rows", "transport_matrix", "regularizers"},
+    {"bridge", "trust"},
+    {"mis", "transport_rows", "transport_matrix", "regularizers", "evaluation_stage"},
     {"transport_cache"},
     {"transport"},
     {"transport_choice", "view"},
-    {"checkpoint"},
+    {"checkpoint", "lit_frame"},
     {"optimize"},
     {"light_optimization"},
     {"recover"},
-    {"refine"},
+    {"refine", "evaluation_rows"},
     {"demo"},
     {"insert", "prior_images", "model_check"},
-    {"check_model"},
-)
+    {"check_model", "train", "evaluate"},
+)  # fmt: skip
 # A dispatcher by file extension: it calls the readers, and they fill its records.
 UPWARD = {("asset", "gltf"), ("asset", "obj")}
 
@@ -41,26 +50,29 @@ UPWARD = {("asset", "gltf"), ("asset", "obj")}
 ONLY_IN = {
     "warp": {
         "kernels", "scene", "render", "samples", "bridge", "transport", "transport_rows",
+        "prior_images",
     },
     "torch": {
         "diffusion", "tone", "bridge", "integrator", "fusion", "sg_light", "regularizers", "view",
         "mis", "transport", "transport_cache", "transport_choice", "transport_matrix", "checkpoint",
         "optimize", "light_optimization", "recover", "refine", "insert", "prior_images",
-        "model_check",
+        "model_check", "acceptance", "lit_frame", "trust", "regressor", "regressor_training",
+        "training_batches", "training_lights", "photo_look", "lpips", "evaluation_rows",
+        "evaluation_stage", "train", "evaluate",
     },
-    "trimesh": {"gltf", "obj", "demo"},
+    "trimesh": {"gltf", "obj", "demo", "training_meshes"},
     "OpenImageIO": {"files"},
     "OpenEXR": {"files"},
-    "PIL": {"files", "asset_files", "demo", "diffusion"},
+    "PIL": {"files", "asset_files", "demo", "diffusion", "contact_sheet"},
     "diffusers": {"diffusion"},
     "transformers": {"diffusion"},
     "peft": {"diffusion"},
-    "safetensors": {"diffusion", "checkpoint", "transport_cache"},
+    "safetensors": {"diffusion", "checkpoint", "transport_cache", "regressor", "regressor_training"},
     "colour": {"color"},
     "yaml": {"command"},
     "rich": {"progress"},
 }  # fmt: skip
-DIFFUSION_IN = {"recover", "refine", "prior_images", "model_check"}
+DIFFUSION_IN = {"recover", "refine", "prior_images", "model_check", "train", "evaluation_rows"}
 """Who drives the diffusion model; everyone else sees its settings and wording, which are plain."""
 SETTINGS = ("warpir.diffusion.settings", "warpir.diffusion.prompts")
 SETTINGS_IN = {"config", "command", *DIFFUSION_IN}

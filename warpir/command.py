@@ -18,7 +18,8 @@ from pathlib import Path
 from typing import Any, NoReturn, Union, get_args, get_origin, get_type_hints
 
 import warpir
-from warpir.config import DEFAULTS, InsertConfig, flag, usage
+from warpir.config import CPU_DEFAULTS, DEFAULTS, PRIOR_DEFAULTS, InsertConfig, flag, usage
+from warpir.diffusion.settings import GuidanceSettings
 from warpir.errors import ExitCode, InputError, raise_all
 from warpir.record import RUN_FORMAT
 from warpir.strict_json import read_json_object
@@ -73,8 +74,13 @@ FLAGS = {
     "guidance": {
         "guidance": "NAME",
         "prompt": "TEXT",
+        "prior": "FILE",
+        "regressor": "FILE",
+        "start": "NAME",
+        "accept": "",
         "show_prior": "TEXT|TEXT",
         "loss": "NAME",
+        "null_background": "RULE",
         "guidance_scale": "G",
         "negative_prompt": "TEXT",
         "base_prompt": "TEXT",
@@ -150,6 +156,7 @@ FLAGS = {
         "chroma": "W",
         "tone_bins": "N",
         "bend": "W",
+        "trust": "W",
         "chroma_limit": "LOG",
         "intensity_limit": "FACTOR",
         "score_every": "N",
@@ -364,6 +371,9 @@ def make_parser(
             text = _help_of(name, about[name]).replace("%", "%%")
             if form:
                 group.add_argument(flag(name), dest=name, metavar=form, help=text)
+            elif DEFAULTS[name] is None:
+                either = argparse.BooleanOptionalAction
+                group.add_argument(flag(name), dest=name, action=either, help=text)
             else:
                 action = "store_false" if DEFAULTS[name] else "store_true"
                 group.add_argument(flag(name), dest=name, action=action, help=text)
@@ -392,6 +402,8 @@ def read_arguments(parser: argparse.ArgumentParser, argv: Sequence[str]) -> dict
 
 def _help_of(name: str, about: str) -> str:
     default = DEFAULTS[name]
+    if name in PRIOR_DEFAULTS["embedded"]:
+        return f"{about} (default: {_by_prior(name)})"
     if default is True:
         return f"Leave out: {about[0].lower()}{about[1:]}"
     # An optional value says in its own words what happens without it.
@@ -401,10 +413,27 @@ def _help_of(name: str, about: str) -> str:
     return f"{about} (default: {shown})"
 
 
+def _by_prior(name: str) -> str:
+    """Return in words what an open field stands for."""
+    names = {"embedded": "embedded", "stable-diffusion": "Stable Diffusion"}
+    found = {}
+    for prior, words in names.items():
+        value = _words(PRIOR_DEFAULTS[prior][name])
+        on_cpu = CPU_DEFAULTS[prior].get(name)
+        found[words] = value if on_cpu is None else f"{value}, on the CPU {_words(on_cpu)}"
+    if len(set(found.values())) == 1:
+        return found["embedded"]
+    return "; ".join(f"{words} {value}" for words, value in found.items())
+
+
+def _words(value: object) -> str:
+    return str(value) if not isinstance(value, bool) else "yes" if value else "no"
+
+
 def _field_docs() -> dict[str, str]:
     """Read the line below each field of `InsertConfig` and its base classes from their sources."""
     docs = {}
-    for settings in InsertConfig.__mro__[:-1]:
+    for settings in (*InsertConfig.__mro__[:-1], GuidanceSettings):
         body = ast.parse(inspect.getsource(settings)).body[0]
         assert isinstance(body, ast.ClassDef)
         for field, below in zip(body.body, body.body[1:], strict=False):

@@ -8,10 +8,16 @@ configuration file and one entry under ``config`` in ``run.json``. The line belo
 import math
 import re
 from collections.abc import Iterator
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
+from typing import Any
 
 from warpir.diffusion.prompts import make_prompts
-from warpir.diffusion.settings import GuidanceSettings, ModelSettings, PersonalizeSettings
+from warpir.diffusion.settings import (
+    GuidanceChoices,
+    GuidanceSettings,
+    ModelSettings,
+    PersonalizeSettings,
+)
 from warpir.errors import ExitCode, InputError, raise_all
 from warpir.optimize_settings import OptimizeSettings
 
@@ -25,8 +31,54 @@ DEVICE_FORM = re.compile(r"cpu|cuda(:\d+)?")
 DEMO_HINT = "--demo needs neither --photo nor --asset"
 
 
+_PLAIN = GuidanceSettings()
+PRIOR_DEFAULTS: dict[str, dict[str, Any]] = {
+    "stable-diffusion": {
+        **{f.name: getattr(_PLAIN, f.name) for f in fields(GuidanceChoices) if f.default is None},
+        "steps": 600,
+        "guidance_width": 384,
+        "light_height": 64,
+        "object_light_height": 32,
+        "personalize": True,
+        "accept": False,
+        "preview_every": 0,
+        "tone": "reinhard",
+    },
+    # The recipe of the experiments with a small prior; their times are of a cosine schedule, where
+    # .05, .8 and .4 are a noise of .08, .95 and .59.
+    "embedded": {
+        "loss": "sds-good-bad",
+        "null_background": "keep",
+        "time_min": 0.05,
+        "time_max": 0.8,
+        "time_max_end": 0.4,
+        "weight": "sigma",
+        "noises": 4,
+        "crop_min": 1.3,
+        "crop_max": 4.0,
+        "steps": 200,
+        "guidance_width": 384,
+        "light_height": 64,
+        "object_light_height": 32,
+        "personalize": False,
+        "accept": True,
+        "preview_every": 50,
+        # What it learnt from is clipped as photos are.
+        "tone": "linear",
+    },
+}
+"""What a field that is None stands for, by the prior that guides."""
+CPU_DEFAULTS: dict[str, dict[str, Any]] = {
+    "stable-diffusion": {},
+    "embedded": {
+        "noises": 2, "guidance_width": 256, "light_height": 48, "object_light_height": 24,
+    },
+}  # fmt: skip
+"""What it stands for on the CPU, where that differs."""
+
+
 @dataclass(frozen=True)
-class InsertConfig(ModelSettings, PersonalizeSettings, GuidanceSettings, OptimizeSettings):
+class InsertConfig(ModelSettings, PersonalizeSettings, GuidanceChoices, OptimizeSettings):
     """One insertion. Checked for ranges and finiteness when made; files are checked later.
 
     Raises:
@@ -90,7 +142,7 @@ class InsertConfig(ModelSettings, PersonalizeSettings, GuidanceSettings, Optimiz
 
     tone: str | None = None
     """How the object's radiance becomes display values: linear (clipped, as the photo was), or
-    reinhard (x / (1 + x), paler, nothing clips) (default: linear, with --guidance reinhard)"""
+    reinhard (x / (1 + x), paler, nothing clips)"""
     ground_albedo: float = 0.25
     """Reflectance assumed of the ground, for the automatic exposure [1]"""
 
@@ -121,16 +173,27 @@ class InsertConfig(ModelSettings, PersonalizeSettings, GuidanceSettings, Optimiz
     mark: bool = True
     """Note in the picture's metadata that it is a composite"""
 
-    guidance: str = "none"
-    """What recovers the light from the photo: stable-diffusion; or none, and the light is used as
-    given"""
+    guidance: str | None = None
+    """What recovers the light from the photo: embedded, the small prior that comes with warpir;
+    stable-diffusion; or none, and the light is used as given, or else as a regressor sees it in the
+    photo (default: stable-diffusion with --model, none where a light is given, else embedded)"""
     prompt: str | None = None
-    """What the object is, in a few words, such as 'a black SUV car'"""
+    """What the object is, in a few words, such as 'a black SUV car' (stable-diffusion needs it)"""
+    prior: str | None = None
+    """Weights for --guidance embedded (default: those that come with warpir)"""
+    regressor: str | None = None
+    """Weights of the regressor (default: those that come with warpir)"""
+    start: str | None = None
+    """Where the recovery begins when no light is given: regressed, as the regressor sees it in the
+    photo, or uniform, an even light (default: regressed)"""
+    accept: bool | None = None
+    """Keep the start of the recovery unless guidance, asked anew, clearly prefers its end"""
     show_prior: tuple[str, ...] | None = None
     """Prompts, separated by |, for pictures of what the model imagines, before and after it was
     adapted to the photo"""
-    preview_every: int = 0
-    """Steps between two preview pictures of the optimisation; 0: none"""
+    preview_every: int | None = None
+    """Steps between two preview pictures of the optimisation, the first of which is the start;
+    0: none"""
     checkpoint_every: int = 50
     """Steps between two checkpoints of the optimisation; 0: none"""
     resume: bool = False
@@ -154,16 +217,31 @@ class InsertConfig(ModelSettings, PersonalizeSettings, GuidanceSettings, Optimiz
         raise_all([*_values_out_of_range(self), *_values_that_clash(self)])
 
     @property
-    def tone_operator(self) -> str:
-        """`tone`, or what stands for it: recovered curves want an operator that never clips."""
-        return self.tone or ("linear" if self.guidance == "none" else "reinhard")
+    def guided_by(self) -> str:
+        """``guidance``, or what stands for it: embedded, stable-diffusion or none."""
+        if self.guidance is not None:
+            return self.guidance
+        if self.model is not None:
+            return "stable-diffusion"
+        is_lit = any(getattr(self, name) is not None for name in LIGHTS)
+        return "none" if is_lit else "embedded"
 
     @property
-    def step_count(self) -> int:
-        """`steps`, or what stands for it: a few unknowns under a known light need fewer."""
-        if self.steps is None and self.refine is not None:
-            return REFINE_STEPS[self.refine]
-        return super().step_count
+    def tone_operator(self) -> str:
+        """`tone`, or what stands for it; a light far from its start wants one that never clips."""
+        return self.tone or PRIOR_DEFAULTS.get(self.guided_by, {"tone": "linear"})["tone"]
+
+    def settled(self, on_cuda: bool = True) -> "InsertConfig":
+        """Return the same with nothing left open to the prior; without one, as Stable Diffusion's.
+
+        Args:
+            on_cuda: Whether it runs on a CUDA device.
+        """
+        return replace(self, **_open_values(self, on_cuda))
+
+    def guidance_settings(self) -> GuidanceSettings:
+        """Return what guidance is asked to do; nothing may be open (`settled`)."""
+        return GuidanceSettings(**{f.name: getattr(self, f.name) for f in fields(GuidanceSettings)})
 
     def require_inputs(self) -> None:
         """Check that what every run needs is named.
@@ -176,9 +254,8 @@ class InsertConfig(ModelSettings, PersonalizeSettings, GuidanceSettings, Optimiz
         # The lines of a sequence may name photos and assets; each frame is checked by itself.
         needed = {} if self.demo or self.sequence else dict.fromkeys(("photo", "asset"), DEMO_HINT)
         needed["out"] = ""
-        if self.guidance == "stable-diffusion":
+        if self.guided_by == "stable-diffusion":
             needed["model"] = "--guidance stable-diffusion needs a folder or a hub id"
-        if self.guidance != "none" or self.refine is not None:
             needed["prompt"] = "say in a few words what the object is"
         raise_all(
             [
@@ -187,6 +264,18 @@ class InsertConfig(ModelSettings, PersonalizeSettings, GuidanceSettings, Optimiz
                 if getattr(self, name) is None
             ]
         )
+
+
+def _open_values(config: InsertConfig, on_cuda: bool = True) -> dict[str, Any]:
+    """Return what stands for the fields that are open; without a prior, Stable Diffusion's."""
+    prior = config.guided_by if config.guided_by in PRIOR_DEFAULTS else "stable-diffusion"
+    chosen = PRIOR_DEFAULTS[prior] | ({} if on_cuda else CPU_DEFAULTS[prior])
+    if config.refine is not None:
+        chosen |= {"steps": REFINE_STEPS[config.refine], "accept": False}
+    if config.lora is not None:
+        chosen |= {"personalize": True}
+    # The tone belongs to the light: `InsertConfig.tone_operator`.
+    return {k: v for k, v in chosen.items() if k != "tone" and getattr(config, k) is None}
 
 
 def flag(name: str) -> str:
@@ -258,6 +347,7 @@ RANGES: dict[str, tuple[float, float | None]] = {
     "spread": (0, None),
     "chroma": (0, None),
     "bend": (0, None),
+    "trust": (0, None),
     "tone_bins": (1, 64),
     "fusion_start": (0, 1),
     "fusion_end": (0, 1),
@@ -278,7 +368,8 @@ CHOICES = {
     "tone": ("reinhard", "linear"),
     "alpha": ("refuse", "ignore"),
     "missing_textures": ("error", "grey"),
-    "guidance": ("none", "stable-diffusion"),
+    "guidance": ("embedded", "stable-diffusion", "none"),
+    "start": ("regressed", "uniform"),
     "precision": ("fp16", "bf16", "fp32"),
     "vae_precision": ("fp16", "bf16", "fp32"),
     "loss": (
@@ -288,15 +379,22 @@ CHOICES = {
         "csd",
         "lds-lora-both",
         "lds-negative",
+        "good-bad",
+        "sds-good-bad",
         "dataset-update",
     ),
+    "null_background": ("keep", "drop"),
     "weight": ("sigma2", "sigma", "uniform"),
     "fusion": ("schedule", "single", "none"),
     "integrator": ("transport", "mis"),
     "refine": ("material", "emission", "tone"),
 }
-LOSSES_OF_BASE = ("csd", "sds-base", "dataset-update")
+LOSSES_OF_BASE = ("csd", "sds-base", "good-bad", "sds-good-bad", "dataset-update")
 """Losses that do without an adapter."""
+LOSSES_AWAY = ("lds-negative", "good-bad", "sds-good-bad")
+"""Losses that move away from a negative prompt."""
+LIGHTS = ("light", "sun", "sky", "reuse")
+"""Fields that name a light."""
 PROMPTS = (
     "prompt",
     "negative_prompt",
@@ -386,13 +484,16 @@ EXCLUSIVE = (
     ("scale", "size"),
     ("light", "sun"),
     ("light", "sky"),
+    ("light", "start"),
+    ("sun", "start"),
+    ("sky", "start"),
+    ("reuse", "start"),
     ("reuse", "demo"),
     ("reuse", "light"),
     ("reuse", "sun"),
     ("reuse", "sky"),
     ("sequence", "refine"),
     ("resume", "overwrite"),
-    ("lora", "personalize"),
 )
 """Pairs of fields of which at most one may be given."""
 
@@ -408,25 +509,31 @@ def _values_that_clash(config: InsertConfig) -> Iterator[InputError]:
     for first, second in EXCLUSIVE:
         if given(first) and given(second):
             yield usage(flag(second), f"cannot be used with {flag(first)}", "leave one of them out")
-    guided = given("guidance")
+    guided, with_words = config.guided_by != "none", config.guided_by == "stable-diffusion"
     if given("reuse") and guided and not given("refine"):
         yield usage(
-            "--guidance",
+            "--guidance" if given("guidance") else "--model",
             "cannot be used with --reuse, whose light is known",
             "leave one of them out, or say with --refine what is to change under that light",
         )
     yield from needs("fit_lobes", given("light"), "--light with a panorama to fit")
     yield from needs("up", given("camera"), "--camera; without a camera file the world is Y up")
     yield from needs("sequence", given("reuse"), "--reuse: one light for all frames")
-    yield from needs("show_prior", guided, "--guidance and its --model")
-    if given("show_prior") and guided and not config.personalize:
+    yield from needs("show_prior", with_words, "--guidance stable-diffusion and its --model")
+    if given("show_prior") and with_words and config.personalize is False:
         yield usage("--no-personalize", "cannot be used with --show-prior, which shows its effect")
+    if given("lora") and config.personalize is False:
+        yield usage("--no-personalize", "cannot be used with --lora", "leave one of them out")
     yield from needs("resume", guided, "--guidance: nothing else has checkpoints")
-    lit = any(map(given, ("reuse", "light", "sun", "sky", "demo")))
+    yield from needs("prior", config.guided_by == "embedded", "--guidance embedded")
+    yield from needs("accept", guided, "--guidance, whose result it judges")
+    is_demo_lit = given("demo") and (not guided or given("refine"))
+    lit = any(map(given, LIGHTS)) or is_demo_lit
     level = "--light, --sun or --sky: with --guidance alone the light's level is recovered"
     yield from needs("exposure", lit or not guided, level)
     yield from needs("refine", lit, "a known light: --reuse, --light, --sun or --sky")
-    yield from needs("refine", guided, "--guidance, which judges the change")
+    who_judges = "--guidance stable-diffusion, which judges the change: no other knows colours"
+    yield from needs("refine", with_words, who_judges)
     yield from needs("refine_parts", config.refine == "material", "--refine material")
     with_materials = config.refine in ("material", "emission")
     yield from needs("refine_materials", with_materials, "--refine material or emission")
@@ -434,16 +541,31 @@ def _values_that_clash(config: InsertConfig) -> Iterator[InputError]:
         yield usage(
             "--no-tone-curve", "cannot be used with --refine tone, which changes nothing else"
         )
-    if guided and not config.personalize and config.loss not in LOSSES_OF_BASE:
-        yield usage(
-            "--no-personalize",
-            f"cannot be used with --loss {config.loss}, which compares the adapted model",
-            f"add --loss {' or '.join(LOSSES_OF_BASE)}, or leave it out",
-        )
-    if config.loss == "lds-negative" and not config.negative_prompt:
-        yield usage("--loss", "lds-negative needs --negative-prompt, which it moves away from")
+    yield from _losses_that_clash(config)
+
+
+def _losses_that_clash(config: InsertConfig) -> Iterator[InputError]:
+    """Find what a loss lacks, and ranges that are empty; with what is open as the prior has it."""
+    made = {**vars(config), **_open_values(config)}
+    loss = made["loss"]
+    if config.guided_by != "none" and not made["personalize"] and loss not in LOSSES_OF_BASE:
+        losses = " or ".join(LOSSES_OF_BASE)
+        if config.personalize is False:
+            yield usage(
+                "--no-personalize",
+                f"cannot be used with --loss {loss}, which compares the adapted model",
+                f"add --loss {losses}, or leave it out",
+            )
+        else:
+            what = f"{loss} compares the adapted model"
+            yield usage("--loss", what, f"add --personalize, or choose {losses}")
+    says_itself = config.guided_by == "embedded" or config.negative_prompt
+    if loss in LOSSES_AWAY and not says_itself:
+        yield usage("--loss", f"{loss} needs --negative-prompt, which it moves away from")
+    if config.accept and loss == "dataset-update":
+        yield usage("--accept", "cannot be used with --loss dataset-update, which has no potential")
     for low, high in (("time_min", "time_max"), ("crop_min", "crop_max")):
-        least, greatest = getattr(config, low), getattr(config, high)
+        least, greatest = made[low], made[high]
         if least > greatest:
             yield usage(flag(low), f"at most {flag(high)} (found {least:g} and {greatest:g})")
 

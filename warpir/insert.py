@@ -132,9 +132,11 @@ def _insert_one(config: InsertConfig, loaders: "Loaders | None" = None) -> Inser
             say(f"device: {device} (the first run compiles the kernels)")
         recovered: dict[str, Any] = {}
         notices = inputs.notices
-        if config.guidance != "none":
+        if config.guided_by != "none":
             inputs, light, recovered, found = _guide(config, inputs, light, device, output, timings)
             notices = (*notices, *found)
+        elif light is None:
+            light, recovered = _regress(config, inputs, device, timings)
         with timings.stage("scene"):
             scene = scene_of(inputs, _rendering_camera(inputs.camera, config), device)
         with timings.stage("render"), progress_bar() as report:
@@ -166,22 +168,50 @@ def _insert_one(config: InsertConfig, loaders: "Loaders | None" = None) -> Inser
             measured={"triangles": scene.triangle_count, **measured, **recovered},
         )
         output.write_json("run.json", record)
-    if config.guidance != "none":
+    _say_who_spoke(record)
+    if config.guided_by != "none":
         # The results are in place: what was kept for a run that stops is not needed any more.
         checkpoints.remove()
     record = read_json_object(output.path / "run.json")
     return Insertion(output.path, (*record["files"], "run.json"), record)
 
 
+def _regress(
+    config: InsertConfig, inputs: "Inputs", device: str, timings: "Timings"
+) -> "tuple[SceneLight, dict[str, Any]]":
+    """Read the light off the photo; return it, and what run.json says of it."""
+    with timings.stage("regress"):
+        from warpir.estimate import estimate_light
+
+        estimate = estimate_light(inputs, config, device)
+    for line in estimate.light.assumed:
+        say(f"assumed: {line}")
+    return estimate.light, {"regression": estimate.regression.record()}
+
+
+def _say_who_spoke(record: dict[str, Any]) -> None:
+    """Print in a line what the light comes from and what computed it."""
+    measured = record["measured"]
+    digest = measured.get("prior_sha256")
+    prior = measured["prior"] + (f" (sha256 {digest[:16]}...)" if digest else "")
+    accepted = measured.get("acceptance", {}).get("is_accepted")
+    words = {True: ", its end accepted", False: ", its start kept", None: ""}[accepted]
+    regressed = "; light regressed from the photo" if "regression" in measured else ""
+    integrators = " and ".join(
+        dict.fromkeys(x for x in (measured.get("loop_integrator"), measured["integrator"]) if x)
+    )
+    say(f"summary: prior {prior}{words}{regressed}; {integrators} on {record['device']}")
+
+
 def _guide(
     config: InsertConfig,
     inputs: "Inputs",
-    light: "SceneLight",
+    light: "SceneLight | None",
     device: str,
     output: "OutputFolder",
     timings: "Timings",
 ) -> "tuple[Inputs, SceneLight, dict[str, Any], tuple[str, ...]]":
-    """Let the diffusion model find the light, or change the object under the light it has.
+    """Let the prior find the light, or change the object under the light it has.
 
     Returns:
         Inputs and light as they are to be rendered, what run.json says of it, and notices.
@@ -196,6 +226,7 @@ def _guide(
         else:
             from warpir.refine import refine
 
+            assert light is not None  # the configuration names it
             light, asset, record, notices = refine(run, light)
             inputs = replace(inputs, asset=asset)
     for notice in notices:
@@ -273,8 +304,11 @@ def _write(
 
 def _read(
     config: InsertConfig, loaders: "Loaders | None" = None
-) -> "tuple[InsertConfig, Inputs, SceneLight]":
-    """Read and check all inputs and say what was assumed; the demo brings its own."""
+) -> "tuple[InsertConfig, Inputs, SceneLight | None]":
+    """Read and check all inputs and say what was assumed; the demo brings its own.
+
+    The light is None where it is to be read off the photo.
+    """
     from warpir.inputs import read_inputs
     from warpir.lighting import make_light
 
@@ -285,7 +319,7 @@ def _read(
     inputs = read_inputs(config, loaders)
     light = make_light(inputs, config)
     say(f"placement: {inputs.placement.summary}")
-    for line in (*inputs.assumed, *light.assumed):
+    for line in (*inputs.assumed, *(light.assumed if light is not None else ())):
         say(f"assumed: {line}")
     for line in inputs.notices:
         say(f"notice: {line}")
@@ -320,8 +354,8 @@ def _run(arguments: list[str]) -> int:
 
 def _validate(config: InsertConfig) -> None:
     if config.sequence is None:
-        _read(config)
-        if config.guidance != "none" and not config.allow_download:
+        config, _, light = _read(config)
+        if light is None or config.guided_by != "none":
             from warpir.recover import require_model
 
             require_model(config)

@@ -24,6 +24,7 @@ from warpir.regularizers import bend, chroma, consistency, spread
 from warpir.sg_light import LightBounds, SGLight, narrowest
 from warpir.tone import Knots, ToneCurve
 from warpir.transport_rows import TransportSettings
+from warpir.trust import TrustRegion
 from warpir.view import Frame, View, expected_light
 
 RETRACE_EVERY = 25
@@ -58,7 +59,7 @@ class Unknowns(torch.nn.Module):
             settings: Count and bounds of the lobes.
         """
         bounds = LightBounds(
-            narrowest(settings.light_height), settings.chroma_limit, settings.intensity_limit
+            narrowest(settings.light_rows), settings.chroma_limit, settings.intensity_limit
         )
 
         def light() -> SGLight:
@@ -103,6 +104,7 @@ class LightOptimization(Optimization):
         cache: Folder for traced rows, or None.
         transport: How finely light is traced; by default the heights are those of the settings.
         record: Makes steps with `transport` faster; by default they are taken as they are.
+        region: Where the light is expected, or None where nothing is known.
     """
 
     unknowns: Unknowns
@@ -116,16 +118,18 @@ class LightOptimization(Optimization):
         cache: Path | None = None,
         transport: TransportSettings | None = None,
         record: Record | None = None,
+        region: TrustRegion | None = None,
     ) -> None:
         super().__init__(unknowns, _groups(unknowns, settings), guide, settings, frame.seed)
         self.frame, self.cache, self.rows = frame, cache, transport
         if transport is None and settings.integrator == "transport":
             self.rows = TransportSettings(
-                height_fg=settings.object_light_height,
-                height_shadow=settings.light_height,
+                height_fg=settings.object_light_rows,
+                height_shadow=settings.light_rows,
                 memory_mib=settings.transport_memory,
             )
         self.retraced = 0
+        self.region = region if settings.trust > 0.0 else None
         self._record = record
         self._terms: dict[str, Tensor] = {}
         self.term_names: tuple[str, ...] = ()
@@ -161,7 +165,7 @@ class LightOptimization(Optimization):
             scale: ``s_fuse`` [1].
             height: Rows; the settings' when absent.
         """
-        return self._fused(self._separate(height or self.settings.light_height), scale)
+        return self._fused(self._separate(height or self.settings.light_rows), scale)
 
     def _separate(self, height: int) -> tuple[Tensor, Tensor]:
         """Return the maps of both sets of lobes, before fusion."""
@@ -172,7 +176,7 @@ class LightOptimization(Optimization):
 
     def parts(self, scale: float | Tensor, seed: int = 0) -> Parts:
         """Return everything up to the composite; of torch alone with `transport`."""
-        unknowns, maps = self.unknowns, self._separate(self.settings.light_height)
+        unknowns, maps = self.unknowns, self._separate(self.settings.light_rows)
         curves = unknowns.curve_fg(), unknowns.curve_shadow()
         radiance = self.view.radiance(*self._fused(maps, scale), seed)
         return Parts(radiance, *curves, self._terms_of(maps, curves))
@@ -183,13 +187,17 @@ class LightOptimization(Optimization):
     def _terms_of(
         self, maps: tuple[Tensor, Tensor], curves: tuple[Knots, Knots]
     ) -> dict[str, Tensor]:
-        """Return the authors' terms (eq. 10, 11) and ours."""
+        """Return the authors' terms (eq. 10, 11) and ours, of which trust is there if asked for."""
         unknowns = self.unknowns
         terms = {"chroma": 0.5 * (chroma(unknowns.light_fg) + chroma(unknowns.light_shadow))}
         if self.settings.fusion != "single":
             terms |= {"consistency": consistency(*maps), "spread": spread(maps[1])}
         if self.settings.tone_curve:
             terms["bend"] = bend(curves[0]) + bend(curves[1])
+        if self.region is not None:
+            terms["trust"] = self.region.distance(unknowns.light_fg)
+            if self.settings.fusion != "single":
+                terms["trust"] = terms["trust"] + self.region.distance(unknowns.light_shadow)
         return terms
 
     def image(self, step: int) -> Tensor:

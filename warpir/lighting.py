@@ -23,8 +23,6 @@ SKIES = {
 """Relative radiances by preset, linear RGB; only their proportions matter."""
 SUN_TO_SKY = 5.0
 """Irradiance of a surface facing the sun over that from a clear sky on the ground [1]."""
-DEFAULT_SUN = (-120.0, 40.0)
-"""Azimuth and elevation when nothing is said about the light [deg]: from the left, behind."""
 GROUND_PERCENTILE = 50.0
 """Of the ground round the object: the level of an even light (the authors state none)."""
 LIT_PERCENTILE = 75.0
@@ -48,8 +46,8 @@ class SceneLight:
     """How well the lobes fit the panorama, when they were fitted."""
 
 
-def make_light(inputs: Inputs, config: InsertConfig) -> SceneLight:
-    """Build the light and set its exposure.
+def make_light(inputs: Inputs, config: InsertConfig) -> SceneLight | None:
+    """Build the light and set its exposure; None: it is to be read off the photo.
 
     Raises:
         InputError: The light is black, so no exposure can be chosen; or --tone contradicts the run
@@ -57,8 +55,8 @@ def make_light(inputs: Inputs, config: InsertConfig) -> SceneLight:
     """
     if inputs.run is not None:
         return _reused(inputs.run, config)
-    if config.guidance != "none" and not is_described(config) and inputs.light is None:
-        return _even(inputs, config)
+    if not is_described(config) and inputs.light is None:
+        return _even(inputs, config) if config.start == "uniform" else None
     assumed: list[str] = []
     light = inputs.light if inputs.light is not None else _described(config, assumed)
     fit = None
@@ -83,10 +81,12 @@ def is_described(config: InsertConfig) -> bool:
 
 
 def _even(inputs: Inputs, config: InsertConfig) -> SceneLight:
-    """Return an even light at the ground's level, from which guidance starts (ours)."""
+    """Return an even light at the ground's level (ours)."""
     level = start_level(inputs, config)
     light = Light(texels=np.full((8, 16, 3), level, np.float32))
-    assumed = "nothing about the light: the recovery starts from an even one (--light, --sun)"
+    assumed = "nothing about the light: an even one (--start, --light, --sun)"
+    if config.guided_by != "none":
+        assumed = "nothing about the light: the recovery starts from an even one (--light, --sun)"
     return SceneLight(light, light, Curves.identity(config.tone_operator), 0.0, (assumed,))
 
 
@@ -115,12 +115,6 @@ def _reused(run: EarlierRun, config: InsertConfig) -> SceneLight:
 def _described(config: InsertConfig, assumed: list[str]) -> Light:
     """Return the sun and sky of the flags."""
     sun, sky = config.sun, config.sky
-    if sun is None and sky is None:
-        sun = DEFAULT_SUN
-        assumed.append(
-            f"a sun at azimuth {sun[0]:g}, elevation {sun[1]:g} in a clear sky "
-            "(--light, --sun, --sky)"
-        )
     preset = sky if isinstance(sky, str) else "clear"
     sky_color, sun_color = SKIES[preset]
     if isinstance(sky, tuple):

@@ -323,11 +323,12 @@ def _try_guidance(
 ) -> tuple[Verdict, float]:
     """Take the model's part of some steps of a run, with the photo for a composite."""
     image = image.to(prior.device)
+    settings = config.settled(on_cuda=prior.device.type == "cuda").guidance_settings()
     mask = torch.zeros(image.shape[-2:])
     height, width = mask.shape
     mask[height // 3 : height - height // 3, width // 3 : width - width // 3] = 1.0
     guide = Guidance(
-        prior, Condition(prompts.guidance), config, mask, GUIDANCE_STEPS, config.seed, "scene"
+        prior, Condition(prompts.guidance), settings, mask, GUIDANCE_STEPS, config.seed, "scene"
     )
     guide.ensure_precision(image)
     clock, norms = _StepClock(prior.device), []

@@ -1,7 +1,9 @@
 """What a user may choose about the optimisation loop; plain values, importable without torch.
 
 Each field is one flag of `warpir.insert`, and the line below it is its ``--help``. Defaults are the
-authors' (DiPIR, Liang et al. 2024) where they state one, else ours.
+authors' (DiPIR, Liang et al. 2024) where they state one, else ours. What is None is open: the
+prior that guides decides it (`warpir.config.PRIOR_DEFAULTS`), and here it means the authors' number
+or what Stable Diffusion gets.
 """
 
 from dataclasses import dataclass
@@ -12,17 +14,16 @@ class OptimizeSettings:
     """How light and tone curves are recovered from the guidance's gradient."""
 
     steps: int | None = None
-    """Steps of the optimisation (default: 600; with --refine material or emission 300, with
-    --refine tone 200)"""
-    guidance_width: int = 384
+    """Steps of the optimisation; with --refine 300, or 200 for tone"""
+    guidance_width: int | None = None
     """Width of the picture inside the loop [px]; its height follows the photo's shape"""
     lobes: int = 64
     """Spherical-Gaussian lobes of each light, the object's and the shadow's"""
     lobe_width: float = 0.6
     """Width of the lobes at the start of an even light, sigma in spacings of the lobes"""
-    light_height: int = 64
+    light_height: int | None = None
     """Rows of the maps in which the two lights are fused"""
-    object_light_height: int = 32
+    object_light_height: int | None = None
     """Rows of the map that lights the object while its light transport is stored"""
     fusion: str = "schedule"
     """How the two lights become one: schedule (blended from none to all over the run), single (one
@@ -73,6 +74,9 @@ class OptimizeSettings:
     """Bins of each tone curve"""
     bend: float = 0.1
     """Weight of the prior that keeps tone curves near the identity"""
+    trust: float = 1.0
+    """Weight of the term that holds the light near the regressed one, in squares of what that is
+    uncertain by; 0: nothing holds it"""
     chroma_limit: float = 1.5
     """Greatest log colour ratio of a lobe"""
     intensity_limit: float = 1e6
@@ -84,3 +88,18 @@ class OptimizeSettings:
     def step_count(self) -> int:
         """`steps`, or the authors' number."""
         return 600 if self.steps is None else self.steps
+
+    @property
+    def picture_width(self) -> int:
+        """`guidance_width`, or the authors' number [px]."""
+        return 384 if self.guidance_width is None else self.guidance_width
+
+    @property
+    def light_rows(self) -> int:
+        """`light_height`, or what Stable Diffusion gets."""
+        return 64 if self.light_height is None else self.light_height
+
+    @property
+    def object_light_rows(self) -> int:
+        """`object_light_height`, or what Stable Diffusion gets."""
+        return 32 if self.object_light_height is None else self.object_light_height

@@ -16,15 +16,7 @@ from warpir.errors import ExitCode, InputError
 
 INTERRUPTED = 130
 TERMINATED = 143
-EXTRA_OF = {
-    "accelerate": "diffusion",
-    "diffusers": "diffusion",
-    "peft": "diffusion",
-    "transformers": "diffusion",
-    "ray": "ray",
-    "mitsuba": "bench",
-    "matplotlib": "bench",
-}
+EXTRA_OF = {"ray": "ray", "mitsuba": "bench", "matplotlib": "bench"}
 """Which extra brings a package that a plain install does not have."""
 NO_MEMORY = ("allocate mem", "Failed to allocate", "out of memory", "ALLOC_FAILED")
 """How torch, Warp and CUDA say in a RuntimeError that memory is short."""

@@ -9,42 +9,50 @@ from __future__ import annotations
 import tempfile
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from dataclasses import asdict, dataclass, fields
+from dataclasses import asdict, dataclass, fields, replace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
 
+from warpir.acceptance import Verdict, blend, judge
 from warpir.checkpoint import Checkpoint, Checkpoints
 from warpir.color import linear_to_gamma
-from warpir.config import InsertConfig
+from warpir.config import PRIOR_DEFAULTS, InsertConfig
 from warpir.curves import Curves, ToneKnots
 from warpir.diffusion.cache import cache_folder, content_key, write_file
+from warpir.diffusion.embedded import embedded_prompts, load_embedded
 from warpir.diffusion.guidance import DatasetUpdate, Guidance, NonFiniteError, make_guidance
 from warpir.diffusion.lora_files import Lora, save_lora
 from warpir.diffusion.model_folder import check_model_folder, find_model
+from warpir.diffusion.network_prior import NetworkPrior
 from warpir.diffusion.personalize import personalize
 from warpir.diffusion.prior import Condition, ModelError
 from warpir.diffusion.prompts import Prompts, make_prompts
 from warpir.diffusion.show_prior import show_personalization
-from warpir.diffusion.stable_diffusion import StableDiffusion, load_stable_diffusion
+from warpir.diffusion.stable_diffusion import load_stable_diffusion
 from warpir.errors import ExitCode, InputError
+from warpir.estimate import Estimate, estimate_light
 from warpir.files import OutputFolder, png_bytes
 from warpir.inputs import Inputs
-from warpir.light import Lobes, as_map
+from warpir.light import Lobes, as_map, summarize
 from warpir.light_optimization import LightOptimization, Unknowns
 from warpir.lighting import SceneLight, is_described, start_level
+from warpir.lit_frame import LitFrame
 from warpir.lobe_fit import fit_lobes
 from warpir.lobes_file import lobes_to_json
 from warpir.optimize import Optimization
 from warpir.picture import resize, scene_of
 from warpir.progress import StepProgress
 from warpir.record import Timings, input_hashes, versions
+from warpir.regressor import load_regressor
 from warpir.render import Renderer
 from warpir.sg_light import narrowest
 from warpir.tone import ToneCurve
 from warpir.transport_cache import default_cache
+from warpir.trust import TrustRegion
 from warpir.view import Frame
 
 FloatArray = NDArray[np.float32]
@@ -57,11 +65,22 @@ SAY_EVERY = 25
 """Steps between two looks at the light, for people."""
 SHOWN_SEEDS = (0, 1, 2)
 """Of the pictures of --show-prior."""
-LOSSES_WITHOUT_LORA = ("csd", "sds-base")
+PREVIEW_SAMPLES = 16
+"""Camera samples per pixel of the first preview, which is to be there soon."""
+CHECK_DRAWS = 16
+"""Noises of the scores that stand beside a verdict."""
+ANYTHING = "object"
+"""What the embedded prior is asked for when nobody says what the object is."""
+ABOUT_EMBEDDED = (
+    "prior: embedded, trained on rendered scenes; for photographs Stable Diffusion is recommended "
+    "(--model)"
+)
+LOSSES_WITHOUT_LORA = ("csd", "sds-base", "good-bad")
 """They ask the unadapted model alone."""
 NOT_IDENTITY = frozenset(
     {"out", "overwrite", "resume", "preview_every", "checkpoint_every", "threads", "mark"}
     | {"allow_download", "show_prior", "samples", "rays", "indirect_limit", "width", "device"}
+    | {"accept"}
 )
 """Settings that an interrupted run may change: they do not reach the optimisation, or, as the
 device that was chosen, count by what came of them."""
@@ -81,6 +100,8 @@ class Run:
     timings: Timings
     say: Say
     progress: StepProgress
+    estimate: Estimate | None = None
+    """What was read off the photo, where that is the start."""
 
     @property
     def torch_device(self) -> torch.device:
@@ -92,8 +113,10 @@ class Run:
 class Guided:
     """A model that has seen the photo, ready to judge composites of it."""
 
-    prior: StableDiffusion
+    prior: NetworkPrior
     prompts: Prompts
+    negative_prompt: str
+    """What the negative term asks for; empty: the null prompt."""
     adapter: str | None
     lora: Lora | None
     record: dict[str, Any]
@@ -101,44 +124,62 @@ class Guided:
     notices: tuple[str, ...]
 
 
-def recover(run: Run, start: SceneLight) -> tuple[SceneLight, dict[str, Any], tuple[str, ...]]:
+def recover(
+    run: Run, start: SceneLight | None
+) -> tuple[SceneLight, dict[str, Any], tuple[str, ...]]:
     """Recover light and tone curves.
 
     Args:
         run: Configuration, inputs, output folder.
-        start: The light that was given, or the one that stands for none.
+        start: The light that was given, or the one that stands for none; None: it is read off the
+            photo.
 
     Returns:
-        Light and curves, what run.json says about them, and notices.
+        Light and curves, those of the start where guidance could show no improvement; what run.json
+        says about them, and notices.
 
     Raises:
         InputError: The model cannot be used (exit 4), memory is short (5), the numbers stayed
             non-finite (6), or what ``--resume`` finds is another run's.
     """
+    run = settled(run)
+    if start is None:
+        with run.timings.stage("regress"):
+            estimate = estimate_light(run.inputs, run.config, run.device)
+        run, start = replace(run, estimate=estimate), estimate.light
+        for line in start.assumed:
+            run.say(f"assumed: {line}")
     config = settings = run.config
     with as_input_errors():
         checkpoints = open_checkpoints(run)
         with run.timings.stage("scene"):
             frame = make_frame(run)
             unknowns = start_of(run, start).to(run.torch_device)
+            region = region_of(run, unknowns)
+        if config.preview_every:
+            with run.timings.stage("preview"):
+                write_start(run, frame, start)
         guided, resumed = prepare_guidance(run, checkpoints)
         with run.timings.stage("trace"):
             guide = make_guide(run, guided, frame)
             graphs = guided.prior.graphs
             faster = graphs.recorded_module if graphs else None
             loop = LightOptimization(
-                frame, guide, settings, unknowns, default_cache(), record=faster
+                frame, guide, settings, unknowns, default_cache(), record=faster, region=region
             )
+        before = {k: v.detach().clone() for k, v in unknowns.state_dict().items()}
         with torch.no_grad():
             first = loop.guide.score(loop.final_image(config.seed))
         optimize(run, loop, checkpoints, resumed)
+        verdict = None
+        if config.accept:
+            assert isinstance(guide, Guidance)
+            with run.timings.stage("accept"):
+                verdict, compared = judge_end(loop, guide, before)
+            run.say(verdict.line)
         notices = (*guided.prior.notices, *guided.notices, *loop_notices(loop))
         light_fg, light_shadow = loop.final_lights(LIGHT_HEIGHT)
         unknowns = loop.unknowns
-        run.output.write_json("lobes.json", lobes_to_json(unknowns.light_fg.lobes()))
-        if settings.fusion != "single":
-            shadow = lobes_to_json(unknowns.light_shadow.lobes())
-            run.output.write_json("lobes_shadow.json", shadow)
         run.output.write_json("optimization.json", convergence(loop, first))
         write_lora(run, guided)
         curves = Curves(
@@ -146,22 +187,92 @@ def recover(run: Run, start: SceneLight) -> tuple[SceneLight, dict[str, Any], tu
         )
     record = {
         **guided.record,
-        "prior": guided.prior.name,
+        **who_spoke(run, guided),
         "loop_integrator": settings.integrator,
         "optimization": summary_of(loop, first) | {"clipped_steps": guide.counts.clipped_steps},
+        **({} if run.estimate is None else {"regression": run.estimate.regression.record()}),
+        "start_light": asdict(summarize(start.light)),
+        "end_light": asdict(summarize(light_fg)),
     }
+    if verdict is not None:
+        record["acceptance"] = verdict.record() | compared
+        if not verdict.is_accepted:
+            return start, record, (*notices, verdict.line)
+    run.output.write_json("lobes.json", lobes_to_json(unknowns.light_fg.lobes()))
+    if settings.fusion != "single":
+        run.output.write_json("lobes_shadow.json", lobes_to_json(unknowns.light_shadow.lobes()))
     light = SceneLight(light_fg, light_shadow, curves, 0.0, start.assumed)
     return light, record, notices
 
 
+def settled(run: Run) -> Run:
+    """Return the run with nothing left open to the prior."""
+    return replace(run, config=run.config.settled(on_cuda=run.device != "cpu"))
+
+
+def who_spoke(run: Run, guided: Guided) -> dict[str, Any]:
+    """Return what run.json says of the prior and of what was left open to it."""
+    prior = guided.prior
+    about = {"prior_about": ABOUT_EMBEDDED} if prior.name == "embedded" else {}
+    settings = {name: getattr(run.config, name) for name in PRIOR_DEFAULTS[prior.name]}
+    settings["tone"] = run.config.tone_operator
+    return {"prior": prior.name, "prior_sha256": prior.digest, **about, "settings": settings}
+
+
+def judge_end(
+    loop: LightOptimization, guide: Guidance, before: dict[str, torch.Tensor]
+) -> tuple[Verdict, dict[str, Any]]:
+    """Return whether the loop's end is better than its start, by guidance that is asked anew.
+
+    Args:
+        loop: At its end, where it also is afterwards.
+        guide: Its guidance.
+        before: The unknowns at the start.
+
+    Returns:
+        The verdict, and scores of both ends with common noises: of the run's own loss, and of the
+        difference of the errors of the right and the wrong prompt where there is a wrong one.
+    """
+    after = {k: v.detach().clone() for k, v in loop.unknowns.state_dict().items()}
+
+    def image(share: float) -> torch.Tensor:
+        loop.unknowns.load_state_dict(blend(before, after, share))
+        return loop.final_image(loop.seed)
+
+    verdict = judge(guide, image)
+    judges = {"score": guide}
+    if guide.row.k_n and guide.settings.loss != "good-bad":
+        judges["good_bad"] = guide.with_loss("good-bad")
+    compared = {}
+    with torch.no_grad():
+        for end, share in (("start", 0.0), ("end", 1.0)):
+            picture = image(share)
+            for name, judging in judges.items():
+                # The seed of no score that chose among the states.
+                seed = loop.seed + 1
+                compared[f"{name}_{end}"] = judging.score(picture, seed, CHECK_DRAWS)
+    loop.unknowns.load_state_dict(after)
+    return verdict, compared
+
+
 def require_model(config: InsertConfig) -> None:
-    """Check the model's folder, and load nothing.
+    """Check what the run reads beside its inputs: the model's folder, or the weights that we ship.
 
     Raises:
         InputError: It is not there, or not what it should be (`ExitCode.MODEL`).
     """
     with as_input_errors():
-        check_model_folder(find_model(config.model, allow_download=False))
+        if config.guided_by == "stable-diffusion" and not config.allow_download:
+            check_model_folder(find_model(config.model, allow_download=False))
+        if config.guided_by == "embedded":
+            load_embedded(_path(config.prior), torch.device("cpu"))
+    is_given = is_described(config) or config.reuse is not None
+    if config.start != "uniform" and not is_given:
+        load_regressor(_path(config.regressor))
+
+
+def _path(name: str | None) -> Path | None:
+    return None if name is None else Path(name)
 
 
 def open_checkpoints(run: Run) -> Checkpoints:
@@ -194,7 +305,7 @@ def open_checkpoints(run: Run) -> Checkpoints:
     return checkpoints
 
 
-def checkpoint_of(run: Run, checkpoints: Checkpoints, prior: StableDiffusion) -> Checkpoint | None:
+def checkpoint_of(run: Run, checkpoints: Checkpoints, prior: NetworkPrior) -> Checkpoint | None:
     """Return the checkpoint to go on from, which is of this very model; None: there is none.
 
     Raises:
@@ -218,27 +329,26 @@ def prepare_guidance(run: Run, checkpoints: Checkpoints) -> tuple[Guided, Checkp
         ModelError: The model cannot be loaded or adapted.
     """
     config = run.config
-    assert config.prompt is not None
     with run.timings.stage("model"):
-        prior = load_stable_diffusion(config, run.torch_device)
-        prompts = make_prompts(config.prompt, config)
+        prior, prompts, negative = load_prior(run)
         shown = [*(config.show_prior or ())]
         prior.embed([prompts.photo, prompts.class_, prompts.guidance, "", *shown])
-        prior.embed([config.negative_prompt, config.null_prompt, config.base_prompt])
-    run.say(f"model: {prior.name} {config.model}, sha256 {prior.digest[:16]}...")
+        prior.embed([negative, config.null_prompt, config.base_prompt])
+    weights = config.model or config.prior or "as shipped"
+    run.say(f"model: {prior.name} {weights}, sha256 {prior.digest[:16]}...")
     resumed = checkpoint_of(run, checkpoints, prior)
     run.say(f'guidance asks for "{prompts.guidance}"')
     record: dict[str, Any] = {
         "model": {"name": prior.name, "sha256": prior.weight_hashes},
         "prompts": asdict(prompts),
     }
-    notices: tuple[str, ...] = ()
+    notices: tuple[str, ...] = (ABOUT_EMBEDDED,) if prior.name == "embedded" else ()
     does_without = config.loss in LOSSES_WITHOUT_LORA and config.lora is None and not shown
     if config.personalize and does_without:
-        notices = (f"--loss {config.loss} does without a LoRA: none was trained",)
+        notices = (*notices, f"--loss {config.loss} does without a LoRA: none was trained")
     if not config.personalize or does_without:
         prior.free_text_encoder()
-        return Guided(prior, prompts, None, None, record, notices), resumed
+        return Guided(prior, prompts, negative, None, None, record, notices), resumed
     photo = torch.from_numpy(run.inputs.photo.srgb).permute(2, 0, 1)[None].contiguous()
     cache = cache_folder()
     with run.timings.stage("personalize"):
@@ -272,7 +382,29 @@ def prepare_guidance(run: Run, checkpoints: Checkpoints) -> tuple[Guided, Checkp
         "error_before_after": made.evaluation and list(made.evaluation),
         "seconds": made.seconds,
     }
-    return Guided(prior, prompts, made.adapter, made.lora, record, made.notices), resumed
+    notices = (*notices, *made.notices)
+    return Guided(prior, prompts, negative, made.adapter, made.lora, record, notices), resumed
+
+
+def load_prior(run: Run) -> tuple[NetworkPrior, Prompts, str]:
+    """Return the prior that is asked for, what it is asked, and what the negative term asks.
+
+    Raises:
+        ModelError: It cannot be loaded.
+    """
+    config = run.config
+    if config.guided_by == "embedded":
+        prompts = embedded_prompts(config.prompt or ANYTHING, config, bool(config.personalize))
+        device = run.torch_device
+        graphs = config.graphs and device.type == "cuda"
+        prior = load_embedded(_path(config.prior), device, graphs)
+        if prompts.unknown:
+            words = ", ".join(prompts.unknown)
+            prior.notices += (f"the embedded prior does not know: {words}",)
+        return prior, prompts, config.negative_prompt or prompts.negative
+    assert config.prompt is not None
+    model = load_stable_diffusion(config, run.torch_device)
+    return model, make_prompts(config.prompt, config), config.negative_prompt
 
 
 def make_frame(run: Run) -> Frame:
@@ -282,7 +414,7 @@ def make_frame(run: Run) -> Frame:
         InputError: The object is not seen in it; better known before the model is adapted.
     """
     config, camera = run.config, run.inputs.camera
-    width = min(config.guidance_width, camera.width)
+    width = min(config.picture_width, camera.width)
     small = camera.scaled(width, max(1, round(width * camera.height / camera.width)))
     renderer = Renderer(scene_of(run.inputs, small, run.device), config.threads or 0)
     photo = np.clip(resize(run.inputs.photo.linear(), small.height, small.width), 0.0, None)
@@ -297,13 +429,26 @@ def make_frame(run: Run) -> Frame:
 
 
 def start_of(run: Run, start: SceneLight) -> Unknowns:
-    """Return the unknowns: lobes fitted to a light that was given, else an even light."""
+    """Return the unknowns: lobes of the light that was given or regressed, else an even light."""
     config = run.config
-    lobes = None
-    if is_described(config):
+    lobes, least = None, narrowest(config.light_rows)
+    if run.estimate is not None:
+        lobes = run.estimate.regression.lobes(least)
+        lobes = replace(lobes, amplitude=(run.estimate.gain * lobes.amplitude).astype(np.float32))
+    elif is_described(config):
         fitted = fit_lobes(as_map(start.light, START_HEIGHT), config.lobes).lobes
-        lobes = widened(fitted, narrowest(config.light_height))
+        lobes = widened(fitted, least)
     return Unknowns.start(lobes, start_level(run.inputs, config), config)
+
+
+def region_of(run: Run, unknowns: Unknowns) -> TrustRegion | None:
+    """Return where a regressed light is expected, with its uncertainty; None without one."""
+    if run.estimate is None:
+        return None
+    found = run.estimate.regression
+    spread = float(np.radians(found.spread_deg))
+    light = unknowns.light_fg
+    return TrustRegion.around(light, spread, found.sun_log_std, found.ambient_log_std)
 
 
 def widened(lobes: Lobes, sigma_min: float) -> Lobes:
@@ -321,15 +466,46 @@ def make_guide(run: Run, guided: Guided, frame: Frame) -> Guidance | DatasetUpda
     background = torch.from_numpy(shown).permute(2, 0, 1)[None].to(run.torch_device)
     prompts = guided.prompts
     condition = Condition(
-        prompts.guidance, negative_prompt=config.negative_prompt, background=background
+        prompts.guidance,
+        negative_prompt=guided.negative_prompt,
+        background=background,
+        gbuffer=gbuffer_of(frame).to(run.torch_device),
     )
     seen = torch.from_numpy(frame.coverage())
     guide = make_guidance(
-        guided.prior, condition, config, seen, config.step_count, config.seed, guided.adapter
+        guided.prior,
+        condition,
+        config.guidance_settings(),
+        seen,
+        config.step_count,
+        config.seed,
+        guided.adapter,
     )
     if isinstance(guide, Guidance):
         guide.ensure_precision(background)
     return guide
+
+
+def gbuffer_of(frame: Frame) -> torch.Tensor:
+    """Return what the object is, as the embedded prior sees it, shape [1, 7, H, W].
+
+    Mask in [0, 1], albedo display-encoded, unit normals in the camera's frame (x right, y up, z
+    toward the camera); all 0 beside the object. `warpir.training_batches.PriorBatch` is the same.
+    """
+    scene = frame.renderer.scene
+    found = frame.renderer.gbuffer(frame.seed)
+    seen = found.coverage > 0.0
+    height, width = frame.photo_lin.shape[:2]
+    plane = np.zeros((height * width, 7), np.float32)
+    plane[found.object_pixels[seen]] = np.concatenate(
+        [
+            found.coverage[seen, None],
+            linear_to_gamma(np.clip(found.base_color[seen], 0.0, 1.0)),
+            found.normal[seen] @ scene.camera.c2w[:3, :3],
+        ],
+        axis=1,
+    )
+    return torch.from_numpy(plane.reshape(height, width, 7)).permute(2, 0, 1)[None].contiguous()
 
 
 def optimize(
@@ -350,7 +526,8 @@ def optimize(
             words += f"; score {score:.4g}" if score is not None else ""
         run.progress.report("optimisation", step, config.step_count, words)
         if config.preview_every and step % config.preview_every == 0:
-            write_preview(run, loop, step)
+            with torch.no_grad():
+                write_preview(run, loop.final_image(config.seed), step)
         if config.checkpoint_every and step % config.checkpoint_every == 0:
             checkpoints.save("optimize", step, loop.state_dict())
 
@@ -360,12 +537,19 @@ def optimize(
         run.say(f"kept: step {loop.state.best_step}, score {loop.state.best_score:.4g}")
 
 
-def write_preview(run: Run, loop: Optimization, step: int) -> None:
-    """Write the composite as it stands to ``progress/``; earlier results are not touched."""
+def write_start(run: Run, frame: Frame, start: SceneLight) -> None:
+    """Write the composite under the light of the start, before anything slow is done."""
+    lit = LitFrame(frame, start, run.torch_device, PREVIEW_SAMPLES)
+    curves = (ToneCurve(n).to(run.torch_device)() for n in (1, 3))
     with torch.no_grad():
-        image = loop.final_image(run.config.seed)[0].permute(1, 2, 0).cpu().numpy()
+        write_preview(run, lit.image(lit.foreground, *curves), 0)
+
+
+def write_preview(run: Run, image: torch.Tensor, step: int) -> None:
+    """Write a composite, shape [1, 3, H, W], to ``progress/``; earlier results are not touched."""
+    shown = image[0].permute(1, 2, 0).cpu().numpy()
     path = run.output.path / "progress" / f"preview-{step:06d}.png"
-    write_file(path, png_bytes(np.round(image * 255.0).astype(np.uint8), None, False, ""))
+    write_file(path, png_bytes(np.round(shown * 255.0).astype(np.uint8), None, False, ""))
     run.say(f"preview: {path}")
 
 

@@ -16,12 +16,13 @@ import torch
 from torch import Tensor
 
 from warpir.asset import Asset, Material
-from warpir.bridge import ComposeConstants, ShadeForeground, compose
+from warpir.bridge import ShadeForeground
 from warpir.camera import Camera
 from warpir.config import REFINE_PARTS, InsertConfig
 from warpir.curves import Curves, ToneKnots
 from warpir.integrator import MaterialTensors
 from warpir.lighting import SceneLight
+from warpir.lit_frame import LitFrame
 from warpir.materials_file import MATERIALS, materials_to_json
 from warpir.mis import MisIntegrator
 from warpir.optimize import Guide, Optimization
@@ -37,16 +38,14 @@ from warpir.recover import (
     open_checkpoints,
     optimize,
     prepare_guidance,
+    settled,
     summary_of,
+    who_spoke,
     write_lora,
 )
 from warpir.regularizers import bend
-from warpir.render import index_of, light_args
 from warpir.tone import Knots, ToneCurve
-from warpir.view import Frame
 
-STILL_SAMPLES = 64
-"""Camera samples per pixel of what is rendered once."""
 MARGIN = 0.05
 """How far beyond its bounds a factor's sigmoid reaches, in spans: raw values of 0 and 1 are finite,
 3 either way, and there the sigmoid still has a fifth of its slope."""
@@ -189,51 +188,6 @@ class ToneUnknowns(torch.nn.Module):
 
 
 # ---------------------------------------------------------------------------------- loops
-
-
-class LitFrame:
-    """A frame under a light that stands still; what no unknown reaches is rendered here, once.
-
-    Args:
-        frame: Scene, photo, tone operator.
-        light: The light.
-        device: Where the unknowns are.
-
-    Attributes:
-        foreground: The object with its own materials, premultiplied, shape [object_pixel, 3].
-    """
-
-    def __init__(self, frame: Frame, light: SceneLight, device: torch.device) -> None:
-        self.frame, renderer, seed = frame, frame.renderer, frame.seed
-        self.args_fg = args_shadow = light_args(light.light, renderer.device)
-        if light.light_shadow is not light.light:
-            args_shadow = light_args(light.light_shadow, renderer.device)
-        self.object_pixels = renderer.gbuffer(seed).object_pixels
-        height, width = frame.photo_lin.shape[:2]
-        is_object = (index_of(self.object_pixels, height * width) >= 0).astype(np.int32)
-        proxies = renderer.shaded_pixels(args_shadow, seed)
-        plane = renderer.proxy(args_shadow, proxies, is_object[proxies], STILL_SAMPLES, 1, seed)
-        seen = renderer.foreground(
-            self.args_fg, self.object_pixels, STILL_SAMPLES, 1, frame.depth, seed
-        )
-        self.foreground, self.lit, self.unoccluded = (
-            torch.from_numpy(values).to(device)
-            for values in (seen.radiance, plane.lit, plane.unoccluded)
-        )
-        self.constants = ComposeConstants(
-            frame.photo_lin,
-            self.object_pixels,
-            proxies,
-            seen.mask,
-            str(renderer.device.alias),
-            frame.is_reinhard,
-        )
-
-    def image(self, foreground: Tensor, curve_fg: Knots, curve_shadow: Knots) -> Tensor:
-        """Return the composite, display-encoded, shape [1, 3, H, W]; differentiable."""
-        return compose(
-            self.constants, foreground, self.lit, self.unoccluded, curve_fg, curve_shadow
-        )
 
 
 class MaterialRefinement(Optimization):
@@ -386,6 +340,7 @@ def refine(
     Raises:
         InputError: As `warpir.recover.recover`.
     """
+    run = settled(run)
     config, asset = run.config, run.inputs.asset
     with as_input_errors():
         checkpoints = open_checkpoints(run)
@@ -424,7 +379,7 @@ def refine(
     run.output.write_json("optimization.json", convergence(loop, first))
     record = {
         **guided.record,
-        "prior": guided.prior.name,
+        **who_spoke(run, guided),
         "loop_integrator": "mis",
         "refine": record,
         "optimization": summary_of(loop, first) | {"clipped_steps": guide.counts.clipped_steps},

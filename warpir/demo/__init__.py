@@ -6,7 +6,7 @@ Everything is made by ``python -m warpir.demo.make``; nothing is downloaded or s
 from dataclasses import replace
 from pathlib import Path
 
-from warpir.config import InsertConfig
+from warpir.config import LIGHTS, InsertConfig
 
 FOLDER = Path(__file__).parent
 PHOTO, ASSET, LIGHT, CAMERA = (
@@ -17,12 +17,14 @@ PHOTO, ASSET, LIGHT, CAMERA = (
 def demo_config(config: InsertConfig) -> InsertConfig:
     """Return the configuration with the demo's files filled in.
 
-    Its light and exposure are too, except where guidance is to recover them.
+    Its light and exposure are too with ``--guidance none`` and for ``--refine``; otherwise the light
+    is what is to be found out.
     """
     from warpir.demo.place import placement
 
     where = placement()
-    is_recovered = config.guidance != "none" and config.refine is None
+    is_given = any(getattr(config, name) is not None for name in LIGHTS)
+    is_recovered = is_given or (config.guided_by != "none" and config.refine is None)
     return replace(
         config,
         demo=False,
@@ -31,7 +33,7 @@ def demo_config(config: InsertConfig) -> InsertConfig:
         camera=str(CAMERA),
         place=where.place,
         rotate_y=where.rotate_y,
-        light=None if is_recovered else str(LIGHT),
+        light=config.light if is_recovered else str(LIGHT),
         exposure=config.exposure if is_recovered else 0.0,
         tone=config.tone if is_recovered else "linear",
     )

@@ -1,0 +1,87 @@
+"""A trust region: guidance may not lead the light far from what the regressor is sure of.
+
+    trust = angle^2 / spread^2 + (log sun / sun_0)^2 / std^2 + (log ambient / ambient_0)^2 / std^2
+
+of the dominant lobe and of all others together. What the regressor says little about, tone curves,
+softness and colour, is free within its bounds.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from warpir.fusion import luminance
+from warpir.sg_light import SGLight
+
+SPREAD_MIN = float(torch.pi) / 36.0
+"""Least spread that a direction is believed to have [rad]: 5 degrees."""
+LOG_STD_MIN = 0.1
+"""Least standard deviation that a log intensity is believed to have."""
+SMALL = 1e-4
+"""Below it, (1 - cos) / 2 has the square of the angle as a series [1]."""
+
+
+@dataclass(frozen=True)
+class TrustRegion:
+    """Where the light is expected, and how surely; the dominant lobe is the first."""
+
+    axis: Tensor
+    """Unit direction of the dominant light, world frame, shape [3]."""
+    log_sun: Tensor
+    """Log luminous flux of the dominant lobe, shape []."""
+    log_ambient: Tensor
+    """Log luminous flux of all others, shape []."""
+    spread: float
+    """Expected angle between `axis` and the truth [rad]."""
+    sun_std: float
+    """Standard deviation of `log_sun`."""
+    ambient_std: float
+    """Standard deviation of `log_ambient`."""
+
+    @staticmethod
+    def around(light: SGLight, spread: float, sun_std: float, ambient_std: float) -> TrustRegion:
+        """Return the region whose middle is a light, the first of whose lobes is the dominant one.
+
+        Args:
+            light: Where the recovery starts.
+            spread: Of the dominant direction [rad]; at least `SPREAD_MIN` is assumed.
+            sun_std: Of the dominant lobe's log flux; at least `LOG_STD_MIN` is assumed.
+            ambient_std: Of the others' log flux; at least `LOG_STD_MIN` is assumed.
+        """
+        with torch.no_grad():
+            log_sun, log_ambient = _log_fluxes(light)
+            axis = torch.nn.functional.normalize(light.axis[0], dim=0).clone()
+        return TrustRegion(
+            axis,
+            log_sun,
+            log_ambient,
+            max(spread, SPREAD_MIN),
+            max(sun_std, LOG_STD_MIN),
+            max(ambient_std, LOG_STD_MIN),
+        )
+
+    def distance(self, light: SGLight) -> Tensor:
+        """Return the squared distance of a light in units of what is uncertain, shape []."""
+        log_sun, log_ambient = _log_fluxes(light)
+        axis = torch.nn.functional.normalize(light.axis[0], dim=0)
+        turned = squared_angle(axis, self.axis) / self.spread**2
+        brighter = ((log_sun - self.log_sun) / self.sun_std).square()
+        return turned + brighter + ((log_ambient - self.log_ambient) / self.ambient_std).square()
+
+
+def squared_angle(a: Tensor, b: Tensor) -> Tensor:
+    """Return the square of the angle between unit vectors of shape [3], smooth where it is 0."""
+    x = (a - b).square().sum() / 4.0
+    # angle = 2 asin(sqrt(x)), whose root has no derivative at 0, nor has asin at 1.
+    root = x.clamp(SMALL, 1.0 - 1e-6).sqrt()
+    return torch.where(x < SMALL, 4.0 * x * (1.0 + x / 3.0), 4.0 * torch.asin(root).square())
+
+
+def _log_fluxes(light: SGLight) -> tuple[Tensor, Tensor]:
+    """Return the logs of the luminous flux of the first lobe and of the others, shape [] each."""
+    variance = torch.exp(2.0 * light.log_sigma)
+    flux = luminance(light.amplitude()) * variance * -torch.expm1(-2.0 / variance)
+    return torch.log(flux[0]), torch.log(flux[1:].sum())
