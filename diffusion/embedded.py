@@ -429,17 +429,18 @@ class EmbeddedPrior(NetworkPrior):
                 raise ValueError(f"{name}: shape {list(given.shape)} (expected {expected})")
         if keep_background is not None and len(keep_background) != count:
             raise ValueError(f"keep_background: {len(keep_background)} (expected {count})")
-        present = torch.zeros(count, len(CONDITIONS))
-        if background is not None:
-            keep = keep_background if keep_background is not None else [True] * count
-            present[:, 0] = torch.tensor(keep, dtype=present.dtype)
-        present[:, 1:] = gbuffer is not None
+        # Made on the device: what is uploaded here could not be recorded as a CUDA graph.
+        present = latents_noisy.new_zeros(count, len(CONDITIONS))
+        present[:, 1:] = float(gbuffer is not None)
+        present[:, 0] = float(background is not None)
+        if background is not None and keep_background is not None:
+            present[:, 0] = torch.tensor(keep_background, dtype=present.dtype).to(device)
         zeros = latents_noisy.new_zeros(count, 7, *size)
         return pack(
             latents_noisy,
             zeros[:, :3] if background is None else background.to(device, torch.float32),
             zeros if gbuffer is None else gbuffer.to(device, torch.float32),
-            present.to(device),
+            present,
         )
 
     def unpack(self, predicted: Tensor) -> Tensor:

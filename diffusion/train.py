@@ -321,8 +321,8 @@ class _Training:
         if is_cuda:
             for each in (self.network, self.average):
                 each.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
-        self.parameters = list(self.network.parameters())
-        self.averages = list(self.average.parameters())
+        self.parameters: list[Tensor] = list(self.network.parameters())
+        self.averages: list[Tensor] = list(self.average.parameters())
         objective: Any = Objective(self.network, settings)
         self.objective = torch.compile(objective) if settings.compile and is_cuda else objective
         self.optimizer = torch.optim.AdamW(
@@ -352,6 +352,8 @@ class _Training:
             share = progress.seconds / total
             if s.step_limit:
                 share = max(share, progress.step / s.step_limit)
+            if s.step_limit and progress.step >= s.step_limit:
+                break
             if self._is_over(share >= 1.0 or now - start >= seconds - reserve):
                 break
             rate = self._rate(share)
