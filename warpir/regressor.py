@@ -41,6 +41,8 @@ AMBIENT_SHARPNESS = 4.0
 """Of the 14 ambient lobes: with equal amplitudes their sum is even within 4 %."""
 DARKEST = 1e-4
 """Mean luminance below which a photo counts as this bright."""
+GATHERINGS = 4
+"""Weighted means of the tokens that each head reads, of a quarter of the features each."""
 LOWEST = -0.25
 """Height y of the lowest direction that a dominant light may have."""
 FORMAT = "warpir-regressor-1"
@@ -181,9 +183,9 @@ def _head(channels: int, dropout: float, count: int) -> nn.Sequential:
 class Regressor(nn.Module):
     """Photo and rays to `Prediction`.
 
-    There are 12 x 18 tokens of 8 x 8 pixels, and two learned ones that gather from them. Each of the
-    two heads, for direction and for levels, reads one of the learned tokens plus a weighted mean of
-    all others. The mean matters: without it training stays long at the answer that fits all photos.
+    There are 12 x 18 tokens of 8 x 8 pixels, and two learned ones that ask them. Each of the two
+    heads, for direction and for levels, reads one learned token plus weighted means of the others.
+    The means matter: without them training stays long at the one answer that fits all photos.
     """
 
     directions: Tensor
@@ -221,8 +223,9 @@ class Regressor(nn.Module):
             _TokenBlock(wide, config.heads, config.dropout, config.skipped)
             for _ in range(config.depth)
         )
-        self.gather = nn.Linear(wide, 2, bias=False)
-        nn.init.zeros_(self.gather.weight)
+        self.gather = nn.Linear(wide, 2 * GATHERINGS, bias=False)
+        # Clearly different weights from the start: an even mean tells nothing of where.
+        nn.init.normal_(self.gather.weight, std=3.0 / math.sqrt(wide))
         self.direction_head = _head(wide, config.dropout, len(directions))
         self.level_head = _head(wide, config.dropout, self.level_count)
 
@@ -245,8 +248,10 @@ class Regressor(nn.Module):
         # Softmax and exponentials of the answers need more digits than autocast leaves.
         with torch.autocast(tokens.device.type, enabled=False):
             asked, seen = tokens[:, :2].float(), tokens[:, 2:].float()
-            asked = asked + self.gather(seen).softmax(dim=1).transpose(1, 2) @ seen
-            direction, levels = asked.unbind(dim=1)
+            weights = self.gather(seen).softmax(dim=1).unflatten(2, (2, GATHERINGS))
+            groups = seen.unflatten(2, (GATHERINGS, -1))
+            gathered = torch.einsum("btag,btgc->bagc", weights, groups).flatten(2)
+            direction, levels = (asked + gathered).unbind(dim=1)
             return torch.cat([self.direction_head(direction), self.level_head(levels)], dim=1)
 
     def split(self, flat: Tensor) -> Prediction:
