@@ -12,9 +12,9 @@ FloatArray = NDArray[np.float32]
 
 DIFFERENCE_GAIN = 4.0
 """Factor on the difference, round mid grey."""
-CAPTION = 14
-"""Height of the line above each scene [px]."""
-COLUMNS = ("photo", "{row}", "truth", "4 x (difference) + grey")
+LINE = 14
+"""Height of a line of words [px]."""
+COLUMNS = ("photo", "{row}", "truth", "{row} - truth, x 4")
 
 
 @dataclass(frozen=True)
@@ -48,12 +48,11 @@ def contact_sheet(panels: Sequence[Panel], row: str, count: int = 40) -> Codes:
         width = panel.photo.shape[1]
         difference = panel.image.astype(np.float32) - panel.truth.astype(np.float32)
         shown = np.clip(128.0 + DIFFERENCE_GAIN * difference, 0.0, 255.0).astype(np.uint8)
-        caption = Image.new("RGB", (4 * width, CAPTION), "white")
+        caption = Image.new("RGB", (4 * width, 2 * LINE), "white")
         draw = ImageDraw.Draw(caption)
+        draw.text((2, 1), f"{panel.name}: RMSE of the box {panel.error:.4f}", fill="black")
         for k, words in enumerate(COLUMNS):
-            text = words.format(row=row)
-            text = f"{text}: {panel.name}, RMSE of the box {panel.error:.4f}" if k == 0 else text
-            draw.text((k * width + 2, 1), text, fill="black")
+            draw.text((k * width + 2, LINE + 1), words.format(row=row), fill="black")
         pictures = np.concatenate([panel.photo, panel.image, panel.truth, shown], axis=1)
         strips += [np.asarray(caption), pictures]
     sheet: Codes = np.concatenate(strips, axis=0)

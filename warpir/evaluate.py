@@ -24,6 +24,8 @@ from warpir.errors import ExitCode, InputError
 from warpir.program import run_program, say
 
 if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
     from warpir.contact_sheet import Panel
     from warpir.evaluation_report import Entry
     from warpir.evaluation_rows import Bench
@@ -31,12 +33,19 @@ if TYPE_CHECKING:
     from warpir.evaluation_stage import Prediction
     from warpir.files import OutputFolder
     from warpir.image_errors import Distance
+    from warpir.regressor import Regressor
+
+    FloatArray = NDArray[np.float32]
 
 FORMAT, VERSION = "warpir-evaluation", 1
 LIGHT_HEIGHT = 128
 """Rows of the maps on which lights are compared."""
 SHEET_ROWS = ("lds-regression", "lds-uniform", "regression", "predictions", "brightest-region")
 """Whose pictures the contact sheet shows: the first of these that was asked for."""
+UNSEEN_SEED = 0xE7A1
+"""Added to the seed of made-up photographs; training and its validation use others."""
+PROCEDURAL_BATCH = 64
+"""Of those, rendered at once."""
 SAVED = ("tables.md", "contact_sheet.png")
 
 
@@ -239,8 +248,6 @@ def evaluate(
 
     record = _record(options, bench, scenes, entries, notices)
     if options.procedural:
-        from warpir.evaluation_procedural import procedural_errors
-
         record["procedural"] = procedural_errors(
             bench.network, options.procedural, options.seed, device
         )
@@ -284,7 +291,7 @@ def _missing_measures(lpips: "Distance | None") -> list[str]:
 
 def _exchange(
     options: argparse.Namespace, places: "list[Place]", notices: list[str]
-) -> "dict[str, np.ndarray[Any, np.dtype[np.float32]]] | None":
+) -> "dict[str, FloatArray] | None":
     """Write crops for, and read maps of, another system."""
     from warpir.predictions import export_crops, read_predictions
 
@@ -304,7 +311,7 @@ def _make_bench(
     options: argparse.Namespace,
     scenes: "list[tuple[Place, list[Subject]]]",
     device: str,
-    predictions: "dict[str, np.ndarray[Any, np.dtype[np.float32]]] | None",
+    predictions: "dict[str, FloatArray] | None",
 ) -> "Bench":
     from warpir.evaluation_rows import Bench
     from warpir.regressor import load_regressor
@@ -366,29 +373,35 @@ def _judge(
     from warpir.evaluation_rows import ROWS
     from warpir.evaluation_stage import Quality, Stage
     from warpir.image_errors import image_errors, make_regions
+    from warpir.light import as_map
+    from warpir.light_errors import light_errors
 
     entries, panels = [], []
-    of_place: dict[str, tuple[Prediction, dict[str, float]]] = {}
+    of_place: dict[str, tuple[Prediction, FloatArray, dict[str, float]]] = {}
     for subject in subjects:
         quality = Quality(samples=options.samples)
         stage = Stage(subject, bench.device, quality, options.seed, options.threads)
         regions = make_regions(stage.mask, stage.ratio)
-        lights: dict[str, np.ndarray[Any, np.dtype[np.float32]]] = {}
+        lights: dict[str, FloatArray] = {}
         for name in rows:
             row = ROWS[name]
             if row.of_subject is not None:
                 prediction = row.of_subject(bench, stage, subject)
-                of_light = light_figures(place, prediction)
+                texels = as_map(prediction.light, LIGHT_HEIGHT)
+                of_light = light_figures(place, texels)
+            elif name in of_place:
+                prediction, texels, of_light = of_place[name]
             else:
                 assert row.of_place is not None
-                if name not in of_place:
-                    prediction = row.of_place(bench, place)
-                    of_place[name] = prediction, light_figures(place, prediction)
-                prediction, of_light = of_place[name]
-            figures = dict(of_light)
-            lights[name] = _map(prediction)
+                prediction = row.of_place(bench, place)
+                texels = as_map(prediction.light, LIGHT_HEIGHT)
+                of_light = light_figures(place, texels)
+                of_place[name] = prediction, texels, of_light
+            lights[name], figures = texels, dict(of_light)
             if row.same_as in lights:
-                figures["light.same_deg"] = _peak_angle(lights[name], lights[row.same_as])
+                figures["light.same_deg"] = light_errors(texels, lights[row.same_as])[
+                    "peak_angle_deg"
+                ]
             rendered = stage.render(prediction)
             image = stage.compose(rendered, prediction.curves)
             figures |= _flat("image", image_errors(image, stage.truth, regions, lpips))
@@ -414,30 +427,82 @@ def _judge(
     return entries, panels
 
 
-def _map(prediction: "Prediction") -> "np.ndarray[Any, np.dtype[np.float32]]":
-    from warpir.light import as_map
+def light_figures(place: "Place", texels: "FloatArray") -> dict[str, float]:
+    """Return the errors of a light, ``light.*`` and ``spheres.*``, in the camera-yaw frame.
 
-    return as_map(prediction.light, LIGHT_HEIGHT)
-
-
-def light_figures(place: "Place", prediction: "Prediction") -> dict[str, float]:
-    """Return the errors of a light, ``light.*`` and ``spheres.*``, in the camera-yaw frame."""
+    Args:
+        place: Knows the truth.
+        texels: Lat-long radiance, world frame, shape [He, 2 He, 3].
+    """
     from warpir.light_errors import light_errors
     from warpir.three_spheres import sphere_errors
 
-    found, true = place.to_camera(_map(prediction)), place.to_camera(place.texels)
+    found, true = place.to_camera(texels), place.to_camera(place.texels)
     errors = light_errors(found, true)
     for name in [n for n in errors if n.startswith("log_")]:
         errors[f"abs_{name}"] = abs(errors[name])
     return _flat("", {"light": errors, "spheres": sphere_errors(found, true)})
 
 
-def _peak_angle(
-    a: "np.ndarray[Any, np.dtype[np.float32]]", b: "np.ndarray[Any, np.dtype[np.float32]]"
-) -> float:
-    from warpir.light_errors import light_errors
+def procedural_errors(
+    network: "Regressor", count: int, seed: int, device: str
+) -> dict[str, dict[str, float]]:
+    """Return how well the regressor finds the direction in made-up photographs never seen.
 
-    return light_errors(a, b)["peak_angle_deg"]
+    Args:
+        network: The regressor.
+        count: Photographs.
+        seed: Objects, lights and photographs are those of no training run.
+        device: Warp device.
+
+    Returns:
+        Angle between found and true dominant direction [deg]: median, mean and 95 % interval of the
+        mean, of the photographs with a visible cue and of those without; beside it that of a guess,
+        the direction of the mean training light.
+    """
+    import torch
+
+    from warpir.prior_images import Mixture, SceneGenerator, Stock
+    from warpir.regressor import least_angle
+    from warpir.training_lights import load_panoramas
+    from warpir.training_meshes import make_meshes
+
+    where = network.directions.device
+    stock = Stock(make_meshes(24, UNSEEN_SEED + seed), load_panoramas([], where), device)
+    scenes = SceneGenerator(stock, UNSEEN_SEED + seed, Mixture(made_up=1.0, hybrid=0.0))
+    guess, _ = least_angle(
+        network.directions, network.split(network.mean_light[None]).logits.softmax(dim=1)
+    )
+    angles: dict[str, list[float]] = {"found": [], "guessed": []}
+    cues: list[bool] = []
+    for index, first in enumerate(range(0, count, PROCEDURAL_BATCH)):
+        batch = scenes.photo_batch(index, PROCEDURAL_BATCH)
+        said = network.predict(batch.photo, batch.rays)
+        axis, _ = least_angle(network.directions, said.logits.softmax(dim=1))
+        wanted = min(PROCEDURAL_BATCH, count - first)
+        cues += batch.has_cue[:wanted].tolist()
+        for name, directions in (("found", axis), ("guessed", guess.expand_as(axis))):
+            cosine = (directions * batch.axis).sum(dim=1).clamp(-1.0, 1.0)
+            angles[name] += torch.rad2deg(torch.acos(cosine))[:wanted].tolist()
+    return {
+        f"{name}, {words}": _spread([a for a, c in zip(values, cues, strict=True) if c == is_cue])
+        for name, values in angles.items()
+        for words, is_cue in (("visible cue", True), ("no cue", False))
+        if is_cue in cues
+    }
+
+
+def _spread(angles: list[float]) -> dict[str, float]:
+    from warpir.evaluation_report import bootstrap
+
+    low, high = bootstrap(angles, [str(k) for k in range(len(angles))], rounds=1000)
+    return {
+        "median_deg": float(np.median(angles)),
+        "mean_deg": float(np.mean(angles)),
+        "mean_low_deg": low,
+        "mean_high_deg": high,
+        "count": len(angles),
+    }
 
 
 def _flat(prefix: str, nested: dict[str, dict[str, float]]) -> dict[str, float]:
@@ -536,11 +601,16 @@ def _page(record: dict[str, Any], entries: "list[Entry]", words: dict[str, str])
     ]  # fmt: skip
     if "procedural" in record:
         lines += ["## Made-up photographs never seen", ""]
-        lines += [f"* {name}: {value:.4g}" for name, value in record["procedural"].items()]
+        lines += [
+            f"* {name}: median {s['median_deg']:.1f}, mean {s['mean_deg']:.1f} degrees "
+            f"({s['mean_low_deg']:.1f} .. {s['mean_high_deg']:.1f}), {s['count']} photographs"
+            for name, s in record["procedural"].items()
+        ]
         lines.append("")
     lines += tables(summarize(entries), words)
-    lines += pair_table(compare(entries, starts))
-    return lines
+    # What is known of the truth needs no comparison; the JSON file has it all the same.
+    judged = [p for p in compare(entries, starts) if ROWS[p.row].group != "references"]
+    return [*lines, *pair_table(judged)]
 
 
 if __name__ == "__main__":

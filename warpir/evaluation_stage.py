@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from warpir.bridge import ComposeConstants, compose
 from warpir.color import linear_to_gamma
 from warpir.curves import Curves, ToneKnots
+from warpir.errors import InputError
 from warpir.evaluation_scenes import RESPONSES, Subject
 from warpir.light import Light
 from warpir.render import Foreground, Renderer, light_args
@@ -25,8 +26,8 @@ from warpir.tone import ToneCurve
 FloatArray = NDArray[np.float32]
 IntArray = NDArray[np.int32]
 
-FLOOR_STEPS, FLOOR_RATE = 200, 0.05
-"""Adam's steps and learning rate for the tone floor's curves."""
+FLOOR_EVALUATIONS = 60
+"""Times that the tone floor's curves are tried while they are sought."""
 EXPOSURE_EV = 8.0
 """How far the fitted exposure may go, either way [EV]."""
 
@@ -87,6 +88,9 @@ class Stage:
         seed: Of the samples; the same for every light.
         threads: On the CPU; 0: one per core.
 
+    Raises:
+        InputError: Nothing of the object is seen.
+
     Attributes:
         truth: The true composite, display-encoded, shape [H, W, 3].
         mask: The object's share of each pixel, shape [H, W].
@@ -102,6 +106,8 @@ class Stage:
         scene = Scene([placed], self.place.camera, Proxy(ground[:3], -float(ground[3])), device)
         self.renderer = Renderer(scene, threads)
         self.objects: IntArray = self.renderer.gbuffer(seed).object_pixels
+        if len(self.objects) == 0:
+            raise InputError(subject.asset_path, f"nothing of it is seen in {self.place.name}")
         self.true = self.render(self.true_prediction())
         self.truth = self.compose(self.true, None)
         self.mask = self._plane(self.objects, self.true.foreground.mask, 0.0)
@@ -223,14 +229,21 @@ class Stage:
         radiance, white = torch.from_numpy(foreground.radiance), torch.ones_like(ratio)
         truth = torch.from_numpy(self.truth).permute(2, 0, 1)[None]
         curve_fg, curve_shadow = ToneCurve(1), ToneCurve(3)
-        optimizer = torch.optim.Adam(
-            [*curve_fg.parameters(), *curve_shadow.parameters()], FLOOR_RATE
+        optimizer = torch.optim.LBFGS(
+            [*curve_fg.parameters(), *curve_shadow.parameters()],
+            max_iter=FLOOR_EVALUATIONS,
+            max_eval=FLOOR_EVALUATIONS,
+            line_search_fn="strong_wolfe",
         )
-        for _ in range(FLOOR_STEPS):
-            image = compose(constants, radiance, ratio, white, curve_fg(), curve_shadow())
+
+        def error() -> float:
             optimizer.zero_grad()
-            (image - truth).square().sum().backward()
-            optimizer.step()
+            image = compose(constants, radiance, ratio, white, curve_fg(), curve_shadow())
+            squared = (image - truth).square().sum()
+            squared.backward()
+            return float(squared.detach())
+
+        optimizer.step(error)
         return Curves("reinhard", ToneKnots(*curve_fg.arrays()), ToneKnots(*curve_shadow.arrays()))
 
     def _plane(self, pixels: IntArray, values: FloatArray, outside: float) -> FloatArray:
