@@ -22,6 +22,7 @@ from typing import Any
 
 import numpy as np
 import torch
+import torch.distributed as dist
 import torch.nn.functional as F
 from safetensors import SafetensorError
 from safetensors.torch import load_file, save_file
@@ -638,17 +639,19 @@ def train_regressor(
         InputError: Nothing to resume from, or a state that is not whole.
     """
     began = time.monotonic()
+    peers = _Peers(torch.device(device))
     out.mkdir(parents=True, exist_ok=True)
     if resume:
         run = _Run.resumed(out, settings, device)
     else:
-        for old in out.glob("state-*"):
-            shutil.rmtree(old)
-        (out / CURVE).unlink(missing_ok=True)
+        if peers.is_first:
+            for old in out.glob("state-*"):
+                shutil.rmtree(old)
+            (out / CURVE).unlink(missing_ok=True)
         run = _Run(out, network or random_regressor(seed), settings, device)
     generator = torch.Generator(device)
-    generator.manual_seed(seed * 1_000_003 + run.step)
-    torch.manual_seed(seed * 1_000_003 + run.step)
+    for draws in (generator, torch):
+        draws.manual_seed((seed * 1_000_003 + run.step) * peers.count + peers.rank)
     is_cuda = torch.device(device).type == "cuda"
     if is_cuda:
         run.network.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
@@ -658,11 +661,10 @@ def train_regressor(
     losses: dict[str, Tensor] = {}
     run.network.train()
     while True:
-        now = time.monotonic()
-        run.minutes = earlier + (now - began) / 60.0
+        run.minutes = earlier + peers.agree(time.monotonic() - began) / 60.0
         by_steps = run.step / settings.step_limit if settings.step_limit else 0.0
         progress = max(run.minutes / total_minutes, by_steps)
-        if progress >= 1.0 or now - began >= 60.0 * minutes:
+        if progress >= 1.0 or run.minutes - earlier >= minutes:
             break
         for group in run.optimizer.param_groups:
             group["lr"] = _rate(settings, progress, run.step - first)
@@ -675,6 +677,7 @@ def train_regressor(
         terms = run.loss.terms(run.network.split(flat.float()), targets)
         run.optimizer.zero_grad(set_to_none=True)
         torch.stack([TERM_WEIGHTS[name] * term for name, term in terms.items()]).sum().backward()
+        peers.average(run.network)
         torch.nn.utils.clip_grad_norm_(run.network.parameters(), settings.clip)
         run.optimizer.step()
         run.step += 1
@@ -682,17 +685,72 @@ def train_regressor(
         for name, term in terms.items():
             kept = losses.get(name, term.detach())
             losses[name] = 0.98 * kept + 0.02 * term.detach()
+        if not peers.is_first:
+            continue
         if time.monotonic() - validated >= 60.0 * settings.validate_minutes:
             run.validate(validation, losses)
             validated = time.monotonic()
         if time.monotonic() - saved >= 60.0 * settings.save_minutes:
             run.save()
             saved = time.monotonic()
+    if not peers.is_first:
+        peers.leave()
+        return TrainingEnd(run.step, run.minutes, progress >= 1.0, {})
     if run.step > first:
         run.validate(validation, losses)
         run.save()
     known = dict(record or {}) | {"settings": asdict(settings), "seed": seed}
-    return TrainingEnd(run.step, run.minutes, progress >= 1.0, run.finish(validation, known))
+    known |= {"processes": peers.count}
+    finished = run.finish(validation, known)
+    peers.leave()
+    return TrainingEnd(run.step, run.minutes, progress >= 1.0, finished)
+
+
+class _Peers:
+    """The processes that train one network together, each with scenes of its own (``torchrun``).
+
+    Args:
+        device: Of this process.
+    """
+
+    def __init__(self, device: torch.device) -> None:
+        self.rank, self.count = (
+            int(os.environ.get(name, default)) for name, default in (("RANK", 0), ("WORLD_SIZE", 1))
+        )
+        self.device = device
+        if self.count > 1:
+            if device.type == "cuda":
+                torch.cuda.set_device(device)
+            dist.init_process_group("nccl" if device.type == "cuda" else "gloo")
+
+    @property
+    def is_first(self) -> bool:
+        """Whether this process is the one that validates and writes."""
+        return self.rank == 0
+
+    def agree(self, seconds: float) -> float:
+        """Return the first process's seconds: rates and the end depend on them."""
+        if self.count == 1:
+            return seconds
+        shared = torch.tensor(seconds, dtype=torch.float64, device=self.device)
+        dist.broadcast(shared, 0)
+        return float(shared)
+
+    def average(self, network: Regressor) -> None:
+        """Replace the gradients by their means over the processes."""
+        if self.count == 1:
+            return
+        gradients = [p.grad for p in network.parameters() if p.grad is not None]
+        flat = torch.cat([g.flatten() for g in gradients])
+        dist.all_reduce(flat)
+        parts = (flat / self.count).split([g.numel() for g in gradients])
+        for gradient, mean in zip(gradients, parts, strict=True):
+            gradient.copy_(mean.view_as(gradient))
+
+    def leave(self) -> None:
+        """Wait for the others, and end what was shared."""
+        if self.count > 1:
+            dist.destroy_process_group()
 
 
 def _rate(settings: TrainingSettings, progress: float, steps: int) -> float:

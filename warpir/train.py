@@ -35,6 +35,9 @@ MADE_UP_OBJECTS = 240
 VALIDATION_PICTURES = 768
 """Of each kind."""
 VALIDATION_SEED = 10**6
+REUSES = 2
+"""Steps in a row with the same composites, at other times, noises and words: rendering takes as
+long as learning."""
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -147,6 +150,20 @@ def _counted(
     return batches
 
 
+def _reused(
+    batches: Callable[[int, torch.Generator], Any], times: int
+) -> Callable[[int, torch.Generator], Any]:
+    """Return a callable that gives each batch several times in a row."""
+    held: list[Any] = []
+
+    def repeated(count: int, generator: torch.Generator) -> Any:
+        if not held:
+            held.extend([batches(count, generator)] * times)
+        return held.pop()
+
+    return repeated
+
+
 def _train_prior(
     options: argparse.Namespace,
     stocks: tuple[Stock, Stock],
@@ -179,7 +196,7 @@ def _train_prior(
     }
     settings = TrainSettings(batch=options.batch or 256, compile=not options.no_compile)
     progress = train_prior(
-        _counted(SceneGenerator(learned, seed).prior_batch),
+        _reused(_counted(SceneGenerator(learned, seed).prior_batch), REUSES),
         options.out,
         settings,
         device,
