@@ -10,7 +10,7 @@ from collections.abc import Sequence
 from dataclasses import asdict, fields, replace
 from itertools import pairwise
 from pathlib import Path
-from typing import Any
+from typing import Any, get_type_hints
 
 import pytest
 
@@ -20,8 +20,10 @@ from warpir.command import FLAGS, parse
 from warpir.config import (
     ABOVE_ZERO,
     CHOICES,
+    CPU_DEFAULTS,
     DEFAULTS,
     EXCLUSIVE,
+    PRIOR_DEFAULTS,
     PROMPTS,
     RANGES,
     InsertConfig,
@@ -36,6 +38,7 @@ from warpir.record import RUN_FORMAT
 ANSWER_SECONDS = 1.0
 HEAVY = ("torch", "warp", "PIL", "OpenImageIO", "OpenEXR", "trimesh", "numpy", "yaml", "colour")
 NEEDED = ["--photo", "p.png", "--asset", "a.glb", "--out", "o"]
+PAINTER = ["--guidance", "stable-diffusion", "--model", "m", "--prompt", "p"]
 
 
 def run(argv: Sequence[str], cwd: Path, after: str = "") -> subprocess.CompletedProcess[str]:
@@ -109,7 +112,61 @@ def test_command_help_tells_every_field(capsys: pytest.CaptureFixture[str]) -> N
     listed = [name for forms in FLAGS.values() for name in forms]
     assert sorted(listed) == sorted(field.name for field in fields(InsertConfig)) == sorted(docs)
     assert all(f"  {flag(name)}" in text and docs[name] for name in listed)
-    assert all(isinstance(DEFAULTS[name], bool) == (not form) for name, form in forms_of_flags())
+    hints = get_type_hints(InsertConfig)
+    switches = {name for name in listed if hints[name] in (bool, bool | None)}
+    assert switches == {name for name, form in forms_of_flags() if not form}
+    for name in switches - {name for name in listed if hints[name] is bool}:
+        assert f"  {flag(name)}, --no-{flag(name)[2:]}" in text
+
+
+def test_command_help_tells_what_each_prior_gets(capsys: pytest.CaptureFixture[str]) -> None:
+    """What is open has no default of its own: the help names those of both priors, by the table."""
+    assert warpir.insert.main(["--help"]) == 0
+    text = " ".join(capsys.readouterr().out.split())
+    assert "(default: embedded sds-good-bad; Stable Diffusion lds)" in text
+    assert "(default: embedded 4, on the CPU 2; Stable Diffusion 1)" in text
+    for name in set(PRIOR_DEFAULTS["embedded"]) | set(PRIOR_DEFAULTS["stable-diffusion"]):
+        assert DEFAULTS[name] is None
+        for values in (*PRIOR_DEFAULTS.values(), *CPU_DEFAULTS.values()):
+            assert values.get(name, "") is not None
+
+
+def test_open_values_are_the_priors() -> None:
+    """Each prior has its own; what was given stays; a known device decides the rest."""
+    plain = GuidanceSettings()
+    painter = InsertConfig(guidance="stable-diffusion", model="m").settled()
+    assert painter.guidance_settings() == plain and painter.step_count == 600
+    assert painter.personalize and not painter.accept and painter.preview_every == 0
+    for on_cuda, noises, width in ((True, 4, 384), (False, 2, 256)):
+        config = InsertConfig(weight="uniform").settled(on_cuda)
+        assert (config.noises, config.picture_width) == (noises, width)
+        assert (config.loss, config.weight) == ("sds-good-bad", "uniform")
+        assert config.accept and config.personalize is False and config.tone_operator == "linear"
+        assert config.settled(not on_cuda) == config
+    adapted = InsertConfig(lora="l.safetensors").settled()
+    assert adapted.personalize is True
+    refined = InsertConfig(refine="tone", reuse="r", model="m", prompt="p").settled()
+    assert refined.step_count == 200 and not refined.accept
+
+
+@pytest.mark.parametrize(
+    ("values", "guide"),
+    [
+        ({}, "embedded"),
+        ({"model": "m"}, "stable-diffusion"),
+        ({"sun": (1.0, 2.0)}, "none"),
+        ({"sky": "clear"}, "none"),
+        ({"light": "l.hdr"}, "none"),
+        ({"reuse": "r"}, "none"),
+        ({"demo": True}, "embedded"),
+        ({"light": "l.hdr", "model": "m"}, "stable-diffusion"),
+        ({"light": "l.hdr", "guidance": "embedded"}, "embedded"),
+        ({"model": "m", "guidance": "none"}, "none"),
+    ],
+)
+def test_who_guides(values: dict[str, Any], guide: str) -> None:
+    """The embedded prior, unless a model or a light is given; what is said counts first."""
+    assert InsertConfig(**values).guided_by == guide
 
 
 def forms_of_flags() -> list[tuple[str, str]]:
@@ -122,7 +179,7 @@ def test_every_value_has_a_rule() -> None:
         "fov", "horizon", "ground", "place", "at", "rotate_y", "light_rotate", "sun", "sky",
         "device", "refine_parts", "refine_materials", "lora_layers",
         "photo", "asset", "materials", "out", "camera", "light", "lora", "model", "reuse",
-        "sequence",
+        "sequence", "prior", "regressor",
     }  # fmt: skip
     ruled = {*RANGES, *ABOVE_ZERO, *CHOICES, *PROMPTS}
     valued = {name for name, form in forms_of_flags() if form}
@@ -156,7 +213,7 @@ def problems_of(**values: Any) -> list[InputError]:
         (["--ground", "-.5,1,0,2e-3"], "ground", (-0.5, 1.0, 0.0, 0.002)),
         (["--pitch", "-8"], "pitch", -8.0),
         (["--light-rotate", "-90.5"], "light_rotate", -90.5),
-        (["--exposure", "-2"], "exposure", -2.0),
+        (["--guidance", "none", "--exposure", "-2"], "exposure", -2.0),
         (["--camera", "f.fspy", "--up", "-z"], "up", "-z"),
         (["--sun", "-30,40"], "sun", (-30.0, 40.0)),
         (["--sun", "120,40,2.5"], "sun", (120.0, 40.0, 2.5)),
@@ -168,6 +225,10 @@ def problems_of(**values: Any) -> list[InputError]:
         (["--photo", "-x.png"], "photo", "-x.png"),
         (["--width", "8"], "width", 8),
         (["--no-personalize"], "personalize", False),
+        (["--personalize"], "personalize", True),
+        (["--no-accept"], "accept", False),
+        (["--accept"], "accept", True),
+        (["--prior", "own.safetensors"], "prior", "own.safetensors"),
         (["--no-tone-curve"], "tone_curve", False),
         (["--allow-download"], "allow_download", True),
         (["--lora-layers", "to_q, to_k"], "lora_layers", ("to_q", "to_k")),
@@ -214,7 +275,7 @@ def test_command_reads_values(argv: list[str], name: str, value: object) -> None
         (["--device", "tpu"], "--device", "cuda"),
         (["--sky", "purple"], "--sky", "overcast"),
         (["--sun", "0,91"], "--sun", "elevation"),
-        (["--guidance", "lds"], "--guidance", "none or stable-diffusion (found lds)"),
+        (["--guidance", "lds"], "--guidance", "embedded or stable-diffusion or none (found lds)"),
         (["--guidance", "stable-diffusion", "--prompt", "p"], "--model", "needed"),
         (["--guidance", "stable-diffusion", "--model", "m"], "--prompt", "needed"),
         (
@@ -237,9 +298,23 @@ def test_command_reads_values(argv: list[str], name: str, value: object) -> None
         ),
         ("--guidance stable-diffusion --exposure 1".split(), "--exposure", "is recovered"),
         (["--loss", "vsd"], "--loss", "lds-lora-both"),
-        (["--loss", "lds-negative"], "--loss", "--negative-prompt"),
-        (["--time-min", "0.7"], "--time-min", "at most --time-max (found 0.7 and 0.6)"),
-        (["--crop-min", "4"], "--crop-min", "at most --crop-max"),
+        ([*PAINTER, "--loss", "lds-negative"], "--loss", "--negative-prompt"),
+        ([*PAINTER, "--loss", "sds-good-bad"], "--loss", "--negative-prompt"),
+        (
+            [*PAINTER, "--time-min", "0.7"],
+            "--time-min",
+            "at most --time-max (found 0.7 and 0.6)",
+        ),
+        (["--time-min", "0.9"], "--time-min", "at most --time-max (found 0.9 and 0.8)"),
+        ([*PAINTER, "--crop-min", "4"], "--crop-min", "at most --crop-max"),
+        (["--crop-min", "5"], "--crop-min", "at most --crop-max (found 5 and 4)"),
+        (["--loss", "lds"], "--loss", "lds compares the adapted model"),
+        (["--accept", "--loss", "dataset-update"], "--accept", "--loss dataset-update"),
+        (["--guidance", "none", "--no-accept"], "--accept", "needs --guidance"),
+        (["--guidance", "none", "--prior", "p"], "--prior", "needs --guidance embedded"),
+        ([*PAINTER, "--lora", "l", "--no-personalize"], "--no-personalize", "--lora"),
+        (["--start", "sunny"], "--start", "regressed or uniform"),
+        (["--trust", "-1"], "--trust", "at least 0"),
         (["--lora-rate", "0"], "--lora-rate", "more than 0"),
         (["--chroma-limit", "0"], "--chroma-limit", "more than 0"),
         (["--intensity-limit", "0.5"], "--intensity-limit", "at least 1"),
@@ -249,17 +324,23 @@ def test_command_reads_values(argv: list[str], name: str, value: object) -> None
         (["--steps", "-1"], "--steps", "at least 0"),
         (["--class-images", "1.5"], "--class-images", "whole number"),
         (["--sequence", "f"], "--sequence", "needs --reuse"),
-        (["--resume"], "--resume", "needs --guidance"),
+        (["--guidance", "none", "--resume"], "--resume", "needs --guidance"),
         (["--refine", "light"], "--refine", "material or emission or tone"),
         (["--refine", "tone", "--prompt", "p"], "--refine", "known light"),
         (["--refine", "tone", "--prompt", "p", "--reuse", "r"], "--refine", "needs --guidance"),
+        (
+            ["--refine", "material", "--light", "l", "--guidance", "embedded"],
+            "--refine",
+            "no other knows colours",
+        ),
         (["--refine-parts", "metallic"], "--refine-parts", "--refine material"),
         (
             ["--reuse", "r", "--guidance", "stable-diffusion", "--model", "m", "--prompt", "p"],
             "--guidance",
             "cannot be used with --reuse",
         ),
-        (["--personalize"], "--personalize", "no such flag"),
+        (["--reuse", "r", "--model", "m", "--prompt", "p"], "--model", "cannot be used with"),
+        (["--mark"], "--mark", "no such flag"),
         (["--photo", ""], "--photo", "not empty"),
         (["--fit-lobes", "4"], "--fit-lobes", "--light"),
         (["--up", "z"], "--up", "--camera"),
@@ -283,7 +364,7 @@ def test_command_refuses_flags_that_exclude_each_other(first: str, second: str) 
         "photo": "p.png", "asset": "a.glb", "camera": "c.json", "fov": "50", "pitch": "0",
         "horizon": "5", "camera_height": "2", "place": "0,0,1", "at": "1,2", "scale": "1",
         "size": "1", "light": "l.hdr", "sun": "1,2", "sky": "clear", "reuse": "r", "refine": "tone",
-        "sequence": "s.jsonl", "lora": "l.safetensors",
+        "sequence": "s.jsonl", "start": "uniform",
     }  # fmt: skip
     argv = ["--out", "o"]
     for name in (first, second):
@@ -553,7 +634,7 @@ def short_of_memory() -> BaseException:
             "error: memory:",
         ),
         (OSError(28, "No space left on device", "o/x.exr"), ExitCode.RESOURCES, "error: o/x.exr:"),
-        (ModuleNotFoundError("", name="diffusers"), ExitCode.USAGE, "warpir[diffusion]"),
+        (ModuleNotFoundError("", name="ray"), ExitCode.USAGE, "warpir[ray]"),
         (InputError("a\nb.png", "x\x1b[31m"), ExitCode.INPUT, "error: a\\nb.png: x\\x1b[31m"),
     ],
     ids=["interrupt", "memory", "torch", "warp", "disk", "R15", "control-characters"],
@@ -620,11 +701,14 @@ def test_demo_leaves_its_light_to_guidance() -> None:
     """The demo's own light and exposure are given, except where they are to be recovered."""
     from warpir.demo import demo_config
 
-    plain = demo_config(InsertConfig(demo=True, out="o"))
+    plain = demo_config(InsertConfig(demo=True, out="o", guidance="none"))
     assert plain.light is not None and plain.exposure == 0.0
     guided = InsertConfig(
         demo=True, out="o", guidance="stable-diffusion", model="m", prompt="a car", tone="reinhard"
     )
+    assert demo_config(InsertConfig(demo=True, out="o")).light is None
+    sunny = demo_config(InsertConfig(demo=True, out="o", sun=(10.0, 20.0)))
+    assert sunny.light is None and sunny.guided_by == "none"
     recovered = demo_config(guided)
     assert recovered.light is None and recovered.exposure is None and recovered.tone == "reinhard"
     assert recovered.photo == plain.photo and recovered.place == plain.place

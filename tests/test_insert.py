@@ -27,6 +27,7 @@ from warpir.files import read_envmap
 from warpir.insert import main
 from warpir.light import as_map
 from warpir.lobes_file import read_lobes
+from warpir.regressor import random_regressor, save_regressor
 
 ALWAYS = (
     "balls.png",
@@ -482,11 +483,10 @@ def test_fit_lobes_reports_its_error(inputs: Path, tmp_path: Path, device: str) 
         ({"sun": "60,35"}, 60.0, 35.0),
         ({"sun": "-150,20,9", "sky": "overcast"}, -150.0, 20.0),
         ({"sky": "0.2,0.3,0.4"}, None, None),
-        ({}, -120.0, 40.0),
         ({"guidance": "none", "sky": "sunset"}, None, None),
         ({"sun": "10,50", "sky": "clear", "tone": "linear", "exposure": "-1"}, 10.0, 50.0),
     ],
-    ids=["sun", "sun-strength-sky", "sky-rgb", "nothing", "sunset", "linear-tone"],
+    ids=["sun", "sun-strength-sky", "sky-rgb", "sunset", "linear-tone"],
 )
 def test_sun_and_sky_flags_light_the_scene(
     inputs: Path,
@@ -503,10 +503,29 @@ def test_sun_and_sky_flags_light_the_scene(
     if azimuth is not None:
         assert lit.record["measured"]["light"]["azimuth_deg"] == pytest.approx(azimuth, abs=1.0)
         assert lit.record["measured"]["light"]["elevation_deg"] == pytest.approx(elevation, abs=1.0)
-    said = [line for line in lit.record["assumed"] if "in a clear sky" in line]
-    assert bool(said) == (changes == {})
     if "exposure" in changes:
         assert lit.record["measured"]["exposure_ev"] == -1.0
+
+
+def test_without_a_light_the_photo_is_asked(inputs: Path, tmp_path: Path, device: str) -> None:
+    """--guidance none lights the object as the regressor says, at the photo's own exposure."""
+    weights = tmp_path / "regressor.safetensors"
+    save_regressor(random_regressor(4), weights, {})
+    found = []
+    for exposure in ("0", "1"):
+        out = tmp_path / f"out{exposure}"
+        changes = {"guidance": "none", "regressor": str(weights), "exposure": exposure}
+        lit = go(arguments(inputs, out, light=None, device=device, **changes), out)
+        run = lit.record["measured"]
+        assert run["prior"] == "none" and run["exposure_ev"] == float(exposure)
+        assert set(lit.record["inputs"]) == {"photo", "asset", "regressor"}
+        (line,) = [x for x in lit.record["assumed"] if "regressor" in x]
+        said = run["regression"]
+        assert f"azimuth {said['azimuth_deg']:.0f}, elevation {said['elevation_deg']:.0f}" in line
+        assert f"+- {said['spread_deg']:.0f} degrees" in line
+        found.append(read_lobes(out / "lobes.json"))
+        np.testing.assert_allclose(found[-1].axis[0], said["axis"], atol=1e-6)
+    np.testing.assert_allclose(found[1].amplitude, 2.0 * found[0].amplitude, rtol=1e-6)
 
 
 def test_light_rotate_turns_panorama_and_lobes(inputs: Path, tmp_path: Path, device: str) -> None:

@@ -67,7 +67,9 @@ ONLY_IN = {
     "diffusers": {"diffusion"},
     "transformers": {"diffusion"},
     "peft": {"diffusion"},
-    "safetensors": {"diffusion", "checkpoint", "transport_cache", "regressor", "regressor_training"},
+    "safetensors": {
+        "diffusion", "checkpoint", "transport_cache", "regressor", "regressor_training",
+    },
     "colour": {"color"},
     "yaml": {"command"},
     "rich": {"progress"},

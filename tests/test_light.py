@@ -36,7 +36,7 @@ from warpir.light import (
     sun_lobe,
     texel_solid_angles,
 )
-from warpir.lighting import DEFAULT_SUN, SKIES, SUN_TO_SKY, make_light
+from warpir.lighting import SKIES, SUN_TO_SKY, make_light
 from warpir.lobe_fit import LAMP_COUNT_MAX, fit_lobes
 from warpir.placement import place_asset
 from warpir.render import light_args
@@ -504,13 +504,22 @@ def test_given_exposure_is_taken_and_nothing_assumed() -> None:
     np.testing.assert_allclose(made.light.texels, 2.0**-1.5, rtol=FLOAT32)
 
 
-def test_nothing_said_means_a_sun_in_a_clear_sky_and_is_said() -> None:
-    """The default is stated in `assumed`, points where it says, and has the stated sun to sky."""
-    made = make_light(inputs_for(0.2), config_for(exposure=0.0))
+def test_nothing_said_means_that_the_photo_is_asked() -> None:
+    """There is no light of our own making, except the even one that --start uniform asks for."""
+    assert make_light(inputs_for(0.2), config_for()) is None
+    even = make_light(inputs_for(0.2), config_for(start="uniform"))
+    assert even is not None and even.light.texels is not None
+    # Reinhard shows radiance .25 as .2.
+    np.testing.assert_allclose(even.light.texels, 0.25, rtol=1e-3)
+    assert "an even one" in even.assumed[0]
+
+
+def test_sun_alone_stands_in_a_clear_sky() -> None:
+    """A sun without a strength has the stated ratio to the sky, and points where it is said."""
+    made = make_light(inputs_for(0.2), config_for(sun=(-120.0, 40.0), exposure=0.0))
+    assert made is not None
     assert made.light.lobes is not None and made.light.texels is not None
-    (line,) = made.assumed
-    assert "azimuth -120, elevation 40" in line and "--sun" in line and "--light" in line
-    axis = axis_from_angles(*DEFAULT_SUN)
+    axis = axis_from_angles(-120.0, 40.0)
     np.testing.assert_allclose(made.light.lobes.axis[0], axis, atol=1e-6)
     sun = float(luminance(Light(made.light.lobes).irradiance(axis)))
     sky = float(luminance(Light(texels=made.light.texels).irradiance(UP)))

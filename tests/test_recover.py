@@ -49,6 +49,7 @@ CHEAP = {
     "score_every": "2",
     "samples": "2",
     "light": None,
+    "start": "uniform",
 }
 
 
@@ -335,10 +336,11 @@ def test_ablations(folder: Path, tmp_path: Path) -> None:
 
 def test_start_from_a_given_light_preview_and_prior(folder: Path, tmp_path: Path) -> None:
     out = tmp_path / "out"
-    changes = {"light": str(folder / "sky.hdr"), "preview_every": "2", "steps": "4"}
+    changes = {"light": str(folder / "sky.hdr"), "start": None, "preview_every": "2", "steps": "4"}
     changes |= {"show_prior": "a photo of a red box", "lora_steps": "2"}
     assert main(argv(folder, out, **changes)) == ExitCode.DONE
     assert sorted(p.name for p in (out / "progress").iterdir()) == [
+        "preview-000000.png",
         "preview-000002.png",
         "preview-000004.png",
     ]
@@ -354,7 +356,7 @@ def test_start_keeps_the_flux_of_a_sun_that_is_too_narrow(monkeypatch: pytest.Mo
     monkeypatch.setattr(recover, "start_level", lambda *_: 0.5)
     config = InsertConfig(sun=(30.0, 40.0), lobes=4, light_height=16)
     sun = Light(sun_lobe(30.0, 40.0, (5.0, 4.0, 3.0)))
-    run = cast(recover.Run, SimpleNamespace(config=config, inputs=None))
+    run = cast(recover.Run, SimpleNamespace(config=config, inputs=None, estimate=None))
     curves = Curves.identity("reinhard")
     unknowns = recover.start_of(run, SceneLight(sun, sun, curves, 0.0, ()))
     lobes = unknowns.light_fg.lobes()

@@ -270,7 +270,7 @@ def _open_values(config: InsertConfig, on_cuda: bool = True) -> dict[str, Any]:
     """Return what stands for the fields that are open; without a prior, Stable Diffusion's."""
     prior = config.guided_by if config.guided_by in PRIOR_DEFAULTS else "stable-diffusion"
     chosen = PRIOR_DEFAULTS[prior] | ({} if on_cuda else CPU_DEFAULTS[prior])
-    if config.refine is not None:
+    if config.refine in REFINE_STEPS:
         chosen |= {"steps": REFINE_STEPS[config.refine], "accept": False}
     if config.lora is not None:
         chosen |= {"personalize": True}

@@ -17,8 +17,8 @@ PHOTO, ASSET, LIGHT, CAMERA = (
 def demo_config(config: InsertConfig) -> InsertConfig:
     """Return the configuration with the demo's files filled in.
 
-    Its light and exposure are too with ``--guidance none`` and for ``--refine``; otherwise the light
-    is what is to be found out.
+    Its light and exposure are too with ``--guidance none`` and for ``--refine``; otherwise the
+    light is what is to be found out.
     """
     from warpir.demo.place import placement
 
