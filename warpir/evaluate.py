@@ -210,6 +210,7 @@ def evaluate(
         What the JSON file holds.
     """
     started = time.perf_counter()
+    from warpir.evaluation_report import as_plain, compare, pair_table, summarize, tables
     from warpir.evaluation_rows import ROWS
     from warpir.evaluation_scenes import ASSET_SUFFIXES, PANORAMA_SUFFIXES, Places, find_files
 
@@ -232,7 +233,7 @@ def evaluate(
     device = choose_device(options.device)
     say(f"device: {device} (the first run compiles the kernels)")
     bench = _make_bench(options, scenes, device, predictions)
-    rows = _usable_rows(bench, rows, options.rows is not None, notices)
+    rows = usable_rows(bench, rows, options.rows is not None, notices)
     for notice in notices:
         say(f"notice: {notice}")
     sheet_row = next((r for r in SHEET_ROWS if r in rows), rows[0])
@@ -246,13 +247,24 @@ def evaluate(
         error = float(np.mean([e.figures["image.box.rmse"] for e in best]))
         say(f"{place.name}: {sheet_row}, RMSE of the box {error:.4f}")
 
-    record = _record(options, bench, scenes, entries, notices)
+    starts = {name: row.start for name, row in ROWS.items() if row.start is not None}
+    summary, pairs = summarize(entries), compare(entries, starts)
+    record = _record(options, bench, scenes, notices)
     if options.procedural:
         record["procedural"] = procedural_errors(
             bench.network, options.procedural, options.seed, device
         )
     record["seconds"] = round(time.perf_counter() - started, 1)
-    lines = _page(record, entries, {name: ROWS[name].words for name in rows})
+    lines = [
+        *_head(record),
+        *_verdicts(entries),
+        *tables(summary, {name: ROWS[name].words for name in rows}),
+        # What is known of the truth needs no comparison; the JSON file has it all the same.
+        *pair_table([p for p in pairs if ROWS[p.row].group != "references"]),
+    ]
+    record["entries"] = [asdict(entry) for entry in entries]
+    record["summary"] = as_plain(summary)
+    record["pairs"] = [asdict(pair) for pair in pairs]
     for line in lines:
         say(line)
     if output is not None:
@@ -262,7 +274,7 @@ def evaluate(
         sheet = contact_sheet(panels, sheet_row)
         output.write_png("contact_sheet.png", sheet, mark=False, description="Evaluation")
     if options.json is not None:
-        text = json.dumps(record, indent=1, allow_nan=False) + "\n"
+        text = json.dumps(_plain(record), indent=1, allow_nan=False) + "\n"
         options.json.write_text(text, encoding="utf-8")
         say(f"written: {options.json}")
     return record
@@ -335,7 +347,7 @@ def _make_bench(
     return Bench(scenes, device, options.seed, config, network, missing, predictions)
 
 
-def _usable_rows(
+def usable_rows(
     bench: "Bench", rows: Sequence[str], is_asked: bool, notices: list[str]
 ) -> list[str]:
     """Return the rows that can be made; those that cannot end the run only if they were named.
@@ -518,16 +530,11 @@ def _record(
     options: argparse.Namespace,
     bench: "Bench",
     scenes: "list[tuple[Place, list[Subject]]]",
-    entries: "list[Entry]",
     notices: list[str],
 ) -> dict[str, Any]:
-    """Return all numbers and what they depend on."""
-    from warpir.evaluation_report import as_plain, compare, summarize
-    from warpir.evaluation_rows import ROWS
+    """Return what the numbers depend on, as plain values."""
     from warpir.record import versions
 
-    starts = {name: row.start for name, row in ROWS.items() if row.start is not None}
-    plain = {k: _plain(v) for k, v in vars(options).items()}
     return {
         "format": FORMAT,
         "version": VERSION,
@@ -536,7 +543,7 @@ def _record(
         "versions": versions(),
         "device": bench.device,
         "date": time.strftime("%Y-%m-%d"),
-        "options": plain,
+        "options": vars(options),
         "weights": bench.digests(),
         "notices": notices,
         "scenes": [
@@ -552,16 +559,18 @@ def _record(
             }
             for place, subjects in scenes
         ],
-        "entries": [asdict(entry) for entry in entries],
-        "summary": as_plain(summarize(entries)),
-        "pairs": [asdict(pair) for pair in compare(entries, starts)],
     }
 
 
 def _plain(value: Any) -> Any:
-    if isinstance(value, list):
+    """Return what JSON can hold; a number that it lacks is null."""
+    if isinstance(value, dict):
+        return {str(k): _plain(v) for k, v in value.items()}
+    if isinstance(value, list | tuple):
         return [_plain(v) for v in value]
-    return str(value) if isinstance(value, Path) else value
+    if isinstance(value, float) and not np.isfinite(value):
+        return None
+    return value if isinstance(value, bool | int | float | str | None) else str(value)
 
 
 def _commit() -> str:
@@ -577,12 +586,8 @@ def _commit() -> str:
     return found.stdout.strip() or "unknown"
 
 
-def _page(record: dict[str, Any], entries: "list[Entry]", words: dict[str, str]) -> list[str]:
-    """Return the tables as lines of Markdown."""
-    from warpir.evaluation_report import compare, pair_table, summarize, tables
-    from warpir.evaluation_rows import ROWS
-
-    starts = {name: row.start for name, row in ROWS.items() if row.start is not None}
+def _head(record: dict[str, Any]) -> list[str]:
+    """Return what stands above the tables, as lines of Markdown."""
     options, panoramas = record["options"], {s["panorama"] for s in record["scenes"]}
     sunny = sum(s["is_sunny"] for s in record["scenes"])
     lines = [
@@ -607,10 +612,21 @@ def _page(record: dict[str, Any], entries: "list[Entry]", words: dict[str, str])
             for name, s in record["procedural"].items()
         ]
         lines.append("")
-    lines += tables(summarize(entries), words)
-    # What is known of the truth needs no comparison; the JSON file has it all the same.
-    judged = [p for p in compare(entries, starts) if ROWS[p.row].group != "references"]
-    return [*lines, *pair_table(judged)]
+    return lines
+
+
+def _verdicts(entries: "list[Entry]") -> list[str]:
+    """Return how often guidance could show that its end is better than its start, by row."""
+    verdicts: dict[str, list[bool]] = {}
+    for entry in entries:
+        acceptance = entry.about.get("record", {}).get("acceptance")
+        if acceptance is not None:
+            verdicts.setdefault(entry.row, []).append(bool(acceptance["is_accepted"]))
+    if not verdicts:
+        return []
+    lines = ["## What guidance said of its own end", ""]
+    lines += [f"* {row}: accepted in {sum(v)} of {len(v)} runs" for row, v in verdicts.items()]
+    return [*lines, ""]
 
 
 if __name__ == "__main__":

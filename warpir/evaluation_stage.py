@@ -161,7 +161,7 @@ class Stage:
             return response.show(linear.astype(np.float64)).astype(np.float32)
         shown, _ = self.renderer.tone(
             replace(foreground, radiance=radiance),
-            rendered.ratio,
+            rendered.ratio[:0],
             curves.foreground,
             curves.shadow_ratio,
             curves.tone == "reinhard",
