@@ -33,7 +33,7 @@ from torch import Tensor, nn
 from warpir.camera import Camera
 from warpir.color import GAMMA, LUMINANCE_WEIGHTS
 from warpir.errors import ExitCode, InputError
-from warpir.light import Float64Array, FloatArray, Lobes, angles_from_axis, fibonacci
+from warpir.light import Float64Array, FloatArray, Lobes, angles_from_axis
 
 HEIGHT, WIDTH = 96, 144
 """Size that the network sees [px]; photos of other shapes are stretched, and the rays say so."""
@@ -92,11 +92,22 @@ class Prediction(NamedTuple):
 def candidates(count: int) -> Float64Array:
     """Return directions that a dominant light may have, camera-yaw frame, shape [K, 3].
 
-    About ``count`` spread over the sphere, without those below `LOWEST`. The second half mirrors
+    Rings of cells of equal area, as if ``count`` covered the whole sphere. The second half mirrors
     the first (x negated), so that turning a distribution over is a roll by K / 2.
     """
-    spread = fibonacci(count)
-    right = spread[(spread[:, 0] > 0.0) & (spread[:, 1] > LOWEST)]
+    spacing = math.sqrt(4.0 * math.pi / count)
+    lowest = math.asin(LOWEST)
+    edges = np.linspace(lowest, math.pi / 2.0, round((math.pi / 2.0 - lowest) / spacing) + 1)
+    rings = []
+    for low, high in itertools.pairwise(edges):
+        # Half of the ring, x > 0; azimuths from -Z.
+        half = max(round(math.pi * (math.sin(high) - math.sin(low)) / spacing**2), 1)
+        azimuth = math.pi * (np.arange(half) + 0.5) / half
+        elevation = 0.5 * (low + high)
+        level = math.cos(elevation)
+        height = np.full(half, math.sin(elevation))
+        rings.append(np.stack([level * np.sin(azimuth), height, -level * np.cos(azimuth)], axis=1))
+    right = np.concatenate(rings)
     return np.concatenate([right, right * (-1.0, 1.0, 1.0)])
 
 

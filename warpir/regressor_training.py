@@ -49,7 +49,7 @@ from warpir.training_batches import PhotoBatch
 NORMALS = 32
 """Directions of surfaces whose irradiance is compared."""
 MAP_FLOOR = 0.02
-"""Ambient radiance, in shares of the photo's mean luminance, below which darkness does not count."""
+"""Ambient radiance over the mean luminance, below which differences fade."""
 SUNNY_SHARE = 0.3
 """Share of the irradiance from which a dominant light counts as one."""
 COVERAGE = 0.68
@@ -469,7 +469,7 @@ def calibrated_temperature(directions: Tensor, sets: Sequence[tuple[Tensor, Tens
         sets: Logits [B, K] and true axes [B, 3] of each set.
     """
     found, gap = 1.0, math.inf
-    for temperature in np.geomspace(0.3, 8.0, 200):
+    for temperature in np.geomspace(0.5, 8.0, 200):
         covered = [
             float(
                 (region_mass(directions, (logits / temperature).softmax(1), axis) <= COVERAGE)
