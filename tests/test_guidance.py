@@ -34,7 +34,10 @@ from warpir.diffusion.schedule import NoiseSchedule
 from warpir.diffusion.settings import GuidanceSettings, ModelSettings
 from warpir.diffusion.stable_diffusion import StableDiffusion, load_stable_diffusion
 
-LOSSES = ("lds", "sds", "sds-base", "csd", "lds-lora-both", "lds-negative")
+LOSSES = (
+    *("lds", "sds", "sds-base", "csd", "lds-lora-both", "lds-negative", "good-bad"),
+    "sds-good-bad",
+)
 FLOAT32 = 1e-5
 """About a hundred float32 operations; times, a and s are float32."""
 CONDITION = Condition("a car in sks", base_prompt="a car", negative_prompt="a wrong shadow")
@@ -58,6 +61,7 @@ class Call:
     adapters: list[str | None]
     background: Tensor | None
     gbuffer: Tensor | None
+    keep_background: list[bool] | None = None
 
 
 @dataclass
@@ -110,10 +114,14 @@ class GaussianPrior:
         adapters: Sequence[str | None],
         background: Tensor | None = None,
         gbuffer: Tensor | None = None,
+        keep_background: Sequence[bool] | None = None,
     ) -> Tensor:
         prompts = [self.prompts[int(e)] for e in embeddings.flatten()]
         assert len(latents_noisy) == len(t) == len(prompts) == len(adapters)
-        self.calls.append(Call(latents_noisy, t, prompts, list(adapters), background, gbuffer))
+        kept = None if keep_background is None else list(keep_background)
+        self.calls.append(
+            Call(latents_noisy, t, prompts, list(adapters), background, gbuffer, kept)
+        )
         samples = zip(latents_noisy, t, prompts, adapters, strict=True)
         noise = torch.stack([self.noise(*sample) for sample in samples])
         # A network of the other kinds would say the same in its own way.
@@ -153,6 +161,8 @@ def literal_delta(loss: str, g: float, e: dict[str, Tensor], noise: Tensor) -> T
         "csd": lambda: e["b"] - e["null"],
         "lds-lora-both": lambda: e["p+"] - e["null+"],
         "lds-negative": lambda: e["p+"] - e["n"],
+        "good-bad": lambda: e["b"] - e["n"],
+        "sds-good-bad": lambda: (e["p+"] - noise) + 2.0 * (e["p+"] - e["n"]),
     }[loss]()
 
 
@@ -164,6 +174,8 @@ TERMS = {
     "csd": ["b", "null"],
     "lds-lora-both": ["p+", "null+"],
     "lds-negative": ["p+", "n"],
+    "good-bad": ["b", "n"],
+    "sds-good-bad": ["p+", "n"],
 }
 
 
@@ -206,6 +218,85 @@ def test_terms_are_one_call_without_idle_branches(rng: np.random.Generator, loss
     assert set(prior.prompts) == {PROMPTS[name.rstrip("+")] for name in TERMS[loss]}
     for half in (call.latents_noisy, call.t):
         torch.testing.assert_close(half[:3], half[3:], rtol=0, atol=0)
+
+
+@pytest.mark.parametrize("loss", ["good-bad", "sds-good-bad"])
+def test_losses_of_the_embedded_prior_do_without_an_adapter(
+    rng: np.random.Generator, loss: str
+) -> None:
+    """The base model says what is good and what is bad."""
+    prior = GaussianPrior()
+    x = picture(rng)
+    settings = at_time(0.4, loss=loss, weight="uniform")
+    found = Guidance(prior, CONDITION, settings, MASK, 100, 3, None).gradient(x, 0)
+    (call,) = prior.calls
+    assert call.prompts == ["a car", "a wrong shadow"] and call.adapters == [None, None]
+    z, t = call.latents_noisy[0], call.t[0]
+    a, s = prior.schedule.alpha_sigma(t)
+    good, bad = (prior.noise(z, t, prompt, None) for prompt in ("a car", "a wrong shadow"))
+    expected = good - bad if loss == "good-bad" else 3 * good - 2 * bad - (z - a * x[0]) / s
+    assert found is not None
+    torch.testing.assert_close(found[0], expected, rtol=FLOAT32, atol=FLOAT32)
+
+
+@pytest.mark.parametrize(
+    ("loss", "keeps"),
+    [("csd", [True, False]), ("sds-good-bad", [True, False]), ("sds-base", [True, False])],
+)
+def test_null_and_negative_terms_may_go_without_the_photo(
+    rng: np.random.Generator, loss: str, keeps: list[bool]
+) -> None:
+    """What is asked for always sees it; by default all terms do, and nothing is said of it."""
+    for rule, expected in (("keep", None), ("drop", [k for k in keeps for _ in range(2)])):
+        prior = GaussianPrior()
+        settings = replace(GuidanceSettings(), loss=loss, null_background=rule, noises=2)
+        guidance(prior, settings).gradient(picture(rng), 0)
+        assert prior.calls[0].keep_background == expected
+
+
+def test_work_is_the_difference_of_the_potential(rng: np.random.Generator) -> None:
+    """Along a straight way the work of SDS at g = 1 is the rise of the noised -log p, in the mean.
+
+    For Gaussian pictures the mean force is ``w s a (x - mean) / v`` (see above), so the potential
+    is quadratic, and the midpoint rule is exact for it. Single draws scatter by their noise; the
+    mean of many lies within its standard error.
+    """
+    prior, t, count = GaussianPrior(), 0.4, 4000
+    settings = at_time(t, loss="sds-base", guidance_scale=1.0, noises=500)
+    made = guidance(prior, settings)
+    start, end = picture(rng), picture(rng)
+    works = np.array(made.work(start, (start + end) / 2, end, range(count)))
+    bar = float(prior.schedule.alphas_cumprod[int(1000 * t)])
+    a, s, v = math.sqrt(bar), math.sqrt(1 - bar), bar * prior.variance + 1 - bar
+    mean = prior.mean("a car", None)
+
+    def potential(x: Tensor) -> float:
+        return s**2 * s * a / v / 2.0 * float((x - mean).square().sum())
+
+    error = works.std(ddof=1) / math.sqrt(count)
+    rise = potential(end) - potential(start)
+    assert abs(works.mean() - rise) < 4.0 * error and error < 0.05 * abs(rise)
+    # Draws are their own: one alone, or in another batch, is the same.
+    assert made.work(start, (start + end) / 2, end, [7]) == pytest.approx([works[7]], rel=1e-6)
+
+
+def test_work_draws_what_no_step_does(rng: np.random.Generator) -> None:
+    """Times of the whole run, noises of none of its steps, and the same ones for each call."""
+    prior = GaussianPrior()
+    made = guidance(prior, replace(GuidanceSettings(), noises=50))
+    x = picture(rng)
+    made.work(x, x, x, range(1000))
+    t = torch.cat([call.t[:50] for call in prior.calls]).double().numpy()
+    assert t.min() >= 0.02 and t.max() <= 0.6
+    # Some step's greatest time lies evenly between .6 and .3, and the time evenly below it.
+    top = np.random.default_rng(1).uniform(0.3, 0.6, 100_000)
+    expected = 0.02 + (top - 0.02) * np.random.default_rng(2).uniform(size=len(top))
+    assert stats.ks_2samp(t, expected).pvalue > 0.01
+    noisy = prior.calls[0].latents_noisy[:50]
+    for step in range(3):
+        made.gradient(x, step)
+        stepped = prior.calls[-1].latents_noisy[:50]
+        assert (noisy[:, None] - stepped[None]).abs().amax(dim=(2, 3, 4)).min() > 1e-3
 
 
 def test_sds_without_guidance_has_one_term(rng: np.random.Generator) -> None:
@@ -561,6 +652,8 @@ def test_score_is_its_printed_formula(rng: np.random.Generator, loss: str, noise
             second = prior.noise(z, t, call.prompts[k + count], call.adapters[k + count])
             if loss in ("sds", "sds-base"):
                 error = (7.5 * first - 6.5 * second - noise).square().sum()
+            elif loss == "sds-good-bad":
+                error = (3.0 * first - 2.0 * second - noise).square().sum()
             else:
                 error = (first - noise).square().sum() - (second - noise).square().sum()
             expected.append(s**2 * float(error))
@@ -646,7 +739,7 @@ def test_loss_without_its_adapter_is_refused() -> None:
     """LDS without a LoRA would be CSD under another name."""
     for loss in LOSSES:
         settings = replace(GuidanceSettings(), loss=loss)
-        if loss in ("csd", "sds-base"):
+        if loss in ("csd", "sds-base", "good-bad", "sds-good-bad"):
             make_guidance(GaussianPrior(), CONDITION, settings, MASK, 10, 0, None)
         else:
             with pytest.raises(ValueError, match=f"{loss} needs an adapter"):

@@ -913,7 +913,7 @@ def test_demo_runs_small(tmp_path: Path, device: str) -> None:
     """--demo at width 64 and one sample writes everything at the photo's size, and replays."""
     out = tmp_path / "demo"
     argv = ["--demo", "--out", str(out), "--width", "64", "--samples", "1", "--device", device]
-    demo = go(argv, out)
+    demo = go([*argv, "--guidance", "none"], out)
     assert set(demo.record["files"]) >= set(ALWAYS)
     assert demo.image().shape == (853, 1280, 3)
     assert demo.record["measured"]["object_pixels"] > 100

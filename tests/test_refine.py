@@ -523,10 +523,10 @@ def test_what_moves_and_what_does_not() -> None:
 
 def test_each_kind_has_its_own_number_of_steps() -> None:
     """--steps where it is given, 600 too; else the kind's own."""
-    steps = [refining(kind).step_count for kind in ("material", "emission", "tone")]
+    steps = [refining(kind).settled().step_count for kind in ("material", "emission", "tone")]
     assert steps == [300, 300, 200]
-    assert refining("tone", steps=600).step_count == 600
-    assert InsertConfig().step_count == OptimizeSettings().step_count == 600
+    assert refining("tone", steps=600).settled().step_count == 600
+    assert InsertConfig(model="m").settled().step_count == OptimizeSettings().step_count == 600
 
 
 def test_materials_survive_the_file(tmp_path: Path) -> None:

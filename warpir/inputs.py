@@ -78,8 +78,9 @@ def read_inputs(config: InsertConfig, loaders: Loaders | None = None) -> Inputs:
     assert config.photo is not None and config.asset is not None
     photo_path, asset_path = config.photo, config.asset
     problems += _inputs_in_out(config)
-    if config.lora is not None and not Path(config.lora).is_file():
-        problems.append(InputError(config.lora, "no such file", code=ExitCode.MODEL))
+    for path in (config.lora, config.prior, config.regressor):
+        if path is not None and not Path(path).is_file():
+            problems.append(InputError(path, "no such file", code=ExitCode.MODEL))
     notices: list[str] = []
     assumed: list[str] = []
     photo = attempt(
@@ -135,7 +136,10 @@ def _inputs_in_out(config: InsertConfig) -> list[InputError]:
     if config.out is None:
         return []
     out = os.path.realpath(config.out)
-    named = (config.photo, config.asset, config.materials, config.camera, config.light, config.lora)
+    named = (
+        *(config.photo, config.asset, config.materials, config.camera, config.light),
+        *(config.lora, config.prior, config.regressor),
+    )
     folders = {path: os.path.dirname(path) for path in named if path is not None}
     if config.reuse is not None:
         folders[config.reuse] = config.reuse
