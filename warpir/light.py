@@ -228,6 +228,13 @@ def rasterize_lobes(lobes: Lobes, height: int, width: int, side: int = 6) -> Flo
         side: Directions along a texel's side, even.
     """
     texels = np.zeros((height, width, 3))
+    # A lobe of two texels and more is as good with a ninth of the directions.
+    broad = lobes.sharpness <= (height / (2.0 * np.pi)) ** 2
+    if side > 2 and broad.any():
+        texels += rasterize_lobes(_some(lobes, broad), height, width, 2)
+        lobes = _some(lobes, ~broad)
+        if not len(lobes.sharpness):
+            return texels.astype(np.float32)
     omega = texel_solid_angles(height, width)
     narrow = lobes.sharpness > (4.0 * height / np.pi) ** 2
     # Rows at the two-point Gauss-Legendre nodes of even bands, as in the kernel: midpoints misjudge
@@ -259,6 +266,10 @@ def rasterize_lobes(lobes: Lobes, height: int, width: int, side: int = 6) -> Flo
         i = min(int(np.arctan2(np.hypot(x, z), y) / np.pi * height), height - 1)
         texels[i, j] += flux / omega[i]
     return texels.astype(np.float32)
+
+
+def _some(lobes: Lobes, chosen: NDArray[np.bool_]) -> Lobes:
+    return Lobes(lobes.amplitude[chosen], lobes.axis[chosen], lobes.sharpness[chosen])
 
 
 def as_map(light: Light, height: int) -> FloatArray:
