@@ -336,6 +336,7 @@ def test_file_keeps_the_network(tmp_path: Path) -> None:
     save_regressor(network, path, {"steps": 12})
     found = load_regressor(path)
     assert found.config == SMALL and found.record == {"steps": 12} and not found.training
+    assert torch.equal(found.directions, network.directions)
     assert float(found.temperature) == pytest.approx(1.7) and found.mean_light[0] == 0.25
     rounded = random_regressor(4, SMALL)
     for parameter in rounded.parameters():

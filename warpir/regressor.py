@@ -200,7 +200,7 @@ class Regressor(nn.Module):
     """
 
     directions: Tensor
-    """Candidates, camera-yaw frame, shape [K, 3]."""
+    """Candidates, camera-yaw frame, shape [K, 3]; in the file, so that weights keep their own."""
     temperature: Tensor
     """Divides the logits; calibrated on validation photos, shape []."""
     mean_light: Tensor
@@ -213,7 +213,7 @@ class Regressor(nn.Module):
         """How it was trained; plain values."""
         fine, middle, wide = config.channels
         directions = torch.from_numpy(candidates(config.directions)).float()
-        self.register_buffer("directions", directions, persistent=False)
+        self.register_buffer("directions", directions)
         self.register_buffer("temperature", torch.ones(()))
         self.level_count = 10 + 3 * len(ambient_axes())
         self.register_buffer("mean_light", torch.zeros(len(directions) + self.level_count))
@@ -553,8 +553,11 @@ def save_regressor(network: Regressor, path: Path, record: Mapping[str, Any]) ->
     Raises:
         OSError: The disk is full or the folder is not writable; an older file is still whole.
     """
-    state = {k: v.detach().cpu().half().contiguous() for k, v in network.state_dict().items()}
-    state["temperature"] = network.temperature.detach().cpu().float()
+    exact = {"temperature", "directions"}
+    state = {
+        name: (part if name in exact else part.half()).cpu().contiguous()
+        for name, part in network.state_dict().items()
+    }
     about = {
         "format": FORMAT,
         "config": json.dumps(asdict(network.config)),
