@@ -31,6 +31,7 @@ from warpir.files import Photo
 from warpir.insert import main
 from warpir.light import Light, Lobes, plain_sky
 from warpir.lighting import SceneLight
+from warpir.lit_frame import STILL_SAMPLES
 from warpir.materials_file import materials_to_json, with_materials
 from warpir.optimize import Optimization
 from warpir.optimize_settings import OptimizeSettings
@@ -251,7 +252,7 @@ def test_loops_see_what_is_delivered(device: str, rng: np.random.Generator) -> N
     frame = loop.lit.frame
     picture = make_picture(
         frame.renderer, light.light, light.light_shadow, some_photo(),
-        Quality(refine_module.STILL_SAMPLES, 1, frame.depth, frame.seed),
+        Quality(STILL_SAMPLES, 1, frame.depth, frame.seed),
         light.curves.foreground, light.curves.shadow_ratio,
     )  # fmt: skip
     with torch.no_grad():
