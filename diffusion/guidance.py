@@ -141,7 +141,7 @@ def coefficients(settings: GuidanceSettings, has_adapter: bool = False) -> Coeff
         ValueError: The loss has no row.
     """
     g = settings.guidance_scale
-    good = {"k_p": 3.0} if has_adapter else {"k_c": 3.0}
+    adapted, base = (3.0, 0.0) if has_adapter else (0.0, 3.0)
     rows = {
         "lds": Coefficients(k_p=1.0, k_0=-1.0),
         "sds": Coefficients(k_p=g, k_0=1.0 - g, k_e=-1.0, null_adapter=True),
@@ -151,7 +151,7 @@ def coefficients(settings: GuidanceSettings, has_adapter: bool = False) -> Coeff
         "lds-negative": Coefficients(k_p=1.0, k_n=-1.0),
         "good-bad": Coefficients(k_c=1.0, k_n=-1.0),
         # SDS without a null term, and twice good - bad.
-        "sds-good-bad": Coefficients(**good, k_n=-2.0, k_e=-1.0),
+        "sds-good-bad": Coefficients(adapted, base, k_n=-2.0, k_e=-1.0),
     }
     if settings.loss not in rows:
         names = ", ".join([*rows, DATASET_UPDATE])
