@@ -143,6 +143,7 @@ def test_open_values_are_the_priors() -> None:
         assert (config.loss, config.weight) == ("sds-good-bad", "uniform")
         assert config.accept and config.personalize is False and config.tone_operator == "linear"
         assert config.settled(not on_cuda) == config
+    assert InsertConfig(loss="dataset-update").settled().accept is False
     adapted = InsertConfig(lora="l.safetensors").settled()
     assert adapted.personalize is True
     refined = InsertConfig(refine="tone", reuse="r", model="m", prompt="p").settled()

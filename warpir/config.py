@@ -274,6 +274,8 @@ def _open_values(config: InsertConfig, on_cuda: bool = True) -> dict[str, Any]:
         chosen |= {"steps": REFINE_STEPS[config.refine], "accept": False}
     if config.lora is not None:
         chosen |= {"personalize": True}
+    if config.loss == "dataset-update":
+        chosen |= {"accept": False}
     # The tone belongs to the light: `InsertConfig.tone_operator`.
     return {k: v for k, v in chosen.items() if k != "tone" and getattr(config, k) is None}
 
