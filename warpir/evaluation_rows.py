@@ -328,11 +328,12 @@ def recover_light(
     with tempfile.TemporaryDirectory() as folder:
         codes = np.round(255.0 * photo).astype(np.uint8)
         picture = _written(codes, Path(folder) / "photo.png")
+        out = Path(folder) / "out"
         config = replace(
             bench.config,
             photo=str(Path(folder) / "photo.png"),
             asset=str(subject.asset_path),
-            out=str(Path(folder) / "out"),
+            out=str(out),
             prompt=bench.config.prompt or f"a {_words(subject.asset_path.stem)}",
             device=bench.device,
             seed=bench.seed,
@@ -345,7 +346,7 @@ def recover_light(
         started = time.perf_counter()
         with (
             StepProgress(lambda _: None) as progress,
-            OutputFolder(config.out) as output,
+            OutputFolder(out) as output,
         ):
             run = Run(config, inputs, bench.device, output, timings, lambda _: None, progress)
             light, record, _ = recover(run, make_light(inputs, config))

@@ -58,10 +58,8 @@ SUNNY_SHARE = 0.25
 """A sunny place sends at least this share of its flux from within 5 degrees of the peak [1]."""
 SUNNY_PEAK = 3000.0
 """Its peak is at least this many times its mean: lamps and soft boxes are larger than a sun [1]."""
-DIFFUSE = {"metallic": 0.0, "roughness": 1.0}
-GLOSSY = {"metallic": 1.0, "roughness": 0.3}
-"""Factors that make an object's materials diffuse or glossy; their colours are its own."""
-MATERIALS = {"diffuse": DIFFUSE, "glossy": GLOSSY}
+MATERIALS = {"diffuse": (0.0, 1.0), "glossy": (1.0, 0.3)}
+"""Metallic and roughness of the two objects of a place; their colours are the asset's own."""
 
 
 # ------------------------------------------------------------------------ the camera's response
@@ -286,7 +284,8 @@ class Places:
         display, ev = expose(seen)
         exposure = 2.0**ev
         if self.response != "gamma":
-            display = linear_to_gamma(RESPONSES[self.response].show(seen * exposure))
+            shown = RESPONSES[self.response].show(seen * exposure)
+            display = linear_to_gamma(shown).astype(np.float64)
         photo = (np.round(255.0 * display) / 255.0).astype(np.float32)
         return Place(
             name=f"{k:03d}-{path.stem}",
@@ -317,8 +316,8 @@ class Places:
         size = _largest(low, high, camera, stand, yaw, share)
         placement = place_asset(low, high, camera, at=at, rotate_y=yaw, size=size)
         return [
-            Subject(place, with_surface(asset, factors), path, name, placement)
-            for name, factors in MATERIALS.items()
+            Subject(place, with_surface(asset, *surface), path, name, placement)
+            for name, surface in MATERIALS.items()
         ]
 
 
@@ -366,7 +365,7 @@ def _largest(
     return least
 
 
-def with_surface(asset: Asset, factors: dict[str, float]) -> Asset:
+def with_surface(asset: Asset, metallic: float, roughness: float) -> Asset:
     """Return the asset with other roughness and metallic, its own colours, and no emission.
 
     What glows by itself says nothing about the light.
@@ -375,7 +374,8 @@ def with_surface(asset: Asset, factors: dict[str, float]) -> Asset:
     def changed(material: Material) -> Material:
         return replace(
             material,
-            **factors,
+            metallic=metallic,
+            roughness=roughness,
             metallic_roughness_texture=None,
             emission=(0.0, 0.0, 0.0),
             emission_texture=None,

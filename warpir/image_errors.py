@@ -73,15 +73,16 @@ def image_errors(
     maps = {"ssim": ssim_map(image, truth)}
     if has_flip():
         maps["flip"] = flip_map(image, truth)
-    errors = {}
+    errors: dict[str, dict[str, float]] = {}
     for name, region in regions.items():
         if not region.any():
             errors[name] = {}
             continue
         a, b = image[region].astype(np.float64), truth[region].astype(np.float64)
+        linear = [gamma_to_linear(x).astype(np.float64) for x in (a, b)]
         errors[name] = {
             "rmse": rmse(a, b),
-            "linear_rmse": rmse(gamma_to_linear(a), gamma_to_linear(b)),
+            "linear_rmse": rmse(*linear),
             "si_rmse": si_rmse(a, b),
             **{key: float(values[region].mean()) for key, values in maps.items()},
         }
@@ -108,7 +109,7 @@ def ssim_map(image: FloatArray, truth: FloatArray) -> Float64Array:
     """
     from skimage.metrics import structural_similarity
 
-    _, similarity = structural_similarity(
+    _, similarity = structural_similarity(  # type: ignore[no-untyped-call]
         truth.astype(np.float64),
         image.astype(np.float64),
         data_range=1.0,
@@ -133,8 +134,8 @@ def flip_map(image: FloatArray, truth: FloatArray) -> Float64Array:
 
     Andersson et al. 2020, by the authors' package; display values count as sRGB.
     """
-    import flip_evaluator
+    from importlib import import_module
 
     pictures = (np.ascontiguousarray(x, np.float32) for x in (truth, image))
-    error, _, _ = flip_evaluator.evaluate(*pictures, "LDR", True, False, False)
+    error, _, _ = import_module("flip_evaluator").evaluate(*pictures, "LDR", True, False, False)
     return np.asarray(error, np.float64).reshape(image.shape[:2])
