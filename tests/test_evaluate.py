@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from warpir.curves import Curves
+from warpir.diffusion.embedded import NetworkConfig, build_network, save_embedded
 from warpir.errors import ExitCode, InputError
 from warpir.evaluate import light_figures, main, usable_rows
 from warpir.evaluation_report import Entry, bootstrap, compare, mean_of, summarize
@@ -480,3 +481,44 @@ def test_other_scenes_are_seen_by_this_camera(
     assert np.array_equal(place.to_camera(texels), other.to_camera(other.texels))
     seen, own = (as_map(p.light, 32) for p in (from_photo(bench, place), regression(bench, other)))
     assert light_errors(place.to_camera(seen), other.to_camera(own))["peak_angle_deg"] < 6.0
+
+
+@pytest.mark.slow
+def test_guided_rows_run_what_insert_runs(data: Path, tmp_path: Path) -> None:
+    """With random weights: they end, say what the prior said, and the mirrored run too.
+
+    Nothing says that such guidance helps; where the acceptance test refuses its end, the row has
+    the light of its start.
+    """
+    config = NetworkConfig(widths=(16, 32), layers=1, head_width=16, groups=8)
+    save_embedded(build_network(config, seed=2), tmp_path / "prior.safetensors", {})
+    numbers = tmp_path / "numbers.json"
+    rows = "regression,lds-regression,lds-mirrored,s3-sds-no-lora"
+
+    status = main(
+        arguments(
+            data,
+            *("--scenes", "1", "--rows", rows, "--json", str(numbers), "--steps", "2"),
+            *("--regressor", str(data / "regressor.safetensors")),
+            *("--prior", str(tmp_path / "prior.safetensors")),
+        )
+    )
+
+    assert status == 0
+    record = json.loads(numbers.read_text())
+    assert len(record["weights"]["prior"]) == 64
+    entries = {(e["row"], e["material"]): e for e in record["entries"]}
+    assert len(entries) == 8
+    for material in ("diffuse", "glossy"):
+        found = entries["lds-regression", material]
+        said = found["about"]["record"]
+        assert said["prior"] == "embedded"
+        accepted = said["acceptance"]["is_accepted"]
+        start = entries["regression", material]["figures"]["image.box.rmse"]
+        if not accepted:
+            assert found["figures"]["image.box.rmse"] == pytest.approx(start, abs=1e-3)
+        assert "acceptance" not in entries["s3-sds-no-lora", material]["about"]["record"]
+        # Mirrored back, the light is where it was found.
+        assert entries["lds-mirrored", material]["figures"]["light.same_deg"] < 20.0
+    starts = {(p["row"], p["against"]) for p in record["pairs"] if p["is_start"]}
+    assert starts == {("lds-regression", "regression")}

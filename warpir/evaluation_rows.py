@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 
 from warpir.color import luminance
 from warpir.config import InsertConfig, usage
+from warpir.diffusion.embedded import build_network, save_embedded
 from warpir.errors import InputError
 from warpir.evaluation_scenes import Place, Subject, mirrored
 from warpir.evaluation_stage import Prediction, Stage
@@ -286,11 +287,19 @@ def guided(**changes: Any) -> Callable[[Bench, Stage, Subject], Prediction]:
     return predict
 
 
+def guided_randomly(bench: Bench, stage: Stage, subject: Subject) -> Prediction:
+    """Return what a prior finds that has learnt nothing."""
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / "random.safetensors"
+        save_embedded(build_network(seed=bench.seed), path, {})
+        changes = {"guidance": "embedded", "model": None, "prior": str(path), "start": "regressed"}
+        return recover_light(bench, subject, subject.place.photo, changes)
+
+
 def guided_elsewhere(bench: Bench, stage: Stage, subject: Subject) -> Prediction:
     """Return what guidance finds in another place's photograph, taken by this camera."""
     other = bench.other(subject.place)
-    found = recover_light(bench, subject, other.photo, {"start": "regressed"})
-    return found
+    return recover_light(bench, subject, other.photo, {"start": "regressed"})
 
 
 def guided_mirrored(bench: Bench, stage: Stage, subject: Subject) -> Prediction:
@@ -436,6 +445,13 @@ ROWS = {
         "the regressor, shown the mirrored photo; its light mirrored back",
         of_place=mirrored_photo,
         same_as="regression",
+        needs=("regressor",),
+    ),
+    "lds-random": Row(
+        "controls",
+        "guidance by a prior with random weights, from the regressor's light",
+        of_subject=guided_randomly,
+        start="regression",
         needs=("regressor",),
     ),
     "lds-other-photo": Row(
