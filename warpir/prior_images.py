@@ -8,7 +8,7 @@ warpir inserts objects. Everything of a batch is drawn and rendered on one devic
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -19,7 +19,7 @@ from torch import Tensor
 
 from warpir.diffusion.embedded import KINDS, NOUNS
 from warpir.kernels import training_scene as kernel
-from warpir.photo_look import draw_faults, draw_looks
+from warpir.photo_look import Look, draw_faults, draw_looks
 from warpir.training_batches import PhotoBatch, PriorBatch
 from warpir.training_lights import LightPool, gray, make_lights, solid_angles
 from warpir.training_meshes import TrainingMesh
@@ -30,7 +30,8 @@ PHOTO_SIZE = (96, 144)
 """Height and width of a whole photo [px]."""
 METER_SIZE = (24, 36)
 """Height and width at which a photo is rendered to expose it [px]."""
-SOLIDS = 8
+SOLIDS = 14
+"""Of a scene: two walls or houses, six small ones, two trees of two, and two far away."""
 DIRECTIONS, SUN_DIRECTIONS = 96, 16
 """Directions that stand for a light, shared by a pixel's four points."""
 NEW_SKIES_EVERY = 40
@@ -180,6 +181,18 @@ class Rendered:
     solid: Tensor
 
 
+@dataclass(frozen=True)
+class Shot:
+    """Photos of scenes without their objects, shape [B, 3, H, W] each."""
+
+    look: Look
+    radiance: Tensor
+    plain: Tensor
+    """Display values of a faultless camera."""
+    photo: Tensor
+    """With noise, blur and the rest."""
+
+
 class SceneGenerator:
     """Draws and renders batches; batch k is a function of the seed and k alone.
 
@@ -218,23 +231,63 @@ class SceneGenerator:
         """
         generator = self._generator(2, index)
         scenes = self._draw(index, count, generator, with_object=True)
+        shot = self._shoot(scenes, generator)
+        return self._inserted(scenes, shot)
+
+    def relit(
+        self, index: int, count: int, changes: Sequence[Callable[[Lighting], Lighting]]
+    ) -> list[PriorBatch]:
+        """Return the same scenes with the object under several lights.
+
+        Args:
+            index: Which batch.
+            count: Scenes in it.
+            changes: Each makes an object's light from the one that `prior_batch` has.
+        """
+        generator = self._generator(2, index)
+        scenes = self._draw(index, count, generator, with_object=True)
+        shot = self._shoot(scenes, generator)
+        batches = []
+        for change in changes:
+            light = change(scenes.object_lighting)
+            # The same random numbers for all, so that only the light differs.
+            directions = self._directions(light, self._generator(4, index))
+            tables = scenes.tables | {"object_light": directions}
+            changed = replace(scenes, tables=tables, object_lighting=light)
+            batches.append(self._inserted(changed, shot))
+        return batches
+
+    def light_of(self, index: int, count: int) -> Tensor:
+        """Return the sun's share of the object's light in `prior_batch`, in [0, 1], shape [B]."""
+        scenes = self._draw(index, count, self._generator(2, index), with_object=True)
+        light = scenes.object_lighting
+        rest = self._rest_map(light)
+        flux = (gray(rest) * solid_angles(rest)).sum(dim=(1, 2))
+        return gray(light.sun) / (gray(light.sun) + flux).clamp(min=1e-20)
+
+    def _shoot(self, scenes: Scenes, generator: torch.Generator) -> Shot:
+        """Take the photos: exposed as a whole, seen through the crop's window."""
         metered = self._render(scenes, scenes.photo_window, METER_SIZE, 1, with_object=False)
         look = draw_looks(metered.background, generator)
+        made = self._render(scenes, scenes.crop_window, (SIDE, SIDE), 2, with_object=False)
+        plain = look.show(made.background)
+        return Shot(look, made.background, plain, draw_faults(plain, generator))
+
+    def _inserted(self, scenes: Scenes, shot: Shot) -> PriorBatch:
+        """Insert the objects into the photos."""
         made = self._render(scenes, scenes.crop_window, (SIDE, SIDE), 2)
-        photo = look.show(made.background)
-        shaded = look.show(made.background * made.ratio)
         # What the shadow does to the picture is applied to the photo with all its faults.
-        factor = (shaded.clamp(min=1e-4) / photo.clamp(min=1e-4)).clamp(max=1.0)
-        background = draw_faults(photo, generator)
-        part = made.object / made.coverage.clamp(min=1e-6)
+        shaded = shot.look.show(shot.radiance * made.ratio)
+        factor = (shaded.clamp(min=1e-4) / shot.plain.clamp(min=1e-4)).clamp(max=1.0)
         covered = made.coverage
-        image = covered * look.show(part) + (1.0 - covered) * background * factor
+        part = shot.look.show(made.object / covered.clamp(min=1e-6))
+        image = covered * part + (1.0 - covered) * shot.photo * factor
         normal = made.normal / made.normal.norm(dim=1, keepdim=True).clamp(min=1e-6)
         albedo = (made.albedo / covered.clamp(min=1e-6)).clamp(0.0, 1.0) ** (1.0 / 2.2)
         is_covered = (covered > 0.0).float()
         gbuffer = torch.cat([covered, albedo * is_covered, normal * is_covered], dim=1)
         words = scenes.noun, scenes.setting, scenes.weather, scenes.kind
-        return PriorBatch(image.clamp(0.0, 1.0), background, gbuffer, *words)
+        return PriorBatch(image.clamp(0.0, 1.0), shot.photo, gbuffer, *words)
 
     def photo_batch(self, index: int, count: int) -> PhotoBatch:
         """Return whole photos and their light; arguments are those of `prior_batch`."""
@@ -557,13 +610,13 @@ class SceneGenerator:
         scale: Tensor,
         camera_height: Tensor,
     ) -> dict[str, Tensor]:
-        """Draw what stands in the scenes, [B, SOLIDS] each: two walls or houses, the rest small."""
+        """Draw what stands in the scenes, [B, SOLIDS] each."""
         count, device = len(place), place.device
 
         def rand(*shape: int) -> Tensor:
             return torch.rand(count, *shape, generator=generator, device=device)
 
-        small = SOLIDS - 2
+        small = SOLIDS - 8
         kind = torch.where(rand(small) < 0.4, 0, torch.where(rand(small) < 0.5, 1, 2))
         half = scale[:, None, None] * torch.exp(np.log(0.13) + rand(small, 3) * np.log(9.0))
         half = torch.minimum(half, camera_height[:, None, None] * 1.5)
@@ -626,10 +679,40 @@ class SceneGenerator:
         large_half = torch.where(is_street[..., None], house_half, wall_half)
         large_centre = torch.where(is_street[..., None], house, wall)
         large_yaw = torch.where(is_street, 0.3 * (rand(2) - 0.5), wall_yaw)
-        kind = torch.cat([large_kind, kind], dim=1)
+        # Trees out of doors, and what stands far away before the sky.
+        outdoors = (place_kind < 2)[:, None]
+        around = 2.0 * np.pi * rand(2)
+        tree_away = h * torch.exp(np.log(2.0) + rand(2) * np.log(8.0))
+        tree = place[:, None] + tree_away[..., None] * torch.stack(
+            [around.sin(), torch.zeros_like(around), -around.cos()], dim=-1
+        )
+        crown = h[..., None] * (0.5 + 1.8 * rand(2, 1)) * (0.7 + 0.6 * rand(2, 3))
+        trunk = h[..., None] * torch.tensor([0.08, 0.0, 0.08], device=device).expand(count, 2, 3)
+        trunk = trunk.clone()
+        trunk[..., 1] = h * (0.3 + 0.9 * rand(2))
+        trunk_centre, crown_centre = tree.clone(), tree.clone()
+        trunk_centre[..., 1] = trunk[..., 1]
+        crown_centre[..., 1] = 2.0 * trunk[..., 1] + 0.8 * crown[..., 1]
+        stands = (rand(2) < 0.45) & outdoors
+        # The camera stands in no crown.
+        stands &= tree[..., [0, 2]].norm(dim=-1) > 1.5 * crown.max(dim=-1).values
+        far = h * (12.0 + 50.0 * rand(2))
+        far_half = (
+            h[..., None]
+            * torch.exp(rand(2, 3) * np.log(12.0))
+            * torch.tensor([2.5, 0.6, 1.0], device=device)
+        )
+        far_centre = torch.stack([far * 1.4 * (rand(2) - 0.5), 0.7 * far_half[..., 1], -far], -1)
+        far_kind = torch.where(rand(2) < 0.5, 1, 0)
+        far_kind = torch.where((rand(2) < 0.45) & outdoors, far_kind, -1)
+        more_kind = torch.cat([torch.where(stands, 2, -1), torch.where(stands, 1, -1), far_kind], 1)
+        more_centre = torch.cat([trunk_centre, crown_centre, far_centre], dim=1)
+        more_half = torch.cat([trunk, crown, far_half], dim=1)
+        kind = torch.cat([large_kind, kind, more_kind], dim=1)
         # Few or none in panorama crops, and never a wall.
         few = rand(SOLIDS) < 0.35
         few[:, :2] = False
+        few[:, -6:] = False
         few &= (rand() < self.mixture.proxies)[:, None]
         kind = torch.where(is_panorama[:, None] & ~few, -1, kind)
         kind = torch.where((rand() < self.mixture.no_cue)[:, None], -1, kind)
@@ -638,9 +721,9 @@ class SceneGenerator:
         is_textured = (rand(SOLIDS) < 0.4) & (panoramas > 0)
         return {
             "kind": kind.int(),
-            "centre": torch.cat([large_centre, centre], dim=1),
-            "half": torch.cat([large_half, half], dim=1).clamp(min=1e-4),
-            "yaw": torch.cat([large_yaw, 2.0 * np.pi * rand(small)], dim=1),
+            "centre": torch.cat([large_centre, centre, more_centre], dim=1),
+            "half": torch.cat([large_half, half, more_half], dim=1).clamp(min=1e-4),
+            "yaw": torch.cat([large_yaw, 2.0 * np.pi * rand(SOLIDS - 2)], dim=1),
             "albedo": (0.08 + 0.7 * rand(SOLIDS, 1)) * tint,
             "texture": torch.where(
                 is_textured, (rand(SOLIDS) * max(panoramas, 1)).long(), -1

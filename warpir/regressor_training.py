@@ -490,7 +490,8 @@ def calibrate(
 ) -> None:
     """Set the network's temperature and scale its variances, on sunny validation photos.
 
-    A variance is scaled so that one standard deviation covers 68 %, by its head's bias.
+    A variance is scaled so that one standard deviation covers 68 %, by its head's bias; the sets'
+    factors are averaged as logs.
 
     Args:
         network: In evaluation mode; changed in place.
@@ -525,7 +526,8 @@ def calibrate(
     last = network.level_head[-1]
     assert isinstance(last, torch.nn.Linear)
     for place, found in scales.items():
-        last.bias[place] += 2.0 * math.log(max(sum(found) / len(found), 1e-3))
+        # The geometric mean: one place that is misread altogether must not decide for all photos.
+        last.bias[place] += 2.0 * sum(math.log(max(z, 1e-3)) for z in found) / len(found)
 
 
 # ------------------------------------------------------------------------------ mean light

@@ -21,6 +21,7 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from warpir.config import usage
 from warpir.errors import ExitCode, InputError
 from warpir.program import run_program, say
 
@@ -59,6 +60,7 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--device", default=None)
     parser.add_argument("--resume", action="store_true")
+    parser.add_argument("--start", type=Path, metavar="FILE", help="weights to begin with")
     parser.add_argument("--no-compile", action="store_true", help="Do without torch.compile")
     return parser
 
@@ -194,6 +196,8 @@ def _train_prior(
         ]
         for name, shares in kinds.items()
     }
+    if options.start is not None:
+        raise usage("--start", "the prior begins with random weights, or goes on with --resume")
     settings = TrainSettings(batch=options.batch or 256, compile=not options.no_compile)
     progress = train_prior(
         _reused(_counted(SceneGenerator(learned, seed).prior_batch), REUSES),
@@ -230,11 +234,12 @@ def _train_regressor(
     record: dict[str, Any],
 ) -> dict[str, Any]:
     from warpir.prior_images import Mixture, SceneGenerator
+    from warpir.regressor import load_regressor
     from warpir.regressor_training import TrainingSettings, train_regressor
 
     learned, unseen = stocks
     # Fewer panorama crops than the prior sees: they are few places, and could be learned by heart.
-    scenes = SceneGenerator(learned, seed, Mixture(made_up=0.5, hybrid=0.25))
+    scenes = SceneGenerator(learned, seed, Mixture(made_up=0.45, hybrid=0.35))
 
     def drawn(**shares: float) -> list[PhotoBatch]:
         made = SceneGenerator(unseen, VALIDATION_SEED, Mixture(**shares, proxies=0.0))
@@ -244,6 +249,9 @@ def _train_regressor(
     if unseen.panoramas.panorama_count:
         validation["panoramas"] = drawn(made_up=0.0, hybrid=0.0)
     settings = TrainingSettings(batch=options.batch or 256, compile=not options.no_compile)
+    start = None if options.start is None else load_regressor(options.start, device)
+    if start is not None:
+        record = record | {"started_from": start.record}
     end = train_regressor(
         _counted(scenes.photo_batch),
         validation,
@@ -254,6 +262,7 @@ def _train_regressor(
         options.total_minutes or options.minutes,
         resume=options.resume,
         seed=options.seed,
+        network=start,
         record=record,
     )
     return vars(end)

@@ -18,8 +18,12 @@ from warpir.sg_light import SGLight
 
 SPREAD_MIN = float(torch.pi) / 36.0
 """Least spread that a direction is believed to have [rad]: 5 degrees."""
-LOG_STD_MIN = 0.1
-"""Least standard deviation that a log intensity is believed to have."""
+SPREAD_MAX = float(torch.pi) / 9.0
+"""Greatest spread of it [rad]: 20 degrees. Where nobody knows, a small network is no guide."""
+LOG_STD_MIN, LOG_STD_MAX = 0.1, 0.7
+"""Least and greatest standard deviation that a log intensity is believed to have: without the
+greatest one, guidance puts out a sun that the regressor is not sure of, for soft light is never
+quite wrong."""
 SMALL = 1e-4
 """Below it, (1 - cos) / 2 has the square of the angle as a series [1]."""
 
@@ -47,9 +51,9 @@ class TrustRegion:
 
         Args:
             light: Where the recovery starts.
-            spread: Of the dominant direction [rad]; at least `SPREAD_MIN` is assumed.
-            sun_std: Of the dominant lobe's log flux; at least `LOG_STD_MIN` is assumed.
-            ambient_std: Of the others' log flux; at least `LOG_STD_MIN` is assumed.
+            spread: Of the dominant direction [rad], brought into `SPREAD_MIN` to `SPREAD_MAX`.
+            sun_std: Of the dominant lobe's log flux, brought into `LOG_STD_MIN` to `LOG_STD_MAX`.
+            ambient_std: Of the others' log flux, likewise.
         """
         with torch.no_grad():
             log_sun, log_ambient = _log_fluxes(light)
@@ -58,9 +62,9 @@ class TrustRegion:
             axis,
             log_sun,
             log_ambient,
-            max(spread, SPREAD_MIN),
-            max(sun_std, LOG_STD_MIN),
-            max(ambient_std, LOG_STD_MIN),
+            min(max(spread, SPREAD_MIN), SPREAD_MAX),
+            min(max(sun_std, LOG_STD_MIN), LOG_STD_MAX),
+            min(max(ambient_std, LOG_STD_MIN), LOG_STD_MAX),
         )
 
     def distance(self, light: SGLight) -> Tensor:
