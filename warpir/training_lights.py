@@ -71,8 +71,9 @@ def split_sun(texels: FloatArray) -> Split:
     omega = np.broadcast_to(texel_solid_angles(height, 2 * height)[:, None], directions.shape[:2])
     lum = luminance(values)
     # The brightest spot, not the brightest texel: a lamp's reflex must not outdo a window.
-    bright = lum >= np.quantile(lum, 0.995)
-    axes, weights = directions[bright], (lum * omega)[bright]
+    # A count, not a threshold: in an even map every texel reaches the quantile.
+    bright = np.argsort(lum, axis=None, kind="stable")[-max(1, lum.size // 200) :]
+    axes, weights = directions.reshape(-1, 3)[bright], (lum * omega).ravel()[bright]
     nearness = np.exp((axes @ axes.T - 1.0) / np.radians(SPOT_DEG) ** 2)
     centre = axes[int(np.argmax(nearness @ weights))]
     angle = np.degrees(np.arccos(np.clip(directions @ centre, -1.0, 1.0)))
