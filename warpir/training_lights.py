@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
@@ -134,7 +135,9 @@ class LightPool:
         """Return the panoramas of this pool with other made-up lights behind them."""
         n = self.panorama_count
         names = ("fine", "axis", "sun", "sigma", "weather", "indoors")
-        joined = {k: torch.cat([getattr(self, k)[:n], getattr(skies, k)]) for k in names}
+        joined: dict[str, Any] = {
+            k: torch.cat([getattr(self, k)[:n], getattr(skies, k)]) for k in names
+        }
         return replace(self, **joined)
 
 
