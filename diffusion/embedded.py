@@ -1,11 +1,11 @@
 """The prior that warpir ships: a small UNet on pixels that is shown what it has to judge by.
 
 A crop of 64 x 64 pixels is its own latent, in [-1, 1]. Beside the noisy crop the network sees the
-photo without the object (blank where the mask covers it), and the object's mask, albedo and
-normals; each may be withheld, and a flag says so. It was trained on rendered scenes, half of them
-wrongly lit: the prompt says ``consistent`` or ``mismatched`` and what is wrong. The empty prompt
-means any of them, wrongly lit ones included, so that a difference of two prompts is a statement
-about the light.
+photo without the object (the crop, blank where the mask covers it, and the whole photo, small), and
+the object's mask, albedo and normals; each may be withheld, and a flag says so. It was trained on
+rendered scenes, half of them wrongly lit: the prompt says ``consistent`` or ``mismatched`` and what
+is wrong. The empty prompt means any of them, wrongly lit ones included, so that a difference of two
+prompts is a statement about the light.
 
 Folding 2 x 2 pixels into channels is orthonormal: white noise stays white, and this is exactly
 diffusion in pixel space at a quarter of the cost. Noise follows a cosine, ``s = sin(pi t / 2)``,
@@ -46,7 +46,7 @@ WEIGHTS = Path(__file__).parent / "weights" / "prior.safetensors"
 """The weights that are part of the package."""
 HEADER_KEY = "warpir_prior"
 """Where a file's header describes its weights."""
-FORMAT = 1
+FORMAT = 2
 
 # What LoRAs adapt here: guidance.md's choice for a small network that is new to photographs.
 LORA_RANK = 8
@@ -272,7 +272,7 @@ class EmbeddedNetwork(nn.Module):
         attends = [level >= config.attention_from for level in levels]
         self.unet: UNet2DConditionModel = UNet2DConditionModel(
             sample_size=RESOLUTION // 2,
-            in_channels=4 * (3 + 3 + 7) + len(CONDITIONS),
+            in_channels=4 * (3 + 6 + 7) + len(CONDITIONS),
             out_channels=4 * 3,
             down_block_types=tuple(f"{'CrossAttn' * a}DownBlock2D" for a in attends),
             up_block_types=tuple(f"{'CrossAttn' * a}UpBlock2D" for a in reversed(attends)),
@@ -307,7 +307,8 @@ class EmbeddedNetwork(nn.Module):
             latents_noisy: z_t, same shape.
             timesteps: int64, shape [B].
             embeddings: From `embed`.
-            background: The photo without the object, in [0, 1], shape [B, 3, 64, 64].
+            background: The photo without the object, in [0, 1]: the crop, and the whole of it
+                squeezed into the same square, shape [B, 6, 64, 64].
             gbuffer: Mask, albedo and normals, shape [B, 7, 64, 64].
             present: 1 for each of `CONDITIONS` that is shown, else 0; float, shape [B, 4].
         """
@@ -317,15 +318,17 @@ class EmbeddedNetwork(nn.Module):
 
 
 def pack(latents_noisy: Tensor, background: Tensor, gbuffer: Tensor, present: Tensor) -> Tensor:
-    """Return the UNet's input, shape [B, 56, 32, 32]; arguments as in `EmbeddedNetwork.forward`.
+    """Return the UNet's input, shape [B, 68, 32, 32]; arguments as in `EmbeddedNetwork.forward`.
 
-    What is not shown is 0. The background is blank where a mask that is shown covers it.
+    What is not shown is 0. The background is blank where a mask that is shown covers it; the whole
+    photo beside it, which has the cues that a crop leaves out, is not.
     """
     shown = present[:, :, None, None].to(latents_noisy)
     mask = gbuffer[:, :1] * shown[:, 1:2]
     planes = [
         latents_noisy,
-        (2.0 * background - 1.0) * (1.0 - mask) * shown[:, :1],
+        (2.0 * background[:, :3] - 1.0) * (1.0 - mask) * shown[:, :1],
+        (2.0 * background[:, 3:] - 1.0) * shown[:, :1],
         mask,
         gbuffer[:, 1:4] * shown[:, 2:3],
         gbuffer[:, 4:] * shown[:, 3:],
@@ -423,7 +426,7 @@ class EmbeddedPrior(NetworkPrior):
         """
         count, size = len(latents_noisy), latents_noisy.shape[-2:]
         device = latents_noisy.device
-        for name, given, channels in (("background", background, 3), ("gbuffer", gbuffer, 7)):
+        for name, given, channels in (("background", background, 6), ("gbuffer", gbuffer, 7)):
             if given is not None and given.shape != (count, channels, *size):
                 expected = [count, channels, *size]
                 raise ValueError(f"{name}: shape {list(given.shape)} (expected {expected})")
@@ -438,7 +441,7 @@ class EmbeddedPrior(NetworkPrior):
         zeros = latents_noisy.new_zeros(count, 7, *size)
         return pack(
             latents_noisy,
-            zeros[:, :3] if background is None else background.to(device, torch.float32),
+            zeros[:, :6] if background is None else background.to(device, torch.float32),
             zeros if gbuffer is None else gbuffer.to(device, torch.float32),
             present,
         )

@@ -22,7 +22,7 @@ from typing import Any, Protocol, cast
 import torch
 from torch import Tensor
 
-from warpir.diffusion.crop import Crop, box_of, draw_crop
+from warpir.diffusion.crop import Crop, box_of, draw_crop, shrink
 from warpir.diffusion.draws import generator_of, seed_of
 from warpir.diffusion.prior import Condition, Counts, ModelError, Prior
 from warpir.diffusion.schedule import time_range, weight
@@ -267,7 +267,7 @@ class NoisyCrops:
     weight: Tensor
     """w(t), shape [noise, 1, 1, 1]."""
     background: Tensor | None
-    """The photo's crops, shape [noise, 3, R, R]."""
+    """The photo's crops, and the whole photo with each, shape [noise, 6, R, R]."""
     gbuffer: Tensor | None
     """The G-buffer's crops, shape [noise, 7, R, R]."""
 
@@ -309,6 +309,8 @@ class Guidance:
         self.row = coefficients(settings, adapter is not None)
         self.terms = terms_of(settings, condition, adapter)
         self.embeddings = prior.embed([term.prompt for term in self.terms])
+        photo = condition.background
+        self.whole = None if photo is None else shrink(photo, prior.resolution).to(prior.device)
         self.gate = GradientGate(settings.gradient_clip)
 
     @property
@@ -487,9 +489,14 @@ class Guidance:
             prior.schedule.add_noise(latents.detach(), noise, t),
             t,
             w,
-            None if background is None else cropped(background),
+            None if background is None else self._shown(cropped(background)),
             None if gbuffer is None else cropped(gbuffer),
         )
+
+    def _shown(self, crops: Tensor) -> Tensor:
+        """Return crops of the photo with the whole of it beside each, shape [noise, 6, R, R]."""
+        assert self.whole is not None
+        return torch.cat([crops, self.whole.expand(len(crops), -1, -1, -1)], dim=1)
 
     @torch.no_grad()
     def _predictions(self, crops: NoisyCrops) -> Tensor:

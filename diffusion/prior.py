@@ -94,7 +94,9 @@ class Prior(Protocol):
             t: Times in [0, 1], shape [B].
             embeddings: From `embed`, one per sample, shape [B, token, channel].
             adapters: Per sample the name of its adapter, or None for the base weights.
-            background: Crop of `Condition.background`, or None; Stable Diffusion ignores it.
+            background: Crop of `Condition.background` and, in three more channels, the whole of it
+                squeezed into the same square, shape [B, 6, resolution, resolution], or None;
+                Stable Diffusion ignores it.
             gbuffer: Crop of `Condition.gbuffer`, or None; Stable Diffusion ignores it.
             keep_background: Per sample whether the background is told; None: wherever it is given.
 

@@ -72,7 +72,7 @@ class Batch(Protocol):
 
     @property
     def background(self) -> Tensor:
-        """The same photos without the object, same shape."""
+        """The same crops without the object, and the whole photos, shape [B, 6, 64, 64]."""
 
     @property
     def gbuffer(self) -> Tensor:
@@ -267,7 +267,7 @@ class Objective(nn.Module):
             present,
         )
         error = (predicted.float() - (a * noise - s * latents)).square()
-        weight = pixel_weight(image, background, gbuffer[:, :1], self.settings)
+        weight = pixel_weight(image, background[:, :3], gbuffer[:, :1], self.settings)
         losses: Tensor = (weight * error).mean(dim=(1, 2, 3))
         return losses
 

@@ -27,6 +27,9 @@ STRIPES = wp.constant(2)
 PLANKS = wp.constant(3)
 PHOTO = wp.constant(4)
 
+SUBSETS = wp.constant(4)
+"""Each point of a pixel asks every fourth direction; neighbouring points ask different ones."""
+
 
 @wp.struct
 class ViewTable:
@@ -86,7 +89,10 @@ class OccluderTable:
     centre: wp.array2d[wp.vec3]
     half: wp.array2d[wp.vec3]
     """Half sizes along the solid's own axes [m]."""
-    yaw: wp.array2d[float]
+    turn: wp.array2d[wp.vec2]
+    """Cosine and sine of the solid's turn about +Y."""
+    count: wp.array[int]
+    """Solids of each scene: those behind are not looked at, shape [scene]."""
     albedo: wp.array2d[wp.vec3]
     texture: wp.array2d[int]
     """Panorama of which a piece covers the solid; negative: none."""
@@ -159,6 +165,22 @@ def turned(v: wp.vec3, yaw: float) -> wp.vec3:
 
 
 @wp.func
+def turned_by(v: wp.vec3, turn: wp.vec2) -> wp.vec3:
+    """Turn about +Y by an angle of which cosine and sine are known."""
+    return wp.vec3(turn[0] * v[0] + turn[1] * v[2], v[1], turn[0] * v[2] - turn[1] * v[0])
+
+
+@wp.func
+def is_near(centre: wp.vec3, half: wp.vec3, o: wp.vec3, d: wp.vec3) -> bool:
+    """Return whether a ray meets the sphere around a solid: most rays do not."""
+    to = centre - o
+    along = wp.dot(to, d)
+    distance2 = wp.dot(to, to)
+    reach2 = wp.dot(half, half)
+    return distance2 < reach2 or (along > 0.0 and distance2 - along * along < reach2)
+
+
+@wp.func
 def solid_t(kind: int, o: wp.vec3, d: wp.vec3, half: wp.vec3) -> float:
     """Return the distance to a solid at the origin from outside, `FAR` if it is missed."""
     if kind == BOX:
@@ -224,35 +246,39 @@ def solid_normal(kind: int, p: wp.vec3, half: wp.vec3) -> wp.vec3:
 
 
 @wp.func
-def nearest_solid(solids: OccluderTable, scene: int, count: int, o: wp.vec3, d: wp.vec3) -> Solid:
+def nearest_solid(solids: OccluderTable, scene: int, o: wp.vec3, d: wp.vec3) -> Solid:
     """Return the nearest solid that a ray meets."""
     hit = Solid()
     hit.index = NO_HIT
     hit.t = FAR
-    for k in range(count):
-        kind = solids.kind[scene, k]
-        if kind >= 0:
-            yaw = solids.yaw[scene, k]
-            half = solids.half[scene, k]
-            lo = turned(o - solids.centre[scene, k], -yaw)
-            ld = turned(d, -yaw)
+    for k in range(solids.count[scene]):
+        half = solids.half[scene, k]
+        centre = solids.centre[scene, k]
+        if is_near(centre, half, o, d):
+            kind = solids.kind[scene, k]
+            turn = solids.turn[scene, k]
+            back = wp.vec2(turn[0], -turn[1])
+            lo = turned_by(o - centre, back)
+            ld = turned_by(d, back)
             t = solid_t(kind, lo, ld, half)
             if t < hit.t:
                 hit.t = t
                 hit.index = k
-                hit.normal = turned(solid_normal(kind, lo + ld * t, half), yaw)
+                hit.normal = turned_by(solid_normal(kind, lo + ld * t, half), turn)
     return hit
 
 
 @wp.func
-def is_open(solids: OccluderTable, scene: int, count: int, o: wp.vec3, d: wp.vec3) -> float:
+def is_open(solids: OccluderTable, scene: int, o: wp.vec3, d: wp.vec3) -> float:
     """Return 1 if no solid stands in the way, else 0."""
-    for k in range(count):
-        kind = solids.kind[scene, k]
-        if kind >= 0:
-            yaw = solids.yaw[scene, k]
-            lo = turned(o - solids.centre[scene, k], -yaw)
-            if solid_t(kind, lo, turned(d, -yaw), solids.half[scene, k]) < FAR:
+    for k in range(solids.count[scene]):
+        half = solids.half[scene, k]
+        centre = solids.centre[scene, k]
+        if is_near(centre, half, o, d):
+            turn = solids.turn[scene, k]
+            back = wp.vec2(turn[0], -turn[1])
+            lo = turned_by(o - centre, back)
+            if solid_t(solids.kind[scene, k], lo, turned_by(d, back), half) < FAR:
                 return 0.0
     return 1.0
 
@@ -389,7 +415,6 @@ def irradiance_among_solids(
     lights: LightTable,
     solids: OccluderTable,
     scene: int,
-    solid_count: int,
     first: int,
     stride: int,
     p: wp.vec3,
@@ -402,7 +427,6 @@ def irradiance_among_solids(
         lights: Which light.
         solids: What stands in its way.
         scene: Index of the scene.
-        solid_count: Solids per scene.
         first: First direction.
         stride: Step between directions.
         p: Point, lifted off its surface.
@@ -414,14 +438,14 @@ def irradiance_among_solids(
         d = lights.direction[scene, k]
         cosine = wp.dot(n, d)
         if cosine > 0.0:
-            if is_blocked == 0.0 or is_open(solids, scene, solid_count, p, d) > 0.0:
+            if is_blocked == 0.0 or is_open(solids, scene, p, d) > 0.0:
                 total = total + lights.flux[scene, k] * (cosine * float(stride))
     count = float(lights.sun_direction.shape[1]) / float(stride)
     for k in range(first, lights.sun_direction.shape[1], stride):
         d = lights.sun_direction[scene, k]
         cosine = wp.dot(n, d)
         if cosine > 0.0:
-            if is_blocked == 0.0 or is_open(solids, scene, solid_count, p, d) > 0.0:
+            if is_blocked == 0.0 or is_open(solids, scene, p, d) > 0.0:
                 total = total + lights.sun[scene] * (cosine / count)
     return total
 
@@ -485,7 +509,6 @@ def render_scenes(
     width: int,
     height: int,
     side: int,
-    solid_count: int,
     blur_min: wp.array[float],
     views: ViewTable,
     light: LightTable,
@@ -496,13 +519,12 @@ def render_scenes(
     objects: ObjectTable,
     out: Pixels,
 ):
-    """Render a pixel of a scene from ``side`` times ``side`` points, each with its share of rays.
+    """Render a pixel from ``side`` times ``side`` points, each with a quarter of the directions.
 
     Args:
         width: Of the picture [px].
         height: Of the picture [px].
-        side: Rows and columns of points in a pixel.
-        solid_count: Solids per scene.
+        side: Rows and columns of points in a pixel: 1 or 2.
         blur_min: Least blur of what an object reflects, by scene.
         views: Cameras.
         light: What lights the scene.
@@ -536,6 +558,9 @@ def render_scenes(
     covered = float(0.0)
     solid_share = float(0.0)
     for k in range(points):
+        first = k % SUBSETS
+        if points == 1:
+            first = 2 * (column % 2) + row % 2
         across = (float(column) + (float(k % side) + 0.5) / float(side)) / float(width)
         down = (float(row) + (float(k // side) + 0.5) / float(side)) / float(height)
         d = wp.normalize(
@@ -545,7 +570,7 @@ def render_scenes(
         ground_t = float(FAR)
         if d[1] < -1.0e-4:
             ground_t = -origin[1] / d[1]
-        hit = nearest_solid(solids, scene, solid_count, origin, d)
+        hit = nearest_solid(solids, scene, origin, d)
         ground_point = origin + d * ground_t
         lifted = ground_point + wp.vec3(0.0, 1.0e-4 * origin[1], 0.0)
         shows_ground = ground_t < FAR and ground_t < hit.t
@@ -553,9 +578,7 @@ def render_scenes(
         if hit.t < FAR and not shows_ground:
             solid_share = solid_share + 1.0
             p = origin + d * hit.t + hit.normal * (1.0e-3 * origin[1])
-            e = irradiance_among_solids(
-                light, solids, scene, solid_count, k, points, p, hit.normal, 1.0
-            )
+            e = irradiance_among_solids(light, solids, scene, first, SUBSETS, p, hit.normal, 1.0)
             albedo = solids.albedo[scene, hit.index]
             if solids.texture[scene, hit.index] >= 0:
                 spread = 0.4 / wp.max(solids.half[scene, hit.index][1], 0.1 * origin[1])
@@ -568,9 +591,7 @@ def render_scenes(
             radiance = wp.cw_mul(albedo, e) / PI
         elif shows_ground and ground.is_seen[scene] == 1:
             n = wp.vec3(0.0, 1.0, 0.0)
-            e = irradiance_among_solids(
-                light, solids, scene, solid_count, k, points, lifted, n, 1.0
-            )
+            e = irradiance_among_solids(light, solids, scene, first, SUBSETS, lifted, n, 1.0)
             radiance = wp.cw_mul(ground_albedo(maps, ground, scene, ground_point), e) / PI
             c = 1.0 + d[1]
             gloss = ground.wetness[scene] * (0.02 + 0.98 * c * c * c * c * c)
@@ -580,14 +601,12 @@ def render_scenes(
             )
         else:
             radiance = seen_sky(maps, light, ground, scene, d)
-            if shows_ground and solid_count > 0:
+            if shows_ground and solids.count[scene] > 0:
                 # The panorama's own ground, in the shadow of what was put there.
                 n = wp.vec3(0.0, 1.0, 0.0)
-                lit = irradiance_among_solids(
-                    light, solids, scene, solid_count, k, points, lifted, n, 1.0
-                )
+                lit = irradiance_among_solids(light, solids, scene, first, SUBSETS, lifted, n, 1.0)
                 all_of_it = irradiance_among_solids(
-                    light, solids, scene, solid_count, k, points, lifted, n, 0.0
+                    light, solids, scene, first, SUBSETS, lifted, n, 0.0
                 )
                 radiance = wp.cw_mul(
                     radiance, wp.cw_div(lit, all_of_it + wp.vec3(1.0e-9, 1.0e-9, 1.0e-9))
@@ -634,15 +653,15 @@ def render_scenes(
                     roughness = objects.roughness[scene]
                     # Diffuse.
                     e = wp.vec3(0.0, 0.0, 0.0)
-                    for j in range(k, object_light.direction.shape[1], points):
+                    for j in range(first, object_light.direction.shape[1], SUBSETS):
                         w = object_light.direction[scene, j]
                         cosine = wp.dot(n, w)
                         if cosine > 0.0:
                             if misses_object(objects, scene, start, turned(w, -turn)) > 0.0:
-                                e = e + object_light.flux[scene, j] * (cosine * float(points))
-                    sun_count = float(object_light.sun_direction.shape[1]) / float(points)
+                                e = e + object_light.flux[scene, j] * (cosine * float(SUBSETS))
+                    sun_count = float(object_light.sun_direction.shape[1]) / float(SUBSETS)
                     sun_seen = float(0.0)
-                    for j in range(k, object_light.sun_direction.shape[1], points):
+                    for j in range(first, object_light.sun_direction.shape[1], SUBSETS):
                         w = object_light.sun_direction[scene, j]
                         cosine = wp.dot(n, w)
                         if cosine > 0.0:
@@ -675,14 +694,14 @@ def render_scenes(
                 lit = wp.vec3(1.0e-9, 1.0e-9, 1.0e-9)
                 total = wp.vec3(1.0e-9, 1.0e-9, 1.0e-9)
                 start = turned(lifted - place, -turn) / scale
-                for j in range(k, object_light.direction.shape[1], points):
+                for j in range(first, object_light.direction.shape[1], SUBSETS):
                     w = object_light.direction[scene, j]
                     if w[1] > 0.0:
-                        part = object_light.flux[scene, j] * (w[1] * float(points))
+                        part = object_light.flux[scene, j] * (w[1] * float(SUBSETS))
                         total = total + part
                         lit = lit + part * misses_object(objects, scene, start, turned(w, -turn))
-                sun_count = float(object_light.sun_direction.shape[1]) / float(points)
-                for j in range(k, object_light.sun_direction.shape[1], points):
+                sun_count = float(object_light.sun_direction.shape[1]) / float(SUBSETS)
+                for j in range(first, object_light.sun_direction.shape[1], SUBSETS):
                     w = object_light.sun_direction[scene, j]
                     if w[1] > 0.0:
                         part = object_light.sun[scene] * (w[1] / sun_count)
@@ -706,7 +725,6 @@ def render_scenes(
 
 @wp.kernel
 def sun_reaches(
-    solid_count: int,
     solids: OccluderTable,
     point: wp.array[wp.vec3],
     axis: wp.array[wp.vec3],
@@ -714,4 +732,4 @@ def sun_reaches(
 ):
     """Tell by scene whether no solid stands between a point and the sun: 1, else 0."""
     scene = wp.tid()
-    reached[scene] = is_open(solids, scene, solid_count, point[scene], axis[scene])
+    reached[scene] = is_open(solids, scene, point[scene], axis[scene])

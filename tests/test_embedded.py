@@ -89,7 +89,7 @@ def both(tiny: EmbeddedPrior, tmp_path_factory: pytest.TempPathFactory) -> dict[
 def scene(count: int = 1, seed: int = 0) -> tuple[Tensor, Tensor, Tensor]:
     """Return random pictures, backgrounds and G-buffers with a square object."""
     g = torch.Generator().manual_seed(seed)
-    image, background = (torch.rand(count, 3, 64, 64, generator=g) for _ in range(2))
+    image, background = (torch.rand(count, n, 64, 64, generator=g) for n in (3, 6))
     mask = torch.zeros(count, 1, 64, 64)
     mask[:, :, 20:44, 16:40] = 1.0
     rest = torch.rand(count, 6, 64, 64, generator=g)
@@ -235,17 +235,20 @@ def test_only_what_is_shown_reaches_the_network() -> None:
     """Each condition alone has its channels and its flag; a shown mask blanks the background."""
     image, background, gbuffer = scene()
     gbuffer[:, 1:] += 0.1
-    channels = {"background": (12, 24), "mask": (24, 28), "albedo": (28, 40), "normals": (40, 52)}
+    channels = {"background": (12, 36), "mask": (36, 40), "albedo": (40, 52), "normals": (52, 64)}
     for place, name in enumerate(CONDITIONS):
         present = torch.zeros(1, len(CONDITIONS))
         present[0, place] = 1.0
         packed = pack(image, background, gbuffer, present)[0]
         for other, (low, high) in channels.items():
             assert bool(packed[low:high].any()) is (other == name)
-        assert packed[52:].mean(dim=(1, 2)).tolist() == present[0].tolist()
+        assert packed[64:].mean(dim=(1, 2)).tolist() == present[0].tolist()
     both = pack(image, background, gbuffer, torch.tensor([[1.0, 1.0, 0.0, 0.0]]))
-    shown = nn.functional.pixel_shuffle(both[:, 12:24], 2)
-    assert torch.equal(shown, (2.0 * background - 1.0) * (1.0 - gbuffer[:, :1]))
+    shown = nn.functional.pixel_shuffle(both[:, 12:36], 2)
+    told = 2.0 * background - 1.0
+    assert torch.equal(shown[:, :3], told[:, :3] * (1.0 - gbuffer[:, :1]))
+    # The whole photo is told as it is: the mask is the crop's.
+    assert torch.equal(shown[:, 3:], told[:, 3:])
 
 
 def test_schedule_is_a_cosine() -> None:

@@ -15,7 +15,7 @@ from torch import Tensor
 
 from tests.statistics import central_differences, compare_gradients
 from tests.tiny_stable_diffusion import make_tiny_stable_diffusion
-from warpir.diffusion.crop import Crop
+from warpir.diffusion.crop import Crop, shrink
 from warpir.diffusion.draws import seed_of
 from warpir.diffusion.guidance import (
     BAD_STEPS_MAX,
@@ -417,7 +417,9 @@ def test_condition_is_cropped_as_the_picture(rng: np.random.Generator) -> None:
     made.gradient(x, 0)
     (call,) = prior.calls
     assert call.background is not None and call.gbuffer is not None
-    assert torch.equal(call.background, encoded[0].repeat(2, 1, 1, 1))
+    assert torch.equal(call.background[:, :3], encoded[0].repeat(2, 1, 1, 1))
+    # Beside each crop the whole photo.
+    assert torch.equal(call.background[:, 3:], shrink(x, 6).expand(4, -1, -1, -1))
     assert not torch.equal(encoded[0][0], encoded[0][1])
     assert call.gbuffer.shape == (4, 7, 6, 6)
     assert torch.equal(call.gbuffer[:2], call.gbuffer[2:])

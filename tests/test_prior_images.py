@@ -19,6 +19,7 @@ from warpir.prior_images import (
     SceneGenerator,
     Stock,
     about_y,
+    packed_solids,
     to_map,
     to_world,
 )
@@ -66,7 +67,7 @@ CROPS = {"made_up": 0.0, "hybrid": 0.0, "proxies": 0.0}
 def test_batches_hold_what_they_promise(device: str) -> None:
     scenes = generator(device, even(device, 3.0))
     batch = scenes.prior_batch(1, 24)
-    assert batch.image.shape == batch.background.shape == (24, 3, 64, 64)
+    assert batch.image.shape == (24, 3, 64, 64) and batch.background.shape == (24, 6, 64, 64)
     for picture in (batch.image, batch.background, batch.gbuffer[:, :4]):
         assert torch.isfinite(picture).all()
         assert 0.0 <= float(picture.min()) and float(picture.max()) <= 1.0
@@ -194,12 +195,16 @@ def test_solids_block_the_sun(device: str) -> None:
         "kind": torch.full((count, SOLIDS), -1, dtype=torch.int32, device=device),
         "centre": torch.zeros(count, SOLIDS, 3, device=device),
         "half": torch.ones(count, SOLIDS, 3, device=device),
-        "yaw": torch.full((count, SOLIDS), 0.7, device=device),
+        "turn": torch.tensor([np.cos(0.7), np.sin(0.7)], dtype=torch.float32, device=device).expand(
+            count, SOLIDS, 2
+        ),
         "albedo": torch.ones(count, SOLIDS, 3, device=device),
         "texture": torch.full((count, SOLIDS), -1, dtype=torch.int32, device=device),
     }
     solids["kind"][:, 3] = torch.tensor([kernel.BOX, kernel.ELLIPSOID, kernel.CYLINDER])
     solids["centre"][:, 3, 1] = 5.0
+    solids = packed_solids(solids)
+    assert solids["count"].tolist() == [1] * count
     scenes = generator(device, even(device))
     up = torch.tensor([[0.0, 1.0, 0.0]] * count, device=device)
     slant = torch.nn.functional.normalize(torch.tensor([[1.0, 0.6, 0.0]] * count), dim=1).to(device)

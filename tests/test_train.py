@@ -74,6 +74,7 @@ def draw(count: int, generator: torch.Generator) -> Toy:
     background = colour.expand(-1, -1, 64, 64).contiguous()
     lit = torch.where(kind[:, None, None, None] > 0, other, colour)
     image = background * (1.0 - mask) + 0.5 * lit * mask
+    background = torch.cat([background, background], dim=1)
     gbuffer = torch.cat(
         [mask, 0.5 * mask.expand(-1, 3, -1, -1), torch.zeros(count, 2, 64, 64), mask], 1
     )
@@ -88,10 +89,10 @@ def fixed(count: int = 8, seed: int = 9) -> Toy:
 def pair() -> tuple[Toy, Toy]:
     """Return the same scenes lit consistently and wrongly."""
     wrong = fixed(6, 1)
-    wrong.image = wrong.background + 0.2 * wrong.gbuffer[:, 1:4]
+    wrong.image = wrong.background[:, :3] + 0.2 * wrong.gbuffer[:, 1:4]
     wrong.kind = torch.ones_like(wrong.kind)
     right = copy.copy(wrong)
-    right.image = wrong.background - 0.2 * wrong.gbuffer[:, :1]
+    right.image = wrong.background[:, :3] - 0.2 * wrong.gbuffer[:, :1]
     right.kind = torch.zeros_like(wrong.kind)
     return right, wrong
 
@@ -145,7 +146,7 @@ def test_loss_is_its_printed_formula() -> None:
             batch.image, batch.background, batch.gbuffer, present, ids, timesteps, noise,
             alpha, sigma,
         )  # fmt: skip
-        z, z_background = 2.0 * batch.image - 1.0, 2.0 * batch.background - 1.0
+        z, z_background = 2.0 * batch.image - 1.0, 2.0 * batch.background[:, :3] - 1.0
         mask = batch.gbuffer[:, :1]
         weight = 1.0 + 5.0 * mask
         difference = (z - z_background).abs().mean(dim=1, keepdim=True)
@@ -167,7 +168,7 @@ def test_loss_is_its_printed_formula() -> None:
 
 def test_weights_are_one_on_average() -> None:
     batch = fixed()
-    weight = pixel_weight(batch.image, batch.background, batch.gbuffer[:, :1], SETTINGS)
+    weight = pixel_weight(batch.image, batch.background[:, :3], batch.gbuffer[:, :1], SETTINGS)
     assert float(weight.mean()) == pytest.approx(1.0, rel=1e-5)
     inside, outside = weight[:, :, 30, 30], weight[:, :, 5, 5]
     torch.testing.assert_close(inside, 9.0 * outside)

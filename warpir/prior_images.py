@@ -28,8 +28,8 @@ SIDE = 64
 """Side of a crop [px]."""
 PHOTO_SIZE = (96, 144)
 """Height and width of a whole photo [px]."""
-METER_SIZE = (24, 36)
-"""Height and width at which a photo is rendered to expose it [px]."""
+WHOLE_SIZE = (SIDE, SIDE)
+"""Height and width of the whole photo beside a crop, whatever its shape [px]."""
 SOLIDS = 14
 """Of a scene: two walls or houses, six small ones, two trees of two, and two far away."""
 DIRECTIONS, SUN_DIRECTIONS = 96, 16
@@ -104,6 +104,18 @@ def to_map(lighting: Lighting, directions: Tensor) -> Tensor:
     flip = torch.ones_like(directions)
     flip[..., 0] = lighting.mirror[:, None]
     return about_y(directions * flip, lighting.yaw)
+
+
+def packed_solids(solids: dict[str, Tensor]) -> dict[str, Tensor]:
+    """Return a table of solids with those that are there in front, and their count."""
+    order = torch.argsort((solids["kind"] < 0).int(), dim=1, stable=True)
+
+    def moved(part: Tensor) -> Tensor:
+        places = order.view(*order.shape, *[1] * (part.ndim - 2))
+        return part.gather(1, places.expand(-1, -1, *part.shape[2:])).contiguous()
+
+    count = (solids["kind"] >= 0).sum(dim=1).int()
+    return {name: moved(part) for name, part in solids.items()} | {"count": count}
 
 
 class Stock:
@@ -191,6 +203,8 @@ class Shot:
     """Display values of a faultless camera."""
     photo: Tensor
     """With noise, blur and the rest."""
+    whole: Tensor
+    """The whole photo of which this is a crop, likewise."""
 
 
 class SceneGenerator:
@@ -267,11 +281,14 @@ class SceneGenerator:
 
     def _shoot(self, scenes: Scenes, generator: torch.Generator) -> Shot:
         """Take the photos: exposed as a whole, seen through the crop's window."""
-        metered = self._render(scenes, scenes.photo_window, METER_SIZE, 1, with_object=False)
-        look = draw_looks(metered.background, generator)
+        whole = self._render(scenes, scenes.photo_window, WHOLE_SIZE, 1, with_object=False)
+        look = draw_looks(whole.background, generator)
         made = self._render(scenes, scenes.crop_window, (SIDE, SIDE), 2, with_object=False)
         plain = look.show(made.background)
-        return Shot(look, made.background, plain, draw_faults(plain, generator))
+        photo, whole_photo = draw_faults(
+            torch.stack([plain, look.show(whole.background)]).flatten(0, 1), generator
+        ).unflatten(0, (2, -1))
+        return Shot(look, made.background, plain, photo, whole_photo)
 
     def _inserted(self, scenes: Scenes, shot: Shot) -> PriorBatch:
         """Insert the objects into the photos."""
@@ -287,7 +304,8 @@ class SceneGenerator:
         is_covered = (covered > 0.0).float()
         gbuffer = torch.cat([covered, albedo * is_covered, normal * is_covered], dim=1)
         words = scenes.noun, scenes.setting, scenes.weather, scenes.kind
-        return PriorBatch(image.clamp(0.0, 1.0), shot.photo, gbuffer, *words)
+        background = torch.cat([shot.photo, shot.whole], dim=1)
+        return PriorBatch(image.clamp(0.0, 1.0), background, gbuffer, *words)
 
     def photo_batch(self, index: int, count: int) -> PhotoBatch:
         """Return whole photos and their light; arguments are those of `prior_batch`."""
@@ -719,16 +737,18 @@ class SceneGenerator:
         tint = 1.0 - 0.6 * rand(SOLIDS, 3) * rand(SOLIDS, 1)
         panoramas = self.stock.panoramas.panorama_count
         is_textured = (rand(SOLIDS) < 0.4) & (panoramas > 0)
-        return {
+        yaw = torch.cat([large_yaw, 2.0 * np.pi * rand(SOLIDS - 2)], dim=1)
+        solids = {
             "kind": kind.int(),
             "centre": torch.cat([large_centre, centre, more_centre], dim=1),
             "half": torch.cat([large_half, half, more_half], dim=1).clamp(min=1e-4),
-            "yaw": torch.cat([large_yaw, 2.0 * np.pi * rand(SOLIDS - 2)], dim=1),
+            "turn": torch.stack([yaw.cos(), yaw.sin()], dim=-1),
             "albedo": (0.08 + 0.7 * rand(SOLIDS, 1)) * tint,
             "texture": torch.where(
                 is_textured, (rand(SOLIDS) * max(panoramas, 1)).long(), -1
             ).int(),
         }
+        return packed_solids(solids)
 
     def _sun_reaches(self, solids: dict[str, Tensor], point: Tensor, axis: Tensor) -> Tensor:
         """Return 1 where no solid stands between the points and the sun, else 0, shape [B]."""
@@ -736,7 +756,7 @@ class SceneGenerator:
         wp.launch(
             kernel.sun_reaches,
             dim=len(point),
-            inputs=[SOLIDS, _struct(kernel.OccluderTable, solids), _vectors(point), _vectors(axis)],
+            inputs=[_struct(kernel.OccluderTable, solids), _vectors(point), _vectors(axis)],
             outputs=[wp.from_torch(reached)],
             device=self.stock.device,
         )
@@ -776,7 +796,7 @@ class SceneGenerator:
             kernel.render_scenes,
             dim=pixels,
             inputs=[
-                width, height, side, SOLIDS, wp.from_torch(tables["blur_min"]),
+                width, height, side, wp.from_torch(tables["blur_min"]),
                 _struct(kernel.ViewTable, tables["views"] | {"window": window.contiguous()}),
                 *lights,
                 _struct(kernel.MapTable, maps),

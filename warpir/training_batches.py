@@ -17,7 +17,8 @@ class PriorBatch:
     image: Tensor
     """Composites, shape [B, 3, 64, 64]."""
     background: Tensor
-    """The same photos without the object, shape [B, 3, 64, 64]."""
+    """The same crops without the object, and with each the whole photo that it is cut from,
+    squeezed into the same square, shape [B, 6, 64, 64]."""
     gbuffer: Tensor
     """Mask in [0, 1], albedo display-encoded in [0, 1], camera-space unit normals (x right, y up, z
     toward the camera), all 0 beside the object, shape [B, 7, 64, 64]."""
