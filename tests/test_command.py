@@ -125,6 +125,8 @@ def test_command_help_tells_what_each_prior_gets(capsys: pytest.CaptureFixture[s
     text = " ".join(capsys.readouterr().out.split())
     assert "(default: embedded sds-good-bad; Stable Diffusion lds)" in text
     assert "(default: embedded 4, on the CPU 2; Stable Diffusion 1)" in text
+    assert "(default: embedded 0; Stable Diffusion 600)" in text
+    assert text.count("it failed its release gate") == 2
     for name in set(PRIOR_DEFAULTS["embedded"]) | set(PRIOR_DEFAULTS["stable-diffusion"]):
         assert DEFAULTS[name] is None
         for values in (*PRIOR_DEFAULTS.values(), *CPU_DEFAULTS.values()):
@@ -138,12 +140,12 @@ def test_open_values_are_the_priors() -> None:
     assert painter.guidance_settings() == plain and painter.step_count == 600
     assert painter.personalize and not painter.accept and painter.preview_every == 0
     for on_cuda, noises, width in ((True, 4, 384), (False, 2, 256)):
-        config = InsertConfig(weight="uniform").settled(on_cuda)
+        config = InsertConfig(weight="uniform", steps=9).settled(on_cuda)
         assert (config.noises, config.picture_width) == (noises, width)
         assert (config.loss, config.weight) == ("sds-good-bad", "uniform")
         assert config.accept and config.personalize is False and config.tone_operator == "linear"
         assert config.settled(not on_cuda) == config
-    assert InsertConfig(loss="dataset-update").settled().accept is False
+    assert InsertConfig(loss="dataset-update", steps=9).settled().accept is False
     adapted = InsertConfig(lora="l.safetensors").settled()
     assert adapted.personalize is True
     refined = InsertConfig(refine="tone", reuse="r", model="m", prompt="p").settled()
@@ -168,6 +170,26 @@ def test_open_values_are_the_priors() -> None:
 def test_who_guides(values: dict[str, Any], guide: str) -> None:
     """The embedded prior, unless a model or a light is given; what is said counts first."""
     assert InsertConfig(**values).guided_by == guide
+
+
+@pytest.mark.parametrize(
+    ("values", "is_guided"),
+    [
+        ({}, False),
+        ({"steps": 0}, False),
+        ({"steps": 200}, True),
+        ({"sun": (1.0, 2.0), "guidance": "embedded"}, False),
+        ({"model": "m"}, True),
+        ({"model": "m", "steps": 0}, True),
+        ({"guidance": "none", "steps": 200}, False),
+    ],
+)
+def test_embedded_prior_is_asked_with_steps_alone(values: dict[str, Any], is_guided: bool) -> None:
+    """It failed its release gate: it speaks when somebody says for how long, and never else."""
+    config = InsertConfig(**values)
+    assert config.is_guided is is_guided
+    if config.guided_by == "embedded":
+        assert (config.settled().steps > 0) is is_guided
 
 
 def forms_of_flags() -> list[tuple[str, str]]:
@@ -227,9 +249,9 @@ def problems_of(**values: Any) -> list[InputError]:
         (["--width", "8"], "width", 8),
         (["--no-personalize"], "personalize", False),
         (["--personalize"], "personalize", True),
-        (["--no-accept"], "accept", False),
-        (["--accept"], "accept", True),
-        (["--prior", "own.safetensors"], "prior", "own.safetensors"),
+        (["--steps", "9", "--no-accept"], "accept", False),
+        (["--steps", "9", "--accept"], "accept", True),
+        (["--steps", "9", "--prior", "own.safetensors"], "prior", "own.safetensors"),
         (["--no-tone-curve"], "tone_curve", False),
         (["--allow-download"], "allow_download", True),
         (["--lora-layers", "to_q, to_k"], "lora_layers", ("to_q", "to_k")),
@@ -310,9 +332,17 @@ def test_command_reads_values(argv: list[str], name: str, value: object) -> None
         ([*PAINTER, "--crop-min", "4"], "--crop-min", "at most --crop-max"),
         (["--crop-min", "5"], "--crop-min", "at most --crop-max (found 5 and 4)"),
         (["--loss", "lds"], "--loss", "lds compares the adapted model"),
-        (["--accept", "--loss", "dataset-update"], "--accept", "--loss dataset-update"),
+        (
+            ["--steps", "9", "--accept", "--loss", "dataset-update"],
+            "--accept",
+            "--loss dataset-update",
+        ),
         (["--guidance", "none", "--no-accept"], "--accept", "needs --guidance"),
         (["--guidance", "none", "--prior", "p"], "--prior", "needs --guidance embedded"),
+        (["--prior", "p"], "--prior", "and --steps 200: the prior is not asked without"),
+        (["--accept"], "--accept", "--steps 200 for the embedded one"),
+        (["--resume", "--steps", "0"], "--resume", "--steps 200 for the embedded one"),
+        (["--steps", "9", "--exposure", "1"], "--exposure", "is recovered"),
         ([*PAINTER, "--lora", "l", "--no-personalize"], "--no-personalize", "--lora"),
         (["--start", "sunny"], "--start", "regressed or uniform"),
         (["--trust", "-1"], "--trust", "at least 0"),

@@ -22,13 +22,14 @@ from warpir.config import InsertConfig
 from warpir.demo import demo_config
 from warpir.diffusion import embedded
 from warpir.errors import ExitCode
-from warpir.files import OutputFolder
+from warpir.files import OutputFolder, read_photo
 from warpir.inputs import read_inputs
 from warpir.insert import main
 from warpir.progress import StepProgress
 from warpir.record import Timings
 from warpir.regressor import random_regressor, save_regressor
 from warpir.sg_light import narrowest
+from warpir.trust import SPREAD_MAX
 
 CHEAP = {
     "guidance_width": "32",
@@ -43,7 +44,8 @@ CHEAP = {
 }
 NETWORK = embedded.NetworkConfig(widths=(16, 32), layers=1, head_width=16, groups=8)
 ABOUT = (
-    "prior: embedded, trained on rendered scenes; for photographs Stable Diffusion is recommended"
+    "prior: embedded, trained on rendered scenes, experimental: it failed its release gate; for "
+    "photographs Stable Diffusion is recommended"
 )
 
 
@@ -87,19 +89,63 @@ def judged_as(monkeypatch: pytest.MonkeyPatch, is_accepted: bool) -> None:
     monkeypatch.setattr(recover, "judge", lambda *_: verdict)
 
 
-def test_default_run_says_who_spoke(
+def test_default_run_is_the_regressed_light(
     folder: Path,
     tmp_path: Path,
     capsys: pytest.CaptureFixture[str],
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    """Neither light nor model: the embedded prior guides, and report and output say all of it."""
+    """The prior is not asked, nor need it be there; the picture is that of --guidance none."""
+    monkeypatch.setattr(embedded, "WEIGHTS", tmp_path / "absent.safetensors")
+    few = dict.fromkeys(("prior", "steps", "preview_every", "checkpoint_every"))
+    out, alone = tmp_path / "out", tmp_path / "alone"
+    flags = argv(folder, out, **few)
+    assert main([*flags, "--validate"]) == ExitCode.DONE
+    assert main(flags) == ExitCode.DONE
+    said = capsys.readouterr().out
+    measured = record(out)["measured"]
+    spread = measured["regression"]["spread_deg"]
+    assert f"light regressed from the photo, +- {spread:.0f} degrees" in said
+    not_asked = "the embedded prior was not asked (--steps 200: experimental, it failed its release"
+    assert not_asked in said and not_asked in measured["prior_about"]
+    assert measured["prior"] == "none" and "acceptance" not in measured
+    assert [p.name for p in (out / "progress").iterdir()] == ["preview-000000.png"]
+    assert main(argv(folder, alone, guidance="none", **few)) == ExitCode.DONE
+    assert not (alone / "progress").exists()
+    assert "prior_about" not in record(alone)["measured"]
+    for name in ("lobes.json", "curves.json", "envmap.exr", "composite.png"):
+        assert digest(out)[name] == digest(alone)[name]
+
+
+def test_preview_is_the_result_in_small(folder: Path, tmp_path: Path) -> None:
+    """A grainy picture of the photo's size under the same light, written before the result."""
+    out = tmp_path / "out"
+    few = {"prior": None, "steps": None, "samples": "64", "preview_every": None}
+    assert main(argv(folder, out, **few)) == ExitCode.DONE
+    shown, result = (
+        read_photo(path).srgb
+        for path in (out / "progress" / "preview-000000.png", out / "composite.png")
+    )
+    before = read_photo(folder / "photo.png").srgb
+    assert shown.shape == result.shape
+    off, change = (np.abs(x - result).mean() for x in (shown, before))
+    assert 0.0 < off < 0.5 * change
+
+
+def test_guided_run_says_who_spoke(
+    folder: Path,
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """With --steps the embedded prior guides, and report and output say all of it."""
     judged_as(monkeypatch, True)
     out = tmp_path / "out"
     assert main(argv(folder, out)) == ExitCode.DONE
     said = capsys.readouterr().out
     assert ABOUT in said and "summary: prior embedded (sha256" in said
-    assert "its end accepted; light regressed from the photo; transport and mis on cpu" in said
+    assert "its end accepted; light regressed from the photo, +- " in said
+    assert "degrees; transport and mis on cpu" in said
     assert "accepted: guidance, asked anew, prefers the end (dU = -3 +- 1)" in said
     names = {"lobes.json", "lobes_shadow.json", "optimization.json", "progress", "run.json"}
     assert {p.name for p in out.iterdir()} == {*ALWAYS, *names}
@@ -247,7 +293,7 @@ def config_of(folder: Path, **changes: Any) -> InsertConfig:
         photo=str(folder / "photo.png"), asset=str(folder / "box.glb"), out="o", fov=60.0,
         pitch=-15.0, camera_height=1.5, place=(0.0, 0.0, -5.0), guidance_width=48,
         light_height=16, object_light_height=8, regressor=str(folder / "regressor.safetensors"),
-        prior=str(folder / "prior.safetensors"), **changes,
+        prior=str(folder / "prior.safetensors"), steps=4, **changes,
     )  # fmt: skip
 
 
@@ -295,14 +341,15 @@ def test_start_is_the_regressed_light(folder: Path, tmp_path: Path) -> None:
             np.testing.assert_allclose(lobes.flux(), expected, rtol=2e-3)
         region = recover.region_of(run, unknowns)
         assert region is not None
-        assert region.spread == pytest.approx(math.radians(found.spread_deg))
+        believed = min(math.radians(found.spread_deg), SPREAD_MAX)
+        assert region.spread == pytest.approx(believed)
         # Only an operator that darkens is made up for.
         assert (estimate.gain == 1.0) == (tone == "linear") and estimate.gain >= 1.0
 
 
 @pytest.mark.slow
 def test_demo_does_the_real_job(folder: Path, tmp_path: Path) -> None:
-    """--demo without a light recovers it; its own light is not looked at."""
+    """--demo with --steps recovers its light; its own is not looked at."""
     out = tmp_path / "demo"
     flags = ["--demo", "--out", str(out), "--width", "64", "--steps", "2", "--samples", "1"]
     flags += ["--light-height", "16", "--object-light-height", "8", "--guidance-width", "64"]

@@ -56,7 +56,8 @@ PRIOR_DEFAULTS: dict[str, dict[str, Any]] = {
         "noises": 4,
         "crop_min": 1.3,
         "crop_max": 4.0,
-        "steps": 200,
+        # The prior failed its release gate: it is asked by those who name --steps alone.
+        "steps": 0,
         "guidance_width": 384,
         "light_height": 64,
         "object_light_height": 32,
@@ -68,6 +69,8 @@ PRIOR_DEFAULTS: dict[str, dict[str, Any]] = {
     },
 }
 """What a field that is None stands for, by the prior that guides."""
+EMBEDDED_STEPS = 200
+"""Steps with which the embedded prior was tried; it is not asked unless --steps says so."""
 CPU_DEFAULTS: dict[str, dict[str, Any]] = {
     "stable-diffusion": {},
     "embedded": {
@@ -174,13 +177,16 @@ class InsertConfig(ModelSettings, PersonalizeSettings, GuidanceChoices, Optimize
     """Note in the picture's metadata that it is a composite"""
 
     guidance: str | None = None
-    """What recovers the light from the photo: embedded, the small prior that comes with warpir;
-    stable-diffusion; or none, and the light is used as given, or else as a regressor sees it in the
-    photo (default: stable-diffusion with --model, none where a light is given, else embedded)"""
+    """What recovers the light from the photo: embedded, what comes with warpir: the light that a
+    regressor sees in the photo, which with --steps 200 a small prior refines (experimental: it
+    failed its release gate); stable-diffusion; or none, and the light is used as given, or else as
+    the regressor sees it (default: stable-diffusion with --model, none where a light is given, else
+    embedded)"""
     prompt: str | None = None
     """What the object is, in a few words, such as 'a black SUV car' (stable-diffusion needs it)"""
     prior: str | None = None
-    """Weights for --guidance embedded (default: those that come with warpir)"""
+    """Weights of the prior of --guidance embedded, which --steps asks (default: those in the
+    package)"""
     regressor: str | None = None
     """Weights of the regressor (default: those that come with warpir)"""
     start: str | None = None
@@ -225,6 +231,13 @@ class InsertConfig(ModelSettings, PersonalizeSettings, GuidanceChoices, Optimize
             return "stable-diffusion"
         is_lit = any(getattr(self, name) is not None for name in LIGHTS)
         return "none" if is_lit else "embedded"
+
+    @property
+    def is_guided(self) -> bool:
+        """Whether a prior is asked: the embedded one is where `steps` says how often."""
+        return self.guided_by == "stable-diffusion" or (
+            self.guided_by == "embedded" and bool(self.steps)
+        )
 
     @property
     def tone_operator(self) -> str:
@@ -276,6 +289,8 @@ def _open_values(config: InsertConfig, on_cuda: bool = True) -> dict[str, Any]:
         chosen |= {"personalize": True}
     if config.loss == "dataset-update":
         chosen |= {"accept": False}
+    if not config.is_guided:
+        del chosen["accept"]  # there is no end that could be judged
     # The tone belongs to the light: `InsertConfig.tone_operator`.
     return {k: v for k, v in chosen.items() if k != "tone" and getattr(config, k) is None}
 
@@ -526,13 +541,16 @@ def _values_that_clash(config: InsertConfig) -> Iterator[InputError]:
         yield usage("--no-personalize", "cannot be used with --show-prior, which shows its effect")
     if given("lora") and config.personalize is False:
         yield usage("--no-personalize", "cannot be used with --lora", "leave one of them out")
-    yield from needs("resume", guided, "--guidance: nothing else has checkpoints")
-    yield from needs("prior", config.guided_by == "embedded", "--guidance embedded")
-    yield from needs("accept", guided, "--guidance, whose result it judges")
+    asks = f"--guidance with a prior (--model, or --steps {EMBEDDED_STEPS} for the embedded one)"
+    yield from needs("resume", config.is_guided, f"{asks}: nothing else has checkpoints")
+    asks_embedded = config.is_guided and not with_words
+    steps = f"--guidance embedded and --steps {EMBEDDED_STEPS}: the prior is not asked without"
+    yield from needs("prior", asks_embedded, steps)
+    yield from needs("accept", config.is_guided, f"{asks}, whose result it judges")
     is_demo_lit = given("demo") and (not guided or given("refine"))
     lit = any(map(given, LIGHTS)) or is_demo_lit
     level = "--light, --sun or --sky: with --guidance alone the light's level is recovered"
-    yield from needs("exposure", lit or not guided, level)
+    yield from needs("exposure", lit or not config.is_guided, level)
     yield from needs("refine", lit, "a known light: --reuse, --light, --sun or --sky")
     who_judges = "--guidance stable-diffusion, which judges the change: no other knows colours"
     yield from needs("refine", with_words, who_judges)

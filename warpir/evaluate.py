@@ -19,7 +19,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 import warpir
-from warpir.config import InsertConfig, usage
+from warpir.config import EMBEDDED_STEPS, InsertConfig, usage
 from warpir.errors import ExitCode, InputError
 from warpir.program import run_program, say
 
@@ -341,7 +341,8 @@ def _make_bench(
         prior=options.prior,
         regressor=None if options.regressor is None else str(options.regressor),
         prompt=options.prompt,
-        steps=options.steps,
+        # Rows that guide ask the embedded prior, which a plain run does not.
+        steps=options.steps or (EMBEDDED_STEPS if options.model is None else None),
         threads=options.threads or None,
     )
     return Bench(scenes, device, options.seed, config, network, missing, predictions)

@@ -813,6 +813,30 @@ class OutputFolder:
         """
         self.write_bytes(name, png_bytes(codes, icc, mark, description))
 
+    def write_preview(self, step: int, codes: Pixels, icc: bytes | None = None) -> Path:
+        """Write a picture of the way to the result, at once and outside of what is staged.
+
+        Args:
+            step: Of the optimisation; 0 is its start.
+            codes: As of `write_png`.
+            icc: Profile the codes are in.
+
+        Returns:
+            The file, in ``progress/``; never seen half written.
+
+        Raises:
+            InputError: The disk is full or the folder is not writable (exit 5).
+        """
+        path = self.path / "progress" / f"preview-{step:06d}.png"
+        staged = self._staging / path.name
+        try:
+            path.parent.mkdir(exist_ok=True)
+            staged.write_bytes(png_bytes(codes, icc, False, ""))
+            os.replace(staged, path)
+        except OSError as error:
+            raise self._disk_error(f"progress/{path.name}", error) from error
+        return path
+
     def write_exr(
         self, name: str, channels: Mapping[str, Pixels], header: Mapping[str, Any] | None = None
     ) -> None:

@@ -21,7 +21,7 @@ from types import ModuleType
 from typing import TYPE_CHECKING, Any
 
 from warpir.command import parse
-from warpir.config import InsertConfig
+from warpir.config import EMBEDDED_STEPS, InsertConfig
 from warpir.errors import ExitCode, InputError
 from warpir.program import run_program, say
 
@@ -34,6 +34,13 @@ if TYPE_CHECKING:
     from warpir.record import Timings
 
 __all__ = ["InsertConfig", "Insertion", "insert", "main"]
+
+NOT_ASKED = (
+    f"the embedded prior was not asked (--steps {EMBEDDED_STEPS}: experimental, it failed its "
+    "release gate)"
+)
+PREVIEW_SAMPLES = 4
+"""Camera samples per pixel of the preview of a run that nothing guides."""
 
 
 @dataclass(frozen=True)
@@ -132,11 +139,16 @@ def _insert_one(config: InsertConfig, loaders: "Loaders | None" = None) -> Inser
             say(f"device: {device} (the first run compiles the kernels)")
         recovered: dict[str, Any] = {}
         notices = inputs.notices
-        if config.guided_by != "none":
+        if config.is_guided:
             inputs, light, recovered, found = _guide(config, inputs, light, device, output, timings)
             notices = (*notices, *found)
-        elif light is None:
-            light, recovered = _regress(config, inputs, device, timings)
+        else:
+            if light is None:
+                light, recovered = _regress(config, inputs, device, timings)
+            if config.guided_by == "embedded":
+                recovered["prior_about"] = NOT_ASKED
+            with timings.stage("preview"):
+                _write_preview(output, config, inputs, light, device)
         with timings.stage("scene"):
             scene = scene_of(inputs, _rendering_camera(inputs.camera, config), device)
         with timings.stage("render"), progress_bar() as report:
@@ -169,7 +181,7 @@ def _insert_one(config: InsertConfig, loaders: "Loaders | None" = None) -> Inser
         )
         output.write_json("run.json", record)
     _say_who_spoke(record)
-    if config.guided_by != "none":
+    if config.is_guided:
         # The results are in place: what was kept for a run that stops is not needed any more.
         checkpoints.remove()
     record = read_json_object(output.path / "run.json")
@@ -196,11 +208,46 @@ def _say_who_spoke(record: dict[str, Any]) -> None:
     prior = measured["prior"] + (f" (sha256 {digest[:16]}...)" if digest else "")
     accepted = measured.get("acceptance", {}).get("is_accepted")
     words = {True: ", its end accepted", False: ", its start kept", None: ""}[accepted]
-    regressed = "; light regressed from the photo" if "regression" in measured else ""
+    parts = [f"prior {prior}{words}"]
+    if "regression" in measured:
+        spread = measured["regression"]["spread_deg"]
+        parts.append(f"light regressed from the photo, +- {spread:.0f} degrees")
+    if measured.get("prior_about") == NOT_ASKED:
+        parts.append(NOT_ASKED)
     integrators = " and ".join(
         dict.fromkeys(x for x in (measured.get("loop_integrator"), measured["integrator"]) if x)
     )
-    say(f"summary: prior {prior}{words}{regressed}; {integrators} on {record['device']}")
+    say(f"summary: {'; '.join(parts)}; {integrators} on {record['device']}")
+
+
+def _write_preview(
+    output: "OutputFolder",
+    config: InsertConfig,
+    inputs: "Inputs",
+    light: "SceneLight",
+    device: str,
+) -> None:
+    """Write the composite as it will be, small and grainy, where previews are asked for."""
+    from warpir.picture import Quality, make_picture, scene_of
+    from warpir.render import Renderer
+
+    settings = config.settled(on_cuda=device != "cpu")
+    if not settings.preview_every:
+        return
+    width = min(settings.picture_width, _rendering_camera(inputs.camera, config).width)
+    camera = _rendering_camera(inputs.camera, replace(config, width=width))
+    picture = make_picture(
+        Renderer(scene_of(inputs, camera, device), config.threads or 0),
+        light.light,
+        light.light_shadow,
+        inputs.photo,
+        Quality(PREVIEW_SAMPLES, 1, config.depth, config.seed, config.indirect_limit),
+        light.curves.foreground,
+        light.curves.shadow_ratio,
+        is_reinhard=light.curves.tone == "reinhard",
+    )
+    codes = inputs.photo.encode(picture.image, picture.changed)
+    say(f"preview: {output.write_preview(0, codes, inputs.photo.icc)}")
 
 
 def _guide(
@@ -355,7 +402,7 @@ def _run(arguments: list[str]) -> int:
 def _validate(config: InsertConfig) -> None:
     if config.sequence is None:
         config, _, light = _read(config)
-        if light is None or config.guided_by != "none":
+        if light is None or config.is_guided:
             from warpir.recover import require_model
 
             require_model(config)

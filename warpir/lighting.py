@@ -85,7 +85,7 @@ def _even(inputs: Inputs, config: InsertConfig) -> SceneLight:
     level = start_level(inputs, config)
     light = Light(texels=np.full((8, 16, 3), level, np.float32))
     assumed = "nothing about the light: an even one (--start, --light, --sun)"
-    if config.guided_by != "none":
+    if config.is_guided:
         assumed = "nothing about the light: the recovery starts from an even one (--light, --sun)"
     return SceneLight(light, light, Curves.identity(config.tone_operator), 0.0, (assumed,))
 

@@ -14,7 +14,8 @@ class OptimizeSettings:
     """How light and tone curves are recovered from the guidance's gradient."""
 
     steps: int | None = None
-    """Steps of the optimisation; with --refine 300, or 200 for tone"""
+    """Steps of the optimisation; with --refine 300, or 200 for tone; the embedded prior is asked
+    with more than 0 alone (experimental: it failed its release gate)"""
     guidance_width: int | None = None
     """Width of the picture inside the loop [px]; its height follows the photo's shape"""
     lobes: int = 64

@@ -22,7 +22,7 @@ from warpir.checkpoint import Checkpoint, Checkpoints
 from warpir.color import linear_to_gamma
 from warpir.config import PRIOR_DEFAULTS, InsertConfig
 from warpir.curves import Curves, ToneKnots
-from warpir.diffusion.cache import cache_folder, content_key, write_file
+from warpir.diffusion.cache import cache_folder, content_key
 from warpir.diffusion.embedded import embedded_prompts, load_embedded
 from warpir.diffusion.guidance import DatasetUpdate, Guidance, NonFiniteError, make_guidance
 from warpir.diffusion.lora_files import Lora, save_lora
@@ -35,7 +35,7 @@ from warpir.diffusion.show_prior import show_personalization
 from warpir.diffusion.stable_diffusion import load_stable_diffusion
 from warpir.errors import ExitCode, InputError
 from warpir.estimate import Estimate, estimate_light
-from warpir.files import OutputFolder, png_bytes
+from warpir.files import OutputFolder
 from warpir.inputs import Inputs
 from warpir.light import Lobes, as_map, summarize
 from warpir.light_optimization import LightOptimization, Unknowns
@@ -72,8 +72,8 @@ CHECK_DRAWS = 16
 ANYTHING = "object"
 """What the embedded prior is asked for when nobody says what the object is."""
 ABOUT_EMBEDDED = (
-    "prior: embedded, trained on rendered scenes; for photographs Stable Diffusion is recommended "
-    "(--model)"
+    "prior: embedded, trained on rendered scenes, experimental: it failed its release gate; for "
+    "photographs Stable Diffusion is recommended (--model)"
 )
 LOSSES_WITHOUT_LORA = ("csd", "sds-base", "good-bad")
 """They ask the unadapted model alone."""
@@ -264,7 +264,7 @@ def require_model(config: InsertConfig) -> None:
     with as_input_errors():
         if config.guided_by == "stable-diffusion" and not config.allow_download:
             check_model_folder(find_model(config.model, allow_download=False))
-        if config.guided_by == "embedded":
+        if config.guided_by == "embedded" and config.is_guided:
             load_embedded(_path(config.prior), torch.device("cpu"))
     is_given = is_described(config) or config.reuse is not None
     if config.start != "uniform" and not is_given:
@@ -548,8 +548,7 @@ def write_start(run: Run, frame: Frame, start: SceneLight) -> None:
 def write_preview(run: Run, image: torch.Tensor, step: int) -> None:
     """Write a composite, shape [1, 3, H, W], to ``progress/``; earlier results are not touched."""
     shown = image[0].permute(1, 2, 0).cpu().numpy()
-    path = run.output.path / "progress" / f"preview-{step:06d}.png"
-    write_file(path, png_bytes(np.round(shown * 255.0).astype(np.uint8), None, False, ""))
+    path = run.output.write_preview(step, np.round(shown * 255.0).astype(np.uint8))
     run.say(f"preview: {path}")
 
 
