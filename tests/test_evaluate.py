@@ -1,10 +1,12 @@
 """The evaluation: scenes from a seed, rows that must be right or wrong, intervals, the command."""
 
 import json
+from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
 import pytest
+import torch
 import trimesh
 from numpy.typing import NDArray
 from PIL import Image
@@ -56,6 +58,15 @@ def panorama(azimuth: float, elevation: float) -> FloatArray:
     )
     texels[row, column] = 10.0 / texel_solid_angles(64, 128)[row]
     return texels.astype(np.float32)
+
+
+@pytest.fixture(scope="module", autouse=True)
+def _one_thread() -> Iterator[None]:
+    """Networks this small lose more by threads than they gain."""
+    before = torch.get_num_threads()
+    torch.set_num_threads(1)
+    yield
+    torch.set_num_threads(before)
 
 
 @pytest.fixture(scope="module")
