@@ -50,6 +50,20 @@ def test_wheel_holds_every_module(wheel: zipfile.ZipFile) -> None:
 
 
 @pytest.mark.slow
+def test_wheel_holds_the_weights_and_their_card(wheel: zipfile.ZipFile) -> None:
+    """What reads the light off a photo is in the package, and all weights stay below 25 MB."""
+    sizes = {
+        info.filename: info.file_size for info in wheel.infolist() if "weights/" in info.filename
+    }
+    names = {
+        "warpir/diffusion/weights/regressor.safetensors",
+        "warpir/diffusion/weights/MODEL_CARD.md",
+    }
+    assert names <= set(sizes)
+    assert sum(sizes.values()) <= 25_000_000
+
+
+@pytest.mark.slow
 def test_wheel_installs_the_command(wheel: zipfile.ZipFile) -> None:
     """``warpir-insert`` is the same program as ``python -m warpir.insert``."""
     entry = next(name for name in wheel.namelist() if name.endswith("entry_points.txt"))

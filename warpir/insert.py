@@ -39,7 +39,7 @@ NOT_ASKED = (
     f"the embedded prior was not asked (--steps {EMBEDDED_STEPS}: experimental, it failed its "
     "release gate)"
 )
-PREVIEW_SAMPLES = 4
+PREVIEW_SAMPLES = 16
 """Camera samples per pixel of the preview of a run that nothing guides."""
 
 
