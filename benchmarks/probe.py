@@ -19,6 +19,7 @@ from torch import Tensor
 
 from warpir.diffusion.embedded import EmbeddedPrior, load_embedded, random_embedded
 from warpir.prior_images import Lighting, Mixture, SceneGenerator, Stock
+from warpir.regressor import load_regressor
 from warpir.render import choose_device
 from warpir.train import files_in
 from warpir.training_batches import PriorBatch
@@ -69,7 +70,6 @@ def potentials(
     is_ring: bool,
     noises: int,
     span: tuple[float, float],
-    background: Tensor | None = None,
 ) -> dict[str, Tensor]:
     """Return by row the potential of each light, shape [light, scene].
 
@@ -79,7 +79,6 @@ def potentials(
         is_ring: The last light is next to the first; what does not close is spread evenly.
         noises: Times and noises.
         span: Range of the times.
-        background: Photos to condition on in place of the scenes' own.
     """
     count = len(batches[0].image)
     device = batches[0].image.device
@@ -87,7 +86,7 @@ def potentials(
     embeddings = prior.embed(words)
     latents = [prior.encode(b.image) for b in batches]
     gbuffer = batches[0].gbuffer
-    shown = batches[0].background if background is None else background
+    shown = batches[0].background
     forces: dict[str, list[Tensor]] = {row: [] for row in ROWS}
     for z in latents:
         total = {row: torch.zeros_like(z) for row in ROWS}
@@ -156,16 +155,15 @@ def measure(
     """
     result: dict[str, Any] = {}
     for family, changes in families().items():
-        batches = scenes.relit(0, count, changes)
+        batches = scenes.relit(0, count, changes, other)
         truth = batches[0 if family == "azimuth" else len(batches) // 2]
         light = scenes.light_of(0, count)
         counted = (light > 0.25) & (truth.gbuffer[:, 0].mean(dim=(1, 2)) > 0.03)
-        background = truth.background.roll(1, dims=0) if other else None
         result[family] = {"scenes": int(counted.sum())} | {
             span: {
                 row: figures(family, potential, counted)
                 for row, potential in potentials(
-                    prior, batches, family == "azimuth", noises, limits, background
+                    prior, batches, family == "azimuth", noises, limits
                 ).items()
             }
             for span, limits in TIMES.items()
@@ -179,6 +177,7 @@ def main() -> None:
     parser.add_argument("--panoramas", type=Path, nargs="*", default=[])
     parser.add_argument("--only", nargs="*", default=[], help="names of panoramas that are used")
     parser.add_argument("--prior", type=Path, default=None)
+    parser.add_argument("--regressor", type=Path, default=None)
     parser.add_argument("--random", action="store_true", help="random weights: must be at chance")
     parser.add_argument("--other", action="store_true", help="another background: must fail")
     parser.add_argument("--scenes", type=int, default=32)
@@ -189,6 +188,7 @@ def main() -> None:
     name = choose_device(options.device)
     device = torch.device(name)
     prior = random_embedded(0, device) if options.random else load_embedded(options.prior, device)
+    regressor = load_regressor(options.regressor, device)
     paths = [p for p in files_in(options.panoramas, (".hdr", ".exr")) if p.stem in options.only]
     stock = Stock(make_meshes(48, SEED), load_panoramas(paths, device), name)
     kinds = {"procedural": Mixture(made_up=1.0, hybrid=0.0, mismatched=0.0)}
@@ -196,7 +196,7 @@ def main() -> None:
         kinds["panoramas"] = Mixture(made_up=0.0, hybrid=0.0, proxies=0.0, mismatched=0.0)
     result = {
         kind: measure(
-            prior, SceneGenerator(stock, SEED, mixture), options.scenes, options.noises,
+            prior, SceneGenerator(stock, SEED, mixture, regressor), options.scenes, options.noises,
             options.other,
         )
         for kind, mixture in kinds.items()

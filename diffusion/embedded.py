@@ -1,11 +1,12 @@
 """The prior that warpir ships: a small UNet on pixels that is shown what it has to judge by.
 
 A crop of 64 x 64 pixels is its own latent, in [-1, 1]. Beside the noisy crop the network sees the
-photo without the object (the crop, blank where the mask covers it, and the whole photo, small), and
-the object's mask, albedo and normals; each may be withheld, and a flag says so. It was trained on
-rendered scenes, half of them wrongly lit: the prompt says ``consistent`` or ``mismatched`` and what
-is wrong. The empty prompt means any of them, wrongly lit ones included, so that a difference of two
-prompts is a statement about the light.
+photo without the object (the crop, blank where the mask covers it, and the whole photo, small), the
+object's mask, albedo and normals, and the light that the regressor reads off the photo, as a first
+guess; each may be withheld, and a flag says so. It was trained on rendered scenes, half of them
+wrongly lit: the prompt says ``consistent`` or ``mismatched`` and what is wrong. The empty prompt
+means any of them, wrongly lit ones included, so that a difference of two prompts is a statement
+about the light.
 
 Folding 2 x 2 pixels into channels is orthonormal: white noise stays white, and this is exactly
 diffusion in pixel space at a quarter of the cost. Noise follows a cosine, ``s = sin(pi t / 2)``,
@@ -251,8 +252,13 @@ class NetworkConfig:
     """Channels of a word."""
 
 
-CONDITIONS = ("background", "mask", "albedo", "normals")
-"""Each has a flag; the columns of ``present`` below."""
+CONDITIONS = ("background", "mask", "albedo", "normals", "light")
+"""Each has a flag; the columns of ``present`` below. ``light`` is what the regressor reads off the
+photo: without the background it is not shown either."""
+GBUFFER_CHANNELS = 13
+"""Mask, albedo (3), normals (3), the object as a white-lit diffuse picture would show it under the
+regressed light (3), and the direction toward that light times its share, in the camera's frame (3).
+"""
 
 
 class EmbeddedNetwork(nn.Module):
@@ -272,7 +278,7 @@ class EmbeddedNetwork(nn.Module):
         attends = [level >= config.attention_from for level in levels]
         self.unet: UNet2DConditionModel = UNet2DConditionModel(
             sample_size=RESOLUTION // 2,
-            in_channels=4 * (3 + 6 + 7) + len(CONDITIONS),
+            in_channels=4 * (3 + 6 + GBUFFER_CHANNELS) + len(CONDITIONS),
             out_channels=4 * 3,
             down_block_types=tuple(f"{'CrossAttn' * a}DownBlock2D" for a in attends),
             up_block_types=tuple(f"{'CrossAttn' * a}UpBlock2D" for a in reversed(attends)),
@@ -309,8 +315,8 @@ class EmbeddedNetwork(nn.Module):
             embeddings: From `embed`.
             background: The photo without the object, in [0, 1]: the crop, and the whole of it
                 squeezed into the same square, shape [B, 6, 64, 64].
-            gbuffer: Mask, albedo and normals, shape [B, 7, 64, 64].
-            present: 1 for each of `CONDITIONS` that is shown, else 0; float, shape [B, 4].
+            gbuffer: `GBUFFER_CHANNELS`, shape [B, 13, 64, 64].
+            present: 1 for each of `CONDITIONS` that is shown, else 0; float, shape [B, 5].
         """
         packed = pack(latents_noisy, background, gbuffer, present)
         predicted: Tensor = self.unet(packed, timesteps, encoder_hidden_states=embeddings).sample
@@ -318,11 +324,13 @@ class EmbeddedNetwork(nn.Module):
 
 
 def pack(latents_noisy: Tensor, background: Tensor, gbuffer: Tensor, present: Tensor) -> Tensor:
-    """Return the UNet's input, shape [B, 68, 32, 32]; arguments as in `EmbeddedNetwork.forward`.
+    """Return the UNet's input, shape [B, 93, 32, 32]; arguments as in `EmbeddedNetwork.forward`.
 
     What is not shown is 0. The background is blank where a mask that is shown covers it; the whole
     photo beside it, which has the cues that a crop leaves out, is not.
     """
+    # What was read off the photo is not known where the photo is not.
+    present = torch.cat([present[:, :4], present[:, 4:] * present[:, :1]], dim=1)
     shown = present[:, :, None, None].to(latents_noisy)
     mask = gbuffer[:, :1] * shown[:, 1:2]
     planes = [
@@ -331,7 +339,8 @@ def pack(latents_noisy: Tensor, background: Tensor, gbuffer: Tensor, present: Te
         (2.0 * background[:, 3:] - 1.0) * shown[:, :1],
         mask,
         gbuffer[:, 1:4] * shown[:, 2:3],
-        gbuffer[:, 4:] * shown[:, 3:],
+        gbuffer[:, 4:7] * shown[:, 3:4],
+        gbuffer[:, 7:] * shown[:, 4:],
     ]
     folded = functional.pixel_unshuffle(torch.cat(planes, dim=1), 2)
     return torch.cat([folded, shown.expand(-1, -1, *folded.shape[-2:])], dim=1)
@@ -426,7 +435,10 @@ class EmbeddedPrior(NetworkPrior):
         """
         count, size = len(latents_noisy), latents_noisy.shape[-2:]
         device = latents_noisy.device
-        for name, given, channels in (("background", background, 6), ("gbuffer", gbuffer, 7)):
+        for name, given, channels in (
+            ("background", background, 6),
+            ("gbuffer", gbuffer, GBUFFER_CHANNELS),
+        ):
             if given is not None and given.shape != (count, channels, *size):
                 expected = [count, channels, *size]
                 raise ValueError(f"{name}: shape {list(given.shape)} (expected {expected})")
@@ -438,7 +450,7 @@ class EmbeddedPrior(NetworkPrior):
         present[:, 0] = float(background is not None)
         if background is not None and keep_background is not None:
             present[:, 0] = torch.tensor(keep_background, dtype=present.dtype).to(device)
-        zeros = latents_noisy.new_zeros(count, 7, *size)
+        zeros = latents_noisy.new_zeros(count, GBUFFER_CHANNELS, *size)
         return pack(
             latents_noisy,
             zeros[:, :6] if background is None else background.to(device, torch.float32),

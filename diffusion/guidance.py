@@ -269,7 +269,7 @@ class NoisyCrops:
     background: Tensor | None
     """The photo's crops, and the whole photo with each, shape [noise, 6, R, R]."""
     gbuffer: Tensor | None
-    """The G-buffer's crops, shape [noise, 7, R, R]."""
+    """The G-buffer's crops, shape [noise, 13, R, R]."""
 
 
 class Guidance:

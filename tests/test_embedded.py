@@ -18,6 +18,7 @@ from warpir.diffusion.embedded import (
     DROP_ATTRIBUTE,
     DROP_KIND,
     DROP_PROMPT,
+    GBUFFER_CHANNELS,
     HEADER_KEY,
     KINDS,
     LORA_LAYERS,
@@ -92,7 +93,7 @@ def scene(count: int = 1, seed: int = 0) -> tuple[Tensor, Tensor, Tensor]:
     image, background = (torch.rand(count, n, 64, 64, generator=g) for n in (3, 6))
     mask = torch.zeros(count, 1, 64, 64)
     mask[:, :, 20:44, 16:40] = 1.0
-    rest = torch.rand(count, 6, 64, 64, generator=g)
+    rest = torch.rand(count, GBUFFER_CHANNELS - 1, 64, 64, generator=g)
     return image, background, torch.cat([mask, mask * rest], dim=1)
 
 
@@ -224,9 +225,9 @@ def test_the_network_has_its_size() -> None:
 def test_folding_is_orthonormal() -> None:
     """White noise stays white: packing keeps lengths, unpacking undoes it."""
     noisy = torch.randn(2, 3, 64, 64)
-    none = torch.zeros(2, 7, 64, 64)
-    packed = pack(noisy, none[:, :3], none, torch.zeros(2, 4))
-    assert packed.shape == (2, 56, 32, 32)
+    none = torch.zeros(2, GBUFFER_CHANNELS, 64, 64)
+    packed = pack(noisy, none[:, :6], none, torch.zeros(2, len(CONDITIONS)))
+    assert packed.shape == (2, 93, 32, 32)
     assert float(packed.norm()) == pytest.approx(float(noisy.norm()), rel=1e-6)
     assert torch.equal(nn.functional.pixel_shuffle(packed[:, :12], 2), noisy)
 
@@ -235,15 +236,24 @@ def test_only_what_is_shown_reaches_the_network() -> None:
     """Each condition alone has its channels and its flag; a shown mask blanks the background."""
     image, background, gbuffer = scene()
     gbuffer[:, 1:] += 0.1
-    channels = {"background": (12, 36), "mask": (36, 40), "albedo": (40, 52), "normals": (52, 64)}
+    channels = {
+        "background": (12, 36), "mask": (36, 40), "albedo": (40, 52), "normals": (52, 64),
+        "light": (64, 88),
+    }  # fmt: skip
     for place, name in enumerate(CONDITIONS):
         present = torch.zeros(1, len(CONDITIONS))
         present[0, place] = 1.0
-        packed = pack(image, background, gbuffer, present)[0]
-        for other, (low, high) in channels.items():
-            assert bool(packed[low:high].any()) is (other == name)
-        assert packed[64:].mean(dim=(1, 2)).tolist() == present[0].tolist()
-    both = pack(image, background, gbuffer, torch.tensor([[1.0, 1.0, 0.0, 0.0]]))
+        # Of the light nothing is known without the photo.
+        expected = [] if name == "light" else [name]
+        for _ in range(2):
+            packed = pack(image, background, gbuffer, present)[0]
+            for other, (low, high) in channels.items():
+                assert bool(packed[low:high].any()) is (other in expected)
+            flags = [float(other in expected) for other in CONDITIONS]
+            assert packed[88:].mean(dim=(1, 2)).tolist() == flags
+            present[0, 0] = 1.0
+            expected = ["background", name]
+    both = pack(image, background, gbuffer, torch.tensor([[1.0, 1.0, 0.0, 0.0, 0.0]]))
     shown = nn.functional.pixel_shuffle(both[:, 12:36], 2)
     told = 2.0 * background - 1.0
     assert torch.equal(shown[:, :3], told[:, :3] * (1.0 - gbuffer[:, :1]))
@@ -325,11 +335,11 @@ def test_predict_is_the_networks_noise(embedded: EmbeddedPrior) -> None:
         return embedded.predict(z, t, embeddings, [None] * 2, background, gbuffer, keep)
 
     for got, present in (
-        (found(background, gbuffer), [[1.0] * 4] * 2),
-        (found(None, gbuffer), [[0.0, 1.0, 1.0, 1.0]] * 2),
-        (found(background, None), [[1.0, 0.0, 0.0, 0.0]] * 2),
-        (found(None, None), [[0.0] * 4] * 2),
-        (found(background, gbuffer, [True, False]), [[1.0] * 4, [0.0, 1.0, 1.0, 1.0]]),
+        (found(background, gbuffer), [[1.0] * 5] * 2),
+        (found(None, gbuffer), [[0.0, 1.0, 1.0, 1.0, 1.0]] * 2),
+        (found(background, None), [[1.0, 0.0, 0.0, 0.0, 0.0]] * 2),
+        (found(None, None), [[0.0] * 5] * 2),
+        (found(background, gbuffer, [True, False]), [[1.0] * 5, [0.0, 1.0, 1.0, 1.0, 1.0]]),
     ):
         torch.testing.assert_close(got, expected(present), atol=1e-6, rtol=1e-5)
     full = found(background, gbuffer)
@@ -373,7 +383,7 @@ def guidance_of(prior: EmbeddedPrior, loss: str) -> tuple[Guidance, Tensor, Tens
     """Return guidance on a picture of 72 x 96, the picture, and its mask."""
     g = torch.Generator().manual_seed(3)
     image, background = (torch.rand(1, 3, 72, 96, generator=g) for _ in range(2))
-    gbuffer = torch.zeros(1, 7, 72, 96)
+    gbuffer = torch.zeros(1, GBUFFER_CHANNELS, 72, 96)
     gbuffer[:, :, 30:60, 40:70] = 1.0
     prompts = embedded_prompts("a car", PersonalizeSettings(), personalized=True)
     condition = Condition(

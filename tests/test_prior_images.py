@@ -20,9 +20,11 @@ from warpir.prior_images import (
     Stock,
     about_y,
     packed_solids,
+    rays_of,
     to_map,
     to_world,
 )
+from warpir.regressor import hints, random_regressor
 from warpir.training_lights import (
     LightPool,
     gray,
@@ -71,7 +73,8 @@ def test_batches_hold_what_they_promise(device: str) -> None:
     for picture in (batch.image, batch.background, batch.gbuffer[:, :4]):
         assert torch.isfinite(picture).all()
         assert 0.0 <= float(picture.min()) and float(picture.max()) <= 1.0
-    mask, normal = batch.gbuffer[:, 0], batch.gbuffer[:, 4:]
+    assert batch.gbuffer.shape == (24, 13, 64, 64)
+    mask, normal = batch.gbuffer[:, 0], batch.gbuffer[:, 4:7]
     length = normal.norm(dim=1)
     torch.testing.assert_close(
         length[mask > 0], torch.ones_like(length[mask > 0]), atol=1e-4, rtol=0
@@ -309,3 +312,45 @@ def test_cameras_expose_and_spoil_within_range() -> None:
     spoilt = draw_faults(shown, draws)
     assert 0.0 <= float(spoilt.min()) and float(spoilt.max()) <= 1.0
     assert 0.001 < float((spoilt - shown).abs().mean()) < 0.1
+
+
+def test_the_prior_is_told_what_the_regressor_says(device: str) -> None:
+    """The planes of a level, unturned camera are those of ``Regression.hint``."""
+    stock = Stock(make_meshes(12, 3), even(device, 3.0), device)
+    network = random_regressor(1).to(device)
+    scenes = SceneGenerator(stock, 5, regressor=network)
+    batch = scenes.prior_batch(0, 4)
+    drawn = scenes._draw(0, 4, scenes._generator(2, 0), with_object=True)
+    draws = scenes._generator(2, 0)
+    scenes._draw(0, 4, draws, with_object=True)
+    shot = scenes._shoot(drawn, draws)
+    assert shot.hint is not None
+    expected = hints(network, shot.whole_photo, rays_of(drawn))
+    torch.testing.assert_close(shot.hint.toward, expected.toward, atol=2e-2, rtol=2e-2)
+    for k in range(4):
+        axes = torch.stack([drawn.right[k], drawn.up[k], drawn.back[k]])
+        told = batch.gbuffer[k, 10:]
+        assert float((told - told[:, :1, :1]).abs().max()) == 0.0
+        torch.testing.assert_close(told[:, 0, 0], axes @ shot.hint.toward[k], atol=1e-5, rtol=0)
+        # Pixel by pixel: irradiance of the nearest texel's direction, which is smooth.
+        inside = batch.gbuffer[k, 0] > 0.999
+        normals = batch.gbuffer[k, 4:7, inside].T @ axes
+        directions = torch.from_numpy(map_directions(16, 32).reshape(-1, 3)).float().to(device)
+        nearest = (normals @ directions.T).argmax(dim=1)
+        e = shot.hint.irradiance[k].flatten(0, 1)[nearest]
+        albedo = batch.gbuffer[k, 1:4, inside].T ** 2.2
+        shown = (albedo * e / np.pi).clamp(0.0, 1.0) ** (1.0 / 2.2)
+        assert float((shown - batch.gbuffer[k, 7:10, inside].T).abs().mean()) < 0.02
+
+
+def test_a_misled_prior_is_told_of_the_next_scene(device: str) -> None:
+    scenes = SceneGenerator(
+        Stock(make_meshes(12, 3), even(device, 3.0), device),
+        5,
+        regressor=random_regressor(1).to(device),
+    )
+    (right,), (wrong,) = (scenes.relit(0, 4, [lambda x: x], misled) for misled in (False, True))
+    torch.testing.assert_close(wrong.image, right.image, atol=0, rtol=0)
+    torch.testing.assert_close(wrong.background, right.background.roll(-1, dims=0), atol=0, rtol=0)
+    torch.testing.assert_close(wrong.gbuffer[:, :7], right.gbuffer[:, :7], atol=0, rtol=0)
+    assert not torch.equal(wrong.gbuffer[:, 7:], right.gbuffer[:, 7:])

@@ -21,13 +21,14 @@ from warpir.acceptance import Verdict
 from warpir.config import InsertConfig
 from warpir.demo import demo_config
 from warpir.diffusion import embedded
+from warpir.diffusion.embedded import GBUFFER_CHANNELS
 from warpir.errors import ExitCode
 from warpir.files import OutputFolder, read_photo
 from warpir.inputs import read_inputs
 from warpir.insert import main
 from warpir.progress import StepProgress
 from warpir.record import Timings
-from warpir.regressor import random_regressor, save_regressor
+from warpir.regressor import load_regressor, random_regressor, regress, save_regressor
 from warpir.sg_light import narrowest
 from warpir.trust import SPREAD_MAX
 
@@ -321,6 +322,29 @@ def test_prior_sees_the_object_as_in_its_training(folder: Path, tmp_path: Path) 
     expected = np.asarray(base) ** (1.0 / 2.2)
     found = albedo[:, mask[0] == 1.0].mean(dim=1).numpy()
     np.testing.assert_allclose(found, expected, atol=1e-3)
+
+
+def test_prior_is_told_the_regressed_light(folder: Path, tmp_path: Path) -> None:
+    """A first guess of the object's picture, dark beside it, and one direction for all pixels."""
+    config = config_of(folder)
+    run = made_run(config, tmp_path)
+    frame = recover.make_frame(run)
+    camera = frame.renderer.scene.camera
+    network = load_regressor(folder / "regressor.safetensors")
+    regression = regress(network, run.inputs.photo.srgb, run.inputs.camera)
+    plain = recover.gbuffer_of(frame)
+    told = recover.with_light(plain, regression, camera)
+    assert told.shape == (1, GBUFFER_CHANNELS, 32, 48) and told.dtype == torch.float32
+    assert torch.equal(told[:, :7], plain)
+    mask = plain[0, 0]
+    assert not told[0, 7:10, mask == 0.0].any()
+    toward = told[0, 10:].flatten(1)
+    assert torch.equal(toward, toward[:, :1].expand_as(toward))
+    place = tuple(torch.nonzero(mask == 1.0)[0].tolist())
+    normal = plain[0, 4:7, *place].double().numpy() @ camera.c2w[:3, :3].T
+    albedo = plain[0, 1:4, *place].double().numpy() ** 2.2
+    expected = np.clip(albedo * regression.irradiance(normal) / np.pi, 0.0, 1.0) ** (1.0 / 2.2)
+    np.testing.assert_allclose(told[0, 7:10, *place].numpy(), expected, atol=1e-5)
 
 
 def test_start_is_the_regressed_light(folder: Path, tmp_path: Path) -> None:

@@ -76,7 +76,7 @@ def draw(count: int, generator: torch.Generator) -> Toy:
     image = background * (1.0 - mask) + 0.5 * lit * mask
     background = torch.cat([background, background], dim=1)
     gbuffer = torch.cat(
-        [mask, 0.5 * mask.expand(-1, 3, -1, -1), torch.zeros(count, 2, 64, 64), mask], 1
+        [mask, 0.5 * mask.expand(-1, 3, -1, -1), torch.zeros(count, 8, 64, 64), mask], 1
     )
     place = torch.zeros(count, dtype=torch.int64)
     return Toy(image, background, gbuffer, place, place, place, kind)
@@ -138,7 +138,7 @@ def test_loss_is_its_printed_formula() -> None:
     alpha = torch.tensor([0.9, 0.5, 0.2])
     sigma = (1.0 - alpha.square()).sqrt()
     noise = torch.randn(batch.image.shape)
-    present = torch.tensor([[1.0] * 4, [0.0] * 4, [0.0, 1.0, 1.0, 0.0]])
+    present = torch.tensor([[1.0] * 5, [0.0] * 5, [0.0, 1.0, 1.0, 0.0, 0.0]])
     ids = training_tokens(batch.noun, batch.setting, batch.weather, batch.kind)
     timesteps = torch.tensor([100, 500, 900])
     with torch.no_grad():
@@ -194,7 +194,7 @@ def test_conditions_and_words_are_withheld_as_often_as_stated(tmp_path: Path) ->
     made._step(many, 1e-3)
     _, _, _, present, ids, timesteps, noise, alpha, sigma = seen[0]
     tolerance = 4.0 * math.sqrt(0.25 / count)
-    assert present.mean(dim=0).tolist() == pytest.approx([0.9 * 0.85] * 4, abs=tolerance)
+    assert present.mean(dim=0).tolist() == pytest.approx([0.9 * 0.85] * 5, abs=tolerance)
     none = float((present == 0).all(dim=1).float().mean())
     assert none == pytest.approx(0.15 + 0.85 * 0.1**4, abs=tolerance)
     assert float((ids == 0).all(dim=1).float().mean()) == pytest.approx(0.2, abs=tolerance)

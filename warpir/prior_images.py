@@ -9,6 +9,7 @@ warpir inserts objects. Everything of a batch is drawn and rendered on one devic
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from contextlib import nullcontext
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -20,6 +21,7 @@ from torch import Tensor
 from warpir.diffusion.embedded import KINDS, NOUNS
 from warpir.kernels import training_scene as kernel
 from warpir.photo_look import Look, draw_faults, draw_looks
+from warpir.regressor import Hint, Regressor, hints
 from warpir.training_batches import PhotoBatch, PriorBatch
 from warpir.training_lights import LightPool, gray, make_lights, solid_angles
 from warpir.training_meshes import TrainingMesh
@@ -28,8 +30,6 @@ SIDE = 64
 """Side of a crop [px]."""
 PHOTO_SIZE = (96, 144)
 """Height and width of a whole photo [px]."""
-WHOLE_SIZE = (SIDE, SIDE)
-"""Height and width of the whole photo beside a crop, whatever its shape [px]."""
 SOLIDS = 14
 """Of a scene: two walls or houses, six small ones, two trees of two, and two far away."""
 DIRECTIONS, SUN_DIRECTIONS = 96, 16
@@ -104,6 +104,19 @@ def to_map(lighting: Lighting, directions: Tensor) -> Tensor:
     flip = torch.ones_like(directions)
     flip[..., 0] = lighting.mirror[:, None]
     return about_y(directions * flip, lighting.yaw)
+
+
+def rays_of(scenes: Scenes) -> Tensor:
+    """Return the photos' unit viewing directions, camera-yaw frame, shape [B, 3, 96, 144]."""
+    window = scenes.photo_window
+    height, width = PHOTO_SIZE
+    across = (torch.arange(width, device=window.device) + 0.5) / width
+    down = (torch.arange(height, device=window.device) + 0.5) / height
+    u = (window[:, 0:1] + across * window[:, 2:3])[:, None, :, None]
+    v = (window[:, 1:2] + down * window[:, 3:4])[:, :, None, None]
+    right, up, back = (x[:, None, None] for x in (scenes.right, scenes.up, scenes.back))
+    rays = torch.nn.functional.normalize(right * u - up * v - back, dim=-1)
+    return rays.permute(0, 3, 1, 2).contiguous()
 
 
 def packed_solids(solids: dict[str, Tensor]) -> dict[str, Tensor]:
@@ -203,8 +216,19 @@ class Shot:
     """Display values of a faultless camera."""
     photo: Tensor
     """With noise, blur and the rest."""
+    whole_photo: Tensor
+    """What it is a crop of, likewise, shape [B, 3, 96, 144]."""
     whole: Tensor
-    """The whole photo of which this is a crop, likewise."""
+    """The same, squeezed to the crop's size."""
+    hint: Hint | None
+    """What the regressor reads off the whole photo."""
+
+    def next(self) -> Shot:
+        """Return for each scene what belongs to the next one; looks and radiance stay."""
+        hint = self.hint and Hint(*(part.roll(-1, dims=0) for part in self.hint))
+        return replace(
+            self, photo=self.photo.roll(-1, dims=0), whole=self.whole.roll(-1, dims=0), hint=hint
+        )
 
 
 class SceneGenerator:
@@ -214,10 +238,19 @@ class SceneGenerator:
         stock: Meshes and panoramas.
         seed: Of everything that is drawn.
         mixture: Shares of what is drawn.
+        regressor: Reads the light off the photos of `prior_batch`, as it will for the prior's
+            users; without one the G-buffer says nothing of the light.
     """
 
-    def __init__(self, stock: Stock, seed: int, mixture: Mixture | None = None) -> None:
+    def __init__(
+        self,
+        stock: Stock,
+        seed: int,
+        mixture: Mixture | None = None,
+        regressor: Regressor | None = None,
+    ) -> None:
         self.stock, self.seed, self.mixture = stock, seed, mixture or Mixture()
+        self.regressor = regressor
         self._pool: tuple[int, LightPool] | None = None
 
     def _generator(self, *key: int) -> torch.Generator:
@@ -249,7 +282,11 @@ class SceneGenerator:
         return self._inserted(scenes, shot)
 
     def relit(
-        self, index: int, count: int, changes: Sequence[Callable[[Lighting], Lighting]]
+        self,
+        index: int,
+        count: int,
+        changes: Sequence[Callable[[Lighting], Lighting]],
+        is_misled: bool = False,
     ) -> list[PriorBatch]:
         """Return the same scenes with the object under several lights.
 
@@ -257,10 +294,12 @@ class SceneGenerator:
             index: Which batch.
             count: Scenes in it.
             changes: Each makes an object's light from the one that `prior_batch` has.
+            is_misled: Give each scene the background, and what is read off it, of the next one.
         """
         generator = self._generator(2, index)
         scenes = self._draw(index, count, generator, with_object=True)
         shot = self._shoot(scenes, generator)
+        told = shot.next() if is_misled else shot
         batches = []
         for change in changes:
             light = change(scenes.object_lighting)
@@ -268,7 +307,10 @@ class SceneGenerator:
             directions = self._directions(light, self._generator(4, index))
             tables = scenes.tables | {"object_light": directions}
             changed = replace(scenes, tables=tables, object_lighting=light)
-            batches.append(self._inserted(changed, shot))
+            made = self._inserted(changed, shot)
+            if is_misled:
+                made = replace(self._inserted(changed, told), image=made.image)
+            batches.append(made)
         return batches
 
     def light_of(self, index: int, count: int) -> Tensor:
@@ -281,14 +323,21 @@ class SceneGenerator:
 
     def _shoot(self, scenes: Scenes, generator: torch.Generator) -> Shot:
         """Take the photos: exposed as a whole, seen through the crop's window."""
-        whole = self._render(scenes, scenes.photo_window, WHOLE_SIZE, 1, with_object=False)
+        whole = self._render(scenes, scenes.photo_window, PHOTO_SIZE, 1, with_object=False)
         look = draw_looks(whole.background, generator)
         made = self._render(scenes, scenes.crop_window, (SIDE, SIDE), 2, with_object=False)
         plain = look.show(made.background)
-        photo, whole_photo = draw_faults(
-            torch.stack([plain, look.show(whole.background)]).flatten(0, 1), generator
-        ).unflatten(0, (2, -1))
-        return Shot(look, made.background, plain, photo, whole_photo)
+        photo = draw_faults(plain, generator)
+        whole_photo = draw_faults(look.show(whole.background), generator)
+        hint = None
+        if self.regressor is not None:
+            is_cuda = whole_photo.device.type == "cuda"
+            with torch.autocast("cuda", torch.bfloat16) if is_cuda else nullcontext():
+                hint = hints(self.regressor, whole_photo, rays_of(scenes))
+        small = torch.nn.functional.interpolate(
+            whole_photo, (SIDE, SIDE), mode="bilinear", antialias=True
+        )
+        return Shot(look, made.background, plain, photo, whole_photo, small, hint)
 
     def _inserted(self, scenes: Scenes, shot: Shot) -> PriorBatch:
         """Insert the objects into the photos."""
@@ -302,10 +351,41 @@ class SceneGenerator:
         normal = made.normal / made.normal.norm(dim=1, keepdim=True).clamp(min=1e-6)
         albedo = (made.albedo / covered.clamp(min=1e-6)).clamp(0.0, 1.0) ** (1.0 / 2.2)
         is_covered = (covered > 0.0).float()
-        gbuffer = torch.cat([covered, albedo * is_covered, normal * is_covered], dim=1)
+        light = self._light_planes(scenes, shot.hint, albedo**2.2, normal) * torch.cat(
+            [is_covered.expand(-1, 3, -1, -1), torch.ones_like(normal)], dim=1
+        )
+        gbuffer = torch.cat([covered, albedo * is_covered, normal * is_covered, light], dim=1)
         words = scenes.noun, scenes.setting, scenes.weather, scenes.kind
         background = torch.cat([shot.photo, shot.whole], dim=1)
         return PriorBatch(image.clamp(0.0, 1.0), background, gbuffer, *words)
+
+    def _light_planes(
+        self, scenes: Scenes, hint: Hint | None, albedo: Tensor, normal: Tensor
+    ) -> Tensor:
+        """Return what the regressor makes of the objects; see ``warpir.regressor.Regression.hint``.
+
+        Args:
+            scenes: Their cameras.
+            hint: The light, or None: nothing is known of it.
+            albedo: Linear, shape [B, 3, H, W].
+            normal: Camera frame, same shape.
+        """
+        if hint is None:
+            return torch.zeros_like(torch.cat([normal, normal], dim=1))
+        axes = torch.stack([scenes.right, scenes.up, scenes.back], dim=1)
+        n = torch.einsum("bchw,bcd->bdhw", normal, axes)
+        # Lat-long coordinates in [-1, 1] for grid_sample; a column beyond each side wraps.
+        u = -torch.atan2(n[:, 0], n[:, 2]) / np.pi
+        v = 2.0 * torch.arccos(n[:, 1].clamp(-1.0, 1.0)) / np.pi - 1.0
+        maps = hint.irradiance.permute(0, 3, 1, 2)
+        maps = torch.cat([maps[..., -1:], maps, maps[..., :1]], dim=-1)
+        grid = torch.stack([u * (32.0 / 34.0), v], dim=-1)
+        irradiance = torch.nn.functional.grid_sample(
+            maps, grid, padding_mode="border", align_corners=False
+        )
+        shown = (albedo * irradiance / np.pi).clamp(0.0, 1.0) ** (1.0 / 2.2)
+        toward = torch.einsum("bd,bcd->bc", hint.toward, axes)
+        return torch.cat([shown, toward[:, :, None, None].expand_as(normal)], dim=1)
 
     def photo_batch(self, index: int, count: int) -> PhotoBatch:
         """Return whole photos and their light; arguments are those of `prior_batch`."""
@@ -314,25 +394,18 @@ class SceneGenerator:
         made = self._render(scenes, scenes.photo_window, PHOTO_SIZE, 2, with_object=False)
         look = draw_looks(made.background, generator)
         photo = draw_faults(look.show(made.background), generator)
-        light, window = scenes.lighting, scenes.photo_window
-        height, width = PHOTO_SIZE
-        across = (torch.arange(width, device=photo.device) + 0.5) / width
-        down = (torch.arange(height, device=photo.device) + 0.5) / height
-        u = (window[:, 0:1] + across * window[:, 2:3])[:, None, :, None]
-        v = (window[:, 1:2] + down * window[:, 3:4])[:, :, None, None]
-        right, up, back = (x[:, None, None] for x in (scenes.right, scenes.up, scenes.back))
-        rays = torch.nn.functional.normalize(right * u - up * v - back, dim=-1)
+        light, rays = scenes.lighting, rays_of(scenes)
         ambient = self._rest_map(light) * look.gain[:, None, None]
         sun = light.sun * look.gain
         omega = solid_angles(ambient)
         rest = (gray(ambient) * omega).sum(dim=(1, 2))
         share = gray(sun) / (gray(sun) + rest).clamp(min=1e-20)
-        toward = torch.einsum("bhwc,bc->bhw", rays, light.axis).flatten(1).max(dim=1).values
+        toward = torch.einsum("bchw,bc->bhw", rays, light.axis).flatten(1).max(dim=1).values
         in_view = toward > float(np.cos(np.radians(3.0)))
         shows_solid = made.solid.mean(dim=(1, 2, 3)) > 0.015
         has_cue = (share > 0.15) & (scenes.is_panorama | in_view | shows_solid)
         return PhotoBatch(
-            photo, rays.permute(0, 3, 1, 2).contiguous(), light.axis, share, sun, light.sigma,
+            photo, rays, light.axis, share, sun, light.sigma,
             ambient, has_cue,
         )  # fmt: skip
 

@@ -18,8 +18,9 @@ import torch
 from numpy.typing import NDArray
 
 from warpir.acceptance import Verdict, blend, judge
+from warpir.camera import Camera
 from warpir.checkpoint import Checkpoint, Checkpoints
-from warpir.color import linear_to_gamma
+from warpir.color import gamma_to_linear, linear_to_gamma
 from warpir.config import PRIOR_DEFAULTS, InsertConfig
 from warpir.curves import Curves, ToneKnots
 from warpir.diffusion.cache import cache_folder, content_key
@@ -47,7 +48,7 @@ from warpir.optimize import Optimization
 from warpir.picture import resize, scene_of
 from warpir.progress import StepProgress
 from warpir.record import Timings, input_hashes, versions
-from warpir.regressor import load_regressor
+from warpir.regressor import Regression, load_regressor, regress
 from warpir.render import Renderer
 from warpir.sg_light import narrowest
 from warpir.tone import ToneCurve
@@ -465,11 +466,17 @@ def make_guide(run: Run, guided: Guided, frame: Frame) -> Guidance | DatasetUpda
     shown = linear_to_gamma(frame.photo_lin).astype(np.float32)
     background = torch.from_numpy(shown).permute(2, 0, 1)[None].to(run.torch_device)
     prompts = guided.prompts
+    gbuffer = gbuffer_of(frame)
+    if guided.prior.name == "embedded":
+        path = None if config.regressor is None else Path(config.regressor)
+        network = load_regressor(path, run.torch_device)
+        regression = regress(network, run.inputs.photo.srgb, run.inputs.camera)
+        gbuffer = with_light(gbuffer, regression, frame.renderer.scene.camera)
     condition = Condition(
         prompts.guidance,
         negative_prompt=guided.negative_prompt,
         background=background,
-        gbuffer=gbuffer_of(frame).to(run.torch_device),
+        gbuffer=gbuffer.to(run.torch_device),
     )
     seen = torch.from_numpy(frame.coverage())
     guide = make_guidance(
@@ -484,6 +491,22 @@ def make_guide(run: Run, guided: Guided, frame: Frame) -> Guidance | DatasetUpda
     if isinstance(guide, Guidance):
         guide.ensure_precision(background)
     return guide
+
+
+def with_light(gbuffer: torch.Tensor, regression: Regression, camera: Camera) -> torch.Tensor:
+    """Return a G-buffer with what the regressor makes of the object, shape [1, 13, H, W].
+
+    Args:
+        gbuffer: Of `gbuffer_of`, shape [1, 7, H, W].
+        regression: The light, world frame.
+        camera: Of the picture.
+    """
+    planes = gbuffer[0].permute(1, 2, 0).double().numpy()
+    shown, toward = regression.hint(gamma_to_linear(planes[..., 1:4]), planes[..., 4:7], camera.c2w)
+    shown = shown * (planes[..., :1] > 0.0)
+    light = np.concatenate([shown, np.broadcast_to(toward, shown.shape)], axis=2)
+    more = torch.from_numpy(light.astype(np.float32)).permute(2, 0, 1)[None]
+    return torch.cat([gbuffer, more], dim=1)
 
 
 def gbuffer_of(frame: Frame) -> torch.Tensor:

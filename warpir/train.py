@@ -61,6 +61,9 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument("--device", default=None)
     parser.add_argument("--resume", action="store_true")
     parser.add_argument("--start", type=Path, metavar="FILE", help="weights to begin with")
+    parser.add_argument(
+        "--regressor", type=Path, metavar="FILE", help="weights that the prior is told the light by"
+    )
     parser.add_argument("--no-compile", action="store_true", help="Do without torch.compile")
     return parser
 
@@ -175,11 +178,14 @@ def _train_prior(
 ) -> dict[str, Any]:
     from warpir.diffusion.train import TrainSettings, export_prior, train_prior
     from warpir.prior_images import Mixture, SceneGenerator
+    from warpir.regressor import load_regressor
 
     learned, unseen = stocks
+    regressor = load_regressor(options.regressor, device)
+    record = record | {"regressor": regressor.record}
 
     def drawn(mixture: Mixture) -> list[PriorBatch]:
-        scenes = SceneGenerator(unseen, VALIDATION_SEED, mixture)
+        scenes = SceneGenerator(unseen, VALIDATION_SEED, mixture, regressor)
         return [scenes.prior_batch(k, 128) for k in range(3)]
 
     kinds = {"procedural": {"made_up": 1.0, "hybrid": 0.0}}
@@ -199,8 +205,9 @@ def _train_prior(
     if options.start is not None:
         raise usage("--start", "the prior begins with random weights, or goes on with --resume")
     settings = TrainSettings(batch=options.batch or 256, compile=not options.no_compile)
+    scenes = SceneGenerator(learned, seed, regressor=regressor)
     progress = train_prior(
-        _reused(_counted(SceneGenerator(learned, seed).prior_batch), REUSES),
+        _reused(_counted(scenes.prior_batch), REUSES),
         options.out,
         settings,
         device,
