@@ -22,7 +22,8 @@ from warpir.demo.sky import (
     sun_direction,
     texel_directions,
 )
-from warpir.files import read_envmap
+from warpir.files import read_envmap, read_photo
+from warpir.regressor import load_regressor, regress
 
 SHIPPED_MAX = 5_000_000
 """All shipped files together [byte]: they travel in every wheel."""
@@ -122,11 +123,24 @@ def test_shipped_files_keep_their_budget() -> None:
 
 
 def test_demo_config_names_files_that_exist() -> None:
-    """``--demo`` becomes an ordinary run whose exposure is the photo's own."""
-    config = demo.demo_config(InsertConfig(demo=True, out="unused"))
-    for name in (config.photo, config.asset, config.light, config.camera):
-        assert name is not None and Path(name).is_file()
-    assert (config.exposure, config.tone) == (0.0, "linear")
+    """``--demo`` becomes an ordinary run, and one under its own light with ``--guidance none``."""
+    plain = demo.demo_config(InsertConfig(demo=True, out="unused"))
+    lit = demo.demo_config(InsertConfig(demo=True, out="unused", guidance="none"))
+    for config in (plain, lit):
+        for name in (config.photo, config.asset, config.camera):
+            assert name is not None and Path(name).is_file()
+    assert plain.light is None and plain.exposure is None
+    assert lit.light is not None and Path(lit.light).is_file()
+    assert (lit.exposure, lit.tone) == (0.0, "linear")
+
+
+def test_shipped_regressor_sees_the_sun_of_the_demo() -> None:
+    """`make demo` lights the car from about where the photo's shadows say (15 degrees off)."""
+    photo, where = read_photo(demo.PHOTO).srgb, camera()
+    found = regress(load_regressor(None), photo, where)
+    cosine = float(np.clip(found.axis @ sun_direction(), -1.0, 1.0))
+    assert np.degrees(np.arccos(cosine)) < 25.0
+    assert found.spread_deg < 45.0
 
 
 def test_fireflies_are_left_out_and_light_is_kept() -> None:

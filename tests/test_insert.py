@@ -919,3 +919,8 @@ def test_demo_runs_small(tmp_path: Path, device: str) -> None:
     assert demo.record["measured"]["object_pixels"] > 100
     replayed = go(["--config", str(out / "run.json"), "--out", str(tmp_path / "r")], tmp_path / "r")
     assert replayed.record["files"]["composite.png"] == demo.record["files"]["composite.png"]
+    # With nothing said the light is read off the photo, by what is in the package.
+    plain = go([*argv[:2], str(tmp_path / "plain"), *argv[3:]], tmp_path / "plain")
+    assert "regression" in plain.record["measured"] and "light" not in plain.record["inputs"]
+    assert (tmp_path / "plain" / "progress" / "preview-000000.png").is_file()
+    assert plain.record["files"]["composite.png"] != demo.record["files"]["composite.png"]
