@@ -335,7 +335,10 @@ def _make_bench(
         if options.regressor is not None:
             raise
         missing = error
+    # Ablations that adapt the small prior do so in proportion: its recipe of 150 to 300 steps.
+    adaptation: dict[str, Any] = {"class_images": 40, "lora_steps": 200, "lora_rank": 8}
     config = InsertConfig(
+        **({} if options.model is not None else adaptation),
         guidance="stable-diffusion" if options.model is not None else "embedded",
         model=options.model,
         prior=options.prior,

@@ -479,7 +479,9 @@ ROWS = {
     "s3-single": _ablation(
         "one light from the start", loss="lds", personalize=True, fusion="single"
     ),
-    "s3-lora-both": _ablation("adapted model in both terms", loss="lds-lora-both"),
+    "s3-lora-both": _ablation(
+        "adapted model in both terms", loss="lds-lora-both", personalize=True
+    ),
 }
 """By name; the order is that of the tables."""
 DEFAULT_ROWS = (
