@@ -520,7 +520,7 @@ def load_embedded(
     path = Path(weights) if weights is not None else WEIGHTS
     if weights is None and not path.is_file():
         what = "the embedded prior's weights are not in this installation"
-        raise ModelError(str(path), what, "install warpir again, or name a model by --model")
+        raise ModelError(str(path), what, "name some by --prior, or leave --steps out")
     network, training = read_network(path)
     with path.open("rb") as file:
         digest = hashlib.file_digest(file, "sha256").hexdigest()
