@@ -20,6 +20,7 @@ from torch import Tensor
 
 from warpir.diffusion.embedded import KINDS, NOUNS
 from warpir.kernels import training_scene as kernel
+from warpir.light import map_directions
 from warpir.photo_look import Look, draw_faults, draw_looks
 from warpir.regressor import Hint, Regressor, hints
 from warpir.training_batches import PhotoBatch, PriorBatch
@@ -411,8 +412,6 @@ class SceneGenerator:
 
     def _rest_map(self, light: Lighting) -> Tensor:
         """Return what is not sun in the world's frame, shape [B, 8, 16, 3]."""
-        from warpir.light import map_directions
-
         fine = self._levels[0]
         height, width = fine.shape[1:3]
         directions = torch.from_numpy(map_directions(height, width)).float().to(fine)
@@ -892,10 +891,10 @@ def _vectors(values: Tensor) -> wp.array:
 
 
 def _struct(kind: Any, tensors: dict[str, Tensor]) -> Any:
-    """Fill one of the kernel's tables with views of tensors; each must outlive the launch."""
+    """Fill one of the kernel's tables with views of tensors; ids of meshes must outlive it."""
     table = kind()
     for name, variable in kind.vars.items():
-        values = tensors[name]
+        values = tensors[name].contiguous()
         dtype = variable.type.dtype
         if dtype is wp.uint64:
             array = wp.array(
@@ -903,7 +902,6 @@ def _struct(kind: Any, tensors: dict[str, Tensor]) -> Any:
                 device=wp.device_from_torch(values.device), copy=False,
             )  # fmt: skip
         else:
-            array = wp.from_torch(values.contiguous(), dtype=dtype)
-        tensors[name] = values
+            array = wp.from_torch(values, dtype=dtype)
         setattr(table, name, array)
     return table

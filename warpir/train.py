@@ -5,10 +5,10 @@ r"""Train the networks that warpir ships: the embedded prior, and the regressor 
         --total-minutes 18
     python -m warpir.train prior ... --resume
 
-Scenes are rendered as they are needed; none is seen twice. A command stops after ``--minutes`` and
-``--resume`` goes on, until ``--total-minutes`` are used up. With torchrun the prior is trained on
-several cards. ``--without`` names panoramas and assets that must not be learned from; of those that
-``--validation`` names only the errors are looked at.
+Scenes are rendered as they are needed and then forgotten; the prior learns from each twice.
+A command stops after ``--minutes`` and ``--resume`` goes on, until ``--total-minutes`` are used up.
+With torchrun a network is trained on several cards. ``--without`` names panoramas and assets that
+must not be learned from; of those that ``--validation`` names only the errors are looked at.
 """
 
 from __future__ import annotations
@@ -50,12 +50,14 @@ def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser("python -m warpir.train", description=_first_line())
     parser.add_argument("network", choices=("prior", "regressor"))
     parser.add_argument("--panoramas", type=Path, nargs="+", required=True, metavar="DIR")
-    parser.add_argument("--assets", type=Path, nargs="*", default=[], metavar="DIR")
-    parser.add_argument("--without", nargs="*", default=[], metavar="NAME")
-    parser.add_argument("--validation", nargs="*", default=[], metavar="NAME")
+    parser.add_argument("--assets", type=Path, nargs="*", default=[], metavar="DIR", help="objects")
+    parser.add_argument("--without", nargs="*", default=[], metavar="NAME", help="not learned from")
+    parser.add_argument(
+        "--validation", nargs="*", default=[], metavar="NAME", help="only looked at"
+    )
     parser.add_argument("--out", type=Path, required=True, metavar="DIR")
-    parser.add_argument("--minutes", type=float, default=9.0)
-    parser.add_argument("--total-minutes", type=float, default=None)
+    parser.add_argument("--minutes", type=float, default=9.0, help="of this command")
+    parser.add_argument("--total-minutes", type=float, help="of all commands together")
     parser.add_argument("--batch", type=int, default=None)
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--device", default=None)
@@ -64,7 +66,7 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument(
         "--regressor", type=Path, metavar="FILE", help="weights that the prior is told the light by"
     )
-    parser.add_argument("--no-compile", action="store_true", help="Do without torch.compile")
+    parser.add_argument("--no-compile", action="store_true", help="do without torch.compile")
     return parser
 
 
@@ -74,6 +76,8 @@ def _first_line() -> str:
 
 def _run(arguments: list[str]) -> int:
     options = _parser().parse_args(arguments)
+    if options.network == "prior" and options.start is not None:
+        raise usage("--start", "the prior begins with random weights, or goes on with --resume")
     panoramas = files_in(options.panoramas, (".hdr", ".exr"))
     assets = files_in(options.assets, (".glb", ".gltf", ".obj", ".stl", ".ply"))
     unknown = sorted({*options.without, *options.validation} - {p.stem for p in panoramas + assets})
@@ -202,8 +206,6 @@ def _train_prior(
         ]
         for name, shares in kinds.items()
     }
-    if options.start is not None:
-        raise usage("--start", "the prior begins with random weights, or goes on with --resume")
     settings = TrainSettings(batch=options.batch or 256, compile=not options.no_compile)
     scenes = SceneGenerator(learned, seed, regressor=regressor)
     progress = train_prior(
