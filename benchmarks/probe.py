@@ -31,12 +31,16 @@ SEED = 2_000_000
 AZIMUTHS = 16
 STOPS = tuple(float(s) for s in np.linspace(-2.0, 2.0, 9))
 ROWS = {
-    "sds": (1.0, 0.0, 0.0, -1.0),
-    "csd": (1.0, -1.0, 0.0, 0.0),
-    "good-bad": (1.0, 0.0, -1.0, 0.0),
-    "sds-good-bad": (3.0, 0.0, -2.0, -1.0),
+    "sds": (1.0, 0.0, 0.0, 0.0, -1.0),
+    "csd": (1.0, -1.0, 0.0, 0.0, 0.0),
+    "good-bad": (1.0, 0.0, -1.0, 0.0, 0.0),
+    "sds-good-bad": (3.0, 0.0, -2.0, 0.0, -1.0),
+    "csd-drop": (1.0, 0.0, 0.0, -1.0, 0.0),
+    "sds-drop-2": (2.0, 0.0, 0.0, -1.0, -1.0),
+    "sds-drop-4": (4.0, 0.0, 0.0, -3.0, -1.0),
 }
-"""Coefficients of consistent, null, mismatched and of the noise itself."""
+"""Coefficients of consistent, null, mismatched, null without the photo (--null-background drop; the
+number is the guidance scale), and of the noise itself."""
 TIMES = {"low": (0.05, 0.35), "middle": (0.3, 0.6), "high": (0.55, 0.9)}
 """Ranges of the time, of which the noise level is sin(pi t / 2)."""
 
@@ -82,7 +86,8 @@ def potentials(
     """
     count = len(batches[0].image)
     device = batches[0].image.device
-    words = ["consistent object", "", "mismatched object"]
+    words = ["consistent object", "", "mismatched object", ""]
+    sees = [True, True, True, False]
     embeddings = prior.embed(words)
     latents = [prior.encode(b.image) for b in batches]
     gbuffer = batches[0].gbuffer
@@ -99,13 +104,14 @@ def potentials(
             noisy = prior.schedule.add_noise(z, noise, times)
             predicted = [
                 prior.predict(
-                    noisy, times, e[None].expand(count, -1, -1), [None] * count, shown, gbuffer
+                    noisy, times, e[None].expand(count, -1, -1), [None] * count, shown, gbuffer,
+                    [is_seen] * count,
                 )
-                for e in embeddings
-            ]
-            for row, (good, null, bad, plain) in ROWS.items():
-                delta = good * predicted[0] + null * predicted[1] + bad * predicted[2]
-                total[row] += sigma * (delta + plain * noise) / noises
+                for e, is_seen in zip(embeddings, sees, strict=True)
+            ]  # fmt: skip
+            for row, weights in ROWS.items():
+                terms = zip(weights, [*predicted, noise], strict=True)
+                total[row] += sigma * sum(w * x for w, x in terms) / noises
         for row in ROWS:
             forces[row].append(total[row])
     found = {}

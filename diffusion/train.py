@@ -197,6 +197,7 @@ def train_prior(
     seed: int = 0,
     validation: Mapping[str, Sequence[Batch]] | None = None,
     pairs: Mapping[str, Sequence[Pair]] | None = None,
+    network: EmbeddedNetwork | None = None,
     say: Callable[[str], None] = log.info,
 ) -> Progress:
     """Train until the clock or the plan ends it; ``out`` then holds a checkpoint and the curve.
@@ -212,6 +213,7 @@ def train_prior(
         seed: Of weights and draws; each run draws new ones.
         validation: Fixed batches by the name of their set, on the device.
         pairs: Fixed pairs by the name of their set, on the device.
+        network: What a new training starts from; default: random weights.
         say: Is told how it goes.
 
     Returns:
@@ -225,7 +227,7 @@ def train_prior(
     start = time.monotonic()
     device, worker = torch.device(device), Worker.this()
     with _process_group(worker, device):
-        training = _Training(settings, device, worker, out, resume, seed, say)
+        training = _Training(settings, device, worker, out, resume, seed, network, say)
         judge = Validation(settings, device, validation or {}, pairs or {})
         training.run(batches, judge, start, 60.0 * minutes, 60.0 * total_minutes)
     return training.progress
@@ -297,6 +299,7 @@ class _Training:
         out: Path,
         resume: bool,
         seed: int,
+        start: EmbeddedNetwork | None,
         say: Callable[[str], None],
     ) -> None:
         self.settings, self.device, self.worker, self.out = settings, device, worker, out
@@ -312,8 +315,8 @@ class _Training:
             if checkpoints_in(out):
                 advice = "resume it, or give another folder"
                 raise ModelError(str(out), "holds a training that was begun", advice)
-            network, self.progress = build_network(settings.network, seed), Progress()
-            average = copy.deepcopy(network)
+            network = start or build_network(settings.network, seed)
+            average, self.progress = copy.deepcopy(network), Progress()
         self.progress.runs += 1
         self.first_step = self.progress.step
         self.network = network.to(device).train()

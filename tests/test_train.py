@@ -175,7 +175,7 @@ def test_weights_are_one_on_average() -> None:
 
 
 def training(out: Path, settings: TrainSettings = SETTINGS) -> module._Training:
-    return module._Training(settings, CPU, Worker.this(), out, False, 0, lambda text: None)
+    return module._Training(settings, CPU, Worker.this(), out, False, 0, None, lambda text: None)
 
 
 def test_conditions_and_words_are_withheld_as_often_as_stated(tmp_path: Path) -> None:
@@ -517,3 +517,14 @@ def test_processes_share_their_gradients(tmp_path: Path) -> None:
     assert ends[0][0] == ends[1][0] and ends[0][1] != ends[1][1]
     progress = read_checkpoint(tmp_path / "out").progress
     assert (progress.step, progress.samples) == (3, 24)
+
+
+def test_a_new_training_may_start_from_given_weights(tmp_path: Path) -> None:
+    begun = build_network(TINY, 7)
+    before = {k: v.clone() for k, v in begun.state_dict().items()}
+    settings = replace(SETTINGS, step_limit=1, rate=1e-12, decay=0.0)
+    train_prior(draw, tmp_path, settings, CPU, 1.0, 1.0, network=begun)
+    after = read_checkpoint(tmp_path).average.state_dict()
+    for name, value in before.items():
+        torch.testing.assert_close(after[name], value.half().float(), rtol=1e-3, atol=1e-5)
+    assert not torch.equal(before["words.weight"], build_network(TINY, 0).words.weight)

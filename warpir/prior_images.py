@@ -504,7 +504,12 @@ class SceneGenerator:
         last = torch.where(made_up, pool.count, panoramas)
         # Panoramas of nothing but sky have no ground to photograph: they come last.
         last = torch.where(is_panorama & (pool.grounded_count > 0), pool.grounded_count, last)
-        map_index = (first + (rand() * (last - first)).long()).clamp(max=pool.count - 1)
+        map_index, second = (
+            (first + (rand() * (last - first)).long()).clamp(max=pool.count - 1) for _ in range(2)
+        )
+        # Few panoramas have a sun: made-up scenes are lit by the sunnier of two.
+        is_sunnier = self._share[second] > self._share[map_index]
+        map_index = torch.where(~made_up & ~is_panorama & is_sunnier, second, map_index)
         light = self._light_of(pool, map_index, u(0.0, 2.0 * np.pi), pick(0.5))
         # Scene types: 0 street, 1 yard, 2 table, 3 room.
         place_kind = (rand() * 3.0).long()

@@ -76,8 +76,8 @@ def _first_line() -> str:
 
 def _run(arguments: list[str]) -> int:
     options = _parser().parse_args(arguments)
-    if options.network == "prior" and options.start is not None:
-        raise usage("--start", "the prior begins with random weights, or goes on with --resume")
+    if options.resume and options.start is not None:
+        raise usage("--start", "what is resumed has its own weights")
     panoramas = files_in(options.panoramas, (".hdr", ".exr"))
     assets = files_in(options.assets, (".glb", ".gltf", ".obj", ".stl", ".ply"))
     unknown = sorted({*options.without, *options.validation} - {p.stem for p in panoramas + assets})
@@ -180,6 +180,7 @@ def _train_prior(
     device: torch.device,
     record: dict[str, Any],
 ) -> dict[str, Any]:
+    from warpir.diffusion.embedded import read_network
     from warpir.diffusion.train import TrainSettings, export_prior, train_prior
     from warpir.prior_images import Mixture, SceneGenerator
     from warpir.regressor import load_regressor
@@ -187,6 +188,10 @@ def _train_prior(
     learned, unseen = stocks
     regressor = load_regressor(options.regressor, device)
     record = record | {"regressor": regressor.record}
+    start = None
+    if options.start is not None:
+        start, begun = read_network(options.start)
+        record |= {"started_from": begun}
 
     def drawn(mixture: Mixture) -> list[PriorBatch]:
         scenes = SceneGenerator(unseen, VALIDATION_SEED, mixture, regressor)
@@ -219,6 +224,7 @@ def _train_prior(
         seed=options.seed,
         validation=validation,
         pairs=pairs,
+        network=start,
         say=say if is_first() else _nobody,
     )
     if is_first():

@@ -275,14 +275,16 @@ def make_lights(count: int, generator: torch.Generator, device: torch.device | s
     )
     strength = torch.where(kind == 1, u(0.2, 0.7), u(0.0, 0.25))[:, None, None]
     maps = maps * torch.exp(strength * patches)[..., None]
-    # The sun: its share falls with the air that it passes.
-    ratio = torch.exp(u(np.log(1.5), np.log(9.0)))
-    ratio = torch.where(kind == 1, torch.exp(u(np.log(0.2), np.log(2.5))), ratio)
+    # The sun, facing it, over the sky on level ground. The air that it passes colours it more than
+    # it weakens that ratio, for the sky darkens with it: clear panoramas have 4 to 13, at all
+    # elevations.
+    ratio = torch.exp(u(np.log(2.0), np.log(16.0)))
+    ratio = torch.where(kind == 1, torch.exp(u(np.log(0.2), np.log(5.0))), ratio)
     ratio = torch.where(kind == 2, u(0.0, 0.03), ratio)
-    air = torch.exp(-0.12 / elevation.sin().clamp(min=0.03))
-    sun = (ratio * air)[:, None] * torch.stack(
-        [torch.ones_like(air), 0.55 + 0.42 * air, 0.25 + 0.65 * air], dim=1
-    )
+    sine = elevation.sin().clamp(min=0.03)
+    air = torch.exp(-0.12 / sine)
+    tint = torch.stack([torch.ones_like(air), 0.55 + 0.42 * air, 0.25 + 0.65 * air], dim=1)
+    sun = (ratio * torch.exp(-0.03 / sine))[:, None] * tint
     sigma = torch.deg2rad(torch.exp(u(np.log(0.27), np.log(1.5))))
     sigma = torch.where(kind == 1, sigma * u(1.0, 4.0), sigma)
     # Rooms and nights: walls, and blobs of light of which the strongest is the "sun".
@@ -306,7 +308,7 @@ def make_lights(count: int, generator: torch.Generator, device: torch.device | s
     lamp = torch.exp(u(np.log(0.1), np.log(4.0)))[:, None] * lamp_tint
     within = is_room | is_night
     chooser = within[:, None, None, None]
-    ground_albedo = u(0.08, 0.5, 3) * torch.tensor([1.0, 0.92, 0.8], device=device)
+    ground_albedo = u(0.05, 0.4, 3) * torch.tensor([1.0, 0.92, 0.8], device=device)
     falling = (gray(maps) * y.clamp(min=0.0) * omega).sum(dim=(1, 2))[:, None]
     below = ground_albedo * (falling + sun * axis[:, 1:2].clamp(min=0.0)) / np.pi
     maps = torch.where(y[None, ..., None] > 0.0, maps, below[:, None, None, :])
