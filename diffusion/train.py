@@ -319,6 +319,8 @@ class _Training:
             average, self.progress = copy.deepcopy(network), Progress()
         self.progress.runs += 1
         self.first_step = self.progress.step
+        is_new = not resume and start is None
+        self.warmup_steps = settings.warmup_steps if is_new else settings.resume_warmup_steps
         self.network = network.to(device).train()
         self.average = average.to(device).requires_grad_(False).eval()
         if is_cuda:
@@ -450,9 +452,8 @@ class _Training:
     def _rate(self, share: float) -> float:
         """Return the learning rate when ``share`` of the plan is used."""
         s = self.settings
-        warmup = s.resume_warmup_steps if self.first_step else s.warmup_steps
         since = self.progress.step - self.first_step + 1
-        rise = min(1.0, since / max(warmup, 1))
+        rise = min(1.0, since / max(self.warmup_steps, 1))
         late = max(0.0, share - s.constant_share) / max(1.0 - s.constant_share, 1e-9)
         return s.rate * rise * (1.0 - (1.0 - s.final_rate) * min(late, 1.0))
 

@@ -227,7 +227,7 @@ def test_the_rate_rises_stays_and_falls(tmp_path: Path) -> None:
     assert rates == [0.25, 0.5, 0.75, 1.0, 1.0, 1.0]
     for share, rate in ((0.55, 1.0), (0.775, 0.51), (1.0, 0.02), (1.5, 0.02)):
         assert made._rate(share) == pytest.approx(rate)
-    made.first_step = 4  # resumed: its own warm-up, of two steps
+    made.first_step, made.warmup_steps = 4, 2  # resumed: its own warm-up, of two steps
     made.progress.step = 4
     assert made._rate(0.0) == 0.5
 

@@ -69,7 +69,7 @@ PRIOR_DEFAULTS: dict[str, dict[str, Any]] = {
     },
 }
 """What a field that is None stands for, by the prior that guides."""
-EMBEDDED_STEPS = 200
+EMBEDDED_STEPS = 100
 """Steps with which the embedded prior was tried; it is not asked unless --steps says so."""
 CPU_DEFAULTS: dict[str, dict[str, Any]] = {
     "stable-diffusion": {},

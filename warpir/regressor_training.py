@@ -50,7 +50,7 @@ NORMALS = 32
 """Directions of surfaces whose irradiance is compared."""
 MAP_FLOOR = 0.02
 """Ambient radiance over the mean luminance, below which differences fade."""
-SUNNY_SHARE = 0.3
+SUNNY_SHARE = 0.2
 """Share of the irradiance from which a dominant light counts as one."""
 COVERAGE = 0.68
 """Share of the truth that the region of this probability shall hold."""
