@@ -209,9 +209,9 @@ def main() -> None:
     }  # fmt: skip
     for kind, by_family in result.items():
         for family, by_span in by_family.items():
-            print(f"{kind}, {family}, {by_span.pop('scenes')} scenes")
-            for span, by_row in by_span.items():
-                for row, numbers in by_row.items():
+            print(f"{kind}, {family}, {by_span['scenes']} scenes")
+            for span in TIMES:
+                for row, numbers in by_span[span].items():
                     text = ", ".join(f"{key} {value:.2f}" for key, value in numbers.items())
                     print(f"    {span:8s}{row:14s}{text}")
     if options.json:

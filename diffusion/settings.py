@@ -75,8 +75,6 @@ class PersonalizeSettings:
 class GuidanceOptions:
     """What every prior is asked in the same way."""
 
-    guidance_scale: float = 100.0
-    """g of the SDS losses: g e(prompt) + (1 - g) e(null) - noise"""
     negative_prompt: str = ""
     """What the losses with a negative term move away from (default: of the embedded prior, the same
     words with another light)"""
@@ -103,6 +101,8 @@ class GuidanceSettings(GuidanceOptions):
     loss: str = "lds"
     """lds, sds, sds-base (no LoRA), csd, lds-lora-both, lds-negative, good-bad, sds-good-bad, or
     dataset-update"""
+    guidance_scale: float = 100.0
+    """g of the SDS losses: g e(prompt) + (1 - g) e(null) - noise"""
     null_background: str = "keep"
     """Whether the null and negative terms see the photo: keep or drop (Stable Diffusion sees only
     the composite)"""
@@ -127,6 +127,7 @@ class GuidanceChoices(GuidanceOptions):
     """`GuidanceSettings` as a user may leave them open; their help is there."""
 
     loss: str | None = None
+    guidance_scale: float | None = None
     null_background: str | None = None
     time_min: float | None = None
     time_max: float | None = None

@@ -123,7 +123,7 @@ def test_command_help_tells_what_each_prior_gets(capsys: pytest.CaptureFixture[s
     """What is open has no default of its own: the help names those of both priors, by the table."""
     assert warpir.insert.main(["--help"]) == 0
     text = " ".join(capsys.readouterr().out.split())
-    assert "(default: embedded sds-good-bad; Stable Diffusion lds)" in text
+    assert "(default: embedded sds-base; Stable Diffusion lds)" in text
     assert "(default: embedded 4, on the CPU 2; Stable Diffusion 1)" in text
     assert "(default: embedded 0; Stable Diffusion 600)" in text
     assert text.count("it failed its release gate") == 2
@@ -142,7 +142,7 @@ def test_open_values_are_the_priors() -> None:
     for on_cuda, noises, width in ((True, 4, 384), (False, 2, 256)):
         config = InsertConfig(weight="uniform", steps=9).settled(on_cuda)
         assert (config.noises, config.picture_width) == (noises, width)
-        assert (config.loss, config.weight) == ("sds-good-bad", "uniform")
+        assert (config.loss, config.weight) == ("sds-base", "uniform")
         assert config.accept and config.personalize is False and config.tone_operator == "linear"
         assert config.settled(not on_cuda) == config
     assert InsertConfig(loss="dataset-update", steps=9).settled().accept is False
@@ -328,7 +328,7 @@ def test_command_reads_values(argv: list[str], name: str, value: object) -> None
             "--time-min",
             "at most --time-max (found 0.7 and 0.6)",
         ),
-        (["--time-min", "0.9"], "--time-min", "at most --time-max (found 0.9 and 0.8)"),
+        (["--time-min", "0.95"], "--time-min", "at most --time-max (found 0.95 and 0.9)"),
         ([*PAINTER, "--crop-min", "4"], "--crop-min", "at most --crop-max"),
         (["--crop-min", "5"], "--crop-min", "at most --crop-max (found 5 and 4)"),
         (["--loss", "lds"], "--loss", "lds compares the adapted model"),
@@ -339,9 +339,9 @@ def test_command_reads_values(argv: list[str], name: str, value: object) -> None
         ),
         (["--guidance", "none", "--no-accept"], "--accept", "needs --guidance"),
         (["--guidance", "none", "--prior", "p"], "--prior", "needs --guidance embedded"),
-        (["--prior", "p"], "--prior", "and --steps 200: the prior is not asked without"),
-        (["--accept"], "--accept", "--steps 200 for the embedded one"),
-        (["--resume", "--steps", "0"], "--resume", "--steps 200 for the embedded one"),
+        (["--prior", "p"], "--prior", "and --steps 60: the prior is not asked without"),
+        (["--accept"], "--accept", "--steps 60 for the embedded one"),
+        (["--resume", "--steps", "0"], "--resume", "--steps 60 for the embedded one"),
         (["--steps", "9", "--exposure", "1"], "--exposure", "is recovered"),
         ([*PAINTER, "--lora", "l", "--no-personalize"], "--no-personalize", "--lora"),
         (["--start", "sunny"], "--start", "regressed or uniform"),

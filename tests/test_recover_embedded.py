@@ -107,7 +107,7 @@ def test_default_run_is_the_regressed_light(
     measured = record(out)["measured"]
     spread = measured["regression"]["spread_deg"]
     assert f"light regressed from the photo, +- {spread:.0f} degrees" in said
-    not_asked = "the embedded prior was not asked (--steps 200: experimental, it failed its release"
+    not_asked = "the embedded prior was not asked (--steps 60: experimental, it failed its release"
     assert not_asked in said and not_asked in measured["prior_about"]
     assert measured["prior"] == "none" and "acceptance" not in measured
     assert [p.name for p in (out / "progress").iterdir()] == ["preview-000000.png"]
@@ -148,7 +148,7 @@ def test_guided_run_says_who_spoke(
     assert "its end accepted; light regressed from the photo, +- " in said
     assert "degrees; transport and mis on cpu" in said
     assert "accepted: guidance, asked anew, prefers the end (dU = -3 +- 1)" in said
-    names = {"lobes.json", "lobes_shadow.json", "optimization.json", "progress", "run.json"}
+    names = {"lobes.json", "optimization.json", "progress", "run.json"}
     assert {p.name for p in out.iterdir()} == {*ALWAYS, *names}
     previews = [f"preview-{step:06d}.png" for step in (0, 2, 4)]
     assert sorted(p.name for p in (out / "progress").iterdir()) == previews
@@ -159,7 +159,7 @@ def test_guided_run_says_who_spoke(
     assert any(ABOUT in notice for notice in run["notices"])
     assert any("what the regressor sees in the photo" in line for line in run["assumed"])
     settings = measured["settings"]
-    assert (settings["loss"], settings["noises"], settings["steps"]) == ("sds-good-bad", 2, 4)
+    assert (settings["loss"], settings["noises"], settings["steps"]) == ("sds-base", 2, 4)
     assert settings["personalize"] is False and settings["tone"] == "linear"
     assert measured["prompts"]["guidance"] == "consistent object"
     assert measured["prompts"]["negative"] == "mismatched object"
@@ -204,7 +204,7 @@ def test_verdict_can_be_left_out(folder: Path, tmp_path: Path) -> None:
     assert main(argv(folder, out, no_accept="", preview_every="0")) == ExitCode.DONE
     run = record(out)
     assert "acceptance" not in run["measured"] and "accept" not in run["seconds"]
-    assert (out / "lobes_shadow.json").exists() and not (out / "progress").exists()
+    assert (out / "lobes.json").exists() and not (out / "progress").exists()
 
 
 def test_judging_leaves_the_end_as_it_was(folder: Path, tmp_path: Path) -> None:
@@ -234,7 +234,7 @@ def test_adapted_to_the_photo(folder: Path, tmp_path: Path) -> None:
     assert main(argv(folder, out, **few, prompt="a red car")) == ExitCode.DONE
     assert (out / "lora_diffusers.safetensors").exists()
     measured = record(out)["measured"]
-    assert measured["settings"]["personalize"] is True
+    assert measured["settings"]["personalize"] is True and measured["settings"]["loss"] == "sds"
     assert measured["prompts"]["guidance"] == "consistent car in the style of sks rendering"
     assert "the embedded prior does not know: red" in record(out)["notices"]
 

@@ -528,3 +528,18 @@ def test_a_new_training_may_start_from_given_weights(tmp_path: Path) -> None:
     for name, value in before.items():
         torch.testing.assert_close(after[name], value.half().float(), rtol=1e-3, atol=1e-5)
     assert not torch.equal(before["words.weight"], build_network(TINY, 0).words.weight)
+
+
+def test_command_refuses_what_cannot_be_meant(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """One line names the flag or the folder."""
+    from warpir.errors import ExitCode
+    from warpir.train import main
+
+    given = ["prior", "--out", str(tmp_path), "--panoramas"]
+    argv = [*given, str(tmp_path), "--resume", "--start", "w.safetensors"]
+    assert main(argv) == ExitCode.USAGE
+    assert "error: --start: what is resumed has its own weights" in capsys.readouterr().err
+    assert main([*given, str(tmp_path / "absent")]) == ExitCode.INPUT
+    assert "no such folder" in capsys.readouterr().err

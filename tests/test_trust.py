@@ -9,7 +9,7 @@ import torch
 from tests.statistics import central_differences, compare_gradients
 from warpir.light import Lobes, fibonacci
 from warpir.sg_light import LightBounds, SGLight
-from warpir.trust import LOG_STD_MIN, SPREAD_MIN, TrustRegion, squared_angle
+from warpir.trust import LOG_STD_MIN, SHAPE_STD, SPREAD_MIN, TrustRegion, squared_angle
 
 BOUNDS = LightBounds(0.05)
 
@@ -68,6 +68,23 @@ def test_distance_is_in_units_of_the_uncertainty() -> None:
     assert distance(sun=0.5) == pytest.approx(1.0, rel=1e-4)
     assert distance(ambient=-0.6) == pytest.approx(4.0, rel=1e-4)
     assert distance(12.0, -0.5, 0.3) == pytest.approx(3.0, rel=1e-4)
+
+
+def test_the_other_lobes_change_together() -> None:
+    """What one of them does alone costs its share, in units of the shape's deviation."""
+    start = light()
+    region = TrustRegion.around(start, 0.2, 0.5, 0.4)
+    log_fluxes = region.log_fluxes.double()
+    share = float(torch.exp(log_fluxes[2]) / torch.exp(log_fluxes).sum())
+    with torch.no_grad():
+        start.log_intensity[3] += 0.4
+        start.axis[4] = turned(start.axis[4], 10.0)
+    change = math.log1p(share * math.expm1(0.4))
+    turned_share = float(torch.exp(log_fluxes[3]) / torch.exp(log_fluxes).sum())
+    away = share * (0.4 - change) ** 2 + (1.0 - share) * change**2
+    away += turned_share * (2.0 * math.sin(math.radians(5.0))) ** 2
+    expected = away / SHAPE_STD**2 + (change / 0.4) ** 2
+    assert float(region.distance(start).detach()) == pytest.approx(expected, rel=1e-4)
 
 
 def test_softness_and_colour_are_free() -> None:

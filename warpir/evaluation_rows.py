@@ -378,14 +378,21 @@ def _words(stem: str) -> str:
     return " ".join(letters.lower().split()) or "object"
 
 
+AUTHORS: dict[str, Any] = {
+    "null_background": "keep", "guidance_scale": 100.0, "time_min": 0.05, "time_max": 0.8,
+    "time_max_end": 0.4, "fusion": "schedule", "lobe_shape": True, "tone_curve": True, "rate": 1.0,
+}  # fmt: skip
+"""What ablations change of the embedded prior's defaults to be the authors' method: all unknowns,
+and their times on its schedule. Stable Diffusion's defaults are theirs already."""
+
+
 def _ablation(words: str, **changes: Any) -> Row:
-    return Row(
-        "ablations",
-        words,
-        of_subject=guided(**{"start": "uniform", "accept": False, **changes}),
-        start="uniform",
-        needs=("prior",),
-    )
+    def predict(bench: Bench, stage: Stage, subject: Subject) -> Prediction:
+        theirs = AUTHORS if bench.config.model is None else {}
+        settings = {"start": "uniform", "accept": False, **theirs, **changes}
+        return recover_light(bench, subject, subject.place.photo, settings)
+
+    return Row("ablations", words, of_subject=predict, start="uniform", needs=("prior",))
 
 
 ROWS = {

@@ -147,7 +147,7 @@ class LightOptimization(Optimization):
 
     def fusion(self, step: int) -> float:
         """Return ``s_fuse`` of a step: how far both lights have become one [1]."""
-        if self.settings.fusion == "schedule":
+        if self.settings.fusion_kind == "schedule":
             share = step / max(self.settings.step_count - 1, 1)
             start, end = self.settings.fusion_start, self.settings.fusion_end
             return min(max((share - start) / max(end - start, 1e-9), 0.0), 1.0)
@@ -156,7 +156,7 @@ class LightOptimization(Optimization):
     @property
     def final_fusion(self) -> float:
         """``s_fuse`` of what is delivered."""
-        return 1.0 if self.settings.fusion == "schedule" else 0.0
+        return 1.0 if self.settings.fusion_kind == "schedule" else 0.0
 
     def lights(self, scale: float, height: int | None = None) -> tuple[Tensor, Tensor]:
         """Return the maps that light the object and cast its shadow, shape [He, We, 3].
@@ -170,7 +170,7 @@ class LightOptimization(Optimization):
     def _separate(self, height: int) -> tuple[Tensor, Tensor]:
         """Return the maps of both sets of lobes, before fusion."""
         texels_fg = self.unknowns.light_fg.texels(height)
-        if self.settings.fusion == "single":
+        if self.settings.fusion_kind == "single":
             return texels_fg, texels_fg
         return texels_fg, self.unknowns.light_shadow.texels(height)
 
@@ -182,21 +182,23 @@ class LightOptimization(Optimization):
         return Parts(radiance, *curves, self._terms_of(maps, curves))
 
     def _fused(self, maps: tuple[Tensor, Tensor], scale: float | Tensor) -> tuple[Tensor, Tensor]:
-        return maps if self.settings.fusion == "single" else fuse(*maps, scale)
+        return maps if self.settings.fusion_kind == "single" else fuse(*maps, scale)
 
     def _terms_of(
         self, maps: tuple[Tensor, Tensor], curves: tuple[Knots, Knots]
     ) -> dict[str, Tensor]:
         """Return the authors' terms (eq. 10, 11) and ours, of which trust is there if asked for."""
         unknowns = self.unknowns
-        terms = {"chroma": 0.5 * (chroma(unknowns.light_fg) + chroma(unknowns.light_shadow))}
-        if self.settings.fusion != "single":
+        terms: dict[str, Tensor] = {}
+        if self.settings.has_lobe_shape:
+            terms["chroma"] = 0.5 * (chroma(unknowns.light_fg) + chroma(unknowns.light_shadow))
+        if self.settings.fusion_kind != "single":
             terms |= {"consistency": consistency(*maps), "spread": spread(maps[1])}
-        if self.settings.tone_curve:
+        if self.settings.has_tone_curve:
             terms["bend"] = bend(curves[0]) + bend(curves[1])
         if self.region is not None:
             terms["trust"] = self.region.distance(unknowns.light_fg)
-            if self.settings.fusion != "single":
+            if self.settings.fusion_kind != "single":
                 terms["trust"] = terms["trust"] + self.region.distance(unknowns.light_shadow)
         return terms
 
@@ -258,7 +260,7 @@ class LightOptimization(Optimization):
         with torch.no_grad():
             fg, shadow = self.lights(self.final_fusion, height)
         light_fg = Light(texels=fg.cpu().numpy())
-        if self.settings.fusion in ("schedule", "single"):
+        if self.settings.fusion_kind in ("schedule", "single"):
             return light_fg, light_fg
         return light_fg, Light(texels=shadow.cpu().numpy())
 
@@ -297,16 +299,22 @@ class _TorchHalf(torch.nn.Module):
 
 def _groups(unknowns: Unknowns, settings: OptimizeSettings) -> list[dict[str, Any]]:
     """Return each kind of parameter with its learning rate."""
-    groups = []
+    rates = {
+        "log_intensity": settings.rate_intensity,
+        "chroma": settings.rate_chroma,
+        "axis": settings.rate_axis,
+        "log_sigma": settings.rate_width,
+    }
+    groups: list[dict[str, Any]] = []
     for light in (unknowns.light_fg, unknowns.light_shadow):
-        groups += [
-            {"params": [light.log_intensity], "rate": settings.rate_intensity},
-            {"params": [light.chroma], "rate": settings.rate_chroma},
-            {"params": [light.axis], "rate": settings.rate_axis},
-            {"params": [light.log_sigma], "rate": settings.rate_width},
-        ]
+        for name, rate in rates.items():
+            parameter = getattr(light, name)
+            if settings.has_lobe_shape or name in ("log_intensity", "axis"):
+                groups.append({"params": [parameter], "rate": rate})
+            else:
+                parameter.requires_grad_(False)
     curves = [*unknowns.curve_fg.parameters(), *unknowns.curve_shadow.parameters()]
-    if settings.tone_curve:
+    if settings.has_tone_curve:
         groups.append({"params": curves, "rate": settings.rate_tone})
     else:
         for parameter in curves:

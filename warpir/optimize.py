@@ -90,7 +90,7 @@ class Optimization(ABC):
         self.unknowns, self.guide, self.settings, self.seed = unknowns, guide, settings, seed
         # Adam ignores the overall scale of a gradient; this eps keeps that true of tiny ones.
         self.optimizer = torch.optim.Adam(
-            [{**group, "lr": group["rate"]} for group in groups],
+            [{**group, "lr": settings.rate_of_all * group["rate"]} for group in groups],
             betas=(settings.adam_beta1, settings.adam_beta2),
             eps=1e-15,
         )
@@ -150,7 +150,8 @@ class Optimization(ABC):
         is_finite = d_image is not None and self._gradients_are_finite()
         if is_finite:
             for group in self.optimizer.param_groups:
-                group["lr"] = group["rate"] * self._rate_factor(step)
+                factor = self.settings.rate_of_all * self._rate_factor(step)
+                group["lr"] = group["rate"] * factor
             self.optimizer.step()
             self.project()
         self._count(is_finite)

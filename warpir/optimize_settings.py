@@ -26,14 +26,16 @@ class OptimizeSettings:
     """Rows of the maps in which the two lights are fused"""
     object_light_height: int | None = None
     """Rows of the map that lights the object while its light transport is stored"""
-    fusion: str = "schedule"
+    fusion: str | None = None
     """How the two lights become one: schedule (blended from none to all over the run), single (one
     light from the start) or none (two lights to the end)"""
     fusion_start: float = 0.0
     """Where in the run the lights begin to become one, as a share of the steps"""
     fusion_end: float = 1.0
     """Where in the run they are one, as a share of the steps"""
-    tone_curve: bool = True
+    lobe_shape: bool | None = None
+    """Recover widths and colours of the lobes too, not their directions and strengths alone"""
+    tone_curve: bool | None = None
     """Recover tone curves for the object and its shadow"""
     integrator: str = "transport"
     """What renders inside the loop: transport (light transport is traced once and then reused) or
@@ -45,6 +47,8 @@ class OptimizeSettings:
     retrace_at: float = 3.0
     """Light transport is traced again when the lights have changed so much that its noise has grown
     by this factor"""
+    rate: float | None = None
+    """Factor on all learning rates"""
     rate_end: float = 0.1
     """Factor to which all learning rates fall over the second half of the run, by a cosine"""
     rate_intensity: float = 0.12
@@ -75,7 +79,7 @@ class OptimizeSettings:
     """Bins of each tone curve"""
     bend: float = 0.1
     """Weight of the prior that keeps tone curves near the identity"""
-    trust: float = 1.0
+    trust: float = 4.0
     """Weight of the term that holds the light near the regressed one, in squares of what that is
     uncertain by; 0: nothing holds it"""
     chroma_limit: float = 1.5
@@ -89,6 +93,26 @@ class OptimizeSettings:
     def step_count(self) -> int:
         """`steps`, or the authors' number."""
         return 600 if self.steps is None else self.steps
+
+    @property
+    def fusion_kind(self) -> str:
+        """`fusion`, or the authors'."""
+        return self.fusion or "schedule"
+
+    @property
+    def has_lobe_shape(self) -> bool:
+        """`lobe_shape`, or what the authors do."""
+        return self.lobe_shape is not False
+
+    @property
+    def rate_of_all(self) -> float:
+        """`rate`, or 1."""
+        return 1.0 if self.rate is None else self.rate
+
+    @property
+    def has_tone_curve(self) -> bool:
+        """`tone_curve`, or what the authors do."""
+        return self.tone_curve is not False
 
     @property
     def picture_width(self) -> int:

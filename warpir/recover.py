@@ -200,7 +200,7 @@ def recover(
         if not verdict.is_accepted:
             return start, record, (*notices, verdict.line)
     run.output.write_json("lobes.json", lobes_to_json(unknowns.light_fg.lobes()))
-    if settings.fusion != "single":
+    if settings.fusion_kind != "single":
         run.output.write_json("lobes_shadow.json", lobes_to_json(unknowns.light_shadow.lobes()))
     light = SceneLight(light_fg, light_shadow, curves, 0.0, start.assumed)
     return light, record, notices
@@ -242,7 +242,7 @@ def judge_end(
 
     verdict = judge(guide, image)
     judges = {"score": guide}
-    if guide.row.k_n and guide.settings.loss != "good-bad":
+    if guide.condition.negative_prompt and guide.settings.loss != "good-bad":
         judges["good_bad"] = guide.with_loss("good-bad")
     compared = {}
     with torch.no_grad():
