@@ -448,7 +448,8 @@ def test_the_loops_torch_half_neither_waits_nor_uploads(device: str) -> None:
 
 @needs_cuda
 @pytest.mark.parametrize(
-    "changes", [{}, {"fusion": "single"}, {"fusion": "none"}, {"tone_curve": False}]
+    "changes",
+    [{}, {"fusion": "single"}, {"fusion": "none"}, {"tone_curve": False}, {"lobe_shape": False}],
 )
 def test_replayed_light_steps_equal_plain_ones(changes: dict[str, Any]) -> None:
     """Parameters and regularisers of a run, through recording and replays."""

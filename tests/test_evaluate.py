@@ -281,6 +281,9 @@ def test_rows_are_named_or_chosen_by_group() -> None:
         "uniform", "mean-training-light", "brightest-region",
     }  # fmt: skip
     assert "predictions" in chosen_rows(None, True)
+    plain, guided = (chosen_rows(None, False, is_guided) for is_guided in (False, True))
+    assert set(guided) - set(plain) == {"lds-uniform", "lds-regression"} and "regression" in plain
+    assert chosen_rows("lds-regression", False, False) == ["lds-regression"]
     assert "predictions" not in chosen_rows("all", False)
     for text in ("unifrom", "truth,,uniform"):
         with pytest.raises(InputError) as caught:

@@ -609,6 +609,25 @@ def test_rate_schedule(device: str) -> None:
     assert [r[-1] / RATES["tone"] for r in rates] == pytest.approx(expected.tolist())
 
 
+def test_no_lobe_shape_leaves_widths_and_colours_alone(device: str) -> None:
+    """``--no-lobe-shape``: directions and strengths move; no term for a still colour."""
+    loop = a_loop(device, settings=replace(SETTINGS, lobe_shape=False))
+    before = values(loop)
+    loop.run()
+    still = {name for name in before if name.endswith(("chroma", "log_sigma"))}
+    assert len(still) == 4 and changed(loop, before) == before.keys() - still
+    assert "chroma" not in loop.state.history[0] and "spread" in loop.state.history[0]
+
+
+def test_rate_scales_all_rates(device: str) -> None:
+    """``--rate``: of every kind of parameter, before the schedule."""
+    loop = a_loop(device, settings=replace(SETTINGS, steps=8, rate=0.25))
+    loop.step()
+    kinds = [0.25 * RATES[name] for name in ("intensity", "chroma", "axis", "width")]
+    found = [group["lr"] for group in loop.optimizer.param_groups]
+    assert found == pytest.approx([*kinds, *kinds, 0.25 * RATES["tone"]])
+
+
 def test_no_tone_curve_leaves_the_curves_alone(device: str) -> None:
     """``--no-tone-curve``: the identity before and after, and no term for its bend."""
     loop = a_loop(device, settings=replace(SETTINGS, tone_curve=False))

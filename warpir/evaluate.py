@@ -151,10 +151,8 @@ def _run(arguments: list[str]) -> int:
 
     from warpir.evaluation_rows import GROUPS, ROWS, chosen_rows
 
-    rows = chosen_rows(options.rows, options.predictions is not None)
-    if options.rows is None and not (options.model or options.prior or options.steps):
-        # A plain run of warpir.insert does not guide either, and it takes most of the time.
-        rows = [name for name in rows if "prior" not in ROWS[name].needs]
+    is_guided = bool(options.model or options.prior or options.steps)
+    rows = chosen_rows(options.rows, options.predictions is not None, is_guided)
     if options.list_rows:
         for name, row in ROWS.items():
             say(f"{name:20} {row.group:12} {row.words}")

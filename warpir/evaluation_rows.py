@@ -497,17 +497,19 @@ DEFAULT_ROWS = (
 )
 
 
-def chosen_rows(text: str | None, has_predictions: bool) -> list[str]:
+def chosen_rows(text: str | None, has_predictions: bool, is_guided: bool = True) -> list[str]:
     """Return the rows that a list of names and groups stands for, in the tables' order.
 
     Args:
         text: Names of rows and groups, separated by commas; None: `DEFAULT_ROWS`.
         has_predictions: Whether --predictions was given; its row is then among them.
+        is_guided: Whether guidance was asked for; else its rows must be named, for a plain run of
+            warpir.insert does not guide either, and they take most of the time.
 
     Raises:
         InputError: A name is unknown.
     """
-    names = set(DEFAULT_ROWS)
+    names = {k for k in DEFAULT_ROWS if is_guided or "prior" not in ROWS[k].needs}
     if text is not None:
         names = set()
         for word in (w.strip() for w in text.split(",")):
