@@ -2,6 +2,7 @@
 
 import os
 import socket
+from collections.abc import Iterator
 from typing import NoReturn
 
 import numpy as np
@@ -32,6 +33,17 @@ def device(request: pytest.FixtureRequest) -> str:
 def rng() -> np.random.Generator:
     """Random numbers that are the same in every run and for every test."""
     return np.random.default_rng(12345)
+
+
+@pytest.fixture(scope="module")
+def one_thread() -> Iterator[None]:
+    """Let torch use one thread: networks this small lose more by threads than they gain."""
+    import torch
+
+    before = torch.get_num_threads()
+    torch.set_num_threads(1)
+    yield
+    torch.set_num_threads(before)
 
 
 @pytest.fixture(autouse=True)

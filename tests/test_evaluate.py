@@ -1,12 +1,10 @@
 """The evaluation: scenes from a seed, rows that must be right or wrong, intervals, the command."""
 
 import json
-from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
 import pytest
-import torch
 import trimesh
 from numpy.typing import NDArray
 from PIL import Image
@@ -60,13 +58,7 @@ def panorama(azimuth: float, elevation: float) -> FloatArray:
     return texels.astype(np.float32)
 
 
-@pytest.fixture(scope="module", autouse=True)
-def _one_thread() -> Iterator[None]:
-    """Networks this small lose more by threads than they gain."""
-    before = torch.get_num_threads()
-    torch.set_num_threads(1)
-    yield
-    torch.set_num_threads(before)
+pytestmark = pytest.mark.usefixtures("one_thread")
 
 
 @pytest.fixture(scope="module")

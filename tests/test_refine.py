@@ -1,7 +1,6 @@
 """Refinement under a known light: what it finds again, what it leaves alone, end to end."""
 
 import json
-from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -74,13 +73,7 @@ MATTE = tuple(replace(m, base_color=(0.5,) * 3, metallic=0.0, roughness=1.0) for
 """The authors' start: a purely diffuse asset."""
 
 
-@pytest.fixture(scope="module", autouse=True)
-def _one_thread() -> Iterator[None]:
-    """Networks this small lose more by threads than they gain."""
-    before = torch.get_num_threads()
-    torch.set_num_threads(1)
-    yield
-    torch.set_num_threads(before)
+pytestmark = pytest.mark.usefixtures("one_thread")
 
 
 @pytest.fixture(autouse=True)
