@@ -63,6 +63,25 @@ class Material:
     """When false, back faces are invisible to camera rays (solid to all other rays)."""
     normal_scale: float = 1.0
     """Factor on the x and y of the normal map [1]."""
+    ior: float = 1.5
+    """Index of refraction of the dielectric (KHR_materials_ior); 0 stands for infinity."""
+    specular: float = 1.0
+    """Strength of the dielectric's reflection (KHR_materials_specular) [1]."""
+    specular_color: tuple[float, float, float] = (1.0, 1.0, 1.0)
+    """Colour of the dielectric's reflection at normal incidence, linear; may exceed 1."""
+    clearcoat: float = 0.0
+    """Share covered by a clear coat of index 1.5 (KHR_materials_clearcoat) [1]."""
+    clearcoat_roughness: float = 0.0
+    """Perceptual roughness of the coat [1]."""
+    clearcoat_normal_scale: float = 1.0
+    """Factor on the x and y of the coat's normal map [1]."""
+    sheen_color: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    """Linear colour of the sheen of cloth (KHR_materials_sheen); black for none."""
+    sheen_roughness: float = 0.0
+    """Perceptual roughness of the sheen [1]."""
+    transmission: float = 0.0
+    """Share of the light that is not reflected and passes a thin wall (KHR_materials_transmission)
+    instead of reaching the diffuse base [1]."""
     base_color_texture: TextureSlot | None = None
     """sRGB-encoded RGB, linear alpha."""
     metallic_roughness_texture: TextureSlot | None = None
@@ -71,6 +90,22 @@ class Material:
     """Tangent space, linear, +Y up."""
     emission_texture: TextureSlot | None = None
     """sRGB-encoded RGB."""
+    specular_texture: TextureSlot | None = None
+    """A: factor on `specular`."""
+    specular_color_texture: TextureSlot | None = None
+    """sRGB-encoded RGB."""
+    clearcoat_texture: TextureSlot | None = None
+    """R: factor on `clearcoat`."""
+    clearcoat_roughness_texture: TextureSlot | None = None
+    """G: factor on `clearcoat_roughness`."""
+    clearcoat_normal_texture: TextureSlot | None = None
+    """As `normal_texture`; without it the coat has the geometry's interpolated normal."""
+    sheen_color_texture: TextureSlot | None = None
+    """sRGB-encoded RGB."""
+    sheen_roughness_texture: TextureSlot | None = None
+    """A: factor on `sheen_roughness`."""
+    transmission_texture: TextureSlot | None = None
+    """R: factor on `transmission`."""
 
 
 @dataclass(frozen=True)
