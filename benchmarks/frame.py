@@ -17,8 +17,8 @@ from warpir.asset import load_asset
 from warpir.camera import camera_from_fov
 from warpir.color import linear_to_gamma
 from warpir.curves import ToneKnots
-from warpir.files import Photo, read_envmap
 from warpir.light import Light
+from warpir.photo_files import Photo, read_envmap
 from warpir.picture import Quality, make_picture
 from warpir.placement import place_asset
 from warpir.render import Renderer, choose_device

@@ -13,8 +13,8 @@ import numpy as np
 from PIL import Image
 
 from warpir.camera import Camera
-from warpir.files import read_envmap
 from warpir.panorama_crop import crop_camera, crop_radiance, expose
+from warpir.photo_files import read_envmap
 
 
 def write_crop(panorama: Path, camera: Camera, out: Path) -> dict[str, Any]:

@@ -26,7 +26,6 @@ from benchmarks.measure import context
 from warpir.asset import Asset, load_asset
 from warpir.bridge import ComposeConstants, compose
 from warpir.color import gamma_to_linear, luminance
-from warpir.files import read_envmap
 from warpir.integrator import LightTensors
 from warpir.light import (
     Light,
@@ -39,6 +38,7 @@ from warpir.light_optimization import LightOptimization, Unknowns
 from warpir.mis import MisIntegrator
 from warpir.optimize_settings import OptimizeSettings
 from warpir.panorama_crop import crop_camera, crop_radiance, expose
+from warpir.photo_files import read_envmap
 from warpir.placement import place_asset
 from warpir.render import Renderer, light_args
 from warpir.scene import Placed, Proxy, Scene

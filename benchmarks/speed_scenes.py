@@ -16,9 +16,9 @@ from benchmarks import ours
 from warpir.asset import Asset, Material, Primitive, load_asset
 from warpir.bridge import rasterize
 from warpir.camera import Camera, camera_from_fov
-from warpir.files import read_envmap
 from warpir.light import Light, Lobes, axis_from_angles, resize_map
 from warpir.lobe_fit import fit_lobes
+from warpir.photo_files import read_envmap
 from warpir.placement import place_asset
 from warpir.render import Renderer, light_args
 

@@ -22,7 +22,7 @@ from warpir.demo.sky import (
     sun_direction,
     texel_directions,
 )
-from warpir.files import read_envmap, read_photo
+from warpir.photo_files import read_envmap, read_photo
 from warpir.regressor import load_regressor, regress
 
 SHIPPED_MAX = 5_000_000

@@ -20,17 +20,9 @@ from PIL import Image, ImageCms, ImageOps
 from warpir import color
 from warpir.camera import Camera, camera_from_fov
 from warpir.errors import ExitCode, InputError
-from warpir.files import (
-    BACKGROUND_DEPTH,
-    ENVMAP_ROLLS,
-    Layers,
-    OutputFolder,
-    Photo,
-    read_envmap,
-    read_photo,
-    write_layers,
-)
+from warpir.files import BACKGROUND_DEPTH, Layers, OutputFolder, write_layers
 from warpir.light import rotate_map
+from warpir.photo_files import ENVMAP_ROLLS, Photo, read_envmap, read_photo
 
 SHARED = Path(__file__).resolve().parents[2] / "shared" / "data"
 needs_shared = pytest.mark.skipif(not SHARED.is_dir(), reason=f"no development data at {SHARED}")
@@ -925,7 +917,7 @@ def test_real_maps_have_their_sun_where_it_was_measured() -> None:
 
 def test_importing_loads_no_heavy_library() -> None:
     code = (
-        "import sys, warpir.files, warpir.camera; "
+        "import sys, warpir.files, warpir.photo_files, warpir.camera; "
         "heavy = {'torch', 'warp', 'trimesh', 'PIL', 'OpenImageIO', 'OpenEXR', 'colour'}; "
         "print(*sorted(heavy & set(sys.modules)))"
     )

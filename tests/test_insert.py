@@ -23,10 +23,10 @@ from warpir import insert
 from warpir.camera import read_camera
 from warpir.config import InsertConfig
 from warpir.errors import ExitCode, InputError
-from warpir.files import read_envmap
 from warpir.insert import main
 from warpir.light import as_map
 from warpir.lobes_file import read_lobes
+from warpir.photo_files import read_envmap
 from warpir.regressor import random_regressor, save_regressor
 
 ALWAYS = (

@@ -18,7 +18,6 @@ from warpir.asset import Asset, Material
 from warpir.bridge import rasterize
 from warpir.config import InsertConfig
 from warpir.errors import InputError
-from warpir.files import Photo
 from warpir.inputs import Inputs
 from warpir.light import (
     Light,
@@ -38,6 +37,7 @@ from warpir.light import (
 )
 from warpir.lighting import SKIES, SUN_TO_SKY, make_light
 from warpir.lobe_fit import LAMP_COUNT_MAX, fit_lobes
+from warpir.photo_files import Photo
 from warpir.placement import place_asset
 from warpir.render import light_args
 

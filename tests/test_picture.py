@@ -14,8 +14,8 @@ from warpir.asset import Material
 from warpir.bridge import ComposeConstants, compose
 from warpir.camera import Camera
 from warpir.curves import ToneKnots
-from warpir.files import Photo
 from warpir.light import Light, axis_from_angles, plain_sky
+from warpir.photo_files import Photo
 from warpir.picture import Picture, Quality, as_file_map, balls, make_picture, resize
 from warpir.render import Renderer, light_args
 from warpir.scene import Scene

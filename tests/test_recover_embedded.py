@@ -22,9 +22,10 @@ from warpir.demo import demo_config
 from warpir.diffusion import embedded
 from warpir.diffusion.embedded import GBUFFER_CHANNELS
 from warpir.errors import ExitCode
-from warpir.files import OutputFolder, read_photo
+from warpir.files import OutputFolder
 from warpir.inputs import read_inputs
 from warpir.insert import main
+from warpir.photo_files import read_photo
 from warpir.progress import StepProgress
 from warpir.record import Timings
 from warpir.regressor import load_regressor, random_regressor, regress, save_regressor

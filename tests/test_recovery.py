@@ -32,10 +32,10 @@ from benchmarks.speed_scenes import uv_ball
 from tests import oracles as o
 from tests.shapes import box
 from warpir.asset import Asset, Material
-from warpir.files import read_envmap
 from warpir.light import axis_from_angles, resize_map
 from warpir.light_optimization import LightOptimization
 from warpir.optimize_settings import OptimizeSettings
+from warpir.photo_files import read_envmap
 
 FloatArray = NDArray[np.float32]
 Float64Array = NDArray[np.float64]

@@ -26,7 +26,6 @@ from warpir.bridge import ShadeForeground
 from warpir.config import REFINE_PARTS, InsertConfig
 from warpir.curves import Curves, ToneKnots
 from warpir.errors import ExitCode, InputError
-from warpir.files import Photo
 from warpir.insert import main
 from warpir.light import Light, Lobes, plain_sky
 from warpir.lighting import SceneLight
@@ -34,6 +33,7 @@ from warpir.lit_frame import STILL_SAMPLES
 from warpir.materials_file import materials_to_json, with_materials
 from warpir.optimize import Optimization
 from warpir.optimize_settings import OptimizeSettings
+from warpir.photo_files import Photo
 from warpir.picture import Quality, make_picture
 from warpir.refine import (
     LOWEST,

@@ -18,10 +18,10 @@ from warpir.command import parse
 from warpir.config import InsertConfig
 from warpir.curves import Curves, ToneKnots, curves_to_json, read_curves
 from warpir.errors import ExitCode, InputError
-from warpir.files import read_envmap
 from warpir.inputs import read_inputs
 from warpir.light import rotate_map
 from warpir.lighting import make_light
+from warpir.photo_files import read_envmap
 from warpir.reuse import read_run
 
 ROUNDING = 1e-6

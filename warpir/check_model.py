@@ -55,7 +55,7 @@ def _run(arguments: list[str]) -> int:
         raise usage("--model", "needed", "a folder in diffusers' layout, or a hub id")
 
     from warpir.demo import PHOTO
-    from warpir.files import read_photo
+    from warpir.photo_files import read_photo
 
     photo = read_photo(config.photo or PHOTO, max_pixels=config.max_pixels, alpha=config.alpha).srgb
 

@@ -22,11 +22,12 @@ from warpir.diffusion.embedded import build_network, save_embedded
 from warpir.errors import InputError
 from warpir.evaluation_scenes import Place, Subject, mirrored
 from warpir.evaluation_stage import Prediction, Stage
-from warpir.files import OutputFolder, Photo, png_bytes, read_photo
+from warpir.files import OutputFolder, png_bytes
 from warpir.inputs import Inputs
 from warpir.light import Light, Lobes, rotate_map
 from warpir.lighting import make_light
 from warpir.lobe_fit import fit_lobes
+from warpir.photo_files import Photo, read_photo
 from warpir.placement import Placement
 from warpir.progress import StepProgress
 from warpir.record import Timings

@@ -23,9 +23,9 @@ from warpir.asset import Asset, Material, load_asset
 from warpir.camera import Camera
 from warpir.color import gamma_to_linear, linear_to_gamma, luminance
 from warpir.errors import InputError
-from warpir.files import read_envmap
 from warpir.light import Light, resize_map, rotate_map, summarize
 from warpir.panorama_crop import crop_camera, crop_radiance, expose
+from warpir.photo_files import read_envmap
 from warpir.placement import Placement, place_asset, point_on_ground, upright_plane
 
 FloatArray = NDArray[np.float32]

@@ -11,10 +11,10 @@ from warpir.asset import Asset, load_asset
 from warpir.camera import Camera, camera_from_exif, camera_from_fov, read_camera
 from warpir.config import InsertConfig, usage
 from warpir.errors import ExitCode, InputError, raise_all
-from warpir.files import Photo, read_envmap, read_photo
 from warpir.light import Light
 from warpir.lobes_file import read_lobes
 from warpir.materials_file import with_materials
+from warpir.photo_files import Photo, read_envmap, read_photo
 from warpir.placement import Placement, place_asset
 from warpir.reuse import EarlierRun, read_run
 

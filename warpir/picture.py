@@ -10,9 +10,10 @@ from numpy.typing import NDArray
 from warpir.camera import Camera
 from warpir.color import linear_to_gamma
 from warpir.curves import ToneKnots
-from warpir.files import Layers, Photo
+from warpir.files import Layers
 from warpir.inputs import Inputs
 from warpir.light import Light, as_map, map_directions, texel_solid_angles
+from warpir.photo_files import Photo
 from warpir.render import Foreground, GBuffer, Renderer, light_args
 from warpir.scene import Placed, Proxy, Scene
 

@@ -22,8 +22,10 @@ from scipy.ndimage import uniform_filter1d
 from warpir.camera import Camera
 from warpir.color import gamma_to_linear
 from warpir.errors import InputError, raise_all
-from warpir.files import ENVMAP_WIDTH_MAX, OutputFolder, check_regular_file, read_envmap
+from warpir.files import OutputFolder
+from warpir.image_decoder import check_regular_file
 from warpir.light import Float64Array, FloatArray, angles_from_axis, map_directions, rotate_map
+from warpir.photo_files import ENVMAP_WIDTH_MAX, read_envmap
 from warpir.strict_json import read_json_object
 from warpir.three_spheres import from_camera_frame, lookup_matrix
 

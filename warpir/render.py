@@ -22,7 +22,7 @@ from warpir.camera import Camera
 from warpir.color import luminance
 from warpir.curves import ToneKnots
 from warpir.errors import ExitCode, InputError
-from warpir.files import captured_stderr
+from warpir.image_decoder import captured_stderr
 from warpir.kernels.composite import tone_foreground, tone_shadow
 from warpir.kernels.path import trace_foreground
 from warpir.kernels.proxy import trace_proxy

@@ -16,9 +16,9 @@ from numpy.typing import NDArray
 
 from warpir.curves import Curves, read_curves
 from warpir.errors import InputError
-from warpir.files import read_envmap
 from warpir.light import Light
 from warpir.materials_file import MATERIALS
+from warpir.photo_files import read_envmap
 from warpir.record import RUN_FORMAT
 from warpir.strict_json import read_json_object
 

@@ -17,8 +17,8 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from warpir.color import LUMINANCE_WEIGHTS, luminance
-from warpir.files import read_envmap
 from warpir.light import map_directions, resize_map, texel_solid_angles
+from warpir.photo_files import read_envmap
 
 FloatArray = NDArray[np.float32]
 Float64Array = NDArray[np.float64]

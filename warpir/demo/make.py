@@ -84,8 +84,8 @@ def render(with_car: bool, samples: int, device: str | None, seed: int = 0) -> N
     Returns:
         Linear Rec.709 radiance, shape [H, W, 3].
     """
-    from warpir.files import read_envmap
     from warpir.light import Light
+    from warpir.photo_files import read_envmap
     from warpir.render import Renderer, choose_device, light_args
     from warpir.scene import Placed, Proxy, Scene
 

@@ -1,0 +1,214 @@
+"""Photographs and environment maps in: what each file holds, upright, finite and in our colours.
+
+The order of the checks: `stat`, magic bytes, header against the size limit, pixels, the library's
+error flag (`warpir.image_decoder`), orientation, colour (`warpir.color_profile`), alpha. Nothing
+behind this border checks again. What is written is in `warpir.files`.
+"""
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from warpir import color
+from warpir.color_profile import convert_profile, srgb_to_profile
+from warpir.errors import InputError
+from warpir.image_decoder import FloatArray, Pixels, decode_image, upright
+from warpir.light import rotate_map
+
+PHOTO_PIXELS_MAX = 64_000_000
+"""Default of ``--max-pixels`` [px]."""
+ENVMAP_WIDTH_MAX = 16384
+"""Widest environment map accepted [px]."""
+
+ENVMAP_ROLLS = {"openexr": 0.0, "nvdiffrec": -0.5, "threejs": -0.25, "blender": -0.25}
+"""Columns to roll a map of each convention by, as a share of its width, to make it ours."""
+
+
+@dataclass(frozen=True)
+class Photo:
+    """A photograph or plate as its file has it, upright, and what the renderer makes of it."""
+
+    codes: Pixels
+    """The file's own numbers in their native type, upright, shape [H, W, 3]."""
+    srgb: FloatArray
+    """Display-encoded Rec.709, in [0, 1], shape [H, W, 3]."""
+    kind: str
+    """``jpeg``, ``png``, ``tiff``, ``webp``, ``exr`` or ``hdr``."""
+    icc: bytes | None = None
+    """The file's colour profile when it is not sRGB; `codes` are in it."""
+    focal_35mm: float | None = None
+    """EXIF focal length, 35 mm equivalent [mm]."""
+    notices: tuple[str, ...] = ()
+    """What was assumed, expanded, repaired or left out, one line each."""
+
+    @property
+    def is_linear(self) -> bool:
+        """Whether the codes are scene-linear floats (EXR, HDR, float TIFF)."""
+        return self.codes.dtype.kind == "f"
+
+    def linear(self) -> FloatArray:
+        """Return ``photo_lin`` [1], shape [H, W, 3]: ``srgb ** 2.2``, or a plate's own values.
+
+        Unlike `srgb`, a linear plate keeps what lies outside [0, 1].
+        """
+        if self.is_linear:
+            return self.codes.astype(np.float32, copy=False)
+        linear: FloatArray = color.gamma_to_linear(self.srgb)
+        return linear
+
+    def encode(self, srgb: FloatArray, changed: NDArray[np.bool_]) -> Pixels:
+        """Turn an edited image into codes that can be saved in place of the photograph.
+
+        Args:
+            srgb: The edited image, display-encoded Rec.709, shape [H, W, 3].
+            changed: Where it was edited, shape [H, W]; all other pixels keep their codes.
+
+        Returns:
+            Integer codes in the photograph's own type and profile, shape [H, W, 3]; 16-bit
+            ones for a linear plate, which has no display codes to keep.
+        """
+        if self.is_linear:
+            return np.round(np.clip(srgb, 0.0, 1.0) * 65535.0).astype(np.uint16)
+        own = srgb
+        if self.icc is not None:
+            in_profile = srgb_to_profile(srgb, self.icc)
+            assert in_profile is not None, "read_photo keeps only profiles that work both ways"
+            own = in_profile
+        top = np.iinfo(self.codes.dtype).max
+        edited = np.round(np.clip(own.astype(np.float64), 0.0, 1.0) * top).astype(self.codes.dtype)
+        return np.where(changed[..., None], edited, self.codes)
+
+
+def read_photo(
+    path: str | Path,
+    *,
+    max_pixels: int = PHOTO_PIXELS_MAX,
+    alpha: str = "refuse",
+) -> Photo:
+    """Read a photograph: JPEG, PNG, TIFF or WebP, or a linear plate in EXR, HDR or float TIFF.
+
+    Args:
+        path: The file; recognised by content, not by name.
+        max_pixels: Largest image decoded [px] (``--max-pixels``).
+        alpha: ``refuse`` a transparent image, or ``ignore`` its alpha (``--alpha``).
+
+    Raises:
+        InputError: Missing, not an image, truncated, too large, transparent, or in a colour
+            space that cannot be converted.
+    """
+    path = Path(path)
+    image = decode_image(path, max_pixels)
+    notices = list(image.notices)
+    codes = image.pixels
+    if image.alpha is not None:
+        opaque = 1.0 if codes.dtype.kind == "f" else np.iinfo(codes.dtype).max
+        if not bool(np.all(image.alpha >= opaque)):
+            if alpha != "ignore":
+                raise InputError(
+                    path,
+                    "partly transparent (found an alpha channel; expected an opaque photograph)",
+                    "flatten it, or pass --alpha ignore",
+                )
+            notices.append("alpha channel ignored")
+    codes = upright(codes, image.orientation)
+    if codes.shape[-1] == 1:
+        notices.append("grey image expanded to three channels")
+        codes = np.repeat(codes, 3, axis=-1)
+    if bool((codes == codes[0, 0]).all()):
+        notices.append("no signal: every pixel has the same value")
+
+    icc: bytes | None = None
+    if codes.dtype.kind == "f":
+        codes, repaired = _finite(codes)
+        if repaired:
+            notices.append(f"{repaired} non-finite pixels set to 0")
+        notices.append("float image taken as scene-linear, encoded with exponent 1/2.2")
+        plate = codes.astype(np.float32, copy=False)
+        srgb: FloatArray = np.clip(color.linear_to_gamma(plate), 0.0, 1.0)
+    else:
+        srgb = codes.astype(np.float32) / np.float32(np.iinfo(codes.dtype).max)
+        if image.icc is not None:
+            codes, srgb, icc, notice = convert_profile(path, codes, srgb, image.icc)
+            notices += [notice] if notice else []
+    return Photo(
+        np.ascontiguousarray(codes),
+        np.ascontiguousarray(srgb),
+        image.kind,
+        icc,
+        image.focal_35mm,
+        tuple(notices),
+    )
+
+
+def read_envmap(
+    path: str | Path,
+    *,
+    convention: str = "openexr",
+    strict: bool = False,
+    notices: list[str] | None = None,
+) -> FloatArray:
+    """Read a lat-long environment map and turn it to our orientation; never clamped.
+
+    Ours is OpenEXR's: image centre +Z, left quarter +X, so the texel at (u, v) shines from
+    ``(sin lon cos lat, sin lat, cos lon cos lat)``, ``lon = pi (1 - 2u)``, ``lat = pi (1/2 - v)``.
+
+    Args:
+        path: A 2:1 ``.hdr`` or ``.exr`` file, recognised by content.
+        convention: Who made the map: a key of `ENVMAP_ROLLS`.
+        strict: Refuse NaN, infinite and negative values instead of repairing them.
+        notices: One line per repair is appended here.
+
+    Returns:
+        Radiance, relative [W/(m^2 sr)], finite and not negative, shape [He, We, 3].
+
+    Raises:
+        InputError: Missing, damaged, not 2:1, not an HDR format, or (strict) not clean.
+    """
+    path = Path(path)
+    if convention not in ENVMAP_ROLLS:
+        raise ValueError(f"convention {convention!r} is not one of {', '.join(ENVMAP_ROLLS)}")
+    image = decode_image(path, ENVMAP_WIDTH_MAX * ENVMAP_WIDTH_MAX // 2, kinds=("exr", "hdr"))
+    texels = upright(image.pixels, image.orientation).astype(np.float32)
+    if texels.shape[-1] == 1:
+        texels = np.repeat(texels, 3, axis=-1)
+    height, width = texels.shape[:2]
+    if width != 2 * height or height < 2:
+        raise InputError(
+            path,
+            f"not a lat-long map (found {width} x {height}; expected 2:1)",
+            "resize it to twice as wide as high",
+        )
+    texels /= np.float32(image.exposure)
+    messages = list(image.notices)
+    bad = ~np.isfinite(texels)
+    negative = texels < 0.0
+    negative &= ~bad
+    if bad.any() or negative.any():
+        found = (
+            f"{int(np.isnan(texels).sum())} NaN, {int(np.isinf(texels).sum())} infinite, "
+            f"{int(negative.sum())} negative values"
+        )
+        if strict:
+            raise InputError(
+                path, f"not clean radiance (found {found}; expected finite values >= 0)"
+            )
+        brightest = float(texels[~bad].max(initial=0.0))
+        texels[np.isposinf(texels)] = brightest
+        texels[~(texels >= 0.0)] = 0.0
+        messages.append(f"{found} repaired: +Inf to the brightest finite value, the others to 0")
+    if notices is not None:
+        notices += messages
+    # Longitude falls with u: rolling to the right by a share of the width is a clockwise turn.
+    return rotate_map(texels, -360.0 * ENVMAP_ROLLS[convention])
+
+
+def _finite(codes: Pixels) -> tuple[Pixels, int]:
+    """Set non-finite pixels to black; return how many there were."""
+    bad = ~np.isfinite(codes).all(axis=-1)
+    count = int(bad.sum())
+    if count:
+        codes = codes.copy()
+        codes[bad] = 0
+    return codes, count
