@@ -1,4 +1,4 @@
-"""Photographs and environment maps in: what each file holds, upright, finite and in our colours.
+"""Photographs, masks and environment maps in: upright, finite and in our colours.
 
 The order of the checks: `stat`, magic bytes, header against the size limit, pixels, the library's
 error flag (`warpir.image_decoder`), orientation, colour (`warpir.color_profile`), alpha. Nothing
@@ -202,6 +202,64 @@ def read_envmap(
         notices += messages
     # Longitude falls with u: rolling to the right by a share of the width is a clockwise turn.
     return rotate_map(texels, -360.0 * ENVMAP_ROLLS[convention])
+
+
+def read_mask(
+    path: str | Path, photo_size: tuple[int, int], *, notices: list[str] | None = None
+) -> FloatArray:
+    """Read a mask that belongs to a photograph: grey, upright, of the photograph's size.
+
+    Codes are shares, not colours: no profile and no transfer function is applied.
+
+    Args:
+        path: 8 or 16 bits, float, 1 bit or a palette; RGB where its channels are equal.
+        photo_size: Width and height of the upright photograph [px].
+        notices: One line per thing that was left out, or looks odd, is appended here.
+
+    Returns:
+        Share of the pixel, 0 (black) to 1 (white) [1], shape [H, W].
+
+    Raises:
+        InputError: Missing, damaged, of another size, coloured, or floats outside [0, 1].
+    """
+    path = Path(path)
+    width, height = photo_size
+    image = decode_image(path, max(PHOTO_PIXELS_MAX, width * height))
+    codes = upright(image.pixels, image.orientation)
+    if codes.shape[:2] != (height, width):
+        raise InputError(
+            path,
+            f"not of the photo's size (found {codes.shape[1]} x {codes.shape[0]}; expected "
+            f"{width} x {height}, the upright photo)",
+            "resize it, or draw it over the upright photo",
+        )
+    if codes.dtype.kind == "f" and not bool(((codes >= 0.0) & (codes <= 1.0)).all()):
+        raise InputError(path, "not a mask (found floats outside 0 to 1, or not finite)")
+    if not bool((codes == codes[..., :1]).all()):
+        raise InputError(
+            path,
+            "not a mask (found three channels that differ; expected a grey image)",
+            "save it as greyscale: black is 0, white is 1",
+        )
+    is_even = bool((codes == codes[0, 0]).all())
+    messages = list(image.notices)
+    if image.alpha is not None:
+        if is_even and not bool((image.alpha == image.alpha[0, 0]).all()):
+            raise InputError(
+                path,
+                "one value everywhere, and only its alpha differs (expected a grey image)",
+                "save the alpha channel as a greyscale image",
+            )
+        messages.append("alpha channel ignored")
+    if is_even:
+        messages.append("no signal: every pixel has the same value")
+    if codes.dtype.kind == "f":
+        mask = codes[..., 0].astype(np.float32)
+    else:
+        mask = codes[..., 0].astype(np.float32) / np.float32(np.iinfo(codes.dtype).max)
+    if notices is not None:
+        notices += messages
+    return np.ascontiguousarray(mask)
 
 
 def _finite(codes: Pixels) -> tuple[Pixels, int]:
