@@ -13,17 +13,15 @@ from numpy.typing import NDArray
 
 from warpir import color
 from warpir.color_profile import convert_profile, srgb_to_profile
+from warpir.envmap_conventions import SEAM_SHIFTS, to_ours
 from warpir.errors import InputError
 from warpir.image_decoder import FloatArray, Pixels, decode_image, upright
-from warpir.light import rotate_map
+from warpir.light import Float64Array
 
 PHOTO_PIXELS_MAX = 64_000_000
 """Default of ``--max-pixels`` [px]."""
 ENVMAP_WIDTH_MAX = 16384
 """Widest environment map accepted [px]."""
-
-ENVMAP_ROLLS = {"openexr": 0.0, "nvdiffrec": -0.5, "threejs": -0.25, "blender": -0.25}
-"""Columns to roll a map of each convention by, as a share of its width, to make it ours."""
 
 
 @dataclass(frozen=True)
@@ -146,6 +144,7 @@ def read_envmap(
     path: str | Path,
     *,
     convention: str = "openexr",
+    camera_to_world: Float64Array | None = None,
     strict: bool = False,
     notices: list[str] | None = None,
 ) -> FloatArray:
@@ -156,7 +155,8 @@ def read_envmap(
 
     Args:
         path: A 2:1 ``.hdr`` or ``.exr`` file, recognised by content.
-        convention: Who made the map: a key of `ENVMAP_ROLLS`.
+        convention: Who made the map: a key of `SEAM_SHIFTS`.
+        camera_to_world: Pose of the camera, shape [4, 4], for a map in camera axes.
         strict: Refuse NaN, infinite and negative values instead of repairing them.
         notices: One line per repair is appended here.
 
@@ -167,8 +167,8 @@ def read_envmap(
         InputError: Missing, damaged, not 2:1, not an HDR format, or (strict) not clean.
     """
     path = Path(path)
-    if convention not in ENVMAP_ROLLS:
-        raise ValueError(f"convention {convention!r} is not one of {', '.join(ENVMAP_ROLLS)}")
+    if convention not in SEAM_SHIFTS:
+        raise ValueError(f"convention {convention!r} is not one of {', '.join(SEAM_SHIFTS)}")
     image = decode_image(path, ENVMAP_WIDTH_MAX * ENVMAP_WIDTH_MAX // 2, kinds=("exr", "hdr"))
     texels = upright(image.pixels, image.orientation).astype(np.float32)
     if texels.shape[-1] == 1:
@@ -200,8 +200,7 @@ def read_envmap(
         messages.append(f"{found} repaired: +Inf to the brightest finite value, the others to 0")
     if notices is not None:
         notices += messages
-    # Longitude falls with u: rolling to the right by a share of the width is a clockwise turn.
-    return rotate_map(texels, -360.0 * ENVMAP_ROLLS[convention])
+    return to_ours(texels, convention, camera_to_world)
 
 
 def read_mask(
