@@ -5,6 +5,8 @@ functions exist on purpose: the sRGB pair describes what files mean, the gamma 2
 DiPIR uses between the photograph and the renderer (`photo_lin = photo_srgb ** 2.2`).
 """
 
+import warnings
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -29,6 +31,62 @@ XYZ_TO_REC709 = np.array(
     ]
 )
 """CIE XYZ (D65, Y = 1 for white) to linear Rec.709, column vectors, shape [3, 3]."""
+
+
+INTEROP_SPACES = {
+    "lin_ap1_scene": "ACEScg",
+    "lin_ap0_scene": "ACES2065-1",
+    "lin_rec2020_scene": "ITU-R BT.2020",
+    "lin_p3d65_scene": "P3-D65",
+    "lin_adobergb_scene": "Adobe RGB (1998)",
+}
+"""Linear spaces of the OpenEXR attribute ``colorInteropID``, by colour-science's names."""
+
+
+def chromaticities_of(space: str) -> tuple[float, ...]:
+    """Return CIE xy of red, green, blue and white of one of colour-science's RGB spaces."""
+    found = _colour().RGB_COLOURSPACES[space]
+    return (*found.primaries.ravel().tolist(), *np.asarray(found.whitepoint).tolist())
+
+
+def are_primaries(chromaticities: Sequence[float]) -> bool:
+    """Return whether eight numbers can be CIE xy of red, green, blue and white."""
+    xy = np.asarray(chromaticities, np.float64)
+    if xy.shape != (8,) or not np.isfinite(xy).all() or (np.abs(xy) > 2.0).any() or xy[7] <= 0.0:
+        return False
+    (xr, yr), (xg, yg), (xb, yb), _ = xy.reshape(4, 2)
+    return bool(abs((xg - xr) * (yb - yr) - (xb - xr) * (yg - yr)) > 1e-3)
+
+
+def primaries_to_xyz(chromaticities: Sequence[float], white: Sequence[float]) -> FloatArray:
+    """Return the matrix from linear RGB of some primaries to CIE XYZ, shape [3, 3].
+
+    Args:
+        chromaticities: CIE xy of red, green, blue and the primaries' own white.
+        white: CIE xy of the white that theirs is adapted to (Bradford), with Y = 1.
+    """
+    xy = np.asarray(chromaticities, np.float64).reshape(4, 2)
+    colour = _colour()
+    to_xyz = colour.models.normalised_primary_matrix(xy[:3], xy[3])
+    adapt = colour.adaptation.matrix_chromatic_adaptation_VonKries(
+        colour.xy_to_XYZ(xy[3]), colour.xy_to_XYZ(np.asarray(white)), transform="Bradford"
+    )
+    matrix: FloatArray = adapt @ to_xyz
+    return matrix
+
+
+def primaries_to_rec709(chromaticities: Sequence[float]) -> FloatArray:
+    """Return the matrix from linear RGB of some primaries to ours, white on white, [3, 3]."""
+    matrix: FloatArray = XYZ_TO_REC709 @ primaries_to_xyz(chromaticities, REC709_CHROMATICITIES[6:])
+    return matrix
+
+
+def _colour() -> Any:
+    """Import colour-science, which takes a second, for the few files that need it."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # Matplotlib, which we do not need, is absent
+        import colour
+    return colour
 
 
 def luminance(rgb: FloatArray) -> FloatArray:

@@ -1,13 +1,15 @@
 """Colour profiles (ICC): from a photo's own codes to sRGB and back.
 
 OpenColorIO, behind OpenImageIO, reads matrix profiles in float; profiles with tables go through
-Pillow, in 8 bits and one way only.
+Pillow, in 8 bits and one way only. What a PNG says in other words than a profile (cICP, gAMA and
+cHRM) becomes a profile first, and so does the curve of a grey image: one path for all of them.
 """
 
 import hashlib
 import io
 import struct
 import tempfile
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -15,6 +17,136 @@ import numpy as np
 from warpir import color
 from warpir.errors import InputError
 from warpir.image_decoder import FloatArray, Pixels, captured_stderr
+
+D50 = (0.34567, 0.35850)
+"""CIE xy of the white of ICC's connection space."""
+_D50_XYZ = (0.9642, 1.0, 0.8249)
+"""The same in XYZ, with the digits of the ICC specification."""
+_CICP_PRIMARIES = {1: "ITU-R BT.709", 9: "ITU-R BT.2020", 12: "P3-D65"}
+_CICP_CURVES = {
+    4: (2.2,),
+    8: (1.0,),
+    13: (2.4, 1.0 / 1.055, 0.055 / 1.055, 1.0 / 12.92, 0.04045),
+    **dict.fromkeys((1, 6, 14, 15), (1.0 / 0.45, 1.0 / 1.099, 0.099 / 1.099, 1.0 / 4.5, 0.081)),
+}
+"""Code points of ITU-T H.273; curves as an ICC parametric curve of type 0 or 3 has them."""
+
+
+def png_profile(path: Path, icc: bytes | None) -> tuple[bytes | None, list[str]]:
+    """Return the profile of a PNG, whichever way it is stated; None for sRGB.
+
+    The PNG specification (third edition, 4.3) ranks cICP, iCCP, sRGB, gAMA with cHRM.
+
+    Args:
+        path: A PNG that was decoded.
+        icc: Its iCCP profile.
+
+    Returns:
+        The profile, and what is not followed, one line each.
+
+    Raises:
+        InputError: The signal is high dynamic range (PQ, HLG).
+    """
+    chunks = _color_chunks(path)
+    if len(chunks.get(b"cICP", b"")) == 4:
+        primaries, curve, matrix, is_full = chunks[b"cICP"]
+        if curve in (16, 18):
+            found = "PQ" if curve == 16 else "HLG"
+            raise InputError(
+                path,
+                f"high dynamic range in a PNG is not supported (found {found})",
+                "save it as a linear EXR, or as sRGB",
+            )
+        if primaries in _CICP_PRIMARIES and curve in _CICP_CURVES and not matrix and is_full:
+            if (primaries, curve) == (1, 13):
+                return None, []
+            xy = color.chromaticities_of(_CICP_PRIMARIES[primaries])
+            return matrix_profile(xy, _parametric(_CICP_CURVES[curve])), []
+        return icc, [f"cICP {primaries},{curve},{matrix},{is_full} of the header is not followed"]
+    if icc is not None or b"sRGB" in chunks:
+        return icc, []
+    gamma, xy = 1.0 / 2.2, color.REC709_CHROMATICITIES
+    if len(chunks.get(b"gAMA", b"")) == 4:
+        gamma = struct.unpack(">I", chunks[b"gAMA"])[0] / 1e5
+    if len(chunks.get(b"cHRM", b"")) == 32:
+        white_x, white_y, *rgb = (n / 1e5 for n in struct.unpack(">8I", chunks[b"cHRM"]))
+        xy = (*rgb, white_x, white_y)
+    if not (0.05 <= gamma <= 5.0 and color.are_primaries(xy)):
+        return None, ["gAMA or cHRM of the header is broken: taken as sRGB"]
+    # 1 / 2.2 with these primaries is how sRGB was written before there was a chunk for it.
+    if np.allclose(xy, color.REC709_CHROMATICITIES, atol=2e-3) and abs(gamma * 2.2 - 1.0) < 0.01:
+        return None, []
+    return matrix_profile(xy, _parametric((1.0 / gamma,))), []
+
+
+def grey_profile(icc: bytes) -> bytes:
+    """Return an RGB profile with the curve of a grey one, or the profile itself if it is none."""
+    if icc[16:20] != b"GRAY" or not _profile_is_whole(icc):
+        return icc
+    (count,) = struct.unpack_from(">I", icc, 128)
+    for k in range(count):
+        name, offset, size = struct.unpack_from(">4sII", icc, 132 + 12 * k)
+        if name == b"kTRC":
+            return matrix_profile(color.REC709_CHROMATICITIES, icc[offset : offset + size])
+    return icc
+
+
+def matrix_profile(chromaticities: Sequence[float], curve: bytes) -> bytes:
+    """Return an ICC profile (version 4.3) of three primaries and one curve for all.
+
+    Args:
+        chromaticities: CIE xy of red, green, blue and white.
+        curve: Content of a ``curv`` or ``para`` tag, from codes to linear.
+    """
+
+    def fixed(*values: float) -> bytes:
+        return struct.pack(f">{len(values)}i", *(round(value * 65536.0) for value in values))
+
+    def text(content: str) -> bytes:
+        coded = content.encode("utf-16-be")
+        return b"mluc" + struct.pack(">4xII4sII", 1, 12, b"enUS", len(coded), 28) + coded
+
+    tags = {
+        b"desc": text("Stated by the picture"),
+        b"cprt": text("None"),
+        b"wtpt": b"XYZ \0\0\0\0" + fixed(*_D50_XYZ),
+    }
+    columns = color.primaries_to_xyz(chromaticities, D50).T
+    for letter, column in zip((b"r", b"g", b"b"), columns, strict=True):
+        tags[letter + b"XYZ"] = b"XYZ \0\0\0\0" + fixed(*column)
+        tags[letter + b"TRC"] = curve
+    table, body, start = struct.pack(">I", len(tags)), b"", 132 + 12 * len(tags)
+    for name, content in tags.items():
+        table += name + struct.pack(">II", start + len(body), len(content))
+        body += content + bytes(-len(content) % 4)
+    size = start + len(body)
+    head = struct.pack(">I4xI4s4s4s", size, 0x04300000, b"mntr", b"RGB ", b"XYZ ")
+    head += struct.pack(">6H4s", 2026, 1, 1, 0, 0, 0, b"acsp") + bytes(28) + fixed(*_D50_XYZ)
+    return head.ljust(128, b"\0") + table + body
+
+
+def _parametric(numbers: Sequence[float]) -> bytes:
+    """Return an ICC parametric curve: of type 0 for one number, of type 3 for five."""
+    kind = {1: 0, 5: 3}[len(numbers)]
+    fixed = (round(number * 65536.0) for number in numbers)
+    return struct.pack(f">4s4xHxx{len(numbers)}i", b"para", kind, *fixed)
+
+
+def _color_chunks(path: Path) -> dict[bytes, bytes]:
+    """Return the chunks of a PNG that state its colours, from before its pixels."""
+    found = {}
+    with path.open("rb") as stream:
+        stream.seek(8)
+        while len(header := stream.read(8)) == 8:
+            size, name = struct.unpack(">I4s", header)
+            if name == b"IDAT" or size > 2**31:
+                break
+            if name in (b"cICP", b"sRGB", b"gAMA", b"cHRM") and size <= 32:
+                found[name] = stream.read(size)
+                stream.seek(4, 1)
+            else:
+                stream.seek(size + 4, 1)
+    return found
 
 
 def convert_profile(

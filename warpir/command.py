@@ -29,6 +29,8 @@ CONFIG_BYTES_LIMIT = 16 * 2**20
 FLAGS = {
     "input and output": {
         "photo": "FILE",
+        "layer": "NAME",
+        "occluder_mask": "FILE",
         "asset": "FILE",
         "materials": "FILE",
         "out": "DIR",
@@ -53,6 +55,7 @@ FLAGS = {
     },
     "light": {
         "light": "FILE",
+        "light_convention": "NAME",
         "light_rotate": "DEG",
         "fit_lobes": "N",
         "sun": "AZIMUTH,ELEVATION[,STRENGTH]",
@@ -176,6 +179,7 @@ FLAGS = {
     "rules for the files": {
         "alpha": "RULE",
         "max_pixels": "N",
+        "strict": "",
         "missing_textures": "RULE",
         "mark": "",
     },

@@ -100,6 +100,11 @@ class InsertConfig(ModelSettings, PersonalizeSettings, GuidanceChoices, Optimize
 
     photo: str | None = None
     """The photograph: JPEG, PNG, TIFF, WebP, EXR or Radiance HDR"""
+    layer: str | None = None
+    """Layer of an EXR photo that is used, such as beauty for beauty.R, beauty.G and beauty.B
+    (default: its R, G and B)"""
+    occluder_mask: str | None = None
+    """Grey image of the upright photo's size: white where the photo stays in front of the object"""
     asset: str | None = None
     """The object: .glb, .gltf, .obj, .ply or .stl"""
     out: str | None = None
@@ -139,7 +144,10 @@ class InsertConfig(ModelSettings, PersonalizeSettings, GuidanceChoices, Optimize
     """Longest side of the asset's bounding box after scaling [m]"""
 
     light: str | None = None
-    """The light: a panorama (.hdr, .exr) or lobes (.json)"""
+    """The light: a panorama (.hdr, .exr, or a picture without a sun's strength) or lobes (.json)"""
+    light_convention: str = "openexr"
+    """Who made the panorama, which tells where its seam lies: openexr (also OpenUSD and Mitsuba),
+    nvdiffrec, threejs, blender, or diffusionlight, whose maps turn with the camera"""
     light_rotate: float = 0.0
     """Turn of the light about +Y, counter-clockwise seen from above [deg]"""
     fit_lobes: int | None = None
@@ -180,6 +188,9 @@ class InsertConfig(ModelSettings, PersonalizeSettings, GuidanceChoices, Optimize
     """What to do with a photo that has transparency: refuse or ignore"""
     max_pixels: int = 64_000_000
     """Largest photo that is opened [px]"""
+    strict: bool = False
+    """Refuse a photo or panorama with values that are not finite, or a light with negative ones,
+    in place of repairing them"""
     missing_textures: str = "error"
     """What to do when a texture of the asset is missing: error, or grey in its place"""
     mark: bool = True
@@ -396,6 +407,7 @@ CHOICES = {
     "up": ("x", "+x", "-x", "y", "+y", "-y", "z", "+z", "-z"),
     "tone": ("reinhard", "linear"),
     "alpha": ("refuse", "ignore"),
+    "light_convention": ("openexr", "nvdiffrec", "threejs", "blender", "diffusionlight"),
     "missing_textures": ("error", "grey"),
     "guidance": ("embedded", "stable-diffusion", "none"),
     "start": ("regressed", "uniform"),
@@ -546,6 +558,7 @@ def _values_that_clash(config: InsertConfig) -> Iterator[InputError]:
             "leave one of them out, or say with --refine what is to change under that light",
         )
     yield from needs("fit_lobes", given("light"), "--light with a panorama to fit")
+    yield from needs("light_convention", given("light"), "--light with a panorama")
     yield from needs("up", given("camera"), "--camera; without a camera file the world is Y up")
     yield from needs("sequence", given("reuse"), "--reuse: one light for all frames")
     yield from needs("show_prior", with_words, "--guidance stable-diffusion and its --model")

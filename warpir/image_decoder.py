@@ -8,10 +8,12 @@ inside the functions that need it, to keep start-up short.
 
 import logging
 import os
+import re
 import stat
+import struct
 import tempfile
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -25,7 +27,6 @@ from warpir.errors import ExitCode, InputError
 FloatArray = NDArray[np.float32]
 Pixels = NDArray[Any]
 
-_SRGB_NAMES = {"", "srgb_rec709_scene", "srgb_rec709_display", "sRGB", "g22_rec709_scene"}
 _LOG = logging.getLogger(__name__)
 
 
@@ -38,8 +39,9 @@ class DecodedImage:
     alpha: Pixels | None
     kind: str
     orientation: int
-    exposure: float
     icc: bytes | None
+    primaries: tuple[float, ...] | None
+    """Chromaticities of a float image that are not Rec.709: xy of red, green, blue and white."""
     focal_35mm: float | None
     notices: tuple[str, ...]
 
@@ -76,6 +78,9 @@ def _sniff(path: Path) -> tuple[str, bytes]:
     if head.startswith(b"\x89PNG\r\n\x1a\n"):
         return "png", head
     if head[:4] in (b"II*\0", b"MM\0*", b"II+\0", b"MM\0+"):
+        if _is_raw_tiff(head):
+            what = "a camera raw file (what it holds as a picture is a thumbnail)"
+            raise InputError(path, what, "export it as JPEG or 16-bit TIFF")
         return "tiff", head
     if head.startswith(b"RIFF") and head[8:12] == b"WEBP":
         return "webp", head
@@ -83,14 +88,52 @@ def _sniff(path: Path) -> tuple[str, bytes]:
         return "exr", head
     if head.startswith((b"#?RADIANCE", b"#?RGBE")):
         return "hdr", head
-    advice = ""
-    if head[4:8] == b"ftyp" and head[8:12] in (b"heic", b"heix", b"mif1", b"avif", b"crx "):
-        advice = "export it as JPEG or 16-bit TIFF"
+    found = _foreign_kind(head)
     raise InputError(
         path,
-        "not an image that warpir reads (expected JPEG, PNG, TIFF, WebP, EXR or Radiance HDR)",
-        advice,
+        f"not an image that warpir reads ({f'found {found}; ' if found else ''}"
+        "expected JPEG, PNG, TIFF, WebP, EXR or Radiance HDR)",
+        "export it as JPEG or 16-bit TIFF" if found else "",
     )
+
+
+_FOREIGN_KINDS = {
+    "camera raw": (b"IIRO", b"IIRS", b"MMOR", b"IIU\0", b"FUJIFILMCCD-RAW", b"FOVb"),
+    "JPEG XL": (b"\xff\x0a", b"\0\0\0\x0cJXL "),
+    "JPEG 2000": (b"\0\0\0\x0cjP  ", b"\xff\x4f\xff\x51"),
+    "GIF": (b"GIF8",),
+    "BMP": (b"BM",),
+    "Photoshop": (b"8BPS",),
+    "PDF": (b"%PDF",),
+    "PostScript": (b"%!PS",),
+}
+_BRANDS = {b"avif": "AVIF", b"avis": "AVIF", b"crx ": "camera raw"}
+_NEW_SUBFILE_TYPE, _DNG_VERSION = 254, 50706
+"""TIFF tags; bit 0 of the first says that a picture is a reduced version of another."""
+
+
+def _foreign_kind(head: bytes) -> str:
+    """Return the name of a kind of image that people have but that is not read, or nothing."""
+    if head[4:8] == b"ftyp":
+        return _BRANDS.get(head[8:12], "HEIC")
+    return next((name for name, starts in _FOREIGN_KINDS.items() if head.startswith(starts)), "")
+
+
+def _is_raw_tiff(head: bytes) -> bool:
+    """Tell camera raw by its first directory: what a TIFF reader shows of it is a thumbnail."""
+    if head[8:10] == b"CR":  # Canon CR2
+        return True
+    order = "<" if head[:2] == b"II" else ">"
+    try:
+        (start,) = struct.unpack_from(f"{order}I", head, 4)
+        (count,) = struct.unpack_from(f"{order}H", head, start)
+        for k in range(count):
+            tag, _, _, value = struct.unpack_from(f"{order}HHII", head, start + 2 + 12 * k)
+            if tag == _DNG_VERSION or (tag == _NEW_SUBFILE_TYPE and value & 1):
+                return True
+    except struct.error:  # a directory behind the head: not how cameras write
+        pass
+    return False
 
 
 _OIIO_NAMES = {
@@ -104,7 +147,10 @@ _OIIO_NAMES = {
 
 
 def decode_image(
-    path: Path, max_pixels: int, kinds: tuple[str, ...] = tuple(_OIIO_NAMES)
+    path: Path,
+    max_pixels: int,
+    kinds: tuple[str, ...] = tuple(_OIIO_NAMES),
+    layer: str | None = None,
 ) -> DecodedImage:
     """Read the pixels of one file through OpenImageIO, with every check it leaves to us.
 
@@ -112,6 +158,7 @@ def decode_image(
         path: The file; recognised by content, not by name.
         max_pixels: Largest image decoded [px].
         kinds: What is accepted, of the kinds that `DecodedImage.kind` names.
+        layer: Of an EXR, the layer or part whose R, G and B are read.
 
     Raises:
         InputError: Missing, not an image of these kinds, truncated, too large, or of a variant
@@ -124,6 +171,11 @@ def decode_image(
             path,
             f"not of a kind that can be used here (found {kind}; expected {' or '.join(kinds)})",
         )
+    try:
+        str(path).encode()
+    except UnicodeEncodeError as error:
+        what = "its name is not UTF-8, which the decoder needs"
+        raise InputError(path, what, "rename it") from error
     import OpenImageIO as oiio
 
     # 64 bytes a pixel leave room for EXR layers; sizes are compared exactly below.
@@ -141,30 +193,14 @@ def decode_image(
                     f"content contradicts itself (found {kind} magic bytes, "
                     f"read as {reader.format_name()})",
                 )
-            spec = reader.spec()
-            for width, height in ((spec.width, spec.height), (spec.full_width, spec.full_height)):
-                if width * height > max_pixels:
-                    raise InputError(
-                        path,
-                        f"too large (found {width} x {height} pixels; expected "
-                        f"at most {max_pixels})",
-                        "raise --max-pixels",
-                    )
-            if spec.deep:
-                raise InputError(path, "deep EXR images are not supported", "flatten it first")
-            if spec.depth > 1:
-                raise InputError(path, "volume images are not supported")
-            if spec.format.basetype in (oiio.INT8, oiio.INT16, oiio.INT32, oiio.INT64, oiio.UINT64):
-                raise InputError(
-                    path,
-                    f"pixel type not supported (found {spec.format}; expected "
-                    "unsigned integers or floats)",
-                )
-            first, count = _choose_channels(path, spec.channelnames)
-            has_alpha = spec.alpha_channel >= 0
-            last = max(first + count, spec.alpha_channel + 1 if has_alpha else 0)
+            specs = _parts(reader, kind)
+            part, channels, alpha = _choose_channels(path, kind, specs, layer)
+            spec = specs[part]
+            _check_spec(path, spec, max_pixels)
+            wanted = channels if alpha is None else [*channels, alpha]
+            first, last = min(wanted), max(wanted) + 1
             try:
-                pixels = reader.read_image(0, 0, first, last, spec.format)
+                pixels = reader.read_image(part, 0, first, last, spec.format)
             except MemoryError as error:
                 raise InputError(
                     path, "not enough memory to decode it", code=ExitCode.RESOURCES
@@ -173,43 +209,140 @@ def decode_image(
             if pixels is None or error_text:
                 raise _unreadable(path, kind, error_text, max_pixels)
             notices = _header_notices(spec, kind, head)
-            part_notice = _check_parts(path, reader, spec, kind)
+            notices += _check_parts(path, reader, specs, part, kind)
         finally:
             reader.close()
     pixels = np.asarray(pixels).reshape(spec.height, spec.width, last - first)
     if kind == "exr":
         pixels = _place_in_display_window(pixels, spec)
+    if kind == "hdr":
+        pixels = pixels / np.float32(_exposure(path, spec))
+    primaries = None
+    if pixels.dtype.kind == "f":
+        primaries, unknown = _stated_primaries(spec, kind, head)
+        notices += unknown
+    profile = spec.getattribute("ICCProfile")
+    focal = spec.getattribute("Exif:FocalLengthIn35mmFilm")
+    chosen: Any = [channel - first for channel in channels]
+    if chosen == [*range(chosen[0], chosen[0] + len(chosen))]:
+        chosen = slice(chosen[0], chosen[0] + len(chosen))  # no copy
+    return DecodedImage(
+        pixels=pixels[..., chosen],
+        alpha=pixels[..., alpha - first] if alpha is not None else None,
+        kind=kind,
+        orientation=int(spec.getattribute("Orientation") or 1),
+        icc=bytes(profile) if profile is not None else None,
+        primaries=primaries,
+        focal_35mm=float(focal) if focal and 1.0 <= float(focal) <= 10000.0 else None,
+        notices=tuple(notices),
+    )
+
+
+def _parts(reader: Any, kind: str) -> list[Any]:
+    """Return the headers of an EXR's parts, as far as they are readable; of others, the first."""
+    specs = [reader.spec()]
+    while kind == "exr" and reader.seek_subimage(len(specs), 0):
+        specs.append(reader.spec())
+    reader.seek_subimage(0, 0)
+    library_error(reader)
+    return specs
+
+
+def _check_spec(path: Path, spec: Any, max_pixels: int) -> None:
+    """Refuse what a header announces, before a pixel is decoded."""
+    import OpenImageIO as oiio
+
+    for width, height in ((spec.width, spec.height), (spec.full_width, spec.full_height)):
+        if width * height > max_pixels:
+            raise InputError(
+                path,
+                f"too large (found {width} x {height} pixels; expected at most {max_pixels})",
+                "raise --max-pixels",
+            )
+    if spec.deep:
+        raise InputError(path, "deep EXR images are not supported", "flatten it first")
+    if spec.depth > 1:
+        raise InputError(path, "volume images are not supported")
+    if spec.format.basetype not in (oiio.UINT8, oiio.UINT16, oiio.HALF, oiio.FLOAT, oiio.DOUBLE):
+        raise InputError(
+            path,
+            f"pixel type not supported (found {spec.format}; expected unsigned integers of 8 or "
+            "16 bits, or floats)",
+        )
+    if "LAB" in str(spec.getattribute("tiff:ColorSpace") or "").upper():
+        raise InputError(path, "CIE Lab images are not supported", "save it as RGB")
+
+
+def _choose_channels(
+    path: Path, kind: str, specs: list[Any], layer: str | None
+) -> tuple[int, list[int], int | None]:
+    """Return the part, its colour channels, 3 or 1, and its alpha channel."""
+    if layer is not None and kind != "exr":
+        raise InputError(path, f"has no layers (found {kind}; expected EXR)", "leave --layer out")
+    if kind != "exr":
+        spec = specs[0]
+        alpha = spec.alpha_channel if spec.alpha_channel >= 0 else None
+        return 0, [0, 1, 2] if spec.channelnames[:3] == ("R", "G", "B") else [0], alpha
+    for wanted in (("r", "g", "b"), ("y",)):
+        for part, spec in enumerate(specs):
+            names = [name.lower() for name in spec.channelnames]
+            is_part = layer is not None and _part_name(spec) == layer
+            prefix = "" if layer is None or is_part else f"{layer.lower()}."
+            if {f"{prefix}ry", f"{prefix}by"} & set(names):
+                raise InputError(path, "luminance/chroma EXR is not supported", "save it as RGB")
+            if all(prefix + name in names for name in wanted):
+                colors = [names.index(prefix + name) for name in wanted]
+                alpha = names.index(f"{prefix}a") if f"{prefix}a" in names else None
+                return part, colors, alpha
+    names = [name for spec in specs for name in spec.channelnames]
+    layers = {name.rpartition(".")[0] for name in names if re.search(r"\.[RrYy]$", name)}
+    layers |= {_part_name(s) for s in specs[1:] if {"R", "G", "B"} <= set(s.channelnames)}
+    what = "no RGB channels" if layer is None else f"no layer {layer!a} with R, G and B"
+    expected = "R, G, B" if layer is None else f"{layer}.R, {layer}.G, {layer}.B"
+    raise InputError(
+        path,
+        f"{what} (found {', '.join(names[:24])}; expected {expected})",
+        f"layers that it has: {', '.join(sorted(layers)[:12])} (--layer)" if layers else "",
+    )
+
+
+def _part_name(spec: Any) -> str:
+    return str(spec.getattribute("oiio:subimagename") or "")
+
+
+def _exposure(path: Path, spec: Any) -> float:
+    """Return by what the values of a Radiance file were multiplied [1]."""
     exposure = float(spec.getattribute("hdr:exposure") or 1.0)
     if not (np.isfinite(exposure) and exposure > 0.0):
         raise InputError(path, f"EXPOSURE is not a positive number (found {exposure})")
-    profile = spec.getattribute("ICCProfile")
-    focal = spec.getattribute("Exif:FocalLengthIn35mmFilm")
-    return DecodedImage(
-        pixels=pixels[..., :count],
-        alpha=pixels[..., spec.alpha_channel - first] if has_alpha else None,
-        kind=kind,
-        orientation=int(spec.getattribute("Orientation") or 1),
-        exposure=exposure,
-        icc=bytes(profile) if profile is not None and count == 3 else None,
-        focal_35mm=float(focal) if focal and 1.0 <= float(focal) <= 10000.0 else None,
-        notices=(*notices, *part_notice),
-    )
+    return exposure
 
 
-def _choose_channels(path: Path, names: tuple[str, ...]) -> tuple[int, int]:
-    """Return the first colour channel and their count, 1 or 3; OpenImageIO puts RGB first."""
-    if names[:3] == ("R", "G", "B"):
-        return 0, 3
-    if "RY" in names or "BY" in names:
-        raise InputError(path, "luminance/chroma EXR is not supported", "save it as RGB")
-    if "Y" in names or len(names) == 1:
-        return (names.index("Y") if "Y" in names else 0), 1
-    layers = sorted({name.rpartition(".")[0] for name in names if "." in name})
-    raise InputError(
-        path,
-        f"no RGB channels (found {', '.join(names[:24])}; expected R, G, B)",
-        f"save one layer as plain RGB: {', '.join(layers[:12])}" if layers else "",
-    )
+def _stated_primaries(
+    spec: Any, kind: str, head: bytes
+) -> tuple[tuple[float, ...] | None, list[str]]:
+    """Return the chromaticities of a float file, None for Rec.709, and what is not followed."""
+    stated = spec.getattribute("chromaticities")
+    space = str(spec.getattribute("colorInteropID") or "")
+    line = re.search(rb"\nPRIMARIES=([^\n]*)\n", head) if kind == "hdr" else None
+    if line is not None:
+        with suppress(ValueError):
+            stated = [float(number) for number in line[1].split()]
+    elif stated is None and space in color.INTEROP_SPACES:
+        stated = color.chromaticities_of(color.INTEROP_SPACES[space])
+    elif stated is None:
+        is_ours = space in ("", "unknown", "data", "lin_rec709_scene")
+        return None, [] if is_ours else [f"colour space {space} is not followed"]
+    if stated is None or len(stated) != 8 or not color.are_primaries(stated):
+        return None, ["primaries of the header are broken: taken as Rec.709"]
+    if np.allclose(stated, color.REC709_CHROMATICITIES, atol=2e-3):
+        return None, []
+    return tuple(float(number) for number in stated), []
+
+
+_GAIN_MAPS = (b"hdrgm:", b"hdr-gain-map", b"hdrgainmap", b"urn:iso:std:iso:ts:21496")
+_PNG_PALETTE = 3
+"""Colour type in a PNG's IHDR, byte 25 of the file."""
 
 
 def _header_notices(spec: Any, kind: str, head: bytes) -> list[str]:
@@ -222,39 +355,40 @@ def _header_notices(spec: Any, kind: str, head: bytes) -> list[str]:
         notices.append("CMYK converted without its profile; export as RGB for exact colours")
     if spec.getattribute("Exif:ColorSpace") == 65535:
         notices.append("EXIF says uncalibrated colour; its profile, or else sRGB, is used")
-    space = str(spec.getattribute("oiio:ColorSpace") or "")
-    if kind == "png" and spec.getattribute("ICCProfile") is None and space not in _SRGB_NAMES:
-        notices.append(f"colour space {space} of the header is not followed: taken as sRGB")
-    primaries = spec.getattribute("chromaticities")
-    if primaries is not None and not np.allclose(primaries, color.REC709_CHROMATICITIES, atol=2e-3):
-        notices.append("chromaticities of the header are not Rec.709 and are not followed")
-    if kind == "jpeg" and (b"hdrgm:" in head or b"hdr-gain-map" in head):
+    aspect = float(spec.getattribute("PixelAspectRatio") or 1.0)
+    if kind == "exr" and abs(aspect - 1.0) > 1e-3:
+        notices.append(f"pixel aspect ratio {aspect:g} is not followed: pixels are taken as square")
+    if kind == "hdr" and re.search(rb"\n(GAMMA|COLORCORR)=", head[:4096]):
+        notices.append("GAMMA and COLORCORR of the header are not followed")
+    if kind == "jpeg" and any(name in head for name in _GAIN_MAPS):
         notices.append("gain map ignored: read as its base image")
     if kind == "png" and b"acTL" in head[:4096]:
         notices.append("animated: first frame used")
+    if (kind == "png" and head[25] == _PNG_PALETTE) or (
+        spec.getattribute("tiff:ColorSpace") == "palette"
+    ):
+        notices.append("palette expanded to RGB")
     return notices
 
 
-def _check_parts(path: Path, reader: Any, spec: Any, kind: str) -> list[str]:
-    """Notice further pages; of an EXR, whose later parts may be cut off, read them all."""
-    if kind not in ("exr", "tiff", "webp") or not reader.seek_subimage(1, 0):
-        reader.geterror()
-        return []
-    if kind != "exr":
+def _check_parts(path: Path, reader: Any, specs: list[Any], used: int, kind: str) -> list[str]:
+    """Notice further pages; of an EXR, whose other parts may be cut off, read them all."""
+    if kind in ("tiff", "webp") and reader.seek_subimage(1, 0):
         return ["more than one page or frame: the first is used"]
-    parts = int(spec.getattribute("oiio:subimages") or 1)
+    library_error(reader)
+    parts = int(specs[0].getattribute("oiio:subimages") or 1)
+    if kind != "exr" or parts == 1:
+        return []
     readable = 1
-    for part in range(1, parts):
-        if not reader.seek_subimage(part, 0):
-            break
-        other = reader.spec()
-        planes = (
-            None if other.deep else reader.read_image(part, 0, 0, other.nchannels, other.format)
-        )
-        readable += planes is not None and not library_error(reader)
+    for part, other in enumerate(specs):
+        if part != used and not other.deep:
+            planes = reader.read_image(part, 0, 0, other.nchannels, other.format)
+            readable += planes is not None and not library_error(reader)
+        else:
+            readable += part != used
     if readable < parts:
         raise InputError(path, f"truncated or corrupt ({readable} of {parts} parts readable)")
-    return [f"{parts} parts: the first is used"]
+    return [f"{parts} parts: {'the first' if used == 0 else f'number {used + 1}'} is used"]
 
 
 def _place_in_display_window(pixels: Pixels, spec: Any) -> Pixels:

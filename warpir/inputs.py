@@ -7,14 +7,16 @@ from functools import lru_cache
 from pathlib import Path
 from typing import TypeVar
 
+import numpy as np
+
 from warpir.asset import Asset, load_asset
 from warpir.camera import Camera, camera_from_exif, camera_from_fov, read_camera
 from warpir.config import InsertConfig, usage
 from warpir.errors import ExitCode, InputError, raise_all
-from warpir.light import Light
+from warpir.light import Float64Array, FloatArray, Light
 from warpir.lobes_file import read_lobes
 from warpir.materials_file import with_materials
-from warpir.photo_files import Photo, read_envmap, read_photo
+from warpir.photo_files import Photo, read_envmap, read_mask, read_photo
 from warpir.placement import Placement, place_asset
 from warpir.reuse import EarlierRun, read_run
 
@@ -44,6 +46,8 @@ class Inputs:
     """What was chosen because nothing was given, one line each."""
     notices: tuple[str, ...] = ()
     """What was repaired, converted, left out or looks odd, one line each."""
+    occluder: FloatArray | None = None
+    """What --occluder-mask holds: share of the photo in front of the object [1], shape [H, W]."""
 
 
 class Loaders:
@@ -88,13 +92,18 @@ def read_inputs(config: InsertConfig, loaders: Loaders | None = None) -> Inputs:
             photo_path,
             max_pixels=config.max_pixels,
             alpha="ignore" if config.alpha == "ignore" else "refuse",
+            layer=config.layer,
+            strict=config.strict,
         )
     )
+    occluder = attempt(lambda: _read_occluder(config, photo, notices))
     asset = attempt(lambda: _read_asset(asset_path, config, loaders))
-    light = attempt(lambda: _read_light(config, notices))
     reuse = config.reuse
     run = attempt(lambda: loaders.run(reuse)) if reuse is not None else None
     camera = attempt(lambda: _make_camera(config, photo, assumed)) if photo is not None else None
+    # Without a camera the run ends below, but all that is wrong with the light is told too.
+    pose = camera.c2w if camera is not None else np.eye(4)
+    light = attempt(lambda: _read_light(config, pose, notices))
     raise_all(problems)
     assert photo is not None and asset is not None and camera is not None
 
@@ -128,7 +137,11 @@ def read_inputs(config: InsertConfig, loaders: Loaders | None = None) -> Inputs:
             f"{run.path} had changed its object's materials, this run has not (--materials "
             f"{run.materials} does the same to that object)"
         )
-    return Inputs(photo, asset, camera, placement, light, run, tuple(assumed), tuple(notices))
+    if occluder is not None and config.is_guided:
+        notices.append("guidance does not see --occluder-mask; the pictures it leads to do")
+    return Inputs(
+        photo, asset, camera, placement, light, run, tuple(assumed), tuple(notices), occluder
+    )
 
 
 def _inputs_in_out(config: InsertConfig) -> list[InputError]:
@@ -138,6 +151,7 @@ def _inputs_in_out(config: InsertConfig) -> list[InputError]:
     out = os.path.realpath(config.out)
     named = (
         *(config.photo, config.asset, config.materials, config.camera, config.light),
+        config.occluder_mask,
         *(config.lora, config.prior, config.regressor),
     )
     folders = {path: os.path.dirname(path) for path in named if path is not None}
@@ -181,15 +195,37 @@ def _make_camera(config: InsertConfig, photo: Photo, assumed: list[str]) -> Came
     return camera_from_fov(width, height, config.fov or DEFAULT_FOV, *pose)
 
 
-def _read_light(config: InsertConfig, notices: list[str]) -> Light | None:
+def _read_occluder(
+    config: InsertConfig, photo: Photo | None, notices: list[str]
+) -> FloatArray | None:
+    if config.occluder_mask is None or photo is None:
+        return None
+    height, width = photo.codes.shape[:2]
+    found: list[str] = []
+    occluder = read_mask(config.occluder_mask, (width, height), notices=found)
+    notices += _about(config.occluder_mask, found)
+    return occluder
+
+
+def _read_light(
+    config: InsertConfig, camera_to_world: Float64Array, notices: list[str]
+) -> Light | None:
     if config.light is None:
         return None
     if Path(config.light).suffix.lower() == ".json":
         if config.fit_lobes is not None:
             raise usage("--fit-lobes", f"needs a panorama to fit (found lobes: {config.light})")
+        if config.light_convention != "openexr":
+            raise usage("--light-convention", f"is for panoramas (found lobes: {config.light})")
         return Light(lobes=read_lobes(config.light)).rotated(config.light_rotate)
     found: list[str] = []
-    texels = read_envmap(config.light, notices=found)
+    texels = read_envmap(
+        config.light,
+        convention=config.light_convention,
+        camera_to_world=camera_to_world,
+        strict=config.strict,
+        notices=found,
+    )
     notices += _about(config.light, found)
     return Light(texels=texels).rotated(config.light_rotate)
 

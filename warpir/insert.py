@@ -167,6 +167,7 @@ def _insert_one(config: InsertConfig, loaders: "Loaders | None" = None) -> Inser
                 light.curves.foreground,
                 light.curves.shadow_ratio,
                 is_reinhard=light.curves.tone == "reinhard",
+                occluder=inputs.occluder,
             )
         with timings.stage("write"):
             measured = _write(output, config, inputs, light, picture)
@@ -245,6 +246,7 @@ def _write_preview(
         light.curves.foreground,
         light.curves.shadow_ratio,
         is_reinhard=light.curves.tone == "reinhard",
+        occluder=inputs.occluder,
     )
     codes = inputs.photo.encode(picture.image, picture.changed)
     say(f"preview: {output.write_preview(0, codes, inputs.photo.icc)}")

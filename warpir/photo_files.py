@@ -12,10 +12,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from warpir import color
-from warpir.color_profile import convert_profile, srgb_to_profile
+from warpir.color_profile import convert_profile, grey_profile, png_profile, srgb_to_profile
 from warpir.envmap_conventions import SEAM_SHIFTS, to_ours
 from warpir.errors import InputError
-from warpir.image_decoder import FloatArray, Pixels, decode_image, upright
+from warpir.image_decoder import DecodedImage, FloatArray, Pixels, decode_image, upright
 from warpir.light import Float64Array
 
 PHOTO_PIXELS_MAX = 64_000_000
@@ -68,7 +68,9 @@ class Photo:
             ones for a linear plate, which has no display codes to keep.
         """
         if self.is_linear:
-            return np.round(np.clip(srgb, 0.0, 1.0) * 65535.0).astype(np.uint16)
+            # Not the photo's own encoding come back, so what the file states: sRGB.
+            linear = color.gamma_to_linear(np.clip(srgb, 0.0, 1.0).astype(np.float64))
+            return np.round(color.linear_to_srgb(linear) * 65535.0).astype(np.uint16)
         own = srgb
         if self.icc is not None:
             in_profile = srgb_to_profile(srgb, self.icc)
@@ -84,6 +86,8 @@ def read_photo(
     *,
     max_pixels: int = PHOTO_PIXELS_MAX,
     alpha: str = "refuse",
+    layer: str | None = None,
+    strict: bool = False,
 ) -> Photo:
     """Read a photograph: JPEG, PNG, TIFF or WebP, or a linear plate in EXR, HDR or float TIFF.
 
@@ -91,13 +95,15 @@ def read_photo(
         path: The file; recognised by content, not by name.
         max_pixels: Largest image decoded [px] (``--max-pixels``).
         alpha: ``refuse`` a transparent image, or ``ignore`` its alpha (``--alpha``).
+        layer: Layer or part of an EXR (``--layer``); its plain R, G and B when absent.
+        strict: Refuse pixels that are not finite instead of setting them to black.
 
     Raises:
         InputError: Missing, not an image, truncated, too large, transparent, or in a colour
             space that cannot be converted.
     """
     path = Path(path)
-    image = decode_image(path, max_pixels)
+    image = decode_image(path, max_pixels, layer=layer)
     notices = list(image.notices)
     codes = image.pixels
     if image.alpha is not None:
@@ -111,7 +117,8 @@ def read_photo(
                 )
             notices.append("alpha channel ignored")
     codes = upright(codes, image.orientation)
-    if codes.shape[-1] == 1:
+    is_grey = codes.shape[-1] == 1
+    if is_grey:
         notices.append("grey image expanded to three channels")
         codes = np.repeat(codes, 3, axis=-1)
     if bool((codes == codes[0, 0]).all()):
@@ -119,17 +126,13 @@ def read_photo(
 
     icc: bytes | None = None
     if codes.dtype.kind == "f":
-        codes, repaired = _finite(codes)
-        if repaired:
-            notices.append(f"{repaired} non-finite pixels set to 0")
-        notices.append("float image taken as scene-linear, encoded with exponent 1/2.2")
-        plate = codes.astype(np.float32, copy=False)
+        codes = _finite(path, codes, strict, notices)
+        plate = _to_rec709(codes.astype(np.float32, copy=False), image, notices)
+        notices.append(_about_plate(plate))
+        codes = plate
         srgb: FloatArray = np.clip(color.linear_to_gamma(plate), 0.0, 1.0)
     else:
-        srgb = codes.astype(np.float32) / np.float32(np.iinfo(codes.dtype).max)
-        if image.icc is not None:
-            codes, srgb, icc, notice = convert_profile(path, codes, srgb, image.icc)
-            notices += [notice] if notice else []
+        codes, srgb, icc = _to_srgb(path, codes, image, is_grey, notices)
     return Photo(
         np.ascontiguousarray(codes),
         np.ascontiguousarray(srgb),
@@ -154,7 +157,8 @@ def read_envmap(
     ``(sin lon cos lat, sin lat, cos lon cos lat)``, ``lon = pi (1 - 2u)``, ``lat = pi (1/2 - v)``.
 
     Args:
-        path: A 2:1 ``.hdr`` or ``.exr`` file, recognised by content.
+        path: A 2:1 file, recognised by content: ``.hdr``, ``.exr`` or float TIFF; or a picture
+            of 8 or 16 bits, which is decoded as sRGB and lacks what is brighter than its white.
         convention: Who made the map: a key of `SEAM_SHIFTS`.
         camera_to_world: Pose of the camera, shape [4, 4], for a map in camera axes.
         strict: Refuse NaN, infinite and negative values instead of repairing them.
@@ -164,24 +168,35 @@ def read_envmap(
         Radiance, relative [W/(m^2 sr)], finite and not negative, shape [He, We, 3].
 
     Raises:
-        InputError: Missing, damaged, not 2:1, not an HDR format, or (strict) not clean.
+        InputError: Missing, damaged, not 2:1, not an image, or (strict) not clean.
     """
     path = Path(path)
     if convention not in SEAM_SHIFTS:
         raise ValueError(f"convention {convention!r} is not one of {', '.join(SEAM_SHIFTS)}")
-    image = decode_image(path, ENVMAP_WIDTH_MAX * ENVMAP_WIDTH_MAX // 2, kinds=("exr", "hdr"))
-    texels = upright(image.pixels, image.orientation).astype(np.float32)
-    if texels.shape[-1] == 1:
-        texels = np.repeat(texels, 3, axis=-1)
-    height, width = texels.shape[:2]
+    image = decode_image(path, ENVMAP_WIDTH_MAX * ENVMAP_WIDTH_MAX // 2)
+    messages = list(image.notices)
+    codes = upright(image.pixels, image.orientation)
+    height, width = codes.shape[:2]
     if width != 2 * height or height < 2:
         raise InputError(
             path,
             f"not a lat-long map (found {width} x {height}; expected 2:1)",
             "resize it to twice as wide as high",
         )
-    texels /= np.float32(image.exposure)
-    messages = list(image.notices)
+    is_grey = codes.shape[-1] == 1
+    if is_grey:
+        codes = np.repeat(codes, 3, axis=-1)
+    if image.alpha is not None and image.kind != "exr":
+        messages.append("alpha channel ignored")
+    if codes.dtype.kind == "f":
+        texels = np.array(codes, dtype=np.float32)
+    else:
+        srgb = _to_srgb(path, codes, image, is_grey, messages)[1]
+        texels = color.srgb_to_linear(srgb).astype(np.float32)
+        messages.append(
+            "a picture, not high dynamic range: decoded as sRGB; lamps and a sun in it are no "
+            "brighter than its white"
+        )
     bad = ~np.isfinite(texels)
     negative = texels < 0.0
     negative &= ~bad
@@ -198,6 +213,8 @@ def read_envmap(
         texels[np.isposinf(texels)] = brightest
         texels[~(texels >= 0.0)] = 0.0
         messages.append(f"{found} repaired: +Inf to the brightest finite value, the others to 0")
+    # Colours outside Rec.709 are negative in it, and no light is.
+    texels = np.maximum(_to_rec709(texels, image, messages), 0.0)
     if notices is not None:
         notices += messages
     return to_ours(texels, convention, camera_to_world)
@@ -261,11 +278,52 @@ def read_mask(
     return np.ascontiguousarray(mask)
 
 
-def _finite(codes: Pixels) -> tuple[Pixels, int]:
-    """Set non-finite pixels to black; return how many there were."""
+def _to_srgb(
+    path: Path, codes: Pixels, image: DecodedImage, is_grey: bool, notices: list[str]
+) -> tuple[Pixels, FloatArray, bytes | None]:
+    """Return codes [H, W, 3], the same as sRGB in [0, 1], and the profile that they are in."""
+    srgb = codes.astype(np.float32) / np.float32(np.iinfo(codes.dtype).max)
+    icc = image.icc
+    if image.kind == "png":
+        icc, ignored = png_profile(path, icc)
+        notices += ignored
+    if icc is None:
+        return codes, srgb, None
+    codes, srgb, icc, notice = convert_profile(
+        path, codes, srgb, grey_profile(icc) if is_grey else icc
+    )
+    notices += [notice] if notice else []
+    return codes, srgb, icc
+
+
+def _to_rec709(linear: FloatArray, image: DecodedImage, notices: list[str]) -> FloatArray:
+    """Bring a float image to linear Rec.709 from the primaries that its header states."""
+    if image.icc is not None:
+        notices.append("colour profile of a float image is not followed")
+    if image.primaries is None:
+        return linear
+    notices.append("colours converted from the primaries of the header to Rec.709")
+    return linear @ color.primaries_to_rec709(image.primaries).T.astype(np.float32)
+
+
+def _about_plate(plate: FloatArray) -> str:
+    """Word what becomes of a linear plate."""
+    text = "float image taken as scene-linear; layers.exr holds its composite as linear floats"
+    outside = int(((plate < 0.0) | (plate > 1.0)).any(axis=-1).sum())
+    if outside:
+        text += f", composite.png clips {outside} pixels to 0..1"
+    return text
+
+
+def _finite(path: Path, codes: Pixels, strict: bool, notices: list[str]) -> Pixels:
+    """Set non-finite pixels to black, and say how many there were."""
     bad = ~np.isfinite(codes).all(axis=-1)
     count = int(bad.sum())
-    if count:
-        codes = codes.copy()
-        codes[bad] = 0
-    return codes, count
+    if not count:
+        return codes
+    if strict:
+        raise InputError(path, f"not finite (found {count} such pixels; expected none)")
+    notices.append(f"{count} non-finite pixels set to 0")
+    codes = codes.copy()
+    codes[bad] = 0
+    return codes

@@ -63,6 +63,7 @@ def make_picture(
     curve_fg: ToneKnots,
     curve_shadow: ToneKnots,
     is_reinhard: bool = True,
+    occluder: FloatArray | None = None,
 ) -> Picture:
     """Render object and shadow at the scene camera's resolution and put them into the photo.
 
@@ -75,6 +76,7 @@ def make_picture(
         curve_fg: One tone curve.
         curve_shadow: Three tone curves.
         is_reinhard: Whether Reinhard's operator precedes the foreground curve.
+        occluder: Share of the photo that stays in front of the object [1], shape [H, W].
     """
     camera = renderer.scene.camera
     args_fg = light_args(light_fg, renderer.device)
@@ -121,6 +123,8 @@ def make_picture(
     height, width = photo.srgb.shape[:2]
     if size != (height, width):
         planes = _resize_planes(planes, height, width)
+    if occluder is not None:
+        planes = _behind(planes, occluder)
     matte = planes["matte"]
     plate = photo.linear()
     composite = planes["foreground"] + (1.0 - matte)[..., None] * plate * planes["shadow_ratio"]
@@ -138,6 +142,30 @@ def make_picture(
         len(objects),
         len(proxy_pixels),
     )
+
+
+def _behind(planes: dict[str, FloatArray], occluder: FloatArray) -> dict[str, FloatArray]:
+    """Put the object and its shadow behind what the occluder marks in the photo.
+
+    With m the occluder, a the matte and s the ratio, the composite ``m plate + (1 - m) (fg +
+    (1 - a) plate s)`` is again ``fg' + (1 - a') plate s'`` with ``fg' = (1 - m) fg``,
+    ``a' = (1 - m) a`` and ``s' = (m + (1 - m) (1 - a) s) / (1 - a')``.
+    """
+    m, free = occluder, 1.0 - occluder
+    matte = planes["matte"]
+    left = 1.0 - free * matte  # share of the pixel that the photo fills
+    lit = m[..., None] + (free * (1.0 - matte))[..., None] * planes["shadow_ratio"]
+    ratio = lit / np.maximum(left, 1e-9)[..., None]
+    # Exact where nothing is in front; there the object may also fill the pixel, and left is 0.
+    ratio = np.where((m == 0.0)[..., None], planes["shadow_ratio"], ratio)
+    behind = {**planes, "matte": free * matte, "shadow_ratio": ratio}
+    for name in ("foreground", "diffuse", "emission", "specular"):
+        behind[name] = free[..., None] * planes[name]
+    hidden = m == 1.0
+    for name in ("depth", "position", "normal", "albedo", "roughness"):
+        behind[name] = planes[name].copy()
+        behind[name][hidden] = np.inf if name == "depth" else 0.0
+    return behind
 
 
 def scene_of(inputs: Inputs, camera: Camera, device: str) -> Scene:

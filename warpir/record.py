@@ -79,7 +79,7 @@ def input_hashes(config: InsertConfig) -> dict[str, str]:
     An earlier run is known by its ``run.json``, which holds the sha256 of its other files.
     """
     names = (
-        *("photo", "asset", "materials", "camera", "light", "lora", "reuse"),
+        *("photo", "occluder_mask", "asset", "materials", "camera", "light", "lora", "reuse"),
         *("prior", "regressor"),
     )
     paths = {name: Path(path) for name in names if (path := getattr(config, name)) is not None}
