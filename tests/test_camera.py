@@ -16,9 +16,9 @@ from warpir.camera import (
     exr_matrices,
     ground_point,
     mitsuba_sensor,
-    read_camera,
     square_pixel_error,
 )
+from warpir.camera_files import read_camera
 from warpir.errors import ExitCode, InputError
 
 PIXEL = 1e-3
@@ -222,7 +222,7 @@ def test_wrong_fspy_projects_are_refused(tmp_path: Path, case: str) -> None:
 
 
 def test_missing_camera_and_folder(tmp_path: Path) -> None:
-    for path, words in ((tmp_path / "no.json", "no such"), (tmp_path, "regular")):
+    for path, words in ((tmp_path / "no.json", "no such"), (tmp_path, "no COLMAP model")):
         with pytest.raises(InputError, match=words):
             read_camera(path, (40, 30))
 
