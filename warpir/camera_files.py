@@ -4,40 +4,31 @@ Each reader returns the camera in the world of its file; here the world is turne
 and the camera is brought to the photograph's size.
 """
 
-from dataclasses import dataclass, field, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from warpir.camera import Camera
-from warpir.camera_source import UP_TO_Y, StoredCamera, count, number, rigid
-from warpir.colmap import is_model, read_colmap
+from warpir.camera_source import (
+    UP_TO_Y,
+    PhotoCamera,
+    StoredCamera,
+    count,
+    number,
+    rigid,
+    turned,
+)
+from warpir.colmap import read_colmap
+from warpir.colmap_model import is_model
 from warpir.errors import ExitCode, InputError
 from warpir.exr_camera import read_exr_camera
 from warpir.fspy import read_fspy, read_fspy_project
 from warpir.gltf_camera import read_gltf_camera
-from warpir.lens import STRAIGHT, Lens
 from warpir.nerfstudio import read_nerfstudio
 from warpir.strict_json import read_json_object
 from warpir.waymo import read_waymo
-
-Float64Array = NDArray[np.float64]
-
-
-@dataclass(frozen=True)
-class PhotoCamera:
-    """The camera of a photograph, and what else its file says."""
-
-    camera: Camera
-    """At the photograph's resolution, in our world."""
-    lens: Lens = STRAIGHT
-    """What bent the photograph; undone with ``--undistort``."""
-    world: Float64Array = field(default_factory=lambda: np.eye(3))
-    """Rotation from the file's world to ours, shape [3, 3]."""
-    has_up: bool = True
-    """Whether it is known which way is up; else our world is the file's, as it happens to lie."""
 
 
 def read_photo_camera(
@@ -92,14 +83,6 @@ def read_photo_camera(
 def read_camera(path: str | Path, photo_size: tuple[int, int], up: str | None = None) -> Camera:
     """As `read_photo_camera`, for a straight photograph: the camera alone."""
     return read_photo_camera(path, photo_size, up).camera
-
-
-def turned(c2w: Float64Array, rotation: Float64Array) -> Float64Array:
-    """Return a pose, shape [4, 4], after its world was turned by a rotation, shape [3, 3]."""
-    turn = np.eye(4)
-    turn[:3, :3] = rotation
-    result: Float64Array = turn @ c2w
-    return result
 
 
 def _up_axis(up: str) -> str:

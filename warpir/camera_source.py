@@ -1,7 +1,7 @@
 """What every reader of a camera file returns, and the checks that they share."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path, PurePosixPath
 from typing import Any
 
@@ -41,6 +41,28 @@ class StoredCamera:
     """What bent the photograph."""
     world_notice: str = ""
     """What is to be said of `world` when the user does not say which way is up."""
+
+
+@dataclass(frozen=True)
+class PhotoCamera:
+    """The camera of a photograph, and what else its file says."""
+
+    camera: Camera
+    """At the photograph's resolution, in our world."""
+    lens: Lens = STRAIGHT
+    """What bent the photograph; undone with ``--undistort``."""
+    world: Float64Array = field(default_factory=lambda: np.eye(3))
+    """Rotation from the file's world to ours, shape [3, 3]."""
+    has_up: bool = True
+    """Whether it is known which way is up; else our world is the file's, as it happens to lie."""
+
+
+def turned(c2w: Float64Array, rotation: Float64Array) -> Float64Array:
+    """Return a pose, shape [4, 4], after its world was turned by a rotation, shape [3, 3]."""
+    turn = np.eye(4)
+    turn[:3, :3] = rotation
+    result: Float64Array = turn @ c2w
+    return result
 
 
 def choose_frame(

@@ -12,6 +12,7 @@ import numpy as np
 from warpir.camera import Camera
 from warpir.camera_source import Float64Array, StoredCamera, rigid
 from warpir.errors import InputError
+from warpir.files import read_exr_header
 
 AFFINE_TOLERANCE = 1e-3
 """How far a projection may be from a pinhole's, relative to its focal lengths."""
@@ -23,21 +24,11 @@ def read_exr_camera(path: Path) -> StoredCamera:
     Raises:
         InputError: Damaged, without both attributes, or not of a pinhole camera.
     """
-    import OpenImageIO as oiio
-
-    from warpir.files import captured_stderr
-
-    with captured_stderr():
-        reader = oiio.ImageInput.open(str(path))
-        if reader is None:
-            oiio.geterror()
-            raise InputError(path, "not an EXR file that can be read")
-        spec = reader.spec()
-        reader.close()
-    w2c = np.diag([1.0, 1.0, -1.0, 1.0]) @ _attribute(path, spec, "worldToCamera").T
+    header = read_exr_header(path, ("worldToCamera", "worldToNDC"))
+    w2c = np.diag([1.0, 1.0, -1.0, 1.0]) @ _matrix(path, header, "worldToCamera").T
     c2w: Float64Array = np.linalg.inv(rigid(path, "worldToCamera", w2c)).astype(np.float64)
     # Columns: camera coordinates; rows: x w, y w, any depth, w of the display window's share.
-    projection = _attribute(path, spec, "worldToNDC").T @ c2w
+    projection = _matrix(path, header, "worldToNDC").T @ c2w
     projection = projection / -projection[3, 2] if projection[3, 2] else np.zeros((4, 4))
     scale = abs(projection[0, 0]) + abs(projection[1, 1])
     rest = projection[[0, 0, 1, 1, 3, 3, 3], [1, 3, 0, 3, 0, 1, 3]]
@@ -45,7 +36,7 @@ def read_exr_camera(path: Path) -> StoredCamera:
         np.abs(rest).max() > AFFINE_TOLERANCE * scale
     ):
         raise InputError(path, "worldToNDC: not the projection of a pinhole camera")
-    width, height = spec.full_width, spec.full_height
+    width, height = header["size"]
     camera = Camera(
         width,
         height,
@@ -58,9 +49,9 @@ def read_exr_camera(path: Path) -> StoredCamera:
     return StoredCamera(camera, np.eye(3))
 
 
-def _attribute(path: Path, spec: Any, name: str) -> Float64Array:
+def _matrix(path: Path, header: dict[str, Any], name: str) -> Float64Array:
     """Return a matrix of the header, which multiplies row vectors, shape [4, 4]."""
-    values = spec.getattribute(name)
+    values = header[name]
     if not isinstance(values, tuple) or len(values) != 16 or not np.isfinite(values).all():
         raise InputError(path, f"{name}: missing (expected a matrix in the EXR header)")
     matrix: Float64Array = np.reshape(np.array(values, dtype=np.float64), (4, 4))

@@ -20,7 +20,7 @@ import stat
 import struct
 import tempfile
 import zlib
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
@@ -230,6 +230,25 @@ def read_envmap(
         notices += messages
     # Longitude falls with u: rolling to the right by a share of the width is a clockwise turn.
     return rotate_map(texels, -360.0 * ENVMAP_ROLLS[convention])
+
+
+def read_exr_header(path: Path, names: Sequence[str]) -> dict[str, Any]:
+    """Read attributes of an EXR header; ``size`` is the display window's [px], absent is None.
+
+    Raises:
+        InputError: Missing or not an EXR file.
+    """
+    check_regular_file(path)
+    import OpenImageIO as oiio
+
+    with captured_stderr():
+        reader = oiio.ImageInput.open(str(path))
+        if reader is None or reader.format_name() != "openexr":
+            raise InputError(path, f"not an EXR file ({_library_error(oiio)[:80]})")
+        spec = reader.spec()
+        reader.close()
+    attributes = {name: spec.getattribute(name) for name in names}
+    return {"size": (spec.full_width, spec.full_height), **attributes}
 
 
 # ----------------------------------------------------------------------------------- decoding

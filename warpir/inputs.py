@@ -9,12 +9,12 @@ from typing import Any, TypeVar
 
 from warpir.asset import Asset, load_asset
 from warpir.camera import Camera, camera_from_exif, camera_from_fov
-from warpir.camera_files import PhotoCamera, read_photo_camera
+from warpir.camera_files import read_photo_camera
+from warpir.camera_source import PhotoCamera
 from warpir.config import InsertConfig, usage
 from warpir.errors import ExitCode, InputError, raise_all
 from warpir.files import Photo, read_envmap, read_photo
 from warpir.free_space import find_place, points_in_way
-from warpir.lens import undistort_photo
 from warpir.light import Light
 from warpir.lobes_file import read_lobes
 from warpir.materials_file import with_materials
@@ -22,6 +22,7 @@ from warpir.photo_world import PhotoWorld, make_world
 from warpir.placement import Placement, place_asset, upright_plane
 from warpir.point_cloud import read_point_cloud
 from warpir.reuse import EarlierRun, read_run
+from warpir.undistort import undistort_photo
 
 DEFAULT_FOV = 60.0
 """Horizontal field of view without --camera, --fov and EXIF [deg]: a phone's main camera."""

@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from warpir.camera import Camera
-from warpir.camera_files import PhotoCamera, turned
+from warpir.camera_source import PhotoCamera, turned
 from warpir.config import InsertConfig
 from warpir.errors import InputError
 from warpir.free_space import Cloud

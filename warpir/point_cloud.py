@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from warpir.asset_files import read_regular
-from warpir.colmap import is_model, read_points
+from warpir.colmap_model import is_model, read_points
 from warpir.errors import InputError
 
 Float64Array = NDArray[np.float64]

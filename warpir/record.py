@@ -81,7 +81,8 @@ def input_hashes(config: InsertConfig) -> dict[str, str]:
 
     An earlier run is known by its ``run.json``, which holds the sha256 of its other files.
     """
-    from warpir.colmap import is_model, model_files
+    # Here, since the command line imports this module and must not load NumPy for --help.
+    from warpir.colmap_model import is_model, model_files
 
     names = (
         *("photo", "asset", "materials", "camera", "light", "lora", "reuse"),
