@@ -202,7 +202,7 @@ def test_every_value_has_a_rule() -> None:
         "fov", "horizon", "ground", "place", "at", "rotate_y", "light_rotate", "sun", "sky",
         "device", "refine_parts", "refine_materials", "lora_layers",
         "photo", "asset", "materials", "out", "camera", "light", "lora", "model", "reuse",
-        "sequence", "prior", "regressor",
+        "sequence", "prior", "regressor", "frame", "ground_points",
     }  # fmt: skip
     ruled = {*RANGES, *ABOVE_ZERO, *CHOICES, *PROMPTS}
     valued = {name for name, form in forms_of_flags() if form}
@@ -395,7 +395,7 @@ def test_command_refuses_flags_that_exclude_each_other(first: str, second: str) 
         "photo": "p.png", "asset": "a.glb", "camera": "c.json", "fov": "50", "pitch": "0",
         "horizon": "5", "camera_height": "2", "place": "0,0,1", "at": "1,2", "scale": "1",
         "size": "1", "light": "l.hdr", "sun": "1,2", "sky": "clear", "reuse": "r", "refine": "tone",
-        "sequence": "s.jsonl", "start": "uniform",
+        "sequence": "s.jsonl", "start": "uniform", "ground": "0,1,0,0", "ground_points": "p.ply",
     }  # fmt: skip
     argv = ["--out", "o"]
     for name in (first, second):
@@ -472,6 +472,7 @@ def test_config_file_of_an_older_version_replays(tmp_path: Path) -> None:
     """``run.json`` of a version that knew none of guidance's settings means their defaults (F2)."""
     settings = (ModelSettings, PersonalizeSettings, GuidanceSettings, OptimizeSettings)
     newer = {field.name for kind in settings for field in fields(kind)}
+    newer |= {"frame", "undistort", "ground_points"}
     newer |= set(FLAGS["applications"]) | set(FLAGS["guidance"]) - {"guidance"}
     config = InsertConfig(photo="p.png", asset="a.glb", out="o", sky="clear", depth=2)
     known = {name: value for name, value in asdict(config).items() if name not in newer}

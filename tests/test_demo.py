@@ -7,7 +7,7 @@ import pytest
 
 from warpir import demo
 from warpir.asset import Asset, load_asset
-from warpir.camera import read_camera
+from warpir.camera_files import read_camera
 from warpir.config import InsertConfig
 from warpir.demo.car import car
 from warpir.demo.make import without_fireflies

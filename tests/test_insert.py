@@ -20,7 +20,7 @@ from PIL import Image
 from tests.conftest import devices
 from tests.test_gltf import Builder
 from warpir import insert
-from warpir.camera import read_camera
+from warpir.camera_files import read_camera
 from warpir.config import InsertConfig
 from warpir.errors import ExitCode, InputError
 from warpir.insert import main

@@ -8,7 +8,7 @@ import pytest
 from PIL import Image
 
 from benchmarks.panorama_crop import write_crop
-from warpir.camera import read_camera
+from warpir.camera_files import read_camera
 from warpir.command import parse
 from warpir.light import angles_from_axis, axis_from_angles, map_directions
 from warpir.panorama_crop import crop_camera, crop_radiance, expose, look_up

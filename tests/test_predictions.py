@@ -9,7 +9,8 @@ import pytest
 from PIL import Image
 
 from tests import oracles
-from warpir.camera import Camera, camera_from_fov, read_camera
+from warpir.camera import Camera, camera_from_fov
+from warpir.camera_files import read_camera
 from warpir.color import linear_to_gamma
 from warpir.errors import InputError
 from warpir.files import OutputFolder

@@ -38,13 +38,16 @@ FLAGS = {
         "demo": "",
     },
     "camera and ground": {
-        "camera": "FILE",
+        "camera": "FILE|DIR",
+        "frame": "NAME",
+        "undistort": "",
         "fov": "DEG",
         "pitch": "DEG",
         "horizon": "ROW",
         "camera_height": "M",
         "up": "AXIS",
         "ground": "A,B,C,D",
+        "ground_points": "FILE|DIR",
     },
     "placement": {
         "place": "X,Y,Z",

@@ -117,7 +117,13 @@ class InsertConfig(ModelSettings, PersonalizeSettings, GuidanceChoices, Optimize
     """Use the scene that ships with warpir in place of --photo and --asset"""
 
     camera: str | None = None
-    """Camera of the photo: warpir's JSON, .fspy or fSpy's JSON (default: the photo's EXIF)"""
+    """Camera of the photo: warpir's JSON, .fspy or fSpy's JSON, a COLMAP model's folder, the
+    transforms.json of nerfstudio, Waymo's calibration, glTF or EXR (default: the photo's EXIF)"""
+    frame: str | None = None
+    """Which image or camera of the camera file is meant (default: the one named as the photo)"""
+    undistort: bool = False
+    """Undo the lens distortion that the camera file states; the composite is of the straight
+    photo"""
     fov: float | None = None
     """Horizontal field of view of the photo [deg]"""
     pitch: float | None = None
@@ -131,6 +137,9 @@ class InsertConfig(ModelSettings, PersonalizeSettings, GuidanceChoices, Optimize
     """Which axis of the camera file's world points up"""
     ground: tuple[float, float, float, float] | None = None
     """Ground plane a x + b y + c z + d = 0 in world coordinates [1, 1, 1, m] (default: y = 0)"""
+    ground_points: str | None = None
+    """Points of the scene in the camera file's world (.ply, text, COLMAP model): the ground is a
+    plane fitted to them, and without --at and --place the object stands where it is free"""
 
     place: tuple[float, float, float] | None = None
     """Where the object stands, world coordinates [m]; moved onto the ground along its normal"""
@@ -521,6 +530,7 @@ EXCLUSIVE = (
     ("camera", "horizon"),
     ("camera", "camera_height"),
     ("pitch", "horizon"),
+    ("ground", "ground_points"),
     ("place", "at"),
     ("scale", "size"),
     ("light", "sun"),
@@ -560,6 +570,8 @@ def _values_that_clash(config: InsertConfig) -> Iterator[InputError]:
     yield from needs("fit_lobes", given("light"), "--light with a panorama to fit")
     yield from needs("light_convention", given("light"), "--light with a panorama")
     yield from needs("up", given("camera"), "--camera; without a camera file the world is Y up")
+    for name in ("frame", "undistort", "ground_points"):
+        yield from needs(name, given("camera"), "--camera with a camera file")
     yield from needs("sequence", given("reuse"), "--reuse: one light for all frames")
     yield from needs("show_prior", with_words, "--guidance stable-diffusion and its --model")
     if given("show_prior") and with_words and config.personalize is False:

@@ -12,7 +12,7 @@ import re
 import stat
 import struct
 import tempfile
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
@@ -236,6 +236,25 @@ def decode_image(
         focal_35mm=float(focal) if focal and 1.0 <= float(focal) <= 10000.0 else None,
         notices=tuple(notices),
     )
+
+
+def read_exr_header(path: Path, names: Sequence[str]) -> dict[str, Any]:
+    """Read attributes of an EXR header; ``size`` is the display window's [px], absent is None.
+
+    Raises:
+        InputError: Missing or not an EXR file.
+    """
+    check_regular_file(path)
+    import OpenImageIO as oiio
+
+    with captured_stderr():
+        reader = oiio.ImageInput.open(str(path))
+        if reader is None or reader.format_name() != "openexr":
+            raise InputError(path, f"not an EXR file ({library_error(oiio)[:80]})")
+        spec = reader.spec()
+        reader.close()
+    attributes = {name: spec.getattribute(name) for name in names}
+    return {"size": (spec.full_width, spec.full_height), **attributes}
 
 
 def _parts(reader: Any, kind: str) -> list[Any]:

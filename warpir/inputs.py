@@ -2,23 +2,29 @@
 
 import os
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 from functools import lru_cache
 from pathlib import Path
-from typing import TypeVar
+from typing import Any, TypeVar
 
 import numpy as np
 
 from warpir.asset import Asset, load_asset
-from warpir.camera import Camera, camera_from_exif, camera_from_fov, read_camera
+from warpir.camera import Camera, camera_from_exif, camera_from_fov
+from warpir.camera_files import read_photo_camera
+from warpir.camera_source import PhotoCamera
 from warpir.config import InsertConfig, usage
 from warpir.errors import ExitCode, InputError, raise_all
+from warpir.free_space import find_place, points_in_way
 from warpir.light import Float64Array, FloatArray, Light
 from warpir.lobes_file import read_lobes
 from warpir.materials_file import with_materials
 from warpir.photo_files import Photo, read_envmap, read_mask, read_photo
-from warpir.placement import Placement, place_asset
+from warpir.photo_world import PhotoWorld, make_world
+from warpir.placement import Placement, place_asset, upright_plane
+from warpir.point_cloud import read_point_cloud
 from warpir.reuse import EarlierRun, read_run
+from warpir.undistort import undistort_photo, undistorted
 
 DEFAULT_FOV = 60.0
 """Horizontal field of view without --camera, --fov and EXIF [deg]: a phone's main camera."""
@@ -48,6 +54,8 @@ class Inputs:
     """What was repaired, converted, left out or looks odd, one line each."""
     occluder: FloatArray | None = None
     """What --occluder-mask holds: share of the photo in front of the object [1], shape [H, W]."""
+    measured: dict[str, Any] = field(default_factory=dict)
+    """What ``run.json`` says of the undone distortion and of the ground's fit."""
 
 
 class Loaders:
@@ -100,28 +108,33 @@ def read_inputs(config: InsertConfig, loaders: Loaders | None = None) -> Inputs:
     asset = attempt(lambda: _read_asset(asset_path, config, loaders))
     reuse = config.reuse
     run = attempt(lambda: loaders.run(reuse)) if reuse is not None else None
-    camera = attempt(lambda: _make_camera(config, photo, assumed)) if photo is not None else None
+    view = attempt(lambda: _make_camera(config, photo, assumed)) if photo is not None else None
     # Without a camera the run ends below, but all that is wrong with the light is told too.
-    pose = camera.c2w if camera is not None else np.eye(4)
+    pose = view.camera.c2w if view is not None else np.eye(4)
     light = attempt(lambda: _read_light(config, pose, notices))
+    points_path = config.ground_points
+    points = attempt(lambda: read_point_cloud(points_path)) if points_path is not None else None
     raise_all(problems)
-    assert photo is not None and asset is not None and camera is not None
+    assert photo is not None and asset is not None and view is not None
 
-    placement = place_asset(
-        *asset.bounds(),
-        camera,
-        config.ground,
-        place=config.place,
-        at=config.at,
-        rotate_y=config.rotate_y,
-        scale=config.scale,
-        size=config.size,
-    )
+    measured: dict[str, Any] = {}
+    straight = photo
+    if not view.lens.is_straight:
+        straight, border = undistort_photo(photo, view.camera, view.lens)
+        measured["undistorted"] = {**view.lens.record(), "border_share": border}
+        if occluder is not None:
+            (occluder,), _ = undistorted([occluder], view.camera, view.lens)
+    elif config.undistort:
+        notices.append("--undistort: the camera has no distortion, nothing was undone")
+    world = make_world(config, view, points)
+    camera = world.camera
+    placement = _place(config, asset, world)
     notices = [
-        *_about(photo_path, photo.notices),
+        *_about(photo_path, straight.notices),
         *_about(asset_path, asset.notices),
         *notices,
         *_split_assumed(camera.notices, assumed),
+        *world.notices,
         *placement.warnings,
     ]
     if config.width is not None and config.width < camera.width:
@@ -129,7 +142,8 @@ def read_inputs(config: InsertConfig, loaders: Loaders | None = None) -> Inputs:
             f"a preview: object and shadow are rendered {config.width} px wide and enlarged to the "
             f"photo's {camera.width} px (--width)"
         )
-    assumed += placement.assumed
+    assumed += [*world.assumed, *placement.assumed]
+    measured |= world.measured
     if run is not None and (assumption := run.assumption(camera.c2w, config.camera)):
         assumed.append(assumption)
     if run is not None and run.materials is not None and config.materials is None:
@@ -139,9 +153,8 @@ def read_inputs(config: InsertConfig, loaders: Loaders | None = None) -> Inputs:
         )
     if occluder is not None and config.is_guided:
         notices.append("guidance does not see --occluder-mask; the pictures it leads to do")
-    return Inputs(
-        photo, asset, camera, placement, light, run, tuple(assumed), tuple(notices), occluder
-    )
+    found = tuple(assumed), tuple(notices), occluder, measured
+    return Inputs(straight, asset, camera, placement, light, run, *found)
 
 
 def _inputs_in_out(config: InsertConfig) -> list[InputError]:
@@ -152,9 +165,13 @@ def _inputs_in_out(config: InsertConfig) -> list[InputError]:
     named = (
         *(config.photo, config.asset, config.materials, config.camera, config.light),
         config.occluder_mask,
-        *(config.lora, config.prior, config.regressor),
+        *(config.lora, config.prior, config.regressor, config.ground_points),
     )
-    folders = {path: os.path.dirname(path) for path in named if path is not None}
+    folders = {
+        path: path if Path(path).is_dir() else os.path.dirname(path)
+        for path in named
+        if path is not None
+    }
     if config.reuse is not None:
         folders[config.reuse] = config.reuse
     for path, folder in folders.items():
@@ -175,10 +192,56 @@ def _read_asset(path: str, config: InsertConfig, loaders: Loaders) -> Asset:
     return asset
 
 
-def _make_camera(config: InsertConfig, photo: Photo, assumed: list[str]) -> Camera:
+def _place(config: InsertConfig, asset: Asset, world: PhotoWorld) -> Placement:
+    """Set the asset on the ground: where it was asked for, or where the points leave space."""
+    low, high = asset.bounds()
+
+    def put(place: tuple[float, float, float] | None) -> Placement:
+        return place_asset(
+            low,
+            high,
+            world.camera,
+            world.ground,
+            place=place,
+            at=config.at if place is None else None,
+            rotate_y=config.rotate_y,
+            scale=config.scale,
+            size=config.size,
+        )
+
+    if world.cloud is None:
+        return put(world.place)
+    if world.place is None and config.at is None:
+        plane = upright_plane(world.ground, world.camera.c2w[:3, 3])
+        place = find_place(put, low, high, world.camera, plane, world.cloud)
+        placement = put(place)
+        shown = ",".join(f"{x:.3g}" for x in place)
+        line = f"the object stands at {shown}, where no points are in its way (--at, --place)"
+        return replace(placement, assumed=(*placement.assumed, line))
+    placement = put(world.place)
+    if count := len(points_in_way(placement.asset_to_world, low, high, world.cloud)):
+        warning = f"{count} points of --ground-points stand where the object does; is it free?"
+        placement = replace(placement, warnings=(*placement.warnings, warning))
+    return placement
+
+
+def _make_camera(config: InsertConfig, photo: Photo, assumed: list[str]) -> PhotoCamera:
     height, width = photo.codes.shape[:2]
     if config.camera is not None:
-        return read_camera(config.camera, (width, height), config.up)
+        assert config.photo is not None
+        return read_photo_camera(
+            config.camera,
+            (width, height),
+            config.up,
+            frame=config.frame,
+            photo_name=Path(config.photo).name,
+            undistort=config.undistort,
+        )
+    return PhotoCamera(_camera_from_numbers(config, photo, assumed))
+
+
+def _camera_from_numbers(config: InsertConfig, photo: Photo, assumed: list[str]) -> Camera:
+    height, width = photo.codes.shape[:2]
     camera_height, pitch = config.camera_height, config.pitch
     if camera_height is None:
         camera_height = DEFAULT_CAMERA_HEIGHT

@@ -178,7 +178,12 @@ def _insert_one(config: InsertConfig, loaders: "Loaders | None" = None) -> Inser
             timings=timings,
             assumed=(*inputs.assumed, *light.assumed),
             notices=notices,
-            measured={"triangles": scene.triangle_count, **measured, **recovered},
+            measured={
+                "triangles": scene.triangle_count,
+                **inputs.measured,
+                **measured,
+                **recovered,
+            },
         )
         output.write_json("run.json", record)
     _say_who_spoke(record)

@@ -20,6 +20,9 @@ RECORDED_PACKAGES = (
     *("diffusers", "transformers", "peft", "safetensors"),
 )
 
+MODEL_STEMS = {"camera": ("cameras", "images"), "ground_points": ("points3D",)}
+"""What is read of a COLMAP model, by field."""
+
 
 class Timings:
     """Seconds by stage, in the order of the run."""
@@ -74,15 +77,22 @@ def run_record(
 
 
 def input_hashes(config: InsertConfig) -> dict[str, str]:
-    """Return the sha256 of every input file, by the name of its field.
+    """Return the sha256 of every input file, by the name of its field; of a model, of its files.
 
     An earlier run is known by its ``run.json``, which holds the sha256 of its other files.
     """
+    # Here, since the command line imports this module and must not load NumPy for --help.
+    from warpir.colmap_model import is_model, model_files
+
     names = (
         *("photo", "occluder_mask", "asset", "materials", "camera", "light", "lora", "reuse"),
-        *("prior", "regressor"),
+        *("prior", "regressor", "ground_points"),
     )
     paths = {name: Path(path) for name in names if (path := getattr(config, name)) is not None}
+    for name, stems in MODEL_STEMS.items():
+        if name in paths and is_model(paths[name]):
+            files = model_files(paths.pop(name), *stems)
+            paths |= {f"{name}/{file.name}": file for file in files}
     if config.reuse is not None:
         paths["reuse"] /= "run.json"
     hashes = {}
