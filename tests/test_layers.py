@@ -17,8 +17,8 @@ LEVELS = (
     {"config"},
     {"camera", "asset_files", "record", "progress", "light", "tone", "curves", "materials_file"},
     {
-        "gltf_file", "mtl", "files", "command", "placement", "lobes_file", "lobe_fit", "regressor",
-        "light_errors",
+        "gltf_file", "gltf_writer", "mtl", "files", "command", "placement", "lobes_file",
+        "lobe_fit", "regressor", "light_errors",
     },
     {
         "gltf_material", "obj", "reuse", "program", "regressor_training", "training_lights",
@@ -63,7 +63,7 @@ ONLY_IN = {
     "trimesh": {"gltf", "obj", "demo", "training_meshes"},
     "OpenImageIO": {"files"},
     "OpenEXR": {"files"},
-    "PIL": {"files", "asset_files", "demo", "diffusion", "contact_sheet"},
+    "PIL": {"files", "asset_files", "gltf_writer", "demo", "diffusion", "contact_sheet"},
     "diffusers": {"diffusion"},
     "transformers": {"diffusion"},
     "peft": {"diffusion"},
