@@ -95,6 +95,8 @@ class Builder:
             "count": len(rows),
             "type": TYPES[rows.shape[1]],
         }
+        if np.isfinite(array).all():  # NaN is not JSON
+            accessor |= {"min": rows.min(axis=0).tolist(), "max": rows.max(axis=0).tolist()}
         self.json["accessors"].append(accessor | ({"normalized": True} if normalized else {}))
         return len(self.json["accessors"]) - 1
 
