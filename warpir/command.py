@@ -50,6 +50,7 @@ FLAGS = {
         "rotate_y": "DEG",
         "scale": "S",
         "size": "METRES",
+        "asset_up": "AXIS",
     },
     "light": {
         "light": "FILE",

@@ -2,7 +2,7 @@
 
 import os
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import lru_cache
 from pathlib import Path
 from typing import TypeVar
@@ -15,13 +15,16 @@ from warpir.files import Photo, read_envmap, read_photo
 from warpir.light import Light
 from warpir.lobes_file import read_lobes
 from warpir.materials_file import with_materials
-from warpir.placement import Placement, place_asset
+from warpir.placement import Placement, place_asset, up_to_y
 from warpir.reuse import EarlierRun, read_run
 
 DEFAULT_FOV = 60.0
 """Horizontal field of view without --camera, --fov and EXIF [deg]: a phone's main camera."""
 DEFAULT_CAMERA_HEIGHT = 1.6
 """Height of a photographer's eyes [m]."""
+
+STATED_UP = (".glb", ".gltf")
+"""Kinds of asset whose format says which way is up."""
 
 Read = TypeVar("Read")
 
@@ -90,7 +93,7 @@ def read_inputs(config: InsertConfig, loaders: Loaders | None = None) -> Inputs:
             alpha="ignore" if config.alpha == "ignore" else "refuse",
         )
     )
-    asset = attempt(lambda: _read_asset(asset_path, config, loaders))
+    asset = attempt(lambda: _read_asset(asset_path, config, loaders, assumed))
     light = attempt(lambda: _read_light(config, notices))
     reuse = config.reuse
     run = attempt(lambda: loaders.run(reuse)) if reuse is not None else None
@@ -149,8 +152,14 @@ def _inputs_in_out(config: InsertConfig) -> list[InputError]:
     return []
 
 
-def _read_asset(path: str, config: InsertConfig, loaders: Loaders) -> Asset:
+def _read_asset(path: str, config: InsertConfig, loaders: Loaders, assumed: list[str]) -> Asset:
     asset = loaders.asset(path, config.missing_textures)
+    if config.asset_up is not None:
+        turned = f"turned: its {config.asset_up} axis points up (--asset-up)"
+        asset = asset.turned(up_to_y(config.asset_up))
+        asset = replace(asset, notices=(*asset.notices, turned))
+    elif Path(path).suffix.lower() not in STATED_UP:
+        assumed.append("the asset's +y axis points up (--asset-up)")
     if config.materials is not None:
         asset = with_materials(asset, config.materials)
     for name in config.refine_materials or ():
