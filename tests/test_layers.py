@@ -15,7 +15,10 @@ LEVELS = (
     },
     {"optimize_settings", "asset", "strict_json", "image_errors", "lpips"},
     {"config"},
-    {"camera", "asset_files", "record", "progress", "light", "tone", "curves", "materials_file"},
+    {
+        "camera", "asset_files", "record", "progress", "light", "tone", "curves", "materials_file",
+        "ply", "stl",
+    },
     {
         "gltf_file", "gltf_writer", "mtl", "files", "command", "placement", "lobes_file",
         "lobe_fit", "regressor", "light_errors",
@@ -60,7 +63,7 @@ ONLY_IN = {
         "training_batches", "training_lights", "photo_look", "lpips", "evaluation_rows",
         "evaluation_stage", "train", "evaluate",
     },
-    "trimesh": {"gltf", "obj", "demo", "training_meshes"},
+    "trimesh": {"training_meshes"},
     "OpenImageIO": {"files"},
     "OpenEXR": {"files"},
     "PIL": {"files", "asset_files", "gltf_writer", "demo", "diffusion", "contact_sheet"},
