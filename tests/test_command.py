@@ -238,6 +238,7 @@ def problems_of(**values: Any) -> list[InputError]:
         (["--light-rotate", "-90.5"], "light_rotate", -90.5),
         (["--guidance", "none", "--exposure", "-2"], "exposure", -2.0),
         (["--camera", "f.fspy", "--up", "-z"], "up", "-z"),
+        (["--asset-up", "-z"], "asset_up", "-z"),
         (["--sun", "-30,40"], "sun", (-30.0, 40.0)),
         (["--sun", "120,40,2.5"], "sun", (120.0, 40.0, 2.5)),
         (["--sky", "overcast"], "sky", "overcast"),
@@ -604,6 +605,26 @@ def test_validate_reads_everything_without_torch_or_warp(scene: list[str], tmp_p
     assert lines[-2:] == ["inputs are valid", "[]"]
     assert any(line.startswith("assumed: ") and "--fov" in line for line in lines)
     assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.parametrize("axis", [None, "+z", "-z"])
+def test_M16_asset_up_is_applied_and_said(scene: list[str], axis: str | None) -> None:
+    """Without --asset-up an OBJ is taken as Y up; with it the asset is turned; both are said."""
+    from warpir.inputs import read_inputs
+
+    given = read_inputs(parse([*scene, *(["--asset-up", axis] if axis else [])]).config)
+    low, high = given.asset.bounds()
+    assumed = [line for line in given.assumed if "--asset-up" in line]
+    turned = [line for line in given.notices if "--asset-up" in line]
+    if axis is None:
+        assert len(assumed) == 1 and "+y axis" in assumed[0] and not turned
+    else:
+        assert not assumed and turned == [
+            f"asset.obj: turned: its {axis} axis points up (--asset-up)"
+        ]
+    # The corners lie at 0 and 1 along each axis.
+    expected = {None: (0.0, 0.0), "+z": (0.0, -1.0), "-z": (-1.0, 0.0)}[axis]
+    assert (low[1], low[2]) == expected and (high[1] - low[1]) == 1.0
 
 
 @pytest.mark.parametrize(

@@ -95,6 +95,8 @@ class Builder:
             "count": len(rows),
             "type": TYPES[rows.shape[1]],
         }
+        if np.isfinite(array).all():  # NaN is not JSON
+            accessor |= {"min": rows.min(axis=0).tolist(), "max": rows.max(axis=0).tolist()}
         self.json["accessors"].append(accessor | ({"normalized": True} if normalized else {}))
         return len(self.json["accessors"]) - 1
 
@@ -203,9 +205,43 @@ fault("G5-image-text", "/images/0", "not a PNG, JPEG or WebP")(
 fault("G5-image-ktx2", "/images/0", "KTX2", "PNG or JPEG")(
     lambda b: b.base_color({"bufferView": b.view(b"\xabKTX 20\xbb\r\n\x1a\n" + bytes(64))})
 )
-fault("G8-sparse", "/accessors/0", "sparse", "POSITION", "re-export")(
+
+
+def sparse(at: list[int], values: np.ndarray, code: str = "B", **members: Any) -> Plant:
+    """Replace vertices ``at`` of POSITION by ``values``."""
+
+    def plant(b: Builder) -> None:
+        b.json["accessors"][0]["sparse"] = {
+            "count": len(at),
+            "indices": {
+                "bufferView": b.view(np.array(at, code).tobytes()), "componentType": CODES[code]
+            },
+            "values": {"bufferView": b.view(values.astype("f").tobytes())},
+        } | members  # fmt: skip
+
+    return plant
+
+
+ONE_ROW = np.full((1, 3), 9.0)
+fault("G8-sparse-without-indices", "/accessors/0/sparse/indices: componentType is missing")(
     set_accessor(0, sparse={"count": 1})
 )
+fault("G8-sparse-index-out-of-range", "/accessors/0/sparse/indices: index 4, but 4 elements")(
+    sparse([4], ONE_ROW)
+)
+fault("G8-sparse-indices-not-increasing", "/accessors/0/sparse/indices", "do not increase")(
+    sparse([2, 2], np.zeros((2, 3)))
+)
+fault("G8-sparse-signed-indices", "/accessors/0/sparse/indices: componentType 5120")(
+    sparse([1], ONE_ROW, "b")
+)
+fault("G8-sparse-values-too-short", "/accessors/0/sparse/values: 2 elements end at byte 24")(
+    sparse([1, 2], ONE_ROW)
+)
+fault("G8-sparse-count-lies", "/accessors/0/sparse/indices: 2147483648 elements end at")(
+    sparse([1], ONE_ROW, count=2**31)
+)
+fault("G8-sparse-NaN", "/accessors/0: 1 elements are NaN")(sparse([1], ONE_ROW * np.nan))
 fault("G12-unknown-extension", "/extensionsRequired", "ACME_holograms", "re-export without")(
     lambda b: b.json.update(extensionsRequired=["ACME_holograms"])
 )
@@ -318,6 +354,60 @@ fault("G28-2^18-instances", "too many nodes", "262144", "100000")(
 )
 fault("G28-too-many-placed", "too many instances", "65536")(
     lambda b: b.json.update(nodes=[{"mesh": 0}] * 70_000, scenes=[{"nodes": list(range(70_000))}])
+)
+
+
+def zeros(b: Builder) -> None:
+    """Ask for 24 GiB of zeros with one element replaced."""
+    sparse([1], ONE_ROW)(b)
+    b.json["accessors"][0].pop("bufferView")
+    b.json["accessors"][0].update(count=10_000_000 * 3)
+    b.primitive.pop("indices")
+
+
+fault("G23-sparse-zeros", "/accessors/0: 360000000 bytes of zeros (limit 268435456)")(zeros)
+fault("G23-normal-count-2^31", "/meshes/0/primitives/0: 2147483648 NORMAL, but 4 vertices")(
+    set_accessor(1, count=2**31)
+)
+
+
+def instanced(**attributes: np.ndarray) -> Plant:
+    """Place the square's mesh as EXT_mesh_gpu_instancing says."""
+
+    def plant(b: Builder) -> None:
+        b.json["extensionsUsed"] = b.json["extensionsRequired"] = ["EXT_mesh_gpu_instancing"]
+        stored = {
+            name: b.accessor(array, normalized=array.dtype.kind != "f")
+            for name, array in attributes.items()
+        }
+        node(extensions={"EXT_mesh_gpu_instancing": {"attributes": stored}})(b)
+
+    return plant
+
+
+INSTANCING = "/nodes/0/extensions/EXT_mesh_gpu_instancing/attributes"
+fault("G28-instances-without-attributes", INSTANCING, "found none")(instanced())
+fault("G28-instances-unequal", INSTANCING, "found 2 TRANSLATION, 3 SCALE")(
+    instanced(TRANSLATION=np.zeros((2, 3), "f"), SCALE=np.ones((3, 3), "f"))
+)
+fault("G28-instances-2^18", INSTANCING, "found 262144; limit 65536")(
+    instanced(TRANSLATION=np.zeros((2**18, 3), "f"))
+)
+fault("G28-instances-of-two-nodes", "too many instances (limit 65536")(
+    lambda b: (
+        instanced(TRANSLATION=np.zeros((40_000, 3), "f"))(b),
+        b.json["nodes"].append(b.json["nodes"][0]),
+        b.json.update(scenes=[{"nodes": [0, 1]}]),
+    )
+)
+fault("G25-instance-of-zero-scale", "/nodes/0: singular transform of instance 1")(
+    instanced(SCALE=np.array([[1, 1, 1], [0, 1, 0]], "f"))
+)
+fault("G25-instance-of-zero-quaternion", INSTANCING, "ROTATION holds the zero quaternion")(
+    instanced(ROTATION=np.zeros((1, 4), "f"))
+)
+fault("G15-instance-NaN", "/accessors/4", "NaN or infinite")(
+    instanced(TRANSLATION=np.full((1, 3), np.nan, "f"))
 )
 fault("M6-past-the-buffer", "/accessors/0", "elements end at byte")(set_accessor(0, count=5))
 fault("M6-negative-offset", "/accessors/0: byteOffset is -4")(set_accessor(0, byteOffset=-4))
@@ -667,6 +757,38 @@ def test_G7_quantised_positions_equal_float(code: str, normalized: bool, tmp_pat
     np.testing.assert_allclose(square.normals, [[-1, 0, 0]] * 4, rtol=FLOAT32_RTOL)
 
 
+@pytest.mark.parametrize("code", ["B", "H", "I"])
+@pytest.mark.parametrize("base", ["stored", "zeros"])
+def test_G8_sparse_equals_dense(code: str, base: str, tmp_path: Path) -> None:
+    """Replaced vertices, on a stored base or on zeros, give the mesh that states them all."""
+    expected = CORNERS if base == "stored" else np.zeros_like(CORNERS)
+    expected = expected.copy()
+    expected[[1, 3]] = [[2, 0, 1], [0, 3, 1]]
+    expected[2, 1] += base == "zeros"  # so that both triangles have an area
+    at = [1, 3] if base == "stored" else [1, 2, 3]
+    builder = Builder()
+    sparse(at, expected[at], code)(builder)
+    if base == "zeros":
+        del builder.json["accessors"][0]["bufferView"]
+    (square,) = load(tmp_path, builder).primitives
+    np.testing.assert_array_equal(square.positions, expected)
+    assert len(square.indices) == 2
+
+
+def test_G8_sparse_quantised_uv_equals_dense(tmp_path: Path) -> None:
+    """Normalised integers are replaced before they are scaled; other attributes may be sparse."""
+    codes = np.array([[0, 255], [255, 255], [255, 0], [0, 0]], "B")
+    builder = Builder()
+    builder.attribute("TEXCOORD_0", codes, normalized=True, stride=4)
+    builder.json["accessors"][-1]["sparse"] = {
+        "count": 1,
+        "indices": {"bufferView": builder.view(b"\3"), "componentType": 5121},
+        "values": {"bufferView": builder.view(b"\x33\xff")},
+    }
+    uv0 = load(tmp_path, builder).primitives[0].uv0
+    np.testing.assert_allclose(uv0, [[0, 1], [1, 1], [1, 0], [0.2, 1]], rtol=FLOAT32_RTOL)
+
+
 def test_G8_sparse_accessor_of_a_morph_target_is_never_read(tmp_path: Path) -> None:
     """A sparse accessor matters only where something drawn uses it."""
     builder = Builder()
@@ -996,6 +1118,31 @@ def test_G28_deep_chain_loads(tmp_path: Path) -> None:
     chain = [{"children": [k + 1], "translation": [0.5, 0, 0]} for k in range(2999)]
     builder.json["nodes"] = [*chain, {"mesh": 0}]
     assert load(tmp_path, builder).bounds()[0][0] == 2999 * 0.5
+
+
+@pytest.mark.parametrize("code", ["f", "b", "h"])
+def test_G28_instances_equal_nodes(code: str, tmp_path: Path) -> None:
+    """EXT_mesh_gpu_instancing places the mesh where nodes of the same numbers do."""
+    shifts = np.array([[1, 0, 0], [0, 2, 0], [0, 0, 3]], "f")
+    turns = np.array([[0, 0, 0, 1], [0, 0, 1, 0], [1, 0, 0, 0]], "f")
+    scales = np.array([[1, 1, 1], [2, 1, 1], [-1, 1, 1]], "f")
+    builder = Builder()
+    stored = turns if code == "f" else (turns * np.iinfo(code).max).astype(code)
+    instanced(TRANSLATION=shifts, ROTATION=stored, SCALE=scales)(builder)
+    node(translation=[5, 0, 0], scale=[1, 2, 1])(builder)
+    asset = load(tmp_path, builder)
+    assert asset.notices == () and winding_agrees(asset)
+    builder = Builder()
+    builder.json["nodes"] = [{"children": [1, 2, 3], "translation": [5, 0, 0], "scale": [1, 2, 1]}]
+    builder.json["nodes"] += [
+        {"mesh": 0, "translation": t.tolist(), "rotation": r.tolist(), "scale": s.tolist()}
+        for t, r, s in zip(shifts, turns, scales, strict=True)
+    ]
+    nodes = load(tmp_path, builder)
+    for a, b in zip(asset.primitives, nodes.primitives, strict=True):
+        np.testing.assert_array_equal(a.positions, b.positions)
+        np.testing.assert_array_equal(a.indices, b.indices)
+        np.testing.assert_array_equal(a.normals, b.normals)
 
 
 def test_G29_primitives_are_not_merged(tmp_path: Path) -> None:

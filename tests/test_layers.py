@@ -18,11 +18,15 @@ LEVELS = (
         "lens", "colmap_model",
     },
     {"config", "color_profile"},
-    {"camera", "asset_files", "record", "progress", "light", "tone", "curves", "materials_file"},
+    {
+        "camera", "asset_files", "record", "progress", "light", "tone", "curves", "materials_file",
+        "ply", "stl",
+    },
     {"envmap_conventions"},
     {
-        "gltf_file", "mtl", "files", "photo_files", "command", "placement", "lobes_file",
-        "lobe_fit", "regressor", "light_errors", "camera_source", "point_cloud", "ground",
+        "gltf_file", "gltf_writer", "mtl", "files", "photo_files", "command", "placement",
+        "lobes_file", "lobe_fit", "regressor", "light_errors", "camera_source", "point_cloud",
+        "ground",
     },
     {
         "gltf_material", "obj", "reuse", "program", "regressor_training", "training_lights",
@@ -67,10 +71,12 @@ ONLY_IN = {
         "training_batches", "training_lights", "photo_look", "lpips", "evaluation_rows",
         "evaluation_stage", "train", "evaluate",
     },
-    "trimesh": {"gltf", "obj", "demo", "training_meshes"},
+    "trimesh": {"training_meshes"},
     "OpenImageIO": {"files", "image_decoder", "color_profile"},
     "OpenEXR": {"files"},
-    "PIL": {"color_profile", "asset_files", "demo", "diffusion", "contact_sheet"},
+    "PIL": {
+        "color_profile", "asset_files", "gltf_writer", "demo", "diffusion", "contact_sheet",
+    },
     "diffusers": {"diffusion"},
     "transformers": {"diffusion"},
     "peft": {"diffusion"},

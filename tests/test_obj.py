@@ -317,22 +317,154 @@ def test_one_primitive_per_material(tmp_path: Path) -> None:
     assert asset.primitives[0].normals is None
 
 
-def ply(kind: str) -> bytes:
-    """Return the square with normals and colours as ASCII or binary PLY."""
-    rows = [(x, y, 0.0, 0.0, 0.0, 1.0, 51, 102, 255) for x, y in ((0, 0), (1, 0), (1, 1), (0, 1))]
-    header = f"ply\nformat {'ascii' if kind == 'ascii' else 'binary_little_endian'} 1.0\n"
-    header += "element vertex 4\n" + "".join(
-        f"property float {k}\n" for k in "x y z nx ny nz".split()
-    )
-    header += "".join(f"property uchar {k}\n" for k in ("red", "green", "blue"))
-    header += "element face 2\nproperty list uchar int vertex_indices\nend_header\n"
-    faces = [(0, 1, 2), (0, 2, 3)]
+PLY_FORMATS = {"ascii": "ascii", "little": "binary_little_endian", "big": "binary_big_endian"}
+PLY_CODES = {"float": "f", "double": "d", "uchar": "B", "ushort": "H", "int": "i"}
+
+
+def ply_text(
+    kind: str,
+    vertices: list[tuple[float, ...]],
+    faces: list[tuple[int, ...]],
+    extra: str = "",
+    of_faces: str = "",
+    comment: str = "",
+) -> bytes:
+    """Return a PLY file.
+
+    Args:
+        kind: A key of `PLY_FORMATS`.
+        vertices: Numbers of each vertex: x, y, z and ``extra``.
+        faces: Corners of each face.
+        extra: Further properties of vertices, such as ``uchar red, uchar green``.
+        of_faces: Properties of faces after the corners; their values are all 7.
+        comment: A comment of the header.
+    """
+    properties = ["float x", "float y", "float z", *filter(None, extra.split(", "))]
+    header = f"ply\nformat {PLY_FORMATS[kind]} 1.0\n" + (f"comment {comment}\n" if comment else "")
+    header += f"element vertex {len(vertices)}\n"
+    header += "".join(f"property {text}\n" for text in properties)
+    header += f"element face {len(faces)}\nproperty list uchar int vertex_indices\n"
+    more = [*filter(None, of_faces.split(", "))]
+    header += "".join(f"property {text}\n" for text in more) + "end_header\n"
+    rows = [*vertices, *((len(face), *face, *[7] * len(more)) for face in faces)]
     if kind == "ascii":
-        body = "".join(" ".join(map(str, row)) + "\n" for row in rows)
-        body += "".join("3 {} {} {}\n".format(*f) for f in faces)
-        return (header + body).encode()
-    packed = b"".join(struct.pack("<6f3B", *row) for row in rows)
-    return header.encode() + packed + b"".join(struct.pack("<B3i", 3, *f) for f in faces)
+        return (header + "".join(" ".join(map(str, row)) + "\n" for row in rows)).encode()
+    order = "<" if kind == "little" else ">"
+    codes = "".join(PLY_CODES[text.split()[0]] for text in properties)
+    tail = "".join(PLY_CODES[text.split()[0]] for text in more)
+    body = b"".join(struct.pack(order + codes, *row) for row in vertices)
+    for face in faces:
+        body += struct.pack(f"{order}B{len(face)}i{tail}", len(face), *face, *[7] * len(more))
+    return header.encode() + body
+
+
+def ply(kind: str) -> bytes:
+    """Return the square with normals and colours."""
+    rows = [(x, y, 0.0, 0.0, 0.0, 1.0, 51, 102, 255) for x, y in ((0, 0), (1, 0), (1, 1), (0, 1))]
+    extra = "float nx, float ny, float nz, uchar red, uchar green, uchar blue"
+    return ply_text("little" if kind == "binary" else kind, rows, [(0, 1, 2), (0, 2, 3)], extra)
+
+
+def areas(asset: Asset) -> float:
+    return float(np.linalg.norm(area(asset), axis=1).sum())
+
+
+@pytest.mark.parametrize("kind", PLY_FORMATS)
+@pytest.mark.parametrize("case", ["quad", "mixed", "pentagon", "concave", "one-corner"])
+def test_ply_polygons_keep_their_area(kind: str, case: str, tmp_path: Path) -> None:
+    """Faces of any number of corners, mixed ones too, in every encoding."""
+    corners, faces, expected = {
+        "quad": ([(0, 0), (1, 0), (1, 1), (0, 1)], [(0, 1, 2, 3)], 1.0),
+        "mixed": (
+            [(0, 0), (1, 0), (1, 1), (0, 1), (2, 0)], [(0, 1, 2, 3), (1, 4, 2)], 1.5
+        ),
+        "pentagon": ([(0, 0), (1, 0), (1.5, 1), (0.5, 2), (-0.5, 1)], [(0, 1, 2, 3, 4)], 2.5),
+        # A fan from its first corner would cover 3.8.
+        "concave": ([(0, 0), (2, 0), (2, 2), (1.9, 0.1)], [(0, 1, 2, 3)], 0.2),
+        "one-corner": ([(0, 0), (1, 0), (1, 1)], [(0, 1, 2), (1,)], 0.5),
+    }[case]  # fmt: skip
+    vertices = [(*corner, 0.0) for corner in corners]
+    content = ply_text(kind, vertices, faces, of_faces="uchar flags, float quality")
+    asset = load_asset(write(tmp_path, content, "asset.ply"))
+    assert areas(asset) == pytest.approx(expected, rel=1e-6)
+    assert (area(asset)[:, 2] > 0).all()
+    said = any("1 faces of fewer than 3" in notice for notice in asset.notices)
+    assert said == (case == "one-corner")
+
+
+@pytest.mark.parametrize("kind", PLY_FORMATS)
+@pytest.mark.parametrize(
+    ("extra", "values", "expected"),
+    [
+        ("uchar red, uchar green, uchar blue", (51, 102, 255), (0.2, 0.4, 1, 1)),
+        ("ushort red, ushort green, ushort blue", (13107, 1, 65535), (0.2, 1 / 65535, 1, 1)),
+        ("float red, float green, float blue", (0.123, 0.4, 1), (0.123, 0.4, 1, 1)),
+        ("uchar red, uchar green, uchar blue, uchar alpha", (0, 0, 0, 51), (0, 0, 0, 0.2)),
+        ("uchar diffuse_red, uchar diffuse_green, uchar diffuse_blue", (0, 51, 0), (0, 0.2, 0, 1)),
+    ],
+    ids=["u8", "u16", "float", "alpha", "diffuse"],
+)
+def test_ply_colors_keep_their_precision(
+    kind: str, extra: str, values: tuple[float, ...], expected: tuple[float, ...], tmp_path: Path
+) -> None:
+    """Vertex colours of every type become linear RGBA, not rounded to 8 bits."""
+    vertices = [(*corner, *values) for corner in ((0, 0, 0), (1, 0, 0), (1, 1, 0))]
+    content = ply_text(kind, vertices, [(0, 1, 2)], extra)
+    colors = load_asset(write(tmp_path, content, "asset.ply")).primitives[0].colors
+    assert colors is not None
+    np.testing.assert_allclose(colors, [expected] * 3, rtol=1e-6)
+
+
+def test_ply_says_what_it_does_not_read(tmp_path: Path) -> None:
+    """Textures and colours of faces give a notice."""
+    vertices = [(0, 0, 0), (1, 0, 0), (1, 1, 0)]
+    of_faces = "uchar red, uchar green, uchar blue"
+    content = ply_text("ascii", vertices, [(0, 1, 2)], "", of_faces, "TextureFile a.png")
+    asset = load_asset(write(tmp_path, content, "asset.ply"))
+    assert any("colours of faces" in notice for notice in asset.notices)
+    assert any("texture" in notice for notice in asset.notices)
+
+
+def test_M12_point_cloud_has_nothing_to_render(tmp_path: Path) -> None:
+    """A PLY of points alone is refused, with the flag that takes it."""
+    content = ply_text("little", [(0, 0, 0), (1, 0, 0), (1, 1, 0)], [])
+    fails(write(tmp_path, content, "asset.ply"), "nothing to render", "3 vertex", "--ground-points")
+
+
+PLY_FAULTS: dict[str, tuple[Callable[[str], str], tuple[str, ...]]] = {
+    "no-header-end": (lambda t: t.replace("end_header", "end"), ("no end_header",)),
+    "format-2": (lambda t: t.replace("ascii 1.0", "ascii 2.0"), ("line 2", "PLY 1.0")),
+    "unknown-type": (lambda t: t.replace("float y", "half y"), ("line 5", "half y")),
+    "float-length": (lambda t: t.replace("list uchar", "list float"), ("line 8", "list float")),
+    "element-twice": (lambda t: t.replace("element face", "element vertex"), ("line 7",)),
+    "no-z": (lambda t: t.replace("float z", "float w"), ("no x, y and z",)),
+    "negative-index": (lambda t: t.replace("3 0 1 2", "3 0 1 -2"), ("index -2, but 3 vertices",)),
+    "negative-length": (lambda t: t.replace("3 0 1 2", "-3 0 1 2"), ("within its 1 face",)),
+    "decimal-comma": (lambda t: t.replace("0.5", "0,5"), ("damaged PLY", "0,5")),
+    "numbers-left-over": (lambda t: t.replace("0.5", "0.5 0.5"), ("damaged PLY",)),
+    "fraction-as-index": (lambda t: t.replace("3 0 1 2", "3 0 1 1.5"), ("1.5",)),
+    "colour-256": (
+        lambda t: t.replace("property float z\n", "property float z\nproperty uchar red\n")
+        .replace("0 0\n", "0 0 256\n")
+        .replace("0.5\n", "0.5 7\n"),
+        ("vertex red 256",),
+    ),
+    "float-colours-to-255": (
+        lambda t: t.replace("float x", "float red").replace("float y", "float green")
+        .replace("float z\n", "float blue\nproperty float x\nproperty float y\nproperty float z\n")
+        .replace("0 0\n", "0 255 1 2 3\n").replace("0.5\n", "0.5 4 4 3\n"),
+        ("colours from 0 to 255",),
+    ),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("case", PLY_FAULTS)
+def test_ply_fault_is_named(case: str, tmp_path: Path) -> None:
+    """What the header or the body gets wrong is named."""
+    damage, words = PLY_FAULTS[case]
+    text = ply_text("ascii", [(0, 0, 0), (1, 0, 0), (1, 1, 0.5)], [(0, 1, 2)]).decode()
+    assert damage(text) != text
+    fails(write(tmp_path, damage(text), "asset.ply"), *words)
 
 
 @pytest.mark.parametrize("kind", ["ascii", "binary"])
@@ -392,15 +524,56 @@ def test_stl_square(tmp_path: Path) -> None:
 
 def test_stl_ascii_square(tmp_path: Path) -> None:
     """An ASCII STL holds the same triangles."""
+    asset = load_asset(write(tmp_path, ascii_stl(), "asset.stl"))
+    np.testing.assert_array_equal(area(asset), [[0, 0, 0.5]] * 2)
+
+
+def ascii_stl(name: str = "a") -> str:
+    """Return the square as ASCII STL."""
     facets = "".join(
-        f"facet normal 0 0 1\nouter loop\n{corners}endloop\nendfacet\n"
+        f"  facet normal 0 0 1\n outer loop\n{corners} endloop\n endfacet\n"
         for corners in (
             "vertex 0 0 0\nvertex 1 0 0\nvertex 1 1 0\n",
             "vertex 0 0 0\nvertex 1 1 0\nvertex 0 1 0\n",
         )
     )
-    asset = load_asset(write(tmp_path, f"solid a\n{facets}endsolid a\n", "asset.stl"))
+    return f"solid {name}\n{facets}endsolid {name}\n"
+
+
+STL_SAME: dict[str, bytes] = {
+    "upper-case": ascii_stl().upper().encode(),
+    "crlf": ascii_stl().replace("\n", "\r\n").encode(),
+    "names-like-statements": ascii_stl("facet normal 1 2").encode(),
+    "two-solids": ascii_stl()
+    .replace("endfacet\n  facet", "endfacet\nendsolid a\nsolid b\nfacet")
+    .encode(),
+    "binary-that-begins-with-solid": b"solid made by a tool".ljust(80) + stl()[80:],
+    "binary-with-a-tail": stl() + b"tail",
+}
+
+
+@pytest.mark.parametrize("case", STL_SAME)
+def test_stl_spellings_agree(case: str, tmp_path: Path) -> None:
+    """Every spelling of the square gives its two triangles."""
+    asset = load_asset(write(tmp_path, STL_SAME[case], "asset.stl"))
     np.testing.assert_array_equal(area(asset), [[0, 0, 0.5]] * 2)
+    assert any("bytes after" in notice for notice in asset.notices) == ("tail" in case)
+
+
+STL_FAULTS = {
+    "two-corners": (ascii_stl().replace("vertex 1 0 0\n", ""), "facet 0 is not one"),
+    "word-for-a-number": (ascii_stl().replace("vertex 1 0 0", "vertex 1 x 0"), "x"),
+    "cut": (ascii_stl()[:-30], "1 solid and 0 endsolid"),
+    "cut-inside": (ascii_stl().replace(" endfacet\nendsolid", "endsolid"), "facet 1 is not one"),
+    "inf": (ascii_stl().replace("vertex 1 0 0", "vertex 1 inf 0"), "NaN or infinite"),
+}
+
+
+@pytest.mark.parametrize("case", STL_FAULTS)
+def test_stl_ascii_fault_is_named(case: str, tmp_path: Path) -> None:
+    """A damaged ASCII file is refused with its facet."""
+    text, words = STL_FAULTS[case]
+    fails(write(tmp_path, text, "asset.stl"), words)
 
 
 @pytest.mark.parametrize("fault", ["cut", "count", "nan", "empty"])

@@ -4,9 +4,10 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from warpir.asset import Asset, Material, Primitive
 from warpir.camera import Camera, camera_from_fov
 from warpir.errors import InputError
-from warpir.placement import place_asset, turn, upright_plane, y_to
+from warpir.placement import place_asset, turn, up_to_y, upright_plane, y_to
 
 Float64Array = NDArray[np.float64]
 
@@ -161,3 +162,31 @@ def test_placement_plane_needs_a_normal() -> None:
     """A plane of zeros is refused."""
     with pytest.raises(InputError, match="--ground"):
         upright_plane((0.0, 0.0, 0.0, 1.0), np.array([0.0, 1.5, 0.0]))
+
+
+@pytest.mark.parametrize("axis", ["x", "+x", "-x", "y", "-y", "z", "-z"])
+def test_M16_up_axis_of_an_asset_becomes_y(axis: str) -> None:
+    """What points along the axis points up; normals and tangents follow, nothing is mirrored."""
+    up = np.zeros(3)
+    up["xyz".index(axis[-1])] = -1.0 if axis[0] == "-" else 1.0
+    corners = np.array([[0.0, 0.0, 0.0], [1.0, 2.0, 3.0], [-2.0, 1.0, 0.5], 5.0 * up])
+    first, second = (v / np.linalg.norm(v) for v in (corners[1], corners[2]))
+    normal = np.cross(first, second)
+    stored = np.tile(normal / np.linalg.norm(normal), (4, 1)).astype(np.float32)
+    tangents = np.column_stack([np.tile(first, (4, 1)), [1, -1, 1, -1]]).astype(np.float32)
+    triangle = np.array([[0, 1, 2]], dtype=np.int32)
+    asset = Asset("", (Primitive(corners, triangle, 0, stored, tangents),), (Material(),))
+    (turned,) = asset.turned(up_to_y(axis)).primitives
+    np.testing.assert_array_equal(turned.positions[3], [0.0, 5.0, 0.0])
+    a, b, c = turned.positions[turned.indices[0]]
+    outward = np.cross(b - a, c - a)
+    assert turned.normals is not None and turned.tangents is not None
+    np.testing.assert_allclose(turned.normals[0], outward / np.linalg.norm(outward), atol=1e-6)
+    np.testing.assert_allclose(turned.tangents[0, :3], b / np.linalg.norm(b), atol=1e-6)
+    np.testing.assert_array_equal(turned.tangents[:, 3], [1, -1, 1, -1])
+    assert turned.normals.dtype == turned.tangents.dtype == np.float32
+
+
+def test_M16_z_up_is_turned_by_the_stated_map() -> None:
+    """(x, y, z) becomes (x, z, -y), as everywhere in the project."""
+    np.testing.assert_array_equal(up_to_y("z") @ (1.0, 2.0, 3.0), (1.0, 3.0, -2.0))

@@ -5,7 +5,7 @@ them checks again. Frame: the asset's own, right-handed, +Y up, front +Z, in met
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
@@ -146,6 +146,27 @@ class Asset:
         low = np.min([p.positions.min(axis=0) for p in self.primitives], axis=0)
         high = np.max([p.positions.max(axis=0) for p in self.primitives], axis=0)
         return low, high
+
+    def turned(self, rotation: NDArray[np.float64]) -> "Asset":
+        """Return the same turned about its origin.
+
+        Args:
+            rotation: From this asset's frame to the new one, shape [3, 3].
+        """
+        rotation32 = rotation.astype(np.float32)
+
+        def turn(p: Primitive) -> Primitive:
+            tangents = p.tangents
+            if tangents is not None:
+                tangents = np.column_stack([tangents[:, :3] @ rotation32.T, tangents[:, 3]])
+            return replace(
+                p,
+                positions=p.positions @ rotation.T,
+                normals=None if p.normals is None else p.normals @ rotation32.T,
+                tangents=tangents,
+            )
+
+        return replace(self, primitives=tuple(turn(p) for p in self.primitives))
 
     def materials_named(self, names: Sequence[str] | None) -> list[int]:
         """Return the indices of the materials that have one of these names; None: of all."""

@@ -55,6 +55,7 @@ FLAGS = {
         "rotate_y": "DEG",
         "scale": "S",
         "size": "METRES",
+        "asset_up": "AXIS",
     },
     "light": {
         "light": "FILE",

@@ -111,6 +111,9 @@ class InsertConfig(ModelSettings, PersonalizeSettings, GuidanceChoices, Optimize
     """Folder for everything that is written"""
     overwrite: bool = False
     """Replace results that are already in --out"""
+    asset_up: str | None = None
+    """Which axis of the asset points up (default: +y, as glTF demands; other tools' OBJ, PLY and
+    STL are often +z)"""
     materials: str | None = None
     """materials.json of a run with --refine: factors for the materials of --asset"""
     demo: bool = False
@@ -412,8 +415,10 @@ RANGES: dict[str, tuple[float, float | None]] = {
 
 ABOVE_ZERO = ("camera_height", "scale", "size", "ground_albedo", "lora_rate", "chroma_limit")
 
+AXES = ("x", "+x", "-x", "y", "+y", "-y", "z", "+z", "-z")
 CHOICES = {
-    "up": ("x", "+x", "-x", "y", "+y", "-y", "z", "+z", "-z"),
+    "up": AXES,
+    "asset_up": AXES,
     "tone": ("reinhard", "linear"),
     "alpha": ("refuse", "ignore"),
     "light_convention": ("openexr", "nvdiffrec", "threejs", "blender", "diffusionlight"),

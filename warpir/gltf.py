@@ -7,7 +7,7 @@ cameras, skins and animations are not read.
 """
 
 import math
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -23,6 +23,7 @@ from warpir.asset_files import (
     concise,
     keep_area,
     repair_normals,
+    unit,
 )
 from warpir.gltf_file import Entry, GltfFile
 from warpir.gltf_material import MaterialReader, check_extensions
@@ -56,7 +57,7 @@ def read_gltf(path: str | Path, missing_textures: str = "error") -> Asset:
     notices: list[str] = []
     file = GltfFile(path)
     check_extensions(file.root, notices)
-    placed = list(placed_primitives(file.root, notices))
+    placed = list(placed_primitives(file, notices))
     check_counts(file, placed)
     materials = MaterialReader(file, missing_textures, notices)
     geometries: dict[str, Geometry | None] = {}
@@ -81,11 +82,11 @@ def read_gltf(path: str | Path, missing_textures: str = "error") -> Asset:
     )
 
 
-def placed_primitives(root: Entry, notices: list[str]) -> Iterator[tuple[Entry, Matrix]]:
+def placed_primitives(file: GltfFile, notices: list[str]) -> Iterator[tuple[Entry, Matrix]]:
     """Walk the scene and yield every drawable primitive with its matrix.
 
     Args:
-        root: The file.
+        file: The file.
         notices: Receives what is left out.
 
     Yields:
@@ -94,6 +95,7 @@ def placed_primitives(root: Entry, notices: list[str]) -> Iterator[tuple[Entry, 
     Raises:
         InputError: The nodes are not a forest, or a drawn transform is singular.
     """
+    root = file.root
     nodes, parents = read_forest(root)
     listed = scene_nodes(root, nodes, parents, notices)
     if root.size("animations"):
@@ -114,7 +116,9 @@ def placed_primitives(root: Entry, notices: list[str]) -> Iterator[tuple[Entry, 
         stack += [(child, world, drawn) for child in reversed(node.integers("children"))]
         if not drawn or "mesh" not in node:
             continue
-        check_invertible(node, world)
+        instances = read_instances(file, node, world)
+        for number, matrix in enumerate(instances):
+            check_invertible(node, matrix, f" of instance {number}" if len(instances) > 1 else "")
         if "skin" in node:
             notices.append(f"{node.pointer}: skin ignored, the mesh is used as stored")
         mesh = root.item("meshes", node.integer("mesh"), node, "mesh")
@@ -122,10 +126,11 @@ def placed_primitives(root: Entry, notices: list[str]) -> Iterator[tuple[Entry, 
             if primitive.integer("mode", 4) in POINTS_OR_LINES:
                 notices.append(f"{primitive.pointer}: points or lines are not drawn")
                 continue
-            instance_count += 1
+            instance_count += len(instances)
             if instance_count > INSTANCES:
                 raise root.error(f"too many instances (limit {INSTANCES} placed primitives)")
-            yield primitive, world
+            for matrix in instances:
+                yield primitive, matrix
 
 
 def read_forest(root: Entry) -> tuple[list[Entry], dict[int, int]]:
@@ -188,33 +193,83 @@ def local_matrix(node: Entry) -> Matrix:
         if not np.allclose(matrix[3], [0.0, 0.0, 0.0, 1.0]):
             raise node.error("matrix is not affine (last row is not 0 0 0 1)")
         return matrix
-    matrix = np.eye(4)
     if not parts:
-        return matrix
-    x, y, z, w = node.numbers("rotation", (0.0, 0.0, 0.0, 1.0))
-    length = math.hypot(x, y, z, w)
-    if length < 1e-6:
+        return np.eye(4)
+    rotation = node.numbers("rotation", (0.0, 0.0, 0.0, 1.0))
+    if math.hypot(*rotation) < 1e-6:
         raise node.error("rotation is the zero quaternion")
-    x, y, z, w = x / length, y / length, z / length, w / length
-    rotation = [
+    return from_trs(
+        node.numbers("translation", (0.0, 0.0, 0.0)), rotation, node.numbers("scale", (1.0,) * 3)
+    )
+
+
+def from_trs(
+    translation: Sequence[float], rotation: Sequence[float], scale: Sequence[float]
+) -> Matrix:
+    """Return translation * rotation * scale as a matrix, shape [4, 4].
+
+    Args:
+        translation: Shift [m].
+        rotation: Quaternion x, y, z, w of any length but 0.
+        scale: Factors [1].
+    """
+    length = math.hypot(*rotation)
+    x, y, z, w = (component / length for component in rotation)
+    turn = [
         [1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)],
         [2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)],
         [2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)],
     ]
-    matrix[:3, :3] = np.array(rotation) * node.numbers("scale", (1.0, 1.0, 1.0))
-    matrix[:3, 3] = node.numbers("translation", (0.0, 0.0, 0.0))
+    matrix = np.eye(4)
+    matrix[:3, :3] = np.array(turn) * scale
+    matrix[:3, 3] = translation
     return matrix
 
 
-def check_invertible(node: Entry, world: Matrix) -> None:
+def read_instances(file: GltfFile, node: Entry, world: Matrix) -> list[Matrix]:
+    """Return the matrices at which a node's mesh stands, shape [4, 4] each.
+
+    One, or as many as EXT_mesh_gpu_instancing lists below the node.
+    """
+    extension = node.extension("EXT_mesh_gpu_instancing")
+    if extension is None:
+        return [world]
+    attributes = extension.child("attributes")
+    read: dict[str, list[list[float]]] = {}
+    for name, kind in {"TRANSLATION": "VEC3", "ROTATION": "VEC4", "SCALE": "VEC3"}.items():
+        if name in attributes:
+            accessor = attributes.integer(name)
+            count = file.count(accessor, attributes, name)
+            if count > INSTANCES:
+                raise attributes.error(f"too many instances (found {count}; limit {INSTANCES})")
+            stored = file.accessor(accessor, attributes, name, (kind,))
+            if stored.dtype.kind != "f":
+                raise attributes.error(f"{name} holds integers that are not normalized")
+            read[name] = stored.tolist()
+    counts = {name: len(values) for name, values in read.items()}
+    if len(set(counts.values())) != 1:
+        found = ", ".join(f"{count} {name}" for name, count in counts.items()) or "none"
+        raise attributes.error(f"expected equally many of each attribute (found {found})")
+    (count,) = set(counts.values())
+    rotations = read.get("ROTATION", [[0.0, 0.0, 0.0, 1.0]] * count)
+    if any(math.hypot(*rotation) < 1e-6 for rotation in rotations):
+        raise attributes.error("ROTATION holds the zero quaternion")
+    shifts = read.get("TRANSLATION", [[0.0] * 3] * count)
+    scales = read.get("SCALE", [[1.0] * 3] * count)
+    with np.errstate(over="ignore", invalid="ignore"):  # `check_invertible` refuses such sizes
+        return [world @ from_trs(*parts) for parts in zip(shifts, rotations, scales, strict=True)]
+
+
+def check_invertible(node: Entry, world: Matrix, which: str = "") -> None:
     """Refuse a transform that flattens the mesh or overflows."""
     linear = world[:3, :3]
     if not (np.abs(world) < EXTENT).all():
-        raise node.error(f"transform with numbers beyond {EXTENT:g}")
+        raise node.error(f"transform{which} with numbers beyond {EXTENT:g}")
     volume = np.linalg.norm(linear, axis=0).prod()
     if abs(np.linalg.det(linear)) <= 1e-9 * volume:
         raise node.error(
-            "singular transform (a scale of zero?)", "give the object a thickness, or remove it"
+            f"singular transform{which} (a scale of zero?)",
+            "give the object a thickness, or remove it",
         )
 
 
@@ -279,10 +334,10 @@ def read_geometry(
     def read(name: str, types: tuple[str, ...]) -> NDArray[Any] | None:
         if name not in attributes:
             return None
-        elements = file.accessor(attributes.integer(name), entry, name, types)
-        if len(elements) != len(positions):
-            raise entry.error(f"{len(elements)} {name}, but {len(positions)} vertices")
-        return elements
+        count = file.count(attributes.integer(name), entry, name)
+        if count != len(positions):
+            raise entry.error(f"{count} {name}, but {len(positions)} vertices")
+        return file.accessor(attributes.integer(name), entry, name, types)
 
     normals, tangents = None, None
     stored = read("NORMAL", ("VEC3",))
@@ -371,9 +426,3 @@ def place(geometry: Geometry, world: Matrix, material: int) -> Primitive:
         uv1=geometry.uv1,
         colors=geometry.colors,
     )
-
-
-def unit(vectors: NDArray[Any]) -> FloatArray:
-    """Normalise the rows; a row of zeros stays, shape [vertex, 3]."""
-    length = np.linalg.norm(vectors, axis=1, keepdims=True)
-    return (vectors / np.where(length > 0, length, 1.0)).astype(np.float32)

@@ -31,7 +31,9 @@ COMPONENTS: dict[int, np.dtype[Any]] = {
     5126: np.dtype("<f4"),
 }
 WIDTHS = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4}
-RE_EXPORT_MESH = "re-export without mesh compression (Draco, meshopt) and without sparse accessors"
+ZERO_BYTES = 256 << 20
+"""Largest sparse accessor that begins as zeros and not as a buffer view [byte]."""
+RE_EXPORT_MESH = "re-export without mesh compression (Draco, meshopt)"
 
 
 class Entry:
@@ -257,21 +259,38 @@ class GltfFile:
             types: Accessor types that are allowed here.
 
         Returns:
-            A read-only view of the file, shape [count, width]; normalised integers become
-            float32, other integers stay.
+            A read-only view of the file, shape [count, width], or a copy where elements are
+            sparse; normalised integers become float32, other integers stay.
         """
         entry = self.root.item("accessors", index, user, what)
-        if "sparse" in entry:
-            raise entry.error(f"sparse accessor used by {user.pointer} ({what})", RE_EXPORT_MESH)
-        if "bufferView" not in entry:
-            raise entry.error(f"no bufferView, used by {user.pointer} ({what})", RE_EXPORT_MESH)
         kind, component = entry.text("type"), entry.integer("componentType")
         if kind not in types:
             raise entry.error(f"type {kind} for {what}, expected {' or '.join(types)}")
         if component not in COMPONENTS:
             raise entry.error(f"componentType {component}, expected {sorted(COMPONENTS)}")
-        content, view = self.view(entry.integer("bufferView"), entry)
         dtype, width, count = COMPONENTS[component], WIDTHS[kind], entry.integer("count", low=1)
+        if "bufferView" in entry:
+            elements = self._stored(entry, count, width, dtype)
+        elif "sparse" in entry:
+            size = count * width * dtype.itemsize
+            if size > ZERO_BYTES:
+                raise entry.error(f"{size} bytes of zeros (limit {ZERO_BYTES})", RE_EXPORT_MESH)
+            elements = np.zeros((count, width), dtype)
+        else:
+            raise entry.error(f"no bufferView, used by {user.pointer} ({what})", RE_EXPORT_MESH)
+        if "sparse" in entry:
+            elements = self._replaced(entry.child("sparse"), elements)
+        if dtype.kind == "f":
+            self._check_finite(elements, entry)
+        elif entry.flag("normalized"):
+            if component == 5125:
+                raise entry.error("32-bit integers cannot be normalized")
+            elements = np.maximum(elements / np.float32(np.iinfo(dtype).max), np.float32(-1.0))
+        return elements
+
+    def _stored(self, entry: Entry, count: int, width: int, dtype: np.dtype[Any]) -> NDArray[Any]:
+        """Return the elements that ``bufferView`` and ``byteOffset`` of an entry refer to."""
+        content, view = self.view(entry.integer("bufferView"), entry)
         size = dtype.itemsize * width
         stride = view.integer("byteStride", size, low=-(1 << 62))
         if stride < size:
@@ -282,16 +301,23 @@ class GltfFile:
             raise entry.error(
                 f"{count} elements end at byte {end}, but {view.pointer} has {len(content)} bytes"
             )
-        elements: NDArray[Any] = np.ndarray(
-            (count, width), dtype, content, start, (stride, dtype.itemsize)
-        )
-        if dtype.kind == "f":
-            self._check_finite(elements, entry)
-        elif entry.flag("normalized"):
-            if component == 5125:
-                raise entry.error("32-bit integers cannot be normalized")
-            elements = np.maximum(elements / np.float32(np.iinfo(dtype).max), np.float32(-1.0))
-        return elements
+        return np.ndarray((count, width), dtype, content, start, (stride, dtype.itemsize))
+
+    def _replaced(self, sparse: Entry, elements: NDArray[Any]) -> NDArray[Any]:
+        """Return a copy of an accessor's elements with those that ``sparse`` lists replaced."""
+        count, (total, width) = sparse.integer("count", low=1), elements.shape
+        indices, values = sparse.child("indices"), sparse.child("values")
+        component = indices.integer("componentType")
+        if component not in (5121, 5123, 5125):
+            raise indices.error(f"componentType {component}, expected 5121, 5123 or 5125")
+        where = self._stored(indices, count, 1, COMPONENTS[component])[:, 0].astype(np.int64)
+        if (np.diff(where) <= 0).any():
+            raise indices.error("the indices do not increase")
+        if where[-1] >= total:
+            raise indices.error(f"index {where[-1]}, but {total} elements")
+        replaced = elements.copy()
+        replaced[where] = self._stored(values, count, width, elements.dtype)
+        return replaced
 
     def _check_finite(self, elements: NDArray[Any], entry: Entry) -> None:
         finite = np.isfinite(elements).all(axis=1)

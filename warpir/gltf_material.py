@@ -13,6 +13,7 @@ from warpir.errors import InputError
 from warpir.gltf_file import RE_EXPORT_MESH, Entry, GltfFile
 
 HONOURED = {
+    "EXT_mesh_gpu_instancing",
     "EXT_texture_webp",
     "KHR_materials_emissive_strength",
     "KHR_materials_pbrSpecularGlossiness",
@@ -38,7 +39,6 @@ LEFT_OUT = {
 }
 """Extensions that can be ignored even when required, and the notice."""
 ADVICE = {
-    "EXT_mesh_gpu_instancing": "re-export with instances as nodes",
     "EXT_meshopt_compression": RE_EXPORT_MESH,
     "KHR_draco_mesh_compression": RE_EXPORT_MESH,
     "KHR_meshopt_compression": RE_EXPORT_MESH,

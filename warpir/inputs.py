@@ -21,7 +21,7 @@ from warpir.lobes_file import read_lobes
 from warpir.materials_file import with_materials
 from warpir.photo_files import Photo, read_envmap, read_mask, read_photo
 from warpir.photo_world import PhotoWorld, make_world
-from warpir.placement import Placement, place_asset, upright_plane
+from warpir.placement import Placement, place_asset, up_to_y, upright_plane
 from warpir.point_cloud import read_point_cloud
 from warpir.reuse import EarlierRun, read_run
 from warpir.undistort import undistort_photo, undistorted
@@ -30,6 +30,9 @@ DEFAULT_FOV = 60.0
 """Horizontal field of view without --camera, --fov and EXIF [deg]: a phone's main camera."""
 DEFAULT_CAMERA_HEIGHT = 1.6
 """Height of a photographer's eyes [m]."""
+
+STATED_UP = (".glb", ".gltf")
+"""Kinds of asset whose format says which way is up."""
 
 Read = TypeVar("Read")
 
@@ -105,7 +108,7 @@ def read_inputs(config: InsertConfig, loaders: Loaders | None = None) -> Inputs:
         )
     )
     occluder = attempt(lambda: _read_occluder(config, photo, notices))
-    asset = attempt(lambda: _read_asset(asset_path, config, loaders))
+    asset = attempt(lambda: _read_asset(asset_path, config, loaders, assumed))
     reuse = config.reuse
     run = attempt(lambda: loaders.run(reuse)) if reuse is not None else None
     view = attempt(lambda: _make_camera(config, photo, assumed)) if photo is not None else None
@@ -180,8 +183,14 @@ def _inputs_in_out(config: InsertConfig) -> list[InputError]:
     return []
 
 
-def _read_asset(path: str, config: InsertConfig, loaders: Loaders) -> Asset:
+def _read_asset(path: str, config: InsertConfig, loaders: Loaders, assumed: list[str]) -> Asset:
     asset = loaders.asset(path, config.missing_textures)
+    if config.asset_up is not None:
+        turned = f"turned: its {config.asset_up} axis points up (--asset-up)"
+        asset = asset.turned(up_to_y(config.asset_up))
+        asset = replace(asset, notices=(*asset.notices, turned))
+    elif Path(path).suffix.lower() not in STATED_UP:
+        assumed.append("the asset's +y axis points up (--asset-up)")
     if config.materials is not None:
         asset = with_materials(asset, config.materials)
     for name in config.refine_materials or ():

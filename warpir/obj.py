@@ -1,23 +1,20 @@
 """Reads OBJ, PLY and STL into an `Asset`.
 
 OBJ is parsed here: every number has to be checked before a library sees it, and then the arrays
-are already there. PLY and STL go through trimesh, from memory and without its processing.
-Materials of OBJ come from `warpir.mtl`. The texture coordinate v is turned from up to down.
+are already there. Materials of OBJ come from `warpir.mtl`, the numbers of PLY and STL from
+`warpir.ply` and `warpir.stl`. The texture coordinate v is turned from up to down.
 """
 
 import contextlib
-import logging
 import re
 from collections.abc import Iterator
 from dataclasses import dataclass, field
-from io import BytesIO
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from warpir.asset import Asset, FloatArray, Material, Primitive
+from warpir.asset import Asset, FloatArray, Primitive
 from warpir.asset_files import (
     TRIANGLES,
     check_drawable,
@@ -29,12 +26,14 @@ from warpir.asset_files import (
 )
 from warpir.errors import InputError
 from warpir.mtl import MaterialLibrary
+from warpir.ply import Element, read_ply
+from warpir.stl import read_stl
 
 GREY = (0.8, 0.8, 0.8)
 """Base colour of what has no material."""
 IGNORED = {"o", "g", "s", "vp", "shadow_obj", "trace_obj", "lod", "bevel", "c_interp", "d_interp"}
-logging.getLogger("trimesh").addHandler(logging.NullHandler())  # it warns on stderr otherwise
 Triangles = NDArray[np.int32]
+NO_TRIANGLES: Triangles = np.zeros((0, 3), dtype=np.int32)
 
 
 def read_mesh(path: str | Path, missing_textures: str = "error") -> Asset:
@@ -55,7 +54,9 @@ def read_mesh(path: str | Path, missing_textures: str = "error") -> Asset:
     content = read_regular(path, path)
     if path.suffix.lower() == ".obj":
         return read_obj(path, content, missing_textures)
-    return read_ply_stl(path, content)
+    if path.suffix.lower() == ".ply":
+        return read_ply_mesh(path, content)
+    return read_stl_mesh(path, content)
 
 
 @dataclass
@@ -376,101 +377,149 @@ def clip_ears(points: NDArray[np.float64]) -> Triangles:
     return np.array([*triangles, tuple(rest)], dtype=np.int32)
 
 
-def read_ply_stl(path: Path, content: bytes) -> Asset:
-    """Read a PLY or STL file through trimesh, from memory; one grey primitive.
+def read_ply_mesh(path: Path, content: bytes) -> Asset:
+    """Read the faces of a PLY file with the normals and colours of its vertices.
+
+    Raises:
+        InputError: The file is damaged or holds no faces.
+    """
+    notices: list[str] = []
+    ply = read_ply(path, content)
+    vertex, face = ply.element("vertex"), ply.element("face")
+    positions = finite_columns(path, vertex, ("x", "y", "z"))
+    if positions is None:
+        raise InputError(path, "no x, y and z of vertices", "convert it to GLB")
+    corners = face.lists.get("vertex_indices", face.lists.get("vertex_index"))
+    if corners is None or not len(corners.lengths):
+        others = ", ".join(f"{e.count} {e.name}" for e in ply.elements.values())
+        raise InputError(
+            path,
+            f"nothing to render (found {others[:80]}; expected faces)",
+            "a point cloud of the place belongs to --ground-points",
+        )
+    if int(np.maximum(corners.lengths - 2, 0).sum()) > TRIANGLES:
+        raise InputError(path, f"too many triangles (limit {TRIANGLES})", "decimate the mesh")
+    used = corners.values
+    if len(used) and not 0 <= used.min() <= used.max() < len(positions):
+        worst = used.min() if used.min() < 0 else used.max()
+        raise InputError(path, f"index {worst:g}, but {len(positions)} vertices")
+    polygons = {n: rows.astype(np.int32) for n, rows in corners.by_length().items() if n >= 3}
+    lines = int((corners.lengths < 3).sum())
+    if lines:
+        notices.append(f"{lines} faces of fewer than 3 corners ignored")
+    stored = finite_columns(path, vertex, ("nx", "ny", "nz"))
+    colors = ply_colors(path, vertex, notices)
+    if finite_columns(path, face, ("red", "green", "blue")) is not None:
+        notices.append("colours of faces are not read; those of vertices would be")
+    if any(line.startswith("TextureFile") for line in ply.comments):
+        notices.append("the texture is not read: export as GLB or OBJ")
+    indices = triangulate(positions, polygons, notices) if polygons else NO_TRIANGLES
+    return plain_asset(path, positions, indices, stored, colors, notices)
+
+
+def read_stl_mesh(path: Path, content: bytes) -> Asset:
+    """Read an STL file; flat shading, since its normals are those of the faces.
 
     Raises:
         InputError: The file is damaged or holds no triangles.
     """
-    import trimesh
-
-    kind = path.suffix.lower()[1:]
-    check_promised_size(path, content, kind)
-    try:
-        mesh: Any = trimesh.load(BytesIO(content), file_type=kind, process=False)
-    except MemoryError:
-        raise
-    except Exception as error:  # trimesh raises whatever its parsers hit
-        short = str(error).splitlines()[0][:80] if str(error) else type(error).__name__
-        raise InputError(
-            path, f"damaged or not a {kind.upper()} file ({short})", "export it again, or as GLB"
-        ) from None
     notices: list[str] = []
-    primitives: list[Primitive] = []
-    material: Material = plain_material("grey", GREY)
-    if isinstance(mesh, trimesh.Trimesh) and len(mesh.faces):
-        positions = np.array(mesh.vertices, dtype=np.float64)
-        if not np.isfinite(positions).all():
-            raise InputError(path, "vertices are NaN or infinite")
-        faces = np.array(mesh.faces)
-        if faces.min() < 0 or faces.max() >= len(positions):
-            raise InputError(path, f"index {faces.max()}, but {len(positions)} vertices")
-        if len(faces) > TRIANGLES:
-            raise InputError(path, f"too many triangles (found {len(faces)}; limit {TRIANGLES})")
-        indices, flat, repeated = keep_area(positions, faces.astype(np.int32))
-        if flat or repeated:
-            notices.append(f"dropped {flat} triangles of zero area and {repeated} repeated ones")
-        normals, colors = None, None
-        if kind == "ply":
-            normals = ply_normals(path, mesh, positions, indices)
-            colors = ply_colors(mesh)
-        if normals is None:
-            notices.append("no normals: shaded flat")
-        if colors is not None:
-            notices.append("vertex colours read as linear Rec.709")
-            material = plain_material("vertex colours", (1.0, 1.0, 1.0))
-        notices.append("no material: grey 0.8, roughness 0.5" if colors is None
-                       else "no material: roughness 0.5")  # fmt: skip
-        if len(indices):
-            primitives.append(Primitive(positions, indices, 0, normals=normals, colors=colors))
-            size = np.ptp(positions, axis=0)
-            notices.append(
-                f"no unit in the file: read as metres, size {size[0]:g} x {size[1]:g} x {size[2]:g}"
-            )
-    check_drawable(path, primitives, type(mesh).__name__)
+    corners = read_stl(path, content, notices)
+    if len(corners) > TRIANGLES:
+        raise InputError(
+            path, f"too many triangles (found {len(corners)}; limit {TRIANGLES})", "decimate it"
+        )
+    if not np.isfinite(corners).all():
+        raise InputError(path, "vertices are NaN or infinite")
+    indices = np.arange(3 * len(corners), dtype=np.int32).reshape(-1, 3)
+    return plain_asset(path, corners.reshape(-1, 3), indices, None, None, notices)
+
+
+def plain_asset(
+    path: Path,
+    positions: NDArray[np.float64],
+    indices: Triangles,
+    normals: NDArray[np.float64] | None,
+    colors: FloatArray | None,
+    notices: list[str],
+) -> Asset:
+    """Return an asset of one material that the file does not state.
+
+    Args:
+        path: The file.
+        positions: Shape [vertex, 3].
+        indices: Shape [triangle, 3].
+        normals: Of any length, shape [vertex, 3].
+        colors: Linear RGBA, shape [vertex, 4].
+        notices: What was found on reading.
+
+    Raises:
+        InputError: No triangle has an area.
+    """
+    indices, flat, repeated = keep_area(positions, indices)
+    if flat or repeated:
+        notices.append(f"dropped {flat} triangles of zero area and {repeated} repeated ones")
+    shading: FloatArray | None = None
+    if normals is None:
+        notices.append("no normals: shaded flat")
+    else:
+        shading, lost = repair_normals(normals, positions, indices)
+        if lost:
+            notices.append(f"{lost} normals of length zero taken from the faces")
+    if colors is None:
+        material = plain_material("grey", GREY)
+        notices.append("no material: grey 0.8, roughness 0.5")
+    else:
+        material = plain_material("vertex colours", (1.0, 1.0, 1.0))
+        notices.append("vertex colours read as linear Rec.709")
+        notices.append("no material: roughness 0.5")
+    primitives = []
+    if len(indices):
+        primitives.append(Primitive(positions, indices, 0, normals=shading, colors=colors))
+        size = np.ptp(positions, axis=0)
+        notices.append(
+            f"no unit in the file: read as metres, size {size[0]:g} x {size[1]:g} x {size[2]:g}"
+        )
+    check_drawable(path, primitives, f"{len(positions)} vertices")
     return Asset(path.stem, tuple(primitives), (material,), notices=concise(notices))
 
 
-def check_promised_size(path: Path, content: bytes, kind: str) -> None:
-    """Refuse headers that promise more than the file can hold, before trimesh allocates it."""
-    if kind == "stl" and not content.lstrip().startswith(b"solid"):
-        promised = int.from_bytes(content[80:84], "little") if len(content) >= 84 else 0
-        if len(content) < 84 or len(content) < 84 + 50 * promised:
+def finite_columns(
+    path: Path, element: Element, names: tuple[str, ...]
+) -> NDArray[np.float64] | None:
+    """Return columns of a PLY element, shape [row, column]; None when one is absent.
+
+    Raises:
+        InputError: One of the numbers is not finite.
+    """
+    table = element.table(*names)
+    if table is not None and not np.isfinite(table).all():
+        row = int(np.flatnonzero(~np.isfinite(table).all(axis=1))[0])
+        raise InputError(path, f"{' '.join(names)} of {element.name} {row} are NaN or infinite")
+    return table
+
+
+def ply_colors(path: Path, vertex: Element, notices: list[str]) -> FloatArray | None:
+    """Return the vertex colours of a PLY file, linear RGBA, shape [vertex, 4].
+
+    Integers count up to their largest value, floats to 1.
+    """
+    for prefix in ("", "diffuse_"):
+        names = (f"{prefix}red", f"{prefix}green", f"{prefix}blue")
+        stored = finite_columns(path, vertex, names)
+        if stored is None:
+            continue
+        stated = [*names, *(key for key in ("alpha",) if key in vertex.columns)]
+        colors = np.ones((len(stored), 4))
+        for k, name in enumerate(stated):
+            kind = np.dtype(vertex.types[name][0])
+            scale = 1.0 if kind.kind == "f" else float(np.iinfo(kind).max)
+            colors[:, k] = vertex.columns[name] / scale
+        if not ((colors >= 0.0) & (colors <= 1.0)).all():
             raise InputError(
                 path,
-                f"damaged STL: {promised} triangles need {84 + 50 * promised} bytes "
-                f"(found {len(content)})",
-                "export it again, or as GLB",
+                f"vertex colours from {colors.min():g} to {colors.max():g} (expected 0 to 1, or "
+                "integers)",
             )
-    if kind == "ply":
-        if not content.startswith(b"ply"):
-            raise InputError(path, "not a PLY file (does not start with 'ply')", "convert to GLB")
-        header = content[: content.find(b"end_header") + 1]
-        for count in re.findall(rb"^element\s+\S+\s+(\d+)", header, re.MULTILINE):
-            if len(count) > 12 or int(count) > len(content):
-                raise InputError(
-                    path, f"damaged PLY: {count[:20].decode()} elements in {len(content)} bytes"
-                )
-
-
-def ply_normals(
-    path: Path, mesh: Any, positions: NDArray[np.float64], indices: Triangles
-) -> FloatArray | None:
-    """Return the normals that a PLY file itself holds, shape [vertex, 3]."""
-    rows = mesh.metadata.get("_ply_raw", {}).get("vertex", {}).get("data")
-    try:
-        stored = np.column_stack([np.ravel(rows[key]) for key in ("nx", "ny", "nz")])
-    except (KeyError, ValueError, TypeError, IndexError):
-        return None
-    if stored.shape != positions.shape:
-        return None
-    if not np.isfinite(stored).all():
-        raise InputError(path, "normals are NaN or infinite")
-    return repair_normals(stored.astype(np.float64), positions, indices)[0]
-
-
-def ply_colors(mesh: Any) -> FloatArray | None:
-    """Return the vertex colours of a PLY file, shape [vertex, 4]."""
-    if mesh.visual.kind != "vertex":
-        return None
-    return (np.array(mesh.visual.vertex_colors, dtype=np.float32) / 255.0).astype(np.float32)
+        return colors.astype(np.float32)
+    return None

@@ -172,6 +172,13 @@ def y_to(normal: Float64Array) -> Float64Array:
     )
 
 
+def up_to_y(axis: str) -> Float64Array:
+    """Return the smallest rotation from an axis such as ``+z`` or ``-x`` to +Y, shape [3, 3]."""
+    up = np.zeros(3)
+    up["xyz".index(axis[-1])] = -1.0 if axis.startswith("-") else 1.0
+    return y_to(up).T
+
+
 def turn(axis: Float64Array, angle: float) -> Float64Array:
     """Return the right-handed rotation about a unit axis by an angle [rad], shape [3, 3]."""
     x, y, z = (float(component) for component in axis)
