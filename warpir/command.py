@@ -177,6 +177,8 @@ FLAGS = {
     "rules for the files": {
         "alpha": "RULE",
         "max_pixels": "N",
+        "max_triangles": "N",
+        "max_texture_pixels": "N",
         "missing_textures": "RULE",
         "mark": "",
     },
