@@ -479,7 +479,7 @@ def test_config_file_of_an_older_version_replays(tmp_path: Path) -> None:
     known = {name: value for name, value in asdict(config).items() if name not in newer}
     path = tmp_path / "run.json"
     path.write_text(json.dumps({"format": 1, "warpir": "0.1.0", "config": known}))
-    assert len(known) < 45 and parse(["--config", str(path)]).config == config
+    assert set(known) < set(asdict(config)) and parse(["--config", str(path)]).config == config
 
 
 def test_config_file_yields_to_flags(tmp_path: Path) -> None:

@@ -18,7 +18,8 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from warpir.asset import Asset, load_asset
+from warpir.asset import LIMITS, Asset, AssetLimits, load_asset
+from warpir.config import InsertConfig
 from warpir.errors import ExitCode, InputError
 from warpir.gltf import read_gltf
 
@@ -972,9 +973,34 @@ def test_M14_texture_pixels_are_limited(tmp_path: Path) -> None:
     from warpir import asset_files
 
     decoder = asset_files.TextureDecoder(tmp_path / "asset.glb", [])
-    decoder.pixel_count = asset_files.TEXTURE_PIXELS - 10
+    decoder.pixel_count = decoder.limits.texture_pixels - 10
     with pytest.raises(InputError, match="too many texture pixels"):
         decoder.decode(bytes(small), "/images/0: ")
+
+
+@pytest.mark.parametrize("kind", ["glb", "obj", "ply", "stl"])
+def test_M14_triangles_are_limited(kind: str, tmp_path: Path) -> None:
+    """Every reader stops at --max-triangles, and says how many there are."""
+    facet = "facet normal 0 0 1\nouter loop\n" + "vertex 0 0 {}\n" * 3 + "endloop\nendfacet\n"
+    content = {
+        "glb": Builder().glb(),
+        "obj": b"v 0 0 0\nv 1 0 0\nv 1 1 0\nv 0 1 0\nf 1 2 3 4\n",
+        "ply": b"ply\nformat ascii 1.0\nelement vertex 4\nproperty float x\nproperty float y\n"
+        b"property float z\nelement face 1\nproperty list uchar int vertex_indices\nend_header\n"
+        b"0 0 0\n1 0 0\n1 1 0\n0 1 0\n4 0 1 2 3\n",
+        "stl": f"solid\n{facet.format(0, 1, 2) * 2}endsolid\n".encode(),
+    }[kind]
+    path = tmp_path / f"asset.{kind}"
+    path.write_bytes(content)
+    with pytest.raises(InputError, match=r"too many triangles \(found 2.*limit 1\)") as caught:
+        load_asset(path, limits=AssetLimits(triangles=1))
+    assert "--max-triangles" in caught.value.advice
+
+
+def test_M14_limits_are_those_of_the_flags() -> None:
+    """What holds without a flag holds in the library."""
+    config = InsertConfig()
+    assert AssetLimits(config.max_triangles, config.max_texture_pixels) == LIMITS
 
 
 def test_G17_no_scenes_draws_the_roots(tmp_path: Path) -> None:

@@ -173,12 +173,28 @@ class Asset:
         return [i for i, m in enumerate(self.materials) if names is None or m.name in names]
 
 
-def load_asset(path: str | Path, missing_textures: str = "error") -> Asset:
+@dataclass(frozen=True)
+class AssetLimits:
+    """Sizes beyond which an asset is refused, before that much is read."""
+
+    triangles: int = 20_000_000
+    """Instances counted (``--max-triangles``); vertices may be three times as many."""
+    texture_pixels: int = 512_000_000
+    """Of all textures together (``--max-texture-pixels``) [px]."""
+
+
+LIMITS = AssetLimits()
+
+
+def load_asset(
+    path: str | Path, missing_textures: str = "error", limits: AssetLimits = LIMITS
+) -> Asset:
     """Read an asset of any supported kind.
 
     Args:
         path: A ``.glb``, ``.gltf``, ``.obj``, ``.ply`` or ``.stl`` file.
         missing_textures: ``error``, or ``grey`` to put mid grey in a missing texture's place.
+        limits: How large it may be.
 
     Raises:
         InputError: The file is missing, of another kind, or cannot be represented faithfully.
@@ -188,11 +204,11 @@ def load_asset(path: str | Path, missing_textures: str = "error") -> Asset:
     if suffix in {".glb", ".gltf"}:
         from warpir.gltf import read_gltf
 
-        return read_gltf(path, missing_textures)
+        return read_gltf(path, missing_textures, limits)
     if suffix in {".obj", ".ply", ".stl"}:
         from warpir.obj import read_mesh
 
-        return read_mesh(path, missing_textures)
+        return read_mesh(path, missing_textures, limits)
     raise InputError(
         path,
         f"not a mesh that warpir reads (found {suffix or 'no extension'}; "

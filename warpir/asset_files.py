@@ -16,17 +16,13 @@ from urllib.parse import unquote
 import numpy as np
 from numpy.typing import NDArray
 
-from warpir.asset import Material, Primitive
+from warpir.asset import LIMITS, AssetLimits, Material, Primitive
 from warpir.errors import InputError
 
 FILE_BYTES = 2 << 30
 """Largest mesh, buffer or image file [byte]."""
-TRIANGLES = 20_000_000
-"""Most triangles of an asset, instances counted."""
 EXTENT = 1e18
 """Largest coordinate [m]; its square still fits float32."""
-TEXTURE_PIXELS = 512_000_000
-"""Most pixels of all textures together."""
 GREY = 188
 """sRGB code that stands for a missing base colour texture: linear 0.5."""
 NOTICES = 40
@@ -129,11 +125,13 @@ class TextureDecoder:
     Args:
         where: The asset that is named in an error.
         notices: Receives one line per repair.
+        limits: How many pixels all images may have together.
     """
 
-    def __init__(self, where: Path, notices: list[str]) -> None:
+    def __init__(self, where: Path, notices: list[str], limits: AssetLimits = LIMITS) -> None:
         self.where = where
         self.notices = notices
+        self.limits = limits
         self.pixel_count = 0
 
     def decode(self, encoded: bytes, pointer: str) -> Pixels:
@@ -178,12 +176,12 @@ class TextureDecoder:
 
     def _count(self, pixel_count: int, pointer: str) -> None:
         self.pixel_count += pixel_count
-        if self.pixel_count > TEXTURE_PIXELS:
+        if self.pixel_count > self.limits.texture_pixels:
             raise InputError(
                 self.where,
                 f"{pointer}too many texture pixels (found {self.pixel_count} so far; "
-                f"limit {TEXTURE_PIXELS})",
-                "use smaller textures",
+                f"limit {self.limits.texture_pixels})",
+                "use smaller textures, or raise --max-texture-pixels",
             )
 
 
@@ -266,6 +264,26 @@ def unit(vectors: NDArray[np.float64]) -> NDArray[np.float32]:
     length = np.linalg.norm(vectors, axis=1, keepdims=True)
     scaled = vectors / np.where(length > 0.0, length, 1.0)
     return np.where(is_unit, stored, scaled).astype(np.float32)
+
+
+def check_triangle_count(where: Path, count: int, limits: AssetLimits, more: str = "") -> None:
+    """Refuse more triangles than the limit.
+
+    Args:
+        where: The asset.
+        count: How many triangles it has.
+        limits: How many it may have.
+        more: What the number stands for, to be added to it.
+
+    Raises:
+        InputError: There are more.
+    """
+    if count > limits.triangles:
+        raise InputError(
+            where,
+            f"too many triangles (found {count}{more}; limit {limits.triangles})",
+            "decimate the mesh, or raise --max-triangles",
+        )
 
 
 def check_drawable(where: Path, primitives: list[Primitive], found: str) -> None:

@@ -184,6 +184,8 @@ FLAGS = {
         "alpha": "RULE",
         "max_pixels": "N",
         "strict": "",
+        "max_triangles": "N",
+        "max_texture_pixels": "N",
         "missing_textures": "RULE",
         "mark": "",
     },

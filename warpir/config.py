@@ -203,6 +203,10 @@ class InsertConfig(ModelSettings, PersonalizeSettings, GuidanceChoices, Optimize
     strict: bool = False
     """Refuse a photo or panorama with values that are not finite, or a light with negative ones,
     in place of repairing them"""
+    max_triangles: int = 20_000_000
+    """Largest asset that is read, instances counted [triangles]"""
+    max_texture_pixels: int = 512_000_000
+    """Most pixels of all textures of the asset together [px]"""
     missing_textures: str = "error"
     """What to do when a texture of the asset is missing: error, or grey in its place"""
     mark: bool = True
@@ -351,6 +355,8 @@ RANGES: dict[str, tuple[float, float | None]] = {
     "threads": (1, 2**10),
     "seed": (0, SEED_LIMIT - 1),
     "max_pixels": (1, None),
+    "max_triangles": (1, None),
+    "max_texture_pixels": (1, None),
     # The diffusion model, and its adaptation to the photo
     "class_images": (0, 10_000),
     "class_steps": (1, 1000),

@@ -15,11 +15,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from warpir.asset import Asset, FloatArray, Primitive
+from warpir.asset import LIMITS, Asset, AssetLimits, FloatArray, Primitive
 from warpir.asset_files import (
     EXTENT,
-    TRIANGLES,
     check_drawable,
+    check_triangle_count,
     concise,
     keep_area,
     repair_normals,
@@ -38,13 +38,16 @@ STRIP, FAN = 5, 6
 Matrix = NDArray[np.float64]
 
 
-def read_gltf(path: str | Path, missing_textures: str = "error") -> Asset:
+def read_gltf(
+    path: str | Path, missing_textures: str = "error", limits: AssetLimits = LIMITS
+) -> Asset:
     """Read a ``.glb`` or ``.gltf`` file.
 
     Args:
         path: The file; everything it refers to must lie in its folder.
         missing_textures: ``error``, or ``grey``: a base colour texture that cannot be read becomes
             grey, any other is left out, with a notice.
+        limits: How large it may be.
 
     Returns:
         The drawn scene, instances flattened, rest pose.
@@ -58,8 +61,8 @@ def read_gltf(path: str | Path, missing_textures: str = "error") -> Asset:
     file = GltfFile(path)
     check_extensions(file.root, notices)
     placed = list(placed_primitives(file, notices))
-    check_counts(file, placed)
-    materials = MaterialReader(file, missing_textures, notices)
+    check_counts(file, placed, limits)
+    materials = MaterialReader(file, missing_textures, notices, limits)
     geometries: dict[str, Geometry | None] = {}
     material_of: dict[str, int] = {}
     primitives: list[Primitive] = []
@@ -273,7 +276,7 @@ def check_invertible(node: Entry, world: Matrix, which: str = "") -> None:
         )
 
 
-def check_counts(file: GltfFile, placed: list[tuple[Entry, Matrix]]) -> None:
+def check_counts(file: GltfFile, placed: list[tuple[Entry, Matrix]], limits: AssetLimits) -> None:
     """Refuse more triangles or vertices than the limit, before any is read."""
     triangle_count = vertex_count = 0
     for entry, _ in placed:
@@ -284,12 +287,8 @@ def check_counts(file: GltfFile, placed: list[tuple[Entry, Matrix]]) -> None:
             corners = file.count(entry.integer("indices"), entry, "indices")
         triangle_count += corners if entry.integer("mode", 4) in (STRIP, FAN) else corners // 3
         vertex_count += vertices
-    if triangle_count > TRIANGLES or vertex_count > 3 * TRIANGLES:
-        raise file.root.error(
-            f"too many triangles (found {triangle_count} with {vertex_count} vertices, instances "
-            f"counted; limit {TRIANGLES})",
-            "decimate the mesh",
-        )
+    counted = f" with {vertex_count} vertices, instances counted"
+    check_triangle_count(file.path, max(triangle_count, vertex_count // 3), limits, counted)
 
 
 @dataclass(frozen=True)

@@ -7,7 +7,7 @@ numbers. Occlusion maps are not read, since a path tracer makes its own.
 import math
 from dataclasses import replace
 
-from warpir.asset import Material, Texture, TextureSlot
+from warpir.asset import LIMITS, AssetLimits, Material, Texture, TextureSlot
 from warpir.asset_files import Pixels, TextureDecoder, grey_pixels, locate, read_uri
 from warpir.errors import InputError
 from warpir.gltf_file import RE_EXPORT_MESH, Entry, GltfFile
@@ -79,15 +79,22 @@ class MaterialReader:
         file: The file.
         missing_textures: ``error`` or ``grey``.
         notices: Receives what was assumed or left out.
+        limits: How many pixels the textures may have.
     """
 
-    def __init__(self, file: GltfFile, missing_textures: str, notices: list[str]) -> None:
+    def __init__(
+        self,
+        file: GltfFile,
+        missing_textures: str,
+        notices: list[str],
+        limits: AssetLimits = LIMITS,
+    ) -> None:
         self.file = file
         self.missing_textures = missing_textures
         self.notices = notices
         self.materials: list[Material] = []
         self.textures: list[Texture] = []
-        self._decoder = TextureDecoder(file.path, notices)
+        self._decoder = TextureDecoder(file.path, notices, limits)
         self._material_index: dict[int, int] = {}
         self._texture_index: dict[tuple[int, str, str], int] = {}
         self._pixels: dict[int, Pixels | None] = {}

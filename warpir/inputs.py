@@ -9,7 +9,7 @@ from typing import Any, TypeVar
 
 import numpy as np
 
-from warpir.asset import Asset, load_asset
+from warpir.asset import Asset, AssetLimits, load_asset
 from warpir.camera import Camera, camera_from_exif, camera_from_fov
 from warpir.camera_files import read_photo_camera
 from warpir.camera_source import PhotoCamera
@@ -65,7 +65,7 @@ class Loaders:
     """Reads assets and earlier runs; the last of each is remembered, for many insertions."""
 
     def __init__(self) -> None:
-        self.asset: Callable[[str, str], Asset] = lru_cache(maxsize=1)(load_asset)
+        self.asset: Callable[[str, str, AssetLimits], Asset] = lru_cache(maxsize=1)(load_asset)
         self.run: Callable[[str], EarlierRun] = lru_cache(maxsize=1)(read_run)
 
 
@@ -184,7 +184,8 @@ def _inputs_in_out(config: InsertConfig) -> list[InputError]:
 
 
 def _read_asset(path: str, config: InsertConfig, loaders: Loaders, assumed: list[str]) -> Asset:
-    asset = loaders.asset(path, config.missing_textures)
+    limits = AssetLimits(config.max_triangles, config.max_texture_pixels)
+    asset = loaders.asset(path, config.missing_textures, limits)
     if config.asset_up is not None:
         turned = f"turned: its {config.asset_up} axis points up (--asset-up)"
         asset = asset.turned(up_to_y(config.asset_up))

@@ -12,7 +12,7 @@ from pathlib import Path, PurePosixPath
 
 import numpy as np
 
-from warpir.asset import Material, Texture, TextureSlot
+from warpir.asset import LIMITS, AssetLimits, Material, Texture, TextureSlot
 from warpir.asset_files import (
     Pixels,
     TextureDecoder,
@@ -70,9 +70,12 @@ class MaterialLibrary:
         path: The OBJ file.
         missing_textures: ``error``, or ``grey``.
         notices: Receives what was assumed or left out.
+        limits: How many pixels the textures may have.
     """
 
-    def __init__(self, path: Path, missing_textures: str, notices: list[str]) -> None:
+    def __init__(
+        self, path: Path, missing_textures: str, notices: list[str], limits: AssetLimits = LIMITS
+    ) -> None:
         self.path = path
         self.missing_textures = missing_textures
         self.notices = notices
@@ -80,7 +83,7 @@ class MaterialLibrary:
         self.textures: list[Texture] = []
         self._entries: dict[str, MtlEntry] = {}
         self._index: dict[str, int] = {}
-        self._decoder = TextureDecoder(path, notices)
+        self._decoder = TextureDecoder(path, notices, limits)
         self._pixels: dict[str, Pixels | None] = {}
 
     def add(self, names: str) -> None:

@@ -14,10 +14,10 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from warpir.asset import Asset, FloatArray, Primitive
+from warpir.asset import LIMITS, Asset, AssetLimits, FloatArray, Primitive
 from warpir.asset_files import (
-    TRIANGLES,
     check_drawable,
+    check_triangle_count,
     concise,
     keep_area,
     plain_material,
@@ -36,13 +36,16 @@ Triangles = NDArray[np.int32]
 NO_TRIANGLES: Triangles = np.zeros((0, 3), dtype=np.int32)
 
 
-def read_mesh(path: str | Path, missing_textures: str = "error") -> Asset:
+def read_mesh(
+    path: str | Path, missing_textures: str = "error", limits: AssetLimits = LIMITS
+) -> Asset:
     """Read an ``.obj``, ``.ply`` or ``.stl`` file.
 
     Args:
         path: The file; material files and textures must lie in its folder.
         missing_textures: ``error``, or ``grey``: a missing material file or base colour texture
             becomes grey, other textures are left out, with a notice.
+        limits: How large it may be.
 
     Returns:
         Double-sided materials; grey, rough and dielectric where the file states none.
@@ -53,10 +56,10 @@ def read_mesh(path: str | Path, missing_textures: str = "error") -> Asset:
     path = Path(path)
     content = read_regular(path, path)
     if path.suffix.lower() == ".obj":
-        return read_obj(path, content, missing_textures)
+        return read_obj(path, content, missing_textures, limits)
     if path.suffix.lower() == ".ply":
-        return read_ply_mesh(path, content)
-    return read_stl_mesh(path, content)
+        return read_ply_mesh(path, content, limits)
+    return read_stl_mesh(path, content, limits)
 
 
 @dataclass
@@ -71,7 +74,7 @@ class ObjText:
     libraries: list[str] = field(default_factory=list)
 
 
-def read_obj(path: Path, content: bytes, missing_textures: str) -> Asset:
+def read_obj(path: Path, content: bytes, missing_textures: str, limits: AssetLimits) -> Asset:
     """Read an OBJ file; one primitive per material.
 
     Raises:
@@ -85,11 +88,11 @@ def read_obj(path: Path, content: bytes, missing_textures: str) -> Asset:
     normals = float_rows(path, "vn", text.normals, 3)
     if uvs.shape[1] == 1:
         uvs = np.column_stack([uvs, np.zeros(len(uvs))])
-    library = MaterialLibrary(path, missing_textures, notices)
+    library = MaterialLibrary(path, missing_textures, notices, limits)
     for name in text.libraries:
         library.add(name)
-    if sum(len(c) - 2 for faces in text.faces.values() for _, c in faces) > TRIANGLES:
-        raise InputError(path, f"too many triangles (limit {TRIANGLES})", "decimate the mesh")
+    triangle_count = sum(len(c) - 2 for faces in text.faces.values() for _, c in faces)
+    check_triangle_count(path, triangle_count, limits)
 
     primitives: list[Primitive] = []
     for name, faces in text.faces.items():
@@ -377,7 +380,7 @@ def clip_ears(points: NDArray[np.float64]) -> Triangles:
     return np.array([*triangles, tuple(rest)], dtype=np.int32)
 
 
-def read_ply_mesh(path: Path, content: bytes) -> Asset:
+def read_ply_mesh(path: Path, content: bytes, limits: AssetLimits) -> Asset:
     """Read the faces of a PLY file with the normals and colours of its vertices.
 
     Raises:
@@ -397,8 +400,7 @@ def read_ply_mesh(path: Path, content: bytes) -> Asset:
             f"nothing to render (found {others[:80]}; expected faces)",
             "a point cloud of the place belongs to --ground-points",
         )
-    if int(np.maximum(corners.lengths - 2, 0).sum()) > TRIANGLES:
-        raise InputError(path, f"too many triangles (limit {TRIANGLES})", "decimate the mesh")
+    check_triangle_count(path, int(np.maximum(corners.lengths - 2, 0).sum()), limits)
     used = corners.values
     if len(used) and not 0 <= used.min() <= used.max() < len(positions):
         worst = used.min() if used.min() < 0 else used.max()
@@ -417,7 +419,7 @@ def read_ply_mesh(path: Path, content: bytes) -> Asset:
     return plain_asset(path, positions, indices, stored, colors, notices)
 
 
-def read_stl_mesh(path: Path, content: bytes) -> Asset:
+def read_stl_mesh(path: Path, content: bytes, limits: AssetLimits) -> Asset:
     """Read an STL file; flat shading, since its normals are those of the faces.
 
     Raises:
@@ -425,10 +427,7 @@ def read_stl_mesh(path: Path, content: bytes) -> Asset:
     """
     notices: list[str] = []
     corners = read_stl(path, content, notices)
-    if len(corners) > TRIANGLES:
-        raise InputError(
-            path, f"too many triangles (found {len(corners)}; limit {TRIANGLES})", "decimate it"
-        )
+    check_triangle_count(path, len(corners), limits)
     if not np.isfinite(corners).all():
         raise InputError(path, "vertices are NaN or infinite")
     indices = np.arange(3 * len(corners), dtype=np.int32).reshape(-1, 3)
