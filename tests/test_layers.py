@@ -15,7 +15,10 @@ LEVELS = (
     },
     {"optimize_settings", "asset", "strict_json", "image_errors", "lpips"},
     {"config"},
-    {"camera", "asset_files", "record", "progress", "light", "tone", "curves", "materials_file"},
+    {
+        "camera", "asset_files", "record", "progress", "light", "tone", "curves", "materials_file",
+        "proxy_mesh",
+    },
     {
         "gltf_file", "mtl", "files", "command", "placement", "lobes_file", "lobe_fit", "regressor",
         "light_errors",
