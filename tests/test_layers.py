@@ -15,17 +15,15 @@ LEVELS = (
     },
     {"optimize_settings", "asset", "strict_json", "image_errors", "lpips"},
     {"config"},
-    {
-        "camera", "asset_files", "record", "progress", "light", "tone", "curves", "materials_file",
-        "proxy_mesh",
-    },
+    {"camera", "asset_files", "record", "progress", "light", "tone", "curves", "materials_file"},
+    {"proxy_mesh", "lamps"},
     {
         "gltf_file", "mtl", "files", "command", "placement", "lobes_file", "lobe_fit", "regressor",
         "light_errors",
     },
     {
         "gltf_material", "obj", "reuse", "program", "regressor_training", "training_lights",
-        "training_meshes", "panorama_crop", "three_spheres",
+        "training_meshes", "panorama_crop", "three_spheres", "shadow_mask",
     },
     {"gltf", "evaluation_scenes", "predictions"},
     {"inputs", "scene"},

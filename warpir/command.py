@@ -43,6 +43,9 @@ FLAGS = {
         "camera_height": "M",
         "up": "AXIS",
         "ground": "A,B,C,D",
+        "proxy": "FILE",
+        "plane": "",
+        "shadow_mask": "FILE",
     },
     "placement": {
         "place": "X,Y,Z",

@@ -170,6 +170,39 @@ def read_photo(
     )
 
 
+def read_grey(path: str | Path, size: tuple[int, int]) -> FloatArray:
+    """Read an image of plain numbers, such as a mask: no transfer function, no colour profile.
+
+    Args:
+        path: The file; recognised by content. 8 and 16 bits are scaled to 1, floats clipped to it.
+        size: Width and height that it must have [px].
+
+    Returns:
+        Values in [0, 1], shape [height, width].
+
+    Raises:
+        InputError: Missing, damaged, of another size, or of channels that differ.
+    """
+    path = Path(path)
+    image = _decode(path, max(size[0] * size[1], PHOTO_PIXELS_MAX))
+    codes = _upright(image.pixels, image.orientation)
+    height, width = codes.shape[:2]
+    if (width, height) != size:
+        raise InputError(
+            path, f"of another size (found {width} x {height}; expected {size[0]} x {size[1]})"
+        )
+    if codes.shape[-1] > 1 and not bool((codes == codes[..., :1]).all()):
+        raise InputError(
+            path,
+            f"not grey (found {width} x {height} with channels that differ; "
+            f"expected {size[0]} x {size[1]} with one)",
+        )
+    grey = codes[..., 0]
+    if grey.dtype.kind == "f":
+        return np.clip(_finite(codes)[0][..., 0], 0.0, 1.0).astype(np.float32)
+    return grey.astype(np.float32) / np.float32(np.iinfo(grey.dtype).max)
+
+
 def read_envmap(
     path: str | Path,
     *,

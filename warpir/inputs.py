@@ -1,8 +1,8 @@
 """All inputs of one insertion, read and checked; torch and Warp are not needed here."""
 
 import os
-from collections.abc import Callable
-from dataclasses import dataclass
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, replace
 from functools import lru_cache
 from pathlib import Path
 from typing import TypeVar
@@ -16,7 +16,9 @@ from warpir.light import Light
 from warpir.lobes_file import read_lobes
 from warpir.materials_file import with_materials
 from warpir.placement import Placement, place_asset
+from warpir.proxy_mesh import ProxyMesh, first_hit, is_in_view, mesh_of
 from warpir.reuse import EarlierRun, read_run
+from warpir.shadow_mask import ShadowMask, read_shadow_mask, shadow_mask
 
 DEFAULT_FOV = 60.0
 """Horizontal field of view without --camera, --fov and EXIF [deg]: a phone's main camera."""
@@ -40,6 +42,12 @@ class Inputs:
     """What --light holds, turned by --light-rotate; absent: --sun and --sky describe it."""
     run: EarlierRun | None = None
     """What --reuse holds, as the run left it; in place of any other light."""
+    proxy: ProxyMesh | None = None
+    """What --proxy holds."""
+    is_plane: bool = True
+    """Whether the ground plane receives shadows too."""
+    shadow_mask: ShadowMask | None = None
+    """What --shadow-mask holds."""
     assumed: tuple[str, ...] = ()
     """What was chosen because nothing was given, one line each."""
     notices: tuple[str, ...] = ()
@@ -47,10 +55,11 @@ class Inputs:
 
 
 class Loaders:
-    """Reads assets and earlier runs; the last of each is remembered, for many insertions."""
+    """Reads assets, places and earlier runs; remembers the last of each, for many insertions."""
 
     def __init__(self) -> None:
         self.asset: Callable[[str, str], Asset] = lru_cache(maxsize=1)(load_asset)
+        self.proxy: Callable[[str], Asset] = lru_cache(maxsize=1)(_read_proxy)
         self.run: Callable[[str], EarlierRun] = lru_cache(maxsize=1)(read_run)
 
 
@@ -95,9 +104,16 @@ def read_inputs(config: InsertConfig, loaders: Loaders | None = None) -> Inputs:
     reuse = config.reuse
     run = attempt(lambda: loaders.run(reuse)) if reuse is not None else None
     camera = attempt(lambda: _make_camera(config, photo, assumed)) if photo is not None else None
+    proxy_path, mask_path = config.proxy, config.shadow_mask
+    proxy = attempt(lambda: loaders.proxy(proxy_path)) if proxy_path is not None else None
+    mask = None
+    if mask_path is not None and camera is not None:
+        view = camera
+        mask = attempt(lambda: read_shadow_mask(mask_path, view))
     raise_all(problems)
     assert photo is not None and asset is not None and camera is not None
 
+    place = None if proxy is None else mesh_of(proxy)
     placement = place_asset(
         *asset.bounds(),
         camera,
@@ -107,10 +123,13 @@ def read_inputs(config: InsertConfig, loaders: Loaders | None = None) -> Inputs:
         rotate_y=config.rotate_y,
         scale=config.scale,
         size=config.size,
+        mesh=place,
+        is_plane=config.plane,
     )
     notices = [
         *_about(photo_path, photo.notices),
         *_about(asset_path, asset.notices),
+        *(_about(config.proxy, proxy.notices) if config.proxy and proxy else ()),
         *notices,
         *_split_assumed(camera.notices, assumed),
         *placement.warnings,
@@ -120,7 +139,16 @@ def read_inputs(config: InsertConfig, loaders: Loaders | None = None) -> Inputs:
             f"a preview: object and shadow are rendered {config.width} px wide and enlarged to the "
             f"photo's {camera.width} px (--width)"
         )
+    if place is not None:
+        notices += _about_place(place, asset, placement, camera)
     assumed += placement.assumed
+    shade = None
+    if mask is not None:
+        shade = shadow_mask(mask, *asset.bounds(), placement.asset_to_world, camera)
+        assumed.append(
+            f"{100.0 * shade.at_object:.0f} % of the lamps' light is kept from the object, the "
+            "mean of --shadow-mask under its footprint"
+        )
     if run is not None and (assumption := run.assumption(camera.c2w, config.camera)):
         assumed.append(assumption)
     if run is not None and run.materials is not None and config.materials is None:
@@ -128,7 +156,19 @@ def read_inputs(config: InsertConfig, loaders: Loaders | None = None) -> Inputs:
             f"{run.path} had changed its object's materials, this run has not (--materials "
             f"{run.materials} does the same to that object)"
         )
-    return Inputs(photo, asset, camera, placement, light, run, tuple(assumed), tuple(notices))
+    return Inputs(
+        photo,
+        asset,
+        camera,
+        placement,
+        light,
+        run,
+        place,
+        config.plane,
+        shade,
+        tuple(assumed),
+        tuple(notices),
+    )
 
 
 def _inputs_in_out(config: InsertConfig) -> list[InputError]:
@@ -138,7 +178,7 @@ def _inputs_in_out(config: InsertConfig) -> list[InputError]:
     out = os.path.realpath(config.out)
     named = (
         *(config.photo, config.asset, config.materials, config.camera, config.light),
-        *(config.lora, config.prior, config.regressor),
+        *(config.lora, config.prior, config.regressor, config.proxy, config.shadow_mask),
     )
     folders = {path: os.path.dirname(path) for path in named if path is not None}
     if config.reuse is not None:
@@ -159,6 +199,28 @@ def _read_asset(path: str, config: InsertConfig, loaders: Loaders) -> Asset:
             what = f"no material {name[:60]!a} in {path} (found {found[:400]})"
             raise usage("--refine-materials", what, "name some of these, or leave it out for all")
     return asset
+
+
+def _read_proxy(path: str) -> Asset:
+    """Read the mesh of the place; of its materials nothing is used."""
+    asset = load_asset(path, "grey")
+    if any(m.alpha_mode != "OPAQUE" for m in asset.materials):
+        notice = "the opacity of its materials is not used: all of the mesh blocks light"
+        return replace(asset, notices=(*asset.notices, notice))
+    return asset
+
+
+def _about_place(
+    mesh: ProxyMesh, asset: Asset, placement: Placement, camera: Camera
+) -> Iterator[str]:
+    """Yield what looks odd of the place's mesh."""
+    if not is_in_view(mesh, camera):
+        yield "no triangle of --proxy is in view: it only stands in the light's way"
+    low, high = asset.bounds()
+    middle = placement.asset_to_world[:3, :3] @ (0.5 * (low + high))
+    toward = middle + placement.asset_to_world[:3, 3] - camera.c2w[:3, 3]
+    if first_hit(mesh, camera.c2w[None, :3, 3], toward[None])[0][0] < 1.0:
+        yield "the mesh of --proxy hides the object's middle from the camera"
 
 
 def _make_camera(config: InsertConfig, photo: Photo, assumed: list[str]) -> Camera:

@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from warpir.asset import Asset
+from warpir.camera import Camera
 
 Float64Array = NDArray[np.float64]
 
@@ -39,7 +40,9 @@ def mesh_of(asset: Asset) -> ProxyMesh:
     )
 
 
-def first_hit(mesh: ProxyMesh, origins: Float64Array, directions: Float64Array) -> Float64Array:
+def first_hit(
+    mesh: ProxyMesh, origins: Float64Array, directions: Float64Array
+) -> tuple[Float64Array, NDArray[np.int64]]:
     """Return how far each ray gets, every triangle tried (Moeller and Trumbore 1997).
 
     Args:
@@ -48,9 +51,11 @@ def first_hit(mesh: ProxyMesh, origins: Float64Array, directions: Float64Array) 
         directions: Of the rays, world frame, shape [ray, 3].
 
     Returns:
-        Distances in lengths of ``directions``, infinite where nothing is met, shape [ray].
+        Distances in lengths of ``directions``, infinite where nothing is met, and the triangles
+        that are met, shape [ray] each.
     """
-    nearest = np.full(len(origins), np.inf)
+    rays = np.arange(len(origins))
+    nearest, triangle = np.full(len(origins), np.inf), np.zeros(len(origins), np.int64)
     size = max(1, CHUNK // max(len(origins), 1))
     for start in range(0, len(mesh.indices), size):
         a, b, c = (mesh.positions[mesh.indices[start : start + size, k]] for k in range(3))
@@ -64,5 +69,25 @@ def first_hit(mesh: ProxyMesh, origins: Float64Array, directions: Float64Array) 
             v = np.einsum("rc,rtc->rt", directions, q) * inverse
             t = np.einsum("rtc,tc->rt", q, e2) * inverse
             met = (u >= 0.0) & (v >= 0.0) & (u + v <= 1.0) & (t > 0.0) & np.isfinite(t)
-        nearest = np.minimum(nearest, np.where(met, t, np.inf).min(axis=1))
-    return nearest
+        t = np.where(met, t, np.inf)
+        best = t.argmin(axis=1)
+        triangle = np.where(t[rays, best] < nearest, start + best, triangle)
+        nearest = np.minimum(nearest, t[rays, best])
+    return nearest, triangle
+
+
+def is_in_view(mesh: ProxyMesh, camera: Camera) -> bool:
+    """Return whether a triangle may be seen: not all of its corners are beyond one of the edges."""
+    local = (mesh.positions - camera.c2w[:3, 3]) @ camera.c2w[:3, :3]
+    x, y, depth = local[:, 0], local[:, 1], -local[:, 2]
+    beyond = (
+        depth <= 0.0,
+        camera.cx * depth + camera.fx * x < 0.0,
+        camera.cx * depth + camera.fx * x > camera.width * depth,
+        camera.cy * depth - camera.fy * y < 0.0,
+        camera.cy * depth - camera.fy * y > camera.height * depth,
+    )
+    hidden = np.zeros(len(mesh.indices), bool)
+    for side in beyond:
+        hidden |= side[mesh.indices].all(axis=1)
+    return bool((~hidden).any())

@@ -80,7 +80,7 @@ def input_hashes(config: InsertConfig) -> dict[str, str]:
     """
     names = (
         *("photo", "asset", "materials", "camera", "light", "lora", "reuse"),
-        *("prior", "regressor"),
+        *("prior", "regressor", "proxy", "shadow_mask"),
     )
     paths = {name: Path(path) for name in names if (path := getattr(config, name)) is not None}
     if config.reuse is not None:

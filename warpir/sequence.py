@@ -34,6 +34,7 @@ FRAME_COUNT_LIMIT = 9999
 FRAME_FIELDS = (
     "photo", "asset", "camera", "fov", "pitch", "horizon", "camera_height", "up", "ground",
     "place", "at", "rotate_y", "scale", "size", "light_rotate", "exposure", "width", "seed",
+    "proxy", "plane", "shadow_mask",
 )  # fmt: skip
 """What a line may change. The light, its curves and the quality are one for all frames."""
 
