@@ -11,10 +11,10 @@ import warp as wp
 from warpir.kernels.brdf import brdf_eval, brdf_sample
 from warpir.kernels.frame import basis, to_local, to_world
 from warpir.kernels.light_gradient import keep_direction
+from warpir.kernels.proxy_mesh import proxy_mesh_hit, proxy_radiance, proxy_visibility
 from warpir.kernels.rng import hash_pair, pixel_seed, sobol_pair
 from warpir.kernels.sampling import light_eval, light_sample, power_heuristic
 from warpir.kernels.trace import (
-    INFINITY,
     Hit,
     Surface,
     camera_hit,
@@ -62,6 +62,9 @@ class Scatter:
     L_brdf: wp.vec3
     weight_brdf: float
     """The same of the BRDF's direction; 0 when it met the object."""
+    bounced: wp.vec3
+    """Radiance from the place's mesh times ``cos / pdf`` of the BRDF's direction, where it met it;
+    a constant to the light."""
     weight_next: float
     """``cos / pdf`` of the BRDF's direction when it met the object, else 0."""
     next: Hit
@@ -72,6 +75,7 @@ def scatter(
     mesh: MeshArgs,
     material: MaterialArgs,
     texture: TextureArgs,
+    proxy: ProxyArgs,
     light: LightArgs,
     surface: Surface,
     wo: wp.vec3,
@@ -98,6 +102,7 @@ def scatter(
     out.f_brdf = wp.vec3(0.0)
     out.L_brdf = wp.vec3(0.0)
     out.weight_brdf = 0.0
+    out.bounced = wp.vec3(0.0)
     out.weight_next = 0.0
     out.next.valid = 0
     frame = basis(surface.n)
@@ -118,6 +123,7 @@ def scatter(
             weight = wi_local[2] * power_heuristic(Li.pdf, f.pdf) / Li.pdf
             origin = offset_origin(surface.position, surface.ng, wi, mesh.epsilon)
             weight = weight * visibility(mesh, material, texture, origin, wi)
+            weight = weight * proxy_visibility(proxy, origin, wi)
             out.weight_light = weight
             out.direct = unshadowed * weight
             out.direct_diffuse = wp.cw_mul(f.diffuse, Li.radiance) * weight
@@ -138,15 +144,21 @@ def scatter(
         if f.pdf > 0.0:
             origin = offset_origin(surface.position, surface.ng, wi, mesh.epsilon)
             escaped = float(0.0)
-            if is_last == 1:
+            slope = wi_local[2] / f.pdf
+            out.f_brdf = f.diffuse + f.specular
+            place = proxy_mesh_hit(proxy, origin, wi)
+            if is_last == 1 and place.valid == 0:
                 escaped = visibility(mesh, material, texture, origin, wi)
             else:
                 ray_key = hash_pair(hash_pair(key, wp.uint32(index)), wp.uint32(vertex + 1))
-                out.next = closest_hit(mesh, material, texture, origin, wi, INFINITY, 0, ray_key)
-                if out.next.valid == 0:
+                out.next = closest_hit(mesh, material, texture, origin, wi, place.t, 0, ray_key)
+                if out.next.valid == 0 and place.valid == 0:
                     escaped = 1.0
-            slope = wi_local[2] / f.pdf
-            out.f_brdf = f.diffuse + f.specular
+                elif out.next.valid == 0:
+                    # No light is sampled from there, so this technique has all of it.
+                    out.bounced = proxy_radiance(proxy, place) * slope
+                    out.direct += wp.cw_mul(out.f_brdf, out.bounced)
+                    out.direct_diffuse += wp.cw_mul(f.diffuse, out.bounced)
             if escaped > 0.0:
                 Li = light_eval(light, wi)
                 weight = slope * escaped * power_heuristic(f.pdf, Li.pdf)
@@ -191,7 +203,7 @@ def keep_event(record: VertexRecord, i: int, j: int, event: Scatter):
     record.wi_light[i, j] = event.wi_light
     record.incident_light[i, j] = event.L_light * event.weight_light
     record.wi_brdf[i, j] = event.wi_brdf
-    record.incident_brdf[i, j] = event.L_brdf * event.weight_brdf
+    record.incident_brdf[i, j] = event.L_brdf * event.weight_brdf + event.bounced
     record.weight_next[i, j] = event.weight_next
 
 
@@ -217,7 +229,7 @@ def trace_foreground(
     light_record: LightRecord,
     vertex_record: VertexRecord,
 ):
-    """Path-trace the object in each listed pixel; the plane hides it but is not lit.
+    """Path-trace the object in each listed pixel; plane and place hide it but are not lit.
 
     A pixel may stand in the list ``lanes`` times, one after the other: each row then takes its
     share of the samples, and the rows' results add up to the pixel's.
@@ -228,7 +240,8 @@ def trace_foreground(
         mesh: The object's triangles.
         material: Their materials.
         texture: Their textures.
-        proxy: The ground plane, which hides what is below it from the camera.
+        proxy: The ground plane, which hides what is below it from the camera, and the place's mesh,
+            which also stands in the light's way.
         light: The light.
         spp: Camera samples per row.
         rays: Paths that share one camera sample.
@@ -299,6 +312,7 @@ def trace_foreground(
             mesh,
             material,
             texture,
+            proxy,
             light,
             surface,
             wo,

@@ -1,15 +1,23 @@
-"""The ground plane with and without the object: numerator and denominator of the shadow ratio.
+"""The photo's place with and without the object: numerator and denominator of the shadow ratio.
 
 ``beta = PathTrace(X + P, L, 1) / PathTrace(P, L, 1)`` per channel (DiPIR, eq. 5). Both use the same
 directions, so the ratio lies in [0, 1] and is exactly 1 where nothing is blocked; and their noise
-cancels, which a closed form of the denominator would undo. Detached.
+cancels, which a closed form of the denominator would undo. P is the ground plane and the place's
+mesh, whichever the camera sees first. The mesh shades both halves: where a wall keeps the sun away
+the object can take away only what is left, so shadows do not double. Detached.
 """
 
 import warp as wp
 
 from warpir.kernels.frame import basis, to_world
 from warpir.kernels.light_gradient import keep_direction
-from warpir.kernels.rng import pixel_seed, sobol_pair
+from warpir.kernels.proxy_mesh import (
+    proxy_distance,
+    proxy_mesh_hit,
+    proxy_radiance,
+    proxy_visibility,
+)
+from warpir.kernels.rng import hash_pair, pixel_seed, sobol_pair
 from warpir.kernels.sampling import (
     cosine_sample,
     light_eval,
@@ -19,7 +27,8 @@ from warpir.kernels.sampling import (
 from warpir.kernels.trace import (
     camera_hit,
     camera_ray,
-    proxy_distance,
+    closest_hit,
+    offset_origin,
     visibility,
 )
 from warpir.kernels.types import (
@@ -37,18 +46,45 @@ wp.set_module_options({"enable_backward": False})
 INV_PI = wp.constant(0.318309886183791)
 
 
+BOUNCE_KEY = wp.constant(wp.uint32(0x2545F491))
+"""Sets the draws of what the object lets through of the place's light apart from the camera's."""
+
+
+@wp.struct
+class Receiver:
+    """A point of the place that the camera sees."""
+
+    valid: int
+    position: wp.vec3
+    normal: wp.vec3
+    """Unit, toward the side that receives light; of the mesh, toward the camera."""
+
+
+@wp.func
+def receiver_origin(mesh: MeshArgs, proxy: ProxyArgs, point: Receiver) -> wp.vec3:
+    """Return where rays from a receiver start, off the plane and the place's mesh."""
+    if proxy.mesh == wp.uint64(0):
+        return point.position + point.normal * mesh.epsilon
+    epsilon = wp.max(mesh.epsilon, proxy.epsilon)
+    return offset_origin(point.position, point.normal, point.normal, epsilon)
+
+
 @wp.struct
 class ProxySample:
-    """Two directions from one point of the plane; ``weight`` is ``cos / pi * mis / pdf``."""
+    """Two directions from one point of the place; ``weight`` is ``cos / pi * mis / pdf``."""
 
     wi_light: wp.vec3
     weight_light: float
+    """0 where the place's mesh is in the way; so is the other."""
     visible_light: float
     radiance_light: wp.vec3
     wi_cosine: wp.vec3
     weight_cosine: float
     visible_cosine: float
     radiance_cosine: wp.vec3
+    bounced: wp.vec3
+    """Radiance from the place's mesh where the second direction meets it; a constant to the
+    light."""
 
 
 @wp.func
@@ -58,7 +94,7 @@ def proxy_sample(
     texture: TextureArgs,
     proxy: ProxyArgs,
     light: LightArgs,
-    position: wp.vec3,
+    point: Receiver,
     keep_dark: int,
     index: int,
     key: wp.uint32,
@@ -72,22 +108,31 @@ def proxy_sample(
     out.visible_light = 1.0
     out.weight_cosine = 0.0
     out.visible_cosine = 1.0
-    origin = position + proxy.normal * mesh.epsilon
+    out.bounced = wp.vec3(0.0)
+    origin = receiver_origin(mesh, proxy, point)
     pick = sobol_pair(index, key, 1)
     wi = light_sample(light, sobol_pair(index, key, 2), pick[0])
-    cos_i = wp.dot(wi, proxy.normal)
+    cos_i = wp.dot(wi, point.normal)
     out.wi_light = wi
     if cos_i > 0.0:
         Li = light_eval(light, wi)
         if Li.pdf > 0.0 and (wp.max(Li.radiance) > 0.0 or keep_dark == 1):
             pdf = cos_i * INV_PI
             out.weight_light = pdf * power_heuristic(Li.pdf, pdf) / Li.pdf
+            out.weight_light = out.weight_light * proxy_visibility(proxy, origin, wi)
             out.radiance_light = Li.radiance
             out.visible_light = visibility(mesh, material, texture, origin, wi)
-    wi = to_world(cosine_sample(sobol_pair(index, key, 3)), basis(proxy.normal))
-    cos_i = wp.dot(wi, proxy.normal)
+    wi = to_world(cosine_sample(sobol_pair(index, key, 3)), basis(point.normal))
+    cos_i = wp.dot(wi, point.normal)
     out.wi_cosine = wi
     if cos_i > 0.0:
+        place = proxy_mesh_hit(proxy, origin, wi)
+        if place.valid == 1:
+            out.bounced = proxy_radiance(proxy, place)
+            ray_key = hash_pair(hash_pair(key, BOUNCE_KEY), wp.uint32(index))
+            hit = closest_hit(mesh, material, texture, origin, wi, place.t, 0, ray_key)
+            out.visible_cosine = 1.0 - float(hit.valid)
+            return out
         Li = light_eval(light, wi)
         if wp.max(Li.radiance) > 0.0 or keep_dark == 1:
             out.weight_cosine = power_heuristic(cos_i * INV_PI, Li.pdf)
@@ -107,19 +152,28 @@ def proxy_point(
     may_see_object: int,
     s: int,
     key: wp.uint32,
-) -> wp.vec4:
-    """Return the plane's point (xyz) that camera sample ``s`` sees; w is 0 when it sees none."""
+) -> Receiver:
+    """Find the point of plane or place that camera sample ``s`` sees, if it sees one."""
+    point = Receiver()
+    point.valid = 0
     ray_dir = camera_ray(camera, pixel, sobol_pair(s, key, 0))
     t = proxy_distance(proxy, camera.origin, ray_dir)
-    if t <= 0.0:
-        return wp.vec4(0.0)
+    place = proxy_mesh_hit(proxy, camera.origin, ray_dir)
+    if t <= 0.0 and place.valid == 0:
+        return point
     if may_see_object == 1:
         if camera_hit(camera, mesh, material, texture, proxy, s, key, ray_dir).valid == 1:
-            return wp.vec4(0.0)
+            return point
+    point.valid = 1
+    if place.valid == 1 and (t <= 0.0 or place.t < t):
+        point.position = place.position
+        point.normal = place.normal
+        return point
     p = camera.origin + ray_dir * t
     # Back onto the plane: far hits lose digits along the ray.
-    p = p - proxy.normal * (wp.dot(proxy.normal, p) - proxy.offset)
-    return wp.vec4(p[0], p[1], p[2], 1.0)
+    point.position = p - proxy.normal * (wp.dot(proxy.normal, p) - proxy.offset)
+    point.normal = proxy.normal
+    return point
 
 
 @wp.func
@@ -145,21 +199,21 @@ def trace_proxy(
     unoccluded: wp.array[wp.vec3],
     record: LightRecord,
 ):
-    """Sum the radiance of a white plane with and without the object in each listed pixel.
+    """Sum the radiance of the place in white, with and without the object, in each listed pixel.
 
     Args:
         pixels: Row-major pixel indices, shape [proxy_pixel].
-        may_see_object: 1 where the object may hide the plane from the camera, shape [proxy_pixel].
+        may_see_object: 1 where the object may hide the place from the camera, shape [proxy_pixel].
         camera: The view.
         mesh: The object's triangles.
         material: Their materials.
         texture: Their textures.
-        proxy: The plane.
+        proxy: The place: plane and mesh.
         light: The light.
         spp: Camera samples per pixel.
         rays: Directions per technique that share one camera sample.
         seed: Base seed.
-        lit: Mean radiance with the object over the samples that see the plane.
+        lit: Mean radiance with the object over the samples that see the place.
         unoccluded: The same without the object.
         record: Output: the weights of each direction in both, or without arrays.
     """
@@ -177,15 +231,14 @@ def trace_proxy(
         point = proxy_point(
             camera, mesh, material, texture, proxy, pixel, may_see_object[i], s, key
         )
-        if point[3] > 0.0:
+        if point.valid == 1:
             count += 1.0
-            p = wp.vec3(point[0], point[1], point[2])
             for r in range(rays):
                 x = proxy_sample(
-                    mesh, material, texture, proxy, light, p, keep_dark, s * rays + r, key
+                    mesh, material, texture, proxy, light, point, keep_dark, s * rays + r, key
                 )
                 from_light = x.radiance_light * x.weight_light
-                from_cosine = x.radiance_cosine * x.weight_cosine
+                from_cosine = x.radiance_cosine * x.weight_cosine + x.bounced
                 sum_all += from_light + from_cosine
                 sum_lit += from_light * x.visible_light + from_cosine * x.visible_cosine
                 if keep_dark == 1:

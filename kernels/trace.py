@@ -5,12 +5,12 @@ Detached: no backward pass.
 
 import warp as wp
 
+from warpir.kernels.proxy_mesh import INFINITY, proxy_distance, proxy_mesh_hit
 from warpir.kernels.rng import hash_pair, pixel_seed, sobol_pair, to_unit
 from warpir.kernels.types import CameraArgs, MaterialArgs, MeshArgs, ProxyArgs, TextureArgs
 
 wp.set_module_options({"enable_backward": False})
 
-INFINITY = wp.constant(1.0e30)
 ULP = wp.constant(1.1920929e-07)
 LAYERS_MAX = wp.constant(64)
 """Surfaces that one ray may pass through; a safety bound, not a quality setting."""
@@ -62,24 +62,22 @@ def camera_ray(camera: CameraArgs, pixel: int, jitter: wp.vec2) -> wp.vec3:
 
 
 @wp.func
-def proxy_distance(proxy: ProxyArgs, origin: wp.vec3, direction: wp.vec3) -> float:
-    """Return the distance to the plane's lit side [m], or a negative number."""
-    slope = wp.dot(proxy.normal, direction)
-    if slope > -1.0e-9:
-        return -1.0
-    return (proxy.offset - wp.dot(proxy.normal, origin)) / slope
-
-
-@wp.func
 def camera_reach(proxy: ProxyArgs, origin: wp.vec3, direction: wp.vec3) -> float:
-    """Return how far a camera ray sees [m]: to the plane and to what lies on it.
+    """Return how far a camera ray sees [m]: to plane or mesh of the place and to what lies there.
 
     Without the tolerance a sheet on the ground would be seen in a random part of its samples.
     """
     reach = proxy_distance(proxy, origin, direction)
     if reach < 0.0:
-        return INFINITY
-    return reach - proxy.tolerance / wp.dot(proxy.normal, direction)
+        reach = INFINITY
+    else:
+        reach = reach - proxy.tolerance / wp.dot(proxy.normal, direction)
+    hit = proxy_mesh_hit(proxy, origin, direction)
+    if hit.valid == 1:
+        # Along a wall a ray may graze for any distance.
+        slope = wp.max(-wp.dot(hit.normal, direction), 1.0e-6)
+        reach = wp.min(reach, hit.t + proxy.tolerance / slope)
+    return reach
 
 
 @wp.func

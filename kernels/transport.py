@@ -15,11 +15,11 @@ import warp as wp
 from warpir.kernels.brdf import brdf_eval, brdf_sample, roughness_to_alpha
 from warpir.kernels.frame import basis, to_local, to_world
 from warpir.kernels.latlong import BilinearTap, bilinear_tap, direction_to_uv, uv_to_direction
-from warpir.kernels.proxy import proxy_point
+from warpir.kernels.proxy import Receiver, proxy_point, receiver_origin
+from warpir.kernels.proxy_mesh import proxy_mesh_hit, proxy_radiance, proxy_visibility
 from warpir.kernels.rng import hash_pair, hash_uint, pixel_seed, sobol_pair, to_unit
-from warpir.kernels.sampling import light_eval, light_sample, power_heuristic, tent
+from warpir.kernels.sampling import cosine_sample, light_eval, light_sample, power_heuristic, tent
 from warpir.kernels.trace import (
-    INFINITY,
     Hit,
     Surface,
     camera_hit,
@@ -216,6 +216,7 @@ def direct_row(
     mesh: MeshArgs,
     material: MaterialArgs,
     texture: TextureArgs,
+    proxy: ProxyArgs,
     texels: TexelArgs,
     subsamples: int,
     path_count: int,
@@ -271,7 +272,8 @@ def direct_row(
                 throughput = (f.diffuse + specular) * wp.dot(wi, n)
                 if wp.max(throughput) > 0.0:
                     origin = offset_origin(points.position[p, s], ng, wi, mesh.epsilon)
-                    total += throughput * visibility(mesh, material, texture, origin, wi)
+                    arriving = visibility(mesh, material, texture, origin, wi)
+                    total += throughput * (arriving * proxy_visibility(proxy, origin, wi))
     return total * (texels.d_omega[i] * float(count) / float(subsamples * directions))
 
 
@@ -282,6 +284,7 @@ def trace_direct(
     mesh: MeshArgs,
     material: MaterialArgs,
     texture: TextureArgs,
+    proxy: ProxyArgs,
     texels: TexelArgs,
     subsamples: int,
     path_count: int,
@@ -296,6 +299,7 @@ def trace_direct(
         mesh: The object's triangles.
         material: Their materials.
         texture: Their textures.
+        proxy: The place's mesh, which stands in the light's way.
         texels: The map and how many directions each texel gets.
         subsamples: Camera samples per pixel.
         path_count: Paths that `trace_paths` will add, for the weights of narrow lobes.
@@ -313,6 +317,7 @@ def trace_direct(
             mesh,
             material,
             texture,
+            proxy,
             texels,
             subsamples,
             path_count,
@@ -368,6 +373,7 @@ def trace_paths(
     mesh: MeshArgs,
     material: MaterialArgs,
     texture: TextureArgs,
+    proxy: ProxyArgs,
     texels: TexelArgs,
     proposal: LightArgs,
     subsamples: int,
@@ -385,6 +391,7 @@ def trace_paths(
         mesh: The object's triangles.
         material: Their materials.
         texture: Their textures.
+        proxy: The place's mesh, which stands in the light's way and sends what the photo shows.
         texels: The map.
         proposal: Where light is expected, for the second and later vertices; any positive map.
         subsamples: Camera samples per pixel.
@@ -436,6 +443,7 @@ def trace_paths(
                     origin = offset_origin(surface.position, surface.ng, wi, mesh.epsilon)
                     weight = wi_local[2] * power_heuristic(expected.pdf, f.pdf) / expected.pdf
                     weight = weight * visibility(mesh, material, texture, origin, wi)
+                    weight = weight * proxy_visibility(proxy, origin, wi)
                     if weight > 0.0:
                         add_to_texels(T, p, texels, wi, value * weight, wp.vec3(0.0), 0.0)
 
@@ -457,14 +465,18 @@ def trace_paths(
         slope = wi_local[2] / f.pdf
         origin = offset_origin(surface.position, surface.ng, wi, mesh.epsilon)
         escaped = float(0.0)
-        if is_last == 1:
+        place = proxy_mesh_hit(proxy, origin, wi)
+        if is_last == 1 and place.valid == 0:
             if k > 0 or is_narrow(surface.roughness, texels.height) == 1:
                 escaped = visibility(mesh, material, texture, origin, wi)
         else:
             ray_key = hash_pair(hash_pair(key, wp.uint32(q)), wp.uint32(k + 1))
-            hit = closest_hit(mesh, material, texture, origin, wi, INFINITY, 0, ray_key)
-            if hit.valid == 0:
+            hit = closest_hit(mesh, material, texture, origin, wi, place.t, 0, ray_key)
+            if hit.valid == 0 and place.valid == 0:
                 escaped = 1.0
+            elif hit.valid == 0:
+                f_all = wp.cw_mul(throughput, f.diffuse + f.specular) * slope
+                wp.atomic_add(emission, p, wp.cw_mul(f_all, proxy_radiance(proxy, place)))
         if escaped > 0.0:
             if k == 0:
                 if is_narrow(surface.roughness, texels.height) == 1:
@@ -498,22 +510,24 @@ def trace_proxy_points(
     seed: int,
     count: wp.array[int],
     position: wp.array2d[wp.vec3],
+    normal: wp.array2d[wp.vec3],
     spread: wp.array[float],
 ):
-    """Find the ground plane under ``subsamples`` positions of each listed pixel.
+    """Find the place, plane or mesh, under ``subsamples`` positions of each listed pixel.
 
     Args:
         pixels: Row-major pixel indices, shape [pixel].
-        may_see_object: 1 where the object may hide the plane from the camera, shape [pixel].
+        may_see_object: 1 where the object may hide the place from the camera, shape [pixel].
         camera: The view.
         mesh: The object's triangles.
         material: Their materials.
         texture: Their textures.
-        proxy: The plane.
+        proxy: The place: plane and mesh.
         subsamples: Camera samples per pixel.
         seed: Base seed.
         count: Filled points of each pixel, shape [pixel].
-        position: Points of the plane, recentred [m], shape [pixel, subsample].
+        position: Points of the place, recentred [m], shape [pixel, subsample].
+        normal: Its unit normals there, shape [pixel, subsample].
         spread: Largest distance of a pixel's points from its first one [m], shape [pixel].
     """
     i = wp.tid()
@@ -525,10 +539,10 @@ def trace_proxy_points(
         point = proxy_point(
             camera, mesh, material, texture, proxy, pixel, may_see_object[i], s, key
         )
-        if point[3] > 0.0:
-            p = wp.vec3(point[0], point[1], point[2])
-            position[i, found] = p
-            farthest = wp.max(farthest, wp.length(p - position[i, 0]))
+        if point.valid == 1:
+            position[i, found] = point.position
+            normal[i, found] = point.normal
+            farthest = wp.max(farthest, wp.length(point.position - position[i, 0]))
             found += 1
     count[i] = found
     spread[i] = farthest
@@ -637,3 +651,133 @@ def trace_blocked(
                 shift,
             )
             wp.atomic_add(blocked, p, c, share)
+
+
+@wp.kernel
+def trace_received(
+    pixels: wp.array[int],
+    count: wp.array[int],
+    position: wp.array2d[wp.vec3],
+    normal: wp.array2d[wp.vec3],
+    mesh: MeshArgs,
+    material: MaterialArgs,
+    texture: TextureArgs,
+    proxy: ProxyArgs,
+    texels: TexelArgs,
+    seed: int,
+    received: wp.array2d[float],
+    blocked: wp.array2d[float],
+):
+    """Write what each texel sends to a place with a mesh, and what the object keeps; (pixel, lane).
+
+    Normals differ within a pixel there and the mesh hides part of the sky, so no row is known
+    beforehand. Directions are spread evenly over the tent.
+
+    Args:
+        pixels: Row-major pixel indices, shape [pixel].
+        count: Filled points of each pixel, shape [pixel].
+        position: Points of the place [m], shape [pixel, subsample].
+        normal: Its unit normals there, shape [pixel, subsample].
+        mesh: The object's triangles.
+        material: Their materials.
+        texture: Their textures.
+        proxy: The place: plane and mesh.
+        texels: The map and how many directions each texel gets.
+        seed: Base seed.
+        received: Radiance of the white place without the object per texel radiance [1], zero,
+            shape [pixel, texel].
+        blocked: The part of it that the object keeps away [1], zero, shape [pixel, texel].
+    """
+    p, lane = wp.tid()
+    filled = count[p]
+    if filled == 0:
+        return
+    pixel_key = pixel_seed(seed, pixels[p])
+    shift = to_unit(hash_uint(pixel_key))
+    for item in range(lane, texels.item_count, texels.lanes):
+        t = texels.item_column[item]
+        i = t // texels.width
+        j = t % texels.width
+        key = hash_pair(pixel_key, wp.uint32(t))
+        directions = texels.direction_count[t]
+        spot = shift + GOLDEN_ROW * float(i) + GOLDEN_COLUMN * float(j)
+        spot = spot - wp.floor(spot)
+        start = wp.min(int(spot * float(filled)), filled - 1)
+        first = texels.item_first[item]
+        total = float(0.0)
+        kept = float(0.0)
+        for r in range(first, wp.min(first + texels.item_size, directions)):
+            s = (start + r) % filled
+            point = Receiver()
+            point.position = position[p, s]
+            point.normal = normal[p, s]
+            u = random_pair(key, -1)
+            if directions > 1:
+                u = sobol_pair(r, key, 0)
+            wi = tent_direction(texels, i, j, u, hash_pair(key, wp.uint32(r)), 0, point.normal)
+            cos_i = wp.dot(wi, point.normal)
+            if cos_i > 0.0:
+                origin = receiver_origin(mesh, proxy, point)
+                arriving = cos_i * proxy_visibility(proxy, origin, wi)
+                total += arriving
+                if arriving > 0.0 and meets_box(origin, wi, mesh.low, mesh.high) == 1:
+                    kept += arriving * (1.0 - visibility(mesh, material, texture, origin, wi))
+        scale = texels.d_omega[i] / (PI * float(directions))
+        wp.atomic_add(received, p, t, total * scale)
+        wp.atomic_add(blocked, p, t, kept * scale)
+
+
+@wp.kernel
+def trace_bounced(
+    pixels: wp.array[int],
+    count: wp.array[int],
+    position: wp.array2d[wp.vec3],
+    normal: wp.array2d[wp.vec3],
+    mesh: MeshArgs,
+    material: MaterialArgs,
+    texture: TextureArgs,
+    proxy: ProxyArgs,
+    path_count: int,
+    seed: int,
+    received: wp.array[wp.vec3],
+    blocked: wp.array[wp.vec3],
+):
+    """Add up what the place's mesh sends to the place, and what the object keeps of it.
+
+    Args:
+        pixels: Row-major pixel indices, shape [pixel].
+        count: Filled points of each pixel, shape [pixel].
+        position: Points of the place [m], shape [pixel, subsample].
+        normal: Its unit normals there, shape [pixel, subsample].
+        mesh: The object's triangles.
+        material: Their materials.
+        texture: Their textures.
+        proxy: The place: plane and mesh.
+        path_count: Directions per pixel.
+        seed: Base seed.
+        received: Radiance of the white place without the object, shape [pixel].
+        blocked: The part of it that the object keeps away, shape [pixel].
+    """
+    p = wp.tid()
+    filled = count[p]
+    if filled == 0:
+        return
+    key = hash_pair(pixel_seed(seed, pixels[p]), wp.uint32(0x51ED27))
+    total = wp.vec3(0.0)
+    kept = wp.vec3(0.0)
+    for q in range(path_count):
+        point = Receiver()
+        point.position = position[p, q % filled]
+        point.normal = normal[p, q % filled]
+        wi = to_world(cosine_sample(sobol_pair(q, key, 0)), basis(point.normal))
+        origin = receiver_origin(mesh, proxy, point)
+        place = proxy_mesh_hit(proxy, origin, wi)
+        if place.valid == 1:
+            L = proxy_radiance(proxy, place)
+            total += L
+            ray_key = hash_pair(key, wp.uint32(q))
+            hit = closest_hit(mesh, material, texture, origin, wi, place.t, 0, ray_key)
+            if hit.valid == 1:
+                kept += L
+    received[p] = total / float(path_count)
+    blocked[p] = kept / float(path_count)

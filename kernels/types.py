@@ -22,14 +22,33 @@ class CameraArgs:
 
 @wp.struct
 class ProxyArgs:
-    """The ground plane ``dot(normal, x) = offset``, analytic and unbounded."""
+    """What is known of the photo's place: a ground plane, a mesh, or both."""
 
     normal: wp.vec3
-    """Unit normal, toward the side that receives light."""
+    """Of the plane ``dot(normal, x) = offset``, analytic and unbounded: unit normal, toward the
+    side that receives light; 0 when there is no plane."""
     offset: float
     """Distance from the recentred origin along ``normal`` [m]."""
     tolerance: float
-    """How far below the plane the object still counts as lying on it [m]."""
+    """How far below plane and mesh the object still counts as lying on them [m]."""
+    mesh: wp.uint64
+    """Handle of the place's ``wp.Mesh``; 0 when there is none, and nothing below is read."""
+    epsilon: float
+    """Ray offset that depends on the mesh's size alone [m]."""
+    positions: wp.array[wp.vec3]
+    """Shape [vertex]."""
+    indices: wp.array[int]
+    """Vertex of each corner, shape [3 * triangle]."""
+    eye: wp.vec3
+    """Centre of the photo's camera [m]."""
+    to_image: wp.mat33
+    """Takes ``x - eye`` to (column, row, 1) of `radiance` times the depth."""
+    radiance: wp.array2d[wp.vec3]
+    """What the photo shows, before its tone operator, shape [height, width]."""
+    elsewhere: wp.vec3
+    """Radiance of the mesh where the photo does not show it."""
+    shines: int
+    """0 leaves out what the mesh sends; it still blocks light."""
 
 
 @wp.struct

@@ -22,7 +22,7 @@ LEVELS = (
         "camera", "asset_files", "record", "progress", "light", "tone", "curves", "materials_file",
         "ply", "stl",
     },
-    {"envmap_conventions"},
+    {"envmap_conventions", "proxy_mesh", "lamps"},
     {
         "gltf_file", "gltf_writer", "mtl", "files", "photo_files", "command", "placement",
         "lobes_file", "lobe_fit", "regressor", "light_errors", "camera_source", "point_cloud",
@@ -31,7 +31,7 @@ LEVELS = (
     {
         "gltf_material", "obj", "reuse", "program", "regressor_training", "training_lights",
         "training_meshes", "panorama_crop", "three_spheres", "undistort", "free_space", "colmap",
-        "fspy", "nerfstudio", "waymo", "exr_camera",
+        "fspy", "nerfstudio", "waymo", "exr_camera", "shadow_mask",
     },
     {"gltf", "evaluation_scenes", "predictions", "photo_world"},
     {"gltf_camera"},

@@ -48,6 +48,9 @@ FLAGS = {
         "up": "AXIS",
         "ground": "A,B,C,D",
         "ground_points": "FILE|DIR",
+        "proxy": "FILE",
+        "plane": "",
+        "shadow_mask": "FILE",
     },
     "placement": {
         "place": "X,Y,Z",

@@ -143,11 +143,20 @@ class InsertConfig(ModelSettings, PersonalizeSettings, GuidanceChoices, Optimize
     ground_points: str | None = None
     """Points of the scene in the camera file's world (.ply, text, COLMAP model): the ground is a
     plane fitted to them, and without --at and --place the object stands where it is free"""
+    proxy: str | None = None
+    """Mesh of the place in world coordinates [m], +Y up: .glb, .gltf, .obj, .ply or .stl. It
+    receives shadows beside the ground plane, hides the object and stands in the light's way"""
+    plane: bool = True
+    """The ground plane beside the mesh of --proxy"""
+    shadow_mask: str | None = None
+    """Grey image of the photo's size, white where its ground is in shadow already: the sun and
+    other lamps are not taken away there once more"""
 
     place: tuple[float, float, float] | None = None
-    """Where the object stands, world coordinates [m]; moved onto the ground along its normal"""
+    """Where the object stands, world coordinates [m]; moved onto the ground along its normal (not
+    with --no-plane)"""
     at: tuple[float, float] | None = None
-    """Where the object stands, as a pixel of the ground in the upright photo [px]"""
+    """Where the object stands, as a pixel of the ground or of --proxy in the upright photo [px]"""
     rotate_y: float = 0.0
     """Turn of the object about the ground's normal, counter-clockwise seen from above [deg]"""
     scale: float | None = None
@@ -577,6 +586,13 @@ def _values_that_clash(config: InsertConfig) -> Iterator[InputError]:
             "--guidance" if given("guidance") else "--model",
             "cannot be used with --reuse, whose light is known",
             "leave one of them out, or say with --refine what is to change under that light",
+        )
+    yield from needs("plane", given("proxy"), "--proxy, without which there is no other ground")
+    if given("shadow_mask") and config.is_guided:
+        yield usage(
+            "--shadow-mask",
+            "cannot be used while a prior changes the light or the object",
+            "recover the light first, then give the mask with --reuse",
         )
     yield from needs("fit_lobes", given("light"), "--light with a panorama to fit")
     yield from needs("light_convention", given("light"), "--light with a panorama")

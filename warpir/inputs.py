@@ -1,7 +1,7 @@
 """All inputs of one insertion, read and checked; torch and Warp are not needed here."""
 
 import os
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field, replace
 from functools import lru_cache
 from pathlib import Path
@@ -23,7 +23,9 @@ from warpir.photo_files import Photo, read_envmap, read_mask, read_photo
 from warpir.photo_world import PhotoWorld, make_world
 from warpir.placement import Placement, place_asset, up_to_y, upright_plane
 from warpir.point_cloud import read_point_cloud
+from warpir.proxy_mesh import ProxyMesh, first_hit, is_in_view, mesh_of
 from warpir.reuse import EarlierRun, read_run
+from warpir.shadow_mask import ShadowMask, shadow_mask
 from warpir.undistort import undistort_photo, undistorted
 
 DEFAULT_FOV = 60.0
@@ -51,6 +53,12 @@ class Inputs:
     """What --light holds, turned by --light-rotate; absent: --sun and --sky describe it."""
     run: EarlierRun | None = None
     """What --reuse holds, as the run left it; in place of any other light."""
+    proxy: ProxyMesh | None = None
+    """What --proxy holds."""
+    is_plane: bool = True
+    """Whether the ground plane receives shadows too."""
+    shadow_mask: ShadowMask | None = None
+    """What --shadow-mask holds."""
     assumed: tuple[str, ...] = ()
     """What was chosen because nothing was given, one line each."""
     notices: tuple[str, ...] = ()
@@ -62,10 +70,11 @@ class Inputs:
 
 
 class Loaders:
-    """Reads assets and earlier runs; the last of each is remembered, for many insertions."""
+    """Reads assets, places and earlier runs; remembers the last of each, for many insertions."""
 
     def __init__(self) -> None:
         self.asset: Callable[[str, str, AssetLimits], Asset] = lru_cache(maxsize=1)(load_asset)
+        self.proxy: Callable[[str], Asset] = lru_cache(maxsize=1)(_read_proxy)
         self.run: Callable[[str], EarlierRun] = lru_cache(maxsize=1)(read_run)
 
 
@@ -107,7 +116,8 @@ def read_inputs(config: InsertConfig, loaders: Loaders | None = None) -> Inputs:
             strict=config.strict,
         )
     )
-    occluder = attempt(lambda: _read_occluder(config, photo, notices))
+    occluder = attempt(lambda: _read_mask(config.occluder_mask, photo, notices))
+    shaded = attempt(lambda: _read_mask(config.shadow_mask, photo, notices))
     asset = attempt(lambda: _read_asset(asset_path, config, loaders, assumed))
     reuse = config.reuse
     run = attempt(lambda: loaders.run(reuse)) if reuse is not None else None
@@ -115,8 +125,9 @@ def read_inputs(config: InsertConfig, loaders: Loaders | None = None) -> Inputs:
     # Without a camera the run ends below, but all that is wrong with the light is told too.
     pose = view.camera.c2w if view is not None else np.eye(4)
     light = attempt(lambda: _read_light(config, pose, notices))
-    points_path = config.ground_points
+    points_path, proxy_path = config.ground_points, config.proxy
     points = attempt(lambda: read_point_cloud(points_path)) if points_path is not None else None
+    proxy = attempt(lambda: loaders.proxy(proxy_path)) if proxy_path is not None else None
     raise_all(problems)
     assert photo is not None and asset is not None and view is not None
 
@@ -125,16 +136,20 @@ def read_inputs(config: InsertConfig, loaders: Loaders | None = None) -> Inputs:
     if not view.lens.is_straight:
         straight, border = undistort_photo(photo, view.camera, view.lens)
         measured["undistorted"] = {**view.lens.record(), "border_share": border}
-        if occluder is not None:
-            (occluder,), _ = undistorted([occluder], view.camera, view.lens)
+        masks = [mask for mask in (occluder, shaded) if mask is not None]
+        bent = iter(undistorted(masks, view.camera, view.lens)[0])
+        occluder = None if occluder is None else next(bent)
+        shaded = None if shaded is None else next(bent)
     elif config.undistort:
         notices.append("--undistort: the camera has no distortion, nothing was undone")
     world = make_world(config, view, points)
     camera = world.camera
-    placement = _place(config, asset, world)
+    mesh = None if proxy is None else mesh_of(proxy)
+    placement = _place(config, asset, world, mesh)
     notices = [
         *_about(photo_path, straight.notices),
         *_about(asset_path, asset.notices),
+        *(_about(config.proxy, proxy.notices) if config.proxy and proxy else ()),
         *notices,
         *_split_assumed(camera.notices, assumed),
         *world.notices,
@@ -147,6 +162,17 @@ def read_inputs(config: InsertConfig, loaders: Loaders | None = None) -> Inputs:
         )
     assumed += [*world.assumed, *placement.assumed]
     measured |= world.measured
+    if mesh is not None:
+        notices += _about_mesh(mesh, asset, placement, camera)
+        if not np.allclose(camera.c2w, view.camera.c2w):
+            notices.append("--proxy counts after that turn, in the world of camera.json")
+    shade = None
+    if shaded is not None:
+        shade = shadow_mask(shaded, *asset.bounds(), placement.asset_to_world, camera)
+        assumed.append(
+            f"{100.0 * shade.at_object:.0f} % of the lamps' light is kept from the object, the "
+            "mean of --shadow-mask under its footprint"
+        )
     if run is not None and (assumption := run.assumption(camera.c2w, config.camera)):
         assumed.append(assumption)
     if run is not None and run.materials is not None and config.materials is None:
@@ -156,8 +182,21 @@ def read_inputs(config: InsertConfig, loaders: Loaders | None = None) -> Inputs:
         )
     if occluder is not None and config.is_guided:
         notices.append("guidance does not see --occluder-mask; the pictures it leads to do")
-    found = tuple(assumed), tuple(notices), occluder, measured
-    return Inputs(straight, asset, camera, placement, light, run, *found)
+    return Inputs(
+        straight,
+        asset,
+        camera,
+        placement,
+        light,
+        run,
+        proxy=mesh,
+        is_plane=config.plane,
+        shadow_mask=shade,
+        assumed=tuple(assumed),
+        notices=tuple(notices),
+        occluder=occluder,
+        measured=measured,
+    )
 
 
 def _inputs_in_out(config: InsertConfig) -> list[InputError]:
@@ -167,7 +206,7 @@ def _inputs_in_out(config: InsertConfig) -> list[InputError]:
     out = os.path.realpath(config.out)
     named = (
         *(config.photo, config.asset, config.materials, config.camera, config.light),
-        config.occluder_mask,
+        *(config.occluder_mask, config.shadow_mask, config.proxy),
         *(config.lora, config.prior, config.regressor, config.ground_points),
     )
     folders = {
@@ -202,7 +241,9 @@ def _read_asset(path: str, config: InsertConfig, loaders: Loaders, assumed: list
     return asset
 
 
-def _place(config: InsertConfig, asset: Asset, world: PhotoWorld) -> Placement:
+def _place(
+    config: InsertConfig, asset: Asset, world: PhotoWorld, mesh: ProxyMesh | None
+) -> Placement:
     """Set the asset on the ground: where it was asked for, or where the points leave space."""
     low, high = asset.bounds()
 
@@ -217,6 +258,8 @@ def _place(config: InsertConfig, asset: Asset, world: PhotoWorld) -> Placement:
             rotate_y=config.rotate_y,
             scale=config.scale,
             size=config.size,
+            mesh=mesh,
+            is_plane=config.plane,
         )
 
     if world.cloud is None:
@@ -233,6 +276,28 @@ def _place(config: InsertConfig, asset: Asset, world: PhotoWorld) -> Placement:
         warning = f"{count} points of --ground-points stand where the object does; is it free?"
         placement = replace(placement, warnings=(*placement.warnings, warning))
     return placement
+
+
+def _read_proxy(path: str) -> Asset:
+    """Read the mesh of the place; of its materials nothing is used."""
+    asset = load_asset(path, "grey")
+    if any(m.alpha_mode != "OPAQUE" for m in asset.materials):
+        notice = "the opacity of its materials is not used: all of the mesh blocks light"
+        return replace(asset, notices=(*asset.notices, notice))
+    return asset
+
+
+def _about_mesh(
+    mesh: ProxyMesh, asset: Asset, placement: Placement, camera: Camera
+) -> Iterator[str]:
+    """Yield what looks odd of the place's mesh."""
+    if not is_in_view(mesh, camera):
+        yield "no triangle of --proxy is in view: it only stands in the light's way"
+    low, high = asset.bounds()
+    middle = placement.asset_to_world[:3, :3] @ (0.5 * (low + high))
+    toward = middle + placement.asset_to_world[:3, 3] - camera.c2w[:3, 3]
+    if first_hit(mesh, camera.c2w[None, :3, 3], toward[None])[0][0] < 1.0:
+        yield "the mesh of --proxy hides the object's middle from the camera"
 
 
 def _make_camera(config: InsertConfig, photo: Photo, assumed: list[str]) -> PhotoCamera:
@@ -268,16 +333,14 @@ def _camera_from_numbers(config: InsertConfig, photo: Photo, assumed: list[str])
     return camera_from_fov(width, height, config.fov or DEFAULT_FOV, *pose)
 
 
-def _read_occluder(
-    config: InsertConfig, photo: Photo | None, notices: list[str]
-) -> FloatArray | None:
-    if config.occluder_mask is None or photo is None:
+def _read_mask(path: str | None, photo: Photo | None, notices: list[str]) -> FloatArray | None:
+    if path is None or photo is None:
         return None
     height, width = photo.codes.shape[:2]
     found: list[str] = []
-    occluder = read_mask(config.occluder_mask, (width, height), notices=found)
-    notices += _about(config.occluder_mask, found)
-    return occluder
+    mask = read_mask(path, (width, height), notices=found)
+    notices += _about(path, found)
+    return mask
 
 
 def _read_light(

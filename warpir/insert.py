@@ -150,7 +150,9 @@ def _insert_one(config: InsertConfig, loaders: "Loaders | None" = None) -> Inser
             with timings.stage("preview"):
                 _write_preview(output, config, inputs, light, device)
         with timings.stage("scene"):
-            scene = scene_of(inputs, _rendering_camera(inputs.camera, config), device)
+            is_reinhard = light.curves.tone == "reinhard"
+            camera = _rendering_camera(inputs.camera, config)
+            scene = scene_of(inputs, camera, device, is_reinhard)
         with timings.stage("render"), progress_bar() as report:
             picture = make_picture(
                 Renderer(scene, config.threads or 0, report),
@@ -166,8 +168,9 @@ def _insert_one(config: InsertConfig, loaders: "Loaders | None" = None) -> Inser
                 ),
                 light.curves.foreground,
                 light.curves.shadow_ratio,
-                is_reinhard=light.curves.tone == "reinhard",
+                is_reinhard=is_reinhard,
                 occluder=inputs.occluder,
+                shadow_mask=inputs.shadow_mask,
             )
         with timings.stage("write"):
             measured = _write(output, config, inputs, light, picture)
@@ -242,16 +245,18 @@ def _write_preview(
         return
     width = min(settings.picture_width, _rendering_camera(inputs.camera, config).width)
     camera = _rendering_camera(inputs.camera, replace(config, width=width))
+    is_reinhard = light.curves.tone == "reinhard"
     picture = make_picture(
-        Renderer(scene_of(inputs, camera, device), config.threads or 0),
+        Renderer(scene_of(inputs, camera, device, is_reinhard), config.threads or 0),
         light.light,
         light.light_shadow,
         inputs.photo,
         Quality(PREVIEW_SAMPLES, 1, config.depth, config.seed, config.indirect_limit),
         light.curves.foreground,
         light.curves.shadow_ratio,
-        is_reinhard=light.curves.tone == "reinhard",
+        is_reinhard=is_reinhard,
         occluder=inputs.occluder,
+        shadow_mask=inputs.shadow_mask,
     )
     codes = inputs.photo.encode(picture.image, picture.changed)
     say(f"preview: {output.write_preview(0, codes, inputs.photo.icc)}")
@@ -338,6 +343,7 @@ def _write(
     if not (picture.layers.matte > 0.0).any():
         say("notice: the object is not seen in the photo")
     fit = light.fit
+    mask = inputs.shadow_mask
     return {
         "prior": "none",
         "integrator": "mis",
@@ -349,6 +355,8 @@ def _write(
             "flux_error": fit.flux_error,
             "lamps": fit.lamp_count,
         },
+        **({} if mask is None else {"shadow_mask_at_object": mask.at_object}),
+        **({} if inputs.proxy is None else {"proxy_triangles": len(inputs.proxy.indices)}),
         "object_pixels": picture.object_pixel_count,
         "shadow_pixels": picture.proxy_pixel_count,
         "changed_pixels": int(picture.changed.sum()),

@@ -10,9 +10,12 @@ from warpir.config import InsertConfig, usage
 from warpir.curves import Curves
 from warpir.errors import InputError
 from warpir.inputs import Inputs
+from warpir.lamps import lamp_axes, without_lamps
 from warpir.light import Light, plain_sky, sun_lobe
 from warpir.lobe_fit import LobeFit, fit_lobes
+from warpir.proxy_mesh import first_hit
 from warpir.reuse import EarlierRun
+from warpir.shadow_mask import values_at
 
 SKIES = {
     # Radiance of the sky, and the colour of the sun that goes with it.
@@ -27,6 +30,14 @@ GROUND_PERCENTILE = 50.0
 """Of the ground round the object: the level of an even light (the authors state none)."""
 LIT_PERCENTILE = 75.0
 """The brighter quarter of the ground round the object stands for ground that is not in shadow."""
+LIT_SHARE = 0.1
+"""Share of that ground which must be known to be out of shadow to be measured alone [1]."""
+
+
+SEEN = 0.99
+"""A point counts as seen when the camera's ray gets this share of the way to it [1]."""
+
+Float64Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True)
@@ -139,9 +150,16 @@ def _automatic_exposure(light: Light, inputs: Inputs, config: InsertConfig) -> f
     """Choose the light's scale so that Lambertian ground appears as the photo shows it.
 
     The tone curve's start is the identity, so display value = Reinhard(albedo * E / pi), or the
-    value itself with ``--tone linear``.
+    value itself with ``--tone linear``. Where mesh or mask say what the lamps reach, that part of
+    the ground is measured; where they reach none of it, the light without them is.
     """
     normal = inputs.placement.ground[:3]
+    points = _ring(inputs)
+    reached = _reached(points, light, inputs)
+    if (reached > 0.5).mean() >= LIT_SHARE:
+        points = points[reached > 0.5]
+    else:
+        light = without_lamps(light, 1.0 - float(reached.mean()))
     irradiance = float(luminance(light.irradiance(normal)))
     if not irradiance > 0.0:
         raise InputError(
@@ -149,7 +167,7 @@ def _automatic_exposure(light: Light, inputs: Inputs, config: InsertConfig) -> f
             "no light reaches the ground, so no exposure follows from the photo",
             "give --exposure",
         )
-    level = np.clip(ground_level(inputs, LIT_PERCENTILE), 1e-3, 0.9)
+    level = np.clip(_level(inputs, points, LIT_PERCENTILE), 1e-3, 0.9)
     wanted = level / (1.0 - level) if config.tone_operator == "reinhard" else level
     return float(np.log2(wanted * np.pi / (config.ground_albedo * irradiance)))
 
@@ -161,6 +179,11 @@ def ground_level(inputs: Inputs, percentile: float) -> float:
         inputs: Photo, camera and placement.
         percentile: Of the ground's pixels [%].
     """
+    return _level(inputs, _ring(inputs), percentile)
+
+
+def _ring(inputs: Inputs) -> Float64Array:
+    """Return points of the ground round the object's foot, world frame [m], shape [point, 3]."""
     camera, placement = inputs.camera, inputs.placement
     low, high = inputs.asset.bounds()
     size = float(np.linalg.norm((high - low) * np.linalg.norm(placement.asset_to_world[:3, 0])))
@@ -169,10 +192,37 @@ def ground_level(inputs: Inputs, percentile: float) -> float:
     )
     rings = np.linspace(0.2, 1.5, 16) * size
     angles = np.linspace(0.0, 2.0 * np.pi, 64, endpoint=False)
+    if inputs.proxy is not None:
+        # Every triangle is tried for each of them.
+        rings, angles = rings[1::4], angles[::4]
     side = np.cross(placement.ground[:3], camera.c2w[:3, 0])
     across = np.cross(side, placement.ground[:3])
     circle = np.cos(angles)[:, None] * _unit(across) + np.sin(angles)[:, None] * _unit(side)
-    points = (foot[:3] + rings[:, None, None] * circle[None]).reshape(-1, 3)
+    points: Float64Array = (foot[:3] + rings[:, None, None] * circle[None]).reshape(-1, 3)
+    if inputs.proxy is not None:
+        eye = np.broadcast_to(camera.c2w[:3, 3], points.shape)
+        is_seen = first_hit(inputs.proxy, eye, points - eye)[0] > SEEN
+        points = points[is_seen] if is_seen.any() else points
+    return points
+
+
+def _reached(points: Float64Array, light: Light, inputs: Inputs) -> Float64Array:
+    """Return which share of the lamps reaches points of the ground [1], shape [point]."""
+    reached = np.ones(len(points))
+    axes = lamp_axes(light) if inputs.proxy is not None else np.zeros((0, 3))
+    if inputs.proxy is not None and len(axes):
+        lifted = points + inputs.placement.ground[:3] * 1e-3
+        free = [first_hit(inputs.proxy, lifted, np.tile(a, (len(points), 1)))[0] for a in axes]
+        reached = np.isinf(free).mean(axis=0)
+    if inputs.shadow_mask is not None:
+        shares = values_at(inputs.shadow_mask.shares, points, inputs.camera)
+        reached = reached * (1.0 - np.nan_to_num(shares))
+    return reached
+
+
+def _level(inputs: Inputs, points: Float64Array, percentile: float) -> float:
+    """Return a percentile of the photo's linear luminance at world points [1]."""
+    camera = inputs.camera
     uv = camera.project(points)
     inside = (uv >= 0.0).all(axis=1) & (uv[:, 0] < camera.width) & (uv[:, 1] < camera.height)
     photo = luminance(inputs.photo.linear().astype(np.float64))

@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from warpir.color import luminance
+from warpir.lamps import LAMP_COUNT_MAX, lamps_of
 from warpir.light import (
     Lobes,
     fibonacci,
@@ -24,12 +25,6 @@ Float64Array = NDArray[np.float64]
 
 FIT_HEIGHT = 64
 """Rows of the map on which amplitudes are solved."""
-LAMP_SHARE = 0.03
-"""A direction whose surroundings send more of the flux than this gets a lobe of its own [1]."""
-LAMP_RADIUS_DEG = 6.0
-"""Surroundings within which a compact source is measured [deg]."""
-LAMP_COUNT_MAX = 8
-LAMP_SHARPNESS_MAX = 1e5
 
 
 @dataclass(frozen=True)
@@ -52,56 +47,19 @@ def fit_lobes(texels: NDArray[np.float32], count: int) -> LobeFit:
         texels: Radiance, shape [He, We, 3].
         count: Number of lobes, at least 1.
     """
-    height, width = texels.shape[:2]
-    directions = map_directions(height, width)
-    omega = np.broadcast_to(texel_solid_angles(height, width)[:, None], (height, width))
-    axes, sharpnesses, covered = _lamps(texels, directions, omega, min(count, LAMP_COUNT_MAX))
-    lamps = len(axes)
+    found = lamps_of(texels, min(count, LAMP_COUNT_MAX))
+    axes, sharpnesses, lamps = found.axes, found.sharpness, len(found.axes)
     # Broad lobes spaced evenly; this width keeps their sum within 2 % of a constant.
     broad = count - lamps
     if broad > 0:
         axes = np.concatenate([axes, fibonacci(broad)])
         sharpness = 1.0 / (0.6 * np.sqrt(4.0 * np.pi / broad)) ** 2
         sharpnesses = np.concatenate([sharpnesses, np.full(broad, sharpness)])
-    amplitudes = _solve(texels, axes, sharpnesses, covered)
+    amplitudes = _solve(texels, axes, sharpnesses, found.near)
     lobes = Lobes(
         amplitudes.astype(np.float32), axes.astype(np.float32), sharpnesses.astype(np.float32)
     )
     return LobeFit(lobes, *_errors(texels, lobes), lamp_count=lamps)
-
-
-def _lamps(
-    texels: NDArray[np.float32], directions: Float64Array, omega: Float64Array, limit: int
-) -> tuple[Float64Array, Float64Array, list[NDArray[np.bool_]]]:
-    """Find compact sources: axis and sharpness by the moments of what exceeds the surroundings."""
-    lum = luminance(texels.astype(np.float64))
-    flux = lum * omega
-    total = flux.sum()
-    left = lum.copy()
-    axes: list[Float64Array] = []
-    sharpnesses: list[float] = []
-    covered: list[NDArray[np.bool_]] = []
-    while len(axes) < limit and total > 0.0:
-        peak = directions[np.unravel_index(np.argmax(left), left.shape)]
-        cosine = directions @ peak
-        near = cosine > np.cos(np.radians(LAMP_RADIUS_DEG))
-        ring = ~near & (cosine > np.cos(np.radians(2.0 * LAMP_RADIUS_DEG)))
-        level = float(np.median(lum[ring])) if ring.any() else 0.0
-        excess = np.where(near, np.maximum(left - level, 0.0), 0.0) * omega
-        if excess.sum() < LAMP_SHARE * total:
-            break
-        resultant = (excess[..., None] * directions).sum(axis=(0, 1))
-        axis = resultant / np.linalg.norm(resultant)
-        # Mean of 1 - cos is 1 / sharpness for a sharp lobe.
-        spread = float((excess * 0.5 * ((directions - axis) ** 2).sum(axis=-1)).sum())
-        spread /= float(excess.sum())
-        axes.append(axis)
-        sharpnesses.append(min(1.0 / max(spread, 1e-9), LAMP_SHARPNESS_MAX))
-        covered.append(near)
-        left[near] = np.minimum(left[near], level)
-    if not axes:
-        return np.zeros((0, 3)), np.zeros(0), []
-    return np.array(axes), np.array(sharpnesses), covered
 
 
 def _solve(

@@ -31,6 +31,7 @@ class MisIntegrator:
         spp: Camera samples per pixel.
         rays: Directions per technique and camera sample.
         depth: Surface interactions of the object's paths.
+        mesh_shines: Whether the place's mesh sends what the photo shows, or only blocks light.
     """
 
     differentiates = frozenset({"light", "material", "emission"})
@@ -43,6 +44,7 @@ class MisIntegrator:
         spp: int = 128,
         rays: int = 4,
         depth: int = 5,
+        mesh_shines: bool = True,
     ) -> None:
         self.renderer = renderer
         self.object_pixels = object_pixels
@@ -51,6 +53,7 @@ class MisIntegrator:
         rows = index_of(object_pixels, camera.width * camera.height)
         self.may_see_object: IntArray = (rows[proxy_pixels] >= 0).astype(np.int32)
         self.spp, self.rays, self.depth = spp, rays, depth
+        self.mesh_shines = mesh_shines
 
     def radiance(
         self,

@@ -12,14 +12,20 @@ from warpir.color import linear_to_gamma
 from warpir.curves import ToneKnots
 from warpir.files import Layers
 from warpir.inputs import Inputs
+from warpir.lamps import without_lamps
 from warpir.light import Light, as_map, map_directions, texel_solid_angles
 from warpir.photo_files import Photo
 from warpir.render import Foreground, GBuffer, Renderer, light_args
 from warpir.scene import Placed, Proxy, Scene
+from warpir.shadow_mask import ShadowMask
 
 FloatArray = NDArray[np.float32]
 Float64Array = NDArray[np.float64]
 
+PLACE_WIDTH = 1024
+"""Most columns of the photo that the mesh of --proxy sends into the scene [px]."""
+PLACE_WHITE = 0.95
+"""Display value that Reinhard's operator is inverted up to [1]: radiance 19."""
 SLIVER = 1e-4
 """Share of a pixel [1] below which the object's surface is not described there."""
 
@@ -64,6 +70,7 @@ def make_picture(
     curve_shadow: ToneKnots,
     is_reinhard: bool = True,
     occluder: FloatArray | None = None,
+    shadow_mask: ShadowMask | None = None,
 ) -> Picture:
     """Render object and shadow at the scene camera's resolution and put them into the photo.
 
@@ -77,12 +84,11 @@ def make_picture(
         curve_shadow: Three tone curves.
         is_reinhard: Whether Reinhard's operator precedes the foreground curve.
         occluder: Share of the photo that stays in front of the object [1], shape [H, W].
+        shadow_mask: Where the photo's ground is in shadow already.
     """
     camera = renderer.scene.camera
-    args_fg = light_args(light_fg, renderer.device)
-    args_shadow = args_fg
-    if light_shadow is not light_fg:
-        args_shadow = light_args(light_shadow, renderer.device)
+    dimmed = light_fg if shadow_mask is None else without_lamps(light_fg, shadow_mask.at_object)
+    args_fg = light_args(dimmed, renderer.device)
     gbuffer = renderer.gbuffer(quality.seed)
     foreground = renderer.foreground(
         args_fg,
@@ -93,19 +99,29 @@ def make_picture(
         quality.seed,
         quality.indirect_limit,
     )
-    proxy_pixels = renderer.shaded_pixels(args_shadow, quality.seed)
     is_object = np.zeros(camera.width * camera.height, np.int32)
     is_object[gbuffer.object_pixels] = 1
-    radiance = renderer.proxy(
-        args_shadow,
-        proxy_pixels,
-        is_object[proxy_pixels],
-        quality.samples,
-        quality.rays,
-        quality.seed,
-    )
+
+    def shaded(light: Light, wanted: NDArray[np.bool_]) -> tuple[NDArray[np.int32], FloatArray]:
+        """Return which of the wanted pixels the object shades, and their ratio."""
+        args = args_fg if light is dimmed else light_args(light, renderer.device)
+        pixels = renderer.shaded_pixels(args, quality.seed)
+        pixels = pixels[wanted[pixels]]
+        radiance = renderer.proxy(
+            args, pixels, is_object[pixels], quality.samples, quality.rays, quality.seed
+        )
+        return pixels, renderer.ratio(radiance)
+
+    shares = np.zeros(len(is_object), np.float32)
+    if shadow_mask is not None:
+        resized = resize(shadow_mask.shares, camera.height, camera.width)
+        shares = np.clip(resized, 0.0, 1.0).reshape(-1)
+    proxy_pixels, ratio = shaded(light_shadow, shares < 1.0)
+    if shadow_mask is not None:
+        rest = shaded(without_lamps(light_shadow), shares > 0.0)
+        proxy_pixels, ratio = _mixed((proxy_pixels, ratio), rest, shares)
     fg_display, ratio_display = renderer.tone(
-        foreground, renderer.ratio(radiance), curve_fg, curve_shadow, is_reinhard
+        foreground, ratio, curve_fg, curve_shadow, is_reinhard
     )
 
     # Planes of the rendering's size, then of the photo's
@@ -168,17 +184,64 @@ def _behind(planes: dict[str, FloatArray], occluder: FloatArray) -> dict[str, Fl
     return behind
 
 
-def scene_of(inputs: Inputs, camera: Camera, device: str) -> Scene:
-    """Put the object onto its plane.
+def _mixed(
+    lit: tuple[NDArray[np.int32], FloatArray],
+    rest: tuple[NDArray[np.int32], FloatArray],
+    shares: FloatArray,
+) -> tuple[NDArray[np.int32], FloatArray]:
+    """Blend the ratio under the whole light and that without lamps by the mask.
 
     Args:
-        inputs: Asset and placement.
+        lit: Pixels and ratio of the whole light; all others are 1.
+        rest: The same without lamps.
+        shares: Weight of the second in each pixel [1].
+
+    Returns:
+        Pixels of either, and their ratio.
+    """
+    pixels = np.union1d(lit[0], rest[0]).astype(np.int32)
+    whole, without = (np.ones((len(shares), 3), np.float32) for _ in range(2))
+    whole[lit[0]], without[rest[0]] = lit[1], rest[1]
+    whole, without, share = whole[pixels], without[pixels], shares[pixels, None]
+    # Exact where both agree, and at both ends.
+    return pixels, np.where(share < 1.0, whole + share * (without - whole), without)
+
+
+def scene_of(inputs: Inputs, camera: Camera, device: str, is_reinhard: bool = True) -> Scene:
+    """Put the object onto its plane or into the mesh of its place.
+
+    Args:
+        inputs: Photo, asset, place and placement.
         camera: At the resolution that is to be rendered.
         device: Warp device.
+        is_reinhard: The tone operator of the picture, which the photo is taken to have passed.
     """
     ground = inputs.placement.ground
     placed = Placed(inputs.asset, inputs.placement.asset_to_world)
-    return Scene([placed], camera, Proxy(ground[:3], -float(ground[3])), device)
+    radiance = None if inputs.proxy is None else photo_radiance(inputs.photo, is_reinhard)
+    proxy = Proxy(ground[:3], -float(ground[3]), inputs.proxy, radiance, inputs.is_plane)
+    return Scene([placed], camera, proxy, device)
+
+
+def photo_radiance(photo: Photo, is_reinhard: bool) -> FloatArray:
+    """Return the radiance that the picture's tone operator would show as the photo.
+
+    Args:
+        photo: The photograph.
+        is_reinhard: Whether that operator is Reinhard's, or none.
+
+    Returns:
+        Relative [W/(m^2 sr)], shape [height, width, 3], at most `PLACE_WIDTH` wide.
+    """
+    linear = photo.linear()
+    height, width = linear.shape[:2]
+    if width > PLACE_WIDTH:
+        linear = resize(linear, max(1, round(height * PLACE_WIDTH / width)), PLACE_WIDTH)
+    linear = np.maximum(linear, 0.0)
+    if is_reinhard:
+        linear = np.minimum(linear, PLACE_WHITE)
+        linear = linear / (1.0 - linear)
+    return np.asarray(linear, np.float32)
 
 
 def _parts(foreground: Foreground, premultiplied: FloatArray) -> dict[str, FloatArray]:

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from warpir.camera import Camera, ground_point
 from warpir.errors import InputError
+from warpir.proxy_mesh import ProxyMesh, first_hit
 
 Float64Array = NDArray[np.float64]
 
@@ -21,6 +22,8 @@ DEFAULT_STAND = (0.5, 0.75)
 SMALLEST_PLAUSIBLE = 0.01
 LARGEST_PLAUSIBLE = 100.0
 """Sizes [m] outside of these are more often a unit mistake than meant."""
+STEEP = 0.5
+"""Cosine between a surface and the ground below which nothing is expected to stand on it [1]."""
 
 
 @dataclass(frozen=True)
@@ -50,6 +53,8 @@ def place_asset(
     rotate_y: float = 0.0,
     scale: float | None = None,
     size: float | None = None,
+    mesh: ProxyMesh | None = None,
+    is_plane: bool = True,
 ) -> Placement:
     """Set an asset on the ground.
 
@@ -59,10 +64,13 @@ def place_asset(
         camera: Camera of the photo at the photo's resolution.
         ground: Plane ``a x + b y + c z + d = 0``, world frame; absent means ``y = 0``.
         place: Where the object stands, world frame [m]; moved onto the ground along its normal.
-        at: Where the object stands, as a pixel of the ground in the photo [px].
+        at: Where the object stands, as a pixel of the ground or of ``mesh`` in the photo [px].
         rotate_y: Turn about the ground's normal, counter-clockwise seen from above [deg].
         scale: Factor on the asset's own size [1].
         size: Longest side of the bounding box after scaling [m].
+        mesh: Of the photo's place, which the object may stand on.
+        is_plane: Whether it may stand on the ground plane too; without, ``place`` is not moved and
+            the plane only says what is upright.
 
     Raises:
         InputError: The place is not on the visible ground, or the camera cannot see the object.
@@ -77,13 +85,18 @@ def place_asset(
     if place is not None:
         where = "--place"
         stand = np.asarray(place, dtype=np.float64)
-        stand = stand - plane[:3] * (plane[:3] @ stand + plane[3])
+        if is_plane:
+            stand = stand - plane[:3] * (plane[:3] @ stand + plane[3])
     else:
         where = "--at"
         if at is None:
             at = (DEFAULT_STAND[0] * camera.width, DEFAULT_STAND[1] * camera.height)
             assumed.append(f"the object stands at pixel {at[0]:g},{at[1]:g} (--at, --place)")
-        stand = point_on_ground(at, camera, plane)
+        if mesh is None:
+            stand = point_on_ground(at, camera, plane)
+        else:
+            stand, steep = _point_on_place(at, camera, plane, mesh, is_plane)
+            warnings += steep
 
     sides = high - low
     longest = float(sides.max())
@@ -148,16 +161,48 @@ def point_on_ground(at: tuple[float, float], camera: Camera, plane: Float64Array
     Raises:
         InputError: The pixel is outside the photo, or at or above the horizon.
     """
+    _check_in_photo(at, camera)
+    try:
+        return ground_point(camera, *at, plane=tuple(map(float, plane)))
+    except InputError as error:
+        raise InputError("--at", error.what, error.advice, error.code) from None
+
+
+def _check_in_photo(at: tuple[float, float], camera: Camera) -> None:
     if not (0.0 <= at[0] <= camera.width and 0.0 <= at[1] <= camera.height):
         raise InputError(
             "--at",
             f"outside the photo (found {at[0]:g},{at[1]:g}; "
             f"expected up to {camera.width},{camera.height})",
         )
-    try:
-        return ground_point(camera, *at, plane=tuple(map(float, plane)))
-    except InputError as error:
-        raise InputError("--at", error.what, error.advice, error.code) from None
+
+
+def _point_on_place(
+    at: tuple[float, float],
+    camera: Camera,
+    plane: Float64Array,
+    mesh: ProxyMesh,
+    is_plane: bool,
+) -> tuple[Float64Array, list[str]]:
+    """Return what a pixel shows first, mesh or plane, world frame [m], and what looks odd."""
+    _check_in_photo(at, camera)
+    origin, direction = camera.ray(*at)
+    distances, triangles = first_hit(mesh, origin[None], direction[None])
+    reach = float(distances[0])
+    slope = float(plane[:3] @ direction)
+    if is_plane and slope < 0.0:
+        to_plane = -float(plane[:3] @ origin + plane[3]) / slope
+        if to_plane <= reach:
+            return origin + to_plane * direction, []
+    pixel = f"pixel ({at[0]:g}, {at[1]:g}) shows"
+    if not math.isfinite(reach):
+        shown = "neither ground nor --proxy" if is_plane else "nothing of --proxy"
+        raise InputError("--at", f"{pixel} {shown}", "choose another pixel")
+    a, b, c = mesh.positions[mesh.indices[triangles[0]]]
+    normal = np.cross(b - a, c - a)
+    steep = abs(float(plane[:3] @ normal)) < STEEP * float(np.linalg.norm(normal))
+    warning = f"{pixel} a steep side of --proxy: is the object to stand there? (--at)"
+    return origin + reach * direction, [warning] if steep else []
 
 
 def y_to(normal: Float64Array) -> Float64Array:

@@ -86,7 +86,7 @@ def input_hashes(config: InsertConfig) -> dict[str, str]:
 
     names = (
         *("photo", "occluder_mask", "asset", "materials", "camera", "light", "lora", "reuse"),
-        *("prior", "regressor", "ground_points"),
+        *("prior", "regressor", "ground_points", "proxy", "shadow_mask"),
     )
     paths = {name: Path(path) for name in names if (path := getattr(config, name)) is not None}
     for name, stems in MODEL_STEMS.items():

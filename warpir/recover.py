@@ -417,9 +417,11 @@ def make_frame(run: Run) -> Frame:
     config, camera = run.config, run.inputs.camera
     width = min(config.picture_width, camera.width)
     small = camera.scaled(width, max(1, round(width * camera.height / camera.width)))
-    renderer = Renderer(scene_of(run.inputs, small, run.device), config.threads or 0)
+    is_reinhard = config.tone_operator == "reinhard"
+    scene = scene_of(run.inputs, small, run.device, is_reinhard)
+    renderer = Renderer(scene, config.threads or 0)
     photo = np.clip(resize(run.inputs.photo.linear(), small.height, small.width), 0.0, None)
-    frame = Frame(renderer, photo, config.tone_operator == "reinhard", config.depth, config.seed)
+    frame = Frame(renderer, photo, is_reinhard, config.depth, config.seed)
     if not frame.coverage().any():
         raise InputError(
             "--guidance",

@@ -377,6 +377,7 @@ class Renderer:
         indirect_limit: float = 0.0,
         light_record: LightRecord | None = None,
         vertex_record: VertexRecord | None = None,
+        mesh_shines: bool = True,
     ) -> Foreground:
         """Path-trace the object alone (DiPIR, eq. 4).
 
@@ -392,6 +393,7 @@ class Renderer:
             light_record: Filled on the way where given; rows are ``pixels``, `lanes` of each.
                 Without a limit only.
             vertex_record: The same.
+            mesh_shines: Whether the place's mesh sends what the photo shows, or only blocks light.
         """
         scene, lanes = self.scene, self.lanes(len(pixels), spp)
         count = len(pixels) * lanes
@@ -408,7 +410,7 @@ class Renderer:
                 scene.mesh_args,
                 scene.material_args,
                 scene.texture_args,
-                scene.proxy_args,
+                scene.proxy_args if mesh_shines else scene.dark_proxy_args,
                 light,
                 spp // lanes,
                 rays,
@@ -436,18 +438,20 @@ class Renderer:
         seed: int,
         camera_args: CameraArgs | None = None,
         record: LightRecord | None = None,
+        mesh_shines: bool = True,
     ) -> ProxyRadiance:
-        """Radiance of a white plane with and without the object (the two halves of DiPIR, eq. 5).
+        """Radiance of the white place with and without the object (both halves of DiPIR, eq. 5).
 
         Args:
             light: From `light_args`.
             pixels: Row-major pixel indices, shape [proxy_pixel].
-            may_see_object: 1 where the object may hide the plane, shape [proxy_pixel].
+            may_see_object: 1 where the object may hide the place, shape [proxy_pixel].
             spp: Camera samples per pixel.
             rays: Directions per technique and camera sample.
             seed: Base seed.
             camera_args: Another resolution of the view, or the scene's own.
             record: Filled on the way where given; rows are ``pixels``.
+            mesh_shines: Whether the place's mesh sends what the photo shows, or only blocks light.
         """
         scene, count = self.scene, len(pixels)
         lit, unoccluded = (
@@ -463,7 +467,7 @@ class Renderer:
                 scene.mesh_args,
                 scene.material_args,
                 scene.texture_args,
-                scene.proxy_args,
+                scene.proxy_args if mesh_shines else scene.dark_proxy_args,
                 light,
                 spp,
                 rays,

@@ -135,6 +135,7 @@ class ObjectSamples:
                 self.seed,
                 light_record=light,
                 vertex_record=vertex,
+                mesh_shines=mis.mesh_shines,
             )
         return out.radiance, light, vertex
 
@@ -268,6 +269,7 @@ class PlaneSamples:
             mis.rays,
             self.seed,
             record=record,
+            mesh_shines=mis.mesh_shines,
         )
         return out, record
 

@@ -1,4 +1,4 @@
-"""The scene on one device: triangles, materials, textures, plane and camera as Warp sees them.
+"""The scene on one device: triangles, materials, textures, place and camera as Warp sees them.
 
 Everything is checked here once. Coordinates are recentred on the object, in float64, before they
 become float32, so an object 100 km from the origin keeps its precision.
@@ -17,22 +17,36 @@ from numpy.typing import NDArray
 from warpir.asset import Asset, Material, Primitive, Texture, TextureSlot
 from warpir.camera import Camera
 from warpir.color import srgb_to_linear
+from warpir.kernels.proxy_mesh import trace_seen
 from warpir.kernels.types import CameraArgs, MaterialArgs, MeshArgs, ProxyArgs, TextureArgs
+from warpir.proxy_mesh import ProxyMesh
 
+FloatArray = NDArray[np.float32]
 Float64Array = NDArray[np.float64]
 
 ALPHA_MODES = {"OPAQUE": 0, "MASK": 1, "BLEND": 2}
 WRAP_MODES = {"repeat": 0, "clamp": 1, "mirror": 2}
 
 
+PROXY_EPSILON = 2e-6
+"""Ray offset over the diagonal of the place's mesh [1]; rays from it meet it again below 1e-7."""
+
+
 @dataclass(frozen=True)
 class Proxy:
-    """The ground plane ``dot(normal, x) = offset``."""
+    """What is known of the photo's place: the plane ``dot(normal, x) = offset``, and a mesh."""
 
     normal: Float64Array
     """Unit, world frame, toward the lit side, shape [3]."""
     offset: float
     """[m]."""
+    mesh: ProxyMesh | None = None
+    """Receives shadows and blocks light."""
+    radiance: FloatArray | None = None
+    """What the photo shows, before its tone operator, in the view of the scene's camera at any
+    resolution, shape [height, width, 3]; without it the mesh is black."""
+    is_plane: bool = True
+    """Whether there is a plane; without one the mesh is all."""
 
 
 @dataclass(frozen=True)
@@ -110,12 +124,13 @@ class Scene:
     Args:
         objects: What is rendered; may be empty (no triangles, no shadow).
         camera: The view.
-        proxy: The ground plane.
+        proxy: The ground plane, the place's mesh, or both.
         device: ``cpu`` or ``cuda``.
 
     Attributes:
         origin: World point that is the recentred origin [m], shape [3].
         diagonal: Diagonal of the objects' bounding box [m].
+        dark_proxy_args: The place, whose mesh sends nothing.
     """
 
     def __init__(
@@ -149,13 +164,65 @@ class Scene:
         self._upload_materials(materials)
         self._upload_textures(textures)
         self.camera_args = self.camera_args_at(camera)
-        self.proxy_args = ProxyArgs()
-        self.proxy_args.normal = wp.vec3(*proxy.normal.astype(np.float32))
-        self.proxy_args.offset = float(proxy.offset - proxy.normal @ self.origin)
+        self.proxy_args = self._proxy_args()
+        self.dark_proxy_args = ProxyArgs()
+        for name in ProxyArgs.vars:
+            setattr(self.dark_proxy_args, name, getattr(self.proxy_args, name))
+        self.dark_proxy_args.shines = 0
+
+    def _proxy_args(self) -> ProxyArgs:
+        proxy, camera = self.proxy, self.camera
+        args = ProxyArgs()
+        # No ray comes down on a plane without a normal.
+        normal = proxy.normal if proxy.is_plane else np.zeros(3)
+        args.normal = wp.vec3(*normal.astype(np.float32))
+        args.offset = float(proxy.offset - proxy.normal @ self.origin)
         # A sheet that lies on the plane is hit before or behind it by a few units in the last place
         # of the camera's coordinates.
         eye = np.abs(camera.c2w[:3, 3] - self.origin).max()
-        self.proxy_args.tolerance = float(1e-5 * self.diagonal + 5e-7 * eye)
+        args.tolerance = float(1e-5 * self.diagonal + 5e-7 * eye)
+        # Plain numbers, as `contents` wants them.
+        args.mesh, args.epsilon, args.shines = 0, 0.0, 0
+        args.positions = self._array(np.zeros((1, 3), np.float32), wp.vec3)
+        args.indices = self._array(np.zeros(3, np.int32), wp.int32)
+        args.radiance = self._array(np.zeros((1, 1, 3), np.float32), wp.vec3)
+        mesh = proxy.mesh
+        if mesh is None:
+            return args
+        positions = mesh.positions - self.origin
+        args.positions = self._array(positions.astype(np.float32), wp.vec3)
+        args.indices = self._array(mesh.indices.reshape(-1), wp.int32)
+        self.proxy_mesh = wp.Mesh(
+            points=args.positions, indices=args.indices, bvh_constructor="sah"
+        )
+        args.mesh = self.proxy_mesh.id
+        args.epsilon = PROXY_EPSILON * float(np.linalg.norm(np.ptp(positions, axis=0)))
+        args.eye = wp.vec3(*(camera.c2w[:3, 3] - self.origin).astype(np.float32))
+        if proxy.radiance is not None:
+            self._upload_radiance(args, proxy.radiance)
+        return args
+
+    def _upload_radiance(self, args: ProxyArgs, radiance: FloatArray) -> None:
+        """Let the place's mesh send what the photo shows, and elsewhere the mean of that."""
+        height, width = radiance.shape[:2]
+        view = self.camera.scaled(width, height)
+        # Columns right, down and ahead; the camera looks along its own -Z.
+        intrinsics = np.array(
+            [[view.fx, 0.0, -view.cx], [0.0, -view.fy, -view.cy], [0.0, 0.0, -1.0]]
+        )
+        to_image = intrinsics @ view.c2w[:3, :3].T
+        args.to_image = wp.mat33(*to_image.astype(np.float32).reshape(-1))
+        args.radiance = self._array(np.ascontiguousarray(radiance, np.float32), wp.vec3)
+        args.shines = 1
+        seen = wp.zeros((height, width), dtype=float, device=self.device)
+        to_world = wp.mat33(*np.linalg.inv(to_image).astype(np.float32).reshape(-1))
+        wp.launch(
+            trace_seen, dim=(height, width), inputs=[args, to_world, seen], device=self.device
+        )
+        weight = seen.numpy().astype(np.float64)
+        if weight.any():
+            mean = (radiance * weight[..., None]).sum(axis=(0, 1)) / weight.sum()
+            args.elsewhere = wp.vec3(*mean.astype(np.float32))
 
     def camera_args_at(self, camera: Camera) -> CameraArgs:
         """Return ``camera`` in the recentred frame."""
@@ -178,7 +245,7 @@ class Scene:
         for args in structs:
             for name in args._cls.vars:
                 value = getattr(args, name)
-                if name != "id":  # a pointer
+                if name not in ("id", "mesh"):  # pointers
                     yield value.numpy() if isinstance(value, wp.array) else np.asarray(value)
 
     def _array(self, values: NDArray[np.generic], dtype: type) -> wp.array:

@@ -33,8 +33,8 @@ SUMMARY = "sequence.json"
 FRAME_COUNT_LIMIT = 9999
 FRAME_FIELDS = (
     "photo", "occluder_mask", "asset", "camera", "frame", "fov", "pitch", "horizon",
-    "camera_height", "up", "ground", "ground_points", "asset_up", "place", "at", "rotate_y",
-    "scale", "size", "light_rotate", "exposure", "width", "seed",
+    "camera_height", "up", "ground", "ground_points", "proxy", "plane", "shadow_mask", "asset_up",
+    "place", "at", "rotate_y", "scale", "size", "light_rotate", "exposure", "width", "seed",
 )  # fmt: skip
 """What a line may change. The light, its curves and the quality are one for all frames."""
 

@@ -5,6 +5,9 @@ writes for each pixel what each texel of a lat-long map sends into it (``T_fg``:
 or how much of it the object keeps from the ground plane (``T_shadow``). A step is then ``T L`` and
 its gradient ``T^T d``; no ray is cast. The kernels are `warpir.kernels.transport`.
 
+What an open plane receives is one analytic row. With a mesh of the place, each pixel has a row of
+its own for that too (``T_place``), and what the mesh sends is a constant, as emission is.
+
 What the numbers are unbiased for is the map they are handed: lobes are averaged over its texels
 first. `edge_width` says what that costs a shadow's edge. Lobes too narrow for the texels are left
 to `warpir.mis` (`TransportSettings.sharp_samples`), so that a sun is never blurred silently.
@@ -35,6 +38,7 @@ from warpir.transport_rows import (
     direction_counts,
     flux_noise,
     object_rows,
+    place_rows,
     proxy_rows,
     sharpness_limit,
     tent_irradiance,
@@ -43,6 +47,9 @@ from warpir.transport_rows import (
 IntArray = NDArray[np.int32]
 FloatArray = NDArray[np.float32]
 Float64Array = NDArray[np.float64]
+
+
+DTYPES = {"bfloat16": torch.bfloat16, "float32": torch.float32}
 
 
 class TransportIntegrator:
@@ -95,8 +102,12 @@ class TransportIntegrator:
             for h in (self.settings.height_fg, self.settings.height_shadow)
         )
         height = self.settings.height_shadow
-        x, y, z = (float(c) for c in renderer.scene.proxy.normal)
-        irradiance = tent_irradiance((x, y, z), height).reshape(-1)
+        self.has_mesh = renderer.scene.proxy.mesh is not None
+        if self.has_mesh:
+            irradiance = np.ones(2 * height * height)
+        else:
+            x, y, z = (float(c) for c in renderer.scene.proxy.normal)
+            irradiance = tent_irradiance((x, y, z), height).reshape(-1)
         above = np.flatnonzero(irradiance > 0.0).astype(np.int32)
         self.above = torch.from_numpy(above.astype(np.int64)).to(self.device)
         self.irradiance = torch.from_numpy(irradiance[above].astype(np.float32)).to(self.device)
@@ -110,18 +121,24 @@ class TransportIntegrator:
         self.is_cached = stored is not None
         if stored is None:
             self._check_memory(0)
-            stored = self._trace_object(seed) | self._trace_proxy(above, seed)
+            traced = self._trace_place(seed) if self.has_mesh else self._trace_proxy(above, seed)
+            stored = self._trace_object(seed) | traced
             if cache is not None:
                 save_rows(cache / f"{key}.safetensors", stored)
         self.T_fg = DenseRows(stored["T_fg"])
         self.T_shadow = SparseRows(
             stored["row"], stored["column"], stored["blocked"], (len(proxy_pixels), len(above))
         )
+        self.T_place = DenseRows(stored["T_place"]) if self.has_mesh else None
+        if self.has_mesh:
+            self.bounced, self.bounced_blocked = stored["bounced"]
         self.emission = stored["emission"]
         self.mask = stored["mask"].cpu().numpy()
         wp.synchronize_device(renderer.device)
         self.seconds_traced = time.perf_counter() - start
         self.bytes = self.T_fg.bytes + self.T_shadow.bytes
+        if self.T_place is not None:
+            self.bytes += self.T_place.bytes
         self.sharp = MisIntegrator(
             renderer,
             object_pixels,
@@ -129,6 +146,8 @@ class TransportIntegrator:
             spp=max(self.settings.sharp_samples, 1),
             rays=1,
             depth=depth,
+            # The rows hold what the place's mesh sends.
+            mesh_shines=False,
         )
 
     def _check_memory(self, entries: int) -> None:
@@ -137,18 +156,22 @@ class TransportIntegrator:
         texels = 2 * settings.height_fg**2
         wide = 2 if settings.dtype == "bfloat16" else 4
         needed = 3 * wide * len(self.object_pixels) * texels + SparseRows.BYTES * entries
+        if self.has_mesh:
+            needed += wide * len(self.proxy_pixels) * 2 * settings.height_shadow**2
         if needed > settings.memory_mib << 20:
             raise InputError(
                 "--transport-memory",
-                f"light transport of {len(self.object_pixels)} object pixels and {texels} texels "
-                f"needs {needed / 2**20:.0f} MiB or more, the limit is {settings.memory_mib} MiB",
+                f"light transport of {len(self.object_pixels)} object pixels"
+                + (f", {len(self.proxy_pixels)} of --proxy" if self.has_mesh else "")
+                + f" and {texels} texels needs {needed / 2**20:.0f} MiB or more, the limit is "
+                f"{settings.memory_mib} MiB",
                 "raise it (memory_mib), or lower --object-light-height or --guidance-width",
                 ExitCode.RESOURCES,
             )
 
     def _trace_object(self, seed: int) -> dict[str, Tensor]:
         settings, count = self.settings, len(self.object_pixels)
-        dtype = {"bfloat16": torch.bfloat16, "float32": torch.float32}[settings.dtype]
+        dtype = DTYPES[settings.dtype]
         shape = (3, count, 2 * settings.height_fg**2)
         T_fg = torch.empty(shape, dtype=dtype, device=self.device)
         emission = torch.empty((count, 3), device=self.device)
@@ -162,36 +185,56 @@ class TransportIntegrator:
             mask[rows] = wp.to_torch(part.count).to(torch.float32) / part.subsamples
         return {"T_fg": T_fg, "emission": emission, "mask": mask}
 
+    def _may_see_object(self) -> IntArray:
+        camera = self.renderer.scene.camera
+        index = index_of(self.object_pixels, camera.width * camera.height)
+        seen: IntArray = (index[self.proxy_pixels] >= 0).astype(np.int32)
+        return seen
+
     def _trace_proxy(self, above: IntArray, seed: int) -> dict[str, Tensor]:
         """Keep what is not zero: most of the plane loses little of the sky."""
-        scene = self.renderer.scene
-        index = index_of(self.object_pixels, scene.camera.width * scene.camera.height)
-        may_see_object = (index[self.proxy_pixels] >= 0).astype(np.int32)
-        none = torch.zeros(0, dtype=torch.int32, device=self.device)
-        rows, columns, values = [none], [none], [none.to(torch.float32)]
-        first = entries = 0
+        entries = _Entries(self.device)
         for share in proxy_rows(
             self.renderer,
             self.proxy_pixels,
-            may_see_object,
+            self._may_see_object(),
             above,
             self.settings,
             self.expected[1],
             seed,
         ):
-            dense = wp.to_torch(share)
-            row, column = torch.nonzero(dense, as_tuple=True)
-            rows.append((row + first).to(torch.int32))
-            columns.append(column.to(torch.int32))
-            values.append(dense[row, column] * self.irradiance[column])
-            first += len(dense)
-            entries += len(row)
-            self._check_memory(entries)
-        return {
-            "row": torch.cat(rows),
-            "column": torch.cat(columns),
-            "blocked": torch.cat(values),
-        }
+            entries.add(wp.to_torch(share), self.irradiance)
+            self._check_memory(entries.count)
+        return entries.tensors()
+
+    def _trace_place(self, seed: int) -> dict[str, Tensor]:
+        """Store what each pixel receives, and what is not zero of what the object keeps."""
+        settings, count = self.settings, len(self.proxy_pixels)
+        entries = _Entries(self.device)
+        T = torch.empty(
+            (1, count, 2 * settings.height_shadow**2),
+            dtype=DTYPES[settings.dtype],
+            device=self.device,
+        )
+        bounced = torch.empty((2, count, 3), device=self.device)
+        for part in place_rows(
+            self.renderer,
+            self.proxy_pixels,
+            self._may_see_object(),
+            settings,
+            self.expected[1],
+            seed,
+        ):
+            received, blocked = wp.to_torch(part.received), wp.to_torch(part.blocked)
+            rows = slice(entries.row_count, entries.row_count + len(received))
+            T[0, rows] = received.to(T.dtype)
+            # The part of what is stored, so that rounding leaves a dark place dark.
+            share = blocked / received.clamp(min=1e-30)
+            entries.add(share * T[0, rows].to(torch.float32))
+            bounced[0, rows] = wp.to_torch(part.bounced)
+            bounced[1, rows] = wp.to_torch(part.bounced_blocked)
+            self._check_memory(entries.count)
+        return entries.tensors() | {"T_place": T, "bounced": bounced}
 
     def staleness(self, light_fg: Light, light_shadow: Light) -> float:
         """Return how much noisier the rows are under these lights than under the expected one [1].
@@ -229,8 +272,12 @@ class TransportIntegrator:
         texels = self._texels(broad_fg, settings.height_fg)
         foreground = product(self.T_fg, texels) + self.emission
         falling = self._texels(broad_shadow, settings.height_shadow)[self.above]
-        unoccluded = (self.irradiance @ falling).expand(len(self.proxy_pixels), 3)
         blocked = product(self.T_shadow, falling)
+        if self.T_place is None:
+            unoccluded = (self.irradiance @ falling).expand(len(self.proxy_pixels), 3)
+        else:
+            unoccluded = product(self.T_place, falling) + self.bounced
+            blocked = blocked + self.bounced_blocked
         # Rounding alone may take more than there is.
         lit = (unoccluded - blocked).clamp(min=0.0)
         if sharp_fg is not None or sharp_shadow is not None:
@@ -273,6 +320,32 @@ class TransportIntegrator:
             lobes = rasterize(light.amplitude, light.axis, light.sharpness, height, name)
             texels = texels + lobes.to(self.device).reshape(-1, 3)
         return texels
+
+
+class _Entries:
+    """Gathers the entries of a sparse matrix that are not zero, chunk by chunk of rows."""
+
+    def __init__(self, device: torch.device) -> None:
+        self.device = device
+        none = torch.zeros(0, dtype=torch.int32, device=device)
+        self.parts = [(none, none, none.to(torch.float32))]
+        self.row_count = 0
+        self.count = 0
+
+    def add(self, dense: Tensor, by_column: Tensor | None = None) -> None:
+        """Append rows, each column times its factor."""
+        row, column = torch.nonzero(dense, as_tuple=True)
+        values = dense[row, column]
+        if by_column is not None:
+            values = values * by_column[column]
+        self.parts.append(((row + self.row_count).to(torch.int32), column.to(torch.int32), values))
+        self.row_count += len(dense)
+        self.count += len(row)
+
+    def tensors(self) -> dict[str, Tensor]:
+        """Return the entries sorted by row."""
+        names = ("row", "column", "blocked")
+        return {n: torch.cat(p) for n, p in zip(names, zip(*self.parts, strict=True), strict=True)}
 
 
 def to_texels(light: Light, height: int, device: wp.Device) -> FloatArray:

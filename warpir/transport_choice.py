@@ -85,7 +85,10 @@ def choose_settings(
         renderer, _some(rng, object_pixels), _some(rng, proxy_pixels), depth, seed, object_pixels
     )
     share = error / np.sqrt(2.0)
-    fits = [h for h in HEIGHTS if _mib(object_pixels, h, 0.0) < memory_mib] or [HEIGHTS[0]]
+    # A place with a mesh has a stored row for each of its pixels.
+    placed = len(proxy_pixels) if renderer.scene.proxy.mesh is not None else 0
+    fits = [h for h in HEIGHTS if _mib(len(object_pixels), placed, h, 0.0) < memory_mib]
+    fits = fits or [HEIGHTS[0]]
     settings, costs, light = _choose_height(pilot, expected, fits, share)
     settings = replace(settings, memory_mib=memory_mib)
     noise, fill = (0.0, 0.0), 0.0
@@ -100,7 +103,7 @@ def choose_settings(
         if max(noise) < share:
             break
     entries = fill * len(proxy_pixels)
-    mib = _mib(object_pixels, settings.height_fg, entries)
+    mib = _mib(len(object_pixels), placed, settings.height_fg, entries)
     return TransportChoice(settings, *costs, *noise, mib)
 
 
@@ -109,8 +112,9 @@ def _some(rng: np.random.Generator, pixels: IntArray) -> IntArray:
     return np.sort(rng.choice(pixels, count, replace=False)).astype(np.int32)
 
 
-def _mib(object_pixels: IntArray, height: int, entries: float) -> float:
-    return (12.0 * len(object_pixels) * height * height + SparseRows.BYTES * entries) / 2**20
+def _mib(objects: int, placed: int, height: int, entries: float) -> float:
+    dense = (12.0 * objects + 4.0 * placed) * height * height
+    return (dense + SparseRows.BYTES * entries) / 2**20
 
 
 def _choose_height(

@@ -57,10 +57,10 @@ def _csr(rows: Tensor, columns: Tensor, values: Tensor, shape: tuple[int, int]) 
 
 
 class DenseRows:
-    """A matrix per channel in a small type.
+    """A matrix per channel in a small type, or one for all of them.
 
     Args:
-        T: Shape [3, row, column].
+        T: Shape [3, row, column], or [1, row, column].
     """
 
     def __init__(self, T: Tensor) -> None:
@@ -73,11 +73,15 @@ class DenseRows:
 
     def times(self, x: Tensor) -> Tensor:
         """Return each channel's product with its column of ``x``, shape [column, 3]."""
+        if len(self.T) == 1:
+            return _multiply(self.T[0], x)
         columns = [_multiply(self.T[c], x[:, c : c + 1]) for c in range(3)]
         return torch.cat(columns, dim=1)
 
     def transposed_times(self, d: Tensor) -> Tensor:
         """Return the transposes' products with the columns of ``d``, shape [row, 3]."""
+        if len(self.T) == 1:
+            return _multiply(self.T[0].t(), d)
         columns = [_multiply(self.T[c].t(), d[:, c : c + 1]) for c in range(3)]
         return torch.cat(columns, dim=1)
 

@@ -223,7 +223,10 @@ def object_rows(
         renderer.launch(
             kernels.trace_direct,
             len(chunk),
-            [launched, Rows(points), *geometry, texels, subsamples, paths, seed, Rows(T)],
+            [
+                *(launched, Rows(points), *geometry, scene.proxy_args),
+                *(texels, subsamples, paths, seed, Rows(T)),
+            ],
             int(counts.sum()),
             "transport",
             texels.lanes,
@@ -236,6 +239,7 @@ def object_rows(
                     launched,
                     Rows(points),
                     *geometry,
+                    scene.proxy_args,
                     texels,
                     proposal,
                     subsamples,
@@ -312,6 +316,56 @@ def _surface_points(
     return points, emission
 
 
+@dataclass(frozen=True)
+class _PlacePoints:
+    """What the camera sees of the place under each pixel's subsamples."""
+
+    pixels: Rows
+    count: Rows
+    """Filled points, shape [pixel]."""
+    position: Rows
+    """Recentred [m], shape [pixel, subsample]."""
+    normal: Rows
+    """Shape [pixel, subsample]."""
+    spread: Rows
+    """Largest distance of a pixel's points from its first one [m], shape [pixel]."""
+
+
+def _place_points(
+    renderer: Renderer, pixels: IntArray, may_see_object: IntArray, subsamples: int, seed: int
+) -> _PlacePoints:
+    scene, device, count = renderer.scene, renderer.device, len(pixels)
+    points = _PlacePoints(
+        Rows(wp.array(pixels, dtype=wp.int32, device=device)),
+        Rows(wp.zeros(count, dtype=int, device=device)),
+        Rows(wp.empty((count, subsamples), dtype=wp.vec3, device=device)),
+        Rows(wp.empty((count, subsamples), dtype=wp.vec3, device=device)),
+        Rows(wp.zeros(count, dtype=float, device=device)),
+    )
+    renderer.launch(
+        kernels.trace_proxy_points,
+        count,
+        [
+            points.pixels,
+            Rows(wp.array(may_see_object, dtype=int, device=device)),
+            scene.camera_args,
+            scene.mesh_args,
+            scene.material_args,
+            scene.texture_args,
+            scene.proxy_args,
+            subsamples,
+            seed,
+            points.count,
+            points.position,
+            points.normal,
+            points.spread,
+        ],
+        subsamples,
+        "transport",
+    )
+    return points
+
+
 def proxy_rows(
     renderer: Renderer,
     pixels: IntArray,
@@ -335,39 +389,20 @@ def proxy_rows(
     geometry = (scene.mesh_args, scene.material_args, scene.texture_args, scene.proxy_args)
     wp_columns = wp.array(columns, dtype=int, device=device)
     for start in range(0, len(pixels), size):
-        chunk = pixels[start : start + size]
-        count = len(chunk)
-        rows = Rows(wp.array(chunk, dtype=wp.int32, device=device))
-        may_see = wp.array(may_see_object[start : start + size], dtype=int, device=device)
-        filled = wp.zeros(count, dtype=int, device=device)
-        position = wp.empty((count, settings.subsamples), dtype=wp.vec3, device=device)
-        spread = wp.zeros(count, dtype=float, device=device)
-        renderer.launch(
-            kernels.trace_proxy_points,
-            count,
-            [
-                rows,
-                Rows(may_see),
-                scene.camera_args,
-                *geometry,
-                settings.subsamples,
-                seed,
-                Rows(filled),
-                Rows(position),
-                Rows(spread),
-            ],
-            settings.subsamples,
-            "transport",
+        chunk = slice(start, start + size)
+        points = _place_points(
+            renderer, pixels[chunk], may_see_object[chunk], settings.subsamples, seed
         )
+        count = len(pixels[chunk])
         blocked = wp.zeros((count, len(columns)), dtype=float, device=device)
         renderer.launch(
             kernels.trace_blocked,
             count,
             [
-                rows,
-                Rows(filled),
-                Rows(position),
-                Rows(spread),
+                points.pixels,
+                points.count,
+                points.position,
+                points.spread,
                 *geometry,
                 texels,
                 wp_columns,
@@ -379,3 +414,61 @@ def proxy_rows(
             texels.lanes,
         )
         yield blocked
+
+
+@dataclass(frozen=True)
+class PlaceRows:
+    """Traced rows of a place with a mesh; what the object keeps is part of what is received."""
+
+    received: wp.array
+    """Radiance of the white place without the object per texel radiance [1], shape [row, texel]."""
+    blocked: wp.array
+    """What the object keeps of it, shape [row, texel]."""
+    bounced: wp.array
+    """Radiance of the white place that the mesh sends it, vec3, shape [row]."""
+    bounced_blocked: wp.array
+    """What the object keeps of it, vec3, shape [row]."""
+
+
+def place_rows(
+    renderer: Renderer,
+    pixels: IntArray,
+    may_see_object: IntArray,
+    settings: TransportSettings,
+    expected: FloatArray,
+    seed: int,
+) -> Iterator[PlaceRows]:
+    """Trace the rows of a place with a mesh chunk by chunk: nothing is known beforehand."""
+    scene, device, height = renderer.scene, renderer.device, settings.height_shadow
+    texel_count = 2 * height * height
+    counts = direction_counts(expected, settings.bright_directions)
+    texels = _texel_args(counts, height, device, np.arange(texel_count, dtype=np.int32))
+    size = max(1, CHUNK_BYTES // (8 * texel_count))
+    geometry = (scene.mesh_args, scene.material_args, scene.texture_args, scene.proxy_args)
+    for start in range(0, len(pixels), size):
+        chunk = slice(start, start + size)
+        points = _place_points(
+            renderer, pixels[chunk], may_see_object[chunk], settings.subsamples, seed
+        )
+        count = len(pixels[chunk])
+        seen = (points.pixels, points.count, points.position, points.normal, *geometry)
+        received, blocked = (
+            wp.zeros((count, texel_count), dtype=float, device=device) for _ in range(2)
+        )
+        renderer.launch(
+            kernels.trace_received,
+            count,
+            [*seen, texels, seed, Rows(received), Rows(blocked)],
+            int(counts.sum()),
+            "transport",
+            texels.lanes,
+        )
+        bounced, kept = (wp.zeros(count, dtype=wp.vec3, device=device) for _ in range(2))
+        renderer.launch(
+            kernels.trace_bounced,
+            count,
+            [*seen, settings.paths, seed, Rows(bounced), Rows(kept)],
+            settings.paths,
+            "transport",
+        )
+        yield PlaceRows(received, blocked, bounced, kept)
