@@ -60,6 +60,7 @@ FLAGS = {
         "exposure": "EV",
         "tone": "NAME",
         "ground_albedo": "SHARE",
+        "detail": "",
     },
     "rendering": {
         "samples": "N",
