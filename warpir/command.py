@@ -70,6 +70,7 @@ FLAGS = {
         "exposure": "EV",
         "tone": "NAME",
         "ground_albedo": "SHARE",
+        "detail": "",
     },
     "rendering": {
         "samples": "N",

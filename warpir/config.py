@@ -218,6 +218,9 @@ class InsertConfig(ModelSettings, PersonalizeSettings, GuidanceChoices, Optimize
     """Most pixels of all textures of the asset together [px]"""
     missing_textures: str = "error"
     """What to do when a texture of the asset is missing: error, or grey in its place"""
+    detail: bool = True
+    """Let the object reflect what the photo shows of its surroundings, where the light has no
+    panorama's detail of its own"""
     mark: bool = True
     """Note in the picture's metadata that it is a composite"""
 

@@ -24,12 +24,15 @@ from warpir.errors import InputError
 from warpir.strict_json import read_json_object
 
 FloatArray = NDArray[np.float32]
+Float64Array = NDArray[np.float64]
 
 FORMAT = "warpir-curves"
 VERSION = 1
 CURVE_COUNTS = {"foreground": 1, "shadow_ratio": 3}
 BIN_COUNT_LIMIT = 256
 SLOPE_LIMIT = 1e6
+RESOLVED = 0.97
+"""Display-linear value up to which a photo says how bright a thing is [1]: more may be clipped."""
 END_TOLERANCE = 1e-6
 """How far the outer knots may be from 0 and 1 [1]: a rounding, not another curve."""
 
@@ -51,6 +54,26 @@ class ToneKnots:
         """Return the arrays in the kernels' order."""
         return self.x, self.y, self.slope
 
+    def invert(self, y: NDArray[np.floating[Any]], curve: int = 0) -> Float64Array:
+        """Return where a curve has these values in [0, 1] (Durkan et al. 2019, eqs. 6 to 8).
+
+        Args:
+            y: Values; clamped to [0, 1]. Any shape.
+            curve: Which curve.
+        """
+        knot_x, knot_y, slope = (k[curve].astype(np.float64) for k in self.arrays())
+        y = np.clip(np.asarray(y, np.float64), 0.0, 1.0)
+        b = np.clip(np.searchsorted(knot_y, y, side="right") - 1, 0, self.bin_count - 1)
+        width, rise = np.diff(knot_x)[b], np.diff(knot_y)[b]
+        d0, d1, m = slope[b], slope[b + 1], rise / width
+        above, bend = y - knot_y[b], d0 + d1 - 2.0 * m
+        a = rise * (m - d0) + above * bend
+        half = rise * d0 - above * bend
+        root = np.sqrt(np.maximum(half * half + 4.0 * a * m * above, 0.0))
+        # 2 c / (-b - sqrt(b^2 - 4 a c)): the form that does not cancel where the bin is straight.
+        inverse: Float64Array = knot_x[b] + width * 2.0 * m * above / (half + root)
+        return inverse
+
     @staticmethod
     def identity(curves: int, bins: int = 5) -> ToneKnots:
         """Return curves that change nothing."""
@@ -68,6 +91,17 @@ class Curves:
     """One curve."""
     shadow_ratio: ToneKnots
     """Three curves, red, green and blue."""
+
+    def radiance(self, photo_lin: NDArray[np.floating[Any]]) -> Float64Array:
+        """Return the radiance that the foreground's curve and operator show as these values.
+
+        Values above `RESOLVED` are read as `RESOLVED`: the thing was at least that bright.
+
+        Args:
+            photo_lin: Display-linear values [1], any shape.
+        """
+        shown = np.minimum(self.foreground.invert(photo_lin), RESOLVED)
+        return shown / (1.0 - shown) if self.tone == "reinhard" else shown
 
     @staticmethod
     def identity(tone: str) -> Curves:

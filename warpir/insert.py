@@ -142,11 +142,15 @@ def _insert_one(config: InsertConfig, loaders: "Loaders | None" = None) -> Inser
         if config.is_guided:
             inputs, light, recovered, found = _guide(config, inputs, light, device, output, timings)
             notices = (*notices, *found)
+            light, shown = _detailed(config, inputs, light, timings)
+            recovered |= shown
         else:
             if light is None:
                 light, recovered = _regress(config, inputs, device, timings)
             if config.guided_by == "embedded":
                 recovered["prior_about"] = NOT_ASKED
+            light, shown = _detailed(config, inputs, light, timings)
+            recovered |= shown
             with timings.stage("preview"):
                 _write_preview(output, config, inputs, light, device)
         with timings.stage("scene"):
@@ -156,7 +160,7 @@ def _insert_one(config: InsertConfig, loaders: "Loaders | None" = None) -> Inser
         with timings.stage("render"), progress_bar() as report:
             picture = make_picture(
                 Renderer(scene, config.threads or 0, report),
-                light.light,
+                light.on_object,
                 light.light_shadow,
                 inputs.photo,
                 Quality(
@@ -210,6 +214,25 @@ def _regress(
     return estimate.light, {"regression": estimate.regression.record()}
 
 
+def _detailed(
+    config: InsertConfig, inputs: "Inputs", light: "SceneLight", timings: "Timings"
+) -> "tuple[SceneLight, dict[str, Any]]":
+    """Put into the light what the photo shows of it, unless a panorama has its own detail."""
+    is_panorama = config.light is not None and light.light.lobes is None
+    if not config.detail or is_panorama:
+        return light, {}
+    with timings.stage("detail"):
+        from warpir.detail import detail_of, with_detail
+
+        detail = detail_of(inputs, light.curves)
+        light = replace(light, detailed=with_detail(light.light, detail))
+    say(
+        f"detail: the photo shows {100.0 * detail.seen:.0f} % of what is round the object, which "
+        "may be reflected in it (--no-detail)"
+    )
+    return light, {"detail_seen": detail.seen}
+
+
 def _say_who_spoke(record: dict[str, Any]) -> None:
     """Print in a line what the light comes from and what computed it."""
     measured = record["measured"]
@@ -248,7 +271,7 @@ def _write_preview(
     is_reinhard = light.curves.tone == "reinhard"
     picture = make_picture(
         Renderer(scene_of(inputs, camera, device, is_reinhard), config.threads or 0),
-        light.light,
+        light.on_object,
         light.light_shadow,
         inputs.photo,
         Quality(PREVIEW_SAMPLES, 1, config.depth, config.seed, config.indirect_limit),
@@ -324,13 +347,15 @@ def _write(
     output.write_envmap(as_file_map(light.light))
     if light.light_shadow is not light.light:
         output.write_envmap(as_file_map(light.light_shadow), "envmap_shadow")
+    if light.detailed is not None:
+        output.write_envmap(as_file_map(light.detailed), "envmap_detail")
     if light.light.lobes is not None:
         output.write_json("lobes.json", lobes_to_json(light.light.lobes))
     output.write_json("curves.json", curves_to_json(light.curves))
     output.write_json("camera.json", camera.record())
     output.write_png(
         "balls.png",
-        balls(light.light, camera, light.curves.tone == "reinhard"),
+        balls(light.on_object, camera, light.curves.tone == "reinhard"),
         mark=False,
         description="Mirror ball and white diffuse ball under the light",
     )

@@ -55,6 +55,14 @@ class SceneLight:
     """What was chosen because nothing was given, one line each."""
     fit: LobeFit | None = None
     """How well the lobes fit the panorama, when they were fitted."""
+    detailed: Light | None = None
+    """`light` with what the photo shows of the surroundings, where that is wanted; not a light of
+    the place that another photo could use."""
+
+    @property
+    def on_object(self) -> Light:
+        """What the object is rendered under."""
+        return self.light if self.detailed is None else self.detailed
 
 
 def make_light(inputs: Inputs, config: InsertConfig) -> SceneLight | None:

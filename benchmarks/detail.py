@@ -1,0 +1,180 @@
+"""Is what the photo shows of the surroundings nearer to the truth than a smooth light alone?
+
+    python -m benchmarks.detail --panoramas DIR --places 8 --json detail.json --sheet detail.png
+
+Photographs are crops of panoramas; a sphere stands in each, once as a mirror, once as polished
+paint, satin metal and matte. The light is the regressor's, and once the best that 32 lobes can be.
+The truth is the panorama with its lower half laid on the ground plane, as the object sees it, and
+for comparison the panorama at infinity. Error: RMSE over the sphere, display-encoded.
+"""
+
+import argparse
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+from PIL import Image
+
+from warpir.asset import Asset, Material, Primitive
+from warpir.camera import Camera
+from warpir.curves import Curves
+from warpir.detail import HEIGHT, Detail, seen_from, with_detail
+from warpir.evaluation_scenes import PANORAMA_SUFFIXES, Place, Places, Subject, find_files
+from warpir.evaluation_stage import Prediction, Quality, Stage
+from warpir.light import Light, as_map, map_directions, resize_map, texel_solid_angles
+from warpir.lobe_fit import fit_lobes
+from warpir.panorama_crop import look_up
+from warpir.placement import place_asset
+from warpir.regressor import load_regressor, regress
+from warpir.render import choose_device
+
+GROUND = np.array([0.0, 1.0, 0.0, 0.0])
+MATERIALS = {
+    "mirror": Material(base_color=(0.9, 0.9, 0.9), metallic=1.0, roughness=0.05),
+    "paint": Material(base_color=(0.2, 0.02, 0.02), metallic=0.0, roughness=0.1),
+    "satin": Material(base_color=(0.9, 0.9, 0.9), metallic=1.0, roughness=0.3),
+    "matte": Material(base_color=(0.6, 0.6, 0.6), metallic=0.0, roughness=1.0),
+}
+COARSE, SIGMA_DEG = 32, 20.0
+"""Rows and width of the low pass of `keeping_low_frequencies`."""
+TILE = 96
+
+
+def sphere(segments: int = 96) -> Primitive:
+    """Return a sphere of radius 1."""
+    theta, phi = np.meshgrid(
+        np.linspace(0.0, np.pi, segments + 1), np.linspace(0.0, 2.0 * np.pi, 2 * segments + 1)
+    )
+    points = np.stack(
+        [np.sin(theta) * np.cos(phi), np.cos(theta), np.sin(theta) * np.sin(phi)], axis=-1
+    )
+    index = np.arange(points[..., 0].size).reshape(theta.shape)
+    a, b, c, d = index[:-1, :-1], index[1:, :-1], index[1:, 1:], index[:-1, 1:]
+    faces = np.concatenate([np.stack([a, b, c], -1), np.stack([a, c, d], -1)]).reshape(-1, 3)
+    flat = points.reshape(-1, 3)
+    return Primitive(flat, faces.astype(np.int32), 0, normals=flat.astype(np.float32))
+
+
+def on_the_ground(place: Place, centre: NDArray[np.float64]) -> Light:
+    """Return the panorama as it is seen from a point, its lower half laid on the ground."""
+    rays = map_directions(HEIGHT, 2 * HEIGHT)
+    below = rays[..., 1] < 0.0
+    point = centre + (centre[1] / -rays[..., 1][below])[:, None] * rays[below]
+    rays[below] = point - place.camera.c2w[:3, 3]
+    rays /= np.linalg.norm(rays, axis=-1, keepdims=True)
+    return Light(texels=look_up(place.texels, rays).astype(np.float32))
+
+
+def keeping_low_frequencies(light: Light, detail: Detail) -> Light:
+    """Return the light times the photo over its own low frequencies: what was not chosen."""
+    weight = detail.weight[..., None]
+    smooth = as_map(light, HEIGHT)
+    level = 0.02 * detail.radiance[detail.weight > 0.0].mean(axis=0)
+    mean = low_pass(weight * detail.radiance) / np.maximum(low_pass(weight), 1e-6)
+    directions = map_directions(HEIGHT, 2 * HEIGHT)
+    factor = (detail.radiance + level) / (look_up(mean, directions) + level)
+    sharp = smooth * (1.0 + weight * (factor - 1.0))
+    kept = low_pass(smooth) / np.maximum(low_pass(sharp), 1e-30)
+    return Light(texels=(sharp * look_up(kept, directions)).astype(np.float32))
+
+
+def low_pass(texels: NDArray[np.floating]) -> NDArray[np.float32]:
+    """Return each direction's mean under a Gaussian, shape [COARSE, 2 COARSE, channel]."""
+    coarse = resize_map(texels.astype(np.float32), COARSE).reshape(2 * COARSE**2, -1)
+    directions = map_directions(COARSE, 2 * COARSE).reshape(-1, 3)
+    omega = np.repeat(texel_solid_angles(COARSE, 2 * COARSE), 2 * COARSE)
+    kernel = np.exp((directions @ directions.T - 1.0) / np.radians(SIGMA_DEG) ** 2) * omega
+    smooth = kernel @ coarse / kernel.sum(axis=1, keepdims=True)
+    return smooth.reshape(COARSE, 2 * COARSE, -1).astype(np.float32)
+
+
+def stand(subject: Subject, camera: Camera) -> tuple[Subject, NDArray[np.float64]]:
+    """Put the sphere where the subject stands, as large; return it and its centre [m]."""
+    low, high = subject.asset.bounds()
+    matrix = subject.placement.asset_to_world
+    size = float((high - low).max() * np.linalg.norm(matrix[:3, 0]))
+    x, _, z = (matrix @ np.append((low + high) / 2.0, 1.0))[:3]
+    asset = Asset("sphere", (sphere(),), (Material(),))
+    placement = place_asset(*asset.bounds(), camera, place=(x, 0.0, z), size=size)
+    return replace(subject, asset=asset, placement=placement), np.array([x, size / 2.0, z])
+
+
+def main() -> None:
+    """Run it."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--panoramas", type=Path, nargs="+", required=True)
+    parser.add_argument("--assets", type=Path, nargs="+", required=True, help="give their places")
+    parser.add_argument("--places", type=int, default=8)
+    parser.add_argument("--seed", type=int, default=3)
+    parser.add_argument("--samples", type=int, default=16)
+    parser.add_argument("--device")
+    parser.add_argument("--json", type=Path)
+    parser.add_argument("--sheet", type=Path)
+    options = parser.parse_args()
+    device = choose_device(options.device)
+    panoramas = find_files(options.panoramas, PANORAMA_SUFFIXES, "--panoramas")
+    assets = find_files(options.assets, (".glb", ".gltf", ".obj", ".ply", ".stl"), "--assets")
+    regressor = load_regressor(None, device)
+    errors: dict[tuple[str, str, str, str], list[float]] = {}
+    tiles = []
+    for place, subjects in Places(panoramas, assets, options.seed).make(options.places):
+        subject, centre = stand(subjects[0], place.camera)
+        shown = Curves.identity("linear").radiance(place.photo_lin).astype(np.float32)
+        detail = seen_from(centre, shown, place.camera, GROUND)
+        lights = {
+            "regressed": Light(lobes=regress(regressor, place.photo, place.camera).lobes()),
+            "32 lobes": Light(lobes=fit_lobes(place.texels, 32).lobes),
+        }
+        for name, material in MATERIALS.items():
+            asset = replace(subject.asset, materials=(material,))
+            quality = Quality(options.samples, 1, 1)
+            stage = Stage(replace(subject, asset=asset), device, quality, options.seed)
+
+            def picture(light: Light, stage: Stage = stage) -> NDArray[np.float32]:
+                prediction = Prediction.of(light)
+                return stage.compose(stage.render(prediction), prediction.curves)
+
+            truths = {"on the ground": picture(on_the_ground(place, centre)), "far": stage.truth}
+            covered = stage.mask > 0.5
+            row = list(truths.values())
+            for kind, light in lights.items():
+                pictures = {
+                    "without": picture(light),
+                    "detail": picture(with_detail(light, detail)),
+                    "low frequencies kept": picture(keeping_low_frequencies(light, detail)),
+                }
+                for truth, true in truths.items():
+                    for which, made in pictures.items():
+                        error = float(np.sqrt(((made - true)[covered] ** 2).mean()))
+                        errors.setdefault((name, kind, truth, which), []).append(error)
+                row += list(pictures.values())[:2]
+            if name in ("mirror", "paint"):
+                v, u = (int(k.mean()) for k in np.nonzero(covered))
+                h, w = covered.shape
+                top = min(max(v - TILE // 2, 0), h - TILE)
+                left = min(max(u - TILE // 2, 0), w - TILE)
+                cut = (slice(top, top + TILE), slice(left, left + TILE))
+                tiles.append(np.concatenate([p[cut] for p in row], axis=1))
+    rows = [
+        dict(zip(("material", "light", "truth", "which"), key, strict=True))
+        | {"rmse": float(np.mean(values))}
+        for key, values in errors.items()
+    ]
+    print("| material | light | truth | without | detail | low frequencies kept |")
+    print("|---|---|---|---|---|---|")
+    for k in range(0, len(rows), 3):
+        first = rows[k]
+        cells = " | ".join(f"{r['rmse']:.4f}" for r in rows[k : k + 3])
+        print(f"| {first['material']} | {first['light']} | {first['truth']} | {cells} |")
+    if options.json is not None:
+        record = {"device": device, "places": options.places, "seed": options.seed, "rows": rows}
+        options.json.write_text(json.dumps(record) + "\n")
+    if options.sheet is not None:
+        sheet = np.clip(np.concatenate(tiles), 0.0, 1.0)
+        Image.fromarray(np.round(255.0 * sheet).astype(np.uint8)).save(options.sheet)
+
+
+if __name__ == "__main__":
+    main()
