@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 import OpenImageIO as oiio
+from PIL import Image
 
 OIIO_TYPES = {"uint8": "uint8", "uint16": "uint16", "float16": "half", "float32": "float"}
 
@@ -16,7 +17,10 @@ def write_image(path: Path, pixels: np.ndarray, **attributes: Any) -> Path:
     height, width, count = pixels.shape
     spec = oiio.ImageSpec(width, height, count, OIIO_TYPES[pixels.dtype.name])
     for name, value in attributes.items():
-        spec.attribute(name, value)
+        if isinstance(value, bytes):
+            spec.attribute(name, oiio.TypeDesc(f"uint8[{len(value)}]"), value)
+        else:
+            spec.attribute(name, value)
     writer = oiio.ImageOutput.create(str(path))
     assert writer.open(str(path), spec), oiio.geterror()
     assert writer.write_image(pixels)
@@ -45,22 +49,11 @@ def matrix_profile(primaries: str) -> bytes:
     def fixed(*values: float) -> bytes:
         return struct.pack(f">{len(values)}i", *(round(value * 65536) for value in values))
 
-    tags = {b"wtpt": b"XYZ \0\0\0\0" + fixed(0.9642, 1.0, 0.8249)}
+    tags = {}
     for letter, column in zip(b"rgb", columns, strict=True):
         tags[bytes([letter]) + b"XYZ"] = b"XYZ \0\0\0\0" + fixed(*column)
         tags[bytes([letter]) + b"TRC"] = b"curv\0\0\0\0" + struct.pack(">IHxx", 1, 563)  # 2.2
-    tags[b"desc"] = b"desc\0\0\0\0" + struct.pack(">I", 5) + b"test\0" + bytes(82)
-    tags[b"cprt"] = b"text\0\0\0\0none\0\0\0\0"
-    offset, table, body = 128 + 4 + 12 * len(tags), struct.pack(">I", len(tags)), b""
-    for name, content in tags.items():
-        content += bytes(-len(content) % 4)
-        table += name + struct.pack(">II", offset + len(body), len(content))
-        body += content
-    size = 128 + len(table) + len(body)
-    head = struct.pack(">I4sI4s4s4s", size, bytes(4), 0x02400000, b"mntr", b"RGB ", b"XYZ ")
-    head += struct.pack(">6H4s", 2026, 1, 1, 0, 0, 0, b"acsp") + bytes(28)
-    head += fixed(0.9642, 1.0, 0.8249)
-    return head.ljust(128, b"\0") + table + body
+    return icc_profile(b"RGB ", tags)
 
 
 def directions(height: int) -> np.ndarray:
@@ -92,3 +85,47 @@ def four_lobes(directions: np.ndarray) -> np.ndarray:
         strength = np.exp(20.0 * (directions @ np.array(axis, float) - 1.0))[..., None]
         texels += (strength * np.array(rgb)).astype(np.float32)
     return texels + np.float32(0.125) * (directions[..., 1:2] > 0)  # brighter sky: up is up
+
+
+def icc_profile(space: bytes, tags: dict[bytes, bytes], pcs: bytes = b"XYZ ") -> bytes:
+    """An ICC v2 display profile made from its tags; a white point and texts are added."""
+
+    def fixed(*values: float) -> bytes:
+        return struct.pack(f">{len(values)}i", *(round(value * 65536) for value in values))
+
+    tags = {
+        b"desc": b"desc\0\0\0\0" + struct.pack(">I", 5) + b"test\0" + bytes(82),
+        b"cprt": b"text\0\0\0\0none\0\0\0\0",
+        b"wtpt": b"XYZ \0\0\0\0" + fixed(0.9642, 1.0, 0.8249),
+        **tags,
+    }
+    offset, table, body = 132 + 12 * len(tags), struct.pack(">I", len(tags)), b""
+    for name, content in tags.items():
+        table += name + struct.pack(">II", offset + len(body), len(content))
+        body += content + bytes(-len(content) % 4)
+    size = offset + len(body)
+    head = struct.pack(">I4xI4s4s4s", size, 0x02400000, b"mntr", space, pcs)
+    head += struct.pack(">6H4s", 2026, 1, 1, 0, 0, 0, b"acsp") + bytes(28)
+    return (head + fixed(0.9642, 1.0, 0.8249)).ljust(128, b"\0") + table + body
+
+
+def table_profile(columns: np.ndarray, gamma: float) -> bytes:
+    """A profile whose tables (lut16Type) say what a matrix profile of these columns says."""
+    curve = np.round((np.arange(256) / 255.0) ** gamma * 65535.0).astype(int).tolist()
+    corners = [
+        round(float(columns[k] @ (r, g, b)) / (1.0 + 32767.0 / 32768.0) * 65535.0)
+        for r in (0, 1) for g in (0, 1) for b in (0, 1) for k in range(3)
+    ]  # fmt: skip
+    matrix = struct.pack(">9i", 65536, 0, 0, 0, 65536, 0, 0, 0, 65536)
+    table = b"mft2\0\0\0\0" + bytes([3, 3, 2, 0]) + matrix + struct.pack(">2H", 256, 2)
+    numbers = [*curve * 3, *(min(max(c, 0), 65535) for c in corners), *[0, 65535] * 3]
+    table += struct.pack(f">{len(numbers)}H", *numbers)
+    return icc_profile(b"RGB ", {b"A2B0": table})
+
+
+def with_chunks(path: Path, codes: np.ndarray, *chunks: bytes, **options: Any) -> Path:
+    """Write a PNG with further chunks behind its header."""
+    Image.fromarray(codes).save(path, **options)
+    content = path.read_bytes()
+    path.write_bytes(content[:33] + b"".join(chunks) + content[33:])
+    return path

@@ -201,8 +201,9 @@ def test_every_value_has_a_rule() -> None:
     free = {  # checked in words of their own, free by nature, or text
         "fov", "horizon", "ground", "place", "at", "rotate_y", "light_rotate", "sun", "sky",
         "device", "refine_parts", "refine_materials", "lora_layers",
-        "photo", "asset", "materials", "out", "camera", "light", "lora", "model", "reuse",
-        "sequence", "prior", "regressor", "frame", "ground_points", "proxy", "shadow_mask",
+        "photo", "layer", "occluder_mask", "asset", "materials", "out", "camera", "light", "lora",
+        "model", "reuse", "sequence", "prior", "regressor", "frame", "ground_points", "proxy",
+        "shadow_mask",
     }  # fmt: skip
     ruled = {*RANGES, *ABOVE_ZERO, *CHOICES, *PROMPTS}
     valued = {name for name, form in forms_of_flags() if form}
@@ -475,7 +476,8 @@ def test_config_file_of_an_older_version_replays(tmp_path: Path) -> None:
     newer = {field.name for kind in settings for field in fields(kind)}
     newer |= {"frame", "undistort", "ground_points"}
     newer |= set(FLAGS["applications"]) | set(FLAGS["guidance"]) - {"guidance"}
-    newer |= {"proxy", "plane", "shadow_mask"}
+    newer |= {"proxy", "plane", "shadow_mask", "layer", "occluder_mask", "light_convention"}
+    newer |= {"strict", "detail"}
     config = InsertConfig(photo="p.png", asset="a.glb", out="o", sky="clear", depth=2)
     known = {name: value for name, value in asdict(config).items() if name not in newer}
     path = tmp_path / "run.json"

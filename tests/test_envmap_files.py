@@ -3,6 +3,7 @@
 from pathlib import Path
 
 import numpy as np
+import OpenEXR
 import pytest
 from PIL import Image
 
@@ -90,7 +91,7 @@ def test_rotation_by_part_columns_keeps_energy(
     np.testing.assert_allclose(turned.sum(axis=1), texels.sum(axis=1), rtol=1e-5)
 
 
-def test_bad_radiance_is_repaired_and_counted(tmp_path: Path) -> None:  # E5, E6
+def test_e5_e6_bad_radiance_is_repaired_and_counted(tmp_path: Path) -> None:
     texels = np.full((4, 8, 3), 0.5, np.float32)
     texels[0, 0, 0], texels[1, 1], texels[2, 2, 2], texels[3, 3, 1] = np.nan, np.inf, -2.0, 1e6
     path = write_image(tmp_path / "m.exr", texels)
@@ -111,7 +112,7 @@ def rgbe_file(path: Path, resolution: str, rgbe: np.ndarray, extra: str = "") ->
     return path
 
 
-def test_radiance_orientation_and_exposure(tmp_path: Path, rng: np.random.Generator) -> None:  # E11
+def test_e11_radiance_orientation_and_exposure(tmp_path: Path, rng: np.random.Generator) -> None:
     rgbe = rng.integers(128, 256, (4, 8, 4))
     rgbe[..., 3] = 129
     flat = read_envmap(rgbe_file(tmp_path / "a.hdr", "-Y 4 +X 8", rgbe))
@@ -125,21 +126,113 @@ def test_radiance_orientation_and_exposure(tmp_path: Path, rng: np.random.Genera
     np.testing.assert_array_equal(flat, 2.0 * exposed)
 
 
-@pytest.mark.parametrize("case", ["square", "row", "jpeg", "xyze", "garbage", "missing"])
+@pytest.mark.parametrize(
+    "case",
+    [
+        "E7-square",
+        "E7-row",
+        "E7-photo",
+        "E7-channels",
+        "E11-xyze",
+        "E11-old-rle",
+        "E12-garbage",
+        "E-missing",
+    ],
+)
 def test_wrong_maps_are_refused(tmp_path: Path, rng: np.random.Generator, case: str) -> None:
-    path = tmp_path / "m.exr"  # E7, E11, E12
-    if case in ("square", "row"):
-        write_image(path, np.ones((8 if case == "square" else 1, 8, 3), np.float32))
-    elif case == "jpeg":
+    path = tmp_path / "m.exr"
+    if case in ("E7-square", "E7-row"):
+        write_image(path, np.ones((8 if case == "E7-square" else 1, 8, 3), np.float32))
+    elif case == "E7-photo":
         Image.fromarray(codes8(rng)).save(path, format="JPEG")
-    elif case == "xyze":
+    elif case == "E11-xyze":
         path = write_image(tmp_path / "m.hdr", np.ones((8, 16, 3), np.float32))
         path.write_bytes(path.read_bytes().replace(b"rle_rgbe", b"rle_xyze"))
-    elif case == "garbage":
+    elif case == "E7-channels":
+        OpenEXR.File({}, dict.fromkeys("UV", np.ones((4, 8), np.float32))).write(str(path))
+    elif case == "E11-old-rle":
+        row = bytes([200, 100, 50, 129, 1, 1, 1, 15])  # fifteen more of the pixel before
+        path = rgbe_file(tmp_path / "m.hdr", "-Y 8 +X 16", np.frombuffer(row * 8, np.uint8))
+    elif case == "E12-garbage":
         path.write_bytes(b"#?RADIANCE\n\xff\xfe\x80\n")
     with pytest.raises(InputError) as caught:
         read_envmap(path)
     assert caught.value.where == str(path)
+
+
+@pytest.mark.parametrize("kind", ["png8", "png16", "jpeg", "grey"], ids="E-picture-{}".format)
+def test_pictures_are_panoramas_without_a_sun(
+    tmp_path: Path, rng: np.random.Generator, kind: str
+) -> None:
+    """Codes are sRGB, in the exact curve: maps are not the paper's photo."""
+    path = tmp_path / "m.png"
+    codes = rng.integers(0, 256, (4, 8, 3), dtype=np.uint8)
+    if kind == "png16":
+        codes = codes.astype(np.uint16) * 257
+        write_image(path, codes)
+    elif kind == "jpeg":
+        codes[:] = codes[..., :1] // 64 * 64
+        path = tmp_path / "m.jpg"
+        Image.fromarray(codes).save(path, quality=100, subsampling=0)
+    elif kind == "grey":
+        codes[:] = codes[..., :1]
+        Image.fromarray(codes[..., 0]).save(path)
+    else:
+        Image.fromarray(codes).save(path)
+    notices: list[str] = []
+    texels = read_envmap(path, notices=notices)
+    shown = codes.astype(np.float64) / np.iinfo(codes.dtype).max
+    expected = np.where(shown <= 0.04045, shown / 12.92, ((shown + 0.055) / 1.055) ** 2.4)
+    np.testing.assert_allclose(texels, expected, atol=0.02 if kind == "jpeg" else 1e-6)
+    assert any("not high dynamic range" in notice for notice in notices)
+
+
+def test_e7_single_channel_is_expanded(tmp_path: Path, rng: np.random.Generator) -> None:
+    plane = rng.random((4, 8), dtype=np.float32)
+    OpenEXR.File({}, {"Y": plane}).write(str(tmp_path / "m.exr"))
+    texels = read_envmap(tmp_path / "m.exr")
+    np.testing.assert_array_equal(texels, np.repeat(plane[..., None], 3, axis=-1))
+
+
+def test_e11_flat_and_run_length_files_are_one(tmp_path: Path, rng: np.random.Generator) -> None:
+    """OpenImageIO writes new run lengths from width 8 on, and narrower files flat."""
+    rgbe = rng.integers(128, 256, (4, 8, 4))
+    rgbe[..., 3] = 129
+    flat = read_envmap(rgbe_file(tmp_path / "a.hdr", "-Y 4 +X 8", rgbe))
+    packed = write_image(tmp_path / "b.hdr", flat)
+    assert packed.read_bytes().split(b"+X 8\n")[1][:4] == b"\x02\x02\x00\x08"
+    np.testing.assert_array_equal(read_envmap(packed), flat)
+    tiny = read_envmap(rgbe_file(tmp_path / "c.hdr", "-Y 2 +X 4", rgbe[:2, :4]))
+    np.testing.assert_array_equal(tiny, flat[:2, :4])
+
+
+def test_e11_exposures_multiply_and_other_lines_are_noted(tmp_path: Path) -> None:
+    rgbe = np.full((4, 8, 4), 129)
+    plain = read_envmap(rgbe_file(tmp_path / "a.hdr", "-Y 4 +X 8", rgbe))
+    lines = "EXPOSURE=2\nEXPOSURE=4\nGAMMA=2.2\n"
+    notices: list[str] = []
+    path = rgbe_file(tmp_path / "b.hdr", "-Y 4 +X 8", rgbe, lines)
+    np.testing.assert_allclose(8.0 * read_envmap(path, notices=notices), plain, rtol=1e-6)
+    assert any("GAMMA" in notice for notice in notices)
+    refused = rgbe_file(tmp_path / "c.hdr", "-Y 4 +X 8", rgbe, "EXPOSURE=-1\n")
+    with pytest.raises(InputError, match="EXPOSURE"):
+        read_envmap(refused)
+
+
+def test_e_stated_primaries_of_maps_are_followed(tmp_path: Path) -> None:
+    """Red of Rec.2020 is more than red of Rec.709; what then is negative becomes 0, and white 1."""
+    rgbe = np.array([[[128, 0, 0, 129]] * 8, [[128, 128, 128, 129]] * 8] * 2)
+    lines = "PRIMARIES=0.708 0.292 0.170 0.797 0.131 0.046 0.3127 0.3290\n"
+    notices: list[str] = []
+    path = rgbe_file(tmp_path / "a.hdr", "-Y 4 +X 8", rgbe, lines)
+    texels = read_envmap(path, notices=notices)
+    # ITU-R BT.2087, matrix from Rec.2020 to Rec.709
+    np.testing.assert_allclose(texels[0, 0], texels[1, 0] * (1.6605, 0.0, 0.0), rtol=4e-3)
+    assert np.ptp(texels[1, 0]) < 1e-5
+    assert any("primaries" in notice for notice in notices)
+    broken = rgbe_file(tmp_path / "b.hdr", "-Y 4 +X 8", rgbe, "PRIMARIES=1 2 x\n")
+    read_envmap(broken, notices=notices)
+    assert "broken" in notices[-1]
 
 
 @needs_shared

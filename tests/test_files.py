@@ -320,6 +320,30 @@ def test_layers_are_the_same_bytes_every_time(tmp_path: Path, rng: np.random.Gen
     assert sha256s(tmp_path / "a") == sha256s(tmp_path / "b")
 
 
+def test_e13_mitsuba_reads_what_is_written(tmp_path: Path, rng: np.random.Generator) -> None:
+    """A second reader finds the same values under the same names (OpenImageIO is the first)."""
+    mitsuba = pytest.importorskip("mitsuba", reason="Mitsuba is not installed (extra bench)")
+    mitsuba.set_variant("scalar_rgb")
+    layers, camera = small_layers(rng)
+    texels = four_lobes(directions(16))
+    texels[3, 5] = 2e5
+    with OutputFolder(tmp_path / "out") as out:
+        write_layers(out, layers, camera)
+        out.write_envmap(texels)
+    envmap = np.array(mitsuba.Bitmap(str(tmp_path / "out" / "envmap.exr")))
+    np.testing.assert_array_equal(envmap, texels)
+    hdr = np.array(mitsuba.Bitmap(str(tmp_path / "out" / "envmap.hdr")))
+    np.testing.assert_array_equal(hdr, read_envmap(tmp_path / "out" / "envmap.hdr"))
+    planes, _ = read_channels(tmp_path / "out" / "layers.exr")
+    bitmap = mitsuba.Bitmap(str(tmp_path / "out" / "layers.exr"))
+    names = [bitmap.struct_()[k].name for k in range(bitmap.channel_count())]
+    assert set(names) == set(planes)
+    pixels = np.array(bitmap)  # all of one type: half, as the first channel is
+    with np.errstate(over="ignore"):
+        for k, name in enumerate(names):
+            np.testing.assert_array_equal(pixels[..., k], planes[name].astype(pixels.dtype))
+
+
 def test_layers_that_do_not_add_up_are_our_bug(tmp_path: Path, rng: np.random.Generator) -> None:
     layers, camera = small_layers(rng)
     layers.composite[7, 7] += 0.5

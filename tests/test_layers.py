@@ -39,6 +39,7 @@ LEVELS = (
     {"inputs", "scene"},
     {"render", "lighting"},
     {"picture", "samples", "sequence", "estimate"},
+    {"detail"},
     {"integrator", "fusion", "sg_light"},
     {"bridge", "trust"},
     {"mis", "transport_rows", "transport_matrix", "regularizers", "evaluation_stage"},

@@ -129,6 +129,39 @@ def test_picture_is_recomputed_from_its_layers(device: str) -> None:
     np.testing.assert_array_equal(layers.plate, photo().linear())
 
 
+def test_i20_occluder_keeps_the_photo_in_front(device: str) -> None:
+    """White keeps the photo's codes, black changes nothing, grey mixes both; layers add up."""
+    free = picture(device)
+    ramp = np.broadcast_to(np.linspace(0.0, 1.0, 5, dtype=np.float32)[:, None], (5, 48))
+    occluder = np.zeros((32, 48), np.float32)
+    rows = 12
+    assert free.layers.matte[rows:].max() == 1.0 and free.changed[rows + 5 :].any()
+    occluder[rows : rows + 5], occluder[rows + 5 :] = ramp, 1.0
+    light = sunny()
+    knots = (ToneKnots.identity(1), ToneKnots.identity(3))
+    behind = make_picture(
+        renderer(device), light, light, photo(), QUALITY, *knots, occluder=occluder
+    )
+    m = occluder[..., None]
+    expected = m * free.layers.plate + (1.0 - m) * free.layers.composite
+    np.testing.assert_allclose(behind.layers.composite, expected, atol=COMPOSITE)
+    layers = behind.layers
+    recomputed = (
+        layers.foreground[..., :3]
+        + (1.0 - layers.foreground[..., 3:]) * layers.plate * layers.shadow_ratio
+    )
+    np.testing.assert_allclose(layers.composite, recomputed, atol=COMPOSITE)
+    np.testing.assert_array_equal(layers.matte, (1.0 - occluder) * free.layers.matte)
+    np.testing.assert_array_equal(layers.composite[:rows], free.layers.composite[:rows])
+    assert not behind.changed[rows + 4 :].any()
+    np.testing.assert_array_equal(
+        photo().encode(behind.image, behind.changed)[rows + 4 :], photo().codes[rows + 4 :]
+    )
+    assert layers.depth is not None and np.isinf(layers.depth[rows + 4 :]).all()
+    parts = sum(getattr(layers, name) for name in ("diffuse", "specular", "emission"))
+    np.testing.assert_allclose(parts, layers.foreground[..., :3], atol=PART)
+
+
 def test_foreground_is_the_tone_mapped_radiance(device: str) -> None:
     """Reinhard, then the curve, of radiance over coverage (method 2.4), in float64."""
     knots = bent(1, 1)

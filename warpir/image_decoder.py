@@ -216,7 +216,7 @@ def decode_image(
     if kind == "exr":
         pixels = _place_in_display_window(pixels, spec)
     if kind == "hdr":
-        pixels = pixels / np.float32(_exposure(path, spec))
+        pixels = pixels / np.float32(_exposure(path, head))
     primaries = None
     if pixels.dtype.kind == "f":
         primaries, unknown = _stated_primaries(spec, kind, head)
@@ -329,12 +329,26 @@ def _part_name(spec: Any) -> str:
     return str(spec.getattribute("oiio:subimagename") or "")
 
 
-def _exposure(path: Path, spec: Any) -> float:
-    """Return by what the values of a Radiance file were multiplied [1]."""
-    exposure = float(spec.getattribute("hdr:exposure") or 1.0)
+def _exposure(path: Path, head: bytes) -> float:
+    """Return by what the values of a Radiance file were multiplied [1].
+
+    Every program on the way adds its line; OpenImageIO knows the last one alone.
+    """
+    exposure = 1.0
+    for line in _radiance_lines(head, b"EXPOSURE"):
+        try:
+            exposure *= float(line)
+        except ValueError:
+            exposure = np.nan
     if not (np.isfinite(exposure) and exposure > 0.0):
-        raise InputError(path, f"EXPOSURE is not a positive number (found {exposure})")
+        raise InputError(path, f"EXPOSURE is not a positive number (found {exposure:g})")
     return exposure
+
+
+def _radiance_lines(head: bytes, name: bytes) -> list[bytes]:
+    """Return the values of all lines of one name in the header of a Radiance file."""
+    header = re.split(rb"\r?\n\r?\n", head, maxsplit=1)[0]
+    return re.findall(rb"\n" + name + rb"=([^\r\n]*)", header)
 
 
 def _stated_primaries(
@@ -343,10 +357,10 @@ def _stated_primaries(
     """Return the chromaticities of a float file, None for Rec.709, and what is not followed."""
     stated = spec.getattribute("chromaticities")
     space = str(spec.getattribute("colorInteropID") or "")
-    line = re.search(rb"\nPRIMARIES=([^\n]*)\n", head) if kind == "hdr" else None
-    if line is not None:
+    lines = _radiance_lines(head, b"PRIMARIES") if kind == "hdr" else []
+    if lines:
         with suppress(ValueError):
-            stated = [float(number) for number in line[1].split()]
+            stated = [float(number) for number in lines[-1].split()]
     elif stated is None and space in color.INTEROP_SPACES:
         stated = color.chromaticities_of(color.INTEROP_SPACES[space])
     elif stated is None:
@@ -377,7 +391,7 @@ def _header_notices(spec: Any, kind: str, head: bytes) -> list[str]:
     aspect = float(spec.getattribute("PixelAspectRatio") or 1.0)
     if kind == "exr" and abs(aspect - 1.0) > 1e-3:
         notices.append(f"pixel aspect ratio {aspect:g} is not followed: pixels are taken as square")
-    if kind == "hdr" and re.search(rb"\n(GAMMA|COLORCORR)=", head[:4096]):
+    if kind == "hdr" and _radiance_lines(head, b"(?:GAMMA|COLORCORR)"):
         notices.append("GAMMA and COLORCORR of the header are not followed")
     if kind == "jpeg" and any(name in head for name in _GAIN_MAPS):
         notices.append("gain map ignored: read as its base image")
