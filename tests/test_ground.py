@@ -223,7 +223,7 @@ def test_points_turn_with_the_camera_file_s_world(rng: np.random.Generator) -> N
     assert made.cloud is not None
     np.testing.assert_allclose(made.cloud.points, points, atol=1e-12)
     assert made.measured["ground_fit"]["rms"] == pytest.approx(NOISE, rel=0.2)
-    assert "fitted to" in made.assumed[0]
+    assert "fitted to" in made.assumed[0] and "degrees off level" in made.assumed[0]
 
 
 def test_a_world_without_up_is_levelled_by_its_ground(rng: np.random.Generator) -> None:
