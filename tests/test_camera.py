@@ -178,11 +178,15 @@ def test_wrong_camera_files_are_named(tmp_path: Path, case: str) -> None:
     assert "\n" not in str(caught.value)
 
 
-@pytest.mark.parametrize("case", ["version", "cut-header", "cut-state", "cut-image", "lying-size"])
+@pytest.mark.parametrize(
+    "case", ["version", "cut-header", "cut-state", "cut-image", "lying-size", "no-image"]
+)
 def test_wrong_fspy_projects_are_refused(tmp_path: Path, case: str) -> None:
     state = {"cameraParameters": fspy_parameters(40, 30, np.eye(4))}
     version = 2 if case == "version" else 1
-    path = fspy_file(tmp_path / "s.fspy", state, version=version, image=b"x" * 99)
+    path = fspy_file(
+        tmp_path / "s.fspy", state, version=version, image=b"x" * (0 if case == "no-image" else 99)
+    )
     content = path.read_bytes()
     length = {"cut-header": 10, "cut-state": 60, "cut-image": len(content) - 50}.get(case)
     content = content[:length]
@@ -191,7 +195,9 @@ def test_wrong_fspy_projects_are_refused(tmp_path: Path, case: str) -> None:
     path.write_bytes(content)
     with pytest.raises(InputError) as caught:
         read_camera(path, (40, 30))
-    assert any(word in caught.value.what for word in ("version", "truncated", "too large"))
+    assert any(
+        word in caught.value.what for word in ("version", "truncated", "too large", "without")
+    )
 
 
 def test_missing_camera_and_folder(tmp_path: Path) -> None:

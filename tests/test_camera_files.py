@@ -63,10 +63,7 @@ def quaternion(rotation: np.ndarray) -> np.ndarray:
     r = rotation
     k = np.array(
         [
-            [
-                r[0, 0] + r[1, 1] + r[2, 2],
-                *(r[2, 1] - r[1, 2], r[0, 2] - r[2, 0], r[1, 0] - r[0, 1]),
-            ],
+            [np.trace(r), r[2, 1] - r[1, 2], r[0, 2] - r[2, 0], r[1, 0] - r[0, 1]],
             [0, r[0, 0] - r[1, 1] - r[2, 2], r[1, 0] + r[0, 1], r[2, 0] + r[0, 2]],
             [0, 0, r[1, 1] - r[0, 0] - r[2, 2], r[2, 1] + r[1, 2]],
             [0, 0, 0, r[2, 2] - r[0, 0] - r[1, 1]],
@@ -158,6 +155,7 @@ def test_colmap_image_of_the_photo_is_chosen(tmp_path: Path) -> None:
     poses = {f"{k}.jpg": (np.array([1.0, 0, 0, 0]), np.array([0.0, 0, k])) for k in range(20)}
     folder = write_text_model(tmp_path / "many", *text_of("PINHOLE"), poses)
     assert read_photo_camera(folder, SIZE, photo_name="3.jpg").camera.c2w[2, 3] == -3.0
+    assert read_photo_camera(folder, SIZE, photo_name="3.png").camera.c2w[2, 3] == -3.0
     assert read_photo_camera(folder, SIZE, frame="4.jpg", photo_name="3.jpg").camera.c2w[2, 3] == -4
     for chosen in ({}, {"photo_name": "photo.png"}, {"frame": "20.jpg"}):
         with pytest.raises(InputError) as caught:

@@ -24,10 +24,12 @@ from warpir.camera_files import read_camera
 from warpir.config import InsertConfig
 from warpir.errors import ExitCode, InputError
 from warpir.insert import main
+from warpir.lens import Lens
 from warpir.light import as_map
 from warpir.lobes_file import read_lobes
-from warpir.photo_files import read_envmap
+from warpir.photo_files import read_envmap, read_photo
 from warpir.regressor import random_regressor, save_regressor
+from warpir.undistort import undistort_photo
 
 ALWAYS = (
     "balls.png",
@@ -295,6 +297,30 @@ def test_camera_file_gives_the_same_picture(run: Run, inputs: Path, tmp_path: Pa
     )
     again = go(argv, tmp_path / "again")
     assert (again.out / "composite.png").read_bytes() == (run.out / "composite.png").read_bytes()
+
+
+def test_bent_photo_is_composed_straight(run: Run, inputs: Path, tmp_path: Path) -> None:
+    """--undistort: what nothing touches has the straightened photo's codes; run.json says so."""
+    known = read_camera(run.out / "camera.json", (WIDTH, HEIGHT))
+    z_up = np.array([[1, 0, 0, 0], [0, 0, -1, 0], [0, 1, 0, 0], [0, 0, 0, 1]]) @ known.c2w
+    frame = {"file_path": "images/photo.jpg", "transform_matrix": z_up.tolist()}
+    content = {"w": WIDTH, "h": HEIGHT, "fl_x": known.fx, "fl_y": known.fy, "k1": -0.1}
+    (tmp_path / "transforms.json").write_text(json.dumps({**content, "frames": [frame]}))
+    out, camera = tmp_path / "out", str(tmp_path / "transforms.json")
+    nothing = dict.fromkeys(("fov", "pitch", "camera_height"))
+    device = run.record["config"]["device"]
+    bent = go(arguments(inputs, out, camera=camera, undistort="", device=device, **nothing), out)
+    lens = Lens((-0.1, 0.0, 0.0, 0.0))
+    straight, border = undistort_photo(read_photo(inputs / "photo.png"), known, lens)
+    planes = read_layers(out / "layers.exr")
+    outside = (planes["matte.A"] == 0.0) & (rgb(planes, "shadow.") == 1.0).all(axis=-1)
+    np.testing.assert_array_equal(bent.image()[outside], straight.codes[outside])
+    # The camera is the same pinhole, to the rounding of a turned matrix.
+    before = read_layers(run.out / "layers.exr")
+    assert np.abs(planes["matte.A"] - before["matte.A"]).max() <= HALF
+    said = {"radial": [-0.1, 0.0, 0.0, 0.0], "tangential": [0.0, 0.0], "border_share": border}
+    assert bent.record["measured"]["undistorted"] == said
+    assert any("straightened" in line for line in bent.record["notices"])
 
 
 # ------------------------------------------------------------------- same bytes and replay

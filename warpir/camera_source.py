@@ -72,7 +72,7 @@ def choose_frame(
 
     Args:
         path: The camera file, for the error.
-        names: Names of its images; folders in them may be left out.
+        names: Names of its images; folders and suffixes in them may be left out.
         frame: What the user names.
         photo: File name of the photograph.
         noun: What a name stands for.
@@ -82,13 +82,13 @@ def choose_frame(
     """
     wanted = frame if frame is not None else photo
     if wanted is not None:
-        # Blender's files leave the suffix out.
+        # Blender's files leave the suffix out, and a photo may have been saved as another kind.
         name = PurePosixPath(wanted).name
         stem = PurePosixPath(wanted).stem
         for found in (
             [k for k, n in enumerate(names) if n == wanted],
             [k for k, n in enumerate(names) if PurePosixPath(n).name == name],
-            [k for k, n in enumerate(names) if PurePosixPath(n).name == stem],
+            [k for k, n in enumerate(names) if PurePosixPath(n).stem == stem],
         ):
             if len(found) == 1:
                 return found[0]

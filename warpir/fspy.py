@@ -26,6 +26,8 @@ def read_fspy_project(path: Path) -> StoredCamera:
         version, state_size, image_size = struct.unpack("<3I", header[4:])
         if version != 1:
             raise InputError(path, f"fSpy project of another version (found {version}; expected 1)")
+        if image_size == 0:
+            raise InputError(path, "fSpy project without an image", "open and save it in fSpy")
         if state_size > JSON_BYTES_MAX:
             raise InputError(
                 path,

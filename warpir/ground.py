@@ -4,7 +4,7 @@ Hypotheses through three points each are scored by MSAC (Torr and Zisserman 2000
 distances, cut off at a threshold), the best is refined by total least squares on its inliers.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -42,18 +42,21 @@ class GroundFit:
     points: int
     """In view of the camera, which the fit was made from."""
     tilt_deg: float
-    """Angle of the normal from up [deg]."""
+    """Angle of the normal from up, or else from the camera's up [deg]."""
     camera_height: float
     """Of the camera above the plane [m]."""
+    has_up: bool = True
+    """Whether the world's up was known."""
 
     @property
     def about(self) -> str:
         """One line for the user."""
         share = 100.0 * self.inliers / self.points
+        level = "level" if self.has_up else "the camera's"
         return (
             f"the ground is a plane fitted to {self.inliers} of the {self.points} points in view "
             f"({share:.0f} %, off by {self.rms:.2g} m rms), {self.camera_height:.3g} m below the "
-            f"camera, {self.tilt_deg:.1f} degrees off level (--ground-points)"
+            f"camera, {self.tilt_deg:.1f} degrees off {level} (--ground-points)"
         )
 
     def record(self) -> dict[str, object]:
@@ -106,7 +109,7 @@ def fit_ground(
             "them)",
             "check --up, or give --ground",
         )
-    return fit
+    return replace(fit, has_up=has_up)
 
 
 def _fit(
