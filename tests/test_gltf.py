@@ -1034,11 +1034,69 @@ def test_G16_scene_that_lists_an_inner_node(tmp_path: Path) -> None:
     assert len(load(tmp_path, builder).primitives) == 1
 
 
+def skinned(weights: list[list[float]], bones: list[dict[str, Any]], **members: Any) -> Plant:
+    """Bind the square's corners to joints: nodes 1, 2, ..., all bound at the origin by default."""
+
+    def plant(b: Builder) -> None:
+        b.json["nodes"][0]["skin"] = 0
+        b.json["nodes"] += bones
+        b.json["scenes"] = [{"nodes": [0, 1]}]
+        b.json["skins"] = [{"joints": [1 + k for k in range(len(bones))]} | members]
+        b.attribute("JOINTS_0", np.tile(np.array([0, 1, 0, 0], "B"), (4, 1)))
+        b.attribute("WEIGHTS_0", np.array([[*w, 0, 0] for w in weights], "f"))
+
+    return plant
+
+
+HALF = [[1, 0], [1, 0], [0.5, 0.5], [0, 1]]
+ARM: list[dict[str, Any]] = [{"children": [2], "scale": [2, 2, 2]}, {"translation": [0, 0, 3]}]
+fault("G18-joint-out-of-range", "/meshes/0/primitives/0: joint 1 in JOINTS_0, but 1 joints")(
+    skinned(HALF, ARM[1:])
+)
+fault("G18-joint-is-no-node", "/skins/0: joint 9, but 3 nodes")(skinned(HALF, ARM, joints=[1, 9]))
+fault("G18-vertex-without-weight", "/meshes/0/primitives/0: vertex 3 has no weight")(
+    skinned([*HALF[:3], [0, 0]], ARM)
+)
+fault("G18-skin-without-joints", "/meshes/0/primitives/0/attributes: JOINTS_0 is missing")(
+    lambda b: (skinned(HALF, ARM)(b), b.primitive["attributes"].pop("JOINTS_0"))
+)
+fault("G18-flat-joint", "the joints flatten the mesh")(skinned(HALF, [{"scale": [1, 0, 1]}, {}]))
+
+
+def test_G18_skinned_mesh_stands_as_its_joints_do(tmp_path: Path) -> None:
+    """Linear blend of joint * inverse bind matrix; the mesh's own node does not count."""
+    bind = np.eye(4)
+    bind[:3, 3] = (-1.0, 0.0, 0.0)
+    builder = Builder()
+    matrices = np.stack([np.eye(4).T.ravel(), bind.T.ravel()]).astype("f")
+    view = builder.view(matrices.tobytes())
+    builder.json["accessors"].append(
+        {"bufferView": view, "componentType": 5126, "count": 2, "type": "MAT4"}
+    )
+    inverse = len(builder.json["accessors"]) - 1
+    skinned(HALF, ARM, inverseBindMatrices=inverse)(builder)
+    node(translation=[99, 0, 0])(builder)
+    (square,) = load(tmp_path, builder).primitives
+    first, second = 2.0 * CORNERS, 2.0 * (CORNERS + np.array([-1, 0, 3]))
+    weight = np.array(HALF, dtype=float)[:, 1:]
+    np.testing.assert_allclose(square.positions, first + weight * (second - first), atol=1e-6)
+    np.testing.assert_array_equal(square.normals, NORMALS)
+
+
+def test_G18_mirrored_skin_keeps_the_outside(tmp_path: Path) -> None:
+    """Joints that mirror turn the winding round, and the normals follow."""
+    builder = Builder()
+    skinned([[1, 0]] * 4, [{"scale": [-1, 1, 1]}, {}])(builder)
+    asset = load(tmp_path, builder)
+    assert winding_agrees(asset)
+    assert asset.primitives[0].positions[1, 0] == -1.0
+
+
 def test_G18_rest_pose_is_noted(tmp_path: Path) -> None:
     """Skins, morph targets and animations give the rest pose and a notice each."""
     builder = Builder()
-    builder.json["nodes"][0]["skin"] = 0
-    builder.json.update(skins=[{"joints": [0]}], animations=[{}])
+    skinned([[1, 0]] * 4, [{}, {}])(builder)
+    builder.json.update(animations=[{}])
     builder.primitive["targets"] = [{"POSITION": 0}]
     asset = load(tmp_path, builder)
     for word in ("skin", "animations", "morph"):
