@@ -253,7 +253,7 @@ for name in (
     fault(f"G13-{name}", "/extensionsRequired", name, "re-export")(
         lambda b, name=name: b.json.update(extensionsRequired=[name])  # type: ignore[misc]
     )
-fault("G14-index-out-of-range", "/meshes/0/primitives/0: index 999, but 4 vertices")(
+fault("G14-M7-index-out-of-range", "/meshes/0/primitives/0: index 999, but 4 vertices")(
     lambda b: b.primitive.update(indices=b.accessor(np.array([0, 1, 999], "H")))
 )
 fault("G14-index-restart-value", "index 4294967295, but 4 vertices")(
@@ -275,11 +275,11 @@ for name, array in {
             b.attribute(name, poisoned)
 
 
-fault("G16-cycle", "cycle")(
+fault("G16-M10-cycle", "cycle")(
     lambda b: b.json["nodes"].extend([{"children": [2]}, {"children": [1]}])
 )
 fault("G16-self-child", "cycle")(node(children=[0]))
-fault("G16-two-parents", "/nodes/1: child 2 is already a child of node 0")(
+fault("G16-M10-two-parents", "/nodes/1: child 2 is already a child of node 0")(
     lambda b: (node(children=[2])(b), b.json["nodes"].extend([{"children": [2]}, {}]))
 )
 fault("G16-same-child-twice", "/nodes/0: child 1 is already a child of node 0")(
@@ -350,7 +350,7 @@ fault("G25-zero-scale", "/nodes/0: singular transform")(node(scale=[1, 0, 1]))
 fault("G25-zero-quaternion", "/nodes/0: rotation is the zero quaternion")(
     node(rotation=[0, 0, 0, 0])
 )
-fault("G28-2^18-instances", "too many nodes", "262144", "100000")(
+fault("G28-M10-2^18-instances", "too many nodes", "262144", "100000")(
     lambda b: b.json.update(nodes=[{"mesh": 0}] * 2**18)
 )
 fault("G28-too-many-placed", "too many instances", "65536")(
@@ -681,7 +681,7 @@ def test_G3_absent_factors_are_one(tmp_path: Path) -> None:
     [("tex%20a.png", "tex a.png"), ("tex a.png", "tex a.png"), ("sch\u00f6n.png", "sch\u00f6n.png"),
      ("sch%C3%B6n.png", "sch\u00f6n.png"), ("a/../b%252e.png", "b%2e.png")],
 )  # fmt: skip
-def test_G4_names_are_decoded_once(uri: str, name: str, tmp_path: Path) -> None:
+def test_G4_M5_names_are_decoded_once(uri: str, name: str, tmp_path: Path) -> None:
     """Percent-encoded and UTF-8 names load, decoded exactly once."""
     (tmp_path / name).write_bytes(png())
     builder = Builder()
@@ -710,7 +710,7 @@ NORMALISED: dict[str, tuple[np.ndarray, int]] = {
 
 
 @pytest.mark.parametrize("kind", NORMALISED)
-def test_G6_normalised_uv_equals_float(kind: str, tmp_path: Path) -> None:
+def test_G6_M9_normalised_uv_equals_float(kind: str, tmp_path: Path) -> None:
     """Normalised integer texture coordinates equal their float version."""
     codes, scale = NORMALISED[kind]
     builder = Builder()
@@ -742,7 +742,7 @@ def test_G6_normalised_colors_equal_float(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("code", ["b", "B", "h", "H"])
 @pytest.mark.parametrize("normalized", [False, True])
-def test_G7_quantised_positions_equal_float(code: str, normalized: bool, tmp_path: Path) -> None:
+def test_G7_M9_quantised_positions_equal_float(code: str, normalized: bool, tmp_path: Path) -> None:
     """Quantised positions and normals under a node's scale equal the float version."""
     top = np.iinfo(code).max
     builder = Builder()
@@ -1196,7 +1196,7 @@ def test_G27_camera_node_with_mesh_children(tmp_path: Path) -> None:
     assert load(tmp_path, builder).bounds()[0][0] == 5
 
 
-def test_G28_deep_chain_loads(tmp_path: Path) -> None:
+def test_G28_M10_deep_chain_loads(tmp_path: Path) -> None:
     """3000 nodes in one chain load, each moving the square a little."""
     builder = Builder()
     chain = [{"children": [k + 1], "translation": [0.5, 0, 0]} for k in range(2999)]
