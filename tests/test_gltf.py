@@ -253,7 +253,7 @@ for name in (
     fault(f"G13-{name}", "/extensionsRequired", name, "re-export")(
         lambda b, name=name: b.json.update(extensionsRequired=[name])  # type: ignore[misc]
     )
-fault("G14-index-out-of-range", "/meshes/0/primitives/0: index 999, but 4 vertices")(
+fault("G14-M7-index-out-of-range", "/meshes/0/primitives/0: index 999, but 4 vertices")(
     lambda b: b.primitive.update(indices=b.accessor(np.array([0, 1, 999], "H")))
 )
 fault("G14-index-restart-value", "index 4294967295, but 4 vertices")(
@@ -275,11 +275,11 @@ for name, array in {
             b.attribute(name, poisoned)
 
 
-fault("G16-cycle", "cycle")(
+fault("G16-M10-cycle", "cycle")(
     lambda b: b.json["nodes"].extend([{"children": [2]}, {"children": [1]}])
 )
 fault("G16-self-child", "cycle")(node(children=[0]))
-fault("G16-two-parents", "/nodes/1: child 2 is already a child of node 0")(
+fault("G16-M10-two-parents", "/nodes/1: child 2 is already a child of node 0")(
     lambda b: (node(children=[2])(b), b.json["nodes"].extend([{"children": [2]}, {}]))
 )
 fault("G16-same-child-twice", "/nodes/0: child 1 is already a child of node 0")(
@@ -350,7 +350,7 @@ fault("G25-zero-scale", "/nodes/0: singular transform")(node(scale=[1, 0, 1]))
 fault("G25-zero-quaternion", "/nodes/0: rotation is the zero quaternion")(
     node(rotation=[0, 0, 0, 0])
 )
-fault("G28-2^18-instances", "too many nodes", "262144", "100000")(
+fault("G28-M10-2^18-instances", "too many nodes", "262144", "100000")(
     lambda b: b.json.update(nodes=[{"mesh": 0}] * 2**18)
 )
 fault("G28-too-many-placed", "too many instances", "65536")(
@@ -681,7 +681,7 @@ def test_G3_absent_factors_are_one(tmp_path: Path) -> None:
     [("tex%20a.png", "tex a.png"), ("tex a.png", "tex a.png"), ("sch\u00f6n.png", "sch\u00f6n.png"),
      ("sch%C3%B6n.png", "sch\u00f6n.png"), ("a/../b%252e.png", "b%2e.png")],
 )  # fmt: skip
-def test_G4_names_are_decoded_once(uri: str, name: str, tmp_path: Path) -> None:
+def test_G4_M5_names_are_decoded_once(uri: str, name: str, tmp_path: Path) -> None:
     """Percent-encoded and UTF-8 names load, decoded exactly once."""
     (tmp_path / name).write_bytes(png())
     builder = Builder()
@@ -710,7 +710,7 @@ NORMALISED: dict[str, tuple[np.ndarray, int]] = {
 
 
 @pytest.mark.parametrize("kind", NORMALISED)
-def test_G6_normalised_uv_equals_float(kind: str, tmp_path: Path) -> None:
+def test_G6_M9_normalised_uv_equals_float(kind: str, tmp_path: Path) -> None:
     """Normalised integer texture coordinates equal their float version."""
     codes, scale = NORMALISED[kind]
     builder = Builder()
@@ -742,7 +742,7 @@ def test_G6_normalised_colors_equal_float(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("code", ["b", "B", "h", "H"])
 @pytest.mark.parametrize("normalized", [False, True])
-def test_G7_quantised_positions_equal_float(code: str, normalized: bool, tmp_path: Path) -> None:
+def test_G7_M9_quantised_positions_equal_float(code: str, normalized: bool, tmp_path: Path) -> None:
     """Quantised positions and normals under a node's scale equal the float version."""
     top = np.iinfo(code).max
     builder = Builder()
@@ -1034,11 +1034,69 @@ def test_G16_scene_that_lists_an_inner_node(tmp_path: Path) -> None:
     assert len(load(tmp_path, builder).primitives) == 1
 
 
+def skinned(weights: list[list[float]], bones: list[dict[str, Any]], **members: Any) -> Plant:
+    """Bind the square's corners to joints: nodes 1, 2, ..., all bound at the origin by default."""
+
+    def plant(b: Builder) -> None:
+        b.json["nodes"][0]["skin"] = 0
+        b.json["nodes"] += bones
+        b.json["scenes"] = [{"nodes": [0, 1]}]
+        b.json["skins"] = [{"joints": [1 + k for k in range(len(bones))]} | members]
+        b.attribute("JOINTS_0", np.tile(np.array([0, 1, 0, 0], "B"), (4, 1)))
+        b.attribute("WEIGHTS_0", np.array([[*w, 0, 0] for w in weights], "f"))
+
+    return plant
+
+
+HALF = [[1, 0], [1, 0], [0.5, 0.5], [0, 1]]
+ARM: list[dict[str, Any]] = [{"children": [2], "scale": [2, 2, 2]}, {"translation": [0, 0, 3]}]
+fault("G18-joint-out-of-range", "/meshes/0/primitives/0: joint 1 in JOINTS_0, but 1 joints")(
+    skinned(HALF, ARM[1:])
+)
+fault("G18-joint-is-no-node", "/skins/0: joint 9, but 3 nodes")(skinned(HALF, ARM, joints=[1, 9]))
+fault("G18-vertex-without-weight", "/meshes/0/primitives/0: vertex 3 has no weight")(
+    skinned([*HALF[:3], [0, 0]], ARM)
+)
+fault("G18-skin-without-joints", "/meshes/0/primitives/0/attributes: JOINTS_0 is missing")(
+    lambda b: (skinned(HALF, ARM)(b), b.primitive["attributes"].pop("JOINTS_0"))
+)
+fault("G18-flat-joint", "the joints flatten the mesh")(skinned(HALF, [{"scale": [1, 0, 1]}, {}]))
+
+
+def test_G18_skinned_mesh_stands_as_its_joints_do(tmp_path: Path) -> None:
+    """Linear blend of joint * inverse bind matrix; the mesh's own node does not count."""
+    bind = np.eye(4)
+    bind[:3, 3] = (-1.0, 0.0, 0.0)
+    builder = Builder()
+    matrices = np.stack([np.eye(4).T.ravel(), bind.T.ravel()]).astype("f")
+    view = builder.view(matrices.tobytes())
+    builder.json["accessors"].append(
+        {"bufferView": view, "componentType": 5126, "count": 2, "type": "MAT4"}
+    )
+    inverse = len(builder.json["accessors"]) - 1
+    skinned(HALF, ARM, inverseBindMatrices=inverse)(builder)
+    node(translation=[99, 0, 0])(builder)
+    (square,) = load(tmp_path, builder).primitives
+    first, second = 2.0 * CORNERS, 2.0 * (CORNERS + np.array([-1, 0, 3]))
+    weight = np.array(HALF, dtype=float)[:, 1:]
+    np.testing.assert_allclose(square.positions, first + weight * (second - first), atol=1e-6)
+    np.testing.assert_array_equal(square.normals, NORMALS)
+
+
+def test_G18_mirrored_skin_keeps_the_outside(tmp_path: Path) -> None:
+    """Joints that mirror turn the winding round, and the normals follow."""
+    builder = Builder()
+    skinned([[1, 0]] * 4, [{"scale": [-1, 1, 1]}, {}])(builder)
+    asset = load(tmp_path, builder)
+    assert winding_agrees(asset)
+    assert asset.primitives[0].positions[1, 0] == -1.0
+
+
 def test_G18_rest_pose_is_noted(tmp_path: Path) -> None:
     """Skins, morph targets and animations give the rest pose and a notice each."""
     builder = Builder()
-    builder.json["nodes"][0]["skin"] = 0
-    builder.json.update(skins=[{"joints": [0]}], animations=[{}])
+    skinned([[1, 0]] * 4, [{}, {}])(builder)
+    builder.json.update(animations=[{}])
     builder.primitive["targets"] = [{"POSITION": 0}]
     asset = load(tmp_path, builder)
     for word in ("skin", "animations", "morph"):
@@ -1138,7 +1196,7 @@ def test_G27_camera_node_with_mesh_children(tmp_path: Path) -> None:
     assert load(tmp_path, builder).bounds()[0][0] == 5
 
 
-def test_G28_deep_chain_loads(tmp_path: Path) -> None:
+def test_G28_M10_deep_chain_loads(tmp_path: Path) -> None:
     """3000 nodes in one chain load, each moving the square a little."""
     builder = Builder()
     chain = [{"children": [k + 1], "translation": [0.5, 0, 0]} for k in range(2999)]

@@ -23,6 +23,7 @@ from tests.test_gltf import (
     instanced,
     node,
     png,
+    skinned,
     sparse,
 )
 from tests.test_gltf_writer import EXTENDED, IDENTITY, everything, extended, patch, placed
@@ -106,6 +107,8 @@ def test_fixtures_of_the_reader_are_valid(tmp_path: Path) -> None:
     node(scale=[1 / 255] * 3)(quantised)
     sparse([2], CORNERS[2:3])(add("sparse"))
     instanced(TRANSLATION=CORNERS, SCALE=np.ones((4, 3), "f"))(add("instances"))
+    skin = [{"children": [2], "scale": [2, 2, 2]}, {"translation": [0, 0, 3]}]
+    skinned([[1, 0], [1, 0], [0.5, 0.5], [0, 1]], skin)(add("skin"))
     webp = add("WebP")
     webp.base_color({"bufferView": webp.view(png(kind="WEBP")), "mimeType": "image/webp"})
     webp.json["textures"][0] = {"extensions": {"EXT_texture_webp": {"source": 0}}}

@@ -595,7 +595,7 @@ def roofed(device: str, *materials: Material, color: FloatArray | None = None) -
     return shadow(renderer, OVERHEAD)[0]
 
 
-def test_blend_lets_its_share_through(device: str) -> None:
+def test_M19_blend_lets_its_share_through(device: str) -> None:
     """BLEND 0.25: a quarter of camera samples stop; 0.75 of the sunlight passes, 0.5625 twice."""
     glass = Material(alpha_mode="BLEND", alpha=0.25)
     out = render(make(card(glass), CARD_VIEW, device), constant(), 256)
@@ -629,7 +629,7 @@ def test_blend_lets_its_share_through(device: str) -> None:
         ("BLEND", 1.0, 1.0),
     ],
 )
-def test_alpha_modes_cover_and_shade_alike(
+def test_M19_alpha_modes_cover_and_shade_alike(
     device: str, mode: str, alpha: float, stays: float
 ) -> None:
     """MASK keeps all at or above its cutoff and nothing below; OPAQUE ignores alpha (M19)."""
@@ -639,7 +639,7 @@ def test_alpha_modes_cover_and_shade_alike(
     np.testing.assert_array_equal(roofed(device, material), 1.0 - stays)
 
 
-def test_mask_follows_the_texture(device: str) -> None:
+def test_M19_mask_follows_the_texture(device: str) -> None:
     """The left half of a card is cut away by its texture's alpha, for camera and for shadow."""
     pixels = np.full((4, 8, 4), 255, np.uint8)
     pixels[:, :4, 3] = 0
@@ -653,7 +653,7 @@ def test_mask_follows_the_texture(device: str) -> None:
     np.testing.assert_array_equal(ratio[:, 0].reshape(4, 8), 1.0 - expected[:4])
 
 
-def test_back_faces_are_culled_for_the_camera_alone(device: str) -> None:
+def test_M19_back_faces_are_culled_for_the_camera_alone(device: str) -> None:
     """A single-sided card seen from behind is invisible and still casts its shadow."""
     for double_sided, covered in ((False, 0.0), (True, 1.0)):
         material = Material(double_sided=double_sided)

@@ -2,13 +2,13 @@
 
 `warpir.gltf_file` is the gate that checks the container and every number; this module says what
 the numbers mean, together with `warpir.gltf_material`. Each drawn primitive of each mesh instance
-becomes one `Primitive` in the asset's frame (right-handed, +Y up, front +Z, metres). Lights,
-cameras, skins and animations are not read.
+becomes one `Primitive` in the asset's frame (right-handed, +Y up, front +Z, metres). Skinned meshes
+stand as their joints do in the file; lights, cameras, morph targets and animations are not read.
 """
 
 import math
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -66,13 +66,15 @@ def read_gltf(
     geometries: dict[str, Geometry | None] = {}
     material_of: dict[str, int] = {}
     primitives: list[Primitive] = []
-    for entry, world in placed:
+    for entry, world, joints in placed:
         key = entry.pointer
         if key not in geometries:
             material_of[key] = materials.index(entry)
             uv_sets = materials.uv_sets(material_of[key])
             geometries[key] = read_geometry(file, entry, uv_sets, notices)
         geometry = geometries[key]
+        if geometry is not None and joints is not None:
+            geometry = pose(file, entry, geometry, joints)
         if geometry is not None:
             primitives.append(place(geometry, world, material_of[key]))
     check_drawable(path, primitives, f"{len(placed)} placed primitives, none with triangles")
@@ -85,7 +87,9 @@ def read_gltf(
     )
 
 
-def placed_primitives(file: GltfFile, notices: list[str]) -> Iterator[tuple[Entry, Matrix]]:
+def placed_primitives(
+    file: GltfFile, notices: list[str]
+) -> Iterator[tuple[Entry, Matrix, Matrix | None]]:
     """Walk the scene and yield every drawable primitive with its matrix.
 
     Args:
@@ -93,7 +97,8 @@ def placed_primitives(file: GltfFile, notices: list[str]) -> Iterator[tuple[Entr
         notices: Receives what is left out.
 
     Yields:
-        The primitive and the matrix from its frame to the asset's, shape [4, 4].
+        The primitive and the matrix from its frame to the asset's, shape [4, 4]; for a skinned one
+        the identity and the matrices of its joints, shape [joint, 4, 4].
 
     Raises:
         InputError: The nodes are not a forest, or a drawn transform is singular.
@@ -119,11 +124,16 @@ def placed_primitives(file: GltfFile, notices: list[str]) -> Iterator[tuple[Entr
         stack += [(child, world, drawn) for child in reversed(node.integers("children"))]
         if not drawn or "mesh" not in node:
             continue
-        instances = read_instances(file, node, world)
+        joints: Matrix | None = None
+        if "skin" in node:
+            # The joints alone place a skinned mesh; its own node does not count.
+            joints = joint_matrices(file, node, nodes, parents)
+            instances = [np.eye(4)]
+            notices.append(f"{node.pointer}: skinned, stands as its joints do in the file")
+        else:
+            instances = read_instances(file, node, world)
         for number, matrix in enumerate(instances):
             check_invertible(node, matrix, f" of instance {number}" if len(instances) > 1 else "")
-        if "skin" in node:
-            notices.append(f"{node.pointer}: skin ignored, the mesh is used as stored")
         mesh = root.item("meshes", node.integer("mesh"), node, "mesh")
         for primitive in mesh.items("primitives"):
             if primitive.integer("mode", 4) in POINTS_OR_LINES:
@@ -133,7 +143,7 @@ def placed_primitives(file: GltfFile, notices: list[str]) -> Iterator[tuple[Entr
             if instance_count > INSTANCES:
                 raise root.error(f"too many instances (limit {INSTANCES} placed primitives)")
             for matrix in instances:
-                yield primitive, matrix
+                yield primitive, matrix, joints
 
 
 def read_forest(root: Entry) -> tuple[list[Entry], dict[int, int]]:
@@ -263,6 +273,41 @@ def read_instances(file: GltfFile, node: Entry, world: Matrix) -> list[Matrix]:
         return [world @ from_trs(*parts) for parts in zip(shifts, rotations, scales, strict=True)]
 
 
+def joint_matrices(
+    file: GltfFile, node: Entry, nodes: list[Entry], parents: dict[int, int]
+) -> Matrix:
+    """Return, for each joint of a node's skin, the matrix that moves what is bound to it alone.
+
+    Joint times inverse bind matrix, from the mesh's frame to the asset's, shape [joint, 4, 4].
+    """
+    skin = file.root.item("skins", node.integer("skin"), node, "skin")
+    joints = skin.integers("joints")
+    worlds: dict[int, Matrix] = {}
+    for joint in joints:
+        if joint >= len(nodes):
+            raise skin.error(f"joint {joint}, but {len(nodes)} nodes")
+        chain = [joint]
+        while chain[-1] not in worlds and chain[-1] in parents:
+            chain.append(parents[chain[-1]])
+        for index in reversed(chain):
+            if index not in worlds:
+                above = worlds[parents[index]] if index in parents else np.eye(4)
+                with np.errstate(over="ignore", invalid="ignore"):  # refused by `pose`
+                    worlds[index] = above @ local_matrix(nodes[index])
+    bound = np.stack([worlds[joint] for joint in joints]) if joints else np.zeros((0, 4, 4))
+    if "inverseBindMatrices" not in skin:
+        return bound
+    accessor = skin.integer("inverseBindMatrices")
+    if file.count(accessor, skin, "inverseBindMatrices") < len(joints):
+        raise skin.error(f"fewer inverseBindMatrices than joints ({len(joints)})")
+    stored = file.accessor(accessor, skin, "inverseBindMatrices", ("MAT4",))[: len(joints)]
+    if stored.dtype.kind != "f":
+        raise skin.error("inverseBindMatrices are not floats")
+    inverse = stored.astype(np.float64).reshape(-1, 4, 4).transpose(0, 2, 1)
+    with np.errstate(over="ignore", invalid="ignore"):
+        return np.asarray(bound @ inverse)
+
+
 def check_invertible(node: Entry, world: Matrix, which: str = "") -> None:
     """Refuse a transform that flattens the mesh or overflows."""
     linear = world[:3, :3]
@@ -276,10 +321,12 @@ def check_invertible(node: Entry, world: Matrix, which: str = "") -> None:
         )
 
 
-def check_counts(file: GltfFile, placed: list[tuple[Entry, Matrix]], limits: AssetLimits) -> None:
+def check_counts(
+    file: GltfFile, placed: list[tuple[Entry, Matrix, Matrix | None]], limits: AssetLimits
+) -> None:
     """Refuse more triangles or vertices than the limit, before any is read."""
     triangle_count = vertex_count = 0
-    for entry, _ in placed:
+    for entry, _, _ in placed:
         attributes = entry.child("attributes")
         vertices = file.count(attributes.integer("POSITION"), entry, "POSITION")
         corners = vertices
@@ -402,6 +449,59 @@ def read_colors(stored: NDArray[Any] | None, entry: Entry, notices: list[str]) -
     colors = np.ones((len(stored), 4), dtype=np.float32)
     colors[:, : stored.shape[1]] = np.clip(stored, 0, 1)
     return colors
+
+
+def pose(file: GltfFile, entry: Entry, geometry: Geometry, joints: Matrix) -> Geometry:
+    """Move the vertices of a skinned primitive as its joints stand (linear blend skinning).
+
+    Args:
+        file: The file.
+        entry: The primitive, with JOINTS_n and WEIGHTS_n.
+        geometry: The primitive as stored.
+        joints: Matrices of `joint_matrices`, shape [joint, 4, 4].
+    """
+    attributes = entry.child("attributes")
+    count = len(geometry.positions)
+    moved = np.zeros((count, 4, 4))
+    total = np.zeros(count)
+    sets = sum(f"JOINTS_{k}" in attributes for k in range(len(attributes.value)))
+    for k in range(max(sets, 1)):
+        stored = []
+        for name in (f"JOINTS_{k}", f"WEIGHTS_{k}"):
+            found = file.count(attributes.integer(name), entry, name)
+            if found != count:
+                raise entry.error(f"{found} {name}, but {count} vertices")
+            stored.append(file.accessor(attributes.integer(name), entry, name, ("VEC4",)))
+        index, weight = stored
+        if index.dtype.kind != "u" or weight.dtype.kind != "f":
+            raise entry.error(f"JOINTS_{k} or WEIGHTS_{k} are of a wrong kind of number")
+        if index.max() >= len(joints):
+            raise entry.error(f"joint {index.max()} in JOINTS_{k}, but {len(joints)} joints")
+        for column in range(4):
+            moved += weight[:, column, None, None] * joints[index[:, column]]
+            total += weight[:, column]
+    if not (total > 0.0).all():
+        raise entry.error(f"vertex {int(np.argmin(total > 0.0))} has no weight")
+    moved /= total[:, None, None]
+    linear = moved[:, :3, :3]
+    volume = np.linalg.norm(linear, axis=1).prod(axis=1)
+    sign = np.linalg.det(linear)
+    if not ((np.abs(moved) < EXTENT).all() and (np.abs(sign) > 1e-9 * volume).all()):
+        raise entry.error("the joints flatten the mesh, or are beyond all bounds")
+    mirrored = bool(np.median(sign) < 0)
+    normals, tangents = geometry.normals, geometry.tangents
+    if normals is not None:
+        normals = unit(np.einsum("vk,vkj->vj", normals, np.linalg.inv(linear)))
+    if tangents is not None:
+        turned = unit(np.einsum("vjk,vk->vj", linear, tangents[:, :3]))
+        tangents = np.column_stack([turned, tangents[:, 3] * (-1 if mirrored else 1)])
+    return replace(
+        geometry,
+        positions=np.einsum("vjk,vk->vj", linear, geometry.positions) + moved[:, :3, 3],
+        indices=np.ascontiguousarray(geometry.indices[:, ::-1]) if mirrored else geometry.indices,
+        normals=normals,
+        tangents=None if tangents is None else tangents.astype(np.float32),
+    )
 
 
 def place(geometry: Geometry, world: Matrix, material: int) -> Primitive:

@@ -30,7 +30,7 @@ COMPONENTS: dict[int, np.dtype[Any]] = {
     5125: np.dtype("<u4"),
     5126: np.dtype("<f4"),
 }
-WIDTHS = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4}
+WIDTHS = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4, "MAT4": 16}
 ZERO_BYTES = 256 << 20
 """Largest sparse accessor that begins as zeros and not as a buffer view [byte]."""
 RE_EXPORT_MESH = "re-export without mesh compression (Draco, meshopt)"

@@ -32,6 +32,12 @@ OPTION_WIDTHS = {
     "-mm": 2, "-o": 3, "-s": 3, "-t": 3, "-texres": 1, "-type": 1,
 }  # fmt: skip
 """How many values follow an option of a map, at most."""
+NUMBERS = ("kd", "ks", "ke", "ns", "ni", "d", "tr", "pr", "pm", "pc", "pcr")
+"""Statements whose numbers are read."""
+MAPS = ("map_kd", "map_d", "map_pr", "map_pm", "map_ke", "map_bump", "norm")
+"""Maps that are read; ``bsdf pbr`` has map_Ks too."""
+MEANINGLESS = ("ka", "illum", "sharpness")
+"""Statements that say nothing to a path tracer."""
 HONOURED_OPTIONS = {"-bm", "-clamp", "-o", "-s", "-type"}
 
 
@@ -61,6 +67,8 @@ class MtlEntry:
     maps: dict[str, MapStatement] = field(default_factory=dict)
     is_pbr: bool = False
     """Whether ``bsdf pbr`` was stated."""
+    left_out: list[str] = field(default_factory=list)
+    """Other statements, which may matter to the picture."""
 
 
 class MaterialLibrary:
@@ -160,7 +168,7 @@ class MaterialLibrary:
             elif key.startswith("map_") or key in ("norm", "bump"):
                 key = "map_bump" if key == "bump" else key
                 entry.maps[key] = self._parse_map(words[1:], where, str(PurePosixPath(file).parent))
-            elif key in ("kd", "ks", "ke", "ns", "ni", "d", "tr", "pr", "pm"):
+            elif key in NUMBERS:
                 if key[0] == "k" and words[1:2] in (["spectral"], ["xyz"]):
                     raise InputError(self.path, f"{where}: {words[0]} {words[1]}, expected RGB")
                 values = words[2:] if words[1:2] == ["-halo"] else words[1:]
@@ -169,6 +177,8 @@ class MaterialLibrary:
                 entry.numbers[key] = numbers * 3 if key[0] == "k" and len(numbers) == 1 else numbers
                 if key[0] == "k" and len(entry.numbers[key]) != 3:
                     raise InputError(self.path, f"{where}: {raw.strip()[:60]!r}, expected RGB")
+            elif key not in MEANINGLESS:
+                entry.left_out.append(words[0])
 
     def _numbers(self, words: list[str], where: str, raw: str) -> tuple[float, ...]:
         try:
@@ -226,8 +236,13 @@ class MaterialLibrary:
         clamped = tuple(min(max(value, 0.0), 1.0) for value in color)
         if clamped != color:
             self.notices.append(f"material {name!r}: Kd clamped to 0 ... 1")
-        if entry.numbers.get("ni", (1.5,))[0] not in (1.0, 1.45, 1.5):
-            self.notices.append(f"material {name!r}: Ni ignored, 1.5 is used")
+        read = (*MAPS, "map_ks") if entry.is_pbr else MAPS
+        left_out = [*entry.left_out, *(key for key in maps if key not in read and key != "map_ka")]
+        if left_out:
+            self.notices.append(f"material {name!r}: {', '.join(left_out)[:80]} ignored")
+        ior = entry.numbers.get("ni", (1.0,))[0]
+        if ior < 1.0:
+            self.notices.append(f"material {name!r}: Ni {ior:g} below 1, 1.5 is used")
         return Material(
             name=name,
             base_color=(clamped[0], clamped[1], clamped[2]),
@@ -238,6 +253,10 @@ class MaterialLibrary:
             alpha_mode="MASK" if "map_d" in maps else "BLEND" if alpha < 1 else "OPAQUE",
             double_sided=True,
             normal_scale=1.0 if normal_statement is None else normal_statement.bump,
+            # Old exporters write Ni 1 for whatever is not glass, and it would reflect nothing.
+            ior=ior if ior > 1.0 else Material.ior,
+            clearcoat=self._share(name, entry, "pc"),
+            clearcoat_roughness=self._share(name, entry, "pcr"),
             base_color_texture=base,
             metallic_roughness_texture=surface,
             normal_texture=normal,
@@ -256,6 +275,13 @@ class MaterialLibrary:
         if value is None and key == "kd":
             self.notices.append(f"material {name!r}: no Kd, grey {default[0]:g} assumed")
         return default if value is None else value
+
+    def _share(self, name: str, entry: MtlEntry, key: str) -> float:
+        """Return a number between 0 and 1, 0 when absent."""
+        (value, *_) = entry.numbers.get(key, (0.0,))
+        if not 0.0 <= value <= 1.0:
+            self.notices.append(f"material {name!r}: {key.title()} {value:g} clamped to 0 ... 1")
+        return min(max(value, 0.0), 1.0)
 
     def _opacity(self, name: str, entry: MtlEntry) -> float:
         if "d" in entry.numbers:
