@@ -281,10 +281,10 @@ def _place(
 def _read_proxy(path: str) -> Asset:
     """Read the mesh of the place; of its materials nothing is used."""
     asset = load_asset(path, "grey")
+    notices = [n for n in asset.notices if "material" not in n and "texture" not in n]
     if any(m.alpha_mode != "OPAQUE" for m in asset.materials):
-        notice = "the opacity of its materials is not used: all of the mesh blocks light"
-        return replace(asset, notices=(*asset.notices, notice))
-    return asset
+        notices.append("the opacity of its materials is not used: all of the mesh blocks light")
+    return replace(asset, notices=tuple(notices))
 
 
 def _about_mesh(
