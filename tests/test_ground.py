@@ -15,10 +15,10 @@ from warpir.camera import Camera, camera_from_fov
 from warpir.camera_source import PhotoCamera, turned
 from warpir.config import InsertConfig
 from warpir.errors import ExitCode, InputError
-from warpir.files import read_photo
 from warpir.free_space import Cloud, find_place, points_in_way
 from warpir.ground import fit_ground, in_view
 from warpir.inputs import read_inputs
+from warpir.photo_files import read_photo
 from warpir.photo_world import make_world
 from warpir.placement import Placement, place_asset, y_to
 from warpir.point_cloud import read_point_cloud

@@ -8,8 +8,8 @@ import OpenImageIO as oiio
 import pytest
 
 from warpir.camera import Camera
-from warpir.files import read_photo
 from warpir.lens import STRAIGHT, Lens
+from warpir.photo_files import read_photo
 from warpir.undistort import BAND_ROWS, source_positions, undistort_photo, undistorted
 
 BARREL = Lens((-0.2, 0.05, 0.003, -0.002), (0.002, -0.001))
