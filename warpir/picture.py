@@ -69,6 +69,7 @@ def make_picture(
     curve_fg: ToneKnots,
     curve_shadow: ToneKnots,
     is_reinhard: bool = True,
+    *,
     occluder: FloatArray | None = None,
     shadow_mask: ShadowMask | None = None,
 ) -> Picture:
