@@ -31,26 +31,29 @@ NOTICES = 40
 Pixels = NDArray[np.uint8]
 
 
-def read_regular(path: Path, where: str | Path, pointer: str = "") -> bytes:
+def read_regular(
+    path: Path, where: str | Path, pointer: str = "", limit: int = FILE_BYTES
+) -> bytes:
     """Return the content of a regular file, refusing folders, devices, pipes and giants.
 
     Args:
         path: The file to read.
         where: The asset that is named in an error.
         pointer: The place in the asset that refers to ``path``, ending in ``: ``, or empty.
+        limit: Largest size [byte].
 
     Raises:
-        InputError: It cannot be read, is empty, or is larger than ``FILE_BYTES``.
+        InputError: It cannot be read, is empty, or is larger than ``limit``.
     """
     named = "" if Path(where) == path else f"{path.name}: "
     try:
         status = path.stat()
         if not stat.S_ISREG(status.st_mode):
             raise InputError(where, f"{pointer}{named}not a regular file")
-        if status.st_size > FILE_BYTES:
+        if status.st_size > limit:
             raise InputError(
                 where,
-                f"{pointer}{named}too large (found {status.st_size} bytes; limit {FILE_BYTES})",
+                f"{pointer}{named}too large (found {status.st_size} bytes; limit {limit})",
             )
         content = path.read_bytes()
     except OSError as error:

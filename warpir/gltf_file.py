@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from warpir.asset_files import read_regular, read_uri
+from warpir.asset_files import FILE_BYTES, read_regular, read_uri
 from warpir.errors import InputError
 from warpir.strict_json import parse_json_object
 
@@ -163,7 +163,8 @@ class GltfFile:
 
     def __init__(self, path: Path) -> None:
         self.path = path
-        content = read_regular(path, path)
+        is_text = path.suffix.lower() == ".gltf"
+        content = read_regular(path, path, limit=JSON_BYTES if is_text else FILE_BYTES)
         self._binary: memoryview | None = None
         if content[:4] == b"glTF" or path.suffix.lower() == ".glb":
             text = self._open_container(content)
