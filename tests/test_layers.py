@@ -18,7 +18,7 @@ LEVELS = (
     {"camera", "asset_files", "record", "progress", "light", "tone", "curves", "materials_file"},
     {
         "gltf_file", "mtl", "files", "command", "placement", "lobes_file", "lobe_fit", "regressor",
-        "light_errors",
+        "light_errors", "sheen",
     },
     {
         "gltf_material", "obj", "reuse", "program", "regressor_training", "training_lights",

@@ -1,6 +1,6 @@
 """Reads the material files of OBJ (MTL) into `Material`.
 
-Physically based keys are used where the file has them (``Pr Pm Ke norm`` and their maps, as in
+Physically based keys are used where the file has them (``Pr Pm Ke norm`` and their maps; ``Pc Pcr Ps Ni`` without maps; as in
 https://benhouston3d.com/blog/extended-wavefront-obj-mtl-for-pbr/). ``bsdf pbr`` (nvdiffrec)
 makes ``Ks`` mean (occlusion, roughness, metallic). What older files leave open is assumed and
 noted. OBJ knows no back faces, so all materials are double-sided.
@@ -157,7 +157,7 @@ class MaterialLibrary:
             elif key.startswith("map_") or key in ("norm", "bump"):
                 key = "map_bump" if key == "bump" else key
                 entry.maps[key] = self._parse_map(words[1:], where, str(PurePosixPath(file).parent))
-            elif key in ("kd", "ks", "ke", "ns", "ni", "d", "tr", "pr", "pm"):
+            elif key in ("kd", "ks", "ke", "ns", "ni", "d", "tr", "pr", "pm", "pc", "pcr", "ps"):
                 if key[0] == "k" and words[1:2] in (["spectral"], ["xyz"]):
                     raise InputError(self.path, f"{where}: {words[0]} {words[1]}, expected RGB")
                 values = words[2:] if words[1:2] == ["-halo"] else words[1:]
@@ -223,8 +223,9 @@ class MaterialLibrary:
         clamped = tuple(min(max(value, 0.0), 1.0) for value in color)
         if clamped != color:
             self.notices.append(f"material {name!r}: Kd clamped to 0 ... 1")
-        if entry.numbers.get("ni", (1.5,))[0] not in (1.0, 1.45, 1.5):
-            self.notices.append(f"material {name!r}: Ni ignored, 1.5 is used")
+        sheen = self._share(name, entry, "ps")
+        if sheen > 0.0:
+            self.notices.append(f"material {name!r}: sheen of roughness {ROUGHNESS} assumed")
         return Material(
             name=name,
             base_color=(clamped[0], clamped[1], clamped[2]),
@@ -235,6 +236,11 @@ class MaterialLibrary:
             alpha_mode="MASK" if "map_d" in maps else "BLEND" if alpha < 1 else "OPAQUE",
             double_sided=True,
             normal_scale=1.0 if normal_statement is None else normal_statement.bump,
+            ior=self._ior(name, entry),
+            clearcoat=self._share(name, entry, "pc"),
+            clearcoat_roughness=self._share(name, entry, "pcr"),
+            sheen_color=(sheen, sheen, sheen),
+            sheen_roughness=ROUGHNESS if sheen > 0.0 else 0.0,
             base_color_texture=base,
             metallic_roughness_texture=surface,
             normal_texture=normal,
@@ -253,6 +259,22 @@ class MaterialLibrary:
         if value is None and key == "kd":
             self.notices.append(f"material {name!r}: no Kd, grey {default[0]:g} assumed")
         return default if value is None else value
+
+    def _share(self, name: str, entry: MtlEntry, key: str) -> float:
+        """Return a number from 0 to 1, 0 where it is not stated."""
+        value = entry.numbers.get(key, (0.0,))[0]
+        if not 0.0 <= value <= 1.0:
+            self.notices.append(f"material {name!r}: {key.title()} {value:g} clamped to 0 ... 1")
+        return min(max(value, 0.0), 1.0)
+
+    def _ior(self, name: str, entry: MtlEntry) -> float:
+        """Return the index of refraction; exporters write 1 (and 0) for materials without one."""
+        ior = entry.numbers.get("ni", (1.5,))[0]
+        if ior > 1.0:
+            return ior
+        if ior not in (0.0, 1.0):
+            self.notices.append(f"material {name!r}: Ni {ior:g} ignored, 1.5 is used")
+        return 1.5
 
     def _opacity(self, name: str, entry: MtlEntry) -> float:
         if "d" in entry.numbers:
