@@ -24,6 +24,7 @@ from tests.shapes import all_pixels, camera, constant, ground, placed, quad
 from warpir.asset import Material, Primitive
 from warpir.kernels.brdf import brdf_eval, brdf_sample
 from warpir.kernels.frame import basis
+from warpir.kernels.types import Layers
 from warpir.render import Renderer, light_args
 from warpir.scene import Scene
 
@@ -56,7 +57,7 @@ def eval_kernel(
 ):
     """Value and density of the material."""
     i = wp.tid()
-    value = brdf_eval(wo[i], wi[i], base_color[i], metallic[i], roughness[i])
+    value = brdf_eval(wo[i], wi[i], base_color[i], metallic[i], roughness[i], Layers())
     f[i] = value.diffuse + value.specular
     pdf[i] = value.pdf
 
@@ -65,7 +66,7 @@ def eval_kernel(
 def sample_kernel(wo: wp.vec3, u: wp.array[wp.vec2], roughness: float, wi: wp.array[wp.vec3]):
     """Draw directions from given numbers."""
     i = wp.tid()
-    wi[i] = brdf_sample(wo, u[i], 0.5, wp.vec3(1.0), 1.0, roughness)
+    wi[i] = brdf_sample(wo, u[i], 0.5, wp.vec3(1.0), 1.0, roughness, Layers())
 
 
 @wp.kernel(enable_backward=False)

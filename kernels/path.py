@@ -114,7 +114,14 @@ def scatter(
     wi_local = to_local(wi, frame)
     out.wi_light = wi
     if wi_local[2] > 0.0 and wp.dot(wi, surface.ng) > 0.0 and wo_local[2] > 0.0:
-        f = brdf_eval(wo_local, wi_local, surface.base_color, surface.metallic, surface.roughness)
+        f = brdf_eval(
+            wo_local,
+            wi_local,
+            surface.base_color,
+            surface.metallic,
+            surface.roughness,
+            surface.layers,
+        )
         Li = light_eval(light, wi)
         out.f_light = f.diffuse + f.specular
         out.L_light = Li.radiance
@@ -136,11 +143,19 @@ def scatter(
         surface.base_color,
         surface.metallic,
         surface.roughness,
+        surface.layers,
     )
     wi = to_world(wi_local, frame)
     out.wi_brdf = wi
     if wi_local[2] > 0.0 and wp.dot(wi, surface.ng) > 0.0 and wo_local[2] > 0.0:
-        f = brdf_eval(wo_local, wi_local, surface.base_color, surface.metallic, surface.roughness)
+        f = brdf_eval(
+            wo_local,
+            wi_local,
+            surface.base_color,
+            surface.metallic,
+            surface.roughness,
+            surface.layers,
+        )
         if f.pdf > 0.0:
             origin = offset_origin(surface.position, surface.ng, wi, mesh.epsilon)
             escaped = float(0.0)
@@ -195,6 +210,8 @@ def keep_surface(record: VertexRecord, i: int, j: int, surface: Surface, wo: wp.
     record.incident_light[i, j] = wp.vec3(0.0)
     record.incident_brdf[i, j] = wp.vec3(0.0)
     record.weight_next[i, j] = 0.0
+    if record.layers.shape[1] > 0:
+        record.layers[i, j] = surface.layers
 
 
 @wp.func

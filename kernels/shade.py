@@ -10,7 +10,17 @@ import warp as wp
 
 from warpir.kernels.brdf import brdf_eval
 from warpir.kernels.frame import basis, to_local
-from warpir.kernels.types import VertexRecord
+from warpir.kernels.types import Layers, VertexRecord
+
+
+@wp.func
+def layers_of(record: VertexRecord, i: int, j: int) -> Layers:
+    """Return the extensions at a vertex."""
+    if record.layers.shape[1] > 0:
+        return record.layers[i, j]
+    layers = Layers()
+    layers.present = 0
+    return layers
 
 
 @wp.kernel
@@ -54,13 +64,14 @@ def shade_vertex(
     metal = metallic[m] * record.texture_metallic[i, j]
     rough = roughness[m] * record.texture_roughness[i, j]
     frame = basis(record.n[i, j])
+    layers = layers_of(record, i, j)
     wo = to_local(record.wo[i, j], frame)
     gathered = wp.cw_mul(emission[m], record.texture_emission[i, j])
 
     incident_light = record.incident_light[i, j]
     if wp.max(incident_light) > 0.0:
         wi = to_local(record.wi_light[i, j], frame)
-        f_light = brdf_eval(wo, wi, color, metal, rough)
+        f_light = brdf_eval(wo, wi, color, metal, rough, layers)
         gathered = gathered + wp.cw_mul(f_light.diffuse + f_light.specular, incident_light)
 
     incident_brdf = record.incident_brdf[i, j]
@@ -68,7 +79,7 @@ def shade_vertex(
     onward = wp.vec3(0.0)
     if wp.max(incident_brdf) > 0.0 or weight_next > 0.0:
         wi2 = to_local(record.wi_brdf[i, j], frame)
-        f_brdf = brdf_eval(wo, wi2, color, metal, rough)
+        f_brdf = brdf_eval(wo, wi2, color, metal, rough, layers)
         f = f_brdf.diffuse + f_brdf.specular
         onward = f * weight_next
         gathered = gathered + wp.cw_mul(f, incident_brdf)

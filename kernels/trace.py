@@ -5,9 +5,18 @@ Detached: no backward pass.
 
 import warp as wp
 
+from warpir.kernels.brdf import F0_COAT, layers_toward, luminance, schlick
+from warpir.kernels.frame import basis, to_local
 from warpir.kernels.proxy_mesh import INFINITY, proxy_distance, proxy_mesh_hit
 from warpir.kernels.rng import hash_pair, pixel_seed, sobol_pair, to_unit
-from warpir.kernels.types import CameraArgs, MaterialArgs, MeshArgs, ProxyArgs, TextureArgs
+from warpir.kernels.types import (
+    CameraArgs,
+    Layers,
+    MaterialArgs,
+    MeshArgs,
+    ProxyArgs,
+    TextureArgs,
+)
 
 wp.set_module_options({"enable_backward": False})
 
@@ -18,6 +27,14 @@ SLOT_BASE_COLOR = wp.constant(0)
 SLOT_METALLIC_ROUGHNESS = wp.constant(1)
 SLOT_NORMAL = wp.constant(2)
 SLOT_EMISSION = wp.constant(3)
+SLOT_SPECULAR = wp.constant(4)
+SLOT_SPECULAR_COLOR = wp.constant(5)
+SLOT_CLEARCOAT = wp.constant(6)
+SLOT_CLEARCOAT_ROUGHNESS = wp.constant(7)
+SLOT_CLEARCOAT_NORMAL = wp.constant(8)
+SLOT_SHEEN_COLOR = wp.constant(9)
+SLOT_SHEEN_ROUGHNESS = wp.constant(10)
+SLOT_TRANSMISSION = wp.constant(11)
 
 
 @wp.struct
@@ -50,6 +67,7 @@ class Surface:
     metallic: float
     roughness: float
     emission: wp.vec3
+    layers: Layers
 
 
 @wp.func
@@ -169,8 +187,17 @@ def slot_uv(mesh: MeshArgs, material: MaterialArgs, m: int, slot: int, hit: Hit)
 
 
 @wp.func
-def hit_alpha(mesh: MeshArgs, material: MaterialArgs, texture: TextureArgs, hit: Hit) -> float:
-    """Return the opacity at a hit: 1 for opaque materials, 0 or 1 for masked ones."""
+def face_normal(mesh: MeshArgs, face: int) -> wp.vec3:
+    """Return the unit geometric normal of a triangle."""
+    a = mesh.positions[mesh.indices[3 * face]]
+    b = mesh.positions[mesh.indices[3 * face + 1]]
+    c = mesh.positions[mesh.indices[3 * face + 2]]
+    return wp.normalize(wp.cross(b - a, c - a))
+
+
+@wp.func
+def hit_coverage(mesh: MeshArgs, material: MaterialArgs, texture: TextureArgs, hit: Hit) -> float:
+    """Return the coverage at a hit: 1 for opaque materials, 0 or 1 for masked ones."""
     m = mesh.face_material[hit.face]
     if material.alpha_mode[m] == 0:
         return 1.0
@@ -191,21 +218,132 @@ def hit_alpha(mesh: MeshArgs, material: MaterialArgs, texture: TextureArgs, hit:
 
 
 @wp.func
+def read_slot(
+    mesh: MeshArgs,
+    material: MaterialArgs,
+    texture: TextureArgs,
+    m: int,
+    slot: int,
+    hit: Hit,
+    is_color: int,
+) -> wp.vec4:
+    """Return what a slot of material ``m`` multiplies its factor with; 1 without a texture."""
+    k = material.slot_texture[m, slot]
+    if k < 0:
+        return wp.vec4(1.0, 1.0, 1.0, 1.0)
+    return sample_texture(texture, k, slot_uv(mesh, material, m, slot, hit), is_color)
+
+
+@wp.func
+def vertex_color(mesh: MeshArgs, hit: Hit) -> wp.vec3:
+    """Interpolate the factors on the base colour, linear RGB [1]."""
+    a = mesh.colors[mesh.indices[3 * hit.face]]
+    b = mesh.colors[mesh.indices[3 * hit.face + 1]]
+    c = mesh.colors[mesh.indices[3 * hit.face + 2]]
+    color = a * hit.u + b * hit.v + c * (1.0 - hit.u - hit.v)
+    return wp.vec3(color[0], color[1], color[2])
+
+
+@wp.func
+def smooth_normal(mesh: MeshArgs, hit: Hit) -> wp.vec3:
+    """Interpolate the unit shading normal, before any map."""
+    a = mesh.normals[mesh.indices[3 * hit.face]]
+    b = mesh.normals[mesh.indices[3 * hit.face + 1]]
+    c = mesh.normals[mesh.indices[3 * hit.face + 2]]
+    n = a * hit.u + b * hit.v + c * (1.0 - hit.u - hit.v)
+    if wp.dot(n, n) > 1.0e-12:
+        return wp.normalize(n)
+    return face_normal(mesh, hit.face)
+
+
+@wp.func
+def dielectric_f0(
+    mesh: MeshArgs, material: MaterialArgs, texture: TextureArgs, m: int, hit: Hit
+) -> wp.vec4:
+    """Return the dielectric's reflectance at normal incidence, unclamped, and its strength."""
+    color = read_slot(mesh, material, texture, m, SLOT_SPECULAR_COLOR, hit, 1)
+    strength = (
+        material.specular[m] * read_slot(mesh, material, texture, m, SLOT_SPECULAR, hit, 0)[3]
+    )
+    f0 = wp.cw_mul(material.f0[m], wp.vec3(color[0], color[1], color[2]))
+    return wp.vec4(f0[0], f0[1], f0[2], strength)
+
+
+@wp.func
+def clearcoat_at(
+    mesh: MeshArgs, material: MaterialArgs, texture: TextureArgs, m: int, hit: Hit
+) -> float:
+    """Return the share of a point that the clear coat covers."""
+    clearcoat = material.clearcoat[m]
+    if clearcoat > 0.0:
+        clearcoat *= read_slot(mesh, material, texture, m, SLOT_CLEARCOAT, hit, 0)[0]
+    return clearcoat
+
+
+@wp.func
+def transmission_at(
+    mesh: MeshArgs, material: MaterialArgs, texture: TextureArgs, m: int, hit: Hit
+) -> float:
+    """Return the share of what enters the dielectric that leaves on the other side."""
+    transmission = material.transmission[m]
+    if transmission > 0.0:
+        transmission *= read_slot(mesh, material, texture, m, SLOT_TRANSMISSION, hit, 0)[0]
+    return transmission
+
+
+@wp.func
+def transmitted_share(
+    mesh: MeshArgs,
+    material: MaterialArgs,
+    texture: TextureArgs,
+    m: int,
+    hit: Hit,
+    direction: wp.vec3,
+) -> float:
+    """Return the share of light that passes a thin transmissive wall straight on.
+
+    KHR_materials_transmission for a surface of roughness 0, its tint reduced to luminance: what
+    coat and dielectric do not reflect toward ``direction``, times the base colour. The Fresnel
+    terms are those of the interpolated normal, so that rays need not read normal maps.
+    """
+    transmission = transmission_at(mesh, material, texture, m, hit)
+    if transmission <= 0.0:
+        return 0.0
+    code = read_slot(mesh, material, texture, m, SLOT_BASE_COLOR, hit, 1)
+    color = wp.cw_mul(vertex_color(mesh, hit), wp.vec3(code[0], code[1], code[2]))
+    tint = luminance(wp.cw_mul(material.base_color[m], color))
+    metallic = (
+        material.metallic[m]
+        * read_slot(mesh, material, texture, m, SLOT_METALLIC_ROUGHNESS, hit, 0)[2]
+    )
+    weight = schlick(wp.abs(wp.dot(smooth_normal(mesh, hit), direction)))
+    f0 = dielectric_f0(mesh, material, texture, m, hit)
+    reflected = wp.min(wp.max(wp.vec3(f0[0], f0[1], f0[2])), 1.0)
+    reflected = f0[3] * (reflected + (1.0 - reflected) * weight)
+    coat = clearcoat_at(mesh, material, texture, m, hit)
+    coat = coat * (F0_COAT + (1.0 - F0_COAT) * weight)
+    return transmission * (1.0 - metallic) * tint * (1.0 - reflected) * (1.0 - coat)
+
+
+@wp.func
+def hit_alpha(
+    mesh: MeshArgs, material: MaterialArgs, texture: TextureArgs, hit: Hit, ray_dir: wp.vec3
+) -> float:
+    """Return the share of rays that a hit stops: its coverage, less what passes the material."""
+    alpha = hit_coverage(mesh, material, texture, hit)
+    m = mesh.face_material[hit.face]
+    if material.transmission[m] > 0.0 and alpha > 0.0:
+        alpha *= 1.0 - transmitted_share(mesh, material, texture, m, hit, ray_dir)
+    return alpha
+
+
+@wp.func
 def hit_position(mesh: MeshArgs, hit: Hit) -> wp.vec3:
     """Interpolate the position from the corners, which is more precise than ``o + t d``."""
     a = mesh.positions[mesh.indices[3 * hit.face]]
     b = mesh.positions[mesh.indices[3 * hit.face + 1]]
     c = mesh.positions[mesh.indices[3 * hit.face + 2]]
     return a * hit.u + b * hit.v + c * (1.0 - hit.u - hit.v)
-
-
-@wp.func
-def face_normal(mesh: MeshArgs, face: int) -> wp.vec3:
-    """Return the unit geometric normal of a triangle."""
-    a = mesh.positions[mesh.indices[3 * face]]
-    b = mesh.positions[mesh.indices[3 * face + 1]]
-    c = mesh.positions[mesh.indices[3 * face + 2]]
-    return wp.normalize(wp.cross(b - a, c - a))
 
 
 @wp.func
@@ -277,7 +415,7 @@ def closest_hit(
                     if twin.valid == 1:
                         hit = twin
         if accept == 1 and material.any_alpha == 1:
-            alpha = hit_alpha(mesh, material, texture, hit)
+            alpha = hit_alpha(mesh, material, texture, hit, ray_dir)
             if alpha < 1.0:
                 if to_unit(hash_pair(key, wp.uint32(layer))) >= alpha:
                     accept = 0
@@ -355,7 +493,7 @@ def visibility(
         hit.face = query.face
         hit.u = query.u
         hit.v = query.v
-        transmitted = transmitted * (1.0 - hit_alpha(mesh, material, texture, hit))
+        transmitted = transmitted * (1.0 - hit_alpha(mesh, material, texture, hit, ray_dir))
         if transmitted <= 0.0:
             return 0.0
         origin = offset_origin(
@@ -370,15 +508,17 @@ def mapped_normal(
     material: MaterialArgs,
     texture: TextureArgs,
     m: int,
+    slot: int,
+    strength: float,
     hit: Hit,
     n: wp.vec3,
 ) -> wp.vec3:
-    """Apply the normal map of material ``m`` to the interpolated normal ``n``.
+    """Apply a normal map of material ``m``, of that strength, to the interpolated normal ``n``.
 
     Tangents come from the asset, or from the triangle's UVs. The map's green axis points to the top
     of the image, that is against v.
     """
-    k = material.slot_texture[m, SLOT_NORMAL]
+    k = material.slot_texture[m, slot]
     if k < 0:
         return n
     a = mesh.indices[3 * hit.face]
@@ -392,7 +532,7 @@ def mapped_normal(
         uv_a = mesh.uv0[a]
         uv_b = mesh.uv0[b]
         uv_c = mesh.uv0[c]
-        if material.slot_uv_set[m, SLOT_NORMAL] == 1:
+        if material.slot_uv_set[m, slot] == 1:
             uv_a = mesh.uv1[a]
             uv_b = mesh.uv1[b]
             uv_c = mesh.uv1[c]
@@ -416,10 +556,9 @@ def mapped_normal(
         return n
     t = wp.normalize(t)
     bitangent = wp.cross(n, t) * handedness
-    code = sample_texture(texture, k, slot_uv(mesh, material, m, SLOT_NORMAL, hit), 0)
-    scale = material.normal_scale[m]
-    x = (2.0 * code[0] - 1.0) * scale
-    y = (2.0 * code[1] - 1.0) * scale
+    code = sample_texture(texture, k, slot_uv(mesh, material, m, slot, hit), 0)
+    x = (2.0 * code[0] - 1.0) * strength
+    y = (2.0 * code[1] - 1.0) * strength
     z = 2.0 * code[2] - 1.0
     mapped = t * x + bitangent * y + n * z
     if wp.dot(mapped, mapped) < 1.0e-12:
@@ -428,35 +567,78 @@ def mapped_normal(
 
 
 @wp.func
+def facing(n: wp.vec3, ng: wp.vec3, wo: wp.vec3) -> wp.vec3:
+    """Return ``n``, or ``ng`` where it faces away from a viewer who sees the triangle.
+
+    Interpolated and mapped normals may.
+    """
+    if wp.dot(n, wo) <= 0.0:
+        return ng
+    return n
+
+
+@wp.func
+def layers_at(
+    mesh: MeshArgs,
+    material: MaterialArgs,
+    texture: TextureArgs,
+    m: int,
+    hit: Hit,
+    n: wp.vec3,
+    coat_n: wp.vec3,
+    wo: wp.vec3,
+) -> Layers:
+    """Read the extensions of material ``m`` at a hit; both normals face ``wo``."""
+    frame = basis(n)
+    f0 = dielectric_f0(mesh, material, texture, m, hit)
+    transmission = transmission_at(mesh, material, texture, m, hit)
+    transmitted = float(0.0)
+    if transmission > 0.0:
+        transmitted = transmitted_share(mesh, material, texture, m, hit, wo)
+    sheen_color = material.sheen_color[m]
+    sheen_roughness = material.sheen_roughness[m]
+    if wp.max(sheen_color) > 0.0:
+        color = read_slot(mesh, material, texture, m, SLOT_SHEEN_COLOR, hit, 1)
+        sheen_color = wp.cw_mul(sheen_color, wp.vec3(color[0], color[1], color[2]))
+        sheen_roughness *= read_slot(mesh, material, texture, m, SLOT_SHEEN_ROUGHNESS, hit, 0)[3]
+    coat_roughness = material.clearcoat_roughness[m]
+    coat_roughness *= read_slot(mesh, material, texture, m, SLOT_CLEARCOAT_ROUGHNESS, hit, 0)[1]
+    return layers_toward(
+        to_local(wo, frame),
+        wp.vec3(f0[0], f0[1], f0[2]),
+        f0[3],
+        transmission,
+        transmitted,
+        sheen_color,
+        sheen_roughness,
+        material.sheen_albedo,
+        clearcoat_at(mesh, material, texture, m, hit),
+        coat_roughness,
+        to_local(coat_n, frame),
+    )
+
+
+@wp.func
 def surface_at(
     mesh: MeshArgs, material: MaterialArgs, texture: TextureArgs, hit: Hit, wo: wp.vec3
 ) -> Surface:
     """Gather everything that shading needs at a hit."""
-    a = mesh.indices[3 * hit.face]
-    b = mesh.indices[3 * hit.face + 1]
-    c = mesh.indices[3 * hit.face + 2]
-    w = 1.0 - hit.u - hit.v
     m = mesh.face_material[hit.face]
     s = Surface()
     s.position = hit_position(mesh, hit)
     s.material = m
     s.ng = face_normal(mesh, hit.face)
-    n = mesh.normals[a] * hit.u + mesh.normals[b] * hit.v + mesh.normals[c] * w
-    if wp.dot(n, n) > 1.0e-12:
-        n = wp.normalize(n)
-    else:
-        n = s.ng
-    n = mapped_normal(mesh, material, texture, m, hit, n)
+    smooth_n = smooth_normal(mesh, hit)
+    n = mapped_normal(
+        mesh, material, texture, m, SLOT_NORMAL, material.normal_scale[m], hit, smooth_n
+    )
+    side = float(1.0)
     if wp.dot(s.ng, wo) < 0.0:
-        s.ng = -s.ng
-        n = -n
-    # Interpolated and mapped normals may face away from a viewer who sees the triangle.
-    if wp.dot(n, wo) <= 0.0:
-        n = s.ng
-    s.n = n
+        side = -1.0
+    s.ng = s.ng * side
+    s.n = facing(n * side, s.ng, wo)
 
-    color = mesh.colors[a] * hit.u + mesh.colors[b] * hit.v + mesh.colors[c] * w
-    s.texture_color = wp.vec3(color[0], color[1], color[2])
+    s.texture_color = vertex_color(mesh, hit)
     k = material.slot_texture[m, SLOT_BASE_COLOR]
     if k >= 0:
         uv = slot_uv(mesh, material, m, SLOT_BASE_COLOR, hit)
@@ -479,6 +661,22 @@ def surface_at(
     s.base_color = wp.cw_mul(material.base_color[m], s.texture_color)
     s.metallic = material.metallic[m] * s.texture_metallic
     s.roughness = material.roughness[m] * s.texture_roughness
+    s.layers.present = 0
+    if material.any_layers == 1 and material.layered[m] == 1:
+        coat_n = mapped_normal(
+            mesh,
+            material,
+            texture,
+            m,
+            SLOT_CLEARCOAT_NORMAL,
+            material.clearcoat_normal_scale[m],
+            hit,
+            smooth_n,
+        )
+        coat_n = facing(coat_n * side, s.ng, wo)
+        s.layers = layers_at(mesh, material, texture, m, hit, s.n, coat_n, wo)
+        # What shines from below the coat; all of it stands for the rays that passed too.
+        s.texture_emission = s.texture_emission * s.layers.emission_scale
     s.emission = wp.cw_mul(material.emission[m], s.texture_emission)
     return s
 

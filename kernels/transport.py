@@ -12,7 +12,12 @@ texels around it, a direction would let a sun in one texel flicker by its interp
 
 import warp as wp
 
-from warpir.kernels.brdf import brdf_eval, brdf_sample, roughness_to_alpha
+from warpir.kernels.brdf import (
+    brdf_eval,
+    brdf_sample,
+    narrowest_roughness,
+    roughness_to_alpha,
+)
 from warpir.kernels.frame import basis, to_local, to_world
 from warpir.kernels.latlong import BilinearTap, bilinear_tap, direction_to_uv, uv_to_direction
 from warpir.kernels.proxy import Receiver, proxy_point, receiver_origin
@@ -32,6 +37,7 @@ from warpir.kernels.trace import (
 )
 from warpir.kernels.types import (
     CameraArgs,
+    Layers,
     LightArgs,
     MaterialArgs,
     MeshArgs,
@@ -67,6 +73,8 @@ class SurfacePoints:
     base_color: wp.array2d[wp.vec3]
     metallic: wp.array2d[float]
     roughness: wp.array2d[float]
+    layers: wp.array2d[Layers]
+    """Without columns where no material is layered."""
 
 
 @wp.struct
@@ -129,6 +137,8 @@ def trace_points(
             points.base_color[i, count] = surface.base_color
             points.metallic[i, count] = surface.metallic
             points.roughness[i, count] = surface.roughness
+            if material.any_layers == 1:
+                points.layers[i, count] = surface.layers
             emitted += surface.emission
             count += 1
     points.count[i] = count
@@ -203,9 +213,19 @@ def texel_pdf(texels: TexelArgs, tap: BilinearTap, i: int, j: int) -> float:
 
 
 @wp.func
-def is_narrow(roughness: float, height: int) -> int:
+def layers_of(points: SurfacePoints, material: MaterialArgs, p: int, s: int) -> Layers:
+    """Return the extensions at point ``s`` of row ``p``."""
+    if material.any_layers == 1:
+        return points.layers[p, s]
+    layers = Layers()
+    layers.present = 0
+    return layers
+
+
+@wp.func
+def is_narrow(roughness: float, layers: Layers, height: int) -> int:
     """Return 1 when a specular lobe may be too narrow for one direction per texel."""
-    if roughness_to_alpha(roughness) < NARROW * PI / float(height):
+    if roughness_to_alpha(narrowest_roughness(roughness, layers)) < NARROW * PI / float(height):
         return 1
     return 0
 
@@ -257,15 +277,17 @@ def direct_row(
             if wp.dot(wi, n) > 0.0 and wp.dot(wi, ng) > 0.0:
                 frame = basis(n)
                 roughness = points.roughness[p, s]
+                layers = layers_of(points, material, p, s)
                 f = brdf_eval(
                     to_local(points.wo[p, s], frame),
                     to_local(wi, frame),
                     points.base_color[p, s],
                     points.metallic[p, s],
                     roughness,
+                    layers,
                 )
                 specular = f.specular
-                if path_count > 0 and is_narrow(roughness, texels.height) == 1:
+                if path_count > 0 and is_narrow(roughness, layers, texels.height) == 1:
                     tap = bilinear_tap(direction_to_uv(wi), texels.height, texels.width)
                     pdf = texel_pdf(texels, tap, i, j)
                     specular = specular * power_heuristic(pdf, float(path_count) * f.pdf)
@@ -414,6 +436,7 @@ def trace_paths(
     surface.base_color = points.base_color[p, s]
     surface.metallic = points.metallic[p, s]
     surface.roughness = points.roughness[p, s]
+    surface.layers = layers_of(points, material, p, s)
     wo = points.wo[p, s]
     scale = float(count) / float(subsamples * path_count)
     throughput = wp.vec3(scale, scale, scale)
@@ -435,7 +458,12 @@ def trace_paths(
             wi_local = to_local(wi, frame)
             if wi_local[2] > 0.0 and wp.dot(wi, surface.ng) > 0.0:
                 f = brdf_eval(
-                    wo_local, wi_local, surface.base_color, surface.metallic, surface.roughness
+                    wo_local,
+                    wi_local,
+                    surface.base_color,
+                    surface.metallic,
+                    surface.roughness,
+                    surface.layers,
                 )
                 expected = light_eval(proposal, wi)
                 value = wp.cw_mul(throughput, f.diffuse + f.specular)
@@ -455,11 +483,19 @@ def trace_paths(
             surface.base_color,
             surface.metallic,
             surface.roughness,
+            surface.layers,
         )
         wi = to_world(wi_local, frame)
         if wi_local[2] <= 0.0 or wp.dot(wi, surface.ng) <= 0.0:
             break
-        f = brdf_eval(wo_local, wi_local, surface.base_color, surface.metallic, surface.roughness)
+        f = brdf_eval(
+            wo_local,
+            wi_local,
+            surface.base_color,
+            surface.metallic,
+            surface.roughness,
+            surface.layers,
+        )
         if f.pdf <= 0.0:
             break
         slope = wi_local[2] / f.pdf
@@ -467,7 +503,7 @@ def trace_paths(
         escaped = float(0.0)
         place = proxy_mesh_hit(proxy, origin, wi)
         if is_last == 1 and place.valid == 0:
-            if k > 0 or is_narrow(surface.roughness, texels.height) == 1:
+            if k > 0 or is_narrow(surface.roughness, surface.layers, texels.height) == 1:
                 escaped = visibility(mesh, material, texture, origin, wi)
         else:
             ray_key = hash_pair(hash_pair(key, wp.uint32(q)), wp.uint32(k + 1))
@@ -479,7 +515,7 @@ def trace_paths(
                 wp.atomic_add(emission, p, wp.cw_mul(f_all, proxy_radiance(proxy, place)))
         if escaped > 0.0:
             if k == 0:
-                if is_narrow(surface.roughness, texels.height) == 1:
+                if is_narrow(surface.roughness, surface.layers, texels.height) == 1:
                     specular = wp.cw_mul(throughput, f.specular) * (slope * escaped)
                     drawn = float(path_count) * f.pdf
                     add_to_texels(T, p, texels, wi, wp.vec3(0.0), specular, drawn)

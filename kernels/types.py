@@ -80,8 +80,39 @@ class MeshArgs:
 
 
 @wp.struct
+class Layers:
+    """What glTF's extensions add to metallic-roughness at one point, as seen from ``wo``.
+
+    What depends on ``wo`` alone is worked out once, by `warpir.kernels.brdf.layers_toward`.
+    """
+
+    present: int
+    """1 where any of it differs from the plain model; the rest is not read otherwise."""
+    f0: wp.vec3
+    """Reflectance of the dielectric at normal incidence, strength included [1]."""
+    f90: float
+    """The same at grazing incidence [1]."""
+    matte: float
+    """Share of what enters the dielectric that its diffuse base gets [1]."""
+    base_scale: float
+    """Factor on the base below sheen and coat [1]."""
+    emission_scale: float
+    """Factor on what shines from below the coat [1]."""
+    sheen_color: wp.vec3
+    """Factor on the sheen's lobe, coat included [1]."""
+    sheen_roughness: float
+    sheen_albedo: float
+    """Share of light that the lobe reflects toward ``wo`` [1]."""
+    coat_weight: float
+    """Factor on the coat's lobe, its Fresnel term included [1]."""
+    coat_roughness: float
+    coat_n: wp.vec3
+    """Unit normal of the coat, in the shading normal's frame (`warpir.kernels.frame.basis`)."""
+
+
+@wp.struct
 class MaterialArgs:
-    """Material factors and texture slots; four slots a material: color, rough, normal, emission."""
+    """Material factors and texture slots; `warpir.kernels.trace` numbers the slots."""
 
     base_color: wp.array[wp.vec3]
     metallic: wp.array[float]
@@ -93,16 +124,31 @@ class MaterialArgs:
     alpha_cutoff: wp.array[float]
     double_sided: wp.array[int]
     normal_scale: wp.array[float]
+    layered: wp.array[int]
+    """1 where a material has more than the metallic-roughness model: the following."""
+    f0: wp.array[wp.vec3]
+    """Reflectance of the dielectric at normal incidence, colour included, unclamped [1]."""
+    specular: wp.array[float]
+    clearcoat: wp.array[float]
+    clearcoat_roughness: wp.array[float]
+    clearcoat_normal_scale: wp.array[float]
+    sheen_color: wp.array[wp.vec3]
+    sheen_roughness: wp.array[float]
+    transmission: wp.array[float]
     """All of shape [material]."""
+    sheen_albedo: wp.array2d[float]
+    """From `warpir.sheen.sheen_albedo_table`."""
     slot_texture: wp.array2d[int]
-    """Texture index or -1, shape [material, 4]."""
+    """Texture index or -1, shape [material, slot]."""
     slot_uv_set: wp.array2d[int]
-    """0 or 1, shape [material, 4]."""
+    """0 or 1, shape [material, slot]."""
     slot_u: wp.array2d[wp.vec3]
     slot_v: wp.array2d[wp.vec3]
-    """Rows of the affine UV transform, shape [material, 4]."""
+    """Rows of the affine UV transform, shape [material, slot]."""
+    any_layers: int
+    """1 when some material is layered."""
     any_alpha: int
-    """1 when some material is not opaque, so that rays must look at what they hit."""
+    """1 when some material lets rays pass, so that they must look at what they hit."""
     any_culled: int
     """1 when some material is single sided."""
     any_emission: int
@@ -195,3 +241,5 @@ class VertexRecord:
     """The same of the BRDF's direction; 0 when it met the object."""
     weight_next: wp.array2d[float]
     """``cos / pdf`` of the BRDF's direction when it met the object, else 0."""
+    layers: wp.array2d[Layers]
+    """Without columns where no material is layered."""

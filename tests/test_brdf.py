@@ -6,7 +6,8 @@ import warp as wp
 
 from tests import oracles as o
 from tests.statistics import chi_square, compare_gradients, graded_edges
-from warpir.kernels.brdf import brdf_eval, brdf_sample, specular_probability
+from warpir.kernels.brdf import brdf_eval, brdf_sample, lobe_probabilities
+from warpir.kernels.types import Layers
 
 VALUE_RTOL = 1e-4
 """float32, few operations."""
@@ -36,7 +37,7 @@ def eval_kernel(
     specular: wp.array[wp.vec3],
 ):
     i = wp.tid()
-    value = brdf_eval(wo[i], wi[i], base_color[i], metallic[i], roughness[i])
+    value = brdf_eval(wo[i], wi[i], base_color[i], metallic[i], roughness[i], Layers())
     diffuse[i] = value.diffuse
     specular[i] = value.specular
 
@@ -52,8 +53,8 @@ def pdf_kernel(
     p_specular: wp.array[float],
 ):
     i = wp.tid()
-    pdf[i] = brdf_eval(wo[i], wi[i], base_color[i], metallic[i], roughness[i]).pdf
-    p_specular[i] = specular_probability(wo[i], base_color[i], metallic[i])
+    pdf[i] = brdf_eval(wo[i], wi[i], base_color[i], metallic[i], roughness[i], Layers()).pdf
+    p_specular[i] = lobe_probabilities(wo[i], base_color[i], metallic[i], Layers())[1]
 
 
 @wp.kernel
@@ -67,7 +68,7 @@ def sample_kernel(
     wi: wp.array[wp.vec3],
 ):
     i = wp.tid()
-    wi[i] = brdf_sample(wo, u[i], u_lobe[i], base_color, metallic, roughness)
+    wi[i] = brdf_sample(wo, u[i], u_lobe[i], base_color, metallic, roughness, Layers())
 
 
 def upload(values: np.ndarray, dtype: type, device: str, requires_grad: bool = False) -> wp.array:

@@ -26,7 +26,7 @@ LEVELS = (
     {
         "gltf_file", "gltf_writer", "mtl", "files", "photo_files", "command", "placement",
         "lobes_file", "lobe_fit", "regressor", "light_errors", "camera_source", "point_cloud",
-        "ground",
+        "ground", "sheen",
     },
     {
         "gltf_material", "obj", "reuse", "program", "regressor_training", "training_lights",

@@ -1,11 +1,13 @@
 """Materials and textures of glTF 2.0, and the extensions that are honoured.
 
-Textures keep their stored codes: base colour and emission are sRGB-encoded, all others are plain
+Textures keep their stored codes: colours and emission are sRGB-encoded, all others are plain
 numbers. Occlusion maps are not read, since a path tracer makes its own.
 """
 
 import math
 from dataclasses import replace
+
+import numpy as np
 
 from warpir.asset import LIMITS, AssetLimits, Material, Texture, TextureSlot
 from warpir.asset_files import Pixels, TextureDecoder, grey_pixels, locate, read_uri
@@ -15,8 +17,13 @@ from warpir.gltf_file import RE_EXPORT_MESH, Entry, GltfFile
 HONOURED = {
     "EXT_mesh_gpu_instancing",
     "EXT_texture_webp",
+    "KHR_materials_clearcoat",
     "KHR_materials_emissive_strength",
+    "KHR_materials_ior",
     "KHR_materials_pbrSpecularGlossiness",
+    "KHR_materials_sheen",
+    "KHR_materials_specular",
+    "KHR_materials_transmission",
     "KHR_materials_unlit",
     "KHR_mesh_quantization",
     "KHR_node_visibility",
@@ -25,11 +32,8 @@ HONOURED = {
 """Extensions whose meaning reaches the picture."""
 BASE_MATERIAL = {
     f"KHR_materials_{name}"
-    for name in (
-        "anisotropy", "clearcoat", "diffuse_transmission", "dispersion", "ior", "iridescence",
-        "sheen", "specular", "transmission", "volume",
-    )
-}  # fmt: skip
+    for name in ("anisotropy", "diffuse_transmission", "dispersion", "iridescence", "volume")
+}
 """Extensions that refine a material; the material below them is used, with a notice."""
 LEFT_OUT = {
     "KHR_animation_pointer": "animations are not played",
@@ -117,13 +121,7 @@ class MaterialReader:
     def uv_sets(self, index: int) -> set[int]:
         """Return the texture coordinate sets that material ``index`` reads."""
         material = self.materials[index]
-        slots = (
-            material.base_color_texture,
-            material.metallic_roughness_texture,
-            material.normal_texture,
-            material.emission_texture,
-        )
-        return {slot.uv_set for slot in slots if slot is not None}
+        return {slot.uv_set for slot in vars(material).values() if isinstance(slot, TextureSlot)}
 
     def _read(self, entry: Entry) -> Material:
         name = entry.text("name", "") or entry.pointer
@@ -162,22 +160,7 @@ class MaterialReader:
         return self._extend(material, entry)
 
     def _extend(self, material: Material, entry: Entry) -> Material:
-        """Apply the material extensions that replace the model; mention those left out."""
-        glossiness = entry.extension("KHR_materials_pbrSpecularGlossiness")
-        if glossiness is not None and "pbrMetallicRoughness" not in entry:
-            *diffuse, alpha = self._factors(glossiness, "diffuseFactor", (1.0,) * 4, 0.0, 1.0)
-            material = replace(
-                material,
-                base_color=(diffuse[0], diffuse[1], diffuse[2]),
-                alpha=alpha,
-                metallic=0.0,
-                roughness=1.0 - self._factor(glossiness, "glossinessFactor", 1.0),
-                base_color_texture=self._slot(glossiness, "diffuseTexture"),
-            )
-            self.notices.append(
-                f"material {material.name!r}: specular-glossiness read as a dielectric of its "
-                "diffuse colour and glossiness factor"
-            )
+        """Apply the material extensions that are honoured; mention those left out."""
         if entry.extension("KHR_materials_unlit") is not None:
             material = replace(
                 material,
@@ -189,6 +172,14 @@ class MaterialReader:
                 emission_texture=None,
             )
             self.notices.append(f"material {material.name!r}: unlit, shown as a lit matte surface")
+        else:
+            glossiness = entry.extension("KHR_materials_pbrSpecularGlossiness")
+            if glossiness is not None and "pbrMetallicRoughness" not in entry:
+                material = self._from_glossiness(material, glossiness)
+            else:
+                material = self._add_reflection(material, entry)
+            material = self._add_layers(material, entry)
+            material = self._add_transmission(material, entry)
         left_out = [name for name in entry.child("extensions").value if name not in HONOURED]
         if left_out:
             self.notices.append(
@@ -196,6 +187,106 @@ class MaterialReader:
                 "its base material is used"
             )
         return material
+
+    def _from_glossiness(self, material: Material, entry: Entry) -> Material:
+        """Convert KHR_materials_pbrSpecularGlossiness, as KHR_materials_specular describes it.
+
+        The dielectric's reflectance is the specular colour itself, at an infinite index.
+        """
+        *diffuse, alpha = self._factors(entry, "diffuseFactor", (1.0,) * 4, 0.0, 1.0)
+        specular = self._factors(entry, "specularFactor", (1.0,) * 3, 0.0, 1.0)
+        glossiness = self._factor(entry, "glossinessFactor", 1.0)
+        slot = self._slot(entry, "specularGlossinessTexture")
+        roughness_slot = None
+        if slot is not None:
+            # Glossiness is in A, roughness in G.
+            texture = self.textures[slot.texture]
+            codes = np.full_like(texture.pixels, 255)
+            codes[..., 1] = np.round(255.0 - glossiness * texture.pixels[..., 3])
+            self.textures.append(replace(texture, pixels=codes))
+            roughness_slot = replace(slot, texture=len(self.textures) - 1)
+        return replace(
+            material,
+            base_color=(diffuse[0], diffuse[1], diffuse[2]),
+            alpha=alpha,
+            metallic=0.0,
+            roughness=1.0 - glossiness if slot is None else 1.0,
+            ior=0.0,
+            specular_color=(specular[0], specular[1], specular[2]),
+            base_color_texture=self._slot(entry, "diffuseTexture"),
+            specular_color_texture=slot,
+            metallic_roughness_texture=roughness_slot,
+        )
+
+    def _add_reflection(self, material: Material, entry: Entry) -> Material:
+        """Read KHR_materials_ior and KHR_materials_specular."""
+        extensions = entry.child("extensions")
+        ior = extensions.child("KHR_materials_ior").number("ior", 1.5)
+        if ior != 0.0 and ior < 1.0:
+            self.notices.append(f"{entry.pointer}: ior {ior:g} clamped to 1")
+            ior = 1.0
+        specular = extensions.child("KHR_materials_specular")
+        color = self._factors(specular, "specularColorFactor", (1.0,) * 3, 0.0, math.inf)
+        return replace(
+            material,
+            ior=ior,
+            specular=self._factor(specular, "specularFactor", 1.0),
+            specular_color=(color[0], color[1], color[2]),
+            specular_texture=self._slot(specular, "specularTexture"),
+            specular_color_texture=self._slot(specular, "specularColorTexture"),
+        )
+
+    def _add_layers(self, material: Material, entry: Entry) -> Material:
+        """Read KHR_materials_clearcoat and KHR_materials_sheen; textures of absent layers are not.
+
+        A normal map keeps its own scale.
+        """
+        coat = entry.child("extensions").child("KHR_materials_clearcoat")
+        clearcoat = self._factor(coat, "clearcoatFactor", 0.0)
+        if clearcoat > 0.0:
+            material = replace(
+                material,
+                clearcoat=clearcoat,
+                clearcoat_roughness=self._factor(coat, "clearcoatRoughnessFactor", 0.0),
+                clearcoat_normal_scale=coat.child("clearcoatNormalTexture").number("scale", 1.0),
+                clearcoat_texture=self._slot(coat, "clearcoatTexture"),
+                clearcoat_roughness_texture=self._slot(coat, "clearcoatRoughnessTexture"),
+                clearcoat_normal_texture=self._slot(coat, "clearcoatNormalTexture"),
+            )
+        sheen = entry.child("extensions").child("KHR_materials_sheen")
+        color = self._factors(sheen, "sheenColorFactor", (0.0,) * 3, 0.0, 1.0)
+        if any(color):
+            material = replace(
+                material,
+                sheen_color=(color[0], color[1], color[2]),
+                sheen_roughness=self._factor(sheen, "sheenRoughnessFactor", 0.0),
+                sheen_color_texture=self._slot(sheen, "sheenColorTexture"),
+                sheen_roughness_texture=self._slot(sheen, "sheenRoughnessTexture"),
+            )
+        return material
+
+    def _add_transmission(self, material: Material, entry: Entry) -> Material:
+        """Read KHR_materials_transmission; say what the glass will not do."""
+        glass = entry.child("extensions").child("KHR_materials_transmission")
+        transmission = self._factor(glass, "transmissionFactor", 0.0)
+        if transmission == 0.0:
+            return material
+        missing = []
+        slot = material.base_color_texture
+        codes = None if slot is None else self.textures[slot.texture].pixels[..., :3]
+        if len(set(material.base_color)) > 1 or (codes is not None and np.ptp(codes, axis=2).any()):
+            missing.append("tinted")
+        if material.roughness > 0.0:
+            missing.append("blurred")
+        if missing:
+            self.notices.append(
+                f"material {material.name!r}: light that passes it is not {' or '.join(missing)}"
+            )
+        return replace(
+            material,
+            transmission=transmission,
+            transmission_texture=self._slot(glass, "transmissionTexture"),
+        )
 
     def _factor(self, entry: Entry, key: str, default: float) -> float:
         value = entry.number(key, default)

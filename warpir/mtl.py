@@ -1,9 +1,9 @@
 """Reads the material files of OBJ (MTL) into `Material`.
 
-Physically based keys are used where the file has them (``Pr Pm Ke norm`` and their maps, as in
-https://benhouston3d.com/blog/extended-wavefront-obj-mtl-for-pbr/). ``bsdf pbr`` (nvdiffrec)
-makes ``Ks`` mean (occlusion, roughness, metallic). What older files leave open is assumed and
-noted. OBJ knows no back faces, so all materials are double-sided.
+Physically based keys are used where the file has them (``Pr Pm Ke norm`` and their maps; ``Pc Pcr
+Ps Ni`` without maps; as in https://benhouston3d.com/blog/extended-wavefront-obj-mtl-for-pbr/).
+``bsdf pbr`` (nvdiffrec) makes ``Ks`` mean (occlusion, roughness, metallic). What older files leave
+open is assumed and noted. OBJ knows no back faces, so all materials are double-sided.
 """
 
 import math
@@ -32,7 +32,7 @@ OPTION_WIDTHS = {
     "-mm": 2, "-o": 3, "-s": 3, "-t": 3, "-texres": 1, "-type": 1,
 }  # fmt: skip
 """How many values follow an option of a map, at most."""
-NUMBERS = ("kd", "ks", "ke", "ns", "ni", "d", "tr", "pr", "pm", "pc", "pcr")
+NUMBERS = ("kd", "ks", "ke", "ns", "ni", "d", "tr", "pr", "pm", "pc", "pcr", "ps")
 """Statements whose numbers are read."""
 MAPS = ("map_kd", "map_d", "map_pr", "map_pm", "map_ke", "map_bump", "norm")
 """Maps that are read; ``bsdf pbr`` has map_Ks too."""
@@ -240,9 +240,9 @@ class MaterialLibrary:
         left_out = [*entry.left_out, *(key for key in maps if key not in read and key != "map_ka")]
         if left_out:
             self.notices.append(f"material {name!r}: {', '.join(left_out)[:80]} ignored")
-        ior = entry.numbers.get("ni", (1.0,))[0]
-        if ior < 1.0:
-            self.notices.append(f"material {name!r}: Ni {ior:g} below 1, 1.5 is used")
+        sheen = self._share(name, entry, "ps")
+        if sheen > 0.0:
+            self.notices.append(f"material {name!r}: sheen of roughness {ROUGHNESS} assumed")
         return Material(
             name=name,
             base_color=(clamped[0], clamped[1], clamped[2]),
@@ -253,10 +253,11 @@ class MaterialLibrary:
             alpha_mode="MASK" if "map_d" in maps else "BLEND" if alpha < 1 else "OPAQUE",
             double_sided=True,
             normal_scale=1.0 if normal_statement is None else normal_statement.bump,
-            # Old exporters write Ni 1 for whatever is not glass, and it would reflect nothing.
-            ior=ior if ior > 1.0 else Material.ior,
+            ior=self._ior(name, entry),
             clearcoat=self._share(name, entry, "pc"),
             clearcoat_roughness=self._share(name, entry, "pcr"),
+            sheen_color=(sheen, sheen, sheen),
+            sheen_roughness=ROUGHNESS if sheen > 0.0 else 0.0,
             base_color_texture=base,
             metallic_roughness_texture=surface,
             normal_texture=normal,
@@ -277,11 +278,20 @@ class MaterialLibrary:
         return default if value is None else value
 
     def _share(self, name: str, entry: MtlEntry, key: str) -> float:
-        """Return a number between 0 and 1, 0 when absent."""
+        """Return a number from 0 to 1, 0 where it is not stated."""
         (value, *_) = entry.numbers.get(key, (0.0,))
         if not 0.0 <= value <= 1.0:
             self.notices.append(f"material {name!r}: {key.title()} {value:g} clamped to 0 ... 1")
         return min(max(value, 0.0), 1.0)
+
+    def _ior(self, name: str, entry: MtlEntry) -> float:
+        """Return the index of refraction; exporters write 1 (and 0) for materials without one."""
+        ior = entry.numbers.get("ni", (1.5,))[0]
+        if ior > 1.0:
+            return ior
+        if ior not in (0.0, 1.0):
+            self.notices.append(f"material {name!r}: Ni {ior:g} ignored, 1.5 is used")
+        return 1.5
 
     def _opacity(self, name: str, entry: MtlEntry) -> float:
         if "d" in entry.numbers:

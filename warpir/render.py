@@ -59,7 +59,9 @@ class Rows:
             return self.array[start:stop]
         part = type(self.array)()
         for name in self.array._cls.vars:
-            setattr(part, name, getattr(self.array, name)[start:stop])
+            array = getattr(self.array, name)
+            # One that is not there has no rows, and Warp cannot slice nothing.
+            setattr(part, name, array[start:stop] if array.size else array)
         return part
 
 

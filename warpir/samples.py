@@ -17,7 +17,13 @@ from numpy.typing import NDArray
 
 from warpir.kernels import light_gradient as light_kernels
 from warpir.kernels import shade as shade_kernels
-from warpir.kernels.types import LightArgs, LightRecord, MaterialArgs, VertexRecord
+from warpir.kernels.types import (
+    Layers,
+    LightArgs,
+    LightRecord,
+    MaterialArgs,
+    VertexRecord,
+)
 from warpir.render import SAMPLES_PER_SLICE, ProxyRadiance, Renderer, Rows
 
 if TYPE_CHECKING:
@@ -33,6 +39,7 @@ RECORD_BYTES = 1 << 30
 What is not filled is not touched: four fifths of it on a convex object at five interactions."""
 ENTRY_BYTES = 24
 VERTEX_BYTES = 112
+LAYERS_BYTES = 72
 LOBE_BLOCK = 4096
 """Directions that one thread of `lobe_gradient` adds up; on the CPU they stay in its cache."""
 PART_PATHS = 4096
@@ -101,7 +108,9 @@ class ObjectSamples:
         self.path_count = mis.spp * mis.rays
         self.entries = 2 * self.path_count * mis.depth * any(free[:4])
         self.vertices = self.path_count * (mis.depth + 1) * any(free[4:])
-        row_bytes = ENTRY_BYTES * self.entries + VERTEX_BYTES * self.vertices
+        self.has_layers = self.materials.args.any_layers == 1
+        vertex_bytes = VERTEX_BYTES + LAYERS_BYTES * self.has_layers
+        row_bytes = ENTRY_BYTES * self.entries + vertex_bytes * self.vertices
         self.parts = _parts(len(mis.object_pixels), row_bytes)
         self.kept: tuple[LightRecord | None, VertexRecord | None] | None = None
 
@@ -124,7 +133,9 @@ class ObjectSamples:
         if is_recording and self.entries:
             light = _new_light_record(len(pixels) * lanes, self.entries // lanes, device)
         if is_recording and self.vertices:
-            vertex = _new_vertex_record(len(pixels) * lanes, self.vertices // lanes, device)
+            vertex = _new_vertex_record(
+                len(pixels) * lanes, self.vertices // lanes, self.has_layers, device
+            )
         with self.materials:
             out = mis.renderer.foreground(
                 self.args,
@@ -375,7 +386,9 @@ def _new_light_record(pixels: int, capacity: int, device: wp.Device) -> LightRec
     return record
 
 
-def _new_vertex_record(pixels: int, capacity: int, device: wp.Device) -> VertexRecord:
+def _new_vertex_record(
+    pixels: int, capacity: int, has_layers: bool, device: wp.Device
+) -> VertexRecord:
     record = VertexRecord()
     vectors = (
         "n", "wo", "texture_color", "texture_emission",
@@ -385,5 +398,6 @@ def _new_vertex_record(pixels: int, capacity: int, device: wp.Device) -> VertexR
         setattr(record, name, wp.empty((pixels, capacity), dtype=wp.vec3, device=device))
     for name in ("texture_metallic", "texture_roughness", "weight_next"):
         setattr(record, name, wp.empty((pixels, capacity), dtype=wp.float32, device=device))
+    record.layers = wp.empty((pixels, capacity * has_layers), dtype=Layers, device=device)
     record.material = wp.full((pixels, capacity), -1, dtype=wp.int32, device=device)
     return record

@@ -20,11 +20,18 @@ from warpir.color import srgb_to_linear
 from warpir.kernels.proxy_mesh import trace_seen
 from warpir.kernels.types import CameraArgs, MaterialArgs, MeshArgs, ProxyArgs, TextureArgs
 from warpir.proxy_mesh import ProxyMesh
+from warpir.sheen import sheen_albedo_table
 
 FloatArray = NDArray[np.float32]
 Float64Array = NDArray[np.float64]
 
 ALPHA_MODES = {"OPAQUE": 0, "MASK": 1, "BLEND": 2}
+SLOTS = (
+    "base_color", "metallic_roughness", "normal", "emission",
+    "specular", "specular_color", "clearcoat", "clearcoat_roughness", "clearcoat_normal",
+    "sheen_color", "sheen_roughness", "transmission",
+)  # fmt: skip
+"""In the order of `warpir.kernels.trace`."""
 WRAP_MODES = {"repeat": 0, "clamp": 1, "mirror": 2}
 
 
@@ -116,6 +123,23 @@ def _slot(slot: TextureSlot | None, first_texture: int) -> tuple[int, int, list[
     if slot is None:
         return -1, 0, [1.0, 0.0, 0.0, 0.0, 1.0, 0.0]
     return first_texture + slot.texture, slot.uv_set, list(slot.transform)
+
+
+def dielectric_f0(ior: float) -> float:
+    """Return the reflectance at normal incidence of a dielectric in air [1]; 0 means infinity.
+
+    ``((1 - ior) / (1 + ior))^2`` (KHR_materials_ior).
+    """
+    return ((1.0 - ior) / (1.0 + ior)) ** 2
+
+
+def is_layered(material: Material) -> bool:
+    """Return whether a material has more than glTF's metallic-roughness model."""
+    plain = Material()
+    names = ("ior", "specular", "specular_color", "clearcoat", "sheen_color", "transmission")
+    return any(getattr(material, name) != getattr(plain, name) for name in names) or any(
+        (material.specular_texture, material.specular_color_texture)
+    )
 
 
 class Scene:
@@ -301,29 +325,28 @@ class Scene:
         rows = materials or [(Material(), 0)]
         plain = [m for m, _ in rows]
         slots = [
-            [
-                _slot(slot, first)
-                for slot in (
-                    m.base_color_texture,
-                    m.metallic_roughness_texture,
-                    m.normal_texture,
-                    m.emission_texture,
-                )
-            ]
+            [_slot(getattr(m, f"{name}_texture"), first) for name in SLOTS]
             for m, (_, first) in zip(plain, rows, strict=True)
         ]
         args = MaterialArgs()
-        floats = {
-            "metallic": [m.metallic for m in plain],
-            "roughness": [m.roughness for m in plain],
-            "alpha": [m.alpha for m in plain],
-            "alpha_cutoff": [m.alpha_cutoff for m in plain],
-            "normal_scale": [m.normal_scale for m in plain],
-        }
-        for name, values in floats.items():
-            setattr(args, name, self._array(np.array(values, np.float32), wp.float32))
-        args.base_color = self._array(np.array([m.base_color for m in plain], np.float32), wp.vec3)
-        args.emission = self._array(np.array([m.emission for m in plain], np.float32), wp.vec3)
+        for name in (
+            "metallic", "roughness", "alpha", "alpha_cutoff", "normal_scale", "specular",
+            "clearcoat", "clearcoat_roughness", "clearcoat_normal_scale", "sheen_roughness",
+            "transmission",
+        ):  # fmt: skip
+            values = np.array([getattr(m, name) for m in plain], np.float32)
+            setattr(args, name, self._array(values, wp.float32))
+        for name in ("base_color", "emission", "sheen_color"):
+            values = np.array([getattr(m, name) for m in plain], np.float32)
+            setattr(args, name, self._array(values, wp.vec3))
+        f0 = [dielectric_f0(m.ior) * np.array(m.specular_color) for m in plain]
+        args.f0 = self._array(np.array(f0, np.float32), wp.vec3)
+        layered = [is_layered(m) for m in plain]
+        args.layered = self._array(np.array(layered, np.int32), wp.int32)
+        args.any_layers = int(any(layered))
+        has_sheen = any(max(m.sheen_color) > 0.0 for m in plain)
+        table = sheen_albedo_table() if has_sheen else np.zeros((2, 2))
+        args.sheen_albedo = self._array(table.astype(np.float32), wp.float32)
         args.alpha_mode = self._array(
             np.array([ALPHA_MODES[m.alpha_mode] for m in plain], np.int32), wp.int32
         )
@@ -339,7 +362,7 @@ class Scene:
         affine = np.array([[s[2] for s in row] for row in slots], np.float32)
         args.slot_u = self._array(np.ascontiguousarray(affine[:, :, :3]), wp.vec3)
         args.slot_v = self._array(np.ascontiguousarray(affine[:, :, 3:]), wp.vec3)
-        args.any_alpha = int(any(m.alpha_mode != "OPAQUE" for m in plain))
+        args.any_alpha = int(any(m.alpha_mode != "OPAQUE" or m.transmission > 0.0 for m in plain))
         args.any_culled = int(any(not m.double_sided for m in plain))
         args.any_emission = int(any(max(m.emission) > 0.0 for m in plain))
         self.material_args = args

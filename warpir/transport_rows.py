@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from warpir.color import luminance
 from warpir.kernels import transport as kernels
+from warpir.kernels.types import Layers
 from warpir.light import Light, map_directions, texel_solid_angles
 from warpir.render import Renderer, Rows, light_args
 
@@ -294,6 +295,8 @@ def _surface_points(
         setattr(points, name, wp.empty((count, subsamples), dtype=wp.vec3, device=device))
     for name in ("metallic", "roughness"):
         setattr(points, name, wp.zeros((count, subsamples), dtype=float, device=device))
+    columns = subsamples * scene.material_args.any_layers
+    points.layers = wp.empty((count, columns), dtype=Layers, device=device)
     emission = wp.zeros(count, dtype=wp.vec3, device=device)
     renderer.launch(
         kernels.trace_points,
