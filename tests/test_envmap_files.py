@@ -214,6 +214,10 @@ def test_e11_exposures_multiply_and_other_lines_are_noted(tmp_path: Path) -> Non
     path = rgbe_file(tmp_path / "b.hdr", "-Y 4 +X 8", rgbe, lines)
     np.testing.assert_allclose(8.0 * read_envmap(path, notices=notices), plain, rtol=1e-6)
     assert any("GAMMA" in notice for notice in notices)
+    photoshop = "GAMMA=1\nPRIMARIES=0 0 0 0 0 0 0 0\n"
+    notices.clear()
+    read_envmap(rgbe_file(tmp_path / "d.hdr", "-Y 4 +X 8", rgbe, photoshop), notices=notices)
+    assert notices == []
     refused = rgbe_file(tmp_path / "c.hdr", "-Y 4 +X 8", rgbe, "EXPOSURE=-1\n")
     with pytest.raises(InputError, match="EXPOSURE"):
         read_envmap(refused)
