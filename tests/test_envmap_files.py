@@ -180,7 +180,9 @@ def test_pictures_are_panoramas_without_a_sun(
     else:
         Image.fromarray(codes).save(path)
     notices: list[str] = []
-    texels = read_envmap(path, notices=notices)
+    with pytest.raises(InputError, match="expected exr or hdr"):
+        read_envmap(path)
+    texels = read_envmap(path, pictures=True, notices=notices)
     shown = codes.astype(np.float64) / np.iinfo(codes.dtype).max
     expected = np.where(shown <= 0.04045, shown / 12.92, ((shown + 0.055) / 1.055) ** 2.4)
     np.testing.assert_allclose(texels, expected, atol=0.02 if kind == "jpeg" else 1e-6)
