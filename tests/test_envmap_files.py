@@ -180,7 +180,9 @@ def test_pictures_are_panoramas_without_a_sun(
     else:
         Image.fromarray(codes).save(path)
     notices: list[str] = []
-    texels = read_envmap(path, notices=notices)
+    with pytest.raises(InputError, match="expected exr or hdr"):
+        read_envmap(path)
+    texels = read_envmap(path, pictures=True, notices=notices)
     shown = codes.astype(np.float64) / np.iinfo(codes.dtype).max
     expected = np.where(shown <= 0.04045, shown / 12.92, ((shown + 0.055) / 1.055) ** 2.4)
     np.testing.assert_allclose(texels, expected, atol=0.02 if kind == "jpeg" else 1e-6)
@@ -214,6 +216,10 @@ def test_e11_exposures_multiply_and_other_lines_are_noted(tmp_path: Path) -> Non
     path = rgbe_file(tmp_path / "b.hdr", "-Y 4 +X 8", rgbe, lines)
     np.testing.assert_allclose(8.0 * read_envmap(path, notices=notices), plain, rtol=1e-6)
     assert any("GAMMA" in notice for notice in notices)
+    photoshop = "GAMMA=1\nPRIMARIES=0 0 0 0 0 0 0 0\n"
+    notices.clear()
+    read_envmap(rgbe_file(tmp_path / "d.hdr", "-Y 4 +X 8", rgbe, photoshop), notices=notices)
+    assert notices == []
     refused = rgbe_file(tmp_path / "c.hdr", "-Y 4 +X 8", rgbe, "EXPOSURE=-1\n")
     with pytest.raises(InputError, match="EXPOSURE"):
         read_envmap(refused)

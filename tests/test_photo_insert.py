@@ -199,6 +199,7 @@ def bad_light(folder: Path) -> dict[str, str]:
             2,
             "--light-convention: is for panoramas",
         ),
+        ("E7-photo", lambda f: {"light": str(f.parent / "photo.png")}, 3, "expected 2:1"),
         ("E8-no-layers", lambda f: {"layer": "beauty"}, 3, "photo.png: has no layers"),
     ],
 )

@@ -358,6 +358,7 @@ def _stated_primaries(
     stated = spec.getattribute("chromaticities")
     space = str(spec.getattribute("colorInteropID") or "")
     lines = _radiance_lines(head, b"PRIMARIES") if kind == "hdr" else []
+    lines = [line for line in lines if set(line.split()) != {b"0"}]  # Photoshop's "not stated"
     if lines:
         with suppress(ValueError):
             stated = [float(number) for number in lines[-1].split()]
@@ -391,7 +392,8 @@ def _header_notices(spec: Any, kind: str, head: bytes) -> list[str]:
     aspect = float(spec.getattribute("PixelAspectRatio") or 1.0)
     if kind == "exr" and abs(aspect - 1.0) > 1e-3:
         notices.append(f"pixel aspect ratio {aspect:g} is not followed: pixels are taken as square")
-    if kind == "hdr" and _radiance_lines(head, b"(?:GAMMA|COLORCORR)"):
+    corrections = _radiance_lines(head, b"(?:GAMMA|COLORCORR)") if kind == "hdr" else []
+    if any(set(line.split()) - {b"1", b"1.0"} for line in corrections):
         notices.append("GAMMA and COLORCORR of the header are not followed")
     if kind == "jpeg" and any(name in head for name in _GAIN_MAPS):
         notices.append("gain map ignored: read as its base image")

@@ -359,6 +359,7 @@ def _read_light(
         config.light,
         convention=config.light_convention,
         camera_to_world=camera_to_world,
+        pictures=True,
         strict=config.strict,
         notices=found,
     )

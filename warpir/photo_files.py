@@ -29,13 +29,15 @@ class Photo:
     """A photograph or plate as its file has it, upright, and what the renderer makes of it."""
 
     codes: Pixels
-    """The file's own numbers in their native type, upright, shape [H, W, 3]."""
+    """The file's own numbers in their native type, upright, shape [H, W, 3]; of a linear plate
+    float32 in Rec.709, of a profile with tables in sRGB."""
     srgb: FloatArray
     """Display-encoded Rec.709, in [0, 1], shape [H, W, 3]."""
     kind: str
     """``jpeg``, ``png``, ``tiff``, ``webp``, ``exr`` or ``hdr``."""
     icc: bytes | None = None
-    """The file's colour profile when it is not sRGB; `codes` are in it."""
+    """The file's colour profile when it is not sRGB; `codes` are in it. Made here where a PNG
+    states its colours in other words, or the profile is of a grey image."""
     focal_35mm: float | None = None
     """EXIF focal length, 35 mm equivalent [mm]."""
     notices: tuple[str, ...] = ()
@@ -148,6 +150,7 @@ def read_envmap(
     *,
     convention: str = "openexr",
     camera_to_world: Float64Array | None = None,
+    pictures: bool = False,
     strict: bool = False,
     notices: list[str] | None = None,
 ) -> FloatArray:
@@ -157,10 +160,11 @@ def read_envmap(
     ``(sin lon cos lat, sin lat, cos lon cos lat)``, ``lon = pi (1 - 2u)``, ``lat = pi (1/2 - v)``.
 
     Args:
-        path: A 2:1 file, recognised by content: ``.hdr``, ``.exr`` or float TIFF; or a picture
-            of 8 or 16 bits, which is decoded as sRGB and lacks what is brighter than its white.
+        path: A 2:1 file, recognised by content: ``.hdr`` or ``.exr``.
         convention: Who made the map: a key of `SEAM_SHIFTS`.
         camera_to_world: Pose of the camera, shape [4, 4], for a map in camera axes.
+        pictures: Whether JPEG, PNG, TIFF and WebP are read too; codes of 8 and 16 bits are
+            decoded as sRGB and lack what is brighter than white, floats are radiance.
         strict: Refuse NaN, infinite and negative values instead of repairing them.
         notices: One line per repair is appended here.
 
@@ -168,12 +172,13 @@ def read_envmap(
         Radiance, relative [W/(m^2 sr)], finite and not negative, shape [He, We, 3].
 
     Raises:
-        InputError: Missing, damaged, not 2:1, not an image, or (strict) not clean.
+        InputError: Missing, damaged, not 2:1, not of these formats, or (strict) not clean.
     """
     path = Path(path)
     if convention not in SEAM_SHIFTS:
         raise ValueError(f"convention {convention!r} is not one of {', '.join(SEAM_SHIFTS)}")
-    image = decode_image(path, ENVMAP_WIDTH_MAX * ENVMAP_WIDTH_MAX // 2)
+    kinds = ("exr", "hdr", "jpeg", "png", "tiff", "webp") if pictures else ("exr", "hdr")
+    image = decode_image(path, ENVMAP_WIDTH_MAX * ENVMAP_WIDTH_MAX // 2, kinds)
     messages = list(image.notices)
     codes = upright(image.pixels, image.orientation)
     height, width = codes.shape[:2]
