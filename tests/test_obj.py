@@ -192,24 +192,11 @@ def test_mtl_pbr_keys(tmp_path: Path) -> None:
     assert asset.notices == ()
 
 
-def test_mtl_index_and_coat(tmp_path: Path) -> None:
-    """Ni, Pc and Pcr are taken as they stand; Ni 1, which old tools always write, says nothing."""
-    (material,) = with_mtl(tmp_path, "Kd 1 1 1\nPr 1\nNi 1.33\nPc 0.5\nPcr 0.25\n").materials
-    assert (material.ior, material.clearcoat, material.clearcoat_roughness) == (1.33, 0.5, 0.25)
-    (material,) = with_mtl(tmp_path, "Kd 1 1 1\nPr 1\nNi 1.0\n").materials
-    assert (material.ior, material.clearcoat) == (1.5, 0.0)
-    asset = with_mtl(tmp_path, "Kd 1 1 1\nPr 1\nNi 0.5\nPc 7\n")
-    assert (asset.materials[0].ior, asset.materials[0].clearcoat) == (1.5, 1.0)
-    assert [n.partition(": ")[2] for n in asset.notices] == [
-        "Ni 0.5 below 1, 1.5 is used", "Pc 7 clamped to 0 ... 1",
-    ]  # fmt: skip
-
-
 def test_mtl_says_what_it_leaves_out(tmp_path: Path) -> None:
     """Statements and maps that could matter and are not read give one notice."""
     png(tmp_path / "c.png", (1, 2, 3))
-    text = "Kd 1 1 1\nKa 1 1 1\nillum 2\nPr 1\nPs 0.5\naniso 0.1\nmap_Ks c.png\nmap_Ka c.png\n"
-    assert with_mtl(tmp_path, text).notices == ("material 'a b': Ps, aniso, map_ks ignored",)
+    text = "Kd 1 1 1\nKa 1 1 1\nillum 2\nPr 1\nTf 1 1 1\naniso 0.1\nmap_Ks c.png\nmap_Ka c.png\n"
+    assert with_mtl(tmp_path, text).notices == ("material 'a b': Tf, aniso, map_ks ignored",)
 
 
 def test_mtl_roughness_from_the_exponent(tmp_path: Path) -> None:

@@ -32,8 +32,6 @@ OPTION_WIDTHS = {
     "-mm": 2, "-o": 3, "-s": 3, "-t": 3, "-texres": 1, "-type": 1,
 }  # fmt: skip
 """How many values follow an option of a map, at most."""
-NUMBERS = ("kd", "ks", "ke", "ns", "ni", "d", "tr", "pr", "pm", "pc", "pcr")
-"""Statements whose numbers are read."""
 MAPS = ("map_kd", "map_d", "map_pr", "map_pm", "map_ke", "map_bump", "norm")
 """Maps that are read; ``bsdf pbr`` has map_Ks too."""
 MEANINGLESS = ("ka", "illum", "sharpness")
@@ -168,7 +166,7 @@ class MaterialLibrary:
             elif key.startswith("map_") or key in ("norm", "bump"):
                 key = "map_bump" if key == "bump" else key
                 entry.maps[key] = self._parse_map(words[1:], where, str(PurePosixPath(file).parent))
-            elif key in NUMBERS:
+            elif key in ("kd", "ks", "ke", "ns", "ni", "d", "tr", "pr", "pm"):
                 if key[0] == "k" and words[1:2] in (["spectral"], ["xyz"]):
                     raise InputError(self.path, f"{where}: {words[0]} {words[1]}, expected RGB")
                 values = words[2:] if words[1:2] == ["-halo"] else words[1:]
@@ -225,6 +223,10 @@ class MaterialLibrary:
 
     def _build(self, name: str, entry: MtlEntry) -> Material:
         maps = entry.maps
+        read = (*MAPS, "map_ks") if entry.is_pbr else MAPS
+        left_out = [*entry.left_out, *(key for key in maps if key not in read and key != "map_ka")]
+        if left_out:
+            self.notices.append(f"material {name!r}: {', '.join(left_out)[:80]} ignored")
         alpha = self._opacity(name, entry)
         base = self._base_slot(entry)
         roughness, metallic, surface = self._surface(name, entry)
@@ -236,13 +238,8 @@ class MaterialLibrary:
         clamped = tuple(min(max(value, 0.0), 1.0) for value in color)
         if clamped != color:
             self.notices.append(f"material {name!r}: Kd clamped to 0 ... 1")
-        read = (*MAPS, "map_ks") if entry.is_pbr else MAPS
-        left_out = [*entry.left_out, *(key for key in maps if key not in read and key != "map_ka")]
-        if left_out:
-            self.notices.append(f"material {name!r}: {', '.join(left_out)[:80]} ignored")
-        ior = entry.numbers.get("ni", (1.0,))[0]
-        if ior < 1.0:
-            self.notices.append(f"material {name!r}: Ni {ior:g} below 1, 1.5 is used")
+        if entry.numbers.get("ni", (1.5,))[0] not in (1.0, 1.45, 1.5):
+            self.notices.append(f"material {name!r}: Ni ignored, 1.5 is used")
         return Material(
             name=name,
             base_color=(clamped[0], clamped[1], clamped[2]),
@@ -253,10 +250,6 @@ class MaterialLibrary:
             alpha_mode="MASK" if "map_d" in maps else "BLEND" if alpha < 1 else "OPAQUE",
             double_sided=True,
             normal_scale=1.0 if normal_statement is None else normal_statement.bump,
-            # Old exporters write Ni 1 for whatever is not glass, and it would reflect nothing.
-            ior=ior if ior > 1.0 else Material.ior,
-            clearcoat=self._share(name, entry, "pc"),
-            clearcoat_roughness=self._share(name, entry, "pcr"),
             base_color_texture=base,
             metallic_roughness_texture=surface,
             normal_texture=normal,
@@ -275,13 +268,6 @@ class MaterialLibrary:
         if value is None and key == "kd":
             self.notices.append(f"material {name!r}: no Kd, grey {default[0]:g} assumed")
         return default if value is None else value
-
-    def _share(self, name: str, entry: MtlEntry, key: str) -> float:
-        """Return a number between 0 and 1, 0 when absent."""
-        (value, *_) = entry.numbers.get(key, (0.0,))
-        if not 0.0 <= value <= 1.0:
-            self.notices.append(f"material {name!r}: {key.title()} {value:g} clamped to 0 ... 1")
-        return min(max(value, 0.0), 1.0)
 
     def _opacity(self, name: str, entry: MtlEntry) -> float:
         if "d" in entry.numbers:
