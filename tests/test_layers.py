@@ -20,9 +20,8 @@ LEVELS = (
         "ply", "stl",
     },
     {
-        "gltf_writer",
-        "gltf_file", "mtl", "files", "command", "placement", "lobes_file", "lobe_fit", "regressor",
-        "light_errors",
+        "gltf_file", "gltf_writer", "mtl", "files", "command", "placement", "lobes_file",
+        "lobe_fit", "regressor", "light_errors",
     },
     {
         "gltf_material", "obj", "reuse", "program", "regressor_training", "training_lights",
