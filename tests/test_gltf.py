@@ -865,14 +865,14 @@ def test_G11_material_extensions(tmp_path: Path) -> None:
         emissiveFactor=[1, 0.5, 0],
         extensions={
             "KHR_materials_emissive_strength": {"emissiveStrength": 8},
-            "KHR_materials_ior": {"ior": 1.3},
-            "KHR_materials_specular": {},
+            "KHR_materials_volume": {"thicknessFactor": 0.1},
+            "KHR_materials_iridescence": {},
         },
     )
     asset = load(tmp_path, builder)
     assert asset.materials[0].emission == (8.0, 4.0, 0.0)
     (notice,) = asset.notices
-    assert "lamp" in notice and "KHR_materials_ior, KHR_materials_specular" in notice
+    assert "lamp" in notice and "KHR_materials_volume, KHR_materials_iridescence" in notice
     builder.material["extensions"] = {"KHR_materials_unlit": {}}
     asset = load(tmp_path, builder)
     (material,) = asset.materials
@@ -1306,10 +1306,58 @@ def test_byte_flips_give_an_asset_or_our_error(
             assert error.where == str(path)
 
 
+ODD: tuple[Any, ...] = (
+    None, True, -1, 0, 1, 2, 99, 2**31, 2**63, 1e300, -0.5, "", "x", [], {}, [0], [{}], [None],
+    "\ud800", [1, 2, 3], [0] * 16, 5126, 5121, "VEC3", "MASK",
+)  # fmt: skip
+
+
+def places(value: Any, path: tuple[Any, ...] = ()) -> list[tuple[Any, ...]]:
+    """Return the paths to everything below a JSON value."""
+    keys = list(value) if isinstance(value, dict) else range(len(value))
+    found = [(*path, key) for key in keys]
+    for key in keys:
+        if isinstance(value[key], dict | list):
+            found += places(value[key], (*path, key))
+    return found
+
+
+@pytest.mark.parametrize("kind", ["instances", "skin"])
+@pytest.mark.filterwarnings("error")
+def test_odd_values_give_an_asset_or_our_error(
+    kind: str, tmp_path: Path, rng: np.random.Generator
+) -> None:
+    """Any value of the JSON replaced by an odd one ends in a sound asset or in one InputError."""
+    builder = Builder()
+    builder.base_color()["extensions"] = {"KHR_texture_transform": {"scale": [2, 3]}}
+    builder.attribute("TANGENT", TANGENTS)
+    sparse([2], np.full((1, 3), 2.0))(builder)
+    if kind == "skin":
+        skinned(HALF, ARM)(builder)
+    else:
+        instanced(TRANSLATION=np.eye(3, dtype="f"), ROTATION=np.full((3, 4), 64, "b"))(builder)
+    original = json.dumps(builder.json)
+    paths = places(builder.json)
+    for _ in range(150):
+        builder.json = json.loads(original)
+        *above, last = paths[rng.integers(len(paths))]
+        holder = builder.json
+        for key in above:
+            holder = holder[key]
+        holder[last] = ODD[rng.integers(len(ODD))]
+        try:
+            asset = load(tmp_path, builder)
+        except InputError as error:
+            assert error.where == str(tmp_path / "asset.glb")
+            continue
+        for p in asset.primitives:
+            assert np.isfinite(p.positions).all() and p.indices.max() < len(p.positions)
+
+
 REAL = {  # triangles placed, those of zero area, primitives, textures read
-    "ToyCar.glb": (108_936, 2, 3, 6),
+    "ToyCar.glb": (108_936, 2, 3, 7),
     "AlphaBlendModeTest.glb": (61, 0, 9, 8),
-    "ClearcoatWicker.glb": (3072, 0, 1, 3),
+    "ClearcoatWicker.glb": (3072, 0, 1, 4),
     "cakeBirthday.glb": (1332, 0, 42, 0),
     "ferris-wheel.glb": (4914, 2, 1, 1),
     "mug.glb": (114_688, 0, 1, 0),

@@ -608,7 +608,9 @@ def test_stl_faults(fault: str, tmp_path: Path) -> None:
     fails(write(tmp_path, content, "asset.stl"))
 
 
-@pytest.mark.parametrize("name", ["asset.obj", "asset.ply", "asset.stl"])
+@pytest.mark.parametrize(
+    "name", ["asset.obj", "asset.ply", "mixed.ply", "ascii.ply", "asset.stl", "ascii.stl"]
+)
 def test_byte_flips_give_an_asset_or_our_error(
     name: str, tmp_path: Path, rng: np.random.Generator
 ) -> None:
@@ -616,7 +618,10 @@ def test_byte_flips_give_an_asset_or_our_error(
     content = {
         "asset.obj": (SQUARE + FACES).encode(),
         "asset.ply": ply("binary"),
+        "mixed.ply": ply_text("big", [(0, 0, 0), (1, 0, 0), (1, 1, 0)], [(0, 1, 2), (0, 2)]),
+        "ascii.ply": ply("ascii"),
         "asset.stl": stl(),
+        "ascii.stl": ascii_stl().encode(),
     }
     original = np.frombuffer(content[name], np.uint8)
     for _ in range(150):

@@ -484,8 +484,9 @@ def pose(file: GltfFile, entry: Entry, geometry: Geometry, joints: Matrix) -> Ge
         raise entry.error(f"vertex {int(np.argmin(total > 0.0))} has no weight")
     moved /= total[:, None, None]
     linear = moved[:, :3, :3]
-    volume = np.linalg.norm(linear, axis=1).prod(axis=1)
-    sign = np.linalg.det(linear)
+    with np.errstate(over="ignore", invalid="ignore"):  # such sizes are refused below
+        volume = np.linalg.norm(linear, axis=1).prod(axis=1)
+        sign = np.linalg.det(linear)
     if not ((np.abs(moved) < EXTENT).all() and (np.abs(sign) > 1e-9 * volume).all()):
         raise entry.error("the joints flatten the mesh, or are beyond all bounds")
     mirrored = bool(np.median(sign) < 0)
