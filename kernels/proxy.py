@@ -55,6 +55,8 @@ class Receiver:
     """A point of the place that the camera sees."""
 
     valid: int
+    is_open: int
+    """1 where a place with a mesh ends: the camera sees neither it nor the object."""
     position: wp.vec3
     normal: wp.vec3
     """Unit, toward the side that receives light; of the mesh, toward the camera."""
@@ -156,14 +158,18 @@ def proxy_point(
     """Find the point of plane or place that camera sample ``s`` sees, if it sees one."""
     point = Receiver()
     point.valid = 0
+    point.is_open = 0
     ray_dir = camera_ray(camera, pixel, sobol_pair(s, key, 0))
     t = proxy_distance(proxy, camera.origin, ray_dir)
     place = proxy_mesh_hit(proxy, camera.origin, ray_dir)
-    if t <= 0.0 and place.valid == 0:
+    if t <= 0.0 and place.valid == 0 and proxy.mesh == wp.uint64(0):
         return point
     if may_see_object == 1:
         if camera_hit(camera, mesh, material, texture, proxy, s, key, ray_dir).valid == 1:
             return point
+    if t <= 0.0 and place.valid == 0:
+        point.is_open = 1
+        return point
     point.valid = 1
     if place.valid == 1 and (t <= 0.0 or place.t < t):
         point.position = place.position
@@ -213,7 +219,8 @@ def trace_proxy(
         spp: Camera samples per pixel.
         rays: Directions per technique that share one camera sample.
         seed: Base seed.
-        lit: Mean radiance with the object over the samples that see the place.
+        lit: Mean radiance with the object over the samples that see the place. Where a mesh ends
+            within a pixel, what is open there loses nothing.
         unoccluded: The same without the object.
         record: Output: the weights of each direction in both, or without arrays.
     """
@@ -227,10 +234,12 @@ def trace_proxy(
     sum_lit = wp.vec3(0.0)
     sum_all = wp.vec3(0.0)
     count = float(0.0)
+    open_count = float(0.0)
     for s in range(spp):
         point = proxy_point(
             camera, mesh, material, texture, proxy, pixel, may_see_object[i], s, key
         )
+        open_count += float(point.is_open)
         if point.valid == 1:
             count += 1.0
             for r in range(rays):
@@ -247,6 +256,13 @@ def trace_proxy(
                     weight = plane_weight(x.weight_cosine, x.visible_cosine)
                     entries += keep_direction(record, i, entries, x.wi_cosine, weight)
     scale = 1.0 / wp.max(count * float(rays), 1.0)
+    if open_count > 0.0:
+        share = open_count / (count + open_count)
+        sum_lit += (sum_all - sum_lit) * share
+        for j in range(entries):
+            weight = record.weight[i, j]
+            weight[0] = weight[0] + (weight[1] - weight[0]) * share
+            record.weight[i, j] = weight
     lit[i] = sum_lit * scale
     unoccluded[i] = sum_all * scale
     if keep_dark == 1:

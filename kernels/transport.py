@@ -548,6 +548,7 @@ def trace_proxy_points(
     position: wp.array2d[wp.vec3],
     normal: wp.array2d[wp.vec3],
     spread: wp.array[float],
+    share: wp.array[float],
 ):
     """Find the place, plane or mesh, under ``subsamples`` positions of each listed pixel.
 
@@ -565,16 +566,20 @@ def trace_proxy_points(
         position: Points of the place, recentred [m], shape [pixel, subsample].
         normal: Its unit normals there, shape [pixel, subsample].
         spread: Largest distance of a pixel's points from its first one [m], shape [pixel].
+        share: Of its subsamples that do not see the object, those that see the place and not what
+            is behind the end of its mesh [1], shape [pixel].
     """
     i = wp.tid()
     pixel = pixels[i]
     key = pixel_seed(seed, pixel)
     found = int(0)
+    is_open = int(0)
     farthest = float(0.0)
     for s in range(subsamples):
         point = proxy_point(
             camera, mesh, material, texture, proxy, pixel, may_see_object[i], s, key
         )
+        is_open += point.is_open
         if point.valid == 1:
             position[i, found] = point.position
             normal[i, found] = point.normal
@@ -582,6 +587,7 @@ def trace_proxy_points(
             found += 1
     count[i] = found
     spread[i] = farthest
+    share[i] = float(found) / float(wp.max(found + is_open, 1))
 
 
 @wp.func
@@ -695,6 +701,7 @@ def trace_received(
     count: wp.array[int],
     position: wp.array2d[wp.vec3],
     normal: wp.array2d[wp.vec3],
+    share: wp.array[float],
     mesh: MeshArgs,
     material: MaterialArgs,
     texture: TextureArgs,
@@ -714,6 +721,7 @@ def trace_received(
         count: Filled points of each pixel, shape [pixel].
         position: Points of the place [m], shape [pixel, subsample].
         normal: Its unit normals there, shape [pixel, subsample].
+        share: From `trace_proxy_points` [1], shape [pixel].
         mesh: The object's triangles.
         material: Their materials.
         texture: Their textures.
@@ -760,7 +768,7 @@ def trace_received(
                     kept += arriving * (1.0 - visibility(mesh, material, texture, origin, wi))
         scale = texels.d_omega[i] / (PI * float(directions))
         wp.atomic_add(received, p, t, total * scale)
-        wp.atomic_add(blocked, p, t, kept * scale)
+        wp.atomic_add(blocked, p, t, kept * scale * share[p])
 
 
 @wp.kernel
@@ -769,6 +777,7 @@ def trace_bounced(
     count: wp.array[int],
     position: wp.array2d[wp.vec3],
     normal: wp.array2d[wp.vec3],
+    share: wp.array[float],
     mesh: MeshArgs,
     material: MaterialArgs,
     texture: TextureArgs,
@@ -785,6 +794,7 @@ def trace_bounced(
         count: Filled points of each pixel, shape [pixel].
         position: Points of the place [m], shape [pixel, subsample].
         normal: Its unit normals there, shape [pixel, subsample].
+        share: From `trace_proxy_points` [1], shape [pixel].
         mesh: The object's triangles.
         material: Their materials.
         texture: Their textures.
@@ -816,4 +826,4 @@ def trace_bounced(
             if hit.valid == 1:
                 kept += L
     received[p] = total / float(path_count)
-    blocked[p] = kept / float(path_count)
+    blocked[p] = kept * (share[p] / float(path_count))

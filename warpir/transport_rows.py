@@ -332,6 +332,8 @@ class _PlacePoints:
     """Shape [pixel, subsample]."""
     spread: Rows
     """Largest distance of a pixel's points from its first one [m], shape [pixel]."""
+    share: Rows
+    """Of what the object does not hide, what is place and not open [1], shape [pixel]."""
 
 
 def _place_points(
@@ -343,7 +345,7 @@ def _place_points(
         Rows(wp.zeros(count, dtype=int, device=device)),
         Rows(wp.empty((count, subsamples), dtype=wp.vec3, device=device)),
         Rows(wp.empty((count, subsamples), dtype=wp.vec3, device=device)),
-        Rows(wp.zeros(count, dtype=float, device=device)),
+        *(Rows(wp.zeros(count, dtype=float, device=device)) for _ in range(2)),
     )
     renderer.launch(
         kernels.trace_proxy_points,
@@ -362,6 +364,7 @@ def _place_points(
             points.position,
             points.normal,
             points.spread,
+            points.share,
         ],
         subsamples,
         "transport",
@@ -454,7 +457,8 @@ def place_rows(
             renderer, pixels[chunk], may_see_object[chunk], settings.subsamples, seed
         )
         count = len(pixels[chunk])
-        seen = (points.pixels, points.count, points.position, points.normal, *geometry)
+        places = (points.count, points.position, points.normal, points.share)
+        seen = (points.pixels, *places, *geometry)
         received, blocked = (
             wp.zeros((count, texel_count), dtype=float, device=device) for _ in range(2)
         )

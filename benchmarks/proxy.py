@@ -1,0 +1,287 @@
+"""What does a mesh of the place save, where the photo holds shadows already?
+
+    python -m benchmarks.proxy --out DIR [--panorama FILE] [--samples 256] [--width 480]
+        [--json FILE]
+
+A made-up yard, open ground and one wall, is path-traced by Mitsuba 3 (`benchmarks.referee`, which
+shares no code with warpir) without the car, which makes the photo, and with it, which is the truth.
+The car is then put into the photo under the same light: with the ground plane alone, with a painted
+shadow mask, and with the wall as the mesh of `--proxy`. RMSE is of display values, over the box
+of all that the car changes in the truth and over the whole picture.
+"""
+
+import argparse
+import json
+import time
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from PIL import Image
+
+from benchmarks.referee import foreground
+from warpir.asset import Asset, Material, Primitive, Texture, TextureSlot, load_asset
+from warpir.camera import Camera, camera_from_fov
+from warpir.color import linear_to_gamma
+from warpir.curves import ToneKnots
+from warpir.demo import ASSET, LIGHT
+from warpir.demo.make import pixel_directions
+from warpir.demo.place import paving_texture
+from warpir.demo.sky import seen
+from warpir.files import Photo, read_envmap
+from warpir.lamps import lamp_axes
+from warpir.light import Light, angles_from_axis, resize_map, rotate_map
+from warpir.mis import IntArray
+from warpir.picture import Quality, make_picture, photo_radiance
+from warpir.placement import Placement, place_asset
+from warpir.proxy_mesh import ProxyMesh, first_hit, mesh_of
+from warpir.render import Renderer, choose_device
+from warpir.scene import Placed, Proxy, Scene
+from warpir.shadow_mask import shadow_mask
+
+FloatArray = NDArray[np.float32]
+
+DEPTH = 4
+GROUND = 40.0
+"""Half of the ground's side [m]."""
+LIT_LEVEL = 0.35
+"""Linear display value of sunlit ground [1]."""
+CHANGE = 8.0 / 255.0
+"""Display values by which the truth differs from the photo where the car changes it."""
+
+
+@dataclass(frozen=True)
+class Case:
+    """Where the car stands, and where the sun is."""
+
+    name: str
+    sun_azimuth: float
+    """Clockwise from the camera's direction [deg]."""
+    place: tuple[float, float, float]
+    rotate_y: float
+
+
+CASES = (
+    Case("in the wall's shadow", 15.0, (0.2, 0.0, -7.6), -35.0),
+    Case("half in the wall's shadow", 15.0, (2.6, 0.0, -7.6), -55.0),
+    Case("before the sunlit wall", 235.0, (0.2, 0.0, -8.2), -70.0),
+)
+BURIED = np.array([[1.0, 0, 0, 0], [0, 1, 0, -5], [0, 0, 1, 0], [0, 0, 0, 1]])
+WALL_CENTRE, WALL_SIZE = np.array([0.6, 1.6, -9.2]), np.array([6.0, 3.2, 0.3])
+
+
+def yard() -> tuple[Asset, Asset]:
+    """Return the ground, and the wall that stands on it."""
+    from trimesh.creation import box
+
+    paving = Material("paving", metallic=0.0, roughness=0.9, base_color_texture=TextureSlot(0))
+    corners = GROUND * np.array([[-1, 0, 1], [1, 0, 1], [1, 0, -1], [-1, 0, -1]], np.float64)
+    uv = np.array([[0, 0], [8, 0], [8, 8], [0, 8]], np.float32)
+    sides = np.array([[0, 1, 2], [0, 2, 3]], np.int32)
+    ground = Asset("ground", (Primitive(corners, sides, 0, uv0=uv),), (paving,), (_paving(),))
+    block = box(extents=WALL_SIZE)
+    brick = Material("brick", (0.3, 0.14, 0.08), metallic=0.0, roughness=0.95)
+    primitive = Primitive(
+        np.array(block.vertices) + WALL_CENTRE, np.array(block.faces, np.int32), 0
+    )
+    return ground, Asset("wall", (primitive,), (brick,))
+
+
+def _paving() -> Texture:
+    return paving_texture(512)
+
+
+def joined(parts: list[tuple[Asset, NDArray[np.float64]]]) -> Asset:
+    """Return several assets where they stand as one, in the world's frame."""
+    primitives: list[Primitive] = []
+    materials: list[Material] = []
+    textures: list[Texture] = []
+    slots = [name for name in vars(Material()) if name.endswith("_texture")]
+    for asset, matrix in parts:
+        linear = matrix[:3, :3]
+        for p in asset.primitives:
+            normals = None if p.normals is None else p.normals @ np.linalg.inv(linear)
+            if normals is not None:
+                normals = normals / np.linalg.norm(normals, axis=1, keepdims=True)
+            primitives.append(
+                replace(
+                    p,
+                    positions=p.positions @ linear.T + matrix[:3, 3],
+                    normals=None if normals is None else normals.astype(np.float32),
+                    tangents=None,
+                    material=p.material + len(materials),
+                )
+            )
+        for m in asset.materials:
+            used = {name: getattr(m, name) for name in slots}
+            moved = {
+                name: replace(slot, texture=slot.texture + len(textures))
+                for name, slot in used.items()
+                if slot is not None
+            }
+            materials.append(replace(m, **moved))
+        textures += asset.textures
+    return Asset("place", tuple(primitives), tuple(materials), tuple(textures))
+
+
+def photograph(asset: Asset, camera: Camera, texels: FloatArray, samples: int) -> NDArray[Any]:
+    """Return the place's linear radiance as Mitsuba path-traces it, the sky behind it."""
+    shot = foreground(asset, np.eye(4), camera, texels, DEPTH, samples, 0)
+    sky = seen(texels, pixel_directions(camera))
+    return np.asarray(shot.mean + (1.0 - shot.coverage)[..., None] * sky)
+
+
+def painted_mask(wall: ProxyMesh, camera: Camera, sun: NDArray[np.float64]) -> FloatArray:
+    """Return what a user would paint: ground that the wall keeps from the sun's centre."""
+    rays = pixel_directions(camera).reshape(-1, 3)
+    eye = np.broadcast_to(camera.c2w[:3, 3], rays.shape)
+    to_wall = first_hit(wall, eye, rays)[0]
+    to_ground = np.where(rays[:, 1] < 0.0, -eye[:, 1] / np.minimum(rays[:, 1], -1e-9), np.inf)
+    points = eye + np.where(np.isfinite(to_ground), to_ground, 0.0)[:, None] * rays
+    points[:, 1] = 1e-4
+    shaded = np.isfinite(first_hit(wall, points, np.broadcast_to(sun, points.shape))[0])
+    mask = shaded & (to_ground < to_wall)
+    return mask.reshape(camera.height, camera.width).astype(np.float32)
+
+
+def as_photo(display: NDArray[Any]) -> Photo:
+    """Return 8-bit codes of display values as a photo."""
+    codes = np.round(255.0 * np.clip(display, 0.0, 1.0)).astype(np.uint8)
+    return Photo(codes=codes, srgb=codes.astype(np.float32) / np.float32(255.0), kind="png")
+
+
+def insertions(
+    car: Asset,
+    placement: Placement,
+    camera: Camera,
+    light: Light,
+    photo: Photo,
+    wall: ProxyMesh,
+    mask: FloatArray,
+    samples: int,
+    device: str,
+) -> dict[str, tuple[FloatArray, float]]:
+    """Return the composites by what was known of the place, and seconds of the second render."""
+    up = np.array([0.0, 1.0, 0.0])
+    plain = Proxy(up, 0.0)
+    known = replace(plain, mesh=wall, radiance=photo_radiance(photo, False))
+    shade = shadow_mask(mask, *car.bounds(), placement.asset_to_world, camera)
+    curves = ToneKnots.identity(1), ToneKnots.identity(3)
+    found = {}
+    for name, proxy, own_mask in (
+        ("plane", plain, None),
+        ("plane and mask", plain, shade),
+        ("plane and mesh", known, None),
+    ):
+        scene = Scene([Placed(car, placement.asset_to_world)], camera, proxy, device)
+        quality = Quality(samples, 1, DEPTH, 0)
+        for _ in range(2):
+            start = time.perf_counter()
+            picture = make_picture(
+                Renderer(scene), light, light, photo, quality, *curves, False, own_mask
+            )
+            seconds = time.perf_counter() - start
+        found[name] = (np.clip(picture.image, 0.0, 1.0), seconds)
+    return found
+
+
+def rmse(a: NDArray[Any], b: NDArray[Any], box: tuple[slice, slice]) -> float:
+    """Root of the mean squared difference of display values in a box."""
+    return float(np.sqrt(np.square(a[box].astype(np.float64) - b[box]).mean()))
+
+
+def changed_box(
+    truth: NDArray[Any], photo: NDArray[Any], seen_car: IntArray
+) -> tuple[slice, slice]:
+    """Return rows and columns of what the car changes clearly, its own pixels included."""
+    difference = np.abs(truth - photo).mean(axis=-1)
+    for axis in (0, 1):  # one path that meets the car far away is no change
+        difference = sum(np.roll(difference, k, axis) for k in range(-2, 3)) / 5.0
+    marked = difference > CHANGE
+    marked |= seen_car.reshape(marked.shape) > 0
+    rows, columns = np.flatnonzero(marked.any(axis=1)), np.flatnonzero(marked.any(axis=0))
+    return slice(rows[0], rows[-1] + 1), slice(columns[0], columns[-1] + 1)
+
+
+def main() -> None:
+    """Render truth and insertions of every case; write the sheet and the figures."""
+    parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
+    parser.add_argument("--out", type=Path, required=True)
+    parser.add_argument("--panorama", type=Path, default=LIGHT, help="default: the demo's sky")
+    parser.add_argument("--samples", type=int, default=256, help="of truth and photo, per pixel")
+    parser.add_argument("--width", type=int, default=480)
+    parser.add_argument("--device", default=None)
+    parser.add_argument("--json", type=Path, default=None)
+    options = parser.parse_args()
+    options.out.mkdir(parents=True, exist_ok=True)
+    device = choose_device(options.device)
+    camera = camera_from_fov(options.width, options.width * 2 // 3, 58.0, -9.0, 1.9)
+    ground, wall_asset = yard()
+    wall, car = mesh_of(wall_asset), load_asset(ASSET)
+    texels = read_envmap(options.panorama)
+    azimuth = angles_from_axis(lamp_axes(Light(texels=texels))[0])[0]
+    rows, figures = [], []
+    photos: dict[float, tuple[FloatArray, float, NDArray[Any]]] = {}
+    for case in CASES:
+        # Counter-clockwise, azimuths run clockwise.
+        turned = resize_map(rotate_map(texels, azimuth - case.sun_azimuth), 256)
+        sun = lamp_axes(Light(texels=turned))[0]
+        # A second car, buried, lets photo and truth draw the same random numbers: Mitsuba draws one
+        # more where any material is transparent.
+        place = [(ground, np.eye(4)), (wall_asset, np.eye(4)), (car, BURIED)]
+        if case.sun_azimuth not in photos:
+            empty = photograph(joined(place), camera, turned, options.samples)
+            lit = np.percentile(empty[-camera.height // 4 :].mean(axis=-1), 60.0)
+            photos[case.sun_azimuth] = (turned, LIT_LEVEL / float(lit), empty)
+        turned, exposure, empty = photos[case.sun_azimuth]
+        photo = as_photo(linear_to_gamma(np.clip(exposure * empty, 0.0, 1.0)))
+        placement = place_asset(
+            *car.bounds(), camera, None, place=case.place, rotate_y=case.rotate_y, size=2.2
+        )
+        with_car = joined([*place, (car, placement.asset_to_world)])
+        shot = photograph(with_car, camera, turned, options.samples)
+        truth = linear_to_gamma(np.clip(exposure * shot, 0.0, 1.0))
+        # Below the horizon a panorama from there would show the ground.
+        lower = turned.copy()
+        lower[128:] = np.mean(empty[-camera.height // 8 :], axis=(0, 1))
+        light = Light(texels=lower).scaled(exposure)
+        mask = painted_mask(wall, camera, sun)
+        found = insertions(
+            car, placement, camera, light, photo, wall, mask, options.samples // 2, device
+        )
+        shape = _coverage(car, placement, camera, device)
+        box = changed_box(truth, photo.srgb, shape)
+        whole = (slice(None), slice(None))
+        tiles = [photo.srgb, *(image for image, _ in found.values()), truth]
+        rows.append(np.concatenate(tiles, axis=1))
+        for name, (image, seconds) in found.items():
+            figures.append(
+                {
+                    "case": case.name,
+                    "known": name,
+                    "rmse_box": round(rmse(image, truth, box), 4),
+                    "rmse_picture": round(rmse(image, truth, whole), 4),
+                    "seconds": round(seconds, 2),
+                }
+            )
+            print(figures[-1], flush=True)
+    sheet = np.round(255.0 * np.clip(np.concatenate(rows, axis=0), 0.0, 1.0)).astype(np.uint8)
+    Image.fromarray(sheet).save(options.out / "proxy.png")
+    if options.json is not None:
+        options.json.write_text("".join(json.dumps(f) + "\n" for f in figures))
+
+
+def _coverage(car: Asset, placement: Placement, camera: Camera, device: str) -> IntArray:
+    """Return 1 in pixels that show the car."""
+    up = np.array([0.0, 1.0, 0.0])
+    scene = Scene([Placed(car, placement.asset_to_world)], camera, Proxy(up, 0.0), device)
+    seen_pixels = np.zeros(camera.width * camera.height, np.int32)
+    gbuffer = Renderer(scene).gbuffer(0)
+    seen_pixels[gbuffer.object_pixels[gbuffer.coverage > 0.0]] = 1
+    return seen_pixels
+
+
+if __name__ == "__main__":
+    main()
