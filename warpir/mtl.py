@@ -1,6 +1,7 @@
 """Reads the material files of OBJ (MTL) into `Material`.
 
-Physically based keys are used where the file has them (``Pr Pm Ke norm`` and their maps; ``Pc Pcr Ps Ni`` without maps; as in
+Physically based keys are used where the file has them (``Pr Pm Ke norm`` and their maps, ``Pc Pcr
+Ps Ni`` without maps, as in
 https://benhouston3d.com/blog/extended-wavefront-obj-mtl-for-pbr/). ``bsdf pbr`` (nvdiffrec)
 makes ``Ks`` mean (occlusion, roughness, metallic). What older files leave open is assumed and
 noted. OBJ knows no back faces, so all materials are double-sided.
