@@ -11,6 +11,7 @@ from warpir.kernels.proxy_mesh import INFINITY, proxy_distance, proxy_mesh_hit
 from warpir.kernels.rng import hash_pair, pixel_seed, sobol_pair, to_unit
 from warpir.kernels.types import (
     CameraArgs,
+    Extensions,
     Layers,
     MaterialArgs,
     MeshArgs,
@@ -218,77 +219,36 @@ def hit_coverage(mesh: MeshArgs, material: MaterialArgs, texture: TextureArgs, h
 
 
 @wp.func
-def read_slot(
-    mesh: MeshArgs,
-    material: MaterialArgs,
-    texture: TextureArgs,
-    m: int,
-    slot: int,
-    hit: Hit,
-    is_color: int,
-) -> wp.vec4:
-    """Return what a slot of material ``m`` multiplies its factor with; 1 without a texture."""
-    k = material.slot_texture[m, slot]
-    if k < 0:
-        return wp.vec4(1.0, 1.0, 1.0, 1.0)
-    return sample_texture(texture, k, slot_uv(mesh, material, m, slot, hit), is_color)
-
-
-@wp.func
-def vertex_color(mesh: MeshArgs, hit: Hit) -> wp.vec3:
-    """Interpolate the factors on the base colour, linear RGB [1]."""
-    a = mesh.colors[mesh.indices[3 * hit.face]]
-    b = mesh.colors[mesh.indices[3 * hit.face + 1]]
-    c = mesh.colors[mesh.indices[3 * hit.face + 2]]
-    color = a * hit.u + b * hit.v + c * (1.0 - hit.u - hit.v)
-    return wp.vec3(color[0], color[1], color[2])
-
-
-@wp.func
-def smooth_normal(mesh: MeshArgs, hit: Hit) -> wp.vec3:
-    """Interpolate the unit shading normal, before any map."""
-    a = mesh.normals[mesh.indices[3 * hit.face]]
-    b = mesh.normals[mesh.indices[3 * hit.face + 1]]
-    c = mesh.normals[mesh.indices[3 * hit.face + 2]]
-    n = a * hit.u + b * hit.v + c * (1.0 - hit.u - hit.v)
-    if wp.dot(n, n) > 1.0e-12:
-        return wp.normalize(n)
-    return face_normal(mesh, hit.face)
-
-
-@wp.func
-def dielectric_f0(
+def extensions_at(
     mesh: MeshArgs, material: MaterialArgs, texture: TextureArgs, m: int, hit: Hit
-) -> wp.vec4:
-    """Return the dielectric's reflectance at normal incidence, unclamped, and its strength."""
-    color = read_slot(mesh, material, texture, m, SLOT_SPECULAR_COLOR, hit, 1)
-    strength = (
-        material.specular[m] * read_slot(mesh, material, texture, m, SLOT_SPECULAR, hit, 0)[3]
-    )
-    f0 = wp.cw_mul(material.f0[m], wp.vec3(color[0], color[1], color[2]))
-    return wp.vec4(f0[0], f0[1], f0[2], strength)
-
-
-@wp.func
-def clearcoat_at(
-    mesh: MeshArgs, material: MaterialArgs, texture: TextureArgs, m: int, hit: Hit
-) -> float:
-    """Return the share of a point that the clear coat covers."""
-    clearcoat = material.clearcoat[m]
-    if clearcoat > 0.0:
-        clearcoat *= read_slot(mesh, material, texture, m, SLOT_CLEARCOAT, hit, 0)[0]
-    return clearcoat
-
-
-@wp.func
-def transmission_at(
-    mesh: MeshArgs, material: MaterialArgs, texture: TextureArgs, m: int, hit: Hit
-) -> float:
-    """Return the share of what enters the dielectric that leaves on the other side."""
-    transmission = material.transmission[m]
-    if transmission > 0.0:
-        transmission *= read_slot(mesh, material, texture, m, SLOT_TRANSMISSION, hit, 0)[0]
-    return transmission
+) -> Extensions:
+    """Read the extensions of material ``m`` at a hit."""
+    e = material.extensions[m]
+    # In a loop: eight inlined lookups slow down scenes that need none of them.
+    for slot in range(SLOT_SPECULAR, material.slot_texture.shape[1]):
+        k = material.slot_texture[m, slot]
+        if k >= 0 and slot != SLOT_CLEARCOAT_NORMAL:
+            is_color = int(0)
+            if slot == SLOT_SPECULAR_COLOR or slot == SLOT_SHEEN_COLOR:
+                is_color = 1
+            uv = slot_uv(mesh, material, m, slot, hit)
+            code = sample_texture(texture, k, uv, is_color)
+            color = wp.vec3(code[0], code[1], code[2])
+            if slot == SLOT_SPECULAR:
+                e.specular = e.specular * code[3]
+            elif slot == SLOT_SPECULAR_COLOR:
+                e.f0 = wp.cw_mul(e.f0, color)
+            elif slot == SLOT_CLEARCOAT:
+                e.clearcoat = e.clearcoat * code[0]
+            elif slot == SLOT_CLEARCOAT_ROUGHNESS:
+                e.clearcoat_roughness = e.clearcoat_roughness * code[1]
+            elif slot == SLOT_SHEEN_COLOR:
+                e.sheen_color = wp.cw_mul(e.sheen_color, color)
+            elif slot == SLOT_SHEEN_ROUGHNESS:
+                e.sheen_roughness = e.sheen_roughness * code[3]
+            else:
+                e.transmission = e.transmission * code[0]
+    return e
 
 
 @wp.func
@@ -303,26 +263,32 @@ def transmitted_share(
     """Return the share of light that passes a thin transmissive wall straight on.
 
     KHR_materials_transmission for a surface of roughness 0, its tint reduced to luminance: what
-    coat and dielectric do not reflect toward ``direction``, times the base colour. The Fresnel
-    terms are those of the interpolated normal, so that rays need not read normal maps.
+    coat and dielectric do not reflect, times the base colour. The angle is that with the
+    interpolated normal, so that rays need not read normal maps.
     """
-    transmission = transmission_at(mesh, material, texture, m, hit)
-    if transmission <= 0.0:
-        return 0.0
-    code = read_slot(mesh, material, texture, m, SLOT_BASE_COLOR, hit, 1)
-    color = wp.cw_mul(vertex_color(mesh, hit), wp.vec3(code[0], code[1], code[2]))
-    tint = luminance(wp.cw_mul(material.base_color[m], color))
-    metallic = (
-        material.metallic[m]
-        * read_slot(mesh, material, texture, m, SLOT_METALLIC_ROUGHNESS, hit, 0)[2]
-    )
-    weight = schlick(wp.abs(wp.dot(smooth_normal(mesh, hit), direction)))
-    f0 = dielectric_f0(mesh, material, texture, m, hit)
-    reflected = wp.min(wp.max(wp.vec3(f0[0], f0[1], f0[2])), 1.0)
-    reflected = f0[3] * (reflected + (1.0 - reflected) * weight)
-    coat = clearcoat_at(mesh, material, texture, m, hit)
-    coat = coat * (F0_COAT + (1.0 - F0_COAT) * weight)
-    return transmission * (1.0 - metallic) * tint * (1.0 - reflected) * (1.0 - coat)
+    e = extensions_at(mesh, material, texture, m, hit)
+    a = mesh.indices[3 * hit.face]
+    b = mesh.indices[3 * hit.face + 1]
+    c = mesh.indices[3 * hit.face + 2]
+    w = 1.0 - hit.u - hit.v
+    n = mesh.normals[a] * hit.u + mesh.normals[b] * hit.v + mesh.normals[c] * w
+    vertex = mesh.colors[a] * hit.u + mesh.colors[b] * hit.v + mesh.colors[c] * w
+    tint = wp.cw_mul(material.base_color[m], wp.vec3(vertex[0], vertex[1], vertex[2]))
+    k = material.slot_texture[m, SLOT_BASE_COLOR]
+    if k >= 0:
+        code = sample_texture(texture, k, slot_uv(mesh, material, m, SLOT_BASE_COLOR, hit), 1)
+        tint = wp.cw_mul(tint, wp.vec3(code[0], code[1], code[2]))
+    metallic = material.metallic[m]
+    k = material.slot_texture[m, SLOT_METALLIC_ROUGHNESS]
+    if k >= 0:
+        uv = slot_uv(mesh, material, m, SLOT_METALLIC_ROUGHNESS, hit)
+        metallic *= sample_texture(texture, k, uv, 0)[2]
+    weight = schlick(wp.abs(wp.dot(wp.normalize(n), direction)))
+    f0 = wp.min(wp.max(e.f0), 1.0)
+    reflected = e.specular * (f0 + (1.0 - f0) * weight)
+    coat = e.clearcoat * (F0_COAT + (1.0 - F0_COAT) * weight)
+    share = e.transmission * (1.0 - metallic) * luminance(tint)
+    return share * (1.0 - reflected) * (1.0 - coat)
 
 
 @wp.func
@@ -332,7 +298,7 @@ def hit_alpha(
     """Return the share of rays that a hit stops: its coverage, less what passes the material."""
     alpha = hit_coverage(mesh, material, texture, hit)
     m = mesh.face_material[hit.face]
-    if material.transmission[m] > 0.0 and alpha > 0.0:
+    if material.any_layers == 1 and material.extensions[m].transmission > 0.0:
         alpha *= 1.0 - transmitted_share(mesh, material, texture, m, hit, ray_dir)
     return alpha
 
@@ -578,67 +544,49 @@ def facing(n: wp.vec3, ng: wp.vec3, wo: wp.vec3) -> wp.vec3:
 
 
 @wp.func
-def layers_at(
-    mesh: MeshArgs,
-    material: MaterialArgs,
-    texture: TextureArgs,
-    m: int,
-    hit: Hit,
-    n: wp.vec3,
-    coat_n: wp.vec3,
-    wo: wp.vec3,
-) -> Layers:
-    """Read the extensions of material ``m`` at a hit; both normals face ``wo``."""
-    frame = basis(n)
-    f0 = dielectric_f0(mesh, material, texture, m, hit)
-    transmission = transmission_at(mesh, material, texture, m, hit)
-    transmitted = float(0.0)
-    if transmission > 0.0:
-        transmitted = transmitted_share(mesh, material, texture, m, hit, wo)
-    sheen_color = material.sheen_color[m]
-    sheen_roughness = material.sheen_roughness[m]
-    if wp.max(sheen_color) > 0.0:
-        color = read_slot(mesh, material, texture, m, SLOT_SHEEN_COLOR, hit, 1)
-        sheen_color = wp.cw_mul(sheen_color, wp.vec3(color[0], color[1], color[2]))
-        sheen_roughness *= read_slot(mesh, material, texture, m, SLOT_SHEEN_ROUGHNESS, hit, 0)[3]
-    coat_roughness = material.clearcoat_roughness[m]
-    coat_roughness *= read_slot(mesh, material, texture, m, SLOT_CLEARCOAT_ROUGHNESS, hit, 0)[1]
-    return layers_toward(
-        to_local(wo, frame),
-        wp.vec3(f0[0], f0[1], f0[2]),
-        f0[3],
-        transmission,
-        transmitted,
-        sheen_color,
-        sheen_roughness,
-        material.sheen_albedo,
-        clearcoat_at(mesh, material, texture, m, hit),
-        coat_roughness,
-        to_local(coat_n, frame),
-    )
-
-
-@wp.func
 def surface_at(
     mesh: MeshArgs, material: MaterialArgs, texture: TextureArgs, hit: Hit, wo: wp.vec3
 ) -> Surface:
     """Gather everything that shading needs at a hit."""
+    a = mesh.indices[3 * hit.face]
+    b = mesh.indices[3 * hit.face + 1]
+    c = mesh.indices[3 * hit.face + 2]
+    w = 1.0 - hit.u - hit.v
     m = mesh.face_material[hit.face]
     s = Surface()
     s.position = hit_position(mesh, hit)
     s.material = m
     s.ng = face_normal(mesh, hit.face)
-    smooth_n = smooth_normal(mesh, hit)
-    n = mapped_normal(
-        mesh, material, texture, m, SLOT_NORMAL, material.normal_scale[m], hit, smooth_n
-    )
+    smooth_n = mesh.normals[a] * hit.u + mesh.normals[b] * hit.v + mesh.normals[c] * w
+    if wp.dot(smooth_n, smooth_n) > 1.0e-12:
+        smooth_n = wp.normalize(smooth_n)
+    else:
+        smooth_n = s.ng
+    s.layers.present = 0
+    if material.any_layers == 1:
+        s.layers.present = material.extensions[m].present
+    # One call in a loop: a function with one caller is inlined, else its arguments are copied.
+    n = smooth_n
+    coat_n = smooth_n
+    for layer in range(1 + s.layers.present):
+        slot = SLOT_NORMAL
+        strength = material.normal_scale[m]
+        if layer == 1:
+            slot = SLOT_CLEARCOAT_NORMAL
+            strength = material.extensions[m].clearcoat_normal_scale
+        mapped = mapped_normal(mesh, material, texture, m, slot, strength, hit, smooth_n)
+        if layer == 0:
+            n = mapped
+        else:
+            coat_n = mapped
     side = float(1.0)
     if wp.dot(s.ng, wo) < 0.0:
         side = -1.0
     s.ng = s.ng * side
     s.n = facing(n * side, s.ng, wo)
 
-    s.texture_color = vertex_color(mesh, hit)
+    color = mesh.colors[a] * hit.u + mesh.colors[b] * hit.v + mesh.colors[c] * w
+    s.texture_color = wp.vec3(color[0], color[1], color[2])
     k = material.slot_texture[m, SLOT_BASE_COLOR]
     if k >= 0:
         uv = slot_uv(mesh, material, m, SLOT_BASE_COLOR, hit)
@@ -661,20 +609,26 @@ def surface_at(
     s.base_color = wp.cw_mul(material.base_color[m], s.texture_color)
     s.metallic = material.metallic[m] * s.texture_metallic
     s.roughness = material.roughness[m] * s.texture_roughness
-    s.layers.present = 0
-    if material.any_layers == 1 and material.layered[m] == 1:
-        coat_n = mapped_normal(
-            mesh,
-            material,
-            texture,
-            m,
-            SLOT_CLEARCOAT_NORMAL,
-            material.clearcoat_normal_scale[m],
-            hit,
-            smooth_n,
-        )
+    if s.layers.present == 1:
         coat_n = facing(coat_n * side, s.ng, wo)
-        s.layers = layers_at(mesh, material, texture, m, hit, s.n, coat_n, wo)
+        e = extensions_at(mesh, material, texture, m, hit)
+        transmitted = float(0.0)
+        if e.transmission > 0.0:
+            transmitted = transmitted_share(mesh, material, texture, m, hit, wo)
+        frame = basis(s.n)
+        s.layers = layers_toward(
+            to_local(wo, frame),
+            e.f0,
+            e.specular,
+            e.transmission,
+            transmitted,
+            e.sheen_color,
+            e.sheen_roughness,
+            material.sheen_albedo,
+            e.clearcoat,
+            e.clearcoat_roughness,
+            to_local(coat_n, frame),
+        )
         # What shines from below the coat; all of it stands for the rays that passed too.
         s.texture_emission = s.texture_emission * s.layers.emission_scale
     s.emission = wp.cw_mul(material.emission[m], s.texture_emission)

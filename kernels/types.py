@@ -111,6 +111,26 @@ class Layers:
 
 
 @wp.struct
+class Extensions:
+    """What glTF's extensions say of a material, or of one point of it."""
+
+    present: int
+    """1 where any of it differs from the plain model."""
+    f0: wp.vec3
+    """Reflectance of the dielectric at normal incidence, colour included, before clamping [1]."""
+    specular: float
+    """Strength of the dielectric's reflection [1]."""
+    clearcoat: float
+    """Share of the surface that the coat covers [1]."""
+    clearcoat_roughness: float
+    clearcoat_normal_scale: float
+    sheen_color: wp.vec3
+    sheen_roughness: float
+    transmission: float
+    """Share of what enters the dielectric that leaves on the other side [1]."""
+
+
+@wp.struct
 class MaterialArgs:
     """Material factors and texture slots; `warpir.kernels.trace` numbers the slots."""
 
@@ -124,18 +144,9 @@ class MaterialArgs:
     alpha_cutoff: wp.array[float]
     double_sided: wp.array[int]
     normal_scale: wp.array[float]
-    layered: wp.array[int]
-    """1 where a material has more than the metallic-roughness model: the following."""
-    f0: wp.array[wp.vec3]
-    """Reflectance of the dielectric at normal incidence, colour included, unclamped [1]."""
-    specular: wp.array[float]
-    clearcoat: wp.array[float]
-    clearcoat_roughness: wp.array[float]
-    clearcoat_normal_scale: wp.array[float]
-    sheen_color: wp.array[wp.vec3]
-    sheen_roughness: wp.array[float]
-    transmission: wp.array[float]
     """All of shape [material]."""
+    extensions: wp.array[Extensions]
+    """Shape [material]; in one array, since functions take these arguments by value."""
     sheen_albedo: wp.array2d[float]
     """From `warpir.sheen.sheen_albedo_table`."""
     slot_texture: wp.array2d[int]
@@ -146,7 +157,7 @@ class MaterialArgs:
     slot_v: wp.array2d[wp.vec3]
     """Rows of the affine UV transform, shape [material, slot]."""
     any_layers: int
-    """1 when some material is layered."""
+    """1 when some material has extensions."""
     any_alpha: int
     """1 when some material lets rays pass, so that they must look at what they hit."""
     any_culled: int

@@ -18,7 +18,14 @@ from warpir.asset import Asset, Material, Primitive, Texture, TextureSlot
 from warpir.camera import Camera
 from warpir.color import srgb_to_linear
 from warpir.kernels.proxy_mesh import trace_seen
-from warpir.kernels.types import CameraArgs, MaterialArgs, MeshArgs, ProxyArgs, TextureArgs
+from warpir.kernels.types import (
+    CameraArgs,
+    Extensions,
+    MaterialArgs,
+    MeshArgs,
+    ProxyArgs,
+    TextureArgs,
+)
 from warpir.proxy_mesh import ProxyMesh
 from warpir.sheen import sheen_albedo_table
 
@@ -125,21 +132,24 @@ def _slot(slot: TextureSlot | None, first_texture: int) -> tuple[int, int, list[
     return first_texture + slot.texture, slot.uv_set, list(slot.transform)
 
 
-def dielectric_f0(ior: float) -> float:
-    """Return the reflectance at normal incidence of a dielectric in air [1]; 0 means infinity.
-
-    ``((1 - ior) / (1 + ior))^2`` (KHR_materials_ior).
-    """
-    return ((1.0 - ior) / (1.0 + ior)) ** 2
-
-
-def is_layered(material: Material) -> bool:
-    """Return whether a material has more than glTF's metallic-roughness model."""
+def _extensions(material: Material) -> Extensions:
+    """Return what a material has beyond metallic-roughness."""
     plain = Material()
     names = ("ior", "specular", "specular_color", "clearcoat", "sheen_color", "transmission")
-    return any(getattr(material, name) != getattr(plain, name) for name in names) or any(
-        (material.specular_texture, material.specular_color_texture)
-    )
+    out = Extensions()
+    out.present = int(any(getattr(material, name) != getattr(plain, name) for name in names))
+    if material.specular_texture or material.specular_color_texture:
+        out.present = 1
+    # KHR_materials_ior; an index of 0 stands for infinity and gives 1 as well.
+    f0 = ((1.0 - material.ior) / (1.0 + material.ior)) ** 2
+    out.f0 = wp.vec3(*(f0 * channel for channel in material.specular_color))
+    out.sheen_color = wp.vec3(*material.sheen_color)
+    for name in (
+        "specular", "clearcoat", "clearcoat_roughness", "clearcoat_normal_scale",
+        "sheen_roughness", "transmission",
+    ):  # fmt: skip
+        setattr(out, name, getattr(material, name))
+    return out
 
 
 class Scene:
@@ -329,21 +339,14 @@ class Scene:
             for m, (_, first) in zip(plain, rows, strict=True)
         ]
         args = MaterialArgs()
-        for name in (
-            "metallic", "roughness", "alpha", "alpha_cutoff", "normal_scale", "specular",
-            "clearcoat", "clearcoat_roughness", "clearcoat_normal_scale", "sheen_roughness",
-            "transmission",
-        ):  # fmt: skip
+        for name in ("metallic", "roughness", "alpha", "alpha_cutoff", "normal_scale"):
             values = np.array([getattr(m, name) for m in plain], np.float32)
             setattr(args, name, self._array(values, wp.float32))
-        for name in ("base_color", "emission", "sheen_color"):
-            values = np.array([getattr(m, name) for m in plain], np.float32)
-            setattr(args, name, self._array(values, wp.vec3))
-        f0 = [dielectric_f0(m.ior) * np.array(m.specular_color) for m in plain]
-        args.f0 = self._array(np.array(f0, np.float32), wp.vec3)
-        layered = [is_layered(m) for m in plain]
-        args.layered = self._array(np.array(layered, np.int32), wp.int32)
-        args.any_layers = int(any(layered))
+        args.base_color = self._array(np.array([m.base_color for m in plain], np.float32), wp.vec3)
+        args.emission = self._array(np.array([m.emission for m in plain], np.float32), wp.vec3)
+        extensions = [_extensions(m) for m in plain]
+        args.extensions = wp.array(extensions, dtype=Extensions, device=self.device)
+        args.any_layers = int(any(e.present for e in extensions))
         has_sheen = any(max(m.sheen_color) > 0.0 for m in plain)
         table = sheen_albedo_table() if has_sheen else np.zeros((2, 2))
         args.sheen_albedo = self._array(table.astype(np.float32), wp.float32)
