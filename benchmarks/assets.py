@@ -59,7 +59,10 @@ def loads(folder: Path, repeats: int) -> dict[str, Any]:
     print("| asset | " + " | ".join(columns) + " |")
     print("|---|" + "---|" * len(columns))
     for name, row in found.items():
-        shown = [str(row[key]) for key in columns] if "seconds" in row else [row["refused"]]
+        if "seconds" in row:
+            shown = [f"{row['seconds']:.3f}", *(str(row[key]) for key in columns[1:])]
+        else:
+            shown = [row["refused"]]
         print(f"| {name} | " + " | ".join(shown + [""] * (len(columns) - len(shown))) + " |")
     return found
 
