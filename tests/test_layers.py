@@ -16,6 +16,7 @@ LEVELS = (
     {"optimize_settings", "asset", "strict_json", "image_errors", "lpips"},
     {"config"},
     {"camera", "asset_files", "record", "progress", "light", "tone", "curves", "materials_file"},
+    {"envmap_conventions"},
     {
         "gltf_file", "mtl", "files", "command", "placement", "lobes_file", "lobe_fit", "regressor",
         "light_errors",

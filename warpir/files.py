@@ -32,8 +32,9 @@ from numpy.typing import NDArray
 import warpir
 from warpir import color
 from warpir.camera import Camera, exr_matrices
+from warpir.envmap_conventions import SEAM_SHIFTS, to_ours
 from warpir.errors import ExitCode, InputError
-from warpir.light import rotate_map
+from warpir.light import Float64Array
 from warpir.strict_json import read_json_object
 
 FloatArray = NDArray[np.float32]
@@ -46,9 +47,6 @@ ENVMAP_WIDTH_MAX = 16384
 
 UNFINISHED = ("checkpoints", "progress")
 """Folders of an output folder that hold what a run needs, or shows, before it has results."""
-
-ENVMAP_ROLLS = {"openexr": 0.0, "nvdiffrec": -0.5, "threejs": -0.25, "blender": -0.25}
-"""Columns to roll a map of each convention by, as a share of its width, to make it ours."""
 
 _SRGB_NAMES = {"", "srgb_rec709_scene", "srgb_rec709_display", "sRGB", "g22_rec709_scene"}
 _LOG = logging.getLogger(__name__)
@@ -174,6 +172,7 @@ def read_envmap(
     path: str | Path,
     *,
     convention: str = "openexr",
+    camera_to_world: Float64Array | None = None,
     strict: bool = False,
     notices: list[str] | None = None,
 ) -> FloatArray:
@@ -184,7 +183,8 @@ def read_envmap(
 
     Args:
         path: A 2:1 ``.hdr`` or ``.exr`` file, recognised by content.
-        convention: Who made the map: a key of `ENVMAP_ROLLS`.
+        convention: Who made the map: a key of `SEAM_SHIFTS`.
+        camera_to_world: Pose of the camera, shape [4, 4], for a map in camera axes.
         strict: Refuse NaN, infinite and negative values instead of repairing them.
         notices: One line per repair is appended here.
 
@@ -195,8 +195,8 @@ def read_envmap(
         InputError: Missing, damaged, not 2:1, not an HDR format, or (strict) not clean.
     """
     path = Path(path)
-    if convention not in ENVMAP_ROLLS:
-        raise ValueError(f"convention {convention!r} is not one of {', '.join(ENVMAP_ROLLS)}")
+    if convention not in SEAM_SHIFTS:
+        raise ValueError(f"convention {convention!r} is not one of {', '.join(SEAM_SHIFTS)}")
     image = _decode(path, ENVMAP_WIDTH_MAX * ENVMAP_WIDTH_MAX // 2, kinds=("exr", "hdr"))
     texels = _upright(image.pixels, image.orientation).astype(np.float32)
     if texels.shape[-1] == 1:
@@ -228,8 +228,7 @@ def read_envmap(
         messages.append(f"{found} repaired: +Inf to the brightest finite value, the others to 0")
     if notices is not None:
         notices += messages
-    # Longitude falls with u: rolling to the right by a share of the width is a clockwise turn.
-    return rotate_map(texels, -360.0 * ENVMAP_ROLLS[convention])
+    return to_ours(texels, convention, camera_to_world)
 
 
 # ----------------------------------------------------------------------------------- decoding
