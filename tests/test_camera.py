@@ -10,11 +10,14 @@ import pytest
 
 from warpir.camera import (
     Camera,
+    blender_camera,
     camera_from_exif,
     camera_from_fov,
     exr_matrices,
     ground_point,
+    mitsuba_sensor,
     read_camera,
+    square_pixel_error,
 )
 from warpir.errors import ExitCode, InputError
 
@@ -302,3 +305,58 @@ def test_exr_matrices_project_as_openexr_says(rng: np.random.Generator) -> None:
     ndc = rows @ world_to_ndc
     pixels = ndc[:, :2] / ndc[:, 3:] * [640.0, 480.0]
     np.testing.assert_allclose(pixels, camera.project(points), atol=PIXEL)
+
+
+SHIFTED = [(640, 480, 321.5, 239.25), (480, 640, 200.0, 350.5), (512, 512, -20.0, 700.0)]
+"""Landscape, portrait and square pictures; the last with a principal point outside."""
+
+
+def camera_of(size: tuple[int, int, float, float], rng: np.random.Generator) -> Camera:
+    return Camera(*size[:2], 500.0, 500.0, *size[2:], pose(rng))
+
+
+@pytest.mark.parametrize("size", SHIFTED)
+def test_mitsuba_sensor_projects_as_mitsuba_does(
+    size: tuple[int, int, float, float], rng: np.random.Generator
+) -> None:
+    """Mitsuba 3's perspective projection restated: +Z forward, +X left, y up, shares of a side."""
+    camera = camera_of(size, rng)
+    sensor, points = mitsuba_sensor(camera), points_in_view(camera.c2w, rng)
+    width, height = size[:2]
+    local = np.hstack([points, np.ones((8, 1))]) @ np.linalg.inv(sensor["to_world"]).T
+    assert (local[:, 2] > 0.0).all()
+    cot = 1.0 / np.tan(np.radians(sensor["fov_deg"]) / 2.0)
+    # Film coordinates in [0, 1]: the x axis is flipped, y is scaled by the aspect.
+    x = 0.5 - 0.5 * cot * local[:, 0] / local[:, 2] - sensor["principal_point_offset_x"]
+    y = 0.5 - 0.5 * cot * width / height * local[:, 1] / local[:, 2]
+    y -= sensor["principal_point_offset_y"]
+    pixels = np.stack([x * width, y * height], axis=1)
+    np.testing.assert_allclose(pixels, camera.project(points), atol=PIXEL)
+
+
+@pytest.mark.parametrize("size", SHIFTED)
+def test_blender_camera_projects_as_blender_does(
+    size: tuple[int, int, float, float], rng: np.random.Generator
+) -> None:
+    """Blender's view frame restated: sensor 36 mm along the longer side, shifts in its units."""
+    camera = camera_of(size, rng)
+    blender, points = blender_camera(camera), points_in_view(camera.c2w, rng)
+    width, height = size[:2]
+    longer = max(width, height)
+    z_up = np.stack([points[:, 0], -points[:, 2], points[:, 1], np.ones(8)], axis=1)
+    local = z_up @ np.linalg.inv(blender["matrix_world"]).T
+    lens_mm = 18.0 / np.tan(blender["angle"] / 2.0)
+    sensor_mm = lens_mm * local[:, :2] / -local[:, 2:3]
+    # The frame's centre lies at the shift; pixels count from its top left corner.
+    offset = sensor_mm / 36.0 - [blender["shift_x"], blender["shift_y"]]
+    pixels = np.stack([width / 2 + offset[:, 0] * longer, height / 2 - offset[:, 1] * longer], 1)
+    np.testing.assert_allclose(pixels, camera.project(points), atol=PIXEL)
+
+
+def test_square_pixel_error_is_the_worst_row(rng: np.random.Generator) -> None:
+    """A corner of the frame is off by what is told when fx replaces fy."""
+    camera = Camera(640, 480, 505.0, 500.0, 320.0, 200.0, np.eye(4))
+    corner = np.array([[0.0, -280.0 / 500.0, -1.0]])  # seen at row 480
+    replaced = Camera(640, 480, 505.0, 505.0, 320.0, 200.0, np.eye(4))
+    off = abs(replaced.project(corner) - camera.project(corner))[0, 1]
+    assert square_pixel_error(camera) == pytest.approx(off) == pytest.approx(2.8)

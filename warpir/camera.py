@@ -120,6 +120,51 @@ def exr_matrices(camera: Camera) -> tuple[Float64Array, Float64Array]:
     return (np.diag([1.0, 1.0, -1.0, 1.0]) @ w2c).T, (projection @ w2c).T
 
 
+def mitsuba_sensor(camera: Camera) -> dict[str, Any]:
+    """Return the parameters of Mitsuba 3's ``perspective`` sensor with ``fov_axis="x"``.
+
+    Mitsuba's camera looks along +Z with +X to the left. Its pixels are square: where fx and fy
+    differ, columns agree and rows do not, by `square_pixel_error`.
+
+    Returns:
+        ``to_world``: world from sensor, column vectors, array of shape [4, 4]; ``fov_deg``: angle
+        across the width [deg]; ``principal_point_offset_x`` and ``_y``: shares of width and height.
+    """
+    return {
+        "to_world": camera.c2w @ np.diag([-1.0, 1.0, -1.0, 1.0]),
+        "fov_deg": float(np.degrees(2.0 * np.arctan(camera.width / 2.0 / camera.fx))),
+        "principal_point_offset_x": (camera.width / 2.0 - camera.cx) / camera.width,
+        "principal_point_offset_y": (camera.height / 2.0 - camera.cy) / camera.height,
+    }
+
+
+def blender_camera(camera: Camera) -> dict[str, Any]:
+    """Return the parameters of a Blender camera with ``sensor_fit="AUTO"``.
+
+    Blender's camera axes are ours, its world has +Z up. AUTO measures angle and shifts by the
+    longer side. Pixels are taken to be square, as in `mitsuba_sensor`.
+
+    Returns:
+        ``matrix_world``: Blender's world from camera, column vectors, array of shape [4, 4];
+        ``angle``: across the longer side [rad]; ``shift_x`` and ``shift_y``: shares of it.
+    """
+    longer = max(camera.width, camera.height)
+    turn = np.eye(4)
+    turn[:3, :3] = np.transpose(_UP_TO_Y["+z"])
+    return {
+        "matrix_world": turn @ camera.c2w,
+        "angle": float(2.0 * np.arctan(longer / 2.0 / camera.fx)),
+        "shift_x": (camera.width / 2.0 - camera.cx) / longer,
+        "shift_y": (camera.cy - camera.height / 2.0) / longer,
+    }
+
+
+def square_pixel_error(camera: Camera) -> float:
+    """Return how far rows are off where fx has to stand for fy too, at the worst pixel [px]."""
+    farthest = max(abs(camera.cy), abs(camera.height - camera.cy))
+    return float(abs(camera.fx / camera.fy - 1.0) * farthest)
+
+
 # ----------------------------------------------------------------------- cameras from few numbers
 
 
