@@ -74,6 +74,11 @@ class Photo:
         """Whether the codes are scene-linear floats (EXR, HDR, float TIFF)."""
         return self.codes.dtype.kind == "f"
 
+    @property
+    def is_deep(self) -> bool:
+        """Whether the codes have more than 8 bits, so that half floats would lose some."""
+        return self.codes.dtype.itemsize > 1
+
     def linear(self) -> FloatArray:
         """Return ``photo_lin`` [1], shape [H, W, 3]: ``srgb ** 2.2``, or a plate's own values.
 
@@ -1204,15 +1209,21 @@ def write_layers(
     layers: Layers,
     camera: Camera,
     *,
+    is_deep: bool = False,
     config: Mapping[str, Any] | None = None,
     inputs: Mapping[str, str] | None = None,
 ) -> int:
     """Stage ``layers.exr``: half channels, float32 for depth, position and normal.
 
+    The composite recomposes exactly. Of a photograph of 8 bits the layers hold halves to begin with
+    (`warpir.picture`), so nothing is lost here, and the composite is stored rounded to half. A
+    deeper one has codes that halves cannot tell apart: its composite and its layers are float32.
+
     Args:
         folder: Where.
         layers: The image planes.
         camera: The camera that made them, at their resolution.
+        is_deep: Whether the photograph has more than 8 bits (`Photo.is_deep`).
         config: Resolved configuration, kept as JSON in the attribute ``warpir/config``.
         inputs: sha256 of the input files by name, kept as JSON in ``warpir/inputs``.
 
@@ -1253,12 +1264,12 @@ def write_layers(
             name = f"{prefix}.{suffix}" if prefix else suffix
             channels[name] = plane[..., k].astype(np.float32 if whole_floats else np.float16)
 
-    add("", "RGB", layers.composite)
+    add("", "RGB", layers.composite, is_deep)
     add("", "A", np.ones((height, width), np.float32))
-    add("fg", "RGBA", layers.foreground)
-    add("shadow", "RGB", layers.shadow_ratio)
-    add("plate", "RGB", layers.plate)
-    add("matte", "A", layers.matte)
+    add("fg", "RGBA", layers.foreground, is_deep)
+    add("shadow", "RGB", layers.shadow_ratio, is_deep)
+    add("plate", "RGB", layers.plate, is_deep)
+    add("matte", "A", layers.matte, is_deep)
     if layers.depth is not None:
         depth = np.where(np.isposinf(layers.depth), BACKGROUND_DEPTH, layers.depth)
         add("", "Z", depth, whole_floats=True)

@@ -307,7 +307,12 @@ def _write(
     codes = photo.encode(picture.image, picture.changed)
     output.write_png("composite.png", codes, icc=photo.icc, mark=config.mark)
     clamped = write_layers(
-        output, picture.layers, camera, config=asdict(config), inputs=input_hashes(config)
+        output,
+        picture.layers,
+        camera,
+        is_deep=photo.is_deep,
+        config=asdict(config),
+        inputs=input_hashes(config),
     )
     output.write_envmap(as_file_map(light.light))
     if light.light_shadow is not light.light:
