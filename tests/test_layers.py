@@ -18,8 +18,8 @@ LEVELS = (
     {"camera", "asset_files", "record", "progress", "light", "tone", "curves", "materials_file"},
     {"envmap_conventions"},
     {
-        "gltf_file", "mtl", "files", "command", "placement", "lobes_file", "lobe_fit", "regressor",
-        "light_errors",
+        "gltf_file", "gltf_writer", "mtl", "files", "command", "placement", "lobes_file",
+        "lobe_fit", "regressor", "light_errors",
     },
     {
         "gltf_material", "obj", "reuse", "program", "regressor_training", "training_lights",
@@ -64,7 +64,7 @@ ONLY_IN = {
     "trimesh": {"gltf", "obj", "demo", "training_meshes"},
     "OpenImageIO": {"files"},
     "OpenEXR": {"files"},
-    "PIL": {"files", "asset_files", "demo", "diffusion", "contact_sheet"},
+    "PIL": {"files", "asset_files", "gltf_writer", "demo", "diffusion", "contact_sheet"},
     "diffusers": {"diffusion"},
     "transformers": {"diffusion"},
     "peft": {"diffusion"},

@@ -252,8 +252,20 @@ def repair_normals(
         length = np.linalg.norm(normals, axis=1, keepdims=True)
         still = length[:, 0] < 1e-20  # vertices that no triangle uses, or a folded pair
         normals = np.where(still[:, None], [0.0, 1.0, 0.0], normals)
-        length = np.where(still[:, None], 1.0, length)
-    return (normals / length).astype(np.float32), int(lost.sum())
+    return unit(normals), int(lost.sum())
+
+
+def unit(vectors: NDArray[np.float64]) -> NDArray[np.float32]:
+    """Normalise the rows, shape [vertex, 3]; zeros stay, and so does what float32 calls unit.
+
+    Stored unit vectors are 6e-8 off in length. Left alone, they read back as they were written.
+    """
+    with np.errstate(over="ignore"):  # beyond float32 is no unit vector either
+        stored = vectors.astype(np.float32)
+    is_unit = np.abs(np.linalg.norm(stored.astype(np.float64), axis=1, keepdims=True) - 1.0) < 1e-7
+    length = np.linalg.norm(vectors, axis=1, keepdims=True)
+    scaled = vectors / np.where(length > 0.0, length, 1.0)
+    return np.where(is_unit, stored, scaled).astype(np.float32)
 
 
 def check_drawable(where: Path, primitives: list[Primitive], found: str) -> None:

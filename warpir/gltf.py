@@ -23,6 +23,7 @@ from warpir.asset_files import (
     concise,
     keep_area,
     repair_normals,
+    unit,
 )
 from warpir.gltf_file import Entry, GltfFile
 from warpir.gltf_material import MaterialReader, check_extensions
@@ -371,9 +372,3 @@ def place(geometry: Geometry, world: Matrix, material: int) -> Primitive:
         uv1=geometry.uv1,
         colors=geometry.colors,
     )
-
-
-def unit(vectors: NDArray[Any]) -> FloatArray:
-    """Normalise the rows; a row of zeros stays, shape [vertex, 3]."""
-    length = np.linalg.norm(vectors, axis=1, keepdims=True)
-    return (vectors / np.where(length > 0, length, 1.0)).astype(np.float32)

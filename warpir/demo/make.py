@@ -21,9 +21,9 @@ from PIL import Image
 from warpir.camera import Camera
 from warpir.demo import ASSET, CAMERA, LIGHT, PHOTO
 from warpir.demo.car import car
-from warpir.demo.glb import write_glb
 from warpir.demo.place import background, camera, placement
 from warpir.demo.sky import seen, sky
+from warpir.gltf_writer import write_glb
 
 DEPTH = 4
 """Surface hits of a light path in the photo."""
@@ -37,7 +37,7 @@ FINE_SKY = 2048
 
 def write_content() -> None:
     """Write ``car.glb``, ``sky.exr`` and ``camera.json``."""
-    write_glb(car(), ASSET)
+    ASSET.write_bytes(write_glb(car(), np.eye(4)))
     write_light(sky(), LIGHT)
     CAMERA.write_text(json.dumps(camera().record(), indent=2) + "\n")
 
