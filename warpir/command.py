@@ -178,6 +178,8 @@ FLAGS = {
         "max_pixels": "N",
         "missing_textures": "RULE",
         "mark": "",
+        "hand_off": "",
+        "mitsuba": "",
     },
 }
 """Every field of `InsertConfig` by its heading in ``--help``, with what stands for its value."""

@@ -184,6 +184,10 @@ class InsertConfig(ModelSettings, PersonalizeSettings, GuidanceChoices, Optimize
     """What to do when a texture of the asset is missing: error, or grey in its place"""
     mark: bool = True
     """Note in the picture's metadata that it is a composite"""
+    hand_off: bool = True
+    """Write the files for Blender, three.js and colour tools as well"""
+    mitsuba: bool = False
+    """Write the insertion as a scene of Mitsuba 3 as well, into a folder of its own"""
 
     guidance: str | None = None
     """What recovers the light from the photo: embedded, what comes with warpir: the light that a
@@ -545,6 +549,7 @@ def _values_that_clash(config: InsertConfig) -> Iterator[InputError]:
             "cannot be used with --reuse, whose light is known",
             "leave one of them out, or say with --refine what is to change under that light",
         )
+    yield from needs("mitsuba", config.hand_off, "the files that --no-hand-off leaves out")
     yield from needs("fit_lobes", given("light"), "--light with a panorama to fit")
     yield from needs("up", given("camera"), "--camera; without a camera file the world is Y up")
     yield from needs("sequence", given("reuse"), "--reuse: one light for all frames")

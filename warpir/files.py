@@ -691,7 +691,8 @@ HALF_MAX = 65504.0
 BACKGROUND_DEPTH = 1e10
 """``Z`` where no object is [m]."""
 
-_PLAIN_NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_.-]{0,99}")
+_PLAIN_NAME = re.compile(r"(?:[A-Za-z0-9][A-Za-z0-9_.-]{0,99}/)?[A-Za-z0-9][A-Za-z0-9_.-]{0,99}")
+"""A file, or a file in a folder of the output folder."""
 _RUN_JSON = "run.json"
 
 _XMP = """<?xpacket begin="\ufeff" id="W5M0MpCehiHzreSzNTczkc9d"?>
@@ -911,7 +912,7 @@ class OutputFolder:
             {c: texels[..., k] for k, c in enumerate("RGB")},
             {**_color_header(), "envmap": OpenEXR.ENVMAP_LATLONG},
         )
-        self._write_hdr(f"{stem}.hdr", texels)
+        self.write_hdr(f"{stem}.hdr", texels)
         # A person expects the viewing direction -Z, our seam, in the middle.
         seen = np.roll(texels, texels.shape[1] // 2, axis=1)
         white = float(np.percentile(color.luminance(seen), 95.0)) / 0.8
@@ -924,8 +925,16 @@ class OutputFolder:
             "middle; scaled and clipped to 8 bits",
         )
 
-    def _write_hdr(self, name: str, texels: FloatArray) -> None:
-        """Stage a Radiance file; the library's last flush is unchecked, so it is read back."""
+    def write_hdr(self, name: str, texels: FloatArray) -> None:
+        """Stage a Radiance file; the library's last flush is unchecked, so it is read back.
+
+        Args:
+            name: File name inside the folder.
+            texels: Finite and not negative, shape [height, width, 3].
+
+        Raises:
+            InputError: The disk is full (exit 5).
+        """
         import OpenImageIO as oiio
 
         path = self._staged(name)
@@ -955,10 +964,15 @@ class OutputFolder:
     # How it is kept whole.
 
     def _staged(self, name: str) -> Path:
-        """Return where a file is staged; names are ours, never a path."""
+        """Return where a file is staged; names are ours, never a path that leads out."""
         if not _PLAIN_NAME.fullmatch(name):
             raise ValueError(f"not a plain file name: {name!r}")
-        return self._staging / name
+        path = self._staging / name
+        try:
+            path.parent.mkdir(exist_ok=True)
+        except OSError as error:
+            raise self._disk_error(name, error) from error
+        return path
 
     def _make(self) -> None:
         if self.path.resolve() == Path(self.path.resolve().anchor):
@@ -1052,6 +1066,7 @@ class OutputFolder:
         moved: list[tuple[Path, Path]] = []
 
         def move(source: Path, target: Path) -> None:
+            target.parent.mkdir(exist_ok=True)
             source.rename(target)
             moved.append((source, target))
 
@@ -1063,15 +1078,24 @@ class OutputFolder:
                     move(self.path / name, old / name)
             for name in names:
                 move(self._staging / name, self.path / name)
-            _sync_folder(self.path)
+            for folder in {(self.path / name).parent for name in names} | {self.path}:
+                _sync_folder(folder)
             move(self._staging / _RUN_JSON, self.path / _RUN_JSON)
             _sync_folder(self.path)
         except BaseException as error:
             for source, target in reversed(moved):
                 target.rename(source)
+            self._remove_empty_folders([*names, *leftover])
             if isinstance(error, OSError):
                 raise self._disk_error("results", error) from error
             raise
+        self._remove_empty_folders(leftover)
+
+    def _remove_empty_folders(self, names: list[str]) -> None:
+        """Remove the folders of files that are gone, as far as nothing else is in them."""
+        for folder in {(self.path / name).parent for name in names} - {self.path}:
+            with suppress(OSError):
+                folder.rmdir()
 
     def _old_results(self) -> list[str]:
         """Return the files of the result being replaced, as far as nobody has changed them."""
