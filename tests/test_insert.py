@@ -32,13 +32,19 @@ from warpir.regressor import random_regressor, save_regressor
 
 ALWAYS = (
     "balls.png",
+    "blender_setup.py",
     "camera.json",
     "composite.png",
     "curves.json",
     "envmap.exr",
     "envmap.hdr",
     "envmap_preview.png",
+    "envmap_web.hdr",
     "layers.exr",
+    "object.glb",
+    "photo.png",
+    "tone_curve_object.cube",
+    "tone_curve_shadow.cube",
 )
 """Every run writes these, and ``run.json`` behind them."""
 HALF = 2e-3

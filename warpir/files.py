@@ -1067,6 +1067,8 @@ class OutputFolder:
 
         def move(source: Path, target: Path) -> None:
             target.parent.mkdir(exist_ok=True)
+            if target.parent != self.path and target.parent.is_symlink():
+                raise NotADirectoryError(errno.ENOTDIR, "found a link in place of its folder")
             source.rename(target)
             moved.append((source, target))
 

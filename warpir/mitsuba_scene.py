@@ -1,14 +1,13 @@
 """An insertion as a scene of Mitsuba 3, in the folder ``mitsuba`` of a run.
 
 ``scene.xml`` needs nothing but Mitsuba: meshes, camera, our light on Mitsuba's rows, and materials
-as its ``principled``, the nearest of its own to glTF's. ``render.py`` renders the same insertion
-with glTF's own material, shadow and tone curves (`warpir.mitsuba_render`).
+as its ``principled``, the nearest of its own to glTF's; emission is left out. ``render.py`` renders
+the same insertion with glTF's own material, shadow and tone curves (`warpir.mitsuba_render`).
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from xml.sax.saxutils import quoteattr
 
 import numpy as np
 from numpy.typing import NDArray
@@ -26,8 +25,9 @@ FloatArray = NDArray[np.float32]
 Float64Array = NDArray[np.float64]
 
 FOLDER = "mitsuba"
-FINE_ROWS = 2048
-"""Maps are refined to twice their rows up to here: irradiance is then right to 2e-5."""
+LEAST_ROWS, FINE_ROWS = 512, 2048
+"""Maps are refined to twice their rows, and small ones to the first, up to the second: irradiance
+is then right to 2e-5."""
 
 
 def write_mitsuba(
@@ -79,7 +79,7 @@ def mitsuba_rows(texels: FloatArray) -> FloatArray:
         texels: Radiance in our orientation, shape [He, 2 He, 3].
     """
     height = texels.shape[0]
-    rows = max(height, min(2 * height, FINE_ROWS))
+    rows = max(height, min(max(2 * height, LEAST_ROWS), FINE_ROWS))
     columns = 2 * rows
     v = np.arange(rows) / (rows - 1) * height - 0.5
     u = (np.arange(columns) + 0.5) / columns * 2 * height - 0.5
@@ -135,8 +135,8 @@ class _Scene:
         """Return the whole text."""
         view = mitsuba_sensor(camera)
         self.lines = [
-            f"<!-- warpir {warpir.__version__}: the object alone, over nothing; ../{OBJECT} is the "
-            "same object. -->",
+            f"<!-- warpir {warpir.__version__}: the object of ../{OBJECT} alone, over nothing; "
+            "without its own emission, as Mitsuba hides what emits together with the sky. -->",
             '<scene version="3.0.0">',
             '<default name="spp" value="256"/>',
             '<integrator type="path">',
@@ -187,7 +187,6 @@ class _Scene:
         if normals is None:
             self.lines.append('    <boolean name="face_normals" value="true"/>')
         self._material(material)
-        self._emission(material)
         self.lines.append("</shape>")
 
     def _material(self, material: Material) -> None:
@@ -219,22 +218,6 @@ class _Scene:
         self._value("metallic", shared, 2, material.metallic)
         self.lines += ["    </bsdf>"] * (open_tags + 1)
 
-    def _emission(self, material: Material) -> None:
-        if max(material.emission) <= 0.0:
-            return
-        self.lines.append('    <emitter type="area">')
-        slot = material.emission_texture
-        if slot is None:
-            value = " ".join(repr(float(c)) for c in material.emission)
-            self.lines.append(f'    <rgb name="radiance" value="{value}"/>')
-        else:
-            radiance = srgb_to_linear(self._pixels(slot)[..., :3] / 255.0) * material.emission
-            name = self._next("exr")
-            planes = {c: radiance[..., k].astype(np.float32) for k, c in enumerate("RGB")}
-            self.output.write_exr(f"{FOLDER}/{name}", planes)
-            self._texture("radiance", name, slot, is_raw=True)
-        self.lines.append("    </emitter>")
-
     def _value(self, name: str, slot: TextureSlot | None, channel: int, factor: float) -> None:
         """Write a number, or a factor times one channel of a texture as a grey picture."""
         if slot is None:
@@ -246,18 +229,16 @@ class _Scene:
     def _bitmap(
         self, name: str, codes: NDArray[np.uint8], slot: TextureSlot, is_color: bool = False
     ) -> None:
-        file = self._next("png")
+        file = f"texture_{self.textures:03d}.png"
+        self.textures += 1
         self.output.write_bytes(f"{FOLDER}/{file}", png_bytes(codes, None, False, ""))
-        self._texture(name, file, slot, is_raw=not is_color)
-
-    def _texture(self, name: str, file: str, slot: TextureSlot, is_raw: bool) -> None:
         texture: Texture = self.asset.textures[slot.texture]
         a, b, c, d, e, f = slot.transform
         uv = np.array([[a, b, c, 0.0], [d, e, f, 0.0], [0.0, 0.0, 1.0, 0.0], [0.0, 0.0, 0.0, 1.0]])
         self.lines += [
             f'    <texture type="bitmap" name="{name}">',
-            f'        <string name="filename" value={quoteattr(file)}/>',
-            f'        <boolean name="raw" value="{str(is_raw).lower()}"/>',
+            f'        <string name="filename" value="{file}"/>',
+            f'        <boolean name="raw" value="{str(not is_color).lower()}"/>',
             f'        <string name="wrap_mode" value="{texture.wrap_u}"/>',
             f'        <transform name="to_uv"><matrix value="{_numbers(uv)}"/></transform>',
             "    </texture>",
@@ -265,10 +246,6 @@ class _Scene:
 
     def _pixels(self, slot: TextureSlot) -> NDArray[np.uint8]:
         return self.asset.textures[slot.texture].pixels
-
-    def _next(self, suffix: str) -> str:
-        self.textures += 1
-        return f"texture_{self.textures - 1:03d}.{suffix}"
 
 
 def _numbers(matrix: Float64Array) -> str:
