@@ -18,7 +18,7 @@ SEED_COUNT = 32
 
 
 class Foreground(NamedTuple):
-    """The object alone; the fields of `benchmarks.referee.Foreground`."""
+    """The object alone; the fields of `warpir.mitsuba_render.Foreground`."""
 
     mean: FloatArray
     variance: FloatArray
@@ -55,7 +55,7 @@ def foreground(
     seed: int,
     device: str = "cpu",
 ) -> Foreground:
-    """Render the object alone; arguments are those of `benchmarks.referee.foreground`."""
+    """Render the object alone; arguments are those of `warpir.mitsuba_render.foreground`."""
     render = renderer(asset, matrix, camera, device)
     light = light_args(Light(texels=texels), render.device)
     pixels = render.candidate_pixels(camera)

@@ -30,10 +30,10 @@ from warpir.demo import ASSET, LIGHT
 from warpir.demo.make import pixel_directions
 from warpir.demo.place import paving_texture
 from warpir.demo.sky import seen
-from warpir.files import Photo, read_envmap
 from warpir.lamps import lamp_axes
 from warpir.light import Light, angles_from_axis, resize_map, rotate_map
 from warpir.mis import IntArray
+from warpir.photo_files import Photo, read_envmap
 from warpir.picture import Quality, make_picture, photo_radiance
 from warpir.placement import Placement, place_asset
 from warpir.proxy_mesh import ProxyMesh, first_hit, mesh_of

@@ -14,10 +14,10 @@ from benchmarks import furnace, referee  # isort: skip  (sets Mitsuba's variant)
 import drjit as dr
 import mitsuba as mi
 
-from benchmarks.mitsuba_light import LatlongEmitter
-from benchmarks.mitsuba_material import GltfBSDF, Image
 from warpir.asset import Asset, Material, Primitive, Texture, TextureSlot
 from warpir.camera import Camera
+from warpir.mitsuba_light import LatlongEmitter
+from warpir.mitsuba_material import GltfBSDF, Image
 
 FloatArray = NDArray[np.float64]
 

@@ -17,7 +17,7 @@ def compare_images(candidate: Any, reference: Any, block: int = 8) -> dict[str, 
     ``beyond_3`` near 0.0027 (more where the samples' tails are heavy).
 
     Args:
-        candidate: Mean, variance of the mean and coverage, as `benchmarks.referee.Foreground`.
+        candidate: Mean, variance of the mean and coverage, as `warpir.mitsuba_render.Foreground`.
         reference: The same from the other renderer, independent samples.
         block: Side of the blocks [px].
 

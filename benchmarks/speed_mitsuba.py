@@ -15,10 +15,10 @@ import numpy as np
 from mitsuba.python.ad.integrators.common import mis_weight
 from numpy.typing import NDArray
 
-from benchmarks import referee
-from benchmarks.mitsuba_light import LatlongEmitter
 from benchmarks.speed_scenes import SpeedScene
 from warpir.camera import Camera
+from warpir.mitsuba_light import LatlongEmitter
+from warpir.mitsuba_render import ObjectScene, build
 
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int32]
@@ -69,7 +69,7 @@ class MitsubaScene:
         freeze: bool = True,
     ) -> None:
         self.sampler = sampler
-        self.setup = referee.build(scene.asset, scene.matrix, scene.camera, texels, scene.depth)
+        self.setup = build(scene.asset, scene.matrix, scene.camera, texels, scene.depth)
         width = scene.camera.width
         rows, columns = scene.object_pixels // width, scene.object_pixels % width
         top, left = int(rows.min()), int(columns.min())
@@ -298,7 +298,7 @@ def _passes(pixels: int, spp: int, seed: int) -> Iterator[tuple[mi.UInt32, int]]
 
 
 def _sensor(
-    camera: Camera, setup: referee.RefereeScene, crop: tuple[int, int, int, int], sampler: str
+    camera: Camera, setup: ObjectScene, crop: tuple[int, int, int, int], sampler: str
 ) -> mi.Sensor:
     """Mitsuba camera in the unit frame, see `benchmarks.referee`; crop is left, top, size."""
     c2w = camera.c2w.copy()

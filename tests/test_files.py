@@ -71,6 +71,58 @@ def test_overwriting_takes_away_what_the_old_run_wrote_and_nothing_else(tmp_path
     assert (folder / "edited.json").read_text() == "mine too"
 
 
+def write_nested(folder: Path, name: str, overwrite: bool = False) -> None:
+    with OutputFolder(folder, overwrite=overwrite) as out:
+        out.write_bytes("top.bin", b"1")
+        out.write_bytes(f"sub/{name}", name.encode())
+        out.write_json("run.json", {})
+
+
+def test_files_in_a_folder_follow_the_same_rules(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Listed, replaced, taken away with their empty folder, left alone when a run fails."""
+    folder = tmp_path / "out"
+    write_nested(folder, "a.bin")
+    files = json.loads((folder / "run.json").read_text())["files"]
+    assert files["sub/a.bin"] == hashlib.sha256(b"a.bin").hexdigest()
+    write_nested(folder, "b.bin", overwrite=True)
+    assert os.listdir(folder / "sub") == ["b.bin"]
+
+    rename = Path.rename
+
+    def no_space(source: Path, target: Path) -> Path:
+        if source.parent.name.startswith(".partial") and source.name == "run.json":
+            raise OSError(28, "No space left on device")
+        return rename(source, target)
+
+    with monkeypatch.context() as patched, pytest.raises(InputError):
+        patched.setattr(Path, "rename", no_space)
+        write_nested(folder, "c.bin", overwrite=True)
+    assert os.listdir(folder / "sub") == ["b.bin"]
+    (folder / "sub" / "mine.txt").write_text("mine")
+    write_small(folder, overwrite=True)
+    assert os.listdir(folder / "sub") == ["mine.txt"]
+    (folder / "sub" / "mine.txt").unlink()
+    write_nested(folder, "a.bin", overwrite=True)
+    write_small(folder, overwrite=True)
+    assert not (folder / "sub").exists()
+
+
+def test_a_link_in_place_of_a_folder_is_not_followed(tmp_path: Path) -> None:
+    folder = tmp_path / "out"
+    folder.mkdir()
+    (tmp_path / "elsewhere").mkdir()
+    (folder / "sub").symlink_to(tmp_path / "elsewhere")
+    with pytest.raises(InputError, match="link") as caught:
+        write_nested(folder, "a.bin", overwrite=True)
+    assert caught.value.code == ExitCode.RESOURCES
+    assert os.listdir(tmp_path / "elsewhere") == [] and os.listdir(folder) == ["sub"]
+    (tmp_path / "link").symlink_to(tmp_path / "elsewhere")  # the output folder itself may be one
+    write_nested(tmp_path / "link", "a.bin")
+    assert (tmp_path / "elsewhere" / "sub" / "a.bin").exists()
+
+
 @pytest.mark.parametrize("existing", [False, True])
 def test_failed_run_leaves_everything_as_it_was(tmp_path: Path, existing: bool) -> None:
     folder = tmp_path / "out"
@@ -135,7 +187,9 @@ def test_places_that_cannot_be_output(tmp_path: Path) -> None:  # F5
     assert os.listdir(tmp_path) == ["file"]
 
 
-@pytest.mark.parametrize("name", ["../x.json", "a/b.json", "/x.json", ".lock", ""])
+@pytest.mark.parametrize(
+    "name", ["../x.json", "a/b/c.json", "a/../x.json", "a/.lock", "/x.json", ".lock", ""]
+)
 def test_names_never_become_paths(tmp_path: Path, name: str) -> None:
     with pytest.raises(ValueError, match="plain"), OutputFolder(tmp_path / "out") as out:
         out.write_json(name, {})
@@ -157,7 +211,7 @@ try:
         elif kind == "exr":
             out.write_exr("layers.exr", {"R": rng.random((400, 400), dtype=np.float32)})
         elif kind == "hdr":
-            out._write_hdr("envmap.hdr", rng.random((256, 512, 3), dtype=np.float32))
+            out.write_hdr("envmap.hdr", rng.random((256, 512, 3), dtype=np.float32))
         else:
             out.write_json("camera.json", {"text": "x" * 400000})
         out.write_json("run.json", {"seed": 2})

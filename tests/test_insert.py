@@ -21,6 +21,7 @@ from tests.conftest import devices
 from tests.test_gltf import Builder
 from warpir import insert
 from warpir.camera_files import read_camera
+from warpir.color import linear_to_gamma
 from warpir.config import InsertConfig
 from warpir.errors import ExitCode, InputError
 from warpir.insert import main
@@ -33,17 +34,21 @@ from warpir.undistort import undistort_photo
 
 ALWAYS = (
     "balls.png",
+    "blender_setup.py",
     "camera.json",
     "composite.png",
     "curves.json",
     "envmap.exr",
     "envmap.hdr",
     "envmap_preview.png",
+    "envmap_web.hdr",
     "layers.exr",
+    "object.glb",
+    "photo.png",
+    "tone_curve_object.cube",
+    "tone_curve_shadow.cube",
 )
 """Every run writes these, and ``run.json`` behind them."""
-HALF_CODES = 1
-"""8-bit codes by which half floats (11 bits) and rounding may move the composite."""
 HALF = 2e-3
 """The same of linear values in [0, 1]; the writer's own limit."""
 RGBE = 0.01
@@ -222,16 +227,26 @@ def test_record_tells_what_was_used_and_assumed(run: Run, inputs: Path) -> None:
     assert measured["triangles"] == 12 and measured["values_clamped_to_half"] == 0
 
 
+def recomposed(planes: dict[str, NDArray[np.float32]]) -> NDArray[np.float32]:
+    """What ``warpir/formula`` says, in float32."""
+    outside = np.float32(1.0) - planes["fg.A"][..., None]
+    return rgb(planes, "fg.") + outside * rgb(planes, "plate.") * rgb(planes, "shadow.")
+
+
+def encoded(linear: NDArray[np.float32], top: int) -> Pixels:
+    """Codes of a composite, as a viewer of gamma 2.2 makes them."""
+    display = np.clip(linear_to_gamma(linear), 0.0, 1.0)
+    return np.round(display.astype(np.float64) * top)
+
+
 def test_composite_is_recomputed_from_the_layers(run: Run) -> None:
-    """The layers compute layers.exr's RGB and, encoded, composite.png (B5)."""
+    """The layers compute every code of composite.png and, rounded, layers.exr's own RGB (B5)."""
     planes = read_layers(run.out / "layers.exr")
-    fg, alpha = rgb(planes, "fg."), planes["fg.A"][..., None]
-    recomputed = fg + (1.0 - alpha) * rgb(planes, "plate.") * rgb(planes, "shadow.")
-    np.testing.assert_allclose(rgb(planes), recomputed, atol=HALF)
-    codes = np.round(np.clip(recomputed, 0.0, 1.0) ** (1.0 / 2.2) * 255.0)
-    assert np.abs(codes - run.image()).max() <= HALF_CODES
+    composite = recomposed(planes)
+    np.testing.assert_array_equal(encoded(composite, 255), run.image())
+    np.testing.assert_array_equal(rgb(planes), composite.astype(np.float16))
     parts = sum(rgb(planes, f"{name}.") for name in ("diffuse", "specular", "emission"))
-    np.testing.assert_allclose(parts, fg, atol=HALF)
+    np.testing.assert_allclose(parts, rgb(planes, "fg."), atol=HALF)
     np.testing.assert_array_equal(planes["matte.A"], planes["fg.A"])
     assert (planes["A"] == 1.0).all() and planes["Z"].min() > 3.0
 
@@ -415,6 +430,9 @@ def test_16_bit_photo_stays_16_bit(inputs: Path, tmp_path: Path, device: str) ->
     outside = (planes["matte.A"] == 0.0) & (rgb(planes, "shadow.") == 1.0).all(axis=-1)
     assert outside.any()
     np.testing.assert_array_equal(codes[outside], photo[outside])
+    # Float32 throughout: halves would miss these codes by up to 15.
+    np.testing.assert_array_equal(rgb(planes), recomposed(planes))
+    np.testing.assert_array_equal(encoded(recomposed(planes), 65535), codes)
 
 
 @pytest.mark.parametrize("width", ["24", "96"])

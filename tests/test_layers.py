@@ -7,6 +7,8 @@ import pytest
 
 ROOT = Path(__file__).resolve().parent.parent
 
+MITSUBA_PARTS = {"mitsuba_light", "mitsuba_material", "mitsuba_path"}
+
 # Each module of warpir/ imports modules of lower levels only; a module that is on no level fails.
 LEVELS = (
     {
@@ -38,9 +40,10 @@ LEVELS = (
     {"camera_files"},
     {"inputs", "scene"},
     {"render", "lighting"},
-    {"picture", "samples", "sequence", "estimate"},
+    {"picture", "samples", "sequence", "estimate", "handoff"},
     {"detail"},
-    {"integrator", "fusion", "sg_light"},
+    {"integrator", "fusion", "sg_light", "mitsuba_scene", *MITSUBA_PARTS},
+    {"mitsuba_render"},
     {"bridge", "trust"},
     {"mis", "transport_rows", "transport_matrix", "regularizers", "evaluation_stage"},
     {"transport_cache"},
@@ -87,6 +90,8 @@ ONLY_IN = {
     "colour": {"color"},
     "yaml": {"command"},
     "rich": {"progress"},
+    "mitsuba": {*MITSUBA_PARTS, "mitsuba_render"},
+    "drjit": {*MITSUBA_PARTS, "mitsuba_render"},
 }  # fmt: skip
 DIFFUSION_IN = {"recover", "refine", "prior_images", "model_check", "train", "evaluation_rows"}
 """Who drives the diffusion model; everyone else sees its settings and wording, which are plain."""

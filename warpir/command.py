@@ -192,6 +192,8 @@ FLAGS = {
         "max_texture_pixels": "N",
         "missing_textures": "RULE",
         "mark": "",
+        "hand_off": "",
+        "mitsuba": "",
     },
 }
 """Every field of `InsertConfig` by its heading in ``--help``, with what stands for its value."""

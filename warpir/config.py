@@ -223,6 +223,10 @@ class InsertConfig(ModelSettings, PersonalizeSettings, GuidanceChoices, Optimize
     panorama's detail of its own"""
     mark: bool = True
     """Note in the picture's metadata that it is a composite"""
+    hand_off: bool = True
+    """Write the files for Blender, three.js and colour tools as well"""
+    mitsuba: bool = False
+    """Write the insertion as a scene of Mitsuba 3 as well, into a folder of its own"""
 
     guidance: str | None = None
     """What recovers the light from the photo: embedded, what comes with warpir: the light that a
@@ -597,6 +601,7 @@ def _values_that_clash(config: InsertConfig) -> Iterator[InputError]:
             "cannot be used while a prior changes the light or the object",
             "recover the light first, then give the mask with --reuse",
         )
+    yield from needs("mitsuba", config.hand_off, "the files that --no-hand-off leaves out")
     yield from needs("fit_lobes", given("light"), "--light with a panorama to fit")
     yield from needs("light_convention", given("light"), "--light with a panorama")
     yield from needs("up", given("camera"), "--camera; without a camera file the world is Y up")

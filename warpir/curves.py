@@ -74,11 +74,45 @@ class ToneKnots:
         inverse: Float64Array = knot_x[b] + width * 2.0 * m * above / (half + root)
         return inverse
 
+    def evaluate(self, x: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Evaluate every curve (Durkan et al. 2019, eq. 4), as `warpir.kernels.tone` does.
+
+        Args:
+            x: Where; clamped to [0, 1], shape [...].
+
+        Returns:
+            Values in [0, 1], shape [..., curve].
+        """
+        x = np.clip(x, 0.0, 1.0)
+        return np.stack(
+            [
+                _spline(x, *(a[k].astype(np.float64) for a in self.arrays()))
+                for k in range(len(self.x))
+            ],
+            axis=-1,
+        )
+
     @staticmethod
     def identity(curves: int, bins: int = 5) -> ToneKnots:
         """Return curves that change nothing."""
         x = np.tile(np.linspace(0.0, 1.0, bins + 1, dtype=np.float32), (curves, 1))
         return ToneKnots(x, x.copy(), np.ones_like(x))
+
+
+def _spline(
+    t: NDArray[np.float64],
+    x: NDArray[np.float64],
+    y: NDArray[np.float64],
+    slope: NDArray[np.float64],
+) -> NDArray[np.float64]:
+    """Evaluate one curve within [0, 1] from its knots."""
+    k = np.clip(np.searchsorted(x, t, side="right") - 1, 0, len(x) - 2)
+    width, rise = x[k + 1] - x[k], y[k + 1] - y[k]
+    m, q = rise / width, (t - x[k]) / width
+    r = q * (1.0 - q)
+    bent = (m * q * q + slope[k] * r) / (m + (slope[k + 1] + slope[k] - 2.0 * m) * r)
+    value: NDArray[np.float64] = y[k] + rise * bent
+    return value
 
 
 @dataclass(frozen=True)

@@ -101,12 +101,21 @@ def rotate_directions(texels: FloatArray, rotation: Float64Array, side: int = 3)
             x, y, z = np.moveaxis(fine[:, i, :, j] @ rotation, -1, 0)
             u = np.arctan2(x, -z) / (2.0 * np.pi) % 1.0 * width - 0.5
             v = np.arctan2(np.hypot(x, z), y) / np.pi * height - 0.5
-            turned += (share[rows, i] / side)[:, None, None] * _bilinear(texels, u, v)
+            turned += (share[rows, i] / side)[:, None, None] * read_map(texels, u, v)
     return turned.astype(np.float32)
 
 
-def _bilinear(texels: FloatArray, u: Float64Array, v: Float64Array) -> Float64Array:
-    """Read a map at column ``u`` (wrapped) and row ``v`` (clamped), 0 at the first's centre."""
+def read_map(texels: FloatArray, u: Float64Array, v: Float64Array) -> Float64Array:
+    """Read a map bilinearly.
+
+    Args:
+        texels: Shape [He, We, 3].
+        u: Column, wrapped; 0 is the first one's centre, shape [...].
+        v: Row, clamped; 0 is the first one's centre, shape [...].
+
+    Returns:
+        Values, shape [..., 3].
+    """
     height, width = texels.shape[:2]
     v = np.clip(v, 0.0, height - 1.0)
     left, top = np.floor(u), np.floor(v)

@@ -40,7 +40,8 @@ HALF_MAX = 65504.0
 BACKGROUND_DEPTH = 1e10
 """``Z`` where no object is [m]."""
 
-_PLAIN_NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_.-]{0,99}")
+_PLAIN_NAME = re.compile(r"(?:[A-Za-z0-9][A-Za-z0-9_.-]{0,99}/)?[A-Za-z0-9][A-Za-z0-9_.-]{0,99}")
+"""A file, or a file in a folder of the output folder."""
 _RUN_JSON = "run.json"
 
 _XMP = """<?xpacket begin="\ufeff" id="W5M0MpCehiHzreSzNTczkc9d"?>
@@ -260,7 +261,7 @@ class OutputFolder:
             {c: texels[..., k] for k, c in enumerate("RGB")},
             {**_color_header(), "envmap": OpenEXR.ENVMAP_LATLONG},
         )
-        self._write_hdr(f"{stem}.hdr", texels)
+        self.write_hdr(f"{stem}.hdr", texels)
         # A person expects the viewing direction -Z, our seam, in the middle.
         seen = np.roll(texels, texels.shape[1] // 2, axis=1)
         white = float(np.percentile(color.luminance(seen), 95.0)) / 0.8
@@ -273,8 +274,16 @@ class OutputFolder:
             "middle; scaled and clipped to 8 bits",
         )
 
-    def _write_hdr(self, name: str, texels: FloatArray) -> None:
-        """Stage a Radiance file; the library's last flush is unchecked, so it is read back."""
+    def write_hdr(self, name: str, texels: FloatArray) -> None:
+        """Stage a Radiance file; the library's last flush is unchecked, so it is read back.
+
+        Args:
+            name: File name inside the folder.
+            texels: Finite and not negative, shape [height, width, 3].
+
+        Raises:
+            InputError: The disk is full (exit 5).
+        """
         import OpenImageIO as oiio
 
         path = self._staged(name)
@@ -304,10 +313,15 @@ class OutputFolder:
     # How it is kept whole.
 
     def _staged(self, name: str) -> Path:
-        """Return where a file is staged; names are ours, never a path."""
+        """Return where a file is staged; names are ours, never a path that leads out."""
         if not _PLAIN_NAME.fullmatch(name):
             raise ValueError(f"not a plain file name: {name!r}")
-        return self._staging / name
+        path = self._staging / name
+        try:
+            path.parent.mkdir(exist_ok=True)
+        except OSError as error:
+            raise self._disk_error(name, error) from error
+        return path
 
     def _make(self) -> None:
         if self.path.resolve() == Path(self.path.resolve().anchor):
@@ -401,6 +415,9 @@ class OutputFolder:
         moved: list[tuple[Path, Path]] = []
 
         def move(source: Path, target: Path) -> None:
+            target.parent.mkdir(exist_ok=True)
+            if target.parent != self.path and target.parent.is_symlink():
+                raise NotADirectoryError(errno.ENOTDIR, "found a link in place of its folder")
             source.rename(target)
             moved.append((source, target))
 
@@ -412,15 +429,24 @@ class OutputFolder:
                     move(self.path / name, old / name)
             for name in names:
                 move(self._staging / name, self.path / name)
-            _sync_folder(self.path)
+            for folder in {(self.path / name).parent for name in names} | {self.path}:
+                _sync_folder(folder)
             move(self._staging / _RUN_JSON, self.path / _RUN_JSON)
             _sync_folder(self.path)
         except BaseException as error:
             for source, target in reversed(moved):
                 target.rename(source)
+            self._remove_empty_folders([*names, *leftover])
             if isinstance(error, OSError):
                 raise self._disk_error("results", error) from error
             raise
+        self._remove_empty_folders(leftover)
+
+    def _remove_empty_folders(self, names: list[str]) -> None:
+        """Remove the folders of files that are gone, as far as nothing else is in them."""
+        for folder in {(self.path / name).parent for name in names} - {self.path}:
+            with suppress(OSError):
+                folder.rmdir()
 
     def _old_results(self) -> list[str]:
         """Return the files of the result being replaced, as far as nobody has changed them."""
@@ -558,15 +584,21 @@ def write_layers(
     layers: Layers,
     camera: Camera,
     *,
+    is_deep: bool = False,
     config: Mapping[str, Any] | None = None,
     inputs: Mapping[str, str] | None = None,
 ) -> int:
     """Stage ``layers.exr``: half channels, float32 for depth, position and normal.
 
+    The composite recomposes exactly. Of a photograph of 8 bits the layers hold halves to begin with
+    (`warpir.picture`), so nothing is lost here, and the composite is stored rounded to half. A
+    deeper one has codes that halves cannot tell apart: its composite and its layers are float32.
+
     Args:
         folder: Where.
         layers: The image planes.
         camera: The camera that made them, at their resolution.
+        is_deep: Whether the photograph has more than 8 bits (`Photo.is_deep`).
         config: Resolved configuration, kept as JSON in the attribute ``warpir/config``.
         inputs: sha256 of the input files by name, kept as JSON in ``warpir/inputs``.
 
@@ -607,12 +639,12 @@ def write_layers(
             name = f"{prefix}.{suffix}" if prefix else suffix
             channels[name] = plane[..., k].astype(np.float32 if whole_floats else np.float16)
 
-    add("", "RGB", layers.composite)
+    add("", "RGB", layers.composite, is_deep)
     add("", "A", np.ones((height, width), np.float32))
-    add("fg", "RGBA", layers.foreground)
-    add("shadow", "RGB", layers.shadow_ratio)
-    add("plate", "RGB", layers.plate)
-    add("matte", "A", layers.matte)
+    add("fg", "RGBA", layers.foreground, is_deep)
+    add("shadow", "RGB", layers.shadow_ratio, is_deep)
+    add("plate", "RGB", layers.plate, is_deep)
+    add("matte", "A", layers.matte, is_deep)
     if layers.depth is not None:
         depth = np.where(np.isposinf(layers.depth), BACKGROUND_DEPTH, layers.depth)
         add("", "Z", depth, whole_floats=True)

@@ -342,9 +342,15 @@ def _write(
     codes = photo.encode(picture.image, picture.changed)
     output.write_png("composite.png", codes, icc=photo.icc, mark=config.mark)
     clamped = write_layers(
-        output, picture.layers, camera, config=asdict(config), inputs=input_hashes(config)
+        output,
+        picture.layers,
+        camera,
+        is_deep=photo.is_deep,
+        config=asdict(config),
+        inputs=input_hashes(config),
     )
-    output.write_envmap(as_file_map(light.light))
+    texels = as_file_map(light.light)
+    output.write_envmap(texels)
     if light.light_shadow is not light.light:
         output.write_envmap(as_file_map(light.light_shadow), "envmap_shadow")
     if light.detailed is not None:
@@ -359,6 +365,17 @@ def _write(
         mark=False,
         description="Mirror ball and white diffuse ball under the light",
     )
+    handed: dict[str, Any] = {}
+    if config.hand_off:
+        from warpir.handoff import write_hand_off
+
+        handed, notices = write_hand_off(output, inputs, light.curves, texels)
+        for line in notices:
+            say(f"notice: {line}")
+    if config.mitsuba:
+        from warpir.mitsuba_scene import write_mitsuba
+
+        write_mitsuba(output, inputs, texels, config.depth)
     summary = summarize(light.light)
     say(
         f"light: brightest toward azimuth {summary.azimuth_deg:.0f}, elevation "
@@ -386,6 +403,7 @@ def _write(
         "shadow_pixels": picture.proxy_pixel_count,
         "changed_pixels": int(picture.changed.sum()),
         "values_clamped_to_half": clamped,
+        **handed,
     }
 
 

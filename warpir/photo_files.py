@@ -48,6 +48,11 @@ class Photo:
         """Whether the codes are scene-linear floats (EXR, HDR, float TIFF)."""
         return self.codes.dtype.kind == "f"
 
+    @property
+    def is_deep(self) -> bool:
+        """Whether the codes have more than 8 bits, so that half floats would lose some."""
+        return self.codes.dtype.itemsize > 1
+
     def linear(self) -> FloatArray:
         """Return ``photo_lin`` [1], shape [H, W, 3]: ``srgb ** 2.2``, or a plate's own values.
 
