@@ -22,7 +22,7 @@ from tests.test_envmap_conventions import radiance, read, threejs
 from tests.test_insert import ALWAYS, arguments, go, read_image, write_inputs
 from warpir import handoff
 from warpir.asset import load_asset
-from warpir.camera import read_camera
+from warpir.camera_files import read_camera
 from warpir.config import InsertConfig
 from warpir.curves import ToneKnots
 from warpir.errors import InputError

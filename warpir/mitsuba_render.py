@@ -25,7 +25,8 @@ if mi.variant() is None:
 from mitsuba.python.ad.integrators.common import mis_weight
 
 from warpir.asset import Asset, load_asset
-from warpir.camera import Camera, mitsuba_sensor, read_camera
+from warpir.camera import Camera, mitsuba_sensor
+from warpir.camera_files import read_camera
 from warpir.color import linear_to_gamma
 from warpir.curves import read_curves
 from warpir.files import png_bytes
