@@ -507,6 +507,7 @@ def test_run_with_place_and_mask(files: Path, tmp_path: Path) -> None:
     assert measured["proxy_triangles"] == 12
     assert measured["shadow_mask_at_object"] == pytest.approx(128 / 255)
     assert any("--shadow-mask" in line for line in run.record["assumed"])
+    assert not any("no lamp" in line for line in run.record["notices"])
     assert not any("material" in line and "wall" in line for line in run.record["notices"])
 
 

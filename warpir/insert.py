@@ -147,6 +147,9 @@ def _insert_one(config: InsertConfig, loaders: "Loaders | None" = None) -> Inser
                 light, recovered = _regress(config, inputs, device, timings)
             if config.guided_by == "embedded":
                 recovered["prior_about"] = NOT_ASKED
+            if inputs.shadow_mask is not None and not _has_lamps(light):
+                notices = (*notices, "the light has no lamp that --shadow-mask could take")
+                say(f"notice: {notices[-1]}")
             with timings.stage("preview"):
                 _write_preview(output, config, inputs, light, device)
         with timings.stage("scene"):
@@ -202,6 +205,12 @@ def _regress(
     for line in estimate.light.assumed:
         say(f"assumed: {line}")
     return estimate.light, {"regression": estimate.regression.record()}
+
+
+def _has_lamps(light: "SceneLight") -> bool:
+    from warpir.lamps import lamp_axes
+
+    return any(len(lamp_axes(x)) > 0 for x in (light.light, light.light_shadow))
 
 
 def _say_who_spoke(record: dict[str, Any]) -> None:
