@@ -6,8 +6,8 @@
 A made-up yard, open ground and one wall, is path-traced by Mitsuba 3 (`benchmarks.referee`, which
 shares no code with warpir) without the car, which makes the photo, and with it, which is the truth.
 The car is then put into the photo under the same light: with the ground plane alone, with a painted
-shadow mask, and with the wall as the mesh of `--proxy`. RMSE is of display values, over the box
-of all that the car changes in the truth and over the whole picture.
+shadow mask, with the wall as the mesh of `--proxy`, and with wall and ground as that mesh. RMSE is
+of display values, over the box of all that the car changes in the truth and over the whole picture.
 """
 
 import argparse
@@ -25,14 +25,13 @@ from benchmarks.referee import foreground
 from warpir.asset import Asset, Material, Primitive, Texture, TextureSlot, load_asset
 from warpir.camera import Camera, camera_from_fov
 from warpir.color import linear_to_gamma
-from warpir.curves import ToneKnots
+from warpir.curves import Curves, ToneKnots
 from warpir.demo import ASSET, LIGHT
 from warpir.demo.make import pixel_directions
 from warpir.demo.place import paving_texture
 from warpir.demo.sky import seen
 from warpir.lamps import lamp_axes
 from warpir.light import Light, angles_from_axis, resize_map, rotate_map
-from warpir.mis import IntArray
 from warpir.photo_files import Photo, read_envmap
 from warpir.picture import Quality, make_picture, photo_radiance
 from warpir.placement import Placement, place_asset
@@ -42,6 +41,7 @@ from warpir.scene import Placed, Proxy, Scene
 from warpir.shadow_mask import shadow_mask
 
 FloatArray = NDArray[np.float32]
+IntArray = NDArray[np.int32]
 
 DEPTH = 4
 GROUND = 40.0
@@ -80,17 +80,15 @@ def yard() -> tuple[Asset, Asset]:
     corners = GROUND * np.array([[-1, 0, 1], [1, 0, 1], [1, 0, -1], [-1, 0, -1]], np.float64)
     uv = np.array([[0, 0], [8, 0], [8, 8], [0, 8]], np.float32)
     sides = np.array([[0, 1, 2], [0, 2, 3]], np.int32)
-    ground = Asset("ground", (Primitive(corners, sides, 0, uv0=uv),), (paving,), (_paving(),))
+    ground = Asset(
+        "ground", (Primitive(corners, sides, 0, uv0=uv),), (paving,), (paving_texture(512),)
+    )
     block = box(extents=WALL_SIZE)
     brick = Material("brick", (0.3, 0.14, 0.08), metallic=0.0, roughness=0.95)
     primitive = Primitive(
         np.array(block.vertices) + WALL_CENTRE, np.array(block.faces, np.int32), 0
     )
     return ground, Asset("wall", (primitive,), (brick,))
-
-
-def _paving() -> Texture:
-    return paving_texture(512)
 
 
 def joined(parts: list[tuple[Asset, NDArray[np.float64]]]) -> Asset:
@@ -158,22 +156,29 @@ def insertions(
     camera: Camera,
     light: Light,
     photo: Photo,
-    wall: ProxyMesh,
+    meshes: tuple[ProxyMesh, ProxyMesh],
     mask: FloatArray,
     samples: int,
     device: str,
 ) -> dict[str, tuple[FloatArray, float]]:
-    """Return the composites by what was known of the place, and seconds of the second render."""
+    """Return the composites by what was known of the place, and seconds of the second render.
+
+    ``meshes`` are the wall, and the wall with the ground, which makes the plane needless.
+    """
     up = np.array([0.0, 1.0, 0.0])
     plain = Proxy(up, 0.0)
-    known = replace(plain, mesh=wall, radiance=photo_radiance(photo, False))
+    wall, whole = (
+        replace(plain, mesh=m, radiance=photo_radiance(photo, Curves.identity("linear")))
+        for m in meshes
+    )
     shade = shadow_mask(mask, *car.bounds(), placement.asset_to_world, camera)
     curves = ToneKnots.identity(1), ToneKnots.identity(3)
     found = {}
     for name, proxy, own_mask in (
         ("plane", plain, None),
         ("plane and mask", plain, shade),
-        ("plane and mesh", known, None),
+        ("plane and mesh", wall, None),
+        ("mesh alone", replace(whole, is_plane=False), None),
     ):
         scene = Scene([Placed(car, placement.asset_to_world)], camera, proxy, device)
         quality = Quality(samples, 1, DEPTH, 0)
@@ -220,6 +225,7 @@ def main() -> None:
     camera = camera_from_fov(options.width, options.width * 2 // 3, 58.0, -9.0, 1.9)
     ground, wall_asset = yard()
     wall, car = mesh_of(wall_asset), load_asset(ASSET)
+    meshes = wall, mesh_of(joined([(ground, np.eye(4)), (wall_asset, np.eye(4))]))
     texels = read_envmap(options.panorama)
     azimuth = angles_from_axis(lamp_axes(Light(texels=texels))[0])[0]
     rows, figures = [], []
@@ -249,7 +255,7 @@ def main() -> None:
         light = Light(texels=lower).scaled(exposure)
         mask = painted_mask(wall, camera, sun)
         found = insertions(
-            car, placement, camera, light, photo, wall, mask, options.samples // 2, device
+            car, placement, camera, light, photo, meshes, mask, options.samples // 2, device
         )
         shape = _coverage(car, placement, camera, device)
         box = changed_box(truth, photo.srgb, shape)

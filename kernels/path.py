@@ -62,9 +62,9 @@ class Scatter:
     L_brdf: wp.vec3
     weight_brdf: float
     """The same of the BRDF's direction; 0 when it met the object."""
-    bounced: wp.vec3
-    """Radiance from the place's mesh times ``cos / pdf`` of the BRDF's direction, where it met it;
-    a constant to the light."""
+    from_place: int
+    """1 when the BRDF's direction met the place's mesh: what it brings is a constant to the
+    light."""
     weight_next: float
     """``cos / pdf`` of the BRDF's direction when it met the object, else 0."""
     next: Hit
@@ -102,7 +102,7 @@ def scatter(
     out.f_brdf = wp.vec3(0.0)
     out.L_brdf = wp.vec3(0.0)
     out.weight_brdf = 0.0
-    out.bounced = wp.vec3(0.0)
+    out.from_place = 0
     out.weight_next = 0.0
     out.next.valid = 0
     frame = basis(surface.n)
@@ -171,9 +171,11 @@ def scatter(
                     escaped = 1.0
                 elif out.next.valid == 0:
                     # No light is sampled from there, so this technique has all of it.
-                    out.bounced = proxy_radiance(proxy, place) * slope
-                    out.direct += wp.cw_mul(out.f_brdf, out.bounced)
-                    out.direct_diffuse += wp.cw_mul(f.diffuse, out.bounced)
+                    out.from_place = 1
+                    out.L_brdf = proxy_radiance(proxy, place)
+                    out.weight_brdf = slope
+                    out.direct += wp.cw_mul(out.f_brdf, out.L_brdf) * slope
+                    out.direct_diffuse += wp.cw_mul(f.diffuse, out.L_brdf) * slope
             if escaped > 0.0:
                 Li = light_eval(light, wi)
                 weight = slope * escaped * power_heuristic(f.pdf, Li.pdf)
@@ -220,7 +222,7 @@ def keep_event(record: VertexRecord, i: int, j: int, event: Scatter):
     record.wi_light[i, j] = event.wi_light
     record.incident_light[i, j] = event.L_light * event.weight_light
     record.wi_brdf[i, j] = event.wi_brdf
-    record.incident_brdf[i, j] = event.L_brdf * event.weight_brdf + event.bounced
+    record.incident_brdf[i, j] = event.L_brdf * event.weight_brdf
     record.weight_next[i, j] = event.weight_next
 
 
@@ -344,8 +346,9 @@ def trace_foreground(
         if light_record.wi.shape[1] > 0:
             gain = wp.cw_mul(throughput, event.f_light) * (event.weight_light * scale)
             entries += keep_direction(light_record, i, entries, event.wi_light, gain)
-            gain = wp.cw_mul(throughput, event.f_brdf) * (event.weight_brdf * scale)
-            entries += keep_direction(light_record, i, entries, event.wi_brdf, gain)
+            if event.from_place == 0:
+                gain = wp.cw_mul(throughput, event.f_brdf) * (event.weight_brdf * scale)
+                entries += keep_direction(light_record, i, entries, event.wi_brdf, gain)
         if k == 0:
             radiance += event.direct
             radiance_diffuse += event.direct_diffuse

@@ -100,4 +100,6 @@ def test_curves_are_inverted(tone: str) -> None:
     again = y0 + h * (m * q * q + d0 * r) / (m + (d0 + d1 - 2 * m) * r)
     np.testing.assert_allclose(again, y, atol=1e-6)
     top = curves.radiance(np.array([1.0]))
-    assert top == pytest.approx(0.97 / 0.03 if tone == "reinhard" else 0.97)
+    assert top == pytest.approx(0.97 / 0.03 if tone == "reinhard" else 1.0)
+    plate = curves.radiance(np.array([4.0]))
+    assert plate == pytest.approx(0.97 / 0.03 if tone == "reinhard" else 4.0)

@@ -28,7 +28,7 @@ from warpir.camera import Camera
 from warpir.color import luminance
 from warpir.command import parse
 from warpir.config import InsertConfig
-from warpir.curves import ToneKnots
+from warpir.curves import Curves, ToneKnots
 from warpir.errors import ExitCode, InputError
 from warpir.inputs import read_inputs
 from warpir.insert import main
@@ -47,6 +47,7 @@ from warpir.transport import TransportIntegrator
 from warpir.transport_rows import TransportSettings
 
 FloatArray = NDArray[np.float32]
+LINEAR = Curves.identity("linear")
 
 SPP = 1024
 NOISE = 4.5 * np.sqrt(0.25 / SPP)
@@ -506,6 +507,7 @@ def test_run_with_place_and_mask(files: Path, tmp_path: Path) -> None:
     assert measured["proxy_triangles"] == 12
     assert measured["shadow_mask_at_object"] == pytest.approx(128 / 255)
     assert any("--shadow-mask" in line for line in run.record["assumed"])
+    assert not any("no lamp" in line for line in run.record["notices"])
     assert not any("material" in line and "wall" in line for line in run.record["notices"])
 
 
@@ -516,7 +518,7 @@ def test_picture_of_a_shaded_place(files: Path, device: str) -> None:
         inputs = read_inputs(config_of(files, **flags))
         light = Light(SUN, plain_sky((0.45, 0.62, 1.0), (0.2, 0.2, 0.2)))
         picture = make_picture(
-            Renderer(scene_of(inputs, inputs.camera, device, False)), light, light, inputs.photo,
+            Renderer(scene_of(inputs, inputs.camera, device, LINEAR)), light, light, inputs.photo,
             Quality(16, 1, 2, 3), ToneKnots.identity(1), ToneKnots.identity(3), False,
             shadow_mask=inputs.shadow_mask,
         )  # fmt: skip

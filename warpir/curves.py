@@ -129,13 +129,17 @@ class Curves:
     def radiance(self, photo_lin: NDArray[np.floating[Any]]) -> Float64Array:
         """Return the radiance that the foreground's curve and operator show as these values.
 
-        Values above `RESOLVED` are read as `RESOLVED`: the thing was at least that bright.
+        Values above 1, which only a linear plate has, are radiance as they are; without an
+        operator that is. With Reinhard's, `RESOLVED` is the most that is read.
 
         Args:
             photo_lin: Display-linear values [1], any shape.
         """
-        shown = np.minimum(self.foreground.invert(photo_lin), RESOLVED)
-        return shown / (1.0 - shown) if self.tone == "reinhard" else shown
+        shown = self.foreground.invert(photo_lin)
+        if self.tone == "reinhard":
+            shown = np.minimum(shown, RESOLVED)
+            return shown / (1.0 - shown)
+        return np.where(photo_lin > 1.0, photo_lin, shown)
 
     @staticmethod
     def identity(tone: str) -> Curves:

@@ -20,7 +20,7 @@ from warpir.curves import Curves
 from warpir.inputs import Inputs
 from warpir.lamps import without_lamps
 from warpir.light import Light, as_map, map_directions, texel_solid_angles
-from warpir.picture import resize
+from warpir.picture import photo_radiance, resize
 
 FloatArray = NDArray[np.float32]
 Float64Array = NDArray[np.float64]
@@ -56,7 +56,7 @@ def detail_of(inputs: Inputs, curves: Curves) -> Detail:
     """
     low, high = inputs.asset.bounds()
     centre = inputs.placement.asset_to_world @ np.append((low + high) / 2.0, 1.0)
-    radiance = curves.radiance(inputs.photo.linear()).astype(np.float32)
+    radiance = photo_radiance(inputs.photo, curves)
     return seen_from(centre[:3], radiance, inputs.camera, inputs.placement.ground)
 
 

@@ -41,16 +41,16 @@ def write_hand_off(
     inputs: Inputs,
     curves: Curves,
     texels: FloatArray,
-    envmap: str = "envmap",
+    envmap: str = "envmap.exr",
 ) -> tuple[dict[str, Any], tuple[str, ...]]:
     """Stage the files for other tools.
 
     Args:
-        output: Where; it holds, or will hold, the map ``<envmap>.exr``.
+        output: Where; it holds, or will hold, the map.
         inputs: Photo, camera, and the object with its place.
         curves: Tone curves of the picture.
-        texels: The light of that map, relative [W/(m^2 sr)], shape [He, 2 He, 3].
-        envmap: First part of the map's name.
+        texels: The light on the object, relative [W/(m^2 sr)], shape [He, 2 He, 3].
+        envmap: Name of the file that holds that map.
 
     Returns:
         Numbers for ``run.json``, and notices.
@@ -62,14 +62,14 @@ def write_hand_off(
     output.write_bytes(OBJECT_CURVE, tone_curve_cube(curves.foreground, _OBJECT_TEXT[curves.tone]))
     output.write_bytes(SHADOW_CURVE, tone_curve_cube(curves.shadow_ratio, _SHADOW_TEXT))
     web, clamped = web_map(texels)
-    output.write_hdr(f"{envmap}_web.hdr", web)
+    output.write_hdr("envmap_web.hdr", web)
     output.write_bytes(OBJECT, write_glb(inputs.asset, placement.asset_to_world, camera))
     # Upright and without the photo's metadata: Blender does not turn pictures by their EXIF tag.
     codes = photo.codes
     if photo.is_linear:
         codes = photo.encode(photo.srgb, np.ones(codes.shape[:2], np.bool_))
     output.write_png(PHOTO, codes, icc=photo.icc, mark=False)
-    script = blender_setup(inputs, f"{envmap}.exr")
+    script = blender_setup(inputs, envmap)
     output.write_bytes(BLENDER_SETUP, script.encode())
     notices = []
     if (off := square_pixel_error(camera)) > SQUARE_ENOUGH:

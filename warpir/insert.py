@@ -149,6 +149,9 @@ def _insert_one(config: InsertConfig, loaders: "Loaders | None" = None) -> Inser
                 light, recovered = _regress(config, inputs, device, timings)
             if config.guided_by == "embedded":
                 recovered["prior_about"] = NOT_ASKED
+            if inputs.shadow_mask is not None and not _has_lamps(light):
+                notices = (*notices, "the light has no lamp that --shadow-mask could take")
+                say(f"notice: {notices[-1]}")
             light, shown = _detailed(config, inputs, light, timings)
             recovered |= shown
             with timings.stage("preview"):
@@ -156,7 +159,7 @@ def _insert_one(config: InsertConfig, loaders: "Loaders | None" = None) -> Inser
         with timings.stage("scene"):
             is_reinhard = light.curves.tone == "reinhard"
             camera = _rendering_camera(inputs.camera, config)
-            scene = scene_of(inputs, camera, device, is_reinhard)
+            scene = scene_of(inputs, camera, device, light.curves)
         with timings.stage("render"), progress_bar() as report:
             picture = make_picture(
                 Renderer(scene, config.threads or 0, report),
@@ -233,6 +236,12 @@ def _detailed(
     return light, {"detail_seen": detail.seen}
 
 
+def _has_lamps(light: "SceneLight") -> bool:
+    from warpir.lamps import lamp_axes
+
+    return any(len(lamp_axes(x)) > 0 for x in (light.light, light.light_shadow))
+
+
 def _say_who_spoke(record: dict[str, Any]) -> None:
     """Print in a line what the light comes from and what computed it."""
     measured = record["measured"]
@@ -270,7 +279,7 @@ def _write_preview(
     camera = _rendering_camera(inputs.camera, replace(config, width=width))
     is_reinhard = light.curves.tone == "reinhard"
     picture = make_picture(
-        Renderer(scene_of(inputs, camera, device, is_reinhard), config.threads or 0),
+        Renderer(scene_of(inputs, camera, device, light.curves), config.threads or 0),
         light.on_object,
         light.light_shadow,
         inputs.photo,
@@ -349,12 +358,13 @@ def _write(
         config=asdict(config),
         inputs=input_hashes(config),
     )
-    texels = as_file_map(light.light)
-    output.write_envmap(texels)
+    output.write_envmap(as_file_map(light.light))
     if light.light_shadow is not light.light:
         output.write_envmap(as_file_map(light.light_shadow), "envmap_shadow")
+    on_object, its_map = as_file_map(light.on_object), "envmap.exr"
     if light.detailed is not None:
-        output.write_envmap(as_file_map(light.detailed), "envmap_detail")
+        output.write_envmap(on_object, "envmap_detail")
+        its_map = "envmap_detail.exr"
     if light.light.lobes is not None:
         output.write_json("lobes.json", lobes_to_json(light.light.lobes))
     output.write_json("curves.json", curves_to_json(light.curves))
@@ -369,13 +379,13 @@ def _write(
     if config.hand_off:
         from warpir.handoff import write_hand_off
 
-        handed, notices = write_hand_off(output, inputs, light.curves, texels)
+        handed, notices = write_hand_off(output, inputs, light.curves, on_object, its_map)
         for line in notices:
             say(f"notice: {line}")
     if config.mitsuba:
         from warpir.mitsuba_scene import write_mitsuba
 
-        write_mitsuba(output, inputs, texels, config.depth)
+        write_mitsuba(output, inputs, on_object, config.depth)
     summary = summarize(light.light)
     say(
         f"light: brightest toward azimuth {summary.azimuth_deg:.0f}, elevation "

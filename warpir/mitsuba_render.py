@@ -397,9 +397,12 @@ def render_run(
     camera = read_camera(folder / "camera.json", (plate.shape[1], plate.shape[0]))
     asset, matrix = load_asset(folder / OBJECT), np.eye(4)
     curves = read_curves(folder / "curves.json")
-    texels = read_envmap(folder / "envmap.exr")
-    shadow_map = folder / "envmap_shadow.exr"
-    texels_shadow = read_envmap(shadow_map) if shadow_map.exists() else texels
+    texels, texels_shadow = (
+        read_envmap(
+            own if (own := folder / f"envmap_{name}.exr").exists() else folder / "envmap.exr"
+        )
+        for name in ("detail", "shadow")
+    )
 
     lit = foreground(asset, matrix, camera, texels, depth, spp, seed)
     coverage = lit.coverage[..., None]

@@ -30,25 +30,22 @@ LEAST_ROWS, FINE_ROWS = 512, 2048
 is then right to 2e-5."""
 
 
-def write_mitsuba(
-    output: OutputFolder, inputs: Inputs, texels: FloatArray, depth: int, envmap: str = "envmap"
-) -> None:
+def write_mitsuba(output: OutputFolder, inputs: Inputs, texels: FloatArray, depth: int) -> None:
     """Stage the folder.
 
     Args:
         output: Where; ``render.py`` reads the files of the hand-off beside the folder.
         inputs: Camera, and the object with its place.
-        texels: The light, relative [W/(m^2 sr)], shape [He, 2 He, 3].
+        texels: The light on the object, relative [W/(m^2 sr)], shape [He, 2 He, 3].
         depth: Surface interactions of the longest path.
-        envmap: First part of the name of the folder's map.
 
     Raises:
         InputError: The disk is full (exit 5).
     """
     rows = mitsuba_rows(texels)
-    output.write_exr(f"{FOLDER}/{envmap}.exr", {c: rows[..., k] for k, c in enumerate("RGB")})
+    output.write_exr(f"{FOLDER}/envmap.exr", {c: rows[..., k] for k, c in enumerate("RGB")})
     scene = _Scene(output, inputs.asset, inputs.placement.asset_to_world)
-    text = scene.xml(inputs.camera, depth, f"{envmap}.exr")
+    text = scene.xml(inputs.camera, depth)
     output.write_bytes(f"{FOLDER}/scene.xml", text.encode())
     ground = tuple(float(c) for c in inputs.placement.ground)
     output.write_bytes(f"{FOLDER}/render.py", _RENDER.format(ground=ground, depth=depth).encode())
@@ -131,7 +128,7 @@ class _Scene:
     textures: int = 0
     lines: list[str] = field(default_factory=list)
 
-    def xml(self, camera: Camera, depth: int, envmap: str) -> str:
+    def xml(self, camera: Camera, depth: int) -> str:
         """Return the whole text."""
         view = mitsuba_sensor(camera)
         self.lines = [
@@ -161,7 +158,7 @@ class _Scene:
             '    <sampler type="independent"><integer name="sample_count" value="$spp"/></sampler>',
             "</sensor>",
             '<emitter type="envmap">',
-            f'    <string name="filename" value="{envmap}"/>',
+            '    <string name="filename" value="envmap.exr"/>',
             "</emitter>",
         ]
         for k, primitive in enumerate(self.asset.primitives):

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from warpir.camera import Camera
 from warpir.color import linear_to_gamma
-from warpir.curves import ToneKnots
+from warpir.curves import Curves, ToneKnots
 from warpir.files import Layers
 from warpir.inputs import Inputs
 from warpir.lamps import without_lamps
@@ -23,9 +23,7 @@ FloatArray = NDArray[np.float32]
 Float64Array = NDArray[np.float64]
 
 PLACE_WIDTH = 1024
-"""Most columns of the photo that the mesh of --proxy sends into the scene [px]."""
-PLACE_WHITE = 0.95
-"""Display value that Reinhard's operator is inverted up to [1]: radiance 19."""
+"""Most columns of the photo that sends light back into the scene [px]."""
 SLIVER = 1e-4
 """Share of a pixel [1] below which the object's surface is not described there."""
 
@@ -214,28 +212,28 @@ def _mixed(
     return pixels, np.where(share < 1.0, whole + share * (without - whole), without)
 
 
-def scene_of(inputs: Inputs, camera: Camera, device: str, is_reinhard: bool = True) -> Scene:
+def scene_of(inputs: Inputs, camera: Camera, device: str, curves: Curves) -> Scene:
     """Put the object onto its plane or into the mesh of its place.
 
     Args:
         inputs: Photo, asset, place and placement.
         camera: At the resolution that is to be rendered.
         device: Warp device.
-        is_reinhard: The tone operator of the picture, which the photo is taken to have passed.
+        curves: Of the picture; what the photo shows of the place is taken to have passed them.
     """
     ground = inputs.placement.ground
     placed = Placed(inputs.asset, inputs.placement.asset_to_world)
-    radiance = None if inputs.proxy is None else photo_radiance(inputs.photo, is_reinhard)
+    radiance = None if inputs.proxy is None else photo_radiance(inputs.photo, curves)
     proxy = Proxy(ground[:3], -float(ground[3]), inputs.proxy, radiance, inputs.is_plane)
     return Scene([placed], camera, proxy, device)
 
 
-def photo_radiance(photo: Photo, is_reinhard: bool) -> FloatArray:
-    """Return the radiance that the picture's tone operator would show as the photo.
+def photo_radiance(photo: Photo, curves: Curves) -> FloatArray:
+    """Return the radiance that the picture's curves and operator would show as the photo.
 
     Args:
         photo: The photograph.
-        is_reinhard: Whether that operator is Reinhard's, or none.
+        curves: Of the picture.
 
     Returns:
         Relative [W/(m^2 sr)], shape [height, width, 3], at most `PLACE_WIDTH` wide.
@@ -244,11 +242,7 @@ def photo_radiance(photo: Photo, is_reinhard: bool) -> FloatArray:
     height, width = linear.shape[:2]
     if width > PLACE_WIDTH:
         linear = resize(linear, max(1, round(height * PLACE_WIDTH / width)), PLACE_WIDTH)
-    linear = np.maximum(linear, 0.0)
-    if is_reinhard:
-        linear = np.minimum(linear, PLACE_WHITE)
-        linear = linear / (1.0 - linear)
-    return np.asarray(linear, np.float32)
+    return curves.radiance(linear).astype(np.float32)
 
 
 def _halves(plane: FloatArray) -> FloatArray:

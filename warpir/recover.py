@@ -417,11 +417,11 @@ def make_frame(run: Run) -> Frame:
     config, camera = run.config, run.inputs.camera
     width = min(config.picture_width, camera.width)
     small = camera.scaled(width, max(1, round(width * camera.height / camera.width)))
-    is_reinhard = config.tone_operator == "reinhard"
-    scene = scene_of(run.inputs, small, run.device, is_reinhard)
+    curves = Curves.identity(config.tone_operator)
+    scene = scene_of(run.inputs, small, run.device, curves)
     renderer = Renderer(scene, config.threads or 0)
     photo = np.clip(resize(run.inputs.photo.linear(), small.height, small.width), 0.0, None)
-    frame = Frame(renderer, photo, is_reinhard, config.depth, config.seed)
+    frame = Frame(renderer, photo, curves.tone == "reinhard", config.depth, config.seed)
     if not frame.coverage().any():
         raise InputError(
             "--guidance",
