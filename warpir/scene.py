@@ -166,7 +166,7 @@ class Scene:
         self.camera_args = self.camera_args_at(camera)
         self.proxy_args = self._proxy_args()
         self.dark_proxy_args = ProxyArgs()
-        for name in ProxyArgs.vars:
+        for name in self.proxy_args._cls.vars:
             setattr(self.dark_proxy_args, name, getattr(self.proxy_args, name))
         self.dark_proxy_args.shines = 0
 
