@@ -165,8 +165,8 @@ class Scene:
         self._upload_textures(textures)
         self.camera_args = self.camera_args_at(camera)
         self.proxy_args = self._proxy_args()
-        self.dark_proxy_args = ProxyArgs()
-        for name in self.proxy_args._cls.vars:
+        self.dark_proxy_args: Any = ProxyArgs()
+        for name in self.dark_proxy_args._cls.vars:
             setattr(self.dark_proxy_args, name, getattr(self.proxy_args, name))
         self.dark_proxy_args.shines = 0
 
