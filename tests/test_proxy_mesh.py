@@ -341,6 +341,27 @@ def test_transport_in_a_place_stays_exact_at_both_ends(device: str) -> None:
     assert float(kept.max()) <= 1.0 + 1e-6
 
 
+def test_transport_gradient_in_a_place_matches_differences(device: str) -> None:
+    """Of object and ratio along one direction of the light, constants of the mesh included."""
+    renderer = corner(device)
+    objects, proxies = pixels_of(renderer)
+    made = TransportIntegrator(renderer, objects, proxies, 2, SETTINGS)
+    texels = torch.tensor(as_map(Light(some_lobes()), HEIGHT), requires_grad=True)
+    toward = torch.rand(texels.shape, generator=torch.Generator().manual_seed(1))
+
+    def loss(light: torch.Tensor) -> torch.Tensor:
+        out = made.radiance(LightTensors(texels=light), LightTensors(texels=light), 0)
+        seen = out.unoccluded > 1e-3
+        ratio = torch.where(seen, out.lit / out.unoccluded.clamp(min=1e-3), 1.0)
+        return (out.foreground.double() ** 2).sum() + (ratio.double() ** 3).sum()
+
+    (d_texels,) = torch.autograd.grad(loss(texels), texels)
+    step, origin = 2e-3, texels.detach()
+    sides = [float(loss(origin + sign * step * toward)) for sign in (1.0, -1.0)]
+    numeric = (sides[0] - sides[1]) / (2.0 * step)
+    assert float((d_texels * toward).sum()) == pytest.approx(numeric, rel=0.01)
+
+
 def test_sharp_lobes_beside_the_rows_bounce_once(device: str) -> None:
     """Lobes left to `mis` add no second copy of what the mesh sends."""
     renderer = corner(device)

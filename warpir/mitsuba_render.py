@@ -425,6 +425,12 @@ def render_run(
     return Composite(displayed * coverage + behind * ratio, np.sqrt(variance))
 
 
+def _light(folder: Path, name: str) -> NDArray[np.float32]:
+    """Return the map of one use, where it has one of its own, else that of all."""
+    own = folder / f"envmap_{name}.exr"
+    return read_envmap(own if own.exists() else folder / "envmap.exr")
+
+
 def write_composite(path: Path, composite: Composite) -> None:
     """Write ``<path>.png``, and ``<path>.exr`` with the standard error in ``error.R/G/B``."""
     names = [*"RGB", *(f"error.{c}" for c in "RGB")]

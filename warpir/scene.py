@@ -152,6 +152,14 @@ def _extensions(material: Material) -> Extensions:
     return out
 
 
+def _copied(args: Any) -> Any:
+    """Return another struct that holds the same arrays and numbers."""
+    copy = type(args)()
+    for name in args._cls.vars:
+        setattr(copy, name, getattr(args, name))
+    return copy
+
+
 class Scene:
     """Geometry, materials, plane and camera on one device; owns every Warp handle for the run.
 
@@ -199,9 +207,7 @@ class Scene:
         self._upload_textures(textures)
         self.camera_args = self.camera_args_at(camera)
         self.proxy_args = self._proxy_args()
-        self.dark_proxy_args = ProxyArgs()
-        for name in ProxyArgs.vars:
-            setattr(self.dark_proxy_args, name, getattr(self.proxy_args, name))
+        self.dark_proxy_args = _copied(self.proxy_args)
         self.dark_proxy_args.shines = 0
 
     def _proxy_args(self) -> ProxyArgs:
