@@ -49,6 +49,8 @@ ALWAYS = (
     "tone_curve_shadow.cube",
 )
 """Every run writes these, and ``run.json`` behind them."""
+DETAIL = ("envmap_detail.exr", "envmap_detail.hdr", "envmap_detail_preview.png")
+"""Where the light has no panorama's detail of its own, also these."""
 HALF = 2e-3
 """The same of linear values in [0, 1]; the writer's own limit."""
 RGBE = 0.01
@@ -497,7 +499,8 @@ def test_obj_under_lobes_writes_them(inputs: Path, tmp_path: Path, device: str) 
     out = tmp_path / "out"
     changes = {"asset": str(inputs / "box.obj"), "light": str(inputs / "lobes.json")}
     lit = go(arguments(inputs, out, device=device, **changes), out)
-    assert set(lit.record["files"]) == {*ALWAYS, "lobes.json"}
+    assert set(lit.record["files"]) == {*ALWAYS, *DETAIL, "lobes.json"}
+    assert 0.0 < lit.record["measured"]["detail_seen"] < 1.0
     given, found = read_lobes(inputs / "lobes.json"), read_lobes(out / "lobes.json")
     factor = 2.0 ** lit.record["measured"]["exposure_ev"]
     np.testing.assert_allclose(found.amplitude, given.amplitude * factor, rtol=1e-5)
@@ -512,9 +515,10 @@ def test_obj_under_lobes_writes_them(inputs: Path, tmp_path: Path, device: str) 
 
 
 def test_fit_lobes_reports_its_error(inputs: Path, tmp_path: Path, device: str) -> None:
-    """--fit-lobes 8 writes 8 lobes and how well they fit."""
+    """--fit-lobes 8 writes 8 lobes and how well they fit; --no-detail leaves it at that."""
     out = tmp_path / "out"
-    fitted = go(arguments(inputs, out, fit_lobes="8", device=device), out)
+    fitted = go([*arguments(inputs, out, fit_lobes="8", device=device), "--no-detail"], out)
+    assert set(fitted.record["files"]) == {*ALWAYS, "lobes.json"}
     assert len(read_lobes(out / "lobes.json").sharpness) == 8
     fit = fitted.record["measured"]["lobe_fit"]
     assert 0.0 <= fit["irradiance_error"] < 0.2 and 0.0 <= fit["flux_error"] < 0.1

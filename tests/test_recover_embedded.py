@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 import torch
 
-from tests.test_insert import ALWAYS, arguments, digest, write_inputs
+from tests.test_insert import ALWAYS, DETAIL, arguments, digest, write_inputs
 from tests.test_recover import Killed, stop_at, stop_hard
 from warpir import recover
 from warpir.acceptance import Verdict
@@ -143,7 +143,7 @@ def test_guided_run_says_who_spoke(
     assert "degrees; transport and mis on cpu" in said
     assert "accepted: guidance, asked anew, prefers the end (dU = -3 +- 1)" in said
     names = {"lobes.json", "optimization.json", "progress", "run.json"}
-    assert {p.name for p in out.iterdir()} == {*ALWAYS, *names}
+    assert {p.name for p in out.iterdir()} == {*ALWAYS, *DETAIL, *names}
     previews = [f"preview-{step:06d}.png" for step in (0, 2, 4)]
     assert sorted(p.name for p in (out / "progress").iterdir()) == previews
     run = record(out)
