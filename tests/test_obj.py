@@ -192,6 +192,20 @@ def test_mtl_pbr_keys(tmp_path: Path) -> None:
     assert asset.notices == ()
 
 
+def test_mtl_coat_sheen_and_index(tmp_path: Path) -> None:
+    """Pc, Pcr, Ps and Ni are coat, its roughness, sheen and index; Ni 1 means none."""
+    asset = with_mtl(tmp_path, "Kd 1 1 1\nPr 0.5\nNi 1.8\nPc 0.75\nPcr 2\nPs 0.25\n")
+    (material,) = asset.materials
+    assert (material.ior, material.clearcoat, material.clearcoat_roughness) == (1.8, 0.75, 1.0)
+    assert material.sheen_color == (0.25, 0.25, 0.25)
+    assert any("Pcr 2 clamped" in notice for notice in asset.notices)
+    assert any("sheen of roughness 0.5 assumed" in notice for notice in asset.notices)
+    for statement, noted in (("Ni 1", False), ("Ni 0.5", True)):
+        asset = with_mtl(tmp_path, f"Kd 1 1 1\nPr 0.5\n{statement}\n")
+        assert asset.materials[0].ior == 1.5
+        assert any("Ni 0.5 ignored" in notice for notice in asset.notices) == noted
+
+
 def test_mtl_roughness_from_the_exponent(tmp_path: Path) -> None:
     """Ns gives roughness^2 = sqrt(2 / (Ns + 2)) where there is no Pr, and is noted as assumed."""
     asset = with_mtl(tmp_path, "Kd 1 1 1\nNs 30\n")
