@@ -4,8 +4,9 @@ Written from appendix B of the specification alone (https://registry.khronos.org
 "BRDF implementation"): GGX, height-correlated Smith, Schlick, and a Lambert lobe damped by the
 same Fresnel term; and from the README of each KHR_materials extension: ior, specular, clearcoat,
 sheen (the form whose albedo scaling depends on the view alone) and thin transmission, whose light
-goes straight on with the luminance of its tint. Names follow warpir: ``wo`` toward the camera, ``wi`` toward the light;
-Mitsuba's arguments are the other way round and are renamed at the border of each method.
+goes straight on with the luminance of its tint. Names follow warpir: ``wo`` toward the camera,
+``wi`` toward the light; Mitsuba's arguments are the other way round and are renamed at the border
+of each method.
 """
 
 from dataclasses import dataclass
