@@ -103,6 +103,17 @@ PRESETS = (
         rotate_y=-50.0,
     ),
     ScenePreset(
+        "toycar_overcast",
+        "mesh/ToyCar.glb",
+        "hdri/potsdamer_platz_1k.hdr",
+        size=0.3,
+        distance=0.8,
+        camera_height=0.35,
+        aim=0.22,
+        fov=22.0,
+        rotate_y=-50.0,
+    ),
+    ScenePreset(
         "truck_overcast",
         "mesh/kenney_trucks/vehicle-truck-red.glb",
         "hdri/potsdamer_platz_1k.hdr",

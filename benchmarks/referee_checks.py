@@ -226,6 +226,57 @@ def check_material(rng: np.random.Generator) -> None:
             report("material: its energy by its sampler", found.mean(), expected, error + 1e-5)
 
 
+def check_layers(rng: np.random.Generator) -> None:
+    """Sample coat, cloth and glass with their density; its energy by two ways of drawing."""
+    corners = np.array([[0.0, 0.0, 0.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])
+    uv = np.array([[0.0, 1.0], [1.0, 1.0], [0.0, 0.0]], dtype=np.float32)
+    codes = np.array([[[190, 60, 220, 255]]], dtype=np.uint8)
+    base = Material(base_color=(0.8, 0.5, 0.2), metallic=0.3, roughness=0.6)
+    for name, material in (
+        ("coat", replace(base, clearcoat=0.9, clearcoat_roughness=0.3)),
+        ("cloth", replace(base, sheen_color=(0.9, 0.4, 0.2), sheen_roughness=0.5)),
+        ("glass", replace(base, transmission=0.8, ior=1.7, specular_color=(1.0, 0.5, 2.0))),
+    ):
+        if name == "coat":
+            material = replace(material, clearcoat_normal_texture=TextureSlot(0))
+        triangle = Primitive(corners, np.array([[0, 1, 2]], dtype=np.int32), 0, uv0=uv)
+        bsdf = GltfBSDF(
+            Asset("triangle", (triangle,), (material,), (Texture(codes),)), triangle, np.eye(3)
+        )
+        for polar in (0.2, 1.3):
+            si = dr.zeros(mi.SurfaceInteraction3f)
+            si.n = mi.Normal3f(0.0, 0.0, 1.0)
+            si.sh_frame = mi.Frame3f(si.n)
+            sine, cosine = float(np.sin(polar)), float(np.cos(polar))
+            si.wi = si.to_local(mi.Vector3f(0.6 * sine, 0.8 * sine, cosine))
+
+            def draw(
+                u: mi.Vector3f, si: mi.SurfaceInteraction3f = si, bsdf: GltfBSDF = bsdf
+            ) -> tuple[mi.Vector3f, mi.Float]:
+                bs, weight = bsdf.sample(mi.BSDFContext(), si, u.x, mi.Point2f(u.y, u.z))
+                return si.to_world(bs.wo), dr.select(dr.max(weight) > 0.0, mi.Float(1.0), 0.0)
+
+            def density(
+                d: mi.Vector3f, si: mi.SurfaceInteraction3f = si, bsdf: GltfBSDF = bsdf
+            ) -> mi.Float:
+                return bsdf.pdf(mi.BSDFContext(), si, si.to_local(d))
+
+            chi2(f"layers: {name}, polar {polar}", draw, density, 3)
+            context = mi.BSDFContext()
+            u = rng.random((3, 1_000_000), dtype=np.float32)
+            _, weight = bsdf.sample(context, si, mi.Float(u[0]), mi.Point2f(u[1:]))
+            found = np.asarray(weight)[0].astype(np.float64)
+            d = mi.warp.square_to_uniform_hemisphere(mi.Point2f(u[:2]))
+            f_cos = np.asarray(bsdf.eval(context, si, si.to_local(d)))[0].astype(np.float64)
+            error = np.hypot(found.std(), 2.0 * np.pi * f_cos.std()) / 1e3
+            report(
+                f"layers: energy of {name} by its sampler",
+                found.mean(),
+                2.0 * np.pi * f_cos.mean(),
+                error + 1e-5,
+            )
+
+
 def check_textures(rng: np.random.Generator) -> None:
     """Read textures as Mitsuba's bitmap does, where that has the wrap mode."""
     codes = rng.integers(0, 256, size=(5, 7, 4), dtype=np.uint8)
@@ -481,6 +532,7 @@ def main() -> None:
     check_light(rng)
     check_textures(rng)
     check_material(rng)
+    check_layers(rng)
     check_energy()
     check_lambert()
     check_coverage()

@@ -291,13 +291,16 @@ def coat_lobe(wo: wp.vec3, wi: wp.vec3, coat_n: wp.vec3, roughness: float) -> wp
     frame = basis(coat_n)
     o = to_local(wo, frame)
     i = to_local(wi, frame)
-    if o[2] <= 0.0 or i[2] <= 0.0:
+    if o[2] <= 0.0:
         return wp.vec2(0.0, 0.0)
     alpha = roughness_to_alpha(roughness)
     D = ggx_d(wp.normalize(o + i), alpha)
     lambda_o = smith_lambda(o, alpha)
-    G2 = 1.0 / (1.0 + lambda_o + smith_lambda(i, alpha))
-    value = D * G2 / wp.max(4.0 * o[2] * wi[2], 1.0e-30)
+    value = float(0.0)
+    if i[2] > 0.0:
+        G2 = 1.0 / (1.0 + lambda_o + smith_lambda(i, alpha))
+        value = D * G2 / wp.max(4.0 * o[2] * wi[2], 1.0e-30)
+    # Directions below the coat's horizon are drawn too.
     return wp.vec2(value, D / wp.max((1.0 + lambda_o) * 4.0 * o[2], 1.0e-30))
 
 

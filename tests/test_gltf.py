@@ -18,7 +18,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from warpir.asset import LIMITS, Asset, AssetLimits, load_asset
+from warpir.asset import LIMITS, Asset, AssetLimits, Material, TextureSlot, load_asset
 from warpir.config import InsertConfig
 from warpir.errors import ExitCode, InputError
 from warpir.gltf import read_gltf
@@ -858,41 +858,131 @@ def test_G10_texture_transform(tmp_path: Path) -> None:
 
 
 def test_G11_material_extensions(tmp_path: Path) -> None:
-    """Emissive strength multiplies; unlit is matte; the others give one notice."""
+    """Emissive strength multiplies; unlit is matte; what is not supported gives one notice."""
     builder = Builder()
     builder.material.update(
         name="lamp",
         emissiveFactor=[1, 0.5, 0],
         extensions={
             "KHR_materials_emissive_strength": {"emissiveStrength": 8},
-            "KHR_materials_volume": {"thicknessFactor": 0.1},
+            "KHR_materials_ior": {"ior": 1.3},
+            "KHR_materials_volume": {"thicknessFactor": 1},
+            "KHR_materials_dispersion": {},
             "KHR_materials_iridescence": {},
+            "KHR_materials_anisotropy": {},
+            "KHR_materials_diffuse_transmission": {},
         },
     )
     asset = load(tmp_path, builder)
     assert asset.materials[0].emission == (8.0, 4.0, 0.0)
+    assert asset.materials[0].ior == 1.3
     (notice,) = asset.notices
-    assert "lamp" in notice and "KHR_materials_volume, KHR_materials_iridescence" in notice
-    builder.material["extensions"] = {"KHR_materials_unlit": {}}
+    assert "lamp" in notice and "KHR_materials_volume, KHR_materials_dispersion" in notice
+    builder.material["extensions"] = {
+        "KHR_materials_unlit": {}, "KHR_materials_clearcoat": {"clearcoatFactor": 1},
+    }  # fmt: skip
     asset = load(tmp_path, builder)
     (material,) = asset.materials
     assert (material.metallic, material.emission) == (0.0, (0.0, 0.0, 0.0))
+    assert material.clearcoat == 0.0
     assert any("unlit" in notice for notice in asset.notices)
 
 
-def test_G11_specular_glossiness_is_converted(tmp_path: Path) -> None:
-    """Specular-glossiness without a fallback becomes a dielectric, not white metal."""
+def test_G11_layers_are_read(tmp_path: Path) -> None:
+    """Coat, sheen, glass and reflection keep factors, textures, UV sets and transforms."""
     builder = Builder()
-    builder.json["materials"][0] = {
-        "extensions": {
-            "KHR_materials_pbrSpecularGlossiness": {
-                "diffuseFactor": [0.5, 0.25, 0.125, 1], "glossinessFactor": 0.75,
-            }
-        }
+    builder.base_color()
+    turned = {"index": 0, "texCoord": 1, "extensions": {"KHR_texture_transform": {"scale": [2, 3]}}}
+    plain = {"index": 0}
+    builder.material.pop("pbrMetallicRoughness", None)
+    builder.material["extensions"] = {
+        "KHR_materials_clearcoat": {
+            "clearcoatFactor": 0.75, "clearcoatRoughnessFactor": 0.125, "clearcoatTexture": turned,
+            "clearcoatRoughnessTexture": plain, "clearcoatNormalTexture": {"index": 0, "scale": 2},
+        },
+        "KHR_materials_sheen": {
+            "sheenColorFactor": [0.5, 0.25, 0], "sheenRoughnessFactor": 0.5,
+            "sheenColorTexture": plain, "sheenRoughnessTexture": turned,
+        },
+        "KHR_materials_transmission": {"transmissionFactor": 0.5, "transmissionTexture": plain},
+        "KHR_materials_specular": {
+            "specularFactor": 0.25, "specularColorFactor": [2, 1, 0.5], "specularTexture": plain,
+            "specularColorTexture": turned,
+        },
     }  # fmt: skip
+    builder.json["extensionsRequired"] = list(builder.material["extensions"])
+    asset = load(tmp_path, builder)
+    (material,) = asset.materials
+    slot = TextureSlot(0)
+    scaled = TextureSlot(0, 1, (2.0, 0.0, 0.0, 0.0, 3.0, 0.0))
+    expected = Material(
+        name=material.name, clearcoat=0.75, clearcoat_roughness=0.125, clearcoat_normal_scale=2.0,
+        clearcoat_texture=scaled, clearcoat_roughness_texture=slot, clearcoat_normal_texture=slot,
+        sheen_color=(0.5, 0.25, 0.0), sheen_roughness=0.5, sheen_color_texture=slot,
+        sheen_roughness_texture=scaled, transmission=0.5, transmission_texture=slot,
+        specular=0.25, specular_color=(2.0, 1.0, 0.5), specular_texture=slot,
+        specular_color_texture=scaled,
+    )  # fmt: skip
+    assert material == expected
+    assert any("not blurred" in notice for notice in asset.notices)
+
+
+def test_G11_layers_are_clamped(tmp_path: Path) -> None:
+    """Factors outside their range are brought into it, each with a notice."""
+    builder = Builder()
+    builder.material["extensions"] = {
+        "KHR_materials_ior": {"ior": 0.5},
+        "KHR_materials_clearcoat": {"clearcoatFactor": 2, "clearcoatRoughnessFactor": -1},
+        "KHR_materials_sheen": {"sheenColorFactor": [2, 0, 0], "sheenRoughnessFactor": 3},
+        "KHR_materials_specular": {"specularFactor": -1, "specularColorFactor": [-1, 9, 0]},
+    }
+    asset = load(tmp_path, builder)
+    (material,) = asset.materials
+    assert (material.ior, material.clearcoat, material.clearcoat_roughness) == (1.0, 1.0, 0.0)
+    assert (material.sheen_color, material.sheen_roughness) == ((1.0, 0.0, 0.0), 1.0)
+    assert (material.specular, material.specular_color) == (0.0, (0.0, 9.0, 0.0))
+    assert sum("clamped" in notice for notice in asset.notices) == 7
+
+
+def test_G11_glass_says_what_it_does_not_do(tmp_path: Path) -> None:
+    """One notice of a tint or blur that is lost, none for clear glass."""
+    builder = Builder()
+    builder.material.update(
+        pbrMetallicRoughness={"metallicFactor": 0, "roughnessFactor": 0},
+        extensions={"KHR_materials_transmission": {"transmissionFactor": 1}},
+    )
+    assert load(tmp_path, builder).notices == ()
+    builder.material["pbrMetallicRoughness"] = {"baseColorFactor": [0.3, 0.8, 0.3, 1]}
+    (notice,) = load(tmp_path, builder).notices
+    assert "tinted or blurred" in notice
+
+
+def test_G11_specular_glossiness_is_converted(tmp_path: Path) -> None:
+    """Specular-glossiness without a fallback becomes a dielectric whose F0 is its specular colour.
+
+    The texture's alpha is glossiness; roughness is what the factor times it leaves to 1.
+    """
+    builder = Builder()
+    builder.base_color()
+    extension = {
+        "diffuseFactor": [0.5, 0.25, 0.125, 1], "specularFactor": [0.5, 0.25, 1],
+        "glossinessFactor": 0.75,
+    }  # fmt: skip
+    builder.json["materials"][0] = {
+        "extensions": {"KHR_materials_pbrSpecularGlossiness": extension}
+    }
     (material,) = load(tmp_path, builder).materials
     assert material.base_color == (0.5, 0.25, 0.125)
-    assert (material.metallic, material.roughness) == (0.0, 0.25)
+    assert (material.metallic, material.roughness, material.ior) == (0.0, 0.25, 0.0)
+    assert material.specular_color == (0.5, 0.25, 1.0)
+    extension["specularGlossinessTexture"] = {"index": 0}
+    asset = load(tmp_path, builder)
+    (material,) = asset.materials
+    given, rough = material.specular_color_texture, material.metallic_roughness_texture
+    assert given is not None and rough is not None and material.roughness == 1.0
+    glossiness = asset.textures[given.texture].pixels[..., 3] / 255.0
+    found = asset.textures[rough.texture].pixels[..., 1] / 255.0
+    np.testing.assert_allclose(found, 1.0 - 0.75 * glossiness, atol=0.5 / 255.0 + 1e-9)
 
 
 @pytest.mark.parametrize(

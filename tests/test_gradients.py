@@ -51,7 +51,14 @@ def one_thread_a_pixel(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(render, "FULL_THREADS", 0)
 
 
-def two_objects() -> Asset:
+LACQUER = Material(
+    ior=1.7, specular_color=(1.0, 0.8, 0.5), clearcoat=0.9, clearcoat_roughness=0.2,
+    transmission=0.3,
+)  # fmt: skip
+CLOTH = Material(sheen_color=(0.6, 0.3, 0.2), sheen_roughness=0.5, clearcoat=0.3)
+
+
+def two_objects(*materials: Material) -> Asset:
     """A sphere of smooth metal paint and a rough box that glows a little; they see each other."""
     ball = trimesh.creation.icosphere(subdivisions=3, radius=0.5)
     box = trimesh.creation.box(extents=(0.3, 0.6, 0.3))
@@ -67,7 +74,7 @@ def two_objects() -> Asset:
             ),
             Primitive(np.array(box.vertices), np.array(box.faces, np.int32), 1),
         ),
-        (Material(), Material()),
+        materials,
     )
 
 
@@ -150,6 +157,11 @@ class Pipeline:
 )
 def pipeline(request: pytest.FixtureRequest) -> Pipeline:
     device, depth = request.param
+    return make_pipeline(device, depth, Material(), Material())
+
+
+def make_pipeline(device: str, depth: int, *materials: Material) -> Pipeline:
+    """Set the two objects on the ground, of materials whose free factors are replaced."""
     focal = 40.0
     pose = np.eye(4)
     pose[1, 3] = 1.0
@@ -157,7 +169,7 @@ def pipeline(request: pytest.FixtureRequest) -> Pipeline:
     stand = np.eye(4)
     stand[:3, 3] = [0.0, 0.5, -4.0]
     proxy = Proxy(np.array([0.0, 1.0, 0.0]), 0.0)
-    renderer = Renderer(Scene([Placed(two_objects(), stand)], camera, proxy, device))
+    renderer = Renderer(Scene([Placed(two_objects(*materials), stand)], camera, proxy, device))
     generator = torch.Generator().manual_seed(0)
 
     def normal(*shape: int) -> Tensor:
@@ -193,6 +205,10 @@ def pipeline(request: pytest.FixtureRequest) -> Pipeline:
 
 @pytest.fixture(scope="module")
 def gradient(pipeline: Pipeline) -> dict[str, Tensor]:
+    return gradient_of(pipeline)
+
+
+def gradient_of(pipeline: Pipeline) -> dict[str, Tensor]:
     leaves = {name: value.clone().requires_grad_(True) for name, value in pipeline.raw.items()}
     pipeline.free(leaves).backward()
     return {name: leaf.grad for name, leaf in leaves.items() if leaf.grad is not None}
@@ -234,6 +250,18 @@ def test_gradient_is_that_of_the_pinned_pipeline(
     pipeline: Pipeline, gradient: dict[str, Tensor], name: str
 ) -> None:
     """Match central differences of the composite's loss, every parameter kind, samples pinned."""
+    check_gradient(pipeline, gradient, name)
+
+
+def test_gradient_of_layered_materials(device: str) -> None:
+    """The same for the materials below a coat and sheen, and of glass whose passing rays stay."""
+    pipeline = make_pipeline(device, 2, LACQUER, CLOTH)
+    gradient = gradient_of(pipeline)
+    for name in MATERIAL:
+        check_gradient(pipeline, gradient, name)
+
+
+def check_gradient(pipeline: Pipeline, gradient: dict[str, Tensor], name: str) -> None:
     step = STEP.get(name, 1e-2)
     values = pipeline.raw[name]
     count = min(values.numel(), 24)

@@ -192,17 +192,18 @@ def test_mtl_pbr_keys(tmp_path: Path) -> None:
     assert asset.notices == ()
 
 
-def test_mtl_index_and_coat(tmp_path: Path) -> None:
-    """Ni, Pc and Pcr are taken as they stand; Ni 1, which old tools always write, says nothing."""
-    (material,) = with_mtl(tmp_path, "Kd 1 1 1\nPr 1\nNi 1.33\nPc 0.5\nPcr 0.25\n").materials
-    assert (material.ior, material.clearcoat, material.clearcoat_roughness) == (1.33, 0.5, 0.25)
-    (material,) = with_mtl(tmp_path, "Kd 1 1 1\nPr 1\nNi 1.0\n").materials
-    assert (material.ior, material.clearcoat) == (1.5, 0.0)
-    asset = with_mtl(tmp_path, "Kd 1 1 1\nPr 1\nNi 0.5\nPc 7\n")
-    assert (asset.materials[0].ior, asset.materials[0].clearcoat) == (1.5, 1.0)
-    assert [n.partition(": ")[2] for n in asset.notices] == [
-        "Ni 0.5 ignored, 1.5 is used", "Pc 7 clamped to 0 ... 1",
-    ]  # fmt: skip
+def test_mtl_coat_sheen_and_index(tmp_path: Path) -> None:
+    """Pc, Pcr, Ps and Ni are coat, its roughness, sheen and index; Ni 1 means none."""
+    asset = with_mtl(tmp_path, "Kd 1 1 1\nPr 0.5\nNi 1.8\nPc 0.75\nPcr 2\nPs 0.25\n")
+    (material,) = asset.materials
+    assert (material.ior, material.clearcoat, material.clearcoat_roughness) == (1.8, 0.75, 1.0)
+    assert material.sheen_color == (0.25, 0.25, 0.25)
+    assert any("Pcr 2 clamped" in notice for notice in asset.notices)
+    assert any("sheen of roughness 0.5 assumed" in notice for notice in asset.notices)
+    for statement, noted in (("Ni 1", False), ("Ni 0.5", True)):
+        asset = with_mtl(tmp_path, f"Kd 1 1 1\nPr 0.5\n{statement}\n")
+        assert asset.materials[0].ior == 1.5
+        assert any("Ni 0.5 ignored" in notice for notice in asset.notices) == noted
 
 
 def test_mtl_says_what_it_leaves_out(tmp_path: Path) -> None:

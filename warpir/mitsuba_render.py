@@ -121,7 +121,8 @@ def build(
     parts = {"type": "scene", "light": LatlongEmitter(texels)}
     for k, positions in enumerate(world):
         parts[f"primitive_{k}"] = _mesh(asset, k, (positions - center) / radius, linear)
-    has_alpha = any(asset.materials[p.material].alpha_mode != "OPAQUE" for p in asset.primitives)
+    used_materials = [asset.materials[p.material] for p in asset.primitives]
+    has_alpha = any(m.alpha_mode != "OPAQUE" or m.transmission > 0.0 for m in used_materials)
     integrator = mi.load_dict({"type": "gltf_path", "max_depth": depth + 1, "has_alpha": has_alpha})
     return ObjectScene(
         mi.load_dict(parts), _sensor(camera, center, radius), integrator, center, radius

@@ -173,6 +173,7 @@ class Scene:
         origin: World point that is the recentred origin [m], shape [3].
         diagonal: Diagonal of the objects' bounding box [m].
         dark_proxy_args: The place, whose mesh sends nothing.
+        has_glass: Whether some material lets light through that it does not reflect.
     """
 
     def __init__(
@@ -374,6 +375,7 @@ class Scene:
         args.any_alpha = int(any(m.alpha_mode != "OPAQUE" or m.transmission > 0.0 for m in plain))
         args.any_culled = int(any(not m.double_sided for m in plain))
         args.any_emission = int(any(max(m.emission) > 0.0 for m in plain))
+        self.has_glass = any(m.transmission > 0.0 for m in plain)
         self.material_args = args
 
     def _upload_textures(self, textures: Sequence[Texture]) -> None:
