@@ -74,7 +74,7 @@ def two_objects(*materials: Material) -> Asset:
             ),
             Primitive(np.array(box.vertices), np.array(box.faces, np.int32), 1),
         ),
-        materials,
+        materials or (Material(), Material()),
     )
 
 
@@ -157,7 +157,7 @@ class Pipeline:
 )
 def pipeline(request: pytest.FixtureRequest) -> Pipeline:
     device, depth = request.param
-    return make_pipeline(device, depth, Material(), Material())
+    return make_pipeline(device, depth)
 
 
 def make_pipeline(device: str, depth: int, *materials: Material) -> Pipeline:
