@@ -6,6 +6,8 @@ asked, writes down what the two adjoints need: `warpir.kernels.light_gradient` f
 `warpir.kernels.shade` for the materials. Detached: no backward pass.
 """
 
+from functools import cache
+
 import warp as wp
 
 from warpir.kernels.brdf import brdf_eval, brdf_sample
@@ -226,157 +228,177 @@ def keep_event(record: VertexRecord, i: int, j: int, event: Scatter):
     record.weight_next[i, j] = event.weight_next
 
 
-@wp.kernel
-def trace_foreground(
-    pixels: wp.array[int],
-    camera: CameraArgs,
-    mesh: MeshArgs,
-    material: MaterialArgs,
-    texture: TextureArgs,
-    proxy: ProxyArgs,
-    light: LightArgs,
-    spp: int,
-    rays: int,
-    lanes: int,
-    depth: int,
-    indirect_limit: float,
-    seed: int,
-    foreground: wp.array[wp.vec3],
-    diffuse: wp.array[wp.vec3],
-    emission: wp.array[wp.vec3],
-    coverage: wp.array[float],
-    light_record: LightRecord,
-    vertex_record: VertexRecord,
-):
-    """Path-trace the object in each listed pixel; plane and place hide it but are not lit.
+@cache
+def foreground_kernel(has_layers: bool, has_place: bool) -> wp.Kernel:
+    """Return `trace_foreground` for scenes with or without these; what is not there costs nothing.
 
-    A pixel may stand in the list ``lanes`` times, one after the other: each row then takes its
-    share of the samples, and the rows' results add up to the pixel's.
+    A flag that is looked at while tracing would do on the CPU. On CUDA the registers of code that
+    never runs slow down what does.
 
     Args:
-        pixels: Row-major pixel indices, shape [row].
-        camera: The view.
-        mesh: The object's triangles.
-        material: Their materials.
-        texture: Their textures.
-        proxy: The ground plane, which hides what is below it from the camera, and the place's mesh,
-            which also stands in the light's way.
-        light: The light.
-        spp: Camera samples per row.
-        rays: Paths that share one camera sample.
-        lanes: Rows per pixel; the launch starts with a pixel's first.
-        depth: Surface interactions.
-        indirect_limit: Most radiance that one path may add behind its first vertex; 0 for no limit.
-            It takes the fireflies of light that a mirror throws onto a matte surface, and with them
-            some of that light.
-        seed: Base seed.
-        foreground: Radiance premultiplied by coverage, shape [row].
-        diffuse: The part of it that the first hit's diffuse lobe reflects, shape [row].
-        emission: The part of it that the first hit emits, shape [row].
-        coverage: Share of samples that see the object, shape [row].
-        light_record: Output: the weight of each direction that saw the light, or without arrays.
-        vertex_record: Output: every vertex; ``material`` must come filled with -1. Or without
-            arrays.
+        has_layers: Whether some material has extensions (``MaterialArgs.any_layers``).
+        has_place: Whether there is a mesh of the place (``ProxyArgs.mesh``).
     """
-    i = wp.tid()
-    pixel = pixels[i]
-    key = pixel_seed(seed, pixel)
-    scale = 1.0 / float(spp * rays * lanes)
-    before = (i % lanes) * spp
-    keep_dark = int(0)
-    if light_record.wi.shape[1] > 0 or vertex_record.material.shape[1] > 0:
-        keep_dark = 1
-    entries = int(0)
-    radiance = wp.vec3(0.0)
-    radiance_diffuse = wp.vec3(0.0)
-    radiance_emission = wp.vec3(0.0)
-    count = float(0.0)
 
-    # One loop over vertices rather than one over paths: a thread whose path has ended starts the
-    # next one at once instead of waiting for the longest path among its neighbours (1.5 x on CUDA).
-    index = int(0)
-    k = int(0)
-    alive = int(0)
-    first = Hit()
-    surface = Surface()
-    wo = wp.vec3(0.0)
-    throughput = wp.vec3(0.0)
-    throughput_diffuse = wp.vec3(0.0)
-    while index < spp * rays:
-        if alive == 0:
-            s = before + index // rays
-            ray_dir = camera_ray(camera, pixel, sobol_pair(s, key, 0))
-            if index % rays == 0:
-                first = camera_hit(camera, mesh, material, texture, proxy, s, key, ray_dir)
-                if first.valid == 1:
-                    count += 1.0
-            if first.valid == 0:
-                index += rays
-                continue
-            alive = 1
-            k = 0
-            wo = -ray_dir
-            surface = surface_at(mesh, material, texture, first, wo)
-            throughput = wp.vec3(1.0, 1.0, 1.0)
-            throughput_diffuse = wp.vec3(0.0)
-            radiance += surface.emission
-            radiance_emission += surface.emission
+    @wp.kernel(module="unique", enable_backward=False)
+    def trace_foreground(
+        pixels: wp.array[int],
+        camera: CameraArgs,
+        mesh: MeshArgs,
+        material: MaterialArgs,
+        texture: TextureArgs,
+        proxy: ProxyArgs,
+        light: LightArgs,
+        spp: int,
+        rays: int,
+        lanes: int,
+        depth: int,
+        indirect_limit: float,
+        seed: int,
+        foreground: wp.array[wp.vec3],
+        diffuse: wp.array[wp.vec3],
+        emission: wp.array[wp.vec3],
+        coverage: wp.array[float],
+        light_record: LightRecord,
+        vertex_record: VertexRecord,
+    ):
+        """Path-trace the object in each listed pixel; plane and place hide it but are not lit.
+
+        A pixel may stand in the list ``lanes`` times, one after the other: each row then takes its
+        share of the samples, and the rows' results add up to the pixel's.
+
+        Args:
+            pixels: Row-major pixel indices, shape [row].
+            camera: The view.
+            mesh: The object's triangles.
+            material: Their materials.
+            texture: Their textures.
+            proxy: The ground plane, which hides what is below it from the camera, and the place's
+                mesh, which also stands in the light's way.
+            light: The light.
+            spp: Camera samples per row.
+            rays: Paths that share one camera sample.
+            lanes: Rows per pixel; the launch starts with a pixel's first.
+            depth: Surface interactions.
+            indirect_limit: Most radiance that one path may add behind its first vertex; 0 for no
+                limit. It takes the fireflies of light that a mirror throws onto a matte surface,
+                and with them some of that light.
+            seed: Base seed.
+            foreground: Radiance premultiplied by coverage, shape [row].
+            diffuse: The part of it that the first hit's diffuse lobe reflects, shape [row].
+            emission: The part of it that the first hit emits, shape [row].
+            coverage: Share of samples that see the object, shape [row].
+            light_record: Output: the weight of each direction that saw the light, or without
+                arrays.
+            vertex_record: Output: every vertex; ``material`` must come filled with -1. Or without
+                arrays.
+        """
+        if wp.static(not has_layers):
+            material.any_layers = 0
+        if wp.static(not has_place):
+            proxy.mesh = wp.uint64(0)
+        i = wp.tid()
+        pixel = pixels[i]
+        key = pixel_seed(seed, pixel)
+        scale = 1.0 / float(spp * rays * lanes)
+        before = (i % lanes) * spp
+        keep_dark = int(0)
+        if light_record.wi.shape[1] > 0 or vertex_record.material.shape[1] > 0:
+            keep_dark = 1
+        entries = int(0)
+        radiance = wp.vec3(0.0)
+        radiance_diffuse = wp.vec3(0.0)
+        radiance_emission = wp.vec3(0.0)
+        count = float(0.0)
+
+        # One loop over vertices rather than one over paths: a thread whose path has ended starts
+        # the next one at once instead of waiting for the longest path among its neighbours (1.5 x
+        # on CUDA).
+        index = int(0)
+        k = int(0)
+        alive = int(0)
+        first = Hit()
+        surface = Surface()
+        wo = wp.vec3(0.0)
+        throughput = wp.vec3(0.0)
+        throughput_diffuse = wp.vec3(0.0)
+        while index < spp * rays:
+            if alive == 0:
+                s = before + index // rays
+                ray_dir = camera_ray(camera, pixel, sobol_pair(s, key, 0))
+                if index % rays == 0:
+                    first = camera_hit(camera, mesh, material, texture, proxy, s, key, ray_dir)
+                    if first.valid == 1:
+                        count += 1.0
+                if first.valid == 0:
+                    index += rays
+                    continue
+                alive = 1
+                k = 0
+                wo = -ray_dir
+                surface = surface_at(mesh, material, texture, first, wo)
+                throughput = wp.vec3(1.0, 1.0, 1.0)
+                throughput_diffuse = wp.vec3(0.0)
+                radiance += surface.emission
+                radiance_emission += surface.emission
+                if vertex_record.material.shape[1] > 0:
+                    keep_surface(vertex_record, i, index, surface, wo)
+
+            is_last = int(0)
+            if k == depth - 1 and material.any_emission == 0:
+                is_last = 1
+            event = scatter(
+                mesh,
+                material,
+                texture,
+                proxy,
+                light,
+                surface,
+                wo,
+                is_last,
+                keep_dark,
+                before * rays + index,
+                key,
+                k,
+            )
             if vertex_record.material.shape[1] > 0:
-                keep_surface(vertex_record, i, index, surface, wo)
+                keep_event(vertex_record, i, k * spp * rays + index, event)
+            if light_record.wi.shape[1] > 0:
+                gain = wp.cw_mul(throughput, event.f_light) * (event.weight_light * scale)
+                entries += keep_direction(light_record, i, entries, event.wi_light, gain)
+                if event.from_place == 0:
+                    gain = wp.cw_mul(throughput, event.f_brdf) * (event.weight_brdf * scale)
+                    entries += keep_direction(light_record, i, entries, event.wi_brdf, gain)
+            if k == 0:
+                radiance += event.direct
+                radiance_diffuse += event.direct_diffuse
+                throughput_diffuse = event.throughput_diffuse
+            else:
+                gathered = wp.cw_mul(throughput, event.direct)
+                kept = limited(gathered, indirect_limit)
+                radiance += gathered * kept
+                radiance_diffuse += wp.cw_mul(throughput_diffuse, event.direct) * kept
+                throughput_diffuse = wp.cw_mul(throughput_diffuse, event.throughput)
+            k += 1
+            alive = event.next.valid
+            if alive == 1:
+                throughput = wp.cw_mul(throughput, event.throughput)
+                wo = -event.wi_brdf
+                surface = surface_at(mesh, material, texture, event.next, wo)
+                radiance += wp.cw_mul(throughput, surface.emission)
+                radiance_diffuse += wp.cw_mul(throughput_diffuse, surface.emission)
+                if vertex_record.material.shape[1] > 0:
+                    keep_surface(vertex_record, i, k * spp * rays + index, surface, wo)
+            if k == depth:
+                alive = 0
+            if alive == 0:
+                index += 1
 
-        is_last = int(0)
-        if k == depth - 1 and material.any_emission == 0:
-            is_last = 1
-        event = scatter(
-            mesh,
-            material,
-            texture,
-            proxy,
-            light,
-            surface,
-            wo,
-            is_last,
-            keep_dark,
-            before * rays + index,
-            key,
-            k,
-        )
-        if vertex_record.material.shape[1] > 0:
-            keep_event(vertex_record, i, k * spp * rays + index, event)
         if light_record.wi.shape[1] > 0:
-            gain = wp.cw_mul(throughput, event.f_light) * (event.weight_light * scale)
-            entries += keep_direction(light_record, i, entries, event.wi_light, gain)
-            if event.from_place == 0:
-                gain = wp.cw_mul(throughput, event.f_brdf) * (event.weight_brdf * scale)
-                entries += keep_direction(light_record, i, entries, event.wi_brdf, gain)
-        if k == 0:
-            radiance += event.direct
-            radiance_diffuse += event.direct_diffuse
-            throughput_diffuse = event.throughput_diffuse
-        else:
-            gathered = wp.cw_mul(throughput, event.direct)
-            kept = limited(gathered, indirect_limit)
-            radiance += gathered * kept
-            radiance_diffuse += wp.cw_mul(throughput_diffuse, event.direct) * kept
-            throughput_diffuse = wp.cw_mul(throughput_diffuse, event.throughput)
-        k += 1
-        alive = event.next.valid
-        if alive == 1:
-            throughput = wp.cw_mul(throughput, event.throughput)
-            wo = -event.wi_brdf
-            surface = surface_at(mesh, material, texture, event.next, wo)
-            radiance += wp.cw_mul(throughput, surface.emission)
-            radiance_diffuse += wp.cw_mul(throughput_diffuse, surface.emission)
-            if vertex_record.material.shape[1] > 0:
-                keep_surface(vertex_record, i, k * spp * rays + index, surface, wo)
-        if k == depth:
-            alive = 0
-        if alive == 0:
-            index += 1
+            light_record.count[i] = entries
+        foreground[i] = radiance * scale
+        diffuse[i] = radiance_diffuse * scale
+        emission[i] = radiance_emission * scale
+        coverage[i] = count / float(spp * lanes)
 
-    if light_record.wi.shape[1] > 0:
-        light_record.count[i] = entries
-    foreground[i] = radiance * scale
-    diffuse[i] = radiance_diffuse * scale
-    emission[i] = radiance_emission * scale
-    coverage[i] = count / float(spp * lanes)
+    return trace_foreground

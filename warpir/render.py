@@ -24,7 +24,7 @@ from warpir.curves import ToneKnots
 from warpir.errors import ExitCode, InputError
 from warpir.image_decoder import captured_stderr
 from warpir.kernels.composite import tone_foreground, tone_shadow
-from warpir.kernels.path import trace_foreground
+from warpir.kernels.path import foreground_kernel
 from warpir.kernels.proxy import trace_proxy
 from warpir.kernels.shadow_ratio import shadow_ratio
 from warpir.kernels.trace import trace_gbuffer
@@ -408,8 +408,11 @@ class Renderer:
             wp.zeros(max(count, 1), dtype=wp.vec3, device=self.device) for _ in range(3)
         )
         mask = wp.zeros(max(count, 1), dtype=float, device=self.device)
+        kernel = foreground_kernel(
+            bool(scene.material_args.any_layers), bool(scene.proxy_args.mesh)
+        )
         self.launch(
-            trace_foreground,
+            kernel,
             count,
             [
                 Rows(self._array(np.repeat(pixels, lanes), wp.int32)),
