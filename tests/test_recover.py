@@ -16,7 +16,7 @@ import numpy as np
 import pytest
 from safetensors.torch import load_file, save_file
 
-from tests.test_insert import ALWAYS, arguments, digest, write_inputs
+from tests.test_insert import ALWAYS, DETAIL, arguments, digest, write_inputs
 from tests.tiny_stable_diffusion import make_tiny_stable_diffusion
 from warpir.config import InsertConfig
 from warpir.curves import Curves
@@ -94,7 +94,7 @@ def record(out: Path) -> dict[str, Any]:
 
 
 def test_guided_run_writes_every_file_and_says_who_spoke(finished: Path) -> None:
-    assert {p.name for p in finished.iterdir()} == {*ALWAYS, *GUIDED, "run.json"}
+    assert {p.name for p in finished.iterdir()} == {*ALWAYS, *DETAIL, *GUIDED, "run.json"}
     run = record(finished)
     measured = run["measured"]
     assert measured["prior"] == "stable-diffusion" and measured["loop_integrator"] == "transport"

@@ -12,6 +12,8 @@ import os
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
+from functools import cache
+from itertools import product
 from typing import Any
 
 import numpy as np
@@ -223,6 +225,20 @@ class ProxyRadiance:
     """Without it, shape [proxy_pixel, 3]."""
 
 
+@cache
+def settle_hashes(is_cpu: bool) -> None:
+    """Compute the hashes that Warp finds compiled modules by, before any is compiled.
+
+    Modules share functions, and building one changes what Warp 1.19 hashes of the next: without
+    this a second run finds the first run's module under another hash and compiles it again (26 s
+    on an H200).
+    """
+    kernels = [trace_gbuffer, trace_proxy, shadow_ratio, tone_foreground]
+    kernels += [foreground_kernel(*flags) for flags in product((False, True), repeat=2)]
+    for kernel in kernels:
+        kernel.module.get_module_hash(1 if is_cpu else None)
+
+
 class Renderer:
     """Launches the kernels over one scene.
 
@@ -240,6 +256,7 @@ class Renderer:
     ) -> None:
         self.scene = scene
         self.device = scene.device
+        settle_hashes(bool(self.device.is_cpu))
         self.threads = threads or default_threads()
         self._progress = progress or (lambda stage, share: None)
 
