@@ -111,14 +111,20 @@ WRONG_CLOUDS = {
     "two": (b"1 2 3\n\n1 2\n", "line 3: not a point"),
     "nan": (b"1 2 nan\n", "line 1: not a point"),
     "decimal-comma": (b"1,5;2,5;3,5\n", "line 1: not a point"),
-    "cut": (LITTLE[: -13 - 20], "truncated"),
-    "cut-text": (b"\n".join(ply("ascii", POINTS).split(b"\n")[:13]) + b"\n", "truncated"),
+    "cut": (LITTLE[: -13 - 20], "ends within its 4 vertex"),
+    "cut-text": (
+        b"\n".join(ply("ascii", POINTS).split(b"\n")[:13]) + b"\n",
+        "ends within its 4 vertex",
+    ),
     "no-end": (LITTLE[:60], "no end"),
     "no-x": (ply("ascii", POINTS, **{"float x": "float u"}), "with x, y, z"),
-    "list": (ply("ascii", POINTS, **{"uchar red": "list uchar int red"}), "line 5"),
+    "list": (
+        ply("ascii", POINTS, **{"uchar red": "list uchar int red"}),
+        "ends within its 4 vertex",
+    ),
     "form": (ply("ascii", POINTS, ascii="utf"), "line 2"),
     "late-nan": (ply("binary_big_endian", np.where(POINTS == 5.0, np.nan, POINTS)), "1 of 4"),
-    "count": (LITTLE.replace(b"vertex 4", b"vertex 99999999999"), "truncated"),
+    "count": (LITTLE.replace(b"vertex 4", b"vertex 99999999999"), "line 4"),
     "png": (b"\x89PNG\r\n\x1a\n" + bytes(99), "line 1"),
 }
 
