@@ -11,7 +11,7 @@ from PIL import Image
 
 from tests.image_files import matrix_profile, write_image
 from tests.test_insert import Run, arguments, go, inputs, read_image, read_layers, rgb, write_photo
-from warpir.camera import read_camera
+from warpir.camera_files import read_camera
 from warpir.envmap_conventions import from_ours
 from warpir.errors import ExitCode
 from warpir.insert import main
