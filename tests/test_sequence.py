@@ -270,7 +270,7 @@ def test_line_replaces_what_excludes_it(inputs: Path, first: Run, tmp_path: Path
     assert configs[2].pitch is None and configs[2].fov == 60.0
     assert configs[3].fov == 50.0 and configs[3].pitch == -15.0 and configs[3].scale is None
     inside = [pair for pair in EXCLUSIVE if set(pair) <= set(FRAME_FIELDS)]
-    assert len(inside) == 7
+    assert len(inside) == 8
 
 
 @pytest.mark.parametrize(
