@@ -14,6 +14,7 @@ from benchmarks import furnace, referee  # isort: skip  (sets Mitsuba's variant)
 import drjit as dr
 import mitsuba as mi
 
+from warpir import mitsuba_render
 from warpir.asset import Asset, Material, Primitive, Texture, TextureSlot
 from warpir.camera import Camera
 from warpir.mitsuba_light import LatlongEmitter
@@ -313,7 +314,7 @@ def check_energy() -> None:
     cases = ((0.2, 0.0), (0.7, 0.0), (1.0, 1.0), (0.0, 1.0))
     for seed, (roughness, metallic) in enumerate(cases):
         asset = sphere(Material(metallic=metallic, roughness=roughness), rings=256)
-        found = referee.foreground(asset, np.eye(4), camera, texels, 1, 512, seed)
+        found = mitsuba_render.foreground(asset, np.eye(4), camera, texels, 1, 512, seed)
         # Angle at the centre of each pixel well inside the disc; E is smooth there
         x = (columns + 0.5 - camera.cx) / camera.fx
         y = (rows + 0.5 - camera.cy) / camera.fy
@@ -348,7 +349,7 @@ def check_lambert() -> None:
     asset = sphere(Material())
     camera = view(6.0)
     texels = np.ones((8, 16, 3), dtype=np.float32)
-    setup = referee.build(asset, np.eye(4), camera, texels, 1)
+    setup = mitsuba_render.build(asset, np.eye(4), camera, texels, 1)
     stock = mi.load_dict(
         {
             "type": "scene",
@@ -387,8 +388,8 @@ def check_stock_integrators(rng: np.random.Generator) -> None:
     asset = replace(ball, primitives=(part, other))
     camera = view(7.0, width=24, height=16, fov=35.0)
     for depth in (1, 4):
-        found = referee.foreground(asset, np.eye(4), camera, texels, depth, 1024, 5)
-        setup = referee.build(asset, np.eye(4), camera, texels, depth)
+        found = mitsuba_render.foreground(asset, np.eye(4), camera, texels, depth, 1024, 5)
+        setup = mitsuba_render.build(asset, np.eye(4), camera, texels, depth)
         for name in ("path", "prb"):
             stock = mi.load_dict(
                 {"type": name, "max_depth": depth + 1, "rr_depth": 1000, "hide_emitters": True}
@@ -419,9 +420,9 @@ def check_stock_integrators(rng: np.random.Generator) -> None:
 def check_gradient(asset: Asset, camera: Camera, rng: np.random.Generator, depth: int) -> None:
     """Satisfy the adjoint identity and agree with Mitsuba's `prb` up to both noises."""
     texels = rng.exponential(size=(8, 16, 3)).astype(np.float32)
-    found = referee.foreground(asset, np.eye(4), camera, texels, depth, 1024, 5)
+    found = mitsuba_render.foreground(asset, np.eye(4), camera, texels, depth, 1024, 5)
     d_image = rng.normal(size=found.mean.shape) + 1.0
-    setup = referee.build(asset, np.eye(4), camera, texels, depth)
+    setup = mitsuba_render.build(asset, np.eye(4), camera, texels, depth)
     parameters = mi.traverse(setup.scene)
     dr.enable_grad(parameters["light.texels"])
     parameters.update()
@@ -472,7 +473,7 @@ def check_coverage() -> None:
         ("double-sided from behind", Material(double_sided=True), 180.0, 1.0),
     ):
         asset = square(material, 2.0, 0.0, up=True)
-        found = referee.foreground(
+        found = mitsuba_render.foreground(
             asset, np.eye(4), view(6.0, fov=8.0, turn=turn), texels, 2, 256, 1
         )
         report(
@@ -483,7 +484,7 @@ def check_coverage() -> None:
         )
     # Emission is seen by the camera and by a bounce; the mask hides the rest
     glow = Material(base_color=(0.0,) * 3, roughness=1.0, emission=(2.0, 1.0, 0.5))
-    found = referee.foreground(
+    found = mitsuba_render.foreground(
         square(glow, 2.0, 0.0, up=True), np.eye(4), camera, np.zeros_like(texels), 1, 16, 1
     )
     report("emission: seen by the camera, green", found.mean[..., 1].mean(), 1.0, 1e-6)
@@ -510,14 +511,14 @@ def check_shadow() -> None:
         ("opaque, single-sided from below", Material(), 1.0 - factor),
         ("blend, alpha 0.5", Material(alpha=0.5, alpha_mode="BLEND"), 1.0 - 0.5 * factor),
     ):
-        found = referee.shadow(
+        found = mitsuba_render.shadow(
             square(material, 2.0 * half, height), np.eye(4), camera, texels, 4096, 2
         )
         error = float(np.sqrt(found.lit_variance[..., 0].sum())) / 64.0
         report(f"shadow: unoccluded white plane, {name}", found.unoccluded.mean(), 1.0, 1e-3)
         report(f"shadow: square above the plane, {name}", found.lit[..., 0].mean(), expected, error)
         report("shadow: share of samples that see the plane", found.seen.mean(), 1.0, 1e-9)
-    far = referee.shadow(square(Material(), 1e-3, 40.0), np.eye(4), camera, texels, 64, 2)
+    far = mitsuba_render.shadow(square(Material(), 1e-3, 40.0), np.eye(4), camera, texels, 64, 2)
     report(
         "shadow: ratio is exactly 1 far from the object",
         np.abs(far.lit / far.unoccluded - 1.0).max(),
