@@ -224,7 +224,8 @@ def _reached(points: Float64Array, light: Light, inputs: Inputs) -> Float64Array
         reached = np.isinf(free).mean(axis=0)
     if inputs.shadow_mask is not None:
         shares = values_at(inputs.shadow_mask.shares, points, inputs.camera)
-        reached = reached * (1.0 - np.nan_to_num(shares))
+        # Nothing is known of the ground outside the photo: it counts as lit.
+        reached = reached * (1.0 - np.where(np.isnan(shares), 0.0, shares))
     return reached
 
 
