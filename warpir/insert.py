@@ -221,8 +221,10 @@ def _detailed(
     config: InsertConfig, inputs: "Inputs", light: "SceneLight", timings: "Timings"
 ) -> "tuple[SceneLight, dict[str, Any]]":
     """Put into the light what the photo shows of it, unless a panorama has its own detail."""
-    is_panorama = config.light is not None and light.light.lobes is None
-    if not config.detail or is_panorama:
+    has_own = config.light is not None and light.light.lobes is None
+    if inputs.run is not None:  # lit by what an earlier run was lit by, with or without
+        has_own = not Path(inputs.run.path, "envmap_detail.exr").exists()
+    if not config.detail or has_own:
         return light, {}
     with timings.stage("detail"):
         from warpir.detail import detail_of, with_detail
