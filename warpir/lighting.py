@@ -32,8 +32,6 @@ LIT_PERCENTILE = 75.0
 """The brighter quarter of the ground round the object stands for ground that is not in shadow."""
 LIT_SHARE = 0.1
 """Share of that ground which must be known to be out of shadow to be measured alone [1]."""
-
-
 SEEN = 0.99
 """A point counts as seen when the camera's ray gets this share of the way to it [1]."""
 
