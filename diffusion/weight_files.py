@@ -1,0 +1,347 @@
+"""The files of weights, checked by themselves: no torch, no network, seconds before either.
+
+What is read here is what a safetensors file says of itself: its header, whose lengths and offsets
+the library checks against the file, and the values of the small networks that we ship. Whether
+weights fit a network that was built of them is checked again when they are loaded.
+"""
+
+import hashlib
+import json
+import re
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from safetensors import SafetensorError, safe_open
+
+from warpir.diffusion.model_error import ModelError
+
+SHIPPED = Path(__file__).parent / "weights"
+"""Folder of the weights that are part of the package."""
+PRIOR_KEY = "warpir_prior"
+"""Where a file's header describes the embedded prior that it holds."""
+PRIOR_FORMAT = 2
+REGRESSOR_FORMAT = "warpir-regressor-1"
+Sizes = Mapping[str, tuple[int, int, type, float, float]]
+PRIOR_SIZES: Sizes = {
+    "widths": (1, 8, int, 1, 4096),
+    "layers": (1, 1, int, 1, 64),
+    "attention_from": (1, 1, int, 0, 8),
+    "head_width": (1, 1, int, 1, 4096),
+    "groups": (1, 1, int, 1, 4096),
+    "embedding_width": (1, 1, int, 1, 65_536),
+}
+"""Of each field of a `warpir.diffusion.embedded.NetworkConfig`: the least and the greatest count of
+numbers, their kind, and the least and the greatest number."""
+REGRESSOR_SIZES: Sizes = {
+    "channels": (3, 3, int, 8, 512),
+    "blocks": (2, 2, int, 0, 16),
+    "depth": (1, 1, int, 0, 16),
+    "heads": (1, 1, int, 1, 64),
+    "directions": (1, 1, int, 8, 10_000),
+    "dropout": (1, 1, float, 0, 0.99),
+    "skipped": (1, 1, float, 0, 0.99),
+}
+"""The same of a `warpir.regressor.RegressorConfig`."""
+
+EXPONENTS = {
+    "F16": ("<u2", 0x7C00),
+    "BF16": ("<u2", 0x7F80),
+    "F32": ("<u4", 0x7F80_0000),
+    "F64": ("<u8", 0x7FF0_0000_0000_0000),
+}
+"""How a kind of number is stored, and the bits that are all set where it is NaN or infinite."""
+
+_LORA_PART = re.compile(r"(.*?)[._]lora(?:_linear_layer)?[._](down|up|A|B)(?:\.weight)?")
+_FOR_TEXT = ("text_encoder", "lora_te_", "lora_te1_", "lora_te2_")
+"""How the names of a LoRA begin that adapts a text encoder."""
+
+
+@dataclass(frozen=True)
+class WeightFile:
+    """What the header of a safetensors file says."""
+
+    path: Path
+    about: dict[str, str]
+    """Texts beside the tensors."""
+    shapes: dict[str, tuple[int, ...]]
+    """Shape of each tensor by name."""
+    kinds: dict[str, str]
+    """Kind of number of each: ``F16``, ``BF16``, ``F32``, ``I64`` and so on."""
+
+
+def read_header(path: Path) -> WeightFile:
+    """Read the header of a safetensors file.
+
+    Raises:
+        ModelError: It is not there, or not a whole safetensors file.
+    """
+    if path.is_dir():
+        raise ModelError(str(path), "is a folder (expected a safetensors file)")
+    if not path.is_file():
+        what = "not a regular file" if path.exists() else "no such file"
+        raise ModelError(str(path), f"{what} (expected a safetensors file)")
+    try:
+        with safe_open(path, framework="np") as content:
+            slices = {name: content.get_slice(name) for name in content.keys()}
+            return WeightFile(
+                path,
+                dict(content.metadata() or {}),
+                {name: tuple(part.get_shape()) for name, part in slices.items()},
+                {name: part.get_dtype() for name, part in slices.items()},
+            )
+    except (SafetensorError, OSError, RuntimeError, ValueError) as error:
+        raise ModelError(str(path), *fault_of(path)) from error
+
+
+POINTER = ("a Git LFS pointer, not the file itself", "run `git lfs pull` in its folder")
+
+
+def is_pointer(start: bytes) -> bool:
+    """Return whether a file that starts so is what git leaves in place of a large one."""
+    return start.startswith(b"version https://git-lfs")
+
+
+def fault_of(path: Path) -> tuple[str, str]:
+    """Return what is wrong with a file that is not safetensors, and what to do."""
+    try:
+        with path.open("rb") as file:
+            start = file.read(64)
+    except OSError as error:
+        return f"cannot be read ({error.strerror})", ""
+    if start.startswith((b"PK\x03\x04", b"\x80")):
+        what = "is a pickle, which may run code (expected a safetensors file)"
+        return what, "convert it with the program that made it"
+    if is_pointer(start):
+        return POINTER
+    if not start:
+        return "an empty file (expected a safetensors file)", "fetch or write it again"
+    return "not a whole safetensors file (cut or damaged)", ""
+
+
+def check_prior(path: Path | None) -> int:
+    """Check the weights of the embedded prior.
+
+    Args:
+        path: The file; None: the one that is part of the package.
+
+    Returns:
+        The width of its prompts' embeddings.
+
+    Raises:
+        ModelError: Not there, damaged, or something else.
+    """
+    shipped = SHIPPED / "prior.safetensors"
+    if path is None and not shipped.is_file():
+        what = "the embedded prior's weights are not in this installation"
+        raise ModelError(str(shipped), what, "name some by --prior, or leave --steps out")
+    file = read_header(path or shipped)
+    where = str(file.path)
+    if PRIOR_KEY not in file.about:
+        raise ModelError(where, f"holds no embedded prior (no {PRIOR_KEY} in its header)")
+    described = _object(where, file.about[PRIOR_KEY])
+    if described.get("format") != PRIOR_FORMAT:
+        what = f"format {described.get('format')!r:.40} (expected {PRIOR_FORMAT})"
+        raise ModelError(where, what, "fetch the weights of this version of warpir")
+    network = described.get("network")
+    if not isinstance(network, dict):
+        raise ModelError(where, "its header is damaged (network)")
+    _check_sizes(where, network, PRIOR_SIZES)
+    if any(width % network["groups"] for width in network["widths"]):
+        what = f"network: widths {network['widths']} in {network['groups']} groups"
+        raise ModelError(where, f"{what} (expected multiples)")
+    values = _finite_values(file)
+    if values_hash(values) != described.get("weights"):
+        raise ModelError(where, "damaged (its weights are not those that were written)")
+    if path is not None and shipped.is_file():
+        ours = read_header(shipped)
+        if _object(str(shipped), ours.about[PRIOR_KEY])["network"] == network:
+            _check_shapes(file, ours)
+    return int(network["embedding_width"])
+
+
+def check_regressor(path: Path | None) -> WeightFile:
+    """Check the weights of the light regressor.
+
+    Args:
+        path: The file; None: the one that is part of the package.
+
+    Returns:
+        Its header; ``config`` in it is a JSON object whose numbers are within their ranges.
+
+    Raises:
+        ModelError: Not there, damaged, or something else.
+    """
+    shipped = SHIPPED / "regressor.safetensors"
+    file = read_header(path or shipped)
+    where = str(file.path)
+    if file.about.get("format") != REGRESSOR_FORMAT:
+        found = str(file.about.get("format"))[:40]
+        what = f"no weights of the light regressor (found {found!r})"
+        raise ModelError(where, what, f"expected {REGRESSOR_FORMAT!r}")
+    config = _object(where, file.about.get("config", ""))
+    _object(where, file.about.get("record", ""))
+    _check_sizes(where, config, REGRESSOR_SIZES)
+    if any(width % 8 for width in config["channels"]) or config["channels"][2] % config["heads"]:
+        what = f"network: channels {config['channels']} of {config['heads']} heads"
+        raise ModelError(where, f"{what} (expected multiples of 8, the last of the heads too)")
+    values = _finite_values(file)
+    if values_hash(values, file.about["config"]) != file.about.get("weights"):
+        raise ModelError(where, "damaged (its weights are not those that were written)")
+    if path is not None and shipped.is_file():
+        ours = read_header(shipped)
+        if _object(str(shipped), ours.about["config"]) == config:
+            _check_shapes(file, ours)
+    temperature, directions = (values.get(name) for name in ("temperature", "directions"))
+    if temperature is None or temperature.shape != () or not temperature > 0.0:
+        raise ModelError(where, "temperature: not a number above 0")
+    length = None if directions is None else np.linalg.norm(directions, axis=-1)
+    if length is None or not np.allclose(length, 1.0, atol=1e-3):
+        raise ModelError(where, "directions: not of length 1")
+    return file
+
+
+def _check_sizes(where: str, config: Mapping[str, Any], sizes: Sizes) -> None:
+    """Check what a header says of its network, before one is built.
+
+    Raises:
+        ModelError: A number is missing, too many, or out of range.
+    """
+    if set(config) != set(sizes):
+        raise ModelError(where, "its header is damaged (other sizes of a network than expected)")
+    for name, (fewest, most, kind, low, high) in sizes.items():
+        numbers = config[name] if isinstance(config[name], list) else [config[name]]
+        if not fewest <= len(numbers) <= most or any(
+            type(number) not in (int, kind) or not low <= number <= high for number in numbers
+        ):
+            count = f"{fewest} to {most}" if fewest < most else f"{fewest}"
+            expected = f"{count} number{'s' * (most > 1)} from {low} to {high}"
+            raise ModelError(where, f"network: {name} {numbers!r:.60} (expected {expected})")
+
+
+def check_lora(path: Path, embedding_width: int | None) -> None:
+    """Check by its names and shapes that a file holds a LoRA of a UNet, and of this base model.
+
+    Args:
+        path: The file, with keys of diffusers, kohya or peft.
+        embedding_width: Channels of the base model's prompts; None: it is not known yet.
+
+    Raises:
+        ModelError: Damaged, something else, of rank 0, or made for another base.
+    """
+    file = read_header(path)
+    where = str(path)
+    named = {key.removeprefix("base_model.model."): s for key, s in file.shapes.items()}
+    if any(key.startswith(_FOR_TEXT) for key in named):
+        what = "adapts the text encoder too, which stays as it is here"
+        raise ModelError(where, what, "give a LoRA of the UNet alone")
+    layers: dict[str, dict[str, tuple[int, ...]]] = {}
+    odd = []
+    for key, shape in named.items():
+        if (found := _LORA_PART.fullmatch(key)) is not None:
+            part = {"down": "A", "up": "B"}.get(found[2], found[2])
+            layers.setdefault(found[1], {})[part] = shape
+        elif not key.endswith(".alpha"):
+            odd.append(key)
+    if odd or not layers:
+        raise not_a_lora(path, odd, len(named))
+    for layer, parts in layers.items():
+        if set(parts) != {"A", "B"}:
+            what = f"{layer}: only one of its two parts is there; the file is not whole"
+            raise ModelError(where, what)
+        a, b = parts["A"], parts["B"]
+        if len(a) not in (2, 4) or len(a) != len(b) or a[0] != b[1]:
+            what = f"{layer}: its parts do not fit (found {list(a)}, {list(b)}; expected [r, i], "
+            raise ModelError(where, f"{what}[o, r])")
+        if a[0] == 0:
+            raise ModelError(where, f"{layer}: rank 0 (expected at least 1)")
+        is_cross = re.search(r"attn2[._](?:processor\.)?to_[kv]$", layer) is not None
+        if is_cross and embedding_width not in (None, a[1]):
+            what = f"made for another base model (found cross-attention {a[1]}; expected "
+            advice = "give a LoRA that was trained on this model"
+            raise ModelError(where, f"{what}{embedding_width})", advice)
+    _check_finite(file)
+
+
+def not_a_lora(path: Path, odd: list[str], count: int) -> ModelError:
+    """Return the error for a file with `count` keys, of which `odd` are no LoRA's."""
+    found = f"{len(odd)} of {count} keys are foreign, such as {odd[0]!r:.80}" if odd else "no keys"
+    what = f"not a LoRA of a UNet (found {found}; expected diffusers, kohya or peft keys)"
+    return ModelError(str(path), what)
+
+
+def values_hash(values: Mapping[str, NDArray[Any]], about: str = "") -> str:
+    """Return the sha256 of weights as they are written: names and values in order.
+
+    Args:
+        values: In the kind of number of the file.
+        about: A text of the header that the weights mean nothing without.
+    """
+    digest = hashlib.sha256(about.encode())
+    for name in sorted(values):
+        digest.update(name.encode())
+        digest.update(np.ascontiguousarray(values[name]).tobytes())
+    return digest.hexdigest()
+
+
+def _finite_values(file: WeightFile) -> dict[str, NDArray[Any]]:
+    """Return the values of a small file by name.
+
+    Raises:
+        ModelError: Some are not numbers, or not finite.
+    """
+    _check_finite(file)
+    values: dict[str, NDArray[Any]] = {}
+    try:
+        with safe_open(file.path, framework="np") as content:
+            for name in file.shapes:
+                values[name] = content.get_tensor(name)
+    except (SafetensorError, OSError, RuntimeError, TypeError, ValueError) as error:
+        raise ModelError(str(file.path), *fault_of(file.path)) from error
+    for name, value in values.items():
+        if value.dtype.kind != "f":
+            raise ModelError(str(file.path), f"{name}: values are not finite numbers")
+    return values
+
+
+def _check_finite(file: WeightFile) -> None:
+    """Check the values of a small file, in any kind of number that weights have.
+
+    Raises:
+        ModelError: Some are NaN or infinite.
+    """
+    content = np.memmap(file.path, np.uint8, mode="r")
+    start = 8 + int.from_bytes(content[:8].tobytes(), "little")
+    header = json.loads(content[8:start].tobytes())
+    for name, kind in file.kinds.items():
+        if kind in EXPONENTS:
+            stored, bits = EXPONENTS[kind]
+            first, last = header[name]["data_offsets"]
+            values = content[start + first : start + last].view(stored)
+            mask = np.array(bits, stored)
+            if bool(((values & mask) == mask).any()):
+                raise ModelError(str(file.path), f"{name}: values are not finite numbers")
+
+
+def _check_shapes(file: WeightFile, ours: WeightFile) -> None:
+    """Check names and shapes against those of the file that we ship for the same network."""
+    names: Iterable[str] = sorted({*file.shapes, *ours.shapes})
+    for name in names:
+        found, expected = file.shapes.get(name), ours.shapes.get(name)
+        if found != expected:
+            what = f"{name}: shape {found} (expected {expected})"
+            raise ModelError(str(file.path), f"the weights do not fit the network; {what}")
+
+
+def _object(where: str, text: str) -> dict[str, Any]:
+    """Return a JSON object of the header."""
+    try:
+        content = json.loads(text)
+    except (ValueError, RecursionError) as error:
+        raise ModelError(where, "its header is damaged (not JSON)") from error
+    if not isinstance(content, dict):
+        raise ModelError(where, "its header is damaged (not a JSON object)")
+    return content
