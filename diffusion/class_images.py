@@ -10,10 +10,10 @@ from __future__ import annotations
 import contextlib
 import hashlib
 import io
-import logging
 import os
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -22,9 +22,10 @@ import torch
 from PIL import Image, PngImagePlugin
 from torch import Tensor
 
-from warpir.diffusion.cache import content_key, make_room, model_key, write_file
+from warpir.atomic import write_file
+from warpir.caches import CACHE_BYTES, make_room
+from warpir.diffusion.cache import content_key, model_key
 from warpir.diffusion.draws import seed_of
-from warpir.diffusion.prior import ModelError
 from warpir.diffusion.prompts import Prompts, draw_class_prompts
 from warpir.diffusion.settings import PersonalizeSettings
 
@@ -38,8 +39,6 @@ COUNT_OUTDOORS, COUNT_INDOORS = 200, 40
 
 Report = Callable[[str, int, int], None]
 """Is told a stage, the steps done and the steps in all."""
-
-log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True)
@@ -85,7 +84,8 @@ def make_class_images(
         report: Is told "class images", the number there is, and the number wanted.
 
     Raises:
-        ModelError: A picture is not finite, or the text encoder was freed.
+        NonFiniteError: A picture is not finite, in fp32 neither.
+        ModelError: The text encoder was freed.
     """
     count = class_image_count(settings)
     texts = draw_class_prompts(prompts.noun, count, seed)
@@ -105,7 +105,6 @@ def make_class_images(
             found = _read_png(file, side) if file and file.is_file() else None
         except Exception as error:  # Pillow says in a dozen ways that a file is damaged
             notices.append(f"{file}: not readable, made again ({error})")
-            log.warning("%s", notices[-1])
             found = None
         if found is None:
             missing.add(index)
@@ -121,14 +120,17 @@ def make_class_images(
         wanted = [index for index in batch if index in missing]
         if not wanted:
             continue
-        made = prior.sample(
-            [texts[index] for index in batch],
-            [seeds[index] for index in batch],
-            steps=settings.class_steps,
-            scale=settings.class_scale,
-            batch=settings.class_batch,
-        )
-        pictures = to_bytes(made)
+
+        def made(batch: range = batch) -> Tensor:
+            return prior.sample(
+                [texts[index] for index in batch],
+                [seeds[index] for index in batch],
+                steps=settings.class_steps,
+                scale=settings.class_scale,
+                batch=settings.class_batch,
+            )
+
+        pictures = to_bytes(prior.finite(made, "pictures of the class"))
         for index in wanted:
             images[index] = picture = pictures[index - start]
             file = files[index]
@@ -138,27 +140,18 @@ def make_class_images(
                 write_file(file, _png(picture, texts[index], seeds[index]))
             except OSError as error:  # without a cache the run still ends as it would have
                 notices.append(f"{cache}: class images are not kept ({error})")
-                log.warning("%s", notices[-1])
                 cache = None
         done += len(wanted)
         if report:
             report("class images", done, count)
     if cache is not None and missing:
         with contextlib.suppress(OSError):  # a folder that is too full harms no run
-            make_room(cache, "*.png")
+            make_room(cache.glob("*.png"), CACHE_BYTES)
     return ClassImages(images, texts, seeds, len(missing), tuple(notices))
 
 
 def to_bytes(pictures: Tensor) -> Tensor:
-    """Round pictures in [0, 1] to uint8 on the CPU.
-
-    Raises:
-        ModelError: A value is not finite, as when half precision overflows.
-    """
-    if not bool(torch.isfinite(pictures).all()):
-        raise ModelError(
-            "model", "its pictures are not finite (found nan or inf)", "try --precision fp32"
-        )
+    """Round finite pictures in [0, 1] to uint8 on the CPU."""
     return (pictures.detach().float().clamp(0.0, 1.0) * 255.0).round().to("cpu", torch.uint8)
 
 
@@ -182,7 +175,7 @@ def encode_pictures(
     with torch.no_grad():
         for start in range(0, len(pictures), batch):
             part = from_bytes(pictures[start : start + batch], prior.device)
-            latents.append(prior.encode(part).cpu())
+            latents.append(prior.finite(partial(prior.encode, part), "latents").cpu())
             if report:
                 report("class latents", start + len(part), len(pictures))
     return torch.cat(latents)

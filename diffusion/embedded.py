@@ -29,13 +29,16 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
-from warpir.diffusion.cache import write_file
+from warpir.atomic import write_file
 from warpir.diffusion.lora_files import read_safetensors, serialize
+from warpir.diffusion.model_error import ModelError
 from warpir.diffusion.network_prior import NetworkPrior
-from warpir.diffusion.prior import ModelError
 from warpir.diffusion.prompts import Prompts, make_prompts
 from warpir.diffusion.schedule import NoiseSchedule
 from warpir.diffusion.settings import PersonalizeSettings
+from warpir.diffusion.weight_files import PRIOR_FORMAT as FORMAT
+from warpir.diffusion.weight_files import PRIOR_KEY as HEADER_KEY
+from warpir.diffusion.weight_files import SHIPPED, values_hash
 
 if TYPE_CHECKING:
     from diffusers import UNet2DConditionModel
@@ -43,11 +46,8 @@ if TYPE_CHECKING:
 RESOLUTION = 64
 """Side of a crop [px]."""
 TIMESTEPS = 1000
-WEIGHTS = Path(__file__).parent / "weights" / "prior.safetensors"
+WEIGHTS = SHIPPED / "prior.safetensors"
 """The weights that are part of the package."""
-HEADER_KEY = "warpir_prior"
-"""Where a file's header describes its weights."""
-FORMAT = 2
 
 # What LoRAs adapt here: guidance.md's choice for a small network that is new to photographs.
 LORA_RANK = 8
@@ -543,10 +543,10 @@ def read_network(path: Path) -> tuple[EmbeddedNetwork, dict[str, Any]]:
             raise ModelError(str(path), what, "fetch the weights of this version of warpir")
         config = config_of(described["network"])
         words, digest = tuple(described["vocabulary"]), str(described["weights"])
-        training = dict(described["training"])
-    except (ValueError, TypeError, KeyError) as error:
+        training, schedule = dict(described["training"]), described["schedule"]
+    except (ValueError, TypeError, KeyError, RecursionError) as error:
         raise ModelError(str(path), f"its header is damaged ({type(error).__name__})") from error
-    if words != VOCABULARY or described["schedule"] != "cosine":
+    if words != VOCABULARY or schedule != "cosine":
         what = "made for another vocabulary or schedule than this version of warpir has"
         raise ModelError(str(path), what, "fetch the weights of this version")
     if weight_hash(weights) != digest:
@@ -601,8 +601,4 @@ def network_of(config: NetworkConfig, weights: Mapping[str, Tensor], where: str)
 
 def weight_hash(weights: Mapping[str, Tensor]) -> str:
     """Return the sha256 of weights as they are written: names and fp16 values in order."""
-    digest = hashlib.sha256()
-    for name in sorted(weights):
-        digest.update(name.encode())
-        digest.update(weights[name].detach().cpu().half().contiguous().numpy().tobytes())
-    return digest.hexdigest()
+    return values_hash({name: v.detach().cpu().half().numpy() for name, v in weights.items()})

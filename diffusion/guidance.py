@@ -24,7 +24,15 @@ from torch import Tensor
 
 from warpir.diffusion.crop import Crop, box_of, draw_crop, shrink
 from warpir.diffusion.draws import generator_of, seed_of
-from warpir.diffusion.prior import Condition, Counts, ModelError, Prior
+from warpir.diffusion.model_error import ModelError
+from warpir.diffusion.prior import (
+    Condition,
+    Counts,
+    InChunks,
+    NonFiniteError,
+    Prior,
+    at_once,
+)
 from warpir.diffusion.schedule import time_range, weight
 from warpir.diffusion.settings import GuidanceSettings
 
@@ -44,10 +52,6 @@ CHECK_COUNT = 4
 """Crops, times and noises of a check of the precision."""
 VALUES_PER_LATENT = 48
 """Values of a picture for each of its latents: Stable Diffusion makes 4 of 8 x 8 x 3."""
-
-
-class NonFiniteError(Exception):
-    """No finite gradient in several steps in a row; the program says so and exits with 6."""
 
 
 class Guide(Protocol):
@@ -331,18 +335,42 @@ class Guidance:
         Raises:
             NonFiniteError: It is the fifth in a row.
         """
+        d_image = self._gradient(image, step)
+        if self._overflows(image, d_image):
+            d_image = self._gradient(image, step)
+        return self.gate.passed(d_image)
+
+    def _gradient(self, image: Tensor, step: int) -> Tensor:
+        """Return the gradient as it comes, of all noises at once or of halves."""
         s = self.settings
         low, high = time_range(step, self.steps, s.time_min, s.time_max, s.time_max_end)
-        generators = [generator_of(self.seed, step, k) for k in range(s.noises)]
-        t = torch.cat([low + (high - low) * torch.rand(1, generator=g) for g in generators])
-        leaf = image.detach().requires_grad_()
-        crops = self._noisy_crops(leaf, t, generators)
-        residual = crops.weight * self._delta(crops, self._predictions(crops)) / s.noises
-        # A half-precision autoencoder keeps its backward pass in range when the greatest residual
-        # is about 1; a power of two is taken out and put back without rounding.
-        scale = torch.exp2(torch.frexp(residual.abs().amax()).exponent.float())
-        (d_image,) = torch.autograd.grad(crops.latents, leaf, residual / scale)
-        return self.gate.passed(d_image * scale.to(d_image))
+
+        def of(first: int, last: int) -> Tensor:
+            generators = [generator_of(self.seed, step, k) for k in range(first, last)]
+            t = torch.cat([low + (high - low) * torch.rand(1, generator=g) for g in generators])
+            leaf = image.detach().requires_grad_()
+            crops = self._noisy_crops(leaf, t, generators)
+            residual = crops.weight * self._delta(crops, self._predictions(crops)) / s.noises
+            # A half-precision autoencoder keeps its backward pass in range when the greatest
+            # residual is about 1; a power of two is taken out and put back without rounding.
+            scale = torch.exp2(torch.frexp(residual.abs().amax()).exponent.float())
+            (d_image,) = torch.autograd.grad(crops.latents, leaf, residual / scale)
+            return d_image * scale.to(d_image)
+
+        in_chunks: InChunks = getattr(self.prior, "in_chunks", at_once)
+        spare = getattr(self.prior, "spare_memory", lambda: None)
+        parts = in_chunks(of, s.noises, "guidance", "--noises or --guidance-width", spare)
+        total = next(parts)
+        for part in parts:
+            total = total + part
+        return total
+
+    def _overflows(self, image: Tensor, d_image: Tensor) -> bool:
+        """Return whether half precision may have spoilt a gradient and was given up for fp32."""
+        upcast: Callable[[], bool] = getattr(self.prior, "upcast", lambda: False)
+        if bool(d_image.isfinite().all()) or not bool(image.isfinite().all()):
+            return False
+        return upcast()
 
     def with_loss(self, loss: str) -> Guidance:
         """Return the same guidance with another loss.
@@ -658,15 +686,20 @@ class DatasetUpdate:
     @torch.no_grad()
     def _edit(self, image: Tensor, crop: Crop, strength: float, *key: int | str) -> Tensor:
         """Return the edited crop, shape [1, 3, R, R]."""
-        return self.prior.edit(
-            crop.apply(image, self.prior.resolution).to(self.prior.device),
-            self.condition.prompt,
-            seed_of(*key, "edit"),
-            strength=strength,
-            steps=self.settings.update_steps,
-            scale=self.settings.update_scale,
-            adapter=self.adapter,
-        )
+
+        def edited(first: int, last: int) -> Tensor:
+            return self.prior.edit(
+                crop.apply(image, self.prior.resolution).to(self.prior.device),
+                self.condition.prompt,
+                seed_of(*key, "edit"),
+                strength=strength,
+                steps=self.settings.update_steps,
+                scale=self.settings.update_scale,
+                adapter=self.adapter,
+            )
+
+        in_chunks: InChunks = getattr(self.prior, "in_chunks", at_once)
+        return next(in_chunks(edited, 1, "an edit of the picture", "--precision"))
 
     def _distance(self, image: Tensor, crop: Crop, edited: Tensor) -> Tensor:
         difference = crop.apply(image, self.prior.resolution) - edited.to(image)

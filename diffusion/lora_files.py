@@ -30,9 +30,11 @@ from safetensors import SafetensorError, safe_open
 from safetensors.torch import save
 from torch import Tensor, nn
 
-from warpir.diffusion.cache import write_file
+from warpir.atomic import write_file
 from warpir.diffusion.draws import generator_of
-from warpir.diffusion.prior import ModelError
+from warpir.diffusion.model_error import ModelError
+from warpir.diffusion.model_folder import read_json
+from warpir.diffusion.weight_files import fault_of, not_a_lora, read_header
 
 if TYPE_CHECKING:
     from warpir.diffusion.network_prior import NetworkPrior
@@ -40,6 +42,7 @@ if TYPE_CHECKING:
 HEADER_KEY = "lora_adapter_metadata"
 """Where diffusers keeps peft's configuration in a file's header."""
 KOHYA = ("lora_unet_", "lora_te_", "lora_te1_", "lora_te2_")
+_LAYER_PATTERN = re.compile(r"\^?(?:[A-Za-z0-9_]|\\?[.-])+\$?")
 KOHYA_PARTS = (".lora_down.weight", ".lora_up.weight", ".alpha")
 
 
@@ -172,8 +175,9 @@ def read_lora(path: str | Path) -> Lora:
             raise ModelError(str(path), f"{layer}: rank 0 (expected at least 1)")
         try:
             alphas.setdefault(layer, _alpha(config, layer, rank=a.shape[0]))
-        except (TypeError, ValueError, AttributeError, re.error) as error:
-            raise ModelError(str(path), "its configuration is damaged (lora_alpha)") from error
+        except (TypeError, ValueError, AttributeError) as error:
+            what = "its configuration is damaged (lora_alpha, alpha_pattern)"
+            raise ModelError(str(path), what) from error
         if not math.isfinite(alphas[layer]):
             raise ModelError(str(path), f"{layer}: alpha is not finite (found {alphas[layer]})")
     if set(alphas) != set(layers):
@@ -186,46 +190,34 @@ def read_lora(path: str | Path) -> Lora:
 
 
 def read_safetensors(path: Path) -> tuple[dict[str, Tensor], dict[str, str]]:
-    """Return tensors and header of a safetensors file."""
-    if path.is_dir():
-        raise ModelError(str(path), "is a folder (expected a safetensors file)")
-    if not path.is_file():
-        raise ModelError(str(path), "no such file (expected a safetensors file)")
+    """Return tensors and what the header says of a safetensors file.
+
+    Raises:
+        ModelError: It is not there, or not a whole safetensors file.
+    """
+    header = read_header(path)
     try:
         with safe_open(path, framework="pt", device="cpu") as file:
-            header = dict(file.metadata() or {})
-            tensors = {key: file.get_tensor(key) for key in file.keys()}
+            return {key: file.get_tensor(key) for key in file.keys()}, header.about
     except (SafetensorError, OSError, RuntimeError) as error:
-        raise ModelError(str(path), *_fault(path)) from error
-    return tensors, header
-
-
-def _fault(path: Path) -> tuple[str, str]:
-    """Return what is wrong with a file that is not safetensors, and what to do."""
-    with path.open("rb") as file:
-        start = file.read(64)
-    if start.startswith((b"PK\x03\x04", b"\x80")):
-        what = "is a pickle, which may run code (expected a safetensors file)"
-        return what, "convert it with the program that made it"
-    if start.startswith(b"version https://git-lfs"):
-        return "is a pointer of Git LFS, not the file", "fetch the file with git lfs pull"
-    return "not a whole safetensors file (cut or damaged)", ""
+        raise ModelError(str(path), *fault_of(path)) from error
 
 
 def _own_config(path: Path, header: dict[str, str]) -> dict[str, Any]:
     """Return what the file itself says of its LoRA: peft's configuration, or nothing."""
     beside = path.with_name("adapter_config.json")
-    text, where = header.get(HEADER_KEY), f"{path}: {HEADER_KEY}"
-    if text is None and path.name == "adapter_model.safetensors" and beside.is_file():
-        text, where = beside.read_text(encoding="utf-8", errors="replace"), str(beside)
-    if text is None:
+    if HEADER_KEY in header:
+        where = f"{path}: {HEADER_KEY}"
+        try:
+            config = json.loads(header[HEADER_KEY])
+        except (ValueError, RecursionError) as error:
+            raise ModelError(where, "not JSON") from error
+        if not isinstance(config, dict):
+            raise ModelError(where, "not a JSON object")
+    elif path.name == "adapter_model.safetensors" and beside.is_file():
+        where, config = str(beside), read_json(beside)
+    else:
         return {}
-    try:
-        config = json.loads(text)
-    except json.JSONDecodeError as error:
-        raise ModelError(where, "not JSON") from error
-    if not isinstance(config, dict):
-        raise ModelError(where, "not a JSON object")
     config = {key.removeprefix("unet."): value for key, value in config.items()}
     for key in ("use_dora", "lora_bias", "modules_to_save", "trainable_token_indices"):
         if config.get(key):
@@ -234,15 +226,23 @@ def _own_config(path: Path, header: dict[str, str]) -> dict[str, Any]:
 
 
 def _alpha(config: Mapping[str, Any], layer: str, rank: int) -> float:
-    """Return a layer's alpha: what the configuration says, else the rank."""
-    from peft.utils.other import get_pattern_key
+    """Return a layer's alpha: what the configuration says, else the rank.
 
+    Raises:
+        ValueError: A key of ``alpha_pattern`` is more than the end of a layer's name: peft takes
+            it as a regular expression, which can be made never to end.
+    """
     if "lora_alpha" not in config:
         return float(rank)
-    patterns = config.get("alpha_pattern") or {}
-    alpha = float(patterns.get(get_pattern_key(list(patterns), layer), config["lora_alpha"]))
+    alpha = config["lora_alpha"]
+    for pattern, stated in reversed((config.get("alpha_pattern") or {}).items()):
+        if _LAYER_PATTERN.fullmatch(pattern) is None:
+            raise ValueError
+        name = pattern.replace("\\", "").removesuffix("$")
+        if layer == name.removeprefix("^") or layer.endswith(f".{name}"):
+            alpha = stated  # the first of them counts
     # Rank-stabilised LoRA divides by sqrt(rank) in place of the rank.
-    return alpha * math.sqrt(rank) if config.get("use_rslora") else alpha
+    return float(alpha) * (math.sqrt(rank) if config.get("use_rslora") else 1.0)
 
 
 def _parts(path: Path, tensors: dict[str, Tensor]) -> tuple[dict[str, Tensor], dict[str, float]]:
@@ -261,7 +261,7 @@ def _parts(path: Path, tensors: dict[str, Tensor]) -> tuple[dict[str, Tensor], d
     if any(key.startswith(KOHYA[0]) for key in named):
         odd = [k for k in named if not (k.startswith(KOHYA[0]) and k.endswith(KOHYA_PARTS))]
         if odd:
-            raise _foreign(path, odd, len(named))
+            raise not_a_lora(path, odd, len(named))
         alphas = {k: v for k, v in named.items() if k.endswith(".alpha")}
         try:
             named, alphas = StableDiffusionLoraLoaderMixin.lora_state_dict(dict(named))
@@ -278,20 +278,13 @@ def _parts(path: Path, tensors: dict[str, Tensor]) -> tuple[dict[str, Tensor], d
     weights = renamed(named)
     odd = [key for key in weights if not key.endswith((".lora_A.weight", ".lora_B.weight"))]
     if odd or not weights:
-        raise _foreign(path, odd, len(weights))
+        raise not_a_lora(path, odd, len(weights))
     # The converter calls an alpha after the part that stood beside it.
     by_layer = {
         key.removesuffix(".alpha").split(".lora_A")[0]: float(alpha)
         for key, alpha in renamed(alphas or {}).items()
     }
     return {key: weights[key].float().contiguous() for key in sorted(weights)}, by_layer
-
-
-def _foreign(path: Path, odd: list[str], count: int) -> ModelError:
-    found = f"{len(odd)} of {count} keys are foreign, such as {odd[0]!r}" if odd else "no keys"
-    return ModelError(
-        str(path), f"not a LoRA of a UNet (found {found}; expected diffusers, kohya or peft keys)"
-    )
 
 
 # Putting a LoRA beside a model's weights

@@ -1,7 +1,8 @@
 """Where a Stable Diffusion is, and whether its folder can be believed.
 
 Nothing of a model folder is run. Its parts must be of the classes of Stable Diffusion 1.5 and 2.x,
-its weights safetensors whose headers hold; every fault is one sentence that names the file.
+its files plain ones that lie in it, its weights safetensors whose headers hold and are those of the
+configurations; every fault is one sentence that names the file. torch is not loaded for it.
 """
 
 from __future__ import annotations
@@ -9,6 +10,7 @@ from __future__ import annotations
 import errno
 import hashlib
 import json
+import os
 import re
 from collections.abc import Collection, Iterator
 from contextlib import contextmanager
@@ -16,9 +18,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NoReturn
 
-from safetensors import SafetensorError, safe_open
-
-from warpir.diffusion.prior import ModelError
+from warpir.diffusion.model_error import ModelError
+from warpir.diffusion.settings import PREDICTION_TYPES
+from warpir.diffusion.weight_files import POINTER, is_pointer, read_header
 
 PIPELINE = "StableDiffusionPipeline"
 SCHEDULERS = (
@@ -62,13 +64,23 @@ WEIGHTS = {
     "text_encoder": "model",
 }
 """Parts with weights, and what their files are called."""
+PICKLED = {**WEIGHTS, "text_encoder": "pytorch_model"}
+"""The same of pickles, which end in ``.bin``."""
 VARIANTS = (None, "fp16")
 """Which file names are taken, the best first."""
 PICKLES = (".bin", ".ckpt", ".pt", ".pth")
 DTYPES = ("F16", "BF16", "F32", "F64")
 LATENT_CHANNELS = 4
+TEXTS = (".json", ".txt", ".jinja")
 JSON_LIMIT = 16 * 2**20
-"""Longest configuration or index that is read [byte]."""
+"""Longest configuration, index or vocabulary that is read [byte]."""
+TEXT_SIZES = {
+    "vocab_size": (49408, 2**20),
+    "max_position_embeddings": (77, 2**16),
+    "num_hidden_layers": (12, 128),
+    "intermediate_size": (2048, 2**16),
+}
+"""Sizes of a text encoder: what stands for an absent one in transformers, and the greatest."""
 HUB_ID = re.compile(r"[A-Za-z0-9][\w.-]*/[A-Za-z0-9][\w.-]*")
 WITHDRAWN = "the original Stable Diffusion 2 repositories were withdrawn in November 2025"
 ADVICE = (
@@ -82,9 +94,14 @@ class Weights:
     """The files of one part's weights."""
 
     files: tuple[Path, ...]
-    """One safetensors file, or its shards."""
+    """One safetensors file or its shards, or one pickle."""
     variant: str | None
     """The word in the files' names, as diffusers calls it: ``fp16`` or None."""
+
+    @property
+    def is_pickle(self) -> bool:
+        """Whether it is a pickle, of which torch's reader of plain tensors reads what it may."""
+        return self.files[0].suffix == ".bin"
 
 
 @dataclass(frozen=True)
@@ -119,12 +136,13 @@ def hub_offline(offline: bool) -> Iterator[None]:
         constants.HF_HUB_OFFLINE = before
 
 
-def find_model(model: str | None, allow_download: bool) -> Path:
+def find_model(model: str | None, allow_download: bool, allow_pickle: bool = False) -> Path:
     """Return the folder of a model: itself, or a hub id's in the local cache.
 
     Args:
         model: A folder, or an id such as ``owner/name``.
         allow_download: Fetch a hub id that is not in the cache; only the files that are read.
+        allow_pickle: Where a part has no other weights, those are among them.
 
     Raises:
         ModelError: It is not there, or could not be downloaded.
@@ -132,9 +150,10 @@ def find_model(model: str | None, allow_download: bool) -> Path:
     if not model:
         raise ModelError("--model", f"no Stable Diffusion was named; {WITHDRAWN}", ADVICE)
     folder = Path(model).expanduser()
-    if folder.is_dir():
+    # Of os.path: pathlib raises where a name is longer than a file's can be.
+    if os.path.isdir(folder):
         return folder
-    if folder.exists():
+    if os.path.exists(folder):
         raise ModelError(model, "is a file (expected a folder in diffusers' layout)", ADVICE)
     if not HUB_ID.fullmatch(model):
         raise ModelError(model, f"no such folder; {WITHDRAWN}", ADVICE)
@@ -147,12 +166,13 @@ def find_model(model: str | None, allow_download: bool) -> Path:
         if not allow_download or model.startswith("stabilityai/stable-diffusion-2"):
             what = f"neither a folder nor in this machine's cache of the hub; {WITHDRAWN}"
             raise ModelError(model, what, ADVICE) from error
-        return _download(model)
+        return _download(model, allow_pickle)
     # A download that was stopped leaves a part of it.
-    return _download(model) if allow_download and missing_files(cached) else cached
+    is_whole = not missing_files(cached, allow_pickle)
+    return _download(model, allow_pickle) if allow_download and not is_whole else cached
 
 
-def _download(model: str) -> Path:
+def _download(model: str, allow_pickle: bool) -> Path:
     """Fetch what is read of a hub repository, and nothing else.
 
     Raises:
@@ -162,7 +182,7 @@ def _download(model: str) -> Path:
 
     try:
         names = HfApi().list_repo_files(model)
-        return Path(snapshot_download(model, allow_patterns=needed_files(names)))
+        return Path(snapshot_download(model, allow_patterns=needed_files(names, allow_pickle)))
     except Exception as error:  # the hub's own, those of its HTTP client, and the system's
         if isinstance(error, OSError) and error.errno in (errno.ENOSPC, errno.EDQUOT):
             raise
@@ -170,14 +190,14 @@ def _download(model: str) -> Path:
         raise ModelError(model, what, ADVICE) from error
 
 
-def needed_files(names: Collection[str]) -> list[str]:
+def needed_files(names: Collection[str], allow_pickle: bool = False) -> list[str]:
     """Return which files of a repository are read, each part's weights in one variant only."""
     needed = {"model_index.json"}
     needed |= {f"{part}/{name}" for part, name in CONFIGS.items()}
     needed |= {n for n in names if n.startswith("tokenizer/") and n.endswith((".json", ".txt"))}
     for part, stem in WEIGHTS.items():
         within = {n.removeprefix(f"{part}/") for n in names if n.startswith(f"{part}/")}
-        chosen, variant = choose_weights(part, within) or ("", None)
+        chosen, variant = choose_weights(part, within, allow_pickle) or ("", None)
         needed.add(f"{part}/{chosen}")
         if chosen.endswith(".json"):
             stem += f".{variant}" if variant else ""
@@ -186,7 +206,9 @@ def needed_files(names: Collection[str]) -> list[str]:
     return sorted(needed & set(names))
 
 
-def choose_weights(part: str, names: Collection[str]) -> tuple[str, str | None] | None:
+def choose_weights(
+    part: str, names: Collection[str], allow_pickle: bool = False
+) -> tuple[str, str | None] | None:
     """Return the weights' file or index of a part and its variant, or None when it has none."""
     stem = WEIGHTS[part]
     for variant in VARIANTS:
@@ -194,18 +216,26 @@ def choose_weights(part: str, names: Collection[str]) -> tuple[str, str | None] 
         for name in (f"{stem}{dot}.safetensors", f"{stem}.safetensors.index{dot}.json"):
             if name in names:
                 return name, variant
+    for variant in VARIANTS if allow_pickle else ():
+        name = f"{PICKLED[part]}{f'.{variant}' if variant else ''}.bin"
+        if name in names:
+            return name, variant
     return None
 
 
-def check_model_folder(folder: Path) -> ModelFolder:
+def check_model_folder(folder: Path, allow_pickle: bool = False) -> ModelFolder:
     """Check a folder before any part of it is loaded; no code and no pickle of it is run.
+
+    Args:
+        folder: The folder.
+        allow_pickle: Take a part's pickle where it has no safetensors.
 
     Raises:
         ModelError: What is missing or wrong, with the file's name.
     """
+    _check_files(folder)
     _check_classes(folder)
-    _check_no_code(folder)
-    _check_complete(folder)
+    _check_complete(folder, allow_pickle)
     configs = {part: read_json(folder / part / name) for part, name in CONFIGS.items()}
     for part in WEIGHTS:
         if "quantization_config" in configs[part]:
@@ -214,36 +244,80 @@ def check_model_folder(folder: Path) -> ModelFolder:
             )
     _check_unet(folder / "unet/config.json", configs["unet"])
     _check_vae(folder / "vae/config.json", configs["vae"])
-    _check_width(folder / "text_encoder/config.json", configs)
-    weights = {part: _find_weights(folder / part, part) for part in WEIGHTS}
-    for held in weights.values():
+    _check_text_encoder(folder / "text_encoder/config.json", configs)
+    _check_scheduler(folder / "scheduler/scheduler_config.json", configs["scheduler"])
+    _check_tokenizer(folder / "tokenizer")
+    weights = {part: _find_weights(folder / part, part, allow_pickle) for part in WEIGHTS}
+    for part, held in weights.items():
+        if held.is_pickle:
+            _check_pointer(held.files[0])
+            continue
+        shapes: dict[str, tuple[int, ...]] = {}
         for file in held.files:
-            _check_header(file)
+            shapes |= _check_header(file)
+        _check_shapes(folder / part, expected_shapes(part, configs[part]), shapes)
     return ModelFolder(folder, configs, weights)
 
 
 def read_json(path: Path) -> dict[str, Any]:
-    """Read a JSON object; NaN and infinity, which Python would take, are refused.
+    """Read a JSON object; NaN, infinity and repeated names, which Python takes, are refused.
 
     Raises:
         ModelError: It cannot be read, or is something else.
     """
 
     def refuse(word: str) -> NoReturn:
-        raise ValueError(word)
+        raise ValueError(f"{word} is not JSON")
+
+    def unique(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+        if len(found := dict(pairs)) < len(pairs):
+            raise ValueError("a name appears twice")
+        return found
 
     try:
         with path.open("rb") as stream:
             text = stream.read(JSON_LIMIT + 1)
         if len(text) > JSON_LIMIT:
-            raise ModelError(str(path), f"longer than {JSON_LIMIT} bytes")
-        _check_pointer(path, text)
-        content = json.loads(text, parse_constant=refuse)
-    except (OSError, ValueError, RecursionError) as error:
-        raise ModelError(str(path), f"no JSON ({type(error).__name__})") from error
+            raise ModelError(str(path), f"too large (expected at most {JSON_LIMIT} bytes)")
+        if is_pointer(text):
+            raise ModelError(str(path), *POINTER)
+        content = json.loads(text, parse_constant=refuse, object_pairs_hook=unique)
+    except (OSError, ValueError) as error:
+        reason = " ".join(str(error).split())[:120]
+        raise ModelError(str(path), f"not JSON ({reason})", "fetch the model again") from error
+    except RecursionError as error:
+        raise ModelError(str(path), "not JSON (nested beyond reason)") from error
     if not isinstance(content, dict):
         raise ModelError(str(path), f"a JSON {type(content).__name__} (expected an object)")
     return content
+
+
+def _check_files(folder: Path) -> None:
+    """Check what a library may open on its own: plain files of the folder, and none of them code.
+
+    A Python file is never run, but a folder that needs one would not work.
+    """
+    inside = [os.path.realpath(folder)]
+    if os.path.basename(os.path.dirname(inside[0])) == "snapshots":
+        # The hub's cache keeps its files under their hashes and links to them.
+        inside.append(os.path.join(os.path.dirname(os.path.dirname(inside[0])), "blobs"))
+    for place in (folder, *(folder / part for part in PARTS)):
+        for file in sorted(place.iterdir()) if place.is_dir() else ():
+            if file.suffix == ".py":
+                raise ModelError(
+                    str(file), "a model folder holds no code", "it is never run: delete it"
+                )
+            if file.is_dir() or (place == folder and file.name != "model_index.json"):
+                continue
+            real = os.path.realpath(file)
+            if not any(os.path.commonpath([real, root]) == root for root in inside):
+                what = "a link that leads out of the model folder"
+                raise ModelError(str(file), what, "put a copy of the file in its place")
+            if not file.is_file():
+                raise ModelError(str(file), "not a regular file")
+            if file.suffix in TEXTS and file.stat().st_size > JSON_LIMIT:
+                what = f"too large (found {file.stat().st_size} bytes; expected at most "
+                raise ModelError(str(file), f"{what}{JSON_LIMIT})")
 
 
 def _check_classes(folder: Path) -> None:
@@ -270,16 +344,7 @@ def _check_classes(folder: Path) -> None:
             raise ModelError(str(path), what, "a model's own code is never run")
 
 
-def _check_no_code(folder: Path) -> None:
-    """Refuse Python files: they are never run, and a folder that needs them would not work."""
-    for place in (folder, *(folder / part for part in PARTS)):
-        for file in sorted(place.glob("*.py")):
-            raise ModelError(
-                str(file), "a model folder holds no code", "it is never run: delete it"
-            )
-
-
-def missing_files(folder: Path) -> list[str]:
+def missing_files(folder: Path, allow_pickle: bool = False) -> list[str]:
     """Return which of the files that are read are not there; shards are not counted."""
     missing = [] if (folder / "model_index.json").is_file() else ["model_index.json"]
     for part in PARTS:
@@ -287,7 +352,8 @@ def missing_files(folder: Path) -> list[str]:
         lacks = [[n for n in names if not (folder / part / n).is_file()] for names in choices]
         if all(lacks):
             missing += [f"{part}/{name}" for name in lacks[0]]
-        if part in WEIGHTS and choose_weights(part, _file_names(folder / part)) is None:
+        names = _file_names(folder / part)
+        if part in WEIGHTS and choose_weights(part, names, allow_pickle) is None:
             missing.append(f"{part}/{WEIGHTS[part]}.safetensors")
     return missing
 
@@ -296,9 +362,9 @@ def _file_names(folder: Path) -> set[str]:
     return {path.name for path in folder.glob("*") if path.is_file()}
 
 
-def _check_complete(folder: Path) -> None:
+def _check_complete(folder: Path, allow_pickle: bool) -> None:
     """List everything that is missing, in one sentence."""
-    missing = missing_files(folder)
+    missing = missing_files(folder, allow_pickle)
     if not missing:
         return
     what, advice = f"missing {', '.join(missing)}", ADVICE
@@ -306,6 +372,8 @@ def _check_complete(folder: Path) -> None:
     if pickles:
         what += f"; {', '.join(sorted(pickles))} are pickles, which can run code and are not read"
         advice = "save the model as safetensors (diffusers: save_pretrained)"
+        if not missing_files(folder, allow_pickle=True):
+            advice += ", or allow torch's reader of plain tensors to read them by --allow-pickle"
     raise ModelError(str(folder), what, advice)
 
 
@@ -322,8 +390,28 @@ def _check_unet(path: Path, config: dict[str, Any]) -> None:
             what = f"{name} {config[name]!r} (expected none): Stable Diffusion XL or another model"
             raise ModelError(str(path), what, ADVICE)
     for name in ("sample_size", "cross_attention_dim"):
-        if type(config.get(name)) is not int or not 1 <= config[name] <= 8192:
-            raise ModelError(str(path), f"{name} {config.get(name)!r} (expected a whole number)")
+        _check_whole(path, name, config.get(name), 8192)
+    _check_blocks(path, config)
+
+
+def _check_whole(path: Path, name: str, value: object, limit: int) -> None:
+    """Check that a value is a whole number of a network that can be."""
+    if type(value) is not int or not 1 <= value <= limit:
+        raise ModelError(str(path), f"{name} {value!r:.60} (expected a whole number to {limit})")
+
+
+def _check_blocks(path: Path, config: dict[str, Any]) -> None:
+    """Check that a UNet or autoencoder says how it is made, and is no larger than one can be."""
+    channels = config.get("block_out_channels")
+    if not isinstance(channels, list) or not 1 <= len(channels) <= 8:
+        what = f"block_out_channels {channels!r:.60} (expected a list of 1 to 8 whole numbers)"
+        raise ModelError(str(path), what, ADVICE)
+    for value in channels:
+        _check_whole(path, "block_out_channels", value, 8192)
+    for name in ("layers_per_block", "transformer_layers_per_block"):
+        value = config.get(name, 1)
+        for count in value if isinstance(value, list) else [value]:
+            _check_whole(path, name, count, 16)
 
 
 def _check_vae(path: Path, config: dict[str, Any]) -> None:
@@ -341,10 +429,11 @@ def _check_vae(path: Path, config: dict[str, Any]) -> None:
     for name in ("shift_factor", "latents_mean"):
         if config.get(name) is not None:
             raise ModelError(str(path), f"{name} (expected none, as in Stable Diffusion 2)", ADVICE)
+    _check_blocks(path, config)
 
 
-def _check_width(path: Path, configs: dict[str, dict[str, Any]]) -> None:
-    """Check that the text encoder's embeddings fit the UNet."""
+def _check_text_encoder(path: Path, configs: dict[str, dict[str, Any]]) -> None:
+    """Check that the text encoder can be one, and that its embeddings fit the UNet."""
     if (path.parent / "adapter_config.json").exists():
         # transformers would follow it to another model, which it names.
         raise ModelError(str(path.parent), "holds an adapter (expected the text encoder alone)")
@@ -352,11 +441,93 @@ def _check_width(path: Path, configs: dict[str, dict[str, Any]]) -> None:
     if found != expected["cross_attention_dim"]:
         what = f"hidden_size {found!r} (expected {expected['cross_attention_dim']}, the UNet's)"
         raise ModelError(str(path), what, "the parts are of different models")
+    for name, (default, limit) in TEXT_SIZES.items():
+        _check_whole(path, name, configs["text_encoder"].get(name, default), limit)
 
 
-def _find_weights(folder: Path, part: str) -> Weights:
+def _check_scheduler(path: Path, config: dict[str, Any]) -> None:
+    """Check that the model predicts what we know how to use."""
+    kind = config.get("prediction_type", "epsilon")
+    if kind not in PREDICTION_TYPES:
+        what = f"prediction_type {kind!r:.60} (expected {', '.join(PREDICTION_TYPES)})"
+        raise ModelError(str(path), what, ADVICE)
+    count = config.get("num_train_timesteps", 1000)
+    if type(count) is not int or not 2 <= count <= 100_000:
+        raise ModelError(str(path), f"num_train_timesteps {count!r:.60} (expected 2 to 100000)")
+
+
+def _check_tokenizer(folder: Path) -> None:
+    """Check that what describes the tokenizer is JSON and text: its reader fails in many ways."""
+    for path in sorted(folder.glob("*.json")):
+        content = read_json(path)
+        if path.name == "vocab.json":
+            odd = [word for word, place in content.items() if type(place) is not int or place < 0]
+            if odd:
+                what = f"the id of {odd[0]!r:.40} is {content[odd[0]]!r:.40} (expected 0, 1, ...)"
+                raise ModelError(str(path), what, "fetch the model again")
+    for path in sorted(folder.glob("*.txt")):
+        try:
+            path.read_text(encoding="utf-8")
+        except (OSError, ValueError) as error:
+            raise ModelError(str(path), "not UTF-8 text", "fetch the model again") from error
+
+
+def expected_shapes(part: str, config: dict[str, Any]) -> dict[str, tuple[int, ...]]:
+    """Return shapes of a few weights at both ends of a network, by its configuration.
+
+    What lies between is compared when the network is built; this tells another model's weights from
+    the right ones without building it.
+
+    Args:
+        part: ``unet``, ``vae`` or ``text_encoder``.
+        config: Its configuration, checked.
+    """
+    if part == "text_encoder":
+        width: int = config["hidden_size"]
+        sizes = {name: config.get(name, default) for name, (default, _) in TEXT_SIZES.items()}
+        last = sizes["num_hidden_layers"] - 1
+        return {
+            "embeddings.token_embedding.weight": (sizes["vocab_size"], width),
+            "embeddings.position_embedding.weight": (sizes["max_position_embeddings"], width),
+            f"encoder.layers.{last}.mlp.fc1.weight": (sizes["intermediate_size"], width),
+        }
+    channels = config["block_out_channels"]
+    if part == "vae":
+        return {
+            "encoder.conv_in.weight": (channels[0], 3, 3, 3),
+            "encoder.conv_out.weight": (2 * LATENT_CHANNELS, channels[-1], 3, 3),
+            "decoder.conv_in.weight": (channels[-1], LATENT_CHANNELS, 3, 3),
+            "decoder.conv_out.weight": (3, channels[0], 3, 3),
+        }
+    last = len(channels) - 1
+    return {
+        "conv_in.weight": (channels[0], LATENT_CHANNELS, 3, 3),
+        "conv_out.weight": (LATENT_CHANNELS, channels[0], 3, 3),
+        f"down_blocks.{last}.resnets.0.conv2.weight": (channels[-1], channels[-1], 3, 3),
+        "mid_block.attentions.0.transformer_blocks.0.attn2.to_k.weight": (
+            channels[-1],
+            config["cross_attention_dim"],
+        ),
+    }
+
+
+def _check_shapes(
+    folder: Path, expected: dict[str, tuple[int, ...]], found: dict[str, tuple[int, ...]]
+) -> None:
+    """Check that weights are those of their configuration."""
+    for end, shape in expected.items():
+        # Text encoders come with and without the name of the model around them.
+        names = [name for name in found if name == end or name == f"text_model.{end}"]
+        if not names:
+            raise ModelError(str(folder), f"lacks weights ({end}, by its config.json)", ADVICE)
+        if found[names[0]] != shape:
+            what = f"{names[0]}: shape {list(found[names[0]])} (expected {list(shape)}, by its "
+            raise ModelError(str(folder), f"{what}config.json)", "fetch the model again")
+
+
+def _find_weights(folder: Path, part: str, allow_pickle: bool) -> Weights:
     """Return the files of a part that `_check_complete` has seen."""
-    name, variant = choose_weights(part, _file_names(folder)) or ("", None)
+    name, variant = choose_weights(part, _file_names(folder), allow_pickle) or ("", None)
     path = folder / name
     if not name.endswith(".json"):
         return Weights((path,), variant)
@@ -374,24 +545,18 @@ def _find_weights(folder: Path, part: str) -> Weights:
     return Weights(tuple(folder / shard for shard in names), variant)
 
 
-def _check_pointer(path: Path, start: bytes) -> None:
-    """Recognise what git leaves in place of a large file."""
-    if start.startswith(b"version https://git-lfs"):
-        what = "a Git LFS pointer, not the file itself"
-        raise ModelError(str(path), what, "run `git lfs pull` in the folder")
-
-
-def _check_header(file: Path) -> None:
-    """Check a safetensors file: its header, its length and that its tensors are numbers."""
-    try:
-        with file.open("rb") as stream:
-            _check_pointer(file, stream.read(64))
-        with safe_open(file, framework="pt") as content:
-            kinds = {name: content.get_slice(name).get_dtype() for name in content.keys()}
-    except (OSError, SafetensorError, ValueError) as error:
-        what = f"damaged ({' '.join(str(error).split())[:120]})"
-        raise ModelError(str(file), what, "fetch the model again") from error
-    for name, kind in kinds.items():
+def _check_header(file: Path) -> dict[str, tuple[int, ...]]:
+    """Return the shapes of a safetensors file whose header, length and kinds of numbers hold."""
+    header = read_header(file)
+    for name, kind in header.kinds.items():
         # Old text encoders carry the numbers of their positions along.
         if kind not in DTYPES and not name.endswith("position_ids"):
             raise ModelError(str(file), f"{name}: {kind} (expected {', '.join(DTYPES)})")
+    return header.shapes
+
+
+def _check_pointer(path: Path) -> None:
+    """Recognise what git leaves in place of a large file."""
+    with path.open("rb") as stream:
+        if is_pointer(stream.read(64)):
+            raise ModelError(str(path), *POINTER)

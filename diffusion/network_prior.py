@@ -19,7 +19,8 @@ import torch
 from torch import Tensor, nn
 
 from warpir.diffusion.cuda_graphs import Graphs
-from warpir.diffusion.prior import ModelError
+from warpir.diffusion.model_error import ModelError
+from warpir.diffusion.prior import InChunks, NonFiniteError, at_once
 from warpir.diffusion.schedule import TIME_LIMIT, NoiseSchedule
 
 if TYPE_CHECKING:
@@ -66,6 +67,8 @@ class NetworkPrior(ABC):
         self.weight_hashes = dict(sorted(weight_hashes.items()))
         lines = "".join(f"{name} {sha256}\n" for name, sha256 in self.weight_hashes.items())
         self.digest = hashlib.sha256(lines.encode()).hexdigest()
+        self.in_chunks: InChunks = at_once
+        """How batches are done; replaced by who watches over memory."""
         self.adapters: set[str] = set()
         """Whoever adds an adapter to the UNet names it here."""
         self.notices: tuple[str, ...] = ()
@@ -170,14 +173,20 @@ class NetworkPrior(ABC):
             raise ValueError(f"seeds: {len(seeds)} (expected {len(prompts)}, one per prompt)")
         self._check_adapters([adapter])
         wanted, null = self.embed(prompts), self.embed([negative_prompt])
-        images = []
+        images: list[Tensor] = []
         for start in range(0, len(prompts), batch):
-            these = slice(start, start + batch)
-            solver = self._solver(order=2)
-            solver.set_timesteps(steps)
-            noise = self._noise(seeds[these])
-            latents = self._solve(solver, noise, wanted[these], null, scale, adapter)
-            images.append(self.decode(latents))
+
+            def made(first: int, last: int, start: int = start) -> Tensor:
+                these = slice(start + first, start + last)
+                solver = self._solver(order=2)
+                solver.set_timesteps(steps)
+                noise = self._noise(seeds[these])
+                return self.decode(self._solve(solver, noise, wanted[these], null, scale, adapter))
+
+            count = min(batch, len(prompts) - start)
+            images += self.in_chunks(
+                made, count, "pictures of the class", "--class-batch", self.spare_memory
+            )
         return torch.cat(images)
 
     def edit(
@@ -261,6 +270,38 @@ class NetworkPrior(ABC):
         for weight in self.unet.parameters():
             weight.data = weight.data.float()
         self.unet_dtype = torch.float32
+
+    def upcast(self) -> bool:
+        """Let all networks compute in fp32 from now on; return False where they do already."""
+        if self.unet_dtype is torch.float32:
+            return False
+        self.use_full_precision()
+        return True
+
+    def finite(self, compute: Callable[[], Tensor], what: str) -> Tensor:
+        """Return what is computed; in fp32 and from now on so, where half precision overflows.
+
+        Args:
+            compute: Called again in fp32.
+            what: What it computes, for a person.
+
+        Raises:
+            NonFiniteError: It is not finite in fp32 either.
+        """
+        computed = compute()
+        if bool(computed.isfinite().all()):
+            return computed
+        if self.upcast():
+            self._notice(f"the model computes in fp32: {what} were not finite before")
+            computed = compute()
+            if bool(computed.isfinite().all()):
+                return computed
+        raise NonFiniteError(f"{what} are not finite (found nan or inf), in fp32 too")
+
+    def spare_memory(self) -> None:
+        """Do without what only makes it faster: recordings hold memory of their own."""
+        self.forget_graphs()
+        self.graphs = None
 
     @contextmanager
     def in_full_precision(self) -> Iterator[None]:

@@ -11,19 +11,21 @@ teach another exposure. Everything random is a function of the seed and the step
 from __future__ import annotations
 
 import json
-import logging
-import math
 import time
 from collections.abc import Callable, Mapping
 from contextlib import AbstractContextManager, nullcontext
 from dataclasses import asdict, dataclass, fields
+from functools import partial
+from itertools import pairwise
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import torch
 from torch import Tensor
 
-from warpir.diffusion.cache import content_key, make_room, model_key, write_file
+from warpir.atomic import write_file
+from warpir.caches import find_kept, seal
+from warpir.diffusion.cache import content_key, model_key
 from warpir.diffusion.class_images import (
     Report,
     class_image_count,
@@ -42,7 +44,8 @@ from warpir.diffusion.lora_files import (
     remove_lora,
     serialize,
 )
-from warpir.diffusion.prior import ModelError
+from warpir.diffusion.model_error import ModelError
+from warpir.diffusion.prior import NonFiniteError
 from warpir.diffusion.prompts import Prompts
 from warpir.diffusion.settings import PersonalizeSettings
 
@@ -53,13 +56,15 @@ FORMAT = 1
 """Meaning of a stored LoRA; part of every key."""
 CROP_COUNT = 64
 """Crops of the photo that are encoded once and drawn from."""
+BAD_STEPS_MAX = 5
+"""Steps in a row without a finite gradient that end the training."""
+LOOK_EVERY = 50
+"""Steps between two looks at the losses: each makes the host wait for the device."""
 ENCODE_BATCH = 4
 EVALUATION_COUNT = 16
 """Fixed draws of time, noise and crop by which a LoRA is judged."""
 BETAS = (0.9, 0.999)
 """Of AdamW; as in diffusers' example of DreamBooth with a LoRA."""
-
-log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True)
@@ -111,14 +116,16 @@ def personalize(
         seed: The run's seed.
         cache: Folder that keeps class images and LoRAs (`cache_folder`), or None to keep none.
         name: The adapter's name; one of that name is replaced.
-        report: Is told a stage, the steps done and the steps in all.
-        on_step: Sees the training after each step, to keep its `state_dict` or to stop the run.
+        report: Is told a stage, the steps done and the steps in all; may stop the run, and no
+            step or class image that it was told of is lost.
+        on_step: Sees the training after each step and before the report, to keep its `state_dict`.
         resume: `LoraTraining.state_dict` of a run that was stopped.
         record: Given the training, returns what replaces its `update`; by default a CUDA graph,
             where the prior has them.
 
     Raises:
-        ModelError: The LoRA cannot be loaded or trained, or ``resume`` is another training's.
+        ModelError: The LoRA cannot be loaded, or ``resume`` is another training's.
+        NonFiniteError: The model's numbers are not finite in fp32 either, or stay so in training.
         ValueError: The photo or a setting has a value that makes no sense.
     """
     _check(photo, settings)
@@ -128,7 +135,7 @@ def personalize(
     key = lora_key(prior, photo, prompts, settings, seed)
     stored = cache / "lora" / f"{key}.safetensors" if cache else None
     notices: list[str] = []
-    found = _read_stored(stored, name, settings, notices) if stored else None
+    found = _read_stored(stored, name, settings) if stored else None
     if found is not None:
         install_lora(prior, found.lora, name, str(stored))
         return found
@@ -143,10 +150,6 @@ def personalize(
     kept = crops[:0]
     if len(class_images.images):
         kept = encode_pictures(prior, class_images.images, ENCODE_BATCH, report)
-    if not bool(torch.isfinite(crops).all() and torch.isfinite(kept).all()):
-        raise ModelError(
-            "model", "its latents are not finite (found nan or inf)", "try --vae-precision fp32"
-        )
     clock.stop("encoding")
     before = evaluate(prior, crops, embeddings[:1], seed, None)
     lora = initial_lora(prior, settings.lora_layers, settings.lora_rank, seed)
@@ -156,25 +159,37 @@ def personalize(
         if resume is not None:
             training.load_state_dict(resume)
         update: Callable[[], None] = training.update
+
+        def spare() -> None:
+            nonlocal update
+            prior.spare_memory()
+            training.part_count, update = len(training.timesteps), training.update
+
         if record:
             update = record(training)
         elif prior.graphs is not None:
             update = prior.graphs.recorded_step(training.update)
         while training.step_count < settings.lora_steps:
             training.prepare(training.step_count)
-            update()
-            training.count_step()
-            if report:
-                report("LoRA", training.step_count, settings.lora_steps)
+            flags = "--lora-class-batch or --lora-rank"
+            for _ in prior.in_chunks(lambda *_: update(), 1, "a step of the LoRA", flags, spare):
+                training.count_step()
+            if training.step_count % LOOK_EVERY == 0:
+                training.losses()
             if on_step:
                 on_step(training)
+            if report:
+                report("LoRA", training.step_count, settings.lora_steps)
         lora, losses = training.lora(), training.losses()
+        skipped = training.skipped()
     install_lora(prior, lora, name)
     clock.stop("training")
     after = evaluate(prior, crops, embeddings[:1], seed, name)
     clock.stop("evaluation")
 
     notices += class_images.notices
+    if skipped:
+        notices.append(f"{skipped} steps of the LoRA had no finite gradient and were skipped")
     if settings.lora_steps and not after < before:
         notices.append(
             f"the model came no closer to the photo: its error on fixed draws was {before:.4g} and "
@@ -223,6 +238,8 @@ class LoraTraining:
         self.step_count = 0
         """Steps that were taken."""
         self.class_count = settings.lora_class_batch if len(classes) else 0
+        self.part_count = 1
+        """Parts that a step's samples are taken in; more need less memory."""
 
         install_lora(prior, lora, name)
         put_weights(prior, name, lora.weights, torch.float32)
@@ -253,6 +270,8 @@ class LoraTraining:
         self.timesteps = torch.zeros(count, dtype=torch.int64, device=prior.device)
         which = [0] + [1] * self.class_count
         self.embeddings = embeddings[which].to(prior.device)
+        share = settings.lora_class_weight / max(self.class_count, 1)
+        self.weights = torch.tensor([1.0] + [share] * self.class_count, device=prior.device)
         self.loss_pair = torch.zeros(2, device=prior.device)
         self._losses = torch.zeros(settings.lora_steps, 2, device=prior.device)
         self._weights: list[tuple[torch.nn.Parameter, Tensor]] = []
@@ -297,17 +316,37 @@ class LoraTraining:
             buffer.copy_(pinned, non_blocking=True)
 
     def update(self) -> None:
-        """Take one step on what `prepare` uploaded; writes `loss_pair`, never waits."""
+        """Take one step on what `prepare` uploaded; writes `loss_pair`, waits on the CPU only.
+
+        Without a finite gradient nothing changes, and the loss is not a number.
+        """
         self.optimizer.zero_grad(set_to_none=True)
-        with self._arithmetic():
-            predicted = self.prior.denoise(self.latents_noisy, self.timesteps, self.embeddings)
-        error = (predicted.float() - self.target).square().mean(dim=(1, 2, 3))
-        loss_photo = error[0]
-        loss_class = error[1:].mean() if self.class_count else torch.zeros_like(loss_photo)
-        torch.autograd.backward(loss_photo + self.settings.lora_class_weight * loss_class)
-        torch.nn.utils.clip_grad_norm_(self.parameters.values(), self.settings.lora_clip)
-        self.optimizer.step()
-        self.loss_pair.copy_(torch.stack([loss_photo, loss_class]).detach())
+        errors = []
+        count = len(self.timesteps)
+        borders = [k * count // self.part_count for k in range(self.part_count + 1)]
+        for these in (slice(*pair) for pair in pairwise(borders)):
+            with self._arithmetic():
+                predicted = self.prior.denoise(
+                    self.latents_noisy[these], self.timesteps[these], self.embeddings[these]
+                )
+            error = (predicted.float() - self.target[these]).square().mean(dim=(1, 2, 3))
+            torch.autograd.backward((self.weights[these] * error).sum())
+            errors.append(error.detach())
+        each = torch.cat(errors)
+        clip = self.settings.lora_clip
+        norm = torch.nn.utils.clip_grad_norm_(self.parameters.values(), clip)
+        self._step_where_finite(norm)
+        loss_class = each[1:].mean() if self.class_count else torch.zeros_like(each[0])
+        losses = torch.stack([each[0], loss_class])
+        self.loss_pair.copy_(torch.where(norm.isfinite(), losses, torch.nan))
+
+    def _step_where_finite(self, norm: Tensor) -> None:
+        if norm.is_cuda:
+            # The fused optimiser looks at this on the device, as it does for gradient scalers.
+            self.optimizer.found_inf = (~norm.isfinite()).float()  # type: ignore[attr-defined]
+            self.optimizer.step()
+        elif bool(norm.isfinite()):
+            self.optimizer.step()
 
     def count_step(self) -> None:
         """Keep the losses of a step that was taken, and go on to the next."""
@@ -322,17 +361,25 @@ class LoraTraining:
     def losses(self) -> Tensor:
         """Return the photo's and the class images' losses by step, shape [step_count, 2].
 
+        Those of steps that were skipped are not a number.
+
         Raises:
-            ModelError: They are not finite.
+            NonFiniteError: `BAD_STEPS_MAX` in a row were.
         """
         losses = _to_cpu(self._losses[: self.step_count])
-        finite = torch.isfinite(losses).all(dim=1)
-        if not bool(finite.all()):
-            step = int((~finite).nonzero()[0]) + 1
-            raise ModelError(
-                "LoRA", f"its loss is not finite from step {step} on", "lower --lora-rate"
-            )
+        in_a_row = 0
+        for step, is_finite in enumerate(losses.isfinite().all(dim=1).tolist()):
+            in_a_row = 0 if is_finite else in_a_row + 1
+            if in_a_row == BAD_STEPS_MAX:
+                first = step + 2 - BAD_STEPS_MAX
+                raise NonFiniteError(
+                    f"the LoRA's loss is not finite from step {first} on (try a lower --lora-rate)"
+                )
         return losses
+
+    def skipped(self) -> int:
+        """Return how many steps had no finite gradient."""
+        return int((~self.losses().isfinite().all(dim=1)).sum())
 
     def state_dict(self) -> dict[str, Any]:
         """Return what a later run needs to go on: tensors on the CPU and plain values."""
@@ -406,7 +453,8 @@ def photo_latents(
     with torch.no_grad():
         for start in range(0, len(crops), ENCODE_BATCH):
             batch = [c.apply(photo, prior.resolution) for c in crops[start : start + ENCODE_BATCH]]
-            latents.append(prior.encode(torch.cat(batch)).cpu())
+            encode = partial(prior.encode, torch.cat(batch))
+            latents.append(prior.finite(encode, "latents").cpu())
     return torch.cat(latents)
 
 
@@ -425,7 +473,7 @@ def evaluate(
         adapter: Its name, or None for the base weights.
 
     Raises:
-        ModelError: The noise is not finite, as when half precision overflows.
+        NonFiniteError: The noise is not finite.
     """
     random = generator_of(seed, "evaluation")
     shares = torch.arange(EVALUATION_COUNT) + torch.rand(EVALUATION_COUNT, generator=random)
@@ -437,16 +485,11 @@ def evaluate(
     for start in range(0, EVALUATION_COUNT, ENCODE_BATCH):
         part = slice(start, start + ENCODE_BATCH)
         count = len(t[part])
-        predicted = prior.predict(
-            noisy[part], t[part], embedding.expand(count, -1, -1), [adapter] * count
-        )
+        prompts = embedding.expand(count, -1, -1)
+        predict = partial(prior.predict, noisy[part], t[part], prompts, [adapter] * count)
+        predicted = prior.finite(predict, "predictions")
         errors.append((predicted.cpu() - noise[part]).square().mean(dim=(1, 2, 3)))
-    error = float(torch.cat(errors).mean())
-    if not math.isfinite(error):
-        raise ModelError(
-            "model", "its predictions are not finite (found nan or inf)", "try --precision fp32"
-        )
-    return error
+    return float(torch.cat(errors).mean())
 
 
 def lora_key(
@@ -481,31 +524,24 @@ def _store(
     try:
         content = serialize({**lora.weights, "losses": losses}, {"record": json.dumps(header)})
         write_file(path, content)
-        make_room(path.parent, "*.safetensors")
+        seal(path, "*.safetensors.*")
     except OSError as error:
         notices.append(f"{path}: the LoRA is not kept ({error})")
-        log.warning("%s", notices[-1])
 
 
-def _read_stored(
-    path: Path, name: str, settings: PersonalizeSettings, notices: list[str]
-) -> Personalization | None:
-    """Return a LoRA that an earlier run kept, or None when there is none that can be read."""
+def _read_stored(path: Path, name: str, settings: PersonalizeSettings) -> Personalization | None:
+    """Return a LoRA that an earlier run kept, or None when there is none that is whole."""
     from safetensors import safe_open
 
-    if not path.is_file():
+    kept = find_kept(path)
+    if kept is None:
         return None
-    try:
-        with safe_open(path, framework="pt", device="cpu") as file:
-            header = json.loads(file.metadata()["record"])
-            tensors = {key: file.get_tensor(key) for key in file.keys()}
-        losses = tensors.pop("losses")
-        before, after = header["errors"]
-        texts, told = tuple(header["class_prompts"]), tuple(header["notices"])
-    except Exception as error:  # a damaged file makes libraries raise anything
-        notices.append(f"{path}: not readable, trained again ({error})")
-        log.warning("%s", notices[-1])
-        return None
+    with safe_open(kept, framework="pt", device="cpu") as file:
+        header = json.loads(file.metadata()["record"])
+        tensors = {key: file.get_tensor(key) for key in file.keys()}
+    losses = tensors.pop("losses")
+    before, after = header["errors"]
+    texts, told = tuple(header["class_prompts"]), tuple(header["notices"])
     layers = sorted({key.rsplit(".lora_", 1)[0] for key in tensors})
     lora = Lora(tensors, dict.fromkeys(layers, float(settings.lora_rank)), settings.lora_layers)
     return Personalization(name, lora, losses, (before, after), texts, {}, True, told)

@@ -7,28 +7,53 @@ the noise in noisy latents for a prompt, with or without an adapter (a LoRA). Gu
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
-from typing import Protocol
+from typing import Protocol, TypeVar
 
 import torch
 from torch import Tensor
 
 from warpir.diffusion.schedule import NoiseSchedule
 
+T = TypeVar("T")
 
-class ModelError(Exception):
-    """A model folder or LoRA file cannot be used; the program prints one line and exits with 4.
 
-    Args:
-        where: The folder, file or flag at fault.
-        what: What is wrong, with what was found and what was expected.
-        advice: What to do about it, or an empty string.
-    """
+class InChunks(Protocol):
+    """How work that may lack memory is done: at once, or tried again in halves."""
 
-    def __init__(self, where: str, what: str, advice: str = "") -> None:
-        super().__init__(f"{where}: {what}")
-        self.where, self.what, self.advice = str(where), what, advice
+    def __call__(
+        self,
+        do: Callable[[int, int], T],
+        count: int,
+        what: str,
+        flags: str,
+        spare: Callable[[], object] = ...,
+    ) -> Iterator[T]:
+        """Yield what is made of ``count`` things.
+
+        Args:
+            do: Makes it of the things from a first to before a last.
+            count: How many there are.
+            what: What is made, for a person.
+            flags: What lowers its memory.
+            spare: Called before a second attempt.
+        """
+
+
+def at_once(
+    do: Callable[[int, int], T],
+    count: int,
+    what: str,
+    flags: str,
+    spare: Callable[[], object] = lambda: None,
+) -> Iterator[T]:
+    """Yield what is made of all things; who drives the model may put another in its place."""
+    yield do(0, count)
+
+
+class NonFiniteError(Exception):
+    """Numbers stayed non-finite; the program says so and exits with 6."""
 
 
 @dataclass(frozen=True)

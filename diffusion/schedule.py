@@ -10,7 +10,8 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-PREDICTION_TYPES = ("epsilon", "v_prediction", "sample")
+from warpir.diffusion.settings import PREDICTION_TYPES
+
 TIME_LIMIT = 0.98
 """Latest time that is used: a schedule rescaled to zero terminal SNR has no signal at its end."""
 

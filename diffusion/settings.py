@@ -7,6 +7,9 @@ prior that guides decides it (`warpir.config.PRIOR_DEFAULTS`).
 
 from dataclasses import dataclass
 
+PREDICTION_TYPES = ("epsilon", "v_prediction", "sample")
+"""What a network may predict: the noise, v, or the clean sample."""
+
 
 @dataclass(frozen=True)
 class ModelSettings:
@@ -24,6 +27,9 @@ class ModelSettings:
     less per noise) and half as much time again"""
     allow_download: bool = False
     """Let a hub id be downloaded; without it only what is on this machine is used"""
+    allow_pickle: bool = False
+    """Read weights that a model folder has as pickles (.bin) alone, by torch's reader of plain
+    tensors, which runs no code of theirs"""
     graphs: bool = True
     """Record the model's passes once as CUDA graphs and replay them, which is faster"""
 

@@ -64,7 +64,8 @@ def show_prior(
         report: Is told "samples", the number done and the number in all.
 
     Raises:
-        ModelError: An adapter is unknown, the text encoder was freed, or a picture is not finite.
+        ModelError: An adapter is unknown, or the text encoder was freed.
+        NonFiniteError: A picture is not finite.
         ValueError: There is no prompt, adapter or seed.
     """
     if not (prompts and adapters and seeds):
@@ -72,9 +73,14 @@ def show_prior(
     asked = [prompt for prompt in prompts for _ in seeds]
     columns = []
     for place, adapter in enumerate(adapters):
-        made = prior.sample(
-            asked, [*seeds] * len(prompts), steps=steps, scale=scale, adapter=adapter, batch=batch
-        )
+
+        def sample(adapter: str | None = adapter) -> Tensor:
+            noises = [*seeds] * len(prompts)
+            return prior.sample(
+                asked, noises, steps=steps, scale=scale, adapter=adapter, batch=batch
+            )
+
+        made = prior.finite(sample, "pictures")
         columns.append(to_bytes(made).reshape(len(prompts), len(seeds), *made.shape[1:]))
         if report:
             report("samples", (place + 1) * len(asked), len(adapters) * len(asked))

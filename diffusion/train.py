@@ -31,7 +31,7 @@ import torch
 import torch.distributed as dist
 from torch import Tensor, nn
 
-from warpir.diffusion.cache import write_file
+from warpir.atomic import write_file, write_folder
 from warpir.diffusion.draws import seed_of
 from warpir.diffusion.embedded import (
     CONDITIONS,
@@ -45,8 +45,8 @@ from warpir.diffusion.embedded import (
     training_tokens,
 )
 from warpir.diffusion.lora_files import read_safetensors, serialize
+from warpir.diffusion.model_error import ModelError
 from warpir.diffusion.network_prior import no_tf32
-from warpir.diffusion.prior import ModelError
 from warpir.diffusion.schedule import NoiseSchedule
 
 FORMAT = 1
@@ -686,7 +686,7 @@ class Checkpoint:
 
 def checkpoints_in(out: Path) -> list[Path]:
     """Return the folders of whole checkpoints, the newest last."""
-    return sorted(p for p in out.glob("checkpoint-*") if p.is_dir() and p.suffix != ".part")
+    return sorted(path for path in out.glob("checkpoint-*") if path.is_dir())
 
 
 def write_checkpoint(
@@ -714,17 +714,19 @@ def write_checkpoint(
         shards[-1][name] = value
         size += value.nbytes
     record = {"format": FORMAT, "progress": asdict(progress), "settings": asdict(settings)}
+
+    def files() -> Iterator[tuple[str, bytes]]:
+        for place, shard in enumerate(shards):
+            described: dict[str, Any] = {
+                "shard": place, "shards": len(shards), "step": progress.step,
+            }  # fmt: skip
+            if place == 0:
+                described |= record
+            header = {"format": "pt", HEADER_KEY: json.dumps(described)}
+            yield f"part-{place}.safetensors", serialize(shard, header)
+
     final = out / f"checkpoint-{progress.step:08d}"
-    staged = final.with_suffix(".part")
-    shutil.rmtree(staged, ignore_errors=True)
-    for place, shard in enumerate(shards):
-        described: dict[str, Any] = {"shard": place, "shards": len(shards), "step": progress.step}
-        if place == 0:
-            described |= record
-        header = {"format": "pt", HEADER_KEY: json.dumps(described)}
-        write_file(staged / f"part-{place}.safetensors", serialize(shard, header))
-    shutil.rmtree(final, ignore_errors=True)
-    staged.rename(final)
+    write_folder(final, files())
     for older in checkpoints_in(out):
         if older != final:
             shutil.rmtree(older)

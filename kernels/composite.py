@@ -19,6 +19,15 @@ def encode(x: float) -> float:
     return wp.min(y, 1.0)
 
 
+@wp.func
+def unhidden(value: wp.vec3, source: wp.vec3) -> wp.vec3:
+    """Return the value, but NaN where its source is not finite.
+
+    Maxima, clamps and branches turn a NaN into an ordinary number, and then nobody learns of it.
+    """
+    return value + source * 0.0
+
+
 @wp.kernel
 def tone_foreground(
     foreground: wp.array[wp.vec3],
@@ -49,11 +58,12 @@ def tone_foreground(
         r = reinhard(r)
         g = reinhard(g)
         b = reinhard(b)
-    display[i] = wp.vec3(
+    shown = wp.vec3(
         tone_curve(r, curve, knot_x, knot_y, knot_slope, bin_count),
         tone_curve(g, curve, knot_x, knot_y, knot_slope, bin_count),
         tone_curve(b, curve, knot_x, knot_y, knot_slope, bin_count),
     )
+    display[i] = unhidden(shown, x)
 
 
 @wp.kernel
@@ -69,11 +79,12 @@ def tone_shadow(
     i = wp.tid()
     curve = 3 * (i % (knot_x.shape[0] // 3))
     x = ratio[i]
-    display[i] = wp.vec3(
+    shown = wp.vec3(
         tone_curve(x[0], curve, knot_x, knot_y, knot_slope, bin_count),
         tone_curve(x[1], curve + 1, knot_x, knot_y, knot_slope, bin_count),
         tone_curve(x[2], curve + 2, knot_x, knot_y, knot_slope, bin_count),
     )
+    display[i] = unhidden(shown, x)
 
 
 @wp.kernel
@@ -105,4 +116,4 @@ def compose(
     o = object_index[i]
     if o >= 0:
         x = x * (1.0 - mask[o]) + foreground_display[o] * mask[o]
-    image[i] = wp.vec3(encode(x[0]), encode(x[1]), encode(x[2]))
+    image[i] = unhidden(wp.vec3(encode(x[0]), encode(x[1]), encode(x[2])), x)

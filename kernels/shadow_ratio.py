@@ -10,7 +10,8 @@ numbers is noise, and its slope ``1 / denominator`` leaves float32."""
 @wp.func
 def safe_ratio(numerator: float, denominator: float) -> float:
     """Return the ratio, or 1 where the plane receives no light at all."""
-    ratio = float(1.0)
+    # NaN where the plane's light is not finite: a comparison would hide it.
+    ratio = 1.0 + 0.0 * denominator
     if denominator > DARK:
         ratio = numerator / denominator
     return ratio

@@ -399,6 +399,7 @@ def trace_paths(
     texels: TexelArgs,
     proposal: LightArgs,
     subsamples: int,
+    first_path: int,
     path_count: int,
     depth: int,
     seed: int,
@@ -417,13 +418,15 @@ def trace_paths(
         texels: The map.
         proposal: Where light is expected, for the second and later vertices; any positive map.
         subsamples: Camera samples per pixel.
+        first_path: Path of the launch's first column.
         path_count: Paths per pixel.
         depth: Surface interactions.
         seed: Base seed.
         T: From `trace_direct`, shape [pixel, texel].
         emission: Radiance that does not depend on the light, shape [pixel].
     """
-    p, q = wp.tid()
+    p, column = wp.tid()
+    q = first_path + column
     count = points.count[p]
     if count == 0:
         return

@@ -4,7 +4,7 @@ Readers (`warpir.gltf`, `warpir.obj`) fill these records after checking the file
 them checks again. Frame: the asset's own, right-handed, +Y up, front +Z, in metres.
 """
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
@@ -12,8 +12,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from warpir.errors import InputError
+from warpir.limits import LIMITS, Limits
 
 FloatArray = NDArray[np.float32]
+
+TEXTURE_LIMIT = 1e6
+"""Of texture coordinates and their transforms [1]; beyond it float32 knows no part of a texel."""
+ABSENT = "absent"
+"""In place of a sha256, where grey stands for a file that could not be read."""
 
 
 @dataclass(frozen=True)
@@ -140,6 +146,9 @@ class Asset:
     textures: tuple[Texture, ...] = ()
     notices: tuple[str, ...] = field(default=())
     """What was repaired, assumed or left out, one line each; printed and kept in ``run.json``."""
+    hashes: Mapping[str, str] = field(default_factory=dict)
+    """sha256 of what was read: of the asset's file as ``""``, of others by their relative names;
+    `ABSENT` where grey stands for a file."""
 
     def bounds(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Return the lowest and highest corner of all vertices, asset frame [m], shape [3] each."""
@@ -173,22 +182,7 @@ class Asset:
         return [i for i, m in enumerate(self.materials) if names is None or m.name in names]
 
 
-@dataclass(frozen=True)
-class AssetLimits:
-    """Sizes beyond which an asset is refused, before that much is read."""
-
-    triangles: int = 20_000_000
-    """Instances counted (``--max-triangles``); vertices may be three times as many."""
-    texture_pixels: int = 512_000_000
-    """Of all textures together (``--max-texture-pixels``) [px]."""
-
-
-LIMITS = AssetLimits()
-
-
-def load_asset(
-    path: str | Path, missing_textures: str = "error", limits: AssetLimits = LIMITS
-) -> Asset:
+def load_asset(path: str | Path, missing_textures: str = "error", limits: Limits = LIMITS) -> Asset:
     """Read an asset of any supported kind.
 
     Args:
@@ -199,7 +193,29 @@ def load_asset(
     Raises:
         InputError: The file is missing, of another kind, or cannot be represented faithfully.
     """
-    path = Path(path)
+    asset = _read(Path(path), missing_textures, limits)
+    _check_numbers(Path(path), asset)
+    return asset
+
+
+def _check_numbers(path: Path, asset: Asset) -> None:
+    """Refuse numbers that are finite, but whose products are not."""
+    for material in asset.materials:
+        slots = [part for part in vars(material).values() if isinstance(part, TextureSlot)]
+        scales = [material.normal_scale, material.clearcoat_normal_scale, material.ior]
+        scales += [number for slot in slots for number in slot.transform]
+        if abs(found := max(scales, key=abs)) > TEXTURE_LIMIT:
+            what = f"material {material.name[:60]!a}: a texture's transform or scale, or an index"
+            raise InputError(path, f"{what} of {found:g} (expected at most {TEXTURE_LIMIT:g})")
+    for primitive in asset.primitives:
+        for uv in (primitive.uv0, primitive.uv1):
+            greatest = 0.0 if uv is None else float(max(uv.max(), -uv.min()))
+            if greatest > TEXTURE_LIMIT:
+                what = f"texture coordinates of {greatest:g} (expected at most {TEXTURE_LIMIT:g})"
+                raise InputError(path, what)
+
+
+def _read(path: Path, missing_textures: str, limits: Limits) -> Asset:
     suffix = path.suffix.lower()
     if suffix in {".glb", ".gltf"}:
         from warpir.gltf import read_gltf

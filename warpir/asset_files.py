@@ -6,9 +6,10 @@ follows a link out of the asset's folder or allocates before the size is known.
 
 import base64
 import binascii
+import hashlib
+import os
 import re
 import stat
-import warnings
 from io import BytesIO
 from pathlib import Path
 from urllib.parse import unquote
@@ -16,11 +17,10 @@ from urllib.parse import unquote
 import numpy as np
 from numpy.typing import NDArray
 
-from warpir.asset import LIMITS, AssetLimits, Material, Primitive
+from warpir.asset import ABSENT, Material, Primitive
 from warpir.errors import InputError
+from warpir.limits import LIMITS, Limits
 
-FILE_BYTES = 2 << 30
-"""Largest mesh, buffer or image file [byte]."""
 EXTENT = 1e18
 """Largest coordinate [m]; its square still fits float32."""
 GREY = 188
@@ -32,7 +32,12 @@ Pixels = NDArray[np.uint8]
 
 
 def read_regular(
-    path: Path, where: str | Path, pointer: str = "", limit: int = FILE_BYTES
+    path: Path,
+    where: str | Path,
+    pointer: str = "",
+    limits: Limits = LIMITS,
+    limit: str = "file_bytes",
+    hashes: dict[str, str] | None = None,
 ) -> bytes:
     """Return the content of a regular file, refusing folders, devices, pipes and giants.
 
@@ -40,26 +45,31 @@ def read_regular(
         path: The file to read.
         where: The asset that is named in an error.
         pointer: The place in the asset that refers to ``path``, ending in ``: ``, or empty.
-        limit: Largest size [byte].
+        limits: How large it may be.
+        limit: Which of them counts here.
+        hashes: Receives the sha256 of what was read; see `warpir.asset.Asset.hashes`.
 
     Raises:
-        InputError: It cannot be read, is empty, or is larger than ``limit``.
+        InputError: It cannot be read, is empty, or is too large.
     """
+    if hashes is not None:
+        name = "" if Path(where) == path else os.path.relpath(path, Path(where).parent.resolve())
+        hashes[name] = ABSENT
     named = "" if Path(where) == path else f"{path.name}: "
     try:
         status = path.stat()
         if not stat.S_ISREG(status.st_mode):
             raise InputError(where, f"{pointer}{named}not a regular file")
-        if status.st_size > limit:
-            raise InputError(
-                where,
-                f"{pointer}{named}too large (found {status.st_size} bytes; limit {limit})",
-            )
+        what = f"{pointer}{named}too large"
+        limits.check(limit, status.st_size, where, what, more=" bytes")
         content = path.read_bytes()
-    except OSError as error:
-        raise InputError(where, f"{pointer}{named}{error.strerror or error}") from None
+    except (OSError, ValueError) as error:  # ValueError: a name that no file can have
+        reason = error.strerror if isinstance(error, OSError) else "not a file name"
+        raise InputError(where, f"{pointer}{named}{reason}") from None
     if not content:
         raise InputError(where, f"{pointer}{named}empty file")
+    if hashes is not None:
+        hashes[name] = hashlib.sha256(content).hexdigest()
     return content
 
 
@@ -80,7 +90,12 @@ def inside(folder: Path, uri: str, where: Path, pointer: str = "") -> Path:
         f"{pointer}{uri[:80]!r} is outside the asset folder",
         "put all files of the asset into one folder and refer to them by relative names",
     )
-    if not uri or "\0" in uri or uri.startswith("/") or re.match(r"[A-Za-z][A-Za-z0-9+.-]*:", uri):
+    if (
+        not uri
+        or "\0" in uri
+        or uri.startswith(("/", "\\"))
+        or re.match(r"[A-Za-z][A-Za-z0-9+.-]*:", uri)
+    ):
         raise outside
     try:
         root = folder.resolve()
@@ -92,7 +107,13 @@ def inside(folder: Path, uri: str, where: Path, pointer: str = "") -> Path:
     return target
 
 
-def read_uri(uri: str, where: Path, pointer: str) -> bytes:
+def read_uri(
+    uri: str,
+    where: Path,
+    pointer: str,
+    limits: Limits = LIMITS,
+    hashes: dict[str, str] | None = None,
+) -> bytes:
     """Return the bytes behind a glTF URI: a base64 ``data:`` URI or a file next to the asset.
 
     Raises:
@@ -106,7 +127,7 @@ def read_uri(uri: str, where: Path, pointer: str) -> bytes:
             return base64.b64decode(payload, validate=True)
         except (binascii.Error, ValueError) as error:
             raise InputError(where, f"{pointer}data: URI is damaged ({error})") from None
-    return read_regular(locate(uri, where, pointer), where, pointer)
+    return read_regular(locate(uri, where, pointer), where, pointer, limits, hashes=hashes)
 
 
 def locate(uri: str, where: Path, pointer: str) -> Path:
@@ -129,13 +150,18 @@ class TextureDecoder:
         where: The asset that is named in an error.
         notices: Receives one line per repair.
         limits: How many pixels all images may have together.
+        measures: Only count the pixels: what is decoded is one grey texel.
     """
 
-    def __init__(self, where: Path, notices: list[str], limits: AssetLimits = LIMITS) -> None:
+    def __init__(
+        self, where: Path, notices: list[str], limits: Limits = LIMITS, measures: bool = False
+    ) -> None:
         self.where = where
+        self.measures = measures
         self.notices = notices
         self.limits = limits
         self.pixel_count = 0
+        self.byte_count = 0
 
     def decode(self, encoded: bytes, pointer: str) -> Pixels:
         """Decode a PNG, JPEG or WebP image to RGBA codes, shape [height, width, 4].
@@ -148,10 +174,13 @@ class TextureDecoder:
             pointer: The place in the asset, ending in ``: ``.
 
         Raises:
-            InputError: Another format, damaged, or beyond the pixel limit.
+            InputError: Another format, damaged, or beyond a limit of all textures.
         """
         from PIL import Image
 
+        self.byte_count += len(encoded)
+        what = f"{pointer}too many bytes of textures"
+        self.limits.check("file_bytes", self.byte_count, self.where, what, more=" so far")
         if encoded[1:5] == b"KTX ":
             raise InputError(
                 self.where,
@@ -159,33 +188,40 @@ class TextureDecoder:
                 "re-export with PNG or JPEG textures, without KHR_texture_basisu",
             )
         try:
-            with warnings.catch_warnings():
-                warnings.simplefilter("error", Image.DecompressionBombWarning)
-                image: Image.Image = Image.open(BytesIO(encoded), formats=["PNG", "JPEG", "WEBP"])
-                self._count(image.width * image.height, pointer)
-                image.load()
-                if image.format == "PNG" and encoded[24:25] == b"\x10":
-                    self.notices.append(f"{pointer}16-bit texture reduced to 8 bits")
-                if image.mode.startswith("I"):
-                    # 16-bit grey: Pillow's own conversion would clip instead of scaling.
-                    grey = np.asarray(image).astype(np.uint32) >> 8
-                    image = Image.fromarray(grey.astype(np.uint8))
-                return np.array(image.convert("RGBA"))
+            Image.MAX_IMAGE_PIXELS = None  # ours is checked before a pixel is decoded
+            image: Image.Image = Image.open(BytesIO(encoded), formats=["PNG", "JPEG", "WEBP"])
+            self.count(image.width * image.height, pointer)
+            if self.measures:
+                return grey_pixels()
+            image.load()
+            if image.format == "PNG" and encoded[24:25] == b"\x10":
+                self.notices.append(f"{pointer}16-bit texture reduced to 8 bits")
+            if image.mode.startswith("I"):
+                # 16-bit grey: Pillow's own conversion would clip instead of scaling.
+                grey = np.asarray(image).astype(np.uint32) >> 8
+                image = Image.fromarray(grey.astype(np.uint8))
+            return np.array(image.convert("RGBA"))
         except (InputError, MemoryError):
             raise
         except Exception as error:  # Pillow raises a dozen kinds, struct.error among them
             short = "not a PNG, JPEG or WebP image" if "identify" in str(error) else str(error)
             raise InputError(self.where, f"{pointer}image cannot be decoded ({short})") from None
 
-    def _count(self, pixel_count: int, pointer: str) -> None:
+    def count(self, pixel_count: int, pointer: str) -> None:
+        """Count the pixels of a texture that is about to be made.
+
+        Raises:
+            InputError: They are too many, together with those that are there.
+        """
         self.pixel_count += pixel_count
-        if self.pixel_count > self.limits.texture_pixels:
-            raise InputError(
-                self.where,
-                f"{pointer}too many texture pixels (found {self.pixel_count} so far; "
-                f"limit {self.limits.texture_pixels})",
-                "use smaller textures, or raise --max-texture-pixels",
-            )
+        self.limits.check(
+            "texture_pixels",
+            self.pixel_count,
+            self.where,
+            f"{pointer}too many texture pixels",
+            more=" so far",
+            advice="use smaller textures",
+        )
 
 
 def grey_pixels() -> Pixels:
@@ -269,7 +305,7 @@ def unit(vectors: NDArray[np.float64]) -> NDArray[np.float32]:
     return np.where(is_unit, stored, scaled).astype(np.float32)
 
 
-def check_triangle_count(where: Path, count: int, limits: AssetLimits, more: str = "") -> None:
+def check_triangle_count(where: Path, count: int, limits: Limits, more: str = "") -> None:
     """Refuse more triangles than the limit.
 
     Args:
@@ -281,12 +317,9 @@ def check_triangle_count(where: Path, count: int, limits: AssetLimits, more: str
     Raises:
         InputError: There are more.
     """
-    if count > limits.triangles:
-        raise InputError(
-            where,
-            f"too many triangles (found {count}{more}; limit {limits.triangles})",
-            "decimate the mesh, or raise --max-triangles",
-        )
+    limits.check(
+        "triangles", count, where, "too many triangles", more=more, advice="decimate the mesh"
+    )
 
 
 def check_drawable(where: Path, primitives: list[Primitive], found: str) -> None:

@@ -22,13 +22,17 @@ from warpir.camera_source import (
 )
 from warpir.colmap import read_colmap
 from warpir.colmap_model import is_model
-from warpir.errors import ExitCode, InputError
+from warpir.errors import ExitCode, InputError, shown
 from warpir.exr_camera import read_exr_camera
 from warpir.fspy import read_fspy, read_fspy_project
 from warpir.gltf_camera import read_gltf_camera
+from warpir.limits import LIMITS, Limits
 from warpir.nerfstudio import read_nerfstudio
 from warpir.strict_json import read_json_object
 from warpir.waymo import read_waymo
+
+ASPECT_SLACK = 0.01
+"""Most that a camera's picture may differ in shape from the photograph, share of its long side."""
 
 
 def read_photo_camera(
@@ -39,6 +43,7 @@ def read_photo_camera(
     frame: str | None = None,
     photo_name: str | None = None,
     undistort: bool = False,
+    limits: Limits = LIMITS,
 ) -> PhotoCamera:
     """Read the camera of a photograph.
 
@@ -53,6 +58,7 @@ def read_photo_camera(
         frame: Which of the file's images or cameras; default: the one named as the photograph.
         photo_name: File name of the photograph.
         undistort: Accept lens distortion, which the caller will undo.
+        limits: How large the file may be.
 
     Raises:
         InputError: Missing, malformed, not a rigid right-handed pose, or of another aspect;
@@ -60,7 +66,7 @@ def read_photo_camera(
     """
     path = Path(path)
     axis = None if up is None else _up_axis(up)
-    stored = _read(path, photo_size, frame, photo_name)
+    stored = _read(path, photo_size, frame, photo_name, limits)
     if not (stored.lens.is_straight or undistort):
         worst = max((*stored.lens.radial, *stored.lens.tangential), key=abs)
         raise InputError(
@@ -96,19 +102,23 @@ def _up_axis(up: str) -> str:
 
 
 def _read(
-    path: Path, photo_size: tuple[int, int], frame: str | None, photo_name: str | None
+    path: Path,
+    photo_size: tuple[int, int],
+    frame: str | None,
+    photo_name: str | None,
+    limits: Limits,
 ) -> StoredCamera:
     """Recognise a file and read it."""
     if is_model(path):
-        return read_colmap(path, frame, photo_name)
+        return read_colmap(path, frame, photo_name, limits)
     magic = _magic(path)
     if magic == b"fspy":
-        return read_fspy_project(path)
+        return read_fspy_project(path, limits)
     if magic == b"\x76\x2f\x31\x01":
         return read_exr_camera(path)
     if magic == b"glTF" or path.suffix.lower() == ".gltf":
-        return read_gltf_camera(path, photo_size, frame)
-    content = read_json_object(path)
+        return read_gltf_camera(path, photo_size, frame, limits)
+    content = read_json_object(path, limits)
     if "cameraTransform" in content or "cameraParameters" in content:
         return read_fspy(path, content)
     if isinstance(content.get("frames"), list):
@@ -116,12 +126,13 @@ def _read(
     if any(key in content for key in ("intrinsic", "cameraCalibrations", "camera_calibrations")):
         return read_waymo(path, content, frame)
     if "asset" in content and "nodes" in content:
-        return read_gltf_camera(path, photo_size, frame)
+        return read_gltf_camera(path, photo_size, frame, limits)
     if "fx" in content or "c2w" in content:
         return _read_own(path, content)
+    keys = [shown(key) for key in list(content)[:8]]
     raise InputError(
         path,
-        f"not a camera that warpir reads (found keys {', '.join(list(content)[:8]) or 'none'}; "
+        f"not a camera that warpir reads (found keys {', '.join(keys) or 'none'}; "
         "expected fx fy cx cy w h c2w, or a file of fSpy, COLMAP, nerfstudio, Waymo or glTF)",
     )
 
@@ -148,8 +159,10 @@ def _read_own(path: Path, content: dict[str, Any]) -> StoredCamera:
 def _fit(path: Path, camera: Camera, photo_size: tuple[int, int]) -> Camera:
     """Scale to the photograph's size; note what looks odd."""
     width, height = photo_size
-    # The other side may have been rounded to a whole pixel, once in each size.
-    slack = max(width / camera.width, height / camera.height, 1.0)
+    # The other side may have been rounded to a whole pixel, once in each size. Of a camera for a
+    # tiny picture that pixel says nothing of the shape.
+    slack = max(width / camera.width, height / camera.height)
+    slack = max(min(slack, ASPECT_SLACK * max(width, height)), 1.0)
     if (
         abs(camera.width * height / camera.height - width) > slack
         and abs(camera.height * width / camera.width - height) > slack
@@ -174,7 +187,9 @@ def _fit(path: Path, camera: Camera, photo_size: tuple[int, int]) -> Camera:
 def _magic(path: Path) -> bytes:
     """Return the first four bytes of a file; none where there is none, for the reader to say."""
     try:
+        if not path.is_file():  # opening a pipe would wait for its other end
+            return b""
         with path.open("rb") as stream:
-            return stream.read(4) if path.is_file() else b""
+            return stream.read(4)
     except OSError:
         return b""

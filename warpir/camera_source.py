@@ -16,6 +16,8 @@ Float64Array = NDArray[np.float64]
 
 RIGID_TOLERANCE = 1e-4
 """How far R^T R may be from the identity; smaller errors are removed."""
+LARGEST = 1e15
+"""Largest number of a camera: of a matrix, an offset, a focal length."""
 NAMES_SHOWN = 8
 
 UP_TO_Y = {
@@ -137,6 +139,10 @@ def rigid(path: Path, name: str, rows: Any) -> Float64Array:
             f"/{name}: last row is not 0 0 0 1 (found {' '.join(f'{x:g}' for x in matrix[3])})",
         )
     rotation = matrix[:3, :3]
+    if (largest := float(np.abs(matrix).max())) > LARGEST:
+        raise InputError(
+            path, f"/{name}: numbers beyond every use (found {largest:g}; limit {LARGEST:g})"
+        )
     product = rotation.T @ rotation
     scale = float(np.trace(product)) / 3.0
     deviation = float(np.abs(product - np.eye(3)).max())
@@ -176,7 +182,7 @@ def member(path: Path, content: Any, key: str) -> dict[str, Any]:
 def number(path: Path, content: Any, key: str) -> float:
     """Return a number of an object, or refuse the file."""
     value = content.get(key) if isinstance(content, dict) else None
-    if isinstance(value, bool) or not isinstance(value, int | float) or abs(value) > 1e15:
+    if isinstance(value, bool) or not isinstance(value, int | float) or abs(value) > LARGEST:
         raise InputError(path, f"/{key}: not a number that can be used (found {str(value)[:40]})")
     return float(value)
 

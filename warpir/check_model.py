@@ -9,26 +9,27 @@ model, with 4 when it is not, and otherwise as `warpir.insert`.
 import sys
 from collections.abc import Sequence
 
-from warpir.command import make_parser, read_arguments, read_values
+from warpir.command import flags_of, make_parser, read_arguments, read_values
 from warpir.config import InsertConfig, flag, usage
 from warpir.errors import ExitCode
-from warpir.program import run_program, say
+from warpir.program import run_program, say, stay_offline
 
 USAGE = "python -m warpir.check_model --model DIR|ID [FLAG ...]"
 DESCRIPTION = "Check that a Stable Diffusion works and guides as a trained one should."
 FLAGS = {
-    "the check": {
-        "model": "DIR|ID",
-        "allow_download": "",
-        "photo": "FILE",
-        "prompt": "TEXT",
-        "device": "NAME",
-        "precision": "NAME",
-        "vae_precision": "NAME",
-        "vae_checkpointing": "",
-        "graphs": "",
-        "seed": "N",
-    }
+    "the check": flags_of(
+        "model",
+        "allow_download",
+        "allow_pickle",
+        "photo",
+        "prompt",
+        "device",
+        "precision",
+        "vae_precision",
+        "vae_checkpointing",
+        "graphs",
+        "seed",
+    ),
 }
 
 
@@ -60,6 +61,8 @@ def _run(arguments: list[str]) -> int:
     photo = read_photo(config.photo or PHOTO, max_pixels=config.max_pixels, alpha=config.alpha).srgb
 
     # torch, Warp and diffusers are loaded here, after everything else that can be wrong.
+    if not config.allow_download:
+        stay_offline()
     from warpir.model_check import load_and_check, write_report
 
     report = load_and_check(config, photo, say)

@@ -17,20 +17,29 @@ import shutil
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from safetensors import SafetensorError
-from safetensors.torch import load, save
-from torch import Tensor
 
-from warpir.errors import ExitCode, InputError
+from warpir.atomic import remove_folder, write_folder
+from warpir.errors import InputError, disk_error
+from warpir.files import remove_unfinished
+from warpir.signals import whole
 from warpir.strict_json import read_json_object
+
+if TYPE_CHECKING:
+    from torch import Tensor
 
 FORMAT = 1
 """Layout of a checkpoint; another is refused."""
 KEPT = 2
 """Checkpoints that stay on disk."""
 FOLDER = "checkpoints"
+UNUSABLE: tuple[type[Exception], ...] = (
+    *(InputError, OSError, SafetensorError, RecursionError),
+    *(AttributeError, KeyError, TypeError, ValueError),
+)
+"""What reading a damaged checkpoint raises; the latter for JSON values of other kinds."""
 STATE, MANIFEST = "state.safetensors", "manifest.json"
 
 
@@ -75,10 +84,12 @@ class Checkpoints:
         Raises:
             InputError: The disk is full or cannot be written (`ExitCode.RESOURCES`).
         """
+        from safetensors.torch import save  # torch: only whether there are any is asked without it
+
         tensors: dict[str, Tensor] = {}
         plain = _split(state, "", tensors)
         content = save(tensors)
-        manifest = {
+        manifest: dict[str, Any] = {
             "format": FORMAT,
             "stage": stage,
             "step": step,
@@ -86,24 +97,20 @@ class Checkpoints:
             "identity": self.identity,
             "state": plain,
         }
-        newest = self.newest
-        serial = int(newest.split("-")[0]) + 1 if newest is not None else 1
-        partial = self.folder / f".partial-{os.getpid()}"
+        serial = 1 + max((int(name.split("-")[0]) for name in self._names()), default=0)
+        path = self.folder / f"{serial:06d}-{stage}-{step}"
         try:
-            self.folder.mkdir(parents=True, exist_ok=True)
-            for abandoned in self.folder.glob(".partial-*"):  # of killed runs: --out is locked
-                shutil.rmtree(abandoned)
-            partial.mkdir()
-            _write(partial / STATE, content)
-            _write(partial / MANIFEST, json.dumps(manifest, allow_nan=False).encode())
-            os.replace(partial, self.folder / f"{serial:06d}-{stage}-{step}")
-            for old in list(self._names())[KEPT:]:
-                shutil.rmtree(self.folder / old)
+            with whole():
+                self.folder.mkdir(exist_ok=True)
+                for abandoned in self.folder.glob(".partial-*"):  # of killed runs: --out is locked
+                    shutil.rmtree(abandoned)
+                text = json.dumps(manifest | {"manifest_sha256": manifest_digest(manifest)})
+                write_folder(path, [(STATE, content), (MANIFEST, text.encode())])
+                for old in list(self._names())[KEPT:]:
+                    remove_folder(self.folder / old)
         except OSError as error:
-            shutil.rmtree(partial, ignore_errors=True)
-            why = error.strerror or str(error)
-            what = f"a checkpoint cannot be written ({why})"
-            raise InputError(self.folder, what, code=ExitCode.RESOURCES) from None
+            what = "a checkpoint cannot be written"
+            raise disk_error(self.folder, error, what) from None
 
     def load(self, notice: Callable[[str], None]) -> Checkpoint:
         """Return the newest checkpoint that is whole.
@@ -115,33 +122,59 @@ class Checkpoints:
             InputError: There is none, none is whole, or the run has changed; every field that
                 differs is named.
         """
-        problems = []
+        path, found, identity, problems = self._newest_whole()
+        self._compare(path, identity)
+        for problem in problems:
+            notice(f"checkpoint passed over: {problem}")
+        return found
+
+    def check(self) -> None:
+        """Compare what is known of the run so far with the checkpoint that it will go on from.
+
+        Raises:
+            InputError: As of `load`; what is not part of `identity` yet counts as the same.
+        """
+        path, _, identity, _ = self._newest_whole()
+        self._compare(path, {key: value for key, value in identity.items() if key in self.identity})
+
+    def _compare(self, path: Path, identity: dict[str, Any]) -> None:
+        differing = sorted(_differences(identity, self.identity))
+        if differing:
+            raise InputError(
+                path,
+                f"of a run with other inputs or settings ({'; '.join(differing)})",
+                "give the same again, or start the run again with --overwrite",
+            )
+
+    def _newest_whole(self) -> tuple[Path, Checkpoint, dict[str, Any], list[str]]:
+        """Return the newest whole checkpoint, of which run it is, and what is wrong with others."""
+        from safetensors.torch import load
+
+        problems: list[str] = []
         for name in self._names():
             path = self.folder / name
             try:
                 manifest = read_json_object(path / MANIFEST)
-                content = (path / STATE).read_bytes()
-                if hashlib.sha256(content).hexdigest() != manifest["sha256"]:
-                    raise InputError(path, "its sha256 is not the one that was written")
                 if manifest["format"] != FORMAT:
-                    raise InputError(path, f"of another format ({manifest['format']!r:.20})")
+                    found_format = repr(manifest["format"])[:20]
+                    what = f"of another format (found {found_format}; expected {FORMAT})"
+                    raise InputError(path, what)
+                if manifest.pop("manifest_sha256", None) != manifest_digest(manifest):
+                    raise InputError(path / MANIFEST, "its sha256 is not the one that was written")
+                content = (path / STATE).read_bytes()
+                digest = hashlib.sha256(content).hexdigest()
+                if digest != manifest["sha256"]:
+                    raise InputError(
+                        path / STATE,
+                        f"its sha256 is not the one that was written (found {digest}; "
+                        f"expected {manifest['sha256']!r:.70})",
+                    )
                 state = _join(manifest["state"], load(content))
                 found = Checkpoint(str(manifest["stage"]), int(manifest["step"]), state)
-                identity = dict(manifest["identity"])
-            except (InputError, OSError, SafetensorError, KeyError, TypeError, ValueError) as error:
+                return path, found, dict(manifest["identity"]), problems
+            except UNUSABLE as error:
                 why = error.what if isinstance(error, InputError) else repr(error)
-                problems.append(f"{name} is damaged: {why}")
-                continue
-            differing = sorted(_differences(identity, self.identity))
-            if differing:
-                raise InputError(
-                    path,
-                    f"of a run with other inputs or settings ({'; '.join(differing)})",
-                    "give the same again, or start the run again with --overwrite",
-                )
-            for problem in problems:
-                notice(f"checkpoint passed over: {problem}")
-            return found
+                problems.append(f"{name} cannot be used: {why}")
         if problems:
             advice = "--overwrite starts the run again"
             raise InputError(self.folder, "; ".join(problems), advice)
@@ -152,24 +185,25 @@ class Checkpoints:
         )
 
     def remove(self) -> None:
-        """Delete all of them: the run is complete, or starts again."""
-        shutil.rmtree(self.folder, ignore_errors=True)
+        """Delete all of them: the run starts again."""
+        remove_unfinished(self.folder)
 
     def _names(self) -> Iterator[str]:
-        """Yield the complete checkpoints, the newest first."""
-        found = self.folder.glob(f"[0-9]*-*-*/{MANIFEST}") if self.folder.is_dir() else ()
-        yield from sorted((path.parent.name for path in found), reverse=True)
+        """Yield the checkpoints, the newest first; damaged ones too, that they may be reported."""
+        found = self.folder.glob("[0-9]*-*-*") if os.path.isdir(self.folder) else ()
+        yield from sorted((path.name for path in found), reverse=True)
 
 
-def _write(path: Path, content: bytes) -> None:
-    with path.open("wb") as stream:
-        stream.write(content)
-        stream.flush()
-        os.fsync(stream.fileno())
+def manifest_digest(manifest: Mapping[str, Any]) -> str:
+    """Return the sha256 of all of a manifest but this."""
+    text = json.dumps(manifest, sort_keys=True, allow_nan=False)
+    return hashlib.sha256(text.encode()).hexdigest()
 
 
 def _split(state: Any, place: str, tensors: dict[str, Tensor]) -> Any:
     """Move the tensors of a nested state into ``tensors``; return the rest, plain."""
+    from torch import Tensor
+
     if isinstance(state, Tensor):
         # safetensors refuses tensors that share memory.
         tensors[place] = state.detach().cpu().contiguous().clone()
@@ -203,4 +237,4 @@ def _differences(then: Any, now: Any, place: str = "") -> Iterator[str]:
 
 def _shown(value: Any) -> str:
     text = json.dumps(value)
-    return text if len(text) <= 40 else text[:37] + "..."
+    return text if len(text) <= 80 else text[:77] + "..."  # a sha256 is shown whole

@@ -16,6 +16,7 @@ from warpir.camera_source import StoredCamera, choose_frame
 from warpir.colmap_model import MODELS, Image, Intrinsics, model_files, read_cameras, read_images
 from warpir.errors import InputError
 from warpir.lens import Lens
+from warpir.limits import LIMITS, Limits
 
 Float64Array = NDArray[np.float64]
 
@@ -24,18 +25,21 @@ UNIT_TOLERANCE = 1e-3
 """How far the length of a quaternion may be from 1 before it is not taken for one."""
 
 
-def read_colmap(path: Path, frame: str | None, photo: str | None) -> StoredCamera:
+def read_colmap(
+    path: Path, frame: str | None, photo: str | None, limits: Limits = LIMITS
+) -> StoredCamera:
     """Read the camera of one image of a model.
 
     Args:
         path: The model's folder, or one of its files.
         frame: The image's name; default: the photo's, or the only one.
         photo: File name of the photograph.
+        limits: How large the files may be.
 
     Raises:
         InputError: Damaged, of a camera model that is not understood, or without that image.
     """
-    cameras_path, images_path = model_files(path, "cameras", "images")
+    cameras_path, images_path = model_files(path, "cameras", "images", limits=limits)
     cameras, images = read_cameras(cameras_path), read_images(images_path)
     image = images[choose_frame(images_path, [i.name for i in images], frame, photo)]
     if image.camera_id not in cameras:

@@ -4,6 +4,7 @@ https://colmap.github.io/format.html
 """
 
 import math
+import os
 import struct
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
@@ -14,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from warpir.errors import InputError
+from warpir.limits import LIMITS, Limits
 
 Float64Array = NDArray[np.float64]
 
@@ -62,26 +64,30 @@ class Image:
 
 def is_model(path: Path) -> bool:
     """Whether a path is a folder, or a file of a model by its name."""
-    return path.is_dir() or (
+    return os.path.isdir(path) or (  # unlike Path's, False too for a name that is too long
         path.suffix in (".txt", ".bin") and path.stem in ("cameras", "images", "points3D")
     )
 
 
-def model_files(path: Path, *stems: str) -> list[Path]:
+def model_files(path: Path, *stems: str, limits: Limits = LIMITS) -> list[Path]:
     """Return the files of a model, binary ones first, as COLMAP looks for them.
 
     Args:
         path: The model's folder, or one of its files, whose kind is then taken.
         stems: ``cameras``, ``images`` or ``points3D``.
+        limits: How large each may be.
 
     Raises:
-        InputError: A file is missing.
+        InputError: A file is missing or too large.
     """
     folder = path if path.is_dir() else path.parent
     kinds = (".bin", ".txt") if path.is_dir() else (path.suffix,)
     for kind in kinds:
         files = [folder / f"{stem}{kind}" for stem in stems]
-        if all(file.is_file() for file in files):
+        if all(map(os.path.isfile, files)):
+            for file in files:
+                size = file.stat().st_size
+                limits.check("file_bytes", size, file, "too large", more=" bytes")
             return files
     expected = " or ".join(" and ".join(stem + kind for stem in stems) for kind in kinds[::-1])
     hint = ", such as sparse/0" if path.is_dir() else ""
@@ -106,26 +112,30 @@ def read_images(path: Path) -> list[Image]:
     return list(_binary_images(path) if path.suffix == ".bin" else _text_images(path))
 
 
-def read_points(path: Path) -> Float64Array:
+def read_points(path: Path, limits: Limits = LIMITS) -> Float64Array:
     """Read the points of a model, world of the file, shape [point, 3].
 
     Args:
         path: The model's folder, or one of its files.
+        limits: How many they may be, and how large their file.
 
     Raises:
-        InputError: Missing or damaged.
+        InputError: Missing, damaged or too large.
     """
-    (points_path,) = model_files(path, "points3D")
+    (points_path,) = model_files(path, "points3D", limits=limits)
     if points_path.suffix == ".txt":
         rows: list[Sequence[float]] = []
         for where, line in _lines(points_path):
             words = line.split(maxsplit=8)
             _require(points_path, where, len(words) >= 8, f"{len(words)} values", "at least 8")
             rows.append(_floats(points_path, where, words[1:4]))
+            limits.check("points", len(rows), points_path, "too many points", more=" so far")
         return np.array(rows, dtype=np.float64).reshape(-1, 3)
     with _Binary(points_path) as file:
         rows = []
-        for _ in range(file.count(43)):
+        count = file.count(43)
+        limits.check("points", count, points_path, "too many points")
+        for _ in range(count):
             rows.append(file.take("<8x3d3x8x"))
             file.skip(8 * file.take("<Q")[0])
         file.end()
@@ -216,6 +226,10 @@ def _intrinsics(
 # ----------------------------------------------------------------------------------------- binary
 
 
+NAME_BYTES = 4096
+"""Longest name of an image: that of a path."""
+
+
 class _Binary:
     """A binary file of little-endian numbers, read from start to end."""
 
@@ -263,6 +277,8 @@ class _Binary:
             if not byte:
                 raise self.truncated()
             raw += byte
+            if len(raw) > NAME_BYTES:
+                raise InputError(self.path, f"damaged: a name of more than {NAME_BYTES} bytes")
         return raw.decode("utf-8", "replace")
 
     def end(self) -> None:

@@ -5,6 +5,7 @@ functions exist on purpose: the sRGB pair describes what files mean, the gamma 2
 DiPIR uses between the photograph and the renderer (`photo_lin = photo_srgb ** 2.2`).
 """
 
+import sys
 import warnings
 from collections.abc import Sequence
 from typing import Any
@@ -45,7 +46,7 @@ INTEROP_SPACES = {
 
 def chromaticities_of(space: str) -> tuple[float, ...]:
     """Return CIE xy of red, green, blue and white of one of colour-science's RGB spaces."""
-    found = _colour().RGB_COLOURSPACES[space]
+    found = colour_science().RGB_COLOURSPACES[space]
     return (*found.primaries.ravel().tolist(), *np.asarray(found.whitepoint).tolist())
 
 
@@ -66,7 +67,7 @@ def primaries_to_xyz(chromaticities: Sequence[float], white: Sequence[float]) ->
         white: CIE xy of the white that theirs is adapted to (Bradford), with Y = 1.
     """
     xy = np.asarray(chromaticities, np.float64).reshape(4, 2)
-    colour = _colour()
+    colour = colour_science()
     to_xyz = colour.models.normalised_primary_matrix(xy[:3], xy[3])
     adapt = colour.adaptation.matrix_chromatic_adaptation_VonKries(
         colour.xy_to_XYZ(xy[3]), colour.xy_to_XYZ(np.asarray(white)), transform="Bradford"
@@ -81,11 +82,20 @@ def primaries_to_rec709(chromaticities: Sequence[float]) -> FloatArray:
     return matrix
 
 
-def _colour() -> Any:
-    """Import colour-science, which takes a second, for the few files that need it."""
+def colour_science() -> Any:
+    """Import colour-science, which takes a second, for the few files that need it.
+
+    Where Matplotlib is absent, colour-science leaves a mock of it in ``sys.modules``, and then
+    diffusers, which looks for Matplotlib, cannot be imported any more. So the mock is taken out.
+    """
+    plotting = {n: m for n, m in sys.modules.items() if n.split(".")[0] == "matplotlib"}
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # Matplotlib, which we do not need, is absent
         import colour
+    for name in [n for n in sys.modules if n.split(".")[0] == "matplotlib"]:
+        if getattr(sys.modules[name], "__spec__", None) is None:
+            del sys.modules[name]
+    sys.modules.update({n: m for n, m in plotting.items() if n not in sys.modules})
     return colour
 
 

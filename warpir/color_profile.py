@@ -7,6 +7,7 @@ cHRM) becomes a profile first, and so does the curve of a grey image: one path f
 
 import hashlib
 import io
+import math
 import struct
 import tempfile
 from collections.abc import Sequence
@@ -190,9 +191,51 @@ def _profile_is_whole(icc: bytes) -> bool:
         offset, size = struct.unpack_from(">4xII", icc, 132 + 12 * k)
         if size < 8 or offset + size > len(icc):
             return False
+        if not _table_is_whole(icc[offset : offset + size]):
+            return False
         if icc[offset : offset + 4] == b"curv":
             if size < 12 or 12 + 2 * struct.unpack_from(">I", icc, offset + 8)[0] > size:
                 return False
+    return True
+
+
+_COLOR_TAGS = (
+    *(b"A2B", b"B2A", b"wtpt", b"chad", b"rXYZ", b"gXYZ", b"bXYZ"),
+    *(b"rTRC", b"gTRC", b"bTRC", b"kTRC"),
+)
+
+
+def _colors_alone(icc: bytes) -> bytes:
+    """Return a profile without its texts, whose lengths OpenColorIO believes, up to gigabytes."""
+    (count,) = struct.unpack_from(">I", icc, 128)
+    entries = [icc[132 + 12 * k : 144 + 12 * k] for k in range(count)]
+    kept = [entry for entry in entries if entry.startswith(_COLOR_TAGS)]
+    table = struct.pack(">I", len(kept)) + b"".join(kept)
+    # What the others pointed to stays where it was, so that no offset changes.
+    return icc[:128] + table + bytes(12 * (count - len(kept))) + icc[132 + 12 * count :]
+
+
+def _table_is_whole(tag: bytes) -> bool:
+    """Check that the numbers of a lookup table are as many as its sizes say, where it is one."""
+    if tag[:4] in (b"mft1", b"mft2"):
+        width = 1 if tag[:4] == b"mft1" else 2
+        if len(tag) < 52:
+            return False
+        inputs, outputs, points = tag[8:11]
+        rows = struct.unpack_from(">2H", tag, 48) if width == 2 else (256, 256)
+        numbers = inputs * rows[0] + points**inputs * outputs + outputs * rows[1]
+        return bool((52 if width == 2 else 48) + width * numbers <= len(tag))
+    if tag[:4] in (b"mAB ", b"mBA "):
+        if len(tag) < 32:
+            return False
+        inputs, outputs = tag[8:10]
+        (start,) = struct.unpack_from(">I", tag, 24)
+        if not start:
+            return True
+        if inputs > 16 or start + 20 > len(tag):
+            return False
+        points, width = math.prod(tag[start : start + inputs]), tag[start + 16]
+        return bool(start + 20 + width * points * outputs <= len(tag))
     return True
 
 
@@ -203,7 +246,7 @@ def _convert_lut_profile(
     from PIL import Image, ImageCms
 
     try:
-        profile = ImageCms.ImageCmsProfile(io.BytesIO(icc))
+        profile = ImageCms.ImageCmsProfile(io.BytesIO(_colors_alone(icc)))
         space = str(profile.profile.xcolor_space).strip()
     except (OSError, ValueError, ImageCms.PyCMSError):
         return codes, srgb, None, "colour profile is broken: taken as sRGB"
@@ -260,7 +303,7 @@ def _apply_profile(values: FloatArray, icc: bytes, inverse: bool) -> FloatArray 
     with tempfile.TemporaryDirectory(prefix="warpir-icc-") as folder:
         # OpenColorIO caches by path, so the path must tell profiles apart: the folder is new.
         profile_path = Path(folder) / f"{hashlib.sha256(icc).hexdigest()[:16]}.icc"
-        profile_path.write_bytes(icc)
+        profile_path.write_bytes(_colors_alone(icc))
         source = oiio.ImageBuf(np.ascontiguousarray(values, dtype=np.float32))
         target = oiio.ImageBuf()
         with captured_stderr():

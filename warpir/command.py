@@ -10,21 +10,27 @@ import ast
 import difflib
 import inspect
 import json
+import re
 import stat
 import types
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, fields
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, NoReturn, Union, get_args, get_origin, get_type_hints
 
 import warpir
 from warpir.config import CPU_DEFAULTS, DEFAULTS, PRIOR_DEFAULTS, InsertConfig, flag, usage
 from warpir.diffusion.settings import GuidanceSettings
-from warpir.errors import ExitCode, InputError, raise_all
+from warpir.errors import LISTED, SHOWN, ExitCode, InputError, raise_all, shown
+from warpir.limits import Limits
 from warpir.record import RUN_FORMAT
 from warpir.strict_json import read_json_object
 
-CONFIG_BYTES_LIMIT = 16 * 2**20
+YAML_SHARE = 256
+"""YAML takes this many times as long to read as JSON, so it may be as much shorter."""
+
+YAML = "tag:yaml.org,2002:"
+"""Begins the tags of YAML's own types."""
 
 FLAGS = {
     "input and output": {
@@ -81,6 +87,7 @@ FLAGS = {
         "device": "NAME",
         "threads": "N",
         "seed": "N",
+        "deterministic": "",
     },
     "guidance": {
         "guidance": "NAME",
@@ -112,6 +119,7 @@ FLAGS = {
     "diffusion model": {
         "model": "DIR|ID",
         "allow_download": "",
+        "allow_pickle": "",
         "precision": "NAME",
         "vae_precision": "NAME",
         "vae_checkpointing": "",
@@ -180,6 +188,7 @@ FLAGS = {
     "applications": {
         "reuse": "DIR",
         "sequence": "FILE",
+        "fps": "N",
         "refine": "WHAT",
         "refine_parts": "NAME,NAME",
         "refine_materials": "NAME,NAME",
@@ -188,15 +197,31 @@ FLAGS = {
         "alpha": "RULE",
         "max_pixels": "N",
         "strict": "",
+        "max_envmap_width": "PX",
+        "max_file_bytes": "BYTES",
         "max_triangles": "N",
         "max_texture_pixels": "N",
+        "max_nodes": "N",
+        "max_instances": "N",
+        "max_points": "N",
+        "max_json_bytes": "BYTES",
+        "max_gltf_json_bytes": "BYTES",
+        "max_json_values": "N",
+        "max_nesting": "LEVELS",
+        "max_prompt_bytes": "BYTES",
         "missing_textures": "RULE",
         "mark": "",
         "hand_off": "",
+        "report": "",
         "mitsuba": "",
     },
 }
 """Every field of `InsertConfig` by its heading in ``--help``, with what stands for its value."""
+FORMS = {name: form for forms in FLAGS.values() for name, form in forms.items()}
+"""The forms of all flags by their fields."""
+BY_HAND = ("allow_download", "allow_pickle")
+"""What a file cannot switch on, since files come from others: it opens the network, or runs code.
+"""
 SEPARATORS = {"show_prior": "|"}
 """What parts the texts of a list, where they may hold commas."""
 
@@ -221,6 +246,11 @@ class Command:
     """Where a flag replaced a value of the configuration file, one line each."""
 
 
+def flags_of(*names: str) -> dict[str, str]:
+    """Return some of an insertion's flags, for a program that takes these alone."""
+    return {name: FORMS[name] for name in names}
+
+
 def parse(argv: Sequence[str]) -> Command:
     """Read a command line, and the configuration file it names.
 
@@ -231,7 +261,10 @@ def parse(argv: Sequence[str]) -> Command:
     """
     texts = read_arguments(_make_parser(), argv)
     validate, path = texts.pop("validate", False), texts.pop("config", None)
-    filed = _read_config_file(path) if path is not None else {}
+    filed: dict[str, Any] = {}
+    if path is not None:
+        filed = _read_config_file(path, _limits_for_config(texts))
+        raise_all([_not_by_hand(path, n) for n in BY_HAND if filed.get(n) and n not in texts])
     config = _make_config({name: (text, flag(name)) for name, text in texts.items()}, filed)
     notices = tuple(
         f"{flag(name)} given at the command line replaces the value in {path}"
@@ -240,6 +273,18 @@ def parse(argv: Sequence[str]) -> Command:
     )
     config.require_inputs()
     return Command(config, validate, notices)
+
+
+def _not_by_hand(path: str, name: str) -> InputError:
+    what = f"{name} is set, which counts at the command line alone"
+    return usage(path, what, f"give {flag(name)} there if you want it")
+
+
+def _limits_for_config(texts: Mapping[str, Any]) -> Limits:
+    """Return the limits of the configuration file itself, which flags alone can set."""
+    names = ("max_json_bytes", "max_json_values", "max_nesting")
+    values = read_values({name: (texts[name], flag(name)) for name in names if name in texts})
+    return InsertConfig(**values).limits
 
 
 def _make_config(given: Mapping[str, tuple[Any, str]], filed: Mapping[str, Any]) -> InsertConfig:
@@ -305,6 +350,8 @@ def _convert(value: Any, hint: Any, separator: str = ",") -> Any:
         raise ValueError
     if not isinstance(value, str | int | float) or (hint is int and isinstance(value, float)):
         raise ValueError
+    if isinstance(value, str) and "_" in value:
+        raise ValueError  # Python would read 1_0 as 10
     try:
         return hint(value)
     except OverflowError:
@@ -320,13 +367,12 @@ def _expected(name: str, hint: Any) -> str:
     arms = [arm for arm in (get_args(hint) or (hint,)) if arm is not type(None)]
     if len(arms) == 1 and arms[0] in kinds:
         return kinds[arms[0]]
-    form = next(group[name] for group in FLAGS.values() if name in group)
-    return form
+    return FORMS[name]
 
 
 def _shown(value: Any) -> str:
     # Not repr(): a YAML file of aliases can hold 10^9 entries in a few lines.
-    return ascii(value[:60]) if isinstance(value, str) else _kind(value)
+    return shown(value) if isinstance(value, str) else _kind(value)
 
 
 def _kind(value: Any) -> str:
@@ -337,8 +383,15 @@ def _kind(value: Any) -> str:
     return "a mapping" if isinstance(value, dict) else "another kind"
 
 
-class _Parser(argparse.ArgumentParser):
+class Parser(argparse.ArgumentParser):
+    """A parser whose errors are ours: one line, not a page of usage."""
+
     def error(self, message: str) -> NoReturn:
+        """Refuse a command line.
+
+        Raises:
+            InputError: Always (`ExitCode.USAGE`).
+        """
         raise usage("command line", message)
 
 
@@ -372,7 +425,7 @@ def make_parser(
         epilog: What follows the flags.
         flags: As `FLAGS`.
     """
-    parser = _Parser(
+    parser = Parser(
         prog=f"python -m warpir.{program}",
         usage=usage_line,
         description=description,
@@ -466,7 +519,7 @@ def _join_minus_values(argv: Sequence[str]) -> list[str]:
 
     argparse takes ``-1,0,-3`` (and a file named ``-x.png``) for a flag of its own.
     """
-    takes_value = {flag(name) for forms in FLAGS.values() for name, form in forms.items() if form}
+    takes_value = {flag(name) for name, form in FORMS.items() if form}
     takes_value.add("--config")
     joined: list[str] = []
     for argument in argv:
@@ -478,7 +531,7 @@ def _join_minus_values(argv: Sequence[str]) -> list[str]:
     return joined
 
 
-def _read_config_file(path: str) -> dict[str, Any]:
+def _read_config_file(path: str, limits: Limits) -> dict[str, Any]:
     """Read the keys of a configuration file or the ``config`` of a ``run.json``.
 
     Relative paths in it mean what they mean at the command line: they start at the working
@@ -487,7 +540,7 @@ def _read_config_file(path: str) -> dict[str, Any]:
     Raises:
         InputError: The file cannot be read or holds an unknown key (`ExitCode.USAGE`).
     """
-    content = _load(path)
+    content = _load(path, limits)
     if not isinstance(content, dict):
         raise usage(path, f"keys and values expected (found {_kind(content)})")
     if isinstance(content.get("config"), dict):
@@ -499,30 +552,74 @@ def _read_config_file(path: str) -> dict[str, Any]:
                 "use the warpir version that wrote it",
             )
         content = content["config"]
-    names = [field.name for field in fields(InsertConfig)]
-    filed, problems = {}, []
-    for key, value in content.items():
-        name = key.replace("-", "_") if isinstance(key, str) else ""
-        if name in names:
-            filed[name] = value
-        else:
-            problems.append(usage(path, f"unknown key {_shown(key)}", closest(name, names)))
+    return by_name(path, content)
+
+
+def by_name(where: str, content: Mapping[Any, Any]) -> dict[str, Any]:
+    """Return the values of a file by the names of their fields, written with ``-`` or ``_``.
+
+    Raises:
+        InputError: Keys are unknown, with advice for the first, or mean the same
+            (`ExitCode.USAGE`).
+    """
+    given = {str(key).replace("-", "_"): value for key, value in content.items()}
+    unknown = [str(key) for key in content if str(key).replace("-", "_") not in DEFAULTS]
+    problems = [usage(where, f"unknown key {shown(key)}") for key in unknown[:LISTED]]
+    if problems:
+        problems[0].advice = closest(unknown[0].replace("-", "_"), list(DEFAULTS))
+    if len(unknown) > LISTED:
+        problems.append(usage(where, f"{len(unknown) - LISTED} more unknown keys"))
     raise_all(problems)
-    return filed
+    if len(given) < len(content):
+        raise usage(where, "a key is given twice, once with - and once with _")
+    return given
 
 
-def _load(path: str) -> Any:
+def _load(path: str, limits: Limits) -> Any:
     """Parse a file into plain values: JSON by its extension, anything else as YAML."""
     if Path(path).suffix.lower() == ".json":
         try:
-            return read_json_object(path, CONFIG_BYTES_LIMIT)
+            return read_json_object(path, limits)
         except InputError as error:
             error.code = ExitCode.USAGE
             raise
     import yaml
 
+    class Loader(yaml.SafeLoader):
+        level = 0
+
+        def compose_sequence_node(self, anchor: Any) -> Any:
+            return self.deeper(super().compose_sequence_node, anchor)
+
+        def compose_mapping_node(self, anchor: Any) -> Any:
+            return self.deeper(super().compose_mapping_node, anchor)
+
+        def compose_scalar_node(self, anchor: Any) -> Any:
+            node = super().compose_scalar_node(anchor)
+            # YAML 1.1 reads 0640 as 416, 1:30 as 90 and 0x10 as 16; a flag does not.
+            is_int = node.tag == f"{YAML}int"
+            if (is_int and not re.fullmatch("[-+]?(0|[1-9][0-9_]*)", node.value)) or (
+                node.tag == f"{YAML}float" and ":" in node.value
+            ):
+                line = f"line {node.start_mark.line + 1}: "
+                what = f"{line}{shown(node.value)} is no decimal number without leading zeros"
+                raise usage(path, what, "quote a text")
+            return node
+
+        def deeper(self, compose: Callable[[Any], Any], anchor: Any) -> Any:
+            self.level += 1
+            _within(limits, "nesting", self.level, path, "nested too deeply", " levels")
+            node = compose(anchor)
+            self.level -= 1
+            return node
+
+        def flatten_mapping(self, node: Any) -> None:
+            # Merges of merges grow without end, in a few lines; no configuration needs one.
+            if any(key.tag == f"{YAML}merge" for key, _ in node.value):
+                raise usage(path, f"line {node.start_mark.line + 1}: merge keys (<<) are not read")
+
     try:
-        loader = yaml.SafeLoader(_read_text(path))
+        loader = Loader(_read_text(path, limits))
         try:
             node = loader.get_single_node()
             _refuse_double_keys(path, node)
@@ -533,20 +630,26 @@ def _load(path: str) -> Any:
         mark = error.problem_mark
         line = f"line {mark.line + 1}: " if mark is not None else ""
         raise usage(path, f"{line}not YAML ({error.problem})") from None
-    except RecursionError:
-        raise usage(path, "nested too deeply") from None
     except (yaml.YAMLError, ValueError, TypeError) as error:
         raise usage(path, f"not usable YAML ({str(error).splitlines()[0][:120]})") from None
 
 
-def _read_text(path: str) -> str:
+def _within(limits: Limits, name: str, found: int, path: str, what: str, more: str) -> None:
+    """As `Limits.check`, with the status of a wrong configuration."""
+    try:
+        limits.check(name, found, path, what, more=more)
+    except InputError as error:
+        error.code = ExitCode.USAGE
+        raise
+
+
+def _read_text(path: str, limits: Limits) -> str:
     try:
         status = Path(path).stat()
         if not stat.S_ISREG(status.st_mode):
             raise usage(path, "not a regular file")
-        if status.st_size > CONFIG_BYTES_LIMIT:
-            expected = f"at most {CONFIG_BYTES_LIMIT}"
-            raise usage(path, f"too large (found {status.st_size} bytes; expected {expected})")
+        limit = replace(limits, json_bytes=limits.json_bytes // YAML_SHARE)
+        _within(limit, "json_bytes", status.st_size, path, "too large for YAML", " bytes")
         return Path(path).read_text(encoding="utf-8-sig")
     except UnicodeDecodeError:
         raise usage(path, "not UTF-8 text") from None
@@ -559,13 +662,15 @@ def _refuse_double_keys(path: str, node: Any) -> None:
     """Refuse a key given twice, of which PyYAML would silently keep the last."""
     seen: set[str] = set()
     for key, _ in node.value if node is not None and node.id == "mapping" else ():
-        name = str(key.value)
-        if name in seen:
-            raise usage(path, f"line {key.start_mark.line + 1}: key {_shown(name)} twice")
-        seen.add(name)
+        line = f"line {key.start_mark.line + 1}: "
+        if key.id != "scalar":  # its text may be 10^9 entries, by aliases
+            raise usage(path, f"{line}unknown key (found a {key.id})")
+        if key.value in seen:
+            raise usage(path, f"{line}key {shown(key.value)} twice")
+        seen.add(key.value)
 
 
 def closest(name: str, names: Sequence[str]) -> str:
     """Return advice for a name that is none of ``names``."""
-    close = difflib.get_close_matches(name, names, n=1)
+    close = difflib.get_close_matches(name[:SHOWN], names, n=1)
     return f"did you mean {close[0]}?" if close else "see --help"

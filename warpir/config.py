@@ -7,9 +7,13 @@ configuration file and one entry under ``config`` in ``run.json``. The line belo
 
 import math
 import re
-from collections.abc import Iterator
+from collections.abc import Container, Iterator, Mapping
 from dataclasses import dataclass, fields, replace
-from typing import Any
+from functools import cache
+from numbers import Integral, Real
+from os import PathLike
+from types import UnionType
+from typing import Any, get_args, get_origin, get_type_hints
 
 from warpir.diffusion.prompts import make_prompts
 from warpir.diffusion.settings import (
@@ -19,6 +23,7 @@ from warpir.diffusion.settings import (
     PersonalizeSettings,
 )
 from warpir.errors import ExitCode, InputError, raise_all
+from warpir.limits import LIMITS, Limits
 from warpir.optimize_settings import OptimizeSettings
 
 SKY_PRESETS = ("clear", "overcast", "sunset")
@@ -26,7 +31,6 @@ REFINE_STEPS = {"material": 300, "emission": 300, "tone": 200}
 REFINE_PARTS = ("base-color", "metallic", "roughness")
 SEED_LIMIT = 2**32
 """Seeds are the 32-bit words that the kernels hash."""
-PROMPT_BYTES_LIMIT = 4096
 DEVICE_FORM = re.compile(r"cpu|cuda(:\d+)?")
 DEMO_HINT = "--demo needs neither --photo nor --asset"
 
@@ -204,18 +208,41 @@ class InsertConfig(ModelSettings, PersonalizeSettings, GuidanceChoices, Optimize
     """CPU threads (default: one per core)"""
     seed: int = 0
     """Seed of all random numbers"""
+    deterministic: bool = False
+    """Repeat the same bytes on a GPU too, slower; on the CPU every run does"""
 
     alpha: str = "refuse"
     """What to do with a photo that has transparency: refuse or ignore"""
-    max_pixels: int = 64_000_000
-    """Largest photo that is opened [px]"""
+    max_pixels: int = LIMITS.pixels
+    """Largest photo or mask that is opened [px]"""
+    max_envmap_width: int = LIMITS.envmap_width
+    """Widest panorama that is opened [px]"""
     strict: bool = False
     """Refuse a photo or panorama with values that are not finite, or a light with negative ones,
     in place of repairing them"""
-    max_triangles: int = 20_000_000
-    """Largest asset that is read, instances counted [triangles]"""
-    max_texture_pixels: int = 512_000_000
+    max_file_bytes: int = LIMITS.file_bytes
+    """Largest mesh, texture, point cloud or file of a COLMAP model that is read [byte]"""
+    max_triangles: int = LIMITS.triangles
+    """Largest asset or proxy that is read, instances counted [triangles]"""
+    max_texture_pixels: int = LIMITS.texture_pixels
     """Most pixels of all textures of the asset together [px]"""
+    max_nodes: int = LIMITS.nodes
+    """Most nodes of a glTF file"""
+    max_instances: int = LIMITS.instances
+    """Most meshes that a glTF file places, each instance counted"""
+    max_points: int = LIMITS.points
+    """Most points of --ground-points"""
+    max_json_bytes: int = LIMITS.json_bytes
+    """Largest JSON file: configuration, camera, lobes, materials, sequence [byte]; of YAML, which
+    takes longer to read, a 256th"""
+    max_gltf_json_bytes: int = LIMITS.gltf_json_bytes
+    """Largest JSON of a glTF file [byte]"""
+    max_json_values: int = LIMITS.json_values
+    """Most values in a JSON file, lists and objects counted"""
+    max_nesting: int = LIMITS.nesting
+    """Most levels of lists and objects within each other in JSON and YAML"""
+    max_prompt_bytes: int = 4096
+    """Longest prompt [byte]"""
     missing_textures: str = "error"
     """What to do when a texture of the asset is missing: error, or grey in its place"""
     detail: bool = True
@@ -225,6 +252,8 @@ class InsertConfig(ModelSettings, PersonalizeSettings, GuidanceChoices, Optimize
     """Note in the picture's metadata that it is a composite"""
     hand_off: bool = True
     """Write the files for Blender, three.js and colour tools as well"""
+    report: bool = True
+    """Write report.html, a page that shows the result, the light and all figures"""
     mitsuba: bool = False
     """Write the insertion as a scene of Mitsuba 3 as well, into a folder of its own"""
 
@@ -262,6 +291,8 @@ class InsertConfig(ModelSettings, PersonalizeSettings, GuidanceChoices, Optimize
     sequence: str | None = None
     """JSON lines, each a frame: what differs from the command line, such as {"photo": "2.png",
     "place": [0, 0, -4]}; needs --reuse"""
+    fps: float = 24.0
+    """Frames per second of the video of --sequence, which is made where ffmpeg is found"""
     refine: str | None = None
     """What is changed by the prompt under a known light (--reuse, --light, --sun or --sky):
     material, emission or tone"""
@@ -275,6 +306,11 @@ class InsertConfig(ModelSettings, PersonalizeSettings, GuidanceChoices, Optimize
         raise_all([*_values_out_of_range(self), *_values_that_clash(self)])
 
     @property
+    def limits(self) -> Limits:
+        """What each input may cost."""
+        return Limits(**{f.name: getattr(self, f"max_{f.name}") for f in fields(Limits)})
+
+    @property
     def guided_by(self) -> str:
         """``guidance``, or what stands for it: embedded, stable-diffusion or none."""
         if self.guidance is not None:
@@ -283,6 +319,11 @@ class InsertConfig(ModelSettings, PersonalizeSettings, GuidanceChoices, Optimize
             return "stable-diffusion"
         is_lit = any(getattr(self, name) is not None for name in LIGHTS)
         return "none" if is_lit else "embedded"
+
+    @property
+    def is_light_described(self) -> bool:
+        """Whether the user said anything about the light."""
+        return any(v is not None for v in (self.light, self.sun, self.sky))
 
     @property
     def is_guided(self) -> bool:
@@ -359,6 +400,8 @@ def usage(where: str, what: str, advice: str = "") -> InputError:
     return InputError(where, what, advice, ExitCode.USAGE)
 
 
+LARGEST = 1e9
+"""Of a coordinate [m] and of a light's strength; float32 products overflow from 10^19 on."""
 RANGES: dict[str, tuple[float, float | None]] = {
     "pitch": (-90, 90),
     "fit_lobes": (1, 4096),
@@ -367,12 +410,29 @@ RANGES: dict[str, tuple[float, float | None]] = {
     "rays": (1, 2**10),
     "depth": (1, 2**10),
     "indirect_limit": (0, None),
+    # Far beyond what anybody photographs, and products of them still fit float32.
+    "camera_height": (1e-6, 1e9),
+    "scale": (1e-9, 1e9),
+    "size": (1e-6, 1e9),
+    "ground_albedo": (1e-6, 1),
     "width": (8, 65_536),
     "threads": (1, 2**10),
     "seed": (0, SEED_LIMIT - 1),
+    "fps": (1, 240),
     "max_pixels": (1, None),
+    "max_envmap_width": (1, 2**20),
+    "max_file_bytes": (1, None),
     "max_triangles": (1, None),
     "max_texture_pixels": (1, None),
+    "max_nodes": (1, None),
+    "max_instances": (1, None),
+    "max_points": (1, None),
+    "max_json_bytes": (1, None),
+    "max_gltf_json_bytes": (1, None),
+    "max_json_values": (1, None),
+    # Python's readers call themselves for each level.
+    "max_nesting": (1, 200),
+    "max_prompt_bytes": (1, None),
     # The diffusion model, and its adaptation to the photo
     "class_images": (0, 10_000),
     "class_steps": (1, 1000),
@@ -435,7 +495,7 @@ RANGES: dict[str, tuple[float, float | None]] = {
 }
 """Least and greatest value of a field; None: no limit."""
 
-ABOVE_ZERO = ("camera_height", "scale", "size", "ground_albedo", "lora_rate", "chroma_limit")
+ABOVE_ZERO = ("lora_rate", "chroma_limit")
 
 AXES = ("x", "+x", "-x", "y", "+y", "-y", "z", "+z", "-z")
 CHOICES = {
@@ -484,6 +544,28 @@ PROMPTS = (
 EMPTY_ALLOWED = ("negative_prompt", "null_prompt", "base_prompt")
 
 
+@cache
+def _kinds() -> dict[str, Any]:
+    """Return the annotations of all fields."""
+    return get_type_hints(InsertConfig)
+
+
+def _is_a(value: object, kind: Any) -> bool:
+    """Return whether a value is what an annotation says; lists are tuples, and paths are texts."""
+    if get_origin(kind) is UnionType:
+        return any(_is_a(value, alternative) for alternative in get_args(kind))
+    if get_origin(kind) is tuple:
+        parts = get_args(kind)
+        if not isinstance(value, tuple | list):
+            return False
+        parts = parts[:1] * len(value) if parts[-1] is Ellipsis else parts
+        return len(parts) == len(value) and all(map(_is_a, value, parts))
+    if kind is bool or isinstance(value, bool):
+        return kind is bool and isinstance(value, bool)
+    accepted: Any = {float: Real, int: Integral, str: str | PathLike}.get(kind, kind)
+    return isinstance(value, accepted)
+
+
 def _values_out_of_range(config: InsertConfig) -> Iterator[InputError]:
     def check(name: str, accepted: bool, expected: str) -> Iterator[InputError]:
         value = getattr(config, name)
@@ -492,12 +574,22 @@ def _values_out_of_range(config: InsertConfig) -> Iterator[InputError]:
             yield usage(flag(name), f"{expected} (found {_shown(value)})")
 
     values = {field.name: getattr(config, field.name) for field in fields(config)}
+    of_other_kinds = [name for name, value in values.items() if not _is_a(value, _kinds()[name])]
+    for name in of_other_kinds:
+        expected = str(_kinds()[name]).removeprefix("<class '").removesuffix("'>")
+        yield usage(flag(name), f"expected {expected} (found {_shown(values[name])})")
+    if of_other_kinds:
+        return  # from Python alone, and no other check would know what to do with them
     for name, value in values.items():
-        yield from _not_plain(name, value)
+        yield from _not_plain(name, value, config.max_prompt_bytes)
     yield from check("fov", config.fov is None or 0.0 < config.fov < 180.0, "between 0 and 180")
     in_order = config.fusion_end >= config.fusion_start
     yield from check("fusion_end", in_order, "at least --fusion-start")
-    yield from check("ground_albedo", config.ground_albedo <= 1.0, "at most 1")
+    for name in ("place", "ground", "sun", "sky", "at"):
+        parts = values[name]
+        if isinstance(parts, tuple):
+            within = not any(abs(part) > LARGEST for part in parts)
+            yield from check(name, within, f"numbers up to {LARGEST:g}")
     if config.ground is not None and all(map(math.isfinite, config.ground)):
         yield from check("ground", any(config.ground[:3]), "a normal a,b,c that is not 0")
     if config.sun is not None:
@@ -533,7 +625,7 @@ def _values_out_of_range(config: InsertConfig) -> Iterator[InputError]:
             yield from check(name, value in CHOICES[name], " or ".join(CHOICES[name]))
 
 
-def _not_plain(name: str, value: object) -> Iterator[InputError]:
+def _not_plain(name: str, value: object, prompt_limit: int) -> Iterator[InputError]:
     """Find numbers that are not finite and texts that no file or model can be asked for."""
     parts = value if isinstance(value, tuple) else (value,)
     if any(isinstance(part, float) and not math.isfinite(part) for part in parts):
@@ -542,10 +634,9 @@ def _not_plain(name: str, value: object) -> Iterator[InputError]:
     if not parts or any("\0" in t or not (t or name in EMPTY_ALLOWED) for t in texts):
         yield usage(flag(name), "a text that is not empty and holds no NUL")
     longest = max((len(text.encode("utf-8", "replace")) for text in texts), default=0)
-    if name in PROMPTS and longest > PROMPT_BYTES_LIMIT:
-        yield usage(
-            flag(name), f"a text too long (found {longest} bytes; expected {PROMPT_BYTES_LIMIT})"
-        )
+    if name in PROMPTS and longest > prompt_limit:
+        found = f"a text too long (found {longest} bytes; limit {prompt_limit})"
+        yield usage(flag(name), f"{found}; --max-prompt-bytes raises it")
 
 
 EXCLUSIVE = (
@@ -574,6 +665,21 @@ EXCLUSIVE = (
     ("resume", "overwrite"),
 )
 """Pairs of fields of which at most one may be given."""
+
+
+def replaced_by(changes: Mapping[str, Any], among: Container[str]) -> dict[str, Any]:
+    """Return what changes leave no room for, at its default: "at" on a line replaces --place.
+
+    Args:
+        changes: Values by their fields, which replace others.
+        among: Fields that may be given up for them.
+    """
+    return {
+        other: DEFAULTS[other]
+        for pair in EXCLUSIVE
+        for name, other in (pair, pair[::-1])
+        if changes.get(name) is not None and other in among and other not in changes
+    }
 
 
 def _values_that_clash(config: InsertConfig) -> Iterator[InputError]:
@@ -608,6 +714,7 @@ def _values_that_clash(config: InsertConfig) -> Iterator[InputError]:
     for name in ("frame", "undistort", "ground_points"):
         yield from needs(name, given("camera"), "--camera with a camera file")
     yield from needs("sequence", given("reuse"), "--reuse: one light for all frames")
+    yield from needs("fps", given("sequence"), "--sequence, of which the video is made")
     yield from needs("show_prior", with_words, "--guidance stable-diffusion and its --model")
     if given("show_prior") and with_words and config.personalize is False:
         yield usage("--no-personalize", "cannot be used with --show-prior, which shows its effect")
@@ -623,6 +730,8 @@ def _values_that_clash(config: InsertConfig) -> Iterator[InputError]:
     lit = any(map(given, LIGHTS)) or is_demo_lit
     level = "--light, --sun or --sky: with --guidance alone the light's level is recovered"
     yield from needs("exposure", lit or not config.is_guided, level)
+    turned = given("light") or given("reuse") or is_demo_lit
+    yield from needs("light_rotate", turned, "--light or --reuse; of --sun, give another azimuth")
     yield from needs("refine", lit, "a known light: --reuse, --light, --sun or --sky")
     who_judges = "--guidance stable-diffusion, which judges the change: no other knows colours"
     yield from needs("refine", with_words, who_judges)

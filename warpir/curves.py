@@ -21,6 +21,7 @@ from numpy.typing import NDArray
 
 from warpir.config import CHOICES
 from warpir.errors import InputError
+from warpir.limits import LIMITS, Limits
 from warpir.strict_json import read_json_object
 
 FloatArray = NDArray[np.float32]
@@ -161,17 +162,18 @@ def curves_to_json(curves: Curves) -> dict[str, Any]:
     return content
 
 
-def read_curves(path: str | Path) -> Curves:
+def read_curves(path: str | Path, limits: Limits = LIMITS) -> Curves:
     """Read and check a curves file.
 
     Args:
         path: The JSON file.
+        limits: How large it may be.
 
     Raises:
         InputError: Missing, of another format, or not monotone curves from (0, 0) to (1, 1); names
             the curve.
     """
-    root = read_json_object(path)
+    root = read_json_object(path, limits)
     if root.get("format") != FORMAT or root.get("version") != VERSION:
         found = f"{root.get('format')!r:.40} version {root.get('version')!r:.10}"
         raise InputError(path, f"not curves (found {found}; expected {FORMAT!r} version {VERSION})")

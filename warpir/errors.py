@@ -1,8 +1,27 @@
 """The one error a user can cause, and the exit codes that tell schedulers the truth."""
 
+import errno
 from collections.abc import Sequence
 from enum import IntEnum
 from pathlib import Path
+
+import warpir
+
+# A folder called warpir in the current directory, such as a checkout, hides an installation that
+# follows its sources, and then a run would only break at its end.
+if warpir.__file__ is None:
+    raise ImportError(
+        "the folder 'warpir' in the current directory hides the installed package: "
+        "start Python in another folder"
+    )
+
+DISK_FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
+
+
+LISTED = 30
+"""Most problems that are listed beside the first."""
+SHOWN = 60
+"""Most characters of a user's text in an error."""
 
 
 class ExitCode(IntEnum):
@@ -61,3 +80,19 @@ def raise_all(problems: Sequence[InputError]) -> None:
         first = problems[0]
         first.also = (*first.also, *(p for later in problems[1:] for p in (later, *later.also)))
         raise first
+
+
+def shown(text: str) -> str:
+    """Return a text of the user as an error shows it: quoted, escaped and cut."""
+    return ascii(text[:SHOWN]) + ("..." if len(text) > SHOWN else "")
+
+
+def disk_error(where: str | Path, error: OSError, what: str = "cannot be written") -> InputError:
+    """Make the error of a file that cannot be written (`ExitCode.RESOURCES`)."""
+    advice = "check the folder's permissions"
+    if error.errno in DISK_FULL:
+        advice = "free some disk space"
+    elif error.errno == errno.ENOENT:
+        advice = "was the folder removed or replaced meanwhile?"
+    why = error.strerror or str(error)
+    return InputError(where, f"{what} ({why})", advice, ExitCode.RESOURCES)

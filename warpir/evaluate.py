@@ -19,6 +19,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 import warpir
+from warpir.atomic import write_file
 from warpir.config import EMBEDDED_STEPS, InsertConfig, usage
 from warpir.errors import ExitCode, InputError
 from warpir.program import run_program, say
@@ -276,7 +277,7 @@ def evaluate(
         output.write_png("contact_sheet.png", sheet, mark=False, description="Evaluation")
     if options.json is not None:
         text = json.dumps(_plain(record), indent=1, allow_nan=False) + "\n"
-        options.json.write_text(text, encoding="utf-8")
+        write_file(options.json, text.encode())
         say(f"written: {options.json}")
     return record
 

@@ -21,6 +21,8 @@ ROUNDS = 10_000
 """Samples drawn by the bootstrap."""
 LEVEL = 95.0
 """Of the intervals [%]."""
+FEWEST = 6
+"""Scenes from which on a percentile interval means anything: of two it is just both values."""
 COMPARED = ("image.box.rmse", "image.full.rmse", "image.asset.rmse", "light.peak_angle_deg")
 """Figures on which rows are compared in pairs."""
 AGAINST = ("uniform", "brightest-region")
@@ -70,8 +72,8 @@ class Mean:
 
     @property
     def is_sure(self) -> bool:
-        """Whether the interval over scenes excludes 0."""
-        return self.low > 0.0 or self.high < 0.0
+        """Whether the interval over scenes excludes 0, and there are scenes enough for one."""
+        return self.count >= FEWEST and (self.low > 0.0 or self.high < 0.0)
 
 
 def bootstrap(
@@ -298,7 +300,8 @@ def pair_table(pairs: Sequence[Pair]) -> Iterator[str]:
     shown = [p for p in pairs if p.group in ("all", "sunny")]
     if not shown:
         return
-    yield "## In pairs, scene by scene (below 0: better; * the 95 % interval excludes 0)"
+    sure = f"* the 95 % interval excludes 0, with {FEWEST} scenes or more"
+    yield f"## In pairs, scene by scene (below 0: better; {sure})"
     yield ""
     yield "| row | against | figure | group | difference | better / worse |"
     yield "|---|---|---|---|---|---|"

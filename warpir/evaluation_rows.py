@@ -27,11 +27,12 @@ from warpir.inputs import Inputs
 from warpir.light import Light, Lobes, rotate_map
 from warpir.lighting import make_light
 from warpir.lobe_fit import fit_lobes
+from warpir.model_files import require_model
 from warpir.photo_files import Photo, read_photo
 from warpir.placement import Placement
 from warpir.progress import StepProgress
 from warpir.record import Timings
-from warpir.recover import Run, recover, require_model
+from warpir.recover import Run, recover
 from warpir.regressor import Regressor, mean_training_light, random_regressor, regress
 
 FloatArray = NDArray[np.float32]

@@ -16,9 +16,9 @@ import shutil
 import socket
 import struct
 import zlib
-from collections.abc import Mapping
-from contextlib import suppress
-from dataclasses import dataclass
+from collections.abc import Iterable, Iterator, Mapping
+from contextlib import contextmanager, suppress
+from dataclasses import MISSING, dataclass, fields
 from pathlib import Path
 from typing import Any
 
@@ -26,12 +26,24 @@ import numpy as np
 
 import warpir
 from warpir import color
+from warpir.atomic import remove_folder, sync, write_staged
 from warpir.camera import Camera, exr_matrices
-from warpir.errors import ExitCode, InputError
-from warpir.image_decoder import FloatArray, Pixels, decode_image, library_error, one_line
+from warpir.errors import ExitCode, InputError, disk_error
+from warpir.image_decoder import (
+    FloatArray,
+    Pixels,
+    decode_image,
+    library_error,
+    read_exr_channels,
+)
+from warpir.limits import LIMITS
+from warpir.signals import Stopped, whole
 from warpir.strict_json import read_json_object
 
-UNFINISHED = ("checkpoints", "progress")
+UNFINISHED = {
+    "checkpoints": re.compile(r"[0-9]{6,}-[a-z-]+-[0-9]+|\.partial-.*"),
+    "progress": re.compile(r"preview-[0-9]{6,}\.png"),
+}
 """Folders of an output folder that hold what a run needs, or shows, before it has results."""
 
 HALF_MAX = 65504.0
@@ -43,6 +55,14 @@ BACKGROUND_DEPTH = 1e10
 _PLAIN_NAME = re.compile(r"(?:[A-Za-z0-9][A-Za-z0-9_.-]{0,99}/)?[A-Za-z0-9][A-Za-z0-9_.-]{0,99}")
 """A file, or a file in a folder of the output folder."""
 _RUN_JSON = "run.json"
+_OWN_LOCK = re.compile(rb"(?:[0-9]+ on [^\n]*\n?)?")
+"""What a lock file holds; empty while it is being written."""
+_READY = ".ready"
+"""Folder of a complete result that is being put in place of an old one, in the output folder."""
+_MADE = ("mitsuba",)
+"""Folders of the results themselves."""
+_OLD, _JOURNAL = ".old", ".journal.json"
+"""In that folder: the files of the old result, and the names of what is moved in and out."""
 
 _XMP = """<?xpacket begin="\ufeff" id="W5M0MpCehiHzreSzNTczkc9d"?>
 <x:xmpmeta xmlns:x="adobe:ns:meta/">
@@ -66,6 +86,10 @@ class OutputFolder:
     last. A folder with ``run.json`` therefore holds a complete result, and after a failure the
     earlier files are what they were, byte for byte. ``.lock`` keeps a second run out; the
     kernel releases it with the process, so it is never stale.
+
+    The one rename of the staging folder to ``.ready/`` decides: a process that is killed before it
+    leaves the old result, and for one that is killed after it the next run that enters the folder
+    puts the rest in place. Signals wait meanwhile (`warpir.signals.whole`).
     """
 
     def __init__(self, path: str | Path, overwrite: bool = False) -> None:
@@ -77,14 +101,16 @@ class OutputFolder:
         """
         self.path = Path(path)
         self.overwrite = overwrite
-        self._staging = self.path / f".partial-{os.getpid()}"
+        self.staging = self.path / f".partial-{os.getpid()}"
+        """On the file system of the results; what lies there is removed at the end."""
         self._lock = -1
         self._made = False
+        self._superseded: list[Path] = []
         self._hashes: dict[str, str] = {}
         self._run: dict[str, Any] = {}
 
     def __enter__(self) -> "OutputFolder":
-        """Make and lock the folder.
+        """Make and lock the folder; finish what a killed run had ready.
 
         Raises:
             InputError: Locked or holding results (exit 7), or not writable (exit 5).
@@ -92,13 +118,15 @@ class OutputFolder:
         self._make()
         try:
             self._take_lock()
+            self._refuse_links()
             for abandoned in self.path.glob(".partial-*"):  # of killed runs: the lock is ours
                 shutil.rmtree(abandoned, ignore_errors=True)
-            self._refuse_results()
+            was_ready = self._finish_earlier()
+            self._refuse_results(was_ready)
             try:
-                self._staging.mkdir()
+                self.staging.mkdir()
             except OSError as error:
-                raise self._disk_error(self._staging.name, error) from error
+                raise disk_error(self.staging, error) from error
         except BaseException:
             self._release()
             raise
@@ -106,12 +134,55 @@ class OutputFolder:
 
     def __exit__(self, kind: type[BaseException] | None, *rest: object) -> None:
         """Move the staged files into place, or on an exception remove them."""
+        is_complete = False
         try:
-            if kind is None:
-                self._commit()
-        finally:
-            shutil.rmtree(self._staging, ignore_errors=True)
-            self._release()
+            with whole():
+                try:
+                    if kind is None:
+                        self._commit()
+                        is_complete = True
+                finally:
+                    shutil.rmtree(self.staging, ignore_errors=True)
+                    self._release()
+        except Stopped as stopped:
+            if is_complete:
+                stopped.kept = f"the results in {self.path} are complete"
+            raise
+
+    def check(self) -> None:
+        """Find what would keep a run out of the folder; nothing is made, and nothing is left.
+
+        Raises:
+            InputError: As on entering the block.
+        """
+        self._refuse_name()
+        try:
+            found = self.path.absolute()
+            while not _is_there(found):
+                found = found.parent
+            if not found.is_dir():
+                raise self._no_folder()
+            if not os.access(found, os.W_OK | os.X_OK):
+                raise PermissionError(errno.EACCES, f"no permission to write in {found}")
+            if found == self.path.absolute():
+                self._refuse_locked()
+                self._refuse_links()
+                self._refuse_results(is_ready(self.path))
+        except OSError as error:
+            raise disk_error(self.path, error) from error
+
+    def supersede(self, folder: Path) -> None:
+        """Remove a folder as soon as the results are in place; until then it is needed."""
+        self._superseded.append(folder)
+
+    @property
+    def hashes(self) -> dict[str, str]:
+        """sha256 of what is staged so far, by its name."""
+        return dict(self._hashes)
+
+    def sizes(self) -> dict[str, int]:
+        """Return the sizes of what is staged so far [byte], by its name."""
+        return {name: (self.staging / name).stat().st_size for name in self._hashes}
 
     # What is written. Each writer ends in `write_bytes` or does the same checks.
 
@@ -119,19 +190,9 @@ class OutputFolder:
         """Stage one file and see that all of it reached the disk."""
         path = self._staged(name)
         try:
-            with path.open("wb") as stream:
-                stream.write(content)
-                stream.flush()
-                os.fsync(stream.fileno())
-            written = path.stat().st_size
+            write_staged(path, content)
         except OSError as error:
-            raise self._disk_error(name, error) from error
-        if written != len(content):
-            raise InputError(
-                self.path / name,
-                f"written incompletely (found {written} bytes; expected {len(content)})",
-                code=ExitCode.RESOURCES,
-            )
+            raise disk_error(self.path / name, error) from error
         self._hashes[name] = hashlib.sha256(content).hexdigest()
 
     def write_json(self, name: str, content: Mapping[str, Any]) -> None:
@@ -182,13 +243,13 @@ class OutputFolder:
             InputError: The disk is full or the folder is not writable (exit 5).
         """
         path = self.path / "progress" / f"preview-{step:06d}.png"
-        staged = self._staging / path.name
+        staged = self.staging / path.name
         try:
             path.parent.mkdir(exist_ok=True)
-            staged.write_bytes(png_bytes(codes, icc, False, ""))
+            write_staged(staged, png_bytes(codes, icc, False, ""))
             os.replace(staged, path)
         except OSError as error:
-            raise self._disk_error(f"progress/{path.name}", error) from error
+            raise disk_error(path, error) from error
         return path
 
     def write_exr(
@@ -302,13 +363,11 @@ class OutputFolder:
             with path.open("rb+") as stream:
                 os.fsync(stream.fileno())
                 self._hashes[name] = hashlib.file_digest(stream, "sha256").hexdigest()
-        except (InputError, OSError) as error:
-            raise InputError(
-                self.path / name,
-                f"cannot be written ({one_line(str(error))})",
-                "free some disk space",
-                ExitCode.RESOURCES,
-            ) from error
+        except InputError as error:  # its text is the library's, and names a staged file
+            what, advice = "written incompletely", "free some disk space"
+            raise InputError(self.path / name, what, advice, ExitCode.RESOURCES) from error
+        except OSError as error:
+            raise disk_error(self.path / name, error) from error
 
     # How it is kept whole.
 
@@ -316,34 +375,69 @@ class OutputFolder:
         """Return where a file is staged; names are ours, never a path that leads out."""
         if not _PLAIN_NAME.fullmatch(name):
             raise ValueError(f"not a plain file name: {name!r}")
-        path = self._staging / name
+        path = self.staging / name
         try:
             path.parent.mkdir(exist_ok=True)
         except OSError as error:
-            raise self._disk_error(name, error) from error
+            raise disk_error(self.path / name, error) from error
         return path
 
     def _make(self) -> None:
-        if self.path.resolve() == Path(self.path.resolve().anchor):
-            raise InputError(
-                "--out", f"{self.path} is the root of the file system", code=ExitCode.USAGE
-            )
+        self._refuse_name()
         try:
             self._made = not self.path.exists()
             self.path.mkdir(parents=True, exist_ok=True)
         except (FileExistsError, NotADirectoryError) as error:
             self._made = False
-            raise InputError(
-                self.path,
-                "not a folder (found a file in its place)",
-                "choose another --out",
-                ExitCode.OUTPUT,
-            ) from error
+            raise self._no_folder() from error
         except OSError as error:
             self._made = False
             raise InputError(
                 self.path, f"cannot be made ({error.strerror})", code=ExitCode.RESOURCES
             ) from error
+
+    def _refuse_name(self) -> None:
+        if os.path.realpath(self.path) == os.path.realpath("/"):
+            raise InputError(
+                "--out", f"{self.path} is the root of the file system", code=ExitCode.USAGE
+            )
+        try:
+            str(self.path).encode()
+        except UnicodeEncodeError:
+            raise InputError(
+                "--out", f"{str(self.path)!a} is not a name in UTF-8", code=ExitCode.USAGE
+            ) from None
+
+    def _no_folder(self) -> InputError:
+        return InputError(
+            self.path,
+            "not a folder (found a file in its place)",
+            "choose another --out",
+            ExitCode.OUTPUT,
+        )
+
+    def _refuse_locked(self) -> None:
+        """Refuse a folder that a run writes now; the lock is tried, not kept."""
+        try:
+            lock = os.open(self.path / ".lock", os.O_RDONLY | os.O_NOFOLLOW)
+        except FileNotFoundError:
+            return
+        try:
+            fcntl.flock(lock, fcntl.LOCK_SH | fcntl.LOCK_NB)
+        except BlockingIOError as error:
+            raise self._locked(lock) from error
+        finally:
+            os.close(lock)
+
+    def _locked(self, lock: int) -> InputError:
+        """Make the error of a folder whose lock another process holds."""
+        holder = os.read(lock, 200).decode("utf-8", "replace").strip() or "unknown"
+        return InputError(
+            self.path,
+            f"locked by pid {holder}",
+            "wait for that run, or choose another --out",
+            ExitCode.OUTPUT,
+        )
 
     def _take_lock(self) -> None:
         path = self.path / ".lock"
@@ -351,7 +445,7 @@ class OutputFolder:
             try:
                 lock = os.open(path, os.O_RDWR | os.O_CREAT | os.O_NOFOLLOW, 0o644)
             except OSError as error:
-                raise self._disk_error(path.name, error) from error
+                raise disk_error(path, error) from error
             try:
                 fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
                 if os.fstat(lock).st_ino == os.stat(path).st_ino:
@@ -360,89 +454,188 @@ class OutputFolder:
             except FileNotFoundError:
                 os.close(lock)
             except BlockingIOError as error:
-                holder = os.read(lock, 200).decode("utf-8", "replace").strip() or "unknown"
+                locked = self._locked(lock)
                 os.close(lock)
-                raise InputError(
-                    self.path,
-                    f"locked by pid {holder}",
-                    "wait for that run, or choose another --out",
-                    ExitCode.OUTPUT,
-                ) from error
+                raise locked from error
             except OSError as error:
                 os.close(lock)
-                raise self._disk_error(path.name, error) from error
+                raise disk_error(path, error) from error
+        if not _OWN_LOCK.fullmatch(os.read(lock, 200)):
+            os.close(lock)
+            raise InputError(
+                path, "not a lock of warpir's", "choose another --out", ExitCode.OUTPUT
+            )
         self._lock = lock
         try:
+            os.lseek(lock, 0, os.SEEK_SET)
             os.ftruncate(lock, 0)
             os.write(lock, f"{os.getpid()} on {socket.gethostname()}\n".encode())
         except OSError as error:
-            raise self._disk_error(path.name, error) from error
+            raise disk_error(path, error) from error
 
     def _release(self) -> None:
         if self._lock >= 0:
-            with suppress(OSError):
-                (self.path / ".lock").unlink()
+            if self._holds_lock():  # else it is another run's
+                with suppress(OSError):
+                    (self.path / ".lock").unlink()
             os.close(self._lock)
             self._lock = -1
         if self._made:
             with suppress(OSError):
                 self.path.rmdir()  # only succeeds when nothing was written
 
-    def _refuse_results(self) -> None:
+    def _refuse_links(self) -> None:
+        """Refuse links in place of the folders that a run makes: they lead out of this one."""
+        for name in (*UNFINISHED, *_MADE, _READY):
+            if (self.path / name).is_symlink():
+                what = "a link in place of a folder of its own"
+                raise InputError(self.path / name, what, "remove it", ExitCode.OUTPUT)
+
+    def _refuse_results(self, was_ready: bool) -> None:
         """Refuse a folder in use; hidden files and an unfinished run's do not count as results."""
-        found = sorted(
-            entry.name
-            for entry in self.path.iterdir()
-            if not entry.name.startswith(".") and entry.name not in UNFINISHED
-        )
+        found = results_in(self.path)
         if found and not self.overwrite:
             shown = _RUN_JSON if _RUN_JSON in found else found[0]
+            of_whom = ", all of a run that was killed in its last moment" if was_ready else ""
             raise InputError(
                 self.path,
                 f"already holds files (found {shown}"
-                f"{f' and {len(found) - 1} more' if len(found) > 1 else ''}; "
+                f"{f' and {len(found) - 1} more' if len(found) > 1 else ''}{of_whom}; "
                 "expected an empty folder)",
                 "pass --overwrite to replace results",
                 ExitCode.OUTPUT,
             )
 
     def _commit(self) -> None:
-        """Move the old results away and the new ones in; undo all of it if a step fails."""
+        """Replace the old result by the new one; undo all of it if a step fails."""
+        self._require_whole()
         names = sorted(self._hashes)
         leftover = [name for name in self._old_results() if name not in self._hashes]
         self.write_bytes(_RUN_JSON, _json_bytes({**self._run, "files": dict(self._hashes)}))
-        old = self._staging / "old"
+        ready = self.path / _READY
+        try:
+            journal = _json_bytes({"new": names, "leftover": leftover})
+            write_staged(self.staging / _JOURNAL, journal)
+            (self.staging / _OLD).mkdir()
+            for folder in {(self.staging / name).parent for name in names} | {self.staging}:
+                sync(folder)
+            os.rename(self.staging, ready)
+        except OSError as error:
+            raise disk_error(self.path / "results", error) from error
+        try:
+            self._put_in_place()
+        except BaseException:
+            if not any(path.is_file() for path in (ready / _OLD).rglob("*")):
+                with suppress(OSError):  # where it stays, the next run goes on with it
+                    os.rename(ready, self.staging)
+            raise
+        for folder in self._superseded:
+            with suppress(OSError):  # nothing but room is lost when it stays
+                remove_unfinished(folder)
+        shutil.rmtree(ready, ignore_errors=True)
+
+    def _require_whole(self) -> None:
+        """See that the folder is still ours and that what was staged is still there.
+
+        Raises:
+            InputError: The lock was deleted and another run may have come in (exit 7), or a staged
+                file has changed (exit 5).
+        """
+        if not self._holds_lock():
+            raise InputError(
+                self.path / ".lock",
+                "deleted while the run was under way: another run may write here",
+                "choose another --out; what was there is left as it is",
+                ExitCode.OUTPUT,
+            )
+        there = [n for n in (_RUN_JSON, *self._hashes) if os.path.lexists(self.path / n)]
+        if there and not self.overwrite:
+            raise InputError(
+                self.path / there[0],
+                "came while the run was under way",
+                "pass --overwrite to replace it",
+                ExitCode.OUTPUT,
+            )
+        for name, digest in self._hashes.items():
+            try:
+                with (self.staging / name).open("rb") as stream:
+                    found = hashlib.file_digest(stream, "sha256").hexdigest()
+            except OSError as error:
+                raise disk_error(self.staging / name, error) from error
+            if found != digest:
+                raise InputError(
+                    self.staging / name,
+                    "changed by somebody else before the run was complete",
+                    code=ExitCode.RESOURCES,
+                )
+
+    def _holds_lock(self) -> bool:
+        try:
+            return os.fstat(self._lock).st_ino == (self.path / ".lock").stat().st_ino
+        except OSError:
+            return False
+
+    def _finish_earlier(self) -> bool:
+        """Put in place what a killed run had ready; return whether there was something."""
+        was_ready = is_ready(self.path)
+        if was_ready:
+            self._put_in_place()
+        shutil.rmtree(self.path / _READY, ignore_errors=True)
+        return was_ready
+
+    def _put_in_place(self) -> None:
+        """Move the old result out and the one in ``.ready/`` in, from wherever that was left.
+
+        Raises:
+            InputError: A file cannot be moved; then those that were moved are where they had been.
+        """
+        ready = self.path / _READY
+        journal = read_json_object(ready / _JOURNAL)
+        names, leftover = (
+            [name for name in journal[part] if _PLAIN_NAME.fullmatch(name)]
+            for part in ("new", "leftover")
+        )
         moved: list[tuple[Path, Path]] = []
 
-        def move(source: Path, target: Path) -> None:
+        def move(name: str, source: Path, target: Path) -> None:
+            source, target = source / name, target / name
             target.parent.mkdir(exist_ok=True)
             if target.parent != self.path and target.parent.is_symlink():
-                raise NotADirectoryError(errno.ENOTDIR, "found a link in place of its folder")
+                raise OSError(None, f"found a link in place of the folder {target.parent.name}")
+            if source.is_dir():
+                raise OSError(None, f"found a folder in place of {name}")
             source.rename(target)
             moved.append((source, target))
 
         try:
-            _sync_folder(self._staging)
-            old.mkdir()
+            sync(self.path)
             for name in (_RUN_JSON, *names, *leftover):
-                if (self.path / name).exists():
-                    move(self.path / name, old / name)
+                is_old = name in leftover or (ready / name).exists()
+                if is_old and (self.path / name).exists():
+                    move(name, self.path, ready / _OLD)
+                    if name == _RUN_JSON:  # nothing is mixed under its name, not by a power cut
+                        sync(self.path)
             for name in names:
-                move(self._staging / name, self.path / name)
+                if (ready / name).exists():
+                    move(name, ready, self.path)
             for folder in {(self.path / name).parent for name in names} | {self.path}:
-                _sync_folder(folder)
-            move(self._staging / _RUN_JSON, self.path / _RUN_JSON)
-            _sync_folder(self.path)
+                sync(folder)
+            move(_RUN_JSON, ready, self.path)
+            sync(self.path)
         except BaseException as error:
-            for source, target in reversed(moved):
-                target.rename(source)
+            try:
+                for source, target in reversed(moved):
+                    target.rename(source)
+            except OSError as stuck:
+                what = "results are half in place: the next run into it finishes that"
+                raise disk_error(self.path, stuck, what) from error
             self._remove_empty_folders([*names, *leftover])
             if isinstance(error, OSError):
-                raise self._disk_error("results", error) from error
+                raise disk_error(self.path / "results", error) from error
             raise
         self._remove_empty_folders(leftover)
 
-    def _remove_empty_folders(self, names: list[str]) -> None:
+    def _remove_empty_folders(self, names: Iterable[str]) -> None:
         """Remove the folders of files that are gone, as far as nothing else is in them."""
         for folder in {(self.path / name).parent for name in names} - {self.path}:
             with suppress(OSError):
@@ -463,23 +656,83 @@ class OutputFolder:
                         unchanged.append(name)
         return unchanged
 
-    def _disk_error(self, name: str, error: OSError) -> InputError:
-        full = error.errno in (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
-        return InputError(
-            self.path / name,
-            f"cannot be written ({error.strerror})",
-            "free some disk space" if full else "check the folder's permissions",
-            ExitCode.RESOURCES,
-        )
+
+def results_in(path: Path) -> list[str]:
+    """Return the names of what counts as somebody's results in an output folder, sorted.
+
+    Hidden files do not, nor what an unfinished run has left.
+    """
+    found = []
+    for entry in path.iterdir():
+        own = UNFINISHED.get(entry.name)
+        if own is None or not entry.is_dir():
+            found += [] if entry.name.startswith(".") else [entry.name]
+        else:
+            others = (other for other in entry.iterdir() if not own.fullmatch(other.name))
+            found += [f"{entry.name}/{other.name}" for other in others]
+    return sorted(found)
 
 
-def _sync_folder(path: Path) -> None:
-    """Make renames in a folder survive a power cut."""
-    descriptor = os.open(path, os.O_RDONLY | os.O_DIRECTORY)
+def remove_unfinished(folder: Path) -> None:
+    """Remove what an unfinished run has left in one of its folders; what is not ours stays.
+
+    Raises:
+        OSError: The folder around it is not writable.
+    """
+    if not folder.is_dir():
+        return
+    entries = sorted(folder.iterdir())
+    ours = [entry for entry in entries if UNFINISHED[folder.name].fullmatch(entry.name)]
+    if len(ours) == len(entries):
+        remove_folder(folder)
+        return
+    for entry in ours:  # the newest last: what is left is whole at every moment
+        remove_folder(entry)
+
+
+def _is_there(path: Path) -> bool:
+    """Return whether anything has this name; unlike `os.path.lexists`, an unusable one raises."""
     try:
-        os.fsync(descriptor)
+        os.lstat(path)
+    except (FileNotFoundError, NotADirectoryError):
+        return False
+    return True
+
+
+def is_ready(path: Path) -> bool:
+    """Return whether a killed run had complete results ready in a folder; see `finish_results`."""
+    return (path / _READY / _RUN_JSON).exists()  # the last file to leave it
+
+
+def finish_results(path: Path) -> None:
+    """Put results in place that a killed run had ready in a folder; do nothing where none are.
+
+    Raises:
+        InputError: The folder is locked (exit 7) or not writable (exit 5).
+    """
+    if is_ready(path):
+        folder = OutputFolder(path)
+        folder._take_lock()
+        try:
+            folder._finish_earlier()
+        finally:
+            folder._release()
+
+
+@contextmanager
+def locked(path: Path) -> Iterator[None]:
+    """Keep other runs out of a folder within the block; it is made, and stays.
+
+    Raises:
+        InputError: It is locked (exit 7) or not writable (exit 5).
+    """
+    folder = OutputFolder(path)
+    folder._make()
+    try:
+        folder._take_lock()
+        yield
     finally:
-        os.close(descriptor)
+        folder._release()
 
 
 def _json_bytes(content: Mapping[str, Any]) -> bytes:
@@ -579,6 +832,58 @@ class Layers:
     """Part of `foreground` reflected specularly [1], shape [H, W, 3]."""
 
 
+_CHANNELS = {
+    "composite": ("", "RGB"),
+    "foreground": ("fg", "RGBA"),
+    "shadow_ratio": ("shadow", "RGB"),
+    "plate": ("plate", "RGB"),
+    "matte": ("matte", "A"),
+    "depth": ("", "Z"),
+    "position": ("position", "XYZ"),
+    "normal": ("normal", "XYZ"),
+    "albedo": ("albedo", "RGB"),
+    "roughness": ("roughness", "Y"),
+    "emission": ("emission", "RGB"),
+    "diffuse": ("diffuse", "RGB"),
+    "specular": ("specular", "RGB"),
+}
+"""Layer and channels that each plane has in ``layers.exr``."""
+_WHOLE_FLOATS = {"depth", "position", "normal"}
+_DEEP = {"composite", "foreground", "shadow_ratio", "plate"}
+"""What is stored as float32: always, and of a photograph of more than 8 bits."""
+
+
+def _channel_names(plane: str) -> list[str]:
+    prefix, suffixes = _CHANNELS[plane]
+    return [f"{prefix}.{suffix}" if prefix else suffix for suffix in suffixes]
+
+
+def read_layers(path: str | Path, max_pixels: int = LIMITS.pixels) -> Layers:
+    """Read ``layers.exr`` back, as far as its own precision goes; all planes are float32.
+
+    Args:
+        path: A file that `write_layers` made.
+        max_pixels: Largest image decoded [px].
+
+    Raises:
+        InputError: Missing, too large, truncated, or without the layers that every such file has.
+    """
+    channels = read_exr_channels(Path(path), max_pixels)
+    planes: dict[str, Pixels] = {}
+    for plane in _CHANNELS:
+        names = _channel_names(plane)
+        if all(name in channels for name in names):
+            values = [channels[name] for name in names]
+            planes[plane] = np.stack(values, axis=-1) if len(values) > 1 else values[0]
+    missing = [f.name for f in fields(Layers) if f.default is MISSING and f.name not in planes]
+    if missing:
+        wanted = ", ".join(_channel_names(missing[0]))
+        raise InputError(path, f"not the layers of a run (found no {wanted})")
+    if "depth" in planes:
+        planes["depth"] = np.where(planes["depth"] >= BACKGROUND_DEPTH, np.inf, planes["depth"])
+    return Layers(**planes)
+
+
 def write_layers(
     folder: OutputFolder,
     layers: Layers,
@@ -621,40 +926,25 @@ def write_layers(
     channels: dict[str, Pixels] = {}
     clamped = 0
 
-    def add(prefix: str, suffixes: str, plane: Pixels | None, whole_floats: bool = False) -> None:
-        nonlocal clamped
+    for name in _CHANNELS:
+        plane: Pixels | None = getattr(layers, name)
         if plane is None:
-            return
+            continue
+        if name == "depth":
+            plane = np.where(np.isposinf(plane), BACKGROUND_DEPTH, plane)
         plane = plane[..., None] if plane.ndim == 2 else plane
-        if plane.shape != (height, width, len(suffixes)):
-            raise ValueError(
-                f"layer {prefix or 'composite'}: shape {plane.shape}, expected "
-                f"{(height, width, len(suffixes))}"
-            )
-        if not whole_floats:
+        names = _channel_names(name)
+        if plane.shape != (height, width, len(names)):
+            expected = (height, width, len(names))
+            raise ValueError(f"layer {name}: shape {plane.shape}, expected {expected}")
+        is_whole = name in _WHOLE_FLOATS or (is_deep and name in _DEEP)
+        if not is_whole:
             clamped += int((np.isfinite(plane) & (np.abs(plane) > HALF_MAX)).sum())
             # NaN and Inf pass through, and the writer refuses them.
             plane = np.where(np.isfinite(plane), np.clip(plane, -HALF_MAX, HALF_MAX), plane)
-        for k, suffix in enumerate(suffixes):
-            name = f"{prefix}.{suffix}" if prefix else suffix
-            channels[name] = plane[..., k].astype(np.float32 if whole_floats else np.float16)
-
-    add("", "RGB", layers.composite, is_deep)
-    add("", "A", np.ones((height, width), np.float32))
-    add("fg", "RGBA", layers.foreground, is_deep)
-    add("shadow", "RGB", layers.shadow_ratio, is_deep)
-    add("plate", "RGB", layers.plate, is_deep)
-    add("matte", "A", layers.matte, is_deep)
-    if layers.depth is not None:
-        depth = np.where(np.isposinf(layers.depth), BACKGROUND_DEPTH, layers.depth)
-        add("", "Z", depth, whole_floats=True)
-    add("position", "XYZ", layers.position, whole_floats=True)
-    add("normal", "XYZ", layers.normal, whole_floats=True)
-    add("albedo", "RGB", layers.albedo)
-    add("roughness", "Y", layers.roughness)
-    add("emission", "RGB", layers.emission)
-    add("diffuse", "RGB", layers.diffuse)
-    add("specular", "RGB", layers.specular)
+        for k, channel in enumerate(names):
+            channels[channel] = plane[..., k].astype(np.float32 if is_whole else np.float16)
+    channels["A"] = np.ones((height, width), np.float16)
 
     world_to_camera, world_to_ndc = exr_matrices(camera)
     folder.write_exr(

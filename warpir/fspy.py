@@ -12,10 +12,11 @@ import numpy as np
 from warpir.camera import Camera
 from warpir.camera_source import UP_TO_Y, StoredCamera, count, member, number, rigid
 from warpir.errors import InputError
-from warpir.strict_json import JSON_BYTES_MAX, parse_json_object
+from warpir.limits import LIMITS, Limits
+from warpir.strict_json import parse_json_object
 
 
-def read_fspy_project(path: Path) -> StoredCamera:
+def read_fspy_project(path: Path, limits: Limits = LIMITS) -> StoredCamera:
     """Read a binary fSpy project: magic, three u32, JSON, image."""
     with path.open("rb") as stream:
         header = stream.read(16)
@@ -28,12 +29,7 @@ def read_fspy_project(path: Path) -> StoredCamera:
             raise InputError(path, f"fSpy project of another version (found {version}; expected 1)")
         if image_size == 0:
             raise InputError(path, "fSpy project without an image", "open and save it in fSpy")
-        if state_size > JSON_BYTES_MAX:
-            raise InputError(
-                path,
-                f"fSpy state too large (found {state_size} bytes; expected at "
-                f"most {JSON_BYTES_MAX})",
-            )
+        limits.check("json_bytes", state_size, path, "fSpy state too large", more=" bytes")
         state = stream.read(state_size)
     found = path.stat().st_size
     if len(state) < state_size or found < 16 + state_size + image_size:
@@ -42,7 +38,7 @@ def read_fspy_project(path: Path) -> StoredCamera:
             f"truncated fSpy project (found {found} bytes; expected "
             f"{16 + state_size + image_size})",
         )
-    return read_fspy(path, parse_json_object(path, state))
+    return read_fspy(path, parse_json_object(path, state, limits))
 
 
 def read_fspy(path: Path, content: dict[str, Any]) -> StoredCamera:

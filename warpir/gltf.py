@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from warpir.asset import LIMITS, Asset, AssetLimits, FloatArray, Primitive
+from warpir.asset import Asset, FloatArray, Primitive
 from warpir.asset_files import (
     EXTENT,
     check_drawable,
@@ -27,20 +27,14 @@ from warpir.asset_files import (
 )
 from warpir.gltf_file import Entry, GltfFile
 from warpir.gltf_material import MaterialReader, check_extensions
-
-NODES = 100_000
-"""Most nodes of a file."""
-INSTANCES = 65_536
-"""Most placed primitives."""
+from warpir.limits import LIMITS, Limits
 
 POINTS_OR_LINES = (0, 1, 2, 3)
 STRIP, FAN = 5, 6
 Matrix = NDArray[np.float64]
 
 
-def read_gltf(
-    path: str | Path, missing_textures: str = "error", limits: AssetLimits = LIMITS
-) -> Asset:
+def read_gltf(path: str | Path, missing_textures: str = "error", limits: Limits = LIMITS) -> Asset:
     """Read a ``.glb`` or ``.gltf`` file.
 
     Args:
@@ -58,10 +52,13 @@ def read_gltf(
     """
     path = Path(path)
     notices: list[str] = []
-    file = GltfFile(path)
+    file = GltfFile(path, limits)
     check_extensions(file.root, notices)
     placed = list(placed_primitives(file, notices))
     check_counts(file, placed, limits)
+    sizes = MaterialReader(file, missing_textures, [], limits, measures=True)
+    for entry, _, _ in placed:  # too many pixels are refused before the first is decoded
+        sizes.index(entry)
     materials = MaterialReader(file, missing_textures, notices, limits)
     geometries: dict[str, Geometry | None] = {}
     material_of: dict[str, int] = {}
@@ -84,6 +81,7 @@ def read_gltf(
         materials=tuple(materials.materials),
         textures=tuple(materials.textures),
         notices=concise(notices),
+        hashes=file.hashes,
     )
 
 
@@ -104,11 +102,13 @@ def placed_primitives(
         InputError: The nodes are not a forest, or a drawn transform is singular.
     """
     root = file.root
-    nodes, parents = read_forest(root)
+    nodes, parents = read_forest(root, file.limits)
     listed = scene_nodes(root, nodes, parents, notices)
     if root.size("animations"):
         notices.append("animations are not played: the rest pose is used")
     instance_count = 0
+    skins: dict[int, Matrix] = {}
+    joint_worlds: dict[int, Matrix] = {}
     stack = [(index, np.eye(4), False) for index in range(len(nodes)) if index not in parents]
     stack.reverse()
     while stack:
@@ -127,7 +127,10 @@ def placed_primitives(
         joints: Matrix | None = None
         if "skin" in node:
             # The joints alone place a skinned mesh; its own node does not count.
-            joints = joint_matrices(file, node, nodes, parents)
+            skin = node.integer("skin")
+            if skin not in skins:
+                skins[skin] = joint_matrices(file, node, nodes, parents, joint_worlds)
+            joints = skins[skin]
             instances = [np.eye(4)]
             notices.append(f"{node.pointer}: skinned, stands as its joints do in the file")
         else:
@@ -140,21 +143,20 @@ def placed_primitives(
                 notices.append(f"{primitive.pointer}: points or lines are not drawn")
                 continue
             instance_count += len(instances)
-            if instance_count > INSTANCES:
-                raise root.error(f"too many instances (limit {INSTANCES} placed primitives)")
+            what = "/: too many instances"
+            file.limits.check("instances", instance_count, file.path, what, more=" so far")
             for matrix in instances:
                 yield primitive, matrix, joints
 
 
-def read_forest(root: Entry) -> tuple[list[Entry], dict[int, int]]:
+def read_forest(root: Entry, limits: Limits) -> tuple[list[Entry], dict[int, int]]:
     """Return all nodes, and the parent of each node that has one.
 
     Raises:
         InputError: Too many nodes, a child out of range, two parents, or a cycle.
     """
     count = root.size("nodes")
-    if count > NODES:
-        raise root.error(f"too many nodes (found {count}; limit {NODES})")
+    limits.check("nodes", count, root.path, "/nodes: too many nodes")
     nodes = list(root.items("nodes"))
     parents: dict[int, int] = {}
     for index, node in enumerate(nodes):
@@ -253,8 +255,8 @@ def read_instances(file: GltfFile, node: Entry, world: Matrix) -> list[Matrix]:
         if name in attributes:
             accessor = attributes.integer(name)
             count = file.count(accessor, attributes, name)
-            if count > INSTANCES:
-                raise attributes.error(f"too many instances (found {count}; limit {INSTANCES})")
+            what = f"{attributes.pointer}: too many instances"
+            file.limits.check("instances", count, file.path, what)
             stored = file.accessor(accessor, attributes, name, (kind,))
             if stored.dtype.kind != "f":
                 raise attributes.error(f"{name} holds integers that are not normalized")
@@ -274,15 +276,19 @@ def read_instances(file: GltfFile, node: Entry, world: Matrix) -> list[Matrix]:
 
 
 def joint_matrices(
-    file: GltfFile, node: Entry, nodes: list[Entry], parents: dict[int, int]
+    file: GltfFile,
+    node: Entry,
+    nodes: list[Entry],
+    parents: dict[int, int],
+    worlds: dict[int, Matrix],
 ) -> Matrix:
     """Return, for each joint of a node's skin, the matrix that moves what is bound to it alone.
 
     Joint times inverse bind matrix, from the mesh's frame to the asset's, shape [joint, 4, 4].
+    ``worlds`` keeps the matrices of nodes from one skin to the next.
     """
     skin = file.root.item("skins", node.integer("skin"), node, "skin")
     joints = skin.integers("joints")
-    worlds: dict[int, Matrix] = {}
     for joint in joints:
         if joint >= len(nodes):
             raise skin.error(f"joint {joint}, but {len(nodes)} nodes")
@@ -322,7 +328,7 @@ def check_invertible(node: Entry, world: Matrix, which: str = "") -> None:
 
 
 def check_counts(
-    file: GltfFile, placed: list[tuple[Entry, Matrix, Matrix | None]], limits: AssetLimits
+    file: GltfFile, placed: list[tuple[Entry, Matrix, Matrix | None]], limits: Limits
 ) -> None:
     """Refuse more triangles or vertices than the limit, before any is read."""
     triangle_count = vertex_count = 0

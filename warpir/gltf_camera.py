@@ -5,44 +5,46 @@ from pathlib import Path
 import numpy as np
 
 from warpir.camera import Camera
-from warpir.camera_source import Float64Array, StoredCamera, choose_frame, rigid
+from warpir.camera_source import LARGEST, Float64Array, StoredCamera, choose_frame, rigid
 from warpir.gltf import local_matrix, read_forest
 from warpir.gltf_file import Entry, GltfFile
+from warpir.limits import LIMITS, Limits
 
 ASPECT_TOLERANCE = 0.01
 """How far the file's aspect ratio may be from the photo's before it is mentioned."""
 
 
-def read_gltf_camera(path: Path, photo_size: tuple[int, int], frame: str | None) -> StoredCamera:
+def read_gltf_camera(
+    path: Path, photo_size: tuple[int, int], frame: str | None, limits: Limits = LIMITS
+) -> StoredCamera:
     """Read a camera; its axes and the world's are ours.
 
     Args:
         path: A ``.glb`` or ``.gltf`` file.
         photo_size: Width and height of the photograph [px]: glTF knows angles only.
-        frame: Name of the camera or of its node, or its number among the nodes with a camera;
-            default: the only one.
+        frame: Name of the camera or of its node; where neither fits, its number among the nodes
+            with a camera, from 0; default: the only one.
+        limits: How large the file may be.
 
     Raises:
         InputError: Damaged, without that camera, or orthographic.
     """
-    root = GltfFile(path).root
-    nodes, parents = read_forest(root)
+    root = GltfFile(path, limits).root
+    nodes, parents = read_forest(root, limits)
     placed = [node for node in nodes if "camera" in node]
     cameras = [root.item("cameras", n.integer("camera"), n, "camera") for n in placed]
-    if frame is not None and frame.isdecimal() and int(frame) < len(placed):
-        k = int(frame)
+    names = [
+        camera.text("name", "") or node.text("name", "") or str(k)
+        for k, (node, camera) in enumerate(zip(placed, cameras, strict=True))
+    ]
+    of_nodes = [node.text("name", "") for node in placed]
+    is_number = frame is not None and frame.isdecimal() and len(frame) < 10
+    if frame not in names and of_nodes.count(str(frame)) == 1:
+        k = of_nodes.index(str(frame))
+    elif frame not in names and is_number and int(str(frame)) < len(placed):
+        k = int(str(frame))  # names come first: some exporters number their cameras from 1
     else:
-        names = [
-            camera.text("name", "") or node.text("name", "") or str(k)
-            for k, (node, camera) in enumerate(zip(placed, cameras, strict=True))
-        ]
-        of_nodes = [node.text("name", "") for node in placed]
-        by_node = frame not in names and of_nodes.count(str(frame)) == 1
-        k = (
-            of_nodes.index(str(frame))
-            if by_node
-            else choose_frame(path, names, frame, None, noun="camera")
-        )
+        k = choose_frame(path, names, frame, None, noun="camera")
     entry = cameras[k]
     if entry.text("type") != "perspective":
         raise entry.error(f"camera of type {entry.text('type')!r}, expected perspective")
@@ -69,15 +71,18 @@ def _world(nodes: list[Entry], parents: dict[int, int], index: int) -> Float64Ar
     world = local_matrix(nodes[index])
     while index in parents:
         index = parents[index]
-        world = local_matrix(nodes[index]) @ world
+        with np.errstate(over="ignore", invalid="ignore"):  # refused by `_unscaled`
+            world = local_matrix(nodes[index]) @ world
     return world
 
 
 def _unscaled(node: Entry, world: Float64Array) -> Float64Array:
     """Return a pose whose axes have length 1."""
+    if not (np.abs(world) <= LARGEST).all():  # nor are NaN and infinity
+        raise node.error(f"the camera's transform holds numbers beyond {LARGEST:g}")
     lengths = np.linalg.norm(world[:3, :3], axis=0)
-    if not (np.isfinite(world).all() and (lengths > 0.0).all()):
-        raise node.error("the camera's transform is singular or not finite")
+    if not (lengths > 0.0).all():
+        raise node.error("the camera's transform is singular")
     pose = world.copy()
     pose[:3, :3] /= lengths
     return rigid(node.path, node.pointer.lstrip("/"), pose)

@@ -15,12 +15,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from warpir.asset_files import FILE_BYTES, read_regular, read_uri
+from warpir.asset_files import read_regular, read_uri
 from warpir.errors import InputError
+from warpir.limits import LIMITS, Limits
 from warpir.strict_json import parse_json_object
-
-JSON_BYTES = 64 << 20
-"""Largest glTF JSON [byte]."""
 
 COMPONENTS: dict[int, np.dtype[Any]] = {
     5120: np.dtype("<i1"),
@@ -156,31 +154,41 @@ class GltfFile:
 
     Args:
         path: A ``.glb`` or ``.gltf`` file.
+        limits: How large it may be.
 
     Raises:
         InputError: The container or the JSON is damaged.
     """
 
-    def __init__(self, path: Path) -> None:
+    def __init__(self, path: Path, limits: Limits = LIMITS) -> None:
         self.path = path
+        self.limits = limits
+        self.hashes: dict[str, str] = {}
         is_text = path.suffix.lower() == ".gltf"
-        content = read_regular(path, path, limit=JSON_BYTES if is_text else FILE_BYTES)
+        content = read_regular(
+            path,
+            path,
+            limits=limits,
+            limit="gltf_json_bytes" if is_text else "file_bytes",
+            hashes=self.hashes,
+        )
         self._binary: memoryview | None = None
         if content[:4] == b"glTF" or path.suffix.lower() == ".glb":
             text = self._open_container(content)
         else:
             text = content
-        if len(text) > JSON_BYTES:
-            raise InputError(
-                path, f"glTF JSON is too large (found {len(text)} bytes; limit {JSON_BYTES})"
-            )
-        self.root = Entry(path, "", parse_json_object(path, text.rstrip(b"\0")))
+        self._check_json(len(text))
+        self.root = Entry(path, "", parse_json_object(path, text.rstrip(b"\0"), limits))
         version = self.root.child("asset").text("version", "")
         if version.split(".")[0] != "2":
             raise self.root.error(
                 f"asset version is {version!r}, expected 2.0", "convert it to glTF 2.0"
             )
         self._buffers: dict[int, memoryview] = {}
+
+    def _check_json(self, length: int) -> None:
+        what = "glTF JSON is too large"
+        self.limits.check("gltf_json_bytes", length, self.path, what, more=" bytes")
 
     def _open_container(self, content: bytes) -> bytes:
         """Return the JSON chunk of a ``.glb`` and keep its binary chunk."""
@@ -212,6 +220,7 @@ class GltfFile:
             if text is None:
                 if kind != b"JSON":
                     raise damaged(f"first chunk is {kind!r} (expected b'JSON')", start - 4)
+                self._check_json(length)
                 text = content[start:offset]
             elif kind == b"BIN\0" and self._binary is None:
                 self._binary = memoryview(content)[start:offset]
@@ -224,7 +233,9 @@ class GltfFile:
         if index not in self._buffers:
             entry = self.root.item("buffers", index, user, "buffer")
             if "uri" in entry:
-                content = memoryview(read_uri(entry.text("uri"), self.path, f"{entry.pointer}: "))
+                where = f"{entry.pointer}: "
+                uri = entry.text("uri")
+                content = memoryview(read_uri(uri, self.path, where, self.limits, self.hashes))
             elif index == 0 and self._binary is not None:
                 content = self._binary
             else:

@@ -9,10 +9,12 @@ from dataclasses import replace
 
 import numpy as np
 
-from warpir.asset import LIMITS, AssetLimits, Material, Texture, TextureSlot
+from warpir.asset import Material, Texture, TextureSlot
 from warpir.asset_files import Pixels, TextureDecoder, grey_pixels, locate, read_uri
 from warpir.errors import InputError
 from warpir.gltf_file import RE_EXPORT_MESH, Entry, GltfFile
+from warpir.limits import LIMITS, Limits
+from warpir.materials_file import EMISSION_LIMIT
 
 HONOURED = {
     "EXT_mesh_gpu_instancing",
@@ -50,6 +52,8 @@ ADVICE = {
 }
 """What to do about an extension that is refused when required."""
 
+SPECULAR_LIMIT = 1e6
+"""Largest factor on the reflectance at normal incidence, which is cut at 1 [1]."""
 WRAPS = {10497: "repeat", 33071: "clamp", 33648: "mirror"}
 NEAREST = (9728, 9984, 9986)
 
@@ -84,6 +88,7 @@ class MaterialReader:
         missing_textures: ``error`` or ``grey``.
         notices: Receives what was assumed or left out.
         limits: How many pixels the textures may have.
+        measures: Only count them, and decode nothing.
     """
 
     def __init__(
@@ -91,16 +96,20 @@ class MaterialReader:
         file: GltfFile,
         missing_textures: str,
         notices: list[str],
-        limits: AssetLimits = LIMITS,
+        limits: Limits = LIMITS,
+        measures: bool = False,
     ) -> None:
         self.file = file
         self.missing_textures = missing_textures
         self.notices = notices
         self.materials: list[Material] = []
         self.textures: list[Texture] = []
-        self._decoder = TextureDecoder(file.path, notices, limits)
+        self._decoder = TextureDecoder(file.path, notices, limits, measures)
         self._material_index: dict[int, int] = {}
         self._texture_index: dict[tuple[int, str, str], int] = {}
+        self._roughness_index: dict[tuple[int, float], int] = {}
+        """By the texture that holds the glossiness, and its factor."""
+        self._is_colored: dict[int, bool] = {}
         self._pixels: dict[int, Pixels | None] = {}
 
     def index(self, primitive: Entry) -> int:
@@ -135,6 +144,9 @@ class MaterialReader:
         if gain < 0:
             self.notices.append(f"{entry.pointer}: emissiveStrength {gain:g} clamped to 0")
         emission = self._factors(entry, "emissiveFactor", (0.0,) * 3, 0.0, math.inf)
+        if max(emission) * max(gain, 0.0) > EMISSION_LIMIT:
+            found = f"emission of {max(emission) * gain:g}"
+            raise entry.error(f"{found}, expected at most {EMISSION_LIMIT:g}")
         material = Material(
             name=name,
             base_color=(base_color[0], base_color[1], base_color[2]),
@@ -200,11 +212,15 @@ class MaterialReader:
         roughness_slot = None
         if slot is not None:
             # Glossiness is in A, roughness in G.
-            texture = self.textures[slot.texture]
-            codes = np.full_like(texture.pixels, 255)
-            codes[..., 1] = np.round(255.0 - glossiness * texture.pixels[..., 3])
-            self.textures.append(replace(texture, pixels=codes))
-            roughness_slot = replace(slot, texture=len(self.textures) - 1)
+            key = slot.texture, glossiness
+            if key not in self._roughness_index:
+                texture = self.textures[slot.texture]
+                self._decoder.count(texture.pixels[..., 0].size, f"{entry.pointer}: ")
+                codes = np.full_like(texture.pixels, 255)
+                codes[..., 1] = np.round(255.0 - glossiness * texture.pixels[..., 3])
+                self._roughness_index[key] = len(self.textures)
+                self.textures.append(replace(texture, pixels=codes))
+            roughness_slot = replace(slot, texture=self._roughness_index[key])
         return replace(
             material,
             base_color=(diffuse[0], diffuse[1], diffuse[2]),
@@ -226,7 +242,7 @@ class MaterialReader:
             self.notices.append(f"{entry.pointer}: ior {ior:g} clamped to 1")
             ior = 1.0
         specular = extensions.child("KHR_materials_specular")
-        color = self._factors(specular, "specularColorFactor", (1.0,) * 3, 0.0, math.inf)
+        color = self._factors(specular, "specularColorFactor", (1.0,) * 3, 0.0, SPECULAR_LIMIT)
         return replace(
             material,
             ior=ior,
@@ -273,8 +289,10 @@ class MaterialReader:
             return material
         missing = []
         slot = material.base_color_texture
-        codes = None if slot is None else self.textures[slot.texture].pixels[..., :3]
-        if len(set(material.base_color)) > 1 or (codes is not None and np.ptp(codes, axis=2).any()):
+        if slot is not None and slot.texture not in self._is_colored:
+            codes = self.textures[slot.texture].pixels[..., :3]
+            self._is_colored[slot.texture] = bool(np.ptp(codes, axis=2).any())
+        if len(set(material.base_color)) > 1 or (slot and self._is_colored[slot.texture]):
             missing.append("tinted")
         if material.roughness > 0.0:
             missing.append("blurred")
@@ -370,7 +388,8 @@ class MaterialReader:
             if source == -1:
                 raise texture.error("only a KTX2 image", ADVICE["KHR_texture_basisu"])
             if "uri" in image:
-                encoded = read_uri(uri, self.file.path, where)
+                file = self.file
+                encoded = read_uri(uri, file.path, where, file.limits, file.hashes)
             else:
                 encoded = bytes(self.file.view(image.integer("bufferView"), image)[0])
             return self._decoder.decode(encoded, where)

@@ -30,6 +30,10 @@ Pixels = NDArray[Any]
 _LOG = logging.getLogger(__name__)
 
 
+EXPOSURE_LIMIT = 1e12
+"""Largest product of a Radiance file's exposures, and its inverse the least [1]."""
+
+
 @dataclass(frozen=True)
 class DecodedImage:
     """What one file holds, before orientation and colour."""
@@ -56,8 +60,9 @@ def check_regular_file(path: Path) -> int:
         status = path.stat()
     except FileNotFoundError as error:
         raise InputError(path, "no such file") from error
-    except OSError as error:
-        raise InputError(path, f"not a regular file ({error.strerror})") from error
+    except (OSError, ValueError) as error:  # ValueError: a name that no file can have
+        reason = error.strerror if isinstance(error, OSError) else "not a file name"
+        raise InputError(path, f"not a regular file ({reason})") from error
     if not stat.S_ISREG(status.st_mode):
         kind = "a folder" if stat.S_ISDIR(status.st_mode) else "a device, pipe or socket"
         raise InputError(path, f"not a regular file (found {kind})")
@@ -151,6 +156,7 @@ def decode_image(
     max_pixels: int,
     kinds: tuple[str, ...] = tuple(_OIIO_NAMES),
     layer: str | None = None,
+    flag: str = "--max-pixels",
 ) -> DecodedImage:
     """Read the pixels of one file through OpenImageIO, with every check it leaves to us.
 
@@ -159,6 +165,7 @@ def decode_image(
         max_pixels: Largest image decoded [px].
         kinds: What is accepted, of the kinds that `DecodedImage.kind` names.
         layer: Of an EXR, the layer or part whose R, G and B are read.
+        flag: What raises ``max_pixels``.
 
     Raises:
         InputError: Missing, not an image of these kinds, truncated, too large, or of a variant
@@ -179,13 +186,13 @@ def decode_image(
     import OpenImageIO as oiio
 
     # 64 bytes a pixel leave room for EXR layers; sizes are compared exactly below.
-    oiio.attribute("limits:imagesize_MB", max(64, max_pixels * 64 // 2**20))
+    _limit_bytes(max_pixels * 64)
     hints = oiio.ImageSpec()
     hints.attribute("oiio:UnassociatedAlpha", 1)
     with captured_stderr():
         reader = oiio.ImageInput.open(str(path), hints)
         if reader is None:
-            raise _unreadable(path, kind, library_error(oiio), max_pixels)
+            raise _unreadable(path, kind, library_error(oiio), max_pixels, flag)
         try:
             if reader.format_name() != _OIIO_NAMES[kind]:
                 raise InputError(
@@ -193,10 +200,14 @@ def decode_image(
                     f"content contradicts itself (found {kind} magic bytes, "
                     f"read as {reader.format_name()})",
                 )
-            specs = _parts(reader, kind)
+            specs, error_text = _parts(reader, kind)
+            if _is_too_large(error_text):
+                raise _unreadable(path, kind, error_text, max_pixels, flag)
             part, channels, alpha = _choose_channels(path, kind, specs, layer)
             spec = specs[part]
-            _check_spec(path, spec, max_pixels)
+            for other in specs:
+                _check_size(path, other, max_pixels, flag)
+            _check_spec(path, spec)
             wanted = channels if alpha is None else [*channels, alpha]
             first, last = min(wanted), max(wanted) + 1
             try:
@@ -207,7 +218,7 @@ def decode_image(
                 ) from error
             error_text = library_error(reader)
             if pixels is None or error_text:
-                raise _unreadable(path, kind, error_text, max_pixels)
+                raise _unreadable(path, kind, error_text, max_pixels, flag)
             notices = _header_notices(spec, kind, head)
             notices += _check_parts(path, reader, specs, part, kind)
         finally:
@@ -222,7 +233,10 @@ def decode_image(
         primaries, unknown = _stated_primaries(spec, kind, head)
         notices += unknown
     profile = spec.getattribute("ICCProfile")
-    focal = spec.getattribute("Exif:FocalLengthIn35mmFilm")
+    if not isinstance(profile, bytes | np.ndarray):  # an EXR may call anything so
+        profile = None
+    # Tags of another type than they should have come back as the default.
+    focal = spec.get_float_attribute("Exif:FocalLengthIn35mmFilm", 0.0)
     chosen: Any = [channel - first for channel in channels]
     if chosen == [*range(chosen[0], chosen[0] + len(chosen))]:
         chosen = slice(chosen[0], chosen[0] + len(chosen))  # no copy
@@ -230,10 +244,10 @@ def decode_image(
         pixels=pixels[..., chosen],
         alpha=pixels[..., alpha - first] if alpha is not None else None,
         kind=kind,
-        orientation=int(spec.getattribute("Orientation") or 1),
+        orientation=spec.get_int_attribute("Orientation", 1),
         icc=bytes(profile) if profile is not None else None,
         primaries=primaries,
-        focal_35mm=float(focal) if focal and 1.0 <= float(focal) <= 10000.0 else None,
+        focal_35mm=focal if 1.0 <= focal <= 10000.0 else None,
         notices=tuple(notices),
     )
 
@@ -257,27 +271,73 @@ def read_exr_header(path: Path, names: Sequence[str]) -> dict[str, Any]:
     return {"size": (spec.full_width, spec.full_height), **attributes}
 
 
-def _parts(reader: Any, kind: str) -> list[Any]:
-    """Return the headers of an EXR's parts, as far as they are readable; of others, the first."""
+def read_exr_channels(path: Path, max_pixels: int) -> dict[str, FloatArray]:
+    """Read every channel of an EXR file's first part by its full name, shape [H, W] each.
+
+    Args:
+        path: The file.
+        max_pixels: Largest image decoded [px].
+
+    Raises:
+        InputError: Missing, not an EXR file, too large, deep, truncated or corrupt.
+    """
+    check_regular_file(path)
+    import OpenImageIO as oiio
+
+    # 256 bytes a pixel: all layers of a run take 136 in float32.
+    _limit_bytes(max_pixels * 256)
+    with captured_stderr():
+        reader = oiio.ImageInput.open(str(path))
+        if reader is None or reader.format_name() != "openexr":
+            raise InputError(path, f"not an EXR file ({library_error(oiio)[:80]})")
+        try:
+            spec = reader.spec()
+            _check_size(path, spec, max_pixels, "--max-pixels")
+            _check_spec(path, spec)
+            pixels = reader.read_image(0, 0, 0, spec.nchannels, "float")
+            error_text = library_error(reader)
+        finally:
+            reader.close()
+    if pixels is None or error_text:
+        raise _unreadable(path, "exr", error_text, max_pixels, "--max-pixels")
+    return {name: pixels[..., k] for k, name in enumerate(spec.channelnames)}
+
+
+def _limit_bytes(count: int) -> None:
+    """Tell the library the most that an image may take [byte]."""
+    import OpenImageIO as oiio
+
+    oiio.attribute("limits:imagesize_MB", min(max(64, count // 2**20), 2**31 - 1))
+
+
+def _parts(reader: Any, kind: str) -> tuple[list[Any], str]:
+    """Return the headers of an EXR's parts, as far as they are readable; of others, the first.
+
+    And what was wrong with the next one, if anything.
+    """
     specs = [reader.spec()]
     while kind == "exr" and reader.seek_subimage(len(specs), 0):
         specs.append(reader.spec())
+    text = library_error(reader)
     reader.seek_subimage(0, 0)
-    library_error(reader)
-    return specs
+    return specs, text
 
 
-def _check_spec(path: Path, spec: Any, max_pixels: int) -> None:
-    """Refuse what a header announces, before a pixel is decoded."""
-    import OpenImageIO as oiio
-
+def _check_size(path: Path, spec: Any, max_pixels: int, flag: str) -> None:
+    """Refuse an image or a part that is too large, before a pixel is decoded."""
     for width, height in ((spec.width, spec.height), (spec.full_width, spec.full_height)):
         if width * height > max_pixels:
             raise InputError(
                 path,
-                f"too large (found {width} x {height} pixels; expected at most {max_pixels})",
-                "raise --max-pixels",
+                f"too large (found {width} x {height} pixels; limit {max_pixels}); "
+                f"{flag} raises it",
             )
+
+
+def _check_spec(path: Path, spec: Any) -> None:
+    """Refuse a kind of image that a header announces, before a pixel is decoded."""
+    import OpenImageIO as oiio
+
     if spec.deep:
         raise InputError(path, "deep EXR images are not supported", "flatten it first")
     if spec.depth > 1:
@@ -301,7 +361,14 @@ def _choose_channels(
     if kind != "exr":
         spec = specs[0]
         alpha = spec.alpha_channel if spec.alpha_channel >= 0 else None
-        return 0, [0, 1, 2] if spec.channelnames[:3] == ("R", "G", "B") else [0], alpha
+        if spec.channelnames[:3] == ("R", "G", "B"):
+            return 0, [0, 1, 2], alpha
+        if spec.channelnames not in (("Y",), ("Y", "A")):
+            # Such as a palette with alpha, whose codes OpenImageIO mixes up.
+            found = ", ".join(spec.channelnames[:24])
+            what = f"a variant of {kind} that is not supported (found channels {found})"
+            raise InputError(path, what, "save it as RGB or greyscale")
+        return 0, [0], alpha
     for wanted in (("r", "g", "b"), ("y",)):
         for part, spec in enumerate(specs):
             names = [name.lower() for name in spec.channelnames]
@@ -340,8 +407,10 @@ def _exposure(path: Path, head: bytes) -> float:
             exposure *= float(line)
         except ValueError:
             exposure = np.nan
-    if not (np.isfinite(exposure) and exposure > 0.0):
-        raise InputError(path, f"EXPOSURE is not a positive number (found {exposure:g})")
+    if not 1.0 / EXPOSURE_LIMIT <= exposure <= EXPOSURE_LIMIT:
+        expected = f"{1.0 / EXPOSURE_LIMIT:g} to {EXPOSURE_LIMIT:g}"
+        what = f"EXPOSURE is not such a number (found {exposure:g}; expected {expected})"
+        raise InputError(path, what, "correct or remove the EXPOSURE lines of its header")
     return exposure
 
 
@@ -367,7 +436,7 @@ def _stated_primaries(
     elif stated is None:
         is_ours = space in ("", "unknown", "data", "lin_rec709_scene")
         return None, [] if is_ours else [f"colour space {space} is not followed"]
-    if stated is None or len(stated) != 8 or not color.are_primaries(stated):
+    if not isinstance(stated, tuple | list) or len(stated) != 8 or not color.are_primaries(stated):
         return None, ["primaries of the header are broken: taken as Rec.709"]
     if np.allclose(stated, color.REC709_CHROMATICITIES, atol=2e-3):
         return None, []
@@ -389,7 +458,7 @@ def _header_notices(spec: Any, kind: str, head: bytes) -> list[str]:
         notices.append("CMYK converted without its profile; export as RGB for exact colours")
     if spec.getattribute("Exif:ColorSpace") == 65535:
         notices.append("EXIF says uncalibrated colour; its profile, or else sRGB, is used")
-    aspect = float(spec.getattribute("PixelAspectRatio") or 1.0)
+    aspect = spec.get_float_attribute("PixelAspectRatio", 1.0)
     if kind == "exr" and abs(aspect - 1.0) > 1e-3:
         notices.append(f"pixel aspect ratio {aspect:g} is not followed: pixels are taken as square")
     corrections = _radiance_lines(head, b"(?:GAMMA|COLORCORR)") if kind == "hdr" else []
@@ -407,23 +476,39 @@ def _header_notices(spec: Any, kind: str, head: bytes) -> list[str]:
 
 
 def _check_parts(path: Path, reader: Any, specs: list[Any], used: int, kind: str) -> list[str]:
-    """Notice further pages; of an EXR, whose other parts may be cut off, read them all."""
+    """Notice further pages; of an EXR, whose other parts may be cut off, see that they are there.
+
+    Of those the first and the last rows are read: more would be no use, and may be a lot.
+    """
     if kind in ("tiff", "webp") and reader.seek_subimage(1, 0):
         return ["more than one page or frame: the first is used"]
     library_error(reader)
-    parts = int(specs[0].getattribute("oiio:subimages") or 1)
+    parts = specs[0].get_int_attribute("oiio:subimages", 1)
     if kind != "exr" or parts == 1:
         return []
     readable = 1
     for part, other in enumerate(specs):
-        if part != used and not other.deep:
-            planes = reader.read_image(part, 0, 0, other.nchannels, other.format)
-            readable += planes is not None and not library_error(reader)
-        else:
-            readable += part != used
+        if part == used:
+            continue
+        ends = () if other.deep else (other.y, other.y + other.height - 1)
+        rows = [_read_row(reader, part, other, y) for y in ends]
+        readable += all(row is not None for row in rows) and not library_error(reader)
     if readable < parts:
         raise InputError(path, f"truncated or corrupt ({readable} of {parts} parts readable)")
     return [f"{parts} parts: {'the first' if used == 0 else f'number {used + 1}'} is used"]
+
+
+def _read_row(reader: Any, part: int, spec: Any, y: int) -> Pixels | None:
+    """Return one row of a part of an EXR, or the row of tiles around it; None where it is cut."""
+    row: Pixels | None
+    if not spec.tile_height:
+        row = reader.read_scanlines(part, 0, y, y + 1, 0, 0, spec.nchannels, spec.format)
+        return row
+    top = y - (y - spec.y) % spec.tile_height
+    bottom = min(top + spec.tile_height, spec.y + spec.height)
+    left, right = spec.x, spec.x + spec.width
+    row = reader.read_tiles(part, 0, left, right, top, bottom, 0, 1, 0, spec.nchannels, spec.format)
+    return row
 
 
 def _place_in_display_window(pixels: Pixels, spec: Any) -> Pixels:
@@ -460,14 +545,13 @@ def upright(pixels: Pixels, orientation: int) -> Pixels:
     return turned[orientation](pixels) if orientation in turned else pixels
 
 
-def _unreadable(path: Path, kind: str, text: str, max_pixels: int) -> InputError:
+def _unreadable(path: Path, kind: str, text: str, max_pixels: int, flag: str) -> InputError:
     """Word a failure of the decoder."""
-    if any(word in text for word in ("exceed", "claims a", "claimed to be")):
+    if _is_too_large(text):
         return InputError(
             path,
             f"the header claims too large an image ({one_line(text)}; "
-            f"expected at most {max_pixels} pixels)",
-            "raise --max-pixels if the file is sound",
+            f"limit {max_pixels} pixels); {flag} raises it if the file is sound",
         )
     if kind == "hdr" and "FORMAT" in text:
         return InputError(
@@ -481,6 +565,10 @@ def _unreadable(path: Path, kind: str, text: str, max_pixels: int) -> InputError
         f"truncated, corrupt or of an unsupported variant of {kind} ({reason})",
         "check that the file was copied or downloaded completely",
     )
+
+
+def _is_too_large(text: str) -> bool:
+    return any(word in text for word in ("exceed", "claims a", "claimed to be"))
 
 
 def library_error(source: Any) -> str:

@@ -2,6 +2,7 @@
 
 import os
 from collections.abc import Callable, Iterator
+from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from functools import lru_cache
 from pathlib import Path
@@ -9,21 +10,24 @@ from typing import Any, TypeVar
 
 import numpy as np
 
-from warpir.asset import Asset, AssetLimits, load_asset
+from warpir.asset import Asset, load_asset
 from warpir.camera import Camera, camera_from_exif, camera_from_fov
 from warpir.camera_files import read_photo_camera
 from warpir.camera_source import PhotoCamera
 from warpir.config import InsertConfig, usage
-from warpir.errors import ExitCode, InputError, raise_all
+from warpir.errors import InputError, raise_all
 from warpir.free_space import find_place, points_in_way
 from warpir.light import Float64Array, FloatArray, Light
+from warpir.limits import Limits
 from warpir.lobes_file import read_lobes
 from warpir.materials_file import with_materials
+from warpir.model_files import require_model
 from warpir.photo_files import Photo, read_envmap, read_mask, read_photo
 from warpir.photo_world import PhotoWorld, make_world
 from warpir.placement import Placement, place_asset, up_to_y, upright_plane
 from warpir.point_cloud import read_point_cloud
 from warpir.proxy_mesh import ProxyMesh, first_hit, is_in_view, mesh_of
+from warpir.record import file_hash, input_files
 from warpir.reuse import EarlierRun, read_run
 from warpir.shadow_mask import ShadowMask, shadow_mask
 from warpir.undistort import undistort_photo, undistorted
@@ -67,15 +71,18 @@ class Inputs:
     """What --occluder-mask holds: share of the photo in front of the object [1], shape [H, W]."""
     measured: dict[str, Any] = field(default_factory=dict)
     """What ``run.json`` says of the undone distortion and of the ground's fit."""
+    hashes: dict[str, str] = field(default_factory=dict)
+    """sha256 of what was read, by the field's name; of files that an asset brings along, by
+    ``asset/`` and their names, relative to it."""
 
 
 class Loaders:
     """Reads assets, places and earlier runs; remembers the last of each, for many insertions."""
 
     def __init__(self) -> None:
-        self.asset: Callable[[str, str, AssetLimits], Asset] = lru_cache(maxsize=1)(load_asset)
-        self.proxy: Callable[[str], Asset] = lru_cache(maxsize=1)(_read_proxy)
-        self.run: Callable[[str], EarlierRun] = lru_cache(maxsize=1)(read_run)
+        self.asset: Callable[[str, str, Limits], Asset] = lru_cache(maxsize=1)(load_asset)
+        self.proxy: Callable[[str, Limits], Asset] = lru_cache(maxsize=1)(_read_proxy)
+        self.run: Callable[[str, Limits], EarlierRun] = lru_cache(maxsize=1)(read_run)
 
 
 def read_inputs(config: InsertConfig, loaders: Loaders | None = None) -> Inputs:
@@ -101,10 +108,10 @@ def read_inputs(config: InsertConfig, loaders: Loaders | None = None) -> Inputs:
 
     assert config.photo is not None and config.asset is not None
     photo_path, asset_path = config.photo, config.asset
+    states: dict[str, tuple[Path, _State | None]] = {}
+    with suppress(InputError):  # the reader tells
+        states = {name: (path, _state(path)) for name, path in input_files(config).items()}
     problems += _inputs_in_out(config)
-    for path in (config.lora, config.prior, config.regressor):
-        if path is not None and not Path(path).is_file():
-            problems.append(InputError(path, "no such file", code=ExitCode.MODEL))
     notices: list[str] = []
     assumed: list[str] = []
     photo = attempt(
@@ -116,20 +123,35 @@ def read_inputs(config: InsertConfig, loaders: Loaders | None = None) -> Inputs:
             strict=config.strict,
         )
     )
-    occluder = attempt(lambda: _read_mask(config.occluder_mask, photo, notices))
-    shaded = attempt(lambda: _read_mask(config.shadow_mask, photo, notices))
-    asset = attempt(lambda: _read_asset(asset_path, config, loaders, assumed))
+    occluder = attempt(lambda: _read_mask(config.occluder_mask, photo, config, notices))
+    shaded = attempt(lambda: _read_mask(config.shadow_mask, photo, config, notices))
+    asset = attempt(lambda: read_asset(asset_path, config, loaders, assumed))
     reuse = config.reuse
-    run = attempt(lambda: loaders.run(reuse)) if reuse is not None else None
-    view = attempt(lambda: _make_camera(config, photo, assumed)) if photo is not None else None
+    run = attempt(lambda: loaders.run(reuse, config.limits)) if reuse is not None else None
+    view = attempt(lambda: photo_camera(config, photo, assumed)) if photo is not None else None
     # Without a camera the run ends below, but all that is wrong with the light is told too.
     pose = view.camera.c2w if view is not None else np.eye(4)
     light = attempt(lambda: _read_light(config, pose, notices))
     points_path, proxy_path = config.ground_points, config.proxy
-    points = attempt(lambda: read_point_cloud(points_path)) if points_path is not None else None
-    proxy = attempt(lambda: loaders.proxy(proxy_path)) if proxy_path is not None else None
+    limits = config.limits
+    points = proxy = None
+    if points_path is not None:
+        points = attempt(lambda: read_point_cloud(points_path, limits))
+    if proxy_path is not None:
+        proxy = attempt(lambda: loaders.proxy(proxy_path, limits))
+    attempt(lambda: require_model(config))
     raise_all(problems)
     assert photo is not None and asset is not None and view is not None
+    hashes = {name: file_hash(path) for name, (path, _) in states.items()}
+    raise_all([_changed(path) for path, before in states.values() if _state(path) != before])
+    for name, mesh_read in (("asset", asset), ("proxy", proxy)):
+        for file, digest in mesh_read.hashes.items() if mesh_read is not None else ():
+            hashes[f"{name}/{file}" if file else name] = digest
+            folder = Path(getattr(config, name)).parent.resolve()
+            problems += _within_out(config, folder / file) if file else []
+    raise_all(problems)
+    if run is not None:
+        hashes["reuse"] = run.digest
 
     measured: dict[str, Any] = {}
     straight = photo
@@ -196,35 +218,74 @@ def read_inputs(config: InsertConfig, loaders: Loaders | None = None) -> Inputs:
         notices=tuple(notices),
         occluder=occluder,
         measured=measured,
+        hashes=hashes,
     )
+
+
+_State = tuple[int, int, int]
+
+
+def _state(path: Path) -> _State | None:
+    """Return what a change of a file's content changes; None where there is no such file."""
+    try:
+        status = path.stat()
+    except (OSError, ValueError):  # the reader tells
+        return None
+    return status.st_ino, status.st_size, status.st_mtime_ns
+
+
+def _changed(path: Path) -> InputError:
+    return InputError(path, "changed while it was read", "run again when it is complete")
 
 
 def _inputs_in_out(config: InsertConfig) -> list[InputError]:
     """Refuse an --out that holds an input: --overwrite could replace it."""
-    if config.out is None:
-        return []
-    out = os.path.realpath(config.out)
     named = (
         *(config.photo, config.asset, config.materials, config.camera, config.light),
-        *(config.occluder_mask, config.shadow_mask, config.proxy),
+        *(config.occluder_mask, config.shadow_mask, config.proxy, config.reuse, config.model),
         *(config.lora, config.prior, config.regressor, config.ground_points),
     )
-    folders = {
-        path: path if Path(path).is_dir() else os.path.dirname(path)
-        for path in named
-        if path is not None
-    }
-    if config.reuse is not None:
-        folders[config.reuse] = config.reuse
-    for path, folder in folders.items():
-        if os.path.realpath(folder) == out:
+    return _within_out(config, *(path for path in named if path is not None))
+
+
+def _within_out(config: InsertConfig, *paths: str | Path) -> list[InputError]:
+    """Refuse the first path that is --out or below it: by links, or in a folder of the results."""
+    if config.out is None:
+        return []
+    out = _places(config.out)[:1]
+    if not out or out[0] == out[0].parent:
+        return []  # no name, or the root: `warpir.files.OutputFolder` says so
+    for path in paths:
+        if any(place.is_relative_to(out[0]) for place in _places(path)):
             return [usage("--out", f"holds the input {path}", "choose a folder of its own")]
     return []
 
 
-def _read_asset(path: str, config: InsertConfig, loaders: Loaders, assumed: list[str]) -> Asset:
-    limits = AssetLimits(config.max_triangles, config.max_texture_pixels)
-    asset = loaders.asset(path, config.missing_textures, limits)
+def _places(path: str | Path) -> list[Path]:
+    """Return where a path leads, and where it lies itself if it is a link: either can be replaced.
+
+    None for what no file can be called: the reader tells.
+    """
+    folder, name = os.path.split(os.path.abspath(path))
+    try:
+        return [Path(os.path.realpath(path)), Path(os.path.realpath(folder), name)]
+    except ValueError:
+        return []
+
+
+def read_asset(path: str, config: InsertConfig, loaders: Loaders, assumed: list[str]) -> Asset:
+    """Read --asset as its flags say: which way is up, and its materials.
+
+    Args:
+        path: The file.
+        config: The flags.
+        loaders: Of earlier insertions.
+        assumed: What was chosen because nothing was given is appended here.
+
+    Raises:
+        InputError: The asset or its materials cannot be used.
+    """
+    asset = loaders.asset(path, config.missing_textures, config.limits)
     if config.asset_up is not None:
         turned = f"turned: its {config.asset_up} axis points up (--asset-up)"
         asset = asset.turned(up_to_y(config.asset_up))
@@ -232,7 +293,7 @@ def _read_asset(path: str, config: InsertConfig, loaders: Loaders, assumed: list
     elif Path(path).suffix.lower() not in STATED_UP:
         assumed.append("the asset's +y axis points up (--asset-up)")
     if config.materials is not None:
-        asset = with_materials(asset, config.materials)
+        asset = with_materials(asset, config.materials, config.limits)
     for name in config.refine_materials or ():
         if not asset.materials_named([name]):
             found = ", ".join(dict.fromkeys(ascii(m.name) for m in asset.materials))
@@ -278,9 +339,9 @@ def _place(
     return placement
 
 
-def _read_proxy(path: str) -> Asset:
+def _read_proxy(path: str, limits: Limits) -> Asset:
     """Read the mesh of the place; of its materials nothing is used."""
-    asset = load_asset(path, "grey")
+    asset = load_asset(path, "grey", limits)
     notices = [n for n in asset.notices if "material" not in n and "texture" not in n]
     if any(m.alpha_mode != "OPAQUE" for m in asset.materials):
         notices.append("the opacity of its materials is not used: all of the mesh blocks light")
@@ -300,7 +361,17 @@ def _about_mesh(
         yield "the mesh of --proxy hides the object's middle from the camera"
 
 
-def _make_camera(config: InsertConfig, photo: Photo, assumed: list[str]) -> PhotoCamera:
+def photo_camera(config: InsertConfig, photo: Photo, assumed: list[str]) -> PhotoCamera:
+    """Return the camera of --camera, else of the numbers given, the photo's EXIF and what is usual.
+
+    Args:
+        config: The flags.
+        photo: The upright photo.
+        assumed: What was chosen because nothing was given is appended here.
+
+    Raises:
+        InputError: The camera file cannot be used, or does not fit the photo.
+    """
     height, width = photo.codes.shape[:2]
     if config.camera is not None:
         assert config.photo is not None
@@ -311,6 +382,7 @@ def _make_camera(config: InsertConfig, photo: Photo, assumed: list[str]) -> Phot
             frame=config.frame,
             photo_name=Path(config.photo).name,
             undistort=config.undistort,
+            limits=config.limits,
         )
     return PhotoCamera(_camera_from_numbers(config, photo, assumed))
 
@@ -333,12 +405,14 @@ def _camera_from_numbers(config: InsertConfig, photo: Photo, assumed: list[str])
     return camera_from_fov(width, height, config.fov or DEFAULT_FOV, *pose)
 
 
-def _read_mask(path: str | None, photo: Photo | None, notices: list[str]) -> FloatArray | None:
+def _read_mask(
+    path: str | None, photo: Photo | None, config: InsertConfig, notices: list[str]
+) -> FloatArray | None:
     if path is None or photo is None:
         return None
     height, width = photo.codes.shape[:2]
     found: list[str] = []
-    mask = read_mask(path, (width, height), notices=found)
+    mask = read_mask(path, (width, height), max_pixels=config.max_pixels, notices=found)
     notices += _about(path, found)
     return mask
 
@@ -353,7 +427,7 @@ def _read_light(
             raise usage("--fit-lobes", f"needs a panorama to fit (found lobes: {config.light})")
         if config.light_convention != "openexr":
             raise usage("--light-convention", f"is for panoramas (found lobes: {config.light})")
-        return Light(lobes=read_lobes(config.light)).rotated(config.light_rotate)
+        return Light(lobes=read_lobes(config.light, config.limits)).rotated(config.light_rotate)
     found: list[str] = []
     texels = read_envmap(
         config.light,
@@ -361,6 +435,7 @@ def _read_light(
         camera_to_world=camera_to_world,
         pictures=True,
         strict=config.strict,
+        max_width=config.max_envmap_width,
         notices=found,
     )
     notices += _about(config.light, found)

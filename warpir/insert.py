@@ -9,29 +9,37 @@ or from Python, where the module itself can be called:
 
     insertion = insert(InsertConfig(photo="street.jpg", asset="car.glb", out="out"))
 
-torch and Warp are imported when all inputs are known to be good, so ``--help``, wrong arguments
-and ``--validate`` answer without them.
+The order of the checks: arguments, all inputs and the models' files, the output folder and its
+lock, disk space. torch and Warp are imported when all of it is known to be good, so ``--help``,
+wrong arguments and ``--validate`` answer without them.
 """
 
+import logging
+import os
 import sys
-from collections.abc import Sequence
+import threading
+from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from types import ModuleType
 from typing import TYPE_CHECKING, Any
 
 from warpir.command import parse
-from warpir.config import EMBEDDED_STEPS, InsertConfig
+from warpir.config import EMBEDDED_STEPS, InsertConfig, usage
 from warpir.errors import ExitCode, InputError
-from warpir.program import run_program, say
+from warpir.limits import LIMITS
+from warpir.memory import Memory, Need, needs_of_photo, needs_of_scene, release, share_device
+from warpir.program import require_packages, run_program, say, stay_offline
+from warpir.signals import Stopped
 
 if TYPE_CHECKING:
     from warpir.camera import Camera
-    from warpir.files import OutputFolder
+    from warpir.files import Layers, OutputFolder
     from warpir.inputs import Inputs, Loaders
     from warpir.lighting import SceneLight
     from warpir.picture import Picture
     from warpir.record import Timings
+    from warpir.report import Results
 
 __all__ = ["InsertConfig", "Insertion", "insert", "main"]
 
@@ -39,6 +47,8 @@ NOT_ASKED = (
     f"the embedded prior was not asked (--steps {EMBEDDED_STEPS}: experimental, it failed its "
     "release gate)"
 )
+_LOG = logging.getLogger(__name__)
+_ONE_AT_A_TIME = threading.Lock()
 PREVIEW_SAMPLES = 16
 """Camera samples per pixel of the preview of a run that nothing guides."""
 
@@ -56,9 +66,23 @@ class Insertion:
     """Content of the last file; ``run.json`` holds inputs, settings, what was assumed, device and
     seconds."""
 
+    def layers(self) -> "Layers":
+        """Read ``layers.exr`` back as arrays; a sequence has one in each frame's folder.
+
+        Raises:
+            InputError: It is not there, or damaged.
+        """
+        from warpir.files import read_layers
+
+        told = self.record.get("config", {})  # that of a sequence has none
+        return read_layers(self.out / "layers.exr", told.get("max_pixels", LIMITS.pixels))
+
 
 def insert(config: InsertConfig) -> Insertion:
     """Insert one object into one photograph, or into a sequence of them, and write the files.
+
+    Calls from several threads wait for each other: Warp's tape, torch's threads and the handling of
+    signals belong to the process.
 
     Args:
         config: What to do. Assumptions and notices are printed on standard output.
@@ -67,13 +91,14 @@ def insert(config: InsertConfig) -> Insertion:
         InputError: An input or the output folder cannot be used; nothing was written then.
     """
     config.require_inputs()
-    if config.sequence is not None:
-        return _insert_sequence(config)
-    try:
-        return _insert_one(config)
-    except BaseException as error:
-        _say_what_is_kept(config, error)
-        raise
+    with _ONE_AT_A_TIME:
+        if config.sequence is not None:
+            return _insert_sequence(config)
+        try:
+            return _insert_one(config)
+        except BaseException as error:
+            _say_what_is_kept(config, error)
+            raise
 
 
 def _say_what_is_kept(config: InsertConfig, error: BaseException) -> None:
@@ -81,66 +106,85 @@ def _say_what_is_kept(config: InsertConfig, error: BaseException) -> None:
     if isinstance(error, InputError) and error.code not in (ExitCode.RESOURCES, ExitCode.NUMERIC):
         return  # refused before it began
     assert config.out is not None
-    kept = sorted((Path(config.out) / "checkpoints").glob("[0-9]*"))
-    if kept:
-        say(f"kept: {kept[-1]}; the same command with --resume goes on from there")
+    folder = Path(config.out) / "checkpoints"
+    kept = sorted(folder.glob("[0-9]*")) if os.path.isdir(folder) else []
+    how = f"kept: {kept[-1]}; the same command with --resume goes on from there" if kept else ""
+    if isinstance(error, Stopped):  # its line is the last one, and may know better
+        error.kept = error.kept or how or "there was no checkpoint to keep yet"
+    elif how:
+        say(how)
 
 
 def _insert_sequence(config: InsertConfig) -> Insertion:
+    from warpir.files import finish_results
     from warpir.inputs import Loaders
+    from warpir.report_sequence import PAGE, refuse_other_page, write_sequence_report
     from warpir.sequence import SUMMARY, read_sequence, write_summary
 
+    assert config.out is not None
+    for folder in sorted(Path(config.out).glob("[0-9][0-9][0-9][0-9]")):
+        finish_results(folder)
     loaders = Loaders()
     frames = read_sequence(config, loaders)
-    for frame in frames:
-        if frame.is_done:
-            say(f"frame {frame.folder.name}: done already")
-        else:
-            say(f"frame {frame.folder.name}: line {frame.line} of {config.sequence}")
-            _insert_one(frame.config, loaders)
-    assert config.out is not None
-    record = write_summary(config, frames)
+    refuse_other_page(config)
+    done = 0
+    try:
+        for frame in frames:
+            if frame.is_done:
+                say(f"frame {frame.folder.name}: done already")
+            else:
+                say(f"frame {frame.folder.name}: line {frame.line} of {config.sequence}")
+                _insert_one(frame.config, loaders)
+            done += 1
+    except Stopped as error:
+        done += bool(error.kept)  # the signal came while this frame's results were put in place
+        how = "renders them again" if config.overwrite else "goes on with the rest"
+        error.kept = f"kept: {done} of {len(frames)} frames; the same command {how}"
+        raise
+    record = write_summary(config, frames, say)
+    if config.report:
+        _made_or_told(PAGE, lambda: write_sequence_report(config, frames))
     composites = (f"{frame.folder.name}/composite.png" for frame in frames)
-    return Insertion(Path(config.out), (*composites, SUMMARY), record)
+    return Insertion(Path(config.out), (*composites, *record["video"], SUMMARY), record)
 
 
 def _insert_one(config: InsertConfig, loaders: "Loaders | None" = None) -> Insertion:
+    from warpir.checkpoint import FOLDER
+    from warpir.disk_space import needed_bytes, require_space
     from warpir.progress import progress_bar
-    from warpir.record import Timings, input_hashes, run_record
+    from warpir.record import Timings, run_record
     from warpir.strict_json import read_json_object
 
     timings = Timings()
     with timings.stage("read"):
-        # The demo fills in its files; what was asked for is what run.json repeats.
-        asked = config
+        # The demo fills in its files; what was asked for is what run.json repeats, but not how the
+        # folder was found: a resumed run leaves what an uninterrupted one does.
+        asked = replace(config, resume=False, overwrite=False)
         config, inputs, light = _read(config, loaders)
 
-    from warpir.checkpoint import Checkpoints
-    from warpir.files import OutputFolder
-
     assert config.out is not None
-    checkpoints = Checkpoints(Path(config.out), {})
-    if config.resume and checkpoints.newest is None and Path(config.out, "run.json").exists():
-        raise InputError(
-            "--resume",
-            f"the run in {config.out} is finished",
-            "to run it again, give --overwrite in place of --resume",
-            ExitCode.OUTPUT,
-        )
-    # A run to resume was allowed to replace what is there, or has made it.
-    overwrite = config.overwrite or (config.resume and checkpoints.newest is not None)
-    with OutputFolder(config.out, overwrite=overwrite) as output:
+    memory, (of_photo, of_scene) = Memory(say=say), needs_of(inputs)
+    with _output_folder(config) as output:
+        require_space(config.out, needed_bytes(config, inputs))
+        memory.require(of_photo, *of_scene, on_host=True)
         # Warp is loaded here, after everything that can be wrong was looked at.
         with timings.stage("load"):
             from warpir.picture import Quality, make_picture, scene_of
             from warpir.render import Renderer, choose_device
 
             device = choose_device(config.device)
+            memory.device = device
+            share_device(device)
+            if device != "cpu":
+                memory.require(*of_scene)
             say(f"device: {device} (the first run compiles the kernels)")
         recovered: dict[str, Any] = {}
-        notices = inputs.notices
+        notices = (*inputs.notices, *_cache_notices())
         if config.is_guided:
-            inputs, light, recovered, found = _guide(config, inputs, light, device, output, timings)
+            inputs, light, recovered, found = _guide(
+                config, inputs, light, device, output, timings, memory
+            )
+            release()
             notices = (*notices, *found)
             light, shown = _detailed(config, inputs, light, timings)
             recovered |= shown
@@ -159,10 +203,13 @@ def _insert_one(config: InsertConfig, loaders: "Loaders | None" = None) -> Inser
         with timings.stage("scene"):
             is_reinhard = light.curves.tone == "reinhard"
             camera = _rendering_camera(inputs.camera, config)
-            scene = scene_of(inputs, camera, device, light.curves)
+            scene = memory.again(
+                lambda: scene_of(inputs, camera, device, light.curves), "the scene", "--asset"
+            )
         with timings.stage("render"), progress_bar() as report:
+            renderer = Renderer(scene, config.threads or 0, report, memory)
             picture = make_picture(
-                Renderer(scene, config.threads or 0, report),
+                renderer,
                 light.on_object,
                 light.light_shadow,
                 inputs.photo,
@@ -179,11 +226,17 @@ def _insert_one(config: InsertConfig, loaders: "Loaders | None" = None) -> Inser
                 occluder=inputs.occluder,
                 shadow_mask=inputs.shadow_mask,
             )
+        notices = (*notices, *memory.notices(), *renderer.bad_pixels.notices())
+        for notice in renderer.bad_pixels.notices():
+            say(f"notice: {notice}")
         with timings.stage("write"):
-            measured = _write(output, config, inputs, light, picture)
+            measured, results = _write(output, config, inputs, light, picture)
+        # With the results in place, what was kept for a run that stops is not needed any more.
+        output.supersede(output.path / FOLDER)
+        notices = (*notices, *_cache_notices())
         record = run_record(
             asked,
-            inputs=input_hashes(config),
+            inputs=inputs.hashes,
             device=str(scene.device),
             timings=timings,
             assumed=(*inputs.assumed, *light.assumed),
@@ -193,22 +246,110 @@ def _insert_one(config: InsertConfig, loaders: "Loaders | None" = None) -> Inser
                 **inputs.measured,
                 **measured,
                 **recovered,
+                "bad_pixels": renderer.bad_pixels.count,
+                "memory_retries": memory.retries,
             },
         )
+        if config.report:
+            from warpir.report import REPORT, write_report
+
+            results = replace(results, record=record)
+            with timings.stage("report"):
+                told = _made_or_told(REPORT, lambda: write_report(output, results))
+            record["notices"] += told
+            record["seconds"] = timings.rounded()
         output.write_json("run.json", record)
     _say_who_spoke(record)
-    if config.is_guided:
-        # The results are in place: what was kept for a run that stops is not needed any more.
-        checkpoints.remove()
     record = read_json_object(output.path / "run.json")
     return Insertion(output.path, (*record["files"], "run.json"), record)
+
+
+def _made_or_told(page: str, make: Callable[[], None]) -> list[str]:
+    """Make a page about results; where that fails return, having said so, a notice of it.
+
+    Raises:
+        InputError: There is no room for it (exit 5).
+    """
+    try:
+        make()
+    # Whatever it is: all results are there, and a page about them must not cost them.
+    except Exception as error:
+        if isinstance(error, InputError) and error.code == ExitCode.RESOURCES:
+            raise
+        _LOG.debug(page, exc_info=True)
+        why = str(error) if isinstance(error, InputError) else f"{type(error).__name__}: {error}"
+        line = f"{page} could not be made ({why})"
+        say(f"notice: {line}")
+        return [line]
+    return []
+
+
+def _output_folder(config: InsertConfig) -> "OutputFolder":
+    """Return the folder that is to be written, not yet entered.
+
+    Raises:
+        InputError: The run that is to be resumed is finished.
+    """
+    from warpir.checkpoint import Checkpoints
+    from warpir.files import OutputFolder
+
+    assert config.out is not None
+    newest = Checkpoints(Path(config.out), {}).newest
+    if config.resume and newest is None and os.path.exists(Path(config.out, "run.json")):
+        raise InputError(
+            "--resume",
+            f"the run in {config.out} is finished",
+            "to run it again, give --overwrite in place of --resume",
+            ExitCode.OUTPUT,
+        )
+    if newest is not None and not (config.resume or config.overwrite):
+        raise InputError(
+            config.out,
+            f"holds an unfinished run ({newest})",
+            "--resume goes on with it, --overwrite starts it again",
+            ExitCode.OUTPUT,
+        )
+    if config.resume and newest is not None and not config.is_guided:
+        raise InputError(
+            "--resume",
+            f"the unfinished run in {config.out} was guided, this one is not",
+            "give its flags, or --overwrite in place of --resume",
+            ExitCode.OUTPUT,
+        )
+    # A run to resume was allowed to replace what is there, or has made it: no other run gets in.
+    overwrite = config.overwrite or (config.resume and newest is not None)
+    return OutputFolder(config.out, overwrite=overwrite)
+
+
+def _cache_notices() -> tuple[str, ...]:
+    """Return what a cache has to say since the last call, having said it."""
+    from warpir.caches import take_notices
+
+    notices = take_notices()
+    for line in notices:
+        say(f"notice: {line}")
+    return notices
+
+
+def needs_of(inputs: "Inputs") -> tuple[Need, tuple[Need, ...]]:
+    """Return what photo and layers need of the host, and the scene of the renderer's device."""
+    height, width = inputs.photo.codes.shape[:2]
+    asset = inputs.asset
+    scene = needs_of_scene(
+        sum(len(part.positions) for part in asset.primitives),
+        sum(len(part.indices) for part in asset.primitives),
+        sum(texture.pixels[..., 0].size for texture in asset.textures),
+    )
+    return needs_of_photo(height * width), scene
 
 
 def _regress(
     config: InsertConfig, inputs: "Inputs", device: str, timings: "Timings"
 ) -> "tuple[SceneLight, dict[str, Any]]":
     """Read the light off the photo; return it, and what run.json says of it."""
-    with timings.stage("regress"):
+    from warpir.determinism import fixed_arithmetic
+
+    with timings.stage("regress"), fixed_arithmetic(device, config.deterministic):
         from warpir.estimate import estimate_light
 
         estimate = estimate_light(inputs, config, device)
@@ -303,17 +444,20 @@ def _guide(
     device: str,
     output: "OutputFolder",
     timings: "Timings",
+    memory: Memory,
 ) -> "tuple[Inputs, SceneLight, dict[str, Any], tuple[str, ...]]":
     """Let the prior find the light, or change the object under the light it has.
 
     Returns:
         Inputs and light as they are to be rendered, what run.json says of it, and notices.
     """
+    from warpir.determinism import fixed_arithmetic
     from warpir.progress import StepProgress
-    from warpir.recover import Run, recover
 
-    with StepProgress(say) as progress:
-        run = Run(config, inputs, device, output, timings, say, progress)
+    with StepProgress(say) as progress, fixed_arithmetic(device, config.deterministic):
+        from warpir.recover import Run, recover
+
+        run = Run(config, inputs, device, output, timings, say, progress, memory=memory)
         if config.refine is None:
             light, record, notices = recover(run, light)
         else:
@@ -340,40 +484,51 @@ def _write(
     inputs: "Inputs",
     light: "SceneLight",
     picture: "Picture",
-) -> dict[str, Any]:
-    """Stage all files but ``run.json``; return the numbers that belong into it."""
+) -> "tuple[dict[str, Any], Results]":
+    """Stage all files but ``run.json`` and the report.
+
+    Returns:
+        The numbers that belong into the one, and what the other shows.
+    """
     from warpir.curves import curves_to_json
     from warpir.files import write_layers
     from warpir.light import summarize
     from warpir.lobes_file import lobes_to_json
     from warpir.picture import as_file_map, balls
-    from warpir.record import input_hashes
+    from warpir.record import config_of_picture
+    from warpir.report import Results
 
     photo, camera = inputs.photo, inputs.camera
     codes = photo.encode(picture.image, picture.changed)
+    # Many shadows are too faint for a code; a linear plate has no codes of the same kind.
+    changed = picture.changed if photo.is_linear else (codes != photo.codes).any(axis=-1)
     output.write_png("composite.png", codes, icc=photo.icc, mark=config.mark)
     clamped = write_layers(
         output,
         picture.layers,
         camera,
         is_deep=photo.is_deep,
-        config=asdict(config),
-        inputs=input_hashes(config),
+        config=config_of_picture(config),
+        inputs=inputs.hashes,
     )
-    output.write_envmap(as_file_map(light.light))
+    texels, texels_shadow = as_file_map(light.light), None
+    output.write_envmap(texels)
     if light.light_shadow is not light.light:
-        output.write_envmap(as_file_map(light.light_shadow), "envmap_shadow")
-    on_object, its_map = as_file_map(light.on_object), "envmap.exr"
+        texels_shadow = as_file_map(light.light_shadow)
+        output.write_envmap(texels_shadow, "envmap_shadow")
+    on_object, its_map = texels, "envmap.exr"
     if light.detailed is not None:
+        on_object = as_file_map(light.on_object)
         output.write_envmap(on_object, "envmap_detail")
         its_map = "envmap_detail.exr"
     if light.light.lobes is not None:
         output.write_json("lobes.json", lobes_to_json(light.light.lobes))
     output.write_json("curves.json", curves_to_json(light.curves))
     output.write_json("camera.json", camera.record())
+    pair = balls(light.on_object, camera, light.curves.tone == "reinhard")
     output.write_png(
         "balls.png",
-        balls(light.on_object, camera, light.curves.tone == "reinhard"),
+        pair,
         mark=False,
         description="Mirror ball and white diffuse ball under the light",
     )
@@ -398,9 +553,13 @@ def _write(
         say("notice: the object is not seen in the photo")
     fit = light.fit
     mask = inputs.shadow_mask
-    return {
+    measured = {
         "prior": "none",
         "integrator": "mis",
+        "placement": {
+            "summary": inputs.placement.summary,
+            "ground": inputs.placement.ground.tolist(),
+        },
         "exposure_ev": light.exposure,
         "light": asdict(summary),
         "lobe_fit": fit
@@ -413,10 +572,20 @@ def _write(
         **({} if inputs.proxy is None else {"proxy_triangles": len(inputs.proxy.indices)}),
         "object_pixels": picture.object_pixel_count,
         "shadow_pixels": picture.proxy_pixel_count,
-        "changed_pixels": int(picture.changed.sum()),
+        "changed_pixels": int(changed.sum()),
         "values_clamped_to_half": clamped,
         **handed,
     }
+    results = Results(
+        layers=picture.layers,
+        light=texels,
+        light_shadow=texels_shadow,
+        light_detail=None if light.detailed is None else on_object,
+        balls=pair,
+        curves=light.curves,
+        camera=camera.record(),
+    )
+    return measured, results
 
 
 def _read(
@@ -459,10 +628,17 @@ def _run(arguments: list[str]) -> int:
     command = parse(arguments)
     for notice in command.notices:
         say(f"notice: {notice}")
+    guides = ("diffusers", "transformers", "peft") if command.config.is_guided else ()
+    require_packages("warp", "torch", *guides)
+    if guides and sys.flags.optimize > 1:
+        advice = "run without -OO and PYTHONOPTIMIZE=2"
+        raise usage("python -OO", "the libraries of the model need their docstrings", advice)
     if command.validate:
         _validate(command.config)
         say("inputs are valid")
         return ExitCode.DONE
+    if not command.config.allow_download:
+        stay_offline()
     insertion = insert(command.config)
     for name in insertion.files:
         say(str(insertion.out / name))
@@ -470,17 +646,24 @@ def _run(arguments: list[str]) -> int:
 
 
 def _validate(config: InsertConfig) -> None:
-    if config.sequence is None:
-        config, _, light = _read(config)
-        if light is None or config.is_guided:
-            from warpir.recover import require_model
+    """Check everything that can be checked without torch and Warp; nothing is written."""
+    from warpir.disk_space import needed_bytes, require_space
+    from warpir.files import OutputFolder
 
-            require_model(config)
+    if config.sequence is None:
+        config, inputs, _ = _read(config)
+        assert config.out is not None
+        _output_folder(config).check()
+        require_space(config.out, needed_bytes(config, inputs))
         return
     from warpir.inputs import Loaders
+    from warpir.report_sequence import refuse_other_page
     from warpir.sequence import read_sequence
 
     frames = read_sequence(config, Loaders())
+    refuse_other_page(config)
+    assert config.out is not None
+    OutputFolder(config.out, overwrite=True).check()  # the frames' folders were looked at
     say(f"frames: {len(frames)}, of which {sum(f.is_done for f in frames)} are done already")
 
 

@@ -76,9 +76,14 @@ class Light:
         total = np.zeros(3)
         if self.texels is not None:
             height, width = self.texels.shape[:2]
-            cosine = np.maximum(map_directions(height, width) @ normal, 0.0)
-            weight = cosine * texel_solid_angles(height, width)[:, None]
-            total += np.einsum("ij,ijc->c", weight, self.texels.astype(np.float64))
+            lon = np.pi * (1.0 - 2.0 * (np.arange(width) + 0.5) / width)
+            lat = np.pi * (0.5 - (np.arange(height) + 0.5) / height)
+            across = normal[0] * np.sin(lon) + normal[2] * np.cos(lon)
+            solid_angles = texel_solid_angles(height, width)
+            for row in range(height):  # the directions of a large map would take gigabytes
+                cosine = np.cos(lat[row]) * across + np.sin(lat[row]) * normal[1]
+                weight = np.maximum(cosine, 0.0) * solid_angles[row]
+                total += weight @ self.texels[row].astype(np.float64)
         if self.lobes is not None:
             for flux, axis, s in zip(
                 self.lobes.flux(), self.lobes.axis, self.lobes.sharpness, strict=True
@@ -339,6 +344,24 @@ def summarize(light: Light) -> LightSummary:
     )
 
 
+def bearing(axis: Float64Array, c2w: Float64Array) -> float:
+    """Return a direction's azimuth from where a camera looks, clockwise seen from above [deg].
+
+    Of a camera that looks straight up or down, what its picture shows at the bottom counts as
+    behind.
+
+    Args:
+        axis: Unit direction, world frame, shape [3].
+        c2w: Pose of the camera, shape [4, 4].
+    """
+    level = np.array([1.0, 0.0, 1.0])
+    ahead = -np.asarray(c2w, np.float64)[:3, 2] * level
+    if float(np.linalg.norm(ahead)) < 1e-3:
+        ahead = np.asarray(c2w, np.float64)[:3, 1] * level
+    right = np.array([-ahead[2], 0.0, ahead[0]])  # ahead x up
+    return float(np.degrees(np.arctan2(axis @ right, axis @ ahead)))
+
+
 def describe(summary: LightSummary, c2w: Float64Array) -> str:
     """Return a light in words, as a person at the camera would point at it.
 
@@ -346,9 +369,8 @@ def describe(summary: LightSummary, c2w: Float64Array) -> str:
         summary: Of the light, in the world frame.
         c2w: Pose of the camera, shape [4, 4].
     """
-    right, _, back = (np.asarray(c2w)[:3, k] * (1.0, 0.0, 1.0) for k in range(3))
     axis = axis_from_angles(summary.azimuth_deg, summary.elevation_deg)
-    around = float(np.degrees(np.arctan2(axis @ right, -(axis @ back)))) % 360.0
+    around = bearing(axis, c2w) % 360.0
     sides = (
         *("ahead", "ahead on the right", "the right", "behind on the right"),
         *("behind", "behind on the left", "the left", "ahead on the left"),

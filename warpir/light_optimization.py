@@ -120,7 +120,8 @@ class LightOptimization(Optimization):
         record: Record | None = None,
         region: TrustRegion | None = None,
     ) -> None:
-        super().__init__(unknowns, _groups(unknowns, settings), guide, settings, frame.seed)
+        memory = frame.renderer.memory
+        super().__init__(unknowns, _groups(unknowns, settings), guide, settings, frame.seed, memory)
         self.frame, self.cache, self.rows = frame, cache, transport
         if transport is None and settings.integrator == "transport":
             self.rows = TransportSettings(
@@ -209,6 +210,7 @@ class LightOptimization(Optimization):
         samples; with the same ones it would also lessen that noise, by a light that moves.
         """
         scale = self.fusion(step)
+        self.frame.renderer.bad_pixels.iteration = step
         if self._recorded is None:
             parts = self.parts(scale, self.seed + 2 * step)
         else:

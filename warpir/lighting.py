@@ -72,7 +72,7 @@ def make_light(inputs: Inputs, config: InsertConfig) -> SceneLight | None:
     """
     if inputs.run is not None:
         return _reused(inputs.run, config)
-    if not is_described(config) and inputs.light is None:
+    if not config.is_light_described and inputs.light is None:
         return _even(inputs, config) if config.start == "uniform" else None
     assumed: list[str] = []
     light = inputs.light if inputs.light is not None else _described(config, assumed)
@@ -90,11 +90,6 @@ def make_light(inputs: Inputs, config: InsertConfig) -> SceneLight | None:
     light = light.scaled(2.0**exposure)
     curves = Curves.identity(config.tone_operator)
     return SceneLight(light, light, curves, exposure, tuple(assumed), fit)
-
-
-def is_described(config: InsertConfig) -> bool:
-    """Return whether the user said anything about the light."""
-    return any(v is not None for v in (config.light, config.sun, config.sky))
 
 
 def _even(inputs: Inputs, config: InsertConfig) -> SceneLight:
@@ -232,11 +227,9 @@ def _level(inputs: Inputs, points: Float64Array, percentile: float) -> float:
     camera = inputs.camera
     uv = camera.project(points)
     inside = (uv >= 0.0).all(axis=1) & (uv[:, 0] < camera.width) & (uv[:, 1] < camera.height)
-    photo = luminance(inputs.photo.linear().astype(np.float64))
-    if not inside.any():
-        return float(np.percentile(photo, percentile))
     columns, rows = uv[inside].astype(int).T
-    return float(np.percentile(photo[rows, columns], percentile))
+    photo = inputs.photo.linear((rows, columns) if inside.any() else ...)
+    return float(np.percentile(luminance(photo.astype(np.float64)), percentile))
 
 
 def _unit(v: NDArray[np.float64]) -> NDArray[np.float64]:

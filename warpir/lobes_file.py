@@ -7,6 +7,7 @@ eq. 2, with ``sharpness = 1 / sigma^2``); axes are in the world frame. The file 
      "lobes": [{"amplitude": [r, g, b], "axis": [x, y, z], "sharpness": s}, ...]}
 """
 
+import math
 from pathlib import Path
 from typing import Any
 
@@ -14,6 +15,7 @@ import numpy as np
 
 from warpir.errors import InputError
 from warpir.light import Lobes
+from warpir.limits import LIMITS, Limits
 from warpir.strict_json import read_json_object, read_numbers
 
 FORMAT = "warpir-lobes"
@@ -21,20 +23,23 @@ VERSION = 1
 LOBE_COUNT_LIMIT = 4096
 AMPLITUDE_LIMIT = 1e12
 """The sun over its sky is 10^5; float32 products overflow from 10^19 on."""
+LEAST_SHARPNESS = 1e-6
+"""Light from everywhere, within what float32 tells apart; it divides by it."""
 SHARPNESS_LIMIT = 1e6
 """The real sun has a sharpness near 190 000; float32 lobes lose their shape beyond this."""
 
 
-def read_lobes(path: str | Path) -> Lobes:
+def read_lobes(path: str | Path, limits: Limits = LIMITS) -> Lobes:
     """Read and check a lobes file.
 
     Args:
         path: The JSON file.
+        limits: How large it may be.
 
     Raises:
         InputError: Missing, of another format, or a lobe is out of range; names the lobe.
     """
-    root = read_json_object(path)
+    root = read_json_object(path, limits)
     if root.get("format") != FORMAT or root.get("version") != VERSION:
         found = f"{root.get('format')!r:.40} version {root.get('version')!r:.10}"
         raise InputError(path, f"not lobes (found {found}; expected {FORMAT!r} version {VERSION})")
@@ -51,10 +56,10 @@ def read_lobes(path: str | Path) -> Lobes:
         if amplitude[i].min() < 0.0 or amplitude[i].max() > AMPLITUDE_LIMIT:
             expected = f"0 to {AMPLITUDE_LIMIT:g}"
             raise InputError(path, f"/lobes/{i}/amplitude: {expected} (found {lobe['amplitude']})")
-        if not 0.0 < sharpness[i] <= SHARPNESS_LIMIT:
-            expected = f"more than 0 and at most {SHARPNESS_LIMIT:g}"
+        if not LEAST_SHARPNESS <= sharpness[i] <= SHARPNESS_LIMIT:
+            expected = f"{LEAST_SHARPNESS:g} to {SHARPNESS_LIMIT:g}"
             raise InputError(path, f"/lobes/{i}/sharpness: {expected} (found {sharpness[i]:g})")
-        length = float(np.linalg.norm(axis[i]))
+        length = math.hypot(*axis[i])  # of huge numbers too
         if not 1e-6 < length < 1e6:
             raise InputError(path, f"/lobes/{i}/axis: a direction expected (found {lobe['axis']})")
         axis[i] /= length

@@ -2,9 +2,12 @@
 
 AlexNet's features, version 0.1. The weights are not part of warpir: the file is what
 
-    torch.save(lpips.LPIPS(net="alex").state_dict(), "lpips.pth")
+    state = lpips.LPIPS(net="alex").state_dict()
+    alone = {name: value for name, value in state.items() if not name.startswith("lins.")}
+    safetensors.torch.save_file(alone, "lpips.safetensors")
 
-writes on a machine that has the authors' package ``lpips`` and torchvision's AlexNet.
+writes on a machine that has the authors' package ``lpips`` and torchvision's AlexNet; ``lins`` are
+the same weights by other names.
 """
 
 from pathlib import Path
@@ -12,6 +15,8 @@ from pathlib import Path
 import numpy as np
 import torch
 from numpy.typing import NDArray
+from safetensors import SafetensorError
+from safetensors.torch import load_file
 from torch import Tensor
 from torch.nn.functional import conv2d, max_pool2d
 
@@ -37,17 +42,22 @@ class Lpips:
     """The distance, with weights from a file.
 
     Args:
-        path: State dict of the authors' ``LPIPS(net="alex")``.
+        path: State dict of the authors' ``LPIPS(net="alex")``, a safetensors file.
 
     Raises:
-        InputError: The file is absent or of another kind (`ExitCode.MODEL`).
+        InputError: The file is absent, damaged or of another kind (`ExitCode.MODEL`).
     """
 
     def __init__(self, path: Path) -> None:
+        about = "warpir/lpips.py says how the file is made"
         if not path.is_file():
-            raise InputError(path, "no such file", "see warpir/lpips.py", ExitCode.MODEL)
+            raise InputError(path, "no such file", about, ExitCode.MODEL)
         try:
-            state = torch.load(path, map_location="cpu", weights_only=True)
+            state = load_file(path)
+        except (SafetensorError, OSError) as error:
+            what = f"not a whole safetensors file ({' '.join(str(error).split())[:120]})"
+            raise InputError(path, what, about, ExitCode.MODEL) from error
+        try:
             self.convolutions = [
                 (state[f"{name}.weight"].float(), state[f"{name}.bias"].float())
                 for name, *_ in LAYERS
@@ -56,9 +66,14 @@ class Lpips:
                 state[f"lin{k}.model.1.weight"].float().reshape(1, -1, 1, 1)
                 for k in range(len(LAYERS))
             ]
-        except Exception as error:  # torch.load has no error of its own
+            # One pass over a small picture: shapes that do not follow on each other fail in it.
+            self(*np.zeros((2, SIDE_MIN, SIDE_MIN, 3), np.float32))
+        except (KeyError, RuntimeError) as error:
             what = f"no weights of LPIPS with AlexNet ({type(error).__name__}: {error})"[:160]
-            raise InputError(path, what, "see warpir/lpips.py", ExitCode.MODEL) from error
+            raise InputError(path, " ".join(what.split()), about, ExitCode.MODEL) from error
+        parts = [*self.weights, *(part for pair in self.convolutions for part in pair)]
+        if not all(bool(torch.isfinite(part).all()) for part in parts):
+            raise InputError(path, "damaged (values are not finite)", about, ExitCode.MODEL)
 
     def __call__(self, image: FloatArray, truth: FloatArray) -> float:
         """Return the distance of two pictures in [0, 1], shape [H, W, 3], of 64 pixels or more."""

@@ -15,6 +15,7 @@ from typing import Any
 
 from warpir.asset import Asset, Material
 from warpir.errors import InputError
+from warpir.limits import LIMITS, Limits
 from warpir.strict_json import read_json_object, read_numbers
 
 FORMAT = "warpir-materials"
@@ -31,18 +32,19 @@ FACTORS = {
 """How many numbers each factor of a `Material` has, and the greatest; the least is 0."""
 
 
-def with_materials(asset: Asset, path: str | Path) -> Asset:
+def with_materials(asset: Asset, path: str | Path, limits: Limits = LIMITS) -> Asset:
     """Return an asset whose material factors are those of a file.
 
     Args:
         asset: Of the same materials as the asset that the file was made for.
         path: The JSON file.
+        limits: How large it may be.
 
     Raises:
         InputError: Missing, of another format, made for another asset, or a factor is out of range;
             names the material.
     """
-    root = read_json_object(path)
+    root = read_json_object(path, limits)
     if root.get("format") != FORMAT or root.get("version") != VERSION:
         found = f"{root.get('format')!r:.40} version {root.get('version')!r:.10}"
         expected = f"{FORMAT!r} version {VERSION}"

@@ -7,6 +7,7 @@ the same insertion with glTF's own material, shadow and tone curves (`warpir.mit
 
 from __future__ import annotations
 
+import re
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -189,7 +190,7 @@ class _Scene:
     def _material(self, material: Material) -> None:
         """Write the nearest ``principled``, under a mask and a normal map where there are any."""
         open_tags = 1
-        self.lines.append(f"    <!-- {material.name.replace('--', '- -')} -->")
+        self.lines.append(f"    <!-- {_comment(material.name)} -->")
         if material.alpha_mode != "OPAQUE":
             self.lines.append('    <bsdf type="mask">')
             self._value("opacity", material.base_color_texture, 3, material.alpha)
@@ -243,6 +244,11 @@ class _Scene:
 
     def _pixels(self, slot: TextureSlot) -> NDArray[np.uint8]:
         return self.asset.textures[slot.texture].pixels
+
+
+def _comment(text: str) -> str:
+    """Return a name from a file as XML allows it in a comment: it cannot end the comment."""
+    return re.sub("-{2,}", "-", "".join(c if c.isprintable() else " " for c in text))[:200]
 
 
 def _numbers(matrix: Float64Array) -> str:

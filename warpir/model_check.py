@@ -19,20 +19,20 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from warpir.atomic import write_file
 from warpir.config import InsertConfig
-from warpir.diffusion.cache import write_file
 from warpir.diffusion.crop import Crop
-from warpir.diffusion.guidance import Guidance, NonFiniteError
+from warpir.diffusion.guidance import Guidance
 from warpir.diffusion.network_prior import LEAST_COSINE
 from warpir.diffusion.personalize import LoraTraining, personalize
-from warpir.diffusion.prior import Condition
+from warpir.diffusion.prior import Condition, NonFiniteError
 from warpir.diffusion.prompts import Prompts, make_prompts
 from warpir.diffusion.stable_diffusion import (
     CHECK_TIMES,
     StableDiffusion,
     load_stable_diffusion,
 )
-from warpir.errors import ExitCode, InputError
+from warpir.errors import disk_error
 from warpir.record import versions
 from warpir.recover import as_input_errors
 from warpir.render import choose_device
@@ -351,6 +351,5 @@ def write_report(path: str, report: Report) -> None:
     """
     try:
         write_file(Path(path), (json.dumps(report.record(), indent=2) + "\n").encode())
-    except (FileExistsError, IsADirectoryError, NotADirectoryError, PermissionError) as error:
-        what = f"cannot be written ({error.strerror})"
-        raise InputError(path, what, code=ExitCode.OUTPUT) from None
+    except OSError as error:
+        raise disk_error(path, error) from None

@@ -7,12 +7,14 @@ open is assumed and noted. OBJ knows no back faces, so all materials are double-
 """
 
 import math
+import os
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path, PurePosixPath
 
 import numpy as np
 
-from warpir.asset import LIMITS, AssetLimits, Material, Texture, TextureSlot
+from warpir.asset import Material, Texture, TextureSlot
 from warpir.asset_files import (
     Pixels,
     TextureDecoder,
@@ -21,7 +23,9 @@ from warpir.asset_files import (
     plain_material,
     read_regular,
 )
-from warpir.errors import InputError
+from warpir.errors import InputError, shown
+from warpir.limits import LIMITS, Limits
+from warpir.materials_file import EMISSION_LIMIT
 
 GREY = (0.8, 0.8, 0.8)
 """Base colour where the file states none."""
@@ -82,17 +86,22 @@ class MaterialLibrary:
     """
 
     def __init__(
-        self, path: Path, missing_textures: str, notices: list[str], limits: AssetLimits = LIMITS
+        self, path: Path, missing_textures: str, notices: list[str], limits: Limits = LIMITS
     ) -> None:
         self.path = path
         self.missing_textures = missing_textures
         self.notices = notices
+        self.hashes: dict[str, str] = {}
         self.materials: list[Material] = []
         self.textures: list[Texture] = []
         self._entries: dict[str, MtlEntry] = {}
         self._index: dict[str, int] = {}
+        self._limits = limits
         self._decoder = TextureDecoder(path, notices, limits)
         self._pixels: dict[str, Pixels | None] = {}
+        self._is_grey: dict[str, bool] = {}
+        self._texture_index: dict[tuple[str, ...], int] = {}
+        """By what a texture is for, the maps that it is made of, and how it is repeated."""
 
     def add(self, names: str) -> None:
         """Read the files of an ``mtllib`` line: one name with spaces, or several names.
@@ -103,10 +112,10 @@ class MaterialLibrary:
         """
         names = names.replace("\\", "/")
         whole = inside(self.path.parent, names, self.path, "mtllib ")
-        for name in [names] if whole.exists() else names.split():
+        for name in [names] if os.path.exists(whole) else names.split():
             file = inside(self.path.parent, name, self.path, "mtllib ")
             try:
-                content = read_regular(file, self.path, "mtllib ")
+                content = read_regular(file, self.path, "mtllib ", self._limits, hashes=self.hashes)
             except InputError as error:
                 if self.missing_textures != "grey":
                     raise InputError(
@@ -161,13 +170,19 @@ class MaterialLibrary:
             if not words:
                 continue
             key = words[0].lower()
+            # Names may hold blanks and "#" (3ds Max: "Material #1").
+            rest = raw.strip()[len(key) :].strip()
             if key == "newmtl":
-                entry = self._entries.setdefault(" ".join(words[1:]), MtlEntry())
+                if rest in self._entries:
+                    self.notices.append(
+                        f"{where}: {rest[:60]!r} defined again, the last one counts"
+                    )
+                entry = self._entries[rest] = MtlEntry()
             elif key == "bsdf":
                 entry.is_pbr = words[1:2] == ["pbr"]
             elif key.startswith("map_") or key in ("norm", "bump"):
                 key = "map_bump" if key == "bump" else key
-                entry.maps[key] = self._parse_map(words[1:], where, str(PurePosixPath(file).parent))
+                entry.maps[key] = self._parse_map(rest, where, str(PurePosixPath(file).parent))
             elif key in NUMBERS:
                 if key[0] == "k" and words[1:2] in (["spectral"], ["xyz"]):
                     raise InputError(self.path, f"{where}: {words[0]} {words[1]}, expected RGB")
@@ -185,28 +200,31 @@ class MaterialLibrary:
             numbers = tuple(float(word) for word in words)
         except ValueError:
             numbers = ()
+        if any("_" in word for word in words):  # Python reads 1_0 as 10
+            numbers = ()
         if not numbers or not all(math.isfinite(number) for number in numbers):
             raise InputError(self.path, f"{where}: {raw.strip()[:60]!r}, expected finite numbers")
         return numbers
 
-    def _parse_map(self, words: list[str], where: str, folder: str) -> MapStatement:
+    def _parse_map(self, rest: str, where: str, folder: str) -> MapStatement:
         """Read options and file name; the name may contain spaces."""
         options: dict[str, list[str]] = {}
-        rest = list(words)
-        while rest and rest[0].lower() in OPTION_WIDTHS:
-            option = rest.pop(0).lower()
+        while (option := first_word(rest)[0].lower()) in OPTION_WIDTHS:
+            _, rest = first_word(rest)
             values: list[str] = []
             while rest and len(values) < OPTION_WIDTHS[option]:
+                word, tail = first_word(rest)
                 # -s, -o, -t take one to three numbers; the name follows.
-                if values and not is_number(rest[0]):
+                if values and not is_number(word):
                     break
-                values.append(rest.pop(0))
+                values.append(word)
+                rest = tail
             options[option] = values
             if option not in HONOURED_OPTIONS:
                 self.notices.append(f"{where}: {option} {' '.join(values)} ignored")
         if not rest:
             raise InputError(self.path, f"{where}: map without a file name")
-        name = " ".join(rest).replace("\\", "/")
+        name = rest.replace("\\", "/")
 
         def pair(option: str, default: float) -> tuple[float, float]:
             values = options.get(option)
@@ -226,11 +244,14 @@ class MaterialLibrary:
     def _build(self, name: str, entry: MtlEntry) -> Material:
         maps = entry.maps
         alpha = self._opacity(name, entry)
-        base = self._base_slot(entry)
+        base = self._base_slot(name, entry)
         roughness, metallic, surface = self._surface(name, entry)
         normal_statement = maps.get("norm", maps.get("map_bump"))
         normal = None if normal_statement is None else self._normal_slot(name, normal_statement)
         emission = self._factor(name, entry, "ke", (0.0,) * 3)
+        if max(emission) > EMISSION_LIMIT:
+            what = f"material {shown(name)}: Ke {max(emission):g}"
+            raise InputError(self.path, f"{what}, expected at most {EMISSION_LIMIT:g}")
         emission_slot = self._plain_slot(maps.get("map_ke"))
         color = self._factor(name, entry, "kd", GREY)
         clamped = tuple(min(max(value, 0.0), 1.0) for value in color)
@@ -330,20 +351,22 @@ class MaterialLibrary:
             metallic = 1.0
         if rough is None and metal is None:
             return roughness, metallic, None
-        height = max(p.shape[0] for p in (rough, metal) if p is not None)
-        width = max(p.shape[1] for p in (rough, metal) if p is not None)
-        packed = np.full((height, width, 4), 255, dtype=np.uint8)
-        if rough is not None:
-            packed[..., 1] = resized(rough, height, width)[..., 0]
-        if metal is not None:
-            packed[..., 2] = resized(metal, height, width)[..., 0]
+
+        def pack() -> Pixels:
+            packed = self._opaque(name, rough, metal)
+            if rough is not None:
+                packed[..., 1] = resized(rough, *packed.shape[:2])[..., 0]
+            if metal is not None:
+                packed[..., 2] = resized(metal, *packed.shape[:2])[..., 0]
+            return packed
+
         statement = metal_map if rough_map is None else rough_map
         assert statement is not None
         if rough_map and metal_map and rough_map.slot(0) != metal_map.slot(0):
             self.notices.append(f"material {name!r}: map_Pm laid on as map_Pr is")
-        return roughness, metallic, self._slot(packed, statement)
+        return roughness, metallic, self._slot(pack, statement, "surface", rough_map, metal_map)
 
-    def _base_slot(self, entry: MtlEntry) -> TextureSlot | None:
+    def _base_slot(self, name: str, entry: MtlEntry) -> TextureSlot | None:
         """Return the base colour texture, its alpha taken from ``map_d`` alone."""
         color_map, mask_map = entry.maps.get("map_kd"), entry.maps.get("map_d")
         if color_map is None and mask_map is None:
@@ -354,38 +377,59 @@ class MaterialLibrary:
         mask = None if mask_map is None else self._load(mask_map)
         if color is None and mask is None:
             return None
-        height = max(p.shape[0] for p in (color, mask) if p is not None)
-        width = max(p.shape[1] for p in (color, mask) if p is not None)
-        packed = np.full((height, width, 4), 255, dtype=np.uint8)
-        if color is not None:
-            packed[..., :3] = resized(color, height, width)[..., :3]
-        if mask is not None:
-            # A mask inside the colour file is its alpha channel; a file of its own is grey.
-            has_alpha = bool((mask[..., 3] < 255).any())
-            packed[..., 3] = resized(mask, height, width)[..., 3 if has_alpha else 0]
+
+        def pack() -> Pixels:
+            packed = self._opaque(name, color, mask)
+            if color is not None:
+                packed[..., :3] = resized(color, *packed.shape[:2])[..., :3]
+            if mask is not None:
+                # A mask inside the colour file is its alpha channel; a file of its own is grey.
+                has_alpha = bool((mask[..., 3] < 255).any())
+                packed[..., 3] = resized(mask, *packed.shape[:2])[..., 3 if has_alpha else 0]
+            return packed
+
         statement = mask_map if color_map is None else color_map
         assert statement is not None
-        return self._slot(packed, statement)
+        return self._slot(pack, statement, "base colour", color_map, mask_map)
 
     def _normal_slot(self, name: str, statement: MapStatement) -> TextureSlot | None:
         pixels = self._load(statement)
         if pixels is None:
             return None
-        if (np.ptp(pixels[..., :3], axis=2) == 0).all():
+        if statement.name not in self._is_grey:
+            self._is_grey[statement.name] = not np.ptp(pixels[..., :3], axis=2).any()
+        if self._is_grey[statement.name]:
             self.notices.append(f"material {name!r}: {statement.name} is a height map, left out")
             return None
-        return self._slot(pixels, statement)
+        return self._slot(lambda: pixels, statement, "plain", statement)
 
     def _plain_slot(self, statement: MapStatement | None) -> TextureSlot | None:
         pixels = None if statement is None else self._load(statement)
         if statement is None or pixels is None:
             return None
-        return self._slot(pixels, statement)
+        return self._slot(lambda: pixels, statement, "plain", statement)
 
-    def _slot(self, pixels: Pixels, statement: MapStatement) -> TextureSlot:
+    def _slot(
+        self,
+        make: Callable[[], Pixels],
+        statement: MapStatement,
+        purpose: str,
+        *maps: MapStatement | None,
+    ) -> TextureSlot:
+        """Return how a texture is laid on, made once for all materials that use these maps."""
         wrap = "clamp" if statement.clamp else "repeat"
-        self.textures.append(Texture(pixels, wrap, wrap))
-        return statement.slot(len(self.textures) - 1)
+        key = (purpose, wrap, *("" if used is None else used.name for used in maps))
+        if key not in self._texture_index:
+            self._texture_index[key] = len(self.textures)
+            self.textures.append(Texture(make(), wrap, wrap))
+        return statement.slot(self._texture_index[key])
+
+    def _opaque(self, name: str, *parts: Pixels | None) -> Pixels:
+        """Return white texels as many as the largest of some maps has, shape [height, width, 4]."""
+        height = max(p.shape[0] for p in parts if p is not None)
+        width = max(p.shape[1] for p in parts if p is not None)
+        self._decoder.count(height * width, f"material {shown(name)}: ")
+        return np.full((height, width, 4), 255, dtype=np.uint8)
 
     def _load(self, statement: MapStatement) -> Pixels | None:
         """Return the pixels of a map; None when it is missing and that is allowed."""
@@ -394,7 +438,9 @@ class MaterialLibrary:
             where = f"{name}: "
             file = inside(self.path.parent, name, self.path)
             try:
-                encoded = read_regular(file, self.path, "texture ")
+                encoded = read_regular(
+                    file, self.path, "texture ", self._limits, hashes=self.hashes
+                )
                 self._pixels[name] = self._decoder.decode(encoded, where)
             except InputError as error:
                 if self.missing_textures != "grey":
@@ -406,6 +452,12 @@ class MaterialLibrary:
                 self.notices.append(f"{error.what}: replaced by grey, or left out where no colour")
                 self._pixels[name] = None
         return self._pixels[name]
+
+
+def first_word(text: str) -> tuple[str, str]:
+    """Return the first word of a text and what follows it, either may be empty."""
+    word, *rest = text.split(maxsplit=1) or [""]
+    return word, "".join(rest)
 
 
 def is_number(word: str) -> bool:

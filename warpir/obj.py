@@ -6,15 +6,17 @@ are already there. Materials of OBJ come from `warpir.mtl`, the numbers of PLY a
 """
 
 import contextlib
+import math
 import re
 from collections.abc import Iterator
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
+from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
-from warpir.asset import LIMITS, Asset, AssetLimits, FloatArray, Primitive
+from warpir.asset import Asset, FloatArray, Primitive
 from warpir.asset_files import (
     check_drawable,
     check_triangle_count,
@@ -25,20 +27,27 @@ from warpir.asset_files import (
     repair_normals,
 )
 from warpir.errors import InputError
+from warpir.limits import LIMITS, Limits
 from warpir.mtl import MaterialLibrary
 from warpir.ply import Element, read_ply
 from warpir.stl import read_stl
 
 GREY = (0.8, 0.8, 0.8)
+LARGEST = 3e38
+"""Largest number of a mesh: what a float32 holds; of positions `EXTENT` is the limit."""
 """Base colour of what has no material."""
+CROSSINGS = 100
+"""After as many cuts that were no ears a polygon is taken for a tangle and cut into a fan."""
+CONCAVE_COST = 100_000_000
+"""Largest sum of the squared numbers of corners of all concave polygons of a material."""
+NAMED = ("usemtl", "mtllib")
+"""Statements that end in a name, which may hold ``#`` (3ds Max: ``Material #1``)."""
 IGNORED = {"o", "g", "s", "vp", "shadow_obj", "trace_obj", "lod", "bevel", "c_interp", "d_interp"}
 Triangles = NDArray[np.int32]
 NO_TRIANGLES: Triangles = np.zeros((0, 3), dtype=np.int32)
 
 
-def read_mesh(
-    path: str | Path, missing_textures: str = "error", limits: AssetLimits = LIMITS
-) -> Asset:
+def read_mesh(path: str | Path, missing_textures: str = "error", limits: Limits = LIMITS) -> Asset:
     """Read an ``.obj``, ``.ply`` or ``.stl`` file.
 
     Args:
@@ -54,12 +63,15 @@ def read_mesh(
         InputError: The file is damaged or holds no triangles.
     """
     path = Path(path)
-    content = read_regular(path, path)
+    hashes: dict[str, str] = {}
+    content = read_regular(path, path, limits=limits, hashes=hashes)
     if path.suffix.lower() == ".obj":
-        return read_obj(path, content, missing_textures, limits)
-    if path.suffix.lower() == ".ply":
-        return read_ply_mesh(path, content, limits)
-    return read_stl_mesh(path, content, limits)
+        asset = read_obj(path, content, missing_textures, limits)
+    elif path.suffix.lower() == ".ply":
+        asset = read_ply_mesh(path, content, limits)
+    else:
+        asset = read_stl_mesh(path, content, limits)
+    return replace(asset, hashes={**hashes, **asset.hashes})
 
 
 @dataclass
@@ -74,7 +86,7 @@ class ObjText:
     libraries: list[str] = field(default_factory=list)
 
 
-def read_obj(path: Path, content: bytes, missing_textures: str, limits: AssetLimits) -> Asset:
+def read_obj(path: Path, content: bytes, missing_textures: str, limits: Limits) -> Asset:
     """Read an OBJ file; one primitive per material.
 
     Raises:
@@ -84,10 +96,9 @@ def read_obj(path: Path, content: bytes, missing_textures: str, limits: AssetLim
     text = split_statements(path, content, notices)
     positions = float_rows(path, "v", text.positions, 3)
     colors = vertex_colors(path, text.positions, notices)
-    uvs = float_rows(path, "vt", text.uvs, 1)
+    # v is optional; the format says 0.
+    uvs = float_rows(path, "vt", [(n, v + ["0"] * (len(v) == 1)) for n, v in text.uvs], 2)
     normals = float_rows(path, "vn", text.normals, 3)
-    if uvs.shape[1] == 1:
-        uvs = np.column_stack([uvs, np.zeros(len(uvs))])
     library = MaterialLibrary(path, missing_textures, notices, limits)
     for name in text.libraries:
         library.add(name)
@@ -98,7 +109,7 @@ def read_obj(path: Path, content: bytes, missing_textures: str, limits: AssetLim
     for name, faces in text.faces.items():
         corners, polygons = unique_corners(path, faces, (len(positions), len(uvs), len(normals)))
         points = positions[corners[:, 0]]
-        indices = triangulate(points, polygons, notices)
+        indices = triangulate(path, points, polygons, notices)
         indices, flat, repeated = keep_area(points, indices)
         if flat or repeated:
             notices.append(
@@ -139,6 +150,7 @@ def read_obj(path: Path, content: bytes, missing_textures: str, limits: AssetLim
         materials=tuple(library.materials),
         textures=tuple(library.textures),
         notices=concise(notices),
+        hashes=library.hashes,
     )
 
 
@@ -183,11 +195,16 @@ def split_statements(path: Path, content: bytes, notices: list[str]) -> ObjText:
 
 
 def logical_lines(text: str) -> Iterator[tuple[int, str]]:
-    """Yield line numbers and statements, comments removed and continued lines joined."""
+    """Yield line numbers and statements, continued lines joined and comments removed.
+
+    Names are kept whole; of the other statements all from ``#`` on is a comment.
+    """
     pending, start = "", 0
     for number, line in enumerate(re.split(r"\r\n|\n|\r", text), 1):
         start = start if pending else number
-        line = pending + line.partition("#")[0].strip()
+        line = pending + line.strip()
+        if "#" in line and line.split()[0] not in NAMED:
+            line = line.partition("#")[0].rstrip()
         if line.endswith("\\"):
             pending = line[:-1] + " "
             continue
@@ -205,16 +222,16 @@ def absolute_corner(path: Path, line: int, corner: str, counts: tuple[int, int, 
         if part.startswith("-"):
             with contextlib.suppress(ValueError):  # reported with all other corners
                 value = counts[k] + 1 + int(part)
-                if value < 1:
-                    raise InputError(
-                        path, f"line {line}: index {part}, but {counts[k]} {'v vt vn'.split()[k]}"
-                    )
+                if not 1 <= value <= counts[k]:
+                    word = ("v", "vt", "vn")[k]
+                    what = f"line {line}: index {part[:20]}, but {counts[k]} {word}"
+                    raise InputError(path, what)
                 parts[k] = str(value)
     return "/".join(parts)
 
 
 def float_rows(
-    path: Path, word: str, rows: list[tuple[int, list[str]]], least: int
+    path: Path, word: str, rows: list[tuple[int, list[str]]], width: int
 ) -> NDArray[np.float64]:
     """Return the first numbers of ``v``, ``vt`` or ``vn`` statements.
 
@@ -222,47 +239,73 @@ def float_rows(
         path: The file.
         word: The statement.
         rows: Line number and words of each.
-        least: How many numbers it needs; a ``vt`` may have a second one.
+        width: How many numbers it needs.
 
     Returns:
-        Shape [statement, 3], or [statement, 1 or 2] for ``vt``.
+        Shape [statement, width].
 
     Raises:
         InputError: With the line at fault.
     """
-    width = least if word != "vt" or not all(len(v) >= 2 for _, v in rows) else 2
     try:
         numbers = np.array([v[:width] for _, v in rows], dtype=np.float64).reshape(-1, width)
-        if np.isfinite(numbers).all():
+        if (
+            not any(map(separated, (v[:width] for _, v in rows)))
+            and (np.abs(numbers) < LARGEST).all()
+        ):
             return numbers
     except (ValueError, OverflowError):
         pass
     for line, values in rows:
         try:
-            if len(values) >= width and np.isfinite([float(v) for v in values[:width]]).all():
+            sound = len(values) >= width and not separated(values[:width])
+            if sound and all(abs(float(v)) < LARGEST for v in values[:width]):
                 continue
         except ValueError:
             pass
         found = " ".join([word, *values])[:60]
         advice = "write numbers with decimal points" if "," in found else ""
-        raise InputError(path, f"line {line}: {found!r}, expected {width} finite numbers", advice)
+        raise InputError(
+            path,
+            f"line {line}: {found!r}, expected {width} numbers up to {LARGEST:g}",
+            advice,
+        )
     raise InputError(path, f"{word} statements cannot be read")
+
+
+def separated(words: list[str]) -> bool:
+    """Return whether there is a ``_`` in numbers, which Python would pass over."""
+    return any("_" in word for word in words)
 
 
 def vertex_colors(
     path: Path, rows: list[tuple[int, list[str]]], notices: list[str]
 ) -> FloatArray | None:
-    """Return the colours after the positions (``v x y z r g b``), shape [vertex, 4]."""
+    """Return the colours after the positions (``v x y z r g b``), shape [vertex, 4].
+
+    Whole numbers above 1 are codes of 8 bits.
+    """
     colored = [len(values) >= 6 for _, values in rows]
     if not any(colored):
         return None
     notices.append("vertex colours read as linear Rec.709")
+    for line, values in rows:
+        if len(values) > 6:  # a weight before the colour, or an opacity behind it
+            what = f"line {line}: v with {len(values)} numbers (expected x y z r g b)"
+            raise InputError(path, what, "export colours of three numbers, or as GLB")
     tails = [
         (line, values[3:6] if has else ["1"] * 3)
         for (line, values), has in zip(rows, colored, strict=True)
     ]
+    stated = float_rows(path, "v ... r g b", tails, 3)
+    has = np.array(colored)
+    if stated.max() > 1.0 and stated.max() <= 255.0 and (stated == np.round(stated)).all():
+        notices.append("vertex colours up to 255 divided by that")
+        stated[has] /= 255.0
+    elif stated.min() < 0.0 or stated.max() > 1.0:
+        notices.append("vertex colours clamped to 0 ... 1")
     colors = np.ones((len(rows), 4), dtype=np.float32)
-    colors[:, :3] = np.clip(float_rows(path, "v ... r g b", tails, 3), 0.0, 1.0)
+    colors[:, :3] = np.clip(stated, 0.0, 1.0)
     return colors
 
 
@@ -295,7 +338,7 @@ def unique_corners(
             if k and not part:
                 continue
             try:
-                value = int(part) if k < 3 else 0
+                value = int(part) if k < 3 and "_" not in part else 0
             except ValueError:
                 value = 0
             if not 1 <= value <= counts[k % 3]:
@@ -310,20 +353,24 @@ def unique_corners(
 
 
 def triangulate(
-    points: NDArray[np.float64], polygons: dict[int, Triangles], notices: list[str]
+    path: Path, points: NDArray[np.float64], polygons: dict[int, Triangles], notices: list[str]
 ) -> Triangles:
     """Cut polygons into triangles: fans where convex, ears where not.
 
     Args:
+        path: The file.
         points: Shape [vertex, 3].
         polygons: Vertex indices by number of corners, shape [polygon, corner].
         notices: Receives the number of concave polygons.
 
     Returns:
         Shape [triangle, 3], the winding kept.
+
+    Raises:
+        InputError: Concave polygons of so many corners that cutting them would take minutes.
     """
     triangles = []
-    concave_count = 0
+    concave_count = cost = 0
     for size, polygon in polygons.items():
         concave = np.zeros(len(polygon), dtype=bool)
         if size > 3:
@@ -333,6 +380,14 @@ def triangulate(
             normal = np.cross(corner, np.roll(corner, -1, axis=1)).sum(axis=1, keepdims=True)
             along = (turn * normal).sum(axis=2)
             concave = (along < -1e-9 * np.abs(along).max(axis=1, keepdims=True)).any(axis=1)
+        cost += int(concave.sum()) * size**2
+        if cost > CONCAVE_COST:
+            raise InputError(
+                path,
+                f"concave polygons of too many corners (found {concave.sum()} of {size}; the limit "
+                f"for one is {math.isqrt(CONCAVE_COST)})",
+                "triangulate the faces on export",
+            )
         fan = np.stack([np.array([0, k, k + 1]) for k in range(1, size - 1)])
         triangles.append(polygon[~concave][:, fan].reshape(-1, 3))
         for row in polygon[concave]:
@@ -346,6 +401,9 @@ def triangulate(
 def clip_ears(points: NDArray[np.float64]) -> Triangles:
     """Triangulate one simple polygon (Meisters 1975), seen along its mean normal.
 
+    A corner that was no ear is looked at again only when a neighbour of it, or the corner that was
+    found within it, is gone: for most polygons the time grows as the square of the corners.
+
     Args:
         points: Corners in order, shape [corner, 3].
 
@@ -358,29 +416,66 @@ def clip_ears(points: NDArray[np.float64]) -> Triangles:
     if (normal[axis] < 0) != (axis == 1):  # dropping y mirrors the plane
         flat = flat * [1.0, -1.0]
 
-    def side(a: int, b: int, c: int) -> float:
-        (ax, ay), (bx, by), (cx, cy) = flat[a], flat[b], flat[c]
-        return float((bx - ax) * (cy - ay) - (by - ay) * (cx - ax))
-
+    x, y = flat.T
     rest = list(range(len(points)))
+    left = np.ones(len(points), dtype=bool)
+    within: dict[int, int] = {}
     triangles = []
-    while len(rest) > 3:
-        for k in range(len(rest)):
+    start = stuck = 0
+    while len(rest) > 3 and stuck < CROSSINGS:
+        for step in range(len(rest)):
+            k = (start + step) % len(rest)
             a, b, c = rest[k - 1], rest[k], rest[(k + 1) % len(rest)]
-            others = (p for p in rest if p not in (a, b, c))
-            if side(a, b, c) > 0 and not any(
-                side(a, b, p) >= 0 and side(b, c, p) >= 0 and side(c, a, p) >= 0 for p in others
-            ):
+            if b not in within or not left[within[b]]:
+                within[b] = corner_within(x, y, left, (a, b, c))
+            if within[b] < 0:
                 break
         else:
             k = 1  # self-intersecting: any cut is as good as another
             a, b, c = rest[0], rest[1], rest[2]
+            stuck += 1
         triangles.append((a, b, c))
         del rest[k]
-    return np.array([*triangles, tuple(rest)], dtype=np.int32)
+        left[b] = False
+        within.pop(a, None)
+        within.pop(c, None)
+        start = max(k - 1, 0)
+    triangles += [(rest[0], b, c) for b, c in pairwise(rest[1:])]
+    return np.array(triangles, dtype=np.int32)
 
 
-def read_ply_mesh(path: Path, content: bytes, limits: AssetLimits) -> Asset:
+def corner_within(
+    x: NDArray[np.float64],
+    y: NDArray[np.float64],
+    left: NDArray[np.bool_],
+    triangle: tuple[int, int, int],
+) -> int:
+    """Return what keeps a corner of a polygon from being an ear.
+
+    Args:
+        x: Of all corners, shape [corner].
+        y: Likewise.
+        left: Which of them were not cut off.
+        triangle: The corner in the middle, its neighbours around it.
+
+    Returns:
+        Another corner in the triangle, its own where it is concave, -1 where it is an ear.
+    """
+
+    def left_of(p: int, q: int) -> NDArray[np.bool_]:
+        side: NDArray[np.bool_] = (x[q] - x[p]) * (y - y[p]) >= (y[q] - y[p]) * (x - x[p])
+        return side
+
+    a, b, c = triangle
+    if (x[b] - x[a]) * (y[c] - y[a]) <= (y[b] - y[a]) * (x[c] - x[a]):
+        return b
+    inside = left & left_of(a, b) & left_of(b, c) & left_of(c, a)
+    inside[list(triangle)] = False
+    found = int(inside.argmax())
+    return found if inside[found] else -1
+
+
+def read_ply_mesh(path: Path, content: bytes, limits: Limits) -> Asset:
     """Read the faces of a PLY file with the normals and colours of its vertices.
 
     Raises:
@@ -402,6 +497,8 @@ def read_ply_mesh(path: Path, content: bytes, limits: AssetLimits) -> Asset:
         )
     check_triangle_count(path, int(np.maximum(corners.lengths - 2, 0).sum()), limits)
     used = corners.values
+    if (used != np.round(used)).any():
+        raise InputError(path, f"index {used[used != np.round(used)][0]:g} is no whole number")
     if len(used) and not 0 <= used.min() <= used.max() < len(positions):
         worst = used.min() if used.min() < 0 else used.max()
         raise InputError(path, f"index {worst:g}, but {len(positions)} vertices")
@@ -415,11 +512,11 @@ def read_ply_mesh(path: Path, content: bytes, limits: AssetLimits) -> Asset:
         notices.append("colours of faces are not read; those of vertices would be")
     if any(line.startswith("TextureFile") for line in ply.comments):
         notices.append("the texture is not read: export as GLB or OBJ")
-    indices = triangulate(positions, polygons, notices) if polygons else NO_TRIANGLES
+    indices = triangulate(path, positions, polygons, notices) if polygons else NO_TRIANGLES
     return plain_asset(path, positions, indices, stored, colors, notices)
 
 
-def read_stl_mesh(path: Path, content: bytes, limits: AssetLimits) -> Asset:
+def read_stl_mesh(path: Path, content: bytes, limits: Limits) -> Asset:
     """Read an STL file; flat shading, since its normals are those of the faces.
 
     Raises:
@@ -492,8 +589,8 @@ def finite_columns(
         InputError: One of the numbers is not finite.
     """
     table = element.table(*names)
-    if table is not None and not np.isfinite(table).all():
-        row = int(np.flatnonzero(~np.isfinite(table).all(axis=1))[0])
+    if table is not None and not (usable := np.abs(table) < LARGEST).all():
+        row = int(np.flatnonzero(~usable.all(axis=1))[0])
         raise InputError(path, f"{' '.join(names)} of {element.name} {row} are NaN or infinite")
     return table
 

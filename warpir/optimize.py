@@ -6,10 +6,14 @@
 
 Everything random is a function of the seed and the step, and the whole state is plain tensors and
 numbers: a run that was stopped and restored ends as if it had not been.
+
+A step whose picture, loss or gradient is not finite is not taken: it is counted, and the learning
+rate is halved until steps are good again. What lacks memory is tried once more.
 """
 
 from __future__ import annotations
 
+import logging
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass, field
@@ -21,12 +25,25 @@ from torch import Tensor
 
 from warpir.camera import Camera
 from warpir.errors import ExitCode, InputError
+from warpir.memory import Memory
 from warpir.optimize_settings import OptimizeSettings
 
 BAD_STEPS_MAX = 5
 """Steps in a row without a finite gradient that end the run."""
+BACK_OFF = 0.5
+"""Share of the learning rate that a step without a finite gradient leaves to the next ones."""
+GOOD_STEPS = 10
+"""Steps in a row after which it doubles again, up to what the schedule says."""
+LOWER = "--guidance-width"
+"""What lowers the memory of a step."""
 SCORE_SEED = 0x5C0E5
 """Added to the seed for the renders that judge a state."""
+
+
+Rendered = tuple[Tensor, dict[str, tuple[float, Tensor]]]
+"""A picture, and the regularisers with their weights."""
+
+log = logging.getLogger(__name__)
 
 
 class Guide(Protocol):
@@ -62,6 +79,10 @@ class State:
     """Without a finite gradient, in a row."""
     skipped: int = 0
     """Without a finite gradient, in all."""
+    rate_share: float = 1.0
+    """What bad steps have left of the learning rate [1]."""
+    good_steps: int = 0
+    """Since `rate_share` fell or rose."""
     best_score: float | None = None
     """Lower is better."""
     best_step: int = -1
@@ -77,6 +98,7 @@ class Optimization(ABC):
         guide: What looks right.
         settings: Steps, rates, weights, schedules.
         seed: Base seed of the renders.
+        memory: Is told where memory was short.
     """
 
     def __init__(
@@ -86,7 +108,9 @@ class Optimization(ABC):
         guide: Guide,
         settings: OptimizeSettings,
         seed: int,
+        memory: Memory | None = None,
     ) -> None:
+        self.memory = memory or Memory()
         self.unknowns, self.guide, self.settings, self.seed = unknowns, guide, settings, seed
         # Adam ignores the overall scale of a gradient; this eps keeps that true of tiny ones.
         self.optimizer = torch.optim.Adam(
@@ -136,26 +160,31 @@ class Optimization(ABC):
     def step(self) -> None:
         """Take one step."""
         step = self.state.step
-        self.prepare(step)
-        image, terms = self.image(step), self.terms()
-        d_image = self.guide.gradient(image.detach(), step)
+        made = self._rendered(step)
+        d_image, terms = None, {}
+        if made is not None:
+            terms = {name: term.detach() for name, (_, term) in made[1].items()}
+            d_image = self.guide.gradient(made[0].detach(), step)
         if d_image is not None and not bool(d_image.isfinite().all()):
             d_image = None
-        self.optimizer.zero_grad()
         if d_image is not None:
-            roots, gradients = [image], [d_image]
-            roots += [weight * term for weight, term in terms.values()]
-            gradients += [torch.ones_like(root) for root in roots[1:]]
-            torch.autograd.backward(roots, gradients)
+            # One reference to the graph: a second attempt needs the memory of the first.
+            graphs = [made]
+            del made
+            self.memory.again(
+                lambda: self._differentiate(graphs.pop() if graphs else None, d_image, step),
+                "the gradient of a step",
+                LOWER,
+            )
         is_finite = d_image is not None and self._gradients_are_finite()
         if is_finite:
             for group in self.optimizer.param_groups:
                 factor = self.settings.rate_of_all * self._rate_factor(step)
-                group["lr"] = group["rate"] * factor
+                group["lr"] = group["rate"] * factor * self.state.rate_share
             self.optimizer.step()
             self.project()
         self._count(is_finite)
-        entry = {name: float(term.detach()) for name, (_, term) in terms.items()}
+        entry = {name: float(term) for name, term in terms.items()}
         if d_image is not None:
             entry["gradient"] = float(d_image.double().norm())
         # Checkpoints hold no number that JSON lacks.
@@ -165,6 +194,36 @@ class Optimization(ABC):
         every = self.settings.score_every
         if every and (self.state.step % every == 0 or self.state.step == self.settings.step_count):
             self._keep_if_best(entry)
+
+    def _rendered(self, step: int) -> Rendered | None:
+        """Return a step's picture and terms; None where they are certain not to be finite."""
+
+        def render() -> Rendered:
+            self.prepare(step)
+            return self.image(step), self.terms()
+
+        try:
+            return self.memory.again(render, "the picture of a step", LOWER)
+        except InputError as error:
+            if error.code != ExitCode.NUMERIC:
+                raise
+            log.warning("step %d: %s", step, error)
+            return None
+
+    def _differentiate(self, made: Rendered | None, d_image: Tensor, step: int) -> None:
+        """Leave the gradient of the picture and of the terms in the unknowns' ``grad``.
+
+        Args:
+            made: What was rendered, used up; None: it is rendered again, which gives the same.
+            d_image: Loss gradient of the picture.
+            step: From 0.
+        """
+        image, terms = made or (self.image(step), self.terms())
+        self.optimizer.zero_grad()
+        roots, gradients = [image], [d_image]
+        roots += [weight * term for weight, term in terms.values()]
+        gradients += [torch.ones_like(root) for root in roots[1:]]
+        torch.autograd.backward(roots, gradients)
 
     def _rate_factor(self, step: int) -> float:
         """Return 1 in the first half, then a cosine that falls to ``rate_end``."""
@@ -180,6 +239,11 @@ class Optimization(ABC):
         state = self.state
         state.bad_steps = 0 if is_finite else state.bad_steps + 1
         state.skipped += not is_finite
+        state.good_steps = state.good_steps + 1 if is_finite else 0
+        if not is_finite:
+            state.rate_share *= BACK_OFF
+        elif state.rate_share < 1.0 and state.good_steps == GOOD_STEPS:
+            state.rate_share, state.good_steps = state.rate_share / BACK_OFF, 0
         if state.bad_steps >= BAD_STEPS_MAX:
             raise InputError(
                 "guidance",

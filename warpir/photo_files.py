@@ -7,6 +7,7 @@ behind this border checks again. What is written is in `warpir.files`.
 
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,11 +18,10 @@ from warpir.envmap_conventions import SEAM_SHIFTS, to_ours
 from warpir.errors import InputError
 from warpir.image_decoder import DecodedImage, FloatArray, Pixels, decode_image, upright
 from warpir.light import Float64Array
+from warpir.limits import LIMITS
 
-PHOTO_PIXELS_MAX = 64_000_000
-"""Default of ``--max-pixels`` [px]."""
-ENVMAP_WIDTH_MAX = 16384
-"""Widest environment map accepted [px]."""
+RADIANCE_LIMIT = 1e12
+"""Of a panorama, relative [W/(m^2 sr)]; float32 products overflow from 10^19 on."""
 
 
 @dataclass(frozen=True)
@@ -53,14 +53,18 @@ class Photo:
         """Whether the codes have more than 8 bits, so that half floats would lose some."""
         return self.codes.dtype.itemsize > 1
 
-    def linear(self) -> FloatArray:
+    def linear(self, where: Any = ...) -> FloatArray:
         """Return ``photo_lin`` [1], shape [H, W, 3]: ``srgb ** 2.2``, or a plate's own values.
 
         Unlike `srgb`, a linear plate keeps what lies outside [0, 1].
+
+        Args:
+            where: Index of the pixels that are wanted; all of them when absent.
         """
         if self.is_linear:
-            return self.codes.astype(np.float32, copy=False)
-        linear: FloatArray = color.gamma_to_linear(self.srgb)
+            plate: FloatArray = self.codes[where].astype(np.float32, copy=False)
+            return plate
+        linear: FloatArray = color.gamma_to_linear(self.srgb[where])
         return linear
 
     def encode(self, srgb: FloatArray, changed: NDArray[np.bool_]) -> Pixels:
@@ -88,10 +92,14 @@ class Photo:
         return np.where(changed[..., None], edited, self.codes)
 
 
+LABELS = 0.05
+"""Below this share of white the codes of a mask are labels, not shares."""
+
+
 def read_photo(
     path: str | Path,
     *,
-    max_pixels: int = PHOTO_PIXELS_MAX,
+    max_pixels: int = LIMITS.pixels,
     alpha: str = "refuse",
     layer: str | None = None,
     strict: bool = False,
@@ -133,8 +141,9 @@ def read_photo(
 
     icc: bytes | None = None
     if codes.dtype.kind == "f":
-        codes = _finite(path, codes, strict, notices)
-        plate = _to_rec709(codes.astype(np.float32, copy=False), image, notices)
+        with np.errstate(over="ignore", invalid="ignore"):  # counted below
+            plate = _to_rec709(codes.astype(np.float32, copy=False), image, notices)
+        plate = _finite(path, plate, strict, notices)
         notices.append(_about_plate(plate))
         codes = plate
         srgb: FloatArray = np.clip(color.linear_to_gamma(plate), 0.0, 1.0)
@@ -157,6 +166,7 @@ def read_envmap(
     camera_to_world: Float64Array | None = None,
     pictures: bool = False,
     strict: bool = False,
+    max_width: int = LIMITS.envmap_width,
     notices: list[str] | None = None,
 ) -> FloatArray:
     """Read a lat-long environment map and turn it to our orientation; never clamped.
@@ -171,6 +181,7 @@ def read_envmap(
         pictures: Whether JPEG, PNG, TIFF and WebP are read too; codes of 8 and 16 bits are
             decoded as sRGB and lack what is brighter than white, floats are radiance.
         strict: Refuse NaN, infinite and negative values instead of repairing them.
+        max_width: Widest map decoded [px] (``--max-envmap-width``).
         notices: One line per repair is appended here.
 
     Returns:
@@ -183,7 +194,7 @@ def read_envmap(
     if convention not in SEAM_SHIFTS:
         raise ValueError(f"convention {convention!r} is not one of {', '.join(SEAM_SHIFTS)}")
     kinds = ("exr", "hdr", "jpeg", "png", "tiff", "webp") if pictures else ("exr", "hdr")
-    image = decode_image(path, ENVMAP_WIDTH_MAX * ENVMAP_WIDTH_MAX // 2, kinds)
+    image = decode_image(path, max_width * max_width // 2, kinds, flag="--max-envmap-width")
     messages = list(image.notices)
     codes = upright(image.pixels, image.orientation)
     height, width = codes.shape[:2]
@@ -199,7 +210,8 @@ def read_envmap(
     if image.alpha is not None and image.kind != "exr":
         messages.append("alpha channel ignored")
     if codes.dtype.kind == "f":
-        texels = np.array(codes, dtype=np.float32)
+        with np.errstate(over="ignore"):  # counted below
+            texels = np.array(codes, dtype=np.float32)
     else:
         srgb = _to_srgb(path, codes, image, is_grey, messages)[1]
         texels = color.srgb_to_linear(srgb).astype(np.float32)
@@ -220,18 +232,34 @@ def read_envmap(
                 path, f"not clean radiance (found {found}; expected finite values >= 0)"
             )
         brightest = float(texels[~bad].max(initial=0.0))
+        if brightest == 0.0:
+            raise InputError(path, f"no light in it (found {found} beside 0)")
         texels[np.isposinf(texels)] = brightest
         texels[~(texels >= 0.0)] = 0.0
         messages.append(f"{found} repaired: +Inf to the brightest finite value, the others to 0")
     # Colours outside Rec.709 are negative in it, and no light is.
-    texels = np.maximum(_to_rec709(texels, image, messages), 0.0)
+    with np.errstate(over="ignore", invalid="ignore"):  # refused below
+        texels = np.maximum(_to_rec709(texels, image, messages), 0.0)
+    brightest = float(texels.max())
+    if not brightest <= RADIANCE_LIMIT:
+        raise InputError(
+            path,
+            f"too bright (found a radiance of {brightest:g}; limit {RADIANCE_LIMIT:g})",
+            "divide its values, and give --exposure",
+        )
+    if brightest == 0.0:
+        messages.append("no light: every texel is 0")
     if notices is not None:
         notices += messages
     return to_ours(texels, convention, camera_to_world)
 
 
 def read_mask(
-    path: str | Path, photo_size: tuple[int, int], *, notices: list[str] | None = None
+    path: str | Path,
+    photo_size: tuple[int, int],
+    *,
+    max_pixels: int = LIMITS.pixels,
+    notices: list[str] | None = None,
 ) -> FloatArray:
     """Read a mask that belongs to a photograph: grey, upright, of the photograph's size.
 
@@ -240,6 +268,7 @@ def read_mask(
     Args:
         path: 8 or 16 bits, float, 1 bit or a palette; RGB where its channels are equal.
         photo_size: Width and height of the upright photograph [px].
+        max_pixels: Largest image decoded [px] (``--max-pixels``).
         notices: One line per thing that was left out, or looks odd, is appended here.
 
     Returns:
@@ -250,7 +279,7 @@ def read_mask(
     """
     path = Path(path)
     width, height = photo_size
-    image = decode_image(path, max(PHOTO_PIXELS_MAX, width * height))
+    image = decode_image(path, max_pixels)
     codes = upright(image.pixels, image.orientation)
     if codes.shape[:2] != (height, width):
         raise InputError(
@@ -279,10 +308,16 @@ def read_mask(
         messages.append("alpha channel ignored")
     if is_even:
         messages.append("no signal: every pixel has the same value")
-    if codes.dtype.kind == "f":
-        mask = codes[..., 0].astype(np.float32)
-    else:
-        mask = codes[..., 0].astype(np.float32) / np.float32(np.iinfo(codes.dtype).max)
+    mask = codes[..., 0].astype(np.float32)
+    if codes.dtype.kind != "f":
+        white, brightest = np.iinfo(codes.dtype).max, codes.max()
+        if 0 < brightest < LABELS * white:
+            raise InputError(
+                path,
+                f"all but black (found {brightest} at most; expected {white} for white)",
+                "multiply labels of 0 and 1 by 255",
+            )
+        mask /= np.float32(white)
     if notices is not None:
         notices += messages
     return np.ascontiguousarray(mask)
@@ -292,7 +327,8 @@ def _to_srgb(
     path: Path, codes: Pixels, image: DecodedImage, is_grey: bool, notices: list[str]
 ) -> tuple[Pixels, FloatArray, bytes | None]:
     """Return codes [H, W, 3], the same as sRGB in [0, 1], and the profile that they are in."""
-    srgb = codes.astype(np.float32) / np.float32(np.iinfo(codes.dtype).max)
+    srgb = codes.astype(np.float32)
+    srgb /= np.float32(np.iinfo(codes.dtype).max)
     icc = image.icc
     if image.kind == "png":
         icc, ignored = png_profile(path, icc)
@@ -325,15 +361,15 @@ def _about_plate(plate: FloatArray) -> str:
     return text
 
 
-def _finite(path: Path, codes: Pixels, strict: bool, notices: list[str]) -> Pixels:
+def _finite(path: Path, plate: FloatArray, strict: bool, notices: list[str]) -> FloatArray:
     """Set non-finite pixels to black, and say how many there were."""
-    bad = ~np.isfinite(codes).all(axis=-1)
+    bad = ~np.isfinite(plate).all(axis=-1)
     count = int(bad.sum())
     if not count:
-        return codes
+        return plate
     if strict:
         raise InputError(path, f"not finite (found {count} such pixels; expected none)")
     notices.append(f"{count} non-finite pixels set to 0")
-    codes = codes.copy()
-    codes[bad] = 0
-    return codes
+    plate = plate.copy()
+    plate[bad] = 0
+    return plate

@@ -347,8 +347,9 @@ def balls(light: Light, camera: Camera, is_reinhard: bool, size: int = 192) -> N
     mirror = sharp[row, column].astype(np.float64)
     coarse = as_map(light, 32).astype(np.float64)
     weighted = (coarse * texel_solid_angles(32, 64)[:, None, None]).reshape(-1, 3)
-    cosine = np.maximum(normal.reshape(-1, 3) @ map_directions(32, 64).reshape(-1, 3).T, 0.0)
-    diffuse = (cosine @ weighted / np.pi).reshape(size, size, 3)
+    toward = map_directions(32, 64).reshape(-1, 3).T
+    # One row at a time: the cosines of all pixels with all texels would take gigabytes.
+    diffuse = np.stack([np.maximum(row @ toward, 0.0) @ weighted / np.pi for row in normal])
     pair = []
     for ball in (mirror, diffuse):
         shown = ball / (1.0 + ball) if is_reinhard else np.minimum(ball, 1.0)

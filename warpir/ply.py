@@ -89,6 +89,8 @@ def read_ply(path: Path, content: bytes) -> Ply:
     if order == "ascii":
         # As binary, with every number a float64: they hold all of PLY's integers exactly.
         try:
+            if b"_" in body:  # Python would read 1_0 as 10
+                raise ValueError("a number with _")
             body = np.array(body.split(), dtype=np.float64).astype("<f8").tobytes()
         except ValueError as error:
             raise InputError(path, f"damaged PLY: {str(error)[:80]}", ADVICE) from None
@@ -119,10 +121,10 @@ def read_header(path: Path, content: bytes) -> tuple[Ply, str, int]:
     """
     if not content.startswith(b"ply"):
         raise InputError(path, "not a PLY file (does not start with 'ply')", "convert it to GLB")
-    end = content.find(b"end_header", 0, HEADER_BYTES)
-    if end < 0:
-        raise InputError(path, "damaged PLY: no end_header", ADVICE)
     newline = b"\r" if content[3:4] == b"\r" and content[4:5] != b"\n" else b"\n"
+    end = content.find(newline + b"end_header", 0, HEADER_BYTES) + 1  # a comment may hold the word
+    if not end:
+        raise InputError(path, "damaged PLY: no end_header", ADVICE)
     start = content.find(newline, end) + 1 or len(content)
     ply, order = Ply({}, ()), ""
     comments: list[str] = []
@@ -139,7 +141,9 @@ def read_header(path: Path, content: bytes) -> tuple[Ply, str, int]:
                 comments.append(" ".join(words))
             case ["format", order, "1.0"] if order in ORDERS:
                 pass
-            case ["element", name, count] if count.isdecimal() and name not in ply.elements:
+            case ["element", name, count] if (
+                count.isdecimal() and len(count) < 20 and name not in ply.elements
+            ):
                 element = ply.elements[name] = Element(name, int(count))
                 if element.count > len(content):  # a row takes at least a byte
                     raise wrong(f"in {len(content)} bytes")

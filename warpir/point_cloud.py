@@ -10,28 +10,30 @@ from numpy.typing import NDArray
 from warpir.asset_files import read_regular
 from warpir.colmap_model import is_model, read_points
 from warpir.errors import InputError
-from warpir.ply import read_ply
+from warpir.limits import LIMITS, Limits
+from warpir.ply import read_header, read_ply
 
 Float64Array = NDArray[np.float64]
 
 
-def read_point_cloud(path: str | Path) -> Float64Array:
+def read_point_cloud(path: str | Path, limits: Limits = LIMITS) -> Float64Array:
     """Read the positions of a point cloud, shape [point, 3], in the world of the file.
 
     Args:
         path: A PLY file, recognised by content; a COLMAP model (folder, or one of its files); or
             text with x y z at the start of each line, blanks or commas between.
+        limits: How many points, and how large a file.
 
     Raises:
         InputError: Missing, damaged, without points, or with numbers that are not finite.
     """
     path = Path(path)
     if is_model(path):
-        points = read_points(path)
+        points = read_points(path, limits)
     else:
-        content = read_regular(path, path)
+        content = read_regular(path, path, limits=limits)
         is_ply = re.match(rb"ply\s", content) is not None
-        points = _read_ply(path, content) if is_ply else _read_text(path, content)
+        points = (_read_ply if is_ply else _read_text)(path, content, limits)
     if not len(points):
         raise InputError(path, "no points")
     if bad := int((~np.isfinite(points).all(axis=1)).sum()):
@@ -39,16 +41,19 @@ def read_point_cloud(path: str | Path) -> Float64Array:
     return points
 
 
-def _read_ply(path: Path, content: bytes) -> Float64Array:
+def _read_ply(path: Path, content: bytes, limits: Limits) -> Float64Array:
     """Read the vertices of a PLY file."""
+    count = read_header(path, content)[0].element("vertex").count
+    limits.check("points", count, path, "too many points")
     points = read_ply(path, content).element("vertex").table("x", "y", "z")
     if points is None:
         raise InputError(path, "not a PLY of points (expected vertices with x, y, z)")
     return points
 
 
-def _read_text(path: Path, content: bytes) -> Float64Array:
+def _read_text(path: Path, content: bytes, limits: Limits) -> Float64Array:
     """Read lines of numbers; the first three are the position."""
+    limits.check("points", content.count(b"\n"), path, "too many points", more=" lines")
     text = content.removeprefix(b"\xef\xbb\xbf").replace(b",", b" ")
     return _rows(path, text.split(b"\n"), [0, 1, 2], 1)
 

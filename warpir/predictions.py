@@ -25,7 +25,8 @@ from warpir.errors import InputError, raise_all
 from warpir.files import OutputFolder
 from warpir.image_decoder import check_regular_file
 from warpir.light import Float64Array, FloatArray, angles_from_axis, map_directions, rotate_map
-from warpir.photo_files import ENVMAP_WIDTH_MAX, read_envmap
+from warpir.limits import LIMITS
+from warpir.photo_files import read_envmap
 from warpir.strict_json import read_json_object
 from warpir.three_spheres import from_camera_frame, lookup_matrix
 
@@ -317,7 +318,7 @@ def _read_array(path: Path) -> FloatArray:
     if stored.dtype.kind != "f":
         raise InputError(path, "not an array of floating-point numbers")
     height = stored.shape[0] if stored.ndim else 0
-    if stored.shape != (height, 2 * height, 3) or not 2 <= height <= ENVMAP_WIDTH_MAX // 2:
+    if stored.shape != (height, 2 * height, 3) or not 2 <= height <= LIMITS.envmap_width // 2:
         raise InputError(
             path,
             f"not a lat-long map (found shape {stored.shape}; expected [H, 2 H, 3])",

@@ -1,25 +1,78 @@
 """What all commands share: errors as one line and an exit status, signals, and lines of output."""
 
-import errno
+import atexit
+import importlib.util
 import logging
 import os
-import signal
 import sys
-import threading
+import tempfile
 import traceback
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
-from types import FrameType
+from collections.abc import Callable, Sequence
+from contextlib import suppress
 
+from warpir import signals
+from warpir.atomic import WriteError
 from warpir.config import usage
-from warpir.errors import ExitCode, InputError
+from warpir.diffusion.model_error import ModelError
+from warpir.errors import DISK_FULL, LISTED, ExitCode, InputError, disk_error
+from warpir.memory import MIB, free_host, is_shortage
 
 INTERRUPTED = 130
-TERMINATED = 143
+"""Of a Ctrl-C where nobody handles signals: 128 and the number of SIGINT."""
+LONGEST = 10_000
+"""Most characters of a line: two file names of any length and a sentence."""
 EXTRA_OF = {"ray": "ray", "mitsuba": "bench", "matplotlib": "bench"}
 """Which extra brings a package that a plain install does not have."""
-NO_MEMORY = ("allocate mem", "Failed to allocate", "out of memory", "ALLOC_FAILED")
-"""How torch, Warp and CUDA say in a RuntimeError that memory is short."""
+BROUGHT = (
+    *("OpenEXR", "OpenImageIO", "PIL", "accelerate", "colour", "diffusers", "numpy", "peft"),
+    *("rich", "safetensors", "scipy", "skimage", "torch", "transformers", "trimesh", "warp"),
+    "yaml",
+)
+"""What a plain install brings, so that only a broken one lacks it."""
+
+
+def settle_environment() -> None:
+    """Set what libraries read when they are loaded, so before they are.
+
+    NumPy's BLAS gets one thread, as the last bits of its sums depend on how many there are, and
+    Hugging Face's libraries send nothing home.
+    """
+    os.environ["OPENBLAS_NUM_THREADS"] = "1"
+    for name in ("HF_HUB_DISABLE_TELEMETRY", "DO_NOT_TRACK"):
+        os.environ[name] = "1"
+
+
+def _open_closed_streams() -> None:
+    """Put nothing in the place of closed standard streams.
+
+    Otherwise the next files that are opened get their numbers, and what libraries print would go
+    into them.
+    """
+    for number in (0, 1, 2):
+        try:
+            os.fstat(number)
+        except OSError:
+            os.dup2(os.open(os.devnull, os.O_RDWR), number)
+    # Python has no stream where the descriptor was closed at its start.
+    sys.stdout = sys.stdout or open(1, "w", closefd=False)
+    sys.stderr = sys.stderr or open(2, "w", closefd=False)
+
+
+def require_packages(*names: str) -> None:
+    """Look for packages that are imported late, without importing them.
+
+    Raises:
+        ModuleNotFoundError: One is not installed; `run_program` says what brings it.
+    """
+    for name in names:
+        if importlib.util.find_spec(name) is None:
+            raise ModuleNotFoundError(f"No module named {name!r}", name=name)
+
+
+def stay_offline() -> None:
+    """Tell Hugging Face's libraries, before they are loaded, to open no connection."""
+    for name in ("HF_HUB_OFFLINE", "TRANSFORMERS_OFFLINE"):
+        os.environ[name] = "1"
 
 
 def run_program(run: Callable[[list[str]], int], argv: Sequence[str] | None = None) -> int:
@@ -32,35 +85,47 @@ def run_program(run: Callable[[list[str]], int], argv: Sequence[str] | None = No
     Returns:
         The exit status, an `ExitCode` or 128 plus the number of a signal.
     """
+    _open_closed_streams()
+    settle_environment()
     arguments = list(sys.argv[1:] if argv is None else argv)
     debug = "--debug" in arguments
+    # Those of NumPy and others are noise to the user: what they tell of is checked for.
+    logging.captureWarnings(True)
+    logging.getLogger("py.warnings").addHandler(logging.NullHandler())
     if debug:
         logging.basicConfig(level=logging.DEBUG, format="debug: %(name)s: %(message)s")
     for stream in (sys.stdout, sys.stderr):
         # A terminal without UTF-8 shows escapes; it must not end the run.
         if hasattr(stream, "reconfigure"):
             stream.reconfigure(errors="backslashreplace")
-    try:
-        with _terminate_as_exception():
+    atexit.unregister(signals.ignore_at_exit)
+    with signals.handled():
+        try:
             return run(arguments)
-    except BaseException as error:
-        status, lines = _explain(error)
-        if debug and not isinstance(error, SystemExit):
-            traceback.print_exc()
-        elif status == ExitCode.BUG:
-            # Without --debug too: without it nobody could repair what is our fault.
-            traceback.print_exc()
-        for line in lines:
-            print(line, file=sys.stderr)
-        return status
+        except BaseException as error:
+            signals.ignore()
+            status, lines = explain(error)
+            with suppress(OSError):  # nobody can read it: the status says it all
+                if debug and not isinstance(error, SystemExit):
+                    traceback.print_exc()
+                elif status == ExitCode.BUG:
+                    # Without --debug too: without it nobody could repair what is our fault.
+                    traceback.print_exc()
+                for line in lines:
+                    print(line, file=sys.stderr, flush=True)
+            return status
+        finally:
+            # What is registered last is called first: before caches are written and torch is gone.
+            atexit.register(signals.ignore_at_exit)
 
 
-def _explain(error: BaseException) -> tuple[int, list[str]]:
+def explain(error: BaseException) -> tuple[int, list[str]]:
     """Return the exit status of an exception and the lines that tell the user about it."""
     if isinstance(error, SystemExit):
         return error.code if isinstance(error.code, int) else ExitCode.DONE, []
-    if isinstance(error, _Terminated):
-        return TERMINATED, ["stopped"]
+    if isinstance(error, signals.Stopped):
+        kept = f"; {error.kept}" if error.kept else ""
+        return 128 + error.number, [_one_line(f"stopped by {error}{kept}")]
     if isinstance(error, KeyboardInterrupt):
         return INTERRUPTED, ["stopped"]
     missing = (getattr(error, "name", None) or "").split(".")[0]
@@ -68,21 +133,27 @@ def _explain(error: BaseException) -> tuple[int, list[str]]:
         error = usage(
             missing, "not installed", f"pip install 'warpir[{EXTRA_OF[missing]}]' brings it"
         )
-    elif _is_short_of_memory(error):
+    elif isinstance(error, ModuleNotFoundError) and missing in BROUGHT:
+        error = usage(missing, "not installed", "pip install --upgrade warpir brings it")
+    elif is_shortage(error):
         error = InputError(
             "memory",
-            "not enough of it",
+            f"not enough of it ({free_host() // MIB} MiB of the host are free now)",
             "lower --width, --samples or --rays, with --guidance --class-batch, --noises or "
-            "--guidance-width, or use --device cpu",
+            "--guidance-width, give a smaller --photo or --asset, or use --device cpu",
             ExitCode.RESOURCES,
         )
-    elif isinstance(error, OSError) and error.errno in (errno.ENOSPC, errno.EDQUOT, errno.EFBIG):
-        name = error.filename or "--out"
-        error = InputError(name, f"cannot be written ({error.strerror})", code=ExitCode.RESOURCES)
+    elif isinstance(error, WriteError) or (isinstance(error, OSError) and error.errno in DISK_FULL):
+        error = disk_error(error.filename or f"--out or {tempfile.gettempdir()}", error)
+    elif isinstance(error, ModelError):
+        error = InputError(error.where, error.what, error.advice, ExitCode.MODEL)
     if isinstance(error, InputError):
         lines = [_one_line(f"error: {error.where}: {error.what}")]
         lines += [_one_line(error.advice)] if error.advice else []
-        return error.code, lines + [_one_line(f"also: {o.where}: {o.what}") for o in error.also]
+        lines += [_one_line(f"also: {o.where}: {o.what}") for o in error.also[:LISTED]]
+        if len(error.also) > LISTED:
+            lines.append(f"also: and {len(error.also) - LISTED} more")
+        return error.code, lines
     kind = _one_line(f"{type(error).__name__}: {error}")
     return ExitCode.BUG, [
         f"error: warpir: a fault of its own ({kind})",
@@ -90,39 +161,17 @@ def _explain(error: BaseException) -> tuple[int, list[str]]:
     ]
 
 
-def _is_short_of_memory(error: BaseException) -> bool:
-    told = isinstance(error, RuntimeError) and any(words in str(error) for words in NO_MEMORY)
-    return told or isinstance(error, MemoryError)
-
-
 def _one_line(text: str) -> str:
+    if len(text) > LONGEST:  # what was found stands at the beginning, what was expected at the end
+        text = f"{text[: LONGEST // 2]} ... {text[-LONGEST // 2 :]}"
     # File names may hold line breaks and control characters.
     return "".join(c if c.isprintable() else repr(c)[1:-1] for c in text)
 
 
 def say(line: str) -> None:
-    """Print on standard output; a reader that went away (``| head``) does not end the run."""
+    """Print on standard output; a reader that went away, or a full disk, does not end the run."""
     try:
         print(_one_line(line), flush=True)
-    except BrokenPipeError:
+    except OSError:
         # Python flushes once more at exit: give it somewhere to write to.
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
-
-
-class _Terminated(BaseException):
-    """SIGTERM, turned into an exception so that staged files and locks are removed."""
-
-
-@contextmanager
-def _terminate_as_exception() -> Iterator[None]:
-    def terminate(signum: int, frame: FrameType | None) -> None:
-        raise _Terminated
-
-    if threading.current_thread() is not threading.main_thread():
-        yield
-        return
-    previous = signal.signal(signal.SIGTERM, terminate)
-    try:
-        yield
-    finally:
-        signal.signal(signal.SIGTERM, previous)

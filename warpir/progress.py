@@ -108,11 +108,12 @@ class StepProgress:
         self._last_line = now
         left = ""
         if first < done < total:
-            left = f", {_duration((now - started) / (done - first) * (total - done))} left"
+            left = f", {duration((now - started) / (done - first) * (total - done))} left"
         self.say(f"{stage}: {done} of {total}{left}{'; ' if words else ''}{words}")
 
 
-def _duration(seconds: float) -> str:
+def duration(seconds: float) -> str:
+    """Return a time as a person says it."""
     if seconds < 100.0:
         return f"about {seconds:.0f} s"
     return f"about {seconds / 60.0:.0f} min"

@@ -1,6 +1,8 @@
 """What a run leaves about itself: the content of ``run.json``."""
 
 import hashlib
+import importlib.util
+import os
 import platform
 import sys
 import time
@@ -12,7 +14,16 @@ from typing import Any
 
 import warpir
 from warpir.config import InsertConfig
+from warpir.errors import InputError
+from warpir.memory import peak_mib
 
+OF_THE_RUN = ("out", "overwrite", "resume", "threads", "report")
+"""Settings that change nothing in a result, so that its pictures do not hold them."""
+PATHS = (
+    *("photo", "occluder_mask", "asset", "materials", "camera", "ground_points", "proxy"),
+    *("shadow_mask", "light", "prior", "regressor", "model", "lora", "reuse", "sequence", "out"),
+)
+"""Settings that name a file or a folder."""
 RUN_FORMAT = 1
 """Layout number of ``run.json``; a newer one is refused: its keys may mean other things."""
 RECORDED_PACKAGES = (
@@ -40,6 +51,10 @@ class Timings:
             spent = time.perf_counter() - start
             self.seconds[name] = self.seconds.get(name, 0.0) + spent
 
+    def rounded(self) -> dict[str, float]:
+        """Return seconds by stage as they are told, to the millisecond."""
+        return {name: round(spent, 3) for name, spent in self.seconds.items()}
+
 
 def run_record(
     config: InsertConfig,
@@ -55,7 +70,7 @@ def run_record(
 
     Args:
         config: What was asked for.
-        inputs: sha256 of the files that were read, from `input_hashes`.
+        inputs: sha256 of the files that were read, from `warpir.inputs.Inputs.hashes`.
         device: What computed it, such as ``cpu`` or the name of a card.
         timings: Seconds by stage.
         assumed: What was chosen because nothing was given, one line each.
@@ -72,34 +87,74 @@ def run_record(
         "measured": dict(measured or {}),
         "device": device,
         "versions": versions(),
-        "seconds": {name: round(spent, 3) for name, spent in timings.seconds.items()},
+        "seconds": timings.rounded(),
+        "peak_mib": peak_mib(),
     }
 
 
-def input_hashes(config: InsertConfig) -> dict[str, str]:
-    """Return the sha256 of every input file, by the name of its field; of a model, of its files.
+def config_of_picture(config: InsertConfig) -> dict[str, Any]:
+    """Return the configuration as a picture carries it, which may be given to others.
 
-    An earlier run is known by its ``run.json``, which holds the sha256 of its other files.
+    Of paths only the names are left: where somebody keeps their files is for ``run.json``.
+    """
+    return {
+        name: name_of(value) if name in PATHS and value is not None else value
+        for name, value in asdict(config).items()
+        if name not in OF_THE_RUN
+    }
+
+
+def name_of(path: str) -> str:
+    """Return the last part of a path, of ``.`` that of the folder it stands for."""
+    return Path(os.path.abspath(path)).name
+
+
+def input_files(config: InsertConfig) -> dict[str, Path]:
+    """Return every input file that a flag names, by the name of its field; of a model, its files.
+
+    Not the asset, the mesh of the place and the earlier run, whose readers hash what they read.
     """
     # Here, since the command line imports this module and must not load NumPy for --help.
     from warpir.colmap_model import is_model, model_files
 
     names = (
-        *("photo", "occluder_mask", "asset", "materials", "camera", "light", "lora", "reuse"),
-        *("prior", "regressor", "ground_points", "proxy", "shadow_mask"),
+        *("photo", "occluder_mask", "materials", "camera", "light", "lora"),
+        *("prior", "regressor", "ground_points", "shadow_mask"),
     )
     paths = {name: Path(path) for name in names if (path := getattr(config, name)) is not None}
     for name, stems in MODEL_STEMS.items():
         if name in paths and is_model(paths[name]):
             files = model_files(paths.pop(name), *stems)
             paths |= {f"{name}/{file.name}": file for file in files}
-    if config.reuse is not None:
-        paths["reuse"] /= "run.json"
-    hashes = {}
-    for name, path in paths.items():
+    return paths
+
+
+def file_hash(path: Path) -> str:
+    """Return the sha256 of a file, or `warpir.asset.ABSENT` where there is none.
+
+    Raises:
+        InputError: It cannot be read.
+    """
+    from warpir.asset import ABSENT
+
+    try:
         with path.open("rb") as stream:
-            hashes[name] = hashlib.file_digest(stream, "sha256").hexdigest()
-    return hashes
+            return hashlib.file_digest(stream, "sha256").hexdigest()
+    except FileNotFoundError:
+        return ABSENT
+    except OSError as error:
+        raise InputError(path, f"cannot be read ({error.strerror})") from error
+
+
+def sources_hash() -> str:
+    """Return the sha256 of warpir's own modules: a checkout changes without another version."""
+    digest = hashlib.sha256()
+    for package in ("warpir", "warpir.kernels", "warpir.diffusion"):
+        spec = importlib.util.find_spec(package)
+        assert spec is not None and spec.origin is not None
+        for file in sorted(Path(spec.origin).parent.glob("*.py")):
+            digest.update(f"{package}/{file.name}\0".encode() + file.read_bytes())
+    return digest.hexdigest()
 
 
 def versions() -> dict[str, str]:
@@ -107,6 +162,7 @@ def versions() -> dict[str, str]:
     import importlib.metadata
 
     found = {"python": platform.python_version(), "platform": sys.platform}
+    found["warpir"] = f"{warpir.__version__} (sources {sources_hash()[:16]})"
     for name in RECORDED_PACKAGES:
         try:
             found[name] = importlib.metadata.version(name)

@@ -9,7 +9,7 @@ from __future__ import annotations
 import tempfile
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from dataclasses import asdict, dataclass, fields, replace
+from dataclasses import asdict, dataclass, field, fields, replace
 from pathlib import Path
 from typing import Any
 
@@ -17,20 +17,24 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
+from warpir import signals
 from warpir.acceptance import Verdict, blend, judge
+from warpir.caches import cache_folder
 from warpir.camera import Camera
 from warpir.checkpoint import Checkpoint, Checkpoints
 from warpir.color import gamma_to_linear, linear_to_gamma
-from warpir.config import PRIOR_DEFAULTS, InsertConfig
+from warpir.config import DEFAULTS, PRIOR_DEFAULTS, InsertConfig
 from warpir.curves import Curves, ToneKnots
-from warpir.diffusion.cache import cache_folder, content_key
+from warpir.determinism import use_threads_for
+from warpir.diffusion.cache import content_key
 from warpir.diffusion.embedded import embedded_prompts, load_embedded
-from warpir.diffusion.guidance import DatasetUpdate, Guidance, NonFiniteError, make_guidance
+from warpir.diffusion.guidance import DatasetUpdate, Guidance, make_guidance
 from warpir.diffusion.lora_files import Lora, save_lora
-from warpir.diffusion.model_folder import check_model_folder, find_model
+from warpir.diffusion.model_error import ModelError
+from warpir.diffusion.model_folder import check_model_folder, find_model, hub_offline
 from warpir.diffusion.network_prior import NetworkPrior
 from warpir.diffusion.personalize import personalize
-from warpir.diffusion.prior import Condition, ModelError
+from warpir.diffusion.prior import Condition, NonFiniteError
 from warpir.diffusion.prompts import Prompts, make_prompts
 from warpir.diffusion.show_prior import show_personalization
 from warpir.diffusion.stable_diffusion import load_stable_diffusion
@@ -40,19 +44,19 @@ from warpir.files import OutputFolder
 from warpir.inputs import Inputs
 from warpir.light import Lobes, as_map, summarize
 from warpir.light_optimization import LightOptimization, Unknowns
-from warpir.lighting import SceneLight, is_described, start_level
+from warpir.lighting import SceneLight, start_level
 from warpir.lit_frame import LitFrame
 from warpir.lobe_fit import fit_lobes
 from warpir.lobes_file import lobes_to_json
+from warpir.memory import Memory, needs_of_model, release
 from warpir.optimize import Optimization
 from warpir.picture import resize, scene_of
 from warpir.progress import StepProgress
-from warpir.record import Timings, input_hashes, versions
+from warpir.record import Timings, versions
 from warpir.regressor import Regression, load_regressor, regress
 from warpir.render import Renderer
 from warpir.sg_light import narrowest
 from warpir.tone import ToneCurve
-from warpir.transport_cache import default_cache
 from warpir.trust import TrustRegion
 from warpir.view import Frame
 
@@ -81,7 +85,8 @@ LOSSES_WITHOUT_LORA = ("csd", "sds-base", "good-bad")
 NOT_IDENTITY = frozenset(
     {"out", "overwrite", "resume", "preview_every", "checkpoint_every", "threads", "mark"}
     | {"allow_download", "show_prior", "samples", "rays", "indirect_limit", "width", "device"}
-    | {"accept"}
+    | {"accept", "report"}
+    | {name for name in DEFAULTS if name.startswith("max_")}
 )
 """Settings that an interrupted run may change: they do not reach the optimisation, or, as the
 device that was chosen, count by what came of them."""
@@ -103,6 +108,8 @@ class Run:
     progress: StepProgress
     estimate: Estimate | None = None
     """What was read off the photo, where that is the start."""
+    memory: Memory = field(default_factory=Memory)
+    """Is told where memory was short."""
 
     @property
     def torch_device(self) -> torch.device:
@@ -161,12 +168,19 @@ def recover(
             with run.timings.stage("preview"):
                 write_start(run, frame, start)
         guided, resumed = prepare_guidance(run, checkpoints)
+        release()
         with run.timings.stage("trace"):
             guide = make_guide(run, guided, frame)
             graphs = guided.prior.graphs
             faster = graphs.recorded_module if graphs else None
             loop = LightOptimization(
-                frame, guide, settings, unknowns, default_cache(), record=faster, region=region
+                frame,
+                guide,
+                settings,
+                unknowns,
+                cache_folder("transport"),
+                record=faster,
+                region=region,
             )
         before = {k: v.detach().clone() for k, v in unknowns.state_dict().items()}
         with torch.no_grad():
@@ -178,7 +192,7 @@ def recover(
             with run.timings.stage("accept"):
                 verdict, compared = judge_end(loop, guide, before)
             run.say(verdict.line)
-        notices = (*guided.prior.notices, *guided.notices, *loop_notices(loop))
+        notices = (*guided.prior.notices, *guided.notices, *loop_notices(loop, frame.renderer))
         light_fg, light_shadow = loop.final_lights(LIGHT_HEIGHT)
         unknowns = loop.unknowns
         run.output.write_json("optimization.json", convergence(loop, first))
@@ -190,7 +204,7 @@ def recover(
         **guided.record,
         **who_spoke(run, guided),
         "loop_integrator": settings.integrator,
-        "optimization": summary_of(loop, first) | {"clipped_steps": guide.counts.clipped_steps},
+        "optimization": summary_of(loop, first) | counts_of(guide, frame),
         **({} if run.estimate is None else {"regression": run.estimate.regression.record()}),
         "start_light": asdict(summarize(start.light)),
         "end_light": asdict(summarize(light_fg)),
@@ -256,22 +270,6 @@ def judge_end(
     return verdict, compared
 
 
-def require_model(config: InsertConfig) -> None:
-    """Check what the run reads beside its inputs: the model's folder, or the weights that we ship.
-
-    Raises:
-        InputError: It is not there, or not what it should be (`ExitCode.MODEL`).
-    """
-    with as_input_errors():
-        if config.guided_by == "stable-diffusion" and not config.allow_download:
-            check_model_folder(find_model(config.model, allow_download=False))
-        if config.guided_by == "embedded" and config.is_guided:
-            load_embedded(_path(config.prior), torch.device("cpu"))
-    is_given = is_described(config) or config.reuse is not None
-    if config.start != "uniform" and not is_given:
-        load_regressor(_path(config.regressor))
-
-
 def _path(name: str | None) -> Path | None:
     return None if name is None else Path(name)
 
@@ -280,28 +278,23 @@ def open_checkpoints(run: Run) -> Checkpoints:
     """Return the run's checkpoints; the model is not among what they depend on yet.
 
     Raises:
-        InputError: --out holds an unfinished run that is neither resumed nor overwritten.
+        InputError: --out holds an unfinished run that is neither resumed nor overwritten, or
+            another one than is to be resumed.
     """
     config = run.config
     values = {f.name: getattr(config, f.name) for f in fields(config)}
     identity = {
         "config": {k: v for k, v in values.items() if k not in NOT_IDENTITY and v is not None},
-        "inputs": input_hashes(config),
+        "inputs": run.inputs.hashes,
         "device": run.device,
         "versions": versions(),
     }
     checkpoints = Checkpoints(run.output.path, identity)
     if config.resume and checkpoints.newest is not None:
+        checkpoints.check()  # before anything is loaded or written
         return checkpoints
     if config.resume:
         run.say(f"notice: no checkpoint in {checkpoints.folder}: the run starts at its beginning")
-    if checkpoints.newest is not None and not config.overwrite:
-        raise InputError(
-            run.output.path,
-            f"holds an unfinished run ({checkpoints.newest})",
-            "--resume goes on with it, --overwrite starts it again",
-            ExitCode.OUTPUT,
-        )
     checkpoints.remove()
     return checkpoints
 
@@ -331,7 +324,9 @@ def prepare_guidance(run: Run, checkpoints: Checkpoints) -> tuple[Guided, Checkp
     """
     config = run.config
     with run.timings.stage("model"):
-        prior, prompts, negative = load_prior(run)
+        prior, prompts, negative = run.memory.again(lambda: load_prior(run), "the model", "--model")
+        prior.in_chunks = run.memory.in_chunks
+        use_threads_for(prior.unet)
         shown = [*(config.show_prior or ())]
         prior.embed([prompts.photo, prompts.class_, prompts.guidance, "", *shown])
         prior.embed([negative, config.null_prompt, config.base_prompt])
@@ -353,23 +348,27 @@ def prepare_guidance(run: Run, checkpoints: Checkpoints) -> tuple[Guided, Checkp
     photo = torch.from_numpy(run.inputs.photo.srgb).permute(2, 0, 1)[None].contiguous()
     cache = cache_folder()
     with run.timings.stage("personalize"):
-        every = config.checkpoint_every
 
         def on_step(training: Any) -> None:
-            if every and training.step_count % every == 0:
+            if is_time_to_save(config, training.step_count):
                 checkpoints.save("personalize", training.step_count, training.state_dict())
 
-        made = personalize(
-            prior,
-            photo,
-            prompts,
-            config,
-            config.seed,
-            cache,
-            report=run.progress.report,
-            on_step=on_step,
-            resume=resumed.state if resumed and resumed.stage == "personalize" else None,
-        )
+        def report(stage: str, done: int, total: int) -> None:
+            run.progress.report(stage, done, total)
+            signals.check()
+
+        with signals.deferred():
+            made = personalize(
+                prior,
+                photo,
+                prompts,
+                config,
+                config.seed,
+                cache,
+                report=report,
+                on_step=on_step,
+                resume=resumed.state if resumed and resumed.stage == "personalize" else None,
+            )
         if shown:
             sheet = show_personalization(
                 prior, photo, prompts, config, config.seed, cache, shown, SHOWN_SEEDS,
@@ -404,8 +403,27 @@ def load_prior(run: Run) -> tuple[NetworkPrior, Prompts, str]:
             prior.notices += (f"the embedded prior does not know: {words}",)
         return prior, prompts, config.negative_prompt or prompts.negative
     assert config.prompt is not None
+    require_memory(run)
     model = load_stable_diffusion(config, run.torch_device)
     return model, make_prompts(config.prompt, config), config.negative_prompt
+
+
+def require_memory(run: Run) -> None:
+    """Compare what Stable Diffusion will take with what is free.
+
+    Raises:
+        InputError: It is certain not to fit (`ExitCode.RESOURCES`).
+        ModelError: It cannot be used.
+    """
+    config = run.config
+    with hub_offline(not config.allow_download):
+        folder = check_model_folder(find_model(config.model, config.allow_download))
+    files = (file for weights in folder.weights.values() for file in weights.files)
+    side = 8 * int(folder.configs["unet"]["sample_size"])
+    is_half = run.device != "cpu" and config.precision != "fp32"
+    pictures = config.guidance_settings().noises
+    size = sum(file.stat().st_size for file in files)
+    run.memory.require(*needs_of_model(size, side, pictures, is_half=is_half))
 
 
 def make_frame(run: Run) -> Frame:
@@ -418,8 +436,16 @@ def make_frame(run: Run) -> Frame:
     width = min(config.picture_width, camera.width)
     small = camera.scaled(width, max(1, round(width * camera.height / camera.width)))
     curves = Curves.identity(config.tone_operator)
-    scene = scene_of(run.inputs, small, run.device, curves)
-    renderer = Renderer(scene, config.threads or 0)
+    scene = run.memory.again(
+        lambda: scene_of(run.inputs, small, run.device, curves), "the scene", "--asset"
+    )
+    renderer = Renderer(
+        scene,
+        config.threads or 0,
+        memory=run.memory,
+        lower="--guidance-width",
+        is_ordered=config.deterministic,
+    )
     photo = np.clip(resize(run.inputs.photo.linear(), small.height, small.width), 0.0, None)
     frame = Frame(renderer, photo, curves.tone == "reinhard", config.depth, config.seed)
     if not frame.coverage().any():
@@ -438,7 +464,7 @@ def start_of(run: Run, start: SceneLight) -> Unknowns:
     if run.estimate is not None:
         lobes = run.estimate.regression.lobes(least)
         lobes = replace(lobes, amplitude=(run.estimate.gain * lobes.amplitude).astype(np.float32))
-    elif is_described(config):
+    elif config.is_light_described:
         fitted = fit_lobes(as_map(start.light, START_HEIGHT), config.lobes).lobes
         lobes = widened(fitted, least)
     return Unknowns.start(lobes, start_level(run.inputs, config), config)
@@ -553,13 +579,26 @@ def optimize(
         if config.preview_every and step % config.preview_every == 0:
             with torch.no_grad():
                 write_preview(run, loop.final_image(config.seed), step)
-        if config.checkpoint_every and step % config.checkpoint_every == 0:
+        if is_time_to_save(config, step):
             checkpoints.save("optimize", step, loop.state_dict())
+        signals.check()
 
-    with run.timings.stage("optimize"):
-        loop.run(on_step)
+    with run.timings.stage("optimize"), signals.deferred():
+        try:
+            loop.run(on_step)
+        except (InputError, NonFiniteError) as error:
+            # The step that failed changed nothing: this is the last good state.
+            if not isinstance(error, InputError) or error.code == ExitCode.NUMERIC:
+                checkpoints.save("optimize", loop.state.step, loop.state_dict())
+            raise
     if loop.state.best_score is not None:
         run.say(f"kept: step {loop.state.best_step}, score {loop.state.best_score:.4g}")
+
+
+def is_time_to_save(config: InsertConfig, step: int) -> bool:
+    """Return whether a checkpoint is due: every so many steps, and when the run is to stop."""
+    every = config.checkpoint_every
+    return bool(every) and (step % every == 0 or signals.is_pending())
 
 
 def write_start(run: Run, frame: Frame, start: SceneLight) -> None:
@@ -582,10 +621,11 @@ def knots_of(curve: ToneCurve) -> ToneKnots:
     return ToneKnots(*curve.arrays())
 
 
-def loop_notices(loop: Optimization) -> Iterator[str]:
+def loop_notices(loop: Optimization, renderer: Renderer) -> Iterator[str]:
     """Yield what the user should know of a finished loop."""
     if loop.state.skipped:
         yield f"{loop.state.skipped} steps had no finite gradient and were skipped"
+    yield from renderer.bad_pixels.notices()
 
 
 def summary_of(loop: Optimization, first: float | None) -> dict[str, Any]:
@@ -597,6 +637,15 @@ def summary_of(loop: Optimization, first: float | None) -> dict[str, Any]:
         "score_at_start": first,
         "best_score": state.best_score,
         "best_step": state.best_step if state.best_step >= 0 else state.step,
+        "rate_share": state.rate_share,
+    }
+
+
+def counts_of(guide: Guidance | DatasetUpdate, frame: Frame) -> dict[str, int]:
+    """Return what was shortened and what was set to black in a loop."""
+    return {
+        "clipped_steps": guide.counts.clipped_steps,
+        "bad_pixels": frame.renderer.bad_pixels.count,
     }
 
 
@@ -617,7 +666,7 @@ def write_lora(run: Run, guided: Guided) -> None:
     lora, prior = guided.lora, guided.prior
     if lora is None:
         return
-    with tempfile.TemporaryDirectory() as folder:
+    with tempfile.TemporaryDirectory(dir=run.output.staging) as folder:
         for path in save_lora(
             lora, folder, prior.unet.config.cross_attention_dim, prior.schedule.prediction_type,
             guided.prompts.photo,

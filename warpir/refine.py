@@ -24,6 +24,7 @@ from warpir.integrator import MaterialTensors
 from warpir.lighting import SceneLight
 from warpir.lit_frame import LitFrame
 from warpir.materials_file import MATERIALS, materials_to_json
+from warpir.memory import release
 from warpir.mis import MisIntegrator
 from warpir.optimize import Guide, Optimization
 from warpir.optimize_settings import OptimizeSettings
@@ -31,6 +32,7 @@ from warpir.recover import (
     Run,
     as_input_errors,
     convergence,
+    counts_of,
     knots_of,
     loop_notices,
     make_frame,
@@ -217,7 +219,7 @@ class MaterialRefinement(Optimization):
             for part, values in unknowns.parts.items()
         ]
         frame = lit.frame
-        super().__init__(unknowns, groups, guide, settings, frame.seed)
+        super().__init__(unknowns, groups, guide, settings, frame.seed, frame.renderer.memory)
         self.lit = lit
         self.curves = [_fixed(k) for k in (curves.foreground, curves.shadow_ratio)]
         nowhere = np.zeros(0, np.int32)
@@ -231,6 +233,7 @@ class MaterialRefinement(Optimization):
         What is asked of a picture follows its noise too. With the same samples the gradient would
         also lessen that noise: smoother metal, darker paint.
         """
+        self.lit.frame.renderer.bad_pixels.iteration = step
         replayed = self.final_image(self.seed + 2 * step)
         with torch.no_grad():
             shown = self.final_image(self.seed + 2 * step + 1)
@@ -282,7 +285,8 @@ class ToneRefinement(Optimization):
         self, lit: LitFrame, guide: Guide, settings: OptimizeSettings, unknowns: ToneUnknowns
     ) -> None:
         groups = [{"params": [*unknowns.parameters()], "rate": settings.rate_tone}]
-        super().__init__(unknowns, groups, guide, settings, lit.frame.seed)
+        memory = lit.frame.renderer.memory
+        super().__init__(unknowns, groups, guide, settings, lit.frame.seed, memory)
         self.lit = lit
 
     def image(self, step: int) -> Tensor:
@@ -348,6 +352,7 @@ def refine(
             # Curves of an earlier run are made for its operator.
             frame = replace(make_frame(run), is_reinhard=light.curves.tone == "reinhard")
         guided, resumed = prepare_guidance(run, checkpoints)
+        release()
         with run.timings.stage("trace"):
             guide = make_guide(run, guided, frame)
             lit = LitFrame(frame, light, run.torch_device)
@@ -366,7 +371,7 @@ def refine(
             first = loop.guide.score(loop.final_image(config.seed))
         optimize(run, loop, checkpoints, resumed)
         write_lora(run, guided)
-    notices = (*guided.prior.notices, *guided.notices, *loop_notices(loop))
+    notices = (*guided.prior.notices, *guided.notices, *loop_notices(loop, frame.renderer))
     if isinstance(loop, ToneRefinement):
         curves = (knots_of(c) for c in (loop.unknowns.curve_fg, loop.unknowns.curve_shadow))
         light = replace(light, curves=Curves(light.curves.tone, *curves))
@@ -382,7 +387,7 @@ def refine(
         **who_spoke(run, guided),
         "loop_integrator": "mis",
         "refine": record,
-        "optimization": summary_of(loop, first) | {"clipped_steps": guide.counts.clipped_steps},
+        "optimization": summary_of(loop, first) | counts_of(guide, frame),
     }
     return light, asset, record, notices
 

@@ -12,10 +12,10 @@ The camera-yaw frame is the world turned about +Y so that the camera looks along
 
 from __future__ import annotations
 
+import copy
 import itertools
 import json
 import math
-import os
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass
 from importlib.resources import as_file, files
@@ -26,12 +26,15 @@ import numpy as np
 import torch
 import torch.nn.functional as F
 from numpy.typing import NDArray
-from safetensors import SafetensorError, safe_open
-from safetensors.torch import save
+from safetensors.torch import load_file, save
 from torch import Tensor, nn
 
+from warpir.atomic import write_file
 from warpir.camera import Camera
 from warpir.color import GAMMA, LUMINANCE_WEIGHTS
+from warpir.diffusion.model_error import ModelError
+from warpir.diffusion.weight_files import REGRESSOR_FORMAT as FORMAT
+from warpir.diffusion.weight_files import check_regressor, values_hash
 from warpir.errors import ExitCode, InputError
 from warpir.light import (
     Float64Array,
@@ -52,7 +55,6 @@ GATHERINGS = 4
 """Weighted means of the tokens that each head reads, of a quarter of the features each."""
 LOWEST = -0.25
 """Height y of the lowest direction that a dominant light may have."""
-FORMAT = "warpir-regressor-1"
 
 
 @dataclass(frozen=True)
@@ -128,8 +130,9 @@ def ambient_axes() -> Float64Array:
 
 def mean_luminance(photo: Tensor) -> Tensor:
     """Return the mean decoded luminance of display-encoded photos [B, 3, H, W], shape [B]."""
+    photo = photo.to(torch.promote_types(photo.dtype, torch.float32))
     weights = photo.new_tensor(LUMINANCE_WEIGHTS)
-    mean = photo.float().clamp(min=0.0).pow(GAMMA).mean(dim=(2, 3))
+    mean = photo.clamp(min=0.0).pow(GAMMA).mean(dim=(2, 3))
     return (mean @ weights).clamp(min=DARKEST)
 
 
@@ -265,7 +268,8 @@ class Regressor(nn.Module):
             tokens = block(tokens)
         # Softmax and exponentials of the answers need more digits than autocast leaves.
         with torch.autocast(tokens.device.type, enabled=False):
-            asked, seen = tokens[:, :2].float(), tokens[:, 2:].float()
+            tokens = tokens.to(self.gather.weight.dtype)
+            asked, seen = tokens[:, :2], tokens[:, 2:]
             weights = self.gather(seen).softmax(dim=1).unflatten(2, (2, GATHERINGS))
             groups = seen.unflatten(2, (GATHERINGS, -1))
             gathered = torch.einsum("btag,btgc->bagc", weights, groups).flatten(2)
@@ -564,8 +568,9 @@ def regress(
     """
     device = network.directions.device
     photo = _network_photo(photo_srgb).to(device)
-    rays = torch.from_numpy(camera_rays(camera)).to(device).permute(2, 0, 1)[None]
-    prediction = network.predict(photo, rays)
+    rays = torch.from_numpy(camera_rays(camera)).to(device).permute(2, 0, 1)[None].double()
+    # In float64, so that kinds of processors, which round sums differently, agree on the light.
+    prediction = copy.deepcopy(network).double().predict(photo, rays)
     return _regression(network, prediction, float(mean_luminance(photo)), camera)
 
 
@@ -584,8 +589,8 @@ def mean_training_light(
 
 
 def _network_photo(photo_srgb: NDArray[np.floating[Any]]) -> Tensor:
-    """Bring a photo to the network's size by area, shape [1, 3, 96, 144]."""
-    photo = torch.from_numpy(np.ascontiguousarray(photo_srgb, np.float32)).permute(2, 0, 1)[None]
+    """Bring a photo to the network's size by area, float64, shape [1, 3, 96, 144]."""
+    photo = torch.from_numpy(np.ascontiguousarray(photo_srgb, np.float64)).permute(2, 0, 1)[None]
     return F.interpolate(
         photo, (HEIGHT, WIDTH), mode="bilinear", align_corners=False, antialias=True
     ).clamp(0.0, 1.0)
@@ -659,18 +664,14 @@ def save_regressor(network: Regressor, path: Path, record: Mapping[str, Any]) ->
         name: (part if name in exact else part.half()).cpu().contiguous()
         for name, part in network.state_dict().items()
     }
+    config = json.dumps(asdict(network.config))
     about = {
         "format": FORMAT,
-        "config": json.dumps(asdict(network.config)),
+        "config": config,
+        "weights": values_hash({name: part.numpy() for name, part in state.items()}, config),
         "record": json.dumps(dict(record), allow_nan=False),
     }
-    path.parent.mkdir(parents=True, exist_ok=True)
-    staged = path.with_name(f".{path.name}.{os.getpid()}.part")
-    try:
-        staged.write_bytes(save(state, metadata=about))
-        os.replace(staged, path)
-    finally:
-        staged.unlink(missing_ok=True)
+    write_file(path, save(state, metadata=about))
 
 
 def load_regressor(path: Path | None, device: str | torch.device = "cpu") -> Regressor:
@@ -687,27 +688,20 @@ def load_regressor(path: Path | None, device: str | torch.device = "cpu") -> Reg
         packaged = files("warpir.diffusion") / "weights" / "regressor.safetensors"
         with as_file(packaged) as found:
             return load_regressor(found, device)
-    if not path.is_file():
-        raise InputError(path, "no such file", "give another --regressor", ExitCode.MODEL)
     try:
-        with safe_open(path, "pt") as content:
-            about = content.metadata() or {}
-            if about.get("format") != FORMAT:
-                found_format = str(about.get("format"))[:40]
-                what = f"no weights of the light regressor (found {found_format!r})"
-                raise InputError(path, what, f"expected {FORMAT!r}", ExitCode.MODEL)
-            config = json.loads(about["config"])
-            record = json.loads(about["record"])
-            state = {name: content.get_tensor(name).float() for name in content.keys()}
+        file = check_regressor(path)
+        config = json.loads(file.about["config"])
         plain: dict[str, Any] = {
             k: tuple(v) if isinstance(v, list) else v for k, v in config.items()
         }
-        network = Regressor(RegressorConfig(**plain))
-        network.load_state_dict(state)
-    except (SafetensorError, OSError, KeyError, TypeError, ValueError, RuntimeError) as error:
-        why = str(error).splitlines()[0][:120]
-        raise InputError(path, f"damaged ({why})", "", ExitCode.MODEL) from error
-    network.record = record
-    if not all(bool(torch.isfinite(part).all()) for part in state.values()):
-        raise InputError(path, "damaged (weights that are not finite)", "", ExitCode.MODEL)
+        size = RegressorConfig(**plain)
+        # Not on "meta" first: its sizes are checked, and random numbers there import the compiler.
+        network = Regressor(size)
+        expected = {name: part.shape for name, part in network.state_dict().items()}
+        if expected != file.shapes:
+            raise ModelError(str(path), "damaged (the weights are not those of its network)")
+        network.load_state_dict({name: part.float() for name, part in load_file(path).items()})
+    except ModelError as error:
+        raise InputError(error.where, error.what, error.advice, ExitCode.MODEL) from None
+    network.record = json.loads(file.about["record"])
     return network.to(device).eval().requires_grad_(False)

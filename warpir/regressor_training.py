@@ -25,11 +25,12 @@ import torch
 import torch.distributed as dist
 import torch.nn.functional as F
 from safetensors import SafetensorError
-from safetensors.torch import load_file, save_file
+from safetensors.torch import load_file, save
 from torch import Tensor
 
+from warpir.atomic import write_folder
 from warpir.color import GAMMA, LUMINANCE_WEIGHTS
-from warpir.errors import InputError
+from warpir.errors import ExitCode, InputError
 from warpir.light import fibonacci, map_directions, texel_solid_angles
 from warpir.regressor import (
     AMBIENT_SHARPNESS,
@@ -638,7 +639,8 @@ def train_regressor(
         record: Put into the weights file beside what is known here; plain values.
 
     Raises:
-        InputError: Nothing to resume from, or a state that is not whole.
+        InputError: Nothing to resume from, a state that is not whole, or ``out`` holds a training
+            that was begun.
     """
     began = time.monotonic()
     peers = _Peers(torch.device(device))
@@ -646,9 +648,10 @@ def train_regressor(
     if resume:
         run = _Run.resumed(out, settings, device)
     else:
+        if any(out.glob("state-*")):
+            advice = "resume it, or give another folder"
+            raise InputError(out, "holds a training that was begun", advice, ExitCode.OUTPUT)
         if peers.is_first:
-            for old in out.glob("state-*"):
-                shutil.rmtree(old)
             (out / CURVE).unlink(missing_ok=True)
         run = _Run(out, network or random_regressor(seed), settings, device)
     generator = torch.Generator(device)
@@ -861,15 +864,13 @@ class _Run:
         }
         earlier = list(self.out.glob("state-*"))
         folder = self.out / f"state-{self.step:09d}"
-        partial = self.out / f".partial-{os.getpid()}"
-        partial.mkdir(parents=True)
-        for name, tensors in held.items():
-            whole = {k: v.detach().cpu().contiguous() for k, v in tensors.items()}
-            save_file(whole, partial / f"{name}.safetensors")
-        (partial / STATE).write_text(json.dumps(about), encoding="utf-8")
-        if folder in earlier:  # no step since
-            shutil.rmtree(folder)
-        partial.rename(folder)
+        files = {
+            f"{name}.safetensors": save(
+                {k: v.detach().cpu().contiguous() for k, v in tensors.items()}
+            )
+            for name, tensors in held.items()
+        }
+        write_folder(folder, [*files.items(), (STATE, json.dumps(about).encode())])
         for old in earlier:
             if old != folder:
                 shutil.rmtree(old)

@@ -2,14 +2,15 @@
 
 On the CPU a Warp launch runs on one core, so every launch is cut into row slices that a thread pool
 works through; on CUDA it is one launch. A pixel's numbers depend on (seed, pixel, sample) alone, so
-slices and threads do not change a result.
+slices and threads do not change a result. Pixels that do not fit into memory at once are traced in
+two halves (`warpir.memory`), those whose radiance is not finite are black (`warpir.bad_pixels`).
 """
 
 from __future__ import annotations
 
 import logging
 import os
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from functools import cache
@@ -20,6 +21,8 @@ import numpy as np
 import warp as wp
 from numpy.typing import NDArray
 
+from warpir.bad_pixels import BadPixels
+from warpir.caches import KernelCache
 from warpir.camera import Camera
 from warpir.color import luminance
 from warpir.curves import ToneKnots
@@ -32,6 +35,7 @@ from warpir.kernels.shadow_ratio import shadow_ratio
 from warpir.kernels.trace import trace_gbuffer
 from warpir.kernels.types import CameraArgs, LightArgs, LightRecord, VertexRecord
 from warpir.light import Light, texel_solid_angles
+from warpir.memory import Memory
 from warpir.scene import Scene
 
 IntArray = NDArray[np.int32]
@@ -69,17 +73,30 @@ class Rows:
         return part
 
 
+_kernel_caches: list[KernelCache] = []
+"""Of this process, if it has one of its own."""
+
+
+def start_warp() -> None:
+    """Start Warp with a kernel cache that can be written and believed, unless it has started."""
+    # The banner, the lines of each loaded module and "no CUDA driver" are for `--debug`.
+    if not logging.getLogger().isEnabledFor(logging.DEBUG):
+        wp.config.log_level = wp.LOG_ERROR
+    if wp.config.kernel_cache_dir is None:  # set by Warp when it starts, or by who calls us
+        cache = KernelCache(wp.config.version)
+        wp.config.kernel_cache_dir = str(cache.folder)
+        _kernel_caches.append(cache)
+    with captured_stderr():
+        wp.init()
+
+
 def choose_device(name: str | None) -> str:
     """Return the Warp device to use: the one asked for, else CUDA where there is one, else CPU.
 
     Raises:
         InputError: The device does not exist.
     """
-    # The banner, the lines of each loaded module and "no CUDA driver" are for `--debug`.
-    if not logging.getLogger().isEnabledFor(logging.DEBUG):
-        wp.config.log_level = wp.LOG_ERROR
-    with captured_stderr():
-        wp.init()
+    start_warp()
     known = [d.alias for d in wp.get_devices()]
     if name is None:
         return "cuda:0" if wp.is_cuda_available() else "cpu"
@@ -106,7 +123,8 @@ def light_args(light: Light, device: wp.Device) -> LightArgs:
     sampler searches, so both agree exactly.
 
     Raises:
-        ValueError: The light has neither lobes nor a map, or negative or non-finite values.
+        ValueError: The light has neither lobes nor a map, or negative values.
+        InputError: It has values that are not finite (`ExitCode.NUMERIC`).
     """
     args = LightArgs()
     lobes, texels = light.lobes, light.texels
@@ -117,8 +135,9 @@ def light_args(light: Light, device: wp.Device) -> LightArgs:
         values = np.concatenate(
             [lobes.amplitude.reshape(-1), lobes.axis.reshape(-1), lobes.sharpness]
         )
-        if not np.isfinite(values).all() or lobes.amplitude.min() < 0.0:
-            raise ValueError("lobes must be finite with amplitudes >= 0")
+        _require_finite(values, "lobes")
+        if lobes.amplitude.min() < 0.0:
+            raise ValueError("lobes must have amplitudes >= 0")
         flux = luminance(lobes.flux())
         s = lobes.sharpness.astype(np.float64)
         args.lobe_count = len(s)
@@ -136,8 +155,9 @@ def light_args(light: Light, device: wp.Device) -> LightArgs:
 
     map_flux = 0.0
     if texels is not None:
-        if not np.isfinite(texels).all() or texels.min() < 0.0:
-            raise ValueError("a light's map must be finite and >= 0")
+        _require_finite(texels, "map")
+        if texels.min() < 0.0:
+            raise ValueError("a light's map must be >= 0")
         height, width = texels.shape[:2]
         weight = luminance(texels.astype(np.float64)) * texel_solid_angles(height, width)[:, None]
         map_flux = float(weight.sum())
@@ -179,6 +199,13 @@ def light_args(light: Light, device: wp.Device) -> LightArgs:
     prob32 = lobe_prob.astype(np.float32) if len(lobe_prob) else np.zeros(1, np.float32)
     args.lobe_prob = wp.array(prob32, dtype=float, device=device)
     return args
+
+
+def _require_finite(values: NDArray[np.floating[Any]], what: str) -> None:
+    bad = int(values.size - np.isfinite(values).sum())
+    if bad:
+        found = f"{bad} of the {values.size} values of its {what} are not finite"
+        raise InputError("light", found, code=ExitCode.NUMERIC)
 
 
 @dataclass(frozen=True)
@@ -225,6 +252,31 @@ class ProxyRadiance:
     """Without it, shape [proxy_pixel, 3]."""
 
 
+def cuda_count() -> int:
+    """Return how many CUDA devices this process may use."""
+    start_warp()
+    return len(wp.get_cuda_devices())
+
+
+def load_kernels(device: str, variants: Iterable[tuple[bool, bool]]) -> None:
+    """Compile what renders a picture, or find it compiled, and keep it for processes yet to start.
+
+    A run does so when it needs it, and keeps it at its end.
+
+    Args:
+        device: Warp's name of it.
+        variants: Of `foreground_kernel`.
+    """
+    on = wp.get_device(device)
+    settle_hashes(on.is_cpu)
+    kernels = [trace_gbuffer, trace_proxy, shadow_ratio, tone_foreground]
+    for kernel in (*kernels, *(foreground_kernel(*flags) for flags in variants)):
+        # As a launch does: on the CPU there are no blocks.
+        kernel.module.load(on, 1 if on.is_cpu else kernel.module.options["block_dim"])
+    for kept in _kernel_caches:
+        kept.keep()
+
+
 @cache
 def settle_hashes(is_cpu: bool) -> None:
     """Compute the hashes that Warp finds compiled modules by, before any is compiled.
@@ -246,6 +298,12 @@ class Renderer:
         scene: What to render.
         threads: CPU threads; 0 means one per core. Ignored on CUDA.
         progress: Called with the share of a stage that is done, 0 to 1, from worker threads.
+        memory: Is told where memory was short.
+        lower: What makes pictures smaller, for errors.
+        is_ordered: Whether sums are to have one order on CUDA too, where that costs time.
+
+    Attributes:
+        bad_pixels: What came out that is not finite.
     """
 
     def __init__(
@@ -253,9 +311,15 @@ class Renderer:
         scene: Scene,
         threads: int = 0,
         progress: Callable[[str, float], None] | None = None,
+        memory: Memory | None = None,
+        lower: str = "--width",
+        is_ordered: bool = False,
     ) -> None:
         self.scene = scene
         self.device = scene.device
+        self.memory, self.lower = memory or Memory(str(self.device.alias)), lower
+        self.is_ordered = is_ordered or bool(self.device.is_cpu)
+        self.bad_pixels = BadPixels()
         settle_hashes(bool(self.device.is_cpu))
         self.threads = threads or default_threads()
         self._progress = progress or (lambda stage, share: None)
@@ -346,33 +410,40 @@ class Renderer:
             # Clear glass stops 1 ray in 25.
             spp *= GLASS_SAMPLES
         candidates = self.candidate_pixels(camera)
-        count = len(candidates)
         names = ("coverage", "position", "normal", "base_color", "roughness", "emission")
         vectors = {"position", "normal", "base_color", "emission"}
-        out = {
-            name: wp.zeros(
-                max(count, 1), dtype=wp.vec3 if name in vectors else float, device=self.device
-            )
-            for name in names
-        }
-        self.launch(
-            trace_gbuffer,
-            count,
-            [
-                Rows(self._array(candidates, wp.int32)),
-                scene.camera_args,
-                scene.mesh_args,
-                scene.material_args,
-                scene.texture_args,
-                scene.proxy_args,
+
+        def trace(start: int, stop: int) -> tuple[FloatArray, ...]:
+            out = [
+                wp.zeros(
+                    max(stop - start, 1),
+                    dtype=wp.vec3 if name in vectors else float,
+                    device=self.device,
+                )
+                for name in names
+            ]
+            self.launch(
+                trace_gbuffer,
+                stop - start,
+                [
+                    Rows(self._array(candidates[start:stop], wp.int32)),
+                    scene.camera_args,
+                    scene.mesh_args,
+                    scene.material_args,
+                    scene.texture_args,
+                    scene.proxy_args,
+                    spp,
+                    seed,
+                    *map(Rows, out),
+                ],
                 spp,
-                seed,
-                *(Rows(out[name]) for name in names),
-            ],
-            spp,
-            "geometry",
-        )
-        host = {name: array.numpy()[:count] for name, array in out.items()}
+                "geometry",
+            )
+            return tuple(array.numpy()[: stop - start] for array in out)
+
+        coverage, *planes = self._in_chunks(trace, len(candidates), "geometry")
+        traced = self.bad_pixels.blackened(tuple(planes), candidates, camera.width, "geometry")
+        host: dict[str, Any] = dict(zip(names, (coverage, *traced), strict=True))
         hit = np.zeros((camera.height, camera.width), bool)
         hit.reshape(-1)[candidates] = host["coverage"] > 0.0
         near = _dilate(hit)
@@ -381,6 +452,26 @@ class Renderer:
         # In float64: float32 is 8 mm coarse 100 km from the origin, and depth follows from this.
         host["position"] = host["position"].astype(np.float64) + self.scene.origin
         return GBuffer(object_pixels=candidates[keep], **host)
+
+    def _in_chunks(
+        self, trace: Callable[[int, int], tuple[FloatArray, ...]], count: int, stage: str
+    ) -> tuple[FloatArray, ...]:
+        """Return what ``trace`` makes of all pixels, in halves where memory is short."""
+        parts = [*self.memory.in_chunks(trace, count, f"rendering the {stage}", self.lower)]
+        return tuple(p[0] if len(p) == 1 else np.concatenate(p) for p in zip(*parts, strict=True))
+
+    def _first_bad_sample(self, is_bad: Callable[[int], bool], spp: int) -> int | None:
+        """Return the first of ``spp`` samples with which a sum is bad; None: it is not bad now.
+
+        Samples are a function of their number: rendering fewer leaves out the last ones.
+        """
+        if not is_bad(spp):
+            return None
+        good, bad = 0, spp
+        while bad - good > 1:
+            middle = (good + bad) // 2
+            good, bad = (good, middle) if is_bad(middle) else (middle, bad)
+        return good
 
     def lanes(self, count: int, spp: int) -> int:
         """Return how many threads share the camera samples of each of ``count`` pixels."""
@@ -420,40 +511,66 @@ class Renderer:
             mesh_shines: Whether the place's mesh sends what the photo shows, or only blocks light.
         """
         scene, lanes = self.scene, self.lanes(len(pixels), spp)
-        count = len(pixels) * lanes
-        radiance, diffuse, emission = (
-            wp.zeros(max(count, 1), dtype=wp.vec3, device=self.device) for _ in range(3)
-        )
-        mask = wp.zeros(max(count, 1), dtype=float, device=self.device)
         kernel = foreground_kernel(
             bool(scene.material_args.any_layers), bool(scene.proxy_args.mesh)
         )
-        self.launch(
-            kernel,
-            count,
-            [
-                Rows(self._array(np.repeat(pixels, lanes), wp.int32)),
-                scene.camera_args,
-                scene.mesh_args,
-                scene.material_args,
-                scene.texture_args,
-                scene.proxy_args if mesh_shines else scene.dark_proxy_args,
-                light,
-                spp // lanes,
-                rays,
-                lanes,
-                depth,
-                indirect_limit,
-                seed,
-                *(Rows(a) for a in (radiance, diffuse, emission, mask)),
-                LightRecord() if light_record is None else Rows(light_record),
-                VertexRecord() if vertex_record is None else Rows(vertex_record),
-            ],
-            spp // lanes * rays,
-            "object",
-        )
-        parts = (a.numpy()[:count] for a in (radiance, diffuse, emission, mask))
-        return Foreground(*(p.reshape(-1, lanes, *p.shape[1:]).sum(axis=1) for p in parts))
+
+        def sums(
+            chunk: IntArray,
+            spp: int,
+            lanes: int,
+            light_record: LightRecord | None = None,
+            vertex_record: VertexRecord | None = None,
+        ) -> tuple[FloatArray, ...]:
+            count = len(chunk) * lanes
+            out = [wp.zeros(max(count, 1), dtype=wp.vec3, device=self.device) for _ in range(3)]
+            mask = wp.zeros(max(count, 1), dtype=float, device=self.device)
+            self.launch(
+                kernel,
+                count,
+                [
+                    Rows(self._array(np.repeat(chunk, lanes), wp.int32)),
+                    scene.camera_args,
+                    scene.mesh_args,
+                    scene.material_args,
+                    scene.texture_args,
+                    scene.proxy_args if mesh_shines else scene.dark_proxy_args,
+                    light,
+                    spp // lanes,
+                    rays,
+                    lanes,
+                    depth,
+                    indirect_limit,
+                    seed,
+                    *map(Rows, (*out, mask)),
+                    LightRecord() if light_record is None else Rows(light_record),
+                    VertexRecord() if vertex_record is None else Rows(vertex_record),
+                ],
+                spp // lanes * rays,
+                "object",
+            )
+            parts = (a.numpy()[:count] for a in (*out, mask))
+            return tuple(p.reshape(-1, lanes, *p.shape[1:]).sum(axis=1) for p in parts)
+
+        def trace(start: int, stop: int) -> tuple[FloatArray, ...]:
+            # As many lanes as all pixels have together: sums keep their order.
+            records = (
+                r if r is None else Rows(r).cut(start * lanes, stop * lanes)
+                for r in (light_record, vertex_record)
+            )
+            return sums(pixels[start:stop], spp, lanes, *records)
+
+        def first_bad_sample(pixel: int) -> int | None:
+            alone = np.array([pixel], np.int32)
+            return self._first_bad_sample(
+                lambda spp: not all(np.isfinite(p).all() for p in sums(alone, spp, 1)), spp
+            )
+
+        *planes, mask = self._in_chunks(trace, len(pixels), "object")
+        width = scene.camera.width
+        traced = self.bad_pixels.blackened(tuple(planes), pixels, width, "object", first_bad_sample)
+        radiance, diffuse, emission = traced
+        return Foreground(radiance, diffuse, emission, mask)
 
     def proxy(
         self,
@@ -480,33 +597,54 @@ class Renderer:
             record: Filled on the way where given; rows are ``pixels``.
             mesh_shines: Whether the place's mesh sends what the photo shows, or only blocks light.
         """
-        scene, count = self.scene, len(pixels)
-        lit, unoccluded = (
-            wp.zeros(max(count, 1), dtype=wp.vec3, device=self.device) for _ in range(2)
-        )
-        self.launch(
-            trace_proxy,
-            count,
-            [
-                Rows(self._array(pixels, wp.int32)),
-                Rows(self._array(may_see_object, wp.int32)),
-                camera_args if camera_args is not None else scene.camera_args,
-                scene.mesh_args,
-                scene.material_args,
-                scene.texture_args,
-                scene.proxy_args if mesh_shines else scene.dark_proxy_args,
-                light,
-                spp,
-                rays,
-                seed,
-                Rows(lit),
-                Rows(unoccluded),
-                LightRecord() if record is None else Rows(record),
-            ],
-            spp * rays,
-            "shadow",
-        )
-        return ProxyRadiance(lit.numpy()[:count], unoccluded.numpy()[:count])
+        scene = self.scene
+
+        def sums(
+            chunk: IntArray, may_see: IntArray, spp: int, record: LightRecord | None = None
+        ) -> tuple[FloatArray, ...]:
+            count = len(chunk)
+            out = [wp.zeros(max(count, 1), dtype=wp.vec3, device=self.device) for _ in range(2)]
+            self.launch(
+                trace_proxy,
+                count,
+                [
+                    Rows(self._array(chunk, wp.int32)),
+                    Rows(self._array(may_see, wp.int32)),
+                    camera_args if camera_args is not None else scene.camera_args,
+                    scene.mesh_args,
+                    scene.material_args,
+                    scene.texture_args,
+                    scene.proxy_args if mesh_shines else scene.dark_proxy_args,
+                    light,
+                    spp,
+                    rays,
+                    seed,
+                    *map(Rows, out),
+                    LightRecord() if record is None else Rows(record),
+                ],
+                spp * rays,
+                "shadow",
+            )
+            return tuple(a.numpy()[:count] for a in out)
+
+        def trace(start: int, stop: int) -> tuple[FloatArray, ...]:
+            cut = None if record is None else Rows(record).cut(start, stop)
+            return sums(pixels[start:stop], may_see_object[start:stop], spp, cut)
+
+        def first_bad_sample(pixel: int) -> int | None:
+            alone = np.array([pixel], np.int32)
+            hidden = may_see_object[pixels == pixel]
+            return self._first_bad_sample(
+                lambda spp: not all(np.isfinite(p).all() for p in sums(alone, hidden, spp)), spp
+            )
+
+        stage, width = "shadow", scene.camera.width
+        if camera_args is not None:
+            stage, width = "shadow in another resolution", int(camera_args.width)
+        traced = self._in_chunks(trace, len(pixels), stage)
+        # Black with and without the object: there the photo stays as it is.
+        traced = self.bad_pixels.blackened(traced, pixels, width, stage, first_bad_sample)
+        return ProxyRadiance(*traced)
 
     def shaded_pixels(self, light: LightArgs, seed: int) -> IntArray:
         """Return the pixels where the object may change the plane's light, row-major.

@@ -7,6 +7,7 @@ photo; for a photo of another exposure ``--exposure`` scales it.
 """
 
 import hashlib
+import os
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -14,12 +15,15 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from warpir.camera_source import rigid
 from warpir.curves import Curves, read_curves
-from warpir.errors import InputError
+from warpir.errors import InputError, shown
+from warpir.image_decoder import check_regular_file
 from warpir.light import Light
+from warpir.limits import LIMITS, Limits
 from warpir.materials_file import MATERIALS
 from warpir.photo_files import read_envmap
-from warpir.record import RUN_FORMAT
+from warpir.record import RUN_FORMAT, file_hash
 from warpir.strict_json import read_json_object
 
 LIGHT, SHADOW_LIGHT, CURVES, CAMERA = (
@@ -46,6 +50,8 @@ class EarlierRun:
     """Pose of the run's camera, whose world is the light's, shape [4, 4]."""
     materials: Path | None = None
     """What --materials would give the run's object its materials by, if they were changed."""
+    digest: str = ""
+    """sha256 of its ``run.json``, which holds those of its other files."""
 
     def assumption(self, c2w: NDArray[np.float64], camera_path: str | None) -> str:
         """Return what is assumed of another camera's world, or an empty text for the same pose."""
@@ -62,18 +68,19 @@ class EarlierRun:
         )
 
 
-def read_run(path: str | Path) -> EarlierRun:
+def read_run(path: str | Path, limits: Limits = LIMITS) -> EarlierRun:
     """Read the light and the tone curves of a finished run.
 
     Args:
         path: The run's folder. What its ``run.json`` does not list is not looked at.
+        limits: How large its files may be.
 
     Raises:
         InputError: The folder holds no finished run, or a file of it is missing, changed or wrong.
     """
     path = Path(path)
     names = [LIGHT, CURVES, CAMERA]
-    record = run_record(path)
+    record = run_record(path, limits)
     files, given = record["files"], record["config"].get("materials")
     materials = path / MATERIALS if MATERIALS in files else None
     if materials is None and isinstance(given, str):
@@ -81,26 +88,31 @@ def read_run(path: str | Path) -> EarlierRun:
     if SHADOW_LIGHT in files:
         names.append(SHADOW_LIGHT)
     check_files(path, {name: files.get(name) for name in names})
-    light_fg = light_shadow = Light(texels=read_envmap(path / LIGHT, strict=True))
+    light_fg = light_shadow = Light(
+        texels=read_envmap(path / LIGHT, strict=True, max_width=limits.envmap_width)
+    )
     if SHADOW_LIGHT in files:
-        light_shadow = Light(texels=read_envmap(path / SHADOW_LIGHT, strict=True))
-    curves = read_curves(path / CURVES)
-    pose = _read_pose(path / CAMERA)
-    return EarlierRun(path, light_fg, light_shadow, curves, pose, materials)
+        light_shadow = Light(
+            texels=read_envmap(path / SHADOW_LIGHT, strict=True, max_width=limits.envmap_width)
+        )
+    digest = file_hash(path / "run.json")
+    curves = read_curves(path / CURVES, limits)
+    pose = _read_pose(path / CAMERA, limits)
+    return EarlierRun(path, light_fg, light_shadow, curves, pose, materials, digest)
 
 
-def run_record(path: Path) -> dict[str, Any]:
+def run_record(path: Path, limits: Limits = LIMITS) -> dict[str, Any]:
     """Return the ``run.json`` of a finished run; its ``config`` and ``files`` are objects.
 
     Raises:
         InputError: There is none, or it is of a format that this version does not know.
     """
-    if not (path / "run.json").is_file():
-        found = "no run.json" if path.is_dir() else "no such folder"
+    if not os.path.isfile(path / "run.json"):
+        found = "no run.json" if os.path.isdir(path) else "no such folder"
         raise InputError(
             path, f"not a finished run (found {found})", "name a folder that a run wrote to its end"
         )
-    record = read_json_object(path / "run.json")
+    record = read_json_object(path / "run.json", limits)
     number = record.get("format")
     if isinstance(number, bool) or not isinstance(number, int) or not 1 <= number <= RUN_FORMAT:
         raise InputError(
@@ -125,12 +137,16 @@ def check_files(path: Path, digests: dict[str, Any]) -> None:
         InputError: A file is missing or has changed.
     """
     for name, digest in digests.items():
+        if ".." in Path(name).parts or Path(name).is_absolute():
+            raise InputError(
+                path / "run.json", f"/files: {shown(name)} is outside the run's folder"
+            )
+        check_regular_file(path / name)
         try:
             with (path / name).open("rb") as stream:
                 found = hashlib.file_digest(stream, "sha256").hexdigest()
-        except (OSError, ValueError) as error:
-            reason = error.strerror if isinstance(error, OSError) else "not a file name"
-            raise InputError(path / name, f"cannot be read ({reason})") from error
+        except OSError as error:
+            raise InputError(path / name, f"cannot be read ({error.strerror})") from error
         if found != digest:
             raise InputError(
                 path / name,
@@ -139,12 +155,5 @@ def check_files(path: Path, digests: dict[str, Any]) -> None:
             )
 
 
-def _read_pose(path: Path) -> NDArray[np.float64]:
-    pose = read_json_object(path).get("c2w")
-    try:
-        c2w = np.asarray(pose, np.float64)
-    except (TypeError, ValueError, OverflowError):
-        c2w = np.zeros(0)
-    if c2w.shape != (4, 4):
-        raise InputError(path, "/c2w: a 4 x 4 matrix expected")
-    return c2w
+def _read_pose(path: Path, limits: Limits) -> NDArray[np.float64]:
+    return rigid(path, "c2w", read_json_object(path, limits).get("c2w"))

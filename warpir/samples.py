@@ -44,6 +44,8 @@ LOBE_BLOCK = 4096
 """Directions that one thread of `lobe_gradient` adds up; on the CPU they stay in its cache."""
 PART_PATHS = 4096
 """Least paths of a part: a path costs about 1 us, the launches of a part about 1 ms."""
+RECORDING, LOWER = "the samples of mis", "--mis-samples or --guidance-width"
+"""What is short of memory, and what lowers it."""
 PART_COUNT = 16
 """Private sums of texels and materials; fixed, so that their order does not depend on threads."""
 
@@ -116,11 +118,17 @@ class ObjectSamples:
 
     def render(self) -> FloatArray:
         """Trace the object's radiance [object_pixel, 3]; keep the records if they fit."""
-        if len(self.parts) == 1:
-            radiance, light, vertex = self.draw(self.parts[0])
-            self.kept = light, vertex
+
+        def drawn() -> FloatArray:
+            if len(self.parts) > 1:
+                return self.draw(slice(None), is_recording=False)[0]
+            whole, self.parts = self.parts[0], _halves(len(self.mis.object_pixels))
+            radiance, light, vertex = self.draw(whole)
+            # It did fit; where it does not, the next attempt keeps no record of the whole.
+            self.parts, self.kept = [whole], (light, vertex)
             return radiance
-        return self.draw(slice(None), is_recording=False)[0]
+
+        return self.mis.renderer.memory.again(drawn, RECORDING, LOWER)
 
     def draw(
         self, rows: slice, is_recording: bool = True
@@ -258,10 +266,16 @@ class PlaneSamples:
 
     def render(self) -> ProxyRadiance:
         """Trace the plane with and without the object; keep the record if it fits."""
-        if len(self.parts) == 1:
-            radiance, self.kept = self.draw(self.parts[0])
+
+        def drawn() -> ProxyRadiance:
+            if len(self.parts) > 1:
+                return self.draw(slice(None), is_recording=False)[0]
+            whole, self.parts = self.parts[0], _halves(len(self.mis.proxy_pixels))
+            radiance, self.kept = self.draw(whole)
+            self.parts = [whole]
             return radiance
-        return self.draw(slice(None), is_recording=False)[0]
+
+        return self.mis.renderer.memory.again(drawn, RECORDING, LOWER)
 
     def draw(
         self, rows: slice, is_recording: bool = True
@@ -376,6 +390,12 @@ def _parts(count: int, bytes_per_row: int) -> list[slice]:
     """Cut rows so that each part's record fits; one part where all fit."""
     size = max(1, RECORD_BYTES // max(bytes_per_row, 1))
     return [slice(start, min(start + size, count)) for start in range(0, max(count, 1), size)]
+
+
+def _halves(count: int) -> list[slice]:
+    """Cut rows into two parts, whose records are smaller."""
+    middle = (count + 1) // 2
+    return [slice(0, middle), slice(middle, count)]
 
 
 def _new_light_record(pixels: int, capacity: int, device: wp.Device) -> LightRecord:

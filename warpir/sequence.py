@@ -4,28 +4,32 @@
     {"photo": "frames/0002.png", "camera": "frames/0002.json", "place": [0, 0, -4.2]}
 
 A line holds what differs from the command line; its relative paths start at the working directory
-too. Frame k is written to ``OUT/000k`` as a result folder of its own; ``OUT/sequence.json`` lists
-all of them at the end. Frames that are there already, made by the same configuration from the same
-files, are left as they are, so an interrupted sequence goes on where it stopped.
+too. Frame k is written to ``OUT/000k`` as a result folder of its own; at the end
+``OUT/sequence.json`` lists all of them, and where ffmpeg is found their composites also make the
+video ``OUT/composite.mp4``. Frames that are there already, made by the same configuration from the
+same files, are left as they are, so an interrupted sequence goes on where it stopped.
 """
 
 import hashlib
 import json
 import os
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import warpir
-from warpir.command import CONFIG_BYTES_LIMIT, closest, read_values
-from warpir.config import DEFAULTS, EXCLUSIVE, InsertConfig
-from warpir.errors import ExitCode, InputError, raise_all
+from warpir.atomic import write_file
+from warpir.command import by_name, read_values
+from warpir.config import DEFAULTS, InsertConfig, replaced_by, usage
+from warpir.errors import ExitCode, InputError, disk_error, raise_all, shown
+from warpir.finished import is_done
 from warpir.inputs import Loaders, read_inputs
 from warpir.lighting import make_light
-from warpir.record import input_hashes
-from warpir.reuse import check_files, run_record
-from warpir.strict_json import parse_json_object
+from warpir.record import file_hash
+from warpir.signals import whole
+from warpir.strict_json import parse_json_object, read_json_lines, read_json_object
+from warpir.video import VIDEO, NoVideo, write_video
 
 FORMAT = "warpir-sequence"
 VERSION = 1
@@ -74,108 +78,199 @@ def read_sequence(config: InsertConfig, loaders: Loaders) -> tuple[Frame, ...]:
         raise InputError(
             config.out, "holds the result of one run", "choose another --out", ExitCode.OUTPUT
         )
+    _refuse_other_summary(Path(config.out) / SUMMARY, config)
     if config.reuse is not None:  # once, not as a problem of every line
-        loaders.run(config.reuse)
+        loaders.run(config.reuse, config.limits)
     frames, problems = [], []
-    for number, (line, raw) in enumerate(_lines(config.sequence), start=1):
+    lines, _ = read_json_lines(config.sequence, "frames", FRAME_COUNT_LIMIT, config.limits)
+    for number, (line, raw) in enumerate(lines, start=1):
         try:
             frame = _read_line(config, number, line, raw)
             make_light(read_inputs(frame.config, loaders), frame.config)
-            frames.append(replace(frame, is_done=_is_done(frame.config)))
+            frames.append(replace(frame, is_done=is_done(frame.config)))
         except InputError as error:
             problems += [_at_line(config.sequence, line, e) for e in (error, *error.also)]
     raise_all(problems)
     return tuple(frames)
 
 
-def write_summary(config: InsertConfig, frames: Sequence[Frame]) -> dict[str, Any]:
-    """Write ``sequence.json``: every frame's folder, line, changes and the sha256 of its run.
+def _refuse_other_summary(path: Path, config: InsertConfig) -> None:
+    """Refuse to write where --sequence itself, or a file that is none of ours, would be lost."""
+    assert config.sequence is not None
+    if not os.path.lexists(path):
+        return
+    if os.path.exists(config.sequence) and os.path.samefile(path, config.sequence):
+        advice = "choose another --out, or another name for it"
+        raise usage("--out", f"the summary {path} would replace --sequence", advice)
+    try:
+        is_ours = read_json_object(path).get("format") == FORMAT
+    except InputError:
+        is_ours = False
+    if not is_ours and not config.overwrite:
+        raise InputError(
+            path,
+            "not the summary of a sequence, which would replace it",
+            "choose another --out, or pass --overwrite",
+            ExitCode.OUTPUT,
+        )
+
+
+def write_summary(
+    config: InsertConfig, frames: Sequence[Frame], say: Callable[[str], None]
+) -> dict[str, Any]:
+    """Write ``sequence.json`` and, beside it, the frames' video, unless that is there.
+
+    The summary holds every frame's folder, line, changes and the sha256 of its run. It tells of a
+    video before that gets its name, and an earlier one is gone by then: whenever the run is killed,
+    a video that is there is one that the summary knows.
+
+    Args:
+        config: Of the sequence.
+        frames: All of them, rendered.
+        say: Told why there is no video; one decides nothing.
 
     Returns:
-        Its content.
+        The summary's content.
+
+    Raises:
+        InputError: The disk is full or the folder is not writable (exit 5).
     """
     assert config.out is not None
-    content = {
-        "format": FORMAT,
-        "version": VERSION,
-        "warpir": warpir.__version__,
-        "sequence": config.sequence,
-        "reuse": config.reuse,
-        "frames": [
-            {
-                "folder": frame.folder.name,
-                "line": frame.line,
-                "changes": {name: getattr(frame.config, name) for name in frame.changed},
-                "run": hashlib.sha256((frame.folder / "run.json").read_bytes()).hexdigest(),
-            }
-            for frame in frames
-        ],
-    }
-    path = Path(config.out) / SUMMARY
-    partial = path.with_name(f".partial-{os.getpid()}.json")
+    path, video = Path(config.out) / SUMMARY, Path(config.out) / VIDEO
+    made = video.with_name(f".{VIDEO}.{os.getpid()}.made")
     try:
-        with partial.open("w", encoding="utf-8") as stream:
-            stream.write(json.dumps(content, indent=2, allow_nan=False) + "\n")
-            stream.flush()
-            os.fsync(stream.fileno())
-        partial.replace(path)
+        content = {
+            "format": FORMAT,
+            "version": VERSION,
+            "warpir": warpir.__version__,
+            "sequence": config.sequence,
+            "reuse": config.reuse,
+            "frames": _records(frames),
+            "video": _make_video(config, frames, made, say),
+        }
+        with whole():
+            if made.exists():
+                video.unlink(missing_ok=True)
+            write_file(path, (json.dumps(content, indent=2, allow_nan=False) + "\n").encode())
+            if made.exists():
+                os.replace(made, video)
+    except OSError as error:
+        raise disk_error(path, error) from error
     finally:
-        partial.unlink(missing_ok=True)
+        made.unlink(missing_ok=True)
     return content
 
 
-def _lines(path: str) -> Iterator[tuple[int, bytes]]:
-    """Yield the number and the bytes of each line that is not blank."""
+def is_whole(config: InsertConfig, frames: Sequence[Frame]) -> bool:
+    """Return whether all frames are done and the summary is of them and of the video beside it.
+
+    Args:
+        config: Of the sequence.
+        frames: All of them, from `read_sequence`.
+    """
+    if not all(frame.is_done for frame in frames):
+        return False
     try:
-        if not Path(path).is_file():
-            found = "not a regular file" if Path(path).exists() else "no such file"
-            raise InputError(path, found, code=ExitCode.USAGE)
-        size = Path(path).stat().st_size
-        if size > CONFIG_BYTES_LIMIT:
-            expected = f"at most {CONFIG_BYTES_LIMIT}"
-            what = f"too large (found {size} bytes; expected {expected})"
-            raise InputError(path, what, code=ExitCode.USAGE)
-        raw = Path(path).read_bytes()
-    except OSError as error:
-        reason = f"cannot be read ({error.strerror})"
-        raise InputError(path, reason, code=ExitCode.USAGE) from error
-    lines = [(number, line) for number, line in enumerate(raw.split(b"\n"), 1) if line.strip()]
-    if not 1 <= len(lines) <= FRAME_COUNT_LIMIT:
-        expected = f"expected 1 to {FRAME_COUNT_LIMIT}"
-        what = f"frames miscounted (found {len(lines)}; {expected})"
-        raise InputError(path, what, code=ExitCode.USAGE)
-    yield from lines
+        found = read_json_object(Path(str(config.out)) / SUMMARY)
+    except InputError:
+        return False
+    if found.get("frames") != json.loads(json.dumps(_records(frames))):
+        return False
+    before, digest = _made_before(config), _video_digest(config)
+    return not before or before == _video_record(config, frames, digest)
+
+
+def _make_video(
+    config: InsertConfig, frames: Sequence[Frame], made: Path, say: Callable[[str], None]
+) -> dict[str, Any]:
+    """Make the video where the one that is there is another one.
+
+    Args:
+        config: Of the sequence.
+        frames: All of them, rendered.
+        made: Where it is written.
+        say: Told why there is none.
+
+    Returns:
+        What the summary says of it, by its name; empty where there is none.
+    """
+    before, digest = _made_before(config), _video_digest(config)
+    video = Path(str(config.out)) / VIDEO
+    if digest is not None and before.get("sha256") == digest:
+        if before == _video_record(config, frames, digest):
+            return {VIDEO: before}
+    elif os.path.lexists(video) and (not config.overwrite or video.is_dir()):
+        say(f"notice: {video} is none of this sequence's and stays as it is (--overwrite)")
+        return {}
+    try:
+        composites = [frame.folder / "composite.png" for frame in frames]
+        write_video(made, composites, config.fps, config.max_pixels)
+    except NoVideo as error:
+        say(f"notice: {error}")
+        return {}
+    return {VIDEO: _video_record(config, frames, file_hash(made))}
+
+
+def _video_record(
+    config: InsertConfig, frames: Sequence[Frame], digest: str | None
+) -> dict[str, Any]:
+    runs = [_run_digest(frame) for frame in frames]
+    return {"fps": config.fps, "frames": runs, "sha256": digest}
+
+
+def _video_digest(config: InsertConfig) -> str | None:
+    path = Path(str(config.out)) / VIDEO
+    return file_hash(path) if path.is_file() else None
+
+
+def _made_before(config: InsertConfig) -> dict[str, Any]:
+    """Return what the summary says of an earlier video."""
+    try:
+        found = read_json_object(Path(str(config.out)) / SUMMARY).get("video")
+    except InputError:
+        return {}
+    video = found.get(VIDEO) if isinstance(found, dict) else None
+    return video if isinstance(video, dict) else {}
+
+
+def _records(frames: Sequence[Frame]) -> list[dict[str, Any]]:
+    """Return what the summary says of the frames."""
+    return [
+        {
+            "folder": frame.folder.name,
+            "line": frame.line,
+            "changes": {name: getattr(frame.config, name) for name in frame.changed},
+            "run": _run_digest(frame),
+        }
+        for frame in frames
+    ]
+
+
+def _run_digest(frame: Frame) -> str:
+    return hashlib.sha256((frame.folder / "run.json").read_bytes()).hexdigest()
 
 
 def _read_line(config: InsertConfig, number: int, line: int, raw: bytes) -> Frame:
     assert config.out is not None
     where = f"{config.sequence}:{line}"
     try:
-        content = parse_json_object(where, raw)
+        content = parse_json_object(where, raw, config.limits)
     except InputError as error:
         error.code = ExitCode.USAGE
         raise
-    given, problems = {}, []
-    for key, value in content.items():
-        name = key.replace("-", "_")
-        if name in FRAME_FIELDS:
-            given[name] = (value, name)
-        elif name in DEFAULTS:
-            what = f"key {key[:60]!a} is one for all frames"
-            problems.append(InputError(where, what, code=ExitCode.USAGE))
-        else:
-            advice = closest(name, FRAME_FIELDS)
-            what = f"unknown key {key[:60]!a}"
-            problems.append(InputError(where, what, advice, ExitCode.USAGE))
-    raise_all(problems)
-    changes = read_values(given)
-    # What a line names replaces what excludes it: "at" in place of --place.
-    for pair in EXCLUSIVE:
-        for name, other in (pair, pair[::-1]):
-            if changes.get(name) is not None and other in FRAME_FIELDS:
-                changes.setdefault(other, DEFAULTS[other])
+    given = by_name(where, content)
+    raise_all(
+        [
+            InputError(where, f"key {shown(name)} is one for all frames", code=ExitCode.USAGE)
+            for name in given
+            if name not in FRAME_FIELDS
+        ]
+    )
+    changes = read_values({name: (value, name) for name, value in given.items()})
+    changes |= replaced_by(changes, FRAME_FIELDS)
     out = str(Path(config.out) / f"{number:04d}")
-    frame = replace(config, **changes, sequence=None, out=out)
+    of_one: dict[str, Any] = {"sequence": None, "fps": DEFAULTS["fps"], "out": out}
+    frame = replace(config, **changes, **of_one)
     frame.require_inputs()
     return Frame(line, frame, tuple(given))
 
@@ -186,49 +281,4 @@ def _at_line(path: str, line: int, problem: InputError) -> InputError:
     what = problem.what.removeprefix("line 1: ")
     if problem.where != where:
         what = f"{problem.where}: {what}"
-    return InputError(where, what, problem.advice, problem.code)
-
-
-def _is_done(config: InsertConfig) -> bool:
-    """Return whether a frame's folder holds its result already.
-
-    Raises:
-        InputError: It holds something else, and --overwrite is not given.
-    """
-    assert config.out is not None
-    out = Path(config.out)
-    if config.overwrite or not out.is_dir():
-        return False
-    if not (out / "run.json").exists():
-        if any(not entry.name.startswith(".") for entry in out.iterdir()):
-            raise _other_result(out, "no finished run")
-        return False
-    try:
-        record = run_record(out)
-        check_files(out, record["files"])
-        same = _same(config, record)
-    except InputError as error:
-        raise _other_result(out, f"{error.where}: {error.what}") from error
-    if not same:
-        raise _other_result(out, "a run of other settings or other files")
-    return True
-
-
-def _same(config: InsertConfig, record: dict[str, Any]) -> bool:
-    """Return whether a run was asked for the same and read the same files."""
-    made = {name: value for name, value in record["config"].items() if name in DEFAULTS}
-    if len(made) < len(record["config"]):
-        return False
-    earlier = InsertConfig(**read_values({name: (value, name) for name, value in made.items()}))
-    return replace(earlier, overwrite=False) == config and record.get("inputs") == input_hashes(
-        config
-    )
-
-
-def _other_result(out: Path, found: str) -> InputError:
-    return InputError(
-        out,
-        f"holds something other than this frame (found {found})",
-        "pass --overwrite to replace results",
-        ExitCode.OUTPUT,
-    )
+    return type(problem)(where, what, problem.advice, problem.code)

@@ -22,6 +22,8 @@ WORDS = np.array(
 """The words of an ASCII facet; empty where numbers stand."""
 NUMBERS = [8, 9, 10, 12, 13, 14, 16, 17, 18]
 """Where the corners stand among them."""
+LONGEST = 64
+"""Most characters of a word; all are stored as long as the longest."""
 
 
 def read_stl(path: Path, content: bytes, notices: list[str]) -> NDArray[np.float64]:
@@ -64,7 +66,12 @@ def _read_ascii(path: Path, content: bytes) -> NDArray[np.float64]:
     inner = [
         line for line in lines if line[:5].lower() != b"solid" and line[:8].lower() != b"endsolid"
     ]
-    words = np.array(b" ".join(inner).split(), dtype="S32")
+    listed = b" ".join(inner).split()
+    longest = max(map(len, listed), default=1)
+    if longest > LONGEST:
+        what = f"damaged STL: a word of {longest} characters (limit {LONGEST})"
+        raise InputError(path, what, ADVICE)
+    words = np.array(listed, dtype=f"S{longest}")
     width = len(WORDS)
     whole = words[: len(words) // width * width].reshape(-1, width)
     wrong = (np.char.lower(whole) != WORDS)[:, WORDS != b""].any(axis=1)

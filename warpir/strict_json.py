@@ -1,15 +1,14 @@
 """JSON as the standard has it: Python's reader also takes NaN and duplicate keys, this one not."""
 
+import hashlib
 import json
 import math
 import re
 from pathlib import Path
 from typing import Any
 
-from warpir.errors import InputError
-
-JSON_BYTES_MAX = 16 * 1024 * 1024
-"""Default size limit of configuration and camera files [byte]."""
+from warpir.errors import ExitCode, InputError
+from warpir.limits import LIMITS, Limits
 
 
 class _Refused(Exception):
@@ -21,31 +20,44 @@ class _Refused(Exception):
         self.pattern = pattern
 
 
-def read_json_object(path: str | Path, byte_limit: int = JSON_BYTES_MAX) -> dict[str, Any]:
+def read_json_object(path: str | Path, limits: Limits = LIMITS) -> dict[str, Any]:
     """Read a file that holds one JSON object.
 
     Args:
         path: A regular file, UTF-8 with or without a byte order mark.
-        byte_limit: Largest file accepted [byte].
+        limits: How large and how nested it may be.
 
     Raises:
         InputError: Missing, too large, or not strict JSON; the text names the line.
     """
-    path = Path(path)
+    return parse_json_object(path, _read(Path(path), limits), limits)
+
+
+def _read(path: Path, limits: Limits) -> bytes:
+    """Return what a regular file holds.
+
+    Raises:
+        InputError: Missing or too large.
+    """
     try:
         if not path.is_file():
             raise InputError(path, "no such file" if not path.exists() else "not a regular file")
-        size = path.stat().st_size
-        if size > byte_limit:
-            raise InputError(path, f"too large (found {size} bytes; expected at most {byte_limit})")
-        raw = path.read_bytes()
+        limits.check("json_bytes", path.stat().st_size, path, "too large", more=" bytes")
+        return path.read_bytes()
     except OSError as error:
         raise InputError(path, f"cannot be read ({error.strerror})") from error
-    return parse_json_object(path, raw)
 
 
-def parse_json_object(where: str | Path, raw: bytes) -> dict[str, Any]:
-    """Parse the bytes of one JSON object; `where` is named in the error text."""
+def parse_json_object(where: str | Path, raw: bytes, limits: Limits = LIMITS) -> dict[str, Any]:
+    """Parse the bytes of one JSON object; `where` is named in the error text.
+
+    Raises:
+        InputError: It is not strict JSON, holds too much, is nested too deeply, or another value.
+    """
+    # Before it is parsed: a list of nothing takes 3 bytes in the file and 80 in memory. Those that
+    # stand in texts are counted, too.
+    values = sum(map(raw.count, (b"{", b"[", b",")))
+    limits.check("json_values", values, where, "too many values in JSON")
 
     def constant(word: str) -> float:
         raise _Refused(f"{word} is not JSON", rf"(?<![\w\"]){re.escape(word)}(?![\w\"])")
@@ -83,15 +95,62 @@ def parse_json_object(where: str | Path, raw: bytes) -> dict[str, Any]:
         found = re.search(refused.pattern, text)
         line = text.count("\n", 0, found.end()) + 1 if found else 1
         raise InputError(where, f"line {line}: {refused.what}") from refused
-    except (RecursionError, ValueError) as error:  # deep nesting; integers of 5000 digits
-        raise InputError(
-            where, "not JSON that can be read (nested or long beyond reason)"
-        ) from error
+    except RecursionError as error:  # beyond every limit that can be given
+        deepest = limits.nesting
+        what = f"JSON nested too deeply (limit {deepest}); --max-nesting raises it"
+        raise InputError(where, what) from error
+    except ValueError as error:  # integers of 5000 digits
+        raise InputError(where, "not JSON that can be read (a number of 5000 digits)") from error
     if not isinstance(root, dict):
         raise InputError(
             where, f"line 1: not a JSON object (found {type(root).__name__}; expected an object)"
         )
+    limits.check("nesting", _depth(root), where, "JSON nested too deeply", more=" levels")
     return root
+
+
+def read_json_lines(
+    path: str | Path, what: str, most: int, limits: Limits = LIMITS
+) -> tuple[list[tuple[int, bytes]], str]:
+    """Read a file of JSON objects, one a line; `parse_json_object` parses a line.
+
+    Args:
+        path: A regular file.
+        what: What a line is, in the plural, for a person.
+        most: How many there may be.
+        limits: How large the file may be.
+
+    Returns:
+        The number and the bytes of each line that is not blank, and the sha256 of the whole file.
+
+    Raises:
+        InputError: Missing, too large, or of another number of lines (`ExitCode.USAGE`).
+    """
+    try:
+        raw = _read(Path(path), limits)
+    except InputError as error:
+        error.code = ExitCode.USAGE
+        raise
+    lines = [(number, line) for number, line in enumerate(raw.split(b"\n"), 1) if line.strip()]
+    if not 1 <= len(lines) <= most:
+        found = f"{what} miscounted (found {len(lines)}; expected 1 to {most})"
+        raise InputError(path, found, code=ExitCode.USAGE)
+    return lines, hashlib.sha256(raw).hexdigest()
+
+
+def _depth(root: dict[str, Any]) -> int:
+    """Return how many objects and lists are within each other at most."""
+    depth = 0
+    level: list[dict[str, Any] | list[Any]] = [root]
+    while level:
+        depth += 1
+        level = [
+            value
+            for held in level
+            for value in (held.values() if isinstance(held, dict) else held)
+            if isinstance(value, dict | list)
+        ]
+    return depth
 
 
 def read_numbers(path: str | Path, pointer: str, value: Any, count: int) -> list[float]:

@@ -15,6 +15,7 @@ from __future__ import annotations
 
 import argparse
 import json
+import math
 import os
 import sys
 from collections.abc import Callable, Sequence
@@ -78,6 +79,7 @@ def _run(arguments: list[str]) -> int:
     options = _parser().parse_args(arguments)
     if options.resume and options.start is not None:
         raise usage("--start", "what is resumed has its own weights")
+    _check(options)
     panoramas = files_in(options.panoramas, (".hdr", ".exr"))
     assets = files_in(options.assets, (".glb", ".gltf", ".obj", ".stl", ".ply"))
     unknown = sorted({*options.without, *options.validation} - {p.stem for p in panoramas + assets})
@@ -123,6 +125,33 @@ def _run(arguments: list[str]) -> int:
     if is_first():
         say(json.dumps(result))
     return ExitCode.DONE
+
+
+def _check(options: argparse.Namespace) -> None:
+    """Find what is wrong with numbers and folders before scenes are made, which takes minutes.
+
+    Raises:
+        InputError: A number makes no sense (exit 2), there is nothing to resume (3), or --out holds
+            a training that would be lost (7).
+    """
+    for name in ("minutes", "total_minutes"):
+        value = getattr(options, name)
+        if value is not None and not 0.0 < value < math.inf:
+            raise usage(f"--{name.replace('_', '-')}", f"expected above 0 (found {value})")
+    if options.batch is not None and options.batch < 1:
+        raise usage("--batch", f"expected at least 1 (found {options.batch})")
+    for name in ("start", "regressor"):
+        path = getattr(options, name)
+        if path is not None and not path.is_file():
+            raise InputError(path, "no such file", code=ExitCode.MODEL)
+    if options.out.exists() and not options.out.is_dir():
+        raise InputError(options.out, "not a folder", "choose another --out", ExitCode.OUTPUT)
+    begun = any(options.out.glob("checkpoint-*")) or any(options.out.glob("state-*"))
+    if begun and not options.resume:
+        advice = "--resume goes on with it; or choose another --out"
+        raise InputError(options.out, "holds a training that was begun", advice, ExitCode.OUTPUT)
+    if options.resume and not begun:
+        raise InputError(options.out, "nothing to resume", "leave --resume out to begin")
 
 
 def files_in(folders: Sequence[Path], suffixes: tuple[str, ...]) -> list[Path]:

@@ -29,11 +29,15 @@ from warpir.bridge import rasterize
 from warpir.errors import ExitCode, InputError
 from warpir.integrator import LightTensors, MaterialTensors, Radiance
 from warpir.light import Light
+from warpir.memory import Need
 from warpir.mis import MisIntegrator
 from warpir.render import Renderer, index_of
 from warpir.transport_cache import content_key, load_rows, save_rows
 from warpir.transport_matrix import DenseRows, SparseRows, product
 from warpir.transport_rows import (
+    LOWER_OBJECT,
+    LOWER_SHADOW,
+    TRACING,
     TransportSettings,
     direction_counts,
     flux_noise,
@@ -115,7 +119,14 @@ class TransportIntegrator:
         stored = None
         if cache is not None:
             key = content_key(
-                renderer.scene, object_pixels, proxy_pixels, depth, self.settings, expected, seed
+                renderer.scene,
+                object_pixels,
+                proxy_pixels,
+                depth,
+                self.settings,
+                expected,
+                seed,
+                renderer.is_ordered,
             )
             stored = load_rows(cache / f"{key}.safetensors", self.device)
         self.is_cached = stored is not None
@@ -158,6 +169,9 @@ class TransportIntegrator:
         needed = 3 * wide * len(self.object_pixels) * texels + SparseRows.BYTES * entries
         if self.has_mesh:
             needed += wide * len(self.proxy_pixels) * 2 * settings.height_shadow**2
+        if entries == 0:
+            rows = Need("the rows of light transport", needed, LOWER_OBJECT)
+            self.renderer.memory.require(rows)
         if needed > settings.memory_mib << 20:
             raise InputError(
                 "--transport-memory",
@@ -173,17 +187,36 @@ class TransportIntegrator:
         settings, count = self.settings, len(self.object_pixels)
         dtype = DTYPES[settings.dtype]
         shape = (3, count, 2 * settings.height_fg**2)
-        T_fg = torch.empty(shape, dtype=dtype, device=self.device)
+        T_fg = self.renderer.memory.again(
+            lambda: torch.empty(shape, dtype=dtype, device=self.device), TRACING, LOWER_OBJECT
+        )
         emission = torch.empty((count, 3), device=self.device)
         mask = torch.empty(count, device=self.device)
         for part in object_rows(
             self.renderer, self.object_pixels, self.depth, settings, self.expected[0], seed
         ):
             rows = torch.from_numpy(part.rows.astype(np.int64)).to(self.device)
-            T_fg[:, rows] = wp.to_torch(part.T).permute(2, 0, 1).to(dtype)
-            emission[rows] = wp.to_torch(part.emission)
+            T, emitted = wp.to_torch(part.T), wp.to_torch(part.emission)
+            self._blacken(self.object_pixels[part.rows], "object's transport", T, emitted)
+            T_fg[:, rows] = T.permute(2, 0, 1).to(dtype)
+            emission[rows] = emitted
             mask[rows] = wp.to_torch(part.count).to(torch.float32) / part.subsamples
         return {"T_fg": T_fg, "emission": emission, "mask": mask}
+
+    def _blacken(self, pixels: IntArray, stage: str, *rows: Tensor) -> None:
+        """Set the rows of pixels that are not finite to 0, in place, and count them.
+
+        Raises:
+            InputError: They are too many (`ExitCode.NUMERIC`).
+        """
+        finite = torch.stack([r.isfinite().flatten(1).all(dim=1) for r in rows]).all(dim=0)
+        if bool(finite.all()):
+            return
+        bad = ~finite
+        width = self.renderer.scene.camera.width
+        self.renderer.bad_pixels.add(bad.cpu().numpy(), pixels, width, stage)
+        for row in rows:
+            row[bad] = 0.0
 
     def _may_see_object(self) -> IntArray:
         camera = self.renderer.scene.camera
@@ -203,7 +236,10 @@ class TransportIntegrator:
             self.expected[1],
             seed,
         ):
-            entries.add(wp.to_torch(share), self.irradiance)
+            rows = wp.to_torch(share)
+            part = slice(entries.row_count, entries.row_count + len(rows))
+            self._blacken(self.proxy_pixels[part], "shadow's transport", rows)
+            entries.add(rows, self.irradiance)
             self._check_memory(entries.count)
         return entries.tensors()
 
@@ -211,10 +247,11 @@ class TransportIntegrator:
         """Store what each pixel receives, and what is not zero of what the object keeps."""
         settings, count = self.settings, len(self.proxy_pixels)
         entries = _Entries(self.device)
-        T = torch.empty(
-            (1, count, 2 * settings.height_shadow**2),
-            dtype=DTYPES[settings.dtype],
-            device=self.device,
+        shape = (1, count, 2 * settings.height_shadow**2)
+        T = self.renderer.memory.again(
+            lambda: torch.empty(shape, dtype=DTYPES[settings.dtype], device=self.device),
+            TRACING,
+            LOWER_SHADOW,
         )
         bounced = torch.empty((2, count, 3), device=self.device)
         for part in place_rows(
@@ -227,12 +264,14 @@ class TransportIntegrator:
         ):
             received, blocked = wp.to_torch(part.received), wp.to_torch(part.blocked)
             rows = slice(entries.row_count, entries.row_count + len(received))
+            sent, kept = wp.to_torch(part.bounced), wp.to_torch(part.bounced_blocked)
+            pixels = self.proxy_pixels[rows]
+            self._blacken(pixels, "place's transport", received, blocked, sent, kept)
             T[0, rows] = received.to(T.dtype)
             # The part of what is stored, so that rounding leaves a dark place dark.
             share = blocked / received.clamp(min=1e-30)
             entries.add(share * T[0, rows].to(torch.float32))
-            bounced[0, rows] = wp.to_torch(part.bounced)
-            bounced[1, rows] = wp.to_torch(part.bounced_blocked)
+            bounced[0, rows], bounced[1, rows] = sent, kept
             self._check_memory(entries.count)
         return entries.tensors() | {"T_place": T, "bounced": bounced}
 

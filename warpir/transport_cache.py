@@ -3,9 +3,6 @@
 from __future__ import annotations
 
 import hashlib
-import logging
-import os
-import tempfile
 from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -16,6 +13,8 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 import warpir
+from warpir.atomic import replacing
+from warpir.caches import find_kept, notice, seal
 from warpir.light import Light
 from warpir.transport_rows import TransportSettings
 
@@ -26,19 +25,6 @@ IntArray = NDArray[np.int32]
 
 FORMAT = 1
 """Layout and meaning of the stored arrays; part of every key."""
-CACHE_BYTES = 4 << 30
-"""What the folder may hold; the files that were used longest ago go first."""
-
-log = logging.getLogger(__name__)
-
-
-def default_cache() -> Path:
-    """Return the folder for traced rows: ``WARPIR_CACHE``, or the user's cache folder."""
-    own = os.environ.get("WARPIR_CACHE")
-    if own:
-        return Path(own) / "transport"
-    base = os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache"
-    return Path(base) / "warpir" / "transport"
 
 
 def content_key(
@@ -49,8 +35,11 @@ def content_key(
     settings: TransportSettings,
     expected: Light,
     seed: int,
+    is_ordered: bool,
 ) -> str:
     """Return a hash of everything that the rows depend on, as 64 hexadecimal digits.
+
+    The device counts, and whether its sums had one order: it decides the last bits.
 
     The scene counts by what is on the device: geometry where it stands, materials, textures,
     camera and plane. Names, files and prompts do not.
@@ -63,7 +52,8 @@ def content_key(
         digest.update(array.data if array.size else b"")
 
     digest.update(
-        f"{FORMAT} {warpir.__version__} {depth} {seed} {sorted(asdict(settings).items())}".encode()
+        f"{FORMAT} {warpir.__version__} {depth} {seed} {sorted(asdict(settings).items())} "
+        f"{scene.device.name} {is_ordered}".encode()
     )
     for content in scene.contents():
         add(content)
@@ -79,45 +69,21 @@ def content_key(
 
 
 def load_rows(path: Path, device: torch.device) -> dict[str, Tensor] | None:
-    """Return the arrays of a cached file, or None when there is none that can be read."""
-    from safetensors import SafetensorError
+    """Return the arrays of a cached file, or None when there is none that is whole."""
     from safetensors.torch import load_file
 
-    if not path.is_file():
-        return None
-    try:
-        rows = load_file(path, device=str(device))
-        os.utime(path)
-    except (SafetensorError, OSError) as error:
-        log.warning("%s: not readable, tracing again (%s)", path, error)
-        return None
-    return rows
+    kept = find_kept(path)
+    return None if kept is None else load_file(kept, device=str(device))
 
 
 def save_rows(path: Path, rows: dict[str, Tensor]) -> None:
     """Write the arrays, whole or not at all, and make room; a full disk is only a notice."""
+    from safetensors import SafetensorError
     from safetensors.torch import save_file
 
-    staged = None
     try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        handle, name = tempfile.mkstemp(suffix=".part", dir=path.parent)
-        os.close(handle)
-        staged = Path(name)
-        save_file({k: v.contiguous() for k, v in rows.items()}, staged)
-        os.replace(staged, path)
-        _evict(path.parent, keep=path)
-    except Exception as error:  # safetensors reports a full disk by its own type
-        log.warning("%s: not kept (%s)", path, error)
-        if staged is not None:
-            staged.unlink(missing_ok=True)
-
-
-def _evict(folder: Path, keep: Path) -> None:
-    """Delete the files that were used longest ago until the folder fits `CACHE_BYTES`."""
-    files = sorted(folder.glob("*.safetensors"), key=lambda f: f.stat().st_mtime, reverse=True)
-    total = 0
-    for file in files:
-        total += file.stat().st_size
-        if total > CACHE_BYTES and file != keep:
-            file.unlink(missing_ok=True)
+        with replacing(path) as staged:
+            save_file({k: v.contiguous() for k, v in rows.items()}, staged)
+        seal(path, "*.safetensors.*")
+    except (SafetensorError, OSError) as error:
+        notice(f"{path}: not kept ({error})")

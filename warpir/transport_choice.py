@@ -217,7 +217,7 @@ class _Pilot:
             trial = TransportIntegrator(
                 self.renderer, self.objects, self.proxies, self.depth, settings, light, k
             )
-            entries = trial.T_shadow.by_row.values().numel()
+            entries = trial.T_shadow.entry_count
             runs.append(trial.radiance(texels, texels, 0))
         objects = _toned(np.stack([r.foreground.numpy() for r in runs]))
         taken = np.stack([1.0 - (r.lit / r.unoccluded.clamp(min=1e-30)).numpy() for r in runs])

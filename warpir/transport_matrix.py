@@ -12,6 +12,8 @@ from torch import Tensor
 class SparseRows:
     """A float32 matrix that is mostly zero, stored by rows and, for the transpose, by columns.
 
+    Where torch is to be deterministic on CUDA it is stored with its zeros.
+
     Args:
         row: Of each entry, int32, rising, shape [entry].
         column: Of each entry, int32, rising within a row, shape [entry].
@@ -23,13 +25,21 @@ class SparseRows:
     """Memory of one entry: value and int32 index, twice."""
 
     def __init__(self, row: Tensor, column: Tensor, values: Tensor, shape: tuple[int, int]) -> None:
+        self.entry_count = values.numel()
         self.by_row = _csr(row, column, values, shape)
+        if values.is_cuda and torch.are_deterministic_algorithms_enabled():
+            # cuSPARSE adds a row's parts in any order, and torch does not say so.
+            self.by_row = self.by_row.to_dense()
+            self.by_column = self.by_row.t()
+            return
         order = torch.argsort(column, stable=True)
         self.by_column = _csr(column[order], row[order], values[order], (shape[1], shape[0]))
 
     @property
     def bytes(self) -> int:
         """Memory of both copies."""
+        if not self.by_row.is_sparse_csr:
+            return self.by_row.numel() * self.by_row.element_size()
         parts = [
             part
             for m in (self.by_row, self.by_column)

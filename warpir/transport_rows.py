@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from functools import lru_cache
+from typing import TypeVar
 
 import numpy as np
 import warp as wp
@@ -19,6 +20,7 @@ from warpir.render import Renderer, Rows, light_args
 IntArray = NDArray[np.int32]
 FloatArray = NDArray[np.float32]
 Float64Array = NDArray[np.float64]
+Traced = TypeVar("Traced")
 
 LANES = 256
 """Threads of a pixel on CUDA."""
@@ -26,7 +28,10 @@ ITEM_SIZE = 16
 """Directions that one of them draws in a row."""
 CHUNK_BYTES = 64 << 20
 """Memory of the rows that are traced at once, before they are stored in a small type."""
-
+TRACING = "tracing light transport"
+LOWER_OBJECT = "--object-light-height or --guidance-width"
+LOWER_SHADOW = "--light-height or --guidance-width"
+"""What lowers the memory of tracing."""
 
 PILOT_SUBSAMPLES = 8
 PILOT_SEED = 0x2F6E2B1
@@ -160,7 +165,7 @@ def flux_noise(texels: FloatArray, counts: NDArray[np.int32]) -> float:
 def _texel_args(
     counts: NDArray[np.int32],
     height: int,
-    device: wp.Device,
+    renderer: Renderer,
     columns: IntArray,
     normal: Float64Array | None = None,
 ) -> kernels.TexelArgs:
@@ -168,6 +173,7 @@ def _texel_args(
 
     ``columns`` are the texels that the rows hold.
     """
+    device = renderer.device
     args = kernels.TexelArgs()
     args.height, args.width = height, 2 * height
     step = np.pi / height
@@ -183,8 +189,9 @@ def _texel_args(
         setattr(args, name, wp.array(values.astype(np.float32), dtype=float, device=device))
     args.direction_count = wp.array(counts, dtype=int, device=device)
     args.centre = wp.array(centres.reshape(-1, 3).astype(np.float32), dtype=wp.vec3, device=device)
-    # On CUDA one thread must not draw a sun's directions while its neighbours wait.
-    args.lanes, args.item_size = (1, 1 << 30) if device.is_cpu else (LANES, ITEM_SIZE)
+    # On CUDA one thread must not draw a sun's directions while its neighbours wait; but a pixel's
+    # sums have one order only where one thread adds them up.
+    args.lanes, args.item_size = (1, 1 << 30) if renderer.is_ordered else (LANES, ITEM_SIZE)
     pieces = -(-counts[columns] // args.item_size)
     which = np.repeat(np.arange(len(columns)), pieces)
     first = np.arange(len(which)) - np.repeat(np.cumsum(pieces) - pieces, pieces)
@@ -206,7 +213,7 @@ def object_rows(
     scene, device, height = renderer.scene, renderer.device, settings.height_fg
     counts = direction_counts(expected, settings.bright_directions)
     texel_count = 2 * height * height
-    texels = _texel_args(counts, height, device, np.arange(texel_count, dtype=np.int32))
+    texels = _texel_args(counts, height, renderer, np.arange(texel_count, dtype=np.int32))
     # Half of the later vertices' directions look for the expected light, half everywhere.
     flux = luminance(expected.astype(np.float64))
     mean = float((flux * texel_solid_angles(height, 2 * height)[:, None]).sum()) / (4.0 * np.pi)
@@ -217,44 +224,58 @@ def object_rows(
     geometry = (scene.mesh_args, scene.material_args, scene.texture_args)
     for rows, factor in _groups(renderer, pixels, settings, seed):
         subsamples, paths = factor * settings.subsamples, factor * settings.paths
-        chunk = pixels[rows]
-        points, emission = _surface_points(renderer, chunk, subsamples, seed)
-        T = wp.zeros((len(chunk), texel_count), dtype=wp.vec3, device=device)
-        launched = Rows(wp.array(chunk, dtype=wp.int32, device=device))
-        renderer.launch(
-            kernels.trace_direct,
-            len(chunk),
-            [
-                *(launched, Rows(points), *geometry, scene.proxy_args),
-                *(texels, subsamples, paths, seed, Rows(T)),
-            ],
-            int(counts.sum()),
-            "transport",
-            texels.lanes,
-        )
-        if paths > 0:
+
+        def trace(
+            start: int,
+            stop: int,
+            rows: IntArray = rows,
+            subsamples: int = subsamples,
+            paths: int = paths,
+        ) -> ObjectRows:
+            rows = rows[start:stop]
+            chunk = pixels[rows]
+            points, emission = _surface_points(renderer, chunk, subsamples, seed)
+            T = wp.zeros((len(chunk), texel_count), dtype=wp.vec3, device=device)
+            launched = Rows(wp.array(chunk, dtype=wp.int32, device=device))
             renderer.launch(
-                kernels.trace_paths,
+                kernels.trace_direct,
                 len(chunk),
                 [
-                    launched,
-                    Rows(points),
-                    *geometry,
-                    scene.proxy_args,
-                    texels,
-                    proposal,
-                    subsamples,
-                    paths,
-                    depth,
-                    seed,
-                    Rows(T),
-                    Rows(emission),
+                    *(launched, Rows(points), *geometry, scene.proxy_args),
+                    *(texels, subsamples, paths, seed, Rows(T)),
                 ],
-                paths * depth,
+                int(counts.sum()),
                 "transport",
-                paths,
+                texels.lanes,
             )
-        yield ObjectRows(rows, T, emission, points.count, subsamples)
+            # Threads of a pixel add to one row: in one order if one runs at a time, as on the CPU.
+            step = 1 if renderer.is_ordered and device.is_cuda else max(paths, 1)
+            for first in range(0, paths, step):
+                renderer.launch(
+                    kernels.trace_paths,
+                    len(chunk),
+                    [
+                        launched,
+                        Rows(points),
+                        *geometry,
+                        scene.proxy_args,
+                        texels,
+                        proposal,
+                        subsamples,
+                        first,
+                        paths,
+                        depth,
+                        seed,
+                        Rows(T),
+                        Rows(emission),
+                    ],
+                    step * depth,
+                    "transport",
+                    step,
+                )
+            return ObjectRows(rows, T, emission, points.count, subsamples)
+
+        yield from renderer.memory.in_chunks(trace, len(rows), TRACING, LOWER_OBJECT)
 
 
 def _groups(
@@ -388,22 +409,22 @@ def proxy_rows(
     """
     scene, device, height = renderer.scene, renderer.device, settings.height_shadow
     counts = direction_counts(expected, settings.bright_directions)
-    texels = _texel_args(counts, height, device, columns, scene.proxy.normal)
+    texels = _texel_args(counts, height, renderer, columns, scene.proxy.normal)
     size = max(1, CHUNK_BYTES // (4 * len(columns)))
     if scene.triangle_count == 0:
         return
     geometry = (scene.mesh_args, scene.material_args, scene.texture_args, scene.proxy_args)
     wp_columns = wp.array(columns, dtype=int, device=device)
-    for start in range(0, len(pixels), size):
-        chunk = slice(start, start + size)
+
+    def trace(first: int, last: int) -> wp.array:
+        chunk = slice(first, last)
         points = _place_points(
             renderer, pixels[chunk], may_see_object[chunk], settings.subsamples, seed
         )
-        count = len(pixels[chunk])
-        blocked = wp.zeros((count, len(columns)), dtype=float, device=device)
+        blocked = wp.zeros((last - first, len(columns)), dtype=float, device=device)
         renderer.launch(
             kernels.trace_blocked,
-            count,
+            last - first,
             [
                 points.pixels,
                 points.count,
@@ -419,7 +440,22 @@ def proxy_rows(
             "transport",
             texels.lanes,
         )
-        yield blocked
+        return blocked
+
+    yield from _chunks(renderer, trace, len(pixels), size)
+
+
+def _chunks(
+    renderer: Renderer, trace: Callable[[int, int], Traced], count: int, size: int
+) -> Iterator[Traced]:
+    """Yield what ``trace`` makes of each ``size`` pixels, of halves where memory is short."""
+    for start in range(0, count, size):
+
+        def part(first: int, last: int, start: int = start) -> Traced:
+            return trace(start + first, start + last)
+
+        length = min(size, count - start)
+        yield from renderer.memory.in_chunks(part, length, TRACING, LOWER_SHADOW)
 
 
 @dataclass(frozen=True)
@@ -448,15 +484,15 @@ def place_rows(
     scene, device, height = renderer.scene, renderer.device, settings.height_shadow
     texel_count = 2 * height * height
     counts = direction_counts(expected, settings.bright_directions)
-    texels = _texel_args(counts, height, device, np.arange(texel_count, dtype=np.int32))
+    texels = _texel_args(counts, height, renderer, np.arange(texel_count, dtype=np.int32))
     size = max(1, CHUNK_BYTES // (8 * texel_count))
     geometry = (scene.mesh_args, scene.material_args, scene.texture_args, scene.proxy_args)
-    for start in range(0, len(pixels), size):
-        chunk = slice(start, start + size)
+
+    def trace(first: int, last: int) -> PlaceRows:
+        chunk, count = slice(first, last), last - first
         points = _place_points(
             renderer, pixels[chunk], may_see_object[chunk], settings.subsamples, seed
         )
-        count = len(pixels[chunk])
         places = (points.count, points.position, points.normal, points.share)
         seen = (points.pixels, *places, *geometry)
         received, blocked = (
@@ -478,4 +514,6 @@ def place_rows(
             settings.paths,
             "transport",
         )
-        yield PlaceRows(received, blocked, bounced, kept)
+        return PlaceRows(received, blocked, bounced, kept)
+
+    yield from _chunks(renderer, trace, len(pixels), size)
