@@ -1,0 +1,216 @@
+// What is dragged over the photo: horizon, ring, size, foot. Positions are pixels of the stage.
+
+import { corners, groundPoint, horizonRow, levelled, placed, project, zoomed } from './camera.js';
+
+const SVG = 'http://www.w3.org/2000/svg';
+const RIM = 14; // handles stay this far inside the stage
+const LEAST_RING = 44; // radius on the screen, however small the object is
+const FARTHEST = 400; // camera heights
+const ICONS = {
+  pitch: 'M0-5V5M-2.6-2.6 0-5.2 2.6-2.6M-2.6 2.6 0 5.2 2.6 2.6',
+  roll: 'M-4.5 2A5 5 0 0 1 4.5 2M4.9-1.4 4.6 2.2 1.2 1.4',
+  fov: 'M-5 0H5M-2.6-2.6-5.2 0-2.6 2.6M2.6-2.6 5.2 0 2.6 2.6',
+  size: 'M-4 4 4-4M.4-4H4V-.4M-.4 4H-4V.4',
+  turn: 'M-4 1.5A4.3 4.3 0 1 1 0 4.3M-1.8 2.6 0 4.4-1.8 6.2',
+  foot: 'M0-5V5M-5 0H5M-1.8-3.4 0-5.2 1.8-3.4M-1.8 3.4 0 5.2 1.8 3.4M-3.4-1.8-5.2 0-3.4 1.8M3.4-1.8 5.2 0 3.4 1.8',
+};
+const NAMES = {
+  pitch: 'Horizon, up and down', roll: 'Tilt of the horizon, right end', tilt: 'Tilt of the horizon, left end',
+  fov: 'Field of view', size: 'Size of the object', turn: 'Turn of the object', foot: 'Place of the object',
+};
+
+function make(tag, attributes, parent) {
+  const element = document.createElementNS(SVG, tag);
+  for (const [name, value] of Object.entries(attributes)) element.setAttribute(name, value);
+  parent?.append(element);
+  return element;
+}
+
+// The same with the camera changed: what stood at a pixel of the ground goes on standing there.
+export function withCamera(before, camera, stance) {
+  const foot = project(before.camera, before.stance, [before.stand.x, 0, before.stand.z]);
+  const point = foot && groundPoint(camera, stance, ...foot);
+  const isNear = point && Math.hypot(point[0] - stance.x, point[1] - stance.z) < FARTHEST * stance.height;
+  return { ...before, camera, stance, stand: isNear ? { x: point[0], z: point[1] } : before.stand };
+}
+
+// The same with the object's foot at a pixel of the photo; as it was where that shows no ground.
+export function stoodAt(before, u, v) {
+  const { camera, stance } = before;
+  const point = groundPoint(camera, stance, u, v);
+  if (!point || Math.hypot(point[0] - stance.x, point[1] - stance.z) > FARTHEST * stance.height) return null;
+  return { ...before, stand: { x: point[0], z: point[1] } };
+}
+
+export const shifted = (before, rows) => {
+  const { camera, stance } = before;
+  const ends = [0, camera.width].map((u) => [u, horizonRow(camera, stance, u) + rows]);
+  return withCamera(before, camera, levelled(camera, stance, ...ends));
+};
+
+export class Handles {
+  // `gesture` has begin(), move(change from the state at its beginning), end().
+  constructor(svg, stage, box, gesture) {
+    Object.assign(this, { svg, stage, box, gesture });
+    this.horizon = this.#line('horizon', 2);
+    this.ring = this.#line('ring', 2);
+    this.knobs = {};
+    // What is later lies on top: the object's handles go where it goes.
+    for (const name of ['tilt', 'pitch', 'fov', 'roll', 'size', 'foot', 'turn']) this.#knob(name);
+    this.#drags(this.horizon.hit, 'pitch');
+    this.#drags(this.ring.hit, 'turn');
+  }
+
+  #line(kind, width) {
+    const group = make('g', { class: kind }, this.svg);
+    const part = (name, extra) => make('path', { class: name, ...extra }, group);
+    return {
+      group,
+      rim: part('rim', { 'stroke-width': width + 2.5 }),
+      line: part('line', { 'stroke-width': width }),
+      hit: part('hit', {}),
+    };
+  }
+
+  #knob(name) {
+    const group = make('g', {
+      class: 'knob', tabindex: 0, role: 'slider', 'aria-label': NAMES[name], 'data-handle': name,
+    }, this.svg);
+    make('circle', { class: 'reach', r: 20 }, group);
+    make('circle', { r: 11 }, group);
+    make('path', { d: ICONS[name === 'tilt' ? 'roll' : name] }, group);
+    this.knobs[name] = group;
+    this.#drags(group, name);
+  }
+
+  // Let an element be dragged: the state at the beginning and both pointers give the new one.
+  #drags(element, name) {
+    element.addEventListener('pointerdown', (event) => {
+      if (event.button !== 0) return;
+      event.preventDefault();
+      event.stopPropagation();
+      this.drag(event, element, name);
+      if (element.tabIndex >= 0) element.focus({ focusVisible: false });
+    });
+  }
+
+  drag(event, element, name) {
+    const from = this.#pixel(event);
+    element.setPointerCapture(event.pointerId);
+    this.gesture.begin(name);
+    const move = (moved) => {
+      if (moved.pointerId !== event.pointerId) return;
+      const to = this.#pixel(moved);
+      this.gesture.move((before) => this.#dragged(name, before, from, to));
+    };
+    const end = (ended) => {
+      if (ended.pointerId !== event.pointerId) return;
+      element.removeEventListener('pointermove', move);
+      for (const kind of ['pointerup', 'pointercancel']) element.removeEventListener(kind, end);
+      this.gesture.end();
+    };
+    element.addEventListener('pointermove', move);
+    for (const kind of ['pointerup', 'pointercancel']) element.addEventListener(kind, end);
+  }
+
+  #pixel(event) {
+    const box = this.stage.getBoundingClientRect();
+    return [(event.clientX - box.left) / this.scale, (event.clientY - box.top) / this.scale];
+  }
+
+  #dragged(name, before, from, to) {
+    const { camera, stance, stand } = before;
+    const [du, dv] = [to[0] - from[0], to[1] - from[1]];
+    const foot = project(camera, stance, [stand.x, 0, stand.z]);
+    if (name === 'pitch') return shifted(before, dv);
+    if (name === 'roll' || name === 'tilt') {
+      // The middle of the horizon stays; this end follows the pointer.
+      const [row, middle] = [horizonRow(camera, stance, from[0]), camera.width / 2];
+      const ends = [[middle, horizonRow(camera, stance, middle)], [from[0], row + dv]];
+      if (name === 'tilt') ends.reverse();
+      return withCamera(before, camera, levelled(camera, stance, ...ends));
+    }
+    if (name === 'fov') {
+      // What is under the pointer goes with it: away from the principal point the view narrows.
+      const reach = Math.abs(from[0] - camera.cx);
+      const factor = Math.max((reach + du * Math.sign(from[0] - camera.cx)) / reach, 0.1);
+      const fx = Math.min(Math.max(camera.fx * factor, camera.width / 20), camera.width * 20);
+      const changed = zoomed(camera, stance, fx);
+      return withCamera(before, changed.camera, changed.stance);
+    }
+    if (!foot) return before;
+    if (name === 'foot') return stoodAt(before, foot[0] + du, foot[1] + dv);
+    if (name === 'size') {
+      const height = Math.max(foot[1] - from[1], 8 / this.scale);
+      return { ...before, size: before.size * Math.max((height - dv) / height, 0.02) };
+    }
+    const [a, b] = [from, to].map(([u, v]) => {
+      // Above the horizon no ground is seen: the angle on the screen has to do.
+      const point = groundPoint(camera, stance, u, v);
+      return point ? Math.atan2(point[0] - stand.x, point[1] - stand.z) : null;
+    });
+    if (a === null || b === null) return before;
+    return { ...before, turn: before.turn + ((b - a) * 180) / Math.PI };
+  }
+
+  // Whether a pointer is on the object.
+  isOnObject(event) {
+    const [u, v] = this.#pixel(event);
+    const [left, top, right, bottom] = this.bounds ?? [1, 1, 0, 0];
+    const slack = 10 / this.scale;
+    return u > left - slack && u < right + slack && v > top - slack && v < bottom + slack;
+  }
+
+  draw(state) {
+    const { camera, stance, stand, turn, size } = state;
+    const box = this.stage.getBoundingClientRect();
+    this.scale = box.width / camera.width;
+    const onStage = (pixel) => pixel && pixel.map((part) => part * this.scale);
+    const inside = ([x, y]) => [
+      Math.min(Math.max(x, RIM), box.width - RIM), Math.min(Math.max(y, RIM), box.height - RIM),
+    ];
+    const put = (name, pixel) => {
+      this.knobs[name].style.display = pixel ? '' : 'none';
+      if (pixel) this.knobs[name].setAttribute('transform', `translate(${inside(pixel)})`);
+    };
+    const draw = (line, path) => {
+      for (const part of ['rim', 'line', 'hit']) line[part].setAttribute('d', path);
+    };
+
+    const level = (share) => onStage([share * camera.width, horizonRow(camera, stance, share * camera.width)]);
+    draw(this.horizon, `M${level(0)}L${level(1)}`);
+    put('pitch', level(0.5));
+    put('fov', level(0.76));
+    put('tilt', level(0.06));
+    put('roll', level(0.94));
+
+    const at = corners(this.box, placed(this.box, stand, turn, size)).map((p) => project(camera, stance, p));
+    const isWhole = at.every(Boolean);
+    this.bounds = isWhole && [
+      Math.min(...at.map((p) => p[0])), Math.min(...at.map((p) => p[1])),
+      Math.max(...at.map((p) => p[0])), Math.max(...at.map((p) => p[1])),
+    ];
+    const foot = project(camera, stance, [stand.x, 0, stand.z]);
+    put('foot', onStage(foot));
+    const away = Math.hypot(stand.x - stance.x, stance.height, stand.z - stance.z);
+    const side = Math.max(...this.box.high.map((top, k) => top - this.box.low[k]));
+    const across = Math.hypot(this.box.high[0] - this.box.low[0], this.box.high[2] - this.box.low[2]);
+    const radius = Math.max((0.62 * across * size) / side, (LEAST_RING * away) / (camera.fx * this.scale));
+    const round = (angle) => project(camera, stance, [
+      stand.x + radius * Math.sin(angle), 0, stand.z + radius * Math.cos(angle),
+    ]);
+    const ring = Array.from({ length: 73 }, (_, k) => onStage(round((k * Math.PI) / 36)));
+    draw(this.ring, ring.every(Boolean) ? `M${ring.join('L')}Z` : '');
+    put('turn', onStage(round((turn * Math.PI) / 180)));
+    const top = this.bounds ? [(this.bounds[0] + this.bounds[2]) / 2, this.bounds[1]] : foot;
+    put('size', top && onStage(top).map((part, k) => part - 30 * k));
+  }
+
+  // What each handle stands at, for those who do not see it.
+  say(values) {
+    for (const [name, { text, now, low, high }] of Object.entries(values)) {
+      const attributes = { valuetext: text, valuenow: now, valuemin: low, valuemax: high };
+      for (const [key, value] of Object.entries(attributes)) this.knobs[name].setAttribute(`aria-${key}`, value);
+    }
+  }
+}
