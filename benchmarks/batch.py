@@ -1,0 +1,112 @@
+"""How many scenes a minute does a batch do, against one process after another?
+
+    python -m benchmarks.batch [--scenes N] [--samples N] [--out DIR] [--json FILE]
+
+The scene that ships with warpir under its own light, each with another seed: by `warpir.insert` in
+a process for each, one after another, then by `warpir.batch` with one and with two workers. All of
+them must leave the same bytes. Prints a table in Markdown, for docs/batch.md; CPU seconds tell what
+was saved on a machine that others use too.
+"""
+
+import argparse
+import json
+import os
+import resource
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import warp as wp
+
+from benchmarks.measure import context, report
+
+WORKERS = (1, 2)
+wp.config.log_level = wp.LOG_ERROR
+
+
+def main() -> None:
+    """Measure, compare and print."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--scenes", type=int, default=12)
+    parser.add_argument("--samples", type=int, default=16)
+    parser.add_argument("--out", type=Path, help="where results go for a while (default: TMPDIR)")
+    parser.add_argument("--json", help="append the figures to this file")
+    options = parser.parse_args()
+    with tempfile.TemporaryDirectory(dir=options.out, prefix="warpir-bench-") as folder:
+        measure(Path(folder), options.scenes, options.samples, options.json)
+
+
+def measure(folder: Path, count: int, samples: int, path: str | None) -> None:
+    """Do the same scenes in each way.
+
+    Raises:
+        AssertionError: Two ways leave other bytes.
+    """
+    flags = ["--demo", "--guidance", "none", "--device", "cpu", "--samples", str(samples)]
+    rows = [{"name": f"scene-{seed}", "seed": seed} for seed in range(count)]
+    (folder / "scenes.jsonl").write_text("".join(json.dumps(row) + "\n" for row in rows))
+
+    def singly(out: Path, seeds: range) -> None:
+        for seed in seeds:
+            scene = ["--seed", str(seed), "--out", str(out / f"scene-{seed}")]
+            run("warpir.insert", [*flags, *scene])
+
+    def batch(workers: int) -> Callable[[Path], None]:
+        argv = [str(folder / "scenes.jsonl"), *flags, "--workers", str(workers)]
+        return lambda out: run("warpir.batch", [*argv, "--out", str(out)])
+
+    singly(folder / "warm", range(1))  # no compilation is measured
+    ways: dict[str, Callable[[Path], None]] = {
+        "`insert`, one process after another": lambda out: singly(out, range(count)),
+        **{f"`batch --workers {n}`": batch(n) for n in WORKERS},
+    }
+    seconds: dict[str, float] = {}
+    cpu: dict[str, float] = {}
+    written = []
+    for number, (name, do) in enumerate(ways.items()):
+        out = folder / str(number)
+        start, before = time.perf_counter(), cpu_seconds()
+        do(out)
+        seconds[name], cpu[name] = time.perf_counter() - start, cpu_seconds() - before
+        records = [out / f"scene-{seed}" / "run.json" for seed in range(count)]
+        written.append([json.loads(record.read_text())["files"] for record in records])
+        for files in written[-1]:
+            files.pop("report.html", None)  # which tells the seconds
+    assert written[1:] == written[:-1], "the bytes differ"
+    first = next(iter(seconds.values()))
+    print(f"{count} scenes of {samples} samples, {len(written[0][0])} files each, the same bytes")
+    print("\n| | s | CPU s | scenes a minute | |\n|---|---|---|---|---|")
+    for name, spent in seconds.items():
+        rate = f"{60.0 * count / spent:.1f} | {first / spent:.2f} x"
+        print(f"| {name} | {spent:.1f} | {cpu[name]:.1f} | {rate} |")
+    cores = len(os.sched_getaffinity(0))
+    figures: dict[str, Any] = {"question": "batch", "scenes": count, "samples": samples}
+    spent_by = {
+        name.replace("`", ""): [round(seconds[name], 2), round(cpu[name], 2)] for name in seconds
+    }
+    figures |= {
+        "cores": cores,
+        "load": round(os.getloadavg()[0], 1),
+        "seconds and CPU seconds": spent_by,
+    }
+    report({**figures, **context(wp.get_device("cpu"), cores)}, path)
+
+
+def run(program: str, argv: list[str]) -> None:
+    """Run a program of warpir quietly, from this folder."""
+    command = [sys.executable, "-P", "-m", program, *argv]
+    subprocess.run(command, check=True, stdout=subprocess.DEVNULL)
+
+
+def cpu_seconds() -> float:
+    """Return what all processes that have ended took so far."""
+    used = resource.getrusage(resource.RUSAGE_CHILDREN)
+    return used.ru_utime + used.ru_stime
+
+
+if __name__ == "__main__":
+    main()
