@@ -24,7 +24,7 @@ from warpir.errors import InputError
 SUFFIXES = (".glb", ".gltf", ".obj", ".ply", ".stl")
 CASES = (*(f"G{k}" for k in range(1, 30)), *(f"M{k}" for k in range(1, 23)))
 """Rows of the project's tables of glTF cases and of mesh faults."""
-TESTS = ("gltf", "obj", "placement", "render", "command", "insert")
+TESTS = ("gltf", "obj", "placement", "render", "command", "faults")
 """Where the tests of the cases are."""
 
 

@@ -1,15 +1,37 @@
 """Fixtures that every test shares."""
 
 import os
+import signal
 import socket
 from collections.abc import Iterator
+from pathlib import Path
 from typing import NoReturn
 
 import numpy as np
 import pytest
 import warp as wp
 
-wp.config.quiet = True
+from tests.cases import CaseReport
+from warpir.render import start_warp
+
+# A shell's background job ignores Ctrl-C, and so would every program that the tests start.
+if signal.getsignal(signal.SIGINT) == signal.SIG_IGN:
+    signal.signal(signal.SIGINT, signal.default_int_handler)
+
+# With the kernels that runs in processes of their own keep, and find.
+start_warp()
+
+
+def pytest_addoption(parser: pytest.Parser) -> None:
+    """Add ``--cases``, from which docs/robustness.md is made."""
+    parser.addoption("--cases", type=Path, help="write the outcomes of the numbered cases here")
+
+
+def pytest_configure(config: pytest.Config) -> None:
+    """Note the outcomes of the numbered cases where that is asked for."""
+    path = config.getoption("--cases")
+    if path is not None:
+        config.pluginmanager.register(CaseReport(path, hasattr(config, "workerinput")))
 
 
 def devices() -> list[str]:

@@ -59,6 +59,7 @@ def fspy_project(parameters: dict[str, Any], points: np.ndarray) -> np.ndarray:
     return np.stack([(x / aspect + 1) / 2 * width, (1 - y) / 2 * height], axis=1)
 
 
+@pytest.mark.case("C2")
 @pytest.mark.parametrize("size", [(1600, 1067), (900, 1350), (640, 640)])
 @pytest.mark.parametrize("form", ["json", "fspy"])
 def test_fspy_projects_as_fspy_does(
@@ -104,6 +105,7 @@ def test_z_up_becomes_y_up_by_the_stated_map(tmp_path: Path) -> None:
     np.testing.assert_array_equal(camera.c2w[:3, 3], [1.0, 3.0, -2.0])
 
 
+@pytest.mark.case("C2")
 def test_own_file_round_trip_and_scaling(tmp_path: Path, rng: np.random.Generator) -> None:
     camera = Camera(640, 480, 500.0, 510.0, 321.5, 239.25, pose(rng))
     path = write_json(tmp_path / "camera.json", camera.record())
@@ -116,6 +118,7 @@ def test_own_file_round_trip_and_scaling(tmp_path: Path, rng: np.random.Generato
     assert any("scaled" in notice for notice in half.notices)
 
 
+@pytest.mark.case("C4", "C9")
 def test_three_rows_and_a_byte_order_mark_are_accepted(tmp_path: Path) -> None:
     content = Camera(40, 30, 50.0, 50.0, 20.0, 15.0, np.eye(4)).record()
     content["c2w"] = content["c2w"][:3]
@@ -124,6 +127,7 @@ def test_three_rows_and_a_byte_order_mark_are_accepted(tmp_path: Path) -> None:
     np.testing.assert_array_equal(read_camera(path, (40, 30)).c2w, np.eye(4))
 
 
+@pytest.mark.case("C5")
 def test_principal_point_outside_is_noted(tmp_path: Path) -> None:
     content = Camera(40, 30, 50.0, 50.0, -5.0, 15.0, np.eye(4)).record()
     camera = read_camera(write_json(tmp_path / "c.json", content), (40, 30))
@@ -179,7 +183,9 @@ def test_wrong_camera_files_are_named(tmp_path: Path, case: str) -> None:
 
 
 @pytest.mark.parametrize(
-    "case", ["version", "cut-header", "cut-state", "cut-image", "lying-size", "no-image"]
+    "case",
+    ["version", "cut-header", "cut-state", "cut-image", "lying-size", "no-image"],
+    ids="C1-{}".format,
 )
 def test_wrong_fspy_projects_are_refused(tmp_path: Path, case: str) -> None:
     state = {"cameraParameters": fspy_parameters(40, 30, np.eye(4))}
@@ -229,6 +235,7 @@ def test_exif_focal_length_is_by_the_diagonal() -> None:
     assert any("assumed" in notice for notice in camera.notices)
 
 
+@pytest.mark.case("C3")
 @pytest.mark.parametrize("fov", [0.0, 180.0, -10.0, float("nan")])
 def test_bad_field_of_view_is_a_usage_error(fov: float) -> None:
     with pytest.raises(InputError) as caught:
@@ -236,6 +243,7 @@ def test_bad_field_of_view_is_a_usage_error(fov: float) -> None:
     assert (caught.value.where, caught.value.code) == ("--fov", ExitCode.USAGE)
 
 
+@pytest.mark.case("C3")
 def test_radians_given_as_degrees_are_noted() -> None:
     assert any("radians" in notice for notice in camera_from_fov(64, 48, 0.9, 0.0, 1.5).notices)
 
@@ -252,6 +260,7 @@ def test_ground_point_projects_back(rng: np.random.Generator) -> None:
     assert np.dot(tilted[:3], point) + tilted[3] == pytest.approx(0.0, abs=1e-9)
 
 
+@pytest.mark.case("C8")
 @pytest.mark.parametrize("v", [0.0, 119.9, 120.0])
 def test_no_ground_at_or_above_the_horizon(v: float) -> None:
     camera = camera_from_fov(640, 480, 60.0, 0.0, 1.6, horizon=120.0)
@@ -259,6 +268,7 @@ def test_no_ground_at_or_above_the_horizon(v: float) -> None:
         ground_point(camera, 320.0, v)
 
 
+@pytest.mark.case("C8")
 @pytest.mark.parametrize(
     ("plane", "words"),
     [

@@ -150,6 +150,7 @@ def still(count: int = 1) -> dict[str, Pose]:
     return {f"{k}.jpg": (np.array([1.0, 0, 0, 0]), np.zeros(3)) for k in range(count)}
 
 
+@pytest.mark.case("C6")
 def test_colmap_image_of_the_photo_is_chosen(tmp_path: Path) -> None:
     """The one named as the photo, the only one, or an error that lists them (C6)."""
     poses = {f"{k}.jpg": (np.array([1.0, 0, 0, 0]), np.array([0.0, 0, k])) for k in range(20)}
@@ -215,6 +216,7 @@ def test_wrong_colmap_texts_are_named(tmp_path: Path, case: str) -> None:
     assert caught.value.where.startswith(str(folder))
 
 
+@pytest.mark.case("C6")
 @pytest.mark.parametrize("file", ["cameras.bin", "images.bin"])
 def test_cut_or_long_colmap_binaries_are_refused(tmp_path: Path, file: str) -> None:
     """Every shorter file, a longer one, and a count that cannot be are refused."""
@@ -287,6 +289,7 @@ WRONG_TRANSFORMS: dict[str, tuple[dict[str, Any], str]] = {
     "C4-scaled": (transforms(SCALED), "scaled"),
     "C4-missing": (transforms(np.eye(4), frame={"transform_matrix": None}), "matrix of numbers"),
     "C2-aspect": (transforms(np.eye(4), h=640), "another shape"),
+    "C2-tiny": (transforms(np.eye(4), w=3, h=2), "another shape"),
     "focal": (transforms(np.eye(4), frame={"fl_x": 0}), "/fl_x"),
     "no-focal": ({"frames": [{"file_path": "2.png"}]}, "no focal length"),
     "no-size": ({"fl_x": 5, "frames": [{"file_path": "2.png"}]}, "/w"),
@@ -307,6 +310,7 @@ def test_wrong_transforms_are_named(tmp_path: Path, case: str) -> None:
     assert (caught.value.where, caught.value.code) == (str(path), ExitCode.INPUT)
 
 
+@pytest.mark.case("C7")
 def test_tiny_distortion_is_none(tmp_path: Path) -> None:
     """Coefficients up to 1e-6 are what exporters write for none."""
     path = write_json(tmp_path / "t.json", transforms(np.eye(4), k1=1e-6))
@@ -420,6 +424,61 @@ def test_gltf_camera_projects_as_gltf_says(
     assert any("aspect" in n for n in view.camera.notices) == (size != (640, 480))
 
 
+@pytest.mark.case("C6")
+def test_C6_gltf_camera_is_named_before_it_is_counted(
+    tmp_path: Path, rng: np.random.Generator
+) -> None:
+    """A name that is a number is a name; where it is none, it counts the cameras from 0."""
+    content = gltf_scene(pose(rng))
+    content["cameras"][0] = {**content["cameras"][1], "name": "1"}
+    content["cameras"][1]["name"] = "0"
+    path = write_glb(tmp_path / "scene.glb", content)
+    poses = {f: read_photo_camera(path, SIZE, frame=f).camera.c2w for f in ("0", "1")}
+    content["cameras"][0]["name"], content["cameras"][1]["name"] = "a", "b"
+    path = write_glb(tmp_path / "scene.glb", content)
+    for frame, name in (("0", "b"), ("1", "a")):
+        counted = read_photo_camera(path, SIZE, frame=frame).camera.c2w
+        np.testing.assert_array_equal(counted, read_photo_camera(path, SIZE, frame=name).camera.c2w)
+        np.testing.assert_array_equal(counted, poses[frame])
+    content["cameras"][0]["name"], content["cameras"][1]["name"] = "0", "1"
+    path = write_glb(tmp_path / "scene.glb", content)
+    np.testing.assert_array_equal(read_photo_camera(path, SIZE, frame="0").camera.c2w, poses["1"])
+    with pytest.raises(InputError, match="no one"):
+        read_photo_camera(path, SIZE, frame="9" * 5000)
+
+
+@pytest.mark.case("C2")
+def test_C2_tiny_camera_has_the_shape_of_the_photo(tmp_path: Path) -> None:
+    """4 x 3 was never 3:2; 150 x 100 was, to a pixel."""
+    camera = {"fx": 3.0, "fy": 3.0, "cx": 2.0, "cy": 1.5, "w": 4, "h": 3, "c2w": np.eye(4).tolist()}
+    write_json(tmp_path / "c.json", camera)
+    with pytest.raises(InputError, match="another shape"):
+        read_photo_camera(tmp_path / "c.json", (1280, 853))
+    write_json(tmp_path / "c.json", {**camera, "w": 150, "h": 100})
+    assert read_photo_camera(tmp_path / "c.json", (1280, 853)).camera.width == 1280
+
+
+@pytest.mark.case("C9")
+def test_C9_long_keys_are_cut(tmp_path: Path) -> None:
+    """What a file holds in place of a camera is told in a line."""
+    write_json(tmp_path / "c.json", {"A" * 10**6: 1})
+    with pytest.raises(InputError, match="AAA") as caught:
+        read_photo_camera(tmp_path / "c.json", SIZE)
+    assert len(caught.value.what) < 300
+
+
+@pytest.mark.case("C6")
+def test_C6_name_without_an_end(tmp_path: Path) -> None:
+    """A name is as long as a path at most; nothing is read byte by byte beyond."""
+    camera = struct.pack("<QIiQQ4d", 1, 1, 1, 64, 48, 50.0, 50.0, 32.0, 24.0)
+    (tmp_path / "cameras.bin").write_bytes(camera)
+    image = struct.pack("<QI7dI", 1, 1, 1, 0, 0, 0, 0, 0, 0, 1)
+    (tmp_path / "images.bin").write_bytes(image + b"a" * 10_000)
+    with pytest.raises(InputError, match="a name of more than 4096 bytes"):
+        read_photo_camera(tmp_path, (64, 48))
+
+
+@pytest.mark.case("C3")
 def test_wrong_gltf_cameras_are_named(tmp_path: Path) -> None:
     """Orthographic, without an angle, several without a name, and none at all."""
     path = tmp_path / "scene.gltf"

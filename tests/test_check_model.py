@@ -185,7 +185,7 @@ def test_a_report_that_cannot_be_written_comes_after_the_verdicts(
     folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     argv = ["--model", str(folder / "epsilon"), "--device", "cpu", "--json", str(tmp_path)]
-    assert main(argv) == ExitCode.OUTPUT
+    assert main(argv) == ExitCode.RESOURCES
     said = capsys.readouterr()
     assert "4 of 5 checks" in said.out and said.err.startswith(f"error: {tmp_path}: cannot be")
 

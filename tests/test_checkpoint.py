@@ -53,7 +53,12 @@ def test_checkpoint_keeps_two_and_the_newest_is_the_last_written(tmp_path: Path)
     assert checkpoints.load(pytest.fail).step == 75
 
 
-@pytest.mark.parametrize("damage", ["cut", "flip", "no state", "manifest cut", "no key"])
+DAMAGES = ("cut", "flip", "no state", "manifest cut", "no key", "no manifest", "newer format")
+
+
+@pytest.mark.parametrize(
+    "damage", [pytest.param(damage, id=f"R3-{damage.replace(' ', '-')}") for damage in DAMAGES]
+)
 def test_checkpoint_damaged_is_passed_over(tmp_path: Path, damage: str) -> None:
     checkpoints = Checkpoints(tmp_path, IDENTITY)
     checkpoints.save("optimize", 50, a_state(1))
@@ -69,6 +74,10 @@ def test_checkpoint_damaged_is_passed_over(tmp_path: Path, damage: str) -> None:
         (newest / STATE).unlink()
     elif damage == "manifest cut":
         (newest / MANIFEST).write_bytes((newest / MANIFEST).read_bytes()[:-20])
+    elif damage == "no manifest":
+        (newest / MANIFEST).unlink()
+    elif damage == "newer format":
+        (newest / MANIFEST).write_text(json.dumps(manifest | {"format": 2}))
     else:
         del manifest["state"]
         (newest / MANIFEST).write_text(json.dumps(manifest))
@@ -77,12 +86,11 @@ def test_checkpoint_damaged_is_passed_over(tmp_path: Path, damage: str) -> None:
     assert len(notices) == 1 and "000002-optimize-100" in notices[0]
 
 
-def test_checkpoint_without_manifest_is_none(tmp_path: Path) -> None:
+def test_checkpoint_without_manifest_is_not_forgotten(tmp_path: Path) -> None:
     checkpoints = Checkpoints(tmp_path, IDENTITY)
     checkpoints.save("optimize", 50, a_state(1))
     (tmp_path / "checkpoints" / "000001-optimize-50" / MANIFEST).unlink()
-    assert checkpoints.newest is None
-    with pytest.raises(InputError, match="nothing to go on from"):
+    with pytest.raises(InputError, match="000001-optimize-50 cannot be used: no such file"):
         checkpoints.load(pytest.fail)
 
 
@@ -105,7 +113,7 @@ def test_checkpoint_all_damaged_says_so(tmp_path: Path) -> None:
     checkpoints = Checkpoints(tmp_path, IDENTITY)
     checkpoints.save("optimize", 50, a_state(1))
     (tmp_path / "checkpoints" / "000001-optimize-50" / STATE).write_bytes(b"")
-    with pytest.raises(InputError, match="is damaged"):
+    with pytest.raises(InputError, match="its sha256 is not the one"):
         checkpoints.load(pytest.fail)
 
 
@@ -129,3 +137,28 @@ def test_checkpoint_remove(tmp_path: Path) -> None:
     checkpoints.save("optimize", 50, a_state(1))
     checkpoints.remove()
     assert checkpoints.newest is None and list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.case("R3")
+@pytest.mark.parametrize("key", ["stage", "step", "identity", "state"])
+def test_checkpoint_with_an_edited_manifest_is_passed_over(tmp_path: Path, key: str) -> None:
+    """One digit of a step is enough for another result: the manifest has a sha256 of its own."""
+    checkpoints = Checkpoints(tmp_path, {"seed": 3})
+    checkpoints.save("optimize", 3, {"step": 3})
+    path = tmp_path / "checkpoints" / "000001-optimize-3" / "manifest.json"
+    manifest = json.loads(path.read_text())
+    manifest[key] = {"stage": "lora", "step": 7, "identity": {"seed": 4}, "state": {"plain": 7}}[
+        key
+    ]
+    path.write_text(json.dumps(manifest))
+    with pytest.raises(InputError, match="sha256"):
+        checkpoints.load(print)
+
+
+def test_checkpoint_removal_leaves_what_is_not_ours(tmp_path: Path) -> None:
+    """A folder of that name is what every training project has."""
+    checkpoints = Checkpoints(tmp_path, {})
+    checkpoints.save("optimize", 3, {})
+    (tmp_path / "checkpoints" / "model.safetensors").write_text("three days")
+    checkpoints.remove()
+    assert [p.name for p in (tmp_path / "checkpoints").iterdir()] == ["model.safetensors"]

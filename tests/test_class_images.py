@@ -13,13 +13,16 @@ from torch import Tensor
 
 import warpir.diffusion.class_images as module
 from tests.tiny_stable_diffusion import make_tiny_stable_diffusion
-from warpir.diffusion.cache import cache_folder, content_key, make_room, model_key, write_file
+from warpir.atomic import write_file
+from warpir.caches import make_room
+from warpir.diffusion.cache import content_key, model_key
 from warpir.diffusion.class_images import (
     class_image_count,
     encode_pictures,
     make_class_images,
 )
-from warpir.diffusion.prior import ModelError
+from warpir.diffusion.network_prior import NetworkPrior
+from warpir.diffusion.prior import NonFiniteError
 from warpir.diffusion.prompts import (
     BACKGROUNDS,
     COLOURS,
@@ -57,6 +60,11 @@ class Painter:
     name, digest, resolution = "painter", "0" * 64, 16
     device = torch.device("cpu")
     schedule = NoiseSchedule(torch.linspace(0.99, 0.01, 10, dtype=torch.float64), "epsilon")
+
+    finite = NetworkPrior.finite
+
+    def upcast(self) -> bool:
+        return False
 
     def __init__(self, stop_after: int = 1000) -> None:
         self.batches: list[int] = []
@@ -284,7 +292,7 @@ def test_pictures_that_are_not_finite_are_refused(tmp_path: Path) -> None:
     """Half precision overflows to black pictures; none is kept."""
     painter = Painter()
     painter.sample = lambda *a, **k: torch.full((2, 3, 16, 16), float("nan"))  # type: ignore[method-assign]
-    with pytest.raises(ModelError, match="not finite"):
+    with pytest.raises(NonFiniteError, match="not finite"):
         make_class_images(painter, PROMPTS, SETTINGS, 0, tmp_path)
     assert not list(tmp_path.iterdir())
 
@@ -300,25 +308,13 @@ def test_latents_are_the_encoded_images(prior: StableDiffusion) -> None:
 # The cache
 
 
-def test_cache_folder(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setenv("WARPIR_CACHE", "/own")
-    assert cache_folder("lora") == Path("/own/lora")
-    assert cache_folder() == Path("/own")
-    monkeypatch.delenv("WARPIR_CACHE")
-    monkeypatch.setenv("XDG_CACHE_HOME", "/xdg")
-    assert cache_folder("class-images") == Path("/xdg/warpir/class-images")
-    monkeypatch.delenv("XDG_CACHE_HOME")
-    monkeypatch.setenv("HOME", "/home/me")
-    assert cache_folder() == Path("/home/me/.cache/warpir")
-
-
 def test_the_longest_unused_files_make_room(tmp_path: Path) -> None:
     for place in range(4):
         write_file(tmp_path / f"{place}.png", bytes(10))
         os.utime(tmp_path / f"{place}.png", (place, place))
     write_file(tmp_path / "other.txt", bytes(1000))
     os.utime(tmp_path / "0.png", (9, 9))
-    make_room(tmp_path, "*.png", limit=25)
+    make_room(tmp_path.glob("*.png"), limit=25)
     assert sorted(os.listdir(tmp_path)) == ["0.png", "3.png", "other.txt"]
 
 

@@ -1,6 +1,7 @@
 """Transfer functions and matrices against colour-science and against their own inverses."""
 
-import warnings
+import subprocess
+import sys
 
 import numpy as np
 import pytest
@@ -16,9 +17,7 @@ def test_srgb_pair_inverts_itself_beyond_the_unit_range() -> None:
 
 
 def test_srgb_pair_and_matrix_equal_colour_science() -> None:
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")
-        colour = pytest.importorskip("colour", reason="colour-science is not installed")
+    colour = color.colour_science()
     encoded = np.linspace(0.0, 1.0, 1001)
     np.testing.assert_allclose(
         color.srgb_to_linear(encoded), colour.models.eotf_sRGB(encoded), atol=1e-12
@@ -43,3 +42,17 @@ def test_gamma_pair_is_the_papers() -> None:
 
 def test_luminance_of_white_is_one() -> None:
     assert color.luminance(np.ones((2, 3))) == pytest.approx(1.0)
+
+
+def test_colour_science_leaves_no_mock_of_matplotlib() -> None:
+    """Diffusers looks for Matplotlib at import, and fails on a module without ``__spec__``."""
+    script = (
+        "import importlib.util, sys\n"
+        "sys.modules['matplotlib'] = None\n"
+        "from warpir.color import chromaticities_of\n"
+        "chromaticities_of('P3-D65')\n"
+        "print(importlib.util.find_spec('matplotlib'), 'colour' in sys.modules)\n"
+    )
+    command = [sys.executable, "-W", "ignore", "-c", script]
+    done = subprocess.run(command, capture_output=True, text=True, check=True)
+    assert done.stdout.split() == ["None", "True"]

@@ -12,11 +12,12 @@ from itertools import pairwise
 from pathlib import Path
 from typing import Any, get_type_hints
 
+import numpy as np
 import pytest
 
 import warpir.command
 import warpir.insert
-from warpir.command import FLAGS, parse
+from warpir.command import BY_HAND, FLAGS, parse
 from warpir.config import (
     ABOVE_ZERO,
     CHOICES,
@@ -30,7 +31,8 @@ from warpir.config import (
     flag,
 )
 from warpir.diffusion.settings import GuidanceSettings, ModelSettings, PersonalizeSettings
-from warpir.errors import ExitCode, InputError
+from warpir.errors import ExitCode, InputError, raise_all
+from warpir.limits import Limits
 from warpir.optimize_settings import OptimizeSettings
 from warpir.record import RUN_FORMAT
 
@@ -196,6 +198,7 @@ def forms_of_flags() -> list[tuple[str, str]]:
     return [pair for forms in FLAGS.values() for pair in forms.items()]
 
 
+@pytest.mark.case("F1", "F8")
 def test_every_value_has_a_rule() -> None:
     """No number without a range, no name that may be anything (F1, F8)."""
     free = {  # checked in words of their own, free by nature, or text
@@ -230,13 +233,45 @@ def problems_of(**values: Any) -> list[InputError]:
 
 
 @pytest.mark.parametrize(
+    ("name", "value", "expected"),
+    [
+        ("at", (165.0, 141.0, 3.0), "tuple[float, float]"),
+        ("fov", "x", "float"),
+        ("steps", 2.5, "int"),
+        ("overwrite", 1, "bool"),
+        ("seed", True, "int"),
+        ("photo", 3, "str"),
+    ],
+)
+def test_values_of_another_kind_are_refused(name: str, value: Any, expected: str) -> None:
+    """From Python nothing has read them before."""
+    (error, *others) = problems_of(**{name: value})
+    assert not others and error.code == ExitCode.USAGE
+    assert str(error).startswith(f"--{name.replace('_', '-')}: expected {expected}"), error
+
+
+def test_paths_lists_and_whole_numbers_are_taken() -> None:
+    assert not problems_of(
+        photo=Path("a.png"), at=[165, 141], fov=np.float32(50), samples=np.int64(8)
+    )
+
+
+@pytest.mark.parametrize("values", [{}, {"sun": (10.0, 40.0)}, {"demo": True}], ids=str)
+def test_only_a_light_that_is_given_is_turned(values: Any) -> None:
+    (error,) = problems_of(light_rotate=30.0, **values)
+    assert str(error).startswith("--light-rotate: needs --light or --reuse")
+    assert not problems_of(light_rotate=30.0, light="sky.exr")
+    assert not problems_of(light_rotate=30.0, demo=True, guidance="none")
+
+
+@pytest.mark.parametrize(
     ("argv", "name", "value"),
     [
         (["--place", "-1,0,-3"], "place", (-1.0, 0.0, -3.0)),
         (["--place=-1,0,-3"], "place", (-1.0, 0.0, -3.0)),
         (["--ground", "-.5,1,0,2e-3"], "ground", (-0.5, 1.0, 0.0, 0.002)),
         (["--pitch", "-8"], "pitch", -8.0),
-        (["--light-rotate", "-90.5"], "light_rotate", -90.5),
+        (["--light", "l.exr", "--light-rotate", "-90.5"], "light_rotate", -90.5),
         (["--guidance", "none", "--exposure", "-2"], "exposure", -2.0),
         (["--camera", "f.fspy", "--up", "-z"], "up", "-z"),
         (["--asset-up", "-z"], "asset_up", "-z"),
@@ -287,14 +322,22 @@ def test_command_reads_values(argv: list[str], name: str, value: object) -> None
         (["--samples", "0"], "--samples", "at least 1 (found 0)"),
         (["--samples", "many"], "--samples", "expected a whole number (found 'many')"),
         (["--samples", "1.5"], "--samples", "whole number"),
+        pytest.param(["--fov", "1_0"], "--fov", "expected a number", id="F1-fov-1_0"),
+        pytest.param(["--seed", "1_0"], "--seed", "expected a whole number", id="F1-seed-1_0"),
         (["--fov", "180"], "--fov", "between 0 and 180 (found 180.0)"),
         (["--fov", "nan"], "--fov", "finite"),
         (["--fov", "1e400"], "--fov", "finite"),
         (["--place", "1,2"], "--place", "expected X,Y,Z (found '1,2')"),
         (["--place", "1,2,inf"], "--place", "finite"),
         (["--ground", "0,0,0,1"], "--ground", "normal"),
-        (["--scale", "0"], "--scale", "more than 0"),
-        (["--size", "-1"], "--size", "more than 0"),
+        (["--scale", "0"], "--scale", "at least 1e-09"),
+        (["--size", "-1"], "--size", "at least 1e-06"),
+        pytest.param(["--size", "1e300"], "--size", "at most", id="F1-size-1e300"),
+        pytest.param(["--sun", "0,45,1e300"], "--sun", "numbers up to 1e+09", id="F1-sun-1e300"),
+        pytest.param(["--sky", "1e300,1,1"], "--sky", "numbers up to 1e+09", id="F1-sky-1e300"),
+        pytest.param(["--place", "0,0,-1e30"], "--place", "numbers up", id="F1-place-1e30"),
+        pytest.param(["--ground", "0,1e200,0,0"], "--ground", "numbers up", id="C8-ground-1e200"),
+        pytest.param(["--ground-albedo", "1e-320"], "--ground-albedo", "least", id="F1-albedo"),
         (["--seed", "-1"], "--seed", "at least 0"),
         (["--seed", str(2**64)], "--seed", "at most"),
         (["--device", "tpu"], "--device", "cuda"),
@@ -458,6 +501,7 @@ def test_config_file_gives_the_same_as_flags(tmp_path: Path) -> None:
     assert parse(["--config", str(other)]).config == expected
 
 
+@pytest.mark.case("F2")
 def test_config_file_replays_a_run(tmp_path: Path) -> None:
     """``run.json`` of an earlier run is a configuration; an unknown layout is refused (F2)."""
     config = InsertConfig(
@@ -470,6 +514,7 @@ def test_config_file_replays_a_run(tmp_path: Path) -> None:
     assert "format" in refused(["--config", str(path)]).what
 
 
+@pytest.mark.case("F2")
 def test_config_file_of_an_older_version_replays(tmp_path: Path) -> None:
     """``run.json`` of a version that knew none of guidance's settings means their defaults (F2)."""
     settings = (ModelSettings, PersonalizeSettings, GuidanceSettings, OptimizeSettings)
@@ -478,7 +523,8 @@ def test_config_file_of_an_older_version_replays(tmp_path: Path) -> None:
     newer |= set(FLAGS["applications"]) | set(FLAGS["guidance"]) - {"guidance"}
     newer |= {"proxy", "plane", "shadow_mask", "layer", "occluder_mask", "light_convention"}
     newer |= {"strict", "detail", "hand_off", "mitsuba", "asset_up"}
-    newer |= {"max_triangles", "max_texture_pixels"}
+    newer |= {f"max_{field.name}" for field in fields(Limits)} - {"max_pixels"}
+    newer |= {"max_prompt_bytes"}
     config = InsertConfig(photo="p.png", asset="a.glb", out="o", sky="clear", depth=2)
     known = {name: value for name, value in asdict(config).items() if name not in newer}
     path = tmp_path / "run.json"
@@ -486,6 +532,22 @@ def test_config_file_of_an_older_version_replays(tmp_path: Path) -> None:
     assert len(known) < 45 and parse(["--config", str(path)]).config == config
 
 
+@pytest.mark.parametrize("name", BY_HAND, ids="F1-{}".format)
+def test_config_file_opens_no_network_and_no_pickle(tmp_path: Path, name: str) -> None:
+    """A configuration may be a stranger's, an earlier run.json too: the flag itself is needed."""
+    path = tmp_path / "c.json"
+    plain = {"photo": "p.png", "asset": "a.glb", "out": "o"}
+    for content in ({name: True}, {"format": RUN_FORMAT, "config": {**plain, name: True}}):
+        path.write_text(json.dumps(content))
+        error = refused([*NEEDED, "--config", str(path)])
+        assert error.where == str(path) and name in error.what and flag(name) in error.advice
+        told = parse([*NEEDED, "--config", str(path), flag(name)])
+        assert getattr(told.config, name) is True
+    path.write_text(json.dumps({name: False}))
+    assert getattr(parse([*NEEDED, "--config", str(path)]).config, name) is False
+
+
+@pytest.mark.case("F3")
 def test_config_file_yields_to_flags(tmp_path: Path) -> None:
     """A flag wins over the file, and says so (F3)."""
     path = tmp_path / "c.yaml"
@@ -512,6 +574,16 @@ def test_config_file_yields_to_flags(tmp_path: Path) -> None:
         ("c.yaml", "photo: !!python/object/apply:os.system ['touch x']\n", "not YAML"),
         ("c.yaml", "samples: 3\nsamples: 4\n", "line 2: key 'samples' twice"),
         ("c.yaml", "a: [\n", "not YAML"),
+        pytest.param(
+            "c.yaml", "at: [0640, 0610]\n", "line 1: '0640' is no dec", id="F1-yaml-octal"
+        ),
+        pytest.param("c.yaml", "seed: 0x1f\n", "'0x1f' is no decimal", id="F1-yaml-hex"),
+        pytest.param("c.yaml", f"seed: 0x{'f' * 10_000}\n", "is no dec", id="F1-yaml-long-hex"),
+        pytest.param("c.yaml", "fov: 1:30.5\n", "'1:30.5' is no decimal", id="F1-yaml-base-60"),
+        pytest.param("c.yaml", "? [a]\n: 1\n", "found a sequence", id="F1-yaml-list-as-key"),
+        pytest.param(
+            "c.yaml", "light-rotate: 1\nlight_rotate: 2\n", "twice", id="F1-two-spellings"
+        ),
         ("c.yaml", "- 1\n", "keys and values"),
         ("c.yaml", "[" * 3000, "nested too deeply"),
         ("c.yaml", "a: &a [x,x]\nb: &b [*a,*a,*a]\nplace: [*b,*b,*b]\n", "unknown key 'a'"),
@@ -531,6 +603,7 @@ def test_config_file_refused(tmp_path: Path, name: str, text: str, words: str) -
     assert list(tmp_path.iterdir()) == [path]
 
 
+@pytest.mark.case("F1")
 def test_config_file_of_aliases_is_refused_at_once(tmp_path: Path) -> None:
     """Ten lines of aliases that stand for 10^9 entries neither hang nor print them (F1)."""
     names = "abcdefghi"
@@ -542,6 +615,72 @@ def test_config_file_of_aliases_is_refused_at_once(tmp_path: Path) -> None:
     error = refused(["--config", str(path)])
     assert time.perf_counter() - start < 5.0
     assert len(str(error)) < 500
+
+
+@pytest.mark.case("F1")
+def test_config_file_of_aliases_as_a_key_is_refused_at_once(tmp_path: Path) -> None:
+    """The same as the key of a mapping: it is never written out."""
+    names = "abcdefgh"
+    lines = ["a: &a [x, x, x, x, x, x, x, x, x]"]
+    lines += [f"{b}: &{b} [{', '.join(['*' + a] * 9)}]" for a, b in pairwise(names)]
+    path = tmp_path / "bomb.yaml"
+    path.write_text("\n".join([*lines, "? *h", ": 1"]))
+    error = refused(["--config", str(path)])
+    assert error.what.endswith("unknown key (found a sequence)")
+
+
+@pytest.mark.case("F1")
+def test_config_file_of_many_unknown_keys(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """20 000 unknown keys, one of them of a megabyte, are a few dozen short lines at once."""
+    path = tmp_path / "c.json"
+    keys = {"a" * 10**6: 1, **{f"phot{k}": 1 for k in range(20_000)}}
+    path.write_text(json.dumps(keys))
+    start = time.perf_counter()
+    assert warpir.insert.main(["--config", str(path)]) == ExitCode.USAGE
+    assert time.perf_counter() - start < 5.0
+    lines = capsys.readouterr().err.splitlines()
+    assert len(lines) == 32 and lines[-1].endswith("19971 more unknown keys")
+    assert max(map(len, lines)) < 300
+
+
+@pytest.mark.case("F1")
+def test_lines_of_an_error_are_bounded(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Whatever a file holds, an error is a line of 10 000 characters and 31 further ones."""
+
+    def fail(config: InsertConfig) -> None:
+        raise_all([InputError("a.json", f"{k}{'A' * 20_000} at last") for k in range(1000)])
+
+    monkeypatch.setattr(warpir.insert, "insert", fail)
+    assert warpir.insert.main(["--demo", "--out", "o"]) == ExitCode.INPUT
+    lines = capsys.readouterr().err.splitlines()
+    assert len(lines) == 32 and lines[-1] == "also: and 969 more"
+    assert lines[0].startswith("error: a.json: 0AAA") and lines[0].endswith("AAA at last")
+    assert max(map(len, lines)) < 10_010
+
+
+@pytest.mark.parametrize(
+    ("flags", "shown"),
+    [pytest.param([], 0, id="R11-warning"), pytest.param(["--debug"], 1, id="R11-with-debug")],
+)
+def test_warnings_of_libraries_are_for_debugging(
+    flags: list[str], shown: int, tmp_path: Path
+) -> None:
+    """What NumPy warns of reaches nobody who did not ask."""
+    code = (
+        "import sys, numpy as np\n"
+        "from warpir.program import run_program\n"
+        "def run(argv):\n    np.float32(3e38) * np.float32(10)\n    return 0\n"
+        "sys.exit(run_program(run))"
+    )
+    done = subprocess.run(
+        [sys.executable, "-c", code, *flags], cwd=tmp_path, capture_output=True, text=True
+    )
+    assert done.returncode == 0 and done.stdout == ""
+    assert done.stderr.count("RuntimeWarning") == shown and bool(done.stderr) == bool(shown)
 
 
 @pytest.mark.parametrize("kind", ["missing", "folder", "pipe"])
@@ -567,6 +706,7 @@ def test_command_reports_bad_inputs_together(
     assert list(tmp_path.iterdir()) == []
 
 
+@pytest.mark.case("F5")
 def test_command_never_writes_over_its_inputs(scene: list[str], tmp_path: Path) -> None:
     """--out may not be the folder of an input: --overwrite could replace the photo (F5)."""
     from warpir.inputs import read_inputs
@@ -574,6 +714,36 @@ def test_command_never_writes_over_its_inputs(scene: list[str], tmp_path: Path) 
     scene[scene.index("--out") + 1] = str(tmp_path / "x" / "..")
     with pytest.raises(InputError, match="--out: holds the input") as caught:
         read_inputs(parse([*scene, "--overwrite"]).config)
+    assert caught.value.code == ExitCode.USAGE
+
+
+@pytest.mark.parametrize(
+    ("flag", "name", "target"),
+    [
+        pytest.param("--photo", "link.png", "out/composite.png", id="F5-link-into-out"),
+        pytest.param("--photo", "out/link.png", "photo.png", id="F5-link-that-lies-in-out"),
+        pytest.param("--photo", "out/progress/p.png", None, id="F5-below-out"),
+        pytest.param("--model", "out/model", None, id="F5-model-in-out"),
+        pytest.param("--asset", "a.obj", None, id="F5-material-file-in-out"),
+    ],
+)
+def test_command_refuses_inputs_that_a_result_could_replace(
+    flag: str, name: str, target: str | None, scene: list[str], tmp_path: Path
+) -> None:
+    """Wherever below --out, and whether a link is there or leads there."""
+    from warpir.inputs import read_inputs
+
+    (tmp_path / "out" / "progress").mkdir(parents=True)
+    for copy in ("composite.png", "progress/p.png"):
+        (tmp_path / "out" / copy).write_bytes((tmp_path / "photo.png").read_bytes())
+    (tmp_path / "out" / "a.mtl").write_text("newmtl red\nKd 1 0 0\n")
+    (tmp_path / "a.obj").write_text("mtllib out/a.mtl\nusemtl red\n" + OBJ)
+    if target is not None:
+        (tmp_path / name).symlink_to(tmp_path / target)
+    argv = [*scene, "--overwrite", flag, str(tmp_path / name)]
+    argv += ["--prompt", "p"] if flag == "--model" else []
+    with pytest.raises(InputError, match="--out: holds the input") as caught:
+        read_inputs(parse(argv).config)
     assert caught.value.code == ExitCode.USAGE
 
 
@@ -640,6 +810,11 @@ def test_M16_asset_up_is_applied_and_said(scene: list[str], axis: str | None) ->
         ({"lobes": [{"amplitude": [1, 2, -3], "axis": [0, 1, 0], "sharpness": 1}]}, "amplitude"),
         ({"lobes": [{"amplitude": [1, 2, 3], "axis": [0, 0, 0], "sharpness": 1}]}, "axis"),
         ({"lobes": [{"amplitude": [1, 2, 3], "axis": [0, 1, 0], "sharpness": 0}]}, "sharpness"),
+        pytest.param(
+            {"lobes": [{"amplitude": [1, 2, 3], "axis": [0, 1, 0], "sharpness": 1e-300}]},
+            "sharpness",
+            id="E5-sharpness-0-in-float32",
+        ),
         ({"lobes": [{"amplitude": [1, 2, 3], "axis": [0, 1, 0]}]}, "sharpness"),
     ],
 )
@@ -732,6 +907,7 @@ def test_main_stops_on_sigterm(
     assert signal.getsignal(signal.SIGTERM) == before
 
 
+@pytest.mark.case("R11")
 def test_main_survives_a_closed_stdout(scene: list[str], tmp_path: Path) -> None:
     """``| head`` ends neither the run nor its status (R11)."""
     code = (
@@ -771,3 +947,11 @@ def test_demo_leaves_its_light_to_guidance() -> None:
     assert recovered.photo == plain.photo and recovered.place == plain.place
     # Refinement changes the object under a light that is known.
     assert demo_config(replace(guided, refine="material")).light == plain.light
+
+
+def test_paths_are_what_the_flags_say() -> None:
+    """Pictures carry of these settings the last name alone."""
+    from warpir.record import PATHS
+
+    forms = forms_of_flags()
+    assert sorted(PATHS) == sorted(n for n, f in forms if {*f.split("|")} & {"FILE", "DIR"})

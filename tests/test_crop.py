@@ -199,3 +199,23 @@ def test_a_shrunk_image_is_the_whole_of_it(rng: np.random.Generator) -> None:
     whole = image(rng, 1, 3, 90, 144)
     expected = interpolate(whole, (32, 32), mode="bilinear", antialias=True)
     torch.testing.assert_close(shrink(whole, 32), expected, atol=FLOAT64, rtol=0)
+
+
+@pytest.mark.parametrize(
+    ("height", "width"),
+    [pytest.param(61, 97, id="I15-61x97"), pytest.param(33, 31, id="I15-33x31")],
+)
+def test_odd_sizes_need_no_padding(rng: np.random.Generator, height: int, width: int) -> None:
+    """The model sees a square of its own resolution; the gradient has the photo's size."""
+    picture = image(rng, 1, 3, height, width).requires_grad_()
+    mask = torch.zeros(height, width)
+    mask[10:21, 7:26] = 1.0
+    crop = draw_crop(box_of(mask), (height, width), GuidanceSettings(), generator())
+    seen = crop.apply(picture, 64)
+    assert seen.shape == (1, 3, 64, 64)
+    seen.sum().backward()
+    assert picture.grad is not None and picture.grad.shape == picture.shape
+    outside = torch.ones(height, width, dtype=torch.bool)
+    reach = [(max(int(a) - 1, 0), int(a + crop.side) + 2) for a in (crop.y, crop.x)]
+    outside[slice(*reach[0]), slice(*reach[1])] = False
+    assert not picture.grad[0, :, outside].any()

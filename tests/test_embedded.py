@@ -47,9 +47,10 @@ from warpir.diffusion.embedded import (
 )
 from warpir.diffusion.guidance import Guidance
 from warpir.diffusion.lora_files import Lora, initial_lora, install_lora, remove_lora, save_lora
+from warpir.diffusion.model_error import ModelError
 from warpir.diffusion.network_prior import NetworkPrior
 from warpir.diffusion.personalize import personalize
-from warpir.diffusion.prior import Condition, ModelError
+from warpir.diffusion.prior import Condition
 from warpir.diffusion.settings import GuidanceSettings, ModelSettings, PersonalizeSettings
 from warpir.diffusion.stable_diffusion import load_stable_diffusion
 

@@ -1,6 +1,7 @@
 """Environment maps in, on files made here; values are asserted exactly."""
 
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import OpenEXR
@@ -12,7 +13,7 @@ from warpir import color
 from warpir.envmap_conventions import IN_CAMERA_AXES, SEAM_SHIFTS
 from warpir.errors import InputError
 from warpir.light import rotate_map
-from warpir.photo_files import read_envmap
+from warpir.photo_files import read_envmap, read_photo
 
 SHARED = Path(__file__).resolve().parents[2] / "shared" / "data"
 needs_shared = pytest.mark.skipif(not SHARED.is_dir(), reason=f"no development data at {SHARED}")
@@ -91,6 +92,7 @@ def test_rotation_by_part_columns_keeps_energy(
     np.testing.assert_allclose(turned.sum(axis=1), texels.sum(axis=1), rtol=1e-5)
 
 
+@pytest.mark.case("E5", "E6")
 def test_e5_e6_bad_radiance_is_repaired_and_counted(tmp_path: Path) -> None:
     texels = np.full((4, 8, 3), 0.5, np.float32)
     texels[0, 0, 0], texels[1, 1], texels[2, 2, 2], texels[3, 3, 1] = np.nan, np.inf, -2.0, 1e6
@@ -112,6 +114,7 @@ def rgbe_file(path: Path, resolution: str, rgbe: np.ndarray, extra: str = "") ->
     return path
 
 
+@pytest.mark.case("E11")
 def test_e11_radiance_orientation_and_exposure(tmp_path: Path, rng: np.random.Generator) -> None:
     rgbe = rng.integers(128, 256, (4, 8, 4))
     rgbe[..., 3] = 129
@@ -189,6 +192,7 @@ def test_pictures_are_panoramas_without_a_sun(
     assert any("not high dynamic range" in notice for notice in notices)
 
 
+@pytest.mark.case("E7")
 def test_e7_single_channel_is_expanded(tmp_path: Path, rng: np.random.Generator) -> None:
     plane = rng.random((4, 8), dtype=np.float32)
     OpenEXR.File({}, {"Y": plane}).write(str(tmp_path / "m.exr"))
@@ -196,6 +200,7 @@ def test_e7_single_channel_is_expanded(tmp_path: Path, rng: np.random.Generator)
     np.testing.assert_array_equal(texels, np.repeat(plane[..., None], 3, axis=-1))
 
 
+@pytest.mark.case("E11")
 def test_e11_flat_and_run_length_files_are_one(tmp_path: Path, rng: np.random.Generator) -> None:
     """OpenImageIO writes new run lengths from width 8 on, and narrower files flat."""
     rgbe = rng.integers(128, 256, (4, 8, 4))
@@ -208,6 +213,7 @@ def test_e11_flat_and_run_length_files_are_one(tmp_path: Path, rng: np.random.Ge
     np.testing.assert_array_equal(tiny, flat[:2, :4])
 
 
+@pytest.mark.case("E11")
 def test_e11_exposures_multiply_and_other_lines_are_noted(tmp_path: Path) -> None:
     rgbe = np.full((4, 8, 4), 129)
     plain = read_envmap(rgbe_file(tmp_path / "a.hdr", "-Y 4 +X 8", rgbe))
@@ -220,9 +226,53 @@ def test_e11_exposures_multiply_and_other_lines_are_noted(tmp_path: Path) -> Non
     notices.clear()
     read_envmap(rgbe_file(tmp_path / "d.hdr", "-Y 4 +X 8", rgbe, photoshop), notices=notices)
     assert notices == []
-    refused = rgbe_file(tmp_path / "c.hdr", "-Y 4 +X 8", rgbe, "EXPOSURE=-1\n")
-    with pytest.raises(InputError, match="EXPOSURE"):
-        read_envmap(refused)
+
+
+@pytest.mark.parametrize(
+    "lines",
+    [
+        pytest.param("EXPOSURE=-1\n", id="E11-exposure-negative"),
+        pytest.param("EXPOSURE=1e39\n", id="E11-exposure-1e39"),
+        pytest.param("EXPOSURE=1e-50\n", id="E11-exposure-1e-50"),
+        pytest.param("EXPOSURE=1e-9\n" * 40, id="E11-exposure-product-underflows"),
+        pytest.param("EXPOSURE=nan\n", id="E11-exposure-nan"),
+    ],
+)
+def test_an_exposure_that_leaves_no_light_is_refused(lines: str, tmp_path: Path) -> None:
+    rgbe = np.full((4, 8, 4), 129)
+    for read in (read_envmap, read_photo):
+        with pytest.raises(InputError, match="EXPOSURE"):
+            read(rgbe_file(tmp_path / "c.hdr", "-Y 4 +X 8", rgbe, lines))
+
+
+AP0 = (0.7347, 0.2653, 0.0, 1.0, 0.0001, -0.077, 0.32168, 0.33767)
+
+
+@pytest.mark.parametrize(
+    ("value", "header", "words"),
+    [
+        pytest.param(np.float32(3e38), {"chromaticities": AP0}, "too bright", id="E5-3e38-in-AP0"),
+        pytest.param(np.float32(1e13), {}, "too bright", id="E6-1e13"),
+        pytest.param(np.float32(np.inf), {}, "no light in it", id="E5-all-infinite"),
+    ],
+)
+def test_light_that_no_sum_can_hold_is_refused(
+    value: np.float32, header: dict[str, Any], words: str, tmp_path: Path
+) -> None:
+    texels = np.full((4, 8, 3), value)
+    texels[0] = 0.0
+    channels = {"RGB": OpenEXR.Channel(texels)}
+    kind = {"type": OpenEXR.scanlineimage, "compression": OpenEXR.ZIP_COMPRESSION}
+    OpenEXR.File({**kind, **header}, channels).write(str(tmp_path / "m.exr"))
+    with pytest.raises(InputError, match=words):
+        read_envmap(tmp_path / "m.exr")
+
+
+def test_a_black_panorama_is_told(tmp_path: Path) -> None:
+    notices: list[str] = []
+    path = write_image(tmp_path / "m.exr", np.zeros((4, 8, 3), np.float32))
+    assert read_envmap(path, notices=notices).max() == 0.0
+    assert any("no light" in notice for notice in notices)
 
 
 def test_e_stated_primaries_of_maps_are_followed(tmp_path: Path) -> None:
@@ -239,6 +289,20 @@ def test_e_stated_primaries_of_maps_are_followed(tmp_path: Path) -> None:
     broken = rgbe_file(tmp_path / "b.hdr", "-Y 4 +X 8", rgbe, "PRIMARIES=1 2 x\n")
     read_envmap(broken, notices=notices)
     assert "broken" in notices[-1]
+
+
+@pytest.mark.case("E9")
+def test_map_of_a_part_of_its_window(tmp_path: Path, rng: np.random.Generator) -> None:
+    """A data window with a negative origin is put where it belongs; around it there is no light."""
+    plane = rng.random((4, 6), dtype=np.float32)
+    header = {
+        "dataWindow": (np.array([-2, 3], np.int32), np.array([3, 6], np.int32)),
+        "displayWindow": (np.array([0, 0], np.int32), np.array([15, 7], np.int32)),
+    }
+    OpenEXR.File(header, dict.fromkeys("RGB", plane)).write(str(tmp_path / "m.exr"))
+    expected = np.zeros((8, 16), np.float32)
+    expected[3:7, :4] = plane[:, 2:]
+    np.testing.assert_array_equal(read_envmap(tmp_path / "m.exr")[..., 0], expected)
 
 
 @needs_shared

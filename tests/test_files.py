@@ -17,7 +17,7 @@ from tests.image_files import directions, four_lobes, matrix_profile
 from warpir import color
 from warpir.camera import Camera, camera_from_fov
 from warpir.errors import ExitCode, InputError
-from warpir.files import BACKGROUND_DEPTH, Layers, OutputFolder, write_layers
+from warpir.files import BACKGROUND_DEPTH, Layers, OutputFolder, read_layers, write_layers
 from warpir.photo_files import read_envmap, read_photo
 
 
@@ -92,7 +92,7 @@ def test_files_in_a_folder_follow_the_same_rules(
     rename = Path.rename
 
     def no_space(source: Path, target: Path) -> Path:
-        if source.parent.name.startswith(".partial") and source.name == "run.json":
+        if source.parent.name == ".ready" and source.name == "run.json":
             raise OSError(28, "No space left on device")
         return rename(source, target)
 
@@ -138,14 +138,15 @@ def test_failed_run_leaves_everything_as_it_was(tmp_path: Path, existing: bool) 
         assert sorted(os.listdir(folder)) == sorted(before)
 
 
-def test_failed_rename_is_undone(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:  # R4
+@pytest.mark.case("R4")
+def test_failed_rename_is_undone(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     folder = tmp_path / "out"
     write_small(folder)
     before = sha256s(folder)
     rename = Path.rename
 
     def no_space(source: Path, target: Path) -> Path:
-        if source.parent.name.startswith(".partial") and source.name == "run.json":
+        if source.parent.name == ".ready" and source.name == "run.json":
             raise OSError(28, "No space left on device")
         return rename(source, target)
 
@@ -157,7 +158,8 @@ def test_failed_rename_is_undone(tmp_path: Path, monkeypatch: pytest.MonkeyPatch
     assert sorted(os.listdir(folder)) == sorted(before)
 
 
-def test_second_run_is_locked_out(tmp_path: Path) -> None:  # F6
+@pytest.mark.case("F6")
+def test_second_run_is_locked_out(tmp_path: Path) -> None:
     folder = tmp_path / "out"
     with OutputFolder(folder):
         with pytest.raises(InputError, match=f"locked by pid {os.getpid()}") as caught:
@@ -207,13 +209,13 @@ rng = np.random.default_rng(1)
 try:
     with OutputFolder(folder, overwrite=True) as out:
         if kind == "png":
-            out.write_png("composite.png", rng.integers(0, 65536, (200, 300, 3), dtype=np.uint16))
+            out.write_png("composite.png", rng.integers(0, 65536, (300, 400, 3), dtype=np.uint16))
         elif kind == "exr":
             out.write_exr("layers.exr", {"R": rng.random((400, 400), dtype=np.float32)})
         elif kind == "hdr":
-            out.write_hdr("envmap.hdr", rng.random((256, 512, 3), dtype=np.float32))
+            out.write_hdr("envmap.hdr", rng.random((300, 600, 3), dtype=np.float32))
         else:
-            out.write_json("camera.json", {"text": "x" * 400000})
+            out.write_json("camera.json", {"text": "x" * 600000})
         out.write_json("run.json", {"seed": 2})
 except InputError as error:
     print(error.code, error)
@@ -221,12 +223,14 @@ except InputError as error:
 """
 
 
-@pytest.mark.parametrize("kind", ["png", "exr", "hdr", "json"])
-def test_full_disk(tmp_path: Path, kind: str) -> None:  # F5, R4
+@pytest.mark.parametrize(
+    "kind", [pytest.param(kind, id=f"R4-{kind}") for kind in ("png", "exr", "hdr", "json")]
+)
+def test_full_disk(tmp_path: Path, kind: str) -> None:
     folder = tmp_path / "out"
     write_small(folder)
     before = sha256s(folder)
-    for limit in (1_000, 100_000):
+    for limit in (1_000, 10_000, 100_000, 500_000):
         child = subprocess.run(
             [sys.executable, "-c", FULL_DISK, str(limit), kind, str(folder)],
             capture_output=True,
@@ -365,6 +369,39 @@ def test_layers_recompute_the_composite(tmp_path: Path, rng: np.random.Generator
     )
 
 
+def test_layers_are_read_back(tmp_path: Path, rng: np.random.Generator) -> None:
+    """Floats as they were, the rest rounded to half; what was not made is absent again."""
+    layers, camera = small_layers(rng)
+    with OutputFolder(tmp_path / "out") as out:
+        write_layers(out, layers, camera)
+    found = read_layers(tmp_path / "out" / "layers.exr")
+    for name in ("depth", "position", "normal"):
+        np.testing.assert_array_equal(getattr(found, name), getattr(layers, name))
+    for name in ("composite", "foreground", "shadow_ratio", "plate", "matte", "roughness"):
+        halves = getattr(layers, name).astype(np.float16)
+        np.testing.assert_array_equal(getattr(found, name), halves)
+    assert found.albedo is found.emission is found.specular is None
+
+
+def test_layers_of_others_are_refused(tmp_path: Path, rng: np.random.Generator) -> None:
+    """A panorama, half a file and no file: one line each, which names the file."""
+    layers, camera = small_layers(rng)
+    with OutputFolder(tmp_path / "out") as out:
+        write_layers(out, layers, camera)
+        out.write_envmap(four_lobes(directions(8)))
+    whole = (tmp_path / "out" / "layers.exr").read_bytes()
+    (tmp_path / "half.exr").write_bytes(whole[: len(whole) // 2])
+    for path, found in (
+        (tmp_path / "out" / "envmap.exr", "found no fg.R, fg.G, fg.B, fg.A"),
+        (tmp_path / "half.exr", "truncated"),
+        (tmp_path / "out" / "envmap.hdr", "not an EXR file"),
+        (tmp_path / "absent.exr", "absent"),
+    ):
+        with pytest.raises(InputError, match=found) as caught:
+            read_layers(path)
+        assert str(path) in str(caught.value)
+
+
 def test_layers_are_the_same_bytes_every_time(tmp_path: Path, rng: np.random.Generator) -> None:
     layers, camera = small_layers(rng)
     for name in ("a", "b"):
@@ -374,6 +411,7 @@ def test_layers_are_the_same_bytes_every_time(tmp_path: Path, rng: np.random.Gen
     assert sha256s(tmp_path / "a") == sha256s(tmp_path / "b")
 
 
+@pytest.mark.case("E13")
 def test_e13_mitsuba_reads_what_is_written(tmp_path: Path, rng: np.random.Generator) -> None:
     """A second reader finds the same values under the same names (OpenImageIO is the first)."""
     mitsuba = pytest.importorskip("mitsuba", reason="Mitsuba is not installed (extra bench)")
@@ -424,3 +462,73 @@ def test_importing_loads_no_heavy_library() -> None:
     )
     child = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=60)
     assert (child.returncode, child.stdout) == (0, "\n"), child.stderr
+
+
+@pytest.mark.case("F5")
+@pytest.mark.parametrize(
+    "name",
+    ["checkpoints/model.safetensors", "checkpoints/run.json", "progress/notes.txt", "progress"],
+)
+def test_folder_of_somebody_else_is_a_result(tmp_path: Path, name: str) -> None:
+    """Only what our names say is ours counts as an unfinished run's."""
+    path = tmp_path / "out" / name
+    path.parent.mkdir(parents=True)
+    path.write_text("mine")
+    for enter in (OutputFolder(tmp_path / "out").check, OutputFolder(tmp_path / "out").__enter__):
+        with pytest.raises(InputError, match="already holds files") as caught:
+            enter()
+        assert caught.value.code == ExitCode.OUTPUT and name in caught.value.what
+    assert path.read_text() == "mine" and len(list((tmp_path / "out").iterdir())) == 1
+
+
+@pytest.mark.case("F5")
+def test_lock_of_somebody_else_is_left_alone(tmp_path: Path) -> None:
+    (tmp_path / ".lock").write_text("precious")
+    with pytest.raises(InputError, match="not a lock") as caught, OutputFolder(tmp_path, True):
+        pass
+    assert caught.value.code == ExitCode.OUTPUT
+    assert (tmp_path / ".lock").read_text() == "precious"
+
+
+@pytest.mark.case("F5")
+@pytest.mark.parametrize("name", ["checkpoints", "progress", "mitsuba"])
+def test_link_in_place_of_a_folder_is_refused(tmp_path: Path, name: str) -> None:
+    """What is written into it would lie outside of --out, --overwrite or not."""
+    (tmp_path / "else").mkdir()
+    (tmp_path / "out").mkdir()
+    (tmp_path / "out" / name).symlink_to(tmp_path / "else")
+    folder = OutputFolder(tmp_path / "out", overwrite=True)
+    for enter in (folder.check, folder.__enter__):
+        with pytest.raises(InputError, match="a link in place") as caught:
+            enter()
+        assert caught.value.code == ExitCode.OUTPUT
+    assert not list((tmp_path / "else").iterdir()) and (tmp_path / "out" / name).is_symlink()
+
+
+@pytest.mark.case("R6")
+@pytest.mark.parametrize("what", ["gone", "changed", "another", "lock"])
+def test_folder_that_somebody_disturbs_is_not_committed(tmp_path: Path, what: str) -> None:
+    """A staged file gone or changed, a file that came meanwhile, a lock that was deleted."""
+    out = tmp_path / "out"
+    codes = {"gone": 5, "changed": 5, "another": 7, "lock": 7}
+    with pytest.raises(InputError) as caught, OutputFolder(out) as folder:
+        folder.write_bytes("a.txt", b"content")
+        folder.write_json("run.json", {})
+        if what == "gone":
+            (folder.staging / "a.txt").unlink()
+        elif what == "changed":
+            (folder.staging / "a.txt").write_bytes(b"CONTENT")
+        elif what == "another":
+            (out / "a.txt").write_bytes(b"mine")
+        else:
+            (out / ".lock").unlink()
+    assert caught.value.code == codes[what]
+    left = [path.name for path in out.rglob("*")] if out.exists() else []
+    assert left == (["a.txt"] if what == "another" else [])
+
+
+@pytest.mark.case("F5")
+def test_name_that_is_not_utf8_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match="UTF-8") as caught:
+        OutputFolder(tmp_path / "o\udcff").check()
+    assert caught.value.code == ExitCode.USAGE and caught.value.where == "--out"

@@ -22,7 +22,6 @@ from warpir.photo_files import read_photo
 from warpir.photo_world import make_world
 from warpir.placement import Placement, place_asset, y_to
 from warpir.point_cloud import read_point_cloud
-from warpir.record import input_hashes
 
 CAMERA = camera_from_fov(640, 480, 60.0, -8.0, 1.7)
 NOISE = 0.02
@@ -365,8 +364,9 @@ def test_colmap_scene_is_set_up_from_its_files(scene: Path) -> None:
     ):
         assert said in words
     assert (inputs.photo.codes != read_photo(scene / "photo.png").codes).any()
-    hashes = input_hashes(config)
-    assert {"camera/cameras.txt", "camera/images.txt", "ground_points/points3D.bin"} < set(hashes)
+    assert {"camera/cameras.txt", "camera/images.txt", "ground_points/points3D.bin"} < set(
+        inputs.hashes
+    )
     warned = read_inputs(replace(config, at=(46.0, 31.0), size=3.0))
     assert any("points of --ground-points stand where" in line for line in warned.notices)
 
@@ -389,6 +389,7 @@ def test_colmap_scene_needs_its_flags(scene: Path) -> None:
         read_inputs(replace(told, out=str(scene / "sparse")))
 
 
+@pytest.mark.case("C2")
 def test_camera_files_refer_to_the_upright_photo(tmp_path: Path) -> None:
     """A photo stored on its side takes the camera of its upright size (C2)."""
     codes = np.random.default_rng(1).integers(0, 256, (64, 48, 3)).astype(np.uint8)

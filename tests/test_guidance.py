@@ -29,7 +29,8 @@ from warpir.diffusion.guidance import (
     coefficients,
     make_guidance,
 )
-from warpir.diffusion.prior import Condition, ModelError
+from warpir.diffusion.model_error import ModelError
+from warpir.diffusion.prior import Condition
 from warpir.diffusion.schedule import NoiseSchedule
 from warpir.diffusion.settings import GuidanceSettings, ModelSettings
 from warpir.diffusion.stable_diffusion import StableDiffusion, load_stable_diffusion

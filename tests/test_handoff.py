@@ -7,7 +7,6 @@ import json
 import os
 import subprocess
 import sys
-import warnings
 import xml.etree.ElementTree as ET
 from pathlib import Path
 
@@ -16,11 +15,13 @@ import OpenImageIO as oiio
 import pytest
 from numpy.typing import NDArray
 from PIL import Image
+from PIL.PngImagePlugin import PngInfo
 
 from tests import oracles
 from tests.test_envmap_conventions import radiance, read, threejs
+from tests.test_gltf import Builder
 from tests.test_insert import ALWAYS, arguments, go, read_image, write_inputs
-from warpir import handoff
+from warpir import color, handoff
 from warpir.asset import load_asset
 from warpir.camera_files import read_camera
 from warpir.config import InsertConfig
@@ -146,6 +147,71 @@ def test_handoff_photo_is_upright_and_tells_nothing(folder: Path, tmp_path: Path
         assert b"a maker" not in (out / name).read_bytes()
 
 
+HOSTILE = (
+    '"""\'\'\'\n--->\n<integrator type="evil"/><!--\x00 ${x} $(touch x) {0} %s \\ -',
+    '-->--><!DOCTYPE a SYSTEM "file:///etc/passwd"]]>&lt;&a;--',
+    "---><shape type='obj'/>\n__import__('os').system('touch x')#\u202e\ud800",
+    "../../evil/--------->",
+)
+
+
+@pytest.mark.case("I17")
+@pytest.mark.parametrize("place", range(len(HOSTILE)))
+def test_handoff_takes_no_code_from_names(folder: Path, tmp_path: Path, place: int) -> None:
+    """Names of an asset, of files and in metadata change no script and no element of the scene."""
+    name = HOSTILE[place]
+    texts = {}
+    for kind, used, stem in (("plain", "name", "asset"), ("hostile", name, "a\n'\"$x {0} --><b")):
+        builder = Builder()
+        for key in ("materials", "meshes", "nodes", "scenes"):
+            builder.json[key][0]["name"] = used
+        builder.json["asset"]["copyright"] = used
+        (tmp_path / f"{stem}.glb").write_bytes(builder.glb())
+        out = tmp_path / kind
+        flags = {"asset": str(tmp_path / f"{stem}.glb"), "mitsuba": "", "device": "cpu"}
+        go(arguments(folder, out, rotate_y="180", **flags), out)
+        scene = out / "mitsuba" / "scene.xml"
+        elements = [(e.tag, e.attrib) for e in ET.parse(scene).iter()]
+        scripts = (out / "blender_setup.py", out / "mitsuba" / "render.py")
+        texts[kind] = (elements, *(path.read_bytes() for path in scripts))
+        names = {str(p.relative_to(out)) for p in out.rglob("*") if p.is_file()}
+        assert names == {*json.loads((out / "run.json").read_text())["files"], "run.json"}
+    assert texts["hostile"] == texts["plain"]
+    assert sorted(p.name for p in tmp_path.iterdir()) == sorted(
+        ["asset.glb", "a\n'\"$x {0} --><b.glb", "plain", "hostile"]
+    )
+
+
+@pytest.mark.case("I19")
+def test_handoff_carries_nothing_of_the_photo_but_its_pixels(folder: Path, tmp_path: Path) -> None:
+    """No EXIF, GPS, XMP, text or comment of any photo, in no file; no folder but in run.json."""
+    exif = Image.Exif()
+    exif[0x10F], exif[0x9286] = "SECRET maker", b"ASCII\0\0\0SECRET comment"
+    exif.get_ifd(0x8825)[1] = "N"
+    exif.get_ifd(0x8825)[29] = "SECRET date"
+    texts = PngInfo()
+    texts.add_itxt("XML:com.adobe.xmp", "<x:xmpmeta xmlns:x='adobe:ns:meta/'>SECRET</x:xmpmeta>")
+    texts.add_text("Comment", "SECRET")
+    xmp = b"<x:xmpmeta xmlns:x='adobe:ns:meta/'>SECRET</x:xmpmeta>" * 1000
+    codes = np.random.default_rng(2).integers(0, 256, (32, 48, 3), dtype=np.uint8)
+    photo = Image.fromarray(codes)
+    where = tmp_path / "private place"
+    where.mkdir()
+    photo.save(where / "a.png", exif=exif, pnginfo=texts)
+    photo.save(where / "a.jpg", exif=exif, comment=b"SECRET", xmp=xmp)
+    photo.save(where / "a.webp", exif=exif, xmp=xmp, lossless=True)
+    photo.save(where / "a.tif", exif=exif, description="SECRET", software="SECRET")
+    for file in sorted(where.iterdir()):
+        assert b"SECRET" in file.read_bytes()
+        out = tmp_path / file.suffix[1:]
+        go(arguments(folder, out, photo=str(file), mitsuba="", device="cpu"), out)
+        for path in (p for p in out.rglob("*") if p.is_file()):
+            content = path.read_bytes()
+            assert b"SECRET" not in content, path
+            assert path.name == "run.json" or b"private place" not in content, path
+            assert path.name == "run.json" or str(tmp_path).encode() not in content, path
+
+
 def test_provenance_is_marked_unless_told_otherwise(folder: Path, tmp_path: Path) -> None:
     """The composite's XMP is well-formed and says compositeSynthetic; --no-mark leaves it out."""
     with Image.open(folder / "out" / "composite.png") as picture:
@@ -171,10 +237,7 @@ def bent(curves: int) -> ToneKnots:
 
 
 def read_cube(path: Path) -> "object":
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")
-        import colour
-    return colour.read_LUT(str(path))
+    return color.colour_science().read_LUT(str(path))
 
 
 @pytest.mark.parametrize("knots", [bent(1), bent(3), ToneKnots.identity(1)], ids="135")

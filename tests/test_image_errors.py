@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 import torch
 from numpy.typing import NDArray
+from safetensors.torch import save_file
 from scipy.ndimage import correlate1d
 from scipy.optimize import minimize_scalar
 
@@ -165,7 +166,7 @@ def alexnet_state(seed: int) -> dict[str, torch.Tensor]:
 def test_lpips_is_alexnet_by_layers(tmp_path: Path, rng: np.random.Generator) -> None:
     """Restated with torch's modules in the order of torchvision's AlexNet."""
     state = alexnet_state(1)
-    torch.save(state, tmp_path / "lpips.pth")
+    save_file(state, tmp_path / "lpips.safetensors")
     image, truth = pictures(rng, 70, 90)
 
     nn = torch.nn
@@ -194,7 +195,7 @@ def test_lpips_is_alexnet_by_layers(tmp_path: Path, rng: np.random.Generator) ->
                 expected += float((squared * weight).sum(dim=0).mean())
                 k += 1
 
-    lpips = Lpips(tmp_path / "lpips.pth")
+    lpips = Lpips(tmp_path / "lpips.safetensors")
 
     assert k == 5
     assert lpips(image, truth) == pytest.approx(expected, rel=1e-4)
@@ -206,13 +207,13 @@ def test_lpips_is_alexnet_by_layers(tmp_path: Path, rng: np.random.Generator) ->
 def test_lpips_refuses_what_is_not_its_weights(tmp_path: Path) -> None:
     state = alexnet_state(1)
     del state["lin3.model.1.weight"]
-    torch.save(state, tmp_path / "part.pth")
-    (tmp_path / "text.pth").write_text("no weights")
-    for name in ("part.pth", "text.pth", "absent.pth"):
+    save_file(state, tmp_path / "part.safetensors")
+    (tmp_path / "text.safetensors").write_text("no weights")
+    for name in ("part.safetensors", "text.safetensors", "absent.safetensors"):
         with pytest.raises(InputError) as caught:
             Lpips(tmp_path / name)
         assert caught.value.code == ExitCode.MODEL
         assert name in str(caught.value)
     with pytest.raises(ValueError, match="64"):
-        torch.save(alexnet_state(1), tmp_path / "lpips.pth")
-        Lpips(tmp_path / "lpips.pth")(*pictures(np.random.default_rng(0)))
+        save_file(alexnet_state(1), tmp_path / "lpips.safetensors")
+        Lpips(tmp_path / "lpips.safetensors")(*pictures(np.random.default_rng(0)))

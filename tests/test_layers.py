@@ -12,36 +12,41 @@ MITSUBA_PARTS = {"mitsuba_light", "mitsuba_material", "mitsuba_path"}
 # Each module of warpir/ imports modules of lower levels only; a module that is on no level fails.
 LEVELS = (
     {
-        "errors", "color", "acceptance", "contact_sheet", "evaluation_report", "photo_look",
-        "training_batches",
+        "errors", "atomic", "caches", "signals", "color", "acceptance",
+        "contact_sheet", "evaluation_report", "photo_look", "training_batches", "study_plan",
+        "study_report", "page_policy",
     },
+    {"limits"},
     {
         "optimize_settings", "asset", "strict_json", "image_errors", "lpips", "image_decoder",
-        "lens", "colmap_model",
+        "lens", "colmap_model", "memory", "bad_pixels", "determinism",
     },
     {"config", "color_profile"},
     {
         "camera", "asset_files", "record", "progress", "light", "tone", "curves", "materials_file",
-        "ply", "stl",
+        "ply", "stl", "model_files", "study_pairs",
     },
-    {"envmap_conventions", "proxy_mesh", "lamps"},
+    {"envmap_conventions", "proxy_mesh", "lamps", "study_key", "study_pages"},
     {
         "gltf_file", "gltf_writer", "mtl", "files", "photo_files", "command", "placement",
         "lobes_file", "lobe_fit", "regressor", "light_errors", "camera_source", "point_cloud",
-        "ground", "sheen",
+        "ground", "sheen", "light_words", "report_plots", "study_answers", "preview_asset",
+        "place_server",
     },
     {
         "gltf_material", "obj", "reuse", "program", "regressor_training", "training_lights",
         "training_meshes", "panorama_crop", "three_spheres", "undistort", "free_space", "colmap",
-        "fspy", "nerfstudio", "waymo", "exr_camera", "shadow_mask",
+        "fspy", "nerfstudio", "waymo", "exr_camera", "shadow_mask", "report_facts",
+        "report_pictures", "study_images", "study_score", "study_server", "stance", "video",
     },
-    {"gltf", "evaluation_scenes", "predictions", "photo_world"},
+    {"finished"},
+    {"gltf", "evaluation_scenes", "predictions", "photo_world", "report"},
     {"gltf_camera"},
     {"camera_files"},
     {"inputs", "scene"},
-    {"render", "lighting"},
-    {"picture", "samples", "sequence", "estimate", "handoff"},
-    {"detail"},
+    {"render", "lighting", "disk_space"},
+    {"picture", "samples", "sequence", "estimate", "handoff", "placing"},
+    {"detail", "report_sequence"},
     {"integrator", "fusion", "sg_light", "mitsuba_scene", *MITSUBA_PARTS},
     {"mitsuba_render"},
     {"bridge", "trust"},
@@ -56,7 +61,10 @@ LEVELS = (
     {"refine", "evaluation_rows"},
     {"demo"},
     {"insert", "prior_images", "model_check"},
-    {"check_model", "train", "evaluate"},
+    {"check_model", "train", "evaluate", "study", "place", "manifest", "batch_task"},
+    {"batch_worker", "batch_local"},
+    {"batch_ray"},
+    {"batch"},
 )  # fmt: skip
 # A dispatcher by file extension: it calls the readers, and they fill its records.
 UPWARD = {("asset", "gltf"), ("asset", "obj")}
@@ -65,7 +73,7 @@ UPWARD = {("asset", "gltf"), ("asset", "obj")}
 ONLY_IN = {
     "warp": {
         "kernels", "scene", "render", "samples", "bridge", "transport", "transport_rows",
-        "prior_images",
+        "prior_images", "determinism",
     },
     "torch": {
         "diffusion", "tone", "bridge", "integrator", "fusion", "sg_light", "regularizers", "view",
@@ -73,30 +81,37 @@ ONLY_IN = {
         "optimize", "light_optimization", "recover", "refine", "insert", "prior_images",
         "model_check", "acceptance", "lit_frame", "trust", "regressor", "regressor_training",
         "training_batches", "training_lights", "photo_look", "lpips", "evaluation_rows",
-        "evaluation_stage", "train", "evaluate",
+        "evaluation_stage", "train", "evaluate", "determinism",
     },
     "trimesh": {"training_meshes"},
     "OpenImageIO": {"files", "image_decoder", "color_profile"},
     "OpenEXR": {"files"},
     "PIL": {
         "color_profile", "asset_files", "gltf_writer", "demo", "diffusion", "contact_sheet",
+        "report_pictures", "placing", "preview_asset",
     },
     "diffusers": {"diffusion"},
     "transformers": {"diffusion"},
     "peft": {"diffusion"},
     "safetensors": {
-        "diffusion", "checkpoint", "transport_cache", "regressor", "regressor_training",
+        "diffusion", "checkpoint", "transport_cache", "regressor", "regressor_training", "lpips",
     },
     "colour": {"color"},
     "yaml": {"command"},
-    "rich": {"progress"},
+    "rich": {"progress", "study_report"},
+    "ray": {"batch_ray"},
     "mitsuba": {*MITSUBA_PARTS, "mitsuba_render"},
     "drjit": {*MITSUBA_PARTS, "mitsuba_render"},
 }  # fmt: skip
 DIFFUSION_IN = {"recover", "refine", "prior_images", "model_check", "train", "evaluation_rows"}
 """Who drives the diffusion model; everyone else sees its settings and wording, which are plain."""
+DIFFUSION_SEES = {"atomic", "caches"}
+"""What diffusion shares with its host: the one way in which files are written."""
 SETTINGS = ("warpir.diffusion.settings", "warpir.diffusion.prompts")
 SETTINGS_IN = {"config", "command", *DIFFUSION_IN}
+FILES = ("model_error", "model_folder", "weight_files")
+"""What checks the models' files, without torch."""
+FILES_IN = {"model_files", "program", "regressor", *DIFFUSION_IN}
 NOT_IN_KERNELS = {"numpy", "warpir"}
 """``warpir.kernels`` sees Warp and itself."""
 
@@ -156,13 +171,15 @@ def test_imports_follow_the_table(path: Path) -> None:
         if folder == "kernels":
             assert top not in NOT_IN_KERNELS or target == "kernels", f"{where}: kernels see Warp"
         elif folder == "diffusion":
-            assert top != "warpir" or target == "diffusion", f"{where}: diffusion stands alone"
+            allowed = {"diffusion", *DIFFUSION_SEES}
+            assert top != "warpir" or target in allowed, f"{where}: diffusion stands alone"
         elif top == "warpir" and target and target != place and place != "__init__":
             if target == "kernels":
                 assert place in ONLY_IN["warp"], f"{where}: only Warp's callers see the kernels"
             elif target == "diffusion":
                 is_settings = name.startswith(SETTINGS)
-                allowed = SETTINGS_IN if is_settings else DIFFUSION_IN
+                is_files = name.split(".")[2] in FILES
+                allowed = SETTINGS_IN if is_settings else FILES_IN if is_files else DIFFUSION_IN
                 assert place in allowed, f"{where}: imported in {sorted(allowed)}"
             elif (place, target) not in UPWARD and level(target) >= 0:
                 assert level(target) < level(place), f"{where}: imports its own level or higher"
@@ -178,6 +195,13 @@ def test_layers_settings_are_plain() -> None:
     """What the command line reads of the diffusion model and the loop costs nothing to import."""
     for path in (ROOT / "diffusion" / "settings.py", ROOT / "warpir" / "optimize_settings.py"):
         assert {name for _, name in imports(path)} == {"dataclasses.dataclass"}
+
+
+def test_layers_models_are_checked_without_torch() -> None:
+    """Neither at the top of these modules nor in their functions."""
+    for name in FILES:
+        tops = {found.split(".")[0] for _, found in imports(ROOT / "diffusion" / f"{name}.py")}
+        assert not tops & {"torch", "diffusers", "transformers", "peft"}
 
 
 def test_layers_package_imports_nothing() -> None:

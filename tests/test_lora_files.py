@@ -29,7 +29,7 @@ from warpir.diffusion.lora_files import (
     save_lora,
     serialize,
 )
-from warpir.diffusion.prior import ModelError
+from warpir.diffusion.model_error import ModelError
 
 ATTENTION = ("to_q", "to_k", "to_v", "to_out.0")
 MORE = (*ATTENTION, "proj_in", "ff.net.0.proj", "ff.net.2", "conv1", "time_emb_proj", "conv_in")
@@ -141,6 +141,7 @@ def test_the_global_random_numbers_are_left_alone() -> None:
     assert torch.equal(torch.rand(3), expected)
 
 
+@pytest.mark.case("L8")
 @pytest.mark.parametrize("make", [random_lora, uneven_lora])
 @pytest.mark.parametrize("layers", [ATTENTION, MORE], ids=["attention", "more"])
 @pytest.mark.parametrize("place", [0, 1], ids=["diffusers", "kohya"])
@@ -161,6 +162,7 @@ def test_what_is_saved_has_the_same_strength_when_read(
     assert torch.equal(output(fresh.unet), output(prior.unet))
 
 
+@pytest.mark.case("L8")
 @pytest.mark.parametrize("place", [0, 1], ids=["diffusers", "kohya"])
 @pytest.mark.parametrize("alpha", [4.0, 8.0])
 def test_diffusers_reads_what_is_saved(
@@ -313,14 +315,14 @@ def renamed(lora: Lora, style: str, folder: Path) -> Path:
 @pytest.mark.parametrize(
     ("style", "alpha"),
     [
-        ("diffusers", 8.0),
-        ("diffusers-peft", 8.0),
-        ("diffusers-old", 4.0),
-        ("peft", 8.0),
-        ("unet-alone", 8.0),
-        ("kohya", 8.0),
-        ("kohya", 0.5),
-        ("kohya-without-alpha", 4.0),
+        pytest.param("diffusers", 8.0, id="L8-diffusers-alpha-8.0"),
+        pytest.param("diffusers-peft", 8.0, id="L8-diffusers-peft-alpha-8.0"),
+        pytest.param("diffusers-old", 4.0, id="L8-diffusers-old-alpha-4.0"),
+        pytest.param("peft", 8.0, id="L8-peft-alpha-8.0"),
+        pytest.param("unet-alone", 8.0, id="L8-unet-alone-alpha-8.0"),
+        pytest.param("kohya", 8.0, id="L8-kohya-alpha-8.0"),
+        pytest.param("kohya", 0.5, id="L8-kohya-alpha-0.5"),
+        pytest.param("kohya-without-alpha", 4.0, id="L8-kohya-without-alpha-alpha-4.0"),
     ],
 )
 def test_every_way_of_naming_is_read(tmp_path: Path, style: str, alpha: float) -> None:
@@ -334,6 +336,26 @@ def test_every_way_of_naming_is_read(tmp_path: Path, style: str, alpha: float) -
     torch.testing.assert_close(output(prior.unet), output(expected), rtol=1e-4, atol=2e-5)
 
 
+@pytest.mark.case("L8")
+def test_patterns_of_layers_are_names(tmp_path: Path) -> None:
+    """An alpha for some layers is read; an expression that would never end is not run."""
+    lora = random_lora(bare_prior())
+    weights = {f"base_model.model.{k}": v for k, v in lora.weights.items()}
+    save_file(weights, tmp_path / "adapter_model.safetensors")
+    first = sorted(lora.alphas)[0]
+    config = {"r": 4, "lora_alpha": 4, "target_modules": list(ATTENTION)}
+    for pattern in (first, f"^{first}$", first.replace(".", r"\.")):
+        text = json.dumps({**config, "alpha_pattern": {pattern: 2}})
+        (tmp_path / "adapter_config.json").write_text(text)
+        read = read_lora(tmp_path / "adapter_model.safetensors")
+        assert read.alphas[first] == 2.0 and set(read.alphas.values()) == {2.0, 4.0}
+    text = json.dumps({**config, "alpha_pattern": {"([a-z0-9_.]+)+X": 4}})
+    (tmp_path / "adapter_config.json").write_text(text)
+    with pytest.raises(ModelError, match="its configuration is damaged"):
+        read_lora(tmp_path / "adapter_model.safetensors")
+
+
+@pytest.mark.case("L8")
 def test_rank_stabilised_loras_keep_their_strength(tmp_path: Path) -> None:
     """The update is alpha / sqrt(rank) B A, as peft's configuration says."""
     lora = random_lora(bare_prior())
@@ -372,6 +394,7 @@ def test_a_second_lora_of_a_name_replaces_the_first() -> None:
 # Refusals
 
 
+@pytest.mark.case("L8")
 def test_a_lora_for_another_base_is_refused_in_one_sentence(tmp_path: Path) -> None:
     """Stable Diffusion 1.5 has the same layers as 2.1 but another width of the prompts."""
     other = bare_prior(tiny_unet(24))
@@ -465,31 +488,33 @@ def broken(kind: str, folder: Path) -> Path:
 @pytest.mark.parametrize(
     ("kind", "words"),
     [
-        ("pickle", "pickle"),
-        ("old pickle", "pickle"),
-        ("truncated", "whole safetensors"),
-        ("huge header", "whole safetensors"),
-        ("pointer", "Git LFS"),
-        ("absent", "no such file"),
-        ("folder", "is a folder"),
-        ("empty", "no keys"),
-        ("foreign", "1 of 1 keys are foreign"),
-        ("some foreign", "1 of 65 keys are foreign"),
-        ("one part", "only one of its two parts"),
-        ("not whole", "found 24 of 32 layers"),
-        ("unknown layers", "8 of its 32 layers are not in the model"),
-        ("nan", "not finite"),
-        ("rank 0", "rank 0"),
-        ("other shape", "another shape"),
-        ("parts that do not fit", "do not fit"),
-        ("text encoder", "text encoder"),
-        ("weight decomposed", "foreign"),
-        ("kohya without up", "whole kohya LoRA"),
-        ("alpha nan", "alpha is not finite"),
-        ("header not JSON", "not JSON"),
-        ("header a list", "not a JSON object"),
-        ("header alpha text", "configuration is damaged"),
-        ("dora in the header", "use_dora"),
+        pytest.param("pickle", "pickle", id="L8-pickle"),
+        pytest.param("old pickle", "pickle", id="L8-old-pickle"),
+        pytest.param("truncated", "whole safetensors", id="L8-truncated"),
+        pytest.param("huge header", "whole safetensors", id="L8-huge-header"),
+        pytest.param("pointer", "Git LFS", id="L8-pointer"),
+        pytest.param("absent", "no such file", id="L8-absent"),
+        pytest.param("folder", "is a folder", id="L8-folder"),
+        pytest.param("empty", "no keys", id="L8-empty"),
+        pytest.param("foreign", "1 of 1 keys are foreign", id="L8-foreign"),
+        pytest.param("some foreign", "1 of 65 keys are foreign", id="L8-some-foreign"),
+        pytest.param("one part", "only one of its two parts", id="L8-one-part"),
+        pytest.param("not whole", "found 24 of 32 layers", id="L8-not-whole"),
+        pytest.param(
+            "unknown layers", "8 of its 32 layers are not in the model", id="L8-unknown-layers"
+        ),
+        pytest.param("nan", "not finite", id="L8-nan"),
+        pytest.param("rank 0", "rank 0", id="L8-rank-0"),
+        pytest.param("other shape", "another shape", id="L8-other-shape"),
+        pytest.param("parts that do not fit", "do not fit", id="L8-parts-that-do-not-fit"),
+        pytest.param("text encoder", "text encoder", id="L8-text-encoder"),
+        pytest.param("weight decomposed", "foreign", id="L8-weight-decomposed"),
+        pytest.param("kohya without up", "whole kohya LoRA", id="L8-kohya-without-up"),
+        pytest.param("alpha nan", "alpha is not finite", id="L8-alpha-nan"),
+        pytest.param("header not JSON", "not JSON", id="L8-header-not-JSON"),
+        pytest.param("header a list", "not a JSON object", id="L8-header-a-list"),
+        pytest.param("header alpha text", "configuration is damaged", id="L8-header-alpha-text"),
+        pytest.param("dora in the header", "use_dora", id="L8-dora-in-the-header"),
     ],
 )
 def test_what_is_not_a_whole_lora_is_refused(tmp_path: Path, kind: str, words: str) -> None:
@@ -504,6 +529,7 @@ def test_what_is_not_a_whole_lora_is_refused(tmp_path: Path, kind: str, words: s
     assert not lora_parameters(prior, "scene")
 
 
+@pytest.mark.case("L8")
 def test_flipped_bytes_raise_nothing_but_our_error(
     tmp_path: Path, rng: np.random.Generator
 ) -> None:
@@ -528,6 +554,7 @@ def test_flipped_bytes_raise_nothing_but_our_error(
     assert refused > 20
 
 
+@pytest.mark.case("L8")
 @pytest.mark.parametrize(
     ("layers", "rank", "words"),
     [(ATTENTION, 0, "lora_rank"), (("to_z",), 4, "found 'to_z'"), (("q",), 4, "found 'q'")],

@@ -306,6 +306,7 @@ print(used() - before)
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="reads /proc")
+@pytest.mark.slow
 def test_steps_keep_no_memory(device: str) -> None:
     """Forty steps of an optimisation leave the process as large as the first ones made it."""
     child = subprocess.run(

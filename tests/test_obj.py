@@ -6,6 +6,7 @@ read where they exist.
 
 import io
 import struct
+import time
 from collections.abc import Callable
 from pathlib import Path
 
@@ -15,6 +16,7 @@ from PIL import Image
 
 from warpir.asset import Asset, load_asset
 from warpir.errors import ExitCode, InputError
+from warpir.limits import Limits
 from warpir.obj import clip_ears
 
 DATA = Path(__file__).parents[2] / "shared" / "data" / "mesh"
@@ -107,11 +109,19 @@ FAULTS: dict[str, tuple[str, tuple[str, ...]]] = {
     "M20-uv-index-too-large": (SQUARE + "f 1/9 2/1 3/1\n", ("line 10", "'1/9'", "4 vt")),
     "M20-normal-index-0": (SQUARE + "f 1//0 2//1 3//1\n", ("line 10", "'1//0'", "1 vn")),
     "M20-negative-too-far": (SQUARE + "f -5 -1 -2\n", ("line 10", "-5", "4 v")),
+    "M20-index-minus-0": (SQUARE + "f -0 -1 -2\n", ("line 10", "index -0", "4 v")),
+    "M20-index-of-4000-digits": (
+        SQUARE + f"f -1 -2 -{'9' * 4000}\n",
+        ("line 10", f"index -{'9' * 19}, but 4 v"),
+    ),
     "M20-decimal-comma": ("v 0,5 0 0\n" + SQUARE + FACES, ("line 1", "0,5", "decimal points")),
-    "M20-nan": (SQUARE.replace("v 1 1 0", "v 1 nan 0") + FACES, ("line 3", "finite")),
-    "M20-inf-uv": (SQUARE.replace("vt 1 1", "vt 1 inf") + FACES, ("line 7", "finite")),
-    "M20-1e300": (SQUARE.replace("v 1 1 0", "v 1 1e300 0") + FACES, ("1e+300", "1e+18")),
-    "M20-short-vertex": (SQUARE.replace("v 1 1 0", "v 1 1") + FACES, ("line 3", "3 finite")),
+    "M20-nan": (SQUARE.replace("v 1 1 0", "v 1 nan 0") + FACES, ("line 3", "numbers up to")),
+    "M20-inf-uv": (SQUARE.replace("vt 1 1", "vt 1 inf") + FACES, ("line 7", "numbers up to")),
+    "M20-1e300": (
+        SQUARE.replace("v 1 1 0", "v 1 1e300 0") + FACES,
+        ("line ", "1e300", "up to 3e+38"),
+    ),
+    "M20-short-vertex": (SQUARE.replace("v 1 1 0", "v 1 1") + FACES, ("line 3", "3 numbers")),
     "M20-two-corners": (SQUARE + "f 1 2\n", ("line 10", "2 corners")),
     "M20-word-as-index": (SQUARE + "f a b c\n", ("line 10", "'a'")),
     "M20-missing-mtl": ("mtllib gone.mtl\n" + SQUARE + FACES, ("gone.mtl", "--missing-textures")),
@@ -133,6 +143,7 @@ def test_fault_is_refused_with_its_line(case: str, tmp_path: Path) -> None:
     fails(write(tmp_path / "asset", text), *words)
 
 
+@pytest.mark.case("M21")
 @pytest.mark.parametrize("name", ["asset.obj", "asset.ply", "asset.stl"])
 @pytest.mark.parametrize("content", ["png", "empty", "noise"])
 def test_M21_other_content_is_refused(name: str, content: str, tmp_path: Path) -> None:
@@ -144,6 +155,7 @@ def test_M21_other_content_is_refused(name: str, content: str, tmp_path: Path) -
     fails(path, *(["empty file"] if content == "empty" else []))
 
 
+@pytest.mark.case("M20")
 def test_M20_concave_polygon_is_cut_by_ears(tmp_path: Path) -> None:
     """An L-shape keeps its area, seen from every side: no triangle lies outside or is turned."""
     shape = np.array([[0, 0], [2, 0], [2, 1], [1, 1], [1, 2], [0, 2]], dtype=float)
@@ -159,15 +171,49 @@ def test_M20_concave_polygon_is_cut_by_ears(tmp_path: Path) -> None:
             assert any("1 concave" in notice for notice in asset.notices)
 
 
+@pytest.mark.case("M20")
 def test_clip_ears_survives_a_crossing_polygon() -> None:
     """A self-intersecting polygon ends in some triangulation, never in a loop."""
     bow_tie = np.array([[0, 0, 0], [1, 1, 0], [1, 0, 0], [0, 1, 0], [0.5, 2, 0]])
     assert clip_ears(bow_tie).shape == (3, 3)
 
 
+@pytest.mark.parametrize(
+    "corners", [pytest.param(2000, id="M14-star"), pytest.param(1999, id="M14-tangle")]
+)
+def test_polygon_of_many_corners_is_cut_at_once(corners: int) -> None:
+    """2000 corners take a moment, simple or crossing; the area is that of the star."""
+    turn = np.arange(corners) * (2 * np.pi / corners)
+    radius = np.where(np.arange(corners) % 2, 1.0, 0.5)
+    points = np.column_stack([radius * np.cos(turn), radius * np.sin(turn), 0 * turn])
+    if corners % 2:
+        points = np.random.default_rng(0).permutation(points)
+    start = time.perf_counter()
+    triangles = clip_ears(points)
+    assert time.perf_counter() - start < 5.0
+    a, b, c = (points[triangles[:, k]] for k in range(3))
+    assert len(a) == corners - 2
+    if not corners % 2:
+        areas = np.cross(b - a, c - a)[:, 2] / 2
+        assert (areas > 0).all()
+        assert areas.sum() == pytest.approx(0.25 * corners * np.sin(2 * np.pi / corners))
+
+
+@pytest.mark.case("M14")
+def test_M14_concave_polygons_of_too_many_corners(tmp_path: Path) -> None:
+    """What would take minutes to cut is refused before."""
+    radius = np.where(np.arange(10_002) % 2, 1.0, 0.5)
+    turn = np.arange(10_002) * (2 * np.pi / 10_002)
+    rows = zip(radius * np.cos(turn), radius * np.sin(turn), strict=True)
+    text = "".join(f"v {x:.9f} {y:.9f} 0\n" for x, y in rows)
+    text += "f " + " ".join(map(str, range(1, 10_003)))
+    fails(write(tmp_path, text), "concave", "10002", "10000", "triangulate")
+
+
+@pytest.mark.case("M20")
 def test_M20_vertex_colors_are_linear_and_noted(tmp_path: Path) -> None:
     """``v x y z r g b`` gives linear colours on white."""
-    text = SQUARE.replace("v 1 1 0", "v 1 1 0 0.5 0.25 2") + FACES
+    text = SQUARE.replace("v 1 1 0", "v 1 1 0 0.5 0.25 1") + FACES
     asset = load_asset(write(tmp_path, text))
     colors = asset.primitives[0].colors
     np.testing.assert_array_equal(colors, [[1, 1, 1, 1]] * 2 + [[0.5, 0.25, 1, 1], [1, 1, 1, 1]])
@@ -175,9 +221,100 @@ def test_M20_vertex_colors_are_linear_and_noted(tmp_path: Path) -> None:
     assert any("linear" in notice for notice in asset.notices)
 
 
+@pytest.mark.case("M20")
+def test_M20_vertex_colors_of_8_bits(tmp_path: Path) -> None:
+    """Whole numbers up to 255 are divided by 255; what is cut is noted."""
+    text = SQUARE.replace("v 1 1 0", "v 1 1 0 255 102 0") + FACES
+    asset = load_asset(write(tmp_path, text))
+    assert asset.primitives[0].colors is not None
+    np.testing.assert_allclose(asset.primitives[0].colors[2], [1, 0.4, 0, 1], atol=1e-6)
+    assert any("divided" in notice for notice in asset.notices)
+    np.testing.assert_array_equal(asset.primitives[0].colors[1], [1, 1, 1, 1])
+    asset = load_asset(write(tmp_path, text.replace("102", "0.4")))
+    assert any("clamped" in notice for notice in asset.notices)
+
+
+@pytest.mark.case("M20")
+def test_M20_a_vertex_of_seven_numbers_is_refused(tmp_path: Path) -> None:
+    """A weight before the colour, or an opacity behind it: nobody knows."""
+    text = SQUARE.replace("v 1 1 0", "v 1 1 0 1 0.1 0.2 0.3") + FACES
+    with pytest.raises(InputError, match="line 3: v with 7 numbers"):
+        load_asset(write(tmp_path, text))
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "words"),
+    [
+        pytest.param("v 1 1 0", "v 1_0 1 0", "line 3: 'v 1_0 1 0'", id="M20-position-1_0"),
+        pytest.param("f 1", "f 0_1", "corner '0_1", id="M20-index-0_1"),
+    ],
+)
+def test_M20_numbers_of_python_alone_are_refused(
+    old: str, new: str, words: str, tmp_path: Path
+) -> None:
+    """Python passes over a _ in a number; no other program does."""
+    text = SQUARE + FACES
+    assert old in text
+    with pytest.raises(InputError, match=words):
+        load_asset(write(tmp_path, text.replace(old, new)))
+
+
+@pytest.mark.case("M20")
+def test_M20_numbers_of_python_alone_in_mtl_and_ply(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match="expected finite numbers"):
+        with_mtl(tmp_path, "Kd 1_0 0 0\n")
+    header = "ply\nformat ascii 1.0\nelement vertex 1\nproperty float x\nend_header\n"
+    with pytest.raises(InputError, match="a number with _"):
+        load_asset(write(tmp_path, header + "1_0\n", "a.ply"))
+
+
 def with_mtl(folder: Path, mtl: str) -> Asset:
     (folder / "asset.mtl").write_text("newmtl a b\n" + mtl)
     return load_asset(write(folder, "mtllib asset.mtl\n" + SQUARE + "usemtl a b\n" + FACES))
+
+
+NAMES = {
+    "M20-hash-in-name": ("newmtl Material #1", "usemtl Material #1"),
+    "M20-two-blanks-in-name": ("newmtl  a  b ", "usemtl a  b"),
+    "M20-name-like-a-comment": ("newmtl #1", "usemtl #1"),
+}
+
+
+@pytest.mark.parametrize("case", NAMES)
+def test_names_of_materials_are_kept_whole(case: str, tmp_path: Path) -> None:
+    """A name is the rest of its line in both files, so no two materials are merged."""
+    first, use = NAMES[case]
+    (tmp_path / "asset.mtl").write_text(f"{first}\nKd 1 0 0 # red\nnewmtl Material #2\nKd 0 1 0\n")
+    half = "f 1 2 3\n", "f 1 3 4\n"
+    text = f"mtllib asset.mtl\n{SQUARE}{use}\n{half[0]}usemtl Material #2\n{half[1]}"
+    asset = load_asset(write(tmp_path, text))
+    assert [m.base_color for m in asset.materials] == [(1.0, 0.0, 0.0), (0.0, 1.0, 0.0)]
+
+
+@pytest.mark.parametrize(
+    "name",
+    [pytest.param("my  c.png", id="M20-two-blanks"), pytest.param("c#1 #.png", id="M20-hash")],
+)
+def test_names_of_textures_are_kept_whole(name: str, tmp_path: Path) -> None:
+    """What follows the options of a map is the file's name, blanks and all."""
+    png(tmp_path / name, (200, 100, 50))
+    asset = with_mtl(tmp_path, f"map_Kd -clamp on  {name}\nPr 1\n")
+    assert asset.textures[0].pixels[0, 0].tolist() == [200, 100, 50, 255]
+
+
+@pytest.mark.case("M20")
+def test_M20_material_defined_again_is_noted(tmp_path: Path) -> None:
+    """The last definition of a name counts, whole, and a notice says so."""
+    asset = with_mtl(tmp_path, "Kd 1 0 0\nPr 1\nPm 1\nnewmtl a b\nKd 0 1 0\nPr 1\n")
+    assert (asset.materials[0].base_color, asset.materials[0].metallic) == ((0.0, 1.0, 0.0), 0.0)
+    assert asset.notices == ("asset.mtl line 5: 'a b' defined again, the last one counts",)
+
+
+@pytest.mark.case("M20")
+def test_M20_texture_coordinate_of_one_number(tmp_path: Path) -> None:
+    """Its v is 0; the others keep theirs."""
+    asset = load_asset(write(tmp_path, SQUARE.replace("vt 1 0\n", "vt 1\n") + FACES))
+    np.testing.assert_array_equal(asset.primitives[0].uv0, [[0, 1], [1, 1], [1, 0], [0, 0]])
 
 
 def test_mtl_pbr_keys(tmp_path: Path) -> None:
@@ -237,6 +374,7 @@ def test_mtl_nvdiffrec_pbr(tmp_path: Path) -> None:
     assert material.metallic_roughness_texture is not None
 
 
+@pytest.mark.case("M20")
 def test_M20_map_options(tmp_path: Path) -> None:
     """-s, -o and -clamp reach the slot; texture row 0 is the top."""
     png(tmp_path / "a c.png", (200, 100, 50))
@@ -260,6 +398,21 @@ def test_mtl_roughness_and_metallic_maps_are_packed(tmp_path: Path) -> None:
     assert slot is not None
     pixels = asset.textures[slot.texture].pixels
     assert pixels.shape == (4, 4, 4) and pixels[3, 3].tolist() == [255, 80, 160, 255]
+
+
+@pytest.mark.case("M14")
+def test_M14_materials_of_the_same_maps_share_them(tmp_path: Path) -> None:
+    """30 materials of the same files make each texture once."""
+    for name in ("c", "d", "r", "m"):
+        png(tmp_path / f"{name}.png", (80,), size=4)
+    maps = "map_Kd c.png\nmap_d d.png\nmap_Pr r.png\nmap_Pm m.png\n"
+    (tmp_path / "asset.mtl").write_text("".join(f"newmtl m{k}\n{maps}" for k in range(30)))
+    faces = "".join(f"usemtl m{k}\n{FACES}" for k in range(30))
+    path = write(tmp_path, "mtllib asset.mtl\n" + SQUARE + faces)
+    asset = load_asset(path, limits=Limits(texture_pixels=6 * 16))
+    assert (len(asset.materials), len(asset.textures)) == (30, 2)
+    with pytest.raises(InputError, match="too many texture pixels"):
+        load_asset(path, limits=Limits(texture_pixels=5 * 16))
 
 
 def test_mtl_mask_becomes_alpha(tmp_path: Path) -> None:
@@ -294,6 +447,7 @@ MTL_FAULTS = {
     "M4-texture-absolute": ("map_Kd /etc/c.png\n", ("outside the asset folder",)),
     "M4-texture-url": ("map_Kd http://127.0.0.1/c.png\n", ("outside the asset folder",)),
     "M18-nan": ("Kd nan 0 0\n", ("asset.mtl line 2", "finite")),
+    "M18-emission": ("Ke 1e30 0 0\n", ("'a b': Ke 1e+30", "at most 1e+12")),
     "M18-two-numbers": ("Kd 1 2\n", ("asset.mtl line 2", "RGB")),
     "M18-spectral": ("Kd spectral x.rfl\n", ("asset.mtl line 2", "RGB")),
     "M18-decimal-comma": ("Pr 0,5\n", ("asset.mtl line 2", "finite")),
@@ -314,6 +468,7 @@ def test_mtl_fault_is_refused(case: str, tmp_path: Path) -> None:
         assert word in f"{caught.value.what} / {caught.value.advice}"
 
 
+@pytest.mark.case("M3")
 def test_M3_missing_files_become_grey_on_request(tmp_path: Path) -> None:
     """A missing texture is one grey texel, a missing library a grey material, both noted."""
     (tmp_path / "asset.mtl").write_text("newmtl a\nmap_Kd gone.png\nPr 1\n")
@@ -446,6 +601,19 @@ def test_ply_says_what_it_does_not_read(tmp_path: Path) -> None:
     assert any("texture" in notice for notice in asset.notices)
 
 
+@pytest.mark.case("M7")
+def test_M7_ply_index_that_is_no_whole_number(tmp_path: Path) -> None:
+    """A list of floats may hold indices, and nothing between them."""
+    text = (
+        "ply\nformat ascii 1.0\ncomment no end_header here\nelement vertex 3\n"
+        "property float x\nproperty float y\nproperty float z\nelement face 1\n"
+        "property list uchar float vertex_indices\nend_header\n0 0 0\n1 0 0\n0 1 0\n"
+    )
+    assert len(load_asset(write(tmp_path, text + "3 0 1 2\n", "a.ply")).primitives) == 1
+    fails(write(tmp_path, text + "3 0 1.7 2\n", "a.ply"), "index 1.7 is no whole number")
+
+
+@pytest.mark.case("M12")
 def test_M12_point_cloud_has_nothing_to_render(tmp_path: Path) -> None:
     """A PLY of points alone is refused, with the flag that takes it."""
     content = ply_text("little", [(0, 0, 0), (1, 0, 0), (1, 1, 0)], [])
@@ -570,6 +738,9 @@ STL_SAME: dict[str, bytes] = {
     .encode(),
     "binary-that-begins-with-solid": b"solid made by a tool".ljust(80) + stl()[80:],
     "binary-with-a-tail": stl() + b"tail",
+    "M8-numbers-of-40-characters": ascii_stl()
+    .replace("vertex 1 0 0", f"vertex 10.{'0' * 35}e-1 0 0")
+    .encode(),
 }
 
 
@@ -586,6 +757,7 @@ STL_FAULTS = {
     "word-for-a-number": (ascii_stl().replace("vertex 1 0 0", "vertex 1 x 0"), "x"),
     "cut": (ascii_stl()[:-30], "1 solid and 0 endsolid"),
     "cut-inside": (ascii_stl().replace(" endfacet\nendsolid", "endsolid"), "facet 1 is not one"),
+    "M8-word-of-1000-characters": (ascii_stl().replace("1 0 0", f"1{'0' * 999} 0 0"), "of 1000 c"),
     "inf": (ascii_stl().replace("vertex 1 0 0", "vertex 1 inf 0"), "NaN or infinite"),
 }
 

@@ -416,6 +416,7 @@ def test_run_does_not_depend_on_threads(device: str, integrator: str) -> None:
 
 @pytest.mark.skipif(not STATM.exists(), reason="the system does not tell a process its memory")
 @pytest.mark.parametrize("integrator", ["transport", "mis"])
+@pytest.mark.slow
 def test_run_takes_flat_memory(device: str, integrator: str) -> None:
     """After the first steps, a hundred more keep nothing but their numbers."""
 

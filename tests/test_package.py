@@ -64,10 +64,19 @@ def test_wheel_holds_the_weights_and_their_card(wheel: zipfile.ZipFile) -> None:
 
 
 @pytest.mark.slow
-def test_wheel_installs_the_command(wheel: zipfile.ZipFile) -> None:
-    """``warpir-insert`` is the same program as ``python -m warpir.insert``."""
+def test_wheel_holds_the_page(wheel: zipfile.ZipFile) -> None:
+    """What warpir.place serves, three.js and its licence included."""
+    page = ROOT / "warpir" / "place_page"
+    files = {f"warpir/place_page/{p.relative_to(page)}" for p in page.rglob("*") if p.is_file()}
+    assert len(files) > 8 and files <= set(wheel.namelist())
+
+
+@pytest.mark.slow
+def test_wheel_installs_the_commands(wheel: zipfile.ZipFile) -> None:
+    """``warpir-insert`` is the same program as ``python -m warpir.insert``, and so is place."""
     entry = next(name for name in wheel.namelist() if name.endswith("entry_points.txt"))
-    assert "warpir-insert = warpir.insert:main" in wheel.read(entry).decode()
+    for name in ("insert", "place"):
+        assert f"warpir-{name} = warpir.{name}:main" in wheel.read(entry).decode()
 
 
 def test_constraints_fit_the_requirements() -> None:
@@ -78,6 +87,9 @@ def test_constraints_fit_the_requirements() -> None:
     names = [pin.split("==")[0].lower() for pin in pins]
     assert len(names) == len(set(names))
     assert not any("+" in pin for pin in pins)
-    wanted = [*project["dependencies"], *project["optional-dependencies"]["dev"]]
-    for requirement in wanted:
+    extras = project["optional-dependencies"]
+    (own,) = (entry for entry in extras["dev"] if entry.startswith("warpir["))
+    named = own.removeprefix("warpir[").removesuffix("]").split(",")
+    wanted = [*project["dependencies"], *(set(extras["dev"]) - {own})]
+    for requirement in [*wanted, *(entry for name in named for entry in extras[name])]:
         assert requirement.split(">")[0].lower() in names, requirement

@@ -77,6 +77,7 @@ def test_float_plates_are_linear(tmp_path: Path, rng: np.random.Generator, name:
     assert any("linear" in notice for notice in photo.notices)
 
 
+@pytest.mark.case("I12")
 def test_non_finite_plate_pixels_are_counted(tmp_path: Path) -> None:
     plate = np.ones((4, 5, 3), np.float32)
     plate[1, 2, 0], plate[3, 4] = np.nan, np.inf
@@ -121,6 +122,7 @@ def test_other_layouts_are_expanded(tmp_path: Path, rng: np.random.Generator, mo
     np.testing.assert_array_equal(photo.codes, np.asarray(picture.convert("RGB")))
 
 
+@pytest.mark.case("I9")
 def test_i9_cmyk_is_noted(tmp_path: Path, rng: np.random.Generator) -> None:
     Image.fromarray(codes8(rng)).convert("CMYK").save(tmp_path / "p.jpg")
     photo = read_photo(tmp_path / "p.jpg")
@@ -128,6 +130,7 @@ def test_i9_cmyk_is_noted(tmp_path: Path, rng: np.random.Generator) -> None:
     assert any("CMYK" in notice for notice in photo.notices)
 
 
+@pytest.mark.case("I10")
 def test_i10_alpha_is_refused_unless_asked(tmp_path: Path, rng: np.random.Generator) -> None:
     rgba = np.dstack([codes8(rng), np.full((24, 36), 255, np.uint8)])
     path = tmp_path / "p.png"
@@ -174,11 +177,13 @@ def test_constant_photo_is_noted(tmp_path: Path, level: int) -> None:
         "x" * 251 + ".png",
     ],
 )
+@pytest.mark.case("I17")
 def test_i17_names_do_not_matter(tmp_path: Path, rng: np.random.Generator, name: str) -> None:
     Image.fromarray(codes8(rng)).save(tmp_path / name, format="PNG")
     assert read_photo(tmp_path / name).kind == "png"
 
 
+@pytest.mark.case("I17")
 def test_i17_name_that_is_no_text(tmp_path: Path, rng: np.random.Generator) -> None:
     path = tmp_path / os.fsdecode(b"caf\xe9.png")
     Image.fromarray(codes8(rng)).save(tmp_path / "p.png")
@@ -187,6 +192,7 @@ def test_i17_name_that_is_no_text(tmp_path: Path, rng: np.random.Generator) -> N
         read_photo(path)
 
 
+@pytest.mark.case("E3")
 def test_e3_bit_rot_is_refused(tmp_path: Path, rng: np.random.Generator) -> None:
     ramp = np.linspace(0.0, 1.0, 64 * 96 * 3, dtype=np.float32).reshape(64, 96, 3)  # compresses
     path = write_image(tmp_path / "p.exr", ramp)
@@ -199,6 +205,7 @@ def test_e3_bit_rot_is_refused(tmp_path: Path, rng: np.random.Generator) -> None
 
 @pytest.mark.parametrize("kind", ["jpg", "png", "tif", "webp", "exr", "hdr"])
 @pytest.mark.parametrize("share", [0.05, 0.6, 0.97])
+@pytest.mark.case("I3", "E1", "E12")
 def test_i3_e1_e12_truncated_files_are_refused(
     tmp_path: Path, rng: np.random.Generator, kind: str, share: float
 ) -> None:
@@ -212,6 +219,7 @@ def test_i3_e1_e12_truncated_files_are_refused(
     fails(path, "truncated" if share > 0.1 else "")
 
 
+@pytest.mark.case("E2")
 def test_e2_second_part_cut_off(tmp_path: Path, rng: np.random.Generator) -> None:
     planes = {c: rng.random((64, 96), dtype=np.float32) for c in "RGB"}
     header = {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage}
@@ -225,6 +233,48 @@ def test_e2_second_part_cut_off(tmp_path: Path, rng: np.random.Generator) -> Non
 
 
 @pytest.mark.parametrize(
+    ("kind", "cut"),
+    [
+        pytest.param("scanlineimage", 0, id="E2-whole"),
+        pytest.param("scanlineimage", 100, id="E2-rows-cut"),
+        pytest.param("tiledimage", 0, id="E2-tiles-whole"),
+        pytest.param("tiledimage", 100, id="E2-tiles-cut"),
+    ],
+)
+def test_parts_that_are_not_used_are_not_decoded(tmp_path: Path, kind: str, cut: int) -> None:
+    """Their ends are read alone, and tell whether they are there."""
+    header = {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage}
+    header["displayWindow"] = (np.zeros(2, np.int32), np.array([63, 63], np.int32))
+    other = {**header, "type": getattr(OpenEXR, kind)}
+    if kind == "tiledimage":
+        other["tiles"] = OpenEXR.TileDescription()
+    planes = {c: np.full((64, 64), 0.5, np.float32) for c in "RGB"}
+    depth = {"Z": np.zeros((5000, 5000), np.float32)}
+    parts = [OpenEXR.Part(header, planes, "a"), OpenEXR.Part(other, depth, "b")]
+    path = tmp_path / "p.exr"
+    OpenEXR.File(parts).write(str(path))
+    path.write_bytes(path.read_bytes()[: path.stat().st_size - cut])
+    tracemalloc.start()
+    try:
+        if cut:
+            fails(path, "1 of 2 parts readable")
+        else:
+            assert any("2 parts" in notice for notice in read_photo(path).notices)
+            fails(path, "found 5000 x 5000", "--max-pixels", max_pixels=4000 * 4000)
+            fails(path, "too large an image", "--max-pixels", max_pixels=64 * 64)
+        assert tracemalloc.get_traced_memory()[1] < 30e6  # the part has 100 MB
+    finally:
+        tracemalloc.stop()
+
+
+@pytest.mark.case("I5")
+def test_i5_largest_limit_is_taken(tmp_path: Path, rng: np.random.Generator) -> None:
+    path = tmp_path / "p.png"
+    Image.fromarray(codes8(rng, 8, 8)).save(path)
+    assert read_photo(path, max_pixels=10**14).linear().shape == (8, 8, 3)
+
+
+@pytest.mark.parametrize(
     ("name", "content"),
     [
         ("text.jpg", b"hello, I am a text\n" * 9),
@@ -235,6 +285,7 @@ def test_e2_second_part_cut_off(tmp_path: Path, rng: np.random.Generator) -> Non
         ("photo.jpg", b"\0\0\0\x18ftypheic" + bytes(40)),
     ],
 )
+@pytest.mark.case("I6")
 def test_i6_other_content_is_refused(tmp_path: Path, name: str, content: bytes) -> None:
     (tmp_path / name).write_bytes(content)
     fails(tmp_path / name, "JPEG", "export" if b"heic" in content else "")
@@ -264,6 +315,7 @@ def test_foreign_kinds_are_named(tmp_path: Path, case: str, head: bytes) -> None
     fails(tmp_path / "p.jpg", case.split("-")[1], "export it as JPEG or 16-bit TIFF")
 
 
+@pytest.mark.case("I1")
 def test_i1_unreadable_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     (tmp_path / "p.png").write_bytes(b"x")
 
@@ -274,6 +326,7 @@ def test_i1_unreadable_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> 
     fails(tmp_path / "p.png", "cannot be read (Permission denied)")
 
 
+@pytest.mark.case("I5")
 def test_i5_large_photo_costs_nothing_until_it_is_allowed(tmp_path: Path) -> None:
     """10000 x 10000 is refused from its header; an allowed photo takes what its arrays take."""
     Image.new("1", (10000, 10000)).save(tmp_path / "p.png")
@@ -292,6 +345,7 @@ def test_i5_large_photo_costs_nothing_until_it_is_allowed(tmp_path: Path) -> Non
         tracemalloc.stop()
 
 
+@pytest.mark.case("I1", "I2", "I18")
 def test_i1_i2_i18_things_that_are_not_files(tmp_path: Path) -> None:
     fails(tmp_path / "missing.jpg", "no such file")
     fails(tmp_path, "folder")
@@ -304,6 +358,7 @@ def test_i1_i2_i18_things_that_are_not_files(tmp_path: Path) -> None:
     fails(Path("/dev/zero"), "not a regular file")
 
 
+@pytest.mark.case("I4", "E4")
 def test_i4_e4_size_limit_before_decoding(tmp_path: Path, rng: np.random.Generator) -> None:
     path = tmp_path / "p.png"
     header = struct.pack(">IIBBBBB", 20000, 20000, 8, 2, 0, 0, 0)
@@ -328,6 +383,7 @@ def test_i4_e4_size_limit_before_decoding(tmp_path: Path, rng: np.random.Generat
     fails(tmp_path / "p.exr", "too large")
 
 
+@pytest.mark.case("E7", "E8")
 def test_e7_e8_layered_exr_names_its_channels(tmp_path: Path) -> None:
     plane = np.ones((4, 6), np.float16)
     header = {"type": OpenEXR.scanlineimage}
@@ -360,6 +416,7 @@ def test_layers_are_chosen_by_name(
     np.testing.assert_array_equal(codes, factor * np.stack(planes, axis=-1))
 
 
+@pytest.mark.case("E8")
 def test_e8_colors_of_a_later_part(tmp_path: Path, rng: np.random.Generator) -> None:
     planes = [rng.random((4, 6), dtype=np.float32) for _ in range(2)]
     parts = [
@@ -375,12 +432,14 @@ def test_e8_colors_of_a_later_part(tmp_path: Path, rng: np.random.Generator) -> 
     np.testing.assert_array_equal(right.codes[..., 2], planes[1])
 
 
+@pytest.mark.case("E8")
 def test_e8_layer_of_a_photo_without_layers(tmp_path: Path, rng: np.random.Generator) -> None:
     Image.fromarray(codes8(rng)).save(tmp_path / "p.png")
     fails(tmp_path / "p.png", "no layers", "--layer", layer="beauty")
 
 
 @pytest.mark.parametrize("case", ["NO", "RLE", "ZIPS", "PIZ", "PXR24", "B44", "DWAA", "ZSTD"])
+@pytest.mark.case("E10")
 def test_e10_compressions(tmp_path: Path, case: str) -> None:
     """What loses nothing is exact; the others stay near a smooth image."""
     ramp = np.linspace(0.25, 1.0, 32 * 48).reshape(32, 48).astype(np.float16)
@@ -391,6 +450,7 @@ def test_e10_compressions(tmp_path: Path, case: str) -> None:
     np.testing.assert_allclose(found, ramp.astype(np.float32), atol=0.01 if lossy else 0.0)
 
 
+@pytest.mark.case("E10")
 def test_e10_tiles(tmp_path: Path, rng: np.random.Generator) -> None:
     pixels = rng.random((40, 56, 3), dtype=np.float32)
     spec = oiio.ImageSpec(56, 40, 3, "float")
@@ -449,6 +509,7 @@ AP1_TO_REC709 = np.array(  # ACES central, Bradford from its white to D65; rows 
 
 
 @pytest.mark.parametrize("case", ["chromaticities", "colorInteropID", "Rec.709"])
+@pytest.mark.case("I12")
 def test_i12_stated_primaries_of_plates_are_followed(
     tmp_path: Path, rng: np.random.Generator, case: str
 ) -> None:
@@ -467,6 +528,7 @@ def test_i12_stated_primaries_of_plates_are_followed(
     np.testing.assert_allclose(photo.codes, expected, atol=2e-4 if converted else 0)
 
 
+@pytest.mark.case("I12")
 def test_i12_what_is_not_followed_is_noted(tmp_path: Path) -> None:
     plane = np.eye(4, dtype=np.float32)
     path = str(tmp_path / "p.exr")
@@ -479,12 +541,14 @@ def test_i12_what_is_not_followed_is_noted(tmp_path: Path) -> None:
         assert any(words in notice for notice in read_photo(path).notices)
 
 
+@pytest.mark.case("E11")
 def test_e11_plates_are_divided_by_their_exposure(tmp_path: Path) -> None:
     path = write_image(tmp_path / "p.hdr", np.full((8, 12, 3), 0.5, np.float32))
     path.write_bytes(path.read_bytes().replace(b"FORMAT", b"EXPOSURE=4.0\nFORMAT", 1))
     np.testing.assert_array_equal(read_photo(path).linear(), np.float32(0.125))
 
 
+@pytest.mark.case("I12")
 def test_i12_bright_plate_becomes_srgb_codes(tmp_path: Path) -> None:
     """The picture is clipped and sRGB, as its file says; `linear` keeps what is above."""
     plate = np.full((4, 5, 3), 0.18, np.float32)
@@ -499,12 +563,14 @@ def test_i12_bright_plate_becomes_srgb_codes(tmp_path: Path) -> None:
     assert (shown[1, 2] == 65535).all() and (shown[2, 2] == 0).all()
 
 
+@pytest.mark.case("E5")
 def test_strict_refuses_what_would_be_repaired(tmp_path: Path) -> None:
     plate = np.ones((4, 5, 3), np.float32)
     plate[1, 2, 0] = np.nan
     fails(write_image(tmp_path / "p.exr", plate), "found 1 such", strict=True)
 
 
+@pytest.mark.case("E9")
 def test_e9_data_window_is_placed_in_the_display_window(tmp_path: Path) -> None:
     plane = np.arange(1, 17, dtype=np.float32).reshape(4, 4)
     header = {
@@ -522,6 +588,7 @@ def test_e9_data_window_is_placed_in_the_display_window(tmp_path: Path) -> None:
 # ----------------------------------------------------------------------------------- profiles
 
 
+@pytest.mark.case("I8")
 def test_i8_display_p3_is_converted_and_comes_back(
     tmp_path: Path, rng: np.random.Generator
 ) -> None:
@@ -553,6 +620,7 @@ def test_only_changed_pixels_get_new_codes(tmp_path: Path, rng: np.random.Genera
     assert edited.dtype == np.uint16
 
 
+@pytest.mark.case("I8")
 def test_i8_srgb_profile_changes_nothing(tmp_path: Path, rng: np.random.Generator) -> None:
     icc = ImageCms.ImageCmsProfile(ImageCms.createProfile("sRGB")).tobytes()
     codes = codes8(rng)
@@ -563,6 +631,7 @@ def test_i8_srgb_profile_changes_nothing(tmp_path: Path, rng: np.random.Generato
 
 
 @pytest.mark.parametrize("case", ["rubbish", "lab", "tag-count", "curve-count", "cut", "singular"])
+@pytest.mark.case("I8")
 def test_unusable_profiles_are_noted(tmp_path: Path, rng: np.random.Generator, case: str) -> None:
     icc = matrix_profile("p3")
     many = struct.pack(">I", 2**31)
@@ -627,6 +696,7 @@ def test_wide_profiles_against_little_cms(
     assert np.abs(back - deep)[inside].max() <= (1.2 if dtype is np.uint16 else 0.0)
 
 
+@pytest.mark.case("I8")
 def test_i8_profile_with_tables(tmp_path: Path, rng: np.random.Generator) -> None:
     columns = color.primaries_to_xyz(P3, color_profile.D50)
     codes = codes8(rng)
@@ -709,6 +779,7 @@ def test_png_says_its_colours(
     np.testing.assert_allclose(photo.srgb, np.clip(expected, 0.0, 1.0), atol=1e-3)
 
 
+@pytest.mark.case("I8")
 def test_i8_cicp_outranks_a_profile(tmp_path: Path, rng: np.random.Generator) -> None:
     codes = codes8(rng)
     icc = color_profile.matrix_profile(ADOBE_RGB, gamma_curve(2.2))
@@ -743,6 +814,7 @@ def test_hdr_signals_in_png_are_refused(
     fails(with_chunks(tmp_path / "p.png", codes8(rng), chunk), word, "sRGB")
 
 
+@pytest.mark.case("I8")
 def test_i8_uncalibrated_exif_is_noted(tmp_path: Path, rng: np.random.Generator) -> None:
     exif = Image.Exif()
     exif.get_ifd(0x8769)[0xA001] = 65535
@@ -750,6 +822,7 @@ def test_i8_uncalibrated_exif_is_noted(tmp_path: Path, rng: np.random.Generator)
     assert any("uncalibrated" in notice for notice in read_photo(tmp_path / "p.jpg").notices)
 
 
+@pytest.mark.case("I19")
 def test_i19_gain_map_is_noted(tmp_path: Path, rng: np.random.Generator) -> None:
     xmp = b"<x:xmpmeta xmlns:x='adobe:ns:meta/' hdrgm:Version='1.0'></x:xmpmeta>"
     Image.fromarray(codes8(rng)).save(tmp_path / "p.jpg", xmp=xmp)
@@ -777,6 +850,35 @@ def test_tiff_layouts(tmp_path: Path, rng: np.random.Generator, case: str) -> No
         assert any(word in notice for notice in read_photo(path).notices)
 
 
+@pytest.mark.parametrize("read", [read_photo, read_mask], ids=["I9-PA-photo", "I20-PA-mask"])
+def test_channels_that_the_decoder_mixes_up_are_refused(tmp_path: Path, read: Any) -> None:
+    """Of a palette with alpha OpenImageIO returns one colour, an index and a neighbour's red."""
+    picture = Image.new("RGB", (9, 6), (200, 100, 50))
+    picture.convert("PA").save(tmp_path / "p.tif")
+    options = {"alpha": "ignore"} if read is read_photo else {"photo_size": (9, 6)}
+    with pytest.raises(InputError, match="channels R, A, B"):
+        read(tmp_path / "p.tif", **options)
+
+
+@pytest.mark.parametrize("case", ["I12-float64-1e300", "I12-3e38-in-AP0"])
+def test_values_that_overflow_on_the_way_are_counted(tmp_path: Path, case: str) -> None:
+    """What is finite in the file but not in a float32 of Rec.709 is repaired, or refused."""
+    spec = oiio.ImageSpec(8, 4, 3, "double" if "64" in case else "float")
+    path = tmp_path / ("p.tif" if "64" in case else "p.exr")
+    pixels = np.full((4, 8, 3), 0.5)
+    pixels[0] = 1e300 if "64" in case else (3e38, -3e38, 0.0)
+    if "AP0" in case:
+        ap0 = (0.7347, 0.2653, 0.0, 1.0, 0.0001, -0.077, 0.32168, 0.33767)
+        spec.attribute("chromaticities", oiio.TypeDesc("float[8]"), ap0)
+    writer = oiio.ImageOutput.create(str(path))
+    assert writer.open(str(path), spec) and writer.write_image(pixels) and writer.close()
+    photo = read_photo(path)
+    assert np.isfinite(photo.codes).all() and (photo.codes[0] == 0.0).all()
+    assert (photo.codes[1:] > 0.4).all()
+    assert any(notice.startswith("8 non-finite") for notice in photo.notices)
+    fails(path, "not finite (found 8", strict=True)
+
+
 # -------------------------------------------------------------------------------------- masks
 
 
@@ -798,6 +900,21 @@ def test_mask_layouts(tmp_path: Path, rng: np.random.Generator, case: str) -> No
     assert notices == expected_notices.get(mode, [])
 
 
+@pytest.mark.parametrize("case", ["I20-labels-16", "I20-labels-palette"])
+def test_labels_of_other_files_are_no_mask(tmp_path: Path, case: str) -> None:
+    """8-bit codes in 16 bits, and palettes; a dim mask is one."""
+    labels = np.zeros((6, 9), np.uint16 if "16" in case else np.uint8)
+    labels[2:4, 2:5] = 255 if "16" in case else 1
+    picture = Image.fromarray(labels)
+    if "palette" in case:
+        picture.putpalette([0, 0, 0, 1, 1, 1])
+    picture.save(tmp_path / "m.png")
+    with pytest.raises(InputError, match="all but black"):
+        read_mask(tmp_path / "m.png", (9, 6))
+    Image.fromarray(np.full((6, 9), 30, np.uint8)).save(tmp_path / "dim.png")
+    assert read_mask(tmp_path / "dim.png", (9, 6)).max() == np.float32(30 / 255)
+
+
 @pytest.mark.parametrize("case", ["I20-uint16.png", "I20-uint16.tif", "I20-float32.exr"])
 def test_deep_masks_keep_their_values(tmp_path: Path, rng: np.random.Generator, case: str) -> None:
     kind, _, suffix = case.removeprefix("I20-").partition(".")
@@ -809,6 +926,7 @@ def test_deep_masks_keep_their_values(tmp_path: Path, rng: np.random.Generator, 
     np.testing.assert_array_equal(mask, codes[..., 0] / np.float32(top))
 
 
+@pytest.mark.case("I20")
 def test_i20_mask_is_turned_upright(tmp_path: Path, rng: np.random.Generator) -> None:
     codes = rng.integers(0, 256, (4, 6), dtype=np.uint8)
     exif = Image.Exif()
@@ -827,6 +945,7 @@ def test_i20_mask_is_turned_upright(tmp_path: Path, rng: np.random.Generator) ->
         ("I20-in-alpha", "only its alpha differs"),
         ("I20-range", "outside 0 to 1"),
         ("I20-nan", "outside 0 to 1, or not finite"),
+        ("I20-labels", "found 1 at most; expected 255"),
         ("I20-missing", "no such file"),
     ],
 )
@@ -842,6 +961,8 @@ def test_wrong_masks_are_refused(
         Image.fromarray(codes8(rng, 4, 6)).save(path)
     elif case == "I20-in-alpha":
         Image.fromarray(np.stack([np.full_like(codes, 255), codes], axis=-1)).save(path)
+    elif case == "I20-labels":
+        Image.fromarray((codes > 99).astype(np.uint8)).save(path)
     elif case in ("I20-range", "I20-nan"):
         path = tmp_path / "m.exr"
         value = 1.5 if case == "I20-range" else np.nan
@@ -852,6 +973,7 @@ def test_wrong_masks_are_refused(
     assert (caught.value.where, caught.value.code) == (str(path), ExitCode.INPUT)
 
 
+@pytest.mark.case("I20")
 def test_i20_even_mask_is_noted(tmp_path: Path) -> None:
     Image.fromarray(np.zeros((4, 6), np.uint8)).save(tmp_path / "m.png")
     notices: list[str] = []
@@ -863,6 +985,7 @@ def test_i20_even_mask_is_noted(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("kind", ["jpg", "png", "tif", "webp", "exr", "hdr"])
+@pytest.mark.case("I3", "E3")
 def test_flipped_bytes_give_a_picture_or_our_error(
     tmp_path: Path, rng: np.random.Generator, kind: str
 ) -> None:

@@ -1,5 +1,6 @@
 """Kinds of photos and of light maps, end to end: what of them is in the files that are written."""
 
+import shutil
 from pathlib import Path
 from typing import Any
 
@@ -7,8 +8,9 @@ import numpy as np
 import OpenEXR
 import pytest
 from numpy.typing import NDArray
-from PIL import Image
+from PIL import Image, PngImagePlugin
 
+from tests.faults import PEAK_BYTES, SECONDS, assert_fails, run_case
 from tests.image_files import matrix_profile, write_image
 from tests.test_insert import Run, arguments, go, inputs, read_image, read_layers, rgb, write_photo
 from warpir.camera_files import read_camera
@@ -20,6 +22,8 @@ from warpir.photo_files import read_envmap
 __all__ = ["inputs"]  # the fixture
 
 SIZE = (48, 32)
+PYTHON_BYTES = 1e8
+"""What Python and its libraries take."""
 TURNED_BACK = {  # how an upright image lies in a file: mirrored, turned, both
     2: lambda a: a[:, ::-1],
     6: lambda a: np.rot90(a, 1),
@@ -83,6 +87,7 @@ def test_untouched_pixels_keep_their_codes(inputs: Path, tmp_path: Path, case: s
         assert picture.info.get("icc_profile") == icc
 
 
+@pytest.mark.case("I19")
 def test_i19_metadata_of_the_photo_is_not_copied(inputs: Path, tmp_path: Path) -> None:
     """Neither place nor maker nor a long XMP is in any file that is written."""
     secret = "GPS-and-maker-of-the-photo"
@@ -120,6 +125,7 @@ def test_linear_plates_survive_in_the_layers(inputs: Path, tmp_path: Path, case:
     assert any("composite.png clips" in notice for notice in done.record["notices"])
 
 
+@pytest.mark.case("E8")
 def test_e8_layer_is_used_and_recorded(inputs: Path, tmp_path: Path) -> None:
     """--layer reaches the reader; without it the run ends with the layers' names."""
     plane = np.random.default_rng(2).uniform(0.1, 0.9, SIZE[::-1]).astype(np.float32)
@@ -155,6 +161,7 @@ def test_light_conventions_give_one_light(
         np.testing.assert_array_equal(theirs.image(), plain.image())
 
 
+@pytest.mark.case("I20")
 def test_i20_occluder_mask_end_to_end(inputs: Path, plain: Run, tmp_path: Path) -> None:
     """The masked half is the photo's, the other as without a mask; its sha256 is recorded."""
     mask = np.zeros(SIZE[::-1], np.uint8)
@@ -220,3 +227,115 @@ def test_bad_input_writes_nothing(
     lines = [line for line in capfd.readouterr().err.splitlines() if line.startswith("error: ")]
     assert len(lines) == 1 and words in lines[0]
     assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.parametrize(
+    "size", [(1, 1), (7, 5), (3, 4000), (4000, 3)], ids="I14-{0[0]}x{0[1]}".format
+)
+def test_odd_sizes_are_whole_runs(inputs: Path, tmp_path: Path, size: tuple[int, int]) -> None:
+    """From the photo to the files: nothing is divided by zero, all is finite and of that size."""
+    width, height = size
+    rng = np.random.default_rng(4)
+    codes = rng.integers(50, 200, (height, width, 3), dtype=np.uint8)
+    Image.fromarray(codes).save(tmp_path / "p.png")
+    changes = {"photo": str(tmp_path / "p.png"), "camera_height": "1.5", "place": "0,0,-3"}
+    done = go(arguments(inputs, tmp_path / "out", **changes), tmp_path / "out")
+    planes = read_layers(done.out / "layers.exr")
+    assert done.image().shape == codes.shape
+    assert all(np.isfinite(plane).all() for plane in planes.values())
+    kept = outside(planes)
+    np.testing.assert_array_equal(done.image()[kept], codes[kept])
+
+
+@pytest.mark.parametrize("level", [0, 255], ids=["I16-black", "I16-white"])
+def test_photos_without_signal_are_whole_runs(inputs: Path, tmp_path: Path, level: int) -> None:
+    """The run says so, also where the light is read off the photo, and holds no NaN."""
+    Image.fromarray(np.full((*SIZE[::-1], 3), level, np.uint8)).save(tmp_path / "p.png")
+    for light in (str(inputs / "sky.hdr"), None):
+        out = tmp_path / f"out-{light is None}"
+        done = go(arguments(inputs, out, photo=str(tmp_path / "p.png"), light=light), out)
+        assert any("no signal" in notice for notice in done.record["notices"])
+        planes = read_layers(done.out / "layers.exr")
+        assert all(np.isfinite(plane).all() for plane in planes.values())
+        assert np.isfinite(read_envmap(done.out / "envmap.exr")).all()
+        assert planes["matte.A"].max() == 1.0
+
+
+@pytest.mark.parametrize(
+    "name",
+    [
+        pytest.param("na\u00efve \u5199\u771f", id="I17-non-ASCII"),
+        pytest.param("a b  c", id="I17-spaces"),
+        pytest.param("quo'te\"", id="I17-quotes"),
+        pytest.param("x" * 251, id="I17-255-bytes"),
+        pytest.param("\u5199" * 83 + "xx", id="I17-255-bytes-of-UTF-8"),
+        pytest.param("-x", id="I17-leading-minus"),
+        pytest.param("--place", id="I17-like-a-flag"),
+        pytest.param("line\nbreak", id="I17-newline"),
+        pytest.param("%04d#?[*]$HOME;", id="I17-wildcards"),
+    ],
+)
+def test_names_do_not_matter_to_a_run(inputs: Path, tmp_path: Path, name: str) -> None:
+    """Photo, asset, light and camera of one name, given relative to the working directory."""
+    for source, suffix in (("photo.png", "png"), ("box.glb", "glb"), ("sky.hdr", "hdr")):
+        shutil.copy(inputs / source, tmp_path / f"{name}.{suffix}")
+    changes = {"photo": f"{name}.png", "asset": f"{name}.glb", "light": f"{name}.hdr"}
+    argv = [*arguments(inputs, "out", **changes), "--validate"]
+    if name.startswith("--"):  # a value that looks like a flag needs the equals sign
+        texts = {f"--{flag}": f"--{flag}={value}" for flag, value in changes.items()}
+        argv = [texts.get(a, a) for a in argv if a not in changes.values()]
+    ended = run_case(argv, tmp_path)
+    assert (ended.status, ended.err) == (ExitCode.DONE, ""), ended
+    assert ended.out.splitlines()[-1] == "inputs are valid"
+
+
+@pytest.mark.case("I17")
+def test_a_name_of_many_kinds_is_written_and_read_again(inputs: Path, tmp_path: Path) -> None:
+    """A whole run into such a folder, from such files; run.json repeats their names."""
+    folder = tmp_path / "na\u00efve \u5199 'q\" -x\nnew"
+    folder.mkdir()
+    for name in ("photo.png", "box.glb", "sky.hdr"):
+        shutil.copy(inputs / name, folder / f"-{name}")
+    changes = {"photo": "-photo.png", "asset": "-box.glb", "light": "-sky.hdr"}
+    changes = {flag: str(folder / name) for flag, name in changes.items()}
+    done = go(arguments(inputs, folder / "out", **changes), folder / "out")
+    assert done.record["config"]["photo"] == changes["photo"]
+    again = ["--config", str(folder / "out" / "run.json"), "--out", str(folder / "again")]
+    assert main(again) == ExitCode.DONE
+    first, second = (folder / n / "composite.png" for n in ("out", "again"))
+    assert first.read_bytes() == second.read_bytes()
+
+
+@pytest.mark.parametrize("kind", ["jpg", "png", "webp"], ids="I19-{}".format)
+def test_huge_metadata_costs_nothing(inputs: Path, tmp_path: Path, kind: str) -> None:
+    """8 MB of XMP (in JPEG, whose segments end at 64 kB, as much as fits), 60 kB of EXIF, GPS."""
+    exif = Image.Exif()
+    exif[0x9286] = "x" * 60_000
+    exif.get_ifd(0x8825)[29] = "2026:01:01"
+    size = 60_000 if kind == "jpg" else 8_000_000
+    xmp = f"<x:xmpmeta xmlns:x='adobe:ns:meta/'>{'y' * size}</x:xmpmeta>".encode()
+    path = tmp_path / f"p.{kind}"
+    picture = Image.fromarray(read_image(inputs / "photo.png")[0])
+    if kind == "png":
+        info = PngImagePlugin.PngInfo()
+        info.add_itxt("XML:com.adobe.xmp", xmp.decode(), zip=False)
+        picture.save(path, exif=exif, pnginfo=info)
+    else:
+        picture.save(path, exif=exif, xmp=xmp)
+    assert path.stat().st_size > size
+    ended = run_case([*arguments(inputs, "out", photo=str(path)), "--validate"], tmp_path)
+    assert (ended.status, ended.err) == (ExitCode.DONE, ""), ended
+    assert ended.peak_bytes < PEAK_BYTES and ended.seconds < SECONDS
+
+
+@pytest.mark.slow
+@pytest.mark.case("I5")
+def test_real_photo_of_100_megapixels(inputs: Path, tmp_path: Path) -> None:
+    """Refused at the default limit; within a larger one its memory is that of its arrays."""
+    Image.new("RGB", (10_000, 10_000), (90, 120, 60)).save(tmp_path / "p.png", compress_level=1)
+    argv = [*arguments(inputs, "out", photo="p.png"), "--validate"]
+    assert_fails(argv, ExitCode.INPUT, "10000 x 10000", "--max-pixels", cwd=tmp_path)
+    ended = run_case([*argv, "--max-pixels", "100000000"], tmp_path)
+    assert (ended.status, ended.err) == (ExitCode.DONE, ""), ended
+    # 3 codes and 3 floats a pixel stay; the floats are made by way of a second array.
+    assert ended.peak_bytes - PYTHON_BYTES < 1e8 * (3 + 2 * 12 + 4)

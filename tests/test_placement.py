@@ -146,6 +146,18 @@ def test_placement_warns(size: float, distance: float, words: str) -> None:
     assert words in placed.warnings[0]
 
 
+@pytest.mark.parametrize("y", [-3.0, 0.0, 7.0], ids=["M22-below", "M22-on", "M22-above"])
+def test_placement_off_the_ground_is_set_on_it(camera: Camera, y: float) -> None:
+    """A place below or above the ground means the point of the ground under or over it."""
+    placed = place_asset(LOW, HIGH, camera, place=(0.5, y, -20.0), scale=1.0)
+    on_ground = place_asset(LOW, HIGH, camera, place=(0.5, 0.0, -20.0), scale=1.0)
+    np.testing.assert_array_equal(placed.asset_to_world, on_ground.asset_to_world)
+    corners = np.array([[x, v, z] for x in (LOW[0], HIGH[0]) for v in (LOW[1], HIGH[1])
+                        for z in (LOW[2], HIGH[2])])  # fmt: skip
+    world = corners @ placed.asset_to_world[:3, :3].T + placed.asset_to_world[:3, 3]
+    assert world[:, 1].min() == pytest.approx(0.0, abs=1e-12)
+
+
 def test_placement_tells_distance_size_and_pixels() -> None:
     """A wrong horizon, height or unit shows in one line before anything is rendered."""
     camera = camera_from_fov(800, 600, 90.0, 0.0, 3.0)
@@ -158,12 +170,14 @@ def test_placement_tells_distance_size_and_pixels() -> None:
     )
 
 
+@pytest.mark.case("C8")
 def test_placement_plane_needs_a_normal() -> None:
     """A plane of zeros is refused."""
     with pytest.raises(InputError, match="--ground"):
         upright_plane((0.0, 0.0, 0.0, 1.0), np.array([0.0, 1.5, 0.0]))
 
 
+@pytest.mark.case("M16")
 @pytest.mark.parametrize("axis", ["x", "+x", "-x", "y", "-y", "z", "-z"])
 def test_M16_up_axis_of_an_asset_becomes_y(axis: str) -> None:
     """What points along the axis points up; normals and tangents follow, nothing is mirrored."""
@@ -187,6 +201,7 @@ def test_M16_up_axis_of_an_asset_becomes_y(axis: str) -> None:
     assert turned.normals.dtype == turned.tangents.dtype == np.float32
 
 
+@pytest.mark.case("M16")
 def test_M16_z_up_is_turned_by_the_stated_map() -> None:
     """(x, y, z) becomes (x, z, -y), as everywhere in the project."""
     np.testing.assert_array_equal(up_to_y("z") @ (1.0, 2.0, 3.0), (1.0, 3.0, -2.0))

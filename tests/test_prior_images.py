@@ -66,6 +66,7 @@ def generator(device: str, pool: LightPool, **shares: float) -> SceneGenerator:
 CROPS = {"made_up": 0.0, "hybrid": 0.0, "proxies": 0.0}
 
 
+@pytest.mark.slow
 def test_batches_hold_what_they_promise(device: str) -> None:
     scenes = generator(device, even(device, 3.0))
     batch = scenes.prior_batch(1, 24)
@@ -92,6 +93,7 @@ def test_batches_hold_what_they_promise(device: str) -> None:
     assert ((photo.share >= 0.0) & (photo.share <= 1.0)).all()
 
 
+@pytest.mark.slow
 def test_a_batch_is_a_function_of_seed_and_index(device: str) -> None:
     pool = even(device, 3.0)
     first = generator(device, pool).prior_batch(7, 6)
@@ -101,6 +103,7 @@ def test_a_batch_is_a_function_of_seed_and_index(device: str) -> None:
     assert not torch.equal(first.image, other.image)
 
 
+@pytest.mark.slow
 def test_the_same_scenes_lit_rightly_and_wrongly(device: str) -> None:
     pool = even(device, 3.0)
     right = generator(device, pool, mismatched=0.0).prior_batch(2, 32)
@@ -343,6 +346,7 @@ def test_the_prior_is_told_what_the_regressor_says(device: str) -> None:
         assert float((shown - batch.gbuffer[k, 7:10, inside].T).abs().mean()) < 0.02
 
 
+@pytest.mark.slow
 def test_a_misled_prior_is_told_of_the_next_scene(device: str) -> None:
     scenes = SceneGenerator(
         Stock(make_meshes(12, 3), even(device, 3.0), device),

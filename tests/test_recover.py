@@ -156,13 +156,14 @@ STOPS = {
     "first trace": ("view:View.__init__", 1),
     "optimisation before a checkpoint": ("optimize:Optimization.step", 2),
     "optimisation": ("optimize:Optimization.step", 6),
-    "checkpoint": ("checkpoint._write", 13),
+    "checkpoint": ("atomic.write_staged", 16),
     "last render": ("picture.make_picture", 1),
     "final files": ("files:OutputFolder._commit", 1),
 }
 
 
 @pytest.mark.parametrize("where", STOPS)
+@pytest.mark.slow
 def test_stopped_run_resumes_as_if_it_had_not_been(
     folder: Path, finished: Path, tmp_path: Path, where: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -233,6 +234,7 @@ def test_resume_without_a_checkpoint_starts_and_says_so(
     assert main([*argv(folder, out), "--resume"]) == ExitCode.OUTPUT
 
 
+@pytest.mark.case("L9")
 def test_resume_refuses_another_model(
     folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -272,6 +274,7 @@ def test_overwrite_starts_an_unfinished_run_again(
     assert results(unfinished) == results(finished)
 
 
+@pytest.mark.slow
 def test_stopped_overwrite_resumes(folder: Path, finished: Path, tmp_path: Path) -> None:
     """The results that were to be replaced do not stand in the way, and stay until the end."""
     out = tmp_path / "out"
@@ -305,6 +308,7 @@ def test_every_loss_runs(folder: Path, tmp_path: Path, loss: str) -> None:
     assert any("does without a LoRA" in x for x in record(out)["notices"]) == asks_base_alone
 
 
+@pytest.mark.slow
 def test_ablations(folder: Path, tmp_path: Path) -> None:
     """No tone curve, two lights, one light, no class images, no adapter, v-prediction."""
     few = {"steps": "3", "score_every": "0", "lora_steps": "2"}
@@ -428,3 +432,31 @@ def test_killed_run_resumes_to_the_same_bytes(folder: Path, tmp_path: Path) -> N
         done = subprocess.run([*command, "--resume"], env=environment, check=False)
         assert done.returncode == 0
     assert results(tmp_path / "out") == results(tmp_path / "whole")
+
+
+@pytest.mark.case("R3")
+def test_resume_of_another_version_is_refused(
+    folder: Path,
+    unfinished: Path,
+    capsys: pytest.CaptureFixture[str],
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """Other sources may compute another result; a checkout has them without another number."""
+    import warpir.record
+
+    monkeypatch.setattr(warpir.record, "sources_hash", lambda: "0" * 64)
+    assert main([*argv(folder, unfinished), "--resume"]) == ExitCode.INPUT
+    assert "versions.warpir: was" in capsys.readouterr().err
+
+
+@pytest.mark.case("F5")
+def test_unguided_run_does_not_take_the_place_of_an_unfinished_one(
+    folder: Path, unfinished: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Else --resume would replace its results, and neither command had --overwrite."""
+    before = digest(unfinished)
+    plain = [*argv(folder, unfinished), "--guidance", "none"]
+    for more in ([], ["--validate"]):
+        assert main([*plain, *more]) == ExitCode.OUTPUT
+        assert "holds an unfinished run" in capsys.readouterr().err
+    assert digest(unfinished) == before

@@ -169,6 +169,7 @@ def test_guided_run_says_who_spoke(
     assert curves["tone"] == "linear"
 
 
+@pytest.mark.slow
 def test_refused_end_is_the_start(
     folder: Path,
     tmp_path: Path,
@@ -201,6 +202,7 @@ def test_verdict_can_be_left_out(folder: Path, tmp_path: Path) -> None:
     assert (out / "lobes.json").exists() and not (out / "progress").exists()
 
 
+@pytest.mark.slow
 def test_judging_leaves_the_end_as_it_was(folder: Path, tmp_path: Path) -> None:
     """The verdict of the real prior is a finite number; the kept end is that of --no-accept."""
     judged, plain = tmp_path / "judged", tmp_path / "plain"
@@ -233,6 +235,7 @@ def test_adapted_to_the_photo(folder: Path, tmp_path: Path) -> None:
     assert "the embedded prior does not know: red" in record(out)["notices"]
 
 
+@pytest.mark.slow
 def test_stopped_run_resumes_as_if_it_had_not_been(folder: Path, tmp_path: Path) -> None:
     """In the loop: the start is read off the photo again, and the verdict is the same."""
     whole, out = tmp_path / "whole", tmp_path / "out"

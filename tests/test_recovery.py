@@ -186,6 +186,7 @@ def check(truth: Truth, loop: LightOptimization, contrast: float) -> None:
 
 
 @pytest.mark.parametrize("case", MADE)
+@pytest.mark.slow
 def test_recovery_of_a_made_sky(device: str, case: tuple[float, float, float, float]) -> None:
     """Direction, sun against sky, and tone curve come out of an even light and the identity."""
     azimuth, elevation, turn, contrast = case

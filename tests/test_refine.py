@@ -222,6 +222,7 @@ def test_curves_start_at_given_knots(rng: np.random.Generator) -> None:
 # ---------------------------------------------------------------------------------- loops
 
 
+@pytest.mark.slow
 def test_start_is_the_unrefined_image() -> None:
     """Free factors at their start give the asset's own picture, to the last bit."""
     own = (

@@ -15,6 +15,7 @@ from safetensors.torch import load_file, save_file
 from scipy.integrate import quad
 
 from warpir.camera import Camera, camera_from_fov
+from warpir.diffusion.weight_files import read_header, values_hash
 from warpir.errors import ExitCode, InputError
 from warpir.light import (
     Light,
@@ -369,11 +370,23 @@ def resize_config(path: Path) -> None:
     path.write_bytes(path.read_bytes().replace(b'\\"directions\\": 300', b'\\"directions\\": 200'))
 
 
+def other_network(path: Path) -> None:
+    """As if it had been written so."""
+    state, about = load_file(path), read_header(path).about
+    about["config"] = about["config"].replace('"directions": 300', '"directions": 200')
+    values = {name: part.numpy() for name, part in state.items()}
+    about["weights"] = values_hash(values, about["config"])
+    save_file(state, path, metadata=about)
+
+
 def other_kind(path: Path) -> None:
     save_file({"weight": torch.zeros(3)}, path)
 
 
-@pytest.mark.parametrize("fault", [Path.unlink, cut, poison, resize_config, other_kind])
+FAULTS = [Path.unlink, cut, poison, resize_config, other_network, other_kind]
+
+
+@pytest.mark.parametrize("fault", FAULTS, ids=lambda fault: f"L2-{fault.__name__}")
 def test_file_faults_are_named(tmp_path: Path, fault: Callable[[Path], None]) -> None:
     """Absent, cut off, not finite, of another size or another kind: one line, exit code 4."""
     path = tmp_path / "regressor.safetensors"

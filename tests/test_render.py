@@ -595,6 +595,7 @@ def roofed(device: str, *materials: Material, color: FloatArray | None = None) -
     return shadow(renderer, OVERHEAD)[0]
 
 
+@pytest.mark.case("M19")
 def test_M19_blend_lets_its_share_through(device: str) -> None:
     """BLEND 0.25: a quarter of camera samples stop; 0.75 of the sunlight passes, 0.5625 twice."""
     glass = Material(alpha_mode="BLEND", alpha=0.25)
@@ -618,6 +619,7 @@ def test_M19_blend_lets_its_share_through(device: str) -> None:
     np.testing.assert_allclose(roofed(device, glass, color=half), 0.875, rtol=FLOAT32)
 
 
+@pytest.mark.case("M19")
 @pytest.mark.parametrize(
     ("mode", "alpha", "stays"),
     [
@@ -639,6 +641,7 @@ def test_M19_alpha_modes_cover_and_shade_alike(
     np.testing.assert_array_equal(roofed(device, material), 1.0 - stays)
 
 
+@pytest.mark.case("M19")
 def test_M19_mask_follows_the_texture(device: str) -> None:
     """The left half of a card is cut away by its texture's alpha, for camera and for shadow."""
     pixels = np.full((4, 8, 4), 255, np.uint8)
@@ -653,6 +656,7 @@ def test_M19_mask_follows_the_texture(device: str) -> None:
     np.testing.assert_array_equal(ratio[:, 0].reshape(4, 8), 1.0 - expected[:4])
 
 
+@pytest.mark.case("M19")
 def test_M19_back_faces_are_culled_for_the_camera_alone(device: str) -> None:
     """A single-sided card seen from behind is invisible and still casts its shadow."""
     for double_sided, covered in ((False, 0.0), (True, 1.0)):
@@ -1054,6 +1058,7 @@ print(peaks[2] - peaks[1])
 """
 
 
+@pytest.mark.slow
 def test_memory_is_flat_in_samples(device: str) -> None:
     """Peak memory at 1024 samples is that at 64: nothing is kept per sample (issue 2)."""
     child = subprocess.run(

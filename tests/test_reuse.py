@@ -2,6 +2,7 @@
 
 import hashlib
 import json
+import os
 import shutil
 from collections.abc import Callable
 from dataclasses import replace
@@ -224,6 +225,14 @@ def cut(name: str) -> Callable[[Path], None]:
     return change
 
 
+def replaced(name: str, make: Callable[[Path], None]) -> Callable[[Path], None]:
+    def change(run: Path) -> None:
+        (run / name).unlink()
+        make(run / name)
+
+    return change
+
+
 def record_with(**changes: Any) -> Callable[[Path], None]:
     def change(run: Path) -> None:
         record = json.loads((run / "run.json").read_text())
@@ -278,8 +287,13 @@ BAD = {
     "record-cut": (cut("run.json"), "run.json: line"),
     "record-newer": (record_with(format=99), "run.json of unknown format (found 99"),
     "record-without-files": (record_with(files=None), "run.json: /files"),
-    "no-light": (removed("envmap.exr"), "envmap.exr: cannot be read"),
-    "no-curves": (removed("curves.json"), "curves.json: cannot be read"),
+    "no-light": (removed("envmap.exr"), "envmap.exr: no such file"),
+    "no-curves": (removed("curves.json"), "curves.json: no such file"),
+    "I18-light-is-a-pipe": (replaced("envmap.exr", os.mkfifo), "envmap.exr: not a regular file"),
+    "I18-light-is-a-device": (
+        replaced("envmap.exr", lambda path: path.symlink_to("/dev/zero")),
+        "envmap.exr: not a regular file",
+    ),
     "light-cut": (cut("envmap.exr"), "envmap.exr: changed since the run wrote it"),
     "curves-cut": (cut("curves.json"), "curves.json: changed since the run wrote it"),
     "light-unlisted": (record_with(files={}), "envmap.exr: changed since the run"),

@@ -5,12 +5,12 @@ import torch
 from torch import Tensor
 
 from warpir.diffusion.schedule import (
-    PREDICTION_TYPES,
     TIME_LIMIT,
     NoiseSchedule,
     time_range,
     weight,
 )
+from warpir.diffusion.settings import PREDICTION_TYPES
 
 FLOAT32 = 1e-6
 """Relative: a few operations in float32."""

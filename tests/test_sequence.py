@@ -80,7 +80,8 @@ def test_sequence_writes_complete_folders(
 ) -> None:
     """One result folder a frame; the summary names each, its line, changes and record."""
     _, out = frames
-    assert sorted(p.name for p in out.iterdir()) == ["0001", "0002", "0003", "sequence.json"]
+    names = ["0001", "0002", "0003", "sequence.html", "sequence.json"]
+    assert sorted(p.name for p in out.iterdir()) == names
     summary = json.loads((out / "sequence.json").read_text())
     assert summary["format"] == "warpir-sequence" and summary["reuse"] == str(first.out)
     assert [frame["line"] for frame in summary["frames"]] == [1, 3, 4]
@@ -230,7 +231,7 @@ BAD_LINES: list[tuple[object, str]] = [
     ({"light": "sky.hdr"}, "key 'light' is one for all frames"),
     ({"place": [0, 0]}, "place: expected X,Y,Z (found a list of 2)"),
     ({"seed": None}, "seed: expected a whole number (found null)"),
-    ({"scale": -1}, "--scale: more than 0 (found -1.0)"),
+    ({"scale": -1}, "--scale: at least 1e-09 (found -1.0)"),
     ({"place": [0, 0, -5], "at": [3, 3]}, "--at: cannot be used with --place"),
     ({"photo": "none.png"}, "none.png: no such file"),
     ({"asset": "photo.png"}, "photo.png: not a mesh"),
@@ -324,3 +325,79 @@ def test_sequence_needs_photo_and_asset_on_every_line_or_once(tmp_path: Path) ->
     config.require_inputs()
     error = refused(["--out", "o", "--sequence", "s.jsonl"])
     assert error.where == "--sequence" and "needs --reuse" in error.what
+
+
+def test_changed_files_of_the_asset_are_noticed(
+    inputs: Path, first: Run, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Another material makes another frame, though the asset's own file is the same."""
+    for name in ("box.obj", "box.mtl"):
+        (tmp_path / name).write_bytes((inputs / name).read_bytes())
+    lines = write_lines(tmp_path / "s.jsonl", [{}], inputs)
+    argv = argv_of(inputs, first, lines, tmp_path / "out", asset=str(tmp_path / "box.obj"))
+    assert main(argv) == ExitCode.DONE
+    assert main([*argv, "--validate"]) == ExitCode.DONE
+    assert "1 are done already" in capsys.readouterr().out
+    (tmp_path / "box.mtl").write_text("newmtl red\nKd 0.1 0.1 0.8\n")
+    assert_fails(capsys, argv, ExitCode.OUTPUT, "s.jsonl:1:", "other settings or other files")
+    (tmp_path / "box.mtl").unlink()
+    assert main(argv) != ExitCode.DONE
+
+
+@pytest.mark.case("F5")
+def test_summary_replaces_no_other_file(
+    inputs: Path, first: Run, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """A list that lies in --out under the summary's name, and a file of that name."""
+    lines = write_lines(tmp_path / "sequence.json", [{}], inputs)
+    before = lines.read_bytes()
+    argv = argv_of(inputs, first, lines, tmp_path)
+    for more in ([], ["--overwrite"]):
+        assert_fails(capsys, [*argv, *more], ExitCode.USAGE, "would replace --sequence")
+    assert lines.read_bytes() == before
+    other = write_lines(tmp_path / "s.jsonl", [{}], inputs)
+    argv = argv_of(inputs, first, other, tmp_path)
+    assert_fails(capsys, argv, ExitCode.OUTPUT, "sequence.json: not the summary")
+    assert lines.read_bytes() == before
+
+
+def test_page_shows_every_frame(frames: tuple[list[str], Path], inputs: Path) -> None:
+    """A picture of each, what its line changes by the names of files, and its own report."""
+    page = (frames[1] / "sequence.html").read_text("utf-8")
+    for name in ("0001", "0002", "0003"):
+        assert f'href="{name}/report.html"' in page and (frames[1] / name / "report.html").exists()
+    assert page.count('src="data:image/jpeg') == 3 and "photo deep.png, at 24.0,24.0" in page
+    assert str(inputs) not in page and "default-src 'none'" in page
+
+
+def test_page_that_fails_is_a_notice(
+    frames: tuple[list[str], Path],
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    """All frames are there: the exit status is theirs, and the page of before stays."""
+
+    def fail(*_: object) -> None:
+        raise ValueError("odd")
+
+    before = (frames[1] / "sequence.html").read_bytes()
+    monkeypatch.setattr("warpir.report_sequence.thumbnail", fail)
+    assert main(frames[0]) == ExitCode.DONE
+    told = capsys.readouterr().out
+    assert "notice: sequence.html could not be made (ValueError: odd)" in told
+    assert (frames[1] / "sequence.html").read_bytes() == before
+
+
+def test_page_replaces_no_other_file(
+    inputs: Path, first: Run, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """A page of somebody's own is not lost, and not asked for where none is written."""
+    out = tmp_path / "out"
+    out.mkdir()
+    (out / "sequence.html").write_text("<p>mine</p>")
+    argv = argv_of(inputs, first, write_lines(tmp_path / "s.jsonl", [{}], inputs), out)
+    before = digest(tmp_path)
+    assert_fails(capsys, argv, ExitCode.OUTPUT, "sequence.html: not a page of warpir's")
+    assert_fails(capsys, [*argv, "--validate"], ExitCode.OUTPUT, "not a page of warpir's")
+    assert digest(tmp_path) == before
+    assert main([*argv, "--validate", "--no-report"]) == ExitCode.DONE

@@ -14,9 +14,9 @@ import torch
 from torch import Tensor
 
 from tests.tiny_stable_diffusion import RESOLUTION, make_tiny_stable_diffusion
-from warpir.diffusion.prior import ModelError, Prior
-from warpir.diffusion.schedule import PREDICTION_TYPES
-from warpir.diffusion.settings import ModelSettings
+from warpir.diffusion.model_error import ModelError
+from warpir.diffusion.prior import Prior
+from warpir.diffusion.settings import PREDICTION_TYPES, ModelSettings
 from warpir.diffusion.stable_diffusion import StableDiffusion, load_stable_diffusion
 
 ROUNDING = 1e-5
@@ -537,6 +537,7 @@ def test_prompts_are_embedded_once(fresh: StableDiffusion) -> None:
         fresh.embed(["scene", "sks"])
 
 
+@pytest.mark.case("F4")
 def test_long_prompt_is_cut_with_a_notice(fresh: StableDiffusion) -> None:
     """77 tokens are read, two of them marks; the notice tells where the rest was left off."""
     count = len(fresh.notices)
@@ -608,6 +609,7 @@ def differences(prior: StableDiffusion, distance: float) -> Callable[[], Tensor]
     return difference
 
 
+@pytest.mark.case("L7")
 def test_precision_check_sees_what_rounding_spoils(low: StableDiffusion) -> None:
     """The smaller the difference, the more of it is rounding; fp32 has none to speak of."""
     cosines = [low.precision_check(differences(low, distance)) for distance in (1.0, 0.01)]
@@ -641,6 +643,7 @@ def load_exact_copy(prior: StableDiffusion) -> StableDiffusion:
     return other
 
 
+@pytest.mark.case("L7")
 def test_ensure_precision_falls_back_with_a_notice(low: StableDiffusion) -> None:
     count = len(low.notices)
     assert low.ensure_precision(differences(low, 3.0)) >= 0.98
@@ -652,6 +655,7 @@ def test_ensure_precision_falls_back_with_a_notice(low: StableDiffusion) -> None
     assert low.ensure_precision(differences(low, 0.01)) == 1.0
 
 
+@pytest.mark.case("L7")
 def test_ensure_precision_falls_back_from_overflow(fresh: StableDiffusion) -> None:
     """Values of attention that overflow in fp16 give nan, whose cosine is no number either."""
     for name, weight in fresh.unet.named_parameters():

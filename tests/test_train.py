@@ -17,6 +17,7 @@ import torch
 from torch import Tensor, nn
 
 import warpir.diffusion.train as module
+from warpir import atomic
 from warpir.diffusion.embedded import (
     NetworkConfig,
     build_network,
@@ -24,7 +25,7 @@ from warpir.diffusion.embedded import (
     tokenize,
     training_tokens,
 )
-from warpir.diffusion.prior import ModelError
+from warpir.diffusion.model_error import ModelError
 from warpir.diffusion.train import (
     CURVE,
     SHARD_BYTES,
@@ -42,6 +43,8 @@ from warpir.diffusion.train import (
     train_prior,
     write_checkpoint,
 )
+from warpir.errors import ExitCode
+from warpir.train import main
 
 TINY = NetworkConfig(
     widths=(16, 32), layers=1, attention_from=1, head_width=16, groups=8, embedding_width=16
@@ -381,10 +384,11 @@ def test_an_older_checkpoint_stays_until_the_new_one_is_whole(
         raise OSError("disk full")
 
     with monkeypatch.context() as patch:
-        patch.setattr(module, "write_file", full)
+        patch.setattr(atomic, "write_staged", full)
         with pytest.raises(OSError, match="disk full"):
             write_checkpoint(out, held.network, held.average, Progress(step=99), SETTINGS)
-    (out / "checkpoint-00000099.part").mkdir(exist_ok=True)
+    assert not [*out.glob(".*")]
+    (out / ".partial-checkpoint-00000099-1").mkdir()  # as a kill leaves it
     assert read_checkpoint(out).progress == held.progress
 
 
@@ -534,12 +538,45 @@ def test_command_refuses_what_cannot_be_meant(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     """One line names the flag or the folder."""
-    from warpir.errors import ExitCode
-    from warpir.train import main
-
     given = ["prior", "--out", str(tmp_path), "--panoramas"]
     argv = [*given, str(tmp_path), "--resume", "--start", "w.safetensors"]
     assert main(argv) == ExitCode.USAGE
     assert "error: --start: what is resumed has its own weights" in capsys.readouterr().err
     assert main([*given, str(tmp_path / "absent")]) == ExitCode.INPUT
     assert "no such folder" in capsys.readouterr().err
+
+
+@pytest.mark.case("F5")
+@pytest.mark.parametrize(
+    ("given", "code", "words"),
+    [
+        (["--minutes", "nan"], ExitCode.USAGE, "--minutes"),
+        (["--total-minutes", "0"], ExitCode.USAGE, "--total-minutes"),
+        (["--batch", "0"], ExitCode.USAGE, "--batch"),
+        (["--start", "no.safetensors"], ExitCode.MODEL, "no.safetensors"),
+        (["--resume", "--out", "empty"], ExitCode.INPUT, "nothing to resume"),
+        (["--out", "begun"], ExitCode.OUTPUT, "a training that was begun"),
+        (["--out", "file"], ExitCode.OUTPUT, "not a folder"),
+    ],
+    ids=["nan", "no-time", "no-batch", "no-start", "no-state", "begun", "file"],
+)
+@pytest.mark.parametrize("network", ["prior", "regressor"])
+def test_training_looks_before_it_begins(
+    network: str,
+    given: list[str],
+    code: int,
+    words: str,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    """Scenes take minutes to make, and hours of training must not be lost."""
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "empty").mkdir()
+    held = tmp_path / "begun" / {"prior": "checkpoint-000100", "regressor": "state-000900"}[network]
+    held.mkdir(parents=True)
+    (tmp_path / "file").write_text("mine")
+    argv = [network, "--panoramas", "empty", "--out", "new", "--minutes", "1", *given]
+    assert main(argv) == code
+    assert words in capsys.readouterr().err.splitlines()[0]
+    assert held.is_dir() and not (tmp_path / "new").exists()

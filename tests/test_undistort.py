@@ -46,6 +46,7 @@ def test_lens_reach_is_where_the_image_folds(k1: float) -> None:
     assert Lens((-0.5, 0.1, 0, 0)).reach() == pytest.approx(1.0)
 
 
+@pytest.mark.case("C7")
 def test_points_are_seen_where_the_photo_is_sampled(rng: np.random.Generator) -> None:
     """World points through pinhole and OpenCV's distortion are what the straight pixel samples."""
     u, v, outside = source_positions(CAMERA, BARREL, 3, 30)

@@ -1,0 +1,205 @@
+"""Which tests cover which numbered case, and the page about it: docs/robustness.md.
+
+A test covers the cases that its id names (``test_faults[I4-huge-header]``) or its mark does
+(``@pytest.mark.case("R13")``). The page is made from a whole run of the tests:
+
+    python -m pytest --cases=cases.json
+    python -m tests.cases cases.json            # writes the page
+    python -m tests.cases cases.json --check    # says whether the page is what it would write
+"""
+
+import csv
+import difflib
+import json
+import re
+import sys
+from collections.abc import Iterable, Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from tests import faults
+
+PAGE = Path(__file__).parent.parent / "docs" / "robustness.md"
+BYTE_FLIPS = PAGE.with_name("byte_flips.json")
+HEADINGS = {
+    "I": "Images: photo and mask",
+    "E": "EXR and HDR",
+    "M": "Meshes",
+    "C": "Cameras and ground",
+    "F": "Configuration, prompt, command line",
+    "L": "Model folder and LoRA",
+    "R": "Checkpoints, disk, signals, memory, environment",
+}
+EXCLUDED = {
+    "E13": "read back by OpenImageIO; by Mitsuba too, but only where the extra bench is installed",
+}
+"""Cases that not every run of the tests covers in full, with the reason."""
+INTRODUCTION = """\
+# What happens when something is wrong
+
+What warpir promises:
+
+1. A bad input ends the run within seconds, with one sentence that names the file or flag, what was
+   found and what was expected. Never a traceback, never a wrong picture.
+2. Results that existed before a failed run are byte-identical afterwards. A folder that contains
+   `run.json` holds a complete result.
+3. An interrupted run continues from its last checkpoint and gives the result the uninterrupted run
+   would have given. A resume that cannot do that is refused; it never restarts silently.
+4. No network, no code from data files, no pickle, no shell, unless a flag named for it is given.
+5. What was repaired, assumed, clamped or skipped is counted and written to `run.json`.
+6. The exit code tells the truth.
+"""
+
+
+def read_cases() -> dict[str, tuple[str, str]]:
+    """Return what each case is and what it must end in, by its number."""
+    with Path(__file__).with_suffix(".tsv").open(encoding="utf-8", newline="") as stream:
+        rows = csv.DictReader(stream, delimiter="\t", quoting=csv.QUOTE_NONE)
+        return {row["number"]: (row["case"], row["expected"]) for row in rows}
+
+
+class CaseReport:
+    """Part of a run of pytest that notes the outcome of every case's tests.
+
+    Args:
+        path: The file to write.
+        is_worker: Whether this process runs a part of the tests for another, which writes.
+    """
+
+    def __init__(self, path: Path, is_worker: bool) -> None:
+        self.path, self.is_worker = path, is_worker
+        self.costs = [0.0, 0.0]
+        self.known = read_cases()
+        self.found: dict[str, dict[str, str]] = {}
+
+    def pytest_collection_modifyitems(self, items: list[pytest.Item]) -> None:
+        """Look up the cases of each test; its reports carry them."""
+        for item in items:
+            ids = item.name.partition("[")[2].rstrip("]").split("-")
+            marks = [str(n) for mark in item.iter_markers("case") for n in mark.args]
+            unknown = set(marks) - set(self.known)
+            assert not unknown, f"{item.nodeid}: no such case: {unknown}"
+            covered = sorted({*marks} | ({*ids} & set(self.known)))
+            item.user_properties.append(("cases", covered))
+
+    @pytest.hookimpl(wrapper=True)
+    def pytest_runtest_call(self, item: pytest.Item) -> Iterator[None]:
+        """Send what refused inputs took so far along with a test's report."""
+        try:
+            return (yield)
+        finally:
+            item.user_properties.append(("costs", list(faults.COSTS)))
+
+    def pytest_runtest_logreport(self, report: pytest.TestReport) -> None:
+        """Note how a test ended; a failure of its set-up counts as one."""
+        if report.when != "call" and report.passed:
+            return
+        costs = dict(report.user_properties).get("costs", self.costs)
+        self.costs = list(map(max, self.costs, costs))  # type: ignore[call-overload]
+        for case in dict(report.user_properties).get("cases", []):
+            outcomes = self.found.setdefault(str(case), {})
+            if outcomes.get(report.nodeid) != "failed":
+                outcomes[report.nodeid] = report.outcome
+
+    def pytest_sessionfinish(self) -> None:
+        """Write what was found, and what refused inputs took at most: seconds and bytes."""
+        if self.is_worker:
+            return
+        found = {**self.found, "costs": self.costs}
+        self.path.write_text(json.dumps(found, indent=1, sort_keys=True) + "\n")
+
+
+def page_of(found: dict[str, dict[str, str]]) -> str:
+    """Return the page that tells of the outcomes of a run of the tests."""
+    cases = read_cases()
+    verdicts = {number: _verdict(number, found.get(number, {})) for number in cases}
+    passed = sum(verdict.startswith("passed") for verdict in verdicts.values())
+    covered = [number for number in cases if number not in EXCLUDED]
+    variants = sum(list(found.get(n, {}).values()).count("passed") for n in covered)
+    lines = [
+        INTRODUCTION,
+        f"**{passed} of {len(cases)} cases passed** in {variants} variants, "
+        f"{len(EXCLUDED)} excluded. The numbers before what is expected are exit codes "
+        "(0: it works). `pytest -k I4` runs the tests of a case; "
+        "`python -m tests.cases` makes this page from a run of all tests.",
+    ]
+    for letter, heading in HEADINGS.items():
+        lines += ["", f"## {heading}", "", "| # | Case | Expected | Outcome | Tests |"]
+        lines += ["|---|---|---|---|---|"]
+        for number, (case, expected) in cases.items():
+            if number.startswith(letter):
+                names = _files(found.get(number, {}))
+                cells = [number, case, expected, verdicts[number], names]
+                lines.append(f"| {' | '.join(cell.replace('|', '&#124;') for cell in cells)} |")
+    if BYTE_FLIPS.exists():
+        lines += ["", *_byte_flips(json.loads(BYTE_FLIPS.read_text()))]
+    return "\n".join(lines) + "\n"
+
+
+def _verdict(number: str, outcomes: dict[str, str]) -> str:
+    values = list(outcomes.values())
+    if number in EXCLUDED:
+        return f"excluded: {EXCLUDED[number]}"
+    if "failed" in values:
+        return f"**FAILED**: {values.count('failed')} of {len(values)}"
+    if "passed" in values:
+        return f"passed: {values.count('passed')}"
+    return "**not tested**"
+
+
+def _files(outcomes: Iterable[str]) -> str:
+    return ", ".join(sorted({Path(name.split("::")[0]).stem for name in outcomes}))
+
+
+def _byte_flips(record: dict[str, Any]) -> list[str]:
+    """Return the table of `benchmarks.byte_flips`."""
+    formats = record["formats"]
+    tried = sum(entry["mutations"] for entry in formats)
+    lines = [
+        "## Damaged files",
+        "",
+        f"{tried} damaged files of {len(formats)} kinds: flipped bits and bytes, truncations, "
+        "repeated and swapped parts, numbers and lengths that lie, values of JSON replaced. Each "
+        "is read in a process of its own; only success or one error line within 10 s and 500 MB "
+        f"may come out (`python -m benchmarks.byte_flips --count {record['count']} --json "
+        "docs/byte_flips.json`; `tests/test_byte_flips.py` tries some of them in every run).",
+        "",
+        "| Format | Tried | Read | Refused, by code | Longest [s] | Most memory [MB] | Faults |",
+        "|---|---|---|---|---|---|---|",
+    ]
+    for entry in formats:
+        codes = dict(entry["exit_codes"])
+        read = codes.pop("0", 0)
+        refused = ", ".join(f"{code}: {count}" for code, count in sorted(codes.items())) or "-"
+        lines.append(
+            f"| {entry['format']} | {entry['mutations']} | {read} | {refused} "
+            f"| {entry['longest_seconds']:.2f} | {entry['most_megabytes']:.0f} "
+            f"| {entry['faults']} |"
+        )
+    return lines
+
+
+def _without_counts(page: str) -> list[str]:
+    """Return the lines of a page without how many variants ran: that depends on the machine."""
+    return re.sub(r"passed: \d+|in \d+ variants", "passed", page).splitlines()
+
+
+def main() -> int:
+    """Write the page, or compare it with what would be written."""
+    found = json.loads(Path(sys.argv[1]).read_text())
+    seconds, peak = found.pop("costs", [0.0, 0])
+    print(f"refused inputs took at most {seconds:.1f} s and {peak / 1e6:.0f} MB")
+    page = page_of(found)
+    if "--check" not in sys.argv[2:]:
+        PAGE.write_text(page)
+        return 0
+    before, after = _without_counts(PAGE.read_text()), _without_counts(page)
+    difference = list(difflib.unified_diff(before, after, "now", "made", lineterm="", n=0))
+    print("\n".join(difference))
+    return int(bool(difference) or "**FAILED" in page or "**not tested" in page)
+
+
+if __name__ == "__main__":
+    sys.exit(main())
