@@ -1,6 +1,8 @@
 # `make demo` and `make test` work from a fresh clone: the first call makes .venv and installs into
 # it, later calls find the stamp and go straight on. PYTHON chooses the interpreter (3.11 or newer).
 PYTHON ?= python3
+# Processes that share the tests; each computes with few threads and takes up to 3 GB.
+WORKERS ?= 2
 VENV := .venv
 BIN := $(VENV)/bin
 STAMP := $(VENV)/.installed
@@ -11,7 +13,7 @@ demo: $(STAMP)
 	$(BIN)/python -m warpir.insert --demo --out out/demo --overwrite
 
 test: $(STAMP)
-	$(BIN)/python -m pytest -q $(PYTEST_ARGS)
+	$(BIN)/python -m pytest -q -m "not slow" -n $(WORKERS) --dist loadfile $(PYTEST_ARGS)
 
 lint: $(STAMP)
 	$(BIN)/ruff check .
