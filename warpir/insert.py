@@ -184,7 +184,8 @@ def _insert_one(config: InsertConfig, loaders: "Loaders | None" = None) -> Inser
             inputs, light, recovered, found = _guide(
                 config, inputs, light, device, output, timings, memory
             )
-            release()
+            with timings.stage("scene"):  # the garbage of guidance makes room for it
+                release()
             notices = (*notices, *found)
             light, shown = _detailed(config, inputs, light, timings)
             recovered |= shown

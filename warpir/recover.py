@@ -168,8 +168,8 @@ def recover(
             with run.timings.stage("preview"):
                 write_start(run, frame, start)
         guided, resumed = prepare_guidance(run, checkpoints)
-        release()
         with run.timings.stage("trace"):
+            release()
             guide = make_guide(run, guided, frame)
             graphs = guided.prior.graphs
             faster = graphs.recorded_module if graphs else None
@@ -183,7 +183,7 @@ def recover(
                 region=region,
             )
         before = {k: v.detach().clone() for k, v in unknowns.state_dict().items()}
-        with torch.no_grad():
+        with run.timings.stage("optimize"), torch.no_grad():
             first = loop.guide.score(loop.final_image(config.seed))
         optimize(run, loop, checkpoints, resumed)
         verdict = None
@@ -193,10 +193,11 @@ def recover(
                 verdict, compared = judge_end(loop, guide, before)
             run.say(verdict.line)
         notices = (*guided.prior.notices, *guided.notices, *loop_notices(loop, frame.renderer))
-        light_fg, light_shadow = loop.final_lights(LIGHT_HEIGHT)
         unknowns = loop.unknowns
-        run.output.write_json("optimization.json", convergence(loop, first))
-        write_lora(run, guided)
+        with run.timings.stage("write"):
+            light_fg, light_shadow = loop.final_lights(LIGHT_HEIGHT)
+            run.output.write_json("optimization.json", convergence(loop, first))
+            write_lora(run, guided)
         curves = Curves(
             config.tone_operator, knots_of(unknowns.curve_fg), knots_of(unknowns.curve_shadow)
         )
