@@ -182,7 +182,10 @@ def test_words_follow_the_figures() -> None:
     assert words == ["hard", "fairly hard", "soft", "very soft"]
     assert "17 cm of blur per metre" in softness_words(with_figures(5.0, 1.0))
     assert "4.0 times the rest" in strength_words(with_figures(5.0, 4.0))
-    assert strength_words(with_figures(5.0, 0.5)).startswith("mostly light from all around")
+    told = [strength_words(with_figures(5.0, d)).split(":")[0] for d in (4.0, 2.3, 1.0, 0.5)]
+    assert told[:2] == ["strong direct light", "more direct light than sky"]
+    assert told[2] == "direct light and sky of similar strength"
+    assert told[3].startswith("mostly light from all around")
 
 
 @pytest.mark.parametrize(

@@ -166,7 +166,9 @@ def strength_words(character: LightCharacter) -> str:
     by = f"{ratio:.1f} times" if ratio < 100.0 else "more than 100 times"
     if ratio >= 3.0:
         what = "strong direct light"
-    elif ratio >= 1.0:
+    elif ratio >= 1.5:
+        what = "more direct light than sky"
+    elif ratio >= 1.0 / 1.5:
         what = "direct light and sky of similar strength"
     else:
         what = "mostly light from all around, with some direct light"

@@ -352,8 +352,8 @@ def refine(
             # Curves of an earlier run are made for its operator.
             frame = replace(make_frame(run), is_reinhard=light.curves.tone == "reinhard")
         guided, resumed = prepare_guidance(run, checkpoints)
-        release()
         with run.timings.stage("trace"):
+            release()
             guide = make_guide(run, guided, frame)
             lit = LitFrame(frame, light, run.torch_device)
         loop: MaterialRefinement | ToneRefinement
@@ -367,10 +367,11 @@ def refine(
             loop = MaterialRefinement(lit, light.curves, guide, config, unknowns)
         record = what_moves(config, asset)
         run.say(f"free: {', '.join(record['free'])}; frozen: {', '.join(record['frozen'])}")
-        with torch.no_grad():
+        with run.timings.stage("optimize"), torch.no_grad():
             first = loop.guide.score(loop.final_image(config.seed))
         optimize(run, loop, checkpoints, resumed)
-        write_lora(run, guided)
+        with run.timings.stage("write"):
+            write_lora(run, guided)
     notices = (*guided.prior.notices, *guided.notices, *loop_notices(loop, frame.renderer))
     if isinstance(loop, ToneRefinement):
         curves = (knots_of(c) for c in (loop.unknowns.curve_fg, loop.unknowns.curve_shadow))
