@@ -37,6 +37,11 @@ def png_chunk(name: bytes, content: bytes) -> bytes:
     return struct.pack(">I", len(content)) + body + struct.pack(">I", zlib.crc32(body))
 
 
+def fixed(*values: float) -> bytes:
+    """Numbers as a profile holds them, s15Fixed16."""
+    return struct.pack(f">{len(values)}i", *(round(value * 65536) for value in values))
+
+
 def matrix_profile(primaries: str) -> bytes:
     """An ICC v2 matrix profile made from bytes: gamma 2.2, Display P3 or Rec.709 primaries."""
     columns = {  # D50-adapted
@@ -45,9 +50,6 @@ def matrix_profile(primaries: str) -> bytes:
         "709": [[0.43607, 0.22249, 0.01392], [0.38515, 0.71687, 0.09708],
                 [0.14307, 0.06061, 0.71410]],
     }[primaries]  # fmt: skip
-
-    def fixed(*values: float) -> bytes:
-        return struct.pack(f">{len(values)}i", *(round(value * 65536) for value in values))
 
     tags = {}
     for letter, column in zip(b"rgb", columns, strict=True):

@@ -8,6 +8,7 @@ most memory are left out, and with them the sha256 of the one file that shows th
 import hashlib
 import json
 import re
+from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
@@ -33,11 +34,13 @@ def without_clock(path: Path) -> bytes:
 
 def outcome(folder: Path) -> dict[str, str]:
     """Sha256 of every file below a folder, by its name in it."""
-    return {
-        str(path.relative_to(folder)): hashlib.sha256(without_clock(path)).hexdigest()
-        for path in sorted(folder.rglob("*"))
-        if path.is_file() and not path.is_symlink()
-    }
+    paths = (path for path in sorted(folder.rglob("*")) if path.is_file() and not path.is_symlink())
+    return outcome_of(folder, [str(path.relative_to(folder)) for path in paths])
+
+
+def outcome_of(folder: Path, names: Iterable[str]) -> dict[str, str]:
+    """Sha256 of some files of a folder."""
+    return {name: hashlib.sha256(without_clock(folder / name)).hexdigest() for name in names}
 
 
 def _without(record: Any) -> Any:

@@ -690,10 +690,9 @@ def test_the_model_is_shown_before_and_after(epsilon: StableDiffusion, tmp_path:
     columns = [sheet[:, LABEL_WIDTH + p * width :][:, : 2 * side] for p in range(3)]
     bodies = [column[-2 * side - 12 :] for column in columns]
     assert not any(np.array_equal(bodies[a], bodies[b]) for a, b in ((0, 1), (1, 2), (0, 2)))
-    alone = show_prior(epsilon, shown[-1:], [WITHOUT_CLASS], [1], 2, 1.0)
-    picture = alone[:, LABEL_WIDTH : LABEL_WIDTH + side][-side - 6 : -6]
-    inside = columns[2][:, side:]
-    assert any(np.array_equal(inside[y : y + side], picture) for y in range(len(inside) - side))
+    # In the same batches: what a picture is made beside changes its last bits on some processors.
+    alone = show_prior(epsilon, shown, [WITHOUT_CLASS], [0, 1], 2, 1.0, settings.class_batch)
+    assert np.array_equal(bodies[2], alone[:, LABEL_WIDTH:][-2 * side - 12 :, : 2 * side])
     told: list[str] = []
     again = show_personalization(*arguments, report=lambda stage, *_: told.append(stage))
     assert np.array_equal(again, sheet)

@@ -16,6 +16,7 @@ from PIL import Image, ImageCms, ImageOps
 
 from tests.image_files import (
     codes8,
+    fixed,
     icc_profile,
     matrix_profile,
     png_chunk,
@@ -630,20 +631,22 @@ def test_i8_srgb_profile_changes_nothing(tmp_path: Path, rng: np.random.Generato
     np.testing.assert_array_equal(photo.srgb, codes.astype(np.float32) / np.float32(255))
 
 
-@pytest.mark.parametrize("case", ["rubbish", "lab", "tag-count", "curve-count", "cut", "singular"])
+@pytest.mark.parametrize(
+    "case", ["rubbish", "lab", "tag-count", "curve-count", "cut", "singular", "thin"]
+)
 @pytest.mark.case("I8")
 def test_unusable_profiles_are_noted(tmp_path: Path, rng: np.random.Generator, case: str) -> None:
     icc = matrix_profile("p3")
     many = struct.pack(">I", 2**31)
+    red, green = fixed(0.51512, 0.24120, -0.00105), fixed(0.29198, 0.69225, 0.04189)
     icc = {
         "rubbish": b"rubbish" * 30,
         "lab": ImageCms.ImageCmsProfile(ImageCms.createProfile("LAB")).tobytes(),
         "tag-count": icc[:128] + many + icc[132:],
         "curve-count": icc.replace(b"curv\0\0\0\0\0\0\0\x01", b"curv\0\0\0\0" + many),
         "cut": icc[:300],
-        "singular": icc.replace(struct.pack(">i", round(0.51512 * 65536)), bytes(4)).replace(
-            struct.pack(">i", round(0.29198 * 65536)), bytes(4)
-        ),
+        "singular": icc.replace(green, red),
+        "thin": icc.replace(red[:4], bytes(4)).replace(green[:4], bytes(4)),
     }[case]
     Image.fromarray(codes8(rng)).save(tmp_path / "p.jpg", icc_profile=icc)
     assert any("taken as sRGB" in notice for notice in read_photo(tmp_path / "p.jpg").notices)

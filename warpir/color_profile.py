@@ -23,6 +23,8 @@ D50 = (0.34567, 0.35850)
 """CIE xy of the white of ICC's connection space."""
 _D50_XYZ = (0.9642, 1.0, 0.8249)
 """The same in XYZ, with the digits of the ICC specification."""
+_MOST_CONDITION = 100.0
+"""Of the matrix of a profile's primaries; sRGB has 4.3, ProPhoto RGB 1.8."""
 _CICP_PRIMARIES = {1: "ITU-R BT.709", 9: "ITU-R BT.2020", 12: "P3-D65"}
 _CICP_CURVES = {
     4: (2.2,),
@@ -164,7 +166,8 @@ def convert_profile(
         return _convert_lut_profile(path, codes, srgb, icc)
     if float(np.abs(expected - probe).max()) < 2e-3:  # the profile is sRGB
         return codes, srgb, None, ""
-    back = srgb_to_profile(expected, icc)
+    # How far off the way back of thin primaries lies depends on the processor: they are looked at.
+    back = srgb_to_profile(expected, icc) if _primaries_are_apart(icc) else None
     if back is None or not np.allclose(back, probe, atol=0.01):  # a NaN is not close either
         return codes, srgb, None, broken
     converted = _profile_to_srgb(srgb, icc)
@@ -197,6 +200,20 @@ def _profile_is_whole(icc: bytes) -> bool:
             if size < 12 or 12 + 2 * struct.unpack_from(">I", icc, offset + 8)[0] > size:
                 return False
     return True
+
+
+def _primaries_are_apart(icc: bytes) -> bool:
+    """Return whether codes can be told from the colours that a profile's primaries mix."""
+    (count,) = struct.unpack_from(">I", icc, 128)
+    columns = {}
+    for k in range(count):
+        name, offset, size = struct.unpack_from(">4sII", icc, 132 + 12 * k)
+        if name in (b"rXYZ", b"gXYZ", b"bXYZ") and size >= 20:
+            columns[name] = struct.unpack_from(">3i", icc, offset + 8)
+    if len(columns) < 3:  # tables mix them
+        return True
+    primaries = np.array([*columns.values()]) / 65536.0
+    return bool(np.linalg.cond(primaries) < _MOST_CONDITION)
 
 
 _COLOR_TAGS = (
