@@ -27,7 +27,8 @@ from warpir.insert import insert, needs_of
 from warpir.lighting import make_light
 from warpir.memory import lacked_memory, release
 from warpir.program import explain, say, stay_offline
-from warpir.sequence import is_whole, read_sequence
+from warpir.report_sequence import refuse_other_page
+from warpir.sequence import Frame, is_whole, read_sequence
 
 CHECK, INSERT, COMPILE = "check", "insert", "compile"
 DONE_BEFORE = "done before"
@@ -158,35 +159,31 @@ def _memory(config: InsertConfig, inputs: Inputs) -> int:
 
 def _check_sequence(config: InsertConfig) -> dict[str, Any]:
     assert config.out is not None
-    try:
-        frames = read_sequence(config, Loaders())
-    except OtherRun as error:
-        if not _is_all_other(error):
-            raise
-        frames = read_sequence(replace(config, overwrite=True), Loaders())
+    memory, disk = [0], [0]
+
+
+    frames = read_sequence(config, Loaders(), renews=True, look_at=look_at)
+    refuse_other_page(config)
     OutputFolder(config.out, overwrite=True).check()
-    has_place = any(frame.config.proxy is not None for frame in frames)
-    return {"is_done": is_whole(config, frames), "memory": 0, "disk": 0, "has_place": has_place}
-
-
-def _is_all_other(error: InputError) -> bool:
-    """Return whether all that stands in a sequence's way are its own frames of earlier settings."""
-    return all(isinstance(problem, OtherRun) for problem in (error, *error.also))
+    return {
+        "is_done": is_whole(config, frames),
+        "memory": max(memory),
+        "disk": sum(disk),
+        "has_place": any(frame.config.proxy is not None for frame in frames),
+    }
 
 
 def _insert(task: Task) -> dict[str, Any]:
+    def look_at(frame: Frame, inputs: Inputs) -> None:
+        if not frame.is_done:
+            memory.append(_memory(frame.config, inputs))
+            disk.append(needed_bytes(frame.config, inputs))
     config = config_of_record(task.config)
     assert config.out is not None
     if not config.allow_download:
         stay_offline()
     if config.sequence is not None:
-        try:
-            insert(config)
-        except OtherRun as error:
-            if not _is_all_other(error):
-                raise
-            say("notice: its settings or inputs have changed: all frames are rendered again")
-            insert(replace(config, overwrite=True))
+        insert(config, renews=True)
         return {"how": "done"}
     out = Path(config.out)
     finish_results(out)
