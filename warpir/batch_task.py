@@ -126,15 +126,13 @@ def _check(task: Task) -> dict[str, Any]:
     assert config.out is not None
     if config.sequence is not None:
         return _check_sequence(config)
+    filled = _filled(config)
     try:
-        if is_done(config):
+        if is_done(config, filled):
             return {"is_done": True}
     except OtherRun:
         pass  # of earlier settings or inputs: done again
-    if config.demo:
-        from warpir.demo import demo_config
-
-        config = demo_config(config)
+    config = filled
     inputs = read_inputs(config)
     make_light(inputs, config)
     OutputFolder(str(config.out), overwrite=True).check()  # what is in it was looked at
@@ -146,6 +144,15 @@ def _check(task: Task) -> dict[str, Any]:
         "disk": disk,
         "has_place": inputs.proxy is not None,
     }
+
+
+def _filled(config: InsertConfig) -> InsertConfig:
+    """Return a configuration with the demo's files, where it asks for them."""
+    if not config.demo:
+        return config
+    from warpir.demo import demo_config
+
+    return demo_config(config)
 
 
 def _memory(config: InsertConfig, inputs: Inputs) -> int:
@@ -189,7 +196,7 @@ def _insert(task: Task) -> dict[str, Any]:
     finish_results(out)
     is_fresh = replaces = config.overwrite
     try:
-        if is_done(config):
+        if is_done(config, _filled(config)):
             return {"how": DONE_BEFORE}
     except OtherRun:
         say("notice: its settings or inputs have changed: it is done again")
