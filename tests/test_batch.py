@@ -332,8 +332,8 @@ def test_validate_looks_at_all_lines_and_writes_nothing(
     assert main([*argv, "--validate"]) == ExitCode.INPUT
     said = capsys.readouterr()
     assert f"line 2, scene-1: failed (3): {memory / 'photo.png'}: not a mesh" in said.out
-    assert f"line 5: failed (2): {manifest}:5: not JSON" in said.out
-    assert f"line 6, x: failed (2): {manifest}:6: unknown key 'fotos'" in said.out
+    assert "line 5: failed (2): not JSON" in said.out
+    assert "line 6, x: failed (2): unknown key 'fotos'" in said.out
     assert said.err.startswith(f"error: {manifest}: 3 of 6 scenes cannot be used\n")
     assert not out.exists()
     assert main([*argv, "--all-or-nothing"]) == ExitCode.INPUT

@@ -288,7 +288,10 @@ class _Batch:
         self._workers: Workers = LocalWorkers([])
         for scene in self.scenes:
             if scene.row.problem is not None:
-                scene.fail(*explain(scene.row.problem))
+                status, lines = explain(scene.row.problem)
+                # Which line it is, is told with every failure.
+                here = f": {options.manifest}:{scene.row.line}: "
+                scene.fail(status, [line.replace(here, ": ", 1) for line in lines])
 
     def __enter__(self) -> "_Batch":
         """Nothing runs yet."""
