@@ -587,6 +587,21 @@ def test_a_worker_that_hangs_is_killed(tmp_path: Path, monkeypatch: pytest.Monke
     assert (key, answer.died) == (7, "SIGKILL") and time.monotonic() - began < 30.0
 
 
+def test_a_worker_with_a_fault_of_its_own_is_replaced() -> None:
+    """What it holds may be spoilt, such as a CUDA context: the next scene gets a new process."""
+    workers = LocalWorkers([{}])
+    processes: list[Any] = []
+    try:
+        for _ in range(2):
+            workers.start(0, Task("no such thing"))
+            ((_, worker),) = [known.data for known in workers._selector.get_map().values()]
+            processes.append(worker._process)
+            assert workers.wait()[1].status == ExitCode.BUG
+    finally:
+        workers.stop()
+    assert processes[0].pid != processes[1].pid and processes[0].returncode is not None
+
+
 def test_a_worker_without_a_log_or_a_reader(tmp_path: Path) -> None:
     """A full disk hides no answer, and a log that cannot be opened is one; nothing is printed."""
     (tmp_path / "logs").write_text("a file")
