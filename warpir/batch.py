@@ -41,6 +41,8 @@ SUMMARY, FAILURES, LOGS = "batch.json", "failures.jsonl", "logs"
 WORKER_BYTES = 700 << 20
 """Of a worker's process with torch, Warp and the regressor, and the largest maps that it writes:
 measured."""
+CHECKER_BYTES = 300 << 20
+"""Of a process that reads and checks inputs, without torch and Warp."""
 MOST_WORKERS = 1024
 STATES = ("done", DONE_BEFORE, "failed", "not run")
 """What can have become of a scene; by an earlier batch, too."""
@@ -284,7 +286,6 @@ class _Batch:
         self.scenes = tuple(Scene(row) for row in manifest.rows)
         self.started = time.monotonic()
         self.worker_count = self.threads = 0
-        self._asked = options.workers or _cores()
         self._workers: Workers = LocalWorkers([])
         for scene in self.scenes:
             if scene.row.problem is not None:
@@ -321,7 +322,10 @@ class _Batch:
                     scene.state = DONE_BEFORE
 
         tasks = {key: self._task(CHECK, key) for key in keys}
-        self._workers = LocalWorkers(self._environments(min(self._asked, len(keys))))
+        # --workers may be those of a cluster.
+        most = max(1, min(_cores(), free_host() // CHECKER_BYTES))
+        count = min(self.options.workers or most, most, len(keys))
+        self._workers = LocalWorkers(self._environments(count))
         _do_all(self._workers, tasks, self._retry, ended)
         for scene in self.scenes:
             if scene.state != "failed":
