@@ -168,6 +168,10 @@ def _check_sequence(config: InsertConfig) -> dict[str, Any]:
     assert config.out is not None
     memory, disk = [0], [0]
 
+    def look_at(frame: Frame, inputs: Inputs) -> None:
+        if not frame.is_done:
+            memory.append(_memory(frame.config, inputs))
+            disk.append(needed_bytes(frame.config, inputs))
 
     frames = read_sequence(config, Loaders(), renews=True, look_at=look_at)
     refuse_other_page(config)
@@ -181,10 +185,6 @@ def _check_sequence(config: InsertConfig) -> dict[str, Any]:
 
 
 def _insert(task: Task) -> dict[str, Any]:
-    def look_at(frame: Frame, inputs: Inputs) -> None:
-        if not frame.is_done:
-            memory.append(_memory(frame.config, inputs))
-            disk.append(needed_bytes(frame.config, inputs))
     config = config_of_record(task.config)
     assert config.out is not None
     if not config.allow_download:
@@ -216,12 +216,16 @@ def _insert(task: Task) -> dict[str, Any]:
 
 
 def _compile(task: Task) -> dict[str, Any]:
-    """Compile what the scenes need, once, before many processes would do it at the same time."""
+    """Compile what the scenes need, once, before many processes would do it at the same time.
+
+    Where nothing is said of places, only the devices are looked for.
+    """
     from warpir.render import choose_device, cuda_count, load_kernels
 
-    for name in task.config["devices"]:
-        load_kernels(choose_device(name), [(x, y) for x in (False, True)
-                                           for y in task.config["places"]])  # fmt: skip
+    places = task.config["places"]
+    for device in [choose_device(name) for name in task.config["devices"]]:
+        if places:
+            load_kernels(device, [(x, y) for x in (False, True) for y in places])
     return {"cuda": cuda_count()}
 
 
