@@ -332,8 +332,8 @@ def test_validate_looks_at_all_lines_and_writes_nothing(
     assert main([*argv, "--validate"]) == ExitCode.INPUT
     said = capsys.readouterr()
     assert f"line 2, scene-1: failed (3): {memory / 'photo.png'}: not a mesh" in said.out
-    assert f"line 5: failed (2): {manifest}:5: not JSON" in said.out
-    assert f"line 6, x: failed (2): {manifest}:6: unknown key 'fotos'" in said.out
+    assert "line 5: failed (2): not JSON" in said.out
+    assert "line 6, x: failed (2): unknown key 'fotos'" in said.out
     assert said.err.startswith(f"error: {manifest}: 3 of 6 scenes cannot be used\n")
     assert not out.exists()
     assert main([*argv, "--all-or-nothing"]) == ExitCode.INPUT
@@ -587,6 +587,21 @@ def test_a_worker_that_hangs_is_killed(tmp_path: Path, monkeypatch: pytest.Monke
     assert (key, answer.died) == (7, "SIGKILL") and time.monotonic() - began < 30.0
 
 
+def test_a_worker_with_a_fault_of_its_own_is_replaced() -> None:
+    """What it holds may be spoilt, such as a CUDA context: the next scene gets a new process."""
+    workers = LocalWorkers([{}])
+    processes: list[Any] = []
+    try:
+        for _ in range(2):
+            workers.start(0, Task("no such thing"))
+            ((_, worker),) = [known.data for known in workers._selector.get_map().values()]
+            processes.append(worker._process)
+            assert workers.wait()[1].status == ExitCode.BUG
+    finally:
+        workers.stop()
+    assert processes[0].pid != processes[1].pid and processes[0].returncode is not None
+
+
 def test_a_worker_without_a_log_or_a_reader(tmp_path: Path) -> None:
     """A full disk hides no answer, and a log that cannot be opened is one; nothing is printed."""
     (tmp_path / "logs").write_text("a file")
@@ -615,6 +630,99 @@ def test_a_worker_without_a_log_or_a_reader(tmp_path: Path) -> None:
     worker.stderr.close()
 
 
+def on_devices(made: batch._Batch, *devices: str | None) -> None:
+    """Let scenes name their devices."""
+    for scene, device in zip(made.scenes, devices, strict=True):
+        assert scene.row.config is not None
+        scene.row = replace(scene.row, config=replace(scene.row.config, device=device))
+
+
+class Devices(Scripted):
+    """Compiles for the CPU alone, and notes for what it was asked."""
+
+    def __init__(self, environments: Sequence[object]) -> None:
+        super().__init__(len(environments), {})
+        self.asked: list[Any] = []
+
+    def start(self, key: int, task: Task) -> None:
+        super().start(key, task)
+        self.answers[key] = [Answer(0, found={"is_done": False, "how": "done", "cuda": 0})]
+        if task.do == COMPILE:
+            self.asked.append((task.config["devices"], task.config["places"]))
+            if task.config["devices"] == ["cuda"]:
+                self.answers[key] = [Answer(ExitCode.USAGE, ("error: --device: no device cuda",))]
+
+
+@pytest.mark.parametrize("are_all_checked", [True, False])
+def test_a_device_that_is_not_there_is_its_lines_alone(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, are_all_checked: bool
+) -> None:
+    """The check finds it; so does what comes later, and the other scenes are done."""
+    made = batch_of(tmp_path, 3)
+    on_devices(made, "cpu", "cuda", None)
+    workers = Devices([1])
+    monkeypatch.setattr(batch, "LocalWorkers", lambda environments: workers)
+    made._workers = workers
+    if are_all_checked:
+        made.check()
+        assert workers.asked == [(["cuda"], [])]
+        assert [scene.state for scene in made.scenes] == ["not run", "failed", "not run"]
+    for scene in made.scenes:
+        scene.needs = {"memory": 0, "disk": 0, "has_place": False}
+    made.do()
+    assert [scene.state for scene in made.scenes] == ["done", "failed", "done"]
+    assert made.scenes[1].failure()["error"] == "--device: no device cuda"
+
+
+def test_no_scene_whose_device_is_there(tmp_path: Path) -> None:
+    """Nothing is started then; with --all-or-nothing neither is any other."""
+    for devices, is_all_or_nothing in ((["cuda"], False), (["cuda", "cpu"], True)):
+        made = batch_of(tmp_path, len(devices), is_all_or_nothing=is_all_or_nothing)
+        on_devices(made, *devices)
+        made._workers = Devices([1])
+        with pytest.raises(InputError, match=r"1 of . scenes") as caught:
+            made.do()
+            made.raise_failures("failed")
+        assert caught.value.code == ExitCode.USAGE
+        assert "done" not in [scene.state for scene in made.scenes]
+
+
+@pytest.mark.slow
+def test_a_batch_on_a_machine_without_the_device(
+    memory: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """--validate tells the line, and without it the other scene is done."""
+    write_inputs(memory)
+    monkeypatch.setenv("CUDA_VISIBLE_DEVICES", "")
+    rows = [{**scenes(2)[k], "device": device} for k, device in enumerate(("cuda", "cpu"))]
+    argv = [str(write_manifest(memory, rows)), "--out", str(memory / "out"), *FLAGS[:4], *FLAGS[6:]]
+    told = "line 1, scene-0: failed (2): --device: no device cuda here (found cpu)"
+    assert main([*argv, "--validate"]) == ExitCode.USAGE
+    assert told in capsys.readouterr().out
+    assert main(argv) == ExitCode.USAGE
+    assert told in capsys.readouterr().out
+    assert states_of(memory / "out") == {"scene-0": "failed", "scene-1": "done"}
+
+
+def test_the_check_takes_no_more_than_the_machine_has(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Whatever --workers says, which may be those of a cluster."""
+    made = batch_of(tmp_path, 9, workers=256, ray="far:1")
+    found: list[int] = []
+
+    def workers(environments: Sequence[object]) -> Devices:
+        found.append(len(environments))
+        return Devices(environments)
+
+    monkeypatch.setattr(batch, "LocalWorkers", workers)
+    monkeypatch.setattr(batch, "_cores", lambda: 8)
+    for free in (100 << 30, 1 << 30, 1):
+        monkeypatch.setattr(batch, "free_host", lambda free=free: free)
+        made.check()
+    assert found == [8, 3, 1]
+
+
 def test_workers_by_cores_memory_and_devices(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -630,7 +738,7 @@ def test_workers_by_cores_memory_and_devices(
     monkeypatch.setattr(batch, "LocalWorkers", Noted)
     monkeypatch.setattr(batch, "_cores", lambda: 8)
     monkeypatch.setattr(batch, "free_host", lambda: 100 << 30)
-    monkeypatch.setattr(made, "_compile", lambda task: 2)
+    monkeypatch.setattr(made, "_compile", lambda *_: 2)
     monkeypatch.delenv("CUDA_VISIBLE_DEVICES", raising=False)
 
     def counts(**changes: Any) -> tuple[int, int]:
@@ -696,6 +804,80 @@ def test_a_batch_on_a_cluster_of_two_machines(memory: Path, hooked: Path) -> Non
     assert set(states_of(memory / "out").values()) == {"done"} and found["workers"] == 2
     assert len(list((memory / "out").glob("*/run.json"))) == 4
     assert not list((memory / "out").glob(".batch-*")) and failures_of(memory / "out") == []
+
+
+def cluster_of(*machines: dict[str, float]) -> RayWorkers:
+    """Workers on machines with these resources, of which nothing runs."""
+    nodes = [{"Alive": True, "Resources": machine} for machine in machines]
+    workers = RayWorkers.__new__(RayWorkers)
+    workers._ray, workers._memory, workers._running = SimpleNamespace(nodes=lambda: nodes), {}, {}
+    return workers
+
+
+def test_what_a_task_asks_of_a_cluster_is_there_on_one_machine() -> None:
+    """Cores and memory of those with a GPU where it takes one: Ray would wait for ever."""
+    head = {"CPU": 64.0, "memory": 256e9}
+    small = {"CPU": 8.0, "GPU": 1.0, "memory": 32e9}
+    large = {"CPU": 4.0, "GPU": 2.0, "memory": 64e9}
+    mixed = cluster_of(head, small)
+    assert mixed.share(1, {1: 1 << 30}) == 8 and mixed.share(2, {1: 1 << 30}) == 4
+    assert mixed.share(1, {0: 1 << 30}) == 64 and mixed.share(1, {0: 1, 1: 1}) == 8
+    mixed.share(1, {0: 10**15, 1: 10**15})
+    assert mixed._memory == {0: int(256e9), 1: int(32e9)}
+    # The machine with the memory has fewer cores than another one.
+    assert cluster_of(small, large).share(1, {1: int(16e9)}) == 8
+    assert cluster_of(small, large).share(1, {1: int(48e9)}) == 4
+    assert cluster_of({"CPU": 0.0, "memory": 64e9}, small).share(1, {0: int(48e9)}) == 8
+    for machines in ([head], [head, {"GPU": 4.0, "memory": 1e9}]):
+        with pytest.raises(InputError, match="no machine of the cluster has a CPU and a GPU") as e:
+            cluster_of(*machines).share(1, {1: 1})
+        assert e.value.code == ExitCode.RESOURCES
+
+
+def test_a_task_with_a_gpu_has_a_process_of_its_own() -> None:
+    """As a fault of CUDA stays in the process that saw it."""
+    workers = cluster_of({"CPU": 8.0, "GPU": 1.0, "memory": 8e9})
+    options: list[dict[str, Any]] = []
+
+    def remote(**given: object) -> Any:
+        options.append(given)
+        return lambda function: SimpleNamespace(remote=lambda task: len(options))
+
+    workers._ray.remote = remote
+    workers.share(1, {0: 1 << 40, 1: 1 << 20})
+    workers.start(0, Task(INSERT, memory=1 << 40))
+    workers.start(1, Task(INSERT, memory=1 << 20, gpus=1))
+    assert [given["max_calls"] for given in options] == [0, 1]
+    assert [given["memory"] for given in options] == [int(8e9), 1 << 20]
+
+
+@pytest.mark.parametrize("gpus", [0, 1])
+def test_a_device_that_no_machine_of_a_cluster_has(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, gpus: int
+) -> None:
+    """Lines that name it fail, and no machine is asked to compile for it."""
+    asked: list[Any] = []
+
+    class Cluster(Scripted):
+        cpus = 4
+
+        def __init__(self, address: str) -> None:
+            super().__init__(1, {})
+            self.gpus = gpus
+
+        def prepare(self, out: Path, task: Task) -> None:
+            asked.append(task.config["devices"])
+
+        def share(self, count: int, memory: dict[int, int]) -> int:
+            asked.append(sorted(memory))
+            return 1
+
+    made = batch_of(tmp_path, 2, ray="far:1")
+    on_devices(made, "cuda", "cpu")
+    monkeypatch.setattr(batch, "RayWorkers", Cluster)
+    made.do()
+    assert [scene.state for scene in made.scenes] == ["done" if gpus else "failed", "done"]
+    assert asked == ([[None, "cpu"], [0, 1]] if gpus else [["cpu"], [0]])
 
 
 def test_ray_is_an_extra(

@@ -256,6 +256,21 @@ def test_paths_lists_and_whole_numbers_are_taken() -> None:
     )
 
 
+def test_values_are_kept_as_json_holds_them() -> None:
+    """Whatever Python gave: a record and a checkpoint of it can be written and read back."""
+    place: Any = [np.float32(0.5), np.int64(2), 3]
+    values: dict[str, Any] = {"fov": np.float32(50), "samples": np.int64(8), "place": place}
+    values["photo"] = Path("a.png")
+    config = InsertConfig(**values)
+    assert config == InsertConfig(photo="a.png", fov=50.0, samples=8, place=(0.5, 2.0, 3.0))
+    told = json.loads(json.dumps(asdict(config)))
+    assert InsertConfig(**told) == config and isinstance(config.place, tuple)
+    (error,) = problems_of(fov=np.float32("nan"))
+    assert "finite" in error.what
+    (error,) = problems_of(place=[None, 1.0, 2.0])
+    assert "expected tuple[float, float, float]" in error.what
+
+
 @pytest.mark.parametrize("values", [{}, {"sun": (10.0, 40.0)}, {"demo": True}], ids=str)
 def test_only_a_light_that_is_given_is_turned(values: Any) -> None:
     (error,) = problems_of(light_rotate=30.0, **values)

@@ -4,7 +4,7 @@ import hashlib
 import json
 import subprocess
 import sys
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -18,8 +18,10 @@ from PIL import Image
 from tests.conftest import devices
 from tests.outcome import outcome
 from warpir import insert
+from warpir.batch_task import CHECK, Task, do_task
 from warpir.camera_files import read_camera
 from warpir.color import linear_to_gamma
+from warpir.command import parse
 from warpir.config import InsertConfig
 from warpir.errors import ExitCode, InputError
 from warpir.insert import main
@@ -699,6 +701,8 @@ def test_demo_runs_small(tmp_path: Path, device: str) -> None:
     # The light is read off the photo, by what is in the package.
     assert "regression" in demo.record["measured"] and "light" not in demo.record["inputs"]
     assert (out / "progress" / "preview-000000.png").is_file()
+    checked = do_task(Task(CHECK, asdict(parse(argv).config)))
+    assert checked.found == {"is_done": True}, "a batch knows it by the files of the package"
 
 
 @pytest.mark.parametrize("change", ["replaced", "removed"])

@@ -30,7 +30,13 @@ from warpir.errors import ExitCode, InputError
 from warpir.files import BACKGROUND_DEPTH, read_layers
 from warpir.insert import main
 from warpir.page_policy import source_hash
-from warpir.report_facts import ABOUT_FILES, about_file, command_line, without_folders
+from warpir.report_facts import (
+    ABOUT_FILES,
+    about_file,
+    command_line,
+    who_spoke,
+    without_folders,
+)
 from warpir.report_pictures import layers_shown, rgbe, shrink, thumbnail
 from warpir.report_plots import Series, line_plot, ticks
 
@@ -325,12 +331,44 @@ def test_command_line_repeats_the_settings(argv: list[str]) -> None:
     assert parse(words[3:]).config == config
 
 
+def test_the_same_again_runs_with_a_model_of_the_hub(
+    guided: report.Results, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """By its whole name, and with what no file can switch on; a folder by its last part."""
+    told = {"model": "someone/a-model", "allow_download": True}
+    record = {**guided.record, "config": {**guided.record["config"], **told}}
+    results = report.replace(guided, record=record)
+    text = html.unescape(report.report_page(results).decode())
+    assert "warpir.insert --config run.json --allow-download --out OUT<" in text
+    assert "--model someone/a-model " in text and "--allow-pickle" not in text
+    config = report.config_of(record)
+    assert without_folders("someone/a-model: odd", config) == "someone/a-model: odd"
+    (tmp_path / "someone" / "a-model").mkdir(parents=True)
+    monkeypatch.chdir(tmp_path)
+    assert "--model a-model " in command_line(config)
+
+
+@pytest.mark.parametrize(
+    ("values", "words"),
+    [
+        ({"demo": True, "guidance": "none"}, "the demo's own"),
+        ({"demo": True, "start": "uniform"}, "even, as nothing was said"),
+    ],
+)
+def test_light_of_the_demo_is_told_where_it_is_used(values: dict[str, Any], words: str) -> None:
+    """Not where an even light was asked for."""
+    ((_, text),) = who_spoke({"measured": {"prior": "none"}}, InsertConfig(**values))
+    assert text.startswith(words)
+
+
 def test_every_file_of_the_table_is_one_that_runs_write() -> None:
     """No purpose is told twice, and none of a name that never fits."""
     names = [pattern for pattern, _ in ABOUT_FILES]
     assert len(set(names)) == len(names)
     assert about_file("mitsuba/scene.xml") and about_file("envmap_detail_preview.png")
     assert about_file("something.else") == ""
+    # Its own purpose, not that of the run's file of the same name.
+    assert about_file("mitsuba/envmap.exr") == about_file("mitsuba/scene.xml")
 
 
 @pytest.mark.parametrize("size", [(10, 7), (64, 48), (100, 301)])
@@ -444,6 +482,9 @@ def test_pictures_beyond_the_limit_are_refused(
     assert report.main([*argv, "--max-pixels", "1000"]) == ExitCode.INPUT
     error = capsys.readouterr().err
     assert "layers.exr: too large (found 48 x 32 pixels; limit 1000)" in error
+    assert report.main([*argv, "--max-envmap-width", "32"]) == ExitCode.INPUT
+    assert "envmap.exr: too large" in capsys.readouterr().err
+    assert report.main([*argv, "--max-envmap-width", "65536"]) == ExitCode.DONE
     with pytest.raises(InputError, match="too large"):
         thumbnail(run.out / "composite.png", 1000)
 

@@ -2,7 +2,9 @@
 
 import hashlib
 import json
+import shutil
 from collections.abc import Sequence
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any, NoReturn
 
@@ -12,10 +14,12 @@ import warpir.picture
 from tests.test_command import assert_fails, refused
 from tests.test_insert import ALWAYS, Run, arguments, digest, go, write_inputs
 from warpir import insert
+from warpir.batch_task import CHECK, Answer, Task, do_task
 from warpir.command import parse
 from warpir.config import EXCLUSIVE, InsertConfig
 from warpir.errors import ExitCode, InputError
 from warpir.inputs import Loaders
+from warpir.insert import insert as insert_now
 from warpir.insert import main
 from warpir.sequence import FRAME_FIELDS, read_sequence
 
@@ -69,6 +73,13 @@ def frames(
     argv = argv_of(inputs, first, lines, folder / "out")
     assert main(argv) == ExitCode.DONE
     return argv, folder / "out"
+
+
+def copy_of(done: Path, out: Path) -> None:
+    """Copy a finished sequence, whose frames then say that they were made there."""
+    shutil.copytree(done, out)
+    for path in out.glob("*/run.json"):
+        path.write_text(path.read_text().replace(str(done), str(out)))
 
 
 def refuse_to_render(*args: object, **kwargs: object) -> NoReturn:
@@ -178,15 +189,7 @@ def test_other_results_are_not_replaced(
     """A frame made otherwise, or damaged, is reported by its line; --overwrite renders it again."""
     _, done = frames
     out = tmp_path / "out"
-    for source in done.rglob("*"):
-        if source.is_file():
-            target = out / source.relative_to(done)
-            target.parent.mkdir(parents=True, exist_ok=True)
-            target.write_bytes(source.read_bytes())
-    # The copies say where they were made: only the folder's name differs.
-    for k in (1, 2, 3):
-        path = out / f"000{k}" / "run.json"
-        path.write_text(path.read_text().replace(str(done), str(out)))
+    copy_of(done, out)
     lines = write_lines(tmp_path / "s.jsonl", [*FRAMES[:2], {**FRAMES[2], "seed": 6}, {}], inputs)
     (out / "0002" / "layers.exr").write_bytes(b"cut")
     (out / "0004").mkdir()
@@ -207,6 +210,62 @@ def test_other_results_are_not_replaced(
     # What --overwrite wrote is done for the command without it.
     assert main([*argv, "--validate"]) == ExitCode.DONE
     assert "frames: 1, of which 1 are done already" in capsys.readouterr().out
+
+
+@pytest.mark.slow
+def test_renewed_sequence_keeps_what_is_done(
+    frames: tuple[list[str], Path], inputs: Path, first: Run, tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str],
+) -> None:  # fmt: skip
+    """Only frames that differ are rendered again, and each of them once, whenever it is stopped."""
+    out = tmp_path / "out"
+    copy_of(frames[1], out)
+    changed = [FRAMES[0], *({**frame, "seed": 9} for frame in FRAMES[1:])]
+    config = parse(argv_of(inputs, first, write_lines(tmp_path / "s", changed, inputs), out)).config
+    make_picture, calls = warpir.picture.make_picture, []
+
+    def stop_at_the_second(*args: Any, **kwargs: Any) -> Any:
+        calls.append(1)
+        if len(calls) == 2:
+            raise KeyboardInterrupt
+        return make_picture(*args, **kwargs)
+
+    monkeypatch.setattr(warpir.picture, "make_picture", stop_at_the_second)
+    with pytest.raises(KeyboardInterrupt):
+        insert_now(config, renews=True)
+    insert_now(config, renews=True)
+    assert len(calls) == 3 and "it is rendered again" in capsys.readouterr().out
+    seeds = [json.loads((out / f"000{k}" / "run.json").read_text())["config"]["seed"]
+             for k in (1, 2, 3)]  # fmt: skip
+    assert seeds == [3, 9, 9], "the first as the command line says"
+    (out / "0002" / "layers.exr").write_bytes(b"edited")
+    with pytest.raises(InputError, match="changed since the run wrote it"):
+        insert_now(config, renews=True)
+
+
+def test_batch_looks_at_all_that_a_sequence_takes(
+    frames: tuple[list[str], Path], inputs: Path, first: Run, tmp_path: Path
+) -> None:
+    """Memory of the largest frame, disk of all that are not done; and a page that is not ours."""
+
+    def check(out: Path, *lines: dict[str, Any]) -> Answer:
+        listed = write_lines(tmp_path / "s.jsonl", lines, inputs)
+        config = parse(argv_of(inputs, first, listed, out)).config
+        return do_task(Task(CHECK, asdict(config)))
+
+    whole, one, two = (
+        check(tmp_path / "none", *FRAMES),
+        check(tmp_path / "none", FRAMES[0]),
+        check(tmp_path / "none", *FRAMES[:2]),
+    )
+    assert 0 < one.found["memory"] <= two.found["memory"] <= whole.found["memory"]
+    assert 0 < one.found["disk"] < two.found["disk"] < whole.found["disk"]
+    copy_of(frames[1], tmp_path / "out")
+    rest = check(tmp_path / "out", *FRAMES[:2], {**FRAMES[2], "seed": 9})
+    assert rest.found["disk"] == whole.found["disk"] - two.found["disk"]
+    (tmp_path / "out" / "sequence.html").write_text("<p>mine</p>")
+    answer = check(tmp_path / "out", *FRAMES)
+    assert answer.status == ExitCode.OUTPUT and "not a page of warpir's" in answer.lines[0]
 
 
 def test_changed_inputs_are_noticed(
@@ -368,6 +427,22 @@ def test_page_shows_every_frame(frames: tuple[list[str], Path], inputs: Path) ->
         assert f'href="{name}/report.html"' in page and (frames[1] / name / "report.html").exists()
     assert page.count('src="data:image/jpeg') == 3 and "photo deep.png, at 24.0,24.0" in page
     assert str(inputs) not in page and "default-src 'none'" in page
+
+
+def test_page_is_there_before_the_summary(
+    frames: tuple[list[str], Path], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """By the summary others see that nothing is left to do, so the page comes first."""
+
+    def stop(*_: object) -> NoReturn:
+        raise KeyboardInterrupt
+
+    argv, out = frames
+    page = (out / "sequence.html").read_bytes()
+    (out / "sequence.html").unlink()
+    monkeypatch.setattr("warpir.sequence.write_summary", stop)
+    assert main(argv) == 130
+    assert (out / "sequence.html").read_bytes() == page
 
 
 def test_page_that_fails_is_a_notice(

@@ -41,7 +41,10 @@ SUMMARY, FAILURES, LOGS = "batch.json", "failures.jsonl", "logs"
 WORKER_BYTES = 700 << 20
 """Of a worker's process with torch, Warp and the regressor, and the largest maps that it writes:
 measured."""
+CHECKER_BYTES = 300 << 20
+"""Of a process that reads and checks inputs, without torch and Warp."""
 MOST_WORKERS = 1024
+NONE_STARTED = "cannot be used, so none was started (--all-or-nothing)"
 STATES = ("done", DONE_BEFORE, "failed", "not run")
 """What can have become of a scene; by an earlier batch, too."""
 
@@ -180,7 +183,7 @@ def _run(arguments: list[str]) -> int:
                 if not (options.out / SUMMARY).exists():
                     batch.write()  # whatever ends it, the next one knows the files for a batch's
                 if options.is_all_or_nothing:
-                    batch.raise_failures("cannot be used, so none was started (--all-or-nothing)")
+                    batch.raise_failures(NONE_STARTED)
                 batch.do()
             except Stopped as error:
                 how = "does all again" if options.is_fresh else "goes on with the rest"
@@ -284,11 +287,13 @@ class _Batch:
         self.scenes = tuple(Scene(row) for row in manifest.rows)
         self.started = time.monotonic()
         self.worker_count = self.threads = 0
-        self._asked = options.workers or _cores()
         self._workers: Workers = LocalWorkers([])
         for scene in self.scenes:
             if scene.row.problem is not None:
-                scene.fail(*explain(scene.row.problem))
+                status, lines = explain(scene.row.problem)
+                # Which line it is, is told with every failure.
+                here = f": {options.manifest}:{scene.row.line}: "
+                scene.fail(status, [line.replace(here, ": ", 1) for line in lines])
 
     def __enter__(self) -> "_Batch":
         """Nothing runs yet."""
@@ -318,11 +323,16 @@ class _Batch:
                     scene.state = DONE_BEFORE
 
         tasks = {key: self._task(CHECK, key) for key in keys}
-        self._workers = LocalWorkers(self._environments(min(self._asked, len(keys))))
+        # --workers may be those of a cluster.
+        most = max(1, min(_cores(), free_host() // CHECKER_BYTES))
+        count = min(self.options.workers or most, most, len(keys))
+        self._workers = LocalWorkers(self._environments(count))
         _do_all(self._workers, tasks, self._retry, ended)
         for scene in self.scenes:
             if scene.state != "failed":
                 scene.retries.clear()  # those of the check are none of its insertion's
+        if self.options.ray is None:  # whose machines are asked when it is known what runs there
+            self._compile([key for key in self._open() if self._config(key).device == "cuda"], [])
         say(
             f"checked: {len(self.scenes)} scenes, of which {self.count(DONE_BEFORE)} are done "
             f"already and {self.count('failed')} cannot be used"
@@ -338,6 +348,9 @@ class _Batch:
         if disk > free:
             say(f"notice: about {disk >> 20} MiB will be written, and {free >> 20} MiB are free")
         gpus = self._prepare(keys)
+        keys = self._open()  # a device may have been refused
+        if self.options.is_all_or_nothing:
+            self.raise_failures(NONE_STARTED)
         tasks = {key: self._task(INSERT, key, self._on_cuda(key, gpus)) for key in keys}
         began, finished = time.monotonic(), 0
 
@@ -421,9 +434,13 @@ class _Batch:
             asdict(config),
             str(self.options.manifest.absolute().parent),
             str(log) if do == INSERT else None,
-            memory=WORKER_BYTES + self.scenes[key].needs.get("memory", 0),
+            memory=self._memory(key),
             gpus=int(on_cuda),
         )
+
+    def _memory(self, key: int) -> int:
+        """Return the least memory that a worker takes with this scene [byte]."""
+        return WORKER_BYTES + int(self.scenes[key].needs.get("memory", 0))
 
     def _retry(self, key: int, answer: Answer) -> bool:
         """Return whether another attempt could cure a scene, and note why it is made."""
@@ -447,22 +464,31 @@ class _Batch:
             How many GPUs there are.
         """
         places = sorted({bool(self.scenes[key].needs["has_place"]) for key in keys})
-        devices = list({self._config(key).device: None for key in keys})
-        compiling = Task(COMPILE, {"devices": devices, "places": places})
         if self.options.ray is not None:
             self._workers.stop()
             cluster = RayWorkers(self.options.ray)
             self._workers = cluster
-            cluster.prepare(self.options.out.absolute(), compiling)
-            on_cuda = any(self._on_cuda(key, cluster.gpus) for key in keys)
-            count = self.options.workers or (cluster.gpus if on_cuda else cluster.cpus)
+            keys = keys if cluster.gpus else self._fail_on_cuda(keys)
+            if not keys:
+                return cluster.gpus
+            # Each machine compiles for what it has: one without a GPU gets no scene that needs it.
+            devices = ["cpu" if self._config(key).device == "cpu" else None for key in keys]
+            task = Task(COMPILE, {"devices": [*dict.fromkeys(devices)], "places": places})
+            cluster.prepare(self.options.out.absolute(), task)
+            memory: dict[int, int] = {}
+            for key in keys:
+                on_gpus, needed = int(self._on_cuda(key, cluster.gpus)), self._memory(key)
+                memory[on_gpus] = max(memory.get(on_gpus, 0), needed)
+            count = self.options.workers or (cluster.gpus if 1 in memory else cluster.cpus)
             self.worker_count = min(count, len(keys))
-            self.threads = cluster.share(self.worker_count)
+            self.threads = cluster.share(self.worker_count, memory)
             return cluster.gpus
-        gpus = self._compile(compiling)
+        gpus = self._compile(keys, places)
+        keys = [key for key in keys if self.scenes[key].is_open]
+        if not keys:
+            return gpus
         on_cuda = any(self._on_cuda(key, gpus) for key in keys)
-        largest = max(self.scenes[key].needs["memory"] for key in keys)
-        by_memory = max(1, free_host() // (WORKER_BYTES + largest))
+        by_memory = max(1, free_host() // max(map(self._memory, keys)))
         count = self.options.workers or min(gpus if on_cuda else _cores(), by_memory)
         self.worker_count = min(count, len(keys))
         self.threads = max(1, _cores() // self.worker_count)
@@ -474,19 +500,34 @@ class _Batch:
             )
         return gpus
 
-    def _compile(self, task: Task) -> int:
-        """Let a worker compile; return how many CUDA devices it sees.
+    def _compile(self, keys: Sequence[int], places: Sequence[bool]) -> int:
+        """Let a worker compile for one device after another; a scene fails where its device does.
 
-        Raises:
-            InputError: It fails, such as for a device that is not there.
+        Args:
+            keys: Of the scenes.
+            places: Whether a mesh of the place is among what is rendered; empty: only see that the
+                devices are there.
+
+        Returns:
+            How many CUDA devices the worker sees.
         """
         found: list[Answer] = []
-        _do_all(self._workers, {0: task}, lambda *_: False, lambda _, answer: found.append(answer))
-        if found[0].status:
-            line = found[0].lines[0].removeprefix("error: ")
-            where, _, what = line.partition(": ")
-            raise InputError(where, what, code=ExitCode(found[0].status))
-        return int(found[0].found["cuda"])
+        for device in dict.fromkeys(self._config(key).device for key in keys):
+            task = Task(COMPILE, {"devices": [device], "places": list(places)})
+            _do_all(self._workers, {0: task}, lambda *_: False, lambda _, a: found.append(a))
+            if found[-1].status:
+                for key in keys:
+                    if self._config(key).device == device:
+                        self.scenes[key].fail(found[-1].status, found[-1].lines)
+        return max((int(answer.found.get("cuda", 0)) for answer in found), default=0)
+
+    def _fail_on_cuda(self, keys: Sequence[int]) -> list[int]:
+        """Let scenes fail that ask for a GPU of a cluster without one; return the others."""
+        for key in keys:
+            if self._config(key).device == "cuda":
+                what = "error: --device: no machine of the cluster has a GPU (found cuda)"
+                self.scenes[key].fail(ExitCode.USAGE, (what, "use --device cpu"))
+        return [key for key in keys if self.scenes[key].is_open]
 
     def _environments(self, count: int, gpus: int = 0) -> list[dict[str, str]]:
         """Return what is special in the environment of each worker: one thread for libraries.

@@ -53,7 +53,8 @@ class LocalWorkers:
         key, worker = ready.data
         answer = worker.receive()
         self._selector.unregister(ready.fileobj)
-        if answer.died or answer.is_short:  # what it holds is unknown: the next one begins anew
+        # What it holds is unknown, such as a CUDA context that one fault has spoilt.
+        if answer.died or answer.is_short or answer.status == ExitCode.BUG:
             worker.end()
         self._idle.append(worker)
         return key, answer

@@ -12,6 +12,7 @@ import shutil
 import signal
 import socket
 import time
+from collections.abc import Mapping
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
@@ -68,19 +69,36 @@ class RayWorkers:
                 signal.signal(number, handler)
         total = self._ray.cluster_resources()
         self.cpus, self.gpus = int(total.get("CPU", 1)), int(total.get("GPU", 0))
-        self._memory = int(self._most("memory"))
+        self._memory: dict[int, int] = {}
+        """The most that a task asks for [byte], by its GPUs."""
         self._running: dict[Any, int] = {}
         self.count = self.threads = 1
 
-    def share(self, count: int) -> int:
-        """Let so many scenes run at the same time; return the threads that each may use."""
-        self.count = count
-        self.threads = int(max(1, min(self.cpus // count, self._most("CPU"))))
-        return self.threads
+    def share(self, count: int, memory: Mapping[int, int]) -> int:
+        """Let so many scenes run at the same time; return the threads that each may use.
 
-    def _most(self, name: str) -> float:
-        """Return the most of a resource that one machine has: a scene cannot have more."""
-        return max((node["Resources"].get(name, 0.0) for node in self._nodes()), default=0.0)
+        Args:
+            count: How many.
+            memory: The most that a task takes [byte], by its GPUs: 0, 1 or both.
+
+        Raises:
+            InputError: No machine could do one, and Ray would wait for one for ever
+                (`ExitCode.RESOURCES`).
+        """
+        self.count, threads = count, list[int]()
+        for gpus, wanted in memory.items():
+            # A task runs on one machine: what others have more of is nothing to it.
+            found = [node["Resources"] for node in self._nodes()]
+            able = [has for has in found if has.get("CPU", 0) >= 1 and has.get("GPU", 0) >= gpus]
+            if not able:
+                what = f"no machine of the cluster has a CPU{' and a GPU' if gpus else ''} to give"
+                raise InputError("--ray", what, "start one that has", ExitCode.RESOURCES)
+            most = int(max(has.get("memory", 0) for has in able))
+            self._memory[gpus] = min(wanted, most)
+            cpus = max(has["CPU"] for has in able if has.get("memory", 0) >= self._memory[gpus])
+            threads.append(int(min(sum(has["CPU"] for has in able) // count, cpus)))
+        self.threads = max(1, min(threads))
+        return self.threads
 
     def _nodes(self) -> list[dict[str, Any]]:
         return [node for node in self._ray.nodes() if node["Alive"]]
@@ -149,8 +167,10 @@ class RayWorkers:
         remote = self._ray.remote(
             num_cpus=self.threads,
             num_gpus=task.gpus,
-            memory=min(task.memory, self._memory),
+            memory=min(task.memory, self._memory[task.gpus]),
             max_retries=0,
+            # A process that has met a fault of CUDA does nothing with it any more.
+            max_calls=1 if task.gpus else 0,
         )(_do)
         self._running[remote.remote(asdict(task))] = key
 

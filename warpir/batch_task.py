@@ -27,7 +27,8 @@ from warpir.insert import insert, needs_of
 from warpir.lighting import make_light
 from warpir.memory import lacked_memory, release
 from warpir.program import explain, say, stay_offline
-from warpir.sequence import is_whole, read_sequence
+from warpir.report_sequence import refuse_other_page
+from warpir.sequence import Frame, is_whole, read_sequence
 
 CHECK, INSERT, COMPILE = "check", "insert", "compile"
 DONE_BEFORE = "done before"
@@ -125,15 +126,13 @@ def _check(task: Task) -> dict[str, Any]:
     assert config.out is not None
     if config.sequence is not None:
         return _check_sequence(config)
+    filled = _filled(config)
     try:
-        if is_done(config):
+        if is_done(config, filled):
             return {"is_done": True}
     except OtherRun:
         pass  # of earlier settings or inputs: done again
-    if config.demo:
-        from warpir.demo import demo_config
-
-        config = demo_config(config)
+    config = filled
     inputs = read_inputs(config)
     make_light(inputs, config)
     OutputFolder(str(config.out), overwrite=True).check()  # what is in it was looked at
@@ -147,6 +146,15 @@ def _check(task: Task) -> dict[str, Any]:
     }
 
 
+def _filled(config: InsertConfig) -> InsertConfig:
+    """Return a configuration with the demo's files, where it asks for them."""
+    if not config.demo:
+        return config
+    from warpir.demo import demo_config
+
+    return demo_config(config)
+
+
 def _memory(config: InsertConfig, inputs: Inputs) -> int:
     """Return the least memory that a scene takes of the host beside the program [byte]."""
     of_photo, of_scene = needs_of(inputs)
@@ -158,20 +166,22 @@ def _memory(config: InsertConfig, inputs: Inputs) -> int:
 
 def _check_sequence(config: InsertConfig) -> dict[str, Any]:
     assert config.out is not None
-    try:
-        frames = read_sequence(config, Loaders())
-    except OtherRun as error:
-        if not _is_all_other(error):
-            raise
-        frames = read_sequence(replace(config, overwrite=True), Loaders())
+    memory, disk = [0], [0]
+
+    def look_at(frame: Frame, inputs: Inputs) -> None:
+        if not frame.is_done:
+            memory.append(_memory(frame.config, inputs))
+            disk.append(needed_bytes(frame.config, inputs))
+
+    frames = read_sequence(config, Loaders(), renews=True, look_at=look_at)
+    refuse_other_page(config)
     OutputFolder(config.out, overwrite=True).check()
-    has_place = any(frame.config.proxy is not None for frame in frames)
-    return {"is_done": is_whole(config, frames), "memory": 0, "disk": 0, "has_place": has_place}
-
-
-def _is_all_other(error: InputError) -> bool:
-    """Return whether all that stands in a sequence's way are its own frames of earlier settings."""
-    return all(isinstance(problem, OtherRun) for problem in (error, *error.also))
+    return {
+        "is_done": is_whole(config, frames),
+        "memory": max(memory),
+        "disk": sum(disk),
+        "has_place": any(frame.config.proxy is not None for frame in frames),
+    }
 
 
 def _insert(task: Task) -> dict[str, Any]:
@@ -180,19 +190,13 @@ def _insert(task: Task) -> dict[str, Any]:
     if not config.allow_download:
         stay_offline()
     if config.sequence is not None:
-        try:
-            insert(config)
-        except OtherRun as error:
-            if not _is_all_other(error):
-                raise
-            say("notice: its settings or inputs have changed: all frames are rendered again")
-            insert(replace(config, overwrite=True))
+        insert(config, renews=True)
         return {"how": "done"}
     out = Path(config.out)
     finish_results(out)
     is_fresh = replaces = config.overwrite
     try:
-        if is_done(config):
+        if is_done(config, _filled(config)):
             return {"how": DONE_BEFORE}
     except OtherRun:
         say("notice: its settings or inputs have changed: it is done again")
@@ -212,12 +216,16 @@ def _insert(task: Task) -> dict[str, Any]:
 
 
 def _compile(task: Task) -> dict[str, Any]:
-    """Compile what the scenes need, once, before many processes would do it at the same time."""
+    """Compile what the scenes need, once, before many processes would do it at the same time.
+
+    Where nothing is said of places, only the devices are looked for.
+    """
     from warpir.render import choose_device, cuda_count, load_kernels
 
-    for name in task.config["devices"]:
-        load_kernels(choose_device(name), [(x, y) for x in (False, True)
-                                           for y in task.config["places"]])  # fmt: skip
+    places = task.config["places"]
+    for device in [choose_device(name) for name in task.config["devices"]]:
+        if places:
+            load_kernels(device, [(x, y) for x in (False, True) for y in places])
     return {"cuda": cuda_count()}
 
 

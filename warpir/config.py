@@ -6,6 +6,7 @@ configuration file and one entry under ``config`` in ``run.json``. The line belo
 """
 
 import math
+import os
 import re
 from collections.abc import Container, Iterator, Mapping
 from dataclasses import dataclass, fields, replace
@@ -303,6 +304,9 @@ class InsertConfig(ModelSettings, PersonalizeSettings, GuidanceChoices, Optimize
 
     def __post_init__(self) -> None:
         """Check everything that can be checked without opening a file."""
+        for field in fields(self):
+            # Frozen for everybody else.
+            object.__setattr__(self, field.name, _plain(getattr(self, field.name)))
         raise_all([*_values_out_of_range(self), *_values_that_clash(self)])
 
     @property
@@ -550,20 +554,32 @@ def _kinds() -> dict[str, Any]:
     return get_type_hints(InsertConfig)
 
 
+def _plain(value: object) -> object:
+    """Return a value as JSON holds it: a path as text, NumPy's numbers as Python's."""
+    if isinstance(value, tuple | list):
+        return tuple(map(_plain, value))
+    if isinstance(value, PathLike):
+        return os.fspath(value)
+    if isinstance(value, bool | str):
+        return value
+    if isinstance(value, Integral):
+        return int(value)
+    return float(value) if isinstance(value, Real) else value
+
+
 def _is_a(value: object, kind: Any) -> bool:
-    """Return whether a value is what an annotation says; lists are tuples, and paths are texts."""
+    """Return whether a plain value is what an annotation says; a whole number is a float too."""
     if get_origin(kind) is UnionType:
         return any(_is_a(value, alternative) for alternative in get_args(kind))
     if get_origin(kind) is tuple:
         parts = get_args(kind)
-        if not isinstance(value, tuple | list):
+        if not isinstance(value, tuple):
             return False
         parts = parts[:1] * len(value) if parts[-1] is Ellipsis else parts
         return len(parts) == len(value) and all(map(_is_a, value, parts))
     if kind is bool or isinstance(value, bool):
         return kind is bool and isinstance(value, bool)
-    accepted: Any = {float: Real, int: Integral, str: str | PathLike}.get(kind, kind)
-    return isinstance(value, accepted)
+    return isinstance(value, int | float if kind is float else kind)
 
 
 def _values_out_of_range(config: InsertConfig) -> Iterator[InputError]:
@@ -773,7 +789,7 @@ def _losses_that_clash(config: InsertConfig) -> Iterator[InputError]:
 
 def _shown(value: object) -> str:
     if isinstance(value, tuple):
-        value = ",".join(part if isinstance(part, str) else f"{part:g}" for part in value)
+        value = ",".join(f"{p:g}" if isinstance(p, int | float) else str(p) for p in value)
     text = str(value)
     return text if len(text) <= 60 else text[:57] + "..."
 

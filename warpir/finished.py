@@ -20,10 +20,14 @@ class OtherRun(InputError):
     """A folder holds a whole result, but of other settings or other files."""
 
 
-def is_done(config: InsertConfig) -> bool:
+def is_done(config: InsertConfig, filled: InsertConfig | None = None) -> bool:
     """Return whether the folder of a configuration holds its result.
 
     With ``overwrite`` nothing is done.
+
+    Args:
+        config: As it was asked for.
+        filled: The same with the demo's files filled in, where those are asked for.
 
     Raises:
         OtherRun: It holds the whole result of another one.
@@ -42,7 +46,7 @@ def is_done(config: InsertConfig) -> bool:
     try:
         record = run_record(out, config.limits)
         check_files(out, record["files"])
-        same = _same(config, record)
+        same = _same(config, filled or config, record)
     except InputError as error:
         raise _something_else(out, f"{error.where}: {error.what}") from error
     if not same:
@@ -59,7 +63,7 @@ def config_of_record(values: dict[str, Any]) -> InsertConfig:
     return InsertConfig(**read_values({name: (value, name) for name, value in values.items()}))
 
 
-def _same(config: InsertConfig, record: dict[str, Any]) -> bool:
+def _same(config: InsertConfig, filled: InsertConfig, record: dict[str, Any]) -> bool:
     """Return whether a run was asked for the same and read the same files."""
     made = {name: value for name, value in record["config"].items() if name in DEFAULTS}
     if len(made) < len(record["config"]):
@@ -69,6 +73,7 @@ def _same(config: InsertConfig, record: dict[str, Any]) -> bool:
     read = record.get("inputs")
     if replace(config_of_record(made), **of_the_run) != config or not isinstance(read, dict):
         return False
+    config = filled  # from here on, what names the files
     paths = input_files(config)
     for name in read:
         field, _, file = name.partition("/")

@@ -78,7 +78,7 @@ class Insertion:
         return read_layers(self.out / "layers.exr", told.get("max_pixels", LIMITS.pixels))
 
 
-def insert(config: InsertConfig) -> Insertion:
+def insert(config: InsertConfig, *, renews: bool = False) -> Insertion:
     """Insert one object into one photograph, or into a sequence of them, and write the files.
 
     Calls from several threads wait for each other: Warp's tape, torch's threads and the handling of
@@ -86,6 +86,8 @@ def insert(config: InsertConfig) -> Insertion:
 
     Args:
         config: What to do. Assumptions and notices are printed on standard output.
+        renews: Whether frames of a sequence that were made of other settings or other files are
+            replaced, one after another, without ``overwrite``.
 
     Raises:
         InputError: An input or the output folder cannot be used; nothing was written then.
@@ -93,7 +95,7 @@ def insert(config: InsertConfig) -> Insertion:
     config.require_inputs()
     with _ONE_AT_A_TIME:
         if config.sequence is not None:
-            return _insert_sequence(config)
+            return _insert_sequence(config, renews)
         try:
             return _insert_one(config)
         except BaseException as error:
@@ -115,7 +117,7 @@ def _say_what_is_kept(config: InsertConfig, error: BaseException) -> None:
         say(how)
 
 
-def _insert_sequence(config: InsertConfig) -> Insertion:
+def _insert_sequence(config: InsertConfig, renews: bool) -> Insertion:
     from warpir.files import finish_results
     from warpir.inputs import Loaders
     from warpir.report_sequence import PAGE, refuse_other_page, write_sequence_report
@@ -125,7 +127,7 @@ def _insert_sequence(config: InsertConfig) -> Insertion:
     for folder in sorted(Path(config.out).glob("[0-9][0-9][0-9][0-9]")):
         finish_results(folder)
     loaders = Loaders()
-    frames = read_sequence(config, loaders)
+    frames = read_sequence(config, loaders, renews=renews)
     refuse_other_page(config)
     done = 0
     try:
@@ -134,6 +136,8 @@ def _insert_sequence(config: InsertConfig) -> Insertion:
                 say(f"frame {frame.folder.name}: done already")
             else:
                 say(f"frame {frame.folder.name}: line {frame.line} of {config.sequence}")
+                if frame.config.overwrite and not config.overwrite:
+                    say("notice: its settings or inputs have changed: it is rendered again")
                 _insert_one(frame.config, loaders)
             done += 1
     except Stopped as error:
@@ -141,9 +145,9 @@ def _insert_sequence(config: InsertConfig) -> Insertion:
         how = "renders them again" if config.overwrite else "goes on with the rest"
         error.kept = f"kept: {done} of {len(frames)} frames; the same command {how}"
         raise
-    record = write_summary(config, frames, say)
-    if config.report:
+    if config.report:  # before the summary, by which others see that nothing is left to do
         _made_or_told(PAGE, lambda: write_sequence_report(config, frames))
+    record = write_summary(config, frames, say)
     composites = (f"{frame.folder.name}/composite.png" for frame in frames)
     return Insertion(Path(config.out), (*composites, *record["video"], SUMMARY), record)
 

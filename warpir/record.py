@@ -95,13 +95,21 @@ def run_record(
 def config_of_picture(config: InsertConfig) -> dict[str, Any]:
     """Return the configuration as a picture carries it, which may be given to others.
 
-    Of paths only the names are left: where somebody keeps their files is for ``run.json``.
+    Of paths only the names are left: where somebody keeps their files is for ``run.json``. A
+    model's name in the hub is no path.
     """
     return {
         name: name_of(value) if name in PATHS and value is not None else value
         for name, value in asdict(config).items()
         if name not in OF_THE_RUN
-    }
+    } | ({"model": config.model} if is_hub_id(config.model) else {})
+
+
+def is_hub_id(model: str | None) -> bool:
+    """Return whether a model is called by its name in the hub, and is no folder here."""
+    from warpir.diffusion.model_folder import HUB_ID
+
+    return model is not None and HUB_ID.fullmatch(model) is not None and not os.path.isdir(model)
 
 
 def name_of(path: str) -> str:

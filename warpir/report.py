@@ -24,8 +24,8 @@ from numpy.typing import NDArray
 
 import warpir
 from warpir.atomic import write_file
-from warpir.command import Parser, read_values
-from warpir.config import DEFAULTS, InsertConfig
+from warpir.command import BY_HAND, Parser, read_values
+from warpir.config import DEFAULTS, InsertConfig, flag
 from warpir.curves import Curves, ToneKnots, read_curves
 from warpir.errors import ExitCode, InputError
 from warpir.files import Layers, OutputFolder, read_layers
@@ -41,7 +41,7 @@ from warpir.light_words import (
     softness_words,
     strength_words,
 )
-from warpir.limits import LIMITS
+from warpir.limits import LIMITS, Limits
 from warpir.page_policy import source_hash
 from warpir.photo_files import read_envmap
 from warpir.program import run_program, say
@@ -562,7 +562,8 @@ def _clock(results: Results) -> str:
 
 
 def _again(config: InsertConfig) -> str:
-    exact = "python -m warpir.insert --config run.json --out OUT"
+    by_hand = [flag(name) for name in BY_HAND if getattr(config, name)]
+    exact = " ".join(["python -m warpir.insert --config run.json", *by_hand, "--out OUT"])
     return section(
         "The same again",
         "<p>Where the run was started, with the run.json that lies beside this page:</p>",
@@ -642,12 +643,13 @@ def _versions(results: Results) -> str:
 # ------------------------------------------------------------------- of a finished folder
 
 
-def read_results(folder: Path, max_pixels: int = LIMITS.pixels) -> Results:
+def read_results(folder: Path, limits: Limits = LIMITS) -> Results:
     """Return what a finished run left in its folder.
 
     Args:
         folder: The run's ``--out``.
-        max_pixels: Largest image decoded [px].
+        limits: How large its pictures and maps may be; its ``run.json`` is of a stranger's and
+            raises none.
 
     Raises:
         InputError: The folder holds no finished run, or a picture is larger.
@@ -664,7 +666,9 @@ def read_results(folder: Path, max_pixels: int = LIMITS.pixels) -> Results:
     there = {name: folder / name for name in sizes}
 
     def texels(name: str) -> FloatArray | None:
-        return read_envmap(there[name], strict=True) if name in there else None
+        if name not in there:
+            return None
+        return read_envmap(there[name], strict=True, max_width=limits.envmap_width)
 
     def content(name: str) -> dict[str, Any] | None:
         return read_json_object(there[name], LIMITS) if name in there else None
@@ -674,11 +678,11 @@ def read_results(folder: Path, max_pixels: int = LIMITS.pixels) -> Results:
         record,
         listed,
         sizes,
-        layers=read_layers(there["layers.exr"], max_pixels) if "layers.exr" in there else None,
+        layers=read_layers(there["layers.exr"], limits.pixels) if "layers.exr" in there else None,
         light=texels("envmap.exr"),
         light_shadow=texels("envmap_shadow.exr"),
         light_detail=texels("envmap_detail.exr"),
-        balls=None if balls is None else decode_image(balls, max_pixels).pixels,
+        balls=None if balls is None else decode_image(balls, limits.pixels).pixels,
         curves=read_curves(there["curves.json"]) if "curves.json" in there else None,
         camera=content("camera.json"),
         optimization=content("optimization.json"),
@@ -707,11 +711,16 @@ def _run(arguments: list[str]) -> int:
     parser.add_argument("folder", type=Path, metavar="DIR", help="what --out of the run named")
     parser.add_argument("--to", type=Path, metavar="FILE", help="default: DIR/report.html")
     parser.add_argument("--overwrite", action="store_true", help="replace FILE")
-    parser.add_argument("--max-pixels", metavar="N", help=f"default: {LIMITS.pixels}")
+    raised = ("max_pixels", "max_envmap_width")
+    for name in raised:
+        parser.add_argument(
+            f"--{name.replace('_', '-')}", metavar="N", help=f"default: {DEFAULTS[name]}"
+        )
     parser.add_argument("--debug", action="store_true", help="show tracebacks")
     given = parser.parse_args(arguments)
-    limits = {} if given.max_pixels is None else {"max_pixels": (given.max_pixels, "--max-pixels")}
-    results = read_results(given.folder, InsertConfig(**read_values(limits)).max_pixels)
+    texts = {name: text for name in raised if (text := getattr(given, name)) is not None}
+    values = read_values({name: (text, flag(name)) for name, text in texts.items()})
+    results = read_results(given.folder, InsertConfig(**values).limits)
     try:
         page = report_page(results)
     except (KeyError, TypeError, ValueError, AttributeError, IndexError) as error:

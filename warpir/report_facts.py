@@ -9,13 +9,14 @@ import re
 import shlex
 from collections.abc import Mapping
 from dataclasses import dataclass
+from fnmatch import fnmatchcase
 from functools import partial
 from pathlib import PurePath
 from typing import Any
 
 from warpir.command import FLAGS, FORMS, SEPARATORS
 from warpir.config import DEFAULTS, InsertConfig, flag
-from warpir.record import PATHS, config_of_picture, name_of
+from warpir.record import PATHS, config_of_picture, is_hub_id, name_of
 
 Rows = list[tuple[str, str]]
 """What is told, by what it is."""
@@ -66,7 +67,7 @@ ABOUT_FILES = (
 
 def about_file(name: str) -> str:
     """Return what a file of a run is for."""
-    return next((about for p, about in ABOUT_FILES if PurePath(name).match(p)), "")
+    return next((about for p, about in ABOUT_FILES if fnmatchcase(name, p)), "")
 
 
 def without_folders(text: str, config: InsertConfig) -> str:
@@ -76,6 +77,8 @@ def without_folders(text: str, config: InsertConfig) -> str:
     path. A place inside a glTF file, such as ``/materials/0``, stays.
     """
     given = {path for name in PATHS if (path := getattr(config, name)) is not None}
+    if is_hub_id(config.model):
+        given.discard(config.model)
     for path in sorted(given, key=len, reverse=True):
         if path != (called := name_of(path)) and set(path) - set("./~"):
             literal = called.replace("\\", r"\\")
@@ -217,7 +220,7 @@ def _source(measured: Mapping[str, Any], config: InsertConfig) -> str:
             f"read off the photo by warpir's regressor: azimuth {found['azimuth_deg']:.0f}°, "
             f"elevation {found['elevation_deg']:.0f}°"
         )
-    elif config.demo:
+    elif config.demo and config.start != "uniform":
         text = "the demo's own"
     else:
         text = "even, as nothing was said about it"

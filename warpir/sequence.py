@@ -23,8 +23,8 @@ from warpir.atomic import write_file
 from warpir.command import by_name, read_values
 from warpir.config import DEFAULTS, InsertConfig, replaced_by, usage
 from warpir.errors import ExitCode, InputError, disk_error, raise_all, shown
-from warpir.finished import is_done
-from warpir.inputs import Loaders, read_inputs
+from warpir.finished import OtherRun, is_done
+from warpir.inputs import Inputs, Loaders, read_inputs
 from warpir.lighting import make_light
 from warpir.record import file_hash
 from warpir.signals import whole
@@ -63,12 +63,20 @@ class Frame:
         return Path(self.config.out)
 
 
-def read_sequence(config: InsertConfig, loaders: Loaders) -> tuple[Frame, ...]:
+def read_sequence(
+    config: InsertConfig,
+    loaders: Loaders,
+    *,
+    renews: bool = False,
+    look_at: Callable[[Frame, Inputs], None] = lambda *_: None,
+) -> tuple[Frame, ...]:
     """Read all lines and check the inputs of all frames, before the first is rendered.
 
     Args:
         config: What the lines are relative to; names the sequence.
         loaders: Read the frames' assets and the run.
+        renews: Whether a frame of other settings or other files is to be replaced.
+        look_at: Shown each frame and what it reads, which is not kept.
 
     Raises:
         InputError: A line cannot be used; all problems are listed, each with ``FILE:line``.
@@ -86,12 +94,24 @@ def read_sequence(config: InsertConfig, loaders: Loaders) -> tuple[Frame, ...]:
     for number, (line, raw) in enumerate(lines, start=1):
         try:
             frame = _read_line(config, number, line, raw)
-            make_light(read_inputs(frame.config, loaders), frame.config)
-            frames.append(replace(frame, is_done=is_done(frame.config)))
+            inputs = read_inputs(frame.config, loaders)
+            make_light(inputs, frame.config)
+            frames.append(_looked_up(frame, renews))
+            look_at(frames[-1], inputs)
         except InputError as error:
             problems += [_at_line(config.sequence, line, e) for e in (error, *error.also)]
     raise_all(problems)
     return tuple(frames)
+
+
+def _looked_up(frame: Frame, renews: bool) -> Frame:
+    """Return a frame that knows what is in its folder."""
+    try:
+        return replace(frame, is_done=is_done(frame.config))
+    except OtherRun:
+        if not renews:
+            raise
+        return replace(frame, config=replace(frame.config, overwrite=True))
 
 
 def _refuse_other_summary(path: Path, config: InsertConfig) -> None:
@@ -281,4 +301,4 @@ def _at_line(path: str, line: int, problem: InputError) -> InputError:
     what = problem.what.removeprefix("line 1: ")
     if problem.where != where:
         what = f"{problem.where}: {what}"
-    return type(problem)(where, what, problem.advice, problem.code)
+    return InputError(where, what, problem.advice, problem.code)
