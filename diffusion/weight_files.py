@@ -277,6 +277,12 @@ def values_hash(values: Mapping[str, NDArray[Any]], about: str = "") -> str:
     """Return the sha256 of weights as they are written: names and values in order.
 
     Args:
+def beside_lora(path: Path) -> Path | None:
+    """Return peft's configuration where it lies beside a LoRA that peft wrote: its alpha counts."""
+    beside = path.with_name("adapter_config.json")
+    return beside if path.name == "adapter_model.safetensors" and beside.is_file() else None
+
+
         values: In the kind of number of the file.
         about: A text of the header that the weights mean nothing without.
     """

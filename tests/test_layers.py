@@ -111,7 +111,7 @@ SETTINGS = ("warpir.diffusion.settings", "warpir.diffusion.prompts")
 SETTINGS_IN = {"config", "command", *DIFFUSION_IN}
 FILES = ("model_error", "model_folder", "weight_files")
 """What checks the models' files, without torch."""
-FILES_IN = {"model_files", "program", "regressor", *DIFFUSION_IN}
+FILES_IN = {"model_files", "program", "record", "regressor", *DIFFUSION_IN}
 NOT_IN_KERNELS = {"numpy", "warpir"}
 """``warpir.kernels`` sees Warp and itself."""
 

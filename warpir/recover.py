@@ -26,7 +26,6 @@ from warpir.color import gamma_to_linear, linear_to_gamma
 from warpir.config import DEFAULTS, PRIOR_DEFAULTS, InsertConfig
 from warpir.curves import Curves, ToneKnots
 from warpir.determinism import use_threads_for
-from warpir.diffusion.cache import content_key
 from warpir.diffusion.embedded import embedded_prompts, load_embedded
 from warpir.diffusion.guidance import DatasetUpdate, Guidance, make_guidance
 from warpir.diffusion.lora_files import Lora, save_lora
@@ -306,9 +305,7 @@ def checkpoint_of(run: Run, checkpoints: Checkpoints, prior: NetworkPrior) -> Ch
     Raises:
         InputError: It is another run's; every difference is named.
     """
-    schedule = prior.schedule
-    scheduler = content_key(schedule.prediction_type, schedule.alphas_cumprod)
-    checkpoints.identity["model"] = {**prior.weight_hashes, "scheduler": scheduler}
+    checkpoints.identity["model"] = prior.file_hashes
     if checkpoints.newest is None:
         return None
     found = checkpoints.load(lambda text: run.say(f"notice: {text}"))
@@ -336,7 +333,7 @@ def prepare_guidance(run: Run, checkpoints: Checkpoints) -> tuple[Guided, Checkp
     resumed = checkpoint_of(run, checkpoints, prior)
     run.say(f'guidance asks for "{prompts.guidance}"')
     record: dict[str, Any] = {
-        "model": {"name": prior.name, "sha256": prior.weight_hashes},
+        "model": {"name": prior.name, "sha256": prior.file_hashes},
         "prompts": asdict(prompts),
     }
     notices: tuple[str, ...] = (ABOUT_EMBEDDED,) if prior.name == "embedded" else ()
@@ -418,7 +415,8 @@ def require_memory(run: Run) -> None:
     """
     config = run.config
     with hub_offline(not config.allow_download):
-        folder = check_model_folder(find_model(config.model, config.allow_download))
+        found = find_model(config.model, config.allow_download, config.allow_pickle)
+        folder = check_model_folder(found, config.allow_pickle)
     files = (file for weights in folder.weights.values() for file in weights.files)
     side = 8 * int(folder.configs["unet"]["sample_size"])
     is_half = run.device != "cpu" and config.precision != "fp32"
