@@ -274,6 +274,19 @@ def test_resume_refuses_another_model(
     assert "text_encoder" not in error
 
 
+@pytest.mark.case("R1")
+@pytest.mark.slow
+def test_resume_stands_on_its_checkpoint_alone(
+    folder: Path, finished: Path, unfinished: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Whoever empties the cache loses no step: the adapter is in the checkpoint."""
+    shutil.rmtree(tmp_path / "cache")
+    monkeypatch.setattr("warpir.diffusion.personalize.LoraTraining.update", pytest.fail)
+    monkeypatch.setattr("warpir.diffusion.network_prior.NetworkPrior.sample", pytest.fail)
+    assert main([*argv(folder, unfinished), "--resume"]) == ExitCode.DONE
+    assert results(unfinished) == results(finished)
+
+
 @pytest.mark.case("L9", "R16")
 @pytest.mark.parametrize("name", ["vae/config.json", "unet/diffusion_pytorch_model.safetensors"])
 def test_a_result_of_another_model_is_not_the_one_asked_for(
