@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 if TYPE_CHECKING:
-    from warpir.diffusion.prior import Prior
+    from warpir.diffusion.network_prior import NetworkPrior
 
 
 def content_key(*contents: object) -> str:
@@ -29,8 +29,8 @@ def content_key(*contents: object) -> str:
     return digest.hexdigest()
 
 
-def model_key(prior: Prior) -> str:
-    """Return what tells a model from all others: weights, schedule, resolution and arithmetic.
+def model_key(prior: NetworkPrior) -> str:
+    """Return what tells a model from all others: files, schedule, resolution and arithmetic.
 
     The schedule counts because the same weights stand for another model under another one; version
     and device because what they make differs in its last bits, and must not depend on what is kept.
@@ -41,6 +41,7 @@ def model_key(prior: Prior) -> str:
         schedule.prediction_type,
         schedule.alphas_cumprod,
         prior.resolution,
+        sorted(prior.precision.items()),
         torch.__version__,
         prior.device.type,
         torch.are_deterministic_algorithms_enabled(),

@@ -369,7 +369,7 @@ class EmbeddedPrior(NetworkPrior):
 
     Args:
         network: On its device, fp32; frozen from now on.
-        weight_hashes: sha256 by name of a weight file.
+        file_hashes: sha256 by name of every file that it was made of.
         training: How the weights came about, from their file; empty for random ones.
         graphs: Record what is done often as CUDA graphs; the device must be one.
     """
@@ -379,7 +379,7 @@ class EmbeddedPrior(NetworkPrior):
     def __init__(
         self,
         network: EmbeddedNetwork,
-        weight_hashes: Mapping[str, str],
+        file_hashes: Mapping[str, str],
         training: Mapping[str, Any] | None = None,
         graphs: bool = False,
     ) -> None:
@@ -395,7 +395,7 @@ class EmbeddedPrior(NetworkPrior):
         }
         shape = (3, RESOLUTION, RESOLUTION)
         super().__init__(
-            network.unet, schedule, solver_config, shape, RESOLUTION, weight_hashes, graphs
+            network.unet, schedule, solver_config, shape, RESOLUTION, file_hashes, graphs
         )
 
     def encode(self, image: Tensor) -> Tensor:

@@ -34,7 +34,7 @@ from warpir.atomic import write_file
 from warpir.diffusion.draws import generator_of
 from warpir.diffusion.model_error import ModelError
 from warpir.diffusion.model_folder import read_json
-from warpir.diffusion.weight_files import fault_of, not_a_lora, read_header
+from warpir.diffusion.weight_files import beside_lora, fault_of, not_a_lora, read_header
 
 if TYPE_CHECKING:
     from warpir.diffusion.network_prior import NetworkPrior
@@ -205,7 +205,7 @@ def read_safetensors(path: Path) -> tuple[dict[str, Tensor], dict[str, str]]:
 
 def _own_config(path: Path, header: dict[str, str]) -> dict[str, Any]:
     """Return what the file itself says of its LoRA: peft's configuration, or nothing."""
-    beside = path.with_name("adapter_config.json")
+    beside = beside_lora(path)
     if HEADER_KEY in header:
         where = f"{path}: {HEADER_KEY}"
         try:
@@ -214,7 +214,7 @@ def _own_config(path: Path, header: dict[str, str]) -> dict[str, Any]:
             raise ModelError(where, "not JSON") from error
         if not isinstance(config, dict):
             raise ModelError(where, "not a JSON object")
-    elif path.name == "adapter_model.safetensors" and beside.is_file():
+    elif beside is not None:
         where, config = str(beside), read_json(beside)
     else:
         return {}

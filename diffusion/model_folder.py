@@ -115,6 +115,14 @@ class ModelFolder:
     weights: dict[str, Weights]
     """Weights by part: ``unet``, ``vae`` and ``text_encoder``."""
 
+    @property
+    def files(self) -> tuple[Path, ...]:
+        """Every file that decides what the model makes: configurations, tokenizer, weights."""
+        configs = (self.path / part / name for part, name in CONFIGS.items())
+        words = (f for f in sorted((self.path / "tokenizer").iterdir()) if f.suffix in TEXTS)
+        weights = (file for held in self.weights.values() for file in held.files)
+        return (*configs, *words, *weights)
+
     def file_hash(self, file: Path) -> tuple[str, str]:
         """Return a file's name within the folder and its sha256."""
         with file.open("rb") as stream:

@@ -40,7 +40,7 @@ class NetworkPrior(ABC):
         solver_config: The same for diffusers' solvers, and what else they have to know.
         latent_shape: Shape of one picture's latents, [C, h, w].
         resolution: Side of the pictures that it judges [px].
-        weight_hashes: sha256 by name of a weight file.
+        file_hashes: sha256 by name of every file that it was made of.
         graphs: Record what is done often as CUDA graphs; the device must be one.
     """
 
@@ -54,7 +54,7 @@ class NetworkPrior(ABC):
         solver_config: Mapping[str, Any],
         latent_shape: tuple[int, int, int],
         resolution: int,
-        weight_hashes: Mapping[str, str],
+        file_hashes: Mapping[str, str],
         graphs: bool,
     ) -> None:
         unet.requires_grad_(False).eval()
@@ -64,8 +64,8 @@ class NetworkPrior(ABC):
         self.unet_dtype: torch.dtype = unet.dtype
         """Arithmetic of the UNet; an adapter in training may have its own."""
         self.latent_shape, self.resolution = latent_shape, resolution
-        self.weight_hashes = dict(sorted(weight_hashes.items()))
-        lines = "".join(f"{name} {sha256}\n" for name, sha256 in self.weight_hashes.items())
+        self.file_hashes = dict(sorted(file_hashes.items()))
+        lines = "".join(f"{name} {sha256}\n" for name, sha256 in self.file_hashes.items())
         self.digest = hashlib.sha256(lines.encode()).hexdigest()
         self.in_chunks: InChunks = at_once
         """How batches are done; replaced by who watches over memory."""
@@ -75,6 +75,21 @@ class NetworkPrior(ABC):
         """What the user is told about: precision, prompts that are not wholly read."""
         self._solver_config = dict(solver_config)
         self._embeddings: dict[str, Tensor] = {}
+
+    @property
+    def precision(self) -> dict[str, str]:
+        """Arithmetic of each network that decides what is made, such as ``unet``: ``fp16``."""
+        return {"unet": name_of_dtype(self.unet_dtype)}
+
+    def state_dict(self) -> dict[str, Any]:
+        """Return what a run has changed in it beside adapters: plain values."""
+        return {"precision": self.precision, "notices": self.notices}
+
+    def load_state_dict(self, state: Mapping[str, Any]) -> None:
+        """Go on from `state_dict`: what had to go over to fp32 computes in it from the start."""
+        if state["precision"]["unet"] == "fp32" and self.unet_dtype is not torch.float32:
+            self.use_full_precision()
+        self.notices = tuple(dict.fromkeys([*state["notices"], *self.notices]))
 
     @abstractmethod
     def encode(self, image: Tensor) -> Tensor:
@@ -256,7 +271,7 @@ class NetworkPrior(ABC):
         """
         cosine = self.precision_check(difference)
         if not cosine >= LEAST_COSINE:  # nan, where half precision overflowed, counts as too small
-            used = next(name for name, dtype in DTYPES.items() if dtype is self.unet_dtype)
+            used = self.precision["unet"]
             self._notice(
                 f"the UNet computes in fp32: in {used} the guidance has cosine {cosine:.3f} with "
                 f"the exact one (at least {LEAST_COSINE})"
@@ -473,6 +488,11 @@ class NetworkPrior(ABC):
 
     def _notice(self, text: str) -> None:
         self.notices = (*self.notices, text)
+
+
+def name_of_dtype(dtype: torch.dtype) -> str:
+    """Return what a user calls one of `DTYPES`."""
+    return next(name for name, known in DTYPES.items() if known is dtype)
 
 
 @contextmanager

@@ -89,6 +89,40 @@ class Personalization:
     notices: tuple[str, ...]
     """What the user is told about."""
 
+    def state_dict(self) -> dict[str, Any]:
+        """Return what a later run needs to go on with this adapter: tensors and plain values."""
+        return {
+            "adapter": self.adapter,
+            "weights": self.lora.weights,
+            "alphas": self.lora.alphas,
+            "targets": self.lora.targets,
+            "losses": self.losses,
+            "evaluation": self.evaluation,
+            "class_prompts": self.class_prompts,
+            "notices": self.notices,
+        }
+
+
+def restore_personalization(prior: NetworkPrior, state: Mapping[str, Any]) -> Personalization:
+    """Adapt the prior as `Personalization.state_dict` says; neither a file nor a cache is asked.
+
+    Raises:
+        ModelError: The adapter belongs to another model.
+    """
+    lora = Lora(dict(state["weights"]), dict(state["alphas"]), tuple(state["targets"]))
+    errors = state["evaluation"]
+    install_lora(prior, lora, state["adapter"], "checkpoint")
+    return Personalization(
+        state["adapter"],
+        lora,
+        state["losses"],
+        errors and (errors[0], errors[1]),
+        tuple(state["class_prompts"]),
+        {},
+        True,
+        tuple(state["notices"]),
+    )
+
 
 def personalize(
     prior: NetworkPrior,

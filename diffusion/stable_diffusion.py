@@ -8,7 +8,7 @@ The attention processors stay diffusers' own: replacing them loses the care that
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from functools import partial
@@ -29,7 +29,7 @@ from warpir.diffusion.model_folder import (
     find_model,
     hub_offline,
 )
-from warpir.diffusion.network_prior import DTYPES, NetworkPrior
+from warpir.diffusion.network_prior import DTYPES, NetworkPrior, name_of_dtype
 from warpir.diffusion.schedule import NoiseSchedule
 from warpir.diffusion.settings import ModelSettings
 
@@ -58,7 +58,7 @@ class StableDiffusion(NetworkPrior):
         text_encoder: Ids to embeddings, fp32.
         tokenizer: Words to ids.
         scheduler_config: The model's own; `SCHEDULE_WORDS` of it are used.
-        weight_hashes: sha256 by name of a weight file.
+        file_hashes: sha256 by name of every file that it was made of.
         checkpoint_vae: Recompute the VAE's encoder in the backward pass instead of keeping it.
         graphs: Record what is done often as CUDA graphs; the device must be one.
     """
@@ -72,7 +72,7 @@ class StableDiffusion(NetworkPrior):
         text_encoder: CLIPTextModel,
         tokenizer: CLIPTokenizer,
         scheduler_config: dict[str, Any],
-        weight_hashes: dict[str, str],
+        file_hashes: dict[str, str],
         checkpoint_vae: bool = True,
         graphs: bool = False,
     ) -> None:
@@ -92,7 +92,7 @@ class StableDiffusion(NetworkPrior):
             solver_config,
             (LATENT_CHANNELS, side, side),
             side * 2 ** (len(vae.config.block_out_channels) - 1),
-            weight_hashes,
+            file_hashes,
             graphs,
         )
         self._mean = _PosteriorMean(vae)
@@ -112,13 +112,28 @@ class StableDiffusion(NetworkPrior):
         super().spare_memory()
         self._checkpoint_vae()
 
+    @property
+    def precision(self) -> dict[str, str]:
+        """Arithmetic of UNet and VAE."""
+        return {**super().precision, "vae": name_of_dtype(self.vae.dtype)}
+
+    def load_state_dict(self, state: Mapping[str, Any]) -> None:
+        """Go on from `state_dict`."""
+        super().load_state_dict(state)
+        if state["precision"]["vae"] == "fp32":
+            self._upcast_vae()
+
     def upcast(self) -> bool:
         """Let UNet and VAE compute in fp32 from now on; return False where they do already."""
-        is_vae_low = self.vae.dtype is not torch.float32
-        if is_vae_low:
-            self.forget_graphs()
-            self.vae.float()
+        is_vae_low = self._upcast_vae()
         return super().upcast() or is_vae_low
+
+    def _upcast_vae(self) -> bool:
+        if self.vae.dtype is torch.float32:
+            return False
+        self.forget_graphs()
+        self.vae.float()
+        return True
 
     def free_text_encoder(self) -> None:
         """Drop the text encoder and its memory; embeddings that were made stay."""
@@ -254,7 +269,7 @@ def load_stable_diffusion(settings: ModelSettings, device: torch.device | str) -
         found = find_model(settings.model, settings.allow_download, settings.allow_pickle)
         folder = check_model_folder(found, settings.allow_pickle)
         # Hashing reads what loading reads, at the same time.
-        hashes = pool.map(folder.file_hash, (f for w in folder.weights.values() for f in w.files))
+        hashes = pool.map(folder.file_hash, folder.files)
         unet = _load(UNet2DConditionModel, folder, "unet", unet_precision, device)
         vae = _load(AutoencoderKL, folder, "vae", vae_precision, device)
         # The attention is named lest the configuration name code of the hub.

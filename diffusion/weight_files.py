@@ -7,8 +7,9 @@ weights fit a network that was built of them is checked again when they are load
 
 import hashlib
 import json
+import math
 import re
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -35,7 +36,7 @@ PRIOR_SIZES: Sizes = {
     "embedding_width": (1, 1, int, 1, 65_536),
 }
 """Of each field of a `warpir.diffusion.embedded.NetworkConfig`: the least and the greatest count of
-numbers, their kind, and the least and the greatest number."""
+numbers, which are a list where there may be several; their kind, and the least and the greatest."""
 REGRESSOR_SIZES: Sizes = {
     "channels": (3, 3, int, 8, 512),
     "blocks": (2, 2, int, 0, 16),
@@ -54,6 +55,12 @@ EXPONENTS = {
     "F64": ("<u8", 0x7FF0_0000_0000_0000),
 }
 """How a kind of number is stored, and the bits that are all set where it is NaN or infinite."""
+OURS = ("F16", "F32", "F64")
+"""Kinds of number of the networks that we ship."""
+NUMBERS_MAX = 2**27
+"""Of such a network; ours have less than a tenth."""
+PIECE = 2**22
+"""What is looked at in one go [byte]."""
 
 _LORA_PART = re.compile(r"(.*?)[._]lora(?:_linear_layer)?[._](down|up|A|B)(?:\.weight)?")
 _FOR_TEXT = ("text_encoder", "lora_te_", "lora_te1_", "lora_te2_")
@@ -153,13 +160,11 @@ def check_prior(path: Path | None) -> int:
     if any(width % network["groups"] for width in network["widths"]):
         what = f"network: widths {network['widths']} in {network['groups']} groups"
         raise ModelError(where, f"{what} (expected multiples)")
-    values = _finite_values(file)
-    if values_hash(values) != described.get("weights"):
-        raise ModelError(where, "damaged (its weights are not those that were written)")
     if path is not None and shipped.is_file():
         ours = read_header(shipped)
         if _object(str(shipped), ours.about[PRIOR_KEY])["network"] == network:
             _check_shapes(file, ours)
+    _check_written(file, described.get("weights"))
     return int(network["embedding_width"])
 
 
@@ -188,18 +193,19 @@ def check_regressor(path: Path | None) -> WeightFile:
     if any(width % 8 for width in config["channels"]) or config["channels"][2] % config["heads"]:
         what = f"network: channels {config['channels']} of {config['heads']} heads"
         raise ModelError(where, f"{what} (expected multiples of 8, the last of the heads too)")
-    values = _finite_values(file)
-    if values_hash(values, file.about["config"]) != file.about.get("weights"):
-        raise ModelError(where, "damaged (its weights are not those that were written)")
     if path is not None and shipped.is_file():
         ours = read_header(shipped)
         if _object(str(shipped), ours.about["config"]) == config:
             _check_shapes(file, ours)
-    temperature, directions = (values.get(name) for name in ("temperature", "directions"))
+    _check_written(file, file.about.get("weights"), file.about["config"])
+    temperature, directions = (_value(file, name) for name in ("temperature", "directions"))
     if temperature is None or temperature.shape != () or not temperature > 0.0:
         raise ModelError(where, "temperature: not a number above 0")
-    length = None if directions is None else np.linalg.norm(directions, axis=-1)
-    if length is None or not np.allclose(length, 1.0, atol=1e-3):
+    if (
+        directions is None
+        or directions.ndim != 2
+        or not np.allclose(np.linalg.norm(directions, axis=1), 1.0, atol=1e-3)
+    ):
         raise ModelError(where, "directions: not of length 1")
     return file
 
@@ -208,18 +214,21 @@ def _check_sizes(where: str, config: Mapping[str, Any], sizes: Sizes) -> None:
     """Check what a header says of its network, before one is built.
 
     Raises:
-        ModelError: A number is missing, too many, or out of range.
+        ModelError: A number is missing, too many, out of range, or a list is none.
     """
     if set(config) != set(sizes):
         raise ModelError(where, "its header is damaged (other sizes of a network than expected)")
     for name, (fewest, most, kind, low, high) in sizes.items():
-        numbers = config[name] if isinstance(config[name], list) else [config[name]]
-        if not fewest <= len(numbers) <= most or any(
-            type(number) not in (int, kind) or not low <= number <= high for number in numbers
+        numbers = config[name] if most > 1 else [config[name]]
+        if (
+            not isinstance(numbers, list)
+            or not fewest <= len(numbers) <= most
+            or any(type(n) not in (int, kind) or not low <= n <= high for n in numbers)
         ):
             count = f"{fewest} to {most}" if fewest < most else f"{fewest}"
-            expected = f"{count} number{'s' * (most > 1)} from {low} to {high}"
-            raise ModelError(where, f"network: {name} {numbers!r:.60} (expected {expected})")
+            expected = f"a list of {count} numbers" if most > 1 else "one number"
+            found = f"network: {name} {config[name]!r:.60}"
+            raise ModelError(where, f"{found} (expected {expected} from {low} to {high})")
 
 
 def check_lora(path: Path, embedding_width: int | None) -> None:
@@ -246,6 +255,8 @@ def check_lora(path: Path, embedding_width: int | None) -> None:
             layers.setdefault(found[1], {})[part] = shape
         elif not key.endswith(".alpha"):
             odd.append(key)
+        elif math.prod(shape) != 1:
+            raise ModelError(where, f"{key}: shape {list(shape)} (expected one number)")
     if odd or not layers:
         raise not_a_lora(path, odd, len(named))
     for layer, parts in layers.items():
@@ -264,6 +275,12 @@ def check_lora(path: Path, embedding_width: int | None) -> None:
             advice = "give a LoRA that was trained on this model"
             raise ModelError(where, f"{what}{embedding_width})", advice)
     _check_finite(file)
+
+
+def beside_lora(path: Path) -> Path | None:
+    """Return peft's configuration where it lies beside a LoRA that peft wrote: its alpha counts."""
+    beside = path.with_name("adapter_config.json")
+    return beside if path.name == "adapter_model.safetensors" and beside.is_file() else None
 
 
 def not_a_lora(path: Path, odd: list[str], count: int) -> ModelError:
@@ -287,43 +304,79 @@ def values_hash(values: Mapping[str, NDArray[Any]], about: str = "") -> str:
     return digest.hexdigest()
 
 
-def _finite_values(file: WeightFile) -> dict[str, NDArray[Any]]:
-    """Return the values of a small file by name.
+def _check_written(file: WeightFile, expected: object, about: str = "") -> None:
+    """Check that the values of one of our networks are finite numbers, and as they were written.
+
+    Args:
+        file: The file.
+        expected: Their `values_hash`, by the header.
+        about: As of `values_hash`.
 
     Raises:
-        ModelError: Some are not numbers, or not finite.
+        ModelError: They are not, or there are too many.
     """
+    where, count = str(file.path), sum(map(math.prod, file.shapes.values()))
+    if count > NUMBERS_MAX:
+        raise ModelError(where, f"{count} weights (expected at most {NUMBERS_MAX})")
+    for name, kind in file.kinds.items():
+        if kind not in OURS:
+            raise ModelError(where, f"{name}: values are not finite numbers (found {kind})")
     _check_finite(file)
-    values: dict[str, NDArray[Any]] = {}
-    try:
-        with safe_open(file.path, framework="np") as content:
-            for name in file.shapes:
-                values[name] = content.get_tensor(name)
-    except (SafetensorError, OSError, RuntimeError, TypeError, ValueError) as error:
-        raise ModelError(str(file.path), *fault_of(file.path)) from error
-    for name, value in values.items():
-        if value.dtype.kind != "f":
-            raise ModelError(str(file.path), f"{name}: values are not finite numbers")
-    return values
+    digest, before = hashlib.sha256(about.encode()), None
+    for name, piece in _pieces(file):
+        digest.update(name.encode() if name != before else b"")
+        digest.update(piece)
+        before = name
+    if digest.hexdigest() != expected:
+        raise ModelError(where, "damaged (its weights are not those that were written)")
 
 
 def _check_finite(file: WeightFile) -> None:
-    """Check the values of a small file, in any kind of number that weights have.
+    """Check the values of a file, in any kind of number that weights have.
 
     Raises:
         ModelError: Some are NaN or infinite.
     """
-    content = np.memmap(file.path, np.uint8, mode="r")
-    start = 8 + int.from_bytes(content[:8].tobytes(), "little")
-    header = json.loads(content[8:start].tobytes())
-    for name, kind in file.kinds.items():
-        if kind in EXPONENTS:
-            stored, bits = EXPONENTS[kind]
-            first, last = header[name]["data_offsets"]
-            values = content[start + first : start + last].view(stored)
+    for name, piece in _pieces(file):
+        if file.kinds[name] in EXPONENTS:
+            stored, bits = EXPONENTS[file.kinds[name]]
             mask = np.array(bits, stored)
-            if bool(((values & mask) == mask).any()):
+            if bool(((np.frombuffer(piece, stored) & mask) == mask).any()):
                 raise ModelError(str(file.path), f"{name}: values are not finite numbers")
+
+
+def _pieces(file: WeightFile) -> Iterator[tuple[str, bytes]]:
+    """Yield what tensors hold, by name in order, in pieces of whole numbers: one at least of each.
+
+    Raises:
+        ModelError: The file cannot be read any more.
+    """
+    try:
+        with file.path.open("rb") as stream:
+            start = 8 + int.from_bytes(stream.read(8), "little")
+            header = json.loads(stream.read(start - 8))
+            for name in sorted(file.shapes):
+                first, last = header[name]["data_offsets"]
+                stream.seek(start + first)
+                for place in range(first, max(last, first + 1), PIECE):
+                    piece = stream.read(min(PIECE, last - place))
+                    if len(piece) < min(PIECE, last - place):
+                        raise EOFError
+                    yield name, piece
+    except (EOFError, OSError, ValueError, LookupError) as error:  # somebody else has changed it
+        raise ModelError(str(file.path), *fault_of(file.path)) from error
+
+
+def _value(file: WeightFile, name: str) -> NDArray[Any] | None:
+    """Return one tensor of a file that was checked; None: it is not there."""
+    if name not in file.shapes:
+        return None
+    try:
+        with safe_open(file.path, framework="np") as content:
+            value: NDArray[Any] = content.get_tensor(name)
+            return value
+    except (SafetensorError, OSError, RuntimeError, TypeError, ValueError) as error:
+        raise ModelError(str(file.path), *fault_of(file.path)) from error
 
 
 def _check_shapes(file: WeightFile, ours: WeightFile) -> None:

@@ -7,7 +7,7 @@ import os
 import subprocess
 import sys
 import tempfile
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import pytest
@@ -19,6 +19,8 @@ from tests.test_recover_embedded import CHEAP, NETWORK
 from warpir import caches
 from warpir.caches import KernelCache, cache_folder, take_notices
 from warpir.diffusion import embedded
+from warpir.errors import ExitCode, InputError
+from warpir.program import explain
 
 VERSION = "1.2"
 
@@ -119,6 +121,26 @@ def test_unusable_cache_is_replaced(
     assert "kept for this run only" in told and "WARPIR_CACHE" in told
     if case in ("no-home", "nobody"):
         assert not root.exists()
+
+
+@pytest.mark.parametrize("make", [cache_folder, lambda: KernelCache(VERSION)])
+def test_no_temporary_folder_is_a_full_disk(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, make: Callable[[], object]
+) -> None:
+    """All of them are full: the run ends with 5, and the line that says so needs none."""
+
+    def full(*_: object, **__: object) -> str:
+        raise FileNotFoundError(errno.ENOENT, "No usable temporary directory found in ['/tmp']")
+
+    monkeypatch.setenv("WARPIR_CACHE", str(tmp_path / "own"))
+    (tmp_path / "own").write_text("in the way")
+    for name in ("mkdtemp", "gettempdir"):
+        monkeypatch.setattr(tempfile, name, full)
+    with pytest.raises(InputError, match="No usable temporary directory") as caught:
+        make()
+    assert caught.value.code == ExitCode.RESOURCES and "disk space" in caught.value.advice
+    status, lines = explain(OSError(errno.ENOSPC, "No space left on device"))
+    assert status == ExitCode.RESOURCES and "No space left" in lines[0]
 
 
 # Compiled kernels

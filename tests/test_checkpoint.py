@@ -6,7 +6,7 @@ from pathlib import Path
 import pytest
 import torch
 
-from warpir.checkpoint import MANIFEST, STATE, Checkpoints
+from warpir.checkpoint import FORMAT, MANIFEST, STATE, Checkpoints
 from warpir.errors import ExitCode, InputError
 
 IDENTITY = {"config": {"steps": 10, "sun": (1.0, 2.0)}, "inputs": {"photo": "ab"}}
@@ -77,7 +77,7 @@ def test_checkpoint_damaged_is_passed_over(tmp_path: Path, damage: str) -> None:
     elif damage == "no manifest":
         (newest / MANIFEST).unlink()
     elif damage == "newer format":
-        (newest / MANIFEST).write_text(json.dumps(manifest | {"format": 2}))
+        (newest / MANIFEST).write_text(json.dumps(manifest | {"format": FORMAT + 1}))
     else:
         del manifest["state"]
         (newest / MANIFEST).write_text(json.dumps(manifest))

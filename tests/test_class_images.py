@@ -57,7 +57,7 @@ def prior(tmp_path_factory: pytest.TempPathFactory) -> StableDiffusion:
 class Painter:
     """Stands for a model: a picture is a function of prompt and seed; all calls are kept."""
 
-    name, digest, resolution = "painter", "0" * 64, 16
+    name, digest, resolution, precision = "painter", "0" * 64, 16, {"unet": "fp32"}
     device = torch.device("cpu")
     schedule = NoiseSchedule(torch.linspace(0.99, 0.01, 10, dtype=torch.float64), "epsilon")
 

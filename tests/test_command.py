@@ -587,6 +587,9 @@ def test_config_file_yields_to_flags(tmp_path: Path) -> None:
         ("c.yaml", "place: {x: 1}\n", "X,Y,Z"),
         ("c.yaml", "camera: [a]\n", "FILE"),
         ("c.yaml", "photo: !!python/object/apply:os.system ['touch x']\n", "not YAML"),
+        pytest.param("c.yaml", "device: !!bool maybe\n", "its tag", id="F1-yaml-bool"),
+        pytest.param("c.yaml", 'fov: !!float ""\n', "its tag", id="F1-yaml-float"),
+        pytest.param("c.yaml", "seed: !!timestamp x\n", "its tag", id="F1-yaml-timestamp"),
         ("c.yaml", "samples: 3\nsamples: 4\n", "line 2: key 'samples' twice"),
         ("c.yaml", "a: [\n", "not YAML"),
         pytest.param(

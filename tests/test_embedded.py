@@ -273,7 +273,7 @@ def test_schedule_is_a_cosine() -> None:
 def test_priors_honour_the_same_contract(both: dict[str, NetworkPrior], name: str) -> None:
     prior = both[name]
     assert prior.name == name and len(prior.digest) == 64 and prior.resolution == 64
-    assert all(len(sha256) == 64 for sha256 in prior.weight_hashes.values())
+    assert all(len(sha256) == 64 for sha256 in prior.file_hashes.values())
     embeddings = prior.embed(["a photo of a car", ""])
     assert embeddings.ndim == 3 and embeddings.dtype == torch.float32
     assert not torch.equal(embeddings[0], embeddings[1])
@@ -460,7 +460,7 @@ def test_files_come_back(tmp_path: Path) -> None:
     found = load_embedded(file, "cpu")
     assert found.training == {"steps": 7} and found.network.config == TINY
     sha256 = hashlib.sha256(file.read_bytes()).hexdigest()
-    assert found.weight_hashes == {"prior.safetensors": sha256}
+    assert found.file_hashes == {"prior.safetensors": sha256}
     held = found.network.state_dict()
     for name, value in network.state_dict().items():
         assert held[name].dtype == torch.float32

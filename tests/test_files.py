@@ -1,10 +1,13 @@
 """What is written, and that it is whole or not there; values are asserted exactly."""
 
+import errno
 import hashlib
 import json
 import os
+import signal
 import subprocess
 import sys
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -14,7 +17,8 @@ import pytest
 from PIL import Image
 
 from tests.image_files import directions, four_lobes, matrix_profile
-from warpir import color
+from warpir import color, files, signals
+from warpir.atomic import restore_folders, write_folder
 from warpir.camera import Camera, camera_from_fov
 from warpir.errors import ExitCode, InputError
 from warpir.files import BACKGROUND_DEPTH, Layers, OutputFolder, read_layers, write_layers
@@ -488,6 +492,124 @@ def test_lock_of_somebody_else_is_left_alone(tmp_path: Path) -> None:
         pass
     assert caught.value.code == ExitCode.OUTPUT
     assert (tmp_path / ".lock").read_text() == "precious"
+
+
+@pytest.mark.case("F5")
+@pytest.mark.parametrize("make", [os.mkfifo, os.mkdir], ids=["FIFO", "folder"])
+def test_lock_that_is_no_file_is_refused(tmp_path: Path, make: Callable[[Path], None]) -> None:
+    """At once: who opens a FIFO waits for its other end."""
+    make(tmp_path / ".lock")
+    folder = OutputFolder(tmp_path, overwrite=True)
+    for enter in (folder.check, folder.__enter__):
+        with pytest.raises(InputError) as caught:
+            enter()
+        assert caught.value.code in (ExitCode.OUTPUT, ExitCode.RESOURCES)
+    assert os.listdir(tmp_path) == [".lock"]
+
+
+@pytest.mark.case("R6")
+def test_old_file_that_cannot_be_read_costs_no_run(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """It is replaced where it has a new one's name, and stays where it has not."""
+    with OutputFolder(tmp_path) as out:
+        for name in ("a.txt", "b.txt"):
+            out.write_bytes(name, b"old")
+        out.write_json("run.json", {})
+    opened = Path.open
+
+    def denied(self: Path, *args: Any, **more: Any) -> Any:
+        if self.parent == tmp_path and self.suffix == ".txt":
+            raise PermissionError(errno.EACCES, "Permission denied", str(self))
+        return opened(self, *args, **more)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(Path, "open", denied)
+        with OutputFolder(tmp_path, overwrite=True) as out:
+            out.write_bytes("a.txt", b"new")
+            out.write_json("run.json", {})
+    assert (tmp_path / "a.txt").read_bytes() == b"new"
+    assert (tmp_path / "b.txt").read_bytes() == b"old"
+
+
+@pytest.mark.case("F5")
+def test_folder_that_cannot_be_listed_is_no_output(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def denied(path: Path) -> Any:
+        raise PermissionError(errno.EACCES, "Permission denied", str(path))
+
+    monkeypatch.setattr(files, "results_in", denied)
+    for enter in (OutputFolder(tmp_path).check, OutputFolder(tmp_path).__enter__):
+        with pytest.raises(InputError, match="Permission denied") as caught:
+            enter()
+        assert caught.value.code == ExitCode.RESOURCES and caught.value.where == str(tmp_path)
+    assert os.listdir(tmp_path) == []
+
+
+# ------------------------------------------------------------------- folders that are replaced
+
+
+def replace_folder(path: Path) -> None:
+    write_folder(path, [("a.txt", b"new"), ("deep/b.txt", b"new")])
+
+
+@pytest.mark.case("R2")
+@pytest.mark.parametrize("turn", [1, 2])
+def test_a_signal_leaves_a_whole_folder(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, turn: int
+) -> None:
+    """SIGTERM after either of the two renames waits for the other; nothing else is left."""
+    path, calls, inner = tmp_path / "state", [0], os.rename
+    write_folder(path, [("a.txt", b"old")])
+
+    def renamed(source: Path, target: Path) -> None:
+        inner(source, target)
+        calls[0] += 1
+        if calls[0] == turn:
+            signal.raise_signal(signal.SIGTERM)
+
+    monkeypatch.setattr(os, "rename", renamed)
+    with pytest.raises(signals.Stopped), signals.handled():
+        replace_folder(path)
+    assert (path / "a.txt").read_bytes() == (path / "deep" / "b.txt").read_bytes() == b"new"
+    assert os.listdir(tmp_path) == ["state"]
+
+
+def test_an_exception_gives_the_folder_back(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Ctrl-C where no handler of ours is."""
+    path, inner = tmp_path / "state", os.rename
+    write_folder(path, [("a.txt", b"old")])
+
+    def renamed(source: Path, target: Path) -> None:
+        inner(source, target)
+        if source == path:
+            raise KeyboardInterrupt
+
+    monkeypatch.setattr(os, "rename", renamed)
+    with pytest.raises(KeyboardInterrupt):
+        replace_folder(path)
+    assert os.listdir(tmp_path) == ["state"] and os.listdir(path) == ["a.txt"]
+
+
+@pytest.mark.case("R1")
+def test_a_kill_leaves_a_folder_that_can_be_restored(tmp_path: Path) -> None:
+    """Between the two renames; one whose name is there again is left alone."""
+    path = tmp_path / "state-000018"
+    write_folder(path, [("a.txt", b"old")])
+    code = "import os, sys; from pathlib import Path; from warpir.atomic import write_folder\n"
+    code += "rename = os.rename\n"
+    code += "os.rename = lambda *names: (rename(*names), os.kill(os.getpid(), 9))\n"
+    code += "write_folder(Path(sys.argv[1]), [('a.txt', b'new')])"
+    assert subprocess.run([sys.executable, "-c", code, path], check=False).returncode == -9
+    assert not path.exists()
+    restore_folders(tmp_path)
+    assert (path / "a.txt").read_bytes() == b"old"
+    replace_folder(path)
+    restore_folders(tmp_path)
+    assert (path / "a.txt").read_bytes() == b"new"
 
 
 @pytest.mark.case("F5")

@@ -12,11 +12,11 @@ MITSUBA_PARTS = {"mitsuba_light", "mitsuba_material", "mitsuba_path"}
 # Each module of warpir/ imports modules of lower levels only; a module that is on no level fails.
 LEVELS = (
     {
-        "errors", "atomic", "caches", "signals", "color", "acceptance",
+        "errors", "signals", "color", "acceptance",
         "contact_sheet", "evaluation_report", "photo_look", "training_batches", "study_plan",
         "study_report", "page_policy",
     },
-    {"limits"},
+    {"limits", "atomic", "caches"},
     {
         "optimize_settings", "asset", "strict_json", "image_errors", "lpips", "image_decoder",
         "lens", "colmap_model", "memory", "bad_pixels", "determinism",

@@ -8,6 +8,7 @@ import json
 import os
 import pickle
 import struct
+import tracemalloc
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -23,10 +24,13 @@ from tests.test_embedded import TINY
 from tests.test_insert import arguments, write_inputs
 from tests.test_regressor import SMALL
 from tests.tiny_stable_diffusion import make_tiny_stable_diffusion
+from warpir.config import InsertConfig
 from warpir.diffusion.embedded import build_network, save_embedded
 from warpir.diffusion.weight_files import values_hash
+from warpir.record import input_files
 from warpir.regressor import random_regressor, save_regressor
 
+WRITTEN = "damaged (its weights are not those that were written)"
 LAYER = "mid_block.attentions.0.transformer_blocks.0.attn2.to_k"
 FLAGS = ("lora", "prior", "regressor")
 
@@ -218,6 +222,7 @@ def as_written(spoil: Callable[[dict[str, Any]], object]) -> Callable[[Path], No
             for name, value, words in (
                 ("heads", 0, "network: heads"),
                 ("heads", 3, "of 3 heads"),
+                ("heads", [4], "network: heads"),
                 ("heads", 4, "not those that were written"),
                 ("directions", 10**9, "network: directions"),
                 ("depth", 10**7, "network: depth"),
@@ -233,6 +238,9 @@ def as_written(spoil: Callable[[dict[str, Any]], object]) -> Callable[[Path], No
             for name, value, words in (
                 ("groups", 0, "network: groups"),
                 ("groups", 7, "in 7 groups"),
+                ("groups", [8], "network: groups"),
+                ("widths", 64, "network: widths"),
+                ("embedding_width", [32], "network: embedding_width"),
                 ("head_width", 0, "network: head_width"),
                 ("widths", [16, 32_000], "network: widths"),
                 ("widths", [], "network: widths"),
@@ -292,6 +300,14 @@ def as_written(spoil: Callable[[dict[str, Any]], object]) -> Callable[[Path], No
             "text encoder",
             id="L8-text-encoder",
         ),
+        pytest.param(
+            "lora",
+            edited(
+                lambda t, about: t.update({f"unet.{LAYER}.alpha": np.ones(2, np.float32)})
+            ),
+            "alpha: shape [2] (expected one number)",
+            id="L8-two-alphas",
+        ),
     ],
 )  # fmt: skip
 def test_weights_that_say_something_else_are_refused(
@@ -302,6 +318,60 @@ def test_weights_that_say_something_else_are_refused(
     damage(file)
     argv = run_with(inputs, flag, file)
     assert_fails(argv, 4, str(file), words, cwd=tmp_path, before=NO_TORCH)
+
+
+@pytest.mark.case("L2")
+@pytest.mark.parametrize("flag", FLAGS)
+def test_a_large_file_is_looked_at_in_pieces(inputs: Path, tmp_path: Path, flag: str) -> None:
+    """64 MiB that take no room on the disk take little in memory; too many are not looked at."""
+    from warpir.diffusion import weight_files
+    from warpir.diffusion.model_error import ModelError
+
+    def check(count: int) -> str:
+        _, about = tensors_of(inputs / f"{flag}.safetensors")
+        names = [f"{LAYER}.lora_A.weight", f"{LAYER}.lora_B.weight"] if flag == "lora" else ["a"]
+        shapes = ([count // 32, 32], [1, count // 32]) if flag == "lora" else ([count],)
+        entries: dict[str, object] = {"__metadata__": about}
+        place = 0
+        for name, shape in zip(names, shapes, strict=True):
+            end = place + 4 * shape[0] * (shape[1] if len(shape) > 1 else 1)
+            entries[name] = {"dtype": "F32", "shape": shape, "data_offsets": [place, end]}
+            place = end
+        text = json.dumps(entries).encode()
+        file = tmp_path / "large.safetensors"
+        with file.open("wb") as stream:
+            stream.write(struct.pack("<Q", len(text)) + text)
+            stream.truncate(8 + len(text) + place)
+        tracemalloc.start()
+        try:
+            if flag == "lora":
+                weight_files.check_lora(file, None)
+            elif flag == "prior":
+                weight_files.check_prior(file)
+            else:
+                weight_files.check_regressor(file)
+        except ModelError as error:
+            return error.what
+        finally:
+            peak = tracemalloc.get_traced_memory()[1]
+            tracemalloc.stop()
+            assert peak < 2**25
+        return ""
+
+    assert check(2**24) == ("" if flag == "lora" else WRITTEN)
+    if flag != "lora":
+        assert "expected at most" in check(2**28)
+
+
+@pytest.mark.case("L9")
+def test_the_configuration_beside_a_lora_is_an_input(tmp_path: Path) -> None:
+    """It sets alpha: a resumed run, and a batch, must see that it changed."""
+    file, beside = tmp_path / "adapter_model.safetensors", tmp_path / "adapter_config.json"
+    file.touch()
+    config = InsertConfig(lora=str(file))
+    assert input_files(config) == {"lora": file}
+    beside.touch()
+    assert input_files(config) == {"lora": file, "lora/adapter_config.json": beside}
 
 
 @pytest.mark.case("L2", "L8")

@@ -111,6 +111,20 @@ def test_bad_pixels_are_black_counted_and_named(
                 assert (renderer.bad_pixels.count == 0) is is_clean
 
 
+def test_bad_pixels_are_counted_on_by_a_resumed_run() -> None:
+    """The sum of both halves, and the names of the first."""
+    plane, pixels = np.array([[np.nan], *[[1.0]] * 199], np.float32), np.arange(200, dtype=np.int32)
+    whole, first, second = BadPixels(), BadPixels(), BadPixels()
+    for step in range(4):
+        if step == 2:
+            second.load_state_dict(json.loads(json.dumps(first.state_dict())))
+        half = first if step < 2 else second
+        for counter in (whole, half):
+            counter.iteration = step
+            counter.blackened((plane,), pixels, 10, "object")
+    assert whole.state_dict() == second.state_dict() and whole.count == 4
+
+
 @pytest.mark.parametrize(
     ("bad", "count", "is_refused"),
     [

@@ -400,6 +400,21 @@ def test_resumed_run_ends_as_if_it_had_not_stopped(
         assert torch.equal(whole.final_image(1), resumed.final_image(1))
 
 
+def test_a_long_history_stays_readable(device: str, tmp_path: Path) -> None:
+    """A checkpoint's text, whose length is bounded, does not grow with the steps that it knows."""
+    loop = a_loop(device)
+    loop.state.history = [{"gradient": 1.0 / (k + 3), "bend": 0.1 * k} for k in range(100_000)]
+    loop.state.history[7] = {}
+    loop.state.history[9]["score"] = 0.1 + 0.2
+    loop.state.step = len(loop.state.history)
+    checkpoints = Checkpoints(tmp_path, {})
+    checkpoints.save("optimize", loop.state.step, loop.state_dict())
+    assert (tmp_path / "checkpoints/000001-optimize-100000/manifest.json").stat().st_size < 2**14
+    resumed = a_loop(device)
+    resumed.load_state_dict(checkpoints.load(pytest.fail).state)
+    assert resumed.state == loop.state
+
+
 @pytest.mark.parametrize("integrator", ["transport", "mis"])
 def test_run_does_not_depend_on_threads(device: str, integrator: str) -> None:
     """One thread or two, tracing and sampling give the same bytes."""

@@ -14,13 +14,16 @@ from typing import Any, cast
 
 import numpy as np
 import pytest
+import torch
 from safetensors.torch import load_file, save_file
 
 from tests.test_insert import ALWAYS, DETAIL, arguments, digest, write_inputs
 from tests.tiny_stable_diffusion import make_tiny_stable_diffusion
+from warpir.command import parse
 from warpir.config import InsertConfig
 from warpir.curves import Curves
 from warpir.errors import ExitCode
+from warpir.finished import OtherRun, is_done
 from warpir.insert import main
 from warpir.light import Light, sun_lobe
 from warpir.lighting import SceneLight
@@ -98,7 +101,7 @@ def test_guided_run_writes_every_file_and_says_who_spoke(finished: Path) -> None
     run = record(finished)
     measured = run["measured"]
     assert measured["prior"] == "stable-diffusion" and measured["loop_integrator"] == "transport"
-    assert set(measured["model"]["sha256"]) == {
+    assert set(measured["model"]["sha256"]) > {
         "text_encoder/model.safetensors",
         "unet/diffusion_pytorch_model.safetensors",
         "vae/diffusion_pytorch_model.safetensors",
@@ -184,7 +187,6 @@ def test_stopped_run_resumes_as_if_it_had_not_been(
 
 def stop_hard(arguments: list[str]) -> None:
     """Run without the program's own explanation of exceptions."""
-    from warpir.command import parse
     from warpir.insert import insert
 
     insert(parse(arguments).config)
@@ -238,7 +240,9 @@ def test_resume_without_a_checkpoint_starts_and_says_so(
 def test_resume_refuses_another_model(
     folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """Other weights and another noise schedule in the folder that is named as before."""
+    """Other weights, schedule, scale and words in the folder that is named as before."""
+    import warpir.recover  # noqa: F401
+
     model = tmp_path / "model"
     shutil.copytree(folder / "epsilon", model)
     out = tmp_path / "other"
@@ -252,10 +256,72 @@ def test_resume_refuses_another_model(
     save_file(tensors, weights, {"format": "pt"})
     scheduler = model / "scheduler/scheduler_config.json"
     scheduler.write_text(scheduler.read_text().replace("0.012", "0.011"))
+    for name, change in (
+        ("vae/config", {"scaling_factor": 0.2}),
+        ("tokenizer/tokenizer_config", {"model_max_length": 70}),
+    ):
+        file = model / f"{name}.json"
+        file.write_text(json.dumps(json.loads(file.read_text()) | change))
     assert main([*argv(folder, out, model=str(model)), "--resume"]) == ExitCode.INPUT
     error = capsys.readouterr().err
-    assert "model.unet/diffusion_pytorch_model.safetensors: was" in error
-    assert "model.scheduler: was" in error and "text_encoder" not in error
+    for name in (
+        "unet/diffusion_pytorch_model.safetensors",
+        "scheduler/scheduler_config.json",
+        "vae/config.json",
+        "tokenizer/tokenizer_config.json",
+    ):
+        assert f"model.{name}: was" in error
+    assert "text_encoder" not in error
+
+
+@pytest.mark.case("R1")
+@pytest.mark.slow
+def test_resume_stands_on_its_checkpoint_alone(
+    folder: Path, finished: Path, unfinished: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Whoever empties the cache loses no step: the adapter is in the checkpoint."""
+    shutil.rmtree(tmp_path / "cache")
+    monkeypatch.setattr("warpir.diffusion.personalize.LoraTraining.update", pytest.fail)
+    monkeypatch.setattr("warpir.diffusion.network_prior.NetworkPrior.sample", pytest.fail)
+    assert main([*argv(folder, unfinished), "--resume"]) == ExitCode.DONE
+    assert results(unfinished) == results(finished)
+
+
+@pytest.mark.case("L9", "R16")
+@pytest.mark.parametrize("name", ["vae/config.json", "unet/diffusion_pytorch_model.safetensors"])
+def test_a_result_of_another_model_is_not_the_one_asked_for(
+    folder: Path, finished: Path, name: str
+) -> None:
+    """What a batch calls done was made by the files that are in the model's folder now."""
+    file, config = folder / "epsilon" / name, parse(argv(folder, finished)).config
+    assert is_done(config)
+    before = file.read_bytes()
+    try:
+        file.write_bytes(before + b" " if file.suffix == ".json" else before[:-1] + b"\0")
+        with pytest.raises(OtherRun):
+            is_done(config)
+        file.unlink()
+        with pytest.raises(OtherRun):
+            is_done(config)
+    finally:
+        file.write_bytes(before)
+    assert is_done(config)
+
+
+@pytest.mark.case("L3")
+@pytest.mark.slow
+def test_pickles_are_read_by_a_run_that_allows_them(folder: Path, tmp_path: Path) -> None:
+    model, out = tmp_path / "model", tmp_path / "out"
+    shutil.copytree(folder / "epsilon", model)
+    for file in [*model.rglob("*.safetensors")]:
+        stem = file.stem.replace("model", "pytorch_model") if file.stem == "model" else file.stem
+        torch.save(load_file(file), file.with_name(f"{stem}.bin"))
+        file.unlink()
+    few = {"no_personalize": "", "loss": "csd", "steps": "1", "score_every": "0"}
+    asked = argv(folder, out, model=str(model), **few)
+    assert main(asked) == ExitCode.MODEL
+    assert main([*asked, "--allow-pickle"]) == ExitCode.DONE
+    assert any("--allow-pickle" in notice for notice in record(out)["notices"])
 
 
 def test_a_finished_run_is_not_resumed(

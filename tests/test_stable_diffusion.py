@@ -14,6 +14,7 @@ import torch
 from torch import Tensor
 
 from tests.tiny_stable_diffusion import RESOLUTION, make_tiny_stable_diffusion
+from warpir.diffusion.cache import model_key
 from warpir.diffusion.model_error import ModelError
 from warpir.diffusion.prior import Prior
 from warpir.diffusion.settings import PREDICTION_TYPES, ModelSettings
@@ -553,28 +554,65 @@ def test_long_prompt_is_cut_with_a_notice(fresh: StableDiffusion) -> None:
 # Weights, precision, memory
 
 
-def test_digest_follows_every_weight_file(folders: Callable[[str], Path], tmp_path: Path) -> None:
-    """A changed bit, a moved file: another model. The same bytes elsewhere: the same."""
+def test_digest_follows_every_file(folders: Callable[[str], Path], tmp_path: Path) -> None:
+    """A changed bit, another line: another model. The same bytes elsewhere: the same."""
     import hashlib
 
     folder = Path(shutil.copytree(folders("epsilon"), tmp_path / "model"))
     prior = load(folder)
     assert prior.digest == load(folders("epsilon")).digest
-    assert prior.weight_hashes == {
+    assert prior.file_hashes == {
         name: hashlib.sha256((folder / name).read_bytes()).hexdigest()
         for name in (
+            "scheduler/scheduler_config.json",
+            "text_encoder/config.json",
             "text_encoder/model.safetensors",
+            "tokenizer/merges.txt",
+            "tokenizer/special_tokens_map.json",
+            "tokenizer/tokenizer_config.json",
+            "tokenizer/vocab.json",
+            "unet/config.json",
             "unet/diffusion_pytorch_model.safetensors",
+            "vae/config.json",
             "vae/diffusion_pytorch_model.safetensors",
         )
     }
     digests = {prior.digest}
-    for name in prior.weight_hashes:
+    changed = [name for name in prior.file_hashes if name.endswith(".safetensors")]
+    changed += ["vae/config.json", "tokenizer/vocab.json"]
+    for name in changed:
         content = bytearray((folder / name).read_bytes())
-        content[-4] ^= 1  # the last bit of a number
+        if name.endswith(".safetensors"):
+            content[-4] ^= 1  # the last bit of a number
+        else:
+            content += b"\n"
         (folder / name).write_bytes(content)
         digests.add(load(folder).digest)
-    assert len(digests) == 4
+    assert len(digests) == 1 + len(changed)
+
+
+def test_precision_is_in_the_key_of_what_is_made(fresh: StableDiffusion) -> None:
+    """Pictures and LoRAs of half precision are none of full precision's, of either network."""
+    keys = {model_key(fresh)}
+    for part in ("unet", "vae"):
+        getattr(fresh, part).half()
+        fresh.unet_dtype = fresh.unet.dtype
+        keys.add(model_key(fresh))
+    assert len(keys) == 3 and fresh.precision == {"unet": "fp16", "vae": "fp16"}
+
+
+@pytest.mark.case("L7")
+def test_a_resumed_run_keeps_the_precision_it_fell_back_to(fresh: StableDiffusion) -> None:
+    """And what was said of it; a model that had no need to stays as it is."""
+    for part in (fresh.unet, fresh.vae):
+        part.half()
+    fresh.unet_dtype, before = torch.float16, fresh.notices
+    fresh.load_state_dict(fresh.state_dict())
+    assert fresh.precision == {"unet": "fp16", "vae": "fp16"} and fresh.notices == before
+    state = {"precision": {"unet": "fp32", "vae": "fp32"}, "notices": [*before, "fell back"]}
+    fresh.load_state_dict(state)
+    assert fresh.precision == {"unet": "fp32", "vae": "fp32"}
+    assert fresh.notices == (*before, "fell back")
 
 
 def test_cpu_computes_in_fp32_and_says_so(folders: Callable[[str], Path]) -> None:

@@ -580,3 +580,17 @@ def test_training_looks_before_it_begins(
     assert main(argv) == code
     assert words in capsys.readouterr().err.splitlines()[0]
     assert held.is_dir() and not (tmp_path / "new").exists()
+
+
+@pytest.mark.case("R1")
+@pytest.mark.parametrize("name", ["checkpoint-00000018", "state-000000018"])
+def test_training_finds_what_a_kill_left_without_a_name(
+    name: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Between the two renames by which a checkpoint replaces the one of the same step."""
+    out = tmp_path / "out"
+    (out / f".partial-{name}-77.earlier").mkdir(parents=True)
+    argv = ["prior", "--panoramas", str(tmp_path), "--out", str(out), "--minutes", "1"]
+    assert main(argv) == ExitCode.OUTPUT
+    assert "a training that was begun" in capsys.readouterr().err
+    assert [path.name for path in out.iterdir()] == [name]

@@ -12,8 +12,10 @@ results of several files.
 import os
 import shutil
 from collections.abc import Iterable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
+
+from warpir.signals import whole
 
 
 class WriteError(OSError):
@@ -57,11 +59,13 @@ def write_folder(path: Path, files: Iterable[tuple[str, bytes]]) -> None:
         files: Names and contents, in the order in which they are written; a name may begin with
             a folder, as in ``pages/a.html``.
 
+    Where a kill leaves none under the name, `restore_folders` gives it the earlier one.
+
     Raises:
         WriteError: The disk is full or the folder is not writable.
     """
     staged = path.with_name(f".partial-{path.name}-{os.getpid()}")
-    earlier = staged.with_suffix(".old")
+    earlier = staged.with_name(f"{staged.name}.earlier")
     with _naming(path):
         try:
             staged.mkdir(parents=True)
@@ -70,18 +74,37 @@ def write_folder(path: Path, files: Iterable[tuple[str, bytes]]) -> None:
                 write_staged(staged / name, content)
             for folder in (*filter(Path.is_dir, staged.iterdir()), staged):
                 sync(folder)
-            if path.is_dir():  # a full folder cannot be replaced by a rename
-                os.rename(path, earlier)
-            try:
-                os.rename(staged, path)
-            except OSError:
-                if earlier.is_dir():
-                    os.rename(earlier, path)
-                raise
+            with whole():  # a signal between two names would leave none
+                _exchange(staged, path, earlier)
             sync(path.parent)
         finally:
-            for folder in (staged, earlier):
-                shutil.rmtree(folder, ignore_errors=True)
+            shutil.rmtree(staged, ignore_errors=True)
+            if path.is_dir():
+                shutil.rmtree(earlier, ignore_errors=True)
+
+
+def _exchange(staged: Path, path: Path, earlier: Path) -> None:
+    """Give a folder its name; one that had it is kept under a third, ``earlier``."""
+    try:
+        if path.is_dir():  # a full folder cannot be replaced by a rename
+            os.rename(path, earlier)
+        os.rename(staged, path)
+    except BaseException:
+        if earlier.is_dir() and not path.exists():
+            os.rename(earlier, path)
+        raise
+
+
+def restore_folders(parent: Path) -> None:
+    """Give folders their names back that a kill took, between the two renames of `write_folder`.
+
+    Nobody else may write in ``parent`` meanwhile.
+    """
+    for earlier in parent.glob(".partial-*.earlier"):
+        name = earlier.name.removeprefix(".partial-").rpartition("-")[0]
+        with suppress(OSError):  # another process was first
+            if not (parent / name).exists():
+                os.rename(earlier, parent / name)
 
 
 def remove_folder(path: Path) -> None:

@@ -7,7 +7,8 @@ away inside a path hides the fault that made it. pbrt does the same with each sa
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -93,6 +94,14 @@ class BadPixels:
                 "look for extreme values in the materials and the light",
                 ExitCode.NUMERIC,
             )
+
+    def state_dict(self) -> dict[str, Any]:
+        """Return plain values."""
+        return {"count": self.count, "named": self.named}
+
+    def load_state_dict(self, state: Mapping[str, Any]) -> None:
+        """Count on from `state_dict`."""
+        self.count, self.named = int(state["count"]), list(state["named"])
 
     def notices(self) -> Iterator[str]:
         """Yield what the user should know of them."""

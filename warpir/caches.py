@@ -23,6 +23,8 @@ from collections.abc import Iterable, Iterator
 from contextlib import suppress
 from pathlib import Path
 
+from warpir.errors import ExitCode, InputError
+
 CACHE_BYTES = 4 << 30
 """What a folder of made things may hold; what was used longest ago goes first."""
 KERNEL_BYTES = 256 << 20
@@ -41,7 +43,7 @@ def cache_folder(kind: str = "") -> Path:
         kind: ``lora``, ``class-images`` or ``transport``; empty: the folder of all kinds.
 
     Raises:
-        OSError: There is no folder for temporary files either.
+        InputError: There is no folder for temporary files either (`ExitCode.RESOURCES`).
     """
     try:
         root = Path(os.environ.get("WARPIR_CACHE") or _users_cache() / "warpir")
@@ -266,7 +268,17 @@ def _files(folder: Path) -> Iterator[Path]:
 
 
 def _temporary(prefix: str) -> Path:
-    folder = Path(tempfile.mkdtemp(prefix=prefix))
+    """Return a new folder that is removed at exit.
+
+    Raises:
+        InputError: None can be made, or none written to (`ExitCode.RESOURCES`).
+    """
+    try:
+        folder = Path(tempfile.mkdtemp(prefix=prefix))
+    except OSError as error:
+        what = f"no folder can be made among the temporary files ({_reason(error)})"
+        advice = "free some disk space, or name a folder that can be written"
+        raise InputError("TMPDIR", what, advice, ExitCode.RESOURCES) from error
     atexit.register(shutil.rmtree, folder, ignore_errors=True)
     return folder
 

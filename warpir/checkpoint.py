@@ -30,7 +30,7 @@ from warpir.strict_json import read_json_object
 if TYPE_CHECKING:
     from torch import Tensor
 
-FORMAT = 1
+FORMAT = 2
 """Layout of a checkpoint; another is refused."""
 KEPT = 2
 """Checkpoints that stay on disk."""

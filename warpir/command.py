@@ -630,8 +630,11 @@ def _load(path: str, limits: Limits) -> Any:
         mark = error.problem_mark
         line = f"line {mark.line + 1}: " if mark is not None else ""
         raise usage(path, f"{line}not YAML ({error.problem})") from None
+    except (LookupError, AttributeError):  # of !!bool maybe, !!float "", !!timestamp x
+        raise usage(path, "not usable YAML (a value is not what its tag says)") from None
     except (yaml.YAMLError, ValueError, TypeError) as error:
-        raise usage(path, f"not usable YAML ({str(error).splitlines()[0][:120]})") from None
+        reason = "".join(str(error).splitlines()[:1])[:120]
+        raise usage(path, f"not usable YAML ({reason})") from None
 
 
 def _within(limits: Limits, name: str, found: int, path: str, what: str, more: str) -> None:

@@ -14,6 +14,7 @@ import os
 import re
 import shutil
 import socket
+import stat
 import struct
 import zlib
 from collections.abc import Iterable, Iterator, Mapping
@@ -123,12 +124,11 @@ class OutputFolder:
                 shutil.rmtree(abandoned, ignore_errors=True)
             was_ready = self._finish_earlier()
             self._refuse_results(was_ready)
-            try:
-                self.staging.mkdir()
-            except OSError as error:
-                raise disk_error(self.staging, error) from error
-        except BaseException:
+            self.staging.mkdir()
+        except BaseException as error:
             self._release()
+            if isinstance(error, OSError):
+                raise disk_error(error.filename or self.path, error) from error
             raise
         return self
 
@@ -419,7 +419,7 @@ class OutputFolder:
     def _refuse_locked(self) -> None:
         """Refuse a folder that a run writes now; the lock is tried, not kept."""
         try:
-            lock = os.open(self.path / ".lock", os.O_RDONLY | os.O_NOFOLLOW)
+            lock = self._open_lock(os.O_RDONLY)
         except FileNotFoundError:
             return
         try:
@@ -428,6 +428,25 @@ class OutputFolder:
             raise self._locked(lock) from error
         finally:
             os.close(lock)
+
+    def _open_lock(self, flags: int) -> int:
+        """Open the lock file.
+
+        Raises:
+            OSError: It cannot be opened.
+            InputError: It is something else, which a lock would not work on.
+        """
+        path = self.path / ".lock"
+        # A FIFO would wait for somebody at its other end.
+        lock = os.open(path, flags | os.O_NOFOLLOW | os.O_NONBLOCK, 0o644)
+        if not stat.S_ISREG(os.fstat(lock).st_mode):
+            os.close(lock)
+            raise self._no_lock()
+        return lock
+
+    def _no_lock(self) -> InputError:
+        what, advice = "not a lock of warpir's", "choose another --out"
+        return InputError(self.path / ".lock", what, advice, ExitCode.OUTPUT)
 
     def _locked(self, lock: int) -> InputError:
         """Make the error of a folder whose lock another process holds."""
@@ -443,7 +462,7 @@ class OutputFolder:
         path = self.path / ".lock"
         while True:
             try:
-                lock = os.open(path, os.O_RDWR | os.O_CREAT | os.O_NOFOLLOW, 0o644)
+                lock = self._open_lock(os.O_RDWR | os.O_CREAT)
             except OSError as error:
                 raise disk_error(path, error) from error
             try:
@@ -462,9 +481,7 @@ class OutputFolder:
                 raise disk_error(path, error) from error
         if not _OWN_LOCK.fullmatch(os.read(lock, 200)):
             os.close(lock)
-            raise InputError(
-                path, "not a lock of warpir's", "choose another --out", ExitCode.OUTPUT
-            )
+            raise self._no_lock()
         self._lock = lock
         try:
             os.lseek(lock, 0, os.SEEK_SET)
@@ -650,10 +667,11 @@ class OutputFolder:
         unchanged = []
         for name, digest in listed.items() if isinstance(listed, dict) else ():
             path = self.path / name
-            if _PLAIN_NAME.fullmatch(name) and path.is_file() and not path.is_symlink():
-                with path.open("rb") as stream:
-                    if hashlib.file_digest(stream, "sha256").hexdigest() == digest:
-                        unchanged.append(name)
+            if not _PLAIN_NAME.fullmatch(name) or not path.is_file() or path.is_symlink():
+                continue
+            with suppress(OSError), path.open("rb") as stream:  # what cannot be read stays
+                if hashlib.file_digest(stream, "sha256").hexdigest() == digest:
+                    unchanged.append(name)
         return unchanged
 
 

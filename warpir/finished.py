@@ -4,6 +4,7 @@ A result is that of a configuration if its ``run.json`` was asked for the same a
 it read has the same sha256 now. What it wrote must be there as it wrote it.
 """
 
+from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -12,6 +13,7 @@ from warpir.command import read_values
 from warpir.config import DEFAULTS, InsertConfig
 from warpir.errors import ExitCode, InputError
 from warpir.files import is_ready, results_in
+from warpir.model_files import model_hashes
 from warpir.record import file_hash, input_files
 from warpir.reuse import check_files, run_record
 
@@ -81,7 +83,20 @@ def _same(config: InsertConfig, filled: InsertConfig, record: dict[str, Any]) ->
             paths[name] = Path(path).parent.resolve() / file if file else Path(path)
     if config.reuse is not None:
         paths["reuse"] = Path(config.reuse, "run.json")
-    return read == {name: file_hash(path) for name, path in paths.items()}
+    hashes = {name: file_hash(path) for name, path in paths.items()}
+    return read == hashes and _same_model(config, record)
+
+
+def _same_model(config: InsertConfig, record: Mapping[str, Any]) -> bool:
+    """Return whether Stable Diffusion's files are those that guided a run.
+
+    Other priors are among the inputs, or part of the package.
+    """
+    measured = record.get("measured")
+    guide = measured.get("model") if isinstance(measured, dict) else None
+    if not isinstance(guide, dict) or guide.get("name") != "stable-diffusion":
+        return True
+    return bool(guide.get("sha256") == model_hashes(config))
 
 
 def _something_else(out: Path, found: str, kind: type[InputError] = InputError) -> InputError:

@@ -248,17 +248,13 @@ def judge_gradient(norms: Sequence[float]) -> Verdict:
 def _model_of(prior: StableDiffusion) -> dict[str, Any]:
     return {
         "name": prior.name,
-        "sha256": prior.weight_hashes,
+        "sha256": prior.file_hashes,
         "resolution": prior.resolution,
         "prediction_type": prior.schedule.prediction_type,
-        "unet_precision": _precision(prior.unet_dtype),
-        "vae_precision": _precision(prior.vae.dtype),
+        "unet_precision": prior.precision["unet"],
+        "vae_precision": prior.precision["vae"],
         "device": str(prior.device),
     }
-
-
-def _precision(kind: torch.dtype) -> str:
-    return {torch.float16: "fp16", torch.bfloat16: "bf16", torch.float32: "fp32"}[kind]
 
 
 def _middle(image: Tensor) -> Crop:

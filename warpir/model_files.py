@@ -3,11 +3,14 @@
 import os
 from collections.abc import Callable
 from pathlib import Path
-from typing import TypeVar
+from typing import TYPE_CHECKING, TypeVar
 
 from warpir.config import InsertConfig
 from warpir.diffusion.model_error import ModelError
 from warpir.errors import ExitCode, InputError, raise_all
+
+if TYPE_CHECKING:
+    from warpir.diffusion.model_folder import ModelFolder
 
 Checked = TypeVar("Checked")
 
@@ -53,10 +56,39 @@ def _model_width(config: InsertConfig) -> int | None:
 
     if config.allow_download and not os.path.isdir(config.model or ""):
         return None
-    found = find_model(config.model, allow_download=False)
+    found = find_model(config.model, allow_download=False, allow_pickle=config.allow_pickle)
     folder = check_model_folder(found, config.allow_pickle)
     width: int = folder.configs["unet"]["cross_attention_dim"]
     return width
+
+
+def model_hashes(config: InsertConfig) -> dict[str, str] | None:
+    """Return the sha256 of every file of Stable Diffusion's that a run would read, by its name.
+
+    None: there is no such model now, or it is damaged.
+    """
+    from warpir.diffusion.model_folder import check_model_folder, find_model
+
+    try:
+        found = find_model(config.model, allow_download=False, allow_pickle=config.allow_pickle)
+        folder = check_model_folder(found, config.allow_pickle)
+        states = [(file, file.stat()) for file in folder.files]
+        return dict(
+            _hash(folder, file, (state.st_ino, state.st_size, state.st_mtime_ns))
+            for file, state in states
+        )
+    except (ModelError, OSError):
+        return None
+
+
+_hashes: dict[tuple[object, ...], tuple[str, str]] = {}
+
+
+def _hash(folder: "ModelFolder", file: Path, state: tuple[int, ...]) -> tuple[str, str]:
+    """Return a file's name and sha256; a batch asks again for gigabytes that stay as they are."""
+    if (file, state) not in _hashes:
+        _hashes[file, state] = folder.file_hash(file)
+    return _hashes[file, state]
 
 
 def _path(name: str | None) -> Path | None:

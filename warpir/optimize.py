@@ -15,8 +15,8 @@ from __future__ import annotations
 
 import logging
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Mapping
-from dataclasses import asdict, dataclass, field
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
 from typing import Any, Protocol, Self
 
 import numpy as np
@@ -272,7 +272,7 @@ class Optimization(ABC):
         """Return everything that a later run needs to go on: nested tensors and plain values."""
         moments = self.optimizer.state_dict()["state"]
         return {
-            "state": asdict(self.state),
+            "state": vars(self.state) | {"history": _columns(self.state.history)},
             "unknowns": dict(self.unknowns.state_dict()),
             "best": dict(self.best),
             "adam": {str(index): dict(entry) for index, entry in moments.items()},
@@ -282,9 +282,32 @@ class Optimization(ABC):
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
         """Go on from `state_dict`."""
         self.state = State(**state["state"])
+        self.state.history = _rows(state["state"]["history"], self.state.step)
         self.unknowns.load_state_dict(state["unknowns"])
         self.best = dict(state["best"])
         packed = self.optimizer.state_dict()
         packed["state"] = {int(index): dict(entry) for index, entry in state["adam"].items()}
         self.optimizer.load_state_dict(packed)
         self.guide.load_state_dict(state["guide"])
+
+
+def _columns(history: Sequence[Mapping[str, float]]) -> dict[str, Tensor]:
+    """Return a history as one tensor a name, NaN where a step has no such number.
+
+    Beside the tensors of a checkpoint they are short; as text they would outgrow it.
+    """
+    names = sorted({name for entry in history for name in entry})
+    return {
+        name: torch.tensor([entry.get(name, np.nan) for entry in history], dtype=torch.float64)
+        for name in names
+    }
+
+
+def _rows(columns: Mapping[str, Tensor], count: int) -> list[dict[str, float]]:
+    """Undo `_columns` of ``count`` entries."""
+    history: list[dict[str, float]] = [{} for _ in range(count)]
+    for name, column in columns.items():
+        for entry, value in zip(history, column.tolist(), strict=True):
+            if not np.isnan(value):
+                entry[name] = value
+    return history

@@ -5,7 +5,6 @@ import importlib.util
 import logging
 import os
 import sys
-import tempfile
 import traceback
 from collections.abc import Callable, Sequence
 from contextlib import suppress
@@ -144,7 +143,7 @@ def explain(error: BaseException) -> tuple[int, list[str]]:
             ExitCode.RESOURCES,
         )
     elif isinstance(error, WriteError) or (isinstance(error, OSError) and error.errno in DISK_FULL):
-        error = disk_error(error.filename or f"--out or {tempfile.gettempdir()}", error)
+        error = disk_error(error.filename or "--out or the folder of temporary files", error)
     elif isinstance(error, ModelError):
         error = InputError(error.where, error.what, error.advice, ExitCode.MODEL)
     if isinstance(error, InputError):

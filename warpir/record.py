@@ -124,6 +124,7 @@ def input_files(config: InsertConfig) -> dict[str, Path]:
     """
     # Here, since the command line imports this module and must not load NumPy for --help.
     from warpir.colmap_model import is_model, model_files
+    from warpir.diffusion.weight_files import beside_lora
 
     names = (
         *("photo", "occluder_mask", "materials", "camera", "light", "lora"),
@@ -134,6 +135,8 @@ def input_files(config: InsertConfig) -> dict[str, Path]:
         if name in paths and is_model(paths[name]):
             files = model_files(paths.pop(name), *stems)
             paths |= {f"{name}/{file.name}": file for file in files}
+    if "lora" in paths and (beside := beside_lora(paths["lora"])) is not None:
+        paths[f"lora/{beside.name}"] = beside
     return paths
 
 

@@ -26,14 +26,17 @@ from warpir.color import gamma_to_linear, linear_to_gamma
 from warpir.config import DEFAULTS, PRIOR_DEFAULTS, InsertConfig
 from warpir.curves import Curves, ToneKnots
 from warpir.determinism import use_threads_for
-from warpir.diffusion.cache import content_key
 from warpir.diffusion.embedded import embedded_prompts, load_embedded
 from warpir.diffusion.guidance import DatasetUpdate, Guidance, make_guidance
-from warpir.diffusion.lora_files import Lora, save_lora
+from warpir.diffusion.lora_files import save_lora
 from warpir.diffusion.model_error import ModelError
 from warpir.diffusion.model_folder import check_model_folder, find_model, hub_offline
 from warpir.diffusion.network_prior import NetworkPrior
-from warpir.diffusion.personalize import personalize
+from warpir.diffusion.personalize import (
+    Personalization,
+    personalize,
+    restore_personalization,
+)
 from warpir.diffusion.prior import Condition, NonFiniteError
 from warpir.diffusion.prompts import Prompts, make_prompts
 from warpir.diffusion.show_prior import show_personalization
@@ -125,11 +128,16 @@ class Guided:
     prompts: Prompts
     negative_prompt: str
     """What the negative term asks for; empty: the null prompt."""
-    adapter: str | None
-    lora: Lora | None
+    learnt: Personalization | None
+    """What the model learnt from the photo; None: it is asked as it is."""
     record: dict[str, Any]
     """What run.json says of model and personalisation."""
     notices: tuple[str, ...]
+
+    def state_dict(self) -> dict[str, Any]:
+        """Return what a checkpoint of the loop holds beside it: precision and adapter."""
+        learnt = None if self.learnt is None else self.learnt.state_dict()
+        return {"prior": self.prior.state_dict(), "learnt": learnt}
 
 
 def recover(
@@ -185,7 +193,7 @@ def recover(
         before = {k: v.detach().clone() for k, v in unknowns.state_dict().items()}
         with run.timings.stage("optimize"), torch.no_grad():
             first = loop.guide.score(loop.final_image(config.seed))
-        optimize(run, loop, checkpoints, resumed)
+        optimize(run, loop, guided, frame.renderer, checkpoints, resumed)
         verdict = None
         if config.accept:
             assert isinstance(guide, Guidance)
@@ -306,9 +314,7 @@ def checkpoint_of(run: Run, checkpoints: Checkpoints, prior: NetworkPrior) -> Ch
     Raises:
         InputError: It is another run's; every difference is named.
     """
-    schedule = prior.schedule
-    scheduler = content_key(schedule.prediction_type, schedule.alphas_cumprod)
-    checkpoints.identity["model"] = {**prior.weight_hashes, "scheduler": scheduler}
+    checkpoints.identity["model"] = prior.file_hashes
     if checkpoints.newest is None:
         return None
     found = checkpoints.load(lambda text: run.say(f"notice: {text}"))
@@ -335,8 +341,32 @@ def prepare_guidance(run: Run, checkpoints: Checkpoints) -> tuple[Guided, Checkp
     run.say(f"model: {prior.name} {weights}, sha256 {prior.digest[:16]}...")
     resumed = checkpoint_of(run, checkpoints, prior)
     run.say(f'guidance asks for "{prompts.guidance}"')
+    guided = adapted(run, prior, prompts, negative, checkpoints, resumed)
+    if resumed is not None and resumed.stage == "optimize":
+        # After the adapter, which was rounded as the model was when it came.
+        prior.load_state_dict(resumed.state["guided"]["prior"])
+    return guided, resumed
+
+
+def adapted(
+    run: Run,
+    prior: NetworkPrior,
+    prompts: Prompts,
+    negative: str,
+    checkpoints: Checkpoints,
+    resumed: Checkpoint | None,
+) -> Guided:
+    """Adapt a model to the photo, as far as the loss asks for it.
+
+    A loop that is resumed goes on with the very adapter that it had, whatever has become of the
+    cache.
+
+    Raises:
+        ModelError: The model cannot be adapted.
+    """
+    config, shown = run.config, [*(run.config.show_prior or ())]
     record: dict[str, Any] = {
-        "model": {"name": prior.name, "sha256": prior.weight_hashes},
+        "model": {"name": prior.name, "sha256": prior.file_hashes},
         "prompts": asdict(prompts),
     }
     notices: tuple[str, ...] = (ABOUT_EMBEDDED,) if prior.name == "embedded" else ()
@@ -345,7 +375,7 @@ def prepare_guidance(run: Run, checkpoints: Checkpoints) -> tuple[Guided, Checkp
         notices = (*notices, f"--loss {config.loss} does without a LoRA: none was trained")
     if not config.personalize or does_without:
         prior.free_text_encoder()
-        return Guided(prior, prompts, negative, None, None, record, notices), resumed
+        return Guided(prior, prompts, negative, None, record, notices)
     photo = torch.from_numpy(run.inputs.photo.srgb).permute(2, 0, 1)[None].contiguous()
     cache = cache_folder()
     with run.timings.stage("personalize"):
@@ -358,18 +388,21 @@ def prepare_guidance(run: Run, checkpoints: Checkpoints) -> tuple[Guided, Checkp
             run.progress.report(stage, done, total)
             signals.check()
 
-        with signals.deferred():
-            made = personalize(
-                prior,
-                photo,
-                prompts,
-                config,
-                config.seed,
-                cache,
-                report=report,
-                on_step=on_step,
-                resume=resumed.state if resumed and resumed.stage == "personalize" else None,
-            )
+        if resumed is not None and resumed.stage == "optimize":
+            made = restore_personalization(prior, resumed.state["guided"]["learnt"])
+        else:
+            with signals.deferred():
+                made = personalize(
+                    prior,
+                    photo,
+                    prompts,
+                    config,
+                    config.seed,
+                    cache,
+                    report=report,
+                    on_step=on_step,
+                    resume=resumed.state if resumed else None,
+                )
         if shown:
             sheet = show_personalization(
                 prior, photo, prompts, config, config.seed, cache, shown, SHOWN_SEEDS,
@@ -384,7 +417,7 @@ def prepare_guidance(run: Run, checkpoints: Checkpoints) -> tuple[Guided, Checkp
         "seconds": made.seconds,
     }
     notices = (*notices, *made.notices)
-    return Guided(prior, prompts, negative, made.adapter, made.lora, record, notices), resumed
+    return Guided(prior, prompts, negative, made, record, notices)
 
 
 def load_prior(run: Run) -> tuple[NetworkPrior, Prompts, str]:
@@ -418,7 +451,8 @@ def require_memory(run: Run) -> None:
     """
     config = run.config
     with hub_offline(not config.allow_download):
-        folder = check_model_folder(find_model(config.model, config.allow_download))
+        found = find_model(config.model, config.allow_download, config.allow_pickle)
+        folder = check_model_folder(found, config.allow_pickle)
     files = (file for weights in folder.weights.values() for file in weights.files)
     side = 8 * int(folder.configs["unet"]["sample_size"])
     is_half = run.device != "cpu" and config.precision != "fp32"
@@ -515,7 +549,7 @@ def make_guide(run: Run, guided: Guided, frame: Frame) -> Guidance | DatasetUpda
         seen,
         config.step_count,
         config.seed,
-        guided.adapter,
+        None if guided.learnt is None else guided.learnt.adapter,
     )
     if isinstance(guide, Guidance):
         guide.ensure_precision(background)
@@ -561,13 +595,27 @@ def gbuffer_of(frame: Frame) -> torch.Tensor:
 
 
 def optimize(
-    run: Run, loop: Optimization, checkpoints: Checkpoints, resumed: Checkpoint | None
+    run: Run,
+    loop: Optimization,
+    guided: Guided,
+    renderer: Renderer,
+    checkpoints: Checkpoints,
+    resumed: Checkpoint | None,
 ) -> None:
     """Run a loop to its end, with checkpoints, previews and progress."""
     config = run.config
     if resumed is not None and resumed.stage == "optimize":
-        loop.load_state_dict(resumed.state)
+        loop.load_state_dict(resumed.state["loop"])
+        renderer.bad_pixels.load_state_dict(resumed.state["bad_pixels"])
     words = ""
+
+    def save() -> None:
+        state = {
+            "loop": loop.state_dict(),
+            "guided": guided.state_dict(),
+            "bad_pixels": renderer.bad_pixels.state_dict(),
+        }
+        checkpoints.save("optimize", loop.state.step, state)
 
     def on_step(loop: Optimization) -> None:
         nonlocal words
@@ -581,7 +629,7 @@ def optimize(
             with torch.no_grad():
                 write_preview(run, loop.final_image(config.seed), step)
         if is_time_to_save(config, step):
-            checkpoints.save("optimize", step, loop.state_dict())
+            save()
         signals.check()
 
     with run.timings.stage("optimize"), signals.deferred():
@@ -590,7 +638,7 @@ def optimize(
         except (InputError, NonFiniteError) as error:
             # The step that failed changed nothing: this is the last good state.
             if not isinstance(error, InputError) or error.code == ExitCode.NUMERIC:
-                checkpoints.save("optimize", loop.state.step, loop.state_dict())
+                save()
             raise
     if loop.state.best_score is not None:
         run.say(f"kept: step {loop.state.best_step}, score {loop.state.best_score:.4g}")
@@ -664,9 +712,9 @@ def convergence(loop: Optimization, first: float | None) -> dict[str, Any]:
 
 def write_lora(run: Run, guided: Guided) -> None:
     """Write the adapter in diffusers' and kohya's forms."""
-    lora, prior = guided.lora, guided.prior
-    if lora is None:
+    if guided.learnt is None:
         return
+    lora, prior = guided.learnt.lora, guided.prior
     with tempfile.TemporaryDirectory(dir=run.output.staging) as folder:
         for path in save_lora(
             lora, folder, prior.unet.config.cross_attention_dim, prior.schedule.prediction_type,

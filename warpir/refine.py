@@ -369,7 +369,7 @@ def refine(
         run.say(f"free: {', '.join(record['free'])}; frozen: {', '.join(record['frozen'])}")
         with run.timings.stage("optimize"), torch.no_grad():
             first = loop.guide.score(loop.final_image(config.seed))
-        optimize(run, loop, checkpoints, resumed)
+        optimize(run, loop, guided, frame.renderer, checkpoints, resumed)
         with run.timings.stage("write"):
             write_lora(run, guided)
     notices = (*guided.prior.notices, *guided.notices, *loop_notices(loop, frame.renderer))

@@ -22,6 +22,7 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from warpir.atomic import restore_folders
 from warpir.config import usage
 from warpir.errors import ExitCode, InputError
 from warpir.program import run_program, say
@@ -146,6 +147,7 @@ def _check(options: argparse.Namespace) -> None:
             raise InputError(path, "no such file", code=ExitCode.MODEL)
     if options.out.exists() and not options.out.is_dir():
         raise InputError(options.out, "not a folder", "choose another --out", ExitCode.OUTPUT)
+    restore_folders(options.out)
     begun = any(options.out.glob("checkpoint-*")) or any(options.out.glob("state-*"))
     if begun and not options.resume:
         advice = "--resume goes on with it; or choose another --out"
