@@ -409,6 +409,25 @@ def test_browser_is_not_started_with_the_token(
     assert not way.parent.exists()
 
 
+def test_address_leaves_out_the_port_of_http() -> None:
+    """As browsers do, whose requests must name what the address has."""
+    from warpir.place_server import PlaceServer
+
+    server = object.__new__(PlaceServer)
+    for port, host in ((80, "127.0.0.1"), (8080, "127.0.0.1:8080")):
+        server.server_address = ("127.0.0.1", port)
+        assert server.host == host
+
+
+def test_demo_starts_where_the_user_says(tmp_path: Path) -> None:
+    """A pixel, a turn and the folder replace the demo's own."""
+    from warpir.place import _with_inputs
+
+    config = _with_inputs(InsertConfig(demo=True, at=(600.0, 700.0), rotate_y=10.0, out="mine"))
+    assert (config.at, config.place, config.rotate_y) == ((600.0, 700.0), None, 10.0)
+    assert config.out == "mine"
+
+
 def test_place_loads_neither_torch_nor_warp() -> None:
     """The page starts at once."""
     code = (

@@ -816,6 +816,7 @@ class Wire:
     def __init__(self, sent: str) -> None:
         self.sent = io.BytesIO(sent.encode())
         self.answered = b""
+        self.longest = 0
 
     def settimeout(self, seconds: float) -> None:
         pass
@@ -825,14 +826,30 @@ class Wire:
 
     def sendall(self, content: bytes) -> None:
         self.answered += content
+        self.longest = max(self.longest, len(content))
 
 
-def unbound(folder: Path, bound: str, name: str, say: Callable[[str], None]) -> StudyServer:
+def unbound(
+    folder: Path, bound: str, name: str, say: Callable[[str], None], port: int = 8000
+) -> StudyServer:
     """A server that listens nowhere."""
     server = object.__new__(StudyServer)
     server.site = Site(folder, read_study(folder), say)
-    server.name, server.server_address = name, (bound, 8000)
+    server.name, server.server_address = name, (bound, port)
     return server
+
+
+def test_a_picture_is_sent_in_parts(scenes: Path, tmp_path: Path) -> None:
+    """The limit of time is that of a part, so that a large picture gets through a slow line."""
+    make(scenes, tmp_path / "study")
+    picture = next((tmp_path / "study" / "pages").glob("*.png"))
+    content = random.Random(1).randbytes(1_000_001)
+    picture.write_bytes(content)
+    server = unbound(tmp_path / "study", "127.0.0.1", "127.0.0.1", lambda line: None)
+    wire = Wire(f"GET /{picture.name} HTTP/1.1\r\nHost: localhost:8000\r\n\r\n")
+    _Handler(wire, ("10.9.9.9", 1), server)  # type: ignore[arg-type]
+    assert wire.answered.endswith(b"\r\n\r\n" + content)
+    assert wire.longest <= 1 << 16
 
 
 def test_a_name_that_was_not_given_is_refused(scenes: Path, tmp_path: Path) -> None:
@@ -840,8 +857,10 @@ def test_a_name_that_was_not_given_is_refused(scenes: Path, tmp_path: Path) -> N
     study = make(scenes, tmp_path / "study")
     path = f"/{study.plan.raters[0].token}.html"
     local, named = ("127.0.0.1", "127.0.0.1"), ("10.0.0.5", "Lab.example")
-    everywhere = ("0.0.0.0", "0.0.0.0")
+    everywhere, mine = ("0.0.0.0", "0.0.0.0"), ("127.0.1.1", "MyBox")
     for where, hosts, status in (
+        (mine, ("mybox:8000", "MyBox:8000", "127.0.1.1:8000", "localhost:8000"), 200),
+        (mine, ("mybox", "mybox:80", "mybox.evil.example:8000", "evil.example:8000"), 403),
         (local, ("127.0.0.1:8000", "localhost:8000"), 200),
         (local, ("127.0.0.1", "10.0.0.5:8000", "evil.example:8000", ""), 403),
         (everywhere, ("192.168.1.7:8000", "192.168.1.7", "[fd00::1]:80", "localhost:8000"), 200),
@@ -859,6 +878,14 @@ def test_a_name_that_was_not_given_is_refused(scenes: Path, tmp_path: Path) -> N
             for answer in (first, second):  # a body would stand before the second
                 assert answer.startswith(f"HTTP/1.1 {status} ".encode()), (where, host)
             assert rest == b""
+
+
+def test_the_port_of_http_may_be_left_out(scenes: Path, tmp_path: Path) -> None:
+    """As browsers do."""
+    make(scenes, tmp_path / "study")
+    server = unbound(tmp_path / "study", "127.0.0.1", "127.0.0.1", lambda line: None, port=80)
+    assert all(map(server.is_named, ("127.0.0.1", "localhost", "127.0.0.1:80")))
+    assert not any(map(server.is_named, ("evil.example", "127.0.0.1:8000", "")))
 
 
 def test_a_fault_of_the_server_is_one_line(scenes: Path, tmp_path: Path) -> None:
@@ -994,12 +1021,15 @@ def test_another_host_must_be_said_and_is_warned_of(scenes: Path, tmp_path: Path
         assert taken.returncode == 2
         assert taken.stderr.startswith("error: --host 127.0.0.1 --port")
     argv = [sys.executable, "-m", "warpir.study", "serve", "study", "--port", "0"]
-    with subprocess.Popen(
-        [*argv, "--host", "0.0.0.0"], stdout=subprocess.PIPE, text=True, cwd=tmp_path
-    ) as server:
-        assert server.stdout is not None
-        assert "everyone who reaches this machine" in server.stdout.readline()
-        server.kill()
+    # The second is a name of the loopback.
+    for name, words in (("0.0.0.0", "everyone who reaches this"), ("0x7f.1", "http://127.0.0.1:")):
+        with subprocess.Popen(
+            [*argv, "--host", name], stdout=subprocess.PIPE, text=True, cwd=tmp_path
+        ) as server:
+            assert server.stdout is not None
+            line = server.stdout.readline()
+            server.kill()
+        assert words in line
 
 
 # -------------------------------------------------------------------------------- the browser
