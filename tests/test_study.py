@@ -418,6 +418,34 @@ def test_missing_raters_are_told(scenes: Path, tmp_path: Path) -> None:
     assert comparison["images_preferred"] == {"mean": 1.0, "sd": None}
 
 
+def test_scenes_without_votes_are_told_once(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """By their row: of each group, or of all scenes where there are no groups."""
+    groups = ("sunny", "sunny", "night", "")
+    pairs = [Pair(f"s{k}", group, "grouped") for k, group in enumerate(groups)]
+    pairs += [Pair("s0", "", "plain"), Pair("s1", "", "plain")]
+    plan = make_plan(pairs, raters=1, runs=1, seed=1, pairs_per_rater=1)
+    study = Study(plan, "ours", 1, 1, 0, "constructed")
+    (tmp_path / "study").mkdir()
+    protocol = protocol_bytes(study, Words())
+    (tmp_path / "study" / "study.json").write_bytes(protocol)
+    key = key_bytes(study, protocol, [{} for _ in plan.pairs])
+    (tmp_path / "study" / "key.json").write_bytes(key)
+    seen = next(k for k, rater in enumerate(plan.raters) if rater.trials[0].pair == 0)
+    write_answers(tmp_path / "study", [sheet_of(plan, seen)])
+    score(tmp_path / "study", "--markdown", str(tmp_path / "table.md"))
+    told = [
+        "no votes yet: 1 scenes against grouped, sunny",
+        "no votes yet: 1 scenes against grouped, night",
+        "no votes yet: 1 scenes against grouped, no group",
+        "no votes yet: 2 scenes against plain",
+    ]
+    lines = capsys.readouterr().out.splitlines()
+    assert [line for line in lines if line.startswith("no votes")] == told
+    assert (tmp_path / "table.md").read_text().count("no votes") == len(told)
+
+
 def test_hostile_names_stay_text(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     """In Markdown, HTML, rich's markup and the lines of a terminal."""
     name = "[bold]a|b`<b>\x1b[31m\n# c"
@@ -582,6 +610,8 @@ BAD_MANIFESTS: dict[str, tuple[Callable[[dict[str, Any]], Any], tuple[str, ...]]
     "long file name": (lambda m: set_scene(m, photo="x" * 300), ("xxx", "no such file")),
     "NUL": (lambda m: set_scene(m, photo="x\0.png"), ("no such file",)),
     "number": (lambda m: set_scene(m, group=3), ("/scenes/scene-0/group", "text of 1 to 100")),
+    "group all": (lambda m: set_scene(m, group="all"), ("/scenes/scene-0/group", "'all'")),
+    "no group": (lambda m: set_scene(m, group="no group"), ("'no group' is a row's own name",)),
     "empty text": (lambda m: m | {"question": " "}, ("/question",)),
     "long text": (lambda m: m | {"contact": "x" * 4001}, ("/contact", "1 to 4000")),
     "catches": (lambda m: m | {"catches": {}}, ("/catches", "a list expected")),
