@@ -19,7 +19,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from tests.browser import Opened, needs_chromium, open_browser
+from tests.browser import Fingers, Opened, needs_chromium, open_browser
 from tests.faults import NO_TORCH, assert_fails, run_case
 from warpir.errors import InputError
 from warpir.files import png_bytes
@@ -1118,6 +1118,33 @@ def use_zoom(opened: Opened) -> None:
     assert transforms(opened) == (whole, whole)
 
 
+def use_fingers(opened: Opened) -> None:
+    """Spread two fingers, lift one, move the other; a third that comes meanwhile does nothing."""
+    box = opened.page.locator(".frame").nth(0).bounding_box()
+    assert box is not None
+    fingers, view = Fingers(opened.page), "[view.scale, view.x, view.y]"
+    left, top, width, height = (box[name] for name in ("x", "y", "width", "height"))
+
+    def at(u: float, v: float) -> tuple[float, float]:
+        return left + u * width, top + v * height
+
+    fingers.press(0, *at(0.4, 0.5))
+    fingers.press(1, *at(0.6, 0.5))
+    fingers.move(1, *at(0.7, 0.5))
+    fingers.press(2, *at(0.1, 0.1))
+    fingers.move(2, *at(0.3, 0.3))
+    fingers.move(1, *at(0.8, 0.5))
+    # The points of the picture that are under the two are there still: twice as large.
+    assert opened.page.evaluate(view) == pytest.approx([2.0, -0.4, -0.5], abs=0.02)
+    fingers.lift(2)
+    fingers.lift(1)
+    fingers.move(0, *at(0.5, 0.5))
+    assert opened.page.evaluate(view) == pytest.approx([2.0, -0.3, -0.5], abs=0.02)
+    fingers.lift(0)
+    assert opened.page.evaluate(view) == pytest.approx([2.0, -0.3, -0.5], abs=0.02)
+    opened.page.keyboard.press("0")
+
+
 def check_frames(opened: Opened) -> None:
     """Both pictures are of one size, apart, on grey."""
     frames = [opened.page.locator(".frame").nth(k).bounding_box() for k in (0, 1)]
@@ -1131,16 +1158,18 @@ def check_frames(opened: Opened) -> None:
 
 
 def answer_all(opened: Opened, count: int) -> None:
-    """Choose picture 2 with a key, then 1 with a double click, and so on; load the page once."""
+    """Choose picture 2 with a key, then 1 with a double click, and so on; load the page twice."""
     page = opened.page
     for number in range(1, count + 1):
         await_pair(opened, number)
         if number == 1:
             check_frames(opened)
             use_zoom(opened)
+            use_fingers(opened)
         if number == 2:
-            page.reload()
-            await_pair(opened, number)
+            for _ in range(2):
+                page.reload()
+                await_pair(opened, number)
         if number % 2:
             page.keyboard.press("2" if number == 1 else "ArrowRight")
         else:
@@ -1151,7 +1180,7 @@ def answer_all(opened: Opened, count: int) -> None:
 def check_sheet_of_browser(path: Path, study: Study) -> None:
     record = json.loads(path.read_text())
     sheet = parse_sheet(path, path.read_bytes(), study.plan)
-    assert sheet.is_automated and record["resumed"] == 1
+    assert sheet.is_automated and record["resumed"] == 2
     assert [answer["choice"] for answer in record["answers"]] == [
         2 if k % 2 == 0 else 1 for k in range(len(record["answers"]))
     ]
