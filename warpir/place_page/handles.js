@@ -1,6 +1,6 @@
 // What is dragged over the photo: horizon, ring, size, foot. Positions are pixels of the stage.
 
-import { corners, groundPoint, horizonRow, levelled, placed, project, zoomed } from './camera.js';
+import { corners, groundPoint, horizonRow, levelled, lowered, placed, project, zoomed } from './camera.js';
 
 const SVG = 'http://www.w3.org/2000/svg';
 const RIM = 14; // handles stay this far inside the stage
@@ -42,14 +42,30 @@ export function stoodAt(before, u, v) {
   return { ...before, stand: { x: point[0], z: point[1] } };
 }
 
-export const shifted = (before, rows) => {
-  const { camera, stance } = before;
-  const ends = [0, camera.width].map((u) => [u, horizonRow(camera, stance, u) + rows]);
-  return withCamera(before, camera, levelled(camera, stance, ...ends));
-};
+export const shifted = (before, rows) => withCamera(before, before.camera, lowered(before.camera, before.stance, rows));
+
+// Let an element follow the pointer that was pressed on it; returns whether it does. Other buttons
+// do nothing, nor do other fingers while a gesture goes on.
+export function follow(element, pressed, gesture, name, moved) {
+  if (pressed.button !== 0 || gesture.isOn) return false;
+  element.setPointerCapture(pressed.pointerId);
+  gesture.begin(name);
+  const move = (event) => {
+    if (event.pointerId === pressed.pointerId) moved(event);
+  };
+  const end = (event) => {
+    if (event.pointerId !== pressed.pointerId) return;
+    element.removeEventListener('pointermove', move);
+    for (const kind of ['pointerup', 'pointercancel']) element.removeEventListener(kind, end);
+    gesture.end();
+  };
+  element.addEventListener('pointermove', move);
+  for (const kind of ['pointerup', 'pointercancel']) element.addEventListener(kind, end);
+  return true;
+}
 
 export class Handles {
-  // `gesture` has begin(), move(change from the state at its beginning), end().
+  // `gesture` has begin(), move(change from the state at its beginning), end(), isOn.
   constructor(svg, stage, box, gesture) {
     Object.assign(this, { svg, stage, box, gesture });
     this.horizon = this.#line('horizon', 2);
@@ -86,31 +102,19 @@ export class Handles {
   // Let an element be dragged: the state at the beginning and both pointers give the new one.
   #drags(element, name) {
     element.addEventListener('pointerdown', (event) => {
-      if (event.button !== 0) return;
+      if (!this.drag(event, element, name)) return;
       event.preventDefault();
       event.stopPropagation();
-      this.drag(event, element, name);
       if (element.tabIndex >= 0) element.focus({ focusVisible: false });
     });
   }
 
   drag(event, element, name) {
     const from = this.#pixel(event);
-    element.setPointerCapture(event.pointerId);
-    this.gesture.begin(name);
-    const move = (moved) => {
-      if (moved.pointerId !== event.pointerId) return;
+    return follow(element, event, this.gesture, name, (moved) => {
       const to = this.#pixel(moved);
       this.gesture.move((before) => this.#dragged(name, before, from, to));
-    };
-    const end = (ended) => {
-      if (ended.pointerId !== event.pointerId) return;
-      element.removeEventListener('pointermove', move);
-      for (const kind of ['pointerup', 'pointercancel']) element.removeEventListener(kind, end);
-      this.gesture.end();
-    };
-    element.addEventListener('pointermove', move);
-    for (const kind of ['pointerup', 'pointercancel']) element.addEventListener(kind, end);
+    });
   }
 
   #pixel(event) {
@@ -127,7 +131,6 @@ export class Handles {
       // The middle of the horizon stays; this end follows the pointer.
       const [row, middle] = [horizonRow(camera, stance, from[0]), camera.width / 2];
       const ends = [[middle, horizonRow(camera, stance, middle)], [from[0], row + dv]];
-      if (name === 'tilt') ends.reverse();
       return withCamera(before, camera, levelled(camera, stance, ...ends));
     }
     if (name === 'fov') {
@@ -186,10 +189,10 @@ export class Handles {
 
     const at = corners(this.box, placed(this.box, stand, turn, size)).map((p) => project(camera, stance, p));
     const isWhole = at.every(Boolean);
-    this.bounds = isWhole && [
+    this.bounds = isWhole ? [
       Math.min(...at.map((p) => p[0])), Math.min(...at.map((p) => p[1])),
       Math.max(...at.map((p) => p[0])), Math.max(...at.map((p) => p[1])),
-    ];
+    ] : null;
     const foot = project(camera, stance, [stand.x, 0, stand.z]);
     put('foot', onStage(foot));
     const away = Math.hypot(stand.x - stance.x, stance.height, stand.z - stance.z);
