@@ -11,6 +11,7 @@ import time
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
+from itertools import combinations
 from pathlib import Path
 from typing import Any
 
@@ -777,6 +778,18 @@ def test_page_serves_small_windows_and_fingers(inputs: Path, tmp_path: Path) -> 
         page.keyboard.press("Control+z")
         settle(opened)
         assert page.evaluate(STATE) == before
+        # Of something flat and far away the knobs are apart, however it is turned.
+        for field, value in (("size", "0.05"), ("ahead", "12")):
+            page.fill(f"#{field}", value)
+            page.keyboard.press("Enter")
+            settle(opened)
+        for turn in (0, 70, 180, -90):
+            page.fill("#turn", str(turn))
+            page.keyboard.press("Enter")
+            settle(opened)
+            knobs = [np.array(handle_at(opened, name)) for name in ("size", "foot", "turn")]
+            apart = [np.linalg.norm(a - b) for a, b in combinations(knobs, 2)]
+            assert min(apart) > 25.5, (turn, apart)
         assert opened.errors == []
 
 

@@ -4,6 +4,7 @@ import { corners, groundPoint, horizonRow, levelled, lowered, placed, project, z
 
 const SVG = 'http://www.w3.org/2000/svg';
 const RIM = 14; // handles stay this far inside the stage
+const APART = 26; // between the middles of an object's knobs
 const LEAST_RING = 44; // radius on the screen, however small the object is
 const FARTHEST = 400; // camera heights
 const ICONS = {
@@ -24,6 +25,19 @@ function make(tag, attributes, parent) {
   for (const [name, value] of Object.entries(attributes)) element.setAttribute(name, value);
   parent?.append(element);
   return element;
+}
+
+// A knob beside another: farther out where it would lie on it.
+function outside([x, y], [u, v]) {
+  const away = Math.hypot(x - u, y - v);
+  if (away >= APART) return [x, y];
+  return away ? [u + ((x - u) * APART) / away, v + ((y - v) * APART) / away] : [u, v + APART];
+}
+
+// A knob above another: higher up where it would lie on it.
+function above([x, y], [u, v]) {
+  const clear = Math.sqrt(Math.max(APART ** 2 - (x - u) ** 2, 0));
+  return [x, Math.abs(y - v) < clear ? v - clear : y];
 }
 
 // The same with the camera changed: what stood at a pixel of the ground goes on standing there.
@@ -194,7 +208,6 @@ export class Handles {
       Math.max(...at.map((p) => p[0])), Math.max(...at.map((p) => p[1])),
     ] : null;
     const foot = project(camera, stance, [stand.x, 0, stand.z]);
-    put('foot', onStage(foot));
     const away = Math.hypot(stand.x - stance.x, stance.height, stand.z - stance.z);
     const side = Math.max(...this.box.high.map((top, k) => top - this.box.low[k]));
     const across = Math.hypot(this.box.high[0] - this.box.low[0], this.box.high[2] - this.box.low[2]);
@@ -204,9 +217,15 @@ export class Handles {
     ]);
     const ring = Array.from({ length: 73 }, (_, k) => onStage(round((k * Math.PI) / 36)));
     draw(this.ring, ring.every(Boolean) ? `M${ring.join('L')}Z` : '');
-    put('turn', onStage(round((turn * Math.PI) / 180)));
     const top = this.bounds ? [(this.bounds[0] + this.bounds[2]) / 2, this.bounds[1]] : foot;
-    put('size', top && onStage(top).map((part, k) => part - 30 * k));
+    const [footAt, onRing, topAt] = [foot, round((turn * Math.PI) / 180), top].map(onStage);
+    const asideAt = footAt && onRing && outside(onRing, footAt);
+    // Above the horizon it could not be dragged.
+    const turnAt = asideAt && groundPoint(camera, stance, ...asideAt.map((part) => part / this.scale)) ? asideAt : onRing;
+    const lowestFirst = [footAt, turnAt].filter(Boolean).sort((a, b) => b[1] - a[1]);
+    put('foot', footAt);
+    put('turn', turnAt);
+    put('size', topAt && lowestFirst.reduce(above, [topAt[0], topAt[1] - 30]));
   }
 
   // What each handle stands at, for those who do not see it.
