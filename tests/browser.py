@@ -29,6 +29,35 @@ class Opened:
     requests: list[str] = field(default_factory=list)
 
 
+class Fingers:
+    """Fingers on the screen of a page, each under a number of its own."""
+
+    def __init__(self, page: Page) -> None:
+        """Touch nothing yet."""
+        self._page, self._screen = page, page.context.new_cdp_session(page)
+        self._places: dict[int, tuple[float, float]] = {}
+
+    def press(self, finger: int, x: float, y: float) -> None:
+        """Put a finger down."""
+        self._send("touchStart", finger, x, y)
+
+    def move(self, finger: int, x: float, y: float) -> None:
+        """Move a finger that is down; pages are told with the next frame."""
+        self._send("touchMove", finger, x, y)
+        self._page.evaluate(
+            "new Promise((r) => requestAnimationFrame(() => requestAnimationFrame(r)))"
+        )
+
+    def lift(self, finger: int) -> None:
+        """Take a finger away."""
+        self._send("touchEnd", finger, *self._places[finger])
+
+    def _send(self, kind: str, finger: int, x: float, y: float) -> None:
+        self._places[finger] = (x, y)
+        points = [{"id": finger, "x": x, "y": y}]
+        self._screen.send("Input.dispatchTouchEvent", {"type": kind, "touchPoints": points})
+
+
 @contextmanager
 def open_browser(width: int = 1280, height: int = 800) -> Iterator[Opened]:
     """Open an empty page of some size [pixels]; WebGL is drawn by the CPU."""

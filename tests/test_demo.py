@@ -134,6 +134,17 @@ def test_demo_config_names_files_that_exist() -> None:
     assert (lit.exposure, lit.tone) == (0.0, "linear")
 
 
+def test_demo_config_keeps_what_the_user_named() -> None:
+    """A place, a pixel, a turn; and exposure and tone under its own light."""
+    where = placement()
+    named = demo.demo_config(InsertConfig(demo=True, place=(1.0, 0.0, -9.0), rotate_y=20.0))
+    assert (named.place, named.rotate_y) == ((1.0, 0.0, -9.0), 20.0)
+    pixel = demo.demo_config(InsertConfig(demo=True, at=(600.0, 700.0)))
+    assert (pixel.place, pixel.at, pixel.rotate_y) == (None, (600.0, 700.0), where.rotate_y)
+    lit = InsertConfig(demo=True, guidance="none", exposure=1.0, tone="reinhard")
+    assert (demo.demo_config(lit).exposure, demo.demo_config(lit).tone) == (1.0, "reinhard")
+
+
 def test_shipped_regressor_sees_the_sun_of_the_demo() -> None:
     """`make demo` lights the car from about where the photo's shadows say (15 degrees off)."""
     photo, where = read_photo(demo.PHOTO).srgb, camera()

@@ -11,6 +11,7 @@ import time
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
+from itertools import combinations
 from pathlib import Path
 from typing import Any
 
@@ -20,7 +21,7 @@ import trimesh
 from numpy.typing import NDArray
 from PIL import Image
 
-from tests.browser import Opened, needs_chromium, open_browser
+from tests.browser import Fingers, Opened, needs_chromium, open_browser
 from tests.test_insert import read_layers
 from warpir.asset import load_asset
 from warpir.camera import Camera, camera_from_fov, ground_point
@@ -409,6 +410,25 @@ def test_browser_is_not_started_with_the_token(
     assert not way.parent.exists()
 
 
+def test_address_leaves_out_the_port_of_http() -> None:
+    """As browsers do, whose requests must name what the address has."""
+    from warpir.place_server import PlaceServer
+
+    server = object.__new__(PlaceServer)
+    for port, host in ((80, "127.0.0.1"), (8080, "127.0.0.1:8080")):
+        server.server_address = ("127.0.0.1", port)
+        assert server.host == host
+
+
+def test_demo_starts_where_the_user_says(tmp_path: Path) -> None:
+    """A pixel, a turn and the folder replace the demo's own."""
+    from warpir.place import _with_inputs
+
+    config = _with_inputs(InsertConfig(demo=True, at=(600.0, 700.0), rotate_y=10.0, out="mine"))
+    assert (config.at, config.place, config.rotate_y) == ((600.0, 700.0), None, 10.0)
+    assert config.out == "mine"
+
+
 def test_place_loads_neither_torch_nor_warp() -> None:
     """The page starts at once."""
     code = (
@@ -615,6 +635,27 @@ def test_page_counts_as_the_camera_does(inputs: Path, tmp_path: Path) -> None:
         level = {**TILTED.record(), "pitch": 0.0, "roll": 0.0}
         found = call("levelled", numbers, level, *ends)
         assert found == pytest.approx(TILTED.record(), abs=EXACT)
+        # Nor is a camera turned over that stands on its head, or steeper than the page makes it.
+        for pitch, roll in ((-11.0, 6.0), (20.0, 100.0), (-30.0, -95.0), (8.0, 175.0)):
+            over = {**TILTED.record(), "pitch": pitch, "roll": roll}
+            ends_over = [[u, call("horizonRow", numbers, over, u)] for u in (0.0, 480.0)]
+            for given in (ends_over, ends_over[::-1]):
+                found = call("levelled", numbers, over, *given)
+                assert found == pytest.approx(over, abs=1e-6)
+            for changed, rows in (
+                (call("zoomed", numbers, over, 800.0), 0.0),
+                ({"camera": numbers, "stance": call("lowered", numbers, over, 25.0)}, 25.0),
+            ):
+                assert changed["stance"]["roll"] == roll
+                for u, v in ends_over:
+                    row = call("horizonRow", changed["camera"], changed["stance"], u)
+                    assert row == pytest.approx(v + rows, abs=1e-6)
+            # Far level points are seen on it, those of the ground on its same side as before.
+            far = [call("project", numbers, over, [x, 1.7, -1e9]) for x in (-1e8, -4e8)]
+            found = [call("horizonRow", numbers, over, u) for u, _ in far]
+            assert found == pytest.approx([v for _, v in far], abs=1e-3)
+        down = {**TILTED.record(), "pitch": -90.0, "roll": 0.0}
+        assert call("zoomed", numbers, down, 800.0)["stance"]["pitch"] == pytest.approx(-90.0)
         # As --horizon has it: a row of the middle column, of a camera without roll.
         flat = camera_from_fov(WIDTH, HEIGHT, 60.0, 0.0, 1.5, horizon=100.0)
         plain = {name: getattr(flat, name) for name in numbers}
@@ -631,6 +672,125 @@ def test_page_counts_as_the_camera_does(inputs: Path, tmp_path: Path) -> None:
         matrix = call("placed", box, {"x": 0.5, "z": -6.0}, 35.0, 1.7)
         found = np.reshape(matrix, (4, 4)).T
         np.testing.assert_allclose(found, wanted.asset_to_world, atol=1e-9)
+
+
+def check_arrows(opened: Opened) -> None:
+    """On a knob each arrow changes what the knob is for, right as up and left as down."""
+    page = opened.page
+    held = page.evaluate(STATE)
+    for knob, group, name, sign in (
+        ("pitch", "stance", "pitch", -1.0),
+        ("roll", "stance", "roll", 1.0),
+        ("tilt", "stance", "roll", -1.0),
+    ):
+        page.locator(f"[data-handle={knob}]").focus()
+        for keys, way in ((("ArrowUp", "ArrowRight"), 1.0), (("ArrowDown", "ArrowLeft"), -1.0)):
+            for key in keys:
+                page.keyboard.press(key)
+                settle(opened)
+                moved = page.evaluate(STATE)[group][name] - held[group][name]
+                assert moved * sign * way > 0.1, (knob, key)
+                page.keyboard.press("Control+z")
+                settle(opened)
+                assert page.evaluate(STATE) == held
+
+
+def check_behind(opened: Opened) -> None:
+    """A box that reaches behind the camera is nowhere under the pointer, and no fault."""
+    page = opened.page
+    page.fill("#ahead", "0.5")
+    page.keyboard.press("Enter")
+    settle(opened)
+    box = page.locator("#canvas").bounding_box()
+    assert box is not None
+    page.mouse.move(box["x"] + 0.3 * box["width"], box["y"] + 0.8 * box["height"])
+    settle(opened)
+    assert opened.errors == []
+    page.keyboard.press("Control+z")
+    settle(opened)
+
+
+@needs_chromium
+@pytest.mark.slow
+def test_page_keeps_what_was_given(inputs: Path, tmp_path: Path) -> None:
+    """A camera that looks straight down, and a sun under a black sky, come out as they went in."""
+    out = tmp_path / "out"
+    steep = ["--pitch", "-90", "--camera-height", "6"]
+    argv = command(inputs, out, *steep, "--sun=-60,45,3", "--sky", "0,0,0")
+    with serve(argv) as served, open_browser(700, 500) as opened:
+        open_page(opened, served)
+        start = opened.page.evaluate(STATE)
+        assert start["stance"]["pitch"] == pytest.approx(-90.0)
+        opened.page.locator("#stage").focus()
+        opened.page.keyboard.press("q")
+        settle(opened)
+        changed = opened.page.evaluate(STATE)
+        assert changed["stance"] == start["stance"] and changed["turn"] != start["turn"]
+        light = "import('./page.js').then(({ stage: { sun, scene, groundUniforms } }) =>"
+        light += " [sun.intensity, ...sun.color, scene.environmentIntensity,"
+        light += " groundUniforms.sunShare.value])"
+        assert np.isfinite(np.array(opened.page.evaluate(light), dtype=float)).all()
+        opened.page.click("#save")
+        opened.page.wait_for_selector("#done:not([hidden])")
+        assert opened.errors == []
+    saved = json.loads((out / "insert.json").read_text())
+    assert saved["sun"] == pytest.approx([-60.0, 45.0, 3.0]) and saved["sky"] == [0.0, 0.0, 0.0]
+    pose = np.array(json.loads((out / "camera.json").read_text())["c2w"])
+    np.testing.assert_allclose(pose[:3, 2], [0.0, 1.0, 0.0], atol=EXACT)
+
+
+@needs_chromium
+@pytest.mark.slow
+def test_page_serves_small_windows_and_fingers(inputs: Path, tmp_path: Path) -> None:
+    """Save and the last field can be reached, and a second finger does not break a drag."""
+    with serve(command(inputs, tmp_path / "out")) as served, open_browser(640, 360) as opened:
+        page = opened.page
+        open_page(opened, served)
+        for width, height in ((640, 360), (568, 320), (320, 256), (390, 844)):
+            page.set_viewport_size({"width": width, "height": height})
+            settle(opened)
+            for name in ("#skyStrength", "#save"):
+                page.locator(name).scroll_into_view_if_needed()
+                box = page.locator(name).bounding_box()
+                assert box is not None
+                assert 0 <= box["x"] <= box["x"] + box["width"] <= width, (name, width, height)
+                assert 0 <= box["y"] <= box["y"] + box["height"] <= height, (name, width, height)
+            page.click("#save", timeout=5000)
+            page.wait_for_selector("#done:not([hidden])")
+            photo = page.locator("#photo").bounding_box()
+            assert photo is not None and photo["width"] >= 60
+        before = page.evaluate(STATE)
+        fingers = Fingers(page)
+        (x, y), (u, v) = handle_at(opened, "size"), handle_at(opened, "roll")
+        fingers.press(0, x, y)
+        fingers.move(0, x, y - 10.0)
+        fingers.press(1, u, v)
+        fingers.move(1, u, v + 30.0)
+        fingers.lift(1)
+        fingers.move(0, x, y - 20.0)
+        fingers.lift(0)
+        settle(opened)
+        after = page.evaluate(STATE)
+        assert after["stance"] == before["stance"] and after["size"] > 1.1 * before["size"]
+        page.locator("#dial").click(position={"x": 60.0, "y": 40.0}, button="right")
+        settle(opened)
+        assert page.evaluate(STATE)["light"] == before["light"]
+        page.keyboard.press("Control+z")
+        settle(opened)
+        assert page.evaluate(STATE) == before
+        # Of something flat and far away the knobs are apart, however it is turned.
+        for field, value in (("size", "0.05"), ("ahead", "12")):
+            page.fill(f"#{field}", value)
+            page.keyboard.press("Enter")
+            settle(opened)
+        for turn in (0, 70, 180, -90):
+            page.fill("#turn", str(turn))
+            page.keyboard.press("Enter")
+            settle(opened)
+            knobs = [np.array(handle_at(opened, name)) for name in ("size", "foot", "turn")]
+            apart = [np.linalg.norm(a - b) for a, b in combinations(knobs, 2)]
+            assert min(apart) > 25.5, (turn, apart)
+        assert opened.errors == []
 
 
 @needs_chromium
@@ -659,6 +819,8 @@ def test_page_undoes_and_tells_what_is_wrong(inputs: Path, tmp_path: Path) -> No
         page.keyboard.press("Control+Shift+z")
         settle(opened)
         assert page.evaluate(STATE)["size"] == 1.25
+        check_arrows(opened)
+        check_behind(opened)
         drag_away_and_back(opened, "#turn-slide")
         page.locator("#stage").focus()
         held = page.evaluate(STATE)

@@ -19,7 +19,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from tests.browser import Opened, needs_chromium, open_browser
+from tests.browser import Fingers, Opened, needs_chromium, open_browser
 from tests.faults import NO_TORCH, assert_fails, run_case
 from warpir.errors import InputError
 from warpir.files import png_bytes
@@ -418,6 +418,34 @@ def test_missing_raters_are_told(scenes: Path, tmp_path: Path) -> None:
     assert comparison["images_preferred"] == {"mean": 1.0, "sd": None}
 
 
+def test_scenes_without_votes_are_told_once(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """By their row: of each group, or of all scenes where there are no groups."""
+    groups = ("sunny", "sunny", "night", "")
+    pairs = [Pair(f"s{k}", group, "grouped") for k, group in enumerate(groups)]
+    pairs += [Pair("s0", "", "plain"), Pair("s1", "", "plain")]
+    plan = make_plan(pairs, raters=1, runs=1, seed=1, pairs_per_rater=1)
+    study = Study(plan, "ours", 1, 1, 0, "constructed")
+    (tmp_path / "study").mkdir()
+    protocol = protocol_bytes(study, Words())
+    (tmp_path / "study" / "study.json").write_bytes(protocol)
+    key = key_bytes(study, protocol, [{} for _ in plan.pairs])
+    (tmp_path / "study" / "key.json").write_bytes(key)
+    seen = next(k for k, rater in enumerate(plan.raters) if rater.trials[0].pair == 0)
+    write_answers(tmp_path / "study", [sheet_of(plan, seen)])
+    score(tmp_path / "study", "--markdown", str(tmp_path / "table.md"))
+    told = [
+        "no votes yet: 1 scenes against grouped, sunny",
+        "no votes yet: 1 scenes against grouped, night",
+        "no votes yet: 1 scenes against grouped, no group",
+        "no votes yet: 2 scenes against plain",
+    ]
+    lines = capsys.readouterr().out.splitlines()
+    assert [line for line in lines if line.startswith("no votes")] == told
+    assert (tmp_path / "table.md").read_text().count("no votes") == len(told)
+
+
 def test_hostile_names_stay_text(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     """In Markdown, HTML, rich's markup and the lines of a terminal."""
     name = "[bold]a|b`<b>\x1b[31m\n# c"
@@ -582,6 +610,8 @@ BAD_MANIFESTS: dict[str, tuple[Callable[[dict[str, Any]], Any], tuple[str, ...]]
     "long file name": (lambda m: set_scene(m, photo="x" * 300), ("xxx", "no such file")),
     "NUL": (lambda m: set_scene(m, photo="x\0.png"), ("no such file",)),
     "number": (lambda m: set_scene(m, group=3), ("/scenes/scene-0/group", "text of 1 to 100")),
+    "group all": (lambda m: set_scene(m, group="all"), ("/scenes/scene-0/group", "'all'")),
+    "no group": (lambda m: set_scene(m, group="no group"), ("'no group' is a row's own name",)),
     "empty text": (lambda m: m | {"question": " "}, ("/question",)),
     "long text": (lambda m: m | {"contact": "x" * 4001}, ("/contact", "1 to 4000")),
     "catches": (lambda m: m | {"catches": {}}, ("/catches", "a list expected")),
@@ -816,6 +846,7 @@ class Wire:
     def __init__(self, sent: str) -> None:
         self.sent = io.BytesIO(sent.encode())
         self.answered = b""
+        self.longest = 0
 
     def settimeout(self, seconds: float) -> None:
         pass
@@ -825,14 +856,30 @@ class Wire:
 
     def sendall(self, content: bytes) -> None:
         self.answered += content
+        self.longest = max(self.longest, len(content))
 
 
-def unbound(folder: Path, bound: str, name: str, say: Callable[[str], None]) -> StudyServer:
+def unbound(
+    folder: Path, bound: str, name: str, say: Callable[[str], None], port: int = 8000
+) -> StudyServer:
     """A server that listens nowhere."""
     server = object.__new__(StudyServer)
     server.site = Site(folder, read_study(folder), say)
-    server.name, server.server_address = name, (bound, 8000)
+    server.name, server.server_address = name, (bound, port)
     return server
+
+
+def test_a_picture_is_sent_in_parts(scenes: Path, tmp_path: Path) -> None:
+    """The limit of time is that of a part, so that a large picture gets through a slow line."""
+    make(scenes, tmp_path / "study")
+    picture = next((tmp_path / "study" / "pages").glob("*.png"))
+    content = random.Random(1).randbytes(1_000_001)
+    picture.write_bytes(content)
+    server = unbound(tmp_path / "study", "127.0.0.1", "127.0.0.1", lambda line: None)
+    wire = Wire(f"GET /{picture.name} HTTP/1.1\r\nHost: localhost:8000\r\n\r\n")
+    _Handler(wire, ("10.9.9.9", 1), server)  # type: ignore[arg-type]
+    assert wire.answered.endswith(b"\r\n\r\n" + content)
+    assert wire.longest <= 1 << 16
 
 
 def test_a_name_that_was_not_given_is_refused(scenes: Path, tmp_path: Path) -> None:
@@ -840,8 +887,10 @@ def test_a_name_that_was_not_given_is_refused(scenes: Path, tmp_path: Path) -> N
     study = make(scenes, tmp_path / "study")
     path = f"/{study.plan.raters[0].token}.html"
     local, named = ("127.0.0.1", "127.0.0.1"), ("10.0.0.5", "Lab.example")
-    everywhere = ("0.0.0.0", "0.0.0.0")
+    everywhere, mine = ("0.0.0.0", "0.0.0.0"), ("127.0.1.1", "MyBox")
     for where, hosts, status in (
+        (mine, ("mybox:8000", "MyBox:8000", "127.0.1.1:8000", "localhost:8000"), 200),
+        (mine, ("mybox", "mybox:80", "mybox.evil.example:8000", "evil.example:8000"), 403),
         (local, ("127.0.0.1:8000", "localhost:8000"), 200),
         (local, ("127.0.0.1", "10.0.0.5:8000", "evil.example:8000", ""), 403),
         (everywhere, ("192.168.1.7:8000", "192.168.1.7", "[fd00::1]:80", "localhost:8000"), 200),
@@ -859,6 +908,14 @@ def test_a_name_that_was_not_given_is_refused(scenes: Path, tmp_path: Path) -> N
             for answer in (first, second):  # a body would stand before the second
                 assert answer.startswith(f"HTTP/1.1 {status} ".encode()), (where, host)
             assert rest == b""
+
+
+def test_the_port_of_http_may_be_left_out(scenes: Path, tmp_path: Path) -> None:
+    """As browsers do."""
+    make(scenes, tmp_path / "study")
+    server = unbound(tmp_path / "study", "127.0.0.1", "127.0.0.1", lambda line: None, port=80)
+    assert all(map(server.is_named, ("127.0.0.1", "localhost", "127.0.0.1:80")))
+    assert not any(map(server.is_named, ("evil.example", "127.0.0.1:8000", "")))
 
 
 def test_a_fault_of_the_server_is_one_line(scenes: Path, tmp_path: Path) -> None:
@@ -994,12 +1051,15 @@ def test_another_host_must_be_said_and_is_warned_of(scenes: Path, tmp_path: Path
         assert taken.returncode == 2
         assert taken.stderr.startswith("error: --host 127.0.0.1 --port")
     argv = [sys.executable, "-m", "warpir.study", "serve", "study", "--port", "0"]
-    with subprocess.Popen(
-        [*argv, "--host", "0.0.0.0"], stdout=subprocess.PIPE, text=True, cwd=tmp_path
-    ) as server:
-        assert server.stdout is not None
-        assert "everyone who reaches this machine" in server.stdout.readline()
-        server.kill()
+    # The second is a name of the loopback.
+    for name, words in (("0.0.0.0", "everyone who reaches this"), ("0x7f.1", "http://127.0.0.1:")):
+        with subprocess.Popen(
+            [*argv, "--host", name], stdout=subprocess.PIPE, text=True, cwd=tmp_path
+        ) as server:
+            assert server.stdout is not None
+            line = server.stdout.readline()
+            server.kill()
+        assert words in line
 
 
 # -------------------------------------------------------------------------------- the browser
@@ -1058,6 +1118,33 @@ def use_zoom(opened: Opened) -> None:
     assert transforms(opened) == (whole, whole)
 
 
+def use_fingers(opened: Opened) -> None:
+    """Spread two fingers, lift one, move the other; a third that comes meanwhile does nothing."""
+    box = opened.page.locator(".frame").nth(0).bounding_box()
+    assert box is not None
+    fingers, view = Fingers(opened.page), "[view.scale, view.x, view.y]"
+    left, top, width, height = (box[name] for name in ("x", "y", "width", "height"))
+
+    def at(u: float, v: float) -> tuple[float, float]:
+        return left + u * width, top + v * height
+
+    fingers.press(0, *at(0.4, 0.5))
+    fingers.press(1, *at(0.6, 0.5))
+    fingers.move(1, *at(0.7, 0.5))
+    fingers.press(2, *at(0.1, 0.1))
+    fingers.move(2, *at(0.3, 0.3))
+    fingers.move(1, *at(0.8, 0.5))
+    # The points of the picture that are under the two are there still: twice as large.
+    assert opened.page.evaluate(view) == pytest.approx([2.0, -0.4, -0.5], abs=0.02)
+    fingers.lift(2)
+    fingers.lift(1)
+    fingers.move(0, *at(0.5, 0.5))
+    assert opened.page.evaluate(view) == pytest.approx([2.0, -0.3, -0.5], abs=0.02)
+    fingers.lift(0)
+    assert opened.page.evaluate(view) == pytest.approx([2.0, -0.3, -0.5], abs=0.02)
+    opened.page.keyboard.press("0")
+
+
 def check_frames(opened: Opened) -> None:
     """Both pictures are of one size, apart, on grey."""
     frames = [opened.page.locator(".frame").nth(k).bounding_box() for k in (0, 1)]
@@ -1071,16 +1158,18 @@ def check_frames(opened: Opened) -> None:
 
 
 def answer_all(opened: Opened, count: int) -> None:
-    """Choose picture 2 with a key, then 1 with a double click, and so on; load the page once."""
+    """Choose picture 2 with a key, then 1 with a double click, and so on; load the page twice."""
     page = opened.page
     for number in range(1, count + 1):
         await_pair(opened, number)
         if number == 1:
             check_frames(opened)
             use_zoom(opened)
+            use_fingers(opened)
         if number == 2:
-            page.reload()
-            await_pair(opened, number)
+            for _ in range(2):
+                page.reload()
+                await_pair(opened, number)
         if number % 2:
             page.keyboard.press("2" if number == 1 else "ArrowRight")
         else:
@@ -1091,7 +1180,7 @@ def answer_all(opened: Opened, count: int) -> None:
 def check_sheet_of_browser(path: Path, study: Study) -> None:
     record = json.loads(path.read_text())
     sheet = parse_sheet(path, path.read_bytes(), study.plan)
-    assert sheet.is_automated and record["resumed"] == 1
+    assert sheet.is_automated and record["resumed"] == 2
     assert [answer["choice"] for answer in record["answers"]] == [
         2 if k % 2 == 0 else 1 for k in range(len(record["answers"]))
     ]

@@ -102,8 +102,9 @@ class PlaceServer(ThreadingHTTPServer):
 
     @property
     def host(self) -> str:
-        """Host and port, as a browser names them."""
-        return f"{HOST}:{self.server_address[1]}"
+        """Host and port, as a browser names them: it leaves out the port that is HTTP's own."""
+        port = self.server_address[1]
+        return HOST if port == 80 else f"{HOST}:{port}"
 
     @property
     def address(self) -> str:

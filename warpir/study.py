@@ -305,7 +305,7 @@ def _serve(options: argparse.Namespace) -> None:
         raise usage(where, f"cannot be listened on ({error.strerror or error})") from error
     with server:
         host, port = server.server_address[:2]
-        if not is_loopback(options.host):
+        if not is_loopback(str(host)):
             say(
                 f"notice: --host {options.host}: everyone who reaches this machine can open the "
                 "pages and send answers, and nothing is encrypted"

@@ -20,7 +20,7 @@ from typing import Any
 from warpir.config import usage
 from warpir.errors import InputError, raise_all, shown
 from warpir.strict_json import read_json_object
-from warpir.study_plan import Pair
+from warpir.study_plan import ALL, UNGROUPED, Pair
 
 SUFFIXES = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".webp")
 PHOTO = "photo"
@@ -185,6 +185,8 @@ class _Reader:
         content = self.mapping(pointer, content)
         self.keys(pointer, content, {"images"}, {"group", "photo"})
         group = self.name(f"{pointer}/group", content["group"]) if "group" in content else ""
+        if group in (ALL, UNGROUPED):
+            self.wrong(f"{pointer}/group", f"{shown(group)} is a row's own name")
         photo = self.file(f"{pointer}/photo", content["photo"]) if "photo" in content else None
         images = {
             self.name(f"{pointer}/images", name): self.file(f"{pointer}/images/{name}", value)

@@ -14,6 +14,8 @@ from typing import Literal
 
 Kind = Literal["pair", "repeat", "catch"]
 
+ALL, UNGROUPED = "all", "no group"
+"""What all scenes together, and those without a group, are called among the groups."""
 PAIRS_PER_REPEAT = 10
 """One pair in so many is shown twice."""
 PAIRS_PER_CATCH = 20

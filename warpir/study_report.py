@@ -4,6 +4,8 @@ import sys
 from collections.abc import Mapping, Sequence
 from typing import Any, Literal
 
+from warpir.study_plan import ALL
+
 HEADINGS = (
     "against",
     "scenes",
@@ -29,11 +31,10 @@ def rows_of(figures: Mapping[str, Any]) -> list[list[str]]:
     rows = []
     for c in figures["comparisons"]:
         scenes = c["scenes_preferred"]
-        name = c["baseline"] if c["group"] == "all" else f"{c['baseline']}, {c['group']}"
         p_value = scenes["p_value"]
         rows.append(
             [
-                printable(name),
+                _name(c),
                 str(c["scenes"]),
                 _spread(c["images_preferred"]),
                 _spread(c["votes_preferred"]),
@@ -59,10 +60,11 @@ def lines_of(report: Mapping[str, Any], figures: Mapping[str, Any]) -> list[str]
     lines.append(f"image 1 chosen: {_with_interval(side)}{tested}")
     lines.append(f"median response: {_number(figures['median_seconds'], 1)} s")
     lines.append(f"zoomed: {'-' if zoomed is None else f'{100.0 * zoomed:.0f} %'} of the pairs")
-    lacking = [c for c in figures["comparisons"] if c["scenes_without_votes"]]
-    for c in lacking:
-        count = c["scenes_without_votes"]
-        lines.append(f"no votes yet: {count} scenes against {printable(c['baseline'])}")
+    grouped = {c["baseline"] for c in figures["comparisons"] if c["group"] != ALL}
+    for c in figures["comparisons"]:
+        is_sum = c["group"] == ALL and c["baseline"] in grouped
+        if c["scenes_without_votes"] and not is_sum:
+            lines.append(f"no votes yet: {c['scenes_without_votes']} scenes against {_name(c)}")
     return lines
 
 
@@ -135,6 +137,12 @@ def markdown_of(report: Mapping[str, Any]) -> str:
 def printable(text: str) -> str:
     """Return a name without line breaks and control characters, which would break a table."""
     return "".join(c if c.isprintable() else repr(c)[1:-1] for c in text)
+
+
+def _name(comparison: Mapping[str, Any]) -> str:
+    """Return what a row is called: the baseline, and the group where it is not all scenes."""
+    baseline, group = comparison["baseline"], comparison["group"]
+    return printable(baseline if group == ALL else f"{baseline}, {group}")
 
 
 def _markdown(text: str) -> str:

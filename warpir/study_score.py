@@ -14,12 +14,10 @@ from typing import Any
 
 from warpir.study_answers import Answer, Sheet
 from warpir.study_key import Study, exclusion_rule
-from warpir.study_plan import Pair
+from warpir.study_plan import ALL, UNGROUPED, Pair
 
 LEVEL = 0.95
 """Of the intervals."""
-ALL = "all"
-"""The group of all scenes."""
 WARNING = (
     "INCLUDES AUTOMATED ANSWERS: a program answered, not a person; these figures are nobody's "
     "opinion."
@@ -174,7 +172,7 @@ def _groups(pairs: Mapping[int, Pair]) -> list[tuple[str, str, list[int]]]:
     for baseline in dict.fromkeys(pair.baseline for pair in pairs.values()):
         own = [(group, ks) for (name, group), ks in chosen.items() if name == baseline]
         if len(own) > 1:
-            table += [(baseline, group or "no group", ks) for group, ks in own]
+            table += [(baseline, group or UNGROUPED, ks) for group, ks in own]
         table.append((baseline, ALL, sorted(k for _, ks in own for k in ks)))
     return table
 

@@ -27,7 +27,10 @@ TYPES = {".html": "text/html; charset=utf-8", ".png": "image/png"}
 MOST_BYTES_PER_TRIAL = 500
 """Of a file of answers; a page sends some 100."""
 SECONDS = 30
-"""After which a request that does not arrive is given up."""
+"""After which a request that does not arrive, or a part of an answer that is not taken, is given
+up."""
+PART = 1 << 16
+"""Bytes of an answer that are sent at a time: a whole picture takes a slow line minutes."""
 HEADERS = {
     "X-Content-Type-Options": "nosniff",
     "Referrer-Policy": "no-referrer",
@@ -109,14 +112,17 @@ class StudyServer(ThreadingHTTPServer):
     def is_named(self, host: str) -> bool:
         """Return whether a ``Host`` header names this server, as no page from elsewhere can."""
         bound, port = str(self.server_address[0]), self.server_address[1]
+        names = (bound, self.name.lower(), "localhost")
         if is_loopback(bound):
-            return host in (f"{name}:{port}" for name in (bound, "localhost"))
+            # Browsers leave out the port that is HTTP's own.
+            ports = ("", ":80") if port == 80 else (f":{port}",)
+            return host.lower() in (name + end for name in names for end in ports)
         # Another machine may pass on what comes to its own address and port.
         try:
             name = urlsplit(f"//{host}").hostname or ""
         except ValueError:  # half a bracket
             return False
-        return name in (self.name.lower(), "localhost") or _is_address(name)
+        return name in names or _is_address(name)
 
 
 class _Handler(BaseHTTPRequestHandler):
@@ -193,7 +199,8 @@ class _Handler(BaseHTTPRequestHandler):
             self.send_header("Connection", "close")
         self.end_headers()
         if with_body:
-            self.wfile.write(content)
+            for start in range(0, len(content), PART):
+                self.wfile.write(content[start : start + PART])
 
     def log_message(self, format: str, *args: object) -> None:
         pass
@@ -201,7 +208,7 @@ class _Handler(BaseHTTPRequestHandler):
 
 def is_loopback(host: str) -> bool:
     """Return whether only this machine reaches an address."""
-    return host.startswith("127.") or host == "localhost"
+    return host.startswith("127.")
 
 
 def _is_address(name: str) -> bool:

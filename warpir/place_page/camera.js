@@ -4,6 +4,7 @@
 
 const RADIANS = Math.PI / 180;
 export const STEEPEST = 89;
+const steep = (pitch) => Math.min(Math.max(pitch, -STEEPEST), STEEPEST);
 
 // Camera to ground frame, rows of turn_y(heading) turn_x(pitch) turn_z(roll).
 export function rotation(stance) {
@@ -66,25 +67,34 @@ export function groundPoint(camera, stance, u, v) {
 // Row of the horizon in a column: level directions d fulfil d.y = 0, with the second row of the
 // rotation sin(roll) X - cos(roll) Y + tan(pitch) = 0 in X = (u - cx) / fx, Y = (v - cy) / fy.
 export function horizonRow(camera, stance, u) {
-  const [p, r] = [stance.pitch * RADIANS, stance.roll * RADIANS];
+  const [p, r] = [steep(stance.pitch) * RADIANS, stance.roll * RADIANS];
   const x = (u - camera.cx) / camera.fx;
   return camera.cy + camera.fy * (Math.tan(p) / Math.cos(r) + Math.tan(r) * x);
 }
 
-// Pitch and roll of a camera that sees the horizon through two pixels, the left one first.
-export function levelled(camera, stance, left, right) {
-  const [x0, x1] = [left, right].map(([u]) => (u - camera.cx) / camera.fx);
-  const [y0, y1] = [left, right].map(([, v]) => (v - camera.cy) / camera.fy);
+// Pitch and roll of a camera that sees the horizon through two pixels. Two cameras do, one of them
+// upside down (roll + 180, -pitch): the one that is nearer to how it stood.
+export function levelled(camera, stance, one, other) {
+  const [x0, x1] = [one, other].map(([u]) => (u - camera.cx) / camera.fx);
+  const [y0, y1] = [one, other].map(([, v]) => (v - camera.cy) / camera.fy);
   const roll = Math.atan2(y1 - y0, x1 - x0);
   const pitch = Math.atan(Math.cos(roll) * y0 - Math.sin(roll) * x0);
-  return { ...stance, pitch: pitch / RADIANS, roll: roll / RADIANS };
+  const isOver = Math.cos(roll - stance.roll * RADIANS) < 0;
+  const [tilt, sign] = isOver ? [roll - Math.PI * Math.sign(roll || -1), -1] : [roll, 1];
+  return { ...stance, pitch: steep((sign * pitch) / RADIANS), roll: tilt / RADIANS };
+}
+
+// The horizon by some rows lower: what adds to its row adds to tan(pitch).
+export function lowered(camera, stance, rows) {
+  const rise = (Math.cos(stance.roll * RADIANS) * rows) / camera.fy;
+  const pitch = Math.atan(Math.tan(steep(stance.pitch) * RADIANS) + rise);
+  return { ...stance, pitch: steep(pitch / RADIANS) };
 }
 
 // Another field of view that leaves the horizon where it is in the photo.
 export function zoomed(camera, stance, fx) {
-  const changed = { ...camera, fx, fy: (camera.fy * fx) / camera.fx };
-  const ends = [0, camera.width].map((u) => [u, horizonRow(camera, stance, u)]);
-  return { camera: changed, stance: levelled(changed, stance, ...ends) };
+  const pitch = Math.atan((Math.tan(stance.pitch * RADIANS) * camera.fx) / fx) / RADIANS;
+  return { camera: { ...camera, fx, fy: (camera.fy * fx) / camera.fx }, stance: { ...stance, pitch } };
 }
 
 // Horizontal field of view [deg], as --fov means it, and back.

@@ -1,9 +1,10 @@
 // What is dragged over the photo: horizon, ring, size, foot. Positions are pixels of the stage.
 
-import { corners, groundPoint, horizonRow, levelled, placed, project, zoomed } from './camera.js';
+import { corners, groundPoint, horizonRow, levelled, lowered, placed, project, zoomed } from './camera.js';
 
 const SVG = 'http://www.w3.org/2000/svg';
 const RIM = 14; // handles stay this far inside the stage
+const APART = 26; // between the middles of an object's knobs
 const LEAST_RING = 44; // radius on the screen, however small the object is
 const FARTHEST = 400; // camera heights
 const ICONS = {
@@ -26,6 +27,19 @@ function make(tag, attributes, parent) {
   return element;
 }
 
+// A knob beside another: farther out where it would lie on it.
+function outside([x, y], [u, v]) {
+  const away = Math.hypot(x - u, y - v);
+  if (away >= APART) return [x, y];
+  return away ? [u + ((x - u) * APART) / away, v + ((y - v) * APART) / away] : [u, v + APART];
+}
+
+// A knob above another: higher up where it would lie on it.
+function above([x, y], [u, v]) {
+  const clear = Math.sqrt(Math.max(APART ** 2 - (x - u) ** 2, 0));
+  return [x, Math.abs(y - v) < clear ? v - clear : y];
+}
+
 // The same with the camera changed: what stood at a pixel of the ground goes on standing there.
 export function withCamera(before, camera, stance) {
   const foot = project(before.camera, before.stance, [before.stand.x, 0, before.stand.z]);
@@ -42,14 +56,30 @@ export function stoodAt(before, u, v) {
   return { ...before, stand: { x: point[0], z: point[1] } };
 }
 
-export const shifted = (before, rows) => {
-  const { camera, stance } = before;
-  const ends = [0, camera.width].map((u) => [u, horizonRow(camera, stance, u) + rows]);
-  return withCamera(before, camera, levelled(camera, stance, ...ends));
-};
+export const shifted = (before, rows) => withCamera(before, before.camera, lowered(before.camera, before.stance, rows));
+
+// Let an element follow the pointer that was pressed on it; returns whether it does. Other buttons
+// do nothing, nor do other fingers while a gesture goes on.
+export function follow(element, pressed, gesture, name, moved) {
+  if (pressed.button !== 0 || gesture.isOn) return false;
+  element.setPointerCapture(pressed.pointerId);
+  gesture.begin(name);
+  const move = (event) => {
+    if (event.pointerId === pressed.pointerId) moved(event);
+  };
+  const end = (event) => {
+    if (event.pointerId !== pressed.pointerId) return;
+    element.removeEventListener('pointermove', move);
+    for (const kind of ['pointerup', 'pointercancel']) element.removeEventListener(kind, end);
+    gesture.end();
+  };
+  element.addEventListener('pointermove', move);
+  for (const kind of ['pointerup', 'pointercancel']) element.addEventListener(kind, end);
+  return true;
+}
 
 export class Handles {
-  // `gesture` has begin(), move(change from the state at its beginning), end().
+  // `gesture` has begin(), move(change from the state at its beginning), end(), isOn.
   constructor(svg, stage, box, gesture) {
     Object.assign(this, { svg, stage, box, gesture });
     this.horizon = this.#line('horizon', 2);
@@ -86,31 +116,19 @@ export class Handles {
   // Let an element be dragged: the state at the beginning and both pointers give the new one.
   #drags(element, name) {
     element.addEventListener('pointerdown', (event) => {
-      if (event.button !== 0) return;
+      if (!this.drag(event, element, name)) return;
       event.preventDefault();
       event.stopPropagation();
-      this.drag(event, element, name);
       if (element.tabIndex >= 0) element.focus({ focusVisible: false });
     });
   }
 
   drag(event, element, name) {
     const from = this.#pixel(event);
-    element.setPointerCapture(event.pointerId);
-    this.gesture.begin(name);
-    const move = (moved) => {
-      if (moved.pointerId !== event.pointerId) return;
+    return follow(element, event, this.gesture, name, (moved) => {
       const to = this.#pixel(moved);
       this.gesture.move((before) => this.#dragged(name, before, from, to));
-    };
-    const end = (ended) => {
-      if (ended.pointerId !== event.pointerId) return;
-      element.removeEventListener('pointermove', move);
-      for (const kind of ['pointerup', 'pointercancel']) element.removeEventListener(kind, end);
-      this.gesture.end();
-    };
-    element.addEventListener('pointermove', move);
-    for (const kind of ['pointerup', 'pointercancel']) element.addEventListener(kind, end);
+    });
   }
 
   #pixel(event) {
@@ -127,7 +145,6 @@ export class Handles {
       // The middle of the horizon stays; this end follows the pointer.
       const [row, middle] = [horizonRow(camera, stance, from[0]), camera.width / 2];
       const ends = [[middle, horizonRow(camera, stance, middle)], [from[0], row + dv]];
-      if (name === 'tilt') ends.reverse();
       return withCamera(before, camera, levelled(camera, stance, ...ends));
     }
     if (name === 'fov') {
@@ -186,12 +203,11 @@ export class Handles {
 
     const at = corners(this.box, placed(this.box, stand, turn, size)).map((p) => project(camera, stance, p));
     const isWhole = at.every(Boolean);
-    this.bounds = isWhole && [
+    this.bounds = isWhole ? [
       Math.min(...at.map((p) => p[0])), Math.min(...at.map((p) => p[1])),
       Math.max(...at.map((p) => p[0])), Math.max(...at.map((p) => p[1])),
-    ];
+    ] : null;
     const foot = project(camera, stance, [stand.x, 0, stand.z]);
-    put('foot', onStage(foot));
     const away = Math.hypot(stand.x - stance.x, stance.height, stand.z - stance.z);
     const side = Math.max(...this.box.high.map((top, k) => top - this.box.low[k]));
     const across = Math.hypot(this.box.high[0] - this.box.low[0], this.box.high[2] - this.box.low[2]);
@@ -201,9 +217,15 @@ export class Handles {
     ]);
     const ring = Array.from({ length: 73 }, (_, k) => onStage(round((k * Math.PI) / 36)));
     draw(this.ring, ring.every(Boolean) ? `M${ring.join('L')}Z` : '');
-    put('turn', onStage(round((turn * Math.PI) / 180)));
     const top = this.bounds ? [(this.bounds[0] + this.bounds[2]) / 2, this.bounds[1]] : foot;
-    put('size', top && onStage(top).map((part, k) => part - 30 * k));
+    const [footAt, onRing, topAt] = [foot, round((turn * Math.PI) / 180), top].map(onStage);
+    const asideAt = footAt && onRing && outside(onRing, footAt);
+    // Above the horizon it could not be dragged.
+    const turnAt = asideAt && groundPoint(camera, stance, ...asideAt.map((part) => part / this.scale)) ? asideAt : onRing;
+    const lowestFirst = [footAt, turnAt].filter(Boolean).sort((a, b) => b[1] - a[1]);
+    put('foot', footAt);
+    put('turn', turnAt);
+    put('size', topAt && lowestFirst.reduce(above, [topAt[0], topAt[1] - 30]));
   }
 
   // What each handle stands at, for those who do not see it.

@@ -1,14 +1,13 @@
 // The page: one state, changed by handles, keys and fields, drawn by the stage, saved by warpir.
 
-import { fieldOfView, focalLength, project, sunAxis, zoomed } from './camera.js';
-import { Handles, shifted, stoodAt, withCamera } from './handles.js';
+import { fieldOfView, focalLength, project, STEEPEST, sunAxis, zoomed } from './camera.js';
+import { follow, Handles, shifted, stoodAt, withCamera } from './handles.js';
 import { Stage } from './stage.js';
 
 const $ = (id) => document.getElementById(id);
 const LUMINANCE = [0.2126, 0.7152, 0.0722];
 const FILM_DIAGONAL = 43.267; // of 36 x 24 mm
 const PAUSE = 600; // ms between two keys that undo takes back one by one
-const STEEPEST = 89;
 
 const dot = (a, b) => a.reduce((sum, part, k) => sum + part * b[k], 0);
 const clamp = (x, low, high) => Math.min(Math.max(x, low), high);
@@ -16,25 +15,26 @@ const wrapped = (angle) => ((((angle + 180) % 360) + 360) % 360) - 180;
 const plain = (x, digits) => Number(x.toFixed(digits));
 
 const start = await (await fetch('start.json')).json();
+const radianceOf = (light) => (light.sky === 'custom' ? light.custom : start.sky_radiance[light.sky]);
+// A sun's strength counts in what the sky gives on the ground; under a black one as --sun has it.
+const sunUnit = (light) => Math.PI * dot(radianceOf(light), LUMINANCE) || 1;
 export const stage = new Stage($('canvas'));
 export let state = opening(start);
 const history = { past: [], future: [], before: null, name: '', last: 0 };
 
-function opening({ camera, stance, stand, rotate_y: turn, size, sun, sky, keeps_light: isKept, sky_radiance: radiance, sun_to_sky: usual }) {
+function opening({ camera, stance, stand, rotate_y: turn, size, sun, sky, keeps_light: isKept, sun_to_sky: usual }) {
   const custom = Array.isArray(sky) ? sky : null;
-  const even = Math.PI * dot(custom ?? radiance[sky], LUMINANCE);
-  return {
-    camera, stance, stand, turn, size,
-    light: {
-      azimuth: sun[0], elevation: sun[1], sky: custom ? 'custom' : sky, custom, skyStrength: 1,
-      sunStrength: sun[2] === null ? usual : sun[2] / even, isKept,
-    },
-  };
+  const light = { azimuth: sun[0], elevation: sun[1], sky: custom ? 'custom' : sky, custom, skyStrength: 1, isKept };
+  const sunStrength = sun[2] === null ? usual : sun[2] / sunUnit(light);
+  return { camera, stance, stand, turn, size, light: { ...light, sunStrength } };
 }
 
 // ---------------------------------------------------------------- changes, and taking them back
 
 const gesture = {
+  get isOn() {
+    return history.before !== null;
+  },
   begin(name) {
     // Keys that follow each other, and a field that is dragged, are one step.
     const isSame = name === history.name && performance.now() - history.last < PAUSE;
@@ -120,17 +120,15 @@ function groundLevel({ camera, stance, stand, size }) {
 // Sun and sky as warpir/lighting.py makes them of --sun and --sky, at its automatic exposure.
 function lightOf(current) {
   const { light } = current;
-  const radiance = (light.custom && light.sky === 'custom' ? light.custom : start.sky_radiance[light.sky])
-    .map((part) => part * light.skyStrength);
+  const radiance = radianceOf(light).map((part) => part * light.skyStrength);
   const color = start.sun_color[light.sky] ?? start.sun_color.clear;
   const brightness = dot(color, LUMINANCE);
-  const even = (Math.PI * dot(radiance, LUMINANCE)) / light.skyStrength;
-  const sun = color.map((part) => (light.sunStrength * even * part) / brightness);
+  const sun = color.map((part) => (light.sunStrength * sunUnit(light) * part) / brightness);
   const world = sunAxis(light.azimuth, light.elevation);
   const rows = start.ground_to_world;
   const axis = [0, 1, 2].map((k) => rows[0][k] * world[0] + rows[1][k] * world[1] + rows[2][k] * world[2]);
   const fromSun = dot(sun, LUMINANCE) * Math.max(axis[1], 0);
-  const total = Math.PI * dot(radiance, LUMINANCE) + fromSun;
+  const total = Math.PI * dot(radiance, LUMINANCE) + fromSun || 1; // of no light there are no shares
   const gain = (groundLevel(current) * Math.PI) / (start.ground_albedo * total);
   const bounce = [0, 1, 2].map((k) =>
     (start.ground_albedo / Math.PI) * (Math.PI * radiance[k] + sun[k] * Math.max(world[1], 0)));
@@ -286,23 +284,16 @@ function shape(tag, attributes) {
 }
 
 dial.addEventListener('pointerdown', (event) => {
-  dial.setPointerCapture(event.pointerId);
-  const point = (moved) => {
-    const box = dial.getBoundingClientRect();
-    const [x, y] = [((moved.clientX - box.left) / box.width) * 120 - 60, ((moved.clientY - box.top) / box.height) * 120 - 60];
-    const azimuth = wrapped((Math.atan2(x, -y) * 180) / Math.PI - state.stance.heading);
-    const elevation = 90 * (1 - Math.min(Math.hypot(x, y) / RADIUS, 1));
-    gesture.move((before) => ({ ...before, light: { ...before.light, isKept: true, azimuth, elevation } }));
-  };
-  const end = () => {
-    dial.removeEventListener('pointermove', point);
-    gesture.end();
-  };
-  gesture.begin('dial');
-  point(event);
-  dial.addEventListener('pointermove', point);
-  for (const kind of ['pointerup', 'pointercancel']) dial.addEventListener(kind, end, { once: true });
+  if (follow(dial, event, gesture, 'dial', pointSun)) pointSun(event);
 });
+
+function pointSun({ clientX, clientY }) {
+  const box = dial.getBoundingClientRect();
+  const [x, y] = [((clientX - box.left) / box.width) * 120 - 60, ((clientY - box.top) / box.height) * 120 - 60];
+  const azimuth = wrapped((Math.atan2(x, -y) * 180) / Math.PI - state.stance.heading);
+  const elevation = 90 * (1 - Math.min(Math.hypot(x, y) / RADIUS, 1));
+  gesture.move((before) => ({ ...before, light: { ...before.light, isKept: true, azimuth, elevation } }));
+}
 
 function showDial() {
   const angle = ((state.light.azimuth + state.stance.heading) * Math.PI) / 180;
@@ -318,8 +309,7 @@ let isDue = false;
 const handles = new Handles($('handles'), $('stage'), start.asset, gesture);
 
 function show(next) {
-  const stance = { ...next.stance, pitch: clamp(next.stance.pitch, -STEEPEST, STEEPEST) };
-  state = { ...next, stance };
+  state = next;
   draw();
 }
 
@@ -370,7 +360,7 @@ function fit() {
 
 const canvas = $('canvas');
 canvas.addEventListener('pointerdown', (event) => {
-  if (event.button === 0 && handles.isOnObject(event)) handles.drag(event, canvas, 'foot');
+  if (handles.isOnObject(event)) handles.drag(event, canvas, 'foot');
 });
 canvas.addEventListener('pointermove', (event) => canvas.classList.toggle('grabs', Boolean(handles.isOnObject(event))));
 canvas.addEventListener('dblclick', (event) => {
@@ -402,11 +392,9 @@ const KEYS = {
   '-': (by) => sized(1.03 ** -by), _: (by) => sized(1.03 ** -by), w: (by) => lifted(-0.01 * by), s: (by) => lifted(0.01 * by),
   a: (by) => tilted(0.5 * by), d: (by) => tilted(-0.5 * by),
 };
-// A handle that has the focus gives the arrows its own meaning.
-const ON_HANDLE = {
-  pitch: { arrowup: 'w', arrowdown: 's' }, roll: { arrowup: 'a', arrowdown: 'd' }, tilt: { arrowup: 'd', arrowdown: 'a' },
-  turn: { arrowleft: 'e', arrowright: 'q', arrowup: 'q', arrowdown: 'e' }, size: { arrowup: '+', arrowdown: '-', arrowright: '+', arrowleft: '-' },
-};
+// A handle that has the focus gives the arrows its own meaning, right that of up and left of down.
+const ON_HANDLE = { pitch: ['w', 's'], roll: ['a', 'd'], tilt: ['d', 'a'], turn: ['q', 'e'], size: ['+', '-'] };
+const UP_DOWN = { arrowup: 0, arrowright: 0, arrowdown: 1, arrowleft: 1 };
 
 window.addEventListener('keydown', (event) => {
   const key = event.key.toLowerCase();
@@ -428,7 +416,7 @@ window.addEventListener('keydown', (event) => {
   } else if (key === 'g') {
     $('guides').click();
   } else {
-    const change = KEYS[ON_HANDLE[handle]?.[key] ?? key];
+    const change = KEYS[ON_HANDLE[handle]?.[UP_DOWN[key]] ?? key];
     if (!change) return;
     once(`key ${key}`, change(by));
   }
@@ -460,8 +448,7 @@ $('copy').addEventListener('click', async () => {
 // What warpir/placing.py reads. Only the proportion of sun and sky counts: the exposure follows.
 function spokenPlacement({ camera, stance, stand, turn, size, light }) {
   const custom = light.sky === 'custom' ? light.custom : null;
-  const even = Math.PI * dot(custom ?? start.sky_radiance[light.sky], LUMINANCE);
-  const strength = (light.sunStrength * even) / light.skyStrength;
+  const strength = (light.sunStrength * sunUnit(light)) / light.skyStrength;
   const isSunny = light.isKept && strength > 0;
   return {
     fx: camera.fx, fy: camera.fy, stance, stand, rotate_y: wrapped(turn), size,
