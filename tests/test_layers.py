@@ -14,9 +14,9 @@ LEVELS = (
     {
         "errors", "signals", "color", "acceptance",
         "contact_sheet", "evaluation_report", "photo_look", "training_batches", "study_plan",
-        "study_report", "page_policy",
+        "page_policy",
     },
-    {"limits", "atomic", "caches"},
+    {"limits", "atomic", "caches", "study_report"},
     {
         "optimize_settings", "asset", "strict_json", "image_errors", "lpips", "image_decoder",
         "lens", "colmap_model", "memory", "bad_pixels", "determinism",

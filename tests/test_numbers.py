@@ -577,5 +577,5 @@ def test_guided_run_counts_bad_steps(
     assert "kept:" in captured.out and not (out / "run.json").exists()
     (manifest,) = (out / "checkpoints").glob("*-optimize-5/manifest.json")
     state = Checkpoints(out, json.loads(manifest.read_text())["identity"]).load(print).state
-    assert all(bool(v.isfinite().all()) for v in state["unknowns"].values())
-    assert state["state"]["rate_share"] == BACK_OFF**4
+    assert all(bool(v.isfinite().all()) for v in state["loop"]["unknowns"].values())
+    assert state["loop"]["state"]["rate_share"] == BACK_OFF**4
