@@ -27,7 +27,7 @@ from tests.test_insert import arguments, write_inputs
 from warpir.errors import ExitCode
 
 FORMATS = {form.name: form for form in formats()}
-QUICK, LONG = 20, 200
+QUICK, LONG = 20, 120
 """Damaged files of each format."""
 
 
