@@ -321,13 +321,13 @@ def halves(preview: NDArray[np.uint8]) -> tuple[NDArray[np.int64], NDArray[np.in
 
 @pytest.mark.parametrize("is_reinhard", [True, False], ids=["reinhard", "linear"])
 def test_balls_under_constant_light_are_flat_discs(is_reinhard: bool) -> None:
-    """A mirror and a white matte ball both show the radiance itself, the same in every pixel."""
+    """A mirror ball shows the radiance itself, a matte one 18 % of it, the same in every pixel."""
     preview = balls(constant((0.5, 0.25, 0.75), 64), VIEW, is_reinhard)
     assert preview.shape == (192, 384, 3) and preview.dtype == np.uint8
     radiance = np.array([0.5, 0.25, 0.75])
-    shown = reinhard(radiance) if is_reinhard else radiance
-    expected = np.round(encode(shown) * 255.0)
-    for ball in halves(preview):
+    for ball, reflectance in zip(halves(preview), (1.0, 0.18), strict=True):
+        seen = reflectance * radiance
+        expected = np.round(encode(reinhard(seen) if is_reinhard else seen) * 255.0)
         middle = ball[60:130, 60:130]
         # The diffuse ball sums 32 rows of texels: a percent of ripple.
         assert np.abs(middle - expected).max() <= 2
@@ -360,7 +360,7 @@ def test_balls_turn_with_the_camera() -> None:
     mirror, matte = halves(balls(light, down, True))
     for ball in (mirror, matte):
         y, x = np.mgrid[:192, :192]
-        lit = luminance(ball) > 150
+        lit = luminance(ball) > 0.9 * luminance(ball).max()
         assert abs(x[lit].mean() - 95.5) < 2 and abs(y[lit].mean() - 95.5) < 2
 
 

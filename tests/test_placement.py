@@ -165,7 +165,7 @@ def test_placement_tells_distance_size_and_pixels() -> None:
     placed = place_asset(low, high, camera, place=(0.0, 0.0, -4.0), scale=2.0)
     # 400 px of focal length: 4 m at a distance of 4 m is 400 px wide, its foot 300 px below the eye
     assert placed.summary == (
-        "the object of 4 x 2 x 0 m stands 5 m from the camera, in columns 200 to 600, "
+        "the object of 4 x 2 x 0 m stands 5 m from the camera, its box in columns 200 to 600, "
         "rows 400 to 600"
     )
 

@@ -517,7 +517,7 @@ def chosen_rows(text: str | None, has_predictions: bool, is_guided: bool = True)
         for word in (w.strip() for w in text.split(",")):
             found = {k for k, row in ROWS.items() if word in (k, row.group, "all")}
             if not found:
-                known = ", ".join((*GROUPS, *ROWS))
+                known = ", ".join(dict.fromkeys((*GROUPS, *ROWS)))
                 raise usage("--rows", f"no row {word!a}", f"known: all, {known}")
             names |= found
         if not has_predictions and text != "all" and "predictions" in names:

@@ -535,7 +535,7 @@ def _write(
         "balls.png",
         pair,
         mark=False,
-        description="Mirror ball and white diffuse ball under the light",
+        description="Mirror ball and grey diffuse ball under the light",
     )
     handed: dict[str, Any] = {}
     if config.hand_off:

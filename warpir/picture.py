@@ -24,6 +24,8 @@ Float64Array = NDArray[np.float64]
 
 PLACE_WIDTH = 1024
 """Most columns of the photo that sends light back into the scene [px]."""
+GREY_BALL = 0.18
+"""Reflectance of the matte ball in ``balls.png``."""
 SLIVER = 1e-4
 """Share of a pixel [1] below which the object's surface is not described there."""
 
@@ -321,7 +323,9 @@ def resize(plane: FloatArray, height: int, width: int) -> FloatArray:
 
 
 def balls(light: Light, camera: Camera, is_reinhard: bool, size: int = 192) -> NDArray[np.uint8]:
-    """Return a mirror ball and a white diffuse ball under the light, as the camera sees them.
+    """Return a mirror ball and a grey diffuse ball under the light, as the camera sees them.
+
+    As on a film set: `GREY_BALL` keeps the lit side of a sunny light below the photo's white.
 
     Args:
         light: At the photo's exposure.
@@ -350,10 +354,11 @@ def balls(light: Light, camera: Camera, is_reinhard: bool, size: int = 192) -> N
     toward = map_directions(32, 64).reshape(-1, 3).T
     # One row at a time: the cosines of all pixels with all texels would take gigabytes.
     diffuse = np.stack([np.maximum(row @ toward, 0.0) @ weighted / np.pi for row in normal])
+    diffuse *= GREY_BALL
     pair = []
     for ball in (mirror, diffuse):
         shown = ball / (1.0 + ball) if is_reinhard else np.minimum(ball, 1.0)
-        shown = np.where(inside[..., None], shown, 0.18)
+        shown = np.where(inside[..., None], shown, 0.03)
         pair.append(linear_to_gamma(shown))
     return np.round(np.concatenate(pair, axis=1) * 255.0).astype(np.uint8)
 

@@ -117,10 +117,10 @@ def place_asset(
     asset_to_world[:3, :3] = scale * rotation
     asset_to_world[:3, 3] = stand - scale * (rotation @ foot)
 
-    seen, cut = _check_in_view(where, _corners(low, high), asset_to_world, camera)
+    shown = " x ".join(f"{scale * side:.3g}" for side in sides)
+    seen, cut = _check_in_view(where, shown, _corners(low, high), asset_to_world, camera)
     warnings += cut
     away = float(np.linalg.norm(stand - origin))
-    shown = " x ".join(f"{scale * side:.3g}" for side in sides)
     summary = f"the object of {shown} m stands {away:.3g} m from the camera, {seen}"
     return Placement(asset_to_world, plane, tuple(assumed), tuple(warnings), summary)
 
@@ -240,7 +240,7 @@ def _corners(low: Float64Array, high: Float64Array) -> Float64Array:
 
 
 def _check_in_view(
-    where: str, corners: Float64Array, asset_to_world: Float64Array, camera: Camera
+    where: str, size: str, corners: Float64Array, asset_to_world: Float64Array, camera: Camera
 ) -> tuple[str, list[str]]:
     """Refuse an object that the camera cannot see; return where in the photo it is, and warnings.
 
@@ -248,7 +248,11 @@ def _check_in_view(
     """
     eye = np.linalg.solve(asset_to_world, camera.c2w[:, 3])[:3]
     if np.all((eye > corners[0]) & (eye < corners[-1])):
-        raise InputError(where, "the camera is inside the object", "move it away, or use --size")
+        raise InputError(
+            where,
+            f"the camera is inside the object of {size} m",
+            "move it away, or use --size or --scale (.01 for centimetres)",
+        )
     pixels = camera.project(corners @ asset_to_world[:3, :3].T + asset_to_world[:3, 3])
     seen = pixels[np.isfinite(pixels).all(axis=1)]
     if len(seen) == 0:
@@ -261,5 +265,5 @@ def _check_in_view(
     if right <= 0.0 or bottom <= 0.0 or left >= camera.width or top >= camera.height:
         raise InputError(where, f"the object is outside the photo ({box}; {frame})")
     if left < 0.0 or top < 0.0 or right > camera.width or bottom > camera.height:
-        return f"in {box}", [f"the object may be cut by the photo's edge ({box}; {frame})"]
-    return f"in {box}", []
+        return f"its box in {box}", [f"the object may be cut by the photo's edge ({box}; {frame})"]
+    return f"its box in {box}", []

@@ -75,6 +75,8 @@ CLOCK, END = "<!--clock-->", "<!--/clock-->"
 memory."""
 MADE_BY = b'<meta name="generator" content="warpir '
 """By which a page of ours is known; it stands within its first 4096 bytes."""
+LEAST_PHOTO = 8.0
+"""Share of the picture that the slider at first leaves to the photo [%]."""
 OPEN_END = 1e-3
 """How far a tone curve's knots may be from the diagonal to count as the identity [1]."""
 
@@ -294,7 +296,10 @@ def _result(results: Results) -> str:
     if layers is None:
         return ""
     views = [("view-whole", "Whole picture", before_and_after(layers))]
+    start = 50.0
     if (box := object_box(layers)) is not None:
+        # At first all of the object is seen, and beside it the photo as it was.
+        start = max(100.0 * box[0] / layers.matte.shape[1], LEAST_PHOTO)
         views.append(("view-object", "The object", before_and_after(layers, box)))
     shown = []
     for at, name, (before, after) in views:
@@ -312,7 +317,7 @@ def _result(results: Results) -> str:
         size += f", here averaged to {small.width} × {small.height}"
     range_ = (
         '<div class="slide"><label for="cut">Photo or result</label><input type="range" id="cut" '
-        'min="0" max="100" step="0.5" value="50"></div>'
+        f'min="0" max="100" step="0.5" value="{start:.1f}"></div>'
     )
     note = "" if (layers.matte > 0.0).any() else " The object is not seen in the photo."
     caption = f'<p class="note">{escape(size + "." + note)} Full size: composite.png.</p>'
@@ -355,9 +360,9 @@ def _light(results: Results) -> str:
     balls = ""
     if results.balls is not None:
         balls = (
-            f'<figure class="balls">{_img(jpeg(results.balls), "A mirror ball and a white ball")}'
-            "<figcaption>A mirror ball and a white, matt ball under the light on the object, as "
-            "the camera sees them.</figcaption></figure>"
+            f'<figure class="balls">{_img(jpeg(results.balls), "A mirror ball and a grey ball")}'
+            "<figcaption>A mirror ball and a matt ball of 18 % grey under the light on the object, "
+            "as the camera sees them.</figcaption></figure>"
         )
     words = _light_words(results)
     below = f'<div class="two">{words}{balls}</div>' if balls and words else words + balls
@@ -566,7 +571,7 @@ def _again(config: InsertConfig) -> str:
     exact = " ".join(["python -m warpir.insert --config run.json", *by_hand, "--out OUT"])
     return section(
         "The same again",
-        "<p>Where the run was started, with the run.json that lies beside this page:</p>",
+        "<p>Where the run was started, by the path of the run.json that lies beside this page:</p>",
         f"<pre><code>{exact}</code></pre>",
         "<p>Or with flags, in a folder that holds the input files:</p>",
         f"<pre><code>{escape(command_line(config))}</code></pre>",

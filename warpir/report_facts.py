@@ -49,7 +49,7 @@ ABOUT_FILES = (
     ("tone_curve_object.cube", "The object's tone curve as a table for Nuke, Resolve, OCIO"),
     ("tone_curve_shadow.cube", "The shadow's tone curves as a table"),
     ("camera.json", "The camera: --camera reads it back"),
-    ("balls.png", "A mirror ball and a white ball under the light"),
+    ("balls.png", "A mirror ball and a grey ball under the light"),
     ("materials.json", "Every material's factors, before and after: --materials reads them back"),
     ("optimization.json", "Numbers of every step of the optimisation"),
     ("prior.png", "What the model paints, before and after it was adapted to the photo"),
@@ -274,9 +274,9 @@ def figures(record: Mapping[str, Any]) -> Rows:
     rows.append(("integrator", " and ".join(dict.fromkeys(i for i in integrators if i))))
     rows += [
         ("triangles", f"{measured['triangles']:,}"),
-        ("pixels of the object", f"{measured['object_pixels']:,}"),
-        ("pixels whose shadow was traced", f"{measured['shadow_pixels']:,}"),
-        ("pixels that differ from the photo", f"{measured['changed_pixels']:,}"),
+        ("pixels of the object, as rendered", f"{measured['object_pixels']:,}"),
+        ("pixels whose shadow was traced, as rendered", f"{measured['shadow_pixels']:,}"),
+        ("pixels of the picture that differ from the photo", f"{measured['changed_pixels']:,}"),
         ("exposure of the light", f"{measured['exposure_ev']:+.2f} EV"),
     ]
     for key, what in (

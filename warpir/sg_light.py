@@ -48,6 +48,9 @@ class LightBounds:
 class SGLight(torch.nn.Module):
     """One set of lobes, as the optimiser holds it.
 
+    Lobes narrower than the bounds allow are widened at the same peak, so their flux grows;
+    `warpir.recover.widened` widens them at the same flux.
+
     Args:
         lobes: Where to start; amplitudes of 0 start at the least intensity, and colours that the
             bound excludes are drawn toward white at their luminance.
