@@ -520,6 +520,7 @@ def test_obj_under_lobes_writes_them(inputs: Path, tmp_path: Path, device: str) 
     assert (albedo[seen][:, 0] > 4.0 * albedo[seen][:, 1]).all()
 
 
+@pytest.mark.slow
 def test_fit_lobes_reports_its_error(inputs: Path, tmp_path: Path, device: str) -> None:
     """--fit-lobes 8 writes 8 lobes and how well they fit; --no-detail leaves it at that."""
     out = tmp_path / "out"
@@ -582,6 +583,7 @@ def test_without_a_light_the_photo_is_asked(inputs: Path, tmp_path: Path, device
     np.testing.assert_allclose(found[1].amplitude, 2.0 * found[0].amplitude, rtol=1e-6)
 
 
+@pytest.mark.slow
 def test_light_rotate_turns_panorama_and_lobes(inputs: Path, tmp_path: Path, device: str) -> None:
     """--light-rotate moves the brightest direction by that angle, counter-clockwise from above."""
     found = []
@@ -688,6 +690,7 @@ def test_validate_of_a_whole_scene_loads_no_renderer(inputs: Path, tmp_path: Pat
     assert list(tmp_path.iterdir()) == []
 
 
+@pytest.mark.slow
 def test_demo_runs_small(tmp_path: Path, device: str) -> None:
     """--demo at width 64 and one sample writes everything at the photo's size, and replays."""
     out = tmp_path / "demo"

@@ -317,6 +317,7 @@ def test_cameras_expose_and_spoil_within_range() -> None:
     assert 0.001 < float((spoilt - shown).abs().mean()) < 0.1
 
 
+@pytest.mark.slow
 def test_the_prior_is_told_what_the_regressor_says(device: str) -> None:
     """The planes of a level, unturned camera are those of ``Regression.hint``."""
     stock = Stock(make_meshes(12, 3), even(device, 3.0), device)

@@ -519,6 +519,7 @@ def config_of(files: Path, **flags: str | None) -> InsertConfig:
     return parse(arguments(files, files / "out", **{**COMMON, **flags})).config
 
 
+@pytest.mark.slow
 def test_run_with_place_and_mask(files: Path, tmp_path: Path) -> None:
     """The run names both by their hashes, and says what they are and do."""
     flags = {"proxy": str(files / "wall.glb"), "shadow_mask": str(files / "half.png")}

@@ -225,6 +225,7 @@ def test_resume_names_what_changed(
     assert "Traceback" not in error and digest(unfinished) == before
 
 
+@pytest.mark.slow
 def test_resume_without_a_checkpoint_starts_and_says_so(
     folder: Path, finished: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -333,6 +334,7 @@ def test_a_finished_run_is_not_resumed(
     assert digest(finished) == before
 
 
+@pytest.mark.slow
 def test_overwrite_starts_an_unfinished_run_again(
     folder: Path, finished: Path, unfinished: Path
 ) -> None:
@@ -359,6 +361,7 @@ def test_stopped_overwrite_resumes(folder: Path, finished: Path, tmp_path: Path)
     "loss",
     ["sds", "sds-base", "csd", "lds-lora-both", "lds-negative", "dataset-update"],
 )
+@pytest.mark.slow
 def test_every_loss_runs(folder: Path, tmp_path: Path, loss: str) -> None:
     changes = {"loss": loss, "steps": "3", "score_every": "0", "lora_steps": "1"}
     if loss == "lds-negative":

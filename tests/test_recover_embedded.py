@@ -223,6 +223,7 @@ def test_a_loss_without_an_adapter_and_without_the_photo(folder: Path, tmp_path:
     assert len(by_step["gradient"]) == 2 and all(v > 0.0 for v in by_step["gradient"])
 
 
+@pytest.mark.slow
 def test_adapted_to_the_photo(folder: Path, tmp_path: Path) -> None:
     """--personalize trains a LoRA through the same code, and its files are written."""
     out = tmp_path / "out"

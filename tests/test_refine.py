@@ -615,6 +615,7 @@ def refined(folder: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     return out
 
 
+@pytest.mark.slow
 def test_refined_material_is_written_and_rendered(
     folder: Path, refined: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -691,6 +692,7 @@ def test_refinement_judges_with_the_earlier_runs_operator(
     assert json.loads((out / "curves.json").read_text())["tone"] == "linear"
 
 
+@pytest.mark.slow
 def test_stopped_refinement_resumes(folder: Path, refined: Path, tmp_path: Path) -> None:
     """A run that stopped in the loop goes on from its checkpoint to the same bytes."""
     out = tmp_path / "out"
@@ -703,6 +705,7 @@ def test_stopped_refinement_resumes(folder: Path, refined: Path, tmp_path: Path)
         assert digest(out)[name] == digest(refined)[name]
 
 
+@pytest.mark.slow
 def test_emission_refinement_runs(folder: Path, tmp_path: Path) -> None:
     """Under a light that is given; the run says that the ground does not see it."""
     out = tmp_path / "out"

@@ -248,6 +248,7 @@ def test_the_average_follows_with_an_early_ramp(tmp_path: Path) -> None:
 # Learning, stopping, going on
 
 
+@pytest.mark.slow
 def test_it_learns(trained: Path) -> None:
     """A dozen steps on a trivial world; the curve tells it, and the average is what is judged."""
     curve = [json.loads(line) for line in (trained / CURVE).read_text().splitlines()]
