@@ -350,16 +350,24 @@ class Killable:
         return [(float(when), event) for when, event in lines]
 
 
-def guided_argv(inputs: Path) -> list[str]:
-    """Return a cheap run through every stage, but for the name of its folder."""
+def guided_flags(inputs: Path, out: str | Path, **changes: str | None) -> list[str]:
+    """Return a run that the inputs' prior guides, as cheap as can be."""
     from tests.test_insert import arguments
 
-    changes = {name: str(inputs / f"{name}.safetensors") for name in ("prior", "regressor")}
-    changes |= {"lora_steps": "4", "class_images": "2", "class_steps": "2", "personalize": ""}
+    flags: dict[str, str | None] = {
+        name: str(inputs / f"{name}.safetensors") for name in ("prior", "regressor")
+    }
+    flags |= {"guidance_width": "32", "light_height": "16", "object_light_height": "8"}
+    flags |= {"samples": "2", "light": None}
+    return arguments(inputs, out, **{**flags, **changes})
+
+
+def guided_argv(inputs: Path) -> list[str]:
+    """Return a cheap run through every stage, but for the name of its folder."""
+    changes = {"lora_steps": "4", "class_images": "2", "class_steps": "2", "personalize": ""}
     changes |= {"steps": "6", "score_every": "2", "checkpoint_every": "2", "preview_every": "2"}
-    changes |= {"guidance_width": "32", "light_height": "16", "object_light_height": "8"}
-    changes |= {"samples": "2", "no_accept": "", "no_hand_off": "", "device": "cpu"}
-    return arguments(inputs, "out", **changes, light=None)
+    changes |= {"no_accept": "", "no_hand_off": "", "device": "cpu"}
+    return guided_flags(inputs, "out", **changes)
 
 
 def write_guided_inputs(folder: Path) -> None:

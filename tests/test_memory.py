@@ -22,13 +22,12 @@ from PIL import Image
 from tests.faults import run_case, snapshot
 from tests.shapes import camera, ground, placed, sphere
 from tests.test_insert import arguments, write_inputs
+from tests.test_kill import guided_flags, write_guided_inputs
 from tests.test_optimize import SETTINGS, TRACED, a_loop, bent, values
-from tests.test_recover_embedded import NETWORK
 from tests.tiny_stable_diffusion import make_tiny_stable_diffusion
 from warpir import memory as memory_module
 from warpir import samples, transport_rows
 from warpir.asset import Material
-from warpir.diffusion import embedded
 from warpir.diffusion.class_images import make_class_images
 from warpir.diffusion.guidance import Guidance
 from warpir.diffusion.personalize import LoraTraining, initial_lora
@@ -40,7 +39,6 @@ from warpir.errors import ExitCode, InputError
 from warpir.insert import main
 from warpir.light import Light
 from warpir.memory import Memory, Need, free_host, is_shortage
-from warpir.regressor import random_regressor, save_regressor
 from warpir.render import Renderer, light_args
 from warpir.scene import Scene
 from warpir.transport import TransportIntegrator
@@ -557,10 +555,7 @@ def test_lora_step_in_parts_is_the_same(device: str, folder: Path) -> None:
 @pytest.fixture(scope="module")
 def inputs(tmp_path_factory: pytest.TempPathFactory) -> Path:
     made = tmp_path_factory.mktemp("inputs")
-    write_inputs(made)
-    network = embedded.build_network(NETWORK, seed=1)
-    embedded.save_embedded(network, made / "prior.safetensors", {})
-    save_regressor(random_regressor(1), made / "regressor.safetensors", {})
+    write_guided_inputs(made)
     return made
 
 
@@ -641,19 +636,7 @@ def test_short_guided_run_keeps_its_checkpoint(
     """Out of memory in step 3 of 4: exit code 5, and --resume goes on from step 2."""
     monkeypatch.setenv("WARPIR_CACHE", str(tmp_path / "cache"))
     out = tmp_path / "out"
-    flags = arguments(
-        inputs,
-        out,
-        prior=str(inputs / "prior.safetensors"),
-        regressor=str(inputs / "regressor.safetensors"),
-        guidance_width="32",
-        light_height="16",
-        object_light_height="8",
-        steps="4",
-        checkpoint_every="2",
-        samples="2",
-        light=None,
-    )
+    flags = guided_flags(inputs, out, steps="4", checkpoint_every="2")
     calls = [0]
 
     def later(*_: object, **__: object) -> bool:

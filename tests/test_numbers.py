@@ -17,16 +17,15 @@ import warp as wp
 from torch import Tensor
 
 from tests.faults import snapshot
-from tests.test_insert import arguments, write_inputs
+from tests.test_insert import arguments
+from tests.test_kill import guided_flags, write_guided_inputs
 from tests.test_layers import ROOT, sources
 from tests.test_memory import a_scene, sky
 from tests.test_optimize import SETTINGS, Pull, a_loop, bent, values
-from tests.test_recover_embedded import NETWORK
 from tests.tiny_stable_diffusion import make_tiny_stable_diffusion
 from warpir import bad_pixels
 from warpir.bad_pixels import NAMED, BadPixels
 from warpir.checkpoint import Checkpoints
-from warpir.diffusion import embedded
 from warpir.diffusion.class_images import make_class_images
 from warpir.diffusion.guidance import Guidance
 from warpir.diffusion.personalize import BAD_STEPS_MAX as LORA_BAD_STEPS_MAX
@@ -40,7 +39,6 @@ from warpir.insert import main
 from warpir.light_optimization import LightOptimization
 from warpir.optimize import BACK_OFF, BAD_STEPS_MAX, GOOD_STEPS
 from warpir.recover import as_input_errors
-from warpir.regressor import random_regressor, save_regressor
 from warpir.render import Renderer, light_args
 from warpir.tone import Knots
 
@@ -479,10 +477,7 @@ def test_lora_ends_after_five_bad_steps(training: LoraTraining) -> None:
 @pytest.fixture(scope="module")
 def inputs(tmp_path_factory: pytest.TempPathFactory) -> Path:
     made = tmp_path_factory.mktemp("inputs")
-    write_inputs(made)
-    network = embedded.build_network(NETWORK, seed=1)
-    embedded.save_embedded(network, made / "prior.safetensors", {})
-    save_regressor(random_regressor(1), made / "regressor.safetensors", {})
+    write_guided_inputs(made)
     return made
 
 
@@ -553,19 +548,7 @@ def test_guided_run_counts_bad_steps(
 
     monkeypatch.setattr(Guidance, "_gradient", gradient)
     out = tmp_path / "out"
-    flags = arguments(
-        inputs,
-        out,
-        prior=str(inputs / "prior.safetensors"),
-        regressor=str(inputs / "regressor.safetensors"),
-        guidance_width="32",
-        light_height="16",
-        object_light_height="8",
-        steps="7",
-        checkpoint_every="0",
-        samples="2",
-        light=None,
-    )
+    flags = guided_flags(inputs, out, steps="7", checkpoint_every="0")
     assert main([*flags, "--no-accept"]) == status
     captured = capsys.readouterr()
     if status == ExitCode.DONE:
