@@ -18,8 +18,8 @@ import xml.etree.ElementTree as ET
 from pathlib import Path
 from typing import Any
 
-from warpir.asset import load_asset
-from warpir.errors import InputError
+from warpir.core.errors import InputError
+from warpir.io.assets import load_asset
 
 SUFFIXES = (".glb", ".gltf", ".obj", ".ply", ".stl")
 CASES = (*(f"G{k}" for k in range(1, 30)), *(f"M{k}" for k in range(1, 23)))

@@ -17,18 +17,18 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
 
-from warpir.asset import Asset, Material, Primitive
-from warpir.camera import Camera
-from warpir.curves import Curves
-from warpir.detail import HEIGHT, Detail, seen_from, with_detail
-from warpir.evaluation_scenes import PANORAMA_SUFFIXES, Place, Places, Subject, find_files
-from warpir.evaluation_stage import Prediction, Quality, Stage
-from warpir.light import Light, as_map, map_directions, resize_map, texel_solid_angles
-from warpir.lobe_fit import fit_lobes
-from warpir.panorama_crop import look_up
-from warpir.placement import place_asset
-from warpir.regressor import load_regressor, regress
-from warpir.render import choose_device
+from warpir.evaluate.panorama_crop import look_up
+from warpir.evaluate.scenes import PANORAMA_SUFFIXES, Place, Places, Subject, find_files
+from warpir.evaluate.stage import Prediction, Quality, Stage
+from warpir.lighting.detail import HEIGHT, Detail, seen_from, with_detail
+from warpir.lighting.fit import fit_lobes
+from warpir.lighting.regressor import load_regressor, regress
+from warpir.render.renderer import choose_device
+from warpir.scene.asset import Asset, Material, Primitive
+from warpir.scene.camera import Camera
+from warpir.scene.light import Light, as_map, map_directions, resize_map, texel_solid_angles
+from warpir.scene.placement import place_asset
+from warpir.scene.tone_curves import Curves
 
 GROUND = np.array([0.0, 1.0, 0.0, 0.0])
 MATERIALS = {

@@ -13,16 +13,16 @@ from pathlib import Path
 import numpy as np
 
 from benchmarks.measure import context, peak_mib, report
-from warpir.asset import load_asset
-from warpir.camera import camera_from_fov
-from warpir.color import linear_to_gamma
-from warpir.curves import ToneKnots
-from warpir.light import Light
-from warpir.photo_files import Photo, read_envmap
-from warpir.picture import Quality, make_picture
-from warpir.placement import place_asset
-from warpir.render import Renderer, choose_device
-from warpir.scene import Placed, Proxy, Scene
+from warpir.core.color import linear_to_gamma
+from warpir.io.assets import load_asset
+from warpir.io.images.photos import Photo, read_envmap
+from warpir.render.composite import Quality, make_picture
+from warpir.render.device_scene import Placed, Proxy, Scene
+from warpir.render.renderer import Renderer, choose_device
+from warpir.scene.camera import camera_from_fov
+from warpir.scene.light import Light
+from warpir.scene.placement import place_asset
+from warpir.scene.tone_curves import ToneKnots
 
 WIDTH, HEIGHT = 1280, 853
 

@@ -28,17 +28,22 @@ import torch
 import warp as wp
 
 from benchmarks.measure import context, peak_mib
-from tests.tiny_stable_diffusion import END, START, make_tiny_stable_diffusion, write_tokenizer
-from warpir.config import InsertConfig
+from tests.builders.tiny_stable_diffusion import (
+    END,
+    START,
+    make_tiny_stable_diffusion,
+    write_tokenizer,
+)
+from warpir.app.config import InsertConfig
+from warpir.app.record import Timings, versions
+from warpir.core.progress import StepProgress
 from warpir.diffusion.lora_files import initial_lora
 from warpir.diffusion.personalize import LoraTraining
 from warpir.diffusion.prompts import make_prompts
 from warpir.diffusion.stable_diffusion import StableDiffusion, load_stable_diffusion
 from warpir.insert import insert
-from warpir.light_optimization import LightOptimization
-from warpir.progress import StepProgress
-from warpir.record import Timings, versions
-from warpir.render import choose_device
+from warpir.optimize.light import LightOptimization
+from warpir.render.renderer import choose_device
 
 PROMPT = "a small red car"
 TARGETS = {"whole_run_s": 180.0, "peak_gb": 12.0, "rendering_share": 0.10}
@@ -187,10 +192,13 @@ class Watch:
 
         with ExitStack() as stack:
             for name, substitute in (
-                ("warpir.record.Timings", WatchedTimings),
-                ("warpir.progress.StepProgress", WatchedProgress),
-                ("warpir.recover.load_stable_diffusion", kept("prior", load_stable_diffusion)),
-                ("warpir.recover.LightOptimization", kept("loop", LightOptimization)),
+                ("warpir.app.record.Timings", WatchedTimings),
+                ("warpir.core.progress.StepProgress", WatchedProgress),
+                (
+                    "warpir.optimize.recover.load_stable_diffusion",
+                    kept("prior", load_stable_diffusion),
+                ),
+                ("warpir.optimize.recover.LightOptimization", kept("loop", LightOptimization)),
             ):
                 stack.enter_context(mock.patch(name, substitute))
             yield

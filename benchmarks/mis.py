@@ -16,14 +16,15 @@ import trimesh
 from numpy.typing import NDArray
 
 from benchmarks.measure import context, peak_mib, report, seconds
-from warpir.asset import Asset, Material, Primitive, load_asset
-from warpir.camera import camera_from_fov
-from warpir.integrator import LightTensors, MaterialTensors
-from warpir.light import Light, Lobes
-from warpir.mis import IntArray, MisIntegrator
-from warpir.placement import place_asset
-from warpir.render import Renderer, choose_device, light_args
-from warpir.scene import Placed, Proxy, Scene
+from warpir.io.assets import load_asset
+from warpir.render.device_scene import Placed, Proxy, Scene
+from warpir.render.integrator import LightTensors, MaterialTensors
+from warpir.render.mis import IntArray, MisIntegrator
+from warpir.render.renderer import Renderer, choose_device, light_args
+from warpir.scene.asset import Asset, Material, Primitive
+from warpir.scene.camera import camera_from_fov
+from warpir.scene.light import Light, Lobes
+from warpir.scene.placement import place_asset
 
 WIDTH, HEIGHT = 384, 256
 LOBE_COUNT = 32

@@ -1,7 +1,7 @@
 """Write a view into a panorama as a photo whose camera, light and exposure are known.
 
-`warpir.panorama_crop` makes it. With ``--tone linear`` and the exposure that ``light.json`` holds,
-an object is lit and shown exactly as the place itself.
+`warpir.evaluate.panorama_crop` makes it. With ``--tone linear`` and the exposure that
+``light.json`` holds, an object is lit and shown exactly as the place itself.
 """
 
 import argparse
@@ -12,9 +12,9 @@ from typing import Any
 import numpy as np
 from PIL import Image
 
-from warpir.camera import Camera
-from warpir.panorama_crop import crop_camera, crop_radiance, expose
-from warpir.photo_files import read_envmap
+from warpir.evaluate.panorama_crop import crop_camera, crop_radiance, expose
+from warpir.io.images.photos import read_envmap
+from warpir.scene.camera import Camera
 
 
 def write_crop(panorama: Path, camera: Camera, out: Path) -> dict[str, Any]:

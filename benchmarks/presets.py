@@ -6,8 +6,8 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from warpir.asset import Asset
-from warpir.camera import Camera
+from warpir.scene.asset import Asset
+from warpir.scene.camera import Camera
 
 Float64Array = NDArray[np.float64]
 

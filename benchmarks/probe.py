@@ -18,13 +18,13 @@ import torch
 from torch import Tensor
 
 from warpir.diffusion.embedded import EmbeddedPrior, load_embedded, random_embedded
-from warpir.prior_images import Lighting, Mixture, SceneGenerator, Stock
-from warpir.regressor import load_regressor
-from warpir.render import choose_device
-from warpir.train import files_in
-from warpir.training_batches import PriorBatch
-from warpir.training_lights import load_panoramas
-from warpir.training_meshes import make_meshes
+from warpir.lighting.regressor import load_regressor
+from warpir.render.renderer import choose_device
+from warpir.train.batches import PriorBatch
+from warpir.train.command import files_in
+from warpir.train.lights import load_panoramas
+from warpir.train.meshes import make_meshes
+from warpir.train.scenes import Lighting, Mixture, SceneGenerator, Stock
 
 SEED = 2_000_000
 """No training draws these scenes, nor these objects."""

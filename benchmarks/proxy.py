@@ -21,24 +21,25 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
 
-from benchmarks.referee import foreground
-from warpir.asset import Asset, Material, Primitive, Texture, TextureSlot, load_asset
-from warpir.camera import Camera, camera_from_fov
-from warpir.color import linear_to_gamma
-from warpir.curves import Curves, ToneKnots
+from benchmarks.referee.__main__ import foreground
+from tools.demo.make import pixel_directions
+from tools.demo.place import paving_texture
+from tools.demo.sky import seen
+from warpir.core.color import linear_to_gamma
 from warpir.demo import ASSET, LIGHT
-from warpir.demo.make import pixel_directions
-from warpir.demo.place import paving_texture
-from warpir.demo.sky import seen
-from warpir.lamps import lamp_axes
-from warpir.light import Light, angles_from_axis, resize_map, rotate_map
-from warpir.photo_files import Photo, read_envmap
-from warpir.picture import Quality, make_picture, photo_radiance
-from warpir.placement import Placement, place_asset
-from warpir.proxy_mesh import ProxyMesh, first_hit, mesh_of
-from warpir.render import Renderer, choose_device
-from warpir.scene import Placed, Proxy, Scene
-from warpir.shadow_mask import shadow_mask
+from warpir.io.assets import load_asset
+from warpir.io.images.photos import Photo, read_envmap
+from warpir.render.composite import Quality, make_picture, photo_radiance
+from warpir.render.device_scene import Placed, Proxy, Scene
+from warpir.render.renderer import Renderer, choose_device
+from warpir.scene.asset import Asset, Material, Primitive, Texture, TextureSlot
+from warpir.scene.camera import Camera, camera_from_fov
+from warpir.scene.lamps import lamp_axes
+from warpir.scene.light import Light, angles_from_axis, resize_map, rotate_map
+from warpir.scene.placement import Placement, place_asset
+from warpir.scene.receiver import ProxyMesh, first_hit, mesh_of
+from warpir.scene.shadow_mask import shadow_mask
+from warpir.scene.tone_curves import Curves, ToneKnots
 
 FloatArray = NDArray[np.float32]
 IntArray = NDArray[np.int32]

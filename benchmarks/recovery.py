@@ -23,27 +23,28 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from benchmarks.measure import context
-from warpir.asset import Asset, load_asset
-from warpir.bridge import ComposeConstants, compose
-from warpir.color import gamma_to_linear, luminance
-from warpir.integrator import LightTensors
-from warpir.light import (
+from warpir.app.optimize_settings import OptimizeSettings
+from warpir.core.color import gamma_to_linear, luminance
+from warpir.evaluate.panorama_crop import crop_camera, crop_radiance, expose
+from warpir.io.assets import load_asset
+from warpir.io.images.photos import read_envmap
+from warpir.optimize.light import LightOptimization, Unknowns
+from warpir.optimize.view import Frame
+from warpir.render.bridge import ComposeConstants, compose
+from warpir.render.device_scene import Placed, Proxy, Scene
+from warpir.render.integrator import LightTensors
+from warpir.render.mis import MisIntegrator
+from warpir.render.renderer import Renderer, light_args
+from warpir.render.tone_curve import Knots, ToneCurve
+from warpir.scene.asset import Asset
+from warpir.scene.light import (
     Light,
     angles_from_axis,
     map_directions,
     resize_map,
     texel_solid_angles,
 )
-from warpir.light_optimization import LightOptimization, Unknowns
-from warpir.mis import MisIntegrator
-from warpir.optimize_settings import OptimizeSettings
-from warpir.panorama_crop import crop_camera, crop_radiance, expose
-from warpir.photo_files import read_envmap
-from warpir.placement import place_asset
-from warpir.render import Renderer, light_args
-from warpir.scene import Placed, Proxy, Scene
-from warpir.tone import Knots, ToneCurve
-from warpir.view import Frame
+from warpir.scene.placement import place_asset
 
 FloatArray = NDArray[np.float32]
 Float64Array = NDArray[np.float64]

@@ -12,8 +12,7 @@ import numpy as np
 import warp as wp
 
 from benchmarks.measure import context, report, seconds
-from warpir.asset import load_asset
-from warpir.camera import Camera
+from warpir.io.assets import load_asset
 from warpir.kernels.frame import basis, to_world
 from warpir.kernels.rng import hash_pair, pixel_seed, sobol_pair
 from warpir.kernels.sampling import cosine_sample
@@ -26,8 +25,9 @@ from warpir.kernels.trace import (
     visibility,
 )
 from warpir.kernels.types import CameraArgs, MaterialArgs, MeshArgs, TextureArgs
-from warpir.render import Renderer, Rows, choose_device
-from warpir.scene import Placed, Proxy, Scene
+from warpir.render.device_scene import Placed, Proxy, Scene
+from warpir.render.renderer import Renderer, Rows, choose_device
+from warpir.scene.camera import Camera
 
 wp.set_module_options({"enable_backward": False})
 

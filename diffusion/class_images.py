@@ -22,8 +22,8 @@ import torch
 from PIL import Image, PngImagePlugin
 from torch import Tensor
 
-from warpir.atomic import write_file
-from warpir.caches import CACHE_BYTES, make_room
+from warpir.core.atomic import write_file
+from warpir.core.cache import CACHE_BYTES, make_room
 from warpir.diffusion.cache import content_key, model_key
 from warpir.diffusion.draws import seed_of
 from warpir.diffusion.prompts import Prompts, draw_class_prompts

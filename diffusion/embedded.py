@@ -29,7 +29,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
-from warpir.atomic import write_file
+from warpir.core.atomic import write_file
 from warpir.diffusion.lora_files import read_safetensors, serialize
 from warpir.diffusion.model_error import ModelError
 from warpir.diffusion.network_prior import NetworkPrior

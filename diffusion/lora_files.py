@@ -30,7 +30,7 @@ from safetensors import SafetensorError, safe_open
 from safetensors.torch import save
 from torch import Tensor, nn
 
-from warpir.atomic import write_file
+from warpir.core.atomic import write_file
 from warpir.diffusion.draws import generator_of
 from warpir.diffusion.model_error import ModelError
 from warpir.diffusion.model_folder import read_json

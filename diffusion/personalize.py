@@ -23,8 +23,8 @@ from typing import TYPE_CHECKING, Any
 import torch
 from torch import Tensor
 
-from warpir.atomic import write_file
-from warpir.caches import find_kept, seal
+from warpir.core.atomic import write_file
+from warpir.core.cache import find_kept, seal
 from warpir.diffusion.cache import content_key, model_key
 from warpir.diffusion.class_images import (
     Report,

@@ -2,7 +2,7 @@
 
 Each field is one flag of `warpir.insert`, and the line below it is its ``--help``. Defaults are the
 authors' (DiPIR, Liang et al. 2024) where they state one, else ours. What is None is open: the
-prior that guides decides it (`warpir.config.PRIOR_DEFAULTS`).
+prior that guides decides it (`warpir.app.config.PRIOR_DEFAULTS`).
 """
 
 from dataclasses import dataclass

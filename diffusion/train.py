@@ -31,7 +31,7 @@ import torch
 import torch.distributed as dist
 from torch import Tensor, nn
 
-from warpir.atomic import write_file, write_folder
+from warpir.core.atomic import write_file, write_folder
 from warpir.diffusion.draws import seed_of
 from warpir.diffusion.embedded import (
     CONDITIONS,
@@ -64,7 +64,7 @@ log = logging.getLogger(__name__)
 
 
 class Batch(Protocol):
-    """Composites and what they are made of; fields as in ``warpir.training_batches.PriorBatch``."""
+    """Composites and what they are made of; fields as in ``warpir.train.batches.PriorBatch``."""
 
     @property
     def image(self) -> Tensor:

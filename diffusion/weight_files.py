@@ -46,7 +46,7 @@ REGRESSOR_SIZES: Sizes = {
     "dropout": (1, 1, float, 0, 0.99),
     "skipped": (1, 1, float, 0, 0.99),
 }
-"""The same of a `warpir.regressor.RegressorConfig`."""
+"""The same of a `warpir.lighting.regressor.RegressorConfig`."""
 
 EXPONENTS = {
     "F16": ("<u2", 0x7C00),

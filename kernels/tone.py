@@ -1,7 +1,7 @@
 """Monotone rational-quadratic tone curves on [0, 1].
 
 Durkan et al. 2019, "Neural Spline Flows", eq. 4. The host's half, raw parameters to knots, is
-`warpir.tone`.
+`warpir.render.tone_curve`.
 """
 
 import warp as wp

@@ -2,8 +2,8 @@
 
 Light at infinity enters linearly, so a pixel's radiance is a row of numbers times the map's texels.
 `trace_points` finds what the camera sees; `trace_direct` and `trace_paths` make the rows of
-``T_fg``, `trace_blocked` those of ``T_shadow``. The host's half is `warpir.transport`. Detached: no
-backward pass.
+``T_fg``, `trace_blocked` those of ``T_shadow``. The host's half is
+`warpir.render.transport.integrator`. Detached: no backward pass.
 
 A texel stands for the tent of bilinear interpolation around it (`bilinear_tap`). Directions are
 drawn from that tent, evenly in solid angle, and belong to that texel alone: spread over the four

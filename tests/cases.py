@@ -19,7 +19,7 @@ from typing import Any
 
 import pytest
 
-from tests import faults
+from tests.builders import faults
 
 PAGE = Path(__file__).parent.parent / "docs" / "robustness.md"
 BYTE_FLIPS = PAGE.with_name("byte_flips.json")
@@ -154,7 +154,7 @@ def _files(outcomes: Iterable[str]) -> str:
 
 
 def _byte_flips(record: dict[str, Any]) -> list[str]:
-    """Return the table of `benchmarks.byte_flips`."""
+    """Return the table of `benchmarks.damage`."""
     formats = record["formats"]
     tried = sum(entry["mutations"] for entry in formats)
     lines = [
@@ -163,8 +163,8 @@ def _byte_flips(record: dict[str, Any]) -> list[str]:
         f"{tried} damaged files of {len(formats)} kinds: flipped bits and bytes, truncations, "
         "repeated and swapped parts, numbers and lengths that lie, values of JSON replaced. Each "
         "is read in a process of its own; only success or one error line within 10 s and 500 MB "
-        f"may come out (`python -m benchmarks.byte_flips --count {record['count']} --json "
-        "docs/byte_flips.json`; `tests/test_byte_flips.py` tries some of them in every run).",
+        f"may come out (`python -m benchmarks.damage --count {record['count']} --json "
+        "docs/byte_flips.json`; `tests/benchmarks/test_byte_flips.py` tries some in every run).",
         "",
         "| Format | Tried | Read | Refused, by code | Longest [s] | Most memory [MB] | Faults |",
         "|---|---|---|---|---|---|---|",

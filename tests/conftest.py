@@ -12,7 +12,7 @@ import pytest
 import warp as wp
 
 from tests.cases import CaseReport
-from warpir.render import start_warp
+from warpir.render.renderer import start_warp
 
 # A shell's background job ignores Ctrl-C, and so would every program that the tests start.
 if signal.getsignal(signal.SIGINT) == signal.SIG_IGN:

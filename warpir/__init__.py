@@ -10,6 +10,17 @@ Conventions, one for the whole project:
 * Radiance is linear Rec.709, relative [W/(m^2 sr)]; display values are linear^(1/2.2).
 * ``wo`` points toward the camera, ``wi`` toward the light.
 * Angles are degrees at the command line and in files, radians inside.
+
+The rooms, each of which imports only those before it (tests/test_layers.py):
+
+    core       errors, limits, colour, files           scene     records of what is in the picture
+    io         every byte in or out                    app       what was asked, checked once
+    render     Warp: radiance, shadow ratio, composite lighting  where a light comes from
+    optimize   the guided loop                         report    the page of a run
+    sequence, place, batch, study, evaluate, train, mitsuba      one command or tool each
+
+`warpir.kernels` holds the device code and knows no room; `warpir.diffusion` the priors and their
+losses, which know the core alone. ``insert.py`` tells the story.
 """
 
 __version__ = "0.1.0"

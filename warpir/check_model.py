@@ -2,17 +2,17 @@
 
     python -m warpir.check_model --model DIR [--photo FILE] [--prompt TEXT] [--json FILE]
 
-`warpir.model_check` says what is measured. Ends with status 0 when all is as expected of a trained
-model, with 4 when it is not, and otherwise as `warpir.insert`.
+`warpir.optimize.model_check` says what is measured. Ends with status 0 when all is as expected of a
+trained model, with 4 when it is not, and otherwise as `warpir.insert`.
 """
 
 import sys
 from collections.abc import Sequence
 
-from warpir.command import flags_of, make_parser, read_arguments, read_values
-from warpir.config import InsertConfig, flag, usage
-from warpir.errors import ExitCode
-from warpir.program import run_program, say, stay_offline
+from warpir.app.command import flags_of, make_parser, read_arguments, read_values
+from warpir.app.config import InsertConfig, flag, usage
+from warpir.app.program import run_program, say, stay_offline
+from warpir.core.errors import ExitCode
 
 USAGE = "python -m warpir.check_model --model DIR|ID [FLAG ...]"
 DESCRIPTION = "Check that a Stable Diffusion works and guides as a trained one should."
@@ -56,14 +56,14 @@ def _run(arguments: list[str]) -> int:
         raise usage("--model", "needed", "a folder in diffusers' layout, or a hub id")
 
     from warpir.demo import PHOTO
-    from warpir.photo_files import read_photo
+    from warpir.io.images.photos import read_photo
 
     photo = read_photo(config.photo or PHOTO, max_pixels=config.max_pixels, alpha=config.alpha).srgb
 
     # torch, Warp and diffusers are loaded here, after everything else that can be wrong.
     if not config.allow_download:
         stay_offline()
-    from warpir.model_check import load_and_check, write_report
+    from warpir.optimize.model_check import load_and_check, write_report
 
     report = load_and_check(config, photo, say)
     good = sum(verdict.ok for verdict in report.verdicts)

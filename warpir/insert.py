@@ -5,7 +5,7 @@
 or from Python, where the module itself can be called:
 
     from warpir import insert
-    from warpir.config import InsertConfig
+    from warpir.app.config import InsertConfig
 
     insertion = insert(InsertConfig(photo="street.jpg", asset="car.glb", out="out"))
 
@@ -24,22 +24,22 @@ from pathlib import Path
 from types import ModuleType
 from typing import TYPE_CHECKING, Any
 
-from warpir.command import parse
-from warpir.config import EMBEDDED_STEPS, InsertConfig, usage
-from warpir.errors import ExitCode, InputError
-from warpir.limits import LIMITS
-from warpir.memory import Memory, Need, needs_of_photo, needs_of_scene, release, share_device
-from warpir.program import require_packages, run_program, say, stay_offline
-from warpir.signals import Stopped
+from warpir.app.command import parse
+from warpir.app.config import EMBEDDED_STEPS, InsertConfig, usage
+from warpir.app.program import require_packages, run_program, say, stay_offline
+from warpir.core.errors import ExitCode, InputError
+from warpir.core.limits import LIMITS
+from warpir.core.memory import Memory, Need, needs_of_photo, needs_of_scene, release, share_device
+from warpir.core.signals import Stopped
 
 if TYPE_CHECKING:
-    from warpir.camera import Camera
-    from warpir.files import Layers, OutputFolder
-    from warpir.inputs import Inputs, Loaders
-    from warpir.lighting import SceneLight
-    from warpir.picture import Picture
-    from warpir.record import Timings
-    from warpir.report import Results
+    from warpir.app.inputs import Inputs, Loaders
+    from warpir.app.record import Timings
+    from warpir.io.results import Layers, OutputFolder
+    from warpir.lighting.scene_light import SceneLight
+    from warpir.render.composite import Picture
+    from warpir.report.page import Results
+    from warpir.scene.camera import Camera
 
 __all__ = ["InsertConfig", "Insertion", "insert", "main"]
 
@@ -72,7 +72,7 @@ class Insertion:
         Raises:
             InputError: It is not there, or damaged.
         """
-        from warpir.files import read_layers
+        from warpir.io.results import read_layers
 
         told = self.record.get("config", {})  # that of a sequence has none
         return read_layers(self.out / "layers.exr", told.get("max_pixels", LIMITS.pixels))
@@ -118,10 +118,10 @@ def _say_what_is_kept(config: InsertConfig, error: BaseException) -> None:
 
 
 def _insert_sequence(config: InsertConfig, renews: bool) -> Insertion:
-    from warpir.files import finish_results
-    from warpir.inputs import Loaders
-    from warpir.report_sequence import PAGE, refuse_other_page, write_sequence_report
-    from warpir.sequence import SUMMARY, read_sequence, write_summary
+    from warpir.app.inputs import Loaders
+    from warpir.io.results import finish_results
+    from warpir.sequence.frames import SUMMARY, read_sequence, write_summary
+    from warpir.sequence.page import PAGE, refuse_other_page, write_sequence_report
 
     assert config.out is not None
     for folder in sorted(Path(config.out).glob("[0-9][0-9][0-9][0-9]")):
@@ -153,11 +153,11 @@ def _insert_sequence(config: InsertConfig, renews: bool) -> Insertion:
 
 
 def _insert_one(config: InsertConfig, loaders: "Loaders | None" = None) -> Insertion:
-    from warpir.checkpoint import FOLDER
-    from warpir.disk_space import needed_bytes, require_space
-    from warpir.progress import progress_bar
-    from warpir.record import Timings, run_record
-    from warpir.strict_json import read_json_object
+    from warpir.app.disk_space import needed_bytes, require_space
+    from warpir.app.record import Timings, run_record
+    from warpir.core.progress import progress_bar
+    from warpir.core.strict_json import read_json_object
+    from warpir.optimize.checkpoint import FOLDER
 
     timings = Timings()
     with timings.stage("read"):
@@ -173,8 +173,8 @@ def _insert_one(config: InsertConfig, loaders: "Loaders | None" = None) -> Inser
         memory.require(of_photo, *of_scene, on_host=True)
         # Warp is loaded here, after everything that can be wrong was looked at.
         with timings.stage("load"):
-            from warpir.picture import Quality, make_picture, scene_of
-            from warpir.render import Renderer, choose_device
+            from warpir.render.composite import Quality, make_picture, scene_of
+            from warpir.render.renderer import Renderer, choose_device
 
             device = choose_device(config.device)
             memory.device = device
@@ -256,7 +256,7 @@ def _insert_one(config: InsertConfig, loaders: "Loaders | None" = None) -> Inser
             },
         )
         if config.report:
-            from warpir.report import REPORT, write_report
+            from warpir.report.page import REPORT, write_report
 
             results = replace(results, record=record)
             with timings.stage("report"):
@@ -295,8 +295,8 @@ def _output_folder(config: InsertConfig) -> "OutputFolder":
     Raises:
         InputError: The run that is to be resumed is finished.
     """
-    from warpir.checkpoint import Checkpoints
-    from warpir.files import OutputFolder
+    from warpir.io.results import OutputFolder
+    from warpir.optimize.checkpoint import Checkpoints
 
     assert config.out is not None
     newest = Checkpoints(Path(config.out), {}).newest
@@ -328,7 +328,7 @@ def _output_folder(config: InsertConfig) -> "OutputFolder":
 
 def _cache_notices() -> tuple[str, ...]:
     """Return what a cache has to say since the last call, having said it."""
-    from warpir.caches import take_notices
+    from warpir.core.cache import take_notices
 
     notices = take_notices()
     for line in notices:
@@ -352,10 +352,10 @@ def _regress(
     config: InsertConfig, inputs: "Inputs", device: str, timings: "Timings"
 ) -> "tuple[SceneLight, dict[str, Any]]":
     """Read the light off the photo; return it, and what run.json says of it."""
-    from warpir.determinism import fixed_arithmetic
+    from warpir.render.determinism import fixed_arithmetic
 
     with timings.stage("regress"), fixed_arithmetic(device, config.deterministic):
-        from warpir.estimate import estimate_light
+        from warpir.lighting.estimate import estimate_light
 
         estimate = estimate_light(inputs, config, device)
     for line in estimate.light.assumed:
@@ -373,7 +373,7 @@ def _detailed(
     if not config.detail or has_own:
         return light, {}
     with timings.stage("detail"):
-        from warpir.detail import detail_of, with_detail
+        from warpir.lighting.detail import detail_of, with_detail
 
         detail = detail_of(inputs, light.curves)
         light = replace(light, detailed=with_detail(light.light, detail))
@@ -385,7 +385,7 @@ def _detailed(
 
 
 def _has_lamps(light: "SceneLight") -> bool:
-    from warpir.lamps import lamp_axes
+    from warpir.scene.lamps import lamp_axes
 
     return any(len(lamp_axes(x)) > 0 for x in (light.light, light.light_shadow))
 
@@ -417,8 +417,8 @@ def _write_preview(
     device: str,
 ) -> None:
     """Write the composite as it will be, small and grainy, where previews are asked for."""
-    from warpir.picture import Quality, make_picture, scene_of
-    from warpir.render import Renderer
+    from warpir.render.composite import Quality, make_picture, scene_of
+    from warpir.render.renderer import Renderer
 
     settings = config.settled(on_cuda=device != "cpu")
     if not settings.preview_every:
@@ -456,17 +456,17 @@ def _guide(
     Returns:
         Inputs and light as they are to be rendered, what run.json says of it, and notices.
     """
-    from warpir.determinism import fixed_arithmetic
-    from warpir.progress import StepProgress
+    from warpir.core.progress import StepProgress
+    from warpir.render.determinism import fixed_arithmetic
 
     with StepProgress(say) as progress, fixed_arithmetic(device, config.deterministic):
-        from warpir.recover import Run, recover
+        from warpir.optimize.recover import Run, recover
 
         run = Run(config, inputs, device, output, timings, say, progress, memory=memory)
         if config.refine is None:
             light, record, notices = recover(run, light)
         else:
-            from warpir.refine import refine
+            from warpir.optimize.materials import refine
 
             assert light is not None  # the configuration names it
             light, asset, record, notices = refine(run, light)
@@ -495,13 +495,13 @@ def _write(
     Returns:
         The numbers that belong into the one, and what the other shows.
     """
-    from warpir.curves import curves_to_json
-    from warpir.files import write_layers
-    from warpir.light import summarize
-    from warpir.lobes_file import lobes_to_json
-    from warpir.picture import as_file_map, balls
-    from warpir.record import config_of_picture
-    from warpir.report import Results
+    from warpir.app.record import config_of_picture
+    from warpir.io.curves_file import curves_to_json
+    from warpir.io.lobes_file import lobes_to_json
+    from warpir.io.results import write_layers
+    from warpir.render.composite import as_file_map, balls
+    from warpir.report.page import Results
+    from warpir.scene.light import summarize
 
     photo, camera = inputs.photo, inputs.camera
     codes = photo.encode(picture.image, picture.changed)
@@ -539,13 +539,22 @@ def _write(
     )
     handed: dict[str, Any] = {}
     if config.hand_off:
-        from warpir.handoff import write_hand_off
+        from warpir.io.export import write_hand_off
 
-        handed, notices = write_hand_off(output, inputs, light.curves, on_object, its_map)
+        handed, notices = write_hand_off(
+            output,
+            inputs.photo,
+            inputs.asset,
+            inputs.camera,
+            inputs.placement,
+            light.curves,
+            on_object,
+            its_map,
+        )
         for line in notices:
             say(f"notice: {line}")
     if config.mitsuba:
-        from warpir.mitsuba_scene import write_mitsuba
+        from warpir.mitsuba.scene import write_mitsuba
 
         write_mitsuba(output, inputs, on_object, config.depth)
     summary = summarize(light.light)
@@ -600,8 +609,8 @@ def _read(
 
     The light is None where it is to be read off the photo.
     """
-    from warpir.inputs import read_inputs
-    from warpir.lighting import make_light
+    from warpir.app.inputs import read_inputs
+    from warpir.lighting.scene_light import make_light
 
     if config.demo:
         from warpir.demo import demo_config
@@ -652,8 +661,8 @@ def _run(arguments: list[str]) -> int:
 
 def _validate(config: InsertConfig) -> None:
     """Check everything that can be checked without torch and Warp; nothing is written."""
-    from warpir.disk_space import needed_bytes, require_space
-    from warpir.files import OutputFolder
+    from warpir.app.disk_space import needed_bytes, require_space
+    from warpir.io.results import OutputFolder
 
     if config.sequence is None:
         config, inputs, _ = _read(config)
@@ -661,9 +670,9 @@ def _validate(config: InsertConfig) -> None:
         _output_folder(config).check()
         require_space(config.out, needed_bytes(config, inputs))
         return
-    from warpir.inputs import Loaders
-    from warpir.report_sequence import refuse_other_page
-    from warpir.sequence import read_sequence
+    from warpir.app.inputs import Loaders
+    from warpir.sequence.frames import read_sequence
+    from warpir.sequence.page import refuse_other_page
 
     frames = read_sequence(config, Loaders())
     refuse_other_page(config)

@@ -1,17 +1,23 @@
 """The scene that ships with warpir: a square in the sun, a small car, and the light itself.
 
-Everything is made by ``python -m warpir.demo.make``; nothing is downloaded or scanned.
+The files beside this module are made by ``python -m tools.demo.make``, which is not installed;
+nothing is downloaded or scanned.
 """
 
 from dataclasses import replace
 from pathlib import Path
 
-from warpir.config import LIGHTS, InsertConfig
+from warpir.app.config import LIGHTS, InsertConfig
 
 FOLDER = Path(__file__).parent
 PHOTO, ASSET, LIGHT, CAMERA = (
     FOLDER / name for name in ("photo.png", "car.glb", "sky.exr", "camera.json")
 )
+PLACE = (0.15, 0.0, -9.3)
+"""Point on the ground under the car's origin, world frame [m]: three-quarter view, about a third of
+the picture's width."""
+ROTATE_Y = 33.0
+"""Turn of the car about +Y, from the front toward +X [deg]."""
 
 
 def demo_config(config: InsertConfig) -> InsertConfig:
@@ -20,9 +26,6 @@ def demo_config(config: InsertConfig) -> InsertConfig:
     Its light and exposure are too with ``--guidance none`` and for ``--refine``; otherwise the
     light is what is to be found out. What the user named is kept.
     """
-    from warpir.demo.place import placement
-
-    where = placement()
     is_placed = config.place is not None or config.at is not None
     is_given = any(getattr(config, name) is not None for name in LIGHTS)
     is_recovered = is_given or (config.guided_by != "none" and config.refine is None)
@@ -32,8 +35,8 @@ def demo_config(config: InsertConfig) -> InsertConfig:
         photo=str(PHOTO),
         asset=str(ASSET),
         camera=str(CAMERA),
-        place=config.place if is_placed else where.place,
-        rotate_y=config.rotate_y or where.rotate_y,
+        place=config.place if is_placed else PLACE,
+        rotate_y=config.rotate_y or ROTATE_Y,
         light=config.light if is_recovered else str(LIGHT),
         exposure=0.0 if config.exposure is None and not is_recovered else config.exposure,
         tone=config.tone or (None if is_recovered else "linear"),

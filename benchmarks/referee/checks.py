@@ -1,0 +1,547 @@
+"""Is the referee right? Closed forms, stock integrators and chi-square tests.
+
+Run as ``python -m benchmarks.referee.checks``; prints one line per check with the measured
+value, the expected one and the error in standard errors, and fails at the first that is wrong.
+"""
+
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from benchmarks import furnace
+
+from benchmarks.referee import __main__ as referee  # isort: skip  (sets the variant)
+
+import drjit as dr
+import mitsuba as mi
+
+from warpir.mitsuba import render as mitsuba_render
+from warpir.mitsuba.light import LatlongEmitter
+from warpir.mitsuba.material import GltfBSDF, Image
+from warpir.scene.asset import Asset, Material, Primitive, Texture, TextureSlot
+from warpir.scene.camera import Camera
+
+FloatArray = NDArray[np.float64]
+
+SIGMAS = 4.5
+"""Allowed error in standard errors: one false alarm in 1e5 checks, with room for heavy tails."""
+
+
+def sphere(material: Material, textures: tuple[Texture, ...] = (), rings: int = 64) -> Asset:
+    """Unit sphere about the origin, +Y poles, shading normals exact."""
+    polar = np.linspace(0.0, np.pi, rings + 1)
+    azimuth = np.linspace(0.0, 2.0 * np.pi, 2 * rings + 1)
+    theta, phi = np.meshgrid(polar, azimuth, indexing="ij")
+    positions = np.stack(
+        [np.sin(theta) * np.sin(phi), np.cos(theta), np.sin(theta) * np.cos(phi)], axis=-1
+    ).reshape(-1, 3)
+    uv = np.stack([phi / (2.0 * np.pi), theta / np.pi], axis=-1).reshape(-1, 2)
+    i, j = np.meshgrid(np.arange(rings), np.arange(2 * rings), indexing="ij")
+    a = (i * (2 * rings + 1) + j).ravel()
+    b, c, d = a + 1, a + 2 * rings + 1, a + 2 * rings + 2
+    upper = np.stack([a, c, b], axis=1)[i.ravel() > 0]
+    lower = np.stack([b, c, d], axis=1)[i.ravel() < rings - 1]
+    primitive = Primitive(
+        positions,
+        np.concatenate([upper, lower]).astype(np.int32),
+        0,
+        normals=positions.astype(np.float32),
+        uv0=uv.astype(np.float32),
+    )
+    return Asset("sphere", (primitive,), (material,), textures)
+
+
+def square(material: Material, side: float, height: float, up: bool = False) -> Asset:
+    """Square in the plane y = ``height`` (or standing in z = 0), facing +Y (or +Z)."""
+    h = 0.5 * side
+    corners = np.array([[-h, -h], [h, -h], [h, h], [-h, h]])
+    if up:
+        positions = np.column_stack([corners[:, 0], corners[:, 1] + height, np.zeros(4)])
+    else:
+        positions = np.column_stack([corners[:, 0], np.full(4, height), -corners[:, 1]])
+    uv = np.array([[0.0, 1.0], [1.0, 1.0], [1.0, 0.0], [0.0, 0.0]], dtype=np.float32)
+    primitive = Primitive(positions, np.array([[0, 1, 2], [0, 2, 3]], dtype=np.int32), 0, uv0=uv)
+    return Asset("square", (primitive,), (material,))
+
+
+def view(
+    distance: float,
+    width: int = 32,
+    height: int = 32,
+    fov: float = 25.0,
+    lift: float = 0.0,
+    turn: float = 0.0,
+) -> Camera:
+    """Camera at ``(0, lift, distance)`` turned about +Y to look from another side, along -Z."""
+    focal = 0.5 * width / np.tan(np.radians(0.5 * fov))
+    angle = np.radians(turn)
+    c2w = np.eye(4)
+    c2w[:3, :3] = [
+        [np.cos(angle), 0.0, np.sin(angle)],
+        [0.0, 1.0, 0.0],
+        [-np.sin(angle), 0.0, np.cos(angle)],
+    ]
+    c2w[:3, 3] = c2w[:3, :3] @ [0.0, lift, distance]
+    return Camera(width, height, focal, focal, 0.5 * width, 0.5 * height, c2w)
+
+
+def sun_and_sky(rng: np.random.Generator, rows: int = 32) -> NDArray[np.float32]:
+    """Noisy coloured sky with one texel 2000 times brighter, shape [rows, 2 rows, 3]."""
+    texels = rng.exponential(size=(rows, 2 * rows, 3))
+    texels[rows // 4, rows // 2] *= 2000.0
+    return texels.astype(np.float32)
+
+
+def report(name: str, value: float, expected: float, error: float) -> None:
+    """Print a check; raise where it is off by more than `SIGMAS` standard errors."""
+    sigmas = abs(value - expected) / max(error, 1e-30)
+    print(f"{name:58s} {value:12.6g} expected {expected:12.6g}  {sigmas:6.2f} s.e.", flush=True)
+    if not sigmas < SIGMAS:
+        raise AssertionError(name)
+
+
+def check_light(rng: np.random.Generator) -> None:
+    """Match the bilinear formula in float64; sample it with the density stated."""
+    texels = sun_and_sky(rng)
+    rows, columns = texels.shape[:2]
+    emitter = LatlongEmitter(texels)
+    directions = rng.normal(size=(100000, 3))
+    directions /= np.linalg.norm(directions, axis=1, keepdims=True)
+    u = np.mod(np.arctan2(directions[:, 0], -directions[:, 2]) / (2.0 * np.pi), 1.0)
+    v = np.arccos(directions[:, 1]) / np.pi
+    x, y = u * columns - 0.5, np.clip(v * rows - 0.5, 0.0, rows - 1.0)
+    j, i = np.floor(x).astype(int), np.floor(y).astype(int)
+    a, b = (x - j)[:, None], (y - i)[:, None]
+    k = np.minimum(i + 1, rows - 1)
+    truth = (texels[i, j % columns] * (1 - a) + texels[i, (j + 1) % columns] * a) * (1 - b) + (
+        texels[k, j % columns] * (1 - a) + texels[k, (j + 1) % columns] * a
+    ) * b
+    found = np.asarray(
+        emitter.radiance(mi.Vector3f(directions.T.astype(np.float32)), mi.Bool(True))
+    ).T
+    # One float32 rounding of u moves the reading by 6e-8 of a slope of peak * columns
+    report(
+        "light: largest difference to bilinear float64, of peak",
+        np.abs(found - truth).max() / texels.max(),
+        0.0,
+        6e-8 * columns,
+    )
+
+    # Without the sun, whose density the test's own quadrature cannot integrate
+    emitter = LatlongEmitter(rng.exponential(size=(8, 16, 3)).astype(np.float32) ** 3)
+    interaction = dr.zeros(mi.Interaction3f)
+
+    def draw(sample: mi.Vector3f) -> mi.Vector3f:
+        return emitter.sample_direction(interaction, mi.Point2f(sample.x, sample.y))[0].d
+
+    def density(d: mi.Vector3f) -> mi.Float:
+        ds = dr.zeros(mi.DirectionSample3f, dr.width(d))
+        ds.d = d
+        return emitter.pdf_direction(interaction, ds)
+
+    chi2("light", draw, density, 2)
+
+
+def chi2(name: str, draw: object, density: object, dimensions: int) -> None:
+    """Compare samples on the sphere with their stated density; raise on rejection at 1e-3."""
+    test = mi.chi2.ChiSquareTest(
+        domain=mi.chi2.SphericalDomain(),
+        sample_func=draw,
+        pdf_func=density,
+        sample_dim=dimensions,
+        sample_count=1_000_000,
+        res=101,
+        ires=16,
+    )
+    with open("/dev/null", "w") as sink:
+        from contextlib import redirect_stdout
+
+        with redirect_stdout(sink):
+            accepted = test.run(0.001)
+    print(f"{name:58s} chi-square p = {test.p_value:.3f}", flush=True)
+    if not accepted:
+        raise AssertionError(f"{name}: {test.messages}")
+
+
+def check_material(rng: np.random.Generator) -> None:
+    """Sample the material with its density, mapped normals included; reciprocity."""
+    corners = np.array([[0.0, 0.0, 0.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])
+    uv = np.array([[0.0, 1.0], [1.0, 1.0], [0.0, 0.0]], dtype=np.float32)
+    codes = np.array([[[190, 60, 220, 255]]], dtype=np.uint8)
+    for roughness, metallic, mapped in (
+        (0.15, 0.0, False),
+        (0.5, 0.0, True),
+        (0.8, 0.7, True),
+        (0.3, 1.0, False),
+    ):
+        material = Material(
+            base_color=(0.8, 0.5, 0.2),
+            metallic=metallic,
+            roughness=roughness,
+            normal_texture=TextureSlot(0) if mapped else None,
+        )
+        triangle = Primitive(corners, np.array([[0, 1, 2]], dtype=np.int32), 0, uv0=uv)
+        asset = Asset("triangle", (triangle,), (material,), (Texture(codes),))
+        bsdf = GltfBSDF(asset, triangle, np.eye(3))
+        for polar in (0.2, 1.3):
+            si = dr.zeros(mi.SurfaceInteraction3f)
+            si.n = mi.Normal3f(0.0, 0.0, 1.0)
+            si.sh_frame = mi.Frame3f(si.n)
+            wo = mi.Vector3f(
+                float(np.sin(polar)) * 0.6, float(np.sin(polar)) * 0.8, float(np.cos(polar))
+            )
+            si.wi = si.to_local(wo)
+            context = mi.BSDFContext()
+
+            def draw(
+                u: mi.Vector3f, si: mi.SurfaceInteraction3f = si, bsdf: GltfBSDF = bsdf
+            ) -> tuple[mi.Vector3f, mi.Float]:
+                bs, weight = bsdf.sample(mi.BSDFContext(), si, u.x, mi.Point2f(u.y, u.z))
+                keep = dr.select(dr.max(weight) > 0.0, mi.Float(1.0), 0.0)
+                return si.to_world(bs.wo), keep
+
+            def density(
+                d: mi.Vector3f, si: mi.SurfaceInteraction3f = si, bsdf: GltfBSDF = bsdf
+            ) -> mi.Float:
+                return bsdf.pdf(mi.BSDFContext(), si, si.to_local(d))
+
+            chi2(
+                f"material: roughness {roughness}, metallic {metallic}, map {mapped}, "
+                f"polar {polar}",
+                draw,
+                density,
+                3,
+            )
+
+            # Its energy: by its own sampler, and in closed form or by uniform directions
+            u = rng.random((3, 4_000_000), dtype=np.float32)
+            _, weight = bsdf.sample(context, si, mi.Float(u[0]), mi.Point2f(u[1:]))
+            found = np.asarray(weight)[0].astype(np.float64)
+            error = found.std() / 2e3
+            expected = furnace.directional_albedo(np.cos(polar), roughness, 0.8, metallic)
+            if mapped:
+                u = rng.random((2, 4_000_000), dtype=np.float32)
+                d = mi.warp.square_to_uniform_hemisphere(mi.Point2f(u))
+                f_cos = np.asarray(bsdf.eval(context, si, si.to_local(d)))[0]
+                expected = 2.0 * np.pi * f_cos.mean(dtype=np.float64)
+                error = np.hypot(error, np.pi * f_cos.std() / 1e3)
+            report("material: its energy by its sampler", found.mean(), expected, error + 1e-5)
+
+
+def check_layers(rng: np.random.Generator) -> None:
+    """Sample coat, cloth and glass with their density; its energy by two ways of drawing."""
+    corners = np.array([[0.0, 0.0, 0.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])
+    uv = np.array([[0.0, 1.0], [1.0, 1.0], [0.0, 0.0]], dtype=np.float32)
+    codes = np.array([[[190, 60, 220, 255]]], dtype=np.uint8)
+    base = Material(base_color=(0.8, 0.5, 0.2), metallic=0.3, roughness=0.6)
+    for name, material in (
+        ("coat", replace(base, clearcoat=0.9, clearcoat_roughness=0.3)),
+        ("cloth", replace(base, sheen_color=(0.9, 0.4, 0.2), sheen_roughness=0.5)),
+        ("glass", replace(base, transmission=0.8, ior=1.7, specular_color=(1.0, 0.5, 2.0))),
+    ):
+        if name == "coat":
+            material = replace(material, clearcoat_normal_texture=TextureSlot(0))
+        triangle = Primitive(corners, np.array([[0, 1, 2]], dtype=np.int32), 0, uv0=uv)
+        bsdf = GltfBSDF(
+            Asset("triangle", (triangle,), (material,), (Texture(codes),)), triangle, np.eye(3)
+        )
+        for polar in (0.2, 1.3):
+            si = dr.zeros(mi.SurfaceInteraction3f)
+            si.n = mi.Normal3f(0.0, 0.0, 1.0)
+            si.sh_frame = mi.Frame3f(si.n)
+            sine, cosine = float(np.sin(polar)), float(np.cos(polar))
+            si.wi = si.to_local(mi.Vector3f(0.6 * sine, 0.8 * sine, cosine))
+
+            def draw(
+                u: mi.Vector3f, si: mi.SurfaceInteraction3f = si, bsdf: GltfBSDF = bsdf
+            ) -> tuple[mi.Vector3f, mi.Float]:
+                bs, weight = bsdf.sample(mi.BSDFContext(), si, u.x, mi.Point2f(u.y, u.z))
+                return si.to_world(bs.wo), dr.select(dr.max(weight) > 0.0, mi.Float(1.0), 0.0)
+
+            def density(
+                d: mi.Vector3f, si: mi.SurfaceInteraction3f = si, bsdf: GltfBSDF = bsdf
+            ) -> mi.Float:
+                return bsdf.pdf(mi.BSDFContext(), si, si.to_local(d))
+
+            chi2(f"layers: {name}, polar {polar}", draw, density, 3)
+            context = mi.BSDFContext()
+            u = rng.random((3, 1_000_000), dtype=np.float32)
+            _, weight = bsdf.sample(context, si, mi.Float(u[0]), mi.Point2f(u[1:]))
+            found = np.asarray(weight)[0].astype(np.float64)
+            d = mi.warp.square_to_uniform_hemisphere(mi.Point2f(u[:2]))
+            f_cos = np.asarray(bsdf.eval(context, si, si.to_local(d)))[0].astype(np.float64)
+            error = np.hypot(found.std(), 2.0 * np.pi * f_cos.std()) / 1e3
+            report(
+                f"layers: energy of {name} by its sampler",
+                found.mean(),
+                2.0 * np.pi * f_cos.mean(),
+                error + 1e-5,
+            )
+
+
+def check_textures(rng: np.random.Generator) -> None:
+    """Read textures as Mitsuba's bitmap does, where that has the wrap mode."""
+    codes = rng.integers(0, 256, size=(5, 7, 4), dtype=np.uint8)
+    uv = mi.Point2f(rng.uniform(-3.0, 3.0, size=(2, 10000)).astype(np.float32))
+    for mode, theirs in (("repeat", "repeat"), ("clamp", "clamp"), ("mirror", "mirror")):
+        image = Image(Texture(codes, mode, mode), TextureSlot(0), is_color=True)
+        found = np.asarray(image.read(uv, mi.Bool(True)))[:3]
+        linear = np.asarray(image.texels).reshape(5, 7, 4)[..., :3]
+        bitmap = mi.load_dict(
+            {
+                "type": "bitmap",
+                "data": mi.TensorXf(linear),
+                "raw": True,
+                "format": "variant",
+                "wrap_mode": theirs,
+            }
+        )
+        si = dr.zeros(mi.SurfaceInteraction3f, 10000)
+        si.uv = uv
+        error = np.abs(np.asarray(bitmap.eval(si)) - found).max()
+        report(f"textures: largest difference to Mitsuba's bitmap, {mode}", error, 0.0, 1e-5)
+    mixed = Image(Texture(codes, "clamp", "repeat"), TextureSlot(0), is_color=False)
+    value = np.asarray(mixed.read(mi.Point2f([-0.4], [1.1]), mi.Bool(True))).ravel()
+    # v = 1.1 on 5 rows: between the last row (wrapped) and row 0 at 0.0
+    expected = codes[0, 0] / 255.0
+    report("textures: clamp in u, repeat in v", np.abs(value - expected).max(), 0.0, 1e-5)
+
+
+def check_energy() -> None:
+    """Match the float64 energy of the material per angle on a sphere under uniform light."""
+    texels = np.ones((8, 16, 3), dtype=np.float32)
+    camera = view(6.0)
+    rows, columns = np.mgrid[0:32, 0:32]
+    cases = ((0.2, 0.0), (0.7, 0.0), (1.0, 1.0), (0.0, 1.0))
+    for seed, (roughness, metallic) in enumerate(cases):
+        asset = sphere(Material(metallic=metallic, roughness=roughness), rings=256)
+        found = mitsuba_render.foreground(asset, np.eye(4), camera, texels, 1, 512, seed)
+        # Angle at the centre of each pixel well inside the disc; E is smooth there
+        x = (columns + 0.5 - camera.cx) / camera.fx
+        y = (rows + 0.5 - camera.cy) / camera.fy
+        d = np.stack([x, y, np.ones_like(x)], axis=-1)
+        d /= np.linalg.norm(d, axis=-1, keepdims=True)
+        along = 6.0 * d[..., 2]
+        closest = np.sqrt(np.maximum(36.0 - along**2, 0.0))
+        inside = closest < 0.7
+        cos_o = np.sqrt(1.0 - closest[inside] ** 2)
+        grid = np.linspace(0.6, 1.0, 41)
+        table = [furnace.directional_albedo(c, roughness, 1.0, metallic) for c in grid]
+        expected = np.interp(cos_o, grid, table)
+        error = float(np.sqrt(found.variance[inside][:, 0].sum())) / inside.sum()
+        report(
+            f"furnace: sphere, roughness {roughness}, metallic {metallic}",
+            found.mean[inside][:, 0].mean(),
+            expected.mean(),
+            error + 1e-4,
+        )
+        if metallic == 1.0:
+            margin = found.mean[..., 0] - 6.0 * np.sqrt(found.variance[..., 0])
+            report(
+                "furnace: white metal stays at or below 1, excess",
+                max(margin.max(), 1.0),
+                1.0,
+                1e-4,
+            )
+
+
+def check_lambert() -> None:
+    """Render 1 with Mitsuba's own white Lambert sphere and plane under our uniform light."""
+    asset = sphere(Material())
+    camera = view(6.0)
+    texels = np.ones((8, 16, 3), dtype=np.float32)
+    setup = mitsuba_render.build(asset, np.eye(4), camera, texels, 1)
+    stock = mi.load_dict(
+        {
+            "type": "scene",
+            "light": LatlongEmitter(texels),
+            "sphere": {
+                "type": "sphere",
+                "bsdf": {"type": "diffuse", "reflectance": {"type": "rgb", "value": 1.0}},
+            },
+        }
+    )
+    image = np.asarray(
+        mi.render(
+            stock,
+            sensor=setup.sensor,
+            spp=1024,
+            integrator=mi.load_dict({"type": "path", "max_depth": 2, "hide_emitters": True}),
+        )
+    )
+    report("lambert: white sphere under uniform light", image[12:20, 12:20].mean(), 1.0, 1e-3)
+
+
+def check_stock_integrators(rng: np.random.Generator) -> None:
+    """Agree with Mitsuba's `path` and `prb` on an opaque closed mesh, image and gradient."""
+    texels = sun_and_sky(rng)
+    codes = rng.integers(60, 256, size=(8, 8, 4), dtype=np.uint8)
+    material = Material(
+        roughness=0.6,
+        metallic=0.4,
+        base_color_texture=TextureSlot(0),
+        metallic_roughness_texture=TextureSlot(0),
+    )
+    ball = sphere(material, (Texture(codes),), rings=24)
+    # Two balls, so that paths bounce
+    part = ball.primitives[0]
+    other = replace(part, positions=0.6 * part.positions + [1.5, 0.3, 0.2])
+    asset = replace(ball, primitives=(part, other))
+    camera = view(7.0, width=24, height=16, fov=35.0)
+    for depth in (1, 4):
+        found = mitsuba_render.foreground(asset, np.eye(4), camera, texels, depth, 1024, 5)
+        setup = mitsuba_render.build(asset, np.eye(4), camera, texels, depth)
+        for name in ("path", "prb"):
+            stock = mi.load_dict(
+                {"type": name, "max_depth": depth + 1, "rr_depth": 1000, "hide_emitters": True}
+            )
+            images = np.stack(
+                [
+                    np.asarray(
+                        mi.render(
+                            setup.scene, sensor=setup.sensor, spp=256, seed=k, integrator=stock
+                        )
+                    )
+                    for k in range(4)
+                ]
+            )
+            sums = images.sum(axis=(1, 2, 3), dtype=np.float64)
+            error = np.hypot(sums.std(ddof=1) / 2.0, np.sqrt(found.variance.sum()))
+            # Mitsuba's ray offset is 20 times ours; 2e-4 of a length moves little light
+            report(
+                f"stock: image sum against {name}, depth {depth}",
+                found.mean.sum(),
+                sums.mean(),
+                error + 2e-5 * sums.mean(),
+            )
+
+        check_gradient(asset, camera, rng, depth)
+
+
+def check_gradient(asset: Asset, camera: Camera, rng: np.random.Generator, depth: int) -> None:
+    """Satisfy the adjoint identity and agree with Mitsuba's `prb` up to both noises."""
+    texels = rng.exponential(size=(8, 16, 3)).astype(np.float32)
+    found = mitsuba_render.foreground(asset, np.eye(4), camera, texels, depth, 1024, 5)
+    d_image = rng.normal(size=found.mean.shape) + 1.0
+    setup = mitsuba_render.build(asset, np.eye(4), camera, texels, depth)
+    parameters = mi.traverse(setup.scene)
+    dr.enable_grad(parameters["light.texels"])
+    parameters.update()
+    stock = mi.load_dict(
+        {"type": "prb", "max_depth": depth + 1, "rr_depth": 1000, "hide_emitters": True}
+    )
+    ours, theirs = [], []
+    for seed in range(6):
+        ours.append(
+            referee.foreground_gradient(asset, np.eye(4), camera, texels, depth, 256, seed, d_image)
+        )
+        dr.set_grad(parameters["light.texels"], 0.0)
+        stock.render_backward(
+            setup.scene,
+            parameters,
+            mi.TensorXf(d_image.astype(np.float32)),
+            setup.sensor,
+            100 + seed,
+            256,
+        )
+        theirs.append(np.asarray(dr.grad(parameters["light.texels"]), dtype=np.float64))
+    sums = np.array([(d_texels * texels).sum() for d_texels in ours])
+    spread = float(np.sqrt((found.variance * d_image**2).sum()))
+    report(
+        f"gradient: <d_texels, texels> = <d_image, image>, depth {depth}",
+        sums.mean(),
+        (d_image * found.mean).sum(),
+        np.hypot(spread, sums.std(ddof=1) / np.sqrt(6.0)),
+    )
+    z = (np.mean(ours, axis=0) - np.mean(theirs, axis=0)) / np.sqrt(
+        (np.var(ours, axis=0, ddof=1) + np.var(theirs, axis=0, ddof=1)) / 6.0
+    )
+    # Student's t of about 10 degrees of freedom has a variance of 1.25
+    report(f"gradient: mean square z against prb, depth {depth}", np.square(z).mean(), 1.25, 0.2)
+    a, b = np.mean(ours, axis=0).ravel(), np.mean(theirs, axis=0).ravel()
+    print(f"{'':10s}cosine {a @ b / np.linalg.norm(a) / np.linalg.norm(b):.5f}", flush=True)
+
+
+def check_coverage() -> None:
+    """Count alpha, cutoff, culling and sidedness as glTF says."""
+    texels = np.ones((8, 16, 3), dtype=np.float32)
+    camera = view(6.0, fov=8.0)
+    for name, material, turn, expected in (
+        ("blend, alpha 0.3", Material(alpha=0.3, alpha_mode="BLEND"), 0.0, 0.3),
+        ("mask, alpha 0.3 under the cutoff", Material(alpha=0.3, alpha_mode="MASK"), 0.0, 0.0),
+        ("opaque ignores alpha", Material(alpha=0.3), 0.0, 1.0),
+        ("single-sided from behind", Material(), 180.0, 0.0),
+        ("double-sided from behind", Material(double_sided=True), 180.0, 1.0),
+    ):
+        asset = square(material, 2.0, 0.0, up=True)
+        found = mitsuba_render.foreground(
+            asset, np.eye(4), view(6.0, fov=8.0, turn=turn), texels, 2, 256, 1
+        )
+        report(
+            f"coverage: {name}",
+            found.coverage.mean(),
+            expected,
+            np.sqrt(expected * (1.0 - expected) / 256.0 / 1024.0) + 1e-9,
+        )
+    # Emission is seen by the camera and by a bounce; the mask hides the rest
+    glow = Material(base_color=(0.0,) * 3, roughness=1.0, emission=(2.0, 1.0, 0.5))
+    found = mitsuba_render.foreground(
+        square(glow, 2.0, 0.0, up=True), np.eye(4), camera, np.zeros_like(texels), 1, 16, 1
+    )
+    report("emission: seen by the camera, green", found.mean[..., 1].mean(), 1.0, 1e-6)
+
+
+def check_shadow() -> None:
+    """Match the configuration factor of a square over a plane; 1 where nothing is blocked."""
+    texels = np.ones((8, 16, 3), dtype=np.float32)
+    height, half = 1.0, 0.75
+    focal = 2000.0
+    # Look at the point under the square's centre, from the side
+    c2w = np.eye(4)
+    c2w[:3, :3] = [
+        [1.0, 0.0, 0.0],
+        [0.0, np.cos(0.1), np.sin(0.1)],
+        [0.0, -np.sin(0.1), np.cos(0.1)],
+    ]
+    c2w[:3, 3] = [0.0, 6.0 * np.sin(0.1), 6.0 * np.cos(0.1)]
+    camera = Camera(8, 8, focal, focal, 4.0, 4.0, c2w)
+    side = half / height
+    root = np.sqrt(1.0 + side**2)
+    factor = 4.0 / (2.0 * np.pi) * 2.0 * side / root * np.arctan(side / root)
+    for name, material, expected in (
+        ("opaque, single-sided from below", Material(), 1.0 - factor),
+        ("blend, alpha 0.5", Material(alpha=0.5, alpha_mode="BLEND"), 1.0 - 0.5 * factor),
+    ):
+        found = mitsuba_render.shadow(
+            square(material, 2.0 * half, height), np.eye(4), camera, texels, 4096, 2
+        )
+        error = float(np.sqrt(found.lit_variance[..., 0].sum())) / 64.0
+        report(f"shadow: unoccluded white plane, {name}", found.unoccluded.mean(), 1.0, 1e-3)
+        report(f"shadow: square above the plane, {name}", found.lit[..., 0].mean(), expected, error)
+        report("shadow: share of samples that see the plane", found.seen.mean(), 1.0, 1e-9)
+    far = mitsuba_render.shadow(square(Material(), 1e-3, 40.0), np.eye(4), camera, texels, 64, 2)
+    report(
+        "shadow: ratio is exactly 1 far from the object",
+        np.abs(far.lit / far.unoccluded - 1.0).max(),
+        0.0,
+        1e-30,
+    )
+
+
+def main() -> None:
+    """Run all checks."""
+    rng = np.random.default_rng(12345)
+    check_light(rng)
+    check_textures(rng)
+    check_material(rng)
+    check_layers(rng)
+    check_energy()
+    check_lambert()
+    check_coverage()
+    check_shadow()
+    check_stock_integrators(rng)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,112 @@
+"""Our renderer in the referee's terms: means with the variance that independent seeds show."""
+
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from warpir.render.device_scene import Placed, Proxy, Scene
+from warpir.render.renderer import Renderer, light_args
+from warpir.scene.asset import Asset
+from warpir.scene.camera import Camera
+from warpir.scene.light import Light
+
+FloatArray = NDArray[np.float64]
+
+SEED_COUNT = 32
+"""Independent runs behind each variance; quasi-random samples of one run are not independent."""
+
+
+class Foreground(NamedTuple):
+    """The object alone; the fields of `warpir.mitsuba.render.Foreground`."""
+
+    mean: FloatArray
+    variance: FloatArray
+    coverage: FloatArray
+
+
+class Ratio(NamedTuple):
+    """Shadow ratio of the plane, 1 where it is not seen, with the variance of the mean."""
+
+    mean: FloatArray
+    variance: FloatArray
+    coverage: FloatArray
+    """1 where the plane is seen, shape [H, W]."""
+
+
+def renderer(asset: Asset, matrix: FloatArray, camera: Camera, device: str = "cpu") -> Renderer:
+    """Set an object over the plane ``y = 0``."""
+    proxy = Proxy(np.array([0.0, 1.0, 0.0]), 0.0)
+    return Renderer(Scene([Placed(asset, matrix)], camera, proxy, device))
+
+
+def _moments(runs: list[FloatArray]) -> tuple[FloatArray, FloatArray]:
+    stack = np.stack(runs)
+    return stack.mean(axis=0), stack.var(axis=0, ddof=1) / len(runs)
+
+
+def foreground(
+    asset: Asset,
+    matrix: FloatArray,
+    camera: Camera,
+    texels: NDArray[np.float32],
+    depth: int,
+    spp: int,
+    seed: int,
+    device: str = "cpu",
+) -> Foreground:
+    """Render the object alone; arguments are those of `warpir.mitsuba.render.foreground`."""
+    render = renderer(asset, matrix, camera, device)
+    light = light_args(Light(texels=texels), render.device)
+    pixels = render.candidate_pixels(camera)
+    shape = (camera.height * camera.width,)
+    runs, covers = [], []
+    for k in range(SEED_COUNT):
+        out = render.foreground(
+            light, pixels, max(1, spp // SEED_COUNT), 1, depth, SEED_COUNT * seed + k
+        )
+        image = np.zeros((*shape, 3))
+        image[pixels] = out.radiance
+        cover = np.zeros(shape)
+        cover[pixels] = out.mask
+        runs.append(image.reshape(camera.height, camera.width, 3))
+        covers.append(cover.reshape(camera.height, camera.width))
+    return Foreground(*_moments(runs), np.mean(covers, axis=0))
+
+
+def shadow_ratio(
+    asset: Asset,
+    matrix: FloatArray,
+    camera: Camera,
+    texels: NDArray[np.float32],
+    spp: int,
+    seed: int,
+    device: str = "cpu",
+) -> Ratio:
+    """Render the shadow ratio; each run is long, since the quotient is biased by 1 / samples."""
+    render = renderer(asset, matrix, camera, device)
+    light = light_args(Light(texels=texels), render.device)
+    pixels = np.arange(camera.height * camera.width, dtype=np.int32)
+    may_see = np.ones(len(pixels), np.int32)
+    lit, unoccluded = [], []
+    for k in range(SEED_COUNT):
+        out = render.proxy(
+            light, pixels, may_see, max(1, spp // SEED_COUNT), 1, SEED_COUNT * seed + k
+        )
+        lit.append(out.lit.astype(np.float64))
+        unoccluded.append(out.unoccluded.astype(np.float64))
+    return quotient(np.stack(lit), np.stack(unoccluded), (camera.height, camera.width))
+
+
+def quotient(lit: FloatArray, unoccluded: FloatArray, size: tuple[int, int]) -> Ratio:
+    """Divide the means of several runs, shape [run, pixel, 3]; variance by linearisation."""
+    a, u = lit.mean(axis=0), unoccluded.mean(axis=0)
+    seen = u > 0.0
+    ratio = np.where(seen, a / np.where(seen, u, 1.0), 1.0)
+    residual = (lit - ratio * unoccluded) / np.where(seen, u, 1.0)
+    variance = np.where(seen, residual.var(axis=0, ddof=1) / len(lit), 0.0)
+    return Ratio(
+        ratio.reshape(*size, 3),
+        variance.reshape(*size, 3),
+        seen.any(-1).astype(float).reshape(size),
+    )

@@ -1,0 +1,477 @@
+"""How long does each renderer take for an image and its light gradient of a given error?
+
+    python -m benchmarks.speed [--quick] [--device cpu|cuda] [--json FILE]
+
+Runs `mis`, `transport` and Mitsuba 3 on the same scenes under the same maps, in one process and in
+turn, measures their errors against references of both renderers, and states how many times longer
+Mitsuba takes at equal error. Without ``--quick`` it also writes ``docs/speed_against_error.md`` and
+``.png`` again, from this run and from those of other devices in ``docs/speed/``.
+
+A step is foreground and shadow ratio, forward and backward to the map. What is built once per scene
+(meshes, trees, kernels) is not timed; what `transport` traces once is, and is stated.
+"""
+
+import argparse
+import gc
+import json
+import sys
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field, replace
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from benchmarks.measure import context
+from benchmarks.speed.candidates import (
+    PARTS,
+    Bench,
+    Candidate,
+    MisPart,
+    MitsubaPart,
+    Step,
+    Transport,
+    use_device,
+)
+from benchmarks.speed.ratios import combined, ratios
+from benchmarks.speed.references import References
+from benchmarks.speed.report import keep_run, summary, write_documents
+from benchmarks.speed.scenes import NAMES, make_scene
+from warpir.render.renderer import choose_device, default_threads
+
+RUN_SEED = 100
+"""First seed of what is measured; references and warm-up have others."""
+ERRORS = ("rmse_image", "rmse_image_all", "rmse_gradient")
+TRANSPORT_STEPS = 10
+"""Steps timed on each traced transport."""
+
+
+@dataclass(frozen=True)
+class Plan:
+    """What a run measures."""
+
+    width: int
+    height: int
+    maps: tuple[tuple[int, int], ...]
+    """Rows of the map for the foreground and for the shadow; the first pair is the main one."""
+    mis_spp: tuple[int, ...]
+    mitsuba_spp: tuple[int, ...]
+    transport: tuple[dict[str, Any], ...]
+    """Settings beside the map, see `Transport`; maps after the first take the first alone."""
+    reference_spp: int
+    own_reference_spp: int
+    rounds: int
+    """Runs of each candidate, in turn with all others."""
+    transport_rounds: int
+    """Rounds in which transport is traced again."""
+    budget_s: float
+    """A candidate that would take longer than this in all is not run again."""
+
+
+FULL = Plan(
+    384,
+    256,
+    ((32, 32), (16, 16), (48, 48)),
+    (4, 16, 64, 256),
+    (4, 16, 64, 256, 1024),
+    (
+        {},
+        {"subsamples": 16, "paths": 32, "bright_directions": 256},
+        {"subsamples": 64, "paths": 128, "bright_directions": 4096},
+        {"expects_light": False},
+    ),
+    2048,
+    512,
+    5,
+    2,
+    30.0,
+)
+QUICK = Plan(
+    96,
+    64,
+    ((32, 32),),
+    (4, 16, 64),
+    (4, 64, 1024),
+    ({},),
+    2048,
+    512,
+    3,
+    1,
+    2.0,
+)
+WARM_TRANSPORT = {"subsamples": 1, "bright_directions": 0, "paths": 1}
+
+
+@dataclass
+class Runs:
+    """What was measured of one candidate."""
+
+    seconds_forward: list[float] = field(default_factory=list)
+    seconds_step: list[float] = field(default_factory=list)
+    seconds_traced: list[float] = field(default_factory=list)
+    rmse: dict[str, list[dict[str, float]]] = field(default_factory=dict)
+    """By part: of ``image``, ``image_all`` and ``gradient``, one record per seed."""
+    peak_mib: float = 0.0
+    bytes: int = 0
+
+    @property
+    def spent(self) -> float:
+        """All timed seconds."""
+        return sum(self.seconds_forward) + sum(self.seconds_step) + sum(self.seconds_traced)
+
+    def time(self, candidate: Candidate, seed: int) -> Callable[[], Step]:
+        """Run the candidate forward and for one step."""
+        start = time.perf_counter()
+        candidate.forward(seed)
+        middle = time.perf_counter()
+        download = candidate.step(seed + 1000)
+        end = time.perf_counter()
+        self.seconds_forward.append(middle - start)
+        self.seconds_step.append(end - middle)
+        return download
+
+    def judge(self, step: Step, references: References, heights: dict[str, int]) -> None:
+        """Add the errors of a step's image and gradient."""
+        for part, values in step.items():
+            errors = references.by_map[part, heights[part]].rmse(values)
+            self.rmse.setdefault(part, []).append(errors)
+
+    def errors(self, part: str) -> dict[str, float]:
+        """Root mean square over seeds."""
+        records = self.rmse[part]
+        return {
+            f"rmse_{name}": float(np.sqrt(np.mean([r[name] ** 2 for r in records])))
+            for name in records[0]
+        }
+
+
+def log(text: str) -> None:
+    """Say on the error stream how far the run is."""
+    print(f"[{time.perf_counter() - STARTED:6.1f} s] {text}", file=sys.stderr, flush=True)
+
+
+STARTED = time.perf_counter()
+
+
+def measure_scene(
+    bench: Bench, plan: Plan, references: References, reasons: list[str]
+) -> list[dict[str, Any]]:
+    """Run every candidate of a scene in turn; return its rows."""
+    parts: list[MisPart | MitsubaPart] = []
+    for part in PARTS:
+        for k, height in enumerate(bench.heights[part]):
+            # Maps after the first: every other point, the curves are straight
+            step = 1 if k == 0 else 2
+            parts += [MisPart(bench, part, height, spp) for spp in plan.mis_spp[::step]]
+            parts += [MitsubaPart(bench, part, height, spp) for spp in plan.mitsuba_spp[::step]]
+    wholes = [(plan.maps[0], settings) for settings in plan.transport]
+    wholes += [(heights, plan.transport[0]) for heights in plan.maps[1:]]
+    name = bench.scene.name
+    try:
+        Transport(bench, plan.maps[0], WARM_TRANSPORT, seed=0).warm()
+    except ImportError as error:
+        reasons.append(f"transport: {error}")
+        wholes = []
+    warmed: set[tuple[Any, ...]] = set()
+    for candidate in parts:
+        if candidate.warm_key not in warmed:
+            warmed.add(candidate.warm_key)
+            candidate.warm()
+    log(f"{name}: kernels are warm")
+
+    part_runs = [Runs() for _ in parts]
+    whole_runs = [Runs() for _ in wholes]
+    for k in range(plan.rounds):
+        for candidate, runs in zip(parts, part_runs, strict=True):
+            if k > 0 and runs.spent * (k + 1) / k > plan.budget_s:
+                continue
+            if k == 0:
+                bench.memory.start()
+            step = runs.time(candidate, RUN_SEED + k)()
+            if k == 0:
+                runs.peak_mib = bench.memory.stop()
+            runs.judge(step, references, {candidate.part: candidate.height})
+        if k < plan.transport_rounds:
+            for (heights, settings), runs in zip(wholes, whole_runs, strict=True):
+                _measure_transport(bench, heights, settings, references, RUN_SEED + k, runs)
+        log(f"{name}: round {k + 1} of {plan.rounds}")
+
+    resolution = references.resolution()
+    rows = []
+    for heights in plan.maps:
+        for which in (MitsubaPart.integrator, MisPart.integrator):
+            rows += _sweep_rows(bench, which, heights, parts, part_runs)
+    rows += [
+        _transport_row(heights, settings, runs)
+        for (heights, settings), runs in zip(wholes, whole_runs, strict=True)
+    ]
+    for row in rows:
+        fg, shadow = row.pop("heights")
+        row["scene"], row["map"] = name, f"{fg}:{shadow}"
+        row["rmse_resolution"] = combined(resolution["foreground", fg], resolution["ratio", shadow])
+    return rows
+
+
+def _measure_transport(
+    bench: Bench,
+    heights: tuple[int, int],
+    settings: dict[str, Any],
+    references: References,
+    seed: int,
+    runs: Runs,
+) -> None:
+    """Trace once and time several steps; the frozen samples have one error, whatever the step."""
+    bench.memory.start()
+    transport = Transport(bench, heights, settings, seed)
+    runs.seconds_traced.append(transport.seconds_traced)
+    runs.bytes = transport.bytes
+    transport.warm()
+    for k in range(TRANSPORT_STEPS):
+        download = runs.time(transport, seed + k)
+    runs.peak_mib = max(runs.peak_mib, bench.memory.stop())
+    runs.judge(download(), references, dict(zip(PARTS, heights, strict=True)))
+    del transport, download
+    gc.collect()
+
+
+def _part(runs: Runs, part: str) -> dict[str, float]:
+    return {
+        "seconds_forward": float(np.median(runs.seconds_forward)),
+        "seconds_step": float(np.median(runs.seconds_step)),
+        **runs.errors(part),
+        "runs": len(runs.seconds_step),
+        "seconds_step_spread": _spread(runs.seconds_step),
+    }
+
+
+def _spread(seconds: Sequence[float]) -> float:
+    """Half the interquartile range."""
+    low, high = np.percentile(seconds, [25, 75])
+    return float(0.5 * (high - low))
+
+
+def _sweep_rows(
+    bench: Bench,
+    which: str,
+    heights: tuple[int, int],
+    parts: Sequence[MisPart | MitsubaPart],
+    runs: Sequence[Runs],
+) -> list[dict[str, Any]]:
+    """Join both parts at the same samples per pixel into rows."""
+    found = {
+        (c.part, c.spp): r
+        for c, r in zip(parts, runs, strict=True)
+        if c.integrator == which and c.height == heights[PARTS.index(c.part)]
+    }
+    rows = []
+    for spp in sorted({spp for _, spp in found}):
+        if not all((part, spp) in found for part in PARTS):
+            continue
+        by_part = {part: _part(found[part, spp], part) for part in PARTS}
+        settings: dict[str, Any] = {"spp": spp}
+        if which == MitsubaPart.integrator:
+            settings |= {"integrator": bench.mitsuba_integrator, "sampler": bench.sampler}
+        rows.append(
+            {
+                "integrator": which,
+                "settings": settings,
+                "heights": heights,
+                **{
+                    key: by_part["foreground"][key] + by_part["ratio"][key]
+                    for key in ("seconds_forward", "seconds_step")
+                },
+                **{
+                    key: combined(by_part["foreground"][key], by_part["ratio"][key])
+                    for key in ERRORS
+                },
+                # One after the other: the larger of the two
+                "peak_mib": round(max(found[part, spp].peak_mib for part in PARTS), 1),
+                "parts": by_part,
+            }
+        )
+    return rows
+
+
+def _transport_row(
+    heights: tuple[int, int], settings: dict[str, Any], runs: Runs
+) -> dict[str, Any]:
+    errors = {part: runs.errors(part) for part in PARTS}
+    return {
+        "integrator": "transport",
+        "settings": settings,
+        "heights": heights,
+        "seconds_forward": float(np.median(runs.seconds_forward)),
+        "seconds_step": float(np.median(runs.seconds_step)),
+        "seconds_step_spread": _spread(runs.seconds_step),
+        "seconds_traced": float(np.median(runs.seconds_traced)),
+        **{key: combined(*(errors[part][key] for part in PARTS)) for key in ERRORS},
+        "peak_mib": round(runs.peak_mib, 1),
+        "transport_mib": round(runs.bytes / 2**20, 1),
+        "runs": len(runs.seconds_step),
+        "parts": errors,
+    }
+
+
+def disagreements(agreement: Sequence[dict[str, Any]], rows: Sequence[dict[str, Any]]) -> list[str]:
+    """Name what the two renderers' references differ in by too much (design, 7.3).
+
+    Too much is a tenth of the smallest error compared, where chance does not explain it.
+    """
+    found = []
+    for entry in agreement:
+        part, height = entry["part"], entry["height"]
+        k = PARTS.index(part)
+        here = [
+            r
+            for r in rows
+            if r["scene"] == entry["scene"] and int(r["map"].split(":")[k]) == height
+        ]
+        for quantity in ("image", "gradient"):
+            least = min((r["parts"][part][f"rmse_{quantity}"] for r in here), default=np.inf)
+            apart = entry[quantity]["without_noise"]
+            if apart > max(0.1 * least, entry[quantity]["resolved"]):
+                found.append(
+                    f"{entry['scene']}, {part} {quantity}, map {height}: the references differ by "
+                    f"{100 * apart:.3f} % beyond their noise; the smallest error compared is "
+                    f"{100 * least:.3f} %"
+                )
+    return found
+
+
+def command(options: argparse.Namespace) -> str:
+    """Return the command that measures the same again; where it writes does not matter."""
+    words = ["python -m benchmarks.speed"]
+    words += ["--quick"] if options.quick else []
+    words += ["--scenes", *options.scenes] if options.scenes != list(NAMES) else []
+    words += [f"--maps {' '.join(options.maps)}"] if options.maps else []
+    for name in ("device", "reference_spp", "own_reference_spp", "rounds", "budget"):
+        value = getattr(options, name)
+        words += [] if value is None else [f"--{name.replace('_', '-')} {value}"]
+    words += [f"--threads {options.threads}"] if options.threads else []
+    words += ["--no-freeze"] if options.no_freeze else []
+    words += [f"--sampler {options.sampler}"] if options.sampler != "ldsampler" else []
+    return " ".join(words)
+
+
+def main(arguments: list[str] | None = None) -> None:
+    """Measure, write the JSON and, after a full run, the documents."""
+    parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
+    parser.add_argument("--quick", action="store_true", help="64 rows, short sweeps: two minutes")
+    parser.add_argument("--scenes", nargs="*", default=list(NAMES), choices=NAMES)
+    parser.add_argument(
+        "--assets",
+        type=Path,
+        default=Path("../shared/data"),
+        help="folder that holds mesh/ and hdri/",
+    )
+    parser.add_argument("--device", default=None, help="cpu or cuda")
+    parser.add_argument("--threads", type=int, default=0, help="CPU threads of every renderer")
+    parser.add_argument("--sampler", default="ldsampler", help="of Mitsuba")
+    parser.add_argument(
+        "--no-freeze", action="store_true", help="let Mitsuba's Python trace every call anew"
+    )
+    parser.add_argument(
+        "--reference-spp", type=int, default=None, help="of Mitsuba's reference, twice a power of 4"
+    )
+    parser.add_argument("--own-reference-spp", type=int, default=None, help="of mis's reference")
+    parser.add_argument(
+        "--maps", nargs="*", default=None, help="rows of the object's map and the shadow's: 32:32"
+    )
+    parser.add_argument("--rounds", type=int, default=None)
+    parser.add_argument("--budget", type=float, default=None, help="seconds per candidate")
+    parser.add_argument("--cache", type=Path, default=Path("out/speed"), help="of references")
+    parser.add_argument("--json", type=Path, default=None, help="write rows and ratios here")
+    parser.add_argument(
+        "--docs", type=Path, default=None, help="write table and plot here (docs, unless --quick)"
+    )
+    options = parser.parse_args(arguments)
+    plan = QUICK if options.quick else FULL
+    plan = replace(
+        plan,
+        reference_spp=options.reference_spp or plan.reference_spp,
+        own_reference_spp=options.own_reference_spp or plan.own_reference_spp,
+        rounds=options.rounds or plan.rounds,
+        budget_s=options.budget or plan.budget_s,
+    )
+    if options.maps:
+        pairs = [tuple(int(h) for h in pair.split(":")) for pair in options.maps]
+        plan = replace(plan, maps=tuple((pair[0], pair[-1]) for pair in pairs))
+    device = choose_device(options.device)
+    threads = options.threads or default_threads()
+    use_device("cpu" if device == "cpu" else "cuda", threads)
+
+    import drjit as dr
+    import mitsuba as mi
+
+    rows: list[dict[str, Any]] = []
+    agreement: list[dict[str, Any]] = []
+    scenes: list[dict[str, Any]] = []
+    reasons: list[str] = []
+    for name in options.scenes:
+        try:
+            scene = make_scene(name, plan.width, plan.height, options.assets, device, threads)
+        except FileNotFoundError as error:
+            reasons.append(f"{name}: {error} (--assets)")
+            log(f"skipped {reasons[-1]}")
+            continue
+        bench = Bench(scene, plan.maps, options.sampler, not options.no_freeze)
+        references = References(
+            bench,
+            plan.reference_spp,
+            plan.own_reference_spp,
+            options.cache,
+            log,
+        )
+        rows += measure_scene(bench, plan, references, reasons)
+        agreement += [
+            {"scene": name, "part": part, "height": height, **reference.agreement()}
+            for (part, height), reference in references.by_map.items()
+        ]
+        scenes.append(
+            {
+                "name": name,
+                "triangles": scene.triangles,
+                "depth": scene.depth,
+                "object_pixels": len(scene.object_pixels),
+                "proxy_pixels": len(scene.proxy_pixels),
+            }
+        )
+        del bench, references
+        gc.collect()
+        dr.flush_malloc_cache()
+    wp_device = scene.renderer.device
+    conditions = {
+        **context(wp_device, threads),
+        "mitsuba": mi.__version__,
+        "drjit": dr.__version__,
+        "variant": mi.variant(),
+        "torch": version("torch"),
+        "quick": options.quick,
+        "size": [plan.width, plan.height],
+        "command": "python -m benchmarks.speed " + " ".join(arguments or sys.argv[1:]),
+        "seconds": round(time.perf_counter() - STARTED, 1),
+    }
+    for row in rows:
+        row["device"] = conditions["device"]
+    result = {
+        "conditions": conditions,
+        "scenes": scenes,
+        "skipped": reasons,
+        "ratios": ratios(rows),
+        "references": agreement,
+        "disagreements": disagreements(agreement, rows),
+        "rows": rows,
+    }
+    if options.json is not None:
+        options.json.write_text(json.dumps(result, indent=1) + "\n", encoding="utf-8")
+    print(summary(result))
+    docs = options.docs or (None if options.quick else Path("docs"))
+    if docs is not None:
+        keep_run(result, docs)
+        write_documents(docs)
+
+
+if __name__ == "__main__":
+    main()

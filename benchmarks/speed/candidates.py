@@ -1,0 +1,292 @@
+"""What competes in `benchmarks.speed`, behind one interface each.
+
+`mis` and Mitsuba render foreground and shadow ratio apart, so that each part has a sweep of its
+own; `transport` makes both at once.
+"""
+
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any, Protocol
+
+import numpy as np
+import torch
+import warp as wp
+from numpy.typing import NDArray
+from torch import Tensor
+
+from benchmarks.speed.memory import PeakMemory
+from benchmarks.speed.scenes import SpeedScene
+from warpir.render.integrator import Integrator, LightTensors, Radiance
+from warpir.render.mis import MisIntegrator
+from warpir.scene.light import Light
+
+FloatArray = NDArray[np.float64]
+Texels = NDArray[np.float32]
+
+PARTS = ("foreground", "ratio")
+WARM_SEED = 1
+
+Step = dict[str, tuple[FloatArray, FloatArray]]
+"""By part: the image [pixel, 3] and the gradient of its weighted sum [He, We, 3]."""
+
+
+class Bench:
+    """One scene, its maps, and what all candidates share.
+
+    Args:
+        scene: What is rendered.
+        maps: Rows of the map for the foreground and for the shadow, by pair.
+        sampler: Of Mitsuba.
+        freeze: Whether Mitsuba's functions are traced once.
+    """
+
+    def __init__(
+        self,
+        scene: SpeedScene,
+        maps: Sequence[tuple[int, int]],
+        sampler: str = "ldsampler",
+        freeze: bool = True,
+    ) -> None:
+        from benchmarks.speed.mitsuba import MitsubaScene
+
+        self.scene, self.sampler = scene, sampler
+        # Stock prb does not see ToyCar's emission texture, and takes twice gltf_path's time there
+        self.mitsuba_integrator = "gltf_path" if scene.name == "toycar" else "prb"
+        self.heights = {
+            part: list(dict.fromkeys(pair[k] for pair in maps)) for k, part in enumerate(PARTS)
+        }
+        every = sorted({height for pair in maps for height in pair})
+        self.texels = {height: scene.texels(height) for height in every}
+        self.mitsuba = {
+            height: MitsubaScene(scene, texels, self.mitsuba_integrator, sampler, freeze)
+            for height, texels in self.texels.items()
+        }
+        self.memory = PeakMemory(scene.renderer.device)
+        self.device = torch.device("cuda" if scene.renderer.device.is_cuda else "cpu")
+        self.weights = {
+            "foreground": torch.tensor(scene.weight_fg, device=self.device),
+            "ratio": torch.tensor(scene.weight_ratio, device=self.device),
+        }
+
+    def leaf(self, height: int, grad: bool = True) -> Tensor:
+        """Upload a map as the optimiser holds it."""
+        return torch.tensor(self.texels[height], device=self.device, requires_grad=grad)
+
+    def synchronize(self) -> None:
+        """Wait for our side of the device."""
+        wp.synchronize_device(self.scene.renderer.device)
+        if self.device.type == "cuda":
+            torch.cuda.synchronize()
+
+
+class Candidate(Protocol):
+    """One renderer with its settings on one scene."""
+
+    integrator: str
+    warm_key: tuple[Any, ...]
+    """Candidates of one key compile the same kernels."""
+
+    def warm(self) -> None:
+        """Compile everything that the timed calls use."""
+
+    def forward(self, seed: int) -> None:
+        """Render, to the end."""
+
+    def step(self, seed: int) -> Callable[[], Step]:
+        """Render and differentiate, to the end; calling what is returned downloads the result."""
+
+
+class MisPart:
+    """`mis` on one part."""
+
+    integrator = "mis"
+
+    def __init__(self, bench: Bench, part: str, height: int, spp: int) -> None:
+        scene = bench.scene
+        self.bench, self.part, self.height, self.spp = bench, part, height, spp
+        self.warm_key = (self.integrator, part)
+        self.mis = MisIntegrator(
+            scene.renderer, scene.object_pixels, scene.proxy_pixels, spp, 1, scene.depth
+        )
+        # Emptied after it was made: the plane must know where the object may hide it
+        nothing = np.zeros(0, np.int32)
+        if part == "foreground":
+            self.mis.proxy_pixels = self.mis.may_see_object = nothing
+        else:
+            self.mis.object_pixels = nothing
+
+    def warm(self) -> None:
+        """Compile."""
+        MisPart(self.bench, self.part, self.height, 1).step(WARM_SEED)
+
+    def forward(self, seed: int) -> None:
+        """Render."""
+        self._forward(seed)
+        self.bench.synchronize()
+
+    def image(self, seed: int) -> FloatArray:
+        """Return what `forward` renders, shape [pixel, 3]."""
+        return numpy(self._forward(seed))
+
+    def _forward(self, seed: int) -> Tensor:
+        light = LightTensors(texels=self.bench.leaf(self.height, grad=False))
+        with torch.no_grad():
+            return self._image(self.mis.radiance(light, light, seed))
+
+    def step(self, seed: int) -> Callable[[], Step]:
+        """Render and differentiate."""
+        leaf = self.bench.leaf(self.height)
+        light = LightTensors(texels=leaf)
+        image = self._image(self.mis.radiance(light, light, seed))
+        (image * self.bench.weights[self.part]).sum().backward()  # type: ignore[no-untyped-call]
+        self.bench.synchronize()
+        return lambda: {self.part: (numpy(image), numpy(leaf.grad))}
+
+    def _image(self, radiance: Radiance) -> Tensor:
+        return radiance.foreground if self.part == "foreground" else shadow_ratio(radiance)
+
+
+class MitsubaPart:
+    """Mitsuba on one part."""
+
+    integrator = "mitsuba"
+
+    def __init__(self, bench: Bench, part: str, height: int, spp: int) -> None:
+        self.bench, self.part, self.height, self.spp = bench, part, height, spp
+        self.target = bench.mitsuba[height]
+        self.pass_spp = self.target.largest_pass(part, spp)
+        self.warm_key = (self.integrator, part, height, self.pass_spp)
+
+    def warm(self) -> None:
+        """Compile and record, with the samples of one pass; a scene's first call records twice."""
+        one = MitsubaPart(self.bench, self.part, self.height, self.pass_spp)
+        for seed in range(WARM_SEED, WARM_SEED + (2 if self.pass_spp < 100 else 1)):
+            one.forward(seed)
+            one.step(seed)
+
+    def forward(self, seed: int) -> None:
+        """Render."""
+        render = self.target.foreground if self.part == "foreground" else self.target.ratio
+        render(self.spp, seed)
+        mitsuba_synchronize()
+
+    def step(self, seed: int) -> Callable[[], Step]:
+        """Render and differentiate; the foreground's two passes have seeds of their own."""
+        if self.part == "foreground":
+            image = self.target.foreground(self.spp, seed)
+            gradient = self.target.foreground_gradient(self.spp, seed + 50_000)
+            mitsuba_synchronize()
+            return lambda: {
+                self.part: (self.target.objects(image), np.asarray(gradient, dtype=np.float64))
+            }
+        ratio, gradient = self.target.ratio_step(self.spp, seed)
+        mitsuba_synchronize()
+        return lambda: {
+            self.part: (np.asarray(ratio, np.float64).T, np.asarray(gradient, dtype=np.float64))
+        }
+
+
+class Transport:
+    """`transport` on both parts, traced when made.
+
+    Args:
+        bench: The scene.
+        heights: Rows of the map for the foreground and for the shadow.
+        settings: Fields of ``TransportSettings``, and ``expects_light``: whether tracing puts
+            directions where this scene's light is, or evenly everywhere.
+        seed: Base seed of the frozen samples.
+
+    Raises:
+        ImportError: This checkout has no `transport`.
+    """
+
+    integrator = "transport"
+
+    def __init__(
+        self, bench: Bench, heights: tuple[int, int], settings: dict[str, Any], seed: int
+    ) -> None:
+        from warpir.render.transport.integrator import TransportIntegrator, TransportSettings
+
+        self.bench, self.heights = bench, heights
+        self.warm_key = (self.integrator,)
+        fields = {k: v for k, v in settings.items() if k != "expects_light"}
+        scene = bench.scene
+        self.traced: Integrator
+        self.traced = made = TransportIntegrator(
+            scene.renderer,
+            scene.object_pixels,
+            scene.proxy_pixels,
+            depth=scene.depth,
+            settings=TransportSettings(height_fg=heights[0], height_shadow=heights[1], **fields),
+            expected=Light(scene.lobes) if settings.get("expects_light", True) else None,
+            seed=seed,
+        )
+        self.seconds_traced = float(made.seconds_traced)
+        self.bytes = int(made.bytes)
+
+    def warm(self) -> None:
+        """Touch everything once."""
+        self.forward(WARM_SEED)
+        self.step(WARM_SEED)
+
+    def forward(self, seed: int) -> None:
+        """Render."""
+        with torch.no_grad():
+            lights = (LightTensors(texels=self.bench.leaf(h, grad=False)) for h in self.heights)
+            shadow_ratio(self.traced.radiance(*lights, seed))
+        self.bench.synchronize()
+
+    def step(self, seed: int) -> Callable[[], Step]:
+        """Render and differentiate."""
+        leaves = [self.bench.leaf(height) for height in self.heights]
+        out = self.traced.radiance(*(LightTensors(texels=leaf) for leaf in leaves), seed)
+        images = (out.foreground, shadow_ratio(out))
+        weights = self.bench.weights
+        loss = (images[0] * weights["foreground"]).sum() + (images[1] * weights["ratio"]).sum()
+        loss.backward()  # type: ignore[no-untyped-call]
+        self.bench.synchronize()
+        return lambda: {
+            part: (numpy(image), numpy(leaf.grad))
+            for part, image, leaf in zip(PARTS, images, leaves, strict=True)
+        }
+
+
+def mitsuba_synchronize() -> None:
+    """Wait for what Dr.Jit has queued."""
+    import drjit as dr
+
+    dr.sync_thread()
+
+
+def shadow_ratio(radiance: Radiance) -> Tensor:
+    """Return lit / unoccluded, 1 where no light arrives, shape [proxy_pixel, 3]."""
+    seen = radiance.unoccluded > 0.0
+    below = torch.where(seen, radiance.unoccluded, torch.ones_like(radiance.unoccluded))
+    return torch.where(seen, radiance.lit / below, torch.ones_like(below))
+
+
+def numpy(tensor: Tensor | None) -> FloatArray:
+    """Download as float64."""
+    assert tensor is not None
+    return tensor.detach().double().cpu().numpy()
+
+
+def use_device(device: str, threads: int) -> None:
+    """Choose Mitsuba's variant and give everyone the same number of cores.
+
+    Must come before anything imports `benchmarks.speed.mitsuba`.
+    """
+    import os
+
+    if device == "cpu" and "DRJIT_LIBLLVM_PATH" not in os.environ:
+        # LLVM 15, which Dr.Jit may find first, aborts in code generation
+        found = sorted(Path("/usr/lib").glob("*/libLLVM.so.2?.*"))
+        if found:
+            os.environ["DRJIT_LIBLLVM_PATH"] = str(found[-1])
+    import mitsuba as mi
+
+    mi.set_variant("llvm_ad_rgb" if device == "cpu" else "cuda_ad_rgb")
+    import drjit as dr
+
+    dr.set_thread_count(threads)
+    torch.set_num_threads(threads)

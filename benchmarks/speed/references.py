@@ -1,0 +1,301 @@
+"""Converged images and gradients of both renderers, kept in a folder that git ignores.
+
+Each renderer's reference is two independent halves: their difference is its noise, and products
+over halves or over renderers are free of noise altogether.
+"""
+
+import hashlib
+import json
+from collections.abc import Callable
+from dataclasses import astuple, dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from benchmarks.speed.candidates import PARTS, Bench, MisPart, MitsubaPart, numpy
+from benchmarks.speed.ratios import rmse
+from warpir.render.integrator import LightTensors
+
+FloatArray = NDArray[np.float64]
+
+TRIMMED = 0.02
+"""Share of pixels left out of an image's error: those in which `mis` is noisiest. A handful of
+mirrored suns holds 99 % of ToyCar's squared error in every renderer, and drowns the rest; the error
+with them is stated beside."""
+PILOT_RUNS, PILOT_SPP = 32, 16
+"""Runs that tell which pixels these are. The references' own halves may not: where they happen to
+agree, their products are no longer free of noise."""
+SEED = 10_000
+CHUNK = 64
+"""Samples per pixel of one run of `mis`."""
+
+
+@dataclass(frozen=True)
+class Reference:
+    """One part under one map."""
+
+    own: tuple[FloatArray, FloatArray]
+    """Our image, shape [2, pixel, 3], and gradient, shape [2, He, We, 3]."""
+    mitsuba: tuple[FloatArray, FloatArray]
+    """Mitsuba's."""
+    kept: NDArray[np.bool_]
+    """The pixels that count, shape [pixel]."""
+
+    def rmse(self, values: tuple[FloatArray, FloatArray]) -> dict[str, float]:
+        """Return relative RMSEs of an image and a gradient, free of the references' noise."""
+        found = {}
+        for name, k, where in (
+            ("image", 0, self.kept),
+            ("image_all", 0, slice(None)),
+            ("gradient", 1, slice(None)),
+        ):
+            halves = [self.own[k][:, where], self.mitsuba[k][:, where]]
+            # By inverse variance: the less noisy renderer counts more
+            weights = [1.0 / max(float(np.square(h[0] - h[1]).mean()), 1e-30) for h in halves]
+            found[name] = rmse(
+                values[k][where], np.concatenate(halves), np.repeat(weights, 2) / sum(weights)
+            )
+        return found
+
+    def agreement(self) -> dict[str, dict[str, float]]:
+        """Compare both renderers: relative RMSE of the difference, of noise, and without noise.
+
+        ``without_noise`` is a product of independent halves; ``resolved`` is the least that is not
+        chance: four standard errors, pixels and texels taken as independent.
+        """
+        found = {}
+        for name, own, other in (
+            ("image", self.own[0][:, self.kept], self.mitsuba[0][:, self.kept]),
+            ("gradient", self.own[1], self.mitsuba[1]),
+        ):
+            size = float(np.square(0.5 * (own + other)).mean())
+            difference = np.square(own.mean(axis=0) - other.mean(axis=0)).mean()
+            noise = sum(np.square(0.5 * (h[0] - h[1])).mean() for h in (own, other))
+            product = ((own[0] - other[0]) * (own[1] - other[1])).mean(axis=-1)
+            apart, chance = product.mean(), 4.0 * product.std() / np.sqrt(product.size)
+            found[name] = {
+                "difference": float(np.sqrt(difference / size)),
+                "noise": float(np.sqrt(noise / size)),
+                "without_noise": float(np.sqrt(max(float(apart), 0.0) / size)),
+                "resolved": float(np.sqrt(chance / size)),
+            }
+        return found
+
+
+class References:
+    """Makes references of one scene, or reads them from the cache.
+
+    Args:
+        bench: The scene.
+        spp: Mitsuba's samples per pixel under the main map; others have a quarter.
+        own_spp: Samples per pixel of `mis`, likewise.
+        cache: Folder of the files.
+        log: Told what was made.
+    """
+
+    def __init__(
+        self, bench: Bench, spp: int, own_spp: int, cache: Path, log: Callable[[str], None]
+    ) -> None:
+        self.bench, self.cache, self.log = bench, cache, log
+        self.spp = {"own": own_spp, "mitsuba": spp}
+        self.by_map: dict[tuple[str, int], Reference] = {}
+        for part in PARTS:
+            self.kept = self._quiet(part)
+            for k, height in enumerate(bench.heights[part]):
+                self.by_map[part, height] = self._converge(part, height, 1 if k == 0 else 4)
+
+    def _converge(self, part: str, height: int, share: int) -> Reference:
+        pixels = len(self.bench.weights[part])
+        made = []
+        for name, make in (("own", _own), ("mitsuba", _mitsuba)):
+            spp = self.spp[name] // share
+            flat = self._cached(
+                f"{name}, {part}, map {height}, {spp} samples",
+                {"renderer": name, "part": part, "spp": spp, "map": self._hash(part, height)},
+                lambda make=make, spp=spp: make(self.bench, part, height, spp),
+            )
+            image, gradient = np.split(flat, [3 * pixels], axis=1)
+            made.append((image.reshape(2, -1, 3), gradient.reshape(2, height, 2 * height, 3)))
+        return Reference(made[0], made[1], self.kept)
+
+    def _quiet(self, part: str) -> NDArray[np.bool_]:
+        """Return which pixels are not among the noisiest, shape [pixel]."""
+        height = self.bench.heights[part][0]
+        variance = self._cached(
+            f"noise, {part}",
+            {"pilot": [PILOT_RUNS, PILOT_SPP], "part": part, "map": self._hash(part, height)},
+            lambda: _variance(self.bench, part, height),
+        )
+        return quiet(variance)
+
+    def resolution(self) -> dict[tuple[str, int], float]:
+        """Relative RMSE between images under the map and under the lobes it was made of."""
+        found = {}
+        for part in PARTS:
+            spp = self.spp["own"]
+            exact = self._cached(
+                f"own, {part}, lobes, {spp} samples",
+                {"renderer": "own", "part": part, "spp": spp, "map": self._hash(part, 0)},
+                lambda part=part, spp=spp: _own_lobes(self.bench, part, spp),
+            ).reshape(2, -1, 3)
+            for height in self.bench.heights[part]:
+                reference = self.by_map[part, height]
+                own, other, *lobes = (
+                    image[reference.kept]
+                    for image in (
+                        reference.own[0].mean(axis=0),
+                        reference.mitsuba[0].mean(axis=0),
+                        *exact,
+                    )
+                )
+                apart = float(((own - lobes[0]) * (other - lobes[1])).mean())
+                size = float((lobes[0] * lobes[1]).mean())
+                found[part, height] = float(np.sqrt(max(apart, 0.0) / size))
+        return found
+
+    def _cached(self, what: str, key: dict[str, Any], make: Callable[[], FloatArray]) -> FloatArray:
+        name = hashlib.sha256(json.dumps(key, sort_keys=True).encode()).hexdigest()[:24]
+        path = self.cache / f"{name}.npy"
+        if path.exists():
+            kept: FloatArray = np.load(path)
+            return kept
+        made = make()
+        self.cache.mkdir(parents=True, exist_ok=True)
+        np.save(path, made)
+        self.log(f"{self.bench.scene.name}: reference of {what}")
+        return made
+
+    def _hash(self, part: str, height: int) -> str:
+        """Digest of all that a reference depends on but its samples; height 0: the lobes."""
+        scene = self.bench.scene
+        light = [self.bench.texels[height]] if height else list(astuple(scene.lobes))
+        settings: tuple[Any, ...] = (scene.camera.width, scene.camera.fx)
+        if part == "foreground":
+            arrays = [scene.object_pixels, scene.weight_fg]
+            materials = [
+                (m.base_color, m.metallic, m.roughness, m.emission) for m in scene.asset.materials
+            ]
+            settings += (scene.depth, materials, self.bench.mitsuba_integrator)
+        else:
+            arrays = [scene.proxy_pixels, scene.weight_ratio]
+        arrays += [*light, scene.matrix, scene.camera.c2w]
+        arrays += [p.positions for p in scene.asset.primitives]
+        digest = hashlib.sha256(repr(settings).encode())
+        for array in arrays:
+            digest.update(np.ascontiguousarray(array).tobytes())
+        return digest.hexdigest()
+
+
+def quiet(variance: FloatArray) -> NDArray[np.bool_]:
+    """Return which pixels are not among the noisiest, shape [pixel]."""
+    kept = np.ones(len(variance), bool)
+    kept[np.argsort(variance, kind="stable")[len(variance) - int(TRIMMED * len(variance)) :]] = (
+        False
+    )
+    return kept
+
+
+def _variance(bench: Bench, part: str, height: int) -> FloatArray:
+    """Variance of `mis` over seeds, summed over channels, shape [pixel]."""
+    run = MisPart(bench, part, height, PILOT_SPP)
+    images = np.stack([run.image(SEED // 2 + k) for k in range(PILOT_RUNS)])
+    variance: FloatArray = images.var(axis=0).sum(axis=-1)
+    return variance
+
+
+def _flat(image: FloatArray, gradient: FloatArray) -> FloatArray:
+    return np.concatenate([image.ravel(), gradient.ravel()])
+
+
+def _own(bench: Bench, part: str, height: int, spp: int) -> FloatArray:
+    """Converge `mis`: two halves of image and gradient, shape [2, image + gradient]."""
+    chunk = min(CHUNK, spp // 2)
+    run = MisPart(bench, part, height, chunk)
+    halves = []
+    for half in range(2):
+        seeds = [SEED * (half + 1) + k for k in range(spp // 2 // chunk)]
+        if part == "foreground":
+            steps = [run.step(seed)()[part] for seed in seeds]
+            image = np.mean([s[0] for s in steps], axis=0)
+            halves.append(_flat(image, np.mean([s[1] for s in steps], axis=0)))
+        else:
+            halves.append(_flat(*_own_ratio(run, seeds)))
+    return np.stack(halves)
+
+
+def _own_ratio(run: MisPart, seeds: list[int]) -> tuple[FloatArray, FloatArray]:
+    """Divide means over many runs, so that the quotient's bias falls with all their samples."""
+    bench = run.bench
+    light = LightTensors(texels=bench.leaf(run.height, grad=False))
+    lit, unoccluded = _plane_sums(run, light, seeds)
+    seen = unoccluded > 0.0
+    inverse = torch.where(seen, 1.0 / torch.where(seen, unoccluded, 1.0), 0.0)
+    ratio = torch.where(seen, lit * inverse, 1.0)
+    d_lit = bench.weights["ratio"] * inverse
+    d_unoccluded = -d_lit * ratio
+    total = np.zeros(bench.texels[run.height].shape)
+    for seed in seeds:
+        leaf = bench.leaf(run.height)
+        light = LightTensors(texels=leaf)
+        # Seeds of their own: the adjoint must share no noise with what it multiplies
+        out = run.mis.radiance(light, light, seed + 500_000)
+        torch.autograd.backward([out.lit, out.unoccluded], [d_lit.float(), d_unoccluded.float()])
+        total += numpy(leaf.grad)
+    return numpy(ratio), total / len(seeds)
+
+
+def _plane_sums(run: MisPart, light: LightTensors, seeds: list[int]) -> tuple[Tensor, Tensor]:
+    """Average the plane's two radiances over runs, in float64."""
+    lit = unoccluded = torch.zeros(1, dtype=torch.float64, device=run.bench.device)
+    with torch.no_grad():
+        for seed in seeds:
+            out = run.mis.radiance(light, light, seed)
+            lit = lit + out.lit.double() / len(seeds)
+            unoccluded = unoccluded + out.unoccluded.double() / len(seeds)
+    return lit, unoccluded
+
+
+def _own_lobes(bench: Bench, part: str, spp: int) -> FloatArray:
+    """Converge `mis` under the lobes themselves: two halves of the image, shape [2, image]."""
+    chunk = min(CHUNK, spp // 2)
+    run = MisPart(bench, part, bench.heights[part][0], chunk)
+    light = LightTensors(
+        *(torch.tensor(a, device=bench.device) for a in astuple(bench.scene.lobes))
+    )
+    halves = []
+    for half in range(2):
+        seeds = [SEED * (half + 5) + k for k in range(spp // 2 // chunk)]
+        if part == "ratio":
+            lit, unoccluded = _plane_sums(run, light, seeds)
+            seen = unoccluded > 0.0
+            image = torch.where(seen, lit / torch.where(seen, unoccluded, 1.0), 1.0)
+        else:
+            with torch.no_grad():
+                runs = [run.mis.radiance(light, light, s).foreground.double() for s in seeds]
+            image = torch.stack(runs).mean(dim=0)
+        halves.append(numpy(image).ravel())
+    return np.stack(halves)
+
+
+def _mitsuba(bench: Bench, part: str, height: int, spp: int) -> FloatArray:
+    """Converge Mitsuba; see `_own`."""
+    from benchmarks.speed.mitsuba import ratio_adjoint
+
+    target = bench.mitsuba[height]
+    halves = []
+    for half in range(2):
+        seed = SEED * (half + 3)
+        if part == "foreground":
+            image, gradient = MitsubaPart(bench, part, height, spp // 2).step(seed)()[part]
+        else:
+            sums = target.plane(spp // 2, seed)
+            d_lit, d_unoccluded, ratio = ratio_adjoint(*sums, target.weight_ratio)
+            made = target.plane_gradient(spp // 2, seed + 5_000, d_lit, d_unoccluded)
+            image = np.asarray(ratio, np.float64).T
+            gradient = np.asarray(made, dtype=np.float64)
+        halves.append(_flat(image, gradient))
+    return np.stack(halves)

@@ -1,0 +1,346 @@
+"""Table and plot of `benchmarks.speed`, from the JSON files of its runs.
+
+    python -m benchmarks.speed.report [DOCS]
+
+writes both again from ``DOCS/speed/*.json``, after another device's file was put there.
+"""
+
+import json
+import re
+import sys
+from collections.abc import Callable, Iterable, Sequence
+from pathlib import Path
+from typing import Any
+
+NAME = "speed_against_error"
+STYLES = {
+    "mitsuba": ("Mitsuba 3", "tab:blue", "o"),
+    "mis": ("mis", "tab:orange", "s"),
+    "transport": ("transport, one step", "tab:green", "*"),
+}
+STEPS = 600
+
+INTRODUCTION = """# Speed against error: `mis`, `transport` and Mitsuba 3
+
+One step is the object's radiance and the plane's shadow ratio, forward and backward to the map of
+the light, as the optimisation of a light needs them. All renderers see the same triangles,
+materials, camera, pixels and map; all run in one process, in turn, on the same cores or card.
+
+Mitsuba renders the object with its own `prb`, film cropped to the object (ToyCar, whose emission
+texture `prb` does not see: with the referee's path replay, which takes half the time there), and
+the shadow ratio from rays of the compared pixels alone, both radiances from the same samples, the
+gradient by Dr.Jit's automatic differentiation. Its sampler is `ldsampler`, with which it takes an
+eighth of `independent`'s time to an image of equal error here, a third to a gradient; its functions
+are frozen (`dr.freeze`), so that Python does not trace them again in each step; where Dr.Jit
+refuses that (ToyCar on CUDA, run with `--no-freeze`), each of Mitsuba's steps holds some 80 ms of
+tracing, and the ratios flatter us by up to a half. Kernels are compiled and scenes built before the
+clock runs.
+
+Errors are relative RMSE against references of both renderers; products of differences to two
+independent references free them of the references' noise. `image` joins foreground and shadow
+ratio, `gradient` the gradients of their weighted sums with respect to the texels, as
+`sqrt((e_fg^2 + e_ratio^2) / 2)`. 2 % of the pixels, those in which a pilot of `mis` is noisiest,
+are left out of `image`: a handful of mirrored suns holds 99 % of ToyCar's squared error in every
+renderer. The error with them is the column `all`.
+
+The ratios say how many times longer Mitsuba takes when its error has come down to ours, in image or
+in gradient, whichever it reaches sooner. It may split its samples between object and plane as suits
+it best. `>=`: its longest run has not come down that far. `600 steps` includes tracing `transport`.
+A map `32:64` has 32 rows for the object and 64 for the shadow."""
+
+
+def number(value: float | None, digits: int = 3) -> str:
+    """Write a number with that many significant digits."""
+    if value is None:
+        return "-"
+    text = f"{value:.{digits}g}"
+    return f"{float(text):.0f}" if "e+" in text else text
+
+
+def percent(value: float) -> str:
+    """Write a share."""
+    return f"{number(100.0 * value)} %"
+
+
+def settings_text(settings: dict[str, Any]) -> str:
+    """Write settings as a reader would name them."""
+    if "spp" in settings:
+        return f"{settings['spp']} samples"
+    if not settings:
+        return "defaults"
+    return ", ".join(f"{k} {v}" for k, v in settings.items())
+
+
+def table(head: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
+    """Write a Markdown table."""
+    lines = ["| " + " | ".join(head) + " |", "|" + "---|" * len(head)]
+    lines += ["| " + " | ".join(row) + " |" for row in rows]
+    return "\n".join(lines)
+
+
+def times(value: float | None, at_least: bool) -> str:
+    """Write a ratio."""
+    return "-" if value is None else f"{'>= ' if at_least else ''}{number(value)} x"
+
+
+def transport_table(result: dict[str, Any]) -> str:
+    """Write the ratios of `transport`."""
+    head = (
+        "scene",
+        "map",
+        "transport",
+        "tracing",
+        "step",
+        "Mitsuba's step at equal image / gradient",
+        "**step**",
+        "**600 steps**",
+        "level after",
+    )
+
+    def seconds(entry: dict[str, Any], name: str) -> str:
+        bound = ">= " if entry[f"mitsuba_at_least_by_{name}"] else ""
+        return f"{bound}{number(entry[f'mitsuba_seconds_step_by_{name}'])} s"
+
+    return table(
+        head,
+        (
+            (
+                record["scene"],
+                record["map"],
+                settings_text(entry["settings"]),
+                f"{number(entry['seconds_traced'])} s",
+                f"{number(1000.0 * entry['seconds_step'])} ms",
+                f"{seconds(entry, 'image')} / {seconds(entry, 'gradient')}",
+                times(entry["step"], entry["at_least"]),
+                times(entry["run_600"], entry["at_least"]),
+                "never"
+                if entry["break_even_steps"] is None
+                else f"{number(entry['break_even_steps'], 2)} steps",
+            )
+            for record in result["ratios"]
+            for entry in record["transport"]
+        ),
+    )
+
+
+def mis_table(result: dict[str, Any]) -> str:
+    """Write the ratios of `mis`."""
+
+    def cell(entry: dict[str, float]) -> str:
+        return f"{times(entry['ratio'], False)} at {percent(entry['rmse'])}"
+
+    return table(
+        ("scene", "map", "forward, image", "step, image", "step, gradient"),
+        (
+            (
+                record["scene"],
+                record["map"],
+                *(cell(record["mis"][k]) for k in ("forward_image", "step_image", "step_gradient")),
+            )
+            for record in result["ratios"]
+            if record["mis"]
+        ),
+    )
+
+
+def row_table(result: dict[str, Any]) -> str:
+    """Write what was measured."""
+    head = (
+        "scene",
+        "map",
+        "integrator",
+        "settings",
+        "tracing",
+        "forward",
+        "step",
+        "image",
+        "all",
+        "gradient",
+        "object / ratio",
+        "gradient of object / ratio",
+        "MiB",
+    )
+
+    def pair(row: dict[str, Any], name: str) -> str:
+        return " / ".join(percent(row["parts"][p][name]) for p in ("foreground", "ratio"))
+
+    def cells(row: dict[str, Any]) -> tuple[str, ...]:
+        traced = row.get("seconds_traced")
+        return (
+            row["scene"],
+            row["map"],
+            row["integrator"],
+            settings_text(row["settings"]),
+            "" if traced is None else f"{number(traced)} s",
+            f"{number(1000.0 * row['seconds_forward'])} ms",
+            f"{number(1000.0 * row['seconds_step'])} ms",
+            percent(row["rmse_image"]),
+            percent(row["rmse_image_all"]),
+            percent(row["rmse_gradient"]),
+            pair(row, "rmse_image"),
+            pair(row, "rmse_gradient"),
+            number(row["peak_mib"]),
+        )
+
+    return table(head, map(cells, result["rows"]))
+
+
+def resolution_text(result: dict[str, Any]) -> str:
+    """Say what the map itself costs, by scene and map."""
+    seen = {(r["scene"], r["map"]): r["rmse_resolution"] for r in result["rows"]}
+    return ", ".join(f"{scene} {size} {percent(e)}" for (scene, size), e in seen.items())
+
+
+def summary(result: dict[str, Any]) -> str:
+    """Return what a run prints."""
+    parts = [
+        f"{result['conditions']['device']}, {result['conditions']['seconds']:.0f} s",
+        row_table(result),
+        transport_table(result),
+        mis_table(result),
+    ]
+    parts += [f"not run: {reason}" for reason in result["skipped"]]
+    parts += [f"references: {line}" for line in result["disagreements"]]
+    return "\n\n".join(parts)
+
+
+def device_text(result: dict[str, Any]) -> str:
+    """Return one device's chapter."""
+    c = result["conditions"]
+    threads = f", {c['threads']} threads" if c["threads"] else ""
+    pixels = "; ".join(
+        f"{s['name']}: {s['triangles']} triangles, D = {s['depth']}, {s['object_pixels']} object "
+        f"pixels, {s['proxy_pixels']} of the plane"
+        for s in result["scenes"]
+    )
+    parts = [
+        f"## {c['device']}{threads}",
+        f"{c['date']}, commit {c['commit']}, warp {c['warp']}, torch {c['torch']}, Mitsuba "
+        f"{c['mitsuba']} (`{c['variant']}`), {c['size'][0]} x {c['size'][1]} pixels. {pixels}.",
+        "    " + c["command"],
+        "How many times longer Mitsuba takes than `transport`:",
+        transport_table(result),
+        "and than `mis`, at the smallest error that both sweeps reach:",
+        mis_table(result),
+        "What rasterising the lobes to the map costs, relative RMSE of the image to that under the "
+        f"lobes themselves: {resolution_text(result)}.",
+        "<details><summary>All that was measured</summary>",
+        row_table(result),
+        "</details>",
+    ]
+    parts += [f"Not run: {reason}." for reason in result["skipped"]]
+    parts += [f"References: {line}." for line in result["disagreements"]]
+    if not result["disagreements"]:
+        parts.append(
+            "The two renderers' references differ nowhere by more than their noise or a tenth of "
+            "the smallest error compared."
+        )
+    return "\n\n".join(parts)
+
+
+def keep_run(result: dict[str, Any], docs: Path) -> Path:
+    """Keep a run beside those of other devices."""
+    slug = re.sub(r"[^a-z0-9]+", "_", result["conditions"]["device"].lower()).strip("_")
+    path = docs / "speed" / f"{slug}.json"
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.write_text(json.dumps(result, indent=1) + "\n", encoding="utf-8")
+    return path
+
+
+def write_documents(docs: Path) -> None:
+    """Write table and plot from all runs that are kept."""
+    results = [
+        json.loads(path.read_text(encoding="utf-8"))
+        for path in sorted((docs / "speed").glob("*.json"))
+    ]
+    results.sort(key=lambda result: result["conditions"]["threads"] is None)
+    text = [INTRODUCTION, f"![Error over time of one step]({NAME}.png)"]
+    text += [device_text(result) for result in results]
+    (docs / f"{NAME}.md").write_text("\n\n".join(text) + "\n", encoding="utf-8")
+    plot(results, docs / f"{NAME}.png")
+
+
+def plot(results: Sequence[dict[str, Any]], path: Path) -> None:
+    """Draw error over time of one step: a row per scene, image and gradient of each device."""
+    import matplotlib
+    from PIL import Image
+
+    matplotlib.use("Agg")
+    from matplotlib import pyplot
+
+    scenes = list(dict.fromkeys(s["name"] for result in results for s in result["scenes"]))
+    quantities = (("rmse_image", "image"), ("rmse_gradient", "gradient"))
+    figure, axes = pyplot.subplots(
+        len(scenes),
+        2 * len(results),
+        figsize=(4.2 * 2 * len(results), 3.2 * len(scenes)),
+        squeeze=False,
+        layout="constrained",
+    )
+    for d, result in enumerate(results):
+        for q, (key, label) in enumerate(quantities):
+            for s, scene in enumerate(scenes):
+                axis = axes[s][2 * d + q]
+                _panel(axis, _main_rows(result, scene), key)
+                axis.set_title(f"{scene}, {label}\n{result['conditions']['device']}", fontsize=9)
+                if s == len(scenes) - 1:
+                    axis.set_xlabel("time of one step [s]")
+                if q == 0:
+                    axis.set_ylabel("relative RMSE")
+    handles: dict[str, Any] = {}
+    for axis in axes.flat:
+        for handle, label in zip(*axis.get_legend_handles_labels(), strict=True):
+            handles.setdefault(label, handle)
+    figure.legend(
+        handles.values(), handles.keys(), loc="outside upper center", ncols=4, frameon=False
+    )
+    figure.savefig(path, dpi=110)
+    pyplot.close(figure)
+    with Image.open(path) as image:
+        few = image.convert("RGB").quantize(64)
+    few.save(path, optimize=True)
+
+
+def _main_rows(result: dict[str, Any], scene: str) -> list[dict[str, Any]]:
+    """Return a scene's rows under the main map, the first that was measured."""
+    here = [r for r in result["rows"] if r["scene"] == scene]
+    return [r for r in here if r["map"] == here[0]["map"]]
+
+
+def _panel(axis: Any, rows: list[dict[str, Any]], key: str) -> None:
+    for name, (label, color, marker) in STYLES.items():
+        found = [r for r in rows if r["integrator"] == name and r[key] > 0.0]
+        if not found:
+            continue
+        x, y = [r["seconds_step"] for r in found], [r[key] for r in found]
+        if name == "transport":
+            whole = [r["seconds_step"] + r["seconds_traced"] / STEPS for r in found]
+            for a, b, e in zip(x, whole, y, strict=True):
+                axis.plot([a, b], [e, e], color=color, linewidth=0.8, alpha=0.6)
+            axis.plot(x, y, marker, color=color, markersize=11, label=label)
+            axis.plot(
+                whole,
+                y,
+                marker,
+                color=color,
+                markersize=11,
+                markerfacecolor="white",
+                label=f"transport, mean of {STEPS} steps and tracing",
+            )
+        else:
+            axis.plot(x, y, marker=marker, color=color, markersize=5, label=label)
+    axis.set_xscale("log")
+    axis.set_yscale("log")
+    axis.grid(True, which="major", alpha=0.4)
+    axis.grid(True, which="minor", alpha=0.12)
+    ticks: Callable[..., Any] = axis.tick_params
+    ticks(labelsize=8)
+    from matplotlib.ticker import FuncFormatter, LogLocator
+
+    axis.yaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
+    axis.yaxis.set_major_formatter(FuncFormatter(lambda v, _: f"{100 * v:g} %"))
+    axis.yaxis.set_minor_formatter("")
+
+
+if __name__ == "__main__":
+    write_documents(Path(sys.argv[1] if len(sys.argv) > 1 else "docs"))

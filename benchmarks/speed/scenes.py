@@ -1,0 +1,192 @@
+"""The scenes, lights and losses that `benchmarks.speed` gives to every renderer.
+
+A scene is an object on the plane y = 0 under 32 spherical Gaussians. Renderers see those as one
+lat-long map, so that all estimate the same integrals; the loss is linear in the foreground and in
+the shadow ratio, with weights that are part smooth and part noise, as a guidance gradient is.
+"""
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from benchmarks.referee import ours
+from warpir.io.assets import load_asset
+from warpir.io.images.photos import read_envmap
+from warpir.lighting.fit import fit_lobes
+from warpir.render.bridge import rasterize
+from warpir.render.renderer import Renderer, light_args
+from warpir.scene.asset import Asset, Material, Primitive
+from warpir.scene.camera import Camera, camera_from_fov
+from warpir.scene.light import Light, Lobes, axis_from_angles, resize_map
+from warpir.scene.placement import place_asset
+
+FloatArray = NDArray[np.float64]
+IntArray = NDArray[np.int32]
+
+NAMES = ("ball", "toycar", "metal")
+TOYCAR = "mesh/ToyCar.glb"
+PANORAMA = "hdri/modern_buildings_2_1k.hdr"
+PANORAMA_HEIGHT = 256
+PANORAMA_TURN = -90.0
+"""About +Y [deg]."""
+SHARPNESS_MAX = 2000.0
+"""Sharper lobes are widened to this, flux kept: a map of 64 rows holds them."""
+COVERAGE_SAMPLES = 64
+"""Camera samples per pixel that decide which pixels are the plane's."""
+
+
+@dataclass(frozen=True)
+class SpeedScene:
+    """One scene with all that is fixed before the clock runs."""
+
+    name: str
+    asset: Asset
+    matrix: FloatArray
+    """Asset to world, shape [4, 4]."""
+    camera: Camera
+    lobes: Lobes
+    depth: int
+    """Surface interactions of the longest path."""
+    triangles: int
+    renderer: Renderer
+    object_pixels: IntArray
+    """Row-major, shape [object_pixel]."""
+    proxy_pixels: IntArray
+    """Row-major pixels whose plane the object may shade and at most half hides, [proxy_pixel]."""
+    weight_fg: NDArray[np.float32]
+    """Loss gradient of the foreground, shape [object_pixel, 3]."""
+    weight_ratio: NDArray[np.float32]
+    """Loss gradient of the shadow ratio, shape [proxy_pixel, 3]."""
+
+    def texels(self, height: int) -> NDArray[np.float32]:
+        """Return the light as a map, relative [W/(m^2 sr)], shape [height, 2 height, 3]."""
+        parts = (self.lobes.amplitude, self.lobes.axis, self.lobes.sharpness)
+        leaves = [torch.tensor(a) for a in parts]
+        device = str(self.renderer.device.alias)
+        made: NDArray[np.float32] = rasterize(*leaves, height, device).cpu().numpy()
+        return made
+
+
+def uv_ball(rows: int = 128, columns: int = 256) -> Primitive:
+    """Return a unit ball of ``2 columns (rows - 1)`` triangles standing on y = 0."""
+    polar = np.pi * np.arange(1, rows) / rows
+    around = 2.0 * np.pi * np.arange(columns) / columns
+    ring = np.stack(
+        [
+            np.sin(polar)[:, None] * np.sin(around),
+            np.broadcast_to(np.cos(polar)[:, None], (rows - 1, columns)),
+            np.sin(polar)[:, None] * np.cos(around),
+        ],
+        axis=-1,
+    )
+    unit = np.concatenate([[[0.0, 1.0, 0.0]], ring.reshape(-1, 3), [[0.0, -1.0, 0.0]]])
+    here = np.arange(columns)
+    right = (here + 1) % columns
+    first, last = 1, 1 + (rows - 2) * columns
+    faces = [np.stack([np.zeros_like(here), first + here, first + right], axis=-1)]
+    for start in range(first, last, columns):
+        a, b, c, d = start + here, start + right, start + columns + here, start + columns + right
+        faces += [np.stack([a, c, d], axis=-1), np.stack([a, d, b], axis=-1)]
+    faces.append(np.stack([last + right, last + here, np.full_like(here, len(unit) - 1)], axis=-1))
+    return Primitive(
+        unit + np.array([0.0, 1.0, 0.0]),
+        np.concatenate(faces).astype(np.int32),
+        0,
+        normals=unit.astype(np.float32),
+    )
+
+
+def sun_and_sky(seed: int = 7) -> Lobes:
+    """Return one sharp lobe and 31 broad ones, brighter above the horizon."""
+    rng = np.random.default_rng(seed)
+    axis = rng.normal(size=(31, 3))
+    axis /= np.linalg.norm(axis, axis=1, keepdims=True)
+    color = rng.uniform(0.02, 0.2, (31, 3)) * np.where(axis[:, 1:2] > 0.0, 1.0, 0.3)
+    sun = axis_from_angles(-60.0, 38.0)
+    return Lobes(
+        np.concatenate([[[110.0, 100.0, 85.0]], color]).astype(np.float32),
+        np.concatenate([sun[None], axis]).astype(np.float32),
+        np.concatenate([[400.0], rng.uniform(2.0, 20.0, 31)]).astype(np.float32),
+    )
+
+
+def panorama_lobes(path: Path) -> Lobes:
+    """Fit 32 lobes to a panorama, turned so that its sun stands to the left."""
+    texels = resize_map(read_envmap(path), PANORAMA_HEIGHT)
+    lobes = Light(fit_lobes(texels, 32).lobes).rotated(PANORAMA_TURN).lobes
+    assert lobes is not None
+    sharpness = np.minimum(lobes.sharpness, SHARPNESS_MAX)
+    amplitude = lobes.amplitude * (sharpness / lobes.sharpness)[:, None]
+    return Lobes(amplitude.astype(np.float32), lobes.axis, sharpness.astype(np.float32))
+
+
+def make_scene(
+    name: str, width: int, height: int, assets: Path, device: str, threads: int
+) -> SpeedScene:
+    """Build a scene.
+
+    Args:
+        name: One of `NAMES`.
+        width: Image width [px].
+        height: Image height [px].
+        assets: Folder that holds ``mesh/`` and ``hdri/``.
+        device: Warp device.
+        threads: CPU threads.
+
+    Raises:
+        FileNotFoundError: A file of the scene is absent.
+    """
+    camera = camera_from_fov(width, height, 40.0, -12.0, 1.4)
+    if name == "toycar":
+        for file in (TOYCAR, PANORAMA):
+            if not (assets / file).exists():
+                raise FileNotFoundError(f"{file} is not in the folder of assets")
+        asset, lobes, depth = load_asset(assets / TOYCAR), panorama_lobes(assets / PANORAMA), 5
+        place, turn, size = (0.0, 0.0, -5.5), -35.0, 2.0
+    else:
+        metal = name == "metal"
+        material = Material(
+            base_color=(0.95, 0.75, 0.45) if metal else (0.8, 0.35, 0.2),
+            metallic=1.0 if metal else 0.0,
+            roughness=0.3 if metal else 0.6,
+        )
+        asset = Asset(name, (uv_ball(),), (material,))
+        lobes, depth = sun_and_sky(), 3
+        place, turn, size = (-0.3, 0.0, -5.5), 0.0, 1.5
+    placement = place_asset(*asset.bounds(), camera, None, place=place, rotate_y=turn, size=size)
+    renderer = ours.renderer(asset, placement.asset_to_world, camera, device)
+    renderer.threads = threads
+    object_pixels = renderer.gbuffer(seed=1, spp=COVERAGE_SAMPLES).object_pixels
+    light = light_args(Light(lobes), renderer.device)
+    hidden = np.zeros(width * height)
+    hidden[object_pixels] = renderer.foreground(
+        light, object_pixels, COVERAGE_SAMPLES, 1, 1, seed=2
+    ).mask
+    shaded = renderer.shaded_pixels(light, seed=3)
+    proxy_pixels = shaded[hidden[shaded] <= 0.5]
+    weight = loss_weights(width, height)
+    return SpeedScene(
+        name,
+        asset,
+        placement.asset_to_world,
+        camera,
+        lobes,
+        depth,
+        sum(len(p.indices) for p in asset.primitives),
+        renderer,
+        object_pixels,
+        proxy_pixels,
+        weight[0].reshape(-1, 3)[object_pixels],
+        weight[1].reshape(-1, 3)[proxy_pixels],
+    )
+
+
+def loss_weights(width: int, height: int, seed: int = 11) -> NDArray[np.float32]:
+    """Return colour ramps plus noise for foreground and ratio, shape [2, height, width, 3]."""
+    rng = np.random.default_rng(seed)
+    row, column = np.mgrid[0:height, 0:width] / height
+    smooth = np.stack([0.5 + row, 0.5 + column, 1.5 - row], axis=-1)
+    return (smooth + rng.normal(0.0, 0.5, (2, height, width, 3))).astype(np.float32)

@@ -1,0 +1,442 @@
+"""Hard cases of spherical Gaussians: sharpness 1e-3, a flat sky, to 1e6, narrower than a sun."""
+
+from functools import partial
+
+import numpy as np
+import torch
+import warp as wp
+
+from benchmarks.stability.case import (
+    MAX_ABSOLUTE,
+    MAX_RELATIVE,
+    RELATIVE,
+    Case,
+    Float64Array,
+    Measured,
+    download,
+    finite,
+    max_relative,
+    relative_l2,
+    upload,
+    worst_l2,
+)
+from tests import oracles as o
+from tests.builders.shapes import all_pixels, camera, ground, lobe
+from tests.statistics import central_differences
+from warpir.kernels.rasterize import rasterize
+from warpir.kernels.sampling import light_eval, lobe_sample
+from warpir.kernels.sg import sg_radiance
+from warpir.kernels.types import LightArgs
+from warpir.render.device_scene import Scene
+from warpir.render.integrator import LightTensors
+from warpir.render.mis import MisIntegrator
+from warpir.render.renderer import Renderer, light_args
+from warpir.scene.light import Lobes, rasterize_lobes
+
+GROUP = "lobes"
+SHARPNESS = (1e-3, 1e-1, 1.0, 30.0, 1e3, 6e3, 1e5, 1e6)
+AXIS = np.array([0.48, -0.6, 0.64], np.float32)
+"""A general direction: no component is 0."""
+EXPONENT = 20.0
+"""Cases reach out to ``exp(-20)``, 2e-9 of the peak."""
+NO_LOBES = "has no spherical-Gaussian light"
+
+VALUE = 2e-5
+"""The exponent, up to 20, carries about 16 roundings of 2^-24 = 6e-8 from the float32 directions,
+the squared chord and the product."""
+CDF_ARITHMETIC, CDF_DIRECTION = 5e-7, 2e-7
+"""Eight roundings, and three roundings of a unit direction times the lobe's width ``sqrt(s)``."""
+GRADIENT = 1e-4
+"""The same roundings in a float32 sum of 20 000 terms, ``sqrt(20 000) 2^-24 = 1e-5``."""
+POWER = 1e-3
+"""What `warpir.kernels.rasterize` states where it has three directions per standard deviation."""
+POWER_NARROW = 1e-2
+"""What it states where it has fewer, and what `warpir.scene.light.rasterize_lobes` states."""
+POWER_GRADIENT = 2e-2
+"""Its derivative by the sharpness: aliasing of the texels' directions counts twice."""
+PLANE = 2e-3
+"""Noise of 64 x 256 low-discrepancy samples, as in the renderer's own tests."""
+PLANE_GRADIENT = 1e-2
+"""The same; ``1 - cos`` of the samples varies as much as its mean."""
+HOST = 2e-3
+"""256 rings of equal probability about a lobe, midpoint rule, relative to the lobe's flux."""
+FLUX = 1e-12
+"""A few float64 operations."""
+
+
+@wp.kernel
+def radiance_kernel(
+    v: wp.array[wp.vec3],
+    amplitude: wp.array[wp.vec3],
+    axis: wp.array[wp.vec3],
+    sharpness: wp.array[float],
+    lobe_count: int,
+    L: wp.array[wp.vec3],
+):
+    """Radiance of some lobes."""
+    i = wp.tid()
+    L[i] = sg_radiance(v[i], amplitude, axis, sharpness, lobe_count)
+
+
+@wp.kernel(enable_backward=False)
+def sample_kernel(u: wp.array[wp.vec2], axis: wp.vec3, sharpness: float, wi: wp.array[wp.vec3]):
+    """Draw directions from given numbers."""
+    i = wp.tid()
+    wi[i] = lobe_sample(u[i], axis, sharpness)
+
+
+@wp.kernel(enable_backward=False)
+def pdf_kernel(light: LightArgs, wi: wp.array[wp.vec3], pdf: wp.array[float]):
+    """Density of the light's proposal."""
+    i = wp.tid()
+    pdf[i] = light_eval(light, wi[i]).pdf
+
+
+def directions(sharpness: float, axis: np.ndarray, count: int = 20000) -> np.ndarray:
+    """Return float32 unit directions out to `EXPONENT`, as far as the sphere goes."""
+    rng = np.random.default_rng(1)
+    t = rng.uniform(0.0, min(EXPONENT / sharpness, 2.0), count)
+    # Through the sine, which keeps the digits of a small angle.
+    sine, phi = np.sqrt(t * (2.0 - t)), rng.uniform(0.0, 2.0 * np.pi, count)
+    local = np.stack([sine * np.cos(phi), sine * np.sin(phi), 1.0 - t], axis=-1)
+    return np.asarray((local @ o.frame_of(axis).T).astype(np.float32))
+
+
+def radiance(device: str, sharpness: float) -> Measured:
+    """Radiance of one lobe and its gradient by amplitude, axis (tangent) and sharpness."""
+    amplitude = np.array([[0.7, 1.3, 2.0]], np.float32)
+    v = directions(sharpness, AXIS)
+    # Weights of one sign, heavier on one side: no parameter's sum cancels.
+    y = np.random.default_rng(2).uniform(0.5, 1.5, v.shape).astype(np.float32)
+    y[v @ np.array([0.8, 0.0, -0.6], np.float32) < 0.0] *= 0.2
+    s = np.array([sharpness], np.float32)
+    arrays = [
+        upload(amplitude, wp.vec3, device, True),
+        upload(AXIS[None], wp.vec3, device, True),
+        upload(s, float, device, True),
+    ]
+    out = wp.zeros(len(v), dtype=wp.vec3, device=device, requires_grad=True)
+    with wp.Tape() as tape:
+        wp.launch(
+            radiance_kernel,
+            len(v),
+            inputs=[upload(v, wp.vec3, device), *arrays, 1],
+            outputs=[out],
+            device=device,
+        )
+    tape.backward(grads={out: upload(y, wp.vec3, device)})
+    found = [download(a.grad) for a in arrays]
+    unit, s64 = o.normalize(AXIS), s.astype(np.float64)
+
+    def loss(a: Float64Array, mu: Float64Array, k: Float64Array) -> float:
+        return float(np.sum(y * o.sg_radiance(v, a, o.normalize(mu), k)))
+
+    a64, mu64 = amplitude.astype(np.float64), unit[None]
+    step = 1e-4 / max(1.0, np.sqrt(sharpness))
+    truth = [
+        central_differences(lambda x: loss(x, mu64, s64), a64, 1e-4),
+        central_differences(lambda x: loss(a64, x, s64), mu64, step),
+        central_differences(lambda x: loss(a64, mu64, x), s64, 1e-4 * s64),
+    ]
+    found[1] -= o.dot(found[1], unit)[:, None] * unit
+    return Measured(
+        max_relative(download(out), o.sg_radiance(v, amplitude, unit[None], s)),
+        finite(out.numpy(), *found),
+        worst_l2(found, truth),
+    )
+
+
+def sampling_error(wi: Float64Array, u: Float64Array, axis: np.ndarray, sharpness: float) -> float:
+    """Return the largest distance of a sample's CDF, about the axis, from the number it is of."""
+    t = o.one_minus_cos(wi, axis)
+    return float(np.max(np.abs(np.expm1(-sharpness * t) / np.expm1(-2.0 * sharpness) - u)))
+
+
+def numbers(count: int = 20000) -> np.ndarray:
+    """Return uniform float32 pairs, the ends of the interval among them."""
+    u = np.random.default_rng(3).random((count, 2), dtype=np.float32)
+    u[:4, 0] = [0.0, 2.0**-24, 0.5, 1.0 - 2.0**-24]
+    return u
+
+
+def sampling(device: str, sharpness: float) -> Measured:
+    """Draw from one lobe: does the direction lie where the inverted CDF says?"""
+    u = numbers()
+    wi = wp.zeros(len(u), dtype=wp.vec3, device=device)
+    inputs = [upload(u, wp.vec2, device), wp.vec3(*map(float, AXIS)), float(np.float32(sharpness))]
+    wp.launch(sample_kernel, len(u), inputs=inputs, outputs=[wi], device=device)
+    d = download(wi)
+    s = float(np.float32(sharpness))
+    return Measured(sampling_error(d, u[:, 0].astype(np.float64), AXIS, s), finite(d))
+
+
+def density(device: str, sharpness: float) -> Measured:
+    """Density of the light's proposal, at directions out to `EXPONENT`."""
+    light = light_args(lobe(AXIS, sharpness), wp.get_device(device))
+    v = directions(sharpness, AXIS)
+    pdf = wp.zeros(len(v), dtype=float, device=device)
+    source = upload(v, wp.vec3, device)
+    wp.launch(pdf_kernel, len(v), inputs=[light, source], outputs=[pdf], device=device)
+    truth = o.sg_pdf(v, AXIS, float(np.float32(sharpness)))
+    return Measured(max_relative(download(pdf), truth), finite(pdf.numpy()))
+
+
+def power(device: str, sharpness: float) -> Measured:
+    """Power of a lobe on a map of 64 x 128 texels, near a pole too, and its gradient."""
+    errors, gradients, values = [], [], []
+    omega = o.texel_solid_angle(64, 128)
+    for axis in ([0.3, 0.8, -0.5], [0.0, 1.0, 0.0], [0.02, -0.99, 0.05]):
+        arrays = [
+            upload(np.full((1, 3), 2.0), wp.vec3, device, True),
+            upload(o.normalize([axis]), wp.vec3, device, True),
+            upload([sharpness], float, device, True),
+        ]
+        texels = wp.zeros((64, 128), dtype=wp.vec3, device=device, requires_grad=True)
+        with wp.Tape() as tape:
+            wp.launch(
+                rasterize,
+                (64, 128),
+                inputs=[64, 128, *arrays, 1],
+                outputs=[texels],
+                device=device,
+            )
+        weight = np.broadcast_to(omega[:, None, None], (64, 128, 3))
+        tape.backward(grads={texels: upload(weight, wp.vec3, device)})
+        found = np.sum(download(texels) * omega[:, None, None], axis=(0, 1))
+        s = float(np.float32(sharpness))
+        truth = 2.0 * float(o.sg_flux(s))
+        h = 1e-4 * s
+        d_s = 3.0 * 2.0 * float(o.sg_flux(s + h) - o.sg_flux(s - h)) / (2.0 * h)
+        d_a = np.full(3, float(o.sg_flux(s)))
+        errors.append(max_relative(found, np.full(3, truth)))
+        moved = [download(arrays[0].grad), download(arrays[2].grad)]
+        gradients.append(worst_l2(moved, [d_a, np.array([d_s])]))
+        values += [found, *moved, download(arrays[1].grad)]
+    return Measured(max(errors), finite(*values), max(gradients))
+
+
+def host_map(device: str, sharpness: float) -> Measured:
+    """Power of the NumPy twin that writes files, on 64 x 128 texels."""
+    found = []
+    for axis in ([0.3, 0.8, -0.5], [0.0, 1.0, 0.0], [0.02, -0.99, 0.05]):
+        lobes = lobe(axis, sharpness).lobes
+        assert lobes is not None
+        texels = rasterize_lobes(lobes, 64, 128).astype(np.float64)
+        found.append(np.einsum("ijc,i->c", texels, o.texel_solid_angle(64, 128)))
+    truth = float(o.sg_flux(float(np.float32(sharpness))))
+    return Measured(max_relative(found, np.full_like(found, truth)), finite(found))
+
+
+def flux(device: str, sharpness: float) -> Measured:
+    """Closed-form integral over the sphere against Gauss-Legendre in ``1 - cos``."""
+    s = float(np.float32(sharpness))
+    lobes = Lobes(np.ones((1, 3), np.float32), AXIS[None], np.array([s], np.float32))
+    edges = np.concatenate([[0.0], np.geomspace(1e-3 / max(s, 1.0), 1.0, 80)]) * min(2.0, 745.0 / s)
+    t, weight = o.gauss_legendre(edges, 20)
+    truth = 2.0 * np.pi * float(np.sum(weight * np.exp(-s * t)))
+    return Measured(max_relative(lobes.flux(), np.full((1, 3), truth)), finite(lobes.flux()))
+
+
+def host_irradiance(device: str, sharpness: float) -> Measured:
+    """Irradiance of a plane by `warpir.scene.light`: the lobe high, grazing, below the horizon."""
+    errors, values = [], []
+    for elevation in (90.0, 30.0, 1.0, 0.0, -1.0, -20.0, -90.0):
+        a = np.radians(elevation)
+        axis = np.array([np.cos(a), np.sin(a), 0.0])
+        up = np.array([0.0, 1.0, 0.0])
+        found = lobe(axis, sharpness).irradiance(up)
+        truth = o.sg_irradiance(up, axis, float(np.float32(sharpness)))
+        errors.append(np.abs(found - truth).max() / float(o.sg_flux(sharpness)))
+        values.append(found)
+    return Measured(float(np.max(errors)), finite(values))
+
+
+def plane(device: str, sharpness: float) -> Measured:
+    """Radiance of a white plane under a slanted lobe, and its gradient through `mis`."""
+    view = camera(8, 8, 500.0, (0.0, 50.0, 0.0), -90.0)
+    renderer = Renderer(Scene([], view, ground(0.0), device))
+    pixels = all_pixels(view)
+    integrator = MisIntegrator(renderer, np.zeros(0, np.int32), pixels, 256, 1, 1)
+    axis = o.normalize([0.5, 0.6, 0.2]).astype(np.float32)
+    tensors = LightTensors(
+        torch.ones(1, 3, requires_grad=True),
+        torch.tensor(axis[None]),
+        torch.tensor([sharpness], dtype=torch.float32, requires_grad=True),
+    )
+    radiance = integrator.radiance(tensors, tensors, 5)
+    radiance.unoccluded.mean(dim=0).sum().backward()
+    assert tensors.amplitude is not None and tensors.sharpness is not None
+    assert tensors.amplitude.grad is not None and tensors.sharpness.grad is not None
+    s = float(np.float32(sharpness))
+    up = [0.0, 1.0, 0.0]
+    truth = o.sg_irradiance(up, axis, s) / np.pi
+    h = 1e-3 * s
+    d_s = (o.sg_irradiance(up, axis, s + h) - o.sg_irradiance(up, axis, s - h)) / (2.0 * h)
+    found = radiance.unoccluded.detach().numpy().astype(np.float64).mean(axis=0)
+    gradients = [tensors.amplitude.grad.numpy(), tensors.sharpness.grad.numpy()]
+    return Measured(
+        max_relative(found, np.full(3, truth)),
+        finite(found, *gradients),
+        worst_l2(
+            [g.astype(np.float64) for g in gradients],
+            [np.full((1, 3), truth), np.array([3.0 * d_s / np.pi])],
+        ),
+    )
+
+
+def zero_amplitude(device: str, sharpness: float) -> Measured:
+    """A lobe of amplitude 0 beside none: black, and the gradient that would light it up."""
+    view = camera(8, 8, 500.0, (0.0, 50.0, 0.0), -90.0)
+    renderer = Renderer(Scene([], view, ground(0.0), device))
+    integrator = MisIntegrator(renderer, np.zeros(0, np.int32), all_pixels(view), 256, 1, 1)
+    axis = o.normalize([0.5, 0.6, 0.2]).astype(np.float32)
+    amplitude = torch.zeros(1, 3, requires_grad=True)
+    tensors = LightTensors(amplitude, torch.tensor(axis[None]), torch.tensor([sharpness]))
+    radiance = integrator.radiance(tensors, tensors, 5)
+    radiance.unoccluded.mean(dim=0).sum().backward()
+    assert amplitude.grad is not None
+    truth = o.sg_irradiance([0.0, 1.0, 0.0], axis, float(np.float32(sharpness))) / np.pi
+    values = radiance.unoccluded.detach().numpy()
+    gradient = amplitude.grad.numpy().astype(np.float64)
+    return Measured(
+        float(np.abs(values).max()),
+        finite(values, gradient),
+        relative_l2(gradient, np.full((1, 3), truth)),
+    )
+
+
+# ------------------------------------------------------------------------------ Mitsuba
+
+
+def mitsuba_density(sharpness: float) -> float:
+    """Error of Mitsuba's von Mises-Fisher density at the same directions about +Z."""
+    import mitsuba as mi
+
+    z = np.array([0.0, 0.0, 1.0], np.float32)
+    v = directions(sharpness, z)
+    pdf = mi.warp.square_to_von_mises_fisher_pdf(mi.Vector3f(v.T), mi.Float(sharpness))
+    return max_relative(np.array(pdf), o.sg_pdf(v, z, float(np.float32(sharpness))))
+
+
+def mitsuba_radiance(sharpness: float) -> float:
+    """Error of the same density over its peak, which is a lobe of amplitude 1."""
+    import mitsuba as mi
+
+    z = np.array([0.0, 0.0, 1.0], np.float32)
+    v = directions(sharpness, z)
+    pdf = mi.warp.square_to_von_mises_fisher_pdf(mi.Vector3f(v.T), mi.Float(sharpness))
+    found = np.array(pdf).astype(np.float64) * float(o.sg_flux(float(np.float32(sharpness))))
+    truth = o.sg_radiance(v, np.ones((1, 1)), z[None], np.array([np.float32(sharpness)]))[:, 0]
+    return max_relative(found, truth)
+
+
+def mitsuba_sampling(sharpness: float) -> float:
+    """Error of Mitsuba's von Mises-Fisher sampler in the same measure."""
+    import mitsuba as mi
+
+    u = numbers()
+    # Its polar angle is a function of the second number.
+    d = mi.warp.square_to_von_mises_fisher(
+        mi.Point2f(u[:, 1].copy(), u[:, 0].copy()), mi.Float(sharpness)
+    )
+    z = np.array([0.0, 0.0, 1.0])
+    s = float(np.float32(sharpness))
+    return sampling_error(np.array(d).T, u[:, 0].astype(np.float64), z, s)
+
+
+def cases() -> list[Case]:
+    """Return the rows of this group."""
+    rows = []
+    for s in SHARPNESS:
+        name = f"sharpness {s:g}"
+        width = CDF_ARITHMETIC + CDF_DIRECTION * max(1.0, float(np.sqrt(s)))
+        rows += [
+            Case(
+                GROUP,
+                name,
+                "radiance",
+                MAX_RELATIVE,
+                partial(radiance, sharpness=s),
+                VALUE,
+                GRADIENT,
+                partial(mitsuba_radiance, s),
+            ),
+            Case(
+                GROUP,
+                name,
+                "sampling",
+                "max CDF distance",
+                partial(sampling, sharpness=s),
+                width,
+                mitsuba=partial(mitsuba_sampling, s),
+            ),
+            Case(
+                GROUP,
+                name,
+                "density",
+                MAX_RELATIVE,
+                partial(density, sharpness=s),
+                VALUE,
+                mitsuba=partial(mitsuba_density, s),
+            ),
+            Case(
+                GROUP,
+                name,
+                "integral",
+                RELATIVE,
+                partial(flux, sharpness=s),
+                FLUX,
+                mitsuba=NO_LOBES,
+            ),
+            Case(
+                GROUP,
+                name,
+                "power on a 64 x 128 map",
+                RELATIVE,
+                partial(power, sharpness=s),
+                POWER if s <= 1e5 else POWER_NARROW,
+                POWER_GRADIENT,
+                NO_LOBES,
+            ),
+            Case(
+                GROUP,
+                name,
+                "power on a 64 x 128 map, host",
+                RELATIVE,
+                partial(host_map, sharpness=s),
+                POWER_NARROW,
+                mitsuba=NO_LOBES,
+            ),
+            Case(
+                GROUP,
+                name,
+                "irradiance, host",
+                "max over the flux",
+                partial(host_irradiance, sharpness=s),
+                HOST,
+                mitsuba=NO_LOBES,
+            ),
+            Case(
+                GROUP,
+                name,
+                "white plane",
+                RELATIVE,
+                partial(plane, sharpness=s),
+                PLANE,
+                PLANE_GRADIENT,
+                NO_LOBES,
+            ),
+        ]
+    rows.append(
+        Case(
+            GROUP,
+            "amplitude 0",
+            "white plane",
+            MAX_ABSOLUTE,
+            partial(zero_amplitude, sharpness=30.0),
+            0.0,
+            PLANE_GRADIENT,
+            NO_LOBES,
+        )
+    )
+    return rows

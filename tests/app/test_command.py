@@ -1,0 +1,975 @@
+"""The command line: flags, configuration files, errors, exit codes, and what is not imported."""
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Sequence
+from dataclasses import asdict, fields, replace
+from itertools import pairwise
+from pathlib import Path
+from typing import Any, get_type_hints
+
+import numpy as np
+import pytest
+
+import warpir.app.command
+import warpir.insert
+from warpir.app.command import BY_HAND, FLAGS, parse
+from warpir.app.config import (
+    ABOVE_ZERO,
+    CHOICES,
+    CPU_DEFAULTS,
+    DEFAULTS,
+    EXCLUSIVE,
+    PRIOR_DEFAULTS,
+    PROMPTS,
+    RANGES,
+    InsertConfig,
+    flag,
+)
+from warpir.app.optimize_settings import OptimizeSettings
+from warpir.app.record import RUN_FORMAT
+from warpir.core.errors import ExitCode, InputError, raise_all
+from warpir.core.limits import Limits
+from warpir.diffusion.settings import GuidanceSettings, ModelSettings, PersonalizeSettings
+
+# The slowest start that still feels immediate. Measured: 0.07 s; the rest is a busy machine.
+ANSWER_SECONDS = 1.0
+HEAVY = ("torch", "warp", "PIL", "OpenImageIO", "OpenEXR", "trimesh", "numpy", "yaml", "colour")
+NEEDED = ["--photo", "p.png", "--asset", "a.glb", "--out", "o"]
+PAINTER = ["--guidance", "stable-diffusion", "--model", "m", "--prompt", "p"]
+
+
+def run(argv: Sequence[str], cwd: Path, after: str = "") -> subprocess.CompletedProcess[str]:
+    """Run ``main`` in a child, then the statements of `after`."""
+    code = f"import sys\nfrom warpir.insert import main\nstatus = main({list(argv)!r})\n{after}\n"
+    return subprocess.run(
+        [sys.executable, "-c", code + "sys.exit(status)"],
+        cwd=cwd,
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+
+
+def assert_fails(
+    capsys: pytest.CaptureFixture[str], argv: Sequence[str], code: int, *words: str
+) -> list[str]:
+    """Check status, exactly one ``error:`` line that holds the words, no traceback."""
+    status = warpir.insert.main(argv)
+    captured = capsys.readouterr()
+    lines = captured.err.splitlines()
+    errors = [line for line in lines if line.startswith("error:")]
+    assert status == code, captured.err
+    assert len(errors) == 1 and lines[0] == errors[0]
+    for word in words:
+        assert word in errors[0]
+    assert "Traceback" not in captured.err
+    return lines
+
+
+def refused(argv: Sequence[str]) -> InputError:
+    with pytest.raises(InputError) as caught:
+        parse(argv)
+    assert caught.value.code == ExitCode.USAGE
+    return caught.value
+
+
+@pytest.mark.parametrize(
+    ("argv", "status"),
+    [(["--help"], 0), (["--version"], 0), (["--samples", "0"], 2), (["--nonsense"], 2)],
+    ids=["help", "version", "range", "unknown"],
+)
+def test_command_answers_at_once(argv: list[str], status: int, tmp_path: Path) -> None:
+    """Help and wrong arguments take under a second and import nothing heavy."""
+    loaded = f"print([m for m in {HEAVY!r} if m in sys.modules])"
+    fastest = float("inf")
+    for _ in range(3):
+        start = time.perf_counter()
+        done = run(argv, tmp_path, loaded)
+        fastest = min(fastest, time.perf_counter() - start)
+        if fastest < ANSWER_SECONDS:
+            break
+    assert done.returncode == status, done.stderr
+    assert done.stdout.splitlines()[-1] == "[]"
+    assert fastest < ANSWER_SECONDS
+
+
+def test_command_runs_as_a_module(tmp_path: Path) -> None:
+    """``python -m warpir.insert`` is the same program, and its status is the process's."""
+    command = [sys.executable, "-m", "warpir.insert", "--fovv", "3"]
+    done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, check=False)
+    assert done.returncode == ExitCode.USAGE
+    assert done.stderr == "error: --fovv: no such flag\ndid you mean --fov?\n"
+
+
+def test_command_help_tells_every_field(capsys: pytest.CaptureFixture[str]) -> None:
+    """Each field of the configuration is a flag with a help text."""
+    assert warpir.insert.main(["--help"]) == 0
+    text = capsys.readouterr().out
+    docs = warpir.app.command._field_docs()
+    listed = [name for forms in FLAGS.values() for name in forms]
+    assert sorted(listed) == sorted(field.name for field in fields(InsertConfig)) == sorted(docs)
+    assert all(f"  {flag(name)}" in text and docs[name] for name in listed)
+    hints = get_type_hints(InsertConfig)
+    switches = {name for name in listed if hints[name] in (bool, bool | None)}
+    assert switches == {name for name, form in forms_of_flags() if not form}
+    for name in switches - {name for name in listed if hints[name] is bool}:
+        assert f"  {flag(name)}, --no-{flag(name)[2:]}" in text
+
+
+def test_command_help_tells_what_each_prior_gets(capsys: pytest.CaptureFixture[str]) -> None:
+    """What is open has no default of its own: the help names those of both priors, by the table."""
+    assert warpir.insert.main(["--help"]) == 0
+    text = " ".join(capsys.readouterr().out.split())
+    assert "(default: embedded sds-base; Stable Diffusion lds)" in text
+    assert "(default: embedded 4, on the CPU 2; Stable Diffusion 1)" in text
+    assert "(default: embedded 0; Stable Diffusion 600)" in text
+    assert text.count("it failed its release gate") == 2
+    for name in set(PRIOR_DEFAULTS["embedded"]) | set(PRIOR_DEFAULTS["stable-diffusion"]):
+        assert DEFAULTS[name] is None
+        for values in (*PRIOR_DEFAULTS.values(), *CPU_DEFAULTS.values()):
+            assert values.get(name, "") is not None
+
+
+def test_open_values_are_the_priors() -> None:
+    """Each prior has its own; what was given stays; a known device decides the rest."""
+    plain = GuidanceSettings()
+    painter = InsertConfig(guidance="stable-diffusion", model="m").settled()
+    assert painter.guidance_settings() == plain and painter.step_count == 600
+    assert painter.personalize and not painter.accept and painter.preview_every == 0
+    for on_cuda, noises, width in ((True, 4, 384), (False, 2, 256)):
+        config = InsertConfig(weight="uniform", steps=9).settled(on_cuda)
+        assert (config.noises, config.picture_width) == (noises, width)
+        assert (config.loss, config.weight) == ("sds-base", "uniform")
+        assert config.accept and config.personalize is False and config.tone_operator == "linear"
+        assert config.settled(not on_cuda) == config
+    assert InsertConfig(loss="dataset-update", steps=9).settled().accept is False
+    adapted = InsertConfig(lora="l.safetensors").settled()
+    assert adapted.personalize is True
+    refined = InsertConfig(refine="tone", reuse="r", model="m", prompt="p").settled()
+    assert refined.step_count == 200 and not refined.accept
+
+
+@pytest.mark.parametrize(
+    ("values", "guide"),
+    [
+        ({}, "embedded"),
+        ({"model": "m"}, "stable-diffusion"),
+        ({"sun": (1.0, 2.0)}, "none"),
+        ({"sky": "clear"}, "none"),
+        ({"light": "l.hdr"}, "none"),
+        ({"reuse": "r"}, "none"),
+        ({"demo": True}, "embedded"),
+        ({"light": "l.hdr", "model": "m"}, "stable-diffusion"),
+        ({"light": "l.hdr", "guidance": "embedded"}, "embedded"),
+        ({"model": "m", "guidance": "none"}, "none"),
+    ],
+)
+def test_who_guides(values: dict[str, Any], guide: str) -> None:
+    """The embedded prior, unless a model or a light is given; what is said counts first."""
+    assert InsertConfig(**values).guided_by == guide
+
+
+@pytest.mark.parametrize(
+    ("values", "is_guided"),
+    [
+        ({}, False),
+        ({"steps": 0}, False),
+        ({"steps": 200}, True),
+        ({"sun": (1.0, 2.0), "guidance": "embedded"}, False),
+        ({"model": "m"}, True),
+        ({"model": "m", "steps": 0}, True),
+        ({"guidance": "none", "steps": 200}, False),
+    ],
+)
+def test_embedded_prior_is_asked_with_steps_alone(values: dict[str, Any], is_guided: bool) -> None:
+    """It failed its release gate: it speaks when somebody says for how long, and never else."""
+    config = InsertConfig(**values)
+    assert config.is_guided is is_guided
+    if config.guided_by == "embedded":
+        assert (config.settled().steps > 0) is is_guided
+
+
+def forms_of_flags() -> list[tuple[str, str]]:
+    return [pair for forms in FLAGS.values() for pair in forms.items()]
+
+
+@pytest.mark.case("F1", "F8")
+def test_every_value_has_a_rule() -> None:
+    """No number without a range, no name that may be anything (F1, F8)."""
+    free = {  # checked in words of their own, free by nature, or text
+        "fov", "horizon", "ground", "place", "at", "rotate_y", "light_rotate", "sun", "sky",
+        "device", "refine_parts", "refine_materials", "lora_layers",
+        "photo", "layer", "occluder_mask", "asset", "materials", "out", "camera", "light", "lora",
+        "model", "reuse", "sequence", "prior", "regressor", "frame", "ground_points", "proxy",
+        "shadow_mask",
+    }  # fmt: skip
+    ruled = {*RANGES, *ABOVE_ZERO, *CHOICES, *PROMPTS}
+    valued = {name for name, form in forms_of_flags() if form}
+    assert valued == ruled | free and not ruled & free
+    defaults = InsertConfig()
+    for name, (low, high) in RANGES.items():
+        # Just outside is refused and both ends are accepted.
+        kind = type(getattr(defaults, name) or low)
+        for value, accepted in ((low, True), (high, True), (low - 1, False)):
+            if value is None or (value == 0 and name in ABOVE_ZERO):
+                continue
+            problems = problems_of(**{name: kind(value)})
+            assert any(p.where == flag(name) and "at least" in p.what for p in problems) != accepted
+        if high is not None:
+            assert any("at most" in p.what for p in problems_of(**{name: kind(high + 1)}))
+
+
+def problems_of(**values: Any) -> list[InputError]:
+    try:
+        InsertConfig(**values)
+    except InputError as error:
+        return [error, *error.also]
+    return []
+
+
+@pytest.mark.parametrize(
+    ("name", "value", "expected"),
+    [
+        ("at", (165.0, 141.0, 3.0), "tuple[float, float]"),
+        ("fov", "x", "float"),
+        ("steps", 2.5, "int"),
+        ("overwrite", 1, "bool"),
+        ("seed", True, "int"),
+        ("photo", 3, "str"),
+    ],
+)
+def test_values_of_another_kind_are_refused(name: str, value: Any, expected: str) -> None:
+    """From Python nothing has read them before."""
+    (error, *others) = problems_of(**{name: value})
+    assert not others and error.code == ExitCode.USAGE
+    assert str(error).startswith(f"--{name.replace('_', '-')}: expected {expected}"), error
+
+
+def test_paths_lists_and_whole_numbers_are_taken() -> None:
+    assert not problems_of(
+        photo=Path("a.png"), at=[165, 141], fov=np.float32(50), samples=np.int64(8)
+    )
+
+
+def test_values_are_kept_as_json_holds_them() -> None:
+    """Whatever Python gave: a record and a checkpoint of it can be written and read back."""
+    place: Any = [np.float32(0.5), np.int64(2), 3]
+    values: dict[str, Any] = {"fov": np.float32(50), "samples": np.int64(8), "place": place}
+    values["photo"] = Path("a.png")
+    config = InsertConfig(**values)
+    assert config == InsertConfig(photo="a.png", fov=50.0, samples=8, place=(0.5, 2.0, 3.0))
+    told = json.loads(json.dumps(asdict(config)))
+    assert InsertConfig(**told) == config and isinstance(config.place, tuple)
+    (error,) = problems_of(fov=np.float32("nan"))
+    assert "finite" in error.what
+    (error,) = problems_of(place=[None, 1.0, 2.0])
+    assert "expected tuple[float, float, float]" in error.what
+
+
+@pytest.mark.parametrize("values", [{}, {"sun": (10.0, 40.0)}, {"demo": True}], ids=str)
+def test_only_a_light_that_is_given_is_turned(values: Any) -> None:
+    (error,) = problems_of(light_rotate=30.0, **values)
+    assert str(error).startswith("--light-rotate: needs --light or --reuse")
+    assert not problems_of(light_rotate=30.0, light="sky.exr")
+    assert not problems_of(light_rotate=30.0, demo=True, guidance="none")
+
+
+@pytest.mark.parametrize(
+    ("argv", "name", "value"),
+    [
+        (["--place", "-1,0,-3"], "place", (-1.0, 0.0, -3.0)),
+        (["--place=-1,0,-3"], "place", (-1.0, 0.0, -3.0)),
+        (["--ground", "-.5,1,0,2e-3"], "ground", (-0.5, 1.0, 0.0, 0.002)),
+        (["--pitch", "-8"], "pitch", -8.0),
+        (["--light", "l.exr", "--light-rotate", "-90.5"], "light_rotate", -90.5),
+        (["--guidance", "none", "--exposure", "-2"], "exposure", -2.0),
+        (["--camera", "f.fspy", "--up", "-z"], "up", "-z"),
+        (["--asset-up", "-z"], "asset_up", "-z"),
+        (["--sun", "-30,40"], "sun", (-30.0, 40.0)),
+        (["--sun", "120,40,2.5"], "sun", (120.0, 40.0, 2.5)),
+        (["--sky", "overcast"], "sky", "overcast"),
+        (["--sky", "0.1,0.2,0.3"], "sky", (0.1, 0.2, 0.3)),
+        (["--no-mark"], "mark", False),
+        (["--overwrite"], "overwrite", True),
+        (["--device", "cuda:1"], "device", "cuda:1"),
+        (["--photo", "-x.png"], "photo", "-x.png"),
+        (["--width", "8"], "width", 8),
+        (["--no-personalize"], "personalize", False),
+        (["--personalize"], "personalize", True),
+        (["--steps", "9", "--no-accept"], "accept", False),
+        (["--steps", "9", "--accept"], "accept", True),
+        (["--steps", "9", "--prior", "own.safetensors"], "prior", "own.safetensors"),
+        (["--no-tone-curve"], "tone_curve", False),
+        (["--allow-download"], "allow_download", True),
+        (["--lora-layers", "to_q, to_k"], "lora_layers", ("to_q", "to_k")),
+        (["--negative-prompt", ""], "negative_prompt", ""),
+        (["--prompt", "a car, \U0001f697\nred"], "prompt", "a car, \U0001f697\nred"),
+        (
+            [
+                "--guidance",
+                "stable-diffusion",
+                "--model",
+                "m",
+                "--prompt",
+                "p",
+                "--show-prior",
+                "a red car, new | a cat",
+            ],
+            "show_prior",
+            ("a red car, new", "a cat"),
+        ),
+        (["--steps", "0"], "steps", 0),
+    ],
+)
+def test_command_reads_values(argv: list[str], name: str, value: object) -> None:
+    """Flags arrive as their field's type, values with a leading minus too."""
+    assert getattr(parse([*NEEDED, *argv]).config, name) == value
+
+
+@pytest.mark.parametrize(
+    ("argv", "where", "words"),
+    [
+        (["--samples", "0"], "--samples", "at least 1 (found 0)"),
+        (["--samples", "many"], "--samples", "expected a whole number (found 'many')"),
+        (["--samples", "1.5"], "--samples", "whole number"),
+        pytest.param(["--fov", "1_0"], "--fov", "expected a number", id="F1-fov-1_0"),
+        pytest.param(["--seed", "1_0"], "--seed", "expected a whole number", id="F1-seed-1_0"),
+        (["--fov", "180"], "--fov", "between 0 and 180 (found 180.0)"),
+        (["--fov", "nan"], "--fov", "finite"),
+        (["--fov", "1e400"], "--fov", "finite"),
+        (["--place", "1,2"], "--place", "expected X,Y,Z (found '1,2')"),
+        (["--place", "1,2,inf"], "--place", "finite"),
+        (["--ground", "0,0,0,1"], "--ground", "normal"),
+        (["--scale", "0"], "--scale", "at least 1e-09"),
+        (["--size", "-1"], "--size", "at least 1e-06"),
+        pytest.param(["--size", "1e300"], "--size", "at most", id="F1-size-1e300"),
+        pytest.param(["--sun", "0,45,1e300"], "--sun", "numbers up to 1e+09", id="F1-sun-1e300"),
+        pytest.param(["--sky", "1e300,1,1"], "--sky", "numbers up to 1e+09", id="F1-sky-1e300"),
+        pytest.param(["--place", "0,0,-1e30"], "--place", "numbers up", id="F1-place-1e30"),
+        pytest.param(["--ground", "0,1e200,0,0"], "--ground", "numbers up", id="C8-ground-1e200"),
+        pytest.param(["--ground-albedo", "1e-320"], "--ground-albedo", "least", id="F1-albedo"),
+        (["--seed", "-1"], "--seed", "at least 0"),
+        (["--seed", str(2**64)], "--seed", "at most"),
+        (["--device", "tpu"], "--device", "cuda"),
+        (["--sky", "purple"], "--sky", "overcast"),
+        (["--sun", "0,91"], "--sun", "elevation"),
+        (["--guidance", "lds"], "--guidance", "embedded or stable-diffusion or none (found lds)"),
+        (["--guidance", "stable-diffusion", "--prompt", "p"], "--model", "needed"),
+        (["--guidance", "stable-diffusion", "--model", "m"], "--prompt", "needed"),
+        (
+            [*"--guidance stable-diffusion --model m --prompt p --no-personalize".split()],
+            "--no-personalize",
+            "--loss lds",
+        ),
+        (["--prompt", "p\0"], "--prompt", "NUL"),
+        (["--prompt", "\u00e9" * 2049], "--prompt", "4098 bytes"),
+        (["--prompt", " "], "--prompt", "empty (found ' '"),
+        (["--prompt", "the."], "--prompt", "empty (found 'the.'"),
+        (["--prompt", "p", "--class-noun", "a"], "--class-noun", "empty (found 'a'"),
+        (["--prompt", "p", "--token", " "], "--token", "empty (found ' '"),
+        (["--show-prior", "a||b"], "--show-prior", "not empty"),
+        (["--show-prior", "a"], "--show-prior", "needs --guidance"),
+        (
+            "--guidance stable-diffusion --show-prior a --no-personalize".split(),
+            "--no-personalize",
+            "--show-prior",
+        ),
+        ("--guidance stable-diffusion --exposure 1".split(), "--exposure", "is recovered"),
+        (["--loss", "vsd"], "--loss", "lds-lora-both"),
+        ([*PAINTER, "--loss", "lds-negative"], "--loss", "--negative-prompt"),
+        ([*PAINTER, "--loss", "sds-good-bad"], "--loss", "--negative-prompt"),
+        (
+            [*PAINTER, "--time-min", "0.7"],
+            "--time-min",
+            "at most --time-max (found 0.7 and 0.6)",
+        ),
+        (["--time-min", "0.95"], "--time-min", "at most --time-max (found 0.95 and 0.9)"),
+        ([*PAINTER, "--crop-min", "4"], "--crop-min", "at most --crop-max"),
+        (["--crop-min", "5"], "--crop-min", "at most --crop-max (found 5 and 4)"),
+        (["--loss", "lds"], "--loss", "lds compares the adapted model"),
+        (
+            ["--steps", "9", "--accept", "--loss", "dataset-update"],
+            "--accept",
+            "--loss dataset-update",
+        ),
+        (["--guidance", "none", "--no-accept"], "--accept", "needs --guidance"),
+        (["--guidance", "none", "--prior", "p"], "--prior", "needs --guidance embedded"),
+        (["--prior", "p"], "--prior", "and --steps 60: the prior is not asked without"),
+        (["--accept"], "--accept", "--steps 60 for the embedded one"),
+        (["--resume", "--steps", "0"], "--resume", "--steps 60 for the embedded one"),
+        (["--steps", "9", "--exposure", "1"], "--exposure", "is recovered"),
+        ([*PAINTER, "--lora", "l", "--no-personalize"], "--no-personalize", "--lora"),
+        (["--start", "sunny"], "--start", "regressed or uniform"),
+        (["--trust", "-1"], "--trust", "at least 0"),
+        (["--lora-rate", "0"], "--lora-rate", "more than 0"),
+        (["--chroma-limit", "0"], "--chroma-limit", "more than 0"),
+        (["--intensity-limit", "0.5"], "--intensity-limit", "at least 1"),
+        (["--lora-layers", "to_q,"], "--lora-layers", "not empty"),
+        (["--adam-beta2", "1"], "--adam-beta2", "at most 0.999999 (found 1.0)"),
+        (["--rate-axis", "inf"], "--rate-axis", "finite"),
+        (["--steps", "-1"], "--steps", "at least 0"),
+        (["--class-images", "1.5"], "--class-images", "whole number"),
+        (["--sequence", "f"], "--sequence", "needs --reuse"),
+        (["--guidance", "none", "--resume"], "--resume", "needs --guidance"),
+        (["--refine", "light"], "--refine", "material or emission or tone"),
+        (["--refine", "tone", "--prompt", "p"], "--refine", "known light"),
+        (["--refine", "tone", "--prompt", "p", "--reuse", "r"], "--refine", "needs --guidance"),
+        (
+            ["--refine", "material", "--light", "l", "--guidance", "embedded"],
+            "--refine",
+            "no other knows colours",
+        ),
+        (["--refine-parts", "metallic"], "--refine-parts", "--refine material"),
+        (
+            ["--reuse", "r", "--guidance", "stable-diffusion", "--model", "m", "--prompt", "p"],
+            "--guidance",
+            "cannot be used with --reuse",
+        ),
+        (["--reuse", "r", "--model", "m", "--prompt", "p"], "--model", "cannot be used with"),
+        (["--mark"], "--mark", "no such flag"),
+        (["--photo", ""], "--photo", "not empty"),
+        (["--fit-lobes", "4"], "--fit-lobes", "--light"),
+        (["--up", "z"], "--up", "--camera"),
+        (["--photo"], "--photo", "expected one argument"),
+        (["--overwrite=yes"], "--overwrite", "ignored explicit argument"),
+        (["stray"], "stray", "no such flag"),
+        (["--sample", "4"], "--sample", "no such flag"),
+    ],
+)
+def test_command_refuses_values(argv: list[str], where: str, words: str) -> None:
+    """A value that cannot be used names its flag, what was found and what was expected (F1, F8)."""
+    error = refused([*NEEDED, *argv])
+    assert error.where == where
+    assert words in error.what
+
+
+@pytest.mark.parametrize(("first", "second"), EXCLUSIVE)
+def test_command_refuses_flags_that_exclude_each_other(first: str, second: str) -> None:
+    """At most one of each pair may be given."""
+    values = {
+        "photo": "p.png", "asset": "a.glb", "camera": "c.json", "fov": "50", "pitch": "0",
+        "horizon": "5", "camera_height": "2", "place": "0,0,1", "at": "1,2", "scale": "1",
+        "size": "1", "light": "l.hdr", "sun": "1,2", "sky": "clear", "reuse": "r", "refine": "tone",
+        "sequence": "s.jsonl", "start": "uniform", "ground": "0,1,0,0", "ground_points": "p.ply",
+    }  # fmt: skip
+    argv = ["--out", "o"]
+    for name in (first, second):
+        argv += [flag(name), values[name]] if name in values else [flag(name)]
+    error = refused(argv)
+    assert error.where == flag(second)
+    assert error.what == f"cannot be used with {flag(first)}"
+
+
+def test_command_lists_all_problems(capsys: pytest.CaptureFixture[str]) -> None:
+    """The first problem is the error, the others follow as also: lines."""
+    argv = [*NEEDED, "--samples", "0", "--depth", "0", "--fov", "0"]
+    lines = assert_fails(capsys, argv, 2, "--fov")
+    assert [line.split(":")[1].strip() for line in lines[1:]] == ["--samples", "--depth"]
+    assert all(line.startswith("also: ") for line in lines[1:])
+
+
+def test_command_names_what_is_needed(capsys: pytest.CaptureFixture[str]) -> None:
+    """Without --demo photo, asset and out are needed; with it only out."""
+    lines = assert_fails(capsys, [], 2, "--photo: needed")
+    assert lines[1:] == [
+        "--demo needs neither --photo nor --asset",
+        "also: --asset: needed",
+        "also: --out: needed",
+    ]
+    assert_fails(capsys, ["--demo"], 2, "--out: needed")
+    assert parse(["--demo", "--out", "o"]).config.demo
+
+
+YAML = """\
+photo: p.png
+asset: "a.glb"
+out: o
+camera-height: 1.5   # a flag's spelling
+rotate_y: 30         # a field's spelling
+place: [-1, 0, -3.5]
+sky: 0.1,0.2,0.3
+samples: 16
+mark: false
+width: null
+lora-layers: [to_q, to_out.0]
+graphs: false
+"""
+
+
+def test_config_file_gives_the_same_as_flags(tmp_path: Path) -> None:
+    """YAML and JSON, lists and comma-separated text, both spellings of a name."""
+    expected = parse(
+        ["--photo", "p.png", "--asset", "a.glb", "--out", "o", "--camera-height", "1.5",
+         "--rotate-y", "30", "--place", "-1,0,-3.5", "--sky", "0.1,0.2,0.3", "--samples", "16",
+         "--no-mark", "--lora-layers", "to_q,to_out.0", "--no-graphs"]
+    ).config  # fmt: skip
+    path = tmp_path / "run.yaml"
+    path.write_text(YAML)
+    assert parse(["--config", str(path)]).config == expected
+    other = tmp_path / "c.json"
+    other.write_text(json.dumps(asdict(expected)))
+    assert parse(["--config", str(other)]).config == expected
+
+
+@pytest.mark.case("F2")
+def test_config_file_replays_a_run(tmp_path: Path) -> None:
+    """``run.json`` of an earlier run is a configuration; an unknown layout is refused (F2)."""
+    config = InsertConfig(
+        photo="p.png", asset="a.glb", out="o", sun=(10.0, 20.0), seed=7, lora_layers=("to_q",)
+    )
+    path = tmp_path / "run.json"
+    path.write_text(json.dumps({"format": RUN_FORMAT, "config": asdict(config), "seconds": {}}))
+    assert parse(["--config", str(path)]).config == config
+    path.write_text(json.dumps({"format": RUN_FORMAT + 1, "config": asdict(config)}))
+    assert "format" in refused(["--config", str(path)]).what
+
+
+@pytest.mark.case("F2")
+def test_config_file_of_an_older_version_replays(tmp_path: Path) -> None:
+    """``run.json`` of a version that knew none of guidance's settings means their defaults (F2)."""
+    settings = (ModelSettings, PersonalizeSettings, GuidanceSettings, OptimizeSettings)
+    newer = {field.name for kind in settings for field in fields(kind)}
+    newer |= {"frame", "undistort", "ground_points"}
+    newer |= set(FLAGS["applications"]) | set(FLAGS["guidance"]) - {"guidance"}
+    newer |= {"proxy", "plane", "shadow_mask", "layer", "occluder_mask", "light_convention"}
+    newer |= {"strict", "detail", "hand_off", "mitsuba", "asset_up"}
+    newer |= {f"max_{field.name}" for field in fields(Limits)} - {"max_pixels"}
+    newer |= {"max_prompt_bytes"}
+    config = InsertConfig(photo="p.png", asset="a.glb", out="o", sky="clear", depth=2)
+    known = {name: value for name, value in asdict(config).items() if name not in newer}
+    path = tmp_path / "run.json"
+    path.write_text(json.dumps({"format": 1, "warpir": "0.1.0", "config": known}))
+    assert len(known) < 45 and parse(["--config", str(path)]).config == config
+
+
+@pytest.mark.parametrize("name", BY_HAND, ids="F1-{}".format)
+def test_config_file_opens_no_network_and_no_pickle(tmp_path: Path, name: str) -> None:
+    """A configuration may be a stranger's, an earlier run.json too: the flag itself is needed."""
+    path = tmp_path / "c.json"
+    plain = {"photo": "p.png", "asset": "a.glb", "out": "o"}
+    for content in ({name: True}, {"format": RUN_FORMAT, "config": {**plain, name: True}}):
+        path.write_text(json.dumps(content))
+        error = refused([*NEEDED, "--config", str(path)])
+        assert error.where == str(path) and name in error.what and flag(name) in error.advice
+        told = parse([*NEEDED, "--config", str(path), flag(name)])
+        assert getattr(told.config, name) is True
+    path.write_text(json.dumps({name: False}))
+    assert getattr(parse([*NEEDED, "--config", str(path)]).config, name) is False
+
+
+@pytest.mark.case("F3")
+def test_config_file_yields_to_flags(tmp_path: Path) -> None:
+    """A flag wins over the file, and says so (F3)."""
+    path = tmp_path / "c.yaml"
+    path.write_text(YAML)
+    command = parse(["--config", str(path), "--samples", "8"])
+    assert command.config.samples == 8
+    assert len(command.notices) == 1 and "--samples" in command.notices[0]
+
+
+@pytest.mark.parametrize(
+    ("name", "text", "words"),
+    [
+        ("c.yaml", "sampels: 3\n", "unknown key 'sampels'"),
+        ("c.yaml", "samples: .nan\n", "whole number"),
+        ("c.yaml", "fov: .nan\n", "finite"),
+        ("c.yaml", "fov: 1e400\n", "finite"),
+        ("c.yaml", "samples: true\n", "whole number"),
+        ("c.yaml", "samples: -3\n", "at least 1"),
+        ("c.yaml", "samples: null\n", "whole number"),
+        ("c.yaml", "seed: 1.5\n", "whole number"),
+        ("c.yaml", "overwrite: 1\n", "true or false"),
+        ("c.yaml", "place: {x: 1}\n", "X,Y,Z"),
+        ("c.yaml", "camera: [a]\n", "FILE"),
+        ("c.yaml", "photo: !!python/object/apply:os.system ['touch x']\n", "not YAML"),
+        pytest.param("c.yaml", "device: !!bool maybe\n", "its tag", id="F1-yaml-bool"),
+        pytest.param("c.yaml", 'fov: !!float ""\n', "its tag", id="F1-yaml-float"),
+        pytest.param("c.yaml", "seed: !!timestamp x\n", "its tag", id="F1-yaml-timestamp"),
+        ("c.yaml", "samples: 3\nsamples: 4\n", "line 2: key 'samples' twice"),
+        ("c.yaml", "a: [\n", "not YAML"),
+        pytest.param(
+            "c.yaml", "at: [0640, 0610]\n", "line 1: '0640' is no dec", id="F1-yaml-octal"
+        ),
+        pytest.param("c.yaml", "seed: 0x1f\n", "'0x1f' is no decimal", id="F1-yaml-hex"),
+        pytest.param("c.yaml", f"seed: 0x{'f' * 10_000}\n", "is no dec", id="F1-yaml-long-hex"),
+        pytest.param("c.yaml", "fov: 1:30.5\n", "'1:30.5' is no decimal", id="F1-yaml-base-60"),
+        pytest.param("c.yaml", "? [a]\n: 1\n", "found a sequence", id="F1-yaml-list-as-key"),
+        pytest.param(
+            "c.yaml", "light-rotate: 1\nlight_rotate: 2\n", "twice", id="F1-two-spellings"
+        ),
+        ("c.yaml", "- 1\n", "keys and values"),
+        ("c.yaml", "[" * 3000, "nested too deeply"),
+        ("c.yaml", "a: &a [x,x]\nb: &b [*a,*a,*a]\nplace: [*b,*b,*b]\n", "unknown key 'a'"),
+        ("c.json", '{"fov": NaN}', "NaN"),
+        ("c.json", '{"samples": 3, "samples": 4}', "twice"),
+        ("c.json", '{"samples": 3,}', "line 1: not JSON"),
+        ("c.json", "[]", "object"),
+        ("c.json", "\xff", "not UTF-8"),
+    ],
+)
+def test_config_file_refused(tmp_path: Path, name: str, text: str, words: str) -> None:
+    """A bad file ends with status 2 and names its key or line; no code from it runs (F1)."""
+    path = tmp_path / name
+    path.write_bytes(text.encode("latin-1"))
+    error = refused([*NEEDED, "--config", str(path)])
+    assert words in f"{error.where}: {error.what}"
+    assert list(tmp_path.iterdir()) == [path]
+
+
+@pytest.mark.case("F1")
+def test_config_file_of_aliases_is_refused_at_once(tmp_path: Path) -> None:
+    """Ten lines of aliases that stand for 10^9 entries neither hang nor print them (F1)."""
+    names = "abcdefghi"
+    lines = ["a: &a [x, x, x, x, x, x, x, x, x]"]
+    lines += [f"{b}: &{b} [{', '.join(['*' + a] * 9)}]" for a, b in pairwise(names)]
+    path = tmp_path / "bomb.yaml"
+    path.write_text("\n".join([*lines, "place: *i", "photo: *i"]))
+    start = time.perf_counter()
+    error = refused(["--config", str(path)])
+    assert time.perf_counter() - start < 5.0
+    assert len(str(error)) < 500
+
+
+@pytest.mark.case("F1")
+def test_config_file_of_aliases_as_a_key_is_refused_at_once(tmp_path: Path) -> None:
+    """The same as the key of a mapping: it is never written out."""
+    names = "abcdefgh"
+    lines = ["a: &a [x, x, x, x, x, x, x, x, x]"]
+    lines += [f"{b}: &{b} [{', '.join(['*' + a] * 9)}]" for a, b in pairwise(names)]
+    path = tmp_path / "bomb.yaml"
+    path.write_text("\n".join([*lines, "? *h", ": 1"]))
+    error = refused(["--config", str(path)])
+    assert error.what.endswith("unknown key (found a sequence)")
+
+
+@pytest.mark.case("F1")
+def test_config_file_of_many_unknown_keys(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """20 000 unknown keys, one of them of a megabyte, are a few dozen short lines at once."""
+    path = tmp_path / "c.json"
+    keys = {"a" * 10**6: 1, **{f"phot{k}": 1 for k in range(20_000)}}
+    path.write_text(json.dumps(keys))
+    start = time.perf_counter()
+    assert warpir.insert.main(["--config", str(path)]) == ExitCode.USAGE
+    assert time.perf_counter() - start < 5.0
+    lines = capsys.readouterr().err.splitlines()
+    assert len(lines) == 32 and lines[-1].endswith("19971 more unknown keys")
+    assert max(map(len, lines)) < 300
+
+
+@pytest.mark.case("F1")
+def test_lines_of_an_error_are_bounded(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Whatever a file holds, an error is a line of 10 000 characters and 31 further ones."""
+
+    def fail(config: InsertConfig) -> None:
+        raise_all([InputError("a.json", f"{k}{'A' * 20_000} at last") for k in range(1000)])
+
+    monkeypatch.setattr(warpir.insert, "insert", fail)
+    assert warpir.insert.main(["--demo", "--out", "o"]) == ExitCode.INPUT
+    lines = capsys.readouterr().err.splitlines()
+    assert len(lines) == 32 and lines[-1] == "also: and 969 more"
+    assert lines[0].startswith("error: a.json: 0AAA") and lines[0].endswith("AAA at last")
+    assert max(map(len, lines)) < 10_010
+
+
+@pytest.mark.parametrize(
+    ("flags", "shown"),
+    [pytest.param([], 0, id="R11-warning"), pytest.param(["--debug"], 1, id="R11-with-debug")],
+)
+def test_warnings_of_libraries_are_for_debugging(
+    flags: list[str], shown: int, tmp_path: Path
+) -> None:
+    """What NumPy warns of reaches nobody who did not ask."""
+    code = (
+        "import sys, numpy as np\n"
+        "from warpir.app.program import run_program\n"
+        "def run(argv):\n    np.float32(3e38) * np.float32(10)\n    return 0\n"
+        "sys.exit(run_program(run))"
+    )
+    done = subprocess.run(
+        [sys.executable, "-c", code, *flags], cwd=tmp_path, capture_output=True, text=True
+    )
+    assert done.returncode == 0 and done.stdout == ""
+    assert done.stderr.count("RuntimeWarning") == shown and bool(done.stderr) == bool(shown)
+
+
+@pytest.mark.parametrize("kind", ["missing", "folder", "pipe"])
+def test_config_file_that_is_no_file(tmp_path: Path, kind: str) -> None:
+    """A missing file, a folder and a pipe are refused without waiting."""
+    path = tmp_path / "c.yaml"
+    if kind == "folder":
+        path.mkdir()
+    elif kind == "pipe":
+        os.mkfifo(path)
+    assert refused(["--config", str(path)]).where == str(path)
+
+
+def test_command_reports_bad_inputs_together(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """--validate looks at every input before it stops; the first decides the status."""
+    argv = ["--photo", str(tmp_path / "no.jpg"), "--asset", str(tmp_path / "no.glb"), "--out",
+            str(tmp_path / "o"), "--light", str(tmp_path / "no.hdr"), "--validate"]  # fmt: skip
+    lines = assert_fails(capsys, argv, ExitCode.INPUT, "no.jpg")
+    also = [line for line in lines if line.startswith("also: ")]
+    assert len(also) == 2 and "no.glb" in also[0] and "no.hdr" in also[1]
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.case("F5")
+def test_command_never_writes_over_its_inputs(scene: list[str], tmp_path: Path) -> None:
+    """--out may not be the folder of an input: --overwrite could replace the photo (F5)."""
+    from warpir.app.inputs import read_inputs
+
+    scene[scene.index("--out") + 1] = str(tmp_path / "x" / "..")
+    with pytest.raises(InputError, match="--out: holds the input") as caught:
+        read_inputs(parse([*scene, "--overwrite"]).config)
+    assert caught.value.code == ExitCode.USAGE
+
+
+@pytest.mark.parametrize(
+    ("flag", "name", "target"),
+    [
+        pytest.param("--photo", "link.png", "out/composite.png", id="F5-link-into-out"),
+        pytest.param("--photo", "out/link.png", "photo.png", id="F5-link-that-lies-in-out"),
+        pytest.param("--photo", "out/progress/p.png", None, id="F5-below-out"),
+        pytest.param("--model", "out/model", None, id="F5-model-in-out"),
+        pytest.param("--asset", "a.obj", None, id="F5-material-file-in-out"),
+    ],
+)
+def test_command_refuses_inputs_that_a_result_could_replace(
+    flag: str, name: str, target: str | None, scene: list[str], tmp_path: Path
+) -> None:
+    """Wherever below --out, and whether a link is there or leads there."""
+    from warpir.app.inputs import read_inputs
+
+    (tmp_path / "out" / "progress").mkdir(parents=True)
+    for copy in ("composite.png", "progress/p.png"):
+        (tmp_path / "out" / copy).write_bytes((tmp_path / "photo.png").read_bytes())
+    (tmp_path / "out" / "a.mtl").write_text("newmtl red\nKd 1 0 0\n")
+    (tmp_path / "a.obj").write_text("mtllib out/a.mtl\nusemtl red\n" + OBJ)
+    if target is not None:
+        (tmp_path / name).symlink_to(tmp_path / target)
+    argv = [*scene, "--overwrite", flag, str(tmp_path / name)]
+    argv += ["--prompt", "p"] if flag == "--model" else []
+    with pytest.raises(InputError, match="--out: holds the input") as caught:
+        read_inputs(parse(argv).config)
+    assert caught.value.code == ExitCode.USAGE
+
+
+OBJ = "v 0 0 0\nv 1 0 0\nv 0 1 0\nv 0 0 1\nf 1 2 3\nf 1 2 4\n"
+LOBES = {
+    "format": "warpir-lobes",
+    "version": 1,
+    "lobes": [{"amplitude": [1, 2, 3], "axis": [0, 2, 0], "sharpness": 5}],
+}
+
+
+@pytest.fixture
+def scene(tmp_path: Path) -> list[str]:
+    """Arguments of a valid run: a small photo, four triangles' corners, one lobe."""
+    import numpy as np
+    from PIL import Image
+
+    ramp = np.arange(48 * 64 * 3, dtype=np.uint32).reshape(48, 64, 3) % 251
+    Image.fromarray(ramp.astype(np.uint8)).save(tmp_path / "photo.png")
+    (tmp_path / "asset.obj").write_text(OBJ)
+    (tmp_path / "lobes.json").write_text(json.dumps(LOBES))
+    return ["--photo", str(tmp_path / "photo.png"), "--asset", str(tmp_path / "asset.obj"),
+            "--light", str(tmp_path / "lobes.json"), "--out", str(tmp_path / "out"),
+            "--pitch", "-20"]  # fmt: skip
+
+
+def test_validate_reads_everything_without_torch_or_warp(scene: list[str], tmp_path: Path) -> None:
+    """--validate says what is assumed, writes nothing and loads no renderer."""
+    loaded = "print([m for m in ('torch', 'warp', 'colour', 'diffusers') if m in sys.modules])"
+    done = run([*scene, "--validate"], tmp_path, loaded)
+    lines = done.stdout.splitlines()
+    assert done.returncode == 0, done.stderr
+    assert lines[-2:] == ["inputs are valid", "[]"]
+    assert any(line.startswith("assumed: ") and "--fov" in line for line in lines)
+    assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.parametrize("axis", [None, "+z", "-z"])
+def test_M16_asset_up_is_applied_and_said(scene: list[str], axis: str | None) -> None:
+    """Without --asset-up an OBJ is taken as Y up; with it the asset is turned; both are said."""
+    from warpir.app.inputs import read_inputs
+
+    given = read_inputs(parse([*scene, *(["--asset-up", axis] if axis else [])]).config)
+    low, high = given.asset.bounds()
+    assumed = [line for line in given.assumed if "--asset-up" in line]
+    turned = [line for line in given.notices if "--asset-up" in line]
+    if axis is None:
+        assert len(assumed) == 1 and "+y axis" in assumed[0] and not turned
+    else:
+        assert not assumed and turned == [
+            f"asset.obj: turned: its {axis} axis points up (--asset-up)"
+        ]
+    # The corners lie at 0 and 1 along each axis.
+    expected = {None: (0.0, 0.0), "+z": (0.0, -1.0), "-z": (-1.0, 0.0)}[axis]
+    assert (low[1], low[2]) == expected and (high[1] - low[1]) == 1.0
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        ({"format": "x"}, "not lobes"),
+        ({"lobes": []}, "/lobes"),
+        ({"lobes": [{"amplitude": [1, 2], "axis": [0, 1, 0], "sharpness": 1}]}, "amplitude"),
+        ({"lobes": [{"amplitude": [1, 2, -3], "axis": [0, 1, 0], "sharpness": 1}]}, "amplitude"),
+        ({"lobes": [{"amplitude": [1, 2, 3], "axis": [0, 0, 0], "sharpness": 1}]}, "axis"),
+        ({"lobes": [{"amplitude": [1, 2, 3], "axis": [0, 1, 0], "sharpness": 0}]}, "sharpness"),
+        pytest.param(
+            {"lobes": [{"amplitude": [1, 2, 3], "axis": [0, 1, 0], "sharpness": 1e-300}]},
+            "sharpness",
+            id="E5-sharpness-0-in-float32",
+        ),
+        ({"lobes": [{"amplitude": [1, 2, 3], "axis": [0, 1, 0]}]}, "sharpness"),
+    ],
+)
+def test_validate_refuses_lobes(
+    scene: list[str],
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+    change: dict[str, object],
+    words: str,
+) -> None:
+    """A lobe out of range is named by its pointer."""
+    (tmp_path / "lobes.json").write_text(json.dumps({**LOBES, **change}))
+    assert_fails(capsys, [*scene, "--validate"], ExitCode.INPUT, "lobes.json", words)
+
+
+def test_main_reports_its_own_faults(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], scene: list[str]
+) -> None:
+    """What nobody foresaw ends with status 1, a traceback and a request to report it."""
+
+    def fail(config: InsertConfig) -> None:
+        raise ZeroDivisionError("none\nof it")
+
+    monkeypatch.setattr(warpir.insert, "insert", fail)
+    assert warpir.insert.main(scene) == ExitCode.BUG
+    text = capsys.readouterr().err
+    assert "Traceback" in text and "report" in text
+    assert "error: warpir: a fault of its own (ZeroDivisionError: none\\nof it)\n" in text
+
+
+def short_of_memory() -> BaseException:
+    """Return what torch raises on the CPU."""
+    import torch
+
+    with pytest.raises(RuntimeError) as caught:
+        torch.empty(10**15)
+    return caught.value
+
+
+@pytest.mark.parametrize(
+    ("raised", "status", "words"),
+    [
+        (KeyboardInterrupt(), 130, "stopped"),
+        (MemoryError(), ExitCode.RESOURCES, "error: memory:"),
+        (short_of_memory(), ExitCode.RESOURCES, "error: memory:"),
+        (
+            RuntimeError("Failed to allocate 9 bytes on device 'cuda:0'"),
+            ExitCode.RESOURCES,
+            "error: memory:",
+        ),
+        (OSError(28, "No space left on device", "o/x.exr"), ExitCode.RESOURCES, "error: o/x.exr:"),
+        (ModuleNotFoundError("", name="ray"), ExitCode.USAGE, "warpir[ray]"),
+        (InputError("a\nb.png", "x\x1b[31m"), ExitCode.INPUT, "error: a\\nb.png: x\\x1b[31m"),
+    ],
+    ids=["interrupt", "memory", "torch", "warp", "disk", "R15", "control-characters"],
+)
+def test_main_tells_the_truth_by_status(
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+    scene: list[str],
+    raised: BaseException,
+    status: int,
+    words: str,
+) -> None:
+    """Each class of fault has its exit status and no traceback."""
+
+    def fail(config: InsertConfig) -> None:
+        raise raised
+
+    monkeypatch.setattr(warpir.insert, "insert", fail)
+    assert warpir.insert.main(scene) == status
+    text = capsys.readouterr().err
+    assert words in text and "Traceback" not in text
+    assert text.count("error:") == (0 if status == 130 else 1)
+    assert warpir.insert.main([*scene, "--debug"]) == status
+    assert "Traceback" in capsys.readouterr().err
+
+
+def test_main_stops_on_sigterm(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], scene: list[str]
+) -> None:
+    """SIGTERM unwinds like Ctrl-C, with status 143, and the old handler comes back."""
+
+    def terminate(config: InsertConfig) -> None:
+        signal.raise_signal(signal.SIGTERM)
+
+    before = signal.getsignal(signal.SIGTERM)
+    monkeypatch.setattr(warpir.insert, "insert", terminate)
+    assert warpir.insert.main(scene) == 143
+    assert signal.getsignal(signal.SIGTERM) == before
+
+
+@pytest.mark.case("R11")
+def test_main_survives_a_closed_stdout(scene: list[str], tmp_path: Path) -> None:
+    """``| head`` ends neither the run nor its status (R11)."""
+    code = (
+        "import os, sys\nread, write = os.pipe()\nos.close(read)\nos.dup2(write, 1)\n"
+        f"from warpir.insert import main\nsys.exit(main({[*scene, '--validate']!r}))"
+    )
+    done = subprocess.run(
+        [sys.executable, "-c", code], cwd=tmp_path, capture_output=True, text=True, check=False
+    )
+    assert (done.returncode, done.stderr) == (0, "")
+
+
+def test_insert_is_called_through_the_module() -> None:
+    """``from warpir import insert; insert(config)`` reaches the same function."""
+    from warpir import insert
+
+    with pytest.raises(InputError, match="--photo: needed"):
+        insert(InsertConfig(out="o"))
+    with pytest.raises(InputError, match="--photo: needed"):
+        insert.insert(InsertConfig(out="o"))
+
+
+def test_demo_leaves_its_light_to_guidance() -> None:
+    """The demo's own light and exposure are given, except where they are to be recovered."""
+    from warpir.demo import demo_config
+
+    plain = demo_config(InsertConfig(demo=True, out="o", guidance="none"))
+    assert plain.light is not None and plain.exposure == 0.0
+    guided = InsertConfig(
+        demo=True, out="o", guidance="stable-diffusion", model="m", prompt="a car", tone="reinhard"
+    )
+    assert demo_config(InsertConfig(demo=True, out="o")).light is None
+    sunny = demo_config(InsertConfig(demo=True, out="o", sun=(10.0, 20.0)))
+    assert sunny.light is None and sunny.guided_by == "none"
+    recovered = demo_config(guided)
+    assert recovered.light is None and recovered.exposure is None and recovered.tone == "reinhard"
+    assert recovered.photo == plain.photo and recovered.place == plain.place
+    # Refinement changes the object under a light that is known.
+    assert demo_config(replace(guided, refine="material")).light == plain.light
+
+
+def test_paths_are_what_the_flags_say() -> None:
+    """Pictures carry of these settings the last name alone."""
+    from warpir.app.record import PATHS
+
+    forms = forms_of_flags()
+    assert sorted(PATHS) == sorted(n for n, f in forms if {*f.split("|")} & {"FILE", "DIR"})

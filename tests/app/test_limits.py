@@ -1,0 +1,777 @@
+"""The order of the checks, the output folder, limits: what ends a run before torch is loaded."""
+
+import json
+import os
+import struct
+import subprocess
+import sys
+import zlib
+from collections.abc import Callable
+from dataclasses import dataclass, fields
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from tests.builders.faults import Ended, assert_fails, run_case, snapshot
+from tests.builders.image_files import png_chunk
+from tests.insert.test_faults import NO_POSE
+from tests.insert.test_insert import arguments, read_layers, write_inputs
+from tests.io.test_gltf import Builder
+from warpir.app.command import FLAGS, YAML_SHARE
+from warpir.app.config import InsertConfig
+from warpir.app.disk_space import needed_bytes
+from warpir.app.inputs import read_inputs
+from warpir.core.errors import ExitCode
+from warpir.core.limits import LIMITS, Limits
+from warpir.io.curves_file import curves_to_json
+from warpir.io.results import OutputFolder
+from warpir.scene.tone_curves import Curves
+
+HEAVY = ("torch", "warp", "diffusers", "transformers", "peft", "colour")
+TELL = (
+    "import atexit, sys\n"
+    f"atexit.register(lambda: print('loaded', [m for m in {HEAVY!r} if m in sys.modules]))"
+)
+"""Says at the end of a child what it had loaded."""
+UNPRIVILEGED = (
+    "import ctypes, struct\nctypes.CDLL(None).capset(struct.pack('Ii', 0x20080522, 0), bytes(24))"
+)
+"""Gives up what lets root write into folders that are read-only."""
+FULL = (
+    "import collections, shutil\n"
+    "usage = collections.namedtuple('usage', 'total used free')\n"
+    "shutil.disk_usage = lambda path: usage(2**40, 2**40 - 2**20, 2**20)"
+)
+"""Leaves a MiB of the disk."""
+
+
+@pytest.fixture(scope="module")
+def inputs(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The good inputs of every case."""
+    folder = tmp_path_factory.mktemp("inputs")
+    write_inputs(folder)
+    return folder
+
+
+def sparse(path: Path, size: int) -> Path:
+    """A file of a size that takes no room."""
+    with path.open("wb") as stream:
+        stream.truncate(size)
+    return path
+
+
+def validated(argv: list[str], cwd: Path, **same: Any) -> Ended:
+    """Check that --validate accepts, in time and memory, and leaves everything as it was."""
+    before = snapshot(cwd)
+    ended = run_case([*argv, "--validate"], cwd, **same)
+    assert (ended.status, ended.err) == (0, ""), ended
+    assert "inputs are valid" in ended.out
+    assert snapshot(cwd) == before and not ended.left and not ended.children
+    assert ended.seconds < 10.0
+    return ended
+
+
+# ------------------------------------------------------------------------------------- order
+
+
+def test_validate_of_the_demo_is_torch_free_in_a_process_of_its_own(tmp_path: Path) -> None:
+    """The program as a user starts it: seconds, no torch, no Warp, nothing left behind."""
+    code = (
+        f"{TELL}\nfrom warpir.insert import main\n"
+        "sys.exit(main(['--demo', '--out', 'out', '--steps', '60', '--validate']))"
+    )
+    done = subprocess.run(
+        [sys.executable, "-c", code], cwd=tmp_path, capture_output=True, text=True, check=False
+    )
+    assert done.returncode == 0, done.stderr
+    assert done.stdout.splitlines()[-2:] == ["inputs are valid", "loaded []"]
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize(
+    "argv",
+    [
+        ["--guidance", "none"],
+        [],
+        ["--steps", "60"],
+        ["--steps", "60", "--personalize"],
+    ],
+    ids=["light-given", "regressor", "embedded-prior", "adapted-prior"],
+)
+def test_validate_asks_for_models_without_torch(argv: list[str], tmp_path: Path) -> None:
+    ended = validated(["--demo", "--out", "out", *argv], tmp_path, before=TELL)
+    assert ended.out.splitlines()[-1] == "loaded []"
+
+
+@pytest.mark.slow
+def test_validate_reads_model_and_lora_without_torch(tmp_path: Path) -> None:
+    """A folder in diffusers' layout and a LoRA are told by their headers."""
+    import torch
+    from safetensors.torch import save_file
+
+    from tests.builders.tiny_stable_diffusion import make_tiny_stable_diffusion
+
+    model = make_tiny_stable_diffusion(tmp_path / "model")
+    argv = ["--demo", "--out", "out", "--model", str(model), "--prompt", "a car"]
+    layer = "unet.down_blocks.0.attentions.0.transformer_blocks.0.attn2.to_k"
+    for width, rank, words in ((32, 2, None), (768, 2, "cross-attention 768"), (32, 0, "rank 0")):
+        lora = tmp_path / f"lora_{width}_{rank}.safetensors"
+        down, up = torch.zeros(rank, width), torch.zeros(32, rank)
+        named = {f"{layer}.lora.down.weight": down, f"{layer}.lora.up.weight": up}
+        save_file({key: part.contiguous() for key, part in named.items()}, lora)
+        case = [*argv, "--lora", str(lora)]
+        if words is None:
+            assert validated(case, tmp_path, before=TELL).out.endswith("loaded []\n")
+        else:
+            assert_fails([*case, "--validate"], ExitCode.MODEL, lora.name, words, cwd=tmp_path)
+    (model / "vae" / "diffusion_pytorch_model.safetensors").unlink()
+    assert_fails([*argv, "--validate"], ExitCode.MODEL, "missing vae", cwd=tmp_path)
+
+
+def weights(change: Callable[[bytearray], None], name: str) -> Callable[[Path], list[str]]:
+    """A changed copy of weights that we ship, and the flags that name it."""
+
+    def make(folder: Path) -> list[str]:
+        from warpir.diffusion.weight_files import SHIPPED
+
+        content = bytearray((SHIPPED / f"{name}.safetensors").read_bytes())
+        change(content)
+        (folder / "own.safetensors").write_bytes(content)
+        return [f"--{name}", "own.safetensors", *(["--steps", "9"] if name == "prior" else [])]
+
+    return make
+
+
+def cut(content: bytearray) -> None:
+    del content[len(content) // 2 :]
+
+
+def flip(content: bytearray) -> None:
+    content[-7] ^= 1
+
+
+def huge_header(content: bytearray) -> None:
+    content[:8] = (2**62).to_bytes(8, "little")
+
+
+def not_finite(content: bytearray) -> None:
+    content[-4:] = b"\xff" * 4  # NaN in halves and in floats
+
+
+@pytest.mark.parametrize(
+    ("make", "words"),
+    [
+        (weights(cut, "prior"), "cut or damaged"),
+        (weights(flip, "prior"), "not those that were written"),
+        (weights(huge_header, "regressor"), "cut or damaged"),
+        (weights(not_finite, "regressor"), "not finite"),
+        (lambda folder: ["--regressor", "none.safetensors"], "no such file"),
+        (lambda folder: ["--model", "nowhere", "--prompt", "car"], "no such folder"),
+    ],
+    ids=[
+        "L2-cut-prior",
+        "L2-flipped-prior",
+        "L2-header-2^62",
+        "L2-nan-regressor",
+        "missing-regressor",
+        "L1-missing-model",
+    ],
+)
+@pytest.mark.parametrize("mode", [[], ["--validate"]], ids=["run", "validate"])
+def test_models_are_looked_at_before_torch_is_loaded(
+    make: Callable[[Path], list[str]], words: str, mode: list[str], tmp_path: Path
+) -> None:
+    """A run, too, checks them by their files: within a second, and --out is not made."""
+    argv = ["--demo", "--out", "out", *make(tmp_path), *mode]
+    assert_fails(argv, ExitCode.MODEL, words, cwd=tmp_path)
+    assert run_case(argv, tmp_path, before=TELL).out.endswith("loaded []\n")
+
+
+@pytest.mark.parametrize("mode", [[], ["--validate"]], ids=["run", "validate"])
+def test_checks_come_in_order(inputs: Path, tmp_path: Path, mode: list[str]) -> None:
+    """Arguments, inputs, models' files, output, disk: what comes first decides the status."""
+    out = tmp_path / "out"
+    out.mkdir()
+    (out / "run.json").write_text("{}")
+    weights(cut, "regressor")(tmp_path)
+    broken = {"photo": "none.png", "light": None, "regressor": "own.safetensors"}
+
+    def ends(code: int, word: str, *more: str, **repaired: str | None) -> None:
+        argv = [*arguments(inputs, out, **{**broken, **repaired}), *more, *mode]
+        assert_fails(argv, code, word, cwd=tmp_path, before=FULL)
+
+    ends(ExitCode.USAGE, "--samples", samples="0")
+    ends(ExitCode.INPUT, "none.png")
+    good: dict[str, str | None] = {"photo": str(inputs / "photo.png")}
+    ends(ExitCode.MODEL, "own.safetensors", **good)
+    good["regressor"] = None
+    ends(ExitCode.OUTPUT, "already holds files", **good)
+    ends(ExitCode.RESOURCES, "disk space", "--overwrite", **good)
+
+
+# ------------------------------------------------------------------------------ output folder
+
+
+@dataclass
+class Out:
+    """An --out that cannot be used: what it needs, its name, how the run ends."""
+
+    out: str
+    code: int
+    words: tuple[str, ...]
+    make: Callable[[Path], object] = lambda folder: None
+    before: str = ""
+
+
+def sealed(folder: Path) -> None:
+    (folder / "sealed").mkdir(mode=0o555)
+
+
+def results(folder: Path) -> None:
+    (folder / "done").mkdir()
+    (folder / "done" / "run.json").write_text("{}")
+
+
+def linked(name: str) -> Callable[[Path], None]:
+    """An earlier run whose folder of that name leads elsewhere."""
+
+    def make(folder: Path) -> None:
+        (folder / "elsewhere").mkdir()
+        (folder / "linked").mkdir()
+        (folder / "linked" / name).symlink_to("../elsewhere")
+
+    return make
+
+
+OUTS = {
+    "F5-file": Out("plain", 7, ("plain", "a file in its place"),
+                   lambda f: (f / "plain").write_text("x")),
+    "F5-below-a-file": Out("plain/x", 7, ("a file in its place",),
+                           lambda f: (f / "plain").write_text("x")),
+    "F5-link-to-nothing": Out("link", 7, ("link",), lambda f: (f / "link").symlink_to("gone")),
+    "F5-link-loop": Out("loop", 7, ("loop",), lambda f: (f / "loop").symlink_to("loop")),
+    "F5-inside-the-asset-folder": Out("{inputs}", 2, ("--out", "holds the input")),
+    "F5-dotdot-to-the-asset-folder": Out("{inputs}/x/..", 2, ("--out", "holds the input")),
+    "F5-root": Out("/", 2, ("--out", "root")),
+    "F5-dotdot-to-the-root": Out("/usr/..", 2, ("--out", "root")),
+    "F5-read-only": Out("sealed", 5, ("sealed",), sealed, UNPRIVILEGED),
+    "F5-below-read-only": Out("sealed/new/er", 5, ("sealed",), sealed, UNPRIVILEGED),
+    "F5-long-name": Out("n" * 300, 5, ("name too long",)),
+    "F5-full-disk": Out("new", 5, ("new", "found 1 MiB free; expected about"), before=FULL),
+    **{f"F5-link-{name}": Out("linked", 7, (f"linked/{name}: a link",), linked(name))
+       for name in ("progress", "checkpoints", "mitsuba", ".ready")},
+    "F5-existing-results": Out("done", 7, ("already holds files", "run.json"), results),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("mode", [[], ["--validate"]], ids=["run", "validate"])
+@pytest.mark.parametrize("case", OUTS)
+def test_unusable_output_is_refused(
+    case: str, mode: list[str], inputs: Path, tmp_path: Path
+) -> None:
+    """A run and --validate say the same, and neither makes or changes anything."""
+    bad = OUTS[case]
+    bad.make(tmp_path)
+    argv = [*arguments(inputs, bad.out.format(inputs=inputs)), *mode]
+    argv += ["--overwrite"] if "a link" in bad.words[0] else []
+    lines = assert_fails(argv, bad.code, cwd=tmp_path, before=bad.before)
+    for word in bad.words:
+        assert word.lower() in lines[0].lower()
+
+
+@pytest.mark.case("F6")
+@pytest.mark.parametrize("mode", [[], ["--validate"]], ids=["run", "validate"])
+def test_locked_output_is_refused(mode: list[str], inputs: Path, tmp_path: Path) -> None:
+    with pytest.raises(KeyboardInterrupt), OutputFolder(tmp_path / "out"):
+        argv = [*arguments(inputs, "out"), "--overwrite", *mode]
+        words = f"locked by pid {os.getpid()} on "
+        assert_fails(argv, ExitCode.OUTPUT, words, cwd=tmp_path)
+        raise KeyboardInterrupt
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.case("F5", "F6")
+def test_abandoned_lock_and_new_folders_are_accepted(inputs: Path, tmp_path: Path) -> None:
+    """The lock of a killed run is nobody's, and --validate leaves it; a new --out is not made."""
+    (tmp_path / "out").mkdir()
+    (tmp_path / "out" / ".lock").write_text("99999 on elsewhere\n")
+    validated(arguments(inputs, "out"), tmp_path)
+    validated(arguments(inputs, "a/b/../c"), tmp_path)
+
+
+def test_disk_estimate_covers_a_run(inputs: Path, tmp_path: Path) -> None:
+    """What the demo's run wrote, every file counted: 15.3 MB, and 8.2 MB for Mitsuba."""
+    from warpir.demo import demo_config
+
+    plain = InsertConfig(demo=True, out=str(tmp_path), guidance="none")
+    for mitsuba, written in ((False, 15.3e6), (True, 22.7e6)):
+        config = demo_config(plain if not mitsuba else InsertConfig(**{
+            **vars(plain), "mitsuba": True}))  # fmt: skip
+        needed = needed_bytes(config, read_inputs(config))
+        assert written < needed < 5 * written
+
+
+# -------------------------------------------------------------------------------- limits
+
+
+def png_header(width: int, height: int) -> bytes:
+    """A PNG of a few bytes that claims a size."""
+    header = struct.pack(">IIBBBBB", width, height, 8, 0, 0, 0, 0)
+    body = png_chunk(b"IHDR", header) + png_chunk(b"IDAT", zlib.compress(b""))
+    return b"\x89PNG\r\n\x1a\n" + body + png_chunk(b"IEND", b"")
+
+
+Made = dict[str, str | None]
+
+
+def changed(name: str, flag: str, content: bytes | str, **more: str | None) -> Any:
+    """Write a file and give it to a flag."""
+
+    def make(folder: Path) -> Made:
+        (folder / name).write_bytes(content.encode() if isinstance(content, str) else content)
+        return {flag: name, **more}
+
+    return make
+
+
+def sparse_file(name: str, flag: str, size: int, **more: str | None) -> Any:
+    """Give a file of a size to a flag."""
+
+    def make(folder: Path) -> Made:
+        sparse(folder / name, size)
+        return {flag: name, **more}
+
+    return make
+
+
+def glb_file(plant: Callable[[Builder], None], flag: str = "asset", **more: str | None) -> Any:
+    """A GLB that is correct but for its size."""
+
+    def make(folder: Path) -> Made:
+        builder = Builder()
+        plant(builder)
+        (folder / "big.glb").write_bytes(builder.glb())
+        return {flag: "big.glb", **more}
+
+    return make
+
+
+def far_buffer(builder: Builder) -> None:
+    builder.json["buffers"].append({"uri": "big.bin", "byteLength": 10})
+    builder.json["bufferViews"].append({"buffer": 1, "byteLength": 10})
+    accessor = {"bufferView": len(builder.json["bufferViews"]) - 1, "componentType": 5123}
+    builder.json["accessors"].append({**accessor, "count": 3, "type": "SCALAR"})
+    builder.primitive["indices"] = len(builder.json["accessors"]) - 1
+
+
+def buffer_beside(folder: Path) -> Made:
+    sparse(folder / "big.bin", LIMITS.file_bytes + 1)
+    made: Made = glb_file(far_buffer)(folder)
+    return made
+
+
+def textures(count: int, side: int) -> Callable[[Builder], None]:
+    """As many materials, each drawn, each with a picture that claims a size."""
+
+    def plant(builder: Builder) -> None:
+        content = png_header(side, side)
+        primitives = builder.json["meshes"][0]["primitives"]
+        for k in range(count):
+            image = {"bufferView": builder.view(content), "mimeType": "image/png"}
+            index = builder.texture(image)
+            slot = {"baseColorTexture": {"index": index}}
+            builder.json["materials"].append({"pbrMetallicRoughness": slot})
+            primitives.append({**builder.primitive, "material": k + 1})
+
+    return plant
+
+
+def many_triangles(builder: Builder) -> None:
+    """50 million triangles in a file of a few KB: the accessor only promises them."""
+    builder.json["accessors"][builder.primitive["indices"]]["count"] = 150_000_000
+
+
+def children(builder: Builder) -> None:
+    builder.json["nodes"] = [{"mesh": 0}] * 3
+    builder.json["scenes"] = [{"nodes": [0, 1, 2]}]
+
+
+def nested(levels: int) -> str:
+    """JSON whose lists lie in each other."""
+    return '{"a": ' + "[" * (levels - 1) + "]" * (levels - 1) + "}"
+
+
+def colmap(folder: Path) -> Made:
+    sparse(folder / "cameras.bin", 100)
+    sparse(folder / "images.bin", LIMITS.file_bytes + 1)
+    return {"camera": ".", **NO_POSE}
+
+
+POINTS = "".join(f"{k} 0 {-k}\n" for k in range(9))
+CAMERA = {
+    "w": 48, "h": 32, "fx": 40.0, "fy": 40.0, "cx": 24.0, "cy": 16.0,
+    "c2w": [[1, 0, 0, 0], [0, 1, 0, 1.5], [0, 0, 1, 0], [0, 0, 0, 1]],
+}  # fmt: skip
+PLY = "ply\nformat ascii 1.0\nelement vertex 9\n" + "".join(
+    f"property float {c}\n" for c in "xyz"
+) + "end_header\n" + POINTS  # fmt: skip
+
+
+def with_points(name: str, content: str) -> Any:
+    def make(folder: Path) -> Made:
+        (folder / "camera.json").write_text(json.dumps(CAMERA))
+        (folder / name).write_text(content)
+        return {"camera": "camera.json", "ground_points": name, "max_points": "8", **NO_POSE}
+
+    return make
+
+
+TOO_MUCH: dict[str, tuple[int, str, Callable[[Path], Made]]] = {
+    # What no flag is needed for: the limits themselves.
+    "I4-20000x20000": (3, "pixels", changed("p.png", "photo", png_header(20000, 20000))),
+    "I4-mask-20000x20000": (
+        3, "pixels", changed("m.png", "occluder_mask", png_header(20000, 20000))),
+    "E4-exr-1e6x1e6": (3, "envmap_width", lambda f: huge_exr(f)),
+    "E12-hdr-1e9-wide": (3, "envmap_width", changed(
+        "w.hdr", "light", "#?RADIANCE\nFORMAT=32-bit_rle_rgbe\n\n-Y 10 +X 1000000000\n")),
+    "E12-hdr-32768-wide": (3, "envmap_width", changed(
+        "w.hdr", "light", "#?RADIANCE\nFORMAT=32-bit_rle_rgbe\n\n-Y 16384 +X 32768\n")),
+    "E4-png-panorama": (3, "envmap_width", changed("p.png", "light", png_header(40000, 20000))),
+    "M2-glb-of-3-GiB": (3, "file_bytes", sparse_file("a.glb", "asset", 3 << 30)),
+    "M2-obj-of-3-GiB": (3, "file_bytes", sparse_file("a.obj", "asset", 3 << 30)),
+    "M2-proxy-of-3-GiB": (3, "file_bytes", sparse_file("a.ply", "proxy", 3 << 30)),
+    "M2-buffer-of-2-GiB": (3, "file_bytes", buffer_beside),
+    "M2-gltf-JSON-of-1-GiB": (3, "gltf_json_bytes", sparse_file("a.gltf", "asset", 1 << 30)),
+    "M2-nested": (3, "nesting", changed("a.gltf", "asset", "[" * 100_000)),
+    "M14-50-million-triangles": (3, "triangles", glb_file(many_triangles)),
+    "M14-64-textures-of-8k": (3, "texture_pixels", glb_file(textures(64, 8192))),
+    "M14-proxy-of-50-million": (3, "triangles", glb_file(many_triangles, "proxy")),
+    "M10-100001-nodes": (3, "nodes", glb_file(
+        lambda b: b.json.update(nodes=[{}] * (LIMITS.nodes + 1)))),
+    "C9-camera-of-17-MiB": (3, "json_bytes", sparse_file("c.json", "camera", 17 << 20, **NO_POSE)),
+    "C9-nested": (3, "nesting", changed("c.json", "camera", nested(101), **NO_POSE)),
+    "C9-nested-beyond-Python": (3, "nesting", changed(
+        "c.json", "camera", nested(100_000), **NO_POSE)),
+    "C6-COLMAP-of-2-GiB": (3, "file_bytes", colmap),
+    "E-lobes-of-17-MiB": (3, "json_bytes", sparse_file("l.json", "light", 17 << 20)),
+    "M-materials-of-17-MiB": (3, "json_bytes", sparse_file("m.json", "materials", 17 << 20)),
+    "F1-config-of-17-MiB": (2, "json_bytes", sparse_file("c.json", "config", 17 << 20)),
+    "F1-yaml-of-17-MiB": (2, "json_bytes", sparse_file("c.yaml", "config", 17 << 20)),
+    "C9-brackets-of-8-MB": (3, "json_values", changed(
+        "c.json", "camera", '{"a": [' + ("[" * 90 + "]" * 90 + ",") * 45_000 + "0]}", **NO_POSE)),
+    "F1-nested-json": (2, "nesting", changed("c.json", "config", nested(101))),
+    "F1-nested-yaml": (2, "nesting", changed("c.yaml", "config", "a: " + "[" * 101)),
+    "F4-1-MB": (2, "prompt_bytes", lambda f: {"prompt": "car " * 2**18}),
+    "F4-4097-bytes": (2, "prompt_bytes", lambda f: {"prompt": "c" * 4097}),
+    # What is within them, and beyond what a flag says.
+    "I5-photo": (3, "pixels", lambda f: {"max_pixels": "100"}),
+    "E-width": (3, "envmap_width", lambda f: {"max_envmap_width": "16"}),
+    "M-file": (3, "file_bytes", lambda f: {"max_file_bytes": "100"}),
+    "M-json": (3, "gltf_json_bytes", lambda f: {"max_gltf_json_bytes": "100"}),
+    "M-nodes": (3, "nodes", glb_file(children, max_nodes="2")),
+    "M10-instances": (3, "instances", glb_file(children, max_instances="2")),
+    "M14-triangles": (3, "triangles", lambda f: {"max_triangles": "11"}),
+    "M14-texture-pixels": (3, "texture_pixels", glb_file(
+        textures(2, 64), max_texture_pixels="5000")),
+    "C-points": (3, "points", with_points("p.txt", POINTS)),
+    "C-points-ply": (3, "points", with_points("p.ply", PLY)),
+    "C-json": (3, "json_bytes", changed(
+        "c.json", "camera", json.dumps(CAMERA), max_json_bytes="50", **NO_POSE)),
+    "F4-prompt": (2, "prompt_bytes", lambda f: {"prompt": "a car", "max_prompt_bytes": "4"}),
+}  # fmt: skip
+
+
+def huge_exr(folder: Path) -> Made:
+    import io
+
+    import OpenEXR
+
+    stream = io.BytesIO()
+    plane = np.zeros((8, 8), np.float32)
+    OpenEXR.File({"type": OpenEXR.scanlineimage}, dict.fromkeys("RGB", plane)).write(stream)
+    content, marker = stream.getvalue(), b"dataWindow\0box2i\0"
+    start = content.index(marker) + len(marker) + 4
+    window = struct.pack("<4i", 0, 0, 999_999, 999_999)
+    (folder / "e.exr").write_bytes(content[:start] + window + content[start + 16 :])
+    return {"light": "e.exr"}
+
+
+@pytest.mark.parametrize("case", TOO_MUCH)
+def test_limits_are_told_with_their_flags(case: str, inputs: Path, tmp_path: Path) -> None:
+    """Seconds and little memory, and the error's own line says which flag raises the limit."""
+    code, name, make = TOO_MUCH[case]
+    argv = [*arguments(inputs, "out", **make(tmp_path)), "--validate"]
+    flag = f"--max-{name.replace('_', '-')} raises it"
+    (line,) = assert_fails(argv, code, flag, cwd=tmp_path)[:1]
+    assert "limit " in line
+
+
+def test_every_limit_is_a_flag_and_is_tried() -> None:
+    limits = {field.name for field in fields(Limits)} | {"prompt_bytes"}
+    listed = {name for name in FLAGS["rules for the files"] if name.startswith("max_")}
+    assert listed == {f"max_{name}" for name in limits}
+    assert {name for _, name, _ in TOO_MUCH.values()} == limits
+    assert InsertConfig().limits == LIMITS
+    assert InsertConfig(max_nodes=3, max_pixels=7).limits == Limits(nodes=3, pixels=7)
+
+
+@pytest.mark.parametrize(
+    ("name", "flag", "content"),
+    [
+        ("frames.jsonl", "--max-json-bytes", '{"place": [0, 0, -5]}\n' * 9),
+        ("nested.jsonl", "--max-nesting", nested(101)),
+    ],
+    ids=["F1-sequence-bytes", "F1-sequence-nesting"],
+)
+def test_limits_hold_for_sequences_and_earlier_runs(
+    name: str, flag: str, content: str, inputs: Path, tmp_path: Path
+) -> None:
+    """The lines of --sequence, and the files of the run that --reuse names."""
+    with OutputFolder(tmp_path / "run") as run:
+        run.write_envmap(np.ones((8, 16, 3), np.float32))
+        run.write_json("curves.json", curves_to_json(Curves.identity("linear")))
+        run.write_json("camera.json", CAMERA)
+        run.write_json("run.json", {"format": 1, "config": {}})
+    (tmp_path / name).write_text(content)
+    argv = arguments(inputs, "out", light=None, reuse="run", sequence=name)
+    small = ["--max-json-bytes", "100"] if flag == "--max-json-bytes" else []
+    code = ExitCode.INPUT if small else ExitCode.USAGE
+    lines = assert_fails([*argv, *small, "--validate"], code, flag, cwd=tmp_path)
+    assert ("run.json" in lines[0]) == bool(small)
+
+
+@pytest.mark.parametrize(
+    ("levels", "limit", "accepted"), [(100, "100", True), (101, "100", False), (150, "150", True)]
+)
+def test_F1_nesting_is_counted_exactly(
+    levels: int, limit: str, accepted: bool, tmp_path: Path
+) -> None:
+    """As many levels as the flag says, in JSON and YAML alike; deeper is refused for that."""
+    for name in ("c.json", "c.yaml"):
+        (tmp_path / name).write_text(nested(levels))
+        argv = ["--out", "o", "--config", name, "--max-nesting", limit]
+        word = "unknown key 'a'" if accepted else f"(found {levels} levels; limit {limit})"
+        assert_fails(argv, ExitCode.USAGE, word, cwd=tmp_path)
+
+
+@pytest.mark.case("F1")
+def test_yaml_at_its_limit_is_read_in_time(tmp_path: Path) -> None:
+    """The most that YAML may hold takes seconds; it is shorter than JSON for that."""
+    size = LIMITS.json_bytes // YAML_SHARE
+    (tmp_path / "c.yaml").write_text("place: [" + "1," * (size // 2 - 5) + "]\n")
+    assert (tmp_path / "c.yaml").stat().st_size <= size
+    assert_fails(["--config", "c.yaml"], ExitCode.USAGE, "--place", cwd=tmp_path)
+
+
+@pytest.mark.slow
+@pytest.mark.case("I5")
+def test_photo_of_100_megapixels(inputs: Path, tmp_path: Path) -> None:
+    """Refused by its header; with another limit read, in memory that goes with its size."""
+    Image.new("RGB", (10_000, 10_000), (90, 120, 60)).save(tmp_path / "p.png", compress_level=1)
+    argv = arguments(inputs, "out", photo="p.png")
+    assert_fails([*argv, "--validate"], ExitCode.INPUT, "10000 x 10000", cwd=tmp_path)
+    ended = run_case([*argv, "--validate", "--max-pixels", "100000000"], tmp_path)
+    assert ended.status == 0, ended
+    # The photo is 3 bytes of codes and 12 of floats a pixel.
+    assert ended.peak_bytes < 100e6 * 15 + 500e6
+
+
+# ------------------------------------------------------------------ what works although it is odd
+
+
+@pytest.mark.parametrize(
+    "name",
+    ["Grüße 写真.png", "a 'b' \"c\".png", "n" * 251 + ".png", "-x.png", "--out.png", "a\nb.png"],
+    ids=["I17-letters", "I17-quotes", "I17-255-bytes", "I17-minus", "I17-two-minus", "I17-newline"],
+)
+def test_names_of_files(name: str, inputs: Path, tmp_path: Path) -> None:
+    (tmp_path / name).write_bytes((inputs / "photo.png").read_bytes())
+    argv = arguments(inputs, "out", photo=None)
+    validated([*argv, f"--photo={name}"], tmp_path)
+
+
+@pytest.mark.parametrize("size", [(1, 1), (7, 5), (3, 4000)], ids="I14-{0[0]}x{0[1]}".format)
+def test_odd_photos_are_valid(size: tuple[int, int], inputs: Path, tmp_path: Path) -> None:
+    Image.new("RGB", size, (120, 130, 140)).save(tmp_path / "odd.png")
+    validated(arguments(inputs, "out", photo="odd.png"), tmp_path)
+
+
+@pytest.mark.parametrize(
+    ("flag", "make"),
+    [
+        ("photo", lambda path: os.mkfifo(path)),
+        ("photo", lambda path: path.symlink_to(path)),
+        ("asset", lambda path: os.mkfifo(path)),
+        ("light", lambda path: path.symlink_to("/dev/zero")),
+        ("occluder_mask", lambda path: path.symlink_to("/dev/zero")),
+        ("materials", lambda path: os.mkfifo(path)),
+        ("camera", lambda path: os.mkfifo(path)),
+        ("config", lambda path: path.symlink_to("/dev/zero")),
+    ],
+    ids=[
+        "I18-fifo",
+        "I18-link-loop",
+        "I18-asset-fifo",
+        "I18-light-device",
+        "I18-mask-device",
+        "I18-materials-fifo",
+        "I18-camera-fifo",
+        "I18-config-device",
+    ],
+)
+def test_what_is_no_file_is_never_opened(
+    flag: str, make: Callable[[Path], None], inputs: Path, tmp_path: Path
+) -> None:
+    """Nobody writes into the pipe and the device has no end: a reader would wait for ever."""
+    name = "x.glb" if flag == "asset" else "x.json" if flag == "materials" else "x.png"
+    make(tmp_path / name)
+    pose = NO_POSE if flag == "camera" else {}
+    code = ExitCode.USAGE if flag == "config" else ExitCode.INPUT
+    argv = [*arguments(inputs, "out", **{flag: name}, **pose), "--validate"]
+    assert_fails(argv, code, name, "not a regular file", cwd=tmp_path)
+
+
+@pytest.mark.case("I1")
+def test_unreadable_photo(inputs: Path, tmp_path: Path) -> None:
+    """No permission to read is told as that."""
+    path = tmp_path / "secret.png"
+    path.write_bytes((inputs / "photo.png").read_bytes())
+    path.chmod(0)
+    argv = [*arguments(inputs, "out", photo="secret.png"), "--validate"]
+    before = snapshot(tmp_path) if os.access(path, os.R_OK) else None
+    ended = run_case(argv, tmp_path, before=UNPRIVILEGED)
+    assert ended.status == ExitCode.INPUT
+    assert ended.err.startswith("error: secret.png: cannot be read (Permission denied)")
+    assert before is None or snapshot(tmp_path) == before
+
+
+@pytest.mark.case("M10")
+def test_deep_scene_is_valid(inputs: Path, tmp_path: Path) -> None:
+    """A chain of 3000 nodes is no recursion."""
+    builder = Builder()
+    builder.json["nodes"] = [*({"children": [k + 1]} for k in range(2999)), {"mesh": 0}]
+    (tmp_path / "deep.glb").write_bytes(builder.glb())
+    validated(arguments(inputs, "out", asset="deep.glb"), tmp_path)
+
+
+@pytest.mark.case("C9")
+def test_camera_with_a_byte_order_mark(inputs: Path, tmp_path: Path) -> None:
+    (tmp_path / "c.json").write_bytes(b"\xef\xbb\xbf" + json.dumps(CAMERA).encode())
+    validated(arguments(inputs, "out", camera="c.json", **NO_POSE), tmp_path)
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        ('{"w": 48,\n"h": NaN}', "line 2: NaN is not JSON"),
+        ('{"w": 48,\n\n"h": -Infinity}', "line 3: -Infinity is not JSON"),
+        ('{"w": 48,\n"h": 2,\n"w": 4}', 'line 3: key "w" appears twice'),
+        ('{"w": 48,\n}', "line 2: not JSON"),
+        ("[\n1]", "line 1: not a JSON object"),
+        ('{"w":\n"\xff"}', "line 2: not UTF-8"),
+        ('{"w": ' + "9" * 5000 + "}", "not JSON that can be read"),
+    ],
+    ids=["C9-nan", "C9-inf", "C9-twice", "C9-comma", "C9-list", "C9-utf8", "C9-long-integer"],
+)
+def test_camera_json_names_its_line(text: str, words: str, inputs: Path, tmp_path: Path) -> None:
+    (tmp_path / "c.json").write_bytes(text.encode("latin-1"))
+    argv = [*arguments(inputs, "out", camera="c.json", **NO_POSE), "--validate"]
+    assert_fails(argv, ExitCode.INPUT, "c.json", words, cwd=tmp_path)
+
+
+# -------------------------------------------------------------------- configuration and prompt
+
+
+@pytest.mark.parametrize(
+    ("name", "text", "words"),
+    [
+        ("c.yaml", "sampels: 3\n", "unknown key 'sampels'"),
+        ("c.yaml", "samples: [3]\n", "--samples"),
+        ("c.yaml", "steps: -3\n", "--steps"),
+        ("c.yaml", "fov: .nan\n", "--fov"),
+        ("c.yaml", "fov: 1e400\n", "--fov"),
+        ("c.json", '{"fov": 1e400}', "line 1"),
+        ("c.yaml", "photo: !!python/object/apply:os.mkdir ['made']\n", "not YAML"),
+        ("c.yaml", "a: &a [x]\nplace: [*a, *a, *a]\n", "unknown key 'a'"),
+        ("c.json", '{"format": 99, "config": {}}', "format"),
+        ("c.json", '{"format": true, "config": {}}', "format"),
+        ("none.yaml", None, "none.yaml"),
+    ],
+    ids=[
+        "F1-unknown-key", "F1-wrong-type", "F1-negative-steps", "F1-nan", "F1-1e400-yaml",
+        "F1-1e400-json", "F1-yaml-tag", "F1-aliases", "F2-newer-version", "F2-no-version",
+        "F1-missing",
+    ],
+)  # fmt: skip
+def test_configurations_are_refused(
+    name: str, text: str | None, words: str, inputs: Path, tmp_path: Path
+) -> None:
+    if text is not None:
+        (tmp_path / name).write_text(text)
+    argv = arguments(inputs, "out", config=name, fov=None, samples=None)
+    assert_fails(argv, ExitCode.USAGE, words, cwd=tmp_path)
+
+
+@pytest.mark.case("F2", "F3")
+def test_configuration_of_an_older_run_yields_to_flags(inputs: Path, tmp_path: Path) -> None:
+    """A run.json of fewer keys means the defaults of the others; what a flag says is logged."""
+    (tmp_path / "run.json").write_text(json.dumps({"format": 1, "config": {"samples": 7}}))
+    ended = validated([*arguments(inputs, "out", config="run.json")], tmp_path)
+    assert "--samples given at the command line replaces the value in run.json" in ended.out
+
+
+PROMPTS = {
+    "F4-empty": ("", 2),
+    "F4-NUL": ("a car\0", 2),
+    "F4-emoji": ("a car \U0001f697", 0),
+    "F4-newlines": ("a car,\n\nred\n", 0),
+    "F4-shell": ("$(touch made); `touch made` | touch made ../made", 0),
+    "F4-path": ("../../made/car", 0),
+    "F4-4096-bytes": ("car " * 1024, 0),
+}
+
+
+@pytest.mark.parametrize("case", PROMPTS)
+def test_prompts(case: str, inputs: Path, tmp_path: Path) -> None:
+    """A text for a model, whatever is in it: never a path, and nothing that a shell sees."""
+    prompt, code = PROMPTS[case]
+    argv = arguments(inputs, "out", prompt=None, light=None, steps="9")
+    argv += ["--prompt=" + prompt]
+    if code:
+        assert_fails([*argv, "--validate"], code, "--prompt", cwd=tmp_path)
+    else:
+        validated(argv, tmp_path)
+
+
+def test_F4_longer_prompts_are_a_flag(inputs: Path, tmp_path: Path) -> None:
+    argv = arguments(inputs, "out", light=None, steps="9", prompt="car " * 2000)
+    validated([*argv, "--max-prompt-bytes", "8000"], tmp_path)
+
+
+@pytest.mark.parametrize(
+    ("seed", "words"),
+    [("-1", "at least 0"), (str(2**64), "at most"), (str(2**32), "at most"), ("1.5", "whole")],
+    ids=["F8-minus-1", "F8-2^64", "F8-2^32", "F8-fraction"],
+)
+def test_seeds(seed: str, words: str, inputs: Path, tmp_path: Path) -> None:
+    argv = arguments(inputs, "out", seed=seed)
+    assert_fails(argv, ExitCode.USAGE, "--seed", words, cwd=tmp_path)
+    validated(arguments(inputs, "out", seed=str(2**32 - 1)), tmp_path)
+
+
+@pytest.mark.slow
+@pytest.mark.case("F7")
+def test_least_of_everything_gives_valid_results(inputs: Path, tmp_path: Path) -> None:
+    """No step, one sample, eight pixels: complete results, every number finite."""
+    least = {"steps": "0", "width": "8", "samples": "1", "depth": "1", "device": "cpu"}
+    argv = arguments(inputs, "out", light=None, guidance_width="8", light_height="4", **least)
+    ended = run_case(argv, tmp_path)
+    assert ended.status == 0, ended
+    record = json.loads((tmp_path / "out" / "run.json").read_text())
+    assert set(record["files"]) <= set(os.listdir(tmp_path / "out"))
+    planes = read_layers(tmp_path / "out" / "layers.exr")
+    assert all(np.isfinite(plane).all() for plane in planes.values())
+    assert planes["matte.A"].max() > 0.0

@@ -1,0 +1,20 @@
+"""The table of acceptance cases in docs/assets.md is complete and names tests that exist."""
+
+import re
+from pathlib import Path
+
+from benchmarks.assets import CASES, TESTS
+
+ROOT = Path(__file__).resolve().parents[2]
+
+
+def test_every_case_has_its_row_and_its_tests() -> None:
+    """Each case has one row, and each test file that the row names carries the case's id."""
+    text = (ROOT / "docs" / "assets.md").read_text(encoding="utf-8")
+    rows = re.findall(r"^\| ([GM]\d+) \|.*\| ([a-z, ]+) \|$", text, re.MULTILINE)
+    assert [case for case, _ in rows] == list(CASES)
+    for case, names in rows:
+        for name in names.split(", "):
+            assert name in TESTS
+            source = (ROOT / "tests" / f"test_{name}.py").read_text(encoding="utf-8")
+            assert re.search(rf"[-_\"]{case}[-_\"]", source), f"{case} in test_{name}.py"

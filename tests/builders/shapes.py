@@ -1,0 +1,110 @@
+"""Small meshes, cameras and lights that render tests share; every number is chosen by the test."""
+
+from collections.abc import Sequence
+
+import numpy as np
+import trimesh
+from numpy.typing import ArrayLike, NDArray
+
+from warpir.render.device_scene import Placed, Proxy
+from warpir.scene.asset import Asset, Material, Primitive, Texture
+from warpir.scene.camera import Camera
+from warpir.scene.light import Light, Lobes
+
+FloatArray = NDArray[np.float32]
+Float64Array = NDArray[np.float64]
+
+DEEP = -1e3
+"""Height of a ground plane that is in nobody's way [m]."""
+
+
+def quad(
+    center: ArrayLike, right: ArrayLike, up: ArrayLike, material: int = 0, uv: float = 1.0
+) -> Primitive:
+    """A parallelogram that faces ``cross(right, up)``; texture row 0 lies along its upper edge.
+
+    Args:
+        center: Its middle [m].
+        right: From the middle to the edge where ``u = uv`` [m].
+        up: From the middle to the edge where ``v = 0`` [m].
+        material: Index of its material.
+        uv: Texture coordinates run from 0 to this.
+    """
+    c, r, u = (np.asarray(v, np.float64) for v in (center, right, up))
+    corners = np.array([c - r - u, c + r - u, c + r + u, c - r + u])
+    coordinates = np.array([[0, uv], [uv, uv], [uv, 0], [0, 0]], np.float32)
+    return Primitive(corners, np.array([[0, 1, 2], [0, 2, 3]], np.int32), material, uv0=coordinates)
+
+
+def sphere(
+    center: ArrayLike = (0.0, 0.0, 0.0), radius: float = 1.0, detail: int = 4, material: int = 0
+) -> Primitive:
+    """A sphere with its true normals; ``detail`` halves the triangles' edges each time."""
+    ball = trimesh.creation.icosphere(subdivisions=detail, radius=radius)
+    unit = np.asarray(ball.vertices, np.float64) / radius
+    return Primitive(
+        unit * radius + np.asarray(center, np.float64),
+        np.array(ball.faces, np.int32),
+        material,
+        normals=unit.astype(np.float32),
+    )
+
+
+def box(center: ArrayLike, extents: ArrayLike, material: int = 0) -> Primitive:
+    """A closed box with flat faces."""
+    mesh = trimesh.creation.box(extents=extents)
+    return Primitive(
+        np.array(mesh.vertices) + np.asarray(center, np.float64),
+        np.array(mesh.faces, np.int32),
+        material,
+    )
+
+
+def placed(
+    primitives: Primitive | Sequence[Primitive],
+    *materials: Material,
+    textures: Sequence[Texture] = (),
+    matrix: ArrayLike | None = None,
+) -> Placed:
+    """An asset where its coordinates say, or moved by ``matrix``."""
+    parts = (primitives,) if isinstance(primitives, Primitive) else tuple(primitives)
+    whole = Asset("test", parts, materials or (Material(),), tuple(textures))
+    return Placed(whole, np.eye(4) if matrix is None else np.asarray(matrix, np.float64))
+
+
+def ground(height: float = DEEP) -> Proxy:
+    """A level ground plane."""
+    return Proxy(np.array([0.0, 1.0, 0.0]), height)
+
+
+def camera(
+    width: int, height: int, focal: float, eye: ArrayLike = (0.0, 0.0, 0.0), pitch: float = 0.0
+) -> Camera:
+    """A camera that looks along -Z, or up by ``pitch`` [deg]; the principal point is central."""
+    a = np.radians(pitch)
+    pose = np.eye(4)
+    pose[1:3, 1:3] = [[np.cos(a), -np.sin(a)], [np.sin(a), np.cos(a)]]
+    pose[:3, 3] = eye
+    return Camera(width, height, focal, focal, width / 2.0, height / 2.0, pose)
+
+
+def all_pixels(view: Camera) -> NDArray[np.int32]:
+    """Every pixel of a view, row-major."""
+    return np.arange(view.width * view.height, dtype=np.int32)
+
+
+def constant(radiance: ArrayLike = (1.0, 1.0, 1.0), height: int = 8) -> Light:
+    """The same radiance from everywhere, as a map."""
+    return Light(texels=np.full((height, 2 * height, 3), radiance, np.float32))
+
+
+def lobe(axis: ArrayLike, sharpness: float, amplitude: ArrayLike = (1.0, 1.0, 1.0)) -> Light:
+    """One spherical Gaussian; the axis need not be a unit vector."""
+    a = np.asarray(axis, np.float64)
+    return Light(
+        Lobes(
+            np.asarray([amplitude], np.float32),
+            (a / np.linalg.norm(a))[None].astype(np.float32),
+            np.array([sharpness], np.float32),
+        )
+    )

@@ -1,0 +1,530 @@
+"""The evaluation: scenes from a seed, rows that must be right or wrong, intervals, the command."""
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+import trimesh
+from numpy.typing import NDArray
+from PIL import Image
+
+from warpir.core.errors import ExitCode, InputError
+from warpir.diffusion.embedded import NetworkConfig, build_network, save_embedded
+from warpir.evaluate.command import light_figures, main, usable_rows
+from warpir.evaluate.light_errors import light_errors
+from warpir.evaluate.report import Entry, bootstrap, compare, mean_of, summarize
+from warpir.evaluate.rows import ROWS, Bench, chosen_rows
+from warpir.evaluate.scenes import (
+    HEIGHT_SHARE,
+    RESPONSES,
+    Place,
+    Places,
+    Subject,
+    find_files,
+    mirrored,
+)
+from warpir.evaluate.stage import Prediction, Quality, Stage
+from warpir.io.results import OutputFolder
+from warpir.lighting.regressor import random_regressor, save_regressor
+from warpir.scene.light import (
+    Light,
+    Lobes,
+    as_map,
+    axis_from_angles,
+    map_directions,
+    rasterize_lobes,
+    rotate_map,
+    texel_solid_angles,
+)
+from warpir.scene.tone_curves import Curves
+
+FloatArray = NDArray[np.float32]
+
+SUNS = {"east": (70.0, 35.0), "west": (-110.0, 50.0), "north": (10.0, 20.0)}
+"""Azimuth and elevation of the made-up panoramas' suns [deg]."""
+WIDTH = 64
+
+
+def panorama(azimuth: float, elevation: float) -> FloatArray:
+    """A blue sky over mottled ground, and a sun that gives two thirds of the light."""
+    directions = map_directions(64, 128)
+    texels = np.where(directions[..., 1:2] > 0.0, (0.3, 0.45, 0.8), (0.25, 0.2, 0.12))
+    texels = texels * (1.0 + 0.3 * np.sin(9.0 * directions[..., :1]))
+    row, column = np.unravel_index(
+        int(np.argmax(directions @ axis_from_angles(azimuth, elevation))), (64, 128)
+    )
+    texels[row, column] = 10.0 / texel_solid_angles(64, 128)[row]
+    return texels.astype(np.float32)
+
+
+pytestmark = pytest.mark.usefixtures("one_thread")
+
+
+@pytest.fixture(scope="module")
+def data(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Folders ``panoramas`` and ``assets``, and ``regressor.safetensors`` with random weights."""
+    folder = tmp_path_factory.mktemp("data")
+    for name, sun in SUNS.items():
+        with OutputFolder(folder / "panoramas" / name) as output:
+            output.write_envmap(panorama(*sun), name)
+        for path in (folder / "panoramas" / name).iterdir():
+            if path.name != f"{name}.exr":
+                path.unlink()
+    (folder / "assets").mkdir()
+    trimesh.creation.box((1.0, 0.7, 0.5)).export(folder / "assets" / "cube.ply")
+    save_regressor(random_regressor(3), folder / "regressor.safetensors", {})
+    return folder
+
+
+def make_places(data: Path, seed: int = 5, response: str = "gamma") -> Places:
+    panoramas = find_files([data / "panoramas"], (".exr", ".hdr"), "--panoramas")
+    assets = find_files([data / "assets"], (".ply",), "--assets")
+    return Places(panoramas, assets, seed, WIDTH, response=response)
+
+
+@pytest.fixture(scope="module")
+def scenes(data: Path) -> list[tuple[Place, list[Subject]]]:
+    return make_places(data).make(3)
+
+
+def sunlit(subject: Subject, samples: int = 32) -> Stage:
+    return Stage(subject, "cpu", Quality(samples=samples, depth=2), seed=1)
+
+
+def make_bench(scenes: list[tuple[Place, list[Subject]]]) -> Bench:
+    from warpir.app.config import InsertConfig
+
+    return Bench(scenes, "cpu", 0, InsertConfig(guidance="embedded"), random_regressor(3))
+
+
+# ---------------------------------------------------------------------------------------- scenes
+
+
+def test_scenes_follow_from_the_seed_alone(
+    data: Path, scenes: list[tuple[Place, list[Subject]]]
+) -> None:
+    """Fewer scenes are the first ones of more; another seed gives others."""
+    again = make_places(data).make(2)
+    for (place, subjects), (same, others) in zip(scenes, again, strict=False):
+        assert (place.name, place.azimuth, place.pitch) == (same.name, same.azimuth, same.pitch)
+        assert np.array_equal(place.photo, same.photo)
+        for a, b in zip(subjects, others, strict=True):
+            assert a.name == b.name
+            assert np.array_equal(a.placement.asset_to_world, b.placement.asset_to_world)
+    other = make_places(data, seed=6).make(1)[0][0]
+    assert not np.array_equal(other.photo, scenes[0][0].photo)
+
+
+def test_every_panorama_is_seen_before_one_is_seen_again(data: Path) -> None:
+    made = make_places(data).make(6)
+    names = [place.panorama for place, _ in made]
+    assert set(names[:3]) == set(names[3:]) == set(SUNS)
+    assert len({place.name for place, _ in made}) == 6
+    assert len({place.azimuth for place, _ in made}) > 3
+
+
+def test_files_that_cannot_be_used_are_left_out(data: Path, tmp_path: Path) -> None:
+    (tmp_path / "broken.exr").write_bytes(b"no picture")
+    good = data / "panoramas" / "east" / "east.exr"
+    places = Places([tmp_path / "broken.exr", good], [data / "assets" / "cube.ply"], 0, WIDTH)
+    assert [p.panorama for p, _ in places.make(3)] == ["east"] * 3
+    assert len(places.notices) == 1
+    assert "broken.exr" in places.notices[0]
+    with pytest.raises(InputError, match="none of the files"):
+        Places([tmp_path / "broken.exr"], [data / "assets" / "cube.ply"], 0, WIDTH).make(1)
+
+
+def test_objects_stand_in_view_at_the_stated_size(data: Path) -> None:
+    for place, (diffuse, glossy) in make_places(data, seed=11).make(6):
+        corners = np.array([[x, y, z] for x in (0, 1) for y in (0, 1) for z in (0, 1)])
+        low, high = diffuse.asset.bounds()
+        matrix = diffuse.placement.asset_to_world
+        world = (low + corners * (high - low)) @ matrix[:3, :3].T + matrix[:3, 3]
+        assert world[:, 1].min() == pytest.approx(0.0, abs=1e-9)
+        pixels = place.camera.project(world) / (place.camera.width, place.camera.height)
+        assert pixels.min() >= 0.0
+        assert pixels.max() <= 1.0
+        height = np.ptp(pixels[:, 1])
+        assert height <= HEIGHT_SHARE[1] + 1e-6
+        assert height >= HEIGHT_SHARE[0] - 1e-6 or np.ptp(pixels[:, 0]) > 0.44
+        assert np.array_equal(matrix, glossy.placement.asset_to_world)
+        assert [m.metallic for m in diffuse.asset.materials] == [0.0]
+        assert [m.metallic for m in glossy.asset.materials] == [1.0]
+
+
+def test_the_camera_frame_has_ahead_at_minus_z(scenes: list[tuple[Place, list[Subject]]]) -> None:
+    """A sun at azimuth a, seen by a camera turned to b, is at a - b in the camera-yaw frame."""
+    for place, _ in scenes:
+        turned = place.to_camera(place.texels)
+        height, width = turned.shape[:2]
+        peak = np.unravel_index(int(np.argmax(turned.sum(axis=-1))), (height, width))
+        azimuth, elevation = SUNS[place.panorama]
+        wanted = axis_from_angles(azimuth - place.azimuth, elevation)
+        # A texel of the panorama is 2.8 degrees wide, the peak is somewhere in its middle.
+        assert map_directions(height, width)[peak] @ wanted > np.cos(np.radians(3.0))
+        assert np.array_equal(place.to_world(turned), place.texels)
+
+
+def test_photographs_are_the_light_at_its_exposure(data: Path) -> None:
+    """What is not clipped decodes to radiance times exposure, through the camera's response."""
+    from warpir.evaluate.panorama_crop import crop_radiance
+
+    for response in RESPONSES:
+        place, _ = make_places(data, response=response).make(1)[0]
+        seen = crop_radiance(panorama(*SUNS[place.panorama]), place.camera) * place.exposure
+        shown = RESPONSES[response].show(seen) ** (1.0 / 2.2)
+        assert np.abs(place.photo - shown).max() <= 0.5 / 255.0 + 2e-3
+        assert place.is_sunny
+
+
+def test_responses_can_be_inverted() -> None:
+    x = np.linspace(0.0, 0.9, 50)
+    for response in RESPONSES.values():
+        shown = response.show(x)
+        assert shown.min() >= 0.0
+        assert shown.max() <= 1.0
+        assert response.invert(shown) == pytest.approx(x, abs=1e-9)
+
+
+def test_a_mirrored_light_has_left_and_right_exchanged() -> None:
+    """Lobes and maps are mirrored alike; twice is the light itself; ahead stays ahead."""
+    azimuth = 45.0
+    lobes = Lobes(
+        np.array([[1.0, 2.0, 3.0]], np.float32),
+        axis_from_angles(azimuth + 30.0, 20.0)[None].astype(np.float32),
+        np.array([50.0], np.float32),
+    )
+    flipped = mirrored(Light(lobes), azimuth).lobes
+    assert flipped is not None
+    assert flipped.axis[0] == pytest.approx(axis_from_angles(azimuth - 30.0, 20.0), abs=1e-6)
+    texels = rasterize_lobes(lobes, 32, 64)
+    from_map = mirrored(Light(texels=texels), azimuth).texels
+    assert from_map == pytest.approx(rasterize_lobes(flipped, 32, 64), abs=1e-3)
+    assert np.array_equal(mirrored(Light(texels=from_map), azimuth).texels, texels)
+
+
+# ------------------------------------------------------------------------------------------ rows
+
+
+def test_the_fitted_exposure_undoes_a_dimmed_light(
+    scenes: list[tuple[Place, list[Subject]]],
+) -> None:
+    """The same random numbers make radiance linear in the light, so the factor is exact."""
+    place, (diffuse, _) = scenes[0]
+    stage = sunlit(diffuse)
+    dim = Light(texels=(place.texels / np.float32(8.0)).astype(np.float32))
+    prediction = Prediction(dim, dim, None)
+    rendered = stage.render(prediction)
+    gain = stage.fit_exposure(rendered, None)
+    assert gain == pytest.approx(8.0, rel=0.01)
+    before = np.abs(stage.compose(rendered, None) - stage.truth).max()
+    after = np.abs(stage.compose(rendered, None, gain) - stage.truth).max()
+    assert after < 0.05 * before
+
+
+def test_identity_curves_are_the_gamma_response_and_not_the_filmic_one(data: Path) -> None:
+    for response in RESPONSES:
+        _, (diffuse, _) = make_places(data, response=response).make(1)[0]
+        stage = sunlit(diffuse, 8)
+        image = stage.compose(stage.true, Curves.identity("linear"))
+        difference = np.abs(image - stage.truth).max()
+        assert difference < 1e-5 if response == "gamma" else difference > 0.02
+        # Far from object and shadow the photograph is untouched.
+        outside = (stage.mask == 0.0) & (stage.ratio == 1.0).all(axis=-1)
+        assert outside.any()
+        assert np.abs(stage.truth - stage.place.photo)[outside].max() < 1e-5
+
+
+def test_the_tone_floor_is_below_reinhard_alone(
+    scenes: list[tuple[Place, list[Subject]]],
+) -> None:
+    _, (diffuse, _) = scenes[1]
+    stage = sunlit(diffuse, 8)
+
+    def error(curves: Curves) -> float:
+        return float(np.square(stage.compose(stage.true, curves) - stage.truth).mean())
+
+    assert error(stage.tone_floor()) < 0.05 * error(Curves.identity("reinhard"))
+
+
+def test_the_brightest_region_is_where_the_sun_is_seen(
+    scenes: list[tuple[Place, list[Subject]]],
+) -> None:
+    """A panorama turned so that its sun is in the picture."""
+    from dataclasses import replace
+
+    from warpir.evaluate.panorama_crop import crop_camera, crop_radiance, expose
+
+    azimuth, elevation = SUNS["north"]
+    camera = crop_camera(96, 64, 80.0, azimuth - 15.0, 0.0, 1.6)
+    photo, _ = expose(crop_radiance(panorama(azimuth, elevation), camera))
+    place = replace(scenes[0][0], camera=camera, photo=photo.astype(np.float32))
+    found = ROWS["brightest-region"].of_place
+    assert found is not None
+    lobes = found(make_bench(scenes), place).light.lobes
+    assert lobes is not None
+    assert lobes.axis[0] @ axis_from_angles(azimuth, elevation) > np.cos(np.radians(5.0))
+
+
+def test_rows_are_named_or_chosen_by_group() -> None:
+    assert chosen_rows("uniform,truth", False) == ["truth", "uniform"]
+    assert set(chosen_rows("baselines", False)) == {
+        "uniform", "mean-training-light", "brightest-region",
+    }  # fmt: skip
+    assert "predictions" in chosen_rows(None, True)
+    plain, guided = (chosen_rows(None, False, is_guided) for is_guided in (False, True))
+    assert set(guided) - set(plain) == {"lds-uniform", "lds-regression"} and "regression" in plain
+    assert chosen_rows("lds-regression", False, False) == ["lds-regression"]
+    assert "predictions" not in chosen_rows("all", False)
+    for text in ("unifrom", "truth,,uniform"):
+        with pytest.raises(InputError) as caught:
+            chosen_rows(text, False)
+        assert caught.value.code == ExitCode.USAGE
+    with pytest.raises(InputError):
+        chosen_rows("predictions", False)
+
+
+def test_the_true_light_has_no_error_and_a_turned_one_has_its_angle(
+    scenes: list[tuple[Place, list[Subject]]],
+) -> None:
+    place = scenes[0][0]
+    errors = light_figures(place, place.texels)
+    assert errors["light.peak_angle_deg"] == 0.0
+    assert errors["spheres.linear_diffuse_rmse"] == 0.0
+    turned = light_figures(place, rotate_map(place.texels, 90.0))
+    elevation = np.radians(SUNS[place.panorama][1])
+    # Two directions of one elevation e, 90 degrees apart: cos = sin^2 e
+    wanted = np.degrees(np.arccos(np.sin(elevation) ** 2))
+    assert turned["light.peak_angle_deg"] == pytest.approx(wanted, abs=3.0)
+
+
+# ------------------------------------------------------------------------------------ statistics
+
+
+def test_bootstrap_interval_of_a_normal_mean(rng: np.random.Generator) -> None:
+    """1.96 standard errors either way."""
+    values = rng.normal(3.0, 2.0, 400)
+    low, high = bootstrap(values.tolist(), [str(k) for k in range(400)])
+    error = values.std() / np.sqrt(400)
+    assert (high - low) / 2.0 == pytest.approx(1.96 * error, rel=0.04)
+    assert (high + low) / 2.0 == pytest.approx(values.mean(), abs=0.1 * error)
+
+
+def test_bootstrap_draws_groups_as_a_whole(rng: np.random.Generator) -> None:
+    """Ten equal values in each of 60 groups tell no more than one."""
+    values = rng.normal(0.0, 1.0, 60)
+    groups = [str(k) for k in range(60)]
+    once = bootstrap(values.tolist(), groups)
+    often = bootstrap(np.repeat(values, 10).tolist(), [g for g in groups for _ in range(10)])
+    assert often == pytest.approx(once)
+
+
+def entry(row: str, scene: str, value: float, material: str = "diffuse") -> Entry:
+    return Entry(row, scene, scene[0], True, material, {"image.box.rmse": value}, {})
+
+
+def test_pairs_are_compared_scene_by_scene() -> None:
+    """Scenes differ by far more than rows do; the pairs see the rows."""
+    entries = []
+    for k in range(20):
+        base = 0.1 * k
+        entries += [
+            entry("uniform", f"{k}", base + 0.02),
+            entry("lds-uniform", f"{k}", base + (0.0 if k else 0.05)),
+        ]
+    pair = next(p for p in compare(entries, {"lds-uniform": "uniform"}) if p.group == "all")
+    assert (pair.row, pair.against, pair.is_start) == ("lds-uniform", "uniform", True)
+    assert (pair.better, pair.worse) == (19, 1)
+    assert pair.difference.mean == pytest.approx((-0.02 * 19 + 0.03) / 20)
+    assert pair.difference.is_sure
+    summary = summarize(entries)
+    rows = [summary[row]["all"]["image.box.rmse"] for row in ("uniform", "lds-uniform")]
+    assert rows[0].low < rows[1].mean < rows[0].high
+
+
+def test_a_scene_counts_once_whatever_stands_in_it() -> None:
+    entries = [entry("r", "a", 1.0), entry("r", "a", 3.0, "glossy"), entry("r", "b", 5.0)]
+    summary = summarize(entries)["r"]
+    assert summary["all"]["image.box.rmse"].mean == 3.5
+    assert summary["all"]["image.box.rmse"].count == 2
+    assert summary["glossy"]["image.box.rmse"].mean == 3.0
+    assert mean_of({"a": 2.0}, {"a": "p"}).low == 2.0
+
+
+# ----------------------------------------------------------------------------------- the command
+
+
+def arguments(data: Path, *more: str) -> list[str]:
+    paths = ["--panoramas", str(data / "panoramas"), "--assets", str(data / "assets")]
+    small = ["--width", str(WIDTH), "--samples", "8", "--device", "cpu", "--seed", "5"]
+    return [*paths, *small, *more]
+
+
+@pytest.mark.slow
+def test_main_judges_rows_and_writes_everything(
+    data: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    out, numbers = tmp_path / "out", tmp_path / "numbers.json"
+    rows = "truth,oracle,turned-180,uniform,regression,mirrored"
+
+    status = main(
+        arguments(
+            data,
+            *("--scenes", "2", "--rows", rows, "--json", str(numbers), "--out", str(out)),
+            *("--regressor", str(data / "regressor.safetensors")),
+        )
+    )
+
+    printed = capsys.readouterr()
+    assert status == 0, printed.err
+    record = json.loads(numbers.read_text())
+    assert [s["name"][:3] for s in record["scenes"]] == ["000", "001"]
+    assert all(s["is_sunny"] for s in record["scenes"])
+    assert len(record["weights"]["regressor"]) == 64
+    mean = {row: groups["all"] for row, groups in record["summary"].items()}
+    assert set(mean) == set(chosen_rows(rows, False))
+    for figures in (mean["truth"],):
+        for region in ("full", "box", "asset", "shadow"):
+            assert figures[f"image.{region}.rmse"]["mean"] == 0.0
+            assert figures[f"image.{region}.si_rmse"]["mean"] == pytest.approx(0.0, abs=1e-7)
+        assert figures["light.peak_angle_deg"]["mean"] == 0.0
+    # What comes near the truth, and what must not
+    asset = {row: figures["image.asset.rmse"]["mean"] for row, figures in mean.items()}
+    assert asset["oracle"] < asset["turned-180"]
+    angle = {row: figures["light.peak_angle_deg"]["mean"] for row, figures in mean.items()}
+    assert angle["oracle"] < 5.0 < 60.0 < angle["turned-180"]
+    # A network that was never trained flips its answer all the same
+    assert mean["mirrored"]["light.same_deg"]["mean"] == pytest.approx(0.0, abs=1e-3)
+    assert mean["uniform"]["fitted.asset.rmse"]["mean"] <= asset["uniform"] + 1e-9
+    for text in ((out / "tables.md").read_text(), printed.out):
+        assert "| oracle |" in text
+        assert "## Composites: glossy (2 scenes)" in text
+        assert "| regression | uniform |" in text
+    sheet = np.asarray(Image.open(out / "contact_sheet.png"))
+    assert sheet.shape == (4 * (28 + round(WIDTH / 1.5)), 4 * WIDTH, 3)
+
+
+@pytest.mark.slow
+def test_main_scores_maps_that_another_system_made(data: Path, tmp_path: Path) -> None:
+    """The true light, written as the exported index asks for it, comes back without an error."""
+    crops, maps = tmp_path / "crops", tmp_path / "maps"
+    chosen = arguments(data, "--scenes", "2", "--rows", "uniform")
+    assert main([*chosen, "--export-crops", str(crops)]) == 0
+    index = json.loads((crops / "crops.json").read_text())
+    index["maps"] = {"frame": "level", "scale": 1.0}
+    maps.mkdir()
+    (maps / "crops.json").write_text(json.dumps(index))
+    for place, _ in make_places(data).make(2):
+        assert (crops / f"{place.name}.png").is_file()
+        # Image centre = ahead; in the camera-yaw frame ahead is at both edges.
+        centred = np.roll(place.to_camera(place.texels), place.texels.shape[0], axis=1)
+        np.save(maps / f"{place.name}.npy", centred)
+
+    numbers = tmp_path / "numbers.json"
+    assert main([*chosen, "--predictions", str(maps), "--json", str(numbers)]) == 0
+
+    summary = json.loads(numbers.read_text())["summary"]
+    assert summary["predictions"]["all"]["light.peak_angle_deg"]["mean"] == pytest.approx(0.0)
+    assert summary["predictions"]["all"]["image.full.rmse"]["mean"] < 1e-6
+    assert summary["uniform"]["all"]["image.full.rmse"]["mean"] > 0.01
+
+
+def test_main_says_in_a_line_what_is_wrong(
+    data: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / "full").mkdir()
+    (tmp_path / "full" / "file").touch()
+    cases = [
+        (["--assets", str(data)], ExitCode.USAGE, "--panoramas"),
+        (arguments(data, "--rows", "best"), ExitCode.USAGE, "best"),
+        (arguments(data, "--curve", "log"), ExitCode.USAGE, "log"),
+        (arguments(data, "--scenes", "0"), ExitCode.USAGE, "--scenes"),
+        (arguments(data, "--width", "9"), ExitCode.USAGE, "--width"),
+        (arguments(data / "absent"), ExitCode.INPUT, "absent"),
+        (["--panoramas", str(data / "assets"), "--assets", str(data)], ExitCode.INPUT, "nothing"),
+        (
+            arguments(data, "--rows", "regression", "--regressor", str(tmp_path / "none")),
+            ExitCode.MODEL,
+            "none",
+        ),
+        (arguments(data, "--lpips", str(tmp_path / "none")), ExitCode.USAGE, "--lpips"),
+        (arguments(data, "--out", str(tmp_path / "full")), ExitCode.OUTPUT, "full"),
+    ]
+    for argv, status, word in cases:
+        assert main(argv) == status, argv
+        error = capsys.readouterr().err
+        assert error.startswith("error: "), error
+        assert word in error.splitlines()[0]
+
+
+def test_a_row_that_cannot_be_made_is_left_out_unless_it_was_named(data: Path) -> None:
+    """With one panorama there is no other scene."""
+    good = data / "panoramas" / "east" / "east.exr"
+    bench = make_bench(Places([good], [data / "assets" / "cube.ply"], 0, WIDTH).make(2))
+    notices: list[str] = []
+    assert usable_rows(bench, ["truth", "other-light", "regression"], False, notices) == [
+        "truth", "regression",
+    ]  # fmt: skip
+    assert "other-light" in notices[0]
+    with pytest.raises(InputError, match="two panoramas"):
+        usable_rows(bench, ["truth", "other-light"], True, notices)
+
+
+def test_other_scenes_are_seen_by_this_camera(
+    scenes: list[tuple[Place, list[Subject]]],
+) -> None:
+    """Another place's light keeps its place in the picture: both agree in the camera-yaw frame."""
+    bench = make_bench(scenes)
+    place = scenes[0][0]
+    other = bench.other(place)
+    assert other.panorama != place.panorama
+    from_map, from_photo = ROWS["other-light"].of_place, ROWS["other-photo"].of_place
+    regression = ROWS["regression"].of_place
+    assert from_map is not None and from_photo is not None and regression is not None
+    texels = from_map(bench, place).light.texels
+    assert texels is not None
+    assert np.array_equal(place.to_camera(texels), other.to_camera(other.texels))
+    seen, own = (as_map(p.light, 32) for p in (from_photo(bench, place), regression(bench, other)))
+    assert light_errors(place.to_camera(seen), other.to_camera(own))["peak_angle_deg"] < 6.0
+
+
+@pytest.mark.slow
+def test_guided_rows_run_what_insert_runs(data: Path, tmp_path: Path) -> None:
+    """With random weights: they end, say what the prior said, and the mirrored run too.
+
+    Nothing says that such guidance helps; where the acceptance test refuses its end, the row has
+    the light of its start.
+    """
+    config = NetworkConfig(widths=(16, 32), layers=1, head_width=16, groups=8)
+    save_embedded(build_network(config, seed=2), tmp_path / "prior.safetensors", {})
+    numbers = tmp_path / "numbers.json"
+    rows = "regression,lds-regression,lds-mirrored,s3-sds-no-lora"
+
+    status = main(
+        arguments(
+            data,
+            *("--scenes", "1", "--rows", rows, "--json", str(numbers), "--steps", "2"),
+            *("--regressor", str(data / "regressor.safetensors")),
+            *("--prior", str(tmp_path / "prior.safetensors")),
+        )
+    )
+
+    assert status == 0
+    record = json.loads(numbers.read_text())
+    assert len(record["weights"]["prior"]) == 64
+    entries = {(e["row"], e["material"]): e for e in record["entries"]}
+    assert len(entries) == 8
+    for material in ("diffuse", "glossy"):
+        found = entries["lds-regression", material]
+        said = found["about"]["record"]
+        assert said["prior"] == "embedded"
+        accepted = said["acceptance"]["is_accepted"]
+        start = entries["regression", material]["figures"]["image.box.rmse"]
+        if not accepted:
+            assert found["figures"]["image.box.rmse"] == pytest.approx(start, abs=1e-3)
+        assert "acceptance" not in entries["s3-sds-no-lora", material]["about"]["record"]
+        # Mirrored back, the light is where it was found.
+        assert entries["lds-mirrored", material]["figures"]["light.same_deg"] < 20.0
+    starts = {(p["row"], p["against"]) for p in record["pairs"] if p["is_start"]}
+    assert starts == {("lds-regression", "regression")}

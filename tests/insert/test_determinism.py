@@ -1,0 +1,279 @@
+"""The same bytes for the same seed: threads, kinds of processors, the clock, a GPU on request."""
+
+import json
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+import warp as wp
+
+from tests.builders.faults import Ended, run_case
+from tests.builders.outcome import outcome
+from tests.builders.tiny_stable_diffusion import make_tiny_stable_diffusion
+from tests.insert.test_insert import arguments, read_layers, write_inputs
+from tests.optimize.test_recover import CHEAP as GUIDED
+from tests.sequence.test_sequence import FAST
+from warpir.render.determinism import (
+    LARGE_PARAMETERS,
+    LARGE_THREADS,
+    THREADS,
+    fixed_arithmetic,
+    use_threads_for,
+)
+
+MANY = {"OMP_NUM_THREADS": "8", "MKL_NUM_THREADS": "8", "OPENBLAS_NUM_THREADS": "8"}
+TWO = {"OMP_NUM_THREADS": "2", "MKL_NUM_THREADS": "2", "OPENBLAS_NUM_THREADS": "2"}
+ONE = dict.fromkeys(MANY, "1")
+LOWER = {
+    "ATEN_CPU_CAPABILITY": "avx2",
+    "ONEDNN_MAX_CPU_ISA": "AVX2",
+    "MKL_ENABLE_INSTRUCTIONS": "AVX2",
+    "NPY_DISABLE_CPU_FEATURES": "AVX512F AVX512CD AVX512_SKX AVX512_CLX AVX512_CNL AVX512_ICL",
+}
+"""A processor without AVX-512, as far as torch and NumPy are concerned."""
+TINY = {
+    "regressed": {"light": None},
+    "embedded": {
+        "light": None,
+        "guidance_width": "32",
+        "light_height": "16",
+        "object_light_height": "8",
+        "steps": "2",
+        "score_every": "1",
+        "checkpoint_every": "1",
+    },
+    "stable-diffusion": {**GUIDED, "steps": "4", "lora_steps": "4"},
+    "refine": {
+        **GUIDED,
+        "steps": "4",
+        "lora_steps": "4",
+        "start": None,
+        "refine": "material",
+        "sun": "30,40",
+    },
+}
+"""A cheap run of each kind."""
+FEW_DRAWS = """
+from functools import partial
+import warpir.optimize.recover as recover
+recover.judge, recover.CHECK_DRAWS = partial(recover.judge, draws=2), 2
+"""
+"""Judges the end of a run by two draws of noise in place of sixteen: most of its time."""
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Photo, box, lights and a tiny Stable Diffusion, made once."""
+    made = tmp_path_factory.mktemp("determinism")
+    write_inputs(made)
+    make_tiny_stable_diffusion(made / "model")
+    return made
+
+
+def argv(folder: Path, kind: str, **changes: str | None) -> list[str]:
+    """A run of a kind into ``out`` of the working directory."""
+    flags: dict[str, str | None] = dict(TINY[kind])
+    if flags.get("guidance") == "stable-diffusion":
+        flags["model"] = str(folder / "model")
+    return arguments(folder, "out", **{**flags, **changes})
+
+
+def run(
+    argv: list[str], cwd: Path, env: Mapping[str, str | None] | None = None, before: str = ""
+) -> dict[str, str]:
+    """Run in a process of its own, with caches of its own; return the sha256 of what it wrote.
+
+    Seconds and the number of threads are not the result: see `tests.builders.outcome`.
+    """
+    cwd.mkdir()
+    ended: Ended = run_case(argv, cwd, env={"WARPIR_CACHE": None, **(env or {})}, before=before)
+    assert ended.status == 0, ended.err
+    assert ended.err == ""
+    for path in (cwd / "out").rglob("sequence.json"):
+        path.unlink()  # it holds the frames' run.json by their sha256, seconds included
+    return outcome(cwd / "out")
+
+
+# Threads
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("kind", [pytest.param(k, id=f"R13-threads-{k}") for k in TINY])
+def test_threads_change_no_byte(folder: Path, tmp_path: Path, kind: str) -> None:
+    """Every file, whatever --threads and the environment say of threads."""
+    before = FEW_DRAWS if kind == "embedded" else ""
+    few = run(argv(folder, kind, threads="1"), tmp_path / "few", ONE, before)
+    many = run(argv(folder, kind, threads="8"), tmp_path / "many", MANY, before)
+    assert len(few) > 15 and many == few
+
+
+@pytest.mark.slow
+@pytest.mark.case("R13")
+def test_threads_change_no_byte_of_a_sequence(folder: Path, tmp_path: Path) -> None:
+    """Both frames, lit by an earlier run."""
+    lines = folder / "frames.jsonl"
+    lines.write_text('{}\n{"place": [0.3, 0, -5]}\n')
+    first = arguments(folder, folder / "first", **FAST)
+    assert run_case(first, folder).status == 0
+    flags = {**FAST, "light": None, "reuse": str(folder / "first"), "sequence": str(lines)}
+    few = run(arguments(folder, "out", **flags, threads="1"), tmp_path / "few", ONE)
+    many = run(arguments(folder, "out", **flags, threads="8"), tmp_path / "many", MANY)
+    assert len(few) > 20 and many == few
+
+
+@pytest.mark.case("R13")
+def test_number_of_threads_is_that_of_the_network() -> None:
+    """Of its size alone, never of the machine or the environment; what was before comes back."""
+    before = torch.get_num_threads()
+    with torch.device("meta"):
+        small, large = torch.nn.Linear(8, 8), torch.nn.Linear(10**4, LARGE_PARAMETERS // 10**4)
+    try:
+        for threads in (1, 3):
+            torch.set_num_threads(threads)
+            with fixed_arithmetic("cpu", False):
+                assert torch.get_num_threads() == THREADS
+                assert torch.are_deterministic_algorithms_enabled()
+                use_threads_for(large)
+                assert torch.get_num_threads() == LARGE_THREADS
+                use_threads_for(small)
+                assert torch.get_num_threads() == THREADS
+            assert torch.get_num_threads() == threads
+            assert not torch.are_deterministic_algorithms_enabled()
+    finally:
+        torch.set_num_threads(before)
+
+
+@pytest.mark.case("R13")
+def test_arithmetic_comes_back_after_an_error() -> None:
+    before = torch.get_num_threads()
+    with pytest.raises(KeyboardInterrupt), fixed_arithmetic("cpu", False):
+        raise KeyboardInterrupt
+    assert torch.get_num_threads() == before
+    assert not torch.are_deterministic_algorithms_enabled()
+
+
+# Kinds of processors
+
+
+@pytest.mark.slow
+@pytest.mark.case("R13")
+def test_kinds_of_processors_agree(folder: Path, tmp_path: Path) -> None:
+    """With AVX-512 and without, the light that is read off the photo gives the same image."""
+    run(argv(folder, "regressed"), tmp_path / "all", ONE)
+    run(argv(folder, "regressed"), tmp_path / "lower", {**ONE, **LOWER})
+    ours, theirs = (
+        read_layers(tmp_path / name / "out" / "layers.exr") for name in ("all", "lower")
+    )
+    assert ours.keys() == theirs.keys()
+    for name, plane in ours.items():
+        # The file's halves are 5e-4 apart: they are equal, or the light was another.
+        np.testing.assert_allclose(theirs[name], plane, rtol=0.0, atol=1e-6, err_msg=name)
+    lights = [
+        json.loads((tmp_path / name / "out" / "lobes.json").read_text())["lobes"]
+        for name in ("all", "lower")
+    ]
+    for one, other in zip(*lights, strict=True):
+        np.testing.assert_allclose(one["amplitude"], other["amplitude"], rtol=1e-6)
+        np.testing.assert_allclose(one["axis"], other["axis"], atol=1e-6)
+
+
+# The clock
+
+BACKWARDS = """
+import time, itertools
+ticks = itertools.count()
+def jumping():
+    # An hour back at every seventh look, a day forward at every other.
+    k = next(ticks)
+    return 1.7e9 + 86400.0 * k - (90000.0 * k if k % 7 == 0 else 0.0)
+time.time = jumping
+time.time_ns = lambda: int(1e9 * jumping())
+time.localtime_of = time.localtime
+time.localtime = lambda seconds=None: time.localtime_of(0 if seconds is None else seconds)
+"""
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("env", "before"),
+    [
+        pytest.param({}, BACKWARDS, id="R12-clock-jumps"),
+        pytest.param({"TZ": "Pacific/Kiritimati"}, "", id="R12-time-zone"),
+    ],
+)
+def test_clock_changes_no_byte(
+    folder: Path, tmp_path: Path, env: dict[str, str], before: str, plain: dict[str, str]
+) -> None:
+    """No file holds a date, and nothing waits for a clock that goes backwards."""
+    settled = "import time; time.tzset()" if env else ""
+    assert run(argv(folder, "regressed"), tmp_path / "a", env, f"{settled}\n{before}") == plain
+
+
+@pytest.fixture(scope="module")
+def plain(folder: Path, tmp_path_factory: pytest.TempPathFactory) -> Iterator[dict[str, str]]:
+    """The result of a plain run, somewhere with a clock that goes as it should."""
+    yield run(argv(folder, "regressed"), tmp_path_factory.mktemp("plain") / "a")
+
+
+# A GPU, on request
+
+
+@pytest.mark.slow
+@pytest.mark.case("R13")
+def test_deterministic_is_accepted_on_the_cpu(
+    folder: Path, tmp_path: Path, plain: dict[str, str]
+) -> None:
+    """It changes nothing there; run.json and the layers' header say that it was asked for."""
+    found = run(argv(folder, "regressed", deterministic="", device="cpu"), tmp_path / "a")
+    differing = {name for name in plain if found[name] != plain[name]}
+    assert differing == {"layers.exr", "report.html", "run.json"}
+    assert json.loads((tmp_path / "a/out/run.json").read_text())["config"]["deterministic"] is True
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(not wp.is_cuda_available(), reason="needs a GPU")
+@pytest.mark.parametrize(
+    ("kind", "changes"),
+    [
+        pytest.param("regressed", {}, id="R13-cuda-regressed"),
+        pytest.param("embedded", {}, id="R13-cuda-embedded"),
+        pytest.param("stable-diffusion", {}, id="R13-cuda-stable-diffusion"),
+        pytest.param("stable-diffusion", {"integrator": "mis"}, id="R13-cuda-mis"),
+        pytest.param("refine", {}, id="R13-cuda-refine"),
+    ],
+)
+def test_deterministic_repeats_its_bytes_on_a_gpu(
+    folder: Path, tmp_path: Path, kind: str, changes: dict[str, str]
+) -> None:
+    """Two runs with --deterministic, each in a process of its own with empty caches."""
+    flags = argv(folder, kind, deterministic="", device="cuda:0", **changes)
+    first, second = (run(flags, tmp_path / name) for name in ("a", "b"))
+    assert first == second
+    record = json.loads((tmp_path / "a/out/run.json").read_text())
+    assert record["config"]["deterministic"] is True and record["device"].startswith("cuda")
+
+
+@pytest.mark.case("R13")
+def test_every_kernel_that_adds_in_common_places_can_be_ordered() -> None:
+    """Warp refuses to order what also reads the sums; compiling for CUDA says so without a GPU."""
+    import tempfile
+
+    from warpir.kernels import composite, light_gradient, rasterize, shade
+
+    if not wp._src.context.runtime.nvrtc_supported_archs:
+        pytest.skip("Warp has no CUDA compiler here")
+    for module in (composite, light_gradient, rasterize, shade):
+        before = wp.get_module_options(module)
+        wp.set_module_options(
+            {"deterministic": wp.DeterministicMode.RUN_TO_RUN, "deterministic_max_records": 16},
+            module,
+        )
+        try:
+            with tempfile.TemporaryDirectory() as out:
+                wp.compile_aot_module(module, arch=80, module_dir=out, use_ptx=True)
+                assert list(Path(out).glob("*.ptx"))
+        finally:
+            names = ("deterministic", "deterministic_max_records")
+            wp.set_module_options({name: before[name] for name in names}, module)

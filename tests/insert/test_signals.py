@@ -1,0 +1,596 @@
+"""Signals, full disks, folders that vanish: how a run ends when something ends it."""
+
+import hashlib
+import json
+import os
+import shutil
+import signal
+import subprocess
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import pytest
+
+from tests.builders.faults import Ended, assert_fails, run_case, snapshot
+from tests.insert.test_kill import guided_argv, results_of, write_guided_inputs
+from warpir.core import signals
+from warpir.core.errors import ExitCode
+from warpir.core.signals import Stopped
+from warpir.io.results import OutputFolder
+from warpir.optimize.checkpoint import manifest_digest
+
+# ----------------------------------------------------------------------- where a signal is raised
+
+
+def send(number: int = signal.SIGTERM) -> None:
+    signal.raise_signal(number)
+
+
+def test_a_signal_is_raised_at_once_where_nothing_defers_it() -> None:
+    with pytest.raises(Stopped, match="SIGHUP") as caught, signals.handled():
+        send(signal.SIGHUP)
+        pytest.fail("went on")
+    assert caught.value.number == signal.SIGHUP
+
+
+def test_a_deferred_signal_waits_for_the_border(capfd: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(Stopped, match="SIGTERM"), signals.handled(), signals.deferred():
+        signals.check()
+        send()
+        assert signals.is_pending()
+        assert "a second signal stops at once" in capfd.readouterr().err
+        signals.check()
+        pytest.fail("went on")
+    assert not signals.is_pending(), "the next run begins anew"
+    steps = []
+    with pytest.raises(Stopped), signals.handled():
+        with signals.deferred():
+            send()
+            steps.append("the end of the block is a border too")
+        steps.append("not reached")
+    assert len(steps) == 1
+
+
+def test_a_second_signal_is_raised_at_once_and_the_first_decides() -> None:
+    with pytest.raises(Stopped, match="SIGTERM"), signals.handled(), signals.deferred():
+        send(signal.SIGTERM)
+        send(signal.SIGINT)
+        pytest.fail("went on")
+
+
+def test_what_must_be_whole_is_finished_first() -> None:
+    done = []
+    with pytest.raises(Stopped), signals.handled(), signals.deferred():
+        with signals.whole():
+            with signals.whole():
+                send()
+                send()
+            done.append("inner")
+            send()
+            done.append("outer")
+        pytest.fail("went on")
+    assert done == ["inner", "outer"]
+    with pytest.raises(Stopped), signals.handled(), signals.deferred():
+        with signals.whole():
+            send()
+        done.append("one signal waits for the border")
+        signals.check()
+    assert len(done) == 3
+
+
+def test_a_swallowed_signal_is_raised_again_at_the_border() -> None:
+    """As when it comes in a finaliser, whose exceptions Python only prints."""
+    with pytest.raises(Stopped), signals.handled():
+        try:
+            send()
+        except Stopped:
+            pass
+        signals.check()
+        pytest.fail("went on")
+
+
+def test_what_the_parent_ignores_stays_ignored() -> None:
+    """As SIGHUP under nohup."""
+    before = signal.signal(signal.SIGHUP, signal.SIG_IGN)
+    try:
+        with signals.handled():
+            send(signal.SIGHUP)
+            assert not signals.is_pending()
+    finally:
+        signal.signal(signal.SIGHUP, before)
+
+
+# -------------------------------------------------------------------------------- runs that stop
+
+
+@pytest.fixture(scope="module")
+def inputs(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    made = tmp_path_factory.mktemp("inputs")
+    write_guided_inputs(made)
+    return made
+
+
+HOOK = """
+import importlib, os, signal, sys
+def at(place, turn, act):
+    module, *parts = place.split(":")
+    importlib.import_module(module)
+    owner = sys.modules[module]
+    *owners, name = parts
+    for part in owners:
+        owner = getattr(owner, part)
+    function, calls = getattr(owner, name), [0]
+    def hooked(*args, **named):
+        calls[0] += 1
+        if calls[0] == turn:
+            act()
+        return function(*args, **named)
+    setattr(owner, name, hooked)
+def send(*numbers):
+    def act():
+        for number in numbers:
+            os.kill(os.getpid(), number)
+    return act
+"""
+
+
+def hook(place: str, turn: int, act: str) -> str:
+    """Return code that does something when a function is called for the ``turn``-th time."""
+    return HOOK + f"\nat({place!r}, {turn}, {act})\n"
+
+
+UPDATE = "warpir.diffusion.personalize:LoraTraining:update"
+STEP = "warpir.optimize.loop:Optimization:step"
+SAVE = "warpir.optimize.checkpoint:write_folder"
+WRITE = "warpir.insert:_write"
+COMMIT = "warpir.io.results:OutputFolder:_put_in_place"
+
+
+def guided(
+    inputs: Path, folder: Path, *more: str, before: str = "", file_size: int | None = None
+) -> Ended:
+    """Run what `guided_argv` describes, into ``folder/out``, with a cache of its own."""
+    cache = folder.parent / f"{folder.name}-cache"
+    return run_case(
+        [*guided_argv(inputs), *more],
+        folder,
+        env={"WARPIR_CACHE": str(cache)},
+        before=before,
+        file_size=file_size,
+        warm=True,
+    )
+
+
+@pytest.fixture(scope="module")
+def finished(inputs: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The folder of a run that nothing stopped."""
+    folder = tmp_path_factory.mktemp("finished")
+    ended = guided(inputs, folder)
+    assert ended.status == ExitCode.DONE, ended.err
+    return folder / "out"
+
+
+def old_results(finished: Path, folder: Path) -> dict[str, str]:
+    """Put an earlier run's results in a folder and return what is there."""
+    shutil.copytree(finished, folder / "out")
+    shutil.rmtree(folder / "out" / "progress")
+    record = json.loads((folder / "out" / "run.json").read_text())
+    record["seconds"] = {"of an earlier run": 1.0}
+    (folder / "out" / "run.json").write_text(json.dumps(record))
+    return snapshot(folder / "out")
+
+
+def what_is_kept(out: Path, old: dict[str, str]) -> str:
+    """Return the name of the newest checkpoint; old results must be whole, and nothing else new."""
+    found = snapshot(out) if out.exists() else {}
+    assert {name: found.get(name) for name in old} == old
+    more = [name for name in found if name not in old]
+    assert all(name.split("/")[0] in ("checkpoints", "progress") for name in more), more
+    for name in more:
+        if name.endswith("manifest.json"):
+            manifest = json.loads((out / name).read_text())
+            state = found[name.replace("manifest.json", "state.safetensors")]
+            assert manifest["sha256"] == state
+    names = {name.split("/")[1] for name in more if name.startswith("checkpoints/")}
+    return max(names, default="")
+
+
+TERM, INT, HUP = signal.SIGTERM, signal.SIGINT, signal.SIGHUP
+STOPS = [
+    pytest.param("warpir.optimize.recover:load_prior", 1, (TERM,), "", id="R2-load"),
+    pytest.param("warpir.optimize.recover:load_prior", 1, (INT,), "", id="R2-load-int"),
+    pytest.param(UPDATE, 3, (TERM,), "000002-personalize-3", id="R2-lora"),
+    pytest.param(STEP, 3, (INT,), "000004-optimize-3", id="R2-iteration-int"),
+    pytest.param(STEP, 3, (HUP,), "000004-optimize-3", id="R2-iteration-hup"),
+    # The step is lost that both came in, and nothing that was saved.
+    pytest.param(STEP, 4, (INT, TERM), "000003-optimize-2", id="R2-iteration-twice"),
+    pytest.param(SAVE, 4, (TERM, TERM), "000004-optimize-4", id="R2-checkpoint-twice"),
+    pytest.param(WRITE, 1, (TERM,), "000005-optimize-6", id="R2-write"),
+]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("place", "turn", "numbers", "kept"), STOPS)
+def test_stopped_run_keeps_what_it_had(
+    inputs: Path,
+    finished: Path,
+    tmp_path: Path,
+    place: str,
+    turn: int,
+    numbers: tuple[int, ...],
+    kept: str,
+) -> None:
+    """A checkpoint at the border of the step, the old results as they were, no lock."""
+    old = old_results(finished, tmp_path) if kept else {}
+    before = hook(place, turn, f"send{(*map(int, numbers),)}")
+    ended = guided(inputs, tmp_path, "--overwrite", before=before)
+    assert ended.status == 128 + numbers[0], ended.err
+    assert "Traceback" not in ended.err and "error:" not in ended.err
+    last = ended.err.splitlines()[-1]
+    assert last.startswith(f"stopped by {signal.Signals(numbers[0]).name}; ")
+    assert (f"{kept}; the same command with --resume" if kept else "no checkpoint") in last
+    assert what_is_kept(tmp_path / "out", old) == kept
+    assert not ended.left and not ended.children
+
+
+@pytest.mark.slow
+@pytest.mark.case("R2")
+def test_results_that_are_being_put_in_place_are_finished(
+    inputs: Path, finished: Path, tmp_path: Path
+) -> None:
+    old_results(finished, tmp_path)
+    before = hook(COMMIT, 1, f"send({int(TERM)}, {int(TERM)})")
+    ended = guided(inputs, tmp_path, "--overwrite", before=before)
+    assert ended.status == 143
+    assert ended.err.splitlines()[-1] == "stopped by SIGTERM; the results in out are complete"
+    assert results_of(tmp_path / "out") == results_of(finished)
+
+
+@pytest.mark.parametrize("number", [INT, TERM, HUP], ids=["R2-read-int", "R2-read", "R2-read-hup"])
+def test_run_stops_while_it_reads(inputs: Path, tmp_path: Path, number: int) -> None:
+    """At once, without a file; and a folder with results is as it was."""
+    (tmp_path / "out").mkdir()
+    (tmp_path / "out" / "run.json").write_text("{}")
+    before = hook("warpir.app.inputs:read_inputs", 1, f"send({int(number)})")
+    was = snapshot(tmp_path)
+    ended = run_case([*guided_argv(inputs), "--overwrite"], tmp_path, before=before)
+    assert (ended.status, snapshot(tmp_path)) == (128 + number, was)
+    assert ended.err.startswith(f"stopped by {signal.Signals(number).name}; ")
+    assert ended.seconds < 5.0
+
+
+@pytest.mark.slow
+@pytest.mark.case("R2")
+def test_stopped_sequence_says_how_many_frames_are_kept(inputs: Path, tmp_path: Path) -> None:
+    """The second frame stops; the same command then makes the rest only."""
+    argv = lit(inputs, tmp_path)
+    assert run_case([*argv, "--out", "first"], tmp_path, warm=True).status == ExitCode.DONE
+    lines = "".join(json.dumps({"place": [x, 0, -5]}) + "\n" for x in (0.0, 0.2))
+    (tmp_path / "frames.jsonl").write_text(lines)
+    reused = argv[: argv.index("--light")] + argv[argv.index("--light") + 2 :]
+    argv = [*reused, "--reuse", "first", "--sequence", "frames.jsonl", "--out", "out"]
+    ended = run_case(argv, tmp_path, before=hook(WRITE, 2, f"send({int(TERM)})"), warm=True)
+    assert ended.status == 143
+    expected = "stopped by SIGTERM; kept: 1 of 2 frames; the same command goes on with the rest"
+    assert ended.err.splitlines()[-1] == expected
+    ended = run_case(argv, tmp_path, before=hook(COMMIT, 1, f"send({int(signal.SIGKILL)})"))
+    assert ended.status == -signal.SIGKILL
+    ended = run_case(argv, tmp_path, warm=True)
+    assert ended.status == ExitCode.DONE, ended.err
+    # The frame that was killed in its last moment was complete.
+    assert ended.out.count("done already") == 2
+
+
+def lit(inputs: Path, folder: Path) -> list[str]:
+    """Return a cheap run under a known light, but for its --out."""
+    from tests.insert.test_insert import arguments
+
+    argv = arguments(inputs, "", samples="1", depth="1", device="cpu", no_hand_off="")
+    place = argv.index("--out")
+    return argv[:place] + argv[place + 1 + (argv[place + 1] == "") :]
+
+
+COMPILED = """
+import sys
+import warp as wp
+from warpir.app.program import run_program
+
+@wp.kernel
+def doubled(x: wp.array(dtype=float)):
+    x[wp.tid()] = 2.0 * x[wp.tid()]
+
+def run(arguments):
+    wp.config.quiet = True
+    x = wp.array([1.5, -2.0], dtype=float, device="cpu")
+    wp.launch(doubled, 2, inputs=[x], device="cpu")
+    print(x.numpy().tolist())
+    return 0
+
+def main():
+    return run_program(run, [])
+"""
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("place", "wait"),
+    [
+        pytest.param("warp._src.build:build_cpu", 0.05, id="R14-compile"),
+        pytest.param("warp._src.build:safe_rename", 0.0, id="R14-rename"),
+    ],
+)
+def test_interrupted_compilation_leaves_a_sound_cache(
+    tmp_path: Path, place: str, wait: float
+) -> None:
+    """Ctrl-C while a kernel is compiled: 130, and the next run computes what it should."""
+    (tmp_path / "compiled.py").write_text(COMPILED)
+    path = f"import sys; sys.path.insert(0, {str(tmp_path)!r})\n"
+    # From another process, in the middle of the compiler's work.
+    act = f"lambda: os.fork() or (time.sleep({wait}), os.kill(os.getppid(), 2), os._exit(0))"
+    env = {"WARP_CACHE_PATH": str(tmp_path / "cache")}
+    before = path + "import time\n" + hook(place, 1, act if wait else f"send({int(INT)})")
+    ended = run_case([], tmp_path, program="compiled", env=env, before=before)
+    assert ended.status == 130, ended.err
+    assert ended.err.splitlines()[-1] == "stopped by SIGINT"
+    ended = run_case([], tmp_path, program="compiled", env=env, before=path)
+    assert ended.status == 0, ended.err
+    assert ended.out.splitlines()[-1] == "[3.0, -4.0]"
+
+
+# ------------------------------------------------------------------- disks and folders that fail
+
+
+@pytest.fixture
+def small_disk(tmp_path: Path) -> Iterator[Callable[[str], Path]]:
+    """A function that mounts a file system of its own; it needs root."""
+    mounted = []
+
+    def mount(size: str) -> Path:
+        folder = tmp_path / "disk"
+        folder.mkdir()
+        command = ["mount", "-t", "tmpfs", "-o", f"size={size}", "none", str(folder)]
+        if subprocess.run(command, capture_output=True, check=False).returncode:
+            pytest.skip("file systems cannot be mounted here")
+        mounted.append(folder)
+        return folder
+
+    yield mount
+    for folder in mounted:
+        subprocess.run(["umount", str(folder)], check=True)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    "limit", [pytest.param(n, id=f"R4-{n}") for n in (1_000, 10_000, 100_000, 500_000)]
+)
+def test_full_disk_keeps_old_results_and_checkpoints(
+    inputs: Path, finished: Path, tmp_path: Path, limit: int
+) -> None:
+    """Wherever the disk is full first: preview, checkpoint, LoRA, EXR."""
+    old = old_results(finished, tmp_path)
+    ended = guided(inputs, tmp_path, "--overwrite", file_size=limit)
+    assert ended.status == ExitCode.RESOURCES, ended.err
+    errors = [line for line in ended.err.splitlines() if line.startswith("error:")]
+    assert len(errors) == 1 and errors[0].startswith("error: out/")
+    assert "cannot be written (File too large)" in errors[0] and "Traceback" not in ended.err
+    kept = what_is_kept(tmp_path / "out", old)
+    assert bool(kept) == (limit >= 500_000)
+    if kept:
+        assert f"{kept}; the same command with --resume" in ended.out
+        ended = guided(inputs, tmp_path, "--resume")
+        assert ended.status == ExitCode.DONE, ended.err
+        assert results_of(tmp_path / "out") == results_of(finished)
+
+
+@pytest.mark.slow
+@pytest.mark.case("R4", "R5")
+def test_full_file_system(
+    inputs: Path, finished: Path, tmp_path: Path, small_disk: Callable[[str], Path]
+) -> None:
+    """A real one, another than that of temporary files, which others fill meanwhile."""
+    disk = small_disk("64m")
+    fill = "lambda: open('filler', 'wb').write(bytes(shutil.disk_usage('.').free - 1_500_000))"
+    ended = guided(inputs, disk, before="import shutil\n" + hook(WRITE, 1, fill))
+    assert ended.status == ExitCode.RESOURCES, ended.err
+    assert ended.err.startswith("error: out/envmap.hdr: written incompletely")
+    (disk / "filler").unlink()
+    assert what_is_kept(disk / "out", {}) == "000005-optimize-6"
+    ended = guided(inputs, disk, "--resume")
+    assert ended.status == ExitCode.DONE, ended.err
+    assert results_of(disk / "out") == results_of(finished)
+
+
+GONE = [
+    pytest.param(STEP, 3, "lambda: shutil.rmtree('out')", id="R6-deleted-iteration"),
+    pytest.param(WRITE, 1, "lambda: shutil.rmtree('out')", id="R6-deleted-write"),
+    pytest.param(
+        STEP, 3, "lambda: (shutil.rmtree('out'), open('out', 'w').close())", id="R6-file-in-place"
+    ),
+]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("place", "turn", "act"), GONE)
+def test_output_folder_that_vanishes(
+    inputs: Path, tmp_path: Path, place: str, turn: int, act: str
+) -> None:
+    """The run ends with one line, and does not make the folder anew."""
+    before = "import shutil\n" + hook(place, turn, act)
+    ended = guided(inputs, tmp_path, before=before)
+    assert ended.status == ExitCode.RESOURCES, ended.err
+    assert ended.err.startswith("error: out/") and "Traceback" not in ended.err
+    assert not (tmp_path / "out").is_dir()
+
+
+@pytest.mark.slow
+@pytest.mark.case("R6")
+def test_output_folder_that_becomes_read_only(
+    inputs: Path, finished: Path, tmp_path: Path, small_disk: Callable[[str], Path]
+) -> None:
+    old = old_results(finished, tmp_path)
+    # What is open for writing cannot become read-only, so that another disk comes on top.
+    command = ["mount", "-t", "tmpfs", "-o", "ro", "none", "out"]
+    small_disk("4k")  # skips where nothing can be mounted
+    act = f"lambda: subprocess.run({command!r}, check=True)"
+    try:
+        before = "import subprocess\n" + hook(STEP, 3, act)
+        ended = guided(inputs, tmp_path, "--overwrite", before=before)
+    finally:
+        subprocess.run(["umount", str(tmp_path / "out")], check=True)
+    assert ended.status == ExitCode.RESOURCES, ended.err
+    assert ended.err.startswith("error: out/") and "Read-only file system" in ended.err
+    found = snapshot(tmp_path / "out")
+    assert {name: found[name] for name in old} == old
+    assert "checkpoints/000003-optimize-2/manifest.json" in found
+
+
+@pytest.mark.case("F6")
+def test_second_run_into_a_folder_is_locked_out(inputs: Path, tmp_path: Path) -> None:
+    """It says whose the folder is, and leaves that run alone."""
+    with OutputFolder(tmp_path / "out"):
+        words = ("out: locked by pid", str(os.getpid()))
+        argv = [*guided_argv(inputs), "--overwrite"]
+        assert_fails(argv, ExitCode.OUTPUT, *words, cwd=tmp_path)
+
+
+# --------------------------------------------------------------- what is resumed is the same run
+
+
+@pytest.fixture(scope="module")
+def stopped(inputs: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Inputs, and ``run/out`` with two checkpoints of a run that was stopped."""
+    folder = tmp_path_factory.mktemp("stopped")
+    shutil.copytree(inputs, folder / "inputs")
+    (folder / "run").mkdir()
+    ended = guided(folder / "inputs", folder / "run", before=hook(STEP, 3, f"send({int(TERM)})"))
+    assert ended.status == 143, ended.err
+    return folder
+
+
+def sha256(path: Path) -> str:
+    return hashlib.sha256(path.read_bytes()).hexdigest()
+
+
+def edit(path: Path) -> None:
+    """Change a file so that it is still one of its kind."""
+    import trimesh
+
+    from tests.optimize.test_recover_embedded import NETWORK
+    from warpir.diffusion import embedded
+    from warpir.lighting.regressor import random_regressor, save_regressor
+
+    if path.stem == "prior":
+        embedded.save_embedded(embedded.build_network(NETWORK, seed=2), path, {})
+    elif path.stem == "regressor":
+        save_regressor(random_regressor(2), path, {})
+    else:
+        trimesh.creation.box(extents=(1.0, 1.0, 1.1)).export(path)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("file", "field"),
+    [
+        pytest.param("prior.safetensors", "inputs.prior", id="L9-prior"),
+        pytest.param("regressor.safetensors", "inputs.regressor", id="L9-regressor"),
+        pytest.param("box.glb", "inputs.asset", id="L9-asset"),
+    ],
+)
+def test_resume_refuses_changed_files_with_both_sha256(
+    stopped: Path, tmp_path: Path, file: str, field: str
+) -> None:
+    folder = tmp_path / "copy"
+    shutil.copytree(stopped, folder)
+    before = sha256(folder / "inputs" / file)
+    edit(folder / "inputs" / file)
+    after = sha256(folder / "inputs" / file)
+    words = (f'{field}: was "{before}", is "{after}"', "000004-optimize-3")
+    argv = [*guided_argv(stopped / "inputs"), "--resume"]
+    # The paths stay those of the run that was stopped: they are part of what it was.
+    shutil.copyfile(stopped / "inputs" / file, tmp_path / "kept")
+    shutil.copyfile(folder / "inputs" / file, stopped / "inputs" / file)
+    try:
+        fails_warm(argv, ExitCode.INPUT, *words, cwd=folder / "run")
+    finally:
+        shutil.copyfile(tmp_path / "kept", stopped / "inputs" / file)
+
+
+def fails_warm(argv: list[str], code: int, *words: str, cwd: Path) -> list[str]:
+    """Check a refusal that comes after the model is loaded: seconds, but no limit on memory."""
+    before = snapshot(cwd)
+    ended = run_case(argv, cwd, warm=True)
+    lines = ended.err.splitlines()
+    assert ended.status == code, ended
+    assert lines[0].startswith("error: ") and "Traceback" not in ended.err
+    assert all(word in lines[0] for word in words), lines[0]
+    assert snapshot(cwd) == before
+    assert not ended.left and not ended.children and ended.seconds < 10.0
+    return lines
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("more", "words"),
+    [
+        pytest.param(("--lobes", "9"), "config.lobes: was", id="R3-config"),
+        pytest.param(("--prompt", "a red car"), 'config.prompt: was "absent", is', id="R3-prompt"),
+        pytest.param(("--steps", "7"), "config.steps: was 6, is 7", id="R3-steps"),
+    ],
+)
+def test_resume_refuses_another_run(
+    stopped: Path, tmp_path: Path, more: tuple[str, str], words: str
+) -> None:
+    folder = tmp_path / "run"
+    shutil.copytree(stopped / "run", folder)
+    argv = guided_argv(stopped / "inputs")
+    if more[0] in argv:
+        place = argv.index(more[0])
+        argv[place : place + 2] = []
+    fails_warm([*argv, *more, "--resume"], ExitCode.INPUT, words, cwd=folder)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    "damage", ["R3-cut", "R3-no-manifest", "R3-newer-format", "R3-other-version"]
+)
+def test_resume_goes_back_to_the_checkpoint_before(
+    stopped: Path, tmp_path: Path, damage: str
+) -> None:
+    """With a notice, and to the same end; where all are like that it is refused."""
+    folder = tmp_path / "run"
+    shutil.copytree(stopped / "run", folder)
+    argv = [*guided_argv(stopped / "inputs"), "--resume"]
+    earlier, newest = sorted((folder / "out" / "checkpoints").iterdir())
+    if damage == "R3-other-version":
+        spoil(newest, damage)
+        words = ("versions.torch", "000004-optimize-3")
+        fails_warm(argv, ExitCode.INPUT, *words, cwd=folder)
+        return
+    spoil(newest, damage)
+    before = hook(STEP, 1, f"send({int(TERM)}, {int(TERM)})")
+    ended = guided(stopped / "inputs", folder, "--resume", before=before)
+    assert ended.status == 143
+    assert "notice: checkpoint passed over: 000004-optimize-3 cannot be used" in ended.out
+    assert "resumed: optimize, step 2" in ended.out
+    for checkpoint in (folder / "out" / "checkpoints").iterdir():
+        spoil(checkpoint, damage)
+    fails_warm(argv, ExitCode.INPUT, "out/checkpoints", "cannot be used", cwd=folder)
+    assert earlier.name < newest.name
+
+
+def spoil(checkpoint: Path, damage: str) -> None:
+    manifest = checkpoint / "manifest.json"
+    if damage == "R3-no-manifest":
+        manifest.unlink(missing_ok=True)
+        return
+    record = json.loads(manifest.read_text())
+    if damage == "R3-cut":
+        state = checkpoint / "state.safetensors"
+        state.write_bytes(state.read_bytes()[:-100])
+    elif damage == "R3-newer-format":
+        record["format"] += 1
+    else:
+        record["identity"]["versions"]["torch"] = "1.0"
+        del record["manifest_sha256"]
+        record["manifest_sha256"] = manifest_digest(record)
+    manifest.write_text(json.dumps(record))

@@ -1,0 +1,1710 @@
+"""The glTF reader against a tiny correct file and named faults in it.
+
+The ids are the rows of the project's interoperability (G) and fault (M) tables. Everything is
+built in memory; the files of the development data are read where they exist.
+"""
+
+import base64
+import io
+import json
+import os
+import struct
+import time
+import tracemalloc
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from tests.builders.faults import assert_fails
+from warpir.app.config import InsertConfig
+from warpir.core.errors import ExitCode, InputError
+from warpir.core.limits import LIMITS, Limits
+from warpir.io.assets import load_asset
+from warpir.io.gltf.reader import read_gltf
+from warpir.scene.asset import Asset, Material, TextureSlot
+
+DATA = Path(__file__).parents[3] / "shared" / "data" / "mesh"
+CODES = {"b": 5120, "B": 5121, "h": 5122, "H": 5123, "I": 5125, "f": 5126}
+TYPES = {1: "SCALAR", 2: "VEC2", 3: "VEC3", 4: "VEC4"}
+
+# A square in the plane z = 0, seen from +Z; corners counter-clockwise from the lower left.
+CORNERS = np.array([[0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]], dtype="f")
+UVS = np.array([[0, 1], [1, 1], [1, 0], [0, 0]], dtype="f")
+NORMALS = np.tile(np.array([0, 0, 1], dtype="f"), (4, 1))
+TANGENTS = np.tile(np.array([1, 0, 0, 1], dtype="f"), (4, 1))
+TWO = np.array([0, 1, 2, 0, 2, 3], dtype="H")
+
+# Decoding c / 65535 and the like rounds once in float32.
+FLOAT32_RTOL = 1e-6
+
+
+def png(color: tuple[int, ...] = (200, 100, 50), size: int = 2, kind: str = "PNG") -> bytes:
+    """Return an encoded image of one colour."""
+    stream = io.BytesIO()
+    mode = "RGBA" if len(color) == 4 else "RGB"
+    Image.new(mode, (size, size), color).save(
+        stream, kind, **({"lossless": True} if kind == "WEBP" else {})
+    )
+    return stream.getvalue()
+
+
+class Builder:
+    """A correct one-square glTF file; a test changes ``json`` or ``binary`` to plant a fault."""
+
+    def __init__(self) -> None:
+        self.binary = bytearray()
+        self.json: dict[str, Any] = {
+            "asset": {"version": "2.0"},
+            "scene": 0,
+            "scenes": [{"nodes": [0]}],
+            "nodes": [{"mesh": 0}],
+            "meshes": [],
+            "accessors": [],
+            "bufferViews": [],
+            "buffers": [{"byteLength": 0}],
+            "materials": [{"pbrMetallicRoughness": {}}],
+        }
+        self.primitive: dict[str, Any] = {
+            "attributes": {
+                "POSITION": self.accessor(CORNERS),
+                "NORMAL": self.accessor(NORMALS),
+                "TEXCOORD_0": self.accessor(UVS),
+            },
+            "indices": self.accessor(TWO),
+            "material": 0,
+        }
+        self.json["meshes"].append({"primitives": [self.primitive]})
+
+    def view(self, content: bytes, stride: int = 0) -> int:
+        """Append bytes and return the index of their buffer view."""
+        self.binary += b"\0" * (-len(self.binary) % 4)
+        view = {"buffer": 0, "byteOffset": len(self.binary), "byteLength": len(content)}
+        self.json["bufferViews"].append(view | ({"byteStride": stride} if stride else {}))
+        self.binary += content
+        self.json["buffers"][0]["byteLength"] = len(self.binary)
+        return len(self.json["bufferViews"]) - 1
+
+    def accessor(self, array: np.ndarray, normalized: bool = False, stride: int = 0) -> int:
+        """Append an array and return the index of its accessor."""
+        rows = array.reshape(len(array), -1)
+        content = rows.tobytes()
+        if stride:
+            content = b"".join(r.tobytes().ljust(stride, b"\xee") for r in rows)
+        accessor = {
+            "bufferView": self.view(content, stride),
+            "componentType": CODES[array.dtype.char],
+            "count": len(rows),
+            "type": TYPES[rows.shape[1]],
+        }
+        if np.isfinite(array).all():  # NaN is not JSON
+            accessor |= {"min": rows.min(axis=0).tolist(), "max": rows.max(axis=0).tolist()}
+        self.json["accessors"].append(accessor | ({"normalized": True} if normalized else {}))
+        return len(self.json["accessors"]) - 1
+
+    def attribute(self, name: str, array: np.ndarray, **options: Any) -> None:
+        """Set a vertex attribute."""
+        self.primitive["attributes"][name] = self.accessor(array, **options)
+
+    def texture(self, image: dict[str, Any] | None = None, **sampler: Any) -> int:
+        """Append a texture and return its index; its image is a PNG in the buffer by default."""
+        image = image or {"bufferView": self.view(png()), "mimeType": "image/png"}
+        for key in ("images", "textures", "samplers"):
+            self.json.setdefault(key, [])
+        self.json["images"].append(image)
+        self.json["samplers"].append(sampler)
+        self.json["textures"].append(
+            {"source": len(self.json["images"]) - 1, "sampler": len(self.json["samplers"]) - 1}
+        )
+        return len(self.json["textures"]) - 1
+
+    @property
+    def material(self) -> dict[str, Any]:
+        """The material of the square."""
+        material: dict[str, Any] = self.json["materials"][0]
+        return material
+
+    @property
+    def pbr(self) -> dict[str, Any]:
+        """Its metallic-roughness block."""
+        pbr: dict[str, Any] = self.material["pbrMetallicRoughness"]
+        return pbr
+
+    def base_color(self, image: dict[str, Any] | None = None, **sampler: Any) -> dict[str, Any]:
+        """Give the material a base colour texture and return its texture info."""
+        self.pbr["baseColorTexture"] = {"index": self.texture(image, **sampler)}
+        info: dict[str, Any] = self.pbr["baseColorTexture"]
+        return info
+
+    def glb(self) -> bytes:
+        """Return the file as ``.glb``."""
+        text = json.dumps(self.json).encode()
+        text += b" " * (-len(text) % 4)
+        binary = bytes(self.binary) + b"\0" * (-len(self.binary) % 4)
+        chunks = struct.pack("<I4s", len(text), b"JSON") + text
+        chunks += struct.pack("<I4s", len(binary), b"BIN\0") + binary
+        return struct.pack("<4sII", b"glTF", 2, 12 + len(chunks)) + chunks
+
+    def gltf(self) -> str:
+        """Return the file as ``.gltf`` with its buffer inside."""
+        uri = "data:application/octet-stream;base64," + base64.b64encode(self.binary).decode()
+        buffers = [self.json["buffers"][0] | {"uri": uri}]
+        return json.dumps(self.json | {"buffers": buffers})
+
+
+def load(folder: Path, builder: Builder, **options: str) -> Asset:
+    path = folder / "asset.glb"
+    path.write_bytes(builder.glb())
+    return read_gltf(path, **options)
+
+
+def fails(path: Path, *words: str, **options: str) -> InputError:
+    """Assert that loading ends in one sentence with the file and the words."""
+    with pytest.raises(InputError) as caught:
+        load_asset(path, **options)
+    error = caught.value
+    assert error.code == ExitCode.INPUT
+    assert error.where == str(path)
+    assert "\n" not in str(error)
+    for word in words:
+        assert word in f"{error.what} / {error.advice}"
+    return error
+
+
+# Faults: what is planted, and the words the error must hold.
+
+Plant = Callable[[Builder], object]
+FAULTS: dict[str, tuple[Plant, tuple[str, ...]]] = {}
+
+
+def fault(case: str, *words: str) -> Callable[[Plant], Plant]:
+    """Register a planted fault under its case id."""
+
+    def register(plant: Plant) -> Plant:
+        FAULTS[case] = (plant, words)
+        return plant
+
+    return register
+
+
+def node(**members: Any) -> Plant:
+    return lambda b: b.json["nodes"][0].update(members)
+
+
+def set_accessor(index: int, **members: Any) -> Plant:
+    return lambda b: b.json["accessors"][index].update(members)
+
+
+fault("M3-G5-image-missing", "/images/0", "gone.png", "--missing-textures grey")(
+    lambda b: b.base_color({"uri": "gone.png"})
+)
+fault("M3-G5-image-corrupt", "/images/0", "cannot be decoded")(
+    lambda b: b.base_color({"bufferView": b.view(png()[:40])})
+)
+fault("M3-G5-image-text", "/images/0", "not a PNG, JPEG or WebP")(
+    lambda b: b.base_color({"bufferView": b.view(b"plain text")})
+)
+fault("M3-G5-image-ktx2", "/images/0", "KTX2", "PNG or JPEG")(
+    lambda b: b.base_color({"bufferView": b.view(b"\xabKTX 20\xbb\r\n\x1a\n" + bytes(64))})
+)
+
+
+def sparse(at: list[int], values: np.ndarray, code: str = "B", **members: Any) -> Plant:
+    """Replace vertices ``at`` of POSITION by ``values``."""
+
+    def plant(b: Builder) -> None:
+        b.json["accessors"][0]["sparse"] = {
+            "count": len(at),
+            "indices": {
+                "bufferView": b.view(np.array(at, code).tobytes()), "componentType": CODES[code]
+            },
+            "values": {"bufferView": b.view(values.astype("f").tobytes())},
+        } | members  # fmt: skip
+
+    return plant
+
+
+ONE_ROW = np.full((1, 3), 9.0)
+fault("M6-G8-sparse-without-indices", "/accessors/0/sparse/indices: componentType is missing")(
+    set_accessor(0, sparse={"count": 1})
+)
+fault("M6-G8-sparse-index-out-of-range", "/accessors/0/sparse/indices: index 4, but 4 elements")(
+    sparse([4], ONE_ROW)
+)
+fault("M6-G8-sparse-indices-not-increasing", "/accessors/0/sparse/indices", "do not increase")(
+    sparse([2, 2], np.zeros((2, 3)))
+)
+fault("M6-G8-sparse-signed-indices", "/accessors/0/sparse/indices: componentType 5120")(
+    sparse([1], ONE_ROW, "b")
+)
+fault("M6-G8-sparse-values-too-short", "/accessors/0/sparse/values: 2 elements end at byte 24")(
+    sparse([1, 2], ONE_ROW)
+)
+fault("M6-G8-sparse-count-lies", "/accessors/0/sparse/indices: 2147483648 elements end at")(
+    sparse([1], ONE_ROW, count=2**31)
+)
+fault("M6-G8-sparse-NaN", "/accessors/0: 1 elements are NaN")(sparse([1], ONE_ROW * np.nan))
+fault("M17-G12-unknown-extension", "/extensionsRequired", "ACME_holograms", "re-export without")(
+    lambda b: b.json.update(extensionsRequired=["ACME_holograms"])
+)
+for name in (
+    "KHR_draco_mesh_compression", "EXT_meshopt_compression", "KHR_meshopt_compression",
+    "KHR_texture_basisu",
+):  # fmt: skip
+    fault(f"M17-G13-{name}", "/extensionsRequired", name, "re-export")(
+        lambda b, name=name: b.json.update(extensionsRequired=[name])  # type: ignore[misc]
+    )
+fault("G14-M7-index-out-of-range", "/meshes/0/primitives/0: index 999, but 4 vertices")(
+    lambda b: b.primitive.update(indices=b.accessor(np.array([0, 1, 999], "H")))
+)
+fault("M7-G14-index-restart-value", "index 4294967295, but 4 vertices")(
+    lambda b: b.primitive.update(indices=b.accessor(np.array([0, 1, 2**32 - 1], "I")))
+)
+fault("M7-G14-indices-float", "/meshes/0/primitives/0: indices are not unsigned integers")(
+    lambda b: b.primitive.update(indices=b.accessor(np.array([0, 1, 2], "f")))
+)
+for name, array in {
+    "POSITION": CORNERS, "NORMAL": NORMALS, "TEXCOORD_0": UVS, "TANGENT": TANGENTS,
+    "COLOR_0": NORMALS,
+}.items():  # fmt: skip
+    for bad in (np.nan, np.inf):
+
+        @fault(f"M8-G15-{name}-{bad}", "/accessors/", "NaN or infinite")
+        def _(b: Builder, name: str = name, array: Any = array, bad: float = bad) -> None:
+            poisoned = array.copy()
+            poisoned[2, 1] = bad
+            b.attribute(name, poisoned)
+
+
+fault("G16-M10-cycle", "cycle")(
+    lambda b: b.json["nodes"].extend([{"children": [2]}, {"children": [1]}])
+)
+fault("M10-G16-self-child", "cycle")(node(children=[0]))
+fault("G16-M10-two-parents", "/nodes/1: child 2 is already a child of node 0")(
+    lambda b: (node(children=[2])(b), b.json["nodes"].extend([{"children": [2]}, {}]))
+)
+fault("M10-G16-same-child-twice", "/nodes/0: child 1 is already a child of node 0")(
+    lambda b: (node(children=[1, 1])(b), b.json["nodes"].append({}))
+)
+fault("M10-G16-root-twice", "/scenes/0: the same node twice")(
+    lambda b: b.json.update(scenes=[{"nodes": [0, 0]}])
+)
+fault("G17-scene-out-of-range", "scene 7, but 1 scenes")(lambda b: b.json.update(scene=7))
+fault("G17-scene-node-out-of-range", "/scenes/0: node 7, but 1 nodes")(
+    lambda b: b.json.update(scenes=[{"nodes": [7]}])
+)
+for mode in (0, 1, 2, 3):
+    fault(f"M12-G19-mode-{mode}-only", "nothing to render")(
+        lambda b, mode=mode: b.primitive.update(mode=mode)  # type: ignore[misc]
+    )
+fault("M12-G19-mode-7", "mode is 7, expected 0 to 6")(lambda b: b.primitive.update(mode=7))
+fault("M12-G19-empty-scene", "nothing to render")(lambda b: b.json.update(scenes=[{}]))
+fault("M12-G19-no-nodes", "nothing to render")(
+    lambda b: [b.json.pop(key) for key in ("nodes", "scenes", "scene")]
+)
+fault("G22-componentType-9999", "/accessors/0", "componentType 9999")(
+    set_accessor(0, componentType=9999)
+)
+fault("G22-child-99", "/nodes/0: child 99, but 1 nodes")(node(children=[99]))
+fault("G22-mesh-9", "/nodes/0: mesh 9, but 1 meshes")(node(mesh=9))
+fault("G22-mesh-is-text", '/nodes/0: mesh is "0", expected an integer')(node(mesh="0"))
+fault("G22-mesh-is-true", "/nodes/0: mesh is true, expected an integer")(node(mesh=True))
+fault("G22-accessor-99", "/meshes/0/primitives/0: POSITION 99, but")(
+    lambda b: b.primitive["attributes"].update(POSITION=99)
+)
+fault("G22-no-position", "/meshes/0/primitives/0/attributes: POSITION is missing")(
+    lambda b: b.primitive["attributes"].pop("POSITION")
+)
+fault("G22-material-5", "/meshes/0/primitives/0: material 5, but 1 materials")(
+    lambda b: b.primitive.update(material=5)
+)
+fault("G22-view-too-long", "/bufferViews/0", "but the buffer has")(
+    lambda b: b.json["bufferViews"][0].update(byteLength=1 << 20)
+)
+fault("G22-buffer-too-long", "/buffers/0: byteLength 1048576, but")(
+    lambda b: b.json["buffers"][0].update(byteLength=1 << 20)
+)
+fault("G22-wrong-type", "type VEC2 for POSITION, expected VEC3")(
+    lambda b: b.attribute("POSITION", UVS)
+)
+fault("G22-counts-differ", "3 NORMAL, but 4 vertices")(lambda b: b.attribute("NORMAL", NORMALS[:3]))
+fault("G22-color-not-normalized", "COLOR_0")(
+    lambda b: b.attribute("COLOR_0", np.full((4, 3), 9, "B"))
+)
+fault("G22-asset-version-1", "asset version is '1.0'")(
+    lambda b: b.json.update(asset={"version": "1.0"})
+)
+fault("G22-texCoord-2", "texCoord 2, but only sets 0 and 1")(
+    lambda b: b.base_color().update(texCoord=2)
+)
+fault("M6-G23-count-2^31-no-view", "/accessors/0", "no bufferView", "re-export")(
+    lambda b: (
+        b.json["accessors"][0].pop("bufferView"),
+        b.primitive.pop("indices"),
+        set_accessor(0, count=40_000_000)(b),
+    )
+)
+fault("M6-G23-count-2^31-limit", "too many triangles", "715827882", "20000000")(
+    lambda b: (b.primitive.pop("indices"), set_accessor(0, count=2**31)(b))
+)
+fault("M11-G25-zero-scale", "/nodes/0: singular transform")(node(scale=[1, 0, 1]))
+fault("M11-G25-zero-quaternion", "/nodes/0: rotation is the zero quaternion")(
+    node(rotation=[0, 0, 0, 0])
+)
+fault("G28-M10-2^18-instances", "too many nodes", "262144", "100000")(
+    lambda b: b.json.update(nodes=[{"mesh": 0}] * 2**18)
+)
+fault("M10-G28-too-many-placed", "too many instances", "65536")(
+    lambda b: b.json.update(nodes=[{"mesh": 0}] * 70_000, scenes=[{"nodes": list(range(70_000))}])
+)
+
+
+def zeros(b: Builder) -> None:
+    """Ask for 24 GiB of zeros with one element replaced."""
+    sparse([1], ONE_ROW)(b)
+    b.json["accessors"][0].pop("bufferView")
+    b.json["accessors"][0].update(count=10_000_000 * 3)
+    b.primitive.pop("indices")
+
+
+fault("M6-G23-sparse-zeros", "/accessors/0: 360000000 bytes of zeros (limit 268435456)")(zeros)
+fault("M6-G23-normal-count-2^31", "/meshes/0/primitives/0: 2147483648 NORMAL, but 4 vertices")(
+    set_accessor(1, count=2**31)
+)
+
+
+def instanced(**attributes: np.ndarray) -> Plant:
+    """Place the square's mesh as EXT_mesh_gpu_instancing says."""
+
+    def plant(b: Builder) -> None:
+        b.json["extensionsUsed"] = b.json["extensionsRequired"] = ["EXT_mesh_gpu_instancing"]
+        stored = {
+            name: b.accessor(array, normalized=array.dtype.kind != "f")
+            for name, array in attributes.items()
+        }
+        node(extensions={"EXT_mesh_gpu_instancing": {"attributes": stored}})(b)
+
+    return plant
+
+
+INSTANCING = "/nodes/0/extensions/EXT_mesh_gpu_instancing/attributes"
+fault("M10-G28-instances-without-attributes", INSTANCING, "found none")(instanced())
+fault("M10-G28-instances-unequal", INSTANCING, "found 2 TRANSLATION, 3 SCALE")(
+    instanced(TRANSLATION=np.zeros((2, 3), "f"), SCALE=np.ones((3, 3), "f"))
+)
+fault("M10-G28-instances-2^18", INSTANCING, "found 262144; limit 65536")(
+    instanced(TRANSLATION=np.zeros((2**18, 3), "f"))
+)
+fault(
+    "M10-G28-instances-of-two-nodes",
+    "too many instances (found 80000 so far; limit 65536); --max-instances",
+)(
+    lambda b: (
+        instanced(TRANSLATION=np.zeros((40_000, 3), "f"))(b),
+        b.json["nodes"].append(b.json["nodes"][0]),
+        b.json.update(scenes=[{"nodes": [0, 1]}]),
+    )
+)
+fault("M11-G25-instance-of-zero-scale", "/nodes/0: singular transform of instance 1")(
+    instanced(SCALE=np.array([[1, 1, 1], [0, 1, 0]], "f"))
+)
+fault("M11-G25-instance-of-zero-quaternion", INSTANCING, "ROTATION holds the zero quaternion")(
+    instanced(ROTATION=np.zeros((1, 4), "f"))
+)
+fault("M8-G15-instance-NaN", "/accessors/4", "NaN or infinite")(
+    instanced(TRANSLATION=np.full((1, 3), np.nan, "f"))
+)
+fault("M6-past-the-buffer", "/accessors/0", "elements end at byte")(set_accessor(0, count=5))
+fault("M6-negative-offset", "/accessors/0: byteOffset is -4")(set_accessor(0, byteOffset=-4))
+fault("M6-view-negative-offset", "/bufferViews/0: byteOffset is -4")(
+    lambda b: b.json["bufferViews"][0].update(byteOffset=-4)
+)
+for stride in (0, 1):
+    fault(f"M6-stride-{stride}", f"/bufferViews/0: byteStride {stride}, but elements of 12")(
+        lambda b, stride=stride: b.json["bufferViews"][0].update(byteStride=stride)  # type: ignore[misc]
+    )
+fault("M6-count-0", "/accessors/0: count is 0, expected at least 1")(set_accessor(0, count=0))
+fault("M11-scale-1e300", "/nodes/0: transform with numbers beyond 1e+18")(node(scale=[1e300, 1, 1]))
+fault("M11-positions-1e30", "coordinates up to 1e+30", "1e+18")(
+    lambda b: b.attribute("POSITION", CORNERS * np.float32(1e30))
+)
+fault("M11-singular-matrix", "/nodes/0: singular transform")(
+    node(matrix=[1, 0, 0, 0, 1, 0, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1])
+)
+fault("M11-projective-matrix", "/nodes/0: matrix is not affine")(
+    node(matrix=[1, 0, 0, 1, 0, 1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1])
+)
+fault("M11-matrix-and-trs", "/nodes/0: both matrix and scale")(
+    node(matrix=np.eye(4).ravel().tolist(), scale=[1, 1, 1])
+)
+fault("M11-short-scale", "/nodes/0: scale has 2 numbers, expected 3")(node(scale=[1, 1]))
+fault("M13-only-zero-area", "nothing to render")(
+    lambda b: b.primitive.update(indices=b.accessor(np.array([0, 0, 1], "H")))
+)
+
+
+def many_textures(b: Builder) -> None:
+    """64 textures of 8192 x 8192, of one bit and so of few bytes each."""
+    stream = io.BytesIO()
+    Image.new("1", (8192, 8192)).save(stream, "PNG")
+    view = b.view(stream.getvalue())
+    for _ in range(64):
+        b.texture({"bufferView": view, "mimeType": "image/png"})
+    b.json["materials"] = [
+        {"pbrMetallicRoughness": {"baseColorTexture": {"index": k}}} for k in range(64)
+    ]
+    b.json["meshes"][0]["primitives"] = [b.primitive | {"material": k} for k in range(64)]
+
+
+fault("M14-64-textures-of-8k", "texture pixels", "512000000")(many_textures)
+fault("M14-50M-triangles", "too many triangles", "50000000", "20000000")(
+    lambda b: (b.primitive.pop("indices"), set_accessor(0, count=150_000_000)(b))
+)
+fault("M18-alphaMode", "/materials/0: alphaMode is 'GLOW'")(
+    lambda b: b.material.update(alphaMode="GLOW")
+)
+
+
+@pytest.mark.parametrize("case", FAULTS)
+def test_fault_is_refused_with_its_pointer(case: str, tmp_path: Path) -> None:
+    """One sentence names the file and the place, before anything large is allocated."""
+    plant, words = FAULTS[case]
+    builder = Builder()
+    plant(builder)
+    path = tmp_path / "asset.glb"
+    path.write_bytes(builder.glb())
+    fails(path, *words)
+
+
+@pytest.fixture(scope="module")
+def inputs(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Photo and light of a run; never changed."""
+    from tests.insert.test_insert import write_inputs
+
+    folder = tmp_path_factory.mktemp("inputs")
+    write_inputs(folder)
+    return folder
+
+
+COSTLY = [
+    case for case in FAULTS if case.startswith(("M6-", "M10-", "M14-", "M11-")) or "2^" in case
+]
+
+
+@pytest.mark.parametrize("case", COSTLY)
+def test_fault_costs_nothing(case: str, inputs: Path, tmp_path: Path) -> None:
+    """What asks for much memory or time ends the program at once, and with little of both."""
+    from tests.insert.test_insert import arguments
+
+    plant, words = FAULTS[case]
+    builder = Builder()
+    plant(builder)
+    (tmp_path / "asset.glb").write_bytes(builder.glb())
+    argv = arguments(inputs, "out", asset="asset.glb", device="cpu")
+    assert_fails(argv, 3, "asset.glb", words[0], cwd=tmp_path)
+
+
+URIS = {
+    "parent": "../secret.png", "encoded-parent": "%2e%2e/secret.png",
+    "inner-parent": "a/../../secret.png", "absolute": "/etc/hostname",
+    "file": "file:///etc/hostname", "http": "http://127.0.0.1:9/x.png",
+    "https": "https://127.0.0.1:9/x.png", "ftp": "ftp://127.0.0.1/x.png", "drive": "C:\\x.png",
+    "share": "\\\\127.0.0.1\\x.png", "two-slashes": "//127.0.0.1/x.png", "link": "link.png",
+    "link-of-a-folder": "folder/secret.png",
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("what", ["image", "buffer"])
+@pytest.mark.parametrize("case", URIS, ids="M4-{}".format)
+def test_uri_opens_nothing_outside(case: str, what: str, inputs: Path, tmp_path: Path) -> None:
+    """Of images and of buffers: refused by the program, without a socket."""
+    from tests.insert.test_insert import arguments
+
+    folder = tmp_path / "asset"
+    folder.mkdir()
+    builder = Builder()
+    (tmp_path / "secret.png").write_bytes(png() if what == "image" else bytes(builder.binary))
+    (folder / "link.png").symlink_to(tmp_path / "secret.png")
+    (folder / "folder").symlink_to(tmp_path)
+    if what == "image":
+        builder.base_color({"uri": URIS[case]})
+        (folder / "asset.gltf").write_text(builder.gltf())
+    else:
+        builder.json["buffers"][0]["uri"] = URIS[case]
+        (folder / "asset.gltf").write_text(json.dumps(builder.json))
+    argv = arguments(inputs, "out", asset="asset/asset.gltf", device="cpu")
+    assert_fails(argv, 3, "asset.gltf", f"/{what}s/0", "outside", cwd=tmp_path)
+
+
+@pytest.mark.parametrize(
+    ("name", "start", "size"),
+    [
+        pytest.param("a.gltf", b"{", 1 << 30, id="M2-json-1GB"),
+        pytest.param("a.gltf", b"[" * 100_000, 100_000, id="M2-100000-brackets-at-the-program"),
+        pytest.param(
+            "a.glb",
+            struct.pack("<4sIII4s", b"glTF", 2, 1 << 28, (1 << 28) - 20, b"JSON"),
+            1 << 28,
+            id="M2-json-256MB-in-glb",
+        ),
+        pytest.param("a.glb", b"glTF", 3 << 30, id="M1-file-3GB"),
+        pytest.param("a.obj", b"v 0 0 0", 3 << 30, id="M20-file-3GB"),
+    ],
+)
+def test_huge_file_is_not_read(
+    name: str, start: bytes, size: int, inputs: Path, tmp_path: Path
+) -> None:
+    """A sparse file takes no room on the disk; it must take none in memory either."""
+    from tests.insert.test_insert import arguments
+
+    with (tmp_path / name).open("wb") as stream:
+        stream.write(start)
+        stream.truncate(size)
+    argv = arguments(inputs, "out", asset=name, device="cpu")
+    assert_fails(argv, 3, name, cwd=tmp_path)
+
+
+def test_unchanged_builder_loads(tmp_path: Path) -> None:
+    """The faults above are the only thing wrong with their files."""
+    asset = load(tmp_path, Builder())
+    (square,) = asset.primitives
+    np.testing.assert_array_equal(square.positions, CORNERS)
+    np.testing.assert_array_equal(square.indices, TWO.reshape(2, 3))
+    assert square.normals is not None and square.uv0 is not None
+    np.testing.assert_array_equal(square.normals, NORMALS)
+    np.testing.assert_array_equal(square.uv0, UVS)
+    assert asset.notices == ()
+
+
+CONTAINERS: dict[str, tuple[Callable[[bytes], bytes], tuple[str, ...]]] = {
+    "M1-G21-empty": (lambda c: b"", ("empty file",)),
+    "M1-G21-4-bytes": (lambda c: c[:4], ("damaged .glb", "byte 4")),
+    "M1-G21-cut": (lambda c: c[:-40], ("total length", "byte 8")),
+    "M1-G21-png-inside": (lambda c: png(), ("not a .glb file", "PNG")),
+    "M1-json-length-lies": (
+        lambda c: c[:12] + struct.pack("<I", 1 << 30) + c[16:],
+        ("chunk of 1073741824 bytes leaves the file at byte 12",),
+    ),
+    "M1-total-length-lies": (
+        lambda c: c[:8] + struct.pack("<I", 7) + c[12:],
+        ("total length 7",),
+    ),
+    "M1-version-1": (lambda c: c[:4] + b"\1" + c[5:], ("container version 1",)),
+    "M1-binary-chunk-first": (lambda c: c[:16] + b"BIN\0" + c[20:], ("first chunk",)),
+}
+
+
+@pytest.mark.parametrize("case", CONTAINERS)
+def test_damaged_container_is_named_with_offset(case: str, tmp_path: Path) -> None:
+    """A damaged ``.glb`` is refused with the byte at fault."""
+    damage, words = CONTAINERS[case]
+    path = tmp_path / "asset.glb"
+    path.write_bytes(damage(Builder().glb()))
+    fails(path, *words)
+
+
+TEXTS: dict[str, tuple[str | bytes, tuple[str, ...]]] = {
+    "M2-G20-truncated": ('{"asset": {"version": "2.0"},\n "nodes": [', ("line 2: not JSON",)),
+    "M2-100000-brackets": ("[" * 100_000, ("nested",)),
+    "M2-list-at-root": ("[]", ("not a JSON object",)),
+    "M2-nan": ('{"asset": NaN}', ("NaN is not JSON",)),
+    "M2-key-twice": ('{"asset": {}, "asset": {}}', ('key "asset" appears twice',)),
+    "M2-not-utf8": (b'{"asset": "\xff"}', ("line 1: not UTF-8",)),
+    "M2-json-65-MB": (b" " * (65 << 20), ("too large", "67108864")),
+    "M2-no-asset": ("{}", ("asset version",)),
+}
+
+
+@pytest.mark.parametrize("case", TEXTS)
+def test_damaged_json_is_named_with_position(case: str, tmp_path: Path) -> None:
+    """A damaged ``.gltf`` is refused with its position."""
+    text, words = TEXTS[case]
+    path = tmp_path / "asset.gltf"
+    path.write_bytes(text if isinstance(text, bytes) else text.encode())
+    fails(path, *words)
+
+
+@pytest.mark.case("M6")
+def test_G23_huge_count_allocates_little(tmp_path: Path) -> None:
+    """An accessor of 2^31 elements in a small file is refused in under 50 MB."""
+    builder = Builder()
+    FAULTS["M6-G23-count-2^31-limit"][0](builder)
+    tracemalloc.start()
+    try:
+        with pytest.raises(InputError):
+            load(tmp_path, builder)
+        assert tracemalloc.get_traced_memory()[1] < 50e6
+    finally:
+        tracemalloc.stop()
+
+
+@pytest.mark.case("M4")
+@pytest.mark.parametrize(
+    "uri",
+    [
+        "../secret.png", "%2e%2e/secret.png", "a/../../secret.png", "/etc/hostname",
+        "file:///etc/hostname", "http://127.0.0.1:9/x.png", "C:\\x.png", "link.png",
+        "folder/secret.png", "loop.png", "nul%00.png", "",
+    ],
+)  # fmt: skip
+@pytest.mark.parametrize("policy", ["error", "grey"])
+def test_G24_uri_outside_the_folder_is_not_read(uri: str, policy: str, tmp_path: Path) -> None:
+    """Parent, absolute, linked and remote URIs are refused under either policy."""
+    folder = tmp_path / "asset"
+    folder.mkdir()
+    (tmp_path / "secret.png").write_bytes(png())
+    (folder / "link.png").symlink_to(tmp_path / "secret.png")
+    (folder / "folder").symlink_to(tmp_path)
+    (folder / "loop.png").symlink_to(folder / "loop.png")
+    builder = Builder()
+    builder.base_color({"uri": uri})
+    path = folder / "asset.glb"
+    path.write_bytes(builder.glb())
+    if uri == "loop.png" and policy == "grey":
+        return  # a loop inside the folder is a missing file
+    fails(path, "/images/0", *(() if uri == "loop.png" else ("outside",)), missing_textures=policy)
+
+
+@pytest.mark.case("M4")
+def test_G24_no_fallback_to_the_base_name(tmp_path: Path) -> None:
+    """``a/b/x.png`` never reads ``x.png``."""
+    (tmp_path / "x.png").write_bytes(png())
+    builder = Builder()
+    builder.base_color({"uri": "a/b/x.png"})
+    path = tmp_path / "asset.glb"
+    path.write_bytes(builder.glb())
+    fails(path, "/images/0", "x.png")
+
+
+@pytest.mark.case("M3")
+def test_M3_missing_buffer_is_refused(tmp_path: Path) -> None:
+    """A ``.gltf`` whose ``.bin`` is absent is refused; so is a FIFO in its place."""
+    builder = Builder()
+    builder.json["buffers"][0]["uri"] = "mesh.bin"
+    path = tmp_path / "asset.gltf"
+    path.write_text(json.dumps(builder.json))
+    fails(path, "/buffers/0", "mesh.bin")
+    os.mkfifo(tmp_path / "mesh.bin")
+    fails(path, "/buffers/0", "not a regular file")
+
+
+def test_missing_file_folder_and_kind(tmp_path: Path) -> None:
+    """A path that is absent, a folder or of another kind is refused."""
+    fails(tmp_path / "none.glb", "No such file")
+    (tmp_path / "folder.glb").mkdir()
+    fails(tmp_path / "folder.glb", "not a regular file")
+
+
+@pytest.mark.case("M21")
+@pytest.mark.parametrize("suffix", [".fbx", ".usdz", ".blend", ".zip", ""])
+def test_M21_other_kinds_are_refused(suffix: str, tmp_path: Path) -> None:
+    """Formats without a reader are refused with the way out."""
+    path = tmp_path / f"asset{suffix}"
+    path.write_bytes(b"x")
+    fails(path, "convert it to GLB")
+
+
+@pytest.mark.parametrize("kind", ["glb", "base64", "bin"])
+def test_G1_containers_agree(kind: str, tmp_path: Path) -> None:
+    """``.glb``, base64 and separate buffers hold the same square."""
+    builder = Builder()
+    path = tmp_path / ("asset.glb" if kind == "glb" else "asset.gltf")
+    if kind == "glb":
+        path.write_bytes(builder.glb())
+    elif kind == "base64":
+        path.write_text("\ufeff" + builder.gltf())
+    else:
+        (tmp_path / "mesh.bin").write_bytes(builder.binary)
+        builder.json["buffers"][0]["uri"] = "mesh.bin"
+        path.write_text(json.dumps(builder.json))
+    np.testing.assert_array_equal(load_asset(path).primitives[0].positions, CORNERS)
+
+
+@pytest.mark.parametrize("code", ["B", "H", "I", "none", "strip", "stride"])
+def test_G1_index_and_layout_kinds(code: str, tmp_path: Path) -> None:
+    """Indices of every width, none, strips and interleaved vertices give the same triangles."""
+    builder = Builder()
+    if code in "BHI":
+        builder.primitive["indices"] = builder.accessor(TWO.astype(code))
+    elif code == "none":
+        del builder.primitive["indices"]
+        for name, array in {"POSITION": CORNERS, "NORMAL": NORMALS, "TEXCOORD_0": UVS}.items():
+            builder.attribute(name, array[TWO])
+    elif code == "strip":
+        strip = np.array([1, 2, 0, 3], "B")
+        builder.primitive.update(mode=5, indices=builder.accessor(strip))
+    else:
+        builder.attribute("POSITION", CORNERS, stride=28)
+    (square,) = load(tmp_path, builder).primitives
+    a, b, c = square.positions[square.indices].transpose(1, 0, 2)
+    np.testing.assert_array_equal(np.cross(b - a, c - a), [[0, 0, 1], [0, 0, 1]])
+
+
+def test_G1_material_values(tmp_path: Path) -> None:
+    """Factors, textures, alpha and sides reach the record."""
+    builder = Builder()
+    builder.pbr.update(metallicFactor=0.25, roughnessFactor=0.75, baseColorFactor=[1, 0.5, 0.25, 1])
+    builder.base_color()
+    builder.pbr["metallicRoughnessTexture"] = {"index": builder.texture()}
+    builder.material.update(
+        alphaMode="MASK", alphaCutoff=0.3, doubleSided=True, emissiveFactor=[0.1, 0.2, 0.3],
+        emissiveTexture={"index": 0}, normalTexture={"index": 1}, occlusionTexture={"index": 0},
+    )  # fmt: skip
+    asset = load(tmp_path, builder)
+    (material,) = asset.materials
+    assert (material.metallic, material.roughness) == (0.25, 0.75)
+    assert material.base_color == (1.0, 0.5, 0.25)
+    assert (material.alpha_mode, material.alpha_cutoff, material.double_sided) == (
+        "MASK",
+        0.3,
+        True,
+    )
+    assert material.emission == (0.1, 0.2, 0.3)
+    slots = (
+        material.base_color_texture, material.metallic_roughness_texture, material.normal_texture,
+        material.emission_texture,
+    )  # fmt: skip
+    assert [slot.texture for slot in slots if slot] == [0, 1, 1, 0]
+    np.testing.assert_array_equal(asset.textures[0].pixels, np.full((2, 2, 4), (200, 100, 50, 255)))
+    assert any("occlusion" in notice for notice in asset.notices)
+
+
+def test_G2_factors_are_exact(tmp_path: Path) -> None:
+    """No factor is rounded to 8 bits."""
+    builder = Builder()
+    builder.pbr["baseColorFactor"] = [0.125, 0.126, 0.127, 0.124]
+    builder.attribute("COLOR_0", np.full((4, 3), 0.123, "f"))
+    asset = load(tmp_path, builder)
+    assert asset.materials[0].base_color == (0.125, 0.126, 0.127)
+    assert asset.materials[0].alpha == 0.124
+    del builder.primitive["material"]
+    colors = load(tmp_path, builder).primitives[0].colors
+    np.testing.assert_array_equal(colors, np.array([[0.123] * 3 + [1]] * 4, "f"))
+
+
+def test_G3_absent_factors_are_one(tmp_path: Path) -> None:
+    """Metallic and roughness default to 1, with and without a material."""
+    builder = Builder()
+    for _ in range(2):
+        (material,) = load(tmp_path, builder).materials
+        assert (material.metallic, material.roughness) == (1.0, 1.0)
+        assert material.base_color == (1.0, 1.0, 1.0) and not material.double_sided
+        builder.primitive.pop("material", None)
+
+
+@pytest.mark.case("M5")
+@pytest.mark.parametrize(
+    ("uri", "name"),
+    [("tex%20a.png", "tex a.png"), ("tex a.png", "tex a.png"), ("sch\u00f6n.png", "sch\u00f6n.png"),
+     ("sch%C3%B6n.png", "sch\u00f6n.png"), ("a/../b%252e.png", "b%2e.png")],
+)  # fmt: skip
+def test_G4_M5_names_are_decoded_once(uri: str, name: str, tmp_path: Path) -> None:
+    """Percent-encoded and UTF-8 names load, decoded exactly once."""
+    (tmp_path / name).write_bytes(png())
+    builder = Builder()
+    builder.base_color({"uri": uri})
+    assert load(tmp_path, builder).textures[0].pixels[0, 0].tolist() == [200, 100, 50, 255]
+
+
+@pytest.mark.case("M3")
+@pytest.mark.parametrize("image", ["missing", "corrupt", "ktx2"])
+def test_G5_missing_textures_become_grey_on_request(image: str, tmp_path: Path) -> None:
+    """The base colour becomes one grey texel, a normal map is left out, both are mentioned."""
+    builder = Builder()
+    content = {"corrupt": png()[:40], "ktx2": b"\xabKTX 20\xbb" + bytes(80)}.get(image, b"")
+    entry = {"bufferView": builder.view(content)} if content else {"uri": "gone.png"}
+    builder.base_color(entry)
+    builder.material["normalTexture"] = {"index": 0}
+    asset = load(tmp_path, builder, missing_textures="grey")
+    assert asset.textures[0].pixels.shape == (1, 1, 4)
+    assert asset.materials[0].normal_texture is None
+    assert any("/images/0" in notice and "grey" in notice for notice in asset.notices)
+
+
+NORMALISED: dict[str, tuple[np.ndarray, int]] = {
+    "u8": (np.array([[0, 255], [255, 255], [255, 0], [51, 0]], "B"), 255),
+    "u16": (np.array([[0, 65535], [65535, 65535], [65535, 0], [13107, 0]], "H"), 65535),
+}
+
+
+@pytest.mark.case("M9")
+@pytest.mark.parametrize("kind", NORMALISED)
+def test_G6_M9_normalised_uv_equals_float(kind: str, tmp_path: Path) -> None:
+    """Normalised integer texture coordinates equal their float version."""
+    codes, scale = NORMALISED[kind]
+    builder = Builder()
+    builder.attribute("TEXCOORD_0", codes, normalized=True)
+    uv0 = load(tmp_path, builder).primitives[0].uv0
+    assert uv0 is not None
+    np.testing.assert_allclose(uv0, np.asarray(codes / scale), rtol=FLOAT32_RTOL)
+
+
+@pytest.mark.case("M9")
+@pytest.mark.parametrize(("code", "lowest"), [("b", -128), ("h", -32768)])
+def test_G6_lowest_signed_code_is_minus_one(code: str, lowest: int, tmp_path: Path) -> None:
+    """The two lowest signed codes both mean -1: max(c / 127, -1)."""
+    builder = Builder()
+    codes = np.array([[lowest, lowest + 1], [0, -1 - lowest]] * 2, code)
+    builder.attribute("TEXCOORD_0", codes, normalized=True)
+    uv0 = load(tmp_path, builder).primitives[0].uv0
+    np.testing.assert_array_equal(uv0, [[-1, -1], [0, 1]] * 2)
+
+
+@pytest.mark.case("M9")
+def test_G6_normalised_colors_equal_float(tmp_path: Path) -> None:
+    """Normalised u8 RGBA and u16 RGB vertex colours equal their float version."""
+    builder = Builder()
+    for codes, scale in ((np.full((4, 4), 51, "B"), 255), (np.full((4, 3), 13107, "H"), 65535)):
+        builder.attribute("COLOR_0", codes, normalized=True)
+        colors = load(tmp_path, builder).primitives[0].colors
+        assert colors is not None
+        np.testing.assert_allclose(colors[:, :3], codes[:, :3] / scale, rtol=FLOAT32_RTOL)
+
+
+@pytest.mark.case("M9")
+@pytest.mark.parametrize("code", ["b", "B", "h", "H"])
+@pytest.mark.parametrize("normalized", [False, True])
+def test_G7_M9_quantised_positions_equal_float(code: str, normalized: bool, tmp_path: Path) -> None:
+    """Quantised positions and normals under a node's scale equal the float version."""
+    top = np.iinfo(code).max
+    builder = Builder()
+    builder.json["extensionsRequired"] = ["KHR_mesh_quantization"]
+    builder.attribute("POSITION", (CORNERS * top).astype(code), normalized=normalized)
+    low = np.array([[-128 if code in "bB" else -32768, 0, 0]] * 4)
+    builder.attribute("NORMAL", low.astype("b" if code in "bB" else "h"), normalized=True)
+    if not normalized:
+        node(scale=[1 / top] * 3)(builder)
+    (square,) = load(tmp_path, builder).primitives
+    np.testing.assert_allclose(square.positions, CORNERS, rtol=FLOAT32_RTOL)
+    assert square.normals is not None
+    np.testing.assert_allclose(square.normals, [[-1, 0, 0]] * 4, rtol=FLOAT32_RTOL)
+
+
+@pytest.mark.case("M6")
+@pytest.mark.parametrize("code", ["B", "H", "I"])
+@pytest.mark.parametrize("base", ["stored", "zeros"])
+def test_G8_sparse_equals_dense(code: str, base: str, tmp_path: Path) -> None:
+    """Replaced vertices, on a stored base or on zeros, give the mesh that states them all."""
+    expected = CORNERS if base == "stored" else np.zeros_like(CORNERS)
+    expected = expected.copy()
+    expected[[1, 3]] = [[2, 0, 1], [0, 3, 1]]
+    expected[2, 1] += base == "zeros"  # so that both triangles have an area
+    at = [1, 3] if base == "stored" else [1, 2, 3]
+    builder = Builder()
+    sparse(at, expected[at], code)(builder)
+    if base == "zeros":
+        del builder.json["accessors"][0]["bufferView"]
+    (square,) = load(tmp_path, builder).primitives
+    np.testing.assert_array_equal(square.positions, expected)
+    assert len(square.indices) == 2
+
+
+@pytest.mark.case("M6")
+def test_G8_sparse_quantised_uv_equals_dense(tmp_path: Path) -> None:
+    """Normalised integers are replaced before they are scaled; other attributes may be sparse."""
+    codes = np.array([[0, 255], [255, 255], [255, 0], [0, 0]], "B")
+    builder = Builder()
+    builder.attribute("TEXCOORD_0", codes, normalized=True, stride=4)
+    builder.json["accessors"][-1]["sparse"] = {
+        "count": 1,
+        "indices": {"bufferView": builder.view(b"\3"), "componentType": 5121},
+        "values": {"bufferView": builder.view(b"\x33\xff")},
+    }
+    uv0 = load(tmp_path, builder).primitives[0].uv0
+    np.testing.assert_allclose(uv0, [[0, 1], [1, 1], [1, 0], [0.2, 1]], rtol=FLOAT32_RTOL)
+
+
+@pytest.mark.case("M6")
+def test_G8_sparse_accessor_of_a_morph_target_is_never_read(tmp_path: Path) -> None:
+    """A sparse accessor matters only where something drawn uses it."""
+    builder = Builder()
+    builder.primitive["targets"] = [{"POSITION": builder.accessor(CORNERS)}]
+    builder.json["accessors"][-1]["sparse"] = {"count": 1}
+    assert any("morph" in notice for notice in load(tmp_path, builder).notices)
+
+
+def test_G9_tangents_and_second_uv_are_used(tmp_path: Path) -> None:
+    """TANGENT, TEXCOORD_1 and ``texCoord`` reach the record."""
+    builder = Builder()
+    builder.attribute("TANGENT", TANGENTS * np.array([1, 1, 1, -1], "f"))
+    builder.attribute("TEXCOORD_1", UVS / 2)
+    builder.base_color().update(texCoord=1)
+    asset = load(tmp_path, builder)
+    (square,) = asset.primitives
+    assert square.tangents is not None and square.uv1 is not None
+    np.testing.assert_array_equal(square.tangents[0], [1, 0, 0, -1])
+    np.testing.assert_array_equal(square.uv1, UVS / 2)
+    slot = asset.materials[0].base_color_texture
+    assert slot is not None and slot.uv_set == 1
+
+
+def test_G9_absent_uv_set_is_noted(tmp_path: Path) -> None:
+    """A texture whose coordinates are absent reads texel zero, with a notice."""
+    builder = Builder()
+    builder.base_color().update(texCoord=1)
+    asset = load(tmp_path, builder)
+    np.testing.assert_array_equal(asset.primitives[0].uv1, np.zeros((4, 2)))
+    assert any("no TEXCOORD_1" in notice for notice in asset.notices)
+
+
+def test_G10_sampler_and_normal_scale(tmp_path: Path) -> None:
+    """Wrap modes and the scale of a normal map are used; one image may have several wraps."""
+    builder = Builder()
+    builder.base_color(wrapS=33071, wrapT=33648, magFilter=9728)
+    builder.json["samplers"].append({})
+    builder.json["textures"].append({"source": 0, "sampler": 1})
+    builder.material["normalTexture"] = {"index": 1, "scale": 0.5}
+    asset = load(tmp_path, builder)
+    first, second = asset.textures
+    assert (first.wrap_u, first.wrap_v) == ("clamp", "mirror")
+    assert (second.wrap_u, second.wrap_v) == ("repeat", "repeat")
+    assert first.pixels is second.pixels
+    assert asset.materials[0].normal_scale == 0.5
+    assert any("nearest" in notice for notice in asset.notices)
+
+
+def test_G10_texture_transform(tmp_path: Path) -> None:
+    """Match the extension's GLSL: translation * rotation * scale, columns first."""
+    builder = Builder()
+    angle, (sx, sy), (ox, oy) = 0.3, (2.0, 3.0), (0.1, 0.2)
+    builder.attribute("TEXCOORD_1", UVS)
+    builder.base_color()["extensions"] = {
+        "KHR_texture_transform": {
+            "offset": [ox, oy], "rotation": angle, "scale": [sx, sy], "texCoord": 1,
+        }
+    }  # fmt: skip
+    slot = load(tmp_path, builder).materials[0].base_color_texture
+    assert slot is not None and slot.uv_set == 1
+    cos, sin = np.cos(angle), np.sin(angle)
+    translation = np.array([[1, 0, 0], [0, 1, 0], [ox, oy, 1]]).T
+    rotation = np.array([[cos, -sin, 0], [sin, cos, 0], [0, 0, 1]]).T
+    matrix = translation @ rotation @ np.diag([sx, sy, 1])
+    np.testing.assert_allclose(np.reshape(slot.transform, (2, 3)), matrix[:2])
+
+
+def test_G11_material_extensions(tmp_path: Path) -> None:
+    """Emissive strength multiplies; unlit is matte; what is not supported gives one notice."""
+    builder = Builder()
+    builder.material.update(
+        name="lamp",
+        emissiveFactor=[1, 0.5, 0],
+        extensions={
+            "KHR_materials_emissive_strength": {"emissiveStrength": 8},
+            "KHR_materials_ior": {"ior": 1.3},
+            "KHR_materials_volume": {"thicknessFactor": 1},
+            "KHR_materials_dispersion": {},
+            "KHR_materials_iridescence": {},
+            "KHR_materials_anisotropy": {},
+            "KHR_materials_diffuse_transmission": {},
+        },
+    )
+    asset = load(tmp_path, builder)
+    assert asset.materials[0].emission == (8.0, 4.0, 0.0)
+    assert asset.materials[0].ior == 1.3
+    (notice,) = asset.notices
+    assert "lamp" in notice and "KHR_materials_volume, KHR_materials_dispersion" in notice
+    builder.material["extensions"] = {
+        "KHR_materials_unlit": {}, "KHR_materials_clearcoat": {"clearcoatFactor": 1},
+    }  # fmt: skip
+    asset = load(tmp_path, builder)
+    (material,) = asset.materials
+    assert (material.metallic, material.emission) == (0.0, (0.0, 0.0, 0.0))
+    assert material.clearcoat == 0.0
+    assert any("unlit" in notice for notice in asset.notices)
+
+
+def test_G11_layers_are_read(tmp_path: Path) -> None:
+    """Coat, sheen, glass and reflection keep factors, textures, UV sets and transforms."""
+    builder = Builder()
+    builder.base_color()
+    turned = {"index": 0, "texCoord": 1, "extensions": {"KHR_texture_transform": {"scale": [2, 3]}}}
+    plain = {"index": 0}
+    builder.material.pop("pbrMetallicRoughness", None)
+    builder.material["extensions"] = {
+        "KHR_materials_clearcoat": {
+            "clearcoatFactor": 0.75, "clearcoatRoughnessFactor": 0.125, "clearcoatTexture": turned,
+            "clearcoatRoughnessTexture": plain, "clearcoatNormalTexture": {"index": 0, "scale": 2},
+        },
+        "KHR_materials_sheen": {
+            "sheenColorFactor": [0.5, 0.25, 0], "sheenRoughnessFactor": 0.5,
+            "sheenColorTexture": plain, "sheenRoughnessTexture": turned,
+        },
+        "KHR_materials_transmission": {"transmissionFactor": 0.5, "transmissionTexture": plain},
+        "KHR_materials_specular": {
+            "specularFactor": 0.25, "specularColorFactor": [2, 1, 0.5], "specularTexture": plain,
+            "specularColorTexture": turned,
+        },
+    }  # fmt: skip
+    builder.json["extensionsRequired"] = list(builder.material["extensions"])
+    asset = load(tmp_path, builder)
+    (material,) = asset.materials
+    slot = TextureSlot(0)
+    scaled = TextureSlot(0, 1, (2.0, 0.0, 0.0, 0.0, 3.0, 0.0))
+    expected = Material(
+        name=material.name, clearcoat=0.75, clearcoat_roughness=0.125, clearcoat_normal_scale=2.0,
+        clearcoat_texture=scaled, clearcoat_roughness_texture=slot, clearcoat_normal_texture=slot,
+        sheen_color=(0.5, 0.25, 0.0), sheen_roughness=0.5, sheen_color_texture=slot,
+        sheen_roughness_texture=scaled, transmission=0.5, transmission_texture=slot,
+        specular=0.25, specular_color=(2.0, 1.0, 0.5), specular_texture=slot,
+        specular_color_texture=scaled,
+    )  # fmt: skip
+    assert material == expected
+    assert any("not blurred" in notice for notice in asset.notices)
+
+
+def test_G11_layers_are_clamped(tmp_path: Path) -> None:
+    """Factors outside their range are brought into it, each with a notice."""
+    builder = Builder()
+    builder.material["extensions"] = {
+        "KHR_materials_ior": {"ior": 0.5},
+        "KHR_materials_clearcoat": {"clearcoatFactor": 2, "clearcoatRoughnessFactor": -1},
+        "KHR_materials_sheen": {"sheenColorFactor": [2, 0, 0], "sheenRoughnessFactor": 3},
+        "KHR_materials_specular": {"specularFactor": -1, "specularColorFactor": [-1, 9, 0]},
+    }
+    asset = load(tmp_path, builder)
+    (material,) = asset.materials
+    assert (material.ior, material.clearcoat, material.clearcoat_roughness) == (1.0, 1.0, 0.0)
+    assert (material.sheen_color, material.sheen_roughness) == ((1.0, 0.0, 0.0), 1.0)
+    assert (material.specular, material.specular_color) == (0.0, (0.0, 9.0, 0.0))
+    assert sum("clamped" in notice for notice in asset.notices) == 7
+
+
+def test_G11_glass_says_what_it_does_not_do(tmp_path: Path) -> None:
+    """One notice of a tint or blur that is lost, none for clear glass."""
+    builder = Builder()
+    builder.material.update(
+        pbrMetallicRoughness={"metallicFactor": 0, "roughnessFactor": 0},
+        extensions={"KHR_materials_transmission": {"transmissionFactor": 1}},
+    )
+    assert load(tmp_path, builder).notices == ()
+    builder.material["pbrMetallicRoughness"] = {"baseColorFactor": [0.3, 0.8, 0.3, 1]}
+    (notice,) = load(tmp_path, builder).notices
+    assert "tinted or blurred" in notice
+
+
+def test_G11_specular_glossiness_is_converted(tmp_path: Path) -> None:
+    """Specular-glossiness without a fallback becomes a dielectric whose F0 is its specular colour.
+
+    The texture's alpha is glossiness; roughness is what the factor times it leaves to 1.
+    """
+    builder = Builder()
+    builder.base_color()
+    extension = {
+        "diffuseFactor": [0.5, 0.25, 0.125, 1], "specularFactor": [0.5, 0.25, 1],
+        "glossinessFactor": 0.75,
+    }  # fmt: skip
+    builder.json["materials"][0] = {
+        "extensions": {"KHR_materials_pbrSpecularGlossiness": extension}
+    }
+    (material,) = load(tmp_path, builder).materials
+    assert material.base_color == (0.5, 0.25, 0.125)
+    assert (material.metallic, material.roughness, material.ior) == (0.0, 0.25, 0.0)
+    assert material.specular_color == (0.5, 0.25, 1.0)
+    extension["specularGlossinessTexture"] = {"index": 0}
+    asset = load(tmp_path, builder)
+    (material,) = asset.materials
+    given, rough = material.specular_color_texture, material.metallic_roughness_texture
+    assert given is not None and rough is not None and material.roughness == 1.0
+    glossiness = asset.textures[given.texture].pixels[..., 3] / 255.0
+    found = asset.textures[rough.texture].pixels[..., 1] / 255.0
+    np.testing.assert_allclose(found, 1.0 - 0.75 * glossiness, atol=0.5 / 255.0 + 1e-9)
+
+
+@pytest.mark.case("M17")
+@pytest.mark.parametrize(
+    "name", ["KHR_texture_transform", "KHR_materials_clearcoat", "KHR_lights_punctual"]
+)
+def test_G12_known_required_extensions_load(name: str, tmp_path: Path) -> None:
+    """Extensions that are honoured, or safe to leave out, may be required."""
+    builder = Builder()
+    builder.json.update(extensionsRequired=[name], extensionsUsed=[name])
+    load(tmp_path, builder)
+
+
+@pytest.mark.case("M17")
+def test_G13_used_but_not_required_reads_the_fallback(tmp_path: Path) -> None:
+    """Compression that is only offered is passed over; its fallback is read."""
+    builder = Builder()
+    builder.json["extensionsUsed"] = ["KHR_draco_mesh_compression", "KHR_texture_basisu"]
+    builder.primitive["extensions"] = {"KHR_draco_mesh_compression": {"bufferView": 0}}
+    builder.base_color()
+    builder.json["textures"][0]["extensions"] = {"KHR_texture_basisu": {"source": 9}}
+    asset = load(tmp_path, builder)
+    np.testing.assert_array_equal(asset.primitives[0].positions, CORNERS)
+    assert len(asset.textures) == 1
+
+
+@pytest.mark.case("M17")
+def test_G13_webp_is_read(tmp_path: Path) -> None:
+    """EXT_texture_webp is honoured."""
+    builder = Builder()
+    builder.json["extensionsRequired"] = ["EXT_texture_webp"]
+    builder.base_color({"bufferView": builder.view(png(kind="WEBP")), "mimeType": "image/webp"})
+    builder.json["textures"][0] = {"extensions": {"EXT_texture_webp": {"source": 0}}}
+    assert load(tmp_path, builder).textures[0].pixels[0, 0].tolist() == [200, 100, 50, 255]
+
+
+@pytest.mark.parametrize("kind", ["16-bit grey", "16-bit rgb", "palette", "grey", "rgba"])
+def test_image_kinds_become_rgba(kind: str, tmp_path: Path) -> None:
+    """Every kind of PNG becomes 8-bit RGBA without rescaling its codes."""
+    image, expected = {
+        "16-bit grey": (Image.fromarray(np.full((2, 2), 200 * 257, "H")), [200, 200, 200, 255]),
+        "16-bit rgb": (None, [200, 100, 50, 255]),
+        "palette": (Image.new("RGB", (2, 2), (200, 100, 50)).quantize(4), [200, 100, 50, 255]),
+        "grey": (Image.new("L", (2, 2), 200), [200, 200, 200, 255]),
+        "rgba": (Image.new("RGBA", (2, 2), (200, 100, 50, 7)), [200, 100, 50, 7]),
+    }[kind]
+    stream = io.BytesIO()
+    if image is None:
+        stream.write(png16([200 * 257, 100 * 257, 50 * 257]))
+    else:
+        image.save(stream, "PNG")
+    builder = Builder()
+    builder.base_color({"bufferView": builder.view(stream.getvalue())})
+    asset = load(tmp_path, builder)
+    assert asset.textures[0].pixels[1, 1].tolist() == expected
+    assert any("16-bit" in notice for notice in asset.notices) == ("16-bit" in kind)
+
+
+def png16(color: list[int]) -> bytes:
+    """Return a 2 x 2 PNG with 16 bits per channel, which Pillow cannot write."""
+    import zlib
+
+    def chunk(kind: bytes, body: bytes) -> bytes:
+        check = struct.pack(">I", zlib.crc32(kind + body))
+        return struct.pack(">I", len(body)) + kind + body + check
+
+    row = b"\0" + struct.pack(">3H", *color) * 2
+    header = struct.pack(">IIBBBBB", 2, 2, 16, 2, 0, 0, 0)
+    return b"\x89PNG\r\n\x1a\n" + b"".join(
+        (chunk(b"IHDR", header), chunk(b"IDAT", zlib.compress(row * 2)), chunk(b"IEND", b""))
+    )
+
+
+@pytest.mark.case("M14")
+def test_M14_texture_pixels_are_limited(tmp_path: Path) -> None:
+    """A header that promises 8000 x 8000 x 9 pixels stops before decoding."""
+    small = bytearray(png())
+    small[16:24] = struct.pack(">II", 8000, 8000)
+    import zlib
+
+    small[29:33] = struct.pack(">I", zlib.crc32(small[12:29]))
+    from warpir.io.meshes import asset_files
+
+    decoder = asset_files.TextureDecoder(tmp_path / "asset.glb", [])
+    decoder.pixel_count = decoder.limits.texture_pixels - 10
+    with pytest.raises(InputError, match="too many texture pixels"):
+        decoder.decode(bytes(small), "/images/0: ")
+
+
+@pytest.mark.case("M14")
+@pytest.mark.parametrize("kind", ["glb", "obj", "ply", "stl"])
+def test_M14_triangles_are_limited(kind: str, tmp_path: Path) -> None:
+    """Every reader stops at --max-triangles, and says how many there are."""
+    facet = "facet normal 0 0 1\nouter loop\n" + "vertex 0 0 {}\n" * 3 + "endloop\nendfacet\n"
+    content = {
+        "glb": Builder().glb(),
+        "obj": b"v 0 0 0\nv 1 0 0\nv 1 1 0\nv 0 1 0\nf 1 2 3 4\n",
+        "ply": b"ply\nformat ascii 1.0\nelement vertex 4\nproperty float x\nproperty float y\n"
+        b"property float z\nelement face 1\nproperty list uchar int vertex_indices\nend_header\n"
+        b"0 0 0\n1 0 0\n1 1 0\n0 1 0\n4 0 1 2 3\n",
+        "stl": f"solid\n{facet.format(0, 1, 2) * 2}endsolid\n".encode(),
+    }[kind]
+    path = tmp_path / f"asset.{kind}"
+    path.write_bytes(content)
+    with pytest.raises(InputError, match=r"too many triangles \(found 2.*limit 1\)") as caught:
+        load_asset(path, limits=Limits(triangles=1))
+    assert "--max-triangles" in caught.value.what
+
+
+@pytest.mark.case("M14")
+def test_M14_limits_are_those_of_the_flags() -> None:
+    """What holds without a flag holds in the library."""
+    assert InsertConfig().limits == LIMITS
+
+
+def test_G17_no_scenes_draws_the_roots(tmp_path: Path) -> None:
+    """Without scenes all root nodes are drawn, with a notice."""
+    builder = Builder()
+    del builder.json["scenes"], builder.json["scene"]
+    asset = load(tmp_path, builder)
+    assert len(asset.primitives) == 1
+    assert any("no scenes" in notice for notice in asset.notices)
+
+
+def test_G17_scene_member_selects(tmp_path: Path) -> None:
+    """``scene`` selects; absent, the first scene is drawn."""
+    builder = Builder()
+    builder.json["nodes"].append({"mesh": 0, "translation": [5, 0, 0]})
+    builder.json.update(scenes=[{"nodes": [0]}, {"nodes": [1]}], scene=1)
+    assert load(tmp_path, builder).bounds()[0][0] == 5
+    del builder.json["scene"]
+    assert load(tmp_path, builder).bounds()[0][0] == 0
+
+
+@pytest.mark.case("M10")
+def test_G16_scene_that_lists_an_inner_node(tmp_path: Path) -> None:
+    """A listed inner node keeps its parents' transforms and is drawn once."""
+    builder = Builder()
+    builder.json["nodes"] = [{"children": [1], "translation": [5, 0, 0]}, {"mesh": 0}]
+    builder.json["scenes"] = [{"nodes": [1]}]
+    asset = load(tmp_path, builder)
+    assert asset.bounds()[0][0] == 5
+    assert any("not a root" in notice for notice in asset.notices)
+    builder.json["scenes"] = [{"nodes": [0, 1]}]
+    assert len(load(tmp_path, builder).primitives) == 1
+
+
+def skinned(weights: list[list[float]], bones: list[dict[str, Any]], **members: Any) -> Plant:
+    """Bind the square's corners to joints: nodes 1, 2, ..., all bound at the origin by default."""
+
+    def plant(b: Builder) -> None:
+        b.json["nodes"][0]["skin"] = 0
+        b.json["nodes"] += bones
+        b.json["scenes"] = [{"nodes": [0, 1]}]
+        b.json["skins"] = [{"joints": [1 + k for k in range(len(bones))]} | members]
+        b.attribute("JOINTS_0", np.tile(np.array([0, 1, 0, 0], "B"), (4, 1)))
+        b.attribute("WEIGHTS_0", np.array([[*w, 0, 0] for w in weights], "f"))
+
+    return plant
+
+
+HALF = [[1, 0], [1, 0], [0.5, 0.5], [0, 1]]
+ARM: list[dict[str, Any]] = [{"children": [2], "scale": [2, 2, 2]}, {"translation": [0, 0, 3]}]
+fault("G18-joint-out-of-range", "/meshes/0/primitives/0: joint 1 in JOINTS_0, but 1 joints")(
+    skinned(HALF, ARM[1:])
+)
+fault("G18-joint-is-no-node", "/skins/0: joint 9, but 3 nodes")(skinned(HALF, ARM, joints=[1, 9]))
+fault("G18-vertex-without-weight", "/meshes/0/primitives/0: vertex 3 has no weight")(
+    skinned([*HALF[:3], [0, 0]], ARM)
+)
+fault("G18-skin-without-joints", "/meshes/0/primitives/0/attributes: JOINTS_0 is missing")(
+    lambda b: (skinned(HALF, ARM)(b), b.primitive["attributes"].pop("JOINTS_0"))
+)
+fault("G18-flat-joint", "the joints flatten the mesh")(skinned(HALF, [{"scale": [1, 0, 1]}, {}]))
+
+
+def test_G18_skinned_mesh_stands_as_its_joints_do(tmp_path: Path) -> None:
+    """Linear blend of joint * inverse bind matrix; the mesh's own node does not count."""
+    bind = np.eye(4)
+    bind[:3, 3] = (-1.0, 0.0, 0.0)
+    builder = Builder()
+    matrices = np.stack([np.eye(4).T.ravel(), bind.T.ravel()]).astype("f")
+    view = builder.view(matrices.tobytes())
+    builder.json["accessors"].append(
+        {"bufferView": view, "componentType": 5126, "count": 2, "type": "MAT4"}
+    )
+    inverse = len(builder.json["accessors"]) - 1
+    skinned(HALF, ARM, inverseBindMatrices=inverse)(builder)
+    node(translation=[99, 0, 0])(builder)
+    (square,) = load(tmp_path, builder).primitives
+    first, second = 2.0 * CORNERS, 2.0 * (CORNERS + np.array([-1, 0, 3]))
+    weight = np.array(HALF, dtype=float)[:, 1:]
+    np.testing.assert_allclose(square.positions, first + weight * (second - first), atol=1e-6)
+    np.testing.assert_array_equal(square.normals, NORMALS)
+
+
+def test_G18_mirrored_skin_keeps_the_outside(tmp_path: Path) -> None:
+    """Joints that mirror turn the winding round, and the normals follow."""
+    builder = Builder()
+    skinned([[1, 0]] * 4, [{"scale": [-1, 1, 1]}, {}])(builder)
+    asset = load(tmp_path, builder)
+    assert winding_agrees(asset)
+    assert asset.primitives[0].positions[1, 0] == -1.0
+
+
+def test_G18_rest_pose_is_noted(tmp_path: Path) -> None:
+    """Skins, morph targets and animations give the rest pose and a notice each."""
+    builder = Builder()
+    skinned([[1, 0]] * 4, [{}, {}])(builder)
+    builder.json.update(animations=[{}])
+    builder.primitive["targets"] = [{"POSITION": 0}]
+    asset = load(tmp_path, builder)
+    for word in ("skin", "animations", "morph"):
+        assert any(word in notice for notice in asset.notices)
+    np.testing.assert_array_equal(asset.primitives[0].positions, CORNERS)
+
+
+@pytest.mark.case("M12")
+def test_G19_fan_is_expanded(tmp_path: Path) -> None:
+    """A fan of four corners gives both triangles with the same winding."""
+    builder = Builder()
+    builder.primitive.update(mode=6, indices=builder.accessor(np.array([0, 1, 2, 3], "B")))
+    (square,) = load(tmp_path, builder).primitives
+    assert square.indices.tolist() == [[1, 2, 0], [2, 3, 0]]
+
+
+@pytest.mark.case("M12")
+def test_G19_lines_beside_triangles_are_noted(tmp_path: Path) -> None:
+    """Lines next to triangles are left out with a notice."""
+    builder = Builder()
+    builder.json["meshes"][0]["primitives"].append(builder.primitive | {"mode": 1})
+    asset = load(tmp_path, builder)
+    assert len(asset.primitives) == 1
+    assert any("points or lines" in notice for notice in asset.notices)
+
+
+def winding_agrees(asset: Asset) -> bool:
+    """Return whether all geometric normals point to the side of the shading normals."""
+    agree = True
+    for p in asset.primitives:
+        assert p.normals is not None
+        a, b, c = p.positions[p.indices].transpose(1, 0, 2)
+        agree &= bool(((np.cross(b - a, c - a) * p.normals[p.indices[:, 0]]).sum(1) > 0).all())
+    return agree
+
+
+@pytest.mark.case("M11")
+@pytest.mark.parametrize("scale", [[-1, 1, 1], [-2, -3, -1], [1, 1, -1], [-1, -1, 1]])
+def test_G25_mirrored_node_keeps_the_outside(scale: list[float], tmp_path: Path) -> None:
+    """Winding agrees with the normals, and bitangents follow the mirror."""
+    builder = Builder()
+    builder.attribute("TANGENT", TANGENTS)
+    node(scale=scale)(builder)
+    asset = load(tmp_path, builder)
+    assert winding_agrees(asset)
+    (square,) = asset.primitives
+    assert square.indices.flags.c_contiguous
+    assert square.normals is not None and square.tangents is not None
+    bitangent = np.cross(square.normals, square.tangents[:, :3]) * square.tangents[:, 3:]
+    np.testing.assert_allclose(bitangent[0], [0, np.sign(scale[1]), 0], atol=FLOAT32_RTOL)
+
+
+@pytest.mark.case("M11")
+def test_M11_shear_keeps_normals_perpendicular(tmp_path: Path) -> None:
+    """Normals under shear stay perpendicular to the surface (inverse transpose)."""
+    builder = Builder()
+    node(matrix=[1, 0, 2, 0, 0, 1, 0, 0, 0.5, 0, 3, 0, 0, 0, 0, 1])(builder)
+    asset = load(tmp_path, builder)
+    (square,) = asset.primitives
+    assert square.normals is not None
+    a, b, c = square.positions[square.indices[0]]
+    np.testing.assert_allclose(square.normals[0] @ np.stack([b - a, c - a]).T, 0, atol=1e-6)
+    assert winding_agrees(asset)
+
+
+def test_node_rotation_and_order(tmp_path: Path) -> None:
+    """TRS apply as T * R * S, parents on the left; 90 degrees about +Z takes +X to +Y."""
+    builder = Builder()
+    half = np.sqrt(0.5)
+    builder.json["nodes"] = [
+        {"children": [1], "translation": [10, 0, 0]},
+        {"mesh": 0, "rotation": [0, 0, half, half], "scale": [2, 1, 1], "translation": [0, 0, 1]},
+    ]
+    (square,) = load(tmp_path, builder).primitives
+    np.testing.assert_allclose(square.positions[1], [10, 2, 1], atol=1e-12)
+
+
+def test_G26_absent_normals_mean_flat(tmp_path: Path) -> None:
+    """No NORMAL: no shading normals; TANGENT is ignored then."""
+    builder = Builder()
+    builder.attribute("TANGENT", TANGENTS)
+    del builder.primitive["attributes"]["NORMAL"]
+    (square,) = load(tmp_path, builder).primitives
+    assert square.normals is None and square.tangents is None
+
+
+def test_zero_normals_come_from_the_faces(tmp_path: Path) -> None:
+    """A normal of length zero is replaced by the faces around it."""
+    builder = Builder()
+    builder.attribute("NORMAL", NORMALS * np.array([[1], [0], [2], [1]], "f"))
+    asset = load(tmp_path, builder)
+    np.testing.assert_array_equal(asset.primitives[0].normals, NORMALS)
+    assert any("1 normals of length zero" in notice for notice in asset.notices)
+
+
+def test_G27_camera_node_with_mesh_children(tmp_path: Path) -> None:
+    """A camera node passes its transform on to its children."""
+    builder = Builder()
+    builder.json["cameras"] = [{"type": "perspective", "perspective": {"yfov": 1, "znear": 1}}]
+    builder.json["nodes"] = [{"camera": 0, "children": [1], "translation": [5, 0, 0]}, {"mesh": 0}]
+    assert load(tmp_path, builder).bounds()[0][0] == 5
+
+
+@pytest.mark.case("M10")
+def test_G28_M10_deep_chain_loads(tmp_path: Path) -> None:
+    """3000 nodes in one chain load, each moving the square a little."""
+    builder = Builder()
+    chain = [{"children": [k + 1], "translation": [0.5, 0, 0]} for k in range(2999)]
+    builder.json["nodes"] = [*chain, {"mesh": 0}]
+    assert load(tmp_path, builder).bounds()[0][0] == 2999 * 0.5
+
+
+@pytest.mark.case("M10")
+@pytest.mark.parametrize("code", ["f", "b", "h"])
+def test_G28_instances_equal_nodes(code: str, tmp_path: Path) -> None:
+    """EXT_mesh_gpu_instancing places the mesh where nodes of the same numbers do."""
+    shifts = np.array([[1, 0, 0], [0, 2, 0], [0, 0, 3]], "f")
+    turns = np.array([[0, 0, 0, 1], [0, 0, 1, 0], [1, 0, 0, 0]], "f")
+    scales = np.array([[1, 1, 1], [2, 1, 1], [-1, 1, 1]], "f")
+    builder = Builder()
+    stored = turns if code == "f" else (turns * np.iinfo(code).max).astype(code)
+    instanced(TRANSLATION=shifts, ROTATION=stored, SCALE=scales)(builder)
+    node(translation=[5, 0, 0], scale=[1, 2, 1])(builder)
+    asset = load(tmp_path, builder)
+    assert asset.notices == () and winding_agrees(asset)
+    builder = Builder()
+    builder.json["nodes"] = [{"children": [1, 2, 3], "translation": [5, 0, 0], "scale": [1, 2, 1]}]
+    builder.json["nodes"] += [
+        {"mesh": 0, "translation": t.tolist(), "rotation": r.tolist(), "scale": s.tolist()}
+        for t, r, s in zip(shifts, turns, scales, strict=True)
+    ]
+    nodes = load(tmp_path, builder)
+    for a, b in zip(asset.primitives, nodes.primitives, strict=True):
+        np.testing.assert_array_equal(a.positions, b.positions)
+        np.testing.assert_array_equal(a.indices, b.indices)
+        np.testing.assert_array_equal(a.normals, b.normals)
+
+
+def test_G29_primitives_are_not_merged(tmp_path: Path) -> None:
+    """Two materials on one mesh in two nodes give four primitives."""
+    builder = Builder()
+    builder.json["materials"].append({"name": "second"})
+    builder.json["meshes"][0]["primitives"].append(builder.primitive | {"material": 1})
+    builder.json["nodes"].append({"mesh": 0, "translation": [5, 0, 0]})
+    builder.json["scenes"] = [{"nodes": [0, 1]}]
+    asset = load(tmp_path, builder)
+    assert [p.material for p in asset.primitives] == [0, 1, 0, 1]
+    assert [p.positions[0, 0] for p in asset.primitives] == [0, 0, 5, 5]
+
+
+@pytest.mark.case("M13")
+def test_M13_degenerate_and_repeated_triangles_are_counted(tmp_path: Path) -> None:
+    """Triangles without area and exact repetitions are dropped and counted."""
+    builder = Builder()
+    bad = np.array([[0, 1, 2], [0, 2, 3], [1, 1, 2], [2, 0, 1], [0, 2, 1]], "H")
+    builder.primitive["indices"] = builder.accessor(bad.reshape(-1))
+    asset = load(tmp_path, builder)
+    # The last one is a back side, not a repetition.
+    assert asset.primitives[0].indices.tolist() == [[0, 1, 2], [0, 2, 3], [0, 2, 1]]
+    assert any("1 triangles of zero area and 1 repeated" in n for n in asset.notices)
+
+
+@pytest.mark.case("M14")
+def test_M14_one_skin_of_many_nodes_is_read_once(tmp_path: Path) -> None:
+    """100 meshes on one skin of 3000 joints take what one takes, not 100 times that."""
+    builder = Builder()
+    skinned([[1, 0]] * 4, [{} for _ in range(3000)])(builder)
+    builder.json["nodes"] += [dict(builder.json["nodes"][0]) for _ in range(99)]
+    count = len(builder.json["nodes"])
+    builder.json["scenes"] = [{"nodes": list(range(count))}]
+    start = time.perf_counter()
+    assert len(load(tmp_path, builder).primitives) == 100
+    assert time.perf_counter() - start < 3.0
+
+
+@pytest.mark.case("M14")
+def test_M14_images_of_one_buffer_view_are_counted(tmp_path: Path) -> None:
+    """Images that nothing draws cost nothing; what is drawn has as many bytes as a file at most."""
+    builder = Builder()
+    content = png() + bytes(100_000)
+    view = builder.view(content)
+    image = {"bufferView": view, "mimeType": "image/png"}
+    builder.base_color(image)
+    builder.json["images"] += [dict(image) for _ in range(100_000)]
+    start = time.perf_counter()
+    assert len(load(tmp_path, builder).textures) == 1
+    assert time.perf_counter() - start < 3.0
+    for k in range(5):
+        builder.json["materials"].append(
+            {"pbrMetallicRoughness": {"baseColorTexture": {"index": builder.texture(dict(image))}}}
+        )
+        primitive = {**builder.primitive, "material": k + 1}
+        builder.json["meshes"][0]["primitives"].append(primitive)
+    del builder.json["images"][1:-5]
+    for k in range(5):
+        builder.json["textures"][-5 + k]["source"] = k + 1
+    path = tmp_path / "asset.glb"
+    path.write_bytes(builder.glb())
+    with pytest.raises(InputError, match=r"too many bytes of textures .*--max-file-bytes"):
+        read_gltf(path, limits=Limits(file_bytes=5 * len(content)))
+    assert len(read_gltf(path, limits=Limits(file_bytes=7 * len(content))).materials) == 6
+
+
+@pytest.mark.case("M14")
+def test_M14_textures_made_of_others_are_shared_and_counted(tmp_path: Path) -> None:
+    """Materials of one texture and one glossiness share what is made of it."""
+    builder = Builder()
+    index = builder.texture({"bufferView": builder.view(png(size=8)), "mimeType": "image/png"})
+    primitives = builder.json["meshes"][0]["primitives"]
+    for k in range(40):
+        extension = {
+            "specularGlossinessTexture": {"index": index},
+            "glossinessFactor": 0.5 if k < 20 else 0.25,
+        }
+        builder.json["materials"].append(
+            {"extensions": {"KHR_materials_pbrSpecularGlossiness": extension}}
+        )
+        primitives.append({**builder.primitive, "material": k + 1})
+    path = tmp_path / "asset.glb"
+    path.write_bytes(builder.glb())
+    assert len(read_gltf(path, limits=Limits(texture_pixels=3 * 64)).textures) == 3
+    with pytest.raises(InputError, match="too many texture pixels"):
+        read_gltf(path, limits=Limits(texture_pixels=2 * 64))
+
+
+@pytest.mark.case("M14")
+def test_M14_limit_of_texture_pixels_is_ours(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Pillow warns of its own limit, and refuses what is twice that: neither reaches the user."""
+    monkeypatch.setattr(Image, "MAX_IMAGE_PIXELS", 16)
+    builder = Builder()
+    builder.base_color({"bufferView": builder.view(png(size=8)), "mimeType": "image/png"})
+    assert load(tmp_path, builder).textures[0].pixels.shape == (8, 8, 4)
+
+
+@pytest.mark.case("M18")
+def test_M18_values_out_of_range_are_clamped(tmp_path: Path) -> None:
+    """Factors out of range are clamped, each with a notice."""
+    builder = Builder()
+    builder.pbr.update(metallicFactor=2, roughnessFactor=-1, baseColorFactor=[2, 0, 0, 1])
+    builder.material.update(emissiveFactor=[-1, 0, 0], alphaCutoff=3)
+    asset = load(tmp_path, builder)
+    (material,) = asset.materials
+    assert (material.metallic, material.roughness, material.alpha_cutoff) == (1.0, 0.0, 1.0)
+    assert material.base_color == (1.0, 0.0, 0.0) and material.emission == (0.0, 0.0, 0.0)
+    words = (
+        "metallicFactor",
+        "roughnessFactor",
+        "baseColorFactor",
+        "emissiveFactor",
+        "alphaCutoff",
+    )
+    builder.material["extensions"] = {"KHR_materials_emissive_strength": {"emissiveStrength": -2}}
+    builder.material["emissiveFactor"] = [1, 1, 1]
+    dark = load(tmp_path, builder)
+    assert dark.materials[0].emission == (0.0, 0.0, 0.0)
+    assert any("emissiveStrength -2 clamped" in notice for notice in dark.notices)
+    for word in words:
+        assert any(word in notice and "clamped" in notice for notice in asset.notices)
+
+
+@pytest.mark.parametrize(
+    ("factor", "strength"),
+    [pytest.param(1e300, 1.0, id="M18-emission"), pytest.param(1.0, 1e38, id="M18-strength")],
+)
+def test_emission_beyond_all_light_is_refused(
+    tmp_path: Path, factor: float, strength: float
+) -> None:
+    """It would be infinite in the picture, far from the file that is at fault."""
+    builder = Builder()
+    extension = {"KHR_materials_emissive_strength": {"emissiveStrength": strength}}
+    builder.material.update(emissiveFactor=[factor, 1, 1], extensions=extension)
+    with pytest.raises(InputError, match=r"/materials/0: emission of .*at most 1e\+12"):
+        load(tmp_path, builder)
+
+
+def test_hidden_node_is_not_drawn(tmp_path: Path) -> None:
+    """KHR_node_visibility hides a node and what hangs on it."""
+    builder = Builder()
+    builder.json["nodes"] += [
+        {"extensions": {"KHR_node_visibility": {"visible": False}}, "children": [2]}, {"mesh": 0}
+    ]  # fmt: skip
+    builder.json["scenes"] = [{"nodes": [0, 1]}]
+    assert len(load(tmp_path, builder).primitives) == 1
+
+
+def test_byte_flips_give_an_asset_or_our_error(
+    tmp_path: Path, rng: np.random.Generator, capfd: pytest.CaptureFixture[str]
+) -> None:
+    """Damaged bytes anywhere end in an asset or in one InputError."""
+    builder = Builder()
+    builder.base_color()
+    original = np.frombuffer(builder.glb(), np.uint8)
+    path = tmp_path / "asset.glb"
+    for _ in range(300):
+        damaged = original.copy()
+        at = rng.integers(12, len(damaged), size=rng.integers(1, 6))
+        damaged[at] = rng.integers(0, 256, size=len(at))
+        path.write_bytes(damaged.tobytes())
+        try:
+            read_gltf(path)
+        except InputError as error:
+            assert error.where == str(path)
+
+
+ODD: tuple[Any, ...] = (
+    None, True, -1, 0, 1, 2, 99, 2**31, 2**63, 1e300, -0.5, "", "x", [], {}, [0], [{}], [None],
+    "\ud800", [1, 2, 3], [0] * 16, 5126, 5121, "VEC3", "MASK",
+)  # fmt: skip
+
+
+def places(value: Any, path: tuple[Any, ...] = ()) -> list[tuple[Any, ...]]:
+    """Return the paths to everything below a JSON value."""
+    keys = list(value) if isinstance(value, dict) else range(len(value))
+    found = [(*path, key) for key in keys]
+    for key in keys:
+        if isinstance(value[key], dict | list):
+            found += places(value[key], (*path, key))
+    return found
+
+
+@pytest.mark.parametrize("kind", ["instances", "skin"])
+@pytest.mark.filterwarnings("error")
+def test_odd_values_give_an_asset_or_our_error(
+    kind: str, tmp_path: Path, rng: np.random.Generator
+) -> None:
+    """Any value of the JSON replaced by an odd one ends in a sound asset or in one InputError."""
+    builder = Builder()
+    builder.base_color()["extensions"] = {"KHR_texture_transform": {"scale": [2, 3]}}
+    builder.attribute("TANGENT", TANGENTS)
+    sparse([2], np.full((1, 3), 2.0))(builder)
+    if kind == "skin":
+        skinned(HALF, ARM)(builder)
+    else:
+        instanced(TRANSLATION=np.eye(3, dtype="f"), ROTATION=np.full((3, 4), 64, "b"))(builder)
+    original = json.dumps(builder.json)
+    paths = places(builder.json)
+    for _ in range(150):
+        builder.json = json.loads(original)
+        *above, last = paths[rng.integers(len(paths))]
+        holder = builder.json
+        for key in above:
+            holder = holder[key]
+        holder[last] = ODD[rng.integers(len(ODD))]
+        try:
+            asset = load(tmp_path, builder)
+        except InputError as error:
+            assert error.where == str(tmp_path / "asset.glb")
+            continue
+        for p in asset.primitives:
+            assert np.isfinite(p.positions).all() and p.indices.max() < len(p.positions)
+
+
+REAL = {  # triangles placed, those of zero area, primitives, textures read
+    "ToyCar.glb": (108_936, 2, 3, 7),
+    "AlphaBlendModeTest.glb": (61, 0, 9, 8),
+    "ClearcoatWicker.glb": (3072, 0, 1, 4),
+    "cakeBirthday.glb": (1332, 0, 42, 0),
+    "ferris-wheel.glb": (4914, 2, 1, 1),
+    "mug.glb": (114_688, 0, 1, 0),
+    "shaderball.glb": (88_264, 0, 2, 0),
+    "kenney_trucks/vehicle-truck-red.glb": (946, 8, 6, 1),
+    "kenney_trucks/vehicle-truck-yellow.glb": (989, 15, 6, 1),
+    "hard/no_indices_3storybuilding.glb": (72, 0, 3, 0),
+    "hard/pins.glb": (3408, 0, 7, 0),
+    "hard/simple_pole.glb": (580, 0, 11, 0),
+}
+
+
+@pytest.mark.parametrize("name", REAL)
+def test_real_file_has_the_published_counts(name: str) -> None:
+    """Files of the development data have the triangles that their table states."""
+    if not DATA.is_dir():
+        pytest.skip("no development data beside the repository")
+    asset = load_asset(DATA / name)
+    triangle_count, flat_count, primitive_count, texture_count = REAL[name]
+    assert sum(len(p.indices) for p in asset.primitives) == triangle_count - flat_count
+    assert (len(asset.primitives), len(asset.textures)) == (primitive_count, texture_count)
+
+
+@pytest.mark.parametrize("name", ["ToyCar_meshopt.glb", "mug_draco.gltf"])
+def test_real_compressed_file_is_refused(name: str) -> None:
+    """Compressed originals are refused by the name of their compression."""
+    if not DATA.is_dir():
+        pytest.skip("no development data beside the repository")
+    fails(DATA / "compressed_originals" / name, "_compression", "re-export")

@@ -1,0 +1,463 @@
+"""Frames, samplers and densities: chi-square against the papers, unbiased MIS."""
+
+import numpy as np
+import pytest
+import warp as wp
+
+from tests import oracles as o
+from tests.statistics import ChiSquare, chi_square, graded_edges
+from warpir.kernels.frame import basis, to_local, to_world
+from warpir.kernels.sampling import (
+    cosine_sample,
+    light_eval,
+    light_sample,
+    lobe_sample,
+    power_heuristic,
+)
+from warpir.kernels.types import LightArgs
+from warpir.render.renderer import light_args
+from warpir.scene.light import Light, Lobes
+
+SAMPLE_COUNT = 200_000
+"""Enough to see a fault of 2 % in a cell of 2 % of the mass; a million where marked slow."""
+UNIT_ABS = 5e-7
+"""Length of a float32 vector after a rotation: a few ulps of 1."""
+PDF_RTOL = 1e-4
+"""float32, few operations."""
+Z_MAX = 4.0
+"""Standard errors; 6e-5 per case at a fixed seed."""
+
+wp.set_module_options({"enable_backward": False})
+
+
+@wp.kernel
+def frame_kernel(
+    n: wp.array[wp.vec3],
+    v: wp.array[wp.vec3],
+    x: wp.array[wp.vec3],
+    y: wp.array[wp.vec3],
+    local: wp.array[wp.vec3],
+    back: wp.array[wp.vec3],
+):
+    i = wp.tid()
+    frame = basis(n[i])
+    x[i] = frame.x
+    y[i] = frame.y
+    local[i] = to_local(v[i], frame)
+    back[i] = to_world(local[i], frame)
+
+
+@wp.kernel
+def heuristic_kernel(a: wp.array[float], b: wp.array[float], weight: wp.array[float]):
+    i = wp.tid()
+    weight[i] = power_heuristic(a[i], b[i])
+
+
+@wp.kernel
+def cosine_kernel(u: wp.array[wp.vec2], wi: wp.array[wp.vec3]):
+    i = wp.tid()
+    wi[i] = cosine_sample(u[i])
+
+
+@wp.kernel
+def lobe_kernel(u: wp.array[wp.vec2], axis: wp.vec3, sharpness: float, wi: wp.array[wp.vec3]):
+    i = wp.tid()
+    wi[i] = lobe_sample(u[i], axis, sharpness)
+
+
+@wp.kernel
+def light_sample_kernel(
+    light: LightArgs, u: wp.array[wp.vec2], pick: wp.array[float], wi: wp.array[wp.vec3]
+):
+    i = wp.tid()
+    wi[i] = light_sample(light, u[i], pick[i])
+
+
+@wp.kernel
+def light_eval_kernel(
+    light: LightArgs, wi: wp.array[wp.vec3], radiance: wp.array[wp.vec3], pdf: wp.array[float]
+):
+    i = wp.tid()
+    value = light_eval(light, wi[i])
+    radiance[i] = value.radiance
+    pdf[i] = value.pdf
+
+
+def vec3s(values: np.ndarray, device: str) -> wp.array:
+    return wp.array(np.ascontiguousarray(values, np.float32), dtype=wp.vec3, device=device)
+
+
+def uniform2(rng: np.random.Generator, count: int, device: str) -> wp.array:
+    return wp.array(rng.random((count, 2), dtype=np.float32), dtype=wp.vec2, device=device)
+
+
+def draw_light(
+    light: LightArgs, rng: np.random.Generator, device: str, count: int = SAMPLE_COUNT
+) -> np.ndarray:
+    wi = wp.zeros(count, dtype=wp.vec3, device=device)
+    pick = wp.array(rng.random(count, dtype=np.float32), dtype=float, device=device)
+    wp.launch(
+        light_sample_kernel,
+        count,
+        inputs=[light, uniform2(rng, count, device), pick],
+        outputs=[wi],
+        device=device,
+    )
+    return wi.numpy().astype(np.float64)
+
+
+def eval_light(light: LightArgs, wi: np.ndarray, device: str) -> tuple[np.ndarray, np.ndarray]:
+    count = wi.size // 3
+    radiance = wp.zeros(count, dtype=wp.vec3, device=device)
+    pdf = wp.zeros(count, dtype=float, device=device)
+    source = vec3s(wi.reshape(-1, 3), device)
+    wp.launch(
+        light_eval_kernel, count, inputs=[light, source], outputs=[radiance, pdf], device=device
+    )
+    return (
+        radiance.numpy().astype(np.float64).reshape(wi.shape),
+        pdf.numpy().astype(np.float64).reshape(wi.shape[:-1]),
+    )
+
+
+def some_lobes() -> Lobes:
+    """Three lobes: a wide sky, a lamp, a sun."""
+    return Lobes(
+        np.array([[0.5, 0.6, 0.9], [8.0, 6.0, 3.0], [2e5, 1.9e5, 1.7e5]], np.float32),
+        o.normalize([[0.0, 1.0, 0.0], [0.8, 0.3, -0.4], [-0.3, 0.6, 0.7]]).astype(np.float32),
+        np.array([0.7, 40.0, 2e4], np.float32),
+    )
+
+
+def sun_map(height: int = 16, width: int = 32, row: int = 4) -> np.ndarray:
+    """A smooth sky whose sun, one texel, is 1e5 times the mean of the others."""
+    d = o.texel_direction(height, width)
+    texels = (0.2 + 0.8 * np.maximum(d[..., 1:2], 0.0) + 0.1 * d[..., :1]) * [0.7, 0.8, 1.0]
+    texels[row, 9] = 1e5 * texels.mean(axis=(0, 1))
+    return texels.astype(np.float32)
+
+
+# ------------------------------------------------------------------------------- frames
+
+
+def test_frame_is_orthonormal_and_right_handed(device: str, rng: np.random.Generator) -> None:
+    """Any unit normal, both poles and their neighbours too, gets a rotation (Duff et al. 2017)."""
+    n = o.normalize(rng.normal(size=(5000, 3)))
+    n[:8] = o.normalize(
+        [
+            [0, 0, 1],
+            [0, 0, -1],
+            [1e-4, 0, -1],
+            [0, -1e-4, -1],
+            [1, 0, 0],
+            [1, 0, -1e-7],
+            [0, 1, 1e-7],
+            [1e-6, 1e-6, -1],
+        ]
+    )
+    v = o.normalize(rng.normal(size=(5000, 3)))
+    out = [wp.zeros(len(n), dtype=wp.vec3, device=device) for _ in range(4)]
+    wp.launch(
+        frame_kernel,
+        len(n),
+        inputs=[vec3s(n, device), vec3s(v, device)],
+        outputs=out,
+        device=device,
+    )
+    x, y, local, back = (a.numpy().astype(np.float64) for a in out)
+    frame = np.stack([x, y, n], axis=-1)
+    # Next to -Z the construction divides by 1 + z, so an ulp of z costs about 1e-6.
+    assert np.abs(np.swapaxes(frame, 1, 2) @ frame - np.eye(3)).max() < 2e-6
+    assert np.abs(np.linalg.det(frame) - 1.0).max() < 4e-6
+    assert np.abs(back - v).max() < 4e-6
+    assert np.abs(local[:, 2] - o.dot(n, v)).max() < UNIT_ABS
+
+
+# ------------------------------------------------------------------------- power heuristic
+
+
+def test_power_heuristic(device: str) -> None:
+    """``a^2 / (a^2 + b^2)`` (Veach 1997), without overflow; weights of a pair sum to 1."""
+    values = np.array([0.0, 1e-30, 1e-6, 0.3, 1.0, 7.0, 1e8, 1e25, 3e38], np.float32)
+    a, b = (m.ravel() for m in np.meshgrid(values, values))
+
+    def launch(p: np.ndarray, q: np.ndarray) -> np.ndarray:
+        weight = wp.zeros(len(p), dtype=float, device=device)
+        arrays = [wp.array(m, dtype=float, device=device) for m in (p, q)]
+        wp.launch(heuristic_kernel, len(p), inputs=arrays, outputs=[weight], device=device)
+        return weight.numpy().astype(np.float64)
+
+    a64, b64 = a.astype(np.float64), b.astype(np.float64)
+    used = (a > 0) | (b > 0)
+    expected = np.divide(a64**2, a64**2 + b64**2, out=np.zeros_like(a64), where=used)
+    weight = launch(a, b)
+    assert weight == pytest.approx(expected, abs=1e-6)
+    assert (weight + launch(b, a))[used] == pytest.approx(1.0, abs=1e-6)
+
+
+# ------------------------------------------------------------------------------ samplers
+
+
+def test_cosine_sample(device: str, rng: np.random.Generator) -> None:
+    """Directions follow ``cos / pi`` and never point below the surface."""
+    wi = wp.zeros(SAMPLE_COUNT, dtype=wp.vec3, device=device)
+    wp.launch(
+        cosine_kernel,
+        SAMPLE_COUNT,
+        inputs=[uniform2(rng, SAMPLE_COUNT, device)],
+        outputs=[wi],
+        device=device,
+    )
+    d = wi.numpy().astype(np.float64)
+    assert np.abs(np.linalg.norm(d, axis=-1) - 1.0).max() < UNIT_ABS
+    theta = np.linspace(0.0, np.pi, 41)
+    verdict = chi_square(d, o.cosine_pdf, theta, np.linspace(-np.pi, np.pi, 33))
+    assert verdict.passed, verdict
+
+
+LOBE_SHARPNESS = [1e-3, 0.03, 1.0, 20.0, 1e3, 2e4, 1e5, 1e6]
+LOBE_AXES = [[0.0, 0.0, 1.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0], [0.48, -0.6, 0.64]]
+
+
+def lobe_verdict(wi: np.ndarray, axis: np.ndarray, sharpness: float, case_count: int) -> ChiSquare:
+    """Compare samples with one lobe on rings about its axis that widen from its core outwards."""
+    theta = graded_edges(0.0, min(1.0, 1.5 / np.sqrt(sharpness)), 0.0, np.pi, 48)
+    return chi_square(
+        wi,
+        lambda d: o.sg_pdf(d, axis, sharpness),
+        theta,
+        np.linspace(-np.pi, np.pi, 25),
+        frame=o.frame_of(axis),
+        case_count=case_count,
+        order=10,
+    )
+
+
+def draw_lobe(
+    axis: np.ndarray, sharpness: float, rng: np.random.Generator, device: str, count: int
+) -> np.ndarray:
+    wi = wp.zeros(count, dtype=wp.vec3, device=device)
+    u = uniform2(rng, count, device)
+    inputs = [u, wp.vec3(*map(float, axis)), sharpness]
+    wp.launch(lobe_kernel, count, inputs=inputs, outputs=[wi], device=device)
+    return wi.numpy().astype(np.float64)
+
+
+@pytest.mark.parametrize("sharpness", LOBE_SHARPNESS)
+def test_lobe_sample(device: str, rng: np.random.Generator, sharpness: float) -> None:
+    """Directions follow the von Mises-Fisher density from a flat sky to a sun."""
+    axis = o.normalize(LOBE_AXES[3]).astype(np.float32)
+    d = draw_lobe(axis, sharpness, rng, device, SAMPLE_COUNT)
+    assert np.abs(np.linalg.norm(d, axis=-1) - 1.0).max() < UNIT_ABS
+    verdict = lobe_verdict(d, o.normalize(axis), sharpness, len(LOBE_SHARPNESS))
+    assert verdict.passed, verdict
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("axis", LOBE_AXES)
+@pytest.mark.parametrize("sharpness", LOBE_SHARPNESS)
+def test_lobe_sample_million(
+    device: str, rng: np.random.Generator, sharpness: float, axis: list[float]
+) -> None:
+    """The same with a million samples, along the frame's special directions too."""
+    unit = o.normalize(axis).astype(np.float32)
+    d = draw_lobe(unit, sharpness, rng, device, 1_000_000)
+    verdict = lobe_verdict(d, o.normalize(unit), sharpness, len(LOBE_SHARPNESS) * len(LOBE_AXES))
+    assert verdict.passed, verdict
+
+
+@pytest.mark.parametrize("sharpness", LOBE_SHARPNESS)
+def test_lobe_mean_cosine(device: str, rng: np.random.Generator, sharpness: float) -> None:
+    """The mean of ``1 - cos`` is ``1 / s - 2 / (exp(2 s) - 1)``."""
+    axis = o.normalize([0.48, -0.6, 0.64]).astype(np.float32)
+    d = draw_lobe(axis, sharpness, rng, device, SAMPLE_COUNT)
+    t = o.one_minus_cos(d, axis)
+    expected = 1.0 / sharpness - (2.0 / np.expm1(2.0 * sharpness) if sharpness < 300 else 0.0)
+    error = np.std(t) / np.sqrt(SAMPLE_COUNT)
+    assert abs(np.mean(t) - expected) < Z_MAX * error
+
+
+# --------------------------------------------------------------------------- light: values
+
+
+@pytest.mark.parametrize("sharpness", LOBE_SHARPNESS)
+def test_lobe_density_matches_oracle(
+    device: str, rng: np.random.Generator, sharpness: float
+) -> None:
+    """One lobe's proposal density equals the float64 density where it matters."""
+    lobes = Lobes(
+        np.ones((1, 3), np.float32),
+        np.array([[0.48, -0.6, 0.64]], np.float32),
+        np.array([sharpness], np.float32),
+    )
+    light = light_args(Light(lobes), wp.get_device(device))
+    wi = draw_light(light, rng, device, 20000).astype(np.float32)
+    radiance, pdf = eval_light(light, wi, device)
+    expected = o.sg_pdf(wi, lobes.axis[0], lobes.sharpness[0])
+    np.testing.assert_allclose(pdf, expected, rtol=PDF_RTOL)
+    shape = o.sg_radiance(wi, lobes.amplitude, lobes.axis, lobes.sharpness)
+    np.testing.assert_allclose(radiance, shape, rtol=PDF_RTOL)
+
+
+def test_light_radiance_is_lobes_plus_map(device: str, rng: np.random.Generator) -> None:
+    """Radiance is the sum of (M 2) and the bilinear map."""
+    lobes, texels = some_lobes(), sun_map()
+    light = light_args(Light(lobes, texels), wp.get_device(device))
+    wi = o.normalize(rng.normal(size=(20000, 3))).astype(np.float32)
+    radiance, _ = eval_light(light, wi, device)
+    expected = o.sg_radiance(wi, lobes.amplitude, lobes.axis, lobes.sharpness)
+    expected += o.bilinear_lookup(texels, o.latlong_uv(wi))
+    # Next to the sun an ulp of u * width changes the lookup by 1e-6 of the sun.
+    np.testing.assert_allclose(radiance, expected, rtol=PDF_RTOL, atol=4e-6 * float(texels.max()))
+
+
+# --------------------------------------------------------------------- light: sampling
+
+
+def map_verdict(
+    wi: np.ndarray, light: LightArgs, device: str, height: int, width: int, case_count: int
+) -> ChiSquare:
+    """Compare samples with the kernel's density on cells that follow the map's half texels."""
+    # About +Y with azimuth from +Z toward +X, so that cells align with the map's grid.
+    frame = np.array([[0.0, 1.0, 0.0], [0.0, 0.0, 1.0], [1.0, 0.0, 0.0]])
+    theta = np.linspace(0.0, np.pi, 2 * height + 1)
+    phi = np.linspace(-np.pi, np.pi, 2 * width + 1)
+    return chi_square(
+        wi, lambda d: eval_light(light, d, device)[1], theta, phi, frame, case_count=case_count
+    )
+
+
+@pytest.mark.parametrize("row", [0, 4, 15])
+def test_map_sample_with_a_sun(device: str, rng: np.random.Generator, row: int) -> None:
+    """A sun texel of 1e5 times the mean is drawn by its bilinear tent, next to the poles too."""
+    light = light_args(Light(None, sun_map(row=row)), wp.get_device(device))
+    verdict = map_verdict(draw_light(light, rng, device), light, device, 16, 32, 6)
+    assert verdict.passed, verdict
+
+
+@pytest.mark.parametrize("kind", ["flat", "black", "one texel"])
+def test_map_sample_of_odd_maps(device: str, rng: np.random.Generator, kind: str) -> None:
+    """Flat, black and all but black maps are sampled as their density says."""
+    texels = np.zeros((7, 12, 3), np.float32)
+    if kind == "flat":
+        texels += 3.0
+    elif kind == "one texel":
+        texels[3, 11] = 1.0
+    light = light_args(Light(None, texels), wp.get_device(device))
+    if kind == "black":
+        light.map_prob = 1.0
+    verdict = map_verdict(draw_light(light, rng, device), light, device, 7, 12, 6)
+    assert verdict.passed, verdict
+
+
+def test_map_density_is_proportional_to_luminance(device: str, rng: np.random.Generator) -> None:
+    """At texel centres the density is luminance over flux, up to the interpolation of d_omega."""
+    texels = sun_map(64, 128, row=20)
+    light = light_args(Light(None, texels), wp.get_device(device))
+    d = o.texel_direction(64, 128)
+    _, pdf = eval_light(light, d, device)
+    flux = np.sum(o.luminance(texels) * o.texel_solid_angle(64, 128)[:, None])
+    # In the sun's row the float32 table ends near 1, where its steps are 1 % of a sky texel.
+    rtol = np.where(np.arange(64) == 20, 1e-2, 2e-3)[:, None]
+    assert np.all(np.abs(pdf * flux / o.luminance(texels) - 1.0)[2:-2] < rtol[2:-2])
+
+
+def test_light_sample_of_a_mixture(device: str, rng: np.random.Generator) -> None:
+    """Lobes and a map together: three lobes of sharpness 0.7 to 2e4 over a sky with a sun."""
+    lobes = some_lobes()
+    light = light_args(Light(lobes, sun_map()), wp.get_device(device))
+    wi = draw_light(light, rng, device)
+    frame = o.frame_of(lobes.axis[2])
+    theta = graded_edges(0.0, 0.01, 0.0, np.pi, 60)
+    verdict = chi_square(
+        wi,
+        lambda d: eval_light(light, d, device)[1],
+        theta,
+        np.linspace(-np.pi, np.pi, 49),
+        frame,
+        order=24,
+    )
+    assert verdict.passed, verdict
+
+
+def test_light_density_integrates_to_one(device: str) -> None:
+    """The mixture's density is one, by quadrature on the map's half texels without the sun lobe."""
+    lobes = some_lobes()
+    lobes = Lobes(lobes.amplitude[:2], lobes.axis[:2], lobes.sharpness[:2])
+    light = light_args(Light(lobes, sun_map()), wp.get_device(device))
+    theta, weight_t = o.gauss_legendre(np.linspace(0, np.pi, 33), 8)
+    phi, weight_p = o.gauss_legendre(np.linspace(-np.pi, np.pi, 65), 8)
+    d = np.stack(
+        np.broadcast_arrays(
+            np.sin(theta)[:, None] * np.sin(phi),
+            np.cos(theta)[:, None],
+            np.sin(theta)[:, None] * np.cos(phi),
+        ),
+        axis=-1,
+    )
+    _, pdf = eval_light(light, d, device)
+    assert (weight_t * np.sin(theta)) @ pdf @ weight_p == pytest.approx(1.0, abs=1e-4)
+
+
+# --------------------------------------------------------------------------------- MIS
+
+
+@pytest.mark.parametrize("kind", ["lobes", "map", "both"])
+def test_mis_irradiance_is_unbiased(device: str, rng: np.random.Generator, kind: str) -> None:
+    """Light and cosine samples with power-heuristic weights give the plane's irradiance.
+
+    Truth: lobes by the ring quadrature, the map by Gauss-Legendre on its half texels.
+    """
+    lobes = some_lobes() if kind != "map" else None
+    texels = sun_map() if kind != "lobes" else None
+    light = light_args(Light(lobes, texels), wp.get_device(device))
+    n = o.normalize([0.2, 1.0, 0.1])
+    truth = np.zeros(3)
+    if lobes is not None:
+        for amplitude, axis, sharpness in zip(
+            lobes.amplitude, lobes.axis, lobes.sharpness, strict=True
+        ):
+            truth += amplitude * o.sg_irradiance(n, axis, float(sharpness))
+    if texels is not None:
+        theta, weight_t = o.gauss_legendre(np.linspace(0, np.pi, 33), 24)
+        phi, weight_p = o.gauss_legendre(np.linspace(-np.pi, np.pi, 65), 24)
+        d = np.stack(
+            np.broadcast_arrays(
+                np.sin(theta)[:, None] * np.sin(phi),
+                np.cos(theta)[:, None],
+                np.sin(theta)[:, None] * np.cos(phi),
+            ),
+            axis=-1,
+        )
+        value = o.bilinear_lookup(texels, o.latlong_uv(d)) * np.maximum(0.0, d @ n)[..., None]
+        truth += np.einsum("t,tpc,p->c", weight_t * np.sin(theta), value, weight_p)
+
+    from_light = draw_light(light, rng, device)
+    wi = wp.zeros(SAMPLE_COUNT, dtype=wp.vec3, device=device)
+    wp.launch(
+        cosine_kernel,
+        SAMPLE_COUNT,
+        inputs=[uniform2(rng, SAMPLE_COUNT, device)],
+        outputs=[wi],
+        device=device,
+    )
+    from_cosine = wi.numpy().astype(np.float64) @ o.frame_of(n).T
+    total = np.zeros((SAMPLE_COUNT, 3))
+    for d, is_light in ((from_light, True), (from_cosine, False)):
+        radiance, pdf_light = eval_light(light, d, device)
+        cos = np.maximum(0.0, d @ n)
+        pdf_cosine = cos / np.pi
+        own, other = (pdf_light, pdf_cosine) if is_light else (pdf_cosine, pdf_light)
+        weight = wp.zeros(SAMPLE_COUNT, dtype=float, device=device)
+        arrays = [wp.array(m.astype(np.float32), dtype=float, device=device) for m in (own, other)]
+        wp.launch(heuristic_kernel, SAMPLE_COUNT, inputs=arrays, outputs=[weight], device=device)
+        factor = np.divide(weight.numpy() * cos, own, out=np.zeros(SAMPLE_COUNT), where=own > 0)
+        total += radiance * factor[:, None]
+    error = total.std(axis=0) / np.sqrt(SAMPLE_COUNT)
+    assert np.all(np.abs(total.mean(axis=0) - truth) < Z_MAX * error), (
+        total.mean(axis=0),
+        truth,
+        error,
+    )
+    # The heuristic's point: no firefly, although the sun is 1e5 times the sky.
+    assert np.all(error < 0.01 * truth)

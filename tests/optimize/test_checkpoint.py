@@ -1,0 +1,164 @@
+"""Checkpoints: what is written comes back, damage is passed over, another run is refused."""
+
+import json
+from pathlib import Path
+
+import pytest
+import torch
+
+from warpir.core.errors import ExitCode, InputError
+from warpir.optimize.checkpoint import FORMAT, MANIFEST, STATE, Checkpoints
+
+IDENTITY = {"config": {"steps": 10, "sun": (1.0, 2.0)}, "inputs": {"photo": "ab"}}
+
+
+def a_state(value: float) -> dict[str, object]:
+    tensor = torch.full((2, 3), value)
+    return {
+        "adam": {"0": {"exp_avg": tensor, "step": torch.tensor(7.0)}},
+        "same": tensor,  # shares memory
+        "half": tensor.to(torch.bfloat16),
+        "history": [{"gradient": 0.1 + 0.2}],
+        "best": None,
+        "empty": {},
+    }
+
+
+def names(out: Path) -> list[str]:
+    return sorted(p.name for p in (out / "checkpoints").iterdir())
+
+
+def test_checkpoint_round_trip(tmp_path: Path) -> None:
+    checkpoints = Checkpoints(tmp_path, IDENTITY)
+    checkpoints.save("optimize", 50, a_state(0.1))
+    found = Checkpoints(tmp_path, IDENTITY).load(pytest.fail)
+    assert (found.stage, found.step) == ("optimize", 50)
+    expected = a_state(0.1)
+    assert set(found.state) == set(expected)
+    assert torch.equal(found.state["same"], expected["same"])
+    assert torch.equal(found.state["adam"]["0"]["exp_avg"], torch.full((2, 3), 0.1))
+    assert found.state["half"].dtype is torch.bfloat16
+    assert found.state["history"] == expected["history"]
+    assert found.state["best"] is None and found.state["empty"] == {}
+
+
+def test_checkpoint_keeps_two_and_the_newest_is_the_last_written(tmp_path: Path) -> None:
+    checkpoints = Checkpoints(tmp_path, IDENTITY)
+    for stage, step in (("personalize", 900), ("optimize", 50), ("optimize", 100)):
+        checkpoints.save(stage, step, a_state(step))
+    assert names(tmp_path) == ["000002-optimize-50", "000003-optimize-100"]
+    assert checkpoints.newest == "000003-optimize-100"
+    # A resumed run writes an earlier step again: it is the newest all the same.
+    checkpoints.save("optimize", 75, a_state(75))
+    assert checkpoints.load(pytest.fail).step == 75
+
+
+DAMAGES = ("cut", "flip", "no state", "manifest cut", "no key", "no manifest", "newer format")
+
+
+@pytest.mark.parametrize(
+    "damage", [pytest.param(damage, id=f"R3-{damage.replace(' ', '-')}") for damage in DAMAGES]
+)
+def test_checkpoint_damaged_is_passed_over(tmp_path: Path, damage: str) -> None:
+    checkpoints = Checkpoints(tmp_path, IDENTITY)
+    checkpoints.save("optimize", 50, a_state(1))
+    checkpoints.save("optimize", 100, a_state(2))
+    newest = tmp_path / "checkpoints" / "000002-optimize-100"
+    content = (newest / STATE).read_bytes()
+    manifest = json.loads((newest / MANIFEST).read_text())
+    if damage == "cut":
+        (newest / STATE).write_bytes(content[: len(content) // 2])
+    elif damage == "flip":
+        (newest / STATE).write_bytes(content[:-1] + bytes([content[-1] ^ 1]))
+    elif damage == "no state":
+        (newest / STATE).unlink()
+    elif damage == "manifest cut":
+        (newest / MANIFEST).write_bytes((newest / MANIFEST).read_bytes()[:-20])
+    elif damage == "no manifest":
+        (newest / MANIFEST).unlink()
+    elif damage == "newer format":
+        (newest / MANIFEST).write_text(json.dumps(manifest | {"format": FORMAT + 1}))
+    else:
+        del manifest["state"]
+        (newest / MANIFEST).write_text(json.dumps(manifest))
+    notices: list[str] = []
+    assert checkpoints.load(notices.append).step == 50
+    assert len(notices) == 1 and "000002-optimize-100" in notices[0]
+
+
+def test_checkpoint_without_manifest_is_not_forgotten(tmp_path: Path) -> None:
+    checkpoints = Checkpoints(tmp_path, IDENTITY)
+    checkpoints.save("optimize", 50, a_state(1))
+    (tmp_path / "checkpoints" / "000001-optimize-50" / MANIFEST).unlink()
+    with pytest.raises(InputError, match="000001-optimize-50 cannot be used: no such file"):
+        checkpoints.load(pytest.fail)
+
+
+def test_checkpoint_of_another_run_names_every_field(tmp_path: Path) -> None:
+    Checkpoints(tmp_path, IDENTITY).save("optimize", 50, a_state(1))
+    other = {"config": {"steps": 20, "sun": [1.0, 2.0]}, "inputs": {"photo": "cd", "asset": "ef"}}
+    with pytest.raises(InputError) as caught:
+        Checkpoints(tmp_path, other).load(pytest.fail)
+    message = caught.value.what
+    for words in (
+        "config.steps: was 10, is 20",
+        'inputs.photo: was "ab", is "cd"',
+        'inputs.asset: was "absent", is "ef"',
+    ):
+        assert words in message
+    assert "sun" not in message
+
+
+def test_checkpoint_all_damaged_says_so(tmp_path: Path) -> None:
+    checkpoints = Checkpoints(tmp_path, IDENTITY)
+    checkpoints.save("optimize", 50, a_state(1))
+    (tmp_path / "checkpoints" / "000001-optimize-50" / STATE).write_bytes(b"")
+    with pytest.raises(InputError, match="its sha256 is not the one"):
+        checkpoints.load(pytest.fail)
+
+
+def test_checkpoint_abandoned_parts_are_removed(tmp_path: Path) -> None:
+    checkpoints = Checkpoints(tmp_path, IDENTITY)
+    abandoned = tmp_path / "checkpoints" / ".partial-1"
+    abandoned.mkdir(parents=True)
+    checkpoints.save("optimize", 50, a_state(1))
+    assert not abandoned.exists()
+
+
+def test_checkpoint_that_cannot_be_written_is_an_error(tmp_path: Path) -> None:
+    (tmp_path / "checkpoints").write_text("in the way")
+    with pytest.raises(InputError, match="cannot be written") as caught:
+        Checkpoints(tmp_path, IDENTITY).save("optimize", 50, a_state(1))
+    assert caught.value.code == ExitCode.RESOURCES
+
+
+def test_checkpoint_remove(tmp_path: Path) -> None:
+    checkpoints = Checkpoints(tmp_path, IDENTITY)
+    checkpoints.save("optimize", 50, a_state(1))
+    checkpoints.remove()
+    assert checkpoints.newest is None and list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.case("R3")
+@pytest.mark.parametrize("key", ["stage", "step", "identity", "state"])
+def test_checkpoint_with_an_edited_manifest_is_passed_over(tmp_path: Path, key: str) -> None:
+    """One digit of a step is enough for another result: the manifest has a sha256 of its own."""
+    checkpoints = Checkpoints(tmp_path, {"seed": 3})
+    checkpoints.save("optimize", 3, {"step": 3})
+    path = tmp_path / "checkpoints" / "000001-optimize-3" / "manifest.json"
+    manifest = json.loads(path.read_text())
+    manifest[key] = {"stage": "lora", "step": 7, "identity": {"seed": 4}, "state": {"plain": 7}}[
+        key
+    ]
+    path.write_text(json.dumps(manifest))
+    with pytest.raises(InputError, match="sha256"):
+        checkpoints.load(print)
+
+
+def test_checkpoint_removal_leaves_what_is_not_ours(tmp_path: Path) -> None:
+    """A folder of that name is what every training project has."""
+    checkpoints = Checkpoints(tmp_path, {})
+    checkpoints.save("optimize", 3, {})
+    (tmp_path / "checkpoints" / "model.safetensors").write_text("three days")
+    checkpoints.remove()
+    assert [p.name for p in (tmp_path / "checkpoints").iterdir()] == ["model.safetensors"]

@@ -1,0 +1,182 @@
+"""Coat, sheen, glass and reflection of glTF in whole pictures: textures, rays, both integrators."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+
+from tests.builders.shapes import box, camera, constant, lobe, placed, quad, sphere
+from tests.render.test_render import (
+    BIAS,
+    CARD_VIEW,
+    FLOAT32,
+    OVERHEAD,
+    STANDARD_ERRORS,
+    card,
+    from_above,
+    make,
+    render,
+    roofed,
+    shadow,
+)
+from tests.render.test_transport import EXACT, HEIGHT, lights, pixels_of
+from warpir.render.integrator import LightTensors
+from warpir.render.mis import MisIntegrator
+from warpir.render.transport.integrator import TransportIntegrator
+from warpir.scene.asset import Material, Primitive, Texture, TextureSlot
+from warpir.scene.light import Light, as_map
+
+DARK = Material(base_color=(0.0, 0.0, 0.0), metallic=0.0, roughness=1.0)
+GLASS = Material(base_color=(0.5, 0.5, 0.5), metallic=0.0, roughness=0.4, transmission=1.0)
+CODES = (64, 128, 192, 96)
+SKY = lobe((0.3, 0.5, 1.0), 2.0)
+
+
+def schlick(f0: float, cosine: float) -> float:
+    return f0 + (1.0 - f0) * (1.0 - cosine) ** 5
+
+
+LAYERED = Material(
+    base_color=(0.7, 0.5, 0.3), metallic=0.2, roughness=0.6, specular=0.9, ior=2.0,
+    specular_color=(1.0, 0.6, 0.8), clearcoat=0.8, clearcoat_roughness=0.7,
+    sheen_color=(0.9, 0.7, 0.5), sheen_roughness=0.9,
+)  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    "name",
+    [
+        "specular", "specular_color", "clearcoat", "clearcoat_roughness", "sheen_color",
+        "sheen_roughness", "transmission",
+    ],
+)  # fmt: skip
+def test_textures_multiply_their_factor(device: str, name: str) -> None:
+    """Each texture is read in its channel, sRGB where it is a colour, as if in the factor."""
+    texture = Texture(np.full((1, 1, 4), CODES, np.uint8))
+    linear = [c / 255.0 for c in CODES]
+    color = [((c + 0.055) / 1.055) ** 2.4 for c in linear[:3]]
+    whole = replace(LAYERED, transmission=0.9 if name == "transmission" else 0.0)
+    by = {
+        "specular": linear[3], "specular_color": color, "clearcoat": linear[0],
+        "clearcoat_roughness": linear[1], "sheen_color": color, "sheen_roughness": linear[3],
+        "transmission": linear[0],
+    }  # fmt: skip
+    value = np.array(getattr(whole, name)) * by[name]
+    multiplied = replace(whole, **{name: tuple(value) if value.ndim else float(value)})
+    textured = replace(whole, **{f"{name}_texture": TextureSlot(0)})
+    found, expected, without = (
+        render(make(card(m, texture), CARD_VIEW, device), SKY, 64).radiance.mean(axis=0)
+        for m in (textured, multiplied, whole)
+    )
+    np.testing.assert_allclose(found, expected, rtol=1e-4)
+    assert np.abs(found / without - 1.0).max() > 3e-3
+
+
+def test_coat_has_a_normal_of_its_own(device: str) -> None:
+    """A mirror coat shows what lies in the mirror direction of its map, not of the base's."""
+    tilt = np.array([0.6, 0.0, 0.8])
+    codes = np.append(np.round(255.0 * (0.5 * tilt + 0.5)), 255).astype(np.uint8)
+    # The map's x runs along u, to the right; the camera looks along -Z at the card's middle.
+    mirror = 2.0 * tilt[2] * tilt - [0.0, 0.0, 1.0]
+    light = lobe(mirror, 400.0, (100.0, 100.0, 100.0))
+    texture = Texture(np.tile(codes, (1, 1, 1)))
+    view = camera(4, 4, 400.0)
+    coated = replace(DARK, specular=0.0, clearcoat=0.5)
+    mapped = replace(coated, clearcoat_normal_texture=TextureSlot(0))
+    other = replace(coated, normal_texture=TextureSlot(0))
+    seen = [
+        float(render(make(card(m, texture), view, device), light, 64).radiance.mean())
+        for m in (mapped, coated, other)
+    ]
+    # 8-bit codes and the few pixels' angles cost some of the lobe's peak.
+    assert seen[0] == pytest.approx(0.5 * schlick(0.04, 0.8) * 100.0, rel=0.05)
+    assert max(seen[1:]) < 1e-3 * seen[0]
+
+
+def test_coat_darkens_what_shines_below_it(device: str) -> None:
+    """Emission loses what the coat reflects toward the camera (KHR_materials_clearcoat)."""
+    lamp = replace(DARK, emission=(1.0, 2.0, 3.0), clearcoat=0.75)
+    view = camera(4, 4, 4000.0)
+    found = render(make(card(lamp), view, device), constant((0.0, 0.0, 0.0)), 4).emission
+    share = 1.0 - 0.75 * 0.04
+    np.testing.assert_allclose(found, np.tile([share, 2 * share, 3 * share], (16, 1)), rtol=1e-4)
+
+
+def leaning(angle: float) -> Primitive:
+    """A wide pane before the camera that leans back by ``angle`` [deg]."""
+    a = np.radians(angle)
+    return quad((0, 0, -5.0), (50, 0, 0), (0, 50 * np.cos(a), -50 * np.sin(a)))
+
+
+@pytest.mark.parametrize("angle", [0.0, 60.0, 80.0])
+def test_glass_covers_what_it_does_not_let_through(device: str, angle: float) -> None:
+    """Coverage is 1 - T: half of what Fresnel lets in passes grey glass, at every angle."""
+    view = camera(4, 4, 4000.0)
+    out = render(make(placed(leaning(angle), GLASS), view, device), constant(), 4096)
+    passes = 0.5 * (1.0 - schlick(0.04, np.cos(np.radians(angle))))
+    error = np.sqrt(passes * (1 - passes) / (4096 * 16))
+    assert abs(float(out.mask.mean()) - (1.0 - passes)) < STANDARD_ERRORS * error
+    # What is seen of it is its reflection alone, undiminished: that of black glass.
+    black = replace(DARK, roughness=GLASS.roughness)
+    opaque = render(make(placed(leaning(angle), black), view, device), constant(), 4096)
+    share = STANDARD_ERRORS * error / (1.0 - passes)
+    assert out.radiance.mean() == pytest.approx(float(opaque.radiance.mean()), rel=share)
+
+
+def test_glass_throws_a_light_shadow(device: str) -> None:
+    """Sunlight loses what each wall reflects and absorbs; coat, index and metal count."""
+    passes = 0.5 * 0.96
+    np.testing.assert_allclose(roofed(device, GLASS), passes, rtol=FLOAT32)
+    np.testing.assert_allclose(roofed(device, GLASS, GLASS), passes**2, rtol=FLOAT32)
+    dense = replace(GLASS, ior=3.0, metallic=0.25, clearcoat=0.5, transmission=0.8)
+    passes = 0.8 * 0.5 * 0.75 * (1.0 - 0.25) * (1.0 - 0.5 * 0.04)
+    np.testing.assert_allclose(roofed(device, dense), passes, rtol=FLOAT32)
+    blended = replace(GLASS, alpha_mode="BLEND", alpha=0.25)
+    np.testing.assert_allclose(roofed(device, blended), 1.0 - 0.25 * 0.52, rtol=FLOAT32)
+    textured = replace(
+        GLASS, transmission_texture=TextureSlot(0), base_color_texture=TextureSlot(0)
+    )
+    texture = Texture(np.full((1, 1, 4), 128, np.uint8))
+    roof = placed(quad((0, 1.0, 0), (5.0, 0, 0), (0, 0, -5.0)), textured, textures=(texture,))
+    ratio = shadow(make(roof, from_above(4, 4, 0.5), device, 0.0), OVERHEAD)[0]
+    linear = ((128 / 255 + 0.055) / 1.055) ** 2.4
+    np.testing.assert_allclose(ratio, (128 / 255) * 0.5 * linear * 0.96, rtol=FLOAT32)
+
+
+def test_clear_glass_is_found_by_the_g_buffer(device: str) -> None:
+    """A pane that lets 96 % of the rays through is still traced in every pixel that it covers."""
+    clear = replace(GLASS, base_color=(1.0, 1.0, 1.0), double_sided=True)
+    view = camera(32, 32, 80.0)
+    assert len(make(card(clear), view, device).gbuffer(0).object_pixels) == 32 * 32
+
+
+def test_transport_agrees_with_mis_on_layered_materials(device: str) -> None:
+    """Both integrators find the same light on a narrow coat, on cloth, and through glass."""
+    coat = Material(
+        base_color=(0.8, 0.3, 0.2), metallic=0.0, roughness=0.8, clearcoat=1.0,
+        clearcoat_roughness=0.1, sheen_color=(0.3, 0.3, 0.6), sheen_roughness=0.5,
+    )  # fmt: skip
+    parts = sphere((0.0, 0.5, -4.0), 0.5), box((0.8, 0.4, -4.0), (0.4, 0.8, 0.4), material=1)
+    scene = placed(parts, coat, replace(GLASS, roughness=0.1))
+    view = camera(12, 8, 19.0, (0.3, 1.5, 0.0), pitch=-14.0)
+    renderer = make(scene, view, device, 0.0)
+    objects, proxies = pixels_of(renderer)
+    light = Light(lobes=lights(6.0))
+    texels = LightTensors(texels=torch.from_numpy(as_map(light, HEIGHT)))
+    own = [
+        TransportIntegrator(renderer, objects, proxies, 2, EXACT, light, seed).radiance(
+            texels, texels, 0
+        )
+        for seed in range(12)
+    ]
+    reference = MisIntegrator(renderer, objects, proxies, spp=512, rays=1, depth=2)
+    other = [reference.radiance(texels, texels, 1000 + seed) for seed in range(4)]
+    for name in ("foreground", "lit"):
+        mine, theirs = (
+            np.stack([getattr(r, name).numpy().astype(np.float64).sum(axis=(0, 1)) for r in runs])
+            for runs in (own, other)
+        )
+        error = np.hypot(mine.std(ddof=1) / np.sqrt(12), theirs.std(ddof=1) / 2.0)
+        difference = mine.mean() - theirs.mean()
+        assert abs(difference) < STANDARD_ERRORS * error + 1e-3 * BIAS * theirs.mean(), name

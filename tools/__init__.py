@@ -1,0 +1,1 @@
+"""Generators of what the package ships; outside the wheel."""

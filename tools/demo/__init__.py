@@ -1,0 +1,1 @@
+"""Makes the files of `warpir.demo`: ``python -m tools.demo.make``."""

@@ -1,0 +1,95 @@
+"""Whether a run has the models that it asks for, by their files: torch is not loaded for it."""
+
+import os
+from collections.abc import Callable
+from pathlib import Path
+from typing import TYPE_CHECKING, TypeVar
+
+from warpir.app.config import InsertConfig
+from warpir.core.errors import ExitCode, InputError, raise_all
+from warpir.diffusion.model_error import ModelError
+
+if TYPE_CHECKING:
+    from warpir.diffusion.model_folder import ModelFolder
+
+Checked = TypeVar("Checked")
+
+
+def require_model(config: InsertConfig) -> None:
+    """Check what the run reads beside its inputs: the model's folder, or the weights that we ship.
+
+    Configurations, and headers of weights: their names, shapes and lengths. A model that is to be
+    downloaded is not looked for.
+
+    Raises:
+        InputError: Something is not there, or not what it should be (`ExitCode.MODEL`); the other
+            problems are in its ``also``.
+    """
+    from warpir.diffusion.weight_files import check_lora, check_prior, check_regressor
+
+    problems: list[InputError] = []
+
+    def attempt(check: Callable[[], Checked]) -> Checked | None:
+        try:
+            return check()
+        except ModelError as error:
+            problems.append(InputError(error.where, error.what, error.advice, ExitCode.MODEL))
+            return None
+
+    lora, prior, regressor = (_path(f) for f in (config.lora, config.prior, config.regressor))
+    is_told = config.is_light_described or config.reuse is not None
+    embedding_width: int | None = None
+    if config.guided_by == "stable-diffusion":
+        embedding_width = attempt(lambda: _model_width(config))
+    if prior is not None or (config.guided_by == "embedded" and config.is_guided):
+        embedding_width = attempt(lambda: check_prior(prior))
+    if lora is not None:
+        attempt(lambda: check_lora(lora, embedding_width))
+    if regressor is not None or (config.start != "uniform" and not is_told):
+        attempt(lambda: check_regressor(regressor))
+    raise_all(problems)
+
+
+def _model_width(config: InsertConfig) -> int | None:
+    """Check the folder of Stable Diffusion; return the width of its prompts' embeddings."""
+    from warpir.diffusion.model_folder import check_model_folder, find_model
+
+    if config.allow_download and not os.path.isdir(config.model or ""):
+        return None
+    found = find_model(config.model, allow_download=False, allow_pickle=config.allow_pickle)
+    folder = check_model_folder(found, config.allow_pickle)
+    width: int = folder.configs["unet"]["cross_attention_dim"]
+    return width
+
+
+def model_hashes(config: InsertConfig) -> dict[str, str] | None:
+    """Return the sha256 of every file of Stable Diffusion's that a run would read, by its name.
+
+    None: there is no such model now, or it is damaged.
+    """
+    from warpir.diffusion.model_folder import check_model_folder, find_model
+
+    try:
+        found = find_model(config.model, allow_download=False, allow_pickle=config.allow_pickle)
+        folder = check_model_folder(found, config.allow_pickle)
+        states = [(file, file.stat()) for file in folder.files]
+        return dict(
+            _hash(folder, file, (state.st_ino, state.st_size, state.st_mtime_ns))
+            for file, state in states
+        )
+    except (ModelError, OSError):
+        return None
+
+
+_hashes: dict[tuple[object, ...], tuple[str, str]] = {}
+
+
+def _hash(folder: "ModelFolder", file: Path, state: tuple[int, ...]) -> tuple[str, str]:
+    """Return a file's name and sha256; a batch asks again for gigabytes that stay as they are."""
+    if (file, state) not in _hashes:
+        _hashes[file, state] = folder.file_hash(file)
+    return _hashes[file, state]
+
+
+def _path(name: str | None) -> Path | None:
+    return None if name is None else Path(name)

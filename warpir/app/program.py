@@ -1,0 +1,176 @@
+"""What all commands share: errors as one line and an exit status, signals, and lines of output."""
+
+import atexit
+import importlib.util
+import logging
+import os
+import sys
+import traceback
+from collections.abc import Callable, Sequence
+from contextlib import suppress
+
+from warpir.app.config import usage
+from warpir.core import signals
+from warpir.core.atomic import WriteError
+from warpir.core.errors import DISK_FULL, LISTED, ExitCode, InputError, disk_error
+from warpir.core.memory import MIB, free_host, is_shortage
+from warpir.diffusion.model_error import ModelError
+
+INTERRUPTED = 130
+"""Of a Ctrl-C where nobody handles signals: 128 and the number of SIGINT."""
+LONGEST = 10_000
+"""Most characters of a line: two file names of any length and a sentence."""
+EXTRA_OF = {"ray": "ray", "mitsuba": "bench", "matplotlib": "bench"}
+"""Which extra brings a package that a plain install does not have."""
+BROUGHT = (
+    *("OpenEXR", "OpenImageIO", "PIL", "accelerate", "colour", "diffusers", "numpy", "peft"),
+    *("rich", "safetensors", "scipy", "skimage", "torch", "transformers", "trimesh", "warp"),
+    "yaml",
+)
+"""What a plain install brings, so that only a broken one lacks it."""
+
+
+def settle_environment() -> None:
+    """Set what libraries read when they are loaded, so before they are.
+
+    NumPy's BLAS gets one thread, as the last bits of its sums depend on how many there are, and
+    Hugging Face's libraries send nothing home.
+    """
+    os.environ["OPENBLAS_NUM_THREADS"] = "1"
+    for name in ("HF_HUB_DISABLE_TELEMETRY", "DO_NOT_TRACK"):
+        os.environ[name] = "1"
+
+
+def _open_closed_streams() -> None:
+    """Put nothing in the place of closed standard streams.
+
+    Otherwise the next files that are opened get their numbers, and what libraries print would go
+    into them.
+    """
+    for number in (0, 1, 2):
+        try:
+            os.fstat(number)
+        except OSError:
+            os.dup2(os.open(os.devnull, os.O_RDWR), number)
+    # Python has no stream where the descriptor was closed at its start.
+    sys.stdout = sys.stdout or open(1, "w", closefd=False)
+    sys.stderr = sys.stderr or open(2, "w", closefd=False)
+
+
+def require_packages(*names: str) -> None:
+    """Look for packages that are imported late, without importing them.
+
+    Raises:
+        ModuleNotFoundError: One is not installed; `run_program` says what brings it.
+    """
+    for name in names:
+        if importlib.util.find_spec(name) is None:
+            raise ModuleNotFoundError(f"No module named {name!r}", name=name)
+
+
+def stay_offline() -> None:
+    """Tell Hugging Face's libraries, before they are loaded, to open no connection."""
+    for name in ("HF_HUB_OFFLINE", "TRANSFORMERS_OFFLINE"):
+        os.environ[name] = "1"
+
+
+def run_program(run: Callable[[list[str]], int], argv: Sequence[str] | None = None) -> int:
+    """Run a command; the one place that prints errors.
+
+    Args:
+        run: Given the arguments, returns the exit status.
+        argv: Arguments without the program's name; ``sys.argv`` when absent.
+
+    Returns:
+        The exit status, an `ExitCode` or 128 plus the number of a signal.
+    """
+    _open_closed_streams()
+    settle_environment()
+    arguments = list(sys.argv[1:] if argv is None else argv)
+    debug = "--debug" in arguments
+    # Those of NumPy and others are noise to the user: what they tell of is checked for.
+    logging.captureWarnings(True)
+    logging.getLogger("py.warnings").addHandler(logging.NullHandler())
+    if debug:
+        logging.basicConfig(level=logging.DEBUG, format="debug: %(name)s: %(message)s")
+    for stream in (sys.stdout, sys.stderr):
+        # A terminal without UTF-8 shows escapes; it must not end the run.
+        if hasattr(stream, "reconfigure"):
+            stream.reconfigure(errors="backslashreplace")
+    atexit.unregister(signals.ignore_at_exit)
+    with signals.handled():
+        try:
+            return run(arguments)
+        except BaseException as error:
+            signals.ignore()
+            status, lines = explain(error)
+            with suppress(OSError):  # nobody can read it: the status says it all
+                if debug and not isinstance(error, SystemExit):
+                    traceback.print_exc()
+                elif status == ExitCode.BUG:
+                    # Without --debug too: without it nobody could repair what is our fault.
+                    traceback.print_exc()
+                for line in lines:
+                    print(line, file=sys.stderr, flush=True)
+            return status
+        finally:
+            # What is registered last is called first: before caches are written and torch is gone.
+            atexit.register(signals.ignore_at_exit)
+
+
+def explain(error: BaseException) -> tuple[int, list[str]]:
+    """Return the exit status of an exception and the lines that tell the user about it."""
+    if isinstance(error, SystemExit):
+        return error.code if isinstance(error.code, int) else ExitCode.DONE, []
+    if isinstance(error, signals.Stopped):
+        kept = f"; {error.kept}" if error.kept else ""
+        return 128 + error.number, [_one_line(f"stopped by {error}{kept}")]
+    if isinstance(error, KeyboardInterrupt):
+        return INTERRUPTED, ["stopped"]
+    missing = (getattr(error, "name", None) or "").split(".")[0]
+    if isinstance(error, ModuleNotFoundError) and missing in EXTRA_OF:
+        error = usage(
+            missing, "not installed", f"pip install 'warpir[{EXTRA_OF[missing]}]' brings it"
+        )
+    elif isinstance(error, ModuleNotFoundError) and missing in BROUGHT:
+        error = usage(missing, "not installed", "pip install --upgrade warpir brings it")
+    elif is_shortage(error):
+        error = InputError(
+            "memory",
+            f"not enough of it ({free_host() // MIB} MiB of the host are free now)",
+            "lower --width, --samples or --rays, with --guidance --class-batch, --noises or "
+            "--guidance-width, give a smaller --photo or --asset, or use --device cpu",
+            ExitCode.RESOURCES,
+        )
+    elif isinstance(error, WriteError) or (isinstance(error, OSError) and error.errno in DISK_FULL):
+        error = disk_error(error.filename or "--out or the folder of temporary files", error)
+    elif isinstance(error, ModelError):
+        error = InputError(error.where, error.what, error.advice, ExitCode.MODEL)
+    if isinstance(error, InputError):
+        lines = [_one_line(f"error: {error.where}: {error.what}")]
+        lines += [_one_line(error.advice)] if error.advice else []
+        lines += [_one_line(f"also: {o.where}: {o.what}") for o in error.also[:LISTED]]
+        if len(error.also) > LISTED:
+            lines.append(f"also: and {len(error.also) - LISTED} more")
+        return error.code, lines
+    kind = _one_line(f"{type(error).__name__}: {error}")
+    return ExitCode.BUG, [
+        f"error: warpir: a fault of its own ({kind})",
+        "please report it with the lines above and the command that was run",
+    ]
+
+
+def _one_line(text: str) -> str:
+    if len(text) > LONGEST:  # what was found stands at the beginning, what was expected at the end
+        text = f"{text[: LONGEST // 2]} ... {text[-LONGEST // 2 :]}"
+    # File names may hold line breaks and control characters.
+    return "".join(c if c.isprintable() else repr(c)[1:-1] for c in text)
+
+
+def say(line: str) -> None:
+    """Print on standard output; a reader that went away, or a full disk, does not end the run."""
+    try:
+        print(_one_line(line), flush=True)
+    except OSError:
+        # Python flushes once more at exit: give it somewhere to write to.
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())

@@ -1,0 +1,182 @@
+"""What a run leaves about itself: the content of ``run.json``."""
+
+import hashlib
+import importlib.util
+import os
+import platform
+import sys
+import time
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+import warpir
+from warpir.app.config import InsertConfig
+from warpir.core.errors import InputError
+from warpir.core.memory import peak_mib
+
+OF_THE_RUN = ("out", "overwrite", "resume", "threads", "report")
+"""Settings that change nothing in a result, so that its pictures do not hold them."""
+PATHS = (
+    *("photo", "occluder_mask", "asset", "materials", "camera", "ground_points", "proxy"),
+    *("shadow_mask", "light", "prior", "regressor", "model", "lora", "reuse", "sequence", "out"),
+)
+"""Settings that name a file or a folder."""
+RUN_FORMAT = 1
+"""Layout number of ``run.json``; a newer one is refused: its keys may mean other things."""
+RECORDED_PACKAGES = (
+    *("warp-lang", "torch", "numpy", "trimesh", "OpenEXR", "OpenImageIO", "pillow"),
+    *("diffusers", "transformers", "peft", "safetensors"),
+)
+
+MODEL_STEMS = {"camera": ("cameras", "images"), "ground_points": ("points3D",)}
+"""What is read of a COLMAP model, by field."""
+
+
+class Timings:
+    """Seconds by stage, in the order of the run."""
+
+    def __init__(self) -> None:
+        self.seconds: dict[str, float] = {}
+
+    @contextmanager
+    def stage(self, name: str) -> Iterator[None]:
+        """Time a ``with`` block; a stage entered twice adds up."""
+        start = time.perf_counter()
+        try:
+            yield
+        finally:
+            spent = time.perf_counter() - start
+            self.seconds[name] = self.seconds.get(name, 0.0) + spent
+
+    def rounded(self) -> dict[str, float]:
+        """Return seconds by stage as they are told, to the millisecond."""
+        return {name: round(spent, 3) for name, spent in self.seconds.items()}
+
+
+def run_record(
+    config: InsertConfig,
+    *,
+    inputs: Mapping[str, str],
+    device: str,
+    timings: Timings,
+    assumed: Sequence[str] = (),
+    notices: Sequence[str] = (),
+    measured: Mapping[str, Any] | None = None,
+) -> dict[str, Any]:
+    """Return the content of ``run.json``; ``--config run.json`` runs it again.
+
+    Args:
+        config: What was asked for.
+        inputs: sha256 of the files that were read, from `warpir.app.inputs.Inputs.hashes`.
+        device: What computed it, such as ``cpu`` or the name of a card.
+        timings: Seconds by stage.
+        assumed: What was chosen because nothing was given, one line each.
+        notices: What was repaired, converted or left out, one line each.
+        measured: Plain numbers about the result, such as photometry and clamped pixels.
+    """
+    return {
+        "format": RUN_FORMAT,
+        "warpir": warpir.__version__,
+        "config": asdict(config),
+        "inputs": dict(inputs),
+        "assumed": list(assumed),
+        "notices": list(notices),
+        "measured": dict(measured or {}),
+        "device": device,
+        "versions": versions(),
+        "seconds": timings.rounded(),
+        "peak_mib": peak_mib(),
+    }
+
+
+def config_of_picture(config: InsertConfig) -> dict[str, Any]:
+    """Return the configuration as a picture carries it, which may be given to others.
+
+    Of paths only the names are left: where somebody keeps their files is for ``run.json``. A
+    model's name in the hub is no path.
+    """
+    return {
+        name: name_of(value) if name in PATHS and value is not None else value
+        for name, value in asdict(config).items()
+        if name not in OF_THE_RUN
+    } | ({"model": config.model} if is_hub_id(config.model) else {})
+
+
+def is_hub_id(model: str | None) -> bool:
+    """Return whether a model is called by its name in the hub, and is no folder here."""
+    from warpir.diffusion.model_folder import HUB_ID
+
+    return model is not None and HUB_ID.fullmatch(model) is not None and not os.path.isdir(model)
+
+
+def name_of(path: str) -> str:
+    """Return the last part of a path, of ``.`` that of the folder it stands for."""
+    return Path(os.path.abspath(path)).name
+
+
+def input_files(config: InsertConfig) -> dict[str, Path]:
+    """Return every input file that a flag names, by the name of its field; of a model, its files.
+
+    Not the asset, the mesh of the place and the earlier run, whose readers hash what they read.
+    """
+    # Here, since the command line imports this module and must not load NumPy for --help.
+    from warpir.diffusion.weight_files import beside_lora
+    from warpir.io.cameras.colmap_model import is_model, model_files
+
+    names = (
+        *("photo", "occluder_mask", "materials", "camera", "light", "lora"),
+        *("prior", "regressor", "ground_points", "shadow_mask"),
+    )
+    paths = {name: Path(path) for name in names if (path := getattr(config, name)) is not None}
+    for name, stems in MODEL_STEMS.items():
+        if name in paths and is_model(paths[name]):
+            files = model_files(paths.pop(name), *stems)
+            paths |= {f"{name}/{file.name}": file for file in files}
+    if "lora" in paths and (beside := beside_lora(paths["lora"])) is not None:
+        paths[f"lora/{beside.name}"] = beside
+    return paths
+
+
+def file_hash(path: Path) -> str:
+    """Return the sha256 of a file, or `warpir.scene.asset.ABSENT` where there is none.
+
+    Raises:
+        InputError: It cannot be read.
+    """
+    from warpir.scene.asset import ABSENT
+
+    try:
+        with path.open("rb") as stream:
+            return hashlib.file_digest(stream, "sha256").hexdigest()
+    except FileNotFoundError:
+        return ABSENT
+    except OSError as error:
+        raise InputError(path, f"cannot be read ({error.strerror})") from error
+
+
+def sources_hash() -> str:
+    """Return the sha256 of warpir's own modules: a checkout changes without another version."""
+    digest = hashlib.sha256()
+    for package in ("warpir", "warpir.kernels", "warpir.diffusion"):
+        spec = importlib.util.find_spec(package)
+        assert spec is not None and spec.origin is not None
+        for file in sorted(Path(spec.origin).parent.glob("*.py")):
+            digest.update(f"{package}/{file.name}\0".encode() + file.read_bytes())
+    return digest.hexdigest()
+
+
+def versions() -> dict[str, str]:
+    """Return the versions that a result depends on, without importing the packages."""
+    import importlib.metadata
+
+    found = {"python": platform.python_version(), "platform": sys.platform}
+    found["warpir"] = f"{warpir.__version__} (sources {sources_hash()[:16]})"
+    for name in RECORDED_PACKAGES:
+        try:
+            found[name] = importlib.metadata.version(name)
+        except importlib.metadata.PackageNotFoundError:
+            found[name] = "absent"
+    return found

@@ -1,0 +1,7 @@
+"""``python -m warpir.batch``."""
+
+import sys
+
+from warpir.batch.command import main
+
+sys.exit(main())

@@ -1,0 +1,178 @@
+"""JSON as the standard has it: Python's reader also takes NaN and duplicate keys, this one not."""
+
+import hashlib
+import json
+import math
+import re
+from pathlib import Path
+from typing import Any
+
+from warpir.core.errors import ExitCode, InputError
+from warpir.core.limits import LIMITS, Limits
+
+
+class _Refused(Exception):
+    """A construct that the standard forbids; `pattern` finds it in the text."""
+
+    def __init__(self, what: str, pattern: str) -> None:
+        super().__init__(what)
+        self.what = what
+        self.pattern = pattern
+
+
+def read_json_object(path: str | Path, limits: Limits = LIMITS) -> dict[str, Any]:
+    """Read a file that holds one JSON object.
+
+    Args:
+        path: A regular file, UTF-8 with or without a byte order mark.
+        limits: How large and how nested it may be.
+
+    Raises:
+        InputError: Missing, too large, or not strict JSON; the text names the line.
+    """
+    return parse_json_object(path, _read(Path(path), limits), limits)
+
+
+def _read(path: Path, limits: Limits) -> bytes:
+    """Return what a regular file holds.
+
+    Raises:
+        InputError: Missing or too large.
+    """
+    try:
+        if not path.is_file():
+            raise InputError(path, "no such file" if not path.exists() else "not a regular file")
+        limits.check("json_bytes", path.stat().st_size, path, "too large", more=" bytes")
+        return path.read_bytes()
+    except OSError as error:
+        raise InputError(path, f"cannot be read ({error.strerror})") from error
+
+
+def parse_json_object(where: str | Path, raw: bytes, limits: Limits = LIMITS) -> dict[str, Any]:
+    """Parse the bytes of one JSON object; `where` is named in the error text.
+
+    Raises:
+        InputError: It is not strict JSON, holds too much, is nested too deeply, or another value.
+    """
+    # Before it is parsed: a list of nothing takes 3 bytes in the file and 80 in memory. Those that
+    # stand in texts are counted, too.
+    values = sum(map(raw.count, (b"{", b"[", b",")))
+    limits.check("json_values", values, where, "too many values in JSON")
+
+    def constant(word: str) -> float:
+        raise _Refused(f"{word} is not JSON", rf"(?<![\w\"]){re.escape(word)}(?![\w\"])")
+
+    def number(digits: str) -> float:
+        value = float(digits)
+        if not math.isfinite(value):
+            raise _Refused(f"number {digits[:20]} is too large", re.escape(digits))
+        return value
+
+    def unique(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+        record: dict[str, Any] = {}
+        for key, value in pairs:
+            if key in record:
+                shown = json.dumps(key)
+                raise _Refused(
+                    f"key {shown[:60]} appears twice",
+                    rf"{re.escape(shown)}\s*:[\s\S]*?{re.escape(shown)}\s*(?=:)",
+                )
+            record[key] = value
+        return record
+
+    try:
+        text = raw.decode("utf-8-sig")
+    except UnicodeDecodeError as error:
+        line = raw.count(b"\n", 0, error.start) + 1
+        raise InputError(where, f"line {line}: not UTF-8 text") from error
+    try:
+        root = json.loads(
+            text, parse_constant=constant, parse_float=number, object_pairs_hook=unique
+        )
+    except json.JSONDecodeError as error:
+        raise InputError(where, f"line {error.lineno}: not JSON ({error.msg})") from error
+    except _Refused as refused:
+        found = re.search(refused.pattern, text)
+        line = text.count("\n", 0, found.end()) + 1 if found else 1
+        raise InputError(where, f"line {line}: {refused.what}") from refused
+    except RecursionError as error:  # beyond every limit that can be given
+        deepest = limits.nesting
+        what = f"JSON nested too deeply (limit {deepest}); --max-nesting raises it"
+        raise InputError(where, what) from error
+    except ValueError as error:  # integers of 5000 digits
+        raise InputError(where, "not JSON that can be read (a number of 5000 digits)") from error
+    if not isinstance(root, dict):
+        raise InputError(
+            where, f"line 1: not a JSON object (found {type(root).__name__}; expected an object)"
+        )
+    limits.check("nesting", _depth(root), where, "JSON nested too deeply", more=" levels")
+    return root
+
+
+def read_json_lines(
+    path: str | Path, what: str, most: int, limits: Limits = LIMITS
+) -> tuple[list[tuple[int, bytes]], str]:
+    """Read a file of JSON objects, one a line; `parse_json_object` parses a line.
+
+    Args:
+        path: A regular file.
+        what: What a line is, in the plural, for a person.
+        most: How many there may be.
+        limits: How large the file may be.
+
+    Returns:
+        The number and the bytes of each line that is not blank, and the sha256 of the whole file.
+
+    Raises:
+        InputError: Missing, too large, or of another number of lines (`ExitCode.USAGE`).
+    """
+    try:
+        raw = _read(Path(path), limits)
+    except InputError as error:
+        error.code = ExitCode.USAGE
+        raise
+    lines = [(number, line) for number, line in enumerate(raw.split(b"\n"), 1) if line.strip()]
+    if not 1 <= len(lines) <= most:
+        found = f"{what} miscounted (found {len(lines)}; expected 1 to {most})"
+        raise InputError(path, found, code=ExitCode.USAGE)
+    return lines, hashlib.sha256(raw).hexdigest()
+
+
+def _depth(root: dict[str, Any]) -> int:
+    """Return how many objects and lists are within each other at most."""
+    depth = 0
+    level: list[dict[str, Any] | list[Any]] = [root]
+    while level:
+        depth += 1
+        level = [
+            value
+            for held in level
+            for value in (held.values() if isinstance(held, dict) else held)
+            if isinstance(value, dict | list)
+        ]
+    return depth
+
+
+def read_numbers(path: str | Path, pointer: str, value: Any, count: int) -> list[float]:
+    """Return a list of numbers that was read from a JSON file.
+
+    Args:
+        path: The file.
+        pointer: Where the list stands in it.
+        value: What stands there.
+        count: How many are expected; one stands by itself in the file.
+
+    Raises:
+        InputError: It is something else.
+    """
+    numeric = isinstance(value, list) and len(value) == count
+    if not numeric or any(isinstance(v, bool) or not isinstance(v, int | float) for v in value):
+        expected = "a number" if count == 1 else f"a list of {count} numbers"
+        raise InputError(path, f"{pointer}: {expected} expected")
+    numbers = []
+    for v in value:
+        try:
+            numbers.append(float(v))
+        except OverflowError:
+            raise InputError(path, f"{pointer}: a number beyond every use") from None
+    return numbers

@@ -1,0 +1,342 @@
+"""Crops for other systems to estimate light from, and the maps they made of them.
+
+`export_crops` writes one photo per scene and ``crops.json``, which says in words and numbers how a
+map must stand; `read_predictions` takes the maps back, named as the crops are.
+
+A map is expected as DiffusionLight, StyleLight and LuxDiT write it: lat-long, the image centre
+shows what the photo's centre shows, what lies to the right of the camera is right of the centre, up
+is up. That leaves open what "up" is for a camera that looks up or down; ``maps.frame`` in
+``crops.json`` says it, see `FRAMES`.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Protocol
+
+import numpy as np
+from numpy.lib.format import open_memmap
+from numpy.typing import NDArray
+from scipy.ndimage import uniform_filter1d
+
+from warpir.core.color import gamma_to_linear
+from warpir.core.errors import InputError, raise_all
+from warpir.core.limits import LIMITS
+from warpir.core.strict_json import read_json_object
+from warpir.evaluate.three_spheres import from_camera_frame, lookup_matrix
+from warpir.io.images.decoder import check_regular_file
+from warpir.io.images.photos import read_envmap
+from warpir.io.results import OutputFolder
+from warpir.scene.camera import Camera
+from warpir.scene.light import (
+    Float64Array,
+    FloatArray,
+    angles_from_axis,
+    map_directions,
+    rotate_map,
+)
+
+INDEX = "crops.json"
+SUFFIXES = (".exr", ".hdr", ".npy")
+"""Kinds of files that a map can come in."""
+
+FRAMES = {
+    "camera": "tilted with the camera: image centre = optical axis, top = the photo's up "
+    "(DiffusionLight, StyleLight)",
+    "level": "the horizon is the middle row: image centre = optical axis without its pitch, "
+    "top = the sky",
+}
+"""What a map can be aligned with; the same for a camera that looks straight ahead."""
+DEFAULT_FRAME = "camera"
+
+PUBLIC_SIZE = (192, 256)
+"""Rows and columns of the crop of the public three-sphere protocol [px]."""
+PUBLIC_FOV_DEG = 60.0
+"""Its vertical field of view [deg]."""
+PUBLIC_GAMMA = 2.4
+PUBLIC_PERCENTILE = 99.0
+PUBLIC_WHITE = 0.9
+"""Its tone: ``(alpha x) ** (1 / 2.4)`` with this percentile of the non-zero values at .9."""
+LEVEL_TOLERANCE = 1e-9
+"""A camera whose up axis differs less from +Y is level: its maps are turned without resampling."""
+
+
+class SceneCrop(Protocol):
+    """What `export_crops` and `read_predictions` want to know of a scene."""
+
+    @property
+    def name(self) -> str:
+        """Letters, digits, ``_``, ``-`` and ``.`` only; each scene has another one."""
+
+    @property
+    def panorama(self) -> str | Path:
+        """The panorama that the crop was taken from; its file name is written down."""
+
+    @property
+    def camera(self) -> Camera:
+        """Camera of the photo, in the world in which the light is compared."""
+
+    @property
+    def photo(self) -> FloatArray:
+        """The crop, display-encoded (gamma 2.2) in [0, 1], shape [H, W, 3]."""
+
+    @property
+    def exposure(self) -> float:
+        """Linear value of the photo per radiance of the panorama [1]."""
+
+
+@dataclass(frozen=True)
+class Predictions:
+    """The maps of another system."""
+
+    maps: dict[str, FloatArray]
+    """Radiance by scene name, world frame, our orientation, shape [He, 2 He, 3]."""
+    missing: tuple[str, ...]
+    """Scenes without a map."""
+    unused: tuple[str, ...]
+    """Files that have the name of no scene."""
+    frame: str
+    """A key of `FRAMES`."""
+
+
+def export_crops(scenes: Sequence[SceneCrop], folder: str | Path, overwrite: bool = False) -> None:
+    """Write ``NAME.png`` for each scene, ``NAME.public.png`` where it can be made, and the index.
+
+    Args:
+        scenes: All with different names.
+        folder: Made when missing.
+        overwrite: Whether an earlier export is replaced.
+
+    Raises:
+        InputError: The folder holds files, or cannot be written.
+    """
+    entries: list[dict[str, Any]] = []
+    with OutputFolder(folder, overwrite) as output:
+        for scene in scenes:
+            photo = f"{scene.name}.png"
+            output.write_png(photo, _codes(scene.photo), mark=False)
+            public = public_crop(scene.photo, scene.camera)
+            if public is not None:
+                output.write_png(f"{scene.name}.public.png", _codes(public), mark=False)
+            rotation = scene.camera.c2w[:3, :3]
+            azimuth, pitch = angles_from_axis(-rotation[:, 2])
+            entries.append(
+                {
+                    "name": scene.name,
+                    "photo": photo,
+                    "public_photo": None if public is None else f"{scene.name}.public.png",
+                    "panorama": Path(scene.panorama).name,
+                    "azimuth_deg": azimuth,
+                    "pitch_deg": pitch,
+                    "exposure": scene.exposure,
+                    "camera": scene.camera.record(),
+                    "world_direction_of_a_map_in_the_camera_frame": {
+                        "image_centre": (-rotation[:, 2]).tolist(),
+                        "middle_row_three_quarters_to_the_right": rotation[:, 0].tolist(),
+                        "top_row": rotation[:, 1].tolist(),
+                    },
+                }
+            )
+        output.write_json(
+            INDEX,
+            {
+                "photos": "display-encoded: linear = code ** 2.2; linear = exposure x radiance of "
+                "the panorama. public_photo: the 192 x 256 crop of the public three-sphere "
+                "protocol, vertical field of view 60 degrees, gamma 2.4, 99th percentile at 0.9, "
+                "made from the photo where that shows enough",
+                "expected": "one map per photo, NAME.exr, NAME.hdr or NAME.npy (float, [H, 2 H, "
+                "3]): lat-long, linear radiance, finite, not negative, twice as wide as high",
+                "orientation": "image centre = viewing direction of the photo; right of the "
+                "centre = to the camera's right; left and right edge = behind the camera; top = "
+                "up. Test: a map that is black but for its centre lights an object from behind "
+                "it, as seen in the photo; one that is bright three quarters to the right lights "
+                "its right side",
+                "world": "right-handed, +Y up; azimuth clockwise from -Z seen from above",
+                "maps": {"frame": DEFAULT_FRAME, "scale": 1.0},
+                "about_maps": {
+                    "use": "copy this file to the folder of the maps and edit `maps` if they "
+                    "differ from it; without the file, these values hold",
+                    "frame": FRAMES,
+                    "scale": "factor from the maps' unit to the photo's linear values",
+                },
+                "crops": entries,
+            },
+        )
+
+
+def read_predictions(folder: str | Path, scenes: Sequence[SceneCrop]) -> Predictions:
+    """Read the maps of another system for the scenes and turn them to the world frame.
+
+    Args:
+        folder: Holds ``NAME.exr``, ``NAME.hdr`` or ``NAME.npy``, and ``crops.json`` if the maps
+            are not as it says by default.
+        scenes: The scenes that were exported, at least one.
+
+    Raises:
+        InputError: No folder, no map for any scene, two for one, or one that is not clean 2:1
+            radiance; all problems at once.
+    """
+    folder = Path(folder)
+    if not folder.is_dir():
+        raise InputError(folder, "not a folder (expected a folder of environment maps)")
+    frame, scale = _options(folder)
+    found: dict[str, list[Path]] = {}
+    for path in sorted(folder.iterdir()):
+        if path.suffix.lower() in SUFFIXES:
+            found.setdefault(path.stem, []).append(path)
+    maps: dict[str, FloatArray] = {}
+    problems: list[InputError] = []
+    for scene in scenes:
+        paths = found.pop(scene.name, [])
+        try:
+            if len(paths) > 1:
+                names = " and ".join(path.name for path in paths)
+                raise InputError(paths[0], f"more than one map of a scene (found {names})")
+            if paths:
+                texels = _read_map(paths[0]) * np.float32(scale)
+                maps[scene.name] = to_world(texels, scene.camera, frame)
+        except InputError as problem:
+            problems.append(problem)
+    raise_all(problems)
+    unused = tuple(path.name for paths in found.values() for path in paths)
+    if not maps:
+        raise InputError(
+            folder,
+            f"no map for any scene (found {unused[0] if unused else 'no map'}; expected "
+            f"{scenes[0].name}.exr, .hdr or .npy)",
+            "name the maps as the exported crops",
+        )
+    missing = tuple(scene.name for scene in scenes if scene.name not in maps)
+    return Predictions(maps, missing, unused, frame)
+
+
+def to_world(texels: FloatArray, camera: Camera, frame: str) -> FloatArray:
+    """Turn a map whose image centre is the viewing direction to the world and our orientation.
+
+    Args:
+        texels: Radiance, shape [He, 2 He, 3].
+        camera: Camera of the photo.
+        frame: A key of `FRAMES`.
+
+    Returns:
+        Radiance, world frame, same shape. A level camera's maps are moved by columns; others are
+        resampled with 2 x 2 look-ups per texel, which keeps the flux of a single one to 2 %
+        (to 10 % in the row at a pole).
+    """
+    if frame not in FRAMES:
+        raise ValueError(f"frame {frame!r} is not one of {', '.join(FRAMES)}")
+    # Ours has -Z at its left and right edge, not in the centre.
+    seen = rotate_map(texels, 180.0)
+    rotation = camera.c2w[:3, :3]
+    is_level = float(np.abs(rotation[:, 1] - (0.0, 1.0, 0.0)).max()) < LEVEL_TOLERANCE
+    if frame == "level" or is_level:
+        azimuth, _ = angles_from_axis(-rotation[:, 2])
+        return from_camera_frame(seen, azimuth)
+    height = len(texels)
+    # Toward the poles texels get narrower than the look-ups' spacing: average them to it first.
+    wide = seen.astype(np.float64)
+    for row, sine in enumerate(np.sin(np.pi * (np.arange(height) + 0.5) / height)):
+        wide[row] = uniform_filter1d(wide[row], 2 * int(0.5 / sine) + 1, axis=0, mode="wrap")
+    flat = wide.reshape(-1, 3)
+    total = np.zeros_like(flat)
+    fine = map_directions(2 * height, 4 * height)
+    for i in (0, 1):
+        for j in (0, 1):
+            directions = fine[i::2, j::2].reshape(-1, 3)
+            total += lookup_matrix(directions @ rotation, height) @ flat
+    return (total / 4.0).reshape(texels.shape).astype(np.float32)
+
+
+def public_crop(photo: FloatArray, camera: Camera) -> Float64Array | None:
+    """Return the crop that the public three-sphere protocol gives to a method, [192, 256, 3].
+
+    Args:
+        photo: Display-encoded with gamma 2.2, shape [H, W, 3].
+        camera: Its camera.
+
+    Returns:
+        Display-encoded with gamma 2.4, or nothing where the photo's vertical field of view is not
+        60 degrees or it is narrower than 4:3. What the photo clips stays clipped, and the camera
+        keeps its pitch, where the protocol's is level.
+    """
+    from skimage.transform import resize as resize_image
+
+    fov = 2.0 * np.degrees(np.arctan(camera.height / (2.0 * camera.fy)))
+    rows, columns = PUBLIC_SIZE
+    width = round(camera.height * columns / rows)
+    if abs(fov - PUBLIC_FOV_DEG) > 0.5 or width > camera.width:
+        return None
+    left = (camera.width - width) // 2
+    linear = gamma_to_linear(photo[:, left : left + width].astype(np.float64))
+    small = resize_image(  # type: ignore[no-untyped-call]
+        linear, (rows, columns, 3), order=1, anti_aliasing=camera.height > rows
+    )
+    powered = np.maximum(np.asarray(small, np.float64), 0.0) ** (1.0 / PUBLIC_GAMMA)
+    if not powered.any():
+        return powered
+    alpha = PUBLIC_WHITE / float(np.percentile(powered[powered > 0.0], PUBLIC_PERCENTILE))
+    return np.clip(alpha * powered, 0.0, 1.0)
+
+
+def _codes(display: FloatArray | Float64Array) -> NDArray[np.uint8]:
+    """Return 8-bit codes of a picture in [0, 1]."""
+    codes = np.round(np.clip(display.astype(np.float64), 0.0, 1.0) * 255.0)
+    return codes.astype(np.uint8)
+
+
+def _options(folder: Path) -> tuple[str, float]:
+    """Return frame and scale of a folder's maps, from its ``crops.json`` if there is one."""
+    path = folder / INDEX
+    if not path.exists():
+        return DEFAULT_FRAME, 1.0
+    maps = read_json_object(path).get("maps", {})
+    if not isinstance(maps, dict):
+        raise InputError(path, "/maps: not an object")
+    frame, scale = maps.get("frame", DEFAULT_FRAME), maps.get("scale", 1.0)
+    if frame not in FRAMES:
+        raise InputError(
+            path, f"/maps/frame: unknown (found {frame!r}; expected {' or '.join(FRAMES)})"
+        )
+    if isinstance(scale, bool) or not isinstance(scale, int | float) or not scale > 0.0:
+        raise InputError(path, f"/maps/scale: not a factor (found {scale!r}; expected > 0)")
+    return frame, float(scale)
+
+
+def _read_map(path: Path) -> FloatArray:
+    """Read one map as it stands; refuse what is not clean radiance with some light in it."""
+    if path.suffix.lower() == ".npy":
+        texels = _read_array(path)
+    else:
+        texels = read_envmap(path, strict=True)
+    if not texels.any():
+        raise InputError(path, "black: every texel is 0")
+    return texels
+
+
+def _read_array(path: Path) -> FloatArray:
+    """Read a map from a NumPy file, with the checks that `read_envmap` makes."""
+    check_regular_file(path)
+    try:
+        # Unlike `numpy.load`, this reads no zip archives and no pickles, whatever the file says.
+        stored = open_memmap(path, mode="r")
+    except Exception as error:  # its header is parsed as Python: whatever the tokenizer raises
+        raise InputError(path, "not a NumPy array of numbers, or damaged") from error
+    if stored.dtype.kind != "f":
+        raise InputError(path, "not an array of floating-point numbers")
+    height = stored.shape[0] if stored.ndim else 0
+    if stored.shape != (height, 2 * height, 3) or not 2 <= height <= LIMITS.envmap_width // 2:
+        raise InputError(
+            path,
+            f"not a lat-long map (found shape {stored.shape}; expected [H, 2 H, 3])",
+            "resize it to twice as wide as high, RGB last",
+        )
+    with np.errstate(over="ignore"):  # counted as not finite below
+        texels = np.array(stored, np.float32)
+    bad, negative = int((~np.isfinite(texels)).sum()), int((texels < 0.0).sum())
+    if bad or negative:
+        raise InputError(
+            path,
+            f"not clean radiance (found {bad} values that are not finite, {negative} negative; "
+            "expected finite values >= 0)",
+        )
+    return texels

@@ -1,0 +1,529 @@
+"""The rows of the evaluation: whose light is judged."""
+
+from __future__ import annotations
+
+import hashlib
+import tempfile
+import time
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, replace
+from functools import cache, cached_property
+from importlib.resources import files
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from warpir.app.config import InsertConfig, usage
+from warpir.app.inputs import Inputs
+from warpir.app.model_files import require_model
+from warpir.app.record import Timings
+from warpir.core.color import luminance
+from warpir.core.errors import InputError
+from warpir.core.progress import StepProgress
+from warpir.diffusion.embedded import build_network, save_embedded
+from warpir.evaluate.scenes import Place, Subject, mirrored
+from warpir.evaluate.stage import Prediction, Stage
+from warpir.io.images.photos import Photo, read_photo
+from warpir.io.results import OutputFolder, png_bytes
+from warpir.lighting.fit import fit_lobes
+from warpir.lighting.regressor import Regressor, mean_training_light, random_regressor, regress
+from warpir.lighting.scene_light import make_light
+from warpir.optimize.recover import Run, recover
+from warpir.scene.light import Light, Lobes, rotate_map
+from warpir.scene.placement import Placement
+
+FloatArray = NDArray[np.float32]
+Float64Array = NDArray[np.float64]
+
+ORACLE_LOBES = 64
+"""Lobes that the oracle has: as many as the recovered light."""
+BRIGHT_SIGMA = np.radians(5.0)
+"""Width of the lobe that stands for the brightest visible region [rad]."""
+MEAN_OVER_PHOTO = 2.0
+"""Mean radiance of all directions over the photo's mean: of 120 crops of 20 panoramas the middle
+one had 2.1, because lamps and suns are seldom in the picture."""
+BLUR_SHARE = 0.02
+"""Standard deviation of the blur under which it is sought, over the photo's width [1]."""
+
+
+class Bench:
+    """What the rows may use.
+
+    Args:
+        scenes: All places and their subjects.
+        device: Warp device; torch uses the same.
+        seed: Of guided runs and of random weights.
+        config: What guided runs start from, without files: model or prior, steps, precision.
+        network: The regressor, or None.
+        missing: Why there is no regressor.
+        predictions: Lights of another system by the place's name, world frame.
+    """
+
+    def __init__(
+        self,
+        scenes: list[tuple[Place, list[Subject]]],
+        device: str,
+        seed: int,
+        config: InsertConfig,
+        network: Regressor | None = None,
+        missing: InputError | None = None,
+        predictions: Mapping[str, FloatArray] | None = None,
+    ) -> None:
+        self.scenes, self.device, self.seed, self.config = scenes, device, seed, config
+        self._network, self._missing = network, missing
+        self.predictions = predictions or {}
+
+    @property
+    def network(self) -> Regressor:
+        """The regressor.
+
+        Raises:
+            InputError: There is none (`ExitCode.MODEL`).
+        """
+        if self._network is None:
+            assert self._missing is not None
+            raise self._missing
+        return self._network
+
+    @cache  # noqa: B019, a bench lives as long as the program
+    def require_prior(self) -> None:
+        """Check that something can guide.
+
+        Raises:
+            InputError: The weights are not there, or not what they should be (`ExitCode.MODEL`).
+        """
+        require_model(replace(self.config, start="uniform"))
+
+    def digests(self) -> dict[str, str | None]:
+        """Return the sha256 of the weights that were used, by what they are."""
+        where = files("warpir.diffusion") / "weights"
+        found: dict[str, str | None] = {}
+        for name in ("regressor", "prior"):
+            given = getattr(self.config, name)
+            path = Path(str(where / f"{name}.safetensors")) if given is None else Path(given)
+            found[name] = None
+            if path.is_file():
+                with path.open("rb") as stream:
+                    found[name] = hashlib.file_digest(stream, "sha256").hexdigest()
+        return found
+
+    @cached_property
+    def random_network(self) -> Regressor:
+        """A regressor that has learnt nothing."""
+        where = torch.device("cpu" if self.device == "cpu" else self.device)
+        return random_regressor(self.seed).to(where)
+
+    def other(self, place: Place) -> Place:
+        """Return the next place of another panorama.
+
+        Raises:
+            InputError: There is only one panorama.
+        """
+        places = [p for p, _ in self.scenes]
+        k = places.index(place)
+        for candidate in (*places[k + 1 :], *places[:k]):
+            if candidate.panorama != place.panorama:
+                return candidate
+        raise InputError("--panoramas", "another scene's row needs two panoramas or more")
+
+
+@dataclass(frozen=True)
+class Row:
+    """One line of the tables."""
+
+    group: str
+    """A key of `GROUPS`."""
+    words: str
+    """What it is, for a reader of the tables."""
+    of_place: Callable[[Bench, Place], Prediction] | None = None
+    """Of a row that asks the photograph alone."""
+    of_subject: Callable[[Bench, Stage, Subject], Prediction] | None = None
+    """Of a row that depends on the object too."""
+    start: str | None = None
+    """The row that it starts from and should be better than."""
+    same_as: str | None = None
+    """The row whose light it should give."""
+    needs: tuple[str, ...] = ()
+    """Some of ``regressor``, ``prior`` and ``panoramas``, two of them."""
+
+    def require(self, bench: Bench) -> None:
+        """Check that what the row needs is there.
+
+        Raises:
+            InputError: It is not.
+        """
+        if "panoramas" in self.needs:
+            bench.other(bench.scenes[0][0])
+        if "regressor" in self.needs:
+            _ = bench.network
+        if "prior" in self.needs:
+            bench.require_prior()
+
+
+GROUPS = {
+    "references": "what is known of the truth",
+    "baselines": "guesses that need no learning",
+    "methods": "what warpir does",
+    "predictions": "lights of another system (--predictions)",
+    "controls": "what must fail, or flip",
+    "ablations": "the authors' Table S3, each from an even light and without the acceptance test",
+}
+"""Of rows; a group's name stands for all of its rows."""
+
+
+def _even(level: float) -> Light:
+    return Light(texels=np.full((8, 16, 3), level, np.float32))
+
+
+def uniform(bench: Bench, place: Place) -> Prediction:
+    """Return an even grey light, as bright as the photograph lets one expect."""
+    return Prediction.of(_even(MEAN_OVER_PHOTO * float(luminance(place.photo_lin).mean())))
+
+
+def brightest(bench: Bench, place: Place) -> Prediction:
+    """Return a light of the photograph's mean colour, half of it from its brightest region.
+
+    As bright on the whole as `uniform`.
+    """
+    from scipy.ndimage import gaussian_filter
+
+    photo, camera = place.photo_lin, place.camera
+    blurred = gaussian_filter(luminance(photo), BLUR_SHARE * camera.width, mode="nearest")
+    row, column = np.unravel_index(int(np.argmax(blurred)), blurred.shape)
+    _, axis = camera.ray(float(column) + 0.5, float(row) + 0.5)
+    half = 0.5 * MEAN_OVER_PHOTO * photo.reshape(-1, 3).mean(axis=0)
+    lobes = Lobes(
+        np.ones((1, 3), np.float32),
+        axis[None].astype(np.float32),
+        np.array([1.0 / BRIGHT_SIGMA**2], np.float32),
+    )
+    lobes.amplitude[:] = 4.0 * np.pi * half / lobes.flux()
+    return Prediction.of(Light(lobes, np.broadcast_to(half, (8, 16, 3)).astype(np.float32)))
+
+
+def mean_training(bench: Bench, place: Place) -> Prediction:
+    """Return the mean light of the regressor's training, turned to the camera."""
+    return Prediction.of(
+        Light(lobes=mean_training_light(bench.network, place.photo, place.camera).lobes())
+    )
+
+
+def regression(bench: Bench, place: Place) -> Prediction:
+    """Return what the regressor sees."""
+    return _regressed(bench.network, place)
+
+
+def _regressed(network: Regressor, place: Place) -> Prediction:
+    found = regress(network, place.photo, place.camera)
+    return Prediction.of(Light(lobes=found.lobes()), spread_deg=found.spread_deg)
+
+
+def random_regression(bench: Bench, place: Place) -> Prediction:
+    """Return what a network says that has learnt nothing."""
+    return _regressed(bench.random_network, place)
+
+
+def other_photo(bench: Bench, place: Place) -> Prediction:
+    """Return what the regressor sees in another place, as if this camera had been there."""
+    other = bench.other(place)
+    found = regress(bench.network, other.photo, other.camera)
+    turned = Light(lobes=found.lobes()).rotated(other.azimuth - place.azimuth)
+    return Prediction.of(turned)
+
+
+def mirrored_photo(bench: Bench, place: Place) -> Prediction:
+    """Return what the regressor sees in the mirrored photograph, mirrored back."""
+    flipped = np.ascontiguousarray(place.photo[:, ::-1])
+    found = regress(bench.network, flipped, place.camera)
+    return Prediction.of(mirrored(Light(lobes=found.lobes()), place.azimuth))
+
+
+def turned(bench: Bench, place: Place) -> Prediction:
+    """Return the true light, turned by 180 degrees about the vertical."""
+    return Prediction.of(Light(texels=rotate_map(place.texels, 180.0)))
+
+
+def other_light(bench: Bench, place: Place) -> Prediction:
+    """Return the light of another place, as if this camera had been there."""
+    other = bench.other(place)
+    return Prediction.of(Light(texels=place.to_world(other.to_camera(other.texels))))
+
+
+def oracle(bench: Bench, place: Place) -> Prediction:
+    """Return lobes that were fitted to the truth."""
+    fit = fit_lobes(place.texels, ORACLE_LOBES)
+    return Prediction.of(Light(lobes=fit.lobes), irradiance_error=fit.irradiance_error)
+
+
+def truth(bench: Bench, stage: Stage, subject: Subject) -> Prediction:
+    """Return the truth: every error must be 0."""
+    return stage.true_prediction()
+
+
+def noise(bench: Bench, stage: Stage, subject: Subject) -> Prediction:
+    """Return the truth, rendered from other random numbers."""
+    return replace(stage.true_prediction(), seed=1)
+
+
+def tone_floor(bench: Bench, stage: Stage, subject: Subject) -> Prediction:
+    """Return the true light, shown by the best curves after Reinhard's operator."""
+    return replace(stage.true_prediction(), curves=stage.tone_floor())
+
+
+def predicted(bench: Bench, place: Place) -> Prediction:
+    """Return what another system said."""
+    if place.name not in bench.predictions:
+        raise InputError("--predictions", f"nothing for {place.name}")
+    return Prediction.of(Light(texels=bench.predictions[place.name]))
+
+
+def guided(**changes: Any) -> Callable[[Bench, Stage, Subject], Prediction]:
+    """Return a row that runs warpir's guided recovery with some settings changed."""
+
+    def predict(bench: Bench, stage: Stage, subject: Subject) -> Prediction:
+        return recover_light(bench, subject, subject.place.photo, changes)
+
+    return predict
+
+
+def guided_randomly(bench: Bench, stage: Stage, subject: Subject) -> Prediction:
+    """Return what a prior finds that has learnt nothing."""
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / "random.safetensors"
+        save_embedded(build_network(seed=bench.seed), path, {})
+        changes = {"guidance": "embedded", "model": None, "prior": str(path), "start": "regressed"}
+        return recover_light(bench, subject, subject.place.photo, changes)
+
+
+def guided_elsewhere(bench: Bench, stage: Stage, subject: Subject) -> Prediction:
+    """Return what guidance finds in another place's photograph, taken by this camera."""
+    other = bench.other(subject.place)
+    return recover_light(bench, subject, other.photo, {"start": "regressed"})
+
+
+def guided_mirrored(bench: Bench, stage: Stage, subject: Subject) -> Prediction:
+    """Return what guidance finds in the mirrored photograph of the mirrored object, mirrored."""
+    place, placement = subject.place, subject.placement
+    right = np.array([np.cos(np.radians(place.azimuth)), 0.0, np.sin(np.radians(place.azimuth))])
+    reflect = np.eye(4)
+    reflect[:3, :3] -= 2.0 * np.outer(right, right)
+    flipped = replace(subject, placement=_moved(placement, reflect @ placement.asset_to_world))
+    photo = np.ascontiguousarray(place.photo[:, ::-1])
+    found = recover_light(bench, flipped, photo, {"start": "regressed"})
+    light = mirrored(found.light, place.azimuth)
+    shadow = light
+    if found.light_shadow is not found.light:
+        shadow = mirrored(found.light_shadow, place.azimuth)
+    return replace(found, light=light, light_shadow=shadow)
+
+
+def _moved(placement: Placement, asset_to_world: Float64Array) -> Placement:
+    return replace(placement, asset_to_world=asset_to_world)
+
+
+def recover_light(
+    bench: Bench, subject: Subject, photo: FloatArray, changes: Mapping[str, Any]
+) -> Prediction:
+    """Run what `warpir.insert` runs, up to the recovered light and curves.
+
+    Args:
+        bench: Names prior or model.
+        subject: The object and where it stands.
+        photo: What guidance is shown, display-encoded, shape [H, W, 3].
+        changes: Settings that differ from the bench's.
+    """
+    place = subject.place
+    with tempfile.TemporaryDirectory() as folder:
+        codes = np.round(255.0 * photo).astype(np.uint8)
+        picture = _written(codes, Path(folder) / "photo.png")
+        out = Path(folder) / "out"
+        config = replace(
+            bench.config,
+            photo=str(Path(folder) / "photo.png"),
+            asset=str(subject.asset_path),
+            out=str(out),
+            prompt=bench.config.prompt or f"a {_words(subject.asset_path.stem)}",
+            device=bench.device,
+            seed=bench.seed,
+            checkpoint_every=0,
+            preview_every=0,
+            **changes,
+        )
+        inputs = Inputs(picture, subject.asset, place.camera, subject.placement)
+        timings = Timings()
+        started = time.perf_counter()
+        with (
+            StepProgress(lambda _: None) as progress,
+            OutputFolder(out) as output,
+        ):
+            run = Run(config, inputs, bench.device, output, timings, lambda _: None, progress)
+            light, record, _ = recover(run, make_light(inputs, config))
+    return Prediction(
+        light.light,
+        light.light_shadow,
+        light.curves,
+        about={"seconds": round(time.perf_counter() - started, 2), "record": record},
+    )
+
+
+def _written(codes: NDArray[np.uint8], path: Path) -> Photo:
+    path.write_bytes(png_bytes(codes, None, False, "a crop of a panorama"))
+    return read_photo(path)
+
+
+def _words(stem: str) -> str:
+    """Return a file's name as words for a prompt."""
+    letters = "".join(c if c.isalpha() else " " for c in stem)
+    return " ".join(letters.lower().split()) or "object"
+
+
+AUTHORS: dict[str, Any] = {
+    "null_background": "keep", "guidance_scale": 100.0, "time_min": 0.05, "time_max": 0.8,
+    "time_max_end": 0.4, "fusion": "schedule", "lobe_shape": True, "tone_curve": True, "rate": 1.0,
+}  # fmt: skip
+"""What ablations change of the embedded prior's defaults to be the authors' method: all unknowns,
+and their times on its schedule. Stable Diffusion's defaults are theirs already."""
+
+
+def _ablation(words: str, **changes: Any) -> Row:
+    def predict(bench: Bench, stage: Stage, subject: Subject) -> Prediction:
+        theirs = AUTHORS if bench.config.model is None else {}
+        settings = {"start": "uniform", "accept": False, **theirs, **changes}
+        return recover_light(bench, subject, subject.place.photo, settings)
+
+    return Row("ablations", words, of_subject=predict, start="uniform", needs=("prior",))
+
+
+ROWS = {
+    "truth": Row("references", "the true light: must be 0", of_subject=truth),
+    "noise": Row(
+        "references", "the true light, other samples: the renderer's noise", of_subject=noise
+    ),
+    "tone-floor": Row(
+        "references", "the true light, Reinhard and the best curves", of_subject=tone_floor
+    ),
+    "oracle": Row("references", f"{ORACLE_LOBES} lobes fitted to the true light", of_place=oracle),
+    "turned-180": Row("references", "the true light, turned by 180 degrees", of_place=turned),
+    "other-light": Row(
+        "references", "the light of another scene", of_place=other_light, needs=("panoramas",)
+    ),
+    "uniform": Row(
+        "baselines", "an even light, as bright as the photo lets one expect", of_place=uniform
+    ),
+    "mean-training-light": Row(
+        "baselines",
+        "the mean light of the regressor's training",
+        of_place=mean_training,
+        needs=("regressor",),
+    ),
+    "brightest-region": Row(
+        "baselines",
+        "the same, half of it from the brightest visible region",
+        of_place=brightest,
+    ),
+    "regression": Row("methods", "the regressor alone", of_place=regression, needs=("regressor",)),
+    "lds-uniform": Row(
+        "methods",
+        "guidance from an even light",
+        of_subject=guided(start="uniform"),
+        start="uniform",
+        needs=("prior",),
+    ),
+    "lds-regression": Row(
+        "methods",
+        "guidance from the regressor's light",
+        of_subject=guided(start="regressed"),
+        start="regression",
+        needs=("prior", "regressor"),
+    ),
+    "predictions": Row("predictions", "the lights of --predictions", of_place=predicted),
+    "random-regression": Row(
+        "controls", "a regressor with random weights", of_place=random_regression
+    ),
+    "other-photo": Row(
+        "controls",
+        "the regressor, shown another scene",
+        of_place=other_photo,
+        needs=("regressor", "panoramas"),
+    ),
+    "mirrored": Row(
+        "controls",
+        "the regressor, shown the mirrored photo; its light mirrored back",
+        of_place=mirrored_photo,
+        same_as="regression",
+        needs=("regressor",),
+    ),
+    "lds-random": Row(
+        "controls",
+        "guidance by a prior with random weights, from the regressor's light",
+        of_subject=guided_randomly,
+        start="regression",
+        needs=("regressor",),
+    ),
+    "lds-other-photo": Row(
+        "controls",
+        "guidance in another scene's photo",
+        of_subject=guided_elsewhere,
+        needs=("prior", "regressor", "panoramas"),
+    ),
+    "lds-mirrored": Row(
+        "controls",
+        "guidance in the mirrored photo; its light mirrored back",
+        of_subject=guided_mirrored,
+        same_as="lds-regression",
+        needs=("prior", "regressor"),
+    ),
+    "s3-full": _ablation("the authors' method", loss="lds", personalize=True),
+    "s3-dataset-update": _ablation("a picture edited again and again", loss="dataset-update"),
+    "s3-sds": _ablation("score distillation, adapted model", loss="sds", personalize=True),
+    "s3-sds-no-lora": _ablation("the same, base model", loss="sds-base"),
+    "s3-no-class-images": _ablation(
+        "no concept preservation", loss="lds", personalize=True, class_images=0
+    ),
+    "s3-no-tone-curve": _ablation("no tone curves", loss="lds", personalize=True, tone_curve=False),
+    "s3-no-fusion": _ablation("two lights to the end", loss="lds", personalize=True, fusion="none"),
+    "s3-single": _ablation(
+        "one light from the start", loss="lds", personalize=True, fusion="single"
+    ),
+    "s3-lora-both": _ablation(
+        "adapted model in both terms", loss="lds-lora-both", personalize=True
+    ),
+}
+"""By name; the order is that of the tables."""
+DEFAULT_ROWS = (
+    *(name for name, row in ROWS.items() if row.group in ("references", "baselines", "methods")),
+    *("random-regression", "other-photo", "mirrored"),
+)
+
+
+def chosen_rows(text: str | None, has_predictions: bool, is_guided: bool = True) -> list[str]:
+    """Return the rows that a list of names and groups stands for, in the tables' order.
+
+    Args:
+        text: Names of rows and groups, separated by commas; None: `DEFAULT_ROWS`.
+        has_predictions: Whether --predictions was given; its row is then among them.
+        is_guided: Whether guidance was asked for; else its rows must be named, for a plain run of
+            warpir.insert does not guide either, and they take most of the time.
+
+    Raises:
+        InputError: A name is unknown.
+    """
+    names = {k for k in DEFAULT_ROWS if is_guided or "prior" not in ROWS[k].needs}
+    if text is not None:
+        names = set()
+        for word in (w.strip() for w in text.split(",")):
+            found = {k for k, row in ROWS.items() if word in (k, row.group, "all")}
+            if not found:
+                known = ", ".join(dict.fromkeys((*GROUPS, *ROWS)))
+                raise usage("--rows", f"no row {word!a}", f"known: all, {known}")
+            names |= found
+        if not has_predictions and text != "all" and "predictions" in names:
+            raise usage("--rows", "predictions needs --predictions DIR")
+    if has_predictions:
+        names.add("predictions")
+    else:
+        names.discard("predictions")
+    return [name for name in ROWS if name in names]

@@ -1,0 +1,257 @@
+"""A subject in its place, ready to be lit: how a light and tone curves become a composite.
+
+Every light is rendered by the same renderer with the same geometry, samples and random numbers.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from warpir.core.color import linear_to_gamma
+from warpir.core.errors import InputError
+from warpir.evaluate.scenes import RESPONSES, Subject
+from warpir.render.bridge import ComposeConstants, compose
+from warpir.render.device_scene import Placed, Proxy, Scene
+from warpir.render.renderer import Foreground, Renderer, light_args
+from warpir.render.tone_curve import ToneCurve
+from warpir.scene.light import Light
+from warpir.scene.tone_curves import Curves, ToneKnots
+
+FloatArray = NDArray[np.float32]
+IntArray = NDArray[np.int32]
+
+FLOOR_EVALUATIONS = 60
+"""Times that the tone floor's curves are tried while they are sought."""
+EXPOSURE_EV = 8.0
+"""How far the fitted exposure may go, either way [EV]."""
+
+
+@dataclass(frozen=True)
+class Prediction:
+    """What a row says of one scene."""
+
+    light: Light
+    """Lights the object, world frame, photo-linear."""
+    light_shadow: Light
+    """Casts its shadow; the same object where there is one light."""
+    curves: Curves | None
+    """Tone operator and curves; None: the camera's own response, which only the truth knows."""
+    seed: int = 0
+    """Added to the seed of the samples."""
+    about: Mapping[str, Any] = field(default_factory=dict)
+    """What a reader may want to know of how it came about; plain values."""
+
+    @staticmethod
+    def of(light: Light, **about: Any) -> Prediction:
+        """Return what is said by a light alone: identity curves, clipped as a photo is."""
+        return Prediction(light, light, Curves.identity("linear"), about=about)
+
+
+@dataclass(frozen=True)
+class Quality:
+    """How finely pictures are sampled."""
+
+    samples: int = 64
+    """Per pixel."""
+    rays: int = 2
+    """Per sample and technique."""
+    depth: int = 5
+    """Surface interactions."""
+    indirect_limit: float = 8.0
+    """Most radiance that one path may add behind its first vertex; 0 for no limit."""
+
+
+@dataclass(frozen=True)
+class Rendered:
+    """A scene under one light, before any tone."""
+
+    foreground: Foreground
+    proxy_pixels: IntArray
+    """Row-major, shape [proxy_pixel]."""
+    ratio: FloatArray
+    """Shadow ratio, shape [proxy_pixel, 3]."""
+
+
+class Stage:
+    """One subject in its place, ready to be lit.
+
+    Args:
+        subject: The object and the photograph.
+        device: Warp device.
+        quality: Samples.
+        seed: Of the samples; the same for every light.
+        threads: On the CPU; 0: one per core.
+
+    Raises:
+        InputError: Nothing of the object is seen.
+
+    Attributes:
+        truth: The true composite, display-encoded, shape [H, W, 3].
+        mask: The object's share of each pixel, shape [H, W].
+        ratio: True shadow ratio, shape [H, W, 3].
+    """
+
+    def __init__(
+        self, subject: Subject, device: str, quality: Quality, seed: int, threads: int = 0
+    ) -> None:
+        self.place, self.quality, self.seed = subject.place, quality, seed
+        placed = Placed(subject.asset, subject.placement.asset_to_world)
+        ground = subject.placement.ground
+        scene = Scene([placed], self.place.camera, Proxy(ground[:3], -float(ground[3])), device)
+        self.renderer = Renderer(scene, threads)
+        self.objects: IntArray = self.renderer.gbuffer(seed).object_pixels
+        if len(self.objects) == 0:
+            raise InputError(subject.asset_path, f"nothing of it is seen in {self.place.name}")
+        self.true = self.render(self.true_prediction())
+        self.truth = self.compose(self.true, None)
+        self.mask = self._plane(self.objects, self.true.foreground.mask, 0.0)
+        self.ratio = self._plane(self.true.proxy_pixels, self.true.ratio, 1.0)
+
+    def true_prediction(self) -> Prediction:
+        """Return the place's own light, shown by the camera's own response."""
+        light = Light(texels=self.place.texels)
+        return Prediction(light, light, None)
+
+    def render(self, prediction: Prediction) -> Rendered:
+        """Return object and shadow under a row's light."""
+        renderer, quality, seed = self.renderer, self.quality, self.seed + prediction.seed
+        args = light_args(prediction.light, renderer.device)
+        shadow = args
+        if prediction.light_shadow is not prediction.light:
+            shadow = light_args(prediction.light_shadow, renderer.device)
+        foreground = renderer.foreground(
+            args, self.objects, quality.samples, quality.rays, quality.depth, seed,
+            quality.indirect_limit,
+        )  # fmt: skip
+        proxies = renderer.shaded_pixels(shadow, self.seed)
+        is_object = np.zeros(self.place.photo.shape[0] * self.place.photo.shape[1], np.int32)
+        is_object[self.objects] = 1
+        radiance = renderer.proxy(
+            shadow, proxies, is_object[proxies], quality.samples, quality.rays, seed
+        )
+        return Rendered(foreground, proxies, renderer.ratio(radiance))
+
+    def compose(self, rendered: Rendered, curves: Curves | None, gain: float = 1.0) -> FloatArray:
+        """Return the composite, display-encoded, shape [H, W, 3].
+
+        Args:
+            rendered: Of `render`.
+            curves: Tone operator and curves; None: the camera's own response.
+            gain: Factor on the object's radiance [1].
+        """
+        shown, behind = self._shown(rendered, curves, gain), self._behind(rendered, curves)
+        mask = rendered.foreground.mask[:, None]
+        behind[self.objects] = shown * mask + (1.0 - mask) * behind[self.objects]
+        return _encoded(behind).reshape(self.place.photo.shape)
+
+    def _shown(self, rendered: Rendered, curves: Curves | None, gain: float) -> FloatArray:
+        """Return the object in display-linear values, not premultiplied, [object_pixel, 3]."""
+        foreground = rendered.foreground
+        radiance = (foreground.radiance * np.float32(gain)).astype(np.float32)
+        if curves is None:
+            seen = foreground.mask[:, None] > 0.0
+            linear = radiance / np.where(seen, foreground.mask[:, None], 1.0)
+            response = RESPONSES[self.place.response]
+            return response.show(linear.astype(np.float64)).astype(np.float32)
+        shown, _ = self.renderer.tone(
+            replace(foreground, radiance=radiance),
+            rendered.ratio[:0],
+            curves.foreground,
+            curves.shadow_ratio,
+            curves.tone == "reinhard",
+        )
+        return shown
+
+    def _behind(self, rendered: Rendered, curves: Curves | None) -> FloatArray:
+        """Return the photograph under the shadow, display-linear, shape [pixel, 3]."""
+        behind = self.place.photo_lin.reshape(-1, 3).copy()
+        proxies = rendered.proxy_pixels
+        if curves is None:
+            # The shadow falls onto the scene, and the camera's response comes after it.
+            response = RESPONSES[self.place.response]
+            lit = response.invert(behind[proxies].astype(np.float64))
+            behind[proxies] = response.show(lit * rendered.ratio).astype(np.float32)
+        else:
+            _, ratio = self.renderer.tone(
+                rendered.foreground,
+                rendered.ratio,
+                curves.foreground,
+                curves.shadow_ratio,
+                curves.tone == "reinhard",
+            )
+            behind[proxies] *= ratio
+        return behind
+
+    def fit_exposure(self, rendered: Rendered, curves: Curves | None) -> float:
+        """Return the factor on the object's radiance that brings it nearest to the truth [1].
+
+        Least squares of display values over the object's pixels; the shadow stays.
+        """
+        from scipy.optimize import minimize_scalar
+
+        behind = self._behind(rendered, curves)[self.objects]
+        mask = rendered.foreground.mask[:, None]
+        truth = self.truth.reshape(-1, 3)[self.objects]
+
+        def error(ev: float) -> float:
+            shown = self._shown(rendered, curves, 2.0**ev)
+            image = _encoded(shown * mask + (1.0 - mask) * behind)
+            return float(np.square(image.astype(np.float64) - truth).sum())
+
+        # Clipping makes it flat far out, so a coarse look comes before the search.
+        grid = np.linspace(-EXPOSURE_EV, EXPOSURE_EV, 33)
+        best = float(grid[int(np.argmin([error(ev) for ev in grid]))])
+        found = minimize_scalar(
+            error, bounds=(best - 0.5, best + 0.5), method="bounded", options={"xatol": 1e-3}
+        )
+        return float(2.0**found.x)
+
+    def tone_floor(self) -> Curves:
+        """Return the curves after Reinhard's operator that come nearest to the truth.
+
+        What they leave is the least error of any method that has this tone model.
+        """
+        foreground, ratio = self.true.foreground, torch.from_numpy(self.true.ratio)
+        constants = ComposeConstants(
+            self.place.photo_lin,
+            self.objects,
+            self.true.proxy_pixels,
+            foreground.mask,
+            str(self.renderer.device.alias),
+            True,
+        )
+        radiance, white = torch.from_numpy(foreground.radiance), torch.ones_like(ratio)
+        truth = torch.from_numpy(self.truth).permute(2, 0, 1)[None]
+        curve_fg, curve_shadow = ToneCurve(1), ToneCurve(3)
+        optimizer = torch.optim.LBFGS(
+            [*curve_fg.parameters(), *curve_shadow.parameters()],
+            max_iter=FLOOR_EVALUATIONS,
+            max_eval=FLOOR_EVALUATIONS,
+            line_search_fn="strong_wolfe",
+        )
+
+        def error() -> float:
+            optimizer.zero_grad()
+            image = compose(constants, radiance, ratio, white, curve_fg(), curve_shadow())
+            squared = (image - truth).square().sum()
+            squared.backward()
+            return float(squared.detach())
+
+        optimizer.step(error)
+        return Curves("reinhard", ToneKnots(*curve_fg.arrays()), ToneKnots(*curve_shadow.arrays()))
+
+    def _plane(self, pixels: IntArray, values: FloatArray, outside: float) -> FloatArray:
+        height, width = self.place.photo.shape[:2]
+        plane = np.full((height * width, *values.shape[1:]), outside, np.float32)
+        plane[pixels] = values
+        return plane.reshape(height, width, *values.shape[1:])
+
+
+def _encoded(linear: FloatArray) -> FloatArray:
+    return np.minimum(linear_to_gamma(linear), 1.0).astype(np.float32)

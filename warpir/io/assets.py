@@ -1,0 +1,59 @@
+"""Reads an asset of any kind that is known: the reader by its extension, then the shared checks."""
+
+from pathlib import Path
+
+from warpir.core.errors import InputError
+from warpir.core.limits import LIMITS, Limits
+from warpir.io.gltf.reader import read_gltf
+from warpir.io.meshes.obj import read_mesh
+from warpir.scene.asset import Asset, TextureSlot
+
+TEXTURE_LIMIT = 1e6
+"""Of texture coordinates and their transforms [1]; beyond it float32 knows no part of a texel."""
+
+
+def load_asset(path: str | Path, missing_textures: str = "error", limits: Limits = LIMITS) -> Asset:
+    """Read an asset of any supported kind.
+
+    Args:
+        path: A ``.glb``, ``.gltf``, ``.obj``, ``.ply`` or ``.stl`` file.
+        missing_textures: ``error``, or ``grey`` to put mid grey in a missing texture's place.
+        limits: How large it may be.
+
+    Raises:
+        InputError: The file is missing, of another kind, or cannot be represented faithfully.
+    """
+    asset = _read(Path(path), missing_textures, limits)
+    _check_numbers(Path(path), asset)
+    return asset
+
+
+def _check_numbers(path: Path, asset: Asset) -> None:
+    """Refuse numbers that are finite, but whose products are not."""
+    for material in asset.materials:
+        slots = [part for part in vars(material).values() if isinstance(part, TextureSlot)]
+        scales = [material.normal_scale, material.clearcoat_normal_scale, material.ior]
+        scales += [number for slot in slots for number in slot.transform]
+        if abs(found := max(scales, key=abs)) > TEXTURE_LIMIT:
+            what = f"material {material.name[:60]!a}: a texture's transform or scale, or an index"
+            raise InputError(path, f"{what} of {found:g} (expected at most {TEXTURE_LIMIT:g})")
+    for primitive in asset.primitives:
+        for uv in (primitive.uv0, primitive.uv1):
+            greatest = 0.0 if uv is None else float(max(uv.max(), -uv.min()))
+            if greatest > TEXTURE_LIMIT:
+                what = f"texture coordinates of {greatest:g} (expected at most {TEXTURE_LIMIT:g})"
+                raise InputError(path, what)
+
+
+def _read(path: Path, missing_textures: str, limits: Limits) -> Asset:
+    suffix = path.suffix.lower()
+    if suffix in {".glb", ".gltf"}:
+        return read_gltf(path, missing_textures, limits)
+    if suffix in {".obj", ".ply", ".stl"}:
+        return read_mesh(path, missing_textures, limits)
+    raise InputError(
+        path,
+        f"not a mesh that warpir reads (found {suffix or 'no extension'}; "
+        "expected .glb, .gltf, .obj, .ply or .stl)",
+        "convert it to GLB",
+    )

@@ -1,0 +1,110 @@
+"""Reads the camera of a COLMAP model (https://colmap.github.io/format.html).
+
+The camera has OpenCV's axes (+Z forward, +Y down), poses are from world to camera with the
+quaternion's w first, and pixels have their centres at + 0.5. The world's axes and its scale are
+arbitrary.
+"""
+
+import math
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from warpir.core.errors import InputError
+from warpir.core.limits import LIMITS, Limits
+from warpir.io.cameras.colmap_model import (
+    MODELS,
+    Image,
+    Intrinsics,
+    model_files,
+    read_cameras,
+    read_images,
+)
+from warpir.io.cameras.source import StoredCamera, choose_frame
+from warpir.scene.camera import Camera
+from warpir.scene.lens import Lens
+
+Float64Array = NDArray[np.float64]
+
+UNDERSTOOD = tuple(MODELS)[:5]
+UNIT_TOLERANCE = 1e-3
+"""How far the length of a quaternion may be from 1 before it is not taken for one."""
+
+
+def read_colmap(
+    path: Path, frame: str | None, photo: str | None, limits: Limits = LIMITS
+) -> StoredCamera:
+    """Read the camera of one image of a model.
+
+    Args:
+        path: The model's folder, or one of its files.
+        frame: The image's name; default: the photo's, or the only one.
+        photo: File name of the photograph.
+        limits: How large the files may be.
+
+    Raises:
+        InputError: Damaged, of a camera model that is not understood, or without that image.
+    """
+    cameras_path, images_path = model_files(path, "cameras", "images", limits=limits)
+    cameras, images = read_cameras(cameras_path), read_images(images_path)
+    image = images[choose_frame(images_path, [i.name for i in images], frame, photo)]
+    if image.camera_id not in cameras:
+        raise InputError(
+            cameras_path,
+            f"camera {image.camera_id} is missing (image {image.name[:80]} was taken with it; "
+            f"found {len(cameras)} cameras)",
+        )
+    camera, lens = _pinhole(cameras_path, image.camera_id, cameras[image.camera_id])
+    notice = (
+        "the scale of a COLMAP world is arbitrary: lengths are in its units, not in metres (--size)"
+    )
+    c2w = _pose(images_path, image)
+    stored = Camera(*camera, c2w, (notice,))
+    return StoredCamera(stored, None, lens)
+
+
+def _pinhole(
+    path: Path, camera_id: int, intrinsics: Intrinsics
+) -> tuple[tuple[int, int, float, float, float, float], Lens]:
+    """Return size, fx, fy, cx, cy and the lens of a camera."""
+    model, numbers = intrinsics.model, intrinsics.parameters
+    if model not in UNDERSTOOD:
+        raise InputError(
+            path,
+            f"camera {camera_id}: model {model[:40]} is not supported (expected "
+            f"{', '.join(UNDERSTOOD)})",
+            "undistort the images with COLMAP's image_undistorter",
+        )
+    focal_count = 2 if model in ("PINHOLE", "OPENCV") else 1
+    fx, fy = numbers[0], numbers[focal_count - 1]
+    cx, cy, *bends = numbers[focal_count:]
+    if not (fx > 0.0 and fy > 0.0):
+        raise InputError(path, f"camera {camera_id}: not a focal length (found {fx:g}, {fy:g})")
+    k1, k2, p1, p2 = (*bends, 0.0, 0.0, 0.0, 0.0)[:4]
+    size = (intrinsics.width, intrinsics.height)
+    return (*size, fx, fy, cx, cy), Lens((k1, k2, 0.0, 0.0), (p1, p2))
+
+
+def _pose(path: Path, image: Image) -> Float64Array:
+    """Return the pose of an image from its world to camera transform, [4, 4]."""
+    length = math.hypot(*image.quaternion)
+    if abs(length - 1.0) > UNIT_TOLERANCE:
+        raise InputError(
+            path,
+            f"image {image.name[:80]}: not a unit quaternion (found a length of {length:.6g}; "
+            "expected 1)",
+        )
+    w, x, y, z = (q / length for q in image.quaternion)
+    world_to_camera = np.array(
+        [
+            [1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)],
+            [2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)],
+            [2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)],
+        ]
+    )
+    c2w = np.eye(4)
+    # OpenCV's camera axes become ours: y and z change their signs.
+    c2w[:3, :3] = world_to_camera.T * [1.0, -1.0, -1.0]
+    c2w[:3, 3] = -world_to_camera.T @ np.array(image.translation)
+    return c2w

@@ -1,0 +1,88 @@
+"""Reads a perspective camera of a glTF 2.0 file: its node's world matrix, without its scale."""
+
+from pathlib import Path
+
+import numpy as np
+
+from warpir.core.limits import LIMITS, Limits
+from warpir.io.cameras.source import LARGEST, Float64Array, StoredCamera, choose_frame, rigid
+from warpir.io.gltf.gate import Entry, GltfFile
+from warpir.io.gltf.reader import local_matrix, read_forest
+from warpir.scene.camera import Camera
+
+ASPECT_TOLERANCE = 0.01
+"""How far the file's aspect ratio may be from the photo's before it is mentioned."""
+
+
+def read_gltf_camera(
+    path: Path, photo_size: tuple[int, int], frame: str | None, limits: Limits = LIMITS
+) -> StoredCamera:
+    """Read a camera; its axes and the world's are ours.
+
+    Args:
+        path: A ``.glb`` or ``.gltf`` file.
+        photo_size: Width and height of the photograph [px]: glTF knows angles only.
+        frame: Name of the camera or of its node; where neither fits, its number among the nodes
+            with a camera, from 0; default: the only one.
+        limits: How large the file may be.
+
+    Raises:
+        InputError: Damaged, without that camera, or orthographic.
+    """
+    root = GltfFile(path, limits).root
+    nodes, parents = read_forest(root, limits)
+    placed = [node for node in nodes if "camera" in node]
+    cameras = [root.item("cameras", n.integer("camera"), n, "camera") for n in placed]
+    names = [
+        camera.text("name", "") or node.text("name", "") or str(k)
+        for k, (node, camera) in enumerate(zip(placed, cameras, strict=True))
+    ]
+    of_nodes = [node.text("name", "") for node in placed]
+    is_number = frame is not None and frame.isdecimal() and len(frame) < 10
+    if frame not in names and of_nodes.count(str(frame)) == 1:
+        k = of_nodes.index(str(frame))
+    elif frame not in names and is_number and int(str(frame)) < len(placed):
+        k = int(str(frame))  # names come first: some exporters number their cameras from 1
+    else:
+        k = choose_frame(path, names, frame, None, noun="camera")
+    entry = cameras[k]
+    if entry.text("type") != "perspective":
+        raise entry.error(f"camera of type {entry.text('type')!r}, expected perspective")
+    perspective = entry.child("perspective")
+    yfov = perspective.number("yfov", 0.0)
+    if not 0.0 < yfov < np.pi:
+        raise perspective.error(f"yfov is {yfov:g}, expected radians from 0 to pi")
+    width, height = photo_size
+    notices = []
+    aspect = perspective.number("aspectRatio", width / height)
+    if abs(aspect * height / width - 1.0) > ASPECT_TOLERANCE:
+        notices.append(
+            f"the camera was made for an aspect ratio of {aspect:.4g}, the photo has "
+            f"{width / height:.4g}: its vertical angle is kept"
+        )
+    focal = height / 2.0 / float(np.tan(yfov / 2.0))
+    c2w = _unscaled(placed[k], _world(nodes, parents, nodes.index(placed[k])))
+    camera = Camera(width, height, focal, focal, width / 2.0, height / 2.0, c2w, tuple(notices))
+    return StoredCamera(camera, np.eye(3))
+
+
+def _world(nodes: list[Entry], parents: dict[int, int], index: int) -> Float64Array:
+    """Return the matrix from a node's frame to the world's, [4, 4]."""
+    world = local_matrix(nodes[index])
+    while index in parents:
+        index = parents[index]
+        with np.errstate(over="ignore", invalid="ignore"):  # refused by `_unscaled`
+            world = local_matrix(nodes[index]) @ world
+    return world
+
+
+def _unscaled(node: Entry, world: Float64Array) -> Float64Array:
+    """Return a pose whose axes have length 1."""
+    if not (np.abs(world) <= LARGEST).all():  # nor are NaN and infinity
+        raise node.error(f"the camera's transform holds numbers beyond {LARGEST:g}")
+    lengths = np.linalg.norm(world[:3, :3], axis=0)
+    if not (lengths > 0.0).all():
+        raise node.error("the camera's transform is singular")
+    pose = world.copy()
+    pose[:3, :3] /= lengths
+    return rigid(node.path, node.pointer.lstrip("/"), pose)

@@ -1,0 +1,102 @@
+"""Reads the ``transforms.json`` of nerfstudio, Instant-NGP and Blender's NeRF scenes.
+
+https://docs.nerf.studio/quickstart/data_conventions.html: OpenGL's camera axes, which are ours, in
+a world with +Z up; pixels have their centres at + 0.5, so the principal point is used as it is.
+"""
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from warpir.core.errors import InputError
+from warpir.io.cameras.source import UP_TO_Y, StoredCamera, choose_frame, count, number, rigid
+from warpir.scene.camera import Camera
+from warpir.scene.lens import Lens
+
+PERSPECTIVE = ("SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV", "PERSPECTIVE")
+"""Values of ``camera_model`` that share the distortion model of `Lens`."""
+
+
+def read_nerfstudio(
+    path: Path,
+    content: dict[str, Any],
+    photo_size: tuple[int, int],
+    frame: str | None,
+    photo: str | None,
+) -> StoredCamera:
+    """Read the camera of one frame; what the frame says goes before what the file says.
+
+    Args:
+        path: The file.
+        content: Its JSON.
+        photo_size: Width and height of the photograph [px], for files that give only an angle.
+        frame: Name of the frame's picture; default: the photo's, or the only one.
+        photo: File name of the photograph.
+
+    Raises:
+        InputError: Damaged, fisheye, or without that frame.
+    """
+    frames = content["frames"]
+    names = [f.get("file_path") if isinstance(f, dict) else None for f in frames]
+    for k, name in enumerate(names):
+        if not isinstance(name, str):
+            raise InputError(path, f"/frames/{k}/file_path: missing or not a text")
+    k = choose_frame(path, [str(name) for name in names], frame, photo, noun="frame")
+    said = {**content, **frames[k]}
+    model = said.get("camera_model", "OPENCV")
+    if model not in PERSPECTIVE or said.get("is_fisheye"):
+        found = "is_fisheye" if said.get("is_fisheye") else f"camera_model {ascii(model)[:60]}"
+        raise InputError(
+            path,
+            f"not a perspective camera (found {found}; expected {', '.join(PERSPECTIVE)})",
+            "undistort the images first",
+        )
+    width, height = photo_size
+    if "w" in said or "h" in said or "fl_x" in said:
+        width, height = count(path, said, "w"), count(path, said, "h")
+    fx = _focal(path, said, "x", width)
+    fy = _focal(path, said, "y", height)
+    if fx is None:
+        raise InputError(path, "no focal length (expected fl_x or camera_angle_x)")
+    coefficients = [number(path, said, key) if key in said else 0.0 for key in BENDS]
+    matrix = f"frames/{k}/transform_matrix"
+    camera = Camera(
+        width,
+        height,
+        fx,
+        fx if fy is None else fy,
+        number(path, said, "cx") if "cx" in said else width / 2.0,
+        number(path, said, "cy") if "cy" in said else height / 2.0,
+        rigid(path, matrix, frames[k].get("transform_matrix")),
+    )
+    k1, k2, k3, k4, p1, p2 = coefficients
+    return StoredCamera(
+        camera,
+        np.array(UP_TO_Y["+z"], dtype=np.float64),
+        Lens((k1, k2, k3, k4), (p1, p2)),
+        "assumed: +z of the transforms.json points up, as nerfstudio has it; only its exporter "
+        "knows whether gravity agrees (--up, --ground)",
+    )
+
+
+BENDS = ("k1", "k2", "k3", "k4", "p1", "p2")
+
+
+def _focal(path: Path, said: dict[str, Any], axis: str, side: int) -> float | None:
+    """Return the focal length along an axis [px], from itself or the field of view."""
+    if f"fl_{axis}" in said:
+        focal = number(path, said, f"fl_{axis}")
+        if focal <= 0.0:
+            raise InputError(path, f"/fl_{axis}: not a focal length (found {focal:g})")
+        return focal
+    key = f"camera_angle_{axis}"
+    # Instant-NGP writes angles beside focal lengths: then fl_x stands for both axes.
+    if key not in said or (axis == "y" and "fl_x" in said):
+        return None
+    angle = number(path, said, key)
+    if not 0.0 < angle < np.pi:
+        raise InputError(
+            path, f"/{key}: not a field of view (found {angle:g}; expected radians from 0 to pi)"
+        )
+    return float(side / 2.0 / np.tan(angle / 2.0))

@@ -1,0 +1,195 @@
+"""The camera of a photograph from a file of any kind that is known; recognised by content.
+
+Each reader returns the camera in the world of its file; here the world is turned so that +Y is up,
+and the camera is brought to the photograph's size.
+"""
+
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from warpir.core.errors import ExitCode, InputError, shown
+from warpir.core.limits import LIMITS, Limits
+from warpir.core.strict_json import read_json_object
+from warpir.io.cameras.colmap import read_colmap
+from warpir.io.cameras.colmap_model import is_model
+from warpir.io.cameras.exr import read_exr_camera
+from warpir.io.cameras.fspy import read_fspy, read_fspy_project
+from warpir.io.cameras.gltf import read_gltf_camera
+from warpir.io.cameras.nerfstudio import read_nerfstudio
+from warpir.io.cameras.source import (
+    UP_TO_Y,
+    PhotoCamera,
+    StoredCamera,
+    count,
+    number,
+    rigid,
+    turned,
+)
+from warpir.io.cameras.waymo import read_waymo
+from warpir.scene.camera import Camera
+
+ASPECT_SLACK = 0.01
+"""Most that a camera's picture may differ in shape from the photograph, share of its long side."""
+
+
+def read_photo_camera(
+    path: str | Path,
+    photo_size: tuple[int, int],
+    up: str | None = None,
+    *,
+    frame: str | None = None,
+    photo_name: str | None = None,
+    undistort: bool = False,
+    limits: Limits = LIMITS,
+) -> PhotoCamera:
+    """Read the camera of a photograph.
+
+    Args:
+        path: Our ``camera.json``, an fSpy project or export, a COLMAP model (folder, or its images
+            file), nerfstudio's ``transforms.json``, Waymo's calibration as JSON, a glTF file with
+            a camera, or an EXR file with OpenEXR's camera attributes.
+        photo_size: Width and height of the upright photograph [px]. A camera made for another
+            size of the same aspect is scaled.
+        up: World axis of the file that points up: ``x``, ``y``, ``z``, with a sign if wanted.
+            Default: what the format says; for fSpy the axis closest to the camera's up.
+        frame: Which of the file's images or cameras; default: the one named as the photograph.
+        photo_name: File name of the photograph.
+        undistort: Accept lens distortion, which the caller will undo.
+        limits: How large the file may be.
+
+    Raises:
+        InputError: Missing, malformed, not a rigid right-handed pose, or of another aspect;
+            distorted without `undistort`.
+    """
+    path = Path(path)
+    axis = None if up is None else _up_axis(up)
+    stored = _read(path, photo_size, frame, photo_name, limits)
+    if not (stored.lens.is_straight or undistort):
+        worst = max((*stored.lens.radial, *stored.lens.tangential), key=abs)
+        raise InputError(
+            path,
+            f"the photograph is distorted (found a coefficient of {worst:.4g}; expected 0)",
+            "--undistort straightens photo and composite; or give a photo without distortion",
+        )
+    world = stored.world if axis is None else np.array(UP_TO_Y[axis], dtype=np.float64)
+    has_up = world is not None
+    if world is None:
+        world = np.eye(3)
+    notices = stored.camera.notices
+    if axis is None and stored.world_notice:
+        notices = (*notices, stored.world_notice)
+    camera = replace(stored.camera, c2w=turned(stored.camera.c2w, world), notices=notices)
+    camera = _fit(path, camera, photo_size)
+    return PhotoCamera(camera, stored.lens, world, has_up)
+
+
+def read_camera(path: str | Path, photo_size: tuple[int, int], up: str | None = None) -> Camera:
+    """As `read_photo_camera`, for a straight photograph: the camera alone."""
+    return read_photo_camera(path, photo_size, up).camera
+
+
+def _up_axis(up: str) -> str:
+    axis = up.strip().lower()
+    axis = axis if axis[:1] in ("+", "-") else f"+{axis}"
+    if axis not in UP_TO_Y:
+        raise InputError(
+            "--up", f"not an axis (found {up}; expected x, y, z, -x, -y or -z)", code=ExitCode.USAGE
+        )
+    return axis
+
+
+def _read(
+    path: Path,
+    photo_size: tuple[int, int],
+    frame: str | None,
+    photo_name: str | None,
+    limits: Limits,
+) -> StoredCamera:
+    """Recognise a file and read it."""
+    if is_model(path):
+        return read_colmap(path, frame, photo_name, limits)
+    magic = _magic(path)
+    if magic == b"fspy":
+        return read_fspy_project(path, limits)
+    if magic == b"\x76\x2f\x31\x01":
+        return read_exr_camera(path)
+    if magic == b"glTF" or path.suffix.lower() == ".gltf":
+        return read_gltf_camera(path, photo_size, frame, limits)
+    content = read_json_object(path, limits)
+    if "cameraTransform" in content or "cameraParameters" in content:
+        return read_fspy(path, content)
+    if isinstance(content.get("frames"), list):
+        return read_nerfstudio(path, content, photo_size, frame, photo_name)
+    if any(key in content for key in ("intrinsic", "cameraCalibrations", "camera_calibrations")):
+        return read_waymo(path, content, frame)
+    if "asset" in content and "nodes" in content:
+        return read_gltf_camera(path, photo_size, frame, limits)
+    if "fx" in content or "c2w" in content:
+        return _read_own(path, content)
+    keys = [shown(key) for key in list(content)[:8]]
+    raise InputError(
+        path,
+        f"not a camera that warpir reads (found keys {', '.join(keys) or 'none'}; "
+        "expected fx fy cx cy w h c2w, or a file of fSpy, COLMAP, nerfstudio, Waymo or glTF)",
+    )
+
+
+def _read_own(path: Path, content: dict[str, Any]) -> StoredCamera:
+    """Read our own ``camera.json``."""
+    focal = {key: number(path, content, key) for key in ("fx", "fy")}
+    for key, value in focal.items():
+        if value <= 0.0:
+            raise InputError(path, f"/{key}: not a focal length (found {value}; expected > 0)")
+    c2w = rigid(path, "c2w", content.get("c2w"))
+    camera = Camera(
+        count(path, content, "w"),
+        count(path, content, "h"),
+        focal["fx"],
+        focal["fy"],
+        number(path, content, "cx"),
+        number(path, content, "cy"),
+        c2w,
+    )
+    return StoredCamera(camera, np.eye(3))
+
+
+def _fit(path: Path, camera: Camera, photo_size: tuple[int, int]) -> Camera:
+    """Scale to the photograph's size; note what looks odd."""
+    width, height = photo_size
+    # The other side may have been rounded to a whole pixel, once in each size. Of a camera for a
+    # tiny picture that pixel says nothing of the shape.
+    slack = max(width / camera.width, height / camera.height)
+    slack = max(min(slack, ASPECT_SLACK * max(width, height)), 1.0)
+    if (
+        abs(camera.width * height / camera.height - width) > slack
+        and abs(camera.height * width / camera.width - height) > slack
+    ):
+        raise InputError(
+            path,
+            f"made for a picture of another shape (found {camera.width} x "
+            f"{camera.height}; expected the aspect of {width} x {height})",
+            "use the camera of this photograph, before cropping or turning it",
+        )
+    notices = list(camera.notices)
+    if (camera.width, camera.height) != photo_size:
+        notices.append(
+            f"camera scaled from {camera.width} x {camera.height} to the photograph's "
+            f"{width} x {height}"
+        )
+    if not (0.0 <= camera.cx <= camera.width and 0.0 <= camera.cy <= camera.height):
+        notices.append(f"principal point ({camera.cx:.1f}, {camera.cy:.1f}) lies outside the image")
+    return replace(camera.scaled(width, height), notices=tuple(notices))
+
+
+def _magic(path: Path) -> bytes:
+    """Return the first four bytes of a file; none where there is none, for the reader to say."""
+    try:
+        if not path.is_file():  # opening a pipe would wait for its other end
+            return b""
+        with path.open("rb") as stream:
+            return stream.read(4)
+    except OSError:
+        return b""

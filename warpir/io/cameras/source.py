@@ -1,0 +1,197 @@
+"""What every reader of a camera file returns, and the checks that they share."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from pathlib import Path, PurePosixPath
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from warpir.core.errors import InputError
+from warpir.scene.camera import Camera
+from warpir.scene.lens import STRAIGHT, Lens
+
+Float64Array = NDArray[np.float64]
+
+RIGID_TOLERANCE = 1e-4
+"""How far R^T R may be from the identity; smaller errors are removed."""
+LARGEST = 1e15
+"""Largest number of a camera: of a matrix, an offset, a focal length."""
+NAMES_SHOWN = 8
+
+UP_TO_Y = {
+    "+x": [[0, -1, 0], [1, 0, 0], [0, 0, 1]],
+    "-x": [[0, 1, 0], [-1, 0, 0], [0, 0, 1]],
+    "+y": [[1, 0, 0], [0, 1, 0], [0, 0, 1]],
+    "-y": [[1, 0, 0], [0, -1, 0], [0, 0, -1]],
+    "+z": [[1, 0, 0], [0, 0, 1], [0, -1, 0]],
+    "-z": [[1, 0, 0], [0, 0, -1], [0, 1, 0]],
+}
+"""Rotations that turn a world whose up axis is the key into ours."""
+
+
+@dataclass(frozen=True)
+class StoredCamera:
+    """A camera as its file has it: our camera axes, in the file's own world."""
+
+    camera: Camera
+    world: Float64Array | None
+    """Rotation from the file's world to ours that the format implies, shape [3, 3]; None: which
+    way is up is not known."""
+    lens: Lens = STRAIGHT
+    """What bent the photograph."""
+    world_notice: str = ""
+    """What is to be said of `world` when the user does not say which way is up."""
+
+
+@dataclass(frozen=True)
+class PhotoCamera:
+    """The camera of a photograph, and what else its file says."""
+
+    camera: Camera
+    """At the photograph's resolution, in our world."""
+    lens: Lens = STRAIGHT
+    """What bent the photograph; undone with ``--undistort``."""
+    world: Float64Array = field(default_factory=lambda: np.eye(3))
+    """Rotation from the file's world to ours, shape [3, 3]."""
+    has_up: bool = True
+    """Whether it is known which way is up; else our world is the file's, as it happens to lie."""
+
+
+def turned(c2w: Float64Array, rotation: Float64Array) -> Float64Array:
+    """Return a pose, shape [4, 4], after its world was turned by a rotation, shape [3, 3]."""
+    turn = np.eye(4)
+    turn[:3, :3] = rotation
+    result: Float64Array = turn @ c2w
+    return result
+
+
+def choose_frame(
+    path: Path, names: Sequence[str], frame: str | None, photo: str | None, noun: str = "image"
+) -> int:
+    """Return which of a file's images is meant: by ``--frame``, else by the photo's file name.
+
+    Args:
+        path: The camera file, for the error.
+        names: Names of its images; folders and suffixes in them may be left out.
+        frame: What the user names.
+        photo: File name of the photograph.
+        noun: What a name stands for.
+
+    Raises:
+        InputError: None or several fit; lists the first names.
+    """
+    wanted = frame if frame is not None else photo
+    if wanted is not None:
+        # Blender's files leave the suffix out, and a photo may have been saved as another kind.
+        name = PurePosixPath(wanted).name
+        stem = PurePosixPath(wanted).stem
+        for found in (
+            [k for k, n in enumerate(names) if n == wanted],
+            [k for k, n in enumerate(names) if PurePosixPath(n).name == name],
+            [k for k, n in enumerate(names) if PurePosixPath(n).stem == stem],
+        ):
+            if len(found) == 1:
+                return found[0]
+            if found:
+                names = [names[k] for k in found]
+                break
+    if frame is None and len(names) == 1:
+        return 0
+    listed = ", ".join(ascii(name)[1:-1] for name in names[:NAMES_SHOWN])
+    rest = len(names) - NAMES_SHOWN
+    listed += f" and {rest} more" if rest > 0 else ""
+    what = f"which {noun} is meant" if wanted is None else f"no one {noun} is {ascii(wanted)[:80]}"
+    raise InputError(
+        path, f"{what} (found {len(names)}: {listed or 'none'})", "name one with --frame"
+    )
+
+
+def rigid(path: Path, name: str, rows: Any) -> Float64Array:
+    """Check a camera-to-world matrix given as 3 or 4 rows; return it exactly rigid, [4, 4]."""
+    try:
+        matrix = np.array(rows)
+        if matrix.dtype.kind not in "if":
+            raise ValueError
+        matrix = matrix.astype(np.float64)
+    except (TypeError, ValueError) as error:
+        raise InputError(path, f"/{name}: not a matrix of numbers") from error
+    if matrix.shape == (3, 4):
+        matrix = np.vstack([matrix, [0.0, 0.0, 0.0, 1.0]])
+    if matrix.shape != (4, 4):
+        raise InputError(
+            path, f"/{name}: not a matrix (found shape {matrix.shape}; expected 4 x 4 or 3 x 4)"
+        )
+    if not np.isfinite(matrix).all():
+        raise InputError(path, f"/{name}: numbers that are not finite")
+    last = np.array([0.0, 0.0, 0.0, 1.0])
+    if np.abs(matrix[3] - last).max() > RIGID_TOLERANCE:
+        if np.abs(matrix[:, 3] - last).max() <= RIGID_TOLERANCE:
+            raise InputError(
+                path,
+                f"/{name}: transposed (found the translation in the last row; "
+                "expected it in the last column)",
+                "transpose the matrix",
+            )
+        raise InputError(
+            path,
+            f"/{name}: last row is not 0 0 0 1 (found {' '.join(f'{x:g}' for x in matrix[3])})",
+        )
+    rotation = matrix[:3, :3]
+    if (largest := float(np.abs(matrix).max())) > LARGEST:
+        raise InputError(
+            path, f"/{name}: numbers beyond every use (found {largest:g}; limit {LARGEST:g})"
+        )
+    product = rotation.T @ rotation
+    scale = float(np.trace(product)) / 3.0
+    deviation = float(np.abs(product - np.eye(3)).max())
+    if deviation > RIGID_TOLERANCE:
+        if scale > 0.0 and np.abs(product / scale - np.eye(3)).max() <= RIGID_TOLERANCE:
+            raise InputError(
+                path,
+                f"/{name}: scaled (found a factor of {np.sqrt(scale):.6g}; expected 1)",
+                "remove the scale from the camera",
+            )
+        raise InputError(
+            path,
+            f"/{name}: not orthonormal (found axes off by {deviation:.3g}; "
+            f"expected at most {RIGID_TOLERANCE})",
+        )
+    if np.linalg.det(rotation) < 0.0:
+        raise InputError(
+            path,
+            f"/{name}: left-handed (found determinant -1; expected +1)",
+            "export it with right-handed axes: camera along -Z, +Y up, +X right",
+        )
+    left, _, right = np.linalg.svd(rotation)
+    rigid = np.eye(4)
+    rigid[:3, :3] = left @ right
+    rigid[:3, 3] = matrix[:3, 3]
+    return rigid
+
+
+def member(path: Path, content: Any, key: str) -> dict[str, Any]:
+    """Return an object within an object, or refuse the file."""
+    value = content.get(key) if isinstance(content, dict) else None
+    if not isinstance(value, dict):
+        raise InputError(path, f"/{key}: missing or not an object")
+    return value
+
+
+def number(path: Path, content: Any, key: str) -> float:
+    """Return a number of an object, or refuse the file."""
+    value = content.get(key) if isinstance(content, dict) else None
+    if isinstance(value, bool) or not isinstance(value, int | float) or abs(value) > LARGEST:
+        raise InputError(path, f"/{key}: not a number that can be used (found {str(value)[:40]})")
+    return float(value)
+
+
+def count(path: Path, content: Any, key: str) -> int:
+    """Return an image size of an object [px], or refuse the file."""
+    value = number(path, content, key)
+    if value != int(value) or not 1 <= value <= 1_000_000:
+        raise InputError(
+            path, f"/{key}: not an image size (found {value:g}; expected whole pixels)"
+        )
+    return int(value)

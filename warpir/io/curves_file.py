@@ -1,0 +1,111 @@
+"""Tone curves as the file ``curves.json`` that every run writes and ``--reuse`` reads.
+
+    {"format": "warpir-curves", "version": 1, "tone": "linear",
+     "foreground": {"x": [[0, ..., 1]], "y": [[0, ..., 1]], "slope": [[1, ..., 1]]},
+     "shadow_ratio": {...}}
+
+``tone`` is the operator between radiance and the foreground's curve.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from warpir.core.errors import InputError
+from warpir.core.limits import LIMITS, Limits
+from warpir.core.strict_json import read_json_object
+from warpir.scene.tone_curves import CURVE_COUNTS, TONES, Curves, ToneKnots
+
+FloatArray = NDArray[np.float32]
+
+FORMAT = "warpir-curves"
+VERSION = 1
+BIN_COUNT_LIMIT = 256
+SLOPE_LIMIT = 1e6
+END_TOLERANCE = 1e-6
+"""How far the outer knots may be from 0 and 1 [1]: a rounding, not another curve."""
+
+
+def curves_to_json(curves: Curves) -> dict[str, Any]:
+    """Return what `read_curves` reads."""
+    content: dict[str, Any] = {"format": FORMAT, "version": VERSION, "tone": curves.tone}
+    for name in CURVE_COUNTS:
+        knots: ToneKnots = getattr(curves, name)
+        content[name] = {
+            "x": knots.x.tolist(),
+            "y": knots.y.tolist(),
+            "slope": knots.slope.tolist(),
+        }
+    return content
+
+
+def read_curves(path: str | Path, limits: Limits = LIMITS) -> Curves:
+    """Read and check a curves file.
+
+    Args:
+        path: The JSON file.
+        limits: How large it may be.
+
+    Raises:
+        InputError: Missing, of another format, or not monotone curves from (0, 0) to (1, 1); names
+            the curve.
+    """
+    root = read_json_object(path, limits)
+    if root.get("format") != FORMAT or root.get("version") != VERSION:
+        found = f"{root.get('format')!r:.40} version {root.get('version')!r:.10}"
+        raise InputError(path, f"not curves (found {found}; expected {FORMAT!r} version {VERSION})")
+    tone = root.get("tone")
+    if tone not in TONES:
+        expected = " or ".join(TONES)
+        raise InputError(path, f"/tone: {expected} expected (found {tone!r:.40})")
+    knots = {name: _read_knots(path, f"/{name}", root.get(name)) for name in CURVE_COUNTS}
+    for name, count in CURVE_COUNTS.items():
+        given = len(knots[name].x)
+        if given != count:
+            raise InputError(path, f"/{name}: curves miscounted (found {given}; expected {count})")
+    return Curves(str(tone), knots["foreground"], knots["shadow_ratio"])
+
+
+def _read_knots(path: str | Path, pointer: str, value: Any) -> ToneKnots:
+    if not isinstance(value, dict):
+        raise InputError(path, f"{pointer}: an object with x, y and slope expected")
+    x, y, slope = (
+        _numbers(path, f"{pointer}/{name}", value.get(name)) for name in ("x", "y", "slope")
+    )
+    if not x.shape == y.shape == slope.shape or not 2 <= x.shape[1] <= BIN_COUNT_LIMIT + 1:
+        shapes = ", ".join(f"{part.shape[0]} x {part.shape[1]}" for part in (x, y, slope))
+        raise InputError(
+            path,
+            f"{pointer}: x, y and slope of one size expected, of 2 to {BIN_COUNT_LIMIT + 1} knots "
+            f"(found {shapes})",
+        )
+    for name, knots in (("x", x), ("y", y)):
+        ends = np.abs(knots[:, [0, -1]] - (0.0, 1.0)).max()
+        if ends > END_TOLERANCE or not (np.diff(knots, axis=1) > 0.0).all():
+            raise InputError(path, f"{pointer}/{name}: knots that rise from 0 to 1 expected")
+    if not ((slope > 0.0) & (slope <= SLOPE_LIMIT)).all():
+        raise InputError(path, f"{pointer}/slope: more than 0 and at most {SLOPE_LIMIT:g} expected")
+    return ToneKnots(x, y, slope)
+
+
+def _numbers(path: str | Path, pointer: str, value: Any) -> FloatArray:
+    """Return a list of lists of numbers as it will be used, in float32, shape [curve, knot]."""
+    rows = value if isinstance(value, list) and value else [None]
+    lengths = {len(row) if isinstance(row, list) else 0 for row in rows}
+    plain = len(lengths) == 1 and all(
+        isinstance(number, int | float) and not isinstance(number, bool)
+        for row in rows
+        for number in (row if isinstance(row, list) else [None])
+    )
+    if not plain or lengths == {0}:
+        raise InputError(path, f"{pointer}: lists of numbers expected, one for each curve")
+    try:
+        numbers = np.asarray(rows, np.float64)
+    except OverflowError:
+        raise InputError(path, f"{pointer}: a number beyond every use") from None
+    with np.errstate(over="ignore"):
+        return numbers.astype(np.float32)

@@ -1,0 +1,184 @@
+"""What other tools take over from a run: tone curves, a web light, the object, Blender's set-up.
+
+Every file is named in docs/handoff.md with what opens it. All of them lie in the run's own folder
+and refer to each other by bare names, so that the folder can be moved or handed on.
+"""
+
+from __future__ import annotations
+
+from importlib.resources import files
+from string import Template
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+import warpir
+from warpir.io.gltf.writer import write_glb
+from warpir.io.images.envmap_conventions import from_ours
+from warpir.io.images.photos import Photo
+from warpir.io.results import HALF_MAX, OutputFolder
+from warpir.scene.asset import Asset
+from warpir.scene.camera import Camera, blender_camera, square_pixel_error
+from warpir.scene.placement import Placement, y_to
+from warpir.scene.tone_curves import Curves, ToneKnots
+
+FloatArray = NDArray[np.float32]
+Float64Array = NDArray[np.float64]
+
+PHOTO, OBJECT, BLENDER_SETUP = "photo.png", "object.glb", "blender_setup.py"
+OBJECT_CURVE, SHADOW_CURVE = "tone_curve_object.cube", "tone_curve_shadow.cube"
+
+CUBE_SIZE = 4096
+"""Entries of a tone curve's table: interpolated, a curve of the narrowest bins is right to 1e-3."""
+GROUND_SIDES = 40.0
+"""Side of Blender's ground, in diagonals of the object."""
+SQUARE_ENOUGH = 0.5
+"""How far rows may be off in a tool that knows square pixels only, before it is said [px]."""
+
+
+def write_hand_off(
+    output: OutputFolder,
+    photo: Photo,
+    asset: Asset,
+    camera: Camera,
+    placement: Placement,
+    curves: Curves,
+    texels: FloatArray,
+    envmap: str = "envmap.exr",
+) -> tuple[dict[str, Any], tuple[str, ...]]:
+    """Stage the files for other tools.
+
+    Args:
+        output: Where; it holds, or will hold, the map.
+        photo: The photograph.
+        asset: The object.
+        camera: Of the photo.
+        placement: Where the object stands.
+        curves: Tone curves of the picture.
+        texels: The light on the object, relative [W/(m^2 sr)], shape [He, 2 He, 3].
+        envmap: Name of the file that holds that map.
+
+    Returns:
+        Numbers for ``run.json``, and notices.
+
+    Raises:
+        InputError: The disk is full (exit 5).
+    """
+    output.write_bytes(OBJECT_CURVE, tone_curve_cube(curves.foreground, _OBJECT_TEXT[curves.tone]))
+    output.write_bytes(SHADOW_CURVE, tone_curve_cube(curves.shadow_ratio, _SHADOW_TEXT))
+    web, clamped = web_map(texels)
+    output.write_hdr("envmap_web.hdr", web)
+    output.write_bytes(OBJECT, write_glb(asset, placement.asset_to_world, camera))
+    # Upright and without the photo's metadata: Blender does not turn pictures by their EXIF tag.
+    codes = photo.codes
+    if photo.is_linear:
+        codes = photo.encode(photo.srgb, np.ones(codes.shape[:2], np.bool_))
+    output.write_png(PHOTO, codes, icc=photo.icc, mark=False)
+    script = blender_setup(asset, camera, placement, envmap)
+    output.write_bytes(BLENDER_SETUP, script.encode())
+    notices = []
+    if (off := square_pixel_error(camera)) > SQUARE_ENOUGH:
+        notices.append(
+            f"Blender and Mitsuba know square pixels only: there the object is up to {off:.1f} px "
+            f"off (the camera has fx {camera.fx:g}, fy {camera.fy:g})"
+        )
+    return {"web_values_clamped": clamped}, tuple(notices)
+
+
+# -------------------------------------------------------------------------------- tone curves
+
+_OBJECT_TEXT = {
+    "linear": "radiance clipped to [0, 1] -> fg.RGB of layers.exr, coverage divided out",
+    "reinhard": "x / (1 + x) of radiance x -> fg.RGB of layers.exr, coverage divided out",
+}
+_SHADOW_TEXT = "shadow ratio clipped to [0, 1] -> shadow.RGB of layers.exr"
+
+
+def tone_curve_cube(knots: ToneKnots, about: str) -> bytes:
+    """Return tone curves as a 1-D LUT in the format ``.cube`` (Iridas/Adobe, version 1.0).
+
+    The domain is [0, 1] in three columns, values are linear on both sides. Written out here because
+    importing colour-science takes longer than all other files of a hand-off; its reader is the
+    test.
+
+    Args:
+        knots: One curve, which serves all channels, or three.
+        about: What the table maps to what, one line.
+    """
+    x = np.linspace(0.0, 1.0, CUBE_SIZE)
+    table = np.broadcast_to(knots.evaluate(x), (CUBE_SIZE, 3))
+    lines = [
+        f'TITLE "warpir {warpir.__version__}"',
+        f"# {about}",
+        f"LUT_1D_SIZE {CUBE_SIZE}",
+        "DOMAIN_MIN 0.0 0.0 0.0",
+        "DOMAIN_MAX 1.0 1.0 1.0",
+        *(f"{r:.8f} {g:.8f} {b:.8f}" for r, g, b in table),
+    ]
+    return ("\n".join(lines) + "\n").encode()
+
+
+# -------------------------------------------------------------------------------------- light
+
+
+def web_map(texels: FloatArray) -> tuple[FloatArray, int]:
+    """Return a map as three.js reads it, and how many of its values were clamped.
+
+    Browsers upload it in half precision, where a sun above 65504 becomes infinite and then black.
+    """
+    turned = from_ours(texels, "threejs")
+    return np.minimum(turned, np.float32(HALF_MAX)), int((turned > HALF_MAX).sum())
+
+
+# ------------------------------------------------------------------------------------ Blender
+
+
+def blender_setup(asset: Asset, camera: Camera, placement: Placement, envmap: str) -> str:
+    """Return the script that builds the scene in Blender.
+
+    Args:
+        asset: The object.
+        camera: Of the photo.
+        placement: Where the object stands.
+        envmap: Name of the map's file.
+    """
+    low, high = asset.bounds()
+    diagonal = float(np.linalg.norm((high - low) * np.linalg.norm(placement.asset_to_world[:3, 0])))
+    middle = (placement.asset_to_world @ np.append(0.5 * (low + high), 1.0))[:3]
+    normal, offset = placement.ground[:3], float(placement.ground[3])
+    ground = np.eye(4)
+    ground[:3, :3] = y_to(normal)
+    ground[:3, 3] = middle - normal * (normal @ middle + offset)
+    distance = float(np.linalg.norm(middle - camera.c2w[:3, 3]))
+    values = blender_camera(camera)
+    template = Template(files("warpir.io").joinpath("blender_setup.py.in").read_text("utf-8"))
+    return template.substitute(
+        version=warpir.__version__,
+        photo=PHOTO,
+        envmap=envmap,
+        object=OBJECT,
+        width=camera.width,
+        height=camera.height,
+        angle=values["angle"],
+        shift_x=values["shift_x"],
+        shift_y=values["shift_y"],
+        near=1e-3 * distance,
+        far=1e3 * (distance + diagonal),
+        camera=_rows(values["matrix_world"]),
+        ground=_rows(_z_up(ground)),
+        ground_size=GROUND_SIDES * diagonal,
+    )
+
+
+def _z_up(matrix: Float64Array) -> Float64Array:
+    """Return a matrix of our frames, +Y up, as one of Blender's, +Z up on both sides."""
+    turn = np.array([[1, 0, 0, 0], [0, 0, -1, 0], [0, 1, 0, 0], [0, 0, 0, 1]], np.float64)
+    turned: Float64Array = turn @ matrix @ turn.T
+    return turned
+
+
+def _rows(matrix: Float64Array) -> str:
+    """Return a matrix as Python writes a tuple of rows; minus zero is zero."""
+    rows = (", ".join(repr(float(v) + 0.0) for v in row) for row in matrix)
+    return "(" + ",\n    ".join(f"({row})" for row in rows) + ")"

@@ -1,0 +1,404 @@
+"""Materials and textures of glTF 2.0, and the extensions that are honoured.
+
+Textures keep their stored codes: colours and emission are sRGB-encoded, all others are plain
+numbers. Occlusion maps are not read, since a path tracer makes its own.
+"""
+
+import math
+from dataclasses import replace
+
+import numpy as np
+
+from warpir.core.errors import InputError
+from warpir.core.limits import LIMITS, Limits
+from warpir.io.gltf.gate import RE_EXPORT_MESH, Entry, GltfFile
+from warpir.io.meshes.asset_files import Pixels, TextureDecoder, grey_pixels, locate, read_uri
+from warpir.io.meshes.materials_file import EMISSION_LIMIT
+from warpir.scene.asset import Material, Texture, TextureSlot
+
+HONOURED = {
+    "EXT_mesh_gpu_instancing",
+    "EXT_texture_webp",
+    "KHR_materials_clearcoat",
+    "KHR_materials_emissive_strength",
+    "KHR_materials_ior",
+    "KHR_materials_pbrSpecularGlossiness",
+    "KHR_materials_sheen",
+    "KHR_materials_specular",
+    "KHR_materials_transmission",
+    "KHR_materials_unlit",
+    "KHR_mesh_quantization",
+    "KHR_node_visibility",
+    "KHR_texture_transform",
+}
+"""Extensions whose meaning reaches the picture."""
+BASE_MATERIAL = {
+    f"KHR_materials_{name}"
+    for name in ("anisotropy", "diffuse_transmission", "dispersion", "iridescence", "volume")
+}
+"""Extensions that refine a material; the material below them is used, with a notice."""
+LEFT_OUT = {
+    "KHR_animation_pointer": "animations are not played",
+    "KHR_materials_variants": "the default variant is used",
+    "KHR_lights_punctual": "the lights of the file are not used",
+    "KHR_xmp_json_ld": "metadata is not read",
+}
+"""Extensions that can be ignored even when required, and the notice."""
+ADVICE = {
+    "EXT_meshopt_compression": RE_EXPORT_MESH,
+    "KHR_draco_mesh_compression": RE_EXPORT_MESH,
+    "KHR_meshopt_compression": RE_EXPORT_MESH,
+    "KHR_texture_basisu": "re-export with PNG or JPEG textures instead of KTX2",
+}
+"""What to do about an extension that is refused when required."""
+
+SPECULAR_LIMIT = 1e6
+"""Largest factor on the reflectance at normal incidence, which is cut at 1 [1]."""
+WRAPS = {10497: "repeat", 33071: "clamp", 33648: "mirror"}
+NEAREST = (9728, 9984, 9986)
+
+
+def check_extensions(root: Entry, notices: list[str]) -> None:
+    """Refuse required extensions that are not honoured; mention the others that are ignored."""
+    names = {}
+    for key in ("extensionsRequired", "extensionsUsed"):
+        listed = root.value.get(key, [])
+        if not isinstance(listed, list) or not all(isinstance(name, str) for name in listed):
+            raise root.error(f"{key} is not a list of names")
+        names[key] = dict.fromkeys(listed)
+    for name in names["extensionsRequired"]:
+        if name not in HONOURED | BASE_MATERIAL and name not in LEFT_OUT:
+            raise InputError(
+                root.path,
+                f"/extensionsRequired: {name} is not supported",
+                ADVICE.get(name, f"re-export without {name}"),
+            )
+    for name in names["extensionsUsed"]:
+        if name in LEFT_OUT:
+            notices.append(f"{name}: {LEFT_OUT[name]}")
+        elif name not in HONOURED | BASE_MATERIAL:
+            notices.append(f"{name} is not supported: what the file holds without it is used")
+
+
+class MaterialReader:
+    """Reads the materials that are drawn, and their textures, each once.
+
+    Args:
+        file: The file.
+        missing_textures: ``error`` or ``grey``.
+        notices: Receives what was assumed or left out.
+        limits: How many pixels the textures may have.
+        measures: Only count them, and decode nothing.
+    """
+
+    def __init__(
+        self,
+        file: GltfFile,
+        missing_textures: str,
+        notices: list[str],
+        limits: Limits = LIMITS,
+        measures: bool = False,
+    ) -> None:
+        self.file = file
+        self.missing_textures = missing_textures
+        self.notices = notices
+        self.materials: list[Material] = []
+        self.textures: list[Texture] = []
+        self._decoder = TextureDecoder(file.path, notices, limits, measures)
+        self._material_index: dict[int, int] = {}
+        self._texture_index: dict[tuple[int, str, str], int] = {}
+        self._roughness_index: dict[tuple[int, float], int] = {}
+        """By the texture that holds the glossiness, and its factor."""
+        self._is_colored: dict[int, bool] = {}
+        self._pixels: dict[int, Pixels | None] = {}
+
+    def index(self, primitive: Entry) -> int:
+        """Return the index in ``materials`` of what a primitive is made of."""
+        stated = primitive.integer("material", -1, low=-1)
+        if stated not in self._material_index:
+            if stated == -1:
+                material = Material(name="default")
+                self.notices.append("no material: glTF's default (white, fully metallic, rough)")
+            else:
+                material = self._read(
+                    self.file.root.item("materials", stated, primitive, "material")
+                )
+            self._material_index[stated] = len(self.materials)
+            self.materials.append(material)
+        return self._material_index[stated]
+
+    def uv_sets(self, index: int) -> set[int]:
+        """Return the texture coordinate sets that material ``index`` reads."""
+        material = self.materials[index]
+        return {slot.uv_set for slot in vars(material).values() if isinstance(slot, TextureSlot)}
+
+    def _read(self, entry: Entry) -> Material:
+        name = entry.text("name", "") or entry.pointer
+        pbr = entry.child("pbrMetallicRoughness")
+        *base_color, alpha = self._factors(pbr, "baseColorFactor", (1.0,) * 4, 0.0, 1.0)
+        mode = entry.text("alphaMode", "OPAQUE")
+        if mode not in ("OPAQUE", "MASK", "BLEND"):
+            raise entry.error(f"alphaMode is {mode!r}, expected OPAQUE, MASK or BLEND")
+        strength = entry.extension("KHR_materials_emissive_strength")
+        gain = 1.0 if strength is None else strength.number("emissiveStrength", 1.0)
+        if gain < 0:
+            self.notices.append(f"{entry.pointer}: emissiveStrength {gain:g} clamped to 0")
+        emission = self._factors(entry, "emissiveFactor", (0.0,) * 3, 0.0, math.inf)
+        if max(emission) * max(gain, 0.0) > EMISSION_LIMIT:
+            found = f"emission of {max(emission) * gain:g}"
+            raise entry.error(f"{found}, expected at most {EMISSION_LIMIT:g}")
+        material = Material(
+            name=name,
+            base_color=(base_color[0], base_color[1], base_color[2]),
+            alpha=alpha,
+            metallic=self._factor(pbr, "metallicFactor", 1.0),
+            roughness=self._factor(pbr, "roughnessFactor", 1.0),
+            emission=(
+                emission[0] * max(gain, 0.0),
+                emission[1] * max(gain, 0.0),
+                emission[2] * max(gain, 0.0),
+            ),
+            alpha_mode=mode,
+            alpha_cutoff=self._factor(entry, "alphaCutoff", 0.5),
+            double_sided=entry.flag("doubleSided"),
+            normal_scale=entry.child("normalTexture").number("scale", 1.0),
+            base_color_texture=self._slot(pbr, "baseColorTexture"),
+            metallic_roughness_texture=self._slot(pbr, "metallicRoughnessTexture"),
+            normal_texture=self._slot(entry, "normalTexture"),
+            emission_texture=self._slot(entry, "emissiveTexture") if any(emission) else None,
+        )
+        if "occlusionTexture" in entry:
+            self.notices.append("occlusion textures are not used: occlusion is traced")
+        return self._extend(material, entry)
+
+    def _extend(self, material: Material, entry: Entry) -> Material:
+        """Apply the material extensions that are honoured; mention those left out."""
+        if entry.extension("KHR_materials_unlit") is not None:
+            material = replace(
+                material,
+                metallic=0.0,
+                roughness=1.0,
+                emission=(0.0, 0.0, 0.0),
+                metallic_roughness_texture=None,
+                normal_texture=None,
+                emission_texture=None,
+            )
+            self.notices.append(f"material {material.name!r}: unlit, shown as a lit matte surface")
+        else:
+            glossiness = entry.extension("KHR_materials_pbrSpecularGlossiness")
+            if glossiness is not None and "pbrMetallicRoughness" not in entry:
+                material = self._from_glossiness(material, glossiness)
+            else:
+                material = self._add_reflection(material, entry)
+            material = self._add_layers(material, entry)
+            material = self._add_transmission(material, entry)
+        left_out = [name for name in entry.child("extensions").value if name not in HONOURED]
+        if left_out:
+            self.notices.append(
+                f"material {material.name!r}: {', '.join(left_out)} not supported, "
+                "its base material is used"
+            )
+        return material
+
+    def _from_glossiness(self, material: Material, entry: Entry) -> Material:
+        """Convert KHR_materials_pbrSpecularGlossiness, as KHR_materials_specular describes it.
+
+        The dielectric's reflectance is the specular colour itself, at an infinite index.
+        """
+        *diffuse, alpha = self._factors(entry, "diffuseFactor", (1.0,) * 4, 0.0, 1.0)
+        specular = self._factors(entry, "specularFactor", (1.0,) * 3, 0.0, 1.0)
+        glossiness = self._factor(entry, "glossinessFactor", 1.0)
+        slot = self._slot(entry, "specularGlossinessTexture")
+        roughness_slot = None
+        if slot is not None:
+            # Glossiness is in A, roughness in G.
+            key = slot.texture, glossiness
+            if key not in self._roughness_index:
+                texture = self.textures[slot.texture]
+                self._decoder.count(texture.pixels[..., 0].size, f"{entry.pointer}: ")
+                codes = np.full_like(texture.pixels, 255)
+                codes[..., 1] = np.round(255.0 - glossiness * texture.pixels[..., 3])
+                self._roughness_index[key] = len(self.textures)
+                self.textures.append(replace(texture, pixels=codes))
+            roughness_slot = replace(slot, texture=self._roughness_index[key])
+        return replace(
+            material,
+            base_color=(diffuse[0], diffuse[1], diffuse[2]),
+            alpha=alpha,
+            metallic=0.0,
+            roughness=1.0 - glossiness if slot is None else 1.0,
+            ior=0.0,
+            specular_color=(specular[0], specular[1], specular[2]),
+            base_color_texture=self._slot(entry, "diffuseTexture"),
+            specular_color_texture=slot,
+            metallic_roughness_texture=roughness_slot,
+        )
+
+    def _add_reflection(self, material: Material, entry: Entry) -> Material:
+        """Read KHR_materials_ior and KHR_materials_specular."""
+        extensions = entry.child("extensions")
+        ior = extensions.child("KHR_materials_ior").number("ior", 1.5)
+        if ior != 0.0 and ior < 1.0:
+            self.notices.append(f"{entry.pointer}: ior {ior:g} clamped to 1")
+            ior = 1.0
+        specular = extensions.child("KHR_materials_specular")
+        color = self._factors(specular, "specularColorFactor", (1.0,) * 3, 0.0, SPECULAR_LIMIT)
+        return replace(
+            material,
+            ior=ior,
+            specular=self._factor(specular, "specularFactor", 1.0),
+            specular_color=(color[0], color[1], color[2]),
+            specular_texture=self._slot(specular, "specularTexture"),
+            specular_color_texture=self._slot(specular, "specularColorTexture"),
+        )
+
+    def _add_layers(self, material: Material, entry: Entry) -> Material:
+        """Read KHR_materials_clearcoat and KHR_materials_sheen; textures of absent layers are not.
+
+        A normal map keeps its own scale.
+        """
+        coat = entry.child("extensions").child("KHR_materials_clearcoat")
+        clearcoat = self._factor(coat, "clearcoatFactor", 0.0)
+        if clearcoat > 0.0:
+            material = replace(
+                material,
+                clearcoat=clearcoat,
+                clearcoat_roughness=self._factor(coat, "clearcoatRoughnessFactor", 0.0),
+                clearcoat_normal_scale=coat.child("clearcoatNormalTexture").number("scale", 1.0),
+                clearcoat_texture=self._slot(coat, "clearcoatTexture"),
+                clearcoat_roughness_texture=self._slot(coat, "clearcoatRoughnessTexture"),
+                clearcoat_normal_texture=self._slot(coat, "clearcoatNormalTexture"),
+            )
+        sheen = entry.child("extensions").child("KHR_materials_sheen")
+        color = self._factors(sheen, "sheenColorFactor", (0.0,) * 3, 0.0, 1.0)
+        if any(color):
+            material = replace(
+                material,
+                sheen_color=(color[0], color[1], color[2]),
+                sheen_roughness=self._factor(sheen, "sheenRoughnessFactor", 0.0),
+                sheen_color_texture=self._slot(sheen, "sheenColorTexture"),
+                sheen_roughness_texture=self._slot(sheen, "sheenRoughnessTexture"),
+            )
+        return material
+
+    def _add_transmission(self, material: Material, entry: Entry) -> Material:
+        """Read KHR_materials_transmission; say what the glass will not do."""
+        glass = entry.child("extensions").child("KHR_materials_transmission")
+        transmission = self._factor(glass, "transmissionFactor", 0.0)
+        if transmission == 0.0:
+            return material
+        missing = []
+        slot = material.base_color_texture
+        if slot is not None and slot.texture not in self._is_colored:
+            codes = self.textures[slot.texture].pixels[..., :3]
+            self._is_colored[slot.texture] = bool(np.ptp(codes, axis=2).any())
+        if len(set(material.base_color)) > 1 or (slot and self._is_colored[slot.texture]):
+            missing.append("tinted")
+        if material.roughness > 0.0:
+            missing.append("blurred")
+        if missing:
+            self.notices.append(
+                f"material {material.name!r}: light that passes it is not {' or '.join(missing)}"
+            )
+        return replace(
+            material,
+            transmission=transmission,
+            transmission_texture=self._slot(glass, "transmissionTexture"),
+        )
+
+    def _factor(self, entry: Entry, key: str, default: float) -> float:
+        value = entry.number(key, default)
+        if not 0.0 <= value <= 1.0:
+            self.notices.append(f"{entry.pointer}: {key} {value:g} clamped to 0 ... 1")
+        return min(max(value, 0.0), 1.0)
+
+    def _factors(
+        self, entry: Entry, key: str, default: tuple[float, ...], low: float, high: float
+    ) -> tuple[float, ...]:
+        values = entry.numbers(key, default)
+        if any(not low <= value <= high for value in values):
+            self.notices.append(f"{entry.pointer}: {key} clamped to {low:g} ... {high:g}")
+        return tuple(min(max(value, low), high) for value in values)
+
+    def _slot(self, owner: Entry, key: str) -> TextureSlot | None:
+        """Return how ``owner`` reads texture ``key``, or None when it has none."""
+        if key not in owner:
+            return None
+        entry = owner.child(key)
+        texture = self._texture(entry, key in ("baseColorTexture", "diffuseTexture"))
+        if texture is None:
+            return None
+        uv_set = entry.integer("texCoord", 0)
+        affine = (1.0, 0.0, 0.0, 0.0, 1.0, 0.0)
+        transform = entry.extension("KHR_texture_transform")
+        if transform is not None:
+            uv_set = transform.integer("texCoord", uv_set)
+            (ox, oy), (sx, sy) = (
+                transform.numbers("offset", (0.0, 0.0)),
+                transform.numbers("scale", (1.0, 1.0)),
+            )
+            angle = transform.number("rotation", 0.0)
+            c, s = math.cos(angle), math.sin(angle)
+            # translation * rotation * scale, as in the extension's own GLSL.
+            affine = (c * sx, s * sy, ox, -s * sx, c * sy, oy)
+        if uv_set > 1:
+            raise entry.error(f"texCoord {uv_set}, but only sets 0 and 1 are supported")
+        return TextureSlot(texture, uv_set, affine)
+
+    def _texture(self, user: Entry, is_base_color: bool) -> int | None:
+        """Return the index in ``textures``, or None when a missing image is left out."""
+        root = self.file.root
+        entry = root.item("textures", user.integer("index"), user, "index")
+        webp = entry.extension("EXT_texture_webp")
+        source = entry.integer("source", -1, low=-1) if webp is None else webp.integer("source")
+        wraps = ["repeat", "repeat"]
+        if "sampler" in entry:
+            sampler = root.item("samplers", entry.integer("sampler"), entry, "sampler")
+            for k, key in enumerate(("wrapS", "wrapT")):
+                code = sampler.integer(key, 10497)
+                if code not in WRAPS:
+                    raise sampler.error(f"{key} is {code}, expected one of {sorted(WRAPS)}")
+                wraps[k] = WRAPS[code]
+            if sampler.integer("magFilter", 9729) in NEAREST:
+                self.notices.append(f"{sampler.pointer}: nearest filter replaced by bilinear")
+        if source not in self._pixels:
+            self._pixels[source] = self._load(source, entry)
+        pixels = self._pixels[source]
+        if pixels is None and not is_base_color:
+            return None
+        use = (source, wraps[0], wraps[1])
+        if use not in self._texture_index:
+            texture = Texture(grey_pixels() if pixels is None else pixels, *wraps)
+            self._texture_index[use] = len(self.textures)
+            self.textures.append(texture)
+        return self._texture_index[use]
+
+    def _load(self, source: int, texture: Entry) -> Pixels | None:
+        """Return the pixels of an image; None when it is missing and that is allowed."""
+        if source == -1 and texture.extension("KHR_texture_basisu") is None:
+            raise texture.error("no image source")
+        image = texture
+        if source != -1:
+            image = self.file.root.item("images", source, texture, "source")
+        where = f"{image.pointer}: "
+        uri = image.text("uri", "")
+        if "uri" in image and not uri.startswith("data:"):
+            locate(uri, self.file.path, where)  # outside the folder is refused in any case
+        try:
+            if source == -1:
+                raise texture.error("only a KTX2 image", ADVICE["KHR_texture_basisu"])
+            if "uri" in image:
+                file = self.file
+                encoded = read_uri(uri, file.path, where, file.limits, file.hashes)
+            else:
+                encoded = bytes(self.file.view(image.integer("bufferView"), image)[0])
+            return self._decoder.decode(encoded, where)
+        except InputError as error:
+            if self.missing_textures != "grey":
+                raise InputError(
+                    error.where,
+                    error.what,
+                    error.advice or "add the image, or pass --missing-textures grey",
+                ) from None
+            self.notices.append(f"{error.what}: replaced by grey, or left out where no colour")
+            return None

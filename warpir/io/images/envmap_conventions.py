@@ -1,0 +1,129 @@
+"""Lat-long conventions of other tools: the one place where their maps become ours and back.
+
+Ours is OpenEXR's, also OpenUSD's and Mitsuba's: with ``u`` to the right and ``v`` down in [0, 1],
+``u = atan2(x, -z) / 2 pi mod 1`` and ``v = acos(y) / pi`` for the unit direction (x, y, z) in a
+world with +Y up, so the image's centre is +Z and its left quarter +X. All tools agree on ``v``
+and, seen from inside, on the sense of rotation; they differ by where the seam lies:
+
+======================================  ===========================  =======  ============
+tool                                    u                            centre   left quarter
+======================================  ===========================  =======  ============
+openexr, OpenUSD, Mitsuba               atan2(x, -z) / 2 pi mod 1    +Z       +X
+nvdiffrec (render/util.py)              atan2(x, -z) / 2 pi + 1/2    -Z       -X
+threejs (common.glsl.js)                atan2(z, x) / 2 pi + 1/2     +X       -Z
+blender (Cycles, projection.h), Z up    1/2 - atan2(y, x) / 2 pi     +X       +Y, our -Z
+diffusionlight (ball2envmap.py)         atan2(x, -z) / 2 pi + 1/2    ahead    image left
+======================================  ===========================  =======  ============
+
+DiffusionLight's directions are in camera axes: its maps also turn with the camera.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from warpir.scene.light import Float64Array, FloatArray, map_directions, rotate_map
+
+SEAM_SHIFTS = {
+    "openexr": 0.0,
+    "nvdiffrec": 0.5,
+    "threejs": 0.25,
+    "blender": 0.25,
+    "diffusionlight": 0.5,
+}
+"""Columns to roll our map to the right by, as a share of its width, to make it the tool's."""
+
+IN_CAMERA_AXES = frozenset({"diffusionlight"})
+"""Conventions whose directions refer to the camera instead of the world."""
+
+
+def to_ours(
+    texels: FloatArray, convention: str, camera_to_world: Float64Array | None = None
+) -> FloatArray:
+    """Turn another tool's map to our orientation.
+
+    Args:
+        texels: Radiance in the tool's orientation, shape [He, 2 He, 3].
+        convention: Who made the map: a key of `SEAM_SHIFTS`.
+        camera_to_world: Rotation or pose of the camera, shape [3, 3] or [4, 4]; needed, and used,
+            only for a convention in `IN_CAMERA_AXES`.
+
+    Returns:
+        The map in our orientation and world frame. Whole columns are moved exactly; a camera that
+        is not level makes each texel a mean over its own area.
+
+    Raises:
+        ValueError: An unknown convention, or the camera is missing.
+    """
+    rotation = _rotation(convention, camera_to_world)
+    # Longitude falls with u: rolling to the right by a share of the width is a clockwise turn.
+    return rotate_directions(rotate_map(texels, 360.0 * SEAM_SHIFTS[convention]), rotation)
+
+
+def from_ours(
+    texels: FloatArray, convention: str, camera_to_world: Float64Array | None = None
+) -> FloatArray:
+    """Turn our map to another tool's orientation; the inverse of `to_ours`, with its arguments."""
+    rotation = _rotation(convention, camera_to_world)
+    return rotate_map(rotate_directions(texels, rotation.T), -360.0 * SEAM_SHIFTS[convention])
+
+
+def _rotation(convention: str, camera_to_world: Float64Array | None) -> Float64Array:
+    """Return the rotation from the convention's axes to the world, shape [3, 3]."""
+    if convention not in SEAM_SHIFTS:
+        raise ValueError(f"convention {convention!r} is not one of {', '.join(SEAM_SHIFTS)}")
+    if convention not in IN_CAMERA_AXES:
+        return np.eye(3)
+    if camera_to_world is None:
+        raise ValueError(f"convention {convention!r} is in camera axes: the camera is needed")
+    return np.asarray(camera_to_world, np.float64)[:3, :3]
+
+
+def rotate_directions(texels: FloatArray, rotation: Float64Array, side: int = 3) -> FloatArray:
+    """Turn a map by any rotation; one about +Y is left to `rotate_map`, which keeps each row's sum.
+
+    Args:
+        texels: Radiance in our orientation, shape [He, 2 He, 3].
+        rotation: Takes a direction of the given map to one of the result, shape [3, 3].
+        side: Directions along a texel's side that are averaged.
+    """
+    if np.allclose(rotation[1], (0.0, 1.0, 0.0), atol=1e-7):
+        return rotate_map(texels, float(np.degrees(np.arctan2(rotation[0, 2], rotation[0, 0]))))
+    height, width = texels.shape[:2]
+    rows = np.arange(height)
+    turned = np.zeros(texels.shape)
+    fine = map_directions(height * side, width * side).reshape(height, side, width, side, 3)
+    # Within a texel, the points nearer to a pole stand for less of the sphere.
+    share = np.sin(np.pi * (np.arange(height * side) + 0.5) / (height * side))
+    share = share.reshape(height, side) / share.reshape(height, side).sum(axis=1, keepdims=True)
+    for i in range(side):
+        for j in range(side):
+            x, y, z = np.moveaxis(fine[:, i, :, j] @ rotation, -1, 0)
+            u = np.arctan2(x, -z) / (2.0 * np.pi) % 1.0 * width - 0.5
+            v = np.arctan2(np.hypot(x, z), y) / np.pi * height - 0.5
+            turned += (share[rows, i] / side)[:, None, None] * read_map(texels, u, v)
+    return turned.astype(np.float32)
+
+
+def read_map(texels: FloatArray, u: Float64Array, v: Float64Array) -> Float64Array:
+    """Read a map bilinearly.
+
+    Args:
+        texels: Shape [He, We, 3].
+        u: Column, wrapped; 0 is the first one's centre, shape [...].
+        v: Row, clamped; 0 is the first one's centre, shape [...].
+
+    Returns:
+        Values, shape [..., 3].
+    """
+    height, width = texels.shape[:2]
+    v = np.clip(v, 0.0, height - 1.0)
+    left, top = np.floor(u), np.floor(v)
+    x, y = (u - left)[..., None], (v - top)[..., None]
+    column, row = left.astype(int), top.astype(int)
+    below = np.minimum(row + 1, height - 1)
+    j, k = column % width, (column + 1) % width
+    upper = texels[row, j] * (1.0 - x) + texels[row, k] * x
+    lower = texels[below, j] * (1.0 - x) + texels[below, k] * x
+    read: Float64Array = upper * (1.0 - y) + lower * y
+    return read

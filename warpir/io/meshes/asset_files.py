@@ -1,0 +1,358 @@
+"""The bytes behind an asset: regular files inside its own folder, within limits; textures as RGBA.
+
+Shared by the readers `warpir.io.gltf.reader` and `warpir.io.meshes.obj`. Nothing here opens a
+network connection, follows a link out of the asset's folder or allocates before the size is known.
+"""
+
+import base64
+import binascii
+import hashlib
+import os
+import re
+import stat
+from io import BytesIO
+from pathlib import Path
+from urllib.parse import unquote
+
+import numpy as np
+from numpy.typing import NDArray
+
+from warpir.core.errors import InputError
+from warpir.core.limits import LIMITS, Limits
+from warpir.scene.asset import ABSENT, Material, Primitive
+
+EXTENT = 1e18
+"""Largest coordinate [m]; its square still fits float32."""
+GREY = 188
+"""sRGB code that stands for a missing base colour texture: linear 0.5."""
+NOTICES = 40
+"""Most notices of an asset."""
+
+Pixels = NDArray[np.uint8]
+
+
+def read_regular(
+    path: Path,
+    where: str | Path,
+    pointer: str = "",
+    limits: Limits = LIMITS,
+    limit: str = "file_bytes",
+    hashes: dict[str, str] | None = None,
+) -> bytes:
+    """Return the content of a regular file, refusing folders, devices, pipes and giants.
+
+    Args:
+        path: The file to read.
+        where: The asset that is named in an error.
+        pointer: The place in the asset that refers to ``path``, ending in ``: ``, or empty.
+        limits: How large it may be.
+        limit: Which of them counts here.
+        hashes: Receives the sha256 of what was read; see `warpir.scene.asset.Asset.hashes`.
+
+    Raises:
+        InputError: It cannot be read, is empty, or is too large.
+    """
+    if hashes is not None:
+        name = "" if Path(where) == path else os.path.relpath(path, Path(where).parent.resolve())
+        hashes[name] = ABSENT
+    named = "" if Path(where) == path else f"{path.name}: "
+    try:
+        status = path.stat()
+        if not stat.S_ISREG(status.st_mode):
+            raise InputError(where, f"{pointer}{named}not a regular file")
+        what = f"{pointer}{named}too large"
+        limits.check(limit, status.st_size, where, what, more=" bytes")
+        content = path.read_bytes()
+    except (OSError, ValueError) as error:  # ValueError: a name that no file can have
+        reason = error.strerror if isinstance(error, OSError) else "not a file name"
+        raise InputError(where, f"{pointer}{named}{reason}") from None
+    if not content:
+        raise InputError(where, f"{pointer}{named}empty file")
+    if hashes is not None:
+        hashes[name] = hashlib.sha256(content).hexdigest()
+    return content
+
+
+def inside(folder: Path, uri: str, where: Path, pointer: str = "") -> Path:
+    """Resolve a relative file name, links included, and insist that it stays in ``folder``.
+
+    Args:
+        folder: The folder of the asset.
+        uri: Relative path with ``/``, already percent-decoded.
+        where: The asset that is named in an error.
+        pointer: The place in the asset, ending in ``: ``, or empty.
+
+    Raises:
+        InputError: The name is empty, absolute, a URL, or leads out of the folder.
+    """
+    outside = InputError(
+        where,
+        f"{pointer}{uri[:80]!r} is outside the asset folder",
+        "put all files of the asset into one folder and refer to them by relative names",
+    )
+    if (
+        not uri
+        or "\0" in uri
+        or uri.startswith(("/", "\\"))
+        or re.match(r"[A-Za-z][A-Za-z0-9+.-]*:", uri)
+    ):
+        raise outside
+    try:
+        root = folder.resolve()
+        target = (root / uri).resolve()
+    except (OSError, RuntimeError):  # a loop of links
+        raise outside from None
+    if not target.is_relative_to(root):
+        raise outside
+    return target
+
+
+def read_uri(
+    uri: str,
+    where: Path,
+    pointer: str,
+    limits: Limits = LIMITS,
+    hashes: dict[str, str] | None = None,
+) -> bytes:
+    """Return the bytes behind a glTF URI: a base64 ``data:`` URI or a file next to the asset.
+
+    Raises:
+        InputError: The URI leaves the folder, is damaged, or its file cannot be read.
+    """
+    if uri.startswith("data:"):
+        head, comma, payload = uri.partition(",")
+        if not comma or not head.endswith(";base64"):
+            raise InputError(where, f"{pointer}data: URI is not base64")
+        try:
+            return base64.b64decode(payload, validate=True)
+        except (binascii.Error, ValueError) as error:
+            raise InputError(where, f"{pointer}data: URI is damaged ({error})") from None
+    return read_regular(locate(uri, where, pointer), where, pointer, limits, hashes=hashes)
+
+
+def locate(uri: str, where: Path, pointer: str) -> Path:
+    """Return the file that a relative glTF URI means, percent-decoded once.
+
+    Raises:
+        InputError: It is not UTF-8 or leaves the asset's folder.
+    """
+    try:
+        name = unquote(uri, errors="strict")
+    except UnicodeDecodeError:
+        raise InputError(where, f"{pointer}URI is not UTF-8 after percent-decoding") from None
+    return inside(where.parent, name, where, pointer)
+
+
+class TextureDecoder:
+    """Decodes the images of one asset and keeps count of their pixels.
+
+    Args:
+        where: The asset that is named in an error.
+        notices: Receives one line per repair.
+        limits: How many pixels all images may have together.
+        measures: Only count the pixels: what is decoded is one grey texel.
+    """
+
+    def __init__(
+        self, where: Path, notices: list[str], limits: Limits = LIMITS, measures: bool = False
+    ) -> None:
+        self.where = where
+        self.measures = measures
+        self.notices = notices
+        self.limits = limits
+        self.pixel_count = 0
+        self.byte_count = 0
+
+    def decode(self, encoded: bytes, pointer: str) -> Pixels:
+        """Decode a PNG, JPEG or WebP image to RGBA codes, shape [height, width, 4].
+
+        Colour profiles and orientation tags are ignored, as the glTF specification demands;
+        16-bit images are reduced to 8 bits.
+
+        Args:
+            encoded: The image file's content.
+            pointer: The place in the asset, ending in ``: ``.
+
+        Raises:
+            InputError: Another format, damaged, or beyond a limit of all textures.
+        """
+        from PIL import Image
+
+        self.byte_count += len(encoded)
+        what = f"{pointer}too many bytes of textures"
+        self.limits.check("file_bytes", self.byte_count, self.where, what, more=" so far")
+        if encoded[1:5] == b"KTX ":
+            raise InputError(
+                self.where,
+                f"{pointer}KTX2 texture (expected PNG, JPEG or WebP)",
+                "re-export with PNG or JPEG textures, without KHR_texture_basisu",
+            )
+        try:
+            Image.MAX_IMAGE_PIXELS = None  # ours is checked before a pixel is decoded
+            image: Image.Image = Image.open(BytesIO(encoded), formats=["PNG", "JPEG", "WEBP"])
+            self.count(image.width * image.height, pointer)
+            if self.measures:
+                return grey_pixels()
+            image.load()
+            if image.format == "PNG" and encoded[24:25] == b"\x10":
+                self.notices.append(f"{pointer}16-bit texture reduced to 8 bits")
+            if image.mode.startswith("I"):
+                # 16-bit grey: Pillow's own conversion would clip instead of scaling.
+                grey = np.asarray(image).astype(np.uint32) >> 8
+                image = Image.fromarray(grey.astype(np.uint8))
+            return np.array(image.convert("RGBA"))
+        except (InputError, MemoryError):
+            raise
+        except Exception as error:  # Pillow raises a dozen kinds, struct.error among them
+            short = "not a PNG, JPEG or WebP image" if "identify" in str(error) else str(error)
+            raise InputError(self.where, f"{pointer}image cannot be decoded ({short})") from None
+
+    def count(self, pixel_count: int, pointer: str) -> None:
+        """Count the pixels of a texture that is about to be made.
+
+        Raises:
+            InputError: They are too many, together with those that are there.
+        """
+        self.pixel_count += pixel_count
+        self.limits.check(
+            "texture_pixels",
+            self.pixel_count,
+            self.where,
+            f"{pointer}too many texture pixels",
+            more=" so far",
+            advice="use smaller textures",
+        )
+
+
+def grey_pixels() -> Pixels:
+    """Return the one texel that replaces a missing base colour texture, shape [1, 1, 4]."""
+    return np.array([[[GREY, GREY, GREY, 255]]], dtype=np.uint8)
+
+
+def keep_area(
+    positions: NDArray[np.float64], indices: NDArray[np.int32]
+) -> tuple[NDArray[np.int32], int, int]:
+    """Drop triangles that no ray can hit and exact repetitions.
+
+    Args:
+        positions: Any frame [m], shape [vertex, 3].
+        indices: Shape [triangle, 3].
+
+    Returns:
+        The remaining triangles, C-contiguous, the number without area, and the number of
+        repetitions (the same three vertices in the same cyclic order).
+    """
+    a, b, c = (positions[indices[:, k]] for k in range(3))
+    with np.errstate(over="ignore", invalid="ignore"):  # `check_drawable` refuses such sizes
+        area_squared = np.square(np.cross(b - a, c - a)).sum(axis=1)
+        longest_squared = np.maximum(np.square(b - a).sum(axis=1), np.square(c - a).sum(axis=1))
+        # Collinear corners leave rounding errors of float64, relative to the longest side.
+        flat = area_squared <= np.square(1e-12 * longest_squared)
+        flat &= np.isfinite(area_squared)
+    kept = indices[~flat] if flat.any() else indices
+    # Start each triangle at its lowest vertex, so that equal triangles are equal rows.
+    first = kept.argmin(axis=1)
+    rows = np.arange(len(kept))
+    key = [kept[rows, (first + k) % 3] for k in range(3)]
+    order = np.lexsort(key)
+    same = np.ones(max(len(kept) - 1, 0), dtype=bool)
+    for column in key:
+        same &= np.diff(column[order]) == 0
+    repeated = np.sort(order[1:][same])
+    if len(repeated):
+        kept = np.delete(kept, repeated, axis=0)
+    return np.ascontiguousarray(kept), int(flat.sum()), len(repeated)
+
+
+def repair_normals(
+    normals: NDArray[np.float64], positions: NDArray[np.float64], indices: NDArray[np.int32]
+) -> tuple[NDArray[np.float32], int]:
+    """Normalise shading normals; those of length zero become the mean of their triangles.
+
+    Args:
+        normals: Any length, shape [vertex, 3].
+        positions: The same frame [m], shape [vertex, 3].
+        indices: Shape [triangle, 3].
+
+    Returns:
+        Unit normals, shape [vertex, 3], and how many had no length.
+    """
+    length = np.linalg.norm(normals, axis=1, keepdims=True)
+    lost = length[:, 0] < 1e-20
+    if lost.any():
+        a, b, c = (positions[indices[:, k]] for k in range(3))
+        area = np.cross(b - a, c - a)
+        mean = np.zeros_like(normals)
+        for k in range(3):
+            np.add.at(mean, indices[:, k], area)
+        normals = np.where(lost[:, None], mean, normals)
+        length = np.linalg.norm(normals, axis=1, keepdims=True)
+        still = length[:, 0] < 1e-20  # vertices that no triangle uses, or a folded pair
+        normals = np.where(still[:, None], [0.0, 1.0, 0.0], normals)
+    return unit(normals), int(lost.sum())
+
+
+def unit(vectors: NDArray[np.float64]) -> NDArray[np.float32]:
+    """Normalise the rows, shape [vertex, 3]; zeros stay, and so does what float32 calls unit.
+
+    Stored unit vectors are 6e-8 off in length. Left alone, they read back as they were written.
+    """
+    with np.errstate(over="ignore"):  # beyond float32 is no unit vector either
+        stored = vectors.astype(np.float32)
+    is_unit = np.abs(np.linalg.norm(stored.astype(np.float64), axis=1, keepdims=True) - 1.0) < 1e-7
+    length = np.linalg.norm(vectors, axis=1, keepdims=True)
+    scaled = vectors / np.where(length > 0.0, length, 1.0)
+    return np.where(is_unit, stored, scaled).astype(np.float32)
+
+
+def check_triangle_count(where: Path, count: int, limits: Limits, more: str = "") -> None:
+    """Refuse more triangles than the limit.
+
+    Args:
+        where: The asset.
+        count: How many triangles it has.
+        limits: How many it may have.
+        more: What the number stands for, to be added to it.
+
+    Raises:
+        InputError: There are more.
+    """
+    limits.check(
+        "triangles", count, where, "too many triangles", more=more, advice="decimate the mesh"
+    )
+
+
+def check_drawable(where: Path, primitives: list[Primitive], found: str) -> None:
+    """Refuse an asset without triangles, or beyond what float32 kernels can place.
+
+    Args:
+        where: The asset.
+        primitives: What was read.
+        found: What the file has instead of triangles.
+
+    Raises:
+        InputError: ``primitives`` is empty or a coordinate is not below ``EXTENT``.
+    """
+    if not primitives:
+        raise InputError(where, f"nothing to render (found {found}; expected triangles)")
+    largest = max(float(np.abs(p.positions).max()) for p in primitives)
+    if not largest < EXTENT:
+        raise InputError(
+            where, f"coordinates up to {largest:g} (expected below {EXTENT:g})", "scale it down"
+        )
+
+
+def plain_material(name: str, base_color: tuple[float, float, float]) -> Material:
+    """Return what stands for an unstated material: rough dielectric, both sides visible."""
+    return Material(
+        name=name, base_color=base_color, metallic=0.0, roughness=0.5, double_sided=True
+    )
+
+
+def concise(notices: list[str]) -> tuple[str, ...]:
+    """Return the different notices in order, cut to ``NOTICES`` lines with a count of the rest."""
+    different = list(dict.fromkeys(notices))
+    if len(different) > NOTICES:
+        rest = len(different) - NOTICES + 1
+        different[NOTICES - 1 :] = [f"and {rest} more notices"]
+    return tuple(different)

@@ -1,0 +1,477 @@
+"""Reads the material files of OBJ (MTL) into `Material`.
+
+Physically based keys are used where the file has them (``Pr Pm Ke norm`` and their maps; ``Pc Pcr
+Ps Ni`` without maps; as in https://benhouston3d.com/blog/extended-wavefront-obj-mtl-for-pbr/).
+``bsdf pbr`` (nvdiffrec) makes ``Ks`` mean (occlusion, roughness, metallic). What older files leave
+open is assumed and noted. OBJ knows no back faces, so all materials are double-sided.
+"""
+
+import math
+import os
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from pathlib import Path, PurePosixPath
+
+import numpy as np
+
+from warpir.core.errors import InputError, shown
+from warpir.core.limits import LIMITS, Limits
+from warpir.io.meshes.asset_files import (
+    Pixels,
+    TextureDecoder,
+    grey_pixels,
+    inside,
+    plain_material,
+    read_regular,
+)
+from warpir.io.meshes.materials_file import EMISSION_LIMIT
+from warpir.scene.asset import Material, Texture, TextureSlot
+
+GREY = (0.8, 0.8, 0.8)
+"""Base colour where the file states none."""
+ROUGHNESS = 0.5
+"""Roughness where the file states none."""
+OPTION_WIDTHS = {
+    "-blendu": 1, "-blendv": 1, "-boost": 1, "-bm": 1, "-cc": 1, "-clamp": 1, "-imfchan": 1,
+    "-mm": 2, "-o": 3, "-s": 3, "-t": 3, "-texres": 1, "-type": 1,
+}  # fmt: skip
+"""How many values follow an option of a map, at most."""
+NUMBERS = ("kd", "ks", "ke", "ns", "ni", "d", "tr", "pr", "pm", "pc", "pcr", "ps")
+"""Statements whose numbers are read."""
+MAPS = ("map_kd", "map_d", "map_pr", "map_pm", "map_ke", "map_bump", "norm")
+"""Maps that are read; ``bsdf pbr`` has map_Ks too."""
+MEANINGLESS = ("ka", "illum", "sharpness")
+"""Statements that say nothing to a path tracer."""
+HONOURED_OPTIONS = {"-bm", "-clamp", "-o", "-s", "-type"}
+
+
+@dataclass(frozen=True)
+class MapStatement:
+    """One ``map_...`` line: a file and how it is laid on the surface."""
+
+    name: str
+    """File name as written, ``/`` between folders, relative to the OBJ's folder."""
+    clamp: bool = False
+    bump: float = 1.0
+    """Factor of ``-bm`` [1]."""
+    scale: tuple[float, float] = (1.0, 1.0)
+    offset: tuple[float, float] = (0.0, 0.0)
+
+    def slot(self, texture: int) -> TextureSlot:
+        """Return the slot that reads ``texture`` this way; v is turned from up to down."""
+        (su, sv), (ou, ov) = self.scale, self.offset
+        return TextureSlot(texture, 0, (su, 0.0, ou, 0.0, sv, 1.0 - sv - ov))
+
+
+@dataclass
+class MtlEntry:
+    """The statements of one ``newmtl``."""
+
+    numbers: dict[str, tuple[float, ...]] = field(default_factory=dict)
+    maps: dict[str, MapStatement] = field(default_factory=dict)
+    is_pbr: bool = False
+    """Whether ``bsdf pbr`` was stated."""
+    left_out: list[str] = field(default_factory=list)
+    """Other statements, which may matter to the picture."""
+
+
+class MaterialLibrary:
+    """The materials of one OBJ file; only those asked for are built.
+
+    Args:
+        path: The OBJ file.
+        missing_textures: ``error``, or ``grey``.
+        notices: Receives what was assumed or left out.
+        limits: How many pixels the textures may have.
+    """
+
+    def __init__(
+        self, path: Path, missing_textures: str, notices: list[str], limits: Limits = LIMITS
+    ) -> None:
+        self.path = path
+        self.missing_textures = missing_textures
+        self.notices = notices
+        self.hashes: dict[str, str] = {}
+        self.materials: list[Material] = []
+        self.textures: list[Texture] = []
+        self._entries: dict[str, MtlEntry] = {}
+        self._index: dict[str, int] = {}
+        self._limits = limits
+        self._decoder = TextureDecoder(path, notices, limits)
+        self._pixels: dict[str, Pixels | None] = {}
+        self._is_grey: dict[str, bool] = {}
+        self._texture_index: dict[tuple[str, ...], int] = {}
+        """By what a texture is for, the maps that it is made of, and how it is repeated."""
+
+    def add(self, names: str) -> None:
+        """Read the files of an ``mtllib`` line: one name with spaces, or several names.
+
+        Raises:
+            InputError: A file is missing (unless missing textures are allowed), outside the
+                folder, or damaged.
+        """
+        names = names.replace("\\", "/")
+        whole = inside(self.path.parent, names, self.path, "mtllib ")
+        for name in [names] if os.path.exists(whole) else names.split():
+            file = inside(self.path.parent, name, self.path, "mtllib ")
+            try:
+                content = read_regular(file, self.path, "mtllib ", self._limits, hashes=self.hashes)
+            except InputError as error:
+                if self.missing_textures != "grey":
+                    raise InputError(
+                        error.where, error.what, "add it, or pass --missing-textures grey"
+                    ) from None
+                self.notices.append(f"{error.what}: its materials are grey")
+                continue
+            self._parse(content, name)
+
+    def index(self, name: str, white: bool = False) -> int:
+        """Return the index in ``materials`` of a ``usemtl`` name.
+
+        Args:
+            name: The name, empty when the OBJ states none.
+            white: Whether vertex colours take the place of the grey of an unstated material.
+        """
+        if name not in self._index:
+            entry = self._entries.get(name)
+            if entry is None:
+                grey = (1.0, 1.0, 1.0) if white else GREY
+                material = plain_material(name or "grey", grey)
+                self.notices.append(
+                    f"no material {name!r}: base colour {grey[0]:g}, metallic 0, roughness 0.5"
+                )
+            else:
+                material = self._build(name, entry)
+            self._index[name] = len(self.materials)
+            self.materials.append(material)
+        return self._index[name]
+
+    def is_textured(self, index: int) -> bool:
+        """Return whether material ``index`` reads any texture."""
+        material = self.materials[index]
+        return any(
+            (
+                material.base_color_texture,
+                material.metallic_roughness_texture,
+                material.normal_texture,
+                material.emission_texture,
+            )
+        )
+
+    def _parse(self, content: bytes, file: str) -> None:
+        try:
+            text = content.decode("utf-8-sig")
+        except UnicodeDecodeError:
+            text = content.decode("latin-1")
+        entry = MtlEntry()
+        for line, raw in enumerate(text.splitlines(), 1):
+            where = f"{file} line {line}"
+            words = raw.partition("#")[0].split()
+            if not words:
+                continue
+            key = words[0].lower()
+            # Names may hold blanks and "#" (3ds Max: "Material #1").
+            rest = raw.strip()[len(key) :].strip()
+            if key == "newmtl":
+                if rest in self._entries:
+                    self.notices.append(
+                        f"{where}: {rest[:60]!r} defined again, the last one counts"
+                    )
+                entry = self._entries[rest] = MtlEntry()
+            elif key == "bsdf":
+                entry.is_pbr = words[1:2] == ["pbr"]
+            elif key.startswith("map_") or key in ("norm", "bump"):
+                key = "map_bump" if key == "bump" else key
+                entry.maps[key] = self._parse_map(rest, where, str(PurePosixPath(file).parent))
+            elif key in NUMBERS:
+                if key[0] == "k" and words[1:2] in (["spectral"], ["xyz"]):
+                    raise InputError(self.path, f"{where}: {words[0]} {words[1]}, expected RGB")
+                values = words[2:] if words[1:2] == ["-halo"] else words[1:]
+                numbers = self._numbers(values[:3], where, raw)
+                # One number stands for three, as in Kd 0.5.
+                entry.numbers[key] = numbers * 3 if key[0] == "k" and len(numbers) == 1 else numbers
+                if key[0] == "k" and len(entry.numbers[key]) != 3:
+                    raise InputError(self.path, f"{where}: {raw.strip()[:60]!r}, expected RGB")
+            elif key not in MEANINGLESS:
+                entry.left_out.append(words[0])
+
+    def _numbers(self, words: list[str], where: str, raw: str) -> tuple[float, ...]:
+        try:
+            numbers = tuple(float(word) for word in words)
+        except ValueError:
+            numbers = ()
+        if any("_" in word for word in words):  # Python reads 1_0 as 10
+            numbers = ()
+        if not numbers or not all(math.isfinite(number) for number in numbers):
+            raise InputError(self.path, f"{where}: {raw.strip()[:60]!r}, expected finite numbers")
+        return numbers
+
+    def _parse_map(self, rest: str, where: str, folder: str) -> MapStatement:
+        """Read options and file name; the name may contain spaces."""
+        options: dict[str, list[str]] = {}
+        while (option := first_word(rest)[0].lower()) in OPTION_WIDTHS:
+            _, rest = first_word(rest)
+            values: list[str] = []
+            while rest and len(values) < OPTION_WIDTHS[option]:
+                word, tail = first_word(rest)
+                # -s, -o, -t take one to three numbers; the name follows.
+                if values and not is_number(word):
+                    break
+                values.append(word)
+                rest = tail
+            options[option] = values
+            if option not in HONOURED_OPTIONS:
+                self.notices.append(f"{where}: {option} {' '.join(values)} ignored")
+        if not rest:
+            raise InputError(self.path, f"{where}: map without a file name")
+        name = rest.replace("\\", "/")
+
+        def pair(option: str, default: float) -> tuple[float, float]:
+            values = options.get(option)
+            if values is None:
+                return default, default
+            numbers = self._numbers(values, where, f"{option} {' '.join(values)}")
+            return numbers[0], numbers[1] if len(numbers) > 1 else default
+
+        return MapStatement(
+            name=name if name.startswith("/") or folder == "." else f"{folder}/{name}",
+            clamp=options.get("-clamp") == ["on"],
+            bump=pair("-bm", 1.0)[0],
+            scale=pair("-s", 1.0),
+            offset=pair("-o", 0.0),
+        )
+
+    def _build(self, name: str, entry: MtlEntry) -> Material:
+        maps = entry.maps
+        alpha = self._opacity(name, entry)
+        base = self._base_slot(name, entry)
+        roughness, metallic, surface = self._surface(name, entry)
+        normal_statement = maps.get("norm", maps.get("map_bump"))
+        normal = None if normal_statement is None else self._normal_slot(name, normal_statement)
+        emission = self._factor(name, entry, "ke", (0.0,) * 3)
+        if max(emission) > EMISSION_LIMIT:
+            what = f"material {shown(name)}: Ke {max(emission):g}"
+            raise InputError(self.path, f"{what}, expected at most {EMISSION_LIMIT:g}")
+        emission_slot = self._plain_slot(maps.get("map_ke"))
+        color = self._factor(name, entry, "kd", GREY)
+        clamped = tuple(min(max(value, 0.0), 1.0) for value in color)
+        if clamped != color:
+            self.notices.append(f"material {name!r}: Kd clamped to 0 ... 1")
+        read = (*MAPS, "map_ks") if entry.is_pbr else MAPS
+        left_out = [*entry.left_out, *(key for key in maps if key not in read and key != "map_ka")]
+        if left_out:
+            self.notices.append(f"material {name!r}: {', '.join(left_out)[:80]} ignored")
+        sheen = self._share(name, entry, "ps")
+        if sheen > 0.0:
+            self.notices.append(f"material {name!r}: sheen of roughness {ROUGHNESS} assumed")
+        return Material(
+            name=name,
+            base_color=(clamped[0], clamped[1], clamped[2]),
+            alpha=alpha,
+            metallic=min(max(metallic, 0.0), 1.0),
+            roughness=min(max(roughness, 0.0), 1.0),
+            emission=(max(emission[0], 0.0), max(emission[1], 0.0), max(emission[2], 0.0)),
+            alpha_mode="MASK" if "map_d" in maps else "BLEND" if alpha < 1 else "OPAQUE",
+            double_sided=True,
+            normal_scale=1.0 if normal_statement is None else normal_statement.bump,
+            ior=self._ior(name, entry),
+            clearcoat=self._share(name, entry, "pc"),
+            clearcoat_roughness=self._share(name, entry, "pcr"),
+            sheen_color=(sheen, sheen, sheen),
+            sheen_roughness=ROUGHNESS if sheen > 0.0 else 0.0,
+            base_color_texture=base,
+            metallic_roughness_texture=surface,
+            normal_texture=normal,
+            emission_texture=emission_slot,
+        )
+
+    def _factor(
+        self, name: str, entry: MtlEntry, key: str, default: tuple[float, ...]
+    ) -> tuple[float, ...]:
+        """Return a colour; with a map, an absent or black one means that the map alone counts."""
+        value = entry.numbers.get(key)
+        if f"map_{key}" in entry.maps and not any(value or ()):
+            if value is not None:
+                self.notices.append(f"material {name!r}: {key.title()} 0 with a map read as 1")
+            return (1.0, 1.0, 1.0)
+        if value is None and key == "kd":
+            self.notices.append(f"material {name!r}: no Kd, grey {default[0]:g} assumed")
+        return default if value is None else value
+
+    def _share(self, name: str, entry: MtlEntry, key: str) -> float:
+        """Return a number from 0 to 1, 0 where it is not stated."""
+        (value, *_) = entry.numbers.get(key, (0.0,))
+        if not 0.0 <= value <= 1.0:
+            self.notices.append(f"material {name!r}: {key.title()} {value:g} clamped to 0 ... 1")
+        return min(max(value, 0.0), 1.0)
+
+    def _ior(self, name: str, entry: MtlEntry) -> float:
+        """Return the index of refraction; exporters write 1 (and 0) for materials without one."""
+        ior = entry.numbers.get("ni", (1.5,))[0]
+        if ior > 1.0:
+            return ior
+        if ior not in (0.0, 1.0):
+            self.notices.append(f"material {name!r}: Ni {ior:g} ignored, 1.5 is used")
+        return 1.5
+
+    def _opacity(self, name: str, entry: MtlEntry) -> float:
+        if "d" in entry.numbers:
+            alpha = entry.numbers["d"][0]
+        else:
+            alpha = 1.0 - entry.numbers.get("tr", (0.0,))[0]
+        if not 0.0 <= alpha <= 1.0:
+            self.notices.append(f"material {name!r}: opacity {alpha:g} clamped to 0 ... 1")
+        return min(max(alpha, 0.0), 1.0)
+
+    def _surface(self, name: str, entry: MtlEntry) -> tuple[float, float, TextureSlot | None]:
+        """Return roughness, metallic and the texture of both (G roughness, B metallic)."""
+        numbers, maps = entry.numbers, entry.maps
+        if entry.is_pbr:
+            slot = self._plain_slot(maps.get("map_ks"))
+            if slot is not None:
+                return 1.0, 1.0, slot
+            _, roughness, metallic = numbers.get("ks", (0.0, ROUGHNESS, 0.0))
+            return roughness, metallic, None
+        rough_map, metal_map = maps.get("map_pr"), maps.get("map_pm")
+        rough = None if rough_map is None else self._load(rough_map)
+        metal = None if metal_map is None else self._load(metal_map)
+        if "pr" in numbers and (numbers["pr"][0] or rough is None):
+            roughness = numbers["pr"][0]
+        elif rough is not None:
+            roughness = 1.0
+        elif "ns" in numbers:
+            # Walter et al. 2007: a Blinn-Phong exponent Ns is about alpha = sqrt(2 / (Ns + 2)).
+            roughness = (2.0 / (max(numbers["ns"][0], 0.0) + 2.0)) ** 0.25
+            self.notices.append(f"material {name!r}: roughness {roughness:.2f} assumed from Ns")
+        else:
+            roughness = ROUGHNESS
+            self.notices.append(f"material {name!r}: roughness {ROUGHNESS} assumed")
+        metallic = numbers.get("pm", (0.0,))[0]
+        if metal is not None and metallic == 0.0:
+            metallic = 1.0
+        if rough is None and metal is None:
+            return roughness, metallic, None
+
+        def pack() -> Pixels:
+            packed = self._opaque(name, rough, metal)
+            if rough is not None:
+                packed[..., 1] = resized(rough, *packed.shape[:2])[..., 0]
+            if metal is not None:
+                packed[..., 2] = resized(metal, *packed.shape[:2])[..., 0]
+            return packed
+
+        statement = metal_map if rough_map is None else rough_map
+        assert statement is not None
+        if rough_map and metal_map and rough_map.slot(0) != metal_map.slot(0):
+            self.notices.append(f"material {name!r}: map_Pm laid on as map_Pr is")
+        return roughness, metallic, self._slot(pack, statement, "surface", rough_map, metal_map)
+
+    def _base_slot(self, name: str, entry: MtlEntry) -> TextureSlot | None:
+        """Return the base colour texture, its alpha taken from ``map_d`` alone."""
+        color_map, mask_map = entry.maps.get("map_kd"), entry.maps.get("map_d")
+        if color_map is None and mask_map is None:
+            return None
+        color = None if color_map is None else self._load(color_map)
+        if color_map is not None and color is None:
+            color = grey_pixels()
+        mask = None if mask_map is None else self._load(mask_map)
+        if color is None and mask is None:
+            return None
+
+        def pack() -> Pixels:
+            packed = self._opaque(name, color, mask)
+            if color is not None:
+                packed[..., :3] = resized(color, *packed.shape[:2])[..., :3]
+            if mask is not None:
+                # A mask inside the colour file is its alpha channel; a file of its own is grey.
+                has_alpha = bool((mask[..., 3] < 255).any())
+                packed[..., 3] = resized(mask, *packed.shape[:2])[..., 3 if has_alpha else 0]
+            return packed
+
+        statement = mask_map if color_map is None else color_map
+        assert statement is not None
+        return self._slot(pack, statement, "base colour", color_map, mask_map)
+
+    def _normal_slot(self, name: str, statement: MapStatement) -> TextureSlot | None:
+        pixels = self._load(statement)
+        if pixels is None:
+            return None
+        if statement.name not in self._is_grey:
+            self._is_grey[statement.name] = not np.ptp(pixels[..., :3], axis=2).any()
+        if self._is_grey[statement.name]:
+            self.notices.append(f"material {name!r}: {statement.name} is a height map, left out")
+            return None
+        return self._slot(lambda: pixels, statement, "plain", statement)
+
+    def _plain_slot(self, statement: MapStatement | None) -> TextureSlot | None:
+        pixels = None if statement is None else self._load(statement)
+        if statement is None or pixels is None:
+            return None
+        return self._slot(lambda: pixels, statement, "plain", statement)
+
+    def _slot(
+        self,
+        make: Callable[[], Pixels],
+        statement: MapStatement,
+        purpose: str,
+        *maps: MapStatement | None,
+    ) -> TextureSlot:
+        """Return how a texture is laid on, made once for all materials that use these maps."""
+        wrap = "clamp" if statement.clamp else "repeat"
+        key = (purpose, wrap, *("" if used is None else used.name for used in maps))
+        if key not in self._texture_index:
+            self._texture_index[key] = len(self.textures)
+            self.textures.append(Texture(make(), wrap, wrap))
+        return statement.slot(self._texture_index[key])
+
+    def _opaque(self, name: str, *parts: Pixels | None) -> Pixels:
+        """Return white texels as many as the largest of some maps has, shape [height, width, 4]."""
+        height = max(p.shape[0] for p in parts if p is not None)
+        width = max(p.shape[1] for p in parts if p is not None)
+        self._decoder.count(height * width, f"material {shown(name)}: ")
+        return np.full((height, width, 4), 255, dtype=np.uint8)
+
+    def _load(self, statement: MapStatement) -> Pixels | None:
+        """Return the pixels of a map; None when it is missing and that is allowed."""
+        name = statement.name
+        if name not in self._pixels:
+            where = f"{name}: "
+            file = inside(self.path.parent, name, self.path)
+            try:
+                encoded = read_regular(
+                    file, self.path, "texture ", self._limits, hashes=self.hashes
+                )
+                self._pixels[name] = self._decoder.decode(encoded, where)
+            except InputError as error:
+                if self.missing_textures != "grey":
+                    raise InputError(
+                        error.where,
+                        error.what,
+                        error.advice or "add the image, or pass --missing-textures grey",
+                    ) from None
+                self.notices.append(f"{error.what}: replaced by grey, or left out where no colour")
+                self._pixels[name] = None
+        return self._pixels[name]
+
+
+def first_word(text: str) -> tuple[str, str]:
+    """Return the first word of a text and what follows it, either may be empty."""
+    word, *rest = text.split(maxsplit=1) or [""]
+    return word, "".join(rest)
+
+
+def is_number(word: str) -> bool:
+    """Return whether a word is a number."""
+    try:
+        float(word)
+    except ValueError:
+        return False
+    return True
+
+
+def resized(pixels: Pixels, height: int, width: int) -> Pixels:
+    """Repeat or drop texels to reach a size, shape [height, width, 4]."""
+    rows = np.arange(height) * pixels.shape[0] // height
+    columns = np.arange(width) * pixels.shape[1] // width
+    scaled: Pixels = pixels[rows][:, columns]
+    return scaled

@@ -1,0 +1,84 @@
+"""Reads STL files, binary and ASCII, into triangles.
+
+Format: 3D Systems, "StereoLithography Interface Specification" (1989).
+"""
+
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from warpir.core.errors import InputError
+
+HEADER = 84
+"""A binary file begins with 80 bytes of anything and the number of its triangles [byte]."""
+FACET = np.dtype([("normal", "<f4", (3,)), ("corners", "<f4", (3, 3)), ("attribute", "<u2")])
+ADVICE = "export it again, or as GLB"
+VERTEX = ["vertex", "", "", ""]
+WORDS = np.array(
+    ["facet", "normal", "", "", "", "outer", "loop", *VERTEX * 3, "endloop", "endfacet"],
+    dtype="S8",
+)
+"""The words of an ASCII facet; empty where numbers stand."""
+NUMBERS = [8, 9, 10, 12, 13, 14, 16, 17, 18]
+"""Where the corners stand among them."""
+LONGEST = 64
+"""Most characters of a word; all are stored as long as the longest."""
+
+
+def read_stl(path: Path, content: bytes, notices: list[str]) -> NDArray[np.float64]:
+    """Return the corners of all triangles, shape [triangle, 3, 3].
+
+    Args:
+        path: The file, for errors.
+        content: What it holds.
+        notices: Receives what is not read.
+
+    Raises:
+        InputError: The file is damaged, or neither kind of STL.
+    """
+    count = int.from_bytes(content[80:HEADER], "little") if len(content) >= HEADER else 0
+    promised = HEADER + FACET.itemsize * count
+    # Some binary files begin with "solid" too; their length gives them away.
+    if content.lstrip()[:5].lower() == b"solid" and len(content) != promised:
+        return _read_ascii(path, content)
+    if len(content) < max(promised, HEADER):
+        raise InputError(
+            path,
+            f"damaged STL: {count} triangles need {promised} bytes (found {len(content)})",
+            ADVICE,
+        )
+    if len(content) > promised:
+        notices.append(f"{len(content) - promised} bytes after the last triangle ignored")
+    facets = np.frombuffer(content, FACET, count, HEADER)
+    if facets["attribute"].any():
+        notices.append("attributes of triangles (colours, in some tools) are not read")
+    return facets["corners"].astype(np.float64)
+
+
+def _read_ascii(path: Path, content: bytes) -> NDArray[np.float64]:
+    lines = [line.strip() for line in content.splitlines()]
+    solids = sum(line[:5].lower() == b"solid" for line in lines)
+    ends = sum(line[:8].lower() == b"endsolid" for line in lines)
+    if solids != ends:
+        what = f"damaged STL: {solids} solid and {ends} endsolid"
+        raise InputError(path, what, ADVICE)
+    inner = [
+        line for line in lines if line[:5].lower() != b"solid" and line[:8].lower() != b"endsolid"
+    ]
+    listed = b" ".join(inner).split()
+    longest = max(map(len, listed), default=1)
+    if longest > LONGEST:
+        what = f"damaged STL: a word of {longest} characters (limit {LONGEST})"
+        raise InputError(path, what, ADVICE)
+    words = np.array(listed, dtype=f"S{longest}")
+    width = len(WORDS)
+    whole = words[: len(words) // width * width].reshape(-1, width)
+    wrong = (np.char.lower(whole) != WORDS)[:, WORDS != b""].any(axis=1)
+    if wrong.any() or whole.size < words.size:
+        number = int(wrong.argmax()) if wrong.any() else len(whole)
+        raise InputError(path, f"damaged STL: facet {number} is not one (counted from 0)", ADVICE)
+    try:
+        return whole[:, NUMBERS].astype(np.float64).reshape(-1, 3, 3)
+    except ValueError as error:
+        raise InputError(path, f"damaged STL: {str(error)[:80]}", ADVICE) from None

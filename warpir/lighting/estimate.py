@@ -1,0 +1,65 @@
+"""The light that the regressor sees in a photo, where nobody says what it is."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from warpir.app.config import InsertConfig
+from warpir.app.inputs import Inputs
+from warpir.lighting.regressor import Regression, load_regressor, regress
+from warpir.lighting.scene_light import SceneLight, start_level
+from warpir.scene.light import Light, angles_from_axis
+from warpir.scene.tone_curves import Curves
+
+
+@dataclass(frozen=True)
+class Estimate:
+    """What was read off a photo."""
+
+    regression: Regression
+    gain: float
+    """What its light is multiplied with, so that the tone operator shows it as the photo does."""
+    light: SceneLight
+
+
+def estimate_light(inputs: Inputs, config: InsertConfig, device: str) -> Estimate:
+    """Return the light that the regressor sees in the photo.
+
+    Args:
+        inputs: Photo and camera.
+        config: Weights, tone operator, exposure.
+        device: torch's name of it.
+
+    Raises:
+        InputError: The weights are absent or damaged (`ExitCode.MODEL`).
+    """
+    path = None if config.regressor is None else Path(config.regressor)
+    regression = regress(load_regressor(path, device), inputs.photo.srgb, inputs.camera)
+    gain = tone_gain(inputs, config) * 2.0 ** (config.exposure or 0.0)
+    light = Light(lobes=regression.lobes()).scaled(gain)
+    curves = Curves.identity(config.tone_operator)
+    scene_light = SceneLight(light, light, curves, float(np.log2(gain)), (in_words(regression),))
+    return Estimate(regression, gain, scene_light)
+
+
+def tone_gain(inputs: Inputs, config: InsertConfig) -> float:
+    """Return by what a light in the photo's own unit is to be multiplied for the tone operator.
+
+    An operator that never clips shows everything darker than it is; with this factor, white ground
+    under an even light looks as the photo's ground does.
+    """
+    linear = config.tone_operator == "linear"
+    return 1.0 if linear else 1.0 + start_level(inputs, config)
+
+
+def in_words(regression: Regression) -> str:
+    """Return what is assumed, in a line."""
+    azimuth, elevation = angles_from_axis(regression.axis)
+    return (
+        "the light is what the regressor sees in the photo: mainly from azimuth "
+        f"{azimuth:.0f}, elevation {elevation:.0f}, +- {regression.spread_deg:.0f} degrees "
+        "(--light, --sun, --sky)"
+    )

@@ -1,0 +1,237 @@
+"""From what the user said about the light to one `Light` at the photo's exposure."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from warpir.app.config import InsertConfig, usage
+from warpir.app.inputs import Inputs
+from warpir.app.reuse import EarlierRun
+from warpir.core.color import luminance
+from warpir.core.errors import InputError
+from warpir.lighting.fit import LobeFit, fit_lobes
+from warpir.scene.lamps import lamp_axes, without_lamps
+from warpir.scene.light import Light, plain_sky, sun_lobe
+from warpir.scene.receiver import first_hit
+from warpir.scene.shadow_mask import values_at
+from warpir.scene.tone_curves import Curves
+
+SKIES = {
+    # Radiance of the sky, and the colour of the sun that goes with it.
+    "clear": ((0.45, 0.62, 1.0), (1.0, 0.94, 0.85)),
+    "overcast": ((1.0, 1.0, 1.0), (1.0, 1.0, 1.0)),
+    "sunset": ((0.75, 0.62, 0.72), (1.0, 0.62, 0.32)),
+}
+"""Relative radiances by preset, linear RGB; only their proportions matter."""
+SUN_TO_SKY = 5.0
+"""Irradiance of a surface facing the sun over that from a clear sky on the ground [1]."""
+GROUND_PERCENTILE = 50.0
+"""Of the ground round the object: the level of an even light (the authors state none)."""
+LIT_PERCENTILE = 75.0
+"""The brighter quarter of the ground round the object stands for ground that is not in shadow."""
+LIT_SHARE = 0.1
+"""Share of that ground which must be known to be out of shadow to be measured alone [1]."""
+SEEN = 0.99
+"""A point counts as seen when the camera's ray gets this share of the way to it [1]."""
+
+Float64Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class SceneLight:
+    """The light of the scene, at the photo's exposure, and the tone curves that go with it."""
+
+    light: Light
+    """Lights the object."""
+    light_shadow: Light
+    """Casts its shadow; the same object as `light` where there is one light."""
+    curves: Curves
+    exposure: float
+    """What the given light was multiplied with, in stops [EV]."""
+    assumed: tuple[str, ...]
+    """What was chosen because nothing was given, one line each."""
+    fit: LobeFit | None = None
+    """How well the lobes fit the panorama, when they were fitted."""
+    detailed: Light | None = None
+    """`light` with what the photo shows of the surroundings, where that is wanted; not a light of
+    the place that another photo could use."""
+
+    @property
+    def on_object(self) -> Light:
+        """What the object is rendered under."""
+        return self.light if self.detailed is None else self.detailed
+
+
+def make_light(inputs: Inputs, config: InsertConfig) -> SceneLight | None:
+    """Build the light and set its exposure; None: it is to be read off the photo.
+
+    Raises:
+        InputError: The light is black, so no exposure can be chosen; or --tone contradicts the run
+            whose light is used again.
+    """
+    if inputs.run is not None:
+        return _reused(inputs.run, config)
+    if not config.is_light_described and inputs.light is None:
+        return _even(inputs, config) if config.start == "uniform" else None
+    assumed: list[str] = []
+    light = inputs.light if inputs.light is not None else _described(config, assumed)
+    fit = None
+    if config.fit_lobes is not None and light.texels is not None:
+        fit = fit_lobes(light.texels, config.fit_lobes)
+        light = Light(lobes=fit.lobes)
+    exposure = config.exposure
+    if exposure is None:
+        exposure = _automatic_exposure(light, inputs, config)
+        assumed.append(
+            f"the light is {exposure:+.2f} EV, so that ground of albedo {config.ground_albedo:g} "
+            "looks as bright as the photo's lit ground (--exposure, --ground-albedo)"
+        )
+    light = light.scaled(2.0**exposure)
+    curves = Curves.identity(config.tone_operator)
+    return SceneLight(light, light, curves, exposure, tuple(assumed), fit)
+
+
+def _even(inputs: Inputs, config: InsertConfig) -> SceneLight:
+    """Return an even light at the ground's level (ours)."""
+    level = start_level(inputs, config)
+    light = Light(texels=np.full((8, 16, 3), level, np.float32))
+    assumed = "nothing about the light: an even one (--start, --light, --sun)"
+    if config.is_guided:
+        assumed = "nothing about the light: the recovery starts from an even one (--light, --sun)"
+    return SceneLight(light, light, Curves.identity(config.tone_operator), 0.0, (assumed,))
+
+
+def start_level(inputs: Inputs, config: InsertConfig) -> float:
+    """Return the radiance of an even light under which white ground looks as the photo's does."""
+    level = float(np.clip(ground_level(inputs, GROUND_PERCENTILE), 1e-3, 0.9))
+    return level / (1.0 - level) if config.tone_operator == "reinhard" else level
+
+
+def _reused(run: EarlierRun, config: InsertConfig) -> SceneLight:
+    """Return an earlier run's light and curves; they are at the exposure of that run's photo."""
+    if config.tone not in (None, run.curves.tone):
+        found = f"the curves of {run.path} are made for {run.curves.tone}"
+        raise usage("--tone", f"cannot be {config.tone}: {found}", "leave --tone out")
+    exposure = config.exposure or 0.0
+
+    def adapted(light: Light) -> Light:
+        return light.rotated(config.light_rotate).scaled(2.0**exposure)
+
+    light = light_shadow = adapted(run.light_fg)
+    if run.light_shadow is not run.light_fg:
+        light_shadow = adapted(run.light_shadow)
+    return SceneLight(light, light_shadow, run.curves, exposure, ())
+
+
+def _described(config: InsertConfig, assumed: list[str]) -> Light:
+    """Return the sun and sky of the flags."""
+    sun, sky = config.sun, config.sky
+    preset = sky if isinstance(sky, str) else "clear"
+    sky_color, sun_color = SKIES[preset]
+    if isinstance(sky, tuple):
+        sky_color = sky
+    # What the ground sends back up, by the same albedo that sets the exposure.
+    from_sky = np.pi * np.asarray(sky_color)
+    lobes = None
+    horizontal = from_sky.copy()
+    if sun is not None and sun[1] <= 0.0:
+        assumed.append("a sun below the horizon is meant: it lights from underneath (--sun)")
+    if sun is not None:
+        strength = sun[2] if len(sun) == 3 else SUN_TO_SKY * float(luminance(from_sky))
+        tint = np.asarray(sun_color) / float(luminance(np.asarray(sun_color)))
+        r, g, b = (float(strength * c) for c in tint)
+        lobes = sun_lobe(sun[0], sun[1], (r, g, b))
+        horizontal += strength * tint * max(np.sin(np.radians(sun[1])), 0.0)
+    r, g, b = (float(c) for c in config.ground_albedo * horizontal / np.pi)
+    return Light(lobes, plain_sky(sky_color, (r, g, b)))
+
+
+def _automatic_exposure(light: Light, inputs: Inputs, config: InsertConfig) -> float:
+    """Choose the light's scale so that Lambertian ground appears as the photo shows it.
+
+    The tone curve's start is the identity, so display value = Reinhard(albedo * E / pi), or the
+    value itself with ``--tone linear``. Where mesh or mask say what the lamps reach, that part of
+    the ground is measured; where they reach none of it, the light without them is.
+    """
+    normal = inputs.placement.ground[:3]
+    points = _ring(inputs)
+    reached = _reached(points, light, inputs)
+    if (reached > 0.5).mean() >= LIT_SHARE:
+        points = points[reached > 0.5]
+    else:
+        light = without_lamps(light, 1.0 - float(reached.mean()))
+    irradiance = float(luminance(light.irradiance(normal)))
+    if not irradiance > 0.0:
+        raise InputError(
+            config.light or "--sun",
+            "no light reaches the ground, so no exposure follows from the photo",
+            "give --exposure",
+        )
+    level = np.clip(_level(inputs, points, LIT_PERCENTILE), 1e-3, 0.9)
+    wanted = level / (1.0 - level) if config.tone_operator == "reinhard" else level
+    return float(np.log2(wanted * np.pi / (config.ground_albedo * irradiance)))
+
+
+def ground_level(inputs: Inputs, percentile: float) -> float:
+    """Return the photo's linear luminance of the ground round the object's foot [1].
+
+    Args:
+        inputs: Photo, camera and placement.
+        percentile: Of the ground's pixels [%].
+    """
+    return _level(inputs, _ring(inputs), percentile)
+
+
+def _ring(inputs: Inputs) -> Float64Array:
+    """Return points of the ground round the object's foot, world frame [m], shape [point, 3]."""
+    camera, placement = inputs.camera, inputs.placement
+    low, high = inputs.asset.bounds()
+    size = float(np.linalg.norm((high - low) * np.linalg.norm(placement.asset_to_world[:3, 0])))
+    foot = placement.asset_to_world @ np.array(
+        [(low[0] + high[0]) / 2.0, low[1], (low[2] + high[2]) / 2.0, 1.0]
+    )
+    rings = np.linspace(0.2, 1.5, 16) * size
+    angles = np.linspace(0.0, 2.0 * np.pi, 64, endpoint=False)
+    if inputs.proxy is not None:
+        # Every triangle is tried for each of them.
+        rings, angles = rings[1::4], angles[::4]
+    side = np.cross(placement.ground[:3], camera.c2w[:3, 0])
+    across = np.cross(side, placement.ground[:3])
+    circle = np.cos(angles)[:, None] * _unit(across) + np.sin(angles)[:, None] * _unit(side)
+    points: Float64Array = (foot[:3] + rings[:, None, None] * circle[None]).reshape(-1, 3)
+    if inputs.proxy is not None:
+        eye = np.broadcast_to(camera.c2w[:3, 3], points.shape)
+        is_seen = first_hit(inputs.proxy, eye, points - eye)[0] > SEEN
+        points = points[is_seen] if is_seen.any() else points
+    return points
+
+
+def _reached(points: Float64Array, light: Light, inputs: Inputs) -> Float64Array:
+    """Return which share of the lamps reaches points of the ground [1], shape [point]."""
+    reached = np.ones(len(points))
+    axes = lamp_axes(light) if inputs.proxy is not None else np.zeros((0, 3))
+    if inputs.proxy is not None and len(axes):
+        lifted = points + inputs.placement.ground[:3] * 1e-3
+        free = [first_hit(inputs.proxy, lifted, np.tile(a, (len(points), 1)))[0] for a in axes]
+        reached = np.isinf(free).mean(axis=0)
+    if inputs.shadow_mask is not None:
+        shares = values_at(inputs.shadow_mask.shares, points, inputs.camera)
+        # Nothing is known of the ground outside the photo: it counts as lit.
+        reached = reached * (1.0 - np.where(np.isnan(shares), 0.0, shares))
+    return reached
+
+
+def _level(inputs: Inputs, points: Float64Array, percentile: float) -> float:
+    """Return a percentile of the photo's linear luminance at world points [1]."""
+    camera = inputs.camera
+    uv = camera.project(points)
+    inside = (uv >= 0.0).all(axis=1) & (uv[:, 0] < camera.width) & (uv[:, 1] < camera.height)
+    columns, rows = uv[inside].astype(int).T
+    photo = inputs.photo.linear((rows, columns) if inside.any() else ...)
+    return float(np.percentile(luminance(photo.astype(np.float64)), percentile))
+
+
+def _unit(v: NDArray[np.float64]) -> NDArray[np.float64]:
+    unit: NDArray[np.float64] = v / np.linalg.norm(v)
+    return unit

@@ -1,0 +1,479 @@
+"""An insertion rendered by Mitsuba 3: object, shadow, and a whole run's composite.
+
+`foreground` and `shadow` are what ``benchmarks/referee/__main__.py`` judges warpir by; `render_run`
+puts them together as a run with ``--mitsuba`` was, for the ``render.py`` in its folder. Material,
+light and integrator are written from the specifications, not from warpir's kernels.
+
+Scenes are moved to the object's centre and scaled to unit radius, where float32 is best;
+radiance does not notice. The environment is at infinity in both.
+"""
+
+import argparse
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import NamedTuple
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+from numpy.typing import NDArray
+
+if mi.variant() is None:
+    mi.set_variant("cuda_ad_rgb" if dr.has_backend(dr.JitBackend.CUDA) else "llvm_ad_rgb")
+
+from mitsuba.python.ad.integrators.common import mis_weight
+
+from warpir.core.color import linear_to_gamma
+from warpir.io.assets import load_asset
+from warpir.io.cameras.reader import read_camera
+from warpir.io.curves_file import read_curves
+from warpir.io.export import OBJECT
+from warpir.io.images.photos import read_envmap
+from warpir.io.results import png_bytes
+from warpir.mitsuba.light import LatlongEmitter
+from warpir.mitsuba.material import GltfBSDF
+from warpir.mitsuba.path import RAY_OFFSET, GltfPath, intersect
+from warpir.scene.asset import Asset
+from warpir.scene.camera import Camera, mitsuba_sensor
+
+FloatArray = NDArray[np.float64]
+
+SAMPLES_PER_PASS = 1 << 21
+"""Camera samples traced at once; bounds memory at about 1 GB."""
+
+
+class Foreground(NamedTuple):
+    """The object alone, averaged over all camera samples of each pixel."""
+
+    mean: FloatArray
+    """Radiance premultiplied by coverage, relative [W/(m^2 sr)], shape [H, W, 3]."""
+    variance: FloatArray
+    """Variance of ``mean``, shape [H, W, 3]."""
+    coverage: FloatArray
+    """Share of camera samples that see the object [1], shape [H, W]."""
+
+
+class Shadow(NamedTuple):
+    """A white Lambertian plane, averaged over the camera samples that see it."""
+
+    lit: FloatArray
+    """Radiance with the object, relative [W/(m^2 sr)], shape [H, W, 3]; NaN where unseen."""
+    unoccluded: FloatArray
+    """Radiance without it, relative [W/(m^2 sr)], shape [H, W, 3]; NaN where unseen."""
+    lit_variance: FloatArray
+    """Variance of ``lit``, shape [H, W, 3]."""
+    unoccluded_variance: FloatArray
+    """Variance of ``unoccluded``, shape [H, W, 3]."""
+    covariance: FloatArray
+    """Covariance of the two means: they share samples, shape [H, W, 3]."""
+    seen: FloatArray
+    """Share of camera samples that see the plane [1], shape [H, W]."""
+
+
+class Ratio(NamedTuple):
+    """Quotient of a plane's two radiances; 1 where it is not seen."""
+
+    mean: FloatArray
+    """Ratio [1], shape [H, W, 3]."""
+    variance: FloatArray
+    """Variance of ``mean``, shape [H, W, 3]."""
+    coverage: FloatArray
+    """Share of camera samples that see the plane [1], shape [H, W]."""
+
+
+@dataclass(frozen=True)
+class ObjectScene:
+    """A Mitsuba scene with what is needed to render it."""
+
+    scene: mi.Scene
+    sensor: mi.Sensor
+    integrator: GltfPath
+    center: FloatArray
+    """World position that became the origin [m], shape [3]."""
+    radius: float
+    """World length that became 1 [m]."""
+
+
+def build(
+    asset: Asset, matrix: FloatArray, camera: Camera, texels: NDArray[np.float32], depth: int
+) -> ObjectScene:
+    """Build the Mitsuba scene of one object under one light.
+
+    Args:
+        asset: Object, asset frame [m].
+        matrix: Asset to world, column vectors, shape [4, 4].
+        camera: Pinhole with ``fx == fy``, world frame [m].
+        texels: Lat-long radiance, relative [W/(m^2 sr)], shape [He, We, 3].
+        depth: Surface interactions of the longest path.
+
+    Raises:
+        ValueError: Mitsuba's camera has square pixels only.
+    """
+    if not np.isclose(camera.fx, camera.fy, rtol=1e-6):
+        raise ValueError(f"Mitsuba needs square pixels, got fx {camera.fx}, fy {camera.fy}")
+    linear, offset = matrix[:3, :3], matrix[:3, 3]
+    world = [p.positions @ linear.T + offset for p in asset.primitives]
+    used = np.concatenate(
+        [w[p.indices.ravel()] for w, p in zip(world, asset.primitives, strict=True)]
+    )
+    low, high = used.min(axis=0), used.max(axis=0)
+    center, radius = 0.5 * (low + high), float(0.5 * np.linalg.norm(high - low))
+    parts = {"type": "scene", "light": LatlongEmitter(texels)}
+    for k, positions in enumerate(world):
+        parts[f"primitive_{k}"] = _mesh(asset, k, (positions - center) / radius, linear)
+    used_materials = [asset.materials[p.material] for p in asset.primitives]
+    has_alpha = any(m.alpha_mode != "OPAQUE" or m.transmission > 0.0 for m in used_materials)
+    integrator = mi.load_dict({"type": "gltf_path", "max_depth": depth + 1, "has_alpha": has_alpha})
+    return ObjectScene(
+        mi.load_dict(parts), _sensor(camera, center, radius), integrator, center, radius
+    )
+
+
+def foreground(
+    asset: Asset,
+    matrix: FloatArray,
+    camera: Camera,
+    texels: NDArray[np.float32],
+    depth: int,
+    spp: int,
+    seed: int,
+) -> Foreground:
+    """Render the object alone under the light.
+
+    Args:
+        asset: Object, asset frame [m].
+        matrix: Asset to world, shape [4, 4].
+        camera: Pinhole camera, world frame [m].
+        texels: Lat-long radiance, relative [W/(m^2 sr)], shape [He, We, 3].
+        depth: Surface interactions of the longest path.
+        spp: Camera samples per pixel, at least 2.
+        seed: Base seed.
+    """
+    setup = build(asset, matrix, camera, texels, depth)
+    shape = (camera.height, camera.width)
+    moments = np.zeros((2, *shape, 3))
+    hits = np.zeros(shape)
+    count = 0
+    for pass_seed, pass_spp in passes(camera, spp, seed):
+        with dr.suspend_grad():
+            sampler, _ = setup.integrator.prepare(setup.sensor, pass_seed, pass_spp)
+            ray, _, _ = setup.integrator.sample_rays(setup.scene, setup.sensor, sampler)
+            L, seen, _, _ = setup.integrator.sample(
+                dr.ADMode.Primal, setup.scene, sampler, ray, active=mi.Bool(True)
+            )
+        samples = np.asarray(L, dtype=np.float64).T.reshape(*shape, pass_spp, 3)
+        moments += np.stack([samples.sum(axis=2), np.square(samples).sum(axis=2)])
+        hits += np.asarray(seen).reshape(*shape, pass_spp).sum(axis=2)
+        count += pass_spp
+    mean, variance = _mean_and_variance(moments, np.full((*shape, 1), float(count)))
+    return Foreground(mean, variance, hits / count)
+
+
+def shadow(
+    asset: Asset,
+    matrix: FloatArray,
+    camera: Camera,
+    texels: NDArray[np.float32],
+    spp: int,
+    seed: int,
+    ground: tuple[float, float, float, float] = (0.0, 1.0, 0.0, 0.0),
+) -> Shadow:
+    """Render an infinite white plane, lit directly, with and without the object above it.
+
+    Only camera samples that meet the plane before the object count; both radiances use the
+    same ones, so their ratio is exactly 1 where nothing is blocked.
+
+    Args:
+        asset: Object, asset frame [m].
+        matrix: Asset to world, shape [4, 4].
+        camera: Pinhole camera on the side of the plane's normal, world frame [m].
+        texels: Lat-long radiance, relative [W/(m^2 sr)], shape [He, We, 3].
+        spp: Camera samples per pixel, at least 2.
+        seed: Base seed.
+        ground: Plane ``a x + b y + c z + d = 0`` with a unit normal, world frame [m].
+    """
+    setup = build(asset, matrix, camera, texels, 1)
+    normal = np.asarray(ground[:3])
+    offset = float(-(ground[3] + normal @ setup.center) / setup.radius)
+    shape = (camera.height, camera.width)
+    moments = np.zeros((2, *shape, 6))
+    products = np.zeros((*shape, 3))
+    hits = np.zeros((*shape, 1))
+    for pass_seed, pass_spp in passes(camera, spp, seed):
+        with dr.suspend_grad():
+            lit, unoccluded, seen = _trace_plane(setup, normal, offset, pass_seed, pass_spp)
+        both = np.concatenate([np.asarray(lit), np.asarray(unoccluded)]).astype(np.float64)
+        samples = both.T.reshape(*shape, pass_spp, 6)
+        moments += np.stack([samples.sum(axis=2), np.square(samples).sum(axis=2)])
+        products += (samples[..., :3] * samples[..., 3:]).sum(axis=2)
+        hits += np.asarray(seen).reshape(*shape, pass_spp, 1).sum(axis=2)
+    mean, variance = _mean_and_variance(moments, hits)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        covariance = (products / hits - mean[..., :3] * mean[..., 3:]) / (hits - 1.0)
+    return Shadow(
+        mean[..., :3],
+        mean[..., 3:],
+        variance[..., :3],
+        variance[..., 3:],
+        covariance,
+        hits[..., 0] / spp,
+    )
+
+
+def shadow_ratio(
+    asset: Asset,
+    matrix: FloatArray,
+    camera: Camera,
+    texels: NDArray[np.float32],
+    spp: int,
+    seed: int,
+    ground: tuple[float, float, float, float] = (0.0, 1.0, 0.0, 0.0),
+) -> Ratio:
+    """Return the quotient of `shadow`'s two radiances; arguments are `shadow`'s."""
+    plane = shadow(asset, matrix, camera, texels, spp, seed, ground)
+    seen = np.isfinite(plane.lit) & (plane.unoccluded > 0.0)
+    u = np.where(seen, plane.unoccluded, 1.0)
+    ratio = np.where(seen, np.where(seen, plane.lit, 0.0) / u, 1.0)
+    residual = (
+        plane.lit_variance - 2.0 * ratio * plane.covariance + ratio**2 * plane.unoccluded_variance
+    )
+    variance = np.where(seen & np.isfinite(residual), np.maximum(residual, 0.0) / u**2, 0.0)
+    return Ratio(ratio, variance, plane.seen)
+
+
+def _mesh(asset: Asset, index: int, positions: FloatArray, linear: FloatArray) -> mi.Mesh:
+    """Mitsuba mesh of one primitive, unit frame, without texture coordinates (see `GltfBSDF`)."""
+    primitive = asset.primitives[index]
+    bsdf = GltfBSDF(asset, primitive, linear)
+    properties = mi.Properties()
+    properties["material"] = bsdf
+    flat = primitive.normals is None
+    properties["face_normals"] = flat
+    mesh = mi.Mesh(
+        f"primitive_{index}",
+        len(positions),
+        len(primitive.indices),
+        properties,
+        has_vertex_normals=not flat,
+        has_vertex_texcoords=False,
+    )
+    parameters = mi.traverse(mesh)
+    parameters["faces"] = bsdf.indices
+    parameters["vertex_positions"] = mi.Float(positions.astype(np.float32).ravel())
+    parameters.update()
+    if not flat:
+        # On its own: changing positions makes Mitsuba recompute the normals
+        normals = primitive.normals.astype(np.float64) @ np.linalg.inv(linear)
+        normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-30)
+        parameters["vertex_normals"] = mi.Float(normals.astype(np.float32).ravel())
+        parameters.update()
+    return mesh
+
+
+def _sensor(camera: Camera, center: FloatArray, radius: float) -> mi.Sensor:
+    """Mitsuba camera in the unit frame, box filter."""
+    c2w = camera.c2w.copy()
+    c2w[:3, 3] = (c2w[:3, 3] - center) / radius
+    view = mitsuba_sensor(replace(camera, c2w=c2w))
+    return mi.load_dict(
+        {
+            "type": "perspective",
+            "to_world": mi.ScalarTransform4f(view["to_world"]),
+            "fov_axis": "x",
+            "fov": view["fov_deg"],
+            "principal_point_offset_x": view["principal_point_offset_x"],
+            "principal_point_offset_y": view["principal_point_offset_y"],
+            "film": {
+                "type": "hdrfilm",
+                "width": camera.width,
+                "height": camera.height,
+                "pixel_format": "rgb",
+                "component_format": "float32",
+                "rfilter": {"type": "box"},
+            },
+            "sampler": {"type": "independent"},
+        }
+    )
+
+
+def passes(camera: Camera, spp: int, seed: int) -> Iterator[tuple[int, int]]:
+    """Seed and samples per pixel of each pass."""
+    largest = max(1, SAMPLES_PER_PASS // (camera.width * camera.height))
+    count = -(-spp // largest)
+    for k in range(count):
+        yield (seed * 65537 + k) % (1 << 32), spp * (k + 1) // count - spp * k // count
+
+
+def _mean_and_variance(moments: FloatArray, count: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Mean, and variance of the mean, from sums of samples and of their squares."""
+    with np.errstate(divide="ignore", invalid="ignore"):
+        mean = moments[0] / count
+        variance = np.maximum(moments[1] / count - np.square(mean), 0.0) / (count - 1.0)
+    return mean, variance
+
+
+def _trace_plane(
+    setup: ObjectScene, normal: FloatArray, offset: float, seed: int, spp: int
+) -> tuple[mi.Color3f, mi.Color3f, mi.Bool]:
+    """Sample radiance of the plane ``dot(normal, x) = offset``, 0 where it is not seen.
+
+    Returns:
+        With the object, without it, and whether the plane is seen.
+    """
+    scene, integrator = setup.scene, setup.integrator
+    sampler, _ = integrator.prepare(setup.sensor, seed, spp)
+    ray, _, _ = integrator.sample_rays(scene, setup.sensor, sampler)
+    ray = mi.Ray3f(ray)
+    has_alpha = integrator.has_alpha
+
+    # Which comes first
+    n = mi.Normal3f(normal)
+    t = (offset - dr.dot(n, ray.o)) / dr.dot(n, ray.d)
+    meets = (t > 0.0) & dr.isfinite(t)
+    si = intersect(scene, ray, sampler, True, has_alpha, mi.Bool(True))
+    nearer = si.is_valid() & (dr.dot(si.p - ray.o, ray.d) < t)
+    seen = meets & ~nearer
+
+    # Direct light on white: f cos_i = cos_i / pi, upper side
+    it = dr.zeros(mi.SurfaceInteraction3f, dr.width(t))
+    it.p = ray(dr.select(seen, t, 0.0))
+    it.p += n * (offset - dr.dot(n, it.p))
+    it.n = n
+    frame = mi.Frame3f(it.n)
+
+    def visible(d: mi.Vector3f, active: mi.Bool) -> mi.Bool:
+        start = mi.Ray3f(it.p + n * RAY_OFFSET, d)
+        return ~intersect(scene, start, sampler, False, has_alpha, active).is_valid()
+
+    ds, em_weight = scene.sample_emitter_direction(it, sampler.next_2d(), False, seen)
+    cos_i = dr.maximum(dr.dot(n, ds.d), 0.0)
+    by_light = em_weight * cos_i * dr.inv_pi * mis_weight(ds.pdf, cos_i * dr.inv_pi)
+    active = seen & (cos_i > 0.0)
+    by_light = dr.select(active, by_light, 0.0)
+    unblocked_light = visible(ds.d, active)
+
+    d = frame.to_world(mi.warp.square_to_cosine_hemisphere(sampler.next_2d()))
+    cos_i = dr.maximum(dr.dot(n, d), 0.0)
+    ds = dr.zeros(mi.DirectionSample3f, dr.width(t))
+    ds.d = d
+    ds.emitter = mi.EmitterPtr(scene.environment())
+    by_cosine = scene.eval_emitter_direction(it, ds, seen) * mis_weight(
+        cos_i * dr.inv_pi, scene.pdf_emitter_direction(it, ds, seen)
+    )
+    by_cosine = dr.select(seen & (cos_i > 0.0), by_cosine, 0.0)
+    unblocked_cosine = visible(d, seen)
+    lit = dr.select(unblocked_light, by_light, 0.0) + dr.select(unblocked_cosine, by_cosine, 0.0)
+    return lit, by_light + by_cosine, seen
+
+
+# -------------------------------------------------------------------------------- a whole run
+
+
+class Composite(NamedTuple):
+    """A run's picture as Mitsuba renders it, display-linear, shape [H, W, 3]."""
+
+    mean: FloatArray
+    error: FloatArray
+    """Standard error of ``mean``, to first order through the tone curves."""
+
+
+def render_run(
+    folder: Path, ground: tuple[float, float, float, float], depth: int, spp: int, seed: int
+) -> Composite:
+    """Render object and shadow of a finished run and put them into its photo.
+
+    Read are its light, camera, curves, placed object and the layer ``plate``.
+
+    Args:
+        folder: The run's folder, complete with the files of its hand-off.
+        ground: Plane of the shadow, ``a x + b y + c z + d = 0``, unit normal, world frame [m].
+        depth: Surface interactions of the longest path.
+        spp: Camera samples per pixel, at least 2.
+        seed: Base seed.
+
+    Raises:
+        InputError: A file of the run is missing or damaged.
+    """
+    plate = _plate(folder / "layers.exr")
+    camera = read_camera(folder / "camera.json", (plate.shape[1], plate.shape[0]))
+    asset, matrix = load_asset(folder / OBJECT), np.eye(4)
+    curves = read_curves(folder / "curves.json")
+    texels, texels_shadow = (
+        read_envmap(
+            own if (own := folder / f"envmap_{name}.exr").exists() else folder / "envmap.exr"
+        )
+        for name in ("detail", "shadow")
+    )
+
+    lit = foreground(asset, matrix, camera, texels, depth, spp, seed)
+    coverage = lit.coverage[..., None]
+    share = np.where(coverage > 0.0, coverage, 1.0)
+
+    def tone(radiance: FloatArray) -> FloatArray:
+        x = radiance / (1.0 + radiance) if curves.tone == "reinhard" else radiance
+        return curves.foreground.evaluate(x)[..., 0]
+
+    displayed, slope = _through(tone, lit.mean / share)
+    plane = shadow_ratio(asset, matrix, camera, texels_shadow, spp, seed + 1, ground)
+
+    def bend(ratio: FloatArray) -> FloatArray:
+        curved = curves.shadow_ratio.evaluate(ratio)
+        return np.stack([curved[..., k, k] for k in range(3)], axis=-1)
+
+    ratio, ratio_slope = _through(bend, plane.mean)
+    behind = (1.0 - coverage) * plate
+    variance = slope**2 * lit.variance + (behind * ratio_slope) ** 2 * plane.variance
+    return Composite(displayed * coverage + behind * ratio, np.sqrt(variance))
+
+
+def _light(folder: Path, name: str) -> NDArray[np.float32]:
+    """Return the map of one use, where it has one of its own, else that of all."""
+    own = folder / f"envmap_{name}.exr"
+    return read_envmap(own if own.exists() else folder / "envmap.exr")
+
+
+def write_composite(path: Path, composite: Composite) -> None:
+    """Write ``<path>.png``, and ``<path>.exr`` with the standard error in ``error.R/G/B``."""
+    names = [*"RGB", *(f"error.{c}" for c in "RGB")]
+    pixels = np.concatenate(composite, axis=-1).astype(np.float32)
+    mi.Bitmap(pixels, channel_names=names).write(str(path.with_suffix(".exr")))
+    display = np.clip(linear_to_gamma(composite.mean), 0.0, 1.0)
+    codes = np.round(display * 255.0).astype(np.uint8)
+    path.with_suffix(".png").write_bytes(png_bytes(codes, None, True, "Rendered by Mitsuba 3"))
+
+
+def main(folder: Path, ground: tuple[float, float, float, float], depth: int) -> None:
+    """Run ``render.py`` of a run's folder; its command line has ``--samples`` and ``--seed``.
+
+    Args:
+        folder: The run's folder.
+        ground: Plane of the shadow, world frame [m].
+        depth: Surface interactions of the longest path.
+    """
+    parser = argparse.ArgumentParser(description="Render this insertion with Mitsuba 3.")
+    parser.add_argument("--samples", type=int, default=256, help="camera samples per pixel")
+    parser.add_argument("--seed", type=int, default=1)
+    options = parser.parse_args()
+    composite = render_run(folder, ground, depth, options.samples, options.seed)
+    path = folder / "mitsuba" / "composite"
+    write_composite(path, composite)
+    noisy = composite.error[composite.error > 0.0]
+    print(f"{path}.png and .exr: standard error {np.median(noisy):.2g} in the median pixel")
+
+
+def _through(
+    curve: Callable[[FloatArray], FloatArray], x: FloatArray
+) -> tuple[FloatArray, FloatArray]:
+    """Return a curve's values and its slopes, by central differences."""
+    step = 1e-4
+    return curve(x), (curve(x + step) - curve(np.maximum(x - step, 0.0))) / (2.0 * step)
+
+
+def _plate(path: Path) -> FloatArray:
+    """Return the linearised photo out of a file of layers, shape [H, W, 3]."""
+    bitmap = mi.Bitmap(str(path))
+    names = [field.name for field in bitmap.struct_()]
+    planes = [names.index(f"plate.{c}") for c in "RGB"]
+    plate: FloatArray = np.array(bitmap)[..., planes].astype(np.float64)
+    return plate

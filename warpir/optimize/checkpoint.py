@@ -1,0 +1,240 @@
+"""Checkpoints of a run: safetensors and JSON, whole or not there, and of this very run.
+
+    checkpoints/000003-optimize-150/state.safetensors  tensors, named by their place in the state
+    checkpoints/000003-optimize-150/manifest.json      plain values, sha256, what it depends on
+
+A checkpoint is built under a temporary name, its manifest last, and renamed once. Its serial number
+grows, so the newest needs no clock to be known. The one before stays until the newer is complete;
+nothing is pickled.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import os
+import shutil
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from safetensors import SafetensorError
+
+from warpir.core.atomic import remove_folder, write_folder
+from warpir.core.errors import InputError, disk_error
+from warpir.core.signals import whole
+from warpir.core.strict_json import read_json_object
+from warpir.io.results import remove_unfinished
+
+if TYPE_CHECKING:
+    from torch import Tensor
+
+FORMAT = 2
+"""Layout of a checkpoint; another is refused."""
+KEPT = 2
+"""Checkpoints that stay on disk."""
+FOLDER = "checkpoints"
+UNUSABLE: tuple[type[Exception], ...] = (
+    *(InputError, OSError, SafetensorError, RecursionError),
+    *(AttributeError, KeyError, TypeError, ValueError),
+)
+"""What reading a damaged checkpoint raises; the latter for JSON values of other kinds."""
+STATE, MANIFEST = "state.safetensors", "manifest.json"
+
+
+@dataclass(frozen=True)
+class Checkpoint:
+    """A state that was read back."""
+
+    stage: str
+    """Part of the run that wrote it, such as ``personalize`` or ``optimize``."""
+    step: int
+    """Steps of that part that were done."""
+    state: dict[str, Any]
+    """Nested tensors and plain values, as they were given to `Checkpoints.save`."""
+
+
+class Checkpoints:
+    """The checkpoints of one run in its output folder.
+
+    Args:
+        out: The output folder.
+        identity: What the run depends on: settings, input hashes, versions; plain values.
+    """
+
+    def __init__(self, out: Path, identity: Mapping[str, Any]) -> None:
+        self.folder = out / FOLDER
+        # Through JSON, so that tuples compare equal to what is read back.
+        self.identity: dict[str, Any] = json.loads(json.dumps(identity))
+
+    @property
+    def newest(self) -> str | None:
+        """Name of the newest checkpoint, such as ``000003-optimize-150``."""
+        return next(iter(self._names()), None)
+
+    def save(self, stage: str, step: int, state: Mapping[str, Any]) -> None:
+        """Write a checkpoint, then remove those that are two older.
+
+        Args:
+            stage: Part of the run.
+            step: Steps of it that are done.
+            state: Nested mappings of tensors and plain values.
+
+        Raises:
+            InputError: The disk is full or cannot be written (`ExitCode.RESOURCES`).
+        """
+        from safetensors.torch import save  # torch: only whether there are any is asked without it
+
+        tensors: dict[str, Tensor] = {}
+        plain = _split(state, "", tensors)
+        content = save(tensors)
+        manifest: dict[str, Any] = {
+            "format": FORMAT,
+            "stage": stage,
+            "step": step,
+            "sha256": hashlib.sha256(content).hexdigest(),
+            "identity": self.identity,
+            "state": plain,
+        }
+        serial = 1 + max((int(name.split("-")[0]) for name in self._names()), default=0)
+        path = self.folder / f"{serial:06d}-{stage}-{step}"
+        try:
+            with whole():
+                self.folder.mkdir(exist_ok=True)
+                for abandoned in self.folder.glob(".partial-*"):  # of killed runs: --out is locked
+                    shutil.rmtree(abandoned)
+                text = json.dumps(manifest | {"manifest_sha256": manifest_digest(manifest)})
+                write_folder(path, [(STATE, content), (MANIFEST, text.encode())])
+                for old in list(self._names())[KEPT:]:
+                    remove_folder(self.folder / old)
+        except OSError as error:
+            what = "a checkpoint cannot be written"
+            raise disk_error(self.folder, error, what) from None
+
+    def load(self, notice: Callable[[str], None]) -> Checkpoint:
+        """Return the newest checkpoint that is whole.
+
+        Args:
+            notice: Told of each damaged one that was passed over.
+
+        Raises:
+            InputError: There is none, none is whole, or the run has changed; every field that
+                differs is named.
+        """
+        path, found, identity, problems = self._newest_whole()
+        self._compare(path, identity)
+        for problem in problems:
+            notice(f"checkpoint passed over: {problem}")
+        return found
+
+    def check(self) -> None:
+        """Compare what is known of the run so far with the checkpoint that it will go on from.
+
+        Raises:
+            InputError: As of `load`; what is not part of `identity` yet counts as the same.
+        """
+        path, _, identity, _ = self._newest_whole()
+        self._compare(path, {key: value for key, value in identity.items() if key in self.identity})
+
+    def _compare(self, path: Path, identity: dict[str, Any]) -> None:
+        differing = sorted(_differences(identity, self.identity))
+        if differing:
+            raise InputError(
+                path,
+                f"of a run with other inputs or settings ({'; '.join(differing)})",
+                "give the same again, or start the run again with --overwrite",
+            )
+
+    def _newest_whole(self) -> tuple[Path, Checkpoint, dict[str, Any], list[str]]:
+        """Return the newest whole checkpoint, of which run it is, and what is wrong with others."""
+        from safetensors.torch import load
+
+        problems: list[str] = []
+        for name in self._names():
+            path = self.folder / name
+            try:
+                manifest = read_json_object(path / MANIFEST)
+                if manifest["format"] != FORMAT:
+                    found_format = repr(manifest["format"])[:20]
+                    what = f"of another format (found {found_format}; expected {FORMAT})"
+                    raise InputError(path, what)
+                if manifest.pop("manifest_sha256", None) != manifest_digest(manifest):
+                    raise InputError(path / MANIFEST, "its sha256 is not the one that was written")
+                content = (path / STATE).read_bytes()
+                digest = hashlib.sha256(content).hexdigest()
+                if digest != manifest["sha256"]:
+                    raise InputError(
+                        path / STATE,
+                        f"its sha256 is not the one that was written (found {digest}; "
+                        f"expected {manifest['sha256']!r:.70})",
+                    )
+                state = _join(manifest["state"], load(content))
+                found = Checkpoint(str(manifest["stage"]), int(manifest["step"]), state)
+                return path, found, dict(manifest["identity"]), problems
+            except UNUSABLE as error:
+                why = error.what if isinstance(error, InputError) else repr(error)
+                problems.append(f"{name} cannot be used: {why}")
+        if problems:
+            advice = "--overwrite starts the run again"
+            raise InputError(self.folder, "; ".join(problems), advice)
+        raise InputError(
+            "--resume",
+            f"nothing to go on from (no checkpoint in {self.folder})",
+            "leave --resume out to start the run",
+        )
+
+    def remove(self) -> None:
+        """Delete all of them: the run starts again."""
+        remove_unfinished(self.folder)
+
+    def _names(self) -> Iterator[str]:
+        """Yield the checkpoints, the newest first; damaged ones too, that they may be reported."""
+        found = self.folder.glob("[0-9]*-*-*") if os.path.isdir(self.folder) else ()
+        yield from sorted((path.name for path in found), reverse=True)
+
+
+def manifest_digest(manifest: Mapping[str, Any]) -> str:
+    """Return the sha256 of all of a manifest but this."""
+    text = json.dumps(manifest, sort_keys=True, allow_nan=False)
+    return hashlib.sha256(text.encode()).hexdigest()
+
+
+def _split(state: Any, place: str, tensors: dict[str, Tensor]) -> Any:
+    """Move the tensors of a nested state into ``tensors``; return the rest, plain."""
+    from torch import Tensor
+
+    if isinstance(state, Tensor):
+        # safetensors refuses tensors that share memory.
+        tensors[place] = state.detach().cpu().contiguous().clone()
+        return {"tensor": place}
+    if isinstance(state, Mapping):
+        parts = {k: _split(v, f"{place}/{k}", tensors) for k, v in state.items()}
+        return {"mapping": parts}
+    return {"plain": state}
+
+
+def _join(plain: Any, tensors: Mapping[str, Tensor]) -> Any:
+    """Undo `_split`; tensors come back on the CPU."""
+    if "tensor" in plain:
+        return tensors[plain["tensor"]]
+    if "mapping" in plain:
+        return {k: _join(v, tensors) for k, v in plain["mapping"].items()}
+    return plain["plain"]
+
+
+def _differences(then: Any, now: Any, place: str = "") -> Iterator[str]:
+    """Yield what differs between two plain trees, one line a leaf."""
+    if isinstance(then, dict) and isinstance(now, dict):
+        for key in sorted({*then, *now}):
+            absent = "absent"
+            yield from _differences(
+                then.get(key, absent), now.get(key, absent), f"{place}.{key}".lstrip(".")
+            )
+    elif then != now:
+        yield f"{place}: was {_shown(then)}, is {_shown(now)}"
+
+
+def _shown(value: Any) -> str:
+    text = json.dumps(value)
+    return text if len(text) <= 80 else text[:77] + "..."  # a sha256 is shown whole

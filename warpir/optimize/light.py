@@ -1,0 +1,324 @@
+"""Recovery of a scene's light and tone curves (DiPIR, sections 4.1 to 4.3, supplement S 1-7).
+
+Two sets of lobes, one that lights the object and one that casts its shadow, become one light over
+the run; a tone curve belongs to the object, three to the shadow ratio.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from warpir.app.optimize_settings import OptimizeSettings
+from warpir.lighting.fusion import fuse
+from warpir.lighting.regularizers import bend, chroma, consistency, spread
+from warpir.lighting.sg_light import LightBounds, SGLight, narrowest
+from warpir.lighting.trust_region import TrustRegion
+from warpir.optimize.loop import Guide, Optimization
+from warpir.optimize.view import Frame, View, expected_light
+from warpir.render.integrator import Radiance
+from warpir.render.tone_curve import Knots, ToneCurve
+from warpir.render.transport.rows import TransportSettings
+from warpir.scene.camera import Camera
+from warpir.scene.light import Light, Lobes, describe, summarize
+
+RETRACE_EVERY = 25
+"""Steps between two looks at whether the light has left what was expected of it."""
+
+Function = Callable[..., tuple[Tensor, ...]]
+Record = Callable[[torch.nn.Module], Function]
+"""Given a module, returns what does the same faster, such as a CUDA graph's replay."""
+
+
+class Unknowns(torch.nn.Module):
+    """All that is recovered: two lights and four curves.
+
+    Args:
+        light_fg: Lights the object.
+        light_shadow: Casts its shadow.
+        bins: Bins of each tone curve.
+    """
+
+    def __init__(self, light_fg: SGLight, light_shadow: SGLight, bins: int = 5) -> None:
+        super().__init__()
+        self.light_fg, self.light_shadow = light_fg, light_shadow
+        self.curve_fg, self.curve_shadow = ToneCurve(1, bins), ToneCurve(3, bins)
+
+    @staticmethod
+    def start(lobes: Lobes | None, level: float, settings: OptimizeSettings) -> Unknowns:
+        """Return the unknowns at their start.
+
+        Args:
+            lobes: A light to start from, or None for an even one.
+            level: Radiance of that even light, relative [W/(m^2 sr)].
+            settings: Count and bounds of the lobes.
+        """
+        bounds = LightBounds(
+            narrowest(settings.light_rows), settings.chroma_limit, settings.intensity_limit
+        )
+
+        def light() -> SGLight:
+            if lobes is not None:
+                return SGLight(lobes, level, bounds)
+            return SGLight.uniform(settings.lobes, level, bounds, settings.lobe_width)
+
+        return Unknowns(light(), light(), settings.tone_bins)
+
+
+@dataclass(frozen=True)
+class Parts:
+    """What a step makes before it is composed."""
+
+    radiance: Radiance
+    curve_fg: Knots
+    curve_shadow: Knots
+    terms: dict[str, Tensor]
+    """Regularisers by name."""
+
+    def tensors(self) -> tuple[Tensor, ...]:
+        """Return all of them in a fixed order."""
+        groups = (self.radiance, self.curve_fg, self.curve_shadow)
+        return *(x for group in groups for x in vars(group).values()), *self.terms.values()
+
+    @staticmethod
+    def of(tensors: Sequence[Tensor], names: Sequence[str]) -> Parts:
+        """Return the parts again, with the names of their terms."""
+        radiance, curve_fg, curve_shadow = tensors[:3], tensors[3:6], tensors[6:9]
+        terms = dict(zip(names, tensors[9:], strict=True))
+        return Parts(Radiance(*radiance), Knots(*curve_fg), Knots(*curve_shadow), terms)
+
+
+class LightOptimization(Optimization):
+    """Light and tone curves of one frame.
+
+    Args:
+        frame: Scene, photo, tone operator.
+        guide: What looks right.
+        settings: Steps, rates, weights, schedules.
+        unknowns: Where to start; changed in place.
+        cache: Folder for traced rows, or None.
+        transport: How finely light is traced; by default the heights are those of the settings.
+        record: Makes steps with `transport` faster; by default they are taken as they are.
+        region: Where the light is expected, or None where nothing is known.
+    """
+
+    unknowns: Unknowns
+
+    def __init__(
+        self,
+        frame: Frame,
+        guide: Guide,
+        settings: OptimizeSettings,
+        unknowns: Unknowns,
+        cache: Path | None = None,
+        transport: TransportSettings | None = None,
+        record: Record | None = None,
+        region: TrustRegion | None = None,
+    ) -> None:
+        memory = frame.renderer.memory
+        super().__init__(unknowns, _groups(unknowns, settings), guide, settings, frame.seed, memory)
+        self.frame, self.cache, self.rows = frame, cache, transport
+        if transport is None and settings.integrator == "transport":
+            self.rows = TransportSettings(
+                height_fg=settings.object_light_rows,
+                height_shadow=settings.light_rows,
+                memory_mib=settings.transport_memory,
+            )
+        self.retraced = 0
+        self.region = region if settings.trust > 0.0 else None
+        self._record = record
+        self._terms: dict[str, Tensor] = {}
+        self.term_names: tuple[str, ...] = ()
+        with torch.no_grad():
+            self.expected = expected_light(*self.lights(0.0))
+        self.view = self._trace()
+
+    def _trace(self) -> View:
+        view = View(self.frame, self.expected, self.rows, self.settings.mis_samples, self.cache)
+        # What was recorded reads the rows of the view before.
+        self._recorded = None
+        if self._record is not None and view.transport is not None:
+            self._recorded = self._record(_TorchHalf(self))
+        return view
+
+    def fusion(self, step: int) -> float:
+        """Return ``s_fuse`` of a step: how far both lights have become one [1]."""
+        if self.settings.fusion_kind == "schedule":
+            share = step / max(self.settings.step_count - 1, 1)
+            start, end = self.settings.fusion_start, self.settings.fusion_end
+            return min(max((share - start) / max(end - start, 1e-9), 0.0), 1.0)
+        return 0.0
+
+    @property
+    def final_fusion(self) -> float:
+        """``s_fuse`` of what is delivered."""
+        return 1.0 if self.settings.fusion_kind == "schedule" else 0.0
+
+    def lights(self, scale: float, height: int | None = None) -> tuple[Tensor, Tensor]:
+        """Return the maps that light the object and cast its shadow, shape [He, We, 3].
+
+        Args:
+            scale: ``s_fuse`` [1].
+            height: Rows; the settings' when absent.
+        """
+        return self._fused(self._separate(height or self.settings.light_rows), scale)
+
+    def _separate(self, height: int) -> tuple[Tensor, Tensor]:
+        """Return the maps of both sets of lobes, before fusion."""
+        texels_fg = self.unknowns.light_fg.texels(height)
+        if self.settings.fusion_kind == "single":
+            return texels_fg, texels_fg
+        return texels_fg, self.unknowns.light_shadow.texels(height)
+
+    def parts(self, scale: float | Tensor, seed: int = 0) -> Parts:
+        """Return everything up to the composite; of torch alone with `transport`."""
+        unknowns, maps = self.unknowns, self._separate(self.settings.light_rows)
+        curves = unknowns.curve_fg(), unknowns.curve_shadow()
+        radiance = self.view.radiance(*self._fused(maps, scale), seed)
+        return Parts(radiance, *curves, self._terms_of(maps, curves))
+
+    def _fused(self, maps: tuple[Tensor, Tensor], scale: float | Tensor) -> tuple[Tensor, Tensor]:
+        return maps if self.settings.fusion_kind == "single" else fuse(*maps, scale)
+
+    def _terms_of(
+        self, maps: tuple[Tensor, Tensor], curves: tuple[Knots, Knots]
+    ) -> dict[str, Tensor]:
+        """Return the authors' terms (eq. 10, 11) and ours, of which trust is there if asked for."""
+        unknowns = self.unknowns
+        terms: dict[str, Tensor] = {}
+        if self.settings.has_lobe_shape:
+            terms["chroma"] = 0.5 * (chroma(unknowns.light_fg) + chroma(unknowns.light_shadow))
+        if self.settings.fusion_kind != "single":
+            terms |= {"consistency": consistency(*maps), "spread": spread(maps[1])}
+        if self.settings.has_tone_curve:
+            terms["bend"] = bend(curves[0]) + bend(curves[1])
+        if self.region is not None:
+            terms["trust"] = self.region.distance(unknowns.light_fg)
+            if self.settings.fusion_kind != "single":
+                terms["trust"] = terms["trust"] + self.region.distance(unknowns.light_shadow)
+        return terms
+
+    def image(self, step: int) -> Tensor:
+        """Return the composite of a step under lights fused as far as the schedule says.
+
+        What is asked of a picture by `mis` follows its noise too, so its gradient comes from other
+        samples; with the same ones it would also lessen that noise, by a light that moves.
+        """
+        scale = self.fusion(step)
+        self.frame.renderer.bad_pixels.iteration = step
+        if self._recorded is None:
+            parts = self.parts(scale, self.seed + 2 * step)
+        else:
+            device = self.unknowns.light_fg.axis.device
+            made = self._recorded(torch.full((), scale, device=device))
+            parts = Parts.of(made, self.term_names)
+        self._terms = parts.terms
+        curves = parts.curve_fg, parts.curve_shadow
+        replayed = self.view.compose(parts.radiance, *curves)
+        if self.view.transport is not None:
+            return replayed
+        with torch.no_grad():
+            shown = self.view.image(*self.lights(scale), *curves, self.seed + 2 * step + 1)
+        return replayed + (shown - replayed.detach())
+
+    def final_image(self, seed: int) -> Tensor:
+        """Return the composite under the light that would be delivered."""
+        curves = self.unknowns.curve_fg(), self.unknowns.curve_shadow()
+        return self.view.image(*self.lights(self.final_fusion), *curves, seed)
+
+    def terms(self) -> dict[str, tuple[float, Tensor]]:
+        """Return the regularisers of what `image` rendered last."""
+        return {name: (getattr(self.settings, name), term) for name, term in self._terms.items()}
+
+    def describe(self, camera: Camera) -> str:
+        """Return where the light comes from, and how much of it."""
+        with torch.no_grad():
+            texels = self.lights(self.final_fusion)[1].cpu().numpy()
+        return describe(summarize(Light(texels=texels)), camera.c2w)
+
+    def project(self) -> None:
+        """Keep both lights within their bounds."""
+        self.unknowns.light_fg.project()
+        self.unknowns.light_shadow.project()
+
+    def prepare(self, step: int) -> None:
+        """Trace light transport again once the light has left what was expected of it."""
+        if self.view.transport is None or step == 0 or step % RETRACE_EVERY:
+            return
+        with torch.no_grad():
+            texels = self.lights(self.fusion(step))
+            if self.view.staleness(*texels) > self.settings.retrace_at:
+                self.expected = expected_light(*texels)
+                self.view = self._trace()
+                self.retraced += 1
+
+    def final_lights(self, height: int) -> tuple[Light, Light]:
+        """Return the delivered lights as maps of ``height`` rows; one and the same when fused."""
+        with torch.no_grad():
+            fg, shadow = self.lights(self.final_fusion, height)
+        light_fg = Light(texels=fg.cpu().numpy())
+        if self.settings.fusion_kind in ("schedule", "single"):
+            return light_fg, light_fg
+        return light_fg, Light(texels=shadow.cpu().numpy())
+
+    def state_dict(self) -> dict[str, Any]:
+        """Return the loop's state and the light that the rows were traced for."""
+        assert self.expected.texels is not None
+        return {
+            **super().state_dict(),
+            "expected": torch.from_numpy(self.expected.texels),
+            "retraced": self.retraced,
+        }
+
+    def load_state_dict(self, state: Mapping[str, Any]) -> None:
+        """Go on from `state_dict`; light transport is traced again, or found in the cache."""
+        super().load_state_dict(state)
+        self.retraced = state["retraced"]
+        expected = Light(texels=state["expected"].numpy())
+        if not torch.equal(state["expected"], torch.from_numpy(self.expected.texels)):
+            self.expected = expected
+            self.view = self._trace()
+
+
+class _TorchHalf(torch.nn.Module):
+    """`LightOptimization.parts` as a module of its unknowns, for recording."""
+
+    def __init__(self, loop: LightOptimization) -> None:
+        super().__init__()
+        self.loop, self.unknowns = loop, loop.unknowns
+
+    def forward(self, scale: Tensor) -> tuple[Tensor, ...]:
+        """Return the parts of a step; ``scale`` is ``s_fuse`` [1]."""
+        parts = self.loop.parts(scale)
+        self.loop.term_names = tuple(parts.terms)
+        return parts.tensors()
+
+
+def _groups(unknowns: Unknowns, settings: OptimizeSettings) -> list[dict[str, Any]]:
+    """Return each kind of parameter with its learning rate."""
+    rates = {
+        "log_intensity": settings.rate_intensity,
+        "chroma": settings.rate_chroma,
+        "axis": settings.rate_axis,
+        "log_sigma": settings.rate_width,
+    }
+    groups: list[dict[str, Any]] = []
+    for light in (unknowns.light_fg, unknowns.light_shadow):
+        for name, rate in rates.items():
+            parameter = getattr(light, name)
+            if settings.has_lobe_shape or name in ("log_intensity", "axis"):
+                groups.append({"params": [parameter], "rate": rate})
+            else:
+                parameter.requires_grad_(False)
+    curves = [*unknowns.curve_fg.parameters(), *unknowns.curve_shadow.parameters()]
+    if settings.has_tone_curve:
+        groups.append({"params": curves, "rate": settings.rate_tone})
+    else:
+        for parameter in curves:
+            parameter.requires_grad_(False)
+    return groups

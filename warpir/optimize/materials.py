@@ -1,0 +1,417 @@
+"""Change materials, emission or tone curves by a prompt, under a known light (DiPIR, section 6).
+
+The light never moves here: a picture cannot tell its colour from the object's, so that only one of
+the two may be free. What no unknown reaches is rendered once: the plane always, and for tone curves
+the object too, whose steps then cost no ray.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from warpir.app.config import REFINE_PARTS, InsertConfig
+from warpir.app.optimize_settings import OptimizeSettings
+from warpir.core.memory import release
+from warpir.io.meshes.materials_file import MATERIALS, materials_to_json
+from warpir.lighting.regularizers import bend
+from warpir.lighting.scene_light import SceneLight
+from warpir.optimize.lit_frame import LitFrame
+from warpir.optimize.loop import Guide, Optimization
+from warpir.optimize.recover import (
+    Run,
+    as_input_errors,
+    convergence,
+    counts_of,
+    knots_of,
+    loop_notices,
+    make_frame,
+    make_guide,
+    open_checkpoints,
+    optimize,
+    prepare_guidance,
+    settled,
+    summary_of,
+    who_spoke,
+    write_lora,
+)
+from warpir.render.bridge import ShadeForeground
+from warpir.render.integrator import MaterialTensors
+from warpir.render.mis import MisIntegrator
+from warpir.render.tone_curve import Knots, ToneCurve
+from warpir.scene.asset import Asset, Material
+from warpir.scene.camera import Camera
+from warpir.scene.tone_curves import Curves, ToneKnots
+
+MARGIN = 0.05
+"""How far beyond its bounds a factor's sigmoid reaches, in spans: raw values of 0 and 1 are finite,
+3 either way, and there the sigmoid still has a fifth of its slope."""
+RAW_LIMIT = 0.9999 * float(np.log((1.0 + MARGIN) / MARGIN))
+"""Greatest raw value, just inside the bound's: rounding then never leaves the bounds."""
+LOWEST = {"base_color": 0.0, "metallic": 0.0, "roughness": 0.05}
+"""Least factor [1]; the greatest is 1. A smoother surface, which is a mirror, starts at it."""
+EMISSION_START = 0.01
+"""Where the emission of a material that has less starts, relative [W/(m^2 sr)]."""
+GROUND_IS_DARK = "what the object emits does not light the ground"
+
+
+# ------------------------------------------------------------------------------ unknowns
+
+
+class Between(torch.nn.Module):
+    """Values between two bounds, both within reach: a sigmoid that is stretched by `MARGIN`.
+
+    Args:
+        start: Any shape; brought into the bounds.
+        low: Lower bound.
+        high: Upper bound.
+    """
+
+    rounding: Tensor
+
+    def __init__(self, start: Tensor, low: float, high: float) -> None:
+        super().__init__()
+        self.low, self.span = low, high - low
+        start = start.clamp(low, high)
+        share = (start.double() - low) / self.span
+        raw = torch.logit((share + MARGIN) / (1.0 + 2.0 * MARGIN))
+        self.raw = torch.nn.Parameter(raw.float())
+        # The start is exact, though its inverse was rounded.
+        self.register_buffer("rounding", torch.zeros_like(start))
+        self.rounding += start - self.forward().detach()
+
+    def forward(self) -> Tensor:
+        """Return the values."""
+        share = (1.0 + 2.0 * MARGIN) * torch.sigmoid(self.raw) - MARGIN
+        return self.low + self.span * share + self.rounding
+
+    def project(self) -> None:
+        """Bring the raw values back within the bounds."""
+        with torch.no_grad():
+            self.raw.clamp_(-RAW_LIMIT, RAW_LIMIT)
+
+
+class Positive(torch.nn.Module):
+    """Values above 0 without a bound: a softplus.
+
+    Args:
+        start: Any shape, above 0.
+    """
+
+    def __init__(self, start: Tensor) -> None:
+        super().__init__()
+        raw = start.double() + torch.log(-torch.expm1(-start.double()))
+        self.raw = torch.nn.Parameter(raw.float())
+
+    def forward(self) -> Tensor:
+        """Return the values."""
+        return torch.nn.functional.softplus(self.raw)
+
+    def project(self) -> None:
+        """Nothing bounds them."""
+
+
+class Factors(torch.nn.Module):
+    """Factors of an asset's materials, some of them free.
+
+    Args:
+        asset: Whose materials.
+        chosen: Indices of the materials that change.
+        parts: Which of their factors: ``base_color``, ``metallic``, ``roughness``, ``emission``.
+    """
+
+    indices: Tensor
+
+    def __init__(self, asset: Asset, chosen: Sequence[int], parts: Sequence[str]) -> None:
+        super().__init__()
+        self.asset, self.chosen = asset, list(chosen)
+        self.register_buffer("indices", torch.tensor(self.chosen), persistent=False)
+        self.parts = torch.nn.ModuleDict()
+        for part in parts:
+            own = torch.tensor([getattr(m, part) for m in asset.materials])
+            self.register_buffer(f"own_{part}", own, persistent=False)
+            start = own[self.indices]
+            self.parts[part] = (
+                Positive(start.clamp(min=EMISSION_START))
+                if part == "emission"
+                else Between(start, LOWEST[part], 1.0)
+            )
+
+    def forward(self) -> MaterialTensors:
+        """Return the free factors of all materials; the others are absent."""
+        return MaterialTensors(
+            **{
+                part: getattr(self, f"own_{part}").index_copy(0, self.indices, values())
+                for part, values in self.parts.items()
+            }
+        )
+
+    def project(self) -> None:
+        """Bring all factors back within their bounds."""
+        for values in self.parts.values():
+            assert isinstance(values, Between | Positive)
+            values.project()
+
+    def materials(self) -> tuple[Material, ...]:
+        """Return the asset's materials with the factors as they are."""
+        with torch.no_grad():  # on CUDA a start at a bound may be a rounding beyond it
+            found = {
+                part: values()
+                .clamp(LOWEST.get(part, 0.0), 1.0 if part in LOWEST else None)
+                .tolist()
+                for part, values in self.parts.items()
+            }
+        materials = list(self.asset.materials)
+        for row, index in enumerate(self.chosen):
+            factors: dict[str, Any] = {
+                part: tuple(rows[row]) if isinstance(rows[row], list) else rows[row]
+                for part, rows in found.items()
+            }
+            materials[index] = replace(materials[index], **factors)
+        return tuple(materials)
+
+
+class ToneUnknowns(torch.nn.Module):
+    """The four curves of a picture.
+
+    Args:
+        curves: Where they start.
+    """
+
+    def __init__(self, curves: Curves) -> None:
+        super().__init__()
+        self.curve_fg = ToneCurve.from_knots(*curves.foreground.arrays())
+        self.curve_shadow = ToneCurve.from_knots(*curves.shadow_ratio.arrays())
+
+
+# ---------------------------------------------------------------------------------- loops
+
+
+class MaterialRefinement(Optimization):
+    """Material factors, or emission, of an object under a known light; by `mis`.
+
+    Args:
+        lit: The frame under its light.
+        curves: The light's tone curves, which stand still.
+        guide: What looks right.
+        settings: Steps, rates, samples.
+        unknowns: Where to start; changed in place.
+    """
+
+    unknowns: Factors
+
+    def __init__(
+        self,
+        lit: LitFrame,
+        curves: Curves,
+        guide: Guide,
+        settings: OptimizeSettings,
+        unknowns: Factors,
+    ) -> None:
+        rates = {"emission": settings.rate_emission}
+        groups = [
+            {"params": [*values.parameters()], "rate": rates.get(part, settings.rate_material)}
+            for part, values in unknowns.parts.items()
+        ]
+        frame = lit.frame
+        super().__init__(unknowns, groups, guide, settings, frame.seed, frame.renderer.memory)
+        self.lit = lit
+        self.curves = [_fixed(k) for k in (curves.foreground, curves.shadow_ratio)]
+        nowhere = np.zeros(0, np.int32)
+        self.mis = MisIntegrator(
+            frame.renderer, lit.object_pixels, nowhere, settings.mis_samples, 1, frame.depth
+        )
+
+    def image(self, step: int) -> Tensor:
+        """Return the composite of a step; its gradient comes from other samples.
+
+        What is asked of a picture follows its noise too. With the same samples the gradient would
+        also lessen that noise: smoother metal, darker paint.
+        """
+        self.lit.frame.renderer.bad_pixels.iteration = step
+        replayed = self.final_image(self.seed + 2 * step)
+        with torch.no_grad():
+            shown = self.final_image(self.seed + 2 * step + 1)
+        return replayed + (shown - replayed.detach())
+
+    def final_image(self, seed: int) -> Tensor:
+        """Return the composite with the materials as they are."""
+        found: MaterialTensors = self.unknowns()
+        factors = found.base_color, found.metallic, found.roughness, found.emission
+        light = (None,) * 4  # all of it is in the arguments: it stands still
+        foreground: Tensor = ShadeForeground.apply(
+            self.mis, self.lit.args_fg, seed, torch.is_grad_enabled(), *light, *factors
+        )
+        return self.lit.image(foreground, *self.curves)
+
+    def terms(self) -> dict[str, tuple[float, Tensor]]:
+        """Return none: their bounds are all that holds factors."""
+        return {}
+
+    def project(self) -> None:
+        """Keep the factors within their bounds."""
+        self.unknowns.project()
+
+    def prepare(self, step: int) -> None:
+        """Nothing is to be done: the light stands still."""
+
+    def describe(self, camera: Camera) -> str:
+        """Return the factors of the first material that changes."""
+        chosen, materials = self.unknowns.chosen, self.unknowns.materials()
+        first = materials[chosen[0]]
+        words = [_words(part, getattr(first, part)) for part in self.unknowns.parts]
+        more = f" (and {len(chosen) - 1} more)" if len(chosen) > 1 else ""
+        return f"{first.name}: {', '.join(words)}{more}"
+
+
+class ToneRefinement(Optimization):
+    """Tone curves of a picture whose light and materials are known.
+
+    Args:
+        lit: The frame under its light.
+        guide: What looks right.
+        settings: Steps, rates, weights.
+        unknowns: Where to start; changed in place.
+    """
+
+    unknowns: ToneUnknowns
+
+    def __init__(
+        self, lit: LitFrame, guide: Guide, settings: OptimizeSettings, unknowns: ToneUnknowns
+    ) -> None:
+        groups = [{"params": [*unknowns.parameters()], "rate": settings.rate_tone}]
+        memory = lit.frame.renderer.memory
+        super().__init__(unknowns, groups, guide, settings, lit.frame.seed, memory)
+        self.lit = lit
+
+    def image(self, step: int) -> Tensor:
+        """Return the composite; nothing in it is drawn anew."""
+        return self.final_image(self.seed)
+
+    def final_image(self, seed: int) -> Tensor:
+        """Return the composite with the curves as they are; it has the samples of `LitFrame`."""
+        curves = self.unknowns.curve_fg(), self.unknowns.curve_shadow()
+        return self.lit.image(self.lit.foreground, *curves)
+
+    def terms(self) -> dict[str, tuple[float, Tensor]]:
+        """Return the prior of plain curves, as in the recovery."""
+        curves = self.unknowns.curve_fg(), self.unknowns.curve_shadow()
+        return {"bend": (self.settings.bend, bend(curves[0]) + bend(curves[1]))}
+
+    def project(self) -> None:
+        """Nothing bounds the curves' parameters."""
+
+    def prepare(self, step: int) -> None:
+        """Nothing is to be done: the light stands still."""
+
+    def describe(self, camera: Camera) -> str:
+        """Return what becomes of mid tones, by straight lines between the knots."""
+        fg, shadow = self.unknowns.curve_fg.arrays(), self.unknowns.curve_shadow.arrays()
+        shown = np.interp(0.5, fg[0][0], fg[1][0])
+        ratios = (f"{np.interp(0.5, x, y):.2f}" for x, y in zip(*shadow[:2], strict=True))
+        return f"mid tone 0.5 becomes {shown:.2f}, of the shadow {' '.join(ratios)}"
+
+
+def _fixed(knots: ToneKnots) -> Knots:
+    return Knots(*(torch.from_numpy(part) for part in knots.arrays()))
+
+
+def _words(part: str, value: float | tuple[float, ...]) -> str:
+    numbers = value if isinstance(value, tuple) else (value,)
+    return f"{part.replace('_', ' ')} {' '.join(f'{number:.2f}' for number in numbers)}"
+
+
+# ---------------------------------------------------------------------------------- the run
+
+
+def refine(
+    run: Run, light: SceneLight
+) -> tuple[SceneLight, Asset, dict[str, Any], tuple[str, ...]]:
+    """Change by the prompt what ``--refine`` names.
+
+    Args:
+        run: Configuration, inputs, output folder.
+        light: The known light, and the tone curves to start from.
+
+    Returns:
+        Light with its curves, the asset with its materials, what run.json says, and notices.
+
+    Raises:
+        InputError: As `warpir.optimize.recover.recover`.
+    """
+    run = settled(run)
+    config, asset = run.config, run.inputs.asset
+    with as_input_errors():
+        checkpoints = open_checkpoints(run)
+        with run.timings.stage("scene"):
+            # Curves of an earlier run are made for its operator.
+            frame = replace(make_frame(run), is_reinhard=light.curves.tone == "reinhard")
+        guided, resumed = prepare_guidance(run, checkpoints)
+        with run.timings.stage("trace"):
+            release()
+            guide = make_guide(run, guided, frame)
+            lit = LitFrame(frame, light, run.torch_device)
+        loop: MaterialRefinement | ToneRefinement
+        if config.refine == "tone":
+            loop = ToneRefinement(
+                lit, guide, config, ToneUnknowns(light.curves).to(run.torch_device)
+            )
+        else:
+            chosen = asset.materials_named(config.refine_materials)
+            unknowns = Factors(asset, chosen, free_parts(config)).to(run.torch_device)
+            loop = MaterialRefinement(lit, light.curves, guide, config, unknowns)
+        record = what_moves(config, asset)
+        run.say(f"free: {', '.join(record['free'])}; frozen: {', '.join(record['frozen'])}")
+        with run.timings.stage("optimize"), torch.no_grad():
+            first = loop.guide.score(loop.final_image(config.seed))
+        optimize(run, loop, guided, frame.renderer, checkpoints, resumed)
+        with run.timings.stage("write"):
+            write_lora(run, guided)
+    notices = (*guided.prior.notices, *guided.notices, *loop_notices(loop, frame.renderer))
+    if isinstance(loop, ToneRefinement):
+        curves = (knots_of(c) for c in (loop.unknowns.curve_fg, loop.unknowns.curve_shadow))
+        light = replace(light, curves=Curves(light.curves.tone, *curves))
+    else:
+        refined = loop.unknowns.materials()
+        run.output.write_json(MATERIALS, materials_to_json(asset.materials, refined))
+        asset = replace(asset, materials=refined)
+        if config.refine == "emission":
+            notices = (*notices, GROUND_IS_DARK)
+    run.output.write_json("optimization.json", convergence(loop, first))
+    record = {
+        **guided.record,
+        **who_spoke(run, guided),
+        "loop_integrator": "mis",
+        "refine": record,
+        "optimization": summary_of(loop, first) | counts_of(guide, frame),
+    }
+    return light, asset, record, notices
+
+
+def free_parts(config: InsertConfig) -> list[str]:
+    """Return the fields of `Material` that ``--refine`` changes; none of them for tone."""
+    chosen = {
+        "material": config.refine_parts or REFINE_PARTS,
+        "emission": ("emission",),
+        "tone": (),
+    }[config.refine or "tone"]
+    return [name.replace("-", "_") for name in chosen]
+
+
+def what_moves(config: InsertConfig, asset: Asset) -> dict[str, Any]:
+    """Return what run.json says of what was free and what was frozen."""
+    parts = free_parts(config)
+    known = ("tone curves", *LOWEST, "emission")
+    free = parts or ["tone curves"]
+    chosen = asset.materials_named(config.refine_materials) if parts else []
+    return {
+        "what": config.refine,
+        "free": free,
+        "frozen": ["light", *(name for name in known if name not in free)],
+        "materials": [asset.materials[index].name for index in chosen],
+    }

@@ -1,0 +1,164 @@
+"""The picture inside the optimisation: one small view, rendered again for every step's light.
+
+Two integrators can stand behind it. `transport` traces once for a light that is expected and makes
+each step a product; when the light has moved away from what was expected, it is traced again. `mis`
+traces in every step.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from warpir.render.bridge import ComposeConstants, compose
+from warpir.render.integrator import Integrator, LightTensors, Radiance
+from warpir.render.mis import MisIntegrator
+from warpir.render.renderer import Renderer, light_args
+from warpir.render.tone_curve import Knots
+from warpir.render.transport.integrator import TransportIntegrator
+from warpir.render.transport.rows import TransportSettings
+from warpir.scene.light import Light
+
+FloatArray = NDArray[np.float32]
+IntArray = NDArray[np.int32]
+
+COVERAGE_SAMPLES = 64
+"""Camera samples that find each pixel's share of the object for `mis`."""
+
+
+@dataclass(frozen=True)
+class Frame:
+    """What stands still while the light is optimised."""
+
+    renderer: Renderer
+    """The scene, with a camera of the loop's resolution."""
+    photo_lin: FloatArray
+    """Linear photo at that resolution, shape [H, W, 3]."""
+    is_reinhard: bool
+    """Whether Reinhard's operator precedes the foreground curve."""
+    depth: int
+    """Surface interactions of the object's paths."""
+    seed: int
+
+    def coverage(self) -> FloatArray:
+        """Return the object's share of each pixel, from a few samples, shape [H, W]."""
+        height, width = self.photo_lin.shape[:2]
+        plane = np.zeros(height * width, np.float32)
+        gbuffer = self.renderer.gbuffer(self.seed)
+        plane[gbuffer.object_pixels] = gbuffer.coverage
+        return plane.reshape(height, width)
+
+
+class View:
+    """Renders composites of a frame; gradients to the light.
+
+    Args:
+        frame: Scene, photo, tone operator.
+        expected: The light that directions are shared out by.
+        transport: How finely `transport` is traced; None: `mis`.
+        mis_samples: Camera samples per pixel of `mis`.
+        cache: Folder for traced rows, or None.
+
+    Attributes:
+        transport: The integrator whose rows were traced, or None.
+    """
+
+    def __init__(
+        self,
+        frame: Frame,
+        expected: Light,
+        transport: TransportSettings | None,
+        mis_samples: int = 16,
+        cache: Path | None = None,
+    ) -> None:
+        self.frame = frame
+        renderer, seed = frame.renderer, frame.seed
+        objects = renderer.gbuffer(seed).object_pixels
+        proxies = _shaded(renderer, expected, seed)
+        self.integrator: Integrator
+        self.transport: TransportIntegrator | None = None
+        if transport is not None:
+            self.transport = TransportIntegrator(
+                renderer, objects, proxies, frame.depth, transport, expected, seed, cache
+            )
+            self.integrator, coverage = self.transport, self.transport.mask
+        else:
+            self.integrator = MisIntegrator(renderer, objects, proxies, mis_samples, 1, frame.depth)
+            args = light_args(expected, renderer.device)
+            coverage = renderer.foreground(args, objects, COVERAGE_SAMPLES, 1, 1, seed).mask
+        self.constants = ComposeConstants(
+            frame.photo_lin,
+            objects,
+            proxies,
+            coverage,
+            str(renderer.device.alias),
+            frame.is_reinhard,
+        )
+
+    def image(
+        self,
+        texels_fg: Tensor,
+        texels_shadow: Tensor,
+        curve_fg: Knots,
+        curve_shadow: Knots,
+        seed: int,
+    ) -> Tensor:
+        """Return the composite, display-encoded, shape [1, 3, H, W]; differentiable.
+
+        Args:
+            texels_fg: Lat-long radiance that lights the object, shape [He, We, 3].
+            texels_shadow: Lat-long radiance that casts its shadow, shape [He, We, 3].
+            curve_fg: One tone curve.
+            curve_shadow: Three tone curves.
+            seed: Of this step's samples; `transport` has none.
+        """
+        radiance = self.radiance(texels_fg, texels_shadow, seed)
+        return self.compose(radiance, curve_fg, curve_shadow)
+
+    def radiance(self, texels_fg: Tensor, texels_shadow: Tensor, seed: int) -> Radiance:
+        """Return what the integrator does; arguments are those of `image`."""
+        light_fg, light_shadow = LightTensors(texels=texels_fg), LightTensors(texels=texels_shadow)
+        return self.integrator.radiance(light_fg, light_shadow, seed)
+
+    def compose(self, radiance: Radiance, curve_fg: Knots, curve_shadow: Knots) -> Tensor:
+        """Return the composite of rendered radiance, display-encoded, shape [1, 3, H, W]."""
+        return compose(
+            self.constants,
+            radiance.foreground,
+            radiance.lit,
+            radiance.unoccluded,
+            curve_fg,
+            curve_shadow,
+        )
+
+    def staleness(self, texels_fg: Tensor, texels_shadow: Tensor) -> float:
+        """Return how much noisier the frozen rows are under this light than where expected [1]."""
+        if self.transport is None:
+            return 1.0
+        fg, shadow = (t.detach().cpu().numpy() for t in (texels_fg, texels_shadow))
+        return self.transport.staleness(Light(texels=fg), Light(texels=shadow))
+
+
+def _shaded(renderer: Renderer, expected: Light, seed: int) -> IntArray:
+    """Return the pixels whose ground the object may shade, under an even sky or the expected light.
+
+    What no light of the loop has shaded yet keeps a ratio of 1 and has no gradient, so the even sky
+    stands for all that is not expected.
+    """
+    even = Light(texels=np.ones((8, 16, 3), np.float32))
+    found = [renderer.shaded_pixels(light_args(x, renderer.device), seed) for x in (even, expected)]
+    union: NDArray[Any] = np.union1d(*found)
+    return union.astype(np.int32)
+
+
+def expected_light(texels_fg: Tensor, texels_shadow: Tensor) -> Light:
+    """Return the light that the next tracing should expect: both maps, each at mean 1."""
+    with torch.no_grad():
+        both = [t / t.mean().clamp(min=1e-20) for t in (texels_fg, texels_shadow)]
+    return Light(texels=(0.5 * (both[0] + both[1])).cpu().numpy())

@@ -1,0 +1,4 @@
+"""Placing an object by hand, in the browser: ``python -m warpir.place``.
+
+Writes a configuration for `warpir.insert`; renders nothing itself.
+"""

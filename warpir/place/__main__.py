@@ -1,0 +1,7 @@
+"""``python -m warpir.place``."""
+
+import sys
+
+from warpir.place.command import main
+
+sys.exit(main())

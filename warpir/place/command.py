@@ -1,0 +1,207 @@
+"""Place an object in a photo by hand, in the browser.
+
+    python -m warpir.place --photo street.jpg --asset car.glb --out placed/street
+
+opens a page on this machine: the horizon, the ground and the object are dragged into place, and
+Save writes ``camera.json`` and ``insert.json`` into --out, which ``python -m warpir.insert --config
+placed/street/insert.json`` takes. Neither torch nor Warp is loaded.
+"""
+
+import os
+import shlex
+import sys
+import threading
+import webbrowser
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import ExitStack, contextmanager
+from dataclasses import replace
+from functools import partial
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import TYPE_CHECKING, Any
+
+from warpir.app.command import flags_of, make_parser, read_arguments, read_values
+from warpir.app.config import DEMO_HINT, InsertConfig, flag, usage
+from warpir.app.program import run_program, say
+from warpir.core.errors import ExitCode, raise_all
+from warpir.core.signals import Stopped
+
+if TYPE_CHECKING:
+    from warpir.place.session import PlacementFolder, Session
+
+USAGE = "python -m warpir.place --photo FILE --asset FILE [--out DIR] [FLAG ...]"
+DESCRIPTION = "Place a 3D object in a photograph by hand, in the browser."
+FLAGS = {
+    "input and output": flags_of(
+        "photo", "layer", "asset", "materials", "out", "overwrite", "demo"
+    ),
+    "where the page starts": flags_of(
+        "camera",
+        "frame",
+        "fov",
+        "pitch",
+        "horizon",
+        "camera_height",
+        "up",
+        "ground",
+        "place",
+        "at",
+        "rotate_y",
+        "scale",
+        "size",
+        "asset_up",
+        "sun",
+        "sky",
+    ),
+    "rules for the files": flags_of(
+        "alpha",
+        "max_pixels",
+        "strict",
+        "max_file_bytes",
+        "max_triangles",
+        "max_texture_pixels",
+        "max_nodes",
+        "max_instances",
+        "max_json_bytes",
+        "max_gltf_json_bytes",
+        "max_json_values",
+        "max_nesting",
+        "missing_textures",
+    ),
+}
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Run the command line.
+
+    Args:
+        argv: Arguments without the program's name; ``sys.argv`` when absent.
+
+    Returns:
+        The exit status: 0 when ``--once`` ended it, 130 after Ctrl-C.
+    """
+    return run_program(_run, argv)
+
+
+def _run(arguments: list[str]) -> int:
+    parser = make_parser("place", USAGE, DESCRIPTION, "", FLAGS)
+    group = parser.add_argument_group("the page")
+    group.add_argument("--port", metavar="N", help="Port of 127.0.0.1 (default: any that is free)")
+    group.add_argument("--no-browser", action="store_true", help="Only print the address")
+    group.add_argument("--once", action="store_true", help="End after the placement was saved")
+    texts = read_arguments(parser, arguments)
+    port = _port(texts.pop("port", "0"))
+    opens, once = not texts.pop("no_browser", False), texts.pop("once", False)
+    config = InsertConfig(**read_values({name: (text, flag(name)) for name, text in texts.items()}))
+    config = _with_inputs(config)
+
+    from warpir.place.server import PlaceServer
+    from warpir.place.session import (
+        PlacementFolder,
+        asset_glb,
+        open_session,
+        photo_jpeg,
+        start_record,
+    )
+
+    assert config.out is not None
+    folder = PlacementFolder(config.out, config.overwrite)
+    folder.check()
+    session = open_session(config)
+    for line in session.assumed:
+        say(f"assumed: {line}")
+    contents: dict[str, Callable[[], bytes]] = {
+        "start.json": lambda: _json(start_record(session)),
+        "photo.jpg": partial(photo_jpeg, session.photo),
+        "asset.glb": partial(asset_glb, session.asset),
+    }
+    with (
+        PlaceServer(port, contents, partial(_save, session, folder), once=once) as server,
+        ExitStack() as until_end,
+    ):
+        say(f"page: {server.address}")
+        if not once:
+            say("Ctrl-C ends it")
+        if opens and _has_screen():
+            try:
+                way = until_end.enter_context(way_to(server.address)).as_uri()
+                threading.Thread(target=webbrowser.open, args=(way,), daemon=True).start()
+            except OSError as error:
+                say(f"notice: open the page yourself ({error.filename}: {error.strerror})")
+        try:
+            server.serve_forever(poll_interval=0.1)
+        except Stopped as stopped:
+            with server.working:  # what is being saved is saved
+                stopped.kept = f"the placement is in {config.out}" if folder.is_written else ""
+            raise
+    return ExitCode.DONE
+
+
+@contextmanager
+def way_to(address: str) -> Iterator[Path]:
+    """Yield a page that leads to an address, which only this user can read while it is there.
+
+    Every user of the machine sees the arguments that a browser is started with: they may not hold
+    the session's token.
+
+    Raises:
+        OSError: It cannot be written.
+    """
+    content = (
+        '<!doctype html><meta charset="utf-8"><title>warpir.place</title>'
+        f'<meta http-equiv="refresh" content="0; url={address}"><a href="{address}">Place</a>\n'
+    )
+    # Its folder is this user's alone, and so is the file should it be moved out of there.
+    with TemporaryDirectory(prefix="warpir-place-", ignore_cleanup_errors=True) as folder:
+        path = Path(folder, "place.html")
+        path.touch(mode=0o600)
+        path.write_text(content, encoding="utf-8")
+        yield path
+
+
+def _save(session: "Session", folder: "PlacementFolder", body: bytes) -> dict[str, Any]:
+    """Write what the page says, and say how to go on, here and there."""
+    from warpir.core.strict_json import parse_json_object
+    from warpir.place.session import placement_files
+
+    path = folder.write(placement_files(session, parse_json_object("the page", body)))
+    command = f"python -m warpir.insert --config {shlex.quote(str(path))}"
+    say(f"saved: {path}")
+    say(command)
+    return {"command": command, "file": str(path)}
+
+
+def _with_inputs(config: InsertConfig) -> InsertConfig:
+    """Return the configuration with the demo's files, and with a folder for what is saved.
+
+    Raises:
+        InputError: Photo or asset is not named (`ExitCode.USAGE`).
+    """
+    if config.demo:
+        from warpir.demo import demo_config
+
+        demo = demo_config(config)
+        return replace(
+            demo, light=None, exposure=None, out=config.out or os.path.join("placed", "demo")
+        )
+    missing = [name for name in ("photo", "asset") if getattr(config, name) is None]
+    raise_all([usage(flag(name), "needed", DEMO_HINT) for name in missing])
+    assert config.photo is not None
+    return replace(config, out=config.out or os.path.join("placed", Path(config.photo).stem))
+
+
+def _port(text: str) -> int:
+    if not (text.isascii() and text.isdigit() and len(text) < 20 and int(text) < 65_536):
+        raise usage("--port", f"expected a whole number up to 65535 (found {text[:60]!a})")
+    return int(text)
+
+
+def _json(record: dict[str, Any]) -> bytes:
+    import json
+
+    return json.dumps(record, allow_nan=False).encode()
+
+
+def _has_screen() -> bool:
+    """Return whether a browser can show itself; one that lives in the terminal would take it."""
+    return sys.platform != "linux" or any(map(os.environ.get, ("DISPLAY", "WAYLAND_DISPLAY")))

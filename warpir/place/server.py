@@ -1,0 +1,197 @@
+"""Serves the page of `warpir.place` to the browser of this machine, and to nobody else.
+
+It listens on 127.0.0.1 alone. Every request must name that host and begin with a token that was
+drawn for this session, so that neither a page from elsewhere (DNS rebinding) nor another user gets
+anything: the address is printed, and given to the browser in a file that only this user can read,
+never as an argument, which everybody sees. Addresses are looked up in a table; none is a path on
+disk.
+"""
+
+from __future__ import annotations
+
+import json
+import re
+import secrets
+import threading
+from collections.abc import Callable, Mapping
+from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
+from pathlib import Path
+from typing import Any
+
+from warpir.app.config import usage
+from warpir.core.errors import InputError
+from warpir.report.page_policy import source_hash
+
+HOST = "127.0.0.1"
+LARGEST_REQUEST = 1 << 16
+"""Most bytes that the page sends."""
+PAGE = Path(__file__).parent / "page"
+FILES = {
+    "": "index.html",
+    **{
+        name: name
+        for name in (
+            "page.css",
+            "icon.svg",
+            "camera.js",
+            "handles.js",
+            "page.js",
+            "stage.js",
+            "vendor/three.core.min.js",
+            "vendor/three.module.min.js",
+            "vendor/loaders/GLTFLoader.js",
+            "vendor/utils/BufferGeometryUtils.js",
+        )
+    },
+}
+"""Files of the page by their addresses behind the token."""
+KINDS = {
+    "html": "text/html; charset=utf-8",
+    "css": "text/css; charset=utf-8",
+    "js": "text/javascript; charset=utf-8",
+    "svg": "image/svg+xml",
+    "jpg": "image/jpeg",
+    "glb": "model/gltf-binary",
+    "json": "application/json",
+}
+
+
+class PlaceServer(ThreadingHTTPServer):
+    """Serves one session.
+
+    Args:
+        port: Port to listen on; 0 for any that is free.
+        contents: By address, what makes a file that is not one of `FILES`; called once, when it is
+            first asked for.
+        save: Called with the bytes that the page sends; returns its answer. Raises `InputError`.
+        once: Whether the first placement that was saved ends `serve_forever`.
+
+    Raises:
+        InputError: The port cannot be used (`ExitCode.USAGE`).
+    """
+
+    daemon_threads = True
+
+    def __init__(
+        self,
+        port: int,
+        contents: Mapping[str, Callable[[], bytes]],
+        save: Callable[[bytes], dict[str, Any]],
+        once: bool = False,
+    ) -> None:
+        try:
+            super().__init__((HOST, port), _Handler)
+        except OSError as error:
+            what = f"cannot be listened on (found {port}: {error.strerror})"
+            raise usage("--port", what, "leave it out for any that is free") from None
+        self.token = secrets.token_urlsafe(24)
+        self.save = save
+        self.once = once
+        self.working = threading.Lock()
+        """Held while files are read, made or saved."""
+        self._makers = dict(contents)
+        self._made: dict[str, bytes] = {}
+        html = (PAGE / "index.html").read_bytes()
+        scripts = re.findall(rb'<script type="importmap">(.*?)</script>', html, re.DOTALL)
+        allowed = " ".join(source_hash(script) for script in scripts)
+        self.policy = (
+            f"default-src 'none'; script-src 'self' {allowed}; style-src 'self'; "
+            "img-src 'self' blob:; connect-src 'self' blob:; base-uri 'none'; "
+            "form-action 'none'; frame-ancestors 'none'"
+        )
+
+    @property
+    def host(self) -> str:
+        """Host and port, as a browser names them: it leaves out the port that is HTTP's own."""
+        port = self.server_address[1]
+        return HOST if port == 80 else f"{HOST}:{port}"
+
+    @property
+    def address(self) -> str:
+        """Of the page."""
+        return f"http://{self.host}/{self.token}/"
+
+    def content(self, name: str) -> bytes | None:
+        """Return what has an address behind the token; None where nothing has."""
+        with self.working:
+            if name not in self._made:
+                if name in FILES:
+                    self._made[name] = (PAGE / FILES[name]).read_bytes()
+                elif name in self._makers:
+                    self._made[name] = self._makers[name]()
+            return self._made.get(name)
+
+
+class _Handler(BaseHTTPRequestHandler):
+    server: PlaceServer
+    timeout = 30
+
+    def do_GET(self) -> None:
+        name = self._name()
+        if name is None:
+            return
+        content = self.server.content(name)
+        if content is None:
+            self._refuse(404)
+        else:
+            self._answer(200, KINDS[FILES.get(name, name).rpartition(".")[2]], content)
+
+    def do_POST(self) -> None:
+        name = self._name()
+        if name is None:
+            return
+        length = self.headers.get("Content-Length", "")
+        if name != "save":
+            self._refuse(404)
+        elif not (length.isascii() and length.isdigit() and len(length) < 10):
+            self._refuse(413)
+        elif int(length) > LARGEST_REQUEST:
+            self._refuse(413)
+        else:
+            body = self.rfile.read(int(length))
+            try:
+                with self.server.working:
+                    status, answer = 200, self.server.save(body)
+            except InputError as error:
+                told = {"where": error.where, "what": error.what, "advice": error.advice}
+                status, answer = 422, told
+            self._answer(status, KINDS["json"], json.dumps(answer).encode())
+            if self.server.once and status == 200:
+                # From a thread of its own: it waits for the loop, which may wait for this one.
+                threading.Thread(target=self.server.shutdown).start()
+
+    def _name(self) -> str | None:
+        """Return the address behind the token; None when the request was refused."""
+        _, _, rest = self.path.partition("/")
+        token, slash, name = rest.partition("/")
+        is_ours = secrets.compare_digest(token.encode(), self.server.token.encode())
+        if not (is_ours and slash and self.headers.get_all("Host") == [self.server.host]):
+            self._refuse(403)
+            return None
+        return name.partition("?")[0]
+
+    def _refuse(self, status: int) -> None:
+        self._answer(status, "text/plain", b"")
+
+    def _answer(self, status: int, kind: str, content: bytes) -> None:
+        self.send_response(status)
+        headers = {
+            "Content-Type": kind,
+            "Content-Length": str(len(content)),
+            "Content-Security-Policy": self.server.policy,
+            "X-Content-Type-Options": "nosniff",
+            "Referrer-Policy": "no-referrer",
+            "Cross-Origin-Resource-Policy": "same-origin",
+            "Cross-Origin-Opener-Policy": "same-origin",
+            "Cache-Control": "no-store",
+        }
+        for name, value in headers.items():
+            self.send_header(name, value)
+        self.end_headers()
+        try:
+            self.wfile.write(content)
+        except ConnectionError:  # the page was closed meanwhile
+            self.close_connection = True
+
+    def log_message(self, *args: object) -> None:
+        """Say nothing: every line on the terminal is one for the user."""

@@ -1,0 +1,336 @@
+"""Placing by hand: what the page starts from, and the files made of what it says in the end.
+
+A saved placement is two files in one folder: ``camera.json``, as `warpir.insert` writes it, and
+``insert.json``, a configuration for ``--config`` that names photo, asset, camera, place and light.
+"""
+
+from __future__ import annotations
+
+import io
+import json
+import os
+from collections.abc import Mapping
+from dataclasses import dataclass, fields, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from warpir.app.command import read_values
+from warpir.app.config import DEFAULTS, SKY_PRESETS, InsertConfig
+from warpir.app.inputs import Loaders, photo_camera, read_asset
+from warpir.app.photo_world import make_world
+from warpir.core.atomic import replacing, write_staged
+from warpir.core.errors import ExitCode, InputError, disk_error
+from warpir.io.cameras.source import number
+from warpir.io.gltf.writer import write_glb
+from warpir.io.images.photos import Photo, read_photo
+from warpir.lighting.scene_light import SKIES, SUN_TO_SKY
+from warpir.place.preview_asset import preview_asset, triangle_count
+from warpir.place.stance import Stance, ground_to_world, stance_of
+from warpir.scene.asset import Asset
+from warpir.scene.camera import Camera
+from warpir.scene.placement import Float64Array, place_asset, upright_plane
+
+CAMERA, CONFIG = "camera.json", "insert.json"
+"""Names of the two files."""
+PHOTO_SIDE = 2048
+"""Longest side of the photo that the page gets [px]."""
+PLACED = ("place", "at", "rotate_y", "scale", "size", "sun", "sky")
+"""Fields that the page decides."""
+SEEN_BY = ("camera", "frame", "up", "fov", "pitch", "horizon", "camera_height", "ground")
+"""Fields that the camera file and the ground in its world stand for."""
+DEFAULT_SUN = (-60.0, 45.0)
+"""Azimuth and elevation of the sun with which the page starts [deg]: from the left, in front."""
+LARGEST_START = 0.6
+"""Longest side of an asset of unknown scale, as a share of its distance, with which it starts."""
+PAGE = Path("the page")
+"""Who is to blame for numbers that the page sends."""
+
+
+@dataclass(frozen=True)
+class Session:
+    """A photo and an asset that is to be placed in it."""
+
+    config: InsertConfig
+    """What the command line said; its `out` is the folder of the two files."""
+    photo: Photo
+    asset: Asset
+    camera: Camera
+    """With which the page starts, at the photo's resolution."""
+    ground: tuple[float, float, float, float] | None
+    """Plane a x + b y + c z + d = 0; absent means y = 0."""
+    asset_to_world: Float64Array
+    """With which the page starts, shape [4, 4]."""
+    rotate_y: float
+    """With which the page starts [deg]."""
+    assumed: tuple[str, ...]
+    """What was chosen because nothing was given, and what looks odd, one line each."""
+
+    @property
+    def frame(self) -> Float64Array:
+        """Pose of the ground frame in the world, shape [4, 4]."""
+        return ground_to_world(upright_plane(self.ground, self.camera.c2w[:3, 3]))
+
+
+def open_session(config: InsertConfig) -> Session:
+    """Read photo, asset and camera as `warpir.insert` does, and choose where the page starts.
+
+    Raises:
+        InputError: One of them cannot be used, or the place that was named is not in the photo.
+    """
+    assert config.photo is not None and config.asset is not None
+    assumed: list[str] = []
+    photo = read_photo(
+        config.photo,
+        max_pixels=config.max_pixels,
+        alpha=config.alpha,
+        layer=config.layer,
+        strict=config.strict,
+    )
+    view = photo_camera(config, photo, assumed)
+    asset = read_asset(config.asset, config, Loaders(), assumed)
+    world = make_world(config, view, None)
+    assumed += [notice.removeprefix("assumed: ") for notice in world.camera.notices]
+    low, high = asset.bounds()
+    stands = (config.place, config.at, config.scale, config.size)
+    try:
+        placement = place_asset(
+            low,
+            high,
+            world.camera,
+            world.ground,
+            place=world.place,
+            at=config.at,
+            rotate_y=config.rotate_y,
+            scale=config.scale,
+            size=config.size,
+        )
+        asset_to_world = placement.asset_to_world
+        assumed += [*placement.assumed, *placement.warnings]
+    except InputError as error:
+        if any(value is not None for value in stands):
+            raise
+        # It is here that this can be put right: begin with something that is seen.
+        asset_to_world = _in_view(asset, world.camera, world.ground, config.rotate_y)
+        assumed.append(f"{error.what}: it starts in front of the camera, and smaller")
+    return Session(
+        config,
+        photo,
+        asset,
+        world.camera,
+        world.ground,
+        asset_to_world,
+        config.rotate_y,
+        tuple(assumed),
+    )
+
+
+def _in_view(
+    asset: Asset, camera: Camera, ground: tuple[float, ...] | None, rotate_y: float
+) -> Float64Array:
+    """Return a pose some heights ahead of the camera, at a size that fits into the view."""
+    plane = upright_plane(None if ground is None else np.array(ground), camera.c2w[:3, 3])
+    frame = ground_to_world(plane)
+    stance = stance_of(np.linalg.inv(frame) @ camera.c2w)
+    ahead = replace(stance, pitch=0.0, roll=0.0).c2w()
+    # Straight ahead on the ground where that is in view, else where the camera looks down at.
+    steep = np.radians(np.clip(-stance.pitch, 0.0, 85.0))
+    away = stance.height * (4.0 if steep < np.arctan(0.25) else 1.0 / np.tan(steep))
+    x, _, z = (float(c) for c in (ahead @ (0.0, 0.0, -away, 1.0))[:3])
+    place = frame @ (x, 0.0, z, 1.0)
+    low, high = asset.bounds()
+    foot = np.array([(low[0] + high[0]) / 2.0, low[1], (low[2] + high[2]) / 2.0])
+    scale = min(1.0, LARGEST_START * np.hypot(away, stance.height) / float((high - low).max()))
+    pose = frame @ Stance(0.0, 0.0, 0.0, rotate_y, 0.0, 0.0).c2w()
+    pose[:3, :3] *= scale
+    pose[:3, 3] = place[:3] - pose[:3, :3] @ foot
+    return pose
+
+
+def start_record(session: Session) -> dict[str, Any]:
+    """Return what the page starts from, as plain values.
+
+    Lengths are metres, angles degrees, pixels those of the upright photo.
+    """
+    camera, asset, config = session.camera, session.asset, session.config
+    assert config.photo is not None and config.asset is not None
+    low, high = asset.bounds()
+    to_ground = np.linalg.inv(session.frame)
+    foot = np.array([(low[0] + high[0]) / 2.0, low[1], (low[2] + high[2]) / 2.0, 1.0])
+    x, _, z, _ = (float(c) for c in to_ground @ session.asset_to_world @ foot)
+    scale = float(np.linalg.norm(session.asset_to_world[:3, 0]))
+    sky_radiance = {name: sky for name, (sky, _) in SKIES.items()}
+    sun_color = {name: color for name, (_, color) in SKIES.items()}
+    return {
+        "photo": {"name": Path(config.photo).name, "width": camera.width, "height": camera.height},
+        "asset": {
+            "name": Path(config.asset).name,
+            "low": low.tolist(),
+            "high": high.tolist(),
+            "triangles": triangle_count(asset),
+        },
+        "camera": {
+            "width": camera.width,
+            "height": camera.height,
+            **{name: getattr(camera, name) for name in ("fx", "fy", "cx", "cy")},
+        },
+        "stance": stance_of(to_ground @ camera.c2w).record(),
+        "stand": {"x": x, "z": z},
+        "rotate_y": session.rotate_y,
+        "size": scale * float((high - low).max()),
+        "ground_to_world": session.frame.tolist(),
+        "sun": _start_sun(config),
+        "sky": config.sky or SKY_PRESETS[0],
+        "keeps_light": config.sun is not None or config.sky is not None,
+        "sky_radiance": sky_radiance,
+        "sun_color": sun_color,
+        "sun_to_sky": SUN_TO_SKY,
+        "ground_albedo": config.ground_albedo,
+        "assumed": list(session.assumed),
+        "folder": str(config.out),
+    }
+
+
+def _start_sun(config: InsertConfig) -> list[float | None]:
+    """Return azimuth, elevation and strength; the last is open where nobody names it."""
+    if config.sun is None:
+        return [*DEFAULT_SUN, 0.0 if config.sky is not None else None]
+    return [*config.sun, None][:3]
+
+
+def photo_jpeg(photo: Photo) -> bytes:
+    """Return the upright photo as sRGB JPEG, its longest side at most `PHOTO_SIDE`."""
+    from PIL import Image
+
+    picture = Image.fromarray(np.round(photo.srgb * 255.0).astype(np.uint8))
+    picture.thumbnail((PHOTO_SIDE, PHOTO_SIDE), Image.Resampling.LANCZOS)
+    stream = io.BytesIO()
+    picture.save(stream, "JPEG", quality=90)
+    return stream.getvalue()
+
+
+def asset_glb(asset: Asset) -> bytes:
+    """Return the asset in its own frame as binary glTF, thinned where it is heavy."""
+    return write_glb(preview_asset(asset), np.eye(4))
+
+
+def placement_files(session: Session, said: Mapping[str, Any]) -> dict[str, dict[str, Any]]:
+    """Return the two files of a placement, the configuration last.
+
+    Args:
+        session: What was placed.
+        said: What the page says: ``fx``, ``fy`` [px], ``stance``, ``stand`` (``x`` and ``z`` in the
+            ground frame) [m], ``rotate_y`` [deg], ``size`` [m], and ``sun`` and ``sky`` as the
+            flags, or null where the light is to be read off the photo.
+
+    Raises:
+        InputError: Numbers out of range, or an object that the camera does not see.
+    """
+    assert session.config.out is not None
+    stance = Stance(*(number(PAGE, said.get("stance"), f.name) for f in fields(Stance)))
+    pose = session.frame @ stance.c2w()
+    fx, fy = (number(PAGE, said, name) for name in ("fx", "fy"))
+    if min(fx, fy, stance.height) <= 0.0:
+        raise InputError(PAGE, "camera height and focal length must be more than 0")
+    camera = replace(session.camera, fx=fx, fy=fy, c2w=pose)
+    stand = [number(PAGE, said.get("stand"), axis) for axis in "xz"]
+    x, y, z = (float(c) for c in (session.frame @ (stand[0], 0.0, stand[1], 1.0))[:3])
+    asked = {name: said.get(name) for name in ("rotate_y", "size", "sun", "sky")}
+    asked = {name: value for name, value in asked.items() if value is not None}
+    chosen = read_values({k: (v, f"--{k.replace('_', '-')}") for k, v in asked.items()})
+    config = InsertConfig(place=(x, y, z), **chosen)
+    place_asset(
+        *session.asset.bounds(),
+        camera,
+        session.ground,
+        place=config.place,
+        rotate_y=config.rotate_y,
+        size=config.size,
+    )
+    folder = Path(os.path.abspath(session.config.out))
+    kept = {
+        name: value
+        for name, value in vars(session.config).items()
+        if value != DEFAULTS[name] and name not in (*PLACED, *SEEN_BY, "overwrite", "demo")
+    }
+    own = ("photo", "asset", "materials")
+    files: dict[str, Any] = {name: os.path.abspath(kept[name]) for name in own if name in kept}
+    ground = {} if session.ground is None else {"ground": session.ground}
+    return {
+        CAMERA: camera.record(),
+        CONFIG: {
+            **kept,
+            **files,
+            "camera": str(folder / CAMERA),
+            **ground,
+            "place": config.place,
+            **chosen,
+            "out": str(folder / "result"),
+        },
+    }
+
+
+class PlacementFolder:
+    """The folder of the two files; replaces what it wrote itself, and others' when told to."""
+
+    def __init__(self, path: str, overwrite: bool) -> None:
+        """Name the folder; it is made when something is written.
+
+        Args:
+            path: The folder.
+            overwrite: Whether a placement that is there may be replaced.
+        """
+        self.path = Path(path)
+        self.overwrite = overwrite
+        self._written: dict[str, bytes] = {}
+
+    @property
+    def is_written(self) -> bool:
+        """Whether a placement of this session is in it."""
+        return bool(self._written)
+
+    def check(self) -> None:
+        """Find what would keep a placement from being saved.
+
+        Raises:
+            InputError: The folder is a file or holds a placement (`ExitCode.OUTPUT`).
+        """
+        if self.path.exists() and not self.path.is_dir():
+            what = "not a folder (found a file)"
+            raise InputError(self.path, what, "choose another --out", ExitCode.OUTPUT)
+        for name in (CAMERA, CONFIG):
+            path = self.path / name
+            if self.overwrite or not os.path.lexists(path):
+                continue
+            try:
+                is_ours = path.read_bytes() == self._written.get(name)
+            except OSError:
+                is_ours = False
+            if not is_ours:
+                what = "exists already, and is not of this session"
+                advice = "pass --overwrite to replace it, or choose another --out"
+                raise InputError(path, what, advice, ExitCode.OUTPUT)
+
+    def write(self, files: Mapping[str, Mapping[str, Any]]) -> Path:
+        """Write both files, each whole or not at all; return the configuration's path.
+
+        Raises:
+            InputError: There is one already (`ExitCode.OUTPUT`), or it cannot be written
+                (`ExitCode.RESOURCES`).
+        """
+        self.check()
+        contents = {
+            name: (json.dumps(content, indent=2, allow_nan=False) + "\n").encode()
+            for name, content in files.items()
+        }
+        config = self.path / CONFIG
+        try:
+            # Both are on the disk before either gets its name, the one that names the other last.
+            with replacing(config) as staged, replacing(self.path / CAMERA) as staged_camera:
+                write_staged(staged, contents[CONFIG])
+                write_staged(staged_camera, contents[CAMERA])
+        except OSError as error:
+            raise disk_error(error.filename or self.path, error) from error
+        self._written = contents
+        return Path(os.path.abspath(config))

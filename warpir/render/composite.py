@@ -1,0 +1,375 @@
+"""From rendered radiance to the picture: layers at the photo's resolution, codes, ball preview."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from warpir.app.inputs import Inputs
+from warpir.core.color import linear_to_gamma
+from warpir.io.images.photos import Photo
+from warpir.io.results import Layers
+from warpir.render.device_scene import Placed, Proxy, Scene
+from warpir.render.renderer import Foreground, GBuffer, Renderer, light_args
+from warpir.scene.camera import Camera
+from warpir.scene.lamps import without_lamps
+from warpir.scene.light import Light, as_map, map_directions, texel_solid_angles
+from warpir.scene.shadow_mask import ShadowMask
+from warpir.scene.tone_curves import Curves, ToneKnots
+
+FloatArray = NDArray[np.float32]
+Float64Array = NDArray[np.float64]
+
+PLACE_WIDTH = 1024
+"""Most columns of the photo that sends light back into the scene [px]."""
+GREY_BALL = 0.18
+"""Reflectance of the matte ball in ``balls.png``."""
+SLIVER = 1e-4
+"""Share of a pixel [1] below which the object's surface is not described there."""
+
+
+@dataclass(frozen=True)
+class Quality:
+    """How finely a picture is sampled."""
+
+    samples: int
+    """Per pixel."""
+    rays: int
+    """Per sample and technique."""
+    depth: int
+    """Surface interactions."""
+    seed: int
+    indirect_limit: float = 0.0
+    """Most radiance that one path may add behind its first vertex; 0 for no limit, unbiased."""
+
+
+@dataclass(frozen=True)
+class Picture:
+    """A finished composite and its layers, at the photo's resolution."""
+
+    layers: Layers
+    image: FloatArray
+    """The composite, display-encoded, shape [H, W, 3]."""
+    changed: NDArray[np.bool_]
+    """Pixels that differ from the photo, shape [H, W]."""
+    object_pixel_count: int
+    """Pixels whose object was traced, at the rendering resolution."""
+    proxy_pixel_count: int
+    """Pixels whose shadow was traced, at the rendering resolution."""
+
+
+def make_picture(
+    renderer: Renderer,
+    light_fg: Light,
+    light_shadow: Light,
+    photo: Photo,
+    quality: Quality,
+    curve_fg: ToneKnots,
+    curve_shadow: ToneKnots,
+    is_reinhard: bool = True,
+    *,
+    occluder: FloatArray | None = None,
+    shadow_mask: ShadowMask | None = None,
+) -> Picture:
+    """Render object and shadow at the scene camera's resolution and put them into the photo.
+
+    Args:
+        renderer: The scene; its camera may be smaller than the photo, never of another aspect.
+        light_fg: Lights the object.
+        light_shadow: Casts its shadow; often the same object as ``light_fg``.
+        photo: The photograph.
+        quality: Samples, rays, depth, seed.
+        curve_fg: One tone curve.
+        curve_shadow: Three tone curves.
+        is_reinhard: Whether Reinhard's operator precedes the foreground curve.
+        occluder: Share of the photo that stays in front of the object [1], shape [H, W].
+        shadow_mask: Where the photo's ground is in shadow already.
+    """
+    camera = renderer.scene.camera
+    dimmed = light_fg if shadow_mask is None else without_lamps(light_fg, shadow_mask.at_object)
+    args_fg = light_args(dimmed, renderer.device)
+    gbuffer = renderer.gbuffer(quality.seed)
+    foreground = renderer.foreground(
+        args_fg,
+        gbuffer.object_pixels,
+        quality.samples,
+        quality.rays,
+        quality.depth,
+        quality.seed,
+        quality.indirect_limit,
+    )
+    is_object = np.zeros(camera.width * camera.height, np.int32)
+    is_object[gbuffer.object_pixels] = 1
+
+    def shaded(light: Light, wanted: NDArray[np.bool_]) -> tuple[NDArray[np.int32], FloatArray]:
+        """Return which of the wanted pixels the object shades, and their ratio."""
+        args = args_fg if light is dimmed else light_args(light, renderer.device)
+        pixels = renderer.shaded_pixels(args, quality.seed)
+        pixels = pixels[wanted[pixels]]
+        radiance = renderer.proxy(
+            args, pixels, is_object[pixels], quality.samples, quality.rays, quality.seed
+        )
+        return pixels, renderer.ratio(radiance)
+
+    shares = np.zeros(len(is_object), np.float32)
+    if shadow_mask is not None:
+        resized = resize(shadow_mask.shares, camera.height, camera.width)
+        shares = np.clip(resized, 0.0, 1.0).reshape(-1)
+    proxy_pixels, ratio = shaded(light_shadow, shares < 1.0)
+    if shadow_mask is not None:
+        rest = shaded(without_lamps(light_shadow), shares > 0.0)
+        proxy_pixels, ratio = _mixed((proxy_pixels, ratio), rest, shares)
+    fg_display, ratio_display = renderer.tone(
+        foreground, ratio, curve_fg, curve_shadow, is_reinhard
+    )
+
+    # Planes of the rendering's size, then of the photo's
+    size = (camera.height, camera.width)
+    objects, mask = gbuffer.object_pixels, foreground.mask
+    premultiplied = fg_display * mask[:, None]
+    parts = _parts(foreground, premultiplied)
+    planes = {
+        "foreground": _plane(size, objects, premultiplied),
+        "matte": _plane(size, objects, mask),
+        "shadow_ratio": _plane(size, proxy_pixels, ratio_display, outside=1.0),
+        **{name: _plane(size, objects, values) for name, values in parts.items()},
+        **_geometry(size, gbuffer, camera),
+    }
+    height, width = photo.srgb.shape[:2]
+    if size != (height, width):
+        planes = _resize_planes(planes, height, width)
+    if occluder is not None:
+        planes = _behind(planes, occluder)
+    plate = photo.linear()
+    if not photo.is_deep:
+        # The composite is made of what the file of layers holds, so that they recompose it exactly;
+        # against codes of 8 bits the rounding to half is nothing, .06 of a code at most.
+        plate = _halves(plate)
+        for name in ("foreground", "matte", "shadow_ratio"):
+            planes[name] = _halves(planes[name])
+    matte = planes["matte"]
+    composite = planes["foreground"] + (1.0 - matte)[..., None] * plate * planes["shadow_ratio"]
+    layers = Layers(
+        composite=composite,
+        foreground=np.concatenate([planes["foreground"], matte[..., None]], axis=-1),
+        plate=plate,
+        **{k: v for k, v in planes.items() if k != "foreground"},
+    )
+    changed = (matte > 0.0) | (planes["shadow_ratio"] != 1.0).any(axis=-1)
+    return Picture(
+        layers,
+        linear_to_gamma(composite).astype(np.float32),
+        changed,
+        len(objects),
+        len(proxy_pixels),
+    )
+
+
+def _behind(planes: dict[str, FloatArray], occluder: FloatArray) -> dict[str, FloatArray]:
+    """Put the object and its shadow behind what the occluder marks in the photo.
+
+    With m the occluder, a the matte and s the ratio, the composite ``m plate + (1 - m) (fg +
+    (1 - a) plate s)`` is again ``fg' + (1 - a') plate s'`` with ``fg' = (1 - m) fg``,
+    ``a' = (1 - m) a`` and ``s' = (m + (1 - m) (1 - a) s) / (1 - a')``.
+    """
+    m, free = occluder, 1.0 - occluder
+    matte = planes["matte"]
+    left = 1.0 - free * matte  # share of the pixel that the photo fills
+    lit = m[..., None] + (free * (1.0 - matte))[..., None] * planes["shadow_ratio"]
+    ratio = lit / np.maximum(left, 1e-9)[..., None]
+    # Exact where nothing is in front; there the object may also fill the pixel, and left is 0.
+    ratio = np.where((m == 0.0)[..., None], planes["shadow_ratio"], ratio)
+    behind = {**planes, "matte": free * matte, "shadow_ratio": ratio}
+    for name in ("foreground", "diffuse", "emission", "specular"):
+        behind[name] = free[..., None] * planes[name]
+    hidden = m == 1.0
+    for name in ("depth", "position", "normal", "albedo", "roughness"):
+        behind[name] = planes[name].copy()
+        behind[name][hidden] = np.inf if name == "depth" else 0.0
+    return behind
+
+
+def _mixed(
+    lit: tuple[NDArray[np.int32], FloatArray],
+    rest: tuple[NDArray[np.int32], FloatArray],
+    shares: FloatArray,
+) -> tuple[NDArray[np.int32], FloatArray]:
+    """Blend the ratio under the whole light and that without lamps by the mask.
+
+    Args:
+        lit: Pixels and ratio of the whole light; all others are 1.
+        rest: The same without lamps.
+        shares: Weight of the second in each pixel [1].
+
+    Returns:
+        Pixels of either, and their ratio.
+    """
+    pixels = np.union1d(lit[0], rest[0]).astype(np.int32)
+    whole, without = (np.ones((len(shares), 3), np.float32) for _ in range(2))
+    whole[lit[0]], without[rest[0]] = lit[1], rest[1]
+    whole, without, share = whole[pixels], without[pixels], shares[pixels, None]
+    # Exact where both agree, and at both ends.
+    return pixels, np.where(share < 1.0, whole + share * (without - whole), without)
+
+
+def scene_of(inputs: Inputs, camera: Camera, device: str, curves: Curves) -> Scene:
+    """Put the object onto its plane or into the mesh of its place.
+
+    Args:
+        inputs: Photo, asset, place and placement.
+        camera: At the resolution that is to be rendered.
+        device: Warp device.
+        curves: Of the picture; what the photo shows of the place is taken to have passed them.
+    """
+    ground = inputs.placement.ground
+    placed = Placed(inputs.asset, inputs.placement.asset_to_world)
+    radiance = None if inputs.proxy is None else photo_radiance(inputs.photo, curves)
+    proxy = Proxy(ground[:3], -float(ground[3]), inputs.proxy, radiance, inputs.is_plane)
+    return Scene([placed], camera, proxy, device)
+
+
+def photo_radiance(photo: Photo, curves: Curves) -> FloatArray:
+    """Return the radiance that the picture's curves and operator would show as the photo.
+
+    Args:
+        photo: The photograph.
+        curves: Of the picture.
+
+    Returns:
+        Relative [W/(m^2 sr)], shape [height, width, 3], at most `PLACE_WIDTH` wide.
+    """
+    linear = photo.linear()
+    height, width = linear.shape[:2]
+    if width > PLACE_WIDTH:
+        linear = resize(linear, max(1, round(height * PLACE_WIDTH / width)), PLACE_WIDTH)
+    return curves.radiance(linear).astype(np.float32)
+
+
+def _halves(plane: FloatArray) -> FloatArray:
+    """Round to what half-precision numbers can hold; all values are display-linear, near [0, 1]."""
+    return plane.astype(np.float16).astype(np.float32)
+
+
+def _parts(foreground: Foreground, premultiplied: FloatArray) -> dict[str, FloatArray]:
+    """Split the tone-mapped object so that diffuse + specular + emission = foreground.
+
+    A curve is not additive: each part keeps its share of the radiance.
+    """
+    whole = np.maximum(foreground.radiance, 1e-30)
+    diffuse = premultiplied * (foreground.diffuse / whole)
+    emission = premultiplied * (foreground.emission / whole)
+    return {
+        "diffuse": diffuse,
+        "emission": emission,
+        "specular": np.maximum(premultiplied - diffuse - emission, 0.0),
+    }
+
+
+def _geometry(size: tuple[int, int], gbuffer: GBuffer, camera: Camera) -> dict[str, FloatArray]:
+    seen = gbuffer.coverage > 0.0
+    pixels = gbuffer.object_pixels[seen]
+    position = gbuffer.position[seen]
+    depth = (camera.c2w[:3, 3] - position) @ camera.c2w[:3, 2]
+    return {
+        "depth": _plane(size, pixels, depth.astype(np.float32), outside=np.inf),
+        "position": _plane(size, pixels, position.astype(np.float32)),
+        "normal": _plane(size, pixels, gbuffer.normal[seen]),
+        "albedo": _plane(size, pixels, gbuffer.base_color[seen]),
+        "roughness": _plane(size, pixels, gbuffer.roughness[seen]),
+    }
+
+
+def _plane(
+    size: tuple[int, int], pixels: NDArray[np.int32], values: FloatArray, outside: float = 0.0
+) -> FloatArray:
+    """Spread rows of values over an image."""
+    plane = np.full((size[0] * size[1], *values.shape[1:]), outside, np.float32)
+    plane[pixels] = values
+    return plane.reshape(*size, *values.shape[1:])
+
+
+def _resize_planes(planes: dict[str, FloatArray], height: int, width: int) -> dict[str, FloatArray]:
+    """Bring all planes to the photo's size.
+
+    What describes the object's surface is averaged over the object alone: mixed with the empty
+    background, its depth would fall to 0 along the outline.
+    """
+    seen = np.isfinite(planes["depth"])
+    share = resize(seen.astype(np.float32), height, width)
+    resized = {name: resize(plane, height, width) for name, plane in planes.items()}
+    shown = (share > SLIVER) & (resized["matte"] > 0.0)
+    weight = np.where(shown, share, 1.0)
+    for name in ("depth", "position", "normal", "albedo", "roughness"):
+        plane = resized[name]
+        plane /= weight if plane.ndim == 2 else weight[..., None]
+        plane[~shown] = np.inf if name == "depth" else 0.0
+    length = np.linalg.norm(resized["normal"], axis=-1, keepdims=True)
+    resized["normal"] /= np.where(length > 0.0, length, 1.0)
+    return resized
+
+
+def resize(plane: FloatArray, height: int, width: int) -> FloatArray:
+    """Bring a plane to the photo's size: bilinear up, area-filtered down."""
+    from skimage.transform import resize as resize_image
+
+    finite = np.where(np.isfinite(plane), plane, 0.0)
+    down = plane.shape[0] > height
+    resized = resize_image(  # type: ignore[no-untyped-call]
+        finite, (height, width, *plane.shape[2:]), order=1, anti_aliasing=down, preserve_range=True
+    )
+    return np.asarray(resized, dtype=np.float32)
+
+
+def balls(light: Light, camera: Camera, is_reinhard: bool, size: int = 192) -> NDArray[np.uint8]:
+    """Return a mirror ball and a grey diffuse ball under the light, as the camera sees them.
+
+    As on a film set: `GREY_BALL` keeps the lit side of a sunny light below the photo's white.
+
+    Args:
+        light: At the photo's exposure.
+        camera: Gives the viewing direction.
+        is_reinhard: The tone operator of the picture.
+        size: Height of the preview [px]; it is twice as wide.
+
+    Returns:
+        Display codes, shape [size, 2 size, 3].
+    """
+    axis = (np.arange(size) + 0.5) / size * 2.0 - 1.0
+    x, y = np.meshgrid(axis * 1.06, -axis * 1.06)
+    inside = x * x + y * y < 1.0
+    z = np.sqrt(np.maximum(1.0 - x * x - y * y, 0.0))
+    normal = np.stack([x, y, z], axis=-1) @ camera.c2w[:3, :3].T
+    view = camera.c2w[:3, 2]
+    reflected = 2.0 * (normal @ view)[..., None] * normal - view
+    sharp = as_map(light, 256)
+    lon = np.arctan2(reflected[..., 0], reflected[..., 2])
+    lat = np.arcsin(np.clip(reflected[..., 1], -1.0, 1.0))
+    column = ((0.5 - 0.5 * lon / np.pi) * sharp.shape[1]).astype(int) % sharp.shape[1]
+    row = np.minimum((0.5 - lat / np.pi) * sharp.shape[0], sharp.shape[0] - 1).astype(int)
+    mirror = sharp[row, column].astype(np.float64)
+    coarse = as_map(light, 32).astype(np.float64)
+    weighted = (coarse * texel_solid_angles(32, 64)[:, None, None]).reshape(-1, 3)
+    toward = map_directions(32, 64).reshape(-1, 3).T
+    # One row at a time: the cosines of all pixels with all texels would take gigabytes.
+    diffuse = np.stack([np.maximum(row @ toward, 0.0) @ weighted / np.pi for row in normal])
+    diffuse *= GREY_BALL
+    pair = []
+    for ball in (mirror, diffuse):
+        shown = ball / (1.0 + ball) if is_reinhard else np.minimum(ball, 1.0)
+        shown = np.where(inside[..., None], shown, 0.03)
+        pair.append(linear_to_gamma(shown))
+    return np.round(np.concatenate(pair, axis=1) * 255.0).astype(np.uint8)
+
+
+def as_file_map(light: Light) -> FloatArray:
+    """Return the light as a map for files: a given map's own size, lobes on 512 rows or more."""
+    height = 256
+    if light.texels is not None:
+        height = max(light.texels.shape[0], 16)
+    if light.lobes is not None:
+        height = max(height, 512)
+    if light.texels is not None and light.lobes is None:
+        return light.texels
+    return as_map(light, height)

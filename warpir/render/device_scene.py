@@ -1,0 +1,399 @@
+"""The scene on one device: triangles, materials, textures, place and camera as Warp sees them.
+
+Everything is checked here once. Coordinates are recentred on the object, in float64, before they
+become float32, so an object 100 km from the origin keeps its precision.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import warp as wp
+from numpy.typing import NDArray
+
+from warpir.core.color import srgb_to_linear
+from warpir.kernels.proxy_mesh import trace_seen
+from warpir.kernels.types import (
+    CameraArgs,
+    Extensions,
+    MaterialArgs,
+    MeshArgs,
+    ProxyArgs,
+    TextureArgs,
+)
+from warpir.render.sheen import sheen_albedo_table
+from warpir.scene.asset import Asset, Material, Primitive, Texture, TextureSlot
+from warpir.scene.camera import Camera
+from warpir.scene.receiver import ProxyMesh
+
+FloatArray = NDArray[np.float32]
+Float64Array = NDArray[np.float64]
+
+ALPHA_MODES = {"OPAQUE": 0, "MASK": 1, "BLEND": 2}
+SLOTS = (
+    "base_color", "metallic_roughness", "normal", "emission",
+    "specular", "specular_color", "clearcoat", "clearcoat_roughness", "clearcoat_normal",
+    "sheen_color", "sheen_roughness", "transmission",
+)  # fmt: skip
+"""In the order of `warpir.kernels.trace`."""
+WRAP_MODES = {"repeat": 0, "clamp": 1, "mirror": 2}
+
+
+PROXY_EPSILON = 2e-6
+"""Ray offset over the diagonal of the place's mesh [1]; rays from it meet it again below 1e-7."""
+
+
+@dataclass(frozen=True)
+class Proxy:
+    """What is known of the photo's place: the plane ``dot(normal, x) = offset``, and a mesh."""
+
+    normal: Float64Array
+    """Unit, world frame, toward the lit side, shape [3]."""
+    offset: float
+    """[m]."""
+    mesh: ProxyMesh | None = None
+    """Receives shadows and blocks light."""
+    radiance: FloatArray | None = None
+    """What the photo shows, before its tone operator, in the view of the scene's camera at any
+    resolution, shape [height, width, 3]; without it the mesh is black."""
+    is_plane: bool = True
+    """Whether there is a plane; without one the mesh is all."""
+
+
+@dataclass(frozen=True)
+class Placed:
+    """An asset and where it stands."""
+
+    asset: Asset
+    asset_to_world: Float64Array
+    """Affine, column vectors, shape [4, 4]."""
+
+
+@dataclass
+class _Vertices:
+    """Attribute arrays of one primitive, world frame, one row a vertex."""
+
+    positions: Float64Array
+    indices: NDArray[np.int32]
+    normals: Float64Array
+    tangents: Float64Array
+    uv0: NDArray[np.float32]
+    uv1: NDArray[np.float32]
+    colors: NDArray[np.float32]
+
+
+def _unit(v: Float64Array) -> Float64Array:
+    """Normalise rows; a zero row stays zero."""
+    length = np.linalg.norm(v, axis=1, keepdims=True)
+    unit: Float64Array = v / np.where(length > 0.0, length, 1.0)
+    return unit
+
+
+def _to_world(primitive: Primitive, matrix: Float64Array) -> _Vertices:
+    """Transform one primitive and fill in what it leaves out."""
+    linear = matrix[:3, :3]
+    positions = primitive.positions @ linear.T + matrix[:3, 3]
+    indices = primitive.indices
+    # A mirror turns the winding around; normals and tangents follow the surface.
+    if np.linalg.det(linear) < 0.0:
+        indices = indices[:, ::-1]
+    count = len(positions)
+    uv0 = primitive.uv0 if primitive.uv0 is not None else np.zeros((count, 2), np.float32)
+    uv1 = primitive.uv1 if primitive.uv1 is not None else uv0
+    colors = primitive.colors if primitive.colors is not None else np.ones((count, 4), np.float32)
+    tangents = np.zeros((count, 4))
+    if primitive.tangents is not None:
+        tangents[:, :3] = _unit(primitive.tangents[:, :3].astype(np.float64) @ linear.T)
+        # A zero handedness means "derive the tangent from the UVs".
+        tangents[:, 3] = np.where(primitive.tangents[:, 3] < 0.0, -1.0, 1.0)
+        if np.linalg.det(linear) < 0.0:
+            tangents[:, 3] *= -1.0
+    if primitive.normals is not None:
+        normals = _unit(primitive.normals.astype(np.float64) @ np.linalg.inv(linear))
+        return _Vertices(positions, indices, normals, tangents, uv0, uv1, colors)
+    # Flat shading (glTF 2.0, 3.7.2.1): each triangle gets vertices of its own.
+    corners = indices.reshape(-1)
+    positions = positions[corners]
+    a, b, c = positions[0::3], positions[1::3], positions[2::3]
+    normals = np.repeat(_unit(np.cross(b - a, c - a)), 3, axis=0)
+    own = np.arange(len(corners), dtype=np.int32).reshape(-1, 3)
+    return _Vertices(
+        positions, own, normals, tangents[corners], uv0[corners], uv1[corners], colors[corners]
+    )
+
+
+def _slot(slot: TextureSlot | None, first_texture: int) -> tuple[int, int, list[float]]:
+    """Return texture index, UV set and the six numbers of the transform."""
+    if slot is None:
+        return -1, 0, [1.0, 0.0, 0.0, 0.0, 1.0, 0.0]
+    return first_texture + slot.texture, slot.uv_set, list(slot.transform)
+
+
+def _extensions(material: Material) -> Extensions:
+    """Return what a material has beyond metallic-roughness."""
+    plain = Material()
+    names = ("ior", "specular", "specular_color", "clearcoat", "sheen_color", "transmission")
+    out = Extensions()
+    out.present = int(any(getattr(material, name) != getattr(plain, name) for name in names))
+    if material.specular_texture or material.specular_color_texture:
+        out.present = 1
+    # KHR_materials_ior; an index of 0 stands for infinity and gives 1 as well.
+    f0 = ((1.0 - material.ior) / (1.0 + material.ior)) ** 2
+    out.f0 = wp.vec3(*(f0 * channel for channel in material.specular_color))
+    out.sheen_color = wp.vec3(*material.sheen_color)
+    for name in (
+        "specular", "clearcoat", "clearcoat_roughness", "clearcoat_normal_scale",
+        "sheen_roughness", "transmission",
+    ):  # fmt: skip
+        setattr(out, name, getattr(material, name))
+    return out
+
+
+def _copied(args: Any) -> Any:
+    """Return another struct that holds the same arrays and numbers."""
+    copy = type(args)()
+    for name in args._cls.vars:
+        setattr(copy, name, getattr(args, name))
+    return copy
+
+
+class Scene:
+    """Geometry, materials, plane and camera on one device; owns every Warp handle for the run.
+
+    Args:
+        objects: What is rendered; may be empty (no triangles, no shadow).
+        camera: The view.
+        proxy: The ground plane, the place's mesh, or both.
+        device: ``cpu`` or ``cuda``.
+
+    Attributes:
+        origin: World point that is the recentred origin [m], shape [3].
+        diagonal: Diagonal of the objects' bounding box [m].
+        dark_proxy_args: The place, whose mesh sends nothing.
+        has_glass: Whether some material lets light through that it does not reflect.
+    """
+
+    def __init__(
+        self, objects: Sequence[Placed], camera: Camera, proxy: Proxy, device: str
+    ) -> None:
+        self.device = wp.get_device(device)
+        self.camera = camera
+        self.proxy = proxy
+        parts: list[tuple[_Vertices, int]] = []
+        materials: list[tuple[Material, int]] = []
+        textures: list[Texture] = []
+        for placed in objects:
+            for primitive in placed.asset.primitives:
+                vertices = _to_world(primitive, placed.asset_to_world)
+                parts.append((vertices, len(materials) + primitive.material))
+            first_texture = len(textures)
+            materials += [(m, first_texture) for m in placed.asset.materials]
+            textures += placed.asset.textures
+        if parts:
+            low = np.min([v.positions.min(axis=0) for v, _ in parts], axis=0)
+            high = np.max([v.positions.max(axis=0) for v, _ in parts], axis=0)
+        else:
+            low = high = camera.c2w[:3, 3]
+        self.bounds = (low, high)
+        self.origin: Float64Array = 0.5 * (low + high)
+        self.diagonal = float(np.linalg.norm(high - low))
+        self.triangle_count = sum(len(v.indices) for v, _ in parts)
+        self.material_names = [m.name for m, _ in materials]
+
+        self._upload_mesh(parts)
+        self._upload_materials(materials)
+        self._upload_textures(textures)
+        self.camera_args = self.camera_args_at(camera)
+        self.proxy_args = self._proxy_args()
+        self.dark_proxy_args = _copied(self.proxy_args)
+        self.dark_proxy_args.shines = 0
+
+    def _proxy_args(self) -> ProxyArgs:
+        proxy, camera = self.proxy, self.camera
+        args = ProxyArgs()
+        # No ray comes down on a plane without a normal.
+        normal = proxy.normal if proxy.is_plane else np.zeros(3)
+        args.normal = wp.vec3(*normal.astype(np.float32))
+        args.offset = float(proxy.offset - proxy.normal @ self.origin)
+        # A sheet that lies on the plane is hit before or behind it by a few units in the last place
+        # of the camera's coordinates.
+        eye = np.abs(camera.c2w[:3, 3] - self.origin).max()
+        args.tolerance = float(1e-5 * self.diagonal + 5e-7 * eye)
+        # Plain numbers, as `contents` wants them.
+        args.mesh, args.epsilon, args.shines = 0, 0.0, 0
+        args.positions = self._array(np.zeros((1, 3), np.float32), wp.vec3)
+        args.indices = self._array(np.zeros(3, np.int32), wp.int32)
+        args.radiance = self._array(np.zeros((1, 1, 3), np.float32), wp.vec3)
+        mesh = proxy.mesh
+        if mesh is None:
+            return args
+        positions = mesh.positions - self.origin
+        args.positions = self._array(positions.astype(np.float32), wp.vec3)
+        args.indices = self._array(mesh.indices.reshape(-1), wp.int32)
+        self.proxy_mesh = wp.Mesh(
+            points=args.positions, indices=args.indices, bvh_constructor="sah"
+        )
+        args.mesh = self.proxy_mesh.id
+        args.epsilon = PROXY_EPSILON * float(np.linalg.norm(np.ptp(positions, axis=0)))
+        args.eye = wp.vec3(*(camera.c2w[:3, 3] - self.origin).astype(np.float32))
+        if proxy.radiance is not None:
+            self._upload_radiance(args, proxy.radiance)
+        return args
+
+    def _upload_radiance(self, args: ProxyArgs, radiance: FloatArray) -> None:
+        """Let the place's mesh send what the photo shows, and elsewhere the mean of that."""
+        height, width = radiance.shape[:2]
+        view = self.camera.scaled(width, height)
+        # Columns right, down and ahead; the camera looks along its own -Z.
+        intrinsics = np.array(
+            [[view.fx, 0.0, -view.cx], [0.0, -view.fy, -view.cy], [0.0, 0.0, -1.0]]
+        )
+        to_image = intrinsics @ view.c2w[:3, :3].T
+        args.to_image = wp.mat33(*to_image.astype(np.float32).reshape(-1))
+        args.radiance = self._array(np.ascontiguousarray(radiance, np.float32), wp.vec3)
+        args.shines = 1
+        seen = wp.zeros((height, width), dtype=float, device=self.device)
+        to_world = wp.mat33(*np.linalg.inv(to_image).astype(np.float32).reshape(-1))
+        wp.launch(
+            trace_seen, dim=(height, width), inputs=[args, to_world, seen], device=self.device
+        )
+        weight = seen.numpy().astype(np.float64)
+        if weight.any():
+            mean = (radiance * weight[..., None]).sum(axis=(0, 1)) / weight.sum()
+            args.elsewhere = wp.vec3(*mean.astype(np.float32))
+
+    def camera_args_at(self, camera: Camera) -> CameraArgs:
+        """Return ``camera`` in the recentred frame."""
+        args = CameraArgs()
+        args.origin = wp.vec3(*(camera.c2w[:3, 3] - self.origin).astype(np.float32))
+        args.rotation = wp.mat33(*camera.c2w[:3, :3].astype(np.float32).reshape(-1))
+        args.fx, args.fy, args.cx, args.cy = camera.fx, camera.fy, camera.cx, camera.cy
+        args.width = camera.width
+        return args
+
+    def contents(self) -> Iterator[NDArray[np.generic]]:
+        """Yield every number that a ray can depend on, in a fixed order, for hashing."""
+        structs: tuple[Any, ...] = (
+            self.mesh_args,
+            self.material_args,
+            self.texture_args,
+            self.camera_args,
+            self.proxy_args,
+        )
+        for args in structs:
+            for name in args._cls.vars:
+                value = getattr(args, name)
+                if name not in ("id", "mesh"):  # pointers
+                    yield value.numpy() if isinstance(value, wp.array) else np.asarray(value)
+
+    def _array(self, values: NDArray[np.generic], dtype: type) -> wp.array:
+        return wp.array(values, dtype=dtype, device=self.device)
+
+    def _upload_mesh(self, parts: list[tuple[_Vertices, int]]) -> None:
+        args = MeshArgs()
+        args.epsilon = 1e-5 * self.diagonal
+        low, high = (b - self.origin for b in self.bounds)
+        args.low = wp.vec3(*(low - args.epsilon).astype(np.float32))
+        args.high = wp.vec3(*(high + args.epsilon).astype(np.float32))
+        # Kernels look at the handle before they read anything, but arrays may not be empty.
+        if not parts:
+            args.id = 0
+            args.indices = self._array(np.zeros(3, np.int32), wp.int32)
+            args.positions = self._array(np.zeros((1, 3), np.float32), wp.vec3)
+            args.normals = self._array(np.zeros((1, 3), np.float32), wp.vec3)
+            args.tangents = self._array(np.zeros((1, 4), np.float32), wp.vec4)
+            args.uv0 = self._array(np.zeros((1, 2), np.float32), wp.vec2)
+            args.uv1 = args.uv0
+            args.colors = self._array(np.zeros((1, 4), np.float32), wp.vec4)
+            args.face_material = self._array(np.zeros(1, np.int32), wp.int32)
+            self.mesh_args = args
+            return
+        offsets = np.cumsum([0] + [len(v.positions) for v, _ in parts])
+        indices = np.concatenate(
+            [v.indices + o for (v, _), o in zip(parts, offsets[:-1], strict=True)]
+        ).astype(np.int32)
+        if indices.min() < 0 or indices.max() >= offsets[-1]:
+            raise ValueError(f"vertex index outside 0..{offsets[-1] - 1}")
+        positions = np.concatenate([v.positions for v, _ in parts]) - self.origin
+        args.positions = self._array(positions.astype(np.float32), wp.vec3)
+        args.indices = self._array(indices.reshape(-1), wp.int32)
+        args.normals = self._array(
+            np.concatenate([v.normals for v, _ in parts]).astype(np.float32), wp.vec3
+        )
+        args.tangents = self._array(
+            np.concatenate([v.tangents for v, _ in parts]).astype(np.float32), wp.vec4
+        )
+        args.uv0 = self._array(np.concatenate([v.uv0 for v, _ in parts]), wp.vec2)
+        args.uv1 = self._array(np.concatenate([v.uv1 for v, _ in parts]), wp.vec2)
+        args.colors = self._array(np.concatenate([v.colors for v, _ in parts]), wp.vec4)
+        args.face_material = self._array(
+            np.concatenate([np.full(len(v.indices), m, np.int32) for v, m in parts]), wp.int32
+        )
+        # The handle is a pointer and the points are referenced: both must outlive every launch.
+        # Warp's default on CUDA builds faster and traces 12 % slower; this tree is built once.
+        self.mesh = wp.Mesh(points=args.positions, indices=args.indices, bvh_constructor="sah")
+        args.id = self.mesh.id
+        self.mesh_args = args
+
+    def _upload_materials(self, materials: Sequence[tuple[Material, int]]) -> None:
+        rows = materials or [(Material(), 0)]
+        plain = [m for m, _ in rows]
+        slots = [
+            [_slot(getattr(m, f"{name}_texture"), first) for name in SLOTS]
+            for m, (_, first) in zip(plain, rows, strict=True)
+        ]
+        args = MaterialArgs()
+        for name in ("metallic", "roughness", "alpha", "alpha_cutoff", "normal_scale"):
+            values = np.array([getattr(m, name) for m in plain], np.float32)
+            setattr(args, name, self._array(values, wp.float32))
+        args.base_color = self._array(np.array([m.base_color for m in plain], np.float32), wp.vec3)
+        args.emission = self._array(np.array([m.emission for m in plain], np.float32), wp.vec3)
+        extensions = [_extensions(m) for m in plain]
+        args.extensions = wp.array(extensions, dtype=Extensions, device=self.device)
+        args.any_layers = int(any(e.present for e in extensions))
+        has_sheen = any(max(m.sheen_color) > 0.0 for m in plain)
+        table = sheen_albedo_table() if has_sheen else np.zeros((2, 2))
+        args.sheen_albedo = self._array(table.astype(np.float32), wp.float32)
+        args.alpha_mode = self._array(
+            np.array([ALPHA_MODES[m.alpha_mode] for m in plain], np.int32), wp.int32
+        )
+        args.double_sided = self._array(
+            np.array([m.double_sided for m in plain], np.int32), wp.int32
+        )
+        args.slot_texture = self._array(
+            np.array([[s[0] for s in row] for row in slots], np.int32), wp.int32
+        )
+        args.slot_uv_set = self._array(
+            np.array([[s[1] for s in row] for row in slots], np.int32), wp.int32
+        )
+        affine = np.array([[s[2] for s in row] for row in slots], np.float32)
+        args.slot_u = self._array(np.ascontiguousarray(affine[:, :, :3]), wp.vec3)
+        args.slot_v = self._array(np.ascontiguousarray(affine[:, :, 3:]), wp.vec3)
+        args.any_alpha = int(any(m.alpha_mode != "OPAQUE" or m.transmission > 0.0 for m in plain))
+        args.any_culled = int(any(not m.double_sided for m in plain))
+        args.any_emission = int(any(max(m.emission) > 0.0 for m in plain))
+        self.has_glass = any(m.transmission > 0.0 for m in plain)
+        self.material_args = args
+
+    def _upload_textures(self, textures: Sequence[Texture]) -> None:
+        rows = textures or [Texture(np.full((1, 1, 4), 255, np.uint8))]
+        packed = [np.ascontiguousarray(t.pixels).view("<u4").reshape(-1) for t in rows]
+        args = TextureArgs()
+        args.texels = self._array(np.concatenate(packed), wp.uint32)
+        args.offset = self._array(
+            np.cumsum([0] + [len(p) for p in packed[:-1]]).astype(np.int32), wp.int32
+        )
+        args.width = self._array(np.array([t.pixels.shape[1] for t in rows], np.int32), wp.int32)
+        args.height = self._array(np.array([t.pixels.shape[0] for t in rows], np.int32), wp.int32)
+        args.wrap_u = self._array(
+            np.array([WRAP_MODES[t.wrap_u] for t in rows], np.int32), wp.int32
+        )
+        args.wrap_v = self._array(
+            np.array([WRAP_MODES[t.wrap_v] for t in rows], np.int32), wp.int32
+        )
+        decode = srgb_to_linear(np.arange(256) / 255.0).astype(np.float32)
+        args.decode = self._array(decode, wp.float32)
+        self.texture_args = args

@@ -1,0 +1,66 @@
+"""What every integrator takes and gives: a light and materials in, three radiance arrays out."""
+
+from dataclasses import dataclass
+from typing import Protocol
+
+from torch import Tensor
+
+
+@dataclass(frozen=True)
+class LightTensors:
+    """A light as the optimiser holds it: lobes plus one map, either may be absent.
+
+    Frames, units and shapes are those of `warpir.scene.light.Light`.
+    """
+
+    amplitude: Tensor | None = None
+    """Lobe peaks, relative [W/(m^2 sr)], shape [lobe, 3]."""
+    axis: Tensor | None = None
+    """Unit lobe axes, world frame, shape [lobe, 3]."""
+    sharpness: Tensor | None = None
+    """Lobe concentration [1], shape [lobe]."""
+    texels: Tensor | None = None
+    """Lat-long radiance, shape [He, We, 3]."""
+
+
+@dataclass(frozen=True)
+class MaterialTensors:
+    """Material factors as the optimiser holds them; what is absent keeps the asset's value."""
+
+    base_color: Tensor | None = None
+    """Linear RGB factor [1], shape [material, 3]."""
+    metallic: Tensor | None = None
+    """Factor [1], shape [material]."""
+    roughness: Tensor | None = None
+    """Perceptual factor [1], shape [material]."""
+    emission: Tensor | None = None
+    """Radiance factor, relative [W/(m^2 sr)], shape [material, 3]."""
+
+
+@dataclass(frozen=True)
+class Radiance:
+    """What an integrator returns; differentiable in what it declares."""
+
+    foreground: Tensor
+    """Object radiance, premultiplied by coverage, shape [object_pixel, 3]."""
+    lit: Tensor
+    """White plane with the object, shape [proxy_pixel, 3]."""
+    unoccluded: Tensor
+    """White plane without it, shape [proxy_pixel, 3]."""
+
+
+class Integrator(Protocol):
+    """Light transport for one scene and view."""
+
+    differentiates: frozenset[str]
+    """What gradients reach: some of ``light``, ``material``, ``emission``."""
+
+    def radiance(
+        self,
+        light_fg: LightTensors,
+        light_shadow: LightTensors,
+        seed: int,
+        materials: MaterialTensors | None = None,
+    ) -> Radiance:
+        """Render the object under ``light_fg`` and the plane under ``light_shadow``."""
+        ...

@@ -1,0 +1,423 @@
+"""Samples of `mis` that are drawn once, for a picture and for its gradient. Pure Warp, no torch.
+
+While the kernels trace, they write down what the gradient needs. Radiance is linear in the light,
+so the light's gradient is a sum over the recorded directions; the materials' goes through the
+attached kernel over the recorded vertices. Both run on the renderer's threads; private sums are
+added up in a fixed order, so threads do not change a bit.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import TYPE_CHECKING
+
+import numpy as np
+import warp as wp
+from numpy.typing import NDArray
+
+from warpir.kernels import light_gradient as light_kernels
+from warpir.kernels import shade as shade_kernels
+from warpir.kernels.types import (
+    Layers,
+    LightArgs,
+    LightRecord,
+    MaterialArgs,
+    VertexRecord,
+)
+from warpir.render.renderer import SAMPLES_PER_SLICE, ProxyRadiance, Renderer, Rows
+
+if TYPE_CHECKING:
+    from warpir.render.mis import MisIntegrator
+
+FloatArray = NDArray[np.float32]
+Gradients = list[NDArray[np.float64] | None]
+"""Of amplitude, axis, sharpness, texels (and base colour, metallic, roughness, emission), in this
+order; None for what is not asked for."""
+
+RECORD_BYTES = 1 << 30
+"""Memory that the records of one picture may take; beyond it samples are drawn again, in parts.
+What is not filled is not touched: four fifths of it on a convex object at five interactions."""
+ENTRY_BYTES = 24
+VERTEX_BYTES = 112
+LAYERS_BYTES = 72
+LOBE_BLOCK = 4096
+"""Directions that one thread of `lobe_gradient` adds up; on the CPU they stay in its cache."""
+PART_PATHS = 4096
+"""Least paths of a part: a path costs about 1 us, the launches of a part about 1 ms."""
+RECORDING, LOWER = "the samples of mis", "--mis-samples or --guidance-width"
+"""What is short of memory, and what lowers it."""
+PART_COUNT = 16
+"""Private sums of texels and materials; fixed, so that their order does not depend on threads."""
+
+
+class SceneMaterials:
+    """Material factors on the device; within the context the scene renders with them.
+
+    Args:
+        renderer: Whose scene.
+        factors: Base colour, metallic, roughness and emission; the scene's own where None.
+    """
+
+    NAMES = (
+        ("base_color", wp.vec3),
+        ("metallic", wp.float32),
+        ("roughness", wp.float32),
+        ("emission", wp.vec3),
+    )
+
+    def __init__(self, renderer: Renderer, factors: Sequence[FloatArray | None]) -> None:
+        self.args: MaterialArgs = renderer.scene.material_args
+        self.own = [getattr(self.args, name) for name, _ in self.NAMES]
+        self.arrays = [
+            own if factor is None else wp.array(factor, dtype=dtype, device=renderer.device)
+            for own, factor, (_, dtype) in zip(self.own, factors, self.NAMES, strict=True)
+        ]
+        self.own_any_emission = self.args.any_emission
+        self.any_emission = self.own_any_emission if factors[3] is None else 1
+
+    def __enter__(self) -> None:
+        for (name, _), array in zip(self.NAMES, self.arrays, strict=True):
+            setattr(self.args, name, array)
+        self.args.any_emission = self.any_emission
+
+    def __exit__(self, *_: object) -> None:
+        for (name, _), array in zip(self.NAMES, self.own, strict=True):
+            setattr(self.args, name, array)
+        self.args.any_emission = self.own_any_emission
+
+
+class ObjectSamples:
+    """Samples of the object at one light, one set of materials and one seed.
+
+    Args:
+        mis: The integrator.
+        args: The light that samples are drawn from, and whose radiance they carry.
+        seed: Base seed.
+        factors: See `SceneMaterials`.
+        free: What gradients will be asked for, in the order of `Gradients`.
+    """
+
+    def __init__(
+        self,
+        mis: MisIntegrator,
+        args: LightArgs,
+        seed: int,
+        factors: Sequence[FloatArray | None],
+        free: Sequence[bool],
+    ) -> None:
+        self.mis, self.args, self.seed, self.free = mis, args, seed, free
+        self.materials = SceneMaterials(mis.renderer, factors)
+        self.path_count = mis.spp * mis.rays
+        self.entries = 2 * self.path_count * mis.depth * any(free[:4])
+        self.vertices = self.path_count * (mis.depth + 1) * any(free[4:])
+        self.has_layers = self.materials.args.any_layers == 1
+        vertex_bytes = VERTEX_BYTES + LAYERS_BYTES * self.has_layers
+        row_bytes = ENTRY_BYTES * self.entries + vertex_bytes * self.vertices
+        self.parts = _parts(len(mis.object_pixels), row_bytes)
+        self.kept: tuple[LightRecord | None, VertexRecord | None] | None = None
+
+    def render(self) -> FloatArray:
+        """Trace the object's radiance [object_pixel, 3]; keep the records if they fit."""
+
+        def drawn() -> FloatArray:
+            if len(self.parts) > 1:
+                return self.draw(slice(None), is_recording=False)[0]
+            whole, self.parts = self.parts[0], _halves(len(self.mis.object_pixels))
+            radiance, light, vertex = self.draw(whole)
+            # It did fit; where it does not, the next attempt keeps no record of the whole.
+            self.parts, self.kept = [whole], (light, vertex)
+            return radiance
+
+        return self.mis.renderer.memory.again(drawn, RECORDING, LOWER)
+
+    def draw(
+        self, rows: slice, is_recording: bool = True
+    ) -> tuple[FloatArray, LightRecord | None, VertexRecord | None]:
+        """Trace some of the object's pixels: radiance [pixel, 3] and the records asked for."""
+        mis, device = self.mis, self.mis.renderer.device
+        pixels = mis.object_pixels[rows]
+        lanes = mis.renderer.lanes(len(pixels), mis.spp)
+        light, vertex = None, None
+        if is_recording and self.entries:
+            light = _new_light_record(len(pixels) * lanes, self.entries // lanes, device)
+        if is_recording and self.vertices:
+            vertex = _new_vertex_record(
+                len(pixels) * lanes, self.vertices // lanes, self.has_layers, device
+            )
+        with self.materials:
+            out = mis.renderer.foreground(
+                self.args,
+                pixels,
+                mis.spp,
+                mis.rays,
+                mis.depth,
+                self.seed,
+                light_record=light,
+                vertex_record=vertex,
+                mesh_shines=mis.mesh_shines,
+            )
+        return out.radiance, light, vertex
+
+    def gradient(self, d_radiance: FloatArray) -> Gradients:
+        """Return the loss gradient of light and materials from that of `render`."""
+        total: Gradients = [None] * 8
+        for rows in self.parts:
+            light, vertex = self.kept or self.draw(rows)[1:]
+            # Records serve one backward pass, so that two steps' never live side by side.
+            self.kept = None
+            lanes = self.mis.renderer.lanes(len(d_radiance[rows]), self.mis.spp)
+            d_rows = np.repeat(d_radiance[rows], lanes, axis=0)
+            if light is not None:
+                d_pixel = d_rows[:, :, None] * np.eye(3, dtype=np.float32)
+                found = light_gradient(self.mis.renderer, self.args, light, d_pixel, self.free[:4])
+                total[:4] = _add(total[:4], found)
+            if vertex is not None:
+                total[4:] = _add(
+                    total[4:], self.material_gradient(vertex, d_rows, self.path_count // lanes)
+                )
+        return total
+
+    def material_gradient(
+        self, record: VertexRecord, d_radiance: FloatArray, count: int
+    ) -> Gradients:
+        """Return the gradient of the four factors over rows of ``count`` paths each."""
+        renderer, device = self.mis.renderer, self.mis.renderer.device
+        pixels = len(d_radiance)
+        # On the CPU each part has a sum of its own and is gone through in short launches.
+        parts = max(1, min(PART_COUNT, pixels * count // PART_PATHS)) if device.is_cpu else 1
+        size = max(1, SAMPLES_PER_SLICE // count) if device.is_cpu else pixels
+        d_path = wp.array(
+            np.repeat(d_radiance / self.path_count, count, axis=0), dtype=wp.vec3, device=device
+        )
+        d_factors = [
+            wp.zeros((parts, len(a)), dtype=a.dtype, device=device) if is_free else None
+            for a, is_free in zip(self.materials.arrays, self.free[4:], strict=True)
+        ]
+
+        def one(part: int) -> None:
+            own = [None if d is None else d[part] for d in d_factors]
+            stop = pixels * (part + 1) // parts
+            for start in range(pixels * part // parts, stop, size):
+                end = min(start + size, stop)
+                vertices = Rows(record).cut(start, end)
+                self.differentiate(vertices, d_path[start * count : end * count], count, own)
+
+        wp.load_module(shade_kernels, device=device)
+        renderer.in_threads(one, range(parts if pixels else 0), "materials")
+        return [None if d is None else d.numpy().sum(axis=0, dtype=np.float64) for d in d_factors]
+
+    def differentiate(
+        self,
+        record: VertexRecord,
+        d_path: wp.array,
+        count: int,
+        d_factors: Sequence[wp.array | None],
+    ) -> None:
+        """Add the gradient of some paths to ``d_factors``: vertices forward, adjoints backward.
+
+        Launched by hand, since a ``wp.Tape`` belongs to one thread.
+
+        Args:
+            record: Vertices, rows are pixels.
+            d_path: Loss gradient of each path's radiance, shape [path].
+            count: Paths of a row.
+            d_factors: Where to add, shape [material] each, or None.
+        """
+        device, paths, depth = d_path.device, len(d_path), self.mis.depth
+        throughput = [wp.full(paths, wp.vec3(1.0), dtype=wp.vec3, device=device)]
+        throughput += [wp.empty(paths, dtype=wp.vec3, device=device) for _ in range(depth + 1)]
+        unused = wp.empty(paths, dtype=wp.vec3, device=device)
+        d_next = wp.zeros(paths, dtype=wp.vec3, device=device)
+
+        def launch(k: int, **adjoint: object) -> None:
+            wp.launch(
+                shade_kernels.shade_vertex,
+                dim=paths,
+                inputs=[record, count, k, *self.materials.arrays, throughput[k]],
+                outputs=[unused, throughput[k + 1]],
+                device=device,
+                record_tape=False,
+                **adjoint,
+            )
+
+        for k in range(depth):
+            launch(k)
+        for k in range(depth, -1, -1):
+            d_throughput = wp.zeros(paths, dtype=wp.vec3, device=device)
+            launch(
+                k,
+                adjoint=True,
+                adj_inputs=[VertexRecord(), 0, 0, *d_factors, d_throughput],
+                adj_outputs=[d_path, d_next],
+            )
+            d_next = d_throughput
+
+
+class PlaneSamples:
+    """Samples of the plane; as `ObjectSamples`."""
+
+    def __init__(
+        self, mis: MisIntegrator, args: LightArgs, seed: int, free: Sequence[bool]
+    ) -> None:
+        self.mis, self.args, self.seed, self.free = mis, args, seed, free
+        self.entries = 2 * mis.spp * mis.rays * any(free)
+        self.parts = _parts(len(mis.proxy_pixels), ENTRY_BYTES * self.entries)
+        self.kept: LightRecord | None = None
+
+    def render(self) -> ProxyRadiance:
+        """Trace the plane with and without the object; keep the record if it fits."""
+
+        def drawn() -> ProxyRadiance:
+            if len(self.parts) > 1:
+                return self.draw(slice(None), is_recording=False)[0]
+            whole, self.parts = self.parts[0], _halves(len(self.mis.proxy_pixels))
+            radiance, self.kept = self.draw(whole)
+            self.parts = [whole]
+            return radiance
+
+        return self.mis.renderer.memory.again(drawn, RECORDING, LOWER)
+
+    def draw(
+        self, rows: slice, is_recording: bool = True
+    ) -> tuple[ProxyRadiance, LightRecord | None]:
+        """Trace some of the plane's pixels, with their record if it is asked for."""
+        mis = self.mis
+        pixels = mis.proxy_pixels[rows]
+        record = None
+        if is_recording and self.entries:
+            record = _new_light_record(len(pixels), self.entries, mis.renderer.device)
+        out = mis.renderer.proxy(
+            self.args,
+            pixels,
+            mis.may_see_object[rows],
+            mis.spp,
+            mis.rays,
+            self.seed,
+            record=record,
+            mesh_shines=mis.mesh_shines,
+        )
+        return out, record
+
+    def gradient(self, d_lit: FloatArray, d_unoccluded: FloatArray) -> Gradients:
+        """Return the loss gradient of the light from those of `render`."""
+        total: Gradients = [None] * 4
+        for rows in self.parts:
+            record = self.kept or self.draw(rows)[1]
+            self.kept = None
+            assert record is not None, "no gradient was announced"
+            d_pixel = np.zeros((len(d_lit[rows]), 3, 3), np.float32)
+            d_pixel[:, :, 0], d_pixel[:, :, 1] = d_lit[rows], d_unoccluded[rows]
+            found = light_gradient(self.mis.renderer, self.args, record, d_pixel, self.free)
+            total = _add(total, found)
+        return total
+
+
+def light_gradient(
+    renderer: Renderer,
+    args: LightArgs,
+    record: LightRecord,
+    d_pixel: FloatArray,
+    free: Sequence[bool],
+) -> Gradients:
+    """Return the loss gradient of a light over recorded directions.
+
+    Args:
+        renderer: Whose device and threads are used.
+        args: The light.
+        record: Directions and weights, rows are pixels; used up.
+        d_pixel: Times a weight it is the loss gradient of the radiance from there, shape
+            [pixel, 3, 3].
+        free: Which of the four are asked for.
+    """
+    device = renderer.device
+    pixels, capacity = record.wi.shape
+    d_array = wp.array(d_pixel, dtype=wp.mat33, device=device)
+    renderer.launch(
+        light_kernels.radiance_gradient, pixels, [Rows(d_array), Rows(record)], capacity, "light"
+    )
+    out: Gradients = [None] * 4
+    if any(free[:3]):
+        block_size = max(1, LOBE_BLOCK // capacity)
+        first = np.arange(0, pixels, block_size, dtype=np.int32)
+        shape = (len(first), args.lobe_count)
+        sums = [wp.empty(shape, dtype=t, device=device) for t in (wp.vec3, wp.vec3, wp.float32)]
+        renderer.launch(
+            light_kernels.lobe_gradient,
+            len(first),
+            [
+                record,
+                Rows(wp.array(first, dtype=wp.int32, device=device)),
+                block_size,
+                args.amplitude,
+                args.axis,
+                args.sharpness,
+                *map(Rows, sums),
+            ],
+            block_size * capacity,
+            "light",
+            width=args.lobe_count,
+        )
+        out[:3] = [a.numpy().sum(axis=0, dtype=np.float64) for a in sums]
+    if free[3]:
+        height, width = args.map_height, args.map_width
+        # A private map pays where more is added into it than there is to add up of it.
+        parts = max(1, min(PART_COUNT, pixels * capacity // (height * width)))
+        parts = parts if device.is_cpu else 1
+        texels = wp.zeros((parts, height, width), dtype=wp.vec3, device=device)
+
+        def one(part: int) -> None:
+            start, stop = pixels * part // parts, pixels * (part + 1) // parts
+            wp.launch(
+                light_kernels.map_gradient,
+                dim=stop - start,
+                inputs=[Rows(record).cut(start, stop), height, width],
+                outputs=[texels[part]],
+                device=device,
+                record_tape=False,
+            )
+
+        wp.load_module(light_kernels, device=device)
+        renderer.in_threads(one, range(parts if pixels else 0), "light")
+        out[3] = texels.numpy().sum(axis=0, dtype=np.float64)
+    return out
+
+
+def _add(total: Gradients, found: Gradients) -> Gradients:
+    return [f if t is None or f is None else t + f for t, f in zip(total, found, strict=True)]
+
+
+def _parts(count: int, bytes_per_row: int) -> list[slice]:
+    """Cut rows so that each part's record fits; one part where all fit."""
+    size = max(1, RECORD_BYTES // max(bytes_per_row, 1))
+    return [slice(start, min(start + size, count)) for start in range(0, max(count, 1), size)]
+
+
+def _halves(count: int) -> list[slice]:
+    """Cut rows into two parts, whose records are smaller."""
+    middle = (count + 1) // 2
+    return [slice(0, middle), slice(middle, count)]
+
+
+def _new_light_record(pixels: int, capacity: int, device: wp.Device) -> LightRecord:
+    record = LightRecord()
+    record.count = wp.zeros(pixels, dtype=wp.int32, device=device)
+    record.wi = wp.empty((pixels, capacity), dtype=wp.vec3, device=device)
+    record.weight = wp.empty((pixels, capacity), dtype=wp.vec3, device=device)
+    return record
+
+
+def _new_vertex_record(
+    pixels: int, capacity: int, has_layers: bool, device: wp.Device
+) -> VertexRecord:
+    record = VertexRecord()
+    vectors = (
+        "n", "wo", "texture_color", "texture_emission",
+        "wi_light", "incident_light", "wi_brdf", "incident_brdf",
+    )  # fmt: skip
+    for name in vectors:
+        setattr(record, name, wp.empty((pixels, capacity), dtype=wp.vec3, device=device))
+    for name in ("texture_metallic", "texture_roughness", "weight_next"):
+        setattr(record, name, wp.empty((pixels, capacity), dtype=wp.float32, device=device))
+    record.layers = wp.empty((pixels, capacity * has_layers), dtype=Layers, device=device)
+    record.material = wp.full((pixels, capacity), -1, dtype=wp.int32, device=device)
+    return record

@@ -1,0 +1,89 @@
+"""Traced rows on disk, found again by their content: another prompt traces nothing."""
+
+from __future__ import annotations
+
+import hashlib
+from dataclasses import asdict
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+import warpir
+from warpir.core.atomic import replacing
+from warpir.core.cache import find_kept, notice, seal
+from warpir.render.transport.rows import TransportSettings
+from warpir.scene.light import Light
+
+if TYPE_CHECKING:
+    from warpir.render.device_scene import Scene
+
+IntArray = NDArray[np.int32]
+
+FORMAT = 1
+"""Layout and meaning of the stored arrays; part of every key."""
+
+
+def content_key(
+    scene: Scene,
+    object_pixels: IntArray,
+    proxy_pixels: IntArray,
+    depth: int,
+    settings: TransportSettings,
+    expected: Light,
+    seed: int,
+    is_ordered: bool,
+) -> str:
+    """Return a hash of everything that the rows depend on, as 64 hexadecimal digits.
+
+    The device counts, and whether its sums had one order: it decides the last bits.
+
+    The scene counts by what is on the device: geometry where it stands, materials, textures,
+    camera and plane. Names, files and prompts do not.
+    """
+    digest = hashlib.sha256()
+
+    def add(value: Any) -> None:
+        array = np.ascontiguousarray(value)
+        digest.update(f"{array.dtype.str}{array.shape}".encode())
+        digest.update(array.data if array.size else b"")
+
+    digest.update(
+        f"{FORMAT} {warpir.__version__} {depth} {seed} {sorted(asdict(settings).items())} "
+        f"{scene.device.name} {is_ordered}".encode()
+    )
+    for content in scene.contents():
+        add(content)
+    add(object_pixels)
+    add(proxy_pixels)
+    lobes = expected.lobes
+    for array in (
+        *((lobes.amplitude, lobes.axis, lobes.sharpness) if lobes is not None else ()),
+        *((expected.texels,) if expected.texels is not None else ()),
+    ):
+        add(array)
+    return digest.hexdigest()
+
+
+def load_rows(path: Path, device: torch.device) -> dict[str, Tensor] | None:
+    """Return the arrays of a cached file, or None when there is none that is whole."""
+    from safetensors.torch import load_file
+
+    kept = find_kept(path)
+    return None if kept is None else load_file(kept, device=str(device))
+
+
+def save_rows(path: Path, rows: dict[str, Tensor]) -> None:
+    """Write the arrays, whole or not at all, and make room; a full disk is only a notice."""
+    from safetensors import SafetensorError
+    from safetensors.torch import save_file
+
+    try:
+        with replacing(path) as staged:
+            save_file({k: v.contiguous() for k, v in rows.items()}, staged)
+        seal(path, "*.safetensors.*")
+    except (SafetensorError, OSError) as error:
+        notice(f"{path}: not kept ({error})")

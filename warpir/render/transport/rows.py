@@ -1,0 +1,519 @@
+"""Trace the rows of light transport, chunk by chunk: launches `warpir.kernels.transport`."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from functools import lru_cache
+from typing import TypeVar
+
+import numpy as np
+import warp as wp
+from numpy.typing import NDArray
+
+from warpir.core.color import luminance
+from warpir.kernels import transport as kernels
+from warpir.kernels.types import Layers
+from warpir.render.renderer import Renderer, Rows, light_args
+from warpir.scene.light import Light, map_directions, texel_solid_angles
+
+IntArray = NDArray[np.int32]
+FloatArray = NDArray[np.float32]
+Float64Array = NDArray[np.float64]
+Traced = TypeVar("Traced")
+
+LANES = 256
+"""Threads of a pixel on CUDA."""
+ITEM_SIZE = 16
+"""Directions that one of them draws in a row."""
+CHUNK_BYTES = 64 << 20
+"""Memory of the rows that are traced at once, before they are stored in a small type."""
+TRACING = "tracing light transport"
+LOWER_OBJECT = "--object-light-height or --guidance-width"
+LOWER_SHADOW = "--light-height or --guidance-width"
+"""What lowers the memory of tracing."""
+
+PILOT_SUBSAMPLES = 8
+PILOT_SEED = 0x2F6E2B1
+"""Of the samples that find mirrors."""
+
+
+@dataclass(frozen=True)
+class ObjectRows:
+    """Traced rows of ``T_fg``."""
+
+    rows: IntArray
+    """Which, shape [row]."""
+    T: wp.array
+    """Pixel radiance per texel radiance [1], vec3, shape [row, texel]."""
+    emission: wp.array
+    """Radiance that does not depend on the light, vec3, shape [row]."""
+    count: wp.array
+    """Subsamples that met the object, shape [row]."""
+    subsamples: int
+    """Of how many."""
+
+
+@dataclass(frozen=True)
+class TransportSettings:
+    """How finely light transport is traced and stored."""
+
+    height_fg: int = 32
+    """Rows of the map that lights the object; it is twice as wide."""
+    height_shadow: int = 32
+    """Rows of the map that casts the shadow."""
+    subsamples: int = 32
+    """Positions within each pixel."""
+    paths: int = 64
+    """Paths per pixel, for narrow specular lobes and for all light of two or more interactions."""
+    mirror_factor: int = 16
+    """Times as many of both for pixels that mirror: there the light that they see changes with
+    every normal in the pixel."""
+    bright_directions: int = 1024
+    """Directions per pixel and map that are shared out by where light is expected, on top of one
+    per texel."""
+    sharpness_max: float | None = None
+    """Lobes sharper than this are left to `mis`; None: those narrower than half a texel."""
+    sharp_samples: int = 4
+    """Camera samples per step of those lobes; with 0 they are averaged over texels like all."""
+    dtype: str = "bfloat16"
+    """Type in which the object's rows are stored, ``bfloat16`` or ``float32``."""
+    memory_mib: int = 1024
+    """Most memory that the stored rows may take [MiB]."""
+
+
+def sharpness_limit(height: int) -> float:
+    """Return the sharpness whose standard deviation is half a texel of a map of that height."""
+    return 4.0 * (height / np.pi) ** 2
+
+
+def tent_solid_angles(height: int) -> Float64Array:
+    """Return the solid angle of a texel's tent in each row [sr], shape [height].
+
+    That is what bilinear interpolation weighs a texel with; all texels sum to 4 pi. Within the map
+    ``2 (1 - cos d) / d sin(theta)``, in the polar rows the lookup is clamped.
+    """
+    step = np.pi / height
+    centre = (np.arange(height) + 0.5) * step
+    rows = np.sin(centre) * 2.0 * (1.0 - np.cos(step)) / step
+    polar = 1.0 - np.cos(0.5 * step)
+    beyond = np.cos(0.5 * step) - (np.sin(1.5 * step) - np.sin(0.5 * step)) / step
+    rows[0] = rows[-1] = polar + beyond
+    solid: Float64Array = rows * np.pi / height
+    return solid
+
+
+@lru_cache(maxsize=8)
+def tent_irradiance(normal: tuple[float, float, float], height: int) -> Float64Array:
+    """Return what a texel of radiance 1 makes a white plane reflect [1], shape [height, 2 height].
+
+    ``integral of tent cos / pi`` by quadrature; all texels of a constant sky sum to 1.
+    """
+    side = max(4, 1024 // height)
+    fine = side * height
+    cosine = np.maximum(map_directions(fine, 2 * fine) @ np.array(normal), 0.0) / np.pi
+    cosine *= texel_solid_angles(fine, 2 * fine)[:, None]
+
+    def tents(count: int, wraps: bool) -> Float64Array:
+        """Interpolation weights of ``side * count`` positions, shape [side * count, count]."""
+        x = (np.arange(side * count) + 0.5) / side - 0.5
+        low = np.floor(x).astype(int)
+        weight = x - low
+        first, second = low % count, (low + 1) % count
+        if not wraps:
+            first, second = np.clip(low, 0, count - 1), np.clip(low + 1, 0, count - 1)
+        matrix = np.zeros((side * count, count))
+        np.add.at(matrix, (np.arange(side * count), first), 1.0 - weight)
+        np.add.at(matrix, (np.arange(side * count), second), weight)
+        return matrix
+
+    irradiance: Float64Array = tents(height, False).T @ cosine @ tents(2 * height, True)
+    return irradiance
+
+
+def direction_counts(expected: FloatArray, budget: int) -> NDArray[np.int32]:
+    """Return how many directions each texel gets: one, and more where light is expected.
+
+    A texel's noise is proportional to its flux, so equal-cost directions are best shared out in
+    proportion to it (Neyman's allocation); powers of two keep the sequences stratified.
+
+    Args:
+        expected: Likely radiance of the map, shape [He, 2 He, 3].
+        budget: Directions to share out.
+
+    Returns:
+        Shape [He * 2 He].
+    """
+    flux = luminance(expected.astype(np.float64)) * tent_solid_angles(len(expected))[:, None]
+    share = budget * flux / max(float(flux.sum()), 1e-30)
+    counts = np.exp2(np.floor(np.log2(np.maximum(share, 1.0)))).astype(np.int32)
+    flat: NDArray[np.int32] = counts.reshape(-1)
+    return flat
+
+
+def flux_noise(texels: FloatArray, counts: NDArray[np.int32]) -> float:
+    """Return how much of a pixel's noise is left with these directions, under this light [1].
+
+    ``sqrt(sum flux_t^2 / count_t)`` over the whole flux: the standard deviation of a pixel if each
+    direction's light were as uncertain as it is strong. A light that has moved shows by it.
+    """
+    flux = luminance(texels.astype(np.float64)) * tent_solid_angles(len(texels))[:, None]
+    total = max(float(flux.sum()), 1e-30)
+    return float(np.sqrt((np.square(flux.reshape(-1)) / counts).sum()) / total)
+
+
+def _texel_args(
+    counts: NDArray[np.int32],
+    height: int,
+    renderer: Renderer,
+    columns: IntArray,
+    normal: Float64Array | None = None,
+) -> kernels.TexelArgs:
+    """Describe a map's texels; directions follow the cosine with ``normal`` where it is given.
+
+    ``columns`` are the texels that the rows hold.
+    """
+    device = renderer.device
+    args = kernels.TexelArgs()
+    args.height, args.width = height, 2 * height
+    step = np.pi / height
+    rows = np.arange(height)
+    low, high = np.maximum(rows - 0.5, 0.0) * step, np.minimum(rows + 1.5, height) * step
+    across = np.where((low < 0.5 * np.pi) & (high > 0.5 * np.pi), 1.0, np.sin([low, high]).max(0))
+    bound = np.repeat(across[:, None], 2 * height, axis=1)
+    centres = map_directions(height, 2 * height)
+    if normal is not None:
+        angle = np.arccos(np.clip(centres @ normal, -1.0, 1.0))
+        bound *= np.cos(np.clip(angle - kernels.TENT_REACH * step, 0.0, 0.5 * np.pi))
+    for name, values in (("d_omega", tent_solid_angles(height)), ("bound", bound.reshape(-1))):
+        setattr(args, name, wp.array(values.astype(np.float32), dtype=float, device=device))
+    args.direction_count = wp.array(counts, dtype=int, device=device)
+    args.centre = wp.array(centres.reshape(-1, 3).astype(np.float32), dtype=wp.vec3, device=device)
+    # On CUDA one thread must not draw a sun's directions while its neighbours wait; but a pixel's
+    # sums have one order only where one thread adds them up.
+    args.lanes, args.item_size = (1, 1 << 30) if renderer.is_ordered else (LANES, ITEM_SIZE)
+    pieces = -(-counts[columns] // args.item_size)
+    which = np.repeat(np.arange(len(columns)), pieces)
+    first = np.arange(len(which)) - np.repeat(np.cumsum(pieces) - pieces, pieces)
+    args.item_count = len(which)
+    for name, values in (("item_column", which), ("item_first", first * args.item_size)):
+        setattr(args, name, wp.array(values.astype(np.int32), dtype=int, device=device))
+    return args
+
+
+def object_rows(
+    renderer: Renderer,
+    pixels: IntArray,
+    depth: int,
+    settings: TransportSettings,
+    expected: FloatArray,
+    seed: int,
+) -> Iterator[ObjectRows]:
+    """Trace the object's rows chunk by chunk, pixels that mirror with more samples than others."""
+    scene, device, height = renderer.scene, renderer.device, settings.height_fg
+    counts = direction_counts(expected, settings.bright_directions)
+    texel_count = 2 * height * height
+    texels = _texel_args(counts, height, renderer, np.arange(texel_count, dtype=np.int32))
+    # Half of the later vertices' directions look for the expected light, half everywhere.
+    flux = luminance(expected.astype(np.float64))
+    mean = float((flux * texel_solid_angles(height, 2 * height)[:, None]).sum()) / (4.0 * np.pi)
+    flat = 0.5 + 0.5 * flux / mean if mean > 0.0 else np.ones_like(flux)
+    proposal = light_args(
+        Light(texels=np.repeat(flat[..., None], 3, axis=2).astype(np.float32)), device
+    )
+    geometry = (scene.mesh_args, scene.material_args, scene.texture_args)
+    for rows, factor in _groups(renderer, pixels, settings, seed):
+        subsamples, paths = factor * settings.subsamples, factor * settings.paths
+
+        def trace(
+            start: int,
+            stop: int,
+            rows: IntArray = rows,
+            subsamples: int = subsamples,
+            paths: int = paths,
+        ) -> ObjectRows:
+            rows = rows[start:stop]
+            chunk = pixels[rows]
+            points, emission = _surface_points(renderer, chunk, subsamples, seed)
+            T = wp.zeros((len(chunk), texel_count), dtype=wp.vec3, device=device)
+            launched = Rows(wp.array(chunk, dtype=wp.int32, device=device))
+            renderer.launch(
+                kernels.trace_direct,
+                len(chunk),
+                [
+                    *(launched, Rows(points), *geometry, scene.proxy_args),
+                    *(texels, subsamples, paths, seed, Rows(T)),
+                ],
+                int(counts.sum()),
+                "transport",
+                texels.lanes,
+            )
+            # Threads of a pixel add to one row: in one order if one runs at a time, as on the CPU.
+            step = 1 if renderer.is_ordered and device.is_cuda else max(paths, 1)
+            for first in range(0, paths, step):
+                renderer.launch(
+                    kernels.trace_paths,
+                    len(chunk),
+                    [
+                        launched,
+                        Rows(points),
+                        *geometry,
+                        scene.proxy_args,
+                        texels,
+                        proposal,
+                        subsamples,
+                        first,
+                        paths,
+                        depth,
+                        seed,
+                        Rows(T),
+                        Rows(emission),
+                    ],
+                    step * depth,
+                    "transport",
+                    step,
+                )
+            return ObjectRows(rows, T, emission, points.count, subsamples)
+
+        yield from renderer.memory.in_chunks(trace, len(rows), TRACING, LOWER_OBJECT)
+
+
+def _groups(
+    renderer: Renderer, pixels: IntArray, settings: TransportSettings, seed: int
+) -> Iterator[tuple[IntArray, int]]:
+    """Yield chunks of rows, and by how much the counts of each are to be multiplied.
+
+    A pixel counts as mirroring when any of a few samples, which are not used again, meets a lobe
+    narrower than half a texel: what it shows is decided by normals, not by directions. Lobes up to
+    two texels wide take the square root of that factor.
+    """
+    texel = np.pi / settings.height_fg
+    middle = round(settings.mirror_factor**0.5)
+    factors = np.ones(len(pixels), np.int32)
+    size = max(1, CHUNK_BYTES // (24 * settings.height_fg**2))
+    for start in range(0, len(pixels), size):
+        points, _ = _surface_points(
+            renderer, pixels[start : start + size], PILOT_SUBSAMPLES, seed ^ PILOT_SEED
+        )
+        filled = np.arange(PILOT_SUBSAMPLES)[None] < points.count.numpy()[:, None]
+        alpha = np.where(filled, points.roughness.numpy() ** 2, 1.0).min(axis=1)
+        found = np.where(alpha < 0.5 * texel, settings.mirror_factor, middle)
+        factors[start : start + size] = np.where(alpha < 2.0 * texel, found, 1)
+    for factor in np.unique(factors):
+        rows = np.flatnonzero(factors == factor).astype(np.int32)
+        for start in range(0, len(rows), size):
+            yield rows[start : start + size], int(factor)
+
+
+def _surface_points(
+    renderer: Renderer, pixels: IntArray, subsamples: int, seed: int
+) -> tuple[kernels.SurfacePoints, wp.array]:
+    """Find what the camera sees in each pixel: points, and mean emitted radiance."""
+    scene, device, count = renderer.scene, renderer.device, len(pixels)
+    points = kernels.SurfacePoints()
+    points.count = wp.zeros(count, dtype=int, device=device)
+    for name in ("position", "ng", "n", "wo", "base_color"):
+        setattr(points, name, wp.empty((count, subsamples), dtype=wp.vec3, device=device))
+    for name in ("metallic", "roughness"):
+        setattr(points, name, wp.zeros((count, subsamples), dtype=float, device=device))
+    columns = subsamples * scene.material_args.any_layers
+    points.layers = wp.empty((count, columns), dtype=Layers, device=device)
+    emission = wp.zeros(count, dtype=wp.vec3, device=device)
+    renderer.launch(
+        kernels.trace_points,
+        count,
+        [
+            Rows(wp.array(pixels, dtype=wp.int32, device=device)),
+            scene.camera_args,
+            scene.mesh_args,
+            scene.material_args,
+            scene.texture_args,
+            scene.proxy_args,
+            subsamples,
+            seed,
+            Rows(points),
+            Rows(emission),
+        ],
+        subsamples,
+        "transport",
+    )
+    return points, emission
+
+
+@dataclass(frozen=True)
+class _PlacePoints:
+    """What the camera sees of the place under each pixel's subsamples."""
+
+    pixels: Rows
+    count: Rows
+    """Filled points, shape [pixel]."""
+    position: Rows
+    """Recentred [m], shape [pixel, subsample]."""
+    normal: Rows
+    """Shape [pixel, subsample]."""
+    spread: Rows
+    """Largest distance of a pixel's points from its first one [m], shape [pixel]."""
+    share: Rows
+    """Of what the object does not hide, what is place and not open [1], shape [pixel]."""
+
+
+def _place_points(
+    renderer: Renderer, pixels: IntArray, may_see_object: IntArray, subsamples: int, seed: int
+) -> _PlacePoints:
+    scene, device, count = renderer.scene, renderer.device, len(pixels)
+    points = _PlacePoints(
+        Rows(wp.array(pixels, dtype=wp.int32, device=device)),
+        Rows(wp.zeros(count, dtype=int, device=device)),
+        Rows(wp.empty((count, subsamples), dtype=wp.vec3, device=device)),
+        Rows(wp.empty((count, subsamples), dtype=wp.vec3, device=device)),
+        *(Rows(wp.zeros(count, dtype=float, device=device)) for _ in range(2)),
+    )
+    renderer.launch(
+        kernels.trace_proxy_points,
+        count,
+        [
+            points.pixels,
+            Rows(wp.array(may_see_object, dtype=int, device=device)),
+            scene.camera_args,
+            scene.mesh_args,
+            scene.material_args,
+            scene.texture_args,
+            scene.proxy_args,
+            subsamples,
+            seed,
+            points.count,
+            points.position,
+            points.normal,
+            points.spread,
+            points.share,
+        ],
+        subsamples,
+        "transport",
+    )
+    return points
+
+
+def proxy_rows(
+    renderer: Renderer,
+    pixels: IntArray,
+    may_see_object: IntArray,
+    columns: IntArray,
+    settings: TransportSettings,
+    expected: FloatArray,
+    seed: int,
+) -> Iterator[wp.array]:
+    """Trace the plane's rows chunk by chunk.
+
+    Yields:
+        Share of each texel's irradiance that the object keeps away [1], shape [row, column].
+    """
+    scene, device, height = renderer.scene, renderer.device, settings.height_shadow
+    counts = direction_counts(expected, settings.bright_directions)
+    texels = _texel_args(counts, height, renderer, columns, scene.proxy.normal)
+    size = max(1, CHUNK_BYTES // (4 * len(columns)))
+    if scene.triangle_count == 0:
+        return
+    geometry = (scene.mesh_args, scene.material_args, scene.texture_args, scene.proxy_args)
+    wp_columns = wp.array(columns, dtype=int, device=device)
+
+    def trace(first: int, last: int) -> wp.array:
+        chunk = slice(first, last)
+        points = _place_points(
+            renderer, pixels[chunk], may_see_object[chunk], settings.subsamples, seed
+        )
+        blocked = wp.zeros((last - first, len(columns)), dtype=float, device=device)
+        renderer.launch(
+            kernels.trace_blocked,
+            last - first,
+            [
+                points.pixels,
+                points.count,
+                points.position,
+                points.spread,
+                *geometry,
+                texels,
+                wp_columns,
+                seed,
+                Rows(blocked),
+            ],
+            len(columns) // 4,
+            "transport",
+            texels.lanes,
+        )
+        return blocked
+
+    yield from _chunks(renderer, trace, len(pixels), size)
+
+
+def _chunks(
+    renderer: Renderer, trace: Callable[[int, int], Traced], count: int, size: int
+) -> Iterator[Traced]:
+    """Yield what ``trace`` makes of each ``size`` pixels, of halves where memory is short."""
+    for start in range(0, count, size):
+
+        def part(first: int, last: int, start: int = start) -> Traced:
+            return trace(start + first, start + last)
+
+        length = min(size, count - start)
+        yield from renderer.memory.in_chunks(part, length, TRACING, LOWER_SHADOW)
+
+
+@dataclass(frozen=True)
+class PlaceRows:
+    """Traced rows of a place with a mesh; what the object keeps is part of what is received."""
+
+    received: wp.array
+    """Radiance of the white place without the object per texel radiance [1], shape [row, texel]."""
+    blocked: wp.array
+    """What the object keeps of it, shape [row, texel]."""
+    bounced: wp.array
+    """Radiance of the white place that the mesh sends it, vec3, shape [row]."""
+    bounced_blocked: wp.array
+    """What the object keeps of it, vec3, shape [row]."""
+
+
+def place_rows(
+    renderer: Renderer,
+    pixels: IntArray,
+    may_see_object: IntArray,
+    settings: TransportSettings,
+    expected: FloatArray,
+    seed: int,
+) -> Iterator[PlaceRows]:
+    """Trace the rows of a place with a mesh chunk by chunk: nothing is known beforehand."""
+    scene, device, height = renderer.scene, renderer.device, settings.height_shadow
+    texel_count = 2 * height * height
+    counts = direction_counts(expected, settings.bright_directions)
+    texels = _texel_args(counts, height, renderer, np.arange(texel_count, dtype=np.int32))
+    size = max(1, CHUNK_BYTES // (8 * texel_count))
+    geometry = (scene.mesh_args, scene.material_args, scene.texture_args, scene.proxy_args)
+
+    def trace(first: int, last: int) -> PlaceRows:
+        chunk, count = slice(first, last), last - first
+        points = _place_points(
+            renderer, pixels[chunk], may_see_object[chunk], settings.subsamples, seed
+        )
+        places = (points.count, points.position, points.normal, points.share)
+        seen = (points.pixels, *places, *geometry)
+        received, blocked = (
+            wp.zeros((count, texel_count), dtype=float, device=device) for _ in range(2)
+        )
+        renderer.launch(
+            kernels.trace_received,
+            count,
+            [*seen, texels, seed, Rows(received), Rows(blocked)],
+            int(counts.sum()),
+            "transport",
+            texels.lanes,
+        )
+        bounced, kept = (wp.zeros(count, dtype=wp.vec3, device=device) for _ in range(2))
+        renderer.launch(
+            kernels.trace_bounced,
+            count,
+            [*seen, settings.paths, seed, Rows(bounced), Rows(kept)],
+            settings.paths,
+            "transport",
+        )
+        return PlaceRows(received, blocked, bounced, kept)
+
+    yield from _chunks(renderer, trace, len(pixels), size)

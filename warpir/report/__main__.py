@@ -1,0 +1,7 @@
+"""``python -m warpir.report``."""
+
+import sys
+
+from warpir.report.page import main
+
+sys.exit(main())

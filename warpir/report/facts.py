@@ -1,0 +1,310 @@
+"""What the report says of a run in words: plain rows of text, read from its ``run.json``.
+
+Of paths only the last part is told, since a report is handed on; whole ones are in ``run.json``.
+"""
+
+from __future__ import annotations
+
+import re
+import shlex
+from collections.abc import Mapping
+from dataclasses import dataclass
+from fnmatch import fnmatchcase
+from functools import partial
+from pathlib import PurePath
+from typing import Any
+
+from warpir.app.command import FLAGS, FORMS, SEPARATORS
+from warpir.app.config import DEFAULTS, InsertConfig, flag
+from warpir.app.record import PATHS, config_of_picture, is_hub_id, name_of
+
+Rows = list[tuple[str, str]]
+"""What is told, by what it is."""
+
+
+@dataclass(frozen=True)
+class Setting:
+    """One setting of a run."""
+
+    name: str
+    value: str
+    is_set: bool
+    """Whether somebody gave it."""
+    is_settled: bool
+    """Whether it was left open, and the prior's own value used."""
+
+
+ABOUT_FILES = (
+    ("composite.png", "The result, at the photo's own resolution, depth and profile"),
+    ("layers.exr", "The composite and its layers, linear, for Nuke, Natron, Fusion, Blender"),
+    ("envmap.exr", "The light of the place, a lat-long map in OpenEXR's orientation, float32"),
+    ("envmap.hdr", "The same as Radiance RGBE"),
+    ("envmap_preview.png", "The same as a picture"),
+    ("envmap_shadow*", "The light that casts the shadow, where it has one of its own"),
+    ("envmap_detail*", "The light on the object, with what the photo shows reflected in it"),
+    ("envmap_web.hdr", "The light on the object as three.js reads it"),
+    ("lobes.json", "The light's spherical Gaussians: --light reads them back"),
+    ("lobes_shadow.json", "Those of the shadow's light"),
+    ("curves.json", "Knots of the tone curves"),
+    ("tone_curve_object.cube", "The object's tone curve as a table for Nuke, Resolve, OCIO"),
+    ("tone_curve_shadow.cube", "The shadow's tone curves as a table"),
+    ("camera.json", "The camera: --camera reads it back"),
+    ("balls.png", "A mirror ball and a grey ball under the light"),
+    ("materials.json", "Every material's factors, before and after: --materials reads them back"),
+    ("optimization.json", "Numbers of every step of the optimisation"),
+    ("prior.png", "What the model paints, before and after it was adapted to the photo"),
+    ("lora_diffusers.safetensors", "The adapter that the model got for this photo, for diffusers"),
+    ("lora_kohya.safetensors", "The same for kohya's tools and web interfaces"),
+    ("object.glb", "The object where it stands, with the photo's camera, for any 3D tool"),
+    ("photo.png", "The photo, upright, as Blender's script reads it"),
+    ("blender_setup.py", "Builds the scene: blender --python blender_setup.py"),
+    ("mitsuba/*", "The insertion as a scene of Mitsuba 3"),
+    ("report.html", "This page"),
+    ("run.json", "Settings, hashes, versions, figures: --config reads it back; written last"),
+)
+"""What each file of a run is for; the first pattern that fits counts."""
+
+
+def about_file(name: str) -> str:
+    """Return what a file of a run is for."""
+    return next((about for p, about in ABOUT_FILES if fnmatchcase(name, p)), "")
+
+
+def without_folders(text: str, config: InsertConfig) -> str:
+    """Return a line of the run in which files are called by their names alone.
+
+    Folders of configured files go first, as these may be relative; then whatever looks like a whole
+    path. A place inside a glTF file, such as ``/materials/0``, stays.
+    """
+    given = {path for name in PATHS if (path := getattr(config, name)) is not None}
+    if is_hub_id(config.model):
+        given.discard(config.model)
+    for path in sorted(given, key=len, reverse=True):
+        if path != (called := name_of(path)) and set(path) - set("./~"):
+            literal = called.replace("\\", r"\\")
+            text = re.sub(rf"{_START}{re.escape(path)}(?![\w/])", literal, text)
+    for folder in sorted({str(PurePath(path).parent) for path in given}, key=len, reverse=True):
+        if set(folder) - set("./~"):
+            text = re.sub(rf"{_START}{re.escape(folder)}/+(?=\S)", "", text)
+    for pattern, separators in _WHOLE_PATHS:
+        text = pattern.sub(partial(_last_part, separators), text)
+    return text
+
+
+def _last_part(separators: str, found: re.Match[str]) -> str:
+    path = found[0]
+    if _POINTER.fullmatch(path):
+        return path
+    return re.split(f"[{separators}]", path.rstrip(separators))[-1]
+
+
+_START = r"(?<![\w./\\~-])"
+"""Of a word or a path."""
+
+
+def _path_pattern(root: str, separators: str) -> re.Pattern[str]:
+    """Return a pattern of whole paths.
+
+    A folder's name may hold spaces, but no colon, semicolon or comma before one, and it ends with
+    nothing that opens a quotation. Of the last part what follows a space is the sentence's.
+    """
+    word = rf"(?:[^{separators}\s:;,]|[:;,](?!\s|$))+"
+    folder = rf"{word}(?: {word})*(?<![('\"\[=<])[{separators}]+"
+    return re.compile(rf"(?:{root})(?:{folder})*{word}[{separators}]*")
+
+
+_WHOLE_PATHS = (
+    (_path_pattern(rf"{_START}(?:[A-Za-z]:[\\/]+|\\\\)", r"\\/"), r"\\/"),  # Windows
+    # A file's address, a home, the root; an address of the web is no path.
+    (_path_pattern(rf"file:/+|{_START}~[\w.-]*/+|(?<![:\w./\\~)<-])/+|(?<=\w:)/(?!/)", "/"), "/"),
+)
+"""With their separators."""
+_POINTER = re.compile(
+    r"/(?:accessors|animations|buffers|bufferViews|cameras|images|materials|meshes|nodes|samplers|"
+    r"scenes|skins|textures|extensions/[A-Z]+_\w+(?:/lights)?)(?:/\d+(?:/\w+)*)?[^\w/]*"
+)
+"""A JSON pointer of glTF 2.0, by the names of its top level."""
+
+
+def command_line(config: InsertConfig) -> str:
+    """Return a command that makes the same result, files by their names alone."""
+    words = ["python", "-m", "warpir.insert"]
+    told = config_of_picture(config)
+    for name in FORMS:
+        value = told.get(name, DEFAULTS[name])
+        if value == DEFAULTS[name]:
+            continue
+        if isinstance(value, bool):
+            is_open = DEFAULTS[name] is None and not value  # its flag alone would say yes
+            words.append("--no-" + name.replace("_", "-") if is_open else flag(name))
+        else:
+            words.append(flag(name))
+            words.append(in_words(name, value))
+    return " ".join(shlex.quote(word) for word in [*words, "--out", "OUT"])
+
+
+def in_words(name: str, value: Any) -> str:
+    """Return a setting's value as the command line takes it; of True and False yes and no."""
+    if isinstance(value, bool):
+        return "yes" if value else "no"
+    if isinstance(value, tuple | list):
+        return SEPARATORS.get(name, ",").join(in_words(name, part) for part in value)
+    return str(value)
+
+
+def settings(config: InsertConfig, record: Mapping[str, Any]) -> dict[str, list[Setting]]:
+    """Return all settings by heading, without those that concern this one run alone.
+
+    Args:
+        config: As it was asked for.
+        record: Its ``measured`` holds what was left open and then settled.
+    """
+    settled = record["measured"].get("settings", {})
+    told = config_of_picture(config)
+    found: dict[str, list[Setting]] = {}
+    for heading, forms in FLAGS.items():
+        for name in (n for n in forms if n in told):
+            value, is_set = told[name], told[name] != DEFAULTS[name]
+            is_settled = value is None and name in settled
+            if is_settled:
+                value = settled[name]
+            words = "" if value is None or value == "" else in_words(name, value)
+            found.setdefault(heading, []).append(
+                Setting(name.replace("_", "-"), words, is_set, is_settled)
+            )
+    return found
+
+
+# ------------------------------------------------------------------------------- who spoke
+
+
+def who_spoke(record: Mapping[str, Any], config: InsertConfig) -> Rows:
+    """Return what the light comes from, and how sure that is."""
+    measured = record["measured"]
+    rows: Rows = [("the light", _source(measured, config))]
+    if "regression" in measured:
+        found = measured["regression"]
+        rows += [
+            (
+                "how sure the regressor was",
+                f"± {found['spread_deg']:.0f}° in the direction (concentration "
+                f"{found['concentration']:.1f}; 0 would be no idea); a factor of "
+                f"{2.718281828 ** found['sun_log_std']:.1f} either way in the main light's "
+                f"strength, {2.718281828 ** found['ambient_log_std']:.1f} in the rest's",
+            ),
+        ]
+    if "detail_seen" in measured:
+        seen = 100.0 * measured["detail_seen"]
+        rows.append(("reflections", f"the photo shows {seen:.0f} % of what is around the object"))
+    prior = measured["prior"]
+    if prior == "none":
+        if "prior_about" in measured:
+            rows.append(("prior", measured["prior_about"]))
+        return rows
+    rows.append(("prior", without_folders(_prior(prior, measured), config)))
+    rows += _guided(measured)
+    return rows
+
+
+def _source(measured: Mapping[str, Any], config: InsertConfig) -> str:
+    if config.reuse is not None:
+        text = f"that of an earlier run, {name_of(config.reuse)}"
+    elif config.light is not None:
+        text = f"given: {name_of(config.light)}"
+    elif config.sun is not None or config.sky is not None:
+        parts = [f"--{n} {in_words(n, v)}" for n in ("sun", "sky") if (v := getattr(config, n))]
+        text = f"described: {' '.join(parts)}"
+    elif "regression" in measured:
+        found = measured["regression"]
+        text = (
+            f"read off the photo by warpir's regressor: azimuth {found['azimuth_deg']:.0f}°, "
+            f"elevation {found['elevation_deg']:.0f}°"
+        )
+    elif config.demo and config.start != "uniform":
+        text = "the demo's own"
+    else:
+        text = "even, as nothing was said about it"
+    if measured["prior"] != "none" and config.refine is None:
+        verdict = measured.get("acceptance")
+        if verdict is not None and not verdict["is_accepted"]:
+            return f"{text}; guidance proposed another, which was not accepted"
+        return f"{text}, then changed by guidance"
+    return text
+
+
+def _prior(name: str, measured: Mapping[str, Any]) -> str:
+    text = "Stable Diffusion" if name == "stable-diffusion" else name
+    text = str(measured.get("prior_about", text)).removeprefix("prior: ")
+    if measured.get("prior_sha256"):
+        text += f" (sha256 {measured['prior_sha256'][:16]}...)"
+    return text
+
+
+def _guided(measured: Mapping[str, Any]) -> Rows:
+    rows: Rows = []
+    if prompt := measured.get("prompts", {}).get("guidance"):
+        rows.append(("asked for", f"“{prompt}”"))
+    if errors := measured.get("personalization", {}).get("error_before_after"):
+        text = f"its error on the photo {errors[0]:.3g} before, {errors[-1]:.3g} after"
+        rows.append(("adapted to the photo", text))
+    if went := measured.get("optimization"):
+        text = f"{went['steps']}, of which step {went['best_step']} was kept"
+        skipped = went["skipped_steps"]
+        text += f"; {skipped} were skipped for want of a finite gradient" if skipped else ""
+        rows.append(("steps", text))
+        if went["score_at_start"] is not None and went["best_score"] is not None:
+            text = f"{went['score_at_start']:.4g} at the start, {went['best_score']:.4g} at the end"
+            rows.append(("guidance score", f"{text} (lower is better)"))
+    if verdict := measured.get("acceptance"):
+        kept = "accepted" if verdict["is_accepted"] else "not accepted: the start was kept"
+        if verdict["rise"] is not None and verdict["error"] is not None:
+            kept += (
+                f". Asked anew with {verdict['draws']} noises, the potential changed by "
+                f"{verdict['rise']:.3g} ± {verdict['error']:.2g} from start to end"
+            )
+        rows.append(("the end", kept))
+    return rows
+
+
+def figures(record: Mapping[str, Any]) -> Rows:
+    """Return plain figures of the run."""
+    measured = record["measured"]
+    rows: Rows = [("device", str(record["device"]))]
+    integrators = [measured.get("loop_integrator"), measured["integrator"]]
+    rows.append(("integrator", " and ".join(dict.fromkeys(i for i in integrators if i))))
+    rows += [
+        ("triangles", f"{measured['triangles']:,}"),
+        ("pixels of the object, as rendered", f"{measured['object_pixels']:,}"),
+        ("pixels whose shadow was traced, as rendered", f"{measured['shadow_pixels']:,}"),
+        ("pixels of the picture that differ from the photo", f"{measured['changed_pixels']:,}"),
+        ("exposure of the light", f"{measured['exposure_ev']:+.2f} EV"),
+    ]
+    for key, what in (
+        ("values_clamped_to_half", "values clamped to half precision"),
+        ("bad_pixels", "pixels that stayed non-finite, set to black"),
+    ):
+        if measured[key]:
+            rows.append((what, f"{measured[key]:,}"))
+    return rows
+
+
+def stage_words(stage: str) -> str:
+    """Return what a stage of the timings does."""
+    return _STAGES.get(stage, re.sub("[_-]", " ", stage))
+
+
+_STAGES = {
+    "read": "read and check all inputs",
+    "load": "load the renderer",
+    "regress": "read the light off the photo",
+    "detail": "take reflections from the photo",
+    "preview": "preview",
+    "scene": "build the scene",
+    "model": "load the prior",
+    "personalize": "adapt the prior to the photo",
+    "trace": "trace the transport",
+    "optimize": "optimise",
+    "accept": "judge the end",
+    "render": "render",
+    "write": "write the files",
+}

@@ -1,0 +1,292 @@
+"""Pinhole camera: intrinsics, pose, the projection both ways, and cameras from a few numbers.
+
+World right-handed, +Y up, metres; the camera looks along its own -Z with +Y up and +X right.
+Pixel (column j, row i) has its centre at (j + 0.5, i + 0.5), origin top left, y down.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from warpir.core.errors import ExitCode, InputError
+
+Float64Array = NDArray[np.float64]
+
+FILM_DIAGONAL_35MM = 43.267
+"""Diagonal of the 36 x 24 mm frame that EXIF's equivalent focal length refers to [mm]."""
+
+
+@dataclass(frozen=True)
+class Camera:
+    """A pinhole camera without distortion."""
+
+    width: int
+    """Image width [px]."""
+    height: int
+    """Image height [px]."""
+    fx: float
+    """Focal length along x [px]."""
+    fy: float
+    """Focal length along y [px]."""
+    cx: float
+    """Principal point, x [px]."""
+    cy: float
+    """Principal point, y [px]."""
+    c2w: Float64Array
+    """Camera to world, rigid, column vectors, shape [4, 4]."""
+    notices: tuple[str, ...] = field(default=(), compare=False)
+    """What was assumed or looks odd, one line each; printed and kept in ``run.json``."""
+
+    def scaled(self, width: int, height: int) -> "Camera":
+        """Return the same view at another resolution."""
+        sx, sy = width / self.width, height / self.height
+        return replace(
+            self,
+            width=width,
+            height=height,
+            fx=self.fx * sx,
+            fy=self.fy * sy,
+            cx=self.cx * sx,
+            cy=self.cy * sy,
+        )
+
+    def project(self, points: Float64Array) -> Float64Array:
+        """Project world points [m], shape [point, 3], to pixels, shape [point, 2].
+
+        Points behind the camera give NaN.
+        """
+        w2c = np.linalg.inv(self.c2w)
+        local = points @ w2c[:3, :3].T + w2c[:3, 3]
+        depth = np.where(local[:, 2] < 0.0, -local[:, 2], np.nan)
+        return np.stack(
+            [self.cx + self.fx * local[:, 0] / depth, self.cy - self.fy * local[:, 1] / depth],
+            axis=1,
+        )
+
+    def ray(self, u: float, v: float) -> tuple[Float64Array, Float64Array]:
+        """Return origin [m] and unit direction, world frame, through pixel position (u, v)."""
+        local = np.array([(u - self.cx) / self.fx, -(v - self.cy) / self.fy, -1.0])
+        direction = self.c2w[:3, :3] @ local
+        return self.c2w[:3, 3].copy(), direction / np.linalg.norm(direction)
+
+    def record(self) -> dict[str, Any]:
+        """Return the content of ``camera.json``, which ``--camera`` takes back."""
+        return {
+            "w": self.width,
+            "h": self.height,
+            "fx": self.fx,
+            "fy": self.fy,
+            "cx": self.cx,
+            "cy": self.cy,
+            "c2w": self.c2w.tolist(),
+        }
+
+
+def exr_matrices(camera: Camera) -> tuple[Float64Array, Float64Array]:
+    """Return OpenEXR's ``worldToCamera`` and ``worldToNDC``, shape [4, 4] each.
+
+    OpenEXR's camera is left-handed with +Z forward, its NDC runs from (0, 0) top left to (1, 1)
+    bottom right, and its matrices multiply row vectors, hence the transposes.
+    """
+    w2c = np.linalg.inv(camera.c2w)
+    width, height = camera.width, camera.height
+    projection = np.array(
+        [
+            [camera.fx / width, 0.0, -camera.cx / width, 0.0],
+            [0.0, -camera.fy / height, -camera.cy / height, 0.0],
+            [0.0, 0.0, 0.0, 1.0],
+            [0.0, 0.0, -1.0, 0.0],
+        ]
+    )
+    return (np.diag([1.0, 1.0, -1.0, 1.0]) @ w2c).T, (projection @ w2c).T
+
+
+def mitsuba_sensor(camera: Camera) -> dict[str, Any]:
+    """Return the parameters of Mitsuba 3's ``perspective`` sensor with ``fov_axis="x"``.
+
+    Mitsuba's camera looks along +Z with +X to the left. Its pixels are square: where fx and fy
+    differ, columns agree and rows do not, by `square_pixel_error`.
+
+    Returns:
+        ``to_world``: world from sensor, column vectors, array of shape [4, 4]; ``fov_deg``: angle
+        across the width [deg]; ``principal_point_offset_x`` and ``_y``: shares of width and height.
+    """
+    return {
+        "to_world": camera.c2w @ np.diag([-1.0, 1.0, -1.0, 1.0]),
+        "fov_deg": float(np.degrees(2.0 * np.arctan(camera.width / 2.0 / camera.fx))),
+        "principal_point_offset_x": (camera.width / 2.0 - camera.cx) / camera.width,
+        "principal_point_offset_y": (camera.height / 2.0 - camera.cy) / camera.height,
+    }
+
+
+def blender_camera(camera: Camera) -> dict[str, Any]:
+    """Return the parameters of a Blender camera with ``sensor_fit="AUTO"``.
+
+    Blender's camera axes are ours, its world has +Z up. AUTO measures angle and shifts by the
+    longer side. Pixels are taken to be square, as in `mitsuba_sensor`.
+
+    Returns:
+        ``matrix_world``: Blender's world from camera, column vectors, array of shape [4, 4];
+        ``angle``: across the longer side [rad]; ``shift_x`` and ``shift_y``: shares of it.
+    """
+    longer = max(camera.width, camera.height)
+    y_up_to_z_up = np.array([[1, 0, 0, 0], [0, 0, -1, 0], [0, 1, 0, 0], [0, 0, 0, 1]], np.float64)
+    return {
+        "matrix_world": y_up_to_z_up @ camera.c2w,
+        "angle": float(2.0 * np.arctan(longer / 2.0 / camera.fx)),
+        "shift_x": (camera.width / 2.0 - camera.cx) / longer,
+        "shift_y": (camera.cy - camera.height / 2.0) / longer,
+    }
+
+
+def square_pixel_error(camera: Camera) -> float:
+    """Return how far rows are off where fx has to stand for fy too, at the worst pixel [px]."""
+    farthest = max(abs(camera.cy), abs(camera.height - camera.cy))
+    return float(abs(camera.fx / camera.fy - 1.0) * farthest)
+
+
+# ----------------------------------------------------------------------- cameras from few numbers
+
+
+def camera_from_fov(
+    width: int,
+    height: int,
+    fov_deg: float,
+    pitch_deg: float,
+    camera_height: float,
+    horizon: float | None = None,
+) -> Camera:
+    """Return an upright camera at (0, camera_height, 0) that looks along -Z over the ground y = 0.
+
+    Args:
+        width: Image width [px].
+        height: Image height [px].
+        fov_deg: Horizontal field of view [deg].
+        pitch_deg: Upward tilt [deg]; negative looks down. Not used when `horizon` is given.
+        camera_height: Height over the ground [m].
+        horizon: Where the horizon is: a share of the height when within (0, 1), else a row [px].
+
+    Raises:
+        InputError: A number outside its range; the text names the flag.
+    """
+    notices = []
+    if not (np.isfinite(fov_deg) and 0.0 < fov_deg < 180.0):
+        raise InputError(
+            "--fov",
+            f"not a field of view (found {fov_deg}; expected degrees between 0 and 180)",
+            code=ExitCode.USAGE,
+        )
+    if fov_deg < 3.2:
+        notices.append(f"--fov: {fov_deg} degrees is very narrow; was it meant in radians?")
+    fx = width / 2.0 / np.tan(np.radians(fov_deg) / 2.0)
+    return _level_camera(width, height, float(fx), pitch_deg, camera_height, horizon, notices)
+
+
+def camera_from_exif(
+    focal_35mm: float,
+    width: int,
+    height: int,
+    pitch_deg: float,
+    camera_height: float,
+    horizon: float | None = None,
+) -> Camera:
+    """As `camera_from_fov`, from EXIF's 35 mm equivalent focal length [mm], by the diagonal."""
+    if not (np.isfinite(focal_35mm) and focal_35mm > 0.0):
+        raise InputError(
+            "--photo",
+            f"EXIF focal length is not one (found {focal_35mm}; expected millimetres > 0)",
+            "give --fov",
+        )
+    fx = focal_35mm * float(np.hypot(width, height)) / FILM_DIAGONAL_35MM
+    fov_deg = 2.0 * float(np.degrees(np.arctan(width / 2.0 / fx)))
+    notices = [
+        f"assumed: field of view {fov_deg:.1f} degrees, from the EXIF focal length "
+        f"{focal_35mm:g} mm (35 mm equivalent, by the diagonal); wrong if cropped"
+    ]
+    return _level_camera(width, height, fx, pitch_deg, camera_height, horizon, notices)
+
+
+def _level_camera(
+    width: int,
+    height: int,
+    focal: float,
+    pitch_deg: float,
+    camera_height: float,
+    horizon: float | None,
+    notices: list[str],
+) -> Camera:
+    """Return a camera without roll whose principal point is the image centre."""
+    if width < 1 or height < 1:
+        raise InputError("--photo", f"no pixels (found {width} x {height})")
+    if not (np.isfinite(camera_height) and camera_height > 0.0):
+        raise InputError(
+            "--camera-height",
+            f"not above the ground (found {camera_height}; expected metres > 0)",
+            code=ExitCode.USAGE,
+        )
+    cx, cy = width / 2.0, height / 2.0
+    if horizon is None:
+        if not (np.isfinite(pitch_deg) and -90.0 <= pitch_deg <= 90.0):
+            raise InputError(
+                "--pitch",
+                f"not a tilt (found {pitch_deg}; expected degrees between -90 and 90)",
+                code=ExitCode.USAGE,
+            )
+        pitch = float(np.radians(pitch_deg))
+    else:
+        if not np.isfinite(horizon):
+            raise InputError("--horizon", f"not a row (found {horizon})", code=ExitCode.USAGE)
+        row = horizon * height if 0.0 < horizon < 1.0 else horizon
+        # A level direction straight ahead projects to row cy + f tan(pitch).
+        pitch = float(np.arctan2(row - cy, focal))
+    cos, sin = np.cos(pitch), np.sin(pitch)
+    c2w = np.array(
+        [
+            [1.0, 0.0, 0.0, 0.0],
+            [0.0, cos, -sin, camera_height],
+            [0.0, sin, cos, 0.0],
+            [0.0, 0.0, 0.0, 1.0],
+        ]
+    )
+    return Camera(width, height, focal, focal, cx, cy, c2w, tuple(notices))
+
+
+def ground_point(
+    camera: Camera, u: float, v: float, plane: Sequence[float] = (0.0, 1.0, 0.0, 0.0)
+) -> Float64Array:
+    """Return where the ray through pixel position (u, v) meets the ground, world [m], shape [3].
+
+    Args:
+        camera: The camera.
+        u: Position to the right [px].
+        v: Position down [px].
+        plane: (a, b, c, d) of ``a x + b y + c z + d = 0``; any length of the normal.
+
+    Raises:
+        InputError: No plane, a camera in it, or a pixel at or beyond its horizon.
+    """
+    normal = np.asarray(plane[:3], dtype=np.float64)
+    length = float(np.linalg.norm(normal))
+    if len(plane) != 4 or not np.isfinite(plane).all() or length < 1e-12:
+        raise InputError(
+            "--ground",
+            f"not a plane (found {', '.join(map(str, plane))}; expected "
+            "a,b,c,d with a normal that is not 0)",
+            code=ExitCode.USAGE,
+        )
+    origin, direction = camera.ray(u, v)
+    distance = float(normal @ origin + plane[3]) / length
+    if abs(distance) < 1e-9:
+        raise InputError("--ground", "the plane passes through the camera")
+    approach = float(normal @ direction) / length
+    if approach * distance >= -1e-9 * abs(distance):
+        raise InputError(
+            "--at",
+            f"pixel ({u:g}, {v:g}) shows no ground: it lies at or above the horizon",
+            "choose a pixel lower in the image, or check the camera's pitch and field of view",
+        )
+    point: Float64Array = origin - direction * (distance / approach)
+    return point

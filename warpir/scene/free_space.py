@@ -1,0 +1,172 @@
+"""Where on the ground an object can stand: free of points, seen by the camera.
+
+Points above the ground by a tenth of the object's height, and lower than its top, are obstacles (of
+a car: between 0.15 m and 1.5 m). Lengths go by the object's size, because the scale of a point
+cloud need not be metres.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from warpir.core.errors import InputError
+from warpir.scene.camera import Camera
+from warpir.scene.placement import DEFAULT_STAND, Placement, point_on_ground
+
+Float64Array = NDArray[np.float64]
+Place = tuple[float, float, float]
+
+MARGIN = 0.1
+"""Space kept free around the object, as a share of its longest side."""
+STEP = 0.1
+"""Height above the ground from which a point is in the way, as a share of the object's."""
+STRAY = 2
+"""So many points in the way are taken for noise of the cloud."""
+NEAR, FAR = 1.2, 7.0
+"""Preferred distance, in longest sides of the object: 5 m to 30 m for a car."""
+GRID = (25, 24)
+"""Places tried, across the photo and down."""
+
+
+@dataclass(frozen=True)
+class Cloud:
+    """Points over a ground plane."""
+
+    points: Float64Array
+    """World frame [m], shape [point, 3]."""
+    heights: Float64Array
+    """Above the ground [m], shape [point]."""
+    noise: float
+    """Standard deviation of the ground's points from the plane [m]."""
+
+    def least_height(self, height: float) -> float:
+        """Return the height from which a point is in the way of an object of that height [m]."""
+        return max(STEP * height, 4.0 * self.noise)
+
+
+def find_place(
+    put: Callable[[Place], Placement],
+    low: Float64Array,
+    high: Float64Array,
+    camera: Camera,
+    plane: Float64Array,
+    cloud: Cloud,
+) -> Place:
+    """Return where the object stands free, world frame [m].
+
+    Of the places where it is seen whole, on ground that has points, with none in its way or in
+    front of it, the one nearest to the default pixel and the preferred distance. Where no place
+    is like that, the ground may lack points, and then the frame may cut the object.
+
+    Args:
+        put: Sets the object down at a place; refuses those that the camera cannot see.
+        low: Lowest corner of the asset's bounding box, asset frame [m], shape [3].
+        high: Highest corner of it, shape [3].
+        camera: The camera.
+        plane: The ground, unit normal on the camera's side, shape [4].
+        cloud: The points.
+
+    Raises:
+        InputError: Every place is occupied or hidden.
+    """
+    found: list[tuple[float, Place, Float64Array]] = []
+    for v in (np.arange(GRID[1]) + 0.5) / GRID[1]:
+        for u in (np.arange(GRID[0]) + 0.5) / GRID[0]:
+            try:
+                stand = point_on_ground((u * camera.width, v * camera.height), camera, plane)
+                place = (float(stand[0]), float(stand[1]), float(stand[2]))
+                matrix = put(place).asset_to_world
+            except InputError:
+                continue
+            sides = float(np.linalg.norm(stand - camera.c2w[:3, 3])) / _longest(matrix, low, high)
+            off = max(np.log(NEAR / sides), np.log(sides / FAR), 0.0)
+            cost = float(np.hypot(u - DEFAULT_STAND[0], v - DEFAULT_STAND[1]) + off)
+            found.append((cost, place, matrix))
+    fallback: tuple[int, Place] | None = None
+    for _, place, matrix in sorted(found, key=lambda entry: entry[0]):
+        box = _Box(matrix, low, high, camera)
+        if len(points_in_way(matrix, low, high, cloud)) > STRAY or box.hidden(cloud) > STRAY:
+            continue
+        rank = 2 * box.is_cut + (_ground_points(matrix, low, high, cloud) <= STRAY)
+        if rank == 0:
+            return place
+        if fallback is None or rank < fallback[0]:
+            fallback = rank, place
+    if fallback is None:
+        raise InputError(
+            "--ground-points",
+            f"no free place for the object in view (tried {len(found)})",
+            "give --at or --place, or a smaller --size",
+        )
+    return fallback[1]
+
+
+def points_in_way(
+    asset_to_world: Float64Array, low: Float64Array, high: Float64Array, cloud: Cloud
+) -> Float64Array:
+    """Return the points that stand where the object does, world frame [m], shape [point, 3]."""
+    height = _scale(asset_to_world) * float(high[1] - low[1])
+    is_raised = cloud.heights > cloud.least_height(height)
+    above = cloud.points[is_raised & (cloud.heights <= height)]
+    return above[_over_footprint(asset_to_world, low, high, above)]
+
+
+def _over_footprint(
+    asset_to_world: Float64Array, low: Float64Array, high: Float64Array, points: Float64Array
+) -> NDArray[np.bool_]:
+    """Return which points lie above or below the footprint and its margin, shape [point]."""
+    inverse = np.linalg.inv(asset_to_world)
+    local = points @ inverse[:3, :3].T + inverse[:3, 3]
+    margin = MARGIN * float((high - low).max())
+    inside = (local >= low - margin) & (local <= high + margin)
+    return np.asarray(inside[:, 0] & inside[:, 2])
+
+
+def _ground_points(
+    asset_to_world: Float64Array, low: Float64Array, high: Float64Array, cloud: Cloud
+) -> int:
+    """Return how many points of the ground lie under the object."""
+    height = _scale(asset_to_world) * float(high[1] - low[1])
+    ground = cloud.points[np.abs(cloud.heights) <= cloud.least_height(height)]
+    return int(_over_footprint(asset_to_world, low, high, ground).sum())
+
+
+class _Box:
+    """The object's bounding box as the camera sees it."""
+
+    def __init__(
+        self, asset_to_world: Float64Array, low: Float64Array, high: Float64Array, camera: Camera
+    ) -> None:
+        corners = np.stack(np.meshgrid(*zip(low, high, strict=True)), axis=-1).reshape(-1, 3)
+        world = corners @ asset_to_world[:3, :3].T + asset_to_world[:3, 3]
+        self.camera = camera
+        self.pixels = camera.project(world)
+        self.depth = float(_depths(world, camera).min())
+
+    @property
+    def is_cut(self) -> bool:
+        """Whether the frame cuts it, or it reaches behind the camera."""
+        size = (self.camera.width, self.camera.height)
+        return not ((self.pixels >= 0.0) & (self.pixels <= size)).all()
+
+    def hidden(self, cloud: Cloud) -> int:
+        """Return how many points stand between it and the camera."""
+        raised = cloud.points[cloud.heights > 4.0 * cloud.noise]
+        pixels = self.camera.project(raised)
+        within = (pixels >= self.pixels.min(axis=0)) & (pixels <= self.pixels.max(axis=0))
+        return int((within.all(axis=1) & (_depths(raised, self.camera) < self.depth)).sum())
+
+
+def _depths(points: Float64Array, camera: Camera) -> Float64Array:
+    depths: Float64Array = (camera.c2w[:3, 3] - points) @ camera.c2w[:3, 2]
+    return depths
+
+
+def _scale(asset_to_world: Float64Array) -> float:
+    return float(np.linalg.norm(asset_to_world[:3, 0]))
+
+
+def _longest(asset_to_world: Float64Array, low: Float64Array, high: Float64Array) -> float:
+    return _scale(asset_to_world) * float((high - low).max())

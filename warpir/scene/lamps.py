@@ -1,0 +1,124 @@
+"""Lamps: the narrow strong parts of a light, such as the sun, apart from all that surrounds them.
+
+One definition for lobes and maps: a lamp is what exceeds its surroundings within `LAMP_RADIUS_DEG`
+and sends more than `LAMP_SHARE` of the light's flux.
+"""
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from warpir.core.color import luminance
+from warpir.scene.light import Light, map_directions, texel_solid_angles
+
+Float64Array = NDArray[np.float64]
+
+LAMP_SHARE = 0.03
+"""Share of the flux above which a compact source counts [1]."""
+LAMP_RADIUS_DEG = 6.0
+"""Surroundings within which a compact source is measured [deg]; of a lobe, what its standard
+deviation is below."""
+LAMP_COUNT_MAX = 8
+LAMP_SHARPNESS_MAX = 1e5
+
+
+@dataclass(frozen=True)
+class MapLamps:
+    """Compact sources of a map."""
+
+    axes: Float64Array
+    """Unit directions, world frame, shape [lamp, 3]."""
+    sharpness: Float64Array
+    """Of lobes with their spread, shape [lamp]."""
+    near: list[NDArray[np.bool_]]
+    """Surroundings of each, shape [He, We]."""
+    rest: Float64Array
+    """Luminance of the map without them, shape [He, We]."""
+
+
+def lamps_of(texels: NDArray[np.float32], limit: int = LAMP_COUNT_MAX) -> MapLamps:
+    """Find compact sources: axis and sharpness by the moments of what exceeds the surroundings.
+
+    Args:
+        texels: Radiance, shape [He, We, 3].
+        limit: Most lamps to find.
+    """
+    height, width = texels.shape[:2]
+    directions = map_directions(height, width)
+    omega = np.broadcast_to(texel_solid_angles(height, width)[:, None], (height, width))
+    lum: Float64Array = np.asarray(luminance(texels.astype(np.float64)), np.float64)
+    total = (lum * omega).sum()
+    left = lum.copy()
+    axes: list[Float64Array] = []
+    sharpnesses: list[float] = []
+    covered: list[NDArray[np.bool_]] = []
+    while len(axes) < limit and total > 0.0:
+        peak = directions[np.unravel_index(np.argmax(left), left.shape)]
+        cosine = directions @ peak
+        near = cosine > np.cos(np.radians(LAMP_RADIUS_DEG))
+        ring = ~near & (cosine > np.cos(np.radians(2.0 * LAMP_RADIUS_DEG)))
+        level = float(np.median(lum[ring])) if ring.any() else 0.0
+        excess = np.where(near, np.maximum(left - level, 0.0), 0.0) * omega
+        if excess.sum() < LAMP_SHARE * total:
+            break
+        resultant = (excess[..., None] * directions).sum(axis=(0, 1))
+        axis = resultant / np.linalg.norm(resultant)
+        # Mean of 1 - cos is 1 / sharpness for a sharp lobe.
+        spread = float((excess * 0.5 * ((directions - axis) ** 2).sum(axis=-1)).sum())
+        spread /= float(excess.sum())
+        axes.append(axis)
+        sharpnesses.append(min(1.0 / max(spread, 1e-9), LAMP_SHARPNESS_MAX))
+        covered.append(near)
+        left[near] = np.minimum(left[near], level)
+    if not axes:
+        return MapLamps(np.zeros((0, 3)), np.zeros(0), [], left)
+    return MapLamps(np.array(axes), np.array(sharpnesses), covered, left)
+
+
+def without_lamps(light: Light, share: float = 1.0) -> Light:
+    """Return the light with this share of its lamps taken away [1]; the same object without lamps.
+
+    Args:
+        light: Lobes, a map or both.
+        share: 0 leaves the light as it is, 1 leaves its surroundings alone.
+    """
+    lobes, texels = light.lobes, light.texels
+    is_lamp = _lamp_lobes(light)
+    if lobes is not None and is_lamp.any():
+        kept = np.where(is_lamp, 1.0 - share, 1.0)[:, None]
+        lobes = replace(lobes, amplitude=(lobes.amplitude * kept).astype(np.float32))
+    if texels is not None:
+        found = lamps_of(texels)
+        if len(found.axes):
+            whole = luminance(texels.astype(np.float64))
+            rest = np.where(whole > 0.0, found.rest / np.where(whole > 0.0, whole, 1.0), 1.0)
+            kept = 1.0 - share * (1.0 - rest)
+            texels = (texels * kept[..., None]).astype(np.float32)
+    if lobes is light.lobes and texels is light.texels:
+        return light
+    return Light(lobes, texels)
+
+
+def lamp_axes(light: Light) -> Float64Array:
+    """Return the unit directions toward all lamps, world frame, shape [lamp, 3]."""
+    axes = [np.zeros((0, 3))]
+    if light.lobes is not None:
+        axes.append(light.lobes.axis[_lamp_lobes(light)].astype(np.float64))
+    if light.texels is not None:
+        axes.append(lamps_of(light.texels).axes)
+    return np.concatenate(axes)
+
+
+def _lamp_lobes(light: Light) -> NDArray[np.bool_]:
+    """Return which lobes are lamps, shape [lobe]."""
+    if light.lobes is None:
+        return np.zeros(0, bool)
+    flux = luminance(light.lobes.flux())
+    total = float(flux.sum())
+    if light.texels is not None:
+        omega = texel_solid_angles(*light.texels.shape[:2])[:, None]
+        total += float((luminance(light.texels.astype(np.float64)) * omega).sum())
+    narrow = light.lobes.sharpness > 1.0 / np.radians(LAMP_RADIUS_DEG) ** 2
+    found: NDArray[np.bool_] = narrow & (flux > LAMP_SHARE * total)
+    return found

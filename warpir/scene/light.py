@@ -1,0 +1,381 @@
+"""Light at infinity: spherical Gaussians plus a lat-long map, as plain arrays.
+
+Frame: world, +Y up. Map: OpenEXR lat-long orientation (image centre = +Z, left quarter = +X).
+Radiance is linear Rec.709, relative [W/(m^2 sr)].
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from itertools import pairwise
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from warpir.core.color import luminance
+
+FloatArray = NDArray[np.float32]
+Float64Array = NDArray[np.float64]
+
+SUN_RADIUS_DEG = 0.2665
+"""Mean angular radius of the sun [deg]."""
+
+
+@dataclass(frozen=True)
+class Lobes:
+    """Spherical Gaussians ``amplitude * exp(sharpness * (dot(v, axis) - 1))``."""
+
+    amplitude: FloatArray
+    """Peak radiance, shape [lobe, 3]."""
+    axis: FloatArray
+    """Unit axes, world frame, shape [lobe, 3]."""
+    sharpness: FloatArray
+    """Concentration, 1 / sigma^2 [1], shape [lobe]."""
+
+    def flux(self) -> Float64Array:
+        """Integrate each lobe over the sphere: ``2 pi c / s (1 - exp(-2 s))``, shape [lobe, 3]."""
+        s = self.sharpness.astype(np.float64)
+        return self.amplitude * (2.0 * np.pi * -np.expm1(-2.0 * s) / s)[:, None]
+
+
+@dataclass(frozen=True)
+class Light:
+    """The sum of some lobes and at most one map."""
+
+    lobes: Lobes | None = None
+    texels: FloatArray | None = None
+    """Shape [He, We, 3]."""
+
+    def scaled(self, factor: float) -> Light:
+        """Return the light times ``factor``."""
+        lobes = self.lobes
+        if lobes is not None:
+            lobes = replace(lobes, amplitude=(lobes.amplitude * factor).astype(np.float32))
+        texels = self.texels
+        if texels is not None:
+            texels = (texels * np.float32(factor)).astype(np.float32)
+        return Light(lobes, texels)
+
+    def rotated(self, degrees: float) -> Light:
+        """Turn the light about +Y, counter-clockwise seen from above."""
+        lobes = self.lobes
+        if lobes is not None:
+            a = np.radians(degrees)
+            turn = np.array(
+                [[np.cos(a), 0.0, np.sin(a)], [0.0, 1.0, 0.0], [-np.sin(a), 0.0, np.cos(a)]]
+            )
+            lobes = replace(lobes, axis=(lobes.axis @ turn.T).astype(np.float32))
+        texels = self.texels
+        if texels is not None:
+            texels = rotate_map(texels, degrees)
+        return Light(lobes, texels)
+
+    def irradiance(self, normal: Float64Array) -> Float64Array:
+        """Irradiance of a surface [W/m^2], RGB, by quadrature over a map of the whole light."""
+        total = np.zeros(3)
+        if self.texels is not None:
+            height, width = self.texels.shape[:2]
+            lon = np.pi * (1.0 - 2.0 * (np.arange(width) + 0.5) / width)
+            lat = np.pi * (0.5 - (np.arange(height) + 0.5) / height)
+            across = normal[0] * np.sin(lon) + normal[2] * np.cos(lon)
+            solid_angles = texel_solid_angles(height, width)
+            for row in range(height):  # the directions of a large map would take gigabytes
+                cosine = np.cos(lat[row]) * across + np.sin(lat[row]) * normal[1]
+                weight = np.maximum(cosine, 0.0) * solid_angles[row]
+                total += weight @ self.texels[row].astype(np.float64)
+        if self.lobes is not None:
+            for flux, axis, s in zip(
+                self.lobes.flux(), self.lobes.axis, self.lobes.sharpness, strict=True
+            ):
+                total += flux * lobe_cosine(float(np.dot(axis, normal)), float(s))
+        return total
+
+
+def lobe_cosine(cos_axis: float, sharpness: float) -> float:
+    """Return the mean clamped cosine over a lobe's directions, by quadrature in its own frame.
+
+    Args:
+        cos_axis: Cosine between the lobe's axis and the surface normal.
+        sharpness: Concentration of the lobe.
+    """
+    # Equal-probability rings of the lobe: t = 1 - cos of the angle to the axis.
+    u = (np.arange(256) + 0.5) / 256.0
+    t = np.clip(-np.log1p(u * np.expm1(-2.0 * sharpness)) / sharpness, 0.0, 2.0)
+    phi = (np.arange(256) + 0.5) / 256.0 * 2.0 * np.pi
+    sin_axis = np.sqrt(max(0.0, 1.0 - cos_axis * cos_axis))
+    radial = np.sqrt(t * (2.0 - t))[:, None] * np.cos(phi)[None, :]
+    cosine = (1.0 - t)[:, None] * cos_axis + radial * sin_axis
+    return float(np.maximum(cosine, 0.0).mean())
+
+
+def texel_solid_angles(height: int, width: int) -> Float64Array:
+    """Return the solid angle of a texel in each row [sr], shape [height]; the map sums to 4 pi."""
+    edges = np.cos(np.pi * np.arange(height + 1) / height)
+    return (2.0 * np.pi / width) * (edges[:-1] - edges[1:])
+
+
+def map_directions(height: int, width: int) -> Float64Array:
+    """Return the unit direction of each texel centre, world frame, shape [height, width, 3]."""
+    lon = np.pi * (1.0 - 2.0 * (np.arange(width) + 0.5) / width)
+    lat = np.pi * (0.5 - (np.arange(height) + 0.5) / height)
+    return np.stack(
+        [
+            np.cos(lat)[:, None] * np.sin(lon)[None, :],
+            np.broadcast_to(np.sin(lat)[:, None], (height, width)),
+            np.cos(lat)[:, None] * np.cos(lon)[None, :],
+        ],
+        axis=-1,
+    )
+
+
+def fibonacci(count: int) -> Float64Array:
+    """Return evenly spread unit directions, world frame, shape [count, 3] (a Fibonacci spiral)."""
+    k = np.arange(count) + 0.5
+    y = 1.0 - 2.0 * k / count
+    lon = np.pi * (1.0 + np.sqrt(5.0)) * k
+    r = np.sqrt(1.0 - y * y)
+    return np.stack([r * np.sin(lon), y, r * np.cos(lon)], axis=1)
+
+
+def rotate_map(texels: FloatArray, degrees: float) -> FloatArray:
+    """Turn a map about +Y, counter-clockwise seen from above; each row keeps its sum.
+
+    Whole columns are moved exactly.
+
+    The map's u falls with longitude (``lon = pi (1 - 2u)``), so content moves to smaller columns.
+    """
+    columns = -(degrees / 360.0) * texels.shape[1]
+    if abs(columns - round(columns)) < 1e-6:  # what 360 degrees in float64 leave behind
+        columns = round(columns)
+    whole = int(np.floor(columns))
+    part = np.float32(columns - whole)
+    moved = np.roll(texels, whole, axis=1)
+    if part > 0.0:
+        moved = (np.float32(1.0) - part) * moved + part * np.roll(texels, whole + 1, axis=1)
+    return np.ascontiguousarray(moved, dtype=np.float32)
+
+
+def axis_from_angles(azimuth_deg: float, elevation_deg: float) -> Float64Array:
+    """Return the unit direction toward (azimuth, elevation), world frame.
+
+    Azimuth is measured from -Z (straight ahead of an unturned camera) clockwise seen from above, so
+    +90 is to the right (+X).
+    """
+    a, e = np.radians(azimuth_deg), np.radians(elevation_deg)
+    return np.array([np.cos(e) * np.sin(a), np.sin(e), -np.cos(e) * np.cos(a)])
+
+
+def angles_from_axis(axis: Float64Array) -> tuple[float, float]:
+    """Return (azimuth, elevation) [deg] of a direction; the inverse of `axis_from_angles`."""
+    x, y, z = (float(c) for c in axis)
+    return float(np.degrees(np.arctan2(x, -z))), float(np.degrees(np.arctan2(y, np.hypot(x, z))))
+
+
+def sun_lobe(
+    azimuth_deg: float, elevation_deg: float, irradiance: tuple[float, float, float]
+) -> Lobes:
+    """Return one lobe with the sun's angular size.
+
+    Args:
+        azimuth_deg: See `axis_from_angles` [deg].
+        elevation_deg: Above the horizon [deg].
+        irradiance: Of a surface that faces the sun, linear RGB, relative [W/m^2].
+    """
+    # A uniform disc of radius r has the per-axis variance r^2 / 4; a lobe has 1 / sharpness.
+    sharpness = 4.0 / np.radians(SUN_RADIUS_DEG) ** 2
+    amplitude = np.asarray(irradiance) * sharpness / (2.0 * np.pi)
+    axis = axis_from_angles(azimuth_deg, elevation_deg)
+    return Lobes(
+        amplitude[None].astype(np.float32),
+        axis[None].astype(np.float32),
+        np.array([sharpness], np.float32),
+    )
+
+
+def plain_sky(sky: tuple[float, float, float], ground: tuple[float, float, float]) -> FloatArray:
+    """Return a map of one colour above the horizon and another below, shape [64, 128, 3].
+
+    Args:
+        sky: Radiance of the upper hemisphere, linear RGB.
+        ground: Radiance of the lower hemisphere, linear RGB.
+    """
+    texels = np.empty((64, 128, 3), np.float32)
+    texels[:32] = sky
+    texels[32:] = ground
+    return texels
+
+
+@dataclass(frozen=True)
+class LightSummary:
+    """What a person wants to know of a light."""
+
+    peak_luminance: float
+    mean_luminance: float
+    """Solid-angle weighted."""
+    azimuth_deg: float
+    elevation_deg: float
+    """Direction of the brightest part."""
+    peak_share: float
+    """Share of the total flux within 5 degrees of it [1]."""
+
+
+def rasterize_lobes(lobes: Lobes, height: int, width: int, side: int = 6) -> FloatArray:
+    """Return the mean radiance of the lobes in each texel, shape [height, width, 3].
+
+    The NumPy twin of `warpir.kernels.rasterize`, for files and summaries; power within 1 %. A lobe
+    whose standard deviation is below a quarter of a texel is put into its texel with its flux.
+
+    Args:
+        lobes: The lobes.
+        height: Rows of the map.
+        width: Columns of the map.
+        side: Directions along a texel's side, even.
+    """
+    texels = np.zeros((height, width, 3))
+    # A lobe of two texels and more is as good with a ninth of the directions.
+    broad = lobes.sharpness <= (height / (2.0 * np.pi)) ** 2
+    if side > 2 and broad.any():
+        texels += rasterize_lobes(_some(lobes, broad), height, width, 2)
+        lobes = _some(lobes, ~broad)
+        if not len(lobes.sharpness):
+            return texels.astype(np.float32)
+    omega = texel_solid_angles(height, width)
+    narrow = lobes.sharpness > (4.0 * height / np.pi) ** 2
+    # Rows at the two-point Gauss-Legendre nodes of even bands, as in the kernel: midpoints misjudge
+    # a lobe at a pole by up to 4 %.
+    step = np.pi / (height * side)
+    theta = (np.arange(height * side) // 2 * 2 + 1.0) * step
+    theta += np.tile([-1.0, 1.0], height * side // 2) * step / np.sqrt(3.0)
+    lon = np.pi * (1.0 - 2.0 * (np.arange(width * side) + 0.5) / (width * side))
+    sin_theta = np.sin(theta)[:, None]
+    big = np.stack(
+        np.broadcast_arrays(
+            sin_theta * np.sin(lon), np.cos(theta)[:, None], sin_theta * np.cos(lon)
+        ),
+        axis=-1,
+    )
+    # Within the texels at a pole, the points nearer to it stand for less of the sphere.
+    share = np.sin(theta).reshape(height, side)
+    share /= share.sum(axis=1, keepdims=True)
+    for amplitude, axis, s in zip(
+        lobes.amplitude[~narrow], lobes.axis[~narrow], lobes.sharpness[~narrow], strict=True
+    ):
+        shape = np.exp(s * (big @ axis.astype(np.float64) - 1.0))
+        fine = shape.reshape(height, side, width, side).mean(axis=3)
+        fine = (fine * share[:, :, None]).sum(axis=1)
+        texels += fine[..., None] * amplitude
+    for flux, axis in zip(lobes.flux()[narrow], lobes.axis[narrow], strict=True):
+        x, y, z = (float(c) for c in axis)
+        j = int((0.5 - 0.5 * np.arctan2(x, z) / np.pi) * width) % width
+        i = min(int(np.arctan2(np.hypot(x, z), y) / np.pi * height), height - 1)
+        texels[i, j] += flux / omega[i]
+    return texels.astype(np.float32)
+
+
+def _some(lobes: Lobes, chosen: NDArray[np.bool_]) -> Lobes:
+    return Lobes(lobes.amplitude[chosen], lobes.axis[chosen], lobes.sharpness[chosen])
+
+
+def as_map(light: Light, height: int) -> FloatArray:
+    """Return the whole light as one map of ``height`` rows, for files and previews.
+
+    A given map is resampled only if its size differs: averaged down, or repeated up.
+    """
+    width = 2 * height
+    texels = np.zeros((height, width, 3), np.float32)
+    if light.texels is not None:
+        texels += resize_map(light.texels, height)
+    if light.lobes is not None:
+        texels += rasterize_lobes(light.lobes, height, width)
+    return texels
+
+
+def resize_map(texels: FloatArray, height: int) -> FloatArray:
+    """Resample a map to ``height`` rows: each texel is the mean over its solid angle.
+
+    Texels are taken as constant, so energy is kept exactly at any size.
+    """
+
+    def boxes(
+        values: NDArray[np.floating[Any]], old: Float64Array, new: Float64Array
+    ) -> Float64Array:
+        """Average rows between rising ``old`` edges over rising ``new`` ones."""
+        averaged = np.empty((len(new) - 1, *values.shape[1:]))
+        # One row at a time: a float64 copy of an 8k map and its running sum would take 3 GiB.
+        for k, (low, high) in enumerate(pairwise(new)):
+            first = max(int(np.searchsorted(old, low, side="right")) - 1, 0)
+            last = max(int(np.searchsorted(old, high, side="left")), first + 1)
+            share = np.diff(np.clip(old[first : last + 1], low, high)) / (high - low)
+            averaged[k] = np.tensordot(share, values[first:last], axes=1)
+        return averaged
+
+    def heights(rows: int) -> Float64Array:
+        # Solid angle is proportional to the height on the sphere (Archimedes).
+        edges: Float64Array = -np.cos(np.pi * np.arange(rows + 1) / rows)
+        return edges
+
+    if texels.shape[0] == height and texels.shape[1] == 2 * height:
+        return texels
+    old_height, old_width = texels.shape[:2]
+    rows = boxes(texels, heights(old_height), heights(height))
+    columns = (np.linspace(0.0, 1.0, count + 1) for count in (old_width, 2 * height))
+    resized = boxes(np.moveaxis(rows, 1, 0), *columns)
+    return np.moveaxis(resized, 0, 1).astype(np.float32)
+
+
+def summarize(light: Light) -> LightSummary:
+    """Measure a light for printing and ``run.json``."""
+    texels = as_map(light, 128).astype(np.float64)
+    omega = texel_solid_angles(128, 256)[:, None]
+    lum = luminance(texels)
+    i, j = np.unravel_index(np.argmax(lum), lum.shape)
+    directions = map_directions(128, 256)
+    axis = directions[i, j]
+    near = directions @ axis > np.cos(np.radians(5.0))
+    flux = float((lum * omega).sum())
+    azimuth, elevation = angles_from_axis(axis)
+    return LightSummary(
+        peak_luminance=float(lum.max()),
+        mean_luminance=flux / (4.0 * np.pi),
+        azimuth_deg=azimuth,
+        elevation_deg=elevation,
+        peak_share=float((lum * omega)[near].sum()) / flux if flux > 0.0 else 0.0,
+    )
+
+
+def bearing(axis: Float64Array, c2w: Float64Array) -> float:
+    """Return a direction's azimuth from where a camera looks, clockwise seen from above [deg].
+
+    Of a camera that looks straight up or down, what its picture shows at the bottom counts as
+    behind.
+
+    Args:
+        axis: Unit direction, world frame, shape [3].
+        c2w: Pose of the camera, shape [4, 4].
+    """
+    level = np.array([1.0, 0.0, 1.0])
+    ahead = -np.asarray(c2w, np.float64)[:3, 2] * level
+    if float(np.linalg.norm(ahead)) < 1e-3:
+        ahead = np.asarray(c2w, np.float64)[:3, 1] * level
+    right = np.array([-ahead[2], 0.0, ahead[0]])  # ahead x up
+    return float(np.degrees(np.arctan2(axis @ right, axis @ ahead)))
+
+
+def describe(summary: LightSummary, c2w: Float64Array) -> str:
+    """Return a light in words, as a person at the camera would point at it.
+
+    Args:
+        summary: Of the light, in the world frame.
+        c2w: Pose of the camera, shape [4, 4].
+    """
+    axis = axis_from_angles(summary.azimuth_deg, summary.elevation_deg)
+    around = bearing(axis, c2w) % 360.0
+    sides = (
+        *("ahead", "ahead on the right", "the right", "behind on the right"),
+        *("behind", "behind on the left", "the left", "ahead on the left"),
+    )
+    side = sides[round(around / 45.0) % 8]
+    height = "overhead" if summary.elevation_deg > 75.0 else f"{summary.elevation_deg:.0f} deg high"
+    where = height if height == "overhead" else f"from {side}, {height}"
+    return f"light {where}, {100.0 * summary.peak_share:.0f} % of it from there"

@@ -1,0 +1,269 @@
+"""Where the object stands: the matrix from the asset's frame to the world.
+
+The asset's +Y becomes the ground's normal, its front +Z faces world +Z (toward a level camera) at
+``rotate_y = 0``, and its lowest point touches the ground. What stands at the chosen point is the
+centre of its footprint, since an asset's origin can be anywhere.
+"""
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from warpir.core.errors import InputError
+from warpir.scene.camera import Camera, ground_point
+from warpir.scene.receiver import ProxyMesh, first_hit
+
+Float64Array = NDArray[np.float64]
+
+DEFAULT_STAND = (0.5, 0.75)
+"""Where an object stands that was given no place: fractions of the photo's width and height."""
+SMALLEST_PLAUSIBLE = 0.01
+LARGEST_PLAUSIBLE = 100.0
+"""Sizes [m] outside of these are more often a unit mistake than meant."""
+STEEP = 0.5
+"""Cosine between a surface and the ground below which nothing is expected to stand on it [1]."""
+
+
+@dataclass(frozen=True)
+class Placement:
+    """Where the object stands."""
+
+    asset_to_world: Float64Array
+    """Rotation, uniform scale and translation, column vectors [m], shape [4, 4]."""
+    ground: Float64Array
+    """Ground plane (a, b, c, d): unit normal on the camera's side, offset [m], shape [4]."""
+    assumed: tuple[str, ...] = ()
+    """What was chosen because nothing was given, one line each."""
+    warnings: tuple[str, ...] = ()
+    """What may not be meant, one line each."""
+    summary: str = ""
+    """How far away, how large and where in the photo the object is, one line."""
+
+
+def place_asset(
+    low: Float64Array,
+    high: Float64Array,
+    camera: Camera,
+    ground: tuple[float, float, float, float] | Float64Array | None = None,
+    *,
+    place: tuple[float, float, float] | None = None,
+    at: tuple[float, float] | None = None,
+    rotate_y: float = 0.0,
+    scale: float | None = None,
+    size: float | None = None,
+    mesh: ProxyMesh | None = None,
+    is_plane: bool = True,
+) -> Placement:
+    """Set an asset on the ground.
+
+    Args:
+        low: Lowest corner of the asset's bounding box, asset frame [m], shape [3].
+        high: Highest corner of the asset's bounding box, asset frame [m], shape [3].
+        camera: Camera of the photo at the photo's resolution.
+        ground: Plane ``a x + b y + c z + d = 0``, world frame; absent means ``y = 0``.
+        place: Where the object stands, world frame [m]; moved onto the ground along its normal.
+        at: Where the object stands, as a pixel of the ground or of ``mesh`` in the photo [px].
+        rotate_y: Turn about the ground's normal, counter-clockwise seen from above [deg].
+        scale: Factor on the asset's own size [1].
+        size: Longest side of the bounding box after scaling [m].
+        mesh: Of the photo's place, which the object may stand on.
+        is_plane: Whether it may stand on the ground plane too; without, ``place`` is not moved and
+            the plane only says what is upright.
+
+    Raises:
+        InputError: The place is not on the visible ground, or the camera cannot see the object.
+    """
+    assumed: list[str] = []
+    warnings: list[str] = []
+    origin = camera.c2w[:3, 3]
+    plane = upright_plane(ground, origin)
+    if ground is None:
+        assumed.append("the ground is the plane y = 0")
+
+    if place is not None:
+        where = "--place"
+        stand = np.asarray(place, dtype=np.float64)
+        if is_plane:
+            stand = stand - plane[:3] * (plane[:3] @ stand + plane[3])
+    else:
+        where = "--at"
+        if at is None:
+            at = (DEFAULT_STAND[0] * camera.width, DEFAULT_STAND[1] * camera.height)
+            assumed.append(f"the object stands at pixel {at[0]:g},{at[1]:g} (--at, --place)")
+        if mesh is None:
+            stand = point_on_ground(at, camera, plane)
+        else:
+            stand, steep = _point_on_place(at, camera, plane, mesh, is_plane)
+            warnings += steep
+
+    sides = high - low
+    longest = float(sides.max())
+    if size is not None:
+        if longest <= 0.0:
+            raise InputError("--size", "the asset is a single point", "use another asset")
+        scale = size / longest
+    elif scale is None:
+        scale = 1.0
+        shown = " x ".join(f"{side:.3g}" for side in sides)
+        assumed.append(f"the asset keeps its own size of {shown} m (--size, --scale)")
+    if not SMALLEST_PLAUSIBLE <= longest * scale <= LARGEST_PLAUSIBLE:
+        warnings.append(f"the object is {longest * scale:.3g} m large; meant? (--size, --scale)")
+
+    rotation = turn(plane[:3], math.radians(rotate_y)) @ y_to(plane[:3])
+    foot = np.array([(low[0] + high[0]) / 2.0, low[1], (low[2] + high[2]) / 2.0])
+    asset_to_world = np.eye(4)
+    asset_to_world[:3, :3] = scale * rotation
+    asset_to_world[:3, 3] = stand - scale * (rotation @ foot)
+
+    shown = " x ".join(f"{scale * side:.3g}" for side in sides)
+    seen, cut = _check_in_view(where, shown, _corners(low, high), asset_to_world, camera)
+    warnings += cut
+    away = float(np.linalg.norm(stand - origin))
+    summary = f"the object of {shown} m stands {away:.3g} m from the camera, {seen}"
+    return Placement(asset_to_world, plane, tuple(assumed), tuple(warnings), summary)
+
+
+def upright_plane(
+    ground: tuple[float, float, float, float] | Float64Array | None, camera_origin: Float64Array
+) -> Float64Array:
+    """Return the ground plane with a unit normal that points to the camera's side, shape [4].
+
+    Args:
+        ground: Plane ``a x + b y + c z + d = 0``, world frame; absent means ``y = 0``.
+        camera_origin: Camera position, world frame [m], shape [3].
+
+    Raises:
+        InputError: The plane has no normal or runs through the camera.
+    """
+    plane = np.array((0.0, 1.0, 0.0, 0.0) if ground is None else ground, dtype=np.float64)
+    length = float(np.linalg.norm(plane[:3]))
+    if not (math.isfinite(length) and length > 0.0):
+        raise InputError("--ground", "a normal a,b,c that is not 0 is needed (found 0)")
+    plane /= length
+    distance = float(plane[:3] @ camera_origin + plane[3])
+    if abs(distance) < 1e-6 * (1.0 + float(np.linalg.norm(camera_origin))):
+        raise InputError(
+            "--ground", "the ground runs through the camera", "give --camera-height or --ground"
+        )
+    return plane if distance > 0.0 else -plane
+
+
+def point_on_ground(at: tuple[float, float], camera: Camera, plane: Float64Array) -> Float64Array:
+    """Return the ground point seen at a pixel, world frame [m], shape [3].
+
+    Args:
+        at: Pixel position (u, v) [px].
+        camera: Camera of the photo at the photo's resolution.
+        plane: Ground plane of `upright_plane`, shape [4].
+
+    Raises:
+        InputError: The pixel is outside the photo, or at or above the horizon.
+    """
+    _check_in_photo(at, camera)
+    try:
+        return ground_point(camera, *at, plane=tuple(map(float, plane)))
+    except InputError as error:
+        raise InputError("--at", error.what, error.advice, error.code) from None
+
+
+def _check_in_photo(at: tuple[float, float], camera: Camera) -> None:
+    if not (0.0 <= at[0] <= camera.width and 0.0 <= at[1] <= camera.height):
+        raise InputError(
+            "--at",
+            f"outside the photo (found {at[0]:g},{at[1]:g}; "
+            f"expected up to {camera.width},{camera.height})",
+        )
+
+
+def _point_on_place(
+    at: tuple[float, float],
+    camera: Camera,
+    plane: Float64Array,
+    mesh: ProxyMesh,
+    is_plane: bool,
+) -> tuple[Float64Array, list[str]]:
+    """Return what a pixel shows first, mesh or plane, world frame [m], and what looks odd."""
+    _check_in_photo(at, camera)
+    origin, direction = camera.ray(*at)
+    distances, triangles = first_hit(mesh, origin[None], direction[None])
+    reach = float(distances[0])
+    slope = float(plane[:3] @ direction)
+    if is_plane and slope < 0.0:
+        to_plane = -float(plane[:3] @ origin + plane[3]) / slope
+        if to_plane <= reach:
+            return origin + to_plane * direction, []
+    pixel = f"pixel ({at[0]:g}, {at[1]:g}) shows"
+    if not math.isfinite(reach):
+        shown = "neither ground nor --proxy" if is_plane else "nothing of --proxy"
+        raise InputError("--at", f"{pixel} {shown}", "choose another pixel")
+    a, b, c = mesh.positions[mesh.indices[triangles[0]]]
+    normal = np.cross(b - a, c - a)
+    steep = abs(float(plane[:3] @ normal)) < STEEP * float(np.linalg.norm(normal))
+    warning = f"{pixel} a steep side of --proxy: is the object to stand there? (--at)"
+    return origin + reach * direction, [warning] if steep else []
+
+
+def y_to(normal: Float64Array) -> Float64Array:
+    """Return the smallest rotation from +Y to a unit vector, shape [3, 3]."""
+    x, y, z = (float(component) for component in normal)
+    if y < -1.0 + 1e-12:
+        return np.diag([1.0, -1.0, -1.0])
+    # Rodrigues' formula about the axis (+Y) x normal = (z, 0, -x).
+    k = 1.0 / (1.0 + y)
+    return np.array(
+        [[1.0 - k * x * x, x, -k * x * z], [-x, y, -z], [-k * x * z, z, 1.0 - k * z * z]]
+    )
+
+
+def up_to_y(axis: str) -> Float64Array:
+    """Return the smallest rotation from an axis such as ``+z`` or ``-x`` to +Y, shape [3, 3]."""
+    up = np.zeros(3)
+    up["xyz".index(axis[-1])] = -1.0 if axis.startswith("-") else 1.0
+    return y_to(up).T
+
+
+def turn(axis: Float64Array, angle: float) -> Float64Array:
+    """Return the right-handed rotation about a unit axis by an angle [rad], shape [3, 3]."""
+    x, y, z = (float(component) for component in axis)
+    cross = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
+    rotation: Float64Array = np.eye(3) + math.sin(angle) * cross
+    rotation += (1.0 - math.cos(angle)) * (cross @ cross)
+    return rotation
+
+
+def _corners(low: Float64Array, high: Float64Array) -> Float64Array:
+    return np.array(
+        [[x, y, z] for x in (low[0], high[0]) for y in (low[1], high[1]) for z in (low[2], high[2])]
+    )
+
+
+def _check_in_view(
+    where: str, size: str, corners: Float64Array, asset_to_world: Float64Array, camera: Camera
+) -> tuple[str, list[str]]:
+    """Refuse an object that the camera cannot see; return where in the photo it is, and warnings.
+
+    The bounding box is looked at, so an object may be reported as cut that just fits.
+    """
+    eye = np.linalg.solve(asset_to_world, camera.c2w[:, 3])[:3]
+    if np.all((eye > corners[0]) & (eye < corners[-1])):
+        raise InputError(
+            where,
+            f"the camera is inside the object of {size} m",
+            "move it away, or use --size or --scale (.01 for centimetres)",
+        )
+    pixels = camera.project(corners @ asset_to_world[:3, :3].T + asset_to_world[:3, 3])
+    seen = pixels[np.isfinite(pixels).all(axis=1)]
+    if len(seen) == 0:
+        raise InputError(where, "the object is behind the camera", "the camera looks along -Z")
+    if len(seen) < len(pixels):
+        return "partly behind it", ["the object reaches behind the camera"]
+    (left, top), (right, bottom) = seen.min(axis=0), seen.max(axis=0)
+    box = f"columns {left:.0f} to {right:.0f}, rows {top:.0f} to {bottom:.0f}"
+    frame = f"the photo is {camera.width} x {camera.height}"
+    if right <= 0.0 or bottom <= 0.0 or left >= camera.width or top >= camera.height:
+        raise InputError(where, f"the object is outside the photo ({box}; {frame})")
+    if left < 0.0 or top < 0.0 or right > camera.width or bottom > camera.height:
+        return f"its box in {box}", [f"the object may be cut by the photo's edge ({box}; {frame})"]
+    return f"its box in {box}", []

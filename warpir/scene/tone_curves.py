@@ -1,0 +1,135 @@
+"""Tone curves of a picture as plain arrays: monotone rational-quadratic splines.
+
+A curve goes from (0, 0) to (1, 1) (Durkan et al. 2019, "Neural Spline Flows") and is given by its
+knots. The foreground has one, the shadow ratio one per channel. `warpir.render.tone_curve` has the
+parameters that are optimised, `warpir.kernels.tone` the device's evaluation,
+`warpir.io.curves_file` the file.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+FloatArray = NDArray[np.float32]
+Float64Array = NDArray[np.float64]
+
+TONES = ("linear", "reinhard")
+"""Operators between radiance and the foreground's curve: clipped, or ``x / (1 + x)``."""
+CURVE_COUNTS = {"foreground": 1, "shadow_ratio": 3}
+RESOLVED = 0.97
+"""Display-linear value up to which a photo says how bright a thing is [1]: more may be clipped."""
+
+
+@dataclass(frozen=True)
+class ToneKnots:
+    """Knots of one or several tone curves, shape [curve, bin + 1] each."""
+
+    x: FloatArray
+    y: FloatArray
+    slope: FloatArray
+
+    @property
+    def bin_count(self) -> int:
+        """Number of bins."""
+        return int(self.x.shape[1]) - 1
+
+    def arrays(self) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """Return the arrays in the kernels' order."""
+        return self.x, self.y, self.slope
+
+    def invert(self, y: NDArray[np.floating[Any]], curve: int = 0) -> Float64Array:
+        """Return where a curve has these values in [0, 1] (Durkan et al. 2019, eqs. 6 to 8).
+
+        Args:
+            y: Values; clamped to [0, 1]. Any shape.
+            curve: Which curve.
+        """
+        knot_x, knot_y, slope = (k[curve].astype(np.float64) for k in self.arrays())
+        y = np.clip(np.asarray(y, np.float64), 0.0, 1.0)
+        b = np.clip(np.searchsorted(knot_y, y, side="right") - 1, 0, self.bin_count - 1)
+        width, rise = np.diff(knot_x)[b], np.diff(knot_y)[b]
+        d0, d1, m = slope[b], slope[b + 1], rise / width
+        above, bend = y - knot_y[b], d0 + d1 - 2.0 * m
+        a = rise * (m - d0) + above * bend
+        half = rise * d0 - above * bend
+        root = np.sqrt(np.maximum(half * half + 4.0 * a * m * above, 0.0))
+        # 2 c / (-b - sqrt(b^2 - 4 a c)): the form that does not cancel where the bin is straight.
+        inverse: Float64Array = knot_x[b] + width * 2.0 * m * above / (half + root)
+        return inverse
+
+    def evaluate(self, x: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Evaluate every curve (Durkan et al. 2019, eq. 4), as `warpir.kernels.tone` does.
+
+        Args:
+            x: Where; clamped to [0, 1], shape [...].
+
+        Returns:
+            Values in [0, 1], shape [..., curve].
+        """
+        x = np.clip(x, 0.0, 1.0)
+        return np.stack(
+            [
+                _spline(x, *(a[k].astype(np.float64) for a in self.arrays()))
+                for k in range(len(self.x))
+            ],
+            axis=-1,
+        )
+
+    @staticmethod
+    def identity(curves: int, bins: int = 5) -> ToneKnots:
+        """Return curves that change nothing."""
+        x = np.tile(np.linspace(0.0, 1.0, bins + 1, dtype=np.float32), (curves, 1))
+        return ToneKnots(x, x.copy(), np.ones_like(x))
+
+
+def _spline(
+    t: NDArray[np.float64],
+    x: NDArray[np.float64],
+    y: NDArray[np.float64],
+    slope: NDArray[np.float64],
+) -> NDArray[np.float64]:
+    """Evaluate one curve within [0, 1] from its knots."""
+    k = np.clip(np.searchsorted(x, t, side="right") - 1, 0, len(x) - 2)
+    width, rise = x[k + 1] - x[k], y[k + 1] - y[k]
+    m, q = rise / width, (t - x[k]) / width
+    r = q * (1.0 - q)
+    bent = (m * q * q + slope[k] * r) / (m + (slope[k + 1] + slope[k] - 2.0 * m) * r)
+    value: NDArray[np.float64] = y[k] + rise * bent
+    return value
+
+
+@dataclass(frozen=True)
+class Curves:
+    """All tone curves of a picture, and the operator in front of the foreground's."""
+
+    tone: str
+    """``linear`` or ``reinhard``."""
+    foreground: ToneKnots
+    """One curve."""
+    shadow_ratio: ToneKnots
+    """Three curves, red, green and blue."""
+
+    def radiance(self, photo_lin: NDArray[np.floating[Any]]) -> Float64Array:
+        """Return the radiance that the foreground's curve and operator show as these values.
+
+        Values above 1, which only a linear plate has, are radiance as they are; without an
+        operator that is. With Reinhard's, `RESOLVED` is the most that is read.
+
+        Args:
+            photo_lin: Display-linear values [1], any shape.
+        """
+        shown = self.foreground.invert(photo_lin)
+        if self.tone == "reinhard":
+            shown = np.minimum(shown, RESOLVED)
+            return shown / (1.0 - shown)
+        return np.where(photo_lin > 1.0, photo_lin, shown)
+
+    @staticmethod
+    def identity(tone: str) -> Curves:
+        """Return curves that change nothing."""
+        one, three = CURVE_COUNTS.values()
+        return Curves(tone, ToneKnots.identity(one), ToneKnots.identity(three))

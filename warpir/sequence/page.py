@@ -1,0 +1,91 @@
+"""The page of a sequence, ``sequence.html``: frames in small, with links to their reports."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Sequence
+from html import escape
+from pathlib import Path
+
+from warpir.app.config import InsertConfig
+from warpir.app.record import name_of
+from warpir.core.atomic import write_file
+from warpir.core.errors import ExitCode, InputError, disk_error
+from warpir.core.signals import whole
+from warpir.core.strict_json import read_json_object
+from warpir.report.facts import in_words, without_folders
+from warpir.report.page import MADE_BY, REPORT, html_page, section
+from warpir.report.pictures import thumbnail
+from warpir.sequence.frames import Frame
+
+PAGE = "sequence.html"
+SHOWN = 240
+"""Most frames with a picture, spread over the sequence: the page stays small."""
+
+
+def refuse_other_page(config: InsertConfig) -> None:
+    """Refuse to write where a page that is none of ours would be lost.
+
+    Raises:
+        InputError: It is there, and --overwrite is not given (`ExitCode.OUTPUT`).
+    """
+    assert config.out is not None
+    path = Path(config.out) / PAGE
+    if not config.report or config.overwrite or not os.path.lexists(path):
+        return
+    try:
+        with path.open("rb") as stream:
+            is_ours = MADE_BY in stream.read(4096)
+    except OSError:
+        is_ours = False
+    if not is_ours:
+        advice = "choose another --out, or pass --overwrite"
+        raise InputError(path, "not a page of warpir's", advice, ExitCode.OUTPUT)
+
+
+def write_sequence_report(config: InsertConfig, frames: Sequence[Frame]) -> None:
+    """Write ``sequence.html`` beside the frames' folders.
+
+    Args:
+        config: Of the sequence.
+        frames: All finished.
+
+    Raises:
+        InputError: A result is not readable, or the disk is full (exit 5).
+    """
+    assert config.out is not None and config.sequence is not None
+    every = max(1, -(-len(frames) // SHOWN))
+    cards = (_card(frame, k % every == 0) for k, frame in enumerate(frames))
+    content = html_page(
+        kind="warpir, report of a sequence",
+        title=f"{name_of(config.sequence)}: {len(frames)} frames",
+        lead=f"Lit by {name_of(config.reuse)}." if config.reuse else "",
+        sections=[section("Frames", f'<ol class="frames">{"".join(cards)}</ol>')],
+    )
+    path = Path(config.out) / PAGE
+    try:
+        with whole():
+            write_file(path, content)
+    except OSError as error:
+        raise disk_error(path, error) from error
+
+
+def _card(frame: Frame, has_picture: bool) -> str:
+    name = frame.folder.name
+    record = read_json_object(frame.folder / "run.json")
+    picture = ""
+    if has_picture:
+        shown = thumbnail(frame.folder / "composite.png", frame.config.max_pixels)
+        picture = (
+            f'<img src="{shown.uri}" width="{shown.width}" height="{shown.height}" '
+            f'alt="The result of frame {name}" loading="lazy">'
+        )
+    target = REPORT if (frame.folder / REPORT).exists() else "composite.png"
+    changes = ", ".join(
+        f"{n.replace('_', '-')} {in_words(n, getattr(frame.config, n))}" for n in frame.changed
+    )
+    told = escape(without_folders(changes, frame.config) or "as the command line says")
+    notices = len(record.get("notices", ()))
+    counted = f"{notices} notice{'s' if notices > 1 else ''}"
+    warned = f'<br><span class="mark">{counted}</span>' if notices else ""
+    return f'<li><a href="{name}/{target}">{picture}<b>{name}</b></a><br>{told}{warned}</li>'

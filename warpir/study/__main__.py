@@ -1,0 +1,7 @@
+"""``python -m warpir.study``."""
+
+import sys
+
+from warpir.study.command import main
+
+sys.exit(main())

@@ -1,0 +1,313 @@
+r"""Train the networks that warpir ships: the embedded prior, and the regressor of the first light.
+
+    python -m warpir.train regressor --panoramas DIR --assets DIR --out DIR --minutes 9
+    python -m warpir.train prior --panoramas DIR --assets DIR --out DIR --minutes 9 \
+        --total-minutes 18
+    python -m warpir.train prior ... --resume
+
+Scenes are rendered as they are needed and then forgotten; the prior learns from each twice.
+A command stops after ``--minutes`` and ``--resume`` goes on, until ``--total-minutes`` are used up.
+With torchrun a network is trained on several cards. ``--without`` names panoramas and assets that
+must not be learned from; of those that ``--validation`` names only the errors are looked at.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import math
+import os
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from warpir.app.config import usage
+from warpir.app.program import run_program, say
+from warpir.core.atomic import restore_folders
+from warpir.core.errors import ExitCode, InputError
+
+if TYPE_CHECKING:
+    import torch
+
+    from warpir.train.batches import PhotoBatch, PriorBatch
+    from warpir.train.scenes import Stock
+
+MADE_UP_OBJECTS = 240
+"""Made-up objects to learn from."""
+VALIDATION_PICTURES = 768
+"""Of each kind."""
+VALIDATION_SEED = 10**6
+REUSES = 2
+"""Steps in a row with the same composites, at other times, noises and words: rendering takes as
+long as learning."""
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Run the command line; return the exit status."""
+    return run_program(_run, argv)
+
+
+def _parser() -> argparse.ArgumentParser:
+    parser = argparse.ArgumentParser("python -m warpir.train", description=_first_line())
+    parser.add_argument("network", choices=("prior", "regressor"))
+    parser.add_argument("--panoramas", type=Path, nargs="+", required=True, metavar="DIR")
+    parser.add_argument("--assets", type=Path, nargs="*", default=[], metavar="DIR", help="objects")
+    parser.add_argument("--without", nargs="*", default=[], metavar="NAME", help="not learned from")
+    parser.add_argument(
+        "--validation", nargs="*", default=[], metavar="NAME", help="only looked at"
+    )
+    parser.add_argument("--out", type=Path, required=True, metavar="DIR")
+    parser.add_argument("--minutes", type=float, default=9.0, help="of this command")
+    parser.add_argument("--total-minutes", type=float, help="of all commands together")
+    parser.add_argument("--batch", type=int, default=None)
+    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--device", default=None)
+    parser.add_argument("--resume", action="store_true")
+    parser.add_argument("--start", type=Path, metavar="FILE", help="weights to begin with")
+    parser.add_argument(
+        "--regressor", type=Path, metavar="FILE", help="weights that the prior is told the light by"
+    )
+    parser.add_argument("--no-compile", action="store_true", help="do without torch.compile")
+    return parser
+
+
+def _first_line() -> str:
+    return (__doc__ or "").partition("\n")[0]
+
+
+def _run(arguments: list[str]) -> int:
+    options = _parser().parse_args(arguments)
+    if options.resume and options.start is not None:
+        raise usage("--start", "what is resumed has its own weights")
+    _check(options)
+    panoramas = files_in(options.panoramas, (".hdr", ".exr"))
+    assets = files_in(options.assets, (".glb", ".gltf", ".obj", ".stl", ".ply"))
+    unknown = sorted({*options.without, *options.validation} - {p.stem for p in panoramas + assets})
+    if unknown:
+        say(f"notice: no panorama or asset is called {', '.join(unknown)}")
+
+    import torch
+
+    from warpir.render.renderer import choose_device
+    from warpir.train.lights import load_panoramas
+    from warpir.train.meshes import make_meshes, read_meshes
+    from warpir.train.scenes import Stock
+
+    rank = int(os.environ.get("LOCAL_RANK", "0"))
+    device = f"cuda:{rank}" if "LOCAL_RANK" in os.environ else choose_device(options.device)
+    kept_out = {*options.without, *options.validation}
+    learned = [p for p in panoramas if p.stem not in kept_out]
+    watched = [p for p in panoramas if p.stem in options.validation]
+    meshes = [*make_meshes(MADE_UP_OBJECTS, options.seed)]
+    meshes += read_meshes(p for p in assets if p.stem not in kept_out)
+    if is_first():
+        say(
+            f"device: {device}; {len(learned)} panoramas, {len(meshes)} objects; "
+            f"validation on {len(watched)} panoramas"
+        )
+    torch_device = torch.device("cpu" if device == "cpu" else device)
+    # What is validated on has other panoramas and other objects.
+    others = make_meshes(48, VALIDATION_SEED + options.seed)
+    stocks = (
+        Stock(meshes, load_panoramas(learned, torch_device), device),
+        Stock(others, load_panoramas(watched, torch_device), device),
+    )
+    record = {
+        "panoramas": [p.stem for p in learned],
+        "validation_panoramas": [p.stem for p in watched],
+        "kept_out": list(options.without),
+        "assets": [p.stem for p in assets if p.stem not in kept_out],
+        "made_up_objects": MADE_UP_OBJECTS,
+        "device": torch.cuda.get_device_name(torch_device) if device != "cpu" else "cpu",
+    }
+    train = _train_prior if options.network == "prior" else _train_regressor
+    result = train(options, stocks, options.seed * 1000 + rank, torch_device, record)
+    if is_first():
+        say(json.dumps(result))
+    return ExitCode.DONE
+
+
+def _check(options: argparse.Namespace) -> None:
+    """Find what is wrong with numbers and folders before scenes are made, which takes minutes.
+
+    Raises:
+        InputError: A number makes no sense (exit 2), there is nothing to resume (3), or --out holds
+            a training that would be lost (7).
+    """
+    for name in ("minutes", "total_minutes"):
+        value = getattr(options, name)
+        if value is not None and not 0.0 < value < math.inf:
+            raise usage(f"--{name.replace('_', '-')}", f"expected above 0 (found {value})")
+    if options.batch is not None and options.batch < 1:
+        raise usage("--batch", f"expected at least 1 (found {options.batch})")
+    for name in ("start", "regressor"):
+        path = getattr(options, name)
+        if path is not None and not path.is_file():
+            raise InputError(path, "no such file", code=ExitCode.MODEL)
+    if options.out.exists() and not options.out.is_dir():
+        raise InputError(options.out, "not a folder", "choose another --out", ExitCode.OUTPUT)
+    restore_folders(options.out)
+    begun = any(options.out.glob("checkpoint-*")) or any(options.out.glob("state-*"))
+    if begun and not options.resume:
+        advice = "--resume goes on with it; or choose another --out"
+        raise InputError(options.out, "holds a training that was begun", advice, ExitCode.OUTPUT)
+    if options.resume and not begun:
+        raise InputError(options.out, "nothing to resume", "leave --resume out to begin")
+
+
+def files_in(folders: Sequence[Path], suffixes: tuple[str, ...]) -> list[Path]:
+    """Return the files of these kinds in folders and the folders in them, sorted by name.
+
+    Raises:
+        InputError: A folder is not there.
+    """
+    found = []
+    for folder in folders:
+        if not folder.is_dir():
+            raise InputError(folder, "no such folder")
+        paths = (*folder.glob("*"), *folder.glob("*/*"))
+        found += [path for path in paths if path.suffix.lower() in suffixes]
+    return sorted(found, key=lambda path: path.stem)
+
+
+def _counted(
+    make: Callable[[int, int], Any],
+) -> Callable[[int, torch.Generator], Any]:
+    """Return a callable that gives new batches: it begins at an index that is drawn once."""
+    index: int | None = None
+
+    def batches(count: int, generator: torch.Generator) -> Any:
+        nonlocal index
+        if index is None:
+            import torch
+
+            drawn = torch.randint(2**30, (), generator=generator, device=generator.device)
+            index = int(drawn)
+        index += 1
+        return make(index, count)
+
+    return batches
+
+
+def _reused(
+    batches: Callable[[int, torch.Generator], Any], times: int
+) -> Callable[[int, torch.Generator], Any]:
+    """Return a callable that gives each batch several times in a row."""
+    held: list[Any] = []
+
+    def repeated(count: int, generator: torch.Generator) -> Any:
+        if not held:
+            held.extend([batches(count, generator)] * times)
+        return held.pop()
+
+    return repeated
+
+
+def _train_prior(
+    options: argparse.Namespace,
+    stocks: tuple[Stock, Stock],
+    seed: int,
+    device: torch.device,
+    record: dict[str, Any],
+) -> dict[str, Any]:
+    from warpir.diffusion.embedded import read_network
+    from warpir.diffusion.train import TrainSettings, export_prior, train_prior
+    from warpir.lighting.regressor import load_regressor
+    from warpir.train.scenes import Mixture, SceneGenerator
+
+    learned, unseen = stocks
+    regressor = load_regressor(options.regressor, device)
+    record = record | {"regressor": regressor.record}
+    start = None
+    if options.start is not None:
+        start, begun = read_network(options.start)
+        record |= {"started_from": begun}
+
+    def drawn(mixture: Mixture) -> list[PriorBatch]:
+        scenes = SceneGenerator(unseen, VALIDATION_SEED, mixture, regressor)
+        return [scenes.prior_batch(k, 128) for k in range(3)]
+
+    kinds = {"procedural": {"made_up": 1.0, "hybrid": 0.0}}
+    if unseen.panoramas.panorama_count:
+        kinds["panoramas"] = {"made_up": 0.0, "hybrid": 0.0}
+    validation = {name: drawn(Mixture(**shares)) for name, shares in kinds.items()}
+    pairs = {
+        name: [
+            *zip(
+                drawn(Mixture(**shares, mismatched=0.0)),
+                drawn(Mixture(**shares, mismatched=1.0)),
+                strict=True,
+            )
+        ]
+        for name, shares in kinds.items()
+    }
+    settings = TrainSettings(batch=options.batch or 256, compile=not options.no_compile)
+    scenes = SceneGenerator(learned, seed, regressor=regressor)
+    progress = train_prior(
+        _reused(_counted(scenes.prior_batch), REUSES),
+        options.out,
+        settings,
+        device,
+        options.minutes,
+        options.total_minutes or options.minutes,
+        resume=options.resume,
+        seed=options.seed,
+        validation=validation,
+        pairs=pairs,
+        network=start,
+        say=say if is_first() else _nobody,
+    )
+    if is_first():
+        export_prior(options.out, options.out / "prior.safetensors", record)
+    return {"step": progress.step, "samples": progress.samples, "seconds": progress.seconds}
+
+
+def is_first() -> bool:
+    """Return whether this process is the one that talks and writes."""
+    return os.environ.get("RANK", "0") == "0"
+
+
+def _nobody(text: str) -> None:
+    """Take what the other processes would say."""
+
+
+def _train_regressor(
+    options: argparse.Namespace,
+    stocks: tuple[Stock, Stock],
+    seed: int,
+    device: torch.device,
+    record: dict[str, Any],
+) -> dict[str, Any]:
+    from warpir.lighting.regressor import load_regressor
+    from warpir.train.regressor import TrainingSettings, train_regressor
+    from warpir.train.scenes import Mixture, SceneGenerator
+
+    learned, unseen = stocks
+    # Fewer panorama crops than the prior sees: they are few places, and could be learned by heart.
+    scenes = SceneGenerator(learned, seed, Mixture(made_up=0.45, hybrid=0.35))
+
+    def drawn(**shares: float) -> list[PhotoBatch]:
+        made = SceneGenerator(unseen, VALIDATION_SEED, Mixture(**shares, proxies=0.0))
+        return [made.photo_batch(k, 128) for k in range(VALIDATION_PICTURES // 128)]
+
+    validation = {"procedural": drawn(made_up=1.0, hybrid=0.0)}
+    if unseen.panoramas.panorama_count:
+        validation["panoramas"] = drawn(made_up=0.0, hybrid=0.0)
+    settings = TrainingSettings(batch=options.batch or 256, compile=not options.no_compile)
+    start = None if options.start is None else load_regressor(options.start, device)
+    if start is not None:
+        record = record | {"started_from": start.record}
+    end = train_regressor(
+        _counted(scenes.photo_batch),
+        validation,
+        options.out,
+        settings,
+        device,
+        options.minutes,
+        options.total_minutes or options.minutes,
+        resume=options.resume,
+        seed=options.seed,
+        network=start,
+        record=record,
+    )
+    return vars(end)

@@ -1,0 +1,334 @@
+"""Lights to learn from: real panoramas, and made-up skies and rooms, each split into sun and rest.
+
+The sun of a light is what exceeds its surroundings within a few degrees of the brightest spot: the
+real sun, a lamp, or a window. Everything else is a small map. Kept apart, both can be turned,
+weakened and coloured without ray tracing ever meeting a texel that holds most of the light.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from warpir.core.color import LUMINANCE_WEIGHTS, luminance
+from warpir.io.images.photos import read_envmap
+from warpir.scene.light import map_directions, resize_map, texel_solid_angles
+
+FloatArray = NDArray[np.float32]
+Float64Array = NDArray[np.float64]
+
+HEIGHT = 32
+"""Rows of the map of everything but the sun."""
+SPLIT_HEIGHT = 128
+"""Rows of the map on which the sun is found."""
+SPOT_DEG = 4.0
+"""Width of the filter that finds the brightest spot [deg]."""
+CAP_DEG, RING_DEG = 10.0, 16.0
+"""The sun lies within the first; between both is what it is compared with [deg]."""
+SEEN_HEIGHT = 512
+"""Rows of the panoramas that are photographed."""
+SKY_ONLY = "sky"
+"""In the names of panoramas without a ground, such as ``mud_road_puresky``."""
+CIE_SKIES = (
+    (4.0, -0.70, 0.0, -1.0, 0.0), (4.0, -0.70, 2.0, -1.5, 0.15), (1.1, -0.80, 0.0, -1.0, 0.0),
+    (1.1, -0.80, 2.0, -1.5, 0.15), (0.0, -1.0, 0.0, -1.0, 0.0), (0.0, -1.0, 2.0, -1.5, 0.15),
+    (0.0, -1.0, 5.0, -2.5, 0.30), (0.0, -1.0, 10.0, -3.0, 0.45), (-1.0, -0.55, 2.0, -1.5, 0.15),
+    (-1.0, -0.55, 5.0, -2.5, 0.30), (-1.0, -0.55, 10.0, -3.0, 0.45),
+    (-1.0, -0.32, 10.0, -3.0, 0.45), (-1.0, -0.32, 16.0, -3.0, 0.30),
+    (-1.0, -0.15, 16.0, -3.0, 0.30), (-1.0, -0.15, 24.0, -2.8, 0.15),
+)  # fmt: skip
+"""Parameters a to e of the CIE standard general sky (ISO 15469:2004), overcast to clear."""
+
+
+@dataclass(frozen=True)
+class Split:
+    """A light as its sun and the rest; luminance-weighted where one number is asked for."""
+
+    axis: Float64Array
+    """Unit direction of the sun, the map's frame, shape [3]."""
+    sun: Float64Array
+    """Irradiance of a surface that faces it, linear RGB, shape [3]."""
+    sigma: float
+    """Its angular standard deviation per axis [rad]."""
+    rest: FloatArray
+    """Everything else, shape [He, We, 3] of the map that was split."""
+
+
+def split_sun(texels: FloatArray) -> Split:
+    """Split a lat-long map into its dominant light and the rest; both sum to the map.
+
+    Args:
+        texels: Radiance, shape [He, We, 3].
+    """
+    height = texels.shape[0]
+    values = texels.astype(np.float64)
+    directions = map_directions(height, 2 * height)
+    omega = np.broadcast_to(texel_solid_angles(height, 2 * height)[:, None], directions.shape[:2])
+    lum = luminance(values)
+    # The brightest spot, not the brightest texel: a lamp's reflex must not outdo a window.
+    # A count, not a threshold: in an even map every texel reaches the quantile.
+    bright = np.argsort(lum, axis=None, kind="stable")[-max(1, lum.size // 200) :]
+    axes, weights = directions.reshape(-1, 3)[bright], (lum * omega).ravel()[bright]
+    nearness = np.exp((axes @ axes.T - 1.0) / np.radians(SPOT_DEG) ** 2)
+    centre = axes[int(np.argmax(nearness @ weights))]
+    angle = np.degrees(np.arccos(np.clip(directions @ centre, -1.0, 1.0)))
+    ring = (angle >= CAP_DEG) & (angle < RING_DEG)
+    around = np.median(values[ring], axis=0)
+    # Full within most of the cap, then fading, so that no edge is left behind.
+    share = np.clip((CAP_DEG - angle) / (0.3 * CAP_DEG), 0.0, 1.0)[..., None]
+    excess = np.maximum(values - around, 0.0) * share
+    flux = luminance(excess) * omega
+    total = max(float(flux.sum()), 1e-30)
+    axis = (directions * flux[..., None]).sum(axis=(0, 1)) + 1e-30 * centre
+    axis /= np.linalg.norm(axis)
+    cosine = np.clip(directions @ axis, -1.0, 1.0)
+    sigma = float(np.sqrt((flux * np.arccos(cosine) ** 2).sum() / (2.0 * total)))
+    sun = (excess * (omega * np.maximum(cosine, 0.0))[..., None]).sum(axis=(0, 1))
+    return Split(axis, sun, max(sigma, 0.0047), (values - excess).astype(np.float32))
+
+
+@dataclass(frozen=True)
+class LightPool:
+    """Lights by index, on one device; panoramas first."""
+
+    fine: Tensor
+    """Maps without suns, shape [light, 32, 64, 3]."""
+    axis: Tensor
+    """Shape [light, 3]."""
+    sun: Tensor
+    """Shape [light, 3]."""
+    sigma: Tensor
+    """Shape [light]."""
+    weather: Tensor
+    """Index into `WEATHERS`, -1 unknown, int64, shape [light]."""
+    indoors: Tensor
+    """1 indoors, 0 outdoors, -1 unknown, int64, shape [light]."""
+    seen: Tensor
+    """Panoramas as they are photographed, shape [panorama, 512, 1024, 3]; one black one if none."""
+    panorama_count: int
+    grounded_count: int
+    """Those of them, in front, that show a ground."""
+
+    @property
+    def count(self) -> int:
+        """Number of lights."""
+        return len(self.fine)
+
+    def flux_share(self) -> Tensor:
+        """Return the sun's share of the light's flux, which is that of a sphere's irradiance."""
+        omega = solid_angles(self.fine)
+        rest = (gray(self.fine) * omega).sum(dim=(1, 2))
+        sun = gray(self.sun)
+        return sun / (sun + rest).clamp(min=1e-20)
+
+    def levels(self) -> tuple[Tensor, Tensor, Tensor]:
+        """Return the maps at full, half and quarter size."""
+        return self.fine, halved(self.fine), halved(halved(self.fine))
+
+    def with_skies(self, skies: LightPool) -> LightPool:
+        """Return the panoramas of this pool with other made-up lights behind them."""
+        n = self.panorama_count
+        names = ("fine", "axis", "sun", "sigma", "weather", "indoors")
+        joined: dict[str, Any] = {
+            k: torch.cat([getattr(self, k)[:n], getattr(skies, k)]) for k in names
+        }
+        return replace(self, **joined)
+
+
+def gray(rgb: Tensor) -> Tensor:
+    """Return the luminance of the last axis."""
+    return (rgb * torch.tensor(LUMINANCE_WEIGHTS, dtype=rgb.dtype, device=rgb.device)).sum(dim=-1)
+
+
+def solid_angles(maps: Tensor) -> Tensor:
+    """Return the solid angle of each texel of maps [..., He, We, 3], shape [He, 1] [sr]."""
+    height, width = maps.shape[-3:-1]
+    omega = torch.from_numpy(texel_solid_angles(height, width)).to(maps)
+    return omega[:, None]
+
+
+def halved(maps: Tensor) -> Tensor:
+    """Return maps of half the size; each texel is the mean over its solid angle."""
+    weighted = maps * solid_angles(maps)[..., None]
+    n, height, width, _ = maps.shape
+    summed = weighted.view(n, height // 2, 2, width // 2, 2, 3).sum(dim=(2, 4))
+    return summed / solid_angles(summed)[..., None]
+
+
+def load_panoramas(paths: list[Path], device: torch.device | str) -> LightPool:
+    """Read panoramas; each is scaled to mean luminance 1, which changes nothing in a photograph.
+
+    Args:
+        paths: Files; sky-only ones are put last.
+        device: Of the tensors.
+
+    Raises:
+        InputError: A file cannot be used.
+    """
+    seen, fine, splits = [], [], []
+    paths = sorted(paths, key=lambda path: (SKY_ONLY in path.stem, path.stem))
+    for path in paths:
+        texels = read_envmap(path)
+        omega = texel_solid_angles(*texels.shape[:2])[:, None]
+        mean = float((luminance(texels.astype(np.float64)) * omega).sum() / (4.0 * np.pi))
+        texels = (texels / max(mean, 1e-20)).astype(np.float32)
+        split = split_sun(resize_map(texels, SPLIT_HEIGHT))
+        splits.append(split)
+        fine.append(resize_map(split.rest, HEIGHT))
+        seen.append(resize_map(texels, SEEN_HEIGHT))
+
+    def stacked(values: list[FloatArray] | list[Float64Array]) -> Tensor:
+        return torch.from_numpy(np.stack(values).astype(np.float32)).to(device)
+
+    unknown = torch.full((len(paths),), -1, dtype=torch.int64, device=device)
+    if not paths:
+        black = torch.zeros(1, 2, 4, 3, device=device)
+        nothing = torch.zeros(0, 3, device=device)
+        maps = torch.zeros(0, HEIGHT, 2 * HEIGHT, 3, device=device)
+        return LightPool(maps, nothing, nothing, nothing[:, 0], unknown, unknown, black, 0, 0)
+    return LightPool(
+        stacked(fine),
+        stacked([s.axis for s in splits]),
+        stacked([s.sun for s in splits]),
+        torch.tensor([s.sigma for s in splits], dtype=torch.float32, device=device),
+        unknown,
+        unknown,
+        stacked(seen),
+        len(paths),
+        sum(SKY_ONLY not in path.stem for path in paths),
+    )
+
+
+def make_lights(count: int, generator: torch.Generator, device: torch.device | str) -> LightPool:
+    """Make up lights: CIE skies with a sun over a ground, and rooms with lamps and windows.
+
+    Args:
+        count: How many.
+        generator: Of this device.
+        device: Where they are made.
+    """
+
+    def u(low: float, high: float, *shape: int) -> Tensor:
+        return low + (high - low) * torch.rand(count, *shape, generator=generator, device=device)
+
+    height, width = HEIGHT, 2 * HEIGHT
+    directions = torch.from_numpy(map_directions(height, width)).float().to(device)
+    y = directions[..., 1]
+    # Kinds: 0 clear, 1 broken clouds, 2 overcast, 3 low sun, 4 room, 5 night.
+    shares = torch.tensor([0.34, 0.14, 0.12, 0.12, 0.18, 0.10], device=device)
+    kind = torch.multinomial(shares, count, replacement=True, generator=generator)
+    is_room, is_night = kind == 4, kind == 5
+    elevation = torch.deg2rad(u(8.0, 78.0))
+    elevation = torch.where(kind == 3, torch.deg2rad(u(1.0, 14.0)), elevation)
+    elevation = torch.where(is_room | is_night, torch.deg2rad(u(5.0, 88.0)), elevation)
+    azimuth = u(0.0, 2.0 * np.pi)
+    axis = torch.stack(
+        [
+            elevation.cos() * azimuth.sin(),
+            elevation.sin(),
+            -elevation.cos() * azimuth.cos(),
+        ],
+        dim=1,
+    )
+    cosine = torch.einsum("hwc,nc->nhw", directions, axis).clamp(-1.0, 1.0)
+    # Luminance of the sky (ISO 15469): gradation from the zenith times indicatrix around the sun.
+    table = torch.tensor(CIE_SKIES, device=device)
+    first = torch.tensor([11, 6, 0, 8, 0, 0], device=device)[kind]
+    last = torch.tensor([14, 10, 5, 14, 4, 4], device=device)[kind]
+    chosen = first + (u(0.0, 1.0) * (last - first + 1)).long().clamp(max=4)
+    a, b, c, d, e = table[chosen.clamp(max=14)].T[:, :, None, None]
+    chi = torch.arccos(cosine)
+    zenith = torch.exp(b / y.clamp(min=0.02))
+    sky = (1.0 + a * zenith) * (
+        1.0 + c * (torch.exp(d * chi) - torch.exp(d * np.pi / 2.0)) + e * cosine.square()
+    )
+    sky = sky.clamp(min=0.02) * (y > 0.0)
+    omega = torch.from_numpy(texel_solid_angles(height, width)).float().to(device)[:, None]
+    sky = sky / (sky * y.clamp(min=0.0) * omega).sum(dim=(1, 2), keepdim=True)
+    # Colours: blue above, paler at the horizon; grey under clouds; warm near a low sun.
+    blue = torch.tensor([0.42, 0.62, 1.0], device=device)
+    pale = torch.tensor([0.85, 0.93, 1.0], device=device)
+    grey = torch.tensor([0.95, 0.98, 1.0], device=device)
+    warm = torch.tensor([1.0, 0.62, 0.32], device=device)
+    up = y.clamp(min=0.0).sqrt()[None, ..., None]
+    clear = pale * (1.0 - up) + blue * up
+    cloudy = torch.where(kind <= 0, u(0.0, 0.25), u(0.3, 1.0))[:, None, None, None]
+    colour = clear * (1.0 - cloudy) + grey * cloudy
+    glow = (torch.exp(-2.0 * chi) * (1.0 - (elevation / 0.5).clamp(0.0, 1.0))[:, None, None]) * u(
+        0.3, 1.0, 1, 1
+    )
+    glow = glow[..., None] * (1.0 - 0.8 * up)
+    colour = colour * (1.0 - glow) + warm * glow
+    maps = sky[..., None] * colour
+    # Clouds: patches that brighten and darken.
+    coarse = torch.randn(count, 1, 5, 10, generator=generator, device=device)
+    finer = torch.randn(count, 1, 10, 20, generator=generator, device=device)
+    patches = sum(
+        torch.nn.functional.interpolate(x, (height, width), mode="bicubic")[:, 0] * s
+        for x, s in ((coarse, 1.0), (finer, 0.6))
+    )
+    strength = torch.where(kind == 1, u(0.2, 0.7), u(0.0, 0.25))[:, None, None]
+    maps = maps * torch.exp(strength * patches)[..., None]
+    # The sun, facing it, over the sky on level ground. The air that it passes colours it more than
+    # it weakens that ratio, for the sky darkens with it: clear panoramas have 4 to 13, at all
+    # elevations.
+    ratio = torch.exp(u(np.log(2.0), np.log(16.0)))
+    ratio = torch.where(kind == 1, torch.exp(u(np.log(0.2), np.log(5.0))), ratio)
+    ratio = torch.where(kind == 2, u(0.0, 0.03), ratio)
+    sine = elevation.sin().clamp(min=0.03)
+    air = torch.exp(-0.12 / sine)
+    tint = torch.stack([torch.ones_like(air), 0.55 + 0.42 * air, 0.25 + 0.65 * air], dim=1)
+    sun = (ratio * torch.exp(-0.03 / sine))[:, None] * tint
+    sigma = torch.deg2rad(torch.exp(u(np.log(0.27), np.log(1.5))))
+    sigma = torch.where(kind == 1, sigma * u(1.0, 4.0), sigma)
+    # Rooms and nights: walls, and blobs of light of which the strongest is the "sun".
+    wall = (
+        u(0.05, 0.4, 1, 1, 1)
+        * u(0.75, 1.25, 1, 1, 3)
+        * (1.0 + 0.6 * y[None, ..., None] * u(-0.5, 1.0, 1, 1, 1))
+    )
+    for _ in range(3):
+        spot = torch.nn.functional.normalize(
+            torch.randn(count, 3, generator=generator, device=device)
+            + torch.tensor([0.0, 0.6, 0.0], device=device),
+            dim=1,
+        )
+        near = (torch.einsum("hwc,nc->nhw", directions, spot) - 1.0) / u(0.06, 0.35, 1, 1).square()
+        wall = wall + torch.exp(near)[..., None] * (u(0.0, 1.0, 1, 1, 1) ** 3 * 6.0) * u(
+            0.6, 1.0, 1, 1, 3
+        )
+    wall = wall / (gray(wall) * omega).sum(dim=(1, 2))[:, None, None, None] * 4.0
+    lamp_tint = 1.0 - u(0.0, 0.45, 1) * torch.tensor([0.0, 0.45, 1.0], device=device)
+    lamp = torch.exp(u(np.log(0.1), np.log(4.0)))[:, None] * lamp_tint
+    within = is_room | is_night
+    chooser = within[:, None, None, None]
+    ground_albedo = u(0.05, 0.4, 3) * torch.tensor([1.0, 0.92, 0.8], device=device)
+    falling = (gray(maps) * y.clamp(min=0.0) * omega).sum(dim=(1, 2))[:, None]
+    below = ground_albedo * (falling + sun * axis[:, 1:2].clamp(min=0.0)) / np.pi
+    maps = torch.where(y[None, ..., None] > 0.0, maps, below[:, None, None, :])
+    maps = torch.where(chooser, wall, maps)
+    night_level = torch.exp(u(np.log(0.05), np.log(0.6)))[:, None, None, None]
+    maps = torch.where(is_night[:, None, None, None], maps * night_level, maps)
+    sun = torch.where(within[:, None], lamp, sun)
+    lamp_sigma = torch.deg2rad(torch.exp(u(np.log(1.5), np.log(13.0))))
+    sigma = torch.where(within, torch.where(is_night, 0.4 * lamp_sigma, lamp_sigma), sigma)
+    # sunny, sunny or overcast, overcast, twilight, lamp, night
+    weather = torch.tensor([0, 0, 1, 2, 4, 3], device=device)[kind]
+    weather = torch.where((kind == 1) & (ratio < 0.6), torch.ones_like(weather), weather)
+    return LightPool(
+        maps.contiguous(),
+        axis,
+        sun.contiguous(),
+        sigma,
+        weather,
+        is_room.long(),
+        torch.zeros(1, 2, 4, 3, device=device),
+        0,
+        0,
+    )
