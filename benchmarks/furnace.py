@@ -7,9 +7,8 @@ warpir. Run as ``python -m benchmarks.furnace``; prints the largest E over angle
 """
 
 import numpy as np
-from numpy.typing import NDArray
 
-FloatArray = NDArray[np.float64]
+from warpir.core.arrays import Float64Array
 
 
 def directional_albedo(
@@ -36,10 +35,10 @@ def directional_albedo(
     node, node_weight = 0.5 * (node + 1.0), 0.5 * node_weight
     phi = 2.0 * np.pi * (np.arange(order) + 0.5) / order
 
-    def schlick(cosine: FloatArray, f0: float = f0) -> FloatArray:
+    def schlick(cosine: Float64Array, f0: float = f0) -> Float64Array:
         return f0 + (1.0 - f0) * (1.0 - np.abs(cosine)) ** 5
 
-    def smith(cosine: FloatArray | float) -> FloatArray:
+    def smith(cosine: Float64Array | float) -> Float64Array:
         return np.sqrt(alpha**2 + (1.0 - alpha**2) * np.square(cosine))
 
     # Specular: mean of F G2 / G1 over visible normals

@@ -16,10 +16,11 @@ import trimesh
 from numpy.typing import NDArray
 
 from benchmarks.measure import context, peak_mib, report, seconds
+from warpir.core.arrays import IntArray
 from warpir.io.assets import load_asset
 from warpir.render.device_scene import Placed, Proxy, Scene
 from warpir.render.integrator import LightTensors, MaterialTensors
-from warpir.render.mis import IntArray, MisIntegrator
+from warpir.render.mis import MisIntegrator
 from warpir.render.renderer import Renderer, choose_device, light_args
 from warpir.scene.asset import Asset, Material, Primitive
 from warpir.scene.camera import camera_from_fov

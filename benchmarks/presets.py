@@ -4,12 +4,10 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
+from warpir.core.arrays import Float64Array, FloatArray
 from warpir.scene.asset import Asset
 from warpir.scene.camera import Camera
-
-Float64Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True)
@@ -73,7 +71,7 @@ class ScenePreset:
             self.width, self.height, focal, focal, 0.5 * self.width, 0.5 * self.height, c2w
         )
 
-    def texels(self, assets: Path) -> NDArray[np.float32]:
+    def texels(self, assets: Path) -> FloatArray:
         """Light, relative [W/(m^2 sr)], shape [light_width / 2, light_width, 3]."""
         import OpenImageIO as oiio
 

@@ -15,16 +15,15 @@ import json
 import time
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 from PIL import Image
 
 from benchmarks.referee.__main__ import foreground
 from tools.demo.make import pixel_directions
 from tools.demo.place import paving_texture
 from tools.demo.sky import seen
+from warpir.core.arrays import Float64Array, FloatArray, IntArray, PixelArray
 from warpir.core.color import linear_to_gamma
 from warpir.demo import ASSET, LIGHT
 from warpir.io.assets import load_asset
@@ -40,9 +39,6 @@ from warpir.scene.placement import Placement, place_asset
 from warpir.scene.receiver import ProxyMesh, first_hit, mesh_of
 from warpir.scene.shadow_mask import shadow_mask
 from warpir.scene.tone_curves import Curves, ToneKnots
-
-FloatArray = NDArray[np.float32]
-IntArray = NDArray[np.int32]
 
 DEPTH = 4
 GROUND = 40.0
@@ -92,7 +88,7 @@ def yard() -> tuple[Asset, Asset]:
     return ground, Asset("wall", (primitive,), (brick,))
 
 
-def joined(parts: list[tuple[Asset, NDArray[np.float64]]]) -> Asset:
+def joined(parts: list[tuple[Asset, Float64Array]]) -> Asset:
     """Return several assets where they stand as one, in the world's frame."""
     primitives: list[Primitive] = []
     materials: list[Material] = []
@@ -125,14 +121,14 @@ def joined(parts: list[tuple[Asset, NDArray[np.float64]]]) -> Asset:
     return Asset("place", tuple(primitives), tuple(materials), tuple(textures))
 
 
-def photograph(asset: Asset, camera: Camera, texels: FloatArray, samples: int) -> NDArray[Any]:
+def photograph(asset: Asset, camera: Camera, texels: FloatArray, samples: int) -> PixelArray:
     """Return the place's linear radiance as Mitsuba path-traces it, the sky behind it."""
     shot = foreground(asset, np.eye(4), camera, texels, DEPTH, samples, 0)
     sky = seen(texels, pixel_directions(camera))
     return np.asarray(shot.mean + (1.0 - shot.coverage)[..., None] * sky)
 
 
-def painted_mask(wall: ProxyMesh, camera: Camera, sun: NDArray[np.float64]) -> FloatArray:
+def painted_mask(wall: ProxyMesh, camera: Camera, sun: Float64Array) -> FloatArray:
     """Return what a user would paint: ground that the wall keeps from the sun's centre."""
     rays = pixel_directions(camera).reshape(-1, 3)
     eye = np.broadcast_to(camera.c2w[:3, 3], rays.shape)
@@ -145,7 +141,7 @@ def painted_mask(wall: ProxyMesh, camera: Camera, sun: NDArray[np.float64]) -> F
     return mask.reshape(camera.height, camera.width).astype(np.float32)
 
 
-def as_photo(display: NDArray[Any]) -> Photo:
+def as_photo(display: PixelArray) -> Photo:
     """Return 8-bit codes of display values as a photo."""
     codes = np.round(255.0 * np.clip(display, 0.0, 1.0)).astype(np.uint8)
     return Photo(codes=codes, srgb=codes.astype(np.float32) / np.float32(255.0), kind="png")
@@ -193,14 +189,12 @@ def insertions(
     return found
 
 
-def rmse(a: NDArray[Any], b: NDArray[Any], box: tuple[slice, slice]) -> float:
+def rmse(a: PixelArray, b: PixelArray, box: tuple[slice, slice]) -> float:
     """Root of the mean squared difference of display values in a box."""
     return float(np.sqrt(np.square(a[box].astype(np.float64) - b[box]).mean()))
 
 
-def changed_box(
-    truth: NDArray[Any], photo: NDArray[Any], seen_car: IntArray
-) -> tuple[slice, slice]:
+def changed_box(truth: PixelArray, photo: PixelArray, seen_car: IntArray) -> tuple[slice, slice]:
     """Return rows and columns of what the car changes clearly, its own pixels included."""
     difference = np.abs(truth - photo).mean(axis=-1)
     for axis in (0, 1):  # one path that meets the car far away is no change
@@ -230,7 +224,7 @@ def main() -> None:
     texels = read_envmap(options.panorama)
     azimuth = angles_from_axis(lamp_axes(Light(texels=texels))[0])[0]
     rows, figures = [], []
-    photos: dict[float, tuple[FloatArray, float, NDArray[Any]]] = {}
+    photos: dict[float, tuple[FloatArray, float, PixelArray]] = {}
     for case in CASES:
         # Counter-clockwise, azimuths run clockwise.
         turned = resize_map(rotate_map(texels, azimuth - case.sun_azimuth), 256)

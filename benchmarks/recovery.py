@@ -19,11 +19,11 @@ from typing import Any
 import numpy as np
 import torch
 import warp as wp
-from numpy.typing import NDArray
 from torch import Tensor
 
 from benchmarks.measure import context
 from warpir.app.optimize_settings import OptimizeSettings
+from warpir.core.arrays import Float64Array, FloatArray
 from warpir.core.color import gamma_to_linear, luminance
 from warpir.evaluate.panorama_crop import crop_camera, crop_radiance, expose
 from warpir.io.assets import load_asset
@@ -45,9 +45,6 @@ from warpir.scene.light import (
     texel_solid_angles,
 )
 from warpir.scene.placement import place_asset
-
-FloatArray = NDArray[np.float32]
-Float64Array = NDArray[np.float64]
 
 MEASURE_HEIGHT = 128
 """Rows of the maps on which lights are compared."""

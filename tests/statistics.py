@@ -8,12 +8,11 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 from scipy import stats
 
 from tests.oracles import gauss_legendre
-
-Float64Array = NDArray[np.float64]
+from warpir.core.arrays import Float64Array
 
 SIGNIFICANCE = 0.01
 """Chance that a family of correct cases fails once; seeds are fixed, so it is drawn once."""

@@ -16,11 +16,11 @@ from typing import Any
 import drjit as dr
 import mitsuba as mi
 import numpy as np
-from numpy.typing import NDArray
 
 from benchmarks.presets import PRESETS, ScenePreset
 from benchmarks.referee import ours
 from benchmarks.referee.sheet import compare_images, write_sheet
+from warpir.core.arrays import AnyFloatArray, Float64Array, FloatArray
 from warpir.io.assets import load_asset
 from warpir.mitsuba.render import (
     Ratio,
@@ -33,19 +33,17 @@ from warpir.render.renderer import choose_device
 from warpir.scene.asset import Asset
 from warpir.scene.camera import Camera
 
-FloatArray = NDArray[np.float64]
-
 
 def foreground_gradient(
     asset: Asset,
-    matrix: FloatArray,
+    matrix: Float64Array,
     camera: Camera,
-    texels: NDArray[np.float32],
+    texels: FloatArray,
     depth: int,
     spp: int,
     seed: int,
-    d_image: FloatArray,
-) -> FloatArray:
+    d_image: Float64Array,
+) -> Float64Array:
     """Gradient of ``sum(mean * d_image)`` with respect to the light, by path replay.
 
     Args:
@@ -80,7 +78,7 @@ def foreground_gradient(
     return d_texels / spp
 
 
-def comparable(image: Ratio, seen: FloatArray, floor: float = 1e-4) -> Ratio:
+def comparable(image: Ratio, seen: Float64Array, floor: float = 1e-4) -> Ratio:
     """Keep the pixels that see the plane with half of their samples or more.
 
     ``floor`` is added to the standard errors: a handful of rare events has no honest variance.
@@ -121,7 +119,7 @@ def gradient_line(
     d_image = np.stack([0.5 + row, 0.5 + column, 1.5 - row], axis=-1)
     setting = asset, preset.matrix(asset), camera
 
-    def to_lobes(d_texels: NDArray[np.floating[Any]]) -> list[FloatArray]:
+    def to_lobes(d_texels: AnyFloatArray) -> list[Float64Array]:
         grads = torch.autograd.grad(
             texels, leaves, torch.tensor(d_texels, dtype=torch.float32), retain_graph=True
         )
@@ -139,7 +137,7 @@ def gradient_line(
     pixels = renderer.candidate_pixels(camera)
     mis = MisIntegrator(renderer, pixels, np.zeros(0, np.int32), spp=64, rays=1, depth=depth)
     weight = torch.tensor(d_image.reshape(-1, 3)[pixels], dtype=torch.float32)
-    own: list[list[FloatArray]] = []
+    own: list[list[Float64Array]] = []
     start = time.perf_counter()
     for k in range(2):
         total = np.zeros(fixed.shape)

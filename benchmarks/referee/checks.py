@@ -7,9 +7,9 @@ value, the expected one and the error in standard errors, and fails at the first
 from dataclasses import replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from benchmarks import furnace
+from warpir.core.arrays import FloatArray
 
 from benchmarks.referee import __main__ as referee  # isort: skip  (sets the variant)
 
@@ -21,8 +21,6 @@ from warpir.mitsuba.light import LatlongEmitter
 from warpir.mitsuba.material import GltfBSDF, Image
 from warpir.scene.asset import Asset, Material, Primitive, Texture, TextureSlot
 from warpir.scene.camera import Camera
-
-FloatArray = NDArray[np.float64]
 
 SIGMAS = 4.5
 """Allowed error in standard errors: one false alarm in 1e5 checks, with room for heavy tails."""
@@ -86,7 +84,7 @@ def view(
     return Camera(width, height, focal, focal, 0.5 * width, 0.5 * height, c2w)
 
 
-def sun_and_sky(rng: np.random.Generator, rows: int = 32) -> NDArray[np.float32]:
+def sun_and_sky(rng: np.random.Generator, rows: int = 32) -> FloatArray:
     """Noisy coloured sky with one texel 2000 times brighter, shape [rows, 2 rows, 3]."""
     texels = rng.exponential(size=(rows, 2 * rows, 3))
     texels[rows // 4, rows // 2] *= 2000.0

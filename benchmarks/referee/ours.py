@@ -3,15 +3,13 @@
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
+from warpir.core.arrays import Float64Array, FloatArray
 from warpir.render.device_scene import Placed, Proxy, Scene
 from warpir.render.renderer import Renderer, light_args
 from warpir.scene.asset import Asset
 from warpir.scene.camera import Camera
 from warpir.scene.light import Light
-
-FloatArray = NDArray[np.float64]
 
 SEED_COUNT = 32
 """Independent runs behind each variance; quasi-random samples of one run are not independent."""
@@ -20,36 +18,36 @@ SEED_COUNT = 32
 class Foreground(NamedTuple):
     """The object alone; the fields of `warpir.mitsuba.render.Foreground`."""
 
-    mean: FloatArray
-    variance: FloatArray
-    coverage: FloatArray
+    mean: Float64Array
+    variance: Float64Array
+    coverage: Float64Array
 
 
 class Ratio(NamedTuple):
     """Shadow ratio of the plane, 1 where it is not seen, with the variance of the mean."""
 
-    mean: FloatArray
-    variance: FloatArray
-    coverage: FloatArray
+    mean: Float64Array
+    variance: Float64Array
+    coverage: Float64Array
     """1 where the plane is seen, shape [H, W]."""
 
 
-def renderer(asset: Asset, matrix: FloatArray, camera: Camera, device: str = "cpu") -> Renderer:
+def renderer(asset: Asset, matrix: Float64Array, camera: Camera, device: str = "cpu") -> Renderer:
     """Set an object over the plane ``y = 0``."""
     proxy = Proxy(np.array([0.0, 1.0, 0.0]), 0.0)
     return Renderer(Scene([Placed(asset, matrix)], camera, proxy, device))
 
 
-def _moments(runs: list[FloatArray]) -> tuple[FloatArray, FloatArray]:
+def _moments(runs: list[Float64Array]) -> tuple[Float64Array, Float64Array]:
     stack = np.stack(runs)
     return stack.mean(axis=0), stack.var(axis=0, ddof=1) / len(runs)
 
 
 def foreground(
     asset: Asset,
-    matrix: FloatArray,
+    matrix: Float64Array,
     camera: Camera,
-    texels: NDArray[np.float32],
+    texels: FloatArray,
     depth: int,
     spp: int,
     seed: int,
@@ -76,9 +74,9 @@ def foreground(
 
 def shadow_ratio(
     asset: Asset,
-    matrix: FloatArray,
+    matrix: Float64Array,
     camera: Camera,
-    texels: NDArray[np.float32],
+    texels: FloatArray,
     spp: int,
     seed: int,
     device: str = "cpu",
@@ -98,7 +96,7 @@ def shadow_ratio(
     return quotient(np.stack(lit), np.stack(unoccluded), (camera.height, camera.width))
 
 
-def quotient(lit: FloatArray, unoccluded: FloatArray, size: tuple[int, int]) -> Ratio:
+def quotient(lit: Float64Array, unoccluded: Float64Array, size: tuple[int, int]) -> Ratio:
     """Divide the means of several runs, shape [run, pixel, 3]; variance by linearisation."""
     a, u = lit.mean(axis=0), unoccluded.mean(axis=0)
     seen = u > 0.0

@@ -4,9 +4,8 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
-FloatArray = NDArray[np.float64]
+from warpir.core.arrays import Float64Array
 
 
 def compare_images(candidate: Any, reference: Any, block: int = 8) -> dict[str, float | int]:
@@ -59,7 +58,7 @@ def compare_images(candidate: Any, reference: Any, block: int = 8) -> dict[str, 
     }
 
 
-def display_rmse(candidate: FloatArray, reference: FloatArray) -> float:
+def display_rmse(candidate: Float64Array, reference: Float64Array) -> float:
     """RMSE of display values over the reference's own RMS [1]: what a viewer sees of fireflies.
 
     Both images are divided by the reference's mean over lit pixels, then Reinhard and gamma 2.2.
@@ -67,9 +66,9 @@ def display_rmse(candidate: FloatArray, reference: FloatArray) -> float:
     lit = reference.sum(axis=-1) > 0.0
     level = float(reference[lit].mean()) if lit.any() else 1.0
 
-    def shown(image: FloatArray) -> FloatArray:
+    def shown(image: Float64Array) -> Float64Array:
         x = np.maximum(image, 0.0) / level
-        values: FloatArray = (x / (1.0 + x)) ** (1.0 / 2.2)
+        values: Float64Array = (x / (1.0 + x)) ** (1.0 / 2.2)
         return values
 
     a, b = shown(candidate), shown(reference)
@@ -99,13 +98,13 @@ def write_sheet(path: Path, candidate: Any, reference: Any) -> None:
     Image.fromarray(enlarged).save(path)
 
 
-def _display(radiance: FloatArray) -> FloatArray:
+def _display(radiance: Float64Array) -> Float64Array:
     """Display values of radiance whose 1 is bright: extended Reinhard, white at 4, gamma 2.2."""
     x = np.maximum(radiance, 0.0)
     return np.clip(x * (1.0 + x / 16.0) / (1.0 + x) * 1.5, 0.0, 1.0) ** (1.0 / 2.2)
 
 
-def _block_sums(image: FloatArray, block: int) -> FloatArray:
+def _block_sums(image: Float64Array, block: int) -> Float64Array:
     """Sums over whole blocks, shape [blocks down, blocks across, 3]."""
     rows, columns = image.shape[0] // block, image.shape[1] // block
     cut = image[: rows * block, : columns * block]

@@ -11,22 +11,19 @@ from typing import Any, Protocol
 import numpy as np
 import torch
 import warp as wp
-from numpy.typing import NDArray
 from torch import Tensor
 
 from benchmarks.speed.memory import PeakMemory
 from benchmarks.speed.scenes import SpeedScene
+from warpir.core.arrays import Float64Array
 from warpir.render.integrator import Integrator, LightTensors, Radiance
 from warpir.render.mis import MisIntegrator
 from warpir.scene.light import Light
 
-FloatArray = NDArray[np.float64]
-Texels = NDArray[np.float32]
-
 PARTS = ("foreground", "ratio")
 WARM_SEED = 1
 
-Step = dict[str, tuple[FloatArray, FloatArray]]
+Step = dict[str, tuple[Float64Array, Float64Array]]
 """By part: the image [pixel, 3] and the gradient of its weighted sum [He, We, 3]."""
 
 
@@ -124,7 +121,7 @@ class MisPart:
         self._forward(seed)
         self.bench.synchronize()
 
-    def image(self, seed: int) -> FloatArray:
+    def image(self, seed: int) -> Float64Array:
         """Return what `forward` renders, shape [pixel, 3]."""
         return numpy(self._forward(seed))
 
@@ -265,7 +262,7 @@ def shadow_ratio(radiance: Radiance) -> Tensor:
     return torch.where(seen, radiance.lit / below, torch.ones_like(below))
 
 
-def numpy(tensor: Tensor | None) -> FloatArray:
+def numpy(tensor: Tensor | None) -> Float64Array:
     """Download as float64."""
     assert tensor is not None
     return tensor.detach().double().cpu().numpy()

@@ -13,15 +13,12 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 from mitsuba.python.ad.integrators.common import mis_weight
-from numpy.typing import NDArray
 
 from benchmarks.speed.scenes import SpeedScene
+from warpir.core.arrays import Float64Array, FloatArray, PixelArray
 from warpir.mitsuba.light import LatlongEmitter
 from warpir.mitsuba.render import ObjectScene, build
 from warpir.scene.camera import Camera
-
-FloatArray = NDArray[np.float64]
-IntArray = NDArray[np.int32]
 
 PASS_SAMPLES = {"llvm_ad_rgb": 1 << 25, "cuda_ad_rgb": 1 << 28}
 """Camera samples traced at once; bounds memory. Passes are long, as only samples of one pass are
@@ -63,7 +60,7 @@ class MitsubaScene:
     def __init__(
         self,
         scene: SpeedScene,
-        texels: NDArray[np.float32],
+        texels: FloatArray,
         integrator: str = "prb",
         sampler: str = "ldsampler",
         freeze: bool = True,
@@ -118,7 +115,7 @@ class MitsubaScene:
         """Gradient of the weighted foreground with respect to the texels, by path replay."""
         return self._mean(self.render_backward, spp, seed)
 
-    def objects(self, image: mi.TensorXf) -> FloatArray:
+    def objects(self, image: mi.TensorXf) -> Float64Array:
         """Return the object pixels of `foreground`, shape [object_pixel, 3]."""
         return np.asarray(image, np.float64).reshape(-1, 3)[self.rows_of_objects]
 
@@ -343,6 +340,6 @@ def ratio_adjoint(
     return d_lit, d_unoccluded, ratio
 
 
-def color(values: NDArray[Any]) -> mi.Color3f:
+def color(values: PixelArray) -> mi.Color3f:
     """Upload rows of RGB."""
     return mi.Color3f(*(mi.Float(np.ascontiguousarray(c, np.float32)) for c in values.T))

@@ -12,9 +12,9 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
-FloatArray = NDArray[np.float64]
+from warpir.core.arrays import BoolArray, Float64Array
 
 ROUNDING = 1e-9
 SMALLEST = 1e-9
@@ -57,7 +57,7 @@ class Curve:
         if len(self.seconds) == 0:
             raise ValueError("a curve needs a point with an error above 0")
 
-    def at(self, error: ArrayLike) -> tuple[FloatArray, NDArray[np.bool_]]:
+    def at(self, error: ArrayLike) -> tuple[Float64Array, BoolArray]:
         """Return the least time that reaches each error, and where it is a lower bound.
 
         The first point is the least that can be run: larger errors cost its time.
@@ -194,7 +194,7 @@ def combined(foreground: float, ratio: float) -> float:
     return float(np.sqrt(0.5 * (foreground**2 + ratio**2)))
 
 
-def rmse(values: FloatArray, references: FloatArray, weights: FloatArray) -> float:
+def rmse(values: Float64Array, references: Float64Array, weights: Float64Array) -> float:
     """Return the relative RMSE of ``values`` against a truth known several times.
 
     A product of differences to two references with independent noise, ``(x - a)(x - b)``, is the
@@ -207,7 +207,7 @@ def rmse(values: FloatArray, references: FloatArray, weights: FloatArray) -> flo
         weights: How much each is trusted [1], shape [reference].
     """
 
-    def square(x: FloatArray | float) -> float:
+    def square(x: Float64Array | float) -> float:
         pairs = weights.sum() ** 2 - np.square(weights).sum()
         total = alone = 0.0
         for reference, weight in zip(references, weights, strict=True):

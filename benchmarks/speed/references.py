@@ -13,14 +13,12 @@ from typing import Any
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 from torch import Tensor
 
 from benchmarks.speed.candidates import PARTS, Bench, MisPart, MitsubaPart, numpy
 from benchmarks.speed.ratios import rmse
+from warpir.core.arrays import BoolArray, Float64Array
 from warpir.render.integrator import LightTensors
-
-FloatArray = NDArray[np.float64]
 
 TRIMMED = 0.02
 """Share of pixels left out of an image's error: those in which `mis` is noisiest. A handful of
@@ -38,14 +36,14 @@ CHUNK = 64
 class Reference:
     """One part under one map."""
 
-    own: tuple[FloatArray, FloatArray]
+    own: tuple[Float64Array, Float64Array]
     """Our image, shape [2, pixel, 3], and gradient, shape [2, He, We, 3]."""
-    mitsuba: tuple[FloatArray, FloatArray]
+    mitsuba: tuple[Float64Array, Float64Array]
     """Mitsuba's."""
-    kept: NDArray[np.bool_]
+    kept: BoolArray
     """The pixels that count, shape [pixel]."""
 
-    def rmse(self, values: tuple[FloatArray, FloatArray]) -> dict[str, float]:
+    def rmse(self, values: tuple[Float64Array, Float64Array]) -> dict[str, float]:
         """Return relative RMSEs of an image and a gradient, free of the references' noise."""
         found = {}
         for name, k, where in (
@@ -122,7 +120,7 @@ class References:
             made.append((image.reshape(2, -1, 3), gradient.reshape(2, height, 2 * height, 3)))
         return Reference(made[0], made[1], self.kept)
 
-    def _quiet(self, part: str) -> NDArray[np.bool_]:
+    def _quiet(self, part: str) -> BoolArray:
         """Return which pixels are not among the noisiest, shape [pixel]."""
         height = self.bench.heights[part][0]
         variance = self._cached(
@@ -157,11 +155,13 @@ class References:
                 found[part, height] = float(np.sqrt(max(apart, 0.0) / size))
         return found
 
-    def _cached(self, what: str, key: dict[str, Any], make: Callable[[], FloatArray]) -> FloatArray:
+    def _cached(
+        self, what: str, key: dict[str, Any], make: Callable[[], Float64Array]
+    ) -> Float64Array:
         name = hashlib.sha256(json.dumps(key, sort_keys=True).encode()).hexdigest()[:24]
         path = self.cache / f"{name}.npy"
         if path.exists():
-            kept: FloatArray = np.load(path)
+            kept: Float64Array = np.load(path)
             return kept
         made = make()
         self.cache.mkdir(parents=True, exist_ok=True)
@@ -190,7 +190,7 @@ class References:
         return digest.hexdigest()
 
 
-def quiet(variance: FloatArray) -> NDArray[np.bool_]:
+def quiet(variance: Float64Array) -> BoolArray:
     """Return which pixels are not among the noisiest, shape [pixel]."""
     kept = np.ones(len(variance), bool)
     kept[np.argsort(variance, kind="stable")[len(variance) - int(TRIMMED * len(variance)) :]] = (
@@ -199,19 +199,19 @@ def quiet(variance: FloatArray) -> NDArray[np.bool_]:
     return kept
 
 
-def _variance(bench: Bench, part: str, height: int) -> FloatArray:
+def _variance(bench: Bench, part: str, height: int) -> Float64Array:
     """Variance of `mis` over seeds, summed over channels, shape [pixel]."""
     run = MisPart(bench, part, height, PILOT_SPP)
     images = np.stack([run.image(SEED // 2 + k) for k in range(PILOT_RUNS)])
-    variance: FloatArray = images.var(axis=0).sum(axis=-1)
+    variance: Float64Array = images.var(axis=0).sum(axis=-1)
     return variance
 
 
-def _flat(image: FloatArray, gradient: FloatArray) -> FloatArray:
+def _flat(image: Float64Array, gradient: Float64Array) -> Float64Array:
     return np.concatenate([image.ravel(), gradient.ravel()])
 
 
-def _own(bench: Bench, part: str, height: int, spp: int) -> FloatArray:
+def _own(bench: Bench, part: str, height: int, spp: int) -> Float64Array:
     """Converge `mis`: two halves of image and gradient, shape [2, image + gradient]."""
     chunk = min(CHUNK, spp // 2)
     run = MisPart(bench, part, height, chunk)
@@ -227,7 +227,7 @@ def _own(bench: Bench, part: str, height: int, spp: int) -> FloatArray:
     return np.stack(halves)
 
 
-def _own_ratio(run: MisPart, seeds: list[int]) -> tuple[FloatArray, FloatArray]:
+def _own_ratio(run: MisPart, seeds: list[int]) -> tuple[Float64Array, Float64Array]:
     """Divide means over many runs, so that the quotient's bias falls with all their samples."""
     bench = run.bench
     light = LightTensors(texels=bench.leaf(run.height, grad=False))
@@ -259,7 +259,7 @@ def _plane_sums(run: MisPart, light: LightTensors, seeds: list[int]) -> tuple[Te
     return lit, unoccluded
 
 
-def _own_lobes(bench: Bench, part: str, spp: int) -> FloatArray:
+def _own_lobes(bench: Bench, part: str, spp: int) -> Float64Array:
     """Converge `mis` under the lobes themselves: two halves of the image, shape [2, image]."""
     chunk = min(CHUNK, spp // 2)
     run = MisPart(bench, part, bench.heights[part][0], chunk)
@@ -281,7 +281,7 @@ def _own_lobes(bench: Bench, part: str, spp: int) -> FloatArray:
     return np.stack(halves)
 
 
-def _mitsuba(bench: Bench, part: str, height: int, spp: int) -> FloatArray:
+def _mitsuba(bench: Bench, part: str, height: int, spp: int) -> Float64Array:
     """Converge Mitsuba; see `_own`."""
     from benchmarks.speed.mitsuba import ratio_adjoint
 

@@ -10,9 +10,9 @@ from pathlib import Path
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 
 from benchmarks.referee import ours
+from warpir.core.arrays import Float64Array, FloatArray, IntArray
 from warpir.io.assets import load_asset
 from warpir.io.images.photos import read_envmap
 from warpir.lighting.fit import fit_lobes
@@ -22,9 +22,6 @@ from warpir.scene.asset import Asset, Material, Primitive
 from warpir.scene.camera import Camera, camera_from_fov
 from warpir.scene.light import Light, Lobes, axis_from_angles, resize_map
 from warpir.scene.placement import place_asset
-
-FloatArray = NDArray[np.float64]
-IntArray = NDArray[np.int32]
 
 NAMES = ("ball", "toycar", "metal")
 TOYCAR = "mesh/ToyCar.glb"
@@ -44,7 +41,7 @@ class SpeedScene:
 
     name: str
     asset: Asset
-    matrix: FloatArray
+    matrix: Float64Array
     """Asset to world, shape [4, 4]."""
     camera: Camera
     lobes: Lobes
@@ -56,17 +53,17 @@ class SpeedScene:
     """Row-major, shape [object_pixel]."""
     proxy_pixels: IntArray
     """Row-major pixels whose plane the object may shade and at most half hides, [proxy_pixel]."""
-    weight_fg: NDArray[np.float32]
+    weight_fg: FloatArray
     """Loss gradient of the foreground, shape [object_pixel, 3]."""
-    weight_ratio: NDArray[np.float32]
+    weight_ratio: FloatArray
     """Loss gradient of the shadow ratio, shape [proxy_pixel, 3]."""
 
-    def texels(self, height: int) -> NDArray[np.float32]:
+    def texels(self, height: int) -> FloatArray:
         """Return the light as a map, relative [W/(m^2 sr)], shape [height, 2 height, 3]."""
         parts = (self.lobes.amplitude, self.lobes.axis, self.lobes.sharpness)
         leaves = [torch.tensor(a) for a in parts]
         device = str(self.renderer.device.alias)
-        made: NDArray[np.float32] = rasterize(*leaves, height, device).cpu().numpy()
+        made: FloatArray = rasterize(*leaves, height, device).cpu().numpy()
         return made
 
 
@@ -184,7 +181,7 @@ def make_scene(
     )
 
 
-def loss_weights(width: int, height: int, seed: int = 11) -> NDArray[np.float32]:
+def loss_weights(width: int, height: int, seed: int = 11) -> FloatArray:
     """Return colour ramps plus noise for foreground and ratio, shape [2, height, width, 3]."""
     rng = np.random.default_rng(seed)
     row, column = np.mgrid[0:height, 0:width] / height

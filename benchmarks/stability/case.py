@@ -6,9 +6,9 @@ from typing import Any
 
 import numpy as np
 import warp as wp
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
-Float64Array = NDArray[np.float64]
+from warpir.core.arrays import Float64Array
 
 MAX_RELATIVE = "max relative"
 RMS_RELATIVE = "RMS relative"

@@ -12,7 +12,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from numpy.typing import NDArray
 
 import warpir.demo
 from benchmarks.recovery import (
@@ -32,13 +31,11 @@ from benchmarks.speed.scenes import uv_ball
 from tests import oracles as o
 from tests.builders.shapes import box
 from warpir.app.optimize_settings import OptimizeSettings
+from warpir.core.arrays import FloatArray
 from warpir.io.images.photos import read_envmap
 from warpir.optimize.light import LightOptimization
 from warpir.scene.asset import Asset, Material
 from warpir.scene.light import axis_from_angles, resize_map
-
-FloatArray = NDArray[np.float32]
-Float64Array = NDArray[np.float64]
 
 WIDTH, HEIGHT = 48, 32
 """Of the picture [px]."""

@@ -3,17 +3,14 @@
 import numpy as np
 import torch
 import warp as wp
-from numpy.typing import NDArray
 from torch import Tensor
 
 from tests import oracles
+from warpir.core.arrays import BoolArray, Float64Array, FloatArray
 from warpir.kernels.shade import shade_vertex
 from warpir.kernels.types import LightRecord, VertexRecord
 from warpir.render.integrator import LightTensors, MaterialTensors
 from warpir.render.samples import ObjectSamples
-
-FloatArray = NDArray[np.float32]
-Float64Array = NDArray[np.float64]
 
 
 def plain_factors(materials: MaterialTensors) -> list[FloatArray | None]:
@@ -22,9 +19,9 @@ def plain_factors(materials: MaterialTensors) -> list[FloatArray | None]:
     return [None if t is None else t.detach().cpu().numpy() for t in tensors]
 
 
-def used(record: LightRecord) -> NDArray[np.bool_]:
+def used(record: LightRecord) -> BoolArray:
     """Which entries are filled, shape [pixel, capacity]."""
-    filled: NDArray[np.bool_] = np.arange(record.wi.shape[1]) < record.count.numpy()[:, None]
+    filled: BoolArray = np.arange(record.wi.shape[1]) < record.count.numpy()[:, None]
     return filled
 
 

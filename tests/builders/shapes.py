@@ -4,15 +4,13 @@ from collections.abc import Sequence
 
 import numpy as np
 import trimesh
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from warpir.core.arrays import IntArray
 from warpir.render.device_scene import Placed, Proxy
 from warpir.scene.asset import Asset, Material, Primitive, Texture
 from warpir.scene.camera import Camera
 from warpir.scene.light import Light, Lobes
-
-FloatArray = NDArray[np.float32]
-Float64Array = NDArray[np.float64]
 
 DEEP = -1e3
 """Height of a ground plane that is in nobody's way [m]."""
@@ -88,7 +86,7 @@ def camera(
     return Camera(width, height, focal, focal, width / 2.0, height / 2.0, pose)
 
 
-def all_pixels(view: Camera) -> NDArray[np.int32]:
+def all_pixels(view: Camera) -> IntArray:
     """Every pixel of a view, row-major."""
     return np.arange(view.width * view.height, dtype=np.int32)
 

@@ -6,9 +6,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 import trimesh
-from numpy.typing import NDArray
 from PIL import Image
 
+from warpir.core.arrays import FloatArray
 from warpir.core.errors import ExitCode, InputError
 from warpir.diffusion.embedded import NetworkConfig, build_network, save_embedded
 from warpir.evaluate.command import light_figures, main, usable_rows
@@ -38,8 +38,6 @@ from warpir.scene.light import (
     texel_solid_angles,
 )
 from warpir.scene.tone_curves import Curves
-
-FloatArray = NDArray[np.float32]
 
 SUNS = {"east": (70.0, 35.0), "west": (-110.0, 50.0), "north": (10.0, 20.0)}
 """Azimuth and elevation of the made-up panoramas' suns [deg]."""

@@ -5,11 +5,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from numpy.typing import NDArray
 from safetensors.torch import save_file
 from scipy.ndimage import correlate1d
 from scipy.optimize import minimize_scalar
 
+from warpir.core.arrays import Float64Array, FloatArray
 from warpir.core.errors import ExitCode, InputError
 from warpir.evaluate.image_errors import (
     flip_map,
@@ -21,9 +21,6 @@ from warpir.evaluate.image_errors import (
     ssim_map,
 )
 from warpir.evaluate.lpips import Lpips
-
-Float64Array = NDArray[np.float64]
-FloatArray = NDArray[np.float32]
 
 
 def pictures(rng: np.random.Generator, height: int = 40, width: int = 60) -> list[FloatArray]:

@@ -12,7 +12,6 @@ import numpy as np
 import OpenImageIO as oiio
 import pytest
 import trimesh
-from numpy.typing import NDArray
 from PIL import Image
 
 from tests.builders.outcome import outcome
@@ -21,6 +20,7 @@ from warpir import insert
 from warpir.app.command import parse
 from warpir.app.config import InsertConfig
 from warpir.batch.task import CHECK, Task, do_task
+from warpir.core.arrays import FloatArray, PixelArray
 from warpir.core.color import linear_to_gamma
 from warpir.core.errors import ExitCode, InputError
 from warpir.insert import main
@@ -58,8 +58,6 @@ RGBE = 0.01
 """Relative to the pixel's largest channel: 8-bit mantissas."""
 WIDTH, HEIGHT = 48, 32
 
-Pixels = NDArray[Any]
-
 
 def digest(folder: Path) -> dict[str, str]:
     """Sha256 of every file below a folder."""
@@ -70,7 +68,7 @@ def digest(folder: Path) -> dict[str, str]:
     }
 
 
-def write_photo(path: Path, bits: int = 8) -> Pixels:
+def write_photo(path: Path, bits: int = 8) -> PixelArray:
     """A photo with structure in every pixel; returns its codes."""
     rng = np.random.default_rng(9)
     top = 2**bits - 1
@@ -81,7 +79,7 @@ def write_photo(path: Path, bits: int = 8) -> Pixels:
     return codes
 
 
-def write_panorama(path: Path, scale: float = 1.0) -> Pixels:
+def write_panorama(path: Path, scale: float = 1.0) -> PixelArray:
     """A small panorama: a blue sky, dark ground and a sun."""
     texels = np.full((16, 32, 3), (0.3, 0.5, 1.0), np.float32)
     texels[8:] = 0.1
@@ -156,13 +154,13 @@ class Run:
     argv: list[str]
     record: dict[str, Any] = field(default_factory=dict)
 
-    def image(self, name: str = "composite.png") -> Pixels:
+    def image(self, name: str = "composite.png") -> PixelArray:
         """Codes of a PNG in their own depth."""
         return read_image(self.out / name)[0]
 
 
-def read_image(path: Path) -> tuple[Pixels, list[str]]:
-    """Pixels in the file's type, and channel names."""
+def read_image(path: Path) -> tuple[PixelArray, list[str]]:
+    """PixelArray in the file's type, and channel names."""
     reader = oiio.ImageInput.open(str(path))
     assert reader is not None, oiio.geterror()
     spec = reader.spec()
@@ -173,13 +171,13 @@ def read_image(path: Path) -> tuple[Pixels, list[str]]:
     return pixels, names
 
 
-def read_layers(path: Path) -> dict[str, NDArray[np.float32]]:
+def read_layers(path: Path) -> dict[str, FloatArray]:
     """The planes of ``layers.exr`` by their full names."""
     pixels, names = read_image(path)
     return {name: pixels[..., k] for k, name in enumerate(names)}
 
 
-def rgb(planes: dict[str, NDArray[np.float32]], prefix: str = "") -> NDArray[np.float32]:
+def rgb(planes: dict[str, FloatArray], prefix: str = "") -> FloatArray:
     """Three planes of a layer, shape [H, W, 3]."""
     return np.stack([planes[f"{prefix}{c}"] for c in "RGB"], axis=-1)
 
@@ -230,13 +228,13 @@ def test_record_tells_what_was_used_and_assumed(run: Run, inputs: Path) -> None:
     assert measured["triangles"] == 12 and measured["values_clamped_to_half"] == 0
 
 
-def recomposed(planes: dict[str, NDArray[np.float32]]) -> NDArray[np.float32]:
+def recomposed(planes: dict[str, FloatArray]) -> FloatArray:
     """What ``warpir/formula`` says, in float32."""
     outside = np.float32(1.0) - planes["fg.A"][..., None]
     return rgb(planes, "fg.") + outside * rgb(planes, "plate.") * rgb(planes, "shadow.")
 
 
-def encoded(linear: NDArray[np.float32], top: int) -> Pixels:
+def encoded(linear: FloatArray, top: int) -> PixelArray:
     """Codes of a composite, as a viewer of gamma 2.2 makes them."""
     display = np.clip(linear_to_gamma(linear), 0.0, 1.0)
     return np.round(display.astype(np.float64) * top)

@@ -7,7 +7,6 @@ from typing import Any
 import numpy as np
 import OpenEXR
 import pytest
-from numpy.typing import NDArray
 from PIL import Image, PngImagePlugin
 
 from tests.builders.faults import PEAK_BYTES, SECONDS, assert_fails, run_case
@@ -22,6 +21,7 @@ from tests.insert.test_insert import (
     rgb,
     write_photo,
 )
+from warpir.core.arrays import BoolArray, FloatArray
 from warpir.core.errors import ExitCode
 from warpir.insert import main
 from warpir.io.cameras.reader import read_camera
@@ -39,11 +39,9 @@ TURNED_BACK = {  # how an upright image lies in a file: mirrored, turned, both
     7: lambda a: np.rot90(a, 2).swapaxes(0, 1),
 }
 
-Pixels = NDArray[Any]
 
-
-def outside(planes: dict[str, NDArray[np.float32]]) -> NDArray[np.bool_]:
-    """Pixels that neither object nor shadow touches, by the layers."""
+def outside(planes: dict[str, FloatArray]) -> BoolArray:
+    """PixelArray that neither object nor shadow touches, by the layers."""
     return (planes["matte.A"] == 0.0) & (rgb(planes, "shadow.") == 1.0).all(axis=-1)
 
 

@@ -3,13 +3,11 @@
 import numpy as np
 import pytest
 import torch
-from numpy.typing import NDArray
 
 from tests import oracles as o
 from tests.statistics import central_differences, compare_gradients
+from warpir.core.arrays import Float64Array
 from warpir.lighting.fusion import fuse, fused_light
-
-Float64Array = NDArray[np.float64]
 
 FLOAT64 = 1e-12
 """About ten float64 operations, relative."""

@@ -3,17 +3,15 @@
 import numpy as np
 import pytest
 import torch
-from numpy.typing import NDArray
 from torch import Tensor
 
 from tests import oracles as o
 from tests.statistics import central_differences, compare_gradients
+from warpir.core.arrays import Float64Array
 from warpir.lighting.regularizers import bend, chroma, consistency, solid_angles, spread
 from warpir.lighting.sg_light import WIDEST, LightBounds, SGLight, narrowest
 from warpir.render.tone_curve import Knots, ToneCurve
 from warpir.scene.light import Lobes
-
-Float64Array = NDArray[np.float64]
 
 FLOAT64 = 1e-12
 """About ten float64 operations, relative."""

@@ -3,10 +3,10 @@
 import numpy as np
 import pytest
 import torch
-from numpy.typing import NDArray
 
 from tests import oracles as o
 from tests.statistics import central_differences, compare_gradients
+from warpir.core.arrays import Float64Array
 from warpir.lighting.sg_light import (
     TEXELS_PER_SIGMA,
     WIDEST,
@@ -16,8 +16,6 @@ from warpir.lighting.sg_light import (
 )
 from warpir.render.bridge import rasterize
 from warpir.scene.light import Lobes, fibonacci
-
-Float64Array = NDArray[np.float64]
 
 FLOAT32 = 2e-6
 """About ten float32 operations, relative: logarithms, exponentials, norms."""

@@ -14,13 +14,13 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from numpy.typing import NDArray
 from torch import Tensor
 
 from tests import oracles as o
 from tests.builders.shapes import camera, ground, placed, sphere
 from tests.statistics import central_differences, compare_gradients
 from warpir.app.optimize_settings import OptimizeSettings
+from warpir.core.arrays import Float64Array
 from warpir.core.errors import ExitCode, InputError
 from warpir.lighting.sg_light import WIDEST, LightBounds, SGLight, narrowest
 from warpir.optimize import light as light_optimization
@@ -33,8 +33,6 @@ from warpir.render.renderer import Renderer
 from warpir.render.transport.rows import TransportSettings
 from warpir.scene.asset import Material
 from warpir.scene.light import Lobes
-
-Float64Array = NDArray[np.float64]
 
 WIDTH, HEIGHT, ROWS = 36, 24, 12
 """Of the picture [px] and of the maps."""

@@ -5,11 +5,11 @@ from dataclasses import fields
 import numpy as np
 import pytest
 import torch
-from numpy.typing import NDArray
 from scipy.ndimage import maximum_filter, minimum_filter
 
 from tests.builders.shapes import box, camera, constant, ground, lobe, placed, quad, sphere
 from tests.oracles import composite, encode, luminance, reinhard, spline
+from warpir.core.arrays import CodeArray, Int64Array
 from warpir.io.images.photos import Photo
 from warpir.render.bridge import ComposeConstants, compose
 from warpir.render.composite import Picture, Quality, as_file_map, balls, make_picture, resize
@@ -20,8 +20,6 @@ from warpir.scene.asset import Material
 from warpir.scene.camera import Camera
 from warpir.scene.light import Light, axis_from_angles, plain_sky
 from warpir.scene.tone_curves import ToneKnots
-
-FloatArray = NDArray[np.float32]
 
 COMPOSITE = 1e-5
 """Largest difference of two composites of the same numbers, display-encoded: the task's figure."""
@@ -313,7 +311,7 @@ def test_two_lights_serve_object_and_shadow_apart(device: str) -> None:
 LEVEL = camera(48, 32, 48.0)
 
 
-def halves(preview: NDArray[np.uint8]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+def halves(preview: CodeArray) -> tuple[Int64Array, Int64Array]:
     """The mirror ball and the diffuse ball."""
     size = preview.shape[0]
     return preview[:, :size].astype(int), preview[:, size:].astype(int)

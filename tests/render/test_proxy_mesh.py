@@ -7,7 +7,6 @@ import numpy as np
 import pytest
 import torch
 import trimesh
-from numpy.typing import NDArray
 from PIL import Image
 
 from tests.builders.records import plane_sums
@@ -25,6 +24,7 @@ from tests.statistics import compare_gradients, z_test
 from warpir.app.command import parse
 from warpir.app.config import InsertConfig
 from warpir.app.inputs import read_inputs
+from warpir.core.arrays import Float64Array, FloatArray, IntArray
 from warpir.core.color import luminance
 from warpir.core.errors import ExitCode, InputError
 from warpir.insert import main
@@ -46,7 +46,6 @@ from warpir.scene.placement import place_asset
 from warpir.scene.receiver import ProxyMesh, first_hit, is_in_view
 from warpir.scene.tone_curves import Curves, ToneKnots
 
-FloatArray = NDArray[np.float32]
 LINEAR = Curves.identity("linear")
 
 SPP = 1024
@@ -271,7 +270,7 @@ def some_lobes() -> Lobes:
     )
 
 
-def pixels_of(renderer: Renderer) -> tuple[NDArray[np.int32], NDArray[np.int32]]:
+def pixels_of(renderer: Renderer) -> tuple[IntArray, IntArray]:
     """Object pixels, and those that the place fills for the better part."""
     seen = renderer.gbuffer(0, spp=64)
     covered = seen.object_pixels[seen.coverage > 0.5]
@@ -295,7 +294,7 @@ def test_transport_agrees_with_mis_in_a_place(device: str) -> None:
         for p in (objects, proxies)
     )
 
-    def gradient(out: object) -> NDArray[np.float64]:
+    def gradient(out: object) -> Float64Array:
         ratio = out.lit / out.unoccluded.clamp(min=1e-6)  # type: ignore[attr-defined]
         loss = (out.foreground.cpu() * weight_fg).sum()  # type: ignore[attr-defined]
         loss = loss + (ratio.cpu() * weight_ratio).sum()
@@ -454,7 +453,7 @@ def test_object_stands_on_what_the_camera_sees_first() -> None:
     view = camera(64, 48, 60.0, (0.0, 1.6, 0.0), -20.0)
     table = mesh(quad((0.0, 0.7, -3.0), (1.0, 0, 0), (0, 0, -1.0)))
 
-    def stand(**how: object) -> NDArray[np.float64]:
+    def stand(**how: object) -> Float64Array:
         found = place_asset(low, high, view, scale=0.2, mesh=table, **how)  # type: ignore[arg-type]
         return np.asarray((found.asset_to_world @ [0.0, 0.0, 0.0, 1.0])[:3])
 

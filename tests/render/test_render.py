@@ -33,15 +33,13 @@ from tests.oracles import (
     sphere_ratio,
 )
 from tests.statistics import z_test
+from warpir.core.arrays import Float64Array, FloatArray, Int64Array
 from warpir.core.color import srgb_to_linear
 from warpir.render.device_scene import Placed, Scene
 from warpir.render.renderer import Foreground, Renderer, light_args
 from warpir.scene.asset import Material, Primitive, Texture, TextureSlot
 from warpir.scene.camera import Camera
 from warpir.scene.light import Light
-
-FloatArray = NDArray[np.float32]
-Float64Array = NDArray[np.float64]
 
 FURNACE = 0.01
 """Share by which a furnace may miss the quadrature: importance-sampled, design reference 6."""
@@ -754,7 +752,7 @@ def test_vertex_colors_multiply_the_base_color(device: str) -> None:
     np.testing.assert_allclose(seen[..., 2], 0.25, rtol=FLOAT32)
 
 
-def wrapped(k: NDArray[np.int64], count: int, mode: str) -> NDArray[np.int64]:
+def wrapped(k: Int64Array, count: int, mode: str) -> Int64Array:
     """Texel index by wrap mode, as the glTF sampler (OpenGL 4.6, 8.14.2) has it."""
     if mode == "clamp":
         return np.clip(k, 0, count - 1)

@@ -6,13 +6,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from numpy.typing import NDArray
 from scipy import stats
 
 from tests.builders.shapes import all_pixels, box, camera, constant, ground, lobe, placed, sphere
 from tests.oracles import gauss_legendre
 from tests.statistics import compare_gradients, sidak, z_test
 from warpir.core import cache as caches
+from warpir.core.arrays import Float64Array, IntArray
 from warpir.core.cache import take_notices
 from warpir.core.errors import ExitCode, InputError
 from warpir.render.device_scene import Scene
@@ -31,8 +31,6 @@ from warpir.render.transport.rows import (
 )
 from warpir.scene.asset import Material
 from warpir.scene.light import Light, Lobes, as_map, map_directions, texel_solid_angles
-
-Float64Array = NDArray[np.float64]
 
 HEIGHT = 12
 SMALL = TransportSettings(
@@ -71,7 +69,7 @@ def scene_of(
     return Renderer(Scene([placed(parts, *materials)], view, ground(0.0), device))
 
 
-def pixels_of(renderer: Renderer) -> tuple[NDArray[np.int32], NDArray[np.int32]]:
+def pixels_of(renderer: Renderer) -> tuple[IntArray, IntArray]:
     """Object pixels, and those that the plane fills for the better part."""
     seen = renderer.gbuffer(0, spp=64)
     covered = seen.object_pixels[seen.coverage > 0.5]

@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 
+from warpir.core.arrays import Float64Array, FloatArray
 from warpir.report.words import (
     LightCharacter,
     characterize,
@@ -13,8 +14,6 @@ from warpir.report.words import (
 )
 from warpir.scene.camera import camera_from_fov
 from warpir.scene.light import (
-    Float64Array,
-    FloatArray,
     Light,
     Lobes,
     as_map,

@@ -3,7 +3,6 @@
 import numpy as np
 import pytest
 import torch
-from numpy.typing import NDArray
 
 from tests.builders.shapes import box, camera, constant, lobe
 from tests.oracles import (
@@ -16,6 +15,7 @@ from tests.oracles import (
 )
 from warpir.app.config import InsertConfig
 from warpir.app.inputs import Inputs
+from warpir.core.arrays import Float64Array, FloatArray
 from warpir.core.errors import ExitCode, InputError
 from warpir.io.images.photos import Photo
 from warpir.lighting.fit import LAMP_COUNT_MAX, fit_lobes
@@ -40,9 +40,6 @@ from warpir.scene.light import (
     texel_solid_angles,
 )
 from warpir.scene.placement import place_asset
-
-FloatArray = NDArray[np.float32]
-Float64Array = NDArray[np.float64]
 
 FLOAT32 = 1e-5
 """Relative; what float32 maps keep of a float64 sum."""

@@ -2,14 +2,12 @@
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 
+from warpir.core.arrays import Float64Array
 from warpir.core.errors import InputError
 from warpir.scene.asset import Asset, Material, Primitive
 from warpir.scene.camera import Camera, camera_from_fov
 from warpir.scene.placement import place_asset, turn, up_to_y, upright_plane, y_to
-
-Float64Array = NDArray[np.float64]
 
 # float64 and a handful of products
 EXACT = 1e-12

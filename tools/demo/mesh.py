@@ -8,11 +8,11 @@ from collections.abc import Callable, Iterable
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
-Float = NDArray[np.float64]
-Int = NDArray[np.int64]
-Distance = Callable[[Float, Float, Float], Float]
+from warpir.core.arrays import BoolArray, Float64Array, Int64Array
+
+Distance = Callable[[Float64Array, Float64Array, Float64Array], Float64Array]
 
 CREASE_COS = np.cos(np.radians(35.0))
 """Profile corners sharper than this get one normal per side."""
@@ -22,20 +22,20 @@ CREASE_COS = np.cos(np.radians(35.0))
 class Surface:
     """Triangles with shading normals."""
 
-    positions: Float
+    positions: Float64Array
     """Position [m], shape [vertex, 3]."""
-    normals: Float
+    normals: Float64Array
     """Unit shading normals, shape [vertex, 3]."""
-    triangles: Int
+    triangles: Int64Array
     """Counter-clockwise seen from outside, shape [triangle, 3]."""
-    uv: Float | None = None
+    uv: Float64Array | None = None
     """Texture coordinates, v down, shape [vertex, 2]."""
 
     def moved(self, offset: ArrayLike) -> "Surface":
         """Return the surface shifted by an offset [m], shape [3]."""
         return replace(self, positions=self.positions + np.asarray(offset, dtype=np.float64))
 
-    def turned(self, rotation: Float) -> "Surface":
+    def turned(self, rotation: Float64Array) -> "Surface":
         """Return the surface turned by a rotation matrix, shape [3, 3]."""
         return replace(
             self, positions=self.positions @ rotation.T, normals=self.normals @ rotation.T
@@ -51,7 +51,7 @@ class Surface:
             triangles=self.triangles[:, ::-1],
         )
 
-    def where(self, keep: NDArray[np.bool_]) -> "Surface":
+    def where(self, keep: BoolArray) -> "Surface":
         """Return the triangles that are kept, shape [triangle], without unused vertices."""
         used, inverse = np.unique(self.triangles[keep], return_inverse=True)
         return Surface(
@@ -81,7 +81,7 @@ def weld(surface: Surface) -> Surface:
     )
 
 
-def rotation(axis: str, degrees: float) -> Float:
+def rotation(axis: str, degrees: float) -> Float64Array:
     """Return the matrix that turns by an angle [deg] about ``x``, ``y`` or ``z``."""
     c, s = np.cos(np.radians(degrees)), np.sin(np.radians(degrees))
     i, j = {"x": (1, 2), "y": (2, 0), "z": (0, 1)}[axis]
@@ -109,14 +109,14 @@ def both_sides(surface: Surface) -> Surface:
     return merge([surface, surface.mirrored()])
 
 
-def normalized(vectors: Float) -> Float:
+def normalized(vectors: Float64Array) -> Float64Array:
     """Scale vectors to unit length along the last axis."""
     length = np.linalg.norm(vectors, axis=-1, keepdims=True)
-    unit: Float = vectors / np.maximum(length, 1e-12)
+    unit: Float64Array = vectors / np.maximum(length, 1e-12)
     return unit
 
 
-def spline(points: ArrayLike, count: int, closed: bool = False) -> Float:
+def spline(points: ArrayLike, count: int, closed: bool = False) -> Float64Array:
     """Sample a Catmull-Rom curve through control points.
 
     Args:
@@ -148,7 +148,7 @@ def spline(points: ArrayLike, count: int, closed: bool = False) -> Float:
     return np.concatenate(spans)
 
 
-def polygon_distance(points: ArrayLike, a: Float, b: Float) -> Float:
+def polygon_distance(points: ArrayLike, a: Float64Array, b: Float64Array) -> Float64Array:
     """Return the signed distance to a closed polygon, negative inside.
 
     Args:
@@ -165,23 +165,23 @@ def polygon_distance(points: ArrayLike, a: Float, b: Float) -> Float:
         squared = np.minimum(squared, (a - a0 - s * da) ** 2 + (b - b0 - s * db) ** 2)
         if db != 0.0:
             inside ^= ((b0 > b) != (b1 > b)) & (a < a0 + (b - b0) / db * da)
-    distance: Float = np.where(inside, -1.0, 1.0) * np.sqrt(squared)
+    distance: Float64Array = np.where(inside, -1.0, 1.0) * np.sqrt(squared)
     return distance
 
 
-def round_intersection(a: Float, b: Float, radius: float) -> Float:
+def round_intersection(a: Float64Array, b: Float64Array, radius: float) -> Float64Array:
     """Intersect two distances with an edge rounded to a radius [m]."""
     corner = np.hypot(np.maximum(a + radius, 0.0), np.maximum(b + radius, 0.0))
-    joined: Float = np.minimum(np.maximum(a, b), -radius) + corner
+    joined: Float64Array = np.minimum(np.maximum(a, b), -radius) + corner
     return joined
 
 
-def round_union(a: Float, b: Float, radius: float) -> Float:
+def round_union(a: Float64Array, b: Float64Array, radius: float) -> Float64Array:
     """Join two distances with an inner edge filled to a radius [m]."""
     return -round_intersection(-a, -b, radius)
 
 
-def gradient(distance: Distance, points: Float, step: float = 1e-3) -> Float:
+def gradient(distance: Distance, points: Float64Array, step: float = 1e-3) -> Float64Array:
     """Differentiate a distance by central differences, shape [point, 3]."""
     columns = []
     for shift in np.eye(3) * step:
@@ -190,7 +190,7 @@ def gradient(distance: Distance, points: Float, step: float = 1e-3) -> Float:
     return np.stack(columns, axis=1)
 
 
-def project(distance: Distance, points: Float, count: int = 3) -> Float:
+def project(distance: Distance, points: Float64Array, count: int = 3) -> Float64Array:
     """Move points onto the zero level of a distance by Newton steps, shape [point, 3]."""
     for _ in range(count):
         slope = gradient(distance, points)
@@ -263,7 +263,7 @@ def mesh_distance(distance: Distance, low: ArrayLike, high: ArrayLike, step: flo
     return Surface(points, normalized(gradient(distance, points, 0.5 * step)), triangles)
 
 
-def split(surface: Surface, values: Float) -> tuple[Surface, Surface]:
+def split(surface: Surface, values: Float64Array) -> tuple[Surface, Surface]:
     """Cut a surface along the zero line of a function given at its vertices, shape [vertex].
 
     Returns:
@@ -321,7 +321,7 @@ def split(surface: Surface, values: Float) -> tuple[Surface, Surface]:
     return parts[0], parts[1]
 
 
-def grid(positions: Float, normals: Float, uv: Float | None = None) -> Surface:
+def grid(positions: Float64Array, normals: Float64Array, uv: Float64Array | None = None) -> Surface:
     """Join a grid of points, shape [row, column, 3], into triangles that face their normals."""
     rows, columns = positions.shape[:2]
     index = np.arange(rows * columns).reshape(rows, columns)
@@ -337,7 +337,7 @@ def grid(positions: Float, normals: Float, uv: Float | None = None) -> Surface:
     return surface.where(np.linalg.norm(area, axis=1) > 1e-12)
 
 
-def flat(positions: Float, normal: ArrayLike) -> Surface:
+def flat(positions: Float64Array, normal: ArrayLike) -> Surface:
     """Join a plane grid of points, shape [row, column, 3], that faces one normal."""
     return grid(positions, np.broadcast_to(np.asarray(normal, dtype=np.float64), positions.shape))
 
@@ -353,7 +353,7 @@ def lathe(profile: ArrayLike, segments: int) -> Surface:
     p = np.asarray(profile, dtype=np.float64)
     span = p[1:] - p[:-1]
     outward = normalized(np.stack([-span[:, 1], span[:, 0]], axis=1))
-    rows: list[tuple[Float, Float]] = [(p[0], outward[0])]
+    rows: list[tuple[Float64Array, Float64Array]] = [(p[0], outward[0])]
     strips = []
     for k in range(1, len(p)):
         last = k == len(p) - 1

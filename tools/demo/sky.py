@@ -5,11 +5,9 @@ Daylight" (1999); the map has the OpenEXR orientation (centre +Z, left quarter +
 """
 
 import numpy as np
-from numpy.typing import NDArray
 
 from tools.demo.noise import value_noise
-
-Float = NDArray[np.float64]
+from warpir.core.arrays import Float64Array, FloatArray
 
 SUN_AZIMUTH, SUN_ELEVATION = -136.0, 37.0
 """Sun: azimuth from -Z toward +X (negative: to the left, behind the camera); elevation [deg]."""
@@ -50,7 +48,7 @@ ZENITH = {
 """Zenith chromaticity: rows for turbidity^2, turbidity, 1; cubic in the sun's zenith angle."""
 
 
-def sun_direction() -> Float:
+def sun_direction() -> Float64Array:
     """Return the unit direction toward the sun, world frame, shape [3]."""
     azimuth, elevation = np.radians(SUN_AZIMUTH), np.radians(SUN_ELEVATION)
     return np.array(
@@ -62,7 +60,7 @@ def sun_direction() -> Float:
     )
 
 
-def latlong_directions(height: int, rows: Float, columns: Float) -> Float:
+def latlong_directions(height: int, rows: Float64Array, columns: Float64Array) -> Float64Array:
     """Return directions at fractional rows and columns of a map, shape [row, column, 3]."""
     lat = np.pi * (0.5 - rows / height)[:, None]
     lon = np.pi * (1.0 - columns / height)[None, :]
@@ -71,29 +69,31 @@ def latlong_directions(height: int, rows: Float, columns: Float) -> Float:
     )
 
 
-def texel_directions(height: int) -> Float:
+def texel_directions(height: int) -> Float64Array:
     """Return the directions of all texel centres, shape [height, 2 height, 3]."""
-    centers: Float = np.arange(2 * height, dtype=np.float64) + 0.5
+    centers: Float64Array = np.arange(2 * height, dtype=np.float64) + 0.5
     return latlong_directions(height, centers[:height], centers)
 
 
-def solid_angles(height: int) -> Float:
+def solid_angles(height: int) -> Float64Array:
     """Return the solid angle of a texel in each row [sr], shape [row]."""
     edge = np.cos(np.pi * np.arange(height + 1) / height)
-    omega: Float = (np.pi / height) * (edge[:-1] - edge[1:])
+    omega: Float64Array = (np.pi / height) * (edge[:-1] - edge[1:])
     return omega
 
 
-def _perez(name: str, cos_zenith: Float | float, gamma: Float | float) -> Float:
+def _perez(
+    name: str, cos_zenith: Float64Array | float, gamma: Float64Array | float
+) -> Float64Array:
     """Evaluate Perez' function at the cosine of a zenith angle and an angle to the sun."""
     a, b, c, d, e = (PEREZ[name][2 * k] * TURBIDITY + PEREZ[name][2 * k + 1] for k in range(5))
-    value: Float = np.asarray(
+    value: Float64Array = np.asarray(
         (1.0 + a * np.exp(b / cos_zenith)) * (1.0 + c * np.exp(d * gamma) + e * np.cos(gamma) ** 2)
     )
     return value
 
 
-def _clear_sky(direction: Float) -> Float:
+def _clear_sky(direction: Float64Array) -> Float64Array:
     """Return sky radiance above the horizon up to a factor, linear Rec.709."""
     sun = sun_direction()
     theta_sun = np.arccos(sun[1])
@@ -105,11 +105,11 @@ def _clear_sky(direction: Float) -> Float:
     x, y = (ratio[name] * (turbidity @ np.array(ZENITH[name]) @ powers) for name in "xy")
     luminance = ratio["Y"]
     xyz = np.stack([x / y * luminance, luminance, (1.0 - x - y) / y * luminance], axis=-1)
-    radiance: Float = np.maximum(xyz @ XYZ_TO_REC709.T, 0.0)
+    radiance: Float64Array = np.maximum(xyz @ XYZ_TO_REC709.T, 0.0)
     return radiance
 
 
-def _clouds(direction: Float) -> Float:
+def _clouds(direction: Float64Array) -> Float64Array:
     """Return the cover of thin fair-weather clouds, 0 to 1."""
     high = np.maximum(direction[..., 1], 0.0)
     flat = direction[..., [0, 2]] / (high + 0.12)[..., None]
@@ -124,7 +124,7 @@ def _clouds(direction: Float) -> Float:
     return np.asarray(cover * np.clip((high - 0.015) / 0.10, 0.0, 1.0))
 
 
-def _sun(height: int) -> Float:
+def _sun(height: int) -> Float64Array:
     """Return the share of each texel that the sun's disc covers [1], shape [H, W]."""
     sun = sun_direction()
     row = height * (0.5 - np.arcsin(sun[1]) / np.pi)
@@ -133,7 +133,7 @@ def _sun(height: int) -> Float:
     rows = np.arange(int(row) - reach, int(row) + reach + 1)
     columns = np.arange(int(column) - reach, int(column) + reach + 1)
     fine = 16
-    inner: Float = (np.arange(fine) + 0.5) / fine
+    inner: Float64Array = (np.arange(fine) + 0.5) / fine
     direction = latlong_directions(
         height,
         np.add.outer(rows, inner).ravel().astype(np.float64),
@@ -146,7 +146,7 @@ def _sun(height: int) -> Float:
     return cover
 
 
-def seen(texels: NDArray[np.float32], direction: Float) -> Float:
+def seen(texels: FloatArray, direction: Float64Array) -> Float64Array:
     """Interpolate a map along unit directions of any shape [..., 3]; shape [..., 3]."""
     height = len(texels)
     row = height * (0.5 - np.arcsin(np.clip(direction[..., 1], -1.0, 1.0)) / np.pi) - 0.5
@@ -157,11 +157,11 @@ def seen(texels: NDArray[np.float32], direction: Float) -> Float:
     j0, j1 = j % (2 * height), (j + 1) % (2 * height)
     upper = texels[i0, j0] * (1.0 - t) + texels[i0, j1] * t
     lower = texels[i1, j0] * (1.0 - t) + texels[i1, j1] * t
-    radiance: Float = upper * (1.0 - s) + lower * s
+    radiance: Float64Array = upper * (1.0 - s) + lower * s
     return radiance
 
 
-def sky(height: int = 512) -> NDArray[np.float32]:
+def sky(height: int = 512) -> FloatArray:
     """Make the light.
 
     The sun's energy is exact at every resolution: its disc is spread over the texels it covers.

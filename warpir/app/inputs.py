@@ -15,6 +15,7 @@ from warpir.app.model_files import require_model
 from warpir.app.photo_world import PhotoWorld, make_world
 from warpir.app.record import file_hash, input_files
 from warpir.app.reuse import EarlierRun, read_run
+from warpir.core.arrays import Float64Array, FloatArray
 from warpir.core.errors import InputError, raise_all
 from warpir.core.limits import Limits
 from warpir.io.assets import load_asset
@@ -28,7 +29,7 @@ from warpir.io.meshes.point_cloud import read_point_cloud
 from warpir.scene.asset import Asset
 from warpir.scene.camera import Camera, camera_from_exif, camera_from_fov
 from warpir.scene.free_space import find_place, points_in_way
-from warpir.scene.light import Float64Array, FloatArray, Light
+from warpir.scene.light import Light
 from warpir.scene.placement import Placement, place_asset, up_to_y, upright_plane
 from warpir.scene.receiver import ProxyMesh, first_hit, is_in_view, mesh_of
 from warpir.scene.shadow_mask import ShadowMask, shadow_mask

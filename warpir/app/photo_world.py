@@ -4,17 +4,15 @@ from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from warpir.app.config import InsertConfig
+from warpir.core.arrays import Float64Array
 from warpir.core.errors import InputError
 from warpir.io.cameras.source import PhotoCamera, turned
 from warpir.scene.camera import Camera
 from warpir.scene.free_space import Cloud
 from warpir.scene.ground import fit_ground
 from warpir.scene.placement import upright_plane, y_to
-
-Float64Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True)

@@ -11,9 +11,8 @@ from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
-FloatArray = NDArray[np.floating[Any]]
+from warpir.core.arrays import AnyFloatArray
 
 LUMINANCE_WEIGHTS = (0.2126, 0.7152, 0.0722)
 """Luminance of linear Rec.709 red, green and blue [1]."""
@@ -59,7 +58,7 @@ def are_primaries(chromaticities: Sequence[float]) -> bool:
     return bool(abs((xg - xr) * (yb - yr) - (xb - xr) * (yg - yr)) > 1e-3)
 
 
-def primaries_to_xyz(chromaticities: Sequence[float], white: Sequence[float]) -> FloatArray:
+def primaries_to_xyz(chromaticities: Sequence[float], white: Sequence[float]) -> AnyFloatArray:
     """Return the matrix from linear RGB of some primaries to CIE XYZ, shape [3, 3].
 
     Args:
@@ -72,13 +71,15 @@ def primaries_to_xyz(chromaticities: Sequence[float], white: Sequence[float]) ->
     adapt = colour.adaptation.matrix_chromatic_adaptation_VonKries(
         colour.xy_to_XYZ(xy[3]), colour.xy_to_XYZ(np.asarray(white)), transform="Bradford"
     )
-    matrix: FloatArray = adapt @ to_xyz
+    matrix: AnyFloatArray = adapt @ to_xyz
     return matrix
 
 
-def primaries_to_rec709(chromaticities: Sequence[float]) -> FloatArray:
+def primaries_to_rec709(chromaticities: Sequence[float]) -> AnyFloatArray:
     """Return the matrix from linear RGB of some primaries to ours, white on white, [3, 3]."""
-    matrix: FloatArray = XYZ_TO_REC709 @ primaries_to_xyz(chromaticities, REC709_CHROMATICITIES[6:])
+    matrix: AnyFloatArray = XYZ_TO_REC709 @ primaries_to_xyz(
+        chromaticities, REC709_CHROMATICITIES[6:]
+    )
     return matrix
 
 
@@ -99,32 +100,32 @@ def colour_science() -> Any:
     return colour
 
 
-def luminance(rgb: FloatArray) -> FloatArray:
+def luminance(rgb: AnyFloatArray) -> AnyFloatArray:
     """Return the luminance of linear Rec.709 colours, shape [..., 3] to [...]."""
     red, green, blue = LUMINANCE_WEIGHTS
-    total: FloatArray = red * rgb[..., 0] + green * rgb[..., 1] + blue * rgb[..., 2]
+    total: AnyFloatArray = red * rgb[..., 0] + green * rgb[..., 1] + blue * rgb[..., 2]
     return total
 
 
-def srgb_to_linear(srgb: FloatArray) -> FloatArray:
+def srgb_to_linear(srgb: AnyFloatArray) -> AnyFloatArray:
     """Decode sRGB (IEC 61966-2-1), odd about 0 so that out-of-gamut values survive."""
     size = np.abs(srgb)
     linear = np.where(size <= 0.04045, size / 12.92, ((size + 0.055) / 1.055) ** 2.4)
     return np.copysign(linear, srgb).astype(srgb.dtype, copy=False)
 
 
-def linear_to_srgb(linear: FloatArray) -> FloatArray:
+def linear_to_srgb(linear: AnyFloatArray) -> AnyFloatArray:
     """Encode linear light as sRGB (IEC 61966-2-1), odd about 0: inverse of `srgb_to_linear`."""
     size = np.abs(linear)
     srgb = np.where(size <= 0.0031308, size * 12.92, 1.055 * size ** (1.0 / 2.4) - 0.055)
     return np.copysign(srgb, linear).astype(linear.dtype, copy=False)
 
 
-def gamma_to_linear(encoded: FloatArray) -> FloatArray:
+def gamma_to_linear(encoded: AnyFloatArray) -> AnyFloatArray:
     """Decode the photograph as DiPIR does: ``encoded ** 2.2``, negative values as 0."""
     return np.maximum(encoded, 0) ** encoded.dtype.type(GAMMA)
 
 
-def linear_to_gamma(linear: FloatArray) -> FloatArray:
+def linear_to_gamma(linear: AnyFloatArray) -> AnyFloatArray:
     """Encode the composite as DiPIR does: ``linear ** (1 / 2.2)``, negative values as 0."""
     return np.maximum(linear, 0) ** linear.dtype.type(1.0 / GAMMA)

@@ -52,6 +52,9 @@ class InputError(Exception):
         what: What is wrong, with what was found and what was expected.
         advice: What to do about it, or an empty string.
         code: The exit code of this class of fault.
+        reason: Stable identifier of the fault, such as ``gltf.index_out_of_range``: what programs
+            and tests compare, where the sentence is for a person.
+        fields: What the sentence says, as values: found, limit, pointer.
     """
 
     def __init__(
@@ -60,12 +63,17 @@ class InputError(Exception):
         what: str,
         advice: str = "",
         code: ExitCode = ExitCode.INPUT,
+        *,
+        reason: str = "",
+        **fields: object,
     ) -> None:
         super().__init__(f"{where}: {what}")
         self.where = str(where)
         self.what = what
         self.advice = advice
         self.code = code
+        self.reason = reason
+        self.fields = fields
         self.also: tuple[InputError, ...] = ()
         """Further problems found in the same pass; printed, but they decide nothing."""
 

@@ -4,11 +4,9 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 from PIL import Image, ImageDraw
 
-Codes = NDArray[np.uint8]
-FloatArray = NDArray[np.float32]
+from warpir.core.arrays import CodeArray, FloatArray
 
 DIFFERENCE_GAIN = 4.0
 """Factor on the difference, round mid grey."""
@@ -24,18 +22,18 @@ class Panel:
     name: str
     error: float
     """What the scenes are sorted by."""
-    photo: Codes
-    image: Codes
-    truth: Codes
+    photo: CodeArray
+    image: CodeArray
+    truth: CodeArray
 
 
-def to_codes(picture: FloatArray) -> Codes:
+def to_codes(picture: FloatArray) -> CodeArray:
     """Return a display-encoded picture as 8-bit codes."""
-    codes: Codes = np.round(255.0 * np.clip(picture, 0.0, 1.0)).astype(np.uint8)
+    codes: CodeArray = np.round(255.0 * np.clip(picture, 0.0, 1.0)).astype(np.uint8)
     return codes
 
 
-def contact_sheet(panels: Sequence[Panel], row: str, count: int = 40) -> Codes:
+def contact_sheet(panels: Sequence[Panel], row: str, count: int = 40) -> CodeArray:
     """Return the sheet, worst scenes first.
 
     Args:
@@ -55,5 +53,5 @@ def contact_sheet(panels: Sequence[Panel], row: str, count: int = 40) -> Codes:
             draw.text((k * width + 2, LINE + 1), words.format(row=row), fill="black")
         pictures = np.concatenate([panel.photo, panel.image, panel.truth, shown], axis=1)
         strips += [np.asarray(caption), pictures]
-    sheet: Codes = np.concatenate(strips, axis=0)
+    sheet: CodeArray = np.concatenate(strips, axis=0)
     return sheet

@@ -9,13 +9,9 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 
 import numpy as np
-from numpy.typing import NDArray
 
+from warpir.core.arrays import BoolArray, Float64Array, FloatArray
 from warpir.core.color import gamma_to_linear
-
-FloatArray = NDArray[np.float32]
-Float64Array = NDArray[np.float64]
-Mask = NDArray[np.bool_]
 
 REGIONS = ("full", "box", "asset", "shadow")
 SHADOW_RATIO = 0.95
@@ -27,7 +23,7 @@ Distance = Callable[[FloatArray, FloatArray], float]
 """Of two pictures of one size, such as LPIPS."""
 
 
-def make_regions(mask: FloatArray, ratio: FloatArray) -> dict[str, Mask]:
+def make_regions(mask: FloatArray, ratio: FloatArray) -> dict[str, BoolArray]:
     """Return the regions that are looked at apart, by name, shape [H, W] each.
 
     ``full``; ``box``, the object's bounding box grown by `BOX_GROWTH`; ``asset``, where any of the
@@ -55,7 +51,7 @@ def make_regions(mask: FloatArray, ratio: FloatArray) -> dict[str, Mask]:
 def image_errors(
     image: FloatArray,
     truth: FloatArray,
-    regions: Mapping[str, Mask],
+    regions: Mapping[str, BoolArray],
     lpips: Distance | None = None,
 ) -> dict[str, dict[str, float]]:
     """Return every error by region and name; an empty region has none.

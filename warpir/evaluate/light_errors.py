@@ -17,20 +17,13 @@ from dataclasses import dataclass
 from functools import cache
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.ndimage import binary_dilation, label
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
+from warpir.core.arrays import BoolArray, Float64Array, FloatArray, Int64Array, IntArray
 from warpir.core.color import luminance
-from warpir.scene.light import (
-    Float64Array,
-    FloatArray,
-    angles_from_axis,
-    map_directions,
-    resize_map,
-    texel_solid_angles,
-)
+from warpir.scene.light import angles_from_axis, map_directions, resize_map, texel_solid_angles
 
 HEIGHT = 128
 """Rows of the maps that are compared; there are twice as many columns."""
@@ -68,7 +61,6 @@ AREA_MAX = 0.5
 LENGTH_MAX = 0.9
 """So is one that is longer than this share of the map's width [1]."""
 
-BoolArray = NDArray[np.bool_]
 Axis = Float64Array | None
 """A unit direction, or nothing where a map has none."""
 
@@ -235,7 +227,7 @@ def _angle_deg(a: Axis, b: Axis) -> float:
 
 
 @cache
-def _neighbours() -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+def _neighbours() -> tuple[Int64Array, Int64Array]:
     """Return the pairs of texels that touch on the sphere: also over the seam and the poles."""
     width = 2 * HEIGHT
     index = np.arange(HEIGHT * width).reshape(HEIGHT, width)
@@ -246,7 +238,7 @@ def _neighbours() -> tuple[NDArray[np.int64], NDArray[np.int64]]:
     return first, second
 
 
-def _parts(mask: BoolArray) -> NDArray[np.int32]:
+def _parts(mask: BoolArray) -> IntArray:
     """Return the number of the connected part that each texel belongs to; each other one is alone.
 
     Args:

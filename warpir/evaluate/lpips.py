@@ -14,15 +14,13 @@ from pathlib import Path
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 from safetensors import SafetensorError
 from safetensors.torch import load_file
 from torch import Tensor
 from torch.nn.functional import conv2d, max_pool2d
 
+from warpir.core.arrays import FloatArray
 from warpir.core.errors import ExitCode, InputError
-
-FloatArray = NDArray[np.float32]
 
 LAYERS = (
     ("net.slice1.0", 4, 2, False),

@@ -9,14 +9,11 @@ it is, since it is the light.
 from dataclasses import replace
 
 import numpy as np
-from numpy.typing import NDArray
 
+from warpir.core.arrays import Float64Array, FloatArray
 from warpir.core.color import GAMMA, linear_to_gamma
 from warpir.scene.camera import Camera, camera_from_fov
 from warpir.scene.placement import turn
-
-FloatArray = NDArray[np.float32]
-Float64Array = NDArray[np.float64]
 
 WHITE_PERCENTILE = 99.0
 """Percentile of the encoded values that becomes `WHITE` [%]."""

@@ -19,6 +19,7 @@ from numpy.lib.format import open_memmap
 from numpy.typing import NDArray
 from scipy.ndimage import uniform_filter1d
 
+from warpir.core.arrays import Float64Array, FloatArray
 from warpir.core.color import gamma_to_linear
 from warpir.core.errors import InputError, raise_all
 from warpir.core.limits import LIMITS
@@ -28,13 +29,7 @@ from warpir.io.images.decoder import check_regular_file
 from warpir.io.images.photos import read_envmap
 from warpir.io.results import OutputFolder
 from warpir.scene.camera import Camera
-from warpir.scene.light import (
-    Float64Array,
-    FloatArray,
-    angles_from_axis,
-    map_directions,
-    rotate_map,
-)
+from warpir.scene.light import angles_from_axis, map_directions, rotate_map
 
 INDEX = "crops.json"
 SUFFIXES = (".exr", ".hdr", ".npy")

@@ -13,9 +13,8 @@ from functools import lru_cache
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
-Float64Array = NDArray[np.float64]
+from warpir.core.arrays import Float64Array
 
 ROUNDS = 10_000
 """Samples drawn by the bootstrap."""

@@ -14,12 +14,12 @@ from typing import Any
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 
 from warpir.app.config import InsertConfig, usage
 from warpir.app.inputs import Inputs
 from warpir.app.model_files import require_model
 from warpir.app.record import Timings
+from warpir.core.arrays import CodeArray, Float64Array, FloatArray
 from warpir.core.color import luminance
 from warpir.core.errors import InputError
 from warpir.core.progress import StepProgress
@@ -34,9 +34,6 @@ from warpir.lighting.scene_light import make_light
 from warpir.optimize.recover import Run, recover
 from warpir.scene.light import Light, Lobes, rotate_map
 from warpir.scene.placement import Placement
-
-FloatArray = NDArray[np.float32]
-Float64Array = NDArray[np.float64]
 
 ORACLE_LOBES = 64
 """Lobes that the oracle has: as many as the recovered light."""
@@ -369,7 +366,7 @@ def recover_light(
     )
 
 
-def _written(codes: NDArray[np.uint8], path: Path) -> Photo:
+def _written(codes: CodeArray, path: Path) -> Photo:
     path.write_bytes(png_bytes(codes, None, False, "a crop of a panorama"))
     return read_photo(path)
 

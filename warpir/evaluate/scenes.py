@@ -17,8 +17,8 @@ from pathlib import Path
 from typing import TypeVar
 
 import numpy as np
-from numpy.typing import NDArray
 
+from warpir.core.arrays import Float64Array, FloatArray
 from warpir.core.color import gamma_to_linear, linear_to_gamma, luminance
 from warpir.core.errors import InputError
 from warpir.evaluate.panorama_crop import crop_camera, crop_radiance, expose
@@ -29,8 +29,6 @@ from warpir.scene.camera import Camera
 from warpir.scene.light import Light, resize_map, rotate_map, summarize
 from warpir.scene.placement import Placement, place_asset, point_on_ground, upright_plane
 
-FloatArray = NDArray[np.float32]
-Float64Array = NDArray[np.float64]
 Read = TypeVar("Read")
 
 LIGHT_HEIGHT = 512

@@ -11,8 +11,8 @@ from typing import Any
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 
+from warpir.core.arrays import FloatArray, IntArray
 from warpir.core.color import linear_to_gamma
 from warpir.core.errors import InputError
 from warpir.evaluate.scenes import RESPONSES, Subject
@@ -22,9 +22,6 @@ from warpir.render.renderer import Foreground, Renderer, light_args
 from warpir.render.tone_curve import ToneCurve
 from warpir.scene.light import Light
 from warpir.scene.tone_curves import Curves, ToneKnots
-
-FloatArray = NDArray[np.float32]
-IntArray = NDArray[np.int32]
 
 FLOOR_EVALUATIONS = 60
 """Times that the tone floor's curves are tried while they are sought."""

@@ -30,15 +30,10 @@ from numpy.typing import NDArray
 from scipy.ndimage import zoom
 from scipy.sparse import csr_array
 
+from warpir.core.arrays import Float64Array, FloatArray
 from warpir.core.color import luminance
 from warpir.evaluate.light_errors import HEIGHT, checked_maps, sun_sky_ratio_error
-from warpir.scene.light import (
-    Float64Array,
-    FloatArray,
-    map_directions,
-    rotate_map,
-    texel_solid_angles,
-)
+from warpir.scene.light import map_directions, rotate_map, texel_solid_angles
 
 CAMERA = np.array([16.0, 2.0, 0.0])
 """Position of the spheres' camera; the unit sphere is at the origin (camera-yaw frame)."""

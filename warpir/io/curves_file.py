@@ -13,14 +13,12 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from warpir.core.arrays import FloatArray
 from warpir.core.errors import InputError
 from warpir.core.limits import LIMITS, Limits
 from warpir.core.strict_json import read_json_object
 from warpir.scene.tone_curves import CURVE_COUNTS, TONES, Curves, ToneKnots
-
-FloatArray = NDArray[np.float32]
 
 FORMAT = "warpir-curves"
 VERSION = 1

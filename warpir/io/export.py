@@ -11,9 +11,9 @@ from string import Template
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 import warpir
+from warpir.core.arrays import Float64Array, FloatArray
 from warpir.io.gltf.writer import write_glb
 from warpir.io.images.envmap_conventions import from_ours
 from warpir.io.images.photos import Photo
@@ -22,9 +22,6 @@ from warpir.scene.asset import Asset
 from warpir.scene.camera import Camera, blender_camera, square_pixel_error
 from warpir.scene.placement import Placement, y_to
 from warpir.scene.tone_curves import Curves, ToneKnots
-
-FloatArray = NDArray[np.float32]
-Float64Array = NDArray[np.float64]
 
 PHOTO, OBJECT, BLENDER_SETUP = "photo.png", "object.glb", "blender_setup.py"
 OBJECT_CURVE, SHADOW_CURVE = "tone_curve_object.cube", "tone_curve_shadow.cube"

@@ -27,18 +27,13 @@ import numpy as np
 
 import warpir
 from warpir.core import color
+from warpir.core.arrays import FloatArray, PixelArray
 from warpir.core.atomic import remove_folder, sync, write_staged
 from warpir.core.errors import ExitCode, InputError, disk_error
 from warpir.core.limits import LIMITS
 from warpir.core.signals import Stopped, whole
 from warpir.core.strict_json import read_json_object
-from warpir.io.images.decoder import (
-    FloatArray,
-    Pixels,
-    decode_image,
-    library_error,
-    read_exr_channels,
-)
+from warpir.io.images.decoder import decode_image, library_error, read_exr_channels
 from warpir.scene.camera import Camera, exr_matrices
 
 UNFINISHED = {
@@ -210,7 +205,7 @@ class OutputFolder:
     def write_png(
         self,
         name: str,
-        codes: Pixels,
+        codes: PixelArray,
         *,
         icc: bytes | None = None,
         mark: bool = True,
@@ -228,7 +223,7 @@ class OutputFolder:
         """
         self.write_bytes(name, png_bytes(codes, icc, mark, description))
 
-    def write_preview(self, step: int, codes: Pixels, icc: bytes | None = None) -> Path:
+    def write_preview(self, step: int, codes: PixelArray, icc: bytes | None = None) -> Path:
         """Write a picture of the way to the result, at once and outside of what is staged.
 
         Args:
@@ -253,7 +248,7 @@ class OutputFolder:
         return path
 
     def write_exr(
-        self, name: str, channels: Mapping[str, Pixels], header: Mapping[str, Any] | None = None
+        self, name: str, channels: Mapping[str, PixelArray], header: Mapping[str, Any] | None = None
     ) -> None:
         """Stage a single-part scanline EXR with ZIP compression.
 
@@ -766,7 +761,7 @@ def _json_bytes(content: Mapping[str, Any]) -> bytes:
     return (json.dumps(content, indent=2, allow_nan=False, default=plain) + "\n").encode()
 
 
-def png_bytes(codes: Pixels, icc: bytes | None, mark: bool, description: str) -> bytes:
+def png_bytes(codes: PixelArray, icc: bytes | None, mark: bool, description: str) -> bytes:
     """Serialise a PNG.
 
     Written out here because Pillow has no 16-bit RGB, and OpenImageIO states sRGB beside any
@@ -822,31 +817,31 @@ def _color_header() -> dict[str, Any]:
 class Layers:
     """What ``layers.exr`` holds, all linear Rec.709; buffers that a run has not made are absent."""
 
-    composite: Pixels
+    composite: PixelArray
     """``foreground.rgb + (1 - foreground.a) * plate * shadow_ratio`` [1], shape [H, W, 3]."""
-    foreground: Pixels
+    foreground: PixelArray
     """Object alone, premultiplied by coverage [1], shape [H, W, 4]."""
-    shadow_ratio: Pixels
+    shadow_ratio: PixelArray
     """Multiplies the plate; 1 where the object changes nothing [1], shape [H, W, 3]."""
-    plate: Pixels
+    plate: PixelArray
     """Linearised photograph [1], shape [H, W, 3]."""
-    matte: Pixels
+    matte: PixelArray
     """Object coverage, 0 to 1, shape [H, W]."""
-    depth: Pixels | None = None
+    depth: PixelArray | None = None
     """Distance along the viewing axis [m], infinite on the background, shape [H, W]."""
-    position: Pixels | None = None
+    position: PixelArray | None = None
     """World position [m], shape [H, W, 3]."""
-    normal: Pixels | None = None
+    normal: PixelArray | None = None
     """World unit normal, shape [H, W, 3]."""
-    albedo: Pixels | None = None
+    albedo: PixelArray | None = None
     """Base colour [1], shape [H, W, 3]."""
-    roughness: Pixels | None = None
+    roughness: PixelArray | None = None
     """Perceptual roughness [1], shape [H, W]."""
-    emission: Pixels | None = None
+    emission: PixelArray | None = None
     """Part of `foreground` that the object emits [1], shape [H, W, 3]."""
-    diffuse: Pixels | None = None
+    diffuse: PixelArray | None = None
     """Part of `foreground` reflected diffusely [1], shape [H, W, 3]."""
-    specular: Pixels | None = None
+    specular: PixelArray | None = None
     """Part of `foreground` reflected specularly [1], shape [H, W, 3]."""
 
 
@@ -887,7 +882,7 @@ def read_layers(path: str | Path, max_pixels: int = LIMITS.pixels) -> Layers:
         InputError: Missing, too large, truncated, or without the layers that every such file has.
     """
     channels = read_exr_channels(Path(path), max_pixels)
-    planes: dict[str, Pixels] = {}
+    planes: dict[str, PixelArray] = {}
     for plane in _CHANNELS:
         names = _channel_names(plane)
         if all(name in channels for name in names):
@@ -942,11 +937,11 @@ def write_layers(
         worst = float(np.nanmax(np.abs(layers.composite - recomputed)))
         raise ValueError(f"composite differs from fg + (1 - a) plate shadow by up to {worst:g}")
 
-    channels: dict[str, Pixels] = {}
+    channels: dict[str, PixelArray] = {}
     clamped = 0
 
     for name in _CHANNELS:
-        plane: Pixels | None = getattr(layers, name)
+        plane: PixelArray | None = getattr(layers, name)
         if plane is None:
             continue
         if name == "depth":

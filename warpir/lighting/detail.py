@@ -13,17 +13,14 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from warpir.app.inputs import Inputs
+from warpir.core.arrays import Float64Array, FloatArray
 from warpir.render.composite import photo_radiance, resize
 from warpir.scene.camera import Camera
 from warpir.scene.lamps import without_lamps
 from warpir.scene.light import Light, as_map, map_directions, texel_solid_angles
 from warpir.scene.tone_curves import Curves
-
-FloatArray = NDArray[np.float32]
-Float64Array = NDArray[np.float64]
 
 HEIGHT = 512
 """Rows of the map with detail: 0.35 degrees, what a mirror of 200 pixels can show."""

@@ -8,8 +8,8 @@ over solid angle. No gradient descent, so nothing can get stuck.
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from warpir.core.arrays import BoolArray, Float64Array, FloatArray
 from warpir.core.color import luminance
 from warpir.scene.lamps import LAMP_COUNT_MAX, lamps_of
 from warpir.scene.light import (
@@ -20,8 +20,6 @@ from warpir.scene.light import (
     resize_map,
     texel_solid_angles,
 )
-
-Float64Array = NDArray[np.float64]
 
 FIT_HEIGHT = 64
 """Rows of the map on which amplitudes are solved."""
@@ -40,7 +38,7 @@ class LobeFit:
     """How many lobes stand for compact sources."""
 
 
-def fit_lobes(texels: NDArray[np.float32], count: int) -> LobeFit:
+def fit_lobes(texels: FloatArray, count: int) -> LobeFit:
     """Fit ``count`` lobes to a map.
 
     Args:
@@ -63,10 +61,10 @@ def fit_lobes(texels: NDArray[np.float32], count: int) -> LobeFit:
 
 
 def _solve(
-    texels: NDArray[np.float32],
+    texels: FloatArray,
     axes: Float64Array,
     sharpnesses: Float64Array,
-    covered: list[NDArray[np.bool_]],
+    covered: list[BoolArray],
 ) -> Float64Array:
     """Solve the amplitudes per channel; a lamp's neighbourhood enters as one equation, its flux."""
     from scipy.optimize import nnls
@@ -101,7 +99,7 @@ def _solve(
     return np.stack([nnls(matrix, target[:, c])[0] for c in range(3)], axis=1)
 
 
-def _errors(texels: NDArray[np.float32], lobes: Lobes) -> tuple[float, float]:
+def _errors(texels: FloatArray, lobes: Lobes) -> tuple[float, float]:
     """Return relative RMSE of irradiance over normals, and relative flux error."""
     normals = fibonacci(512)
     coarse = resize_map(texels, FIT_HEIGHT)
@@ -119,7 +117,7 @@ def _errors(texels: NDArray[np.float32], lobes: Lobes) -> tuple[float, float]:
     return error / scale, abs(fitted_flux - flux) / flux
 
 
-def texel_flux(texels: NDArray[np.float32]) -> Float64Array:
+def texel_flux(texels: FloatArray) -> Float64Array:
     """Return radiance times solid angle of each texel, shape [He, We, 3]."""
     omega = texel_solid_angles(texels.shape[0], texels.shape[1])
     return texels.astype(np.float64) * omega[:, None, None]

@@ -29,6 +29,7 @@ from numpy.typing import NDArray
 from safetensors.torch import load_file, save
 from torch import Tensor, nn
 
+from warpir.core.arrays import Float64Array, FloatArray
 from warpir.core.atomic import write_file
 from warpir.core.color import GAMMA, LUMINANCE_WEIGHTS
 from warpir.core.errors import ExitCode, InputError
@@ -36,14 +37,7 @@ from warpir.diffusion.model_error import ModelError
 from warpir.diffusion.weight_files import REGRESSOR_FORMAT as FORMAT
 from warpir.diffusion.weight_files import check_regressor, values_hash
 from warpir.scene.camera import Camera
-from warpir.scene.light import (
-    Float64Array,
-    FloatArray,
-    Lobes,
-    angles_from_axis,
-    fibonacci,
-    map_directions,
-)
+from warpir.scene.light import Lobes, angles_from_axis, fibonacci, map_directions
 
 HEIGHT, WIDTH = 96, 144
 """Size that the network sees [px]; photos of other shapes are stretched, and the rays say so."""

@@ -3,11 +3,11 @@
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from warpir.app.config import InsertConfig, usage
 from warpir.app.inputs import Inputs
 from warpir.app.reuse import EarlierRun
+from warpir.core.arrays import Float64Array
 from warpir.core.color import luminance
 from warpir.core.errors import InputError
 from warpir.lighting.fit import LobeFit, fit_lobes
@@ -34,8 +34,6 @@ LIT_SHARE = 0.1
 """Share of that ground which must be known to be out of shadow to be measured alone [1]."""
 SEEN = 0.99
 """A point counts as seen when the camera's ray gets this share of the way to it [1]."""
-
-Float64Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True)
@@ -232,6 +230,6 @@ def _level(inputs: Inputs, points: Float64Array, percentile: float) -> float:
     return float(np.percentile(luminance(photo.astype(np.float64)), percentile))
 
 
-def _unit(v: NDArray[np.float64]) -> NDArray[np.float64]:
-    unit: NDArray[np.float64] = v / np.linalg.norm(v)
+def _unit(v: Float64Array) -> Float64Array:
+    unit: Float64Array = v / np.linalg.norm(v)
     return unit

@@ -17,13 +17,13 @@ from typing import NamedTuple
 import drjit as dr
 import mitsuba as mi
 import numpy as np
-from numpy.typing import NDArray
 
 if mi.variant() is None:
     mi.set_variant("cuda_ad_rgb" if dr.has_backend(dr.JitBackend.CUDA) else "llvm_ad_rgb")
 
 from mitsuba.python.ad.integrators.common import mis_weight
 
+from warpir.core.arrays import Float64Array, FloatArray
 from warpir.core.color import linear_to_gamma
 from warpir.io.assets import load_asset
 from warpir.io.cameras.reader import read_camera
@@ -37,8 +37,6 @@ from warpir.mitsuba.path import RAY_OFFSET, GltfPath, intersect
 from warpir.scene.asset import Asset
 from warpir.scene.camera import Camera, mitsuba_sensor
 
-FloatArray = NDArray[np.float64]
-
 SAMPLES_PER_PASS = 1 << 21
 """Camera samples traced at once; bounds memory at about 1 GB."""
 
@@ -46,39 +44,39 @@ SAMPLES_PER_PASS = 1 << 21
 class Foreground(NamedTuple):
     """The object alone, averaged over all camera samples of each pixel."""
 
-    mean: FloatArray
+    mean: Float64Array
     """Radiance premultiplied by coverage, relative [W/(m^2 sr)], shape [H, W, 3]."""
-    variance: FloatArray
+    variance: Float64Array
     """Variance of ``mean``, shape [H, W, 3]."""
-    coverage: FloatArray
+    coverage: Float64Array
     """Share of camera samples that see the object [1], shape [H, W]."""
 
 
 class Shadow(NamedTuple):
     """A white Lambertian plane, averaged over the camera samples that see it."""
 
-    lit: FloatArray
+    lit: Float64Array
     """Radiance with the object, relative [W/(m^2 sr)], shape [H, W, 3]; NaN where unseen."""
-    unoccluded: FloatArray
+    unoccluded: Float64Array
     """Radiance without it, relative [W/(m^2 sr)], shape [H, W, 3]; NaN where unseen."""
-    lit_variance: FloatArray
+    lit_variance: Float64Array
     """Variance of ``lit``, shape [H, W, 3]."""
-    unoccluded_variance: FloatArray
+    unoccluded_variance: Float64Array
     """Variance of ``unoccluded``, shape [H, W, 3]."""
-    covariance: FloatArray
+    covariance: Float64Array
     """Covariance of the two means: they share samples, shape [H, W, 3]."""
-    seen: FloatArray
+    seen: Float64Array
     """Share of camera samples that see the plane [1], shape [H, W]."""
 
 
 class Ratio(NamedTuple):
     """Quotient of a plane's two radiances; 1 where it is not seen."""
 
-    mean: FloatArray
+    mean: Float64Array
     """Ratio [1], shape [H, W, 3]."""
-    variance: FloatArray
+    variance: Float64Array
     """Variance of ``mean``, shape [H, W, 3]."""
-    coverage: FloatArray
+    coverage: Float64Array
     """Share of camera samples that see the plane [1], shape [H, W]."""
 
 
@@ -89,14 +87,14 @@ class ObjectScene:
     scene: mi.Scene
     sensor: mi.Sensor
     integrator: GltfPath
-    center: FloatArray
+    center: Float64Array
     """World position that became the origin [m], shape [3]."""
     radius: float
     """World length that became 1 [m]."""
 
 
 def build(
-    asset: Asset, matrix: FloatArray, camera: Camera, texels: NDArray[np.float32], depth: int
+    asset: Asset, matrix: Float64Array, camera: Camera, texels: FloatArray, depth: int
 ) -> ObjectScene:
     """Build the Mitsuba scene of one object under one light.
 
@@ -132,9 +130,9 @@ def build(
 
 def foreground(
     asset: Asset,
-    matrix: FloatArray,
+    matrix: Float64Array,
     camera: Camera,
-    texels: NDArray[np.float32],
+    texels: FloatArray,
     depth: int,
     spp: int,
     seed: int,
@@ -172,9 +170,9 @@ def foreground(
 
 def shadow(
     asset: Asset,
-    matrix: FloatArray,
+    matrix: Float64Array,
     camera: Camera,
-    texels: NDArray[np.float32],
+    texels: FloatArray,
     spp: int,
     seed: int,
     ground: tuple[float, float, float, float] = (0.0, 1.0, 0.0, 0.0),
@@ -223,9 +221,9 @@ def shadow(
 
 def shadow_ratio(
     asset: Asset,
-    matrix: FloatArray,
+    matrix: Float64Array,
     camera: Camera,
-    texels: NDArray[np.float32],
+    texels: FloatArray,
     spp: int,
     seed: int,
     ground: tuple[float, float, float, float] = (0.0, 1.0, 0.0, 0.0),
@@ -242,7 +240,7 @@ def shadow_ratio(
     return Ratio(ratio, variance, plane.seen)
 
 
-def _mesh(asset: Asset, index: int, positions: FloatArray, linear: FloatArray) -> mi.Mesh:
+def _mesh(asset: Asset, index: int, positions: Float64Array, linear: Float64Array) -> mi.Mesh:
     """Mitsuba mesh of one primitive, unit frame, without texture coordinates (see `GltfBSDF`)."""
     primitive = asset.primitives[index]
     bsdf = GltfBSDF(asset, primitive, linear)
@@ -271,7 +269,7 @@ def _mesh(asset: Asset, index: int, positions: FloatArray, linear: FloatArray) -
     return mesh
 
 
-def _sensor(camera: Camera, center: FloatArray, radius: float) -> mi.Sensor:
+def _sensor(camera: Camera, center: Float64Array, radius: float) -> mi.Sensor:
     """Mitsuba camera in the unit frame, box filter."""
     c2w = camera.c2w.copy()
     c2w[:3, 3] = (c2w[:3, 3] - center) / radius
@@ -305,7 +303,9 @@ def passes(camera: Camera, spp: int, seed: int) -> Iterator[tuple[int, int]]:
         yield (seed * 65537 + k) % (1 << 32), spp * (k + 1) // count - spp * k // count
 
 
-def _mean_and_variance(moments: FloatArray, count: FloatArray) -> tuple[FloatArray, FloatArray]:
+def _mean_and_variance(
+    moments: Float64Array, count: Float64Array
+) -> tuple[Float64Array, Float64Array]:
     """Mean, and variance of the mean, from sums of samples and of their squares."""
     with np.errstate(divide="ignore", invalid="ignore"):
         mean = moments[0] / count
@@ -314,7 +314,7 @@ def _mean_and_variance(moments: FloatArray, count: FloatArray) -> tuple[FloatArr
 
 
 def _trace_plane(
-    setup: ObjectScene, normal: FloatArray, offset: float, seed: int, spp: int
+    setup: ObjectScene, normal: Float64Array, offset: float, seed: int, spp: int
 ) -> tuple[mi.Color3f, mi.Color3f, mi.Bool]:
     """Sample radiance of the plane ``dot(normal, x) = offset``, 0 where it is not seen.
 
@@ -373,8 +373,8 @@ def _trace_plane(
 class Composite(NamedTuple):
     """A run's picture as Mitsuba renders it, display-linear, shape [H, W, 3]."""
 
-    mean: FloatArray
-    error: FloatArray
+    mean: Float64Array
+    error: Float64Array
     """Standard error of ``mean``, to first order through the tone curves."""
 
 
@@ -410,14 +410,14 @@ def render_run(
     coverage = lit.coverage[..., None]
     share = np.where(coverage > 0.0, coverage, 1.0)
 
-    def tone(radiance: FloatArray) -> FloatArray:
+    def tone(radiance: Float64Array) -> Float64Array:
         x = radiance / (1.0 + radiance) if curves.tone == "reinhard" else radiance
         return curves.foreground.evaluate(x)[..., 0]
 
     displayed, slope = _through(tone, lit.mean / share)
     plane = shadow_ratio(asset, matrix, camera, texels_shadow, spp, seed + 1, ground)
 
-    def bend(ratio: FloatArray) -> FloatArray:
+    def bend(ratio: Float64Array) -> Float64Array:
         curved = curves.shadow_ratio.evaluate(ratio)
         return np.stack([curved[..., k, k] for k in range(3)], axis=-1)
 
@@ -427,7 +427,7 @@ def render_run(
     return Composite(displayed * coverage + behind * ratio, np.sqrt(variance))
 
 
-def _light(folder: Path, name: str) -> NDArray[np.float32]:
+def _light(folder: Path, name: str) -> FloatArray:
     """Return the map of one use, where it has one of its own, else that of all."""
     own = folder / f"envmap_{name}.exr"
     return read_envmap(own if own.exists() else folder / "envmap.exr")
@@ -463,17 +463,17 @@ def main(folder: Path, ground: tuple[float, float, float, float], depth: int) ->
 
 
 def _through(
-    curve: Callable[[FloatArray], FloatArray], x: FloatArray
-) -> tuple[FloatArray, FloatArray]:
+    curve: Callable[[Float64Array], Float64Array], x: Float64Array
+) -> tuple[Float64Array, Float64Array]:
     """Return a curve's values and its slopes, by central differences."""
     step = 1e-4
     return curve(x), (curve(x + step) - curve(np.maximum(x - step, 0.0))) / (2.0 * step)
 
 
-def _plate(path: Path) -> FloatArray:
+def _plate(path: Path) -> Float64Array:
     """Return the linearised photo out of a file of layers, shape [H, W, 3]."""
     bitmap = mi.Bitmap(str(path))
     names = [field.name for field in bitmap.struct_()]
     planes = [names.index(f"plate.{c}") for c in "RGB"]
-    plate: FloatArray = np.array(bitmap)[..., planes].astype(np.float64)
+    plate: Float64Array = np.array(bitmap)[..., planes].astype(np.float64)
     return plate

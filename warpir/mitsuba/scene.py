@@ -11,19 +11,16 @@ import re
 from dataclasses import dataclass, field
 
 import numpy as np
-from numpy.typing import NDArray
 
 import warpir
 from warpir.app.inputs import Inputs
+from warpir.core.arrays import CodeArray, Float64Array, FloatArray, IntArray
 from warpir.core.color import linear_to_srgb, srgb_to_linear
 from warpir.io.export import OBJECT
 from warpir.io.images.envmap_conventions import read_map
 from warpir.io.results import OutputFolder, png_bytes
 from warpir.scene.asset import Asset, Material, Primitive, Texture, TextureSlot
 from warpir.scene.camera import Camera, mitsuba_sensor
-
-FloatArray = NDArray[np.float32]
-Float64Array = NDArray[np.float64]
 
 FOLDER = "mitsuba"
 LEAST_ROWS, FINE_ROWS = 512, 2048
@@ -87,9 +84,9 @@ def mitsuba_rows(texels: FloatArray) -> FloatArray:
 
 def ply_bytes(
     positions: Float64Array,
-    indices: NDArray[np.int32],
+    indices: IntArray,
     normals: Float64Array | None,
-    uv: NDArray[np.float32] | None,
+    uv: FloatArray | None,
 ) -> bytes:
     """Return a mesh as a binary PLY.
 
@@ -225,7 +222,7 @@ class _Scene:
         self._bitmap(name, codes, slot)
 
     def _bitmap(
-        self, name: str, codes: NDArray[np.uint8], slot: TextureSlot, is_color: bool = False
+        self, name: str, codes: CodeArray, slot: TextureSlot, is_color: bool = False
     ) -> None:
         file = f"texture_{self.textures:03d}.png"
         self.textures += 1
@@ -242,7 +239,7 @@ class _Scene:
             "    </texture>",
         ]
 
-    def _pixels(self, slot: TextureSlot) -> NDArray[np.uint8]:
+    def _pixels(self, slot: TextureSlot) -> CodeArray:
         return self.asset.textures[slot.texture].pixels
 
 

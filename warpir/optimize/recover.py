@@ -16,7 +16,6 @@ from typing import Any
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 
 from warpir.app.config import DEFAULTS, PRIOR_DEFAULTS, InsertConfig
 from warpir.app.inputs import Inputs
@@ -63,8 +62,6 @@ from warpir.render.tone_curve import ToneCurve
 from warpir.scene.camera import Camera
 from warpir.scene.light import Lobes, as_map, summarize
 from warpir.scene.tone_curves import Curves, ToneKnots
-
-FloatArray = NDArray[np.float32]
 
 LIGHT_HEIGHT = 256
 """Rows of the map that is delivered."""

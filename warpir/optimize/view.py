@@ -9,13 +9,12 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 from torch import Tensor
 
+from warpir.core.arrays import FloatArray, IntArray, PixelArray
 from warpir.render.bridge import ComposeConstants, compose
 from warpir.render.integrator import Integrator, LightTensors, Radiance
 from warpir.render.mis import MisIntegrator
@@ -24,9 +23,6 @@ from warpir.render.tone_curve import Knots
 from warpir.render.transport.integrator import TransportIntegrator
 from warpir.render.transport.rows import TransportSettings
 from warpir.scene.light import Light
-
-FloatArray = NDArray[np.float32]
-IntArray = NDArray[np.int32]
 
 COVERAGE_SAMPLES = 64
 """Camera samples that find each pixel's share of the object for `mis`."""
@@ -153,7 +149,7 @@ def _shaded(renderer: Renderer, expected: Light, seed: int) -> IntArray:
     """
     even = Light(texels=np.ones((8, 16, 3), np.float32))
     found = [renderer.shaded_pixels(light_args(x, renderer.device), seed) for x in (even, expected)]
-    union: NDArray[Any] = np.union1d(*found)
+    union: PixelArray = np.union1d(*found)
     return union.astype(np.int32)
 
 

@@ -3,8 +3,8 @@
 from dataclasses import replace
 
 import numpy as np
-from numpy.typing import NDArray
 
+from warpir.core.arrays import Float64Array, FloatArray
 from warpir.scene.asset import Asset, Primitive, Texture
 
 TRIANGLES = 300_000
@@ -13,9 +13,6 @@ TEXTURE_SIDE = 1024
 """Longest side of a texture that it gets [px]."""
 FINEST = 1024
 """Cells along the asset's longest side with which thinning begins."""
-
-FloatArray = NDArray[np.float32]
-Float64Array = NDArray[np.float64]
 
 
 def preview_asset(asset: Asset, triangles: int = TRIANGLES) -> Asset:

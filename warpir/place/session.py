@@ -20,6 +20,7 @@ from warpir.app.command import read_values
 from warpir.app.config import DEFAULTS, SKY_PRESETS, InsertConfig
 from warpir.app.inputs import Loaders, photo_camera, read_asset
 from warpir.app.photo_world import make_world
+from warpir.core.arrays import Float64Array
 from warpir.core.atomic import replacing, write_staged
 from warpir.core.errors import ExitCode, InputError, disk_error
 from warpir.io.cameras.source import number
@@ -30,7 +31,7 @@ from warpir.place.preview_asset import preview_asset, triangle_count
 from warpir.place.stance import Stance, ground_to_world, stance_of
 from warpir.scene.asset import Asset
 from warpir.scene.camera import Camera
-from warpir.scene.placement import Float64Array, place_asset, upright_plane
+from warpir.scene.placement import place_asset, upright_plane
 
 CAMERA, CONFIG = "camera.json", "insert.json"
 """Names of the two files."""

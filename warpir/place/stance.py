@@ -8,11 +8,9 @@ import math
 from dataclasses import asdict, dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from warpir.core.arrays import Float64Array
 from warpir.scene.placement import turn, y_to
-
-Float64Array = NDArray[np.float64]
 
 X, Y, Z = np.eye(3)
 

@@ -11,12 +11,9 @@ from collections.abc import Callable, Iterator, Mapping
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from warpir.core.arrays import BoolArray, FloatArray, IntArray
 from warpir.core.errors import ExitCode, InputError
-
-IntArray = NDArray[np.int32]
-FloatArray = NDArray[np.float32]
 
 BAD_SHARE = 0.01
 """Of the pixels of one rendering: more than this is no picture any more."""
@@ -70,7 +67,7 @@ class BadPixels:
 
     def add(
         self,
-        bad: NDArray[np.bool_],
+        bad: BoolArray,
         pixels: IntArray,
         width: int,
         stage: str,

@@ -11,9 +11,9 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import torch
 import warp as wp
-from numpy.typing import NDArray
 from torch import Tensor
 
+from warpir.core.arrays import FloatArray, IntArray
 from warpir.kernels import composite as composite_kernels
 from warpir.kernels.rasterize import rasterize as rasterize_kernel
 from warpir.kernels.shadow_ratio import shadow_ratio as ratio_kernel
@@ -25,9 +25,8 @@ from warpir.render.tone_curve import Knots
 from warpir.scene.light import Light, Lobes
 
 if TYPE_CHECKING:
-    from warpir.render.mis import IntArray, MisIntegrator
+    from warpir.render.mis import MisIntegrator
 
-FloatArray = NDArray[np.float32]
 
 KNOT_COPIES = 32
 """Copies of the tone curves on CUDA, so that threads add to gradients of their own; see

@@ -5,9 +5,9 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from warpir.app.inputs import Inputs
+from warpir.core.arrays import BoolArray, CodeArray, FloatArray, IntArray
 from warpir.core.color import linear_to_gamma
 from warpir.io.images.photos import Photo
 from warpir.io.results import Layers
@@ -18,9 +18,6 @@ from warpir.scene.lamps import without_lamps
 from warpir.scene.light import Light, as_map, map_directions, texel_solid_angles
 from warpir.scene.shadow_mask import ShadowMask
 from warpir.scene.tone_curves import Curves, ToneKnots
-
-FloatArray = NDArray[np.float32]
-Float64Array = NDArray[np.float64]
 
 PLACE_WIDTH = 1024
 """Most columns of the photo that sends light back into the scene [px]."""
@@ -52,7 +49,7 @@ class Picture:
     layers: Layers
     image: FloatArray
     """The composite, display-encoded, shape [H, W, 3]."""
-    changed: NDArray[np.bool_]
+    changed: BoolArray
     """Pixels that differ from the photo, shape [H, W]."""
     object_pixel_count: int
     """Pixels whose object was traced, at the rendering resolution."""
@@ -103,7 +100,7 @@ def make_picture(
     is_object = np.zeros(camera.width * camera.height, np.int32)
     is_object[gbuffer.object_pixels] = 1
 
-    def shaded(light: Light, wanted: NDArray[np.bool_]) -> tuple[NDArray[np.int32], FloatArray]:
+    def shaded(light: Light, wanted: BoolArray) -> tuple[IntArray, FloatArray]:
         """Return which of the wanted pixels the object shades, and their ratio."""
         args = args_fg if light is dimmed else light_args(light, renderer.device)
         pixels = renderer.shaded_pixels(args, quality.seed)
@@ -192,10 +189,10 @@ def _behind(planes: dict[str, FloatArray], occluder: FloatArray) -> dict[str, Fl
 
 
 def _mixed(
-    lit: tuple[NDArray[np.int32], FloatArray],
-    rest: tuple[NDArray[np.int32], FloatArray],
+    lit: tuple[IntArray, FloatArray],
+    rest: tuple[IntArray, FloatArray],
     shares: FloatArray,
-) -> tuple[NDArray[np.int32], FloatArray]:
+) -> tuple[IntArray, FloatArray]:
     """Blend the ratio under the whole light and that without lamps by the mask.
 
     Args:
@@ -282,7 +279,7 @@ def _geometry(size: tuple[int, int], gbuffer: GBuffer, camera: Camera) -> dict[s
 
 
 def _plane(
-    size: tuple[int, int], pixels: NDArray[np.int32], values: FloatArray, outside: float = 0.0
+    size: tuple[int, int], pixels: IntArray, values: FloatArray, outside: float = 0.0
 ) -> FloatArray:
     """Spread rows of values over an image."""
     plane = np.full((size[0] * size[1], *values.shape[1:]), outside, np.float32)
@@ -322,7 +319,7 @@ def resize(plane: FloatArray, height: int, width: int) -> FloatArray:
     return np.asarray(resized, dtype=np.float32)
 
 
-def balls(light: Light, camera: Camera, is_reinhard: bool, size: int = 192) -> NDArray[np.uint8]:
+def balls(light: Light, camera: Camera, is_reinhard: bool, size: int = 192) -> CodeArray:
     """Return a mirror ball and a grey diffuse ball under the light, as the camera sees them.
 
     As on a film set: `GREY_BALL` keeps the lit side of a sunny light below the photo's white.

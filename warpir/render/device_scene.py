@@ -14,6 +14,7 @@ import numpy as np
 import warp as wp
 from numpy.typing import NDArray
 
+from warpir.core.arrays import Float64Array, FloatArray, IntArray
 from warpir.core.color import srgb_to_linear
 from warpir.kernels.proxy_mesh import trace_seen
 from warpir.kernels.types import (
@@ -28,9 +29,6 @@ from warpir.render.sheen import sheen_albedo_table
 from warpir.scene.asset import Asset, Material, Primitive, Texture, TextureSlot
 from warpir.scene.camera import Camera
 from warpir.scene.receiver import ProxyMesh
-
-FloatArray = NDArray[np.float32]
-Float64Array = NDArray[np.float64]
 
 ALPHA_MODES = {"OPAQUE": 0, "MASK": 1, "BLEND": 2}
 SLOTS = (
@@ -77,12 +75,12 @@ class _Vertices:
     """Attribute arrays of one primitive, world frame, one row a vertex."""
 
     positions: Float64Array
-    indices: NDArray[np.int32]
+    indices: IntArray
     normals: Float64Array
     tangents: Float64Array
-    uv0: NDArray[np.float32]
-    uv1: NDArray[np.float32]
-    colors: NDArray[np.float32]
+    uv0: FloatArray
+    uv1: FloatArray
+    colors: FloatArray
 
 
 def _unit(v: Float64Array) -> Float64Array:

@@ -11,14 +11,12 @@ from __future__ import annotations
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 from torch import Tensor
 
+from warpir.core.arrays import IntArray
 from warpir.render.bridge import ShadeForeground, ShadeProxy, host_light
 from warpir.render.integrator import LightTensors, MaterialTensors, Radiance
 from warpir.render.renderer import Renderer, index_of, light_args
-
-IntArray = NDArray[np.int32]
 
 
 class MisIntegrator:

@@ -22,6 +22,7 @@ import numpy as np
 import warp as wp
 from numpy.typing import NDArray
 
+from warpir.core.arrays import AnyFloatArray, BoolArray, Float64Array, FloatArray, IntArray
 from warpir.core.cache import KernelCache
 from warpir.core.color import luminance
 from warpir.core.errors import ExitCode, InputError
@@ -38,10 +39,6 @@ from warpir.render.device_scene import Scene
 from warpir.scene.camera import Camera
 from warpir.scene.light import Light, texel_solid_angles
 from warpir.scene.tone_curves import ToneKnots
-
-IntArray = NDArray[np.int32]
-FloatArray = NDArray[np.float32]
-Float64Array = NDArray[np.float64]
 
 SAMPLES_PER_SLICE = 1 << 16
 """CPU work of one launch; keeps launches under half a second, so that Ctrl-C is answered."""
@@ -131,7 +128,7 @@ def light_args(light: Light, device: wp.Device) -> LightArgs:
     lobes, texels = light.lobes, light.texels
     if texels is None and (lobes is None or len(lobes.sharpness) == 0):
         raise ValueError("a light needs lobes or a map")
-    flux: NDArray[np.floating[Any]] = np.zeros(0)
+    flux: AnyFloatArray = np.zeros(0)
     if lobes is not None and len(lobes.sharpness):
         values = np.concatenate(
             [lobes.amplitude.reshape(-1), lobes.axis.reshape(-1), lobes.sharpness]
@@ -202,7 +199,7 @@ def light_args(light: Light, device: wp.Device) -> LightArgs:
     return args
 
 
-def _require_finite(values: NDArray[np.floating[Any]], what: str) -> None:
+def _require_finite(values: AnyFloatArray, what: str) -> None:
     bad = int(values.size - np.isfinite(values).sum())
     if bad:
         found = f"{bad} of the {values.size} values of its {what} are not finite"
@@ -756,7 +753,7 @@ def _mean_of_neighbours(values: FloatArray) -> FloatArray:
     return np.asarray(total / 9.0, np.float32)
 
 
-def _dilate(mask: NDArray[np.bool_]) -> NDArray[np.bool_]:
+def _dilate(mask: BoolArray) -> BoolArray:
     """Grow a mask by one pixel in all eight directions."""
     padded = np.pad(mask, 1)
     grown = np.zeros_like(mask)

@@ -13,8 +13,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 import warp as wp
-from numpy.typing import NDArray
 
+from warpir.core.arrays import Float64Array, FloatArray
 from warpir.kernels import light_gradient as light_kernels
 from warpir.kernels import shade as shade_kernels
 from warpir.kernels.types import (
@@ -29,8 +29,7 @@ from warpir.render.renderer import SAMPLES_PER_SLICE, ProxyRadiance, Renderer, R
 if TYPE_CHECKING:
     from warpir.render.mis import MisIntegrator
 
-FloatArray = NDArray[np.float32]
-Gradients = list[NDArray[np.float64] | None]
+Gradients = list[Float64Array | None]
 """Of amplitude, axis, sharpness, texels (and base colour, metallic, roughness, emission), in this
 order; None for what is not asked for."""
 

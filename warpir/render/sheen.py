@@ -8,9 +8,8 @@ table is integrated here, in float64.
 from functools import cache
 
 import numpy as np
-from numpy.typing import NDArray
 
-Float64Array = NDArray[np.float64]
+from warpir.core.arrays import Float64Array
 
 TABLE_SIZE = 32
 ALPHA_MIN = 1e-3

@@ -10,10 +10,9 @@ from dataclasses import dataclass
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 from torch import Tensor
 
-FloatArray = NDArray[np.float32]
+from warpir.core.arrays import FloatArray
 
 MIN_BIN = 1e-3
 """Least width, height and slope of a bin [1]."""

@@ -19,7 +19,6 @@ from string import Template
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 import warpir
 from warpir.app.command import BY_HAND, Parser, read_values
@@ -28,6 +27,7 @@ from warpir.app.finished import config_of_record
 from warpir.app.program import run_program, say
 from warpir.app.record import name_of
 from warpir.app.reuse import check_files, run_record
+from warpir.core.arrays import CodeArray, Float64Array, FloatArray
 from warpir.core.atomic import write_file
 from warpir.core.errors import ExitCode, InputError
 from warpir.core.limits import LIMITS, Limits
@@ -80,10 +80,6 @@ LEAST_PHOTO = 8.0
 OPEN_END = 1e-3
 """How far a tone curve's knots may be from the diagonal to count as the identity [1]."""
 
-Codes = NDArray[np.uint8]
-FloatArray = NDArray[np.float32]
-Float64Array = NDArray[np.float64]
-
 
 @dataclass(frozen=True)
 class Results:
@@ -102,7 +98,7 @@ class Results:
     """That of the shadow, where it has one of its own."""
     light_detail: FloatArray | None = None
     """That on the object with what the photo shows, where it has that."""
-    balls: Codes | None = None
+    balls: CodeArray | None = None
     """Content of ``balls.png``."""
     curves: Curves | None = None
     camera: Mapping[str, Any] | None = None

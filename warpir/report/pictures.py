@@ -15,16 +15,14 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 from PIL import Image
 
+from warpir.core.arrays import BoolArray, CodeArray, Float64Array, FloatArray
 from warpir.core.color import linear_to_gamma, luminance
 from warpir.io.images.decoder import decode_image
 from warpir.io.results import Layers
-from warpir.scene.light import Float64Array, bearing, resize_map, rotate_map
+from warpir.scene.light import bearing, resize_map, rotate_map
 
-Codes = NDArray[np.uint8]
-FloatArray = NDArray[np.float32]
 Box = tuple[int, int, int, int]
 """Left, top, right, bottom, half-open [px]."""
 
@@ -57,14 +55,14 @@ class Shown:
     height: int
 
 
-def jpeg(codes: Codes, quality: int = 88) -> Shown:
+def jpeg(codes: CodeArray, quality: int = 88) -> Shown:
     """Encode 8-bit codes, shape [H, W, 3] or [H, W]."""
     stream = io.BytesIO()
     Image.fromarray(codes).save(stream, "JPEG", quality=quality, subsampling=0)
     return Shown(_uri("image/jpeg", stream.getvalue()), codes.shape[1], codes.shape[0])
 
 
-def webp(codes: Codes) -> Shown:
+def webp(codes: CodeArray) -> Shown:
     """Encode 8-bit codes with alpha, shape [H, W, 4]."""
     stream = io.BytesIO()
     Image.fromarray(codes).save(stream, "WEBP", quality=88, method=1, alpha_quality=90)
@@ -100,15 +98,15 @@ def shrink(plane: FloatArray, largest: int) -> FloatArray:
     return shrunk
 
 
-def encoded(linear: FloatArray) -> Codes:
+def encoded(linear: FloatArray) -> CodeArray:
     """Return display codes of linear values."""
-    codes: Codes = np.round(255.0 * np.clip(linear_to_gamma(linear), 0.0, 1.0)).astype(np.uint8)
+    codes: CodeArray = np.round(255.0 * np.clip(linear_to_gamma(linear), 0.0, 1.0)).astype(np.uint8)
     return codes
 
 
-def plain(values: FloatArray) -> Codes:
+def plain(values: FloatArray) -> CodeArray:
     """Return codes of values in [0, 1] that are no light."""
-    codes: Codes = np.round(255.0 * np.clip(values, 0.0, 1.0)).astype(np.uint8)
+    codes: CodeArray = np.round(255.0 * np.clip(values, 0.0, 1.0)).astype(np.uint8)
     return codes
 
 
@@ -123,9 +121,9 @@ def thumbnail(path: Path, max_pixels: int) -> Shown:
         InputError: It cannot be read.
     """
     found = decode_image(path, max_pixels)
-    # Codes of 16 bits are 257 times those of 8.
+    # CodeArray of 16 bits are 257 times those of 8.
     is_deep = found.pixels.dtype != np.uint8
-    codes: Codes = (found.pixels // 257).astype(np.uint8) if is_deep else found.pixels
+    codes: CodeArray = (found.pixels // 257).astype(np.uint8) if is_deep else found.pixels
     image = Image.fromarray(codes[..., 0] if codes.shape[-1] == 1 else codes).convert("RGB")
     image.thumbnail((THUMBNAIL, THUMBNAIL), reducing_gap=2.0)
     stream = io.BytesIO()
@@ -156,7 +154,7 @@ def object_box(layers: Layers) -> Box | None:
     return None if is_whole else box
 
 
-def _box_of(chosen: NDArray[np.bool_]) -> Box | None:
+def _box_of(chosen: BoolArray) -> Box | None:
     rows, columns = np.flatnonzero(chosen.any(axis=1)), np.flatnonzero(chosen.any(axis=0))
     if not len(rows):
         return None
@@ -214,7 +212,7 @@ def layers_shown(layers: Layers) -> list[Layer]:
         weight = weight if averaged.ndim == 2 else weight[..., None]
         return np.asarray(averaged / weight, np.float32)
 
-    def over(codes: Codes, alpha: FloatArray) -> Shown:
+    def over(codes: CodeArray, alpha: FloatArray) -> Shown:
         rgb = np.repeat(codes[..., None], 3, axis=-1) if codes.ndim == 2 else codes
         return webp(np.concatenate([rgb, plain(alpha)[..., None]], axis=-1))
 
@@ -342,7 +340,7 @@ def panorama(texels: FloatArray, c2w: Float64Array, tone: str) -> Panorama:
     return Panorama(jpeg(encoded(shown)), stops, packed)
 
 
-def rgbe(linear: FloatArray) -> Codes:
+def rgbe(linear: FloatArray) -> CodeArray:
     """Return values as three mantissas and an exponent (Ward 1991), shape [H, W, 4]."""
     largest = linear.max(axis=-1)
     _, exponent = np.frexp(largest)

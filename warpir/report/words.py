@@ -10,9 +10,9 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.ndimage import label
 
+from warpir.core.arrays import Float64Array, FloatArray
 from warpir.core.color import luminance
 from warpir.scene.light import (
     angles_from_axis,
@@ -21,9 +21,6 @@ from warpir.scene.light import (
     resize_map,
     texel_solid_angles,
 )
-
-FloatArray = NDArray[np.float32]
-Float64Array = NDArray[np.float64]
 
 HEIGHT = 128
 """Rows of the map that is measured; a texel is 1.4 degrees."""

@@ -9,9 +9,8 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
-FloatArray = NDArray[np.float32]
+from warpir.core.arrays import CodeArray, Float64Array, FloatArray, IntArray
 
 ABSENT = "absent"
 """In place of a sha256, where grey stands for a file that could not be read."""
@@ -21,7 +20,7 @@ ABSENT = "absent"
 class Texture:
     """An image in memory; whether it is colour or plain numbers is decided by the slot using it."""
 
-    pixels: NDArray[np.uint8]
+    pixels: CodeArray
     """RGBA codes, row 0 at the top (v = 0), shape [height, width, 4]."""
     wrap_u: str = "repeat"
     """``repeat``, ``clamp`` or ``mirror``."""
@@ -113,9 +112,9 @@ class Material:
 class Primitive:
     """Triangles of one material, already in the asset's frame (node transforms applied)."""
 
-    positions: NDArray[np.float64]
+    positions: Float64Array
     """Asset frame [m], shape [vertex, 3]; float64 so that recentring loses nothing."""
-    indices: NDArray[np.int32]
+    indices: IntArray
     """Counter-clockwise seen from outside, shape [triangle, 3]."""
     material: int
     """Index into ``Asset.materials``."""
@@ -145,13 +144,13 @@ class Asset:
     """sha256 of what was read: of the asset's file as ``""``, of others by their relative names;
     `ABSENT` where grey stands for a file."""
 
-    def bounds(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    def bounds(self) -> tuple[Float64Array, Float64Array]:
         """Return the lowest and highest corner of all vertices, asset frame [m], shape [3] each."""
         low = np.min([p.positions.min(axis=0) for p in self.primitives], axis=0)
         high = np.max([p.positions.max(axis=0) for p in self.primitives], axis=0)
         return low, high
 
-    def turned(self, rotation: NDArray[np.float64]) -> "Asset":
+    def turned(self, rotation: Float64Array) -> "Asset":
         """Return the same turned about its origin.
 
         Args:

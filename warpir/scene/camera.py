@@ -9,11 +9,9 @@ from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from warpir.core.arrays import Float64Array
 from warpir.core.errors import ExitCode, InputError
-
-Float64Array = NDArray[np.float64]
 
 FILM_DIAGONAL_35MM = 43.267
 """Diagonal of the 36 x 24 mm frame that EXIF's equivalent focal length refers to [mm]."""

@@ -9,13 +9,12 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from warpir.core.arrays import BoolArray, Float64Array
 from warpir.core.errors import InputError
 from warpir.scene.camera import Camera
 from warpir.scene.placement import DEFAULT_STAND, Placement, point_on_ground
 
-Float64Array = NDArray[np.float64]
 Place = tuple[float, float, float]
 
 MARGIN = 0.1
@@ -115,7 +114,7 @@ def points_in_way(
 
 def _over_footprint(
     asset_to_world: Float64Array, low: Float64Array, high: Float64Array, points: Float64Array
-) -> NDArray[np.bool_]:
+) -> BoolArray:
     """Return which points lie above or below the footprint and its margin, shape [point]."""
     inverse = np.linalg.inv(asset_to_world)
     local = points @ inverse[:3, :3].T + inverse[:3, 3]

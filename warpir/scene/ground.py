@@ -7,12 +7,10 @@ distances, cut off at a threshold), the best is refined by total least squares o
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
+from warpir.core.arrays import BoolArray, Float64Array
 from warpir.core.errors import InputError
 from warpir.scene.camera import Camera
-
-Float64Array = NDArray[np.float64]
 
 HYPOTHESES = 50_000
 """Triples tried: ground that makes up 5 % of the points is hit about six times."""
@@ -139,7 +137,7 @@ def _fit(
     return GroundFit(plane, rms, int(near.sum()), len(points), tilt, height)
 
 
-def in_view(points: Float64Array, camera: Camera) -> NDArray[np.bool_]:
+def in_view(points: Float64Array, camera: Camera) -> BoolArray:
     """Return which points project into the photo, shape [point]."""
     with np.errstate(invalid="ignore"):
         pixels = camera.project(points)

@@ -7,12 +7,10 @@ and sends more than `LAMP_SHARE` of the light's flux.
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
+from warpir.core.arrays import BoolArray, Float64Array, FloatArray
 from warpir.core.color import luminance
 from warpir.scene.light import Light, map_directions, texel_solid_angles
-
-Float64Array = NDArray[np.float64]
 
 LAMP_SHARE = 0.03
 """Share of the flux above which a compact source counts [1]."""
@@ -31,13 +29,13 @@ class MapLamps:
     """Unit directions, world frame, shape [lamp, 3]."""
     sharpness: Float64Array
     """Of lobes with their spread, shape [lamp]."""
-    near: list[NDArray[np.bool_]]
+    near: list[BoolArray]
     """Surroundings of each, shape [He, We]."""
     rest: Float64Array
     """Luminance of the map without them, shape [He, We]."""
 
 
-def lamps_of(texels: NDArray[np.float32], limit: int = LAMP_COUNT_MAX) -> MapLamps:
+def lamps_of(texels: FloatArray, limit: int = LAMP_COUNT_MAX) -> MapLamps:
     """Find compact sources: axis and sharpness by the moments of what exceeds the surroundings.
 
     Args:
@@ -52,7 +50,7 @@ def lamps_of(texels: NDArray[np.float32], limit: int = LAMP_COUNT_MAX) -> MapLam
     left = lum.copy()
     axes: list[Float64Array] = []
     sharpnesses: list[float] = []
-    covered: list[NDArray[np.bool_]] = []
+    covered: list[BoolArray] = []
     while len(axes) < limit and total > 0.0:
         peak = directions[np.unravel_index(np.argmax(left), left.shape)]
         cosine = directions @ peak
@@ -110,7 +108,7 @@ def lamp_axes(light: Light) -> Float64Array:
     return np.concatenate(axes)
 
 
-def _lamp_lobes(light: Light) -> NDArray[np.bool_]:
+def _lamp_lobes(light: Light) -> BoolArray:
     """Return which lobes are lamps, shape [lobe]."""
     if light.lobes is None:
         return np.zeros(0, bool)
@@ -120,5 +118,5 @@ def _lamp_lobes(light: Light) -> NDArray[np.bool_]:
         omega = texel_solid_angles(*light.texels.shape[:2])[:, None]
         total += float((luminance(light.texels.astype(np.float64)) * omega).sum())
     narrow = light.lobes.sharpness > 1.0 / np.radians(LAMP_RADIUS_DEG) ** 2
-    found: NDArray[np.bool_] = narrow & (flux > LAMP_SHARE * total)
+    found: BoolArray = narrow & (flux > LAMP_SHARE * total)
     return found

@@ -11,9 +11,8 @@ A point at (x, y) of the image plane at depth 1, x right and y down, is seen at
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
-Float64Array = NDArray[np.float64]
+from warpir.core.arrays import Float64Array
 
 NEGLIGIBLE = 1e-6
 """A lens none of whose coefficients is larger is taken to be straight."""

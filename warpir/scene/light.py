@@ -8,15 +8,11 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from itertools import pairwise
-from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from warpir.core.arrays import AnyFloatArray, BoolArray, Float64Array, FloatArray
 from warpir.core.color import luminance
-
-FloatArray = NDArray[np.float32]
-Float64Array = NDArray[np.float64]
 
 SUN_RADIUS_DEG = 0.2665
 """Mean angular radius of the sun [deg]."""
@@ -273,7 +269,7 @@ def rasterize_lobes(lobes: Lobes, height: int, width: int, side: int = 6) -> Flo
     return texels.astype(np.float32)
 
 
-def _some(lobes: Lobes, chosen: NDArray[np.bool_]) -> Lobes:
+def _some(lobes: Lobes, chosen: BoolArray) -> Lobes:
     return Lobes(lobes.amplitude[chosen], lobes.axis[chosen], lobes.sharpness[chosen])
 
 
@@ -297,9 +293,7 @@ def resize_map(texels: FloatArray, height: int) -> FloatArray:
     Texels are taken as constant, so energy is kept exactly at any size.
     """
 
-    def boxes(
-        values: NDArray[np.floating[Any]], old: Float64Array, new: Float64Array
-    ) -> Float64Array:
+    def boxes(values: AnyFloatArray, old: Float64Array, new: Float64Array) -> Float64Array:
         """Average rows between rising ``old`` edges over rising ``new`` ones."""
         averaged = np.empty((len(new) - 1, *values.shape[1:]))
         # One row at a time: a float64 copy of an 8k map and its running sum would take 3 GiB.

@@ -9,13 +9,11 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from warpir.core.arrays import Float64Array
 from warpir.core.errors import InputError
 from warpir.scene.camera import Camera, ground_point
 from warpir.scene.receiver import ProxyMesh, first_hit
-
-Float64Array = NDArray[np.float64]
 
 DEFAULT_STAND = (0.5, 0.75)
 """Where an object stands that was given no place: fractions of the photo's width and height."""

@@ -7,12 +7,10 @@ point of the ground. The kernels' half is `warpir.kernels.proxy_mesh`.
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from warpir.core.arrays import Float64Array, Int64Array, IntArray
 from warpir.scene.asset import Asset
 from warpir.scene.camera import Camera
-
-Float64Array = NDArray[np.float64]
 
 CHUNK = 1 << 21
 """Pairs of ray and triangle that are tested at once."""
@@ -24,7 +22,7 @@ class ProxyMesh:
 
     positions: Float64Array
     """World frame [m], shape [vertex, 3]."""
-    indices: NDArray[np.int32]
+    indices: IntArray
     """Shape [triangle, 3]."""
 
 
@@ -42,7 +40,7 @@ def mesh_of(asset: Asset) -> ProxyMesh:
 
 def first_hit(
     mesh: ProxyMesh, origins: Float64Array, directions: Float64Array
-) -> tuple[Float64Array, NDArray[np.int64]]:
+) -> tuple[Float64Array, Int64Array]:
     """Return how far each ray gets, every triangle tried (Moeller and Trumbore 1997).
 
     Args:

@@ -8,12 +8,9 @@ itself no lamp lights it.
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from warpir.core.arrays import Float64Array, FloatArray
 from warpir.scene.camera import Camera
-
-FloatArray = NDArray[np.float32]
-Float64Array = NDArray[np.float64]
 
 FOOTPRINT_SIDE = 16
 """Points along each side of the object's footprint that the mask is read at."""

@@ -9,13 +9,10 @@ parameters that are optimised, `warpir.kernels.tone` the device's evaluation,
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
-FloatArray = NDArray[np.float32]
-Float64Array = NDArray[np.float64]
+from warpir.core.arrays import AnyFloatArray, Float64Array, FloatArray
 
 TONES = ("linear", "reinhard")
 """Operators between radiance and the foreground's curve: clipped, or ``x / (1 + x)``."""
@@ -41,7 +38,7 @@ class ToneKnots:
         """Return the arrays in the kernels' order."""
         return self.x, self.y, self.slope
 
-    def invert(self, y: NDArray[np.floating[Any]], curve: int = 0) -> Float64Array:
+    def invert(self, y: AnyFloatArray, curve: int = 0) -> Float64Array:
         """Return where a curve has these values in [0, 1] (Durkan et al. 2019, eqs. 6 to 8).
 
         Args:
@@ -61,7 +58,7 @@ class ToneKnots:
         inverse: Float64Array = knot_x[b] + width * 2.0 * m * above / (half + root)
         return inverse
 
-    def evaluate(self, x: NDArray[np.float64]) -> NDArray[np.float64]:
+    def evaluate(self, x: Float64Array) -> Float64Array:
         """Evaluate every curve (Durkan et al. 2019, eq. 4), as `warpir.kernels.tone` does.
 
         Args:
@@ -87,18 +84,18 @@ class ToneKnots:
 
 
 def _spline(
-    t: NDArray[np.float64],
-    x: NDArray[np.float64],
-    y: NDArray[np.float64],
-    slope: NDArray[np.float64],
-) -> NDArray[np.float64]:
+    t: Float64Array,
+    x: Float64Array,
+    y: Float64Array,
+    slope: Float64Array,
+) -> Float64Array:
     """Evaluate one curve within [0, 1] from its knots."""
     k = np.clip(np.searchsorted(x, t, side="right") - 1, 0, len(x) - 2)
     width, rise = x[k + 1] - x[k], y[k + 1] - y[k]
     m, q = rise / width, (t - x[k]) / width
     r = q * (1.0 - q)
     bent = (m * q * q + slope[k] * r) / (m + (slope[k + 1] + slope[k] - 2.0 * m) * r)
-    value: NDArray[np.float64] = y[k] + rise * bent
+    value: Float64Array = y[k] + rise * bent
     return value
 
 
@@ -113,7 +110,7 @@ class Curves:
     shadow_ratio: ToneKnots
     """Three curves, red, green and blue."""
 
-    def radiance(self, photo_lin: NDArray[np.floating[Any]]) -> Float64Array:
+    def radiance(self, photo_lin: AnyFloatArray) -> Float64Array:
         """Return the radiance that the foreground's curve and operator show as these values.
 
         Values above 1, which only a linear plate has, are radiance as they are; without an

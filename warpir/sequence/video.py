@@ -16,10 +16,10 @@ from subprocess import DEVNULL, PIPE
 
 import numpy as np
 
+from warpir.core.arrays import PixelArray
 from warpir.core.atomic import WriteError, replacing
 from warpir.core.errors import InputError
 from warpir.core.limits import LIMITS
-from warpir.io.images.decoder import Pixels
 from warpir.io.images.photos import read_photo
 
 VIDEO = "composite.mp4"
@@ -61,7 +61,7 @@ def write_video(
     if program is None:
         raise NoVideo("no ffmpeg was found on PATH, so there is no video of the frames")
 
-    def read(frame: Path) -> Pixels:
+    def read(frame: Path) -> PixelArray:
         photo = read_photo(frame, max_pixels=max_pixels)
         return np.round(np.clip(photo.srgb, 0.0, 1.0) * 255.0).astype(np.uint8)
 
@@ -73,7 +73,9 @@ def write_video(
         raise NoVideo(f"no video of the frames: {error}") from error
 
 
-def _encode(program: str, path: Path, first: Pixels, others: Iterable[Pixels], fps: float) -> None:
+def _encode(
+    program: str, path: Path, first: PixelArray, others: Iterable[PixelArray], fps: float
+) -> None:
     """Let ffmpeg write a file of pictures that it gets one by one.
 
     Raises:

@@ -8,9 +8,9 @@ from pathlib import Path
 
 import numpy as np
 
+from warpir.core.arrays import PixelArray
 from warpir.core.errors import InputError
 from warpir.core.limits import LIMITS
-from warpir.io.images.decoder import Pixels
 from warpir.io.images.photos import read_photo
 from warpir.io.results import png_bytes
 
@@ -22,7 +22,7 @@ LARGEST_SHARE = 0.5
 HOW_MADE = "what differs from the photo is turned upside down in place"
 
 
-def read_image(path: Path, *, max_pixels: int = LIMITS.pixels, alpha: str = "refuse") -> Pixels:
+def read_image(path: Path, *, max_pixels: int = LIMITS.pixels, alpha: str = "refuse") -> PixelArray:
     """Read a picture as raters see it: 8-bit sRGB codes, upright, shape [H, W, 3].
 
     Args:
@@ -39,11 +39,11 @@ def read_image(path: Path, *, max_pixels: int = LIMITS.pixels, alpha: str = "ref
         raise InputError(
             path, f"scene-linear ({photo.kind}; expected a picture as it is displayed)"
         )
-    codes: Pixels = np.round(255.0 * photo.srgb).astype(np.uint8)
+    codes: PixelArray = np.round(255.0 * photo.srgb).astype(np.uint8)
     return codes
 
 
-def require_same_size(first: Path, image: Pixels, second: Path, other: Pixels) -> None:
+def require_same_size(first: Path, image: PixelArray, second: Path, other: PixelArray) -> None:
     """Refuse two images of different size: a rater would tell them apart by it.
 
     Raises:
@@ -55,7 +55,7 @@ def require_same_size(first: Path, image: Pixels, second: Path, other: Pixels) -
         raise InputError(second, f"size {found} px (expected {expected} px, as {first})")
 
 
-def upside_down(image: Pixels, photo: Pixels) -> Pixels | None:
+def upside_down(image: PixelArray, photo: PixelArray) -> PixelArray | None:
     """Make the worse image of a catch pair: the object and its shadow hang upside down.
 
     Args:
@@ -79,6 +79,6 @@ def upside_down(image: Pixels, photo: Pixels) -> Pixels | None:
     return turned
 
 
-def neutral_png(codes: Pixels) -> bytes:
+def neutral_png(codes: PixelArray) -> bytes:
     """Serialise an image with nothing in the file but its pixels and the word sRGB."""
     return png_bytes(codes, icc=None, mark=False, description="")

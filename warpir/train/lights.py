@@ -13,15 +13,12 @@ from typing import Any
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 from torch import Tensor
 
+from warpir.core.arrays import Float64Array, FloatArray
 from warpir.core.color import LUMINANCE_WEIGHTS, luminance
 from warpir.io.images.photos import read_envmap
 from warpir.scene.light import map_directions, resize_map, texel_solid_angles
-
-FloatArray = NDArray[np.float32]
-Float64Array = NDArray[np.float64]
 
 HEIGHT = 32
 """Rows of the map of everything but the sun."""

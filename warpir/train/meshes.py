@@ -14,11 +14,11 @@ import numpy as np
 import trimesh
 from numpy.typing import NDArray
 
+from warpir.core.arrays import Float64Array, FloatArray, IntArray
 from warpir.core.color import srgb_to_linear
 from warpir.io.assets import load_asset
 from warpir.scene.asset import Asset, Material, Primitive
 
-FloatArray = NDArray[np.float32]
 Random = np.random.Generator
 
 ASSET_NOUNS = {
@@ -35,7 +35,7 @@ class TrainingMesh:
     noun: str
     vertices: FloatArray
     """Shape [vertex, 3]."""
-    faces: NDArray[np.int32]
+    faces: IntArray
     """Shape [face, 3]."""
     normals: FloatArray
     """Of the corners, shape [face, 3, 3]."""
@@ -279,7 +279,7 @@ def mesh_of(asset: Asset, name: str) -> TrainingMesh:
     )
 
 
-def _face_albedo(asset: Asset, material: Material, primitive: Primitive) -> NDArray[np.float64]:
+def _face_albedo(asset: Asset, material: Material, primitive: Primitive) -> Float64Array:
     """Return the base colour in the middle of each face, linear, shape [face, 3]."""
     albedo = np.broadcast_to(material.base_color, (len(primitive.indices), 3)).astype(np.float64)
     slot = material.base_color_texture

@@ -9,8 +9,8 @@ import math
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
+from warpir.core.arrays import Float64Array
 from warpir.core.errors import InputError
 from warpir.core.limits import LIMITS, Limits
 from warpir.io.cameras.colmap_model import (
@@ -24,8 +24,6 @@ from warpir.io.cameras.colmap_model import (
 from warpir.io.cameras.source import StoredCamera, choose_frame
 from warpir.scene.camera import Camera
 from warpir.scene.lens import Lens
-
-Float64Array = NDArray[np.float64]
 
 UNDERSTOOD = tuple(MODELS)[:5]
 UNIT_TOLERANCE = 1e-3

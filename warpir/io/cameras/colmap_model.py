@@ -12,12 +12,10 @@ from pathlib import Path
 from typing import Any, BinaryIO
 
 import numpy as np
-from numpy.typing import NDArray
 
+from warpir.core.arrays import Float64Array
 from warpir.core.errors import InputError
 from warpir.core.limits import LIMITS, Limits
-
-Float64Array = NDArray[np.float64]
 
 MODELS = {
     "SIMPLE_PINHOLE": 3,

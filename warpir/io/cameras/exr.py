@@ -9,8 +9,9 @@ from typing import Any
 
 import numpy as np
 
+from warpir.core.arrays import Float64Array
 from warpir.core.errors import InputError
-from warpir.io.cameras.source import Float64Array, StoredCamera, rigid
+from warpir.io.cameras.source import StoredCamera, rigid
 from warpir.io.images.decoder import read_exr_header
 from warpir.scene.camera import Camera
 

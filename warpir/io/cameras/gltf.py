@@ -4,8 +4,9 @@ from pathlib import Path
 
 import numpy as np
 
+from warpir.core.arrays import Float64Array
 from warpir.core.limits import LIMITS, Limits
-from warpir.io.cameras.source import LARGEST, Float64Array, StoredCamera, choose_frame, rigid
+from warpir.io.cameras.source import LARGEST, StoredCamera, choose_frame, rigid
 from warpir.io.gltf.gate import Entry, GltfFile
 from warpir.io.gltf.reader import local_matrix, read_forest
 from warpir.scene.camera import Camera

@@ -6,13 +6,11 @@ from pathlib import Path, PurePosixPath
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from warpir.core.arrays import Float64Array
 from warpir.core.errors import InputError
 from warpir.scene.camera import Camera
 from warpir.scene.lens import STRAIGHT, Lens
-
-Float64Array = NDArray[np.float64]
 
 RIGID_TOLERANCE = 1e-4
 """How far R^T R may be from the identity; smaller errors are removed."""

@@ -9,10 +9,11 @@ from dataclasses import replace
 
 import numpy as np
 
+from warpir.core.arrays import PixelArray
 from warpir.core.errors import InputError
 from warpir.core.limits import LIMITS, Limits
 from warpir.io.gltf.gate import RE_EXPORT_MESH, Entry, GltfFile
-from warpir.io.meshes.asset_files import Pixels, TextureDecoder, grey_pixels, locate, read_uri
+from warpir.io.meshes.asset_files import TextureDecoder, grey_pixels, locate, read_uri
 from warpir.io.meshes.materials_file import EMISSION_LIMIT
 from warpir.scene.asset import Material, Texture, TextureSlot
 
@@ -110,7 +111,7 @@ class MaterialReader:
         self._roughness_index: dict[tuple[int, float], int] = {}
         """By the texture that holds the glossiness, and its factor."""
         self._is_colored: dict[int, bool] = {}
-        self._pixels: dict[int, Pixels | None] = {}
+        self._pixels: dict[int, PixelArray | None] = {}
 
     def index(self, primitive: Entry) -> int:
         """Return the index in ``materials`` of what a primitive is made of."""
@@ -373,7 +374,7 @@ class MaterialReader:
             self.textures.append(texture)
         return self._texture_index[use]
 
-    def _load(self, source: int, texture: Entry) -> Pixels | None:
+    def _load(self, source: int, texture: Entry) -> PixelArray | None:
         """Return the pixels of an image; None when it is missing and that is allowed."""
         if source == -1 and texture.extension("KHR_texture_basisu") is None:
             raise texture.error("no image source")

@@ -11,11 +11,10 @@ import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from warpir.core.arrays import Float64Array, FloatArray, IntArray, PixelArray
 from warpir.core.limits import LIMITS, Limits
 from warpir.io.gltf.gate import Entry, GltfFile
 from warpir.io.gltf.materials import MaterialReader, check_extensions
@@ -28,11 +27,10 @@ from warpir.io.meshes.asset_files import (
     repair_normals,
     unit,
 )
-from warpir.scene.asset import Asset, FloatArray, Primitive
+from warpir.scene.asset import Asset, Primitive
 
 POINTS_OR_LINES = (0, 1, 2, 3)
 STRIP, FAN = 5, 6
-Matrix = NDArray[np.float64]
 
 
 def read_gltf(path: str | Path, missing_textures: str = "error", limits: Limits = LIMITS) -> Asset:
@@ -88,7 +86,7 @@ def read_gltf(path: str | Path, missing_textures: str = "error", limits: Limits 
 
 def placed_primitives(
     file: GltfFile, notices: list[str]
-) -> Iterator[tuple[Entry, Matrix, Matrix | None]]:
+) -> Iterator[tuple[Entry, Float64Array, Float64Array | None]]:
     """Walk the scene and yield every drawable primitive with its matrix.
 
     Args:
@@ -108,8 +106,8 @@ def placed_primitives(
     if root.size("animations"):
         notices.append("animations are not played: the rest pose is used")
     instance_count = 0
-    skins: dict[int, Matrix] = {}
-    joint_worlds: dict[int, Matrix] = {}
+    skins: dict[int, Float64Array] = {}
+    joint_worlds: dict[int, Float64Array] = {}
     stack = [(index, np.eye(4), False) for index in range(len(nodes)) if index not in parents]
     stack.reverse()
     while stack:
@@ -125,7 +123,7 @@ def placed_primitives(
         stack += [(child, world, drawn) for child in reversed(node.integers("children"))]
         if not drawn or "mesh" not in node:
             continue
-        joints: Matrix | None = None
+        joints: Float64Array | None = None
         if "skin" in node:
             # The joints alone place a skinned mesh; its own node does not count.
             skin = node.integer("skin")
@@ -199,7 +197,7 @@ def scene_nodes(
     return set(listed)
 
 
-def local_matrix(node: Entry) -> Matrix:
+def local_matrix(node: Entry) -> Float64Array:
     """Return the matrix from a node's frame to its parent's, shape [4, 4]."""
     parts = [key for key in ("translation", "rotation", "scale") if key in node]
     if "matrix" in node:
@@ -221,7 +219,7 @@ def local_matrix(node: Entry) -> Matrix:
 
 def from_trs(
     translation: Sequence[float], rotation: Sequence[float], scale: Sequence[float]
-) -> Matrix:
+) -> Float64Array:
     """Return translation * rotation * scale as a matrix, shape [4, 4].
 
     Args:
@@ -242,7 +240,7 @@ def from_trs(
     return matrix
 
 
-def read_instances(file: GltfFile, node: Entry, world: Matrix) -> list[Matrix]:
+def read_instances(file: GltfFile, node: Entry, world: Float64Array) -> list[Float64Array]:
     """Return the matrices at which a node's mesh stands, shape [4, 4] each.
 
     One, or as many as EXT_mesh_gpu_instancing lists below the node.
@@ -281,8 +279,8 @@ def joint_matrices(
     node: Entry,
     nodes: list[Entry],
     parents: dict[int, int],
-    worlds: dict[int, Matrix],
-) -> Matrix:
+    worlds: dict[int, Float64Array],
+) -> Float64Array:
     """Return, for each joint of a node's skin, the matrix that moves what is bound to it alone.
 
     Joint times inverse bind matrix, from the mesh's frame to the asset's, shape [joint, 4, 4].
@@ -315,7 +313,7 @@ def joint_matrices(
         return np.asarray(bound @ inverse)
 
 
-def check_invertible(node: Entry, world: Matrix, which: str = "") -> None:
+def check_invertible(node: Entry, world: Float64Array, which: str = "") -> None:
     """Refuse a transform that flattens the mesh or overflows."""
     linear = world[:3, :3]
     if not (np.abs(world) < EXTENT).all():
@@ -329,7 +327,7 @@ def check_invertible(node: Entry, world: Matrix, which: str = "") -> None:
 
 
 def check_counts(
-    file: GltfFile, placed: list[tuple[Entry, Matrix, Matrix | None]], limits: Limits
+    file: GltfFile, placed: list[tuple[Entry, Float64Array, Float64Array | None]], limits: Limits
 ) -> None:
     """Refuse more triangles or vertices than the limit, before any is read."""
     triangle_count = vertex_count = 0
@@ -349,8 +347,8 @@ def check_counts(
 class Geometry:
     """A primitive in its own frame; the fields are those of `Primitive`."""
 
-    positions: NDArray[np.float64]
-    indices: NDArray[np.int32]
+    positions: Float64Array
+    indices: IntArray
     normals: FloatArray | None
     tangents: FloatArray | None
     uv0: FloatArray | None
@@ -384,7 +382,7 @@ def read_geometry(
     if not len(indices):
         return None
 
-    def read(name: str, types: tuple[str, ...]) -> NDArray[Any] | None:
+    def read(name: str, types: tuple[str, ...]) -> PixelArray | None:
         if name not in attributes:
             return None
         count = file.count(attributes.integer(name), entry, name)
@@ -416,9 +414,7 @@ def read_geometry(
     return Geometry(positions, indices, normals, tangents, uvs[0], uvs[1], colors)
 
 
-def read_triangles(
-    file: GltfFile, entry: Entry, vertex_count: int, notices: list[str]
-) -> NDArray[np.int32]:
+def read_triangles(file: GltfFile, entry: Entry, vertex_count: int, notices: list[str]) -> IntArray:
     """Return the triangles of a list, strip or fan, shape [triangle, 3]."""
     if "indices" in entry:
         stored = file.accessor(entry.integer("indices"), entry, "indices", ("SCALAR",))[:, 0]
@@ -445,7 +441,7 @@ def read_triangles(
     return np.stack([corners[first], corners[first + 1 + odd], corners[first + 2 - odd]], axis=1)
 
 
-def read_colors(stored: NDArray[Any] | None, entry: Entry, notices: list[str]) -> FloatArray | None:
+def read_colors(stored: PixelArray | None, entry: Entry, notices: list[str]) -> FloatArray | None:
     """Return linear RGBA in [0, 1], shape [vertex, 4]."""
     if stored is None:
         return None
@@ -458,7 +454,7 @@ def read_colors(stored: NDArray[Any] | None, entry: Entry, notices: list[str]) -
     return colors
 
 
-def pose(file: GltfFile, entry: Entry, geometry: Geometry, joints: Matrix) -> Geometry:
+def pose(file: GltfFile, entry: Entry, geometry: Geometry, joints: Float64Array) -> Geometry:
     """Move the vertices of a skinned primitive as its joints stand (linear blend skinning).
 
     Args:
@@ -512,7 +508,7 @@ def pose(file: GltfFile, entry: Entry, geometry: Geometry, joints: Matrix) -> Ge
     )
 
 
-def place(geometry: Geometry, world: Matrix, material: int) -> Primitive:
+def place(geometry: Geometry, world: Float64Array, material: int) -> Primitive:
     """Move a geometry into the asset's frame; a mirroring matrix turns the triangles round."""
     linear = world[:3, :3]
     mirrored = bool(np.linalg.det(linear) < 0)

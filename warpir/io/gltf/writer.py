@@ -14,9 +14,9 @@ from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 import warpir
+from warpir.core.arrays import CodeArray, Float64Array, FloatArray, PixelArray
 from warpir.core.errors import InputError
 from warpir.scene.asset import Asset, Material, Primitive, Texture, TextureSlot
 from warpir.scene.camera import Camera
@@ -32,11 +32,10 @@ FAR = 64.0
 NEAR = 0.01
 """Near plane of the written camera [m]; glTF demands one, rays have none."""
 IDENTITY = (1.0, 0.0, 0.0, 0.0, 1.0, 0.0)
-Matrix = NDArray[np.float64]
 Members = dict[str, Any]
 
 
-def write_glb(asset: Asset, asset_to_world: Matrix, camera: Camera | None = None) -> bytes:
+def write_glb(asset: Asset, asset_to_world: Float64Array, camera: Camera | None = None) -> bytes:
     """Return an asset as one binary glTF 2.0 file.
 
     The scene has a node for the object and, with ``camera``, one for it. ``asset.extras`` of the
@@ -84,7 +83,7 @@ def write_glb(asset: Asset, asset_to_world: Matrix, camera: Camera | None = None
     return file.pack(document, asset.name)
 
 
-def float32_center(asset: Asset) -> Matrix:
+def float32_center(asset: Asset) -> Float64Array:
     """Return what is subtracted from the positions so that float32 keeps them, shape [3].
 
     Zero unless the object is far from its origin; the object's node adds it again.
@@ -93,11 +92,11 @@ def float32_center(asset: Asset) -> Matrix:
     farthest = float(np.maximum(np.abs(low), np.abs(high)).max())
     if farthest <= FAR * float((high - low).max()):
         return np.zeros(3)
-    center: Matrix = (low + high) / 2.0
+    center: Float64Array = (low + high) / 2.0
     return center
 
 
-def translation(offset: Matrix) -> Matrix:
+def translation(offset: Float64Array) -> Float64Array:
     """Return the matrix that moves by ``offset`` [m], shape [4, 4]."""
     matrix = np.eye(4)
     matrix[:3, 3] = offset
@@ -123,7 +122,7 @@ class _Glb:
         self.length += len(content) + len(padding)
         return len(self.views) - 1
 
-    def accessor(self, elements: NDArray[Any], target: int = ARRAY_BUFFER, **more: Any) -> int:
+    def accessor(self, elements: PixelArray, target: int = ARRAY_BUFFER, **more: Any) -> int:
         """Append an array, shape [count] or [count, width], and return its accessor's index."""
         width = elements.shape[1] if elements.ndim == 2 else 1
         component = {"f": FLOAT, "u": UNSIGNED_SHORT if elements.itemsize == 2 else UNSIGNED_INT}
@@ -168,7 +167,7 @@ class _Glb:
         )
 
 
-def _matrix(matrix: Matrix) -> Members:
+def _matrix(matrix: Float64Array) -> Members:
     """Return a node's ``matrix`` (columns first); glTF asks to leave the identity out."""
     if np.array_equal(matrix, np.eye(4)):
         return {}
@@ -191,7 +190,7 @@ def _camera(camera: Camera) -> Members:
     }
 
 
-def _primitive(file: _Glb, asset: Asset, p: Primitive, center: Matrix) -> Members:
+def _primitive(file: _Glb, asset: Asset, p: Primitive, center: Float64Array) -> Members:
     vertex_count = len(p.positions)
     positions = (p.positions - center).astype("<f4")
     bounds = {"min": positions.min(axis=0).tolist(), "max": positions.max(axis=0).tolist()}
@@ -216,7 +215,7 @@ def _primitive(file: _Glb, asset: Asset, p: Primitive, center: Matrix) -> Member
     }
 
 
-def _uv_sets(asset: Asset, p: Primitive) -> list[NDArray[np.float32] | None]:
+def _uv_sets(asset: Asset, p: Primitive) -> list[FloatArray | None]:
     """Return both sets of texture coordinates; zero where glTF demands one that is absent.
 
     It does for a set that the material reads, and for the first where there is a second.
@@ -337,7 +336,7 @@ def _textures(file: _Glb, textures: tuple[Texture, ...]) -> Members:
     }
 
 
-def png(pixels: NDArray[np.uint8]) -> bytes:
+def png(pixels: CodeArray) -> bytes:
     """Return RGBA codes, shape [height, width, 4], as PNG; without alpha where all is opaque."""
     from PIL import Image
 

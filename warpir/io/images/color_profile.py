@@ -16,8 +16,9 @@ from pathlib import Path
 import numpy as np
 
 from warpir.core import color
+from warpir.core.arrays import FloatArray, PixelArray
 from warpir.core.errors import InputError
-from warpir.io.images.decoder import FloatArray, Pixels, captured_stderr
+from warpir.io.images.decoder import captured_stderr
 
 D50 = (0.34567, 0.35850)
 """CIE xy of the white of ICC's connection space."""
@@ -153,8 +154,8 @@ def _color_chunks(path: Path) -> dict[bytes, bytes]:
 
 
 def convert_profile(
-    path: Path, codes: Pixels, srgb: FloatArray, icc: bytes
-) -> tuple[Pixels, FloatArray, bytes | None, str]:
+    path: Path, codes: PixelArray, srgb: FloatArray, icc: bytes
+) -> tuple[PixelArray, FloatArray, bytes | None, str]:
     """Return (codes, srgb, profile to keep, notice) of an image that carries a profile."""
     broken = "colour profile is broken: taken as sRGB"
     if not _profile_is_whole(icc):
@@ -257,8 +258,8 @@ def _table_is_whole(tag: bytes) -> bool:
 
 
 def _convert_lut_profile(
-    path: Path, codes: Pixels, srgb: FloatArray, icc: bytes
-) -> tuple[Pixels, FloatArray, bytes | None, str]:
+    path: Path, codes: PixelArray, srgb: FloatArray, icc: bytes
+) -> tuple[PixelArray, FloatArray, bytes | None, str]:
     """Convert by Pillow what OpenColorIO does not read: profiles with tables, 8 bits only."""
     from PIL import Image, ImageCms
 

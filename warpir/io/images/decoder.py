@@ -19,13 +19,10 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from warpir.core import color
+from warpir.core.arrays import FloatArray, PixelArray
 from warpir.core.errors import ExitCode, InputError
-
-FloatArray = NDArray[np.float32]
-Pixels = NDArray[Any]
 
 _LOG = logging.getLogger(__name__)
 
@@ -38,9 +35,9 @@ EXPOSURE_LIMIT = 1e12
 class DecodedImage:
     """What one file holds, before orientation and colour."""
 
-    pixels: Pixels
+    pixels: PixelArray
     """Native type, as stored, shape [height, width, 1 or 3]."""
-    alpha: Pixels | None
+    alpha: PixelArray | None
     kind: str
     orientation: int
     icc: bytes | None
@@ -498,9 +495,9 @@ def _check_parts(path: Path, reader: Any, specs: list[Any], used: int, kind: str
     return [f"{parts} parts: {'the first' if used == 0 else f'number {used + 1}'} is used"]
 
 
-def _read_row(reader: Any, part: int, spec: Any, y: int) -> Pixels | None:
+def _read_row(reader: Any, part: int, spec: Any, y: int) -> PixelArray | None:
     """Return one row of a part of an EXR, or the row of tiles around it; None where it is cut."""
-    row: Pixels | None
+    row: PixelArray | None
     if not spec.tile_height:
         row = reader.read_scanlines(part, 0, y, y + 1, 0, 0, spec.nchannels, spec.format)
         return row
@@ -511,7 +508,7 @@ def _read_row(reader: Any, part: int, spec: Any, y: int) -> Pixels | None:
     return row
 
 
-def _place_in_display_window(pixels: Pixels, spec: Any) -> Pixels:
+def _place_in_display_window(pixels: PixelArray, spec: Any) -> PixelArray:
     """Crop or pad the data window of an EXR, with zeros, to its display window."""
     if (spec.x, spec.y, spec.width, spec.height) == (
         spec.full_x,
@@ -531,7 +528,7 @@ def _place_in_display_window(pixels: Pixels, spec: Any) -> Pixels:
     return placed
 
 
-def upright(pixels: Pixels, orientation: int) -> Pixels:
+def upright(pixels: PixelArray, orientation: int) -> PixelArray:
     """Apply the EXIF orientation (tag 0x0112), shape [height, width, channel]."""
     turned = {
         2: lambda a: a[:, ::-1],

@@ -22,7 +22,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from warpir.scene.light import Float64Array, FloatArray, map_directions, rotate_map
+from warpir.core.arrays import Float64Array, FloatArray
+from warpir.scene.light import map_directions, rotate_map
 
 SEAM_SHIFTS = {
     "openexr": 0.0,

@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from warpir.core import color
+from warpir.core.arrays import Float64Array, FloatArray, PixelArray
 from warpir.core.errors import InputError
 from warpir.core.limits import LIMITS
 from warpir.io.images.color_profile import (
@@ -21,9 +22,8 @@ from warpir.io.images.color_profile import (
     png_profile,
     srgb_to_profile,
 )
-from warpir.io.images.decoder import DecodedImage, FloatArray, Pixels, decode_image, upright
+from warpir.io.images.decoder import DecodedImage, decode_image, upright
 from warpir.io.images.envmap_conventions import SEAM_SHIFTS, to_ours
-from warpir.scene.light import Float64Array
 
 RADIANCE_LIMIT = 1e12
 """Of a panorama, relative [W/(m^2 sr)]; float32 products overflow from 10^19 on."""
@@ -33,7 +33,7 @@ RADIANCE_LIMIT = 1e12
 class Photo:
     """A photograph or plate as its file has it, upright, and what the renderer makes of it."""
 
-    codes: Pixels
+    codes: PixelArray
     """The file's own numbers in their native type, upright, shape [H, W, 3]; of a linear plate
     float32 in Rec.709, of a profile with tables in sRGB."""
     srgb: FloatArray
@@ -72,7 +72,7 @@ class Photo:
         linear: FloatArray = color.gamma_to_linear(self.srgb[where])
         return linear
 
-    def encode(self, srgb: FloatArray, changed: NDArray[np.bool_]) -> Pixels:
+    def encode(self, srgb: FloatArray, changed: NDArray[np.bool_]) -> PixelArray:
         """Turn an edited image into codes that can be saved in place of the photograph.
 
         Args:
@@ -329,8 +329,8 @@ def read_mask(
 
 
 def _to_srgb(
-    path: Path, codes: Pixels, image: DecodedImage, is_grey: bool, notices: list[str]
-) -> tuple[Pixels, FloatArray, bytes | None]:
+    path: Path, codes: PixelArray, image: DecodedImage, is_grey: bool, notices: list[str]
+) -> tuple[PixelArray, FloatArray, bytes | None]:
     """Return codes [H, W, 3], the same as sRGB in [0, 1], and the profile that they are in."""
     srgb = codes.astype(np.float32)
     srgb /= np.float32(np.iinfo(codes.dtype).max)

@@ -2,17 +2,13 @@
 
 from collections.abc import Sequence
 from dataclasses import replace
-from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from warpir.core.arrays import BoolArray, Float64Array, PixelArray
 from warpir.io.images.photos import Photo
 from warpir.scene.camera import Camera
 from warpir.scene.lens import Lens
-
-Float64Array = NDArray[np.float64]
-Pixels = NDArray[Any]
 
 BAND_ROWS = 256
 """Rows resampled at a time, which bounds the memory for positions."""
@@ -20,7 +16,7 @@ BAND_ROWS = 256
 
 def source_positions(
     camera: Camera, lens: Lens, first: int, last: int
-) -> tuple[Float64Array, Float64Array, NDArray[np.bool_]]:
+) -> tuple[Float64Array, Float64Array, BoolArray]:
     """Return where the distorted photograph shows what a pinhole would show at some rows.
 
     Args:
@@ -47,8 +43,8 @@ def source_positions(
 
 
 def undistorted(
-    images: Sequence[Pixels], camera: Camera, lens: Lens
-) -> tuple[list[Pixels], NDArray[np.bool_]]:
+    images: Sequence[PixelArray], camera: Camera, lens: Lens
+) -> tuple[list[PixelArray], BoolArray]:
     """Resample images to the pinhole of the same intrinsics, bilinear, as OpenCV does.
 
     Args:

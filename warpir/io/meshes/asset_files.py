@@ -15,8 +15,8 @@ from pathlib import Path
 from urllib.parse import unquote
 
 import numpy as np
-from numpy.typing import NDArray
 
+from warpir.core.arrays import CodeArray, Float64Array, FloatArray, IntArray
 from warpir.core.errors import InputError
 from warpir.core.limits import LIMITS, Limits
 from warpir.scene.asset import ABSENT, Material, Primitive
@@ -27,8 +27,6 @@ GREY = 188
 """sRGB code that stands for a missing base colour texture: linear 0.5."""
 NOTICES = 40
 """Most notices of an asset."""
-
-Pixels = NDArray[np.uint8]
 
 
 def read_regular(
@@ -163,7 +161,7 @@ class TextureDecoder:
         self.pixel_count = 0
         self.byte_count = 0
 
-    def decode(self, encoded: bytes, pointer: str) -> Pixels:
+    def decode(self, encoded: bytes, pointer: str) -> CodeArray:
         """Decode a PNG, JPEG or WebP image to RGBA codes, shape [height, width, 4].
 
         Colour profiles and orientation tags are ignored, as the glTF specification demands;
@@ -224,14 +222,12 @@ class TextureDecoder:
         )
 
 
-def grey_pixels() -> Pixels:
+def grey_pixels() -> CodeArray:
     """Return the one texel that replaces a missing base colour texture, shape [1, 1, 4]."""
     return np.array([[[GREY, GREY, GREY, 255]]], dtype=np.uint8)
 
 
-def keep_area(
-    positions: NDArray[np.float64], indices: NDArray[np.int32]
-) -> tuple[NDArray[np.int32], int, int]:
+def keep_area(positions: Float64Array, indices: IntArray) -> tuple[IntArray, int, int]:
     """Drop triangles that no ray can hit and exact repetitions.
 
     Args:
@@ -265,8 +261,8 @@ def keep_area(
 
 
 def repair_normals(
-    normals: NDArray[np.float64], positions: NDArray[np.float64], indices: NDArray[np.int32]
-) -> tuple[NDArray[np.float32], int]:
+    normals: Float64Array, positions: Float64Array, indices: IntArray
+) -> tuple[FloatArray, int]:
     """Normalise shading normals; those of length zero become the mean of their triangles.
 
     Args:
@@ -292,7 +288,7 @@ def repair_normals(
     return unit(normals), int(lost.sum())
 
 
-def unit(vectors: NDArray[np.float64]) -> NDArray[np.float32]:
+def unit(vectors: Float64Array) -> FloatArray:
     """Normalise the rows, shape [vertex, 3]; zeros stay, and so does what float32 calls unit.
 
     Stored unit vectors are 6e-8 off in length. Left alone, they read back as they were written.

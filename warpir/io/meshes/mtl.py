@@ -14,10 +14,10 @@ from pathlib import Path, PurePosixPath
 
 import numpy as np
 
+from warpir.core.arrays import CodeArray
 from warpir.core.errors import InputError, shown
 from warpir.core.limits import LIMITS, Limits
 from warpir.io.meshes.asset_files import (
-    Pixels,
     TextureDecoder,
     grey_pixels,
     inside,
@@ -98,7 +98,7 @@ class MaterialLibrary:
         self._index: dict[str, int] = {}
         self._limits = limits
         self._decoder = TextureDecoder(path, notices, limits)
-        self._pixels: dict[str, Pixels | None] = {}
+        self._pixels: dict[str, CodeArray | None] = {}
         self._is_grey: dict[str, bool] = {}
         self._texture_index: dict[tuple[str, ...], int] = {}
         """By what a texture is for, the maps that it is made of, and how it is repeated."""
@@ -352,7 +352,7 @@ class MaterialLibrary:
         if rough is None and metal is None:
             return roughness, metallic, None
 
-        def pack() -> Pixels:
+        def pack() -> CodeArray:
             packed = self._opaque(name, rough, metal)
             if rough is not None:
                 packed[..., 1] = resized(rough, *packed.shape[:2])[..., 0]
@@ -378,7 +378,7 @@ class MaterialLibrary:
         if color is None and mask is None:
             return None
 
-        def pack() -> Pixels:
+        def pack() -> CodeArray:
             packed = self._opaque(name, color, mask)
             if color is not None:
                 packed[..., :3] = resized(color, *packed.shape[:2])[..., :3]
@@ -411,7 +411,7 @@ class MaterialLibrary:
 
     def _slot(
         self,
-        make: Callable[[], Pixels],
+        make: Callable[[], CodeArray],
         statement: MapStatement,
         purpose: str,
         *maps: MapStatement | None,
@@ -424,14 +424,14 @@ class MaterialLibrary:
             self.textures.append(Texture(make(), wrap, wrap))
         return statement.slot(self._texture_index[key])
 
-    def _opaque(self, name: str, *parts: Pixels | None) -> Pixels:
+    def _opaque(self, name: str, *parts: CodeArray | None) -> CodeArray:
         """Return white texels as many as the largest of some maps has, shape [height, width, 4]."""
         height = max(p.shape[0] for p in parts if p is not None)
         width = max(p.shape[1] for p in parts if p is not None)
         self._decoder.count(height * width, f"material {shown(name)}: ")
         return np.full((height, width, 4), 255, dtype=np.uint8)
 
-    def _load(self, statement: MapStatement) -> Pixels | None:
+    def _load(self, statement: MapStatement) -> CodeArray | None:
         """Return the pixels of a map; None when it is missing and that is allowed."""
         name = statement.name
         if name not in self._pixels:
@@ -469,9 +469,9 @@ def is_number(word: str) -> bool:
     return True
 
 
-def resized(pixels: Pixels, height: int, width: int) -> Pixels:
+def resized(pixels: CodeArray, height: int, width: int) -> CodeArray:
     """Repeat or drop texels to reach a size, shape [height, width, 4]."""
     rows = np.arange(height) * pixels.shape[0] // height
     columns = np.arange(width) * pixels.shape[1] // width
-    scaled: Pixels = pixels[rows][:, columns]
+    scaled: CodeArray = pixels[rows][:, columns]
     return scaled

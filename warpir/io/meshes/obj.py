@@ -15,8 +15,8 @@ from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
+from warpir.core.arrays import BoolArray, Float64Array, FloatArray, Int64Array, IntArray
 from warpir.core.errors import InputError
 from warpir.core.limits import LIMITS, Limits
 from warpir.io.meshes.asset_files import (
@@ -31,7 +31,7 @@ from warpir.io.meshes.asset_files import (
 from warpir.io.meshes.mtl import MaterialLibrary
 from warpir.io.meshes.ply import Element, read_ply
 from warpir.io.meshes.stl import read_stl
-from warpir.scene.asset import Asset, FloatArray, Primitive
+from warpir.scene.asset import Asset, Primitive
 
 GREY = (0.8, 0.8, 0.8)
 LARGEST = 3e38
@@ -44,8 +44,7 @@ CONCAVE_COST = 100_000_000
 NAMED = ("usemtl", "mtllib")
 """Statements that end in a name, which may hold ``#`` (3ds Max: ``Material #1``)."""
 IGNORED = {"o", "g", "s", "vp", "shadow_obj", "trace_obj", "lod", "bevel", "c_interp", "d_interp"}
-Triangles = NDArray[np.int32]
-NO_TRIANGLES: Triangles = np.zeros((0, 3), dtype=np.int32)
+NO_TRIANGLES: IntArray = np.zeros((0, 3), dtype=np.int32)
 
 
 def read_mesh(path: str | Path, missing_textures: str = "error", limits: Limits = LIMITS) -> Asset:
@@ -233,7 +232,7 @@ def absolute_corner(path: Path, line: int, corner: str, counts: tuple[int, int, 
 
 def float_rows(
     path: Path, word: str, rows: list[tuple[int, list[str]]], width: int
-) -> NDArray[np.float64]:
+) -> Float64Array:
     """Return the first numbers of ``v``, ``vt`` or ``vn`` statements.
 
     Args:
@@ -312,7 +311,7 @@ def vertex_colors(
 
 def unique_corners(
     path: Path, faces: list[tuple[int, list[str]]], counts: tuple[int, int, int]
-) -> tuple[NDArray[np.int64], dict[int, Triangles]]:
+) -> tuple[Int64Array, dict[int, IntArray]]:
     """Make one vertex of every different ``v/vt/vn`` corner.
 
     Args:
@@ -354,8 +353,8 @@ def unique_corners(
 
 
 def triangulate(
-    path: Path, points: NDArray[np.float64], polygons: dict[int, Triangles], notices: list[str]
-) -> Triangles:
+    path: Path, points: Float64Array, polygons: dict[int, IntArray], notices: list[str]
+) -> IntArray:
     """Cut polygons into triangles: fans where convex, ears where not.
 
     Args:
@@ -399,7 +398,7 @@ def triangulate(
     return np.concatenate(triangles).astype(np.int32)
 
 
-def clip_ears(points: NDArray[np.float64]) -> Triangles:
+def clip_ears(points: Float64Array) -> IntArray:
     """Triangulate one simple polygon (Meisters 1975), seen along its mean normal.
 
     A corner that was no ear is looked at again only when a neighbour of it, or the corner that was
@@ -446,9 +445,9 @@ def clip_ears(points: NDArray[np.float64]) -> Triangles:
 
 
 def corner_within(
-    x: NDArray[np.float64],
-    y: NDArray[np.float64],
-    left: NDArray[np.bool_],
+    x: Float64Array,
+    y: Float64Array,
+    left: BoolArray,
     triangle: tuple[int, int, int],
 ) -> int:
     """Return what keeps a corner of a polygon from being an ear.
@@ -463,8 +462,8 @@ def corner_within(
         Another corner in the triangle, its own where it is concave, -1 where it is an ear.
     """
 
-    def left_of(p: int, q: int) -> NDArray[np.bool_]:
-        side: NDArray[np.bool_] = (x[q] - x[p]) * (y - y[p]) >= (y[q] - y[p]) * (x - x[p])
+    def left_of(p: int, q: int) -> BoolArray:
+        side: BoolArray = (x[q] - x[p]) * (y - y[p]) >= (y[q] - y[p]) * (x - x[p])
         return side
 
     a, b, c = triangle
@@ -534,9 +533,9 @@ def read_stl_mesh(path: Path, content: bytes, limits: Limits) -> Asset:
 
 def plain_asset(
     path: Path,
-    positions: NDArray[np.float64],
-    indices: Triangles,
-    normals: NDArray[np.float64] | None,
+    positions: Float64Array,
+    indices: IntArray,
+    normals: Float64Array | None,
     colors: FloatArray | None,
     notices: list[str],
 ) -> Asset:
@@ -581,9 +580,7 @@ def plain_asset(
     return Asset(path.stem, tuple(primitives), (material,), notices=concise(notices))
 
 
-def finite_columns(
-    path: Path, element: Element, names: tuple[str, ...]
-) -> NDArray[np.float64] | None:
+def finite_columns(path: Path, element: Element, names: tuple[str, ...]) -> Float64Array | None:
     """Return columns of a PLY element, shape [row, column]; None when one is absent.
 
     Raises:

@@ -5,15 +5,13 @@ import re
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
+from warpir.core.arrays import Float64Array
 from warpir.core.errors import InputError
 from warpir.core.limits import LIMITS, Limits
 from warpir.io.cameras.colmap_model import is_model, read_points
 from warpir.io.meshes.asset_files import read_regular
 from warpir.io.meshes.ply import read_header, read_ply
-
-Float64Array = NDArray[np.float64]
 
 
 def read_point_cloud(path: str | Path, limits: Limits = LIMITS) -> Float64Array:

@@ -9,10 +9,10 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 from torch import Tensor
 
 import warpir
+from warpir.core.arrays import IntArray
 from warpir.core.atomic import replacing
 from warpir.core.cache import find_kept, notice, seal
 from warpir.render.transport.rows import TransportSettings
@@ -21,7 +21,6 @@ from warpir.scene.light import Light
 if TYPE_CHECKING:
     from warpir.render.device_scene import Scene
 
-IntArray = NDArray[np.int32]
 
 FORMAT = 1
 """Layout and meaning of the stored arrays; part of every key."""

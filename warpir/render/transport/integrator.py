@@ -22,9 +22,9 @@ from pathlib import Path
 import numpy as np
 import torch
 import warp as wp
-from numpy.typing import NDArray
 from torch import Tensor
 
+from warpir.core.arrays import Float64Array, FloatArray, IntArray
 from warpir.core.errors import ExitCode, InputError
 from warpir.core.memory import Need
 from warpir.render.bridge import rasterize
@@ -47,11 +47,6 @@ from warpir.render.transport.rows import (
     tent_irradiance,
 )
 from warpir.scene.light import Light
-
-IntArray = NDArray[np.int32]
-FloatArray = NDArray[np.float32]
-Float64Array = NDArray[np.float64]
-
 
 DTYPES = {"bfloat16": torch.bfloat16, "float32": torch.float32}
 

@@ -9,17 +9,14 @@ from typing import TypeVar
 
 import numpy as np
 import warp as wp
-from numpy.typing import NDArray
 
+from warpir.core.arrays import Float64Array, FloatArray, IntArray
 from warpir.core.color import luminance
 from warpir.kernels import transport as kernels
 from warpir.kernels.types import Layers
 from warpir.render.renderer import Renderer, Rows, light_args
 from warpir.scene.light import Light, map_directions, texel_solid_angles
 
-IntArray = NDArray[np.int32]
-FloatArray = NDArray[np.float32]
-Float64Array = NDArray[np.float64]
 Traced = TypeVar("Traced")
 
 LANES = 256
@@ -131,7 +128,7 @@ def tent_irradiance(normal: tuple[float, float, float], height: int) -> Float64A
     return irradiance
 
 
-def direction_counts(expected: FloatArray, budget: int) -> NDArray[np.int32]:
+def direction_counts(expected: FloatArray, budget: int) -> IntArray:
     """Return how many directions each texel gets: one, and more where light is expected.
 
     A texel's noise is proportional to its flux, so equal-cost directions are best shared out in
@@ -147,11 +144,11 @@ def direction_counts(expected: FloatArray, budget: int) -> NDArray[np.int32]:
     flux = luminance(expected.astype(np.float64)) * tent_solid_angles(len(expected))[:, None]
     share = budget * flux / max(float(flux.sum()), 1e-30)
     counts = np.exp2(np.floor(np.log2(np.maximum(share, 1.0)))).astype(np.int32)
-    flat: NDArray[np.int32] = counts.reshape(-1)
+    flat: IntArray = counts.reshape(-1)
     return flat
 
 
-def flux_noise(texels: FloatArray, counts: NDArray[np.int32]) -> float:
+def flux_noise(texels: FloatArray, counts: IntArray) -> float:
     """Return how much of a pixel's noise is left with these directions, under this light [1].
 
     ``sqrt(sum flux_t^2 / count_t)`` over the whole flux: the standard deviation of a pixel if each
@@ -163,7 +160,7 @@ def flux_noise(texels: FloatArray, counts: NDArray[np.int32]) -> float:
 
 
 def _texel_args(
-    counts: NDArray[np.int32],
+    counts: IntArray,
     height: int,
     renderer: Renderer,
     columns: IntArray,
