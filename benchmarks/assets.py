@@ -70,7 +70,7 @@ def loads(folder: Path, repeats: int) -> dict[str, Any]:
 def cases() -> dict[str, Any]:
     """Run the tests that carry a case's id and print how many of each pass."""
     root = Path(__file__).resolve().parents[1]
-    files = [str(root / "tests" / f"test_{name}.py") for name in TESTS]
+    files = [str(path) for name in TESTS for path in root.glob(f"tests/*/test_{name}.py")]
     with tempfile.TemporaryDirectory() as folder:
         report = Path(folder) / "report.xml"
         command = [sys.executable, "-m", "pytest", "-q", "-p", "no:cacheprovider", *files]

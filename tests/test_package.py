@@ -5,9 +5,12 @@ import subprocess
 import sys
 import tomllib
 import zipfile
+from importlib import import_module
 from pathlib import Path
 
 import pytest
+
+from warpir.core.moved import MOVED
 
 ROOT = Path(__file__).resolve().parent.parent
 
@@ -66,8 +69,8 @@ def test_wheel_holds_the_weights_and_their_card(wheel: zipfile.ZipFile) -> None:
 @pytest.mark.slow
 def test_wheel_holds_the_page(wheel: zipfile.ZipFile) -> None:
     """What warpir.place serves, three.js and its licence included."""
-    page = ROOT / "warpir" / "place_page"
-    files = {f"warpir/place_page/{p.relative_to(page)}" for p in page.rglob("*") if p.is_file()}
+    page = ROOT / "warpir" / "place" / "page"
+    files = {f"warpir/place/page/{p.relative_to(page)}" for p in page.rglob("*") if p.is_file()}
     assert len(files) > 8 and files <= set(wheel.namelist())
 
 
@@ -75,8 +78,18 @@ def test_wheel_holds_the_page(wheel: zipfile.ZipFile) -> None:
 def test_wheel_installs_the_commands(wheel: zipfile.ZipFile) -> None:
     """``warpir-insert`` is the same program as ``python -m warpir.insert``, and so is place."""
     entry = next(name for name in wheel.namelist() if name.endswith("entry_points.txt"))
-    for name in ("insert", "place"):
-        assert f"warpir-{name} = warpir.{name}:main" in wheel.read(entry).decode()
+    for name, module in (("insert", "insert"), ("place", "place.command")):
+        assert f"warpir-{name} = warpir.{module}:main" in wheel.read(entry).decode()
+
+
+def test_former_names_are_the_same_modules() -> None:
+    """Scripts that import what documents showed before the rooms get the very same module."""
+    for former, present in MOVED.items():
+        moved = import_module(f"warpir.{former}")
+        assert moved is import_module(f"warpir.{present}")
+        assert moved.__name__ == moved.__spec__.name == f"warpir.{present}"
+    with pytest.raises(ModuleNotFoundError):
+        import_module("warpir.nothing")
 
 
 def test_constraints_fit_the_requirements() -> None:

@@ -23,4 +23,8 @@ The rooms, each of which imports only those before it (tests/test_layers.py):
 losses, which know the core alone. ``insert.py`` tells the story.
 """
 
+from warpir.core.moved import find_moved_modules
+
 __version__ = "0.1.0"
+
+find_moved_modules()

@@ -156,12 +156,12 @@ STOPS = {
     "class images": ("diffusion.class_images._png", 2),
     "lora before a checkpoint": ("diffusion.personalize:LoraTraining.update", 2),
     "lora": ("diffusion.personalize:LoraTraining.update", 4),
-    "first trace": ("view:View.__init__", 1),
-    "optimisation before a checkpoint": ("optimize:Optimization.step", 2),
-    "optimisation": ("optimize:Optimization.step", 6),
+    "first trace": ("optimize.view:View.__init__", 1),
+    "optimisation before a checkpoint": ("optimize.loop:Optimization.step", 2),
+    "optimisation": ("optimize.loop:Optimization.step", 6),
     "checkpoint": ("atomic.write_staged", 16),
-    "last render": ("picture.make_picture", 1),
-    "final files": ("files:OutputFolder._commit", 1),
+    "last render": ("render.composite.make_picture", 1),
+    "final files": ("io.results:OutputFolder._commit", 1),
 }
 
 
@@ -199,7 +199,7 @@ def unfinished(folder: Path, tmp_path: Path) -> Path:
 
     out = tmp_path / "out"
     with pytest.MonkeyPatch.context() as patch:
-        stop_at(patch, "optimize:Optimization.step", 6)
+        stop_at(patch, "optimize.loop:Optimization.step", 6)
         with pytest.raises(Killed):
             stop_hard(argv(folder, out))
     return out
@@ -248,7 +248,7 @@ def test_resume_refuses_another_model(
     shutil.copytree(folder / "epsilon", model)
     out = tmp_path / "other"
     with pytest.MonkeyPatch.context() as patch:
-        stop_at(patch, "optimize:Optimization.step", 6)
+        stop_at(patch, "optimize.loop:Optimization.step", 6)
         with pytest.raises(Killed):
             stop_hard(argv(folder, out, model=str(model)))
     weights = model / "unet/diffusion_pytorch_model.safetensors"
@@ -349,7 +349,7 @@ def test_stopped_overwrite_resumes(folder: Path, finished: Path, tmp_path: Path)
     assert main(argv(folder, out, seed="5", steps="0", lora_steps="0")) == ExitCode.DONE
     before = results(out)
     with pytest.MonkeyPatch.context() as patch:
-        stop_at(patch, "optimize:Optimization.step", 6)
+        stop_at(patch, "optimize.loop:Optimization.step", 6)
         with pytest.raises(Killed):
             stop_hard([*argv(folder, out), "--overwrite"])
     assert results(out) == before

@@ -242,7 +242,7 @@ def test_stopped_run_resumes_as_if_it_had_not_been(folder: Path, tmp_path: Path)
     whole, out = tmp_path / "whole", tmp_path / "out"
     assert main(argv(folder, whole)) == ExitCode.DONE
     with pytest.MonkeyPatch.context() as patch:
-        stop_at(patch, "optimize:Optimization.step", 4)
+        stop_at(patch, "optimize.loop:Optimization.step", 4)
         with pytest.raises(Killed):
             stop_hard(argv(folder, out))
     assert main([*argv(folder, out), "--resume"]) == ExitCode.DONE

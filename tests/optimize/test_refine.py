@@ -697,7 +697,7 @@ def test_stopped_refinement_resumes(folder: Path, refined: Path, tmp_path: Path)
     """A run that stopped in the loop goes on from its checkpoint to the same bytes."""
     out = tmp_path / "out"
     with pytest.MonkeyPatch.context() as patch:
-        stop_at(patch, "optimize:Optimization.step", 4)
+        stop_at(patch, "optimize.loop:Optimization.step", 4)
         with pytest.raises(Killed):
             stop_hard(argv(folder, out, "material"))
     assert main([*argv(folder, out, "material"), "--resume"]) == ExitCode.DONE

@@ -14,8 +14,8 @@ import numpy as np
 
 from warpir.core.arrays import AnyFloatArray, Float64Array, FloatArray
 
-TONES = ("linear", "reinhard")
-"""Operators between radiance and the foreground's curve: clipped, or ``x / (1 + x)``."""
+TONES = ("reinhard", "linear")
+"""Operators between radiance and the foreground's curve: ``x / (1 + x)``, or clipped."""
 CURVE_COUNTS = {"foreground": 1, "shadow_ratio": 3}
 RESOLVED = 0.97
 """Display-linear value up to which a photo says how bright a thing is [1]: more may be clipped."""
