@@ -10,7 +10,6 @@ import numpy as np
 from PIL import Image, ImageDraw, ImageFont
 
 from tools.demo.mesh import (
-    Float,
     Surface,
     both_sides,
     ellipsoid,
@@ -33,6 +32,7 @@ from tools.demo.mesh import (
     tube,
     weld,
 )
+from warpir.core.arrays import Float64Array
 from warpir.scene.asset import Asset, Material, Primitive, Texture, TextureSlot
 
 CELL = 0.040
@@ -179,13 +179,13 @@ BACKLIGHT = [
 ]
 
 
-def _at(curve: Float, height: Float) -> Float:
+def _at(curve: Float64Array, height: Float64Array) -> Float64Array:
     """Read a half width [m] off a curve of (y, x) at heights [m]."""
-    widths: Float = np.interp(height, curve[:, 0], curve[:, 1])
+    widths: Float64Array = np.interp(height, curve[:, 0], curve[:, 1])
     return widths
 
 
-def body_distance(x: Float, y: Float, z: Float) -> Float:
+def body_distance(x: Float64Array, y: Float64Array, z: Float64Array) -> Float64Array:
     """Return the signed distance to the closed body [m], wheel arches not yet cut."""
     across = np.abs(x)
     # Nose and tail are bowed in plan, the bonnet and the roof are crowned.
@@ -234,7 +234,7 @@ def _arches(surface: Surface) -> Surface:
     return surface
 
 
-def _band(surface: Surface, values: Float, width: float) -> tuple[Surface, Surface, Surface]:
+def _band(surface: Surface, values: Float64Array, width: float) -> tuple[Surface, Surface, Surface]:
     """Cut a surface into what is below 0, a band from 0 to a width [m], and what is above.
 
     Cut twice along the same straight function, so that a band narrower than a triangle survives.
@@ -255,14 +255,14 @@ def _body() -> list[Part]:
     rest = _arches(shell)
     parts: list[Part] = []
 
-    def cut(name: str, values: Float, seal: str | None = None, width: float = 0.0) -> None:
+    def cut(name: str, values: Float64Array, seal: str | None = None, width: float = 0.0) -> None:
         nonlocal rest
         inside, band, rest = _band(rest, values, width)
         parts.append((name, inside))
         if seal is not None:
             parts.append((seal, band))
 
-    def seam_along(values: Float) -> None:
+    def seam_along(values: Float64Array) -> None:
         nonlocal rest
         below, band, above = _band(rest, values, 0.0075)
         parts.append(("black", band))
@@ -311,7 +311,7 @@ def _body() -> list[Part]:
     return [(name, surface) for name, surface in parts if len(surface.triangles)]
 
 
-def _on_side(y: Float, z: Float) -> Float:
+def _on_side(y: Float64Array, z: Float64Array) -> Float64Array:
     """Return where lines along x at (y, z) meet the left side of the body, shape [point, 3]."""
     near, far = np.full_like(y, 0.3), np.full_like(y, 1.0)
     for _ in range(40):
@@ -321,7 +321,7 @@ def _on_side(y: Float, z: Float) -> Float:
     return np.stack([0.5 * (near + far), y, z], axis=1)
 
 
-def _on_end(x: Float, y: Float, end: float) -> Float:
+def _on_end(x: Float64Array, y: Float64Array, end: float) -> Float64Array:
     """Return where lines along z at (x, y) meet the nose (``end`` 1) or tail (-1)."""
     near, far = np.zeros_like(x), np.full_like(x, 2.0)
     for _ in range(40):
@@ -522,7 +522,7 @@ def _nose() -> list[Part]:
     return parts
 
 
-def _button(spot: Float, size: float, name: str) -> list[Part]:
+def _button(spot: Float64Array, size: float, name: str) -> list[Part]:
     """Return a pair of small round lamps with chrome rims on the body at ``spot``, shape [1, 3]."""
     place, out = spot[0], normalized(gradient(body_distance, spot))[0]
     side = normalized(np.cross([0.0, 1.0, 0.0], out))
@@ -613,7 +613,7 @@ def _trim() -> list[Part]:
     return parts
 
 
-def _on_screen(x: Float, y: Float) -> Float:
+def _on_screen(x: Float64Array, y: Float64Array) -> Float64Array:
     """Return points on the windscreen, in front of it by the thickness of a wiper."""
     points = _on_end(x, y, 1.0)
     return points + 0.008 * normalized(gradient(body_distance, points))

@@ -11,7 +11,6 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from tools.demo.mesh import (
-    Float,
     Surface,
     ellipsoid,
     lathe,
@@ -23,6 +22,7 @@ from tools.demo.mesh import (
     tube,
 )
 from tools.demo.noise import blurred_noise
+from warpir.core.arrays import Float64Array
 from warpir.demo import PLACE, ROTATE_Y
 from warpir.scene.asset import Asset, Material, Primitive, Texture, TextureSlot
 from warpir.scene.camera import Camera
@@ -67,7 +67,7 @@ class Placement:
     rotate_y: float = ROTATE_Y
     """Turn about +Y, from the front toward +X [deg]."""
 
-    def matrix(self) -> Float:
+    def matrix(self) -> Float64Array:
         """Return asset to world, column vectors, shape [4, 4]."""
         asset_to_world = np.eye(4)
         asset_to_world[:3, :3] = rotation("y", self.rotate_y)
@@ -208,7 +208,7 @@ class Builder:
         return tuple(made)
 
 
-def _encoded(reflectance: Float) -> Texture:
+def _encoded(reflectance: Float64Array) -> Texture:
     """Encode linear reflectance, shape [H, W, 3], as an sRGB texture."""
     c = np.clip(reflectance, 0.0, 1.0)
     code = np.where(c <= 0.0031308, 12.92 * c, 1.055 * c ** (1.0 / 2.4) - 0.055)
@@ -223,7 +223,7 @@ def _courses(
     columns: int,
     joint: float,
     seed: int,
-) -> tuple[NDArray[np.int64], Float, Float]:
+) -> tuple[NDArray[np.int64], Float64Array, Float64Array]:
     """Lay blocks in running bond over a square texture that tiles.
 
     Args:
