@@ -584,7 +584,7 @@ def manifest_of() -> dict[str, Any]:
 
 def refuse(argv: Sequence[str], code: int, *words: str, cwd: Path) -> list[str]:
     """Check a refusal, and that neither torch nor Warp is looked at."""
-    return assert_fails(argv, code, *words, cwd=cwd, program="warpir.study", before=NO_TORCH)
+    return assert_fails(argv, code, *words, cwd=cwd, program="warpir.study.command", before=NO_TORCH)
 
 
 MAKE = ("make", "scenes", "--method", METHOD, "--out", "study")
@@ -675,7 +675,7 @@ def test_a_study_is_never_written_over(scenes: Path, tmp_path: Path) -> None:
 
 
 def test_make_needs_neither_torch_nor_warp(scenes: Path, tmp_path: Path) -> None:
-    ended = run_case(MAKE, tmp_path, program="warpir.study", before=NO_TORCH)
+    ended = run_case(MAKE, tmp_path, program="warpir.study.command", before=NO_TORCH)
     assert ended.status == 0, ended
     assert "2 pairs against 1 baselines, 1 catch pairs" in ended.out
     assert not list(tmp_path.glob(".partial*"))
@@ -804,7 +804,7 @@ def test_answers_of_people_are_scored_without_a_warning(scenes: Path, tmp_path: 
     """The form of what a browser saves; nobody's opinion here either, and thrown away."""
     study = make(scenes, tmp_path / "study")
     write_answers(tmp_path / "study", [sheet_of(study.plan, 0, source=BROWSER)])
-    ended = run_case(["score", "study"], tmp_path, program="warpir.study", before=NO_TORCH)
+    ended = run_case(["score", "study"], tmp_path, program="warpir.study.command", before=NO_TORCH)
     assert ended.status == 0, ended
     assert "AUTOMATED" not in ended.out and "1 of 3 raters" in ended.out
 
