@@ -584,7 +584,9 @@ def manifest_of() -> dict[str, Any]:
 
 def refuse(argv: Sequence[str], code: int, *words: str, cwd: Path) -> list[str]:
     """Check a refusal, and that neither torch nor Warp is looked at."""
-    return assert_fails(argv, code, *words, cwd=cwd, program="warpir.study.command", before=NO_TORCH)
+    return assert_fails(
+        argv, code, *words, cwd=cwd, program="warpir.study.command", before=NO_TORCH
+    )
 
 
 MAKE = ("make", "scenes", "--method", METHOD, "--out", "study")
