@@ -17,7 +17,7 @@ from PIL import Image
 from warpir.core.errors import ExitCode, InputError
 from warpir.core.limits import Limits
 from warpir.io.assets import load_asset
-from warpir.io.meshes.obj import clip_ears
+from warpir.io.meshes.triangles import clip_ears
 from warpir.scene.asset import Asset
 
 DATA = Path(__file__).parents[3] / "shared" / "data" / "mesh"

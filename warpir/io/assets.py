@@ -5,7 +5,8 @@ from pathlib import Path
 from warpir.core.errors import InputError
 from warpir.core.limits import LIMITS, Limits
 from warpir.io.gltf.reader import read_gltf
-from warpir.io.meshes.obj import read_mesh
+from warpir.io.meshes.obj import read_obj
+from warpir.io.meshes.plain import read_ply_mesh, read_stl_mesh
 from warpir.scene.asset import Asset, TextureSlot
 
 TEXTURE_LIMIT = 1e6
@@ -49,8 +50,12 @@ def _read(path: Path, missing_textures: str, limits: Limits) -> Asset:
     suffix = path.suffix.lower()
     if suffix in {".glb", ".gltf"}:
         return read_gltf(path, missing_textures, limits)
-    if suffix in {".obj", ".ply", ".stl"}:
-        return read_mesh(path, missing_textures, limits)
+    if suffix == ".obj":
+        return read_obj(path, missing_textures, limits)
+    if suffix == ".ply":
+        return read_ply_mesh(path, limits)
+    if suffix == ".stl":
+        return read_stl_mesh(path, limits)
     raise InputError(
         path,
         f"not a mesh that warpir reads (found {suffix or 'no extension'}; "

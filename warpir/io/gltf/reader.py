@@ -18,14 +18,14 @@ from warpir.core.arrays import Float64Array, FloatArray, IntArray, PixelArray
 from warpir.core.limits import LIMITS, Limits
 from warpir.io.gltf.gate import Entry, GltfFile
 from warpir.io.gltf.materials import MaterialReader, check_extensions
-from warpir.io.meshes.asset_files import (
+from warpir.io.meshes.asset_files import concise
+from warpir.io.meshes.triangles import (
     EXTENT,
     check_drawable,
     check_triangle_count,
-    concise,
-    keep_area,
-    repair_normals,
+    drop_without_area,
     unit,
+    unit_normals,
 )
 from warpir.scene.asset import Asset, Primitive
 
@@ -374,11 +374,7 @@ def read_geometry(
     positions = file.accessor(attributes.integer("POSITION"), entry, "POSITION", ("VEC3",))
     positions = positions.astype(np.float64)
     indices = read_triangles(file, entry, len(positions), notices)
-    indices, flat, repeated = keep_area(positions, indices)
-    if flat or repeated:
-        notices.append(
-            f"{entry.pointer}: dropped {flat} triangles of zero area and {repeated} repeated ones"
-        )
+    indices = drop_without_area(positions, indices, notices, f"{entry.pointer}: ")
     if not len(indices):
         return None
 
@@ -393,9 +389,8 @@ def read_geometry(
     normals, tangents = None, None
     stored = read("NORMAL", ("VEC3",))
     if stored is not None:
-        normals, lost = repair_normals(stored.astype(np.float64), positions, indices)
-        if lost:
-            notices.append(f"{entry.pointer}: {lost} normals of length zero taken from the faces")
+        stored = stored.astype(np.float64)
+        normals = unit_normals(stored, positions, indices, notices, f"{entry.pointer}: ")
         # Without normals the specification ignores tangents.
         stored = read("TANGENT", ("VEC4",))
         if stored is not None:

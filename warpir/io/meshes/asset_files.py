@@ -16,13 +16,11 @@ from urllib.parse import unquote
 
 import numpy as np
 
-from warpir.core.arrays import CodeArray, Float64Array, FloatArray, IntArray
+from warpir.core.arrays import CodeArray
 from warpir.core.errors import InputError
 from warpir.core.limits import LIMITS, Limits
-from warpir.scene.asset import ABSENT, Material, Primitive
+from warpir.scene.asset import ABSENT, Material
 
-EXTENT = 1e18
-"""Largest coordinate [m]; its square still fits float32."""
 GREY = 188
 """sRGB code that stands for a missing base colour texture: linear 0.5."""
 NOTICES = 40
@@ -225,117 +223,6 @@ class TextureDecoder:
 def grey_pixels() -> CodeArray:
     """Return the one texel that replaces a missing base colour texture, shape [1, 1, 4]."""
     return np.array([[[GREY, GREY, GREY, 255]]], dtype=np.uint8)
-
-
-def keep_area(positions: Float64Array, indices: IntArray) -> tuple[IntArray, int, int]:
-    """Drop triangles that no ray can hit and exact repetitions.
-
-    Args:
-        positions: Any frame [m], shape [vertex, 3].
-        indices: Shape [triangle, 3].
-
-    Returns:
-        The remaining triangles, C-contiguous, the number without area, and the number of
-        repetitions (the same three vertices in the same cyclic order).
-    """
-    a, b, c = (positions[indices[:, k]] for k in range(3))
-    with np.errstate(over="ignore", invalid="ignore"):  # `check_drawable` refuses such sizes
-        area_squared = np.square(np.cross(b - a, c - a)).sum(axis=1)
-        longest_squared = np.maximum(np.square(b - a).sum(axis=1), np.square(c - a).sum(axis=1))
-        # Collinear corners leave rounding errors of float64, relative to the longest side.
-        flat = area_squared <= np.square(1e-12 * longest_squared)
-        flat &= np.isfinite(area_squared)
-    kept = indices[~flat] if flat.any() else indices
-    # Start each triangle at its lowest vertex, so that equal triangles are equal rows.
-    first = kept.argmin(axis=1)
-    rows = np.arange(len(kept))
-    key = [kept[rows, (first + k) % 3] for k in range(3)]
-    order = np.lexsort(key)
-    same = np.ones(max(len(kept) - 1, 0), dtype=bool)
-    for column in key:
-        same &= np.diff(column[order]) == 0
-    repeated = np.sort(order[1:][same])
-    if len(repeated):
-        kept = np.delete(kept, repeated, axis=0)
-    return np.ascontiguousarray(kept), int(flat.sum()), len(repeated)
-
-
-def repair_normals(
-    normals: Float64Array, positions: Float64Array, indices: IntArray
-) -> tuple[FloatArray, int]:
-    """Normalise shading normals; those of length zero become the mean of their triangles.
-
-    Args:
-        normals: Any length, shape [vertex, 3].
-        positions: The same frame [m], shape [vertex, 3].
-        indices: Shape [triangle, 3].
-
-    Returns:
-        Unit normals, shape [vertex, 3], and how many had no length.
-    """
-    length = np.linalg.norm(normals, axis=1, keepdims=True)
-    lost = length[:, 0] < 1e-20
-    if lost.any():
-        a, b, c = (positions[indices[:, k]] for k in range(3))
-        area = np.cross(b - a, c - a)
-        mean = np.zeros_like(normals)
-        for k in range(3):
-            np.add.at(mean, indices[:, k], area)
-        normals = np.where(lost[:, None], mean, normals)
-        length = np.linalg.norm(normals, axis=1, keepdims=True)
-        still = length[:, 0] < 1e-20  # vertices that no triangle uses, or a folded pair
-        normals = np.where(still[:, None], [0.0, 1.0, 0.0], normals)
-    return unit(normals), int(lost.sum())
-
-
-def unit(vectors: Float64Array) -> FloatArray:
-    """Normalise the rows, shape [vertex, 3]; zeros stay, and so does what float32 calls unit.
-
-    Stored unit vectors are 6e-8 off in length. Left alone, they read back as they were written.
-    """
-    with np.errstate(over="ignore"):  # beyond float32 is no unit vector either
-        stored = vectors.astype(np.float32)
-    is_unit = np.abs(np.linalg.norm(stored.astype(np.float64), axis=1, keepdims=True) - 1.0) < 1e-7
-    length = np.linalg.norm(vectors, axis=1, keepdims=True)
-    scaled = vectors / np.where(length > 0.0, length, 1.0)
-    return np.where(is_unit, stored, scaled).astype(np.float32)
-
-
-def check_triangle_count(where: Path, count: int, limits: Limits, more: str = "") -> None:
-    """Refuse more triangles than the limit.
-
-    Args:
-        where: The asset.
-        count: How many triangles it has.
-        limits: How many it may have.
-        more: What the number stands for, to be added to it.
-
-    Raises:
-        InputError: There are more.
-    """
-    limits.check(
-        "triangles", count, where, "too many triangles", more=more, advice="decimate the mesh"
-    )
-
-
-def check_drawable(where: Path, primitives: list[Primitive], found: str) -> None:
-    """Refuse an asset without triangles, or beyond what float32 kernels can place.
-
-    Args:
-        where: The asset.
-        primitives: What was read.
-        found: What the file has instead of triangles.
-
-    Raises:
-        InputError: ``primitives`` is empty or a coordinate is not below ``EXTENT``.
-    """
-    if not primitives:
-        raise InputError(where, f"nothing to render (found {found}; expected triangles)")
-    largest = max(float(np.abs(p.positions).max()) for p in primitives)
-    if not largest < EXTENT:
-        raise InputError(
-            where, f"coordinates up to {largest:g} (expected below {EXTENT:g})", "scale it down"
-        )
 
 
 def plain_material(name: str, base_color: tuple[float, float, float]) -> Material:

@@ -82,16 +82,22 @@ class MaterialLibrary:
         path: The OBJ file.
         missing_textures: ``error``, or ``grey``.
         notices: Receives what was assumed or left out.
+        hashes: Receives the sha256 of every file that is read.
         limits: How many pixels the textures may have.
     """
 
     def __init__(
-        self, path: Path, missing_textures: str, notices: list[str], limits: Limits = LIMITS
+        self,
+        path: Path,
+        missing_textures: str,
+        notices: list[str],
+        hashes: dict[str, str],
+        limits: Limits = LIMITS,
     ) -> None:
         self.path = path
         self.missing_textures = missing_textures
         self.notices = notices
-        self.hashes: dict[str, str] = {}
+        self.hashes = hashes
         self.materials: list[Material] = []
         self.textures: list[Texture] = []
         self._entries: dict[str, MtlEntry] = {}

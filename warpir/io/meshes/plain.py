@@ -1,0 +1,179 @@
+"""Reads PLY and STL, which state no material, into an `Asset` of one grey primitive.
+
+Parsed here and not by trimesh 5.2, with which 40 of 100 tests of these two formats failed: it cuts
+concave polygons into fans, refuses binary files that mix triangles and quads, drops colours that
+are not 8-bit, stops at the first bad number of a text without a word, and accepts a cut STL.
+"""
+
+from pathlib import Path
+
+import numpy as np
+
+from warpir.core.arrays import Float64Array, FloatArray, IntArray
+from warpir.core.errors import InputError
+from warpir.core.limits import LIMITS, Limits
+from warpir.io.meshes.asset_files import concise, plain_material, read_regular
+from warpir.io.meshes.ply import Element, Lists, read_ply
+from warpir.io.meshes.stl import read_stl
+from warpir.io.meshes.triangles import (
+    LARGEST,
+    check_drawable,
+    check_triangle_count,
+    drop_without_area,
+    triangulate,
+    unit_normals,
+)
+from warpir.scene.asset import Asset, Primitive
+
+GREY = (0.8, 0.8, 0.8)
+"""Base colour where the vertices have none."""
+
+
+def read_ply_mesh(path: Path, limits: Limits = LIMITS) -> Asset:
+    """Read the faces of a PLY file with the normals and colours of its vertices.
+
+    Raises:
+        InputError: The file is damaged or holds no faces.
+    """
+    notices: list[str] = []
+    hashes: dict[str, str] = {}
+    ply = read_ply(path, read_regular(path, path, limits=limits, hashes=hashes))
+    vertex, face = ply.element("vertex"), ply.element("face")
+    positions = _finite(path, vertex, ("x", "y", "z"))
+    if positions is None:
+        raise InputError(path, "no x, y and z of vertices", "convert it to GLB")
+    corners = face.lists.get("vertex_indices", face.lists.get("vertex_index"))
+    if corners is None or not len(corners.lengths):
+        others = ", ".join(f"{e.count} {e.name}" for e in ply.elements.values())
+        raise InputError(
+            path,
+            f"nothing to render (found {others[:80]}; expected faces)",
+            "a point cloud of the place belongs to --ground-points",
+        )
+    check_triangle_count(path, int(np.maximum(corners.lengths - 2, 0).sum()), limits)
+    polygons = _polygons(path, corners, len(positions), notices)
+    normals = _finite(path, vertex, ("nx", "ny", "nz"))
+    colors = _colors(path, vertex)
+    if _finite(path, face, ("red", "green", "blue")) is not None:
+        notices.append("colours of faces are not read; those of vertices would be")
+    if any(line.startswith("TextureFile") for line in ply.comments):
+        notices.append("the texture is not read: export as GLB or OBJ")
+    indices = triangulate(path, positions, polygons, notices)
+    return _asset(path, positions, indices, normals, colors, notices, hashes)
+
+
+def read_stl_mesh(path: Path, limits: Limits = LIMITS) -> Asset:
+    """Read an STL file; flat shading, since its normals are those of the faces.
+
+    Raises:
+        InputError: The file is damaged or holds no triangles.
+    """
+    notices: list[str] = []
+    hashes: dict[str, str] = {}
+    corners = read_stl(path, read_regular(path, path, limits=limits, hashes=hashes), notices)
+    check_triangle_count(path, len(corners), limits)
+    if not np.isfinite(corners).all():
+        raise InputError(path, "vertices are NaN or infinite")
+    indices = np.arange(3 * len(corners), dtype=np.int32).reshape(-1, 3)
+    return _asset(path, corners.reshape(-1, 3), indices, None, None, notices, hashes)
+
+
+def _asset(
+    path: Path,
+    positions: Float64Array,
+    indices: IntArray,
+    normals: Float64Array | None,
+    colors: FloatArray | None,
+    notices: list[str],
+    hashes: dict[str, str],
+) -> Asset:
+    """Return an asset of one material, which the file does not state.
+
+    Args:
+        path: The file.
+        positions: Shape [vertex, 3].
+        indices: Shape [triangle, 3].
+        normals: Of any length, shape [vertex, 3].
+        colors: Linear RGBA, shape [vertex, 4].
+        notices: What was noted on reading.
+        hashes: Of what was read.
+
+    Raises:
+        InputError: No triangle has an area.
+    """
+    indices = drop_without_area(positions, indices, notices)
+    shading = None
+    if normals is None:
+        notices.append("no normals: shaded flat")
+    else:
+        shading = unit_normals(normals, positions, indices, notices)
+    if colors is None:
+        material = plain_material("grey", GREY)
+        notices.append("no material: grey 0.8, roughness 0.5")
+    else:
+        material = plain_material("vertex colours", (1.0, 1.0, 1.0))
+        notices.append("vertex colours read as linear Rec.709")
+        notices.append("no material: roughness 0.5")
+    primitives = []
+    if len(indices):
+        primitives.append(Primitive(positions, indices, 0, normals=shading, colors=colors))
+        size = np.ptp(positions, axis=0)
+        notices.append(
+            f"no unit in the file: read as metres, size {size[0]:g} x {size[1]:g} x {size[2]:g}"
+        )
+    check_drawable(path, primitives, f"{len(positions)} vertices")
+    return Asset(path.stem, tuple(primitives), (material,), notices=concise(notices), hashes=hashes)
+
+
+def _polygons(
+    path: Path, corners: Lists, vertex_count: int, notices: list[str]
+) -> dict[int, IntArray]:
+    """Return the faces as vertex indices, by number of corners, shape [polygon, corner].
+
+    Raises:
+        InputError: An index is out of range.
+    """
+    used = corners.values
+    if (used != np.round(used)).any():
+        raise InputError(path, f"index {used[used != np.round(used)][0]:g} is no whole number")
+    if len(used) and not 0 <= used.min() <= used.max() < vertex_count:
+        worst = used.min() if used.min() < 0 else used.max()
+        raise InputError(path, f"index {worst:g}, but {vertex_count} vertices")
+    if lines := int((corners.lengths < 3).sum()):
+        notices.append(f"{lines} faces of fewer than 3 corners ignored")
+    return {n: rows.astype(np.int32) for n, rows in corners.by_length().items() if n >= 3}
+
+
+def _finite(path: Path, element: Element, names: tuple[str, ...]) -> Float64Array | None:
+    """Return columns of a PLY element, shape [row, column]; None when one is absent.
+
+    Raises:
+        InputError: One of the numbers is not finite.
+    """
+    table = element.table(*names)
+    if table is not None and not (usable := np.abs(table) < LARGEST).all():
+        row = int(np.flatnonzero(~usable.all(axis=1))[0])
+        raise InputError(path, f"{' '.join(names)} of {element.name} {row} are NaN or infinite")
+    return table
+
+
+def _colors(path: Path, vertex: Element) -> FloatArray | None:
+    """Return the vertex colours of a PLY file, linear RGBA, shape [vertex, 4].
+
+    Integers count up to their largest value, floats to 1.
+    """
+    for prefix in ("", "diffuse_"):
+        names = (f"{prefix}red", f"{prefix}green", f"{prefix}blue")
+        if _finite(path, vertex, names) is None:
+            continue
+        colors = np.ones((vertex.count, 4))
+        for k, name in enumerate([*names, "alpha"] if "alpha" in vertex.columns else names):
+            kind = np.dtype(vertex.types[name][0])
+            scale = 1.0 if kind.kind == "f" else float(np.iinfo(kind).max)
+            colors[:, k] = vertex.columns[name] / scale
+        if not ((colors >= 0.0) & (colors <= 1.0)).all():
+            found = f"{colors.min():g} to {colors.max():g}"
+            what = f"vertex colours from {found} (expected 0 to 1, or integers)"
+            raise InputError(path, what)
+        return colors.astype(np.float32)
+    return None
