@@ -7,7 +7,7 @@ from warpir.core.limits import LIMITS, Limits
 from warpir.io.gltf.reader import read_gltf
 from warpir.io.meshes.obj import read_obj
 from warpir.io.meshes.plain import read_ply_mesh, read_stl_mesh
-from warpir.scene.asset import Asset, TextureSlot
+from warpir.scene.asset import Asset
 
 TEXTURE_LIMIT = 1e6
 """Of texture coordinates and their transforms [1]; beyond it float32 knows no part of a texel."""
@@ -32,7 +32,7 @@ def load_asset(path: str | Path, missing_textures: str = "error", limits: Limits
 def _check_numbers(path: Path, asset: Asset) -> None:
     """Refuse numbers that are finite, but whose products are not."""
     for material in asset.materials:
-        slots = [part for part in vars(material).values() if isinstance(part, TextureSlot)]
+        slots = material.texture_slots()
         scales = [material.normal_scale, material.clearcoat_normal_scale, material.ior]
         scales += [number for slot in slots for number in slot.transform]
         if abs(found := max(scales, key=abs)) > TEXTURE_LIMIT:

@@ -1,7 +1,7 @@
 """What a 3D asset is once it is loaded: triangles, materials and textures as plain arrays.
 
-Readers (`warpir.io.gltf.reader`, `warpir.io.meshes.obj`) fill these records after checking the
-file; nothing behind them checks again. Frame: the asset's own, right-handed, +Y up, front +Z, in
+The readers of `warpir.io.assets` fill these records after checking the file; nothing behind them
+checks again. Frame: the asset's own, right-handed, +Y up, front +Z, in
 metres.
 """
 
@@ -106,6 +106,10 @@ class Material:
     """A: factor on `sheen_roughness`."""
     transmission_texture: TextureSlot | None = None
     """R: factor on `transmission`."""
+
+    def texture_slots(self) -> list[TextureSlot]:
+        """Return how the material reads its textures, in the order of the fields."""
+        return [value for value in vars(self).values() if isinstance(value, TextureSlot)]
 
 
 @dataclass(frozen=True)

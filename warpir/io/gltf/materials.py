@@ -131,7 +131,7 @@ class MaterialReader:
     def uv_sets(self, index: int) -> set[int]:
         """Return the texture coordinate sets that material ``index`` reads."""
         material = self.materials[index]
-        return {slot.uv_set for slot in vars(material).values() if isinstance(slot, TextureSlot)}
+        return {slot.uv_set for slot in material.texture_slots()}
 
     def _read(self, entry: Entry) -> Material:
         name = entry.text("name", "") or entry.pointer

@@ -229,7 +229,7 @@ def _uv_sets(asset: Asset, p: Primitive) -> list[FloatArray | None]:
 
 
 def _slots(material: Material) -> list[TextureSlot]:
-    return [value for value in vars(material).values() if isinstance(value, TextureSlot)]
+    return material.texture_slots()
 
 
 def _material(file: _Glb, m: Material) -> Members:

@@ -9,7 +9,7 @@ open is assumed and noted. OBJ knows no back faces, so all materials are double-
 import math
 import os
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path, PurePosixPath
 
 import numpy as np
@@ -73,6 +73,23 @@ class MtlEntry:
     """Whether ``bsdf pbr`` was stated."""
     left_out: list[str] = field(default_factory=list)
     """Other statements, which may matter to the picture."""
+
+    def number(self, key: str, default: float) -> float:
+        """Return the first number of a statement."""
+        return self.numbers.get(key, (default,))[0]
+
+
+@dataclass(frozen=True)
+class Layer:
+    """What one map adds to a texture that is made of several."""
+
+    statement: MapStatement
+    pixels: CodeArray
+    """RGBA codes, shape [height, width, 4]."""
+    to: int | slice
+    """Channels that are written."""
+    of: int | slice
+    """Channels of the map that they come from."""
 
 
 class MaterialLibrary:
@@ -154,15 +171,7 @@ class MaterialLibrary:
 
     def is_textured(self, index: int) -> bool:
         """Return whether material ``index`` reads any texture."""
-        material = self.materials[index]
-        return any(
-            (
-                material.base_color_texture,
-                material.metallic_roughness_texture,
-                material.normal_texture,
-                material.emission_texture,
-            )
-        )
+        return bool(self.materials[index].texture_slots())
 
     def _parse(self, content: bytes, file: str) -> None:
         try:
@@ -249,49 +258,47 @@ class MaterialLibrary:
 
     def _build(self, name: str, entry: MtlEntry) -> Material:
         maps = entry.maps
-        alpha = self._opacity(name, entry)
         base = self._base_slot(name, entry)
         roughness, metallic, surface = self._surface(name, entry)
-        normal_statement = maps.get("norm", maps.get("map_bump"))
-        normal = None if normal_statement is None else self._normal_slot(name, normal_statement)
-        emission = self._factor(name, entry, "ke", (0.0,) * 3)
+        normal = maps.get("norm", maps.get("map_bump"))
+        emission = self._color(name, entry, "ke", (0.0,) * 3)
         if max(emission) > EMISSION_LIMIT:
             what = f"material {shown(name)}: Ke {max(emission):g}"
             raise InputError(self.path, f"{what}, expected at most {EMISSION_LIMIT:g}")
-        emission_slot = self._plain_slot(maps.get("map_ke"))
-        color = self._factor(name, entry, "kd", GREY)
-        clamped = tuple(min(max(value, 0.0), 1.0) for value in color)
-        if clamped != color:
+        color = self._color(name, entry, "kd", GREY)
+        red, green, blue = (min(max(value, 0.0), 1.0) for value in color)
+        if (red, green, blue) != color:
             self.notices.append(f"material {name!r}: Kd clamped to 0 ... 1")
         read = (*MAPS, "map_ks") if entry.is_pbr else MAPS
-        left_out = [*entry.left_out, *(key for key in maps if key not in read and key != "map_ka")]
+        left_out = [*entry.left_out, *(key for key in maps if key not in (*read, "map_ka"))]
         if left_out:
             self.notices.append(f"material {name!r}: {', '.join(left_out)[:80]} ignored")
-        sheen = self._share(name, entry, "ps")
+        sheen = self._share(name, "Ps", entry.number("ps", 0.0))
         if sheen > 0.0:
             self.notices.append(f"material {name!r}: sheen of roughness {ROUGHNESS} assumed")
+        alpha = self._share(name, "opacity", entry.number("d", 1.0 - entry.number("tr", 0.0)))
         return Material(
             name=name,
-            base_color=(clamped[0], clamped[1], clamped[2]),
+            base_color=(red, green, blue),
             alpha=alpha,
             metallic=min(max(metallic, 0.0), 1.0),
             roughness=min(max(roughness, 0.0), 1.0),
             emission=(max(emission[0], 0.0), max(emission[1], 0.0), max(emission[2], 0.0)),
             alpha_mode="MASK" if "map_d" in maps else "BLEND" if alpha < 1 else "OPAQUE",
             double_sided=True,
-            normal_scale=1.0 if normal_statement is None else normal_statement.bump,
+            normal_scale=1.0 if normal is None else normal.bump,
             ior=self._ior(name, entry),
-            clearcoat=self._share(name, entry, "pc"),
-            clearcoat_roughness=self._share(name, entry, "pcr"),
+            clearcoat=self._share(name, "Pc", entry.number("pc", 0.0)),
+            clearcoat_roughness=self._share(name, "Pcr", entry.number("pcr", 0.0)),
             sheen_color=(sheen, sheen, sheen),
             sheen_roughness=ROUGHNESS if sheen > 0.0 else 0.0,
             base_color_texture=base,
             metallic_roughness_texture=surface,
-            normal_texture=normal,
-            emission_texture=emission_slot,
+            normal_texture=self._normal_slot(name, normal),
+            emission_texture=self._whole_slot(maps.get("map_ke")),
         )
 
-    def _factor(
+    def _color(
         self, name: str, entry: MtlEntry, key: str, default: tuple[float, ...]
     ) -> tuple[float, ...]:
         """Return a colour; with a map, an absent or black one means that the map alone counts."""
@@ -304,43 +311,32 @@ class MaterialLibrary:
             self.notices.append(f"material {name!r}: no Kd, grey {default[0]:g} assumed")
         return default if value is None else value
 
-    def _share(self, name: str, entry: MtlEntry, key: str) -> float:
-        """Return a number from 0 to 1, 0 where it is not stated."""
-        (value, *_) = entry.numbers.get(key, (0.0,))
+    def _share(self, name: str, what: str, value: float) -> float:
+        """Return a number clamped to 0 ... 1, with a notice where that changes it."""
         if not 0.0 <= value <= 1.0:
-            self.notices.append(f"material {name!r}: {key.title()} {value:g} clamped to 0 ... 1")
+            self.notices.append(f"material {name!r}: {what} {value:g} clamped to 0 ... 1")
         return min(max(value, 0.0), 1.0)
 
     def _ior(self, name: str, entry: MtlEntry) -> float:
         """Return the index of refraction; exporters write 1 (and 0) for materials without one."""
-        ior = entry.numbers.get("ni", (1.5,))[0]
+        ior = entry.number("ni", 1.5)
         if ior > 1.0:
             return ior
         if ior not in (0.0, 1.0):
             self.notices.append(f"material {name!r}: Ni {ior:g} ignored, 1.5 is used")
         return 1.5
 
-    def _opacity(self, name: str, entry: MtlEntry) -> float:
-        if "d" in entry.numbers:
-            alpha = entry.numbers["d"][0]
-        else:
-            alpha = 1.0 - entry.numbers.get("tr", (0.0,))[0]
-        if not 0.0 <= alpha <= 1.0:
-            self.notices.append(f"material {name!r}: opacity {alpha:g} clamped to 0 ... 1")
-        return min(max(alpha, 0.0), 1.0)
-
     def _surface(self, name: str, entry: MtlEntry) -> tuple[float, float, TextureSlot | None]:
         """Return roughness, metallic and the texture of both (G roughness, B metallic)."""
         numbers, maps = entry.numbers, entry.maps
         if entry.is_pbr:
-            slot = self._plain_slot(maps.get("map_ks"))
+            slot = self._whole_slot(maps.get("map_ks"))
             if slot is not None:
                 return 1.0, 1.0, slot
             _, roughness, metallic = numbers.get("ks", (0.0, ROUGHNESS, 0.0))
             return roughness, metallic, None
-        rough_map, metal_map = maps.get("map_pr"), maps.get("map_pm")
-        rough = None if rough_map is None else self._load(rough_map)
-        metal = None if metal_map is None else self._load(metal_map)
+        rough = self._layer(maps.get("map_pr"), 1)
+        metal = self._layer(maps.get("map_pm"), 2)
         if "pr" in numbers and (numbers["pr"][0] or rough is None):
             roughness = numbers["pr"][0]
         elif rough is not None:
@@ -352,93 +348,86 @@ class MaterialLibrary:
         else:
             roughness = ROUGHNESS
             self.notices.append(f"material {name!r}: roughness {ROUGHNESS} assumed")
-        metallic = numbers.get("pm", (0.0,))[0]
+        metallic = entry.number("pm", 0.0)
         if metal is not None and metallic == 0.0:
             metallic = 1.0
-        if rough is None and metal is None:
-            return roughness, metallic, None
-
-        def pack() -> CodeArray:
-            packed = self._opaque(name, rough, metal)
-            if rough is not None:
-                packed[..., 1] = resized(rough, *packed.shape[:2])[..., 0]
-            if metal is not None:
-                packed[..., 2] = resized(metal, *packed.shape[:2])[..., 0]
-            return packed
-
-        statement = metal_map if rough_map is None else rough_map
-        assert statement is not None
-        if rough_map and metal_map and rough_map.slot(0) != metal_map.slot(0):
+        if rough and metal and rough.statement.slot(0) != metal.statement.slot(0):
             self.notices.append(f"material {name!r}: map_Pm laid on as map_Pr is")
-        return roughness, metallic, self._slot(pack, statement, "surface", rough_map, metal_map)
+        return roughness, metallic, self._combined(name, "surface", rough, metal)
 
     def _base_slot(self, name: str, entry: MtlEntry) -> TextureSlot | None:
         """Return the base colour texture, its alpha taken from ``map_d`` alone."""
         color_map, mask_map = entry.maps.get("map_kd"), entry.maps.get("map_d")
-        if color_map is None and mask_map is None:
-            return None
-        color = None if color_map is None else self._load(color_map)
+        color = self._layer(color_map, slice(0, 3), slice(0, 3))
         if color_map is not None and color is None:
-            color = grey_pixels()
-        mask = None if mask_map is None else self._load(mask_map)
-        if color is None and mask is None:
-            return None
+            color = Layer(color_map, grey_pixels(), slice(0, 3), slice(0, 3))
+        mask = self._layer(mask_map, 3)
+        if mask is not None and bool((mask.pixels[..., 3] < 255).any()):
+            # A mask inside the colour file is its alpha channel; a file of its own is grey.
+            mask = replace(mask, of=3)
+        return self._combined(name, "base colour", color, mask)
 
-        def pack() -> CodeArray:
-            packed = self._opaque(name, color, mask)
-            if color is not None:
-                packed[..., :3] = resized(color, *packed.shape[:2])[..., :3]
-            if mask is not None:
-                # A mask inside the colour file is its alpha channel; a file of its own is grey.
-                has_alpha = bool((mask[..., 3] < 255).any())
-                packed[..., 3] = resized(mask, *packed.shape[:2])[..., 3 if has_alpha else 0]
-            return packed
-
-        statement = mask_map if color_map is None else color_map
-        assert statement is not None
-        return self._slot(pack, statement, "base colour", color_map, mask_map)
-
-    def _normal_slot(self, name: str, statement: MapStatement) -> TextureSlot | None:
+    def _normal_slot(self, name: str, statement: MapStatement | None) -> TextureSlot | None:
+        """Return the normal map, None where the file is a height map."""
         pixels = self._load(statement)
-        if pixels is None:
+        if statement is None or pixels is None:
             return None
         if statement.name not in self._is_grey:
             self._is_grey[statement.name] = not np.ptp(pixels[..., :3], axis=2).any()
         if self._is_grey[statement.name]:
             self.notices.append(f"material {name!r}: {statement.name} is a height map, left out")
             return None
-        return self._slot(lambda: pixels, statement, "plain", statement)
+        return self._whole_slot(statement)
 
-    def _plain_slot(self, statement: MapStatement | None) -> TextureSlot | None:
-        pixels = None if statement is None else self._load(statement)
+    def _whole_slot(self, statement: MapStatement | None) -> TextureSlot | None:
+        """Return the texture of one map, all its channels as they are."""
+        pixels = self._load(statement)
         if statement is None or pixels is None:
             return None
-        return self._slot(lambda: pixels, statement, "plain", statement)
+        return self._slot(statement, ("plain", statement.name), lambda: pixels)
+
+    def _layer(
+        self, statement: MapStatement | None, to: int | slice, of: int | slice = 0
+    ) -> "Layer | None":
+        """Return what a map adds to a texture, None where there is none."""
+        pixels = self._load(statement)
+        if statement is None or pixels is None:
+            return None
+        return Layer(statement, pixels, to, of)
+
+    def _combined(self, name: str, purpose: str, *parts: "Layer | None") -> TextureSlot | None:
+        """Return the texture that some maps make together, white where none says anything."""
+        layers = [part for part in parts if part is not None]
+        if not layers:
+            return None
+
+        def combine() -> CodeArray:
+            height = max(layer.pixels.shape[0] for layer in layers)
+            width = max(layer.pixels.shape[1] for layer in layers)
+            self._decoder.count(height * width, f"material {shown(name)}: ")
+            texels = np.full((height, width, 4), 255, dtype=np.uint8)
+            for layer in layers:
+                texels[..., layer.to] = resized(layer.pixels, height, width)[..., layer.of]
+            return texels
+
+        names = ("" if part is None else part.statement.name for part in parts)
+        return self._slot(layers[0].statement, (purpose, *names), combine)
 
     def _slot(
-        self,
-        make: Callable[[], CodeArray],
-        statement: MapStatement,
-        purpose: str,
-        *maps: MapStatement | None,
+        self, statement: MapStatement, key: tuple[str, ...], make: Callable[[], CodeArray]
     ) -> TextureSlot:
         """Return how a texture is laid on, made once for all materials that use these maps."""
         wrap = "clamp" if statement.clamp else "repeat"
-        key = (purpose, wrap, *("" if used is None else used.name for used in maps))
+        key = (wrap, *key)
         if key not in self._texture_index:
             self._texture_index[key] = len(self.textures)
             self.textures.append(Texture(make(), wrap, wrap))
         return statement.slot(self._texture_index[key])
 
-    def _opaque(self, name: str, *parts: CodeArray | None) -> CodeArray:
-        """Return white texels as many as the largest of some maps has, shape [height, width, 4]."""
-        height = max(p.shape[0] for p in parts if p is not None)
-        width = max(p.shape[1] for p in parts if p is not None)
-        self._decoder.count(height * width, f"material {shown(name)}: ")
-        return np.full((height, width, 4), 255, dtype=np.uint8)
-
-    def _load(self, statement: MapStatement) -> CodeArray | None:
-        """Return the pixels of a map; None when it is missing and that is allowed."""
+    def _load(self, statement: MapStatement | None) -> CodeArray | None:
+        """Return the pixels of a map; None where none is stated, or it may be missing and is."""
+        if statement is None:
+            return None
         name = statement.name
         if name not in self._pixels:
             where = f"{name}: "
