@@ -28,9 +28,9 @@ from benchmarks.damage.mutations import (
     damaged_text,
 )
 from benchmarks.damage.reader import PHOTO_SIZE
+from tests.builders.gltf_files import Builder
 from tests.builders.image_files import icc_profile, matrix_profile, table_profile, write_image
 from tests.io.test_camera_files import calibration, gltf_scene, transforms
-from tests.io.test_gltf import Builder
 from tests.scene.test_camera import fspy_parameters
 from warpir.core.color import primaries_to_xyz
 from warpir.io.images.color_profile import D50

@@ -17,6 +17,7 @@ import pytest
 
 import warpir.app.command
 import warpir.insert
+from tests.builders.refusals import assert_fails, refused
 from warpir.app.command import BY_HAND, FLAGS, parse
 from warpir.app.config import (
     ABOVE_ZERO,
@@ -53,29 +54,6 @@ def run(argv: Sequence[str], cwd: Path, after: str = "") -> subprocess.Completed
         text=True,
         check=False,
     )
-
-
-def assert_fails(
-    capsys: pytest.CaptureFixture[str], argv: Sequence[str], code: int, *words: str
-) -> list[str]:
-    """Check status, exactly one ``error:`` line that holds the words, no traceback."""
-    status = warpir.insert.main(argv)
-    captured = capsys.readouterr()
-    lines = captured.err.splitlines()
-    errors = [line for line in lines if line.startswith("error:")]
-    assert status == code, captured.err
-    assert len(errors) == 1 and lines[0] == errors[0]
-    for word in words:
-        assert word in errors[0]
-    assert "Traceback" not in captured.err
-    return lines
-
-
-def refused(argv: Sequence[str]) -> InputError:
-    with pytest.raises(InputError) as caught:
-        parse(argv)
-    assert caught.value.code == ExitCode.USAGE
-    return caught.value
 
 
 @pytest.mark.parametrize(

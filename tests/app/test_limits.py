@@ -16,10 +16,10 @@ import pytest
 from PIL import Image
 
 from tests.builders.faults import Ended, assert_fails, run_case, snapshot
+from tests.builders.gltf_files import Builder
 from tests.builders.image_files import png_chunk
+from tests.builders.insertions import arguments, read_layers, write_inputs
 from tests.insert.test_faults import NO_POSE
-from tests.insert.test_insert import arguments, read_layers, write_inputs
-from tests.io.test_gltf import Builder
 from warpir.app.command import FLAGS, YAML_SHARE
 from warpir.app.config import InsertConfig
 from warpir.app.disk_space import needed_bytes

@@ -13,8 +13,7 @@ import numpy as np
 import pytest
 
 from tests import oracles as o
-from tests.app.test_command import assert_fails
-from tests.insert.test_insert import (
+from tests.builders.insertions import (
     HALF,
     Run,
     arguments,
@@ -24,6 +23,7 @@ from tests.insert.test_insert import (
     rgb,
     write_inputs,
 )
+from tests.builders.refusals import assert_fails
 from warpir.app.command import parse
 from warpir.app.config import InsertConfig
 from warpir.app.inputs import read_inputs

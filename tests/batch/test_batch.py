@@ -24,7 +24,7 @@ import imageio_ffmpeg
 import pytest
 
 from tests.builders.faults import snapshot
-from tests.insert.test_insert import arguments, write_inputs
+from tests.builders.insertions import arguments, write_inputs
 from warpir.app.command import parse
 from warpir.app.config import DEFAULTS
 from warpir.batch import command as batch
@@ -260,7 +260,7 @@ def test_a_batch_that_is_stopped(memory: Path, hooked: Path, number: int) -> Non
 @pytest.mark.slow
 def test_a_killed_guided_scene_goes_on_from_its_checkpoint(memory: Path, hooked: Path) -> None:
     """Killed when it writes its light, it takes that up again; changed, it starts anew."""
-    from tests.insert.test_kill import guided_argv, write_guided_inputs
+    from tests.builders.guided_runs import guided_argv, write_guided_inputs
 
     write_guided_inputs(memory)
     asked = asdict(parse(guided_argv(memory)).config)

@@ -20,10 +20,10 @@ from benchmarks.damage.__main__ import BYTES, SECONDS, Reader, survey, write
 from benchmarks.damage.formats import formats, weights
 from benchmarks.damage.mutations import exr_attributes
 from tests.builders.faults import Ended, run_case
+from tests.builders.gltf_files import Builder
 from tests.builders.image_files import matrix_profile, png_chunk, write_image
+from tests.builders.insertions import arguments, write_inputs
 from tests.builders.poses import write_json
-from tests.insert.test_insert import arguments, write_inputs
-from tests.io.test_gltf import Builder
 from warpir.core.errors import ExitCode
 
 FORMATS = {form.name: form for form in formats()}

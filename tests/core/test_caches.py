@@ -13,8 +13,8 @@ from pathlib import Path
 import pytest
 
 from tests.builders.faults import run_case
+from tests.builders.insertions import arguments, write_inputs
 from tests.builders.outcome import outcome
-from tests.insert.test_insert import arguments, write_inputs
 from tests.optimize.test_recover_embedded import CHEAP, NETWORK
 from warpir.app.program import explain
 from warpir.core import cache as caches

@@ -20,11 +20,11 @@ import warp as wp
 from PIL import Image
 
 from tests.builders.faults import run_case, snapshot
+from tests.builders.guided_runs import guided_flags, write_guided_inputs
+from tests.builders.insertions import arguments, write_inputs
+from tests.builders.loops import SETTINGS, TRACED, a_loop, bent, values
 from tests.builders.shapes import camera, ground, placed, sphere
 from tests.builders.tiny_stable_diffusion import make_tiny_stable_diffusion
-from tests.insert.test_insert import arguments, write_inputs
-from tests.insert.test_kill import guided_flags, write_guided_inputs
-from tests.optimize.test_optimize import SETTINGS, TRACED, a_loop, bent, values
 from warpir.core import memory as memory_module
 from warpir.core.errors import ExitCode, InputError
 from warpir.core.memory import Memory, Need, free_host, is_shortage

@@ -16,9 +16,9 @@ from torch.func import functional_call
 from torch.utils._python_dispatch import TorchDispatchMode
 
 import warpir.diffusion.personalize as personalize_module
+from tests.builders.loops import SETTINGS as LOOP
+from tests.builders.loops import TRACED, Pull, a_frame, bent
 from tests.builders.tiny_stable_diffusion import make_tiny_stable_diffusion
-from tests.optimize.test_optimize import SETTINGS as LOOP
-from tests.optimize.test_optimize import TRACED, Pull, a_frame, bent
 from warpir.diffusion.cuda_graphs import PLAIN_CALLS, Graphs
 from warpir.diffusion.guidance import Guidance
 from warpir.diffusion.lora_files import initial_lora, install_lora, lora_parameters, remove_lora

@@ -21,8 +21,8 @@ from hypothesis import strategies as st
 from safetensors.torch import load_file, save_file
 
 from tests.builders.faults import NO_TORCH, assert_fails
+from tests.builders.insertions import arguments, write_inputs
 from tests.builders.tiny_stable_diffusion import make_tiny_stable_diffusion
-from tests.insert.test_insert import arguments, write_inputs
 from warpir.diffusion.model_error import ModelError
 from warpir.diffusion.model_folder import (
     JSON_LIMIT,

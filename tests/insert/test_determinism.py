@@ -10,9 +10,9 @@ import torch
 import warp as wp
 
 from tests.builders.faults import Ended, run_case
+from tests.builders.insertions import arguments, read_layers, write_inputs
 from tests.builders.outcome import outcome
 from tests.builders.tiny_stable_diffusion import make_tiny_stable_diffusion
-from tests.insert.test_insert import arguments, read_layers, write_inputs
 from tests.optimize.test_recover import CHEAP as GUIDED
 from tests.sequence.test_sequence import FAST
 from warpir.render.determinism import (

@@ -11,8 +11,8 @@ import pytest
 import torch
 
 from tests.builders.faults import assert_fails, run_case
+from tests.builders.insertions import arguments, write_inputs
 from tests.builders.outcome import outcome
-from tests.insert.test_insert import arguments, write_inputs
 from warpir.app.program import BROUGHT, EXTRA_OF
 from warpir.core.errors import ExitCode, InputError
 from warpir.render.determinism import fixed_arithmetic

@@ -12,8 +12,8 @@ import pytest
 from PIL import Image
 
 from tests.builders.faults import assert_fails
-from tests.insert.test_insert import HEIGHT, LOBES, WIDTH, arguments, write_inputs, write_panorama
-from tests.io.test_gltf import Builder
+from tests.builders.gltf_files import Builder
+from tests.builders.insertions import HEIGHT, LOBES, WIDTH, arguments, write_inputs, write_panorama
 
 
 @dataclass

@@ -20,9 +20,9 @@ from safetensors import safe_open
 from safetensors.numpy import save_file
 
 from tests.builders.faults import NO_TORCH, assert_fails
+from tests.builders.insertions import arguments, write_inputs
 from tests.builders.tiny_stable_diffusion import make_tiny_stable_diffusion
 from tests.diffusion.test_embedded import TINY
-from tests.insert.test_insert import arguments, write_inputs
 from tests.lighting.test_regressor import SMALL
 from warpir.app.config import InsertConfig
 from warpir.app.record import input_files

@@ -11,7 +11,7 @@ from PIL import Image, PngImagePlugin
 
 from tests.builders.faults import PEAK_BYTES, SECONDS, assert_fails, run_case
 from tests.builders.image_files import matrix_profile, write_image
-from tests.insert.test_insert import (
+from tests.builders.insertions import (
     Run,
     arguments,
     go,

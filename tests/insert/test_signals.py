@@ -12,7 +12,7 @@ from pathlib import Path
 import pytest
 
 from tests.builders.faults import Ended, assert_fails, run_case, snapshot
-from tests.insert.test_kill import guided_argv, results_of, write_guided_inputs
+from tests.builders.guided_runs import guided_argv, results_of, write_guided_inputs
 from warpir.core import signals
 from warpir.core.errors import ExitCode
 from warpir.core.signals import Stopped
@@ -283,7 +283,7 @@ def test_stopped_sequence_says_how_many_frames_are_kept(inputs: Path, tmp_path: 
 
 def lit(inputs: Path, folder: Path) -> list[str]:
     """Return a cheap run under a known light, but for its --out."""
-    from tests.insert.test_insert import arguments
+    from tests.builders.insertions import arguments
 
     argv = arguments(inputs, "", samples="1", depth="1", device="cpu", no_hand_off="")
     place = argv.index("--out")

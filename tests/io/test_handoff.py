@@ -18,9 +18,9 @@ from PIL import Image
 from PIL.PngImagePlugin import PngInfo
 
 from tests import oracles
-from tests.insert.test_insert import ALWAYS, arguments, go, read_image, write_inputs
+from tests.builders.gltf_files import Builder
+from tests.builders.insertions import ALWAYS, arguments, go, read_image, write_inputs
 from tests.io.test_envmap_conventions import radiance, read, threejs
-from tests.io.test_gltf import Builder
 from warpir.app.config import InsertConfig
 from warpir.app.inputs import Inputs, read_inputs
 from warpir.core import color

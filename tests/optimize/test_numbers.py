@@ -17,11 +17,11 @@ import warp as wp
 from torch import Tensor
 
 from tests.builders.faults import snapshot
+from tests.builders.guided_runs import guided_flags, write_guided_inputs
+from tests.builders.insertions import arguments
+from tests.builders.loops import SETTINGS, Pull, a_loop, bent, values
 from tests.builders.tiny_stable_diffusion import make_tiny_stable_diffusion
 from tests.core.test_memory import a_scene, sky
-from tests.insert.test_insert import arguments
-from tests.insert.test_kill import guided_flags, write_guided_inputs
-from tests.optimize.test_optimize import SETTINGS, Pull, a_loop, bent, values
 from tests.test_layers import sources
 from warpir.core.errors import ExitCode, InputError
 from warpir.diffusion.class_images import make_class_images

@@ -17,8 +17,9 @@ import pytest
 import torch
 from safetensors.torch import load_file, save_file
 
+from tests.builders.insertions import ALWAYS, DETAIL, arguments, digest, write_inputs
+from tests.builders.stops import Killed, stop_at, stop_hard
 from tests.builders.tiny_stable_diffusion import make_tiny_stable_diffusion
-from tests.insert.test_insert import ALWAYS, DETAIL, arguments, digest, write_inputs
 from warpir.app.command import parse
 from warpir.app.config import InsertConfig
 from warpir.app.finished import OtherRun, is_done
@@ -131,27 +132,6 @@ def test_guided_run_again_reuses_the_lora_and_gives_the_same_bytes(
     assert results(out) == results(finished)
 
 
-class Killed(BaseException):
-    """Stands for SIGKILL: nothing of ours catches it."""
-
-
-def stop_at(monkeypatch: pytest.MonkeyPatch, place: str, count: int) -> None:
-    """Raise at the ``count``-th call of a function of the run."""
-    module, name = place.rsplit(".", 1)
-    owner = sys.modules["warpir." + module.split(":")[0]]
-    for part in module.split(":")[1:]:
-        owner = getattr(owner, part)
-    original, calls = getattr(owner, name), [0]
-
-    def stopping(*args: Any, **kwargs: Any) -> Any:
-        calls[0] += 1
-        if calls[0] == count:
-            raise Killed
-        return original(*args, **kwargs)
-
-    monkeypatch.setattr(owner, name, stopping)
-
-
 STOPS = {
     "class images": ("diffusion.class_images._png", 2),
     "lora before a checkpoint": ("diffusion.personalize:LoraTraining.update", 2),
@@ -183,13 +163,6 @@ def test_stopped_run_resumes_as_if_it_had_not_been(
     assert main([*argv(folder, out), "--resume"]) == ExitCode.DONE
     assert results(out) == results(finished)
     assert not (out / "checkpoints").exists()
-
-
-def stop_hard(arguments: list[str]) -> None:
-    """Run without the program's own explanation of exceptions."""
-    from warpir.insert import insert
-
-    insert(parse(arguments).config)
 
 
 @pytest.fixture

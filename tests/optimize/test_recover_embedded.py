@@ -13,8 +13,8 @@ import numpy as np
 import pytest
 import torch
 
-from tests.insert.test_insert import ALWAYS, DETAIL, arguments, digest, write_inputs
-from tests.optimize.test_recover import Killed, stop_at, stop_hard
+from tests.builders.insertions import ALWAYS, DETAIL, arguments, digest, write_inputs
+from tests.builders.stops import Killed, stop_at, stop_hard
 from warpir.app.config import InsertConfig
 from warpir.app.inputs import read_inputs
 from warpir.app.record import Timings

@@ -12,13 +12,13 @@ from torch import Tensor
 
 from benchmarks.recovery import TowardTruth
 from tests import oracles as o
-from tests.app.test_command import assert_fails
+from tests.builders.insertions import ALWAYS, arguments, digest, write_inputs
 from tests.builders.records import path_means, plain_factors, shade_vertices
+from tests.builders.refusals import assert_fails
 from tests.builders.shapes import camera, ground, sphere
+from tests.builders.stops import Killed, stop_at, stop_hard
 from tests.builders.tiny_stable_diffusion import make_tiny_stable_diffusion
 from tests.conftest import devices
-from tests.insert.test_insert import ALWAYS, arguments, digest, write_inputs
-from tests.optimize.test_recover import Killed, stop_at, stop_hard
 from tests.statistics import compare_gradients
 from warpir.app.config import REFINE_PARTS, InsertConfig
 from warpir.app.optimize_settings import OptimizeSettings

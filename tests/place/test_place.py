@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from tests.builders.browser import Fingers, Opened, needs_chromium, open_browser
-from tests.insert.test_insert import read_layers
+from tests.builders.insertions import read_layers
 from warpir.app.config import InsertConfig
 from warpir.core.errors import ExitCode, InputError
 from warpir.io.assets import load_asset

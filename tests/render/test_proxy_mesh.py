@@ -9,9 +9,9 @@ import torch
 import trimesh
 from PIL import Image
 
+from tests.builders.insertions import arguments, go, write_inputs
 from tests.builders.records import plane_sums
 from tests.builders.shapes import box, camera, constant, ground, lobe, placed, quad, sphere
-from tests.insert.test_insert import arguments, go, write_inputs
 from tests.oracles import (
     half_plane_ratio,
     half_plane_ratio_lobe,

@@ -20,9 +20,9 @@ from PIL import Image
 from playwright.sync_api import Locator
 
 from tests.builders.browser import Opened, needs_chromium, open_browser
+from tests.builders.insertions import Run, arguments, go, write_inputs
+from tests.builders.insertions import read_layers as read_planes
 from tests.builders.outcome import outcome
-from tests.insert.test_insert import Run, arguments, go, write_inputs
-from tests.insert.test_insert import read_layers as read_planes
 from warpir.app.command import parse
 from warpir.app.config import InsertConfig
 from warpir.core.errors import ExitCode, InputError

@@ -11,8 +11,8 @@ from typing import Any, NoReturn
 import pytest
 
 import warpir.render.composite
-from tests.app.test_command import assert_fails, refused
-from tests.insert.test_insert import ALWAYS, Run, arguments, digest, go, write_inputs
+from tests.builders.insertions import ALWAYS, Run, arguments, digest, go, write_inputs
+from tests.builders.refusals import assert_fails, refused
 from warpir import insert
 from warpir.app.command import parse
 from warpir.app.config import EXCLUSIVE, InsertConfig

@@ -14,7 +14,7 @@ import pytest
 from numpy.typing import NDArray
 from PIL import Image
 
-from tests.insert.test_insert import arguments, digest, write_inputs
+from tests.builders.insertions import arguments, digest, write_inputs
 from warpir.core.errors import ExitCode
 from warpir.insert import main
 from warpir.sequence.video import VIDEO, NoVideo, write_video
