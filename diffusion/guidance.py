@@ -29,7 +29,6 @@ from warpir.diffusion.prior import (
     Condition,
     Counts,
     InChunks,
-    NonFiniteError,
     Prior,
     at_once,
 )
@@ -38,7 +37,6 @@ from warpir.diffusion.settings import GuidanceSettings
 
 DATASET_UPDATE = "dataset-update"
 """The loss that has no row: the picture is edited, and the edit is the target."""
-BAD_STEPS_MAX = 5
 """Steps in a row without a finite gradient that end the run."""
 NORM_WINDOW = 101
 """Past steps whose median norm tells what an outlier is."""
@@ -70,9 +68,6 @@ class Guide(Protocol):
 
         Returns:
             None when this step has no finite gradient.
-
-        Raises:
-            NonFiniteError: It is the fifth in a row.
         """
 
     def score(self, image: Tensor, seed: int | None = None) -> float | None:
@@ -198,7 +193,7 @@ def terms_of(settings: GuidanceSettings, condition: Condition, adapter: str | No
 
 
 class GradientGate:
-    """Lets finite gradients pass, shortens outliers, and counts both.
+    """Lets finite gradients pass, shortens outliers, and counts those.
 
     Args:
         clip: Greatest norm in running medians; 0 for no limit.
@@ -208,30 +203,19 @@ class GradientGate:
         self.clip = clip
         self.counts = Counts()
         self.norms: deque[float] = deque(maxlen=NORM_WINDOW)
-        self.bad_steps = 0
 
     def passed(self, d_image: Tensor | None) -> Tensor | None:
         """Return the gradient, no longer than allowed; None when it is not finite.
 
         Args:
             d_image: Any shape; None when it is known not to be finite.
-
-        Raises:
-            NonFiniteError: The fifth in a row is not finite.
         """
         norm = math.nan
         if d_image is not None:
             # In float64 the norm is finite exactly when every element is.
             norm = float(torch.linalg.vector_norm(d_image, dtype=torch.float64))
         if d_image is None or not math.isfinite(norm):
-            self.counts.skipped_steps += 1
-            self.bad_steps += 1
-            if self.bad_steps >= BAD_STEPS_MAX:
-                raise NonFiniteError(
-                    f"guidance: no finite gradient in {BAD_STEPS_MAX} steps in a row"
-                )
             return None
-        self.bad_steps = 0
         limit = self.clip * median(self.norms) if len(self.norms) >= NORM_COUNT_MIN else 0.0
         self.norms.append(norm)
         if not 0.0 < limit < norm:
@@ -241,18 +225,11 @@ class GradientGate:
 
     def state_dict(self) -> dict[str, Any]:
         """Return numbers and lists of numbers."""
-        return {
-            "norms": list(self.norms),
-            "bad_steps": self.bad_steps,
-            "skipped_steps": self.counts.skipped_steps,
-            "clipped_steps": self.counts.clipped_steps,
-        }
+        return {"norms": list(self.norms), "clipped_steps": self.counts.clipped_steps}
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
         """Go on from `state_dict`."""
         self.norms = deque(state["norms"], maxlen=NORM_WINDOW)
-        self.bad_steps = int(state["bad_steps"])
-        self.counts.skipped_steps = int(state["skipped_steps"])
         self.counts.clipped_steps = int(state["clipped_steps"])
 
 
@@ -331,9 +308,6 @@ class Guidance:
 
         Returns:
             Same shape, dtype and device; None when it is not finite.
-
-        Raises:
-            NonFiniteError: It is the fifth in a row.
         """
         d_image = self._gradient(image, step)
         if self._overflows(image, d_image):
@@ -625,9 +599,6 @@ class DatasetUpdate:
 
         Returns:
             Same shape, dtype and device; None when it is not finite.
-
-        Raises:
-            NonFiniteError: It is the fifth in a row.
         """
         s = self.settings
         if self.crop is None or self.edited is None or step % s.update_every == 0:

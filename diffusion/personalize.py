@@ -45,7 +45,7 @@ from warpir.diffusion.lora_files import (
     serialize,
 )
 from warpir.diffusion.model_error import ModelError
-from warpir.diffusion.prior import NonFiniteError
+from warpir.diffusion.prior import BAD_STEPS_MAX, NonFiniteError
 from warpir.diffusion.prompts import Prompts
 from warpir.diffusion.settings import PersonalizeSettings
 
@@ -56,8 +56,6 @@ FORMAT = 1
 """Meaning of a stored LoRA; part of every key."""
 CROP_COUNT = 64
 """Crops of the photo that are encoded once and drawn from."""
-BAD_STEPS_MAX = 5
-"""Steps in a row without a finite gradient that end the training."""
 LOOK_EVERY = 50
 """Steps between two looks at the losses: each makes the host wait for the device."""
 ENCODE_BATCH = 4

@@ -52,6 +52,10 @@ def at_once(
     yield do(0, count)
 
 
+BAD_STEPS_MAX = 5
+"""Steps in a row without a finite gradient that end a training or an optimisation."""
+
+
 class NonFiniteError(Exception):
     """Numbers stayed non-finite; the program says so and exits with 6."""
 
@@ -135,7 +139,5 @@ class Prior(Protocol):
 class Counts:
     """What happened during a run that the user is told about."""
 
-    skipped_steps: int = 0
-    """Steps without a finite gradient."""
     clipped_steps: int = 0
     """Steps whose gradient was shortened."""

@@ -27,7 +27,7 @@ from tests.builders.shapes import camera, ground, placed, sphere
 from tests.builders.tiny_stable_diffusion import make_tiny_stable_diffusion
 from warpir.core import memory as memory_module
 from warpir.core.errors import ExitCode, InputError
-from warpir.core.memory import Memory, Need, free_host, is_shortage
+from warpir.core.memory import SHORT, Memory, Need, free_host, is_shortage, lacked_memory
 from warpir.diffusion.class_images import make_class_images
 from warpir.diffusion.guidance import Guidance
 from warpir.diffusion.personalize import LoraTraining, initial_lora
@@ -187,6 +187,7 @@ def test_one_retry_then_the_flag(count: int, room: int, words: str, attempts: in
         list(Memory().in_chunks(making, count, "numbers", "--width"))
     assert len(making.asked) == attempts
     assert caught.value.code == ExitCode.RESOURCES and caught.value.where == "--width"
+    assert caught.value.reason == SHORT and lacked_memory(caught.value)
     assert "MiB of the host" in caught.value.what and "--width" in caught.value.advice
     assert caught.value.__suppress_context__
 
@@ -242,6 +243,8 @@ def test_needs_beyond_doubt_are_refused() -> None:
     with pytest.raises(InputError, match="MiB") as caught:
         memory.require(Need("photo", free, "--photo"), Need("mesh", 2 * free, "--asset"))
     assert caught.value.code == ExitCode.RESOURCES and caught.value.where == "--asset"
+    assert lacked_memory(caught.value)
+    assert not lacked_memory(InputError("out", "no memory card", code=ExitCode.RESOURCES))
 
 
 @pytest.mark.parametrize(

@@ -175,7 +175,7 @@ def read_inputs(config: InsertConfig, loaders: Loaders | None = None) -> Inputs:
         *_about(asset_path, asset.notices),
         *(_about(config.proxy, proxy.notices) if config.proxy and proxy else ()),
         *notices,
-        *_split_assumed(camera.notices, assumed),
+        *camera.notices,
         *world.notices,
         *placement.warnings,
     ]
@@ -184,7 +184,7 @@ def read_inputs(config: InsertConfig, loaders: Loaders | None = None) -> Inputs:
             f"a preview: object and shadow are rendered {config.width} px wide and enlarged to the "
             f"photo's {camera.width} px (--width)"
         )
-    assumed += [*world.assumed, *placement.assumed]
+    assumed += [*camera.assumed, *world.assumed, *placement.assumed]
     measured |= world.measured
     if mesh is not None:
         notices += _about_mesh(mesh, asset, placement, camera)
@@ -446,10 +446,3 @@ def _read_light(
 
 def _about(path: str, notices: tuple[str, ...] | list[str]) -> list[str]:
     return [f"{Path(path).name}: {notice}" for notice in notices]
-
-
-def _split_assumed(notices: tuple[str, ...], assumed: list[str]) -> list[str]:
-    """Move the lines that begin with ``assumed:`` to `assumed`; return the others."""
-    mark = "assumed: "
-    assumed += [line.removeprefix(mark) for line in notices if line.startswith(mark)]
-    return [line for line in notices if not line.startswith(mark)]

@@ -41,6 +41,8 @@ VAE_BYTES = 2560
 Stable Diffusion 2.1: 1.5 GB a picture. Recomputing leaves a tenth."""
 CERTAIN = 2.0
 """Needs in free memories beyond which a run is refused; up to it an estimate may be wrong."""
+SHORT = "memory.short"
+"""Reason of an `InputError` that another run's end, or a smaller task, would remove."""
 MIB = 1 << 20
 _RSS_UNIT = 1 if sys.platform == "darwin" else 1024
 """What the system counts resident memory in [byte]."""
@@ -64,10 +66,10 @@ def is_shortage(error: BaseException) -> bool:
 def lacked_memory(error: BaseException) -> bool:
     """Return whether memory is what a run ended for: it may do in a memory that others have left.
 
-    So say `Memory.require` and what is left after `Memory.in_chunks`, and what nobody has caught.
+    `Memory.require` and `Memory.in_chunks` raise such errors; so do the libraries themselves.
     """
     if isinstance(error, InputError):
-        return error.code == ExitCode.RESOURCES and "memory" in error.what
+        return error.reason == SHORT
     return is_shortage(error)
 
 
@@ -121,7 +123,15 @@ class Memory:
         found = f"about {total // MIB} MiB are needed ({parts}), {free // MIB} MiB of {where} free"
         if total > CERTAIN * free:
             advice = f"ask for less by {largest.flags}"
-            raise InputError(largest.flags, f"memory: {found}", advice, ExitCode.RESOURCES)
+            raise InputError(
+                largest.flags,
+                f"memory: {found}",
+                advice,
+                ExitCode.RESOURCES,
+                reason=SHORT,
+                needed=total,
+                free=free,
+            )
         self.doubts.append(f"memory may be short: {found}; {largest.flags} would lower it")
         self.say(f"notice: {self.doubts[-1]}")
 
@@ -171,13 +181,21 @@ class Memory:
                 raise self._too_large(what, flags, len(halves)) from None
             yield part
 
-    def again(self, do: Callable[[], T], what: str, flags: str) -> T:
+    def again(
+        self,
+        do: Callable[[], T],
+        what: str,
+        flags: str,
+        spare: Callable[[], object] = lambda: None,
+    ) -> T:
         """Return what ``do`` makes, at the second attempt if the first lacks memory.
+
+        Arguments are those of `in_chunks`.
 
         Raises:
             InputError: So does the second (`ExitCode.RESOURCES`).
         """
-        return next(self.in_chunks(lambda start, stop: do(), 1, what, flags))
+        return next(self.in_chunks(lambda start, stop: do(), 1, what, flags, spare))
 
     def _too_large(self, what: str, flags: str, parts: int) -> InputError:
         free = f"{free_host() // MIB} MiB of the host are free"
@@ -188,7 +206,7 @@ class Memory:
             advice += ", or use --device cpu"
         tried = "in one piece and in halves" if parts > 1 else "twice"
         found = f"not enough memory for {what} (tried {tried}; {free})"
-        return InputError(flags, found, advice, ExitCode.RESOURCES)
+        return InputError(flags, found, advice, ExitCode.RESOURCES, reason=SHORT)
 
     def notices(self) -> Iterator[str]:
         """Yield what the user should know of it."""

@@ -1,8 +1,10 @@
 """The loop of every optimisation: unknowns follow a gradient on the composite (DiPIR, section 4.3).
 
-    image   = render and compose(unknowns)            `LightOptimization`,
-    `warpir.optimize.materials` d_image = guide.gradient(image, step)             what a diffusion
-    model, or a test, asks for Adam on d_image and on the regularisers (eq. 9)
+    for step in range(step_count):
+        image = render and compose(unknowns)               `Optimization.image`, of the subclasses
+        d_image = guide.gradient(image, step)              of a diffusion model, or of a test
+        d_image and the regularisers, backward (eq. 9)     `Optimization.differentiate`
+        Adam's step, then back within bounds               `Optimization.step`
 
 Everything random is a function of the seed and the step, and the whole state is plain tensors and
 numbers: a run that was stopped and restored ends as if it had not been.
@@ -26,10 +28,9 @@ from torch import Tensor
 from warpir.app.optimize_settings import OptimizeSettings
 from warpir.core.errors import ExitCode, InputError
 from warpir.core.memory import Memory
+from warpir.diffusion.prior import BAD_STEPS_MAX
 from warpir.scene.camera import Camera
 
-BAD_STEPS_MAX = 5
-"""Steps in a row without a finite gradient that end the run."""
 BACK_OFF = 0.5
 """Share of the learning rate that a step without a finite gradient leaves to the next ones."""
 GOOD_STEPS = 10
@@ -38,10 +39,6 @@ LOWER = "--guidance-width"
 """What lowers the memory of a step."""
 SCORE_SEED = 0x5C0E5
 """Added to the seed for the renders that judge a state."""
-
-
-Rendered = tuple[Tensor, dict[str, tuple[float, Tensor]]]
-"""A picture, and the regularisers with their weights."""
 
 log = logging.getLogger(__name__)
 
@@ -158,72 +155,62 @@ class Optimization(ABC):
             self.unknowns.load_state_dict(self.best)
 
     def step(self) -> None:
-        """Take one step."""
+        """Take one step; where memory is short, its gradient is tried once more, with equal result.
+
+        Raises:
+            InputError: Memory is short again, or there was no finite gradient for too long.
+        """
         step = self.state.step
-        made = self._rendered(step)
-        d_image, terms = None, {}
-        if made is not None:
-            terms = {name: term.detach() for name, (_, term) in made[1].items()}
-            d_image = self.guide.gradient(made[0].detach(), step)
-        if d_image is not None and not bool(d_image.isfinite().all()):
-            d_image = None
-        if d_image is not None:
-            # One reference to the graph: a second attempt needs the memory of the first.
-            graphs = [made]
-            del made
-            self.memory.again(
-                lambda: self._differentiate(graphs.pop() if graphs else None, d_image, step),
-                "the gradient of a step",
-                LOWER,
-            )
-        is_finite = d_image is not None and self._gradients_are_finite()
+        before = self.guide.state_dict()  # it counts and remembers gradients
+        numbers = self.memory.again(
+            lambda: self.differentiate(step),
+            "the gradient of a step",
+            LOWER,
+            lambda: self.guide.load_state_dict(before),
+        )
+        is_finite = "gradient" in numbers and self._gradients_are_finite()
         if is_finite:
-            for group in self.optimizer.param_groups:
-                factor = self.settings.rate_of_all * self._rate_factor(step)
-                group["lr"] = group["rate"] * factor * self.state.rate_share
+            self._set_rates(step)
             self.optimizer.step()
             self.project()
         self._count(is_finite)
-        entry = {name: float(term) for name, term in terms.items()}
-        if d_image is not None:
-            entry["gradient"] = float(d_image.double().norm())
-        # Checkpoints hold no number that JSON lacks.
-        entry = {name: value for name, value in entry.items() if np.isfinite(value)}
-        self.state.step = step + 1
-        self.state.history.append(entry)
+        self.state.step += 1
+        self.state.history.append(numbers)
         every = self.settings.score_every
         if every and (self.state.step % every == 0 or self.state.step == self.settings.step_count):
-            self._keep_if_best(entry)
+            self._keep_if_best(numbers)
 
-    def _rendered(self, step: int) -> Rendered | None:
-        """Return a step's picture and terms; None where they are certain not to be finite."""
+    def differentiate(self, step: int) -> dict[str, float]:
+        """Leave the gradient of guidance and regularisers (eq. 9) in the unknowns' ``grad``.
 
-        def render() -> Rendered:
-            self.prepare(step)
-            return self.image(step), self.terms()
-
+        Returns:
+            The regularisers by name, and the norm of the guidance as ``gradient``, which is absent
+            where there is none that is finite: nothing is left in ``grad`` then. Checkpoints hold
+            no number that JSON lacks, so others that are not finite are absent too.
+        """
+        self.optimizer.zero_grad()
         try:
-            return self.memory.again(render, "the picture of a step", LOWER)
+            self.prepare(step)
+            image, terms = self.image(step), self.terms()
         except InputError as error:
             if error.code != ExitCode.NUMERIC:
                 raise
             log.warning("step %d: %s", step, error)
-            return None
+            return {}
+        d_image = self.guide.gradient(image.detach(), step)
+        numbers = {name: float(term.detach()) for name, (_, term) in terms.items()}
+        if d_image is not None and bool(d_image.isfinite().all()):
+            weighted = [weight * term for weight, term in terms.values()]
+            ones = [torch.ones_like(term) for term in weighted]
+            torch.autograd.backward([image, *weighted], [d_image, *ones])
+            numbers["gradient"] = float(d_image.double().norm())
+        return {name: value for name, value in numbers.items() if np.isfinite(value)}
 
-    def _differentiate(self, made: Rendered | None, d_image: Tensor, step: int) -> None:
-        """Leave the gradient of the picture and of the terms in the unknowns' ``grad``.
-
-        Args:
-            made: What was rendered, used up; None: it is rendered again, which gives the same.
-            d_image: Loss gradient of the picture.
-            step: From 0.
-        """
-        image, terms = made or (self.image(step), self.terms())
-        self.optimizer.zero_grad()
-        roots, gradients = [image], [d_image]
-        roots += [weight * term for weight, term in terms.values()]
-        gradients += [torch.ones_like(root) for root in roots[1:]]
-        torch.autograd.backward(roots, gradients)
+    def _set_rates(self, step: int) -> None:
+        """Give each group its rate: constant in the first half, then falling by a cosine."""
+        share = self.settings.rate_of_all * self._rate_factor(step) * self.state.rate_share
+        for group in self.optimizer.param_groups:
+            group["lr"] = group["rate"] * share
 
     def _rate_factor(self, step: int) -> float:
         """Return 1 in the first half, then a cosine that falls to ``rate_end``."""
@@ -236,23 +223,29 @@ class Optimization(ABC):
         return bool(torch.stack([g.isfinite().all() for g in found]).all())
 
     def _count(self, is_finite: bool) -> None:
+        """Count a step, and let the learning rate back off from those that are not finite.
+
+        Raises:
+            InputError: `BAD_STEPS_MAX` in a row are not (`ExitCode.NUMERIC`).
+        """
         state = self.state
         state.bad_steps = 0 if is_finite else state.bad_steps + 1
         state.skipped += not is_finite
-        state.good_steps = state.good_steps + 1 if is_finite else 0
-        if not is_finite:
-            state.rate_share *= BACK_OFF
-        elif state.rate_share < 1.0 and state.good_steps == GOOD_STEPS:
-            state.rate_share, state.good_steps = state.rate_share / BACK_OFF, 0
         if state.bad_steps >= BAD_STEPS_MAX:
             raise InputError(
                 "guidance",
                 f"no finite gradient in {BAD_STEPS_MAX} steps in a row (step {state.step})",
                 "try --precision fp32; the last checkpoint holds the state before",
                 ExitCode.NUMERIC,
+                reason="guidance.no_finite_gradient",
             )
+        state.good_steps = state.good_steps + 1 if is_finite else 0
+        if not is_finite:
+            state.rate_share *= BACK_OFF
+        elif state.rate_share < 1.0 and state.good_steps == GOOD_STEPS:
+            state.rate_share, state.good_steps = state.rate_share / BACK_OFF, 0
 
-    def _keep_if_best(self, entry: dict[str, float]) -> None:
+    def _keep_if_best(self, numbers: dict[str, float]) -> None:
         """Judge the state as it would be delivered, and keep it if it is the best so far.
 
         Only the second half counts: before it, the lights were not the ones that fusion leads to.
@@ -262,7 +255,7 @@ class Optimization(ABC):
             score = self.guide.score(self.final_image(self.seed + SCORE_SEED))
         if score is None or not np.isfinite(score):
             return
-        entry["score"] = score
+        numbers["score"] = score
         is_late = 2 * state.step >= self.settings.step_count
         if is_late and (state.best_score is None or score < state.best_score):
             state.best_score, state.best_step = score, state.step

@@ -92,7 +92,7 @@ def open_session(config: InsertConfig) -> Session:
     view = photo_camera(config, photo, assumed)
     asset = read_asset(config.asset, config, Loaders(), assumed)
     world = make_world(config, view, None)
-    assumed += [notice.removeprefix("assumed: ") for notice in world.camera.notices]
+    assumed += [*world.camera.assumed, *world.camera.notices]
     low, high = asset.bounds()
     stands = (config.place, config.at, config.scale, config.size)
     try:

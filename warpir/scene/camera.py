@@ -36,7 +36,9 @@ class Camera:
     c2w: Float64Array
     """Camera to world, rigid, column vectors, shape [4, 4]."""
     notices: tuple[str, ...] = field(default=(), compare=False)
-    """What was assumed or looks odd, one line each; printed and kept in ``run.json``."""
+    """What was scaled or looks odd, one line each; printed and kept in ``run.json``."""
+    assumed: tuple[str, ...] = field(default=(), compare=False)
+    """What was chosen because nothing was given, one line each; likewise."""
 
     def scaled(self, width: int, height: int) -> "Camera":
         """Return the same view at another resolution."""
@@ -200,11 +202,11 @@ def camera_from_exif(
         )
     fx = focal_35mm * float(np.hypot(width, height)) / FILM_DIAGONAL_35MM
     fov_deg = 2.0 * float(np.degrees(np.arctan(width / 2.0 / fx)))
-    notices = [
-        f"assumed: field of view {fov_deg:.1f} degrees, from the EXIF focal length "
+    assumed = [
+        f"field of view {fov_deg:.1f} degrees, from the EXIF focal length "
         f"{focal_35mm:g} mm (35 mm equivalent, by the diagonal); wrong if cropped"
     ]
-    return _level_camera(width, height, fx, pitch_deg, camera_height, horizon, notices)
+    return _level_camera(width, height, fx, pitch_deg, camera_height, horizon, assumed=assumed)
 
 
 def _level_camera(
@@ -214,7 +216,8 @@ def _level_camera(
     pitch_deg: float,
     camera_height: float,
     horizon: float | None,
-    notices: list[str],
+    notices: Sequence[str] = (),
+    assumed: Sequence[str] = (),
 ) -> Camera:
     """Return a camera without roll whose principal point is the image centre."""
     if width < 1 or height < 1:
@@ -249,7 +252,7 @@ def _level_camera(
             [0.0, 0.0, 0.0, 1.0],
         ]
     )
-    return Camera(width, height, focal, focal, cx, cy, c2w, tuple(notices))
+    return Camera(width, height, focal, focal, cx, cy, c2w, tuple(notices), tuple(assumed))
 
 
 def ground_point(

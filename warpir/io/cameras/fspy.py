@@ -75,5 +75,5 @@ def read_fspy(path: Path, content: dict[str, Any]) -> StoredCamera:
     return StoredCamera(
         Camera(width, height, focal, focal, cx, cy, c2w),
         np.array(UP_TO_Y[axis], dtype=np.float64),
-        world_notice=f"assumed: {axis} of the fSpy world points up; --up overrides",
+        assumed_up=f"{axis} of the fSpy world points up; --up overrides",
     )

@@ -75,7 +75,7 @@ def read_nerfstudio(
         camera,
         np.array(UP_TO_Y["+z"], dtype=np.float64),
         Lens((k1, k2, k3, k4), (p1, p2)),
-        "assumed: +z of the transforms.json points up, as nerfstudio has it; only its exporter "
+        "+z of the transforms.json points up, as nerfstudio has it; only its exporter "
         "knows whether gravity agrees (--up, --ground)",
     )
 

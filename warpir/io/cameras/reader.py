@@ -78,10 +78,8 @@ def read_photo_camera(
     has_up = world is not None
     if world is None:
         world = np.eye(3)
-    notices = stored.camera.notices
-    if axis is None and stored.world_notice:
-        notices = (*notices, stored.world_notice)
-    camera = replace(stored.camera, c2w=turned(stored.camera.c2w, world), notices=notices)
+    assumed = (stored.assumed_up,) if axis is None and stored.assumed_up else ()
+    camera = replace(stored.camera, c2w=turned(stored.camera.c2w, world), assumed=assumed)
     camera = _fit(path, camera, photo_size)
     return PhotoCamera(camera, stored.lens, world, has_up)
 

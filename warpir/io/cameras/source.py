@@ -39,8 +39,8 @@ class StoredCamera:
     way is up is not known."""
     lens: Lens = STRAIGHT
     """What bent the photograph."""
-    world_notice: str = ""
-    """What is to be said of `world` when the user does not say which way is up."""
+    assumed_up: str = ""
+    """What `world` rests on when the user does not say which way is up; empty: the format says."""
 
 
 @dataclass(frozen=True)
