@@ -8,13 +8,14 @@ import json
 import re
 import shutil
 from collections.abc import Iterator
-from dataclasses import fields
+from dataclasses import fields, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import OpenImageIO as oiio
 import pytest
+from markupsafe import escape
 from numpy.typing import NDArray
 from PIL import Image
 from playwright.sync_api import Locator
@@ -29,15 +30,18 @@ from warpir.core.errors import ExitCode, InputError
 from warpir.insert import main
 from warpir.io.results import BACKGROUND_DEPTH, read_layers
 from warpir.report import page as report
+from warpir.report.command import main as remake
+from warpir.report.command import read_results
 from warpir.report.facts import (
     ABOUT_FILES,
     about_file,
     command_line,
-    who_spoke,
+    light_sources,
     without_folders,
 )
-from warpir.report.page_policy import source_hash
-from warpir.report.pictures import layers_shown, rgbe, shrink, thumbnail
+from warpir.report.html import source_hash
+from warpir.report.panorama import rgbe
+from warpir.report.pictures import layers_shown, shrink, thumbnail
 from warpir.report.plots import Series, line_plot, ticks
 
 HOSTILE = "</script><img src=x onerror=alert(1)>\"'&"
@@ -74,7 +78,7 @@ def page(run: Run) -> str:
 @pytest.fixture(scope="module")
 def guided(run: Run) -> report.Results:
     """The same results as a guided run would have left them: steps, a verdict, recovered curves."""
-    results = report.read_results(run.out)
+    results = read_results(run.out)
     record: dict[str, Any] = json.loads(json.dumps(results.record))
     record["notices"] = [f"the prior does not know: {HOSTILE}"]
     record["config"] |= {"prompt": HOSTILE, "guidance": "stable-diffusion", "model": "/a/model"}
@@ -94,10 +98,10 @@ def guided(run: Run) -> report.Results:
     knots = results.curves.shadow_ratio
     bent = type(knots)(knots.x, knots.y**2, knots.slope)
     by_step = {"score": [None, 7.5, None, 8.0], "gradient": [3.0, 2.0, 1.0, 0.5], "new": [None] * 4}
-    return report.replace(
+    return replace(
         results,
         record=record,
-        curves=report.replace(results.curves, shadow_ratio=bent),
+        curves=replace(results.curves, shadow_ratio=bent),
         optimization={**record["measured"]["optimization"], "by_step": by_step},
     )
 
@@ -178,7 +182,7 @@ def test_page_tells_no_folder(run: Run, page: str, folder: Path) -> None:
     """A report is handed on: where somebody keeps their files is for run.json."""
     assert str(folder) not in html.unescape(page)
     record = {**run.record, "notices": [f"{folder}/{FILE_NAME}: odd"]}
-    results = report.replace(report.read_results(run.out), record=record)
+    results = replace(read_results(run.out), record=record)
     told = html.unescape(report.report_page(results).decode())
     assert str(folder) not in told and f"{FILE_NAME}: odd" in told
 
@@ -224,17 +228,17 @@ def test_hostile_texts_stay_texts(page: str, guided: report.Results) -> None:
     for text in (page, report.report_page(guided).decode()):
         assert "<img src=x" not in text
         assert text.count("</script>") == 1
-        assert html.escape(FILE_NAME) in text
-    assert report.report_page(guided).decode().count(html.escape(HOSTILE)) >= 3
+        assert escape(FILE_NAME) in text
+    assert report.report_page(guided).decode().count(escape(HOSTILE)) >= 3
 
 
 def test_names_that_are_no_text_do_not_end_the_run(guided: report.Results) -> None:
     """A photo's name need not be UTF-8: what cannot be shown is a question mark."""
     record = {**guided.record, "config": {**guided.record["config"], "photo": "a\udcff.png"}}
-    assert b"a?.png" in report.report_page(report.replace(guided, record=record))
+    assert b"a?.png" in report.report_page(replace(guided, record=record))
 
 
-def test_guided_run_tells_who_spoke(guided: report.Results) -> None:
+def test_guided_run_tells_light_sources(guided: report.Results) -> None:
     """Steps, scores, verdict, curves and every series that has numbers; nothing empty."""
     text = html.unescape(report.report_page(guided).decode())
     assert {"Tone curves", "Convergence"} <= set(headings(text))
@@ -253,7 +257,7 @@ def test_missing_parts_leave_no_empty_headings(guided: report.Results) -> None:
     assert not gone & set(headings(text)) and "not shown: layers.exr" in text
     assert not re.search(r"</h2>\s*</section>", text)
     silent = {**guided.record, "notices": [], "assumed": [], "inputs": {}, "versions": {}}
-    text = report.report_page(report.replace(guided, record=silent)).decode()
+    text = report.report_page(replace(guided, record=silent)).decode()
     assert not {"What was noticed and assumed", "Inputs", "Versions"} & set(headings(text))
 
 
@@ -261,8 +265,8 @@ def test_object_that_is_not_seen_is_told(guided: report.Results) -> None:
     """Only a shadow: the whole picture alone, layers without an object."""
     assert guided.layers is not None
     none = np.zeros_like(guided.layers.matte)
-    layers = report.replace(guided.layers, matte=none, depth=np.full_like(none, np.inf))
-    text = report.report_page(report.replace(guided, layers=layers)).decode()
+    layers = replace(guided.layers, matte=none, depth=np.full_like(none, np.inf))
+    text = report.report_page(replace(guided, layers=layers)).decode()
     assert "The object is not seen in the photo." in text and "view-object" not in text
     assert 'id="layer-shadow"' in text and 'id="layer-depth"' not in text
 
@@ -275,7 +279,7 @@ def test_object_in_pixels_that_are_cut_off_has_no_depth(guided: report.Results) 
         for f in fields(guided.layers)
         for p in [getattr(guided.layers, f.name)]
     }
-    layers = report.replace(guided.layers, **planes)
+    layers = replace(guided.layers, **planes)
     assert layers.depth is not None
     layers.depth[:] = np.inf
     layers.depth[:, -2:] = 3.0
@@ -337,7 +341,7 @@ def test_the_same_again_runs_with_a_model_of_the_hub(
     """By its whole name, and with what no file can switch on; a folder by its last part."""
     told = {"model": "someone/a-model", "allow_download": True}
     record = {**guided.record, "config": {**guided.record["config"], **told}}
-    results = report.replace(guided, record=record)
+    results = replace(guided, record=record)
     text = html.unescape(report.report_page(results).decode())
     assert "warpir.insert --config run.json --allow-download --out OUT<" in text
     assert "--model someone/a-model " in text and "--allow-pickle" not in text
@@ -352,12 +356,12 @@ def test_the_same_again_runs_with_a_model_of_the_hub(
     ("values", "words"),
     [
         ({"demo": True, "guidance": "none"}, "the demo's own"),
-        ({"demo": True, "start": "uniform"}, "even, as nothing was said"),
+        ({"demo": True, "start": "uniform"}, "even, as none was given"),
     ],
 )
 def test_light_of_the_demo_is_told_where_it_is_used(values: dict[str, Any], words: str) -> None:
     """Not where an even light was asked for."""
-    ((_, text),) = who_spoke({"measured": {"prior": "none"}}, InsertConfig(**values))
+    ((_, text),) = light_sources({"measured": {"prior": "none"}}, InsertConfig(**values))
     assert text.startswith(words)
 
 
@@ -403,9 +407,12 @@ def test_plot_has_axes_in_round_numbers() -> None:
     """Ticks within the range, in steps of 1, 2 or 5; one value alone is drawn too."""
     assert ticks(0.0, 1.0, 5) == pytest.approx([0.0, 0.2, 0.4, 0.6, 0.8, 1.0])
     assert ticks(-3.2, 11.0, 5) == pytest.approx([0.0, 5.0, 10.0])
-    plot = line_plot([Series("a", np.array([2.0]), np.array([3.0]))], "<b>", ("x & y", "z"))
-    assert "&lt;b&gt;" in plot and "x &amp; y" in plot and "nan" not in plot
-    assert plot.count("<circle") == 1
+    plot = line_plot([Series(np.array([2.0]), np.array([3.0]))], "a", ("x", "y"))
+    (line,) = plot.lines
+    assert line.points == [plot.middle] and line.has_dots
+    assert [text for _, text in plot.x_ticks] == ["1", "1.5", "2", "2.5", "3"]
+    assert all(plot.left <= x <= plot.right for x, _ in plot.x_ticks)
+    assert all(plot.top <= y <= plot.bottom for y, _ in plot.y_ticks)
 
 
 def test_layers_are_read_as_they_were_written(run: Run) -> None:
@@ -439,18 +446,18 @@ def test_report_is_made_anew_of_a_finished_folder(
     copy = tmp_path / "copy"
     shutil.copytree(run.out, copy)
     before = outcome(copy)
-    assert report.main([str(copy), "--to", str(tmp_path / "new.html")]) == ExitCode.DONE
+    assert remake([str(copy), "--to", str(tmp_path / "new.html")]) == ExitCode.DONE
     text = (tmp_path / "new.html").read_text("utf-8")
     assert headings(text) == headings((run.out / "report.html").read_text("utf-8"))
-    assert report.main([str(copy)]) == ExitCode.OUTPUT
-    assert report.main([str(copy), "--overwrite"]) == ExitCode.OUTPUT
-    assert report.main([str(copy), "--to", str(tmp_path / "new.html")]) == ExitCode.OUTPUT
+    assert remake([str(copy)]) == ExitCode.OUTPUT
+    assert remake([str(copy), "--overwrite"]) == ExitCode.OUTPUT
+    assert remake([str(copy), "--to", str(tmp_path / "new.html")]) == ExitCode.OUTPUT
     assert outcome(copy) == before
     capsys.readouterr()
     (copy / "layers.exr").unlink()
     (copy / "balls.png").write_bytes(b"another")
     again = [str(copy), "--to", str(tmp_path / "new.html"), "--overwrite"]
-    assert report.main(again) == ExitCode.DONE
+    assert remake(again) == ExitCode.DONE
     assert "layers.exr is not there any more" in capsys.readouterr().out
     text = (tmp_path / "new.html").read_text("utf-8")
     assert "not shown: layers.exr, balls.png" in text and "The light" in headings(text)
@@ -469,7 +476,7 @@ def test_wrong_arguments_are_one_line(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], argv: list[str], words: str
 ) -> None:
     """As of every command of ours: no page of usage, no abbreviations."""
-    assert report.main([*([str(tmp_path)] if argv else []), *argv]) == ExitCode.USAGE
+    assert remake([*([str(tmp_path)] if argv else []), *argv]) == ExitCode.USAGE
     error = capsys.readouterr().err
     assert error.startswith("error: ") and words in error and "usage:" not in error
 
@@ -479,12 +486,12 @@ def test_pictures_beyond_the_limit_are_refused(
 ) -> None:
     """By the limit of every other picture, before a pixel is decoded; the flag raises it."""
     argv = [str(run.out), "--to", str(tmp_path / "new.html")]
-    assert report.main([*argv, "--max-pixels", "1000"]) == ExitCode.INPUT
+    assert remake([*argv, "--max-pixels", "1000"]) == ExitCode.INPUT
     error = capsys.readouterr().err
     assert "layers.exr: too large (found 48 x 32 pixels; limit 1000)" in error
-    assert report.main([*argv, "--max-envmap-width", "32"]) == ExitCode.INPUT
+    assert remake([*argv, "--max-envmap-width", "32"]) == ExitCode.INPUT
     assert "envmap.exr: too large" in capsys.readouterr().err
-    assert report.main([*argv, "--max-envmap-width", "65536"]) == ExitCode.DONE
+    assert remake([*argv, "--max-envmap-width", "65536"]) == ExitCode.DONE
     with pytest.raises(InputError, match="too large"):
         thumbnail(run.out / "composite.png", 1000)
 
@@ -525,7 +532,7 @@ def test_folder_that_is_no_run_is_refused(
     """One line, nothing written."""
     if content is not None:
         (tmp_path / "run.json").write_text(content)
-    assert report.main([str(tmp_path)]) in (ExitCode.INPUT, ExitCode.USAGE)
+    assert remake([str(tmp_path)]) in (ExitCode.INPUT, ExitCode.USAGE)
     error = capsys.readouterr().err
     assert error.count("error:") == 1 and words in error
     assert not (tmp_path / "report.html").exists()

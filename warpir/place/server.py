@@ -20,7 +20,7 @@ from typing import Any
 
 from warpir.app.config import usage
 from warpir.core.errors import InputError
-from warpir.report.page_policy import source_hash
+from warpir.report.html import source_hash
 
 HOST = "127.0.0.1"
 LARGEST_REQUEST = 1 << 16

@@ -2,6 +2,6 @@
 
 import sys
 
-from warpir.report.page import main
+from warpir.report.command import main
 
 sys.exit(main())

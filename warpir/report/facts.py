@@ -1,6 +1,6 @@
-"""What the report says of a run in words: plain rows of text, read from its ``run.json``.
+"""Facts about a run as rows of text, read from its ``run.json``.
 
-Of paths only the last part is told, since a report is handed on; whole ones are in ``run.json``.
+Files are called by their names alone, since a report is passed on; ``run.json`` has whole paths.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from warpir.app.config import DEFAULTS, InsertConfig, flag
 from warpir.app.record import PATHS, config_of_picture, is_hub_id, name_of
 
 Rows = list[tuple[str, str]]
-"""What is told, by what it is."""
+"""Name and text of each row."""
 
 
 @dataclass(frozen=True)
@@ -29,9 +29,9 @@ class Setting:
     name: str
     value: str
     is_set: bool
-    """Whether somebody gave it."""
+    """Whether it differs from the default."""
     is_settled: bool
-    """Whether it was left open, and the prior's own value used."""
+    """Whether it was left open and the prior's own value was used."""
 
 
 ABOUT_FILES = (
@@ -62,11 +62,11 @@ ABOUT_FILES = (
     ("report.html", "This page"),
     ("run.json", "Settings, hashes, versions, figures: --config reads it back; written last"),
 )
-"""What each file of a run is for; the first pattern that fits counts."""
+"""Purpose of each file by a pattern of its name; the first pattern that fits counts."""
 
 
 def about_file(name: str) -> str:
-    """Return what a file of a run is for."""
+    """Return the purpose of a run's file; empty where unknown."""
     return next((about for p, about in ABOUT_FILES if fnmatchcase(name, p)), "")
 
 
@@ -99,7 +99,7 @@ def _last_part(separators: str, found: re.Match[str]) -> str:
 
 
 _START = r"(?<![\w./\\~-])"
-"""Of a word or a path."""
+"""Start of a word or of a path, with its separators."""
 
 
 def _path_pattern(root: str, separators: str) -> re.Pattern[str]:
@@ -118,7 +118,7 @@ _WHOLE_PATHS = (
     # A file's address, a home, the root; an address of the web is no path.
     (_path_pattern(rf"file:/+|{_START}~[\w.-]*/+|(?<![:\w./\\~)<-])/+|(?<=\w:)/(?!/)", "/"), "/"),
 )
-"""With their separators."""
+"""Patterns of whole paths, each with its separators."""
 _POINTER = re.compile(
     r"/(?:accessors|animations|buffers|bufferViews|cameras|images|materials|meshes|nodes|samplers|"
     r"scenes|skins|textures|extensions/[A-Z]+_\w+(?:/lights)?)(?:/\d+(?:/\w+)*)?[^\w/]*"
@@ -175,11 +175,11 @@ def settings(config: InsertConfig, record: Mapping[str, Any]) -> dict[str, list[
     return found
 
 
-# ------------------------------------------------------------------------------- who spoke
+# ------------------------------------------------------------------- where the light comes from
 
 
-def who_spoke(record: Mapping[str, Any], config: InsertConfig) -> Rows:
-    """Return what the light comes from, and how sure that is."""
+def light_sources(record: Mapping[str, Any], config: InsertConfig) -> Rows:
+    """Return where the light comes from, with the uncertainty of estimates."""
     measured = record["measured"]
     rows: Rows = [("the light", _source(measured, config))]
     if "regression" in measured:
@@ -217,13 +217,13 @@ def _source(measured: Mapping[str, Any], config: InsertConfig) -> str:
     elif "regression" in measured:
         found = measured["regression"]
         text = (
-            f"read off the photo by warpir's regressor: azimuth {found['azimuth_deg']:.0f}°, "
+            f"estimated from the photo by warpir's regressor: azimuth {found['azimuth_deg']:.0f}°, "
             f"elevation {found['elevation_deg']:.0f}°"
         )
     elif config.demo and config.start != "uniform":
         text = "the demo's own"
     else:
-        text = "even, as nothing was said about it"
+        text = "even, as none was given"
     if measured["prior"] != "none" and config.refine is None:
         verdict = measured.get("acceptance")
         if verdict is not None and not verdict["is_accepted"]:
@@ -289,14 +289,14 @@ def figures(record: Mapping[str, Any]) -> Rows:
 
 
 def stage_words(stage: str) -> str:
-    """Return what a stage of the timings does."""
+    """Return the name of a stage of the timings in words."""
     return _STAGES.get(stage, re.sub("[_-]", " ", stage))
 
 
 _STAGES = {
     "read": "read and check all inputs",
     "load": "load the renderer",
-    "regress": "read the light off the photo",
+    "regress": "estimate the light from the photo",
     "detail": "take reflections from the photo",
     "preview": "preview",
     "scene": "build the scene",

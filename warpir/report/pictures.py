@@ -9,7 +9,7 @@ from __future__ import annotations
 import base64
 import io
 import math
-import zlib
+from collections.abc import Iterator
 from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Any
@@ -17,11 +17,10 @@ from typing import Any
 import numpy as np
 from PIL import Image
 
-from warpir.core.arrays import BoolArray, CodeArray, Float64Array, FloatArray
+from warpir.core.arrays import BoolArray, CodeArray, FloatArray
 from warpir.core.color import linear_to_gamma, luminance
 from warpir.io.images.decoder import decode_image
 from warpir.io.results import Layers
-from warpir.scene.light import bearing, resize_map, rotate_map
 
 Box = tuple[int, int, int, int]
 """Left, top, right, bottom, half-open [px]."""
@@ -32,12 +31,6 @@ LAYER_LARGEST = 960
 """Longest side of a layer in the report [px]."""
 THUMBNAIL = 320
 """Longest side of a frame in the report of a sequence [px]."""
-PANORAMA_HEIGHT = 192
-"""Rows of the panorama in the report."""
-STOPS = 8.0
-"""Most that the panorama can be brightened or darkened by [EV]."""
-BRIGHT = 90.0
-"""Percentile of the panorama's luminance that is shown as white [%]."""
 MARGIN = 0.12
 """Round the object, in its own sides [1]."""
 SHADED = 0.9
@@ -187,7 +180,12 @@ class Layer:
     name: str
     about: str
     picture: Shown
-    has_alpha: bool
+    has_alpha: bool = True
+
+    @property
+    def id(self) -> str:
+        """Of its element in the page."""
+        return f"layer-{self.name}"
 
 
 def layers_shown(layers: Layers) -> list[Layer]:
@@ -195,156 +193,92 @@ def layers_shown(layers: Layers) -> list[Layer]:
     box = _box_of((layers.matte > 0.0) | (layers.shadow_ratio[..., 1] < SHADED))
     if box is not None:
         layers = _cropped(layers, box)
+    composite, *others = _opaque_layers(layers)
+    foreground, *parts = _object_layers(layers)
+    return [composite, foreground, *others, *parts, *_surface_layers(layers)]
 
-    def cut(plane: FloatArray) -> FloatArray:
-        return shrink(plane, LAYER_LARGEST)
 
-    matte = cut(layers.matte)
-    seen = matte[..., None]
-    if layers.depth is not None:
-        # What describes the surface is averaged over the object alone.
-        is_surface = np.isfinite(layers.depth).astype(np.float32)
-        share = cut(is_surface)
+def _opaque_layers(layers: Layers) -> Iterator[Layer]:
+    """Yield the layers that have a value in every pixel."""
 
-    def surface(plane: FloatArray) -> FloatArray:
-        averaged = cut(plane)
-        weight = np.where(share > 0.0, share, 1.0)
-        weight = weight if averaged.ndim == 2 else weight[..., None]
-        return np.asarray(averaged / weight, np.float32)
+    def opaque(plane: FloatArray) -> Shown:
+        return jpeg(encoded(shrink(plane, LAYER_LARGEST)))
 
-    def over(codes: CodeArray, alpha: FloatArray) -> Shown:
-        rgb = np.repeat(codes[..., None], 3, axis=-1) if codes.ndim == 2 else codes
-        return webp(np.concatenate([rgb, plain(alpha)[..., None]], axis=-1))
-
-    def part(plane: FloatArray) -> Shown:
-        return over(encoded(np.asarray(cut(plane) / np.maximum(seen, 1e-6), np.float32)), matte)
-
-    found: list[Layer] = []
-
-    def add(name: str, about: str, picture: Shown, has_alpha: bool = False) -> None:
-        found.append(Layer(name, about, picture, has_alpha))
-
-    add(
-        "composite",
-        "The picture: fg + (1 − fg.A) × plate × shadow, pixel by pixel.",
-        jpeg(encoded(cut(layers.composite))),
-    )
-    add(
-        "fg",
-        "The object alone, lit and tone-mapped, premultiplied by its coverage (RGBA).",
-        part(layers.foreground[..., :3]),
-        True,
-    )
-    darkest = float(luminance(layers.shadow_ratio).min())
+    about = "The picture: fg + (1 − fg.A) × plate × shadow, pixel by pixel."
+    yield Layer("composite", about, opaque(layers.composite), has_alpha=False)
     about = "What the photo is multiplied with: white where the object changes nothing."
-    if darkest < 1.0:
+    if (darkest := float(luminance(layers.shadow_ratio).min())) < 1.0:
         about += f" Its darkest pixel keeps {100.0 * max(darkest, 0.0):.0f} % of the light."
-    add("shadow", about, jpeg(encoded(cut(layers.shadow_ratio))))
-    add("plate", "The photo, linearised.", jpeg(encoded(cut(layers.plate))))
-    add("matte", "How much of each pixel the object covers: white is all.", jpeg(plain(matte)))
+    yield Layer("shadow", about, opaque(layers.shadow_ratio), has_alpha=False)
+    yield Layer("plate", "The photo, linearised.", opaque(layers.plate), has_alpha=False)
+    matte = jpeg(plain(shrink(layers.matte, LAYER_LARGEST)))
+    about = "How much of each pixel the object covers: white is all."
+    yield Layer("matte", about, matte, has_alpha=False)
+
+
+def _object_layers(layers: Layers) -> Iterator[Layer]:
+    """Yield the object's own light and its parts, which are premultiplied by the coverage."""
+    matte = shrink(layers.matte, LAYER_LARGEST)
+
+    def straight(premultiplied: FloatArray) -> Shown:
+        plane = shrink(premultiplied, LAYER_LARGEST)
+        return _with_alpha(encoded(plane / np.maximum(matte, np.float32(1e-6))[..., None]), matte)
+
+    about = "The object alone, lit and tone-mapped, premultiplied by its coverage (RGBA)."
+    yield Layer("fg", about, straight(layers.foreground[..., :3]))
     if layers.diffuse is not None:
         about = "Part of fg that the object scatters in all directions."
-        add("diffuse", about, part(layers.diffuse), True)
+        yield Layer("diffuse", about, straight(layers.diffuse))
     if layers.specular is not None:
         about = "Part of fg that the object mirrors: highlights and reflections."
-        add("specular", about, part(layers.specular), True)
+        yield Layer("specular", about, straight(layers.specular))
     if layers.emission is not None:
         about = "Part of fg that the object emits."
         if not layers.emission.any():
             about += " This one emits nothing."
-        add("emission", about, part(layers.emission), True)
+        yield Layer("emission", about, straight(layers.emission))
+
+
+def _surface_layers(layers: Layers) -> Iterator[Layer]:
+    """Yield what describes the surface, averaged over the object alone."""
+    if layers.depth is None:
+        return
+    is_surface = np.isfinite(layers.depth)
+    share = shrink(is_surface.astype(np.float32), LAYER_LARGEST)
+    is_shown = share > 0.0
+    weight = np.where(is_shown, share, np.float32(1.0))
+
+    def mean(plane: FloatArray) -> FloatArray:
+        shrunk = shrink(plane, LAYER_LARGEST)
+        return shrunk / (weight if shrunk.ndim == 2 else weight[..., None])
+
     if layers.albedo is not None:
-        add(
-            "albedo",
-            "Base colour of the surface, without any light.",
-            over(encoded(surface(layers.albedo)), share),
-            True,
-        )
+        about = "Base colour of the surface, without any light."
+        yield Layer("albedo", about, _with_alpha(encoded(mean(layers.albedo)), share))
     if layers.roughness is not None:
-        add(
-            "roughness",
-            "Perceptual roughness: black is a mirror, white is matt.",
-            over(plain(surface(layers.roughness)), share),
-            True,
-        )
+        about = "Perceptual roughness: black is a mirror, white is matt."
+        yield Layer("roughness", about, _with_alpha(plain(mean(layers.roughness)), share))
     if layers.normal is not None:
-        add(
-            "normal",
-            "Unit normal of the surface in world axes: red +X, green +Y (up), blue +Z.",
-            over(plain(0.5 + 0.5 * surface(layers.normal)), share),
-            True,
-        )
-    # Seen in the pixels alone that shrinking cuts off, it has no depth either.
-    if layers.depth is not None and (share > 0.0).any():
-        clean = np.where(np.isfinite(layers.depth), layers.depth, np.float32(0.0))
-        depth = surface(clean)
-        low, high = float(depth[share > 0.0].min()), float(depth[share > 0.0].max())
-        add(
-            "depth",
-            f"Distance along the viewing axis: white is {low:.2f} m, black is {high:.2f} m.",
-            over(plain((high - depth) / max(high - low, 1e-6)), share),
-            True,
-        )
-        if layers.position is not None:
-            position = surface(layers.position)
-            points = position[share > 0.0]
-            lows, highs = points.min(axis=0), points.max(axis=0)
-            ranges = ", ".join(
-                f"{axis} from {a:.2f} to {b:.2f} m"
-                for axis, a, b in zip(
-                    ("X (red)", "Y (green)", "Z (blue)"), lows, highs, strict=True
-                )
-            )
-            span = np.maximum(highs - lows, 1e-6)
-            add(
-                "position",
-                f"Position of the surface in the world: {ranges}.",
-                over(plain((position - lows) / span), share),
-                True,
-            )
-    return found
+        about = "Unit normal of the surface in world axes: red +X, green +Y (up), blue +Z."
+        yield Layer("normal", about, _with_alpha(plain(0.5 + 0.5 * mean(layers.normal)), share))
+    if not is_shown.any():  # the surface is in the pixels alone that shrinking cuts off
+        return
+    depth = mean(np.where(is_surface, layers.depth, np.float32(0.0)))
+    low, high = float(depth[is_shown].min()), float(depth[is_shown].max())
+    about = f"Distance along the viewing axis: white is {low:.2f} m, black is {high:.2f} m."
+    nearness = (high - depth) / max(high - low, 1e-6)
+    yield Layer("depth", about, _with_alpha(plain(nearness), share))
+    if layers.position is not None:
+        position = mean(layers.position)
+        lows, highs = position[is_shown].min(axis=0), position[is_shown].max(axis=0)
+        axes = zip(("X (red)", "Y (green)", "Z (blue)"), lows, highs, strict=True)
+        ranges = ", ".join(f"{axis} from {a:.2f} to {b:.2f} m" for axis, a, b in axes)
+        about = f"Position of the surface in the world: {ranges}."
+        scaled = (position - lows) / np.maximum(highs - lows, 1e-6)
+        yield Layer("position", about, _with_alpha(plain(scaled), share))
 
 
-# ---------------------------------------------------------------------------------- light
-
-
-@dataclass(frozen=True)
-class Panorama:
-    """A light as the report shows it, ahead of the camera in the middle."""
-
-    picture: Shown
-    """At `stops`."""
-    stops: float
-    """By which the photo's exposure was changed, so that the light can be looked at [EV]."""
-    rgbe: str
-    """The same values for other exposures: zlib'd RGBE, base64, row by row."""
-
-
-def panorama(texels: FloatArray, c2w: Float64Array, tone: str) -> Panorama:
-    """Return a light as a person at the camera would see it, turning all the way round.
-
-    Args:
-        texels: Radiance in our orientation, relative [W/(m^2 sr)], shape [He, 2 He, 3].
-        c2w: Pose of the camera, shape [4, 4].
-        tone: The picture's operator, ``linear`` or ``reinhard``.
-    """
-    small = resize_map(texels, PANORAMA_HEIGHT)
-    turned = rotate_map(small, -bearing(np.array([0.0, 0.0, -1.0]), c2w))
-    # Our map's seam is what a camera along -Z looks at.
-    seen = np.roll(turned, turned.shape[1] // 2, axis=1)
-    bright = float(np.percentile(luminance(seen), BRIGHT))
-    stops = float(np.clip(np.round(-2.0 * np.log2(max(bright, 1e-6))) / 2.0, -STOPS, STOPS))
-    shown = seen * np.float32(2.0**stops)
-    shown = shown / (1.0 + shown) if tone == "reinhard" else shown
-    packed = base64.b64encode(zlib.compress(rgbe(seen).tobytes(), 9)).decode()
-    return Panorama(jpeg(encoded(shown)), stops, packed)
-
-
-def rgbe(linear: FloatArray) -> CodeArray:
-    """Return values as three mantissas and an exponent (Ward 1991), shape [H, W, 4]."""
-    largest = linear.max(axis=-1)
-    _, exponent = np.frexp(largest)
-    scale = np.where(largest > 1e-32, np.ldexp(np.float32(256.0), -exponent), 0.0)
-    mantissas = np.minimum(linear * scale[..., None], 255.0).astype(np.uint8)
-    exponents = np.where(largest > 1e-32, exponent + 128, 0).astype(np.uint8)
-    return np.concatenate([mantissas, exponents[..., None]], axis=-1)
+def _with_alpha(codes: CodeArray, alpha: FloatArray) -> Shown:
+    """Encode codes, shape [H, W] or [H, W, 3], under an alpha in [0, 1], shape [H, W]."""
+    rgb = np.repeat(codes[..., None], 3, axis=-1) if codes.ndim == 2 else codes
+    return webp(np.concatenate([rgb, plain(alpha)[..., None]], axis=-1))

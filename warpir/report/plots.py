@@ -1,4 +1,4 @@
-"""Plots of the report, as SVG without scripts and without styles of their own.
+"""Geometry of the report's plots; the template ``macros.html.j2`` draws them as SVG.
 
 Colours come from the page's style sheet by class, so that a plot is dark on light and light on dark
 as the page is.
@@ -8,28 +8,89 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from html import escape
 
 import numpy as np
 
 from warpir.core.arrays import Float64Array
 
 WIDTH, HEIGHT = 360, 250
-LEFT, RIGHT, TOP, BOTTOM = 58, 14, 14, 44
-"""Room for the axes [px]."""
+LEFT, RIGHT, TOP, BOTTOM = 58, 346, 14, 206
+"""Edges of the area between the axes [px]."""
 POINTS_MAX = 400
-"""Of a line: more cannot be told apart."""
+"""Most points of a line: more cannot be told apart."""
+DOTS_MAX = 12
+"""Most points that are also drawn as dots."""
+
+Point = tuple[float, float]
 
 
 @dataclass(frozen=True)
 class Series:
-    """One line, or single points where values are missing between them."""
+    """One line of values, or a single point."""
 
-    name: str
     x: Float64Array
     y: Float64Array
     style: str = "s0"
     """Class of the style sheet."""
+
+
+@dataclass(frozen=True)
+class Line:
+    """A series in pixels of the plot."""
+
+    style: str
+    points: list[Point]
+
+    @property
+    def has_dots(self) -> bool:
+        """Whether its points are few enough to be read one by one."""
+        return len(self.points) <= DOTS_MAX
+
+
+@dataclass(frozen=True)
+class Plot:
+    """A plot in pixels: axes with ticks, lines, and vertical marks."""
+
+    title: str
+    """What is plotted, for those who cannot see it."""
+    labels: tuple[str, str]
+    """Of the axes."""
+    x_ticks: list[tuple[float, str]]
+    """Position and text."""
+    y_ticks: list[tuple[float, str]]
+    lines: list[Line]
+    marks: list[tuple[float, str]]
+    """Position and name."""
+    width: int = WIDTH
+    height: int = HEIGHT
+    left: int = LEFT
+    right: int = RIGHT
+    top: int = TOP
+    bottom: int = BOTTOM
+
+    @property
+    def middle(self) -> Point:
+        """Middle of the area between the axes."""
+        return (self.left + self.right) / 2, (self.top + self.bottom) / 2
+
+
+@dataclass(frozen=True)
+class _Axis:
+    """A range of values along an edge of the plot."""
+
+    low: float
+    high: float
+    start: int
+    """Where `low` is [px]."""
+    end: int
+
+    def at(self, value: float) -> float:
+        """Return where a value is [px]."""
+        share = (value - self.low) / (self.high - self.low)
+        return round(float(self.start + share * (self.end - self.start)), 1)
+
+    def ticks(self) -> list[tuple[float, str]]:
+        return [(self.at(tick), f"{tick:.6g}") for tick in ticks(self.low, self.high, 5)]
 
 
 def line_plot(
@@ -40,73 +101,31 @@ def line_plot(
     x_range: tuple[float, float] | None = None,
     y_range: tuple[float, float] | None = None,
     marks: Mapping[str, float] | None = None,
-) -> str:
-    """Return a plot with axes, ticks and labels.
+) -> Plot:
+    """Lay out a plot with axes, ticks and labels.
 
     Args:
         series: At least one, each with at least one point.
-        title: Says what is plotted, for those who cannot see it.
+        title: What is plotted, for those who cannot see it.
         labels: Of the axes.
         x_range: Of the axis; that of the values when absent.
         y_range: Likewise.
-        marks: Vertical lines, by what they stand for.
+        marks: Vertical lines, by their names.
     """
-    x_low, x_high = x_range or _range_of([s.x for s in series])
-    y_low, y_high = y_range or _range_of([s.y for s in series])
-    right, bottom = WIDTH - RIGHT, HEIGHT - BOTTOM
-
-    def at_x(x: float) -> float:
-        return LEFT + (x - x_low) / (x_high - x_low) * (right - LEFT)
-
-    def at_y(y: float) -> float:
-        return bottom - (y - y_low) / (y_high - y_low) * (bottom - TOP)
-
-    parts = [
-        f'<svg class="plot" viewBox="0 0 {WIDTH} {HEIGHT}" role="img" aria-label="{escape(title)}">'
-    ]
-    for tick in ticks(x_low, x_high, 5):
-        x = at_x(tick)
-        parts.append(f'<path class="grid" d="M{x:.1f} {TOP}V{bottom}"/>')
-        parts.append(f'<text x="{x:.1f}" y="{bottom + 16}" text-anchor="middle">{tick:.6g}</text>')
-    for tick in ticks(y_low, y_high, 5):
-        y = at_y(tick)
-        parts.append(f'<path class="grid" d="M{LEFT} {y:.1f}H{right}"/>')
-        parts.append(f'<text x="{LEFT - 6}" y="{y + 4:.1f}" text-anchor="end">{tick:.6g}</text>')
-    parts.append(f'<path class="axis" d="M{LEFT} {TOP}V{bottom}H{right}"/>')
-    for name, value in (marks or {}).items():
-        x = at_x(value)
-        anchor, shift = ("end", -4) if x > (LEFT + right) / 2 else ("start", 4)
-        parts.append(f'<path class="mark" d="M{x:.1f} {TOP}V{bottom}"/>')
-        parts.append(
-            f'<text class="mark" x="{x + shift:.1f}" y="{TOP + 10}" text-anchor="{anchor}">'
-            f"{escape(name)}</text>"
-        )
+    x_axis = _Axis(*(x_range or _range_of([s.x for s in series])), LEFT, RIGHT)
+    y_axis = _Axis(*(y_range or _range_of([s.y for s in series])), BOTTOM, TOP)
+    lines = []
     for s in series:
         every = max(1, len(s.x) // POINTS_MAX)
         chosen = sorted({*range(0, len(s.x), every), len(s.x) - 1})
-        points = [f"{at_x(s.x[k]):.1f} {at_y(s.y[k]):.1f}" for k in chosen]
-        parts.append(f'<path class="line {s.style}" d="M{" L".join(points)}"/>')
-        if len(points) <= 12:  # few enough to be measured one by one
-            dots = (p.split() for p in points)
-            parts += [f'<circle class="dot {s.style}" cx="{x}" cy="{y}" r="2.5"/>' for x, y in dots]
-    middle = (LEFT + right) / 2
-    parts.append(
-        f'<text class="label" x="{middle}" y="{HEIGHT - 8}" text-anchor="middle">'
-        f"{escape(labels[0])}</text>"
-    )
-    parts.append(
-        f'<text class="label" transform="translate(13 {(TOP + bottom) / 2}) rotate(-90)" '
-        f'text-anchor="middle">{escape(labels[1])}</text></svg>'
-    )
-    return "".join(parts)
-
-
-def bar(share: float) -> str:
-    """Return a horizontal bar of a share of the full width [1]."""
-    width = f"{100.0 * min(max(share, 0.0), 1.0):.2f}"
-    return (
-        '<svg class="bar" viewBox="0 0 100 8" preserveAspectRatio="none" aria-hidden="true">'
-        f'<rect class="trough" width="100" height="8"/><rect width="{width}" height="8"/></svg>'
+        lines.append(Line(s.style, [(x_axis.at(s.x[k]), y_axis.at(s.y[k])) for k in chosen]))
+    return Plot(
+        title,
+        labels,
+        x_axis.ticks(),
+        y_axis.ticks(),
+        lines,
+        [(x_axis.at(value), name) for name, value in (marks or {}).items()],
     )
 
 

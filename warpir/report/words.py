@@ -1,8 +1,8 @@
-"""What a light looks like, in figures and in words that a photographer would use.
+"""Describes a light in figures and in a photographer's words.
 
-Everything is measured on a lat-long map of it, so that a recovered light, a panorama and a sun of
-the command line are described alike. Directions in words are those of the camera: left and right as
-in the photo, "behind the camera" is where the photographer stands.
+Everything is measured on a lat-long map, so that a recovered light, a panorama and a sun of the
+command line are described alike. Directions in words are those of the camera: left and right as in
+the photo, "behind the camera" is where the photographer stands.
 """
 
 from __future__ import annotations
@@ -127,6 +127,43 @@ def _brightest(
 
 
 # ---------------------------------------------------------------------------------- words
+
+
+def light_rows(
+    character: LightCharacter, shadow: LightCharacter | None = None
+) -> list[tuple[str, str]]:
+    """Describe a light as rows of a name and a text.
+
+    Args:
+        character: Of the light.
+        shadow: Of the light that casts the shadow, where it has one of its own.
+    """
+    direct, sky = color_words(character.direct), color_words(character.sky)
+    rows = [("direction", origin_words(character))]
+    if character.direct_share >= EVEN:
+        position = (
+            f"azimuth {character.azimuth_deg:.0f}° (clockwise from -Z of the world, seen from "
+            f"above), elevation {character.elevation_deg:.0f}°; "
+            f"{character.bearing_deg:+.0f}° from where the camera looks"
+        )
+        rows += [
+            ("in degrees", position),
+            ("strength", strength_words(character)),
+            ("colour of the direct light", direct),
+            ("colour of the rest", sky),
+        ]
+    else:
+        rows += [("strength", strength_words(character)), ("colour", sky)]
+    if shadow is not None:
+        rows.append(("light of the shadow", origin_words(shadow)))
+    rows.append(("shadow", softness_words(shadow or character)))
+    return rows
+
+
+def origin_words(character: LightCharacter) -> str:
+    """Return where a light comes from, or that it is even and where it is brightest."""
+    words = direction_words(character.bearing_deg, character.elevation_deg)
+    return words if character.direct_share >= EVEN else f"from all around, brightest {words}"
 
 
 def direction_words(bearing_deg: float, elevation_deg: float) -> str:

@@ -1,11 +1,11 @@
-"""The page of a sequence, ``sequence.html``: frames in small, with links to their reports."""
+"""The page of a sequence, ``sequence.html``: thumbnails that link to the frames' reports."""
 
 from __future__ import annotations
 
 import os
 from collections.abc import Sequence
-from html import escape
 from pathlib import Path
+from typing import Any
 
 from warpir.app.config import InsertConfig
 from warpir.app.record import name_of
@@ -14,7 +14,8 @@ from warpir.core.errors import ExitCode, InputError, disk_error
 from warpir.core.signals import whole
 from warpir.core.strict_json import read_json_object
 from warpir.report.facts import in_words, without_folders
-from warpir.report.page import MADE_BY, REPORT, html_page, section
+from warpir.report.html import render_page
+from warpir.report.page import MADE_BY, REPORT
 from warpir.report.pictures import thumbnail
 from warpir.sequence.frames import Frame
 
@@ -24,10 +25,10 @@ SHOWN = 240
 
 
 def refuse_other_page(config: InsertConfig) -> None:
-    """Refuse to write where a page that is none of ours would be lost.
+    """Refuse to replace a page that warpir did not write.
 
     Raises:
-        InputError: It is there, and --overwrite is not given (`ExitCode.OUTPUT`).
+        InputError: There is one, and --overwrite is not given (`ExitCode.OUTPUT`).
     """
     assert config.out is not None
     path = Path(config.out) / PAGE
@@ -55,12 +56,13 @@ def write_sequence_report(config: InsertConfig, frames: Sequence[Frame]) -> None
     """
     assert config.out is not None and config.sequence is not None
     every = max(1, -(-len(frames) // SHOWN))
-    cards = (_card(frame, k % every == 0) for k, frame in enumerate(frames))
-    content = html_page(
+    content = render_page(
+        "sequence",
+        package="warpir.sequence",
         kind="warpir, report of a sequence",
         title=f"{name_of(config.sequence)}: {len(frames)} frames",
         lead=f"Lit by {name_of(config.reuse)}." if config.reuse else "",
-        sections=[section("Frames", f'<ol class="frames">{"".join(cards)}</ol>')],
+        frames=[_card(frame, k % every == 0) for k, frame in enumerate(frames)],
     )
     path = Path(config.out) / PAGE
     try:
@@ -70,22 +72,18 @@ def write_sequence_report(config: InsertConfig, frames: Sequence[Frame]) -> None
         raise disk_error(path, error) from error
 
 
-def _card(frame: Frame, has_picture: bool) -> str:
-    name = frame.folder.name
-    record = read_json_object(frame.folder / "run.json")
-    picture = ""
+def _card(frame: Frame, has_picture: bool) -> dict[str, Any]:
+    """Return what the page shows of a frame."""
+    picture = None
     if has_picture:
-        shown = thumbnail(frame.folder / "composite.png", frame.config.max_pixels)
-        picture = (
-            f'<img src="{shown.uri}" width="{shown.width}" height="{shown.height}" '
-            f'alt="The result of frame {name}" loading="lazy">'
-        )
-    target = REPORT if (frame.folder / REPORT).exists() else "composite.png"
+        picture = thumbnail(frame.folder / "composite.png", frame.config.max_pixels)
     changes = ", ".join(
         f"{n.replace('_', '-')} {in_words(n, getattr(frame.config, n))}" for n in frame.changed
     )
-    told = escape(without_folders(changes, frame.config) or "as the command line says")
-    notices = len(record.get("notices", ()))
-    counted = f"{notices} notice{'s' if notices > 1 else ''}"
-    warned = f'<br><span class="mark">{counted}</span>' if notices else ""
-    return f'<li><a href="{name}/{target}">{picture}<b>{name}</b></a><br>{told}{warned}</li>'
+    return {
+        "name": frame.folder.name,
+        "target": REPORT if (frame.folder / REPORT).exists() else "composite.png",
+        "picture": picture,
+        "changes": without_folders(changes, frame.config),
+        "notices": len(read_json_object(frame.folder / "run.json").get("notices", ())),
+    }

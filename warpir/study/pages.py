@@ -13,7 +13,7 @@ from dataclasses import dataclass
 from functools import cache
 from importlib import resources
 
-from warpir.report.page_policy import source_hash
+from warpir.report.html import source_hash
 from warpir.study.pairs import Words
 from warpir.study.plan import Plan, Rater
 
