@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 import warp as wp
 
+from tests.builders.insertions import write_inputs
 from tests.cases import CaseReport
 from warpir.render.renderer import start_warp
 
@@ -55,6 +56,14 @@ def device(request: pytest.FixtureRequest) -> str:
 def rng() -> np.random.Generator:
     """Random numbers that are the same in every run and for every test."""
     return np.random.default_rng(12345)
+
+
+@pytest.fixture(scope="module")
+def inputs(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Photo, asset, camera and light of a small insertion, written once for a test module."""
+    folder = tmp_path_factory.mktemp("inputs")
+    write_inputs(folder)
+    return folder
 
 
 @pytest.fixture(scope="module")

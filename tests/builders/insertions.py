@@ -8,7 +8,6 @@ from typing import Any
 
 import numpy as np
 import OpenImageIO as oiio
-import pytest
 import trimesh
 
 from warpir.core.arrays import FloatArray, PixelArray
@@ -125,14 +124,6 @@ def arguments(folder: Path, into: Path | str, **changes: str | None) -> list[str
         if value is not None:
             argv += ["--" + name.replace("_", "-"), *([value] if value else [])]
     return argv
-
-
-@pytest.fixture(scope="module")
-def inputs(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The input files, made once."""
-    folder = tmp_path_factory.mktemp("inputs")
-    write_inputs(folder)
-    return folder
 
 
 @dataclass(frozen=True)

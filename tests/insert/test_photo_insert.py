@@ -15,7 +15,6 @@ from tests.builders.insertions import (
     Run,
     arguments,
     go,
-    inputs,
     read_image,
     read_layers,
     rgb,
@@ -27,8 +26,6 @@ from warpir.insert import main
 from warpir.io.cameras.reader import read_camera
 from warpir.io.images.envmap_conventions import from_ours
 from warpir.io.images.photos import read_envmap
-
-__all__ = ["inputs"]  # the fixture
 
 SIZE = (48, 32)
 PYTHON_BYTES = 1e8
