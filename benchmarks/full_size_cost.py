@@ -54,9 +54,9 @@ AUTHORS = InsertConfig(
     report=False,
 )  # fmt: skip
 """What the authors' run does; neither detail, files for other tools nor a report are theirs."""
-QUICK = replace(AUTHORS, class_images=16, lora_steps=100, steps=60)
-TINY = replace(
-    AUTHORS, class_images=2, class_steps=2, lora_steps=4, steps=8, guidance_width=32, lobes=8,
+QUICK = AUTHORS.changed(class_images=16, lora_steps=100, steps=60)
+TINY = AUTHORS.changed(
+ class_images=2, class_steps=2, lora_steps=4, steps=8, guidance_width=32, lobes=8,
     light_height=16, object_light_height=8, score_every=4, width=48, samples=2,
 )  # fmt: skip
 WARM_STEPS, TIMED_STEPS = 8, 12
@@ -282,11 +282,13 @@ def lora_step_ms(prior: StableDiffusion, config: InsertConfig) -> float:
     """Return the time of a training step on random latents [ms]."""
     watch = Stopwatch(prior.device)
     latents = torch.randn(8, *prior.latent_shape)
-    assert config.prompt is not None
-    prompts = make_prompts(config.prompt, config)
+    assert config.guidance.prompt is not None
+    prompts = make_prompts(config.guidance.prompt, config.adapter)
     embeddings = prior.embed([prompts.photo, prompts.class_])
-    lora = initial_lora(prior, config.lora_layers, config.lora_rank, 0)
-    with LoraTraining(prior, lora, latents, latents, embeddings, config, 0, name="timed") as made:
+    lora = initial_lora(prior, config.adapter.lora_layers, config.adapter.lora_rank, 0)
+    with LoraTraining(
+        prior, lora, latents, latents, embeddings, config.adapter, 0, name="timed"
+    ) as made:
         update = prior.graphs.recorded_step(made.update) if prior.graphs else made.update
 
         def steps(count: int) -> None:
@@ -385,7 +387,7 @@ def measure(config: InsertConfig, model: Path, room: Path, device: wp.Device) ->
         torch.cuda.reset_peak_memory_stats()
     memory = Memory(device)
     watch = Watch(memory)
-    config = replace(config, model=str(model), out=str(room / "out"), device=str(device.alias))
+    config = config.changed(model=str(model), out=str(room / "out"), device=str(device.alias))
     with own_cache(room / "cache"), watch.installed():
         start = time.perf_counter()
         record = insert(config).record
@@ -419,29 +421,29 @@ def measure(config: InsertConfig, model: Path, room: Path, device: wp.Device) ->
             "vae": sum(p.numel() for p in prior.vae.parameters()),
         },
         "batch": {
-            "class_images": 2 * config.class_batch,
-            "lora": 1 + config.lora_class_batch,
+            "class_images": 2 * config.adapter.class_batch,
+            "lora": 1 + config.adapter.lora_class_batch,
             "unet": len(loop.guide.terms) * loop.guide.settings.noises,
             "vae": loop.guide.settings.noises,
         },
         "settings": {
-            "class_images": config.class_images,
-            "class_steps": config.class_steps,
-            "lora_steps": config.lora_steps,
-            "steps": config.step_count,
+            "class_images": config.adapter.class_images,
+            "class_steps": config.adapter.class_steps,
+            "lora_steps": config.adapter.lora_steps,
+            "steps": config.optimize.step_count,
             "picture": [loop.frame.photo_lin.shape[1], loop.frame.photo_lin.shape[0]],
-            "lobes": config.lobes,
-            "integrator": config.integrator,
-            "vae_checkpointing": config.vae_checkpointing,
+            "lobes": config.optimize.lobes,
+            "integrator": config.optimize.integrator,
+            "vae_checkpointing": config.diffusion.vae_checkpointing,
             "graphs": prior.graphs is not None,
         },
         "seconds": {name: round(spent, 3) for name, spent in stages.items()},
         "seconds_recording_graphs": round(recording, 3),
         "whole_run_s": total,
         "per_step_ms": {
-            "class_image": 1e3 * stages["class images"] / max(config.class_images or 1, 1),
-            "lora": 1e3 * stages["training"] / max(config.lora_steps, 1),
-            "light": 1e3 * stages["optimize"] / max(config.step_count, 1),
+            "class_image": 1e3 * stages["class images"] / max(config.adapter.class_images or 1, 1),
+            "lora": 1e3 * stages["training"] / max(config.adapter.lora_steps, 1),
+            "light": 1e3 * stages["optimize"] / max(config.optimize.step_count, 1),
         },
         "step_ms": steps,
         "rendering_share": share,
@@ -472,7 +474,7 @@ def main(argv: list[str] | None = None) -> None:
     config = TINY if options.tiny else QUICK if options.quick else AUTHORS
     for text in options.set:
         name, _, value = text.partition("=")
-        config = replace(config, **{name: json.loads(value)})
+        config = config.changed(**{name: json.loads(value)})
     device = wp.get_device(choose_device(options.device))
     if options.tiny:
         torch.set_num_threads(1)  # more only wait for each other in a network this small
@@ -481,7 +483,7 @@ def main(argv: list[str] | None = None) -> None:
         start = time.perf_counter()
         make_tiny_stable_diffusion(room / "tiny")
         if not options.tiny:
-            measure(replace(TINY, width=None), room / "tiny", room / "warm", device)
+            measure(TINY.changed(width=None), room / "tiny", room / "warm", device)
         warmed = time.perf_counter()
         model = room / "tiny"
         if not options.tiny:

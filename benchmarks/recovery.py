@@ -22,7 +22,7 @@ import warp as wp
 from torch import Tensor
 
 from benchmarks.measure import context
-from warpir.app.optimize_settings import OptimizeSettings
+from warpir.app.settings import OptimizeSettings
 from warpir.core.arrays import Float64Array, FloatArray
 from warpir.core.color import gamma_to_linear, luminance
 from warpir.evaluate.panorama_crop import crop_camera, crop_radiance, expose

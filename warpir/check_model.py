@@ -52,16 +52,18 @@ def _run(arguments: list[str]) -> int:
     path = texts.pop("json", None)
     values = read_values({name: (text, flag(name)) for name, text in texts.items()})
     config = InsertConfig(**values)
-    if config.model is None:
+    if config.diffusion.model is None:
         raise usage("--model", "needed", "a folder in diffusers' layout, or a hub id")
 
     from warpir.demo import PHOTO
     from warpir.io.images.photos import read_photo
 
-    photo = read_photo(config.photo or PHOTO, max_pixels=config.max_pixels, alpha=config.alpha).srgb
+    photo = read_photo(
+        config.inputs.photo or PHOTO, max_pixels=config.limits.pixels, alpha=config.inputs.alpha
+    ).srgb
 
     # torch, Warp and diffusers are loaded here, after everything else that can be wrong.
-    if not config.allow_download:
+    if not config.diffusion.allow_download:
         stay_offline()
     from warpir.optimize.model_check import load_and_check, write_report
 

@@ -94,7 +94,7 @@ def insert(config: InsertConfig, *, renews: bool = False) -> Insertion:
     """
     config.require_inputs()
     with _ONE_AT_A_TIME:
-        if config.sequence is not None:
+        if config.task.sequence is not None:
             return _insert_sequence(config, renews)
         try:
             return _insert_one(config)
@@ -107,8 +107,8 @@ def _say_what_is_kept(config: InsertConfig, error: BaseException) -> None:
     """Tell of the checkpoints that a run left when it was stopped or broke down on its way."""
     if isinstance(error, InputError) and error.code not in (ExitCode.RESOURCES, ExitCode.NUMERIC):
         return  # refused before it began
-    assert config.out is not None
-    folder = Path(config.out) / "checkpoints"
+    assert config.output.out is not None
+    folder = Path(config.output.out) / "checkpoints"
     kept = sorted(folder.glob("[0-9]*")) if os.path.isdir(folder) else []
     how = f"kept: {kept[-1]}; the same command with --resume goes on from there" if kept else ""
     if isinstance(error, Stopped):  # its line is the last one, and may know better
@@ -123,8 +123,8 @@ def _insert_sequence(config: InsertConfig, renews: bool) -> Insertion:
     from warpir.sequence.frames import SUMMARY, read_sequence, write_summary
     from warpir.sequence.page import PAGE, refuse_other_page, write_sequence_report
 
-    assert config.out is not None
-    for folder in sorted(Path(config.out).glob("[0-9][0-9][0-9][0-9]")):
+    assert config.output.out is not None
+    for folder in sorted(Path(config.output.out).glob("[0-9][0-9][0-9][0-9]")):
         finish_results(folder)
     loaders = Loaders()
     frames = read_sequence(config, loaders, renews=renews)
@@ -135,21 +135,21 @@ def _insert_sequence(config: InsertConfig, renews: bool) -> Insertion:
             if frame.is_done:
                 say(f"frame {frame.folder.name}: done already")
             else:
-                say(f"frame {frame.folder.name}: line {frame.line} of {config.sequence}")
-                if frame.config.overwrite and not config.overwrite:
+                say(f"frame {frame.folder.name}: line {frame.line} of {config.task.sequence}")
+                if frame.config.output.overwrite and not config.output.overwrite:
                     say("notice: its settings or inputs have changed: it is rendered again")
                 _insert_one(frame.config, loaders)
             done += 1
     except Stopped as error:
         done += bool(error.kept)  # the signal came while this frame's results were put in place
-        how = "renders them again" if config.overwrite else "goes on with the rest"
+        how = "renders them again" if config.output.overwrite else "goes on with the rest"
         error.kept = f"kept: {done} of {len(frames)} frames; the same command {how}"
         raise
-    if config.report:  # before the summary, by which others see that nothing is left to do
+    if config.output.report:  # before the summary, by which others see that nothing is left to do
         _made_or_told(PAGE, lambda: write_sequence_report(config, frames))
     record = write_summary(config, frames, say)
     composites = (f"{frame.folder.name}/composite.png" for frame in frames)
-    return Insertion(Path(config.out), (*composites, *record["video"], SUMMARY), record)
+    return Insertion(Path(config.output.out), (*composites, *record["video"], SUMMARY), record)
 
 
 def _insert_one(config: InsertConfig, loaders: "Loaders | None" = None) -> Insertion:
@@ -163,20 +163,20 @@ def _insert_one(config: InsertConfig, loaders: "Loaders | None" = None) -> Inser
     with timings.stage("read"):
         # The demo fills in its files; what was asked for is what run.json repeats, but not how the
         # folder was found: a resumed run leaves what an uninterrupted one does.
-        asked = replace(config, resume=False, overwrite=False)
+        asked = config.changed(resume=False, overwrite=False)
         config, inputs, light = _read(config, loaders)
 
-    assert config.out is not None
+    assert config.output.out is not None
     memory, (of_photo, of_scene) = Memory(say=say), needs_of(inputs)
     with _output_folder(config) as output:
-        require_space(config.out, needed_bytes(config, inputs))
+        require_space(config.output.out, needed_bytes(config, inputs))
         memory.require(of_photo, *of_scene, on_host=True)
         # Warp is loaded here, after everything that can be wrong was looked at.
         with timings.stage("load"):
             from warpir.render.composite import Quality, make_picture, scene_of
             from warpir.render.renderer import Renderer, choose_device
 
-            device = choose_device(config.device)
+            device = choose_device(config.render.device)
             memory.device = device
             share_device(device)
             if device != "cpu":
@@ -212,18 +212,18 @@ def _insert_one(config: InsertConfig, loaders: "Loaders | None" = None) -> Inser
                 lambda: scene_of(inputs, camera, device, light.curves), "the scene", "--asset"
             )
         with timings.stage("render"), progress_bar() as report:
-            renderer = Renderer(scene, config.threads or 0, report, memory)
+            renderer = Renderer(scene, config.render.threads or 0, report, memory)
             picture = make_picture(
                 renderer,
                 light.on_object,
                 light.light_shadow,
                 inputs.photo,
                 Quality(
-                    config.samples,
-                    config.rays,
-                    config.depth,
-                    config.seed,
-                    config.indirect_limit,
+                    config.render.samples,
+                    config.render.rays,
+                    config.render.depth,
+                    config.render.seed,
+                    config.render.indirect_limit,
                 ),
                 light.curves.foreground,
                 light.curves.shadow_ratio,
@@ -255,7 +255,7 @@ def _insert_one(config: InsertConfig, loaders: "Loaders | None" = None) -> Inser
                 "memory_retries": memory.retries,
             },
         )
-        if config.report:
+        if config.output.report:
             from warpir.report.page import REPORT, write_report
 
             results = replace(results, record=record)
@@ -298,32 +298,36 @@ def _output_folder(config: InsertConfig) -> "OutputFolder":
     from warpir.io.results import OutputFolder
     from warpir.optimize.checkpoint import Checkpoints
 
-    assert config.out is not None
-    newest = Checkpoints(Path(config.out), {}).newest
-    if config.resume and newest is None and os.path.exists(Path(config.out, "run.json")):
+    assert config.output.out is not None
+    newest = Checkpoints(Path(config.output.out), {}).newest
+    if (
+        config.output.resume
+        and newest is None
+        and os.path.exists(Path(config.output.out, "run.json"))
+    ):
         raise InputError(
             "--resume",
-            f"the run in {config.out} is finished",
+            f"the run in {config.output.out} is finished",
             "to run it again, give --overwrite in place of --resume",
             ExitCode.OUTPUT,
         )
-    if newest is not None and not (config.resume or config.overwrite):
+    if newest is not None and not (config.output.resume or config.output.overwrite):
         raise InputError(
-            config.out,
+            config.output.out,
             f"holds an unfinished run ({newest})",
             "--resume goes on with it, --overwrite starts it again",
             ExitCode.OUTPUT,
         )
-    if config.resume and newest is not None and not config.is_guided:
+    if config.output.resume and newest is not None and not config.is_guided:
         raise InputError(
             "--resume",
-            f"the unfinished run in {config.out} was guided, this one is not",
+            f"the unfinished run in {config.output.out} was guided, this one is not",
             "give its flags, or --overwrite in place of --resume",
             ExitCode.OUTPUT,
         )
     # A run to resume was allowed to replace what is there, or has made it: no other run gets in.
-    overwrite = config.overwrite or (config.resume and newest is not None)
-    return OutputFolder(config.out, overwrite=overwrite)
+    overwrite = config.output.overwrite or (config.output.resume and newest is not None)
+    return OutputFolder(config.output.out, overwrite=overwrite)
 
 
 def _cache_notices() -> tuple[str, ...]:
@@ -354,7 +358,7 @@ def _regress(
     """Read the light off the photo; return it, and what run.json says of it."""
     from warpir.render.determinism import fixed_arithmetic
 
-    with timings.stage("regress"), fixed_arithmetic(device, config.deterministic):
+    with timings.stage("regress"), fixed_arithmetic(device, config.render.deterministic):
         from warpir.lighting.estimate import estimate_light
 
         estimate = estimate_light(inputs, config, device)
@@ -367,10 +371,10 @@ def _detailed(
     config: InsertConfig, inputs: "Inputs", light: "SceneLight", timings: "Timings"
 ) -> "tuple[SceneLight, dict[str, Any]]":
     """Put into the light what the photo shows of it, unless a panorama has its own detail."""
-    has_own = config.light is not None and light.light.lobes is None
+    has_own = config.light.file is not None and light.light.lobes is None
     if inputs.run is not None:  # lit by what an earlier run was lit by, with or without
         has_own = not Path(inputs.run.path, "envmap_detail.exr").exists()
-    if not config.detail or has_own:
+    if not config.light.detail or has_own:
         return light, {}
     with timings.stage("detail"):
         from warpir.lighting.detail import detail_of, with_detail
@@ -421,17 +425,23 @@ def _write_preview(
     from warpir.render.renderer import Renderer
 
     settings = config.settled(on_cuda=device != "cpu")
-    if not settings.preview_every:
+    if not settings.optimize.preview_every:
         return
-    width = min(settings.picture_width, _rendering_camera(inputs.camera, config).width)
-    camera = _rendering_camera(inputs.camera, replace(config, width=width))
+    width = min(settings.optimize.picture_width, _rendering_camera(inputs.camera, config).width)
+    camera = _rendering_camera(inputs.camera, config.changed(width=width))
     is_reinhard = light.curves.tone == "reinhard"
     picture = make_picture(
-        Renderer(scene_of(inputs, camera, device, light.curves), config.threads or 0),
+        Renderer(scene_of(inputs, camera, device, light.curves), config.render.threads or 0),
         light.on_object,
         light.light_shadow,
         inputs.photo,
-        Quality(PREVIEW_SAMPLES, 1, config.depth, config.seed, config.indirect_limit),
+        Quality(
+            PREVIEW_SAMPLES,
+            1,
+            config.render.depth,
+            config.render.seed,
+            config.render.indirect_limit,
+        ),
         light.curves.foreground,
         light.curves.shadow_ratio,
         is_reinhard=is_reinhard,
@@ -459,11 +469,11 @@ def _guide(
     from warpir.core.progress import StepProgress
     from warpir.render.determinism import fixed_arithmetic
 
-    with StepProgress(say) as progress, fixed_arithmetic(device, config.deterministic):
+    with StepProgress(say) as progress, fixed_arithmetic(device, config.render.deterministic):
         from warpir.optimize.recover import Run, recover
 
         run = Run(config, inputs, device, output, timings, say, progress, memory=memory)
-        if config.refine is None:
+        if config.task.refine is None:
             light, record, notices = recover(run, light)
         else:
             from warpir.optimize.materials import refine
@@ -478,9 +488,11 @@ def _guide(
 
 def _rendering_camera(camera: "Camera", config: InsertConfig) -> "Camera":
     """Return the photo's camera, or the same view at --width."""
-    if config.width is None:
+    if config.render.width is None:
         return camera
-    return camera.scaled(config.width, max(1, round(config.width * camera.height / camera.width)))
+    return camera.scaled(
+        config.render.width, max(1, round(config.render.width * camera.height / camera.width))
+    )
 
 
 def _write(
@@ -507,7 +519,7 @@ def _write(
     codes = photo.encode(picture.image, picture.changed)
     # Many shadows are too faint for a code; a linear plate has no codes of the same kind.
     changed = picture.changed if photo.is_linear else (codes != photo.codes).any(axis=-1)
-    output.write_png("composite.png", codes, icc=photo.icc, mark=config.mark)
+    output.write_png("composite.png", codes, icc=photo.icc, mark=config.output.mark)
     clamped = write_layers(
         output,
         picture.layers,
@@ -538,7 +550,7 @@ def _write(
         description="Mirror ball and grey diffuse ball under the light",
     )
     handed: dict[str, Any] = {}
-    if config.hand_off:
+    if config.output.hand_off:
         from warpir.io.export import write_hand_off
 
         handed, notices = write_hand_off(
@@ -553,10 +565,10 @@ def _write(
         )
         for line in notices:
             say(f"notice: {line}")
-    if config.mitsuba:
+    if config.output.mitsuba:
         from warpir.mitsuba.scene import write_mitsuba
 
-        write_mitsuba(output, inputs, on_object, config.depth)
+        write_mitsuba(output, inputs, on_object, config.render.depth)
     summary = summarize(light.light)
     say(
         f"light: brightest toward azimuth {summary.azimuth_deg:.0f}, elevation "
@@ -612,7 +624,7 @@ def _read(
     from warpir.app.inputs import read_inputs
     from warpir.lighting.scene_light import make_light
 
-    if config.demo:
+    if config.inputs.demo:
         from warpir.demo import demo_config
 
         config = demo_config(config)
@@ -651,7 +663,7 @@ def _run(arguments: list[str]) -> int:
         _validate(command.config)
         say("inputs are valid")
         return ExitCode.DONE
-    if not command.config.allow_download:
+    if not command.config.diffusion.allow_download:
         stay_offline()
     insertion = insert(command.config)
     for name in insertion.files:
@@ -664,11 +676,11 @@ def _validate(config: InsertConfig) -> None:
     from warpir.app.disk_space import needed_bytes, require_space
     from warpir.io.results import OutputFolder
 
-    if config.sequence is None:
+    if config.task.sequence is None:
         config, inputs, _ = _read(config)
-        assert config.out is not None
+        assert config.output.out is not None
         _output_folder(config).check()
-        require_space(config.out, needed_bytes(config, inputs))
+        require_space(config.output.out, needed_bytes(config, inputs))
         return
     from warpir.app.inputs import Loaders
     from warpir.sequence.frames import read_sequence
@@ -676,8 +688,8 @@ def _validate(config: InsertConfig) -> None:
 
     frames = read_sequence(config, Loaders())
     refuse_other_page(config)
-    assert config.out is not None
-    OutputFolder(config.out, overwrite=True).check()  # the frames' folders were looked at
+    assert config.output.out is not None
+    OutputFolder(config.output.out, overwrite=True).check()  # the frames' folders were looked at
     say(f"frames: {len(frames)}, of which {sum(f.is_done for f in frames)} are done already")
 
 

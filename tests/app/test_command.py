@@ -7,10 +7,10 @@ import subprocess
 import sys
 import time
 from collections.abc import Sequence
-from dataclasses import asdict, fields, replace
+from dataclasses import fields, replace
 from itertools import pairwise
 from pathlib import Path
-from typing import Any, get_type_hints
+from typing import Any
 
 import numpy as np
 import pytest
@@ -25,14 +25,16 @@ from warpir.app.config import (
     CPU_DEFAULTS,
     DEFAULTS,
     EXCLUSIVE,
+    OPTIONS,
     PRIOR_DEFAULTS,
     PROMPTS,
     RANGES,
     InsertConfig,
     flag,
+    kinds,
 )
-from warpir.app.optimize_settings import OptimizeSettings
 from warpir.app.record import RUN_FORMAT
+from warpir.app.settings import OptimizeSettings
 from warpir.core.errors import ExitCode, InputError, raise_all
 from warpir.core.limits import Limits
 from warpir.diffusion.settings import GuidanceSettings, ModelSettings, PersonalizeSettings
@@ -90,9 +92,9 @@ def test_command_help_tells_every_field(capsys: pytest.CaptureFixture[str]) -> N
     text = capsys.readouterr().out
     docs = warpir.app.command._field_docs()
     listed = [name for forms in FLAGS.values() for name in forms]
-    assert sorted(listed) == sorted(field.name for field in fields(InsertConfig)) == sorted(docs)
+    assert sorted(listed) == sorted(OPTIONS) == sorted(docs)
     assert all(f"  {flag(name)}" in text and docs[name] for name in listed)
-    hints = get_type_hints(InsertConfig)
+    hints = kinds()
     switches = {name for name in listed if hints[name] in (bool, bool | None)}
     assert switches == {name for name, form in forms_of_flags() if not form}
     for name in switches - {name for name in listed if hints[name] is bool}:
@@ -117,19 +119,27 @@ def test_open_values_are_the_priors() -> None:
     """Each prior has its own; what was given stays; a known device decides the rest."""
     plain = GuidanceSettings()
     painter = InsertConfig(guidance="stable-diffusion", model="m").settled()
-    assert painter.guidance_settings() == plain and painter.step_count == 600
-    assert painter.personalize and not painter.accept and painter.preview_every == 0
+    assert painter.guidance_settings() == plain and painter.optimize.step_count == 600
+    assert (
+        painter.adapter.personalize
+        and not painter.guidance.accept
+        and painter.optimize.preview_every == 0
+    )
     for on_cuda, noises, width in ((True, 4, 384), (False, 2, 256)):
         config = InsertConfig(weight="uniform", steps=9).settled(on_cuda)
-        assert (config.noises, config.picture_width) == (noises, width)
-        assert (config.loss, config.weight) == ("sds-base", "uniform")
-        assert config.accept and config.personalize is False and config.tone_operator == "linear"
+        assert (config.guidance.noises, config.optimize.picture_width) == (noises, width)
+        assert (config.guidance.loss, config.guidance.weight) == ("sds-base", "uniform")
+        assert (
+            config.guidance.accept
+            and config.adapter.personalize is False
+            and config.tone_operator == "linear"
+        )
         assert config.settled(not on_cuda) == config
-    assert InsertConfig(loss="dataset-update", steps=9).settled().accept is False
+    assert InsertConfig(loss="dataset-update", steps=9).settled().guidance.accept is False
     adapted = InsertConfig(lora="l.safetensors").settled()
-    assert adapted.personalize is True
+    assert adapted.adapter.personalize is True
     refined = InsertConfig(refine="tone", reuse="r", model="m", prompt="p").settled()
-    assert refined.step_count == 200 and not refined.accept
+    assert refined.optimize.step_count == 200 and not refined.guidance.accept
 
 
 @pytest.mark.parametrize(
@@ -169,7 +179,7 @@ def test_embedded_prior_is_asked_with_steps_alone(values: dict[str, Any], is_gui
     config = InsertConfig(**values)
     assert config.is_guided is is_guided
     if config.guided_by == "embedded":
-        assert (config.settled().steps > 0) is is_guided
+        assert (config.settled().optimize.steps > 0) is is_guided
 
 
 def forms_of_flags() -> list[tuple[str, str]]:
@@ -189,10 +199,10 @@ def test_every_value_has_a_rule() -> None:
     ruled = {*RANGES, *ABOVE_ZERO, *CHOICES, *PROMPTS}
     valued = {name for name, form in forms_of_flags() if form}
     assert valued == ruled | free and not ruled & free
-    defaults = InsertConfig()
+    defaults = InsertConfig().flat()
     for name, (low, high) in RANGES.items():
         # Just outside is refused and both ends are accepted.
-        kind = type(getattr(defaults, name) or low)
+        kind = type(defaults[name] or low)
         for value, accepted in ((low, True), (high, True), (low - 1, False)):
             if value is None or (value == 0 and name in ABOVE_ZERO):
                 continue
@@ -241,8 +251,8 @@ def test_values_are_kept_as_json_holds_them() -> None:
     values["photo"] = Path("a.png")
     config = InsertConfig(**values)
     assert config == InsertConfig(photo="a.png", fov=50.0, samples=8, place=(0.5, 2.0, 3.0))
-    told = json.loads(json.dumps(asdict(config)))
-    assert InsertConfig(**told) == config and isinstance(config.place, tuple)
+    told = json.loads(json.dumps(config.flat()))
+    assert InsertConfig(**told) == config and isinstance(config.placement.place, tuple)
     (error,) = problems_of(fov=np.float32("nan"))
     assert "finite" in error.what
     (error,) = problems_of(place=[None, 1.0, 2.0])
@@ -306,7 +316,7 @@ def test_only_a_light_that_is_given_is_turned(values: Any) -> None:
 )
 def test_command_reads_values(argv: list[str], name: str, value: object) -> None:
     """Flags arrive as their field's type, values with a leading minus too."""
-    assert getattr(parse([*NEEDED, *argv]).config, name) == value
+    assert parse([*NEEDED, *argv]).config.flat()[name] == value
 
 
 @pytest.mark.parametrize(
@@ -460,7 +470,7 @@ def test_command_names_what_is_needed(capsys: pytest.CaptureFixture[str]) -> Non
         "also: --out: needed",
     ]
     assert_fails(capsys, ["--demo"], 2, "--out: needed")
-    assert parse(["--demo", "--out", "o"]).config.demo
+    assert parse(["--demo", "--out", "o"]).config.inputs.demo
 
 
 YAML = """\
@@ -490,7 +500,7 @@ def test_config_file_gives_the_same_as_flags(tmp_path: Path) -> None:
     path.write_text(YAML)
     assert parse(["--config", str(path)]).config == expected
     other = tmp_path / "c.json"
-    other.write_text(json.dumps(asdict(expected)))
+    other.write_text(json.dumps(expected.flat()))
     assert parse(["--config", str(other)]).config == expected
 
 
@@ -501,9 +511,9 @@ def test_config_file_replays_a_run(tmp_path: Path) -> None:
         photo="p.png", asset="a.glb", out="o", sun=(10.0, 20.0), seed=7, lora_layers=("to_q",)
     )
     path = tmp_path / "run.json"
-    path.write_text(json.dumps({"format": RUN_FORMAT, "config": asdict(config), "seconds": {}}))
+    path.write_text(json.dumps({"format": RUN_FORMAT, "config": config.flat(), "seconds": {}}))
     assert parse(["--config", str(path)]).config == config
-    path.write_text(json.dumps({"format": RUN_FORMAT + 1, "config": asdict(config)}))
+    path.write_text(json.dumps({"format": RUN_FORMAT + 1, "config": config.flat()}))
     assert "format" in refused(["--config", str(path)]).what
 
 
@@ -519,7 +529,7 @@ def test_config_file_of_an_older_version_replays(tmp_path: Path) -> None:
     newer |= {f"max_{field.name}" for field in fields(Limits)} - {"max_pixels"}
     newer |= {"max_prompt_bytes"}
     config = InsertConfig(photo="p.png", asset="a.glb", out="o", sky="clear", depth=2)
-    known = {name: value for name, value in asdict(config).items() if name not in newer}
+    known = {name: value for name, value in config.flat().items() if name not in newer}
     path = tmp_path / "run.json"
     path.write_text(json.dumps({"format": 1, "warpir": "0.1.0", "config": known}))
     assert len(known) < 45 and parse(["--config", str(path)]).config == config
@@ -535,9 +545,9 @@ def test_config_file_opens_no_network_and_no_pickle(tmp_path: Path, name: str) -
         error = refused([*NEEDED, "--config", str(path)])
         assert error.where == str(path) and name in error.what and flag(name) in error.advice
         told = parse([*NEEDED, "--config", str(path), flag(name)])
-        assert getattr(told.config, name) is True
+        assert told.config.flat()[name] is True
     path.write_text(json.dumps({name: False}))
-    assert getattr(parse([*NEEDED, "--config", str(path)]).config, name) is False
+    assert parse([*NEEDED, "--config", str(path)]).config.flat()[name] is False
 
 
 @pytest.mark.case("F3")
@@ -546,7 +556,7 @@ def test_config_file_yields_to_flags(tmp_path: Path) -> None:
     path = tmp_path / "c.yaml"
     path.write_text(YAML)
     command = parse(["--config", str(path), "--samples", "8"])
-    assert command.config.samples == 8
+    assert command.config.render.samples == 8
     assert len(command.notices) == 1 and "--samples" in command.notices[0]
 
 
@@ -931,18 +941,18 @@ def test_demo_leaves_its_light_to_guidance() -> None:
     from warpir.demo import demo_config
 
     plain = demo_config(InsertConfig(demo=True, out="o", guidance="none"))
-    assert plain.light is not None and plain.exposure == 0.0
+    assert plain.light.file is not None and plain.light.exposure == 0.0
     guided = InsertConfig(
         demo=True, out="o", guidance="stable-diffusion", model="m", prompt="a car", tone="reinhard"
     )
-    assert demo_config(InsertConfig(demo=True, out="o")).light is None
+    assert demo_config(InsertConfig(demo=True, out="o")).light.file is None
     sunny = demo_config(InsertConfig(demo=True, out="o", sun=(10.0, 20.0)))
-    assert sunny.light is None and sunny.guided_by == "none"
+    assert sunny.light.file is None and sunny.guided_by == "none"
     recovered = demo_config(guided)
-    assert recovered.light is None and recovered.exposure is None and recovered.tone == "reinhard"
-    assert recovered.photo == plain.photo and recovered.place == plain.place
+    assert recovered.light == replace(plain.light, file=None, exposure=None, tone="reinhard")
+    assert recovered.inputs == plain.inputs and recovered.placement == plain.placement
     # Refinement changes the object under a light that is known.
-    assert demo_config(replace(guided, refine="material")).light == plain.light
+    assert demo_config(guided.changed(refine="material")).light.file == plain.light.file
 
 
 def test_paths_are_what_the_flags_say() -> None:

@@ -5,7 +5,6 @@ import json
 import os
 import shutil
 from collections.abc import Callable
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -155,7 +154,7 @@ def test_curves_and_tone_of_the_run_are_applied(
         np.testing.assert_array_equal(a, b)
     assert written.tone == "reinhard"
     with pytest.raises(InputError, match="--tone: cannot be reinhard"):
-        config = replace(parse(run.argv).config, reuse=str(first.out), tone="reinhard")
+        config = parse(run.argv).config.changed(reuse=str(first.out), tone="reinhard")
         make_light(read_inputs(config), config)
 
 

@@ -263,7 +263,7 @@ def test_a_killed_guided_scene_goes_on_from_its_checkpoint(memory: Path, hooked:
     from tests.builders.guided_runs import guided_argv, write_guided_inputs
 
     write_guided_inputs(memory)
-    asked = asdict(parse(guided_argv(memory)).config)
+    asked = parse(guided_argv(memory)).config.flat()
     row = {key: value for key, value in asked.items() if value != DEFAULTS[key] and key != "out"}
     manifest, out = write_manifest(memory, [{"name": "guided", **row}]), memory / "out"
     (hooked / "kill-guided").touch()
@@ -390,20 +390,28 @@ def test_rows_and_flags_become_configurations(tmp_path: Path) -> None:
     )  # fmt: skip
     first, second = (row.config for row in rows)
     assert first is not None and second is not None, [row.problem for row in rows]
-    assert (first.photo, first.asset) == (str(tmp_path / "sub/p.png"), "/abs/car.glb")
-    assert first.light == second.light or first.light == str(Path.cwd() / "noon.hdr")
-    assert (first.at, first.place) == ((3.0, 4.0), None)
-    assert first.out == str(tmp_path / "out" / "a")
-    assert second.asset == str(Path.cwd() / "car.glb") and second.place == (0.0, 0.0, -5.0)
-    assert second.light is None and second.sun == (10.0, 20.0) and second.camera_height == 2.0
-    assert second.model == "someone/some-model"
+    assert (first.inputs.photo, first.inputs.asset) == (str(tmp_path / "sub/p.png"), "/abs/car.glb")
+    assert first.light.file == second.light.file or first.light.file == str(Path.cwd() / "noon.hdr")
+    assert (first.placement.at, first.placement.place) == ((3.0, 4.0), None)
+    assert first.output.out == str(tmp_path / "out" / "a")
+    assert second.inputs.asset == str(Path.cwd() / "car.glb") and second.placement.place == (
+        0.0,
+        0.0,
+        -5.0,
+    )
+    assert (
+        second.light.file is None
+        and second.light.sun == (10.0, 20.0)
+        and second.camera.height == 2.0
+    )
+    assert second.diffusion.model == "someone/some-model"
 
 
 def test_a_name_longer_than_a_file_can_have_is_its_scenes_alone(tmp_path: Path) -> None:
     """No folder has it; the model's reader says so."""
     long = {"name": "a", "demo": True, "model": "m" * 300, "prompt": "a car"}
     first, second = read(write_manifest(tmp_path, [long, {"name": "b", "demo": True}]))
-    assert first.config is not None and first.config.model == "m" * 300
+    assert first.config is not None and first.config.diffusion.model == "m" * 300
     assert second.config is not None
 
 
@@ -634,7 +642,7 @@ def on_devices(made: batch._Batch, *devices: str | None) -> None:
     """Let scenes name their devices."""
     for scene, device in zip(made.scenes, devices, strict=True):
         assert scene.row.config is not None
-        scene.row = replace(scene.row, config=replace(scene.row.config, device=device))
+        scene.row = replace(scene.row, config=scene.row.config.changed(device=device))
 
 
 class Devices(Scripted):
@@ -756,7 +764,7 @@ def test_workers_by_cores_memory_and_devices(
     assert made._task(INSERT, 0).config["threads"] == 2
     for scene in made.scenes:
         assert scene.row.config is not None
-        scene.row = replace(scene.row, config=replace(scene.row.config, device=None))
+        scene.row = replace(scene.row, config=scene.row.config.changed(device=None))
     made.options = options_of(tmp_path)
     assert counts(free_host=lambda: 100 << 30) == (2, 4)
     assert [e["CUDA_VISIBLE_DEVICES"] for e in found[-1]] == ["0", "1"]

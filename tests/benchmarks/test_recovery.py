@@ -30,7 +30,7 @@ from benchmarks.recovery import (
 from benchmarks.speed.scenes import uv_ball
 from tests import oracles as o
 from tests.builders.shapes import box
-from warpir.app.optimize_settings import OptimizeSettings
+from warpir.app.settings import OptimizeSettings
 from warpir.core.arrays import FloatArray
 from warpir.io.images.photos import read_envmap
 from warpir.optimize.light import LightOptimization

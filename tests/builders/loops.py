@@ -9,7 +9,7 @@ from torch import Tensor
 
 from tests import oracles as o
 from tests.builders.shapes import camera, ground, placed, sphere
-from warpir.app.optimize_settings import OptimizeSettings
+from warpir.app.settings import OptimizeSettings
 from warpir.lighting.sg_light import LightBounds, SGLight, narrowest
 from warpir.optimize.light import LightOptimization, Unknowns
 from warpir.optimize.loop import Guide

@@ -84,5 +84,5 @@ def test_written_files_are_what_the_command_reads(tmp_path: Path) -> None:
     assert json.loads((out / "light.json").read_text()) == light
     argv = ["--photo", str(out / "photo.png"), "--asset", "a.glb", "--out", "o"]
     config = parse([*argv, "--config", str(out / "light.json")]).config
-    assert config.light == light["light"]
-    assert (config.exposure, config.tone) == (light["exposure"], "linear")
+    assert config.light.file == light["light"]
+    assert (config.light.exposure, config.light.tone) == (light["exposure"], "linear")

@@ -128,22 +128,24 @@ def test_demo_config_names_files_that_exist() -> None:
     plain = demo.demo_config(InsertConfig(demo=True, out="unused"))
     lit = demo.demo_config(InsertConfig(demo=True, out="unused", guidance="none"))
     for config in (plain, lit):
-        for name in (config.photo, config.asset, config.camera):
+        for name in (config.inputs.photo, config.inputs.asset, config.camera.file):
             assert name is not None and Path(name).is_file()
-    assert plain.light is None and plain.exposure is None
-    assert lit.light is not None and Path(lit.light).is_file()
-    assert (lit.exposure, lit.tone) == (0.0, "linear")
+    assert plain.light.file is None and plain.light.exposure is None
+    assert lit.light.file is not None and Path(lit.light.file).is_file()
+    assert (lit.light.exposure, lit.light.tone) == (0.0, "linear")
 
 
 def test_demo_config_keeps_what_the_user_named() -> None:
     """A place, a pixel, a turn; and exposure and tone under its own light."""
     where = placement()
     named = demo.demo_config(InsertConfig(demo=True, place=(1.0, 0.0, -9.0), rotate_y=20.0))
-    assert (named.place, named.rotate_y) == ((1.0, 0.0, -9.0), 20.0)
+    assert (named.placement.place, named.placement.rotate_y) == ((1.0, 0.0, -9.0), 20.0)
     pixel = demo.demo_config(InsertConfig(demo=True, at=(600.0, 700.0)))
-    assert (pixel.place, pixel.at, pixel.rotate_y) == (None, (600.0, 700.0), where.rotate_y)
+    stands = pixel.placement
+    assert (stands.place, stands.at, stands.rotate_y) == (None, (600.0, 700.0), where.rotate_y)
     lit = InsertConfig(demo=True, guidance="none", exposure=1.0, tone="reinhard")
-    assert (demo.demo_config(lit).exposure, demo.demo_config(lit).tone) == (1.0, "reinhard")
+    light = demo.demo_config(lit).light
+    assert (light.exposure, light.tone) == (1.0, "reinhard")
 
 
 def test_shipped_regressor_sees_the_sun_of_the_demo() -> None:

@@ -4,7 +4,6 @@ import hashlib
 import json
 import subprocess
 import sys
-from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -562,7 +561,7 @@ def test_demo_runs_small(tmp_path: Path, device: str) -> None:
     # The light is read off the photo, by what is in the package.
     assert "regression" in demo.record["measured"] and "light" not in demo.record["inputs"]
     assert (out / "progress" / "preview-000000.png").is_file()
-    checked = do_task(Task(CHECK, asdict(parse(argv).config)))
+    checked = do_task(Task(CHECK, parse(argv).config.flat()))
     assert checked.found == {"is_done": True}, "a batch knows it by the files of the package"
 
 

@@ -99,7 +99,7 @@ def inputs_of(folder: Path, **changes: object) -> Inputs:
             photo=str(folder / "photo.png"),
             asset=str(folder / "box.glb"),
             out=str(folder / "unused"),
-            **{**fields, **changes},  # type: ignore[arg-type]
+            **{**fields, **changes},
         )
     )
 

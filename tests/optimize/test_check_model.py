@@ -16,6 +16,7 @@ from warpir.app.config import InsertConfig
 from warpir.check_model import main
 from warpir.core.errors import ExitCode
 from warpir.diffusion.network_prior import LEAST_COSINE
+from warpir.diffusion.settings import ModelSettings
 from warpir.diffusion.stable_diffusion import (
     CHECK_TIMES,
     StableDiffusion,
@@ -85,7 +86,7 @@ def test_a_perfect_denoiser_is_seen_through_the_real_measurement(
 ) -> None:
     """One that knows the photo makes no error; its LoRA, which it ignores, learns nothing."""
     config = InsertConfig(model=str(folder / "epsilon"))
-    prior = load_stable_diffusion(config, "cpu")
+    prior = load_stable_diffusion(config.diffusion, "cpu")
     photo = torch.rand(64, 96, 3, generator=torch.Generator().manual_seed(3))
     with torch.no_grad():
         clean = prior.encode(photo[:, 16:80].permute(2, 0, 1)[None].contiguous())
@@ -107,7 +108,7 @@ def test_a_perfect_denoiser_is_seen_through_the_real_measurement(
 @pytest.mark.parametrize("kind", ["epsilon", "v_prediction", "sample"])
 def test_saying_nothing_has_the_error_of_its_prediction_type(folder: Path, kind: str) -> None:
     """Expected of noise: 1; ``a^4 + a^2 s^2 |z|^2``; ``a^2 |z|^2 / s^2``."""
-    prior = load_stable_diffusion(InsertConfig(model=str(folder / kind)), "cpu")
+    prior = load_stable_diffusion(ModelSettings(model=str(folder / kind)), "cpu")
     square = torch.rand(1, 3, 64, 64, generator=torch.Generator().manual_seed(1))
     a2 = float(prior.schedule.alphas_cumprod[500])
     z2 = float(prior.encode(square).detach().square().mean())

@@ -301,7 +301,7 @@ def test_prior_sees_the_object_as_in_its_training(folder: Path, tmp_path: Path) 
 
     A box seen from the front and from above, by a camera that looks down by 30 degrees.
     """
-    config = replace(config_of(folder), pitch=-30.0, camera_height=3.0)
+    config = config_of(folder).changed(pitch=-30.0, camera_height=3.0)
     run = made_run(config, tmp_path)
     frame = recover.make_frame(run)
     gbuffer = recover.gbuffer_of(frame)

@@ -21,7 +21,7 @@ from tests.builders.tiny_stable_diffusion import make_tiny_stable_diffusion
 from tests.conftest import devices
 from tests.statistics import compare_gradients
 from warpir.app.config import REFINE_PARTS, InsertConfig
-from warpir.app.optimize_settings import OptimizeSettings
+from warpir.app.settings import OptimizeSettings
 from warpir.core.errors import ExitCode, InputError
 from warpir.insert import main
 from warpir.io.images.photos import Photo
@@ -520,10 +520,16 @@ def test_what_moves_and_what_does_not() -> None:
 
 def test_each_kind_has_its_own_number_of_steps() -> None:
     """--steps where it is given, 600 too; else the kind's own."""
-    steps = [refining(kind).settled().step_count for kind in ("material", "emission", "tone")]
+    steps = [
+        refining(kind).settled().optimize.step_count for kind in ("material", "emission", "tone")
+    ]
     assert steps == [300, 300, 200]
-    assert refining("tone", steps=600).settled().step_count == 600
-    assert InsertConfig(model="m").settled().step_count == OptimizeSettings().step_count == 600
+    assert refining("tone", steps=600).settled().optimize.step_count == 600
+    assert (
+        InsertConfig(model="m").settled().optimize.step_count
+        == OptimizeSettings().step_count
+        == 600
+    )
 
 
 def test_materials_survive_the_file(tmp_path: Path) -> None:

@@ -10,7 +10,7 @@ import sys
 import time
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from itertools import combinations
 from pathlib import Path
 from typing import Any
@@ -190,7 +190,7 @@ def test_start_shows_what_insert_would_refuse(inputs: Path, tmp_path: Path) -> N
         if pitch < 30.0:
             assert placement_files(session, said)
     with pytest.raises(InputError, match="camera is inside"):
-        open_session(replace(config, pitch=0.0, place=(0.0, 0.0, -5.0)))
+        open_session(config.changed(pitch=0.0, place=(0.0, 0.0, -5.0)))
 
 
 # ---------------------------------------------------------------------------- what the page gets
@@ -425,8 +425,12 @@ def test_demo_starts_where_the_user_says(tmp_path: Path) -> None:
     from warpir.place.command import _with_inputs
 
     config = _with_inputs(InsertConfig(demo=True, at=(600.0, 700.0), rotate_y=10.0, out="mine"))
-    assert (config.at, config.place, config.rotate_y) == ((600.0, 700.0), None, 10.0)
-    assert config.out == "mine"
+    assert (config.placement.at, config.placement.place, config.placement.rotate_y) == (
+        (600.0, 700.0),
+        None,
+        10.0,
+    )
+    assert config.output.out == "mine"
 
 
 def test_place_loads_neither_torch_nor_warp() -> None:

@@ -676,5 +676,5 @@ def contrast(one: str, other: str) -> float:
 def test_config_of_a_record_is_the_runs(run: Run) -> None:
     """Read back from JSON, lists and all."""
     config = report.config_of(run.record)
-    assert isinstance(config, InsertConfig) and config.place == (0.0, 0.0, -5.0)
-    assert config.samples == 4
+    assert isinstance(config, InsertConfig) and config.placement.place == (0.0, 0.0, -5.0)
+    assert config.render.samples == 4

@@ -214,7 +214,7 @@ def test_no_ground_is_refused(seed: int) -> None:
 
 
 def config(**values: object) -> InsertConfig:
-    return InsertConfig(camera="c", photo="p", asset="a", out="o", **values)  # type: ignore[arg-type]
+    return InsertConfig(camera="c", photo="p", asset="a", out="o", **values)
 
 
 def test_points_turn_with_the_camera_file_s_world(rng: np.random.Generator) -> None:
@@ -344,7 +344,7 @@ def scene(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def asked(scene: Path, **values: object) -> InsertConfig:
     paths = {"photo": "photo.png", "asset": "box.glb", "camera": "sparse", "out": "out"}
     given = {name: str(scene / path) for name, path in paths.items()} | {"sky": "clear"}
-    return InsertConfig(**(given | values))  # type: ignore[arg-type]
+    return InsertConfig(**(given | values))
 
 
 def test_colmap_scene_is_set_up_from_its_files(scene: Path) -> None:
@@ -367,7 +367,7 @@ def test_colmap_scene_is_set_up_from_its_files(scene: Path) -> None:
     assert {"camera/cameras.txt", "camera/images.txt", "ground_points/points3D.bin"} < set(
         inputs.hashes
     )
-    warned = read_inputs(replace(config, at=(46.0, 31.0), size=3.0))
+    warned = read_inputs(config.changed(at=(46.0, 31.0), size=3.0))
     assert any("points of --ground-points stand where" in line for line in warned.notices)
 
 
@@ -386,7 +386,7 @@ def test_colmap_scene_needs_its_flags(scene: Path) -> None:
     np.testing.assert_array_equal(inputs.camera.c2w[:3, :3], np.eye(3))
     assert "ground_fit" not in inputs.measured
     with pytest.raises(InputError, match="holds the input"):
-        read_inputs(replace(told, out=str(scene / "sparse")))
+        read_inputs(told.changed(out=str(scene / "sparse")))
 
 
 @pytest.mark.case("C2")

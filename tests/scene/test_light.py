@@ -458,7 +458,7 @@ def inputs_for(level: float | FloatArray, light: Light | None = None) -> Inputs:
 
 def config_for(tone: str = "reinhard", **values: object) -> InsertConfig:
     """A configuration that names its files but reads none."""
-    return InsertConfig(photo="p", asset="a", out="o", tone=tone, **values)  # type: ignore[arg-type]
+    return InsertConfig(photo="p", asset="a", out="o", tone=tone, **values)
 
 
 def ground_level(light: Light, albedo: float) -> float:

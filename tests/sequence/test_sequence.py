@@ -4,7 +4,6 @@ import hashlib
 import json
 import shutil
 from collections.abc import Sequence
-from dataclasses import asdict
 from pathlib import Path
 from typing import Any, NoReturn
 
@@ -251,7 +250,7 @@ def test_batch_looks_at_all_that_a_sequence_takes(
     def check(out: Path, *lines: dict[str, Any]) -> Answer:
         listed = write_lines(tmp_path / "s.jsonl", lines, inputs)
         config = parse(argv_of(inputs, first, listed, out)).config
-        return do_task(Task(CHECK, asdict(config)))
+        return do_task(Task(CHECK, config.flat()))
 
     whole, one, two = (
         check(tmp_path / "none", *FRAMES),
@@ -324,11 +323,15 @@ def test_line_replaces_what_excludes_it(inputs: Path, first: Run, tmp_path: Path
     lines = write_lines(tmp_path / "s.jsonl", changes, inputs)
     argv = argv_of(inputs, first, lines, tmp_path / "out", scale="2")
     configs = [frame.config for frame in read_sequence(parse(argv).config, Loaders())]
-    assert configs[0].place is None and configs[0].scale == 2.0
-    gone = [configs[1].fov, configs[1].pitch, configs[1].camera_height]
-    assert gone == [None] * 3 and configs[1].place == (0.0, 0.0, -5.0)
-    assert configs[2].pitch is None and configs[2].fov == 60.0
-    assert configs[3].fov == 50.0 and configs[3].pitch == -15.0 and configs[3].scale is None
+    assert configs[0].placement.place is None and configs[0].placement.scale == 2.0
+    gone = [configs[1].camera.fov, configs[1].camera.pitch, configs[1].camera.height]
+    assert gone == [None] * 3 and configs[1].placement.place == (0.0, 0.0, -5.0)
+    assert configs[2].camera.pitch is None and configs[2].camera.fov == 60.0
+    assert (
+        configs[3].camera.fov == 50.0
+        and configs[3].camera.pitch == -15.0
+        and configs[3].placement.scale is None
+    )
     inside = [pair for pair in EXCLUSIVE if set(pair) <= set(FRAME_FIELDS)]
     assert len(inside) == 8
 

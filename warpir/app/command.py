@@ -16,10 +16,20 @@ import types
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, NoReturn, Union, get_args, get_origin, get_type_hints
+from typing import Any, NoReturn, Union, get_args, get_origin
 
 import warpir
-from warpir.app.config import CPU_DEFAULTS, DEFAULTS, PRIOR_DEFAULTS, InsertConfig, flag, usage
+from warpir.app.config import (
+    CPU_DEFAULTS,
+    DEFAULTS,
+    OPTIONS,
+    PARTS,
+    PRIOR_DEFAULTS,
+    InsertConfig,
+    flag,
+    kinds,
+    usage,
+)
 from warpir.app.record import RUN_FORMAT
 from warpir.core.errors import LISTED, SHOWN, ExitCode, InputError, raise_all, shown
 from warpir.core.limits import Limits
@@ -301,7 +311,7 @@ def read_values(given: Mapping[str, tuple[Any, str]]) -> dict[str, Any]:
     Raises:
         InputError: A value cannot be read as its field's type (`ExitCode.USAGE`).
     """
-    hints = get_type_hints(InsertConfig)
+    hints = kinds()
     values, problems = {}, []
     for name, (value, where) in given.items():
         try:
@@ -502,15 +512,19 @@ def _words(value: object) -> str:
 
 
 def _field_docs() -> dict[str, str]:
-    """Read the line below each field of `InsertConfig` and its base classes from their sources."""
+    """Read the line below each field of the parts and their base classes from their sources."""
+    names = {(option.part, option.field.name): name for name, option in OPTIONS.items()}
     docs = {}
-    for settings in (*InsertConfig.__mro__[:-1], GuidanceSettings):
+    # `GuidanceChoices` has its help at `GuidanceSettings`.
+    sources = [(name, base) for name, part in PARTS.items() for base in part.__mro__[:-1]]
+    for part, settings in (*sources, ("guidance", GuidanceSettings)):
         body = ast.parse(inspect.getsource(settings)).body[0]
         assert isinstance(body, ast.ClassDef)
         for field, below in zip(body.body, body.body[1:], strict=False):
             if isinstance(field, ast.AnnAssign) and isinstance(below, ast.Expr):
                 assert isinstance(field.target, ast.Name) and isinstance(below.value, ast.Constant)
-                docs[field.target.id] = inspect.cleandoc(str(below.value.value)).replace("\n", " ")
+                text = inspect.cleandoc(str(below.value.value)).replace("\n", " ")
+                docs[names[part, field.target.id]] = text
     return docs
 
 

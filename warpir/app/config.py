@@ -9,16 +9,26 @@ import math
 import os
 import re
 from collections.abc import Container, Iterator, Mapping
-from dataclasses import dataclass, fields, replace
+from dataclasses import Field, dataclass, fields
 from functools import cache
 from numbers import Integral, Real
 from os import PathLike
 from types import UnionType
 from typing import Any, get_args, get_origin, get_type_hints
 
-from warpir.app.optimize_settings import OptimizeSettings
+from warpir.app.settings import (
+    CameraConfig,
+    GuidanceConfig,
+    InputConfig,
+    LightConfig,
+    OptimizeSettings,
+    OutputConfig,
+    PlacementConfig,
+    RenderConfig,
+    TaskConfig,
+)
 from warpir.core.errors import ExitCode, InputError, raise_all
-from warpir.core.limits import LIMITS, Limits
+from warpir.core.limits import Limits
 from warpir.diffusion.prompts import make_prompts
 from warpir.diffusion.settings import (
     GuidanceChoices,
@@ -94,252 +104,81 @@ CPU_DEFAULTS: dict[str, dict[str, Any]] = {
 """What it stands for on the CPU, where that differs."""
 
 
-@dataclass(frozen=True)
-class InsertConfig(ModelSettings, PersonalizeSettings, GuidanceChoices, OptimizeSettings):
-    """One insertion. Checked for ranges and finiteness when made; files are checked later.
+@dataclass(frozen=True, init=False)
+class InsertConfig:
+    """One insertion: a part for each stage. Files are checked later.
+
+    It is made by the names of the command line, ``InsertConfig(photo="a.jpg", camera_height=1.6)``;
+    each part is an attribute, ``config.camera.height``.
 
     Raises:
         InputError: A value is out of range, or two values exclude each other
             (`ExitCode.USAGE`; further problems are in ``also``).
+        TypeError: A name is unknown.
     """
 
-    photo: str | None = None
-    """The photograph: JPEG, PNG, TIFF, WebP, EXR or Radiance HDR"""
-    layer: str | None = None
-    """Layer of an EXR photo that is used, such as beauty for beauty.R, beauty.G and beauty.B
-    (default: its R, G and B)"""
-    occluder_mask: str | None = None
-    """Grey image of the upright photo's size: white where the photo stays in front of the object"""
-    asset: str | None = None
-    """The object: .glb, .gltf, .obj, .ply or .stl"""
-    out: str | None = None
-    """Folder for everything that is written"""
-    overwrite: bool = False
-    """Replace results that are already in --out"""
-    asset_up: str | None = None
-    """Which axis of the asset points up (default: +y, as glTF demands; other tools' OBJ, PLY and
-    STL are often +z)"""
-    materials: str | None = None
-    """materials.json of a run with --refine: factors for the materials of --asset"""
-    demo: bool = False
-    """Use the scene that ships with warpir in place of --photo and --asset"""
+    inputs: InputConfig
+    camera: CameraConfig
+    placement: PlacementConfig
+    light: LightConfig
+    render: RenderConfig
+    guidance: GuidanceConfig
+    diffusion: ModelSettings
+    adapter: PersonalizeSettings
+    optimize: OptimizeSettings
+    task: TaskConfig
+    output: OutputConfig
+    limits: Limits
 
-    camera: str | None = None
-    """Camera of the photo: warpir's JSON, .fspy or fSpy's JSON, a COLMAP model's folder, the
-    transforms.json of nerfstudio, Waymo's calibration, glTF or EXR (default: the photo's EXIF)"""
-    frame: str | None = None
-    """Which image or camera of the camera file is meant (default: the one named as the photo)"""
-    undistort: bool = False
-    """Undo the lens distortion that the camera file states; the composite is of the straight
-    photo"""
-    fov: float | None = None
-    """Horizontal field of view of the photo [deg]"""
-    pitch: float | None = None
-    """How far the camera looks up, negative for down [deg]"""
-    horizon: float | None = None
-    """Row of the horizon in the photo's middle column, from the top [px], or its share of the
-    height when between 0 and 1; in place of --pitch"""
-    camera_height: float | None = None
-    """Height of the camera above the ground [m]"""
-    up: str | None = None
-    """Which axis of the camera file's world points up"""
-    ground: tuple[float, float, float, float] | None = None
-    """Ground plane a x + b y + c z + d = 0 in world coordinates [1, 1, 1, m] (default: y = 0)"""
-    ground_points: str | None = None
-    """Points of the scene in the camera file's world (.ply, text, COLMAP model): the ground is a
-    plane fitted to them, and without --at and --place the object stands where it is free"""
-    proxy: str | None = None
-    """Mesh of the place in world coordinates [m], +Y up: .glb, .gltf, .obj, .ply or .stl. It
-    receives shadows beside the ground plane, hides the object and stands in the light's way"""
-    plane: bool = True
-    """The ground plane beside the mesh of --proxy"""
-    shadow_mask: str | None = None
-    """Grey image of the photo's size, white where its ground is in shadow already: the sun and
-    other lamps are not taken away there once more"""
-
-    place: tuple[float, float, float] | None = None
-    """Where the object stands, world coordinates [m]; moved onto the ground along its normal (not
-    with --no-plane)"""
-    at: tuple[float, float] | None = None
-    """Where the object stands, as a pixel of the ground or of --proxy in the upright photo [px]"""
-    rotate_y: float = 0.0
-    """Turn of the object about the ground's normal, counter-clockwise seen from above [deg]"""
-    scale: float | None = None
-    """Factor on the asset's own size [1]"""
-    size: float | None = None
-    """Longest side of the asset's bounding box after scaling [m]"""
-
-    light: str | None = None
-    """The light: a panorama (.hdr, .exr, or a picture without a sun's strength) or lobes (.json)"""
-    light_convention: str = "openexr"
-    """Who made the panorama, which tells where its seam lies: openexr (also OpenUSD and Mitsuba),
-    nvdiffrec, threejs, blender, or diffusionlight, whose maps turn with the camera"""
-    light_rotate: float = 0.0
-    """Turn of the light about +Y, counter-clockwise seen from above [deg]"""
-    fit_lobes: int | None = None
-    """Replace the panorama by this many spherical-Gaussian lobes fitted to it"""
-    sun: tuple[float, float] | tuple[float, float, float] | None = None
-    """A sun: azimuth clockwise from -Z seen from above [deg], elevation [deg], irradiance it
-    gives a surface that faces it, relative [W/m^2]"""
-    sky: str | tuple[float, float, float] | None = None
-    """A sky: clear, overcast or sunset, or its linear radiance R,G,B, relative [W/(m^2 sr)]"""
-    exposure: float | None = None
-    """Factor on the light, in stops [EV] (default: chosen from the photo)"""
-
-    tone: str | None = None
-    """How the object's radiance becomes display values: linear (clipped, as the photo was), or
-    reinhard (x / (1 + x), paler, nothing clips)"""
-    ground_albedo: float = 0.25
-    """Reflectance assumed of the ground, for the automatic exposure [1]"""
-
-    samples: int = 64
-    """Samples per pixel"""
-    rays: int = 1
-    """Rays per sample of each sampling strategy, light and surface"""
-    depth: int = 5
-    """Longest light path, in surface hits"""
-    indirect_limit: float = 8.0
-    """Most radiance that one light path may add after its first bounce; 0: no limit (the limit
-    removes bright specks where a mirror throws sunlight onto the object)"""
-    width: int | None = None
-    """Width at which the object is rendered [px] (default: the photo's)"""
-    device: str | None = None
-    """cpu, cuda or cuda:N (default: cuda where there is one, else cpu)"""
-    threads: int | None = None
-    """CPU threads (default: one per core)"""
-    seed: int = 0
-    """Seed of all random numbers"""
-    deterministic: bool = False
-    """Repeat the same bytes on a GPU too, slower; on the CPU every run does"""
-
-    alpha: str = "refuse"
-    """What to do with a photo that has transparency: refuse or ignore"""
-    max_pixels: int = LIMITS.pixels
-    """Largest photo or mask that is opened [px]"""
-    max_envmap_width: int = LIMITS.envmap_width
-    """Widest panorama that is opened [px]"""
-    strict: bool = False
-    """Refuse a photo or panorama with values that are not finite, or a light with negative ones,
-    in place of repairing them"""
-    max_file_bytes: int = LIMITS.file_bytes
-    """Largest mesh, texture, point cloud or file of a COLMAP model that is read [byte]"""
-    max_triangles: int = LIMITS.triangles
-    """Largest asset or proxy that is read, instances counted [triangles]"""
-    max_texture_pixels: int = LIMITS.texture_pixels
-    """Most pixels of all textures of the asset together [px]"""
-    max_nodes: int = LIMITS.nodes
-    """Most nodes of a glTF file"""
-    max_instances: int = LIMITS.instances
-    """Most meshes that a glTF file places, each instance counted"""
-    max_points: int = LIMITS.points
-    """Most points of --ground-points"""
-    max_json_bytes: int = LIMITS.json_bytes
-    """Largest JSON file: configuration, camera, lobes, materials, sequence [byte]; of YAML, which
-    takes longer to read, a 256th"""
-    max_gltf_json_bytes: int = LIMITS.gltf_json_bytes
-    """Largest JSON of a glTF file [byte]"""
-    max_json_values: int = LIMITS.json_values
-    """Most values in a JSON file, lists and objects counted"""
-    max_nesting: int = LIMITS.nesting
-    """Most levels of lists and objects within each other in JSON and YAML"""
-    max_prompt_bytes: int = 4096
-    """Longest prompt [byte]"""
-    missing_textures: str = "error"
-    """What to do when a texture of the asset is missing: error, or grey in its place"""
-    detail: bool = True
-    """Let the object reflect what the photo shows of its surroundings, where the light has no
-    panorama's detail of its own"""
-    mark: bool = True
-    """Note in the picture's metadata that it is a composite"""
-    hand_off: bool = True
-    """Write the files for Blender, three.js and colour tools as well"""
-    report: bool = True
-    """Write report.html, a page that shows the result, the light and all figures"""
-    mitsuba: bool = False
-    """Write the insertion as a scene of Mitsuba 3 as well, into a folder of its own"""
-
-    guidance: str | None = None
-    """What recovers the light from the photo: embedded, what comes with warpir: the light that a
-    regressor sees in the photo, which with --steps 60 a small prior refines (experimental: it
-    failed its release gate); stable-diffusion; or none, and the light is used as given, or else as
-    the regressor sees it (default: stable-diffusion with --model, none where a light is given, else
-    embedded)"""
-    prompt: str | None = None
-    """What the object is, in a few words, such as 'a black SUV car' (stable-diffusion needs it)"""
-    prior: str | None = None
-    """Weights of the prior of --guidance embedded, which --steps asks (default: those in the
-    package)"""
-    regressor: str | None = None
-    """Weights of the regressor (default: those that come with warpir)"""
-    start: str | None = None
-    """Where the recovery begins when no light is given: regressed, as the regressor sees it in the
-    photo, or uniform, an even light (default: regressed)"""
-    accept: bool | None = None
-    """Keep the start of the recovery unless guidance, asked anew, clearly prefers its end"""
-    show_prior: tuple[str, ...] | None = None
-    """Prompts, separated by |, for pictures of what the model imagines, before and after it was
-    adapted to the photo"""
-    preview_every: int | None = None
-    """Steps between two preview pictures of the optimisation, the first of which is the start;
-    0: none"""
-    checkpoint_every: int = 50
-    """Steps between two checkpoints of the optimisation; 0: none"""
-    resume: bool = False
-    """Go on from the last checkpoint in --out"""
-
-    reuse: str | None = None
-    """Folder of an earlier run: its light and its tone curves are used, and nothing is optimised"""
-    sequence: str | None = None
-    """JSON lines, each a frame: what differs from the command line, such as {"photo": "2.png",
-    "place": [0, 0, -4]}; needs --reuse"""
-    fps: float = 24.0
-    """Frames per second of the video of --sequence, which is made where ffmpeg is found"""
-    refine: str | None = None
-    """What is changed by the prompt under a known light (--reuse, --light, --sun or --sky):
-    material, emission or tone"""
-    refine_parts: tuple[str, ...] | None = None
-    """What --refine material changes: base-color, metallic, roughness (default: all of them)"""
-    refine_materials: tuple[str, ...] | None = None
-    """Names of the asset's materials that --refine changes (default: all of them)"""
-
-    def __post_init__(self) -> None:
+    def __init__(self, **values: Any) -> None:
         """Check everything that can be checked without opening a file."""
-        for field in fields(self):
+        parts: dict[str, dict[str, Any]] = {part.name: {} for part in fields(InsertConfig)}
+        for name, value in values.items():
+            if name not in OPTIONS:
+                raise TypeError(f"InsertConfig has no value {name!r}")
+            parts[OPTIONS[name].part][OPTIONS[name].field.name] = _plain(value)
+        for name, given in parts.items():
             # Frozen for everybody else.
-            object.__setattr__(self, field.name, _plain(getattr(self, field.name)))
+            object.__setattr__(self, name, PARTS[name](**given))
         raise_all([*_values_out_of_range(self), *_values_that_clash(self)])
 
-    @property
-    def limits(self) -> Limits:
-        """What each input may cost."""
-        return Limits(**{f.name: getattr(self, f"max_{f.name}") for f in fields(Limits)})
+    def flat(self) -> dict[str, Any]:
+        """Return all values by the names that the command line and ``run.json`` use."""
+        return {
+            name: getattr(getattr(self, option.part), option.field.name)
+            for name, option in OPTIONS.items()
+        }
+
+    def changed(self, **values: Any) -> "InsertConfig":
+        """Return the same with other values, by the names that `InsertConfig` takes."""
+        return InsertConfig(**{**self.flat(), **values})
 
     @property
     def guided_by(self) -> str:
         """``guidance``, or what stands for it: embedded, stable-diffusion or none."""
-        if self.guidance is not None:
-            return self.guidance
-        if self.model is not None:
+        if self.guidance.kind is not None:
+            return self.guidance.kind
+        if self.diffusion.model is not None:
             return "stable-diffusion"
-        is_lit = any(getattr(self, name) is not None for name in LIGHTS)
+        is_lit = self.light.reuse is not None or self.is_light_described
         return "none" if is_lit else "embedded"
 
     @property
     def is_light_described(self) -> bool:
         """Whether the user said anything about the light."""
-        return any(v is not None for v in (self.light, self.sun, self.sky))
+        return any(v is not None for v in (self.light.file, self.light.sun, self.light.sky))
 
     @property
     def is_guided(self) -> bool:
         """Whether a prior is asked: the embedded one is where `steps` says how often."""
         return self.guided_by == "stable-diffusion" or (
-            self.guided_by == "embedded" and bool(self.steps)
+            self.guided_by == "embedded" and bool(self.optimize.steps)
         )
 
     @property
     def tone_operator(self) -> str:
         """`tone`, or what stands for it; a light far from its start wants one that never clips."""
-        return self.tone or PRIOR_DEFAULTS.get(self.guided_by, {"tone": "linear"})["tone"]
+        return self.light.tone or PRIOR_DEFAULTS.get(self.guided_by, {"tone": "linear"})["tone"]
 
     def settled(self, on_cuda: bool = True) -> "InsertConfig":
         """Return the same with nothing left open to the prior; without one, as Stable Diffusion's.
@@ -347,11 +186,12 @@ class InsertConfig(ModelSettings, PersonalizeSettings, GuidanceChoices, Optimize
         Args:
             on_cuda: Whether it runs on a CUDA device.
         """
-        return replace(self, **_open_values(self, on_cuda))
+        return self.changed(**_open_values(self, on_cuda))
 
     def guidance_settings(self) -> GuidanceSettings:
         """Return what guidance is asked to do; nothing may be open (`settled`)."""
-        return GuidanceSettings(**{f.name: getattr(self, f.name) for f in fields(GuidanceSettings)})
+        names = (field.name for field in fields(GuidanceSettings))
+        return GuidanceSettings(**{name: getattr(self.guidance, name) for name in names})
 
     def require_inputs(self) -> None:
         """Check that what every run needs is named.
@@ -362,36 +202,61 @@ class InsertConfig(ModelSettings, PersonalizeSettings, GuidanceChoices, Optimize
             InputError: A needed value is absent (`ExitCode.USAGE`).
         """
         # The lines of a sequence may name photos and assets; each frame is checked by itself.
-        needed = {} if self.demo or self.sequence else dict.fromkeys(("photo", "asset"), DEMO_HINT)
+        is_whole = self.inputs.demo or self.task.sequence
+        needed = {} if is_whole else dict.fromkeys(("photo", "asset"), DEMO_HINT)
         needed["out"] = ""
         if self.guided_by == "stable-diffusion":
             needed["model"] = "--guidance stable-diffusion needs a folder or a hub id"
             needed["prompt"] = "say in a few words what the object is"
-        raise_all(
-            [
-                usage(flag(name), "needed", advice)
-                for name, advice in needed.items()
-                if getattr(self, name) is None
-            ]
-        )
+        values = self.flat()
+        missing = {name: advice for name, advice in needed.items() if values[name] is None}
+        raise_all([usage(flag(name), "needed", advice) for name, advice in missing.items()])
+
+
+@dataclass(frozen=True)
+class Option:
+    """Where one value of a configuration stands."""
+
+    part: str
+    """Attribute of `InsertConfig`."""
+    field: Field[Any]
+    """Field of that part."""
+
+
+def _options() -> dict[str, Option]:
+    found = {}
+    for name, part in PARTS.items():
+        for field in fields(part):
+            own = f"max_{field.name}" if name == "limits" else field.name
+            found[field.metadata.get("name", own)] = Option(name, field)
+    return found
+
+
+PARTS: dict[str, Any] = {part.name: part.type for part in fields(InsertConfig)}
+"""The parts' classes by their names."""
+OPTIONS = _options()
+"""Every value by the name that the command line, files and ``run.json`` give it."""
+DEFAULTS = {name: option.field.default for name, option in OPTIONS.items()}
+"""What a value is when nobody names it."""
 
 
 def _open_values(config: InsertConfig, on_cuda: bool = True) -> dict[str, Any]:
     """Return what stands for the fields that are open; without a prior, Stable Diffusion's."""
     prior = config.guided_by if config.guided_by in PRIOR_DEFAULTS else "stable-diffusion"
     chosen = PRIOR_DEFAULTS[prior] | ({} if on_cuda else CPU_DEFAULTS[prior])
-    if config.refine in REFINE_STEPS:
-        chosen |= {"steps": REFINE_STEPS[config.refine], "accept": False}
-    if config.lora is not None:
+    if config.task.refine in REFINE_STEPS:
+        chosen |= {"steps": REFINE_STEPS[config.task.refine], "accept": False}
+    if config.adapter.lora is not None:
         chosen |= {"personalize": True}
-    if prior == "embedded" and (config.lora is not None or config.personalize):
+    if prior == "embedded" and (config.adapter.lora is not None or config.adapter.personalize):
         chosen |= {"loss": "sds"}  # the same, asked of the adapted model
-    if config.loss == "dataset-update":
+    if config.guidance.loss == "dataset-update":
         chosen |= {"accept": False}
     if not config.is_guided:
         del chosen["accept"]  # there is no end that could be judged
+    values = config.flat()
     # The tone belongs to the light: `InsertConfig.tone_operator`.
-    return {k: v for k, v in chosen.items() if k != "tone" and getattr(config, k) is None}
+    return {k: v for k, v in chosen.items() if k != "tone" and values[k] is None}
 
 
 def flag(name: str) -> str:
@@ -549,9 +414,10 @@ EMPTY_ALLOWED = ("negative_prompt", "null_prompt", "base_prompt")
 
 
 @cache
-def _kinds() -> dict[str, Any]:
+def kinds() -> dict[str, Any]:
     """Return the annotations of all fields."""
-    return get_type_hints(InsertConfig)
+    hints = {name: get_type_hints(part) for name, part in PARTS.items()}
+    return {name: hints[option.part][option.field.name] for name, option in OPTIONS.items()}
 
 
 def _plain(value: object) -> object:
@@ -584,49 +450,53 @@ def _is_a(value: object, kind: Any) -> bool:
 
 def _values_out_of_range(config: InsertConfig) -> Iterator[InputError]:
     def check(name: str, accepted: bool, expected: str) -> Iterator[InputError]:
-        value = getattr(config, name)
+        value = values[name]
         # A NaN fails every comparison and is reported as not finite.
         if value is not None and value == value and not accepted:
             yield usage(flag(name), f"{expected} (found {_shown(value)})")
 
-    values = {field.name: getattr(config, field.name) for field in fields(config)}
-    of_other_kinds = [name for name, value in values.items() if not _is_a(value, _kinds()[name])]
+    values = config.flat()
+    of_other_kinds = [name for name, value in values.items() if not _is_a(value, kinds()[name])]
     for name in of_other_kinds:
-        expected = str(_kinds()[name]).removeprefix("<class '").removesuffix("'>")
+        expected = str(kinds()[name]).removeprefix("<class '").removesuffix("'>")
         yield usage(flag(name), f"expected {expected} (found {_shown(values[name])})")
     if of_other_kinds:
         return  # from Python alone, and no other check would know what to do with them
     for name, value in values.items():
-        yield from _not_plain(name, value, config.max_prompt_bytes)
-    yield from check("fov", config.fov is None or 0.0 < config.fov < 180.0, "between 0 and 180")
-    in_order = config.fusion_end >= config.fusion_start
+        yield from _not_plain(name, value, config.limits.prompt_bytes)
+    yield from check(
+        "fov", config.camera.fov is None or 0.0 < config.camera.fov < 180.0, "between 0 and 180"
+    )
+    in_order = config.optimize.fusion_end >= config.optimize.fusion_start
     yield from check("fusion_end", in_order, "at least --fusion-start")
     for name in ("place", "ground", "sun", "sky", "at"):
         parts = values[name]
         if isinstance(parts, tuple):
             within = not any(abs(part) > LARGEST for part in parts)
             yield from check(name, within, f"numbers up to {LARGEST:g}")
-    if config.ground is not None and all(map(math.isfinite, config.ground)):
-        yield from check("ground", any(config.ground[:3]), "a normal a,b,c that is not 0")
-    if config.sun is not None:
-        yield from check("sun", -90.0 <= config.sun[1] <= 90.0, "elevation -90 to 90")
-        yield from check("sun", len(config.sun) < 3 or config.sun[-1] >= 0.0, "strength at least 0")
-    if isinstance(config.sky, tuple):
-        yield from check("sky", min(config.sky) >= 0.0, "radiance at least 0")
+    if config.camera.ground is not None and all(map(math.isfinite, config.camera.ground)):
+        yield from check("ground", any(config.camera.ground[:3]), "a normal a,b,c that is not 0")
+    if config.light.sun is not None:
+        yield from check("sun", -90.0 <= config.light.sun[1] <= 90.0, "elevation -90 to 90")
+        yield from check(
+            "sun", len(config.light.sun) < 3 or config.light.sun[-1] >= 0.0, "strength at least 0"
+        )
+    if isinstance(config.light.sky, tuple):
+        yield from check("sky", min(config.light.sky) >= 0.0, "radiance at least 0")
     else:
         presets = f"{', '.join(SKY_PRESETS)} or R,G,B"
-        yield from check("sky", config.sky in SKY_PRESETS, presets)
-    if config.device is not None:
-        known = DEVICE_FORM.fullmatch(config.device) is not None
+        yield from check("sky", config.light.sky in SKY_PRESETS, presets)
+    if config.render.device is not None:
+        known = DEVICE_FORM.fullmatch(config.render.device) is not None
         yield from check("device", known, "cpu, cuda or cuda:N")
-    if config.prompt and config.token:
+    if config.guidance.prompt and config.adapter.token:
         try:
-            make_prompts(config.prompt, config)
+            make_prompts(config.guidance.prompt, config.adapter)
         except ValueError as error:
             name, _, what = str(error).partition(": ")
             yield usage(flag(name), what)
-    if config.refine_parts is not None:
-        known = set(config.refine_parts) <= set(REFINE_PARTS)
+    if config.task.refine_parts is not None:
+        known = set(config.task.refine_parts) <= set(REFINE_PARTS)
         yield from check("refine_parts", known, f"some of {', '.join(REFINE_PARTS)}")
     for name, value in values.items():
         if value is None:
@@ -699,8 +569,10 @@ def replaced_by(changes: Mapping[str, Any], among: Container[str]) -> dict[str, 
 
 
 def _values_that_clash(config: InsertConfig) -> Iterator[InputError]:
+    values = config.flat()
+
     def given(name: str) -> bool:
-        return bool(getattr(config, name) != DEFAULTS[name])
+        return bool(values[name] != DEFAULTS[name])
 
     def needs(name: str, fulfilled: bool, what: str) -> Iterator[InputError]:
         if given(name) and not fulfilled:
@@ -723,7 +595,7 @@ def _values_that_clash(config: InsertConfig) -> Iterator[InputError]:
             "cannot be used while a prior changes the light or the object",
             "recover the light first, then give the mask with --reuse",
         )
-    yield from needs("mitsuba", config.hand_off, "the files that --no-hand-off leaves out")
+    yield from needs("mitsuba", config.output.hand_off, "the files that --no-hand-off leaves out")
     yield from needs("fit_lobes", given("light"), "--light with a panorama to fit")
     yield from needs("light_convention", given("light"), "--light with a panorama")
     yield from needs("up", given("camera"), "--camera; without a camera file the world is Y up")
@@ -732,9 +604,9 @@ def _values_that_clash(config: InsertConfig) -> Iterator[InputError]:
     yield from needs("sequence", given("reuse"), "--reuse: one light for all frames")
     yield from needs("fps", given("sequence"), "--sequence, of which the video is made")
     yield from needs("show_prior", with_words, "--guidance stable-diffusion and its --model")
-    if given("show_prior") and with_words and config.personalize is False:
+    if given("show_prior") and with_words and config.adapter.personalize is False:
         yield usage("--no-personalize", "cannot be used with --show-prior, which shows its effect")
-    if given("lora") and config.personalize is False:
+    if given("lora") and config.adapter.personalize is False:
         yield usage("--no-personalize", "cannot be used with --lora", "leave one of them out")
     asks = f"--guidance with a prior (--model, or --steps {EMBEDDED_STEPS} for the embedded one)"
     yield from needs("resume", config.is_guided, f"{asks}: nothing else has checkpoints")
@@ -751,10 +623,10 @@ def _values_that_clash(config: InsertConfig) -> Iterator[InputError]:
     yield from needs("refine", lit, "a known light: --reuse, --light, --sun or --sky")
     who_judges = "--guidance stable-diffusion, which judges the change: no other knows colours"
     yield from needs("refine", with_words, who_judges)
-    yield from needs("refine_parts", config.refine == "material", "--refine material")
-    with_materials = config.refine in ("material", "emission")
+    yield from needs("refine_parts", config.task.refine == "material", "--refine material")
+    with_materials = config.task.refine in ("material", "emission")
     yield from needs("refine_materials", with_materials, "--refine material or emission")
-    if config.refine == "tone" and config.tone_curve is False:
+    if config.task.refine == "tone" and config.optimize.tone_curve is False:
         yield usage(
             "--no-tone-curve", "cannot be used with --refine tone, which changes nothing else"
         )
@@ -763,11 +635,11 @@ def _values_that_clash(config: InsertConfig) -> Iterator[InputError]:
 
 def _losses_that_clash(config: InsertConfig) -> Iterator[InputError]:
     """Find what a loss lacks, and ranges that are empty; with what is open as the prior has it."""
-    made = {**vars(config), **_open_values(config)}
+    made = {**config.flat(), **_open_values(config)}
     loss = made["loss"]
     if config.guided_by != "none" and not made["personalize"] and loss not in LOSSES_OF_BASE:
         losses = " or ".join(LOSSES_OF_BASE)
-        if config.personalize is False:
+        if config.adapter.personalize is False:
             yield usage(
                 "--no-personalize",
                 f"cannot be used with --loss {loss}, which compares the adapted model",
@@ -776,10 +648,10 @@ def _losses_that_clash(config: InsertConfig) -> Iterator[InputError]:
         else:
             what = f"{loss} compares the adapted model"
             yield usage("--loss", what, f"add --personalize, or choose {losses}")
-    says_itself = config.guided_by == "embedded" or config.negative_prompt
+    says_itself = config.guided_by == "embedded" or config.guidance.negative_prompt
     if loss in LOSSES_AWAY and not says_itself:
         yield usage("--loss", f"{loss} needs --negative-prompt, which it moves away from")
-    if config.accept and loss == "dataset-update":
+    if config.guidance.accept and loss == "dataset-update":
         yield usage("--accept", "cannot be used with --loss dataset-update, which has no potential")
     for low, high in (("time_min", "time_max"), ("crop_min", "crop_max")):
         least, greatest = made[low], made[high]
@@ -792,7 +664,3 @@ def _shown(value: object) -> str:
         value = ",".join(f"{p:g}" if isinstance(p, int | float) else str(p) for p in value)
     text = str(value)
     return text if len(text) <= 60 else text[:57] + "..."
-
-
-DEFAULTS = {field.name: field.default for field in fields(InsertConfig)}
-"""What a field holds when nobody names it."""

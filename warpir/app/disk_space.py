@@ -40,12 +40,12 @@ def needed_bytes(config: InsertConfig, inputs: Inputs) -> int:
         VERTEX_BYTES * len(p.positions) + TRIANGLE_BYTES * len(p.indices) for p in asset.primitives
     )
     mesh += sum(3 * t.pixels.shape[0] * t.pixels.shape[1] for t in asset.textures)
-    if config.hand_off:
+    if config.output.hand_off:
         total += pixels * png + texels * 4 + mesh
-    if config.mitsuba:
+    if config.output.mitsuba:
         total += texels * 12 + mesh
-    if config.guided_by == "stable-diffusion" and config.settled().personalize:
-        total += config.lora_rank * RANK_BYTES * LORA_COPIES
+    if config.guided_by == "stable-diffusion" and config.settled().adapter.personalize:
+        total += config.adapter.lora_rank * RANK_BYTES * LORA_COPIES
     return int(total)
 
 

@@ -5,7 +5,6 @@ it read has the same sha256 now. What it wrote must be there as it wrote it.
 """
 
 from collections.abc import Mapping
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -35,11 +34,11 @@ def is_done(config: InsertConfig, filled: InsertConfig | None = None) -> bool:
         OtherRun: It holds the whole result of another one.
         InputError: It holds something else.
     """
-    assert config.out is not None
-    out = Path(config.out)
+    assert config.output.out is not None
+    out = Path(config.output.out)
     if out.is_symlink():
         raise _something_else(out, "a link")
-    if config.overwrite or not out.is_dir() or is_ready(out):
+    if config.output.overwrite or not out.is_dir() or is_ready(out):
         return False
     if not (out / "run.json").exists():
         if results_in(out):
@@ -71,18 +70,18 @@ def _same(config: InsertConfig, filled: InsertConfig, record: dict[str, Any]) ->
     if len(made) < len(record["config"]):
         return False
     # As many threads as there are make the same picture.
-    of_the_run = {name: getattr(config, name) for name in ("overwrite", "resume", "threads")}
+    of_the_run = {name: config.flat()[name] for name in ("overwrite", "resume", "threads")}
     read = record.get("inputs")
-    if replace(config_of_record(made), **of_the_run) != config or not isinstance(read, dict):
+    if config_of_record(made).changed(**of_the_run) != config or not isinstance(read, dict):
         return False
     config = filled  # from here on, what names the files
     paths = input_files(config)
     for name in read:
         field, _, file = name.partition("/")
-        if name not in paths and field in ("asset", "proxy") and (path := getattr(config, field)):
+        if name not in paths and field in ("asset", "proxy") and (path := config.flat()[field]):
             paths[name] = Path(path).parent.resolve() / file if file else Path(path)
-    if config.reuse is not None:
-        paths["reuse"] = Path(config.reuse, "run.json")
+    if config.light.reuse is not None:
+        paths["reuse"] = Path(config.light.reuse, "run.json")
     hashes = {name: file_hash(path) for name, path in paths.items()}
     return read == hashes and _same_model(config, record)
 

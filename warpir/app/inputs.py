@@ -108,8 +108,8 @@ def read_inputs(config: InsertConfig, loaders: Loaders | None = None) -> Inputs:
             problems.append(error)
             return None
 
-    assert config.photo is not None and config.asset is not None
-    photo_path, asset_path = config.photo, config.asset
+    assert config.inputs.photo is not None and config.inputs.asset is not None
+    photo_path, asset_path = config.inputs.photo, config.inputs.asset
     states: dict[str, tuple[Path, _State | None]] = {}
     with suppress(InputError):  # the reader tells
         states = {name: (path, _state(path)) for name, path in input_files(config).items()}
@@ -119,22 +119,22 @@ def read_inputs(config: InsertConfig, loaders: Loaders | None = None) -> Inputs:
     photo = attempt(
         lambda: read_photo(
             photo_path,
-            max_pixels=config.max_pixels,
-            alpha="ignore" if config.alpha == "ignore" else "refuse",
-            layer=config.layer,
-            strict=config.strict,
+            max_pixels=config.limits.pixels,
+            alpha="ignore" if config.inputs.alpha == "ignore" else "refuse",
+            layer=config.inputs.layer,
+            strict=config.inputs.strict,
         )
     )
-    occluder = attempt(lambda: _read_mask(config.occluder_mask, photo, config, notices))
-    shaded = attempt(lambda: _read_mask(config.shadow_mask, photo, config, notices))
+    occluder = attempt(lambda: _read_mask(config.inputs.occluder_mask, photo, config, notices))
+    shaded = attempt(lambda: _read_mask(config.camera.shadow_mask, photo, config, notices))
     asset = attempt(lambda: read_asset(asset_path, config, loaders, assumed))
-    reuse = config.reuse
+    reuse = config.light.reuse
     run = attempt(lambda: loaders.run(reuse, config.limits)) if reuse is not None else None
     view = attempt(lambda: photo_camera(config, photo, assumed)) if photo is not None else None
     # Without a camera the run ends below, but all that is wrong with the light is told too.
     pose = view.camera.c2w if view is not None else np.eye(4)
     light = attempt(lambda: _read_light(config, pose, notices))
-    points_path, proxy_path = config.ground_points, config.proxy
+    points_path, proxy_path = config.camera.ground_points, config.camera.proxy
     limits = config.limits
     points = proxy = None
     if points_path is not None:
@@ -149,7 +149,7 @@ def read_inputs(config: InsertConfig, loaders: Loaders | None = None) -> Inputs:
     for name, mesh_read in (("asset", asset), ("proxy", proxy)):
         for file, digest in mesh_read.hashes.items() if mesh_read is not None else ():
             hashes[f"{name}/{file}" if file else name] = digest
-            folder = Path(getattr(config, name)).parent.resolve()
+            folder = Path(config.flat()[name]).parent.resolve()
             problems += _within_out(config, folder / file) if file else []
     raise_all(problems)
     if run is not None:
@@ -164,7 +164,7 @@ def read_inputs(config: InsertConfig, loaders: Loaders | None = None) -> Inputs:
         bent = iter(undistorted(masks, view.camera, view.lens)[0])
         occluder = None if occluder is None else next(bent)
         shaded = None if shaded is None else next(bent)
-    elif config.undistort:
+    elif config.camera.undistort:
         notices.append("--undistort: the camera has no distortion, nothing was undone")
     world = make_world(config, view, points)
     camera = world.camera
@@ -173,16 +173,16 @@ def read_inputs(config: InsertConfig, loaders: Loaders | None = None) -> Inputs:
     notices = [
         *_about(photo_path, straight.notices),
         *_about(asset_path, asset.notices),
-        *(_about(config.proxy, proxy.notices) if config.proxy and proxy else ()),
+        *(_about(config.camera.proxy, proxy.notices) if config.camera.proxy and proxy else ()),
         *notices,
         *camera.notices,
         *world.notices,
         *placement.warnings,
     ]
-    if config.width is not None and config.width < camera.width:
+    if config.render.width is not None and config.render.width < camera.width:
         notices.append(
-            f"a preview: object and shadow are rendered {config.width} px wide and enlarged to the "
-            f"photo's {camera.width} px (--width)"
+            f"a preview: object and shadow are rendered {config.render.width} px wide and enlarged "
+            f"to the photo's {camera.width} px (--width)"
         )
     assumed += [*camera.assumed, *world.assumed, *placement.assumed]
     measured |= world.measured
@@ -197,9 +197,9 @@ def read_inputs(config: InsertConfig, loaders: Loaders | None = None) -> Inputs:
             f"{100.0 * shade.at_object:.0f} % of the lamps' light is kept from the object, the "
             "mean of --shadow-mask under its footprint"
         )
-    if run is not None and (assumption := run.assumption(camera.c2w, config.camera)):
+    if run is not None and (assumption := run.assumption(camera.c2w, config.camera.file)):
         assumed.append(assumption)
-    if run is not None and run.materials is not None and config.materials is None:
+    if run is not None and run.materials is not None and config.inputs.materials is None:
         notices.append(
             f"{run.path} had changed its object's materials, this run has not (--materials "
             f"{run.materials} does the same to that object)"
@@ -214,7 +214,7 @@ def read_inputs(config: InsertConfig, loaders: Loaders | None = None) -> Inputs:
         light,
         run,
         proxy=mesh,
-        is_plane=config.plane,
+        is_plane=config.camera.plane,
         shadow_mask=shade,
         assumed=tuple(assumed),
         notices=tuple(notices),
@@ -243,18 +243,35 @@ def _changed(path: Path) -> InputError:
 def _inputs_in_out(config: InsertConfig) -> list[InputError]:
     """Refuse an --out that holds an input: --overwrite could replace it."""
     named = (
-        *(config.photo, config.asset, config.materials, config.camera, config.light),
-        *(config.occluder_mask, config.shadow_mask, config.proxy, config.reuse, config.model),
-        *(config.lora, config.prior, config.regressor, config.ground_points),
+        *(
+            config.inputs.photo,
+            config.inputs.asset,
+            config.inputs.materials,
+            config.camera.file,
+            config.light.file,
+        ),
+        *(
+            config.inputs.occluder_mask,
+            config.camera.shadow_mask,
+            config.camera.proxy,
+            config.light.reuse,
+            config.diffusion.model,
+        ),
+        *(
+            config.adapter.lora,
+            config.guidance.prior,
+            config.light.regressor,
+            config.camera.ground_points,
+        ),
     )
     return _within_out(config, *(path for path in named if path is not None))
 
 
 def _within_out(config: InsertConfig, *paths: str | Path) -> list[InputError]:
     """Refuse the first path that is --out or below it: by links, or in a folder of the results."""
-    if config.out is None:
+    if config.output.out is None:
         return []
-    out = _places(config.out)[:1]
+    out = _places(config.output.out)[:1]
     if not out or out[0] == out[0].parent:
         return []  # no name, or the root: `warpir.io.results.OutputFolder` says so
     for path in paths:
@@ -287,16 +304,16 @@ def read_asset(path: str, config: InsertConfig, loaders: Loaders, assumed: list[
     Raises:
         InputError: The asset or its materials cannot be used.
     """
-    asset = loaders.asset(path, config.missing_textures, config.limits)
-    if config.asset_up is not None:
-        turned = f"turned: its {config.asset_up} axis points up (--asset-up)"
-        asset = asset.turned(up_to_y(config.asset_up))
+    asset = loaders.asset(path, config.inputs.missing_textures, config.limits)
+    if config.inputs.asset_up is not None:
+        turned = f"turned: its {config.inputs.asset_up} axis points up (--asset-up)"
+        asset = asset.turned(up_to_y(config.inputs.asset_up))
         asset = replace(asset, notices=(*asset.notices, turned))
     elif Path(path).suffix.lower() not in STATED_UP:
         assumed.append("the asset's +y axis points up (--asset-up)")
-    if config.materials is not None:
-        asset = with_materials(asset, config.materials, config.limits)
-    for name in config.refine_materials or ():
+    if config.inputs.materials is not None:
+        asset = with_materials(asset, config.inputs.materials, config.limits)
+    for name in config.task.refine_materials or ():
         if not asset.materials_named([name]):
             found = ", ".join(dict.fromkeys(ascii(m.name) for m in asset.materials))
             what = f"no material {name[:60]!a} in {path} (found {found[:400]})"
@@ -317,17 +334,17 @@ def _place(
             world.camera,
             world.ground,
             place=place,
-            at=config.at if place is None else None,
-            rotate_y=config.rotate_y,
-            scale=config.scale,
-            size=config.size,
+            at=config.placement.at if place is None else None,
+            rotate_y=config.placement.rotate_y,
+            scale=config.placement.scale,
+            size=config.placement.size,
             mesh=mesh,
-            is_plane=config.plane,
+            is_plane=config.camera.plane,
         )
 
     if world.cloud is None:
         return put(world.place)
-    if world.place is None and config.at is None:
+    if world.place is None and config.placement.at is None:
         plane = upright_plane(world.ground, world.camera.c2w[:3, 3])
         place = find_place(put, low, high, world.camera, plane, world.cloud)
         placement = put(place)
@@ -375,15 +392,15 @@ def photo_camera(config: InsertConfig, photo: Photo, assumed: list[str]) -> Phot
         InputError: The camera file cannot be used, or does not fit the photo.
     """
     height, width = photo.codes.shape[:2]
-    if config.camera is not None:
-        assert config.photo is not None
+    if config.camera.file is not None:
+        assert config.inputs.photo is not None
         return read_photo_camera(
-            config.camera,
+            config.camera.file,
             (width, height),
-            config.up,
-            frame=config.frame,
-            photo_name=Path(config.photo).name,
-            undistort=config.undistort,
+            config.camera.up,
+            frame=config.camera.frame,
+            photo_name=Path(config.inputs.photo).name,
+            undistort=config.camera.undistort,
             limits=config.limits,
         )
     return PhotoCamera(_camera_from_numbers(config, photo, assumed))
@@ -391,20 +408,20 @@ def photo_camera(config: InsertConfig, photo: Photo, assumed: list[str]) -> Phot
 
 def _camera_from_numbers(config: InsertConfig, photo: Photo, assumed: list[str]) -> Camera:
     height, width = photo.codes.shape[:2]
-    camera_height, pitch = config.camera_height, config.pitch
+    camera_height, pitch = config.camera.height, config.camera.pitch
     if camera_height is None:
         camera_height = DEFAULT_CAMERA_HEIGHT
         assumed.append(f"the camera is {camera_height} m above the ground (--camera-height)")
     if pitch is None:
         pitch = 0.0
-        if config.horizon is None:
+        if config.camera.horizon is None:
             assumed.append("the camera is level (--pitch, --horizon)")
-    pose = (pitch, camera_height, config.horizon)
-    if config.fov is None and photo.focal_35mm is not None:
+    pose = (pitch, camera_height, config.camera.horizon)
+    if config.camera.fov is None and photo.focal_35mm is not None:
         return camera_from_exif(photo.focal_35mm, width, height, *pose)
-    if config.fov is None:
+    if config.camera.fov is None:
         assumed.append(f"the horizontal field of view is {DEFAULT_FOV:g} degrees (--fov)")
-    return camera_from_fov(width, height, config.fov or DEFAULT_FOV, *pose)
+    return camera_from_fov(width, height, config.camera.fov or DEFAULT_FOV, *pose)
 
 
 def _read_mask(
@@ -414,7 +431,7 @@ def _read_mask(
         return None
     height, width = photo.codes.shape[:2]
     found: list[str] = []
-    mask = read_mask(path, (width, height), max_pixels=config.max_pixels, notices=found)
+    mask = read_mask(path, (width, height), max_pixels=config.limits.pixels, notices=found)
     notices += _about(path, found)
     return mask
 
@@ -422,26 +439,32 @@ def _read_mask(
 def _read_light(
     config: InsertConfig, camera_to_world: Float64Array, notices: list[str]
 ) -> Light | None:
-    if config.light is None:
+    if config.light.file is None:
         return None
-    if Path(config.light).suffix.lower() == ".json":
-        if config.fit_lobes is not None:
-            raise usage("--fit-lobes", f"needs a panorama to fit (found lobes: {config.light})")
-        if config.light_convention != "openexr":
-            raise usage("--light-convention", f"is for panoramas (found lobes: {config.light})")
-        return Light(lobes=read_lobes(config.light, config.limits)).rotated(config.light_rotate)
+    if Path(config.light.file).suffix.lower() == ".json":
+        if config.light.fit_lobes is not None:
+            raise usage(
+                "--fit-lobes", f"needs a panorama to fit (found lobes: {config.light.file})"
+            )
+        if config.light.convention != "openexr":
+            raise usage(
+                "--light-convention", f"is for panoramas (found lobes: {config.light.file})"
+            )
+        return Light(lobes=read_lobes(config.light.file, config.limits)).rotated(
+            config.light.rotate
+        )
     found: list[str] = []
     texels = read_envmap(
-        config.light,
-        convention=config.light_convention,
+        config.light.file,
+        convention=config.light.convention,
         camera_to_world=camera_to_world,
         pictures=True,
-        strict=config.strict,
-        max_width=config.max_envmap_width,
+        strict=config.inputs.strict,
+        max_width=config.limits.envmap_width,
         notices=found,
     )
-    notices += _about(config.light, found)
-    return Light(texels=texels).rotated(config.light_rotate)
+    notices += _about(config.light.file, found)
+    return Light(texels=texels).rotated(config.light.rotate)
 
 
 def _about(path: str, notices: tuple[str, ...] | list[str]) -> list[str]:

@@ -36,8 +36,10 @@ def require_model(config: InsertConfig) -> None:
             problems.append(InputError(error.where, error.what, error.advice, ExitCode.MODEL))
             return None
 
-    lora, prior, regressor = (_path(f) for f in (config.lora, config.prior, config.regressor))
-    is_told = config.is_light_described or config.reuse is not None
+    lora, prior, regressor = (
+        _path(f) for f in (config.adapter.lora, config.guidance.prior, config.light.regressor)
+    )
+    is_told = config.is_light_described or config.light.reuse is not None
     embedding_width: int | None = None
     if config.guided_by == "stable-diffusion":
         embedding_width = attempt(lambda: _model_width(config))
@@ -45,7 +47,7 @@ def require_model(config: InsertConfig) -> None:
         embedding_width = attempt(lambda: check_prior(prior))
     if lora is not None:
         attempt(lambda: check_lora(lora, embedding_width))
-    if regressor is not None or (config.start != "uniform" and not is_told):
+    if regressor is not None or (config.light.start != "uniform" and not is_told):
         attempt(lambda: check_regressor(regressor))
     raise_all(problems)
 
@@ -54,10 +56,12 @@ def _model_width(config: InsertConfig) -> int | None:
     """Check the folder of Stable Diffusion; return the width of its prompts' embeddings."""
     from warpir.diffusion.model_folder import check_model_folder, find_model
 
-    if config.allow_download and not os.path.isdir(config.model or ""):
+    if config.diffusion.allow_download and not os.path.isdir(config.diffusion.model or ""):
         return None
-    found = find_model(config.model, allow_download=False, allow_pickle=config.allow_pickle)
-    folder = check_model_folder(found, config.allow_pickle)
+    found = find_model(
+        config.diffusion.model, allow_download=False, allow_pickle=config.diffusion.allow_pickle
+    )
+    folder = check_model_folder(found, config.diffusion.allow_pickle)
     width: int = folder.configs["unet"]["cross_attention_dim"]
     return width
 
@@ -70,8 +74,10 @@ def model_hashes(config: InsertConfig) -> dict[str, str] | None:
     from warpir.diffusion.model_folder import check_model_folder, find_model
 
     try:
-        found = find_model(config.model, allow_download=False, allow_pickle=config.allow_pickle)
-        folder = check_model_folder(found, config.allow_pickle)
+        found = find_model(
+            config.diffusion.model, allow_download=False, allow_pickle=config.diffusion.allow_pickle
+        )
+        folder = check_model_folder(found, config.diffusion.allow_pickle)
         states = [(file, file.stat()) for file in folder.files]
         return dict(
             _hash(folder, file, (state.st_ino, state.st_size, state.st_mtime_ns))

@@ -46,7 +46,7 @@ def make_world(config: InsertConfig, view: PhotoCamera, points: Float64Array | N
     Raises:
         InputError: No ground in the points, or nothing that tells which way is up.
     """
-    camera, ground, place = view.camera, config.ground, config.place
+    camera, ground, place = view.camera, config.camera.ground, config.placement.place
     fit = None
     if points is not None:
         points = points @ view.world.T
@@ -56,7 +56,7 @@ def make_world(config: InsertConfig, view: PhotoCamera, points: Float64Array | N
     if not view.has_up:
         if ground is None:
             raise InputError(
-                str(config.camera),
+                str(config.camera.file),
                 "nothing says which way is up (a COLMAP world lies as it happens to)",
                 "give --ground-points with its points, or --ground, or --up",
             )

@@ -8,7 +8,6 @@ import sys
 import time
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -80,7 +79,7 @@ def run_record(
     return {
         "format": RUN_FORMAT,
         "warpir": warpir.__version__,
-        "config": asdict(config),
+        "config": config.flat(),
         "inputs": dict(inputs),
         "assumed": list(assumed),
         "notices": list(notices),
@@ -100,9 +99,9 @@ def config_of_picture(config: InsertConfig) -> dict[str, Any]:
     """
     return {
         name: name_of(value) if name in PATHS and value is not None else value
-        for name, value in asdict(config).items()
+        for name, value in config.flat().items()
         if name not in OF_THE_RUN
-    } | ({"model": config.model} if is_hub_id(config.model) else {})
+    } | ({"model": config.diffusion.model} if is_hub_id(config.diffusion.model) else {})
 
 
 def is_hub_id(model: str | None) -> bool:
@@ -130,7 +129,7 @@ def input_files(config: InsertConfig) -> dict[str, Path]:
         *("photo", "occluder_mask", "materials", "camera", "light", "lora"),
         *("prior", "regressor", "ground_points", "shadow_mask"),
     )
-    paths = {name: Path(path) for name in names if (path := getattr(config, name)) is not None}
+    paths = {name: Path(path) for name in names if (path := config.flat()[name]) is not None}
     for name, stems in MODEL_STEMS.items():
         if name in paths and is_model(paths[name]):
             files = model_files(paths.pop(name), *stems)

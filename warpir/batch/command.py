@@ -15,7 +15,7 @@ import time
 from collections import deque
 from collections.abc import Callable, Sequence
 from contextlib import suppress
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, Protocol
 
@@ -331,7 +331,9 @@ class _Batch:
             if scene.state != "failed":
                 scene.retries.clear()  # those of the check are none of its insertion's
         if self.options.ray is None:  # whose machines are asked when it is known what runs there
-            self._compile([key for key in self._open() if self._config(key).device == "cuda"], [])
+            self._compile(
+                [key for key in self._open() if self._config(key).render.device == "cuda"], []
+            )
         say(
             f"checked: {len(self.scenes)} scenes, of which {self.count(DONE_BEFORE)} are done "
             f"already and {self.count('failed')} cannot be used"
@@ -425,12 +427,12 @@ class _Batch:
     def _task(self, do: str, key: int, on_cuda: bool = False) -> Task:
         config = self._config(key)
         if do == INSERT:
-            config = replace(config, threads=config.threads or self.threads)
-        config = replace(config, overwrite=self.options.is_fresh)
+            config = config.changed(threads=config.render.threads or self.threads)
+        config = config.changed(overwrite=self.options.is_fresh)
         log = self.options.out.absolute() / LOGS / f"{self.scenes[key].row.name}.log"
         return Task(
             do,
-            asdict(config),
+            config.flat(),
             str(self.options.manifest.absolute().parent),
             str(log) if do == INSERT else None,
             memory=self._memory(key),
@@ -454,7 +456,7 @@ class _Batch:
         return True
 
     def _on_cuda(self, key: int, count: int) -> bool:
-        return count > 0 and self._config(key).device != "cpu"
+        return count > 0 and self._config(key).render.device != "cpu"
 
     def _prepare(self, keys: Sequence[int]) -> int:
         """Compile the kernels once, which all workers would do, and get those that do the scenes.
@@ -471,7 +473,7 @@ class _Batch:
             if not keys:
                 return cluster.gpus
             # Each machine compiles for what it has: one without a GPU gets no scene that needs it.
-            devices = ["cpu" if self._config(key).device == "cpu" else None for key in keys]
+            devices = ["cpu" if self._config(key).render.device == "cpu" else None for key in keys]
             task = Task(COMPILE, {"devices": [*dict.fromkeys(devices)], "places": places})
             cluster.prepare(self.options.out.absolute(), task)
             memory: dict[int, int] = {}
@@ -511,19 +513,19 @@ class _Batch:
             How many CUDA devices the worker sees.
         """
         found: list[Answer] = []
-        for device in dict.fromkeys(self._config(key).device for key in keys):
+        for device in dict.fromkeys(self._config(key).render.device for key in keys):
             task = Task(COMPILE, {"devices": [device], "places": list(places)})
             _do_all(self._workers, {0: task}, lambda *_: False, lambda _, a: found.append(a))
             if found[-1].status:
                 for key in keys:
-                    if self._config(key).device == device:
+                    if self._config(key).render.device == device:
                         self.scenes[key].fail(found[-1].status, found[-1].lines)
         return max((int(answer.found.get("cuda", 0)) for answer in found), default=0)
 
     def _fail_on_cuda(self, keys: Sequence[int]) -> list[int]:
         """Let scenes fail that ask for a GPU of a cluster without one; return the others."""
         for key in keys:
-            if self._config(key).device == "cuda":
+            if self._config(key).render.device == "cuda":
                 what = "error: --device: no machine of the cluster has a GPU (found cuda)"
                 self.scenes[key].fail(ExitCode.USAGE, (what, "use --device cpu"))
         return [key for key in keys if self.scenes[key].is_open]

@@ -12,7 +12,7 @@ import time
 import traceback
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager, suppress
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -123,8 +123,8 @@ def do_task(task: Task) -> Answer:
 
 def _check(task: Task) -> dict[str, Any]:
     config = config_of_record(task.config)
-    assert config.out is not None
-    if config.sequence is not None:
+    assert config.output.out is not None
+    if config.task.sequence is not None:
         return _check_sequence(config)
     filled = _filled(config)
     try:
@@ -135,9 +135,9 @@ def _check(task: Task) -> dict[str, Any]:
     config = filled
     inputs = read_inputs(config)
     make_light(inputs, config)
-    OutputFolder(str(config.out), overwrite=True).check()  # what is in it was looked at
+    OutputFolder(str(config.output.out), overwrite=True).check()  # what is in it was looked at
     disk = needed_bytes(config, inputs)
-    require_space(str(config.out), disk)
+    require_space(str(config.output.out), disk)
     return {
         "is_done": False,
         "memory": _memory(config, inputs),
@@ -148,7 +148,7 @@ def _check(task: Task) -> dict[str, Any]:
 
 def _filled(config: InsertConfig) -> InsertConfig:
     """Return a configuration with the demo's files, where it asks for them."""
-    if not config.demo:
+    if not config.inputs.demo:
         return config
     from warpir.demo import demo_config
 
@@ -159,13 +159,13 @@ def _memory(config: InsertConfig, inputs: Inputs) -> int:
     """Return the least memory that a scene takes of the host beside the program [byte]."""
     of_photo, of_scene = needs_of(inputs)
     total = of_photo.bytes + sum(need.bytes for need in of_scene)
-    if config.guided_by == "stable-diffusion" and config.model is not None:
-        total += sum(f.stat().st_size for f in Path(config.model).rglob("*.safetensors"))
+    if config.guided_by == "stable-diffusion" and config.diffusion.model is not None:
+        total += sum(f.stat().st_size for f in Path(config.diffusion.model).rglob("*.safetensors"))
     return total
 
 
 def _check_sequence(config: InsertConfig) -> dict[str, Any]:
-    assert config.out is not None
+    assert config.output.out is not None
     memory, disk = [0], [0]
 
     def look_at(frame: Frame, inputs: Inputs) -> None:
@@ -175,26 +175,26 @@ def _check_sequence(config: InsertConfig) -> dict[str, Any]:
 
     frames = read_sequence(config, Loaders(), renews=True, look_at=look_at)
     refuse_other_page(config)
-    OutputFolder(config.out, overwrite=True).check()
+    OutputFolder(config.output.out, overwrite=True).check()
     return {
         "is_done": is_whole(config, frames),
         "memory": max(memory),
         "disk": sum(disk),
-        "has_place": any(frame.config.proxy is not None for frame in frames),
+        "has_place": any(frame.config.camera.proxy is not None for frame in frames),
     }
 
 
 def _insert(task: Task) -> dict[str, Any]:
     config = config_of_record(task.config)
-    assert config.out is not None
-    if not config.allow_download:
+    assert config.output.out is not None
+    if not config.diffusion.allow_download:
         stay_offline()
-    if config.sequence is not None:
+    if config.task.sequence is not None:
         insert(config, renews=True)
         return {"how": "done"}
-    out = Path(config.out)
+    out = Path(config.output.out)
     finish_results(out)
-    is_fresh = replaces = config.overwrite
+    is_fresh = replaces = config.output.overwrite
     try:
         if is_done(config, _filled(config)):
             return {"how": DONE_BEFORE}
@@ -205,13 +205,13 @@ def _insert(task: Task) -> dict[str, Any]:
     # Of an earlier attempt it is this batch's own, whatever --overwrite says.
     if has_checkpoint and config.is_guided and (task.attempt > 1 or not is_fresh):
         try:
-            insert(replace(config, resume=True, overwrite=False))
+            insert(config.changed(resume=True, overwrite=False))
             return {"how": "resumed"}
         except InputError as error:
             if not Path(error.where).is_relative_to(out / "checkpoints"):
                 raise
             say(f"notice: it starts again: {error.where}: {error.what}")
-    insert(replace(config, overwrite=replaces or has_checkpoint))
+    insert(config.changed(overwrite=replaces or has_checkpoint))
     return {"how": "done"}
 
 

@@ -1,6 +1,7 @@
 """What an input may cost: sizes beyond which a file is refused before that much is read.
 
-Each is a flag, ``--max-`` and the field's name; an error that is raised for one names it.
+Each is a flag, ``--max-`` and the field's name, whose ``--help`` is the line below the field; an
+error that is raised for one names it.
 """
 
 from dataclasses import dataclass
@@ -14,29 +15,32 @@ class Limits:
     """The limits of one run."""
 
     pixels: int = 64_000_000
-    """Of the photo and its masks, each [px]."""
+    """Largest photo or mask that is opened [px]"""
     envmap_width: int = 16_384
-    """Of a panorama [px]."""
+    """Widest panorama that is opened [px]"""
     file_bytes: int = 2 << 30
-    """Of a mesh, a texture, a point cloud or a file of a COLMAP model [byte]."""
+    """Largest mesh, texture, point cloud or file of a COLMAP model that is read [byte]"""
     triangles: int = 20_000_000
-    """Of an asset or a proxy, instances counted; vertices may be three times as many."""
+    """Largest asset or proxy that is read, instances counted [triangles]"""
     texture_pixels: int = 512_000_000
-    """Of all textures of an asset together [px]."""
+    """Most pixels of all textures of the asset together [px]"""
     nodes: int = 100_000
-    """Of a glTF file."""
+    """Most nodes of a glTF file"""
     instances: int = 65_536
-    """Of placed primitives of a glTF file."""
+    """Most meshes that a glTF file places, each instance counted"""
     points: int = 20_000_000
-    """Of a point cloud."""
+    """Most points of --ground-points"""
     json_bytes: int = 16 << 20
-    """Of a configuration, a camera, lobes, a sequence or another JSON file [byte]."""
+    """Largest JSON file: configuration, camera, lobes, materials, sequence [byte]; of YAML, which
+    takes longer to read, a 256th"""
     gltf_json_bytes: int = 64 << 20
-    """Of the JSON of a glTF file [byte]."""
+    """Largest JSON of a glTF file [byte]"""
     json_values: int = 3_000_000
-    """Of JSON: objects, lists and what they hold."""
+    """Most values in a JSON file, lists and objects counted"""
     nesting: int = 100
-    """Levels of lists and objects within each other in JSON and YAML."""
+    """Most levels of lists and objects within each other in JSON and YAML"""
+    prompt_bytes: int = 4096
+    """Longest prompt [byte]"""
 
     def check(
         self,

@@ -4,7 +4,6 @@ The files beside this module are made by ``python -m tools.demo.make``, which is
 nothing is downloaded or scanned.
 """
 
-from dataclasses import replace
 from pathlib import Path
 
 from warpir.app.config import LIGHTS, InsertConfig
@@ -26,18 +25,19 @@ def demo_config(config: InsertConfig) -> InsertConfig:
     Its light and exposure are too with ``--guidance none`` and for ``--refine``; otherwise the
     light is what is to be found out. What the user named is kept.
     """
-    is_placed = config.place is not None or config.at is not None
-    is_given = any(getattr(config, name) is not None for name in LIGHTS)
-    is_recovered = is_given or (config.guided_by != "none" and config.refine is None)
-    return replace(
-        config,
+    is_placed = config.placement.place is not None or config.placement.at is not None
+    is_given = any(config.flat()[name] is not None for name in LIGHTS)
+    is_recovered = is_given or (config.guided_by != "none" and config.task.refine is None)
+    return config.changed(
         demo=False,
         photo=str(PHOTO),
         asset=str(ASSET),
         camera=str(CAMERA),
-        place=config.place if is_placed else PLACE,
-        rotate_y=config.rotate_y or ROTATE_Y,
-        light=config.light if is_recovered else str(LIGHT),
-        exposure=0.0 if config.exposure is None and not is_recovered else config.exposure,
-        tone=config.tone or (None if is_recovered else "linear"),
+        place=config.placement.place if is_placed else PLACE,
+        rotate_y=config.placement.rotate_y or ROTATE_Y,
+        light=config.light.file if is_recovered else str(LIGHT),
+        exposure=0.0
+        if config.light.exposure is None and not is_recovered
+        else config.light.exposure,
+        tone=config.light.tone or (None if is_recovered else "linear"),
     )

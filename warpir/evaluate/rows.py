@@ -92,14 +92,14 @@ class Bench:
         Raises:
             InputError: The weights are not there, or not what they should be (`ExitCode.MODEL`).
         """
-        require_model(replace(self.config, start="uniform"))
+        require_model(self.config.changed(start="uniform"))
 
     def digests(self) -> dict[str, str | None]:
         """Return the sha256 of the weights that were used, by what they are."""
         where = files("warpir.diffusion") / "weights"
         found: dict[str, str | None] = {}
         for name in ("regressor", "prior"):
-            given = getattr(self.config, name)
+            given = self.config.flat()[name]
             path = Path(str(where / f"{name}.safetensors")) if given is None else Path(given)
             found[name] = None
             if path.is_file():
@@ -337,12 +337,11 @@ def recover_light(
         codes = np.round(255.0 * photo).astype(np.uint8)
         picture = _written(codes, Path(folder) / "photo.png")
         out = Path(folder) / "out"
-        config = replace(
-            bench.config,
+        config = bench.config.changed(
             photo=str(Path(folder) / "photo.png"),
             asset=str(subject.asset_path),
             out=str(out),
-            prompt=bench.config.prompt or f"a {_words(subject.asset_path.stem)}",
+            prompt=bench.config.guidance.prompt or f"a {_words(subject.asset_path.stem)}",
             device=bench.device,
             seed=bench.seed,
             checkpoint_every=0,
@@ -387,7 +386,7 @@ and their times on its schedule. Stable Diffusion's defaults are theirs already.
 
 def _ablation(words: str, **changes: Any) -> Row:
     def predict(bench: Bench, stage: Stage, subject: Subject) -> Prediction:
-        theirs = AUTHORS if bench.config.model is None else {}
+        theirs = AUTHORS if bench.config.diffusion.model is None else {}
         settings = {"start": "uniform", "accept": False, **theirs, **changes}
         return recover_light(bench, subject, subject.place.photo, settings)
 

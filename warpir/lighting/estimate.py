@@ -36,9 +36,9 @@ def estimate_light(inputs: Inputs, config: InsertConfig, device: str) -> Estimat
     Raises:
         InputError: The weights are absent or damaged (`ExitCode.MODEL`).
     """
-    path = None if config.regressor is None else Path(config.regressor)
+    path = None if config.light.regressor is None else Path(config.light.regressor)
     regression = regress(load_regressor(path, device), inputs.photo.srgb, inputs.camera)
-    gain = tone_gain(inputs, config) * 2.0 ** (config.exposure or 0.0)
+    gain = tone_gain(inputs, config) * 2.0 ** (config.light.exposure or 0.0)
     light = Light(lobes=regression.lobes()).scaled(gain)
     curves = Curves.identity(config.tone_operator)
     scene_light = SceneLight(light, light, curves, float(np.log2(gain)), (in_words(regression),))

@@ -71,19 +71,20 @@ def make_light(inputs: Inputs, config: InsertConfig) -> SceneLight | None:
     if inputs.run is not None:
         return _reused(inputs.run, config)
     if not config.is_light_described and inputs.light is None:
-        return _even(inputs, config) if config.start == "uniform" else None
+        return _even(inputs, config) if config.light.start == "uniform" else None
     assumed: list[str] = []
     light = inputs.light if inputs.light is not None else _described(config, assumed)
     fit = None
-    if config.fit_lobes is not None and light.texels is not None:
-        fit = fit_lobes(light.texels, config.fit_lobes)
+    if config.light.fit_lobes is not None and light.texels is not None:
+        fit = fit_lobes(light.texels, config.light.fit_lobes)
         light = Light(lobes=fit.lobes)
-    exposure = config.exposure
+    exposure = config.light.exposure
     if exposure is None:
         exposure = _automatic_exposure(light, inputs, config)
         assumed.append(
-            f"the light is {exposure:+.2f} EV, so that ground of albedo {config.ground_albedo:g} "
-            "looks as bright as the photo's lit ground (--exposure, --ground-albedo)"
+            f"the light is {exposure:+.2f} EV, so that ground of albedo "
+            f"{config.light.ground_albedo:g} looks as bright as the photo's lit ground "
+            "(--exposure, --ground-albedo)"
         )
     light = light.scaled(2.0**exposure)
     curves = Curves.identity(config.tone_operator)
@@ -108,13 +109,13 @@ def start_level(inputs: Inputs, config: InsertConfig) -> float:
 
 def _reused(run: EarlierRun, config: InsertConfig) -> SceneLight:
     """Return an earlier run's light and curves; they are at the exposure of that run's photo."""
-    if config.tone not in (None, run.curves.tone):
+    if config.light.tone not in (None, run.curves.tone):
         found = f"the curves of {run.path} are made for {run.curves.tone}"
-        raise usage("--tone", f"cannot be {config.tone}: {found}", "leave --tone out")
-    exposure = config.exposure or 0.0
+        raise usage("--tone", f"cannot be {config.light.tone}: {found}", "leave --tone out")
+    exposure = config.light.exposure or 0.0
 
     def adapted(light: Light) -> Light:
-        return light.rotated(config.light_rotate).scaled(2.0**exposure)
+        return light.rotated(config.light.rotate).scaled(2.0**exposure)
 
     light = light_shadow = adapted(run.light_fg)
     if run.light_shadow is not run.light_fg:
@@ -124,7 +125,7 @@ def _reused(run: EarlierRun, config: InsertConfig) -> SceneLight:
 
 def _described(config: InsertConfig, assumed: list[str]) -> Light:
     """Return the sun and sky of the flags."""
-    sun, sky = config.sun, config.sky
+    sun, sky = config.light.sun, config.light.sky
     preset = sky if isinstance(sky, str) else "clear"
     sky_color, sun_color = SKIES[preset]
     if isinstance(sky, tuple):
@@ -141,7 +142,7 @@ def _described(config: InsertConfig, assumed: list[str]) -> Light:
         r, g, b = (float(strength * c) for c in tint)
         lobes = sun_lobe(sun[0], sun[1], (r, g, b))
         horizontal += strength * tint * max(np.sin(np.radians(sun[1])), 0.0)
-    r, g, b = (float(c) for c in config.ground_albedo * horizontal / np.pi)
+    r, g, b = (float(c) for c in config.light.ground_albedo * horizontal / np.pi)
     return Light(lobes, plain_sky(sky_color, (r, g, b)))
 
 
@@ -162,13 +163,13 @@ def _automatic_exposure(light: Light, inputs: Inputs, config: InsertConfig) -> f
     irradiance = float(luminance(light.irradiance(normal)))
     if not irradiance > 0.0:
         raise InputError(
-            config.light or "--sun",
+            config.light.file or "--sun",
             "no light reaches the ground, so no exposure follows from the photo",
             "give --exposure",
         )
     level = np.clip(_level(inputs, points, LIT_PERCENTILE), 1e-3, 0.9)
     wanted = level / (1.0 - level) if config.tone_operator == "reinhard" else level
-    return float(np.log2(wanted * np.pi / (config.ground_albedo * irradiance)))
+    return float(np.log2(wanted * np.pi / (config.light.ground_albedo * irradiance)))
 
 
 def ground_level(inputs: Inputs, percentile: float) -> float:

@@ -14,7 +14,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from warpir.app.optimize_settings import OptimizeSettings
+from warpir.app.settings import OptimizeSettings
 from warpir.lighting.fusion import fuse
 from warpir.lighting.regularizers import bend, chroma, consistency, spread
 from warpir.lighting.sg_light import LightBounds, SGLight, narrowest

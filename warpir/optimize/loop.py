@@ -25,7 +25,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from warpir.app.optimize_settings import OptimizeSettings
+from warpir.app.settings import OptimizeSettings
 from warpir.core.errors import ExitCode, InputError
 from warpir.core.memory import Memory
 from warpir.diffusion.prior import BAD_STEPS_MAX

@@ -16,7 +16,7 @@ import torch
 from torch import Tensor
 
 from warpir.app.config import REFINE_PARTS, InsertConfig
-from warpir.app.optimize_settings import OptimizeSettings
+from warpir.app.settings import OptimizeSettings
 from warpir.core.memory import release
 from warpir.io.meshes.materials_file import MATERIALS, materials_to_json
 from warpir.lighting.regularizers import bend
@@ -357,18 +357,18 @@ def refine(
             guide = make_guide(run, guided, frame)
             lit = LitFrame(frame, light, run.torch_device)
         loop: MaterialRefinement | ToneRefinement
-        if config.refine == "tone":
+        if config.task.refine == "tone":
             loop = ToneRefinement(
-                lit, guide, config, ToneUnknowns(light.curves).to(run.torch_device)
+                lit, guide, config.optimize, ToneUnknowns(light.curves).to(run.torch_device)
             )
         else:
-            chosen = asset.materials_named(config.refine_materials)
+            chosen = asset.materials_named(config.task.refine_materials)
             unknowns = Factors(asset, chosen, free_parts(config)).to(run.torch_device)
-            loop = MaterialRefinement(lit, light.curves, guide, config, unknowns)
+            loop = MaterialRefinement(lit, light.curves, guide, config.optimize, unknowns)
         record = what_moves(config, asset)
         run.say(f"free: {', '.join(record['free'])}; frozen: {', '.join(record['frozen'])}")
         with run.timings.stage("optimize"), torch.no_grad():
-            first = loop.guide.score(loop.final_image(config.seed))
+            first = loop.guide.score(loop.final_image(config.render.seed))
         optimize(run, loop, guided, frame.renderer, checkpoints, resumed)
         with run.timings.stage("write"):
             write_lora(run, guided)
@@ -380,7 +380,7 @@ def refine(
         refined = loop.unknowns.materials()
         run.output.write_json(MATERIALS, materials_to_json(asset.materials, refined))
         asset = replace(asset, materials=refined)
-        if config.refine == "emission":
+        if config.task.refine == "emission":
             notices = (*notices, GROUND_IS_DARK)
     run.output.write_json("optimization.json", convergence(loop, first))
     record = {
@@ -396,10 +396,10 @@ def refine(
 def free_parts(config: InsertConfig) -> list[str]:
     """Return the fields of `Material` that ``--refine`` changes; none of them for tone."""
     chosen = {
-        "material": config.refine_parts or REFINE_PARTS,
+        "material": config.task.refine_parts or REFINE_PARTS,
         "emission": ("emission",),
         "tone": (),
-    }[config.refine or "tone"]
+    }[config.task.refine or "tone"]
     return [name.replace("-", "_") for name in chosen]
 
 
@@ -408,9 +408,9 @@ def what_moves(config: InsertConfig, asset: Asset) -> dict[str, Any]:
     parts = free_parts(config)
     known = ("tone curves", *LOWEST, "emission")
     free = parts or ["tone curves"]
-    chosen = asset.materials_named(config.refine_materials) if parts else []
+    chosen = asset.materials_named(config.task.refine_materials) if parts else []
     return {
-        "what": config.refine,
+        "what": config.task.refine,
         "free": free,
         "frozen": ["light", *(name for name in known if name not in free)],
         "materials": [asset.materials[index].name for index in chosen],

@@ -116,9 +116,9 @@ def load_and_check(
     Raises:
         InputError: The model cannot be used, or there is no such device.
     """
-    device = torch.device(choose_device(config.device))
+    device = torch.device(choose_device(config.render.device))
     with as_input_errors():
-        prior = load_stable_diffusion(config, device)
+        prior = load_stable_diffusion(config.diffusion, device)
         report = check_model(prior, photo, config, say)
     for notice in prior.notices:
         say(f"notice: {notice}")
@@ -145,14 +145,14 @@ def check_model(
     model = _model_of(prior)
     kind = KNOWN.get((prior.resolution, prior.schedule.prediction_type))
     side = f"{prior.resolution} x {prior.resolution} pixels"
-    say(f"model: {config.model}, sha256 {prior.digest[:16]}...")
+    say(f"model: {config.diffusion.model}, sha256 {prior.digest[:16]}...")
     say(
         f"{side}, predicts {prior.schedule.prediction_type}, UNet in {model['unet_precision']}, "
         f"VAE in {model['vae_precision']}, on {prior.device}"
         f" ({kind or 'no Stable Diffusion that the method was made with'})"
     )
     image = torch.from_numpy(photo).permute(2, 0, 1)[None].contiguous()
-    prompts = make_prompts(config.prompt or PROMPT, config)
+    prompts = make_prompts(config.guidance.prompt or PROMPT, config.adapter)
     verdicts: list[Verdict] = []
 
     def judged(*found: Verdict) -> None:
@@ -161,9 +161,9 @@ def check_model(
         verdicts.extend(found)
 
     square = _middle(image).apply(image, prior.resolution)
-    figures = prior.self_check(square, prompts.guidance, config.seed)
+    figures = prior.self_check(square, prompts.guidance, config.render.seed)
     judged(
-        judge_noise(figures["noise_error"], _silent_error(prior, square, config.seed)),
+        judge_noise(figures["noise_error"], _silent_error(prior, square, config.render.seed)),
         judge_effect([figures[f"difference_{t}"] for t in CHECK_TIMES]),
         judge_precision(figures["precision"], model["unet_precision"]),
     )
@@ -172,11 +172,13 @@ def check_model(
     verdict, guidance_seconds = _try_guidance(prior, image, prompts, config)
     judged(verdict)
     seconds = {"lora_step": lora_seconds, "guidance_step": guidance_seconds}
-    minutes = (config.lora_steps * lora_seconds + config.step_count * guidance_seconds) / 60.0
+    minutes = (
+        config.adapter.lora_steps * lora_seconds + config.optimize.step_count * guidance_seconds
+    ) / 60.0
     say(
         f"cost: {lora_seconds:.3g} s per LoRA step, {guidance_seconds:.3g} s per guidance step; "
-        f"the {config.lora_steps} and {config.step_count} of a run take {minutes:.1f} min "
-        "(class images and rendering come on top)"
+        f"the {config.adapter.lora_steps} and {config.optimize.step_count} of a run take "
+        f"{minutes:.1f} min (class images and rendering come on top)"
     )
     return Report(model, tuple(verdicts), seconds)
 
@@ -308,8 +310,8 @@ def _try_lora(
         if training.step_count == LORA_STEPS:
             spent[0] = clock.seconds()
 
-    settings = replace(config, class_images=0, lora_steps=LORA_STEPS, lora_rate=LORA_RATE)
-    made = personalize(prior, image, prompts, settings, config.seed, None, on_step=on_step)
+    settings = replace(config.adapter, class_images=0, lora_steps=LORA_STEPS, lora_rate=LORA_RATE)
+    made = personalize(prior, image, prompts, settings, config.render.seed, None, on_step=on_step)
     assert made.evaluation is not None
     return judge_lora(*made.evaluation), spent[0]
 
@@ -324,7 +326,13 @@ def _try_guidance(
     height, width = mask.shape
     mask[height // 3 : height - height // 3, width // 3 : width - width // 3] = 1.0
     guide = Guidance(
-        prior, Condition(prompts.guidance), settings, mask, GUIDANCE_STEPS, config.seed, "scene"
+        prior,
+        Condition(prompts.guidance),
+        settings,
+        mask,
+        GUIDANCE_STEPS,
+        config.render.seed,
+        "scene",
     )
     guide.ensure_precision(image)
     clock, norms = _StepClock(prior.device), []

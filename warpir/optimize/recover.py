@@ -10,7 +10,7 @@ from __future__ import annotations
 import tempfile
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from dataclasses import asdict, dataclass, field, fields, replace
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -170,7 +170,7 @@ def recover(
             frame = make_frame(run)
             unknowns = start_of(run, start).to(run.torch_device)
             region = region_of(run, unknowns)
-        if config.preview_every:
+        if config.optimize.preview_every:
             with run.timings.stage("preview"):
                 write_start(run, frame, start)
         guided, resumed = prepare_guidance(run, checkpoints)
@@ -182,7 +182,7 @@ def recover(
             loop = LightOptimization(
                 frame,
                 guide,
-                settings,
+                settings.optimize,
                 unknowns,
                 cache_folder("transport"),
                 record=faster,
@@ -190,10 +190,10 @@ def recover(
             )
         before = {k: v.detach().clone() for k, v in unknowns.state_dict().items()}
         with run.timings.stage("optimize"), torch.no_grad():
-            first = loop.guide.score(loop.final_image(config.seed))
+            first = loop.guide.score(loop.final_image(config.render.seed))
         optimize(run, loop, guided, frame.renderer, checkpoints, resumed)
         verdict = None
-        if config.accept:
+        if config.guidance.accept:
             assert isinstance(guide, Guidance)
             with run.timings.stage("accept"):
                 verdict, compared = judge_end(loop, guide, before)
@@ -210,7 +210,7 @@ def recover(
     record = {
         **guided.record,
         **who_spoke(run, guided),
-        "loop_integrator": settings.integrator,
+        "loop_integrator": settings.optimize.integrator,
         "optimization": summary_of(loop, first) | counts_of(guide, frame),
         **({} if run.estimate is None else {"regression": run.estimate.regression.record()}),
         "start_light": asdict(summarize(start.light)),
@@ -221,7 +221,7 @@ def recover(
         if not verdict.is_accepted:
             return start, record, (*notices, verdict.line)
     run.output.write_json("lobes.json", lobes_to_json(unknowns.light_fg.lobes()))
-    if settings.fusion_kind != "single":
+    if settings.optimize.fusion_kind != "single":
         run.output.write_json("lobes_shadow.json", lobes_to_json(unknowns.light_shadow.lobes()))
     light = SceneLight(light_fg, light_shadow, curves, 0.0, start.assumed)
     return light, record, notices
@@ -236,7 +236,7 @@ def who_spoke(run: Run, guided: Guided) -> dict[str, Any]:
     """Return what run.json says of the prior and of what was left open to it."""
     prior = guided.prior
     about = {"prior_about": ABOUT_EMBEDDED} if prior.name == "embedded" else {}
-    settings = {name: getattr(run.config, name) for name in PRIOR_DEFAULTS[prior.name]}
+    settings = {name: run.config.flat()[name] for name in PRIOR_DEFAULTS[prior.name]}
     settings["tone"] = run.config.tone_operator
     return {"prior": prior.name, "prior_sha256": prior.digest, **about, "settings": settings}
 
@@ -289,7 +289,7 @@ def open_checkpoints(run: Run) -> Checkpoints:
             another one than is to be resumed.
     """
     config = run.config
-    values = {f.name: getattr(config, f.name) for f in fields(config)}
+    values = config.flat()
     identity = {
         "config": {k: v for k, v in values.items() if k not in NOT_IDENTITY and v is not None},
         "inputs": run.inputs.hashes,
@@ -297,10 +297,10 @@ def open_checkpoints(run: Run) -> Checkpoints:
         "versions": versions(),
     }
     checkpoints = Checkpoints(run.output.path, identity)
-    if config.resume and checkpoints.newest is not None:
+    if config.output.resume and checkpoints.newest is not None:
         checkpoints.check()  # before anything is loaded or written
         return checkpoints
-    if config.resume:
+    if config.output.resume:
         run.say(f"notice: no checkpoint in {checkpoints.folder}: the run starts at its beginning")
     checkpoints.remove()
     return checkpoints
@@ -332,10 +332,10 @@ def prepare_guidance(run: Run, checkpoints: Checkpoints) -> tuple[Guided, Checkp
         prior, prompts, negative = run.memory.again(lambda: load_prior(run), "the model", "--model")
         prior.in_chunks = run.memory.in_chunks
         use_threads_for(prior.unet)
-        shown = [*(config.show_prior or ())]
+        shown = [*(config.guidance.show_prior or ())]
         prior.embed([prompts.photo, prompts.class_, prompts.guidance, "", *shown])
-        prior.embed([negative, config.null_prompt, config.base_prompt])
-    weights = config.model or config.prior or "as shipped"
+        prior.embed([negative, config.guidance.null_prompt, config.guidance.base_prompt])
+    weights = config.diffusion.model or config.guidance.prior or "as shipped"
     run.say(f"model: {prior.name} {weights}, sha256 {prior.digest[:16]}...")
     resumed = checkpoint_of(run, checkpoints, prior)
     run.say(f'guidance asks for "{prompts.guidance}"')
@@ -362,16 +362,18 @@ def adapted(
     Raises:
         ModelError: The model cannot be adapted.
     """
-    config, shown = run.config, [*(run.config.show_prior or ())]
+    config, shown = run.config, [*(run.config.guidance.show_prior or ())]
     record: dict[str, Any] = {
         "model": {"name": prior.name, "sha256": prior.file_hashes},
         "prompts": asdict(prompts),
     }
     notices: tuple[str, ...] = (ABOUT_EMBEDDED,) if prior.name == "embedded" else ()
-    does_without = config.loss in LOSSES_WITHOUT_LORA and config.lora is None and not shown
-    if config.personalize and does_without:
-        notices = (*notices, f"--loss {config.loss} does without a LoRA: none was trained")
-    if not config.personalize or does_without:
+    does_without = (
+        config.guidance.loss in LOSSES_WITHOUT_LORA and config.adapter.lora is None and not shown
+    )
+    if config.adapter.personalize and does_without:
+        notices = (*notices, f"--loss {config.guidance.loss} does without a LoRA: none was trained")
+    if not config.adapter.personalize or does_without:
         prior.free_text_encoder()
         return Guided(prior, prompts, negative, None, record, notices)
     photo = torch.from_numpy(run.inputs.photo.srgb).permute(2, 0, 1)[None].contiguous()
@@ -394,8 +396,8 @@ def adapted(
                     prior,
                     photo,
                     prompts,
-                    config,
-                    config.seed,
+                    config.adapter,
+                    config.render.seed,
                     cache,
                     report=report,
                     on_step=on_step,
@@ -403,8 +405,8 @@ def adapted(
                 )
         if shown:
             sheet = show_personalization(
-                prior, photo, prompts, config, config.seed, cache, shown, SHOWN_SEEDS,
-                run.progress.report,
+                prior, photo, prompts, config.adapter, config.render.seed, cache, shown,
+                SHOWN_SEEDS, run.progress.report,
             )  # fmt: skip
             run.output.write_png("prior.png", sheet, mark=False, description="The model's idea")
     prior.free_text_encoder()
@@ -426,18 +428,24 @@ def load_prior(run: Run) -> tuple[NetworkPrior, Prompts, str]:
     """
     config = run.config
     if config.guided_by == "embedded":
-        prompts = embedded_prompts(config.prompt or ANYTHING, config, bool(config.personalize))
+        prompts = embedded_prompts(
+            config.guidance.prompt or ANYTHING, config.adapter, bool(config.adapter.personalize)
+        )
         device = run.torch_device
-        graphs = config.graphs and device.type == "cuda"
-        prior = load_embedded(_path(config.prior), device, graphs)
+        graphs = config.diffusion.graphs and device.type == "cuda"
+        prior = load_embedded(_path(config.guidance.prior), device, graphs)
         if prompts.unknown:
             words = ", ".join(prompts.unknown)
             prior.notices += (f"the embedded prior does not know: {words}",)
-        return prior, prompts, config.negative_prompt or prompts.negative
-    assert config.prompt is not None
+        return prior, prompts, config.guidance.negative_prompt or prompts.negative
+    assert config.guidance.prompt is not None
     require_memory(run)
-    model = load_stable_diffusion(config, run.torch_device)
-    return model, make_prompts(config.prompt, config), config.negative_prompt
+    model = load_stable_diffusion(config.diffusion, run.torch_device)
+    return (
+        model,
+        make_prompts(config.guidance.prompt, config.adapter),
+        config.guidance.negative_prompt,
+    )
 
 
 def require_memory(run: Run) -> None:
@@ -448,12 +456,14 @@ def require_memory(run: Run) -> None:
         ModelError: It cannot be used.
     """
     config = run.config
-    with hub_offline(not config.allow_download):
-        found = find_model(config.model, config.allow_download, config.allow_pickle)
-        folder = check_model_folder(found, config.allow_pickle)
+    with hub_offline(not config.diffusion.allow_download):
+        found = find_model(
+            config.diffusion.model, config.diffusion.allow_download, config.diffusion.allow_pickle
+        )
+        folder = check_model_folder(found, config.diffusion.allow_pickle)
     files = (file for weights in folder.weights.values() for file in weights.files)
     side = 8 * int(folder.configs["unet"]["sample_size"])
-    is_half = run.device != "cpu" and config.precision != "fp32"
+    is_half = run.device != "cpu" and config.diffusion.precision != "fp32"
     pictures = config.guidance_settings().noises
     size = sum(file.stat().st_size for file in files)
     run.memory.require(*needs_of_model(size, side, pictures, is_half=is_half))
@@ -466,7 +476,7 @@ def make_frame(run: Run) -> Frame:
         InputError: The object is not seen in it; better known before the model is adapted.
     """
     config, camera = run.config, run.inputs.camera
-    width = min(config.picture_width, camera.width)
+    width = min(config.optimize.picture_width, camera.width)
     small = camera.scaled(width, max(1, round(width * camera.height / camera.width)))
     curves = Curves.identity(config.tone_operator)
     scene = run.memory.again(
@@ -474,13 +484,15 @@ def make_frame(run: Run) -> Frame:
     )
     renderer = Renderer(
         scene,
-        config.threads or 0,
+        config.render.threads or 0,
         memory=run.memory,
         lower="--guidance-width",
-        is_ordered=config.deterministic,
+        is_ordered=config.render.deterministic,
     )
     photo = np.clip(resize(run.inputs.photo.linear(), small.height, small.width), 0.0, None)
-    frame = Frame(renderer, photo, curves.tone == "reinhard", config.depth, config.seed)
+    frame = Frame(
+        renderer, photo, curves.tone == "reinhard", config.render.depth, config.render.seed
+    )
     if not frame.coverage().any():
         raise InputError(
             "--guidance",
@@ -493,14 +505,14 @@ def make_frame(run: Run) -> Frame:
 def start_of(run: Run, start: SceneLight) -> Unknowns:
     """Return the unknowns: lobes of the light that was given or regressed, else an even light."""
     config = run.config
-    lobes, least = None, narrowest(config.light_rows)
+    lobes, least = None, narrowest(config.optimize.light_rows)
     if run.estimate is not None:
         lobes = run.estimate.regression.lobes(least)
         lobes = replace(lobes, amplitude=(run.estimate.gain * lobes.amplitude).astype(np.float32))
     elif config.is_light_described:
-        fitted = fit_lobes(as_map(start.light, START_HEIGHT), config.lobes).lobes
+        fitted = fit_lobes(as_map(start.light, START_HEIGHT), config.optimize.lobes).lobes
         lobes = widened(fitted, least)
-    return Unknowns.start(lobes, start_level(run.inputs, config), config)
+    return Unknowns.start(lobes, start_level(run.inputs, config), config.optimize)
 
 
 def region_of(run: Run, unknowns: Unknowns) -> TrustRegion | None:
@@ -529,7 +541,7 @@ def make_guide(run: Run, guided: Guided, frame: Frame) -> Guidance | DatasetUpda
     prompts = guided.prompts
     gbuffer = gbuffer_of(frame)
     if guided.prior.name == "embedded":
-        path = None if config.regressor is None else Path(config.regressor)
+        path = None if config.light.regressor is None else Path(config.light.regressor)
         network = load_regressor(path, run.torch_device)
         regression = regress(network, run.inputs.photo.srgb, run.inputs.camera)
         gbuffer = with_light(gbuffer, regression, frame.renderer.scene.camera)
@@ -545,8 +557,8 @@ def make_guide(run: Run, guided: Guided, frame: Frame) -> Guidance | DatasetUpda
         condition,
         config.guidance_settings(),
         seen,
-        config.step_count,
-        config.seed,
+        config.optimize.step_count,
+        config.render.seed,
         None if guided.learnt is None else guided.learnt.adapter,
     )
     if isinstance(guide, Guidance):
@@ -618,14 +630,14 @@ def optimize(
     def on_step(loop: Optimization) -> None:
         nonlocal words
         step = loop.state.step
-        if step % SAY_EVERY == 0 or step == config.step_count:
+        if step % SAY_EVERY == 0 or step == config.optimize.step_count:
             score = loop.state.history[-1].get("score")
             words = loop.describe(run.inputs.camera)
             words += f"; score {score:.4g}" if score is not None else ""
-        run.progress.report("optimisation", step, config.step_count, words)
-        if config.preview_every and step % config.preview_every == 0:
+        run.progress.report("optimisation", step, config.optimize.step_count, words)
+        if config.optimize.preview_every and step % config.optimize.preview_every == 0:
             with torch.no_grad():
-                write_preview(run, loop.final_image(config.seed), step)
+                write_preview(run, loop.final_image(config.render.seed), step)
         if is_time_to_save(config, step):
             save()
         signals.check()
@@ -644,7 +656,7 @@ def optimize(
 
 def is_time_to_save(config: InsertConfig, step: int) -> bool:
     """Return whether a checkpoint is due: every so many steps, and when the run is to stop."""
-    every = config.checkpoint_every
+    every = config.optimize.checkpoint_every
     return bool(every) and (step % every == 0 or signals.is_pending())
 
 

@@ -14,7 +14,6 @@ import threading
 import webbrowser
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager
-from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -104,8 +103,8 @@ def _run(arguments: list[str]) -> int:
         start_record,
     )
 
-    assert config.out is not None
-    folder = PlacementFolder(config.out, config.overwrite)
+    assert config.output.out is not None
+    folder = PlacementFolder(config.output.out, config.output.overwrite)
     folder.check()
     session = open_session(config)
     for line in session.assumed:
@@ -132,7 +131,9 @@ def _run(arguments: list[str]) -> int:
             server.serve_forever(poll_interval=0.1)
         except Stopped as stopped:
             with server.working:  # what is being saved is saved
-                stopped.kept = f"the placement is in {config.out}" if folder.is_written else ""
+                stopped.kept = (
+                    f"the placement is in {config.output.out}" if folder.is_written else ""
+                )
             raise
     return ExitCode.DONE
 
@@ -177,17 +178,19 @@ def _with_inputs(config: InsertConfig) -> InsertConfig:
     Raises:
         InputError: Photo or asset is not named (`ExitCode.USAGE`).
     """
-    if config.demo:
+    if config.inputs.demo:
         from warpir.demo import demo_config
 
         demo = demo_config(config)
-        return replace(
-            demo, light=None, exposure=None, out=config.out or os.path.join("placed", "demo")
+        return demo.changed(
+            light=None, exposure=None, out=config.output.out or os.path.join("placed", "demo")
         )
-    missing = [name for name in ("photo", "asset") if getattr(config, name) is None]
+    missing = [name for name in ("photo", "asset") if config.flat()[name] is None]
     raise_all([usage(flag(name), "needed", DEMO_HINT) for name in missing])
-    assert config.photo is not None
-    return replace(config, out=config.out or os.path.join("placed", Path(config.photo).stem))
+    assert config.inputs.photo is not None
+    return config.changed(
+        out=config.output.out or os.path.join("placed", Path(config.inputs.photo).stem)
+    )
 
 
 def _port(text: str) -> int:

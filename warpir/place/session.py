@@ -80,21 +80,26 @@ def open_session(config: InsertConfig) -> Session:
     Raises:
         InputError: One of them cannot be used, or the place that was named is not in the photo.
     """
-    assert config.photo is not None and config.asset is not None
+    assert config.inputs.photo is not None and config.inputs.asset is not None
     assumed: list[str] = []
     photo = read_photo(
-        config.photo,
-        max_pixels=config.max_pixels,
-        alpha=config.alpha,
-        layer=config.layer,
-        strict=config.strict,
+        config.inputs.photo,
+        max_pixels=config.limits.pixels,
+        alpha=config.inputs.alpha,
+        layer=config.inputs.layer,
+        strict=config.inputs.strict,
     )
     view = photo_camera(config, photo, assumed)
-    asset = read_asset(config.asset, config, Loaders(), assumed)
+    asset = read_asset(config.inputs.asset, config, Loaders(), assumed)
     world = make_world(config, view, None)
     assumed += [*world.camera.assumed, *world.camera.notices]
     low, high = asset.bounds()
-    stands = (config.place, config.at, config.scale, config.size)
+    stands = (
+        config.placement.place,
+        config.placement.at,
+        config.placement.scale,
+        config.placement.size,
+    )
     try:
         placement = place_asset(
             low,
@@ -102,10 +107,10 @@ def open_session(config: InsertConfig) -> Session:
             world.camera,
             world.ground,
             place=world.place,
-            at=config.at,
-            rotate_y=config.rotate_y,
-            scale=config.scale,
-            size=config.size,
+            at=config.placement.at,
+            rotate_y=config.placement.rotate_y,
+            scale=config.placement.scale,
+            size=config.placement.size,
         )
         asset_to_world = placement.asset_to_world
         assumed += [*placement.assumed, *placement.warnings]
@@ -113,7 +118,7 @@ def open_session(config: InsertConfig) -> Session:
         if any(value is not None for value in stands):
             raise
         # It is here that this can be put right: begin with something that is seen.
-        asset_to_world = _in_view(asset, world.camera, world.ground, config.rotate_y)
+        asset_to_world = _in_view(asset, world.camera, world.ground, config.placement.rotate_y)
         assumed.append(f"{error.what}: it starts in front of the camera, and smaller")
     return Session(
         config,
@@ -122,7 +127,7 @@ def open_session(config: InsertConfig) -> Session:
         world.camera,
         world.ground,
         asset_to_world,
-        config.rotate_y,
+        config.placement.rotate_y,
         tuple(assumed),
     )
 
@@ -155,7 +160,7 @@ def start_record(session: Session) -> dict[str, Any]:
     Lengths are metres, angles degrees, pixels those of the upright photo.
     """
     camera, asset, config = session.camera, session.asset, session.config
-    assert config.photo is not None and config.asset is not None
+    assert config.inputs.photo is not None and config.inputs.asset is not None
     low, high = asset.bounds()
     to_ground = np.linalg.inv(session.frame)
     foot = np.array([(low[0] + high[0]) / 2.0, low[1], (low[2] + high[2]) / 2.0, 1.0])
@@ -164,9 +169,13 @@ def start_record(session: Session) -> dict[str, Any]:
     sky_radiance = {name: sky for name, (sky, _) in SKIES.items()}
     sun_color = {name: color for name, (_, color) in SKIES.items()}
     return {
-        "photo": {"name": Path(config.photo).name, "width": camera.width, "height": camera.height},
+        "photo": {
+            "name": Path(config.inputs.photo).name,
+            "width": camera.width,
+            "height": camera.height,
+        },
         "asset": {
-            "name": Path(config.asset).name,
+            "name": Path(config.inputs.asset).name,
             "low": low.tolist(),
             "high": high.tolist(),
             "triangles": triangle_count(asset),
@@ -182,22 +191,22 @@ def start_record(session: Session) -> dict[str, Any]:
         "size": scale * float((high - low).max()),
         "ground_to_world": session.frame.tolist(),
         "sun": _start_sun(config),
-        "sky": config.sky or SKY_PRESETS[0],
-        "keeps_light": config.sun is not None or config.sky is not None,
+        "sky": config.light.sky or SKY_PRESETS[0],
+        "keeps_light": config.light.sun is not None or config.light.sky is not None,
         "sky_radiance": sky_radiance,
         "sun_color": sun_color,
         "sun_to_sky": SUN_TO_SKY,
-        "ground_albedo": config.ground_albedo,
+        "ground_albedo": config.light.ground_albedo,
         "assumed": list(session.assumed),
-        "folder": str(config.out),
+        "folder": str(config.output.out),
     }
 
 
 def _start_sun(config: InsertConfig) -> list[float | None]:
     """Return azimuth, elevation and strength; the last is open where nobody names it."""
-    if config.sun is None:
-        return [*DEFAULT_SUN, 0.0 if config.sky is not None else None]
-    return [*config.sun, None][:3]
+    if config.light.sun is None:
+        return [*DEFAULT_SUN, 0.0 if config.light.sky is not None else None]
+    return [*config.light.sun, None][:3]
 
 
 def photo_jpeg(photo: Photo) -> bytes:
@@ -228,7 +237,7 @@ def placement_files(session: Session, said: Mapping[str, Any]) -> dict[str, dict
     Raises:
         InputError: Numbers out of range, or an object that the camera does not see.
     """
-    assert session.config.out is not None
+    assert session.config.output.out is not None
     stance = Stance(*(number(PAGE, said.get("stance"), f.name) for f in fields(Stance)))
     pose = session.frame @ stance.c2w()
     fx, fy = (number(PAGE, said, name) for name in ("fx", "fy"))
@@ -245,14 +254,14 @@ def placement_files(session: Session, said: Mapping[str, Any]) -> dict[str, dict
         *session.asset.bounds(),
         camera,
         session.ground,
-        place=config.place,
-        rotate_y=config.rotate_y,
-        size=config.size,
+        place=config.placement.place,
+        rotate_y=config.placement.rotate_y,
+        size=config.placement.size,
     )
-    folder = Path(os.path.abspath(session.config.out))
+    folder = Path(os.path.abspath(session.config.output.out))
     kept = {
         name: value
-        for name, value in vars(session.config).items()
+        for name, value in session.config.flat().items()
         if value != DEFAULTS[name] and name not in (*PLACED, *SEEN_BY, "overwrite", "demo")
     }
     own = ("photo", "asset", "materials")
@@ -265,7 +274,7 @@ def placement_files(session: Session, said: Mapping[str, Any]) -> dict[str, dict
             **files,
             "camera": str(folder / CAMERA),
             **ground,
-            "place": config.place,
+            "place": config.placement.place,
             **chosen,
             "out": str(folder / "result"),
         },

@@ -76,9 +76,9 @@ def without_folders(text: str, config: InsertConfig) -> str:
     Folders of configured files go first, as these may be relative; then whatever looks like a whole
     path. A place inside a glTF file, such as ``/materials/0``, stays.
     """
-    given = {path for name in PATHS if (path := getattr(config, name)) is not None}
-    if is_hub_id(config.model):
-        given.discard(config.model)
+    given = {path for name in PATHS if (path := config.flat()[name]) is not None}
+    if is_hub_id(config.diffusion.model):
+        given.discard(config.diffusion.model)
     for path in sorted(given, key=len, reverse=True):
         if path != (called := name_of(path)) and set(path) - set("./~"):
             literal = called.replace("\\", r"\\")
@@ -207,12 +207,12 @@ def light_sources(record: Mapping[str, Any], config: InsertConfig) -> Rows:
 
 
 def _source(measured: Mapping[str, Any], config: InsertConfig) -> str:
-    if config.reuse is not None:
-        text = f"that of an earlier run, {name_of(config.reuse)}"
-    elif config.light is not None:
-        text = f"given: {name_of(config.light)}"
-    elif config.sun is not None or config.sky is not None:
-        parts = [f"--{n} {in_words(n, v)}" for n in ("sun", "sky") if (v := getattr(config, n))]
+    if config.light.reuse is not None:
+        text = f"that of an earlier run, {name_of(config.light.reuse)}"
+    elif config.light.file is not None:
+        text = f"given: {name_of(config.light.file)}"
+    elif config.light.sun is not None or config.light.sky is not None:
+        parts = [f"--{n} {in_words(n, v)}" for n in ("sun", "sky") if (v := config.flat()[n])]
         text = f"described: {' '.join(parts)}"
     elif "regression" in measured:
         found = measured["regression"]
@@ -220,11 +220,11 @@ def _source(measured: Mapping[str, Any], config: InsertConfig) -> str:
             f"estimated from the photo by warpir's regressor: azimuth {found['azimuth_deg']:.0f}°, "
             f"elevation {found['elevation_deg']:.0f}°"
         )
-    elif config.demo and config.start != "uniform":
+    elif config.inputs.demo and config.light.start != "uniform":
         text = "the demo's own"
     else:
         text = "even, as none was given"
-    if measured["prior"] != "none" and config.refine is None:
+    if measured["prior"] != "none" and config.task.refine is None:
         verdict = measured.get("acceptance")
         if verdict is not None and not verdict["is_accepted"]:
             return f"{text}; guidance proposed another, which was not accepted"

@@ -114,8 +114,10 @@ def write_report(output: OutputFolder, results: Results) -> None:
 def report_page(results: Results) -> bytes:
     """Return the page, in UTF-8."""
     record, config = results.record, config_of(results.record)
-    photo = "the demo's photo" if config.demo else PurePath(config.photo or "photo").name
-    asset = "A car" if config.demo else PurePath(config.asset or "object").name
+    photo = (
+        "the demo's photo" if config.inputs.demo else PurePath(config.inputs.photo or "photo").name
+    )
+    asset = "A car" if config.inputs.demo else PurePath(config.inputs.asset or "object").name
     character = results.character
     return render_page(
         "report",
@@ -284,7 +286,7 @@ def _clock(record: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def _command_by_record(config: InsertConfig) -> str:
-    by_hand = [flag(name) for name in BY_HAND if getattr(config, name)]
+    by_hand = [flag(name) for name in BY_HAND if config.flat()[name]]
     return " ".join(["python -m warpir.insert --config run.json", *by_hand, "--out OUT"])
 
 
@@ -293,9 +295,9 @@ def _inputs(config: InsertConfig, record: Mapping[str, Any]) -> list[tuple[str, 
     rows = []
     for name, digest in record["inputs"].items():
         field_name, _, file = name.partition("/")
-        given = getattr(config, field_name, None)
+        given = config.flat().get(field_name)
         called = file or (name_of(given) if isinstance(given, str) else "")
-        if not called and config.demo:
+        if not called and config.inputs.demo:
             called = "the demo's own"
         rows.append((name, called, without_folders(str(digest), config)))
     return rows

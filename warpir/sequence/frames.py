@@ -59,8 +59,8 @@ class Frame:
     @property
     def folder(self) -> Path:
         """Where the frame is written."""
-        assert self.config.out is not None
-        return Path(self.config.out)
+        assert self.config.output.out is not None
+        return Path(self.config.output.out)
 
 
 def read_sequence(
@@ -81,16 +81,19 @@ def read_sequence(
     Raises:
         InputError: A line cannot be used; all problems are listed, each with ``FILE:line``.
     """
-    assert config.sequence is not None and config.out is not None
-    if (Path(config.out) / "run.json").exists():
+    assert config.task.sequence is not None and config.output.out is not None
+    if (Path(config.output.out) / "run.json").exists():
         raise InputError(
-            config.out, "holds the result of one run", "choose another --out", ExitCode.OUTPUT
+            config.output.out,
+            "holds the result of one run",
+            "choose another --out",
+            ExitCode.OUTPUT,
         )
-    _refuse_other_summary(Path(config.out) / SUMMARY, config)
-    if config.reuse is not None:  # once, not as a problem of every line
-        loaders.run(config.reuse, config.limits)
+    _refuse_other_summary(Path(config.output.out) / SUMMARY, config)
+    if config.light.reuse is not None:  # once, not as a problem of every line
+        loaders.run(config.light.reuse, config.limits)
     frames, problems = [], []
-    lines, _ = read_json_lines(config.sequence, "frames", FRAME_COUNT_LIMIT, config.limits)
+    lines, _ = read_json_lines(config.task.sequence, "frames", FRAME_COUNT_LIMIT, config.limits)
     for number, (line, raw) in enumerate(lines, start=1):
         try:
             frame = _read_line(config, number, line, raw)
@@ -99,7 +102,7 @@ def read_sequence(
             frames.append(_looked_up(frame, renews))
             look_at(frames[-1], inputs)
         except InputError as error:
-            problems += [_at_line(config.sequence, line, e) for e in (error, *error.also)]
+            problems += [_at_line(config.task.sequence, line, e) for e in (error, *error.also)]
     raise_all(problems)
     return tuple(frames)
 
@@ -111,22 +114,22 @@ def _looked_up(frame: Frame, renews: bool) -> Frame:
     except OtherRun:
         if not renews:
             raise
-        return replace(frame, config=replace(frame.config, overwrite=True))
+        return replace(frame, config=frame.config.changed(overwrite=True))
 
 
 def _refuse_other_summary(path: Path, config: InsertConfig) -> None:
     """Refuse to write where --sequence itself, or a file that is none of ours, would be lost."""
-    assert config.sequence is not None
+    assert config.task.sequence is not None
     if not os.path.lexists(path):
         return
-    if os.path.exists(config.sequence) and os.path.samefile(path, config.sequence):
+    if os.path.exists(config.task.sequence) and os.path.samefile(path, config.task.sequence):
         advice = "choose another --out, or another name for it"
         raise usage("--out", f"the summary {path} would replace --sequence", advice)
     try:
         is_ours = read_json_object(path).get("format") == FORMAT
     except InputError:
         is_ours = False
-    if not is_ours and not config.overwrite:
+    if not is_ours and not config.output.overwrite:
         raise InputError(
             path,
             "not the summary of a sequence, which would replace it",
@@ -155,16 +158,16 @@ def write_summary(
     Raises:
         InputError: The disk is full or the folder is not writable (exit 5).
     """
-    assert config.out is not None
-    path, video = Path(config.out) / SUMMARY, Path(config.out) / VIDEO
+    assert config.output.out is not None
+    path, video = Path(config.output.out) / SUMMARY, Path(config.output.out) / VIDEO
     made = video.with_name(f".{VIDEO}.{os.getpid()}.made")
     try:
         content = {
             "format": FORMAT,
             "version": VERSION,
             "warpir": warpir.__version__,
-            "sequence": config.sequence,
-            "reuse": config.reuse,
+            "sequence": config.task.sequence,
+            "reuse": config.light.reuse,
             "frames": _records(frames),
             "video": _make_video(config, frames, made, say),
         }
@@ -191,7 +194,7 @@ def is_whole(config: InsertConfig, frames: Sequence[Frame]) -> bool:
     if not all(frame.is_done for frame in frames):
         return False
     try:
-        found = read_json_object(Path(str(config.out)) / SUMMARY)
+        found = read_json_object(Path(str(config.output.out)) / SUMMARY)
     except InputError:
         return False
     if found.get("frames") != json.loads(json.dumps(_records(frames))):
@@ -215,16 +218,16 @@ def _make_video(
         What the summary says of it, by its name; empty where there is none.
     """
     before, digest = _made_before(config), _video_digest(config)
-    video = Path(str(config.out)) / VIDEO
+    video = Path(str(config.output.out)) / VIDEO
     if digest is not None and before.get("sha256") == digest:
         if before == _video_record(config, frames, digest):
             return {VIDEO: before}
-    elif os.path.lexists(video) and (not config.overwrite or video.is_dir()):
+    elif os.path.lexists(video) and (not config.output.overwrite or video.is_dir()):
         say(f"notice: {video} is none of this sequence's and stays as it is (--overwrite)")
         return {}
     try:
         composites = [frame.folder / "composite.png" for frame in frames]
-        write_video(made, composites, config.fps, config.max_pixels)
+        write_video(made, composites, config.task.fps, config.limits.pixels)
     except NoVideo as error:
         say(f"notice: {error}")
         return {}
@@ -235,18 +238,18 @@ def _video_record(
     config: InsertConfig, frames: Sequence[Frame], digest: str | None
 ) -> dict[str, Any]:
     runs = [_run_digest(frame) for frame in frames]
-    return {"fps": config.fps, "frames": runs, "sha256": digest}
+    return {"fps": config.task.fps, "frames": runs, "sha256": digest}
 
 
 def _video_digest(config: InsertConfig) -> str | None:
-    path = Path(str(config.out)) / VIDEO
+    path = Path(str(config.output.out)) / VIDEO
     return file_hash(path) if path.is_file() else None
 
 
 def _made_before(config: InsertConfig) -> dict[str, Any]:
     """Return what the summary says of an earlier video."""
     try:
-        found = read_json_object(Path(str(config.out)) / SUMMARY).get("video")
+        found = read_json_object(Path(str(config.output.out)) / SUMMARY).get("video")
     except InputError:
         return {}
     video = found.get(VIDEO) if isinstance(found, dict) else None
@@ -259,7 +262,7 @@ def _records(frames: Sequence[Frame]) -> list[dict[str, Any]]:
         {
             "folder": frame.folder.name,
             "line": frame.line,
-            "changes": {name: getattr(frame.config, name) for name in frame.changed},
+            "changes": {name: frame.config.flat()[name] for name in frame.changed},
             "run": _run_digest(frame),
         }
         for frame in frames
@@ -271,8 +274,8 @@ def _run_digest(frame: Frame) -> str:
 
 
 def _read_line(config: InsertConfig, number: int, line: int, raw: bytes) -> Frame:
-    assert config.out is not None
-    where = f"{config.sequence}:{line}"
+    assert config.output.out is not None
+    where = f"{config.task.sequence}:{line}"
     try:
         content = parse_json_object(where, raw, config.limits)
     except InputError as error:
@@ -288,9 +291,9 @@ def _read_line(config: InsertConfig, number: int, line: int, raw: bytes) -> Fram
     )
     changes = read_values({name: (value, name) for name, value in given.items()})
     changes |= replaced_by(changes, FRAME_FIELDS)
-    out = str(Path(config.out) / f"{number:04d}")
+    out = str(Path(config.output.out) / f"{number:04d}")
     of_one: dict[str, Any] = {"sequence": None, "fps": DEFAULTS["fps"], "out": out}
-    frame = replace(config, **changes, **of_one)
+    frame = config.changed(**changes, **of_one)
     frame.require_inputs()
     return Frame(line, frame, tuple(given))
 

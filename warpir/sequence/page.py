@@ -30,9 +30,9 @@ def refuse_other_page(config: InsertConfig) -> None:
     Raises:
         InputError: There is one, and --overwrite is not given (`ExitCode.OUTPUT`).
     """
-    assert config.out is not None
-    path = Path(config.out) / PAGE
-    if not config.report or config.overwrite or not os.path.lexists(path):
+    assert config.output.out is not None
+    path = Path(config.output.out) / PAGE
+    if not config.output.report or config.output.overwrite or not os.path.lexists(path):
         return
     try:
         with path.open("rb") as stream:
@@ -54,17 +54,17 @@ def write_sequence_report(config: InsertConfig, frames: Sequence[Frame]) -> None
     Raises:
         InputError: A result is not readable, or the disk is full (exit 5).
     """
-    assert config.out is not None and config.sequence is not None
+    assert config.output.out is not None and config.task.sequence is not None
     every = max(1, -(-len(frames) // SHOWN))
     content = render_page(
         "sequence",
         package="warpir.sequence",
         kind="warpir, report of a sequence",
-        title=f"{name_of(config.sequence)}: {len(frames)} frames",
-        lead=f"Lit by {name_of(config.reuse)}." if config.reuse else "",
+        title=f"{name_of(config.task.sequence)}: {len(frames)} frames",
+        lead=f"Lit by {name_of(config.light.reuse)}." if config.light.reuse else "",
         frames=[_card(frame, k % every == 0) for k, frame in enumerate(frames)],
     )
-    path = Path(config.out) / PAGE
+    path = Path(config.output.out) / PAGE
     try:
         with whole():
             write_file(path, content)
@@ -76,9 +76,9 @@ def _card(frame: Frame, has_picture: bool) -> dict[str, Any]:
     """Return what the page shows of a frame."""
     picture = None
     if has_picture:
-        picture = thumbnail(frame.folder / "composite.png", frame.config.max_pixels)
+        picture = thumbnail(frame.folder / "composite.png", frame.config.limits.pixels)
     changes = ", ".join(
-        f"{n.replace('_', '-')} {in_words(n, getattr(frame.config, n))}" for n in frame.changed
+        f"{n.replace('_', '-')} {in_words(n, frame.config.flat()[n])}" for n in frame.changed
     )
     return {
         "name": frame.folder.name,
