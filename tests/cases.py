@@ -43,8 +43,9 @@ What warpir promises:
 
 1. A bad input ends the run within seconds, with one sentence that names the file or flag, what was
    found and what was expected. Never a traceback, never a wrong picture.
-2. Results that existed before a failed run are byte-identical afterwards. A folder that contains
-   `run.json` holds a complete result.
+2. A folder that contains `run.json` holds a complete result. Results that existed before a failed
+   run are byte-identical afterwards; only a run that is killed, or whose disk fails, while it puts
+   complete files in their place (`--overwrite`) leaves a folder without `run.json` instead.
 3. An interrupted run continues from its last checkpoint and gives the result the uninterrupted run
    would have given. A resume that cannot do that is refused; it never restarts silently.
 4. No network, no code from data files, no pickle, no shell, unless a flag named for it is given.

@@ -35,7 +35,8 @@ from warpir.core.signals import Stopped
 if TYPE_CHECKING:
     from warpir.app.inputs import Inputs, Loaders
     from warpir.app.record import Timings
-    from warpir.io.results import Layers, OutputFolder
+    from warpir.io.layers import Layers
+    from warpir.io.results import OutputFolder
     from warpir.lighting.scene_light import SceneLight
     from warpir.render.composite import Picture
     from warpir.report.page import Results
@@ -72,7 +73,7 @@ class Insertion:
         Raises:
             InputError: It is not there, or damaged.
         """
-        from warpir.io.results import read_layers
+        from warpir.io.layers import read_layers
 
         told = self.record.get("config", {})  # that of a sequence has none
         return read_layers(self.out / "layers.exr", told.get("max_pixels", LIMITS.pixels))
@@ -119,13 +120,10 @@ def _say_what_is_kept(config: InsertConfig, error: BaseException) -> None:
 
 def _insert_sequence(config: InsertConfig, renews: bool) -> Insertion:
     from warpir.app.inputs import Loaders
-    from warpir.io.results import finish_results
     from warpir.sequence.frames import SUMMARY, read_sequence, write_summary
     from warpir.sequence.page import PAGE, refuse_other_page, write_sequence_report
 
     assert config.output.out is not None
-    for folder in sorted(Path(config.output.out).glob("[0-9][0-9][0-9][0-9]")):
-        finish_results(folder)
     loaders = Loaders()
     frames = read_sequence(config, loaders, renews=renews)
     refuse_other_page(config)
@@ -509,8 +507,8 @@ def _write(
     """
     from warpir.app.record import config_of_picture
     from warpir.io.curves_file import curves_to_json
+    from warpir.io.layers import write_layers
     from warpir.io.lobes_file import lobes_to_json
-    from warpir.io.results import write_layers
     from warpir.render.composite import as_file_map, balls
     from warpir.report.page import Results
     from warpir.scene.light import summarize

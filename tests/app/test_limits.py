@@ -262,7 +262,7 @@ OUTS = {
     "F5-long-name": Out("n" * 300, 5, ("name too long",)),
     "F5-full-disk": Out("new", 5, ("new", "found 1 MiB free; expected about"), before=FULL),
     **{f"F5-link-{name}": Out("linked", 7, (f"linked/{name}: a link",), linked(name))
-       for name in ("progress", "checkpoints", "mitsuba", ".ready")},
+       for name in ("progress", "checkpoints", "mitsuba")},
     "F5-existing-results": Out("done", 7, ("already holds files", "run.json"), results),
 }  # fmt: skip
 

@@ -13,7 +13,8 @@ from tests.builders.poses import points_in_view, pose, write_json
 from warpir.core.errors import ExitCode, InputError
 from warpir.io.cameras.reader import read_photo_camera
 from warpir.io.cameras.source import PhotoCamera
-from warpir.io.results import OutputFolder, write_layers
+from warpir.io.layers import write_layers
+from warpir.io.results import OutputFolder
 from warpir.scene.camera import Camera
 
 PIXEL = 1e-3

@@ -22,7 +22,8 @@ from warpir.core.atomic import restore_folders, write_folder
 from warpir.core.errors import ExitCode, InputError
 from warpir.io import results as files
 from warpir.io.images.photos import read_envmap, read_photo
-from warpir.io.results import BACKGROUND_DEPTH, Layers, OutputFolder, read_layers, write_layers
+from warpir.io.layers import BACKGROUND_DEPTH, Layers, read_layers, write_layers
+from warpir.io.results import OutputFolder
 from warpir.scene.camera import Camera, camera_from_fov
 
 
@@ -83,9 +84,7 @@ def write_nested(folder: Path, name: str, overwrite: bool = False) -> None:
         out.write_json("run.json", {})
 
 
-def test_files_in_a_folder_follow_the_same_rules(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_files_in_a_folder_follow_the_same_rules(tmp_path: Path) -> None:
     """Listed, replaced, taken away with their empty folder, left alone when a run fails."""
     folder = tmp_path / "out"
     write_nested(folder, "a.bin")
@@ -94,17 +93,12 @@ def test_files_in_a_folder_follow_the_same_rules(
     write_nested(folder, "b.bin", overwrite=True)
     assert os.listdir(folder / "sub") == ["b.bin"]
 
-    rename = Path.rename
-
-    def no_space(source: Path, target: Path) -> Path:
-        if source.parent.name == ".ready" and source.name == "run.json":
-            raise OSError(28, "No space left on device")
-        return rename(source, target)
-
-    with monkeypatch.context() as patched, pytest.raises(InputError):
-        patched.setattr(Path, "rename", no_space)
+    (folder / "sub" / "c.bin").mkdir()
+    with pytest.raises(InputError, match="a folder in place of a file"):
         write_nested(folder, "c.bin", overwrite=True)
-    assert os.listdir(folder / "sub") == ["b.bin"]
+    assert sorted(os.listdir(folder / "sub")) == ["b.bin", "c.bin"]
+    assert json.loads((folder / "run.json").read_text())["files"].keys() == {"top.bin", "sub/b.bin"}
+    (folder / "sub" / "c.bin").rmdir()
     (folder / "sub" / "mine.txt").write_text("mine")
     write_small(folder, overwrite=True)
     assert os.listdir(folder / "sub") == ["mine.txt"]
@@ -144,23 +138,31 @@ def test_failed_run_leaves_everything_as_it_was(tmp_path: Path, existing: bool) 
 
 
 @pytest.mark.case("R4")
-def test_failed_rename_is_undone(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.mark.parametrize("failing", ["camera.json", "run.json"])
+def test_failed_rename_leaves_no_result(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, failing: str
+) -> None:
+    """Once the old ``run.json`` is gone there is none, and of the new files none either."""
     folder = tmp_path / "out"
     write_small(folder)
-    before = sha256s(folder)
-    rename = Path.rename
+    (folder / "notes.txt").write_text("mine")
+    replace = os.replace
 
-    def no_space(source: Path, target: Path) -> Path:
-        if source.parent.name == ".ready" and source.name == "run.json":
+    def no_space(source: Path, target: Path) -> None:
+        if Path(target) == folder / failing:
             raise OSError(28, "No space left on device")
-        return rename(source, target)
+        replace(source, target)
 
-    monkeypatch.setattr(Path, "rename", no_space)
-    with pytest.raises(InputError) as caught:
-        write_small(folder, seed=1, overwrite=True)
+    with monkeypatch.context() as patch:
+        patch.setattr(os, "replace", no_space)
+        with pytest.raises(InputError) as caught:
+            write_small(folder, seed=1, overwrite=True)
     assert caught.value.code == ExitCode.RESOURCES
-    assert sha256s(folder) == before
-    assert sorted(os.listdir(folder)) == sorted(before)
+    left = set(os.listdir(folder))
+    assert "notes.txt" in left and "run.json" not in left and ".lock" not in left
+    assert not any(name.startswith(".partial") for name in left)
+    write_small(folder, seed=1, overwrite=True)
+    assert json.loads((folder / "run.json").read_text())["seed"] == 1
 
 
 @pytest.mark.case("F6")

@@ -28,7 +28,7 @@ from warpir.app.command import parse
 from warpir.app.config import InsertConfig
 from warpir.core.errors import ExitCode, InputError
 from warpir.insert import main
-from warpir.io.results import BACKGROUND_DEPTH, read_layers
+from warpir.io.layers import BACKGROUND_DEPTH, read_layers
 from warpir.report import page as report
 from warpir.report.command import main as remake
 from warpir.report.command import read_results

@@ -22,7 +22,7 @@ import pytest
 from tests.builders.browser import Fingers, Opened, needs_chromium, open_browser
 from tests.builders.faults import NO_TORCH, assert_fails, run_case
 from warpir.core.errors import InputError
-from warpir.io.results import png_bytes
+from warpir.io.images.writers import png_bytes
 from warpir.study.answers import AUTOMATED, BROWSER, parse_sheet
 from warpir.study.command import main
 from warpir.study.images import neutral_png, read_image, upside_down

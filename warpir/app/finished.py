@@ -14,7 +14,7 @@ from warpir.app.model_files import model_hashes
 from warpir.app.record import file_hash, input_files
 from warpir.app.reuse import check_files, run_record
 from warpir.core.errors import ExitCode, InputError
-from warpir.io.results import is_ready, results_in
+from warpir.io.results import results_in
 
 
 class OtherRun(InputError):
@@ -38,7 +38,7 @@ def is_done(config: InsertConfig, filled: InsertConfig | None = None) -> bool:
     out = Path(config.output.out)
     if out.is_symlink():
         raise _something_else(out, "a link")
-    if config.output.overwrite or not out.is_dir() or is_ready(out):
+    if config.output.overwrite or not out.is_dir():
         return False
     if not (out / "run.json").exists():
         if results_in(out):

@@ -33,7 +33,7 @@ from warpir.core.memory import free_host
 from warpir.core.progress import duration
 from warpir.core.signals import Stopped, whole
 from warpir.core.strict_json import read_json_object
-from warpir.io.results import locked
+from warpir.io.folder_lock import locked
 
 FORMAT, VERSION = "warpir-batch", 1
 SUMMARY, FAILURES, LOGS = "batch.json", "failures.jsonl", "logs"

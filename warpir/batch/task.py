@@ -25,7 +25,7 @@ from warpir.core import signals
 from warpir.core.errors import ExitCode, InputError, disk_error
 from warpir.core.memory import lacked_memory, release
 from warpir.insert import insert, needs_of
-from warpir.io.results import OutputFolder, finish_results
+from warpir.io.results import OutputFolder
 from warpir.lighting.scene_light import make_light
 from warpir.sequence.frames import Frame, is_whole, read_sequence
 from warpir.sequence.page import refuse_other_page
@@ -193,7 +193,6 @@ def _insert(task: Task) -> dict[str, Any]:
         insert(config, renews=True)
         return {"how": "done"}
     out = Path(config.output.out)
-    finish_results(out)
     is_fresh = replaces = config.output.overwrite
     try:
         if is_done(config, _filled(config)):

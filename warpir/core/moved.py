@@ -16,6 +16,7 @@ MOVED = {
     "color": "core.color",
     "config": "app.config",
     "curves": "scene.tone_curves",
+    "files": "io.layers",
     "fusion": "lighting.fusion",
     "inputs": "app.inputs",
     "integrator": "render.integrator",

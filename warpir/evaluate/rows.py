@@ -27,7 +27,8 @@ from warpir.diffusion.embedded import build_network, save_embedded
 from warpir.evaluate.scenes import Place, Subject, mirrored
 from warpir.evaluate.stage import Prediction, Stage
 from warpir.io.images.photos import Photo, read_photo
-from warpir.io.results import OutputFolder, png_bytes
+from warpir.io.images.writers import png_bytes
+from warpir.io.results import OutputFolder
 from warpir.lighting.fit import fit_lobes
 from warpir.lighting.regressor import Regressor, mean_training_light, random_regressor, regress
 from warpir.lighting.scene_light import make_light

@@ -17,7 +17,8 @@ from warpir.core.arrays import Float64Array, FloatArray
 from warpir.io.gltf.writer import write_glb
 from warpir.io.images.envmap_conventions import from_ours
 from warpir.io.images.photos import Photo
-from warpir.io.results import HALF_MAX, OutputFolder
+from warpir.io.layers import HALF_MAX
+from warpir.io.results import OutputFolder
 from warpir.scene.asset import Asset
 from warpir.scene.camera import Camera, blender_camera, square_pixel_error
 from warpir.scene.placement import Placement, y_to

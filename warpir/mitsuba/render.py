@@ -30,7 +30,7 @@ from warpir.io.cameras.reader import read_camera
 from warpir.io.curves_file import read_curves
 from warpir.io.export import OBJECT
 from warpir.io.images.photos import read_envmap
-from warpir.io.results import png_bytes
+from warpir.io.images.writers import png_bytes
 from warpir.mitsuba.light import LatlongEmitter
 from warpir.mitsuba.material import GltfBSDF
 from warpir.mitsuba.path import RAY_OFFSET, GltfPath, intersect

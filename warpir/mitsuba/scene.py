@@ -18,7 +18,8 @@ from warpir.core.arrays import CodeArray, Float64Array, FloatArray, IntArray
 from warpir.core.color import linear_to_srgb, srgb_to_linear
 from warpir.io.export import OBJECT
 from warpir.io.images.envmap_conventions import read_map
-from warpir.io.results import OutputFolder, png_bytes
+from warpir.io.images.writers import png_bytes
+from warpir.io.results import OutputFolder
 from warpir.scene.asset import Asset, Material, Primitive, Texture, TextureSlot
 from warpir.scene.camera import Camera, mitsuba_sensor
 

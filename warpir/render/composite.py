@@ -10,7 +10,7 @@ from warpir.app.inputs import Inputs
 from warpir.core.arrays import BoolArray, CodeArray, FloatArray, IntArray
 from warpir.core.color import linear_to_gamma
 from warpir.io.images.photos import Photo
-from warpir.io.results import Layers
+from warpir.io.layers import Layers
 from warpir.render.device_scene import Placed, Proxy, Scene
 from warpir.render.renderer import Foreground, GBuffer, Renderer, light_args
 from warpir.scene.camera import Camera

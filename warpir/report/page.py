@@ -21,7 +21,8 @@ from warpir.app.record import name_of
 from warpir.core.arrays import CodeArray, FloatArray
 from warpir.core.limits import LIMITS
 from warpir.core.strict_json import read_json_object
-from warpir.io.results import Layers, OutputFolder
+from warpir.io.layers import Layers
+from warpir.io.results import OutputFolder
 from warpir.report.facts import (
     about_file,
     command_line,

@@ -20,7 +20,7 @@ from PIL import Image
 from warpir.core.arrays import BoolArray, CodeArray, FloatArray
 from warpir.core.color import linear_to_gamma, luminance
 from warpir.io.images.decoder import decode_image
-from warpir.io.results import Layers
+from warpir.io.layers import Layers
 
 Box = tuple[int, int, int, int]
 """Left, top, right, bottom, half-open [px]."""

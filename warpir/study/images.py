@@ -12,7 +12,7 @@ from warpir.core.arrays import PixelArray
 from warpir.core.errors import InputError
 from warpir.core.limits import LIMITS
 from warpir.io.images.photos import read_photo
-from warpir.io.results import png_bytes
+from warpir.io.images.writers import png_bytes
 
 CHANGED_CODES = 8
 """Smallest difference from the photo that counts as changed, of 255: above what JPEG adds."""
