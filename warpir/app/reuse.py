@@ -21,7 +21,7 @@ from warpir.core.limits import LIMITS, Limits
 from warpir.core.strict_json import read_json_object
 from warpir.io.cameras.source import rigid
 from warpir.io.curves_file import read_curves
-from warpir.io.images.decoder import check_regular_file
+from warpir.io.images.kinds import check_regular_file
 from warpir.io.images.photos import read_envmap
 from warpir.io.meshes.materials_file import MATERIALS
 from warpir.scene.light import Light

@@ -25,7 +25,7 @@ from warpir.core.errors import InputError, raise_all
 from warpir.core.limits import LIMITS
 from warpir.core.strict_json import read_json_object
 from warpir.evaluate.three_spheres import from_camera_frame, lookup_matrix
-from warpir.io.images.decoder import check_regular_file
+from warpir.io.images.kinds import check_regular_file
 from warpir.io.images.photos import read_envmap
 from warpir.io.results import OutputFolder
 from warpir.scene.camera import Camera

@@ -9,26 +9,22 @@ inside the functions that need it, to keep start-up short.
 import logging
 import os
 import re
-import stat
-import struct
 import tempfile
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager, suppress
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from warpir.core import color
 from warpir.core.arrays import FloatArray, PixelArray
 from warpir.core.errors import ExitCode, InputError
+from warpir.core.limits import LIMITS
+from warpir.io.images.headers import exposure, header_notices, stated_primaries
+from warpir.io.images.kinds import KINDS, check_regular_file, sniff
 
 _LOG = logging.getLogger(__name__)
-
-
-EXPOSURE_LIMIT = 1e12
-"""Largest product of a Radiance file's exposures, and its inverse the least [1]."""
 
 
 @dataclass(frozen=True)
@@ -46,112 +42,16 @@ class DecodedImage:
     focal_35mm: float | None
     notices: tuple[str, ...]
 
-
-def check_regular_file(path: Path) -> int:
-    """Return the size of a regular file [byte], before any library opens it (a FIFO blocks).
-
-    Raises:
-        InputError: Missing, a folder, a device, empty, or not readable.
-    """
-    try:
-        status = path.stat()
-    except FileNotFoundError as error:
-        raise InputError(path, "no such file") from error
-    except (OSError, ValueError) as error:  # ValueError: a name that no file can have
-        reason = error.strerror if isinstance(error, OSError) else "not a file name"
-        raise InputError(path, f"not a regular file ({reason})") from error
-    if not stat.S_ISREG(status.st_mode):
-        kind = "a folder" if stat.S_ISDIR(status.st_mode) else "a device, pipe or socket"
-        raise InputError(path, f"not a regular file (found {kind})")
-    if status.st_size == 0:
-        raise InputError(path, "empty file")
-    return status.st_size
-
-
-def _sniff(path: Path) -> tuple[str, bytes]:
-    """Return the kind of image by its magic bytes, and the first 64 KiB."""
-    try:
-        with path.open("rb") as stream:
-            head = stream.read(65536)
-    except OSError as error:
-        raise InputError(path, f"cannot be read ({error.strerror})") from error
-    if head.startswith(b"\xff\xd8\xff"):
-        return "jpeg", head
-    if head.startswith(b"\x89PNG\r\n\x1a\n"):
-        return "png", head
-    if head[:4] in (b"II*\0", b"MM\0*", b"II+\0", b"MM\0+"):
-        if _is_raw_tiff(head):
-            what = "a camera raw file (what it holds as a picture is a thumbnail)"
-            raise InputError(path, what, "export it as JPEG or 16-bit TIFF")
-        return "tiff", head
-    if head.startswith(b"RIFF") and head[8:12] == b"WEBP":
-        return "webp", head
-    if head.startswith(b"\x76\x2f\x31\x01"):
-        return "exr", head
-    if head.startswith((b"#?RADIANCE", b"#?RGBE")):
-        return "hdr", head
-    found = _foreign_kind(head)
-    raise InputError(
-        path,
-        f"not an image that warpir reads ({f'found {found}; ' if found else ''}"
-        "expected JPEG, PNG, TIFF, WebP, EXR or Radiance HDR)",
-        "export it as JPEG or 16-bit TIFF" if found else "",
-    )
-
-
-_FOREIGN_KINDS = {
-    "camera raw": (b"IIRO", b"IIRS", b"MMOR", b"IIU\0", b"FUJIFILMCCD-RAW", b"FOVb"),
-    "JPEG XL": (b"\xff\x0a", b"\0\0\0\x0cJXL "),
-    "JPEG 2000": (b"\0\0\0\x0cjP  ", b"\xff\x4f\xff\x51"),
-    "GIF": (b"GIF8",),
-    "BMP": (b"BM",),
-    "Photoshop": (b"8BPS",),
-    "PDF": (b"%PDF",),
-    "PostScript": (b"%!PS",),
-}
-_BRANDS = {b"avif": "AVIF", b"avis": "AVIF", b"crx ": "camera raw"}
-_NEW_SUBFILE_TYPE, _DNG_VERSION = 254, 50706
-"""TIFF tags; bit 0 of the first says that a picture is a reduced version of another."""
-
-
-def _foreign_kind(head: bytes) -> str:
-    """Return the name of a kind of image that people have but that is not read, or nothing."""
-    if head[4:8] == b"ftyp":
-        return _BRANDS.get(head[8:12], "HEIC")
-    return next((name for name, starts in _FOREIGN_KINDS.items() if head.startswith(starts)), "")
-
-
-def _is_raw_tiff(head: bytes) -> bool:
-    """Tell camera raw by its first directory: what a TIFF reader shows of it is a thumbnail."""
-    if head[8:10] == b"CR":  # Canon CR2
-        return True
-    order = "<" if head[:2] == b"II" else ">"
-    try:
-        (start,) = struct.unpack_from(f"{order}I", head, 4)
-        (count,) = struct.unpack_from(f"{order}H", head, start)
-        for k in range(count):
-            tag, _, _, value = struct.unpack_from(f"{order}HHII", head, start + 2 + 12 * k)
-            if tag == _DNG_VERSION or (tag == _NEW_SUBFILE_TYPE and value & 1):
-                return True
-    except struct.error:  # a directory behind the head: not how cameras write
-        pass
-    return False
-
-
-_OIIO_NAMES = {
-    "jpeg": "jpeg",
-    "png": "png",
-    "tiff": "tiff",
-    "webp": "webp",
-    "exr": "openexr",
-    "hdr": "hdr",
-}
+    @property
+    def is_grey(self) -> bool:
+        """Whether there is one channel, not three."""
+        return self.pixels.shape[-1] == 1
 
 
 def decode_image(
     path: Path,
     max_pixels: int,
-    kinds: tuple[str, ...] = tuple(_OIIO_NAMES),
+    kinds: tuple[str, ...] = KINDS,
     layer: str | None = None,
     flag: str = "--max-pixels",
 ) -> DecodedImage:
@@ -160,7 +60,7 @@ def decode_image(
     Args:
         path: The file; recognised by content, not by name.
         max_pixels: Largest image decoded [px].
-        kinds: What is accepted, of the kinds that `DecodedImage.kind` names.
+        kinds: What is accepted, of `KINDS`.
         layer: Of an EXR, the layer or part whose R, G and B are read.
         flag: What raises ``max_pixels``.
 
@@ -169,82 +69,41 @@ def decode_image(
             that is not supported.
     """
     check_regular_file(path)
-    kind, head = _sniff(path)
+    kind, head = sniff(path)
     if kind not in kinds:
-        raise InputError(
-            path,
-            f"not of a kind that can be used here (found {kind}; expected {' or '.join(kinds)})",
-        )
-    try:
-        str(path).encode()
-    except UnicodeEncodeError as error:
-        what = "its name is not UTF-8, which the decoder needs"
-        raise InputError(path, what, "rename it") from error
-    import OpenImageIO as oiio
-
+        what = f"not of a kind that can be used here (found {kind}; expected {' or '.join(kinds)})"
+        raise InputError(path, what, reason="image.kind", found=kind)
+    file = _File(path, kind, max_pixels, flag)
     # 64 bytes a pixel leave room for EXR layers; sizes are compared exactly below.
-    _limit_bytes(max_pixels * 64)
-    hints = oiio.ImageSpec()
-    hints.attribute("oiio:UnassociatedAlpha", 1)
-    with captured_stderr():
-        reader = oiio.ImageInput.open(str(path), hints)
-        if reader is None:
-            raise _unreadable(path, kind, library_error(oiio), max_pixels, flag)
-        try:
-            if reader.format_name() != _OIIO_NAMES[kind]:
-                raise InputError(
-                    path,
-                    f"content contradicts itself (found {kind} magic bytes, "
-                    f"read as {reader.format_name()})",
-                )
-            specs, error_text = _parts(reader, kind)
-            if _is_too_large(error_text):
-                raise _unreadable(path, kind, error_text, max_pixels, flag)
-            part, channels, alpha = _choose_channels(path, kind, specs, layer)
-            spec = specs[part]
-            for other in specs:
-                _check_size(path, other, max_pixels, flag)
-            _check_spec(path, spec)
-            wanted = channels if alpha is None else [*channels, alpha]
-            first, last = min(wanted), max(wanted) + 1
-            try:
-                pixels = reader.read_image(part, 0, first, last, spec.format)
-            except MemoryError as error:
-                raise InputError(
-                    path, "not enough memory to decode it", code=ExitCode.RESOURCES
-                ) from error
-            error_text = library_error(reader)
-            if pixels is None or error_text:
-                raise _unreadable(path, kind, error_text, max_pixels, flag)
-            notices = _header_notices(spec, kind, head)
-            notices += _check_parts(path, reader, specs, part, kind)
-        finally:
-            reader.close()
+    with _opened(file, 64, {"oiio:UnassociatedAlpha": 1}) as reader:
+        specs = _readable_parts(file, reader)
+        part, channels, alpha = _choose_channels(path, kind, specs, layer)
+        spec = specs[part]
+        for other in specs:
+            file.check_size(other)
+        _check_spec(path, spec)
+        wanted = channels if alpha is None else [*channels, alpha]
+        first, last = min(wanted), max(wanted) + 1
+        pixels = _read_pixels(file, reader, part, first, last, spec.format)
+        notices = header_notices(spec, kind, head)
+        notices += _check_parts(path, reader, specs, part, kind)
     pixels = np.asarray(pixels).reshape(spec.height, spec.width, last - first)
     if kind == "exr":
         pixels = _place_in_display_window(pixels, spec)
     if kind == "hdr":
-        pixels = pixels / np.float32(_exposure(path, head))
+        pixels = pixels / np.float32(exposure(path, head))
     primaries = None
     if pixels.dtype.kind == "f":
-        primaries, unknown = _stated_primaries(spec, kind, head)
+        primaries, unknown = stated_primaries(spec, kind, head)
         notices += unknown
-    profile = spec.getattribute("ICCProfile")
-    if not isinstance(profile, bytes | np.ndarray):  # an EXR may call anything so
-        profile = None
-    # Tags of another type than they should have come back as the default.
-    focal = spec.get_float_attribute("Exif:FocalLengthIn35mmFilm", 0.0)
-    chosen: Any = [channel - first for channel in channels]
-    if chosen == [*range(chosen[0], chosen[0] + len(chosen))]:
-        chosen = slice(chosen[0], chosen[0] + len(chosen))  # no copy
     return DecodedImage(
-        pixels=pixels[..., chosen],
+        pixels=_some_channels(pixels, [channel - first for channel in channels]),
         alpha=pixels[..., alpha - first] if alpha is not None else None,
         kind=kind,
         orientation=spec.get_int_attribute("Orientation", 1),
-        icc=bytes(profile) if profile is not None else None,
+        icc=_profile(spec),
         primaries=primaries,
-        focal_35mm=focal if 1.0 <= focal <= 10000.0 else None,
+        focal_35mm=_focal_35mm(spec),
         notices=tuple(notices),
     )
 
@@ -256,14 +115,8 @@ def read_exr_header(path: Path, names: Sequence[str]) -> dict[str, Any]:
         InputError: Missing or not an EXR file.
     """
     check_regular_file(path)
-    import OpenImageIO as oiio
-
-    with captured_stderr():
-        reader = oiio.ImageInput.open(str(path))
-        if reader is None or reader.format_name() != "openexr":
-            raise InputError(path, f"not an EXR file ({library_error(oiio)[:80]})")
+    with _opened(_File(path, "exr", LIMITS.pixels)) as reader:
         spec = reader.spec()
-        reader.close()
     attributes = {name: spec.getattribute(name) for name in names}
     return {"size": (spec.full_width, spec.full_height), **attributes}
 
@@ -279,56 +132,153 @@ def read_exr_channels(path: Path, max_pixels: int) -> dict[str, FloatArray]:
         InputError: Missing, not an EXR file, too large, deep, truncated or corrupt.
     """
     check_regular_file(path)
-    import OpenImageIO as oiio
-
+    file = _File(path, "exr", max_pixels)
     # 256 bytes a pixel: all layers of a run take 136 in float32.
-    _limit_bytes(max_pixels * 256)
-    with captured_stderr():
-        reader = oiio.ImageInput.open(str(path))
-        if reader is None or reader.format_name() != "openexr":
-            raise InputError(path, f"not an EXR file ({library_error(oiio)[:80]})")
-        try:
-            spec = reader.spec()
-            _check_size(path, spec, max_pixels, "--max-pixels")
-            _check_spec(path, spec)
-            pixels = reader.read_image(0, 0, 0, spec.nchannels, "float")
-            error_text = library_error(reader)
-        finally:
-            reader.close()
-    if pixels is None or error_text:
-        raise _unreadable(path, "exr", error_text, max_pixels, "--max-pixels")
+    with _opened(file, 256) as reader:
+        spec = reader.spec()
+        file.check_size(spec)
+        _check_spec(path, spec)
+        pixels = _read_pixels(file, reader, 0, 0, spec.nchannels, "float")
     return {name: pixels[..., k] for k, name in enumerate(spec.channelnames)}
 
 
-def _limit_bytes(count: int) -> None:
-    """Tell the library the most that an image may take [byte]."""
+@dataclass(frozen=True)
+class _File:
+    """A file that is being decoded, for its checks and errors."""
+
+    path: Path
+    kind: str
+    max_pixels: int
+    flag: str = "--max-pixels"
+
+    def check_size(self, spec: Any) -> None:
+        """Refuse an image or a part that is too large, before a pixel is decoded."""
+        for width, height in ((spec.width, spec.height), (spec.full_width, spec.full_height)):
+            if width * height > self.max_pixels:
+                raise InputError(
+                    self.path,
+                    f"too large (found {width} x {height} pixels; limit {self.max_pixels}); "
+                    f"{self.flag} raises it",
+                    reason="image.too_large",
+                    found=(width, height),
+                    limit=self.max_pixels,
+                )
+
+    def unreadable(self, text: str) -> InputError:
+        """Return the error of a failure of the decoder, from its own text."""
+        if _is_too_large(text):
+            return InputError(
+                self.path,
+                f"the header claims too large an image ({one_line(text)}; "
+                f"limit {self.max_pixels} pixels); {self.flag} raises it if the file is sound",
+                reason="image.too_large",
+                limit=self.max_pixels,
+            )
+        if self.kind == "hdr" and "FORMAT" in text:
+            what = "not 32-bit_rle_rgbe (XYZE files are not supported)"
+            return InputError(
+                self.path, what, "save it as RGBE .hdr or as EXR", reason="image.variant"
+            )
+        why = one_line(text) or "the decoder gave no reason"
+        return InputError(
+            self.path,
+            f"truncated, corrupt or of an unsupported variant of {self.kind} ({why})",
+            "check that the file was copied or downloaded completely",
+            reason="image.damaged",
+            found=why,
+        )
+
+
+_ARTICLES = {"exr": "an EXR", "hdr": "a Radiance HDR", "jpeg": "a JPEG", "png": "a PNG"}
+_ARTICLES |= {"tiff": "a TIFF", "webp": "a WebP"}
+
+
+@contextmanager
+def _opened(
+    file: _File, bytes_per_pixel: int = 64, hints: Mapping[str, int] | None = None
+) -> Iterator[Any]:
+    """Yield the library's reader of a file; what C libraries print meanwhile is not shown.
+
+    Args:
+        file: Which; its name must be UTF-8.
+        bytes_per_pixel: Most that the image may take.
+        hints: Of OpenImageIO, by name.
+
+    Raises:
+        InputError: The library does not know it, or takes it for another kind.
+    """
+    try:
+        str(file.path).encode()
+    except UnicodeEncodeError as error:
+        what = "its name is not UTF-8, which the decoder needs"
+        raise InputError(file.path, what, "rename it", reason="image.name") from error
     import OpenImageIO as oiio
 
-    oiio.attribute("limits:imagesize_MB", min(max(64, count // 2**20), 2**31 - 1))
+    megabytes = file.max_pixels * bytes_per_pixel // 2**20
+    oiio.attribute("limits:imagesize_MB", min(max(64, megabytes), 2**31 - 1))
+    spec = oiio.ImageSpec()
+    for name, value in (hints or {}).items():
+        spec.attribute(name, value)
+    with captured_stderr():
+        reader = oiio.ImageInput.open(str(file.path), spec)
+        if reader is None:
+            raise file.unreadable(library_error(oiio))
+        try:
+            name = reader.format_name()
+            if name != {"exr": "openexr"}.get(file.kind, file.kind):
+                what = f"not {_ARTICLES[file.kind]} file (the library reads it as {name})"
+                raise InputError(file.path, what, reason="image.kind", found=name)
+            yield reader
+        finally:
+            reader.close()
 
 
-def _parts(reader: Any, kind: str) -> tuple[list[Any], str]:
-    """Return the headers of an EXR's parts, as far as they are readable; of others, the first.
-
-    And what was wrong with the next one, if anything.
-    """
+def _readable_parts(file: _File, reader: Any) -> list[Any]:
+    """Return the headers of an EXR's parts, as far as they are readable; of others, the first."""
     specs = [reader.spec()]
-    while kind == "exr" and reader.seek_subimage(len(specs), 0):
+    while file.kind == "exr" and reader.seek_subimage(len(specs), 0):
         specs.append(reader.spec())
     text = library_error(reader)
     reader.seek_subimage(0, 0)
-    return specs, text
+    if _is_too_large(text):
+        raise file.unreadable(text)
+    return specs
 
 
-def _check_size(path: Path, spec: Any, max_pixels: int, flag: str) -> None:
-    """Refuse an image or a part that is too large, before a pixel is decoded."""
-    for width, height in ((spec.width, spec.height), (spec.full_width, spec.full_height)):
-        if width * height > max_pixels:
-            raise InputError(
-                path,
-                f"too large (found {width} x {height} pixels; limit {max_pixels}); "
-                f"{flag} raises it",
-            )
+def _read_pixels(
+    file: _File, reader: Any, part: int, first: int, last: int, kind: Any
+) -> PixelArray:
+    """Return some channels of a part in one pixel type, shape [height, width, last - first]."""
+    try:
+        pixels = reader.read_image(part, 0, first, last, kind)
+    except MemoryError as error:
+        what = "not enough memory to decode it"
+        code = ExitCode.RESOURCES
+        raise InputError(file.path, what, code=code, reason="image.memory") from error
+    text = library_error(reader)
+    if pixels is None or text:
+        raise file.unreadable(text)
+    read: PixelArray = pixels
+    return read
+
+
+def _some_channels(pixels: PixelArray, channels: list[int]) -> PixelArray:
+    """Return some channels; no copy where they follow each other."""
+    if channels == [*range(channels[0], channels[0] + len(channels))]:
+        return pixels[..., channels[0] : channels[0] + len(channels)]
+    return pixels[..., channels]
+
+
+def _profile(spec: Any) -> bytes | None:
+    profile = spec.getattribute("ICCProfile")
+    # An EXR may call anything so.
+    return bytes(profile) if isinstance(profile, bytes | np.ndarray) else None
+
+
+def _focal_35mm(spec: Any) -> float | None:
+    # A tag of another type than it should have comes back as the default.
+    focal = float(spec.get_float_attribute("Exif:FocalLengthIn35mmFilm", 0.0))
+    return focal if 1.0 <= focal <= 10000.0 else None
 
 
 def _check_spec(path: Path, spec: Any) -> None:
@@ -336,17 +286,22 @@ def _check_spec(path: Path, spec: Any) -> None:
     import OpenImageIO as oiio
 
     if spec.deep:
-        raise InputError(path, "deep EXR images are not supported", "flatten it first")
+        what = "deep EXR images are not supported"
+        raise InputError(path, what, "flatten it first", reason="image.variant", found="deep")
     if spec.depth > 1:
-        raise InputError(path, "volume images are not supported")
+        what = "volume images are not supported"
+        raise InputError(path, what, reason="image.variant", found="volume")
     if spec.format.basetype not in (oiio.UINT8, oiio.UINT16, oiio.HALF, oiio.FLOAT, oiio.DOUBLE):
         raise InputError(
             path,
             f"pixel type not supported (found {spec.format}; expected unsigned integers of 8 or "
             "16 bits, or floats)",
+            reason="image.variant",
+            found=str(spec.format),
         )
     if "LAB" in str(spec.getattribute("tiff:ColorSpace") or "").upper():
-        raise InputError(path, "CIE Lab images are not supported", "save it as RGB")
+        what = "CIE Lab images are not supported"
+        raise InputError(path, what, "save it as RGB", reason="image.variant", found="Lab")
 
 
 def _choose_channels(
@@ -354,7 +309,8 @@ def _choose_channels(
 ) -> tuple[int, list[int], int | None]:
     """Return the part, its colour channels, 3 or 1, and its alpha channel."""
     if layer is not None and kind != "exr":
-        raise InputError(path, f"has no layers (found {kind}; expected EXR)", "leave --layer out")
+        what = f"has no layers (found {kind}; expected EXR)"
+        raise InputError(path, what, "leave --layer out", reason="image.layer", found=kind)
     if kind != "exr":
         spec = specs[0]
         alpha = spec.alpha_channel if spec.alpha_channel >= 0 else None
@@ -364,7 +320,8 @@ def _choose_channels(
             # Such as a palette with alpha, whose codes OpenImageIO mixes up.
             found = ", ".join(spec.channelnames[:24])
             what = f"a variant of {kind} that is not supported (found channels {found})"
-            raise InputError(path, what, "save it as RGB or greyscale")
+            advice = "save it as RGB or greyscale"
+            raise InputError(path, what, advice, reason="image.channels", found=found)
         return 0, [0], alpha
     for wanted in (("r", "g", "b"), ("y",)):
         for part, spec in enumerate(specs):
@@ -372,7 +329,8 @@ def _choose_channels(
             is_part = layer is not None and _part_name(spec) == layer
             prefix = "" if layer is None or is_part else f"{layer.lower()}."
             if {f"{prefix}ry", f"{prefix}by"} & set(names):
-                raise InputError(path, "luminance/chroma EXR is not supported", "save it as RGB")
+                what = "luminance/chroma EXR is not supported"
+                raise InputError(path, what, "save it as RGB", reason="image.channels")
             if all(prefix + name in names for name in wanted):
                 colors = [names.index(prefix + name) for name in wanted]
                 alpha = names.index(f"{prefix}a") if f"{prefix}a" in names else None
@@ -386,90 +344,13 @@ def _choose_channels(
         path,
         f"{what} (found {', '.join(names[:24])}; expected {expected})",
         f"layers that it has: {', '.join(sorted(layers)[:12])} (--layer)" if layers else "",
+        reason="image.channels" if layer is None else "image.layer",
+        found=names[:24],
     )
 
 
 def _part_name(spec: Any) -> str:
     return str(spec.getattribute("oiio:subimagename") or "")
-
-
-def _exposure(path: Path, head: bytes) -> float:
-    """Return by what the values of a Radiance file were multiplied [1].
-
-    Every program on the way adds its line; OpenImageIO knows the last one alone.
-    """
-    exposure = 1.0
-    for line in _radiance_lines(head, b"EXPOSURE"):
-        try:
-            exposure *= float(line)
-        except ValueError:
-            exposure = np.nan
-    if not 1.0 / EXPOSURE_LIMIT <= exposure <= EXPOSURE_LIMIT:
-        expected = f"{1.0 / EXPOSURE_LIMIT:g} to {EXPOSURE_LIMIT:g}"
-        what = f"EXPOSURE is not such a number (found {exposure:g}; expected {expected})"
-        raise InputError(path, what, "correct or remove the EXPOSURE lines of its header")
-    return exposure
-
-
-def _radiance_lines(head: bytes, name: bytes) -> list[bytes]:
-    """Return the values of all lines of one name in the header of a Radiance file."""
-    header = re.split(rb"\r?\n\r?\n", head, maxsplit=1)[0]
-    return re.findall(rb"\n" + name + rb"=([^\r\n]*)", header)
-
-
-def _stated_primaries(
-    spec: Any, kind: str, head: bytes
-) -> tuple[tuple[float, ...] | None, list[str]]:
-    """Return the chromaticities of a float file, None for Rec.709, and what is not followed."""
-    stated = spec.getattribute("chromaticities")
-    space = str(spec.getattribute("colorInteropID") or "")
-    lines = _radiance_lines(head, b"PRIMARIES") if kind == "hdr" else []
-    lines = [line for line in lines if set(line.split()) != {b"0"}]  # Photoshop's "not stated"
-    if lines:
-        with suppress(ValueError):
-            stated = [float(number) for number in lines[-1].split()]
-    elif stated is None and space in color.INTEROP_SPACES:
-        stated = color.chromaticities_of(color.INTEROP_SPACES[space])
-    elif stated is None:
-        is_ours = space in ("", "unknown", "data", "lin_rec709_scene")
-        return None, [] if is_ours else [f"colour space {space} is not followed"]
-    if not isinstance(stated, tuple | list) or len(stated) != 8 or not color.are_primaries(stated):
-        return None, ["primaries of the header are broken: taken as Rec.709"]
-    if np.allclose(stated, color.REC709_CHROMATICITIES, atol=2e-3):
-        return None, []
-    return tuple(float(number) for number in stated), []
-
-
-_GAIN_MAPS = (b"hdrgm:", b"hdr-gain-map", b"hdrgainmap", b"urn:iso:std:iso:ts:21496")
-_PNG_PALETTE = 3
-"""Colour type in a PNG's IHDR, byte 25 of the file."""
-
-
-def _header_notices(spec: Any, kind: str, head: bytes) -> list[str]:
-    """Say what the header tells about colour and content that is not followed."""
-    notices = []
-    if (
-        spec.getattribute("jpeg:ColorSpace") in ("CMYK", "YCCK")
-        or spec.getattribute("tiff:ColorSpace") == "CMYK"
-    ):
-        notices.append("CMYK converted without its profile; export as RGB for exact colours")
-    if spec.getattribute("Exif:ColorSpace") == 65535:
-        notices.append("EXIF says uncalibrated colour; its profile, or else sRGB, is used")
-    aspect = spec.get_float_attribute("PixelAspectRatio", 1.0)
-    if kind == "exr" and abs(aspect - 1.0) > 1e-3:
-        notices.append(f"pixel aspect ratio {aspect:g} is not followed: pixels are taken as square")
-    corrections = _radiance_lines(head, b"(?:GAMMA|COLORCORR)") if kind == "hdr" else []
-    if any(set(line.split()) - {b"1", b"1.0"} for line in corrections):
-        notices.append("GAMMA and COLORCORR of the header are not followed")
-    if kind == "jpeg" and any(name in head for name in _GAIN_MAPS):
-        notices.append("gain map ignored: read as its base image")
-    if kind == "png" and b"acTL" in head[:4096]:
-        notices.append("animated: first frame used")
-    if (kind == "png" and head[25] == _PNG_PALETTE) or (
-        spec.getattribute("tiff:ColorSpace") == "palette"
-    ):
-        notices.append("palette expanded to RGB")
-    return notices
 
 
 def _check_parts(path: Path, reader: Any, specs: list[Any], used: int, kind: str) -> list[str]:
@@ -491,7 +372,8 @@ def _check_parts(path: Path, reader: Any, specs: list[Any], used: int, kind: str
         rows = [_read_row(reader, part, other, y) for y in ends]
         readable += all(row is not None for row in rows) and not library_error(reader)
     if readable < parts:
-        raise InputError(path, f"truncated or corrupt ({readable} of {parts} parts readable)")
+        what = f"truncated or corrupt ({readable} of {parts} parts readable)"
+        raise InputError(path, what, reason="image.damaged", found=readable)
     return [f"{parts} parts: {'the first' if used == 0 else f'number {used + 1}'} is used"]
 
 
@@ -540,28 +422,6 @@ def upright(pixels: PixelArray, orientation: int) -> PixelArray:
         8: lambda a: np.rot90(a, 1),
     }
     return turned[orientation](pixels) if orientation in turned else pixels
-
-
-def _unreadable(path: Path, kind: str, text: str, max_pixels: int, flag: str) -> InputError:
-    """Word a failure of the decoder."""
-    if _is_too_large(text):
-        return InputError(
-            path,
-            f"the header claims too large an image ({one_line(text)}; "
-            f"limit {max_pixels} pixels); {flag} raises it if the file is sound",
-        )
-    if kind == "hdr" and "FORMAT" in text:
-        return InputError(
-            path,
-            "not 32-bit_rle_rgbe (XYZE files are not supported)",
-            "save it as RGBE .hdr or as EXR",
-        )
-    reason = one_line(text) or "the decoder gave no reason"
-    return InputError(
-        path,
-        f"truncated, corrupt or of an unsupported variant of {kind} ({reason})",
-        "check that the file was copied or downloaded completely",
-    )
 
 
 def _is_too_large(text: str) -> bool:

@@ -125,22 +125,15 @@ def read_photo(
     path = Path(path)
     image = decode_image(path, max_pixels, layer=layer)
     notices = list(image.notices)
-    codes = image.pixels
-    if image.alpha is not None:
-        opaque = 1.0 if codes.dtype.kind == "f" else np.iinfo(codes.dtype).max
-        if not bool(np.all(image.alpha >= opaque)):
-            if alpha != "ignore":
-                raise InputError(
-                    path,
-                    "partly transparent (found an alpha channel; expected an opaque photograph)",
-                    "flatten it, or pass --alpha ignore",
-                )
-            notices.append("alpha channel ignored")
-    codes = upright(codes, image.orientation)
-    is_grey = codes.shape[-1] == 1
-    if is_grey:
+    if _is_transparent(image):
+        if alpha != "ignore":
+            what = "partly transparent (found an alpha channel; expected an opaque photograph)"
+            advice = "flatten it, or pass --alpha ignore"
+            raise InputError(path, what, advice, reason="photo.transparent")
+        notices.append("alpha channel ignored")
+    codes = _upright_rgb(image)
+    if image.is_grey:
         notices.append("grey image expanded to three channels")
-        codes = np.repeat(codes, 3, axis=-1)
     if bool((codes == codes[0, 0]).all()):
         notices.append("no signal: every pixel has the same value")
 
@@ -153,7 +146,7 @@ def read_photo(
         codes = plate
         srgb: FloatArray = np.clip(color.linear_to_gamma(plate), 0.0, 1.0)
     else:
-        codes, srgb, icc = _to_srgb(path, codes, image, is_grey, notices)
+        codes, srgb, icc = _to_srgb(path, codes, image, notices)
     return Photo(
         np.ascontiguousarray(codes),
         np.ascontiguousarray(srgb),
@@ -201,47 +194,29 @@ def read_envmap(
     kinds = ("exr", "hdr", "jpeg", "png", "tiff", "webp") if pictures else ("exr", "hdr")
     image = decode_image(path, max_width * max_width // 2, kinds, flag="--max-envmap-width")
     messages = list(image.notices)
-    codes = upright(image.pixels, image.orientation)
+    codes = _upright_rgb(image)
     height, width = codes.shape[:2]
     if width != 2 * height or height < 2:
         raise InputError(
             path,
             f"not a lat-long map (found {width} x {height}; expected 2:1)",
             "resize it to twice as wide as high",
+            reason="envmap.not_two_to_one",
+            found=(width, height),
         )
-    is_grey = codes.shape[-1] == 1
-    if is_grey:
-        codes = np.repeat(codes, 3, axis=-1)
     if image.alpha is not None and image.kind != "exr":
         messages.append("alpha channel ignored")
     if codes.dtype.kind == "f":
         with np.errstate(over="ignore"):  # counted below
             texels = np.array(codes, dtype=np.float32)
     else:
-        srgb = _to_srgb(path, codes, image, is_grey, messages)[1]
+        srgb = _to_srgb(path, codes, image, messages)[1]
         texels = color.srgb_to_linear(srgb).astype(np.float32)
         messages.append(
             "a picture, not high dynamic range: decoded as sRGB; lamps and a sun in it are no "
             "brighter than its white"
         )
-    bad = ~np.isfinite(texels)
-    negative = texels < 0.0
-    negative &= ~bad
-    if bad.any() or negative.any():
-        found = (
-            f"{int(np.isnan(texels).sum())} NaN, {int(np.isinf(texels).sum())} infinite, "
-            f"{int(negative.sum())} negative values"
-        )
-        if strict:
-            raise InputError(
-                path, f"not clean radiance (found {found}; expected finite values >= 0)"
-            )
-        brightest = float(texels[~bad].max(initial=0.0))
-        if brightest == 0.0:
-            raise InputError(path, f"no light in it (found {found} beside 0)")
-        texels[np.isposinf(texels)] = brightest
-        texels[~(texels >= 0.0)] = 0.0
-        messages.append(f"{found} repaired: +Inf to the brightest finite value, the others to 0")
+    _repair_radiance(path, texels, strict, messages)
     # Colours outside Rec.709 are negative in it, and no light is.
     with np.errstate(over="ignore", invalid="ignore"):  # refused below
         texels = np.maximum(_to_rec709(texels, image, messages), 0.0)
@@ -251,6 +226,9 @@ def read_envmap(
             path,
             f"too bright (found a radiance of {brightest:g}; limit {RADIANCE_LIMIT:g})",
             "divide its values, and give --exposure",
+            reason="envmap.too_bright",
+            found=brightest,
+            limit=RADIANCE_LIMIT,
         )
     if brightest == 0.0:
         messages.append("no light: every texel is 0")
@@ -292,44 +270,105 @@ def read_mask(
             f"not of the photo's size (found {codes.shape[1]} x {codes.shape[0]}; expected "
             f"{width} x {height}, the upright photo)",
             "resize it, or draw it over the upright photo",
+            reason="mask.size",
+            found=codes.shape[1::-1],
+            limit=photo_size,
         )
-    if codes.dtype.kind == "f" and not bool(((codes >= 0.0) & (codes <= 1.0)).all()):
-        raise InputError(path, "not a mask (found floats outside 0 to 1, or not finite)")
-    if not bool((codes == codes[..., :1]).all()):
-        raise InputError(
-            path,
-            "not a mask (found three channels that differ; expected a grey image)",
-            "save it as greyscale: black is 0, white is 1",
-        )
+    _check_grey(path, codes)
     is_even = bool((codes == codes[0, 0]).all())
     messages = list(image.notices)
     if image.alpha is not None:
         if is_even and not bool((image.alpha == image.alpha[0, 0]).all()):
-            raise InputError(
-                path,
-                "one value everywhere, and only its alpha differs (expected a grey image)",
-                "save the alpha channel as a greyscale image",
-            )
+            what = "one value everywhere, and only its alpha differs (expected a grey image)"
+            advice = "save the alpha channel as a greyscale image"
+            raise InputError(path, what, advice, reason="mask.alpha")
         messages.append("alpha channel ignored")
     if is_even:
         messages.append("no signal: every pixel has the same value")
     mask = codes[..., 0].astype(np.float32)
     if codes.dtype.kind != "f":
-        white, brightest = np.iinfo(codes.dtype).max, codes.max()
-        if 0 < brightest < LABELS * white:
-            raise InputError(
-                path,
-                f"all but black (found {brightest} at most; expected {white} for white)",
-                "multiply labels of 0 and 1 by 255",
-            )
-        mask /= np.float32(white)
+        mask /= np.float32(np.iinfo(codes.dtype).max)
     if notices is not None:
         notices += messages
     return np.ascontiguousarray(mask)
 
 
+def _check_grey(path: Path, codes: PixelArray) -> None:
+    """Refuse what is no mask: colours, floats beyond 0 to 1, and labels.
+
+    Raises:
+        InputError: With what was found.
+    """
+    if codes.dtype.kind == "f" and not bool(((codes >= 0.0) & (codes <= 1.0)).all()):
+        what = "not a mask (found floats outside 0 to 1, or not finite)"
+        raise InputError(path, what, reason="mask.range")
+    if not bool((codes == codes[..., :1]).all()):
+        what = "not a mask (found three channels that differ; expected a grey image)"
+        advice = "save it as greyscale: black is 0, white is 1"
+        raise InputError(path, what, advice, reason="mask.colored")
+    if codes.dtype.kind != "f":
+        white, brightest = np.iinfo(codes.dtype).max, int(codes.max())
+        if 0 < brightest < LABELS * white:
+            raise InputError(
+                path,
+                f"all but black (found {brightest} at most; expected {white} for white)",
+                "multiply labels of 0 and 1 by 255",
+                reason="mask.labels",
+                found=brightest,
+                limit=white,
+            )
+
+
+def _upright_rgb(image: DecodedImage) -> PixelArray:
+    """Return the pixels as they are to be seen, grey ones three times, shape [H, W, 3]."""
+    codes = upright(image.pixels, image.orientation)
+    return np.repeat(codes, 3, axis=-1) if image.is_grey else codes
+
+
+def _is_transparent(image: DecodedImage) -> bool:
+    """Return whether any pixel is not opaque."""
+    if image.alpha is None:
+        return False
+    is_float = image.pixels.dtype.kind == "f"
+    opaque = 1.0 if is_float else np.iinfo(image.pixels.dtype).max
+    return not bool(np.all(image.alpha >= opaque))
+
+
+def _repair_radiance(path: Path, texels: FloatArray, strict: bool, notices: list[str]) -> None:
+    """Put finite, non-negative numbers in place of others, with a notice.
+
+    Args:
+        path: The file.
+        texels: Radiance, changed in place, shape [height, width, 3].
+        strict: Refuse instead.
+        notices: Receives how many there were.
+
+    Raises:
+        InputError: ``strict``, or no light is left.
+    """
+    bad = ~np.isfinite(texels)
+    negative = texels < 0.0
+    negative &= ~bad
+    if not (bad.any() or negative.any()):
+        return
+    found = (
+        f"{int(np.isnan(texels).sum())} NaN, {int(np.isinf(texels).sum())} infinite, "
+        f"{int(negative.sum())} negative values"
+    )
+    if strict:
+        what = f"not clean radiance (found {found}; expected finite values >= 0)"
+        raise InputError(path, what, reason="envmap.not_clean", found=found)
+    brightest = float(texels[~bad].max(initial=0.0))
+    if brightest == 0.0:
+        what = f"no light in it (found {found} beside 0)"
+        raise InputError(path, what, reason="envmap.no_light", found=found)
+    texels[np.isposinf(texels)] = brightest
+    texels[~(texels >= 0.0)] = 0.0
+    notices.append(f"{found} repaired: +Inf to the brightest finite value, the others to 0")
+
+
 def _to_srgb(
-    path: Path, codes: PixelArray, image: DecodedImage, is_grey: bool, notices: list[str]
+    path: Path, codes: PixelArray, image: DecodedImage, notices: list[str]
 ) -> tuple[PixelArray, FloatArray, bytes | None]:
     """Return codes [H, W, 3], the same as sRGB in [0, 1], and the profile that they are in."""
     srgb = codes.astype(np.float32)
@@ -341,7 +380,7 @@ def _to_srgb(
     if icc is None:
         return codes, srgb, None
     codes, srgb, icc, notice = convert_profile(
-        path, codes, srgb, grey_profile(icc) if is_grey else icc
+        path, codes, srgb, grey_profile(icc) if image.is_grey else icc
     )
     notices += [notice] if notice else []
     return codes, srgb, icc
@@ -373,7 +412,8 @@ def _finite(path: Path, plate: FloatArray, strict: bool, notices: list[str]) -> 
     if not count:
         return plate
     if strict:
-        raise InputError(path, f"not finite (found {count} such pixels; expected none)")
+        what = f"not finite (found {count} such pixels; expected none)"
+        raise InputError(path, what, reason="photo.not_finite", found=count)
     notices.append(f"{count} non-finite pixels set to 0")
     plate = plate.copy()
     plate[bad] = 0

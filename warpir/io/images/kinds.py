@@ -1,0 +1,111 @@
+"""What kind of image a file is, by its content, before any library opens it."""
+
+import stat
+import struct
+from pathlib import Path
+
+from warpir.core.errors import InputError
+
+KINDS = ("jpeg", "png", "tiff", "webp", "exr", "hdr")
+"""Kinds that are read."""
+
+
+def check_regular_file(path: Path) -> int:
+    """Return the size of a regular file [byte], before any library opens it (a FIFO blocks).
+
+    Raises:
+        InputError: Missing, a folder, a device, empty, or not readable.
+    """
+    try:
+        status = path.stat()
+    except FileNotFoundError as error:
+        raise InputError(path, "no such file", reason="file.missing") from error
+    except (OSError, ValueError) as error:  # ValueError: a name that no file can have
+        reason = error.strerror if isinstance(error, OSError) else "not a file name"
+        what = f"not a regular file ({reason})"
+        raise InputError(path, what, reason="file.not_regular") from error
+    if not stat.S_ISREG(status.st_mode):
+        kind = "a folder" if stat.S_ISDIR(status.st_mode) else "a device, pipe or socket"
+        what = f"not a regular file (found {kind})"
+        raise InputError(path, what, reason="file.not_regular", found=kind)
+    if status.st_size == 0:
+        raise InputError(path, "empty file", reason="file.empty")
+    return status.st_size
+
+
+def sniff(path: Path) -> tuple[str, bytes]:
+    """Return the kind of image by its magic bytes, and the first 64 KiB.
+
+    Raises:
+        InputError: It is of none of `KINDS`, or cannot be read.
+    """
+    try:
+        with path.open("rb") as stream:
+            head = stream.read(65536)
+    except OSError as error:
+        what = f"cannot be read ({error.strerror})"
+        raise InputError(path, what, reason="file.unreadable") from error
+    if head.startswith(b"\xff\xd8\xff"):
+        return "jpeg", head
+    if head.startswith(b"\x89PNG\r\n\x1a\n"):
+        return "png", head
+    if head[:4] in (b"II*\0", b"MM\0*", b"II+\0", b"MM\0+"):
+        if _is_raw_tiff(head):
+            what = "a camera raw file (what it holds as a picture is a thumbnail)"
+            advice = "export it as JPEG or 16-bit TIFF"
+            raise InputError(path, what, advice, reason="image.kind", found="camera raw")
+        return "tiff", head
+    if head.startswith(b"RIFF") and head[8:12] == b"WEBP":
+        return "webp", head
+    if head.startswith(b"\x76\x2f\x31\x01"):
+        return "exr", head
+    if head.startswith((b"#?RADIANCE", b"#?RGBE")):
+        return "hdr", head
+    found = _foreign_kind(head)
+    raise InputError(
+        path,
+        f"not an image that warpir reads ({f'found {found}; ' if found else ''}"
+        "expected JPEG, PNG, TIFF, WebP, EXR or Radiance HDR)",
+        "export it as JPEG or 16-bit TIFF" if found else "",
+        reason="image.kind",
+        found=found,
+    )
+
+
+_FOREIGN_KINDS = {
+    "camera raw": (b"IIRO", b"IIRS", b"MMOR", b"IIU\0", b"FUJIFILMCCD-RAW", b"FOVb"),
+    "JPEG XL": (b"\xff\x0a", b"\0\0\0\x0cJXL "),
+    "JPEG 2000": (b"\0\0\0\x0cjP  ", b"\xff\x4f\xff\x51"),
+    "GIF": (b"GIF8",),
+    "BMP": (b"BM",),
+    "Photoshop": (b"8BPS",),
+    "PDF": (b"%PDF",),
+    "PostScript": (b"%!PS",),
+}
+_BRANDS = {b"avif": "AVIF", b"avis": "AVIF", b"crx ": "camera raw"}
+_NEW_SUBFILE_TYPE, _DNG_VERSION = 254, 50706
+"""TIFF tags; bit 0 of the first says that a picture is a reduced version of another."""
+
+
+def _foreign_kind(head: bytes) -> str:
+    """Return the name of a kind of image that people have but that is not read, or nothing."""
+    if head[4:8] == b"ftyp":
+        return _BRANDS.get(head[8:12], "HEIC")
+    return next((name for name, starts in _FOREIGN_KINDS.items() if head.startswith(starts)), "")
+
+
+def _is_raw_tiff(head: bytes) -> bool:
+    """Tell camera raw by its first directory: what a TIFF reader shows of it is a thumbnail."""
+    if head[8:10] == b"CR":  # Canon CR2
+        return True
+    order = "<" if head[:2] == b"II" else ">"
+    try:
+        (start,) = struct.unpack_from(f"{order}I", head, 4)
+        (count,) = struct.unpack_from(f"{order}H", head, start)
+        for k in range(count):
+            tag, _, _, value = struct.unpack_from(f"{order}HHII", head, start + 2 + 12 * k)
+            if tag == _DNG_VERSION or (tag == _NEW_SUBFILE_TYPE and value & 1):
+                return True
+    except struct.error:  # a directory behind the head: not how cameras write
+        pass
+    return False
