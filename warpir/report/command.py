@@ -23,7 +23,7 @@ from warpir.core.strict_json import read_json_object
 from warpir.io.curves_file import read_curves
 from warpir.io.images.decoder import decode_image
 from warpir.io.images.photos import read_envmap
-from warpir.io.results import read_layers
+from warpir.io.layers import read_layers
 from warpir.report.page import REPORT, Results, report_page
 
 
