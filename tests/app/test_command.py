@@ -2,6 +2,7 @@
 
 import json
 import os
+import re
 import signal
 import subprocess
 import sys
@@ -10,7 +11,7 @@ from collections.abc import Sequence
 from dataclasses import fields, replace
 from itertools import pairwise
 from pathlib import Path
-from typing import Any
+from typing import Any, get_args
 
 import numpy as np
 import pytest
@@ -20,18 +21,13 @@ import warpir.insert
 from tests.builders.refusals import assert_fails, refused
 from warpir.app.command import BY_HAND, FLAGS, parse
 from warpir.app.config import (
-    ABOVE_ZERO,
-    CHOICES,
     CPU_DEFAULTS,
     DEFAULTS,
     EXCLUSIVE,
     OPTIONS,
     PRIOR_DEFAULTS,
-    PROMPTS,
-    RANGES,
     InsertConfig,
     flag,
-    kinds,
 )
 from warpir.app.record import RUN_FORMAT
 from warpir.app.settings import OptimizeSettings
@@ -88,22 +84,51 @@ def test_command_runs_as_a_module(tmp_path: Path) -> None:
 
 def test_command_help_tells_every_field(capsys: pytest.CaptureFixture[str]) -> None:
     """Each field of the configuration is a flag with a help text."""
+    assert warpir.insert.main(["--help-all"]) == 0
+    text = capsys.readouterr().out
+    docs = warpir.app.command.field_docs()
+    assert sorted(name for forms in FLAGS.values() for name in forms) == sorted(OPTIONS)
+    assert all(f"  {flag(name)}" in text and docs[name] for name in OPTIONS)
+    switches = {name for name, option in OPTIONS.items() if option.kind in (bool, bool | None)}
+    assert switches == {name for name, option in OPTIONS.items() if not option.rule.form}
+    for name in (name for name in switches if OPTIONS[name].kind is not bool):
+        assert f"  {flag(name)}, --no-{flag(name)[2:]}" in text
+
+
+def test_command_help_is_short_and_holds_what_documents_show(
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    """About two screens: each flag of README and manual but limits, and none for experts."""
     assert warpir.insert.main(["--help"]) == 0
     text = capsys.readouterr().out
-    docs = warpir.app.command._field_docs()
-    listed = [name for forms in FLAGS.values() for name in forms]
-    assert sorted(listed) == sorted(OPTIONS) == sorted(docs)
-    assert all(f"  {flag(name)}" in text and docs[name] for name in listed)
-    hints = kinds()
-    switches = {name for name in listed if hints[name] in (bool, bool | None)}
-    assert switches == {name for name, form in forms_of_flags() if not form}
-    for name in switches - {name for name in listed if hints[name] is bool}:
-        assert f"  {flag(name)}, --no-{flag(name)[2:]}" in text
+    lines = text.splitlines()
+    assert len(lines) <= 115 and max(map(len, lines)) <= 100
+    root = Path(__file__).parents[2]
+    documents = "".join(
+        (root / name).read_text("utf-8") for name in ("README.md", "docs/manual.md")
+    )
+    for name, option in OPTIONS.items():
+        assert (f"  {flag(name)}" in text.replace(",", " ")) is not option.rule.expert, name
+        if re.search(rf"{flag(name)}(?![\w-])", documents) and option.part != "limits":
+            assert not option.rule.expert, name
+
+
+def test_dotted_names_mean_the_same(tmp_path: Path) -> None:
+    """Part and field, as the configuration's own attributes, at the command line and in files."""
+    flat = parse([*NEEDED, "--camera-height", "1.5", "--rate-tone=0.5"]).config
+    argv = ["--camera.height", "1.5", "--optimize.rate_tone=0.5"]
+    assert parse([*NEEDED, *argv]).config == flat
+    path = tmp_path / "c.yaml"
+    path.write_text("camera.height: 1.5\noptimize.rate-tone: 0.5\n")
+    assert parse([*NEEDED, "--config", str(path)]).config == flat
+    path.write_text("camera.height: 1.5\ncamera-height: 2\n")
+    assert "twice" in refused([*NEEDED, "--config", str(path)]).what
+    assert "no such flag" in refused([*NEEDED, "--output.report"]).what
 
 
 def test_command_help_tells_what_each_prior_gets(capsys: pytest.CaptureFixture[str]) -> None:
     """What is open has no default of its own: the help names those of both priors, by the table."""
-    assert warpir.insert.main(["--help"]) == 0
+    assert warpir.insert.main(["--help-all"]) == 0
     text = " ".join(capsys.readouterr().out.split())
     assert "(default: embedded sds-base; Stable Diffusion lds)" in text
     assert "(default: embedded 4, on the CPU 2; Stable Diffusion 1)" in text
@@ -182,34 +207,41 @@ def test_embedded_prior_is_asked_with_steps_alone(values: dict[str, Any], is_gui
         assert (config.settled().optimize.steps > 0) is is_guided
 
 
-def forms_of_flags() -> list[tuple[str, str]]:
-    return [pair for forms in FLAGS.values() for pair in forms.items()]
-
-
 @pytest.mark.case("F1", "F8")
 def test_every_value_has_a_rule() -> None:
     """No number without a range, no name that may be anything (F1, F8)."""
     free = {  # checked in words of their own, free by nature, or text
-        "fov", "horizon", "ground", "place", "at", "rotate_y", "light_rotate", "sun", "sky",
+        "horizon", "ground", "place", "at", "rotate_y", "light_rotate", "sun", "sky",
         "device", "refine_parts", "refine_materials", "lora_layers",
         "photo", "layer", "occluder_mask", "asset", "materials", "out", "camera", "light", "lora",
         "model", "reuse", "sequence", "prior", "regressor", "frame", "ground_points", "proxy",
         "shadow_mask",
     }  # fmt: skip
-    ruled = {*RANGES, *ABOVE_ZERO, *CHOICES, *PROMPTS}
-    valued = {name for name, form in forms_of_flags() if form}
-    assert valued == ruled | free and not ruled & free
-    defaults = InsertConfig().flat()
-    for name, (low, high) in RANGES.items():
+    for name, option in OPTIONS.items():
+        rule = option.rule
+        bounds = (rule.low, rule.high, rule.above, rule.below)
+        is_ruled = any(b is not None for b in bounds) or bool(rule.choices) or rule.is_prompt
+        assert is_ruled is not (name in free or not rule.form), name
         # Just outside is refused and both ends are accepted.
-        kind = type(defaults[name] or low)
-        for value, accepted in ((low, True), (high, True), (low - 1, False)):
-            if value is None or (value == 0 and name in ABOVE_ZERO):
-                continue
-            problems = problems_of(**{name: kind(value)})
-            assert any(p.where == flag(name) and "at least" in p.what for p in problems) != accepted
-        if high is not None:
-            assert any("at most" in p.what for p in problems_of(**{name: kind(high + 1)}))
+        kind = float if float in (option.kind, *get_args(option.kind)) else int
+        for value, words in (
+            (rule.low, ""),
+            (rule.high, ""),
+            (rule.above, "more than|between"),
+            (rule.below, "between"),
+            (None if rule.low is None else rule.low - 1, "at least"),
+            (None if rule.high is None else rule.high + 1, "at most"),
+        ):
+            if value is not None:
+                # Not what stands between two values: "at most --time-max".
+                found = [
+                    match[0]
+                    for problem in problems_of(**{name: kind(value)})
+                    if problem.where == flag(name) and " --" not in problem.what
+                    if (match := re.match("more than|between|at least|at most", problem.what))
+                ]
+                assert len(found) == bool(words), (name, value, found)
+                assert all(re.fullmatch(words, what) for what in found), (name, value, found)
 
 
 def problems_of(**values: Any) -> list[InputError]:
@@ -523,7 +555,9 @@ def test_config_file_of_an_older_version_replays(tmp_path: Path) -> None:
     settings = (ModelSettings, PersonalizeSettings, GuidanceSettings, OptimizeSettings)
     newer = {field.name for kind in settings for field in fields(kind)}
     newer |= {"frame", "undistort", "ground_points"}
-    newer |= set(FLAGS["applications"]) | set(FLAGS["guidance"]) - {"guidance"}
+    newer |= {n for n, option in OPTIONS.items() if option.part in ("task", "guidance")}
+    newer |= {"reuse", "start", "regressor"}
+    newer -= {"guidance"}
     newer |= {"proxy", "plane", "shadow_mask", "layer", "occluder_mask", "light_convention"}
     newer |= {"strict", "detail", "hand_off", "mitsuba", "asset_up"}
     newer |= {f"max_{field.name}" for field in fields(Limits)} - {"max_pixels"}
@@ -959,5 +993,5 @@ def test_paths_are_what_the_flags_say() -> None:
     """Pictures carry of these settings the last name alone."""
     from warpir.app.record import PATHS
 
-    forms = forms_of_flags()
-    assert sorted(PATHS) == sorted(n for n, f in forms if {*f.split("|")} & {"FILE", "DIR"})
+    forms = {name: {*option.rule.form.split("|")} for name, option in OPTIONS.items()}
+    assert sorted(PATHS) == sorted(name for name, f in forms.items() if f & {"FILE", "DIR"})

@@ -20,8 +20,8 @@ from tests.builders.gltf_files import Builder
 from tests.builders.image_files import png_chunk
 from tests.builders.insertions import arguments, read_layers, write_inputs
 from tests.insert.test_faults import NO_POSE
-from warpir.app.command import FLAGS, YAML_SHARE
-from warpir.app.config import InsertConfig
+from warpir.app.config import OPTIONS, InsertConfig
+from warpir.app.config_file import YAML_SHARE
 from warpir.app.disk_space import needed_bytes
 from warpir.app.inputs import read_inputs
 from warpir.core.errors import ExitCode
@@ -510,8 +510,8 @@ def test_limits_are_told_with_their_flags(case: str, inputs: Path, tmp_path: Pat
 
 
 def test_every_limit_is_a_flag_and_is_tried() -> None:
-    limits = {field.name for field in fields(Limits)} | {"prompt_bytes"}
-    listed = {name for name in FLAGS["rules for the files"] if name.startswith("max_")}
+    limits = {field.name for field in fields(Limits)}
+    listed = {name for name, option in OPTIONS.items() if option.part == "limits"}
     assert listed == {f"max_{name}" for name in limits}
     assert {name for _, name, _ in TOO_MUCH.values()} == limits
     assert InsertConfig().limits == LIMITS

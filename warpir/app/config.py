@@ -1,20 +1,16 @@
 """What one insertion is asked to do: `InsertConfig`, plain values only.
 
-Each field is one flag of the command line (``camera_height`` is ``--camera-height``), one key of a
-configuration file and one entry under ``config`` in ``run.json``. The line below a field is its
-``--help``. Angles are degrees here and at the command line, radians everywhere inside.
+Each value is one flag of the command line (``camera_height`` is ``--camera-height``), one key of a
+configuration file and one entry under ``config`` in ``run.json``; its field in
+`warpir.app.settings` holds all there is to know about it. Angles are degrees here and at the
+command line, radians everywhere inside.
 """
 
 import math
-import os
 import re
-from collections.abc import Container, Iterator, Mapping
-from dataclasses import Field, dataclass, fields
-from functools import cache
-from numbers import Integral, Real
-from os import PathLike
-from types import UnionType
-from typing import Any, get_args, get_origin, get_type_hints
+from collections.abc import Callable, Container, Iterator, Mapping
+from dataclasses import dataclass, fields
+from typing import Any, get_type_hints
 
 from warpir.app.settings import (
     CameraConfig,
@@ -29,9 +25,9 @@ from warpir.app.settings import (
 )
 from warpir.core.errors import ExitCode, InputError, raise_all
 from warpir.core.limits import Limits
+from warpir.core.options import Rule, is_a, plain, rule_of
 from warpir.diffusion.prompts import make_prompts
 from warpir.diffusion.settings import (
-    GuidanceChoices,
     GuidanceSettings,
     ModelSettings,
     PersonalizeSettings,
@@ -44,64 +40,8 @@ SEED_LIMIT = 2**32
 """Seeds are the 32-bit words that the kernels hash."""
 DEVICE_FORM = re.compile(r"cpu|cuda(:\d+)?")
 DEMO_HINT = "--demo needs neither --photo nor --asset"
-
-
-_PLAIN = GuidanceSettings()
-PRIOR_DEFAULTS: dict[str, dict[str, Any]] = {
-    "stable-diffusion": {
-        **{f.name: getattr(_PLAIN, f.name) for f in fields(GuidanceChoices) if f.default is None},
-        "steps": 600,
-        "guidance_width": 384,
-        "light_height": 64,
-        "object_light_height": 32,
-        "personalize": True,
-        "fusion": "schedule",
-        "lobe_shape": True,
-        "tone_curve": True,
-        "rate": 1.0,
-        "accept": False,
-        "preview_every": 0,
-        "tone": "reinhard",
-    },
-    # What the prior's potential is least biased for (benchmarks/probe.py): the photo's own share in
-    # what it expects, at noise levels of .76 to .99. One light and no curves: a small prior cannot
-    # tell more apart, and it learnt from photos that are clipped, not bent.
-    "embedded": {
-        "loss": "sds-base",
-        "guidance_scale": 4.0,
-        "null_background": "drop",
-        "time_min": 0.55,
-        "time_max": 0.9,
-        "time_max_end": 0.9,
-        "weight": "sigma",
-        "noises": 4,
-        "crop_min": 1.3,
-        "crop_max": 4.0,
-        "fusion": "single",
-        "lobe_shape": False,
-        "tone_curve": False,
-        "rate": 0.35,
-        "steps": 0,
-        "guidance_width": 384,
-        "light_height": 64,
-        "object_light_height": 32,
-        "personalize": False,
-        "accept": True,
-        "preview_every": 50,
-        # What it learnt from is clipped as photos are.
-        "tone": "linear",
-    },
-}
-"""What a field that is None stands for, by the prior that guides."""
 EMBEDDED_STEPS = 60
 """Steps with which the embedded prior was tried; it is not asked unless --steps says so."""
-CPU_DEFAULTS: dict[str, dict[str, Any]] = {
-    "stable-diffusion": {},
-    "embedded": {
-        "noises": 2, "guidance_width": 256, "light_height": 48, "object_light_height": 24,
-    },
-}  # fmt: skip
-"""What it stands for on the CPU, where that differs."""
 
 
 @dataclass(frozen=True, init=False)
@@ -136,7 +76,7 @@ class InsertConfig:
         for name, value in values.items():
             if name not in OPTIONS:
                 raise TypeError(f"InsertConfig has no value {name!r}")
-            parts[OPTIONS[name].part][OPTIONS[name].field.name] = _plain(value)
+            parts[OPTIONS[name].part][OPTIONS[name].field] = plain(value)
         for name, given in parts.items():
             # Frozen for everybody else.
             object.__setattr__(self, name, PARTS[name](**given))
@@ -145,7 +85,7 @@ class InsertConfig:
     def flat(self) -> dict[str, Any]:
         """Return all values by the names that the command line and ``run.json`` use."""
         return {
-            name: getattr(getattr(self, option.part), option.field.name)
+            name: getattr(getattr(self, option.part), option.field)
             for name, option in OPTIONS.items()
         }
 
@@ -215,20 +155,26 @@ class InsertConfig:
 
 @dataclass(frozen=True)
 class Option:
-    """Where one value of a configuration stands."""
+    """One value of a configuration."""
 
     part: str
     """Attribute of `InsertConfig`."""
-    field: Field[Any]
-    """Field of that part."""
+    field: str
+    """Attribute of that part."""
+    kind: Any
+    """Annotation."""
+    default: Any
+    rule: Rule
 
 
 def _options() -> dict[str, Option]:
     found = {}
-    for name, part in PARTS.items():
-        for field in fields(part):
-            own = f"max_{field.name}" if name == "limits" else field.name
-            found[field.metadata.get("name", own)] = Option(name, field)
+    for part, settings in PARTS.items():
+        kinds = get_type_hints(settings)
+        for field in fields(settings):
+            name, rule = field.name, rule_of(field)
+            flat = f"max_{name}" if part == "limits" else rule.name or name
+            found[flat] = Option(part, name, kinds[name], field.default, rule)
     return found
 
 
@@ -236,8 +182,33 @@ PARTS: dict[str, Any] = {part.name: part.type for part in fields(InsertConfig)}
 """The parts' classes by their names."""
 OPTIONS = _options()
 """Every value by the name that the command line, files and ``run.json`` give it."""
-DEFAULTS = {name: option.field.default for name, option in OPTIONS.items()}
+DOTTED = {f"{option.part}.{option.field}": name for name, option in OPTIONS.items()}
+"""The same names by part and field, as ``camera.height``."""
+DEFAULTS = {name: option.default for name, option in OPTIONS.items()}
 """What a value is when nobody names it."""
+PRIOR_DEFAULTS: dict[str, dict[str, Any]] = {
+    prior: {
+        name: getattr(option.rule, prior.replace("-", "_"))
+        for name, option in OPTIONS.items()
+        if option.rule.embedded is not None
+    }
+    for prior in ("stable-diffusion", "embedded")
+}
+"""What a value that is None stands for, by the prior that guides.
+
+The embedded prior's are those for which its potential is least biased (benchmarks/probe.py): the
+photo's own share in what it expects, at noise levels of .76 to .99. One light and no curves: a
+small prior cannot tell more apart, and it learnt from photos that are clipped, not bent.
+"""
+CPU_DEFAULTS: dict[str, dict[str, Any]] = {
+    "stable-diffusion": {},
+    "embedded": {
+        name: option.rule.embedded_on_cpu
+        for name, option in OPTIONS.items()
+        if option.rule.embedded_on_cpu is not None
+    },
+}
+"""What it stands for on the CPU, where that differs."""
 
 
 def _open_values(config: InsertConfig, on_cuda: bool = True) -> dict[str, Any]:
@@ -271,181 +242,15 @@ def usage(where: str, what: str, advice: str = "") -> InputError:
 
 LARGEST = 1e9
 """Of a coordinate [m] and of a light's strength; float32 products overflow from 10^19 on."""
-RANGES: dict[str, tuple[float, float | None]] = {
-    "pitch": (-90, 90),
-    "fit_lobes": (1, 4096),
-    "exposure": (-30, 30),
-    "samples": (1, 2**20),
-    "rays": (1, 2**10),
-    "depth": (1, 2**10),
-    "indirect_limit": (0, None),
-    # Far beyond what anybody photographs, and products of them still fit float32.
-    "camera_height": (1e-6, 1e9),
-    "scale": (1e-9, 1e9),
-    "size": (1e-6, 1e9),
-    "ground_albedo": (1e-6, 1),
-    "width": (8, 65_536),
-    "threads": (1, 2**10),
-    "seed": (0, SEED_LIMIT - 1),
-    "fps": (1, 240),
-    "max_pixels": (1, None),
-    "max_envmap_width": (1, 2**20),
-    "max_file_bytes": (1, None),
-    "max_triangles": (1, None),
-    "max_texture_pixels": (1, None),
-    "max_nodes": (1, None),
-    "max_instances": (1, None),
-    "max_points": (1, None),
-    "max_json_bytes": (1, None),
-    "max_gltf_json_bytes": (1, None),
-    "max_json_values": (1, None),
-    # Python's readers call themselves for each level.
-    "max_nesting": (1, 200),
-    "max_prompt_bytes": (1, None),
-    # The diffusion model, and its adaptation to the photo
-    "class_images": (0, 10_000),
-    "class_steps": (1, 1000),
-    "class_scale": (0, 1000),
-    "class_batch": (1, 256),
-    "lora_rank": (1, 1024),
-    "lora_steps": (0, 10**6),
-    "lora_rate": (0, 1),
-    "lora_class_batch": (1, 64),
-    "lora_class_weight": (0, 1000),
-    "lora_crop": (0.05, 1),
-    "lora_decay": (0, 1),
-    "lora_clip": (1e-9, None),
-    # Guidance
-    "guidance_scale": (0, 10_000),
-    "time_min": (0, 1),
-    "time_max": (0, 1),
-    "time_max_end": (0, 1),
-    "noises": (1, 64),
-    "crop_min": (0.01, 100),
-    "crop_max": (0.01, 100),
-    "gradient_clip": (0, None),
-    "update_every": (1, 10**6),
-    "update_steps": (1, 1000),
-    "update_scale": (0, 1000),
-    # Optimisation
-    "steps": (0, 10**6),
-    "guidance_width": (8, 4096),
-    "lobes": (1, 4096),
-    "light_height": (4, 512),
-    "object_light_height": (4, 512),
-    "transport_memory": (1, 2**24),
-    "mis_samples": (1, 2**20),
-    "retrace_at": (1, None),
-    "rate": (0, 10),
-    "rate_intensity": (0, 10),
-    "rate_axis": (0, 10),
-    "rate_width": (0, 10),
-    "rate_chroma": (0, 10),
-    "rate_tone": (0, 10),
-    "rate_material": (0, 10),
-    "rate_emission": (0, 10),
-    "adam_beta1": (0, 0.999999),
-    "adam_beta2": (0, 0.999999),
-    "consistency": (0, None),
-    "spread": (0, None),
-    "chroma": (0, None),
-    "bend": (0, None),
-    "trust": (0, None),
-    "tone_bins": (1, 64),
-    "fusion_start": (0, 1),
-    "fusion_end": (0, 1),
-    "rate_end": (0, 1),
-    "lobe_width": (0.05, 10),
-    "chroma_limit": (0, 20),
-    "intensity_limit": (1, 1e12),
-    "score_every": (0, 10**6),
-    "preview_every": (0, 10**6),
-    "checkpoint_every": (0, 10**6),
-}
-"""Least and greatest value of a field; None: no limit."""
-
-ABOVE_ZERO = ("lora_rate", "chroma_limit")
-
-AXES = ("x", "+x", "-x", "y", "+y", "-y", "z", "+z", "-z")
-CHOICES = {
-    "up": AXES,
-    "asset_up": AXES,
-    "tone": ("reinhard", "linear"),
-    "alpha": ("refuse", "ignore"),
-    "light_convention": ("openexr", "nvdiffrec", "threejs", "blender", "diffusionlight"),
-    "missing_textures": ("error", "grey"),
-    "guidance": ("embedded", "stable-diffusion", "none"),
-    "start": ("regressed", "uniform"),
-    "precision": ("fp16", "bf16", "fp32"),
-    "vae_precision": ("fp16", "bf16", "fp32"),
-    "loss": (
-        "lds",
-        "sds",
-        "sds-base",
-        "csd",
-        "lds-lora-both",
-        "lds-negative",
-        "good-bad",
-        "sds-good-bad",
-        "dataset-update",
-    ),
-    "null_background": ("keep", "drop"),
-    "weight": ("sigma2", "sigma", "uniform"),
-    "fusion": ("schedule", "single", "none"),
-    "integrator": ("transport", "mis"),
-    "refine": ("material", "emission", "tone"),
-}
 LOSSES_OF_BASE = ("csd", "sds-base", "good-bad", "sds-good-bad", "dataset-update")
 """Losses that do without an adapter."""
 LOSSES_AWAY = ("lds-negative", "good-bad", "sds-good-bad")
 """Losses that move away from a negative prompt."""
 LIGHTS = ("light", "sun", "sky", "reuse")
 """Fields that name a light."""
-PROMPTS = (
-    "prompt",
-    "negative_prompt",
-    "null_prompt",
-    "base_prompt",
-    "class_noun",
-    "token",
-    "show_prior",
-)
-EMPTY_ALLOWED = ("negative_prompt", "null_prompt", "base_prompt")
 
 
-@cache
-def kinds() -> dict[str, Any]:
-    """Return the annotations of all fields."""
-    hints = {name: get_type_hints(part) for name, part in PARTS.items()}
-    return {name: hints[option.part][option.field.name] for name, option in OPTIONS.items()}
-
-
-def _plain(value: object) -> object:
-    """Return a value as JSON holds it: a path as text, NumPy's numbers as Python's."""
-    if isinstance(value, tuple | list):
-        return tuple(map(_plain, value))
-    if isinstance(value, PathLike):
-        return os.fspath(value)
-    if isinstance(value, bool | str):
-        return value
-    if isinstance(value, Integral):
-        return int(value)
-    return float(value) if isinstance(value, Real) else value
-
-
-def _is_a(value: object, kind: Any) -> bool:
-    """Return whether a plain value is what an annotation says; a whole number is a float too."""
-    if get_origin(kind) is UnionType:
-        return any(_is_a(value, alternative) for alternative in get_args(kind))
-    if get_origin(kind) is tuple:
-        parts = get_args(kind)
-        if not isinstance(value, tuple):
-            return False
-        parts = parts[:1] * len(value) if parts[-1] is Ellipsis else parts
-        return len(parts) == len(value) and all(map(_is_a, value, parts))
-    if kind is bool or isinstance(value, bool):
-        return kind is bool and isinstance(value, bool)
-    return isinstance(value, int | float if kind is float else kind)
+Check = Callable[[str, bool, str], Iterator[InputError]]
 
 
 def _values_out_of_range(config: InsertConfig) -> Iterator[InputError]:
@@ -456,17 +261,14 @@ def _values_out_of_range(config: InsertConfig) -> Iterator[InputError]:
             yield usage(flag(name), f"{expected} (found {_shown(value)})")
 
     values = config.flat()
-    of_other_kinds = [name for name, value in values.items() if not _is_a(value, kinds()[name])]
+    of_other_kinds = [name for name, value in values.items() if not is_a(value, OPTIONS[name].kind)]
     for name in of_other_kinds:
-        expected = str(kinds()[name]).removeprefix("<class '").removesuffix("'>")
+        expected = str(OPTIONS[name].kind).removeprefix("<class '").removesuffix("'>")
         yield usage(flag(name), f"expected {expected} (found {_shown(values[name])})")
     if of_other_kinds:
         return  # from Python alone, and no other check would know what to do with them
     for name, value in values.items():
         yield from _not_plain(name, value, config.limits.prompt_bytes)
-    yield from check(
-        "fov", config.camera.fov is None or 0.0 < config.camera.fov < 180.0, "between 0 and 180"
-    )
     in_order = config.optimize.fusion_end >= config.optimize.fusion_start
     yield from check("fusion_end", in_order, "at least --fusion-start")
     for name in ("place", "ground", "sun", "sky", "at"):
@@ -474,18 +276,7 @@ def _values_out_of_range(config: InsertConfig) -> Iterator[InputError]:
         if isinstance(parts, tuple):
             within = not any(abs(part) > LARGEST for part in parts)
             yield from check(name, within, f"numbers up to {LARGEST:g}")
-    if config.camera.ground is not None and all(map(math.isfinite, config.camera.ground)):
-        yield from check("ground", any(config.camera.ground[:3]), "a normal a,b,c that is not 0")
-    if config.light.sun is not None:
-        yield from check("sun", -90.0 <= config.light.sun[1] <= 90.0, "elevation -90 to 90")
-        yield from check(
-            "sun", len(config.light.sun) < 3 or config.light.sun[-1] >= 0.0, "strength at least 0"
-        )
-    if isinstance(config.light.sky, tuple):
-        yield from check("sky", min(config.light.sky) >= 0.0, "radiance at least 0")
-    else:
-        presets = f"{', '.join(SKY_PRESETS)} or R,G,B"
-        yield from check("sky", config.light.sky in SKY_PRESETS, presets)
+    yield from _light_and_ground_problems(config, check)
     if config.render.device is not None:
         known = DEVICE_FORM.fullmatch(config.render.device) is not None
         yield from check("device", known, "cpu, cuda or cuda:N")
@@ -499,16 +290,21 @@ def _values_out_of_range(config: InsertConfig) -> Iterator[InputError]:
         known = set(config.task.refine_parts) <= set(REFINE_PARTS)
         yield from check("refine_parts", known, f"some of {', '.join(REFINE_PARTS)}")
     for name, value in values.items():
-        if value is None:
-            continue
-        if name in ABOVE_ZERO:
-            yield from check(name, value > 0.0, "more than 0")
-        if name in RANGES:
-            low, high = RANGES[name]
-            yield from check(name, value >= low, f"at least {low}")
-            yield from check(name, high is None or value <= high, f"at most {high}")
-        if name in CHOICES:
-            yield from check(name, value in CHOICES[name], " or ".join(CHOICES[name]))
+        expected = OPTIONS[name].rule.problem(value) if value is not None else ""
+        yield from check(name, not expected, expected)
+
+
+def _light_and_ground_problems(config: InsertConfig, check: Check) -> Iterator[InputError]:
+    ground, sun, sky = config.camera.ground, config.light.sun, config.light.sky
+    if ground is not None and all(map(math.isfinite, ground)):
+        yield from check("ground", any(ground[:3]), "a normal a,b,c that is not 0")
+    if sun is not None:
+        yield from check("sun", -90.0 <= sun[1] <= 90.0, "elevation -90 to 90")
+        yield from check("sun", len(sun) < 3 or sun[-1] >= 0.0, "strength at least 0")
+    if isinstance(sky, tuple):
+        yield from check("sky", min(sky) >= 0.0, "radiance at least 0")
+    else:
+        yield from check("sky", sky in SKY_PRESETS, f"{', '.join(SKY_PRESETS)} or R,G,B")
 
 
 def _not_plain(name: str, value: object, prompt_limit: int) -> Iterator[InputError]:
@@ -517,10 +313,10 @@ def _not_plain(name: str, value: object, prompt_limit: int) -> Iterator[InputErr
     if any(isinstance(part, float) and not math.isfinite(part) for part in parts):
         yield usage(flag(name), f"finite numbers (found {_shown(value)})")
     texts = [part for part in parts if isinstance(part, str)]
-    if not parts or any("\0" in t or not (t or name in EMPTY_ALLOWED) for t in texts):
+    if not parts or any("\0" in t or not (t or OPTIONS[name].rule.may_be_empty) for t in texts):
         yield usage(flag(name), "a text that is not empty and holds no NUL")
     longest = max((len(text.encode("utf-8", "replace")) for text in texts), default=0)
-    if name in PROMPTS and longest > prompt_limit:
+    if OPTIONS[name].rule.is_prompt and longest > prompt_limit:
         found = f"a text too long (found {longest} bytes; limit {prompt_limit})"
         yield usage(flag(name), f"{found}; --max-prompt-bytes raises it")
 

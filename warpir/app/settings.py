@@ -1,44 +1,48 @@
 """The parts of a configuration: what each stage of an insertion is asked to do; plain values only.
 
 Each field is one flag of the command line (``height`` of `CameraConfig` is ``--camera-height``),
-one key of a configuration file and one entry under ``config`` in ``run.json``. The line below a
-field is its ``--help``. Angles are degrees here and at the command line, radians everywhere inside.
-Defaults are the authors' (DiPIR, Liang et al. 2024) where they state one, else ours. What is None
-is open: it follows from other values, or from the prior that guides
-(`warpir.app.config.PRIOR_DEFAULTS`).
+one key of a configuration file and one entry under ``config`` in ``run.json``. Its range and form
+stand on it (`warpir.core.options`), and its help below it. Angles are degrees here and at the
+command line, radians everywhere inside. Defaults are the authors' (DiPIR, Liang et al. 2024) where
+they state one, else ours. What is None is open: it follows from other values, or from the prior
+that guides (`warpir.app.config.PRIOR_DEFAULTS`).
 """
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
+from warpir.core.options import option
 from warpir.diffusion.settings import GuidanceChoices
+
+AXES = ("x", "+x", "-x", "y", "+y", "-y", "z", "+z", "-z")
 
 
 @dataclass(frozen=True)
 class InputConfig:
     """The photograph, the object, and how strictly their files are read."""
 
-    photo: str | None = None
-    """The photograph: JPEG, PNG, TIFF, WebP, EXR or Radiance HDR"""
-    layer: str | None = None
-    """Layer of an EXR photo that is used, such as beauty for beauty.R, beauty.G and beauty.B
-    (default: its R, G and B)"""
-    occluder_mask: str | None = None
-    """Grey image of the upright photo's size: white where the photo stays in front of the object"""
-    asset: str | None = None
+    photo: str | None = option(None, "FILE")
+    """The photograph; JPEG, PNG, TIFF, WebP, EXR or Radiance HDR"""
+    layer: str | None = option(None, "NAME")
+    """Layer of an EXR photo (default: its R, G and B); such as beauty for beauty.R, beauty.G and
+    beauty.B"""
+    occluder_mask: str | None = option(None, "FILE")
+    """Grey image, white where the photo stays in front of the object; of the upright photo's
+    size"""
+    asset: str | None = option(None, "FILE")
     """The object: .glb, .gltf, .obj, .ply or .stl"""
-    asset_up: str | None = None
-    """Which axis of the asset points up (default: +y, as glTF demands; other tools' OBJ, PLY and
-    STL are often +z)"""
-    materials: str | None = None
-    """materials.json of a run with --refine: factors for the materials of --asset"""
-    demo: bool = False
-    """Use the scene that ships with warpir in place of --photo and --asset"""
-    alpha: str = "refuse"
+    asset_up: str | None = option(None, "AXIS", choices=AXES)
+    """Axis of the asset that points up (default: +y); as glTF demands; other tools' OBJ, PLY and
+    STL are often +z"""
+    materials: str | None = option(None, "FILE")
+    """materials.json of a run with --refine; factors for the materials of --asset"""
+    demo: bool = option(False)
+    """Use the scene that ships with warpir; in place of --photo and --asset"""
+    alpha: str = option("refuse", "RULE", expert=True, choices=("refuse", "ignore"))
     """What to do with a photo that has transparency: refuse or ignore"""
-    strict: bool = False
-    """Refuse a photo or panorama with values that are not finite, or a light with negative ones,
-    in place of repairing them"""
-    missing_textures: str = "error"
+    strict: bool = option(False)
+    """Refuse values that are not finite in place of repairing them; in a photo or a panorama, and
+    negative light"""
+    missing_textures: str = option("error", "RULE", expert=True, choices=("error", "grey"))
     """What to do when a texture of the asset is missing: error, or grey in its place"""
 
 
@@ -46,37 +50,37 @@ class InputConfig:
 class CameraConfig:
     """The camera of the photo and the ground that it sees."""
 
-    file: str | None = field(default=None, metadata={"name": "camera"})
-    """Camera of the photo: warpir's JSON, .fspy or fSpy's JSON, a COLMAP model's folder, the
-    transforms.json of nerfstudio, Waymo's calibration, glTF or EXR (default: the photo's EXIF)"""
-    frame: str | None = None
-    """Which image or camera of the camera file is meant (default: the one named as the photo)"""
-    undistort: bool = False
+    file: str | None = option(None, "FILE|DIR", name="camera")
+    """Camera of the photo (default: the photo's EXIF); warpir's JSON, .fspy or fSpy's JSON, a
+    COLMAP model's folder, the transforms.json of nerfstudio, Waymo's calibration, glTF or EXR"""
+    frame: str | None = option(None, "NAME")
+    """Image or camera of --camera (default: named as the photo)"""
+    undistort: bool = option(False)
     """Undo the lens distortion that the camera file states; the composite is of the straight
     photo"""
-    fov: float | None = None
+    fov: float | None = option(None, "DEG", above=0, below=180)
     """Horizontal field of view of the photo [deg]"""
-    pitch: float | None = None
+    pitch: float | None = option(None, "DEG", low=-90, high=90)
     """How far the camera looks up, negative for down [deg]"""
-    horizon: float | None = None
-    """Row of the horizon in the photo's middle column, from the top [px], or its share of the
-    height when between 0 and 1; in place of --pitch"""
-    height: float | None = field(default=None, metadata={"name": "camera_height"})
+    horizon: float | None = option(None, "ROW")
+    """Row of the horizon [px], or its share of the height; in the photo's middle column, from the
+    top; a share when between 0 and 1; in place of --pitch"""
+    height: float | None = option(None, "M", name="camera_height", low=1e-6, high=1e9)
     """Height of the camera above the ground [m]"""
-    up: str | None = None
+    up: str | None = option(None, "AXIS", expert=True, choices=AXES)
     """Which axis of the camera file's world points up"""
-    ground: tuple[float, float, float, float] | None = None
-    """Ground plane a x + b y + c z + d = 0 in world coordinates [1, 1, 1, m] (default: y = 0)"""
-    ground_points: str | None = None
-    """Points of the scene in the camera file's world (.ply, text, COLMAP model): the ground is a
-    plane fitted to them, and without --at and --place the object stands where it is free"""
-    proxy: str | None = None
-    """Mesh of the place in world coordinates [m], +Y up: .glb, .gltf, .obj, .ply or .stl. It
-    receives shadows beside the ground plane, hides the object and stands in the light's way"""
-    plane: bool = True
+    ground: tuple[float, float, float, float] | None = option(None, "A,B,C,D")
+    """Ground plane a x + b y + c z + d = 0 (default: y = 0); in world coordinates [1, 1, 1, m]"""
+    ground_points: str | None = option(None, "FILE|DIR")
+    """Points of the scene, to which the ground is fitted; in the camera file's world (.ply, text,
+    COLMAP model); without --at and --place the object stands where it is free"""
+    proxy: str | None = option(None, "FILE")
+    """Mesh of the place: receives shadows, hides the object; in world coordinates [m], +Y up: .glb,
+    .gltf, .obj, .ply or .stl; beside the ground plane, and it stands in the light's way"""
+    plane: bool = option(True)
     """The ground plane beside the mesh of --proxy"""
-    shadow_mask: str | None = None
-    """Grey image of the photo's size, white where its ground is in shadow already: the sun and
+    shadow_mask: str | None = option(None, "FILE")
+    """Grey image, white where the ground is in shadow already; of the photo's size; the sun and
     other lamps are not taken away there once more"""
 
 
@@ -84,78 +88,89 @@ class CameraConfig:
 class PlacementConfig:
     """Where the object stands, and how large it is."""
 
-    place: tuple[float, float, float] | None = None
+    place: tuple[float, float, float] | None = option(None, "X,Y,Z")
     """Where the object stands, world coordinates [m]; moved onto the ground along its normal (not
     with --no-plane)"""
-    at: tuple[float, float] | None = None
-    """Where the object stands, as a pixel of the ground or of --proxy in the upright photo [px]"""
-    rotate_y: float = 0.0
-    """Turn of the object about the ground's normal, counter-clockwise seen from above [deg]"""
-    scale: float | None = None
+    at: tuple[float, float] | None = option(None, "U,V")
+    """Where the object stands, as a pixel of the photo [px]; of the ground or of --proxy in the
+    upright photo"""
+    rotate_y: float = option(0.0, "DEG")
+    """Turn of the object, counter-clockwise from above [deg]; about the ground's normal"""
+    scale: float | None = option(None, "S", low=1e-9, high=1e9)
     """Factor on the asset's own size [1]"""
-    size: float | None = None
-    """Longest side of the asset's bounding box after scaling [m]"""
+    size: float | None = option(None, "METRES", low=1e-6, high=1e9)
+    """Longest side of the asset after scaling [m]; of its bounding box"""
 
 
 @dataclass(frozen=True)
 class LightConfig:
     """The light as it is given, and how radiance becomes display values."""
 
-    file: str | None = field(default=None, metadata={"name": "light"})
-    """The light: a panorama (.hdr, .exr, or a picture without a sun's strength) or lobes (.json)"""
-    convention: str = field(default="openexr", metadata={"name": "light_convention"})
-    """Who made the panorama, which tells where its seam lies: openexr (also OpenUSD and Mitsuba),
+    file: str | None = option(None, "FILE", name="light")
+    """The light: a panorama (.hdr, .exr, picture) or lobes (.json); a picture lacks a sun's
+    strength"""
+    convention: str = option(
+        "openexr",
+        "NAME",
+        name="light_convention",
+        choices=("openexr", "nvdiffrec", "threejs", "blender", "diffusionlight"),
+    )
+    """Who made the panorama: tells where its seam lies; openexr (also OpenUSD and Mitsuba),
     nvdiffrec, threejs, blender, or diffusionlight, whose maps turn with the camera"""
-    rotate: float = field(default=0.0, metadata={"name": "light_rotate"})
-    """Turn of the light about +Y, counter-clockwise seen from above [deg]"""
-    fit_lobes: int | None = None
-    """Replace the panorama by this many spherical-Gaussian lobes fitted to it"""
-    sun: tuple[float, float] | tuple[float, float, float] | None = None
-    """A sun: azimuth clockwise from -Z seen from above [deg], elevation [deg], irradiance it
-    gives a surface that faces it, relative [W/m^2]"""
-    sky: str | tuple[float, float, float] | None = None
-    """A sky: clear, overcast or sunset, or its linear radiance R,G,B, relative [W/(m^2 sr)]"""
-    reuse: str | None = None
-    """Folder of an earlier run: its light and its tone curves are used, and nothing is optimised"""
-    start: str | None = None
-    """Where the recovery begins when no light is given: regressed, as the regressor sees it in the
-    photo, or uniform, an even light (default: regressed)"""
-    regressor: str | None = None
-    """Weights of the regressor (default: those that come with warpir)"""
-    exposure: float | None = None
-    """Factor on the light, in stops [EV] (default: chosen from the photo)"""
-    tone: str | None = None
-    """How the object's radiance becomes display values: linear (clipped, as the photo was), or
-    reinhard (x / (1 + x), paler, nothing clips)"""
-    ground_albedo: float = 0.25
-    """Reflectance assumed of the ground, for the automatic exposure [1]"""
-    detail: bool = True
-    """Let the object reflect what the photo shows of its surroundings, where the light has no
-    panorama's detail of its own"""
+    rotate: float = option(0.0, "DEG", name="light_rotate")
+    """Turn of the light, counter-clockwise from above [deg]; about +Y"""
+    fit_lobes: int | None = option(None, "N", low=1, high=4096)
+    """Replace the panorama by this many fitted lobes; spherical Gaussians"""
+    sun: tuple[float, float] | tuple[float, float, float] | None = option(
+        None, "AZIMUTH,ELEVATION[,STRENGTH]"
+    )
+    """A sun: azimuth, elevation [deg], strength; azimuth clockwise from -Z seen from above; the
+    strength is the irradiance it gives a surface that faces it, relative [W/m^2]"""
+    sky: str | tuple[float, float, float] | None = option(None, "NAME|R,G,B")
+    """A sky: clear, overcast, sunset, or its radiance; linear R,G,B, relative [W/(m^2 sr)]"""
+    reuse: str | None = option(None, "DIR")
+    """Earlier run whose light and tone curves are used; nothing is optimised"""
+    start: str | None = option(None, "NAME", choices=("regressed", "uniform"))
+    """Start without a light: regressed (default) or uniform; where the recovery begins when no
+    light is given: as the regressor sees it in the photo, or an even light"""
+    regressor: str | None = option(None, "FILE")
+    """Weights of the regressor (default: those in the package)"""
+    exposure: float | None = option(None, "EV", low=-30, high=30)
+    """Factor on the light, in stops (default: from the photo); [EV]"""
+    tone: str | None = option(
+        None, "NAME", choices=("reinhard", "linear"), stable_diffusion="reinhard", embedded="linear"
+    )
+    """Object's radiance to display values: linear or reinhard; clipped, as the photo was, or x / (1
+    + x), which is paler and does not clip"""
+    ground_albedo: float = option(0.25, "SHARE", low=1e-6, high=1)
+    """Reflectance of the ground, for the exposure; which is automatic without --exposure"""
+    detail: bool = option(True)
+    """Let the object reflect what the photo shows around it; where the light has no panorama's
+    detail of its own"""
 
 
 @dataclass(frozen=True)
 class RenderConfig:
     """How the picture is rendered, and on what."""
 
-    samples: int = 64
+    samples: int = option(64, "N", low=1, high=2**20)
     """Samples per pixel"""
-    rays: int = 1
-    """Rays per sample of each sampling strategy, light and surface"""
-    depth: int = 5
+    rays: int = option(1, "N", low=1, high=2**10)
+    """Rays per sample, of light and of surface each"""
+    depth: int = option(5, "D", low=1, high=2**10)
     """Longest light path, in surface hits"""
-    indirect_limit: float = 8.0
-    """Most radiance that one light path may add after its first bounce; 0: no limit (the limit
-    removes bright specks where a mirror throws sunlight onto the object)"""
-    width: int | None = None
-    """Width at which the object is rendered [px] (default: the photo's)"""
-    device: str | None = None
-    """cpu, cuda or cuda:N (default: cuda where there is one, else cpu)"""
-    threads: int | None = None
+    indirect_limit: float = option(8.0, "RADIANCE", low=0)
+    """Most radiance after a path's first bounce (0: any); the limit removes bright specks where a
+    mirror throws sunlight onto the object"""
+    width: int | None = option(None, "W", low=8, high=65_536)
+    """Width at which the object is rendered (default: the photo's); [px]"""
+    device: str | None = option(None, "NAME")
+    """cpu, cuda or cuda:N (default: cuda where there is one); else cpu"""
+    threads: int | None = option(None, "N", low=1, high=2**10)
     """CPU threads (default: one per core)"""
-    seed: int = 0
+    seed: int = option(0, "N", low=0, high=2**32 - 1)
     """Seed of all random numbers"""
-    deterministic: bool = False
+    deterministic: bool = option(False)
     """Repeat the same bytes on a GPU too, slower; on the CPU every run does"""
 
 
@@ -163,21 +178,23 @@ class RenderConfig:
 class GuidanceConfig(GuidanceChoices):
     """Which prior guides, and what it is asked."""
 
-    kind: str | None = field(default=None, metadata={"name": "guidance"})
-    """What recovers the light from the photo: embedded, what comes with warpir: the light that a
-    regressor sees in the photo, which with --steps 60 a small prior refines (experimental: it
-    failed its release gate); stable-diffusion; or none, and the light is used as given, or else as
-    the regressor sees it (default: stable-diffusion with --model, none where a light is given, else
-    embedded)"""
-    prompt: str | None = None
-    """What the object is, in a few words, such as 'a black SUV car' (stable-diffusion needs it)"""
-    prior: str | None = None
-    """Weights of the prior of --guidance embedded, which --steps asks (default: those in the
-    package)"""
-    accept: bool | None = None
-    """Keep the start of the recovery unless guidance, asked anew, clearly prefers its end"""
-    show_prior: tuple[str, ...] | None = None
-    """Prompts, separated by |, for pictures of what the model imagines, before and after it was
+    kind: str | None = option(
+        None, "NAME", name="guidance", choices=("embedded", "stable-diffusion", "none")
+    )
+    """Prior: embedded, stable-diffusion or none; what recovers the light from the photo. embedded
+    comes with warpir: the light that a regressor sees in the photo, which with --steps 60 a small
+    prior refines (experimental: it failed its release gate). With none the light is used as given,
+    or else as the regressor sees it (default: stable-diffusion with --model, none where a light is
+    given, else embedded)"""
+    prompt: str | None = option(None, "TEXT", is_prompt=True)
+    """What the object is, such as 'a black SUV car'; in a few words; stable-diffusion needs it"""
+    prior: str | None = option(None, "FILE")
+    """Weights of the embedded prior (default: in the package); which --steps asks"""
+    accept: bool | None = option(None, stable_diffusion=False, embedded=True)
+    """Keep the start of the recovery unless its end is better; guidance, asked anew, must clearly
+    prefer the end"""
+    show_prior: tuple[str, ...] | None = option(None, "TEXT|TEXT", is_prompt=True, separator="|")
+    """Prompts for pictures of what the model imagines; separated by |; before and after it was
     adapted to the photo"""
 
 
@@ -185,85 +202,123 @@ class GuidanceConfig(GuidanceChoices):
 class OptimizeSettings:
     """How light and tone curves are recovered from the guidance's gradient."""
 
-    preview_every: int | None = None
-    """Steps between two preview pictures of the optimisation, the first of which is the start;
-    0: none"""
-    checkpoint_every: int = 50
+    preview_every: int | None = option(
+        None, "N", low=0, high=10**6, stable_diffusion=0, embedded=50
+    )
+    """Steps between two preview pictures (0: none); of the optimisation, the first of which is the
+    start"""
+    checkpoint_every: int = option(50, "N", expert=True, low=0, high=10**6)
     """Steps between two checkpoints of the optimisation; 0: none"""
-    steps: int | None = None
+    steps: int | None = option(None, "N", low=0, high=10**6, stable_diffusion=600, embedded=0)
     """Steps of the optimisation; with --refine 300, or 200 for tone; the embedded prior is asked
     with more than 0 alone (experimental: it failed its release gate)"""
-    guidance_width: int | None = None
+    guidance_width: int | None = option(
+        None,
+        "W",
+        expert=True,
+        low=8,
+        high=4096,
+        stable_diffusion=384,
+        embedded=384,
+        embedded_on_cpu=256,
+    )
     """Width of the picture inside the loop [px]; its height follows the photo's shape"""
-    lobes: int = 64
+    lobes: int = option(64, "N", expert=True, low=1, high=4096)
     """Spherical-Gaussian lobes of each light, the object's and the shadow's"""
-    lobe_width: float = 0.6
+    lobe_width: float = option(0.6, "SPACINGS", expert=True, low=0.05, high=10)
     """Width of the lobes at the start of an even light, sigma in spacings of the lobes"""
-    light_height: int | None = None
+    light_height: int | None = option(
+        None,
+        "ROWS",
+        expert=True,
+        low=4,
+        high=512,
+        stable_diffusion=64,
+        embedded=64,
+        embedded_on_cpu=48,
+    )
     """Rows of the maps in which the two lights are fused"""
-    object_light_height: int | None = None
+    object_light_height: int | None = option(
+        None,
+        "ROWS",
+        expert=True,
+        low=4,
+        high=512,
+        stable_diffusion=32,
+        embedded=32,
+        embedded_on_cpu=24,
+    )
     """Rows of the map that lights the object while its light transport is stored"""
-    fusion: str | None = None
+    fusion: str | None = option(
+        None,
+        "NAME",
+        expert=True,
+        choices=("schedule", "single", "none"),
+        stable_diffusion="schedule",
+        embedded="single",
+    )
     """How the two lights become one: schedule (blended from none to all over the run), single (one
     light from the start) or none (two lights to the end)"""
-    fusion_start: float = 0.0
+    fusion_start: float = option(0.0, "SHARE", expert=True, low=0, high=1)
     """Where in the run the lights begin to become one, as a share of the steps"""
-    fusion_end: float = 1.0
+    fusion_end: float = option(1.0, "SHARE", expert=True, low=0, high=1)
     """Where in the run they are one, as a share of the steps"""
-    lobe_shape: bool | None = None
+    lobe_shape: bool | None = option(None, expert=True, stable_diffusion=True, embedded=False)
     """Recover widths and colours of the lobes too, not their directions and strengths alone"""
-    tone_curve: bool | None = None
+    tone_curve: bool | None = option(None, expert=True, stable_diffusion=True, embedded=False)
     """Recover tone curves for the object and its shadow"""
-    integrator: str = "transport"
+    integrator: str = option("transport", "NAME", expert=True, choices=("transport", "mis"))
     """What renders inside the loop: transport (light transport is traced once and then reused) or
     mis (every step is traced)"""
-    transport_memory: int = 4096
+    transport_memory: int = option(4096, "MIB", expert=True, low=1, high=2**24)
     """Most memory that the stored light transport may take [MiB]"""
-    mis_samples: int = 16
+    mis_samples: int = option(16, "N", expert=True, low=1, high=2**20)
     """Samples per pixel of --integrator mis"""
-    retrace_at: float = 3.0
+    retrace_at: float = option(3.0, "FACTOR", expert=True, low=1)
     """Light transport is traced again when the lights have changed so much that its noise has grown
     by this factor"""
-    rate: float | None = None
+    rate: float | None = option(
+        None, "FACTOR", expert=True, low=0, high=10, stable_diffusion=1.0, embedded=0.35
+    )
     """Factor on all learning rates"""
-    rate_end: float = 0.1
+    rate_end: float = option(0.1, "FACTOR", expert=True, low=0, high=1)
     """Factor to which all learning rates fall over the second half of the run, by a cosine"""
-    rate_intensity: float = 0.12
+    rate_intensity: float = option(0.12, "R", expert=True, low=0, high=10)
     """Learning rate of the lobes' log intensities"""
-    rate_axis: float = 0.04
+    rate_axis: float = option(0.04, "R", expert=True, low=0, high=10)
     """Learning rate of the lobes' directions; 0.04 is at most two degrees per step"""
-    rate_width: float = 0.06
+    rate_width: float = option(0.06, "R", expert=True, low=0, high=10)
     """Learning rate of the lobes' log widths"""
-    rate_chroma: float = 0.01
+    rate_chroma: float = option(0.01, "R", expert=True, low=0, high=10)
     """Learning rate of the lobes' log colour ratios"""
-    rate_tone: float = 0.01
+    rate_tone: float = option(0.01, "R", expert=True, low=0, high=10)
     """Learning rate of the tone curves"""
-    rate_material: float = 0.02
+    rate_material: float = option(0.02, "R", expert=True, low=0, high=10)
     """Learning rate of --refine material"""
-    rate_emission: float = 0.05
+    rate_emission: float = option(0.05, "R", expert=True, low=0, high=10)
     """Learning rate of --refine emission, whose factors range over decades"""
-    adam_beta1: float = 0.9
+    adam_beta1: float = option(0.9, "B", expert=True, low=0, high=0.999999)
     """Adam's decay of the gradient's mean"""
-    adam_beta2: float = 0.99
+    adam_beta2: float = option(0.99, "B", expert=True, low=0, high=0.999999)
     """Adam's decay of the gradient's square"""
-    consistency: float = 0.03
+    consistency: float = option(0.03, "W", expert=True, low=0)
     """Weight of the term that gives the object's light the shape of the shadow's (eq. 10)"""
-    spread: float = 0.01
+    spread: float = option(0.01, "W", expert=True, low=0)
     """Weight of the Cauchy term that keeps the shadow's light in few directions (eq. 11)"""
-    chroma: float = 0.1
+    chroma: float = option(0.1, "W", expert=True, low=0)
     """Weight of the prior that keeps the light's colour near white"""
-    tone_bins: int = 5
+    tone_bins: int = option(5, "N", expert=True, low=1, high=64)
     """Bins of each tone curve"""
-    bend: float = 0.1
+    bend: float = option(0.1, "W", expert=True, low=0)
     """Weight of the prior that keeps tone curves near the identity"""
-    trust: float = 4.0
-    """Weight of the term that holds the light near the regressed one, in squares of what that is
-    uncertain by; 0: nothing holds it"""
-    chroma_limit: float = 1.5
+    trust: float = option(4.0, "W", low=0)
+    """Weight that holds the light near the regressed one (0: none); in squares of what that is
+    uncertain by"""
+    chroma_limit: float = option(1.5, "LOG", expert=True, above=0, high=20)
     """Greatest log colour ratio of a lobe"""
-    intensity_limit: float = 1e6
+    intensity_limit: float = option(1e6, "FACTOR", expert=True, low=1, high=1e12)
     """Greatest factor between a lobe's intensity and that of the start, either way"""
-    score_every: int = 25
+    score_every: int = option(25, "N", expert=True, low=0, high=10**6)
     """Steps between two scores, of which the best state is kept; 0: the last state is kept"""
 
     @property
@@ -311,35 +366,35 @@ class OptimizeSettings:
 class TaskConfig:
     """What else is done under a known light."""
 
-    sequence: str | None = None
-    """JSON lines, each a frame: what differs from the command line, such as {"photo": "2.png",
-    "place": [0, 0, -4]}; needs --reuse"""
-    fps: float = 24.0
-    """Frames per second of the video of --sequence, which is made where ffmpeg is found"""
-    refine: str | None = None
-    """What is changed by the prompt under a known light (--reuse, --light, --sun or --sky):
-    material, emission or tone"""
-    refine_parts: tuple[str, ...] | None = None
-    """What --refine material changes: base-color, metallic, roughness (default: all of them)"""
-    refine_materials: tuple[str, ...] | None = None
-    """Names of the asset's materials that --refine changes (default: all of them)"""
+    sequence: str | None = option(None, "FILE")
+    """JSON lines, each a frame (needs --reuse); what differs from the command line, such as
+    {"photo": "2.png", "place": [0, 0, -4]}"""
+    fps: float = option(24.0, "N", low=1, high=240)
+    """Frames per second of the video of --sequence; which is made where ffmpeg is found"""
+    refine: str | None = option(None, "WHAT", choices=("material", "emission", "tone"))
+    """Change material, emission or tone under a known light; by the prompt; the light is that of
+    --reuse, --light, --sun or --sky"""
+    refine_parts: tuple[str, ...] | None = option(None, "NAME,NAME")
+    """Parts that --refine material changes (default: all); base-color, metallic, roughness"""
+    refine_materials: tuple[str, ...] | None = option(None, "NAME,NAME")
+    """Materials that --refine changes, by name (default: all); of the asset"""
 
 
 @dataclass(frozen=True)
 class OutputConfig:
     """Where results are written, and which."""
 
-    out: str | None = None
+    out: str | None = option(None, "DIR")
     """Folder for everything that is written"""
-    overwrite: bool = False
+    overwrite: bool = option(False)
     """Replace results that are already in --out"""
-    resume: bool = False
+    resume: bool = option(False)
     """Go on from the last checkpoint in --out"""
-    mark: bool = True
+    mark: bool = option(True, expert=True)
     """Note in the picture's metadata that it is a composite"""
-    hand_off: bool = True
-    """Write the files for Blender, three.js and colour tools as well"""
-    report: bool = True
-    """Write report.html, a page that shows the result, the light and all figures"""
-    mitsuba: bool = False
-    """Write the insertion as a scene of Mitsuba 3 as well, into a folder of its own"""
+    hand_off: bool = option(True)
+    """Write the files for Blender, three.js, colour tools"""
+    report: bool = option(True)
+    """Write report.html; a page that shows the result, the light and all figures"""
+    mitsuba: bool = option(False)
+    """Write a scene of Mitsuba 3 as well; the insertion, into a folder of its own"""

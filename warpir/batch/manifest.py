@@ -15,8 +15,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from warpir.app.command import by_name, read_values
+from warpir.app.command import read_values
 from warpir.app.config import DEFAULTS, InsertConfig, flag, replaced_by, usage
+from warpir.app.config_file import by_name
 from warpir.app.record import PATHS
 from warpir.core.errors import ExitCode, InputError, raise_all, shown
 from warpir.core.limits import Limits

@@ -8,38 +8,39 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from warpir.core.errors import InputError
+from warpir.core.options import option
 
 
 @dataclass(frozen=True)
 class Limits:
     """The limits of one run."""
 
-    pixels: int = 64_000_000
+    pixels: int = option(64_000_000, "N", expert=True, low=1)
     """Largest photo or mask that is opened [px]"""
-    envmap_width: int = 16_384
+    envmap_width: int = option(16_384, "PX", expert=True, low=1, high=2**20)
     """Widest panorama that is opened [px]"""
-    file_bytes: int = 2 << 30
+    file_bytes: int = option(2 << 30, "BYTES", expert=True, low=1)
     """Largest mesh, texture, point cloud or file of a COLMAP model that is read [byte]"""
-    triangles: int = 20_000_000
+    triangles: int = option(20_000_000, "N", expert=True, low=1)
     """Largest asset or proxy that is read, instances counted [triangles]"""
-    texture_pixels: int = 512_000_000
+    texture_pixels: int = option(512_000_000, "N", expert=True, low=1)
     """Most pixels of all textures of the asset together [px]"""
-    nodes: int = 100_000
+    nodes: int = option(100_000, "N", expert=True, low=1)
     """Most nodes of a glTF file"""
-    instances: int = 65_536
+    instances: int = option(65_536, "N", expert=True, low=1)
     """Most meshes that a glTF file places, each instance counted"""
-    points: int = 20_000_000
+    points: int = option(20_000_000, "N", expert=True, low=1)
     """Most points of --ground-points"""
-    json_bytes: int = 16 << 20
+    json_bytes: int = option(16 << 20, "BYTES", expert=True, low=1)
     """Largest JSON file: configuration, camera, lobes, materials, sequence [byte]; of YAML, which
     takes longer to read, a 256th"""
-    gltf_json_bytes: int = 64 << 20
+    gltf_json_bytes: int = option(64 << 20, "BYTES", expert=True, low=1)
     """Largest JSON of a glTF file [byte]"""
-    json_values: int = 3_000_000
+    json_values: int = option(3_000_000, "N", expert=True, low=1)
     """Most values in a JSON file, lists and objects counted"""
-    nesting: int = 100
+    nesting: int = option(100, "LEVELS", expert=True, low=1, high=200)
     """Most levels of lists and objects within each other in JSON and YAML"""
-    prompt_bytes: int = 4096
+    prompt_bytes: int = option(4096, "BYTES", expert=True, low=1)
     """Longest prompt [byte]"""
 
     def check(

@@ -19,8 +19,9 @@ from pathlib import Path
 from typing import Any
 
 import warpir
-from warpir.app.command import by_name, read_values
+from warpir.app.command import read_values
 from warpir.app.config import DEFAULTS, InsertConfig, replaced_by, usage
+from warpir.app.config_file import by_name
 from warpir.app.finished import OtherRun, is_done
 from warpir.app.inputs import Inputs, Loaders, read_inputs
 from warpir.app.record import file_hash
