@@ -37,10 +37,10 @@ from tests.builders.tiny_stable_diffusion import (
 from warpir.app.config import InsertConfig
 from warpir.app.record import Timings, versions
 from warpir.core.progress import StepProgress
-from warpir.diffusion.lora_files import initial_lora
-from warpir.diffusion.personalize import LoraTraining
+from warpir.diffusion.models.stable_diffusion import StableDiffusion, load_stable_diffusion
+from warpir.diffusion.personalization.lora_files import initial_lora
+from warpir.diffusion.personalization.personalize import LoraTraining
 from warpir.diffusion.prompts import make_prompts
-from warpir.diffusion.stable_diffusion import StableDiffusion, load_stable_diffusion
 from warpir.insert import insert
 from warpir.optimize.light import LightOptimization
 from warpir.render.renderer import choose_device

@@ -17,7 +17,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from warpir.diffusion.embedded import EmbeddedPrior, load_embedded, random_embedded
+from warpir.diffusion.models.embedded import EmbeddedPrior, load_embedded, random_embedded
 from warpir.lighting.regressor import load_regressor
 from warpir.render.renderer import choose_device
 from warpir.train.batches import PriorBatch

@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 if TYPE_CHECKING:
-    from warpir.diffusion.network_prior import NetworkPrior
+    from warpir.diffusion.models.network_prior import NetworkPrior
 
 
 def content_key(*contents: object) -> str:

@@ -24,7 +24,7 @@ from torch import Tensor
 
 from warpir.diffusion.crop import Crop, box_of, draw_crop, shrink
 from warpir.diffusion.draws import generator_of, seed_of
-from warpir.diffusion.model_error import ModelError
+from warpir.diffusion.models.model_error import ModelError
 from warpir.diffusion.prior import (
     Condition,
     Counts,

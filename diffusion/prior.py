@@ -74,7 +74,7 @@ class Condition:
     """The photo without the object, display-encoded, in [0, 1], shape [1, 3, H, W]."""
     gbuffer: Tensor | None = None
     """Mask, albedo, camera-space normals of the object, and the light that the regressor reads off
-    the photo (`warpir.diffusion.embedded.GBUFFER_CHANNELS`), shape [1, 13, H, W]."""
+    the photo (`warpir.diffusion.models.embedded.GBUFFER_CHANNELS`), shape [1, 13, H, W]."""
 
 
 class Prior(Protocol):

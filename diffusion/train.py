@@ -33,7 +33,7 @@ from torch import Tensor, nn
 
 from warpir.core.atomic import write_file, write_folder
 from warpir.diffusion.draws import seed_of
-from warpir.diffusion.embedded import (
+from warpir.diffusion.models.embedded import (
     CONDITIONS,
     EmbeddedNetwork,
     NetworkConfig,
@@ -44,9 +44,9 @@ from warpir.diffusion.embedded import (
     save_embedded,
     training_tokens,
 )
-from warpir.diffusion.lora_files import read_safetensors, serialize
-from warpir.diffusion.model_error import ModelError
-from warpir.diffusion.network_prior import no_tf32
+from warpir.diffusion.models.model_error import ModelError
+from warpir.diffusion.models.network_prior import no_tf32
+from warpir.diffusion.personalization.lora_files import read_safetensors, serialize
 from warpir.diffusion.schedule import NoiseSchedule
 
 FORMAT = 1

@@ -385,7 +385,7 @@ def weights() -> Iterator[Format]:
     import torch
     from safetensors.torch import save
 
-    from warpir.diffusion.embedded import NetworkConfig, build_network, save_embedded
+    from warpir.diffusion.models.embedded import NetworkConfig, build_network, save_embedded
     from warpir.lighting.regressor import RegressorConfig, random_regressor, save_regressor
     from warpir.optimize.checkpoint import Checkpoints
 

@@ -143,8 +143,8 @@ def _told(error: Any) -> InputError:
 
 
 def _prior(path: Path) -> None:
-    from warpir.diffusion.embedded import load_embedded
-    from warpir.diffusion.model_error import ModelError
+    from warpir.diffusion.models.embedded import load_embedded
+    from warpir.diffusion.models.model_error import ModelError
 
     try:
         load_embedded(path, "cpu")
@@ -153,8 +153,8 @@ def _prior(path: Path) -> None:
 
 
 def _lora(path: Path) -> None:
-    from warpir.diffusion.lora_files import read_lora
-    from warpir.diffusion.model_error import ModelError
+    from warpir.diffusion.models.model_error import ModelError
+    from warpir.diffusion.personalization.lora_files import read_lora
 
     try:
         read_lora(path)

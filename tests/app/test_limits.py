@@ -135,7 +135,7 @@ def weights(change: Callable[[bytearray], None], name: str) -> Callable[[Path], 
     """A changed copy of weights that we ship, and the flags that name it."""
 
     def make(folder: Path) -> list[str]:
-        from warpir.diffusion.weight_files import SHIPPED
+        from warpir.diffusion.models.weight_files import SHIPPED
 
         content = bytearray((SHIPPED / f"{name}.safetensors").read_bytes())
         change(content)

@@ -30,7 +30,7 @@ def write_guided_inputs(folder: Path) -> None:
     """Write photo, box, and random weights of both networks."""
     from tests.builders.insertions import write_inputs
     from tests.optimize.test_recover_embedded import NETWORK
-    from warpir.diffusion import embedded
+    from warpir.diffusion.models import embedded
     from warpir.lighting.regressor import random_regressor, save_regressor
 
     write_inputs(folder)

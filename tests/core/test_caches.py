@@ -20,7 +20,7 @@ from warpir.app.program import explain
 from warpir.core import cache as caches
 from warpir.core.cache import KernelCache, cache_folder, take_notices
 from warpir.core.errors import ExitCode, InputError
-from warpir.diffusion import embedded
+from warpir.diffusion.models import embedded
 
 VERSION = "1.2"
 

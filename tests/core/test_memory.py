@@ -28,13 +28,13 @@ from tests.builders.tiny_stable_diffusion import make_tiny_stable_diffusion
 from warpir.core import memory as memory_module
 from warpir.core.errors import ExitCode, InputError
 from warpir.core.memory import SHORT, Memory, Need, free_host, is_shortage, lacked_memory
-from warpir.diffusion.class_images import make_class_images
 from warpir.diffusion.guidance import Guidance
-from warpir.diffusion.personalize import LoraTraining, initial_lora
+from warpir.diffusion.models.stable_diffusion import StableDiffusion, load_stable_diffusion
+from warpir.diffusion.personalization.class_images import make_class_images
+from warpir.diffusion.personalization.personalize import LoraTraining, initial_lora
 from warpir.diffusion.prior import Condition
 from warpir.diffusion.prompts import make_prompts
 from warpir.diffusion.settings import GuidanceSettings, ModelSettings, PersonalizeSettings
-from warpir.diffusion.stable_diffusion import StableDiffusion, load_stable_diffusion
 from warpir.insert import main
 from warpir.render import samples
 from warpir.render.device_scene import Scene

@@ -11,17 +11,18 @@ import torch
 from PIL import Image
 from torch import Tensor
 
-import warpir.diffusion.class_images as module
+import warpir.diffusion.personalization.class_images as module
 from tests.builders.tiny_stable_diffusion import make_tiny_stable_diffusion
 from warpir.core.atomic import write_file
 from warpir.core.cache import make_room
 from warpir.diffusion.cache import content_key, model_key
-from warpir.diffusion.class_images import (
+from warpir.diffusion.models.network_prior import NetworkPrior
+from warpir.diffusion.models.stable_diffusion import StableDiffusion, load_stable_diffusion
+from warpir.diffusion.personalization.class_images import (
     class_image_count,
     encode_pictures,
     make_class_images,
 )
-from warpir.diffusion.network_prior import NetworkPrior
 from warpir.diffusion.prior import NonFiniteError
 from warpir.diffusion.prompts import (
     BACKGROUNDS,
@@ -33,7 +34,6 @@ from warpir.diffusion.prompts import (
 )
 from warpir.diffusion.schedule import NoiseSchedule
 from warpir.diffusion.settings import ModelSettings, PersonalizeSettings
-from warpir.diffusion.stable_diffusion import StableDiffusion, load_stable_diffusion
 
 SETTINGS = PersonalizeSettings(class_images=5, class_steps=3, class_batch=2)
 PROMPTS = make_prompts("a black SUV car", SETTINGS)

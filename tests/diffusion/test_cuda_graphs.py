@@ -15,18 +15,23 @@ from torch import Tensor, nn
 from torch.func import functional_call
 from torch.utils._python_dispatch import TorchDispatchMode
 
-import warpir.diffusion.personalize as personalize_module
+import warpir.diffusion.personalization.personalize as personalize_module
 from tests.builders.loops import SETTINGS as LOOP
 from tests.builders.loops import TRACED, Pull, a_frame, bent
 from tests.builders.tiny_stable_diffusion import make_tiny_stable_diffusion
-from warpir.diffusion.cuda_graphs import PLAIN_CALLS, Graphs
 from warpir.diffusion.guidance import Guidance
-from warpir.diffusion.lora_files import initial_lora, install_lora, lora_parameters, remove_lora
-from warpir.diffusion.personalize import LoraTraining, personalize
+from warpir.diffusion.models.cuda_graphs import PLAIN_CALLS, Graphs
+from warpir.diffusion.models.stable_diffusion import StableDiffusion, load_stable_diffusion
+from warpir.diffusion.personalization.lora_files import (
+    initial_lora,
+    install_lora,
+    lora_parameters,
+    remove_lora,
+)
+from warpir.diffusion.personalization.personalize import LoraTraining, personalize
 from warpir.diffusion.prior import Condition
 from warpir.diffusion.prompts import make_prompts
 from warpir.diffusion.settings import GuidanceSettings, ModelSettings, PersonalizeSettings
-from warpir.diffusion.stable_diffusion import StableDiffusion, load_stable_diffusion
 from warpir.optimize.light import Function, LightOptimization, Record
 from warpir.optimize.view import expected_light
 

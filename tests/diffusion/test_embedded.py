@@ -11,9 +11,10 @@ import pytest
 import torch
 from torch import Tensor, nn
 
-import warpir.diffusion.personalize as personalize_module
+import warpir.diffusion.personalization.personalize as personalize_module
 from tests.builders.tiny_stable_diffusion import make_tiny_stable_diffusion
-from warpir.diffusion.embedded import (
+from warpir.diffusion.guidance import Guidance
+from warpir.diffusion.models.embedded import (
     CONDITIONS,
     DROP_ATTRIBUTE,
     DROP_KIND,
@@ -45,14 +46,19 @@ from warpir.diffusion.embedded import (
     tokenize,
     training_tokens,
 )
-from warpir.diffusion.guidance import Guidance
-from warpir.diffusion.lora_files import Lora, initial_lora, install_lora, remove_lora, save_lora
-from warpir.diffusion.model_error import ModelError
-from warpir.diffusion.network_prior import NetworkPrior
-from warpir.diffusion.personalize import personalize
+from warpir.diffusion.models.model_error import ModelError
+from warpir.diffusion.models.network_prior import NetworkPrior
+from warpir.diffusion.models.stable_diffusion import load_stable_diffusion
+from warpir.diffusion.personalization.lora_files import (
+    Lora,
+    initial_lora,
+    install_lora,
+    remove_lora,
+    save_lora,
+)
+from warpir.diffusion.personalization.personalize import personalize
 from warpir.diffusion.prior import Condition
 from warpir.diffusion.settings import GuidanceSettings, ModelSettings, PersonalizeSettings
-from warpir.diffusion.stable_diffusion import load_stable_diffusion
 
 TINY = NetworkConfig(
     widths=(16, 32), layers=1, attention_from=1, head_width=16, groups=8, embedding_width=16
@@ -525,7 +531,9 @@ def test_values_that_are_not_finite_are_refused(tmp_path: Path) -> None:
 
 
 def test_weights_of_the_package_are_missed_by_name(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("warpir.diffusion.embedded.WEIGHTS", Path("/nowhere/prior.safetensors"))
+    monkeypatch.setattr(
+        "warpir.diffusion.models.embedded.WEIGHTS", Path("/nowhere/prior.safetensors")
+    )
     with pytest.raises(ModelError, match="not in this installation"):
         load_embedded(None, "cpu")
 

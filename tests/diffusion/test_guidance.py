@@ -27,11 +27,11 @@ from warpir.diffusion.guidance import (
     coefficients,
     make_guidance,
 )
-from warpir.diffusion.model_error import ModelError
+from warpir.diffusion.models.model_error import ModelError
+from warpir.diffusion.models.stable_diffusion import StableDiffusion, load_stable_diffusion
 from warpir.diffusion.prior import Condition
 from warpir.diffusion.schedule import NoiseSchedule
 from warpir.diffusion.settings import GuidanceSettings, ModelSettings
-from warpir.diffusion.stable_diffusion import StableDiffusion, load_stable_diffusion
 
 LOSSES = (
     *("lds", "sds", "sds-base", "csd", "lds-lora-both", "lds-negative", "good-bad"),

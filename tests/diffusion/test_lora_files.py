@@ -17,7 +17,8 @@ from safetensors.torch import load_file, save_file
 from torch import Tensor, nn
 
 from tests.builders.tiny_stable_diffusion import make_tiny_stable_diffusion
-from warpir.diffusion.lora_files import (
+from warpir.diffusion.models.model_error import ModelError
+from warpir.diffusion.personalization.lora_files import (
     Lora,
     adaptable_layers,
     initial_lora,
@@ -29,7 +30,6 @@ from warpir.diffusion.lora_files import (
     save_lora,
     serialize,
 )
-from warpir.diffusion.model_error import ModelError
 
 ATTENTION = ("to_q", "to_k", "to_v", "to_out.0")
 MORE = (*ATTENTION, "proj_in", "ff.net.0.proj", "ff.net.2", "conv1", "time_emb_proj", "conv_in")

@@ -23,8 +23,8 @@ from safetensors.torch import load_file, save_file
 from tests.builders.faults import NO_TORCH, assert_fails
 from tests.builders.insertions import arguments, write_inputs
 from tests.builders.tiny_stable_diffusion import make_tiny_stable_diffusion
-from warpir.diffusion.model_error import ModelError
-from warpir.diffusion.model_folder import (
+from warpir.diffusion.models.model_error import ModelError
+from warpir.diffusion.models.model_folder import (
     JSON_LIMIT,
     check_model_folder,
     choose_weights,
@@ -32,8 +32,8 @@ from warpir.diffusion.model_folder import (
     hub_offline,
     needed_files,
 )
+from warpir.diffusion.models.stable_diffusion import load_stable_diffusion
 from warpir.diffusion.settings import ModelSettings
-from warpir.diffusion.stable_diffusion import load_stable_diffusion
 
 UNET = "unet/diffusion_pytorch_model.safetensors"
 VAE = "vae/diffusion_pytorch_model.safetensors"

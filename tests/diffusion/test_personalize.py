@@ -13,10 +13,13 @@ import pytest
 import torch
 from torch import Tensor
 
-import warpir.diffusion.personalize as module
+import warpir.diffusion.personalization.personalize as module
 from tests.builders.tiny_stable_diffusion import make_tiny_stable_diffusion
 from warpir.core.cache import take_notices
-from warpir.diffusion.lora_files import (
+from warpir.diffusion.models.model_error import ModelError
+from warpir.diffusion.models.network_prior import NetworkPrior
+from warpir.diffusion.models.stable_diffusion import StableDiffusion, load_stable_diffusion
+from warpir.diffusion.personalization.lora_files import (
     Lora,
     initial_lora,
     load_lora,
@@ -25,9 +28,7 @@ from warpir.diffusion.lora_files import (
     save_lora,
     serialize,
 )
-from warpir.diffusion.model_error import ModelError
-from warpir.diffusion.network_prior import NetworkPrior
-from warpir.diffusion.personalize import (
+from warpir.diffusion.personalization.personalize import (
     EVALUATION_COUNT,
     LoraTraining,
     Personalization,
@@ -36,10 +37,7 @@ from warpir.diffusion.personalize import (
     photo_crops,
     photo_latents,
 )
-from warpir.diffusion.prior import NonFiniteError
-from warpir.diffusion.prompts import make_prompts
-from warpir.diffusion.settings import ModelSettings, PersonalizeSettings
-from warpir.diffusion.show_prior import (
+from warpir.diffusion.personalization.show_prior import (
     LABEL_WIDTH,
     WITH_CLASS,
     WITHOUT_CLASS,
@@ -47,7 +45,9 @@ from warpir.diffusion.show_prior import (
     show_personalization,
     show_prior,
 )
-from warpir.diffusion.stable_diffusion import StableDiffusion, load_stable_diffusion
+from warpir.diffusion.prior import NonFiniteError
+from warpir.diffusion.prompts import make_prompts
+from warpir.diffusion.settings import ModelSettings, PersonalizeSettings
 
 KINDS = ("epsilon", "v_prediction")
 SETTINGS = PersonalizeSettings(

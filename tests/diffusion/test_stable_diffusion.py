@@ -15,10 +15,10 @@ from torch import Tensor
 
 from tests.builders.tiny_stable_diffusion import RESOLUTION, make_tiny_stable_diffusion
 from warpir.diffusion.cache import model_key
-from warpir.diffusion.model_error import ModelError
+from warpir.diffusion.models.model_error import ModelError
+from warpir.diffusion.models.stable_diffusion import StableDiffusion, load_stable_diffusion
 from warpir.diffusion.prior import Prior
 from warpir.diffusion.settings import PREDICTION_TYPES, ModelSettings
-from warpir.diffusion.stable_diffusion import StableDiffusion, load_stable_diffusion
 
 ROUNDING = 1e-5
 """Between two orders of the same float32 sums, on values of about 1."""

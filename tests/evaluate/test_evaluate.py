@@ -10,7 +10,7 @@ from PIL import Image
 
 from warpir.core.arrays import FloatArray
 from warpir.core.errors import ExitCode, InputError
-from warpir.diffusion.embedded import NetworkConfig, build_network, save_embedded
+from warpir.diffusion.models.embedded import NetworkConfig, build_network, save_embedded
 from warpir.evaluate.command import light_figures, main, usable_rows
 from warpir.evaluate.light_errors import light_errors
 from warpir.evaluate.report import Entry, bootstrap, compare, mean_of, summarize

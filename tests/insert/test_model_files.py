@@ -26,8 +26,8 @@ from tests.diffusion.test_embedded import TINY
 from tests.lighting.test_regressor import SMALL
 from warpir.app.config import InsertConfig
 from warpir.app.record import input_files
-from warpir.diffusion.embedded import build_network, save_embedded
-from warpir.diffusion.weight_files import values_hash
+from warpir.diffusion.models.embedded import build_network, save_embedded
+from warpir.diffusion.models.weight_files import values_hash
 from warpir.lighting.regressor import random_regressor, save_regressor
 
 WRITTEN = "damaged (its weights are not those that were written)"
@@ -324,8 +324,8 @@ def test_weights_that_say_something_else_are_refused(
 @pytest.mark.parametrize("flag", FLAGS)
 def test_a_large_file_is_looked_at_in_pieces(inputs: Path, tmp_path: Path, flag: str) -> None:
     """64 MiB that take no room on the disk take little in memory; too many are not looked at."""
-    from warpir.diffusion import weight_files
-    from warpir.diffusion.model_error import ModelError
+    from warpir.diffusion.models import weight_files
+    from warpir.diffusion.models.model_error import ModelError
 
     def check(count: int) -> str:
         _, about = tensors_of(inputs / f"{flag}.safetensors")
@@ -388,8 +388,8 @@ def test_good_files_are_valid(inputs: Path, tmp_path: Path, flag: str) -> None:
 @pytest.mark.case("L8")
 def test_a_configuration_beside_a_lora_is_read_as_json(tmp_path: Path) -> None:
     """peft's, which may be of any size and depth when it comes from a stranger."""
-    from warpir.diffusion.lora_files import read_lora
-    from warpir.diffusion.model_error import ModelError
+    from warpir.diffusion.models.model_error import ModelError
+    from warpir.diffusion.personalization.lora_files import read_lora
 
     tensors = {
         f"base_model.model.{LAYER}.lora_A.weight": np.ones((2, 32), np.float32),
@@ -421,8 +421,8 @@ def test_alpha_patterns_are_names(tmp_path: Path, pattern: str, alpha: float | N
     """By peft they are run as regular expressions; of names the answer is the same as peft's."""
     from peft.utils.other import get_pattern_key
 
-    from warpir.diffusion.lora_files import read_lora
-    from warpir.diffusion.model_error import ModelError
+    from warpir.diffusion.models.model_error import ModelError
+    from warpir.diffusion.personalization.lora_files import read_lora
 
     tensors = {
         f"unet.{LAYER}.lora_A.weight": np.ones((2, 32), np.float32),
@@ -445,8 +445,8 @@ def test_values_are_looked_at_in_every_kind_of_number(tmp_path: Path, kind: torc
     """The greatest and the smallest numbers are finite; NaN and infinity of either sign are not."""
     from safetensors.torch import save_file as save_tensors
 
-    from warpir.diffusion.model_error import ModelError
-    from warpir.diffusion.weight_files import check_lora
+    from warpir.diffusion.models.model_error import ModelError
+    from warpir.diffusion.models.weight_files import check_lora
 
     limits, file = torch.finfo(kind), tmp_path / "lora.safetensors"
     values = torch.tensor([limits.max, limits.min, limits.tiny, -0.0], dtype=kind)

@@ -139,7 +139,7 @@ def hook(place: str, turn: int, act: str) -> str:
     return HOOK + f"\nat({place!r}, {turn}, {act})\n"
 
 
-UPDATE = "warpir.diffusion.personalize:LoraTraining:update"
+UPDATE = "warpir.diffusion.personalization.personalize:LoraTraining:update"
 STEP = "warpir.optimize.loop:Optimization:step"
 SAVE = "warpir.optimize.checkpoint:write_folder"
 WRITE = "warpir.insert:_write"
@@ -476,7 +476,7 @@ def edit(path: Path) -> None:
     import trimesh
 
     from tests.optimize.test_recover_embedded import NETWORK
-    from warpir.diffusion import embedded
+    from warpir.diffusion.models import embedded
     from warpir.lighting.regressor import random_regressor, save_regressor
 
     if path.stem == "prior":

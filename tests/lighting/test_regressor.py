@@ -15,7 +15,7 @@ from safetensors.torch import load_file, save_file
 from scipy.integrate import quad
 
 from warpir.core.errors import ExitCode, InputError
-from warpir.diffusion.weight_files import read_header, values_hash
+from warpir.diffusion.models.weight_files import read_header, values_hash
 from warpir.lighting.regressor import (
     AMBIENT_SHARPNESS,
     Prediction,

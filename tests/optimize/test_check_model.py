@@ -15,13 +15,13 @@ from tests.builders.tiny_stable_diffusion import make_tiny_stable_diffusion
 from warpir.app.config import InsertConfig
 from warpir.check_model import main
 from warpir.core.errors import ExitCode
-from warpir.diffusion.network_prior import LEAST_COSINE
-from warpir.diffusion.settings import ModelSettings
-from warpir.diffusion.stable_diffusion import (
+from warpir.diffusion.models.network_prior import LEAST_COSINE
+from warpir.diffusion.models.stable_diffusion import (
     CHECK_TIMES,
     StableDiffusion,
     load_stable_diffusion,
 )
+from warpir.diffusion.settings import ModelSettings
 from warpir.optimize import model_check
 from warpir.optimize.model_check import (
     NOISE_ERROR_MAX,

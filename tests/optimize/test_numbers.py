@@ -24,13 +24,13 @@ from tests.builders.tiny_stable_diffusion import make_tiny_stable_diffusion
 from tests.core.test_memory import a_scene, sky
 from tests.test_layers import sources
 from warpir.core.errors import ExitCode, InputError
-from warpir.diffusion.class_images import make_class_images
 from warpir.diffusion.guidance import Guidance
-from warpir.diffusion.personalize import LoraTraining, initial_lora
+from warpir.diffusion.models.stable_diffusion import StableDiffusion, load_stable_diffusion
+from warpir.diffusion.personalization.class_images import make_class_images
+from warpir.diffusion.personalization.personalize import LoraTraining, initial_lora
 from warpir.diffusion.prior import BAD_STEPS_MAX, Condition, NonFiniteError
 from warpir.diffusion.prompts import make_prompts
 from warpir.diffusion.settings import GuidanceSettings, ModelSettings, PersonalizeSettings
-from warpir.diffusion.stable_diffusion import StableDiffusion, load_stable_diffusion
 from warpir.insert import main
 from warpir.optimize.checkpoint import Checkpoints
 from warpir.optimize.light import LightOptimization

@@ -21,8 +21,8 @@ from warpir.app.record import Timings
 from warpir.core.errors import ExitCode
 from warpir.core.progress import StepProgress
 from warpir.demo import demo_config
-from warpir.diffusion import embedded
-from warpir.diffusion.embedded import GBUFFER_CHANNELS
+from warpir.diffusion.models import embedded
+from warpir.diffusion.models.embedded import GBUFFER_CHANNELS
 from warpir.insert import main
 from warpir.io.images.photos import read_photo
 from warpir.io.results import OutputFolder

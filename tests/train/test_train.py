@@ -19,14 +19,14 @@ from torch import Tensor, nn
 import warpir.diffusion.train as module
 from warpir.core import atomic
 from warpir.core.errors import ExitCode
-from warpir.diffusion.embedded import (
+from warpir.diffusion.models.embedded import (
     NetworkConfig,
     build_network,
     load_embedded,
     tokenize,
     training_tokens,
 )
-from warpir.diffusion.model_error import ModelError
+from warpir.diffusion.models.model_error import ModelError
 from warpir.diffusion.train import (
     CURVE,
     SHARD_BYTES,
@@ -494,7 +494,7 @@ from pathlib import Path
 from dataclasses import replace
 import warpir.diffusion.train as module
 from tests.train.test_train import SETTINGS, draw, fixed
-from warpir.diffusion.embedded import weight_hash
+from warpir.diffusion.models.embedded import weight_hash
 from warpir.diffusion.train import Worker, train_prior
 out, worker = Path({out!r}), Worker.this()
 made = []

@@ -7,10 +7,10 @@ from typing import TYPE_CHECKING, TypeVar
 
 from warpir.app.config import InsertConfig
 from warpir.core.errors import ExitCode, InputError, raise_all
-from warpir.diffusion.model_error import ModelError
+from warpir.diffusion.models.model_error import ModelError
 
 if TYPE_CHECKING:
-    from warpir.diffusion.model_folder import ModelFolder
+    from warpir.diffusion.models.model_folder import ModelFolder
 
 Checked = TypeVar("Checked")
 
@@ -25,7 +25,7 @@ def require_model(config: InsertConfig) -> None:
         InputError: Something is not there, or not what it should be (`ExitCode.MODEL`); the other
             problems are in its ``also``.
     """
-    from warpir.diffusion.weight_files import check_lora, check_prior, check_regressor
+    from warpir.diffusion.models.weight_files import check_lora, check_prior, check_regressor
 
     problems: list[InputError] = []
 
@@ -54,7 +54,7 @@ def require_model(config: InsertConfig) -> None:
 
 def _model_width(config: InsertConfig) -> int | None:
     """Check the folder of Stable Diffusion; return the width of its prompts' embeddings."""
-    from warpir.diffusion.model_folder import check_model_folder, find_model
+    from warpir.diffusion.models.model_folder import check_model_folder, find_model
 
     if config.diffusion.allow_download and not os.path.isdir(config.diffusion.model or ""):
         return None
@@ -71,7 +71,7 @@ def model_hashes(config: InsertConfig) -> dict[str, str] | None:
 
     None: there is no such model now, or it is damaged.
     """
-    from warpir.diffusion.model_folder import check_model_folder, find_model
+    from warpir.diffusion.models.model_folder import check_model_folder, find_model
 
     try:
         found = find_model(

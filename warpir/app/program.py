@@ -14,7 +14,7 @@ from warpir.core import signals
 from warpir.core.atomic import WriteError
 from warpir.core.errors import DISK_FULL, LISTED, ExitCode, InputError, disk_error
 from warpir.core.memory import MIB, free_host, is_shortage
-from warpir.diffusion.model_error import ModelError
+from warpir.diffusion.models.model_error import ModelError
 
 INTERRUPTED = 130
 """Of a Ctrl-C where nobody handles signals: 128 and the number of SIGINT."""

@@ -106,7 +106,7 @@ def config_of_picture(config: InsertConfig) -> dict[str, Any]:
 
 def is_hub_id(model: str | None) -> bool:
     """Return whether a model is called by its name in the hub, and is no folder here."""
-    from warpir.diffusion.model_folder import HUB_ID
+    from warpir.diffusion.models.model_folder import HUB_ID
 
     return model is not None and HUB_ID.fullmatch(model) is not None and not os.path.isdir(model)
 
@@ -122,7 +122,7 @@ def input_files(config: InsertConfig) -> dict[str, Path]:
     Not the asset, the mesh of the place and the earlier run, whose readers hash what they read.
     """
     # Here, since the command line imports this module and must not load NumPy for --help.
-    from warpir.diffusion.weight_files import beside_lora
+    from warpir.diffusion.models.weight_files import beside_lora
     from warpir.io.cameras.colmap_model import is_model, model_files
 
     names = (

@@ -23,7 +23,7 @@ from warpir.core.arrays import CodeArray, Float64Array, FloatArray
 from warpir.core.color import luminance
 from warpir.core.errors import InputError
 from warpir.core.progress import StepProgress
-from warpir.diffusion.embedded import build_network, save_embedded
+from warpir.diffusion.models.embedded import build_network, save_embedded
 from warpir.evaluate.scenes import Place, Subject, mirrored
 from warpir.evaluate.stage import Prediction, Stage
 from warpir.io.images.photos import Photo, read_photo

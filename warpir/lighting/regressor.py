@@ -33,9 +33,9 @@ from warpir.core.arrays import Float64Array, FloatArray
 from warpir.core.atomic import write_file
 from warpir.core.color import GAMMA, LUMINANCE_WEIGHTS
 from warpir.core.errors import ExitCode, InputError
-from warpir.diffusion.model_error import ModelError
-from warpir.diffusion.weight_files import REGRESSOR_FORMAT as FORMAT
-from warpir.diffusion.weight_files import check_regressor, values_hash
+from warpir.diffusion.models.model_error import ModelError
+from warpir.diffusion.models.weight_files import REGRESSOR_FORMAT as FORMAT
+from warpir.diffusion.models.weight_files import check_regressor, values_hash
 from warpir.scene.camera import Camera
 from warpir.scene.light import Lobes, angles_from_axis, fibonacci, map_directions
 

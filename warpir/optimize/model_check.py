@@ -25,15 +25,15 @@ from warpir.core.atomic import write_file
 from warpir.core.errors import disk_error
 from warpir.diffusion.crop import Crop
 from warpir.diffusion.guidance import Guidance
-from warpir.diffusion.network_prior import LEAST_COSINE
-from warpir.diffusion.personalize import LoraTraining, personalize
-from warpir.diffusion.prior import Condition, NonFiniteError
-from warpir.diffusion.prompts import Prompts, make_prompts
-from warpir.diffusion.stable_diffusion import (
+from warpir.diffusion.models.network_prior import LEAST_COSINE
+from warpir.diffusion.models.stable_diffusion import (
     CHECK_TIMES,
     StableDiffusion,
     load_stable_diffusion,
 )
+from warpir.diffusion.personalization.personalize import LoraTraining, personalize
+from warpir.diffusion.prior import Condition, NonFiniteError
+from warpir.diffusion.prompts import Prompts, make_prompts
 from warpir.optimize.recover import as_input_errors
 from warpir.render.renderer import choose_device
 

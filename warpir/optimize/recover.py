@@ -26,21 +26,21 @@ from warpir.core.color import gamma_to_linear, linear_to_gamma
 from warpir.core.errors import ExitCode, InputError
 from warpir.core.memory import Memory, needs_of_model, release
 from warpir.core.progress import StepProgress
-from warpir.diffusion.embedded import embedded_prompts, load_embedded
 from warpir.diffusion.guidance import DatasetUpdate, Guidance, make_guidance
-from warpir.diffusion.lora_files import save_lora
-from warpir.diffusion.model_error import ModelError
-from warpir.diffusion.model_folder import check_model_folder, find_model, hub_offline
-from warpir.diffusion.network_prior import NetworkPrior
-from warpir.diffusion.personalize import (
+from warpir.diffusion.models.embedded import embedded_prompts, load_embedded
+from warpir.diffusion.models.model_error import ModelError
+from warpir.diffusion.models.model_folder import check_model_folder, find_model, hub_offline
+from warpir.diffusion.models.network_prior import NetworkPrior
+from warpir.diffusion.models.stable_diffusion import load_stable_diffusion
+from warpir.diffusion.personalization.lora_files import save_lora
+from warpir.diffusion.personalization.personalize import (
     Personalization,
     personalize,
     restore_personalization,
 )
+from warpir.diffusion.personalization.show_prior import show_personalization
 from warpir.diffusion.prior import Condition, NonFiniteError
 from warpir.diffusion.prompts import Prompts, make_prompts
-from warpir.diffusion.show_prior import show_personalization
-from warpir.diffusion.stable_diffusion import load_stable_diffusion
 from warpir.io.lobes_file import lobes_to_json
 from warpir.io.results import OutputFolder
 from warpir.lighting.estimate import Estimate, estimate_light

@@ -210,7 +210,7 @@ def _train_prior(
     device: torch.device,
     record: dict[str, Any],
 ) -> dict[str, Any]:
-    from warpir.diffusion.embedded import read_network
+    from warpir.diffusion.models.embedded import read_network
     from warpir.diffusion.train import TrainSettings, export_prior, train_prior
     from warpir.lighting.regressor import load_regressor
     from warpir.train.scenes import Mixture, SceneGenerator

@@ -16,13 +16,13 @@ from numpy.typing import NDArray
 from PIL import Image, ImageDraw, ImageFont
 from torch import Tensor
 
-from warpir.diffusion.class_images import Report, to_bytes
-from warpir.diffusion.personalize import personalize
+from warpir.diffusion.personalization.class_images import Report, to_bytes
+from warpir.diffusion.personalization.personalize import personalize
 from warpir.diffusion.prompts import Prompts
 from warpir.diffusion.settings import PersonalizeSettings
 
 if TYPE_CHECKING:
-    from warpir.diffusion.network_prior import NetworkPrior
+    from warpir.diffusion.models.network_prior import NetworkPrior
 
 # Neither is part of the other: diffusers would look for the one among the weights of the other.
 WITH_CLASS, WITHOUT_CLASS = "scene", "no-class"

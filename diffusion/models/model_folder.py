@@ -18,9 +18,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NoReturn
 
-from warpir.diffusion.model_error import ModelError
+from warpir.diffusion.models.model_error import ModelError
+from warpir.diffusion.models.weight_files import POINTER, is_pointer, read_header
 from warpir.diffusion.settings import PREDICTION_TYPES
-from warpir.diffusion.weight_files import POINTER, is_pointer, read_header
 
 PIPELINE = "StableDiffusionPipeline"
 SCHEDULERS = (

@@ -18,8 +18,8 @@ from typing import TYPE_CHECKING, Any
 import torch
 from torch import Tensor, nn
 
-from warpir.diffusion.cuda_graphs import Graphs
-from warpir.diffusion.model_error import ModelError
+from warpir.diffusion.models.cuda_graphs import Graphs
+from warpir.diffusion.models.model_error import ModelError
 from warpir.diffusion.prior import InChunks, NonFiniteError, at_once
 from warpir.diffusion.schedule import TIME_LIMIT, NoiseSchedule
 

@@ -18,9 +18,9 @@ import numpy as np
 from numpy.typing import NDArray
 from safetensors import SafetensorError, safe_open
 
-from warpir.diffusion.model_error import ModelError
+from warpir.diffusion.models.model_error import ModelError
 
-SHIPPED = Path(__file__).parent / "weights"
+SHIPPED = Path(__file__).parents[1] / "weights"
 """Folder of the weights that are part of the package."""
 PRIOR_KEY = "warpir_prior"
 """Where a file's header describes the embedded prior that it holds."""
@@ -35,7 +35,7 @@ PRIOR_SIZES: Sizes = {
     "groups": (1, 1, int, 1, 4096),
     "embedding_width": (1, 1, int, 1, 65_536),
 }
-"""Of each field of a `warpir.diffusion.embedded.NetworkConfig`: the least and the greatest count of
+"""Of each field of a `NetworkConfig` of the embedded prior: the least and the greatest count of
 numbers, which are a list where there may be several; their kind, and the least and the greatest."""
 REGRESSOR_SIZES: Sizes = {
     "channels": (3, 3, int, 8, 512),

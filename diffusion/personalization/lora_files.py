@@ -32,12 +32,12 @@ from torch import Tensor, nn
 
 from warpir.core.atomic import write_file
 from warpir.diffusion.draws import generator_of
-from warpir.diffusion.model_error import ModelError
-from warpir.diffusion.model_folder import read_json
-from warpir.diffusion.weight_files import beside_lora, fault_of, not_a_lora, read_header
+from warpir.diffusion.models.model_error import ModelError
+from warpir.diffusion.models.model_folder import read_json
+from warpir.diffusion.models.weight_files import beside_lora, fault_of, not_a_lora, read_header
 
 if TYPE_CHECKING:
-    from warpir.diffusion.network_prior import NetworkPrior
+    from warpir.diffusion.models.network_prior import NetworkPrior
 
 HEADER_KEY = "lora_adapter_metadata"
 """Where diffusers keeps peft's configuration in a file's header."""

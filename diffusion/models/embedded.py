@@ -30,15 +30,15 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from warpir.core.atomic import write_file
-from warpir.diffusion.lora_files import read_safetensors, serialize
-from warpir.diffusion.model_error import ModelError
-from warpir.diffusion.network_prior import NetworkPrior
+from warpir.diffusion.models.model_error import ModelError
+from warpir.diffusion.models.network_prior import NetworkPrior
+from warpir.diffusion.models.weight_files import PRIOR_FORMAT as FORMAT
+from warpir.diffusion.models.weight_files import PRIOR_KEY as HEADER_KEY
+from warpir.diffusion.models.weight_files import SHIPPED, values_hash
+from warpir.diffusion.personalization.lora_files import read_safetensors, serialize
 from warpir.diffusion.prompts import Prompts, make_prompts
 from warpir.diffusion.schedule import NoiseSchedule
 from warpir.diffusion.settings import PersonalizeSettings
-from warpir.diffusion.weight_files import PRIOR_FORMAT as FORMAT
-from warpir.diffusion.weight_files import PRIOR_KEY as HEADER_KEY
-from warpir.diffusion.weight_files import SHIPPED, values_hash
 
 if TYPE_CHECKING:
     from diffusers import UNet2DConditionModel

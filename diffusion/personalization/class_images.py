@@ -30,7 +30,7 @@ from warpir.diffusion.prompts import Prompts, draw_class_prompts
 from warpir.diffusion.settings import PersonalizeSettings
 
 if TYPE_CHECKING:
-    from warpir.diffusion.network_prior import NetworkPrior
+    from warpir.diffusion.models.network_prior import NetworkPrior
 
 FORMAT = 1
 """Meaning of a stored picture; part of every key."""

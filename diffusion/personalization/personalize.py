@@ -26,15 +26,16 @@ from torch import Tensor
 from warpir.core.atomic import write_file
 from warpir.core.cache import find_kept, seal
 from warpir.diffusion.cache import content_key, model_key
-from warpir.diffusion.class_images import (
+from warpir.diffusion.crop import Crop
+from warpir.diffusion.draws import generator_of
+from warpir.diffusion.models.model_error import ModelError
+from warpir.diffusion.personalization.class_images import (
     Report,
     class_image_count,
     encode_pictures,
     make_class_images,
 )
-from warpir.diffusion.crop import Crop
-from warpir.diffusion.draws import generator_of
-from warpir.diffusion.lora_files import (
+from warpir.diffusion.personalization.lora_files import (
     Lora,
     initial_lora,
     install_lora,
@@ -44,13 +45,12 @@ from warpir.diffusion.lora_files import (
     remove_lora,
     serialize,
 )
-from warpir.diffusion.model_error import ModelError
 from warpir.diffusion.prior import BAD_STEPS_MAX, NonFiniteError
 from warpir.diffusion.prompts import Prompts
 from warpir.diffusion.settings import PersonalizeSettings
 
 if TYPE_CHECKING:
-    from warpir.diffusion.network_prior import NetworkPrior
+    from warpir.diffusion.models.network_prior import NetworkPrior
 
 FORMAT = 1
 """Meaning of a stored LoRA; part of every key."""
