@@ -1,18 +1,12 @@
-"""A study with people: its pages, its server and its figures. All answers here are constructed."""
+"""A study with people: its pages and its figures. All answers here are constructed."""
 
-import io
 import json
 import math
 import random
 import re
 import shutil
-import signal
-import subprocess
-import sys
 from collections import Counter
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
-from http import HTTPStatus
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -22,8 +16,9 @@ import pytest
 from tests.builders.browser import Fingers, Opened, needs_chromium, open_browser
 from tests.builders.faults import NO_TORCH, assert_fails, run_case
 from warpir.core.errors import InputError
+from warpir.core.strict_json import parse_json_object
 from warpir.io.images.writers import png_bytes
-from warpir.study.answers import AUTOMATED, BROWSER, parse_sheet
+from warpir.study.answers import AUTOMATED, BROWSER, check_sheet
 from warpir.study.command import main
 from warpir.study.images import neutral_png, read_image, upside_down
 from warpir.study.key import Study, key_bytes, protocol_bytes, read_study
@@ -31,7 +26,6 @@ from warpir.study.pages import Images, page
 from warpir.study.pairs import Words
 from warpir.study.plan import Pair, Plan, balanced_sides, make_plan
 from warpir.study.score import WARNING, fleiss_kappa, majority, proportion
-from warpir.study.server import Site, StudyServer, _Handler
 
 HEIGHT, WIDTH = 40, 60
 METHOD, BASELINE = "our-secret-method", "their-secret-baseline"
@@ -643,7 +637,7 @@ def test_make_refuses_flags(scenes: Path, tmp_path: Path) -> None:
         ([*MAKE, "--colour"], ("--colour",)),
         ([*MAKE[:-1], "."], ("--out", "names no new folder")),
         ([*MAKE, "--runs", "9" * 5000], ("--runs", "from 1")),
-        (["serve", "study", "--port", "9" * 5000], ("--port", "0 to 65535")),
+        (["make", "scenes", "--out", "s", "--seed", "9" * 5000], ("--seed", "whole number")),
         ([], ("command line",)),
     ):
         refuse(argv, 2, *words, cwd=tmp_path)
@@ -713,7 +707,7 @@ def test_score_refuses_bad_answers_and_lists_them(scenes: Path, tmp_path: Path) 
     for change, words in BAD_SHEETS.values():
         bad = json.dumps(change(sheet_of(study.plan, 0, source=BROWSER)))
         with pytest.raises(InputError, match=f"^one.json: .*{words}"):
-            parse_sheet("one.json", bad.encode(), study.plan)
+            check_sheet("one.json", parse_json_object("one.json", bad.encode()), study.plan)
     (folder / "one.json").write_text(json.dumps(sheet_of(study.plan, 0)))
     refuse(["score", "study"], 3, "one.json", "answered by a program", cwd=tmp_path)
     (folder / "one.json").write_text('{"format": NaN}')
@@ -809,259 +803,6 @@ def test_answers_of_people_are_scored_without_a_warning(scenes: Path, tmp_path: 
     ended = run_case(["score", "study"], tmp_path, program="warpir.study.command", before=NO_TORCH)
     assert ended.status == 0, ended
     assert "AUTOMATED" not in ended.out and "1 of 3 raters" in ended.out
-
-
-# --------------------------------------------------------------------------------- the server
-
-
-def test_answers_are_saved_once(scenes: Path, tmp_path: Path) -> None:
-    study = make(scenes, tmp_path / "study")
-    site = Site(tmp_path / "study", study, lambda line: None)
-    token = study.plan.raters[0].token
-    body = json.dumps(sheet_of(study.plan, 0)).encode()
-    other = json.dumps(sheet_of(study.plan, 0, lambda pair: False)).encode()
-    assert site.save(study.plan.raters[1].token, body)[0] == HTTPStatus.BAD_REQUEST
-    assert site.save(token, b"{}")[0] == HTTPStatus.BAD_REQUEST
-    assert not (tmp_path / "study" / "answers").exists()
-    assert site.save(token, body)[0] == HTTPStatus.CREATED
-    assert site.save(token, other)[0] == HTTPStatus.CONFLICT
-    assert site.saved(token).read_bytes() == body
-    assert [p.name for p in (tmp_path / "study/answers").iterdir()] == [f"{token}.json"]
-    assert parse_sheet("it", body, study.plan).is_automated
-    with pytest.raises(InputError, match="not JSON"):
-        parse_sheet("it", b"{", study.plan)
-
-
-def test_only_pages_are_served(scenes: Path, tmp_path: Path) -> None:
-    study = make(scenes, tmp_path / "study")
-    pages = tmp_path / "study" / "pages"
-    (pages / "link.html").symlink_to(tmp_path / "study" / "key.json")
-    (pages / "notes.txt").write_text("private")
-    site = Site(tmp_path / "study", study, lambda line: None)
-    assert len(site.files) == 12
-    assert not any("link" in name or "notes" in name for name in site.files)
-
-
-class Wire:
-    """A connection on which all requests are there already; no socket."""
-
-    def __init__(self, sent: str) -> None:
-        self.sent = io.BytesIO(sent.encode())
-        self.answered = b""
-        self.longest = 0
-
-    def settimeout(self, seconds: float) -> None:
-        pass
-
-    def makefile(self, mode: str, size: int) -> io.BytesIO:
-        return self.sent
-
-    def sendall(self, content: bytes) -> None:
-        self.answered += content
-        self.longest = max(self.longest, len(content))
-
-
-def unbound(
-    folder: Path, bound: str, name: str, say: Callable[[str], None], port: int = 8000
-) -> StudyServer:
-    """A server that listens nowhere."""
-    server = object.__new__(StudyServer)
-    server.site = Site(folder, read_study(folder), say)
-    server.name, server.server_address = name, (bound, port)
-    return server
-
-
-def test_a_picture_is_sent_in_parts(scenes: Path, tmp_path: Path) -> None:
-    """The limit of time is that of a part, so that a large picture gets through a slow line."""
-    make(scenes, tmp_path / "study")
-    picture = next((tmp_path / "study" / "pages").glob("*.png"))
-    content = random.Random(1).randbytes(1_000_001)
-    picture.write_bytes(content)
-    server = unbound(tmp_path / "study", "127.0.0.1", "127.0.0.1", lambda line: None)
-    wire = Wire(f"GET /{picture.name} HTTP/1.1\r\nHost: localhost:8000\r\n\r\n")
-    _Handler(wire, ("10.9.9.9", 1), server)  # type: ignore[arg-type]
-    assert wire.answered.endswith(b"\r\n\r\n" + content)
-    assert wire.longest <= 1 << 16
-
-
-def test_a_name_that_was_not_given_is_refused(scenes: Path, tmp_path: Path) -> None:
-    """Elsewhere than on the loopback: addresses and the given name; a refused HEAD has no body."""
-    study = make(scenes, tmp_path / "study")
-    path = f"/{study.plan.raters[0].token}.html"
-    local, named = ("127.0.0.1", "127.0.0.1"), ("10.0.0.5", "Lab.example")
-    everywhere, mine = ("0.0.0.0", "0.0.0.0"), ("127.0.1.1", "MyBox")
-    for where, hosts, status in (
-        (mine, ("mybox:8000", "MyBox:8000", "127.0.1.1:8000", "localhost:8000"), 200),
-        (mine, ("mybox", "mybox:80", "mybox.evil.example:8000", "evil.example:8000"), 403),
-        (local, ("127.0.0.1:8000", "localhost:8000"), 200),
-        (local, ("127.0.0.1", "10.0.0.5:8000", "evil.example:8000", ""), 403),
-        (everywhere, ("192.168.1.7:8000", "192.168.1.7", "[fd00::1]:80", "localhost:8000"), 200),
-        (everywhere, ("evil.example", "evil.example:8000", "127.0.0.1.evil.example", ""), 403),
-        (everywhere, ("127.0.0.1@evil.example", "[fd00::1", "a\r\nHost: b", "fd00::1"), 403),
-        (everywhere, ("127.0.0.1:8000\r\nHost: evil.example",), 403),
-        (named, ("lab.example:8000", "LAB.example", "10.0.0.5:8000"), 200),
-        (named, ("evil.example:8000", "lab.example.evil.example"), 403),
-    ):
-        server = unbound(tmp_path / "study", *where, say=lambda line: None)
-        for host in hosts:
-            wire = Wire(f"HEAD {path} HTTP/1.1\r\nHost: {host}\r\n\r\n" * 2)
-            _Handler(wire, ("10.9.9.9", 1), server)  # type: ignore[arg-type]
-            first, second, rest = wire.answered.split(b"\r\n\r\n")
-            for answer in (first, second):  # a body would stand before the second
-                assert answer.startswith(f"HTTP/1.1 {status} ".encode()), (where, host)
-            assert rest == b""
-
-
-def test_the_port_of_http_may_be_left_out(scenes: Path, tmp_path: Path) -> None:
-    """As browsers do."""
-    make(scenes, tmp_path / "study")
-    server = unbound(tmp_path / "study", "127.0.0.1", "127.0.0.1", lambda line: None, port=80)
-    assert all(map(server.is_named, ("127.0.0.1", "localhost", "127.0.0.1:80")))
-    assert not any(map(server.is_named, ("evil.example", "127.0.0.1:8000", "")))
-
-
-def test_a_fault_of_the_server_is_one_line(scenes: Path, tmp_path: Path) -> None:
-    """It is said without the address of who asked; who went away is not spoken of."""
-    make(scenes, tmp_path / "study")
-    lines: list[str] = []
-    server = unbound(tmp_path / "study", "127.0.0.1", "127.0.0.1", lines.append)
-    for error in (BrokenPipeError("gone"), ConnectionResetError("gone"), KeyError("trial")):
-        try:
-            raise error
-        except (ConnectionError, KeyError):
-            server.handle_error(None, ("10.9.9.9", 1))
-    assert lines == ["notice: a request failed (KeyError: 'trial')"]
-
-
-@contextmanager
-def serving(folder: Path, *more: str) -> Iterator[tuple[list[str], subprocess.Popen[str]]]:
-    """Serve a study in a child; yield the raters' addresses."""
-    command = [sys.executable, "-m", "warpir.study", "serve", str(folder), "--port", "0", *more]
-    server = subprocess.Popen(
-        command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, cwd=folder.parent
-    )
-    assert server.stdout is not None and server.stderr is not None
-    urls = []
-    try:
-        for line in server.stdout:
-            urls += re.findall(r"http://\S+", line)
-            if line.startswith("serving"):
-                break
-        assert urls, server.stderr.read()
-        yield urls, server
-    finally:
-        server.kill()
-        server.communicate()
-
-
-ASK = """
-import http.client, json, sys
-host, asked = json.loads(sys.stdin.read())
-answers = []
-for method, path, headers, body in asked:
-    connection = http.client.HTTPConnection(host, timeout=20)
-    connection.putrequest(method, path, skip_host="Host" in headers, skip_accept_encoding=True)
-    for name, value in headers.items():
-        connection.putheader(name, value)
-    connection.endheaders(body.encode())
-    answer = connection.getresponse()
-    answers.append([answer.status, answer.read().decode("latin-1"), dict(answer.getheaders())])
-print(json.dumps(answers))
-"""
-"""A client that sends paths and headers as they are, in a process that may open sockets."""
-
-
-def ask(host: str, asked: Sequence[tuple[str, str, dict[str, str], str]]) -> list[list[Any]]:
-    done = subprocess.run(
-        [sys.executable, "-c", ASK],
-        input=json.dumps([host, asked]),
-        capture_output=True,
-        text=True,
-        check=True,
-        timeout=60,
-    )
-    return list(json.loads(done.stdout))
-
-
-def test_the_server_refuses_what_is_not_for_it(scenes: Path, tmp_path: Path) -> None:
-    study = make(scenes, tmp_path / "study")
-    token = study.plan.raters[0].token
-    body = json.dumps(sheet_of(study.plan, 0))
-    answers = f"/answers/{token}"
-
-    def headers(**changes: str) -> dict[str, str]:
-        plain = {"Content-Type": "application/json", "Content-Length": str(len(body))}
-        return plain | {name.replace("_", "-"): value for name, value in changes.items()}
-
-    with serving(tmp_path / "study") as (urls, server):
-        host = urls[0].split("/")[2]
-        refused = [
-            (404, ("GET", "/", {}, "")),
-            (404, ("GET", "/key.json", {}, "")),
-            (404, ("GET", "/../key.json", {}, "")),
-            (404, ("GET", "/%2e%2e/key.json", {}, "")),
-            (404, ("GET", "//../../key.json", {}, "")),
-            (404, ("GET", "/study.json", {}, "")),
-            (404, ("GET", answers, {}, "")),
-            (403, ("GET", f"/{token}.html", {"Host": "evil.example"}, "")),
-            (404, ("POST", "/answers/nobody", headers(), body)),
-            (404, ("POST", "/answers/../key", headers(), body)),
-            (404, ("POST", f"/{token}.html", headers(), body)),
-            (403, ("POST", answers, headers(Origin="http://evil.example"), body)),
-            (403, ("POST", answers, headers(Origin="null"), body)),
-            (415, ("POST", answers, headers(Content_Type="text/plain"), body)),
-            (411, ("POST", answers, headers(Transfer_Encoding="chunked"), "")),
-            (411, ("POST", answers, headers(Content_Length="-1"), "")),
-            (413, ("POST", answers, headers(Content_Length="100000"), "")),
-            (413, ("POST", answers, headers(Content_Length="9" * 30), "")),
-            (400, ("POST", answers, headers(), "x" * len(body))),
-            (400, ("POST", answers, headers(), body.replace(token, "0" * len(token)))),
-            (501, ("PUT", answers, headers(), body)),
-            (501, ("DELETE", f"/{token}.html", {}, "")),
-        ]
-        for (status, asked), found in zip(
-            refused, ask(host, [asked for _, asked in refused]), strict=True
-        ):
-            assert found[0] == status, (asked, found)
-            assert METHOD not in found[1]
-        assert not (tmp_path / "study" / "answers").exists()
-        good = [
-            ("GET", f"/{token}.html", {}, ""),
-            ("HEAD", f"/{token}.html", {}, ""),
-            ("POST", answers, headers(Origin=f"http://{host}"), body),
-            ("POST", answers, headers(), body),
-        ]
-        page_found, head, first, second = ask(host, good)
-        assert (page_found[0], head[0], first[0], second[0]) == (200, 200, 201, 409)
-        assert 'data-save="server"' in page_found[1] and head[1] == ""
-        assert page_found[2]["X-Content-Type-Options"] == "nosniff"
-        assert "Server" not in page_found[2] or "Python" not in page_found[2]["Server"]
-        server.send_signal(signal.SIGINT)
-        out, err = server.communicate(timeout=20)
-        assert server.returncode == 130
-        assert err == "stopped by SIGINT; kept: answers of 1 of 3 raters\n"
-        assert "127.0.0.1" not in out, "whoever asked is not written down"
-
-
-def test_another_host_must_be_said_and_is_warned_of(scenes: Path, tmp_path: Path) -> None:
-    make(scenes, tmp_path / "study")
-    with serving(tmp_path / "study") as (urls, _):
-        port = urls[0].split(":")[2].split("/")[0]
-        assert urls[0].startswith("http://127.0.0.1:")
-        argv = [sys.executable, "-m", "warpir.study", "serve", "study", "--port", port]
-        taken = subprocess.run(argv, capture_output=True, text=True, cwd=tmp_path, timeout=60)
-        assert taken.returncode == 2
-        assert taken.stderr.startswith("error: --host 127.0.0.1 --port")
-    argv = [sys.executable, "-m", "warpir.study", "serve", "study", "--port", "0"]
-    # The second is a name of the loopback.
-    for name, words in (("0.0.0.0", "everyone who reaches this"), ("0x7f.1", "http://127.0.0.1:")):
-        with subprocess.Popen(
-            [*argv, "--host", name], stdout=subprocess.PIPE, text=True, cwd=tmp_path
-        ) as server:
-            assert server.stdout is not None
-            line = server.stdout.readline()
-            server.kill()
-        assert words in line
 
 
 # -------------------------------------------------------------------------------- the browser
@@ -1181,7 +922,7 @@ def answer_all(opened: Opened, count: int) -> None:
 
 def check_sheet_of_browser(path: Path, study: Study) -> None:
     record = json.loads(path.read_text())
-    sheet = parse_sheet(path, path.read_bytes(), study.plan)
+    sheet = check_sheet(path, record, study.plan)
     assert sheet.is_automated and record["resumed"] == 2
     assert [answer["choice"] for answer in record["answers"]] == [
         2 if k % 2 == 0 else 1 for k in range(len(record["answers"]))
@@ -1192,41 +933,9 @@ def check_sheet_of_browser(path: Path, study: Study) -> None:
 
 @pytest.mark.slow
 @needs_chromium
-def test_a_served_study_from_consent_to_figures(
+def test_a_study_from_consent_to_figures(
     scenes: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    study = make(scenes, tmp_path / "study")
-    saved = tmp_path / "study" / "answers" / f"{study.plan.raters[0].token}.json"
-    with serving(tmp_path / "study") as (urls, _):
-        with open_browser() as opened:
-            opened.page.goto(urls[1])
-            begin(opened)
-            opened.page.get_by_role("button", name="Stop").click()
-            opened.page.keyboard.press("1")  # a dialog is open: nothing is chosen
-            opened.page.get_by_role("button", name="Stop and discard").click()
-            assert opened.page.is_visible("#stopped")
-            assert opened.page.evaluate("sessionStorage.length") == 0
-
-            opened.page.goto(urls[0])
-            begin(opened)
-            answer_all(opened, len(study.plan.raters[0].trials))
-            assert not saved.exists(), "before it is said so"
-            assert opened.page.is_hidden("#download")
-            opened.page.get_by_role("button", name="Save my answers").click()
-            opened.page.get_by_text("Your answers are saved").wait_for()
-        assert opened.errors == []
-        assert all(url.startswith(urls[0].rsplit("/", 1)[0]) for url in opened.requests)
-    assert [p.name for p in saved.parent.iterdir()] == [saved.name]
-    check_sheet_of_browser(saved, study)
-    refuse(["score", "study"], 3, saved.name, "answered by a program", cwd=tmp_path)
-    capsys.readouterr()
-    assert score(tmp_path / "study")["sheets"]["automated"] == 1
-    assert capsys.readouterr().out.startswith(WARNING)
-
-
-@pytest.mark.slow
-@needs_chromium
-def test_a_study_on_a_disk_from_consent_to_figures(scenes: Path, tmp_path: Path) -> None:
     """Pages that were copied somewhere, without a server; the answers are a download."""
     study = make(scenes, tmp_path / "study")
     copied = tmp_path / "copied"
@@ -1236,12 +945,18 @@ def test_a_study_on_a_disk_from_consent_to_figures(scenes: Path, tmp_path: Path)
         opened.page.goto((copied / f"{rater.token}.html").as_uri())
         opened.page.set_viewport_size({"width": 1280, "height": 800})
         begin(opened)
+        opened.page.get_by_role("button", name="Stop").click()
+        opened.page.keyboard.press("1")  # a dialog is open: nothing is chosen
+        opened.page.get_by_role("button", name="Stop and discard").click()
+        assert opened.page.is_visible("#stopped")
+        assert opened.page.evaluate("sessionStorage.length") == 0
+        opened.page.reload()
+        begin(opened)
         opened.page.get_by_role("button", name="Photo without the object").click()
         assert opened.page.is_visible("#image-photo")
         opened.page.get_by_role("button", name="Photo without the object").click()
         assert opened.page.is_hidden("#image-photo")
         answer_all(opened, len(rater.trials))
-        assert opened.page.is_hidden("#send")
         with opened.page.expect_download() as downloading:
             opened.page.get_by_role("button", name="Download my answers").click()
         assert downloading.value.suggested_filename == f"answers-{rater.token}.json"
@@ -1251,5 +966,9 @@ def test_a_study_on_a_disk_from_consent_to_figures(scenes: Path, tmp_path: Path)
     assert opened.errors == []
     assert all(url.startswith("file:///") for url in opened.requests)
     check_sheet_of_browser(tmp_path / "back" / "a.json", study)
+    argv = ["score", "study", "--answers", "back"]
+    refuse(argv, 3, "a.json", "answered by a program", cwd=tmp_path)
+    capsys.readouterr()
     report = score(tmp_path / "study", "--answers", str(tmp_path / "back"))
-    assert report["sheets"]["found"] == 1
+    assert report["sheets"]["found"] == report["sheets"]["automated"] == 1
+    assert capsys.readouterr().out.startswith(WARNING)

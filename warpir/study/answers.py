@@ -1,4 +1,4 @@
-"""The file of answers of one rater: what it must hold, whether a browser sends it or a disk has it.
+"""The file of answers of one rater, as the page saves it.
 
     {"format": 1, "study": ID, "rater": TOKEN, "source": "browser", "resumed": 0,
      "answers": [{"trial": ID, "choice": 1, "ms": 4210, "zoomed": true}, ...]}
@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Any
 
 from warpir.core.errors import InputError, raise_all, shown
-from warpir.core.strict_json import parse_json_object, read_json_object
+from warpir.core.strict_json import read_json_object
 from warpir.study.key import FORMAT
 from warpir.study.plan import Plan, Rater, Trial
 
@@ -48,11 +48,6 @@ class Sheet:
     def catches_missed(self) -> int:
         """Catch pairs whose obviously worse image was chosen."""
         return sum(a.trial.kind == "catch" and not a.is_a for a in self.answers)
-
-
-def parse_sheet(where: str | Path, raw: bytes, plan: Plan) -> Sheet:
-    """Check the bytes of a file of answers; see `check_sheet`."""
-    return check_sheet(where, parse_json_object(where, raw), plan)
 
 
 def check_sheet(where: str | Path, record: Mapping[str, Any], plan: Plan) -> Sheet:

@@ -1,7 +1,6 @@
 """A study with people: which of two composites looks like an unedited photograph?
 
     python -m warpir.study make PAIRS --out STUDY       pages for raters, and the key to them
-    python -m warpir.study serve STUDY                  serve them on this machine, save answers
     python -m warpir.study score STUDY                  figures from the answers
 
 PAIRS is a manifest or a folder of scenes (`warpir.study.pairs`). The protocol is that of DiPIR's
@@ -14,7 +13,7 @@ import math
 import os
 import random
 import secrets
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 
 from warpir.app.command import Parser
@@ -24,7 +23,6 @@ from warpir.app.record import file_hash
 from warpir.core.atomic import write_file, write_folder
 from warpir.core.errors import ExitCode, InputError
 from warpir.core.limits import LIMITS
-from warpir.core.signals import Stopped
 from warpir.study.answers import read_sheets
 from warpir.study.key import (
     ANSWERS,
@@ -57,7 +55,7 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 def _run(arguments: list[str]) -> int:
     options = _parser().parse_args(arguments)
-    run = {"make": _make, "serve": _serve, "score": _score}[options.command]
+    run = {"make": _make, "score": _score}[options.command]
     run(options)
     return ExitCode.DONE
 
@@ -69,91 +67,64 @@ def _parser() -> argparse.ArgumentParser:
         formatter_class=argparse.RawDescriptionHelpFormatter,
         allow_abbrev=False,
     )
-    commands = parser.add_subparsers(dest="command", required=True, metavar="make|serve|score")
-
-    def command(name: str, about: str) -> argparse.ArgumentParser:
-        made = commands.add_parser(name, help=about, description=about, allow_abbrev=False)
-        made.add_argument("--debug", action="store_true", help="show tracebacks")
-        return made
-
-    def count(text: str, least: int = 0) -> int:
-        is_number = text.isascii() and text.isdigit() and len(text) < 20
-        if not (is_number and least <= int(text) <= LARGEST):
-            raise argparse.ArgumentTypeError(
-                f"expected a whole number from {least} to {LARGEST} (found {text[:40]})"
-            )
-        return int(text)
-
-    def at_least_one(text: str) -> int:
-        return count(text, 1)
-
-    make = command("make", "Make the pages of a study.")
-    add = make.add_argument
-    add("pairs", type=Path, metavar="PAIRS", help="manifest (JSON), or a folder of scenes")
-    add("--out", type=Path, required=True, metavar="STUDY", help="new folder")
-    add("--method", metavar="NAME", help="of a folder: the method the others are compared with")
-    add("--raters", type=at_least_one, default=9, metavar="N", help="people a pair (default: 9)")
-    add("--runs", type=at_least_one, default=3, metavar="N", help="of the study (default: 3)")
-    add(
-        "--repeats",
-        type=count,
-        metavar="N",
-        help=f"pairs shown twice to a rater (default: one in {PAIRS_PER_REPEAT})",
-    )
-    add(
-        "--catches",
-        type=count,
-        metavar="N",
-        help="catch pairs that are made where the manifest gives none and scenes have a photo "
-        f"(default: one to {PAIRS_PER_CATCH} pairs)",
-    )
-    add(
-        "--catch-misses",
-        type=count,
-        default=0,
-        metavar="N",
-        help="catch pairs that a rater may miss and still count (default: 0)",
-    )
-    add("--pairs-per-rater", type=at_least_one, metavar="N", help="most pairs (default: all)")
-    add("--seed", type=_seed, metavar="N", help="of sides and order (default: a new random one)")
-    add("--alpha", choices=("refuse", "ignore"), default="refuse", help="of transparent images")
-    add("--max-pixels", type=_seed, default=LIMITS.pixels, metavar="N", help="largest image [px]")
-
-    serve = command("serve", "Serve the pages, and save the answers in STUDY/answers.")
-    add = serve.add_argument
-    add("study", type=Path, metavar="STUDY", help="folder that make has written")
-    add("--host", default="127.0.0.1", metavar="ADDRESS", help="to listen on (default: 127.0.0.1)")
-    add("--port", type=_port, default=8000, metavar="N", help="0: any (default: 8000)")
-
-    score = command("score", "Print the figures of a study.")
-    add = score.add_argument
-    add("study", type=Path, metavar="STUDY", help="folder that make has written")
-    add(
-        "--answers",
-        type=Path,
-        nargs="+",
-        metavar="PATH",
-        help="files of answers, or folders of them (default: STUDY/answers)",
-    )
-    add(
-        "--include-automated", action="store_true", help="count what a program answered, and say so"
-    )
-    add("--json", type=Path, metavar="FILE", help="all figures")
-    add("--markdown", type=Path, metavar="FILE", help="the tables")
-    add("--overwrite", action="store_true", help="replace --json and --markdown")
+    commands = parser.add_subparsers(dest="command", required=True, metavar="make|score")
+    for name, about, add_arguments in (
+        ("make", "Make the pages of a study.", _add_make_arguments),
+        ("score", "Print the figures of a study.", _add_score_arguments),
+    ):
+        command = commands.add_parser(name, help=about, description=about, allow_abbrev=False)
+        command.add_argument("--debug", action="store_true", help="show tracebacks")
+        add_arguments(command)
     return parser
 
 
-def _seed(text: str) -> int:
-    if not (text.isascii() and text.isdigit() and len(text) < 20):
-        raise argparse.ArgumentTypeError(f"expected a whole number (found {text[:40]})")
-    return int(text)
+def _add_make_arguments(command: argparse.ArgumentParser) -> None:
+    add = command.add_argument
+    add("pairs", type=Path, metavar="PAIRS", help="manifest (JSON), or a folder of scenes")
+    add("--out", type=Path, required=True, metavar="STUDY", help="new folder")
+    add("--method", metavar="NAME", help="of a folder: the method the others are compared with")
+    at_least_one, count = _whole_number(1, LARGEST), _whole_number(0, LARGEST)
+    add("--raters", type=at_least_one, default=9, metavar="N", help="people a pair (default: 9)")
+    add("--runs", type=at_least_one, default=3, metavar="N", help="of the study (default: 3)")
+    repeats = f"pairs shown twice to a rater (default: one in {PAIRS_PER_REPEAT})"
+    add("--repeats", type=count, metavar="N", help=repeats)
+    catches = (
+        "catch pairs that are made where the manifest gives none and scenes have a photo "
+        f"(default: one to {PAIRS_PER_CATCH} pairs)"
+    )
+    add("--catches", type=count, metavar="N", help=catches)
+    misses = "catch pairs that a rater may miss and still count (default: 0)"
+    add("--catch-misses", type=count, default=0, metavar="N", help=misses)
+    add("--pairs-per-rater", type=at_least_one, metavar="N", help="most pairs (default: all)")
+    number = _whole_number(0, 10**19 - 1)
+    add("--seed", type=number, metavar="N", help="of sides and order (default: a new random one)")
+    add("--alpha", choices=("refuse", "ignore"), default="refuse", help="of transparent images")
+    add("--max-pixels", type=number, default=LIMITS.pixels, metavar="N", help="largest image [px]")
 
 
-def _port(text: str) -> int:
-    if not (text.isascii() and text.isdigit() and len(text) < 20 and int(text) <= 65535):
-        raise argparse.ArgumentTypeError(f"expected 0 to 65535 (found {text[:40]})")
-    return int(text)
+def _add_score_arguments(command: argparse.ArgumentParser) -> None:
+    add = command.add_argument
+    add("study", type=Path, metavar="STUDY", help="folder that make has written")
+    answers = "files of answers, or folders of them (default: STUDY/answers)"
+    add("--answers", type=Path, nargs="+", metavar="PATH", help=answers)
+    automated = "count what a program answered, and say so"
+    add("--include-automated", action="store_true", help=automated)
+    add("--json", type=Path, metavar="FILE", help="all figures")
+    add("--markdown", type=Path, metavar="FILE", help="the tables")
+    add("--overwrite", action="store_true", help="replace --json and --markdown")
+
+
+def _whole_number(least: int, most: int) -> Callable[[str], int]:
+    """Return what reads an argument as a whole number of a range."""
+
+    def read(text: str) -> int:
+        is_number = text.isascii() and text.isdigit() and len(text) < 20
+        if not (is_number and least <= int(text) <= most):
+            expected = f"expected a whole number from {least} to {most}"
+            raise argparse.ArgumentTypeError(f"{expected} (found {text[:40]})")
+        return int(text)
+
+    return read
 
 
 # -------------------------------------------------------------------------------------- make
@@ -285,40 +256,6 @@ def _files(
 def _origin(path: Path | None) -> dict[str, str]:
     """Return what the key says of where an image is from; nothing of one that was made here."""
     return {} if path is None else {"from": path.name, "sha256": file_hash(path)}
-
-
-# ------------------------------------------------------------------------------------- serve
-
-
-def _serve(options: argparse.Namespace) -> None:
-    from warpir.study.server import Site, StudyServer, is_loopback
-
-    study = read_study(options.study)
-    if not (options.study / PAGES).is_dir():
-        raise InputError(options.study, f"no folder {PAGES}")
-    site = Site(options.study, study, say)
-    try:
-        server = StudyServer(site, options.host, options.port)
-    except OSError as error:
-        where = f"--host {options.host} --port {options.port}"
-        raise usage(where, f"cannot be listened on ({error.strerror or error})") from error
-    with server:
-        host, port = server.server_address[:2]
-        if not is_loopback(str(host)):
-            say(
-                f"notice: --host {options.host}: everyone who reaches this machine can open the "
-                "pages and send answers, and nothing is encrypted"
-            )
-        for rater in study.plan.raters:
-            done = " (saved)" if site.saved(rater.token).exists() else ""
-            say(f"rater of run {rater.run}: http://{host!s}:{port}/{rater.token}.html{done}")
-        say(f"serving {options.study}; Ctrl-C stops")
-        try:
-            server.serve_forever()
-        except Stopped as stopped:
-            count = sum(site.saved(rater.token).exists() for rater in study.plan.raters)
-            stopped.kept = f"kept: answers of {count} of {len(study.plan.raters)} raters"
-            raise
 
 
 # ------------------------------------------------------------------------------------- score

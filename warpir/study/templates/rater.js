@@ -1,7 +1,6 @@
 "use strict";
 // One rater's way through the study. Answers stay in this tab until the last page.
 const sheet = JSON.parse(document.getElementById("sheet").textContent);
-const served = document.body.dataset.save === "server";
 const by = (id) => document.getElementById(id);
 const pages = ["consent", "instruction", "trial", "last", "stopped"];
 const largestZoom = 8, clickZoom = 3, zoomStep = 1.25, panStep = 0.1;
@@ -202,39 +201,15 @@ function content() {
     resumed: state.resumed, answers: state.answers,
   }, null, 1) + "\n";
 }
-function done(words) {
-  by("outcome").textContent = words;
-  by("how-to-save").hidden = by("send").hidden = by("discard").hidden = true;
-}
-function download() {
+by("download").addEventListener("click", () => {
   const link = document.createElement("a");
   link.href = URL.createObjectURL(new Blob([content()], { type: "application/json" }));
   link.download = `answers-${sheet.rater}.json`;
   link.click();
   URL.revokeObjectURL(link.href);
-  done(`Thank you. The file is called ${link.download}; see that it is among your downloads before `
-    + "you close this page.");
-}
-by("download").addEventListener("click", download);
-by("send").addEventListener("click", async () => {
-  by("send").disabled = true;
-  by("outcome").textContent = "Saving \u2026";
-  let status = 0;
-  try {
-    const headers = { "Content-Type": "application/json" };
-    status = (await fetch(`answers/${sheet.rater}`, { method: "POST", headers, body: content() })).status;
-  } catch { /* the computer does not answer */ }
-  if (status === 201) {
-    forget();
-    done("Thank you. Your answers are saved; you can close this page.");
-  } else if (status === 409) {
-    done("Answers of this link were saved before. They are kept; these are not added.");
-  } else {
-    by("send").disabled = false;
-    by("outcome").textContent = "Not saved: the computer that this page came from does not answer. "
-      + "Try again, or download the file and hand it over.";
-    by("download").classList.remove("when-static", "primary");
-  }
+  by("how-to-save").hidden = by("discard").hidden = true;
+  by("outcome").textContent = `Thank you. The file is called ${link.download}; see that it is among `
+    + "your downloads before you close this page.";
 });
 
 if (state.begun) {
