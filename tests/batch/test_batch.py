@@ -15,7 +15,7 @@ import sys
 import tempfile
 import time
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import asdict, replace
+from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -27,7 +27,7 @@ from tests.builders.faults import snapshot
 from tests.builders.insertions import arguments, write_inputs
 from warpir.app.command import parse
 from warpir.app.config import DEFAULTS
-from warpir.batch import command as batch
+from warpir.batch import run as batch
 from warpir.batch.command import main
 from warpir.batch.local import LocalWorkers, answer_of_the_dead
 from warpir.batch.manifest import Row, read_manifest
@@ -44,7 +44,7 @@ POSE = {"fov": 60, "pitch": -15, "camera-height": 1.5, "place": [0, 0, -5]}
 HOOK = """
 import os, signal, sys, time
 from pathlib import Path
-if any(word.endswith(("warpir.batch.worker", "/default_worker.py")) for word in sys.orig_argv):
+if any(word.endswith(("--multiprocessing-fork", "/default_worker.py")) for word in sys.orig_argv):
     from warpir.io.results import OutputFolder
     here, pid = Path(os.environ["HOOKED"]), os.getpid()
     (here / f"worker-{pid}").touch()
@@ -493,12 +493,12 @@ def options_of(tmp_path: Path, **changes: Any) -> batch.Options:
     return batch.Options(tmp_path / "m.jsonl", tmp_path, **{**values, **changes})
 
 
-def batch_of(tmp_path: Path, count: int, **changes: Any) -> batch._Batch:
+def batch_of(tmp_path: Path, count: int, **changes: Any) -> batch.Batch:
     (tmp_path / "m.jsonl").write_text(
         "".join(json.dumps({"name": f"s{k}", "demo": True, "device": "cpu"}) + "\n"
                 for k in range(count))
     )  # fmt: skip
-    made = batch._Batch(
+    made = batch.Batch(
         options_of(tmp_path, **changes),
         read_manifest(tmp_path / "m.jsonl", tmp_path / "out", {}, LIMITS),
     )
@@ -557,7 +557,7 @@ def test_a_manifest_that_goes_meanwhile(tmp_path: Path, monkeypatch: pytest.Monk
     """The summary has the digest of what was read, and both files are there."""
     manifest = write_manifest(tmp_path, [{"name": "a", "demo": True, "plaice": 1}])
     digest = hashlib.sha256(manifest.read_bytes()).hexdigest()
-    monkeypatch.setattr(batch._Batch, "check", lambda self: manifest.unlink())
+    monkeypatch.setattr(batch.Batch, "check", lambda self: manifest.unlink())
     assert main([str(manifest), "--out", str(tmp_path / "out")]) == ExitCode.USAGE
     assert summary_of(tmp_path / "out")["sha256"] == digest
     assert [failure["name"] for failure in failures_of(tmp_path / "out")] == ["a"]
@@ -576,8 +576,8 @@ def test_how_a_stopped_batch_goes_on(
         raise Stopped(signal.SIGTERM)
 
     manifest = write_manifest(tmp_path, [{"name": "a", "demo": True}])
-    monkeypatch.setattr(batch._Batch, "check", lambda self: None)
-    monkeypatch.setattr(batch._Batch, "do", stop)
+    monkeypatch.setattr(batch.Batch, "check", lambda self: None)
+    monkeypatch.setattr(batch.Batch, "do", stop)
     for _ in range(2):
         assert main([str(manifest), "--out", str(tmp_path / "out"), *flags]) == 143
         said = f"stopped by SIGTERM; kept: 0 of 1 scenes; the same command {how}\n"
@@ -587,10 +587,16 @@ def test_how_a_stopped_batch_goes_on(
 
 def test_a_worker_that_hangs_is_killed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """When its time is over, and its answer is not waited for."""
-    (tmp_path / "sitecustomize.py").write_text("import time; time.sleep(60)")
+    (tmp_path / "sitecustomize.py").write_text(
+        "import pathlib, signal, time\n"
+        "signal.signal(signal.SIGTERM, signal.SIG_IGN)\n"
+        f"pathlib.Path({str(tmp_path)!r}, 'begun').touch()\n"
+        "time.sleep(60)\n"
+    )
     monkeypatch.setattr("warpir.batch.local.GRACE_SECONDS", 0.2)
     workers, began = LocalWorkers([{"PYTHONPATH": str(tmp_path)}]), time.monotonic()
     workers.start(7, Task(COMPILE))
+    wait_for(lambda: (tmp_path / "begun").exists())
     ((key, answer),) = workers.stop()
     assert (key, answer.died) == (7, "SIGKILL") and time.monotonic() - began < 30.0
 
@@ -602,43 +608,43 @@ def test_a_worker_with_a_fault_of_its_own_is_replaced() -> None:
     try:
         for _ in range(2):
             workers.start(0, Task("no such thing"))
-            ((_, worker),) = [known.data for known in workers._selector.get_map().values()]
+            ((_, worker),) = workers._running.values()
             processes.append(worker._process)
             assert workers.wait()[1].status == ExitCode.BUG
     finally:
         workers.stop()
-    assert processes[0].pid != processes[1].pid and processes[0].returncode is not None
+    assert processes[0].pid != processes[1].pid and processes[0].exitcode is not None
 
 
-def test_a_worker_without_a_log_or_a_reader(tmp_path: Path) -> None:
-    """A full disk hides no answer, and a log that cannot be opened is one; nothing is printed."""
+def test_a_worker_without_a_log(tmp_path: Path) -> None:
+    """A full disk hides no answer, and a log that cannot be opened is one; the worker goes on.
+
+    Killed while it has nothing to do, it is replaced.
+    """
     (tmp_path / "logs").write_text("a file")
-    worker = subprocess.Popen(
-        [sys.executable, "-P", "-m", "warpir.batch.worker"],
-        stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.PIPE,
-    )  # fmt: skip
-    assert worker.stdin is not None and worker.stdout is not None and worker.stderr is not None
-
-    def give(**values: str) -> None:
-        assert worker.stdin is not None
-        worker.stdin.write(Task(COMPILE, folder=str(tmp_path / "gone"), **values).line())
-        worker.stdin.flush()
-
-    answers = []
-    for log in ("/dev/full", str(tmp_path / "logs" / "a.log")):
-        give(log=log)
-        answers.append(Answer.of_line(worker.stdout.readline()))
-    assert [answer.status for answer in answers] == [ExitCode.INPUT, ExitCode.RESOURCES]
+    workers, answers, pids = LocalWorkers([{}]), [], []
+    try:
+        for log in ("/dev/full", str(tmp_path / "logs" / "a.log"), None):
+            workers.start(0, Task(COMPILE, folder=str(tmp_path / "gone"), log=log))
+            ((_, worker),) = workers._running.values()
+            assert worker._process is not None
+            pids.append(worker._process.pid)
+            answers.append(workers.wait()[1])
+            if len(pids) == 2:
+                worker._process.kill()
+                worker._process.join()
+                time.sleep(0.2)  # the pool learns of it in a thread
+    finally:
+        workers.stop()
+    assert [answer.status for answer in answers] == [
+        ExitCode.INPUT, ExitCode.RESOURCES, ExitCode.INPUT,
+    ]  # fmt: skip
     assert "the folder of the manifest cannot be entered" in answers[0].lines[0]
     assert answers[1].lines[0].startswith(f"error: {tmp_path / 'logs' / 'a.log'}: cannot be")
-    worker.stdout.close()
-    give()
-    assert worker.wait(60) == 0 and worker.stderr.read() == b""
-    worker.stdin.close()
-    worker.stderr.close()
+    assert pids[0] == pids[1] != pids[2]
 
 
-def on_devices(made: batch._Batch, *devices: str | None) -> None:
+def on_devices(made: batch.Batch, *devices: str | None) -> None:
     """Let scenes name their devices."""
     for scene, device in zip(made.scenes, devices, strict=True):
         assert scene.row.config is not None
@@ -780,14 +786,15 @@ CLUSTER = """
 import sys
 from ray.cluster_utils import Cluster
 
-small = {"num_cpus": 1, "object_store_memory": 80 << 20}
-cluster = Cluster(initialize_head=True, head_node_args={**small, "include_dashboard": False})
-cluster.add_node(**small)
-try:
-    from warpir.batch.command import main
-    sys.exit(main([*sys.argv[1:], "--ray", cluster.address]))
-finally:
-    cluster.shutdown()
+if __name__ == "__main__":
+    small = {"num_cpus": 1, "object_store_memory": 80 << 20}
+    cluster = Cluster(initialize_head=True, head_node_args={**small, "include_dashboard": False})
+    cluster.add_node(**small)
+    try:
+        from warpir.batch.command import main
+        sys.exit(main([*sys.argv[1:], "--ray", cluster.address]))
+    finally:
+        cluster.shutdown()
 """
 
 
@@ -914,11 +921,11 @@ def test_an_address_where_nobody_listens(tmp_path: Path, monkeypatch: pytest.Mon
 
 def test_a_machine_without_the_folder_says_so(tmp_path: Path) -> None:
     """What each machine of a cluster is asked before any scene."""
-    assert _probe(str(tmp_path / "elsewhere"), "node", {}) == (False, {})
+    task = Task(COMPILE, {"devices": [], "places": []})
+    assert not _probe(str(tmp_path / "elsewhere"), "node", task)[0]
     (tmp_path / "driver").write_text("token")
-    seen, answer = _probe(str(tmp_path), "node", asdict(Task("compile", {"devices": [], "places":
-                          []})))  # fmt: skip
-    assert seen and answer["status"] == 0, answer
+    seen, answer = _probe(str(tmp_path), "node", task)
+    assert seen and answer.status == 0, answer
     assert (tmp_path / "node").read_text() == "token"
 
 

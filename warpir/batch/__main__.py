@@ -4,4 +4,5 @@ import sys
 
 from warpir.batch.command import main
 
-sys.exit(main())
+if __name__ == "__main__":  # workers import this module under another name
+    sys.exit(main())

@@ -1,16 +1,18 @@
 """Worker processes on this machine: each does one scene after another; the dead are replaced."""
 
+import logging
+import multiprocessing
 import os
-import selectors
 import signal
-import subprocess
-import sys
+import threading
 import time
-from collections.abc import Mapping, Sequence
-from contextlib import suppress
-from subprocess import PIPE
+from collections.abc import Iterator, Mapping, Sequence
+from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
+from concurrent.futures.process import BrokenProcessPool
+from contextlib import contextmanager, suppress
+from multiprocessing.process import BaseProcess
 
-from warpir.batch.task import Answer, Task
+from warpir.batch.task import Answer, Task, do_task
 from warpir.core.errors import ExitCode
 
 GRACE_SECONDS = 60.0
@@ -19,16 +21,16 @@ GRACE_SECONDS = 60.0
 
 
 class LocalWorkers:
-    """A pool of processes.
+    """Processes that load torch, Warp and the kernels once.
 
     Args:
         environments: Of each process, what differs from this one's.
     """
 
     def __init__(self, environments: Sequence[Mapping[str, str]]) -> None:
-        self._selector = selectors.DefaultSelector()
         self._idle = [_Worker(environment) for environment in environments]
         self._idle.reverse()  # the first one works first
+        self._running: dict[Future[Answer], tuple[int, _Worker]] = {}
 
     @property
     def free(self) -> int:
@@ -39,20 +41,19 @@ class LocalWorkers:
         """Give a task to a free worker.
 
         Args:
-            key: What `wait` says of it.
+            key: What `wait` returns with its answer.
             task: The task.
         """
         worker = self._idle.pop()
-        # Registered first: a signal may come between the two.
-        self._selector.register(worker.begin(), selectors.EVENT_READ, (key, worker))
-        worker.send(task)
+        self._running[worker.submit(task)] = key, worker
 
     def wait(self) -> tuple[int, Answer]:
         """Return the key and the answer of a task that has ended; its worker is free again."""
-        ready, _ = self._selector.select()[0]
-        key, worker = ready.data
-        answer = worker.receive()
-        self._selector.unregister(ready.fileobj)
+        done, _ = wait(self._running, return_when=FIRST_COMPLETED)
+        future = done.pop()
+        key, worker = self._running[future]
+        answer = worker.answer(future)
+        del self._running[future]
         # What it holds is unknown, such as a CUDA context that one fault has spoilt.
         if answer.died or answer.is_short or answer.status == ExitCode.BUG:
             worker.end()
@@ -63,90 +64,106 @@ class LocalWorkers:
         """End all processes: those that work, as a signal ends a run; one that hangs is killed.
 
         Returns:
-            What was under way, by its key, and how it ended.
+            The tasks under way: the key of each, and how it ended.
         """
-        busy = [registered.data for registered in self._selector.get_map().values()]
-        workers = [*self._idle, *(worker for _, worker in busy)]
+        busy = [worker for _, worker in self._running.values()]
         try:
-            for worker in workers:
-                worker.close_input()
-            deadline = time.monotonic() + GRACE_SECONDS
-            for worker in workers:
-                worker.wait(deadline)
-            for worker in workers:  # before an answer is waited for: one that hangs gives none
-                worker.kill()
-            return [(key, worker.receive()) for key, worker in busy]
+            for worker in busy:
+                worker.terminate()
+            wait(self._running, timeout=GRACE_SECONDS)
         finally:
-            for worker in workers:
+            for worker in [*self._idle, *busy]:
                 worker.end()
-            for descriptor in [*self._selector.get_map()]:
-                self._selector.unregister(descriptor)
-            self._idle.clear()
+        answers = [(key, worker.answer(future)) for future, (key, worker) in self._running.items()]
+        self._running.clear()
+        self._idle.clear()
+        return answers
 
 
 class _Worker:
-    """A process that is started when there is something to do."""
+    """One process behind an executor of its own, so that its end is that of one scene."""
 
     def __init__(self, environment: Mapping[str, str]) -> None:
         self._environment = environment
-        self._process: subprocess.Popen[bytes] | None = None
+        self._executor: ProcessPoolExecutor | None = None
+        self._process: BaseProcess | None = None
 
-    def begin(self) -> int:
-        """Start the process if there is none; return the descriptor that its answers come from."""
-        if self._process is None:
-            self._process = subprocess.Popen(
-                # -P: what lies in the working directory is no module of ours.
-                [sys.executable, "-P", "-m", "warpir.batch.worker"],
-                stdin=PIPE,
-                stdout=PIPE,
-                env={**os.environ, **self._environment},
-                # Ctrl-C is for the batch, which ends its workers itself.
-                process_group=0,
-            )
-        assert self._process.stdout is not None
-        return self._process.stdout.fileno()
+    def submit(self, task: Task) -> Future[Answer]:
+        """Give it a task, and start its process where there is none."""
+        if self._executor is not None:
+            with suppress(BrokenProcessPool):
+                return self._executor.submit(do_task, task)
+            self.end()  # it died while it had nothing to do
+        context = multiprocessing.get_context("spawn")
+        executor = self._executor = ProcessPoolExecutor(1, context, _begin)
+        others = {*multiprocessing.active_children()}
+        with _starting(self._environment):
+            future = executor.submit(do_task, task)
+        (self._process,) = {*multiprocessing.active_children()} - others
+        return future
 
-    def send(self, task: Task) -> None:
-        assert self._process is not None and self._process.stdin is not None
-        with suppress(BrokenPipeError):  # it has died: `receive` tells
-            self._process.stdin.write(task.line())
-            self._process.stdin.flush()
+    def answer(self, future: Future[Answer]) -> Answer:
+        """Return the answer to a task that has ended, or how its process ended without one."""
+        try:
+            return future.result()
+        except BrokenProcessPool:
+            self.end()
+            assert self._process is not None
+            return answer_of_the_dead(self._process.exitcode or 0)
 
-    def receive(self) -> Answer:
-        """Read the answer, or how the process ended without one."""
-        assert self._process is not None and self._process.stdout is not None
-        line = self._process.stdout.readline()
-        if line.endswith(b"\n"):
-            return Answer.of_line(line)
-        return answer_of_the_dead(self._process.wait())
-
-    def close_input(self) -> None:
-        if self._process is not None and self._process.stdin is not None:
-            with suppress(BrokenPipeError):
-                self._process.stdin.close()
-
-    def wait(self, deadline: float) -> None:
+    def terminate(self) -> None:
+        """End the task of a worker that has one, as a signal ends a run."""
         if self._process is not None:
-            with suppress(subprocess.TimeoutExpired):
-                self._process.wait(max(0.0, deadline - time.monotonic()))
-
-    def kill(self) -> None:
-        if self._process is not None:
-            self._process.kill()
+            self._process.terminate()
 
     def end(self) -> None:
-        """Kill the process if it still runs, and forget it."""
+        """Kill the process if it still runs; the next task gets another one."""
         if self._process is not None:
-            self.kill()
-            self._process.wait()
-            self.close_input()
-            assert self._process.stdout is not None
-            self._process.stdout.close()
-            self._process = None
+            self._process.kill()
+        if self._executor is not None:
+            self._executor.shutdown()
+            self._executor = None
+
+
+@contextmanager
+def _starting(environment: Mapping[str, str]) -> Iterator[None]:
+    """Let a process that is started within the block have its environment, and no Ctrl-C yet."""
+    before = dict(os.environ)
+    blocked = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+    os.environ.update(environment)
+    try:
+        yield
+    finally:
+        for name in environment:
+            if name in before:
+                os.environ[name] = before[name]
+            else:
+                del os.environ[name]
+        signal.pthread_sigmask(signal.SIG_SETMASK, blocked)
+
+
+def _begin() -> None:
+    """Make a process a worker: Ctrl-C goes to the batch alone, and it ends with the batch."""
+    os.setpgid(0, 0)
+    signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGINT})
+    os.dup2(2, 1)  # what libraries print outside of a scene is no line of the batch's
+    logging.captureWarnings(True)
+    logging.getLogger("py.warnings").addHandler(logging.NullHandler())
+    threading.Thread(target=_end_with_parent, daemon=True).start()
+
+
+def _end_with_parent() -> None:
+    """Wait until the batch is gone, then end this process as a signal ends a run."""
+    parent = multiprocessing.parent_process()
+    assert parent is not None
+    parent.join()
+    os.kill(os.getpid(), signal.SIGTERM)
+    time.sleep(GRACE_SECONDS)
+    os.kill(os.getpid(), signal.SIGKILL)
 
 
 def answer_of_the_dead(status: int) -> Answer:
-    """Make the answer of a process that has ended without one.
+    """Return the answer in place of a process that has ended without one.
 
     Args:
         status: Its exit status, or minus the number of the signal that killed it.

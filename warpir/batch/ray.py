@@ -13,7 +13,6 @@ import signal
 import socket
 import time
 from collections.abc import Mapping
-from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -126,7 +125,7 @@ class RayWorkers:
             for node in nodes:
                 where = NodeAffinitySchedulingStrategy(node["NodeID"], soft=False)
                 asked = probe.options(scheduling_strategy=where)
-                probes[node["NodeID"]] = asked.remote(str(folder), node["NodeID"], asdict(task))
+                probes[node["NodeID"]] = asked.remote(str(folder), node["NodeID"], task)
             for node in nodes:
                 name = node["NodeManagerHostname"]
                 try:
@@ -145,9 +144,9 @@ class RayWorkers:
                         "name a folder that is mounted at the same place on all of them",
                         ExitCode.USAGE,
                     )  # fmt: skip
-                if answer["status"]:
-                    line = " ".join(answer["lines"]).removeprefix("error: ")
-                    raise InputError(f"the machine {name}", line, code=ExitCode(answer["status"]))
+                if answer.status:
+                    line = " ".join(answer.lines).removeprefix("error: ")
+                    raise InputError(f"the machine {name}", line, code=ExitCode(answer.status))
         finally:
             # A machine that comes late may write into it meanwhile: not what the user is to read.
             shutil.rmtree(folder, ignore_errors=True)
@@ -171,8 +170,8 @@ class RayWorkers:
             max_retries=0,
             # A process that has met a fault of CUDA does nothing with it any more.
             max_calls=1 if task.gpus else 0,
-        )(_do)
-        self._running[remote.remote(asdict(task))] = key
+        )(do_task)
+        self._running[remote.remote(task)] = key
 
     def wait(self) -> tuple[int, Answer]:
         """Return the key and the answer of a task that has ended."""
@@ -184,7 +183,8 @@ class RayWorkers:
         from ray import exceptions
 
         try:
-            return Answer.of_line(self._ray.get(reference))
+            answer: Answer = self._ray.get(reference)
+            return answer
         except exceptions.OutOfMemoryError:
             line = "error: worker: ended by Ray, as its machine ran out of memory"
             return Answer(ExitCode.RESOURCES, (line,), is_short=True, died="OutOfMemoryError")
@@ -238,17 +238,13 @@ def _no_cluster(address: str, error: Exception) -> InputError:
     )
 
 
-def _do(task: dict[str, Any]) -> bytes:
-    return do_task(Task(**task)).line()
-
-
-def _probe(folder: str, node: str, task: dict[str, Any]) -> tuple[bool, dict[str, Any]]:
-    """Say whether this machine sees a folder, write into it, and compile."""
+def _probe(folder: str, node: str, task: Task) -> tuple[bool, Answer]:
+    """Return whether this machine sees a folder; write into it, and compile."""
     seen = Path(folder, "driver")
     if not _appears(seen):
-        return False, {}
+        return False, Answer(ExitCode.USAGE)
     Path(folder, node).write_text(seen.read_text())
-    return True, asdict(do_task(Task(**task)))
+    return True, do_task(task)
 
 
 def _appears(path: Path) -> bool:

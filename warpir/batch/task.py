@@ -1,18 +1,17 @@
-"""What a worker of a batch does with one scene, and what it answers: plain values both.
+"""What a worker of a batch does with one scene, and what it answers: both hold plain values.
 
 A task is done in a process of its own, whoever starts that: `warpir.batch.local` on this machine,
 `warpir.batch.ray` on others. Whatever ends a scene becomes an `Answer`; only what ends the process
 does not.
 """
 
-import json
 import os
 import sys
 import time
 import traceback
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager, suppress
-from dataclasses import asdict, dataclass, field
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -36,7 +35,7 @@ DONE_BEFORE = "done before"
 
 @dataclass(frozen=True)
 class Task:
-    """What is to be done, in values that JSON holds."""
+    """What is to be done."""
 
     do: str
     """`CHECK`: read and check its inputs; `INSERT`; `COMPILE`: the kernels of a batch."""
@@ -52,10 +51,6 @@ class Task:
     """Of the host, at least [byte]; what a cluster looks for."""
     gpus: int = 0
     """The same, 0 or 1."""
-
-    def line(self) -> bytes:
-        """Return it as one line of JSON."""
-        return json.dumps(asdict(self)).encode() + b"\n"
 
 
 @dataclass(frozen=True)
@@ -73,16 +68,6 @@ class Answer:
     """Whether it ended for want of memory."""
     died: str = ""
     """How the process ended that should have answered; empty: it has."""
-
-    def line(self) -> bytes:
-        """Return it as one line of JSON."""
-        return json.dumps(asdict(self)).encode() + b"\n"
-
-    @classmethod
-    def of_line(cls, line: bytes) -> "Answer":
-        """Read what `line` has written."""
-        values = json.loads(line)
-        return cls(**{**values, "lines": tuple(values["lines"])})
 
 
 def do_task(task: Task) -> Answer:
