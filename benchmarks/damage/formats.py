@@ -64,7 +64,8 @@ class Format:
 
 def formats() -> list[Format]:
     """Return all formats that are read without torch."""
-    return [*_images(), *_meshes(), *_cameras(), *_records()]
+    images = (*_photos(), *_lights_and_masks(), *_metadata())
+    return [*images, *_gltf(), *_meshes(), *_cameras(), *_records()]
 
 
 def _codes(channels: int = 3, dtype: type = np.uint8) -> np.ndarray:
@@ -102,27 +103,33 @@ def _exif() -> bytes:
     return exif.tobytes()
 
 
-def _images() -> Iterator[Format]:
-    photo, plate = _codes(), _codes().astype(np.float32) / np.float32(255)
-    smooth = {c: np.ascontiguousarray(plate[..., k]) for k, c in enumerate("RGB")}
-    half = {c: plane.astype(np.float16) for c, plane in smooth.items()}
-    sky = {c: plane[:16, :32] for c, plane in half.items()}
+def _both(sound: bytes, structured: Callable[[bytes], Bytes]) -> Bytes:
+    return st.one_of(damaged(sound), structured(sound))
+
+
+def _image(name: str, reader: str, kind: str, sound: bytes, damage: Bytes) -> Format:
+    return Format(name, reader, f"file.{kind}", sound, damage)
+
+
+def _plate() -> np.ndarray:
+    """Return a linear picture, float32, shape [height, width, 3]."""
+    return np.asarray(_codes().astype(np.float32) / np.float32(255))
+
+
+def _planes(dtype: type) -> dict[str, np.ndarray]:
+    return {c: np.ascontiguousarray(_plate()[..., k], dtype) for k, c in enumerate("RGB")}
+
+
+def _photos() -> Iterator[Format]:
+    photo, plate, half = _codes(), _plate(), _planes(np.float16)
     flat = _written("p.hdr", plate[:16, :32])
     p3 = matrix_profile("p3")
     png = _saved("PNG", photo[::2, ::2], icc_profile=p3)
-    grey = photo[..., 0]
-
-    def both(sound: bytes, structured: Callable[[bytes], Bytes]) -> Bytes:
-        return st.one_of(damaged(sound), structured(sound))
-
-    def image(name: str, reader: str, kind: str, sound: bytes, damage: Bytes) -> Format:
-        return Format(name, reader, f"file.{kind}", sound, damage)
-
     deep = _written("p.png", _codes(dtype=np.uint16)[::4, ::4])
     palette = _saved("PNG", np.asarray(Image.fromarray(photo).quantize(16)))
-    yield image("photo PNG 8 bits", "photo", "png", png, both(png, damaged_png))
-    yield image("photo PNG 16 bits", "photo", "png", deep, both(deep, damaged_png))
-    yield image("photo PNG palette", "photo", "png", palette, both(palette, damaged_png))
+    yield _image("photo PNG 8 bits", "photo", "png", png, _both(png, damaged_png))
+    yield _image("photo PNG 16 bits", "photo", "png", deep, _both(deep, damaged_png))
+    yield _image("photo PNG palette", "photo", "png", palette, _both(palette, damaged_png))
     for name, kind, options in (
         ("JPEG", "jpg", {"exif": _exif(), "icc_profile": p3}),
         ("JPEG progressive", "jpg", {"progressive": True}),
@@ -132,27 +139,36 @@ def _images() -> Iterator[Format]:
         ("TIFF deflate", "tif", {"compression": "tiff_adobe_deflate"}),
     ):
         saved = _saved({"jpg": "JPEG", "webp": "WEBP", "tif": "TIFF"}[kind], **options)
-        yield image(f"photo {name}", "photo", kind, saved, damaged(saved))
+        yield _image(f"photo {name}", "photo", kind, saved, damaged(saved))
     float_tiff = _written("p.tif", plate[:12, :16], compression="zip")
-    yield image("photo TIFF float", "photo", "tif", float_tiff, damaged(float_tiff))
+    yield _image("photo TIFF float", "photo", "tif", float_tiff, damaged(float_tiff))
     for compression in ("ZIP", "PIZ", "DWAA", "RLE", "B44", "ZSTD"):
         sound = _exr(half, compression=getattr(OpenEXR, f"{compression}_COMPRESSION"))
-        yield image(f"photo EXR {compression}", "photo", "exr", sound, both(sound, damaged_exr))
+        yield _image(f"photo EXR {compression}", "photo", "exr", sound, _both(sound, damaged_exr))
     size = OpenEXR.TileDescription()
     size.xSize = size.ySize = 16
     tiles = _exr(half, type=OpenEXR.tiledimage, tiles=size)
-    yield image("photo EXR tiles", "photo", "exr", tiles, both(tiles, damaged_exr))
-    yield image("photo HDR", "photo", "hdr", flat, st.one_of(damaged(flat), damaged_text(flat)))
-    sound = _exr(sky)
-    yield image("light EXR", "envmap", "exr", sound, both(sound, damaged_exr))
-    yield image("light HDR", "envmap", "hdr", flat, st.one_of(damaged(flat), damaged_text(flat)))
-    sound = _saved("PNG", photo[:16, :32])
-    yield image("light PNG", "envmap", "png", sound, both(sound, damaged_png))
-    sound = _saved("PNG", grey)
-    yield image("mask PNG", "mask", "png", sound, both(sound, damaged_png))
-    sound = _exr({"Y": smooth["G"]})
-    yield image("mask EXR", "mask", "exr", sound, both(sound, damaged_exr))
+    yield _image("photo EXR tiles", "photo", "exr", tiles, _both(tiles, damaged_exr))
+    yield _image("photo HDR", "photo", "hdr", flat, st.one_of(damaged(flat), damaged_text(flat)))
 
+
+def _lights_and_masks() -> Iterator[Format]:
+    photo = _codes()
+    flat = _written("p.hdr", _plate()[:16, :32])
+    sky = {c: plane[:16, :32] for c, plane in _planes(np.float16).items()}
+    sound = _exr(sky)
+    yield _image("light EXR", "envmap", "exr", sound, _both(sound, damaged_exr))
+    yield _image("light HDR", "envmap", "hdr", flat, st.one_of(damaged(flat), damaged_text(flat)))
+    sound = _saved("PNG", photo[:16, :32])
+    yield _image("light PNG", "envmap", "png", sound, _both(sound, damaged_png))
+    sound = _saved("PNG", photo[..., 0])
+    yield _image("mask PNG", "mask", "png", sound, _both(sound, damaged_png))
+    sound = _exr({"Y": _planes(np.float32)["G"]})
+    yield _image("mask EXR", "mask", "exr", sound, _both(sound, damaged_exr))
+
+
+def _metadata() -> Iterator[Format]:
+    photo, p3 = _codes(), matrix_profile("p3")
     tables = table_profile(primaries_to_xyz((0.68, 0.32, 0.265, 0.69, 0.15, 0.06, 0.3127, 0.329),
                                             D50), 2.2)  # fmt: skip
     curve = b"curv\0\0\0\0" + struct.pack(">IHxx", 1, 460)
@@ -168,16 +184,16 @@ def _images() -> Iterator[Format]:
             return _saved("PNG", codes, icc_profile=profile or b"\0")
 
         damage = damaged(profile).map(with_profile)
-        yield image(f"profile ICC {name}", "photo", "png", with_profile(profile), damage)
+        yield _image(f"profile ICC {name}", "photo", "png", with_profile(profile), damage)
 
     def with_exif(exif: bytes) -> bytes:
         return _saved("JPEG", exif=exif[:60_000])
 
     exif = _exif()
-    yield image("tags EXIF", "photo", "jpg", with_exif(exif), damaged(exif).map(with_exif))
+    yield _image("tags EXIF", "photo", "jpg", with_exif(exif), damaged(exif).map(with_exif))
 
 
-def _meshes() -> Iterator[Format]:
+def _gltf() -> Iterator[Format]:
     builder = Builder()
     builder.base_color()
     builder.attribute("COLOR_0", np.full((4, 4), 200, np.uint8), normalized=True)
@@ -202,6 +218,9 @@ def _meshes() -> Iterator[Format]:
     damage = st.one_of(damaged(picture), damaged_png(picture)).map(with_texture)
     yield Format("mesh GLB texture", "asset", "asset.glb", with_texture(picture), damage)
 
+
+def _meshes() -> Iterator[Format]:
+    picture = _saved("PNG", _codes()[:4, :4])
     corners = [(0, 0, 0), (1, 0, 0), (1, 1, 0), (0, 1, 0.5)]
     obj = "mtllib asset.mtl\no square\nusemtl red\n"
     obj += "".join(f"v {x} {y} {z} 0.5 0.5 0.5\n" for x, y, z in corners)

@@ -54,17 +54,16 @@ def fails(path: Path, *words: str, **options: str) -> InputError:
     return error
 
 
-# Faults: what is planted, and the words the error must hold.
-
 Plant = Callable[[Builder], object]
-FAULTS: dict[str, tuple[Plant, tuple[str, ...]]] = {}
+FAULTS: dict[str, tuple[Plant, str, str, dict[str, object]]] = {}
+"""By case: what is planted; and of the error the reason, the start of the pointer, and fields."""
 
 
-def fault(case: str, *words: str) -> Callable[[Plant], Plant]:
+def fault(case: str, reason: str, pointer: str = "", **fields: object) -> Callable[[Plant], Plant]:
     """Register a planted fault under its case id."""
 
     def register(plant: Plant) -> Plant:
-        FAULTS[case] = (plant, words)
+        FAULTS[case] = (plant, reason, pointer, fields)
         return plant
 
     return register
@@ -78,16 +77,16 @@ def set_accessor(index: int, **members: Any) -> Plant:
     return lambda b: b.json["accessors"][index].update(members)
 
 
-fault("M3-G5-image-missing", "/images/0", "gone.png", "--missing-textures grey")(
+fault("M3-G5-image-missing", "file.unreadable", "/images/0")(
     lambda b: b.base_color({"uri": "gone.png"})
 )
-fault("M3-G5-image-corrupt", "/images/0", "cannot be decoded")(
+fault("M3-G5-image-corrupt", "texture.damaged", "/images/0")(
     lambda b: b.base_color({"bufferView": b.view(png()[:40])})
 )
-fault("M3-G5-image-text", "/images/0", "not a PNG, JPEG or WebP")(
+fault("M3-G5-image-text", "texture.damaged", "/images/0")(
     lambda b: b.base_color({"bufferView": b.view(b"plain text")})
 )
-fault("M3-G5-image-ktx2", "/images/0", "KTX2", "PNG or JPEG")(
+fault("M3-G5-image-ktx2", "texture.format", "/images/0", found="KTX2")(
     lambda b: b.base_color({"bufferView": b.view(b"\xabKTX 20\xbb\r\n\x1a\n" + bytes(64))})
 )
 
@@ -108,42 +107,62 @@ def sparse(at: list[int], values: np.ndarray, code: str = "B", **members: Any) -
 
 
 ONE_ROW = np.full((1, 3), 9.0)
-fault("M6-G8-sparse-without-indices", "/accessors/0/sparse/indices: componentType is missing")(
+fault("M6-G8-sparse-without-indices", "gltf.missing", "/accessors/0/sparse/indices")(
     set_accessor(0, sparse={"count": 1})
 )
-fault("M6-G8-sparse-index-out-of-range", "/accessors/0/sparse/indices: index 4, but 4 elements")(
-    sparse([4], ONE_ROW)
-)
-fault("M6-G8-sparse-indices-not-increasing", "/accessors/0/sparse/indices", "do not increase")(
+fault(
+    "M6-G8-sparse-index-out-of-range",
+    "gltf.index_out_of_range",
+    "/accessors/0/sparse/indices",
+    found=4,
+    limit=4,
+)(sparse([4], ONE_ROW))
+fault("M6-G8-sparse-indices-not-increasing", "gltf.sparse_order", "/accessors/0/sparse/indices")(
     sparse([2, 2], np.zeros((2, 3)))
 )
-fault("M6-G8-sparse-signed-indices", "/accessors/0/sparse/indices: componentType 5120")(
-    sparse([1], ONE_ROW, "b")
-)
-fault("M6-G8-sparse-values-too-short", "/accessors/0/sparse/values: 2 elements end at byte 24")(
-    sparse([1, 2], ONE_ROW)
-)
-fault("M6-G8-sparse-count-lies", "/accessors/0/sparse/indices: 2147483648 elements end at")(
-    sparse([1], ONE_ROW, count=2**31)
-)
-fault("M6-G8-sparse-NaN", "/accessors/0: 1 elements are NaN")(sparse([1], ONE_ROW * np.nan))
-fault("M17-G12-unknown-extension", "/extensionsRequired", "ACME_holograms", "re-export without")(
+fault(
+    "M6-G8-sparse-signed-indices", "gltf.component_type", "/accessors/0/sparse/indices", found=5120
+)(sparse([1], ONE_ROW, "b"))
+fault(
+    "M6-G8-sparse-values-too-short",
+    "gltf.beyond_data",
+    "/accessors/0/sparse/values",
+    found=24,
+    limit=12,
+)(sparse([1, 2], ONE_ROW))
+fault(
+    "M6-G8-sparse-count-lies",
+    "gltf.beyond_data",
+    "/accessors/0/sparse/indices",
+    found=2147483648,
+    limit=1,
+)(sparse([1], ONE_ROW, count=2**31))
+fault("M6-G8-sparse-NaN", "gltf.not_finite", "/accessors/0", found=1)(sparse([1], ONE_ROW * np.nan))
+fault("M17-G12-unknown-extension", "gltf.extension", "/extensionsRequired", found="ACME_holograms")(
     lambda b: b.json.update(extensionsRequired=["ACME_holograms"])
 )
 for name in (
     "KHR_draco_mesh_compression", "EXT_meshopt_compression", "KHR_meshopt_compression",
     "KHR_texture_basisu",
 ):  # fmt: skip
-    fault(f"M17-G13-{name}", "/extensionsRequired", name, "re-export")(
+    fault(f"M17-G13-{name}", "gltf.extension", "/extensionsRequired", found=name)(
         lambda b, name=name: b.json.update(extensionsRequired=[name])  # type: ignore[misc]
     )
-fault("G14-M7-index-out-of-range", "/meshes/0/primitives/0: index 999, but 4 vertices")(
-    lambda b: b.primitive.update(indices=b.accessor(np.array([0, 1, 999], "H")))
-)
-fault("M7-G14-index-restart-value", "index 4294967295, but 4 vertices")(
-    lambda b: b.primitive.update(indices=b.accessor(np.array([0, 1, 2**32 - 1], "I")))
-)
-fault("M7-G14-indices-float", "/meshes/0/primitives/0: indices are not unsigned integers")(
+fault(
+    "G14-M7-index-out-of-range",
+    "gltf.index_out_of_range",
+    "/meshes/0/primitives/0",
+    found=999,
+    limit=4,
+)(lambda b: b.primitive.update(indices=b.accessor(np.array([0, 1, 999], "H"))))
+fault(
+    "M7-G14-index-restart-value",
+    "gltf.index_out_of_range",
+    "/meshes/0/primitives/0",
+    found=4294967295,
+    limit=4,
+)(lambda b: b.primitive.update(indices=b.accessor(np.array([0, 1, 2**32 - 1], "I"))))
+fault("M7-G14-indices-float", "gltf.component_type", "/meshes/0/primitives/0")(
     lambda b: b.primitive.update(indices=b.accessor(np.array([0, 1, 2], "f")))
 )
 for name, array in {
@@ -152,92 +171,100 @@ for name, array in {
 }.items():  # fmt: skip
     for bad in (np.nan, np.inf):
 
-        @fault(f"M8-G15-{name}-{bad}", "/accessors/", "NaN or infinite")
+        @fault(f"M8-G15-{name}-{bad}", "gltf.not_finite", "/accessors/")
         def _(b: Builder, name: str = name, array: Any = array, bad: float = bad) -> None:
             poisoned = array.copy()
             poisoned[2, 1] = bad
             b.attribute(name, poisoned)
 
 
-fault("G16-M10-cycle", "cycle")(
+fault("G16-M10-cycle", "gltf.cycle", "/", found=2)(
     lambda b: b.json["nodes"].extend([{"children": [2]}, {"children": [1]}])
 )
-fault("M10-G16-self-child", "cycle")(node(children=[0]))
-fault("G16-M10-two-parents", "/nodes/1: child 2 is already a child of node 0")(
+fault("M10-G16-self-child", "gltf.cycle", "/", found=1)(node(children=[0]))
+fault("G16-M10-two-parents", "gltf.two_parents", "/nodes/1", found=2)(
     lambda b: (node(children=[2])(b), b.json["nodes"].extend([{"children": [2]}, {}]))
 )
-fault("M10-G16-same-child-twice", "/nodes/0: child 1 is already a child of node 0")(
+fault("M10-G16-same-child-twice", "gltf.two_parents", "/nodes/0", found=1)(
     lambda b: (node(children=[1, 1])(b), b.json["nodes"].append({}))
 )
-fault("M10-G16-root-twice", "/scenes/0: the same node twice")(
+fault("M10-G16-root-twice", "gltf.two_parents", "/scenes/0")(
     lambda b: b.json.update(scenes=[{"nodes": [0, 0]}])
 )
-fault("G17-scene-out-of-range", "scene 7, but 1 scenes")(lambda b: b.json.update(scene=7))
-fault("G17-scene-node-out-of-range", "/scenes/0: node 7, but 1 nodes")(
+fault("G17-scene-out-of-range", "gltf.index_out_of_range", "/", found=7, limit=1)(
+    lambda b: b.json.update(scene=7)
+)
+fault("G17-scene-node-out-of-range", "gltf.index_out_of_range", "/scenes/0", found=7, limit=1)(
     lambda b: b.json.update(scenes=[{"nodes": [7]}])
 )
 for mode in (0, 1, 2, 3):
-    fault(f"M12-G19-mode-{mode}-only", "nothing to render")(
+    fault(f"M12-G19-mode-{mode}-only", "mesh.nothing_to_render")(
         lambda b, mode=mode: b.primitive.update(mode=mode)  # type: ignore[misc]
     )
-fault("M12-G19-mode-7", "mode is 7, expected 0 to 6")(lambda b: b.primitive.update(mode=7))
-fault("M12-G19-empty-scene", "nothing to render")(lambda b: b.json.update(scenes=[{}]))
-fault("M12-G19-no-nodes", "nothing to render")(
+fault("M12-G19-mode-7", "gltf.range", "/meshes/0/primitives/0", found=7)(
+    lambda b: b.primitive.update(mode=7)
+)
+fault("M12-G19-empty-scene", "mesh.nothing_to_render")(lambda b: b.json.update(scenes=[{}]))
+fault("M12-G19-no-nodes", "mesh.nothing_to_render")(
     lambda b: [b.json.pop(key) for key in ("nodes", "scenes", "scene")]
 )
-fault("G22-componentType-9999", "/accessors/0", "componentType 9999")(
+fault("G22-componentType-9999", "gltf.component_type", "/accessors/0", found=9999)(
     set_accessor(0, componentType=9999)
 )
-fault("G22-child-99", "/nodes/0: child 99, but 1 nodes")(node(children=[99]))
-fault("G22-mesh-9", "/nodes/0: mesh 9, but 1 meshes")(node(mesh=9))
-fault("G22-mesh-is-text", '/nodes/0: mesh is "0", expected an integer')(node(mesh="0"))
-fault("G22-mesh-is-true", "/nodes/0: mesh is true, expected an integer")(node(mesh=True))
-fault("G22-accessor-99", "/meshes/0/primitives/0: POSITION 99, but")(
+fault("G22-child-99", "gltf.index_out_of_range", "/nodes/0", found=99, limit=1)(node(children=[99]))
+fault("G22-mesh-9", "gltf.index_out_of_range", "/nodes/0", found=9, limit=1)(node(mesh=9))
+fault("G22-mesh-is-text", "gltf.type", "/nodes/0")(node(mesh="0"))
+fault("G22-mesh-is-true", "gltf.type", "/nodes/0")(node(mesh=True))
+fault("G22-accessor-99", "gltf.index_out_of_range", "/meshes/0/primitives/0", found=99, limit=4)(
     lambda b: b.primitive["attributes"].update(POSITION=99)
 )
-fault("G22-no-position", "/meshes/0/primitives/0/attributes: POSITION is missing")(
+fault("G22-no-position", "gltf.missing", "/meshes/0/primitives/0/attributes")(
     lambda b: b.primitive["attributes"].pop("POSITION")
 )
-fault("G22-material-5", "/meshes/0/primitives/0: material 5, but 1 materials")(
+fault("G22-material-5", "gltf.index_out_of_range", "/meshes/0/primitives/0", found=5, limit=1)(
     lambda b: b.primitive.update(material=5)
 )
-fault("G22-view-too-long", "/bufferViews/0", "but the buffer has")(
+fault("G22-view-too-long", "gltf.beyond_data", "/bufferViews/0", found=1048576, limit=140)(
     lambda b: b.json["bufferViews"][0].update(byteLength=1 << 20)
 )
-fault("G22-buffer-too-long", "/buffers/0: byteLength 1048576, but")(
+fault("G22-buffer-too-long", "gltf.beyond_data", "/buffers/0", found=1048576, limit=140)(
     lambda b: b.json["buffers"][0].update(byteLength=1 << 20)
 )
-fault("G22-wrong-type", "type VEC2 for POSITION, expected VEC3")(
+fault("G22-wrong-type", "gltf.type", "/accessors/4", found="VEC2")(
     lambda b: b.attribute("POSITION", UVS)
 )
-fault("G22-counts-differ", "3 NORMAL, but 4 vertices")(lambda b: b.attribute("NORMAL", NORMALS[:3]))
-fault("G22-color-not-normalized", "COLOR_0")(
+fault("G22-counts-differ", "gltf.count", "/meshes/0/primitives/0", found=3, limit=4)(
+    lambda b: b.attribute("NORMAL", NORMALS[:3])
+)
+fault("G22-color-not-normalized", "gltf.component_type", "/meshes/0/primitives/0")(
     lambda b: b.attribute("COLOR_0", np.full((4, 3), 9, "B"))
 )
-fault("G22-asset-version-1", "asset version is '1.0'")(
+fault("G22-asset-version-1", "gltf.version", "/", found="1.0")(
     lambda b: b.json.update(asset={"version": "1.0"})
 )
-fault("G22-texCoord-2", "texCoord 2, but only sets 0 and 1")(
-    lambda b: b.base_color().update(texCoord=2)
-)
-fault("M6-G23-count-2^31-no-view", "/accessors/0", "no bufferView", "re-export")(
+fault(
+    "G22-texCoord-2",
+    "gltf.uv_set",
+    "/materials/0/pbrMetallicRoughness/baseColorTexture",
+    found=2,
+    limit=1,
+)(lambda b: b.base_color().update(texCoord=2))
+fault("M6-G23-count-2^31-no-view", "gltf.missing", "/accessors/0")(
     lambda b: (
         b.json["accessors"][0].pop("bufferView"),
         b.primitive.pop("indices"),
         set_accessor(0, count=40_000_000)(b),
     )
 )
-fault("M6-G23-count-2^31-limit", "too many triangles", "715827882", "20000000")(
+fault("M6-G23-count-2^31-limit", "limit.triangles", found=715827882, limit=20000000)(
     lambda b: (b.primitive.pop("indices"), set_accessor(0, count=2**31)(b))
 )
-fault("M11-G25-zero-scale", "/nodes/0: singular transform")(node(scale=[1, 0, 1]))
-fault("M11-G25-zero-quaternion", "/nodes/0: rotation is the zero quaternion")(
-    node(rotation=[0, 0, 0, 0])
-)
-fault("G28-M10-2^18-instances", "too many nodes", "262144", "100000")(
+fault("M11-G25-zero-scale", "gltf.singular", "/nodes/0")(node(scale=[1, 0, 1]))
+fault("M11-G25-zero-quaternion", "gltf.matrix", "/nodes/0")(node(rotation=[0, 0, 0, 0]))
+fault("G28-M10-2^18-instances", "limit.nodes", "/nodes", found=262144, limit=100000)(
     lambda b: b.json.update(nodes=[{"mesh": 0}] * 2**18)
 )
-fault("M10-G28-too-many-placed", "too many instances", "65536")(
+fault("M10-G28-too-many-placed", "limit.instances", "/", found=65537, limit=65536)(
     lambda b: b.json.update(nodes=[{"mesh": 0}] * 70_000, scenes=[{"nodes": list(range(70_000))}])
 )
 
@@ -250,10 +277,12 @@ def zeros(b: Builder) -> None:
     b.primitive.pop("indices")
 
 
-fault("M6-G23-sparse-zeros", "/accessors/0: 360000000 bytes of zeros (limit 268435456)")(zeros)
-fault("M6-G23-normal-count-2^31", "/meshes/0/primitives/0: 2147483648 NORMAL, but 4 vertices")(
-    set_accessor(1, count=2**31)
+fault("M6-G23-sparse-zeros", "gltf.too_large", "/accessors/0", found=360000000, limit=268435456)(
+    zeros
 )
+fault(
+    "M6-G23-normal-count-2^31", "gltf.count", "/meshes/0/primitives/0", found=2147483648, limit=4
+)(set_accessor(1, count=2**31))
 
 
 def instanced(**attributes: np.ndarray) -> Plant:
@@ -271,57 +300,58 @@ def instanced(**attributes: np.ndarray) -> Plant:
 
 
 INSTANCING = "/nodes/0/extensions/EXT_mesh_gpu_instancing/attributes"
-fault("M10-G28-instances-without-attributes", INSTANCING, "found none")(instanced())
-fault("M10-G28-instances-unequal", INSTANCING, "found 2 TRANSLATION, 3 SCALE")(
+fault("M10-G28-instances-without-attributes", "gltf.count", INSTANCING)(instanced())
+fault("M10-G28-instances-unequal", "gltf.count", INSTANCING)(
     instanced(TRANSLATION=np.zeros((2, 3), "f"), SCALE=np.ones((3, 3), "f"))
 )
-fault("M10-G28-instances-2^18", INSTANCING, "found 262144; limit 65536")(
+fault("M10-G28-instances-2^18", "limit.instances", INSTANCING, found=262144, limit=65536)(
     instanced(TRANSLATION=np.zeros((2**18, 3), "f"))
 )
-fault(
-    "M10-G28-instances-of-two-nodes",
-    "too many instances (found 80000 so far; limit 65536); --max-instances",
-)(
+fault("M10-G28-instances-of-two-nodes", "limit.instances", "/", found=80000, limit=65536)(
     lambda b: (
         instanced(TRANSLATION=np.zeros((40_000, 3), "f"))(b),
         b.json["nodes"].append(b.json["nodes"][0]),
         b.json.update(scenes=[{"nodes": [0, 1]}]),
     )
 )
-fault("M11-G25-instance-of-zero-scale", "/nodes/0: singular transform of instance 1")(
+fault("M11-G25-instance-of-zero-scale", "gltf.singular", "/nodes/0")(
     instanced(SCALE=np.array([[1, 1, 1], [0, 1, 0]], "f"))
 )
-fault("M11-G25-instance-of-zero-quaternion", INSTANCING, "ROTATION holds the zero quaternion")(
+fault("M11-G25-instance-of-zero-quaternion", "gltf.matrix", INSTANCING)(
     instanced(ROTATION=np.zeros((1, 4), "f"))
 )
-fault("M8-G15-instance-NaN", "/accessors/4", "NaN or infinite")(
+fault("M8-G15-instance-NaN", "gltf.not_finite", "/accessors/4", found=1)(
     instanced(TRANSLATION=np.full((1, 3), np.nan, "f"))
 )
-fault("M6-past-the-buffer", "/accessors/0", "elements end at byte")(set_accessor(0, count=5))
-fault("M6-negative-offset", "/accessors/0: byteOffset is -4")(set_accessor(0, byteOffset=-4))
-fault("M6-view-negative-offset", "/bufferViews/0: byteOffset is -4")(
+fault("M6-past-the-buffer", "gltf.beyond_data", "/accessors/0", found=60, limit=48)(
+    set_accessor(0, count=5)
+)
+fault("M6-negative-offset", "gltf.range", "/accessors/0", found=-4, limit=0)(
+    set_accessor(0, byteOffset=-4)
+)
+fault("M6-view-negative-offset", "gltf.range", "/bufferViews/0", found=-4, limit=0)(
     lambda b: b.json["bufferViews"][0].update(byteOffset=-4)
 )
 for stride in (0, 1):
-    fault(f"M6-stride-{stride}", f"/bufferViews/0: byteStride {stride}, but elements of 12")(
+    fault(f"M6-stride-{stride}", "gltf.stride", "/bufferViews/0", found=stride, limit=12)(
         lambda b, stride=stride: b.json["bufferViews"][0].update(byteStride=stride)  # type: ignore[misc]
     )
-fault("M6-count-0", "/accessors/0: count is 0, expected at least 1")(set_accessor(0, count=0))
-fault("M11-scale-1e300", "/nodes/0: transform with numbers beyond 1e+18")(node(scale=[1e300, 1, 1]))
-fault("M11-positions-1e30", "coordinates up to 1e+30", "1e+18")(
+fault("M6-count-0", "gltf.range", "/accessors/0", found=0, limit=1)(set_accessor(0, count=0))
+fault("M11-scale-1e300", "gltf.transform_too_large", "/nodes/0")(node(scale=[1e300, 1, 1]))
+fault("M11-positions-1e30", "mesh.too_large")(
     lambda b: b.attribute("POSITION", CORNERS * np.float32(1e30))
 )
-fault("M11-singular-matrix", "/nodes/0: singular transform")(
+fault("M11-singular-matrix", "gltf.singular", "/nodes/0")(
     node(matrix=[1, 0, 0, 0, 1, 0, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1])
 )
-fault("M11-projective-matrix", "/nodes/0: matrix is not affine")(
+fault("M11-projective-matrix", "gltf.matrix", "/nodes/0")(
     node(matrix=[1, 0, 0, 1, 0, 1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1])
 )
-fault("M11-matrix-and-trs", "/nodes/0: both matrix and scale")(
+fault("M11-matrix-and-trs", "gltf.matrix", "/nodes/0")(
     node(matrix=np.eye(4).ravel().tolist(), scale=[1, 1, 1])
 )
-fault("M11-short-scale", "/nodes/0: scale has 2 numbers, expected 3")(node(scale=[1, 1]))
-fault("M13-only-zero-area", "nothing to render")(
+fault("M11-short-scale", "gltf.type", "/nodes/0")(node(scale=[1, 1]))
+fault("M13-only-zero-area", "mesh.nothing_to_render")(
     lambda b: b.primitive.update(indices=b.accessor(np.array([0, 0, 1], "H")))
 )
 
@@ -339,24 +369,81 @@ def many_textures(b: Builder) -> None:
     b.json["meshes"][0]["primitives"] = [b.primitive | {"material": k} for k in range(64)]
 
 
-fault("M14-64-textures-of-8k", "texture pixels", "512000000")(many_textures)
-fault("M14-50M-triangles", "too many triangles", "50000000", "20000000")(
+fault(
+    "M14-64-textures-of-8k", "limit.texture_pixels", "/images/7", found=536870912, limit=512000000
+)(many_textures)
+fault("M14-50M-triangles", "limit.triangles", found=50000000, limit=20000000)(
     lambda b: (b.primitive.pop("indices"), set_accessor(0, count=150_000_000)(b))
 )
-fault("M18-alphaMode", "/materials/0: alphaMode is 'GLOW'")(
+fault("M18-alphaMode", "gltf.range", "/materials/0", found="GLOW")(
     lambda b: b.material.update(alphaMode="GLOW")
 )
 
 
+def planted(case: str, folder: Path) -> Path:
+    """Write the correct file with a fault in it."""
+    builder = Builder()
+    FAULTS[case][0](builder)
+    path = folder / "asset.glb"
+    path.write_bytes(builder.glb())
+    return path
+
+
 @pytest.mark.parametrize("case", FAULTS)
 def test_fault_is_refused_with_its_pointer(case: str, tmp_path: Path) -> None:
-    """One sentence names the file and the place, before anything large is allocated."""
-    plant, words = FAULTS[case]
-    builder = Builder()
-    plant(builder)
-    path = tmp_path / "asset.glb"
-    path.write_bytes(builder.glb())
-    fails(path, *words)
+    """The error has its reason, place and numbers, before anything large is allocated."""
+    _, reason, pointer, fields = FAULTS[case]
+    error = fails(planted(case, tmp_path))
+    assert error.reason == reason
+    assert error.what.startswith(pointer)
+    assert str(error.fields.get("pointer", pointer)).startswith(pointer)
+    assert fields.items() <= error.fields.items()
+
+
+SENTENCES: dict[str, tuple[str, ...]] = {
+    "M3-G5-image-missing": ("/images/0", "gone.png", "--missing-textures grey"),
+    "M3-G5-image-corrupt": ("/images/0", "cannot be decoded"),
+    "M3-G5-image-ktx2": ("/images/0", "KTX2", "PNG or JPEG"),
+    "M6-G8-sparse-without-indices": ("/accessors/0/sparse/indices: componentType is missing",),
+    "M6-G8-sparse-index-out-of-range": ("/accessors/0/sparse/indices: index 4, but 4 elements",),
+    "M6-G8-sparse-indices-not-increasing": ("/accessors/0/sparse/indices", "do not increase"),
+    "M6-G8-sparse-signed-indices": ("/accessors/0/sparse/indices: componentType 5120",),
+    "M6-G8-sparse-values-too-short": ("/accessors/0/sparse/values: 2 elements end at byte 24",),
+    "M6-G8-sparse-NaN": ("/accessors/0: 1 elements are NaN",),
+    "M17-G12-unknown-extension": ("/extensionsRequired", "ACME_holograms", "re-export without"),
+    "G16-M10-cycle": ("cycle",),
+    "G16-M10-two-parents": ("/nodes/1: child 2 is already a child of node 0",),
+    "M12-G19-mode-7": ("mode is 7, expected 0 to 6",),
+    "M12-G19-empty-scene": ("nothing to render",),
+    "G22-mesh-is-text": ('/nodes/0: mesh is "0", expected an integer',),
+    "G22-counts-differ": ("3 NORMAL, but 4 vertices",),
+    "G22-asset-version-1": ("asset version is '1.0'",),
+    "G22-texCoord-2": ("texCoord 2, but only sets 0 and 1",),
+    "M6-G23-count-2^31-limit": ("too many triangles", "715827882", "20000000"),
+    "M11-G25-zero-scale": ("/nodes/0: singular transform",),
+    "M11-G25-zero-quaternion": ("/nodes/0: rotation is the zero quaternion",),
+    "G28-M10-2^18-instances": ("too many nodes", "262144", "100000"),
+    "M10-G28-too-many-placed": ("too many instances", "65536"),
+    "M6-G23-sparse-zeros": ("/accessors/0: 360000000 bytes of zeros (limit 268435456)",),
+    "M11-scale-1e300": ("/nodes/0: transform with numbers beyond 1e+18",),
+    "M11-positions-1e30": ("coordinates up to 1e+30", "1e+18"),
+    "M14-64-textures-of-8k": ("texture pixels", "512000000"),
+    "G18-vertex-without-weight": ("/meshes/0/primitives/0: vertex 3 has no weight",),
+    "M6-stride-1": ("/bufferViews/0: byteStride 1, but elements of 12",),
+}
+"""Words of one error of each reason."""
+
+
+@pytest.mark.parametrize("case", SENTENCES)
+def test_sentence_of_a_reason(case: str, tmp_path: Path) -> None:
+    """The sentence names the place, what was found and what was expected."""
+    fails(planted(case, tmp_path), *SENTENCES[case])
+
+
+def test_every_reason_has_a_sentence() -> None:
+    """Of each reason that the planted faults have, one sentence is read."""
+    reasons = {reason for _, reason, _, _ in FAULTS.values()}
+    assert reasons == {FAULTS[case][1] for case in SENTENCES}
 
 
 @pytest.fixture(scope="module")
@@ -379,12 +466,9 @@ def test_fault_costs_nothing(case: str, inputs: Path, tmp_path: Path) -> None:
     """What asks for much memory or time ends the program at once, and with little of both."""
     from tests.builders.insertions import arguments
 
-    plant, words = FAULTS[case]
-    builder = Builder()
-    plant(builder)
-    (tmp_path / "asset.glb").write_bytes(builder.glb())
+    planted(case, tmp_path)
     argv = arguments(inputs, "out", asset="asset.glb", device="cpu")
-    assert_fails(argv, 3, "asset.glb", words[0], cwd=tmp_path)
+    assert_fails(argv, 3, "asset.glb", FAULTS[case][2], cwd=tmp_path)
 
 
 URIS = {
@@ -1154,17 +1238,21 @@ def skinned(weights: list[list[float]], bones: list[dict[str, Any]], **members: 
 
 HALF = [[1, 0], [1, 0], [0.5, 0.5], [0, 1]]
 ARM: list[dict[str, Any]] = [{"children": [2], "scale": [2, 2, 2]}, {"translation": [0, 0, 3]}]
-fault("G18-joint-out-of-range", "/meshes/0/primitives/0: joint 1 in JOINTS_0, but 1 joints")(
-    skinned(HALF, ARM[1:])
+fault(
+    "G18-joint-out-of-range", "gltf.index_out_of_range", "/meshes/0/primitives/0", found=1, limit=1
+)(skinned(HALF, ARM[1:]))
+fault("G18-joint-is-no-node", "gltf.index_out_of_range", "/skins/0", found=9, limit=3)(
+    skinned(HALF, ARM, joints=[1, 9])
 )
-fault("G18-joint-is-no-node", "/skins/0: joint 9, but 3 nodes")(skinned(HALF, ARM, joints=[1, 9]))
-fault("G18-vertex-without-weight", "/meshes/0/primitives/0: vertex 3 has no weight")(
+fault("G18-vertex-without-weight", "gltf.no_weight", "/meshes/0/primitives/0")(
     skinned([*HALF[:3], [0, 0]], ARM)
 )
-fault("G18-skin-without-joints", "/meshes/0/primitives/0/attributes: JOINTS_0 is missing")(
+fault("G18-skin-without-joints", "gltf.missing", "/meshes/0/primitives/0/attributes")(
     lambda b: (skinned(HALF, ARM)(b), b.primitive["attributes"].pop("JOINTS_0"))
 )
-fault("G18-flat-joint", "the joints flatten the mesh")(skinned(HALF, [{"scale": [1, 0, 1]}, {}]))
+fault("G18-flat-joint", "gltf.singular", "/meshes/0/primitives/0")(
+    skinned(HALF, [{"scale": [1, 0, 1]}, {}])
+)
 
 
 def test_G18_skinned_mesh_stands_as_its_joints_do(tmp_path: Path) -> None:

@@ -70,7 +70,7 @@ class Limits:
         if found > limit:
             flag = f"--max-{name.replace('_', '-')}"
             text = f"{what} (found {found}{more}; limit {limit}); {flag} raises it"
-            raise InputError(where, text, advice)
+            raise InputError(where, text, advice, reason=f"limit.{name}", found=found, limit=limit)
 
 
 LIMITS = Limits()

@@ -37,13 +37,24 @@ def _check_numbers(path: Path, asset: Asset) -> None:
         scales += [number for slot in slots for number in slot.transform]
         if abs(found := max(scales, key=abs)) > TEXTURE_LIMIT:
             what = f"material {material.name[:60]!a}: a texture's transform or scale, or an index"
-            raise InputError(path, f"{what} of {found:g} (expected at most {TEXTURE_LIMIT:g})")
+            raise InputError(
+                path,
+                f"{what} of {found:g} (expected at most {TEXTURE_LIMIT:g})",
+                reason="asset.texture_transform",
+                limit=TEXTURE_LIMIT,
+            )
     for primitive in asset.primitives:
         for uv in (primitive.uv0, primitive.uv1):
             greatest = 0.0 if uv is None else float(max(uv.max(), -uv.min()))
             if greatest > TEXTURE_LIMIT:
                 what = f"texture coordinates of {greatest:g} (expected at most {TEXTURE_LIMIT:g})"
-                raise InputError(path, what)
+                raise InputError(
+                    path,
+                    what,
+                    reason="asset.texture_coordinates",
+                    found=greatest,
+                    limit=TEXTURE_LIMIT,
+                )
 
 
 def _read(path: Path, missing_textures: str, limits: Limits) -> Asset:
@@ -61,4 +72,6 @@ def _read(path: Path, missing_textures: str, limits: Limits) -> Asset:
         f"not a mesh that warpir reads (found {suffix or 'no extension'}; "
         "expected .glb, .gltf, .obj, .ply or .stl)",
         "convert it to GLB",
+        reason="asset.kind",
+        found=suffix,
     )

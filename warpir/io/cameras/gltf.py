@@ -8,7 +8,7 @@ from warpir.core.arrays import Float64Array
 from warpir.core.limits import LIMITS, Limits
 from warpir.io.cameras.source import LARGEST, StoredCamera, choose_frame, rigid
 from warpir.io.gltf.gate import Entry, GltfFile
-from warpir.io.gltf.reader import local_matrix, read_forest
+from warpir.io.gltf.nodes import local_matrix, read_forest
 from warpir.scene.camera import Camera
 
 ASPECT_TOLERANCE = 0.01
@@ -48,11 +48,15 @@ def read_gltf_camera(
         k = choose_frame(path, names, frame, None, noun="camera")
     entry = cameras[k]
     if entry.text("type") != "perspective":
-        raise entry.error(f"camera of type {entry.text('type')!r}, expected perspective")
+        raise entry.error(
+            f"camera of type {entry.text('type')!r}, expected perspective", reason="camera"
+        )
     perspective = entry.child("perspective")
     yfov = perspective.number("yfov", 0.0)
     if not 0.0 < yfov < np.pi:
-        raise perspective.error(f"yfov is {yfov:g}, expected radians from 0 to pi")
+        raise perspective.error(
+            f"yfov is {yfov:g}, expected radians from 0 to pi", reason="range", found=yfov
+        )
     width, height = photo_size
     notices = []
     aspect = perspective.number("aspectRatio", width / height)
@@ -80,10 +84,14 @@ def _world(nodes: list[Entry], parents: dict[int, int], index: int) -> Float64Ar
 def _unscaled(node: Entry, world: Float64Array) -> Float64Array:
     """Return a pose whose axes have length 1."""
     if not (np.abs(world) <= LARGEST).all():  # nor are NaN and infinity
-        raise node.error(f"the camera's transform holds numbers beyond {LARGEST:g}")
+        raise node.error(
+            f"the camera's transform holds numbers beyond {LARGEST:g}",
+            reason="transform_too_large",
+            limit=LARGEST,
+        )
     lengths = np.linalg.norm(world[:3, :3], axis=0)
     if not (lengths > 0.0).all():
-        raise node.error("the camera's transform is singular")
+        raise node.error("the camera's transform is singular", reason="singular")
     pose = world.copy()
     pose[:3, :3] /= lengths
     return rigid(node.path, node.pointer.lstrip("/"), pose)

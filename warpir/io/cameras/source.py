@@ -108,34 +108,7 @@ def choose_frame(
 
 def rigid(path: Path, name: str, rows: Any) -> Float64Array:
     """Check a camera-to-world matrix given as 3 or 4 rows; return it exactly rigid, [4, 4]."""
-    try:
-        matrix = np.array(rows)
-        if matrix.dtype.kind not in "if":
-            raise ValueError
-        matrix = matrix.astype(np.float64)
-    except (TypeError, ValueError) as error:
-        raise InputError(path, f"/{name}: not a matrix of numbers") from error
-    if matrix.shape == (3, 4):
-        matrix = np.vstack([matrix, [0.0, 0.0, 0.0, 1.0]])
-    if matrix.shape != (4, 4):
-        raise InputError(
-            path, f"/{name}: not a matrix (found shape {matrix.shape}; expected 4 x 4 or 3 x 4)"
-        )
-    if not np.isfinite(matrix).all():
-        raise InputError(path, f"/{name}: numbers that are not finite")
-    last = np.array([0.0, 0.0, 0.0, 1.0])
-    if np.abs(matrix[3] - last).max() > RIGID_TOLERANCE:
-        if np.abs(matrix[:, 3] - last).max() <= RIGID_TOLERANCE:
-            raise InputError(
-                path,
-                f"/{name}: transposed (found the translation in the last row; "
-                "expected it in the last column)",
-                "transpose the matrix",
-            )
-        raise InputError(
-            path,
-            f"/{name}: last row is not 0 0 0 1 (found {' '.join(f'{x:g}' for x in matrix[3])})",
-        )
+    matrix = _affine(path, name, rows)
     rotation = matrix[:3, :3]
     if (largest := float(np.abs(matrix).max())) > LARGEST:
         raise InputError(
@@ -167,6 +140,43 @@ def rigid(path: Path, name: str, rows: Any) -> Float64Array:
     rigid[:3, :3] = left @ right
     rigid[:3, 3] = matrix[:3, 3]
     return rigid
+
+
+def _affine(path: Path, name: str, rows: Any) -> Float64Array:
+    """Return a finite matrix whose last row is 0 0 0 1, [4, 4].
+
+    Raises:
+        InputError: The rows are no such matrix, or it is transposed.
+    """
+    try:
+        matrix = np.array(rows)
+        if matrix.dtype.kind not in "if":
+            raise ValueError
+        matrix = matrix.astype(np.float64)
+    except (TypeError, ValueError) as error:
+        raise InputError(path, f"/{name}: not a matrix of numbers") from error
+    if matrix.shape == (3, 4):
+        matrix = np.vstack([matrix, [0.0, 0.0, 0.0, 1.0]])
+    if matrix.shape != (4, 4):
+        raise InputError(
+            path, f"/{name}: not a matrix (found shape {matrix.shape}; expected 4 x 4 or 3 x 4)"
+        )
+    if not np.isfinite(matrix).all():
+        raise InputError(path, f"/{name}: numbers that are not finite")
+    last = np.array([0.0, 0.0, 0.0, 1.0])
+    if np.abs(matrix[3] - last).max() > RIGID_TOLERANCE:
+        if np.abs(matrix[:, 3] - last).max() <= RIGID_TOLERANCE:
+            raise InputError(
+                path,
+                f"/{name}: transposed (found the translation in the last row; "
+                "expected it in the last column)",
+                "transpose the matrix",
+            )
+        raise InputError(
+            path,
+            f"/{name}: last row is not 0 0 0 1 (found {' '.join(f'{x:g}' for x in matrix[3])})",
+        )
+    return matrix
 
 
 def member(path: Path, content: Any, key: str) -> dict[str, Any]:

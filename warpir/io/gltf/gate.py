@@ -48,9 +48,23 @@ class Entry:
         self.pointer = pointer
         self.value = value
 
-    def error(self, what: str, advice: str = "") -> InputError:
-        """Return an error that names the file and this place in it."""
-        return InputError(self.path, f"{self.pointer or '/'}: {what}", advice)
+    def error(self, what: str, advice: str = "", *, reason: str, **fields: object) -> InputError:
+        """Return an error that names the file and this place in it.
+
+        Args:
+            what: The sentence.
+            advice: What to do about it.
+            reason: The fault, without ``gltf.``.
+            fields: What the sentence says, as values; ``pointer`` is added.
+        """
+        pointer = self.pointer or "/"
+        what, reason = f"{pointer}: {what}", f"gltf.{reason}"
+        return InputError(self.path, what, advice, reason=reason, pointer=pointer, **fields)
+
+    def out_of_range(self, what: str, found: int, limit: int, of: str) -> InputError:
+        """Return the error of an index: ``what`` is ``found``, but there are ``limit`` of them."""
+        text = f"{what} {found}, but {limit} {of}"
+        return self.error(text, reason="index_out_of_range", found=found, limit=limit)
 
     def __contains__(self, key: str) -> bool:
         return key in self.value
@@ -60,10 +74,12 @@ class Entry:
         if key not in self.value:
             if default is not None:
                 return default
-            raise self.error(f"{key} is missing")
+            raise self.error(f"{key} is missing", reason="missing")
         value = self.value[key]
         if not isinstance(value, kinds) or (isinstance(value, bool) and bool not in kinds):
-            raise self.error(f"{key} is {json.dumps(value)[:40]}, expected {expected}")
+            raise self.error(
+                f"{key} is {json.dumps(value)[:40]}, expected {expected}", reason="type"
+            )
         return value
 
     def text(self, key: str, default: str | None = None) -> str:
@@ -78,7 +94,9 @@ class Entry:
         """Return an integer of at least ``low``; without ``default`` it must be there."""
         value = self._get(key, (int,), "an integer", default)
         if value < low:
-            raise self.error(f"{key} is {value}, expected at least {low}")
+            raise self.error(
+                f"{key} is {value}, expected at least {low}", reason="range", found=value, limit=low
+            )
         return int(value)
 
     def number(self, key: str, default: float) -> float:
@@ -89,9 +107,11 @@ class Entry:
         """Return as many finite numbers as ``default`` has."""
         values = self._get(key, (list,), "a list of numbers", list(default))
         if len(values) != len(default):
-            raise self.error(f"{key} has {len(values)} numbers, expected {len(default)}")
+            raise self.error(
+                f"{key} has {len(values)} numbers, expected {len(default)}", reason="type"
+            )
         if not all(isinstance(v, int | float) and not isinstance(v, bool) for v in values):
-            raise self.error(f"{key} holds something else than numbers")
+            raise self.error(f"{key} holds something else than numbers", reason="type")
         return tuple(self._finite(key, v) for v in values)
 
     def _finite(self, key: str, value: float) -> float:
@@ -100,7 +120,7 @@ class Entry:
         except OverflowError:
             number = math.inf
         if not math.isfinite(number):
-            raise self.error(f"{key} is not finite")
+            raise self.error(f"{key} is not finite", reason="not_finite")
         return number
 
     def integers(self, key: str) -> list[int]:
@@ -108,7 +128,9 @@ class Entry:
         values = self._get(key, (list,), "a list of indices", [])
         for value in values:
             if not isinstance(value, int) or isinstance(value, bool) or value < 0:
-                raise self.error(f"{key} holds {json.dumps(value)[:40]}, expected indices")
+                raise self.error(
+                    f"{key} holds {json.dumps(value)[:40]}, expected indices", reason="type"
+                )
         return list(values)
 
     def child(self, key: str) -> "Entry":
@@ -131,11 +153,11 @@ class Entry:
         """
         count = self.size(key)
         if not 0 <= index < count:
-            raise user.error(f"{what} {index}, but {count} {key}")
+            raise user.out_of_range(what, index, count, key)
         value = self.value[key][index]
         pointer = f"{self.pointer}/{key}/{index}"
         if not isinstance(value, dict):
-            raise Entry(self.path, pointer, value).error("not an object")
+            raise Entry(self.path, pointer, value).error("not an object", reason="type")
         return Entry(self.path, pointer, value)
 
     def items(self, key: str) -> Iterator["Entry"]:
@@ -182,7 +204,10 @@ class GltfFile:
         version = self.root.child("asset").text("version", "")
         if version.split(".")[0] != "2":
             raise self.root.error(
-                f"asset version is {version!r}, expected 2.0", "convert it to glTF 2.0"
+                f"asset version is {version!r}, expected 2.0",
+                "convert it to glTF 2.0",
+                reason="version",
+                found=version,
             )
         self._buffers: dict[int, memoryview] = {}
 
@@ -195,7 +220,11 @@ class GltfFile:
 
         def damaged(what: str, offset: int) -> InputError:
             return InputError(
-                self.path, f"damaged .glb: {what} at byte {offset}", "export or copy it again"
+                self.path,
+                f"damaged .glb: {what} at byte {offset}",
+                "export or copy it again",
+                reason="gltf.container",
+                found=offset,
             )
 
         if content[:4] != b"glTF":
@@ -203,6 +232,7 @@ class GltfFile:
                 self.path,
                 f"not a .glb file (starts with {content[:4]!r}; expected b'glTF')",
                 "convert it to GLB",
+                reason="gltf.kind",
             )
         if len(content) < 20:
             raise damaged(f"the file ends ({len(content)} bytes)", len(content))
@@ -239,10 +269,15 @@ class GltfFile:
             elif index == 0 and self._binary is not None:
                 content = self._binary
             else:
-                raise entry.error("no uri and no binary chunk", RE_EXPORT_MESH)
+                raise entry.error("no uri and no binary chunk", RE_EXPORT_MESH, reason="missing")
             length = entry.integer("byteLength", low=1)
             if length > len(content):
-                raise entry.error(f"byteLength {length}, but {len(content)} bytes")
+                raise entry.error(
+                    f"byteLength {length}, but {len(content)} bytes",
+                    reason="beyond_data",
+                    found=length,
+                    limit=len(content),
+                )
             self._buffers[index] = content[:length]
         return self._buffers[index]
 
@@ -253,7 +288,10 @@ class GltfFile:
         start, length = entry.integer("byteOffset", 0), entry.integer("byteLength", low=1)
         if start + length > len(content):
             raise entry.error(
-                f"bytes {start} to {start + length}, but the buffer has {len(content)} bytes"
+                f"bytes {start} to {start + length}, but the buffer has {len(content)} bytes",
+                reason="beyond_data",
+                found=start + length,
+                limit=len(content),
             )
         return content[start : start + length], entry
 
@@ -277,26 +315,40 @@ class GltfFile:
         entry = self.root.item("accessors", index, user, what)
         kind, component = entry.text("type"), entry.integer("componentType")
         if kind not in types:
-            raise entry.error(f"type {kind} for {what}, expected {' or '.join(types)}")
+            raise entry.error(
+                f"type {kind} for {what}, expected {' or '.join(types)}", reason="type", found=kind
+            )
         if component not in COMPONENTS:
-            raise entry.error(f"componentType {component}, expected {sorted(COMPONENTS)}")
+            raise entry.error(
+                f"componentType {component}, expected {sorted(COMPONENTS)}",
+                reason="component_type",
+                found=component,
+            )
         dtype, width, count = COMPONENTS[component], WIDTHS[kind], entry.integer("count", low=1)
         if "bufferView" in entry:
             elements = self._stored(entry, count, width, dtype)
         elif "sparse" in entry:
             size = count * width * dtype.itemsize
             if size > ZERO_BYTES:
-                raise entry.error(f"{size} bytes of zeros (limit {ZERO_BYTES})", RE_EXPORT_MESH)
+                raise entry.error(
+                    f"{size} bytes of zeros (limit {ZERO_BYTES})",
+                    RE_EXPORT_MESH,
+                    reason="too_large",
+                    found=size,
+                    limit=ZERO_BYTES,
+                )
             elements = np.zeros((count, width), dtype)
         else:
-            raise entry.error(f"no bufferView, used by {user.pointer} ({what})", RE_EXPORT_MESH)
+            raise entry.error(
+                f"no bufferView, used by {user.pointer} ({what})", RE_EXPORT_MESH, reason="missing"
+            )
         if "sparse" in entry:
             elements = self._replaced(entry.child("sparse"), elements)
         if dtype.kind == "f":
             self._check_finite(elements, entry)
         elif entry.flag("normalized"):
             if component == 5125:
-                raise entry.error("32-bit integers cannot be normalized")
+                raise entry.error("32-bit integers cannot be normalized", reason="component_type")
             elements = np.maximum(elements / np.float32(np.iinfo(dtype).max), np.float32(-1.0))
         return elements
 
@@ -306,12 +358,20 @@ class GltfFile:
         size = dtype.itemsize * width
         stride = view.integer("byteStride", size, low=-(1 << 62))
         if stride < size:
-            raise view.error(f"byteStride {stride}, but elements of {size} bytes")
+            raise view.error(
+                f"byteStride {stride}, but elements of {size} bytes",
+                reason="stride",
+                found=stride,
+                limit=size,
+            )
         start = entry.integer("byteOffset", 0)
         end = start + stride * (count - 1) + size
         if end > len(content):
             raise entry.error(
-                f"{count} elements end at byte {end}, but {view.pointer} has {len(content)} bytes"
+                f"{count} elements end at byte {end}, but {view.pointer} has {len(content)} bytes",
+                reason="beyond_data",
+                found=end,
+                limit=len(content),
             )
         return np.ndarray((count, width), dtype, content, start, (stride, dtype.itemsize))
 
@@ -321,12 +381,16 @@ class GltfFile:
         indices, values = sparse.child("indices"), sparse.child("values")
         component = indices.integer("componentType")
         if component not in (5121, 5123, 5125):
-            raise indices.error(f"componentType {component}, expected 5121, 5123 or 5125")
+            raise indices.error(
+                f"componentType {component}, expected 5121, 5123 or 5125",
+                reason="component_type",
+                found=component,
+            )
         where = self._stored(indices, count, 1, COMPONENTS[component])[:, 0].astype(np.int64)
         if (np.diff(where) <= 0).any():
-            raise indices.error("the indices do not increase")
+            raise indices.error("the indices do not increase", reason="sparse_order")
         if where[-1] >= total:
-            raise indices.error(f"index {where[-1]}, but {total} elements")
+            raise indices.out_of_range("index", int(where[-1]), total, "elements")
         replaced = elements.copy()
         replaced[where] = self._stored(values, count, width, elements.dtype)
         return replaced
@@ -336,5 +400,7 @@ class GltfFile:
         if not finite.all():
             bad = int(np.flatnonzero(~finite)[0])
             raise entry.error(
-                f"{int((~finite).sum())} elements are NaN or infinite, first is {bad}"
+                f"{int((~finite).sum())} elements are NaN or infinite, first is {bad}",
+                reason="not_finite",
+                found=int((~finite).sum()),
             )

@@ -65,7 +65,7 @@ def check_extensions(root: Entry, notices: list[str]) -> None:
     for key in ("extensionsRequired", "extensionsUsed"):
         listed = root.value.get(key, [])
         if not isinstance(listed, list) or not all(isinstance(name, str) for name in listed):
-            raise root.error(f"{key} is not a list of names")
+            raise root.error(f"{key} is not a list of names", reason="type")
         names[key] = dict.fromkeys(listed)
     for name in names["extensionsRequired"]:
         if name not in HONOURED | BASE_MATERIAL and name not in LEFT_OUT:
@@ -73,6 +73,9 @@ def check_extensions(root: Entry, notices: list[str]) -> None:
                 root.path,
                 f"/extensionsRequired: {name} is not supported",
                 ADVICE.get(name, f"re-export without {name}"),
+                reason="gltf.extension",
+                pointer="/extensionsRequired",
+                found=name,
             )
     for name in names["extensionsUsed"]:
         if name in LEFT_OUT:
@@ -139,7 +142,9 @@ class MaterialReader:
         *base_color, alpha = self._factors(pbr, "baseColorFactor", (1.0,) * 4, 0.0, 1.0)
         mode = entry.text("alphaMode", "OPAQUE")
         if mode not in ("OPAQUE", "MASK", "BLEND"):
-            raise entry.error(f"alphaMode is {mode!r}, expected OPAQUE, MASK or BLEND")
+            raise entry.error(
+                f"alphaMode is {mode!r}, expected OPAQUE, MASK or BLEND", reason="range", found=mode
+            )
         strength = entry.extension("KHR_materials_emissive_strength")
         gain = 1.0 if strength is None else strength.number("emissiveStrength", 1.0)
         if gain < 0:
@@ -147,7 +152,11 @@ class MaterialReader:
         emission = self._factors(entry, "emissiveFactor", (0.0,) * 3, 0.0, math.inf)
         if max(emission) * max(gain, 0.0) > EMISSION_LIMIT:
             found = f"emission of {max(emission) * gain:g}"
-            raise entry.error(f"{found}, expected at most {EMISSION_LIMIT:g}")
+            raise entry.error(
+                f"{found}, expected at most {EMISSION_LIMIT:g}",
+                reason="range",
+                limit=EMISSION_LIMIT,
+            )
         material = Material(
             name=name,
             base_color=(base_color[0], base_color[1], base_color[2]),
@@ -343,7 +352,12 @@ class MaterialReader:
             # translation * rotation * scale, as in the extension's own GLSL.
             affine = (c * sx, s * sy, ox, -s * sx, c * sy, oy)
         if uv_set > 1:
-            raise entry.error(f"texCoord {uv_set}, but only sets 0 and 1 are supported")
+            raise entry.error(
+                f"texCoord {uv_set}, but only sets 0 and 1 are supported",
+                reason="uv_set",
+                found=uv_set,
+                limit=1,
+            )
         return TextureSlot(texture, uv_set, affine)
 
     def _texture(self, user: Entry, is_base_color: bool) -> int | None:
@@ -358,7 +372,11 @@ class MaterialReader:
             for k, key in enumerate(("wrapS", "wrapT")):
                 code = sampler.integer(key, 10497)
                 if code not in WRAPS:
-                    raise sampler.error(f"{key} is {code}, expected one of {sorted(WRAPS)}")
+                    raise sampler.error(
+                        f"{key} is {code}, expected one of {sorted(WRAPS)}",
+                        reason="range",
+                        found=code,
+                    )
                 wraps[k] = WRAPS[code]
             if sampler.integer("magFilter", 9729) in NEAREST:
                 self.notices.append(f"{sampler.pointer}: nearest filter replaced by bilinear")
@@ -377,7 +395,7 @@ class MaterialReader:
     def _load(self, source: int, texture: Entry) -> PixelArray | None:
         """Return the pixels of an image; None when it is missing and that is allowed."""
         if source == -1 and texture.extension("KHR_texture_basisu") is None:
-            raise texture.error("no image source")
+            raise texture.error("no image source", reason="missing")
         image = texture
         if source != -1:
             image = self.file.root.item("images", source, texture, "source")
@@ -387,7 +405,12 @@ class MaterialReader:
             locate(uri, self.file.path, where)  # outside the folder is refused in any case
         try:
             if source == -1:
-                raise texture.error("only a KTX2 image", ADVICE["KHR_texture_basisu"])
+                raise texture.error(
+                    "only a KTX2 image",
+                    ADVICE["KHR_texture_basisu"],
+                    reason="texture_format",
+                    found="KTX2",
+                )
             if "uri" in image:
                 file = self.file
                 encoded = read_uri(uri, file.path, where, file.limits, file.hashes)
@@ -396,10 +419,7 @@ class MaterialReader:
             return self._decoder.decode(encoded, where)
         except InputError as error:
             if self.missing_textures != "grey":
-                raise InputError(
-                    error.where,
-                    error.what,
-                    error.advice or "add the image, or pass --missing-textures grey",
-                ) from None
+                error.advice = error.advice or "add the image, or pass --missing-textures grey"
+                raise
             self.notices.append(f"{error.what}: replaced by grey, or left out where no colour")
             return None

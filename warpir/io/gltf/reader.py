@@ -1,14 +1,13 @@
-"""Reads glTF 2.0 into an `Asset`: the scene graph and the geometry.
+"""Reads glTF 2.0 into an `Asset`: the drawn primitives and their geometry.
 
-`warpir.io.gltf.gate` is the gate that checks the container and every number; this module says what
-the numbers mean, together with `warpir.io.gltf.materials`. Each drawn primitive of each mesh
-instance becomes one `Primitive` in the asset's frame (right-handed, +Y up, front +Z, metres).
+`warpir.io.gltf.gate` checks the container and every number; this module says what the numbers mean,
+together with `warpir.io.gltf.nodes` and `warpir.io.gltf.materials`. Each drawn primitive of each
+mesh instance becomes one `Primitive` in the asset's frame (right-handed, +Y up, front +Z, metres).
 Skinned meshes stand as their joints do in the file; lights, cameras, morph targets and animations
 are not read.
 """
 
-import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -18,6 +17,14 @@ from warpir.core.arrays import Float64Array, FloatArray, IntArray, PixelArray
 from warpir.core.limits import LIMITS, Limits
 from warpir.io.gltf.gate import Entry, GltfFile
 from warpir.io.gltf.materials import MaterialReader, check_extensions
+from warpir.io.gltf.nodes import (
+    Skins,
+    check_invertible,
+    local_matrix,
+    read_forest,
+    read_instances,
+    scene_nodes,
+)
 from warpir.io.meshes.asset_files import concise
 from warpir.io.meshes.triangles import (
     EXTENT,
@@ -106,8 +113,7 @@ def placed_primitives(
     if root.size("animations"):
         notices.append("animations are not played: the rest pose is used")
     instance_count = 0
-    skins: dict[int, Float64Array] = {}
-    joint_worlds: dict[int, Float64Array] = {}
+    skins = Skins(file, nodes, parents)
     stack = [(index, np.eye(4), False) for index in range(len(nodes)) if index not in parents]
     stack.reverse()
     while stack:
@@ -123,19 +129,13 @@ def placed_primitives(
         stack += [(child, world, drawn) for child in reversed(node.integers("children"))]
         if not drawn or "mesh" not in node:
             continue
-        joints: Float64Array | None = None
-        if "skin" in node:
-            # The joints alone place a skinned mesh; its own node does not count.
-            skin = node.integer("skin")
-            if skin not in skins:
-                skins[skin] = joint_matrices(file, node, nodes, parents, joint_worlds)
-            joints = skins[skin]
-            instances = [np.eye(4)]
-            notices.append(f"{node.pointer}: skinned, stands as its joints do in the file")
-        else:
-            instances = read_instances(file, node, world)
+        # The joints alone place a skinned mesh; its own node does not count.
+        joints = skins.read(node) if "skin" in node else None
+        instances = [np.eye(4)] if joints is not None else read_instances(file, node, world)
         for number, matrix in enumerate(instances):
             check_invertible(node, matrix, f" of instance {number}" if len(instances) > 1 else "")
+        if joints is not None:
+            notices.append(f"{node.pointer}: skinned, stands as its joints do in the file")
         mesh = root.item("meshes", node.integer("mesh"), node, "mesh")
         for primitive in mesh.items("primitives"):
             if primitive.integer("mode", 4) in POINTS_OR_LINES:
@@ -146,184 +146,6 @@ def placed_primitives(
             file.limits.check("instances", instance_count, file.path, what, more=" so far")
             for matrix in instances:
                 yield primitive, matrix, joints
-
-
-def read_forest(root: Entry, limits: Limits) -> tuple[list[Entry], dict[int, int]]:
-    """Return all nodes, and the parent of each node that has one.
-
-    Raises:
-        InputError: Too many nodes, a child out of range, two parents, or a cycle.
-    """
-    count = root.size("nodes")
-    limits.check("nodes", count, root.path, "/nodes: too many nodes")
-    nodes = list(root.items("nodes"))
-    parents: dict[int, int] = {}
-    for index, node in enumerate(nodes):
-        for child in node.integers("children"):
-            if child >= count:
-                raise node.error(f"child {child}, but {count} nodes")
-            if child in parents:
-                raise node.error(f"child {child} is already a child of node {parents[child]}")
-            parents[child] = index
-    # Every node has at most one parent, so whatever the roots do not reach is a cycle.
-    reached = 0
-    stack = [index for index in range(count) if index not in parents]
-    while stack:
-        reached += 1
-        stack += nodes[stack.pop()].integers("children")
-    if reached < count:
-        raise root.error(f"the nodes form a cycle ({count - reached} nodes hang on no root)")
-    return nodes, parents
-
-
-def scene_nodes(
-    root: Entry, nodes: list[Entry], parents: dict[int, int], notices: list[str]
-) -> set[int]:
-    """Return the nodes that ``scene`` lists, else the first scene, else all without a parent."""
-    if not root.size("scenes"):
-        if "scene" in root:
-            raise root.error(f"scene {root.value['scene']}, but 0 scenes")
-        notices.append("the file has no scenes: all root nodes are drawn")
-        return {index for index in range(len(nodes)) if index not in parents}
-    scene = root.item("scenes", root.integer("scene", 0), root, "scene")
-    listed = scene.integers("nodes")
-    for index in listed:
-        if index >= len(nodes):
-            raise scene.error(f"node {index}, but {len(nodes)} nodes")
-        if index in parents:
-            notices.append(f"{scene.pointer}: node {index} is not a root; drawn below its parents")
-    if len(set(listed)) < len(listed):
-        raise scene.error("the same node twice")
-    return set(listed)
-
-
-def local_matrix(node: Entry) -> Float64Array:
-    """Return the matrix from a node's frame to its parent's, shape [4, 4]."""
-    parts = [key for key in ("translation", "rotation", "scale") if key in node]
-    if "matrix" in node:
-        if parts:
-            raise node.error(f"both matrix and {parts[0]}")
-        matrix = np.array(node.numbers("matrix", (0.0,) * 16)).reshape(4, 4).T
-        if not np.allclose(matrix[3], [0.0, 0.0, 0.0, 1.0]):
-            raise node.error("matrix is not affine (last row is not 0 0 0 1)")
-        return matrix
-    if not parts:
-        return np.eye(4)
-    rotation = node.numbers("rotation", (0.0, 0.0, 0.0, 1.0))
-    if math.hypot(*rotation) < 1e-6:
-        raise node.error("rotation is the zero quaternion")
-    return from_trs(
-        node.numbers("translation", (0.0, 0.0, 0.0)), rotation, node.numbers("scale", (1.0,) * 3)
-    )
-
-
-def from_trs(
-    translation: Sequence[float], rotation: Sequence[float], scale: Sequence[float]
-) -> Float64Array:
-    """Return translation * rotation * scale as a matrix, shape [4, 4].
-
-    Args:
-        translation: Shift [m].
-        rotation: Quaternion x, y, z, w of any length but 0.
-        scale: Factors [1].
-    """
-    length = math.hypot(*rotation)
-    x, y, z, w = (component / length for component in rotation)
-    turn = [
-        [1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)],
-        [2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)],
-        [2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)],
-    ]
-    matrix = np.eye(4)
-    matrix[:3, :3] = np.array(turn) * scale
-    matrix[:3, 3] = translation
-    return matrix
-
-
-def read_instances(file: GltfFile, node: Entry, world: Float64Array) -> list[Float64Array]:
-    """Return the matrices at which a node's mesh stands, shape [4, 4] each.
-
-    One, or as many as EXT_mesh_gpu_instancing lists below the node.
-    """
-    extension = node.extension("EXT_mesh_gpu_instancing")
-    if extension is None:
-        return [world]
-    attributes = extension.child("attributes")
-    read: dict[str, list[list[float]]] = {}
-    for name, kind in {"TRANSLATION": "VEC3", "ROTATION": "VEC4", "SCALE": "VEC3"}.items():
-        if name in attributes:
-            accessor = attributes.integer(name)
-            count = file.count(accessor, attributes, name)
-            what = f"{attributes.pointer}: too many instances"
-            file.limits.check("instances", count, file.path, what)
-            stored = file.accessor(accessor, attributes, name, (kind,))
-            if stored.dtype.kind != "f":
-                raise attributes.error(f"{name} holds integers that are not normalized")
-            read[name] = stored.tolist()
-    counts = {name: len(values) for name, values in read.items()}
-    if len(set(counts.values())) != 1:
-        found = ", ".join(f"{count} {name}" for name, count in counts.items()) or "none"
-        raise attributes.error(f"expected equally many of each attribute (found {found})")
-    (count,) = set(counts.values())
-    rotations = read.get("ROTATION", [[0.0, 0.0, 0.0, 1.0]] * count)
-    if any(math.hypot(*rotation) < 1e-6 for rotation in rotations):
-        raise attributes.error("ROTATION holds the zero quaternion")
-    shifts = read.get("TRANSLATION", [[0.0] * 3] * count)
-    scales = read.get("SCALE", [[1.0] * 3] * count)
-    with np.errstate(over="ignore", invalid="ignore"):  # `check_invertible` refuses such sizes
-        return [world @ from_trs(*parts) for parts in zip(shifts, rotations, scales, strict=True)]
-
-
-def joint_matrices(
-    file: GltfFile,
-    node: Entry,
-    nodes: list[Entry],
-    parents: dict[int, int],
-    worlds: dict[int, Float64Array],
-) -> Float64Array:
-    """Return, for each joint of a node's skin, the matrix that moves what is bound to it alone.
-
-    Joint times inverse bind matrix, from the mesh's frame to the asset's, shape [joint, 4, 4].
-    ``worlds`` keeps the matrices of nodes from one skin to the next.
-    """
-    skin = file.root.item("skins", node.integer("skin"), node, "skin")
-    joints = skin.integers("joints")
-    for joint in joints:
-        if joint >= len(nodes):
-            raise skin.error(f"joint {joint}, but {len(nodes)} nodes")
-        chain = [joint]
-        while chain[-1] not in worlds and chain[-1] in parents:
-            chain.append(parents[chain[-1]])
-        for index in reversed(chain):
-            if index not in worlds:
-                above = worlds[parents[index]] if index in parents else np.eye(4)
-                with np.errstate(over="ignore", invalid="ignore"):  # refused by `pose`
-                    worlds[index] = above @ local_matrix(nodes[index])
-    bound = np.stack([worlds[joint] for joint in joints]) if joints else np.zeros((0, 4, 4))
-    if "inverseBindMatrices" not in skin:
-        return bound
-    accessor = skin.integer("inverseBindMatrices")
-    if file.count(accessor, skin, "inverseBindMatrices") < len(joints):
-        raise skin.error(f"fewer inverseBindMatrices than joints ({len(joints)})")
-    stored = file.accessor(accessor, skin, "inverseBindMatrices", ("MAT4",))[: len(joints)]
-    if stored.dtype.kind != "f":
-        raise skin.error("inverseBindMatrices are not floats")
-    inverse = stored.astype(np.float64).reshape(-1, 4, 4).transpose(0, 2, 1)
-    with np.errstate(over="ignore", invalid="ignore"):
-        return np.asarray(bound @ inverse)
-
-
-def check_invertible(node: Entry, world: Float64Array, which: str = "") -> None:
-    """Refuse a transform that flattens the mesh or overflows."""
-    linear = world[:3, :3]
-    if not (np.abs(world) < EXTENT).all():
-        raise node.error(f"transform{which} with numbers beyond {EXTENT:g}")
-    volume = np.linalg.norm(linear, axis=0).prod()
-    if abs(np.linalg.det(linear)) <= 1e-9 * volume:
-        raise node.error(
-            f"singular transform{which} (a scale of zero?)",
-            "give the object a thickness, or remove it",
-        )
 
 
 def check_counts(
@@ -383,7 +205,12 @@ def read_geometry(
             return None
         count = file.count(attributes.integer(name), entry, name)
         if count != len(positions):
-            raise entry.error(f"{count} {name}, but {len(positions)} vertices")
+            raise entry.error(
+                f"{count} {name}, but {len(positions)} vertices",
+                reason="count",
+                found=count,
+                limit=len(positions),
+            )
         return file.accessor(attributes.integer(name), entry, name, types)
 
     normals, tangents = None, None
@@ -414,16 +241,16 @@ def read_triangles(file: GltfFile, entry: Entry, vertex_count: int, notices: lis
     if "indices" in entry:
         stored = file.accessor(entry.integer("indices"), entry, "indices", ("SCALAR",))[:, 0]
         if stored.dtype.kind != "u":
-            raise entry.error("indices are not unsigned integers")
+            raise entry.error("indices are not unsigned integers", reason="component_type")
         highest = int(stored.max())
         if highest >= vertex_count:
-            raise entry.error(f"index {highest}, but {vertex_count} vertices")
+            raise entry.out_of_range("index", highest, vertex_count, "vertices")
         corners = stored.astype(np.int32)
     else:
         corners = np.arange(vertex_count, dtype=np.int32)
     mode = entry.integer("mode", 4)
     if mode not in (4, STRIP, FAN):
-        raise entry.error(f"mode is {mode}, expected 0 to 6")
+        raise entry.error(f"mode is {mode}, expected 0 to 6", reason="range", found=mode)
     if mode == 4:
         spare = len(corners) % 3
         if spare:
@@ -441,7 +268,7 @@ def read_colors(stored: PixelArray | None, entry: Entry, notices: list[str]) -> 
     if stored is None:
         return None
     if stored.dtype.kind != "f":
-        raise entry.error("COLOR_0 holds integers that are not normalized")
+        raise entry.error("COLOR_0 holds integers that are not normalized", reason="component_type")
     if stored.min() < 0 or stored.max() > 1:
         notices.append(f"{entry.pointer}: COLOR_0 clamped to 0 ... 1")
     colors = np.ones((len(stored), 4), dtype=np.float32)
@@ -456,37 +283,17 @@ def pose(file: GltfFile, entry: Entry, geometry: Geometry, joints: Float64Array)
         file: The file.
         entry: The primitive, with JOINTS_n and WEIGHTS_n.
         geometry: The primitive as stored.
-        joints: Matrices of `joint_matrices`, shape [joint, 4, 4].
+        joints: Matrices of `Skins.read`, shape [joint, 4, 4].
     """
-    attributes = entry.child("attributes")
-    count = len(geometry.positions)
-    moved = np.zeros((count, 4, 4))
-    total = np.zeros(count)
-    sets = sum(f"JOINTS_{k}" in attributes for k in range(len(attributes.value)))
-    for k in range(max(sets, 1)):
-        stored = []
-        for name in (f"JOINTS_{k}", f"WEIGHTS_{k}"):
-            found = file.count(attributes.integer(name), entry, name)
-            if found != count:
-                raise entry.error(f"{found} {name}, but {count} vertices")
-            stored.append(file.accessor(attributes.integer(name), entry, name, ("VEC4",)))
-        index, weight = stored
-        if index.dtype.kind != "u" or weight.dtype.kind != "f":
-            raise entry.error(f"JOINTS_{k} or WEIGHTS_{k} are of a wrong kind of number")
-        if index.max() >= len(joints):
-            raise entry.error(f"joint {index.max()} in JOINTS_{k}, but {len(joints)} joints")
-        for column in range(4):
-            moved += weight[:, column, None, None] * joints[index[:, column]]
-            total += weight[:, column]
-    if not (total > 0.0).all():
-        raise entry.error(f"vertex {int(np.argmin(total > 0.0))} has no weight")
-    moved /= total[:, None, None]
+    moved = _blended_joints(file, entry, len(geometry.positions), joints)
     linear = moved[:, :3, :3]
     with np.errstate(over="ignore", invalid="ignore"):  # such sizes are refused below
         volume = np.linalg.norm(linear, axis=1).prod(axis=1)
         sign = np.linalg.det(linear)
     if not ((np.abs(moved) < EXTENT).all() and (np.abs(sign) > 1e-9 * volume).all()):
-        raise entry.error("the joints flatten the mesh, or are beyond all bounds")
+        raise entry.error(
+            "the joints flatten the mesh, or are beyond all bounds", reason="singular"
+        )
     mirrored = bool(np.median(sign) < 0)
     normals, tangents = geometry.normals, geometry.tangents
     if normals is not None:
@@ -501,6 +308,44 @@ def pose(file: GltfFile, entry: Entry, geometry: Geometry, joints: Float64Array)
         normals=normals,
         tangents=None if tangents is None else tangents.astype(np.float32),
     )
+
+
+def _blended_joints(file: GltfFile, entry: Entry, count: int, joints: Float64Array) -> Float64Array:
+    """Return the weighted mean of the joints of each vertex, shape [vertex, 4, 4].
+
+    Raises:
+        InputError: Joints or weights are damaged, or a vertex has no weight.
+    """
+    attributes = entry.child("attributes")
+    moved = np.zeros((count, 4, 4))
+    total = np.zeros(count)
+    sets = sum(f"JOINTS_{k}" in attributes for k in range(len(attributes.value)))
+    for k in range(max(sets, 1)):
+        stored = []
+        for name in (f"JOINTS_{k}", f"WEIGHTS_{k}"):
+            found = file.count(attributes.integer(name), entry, name)
+            if found != count:
+                raise entry.error(
+                    f"{found} {name}, but {count} vertices",
+                    reason="count",
+                    found=found,
+                    limit=count,
+                )
+            stored.append(file.accessor(attributes.integer(name), entry, name, ("VEC4",)))
+        index, weight = stored
+        if index.dtype.kind != "u" or weight.dtype.kind != "f":
+            raise entry.error(
+                f"JOINTS_{k} or WEIGHTS_{k} are of a wrong kind of number", reason="component_type"
+            )
+        if index.max() >= len(joints):
+            raise entry.out_of_range(f"JOINTS_{k} index", int(index.max()), len(joints), "joints")
+        for column in range(4):
+            moved += weight[:, column, None, None] * joints[index[:, column]]
+            total += weight[:, column]
+    if not (total > 0.0).all():
+        raise entry.error(f"vertex {int(np.argmin(total > 0.0))} has no weight", reason="no_weight")
+    moved /= total[:, None, None]
+    return moved
 
 
 def place(geometry: Geometry, world: Float64Array, material: int) -> Primitive:

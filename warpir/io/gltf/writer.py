@@ -220,7 +220,7 @@ def _uv_sets(asset: Asset, p: Primitive) -> list[FloatArray | None]:
 
     It does for a set that the material reads, and for the first where there is a second.
     """
-    needed = {slot.uv_set for slot in _slots(asset.materials[p.material])}
+    needed = {slot.uv_set for slot in asset.materials[p.material].texture_slots()}
     if p.uv1 is not None or 1 in needed:
         needed.add(0)
     zero = np.zeros((len(p.positions), 2), dtype=np.float32)
@@ -228,71 +228,70 @@ def _uv_sets(asset: Asset, p: Primitive) -> list[FloatArray | None]:
     return [zero if uv is None and k in needed else uv for k, uv in enumerate(sets)]
 
 
-def _slots(material: Material) -> list[TextureSlot]:
-    return material.texture_slots()
-
-
 def _material(file: _Glb, m: Material) -> Members:
-    def texture(slot: TextureSlot | None, key: str, **more: float) -> Members:
-        return {} if slot is None else {key: _texture_info(file, slot, m.name) | more}
-
-    def unless(default: Any, **member: Any) -> Members:
-        return {key: value for key, value in member.items() if value != default}
-
     pbr = {
         "baseColorFactor": [*m.base_color, m.alpha],
         "metallicFactor": m.metallic,
         "roughnessFactor": m.roughness,
-        **texture(m.base_color_texture, "baseColorTexture"),
-        **texture(m.metallic_roughness_texture, "metallicRoughnessTexture"),
+        **_texture(file, m, "base_color", "baseColorTexture"),
+        **_texture(file, m, "metallic_roughness", "metallicRoughnessTexture"),
     }
     # A power of two, so that factor times strength is the emission to the last bit.
     strength = 2.0 ** max(math.ceil(math.log2(max(*m.emission, 1.0))), 0)
-    glowing = any(m.emission)
-    extensions = (
-        file.extension("KHR_materials_emissive_strength", unless(1.0, emissiveStrength=strength))
-        | file.extension("KHR_materials_ior", unless(1.5, ior=m.ior))
-        | file.extension(
-            "KHR_materials_specular",
-            unless(1.0, specularFactor=m.specular)
-            | unless([1.0] * 3, specularColorFactor=list(m.specular_color))
-            | texture(m.specular_texture, "specularTexture")
-            | texture(m.specular_color_texture, "specularColorTexture"),
-        )
-        | file.extension(
-            "KHR_materials_clearcoat",
-            unless(0.0, clearcoatFactor=m.clearcoat)
-            | unless(0.0, clearcoatRoughnessFactor=m.clearcoat_roughness)
-            | texture(m.clearcoat_texture, "clearcoatTexture")
-            | texture(m.clearcoat_roughness_texture, "clearcoatRoughnessTexture")
-            | texture(
-                m.clearcoat_normal_texture, "clearcoatNormalTexture", scale=m.clearcoat_normal_scale
-            ),
-        )
-        | file.extension(
-            "KHR_materials_sheen",
-            unless([0.0] * 3, sheenColorFactor=list(m.sheen_color))
-            | unless(0.0, sheenRoughnessFactor=m.sheen_roughness)
-            | texture(m.sheen_color_texture, "sheenColorTexture")
-            | texture(m.sheen_roughness_texture, "sheenRoughnessTexture"),
-        )
-        | file.extension(
-            "KHR_materials_transmission",
-            unless(0.0, transmissionFactor=m.transmission)
-            | texture(m.transmission_texture, "transmissionTexture"),
-        )
-    )
+    emission: Members = {}
+    if any(m.emission):
+        emission = {"emissiveFactor": [e / strength for e in m.emission]}
+        emission |= _texture(file, m, "emission", "emissiveTexture")
     return {
-        **unless("", name=m.name),
+        **_unless("", name=m.name),
         "pbrMetallicRoughness": pbr,
-        **texture(m.normal_texture, "normalTexture", scale=m.normal_scale),
-        **({"emissiveFactor": [e / strength for e in m.emission]} if glowing else {}),
-        **(texture(m.emission_texture, "emissiveTexture") if glowing else {}),
-        **unless("OPAQUE", alphaMode=m.alpha_mode),
+        **_texture(file, m, "normal", "normalTexture", scale=m.normal_scale),
+        **emission,
+        **_unless("OPAQUE", alphaMode=m.alpha_mode),
         **({"alphaCutoff": m.alpha_cutoff} if m.alpha_mode == "MASK" else {}),
-        **unless(False, doubleSided=m.double_sided),
-        **unless({}, extensions=extensions),
+        **_unless(False, doubleSided=m.double_sided),
+        **_unless({}, extensions=_material_extensions(file, m, strength)),
     }
+
+
+def _material_extensions(file: _Glb, m: Material, strength: float) -> Members:
+    """Return what of a material differs from the defaults of its extensions."""
+    extensions = {
+        "KHR_materials_emissive_strength": _unless(1.0, emissiveStrength=strength),
+        "KHR_materials_ior": _unless(1.5, ior=m.ior),
+        "KHR_materials_specular": _unless(1.0, specularFactor=m.specular)
+        | _unless([1.0] * 3, specularColorFactor=list(m.specular_color))
+        | _texture(file, m, "specular", "specularTexture")
+        | _texture(file, m, "specular_color", "specularColorTexture"),
+        "KHR_materials_clearcoat": _unless(0.0, clearcoatFactor=m.clearcoat)
+        | _unless(0.0, clearcoatRoughnessFactor=m.clearcoat_roughness)
+        | _texture(file, m, "clearcoat", "clearcoatTexture")
+        | _texture(file, m, "clearcoat_roughness", "clearcoatRoughnessTexture")
+        | _texture(
+            file, m, "clearcoat_normal", "clearcoatNormalTexture", scale=m.clearcoat_normal_scale
+        ),
+        "KHR_materials_sheen": _unless([0.0] * 3, sheenColorFactor=list(m.sheen_color))
+        | _unless(0.0, sheenRoughnessFactor=m.sheen_roughness)
+        | _texture(file, m, "sheen_color", "sheenColorTexture")
+        | _texture(file, m, "sheen_roughness", "sheenRoughnessTexture"),
+        "KHR_materials_transmission": _unless(0.0, transmissionFactor=m.transmission)
+        | _texture(file, m, "transmission", "transmissionTexture"),
+    }
+    used: Members = {}
+    for name, members in extensions.items():
+        used |= file.extension(name, members)
+    return used
+
+
+def _unless(default: Any, **member: Any) -> Members:
+    """Return a member where it differs from its default."""
+    return {key: value for key, value in member.items() if value != default}
+
+
+def _texture(file: _Glb, m: Material, slot: str, key: str, **more: float) -> Members:
+    """Return the member of the texture that a material reads as ``slot``, if it has one."""
+    texture: TextureSlot | None = getattr(m, f"{slot}_texture")
+    return {} if texture is None else {key: _texture_info(file, texture, m.name) | more}
 
 
 def _texture_info(file: _Glb, slot: TextureSlot, name: str) -> Members:

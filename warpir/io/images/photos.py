@@ -206,32 +206,12 @@ def read_envmap(
         )
     if image.alpha is not None and image.kind != "exr":
         messages.append("alpha channel ignored")
-    if codes.dtype.kind == "f":
-        with np.errstate(over="ignore"):  # counted below
-            texels = np.array(codes, dtype=np.float32)
-    else:
-        srgb = _to_srgb(path, codes, image, messages)[1]
-        texels = color.srgb_to_linear(srgb).astype(np.float32)
-        messages.append(
-            "a picture, not high dynamic range: decoded as sRGB; lamps and a sun in it are no "
-            "brighter than its white"
-        )
+    texels = _radiance(path, codes, image, messages)
     _repair_radiance(path, texels, strict, messages)
     # Colours outside Rec.709 are negative in it, and no light is.
     with np.errstate(over="ignore", invalid="ignore"):  # refused below
         texels = np.maximum(_to_rec709(texels, image, messages), 0.0)
-    brightest = float(texels.max())
-    if not brightest <= RADIANCE_LIMIT:
-        raise InputError(
-            path,
-            f"too bright (found a radiance of {brightest:g}; limit {RADIANCE_LIMIT:g})",
-            "divide its values, and give --exposure",
-            reason="envmap.too_bright",
-            found=brightest,
-            limit=RADIANCE_LIMIT,
-        )
-    if brightest == 0.0:
-        messages.append("no light: every texel is 0")
+    _check_brightness(path, texels, messages)
     if notices is not None:
         notices += messages
     return to_ours(texels, convention, camera_to_world)
@@ -332,6 +312,39 @@ def _is_transparent(image: DecodedImage) -> bool:
     is_float = image.pixels.dtype.kind == "f"
     opaque = 1.0 if is_float else np.iinfo(image.pixels.dtype).max
     return not bool(np.all(image.alpha >= opaque))
+
+
+def _radiance(path: Path, codes: PixelArray, image: DecodedImage, notices: list[str]) -> FloatArray:
+    """Return the values of a panorama as radiance, not yet checked, shape [height, width, 3]."""
+    if codes.dtype.kind == "f":
+        with np.errstate(over="ignore"):  # `_repair_radiance` counts them
+            return np.array(codes, dtype=np.float32)
+    srgb = _to_srgb(path, codes, image, notices)[1]
+    notices.append(
+        "a picture, not high dynamic range: decoded as sRGB; lamps and a sun in it are no "
+        "brighter than its white"
+    )
+    return color.srgb_to_linear(srgb).astype(np.float32)
+
+
+def _check_brightness(path: Path, texels: FloatArray, notices: list[str]) -> None:
+    """Refuse radiance whose products would overflow; note a map that is black.
+
+    Raises:
+        InputError: The brightest value is beyond `RADIANCE_LIMIT`.
+    """
+    brightest = float(texels.max())
+    if not brightest <= RADIANCE_LIMIT:
+        raise InputError(
+            path,
+            f"too bright (found a radiance of {brightest:g}; limit {RADIANCE_LIMIT:g})",
+            "divide its values, and give --exposure",
+            reason="envmap.too_bright",
+            found=brightest,
+            limit=RADIANCE_LIMIT,
+        )
+    if brightest == 0.0:
+        notices.append("no light: every texel is 0")
 
 
 def _repair_radiance(path: Path, texels: FloatArray, strict: bool, notices: list[str]) -> None:

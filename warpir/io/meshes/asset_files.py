@@ -55,15 +55,17 @@ def read_regular(
     try:
         status = path.stat()
         if not stat.S_ISREG(status.st_mode):
-            raise InputError(where, f"{pointer}{named}not a regular file")
+            raise InputError(
+                where, f"{pointer}{named}not a regular file", reason="file.not_regular"
+            )
         what = f"{pointer}{named}too large"
         limits.check(limit, status.st_size, where, what, more=" bytes")
         content = path.read_bytes()
     except (OSError, ValueError) as error:  # ValueError: a name that no file can have
         reason = error.strerror if isinstance(error, OSError) else "not a file name"
-        raise InputError(where, f"{pointer}{named}{reason}") from None
+        raise InputError(where, f"{pointer}{named}{reason}", reason="file.unreadable") from None
     if not content:
-        raise InputError(where, f"{pointer}{named}empty file")
+        raise InputError(where, f"{pointer}{named}empty file", reason="file.empty")
     if hashes is not None:
         hashes[name] = hashlib.sha256(content).hexdigest()
     return content
@@ -85,6 +87,8 @@ def inside(folder: Path, uri: str, where: Path, pointer: str = "") -> Path:
         where,
         f"{pointer}{uri[:80]!r} is outside the asset folder",
         "put all files of the asset into one folder and refer to them by relative names",
+        reason="file.outside",
+        found=uri,
     )
     if (
         not uri
@@ -118,11 +122,13 @@ def read_uri(
     if uri.startswith("data:"):
         head, comma, payload = uri.partition(",")
         if not comma or not head.endswith(";base64"):
-            raise InputError(where, f"{pointer}data: URI is not base64")
+            raise InputError(where, f"{pointer}data: URI is not base64", reason="file.data_uri")
         try:
             return base64.b64decode(payload, validate=True)
         except (binascii.Error, ValueError) as error:
-            raise InputError(where, f"{pointer}data: URI is damaged ({error})") from None
+            raise InputError(
+                where, f"{pointer}data: URI is damaged ({error})", reason="file.data_uri"
+            ) from None
     return read_regular(locate(uri, where, pointer), where, pointer, limits, hashes=hashes)
 
 
@@ -135,7 +141,9 @@ def locate(uri: str, where: Path, pointer: str) -> Path:
     try:
         name = unquote(uri, errors="strict")
     except UnicodeDecodeError:
-        raise InputError(where, f"{pointer}URI is not UTF-8 after percent-decoding") from None
+        raise InputError(
+            where, f"{pointer}URI is not UTF-8 after percent-decoding", reason="file.name"
+        ) from None
     return inside(where.parent, name, where, pointer)
 
 
@@ -182,6 +190,8 @@ class TextureDecoder:
                 self.where,
                 f"{pointer}KTX2 texture (expected PNG, JPEG or WebP)",
                 "re-export with PNG or JPEG textures, without KHR_texture_basisu",
+                reason="texture.format",
+                found="KTX2",
             )
         try:
             Image.MAX_IMAGE_PIXELS = None  # ours is checked before a pixel is decoded
@@ -201,7 +211,9 @@ class TextureDecoder:
             raise
         except Exception as error:  # Pillow raises a dozen kinds, struct.error among them
             short = "not a PNG, JPEG or WebP image" if "identify" in str(error) else str(error)
-            raise InputError(self.where, f"{pointer}image cannot be decoded ({short})") from None
+            raise InputError(
+                self.where, f"{pointer}image cannot be decoded ({short})", reason="texture.damaged"
+            ) from None
 
     def count(self, pixel_count: int, pointer: str) -> None:
         """Count the pixels of a texture that is about to be made.

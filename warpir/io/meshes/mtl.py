@@ -141,9 +141,8 @@ class MaterialLibrary:
                 content = read_regular(file, self.path, "mtllib ", self._limits, hashes=self.hashes)
             except InputError as error:
                 if self.missing_textures != "grey":
-                    raise InputError(
-                        error.where, error.what, "add it, or pass --missing-textures grey"
-                    ) from None
+                    error.advice = "add it, or pass --missing-textures grey"
+                    raise
                 self.notices.append(f"{error.what}: its materials are grey")
                 continue
             self._parse(content, name)
@@ -200,13 +199,21 @@ class MaterialLibrary:
                 entry.maps[key] = self._parse_map(rest, where, str(PurePosixPath(file).parent))
             elif key in NUMBERS:
                 if key[0] == "k" and words[1:2] in (["spectral"], ["xyz"]):
-                    raise InputError(self.path, f"{where}: {words[0]} {words[1]}, expected RGB")
+                    raise InputError(
+                        self.path,
+                        f"{where}: {words[0]} {words[1]}, expected RGB",
+                        reason="mtl.number",
+                    )
                 values = words[2:] if words[1:2] == ["-halo"] else words[1:]
                 numbers = self._numbers(values[:3], where, raw)
                 # One number stands for three, as in Kd 0.5.
                 entry.numbers[key] = numbers * 3 if key[0] == "k" and len(numbers) == 1 else numbers
                 if key[0] == "k" and len(entry.numbers[key]) != 3:
-                    raise InputError(self.path, f"{where}: {raw.strip()[:60]!r}, expected RGB")
+                    raise InputError(
+                        self.path,
+                        f"{where}: {raw.strip()[:60]!r}, expected RGB",
+                        reason="mtl.number",
+                    )
             elif key not in MEANINGLESS:
                 entry.left_out.append(words[0])
 
@@ -218,7 +225,11 @@ class MaterialLibrary:
         if any("_" in word for word in words):  # Python reads 1_0 as 10
             numbers = ()
         if not numbers or not all(math.isfinite(number) for number in numbers):
-            raise InputError(self.path, f"{where}: {raw.strip()[:60]!r}, expected finite numbers")
+            raise InputError(
+                self.path,
+                f"{where}: {raw.strip()[:60]!r}, expected finite numbers",
+                reason="mtl.number",
+            )
         return numbers
 
     def _parse_map(self, rest: str, where: str, folder: str) -> MapStatement:
@@ -238,7 +249,7 @@ class MaterialLibrary:
             if option not in HONOURED_OPTIONS:
                 self.notices.append(f"{where}: {option} {' '.join(values)} ignored")
         if not rest:
-            raise InputError(self.path, f"{where}: map without a file name")
+            raise InputError(self.path, f"{where}: map without a file name", reason="mtl.map")
         name = rest.replace("\\", "/")
 
         def pair(option: str, default: float) -> tuple[float, float]:
@@ -264,7 +275,12 @@ class MaterialLibrary:
         emission = self._color(name, entry, "ke", (0.0,) * 3)
         if max(emission) > EMISSION_LIMIT:
             what = f"material {shown(name)}: Ke {max(emission):g}"
-            raise InputError(self.path, f"{what}, expected at most {EMISSION_LIMIT:g}")
+            raise InputError(
+                self.path,
+                f"{what}, expected at most {EMISSION_LIMIT:g}",
+                reason="mtl.range",
+                limit=EMISSION_LIMIT,
+            )
         color = self._color(name, entry, "kd", GREY)
         red, green, blue = (min(max(value, 0.0), 1.0) for value in color)
         if (red, green, blue) != color:
@@ -439,11 +455,8 @@ class MaterialLibrary:
                 self._pixels[name] = self._decoder.decode(encoded, where)
             except InputError as error:
                 if self.missing_textures != "grey":
-                    raise InputError(
-                        error.where,
-                        error.what,
-                        error.advice or "add the image, or pass --missing-textures grey",
-                    ) from None
+                    error.advice = error.advice or "add the image, or pass --missing-textures grey"
+                    raise
                 self.notices.append(f"{error.what}: replaced by grey, or left out where no colour")
                 self._pixels[name] = None
         return self._pixels[name]

@@ -95,6 +95,28 @@ class Statements:
     """By name of the material."""
     libraries: list[str] = field(default_factory=list)
 
+    def add_position(self, path: Path, line: int, values: list[str]) -> None:
+        """Add the numbers of a ``v`` statement: a position, or a position and a colour.
+
+        Raises:
+            InputError: They are of another count, or not numbers.
+        """
+        if len(values) > 6:  # a weight before the colour, or an opacity behind it
+            what = f"line {line}: v with {len(values)} numbers (expected x y z r g b)"
+            raise InputError(
+                path,
+                what,
+                "export colours of three numbers, or as GLB",
+                reason="obj.number",
+                line=line,
+                found=len(values),
+                limit=6,
+            )
+        if len(values) == 6:
+            color = _numbers(path, line, "v", values[3:], 3)
+            self.colors[len(self.positions)] = color
+        self.positions.append(_numbers(path, line, "v", values, 3))
+
     def tables(self) -> tuple[tuple[list[list[float]], int], ...]:
         """Return positions, texture coordinates and normals with their numbers a row."""
         return (self.positions, 3), (self.uvs, 2), (self.normals, 3)
@@ -125,7 +147,7 @@ def _read_statements(path: Path, content: bytes, notices: list[str]) -> Statemen
         InputError: A number or face is damaged, or this is no OBJ file.
     """
     if b"\0" in content[:4096]:
-        raise InputError(path, "not an OBJ text file", "convert it to GLB")
+        raise InputError(path, "not an OBJ text file", "convert it to GLB", reason="obj.kind")
     try:
         whole = content.decode("utf-8-sig")
     except UnicodeDecodeError:
@@ -137,13 +159,7 @@ def _read_statements(path: Path, content: bytes, notices: list[str]) -> Statemen
         word, *values = statement.split()
         match word:
             case "v":
-                if len(values) > 6:  # a weight before the colour, or an opacity behind it
-                    what = f"line {line}: v with {len(values)} numbers (expected x y z r g b)"
-                    raise InputError(path, what, "export colours of three numbers, or as GLB")
-                if len(values) == 6:
-                    color = _numbers(path, line, word, values[3:], 3)
-                    text.colors[len(text.positions)] = color
-                text.positions.append(_numbers(path, line, word, values, 3))
+                text.add_position(path, line, values)
             case "vt":
                 # v is optional; the format says 0.
                 padded = [*values, "0"] if len(values) == 1 else values
@@ -152,7 +168,13 @@ def _read_statements(path: Path, content: bytes, notices: list[str]) -> Statemen
                 text.normals.append(_numbers(path, line, word, values, 3))
             case "f":
                 if len(values) < 3:
-                    raise InputError(path, f"line {line}: face with {len(values)} corners")
+                    raise InputError(
+                        path,
+                        f"line {line}: face with {len(values)} corners",
+                        reason="obj.face",
+                        line=line,
+                        found=len(values),
+                    )
                 if "-" in statement:
                     values = [_absolute(path, line, v, text.counts()) for v in values]
                 text.faces.setdefault(material, []).append((line, values))
@@ -163,7 +185,12 @@ def _read_statements(path: Path, content: bytes, notices: list[str]) -> Statemen
             case _ if word not in IGNORED:
                 left_out[word] += 1
     if not (text.positions or text.faces):
-        raise InputError(path, "not an OBJ file (no v and no f statements)", "convert it to GLB")
+        raise InputError(
+            path,
+            "not an OBJ file (no v and no f statements)",
+            "convert it to GLB",
+            reason="obj.kind",
+        )
     notices += [f"{count} {word[:20]!r} statements ignored" for word, count in left_out.items()]
     return text
 
@@ -200,7 +227,14 @@ def _numbers(path: Path, line: int, word: str, values: list[str], width: int) ->
     if not sound or any("_" in value for value in values[:width]):  # Python reads 1_0 as 10
         shown = " ".join([word, *values])[:60]
         what = f"line {line}: {shown!r}, expected {width} numbers up to {LARGEST:g}"
-        raise InputError(path, what, "write numbers with decimal points" if "," in shown else "")
+        raise InputError(
+            path,
+            what,
+            "write numbers with decimal points" if "," in shown else "",
+            reason="obj.number",
+            line=line,
+            limit=LARGEST,
+        )
     return numbers
 
 
@@ -212,7 +246,9 @@ def _absolute(path: Path, line: int, corner: str, counts: tuple[int, int, int]) 
             value = counts[k] + 1 - int(part[1:20])  # of more digits it is out of range anyway
             if not 1 <= value <= counts[k]:
                 what = f"line {line}: index {part[:20]}, but {counts[k]} {WORDS[k]}"
-                raise InputError(path, what)
+                raise InputError(
+                    path, what, reason="obj.index_out_of_range", line=line, limit=counts[k]
+                )
             parts[k] = str(value)
     return "/".join(parts)
 
@@ -309,6 +345,9 @@ def _unique_corners(
                     path,
                     f"line {line}: corner {corner[:40]!r}, but {counts[k % 3]} {WORDS[k % 3]} "
                     "(indices start at 1)",
+                    reason="obj.index_out_of_range",
+                    line=line,
+                    limit=counts[k % 3],
                 )
             triples[row, k] = value - 1
     return triples, {size: np.array(p, dtype=np.int32) for size, p in by_size.items()}

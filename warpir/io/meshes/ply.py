@@ -93,7 +93,9 @@ def read_ply(path: Path, content: bytes) -> Ply:
                 raise ValueError("a number with _")
             body = np.array(body.split(), dtype=np.float64).astype("<f8").tobytes()
         except ValueError as error:
-            raise InputError(path, f"damaged PLY: {str(error)[:80]}", ADVICE) from None
+            raise InputError(
+                path, f"damaged PLY: {str(error)[:80]}", ADVICE, reason="ply.damaged"
+            ) from None
         cell = "f8"
     at = 0
     for element in ply.elements.values():
@@ -101,7 +103,7 @@ def read_ply(path: Path, content: bytes) -> Ply:
             at = _read_element(element, body, at, ORDERS[order], cell)
         except (struct.error, ValueError, OverflowError):
             what = f"damaged PLY: it ends within its {element.count} {element.name} elements"
-            raise InputError(path, what, ADVICE) from None
+            raise InputError(path, what, ADVICE, reason="ply.damaged") from None
         for name, column in element.columns.items():
             element.columns[name] = _as_stated(path, element, name, column)
         for name, lists in element.lists.items():
@@ -109,7 +111,9 @@ def read_ply(path: Path, content: bytes) -> Ply:
             element.lists[name] = Lists(lists.lengths, stated)
     rest = len(body) - at
     if order == "ascii" and rest:
-        raise InputError(path, f"damaged PLY: {rest // 8} numbers too many", ADVICE)
+        raise InputError(
+            path, f"damaged PLY: {rest // 8} numbers too many", ADVICE, reason="ply.damaged"
+        )
     return ply
 
 
@@ -120,11 +124,16 @@ def read_header(path: Path, content: bytes) -> tuple[Ply, str, int]:
         InputError: With the line at fault.
     """
     if not content.startswith(b"ply"):
-        raise InputError(path, "not a PLY file (does not start with 'ply')", "convert it to GLB")
+        raise InputError(
+            path,
+            "not a PLY file (does not start with 'ply')",
+            "convert it to GLB",
+            reason="ply.kind",
+        )
     newline = b"\r" if content[3:4] == b"\r" and content[4:5] != b"\n" else b"\n"
     end = content.find(newline + b"end_header", 0, HEADER_BYTES) + 1  # a comment may hold the word
     if not end:
-        raise InputError(path, "damaged PLY: no end_header", ADVICE)
+        raise InputError(path, "damaged PLY: no end_header", ADVICE, reason="ply.header")
     start = content.find(newline, end) + 1 or len(content)
     ply, order = Ply({}, ()), ""
     comments: list[str] = []
@@ -132,7 +141,13 @@ def read_header(path: Path, content: bytes) -> tuple[Ply, str, int]:
     for line, text in enumerate(content[:end].decode("latin-1").splitlines(), 1):
 
         def wrong(what: str, line: int = line, text: str = text) -> InputError:
-            return InputError(path, f"damaged PLY: line {line}: {text[:40]!r}, {what}", ADVICE)
+            return InputError(
+                path,
+                f"damaged PLY: line {line}: {text[:40]!r}, {what}",
+                ADVICE,
+                reason="ply.header",
+                line=line,
+            )
 
         match text.split():
             case ["ply"] | ["obj_info", *_] | []:
@@ -156,7 +171,7 @@ def read_header(path: Path, content: bytes) -> tuple[Ply, str, int]:
             case _:
                 raise wrong("expected a statement of PLY 1.0")
     if not order:
-        raise InputError(path, "damaged PLY: no format", ADVICE)
+        raise InputError(path, "damaged PLY: no format", ADVICE, reason="ply.header")
     return Ply(ply.elements, tuple(comments)), order, start
 
 
@@ -259,5 +274,10 @@ def _as_stated(path: Path, element: Element, name: str, column: NDArray[Any]) ->
         stated = column.astype(kind)
     if (stated != column).any():
         found = column[stated != column][0]
-        raise InputError(path, f"damaged PLY: {element.name} {name} {found:g} is no {kind}", ADVICE)
+        raise InputError(
+            path,
+            f"damaged PLY: {element.name} {name} {found:g} is no {kind}",
+            ADVICE,
+            reason="ply.range",
+        )
     return stated

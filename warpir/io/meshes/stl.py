@@ -47,6 +47,9 @@ def read_stl(path: Path, content: bytes, notices: list[str]) -> NDArray[np.float
             path,
             f"damaged STL: {count} triangles need {promised} bytes (found {len(content)})",
             ADVICE,
+            reason="stl.damaged",
+            found=len(content),
+            limit=promised,
         )
     if len(content) > promised:
         notices.append(f"{len(content) - promised} bytes after the last triangle ignored")
@@ -62,7 +65,7 @@ def _read_ascii(path: Path, content: bytes) -> NDArray[np.float64]:
     ends = sum(line[:8].lower() == b"endsolid" for line in lines)
     if solids != ends:
         what = f"damaged STL: {solids} solid and {ends} endsolid"
-        raise InputError(path, what, ADVICE)
+        raise InputError(path, what, ADVICE, reason="stl.damaged")
     inner = [
         line for line in lines if line[:5].lower() != b"solid" and line[:8].lower() != b"endsolid"
     ]
@@ -70,15 +73,23 @@ def _read_ascii(path: Path, content: bytes) -> NDArray[np.float64]:
     longest = max(map(len, listed), default=1)
     if longest > LONGEST:
         what = f"damaged STL: a word of {longest} characters (limit {LONGEST})"
-        raise InputError(path, what, ADVICE)
+        raise InputError(path, what, ADVICE, reason="stl.damaged", found=longest, limit=LONGEST)
     words = np.array(listed, dtype=f"S{longest}")
     width = len(WORDS)
     whole = words[: len(words) // width * width].reshape(-1, width)
     wrong = (np.char.lower(whole) != WORDS)[:, WORDS != b""].any(axis=1)
     if wrong.any() or whole.size < words.size:
         number = int(wrong.argmax()) if wrong.any() else len(whole)
-        raise InputError(path, f"damaged STL: facet {number} is not one (counted from 0)", ADVICE)
+        raise InputError(
+            path,
+            f"damaged STL: facet {number} is not one (counted from 0)",
+            ADVICE,
+            reason="stl.damaged",
+            found=number,
+        )
     try:
         return whole[:, NUMBERS].astype(np.float64).reshape(-1, 3, 3)
     except ValueError as error:
-        raise InputError(path, f"damaged STL: {str(error)[:80]}", ADVICE) from None
+        raise InputError(
+            path, f"damaged STL: {str(error)[:80]}", ADVICE, reason="stl.damaged"
+        ) from None

@@ -56,6 +56,7 @@ def triangulate(
                 f"concave polygons of too many corners (found {concave.sum()} of {size}; the limit "
                 f"for one is {math.isqrt(CONCAVE_COST)})",
                 "triangulate the faces on export",
+                reason="mesh.concave",
             )
         fan = np.stack([np.array([0, k, k + 1]) for k in range(1, size - 1)])
         triangles.append(polygon[~concave][:, fan].reshape(-1, 3))
@@ -262,9 +263,18 @@ def check_drawable(where: Path, primitives: list[Primitive], found: str) -> None
         InputError: ``primitives`` is empty or a coordinate is not below ``EXTENT``.
     """
     if not primitives:
-        raise InputError(where, f"nothing to render (found {found}; expected triangles)")
+        raise InputError(
+            where,
+            f"nothing to render (found {found}; expected triangles)",
+            reason="mesh.nothing_to_render",
+        )
     largest = max(float(np.abs(p.positions).max()) for p in primitives)
     if not largest < EXTENT:
         raise InputError(
-            where, f"coordinates up to {largest:g} (expected below {EXTENT:g})", "scale it down"
+            where,
+            f"coordinates up to {largest:g} (expected below {EXTENT:g})",
+            "scale it down",
+            reason="mesh.too_large",
+            found=largest,
+            limit=EXTENT,
         )
