@@ -77,7 +77,7 @@ class Batch:
         for scene in self.scenes:
             if scene.row.problem is not None:
                 status, lines = explain(scene.row.problem)
-                # Which line it is, is told with every failure.
+                # Every failure is printed with its line already.
                 here = f": {options.manifest}:{scene.row.line}: "
                 scene.fail(status, [line.replace(here, ": ", 1) for line in lines])
 

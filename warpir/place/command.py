@@ -161,7 +161,7 @@ def way_to(address: str) -> Iterator[Path]:
 
 
 def _save(session: "Session", folder: "PlacementFolder", body: bytes) -> dict[str, Any]:
-    """Write what the page says, and say how to go on, here and there."""
+    """Write the placement that the page sends; print and return the command that uses it."""
     from warpir.core.strict_json import parse_json_object
     from warpir.place.session import placement_files
 

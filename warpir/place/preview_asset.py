@@ -1,4 +1,4 @@
-"""An asset made small enough that a browser moves it smoothly."""
+"""Thins an asset so that a browser moves it smoothly."""
 
 from dataclasses import replace
 

@@ -61,8 +61,8 @@ class PlaceServer(ThreadingHTTPServer):
 
     Args:
         port: Port to listen on; 0 for any that is free.
-        contents: By address, what makes a file that is not one of `FILES`; called once, when it is
-            first asked for.
+        contents: Functions that build the other files, by address; each is called once, when its
+            file is first requested.
         save: Called with the bytes that the page sends; returns its answer. Raises `InputError`.
         once: Whether the first placement that was saved ends `serve_forever`.
 
@@ -88,7 +88,7 @@ class PlaceServer(ThreadingHTTPServer):
         self.save = save
         self.once = once
         self.working = threading.Lock()
-        """Held while files are read, made or saved."""
+        """Held while files are read, built or saved."""
         self._makers = dict(contents)
         self._made: dict[str, bytes] = {}
         html = (PAGE / "index.html").read_bytes()
@@ -112,7 +112,7 @@ class PlaceServer(ThreadingHTTPServer):
         return f"http://{self.host}/{self.token}/"
 
     def content(self, name: str) -> bytes | None:
-        """Return what has an address behind the token; None where nothing has."""
+        """Return the file at an address behind the token; None where there is none."""
         with self.working:
             if name not in self._made:
                 if name in FILES:
@@ -153,8 +153,8 @@ class _Handler(BaseHTTPRequestHandler):
                 with self.server.working:
                     status, answer = 200, self.server.save(body)
             except InputError as error:
-                told = {"where": error.where, "what": error.what, "advice": error.advice}
-                status, answer = 422, told
+                status = 422
+                answer = {"where": error.where, "what": error.what, "advice": error.advice}
             self._answer(status, KINDS["json"], json.dumps(answer).encode())
             if self.server.once and status == 200:
                 # From a thread of its own: it waits for the loop, which may wait for this one.
@@ -194,4 +194,4 @@ class _Handler(BaseHTTPRequestHandler):
             self.close_connection = True
 
     def log_message(self, *args: object) -> None:
-        """Say nothing: every line on the terminal is one for the user."""
+        """Print nothing: lines on the terminal are for the user."""

@@ -1,4 +1,4 @@
-"""Placing by hand: what the page starts from, and the files made of what it says in the end.
+"""Placing by hand: the values that the page starts from, and the files of a saved placement.
 
 A saved placement is two files in one folder: ``camera.json``, as `warpir.insert` writes it, and
 ``insert.json``, a configuration for ``--config`` that names photo, asset, camera, place and light.
@@ -46,7 +46,7 @@ DEFAULT_SUN = (-60.0, 45.0)
 LARGEST_START = 0.6
 """Longest side of an asset of unknown scale, as a share of its distance, with which it starts."""
 PAGE = Path("the page")
-"""Who is to blame for numbers that the page sends."""
+"""Where errors about numbers that the page sends are located."""
 
 
 @dataclass(frozen=True)
@@ -58,13 +58,13 @@ class Session:
     photo: Photo
     asset: Asset
     camera: Camera
-    """With which the page starts, at the photo's resolution."""
+    """Initial camera, at the photo's resolution."""
     ground: tuple[float, float, float, float] | None
     """Plane a x + b y + c z + d = 0; absent means y = 0."""
     asset_to_world: Float64Array
-    """With which the page starts, shape [4, 4]."""
+    """Initial pose of the asset, shape [4, 4]."""
     rotate_y: float
-    """With which the page starts [deg]."""
+    """Initial turn about the vertical [deg]."""
     assumed: tuple[str, ...]
     """What was chosen because nothing was given, and what looks odd, one line each."""
 
@@ -232,7 +232,7 @@ def placement_files(session: Session, said: Mapping[str, Any]) -> dict[str, dict
         session: What was placed.
         said: What the page says: ``fx``, ``fy`` [px], ``stance``, ``stand`` (``x`` and ``z`` in the
             ground frame) [m], ``rotate_y`` [deg], ``size`` [m], and ``sun`` and ``sky`` as the
-            flags, or null where the light is to be read off the photo.
+            flags, or null where the light is to be estimated from the photo.
 
     Raises:
         InputError: Numbers out of range, or an object that the camera does not see.
@@ -282,10 +282,10 @@ def placement_files(session: Session, said: Mapping[str, Any]) -> dict[str, dict
 
 
 class PlacementFolder:
-    """The folder of the two files; replaces what it wrote itself, and others' when told to."""
+    """The folder of the two files; it replaces its own, and others' where `overwrite` allows it."""
 
     def __init__(self, path: str, overwrite: bool) -> None:
-        """Name the folder; it is made when something is written.
+        """Name the folder, which is created with the first file.
 
         Args:
             path: The folder.
@@ -301,7 +301,7 @@ class PlacementFolder:
         return bool(self._written)
 
     def check(self) -> None:
-        """Find what would keep a placement from being saved.
+        """Check that a placement can be saved.
 
         Raises:
             InputError: The folder is a file or holds a placement (`ExitCode.OUTPUT`).

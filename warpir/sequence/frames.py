@@ -216,7 +216,7 @@ def _make_video(
         say: Told why there is none.
 
     Returns:
-        What the summary says of it, by its name; empty where there is none.
+        Its entry in the summary, by its name; empty where there is none.
     """
     before, digest = _made_before(config), _video_digest(config)
     video = Path(str(config.output.out)) / VIDEO
@@ -248,7 +248,7 @@ def _video_digest(config: InsertConfig) -> str | None:
 
 
 def _made_before(config: InsertConfig) -> dict[str, Any]:
-    """Return what the summary says of an earlier video."""
+    """Return the summary's entry of an earlier video."""
     try:
         found = read_json_object(Path(str(config.output.out)) / SUMMARY).get("video")
     except InputError:
@@ -258,7 +258,7 @@ def _made_before(config: InsertConfig) -> dict[str, Any]:
 
 
 def _records(frames: Sequence[Frame]) -> list[dict[str, Any]]:
-    """Return what the summary says of the frames."""
+    """Return the summary's entries of the frames."""
     return [
         {
             "folder": frame.folder.name,

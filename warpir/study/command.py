@@ -254,7 +254,7 @@ def _files(
 
 
 def _origin(path: Path | None) -> dict[str, str]:
-    """Return what the key says of where an image is from; nothing of one that was made here."""
+    """Return the source of an image for the key; empty for one that was generated."""
     return {} if path is None else {"from": path.name, "sha256": file_hash(path)}
 
 

@@ -55,14 +55,14 @@ class Shown:
     pair: Pair
     a: Path
     b: Path | None
-    """None of a catch pair whose worse image is to be made of `a` and the photo."""
+    """None for a catch pair whose worse image is generated from `a` and the photo."""
     photo: Path | None = None
     """The untouched photo, which is shown beside the pair on demand."""
 
 
 @dataclass(frozen=True)
 class Material:
-    """What a study is made of."""
+    """Method, pairs and texts of a study."""
 
     method: str
     """Name of the method that all others are compared with."""

@@ -19,14 +19,14 @@ ALL, UNGROUPED = "all", "no group"
 PAIRS_PER_REPEAT = 10
 """One pair in so many is shown twice."""
 PAIRS_PER_CATCH = 20
-"""To one catch pair, where these are made."""
+"""Pairs for each catch pair, where these are generated."""
 MIXINGS = 20
 """Random exchanges for each cell of a table of sides."""
 
 
 @dataclass(frozen=True)
 class Pair:
-    """Two images of one scene; `a` and `b` are what the key tells apart and the pages do not."""
+    """Two images of one scene, `a` and `b`, which only the key tells apart."""
 
     scene: str
     group: str
