@@ -2,9 +2,9 @@
 
     python -m benchmarks.mis [--assets DIR] [--device cpu|cuda] [--threads N] [--json FILE]
 
-A ball of 64k triangles and ToyCar, 256 x 384, under a sun with 31 broad lobes and under a map of
-64 x 128 texels. A sample is one path of the object, or one point of the plane, with a direction of
-each technique per vertex.
+A ball of 64k triangles and ToyCar, 256 x 384, under maps of 64 x 128 texels: a sun with 31 broad
+lobes, and noise with a lamp. A sample is one path of the object, or one point of the plane, with a
+direction of each technique per vertex.
 """
 
 import argparse
@@ -13,18 +13,17 @@ from pathlib import Path
 import numpy as np
 import torch
 import trimesh
-from numpy.typing import NDArray
 
 from benchmarks.measure import context, peak_mib, report, seconds
 from warpir.core.arrays import IntArray
 from warpir.io.assets import load_asset
 from warpir.render.device_scene import Placed, Proxy, Scene
-from warpir.render.integrator import LightTensors, MaterialTensors
+from warpir.render.integrator import MaterialTensors
 from warpir.render.mis import MisIntegrator
 from warpir.render.renderer import Renderer, choose_device, light_args
 from warpir.scene.asset import Asset, Material, Primitive
 from warpir.scene.camera import camera_from_fov
-from warpir.scene.light import Light, Lobes
+from warpir.scene.light import Light, Lobes, as_map
 from warpir.scene.placement import place_asset
 
 WIDTH, HEIGHT = 384, 256
@@ -74,19 +73,6 @@ def lights() -> dict[str, Light]:
     return {"lobes": Light(sun_and_sky()), "map": Light(texels=texels.astype(np.float32))}
 
 
-def light_tensors(light: Light, grad: bool) -> LightTensors:
-    """Return the light as an optimiser holds it."""
-
-    def leaf(values: NDArray[np.float32]) -> torch.Tensor:
-        return torch.tensor(values, requires_grad=grad)
-
-    lobes = light.lobes
-    return LightTensors(
-        *(map(leaf, (lobes.amplitude, lobes.axis, lobes.sharpness)) if lobes else (None,) * 3),
-        texels=leaf(light.texels) if light.texels is not None else None,
-    )
-
-
 def material_tensors(renderer: Renderer) -> MaterialTensors:
     """Return the scene's base colour and roughness as free parameters."""
     material = renderer.scene.material_args
@@ -132,7 +118,8 @@ def main() -> None:
         objects = render.gbuffer(0).object_pixels
         for light_name, light in lights().items():
             shaded = render.shaded_pixels(light_args(light, render.device), 0)
-            fixed, free = light_tensors(light, False), light_tensors(light, True)
+            texels = as_map(light, MAP_HEIGHT)
+            fixed, free = torch.tensor(texels), torch.tensor(texels, requires_grad=True)
             for part, pixels, depth, materials in (
                 ("object", (objects, none), 1, False),
                 ("object", (objects, none), 5, False),
@@ -142,13 +129,13 @@ def main() -> None:
                 mis = MisIntegrator(render, *pixels, options.samples, 1, depth)
                 factors = material_tensors(render) if materials else None
 
-                def forward(mis: MisIntegrator = mis, fixed: LightTensors = fixed) -> None:
+                def forward(mis: MisIntegrator = mis, fixed: torch.Tensor = fixed) -> None:
                     with torch.no_grad():
                         mis.radiance(fixed, fixed, 0)
 
                 def both(
                     mis: MisIntegrator = mis,
-                    free: LightTensors = free,
+                    free: torch.Tensor = free,
                     factors: MaterialTensors | None = factors,
                 ) -> None:
                     out = mis.radiance(free, free, 0, factors)

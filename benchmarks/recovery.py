@@ -32,7 +32,6 @@ from warpir.optimize.light import LightOptimization, Unknowns
 from warpir.optimize.view import Frame
 from warpir.render.bridge import ComposeConstants, compose
 from warpir.render.device_scene import Placed, Proxy, Scene
-from warpir.render.integrator import LightTensors
 from warpir.render.mis import MisIntegrator
 from warpir.render.renderer import Renderer, light_args
 from warpir.render.tone_curve import Knots, ToneCurve
@@ -201,7 +200,7 @@ def reference(
     proxies = renderer.shaded_pixels(args, 99)
     mask = renderer.foreground(args, objects, 64, 1, 1, 99).mask
     mis = MisIntegrator(renderer, objects, proxies, samples, 2, frame.depth)
-    light = LightTensors(texels=torch.from_numpy(texels))
+    light = torch.from_numpy(texels)
     radiance = mis.radiance(light, light, 99)
     constants = ComposeConstants(
         frame.photo_lin, objects, proxies, mask, str(renderer.device.alias), frame.is_reinhard

@@ -1,14 +1,13 @@
 """Gradient of the light over recorded directions: radiance is linear in it.
 
 A pixel is ``sum_j weight_j * L(wi_j)`` with weights that do not depend on L (detached sampling), so
-``d_L(wi_j) = d_pixel * weight_j`` goes straight to the lobes and texels that shine there: no BRDF,
+``d_L(wi_j) = d_pixel * weight_j`` goes straight to the texels that shine there: no BRDF,
 no ray, no tape. Detached: it *is* the backward pass.
 """
 
 import warp as wp
 
 from warpir.kernels.latlong import bilinear_tap, direction_to_uv
-from warpir.kernels.sg import sg_shape
 from warpir.kernels.types import LightRecord
 
 wp.set_module_options({"enable_backward": False})
@@ -39,53 +38,6 @@ def radiance_gradient(d_pixel: wp.array[wp.mat33], record: LightRecord):
 
 
 @wp.kernel
-def lobe_gradient(
-    record: LightRecord,
-    first: wp.array[int],
-    block_size: int,
-    amplitude: wp.array[wp.vec3],
-    axis: wp.array[wp.vec3],
-    sharpness: wp.array[float],
-    d_amplitude: wp.array2d[wp.vec3],
-    d_axis: wp.array2d[wp.vec3],
-    d_sharpness: wp.array2d[float],
-):
-    """Add up one lobe's gradient over a block of pixels, in registers; one thread each.
-
-    Args:
-        record: Directions, and what `radiance_gradient` left; rows are pixels.
-        first: First pixel of each block, shape [block].
-        block_size: Pixels of a block; the last may have fewer.
-        amplitude: Lobe peaks, shape [lobe].
-        axis: Unit lobe axes, shape [lobe].
-        sharpness: Lobe concentration, shape [lobe].
-        d_amplitude: Output, shape [block, lobe]; so are the others.
-        d_axis: Output; of `sg_shape`, that is before the axis is normalised.
-        d_sharpness: Output.
-    """
-    block, k = wp.tid()
-    c = amplitude[k]
-    a = axis[k]
-    s = sharpness[k]
-    sum_amplitude = wp.vec3(0.0)
-    sum_axis = wp.vec3(0.0)
-    sum_sharpness = float(0.0)
-    for i in range(first[block], wp.min(first[block] + block_size, record.count.shape[0])):
-        for j in range(record.count[i]):
-            wi = record.wi[i, j]
-            d_L = record.weight[i, j]
-            shape = sg_shape(wi, a, s)
-            d_exponent = wp.dot(d_L, c) * shape
-            difference = wi - a
-            sum_amplitude += d_L * shape
-            sum_axis += difference * d_exponent
-            sum_sharpness += wp.dot(difference, difference) * d_exponent
-    d_amplitude[block, k] = sum_amplitude
-    d_axis[block, k] = sum_axis * s
-    d_sharpness[block, k] = -0.5 * sum_sharpness
-
-
-@wp.kernel
 def map_gradient(
     record: LightRecord,
     map_height: int,
@@ -94,7 +46,11 @@ def map_gradient(
 ):
     """Add each entry's gradient to the four texels that its direction reads; a thread a pixel.
 
-    Arguments are those of `lobe_gradient`; ``d_texels`` has shape [He, We].
+    Args:
+        record: Directions, and what `radiance_gradient` left; rows are pixels.
+        map_height: He.
+        map_width: We.
+        d_texels: Output, shape [He, We].
     """
     i = wp.tid()
     for j in range(record.count[i]):

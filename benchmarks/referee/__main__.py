@@ -32,6 +32,7 @@ from warpir.mitsuba.render import (
 from warpir.render.renderer import choose_device
 from warpir.scene.asset import Asset
 from warpir.scene.camera import Camera
+from warpir.scene.light import map_directions
 
 
 def foreground_gradient(
@@ -98,13 +99,11 @@ def gradient_line(
     """Compare lobe gradients through a rasterised map: ours against path replay in Mitsuba.
 
     The loss is ``sum(foreground * d_image)`` with colour ramps for ``d_image``; the map's gradient
-    of both is carried to the lobes by the same adjoint of `warpir.render.bridge.rasterize`.
+    of both is carried to the lobes by the same adjoint, of the lobes at the texels' centres.
     """
     import torch
 
     from warpir.lighting.fit import fit_lobes
-    from warpir.render.bridge import rasterize
-    from warpir.render.integrator import LightTensors
     from warpir.render.mis import MisIntegrator
 
     asset = load_asset(assets / preset.asset)
@@ -113,7 +112,9 @@ def gradient_line(
         torch.tensor(a, requires_grad=True)
         for a in (lobes.amplitude, lobes.axis, np.minimum(lobes.sharpness, 2000.0))
     ]
-    texels = rasterize(*leaves, 64, device)
+    amplitude, axis, sharpness = leaves
+    toward = torch.tensor(map_directions(64, 128), dtype=torch.float32)
+    texels = torch.exp((toward @ axis.T - 1.0) * sharpness) @ amplitude
     camera = preset.camera()
     row, column = np.mgrid[0 : camera.height, 0 : camera.width] / camera.height
     d_image = np.stack([0.5 + row, 0.5 + column, 1.5 - row], axis=-1)
@@ -143,8 +144,7 @@ def gradient_line(
         total = np.zeros(fixed.shape)
         for run in range(max(1, half // 64)):
             leaf = torch.tensor(fixed, requires_grad=True)
-            light = LightTensors(texels=leaf)
-            image = mis.radiance(light, light, seed=1000 * (k + 1) + run).foreground
+            image = mis.radiance(leaf, leaf, seed=1000 * (k + 1) + run).foreground
             (image * weight).sum().backward()
             assert leaf.grad is not None
             total += leaf.grad.double().numpy()

@@ -16,7 +16,7 @@ from torch import Tensor
 from benchmarks.speed.memory import PeakMemory
 from benchmarks.speed.scenes import SpeedScene
 from warpir.core.arrays import Float64Array
-from warpir.render.integrator import Integrator, LightTensors, Radiance
+from warpir.render.integrator import Integrator, Radiance
 from warpir.render.mis import MisIntegrator
 from warpir.scene.light import Light
 
@@ -126,15 +126,14 @@ class MisPart:
         return numpy(self._forward(seed))
 
     def _forward(self, seed: int) -> Tensor:
-        light = LightTensors(texels=self.bench.leaf(self.height, grad=False))
+        light = self.bench.leaf(self.height, grad=False)
         with torch.no_grad():
             return self._image(self.mis.radiance(light, light, seed))
 
     def step(self, seed: int) -> Callable[[], Step]:
         """Render and differentiate."""
         leaf = self.bench.leaf(self.height)
-        light = LightTensors(texels=leaf)
-        image = self._image(self.mis.radiance(light, light, seed))
+        image = self._image(self.mis.radiance(leaf, leaf, seed))
         (image * self.bench.weights[self.part]).sum().backward()  # type: ignore[no-untyped-call]
         self.bench.synchronize()
         return lambda: {self.part: (numpy(image), numpy(leaf.grad))}
@@ -229,14 +228,14 @@ class Transport:
     def forward(self, seed: int) -> None:
         """Render."""
         with torch.no_grad():
-            lights = (LightTensors(texels=self.bench.leaf(h, grad=False)) for h in self.heights)
+            lights = (self.bench.leaf(h, grad=False) for h in self.heights)
             shadow_ratio(self.traced.radiance(*lights, seed))
         self.bench.synchronize()
 
     def step(self, seed: int) -> Callable[[], Step]:
         """Render and differentiate."""
         leaves = [self.bench.leaf(height) for height in self.heights]
-        out = self.traced.radiance(*(LightTensors(texels=leaf) for leaf in leaves), seed)
+        out = self.traced.radiance(*leaves, seed)
         images = (out.foreground, shadow_ratio(out))
         weights = self.bench.weights
         loss = (images[0] * weights["foreground"]).sum() + (images[1] * weights["ratio"]).sum()

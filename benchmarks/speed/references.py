@@ -18,7 +18,8 @@ from torch import Tensor
 from benchmarks.speed.candidates import PARTS, Bench, MisPart, MitsubaPart, numpy
 from benchmarks.speed.ratios import rmse
 from warpir.core.arrays import BoolArray, Float64Array
-from warpir.render.integrator import LightTensors
+from warpir.render.renderer import light_args
+from warpir.scene.light import Light
 
 TRIMMED = 0.02
 """Share of pixels left out of an image's error: those in which `mis` is noisiest. A handful of
@@ -230,7 +231,7 @@ def _own(bench: Bench, part: str, height: int, spp: int) -> Float64Array:
 def _own_ratio(run: MisPart, seeds: list[int]) -> tuple[Float64Array, Float64Array]:
     """Divide means over many runs, so that the quotient's bias falls with all their samples."""
     bench = run.bench
-    light = LightTensors(texels=bench.leaf(run.height, grad=False))
+    light = bench.leaf(run.height, grad=False)
     lit, unoccluded = _plane_sums(run, light, seeds)
     seen = unoccluded > 0.0
     inverse = torch.where(seen, 1.0 / torch.where(seen, unoccluded, 1.0), 0.0)
@@ -240,15 +241,14 @@ def _own_ratio(run: MisPart, seeds: list[int]) -> tuple[Float64Array, Float64Arr
     total = np.zeros(bench.texels[run.height].shape)
     for seed in seeds:
         leaf = bench.leaf(run.height)
-        light = LightTensors(texels=leaf)
         # Seeds of their own: the adjoint must share no noise with what it multiplies
-        out = run.mis.radiance(light, light, seed + 500_000)
+        out = run.mis.radiance(leaf, leaf, seed + 500_000)
         torch.autograd.backward([out.lit, out.unoccluded], [d_lit.float(), d_unoccluded.float()])
         total += numpy(leaf.grad)
     return numpy(ratio), total / len(seeds)
 
 
-def _plane_sums(run: MisPart, light: LightTensors, seeds: list[int]) -> tuple[Tensor, Tensor]:
+def _plane_sums(run: MisPart, light: Tensor, seeds: list[int]) -> tuple[Tensor, Tensor]:
     """Average the plane's two radiances over runs, in float64."""
     lit = unoccluded = torch.zeros(1, dtype=torch.float64, device=run.bench.device)
     with torch.no_grad():
@@ -263,21 +263,28 @@ def _own_lobes(bench: Bench, part: str, spp: int) -> Float64Array:
     """Converge `mis` under the lobes themselves: two halves of the image, shape [2, image]."""
     chunk = min(CHUNK, spp // 2)
     run = MisPart(bench, part, bench.heights[part][0], chunk)
-    light = LightTensors(
-        *(torch.tensor(a, device=bench.device) for a in astuple(bench.scene.lobes))
-    )
+    scene, renderer = bench.scene, bench.scene.renderer
+    light = light_args(Light(scene.lobes), renderer.device)
     halves = []
     for half in range(2):
         seeds = [SEED * (half + 5) + k for k in range(spp // 2 // chunk)]
         if part == "ratio":
-            lit, unoccluded = _plane_sums(run, light, seeds)
+            mis = run.mis
+            runs = [
+                renderer.proxy(light, mis.proxy_pixels, mis.may_see_object, chunk, 1, seed)
+                for seed in seeds
+            ]
+            lit = np.mean([r.lit.astype(np.float64) for r in runs], axis=0)
+            unoccluded = np.mean([r.unoccluded.astype(np.float64) for r in runs], axis=0)
             seen = unoccluded > 0.0
-            image = torch.where(seen, lit / torch.where(seen, unoccluded, 1.0), 1.0)
+            image = np.where(seen, lit / np.where(seen, unoccluded, 1.0), 1.0)
         else:
-            with torch.no_grad():
-                runs = [run.mis.radiance(light, light, s).foreground.double() for s in seeds]
-            image = torch.stack(runs).mean(dim=0)
-        halves.append(numpy(image).ravel())
+            images = (
+                renderer.foreground(light, scene.object_pixels, chunk, 1, scene.depth, seed)
+                for seed in seeds
+            )
+            image = np.mean([x.radiance.astype(np.float64) for x in images], axis=0)
+        halves.append(image.ravel())
     return np.stack(halves)
 
 

@@ -9,18 +9,16 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-import torch
 
 from benchmarks.referee import ours
 from warpir.core.arrays import Float64Array, FloatArray, IntArray
 from warpir.io.assets import load_asset
 from warpir.io.images.photos import read_envmap
 from warpir.lighting.fit import fit_lobes
-from warpir.render.bridge import rasterize
 from warpir.render.renderer import Renderer, light_args
 from warpir.scene.asset import Asset, Material, Primitive
 from warpir.scene.camera import Camera, camera_from_fov
-from warpir.scene.light import Light, Lobes, axis_from_angles, resize_map
+from warpir.scene.light import Light, Lobes, axis_from_angles, rasterize_lobes, resize_map
 from warpir.scene.placement import place_asset
 
 NAMES = ("ball", "toycar", "metal")
@@ -60,11 +58,7 @@ class SpeedScene:
 
     def texels(self, height: int) -> FloatArray:
         """Return the light as a map, relative [W/(m^2 sr)], shape [height, 2 height, 3]."""
-        parts = (self.lobes.amplitude, self.lobes.axis, self.lobes.sharpness)
-        leaves = [torch.tensor(a) for a in parts]
-        device = str(self.renderer.device.alias)
-        made: FloatArray = rasterize(*leaves, height, device).cpu().numpy()
-        return made
+        return rasterize_lobes(self.lobes, height, 2 * height)
 
 
 def uv_ball(rows: int = 128, columns: int = 256) -> Primitive:

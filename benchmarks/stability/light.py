@@ -32,7 +32,6 @@ from warpir.kernels.tone import reinhard, tone_curve
 from warpir.kernels.types import LightArgs
 from warpir.lighting.fusion import fuse
 from warpir.render.device_scene import Scene
-from warpir.render.integrator import LightTensors
 from warpir.render.mis import MisIntegrator
 from warpir.render.renderer import Renderer, light_args
 from warpir.render.tone_curve import ToneCurve
@@ -236,7 +235,7 @@ def plane(device: str, make: Callable[[], np.ndarray], has_gradient: bool = Fals
     if has_gradient:
         integrator.spp = 4096
     tensor = torch.tensor(texels, requires_grad=has_gradient)
-    light = LightTensors(texels=tensor)
+    light = tensor
     if has_gradient:
         unoccluded = integrator.radiance(light, light, 3).unoccluded
         unoccluded.mean(dim=0).sum().backward()

@@ -9,7 +9,7 @@ from tests import oracles
 from warpir.core.arrays import BoolArray, Float64Array, FloatArray
 from warpir.kernels.shade import shade_vertex
 from warpir.kernels.types import LightRecord, VertexRecord
-from warpir.render.integrator import LightTensors, MaterialTensors
+from warpir.render.integrator import MaterialTensors
 from warpir.render.samples import ObjectSamples
 
 
@@ -25,21 +25,13 @@ def used(record: LightRecord) -> BoolArray:
     return filled
 
 
-def incident(record: LightRecord, light: LightTensors) -> Tensor:
+def incident(record: LightRecord, light: Tensor) -> Tensor:
     """Radiance from each filled entry's direction, float64, shape [entry, 3]; differentiable."""
     wi = record.wi.numpy()[used(record)].astype(np.float64)
-    total = torch.zeros(len(wi), 3, dtype=torch.float64)
-    if light.amplitude is not None and light.axis is not None and light.sharpness is not None:
-        # The kernels' form, which differs from the dot product where the axis is not of unit length
-        distance = ((torch.from_numpy(wi)[:, None] - light.axis.double()) ** 2).sum(-1)
-        lobes = torch.exp(-0.5 * light.sharpness.double() * distance)
-        total = total + lobes @ light.amplitude.double()
-    if light.texels is not None:
-        texels = light.texels.double()
-        rows, columns, weights = oracles.bilinear_weights(oracles.latlong_uv(wi), *texels.shape[:2])
-        taps = texels[torch.from_numpy(rows), torch.from_numpy(columns)]
-        total = total + (taps * torch.from_numpy(weights)[..., None]).sum(-2)
-    return total
+    texels = light.double()
+    rows, columns, weights = oracles.bilinear_weights(oracles.latlong_uv(wi), *texels.shape[:2])
+    taps = texels[torch.from_numpy(rows), torch.from_numpy(columns)]
+    return (taps * torch.from_numpy(weights)[..., None]).sum(-2)
 
 
 def pixel_sums(record: LightRecord, gathered: Tensor) -> Tensor:
@@ -48,13 +40,13 @@ def pixel_sums(record: LightRecord, gathered: Tensor) -> Tensor:
     return torch.zeros(len(record.count), 3, dtype=torch.float64).index_add(0, pixel, gathered)
 
 
-def object_sums(record: LightRecord, light: LightTensors) -> Tensor:
+def object_sums(record: LightRecord, light: Tensor) -> Tensor:
     """The object's pixels under ``light``, without what it emits, shape [pixel, 3]."""
     weight = torch.from_numpy(record.weight.numpy()[used(record)].astype(np.float64))
     return pixel_sums(record, weight * incident(record, light))
 
 
-def plane_sums(record: LightRecord, light: LightTensors) -> tuple[Tensor, Tensor]:
+def plane_sums(record: LightRecord, light: Tensor) -> tuple[Tensor, Tensor]:
     """The plane's pixels with and without the object, shape [pixel, 3] each."""
     weight = torch.from_numpy(record.weight.numpy()[used(record)].astype(np.float64))
     Li = incident(record, light)

@@ -260,11 +260,11 @@ def test_every_kernel_that_adds_in_common_places_can_be_ordered() -> None:
     """Warp refuses to order what also reads the sums; compiling for CUDA says so without a GPU."""
     import tempfile
 
-    from warpir.kernels import composite, light_gradient, rasterize, shade
+    from warpir.kernels import composite, light_gradient, shade
 
     if not wp._src.context.runtime.nvrtc_supported_archs:
         pytest.skip("Warp has no CUDA compiler here")
-    for module in (composite, light_gradient, rasterize, shade):
+    for module in (composite, light_gradient, shade):
         before = wp.get_module_options(module)
         wp.set_module_options(
             {"deterministic": wp.DeterministicMode.RUN_TO_RUN, "deterministic_max_records": 16},

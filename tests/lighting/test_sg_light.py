@@ -14,8 +14,7 @@ from warpir.lighting.sg_light import (
     SGLight,
     narrowest,
 )
-from warpir.render.bridge import rasterize
-from warpir.scene.light import Lobes, fibonacci
+from warpir.scene.light import Lobes, fibonacci, rasterize_lobes
 
 FLOAT32 = 2e-6
 """About ten float32 operations, relative: logarithms, exponentials, norms."""
@@ -178,8 +177,8 @@ def test_texels_hold_the_flux(sigma: float) -> None:
 
 
 @pytest.mark.parametrize("height", [16, 32])
-def test_texels_agree_with_averaging(device: str, height: int) -> None:
-    """`bridge.rasterize` averages over texels: the same flux, and the same texels to two orders.
+def test_texels_agree_with_averaging(height: int) -> None:
+    """`rasterize_lobes` averages over texels: the same flux, and the same texels to two orders.
 
     Fluxes agree to 3 % at a pole, elsewhere to 0.3 % (lobes six times as wide reach the poles). A
     texel's mean of a parabola of curvature ``1 / sigma^2`` is ``2 / 24 / 1.25^2`` = 5.3 % of the
@@ -195,9 +194,8 @@ def test_texels_agree_with_averaging(device: str, height: int) -> None:
     for axis in ((0.3, 0.2, -0.9), (-0.7, 0.6, 0.2), (0.0, 1.0, 0.0), (0.0, -1.0, 0.0)):
         for factor in (1.0, 6.0):
             light = one_lobe(axis, factor * bounds.sigma_min, bounds=bounds)
-            amplitude, unit, sharpness = map(torch.from_numpy, vars(light.lobes()).values())
-            averaged = rasterize(amplitude, unit, sharpness, height, device)
-            mean = averaged.numpy()[..., 0].astype(np.float64)
+            averaged = rasterize_lobes(light.lobes(), height, 2 * height)
+            mean = averaged[..., 0].astype(np.float64)
             with torch.no_grad():
                 texels = light.texels(height).numpy()[..., 0].astype(np.float64)
             bound = 0.03 if axis[0] == 0.0 else 0.003

@@ -331,7 +331,7 @@ def test_material_gradient_matches_central_differences(part: str) -> None:
     (found,) = torch.autograd.grad((weight * loop.final_image(seed)).sum(), raw)
 
     factors = plain_factors(loop.unknowns())
-    samples = ObjectSamples(loop.mis, lit.args_fg, seed, factors, (False,) * 4 + (True,) * 4)
+    samples = ObjectSamples(loop.mis, lit.args_fg, seed, factors, (False,) + (True,) * 4)
     _, _, record = samples.draw(slice(None))
     assert record is not None
 

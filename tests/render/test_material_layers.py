@@ -21,7 +21,6 @@ from tests.render.test_render import (
     shadow,
 )
 from tests.render.test_transport import EXACT, HEIGHT, lights, pixels_of
-from warpir.render.integrator import LightTensors
 from warpir.render.mis import MisIntegrator
 from warpir.render.transport.integrator import TransportIntegrator
 from warpir.scene.asset import Material, Primitive, Texture, TextureSlot
@@ -163,7 +162,7 @@ def test_transport_agrees_with_mis_on_layered_materials(device: str) -> None:
     renderer = make(scene, view, device, 0.0)
     objects, proxies = pixels_of(renderer)
     light = Light(lobes=lights(6.0))
-    texels = LightTensors(texels=torch.from_numpy(as_map(light, HEIGHT)))
+    texels = torch.from_numpy(as_map(light, HEIGHT))
     own = [
         TransportIntegrator(renderer, objects, proxies, 2, EXACT, light, seed).radiance(
             texels, texels, 0

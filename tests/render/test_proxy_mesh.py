@@ -19,7 +19,7 @@ from tests.oracles import (
     sg_irradiance,
 )
 from tests.render.test_render import DOWN, foot, render, shadow
-from tests.render.test_transport import FLOOR, _objects, _ratios, leaves
+from tests.render.test_transport import FLOOR, _objects, _ratios
 from tests.statistics import compare_gradients, z_test
 from warpir.app.command import parse
 from warpir.app.config import InsertConfig
@@ -32,7 +32,7 @@ from warpir.lighting.scene_light import make_light
 from warpir.render.bridge import host_light
 from warpir.render.composite import Quality, make_picture, scene_of
 from warpir.render.device_scene import Placed, Scene
-from warpir.render.integrator import LightTensors, MaterialTensors
+from warpir.render.integrator import MaterialTensors
 from warpir.render.mis import MisIntegrator
 from warpir.render.renderer import Renderer, light_args
 from warpir.render.samples import PlaneSamples
@@ -248,15 +248,15 @@ def test_place_hides_the_object_from_the_camera(device: str) -> None:
 # ----------------------------------------------------------------------- both integrators
 
 
-def corner(device: str) -> Renderer:
-    """A ball before a wall of uneven photo on the ground, which shades part of it."""
+def corner(device: str, is_black: bool = False) -> Renderer:
+    """A ball before a wall of uneven photo, or black, on the ground, which shades part of it."""
     wall = mesh(quad((0.7, 0.6, -4.6), (0.8, 0, 0.5), (0, 0.9, 0)))
     ball = placed(
         sphere((0.0, 0.5, -4.0), 0.5, 3), Material(base_color=(0.8, 0.6, 0.4), metallic=0.2)
     )
     view = camera(20, 14, 30.0, (0.3, 1.5, 0.0), -14.0)
     photo = np.random.default_rng(1).uniform(0.1, 0.9, (14, 20, 3)).astype(np.float32)
-    return make(ball, view, device, wall, 0.0, photo)
+    return make(ball, view, device, wall, 0.0, None if is_black else photo)
 
 
 def some_lobes() -> Lobes:
@@ -285,7 +285,7 @@ def test_transport_agrees_with_mis_in_a_place(device: str) -> None:
     renderer = corner(device)
     objects, proxies = pixels_of(renderer)
     texels = torch.tensor(as_map(Light(some_lobes()), HEIGHT), requires_grad=True)
-    light = LightTensors(texels=texels)
+    light = texels
     expected = Light(texels=texels.detach().numpy())
     own, own_gradients, other, other_gradients = [], [], [], []
     rng = np.random.default_rng(3)
@@ -328,7 +328,7 @@ def test_transport_in_a_place_stays_exact_at_both_ends(device: str) -> None:
     objects, proxies = pixels_of(renderer)
     settings = replace(SETTINGS, dtype="bfloat16")
     made = TransportIntegrator(renderer, objects, proxies, 1, settings)
-    sun = LightTensors(texels=torch.from_numpy(as_map(Light(some_lobes()), HEIGHT)))
+    sun = torch.from_numpy(as_map(Light(some_lobes()), HEIGHT))
     out = made.radiance(sun, sun, 0)
     ratio = (out.lit / out.unoccluded).cpu()
     free = (made.T_shadow.by_row.crow_indices().diff() == 0).cpu()
@@ -349,7 +349,7 @@ def test_transport_gradient_in_a_place_matches_differences(device: str) -> None:
     toward = torch.rand(texels.shape, generator=torch.Generator().manual_seed(1))
 
     def loss(light: torch.Tensor) -> torch.Tensor:
-        out = made.radiance(LightTensors(texels=light), LightTensors(texels=light), 0)
+        out = made.radiance(light, light, 0)
         seen = out.unoccluded > 1e-3
         ratio = torch.where(seen, out.lit / out.unoccluded.clamp(min=1e-3), 1.0)
         return (out.foreground.double() ** 2).sum() + (ratio.double() ** 3).sum()
@@ -361,49 +361,31 @@ def test_transport_gradient_in_a_place_matches_differences(device: str) -> None:
     assert float((d_texels * toward).sum()) == pytest.approx(numeric, rel=0.01)
 
 
-def test_sharp_lobes_beside_the_rows_bounce_once(device: str) -> None:
-    """Lobes left to `mis` add no second copy of what the mesh sends."""
-    renderer = corner(device)
-    objects, proxies = pixels_of(renderer)
-    made = TransportIntegrator(renderer, objects, proxies, 2, replace(SETTINGS, paths=256))
-    axis, sharpness = torch.tensor([[0.0, 1.0, 0.0]]), torch.tensor([1e4])
-    dark = LightTensors(torch.full((1, 3), 1e-9), axis, sharpness)
-    out = made.radiance(dark, dark, 0)
-    mis = MisIntegrator(renderer, objects, proxies, spp=256, rays=1, depth=2)
-    own = mis.radiance(dark, dark, 1)
-    assert float(own.foreground.sum()) > 0.1
-    for name in ("foreground", "lit", "unoccluded"):
-        found, truth = float(getattr(out, name).sum()), float(getattr(own, name).sum())
-        assert found == pytest.approx(truth, rel=0.06), name
-
-
 def test_mis_gradients_match_central_differences(device: str) -> None:
     """Of light and material, over the recorded samples; what the mesh sends is a constant."""
     renderer = corner(device)
     objects, proxies = pixels_of(renderer)
     mis = MisIntegrator(renderer, objects, proxies, spp=16, rays=2, depth=2)
-    handed = LightTensors(*leaves(some_lobes()))
-    free = (True, True, True, False)
-    samples = PlaneSamples(mis, light_args(host_light(handed), renderer.device), 5, free)
+    texels = torch.tensor(as_map(Light(some_lobes()), HEIGHT), requires_grad=True)
+    args = light_args(host_light(texels), renderer.device)
+    samples = PlaneSamples(mis, args, 5, (True,))
     drawn = samples.render()
     assert samples.kept is not None
-    lit, unoccluded = plane_sums(samples.kept, handed)
-    dark = PlaneSamples(
-        MisIntegrator(renderer, objects, proxies, 16, 2, 2, mesh_shines=False),
-        samples.args, 5, (False,) * 4,
-    ).render()  # fmt: skip
+    lit, unoccluded = plane_sums(samples.kept, texels)
+    black = MisIntegrator(corner(device, is_black=True), objects, proxies, 16, 2, 2)
+    dark = PlaneSamples(black, args, 5, (False,)).render()
     np.testing.assert_allclose(lit.detach(), dark.lit, rtol=1e-4, atol=1e-6)
     np.testing.assert_allclose(unoccluded.detach(), dark.unoccluded, rtol=1e-4, atol=1e-6)
     assert (drawn.unoccluded - dark.unoccluded).max() > 0.05
     found = samples.gradient(np.ones_like(drawn.lit), -2.0 * np.ones_like(drawn.lit))
-    expected = torch.autograd.grad((lit - 2.0 * unoccluded).sum(), handed.amplitude)[0]
+    (expected,) = torch.autograd.grad((lit - 2.0 * unoccluded).sum(), texels)
     assert found[0] is not None
     assert compare_gradients(found[0], expected.double().numpy()).relative_l2 < 1e-4
 
     # A black light: all that the object shows comes from the wall, in proportion to a Lambertian
     # colour where it is seen once.
     color = torch.tensor([[0.5, 0.5, 0.5]], requires_grad=True)
-    fixed = LightTensors(texels=torch.zeros(4, 8, 3))
+    fixed = torch.zeros(4, 8, 3)
     metallic = torch.tensor([1.0])
     matte = MaterialTensors(base_color=color, metallic=metallic, roughness=torch.tensor([1.0]))
     once = MisIntegrator(renderer, objects, proxies, spp=16, rays=2, depth=1)

@@ -16,12 +16,12 @@ from warpir.core.arrays import Float64Array, IntArray
 from warpir.core.cache import take_notices
 from warpir.core.errors import ExitCode, InputError
 from warpir.render.device_scene import Scene
-from warpir.render.integrator import LightTensors, MaterialTensors, Radiance
+from warpir.render.integrator import MaterialTensors, Radiance
 from warpir.render.mis import MisIntegrator
 from warpir.render.renderer import Renderer
 from warpir.render.transport import cache as transport_cache
 from warpir.render.transport import rows as transport_rows
-from warpir.render.transport.integrator import TransportIntegrator, edge_width
+from warpir.render.transport.integrator import TransportIntegrator
 from warpir.render.transport.matrix import DenseRows, product
 from warpir.render.transport.rows import (
     TransportSettings,
@@ -85,12 +85,6 @@ def lights(sun: float = 60.0) -> Lobes:
     peak[0] *= sun / 6.0
     sharpness = np.array([sun, 3.0, 8.0])
     return Lobes(*(a.astype(np.float32) for a in (peak, axis, sharpness)))
-
-
-def leaves(lobes: Lobes) -> list[torch.Tensor]:
-    return [
-        torch.tensor(a, requires_grad=True) for a in (lobes.amplitude, lobes.axis, lobes.sharpness)
-    ]
 
 
 def test_transport_tents_share_out_the_sphere() -> None:
@@ -157,7 +151,7 @@ def test_transport_agrees_with_mis(
     renderer = scene_of(device, roughness, metallic)
     objects, proxies = pixels_of(renderer)
     light = Light(lobes=lights(sun))
-    texels = LightTensors(texels=torch.from_numpy(as_map(light, HEIGHT)))
+    texels = torch.from_numpy(as_map(light, HEIGHT))
     own = [
         TransportIntegrator(renderer, objects, proxies, depth, EXACT, light, seed).radiance(
             texels, texels, 0
@@ -205,7 +199,7 @@ def test_transport_gradient_agrees_with_mis(device: str) -> None:
     weight_ratio = torch.tensor(rng.uniform(0.5, 1.5, (len(proxies), 3)), dtype=torch.float32)
 
     def gradient(integrator: TransportIntegrator | MisIntegrator, seed: int) -> Float64Array:
-        handed = LightTensors(texels=texels)
+        handed = texels
         out = integrator.radiance(handed, handed, seed)
         ratio = out.lit / out.unoccluded.clamp(min=1e-6)
         loss = (out.foreground.cpu() * weight_fg).sum() + (ratio.cpu() * weight_ratio).sum()
@@ -225,34 +219,32 @@ def test_transport_gradient_agrees_with_mis(device: str) -> None:
 
 
 def test_transport_gradient_matches_central_differences(device: str) -> None:
-    """Gradients with respect to lobes are those of the very function that radiance computes."""
+    """Gradients with respect to texels are those of the very function that radiance computes."""
     renderer = scene_of(device)
     objects, proxies = pixels_of(renderer)
     light = Light(lobes=lights(20.0))
     made = TransportIntegrator(renderer, objects, proxies, 2, EXACT, light)
-    raw = leaves(lights(20.0))
+    texels = torch.tensor(as_map(light, HEIGHT), requires_grad=True)
 
-    def loss(tensors: list[torch.Tensor]) -> torch.Tensor:
-        axis = torch.nn.functional.normalize(tensors[1], dim=1)
-        handed = LightTensors(tensors[0], axis, tensors[2])
-        out = made.radiance(handed, handed, 0)
+    def loss(texels: torch.Tensor) -> torch.Tensor:
+        out = made.radiance(texels, texels, 0)
         weight = torch.linspace(0.5, 1.5, 3)
         ratio = out.lit / out.unoccluded
         return ((out.foreground * weight).double() ** 2).sum() + (ratio.double() ** 3).sum()
 
-    gradients = torch.autograd.grad(loss(raw), raw)
-    for k, step in enumerate((1e-2, 3e-3, 3e-2)):
-        numeric = np.zeros(raw[k].shape)
-        for index in np.ndindex(*raw[k].shape):
-            sides = []
-            for sign in (1.0, -1.0):
-                moved = [r.detach().clone() for r in raw]
-                moved[k][index] += sign * step * (1.0 if k < 2 else float(raw[k].detach()[index]))
-                sides.append(float(loss(moved)))
-            width = 2.0 * step * (1.0 if k < 2 else float(raw[k].detach()[index]))
-            numeric[index] = (sides[0] - sides[1]) / width
-        match = compare_gradients(gradients[k].numpy(), numeric)
-        assert match.relative_l2 < 0.02 and match.cosine > 0.999, (k, match)
+    (gradient,) = torch.autograd.grad(loss(texels), texels)
+    picked = np.linspace(0, texels.numel() - 1, 48).astype(int)
+    numeric = np.zeros(len(picked))
+    step = 0.05
+    for k, index in enumerate(picked):
+        sides = []
+        for sign in (1.0, -1.0):
+            moved = texels.detach().clone()
+            moved.view(-1)[index] += sign * step
+            sides.append(float(loss(moved)))
+        numeric[k] = (sides[0] - sides[1]) / (2.0 * step)
+    match = compare_gradients(gradient.reshape(-1)[picked].numpy(), numeric)
+    assert match.relative_l2 < 0.02 and match.cosine > 0.999, match
 
 
 def test_transport_adjoint_and_linearity(device: str) -> None:
@@ -304,7 +296,7 @@ def test_transport_shadow_ratio_stays_within_its_bounds(device: str) -> None:
     handed = lights(400.0)
     made = TransportIntegrator(renderer, objects, proxies, 1, SMALL, Light(lobes=handed))
     sun = Light(lobes=Lobes(handed.amplitude[:1], handed.axis[:1], handed.sharpness[:1]))
-    texels = LightTensors(texels=torch.from_numpy(as_map(sun, HEIGHT)))
+    texels = torch.from_numpy(as_map(sun, HEIGHT))
     out = made.radiance(texels, texels, 0)
     ratio = out.lit / out.unoccluded
     assert float(ratio.max()) <= 1.0 and float(ratio.min()) >= 0.0
@@ -320,7 +312,7 @@ def test_transport_adds_what_does_not_depend_on_the_light(device: str) -> None:
     """In darkness the object shows its own emission, and that of what it reflects."""
     renderer = scene_of(device, emission=(2.0, 1.0, 0.5))
     objects, proxies = pixels_of(renderer)
-    dark = LightTensors(texels=torch.zeros(HEIGHT, 2 * HEIGHT, 3))
+    dark = torch.zeros(HEIGHT, 2 * HEIGHT, 3)
     settings = replace(EXACT, subsamples=32, paths=256)
     own = TransportIntegrator(renderer, objects, proxies, 2, settings).radiance(dark, dark, 0)
     reference = MisIntegrator(renderer, objects, proxies, spp=512, rays=1, depth=2)
@@ -328,12 +320,6 @@ def test_transport_adds_what_does_not_depend_on_the_light(device: str) -> None:
     assert float(truth.max()) > 1.0
     assert float(own.foreground.sum()) == pytest.approx(float(truth.sum()), rel=0.01)
     assert bool((own.lit == own.unoccluded).all())
-    # Lobes that are left to mis bring the light alone, not the emission once more.
-    sun = LightTensors(*(torch.from_numpy(a) for a in vars(lights(50_000.0)).values()))
-    made = TransportIntegrator(renderer, objects, proxies, 2, settings)
-    both = np.mean([made.radiance(sun, sun, s).foreground.numpy().sum() for s in range(16)])
-    truth = reference.radiance(sun, sun, 2).foreground
-    assert both == pytest.approx(float(truth.sum()), rel=0.03)
 
 
 def test_transport_does_not_depend_on_threads_or_chunks(
@@ -355,59 +341,6 @@ def test_transport_does_not_depend_on_threads_or_chunks(
         assert torch.equal(other.T_shadow.by_column.values(), first.T_shadow.by_column.values())
 
 
-@pytest.mark.slow
-def test_transport_leaves_sharp_suns_to_mis(device: str) -> None:
-    """A real sun keeps its sharp shadow: in expectation that of `mis` under the lobes."""
-    renderer = scene_of(device)
-    objects, proxies = pixels_of(renderer)
-    raw = leaves(lights(50_000.0))
-    handed = LightTensors(*raw)
-    made = TransportIntegrator(
-        renderer, objects, proxies, 2, replace(EXACT, sharp_samples=16), Light(lobes=lights(20.0))
-    )
-    reference = MisIntegrator(renderer, objects, proxies, spp=256, rays=1, depth=2)
-    blurred = TransportIntegrator(
-        renderer, objects, proxies, 2, replace(EXACT, sharp_samples=0), Light(lobes=lights(20.0))
-    )
-    with torch.no_grad():
-        own, _ = _ratios([made.radiance(handed, handed, s) for s in range(32)])
-        truth, _ = _ratios([reference.radiance(handed, handed, s) for s in range(8)])
-        without, _ = _ratios([blurred.radiance(handed, handed, s) for s in range(2)])
-    error, error_without = (np.sqrt(np.square(x - truth).mean()) for x in (own, without))
-    assert error < 0.01 and error_without > 4.0 * error, (error, error_without)
-    made = TransportIntegrator(renderer, objects, proxies, 2, SMALL)
-    out = made.radiance(handed, handed, 0)
-    gradients = torch.autograd.grad(out.foreground.sum() + out.lit.sum(), raw)
-    for gradient in gradients:
-        assert bool(torch.isfinite(gradient).all()) and bool((gradient[0] != 0.0).any())
-
-
-def test_transport_edge_width_is_that_of_the_map() -> None:
-    """A lobe's second moment on a bilinear map grows as `edge_width` says."""
-    height, sharpness = 24, 400.0
-    axis = np.array([0.6, 0.1, 0.8])
-    axis /= np.linalg.norm(axis)
-    texels = as_map(lobe(axis, sharpness), height)[..., 0].astype(np.float64)
-    fine = 24 * height
-    at = (np.arange(fine) + 0.5) / 24 - 0.5
-    low, part = np.floor(at).astype(int), at - np.floor(at)
-    big = (
-        texels[np.clip(low, 0, height - 1)] * (1 - part)[:, None]
-        + texels[np.clip(low + 1, 0, height - 1)] * part[:, None]
-    )
-    at = (np.arange(2 * fine) + 0.5) / 24 - 0.5
-    low, part = np.floor(at).astype(int), at - np.floor(at)
-    width = 2 * height
-    big = big[:, low % width] * (1 - part) + big[:, (low + 1) % width] * part
-    weight = big * texel_solid_angles(fine, 2 * fine)[:, None]
-    cosine = map_directions(fine, 2 * fine) @ axis
-    # Two axes share the squared angle.
-    variance = (weight * np.arccos(np.clip(cosine, -1, 1)) ** 2).sum() / weight.sum() / 2.0
-    exact, blurred = edge_width(sharpness, height)
-    assert exact == pytest.approx(0.05)
-    assert np.sqrt(variance) == pytest.approx(blurred, rel=0.03)
-
-
 def test_transport_puts_directions_where_light_is_expected() -> None:
     """Each texel gets one direction; a sun gets a power of two of the budget."""
     sun = as_map(lobe((0.0, 1.0, 0.3), 500.0), 16)
@@ -423,7 +356,7 @@ def test_transport_splits_directions_between_texels_that_share_a_sun(device: str
     renderer = scene_of(device)
     objects, proxies = pixels_of(renderer)
     angle = np.pi * (1.0 - 2.0 * 10 / (2 * HEIGHT))  # where columns 9 and 10 meet
-    sun = lobe((np.sin(angle), 0.13, np.cos(angle)), 3000.0)
+    sun = lobe((np.sin(angle), 0.13, np.cos(angle)), 200.0)
     made = TransportIntegrator(renderer, objects, proxies, 1, SMALL, sun)
     counts = direction_counts(made.expected[0], 100).reshape(HEIGHT, -1)
     row = counts.max(axis=1).argmax()
@@ -498,7 +431,7 @@ def test_transport_refuses_what_it_cannot_do(device: str) -> None:
     renderer = scene_of(device)
     objects, proxies = pixels_of(renderer)
     made = TransportIntegrator(renderer, objects, proxies, 1, SMALL)
-    light = LightTensors(texels=torch.ones(8, 16, 3))
+    light = torch.ones(8, 16, 3)
     made.radiance(light, light, 0, MaterialTensors())
     with pytest.raises(ValueError, match="use mis"):
         made.radiance(light, light, 0, MaterialTensors(metallic=torch.zeros(2)))
@@ -515,7 +448,7 @@ def test_transport_of_nothing(device: str) -> None:
     renderer = Renderer(Scene([], view, ground(0.0), device))
     none = np.zeros(0, np.int32)
     made = TransportIntegrator(renderer, none, all_pixels(view), 2, SMALL)
-    light = LightTensors(texels=torch.ones(HEIGHT, 2 * HEIGHT, 3, requires_grad=True))
+    light = torch.ones(HEIGHT, 2 * HEIGHT, 3, requires_grad=True)
     out = made.radiance(light, light, 0)
     assert out.foreground.shape == (0, 3) and torch.equal(out.lit, out.unoccluded)
     assert float(out.lit.detach().mean()) == pytest.approx(1.0, abs=1e-4)

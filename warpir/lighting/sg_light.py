@@ -131,7 +131,7 @@ class SGLight(torch.nn.Module):
         """Return the light as a lat-long map, shape [height, 2 height, 3]; differentiable.
 
         Each texel holds the light at its centre, which is exact enough for lobes of at least
-        `TEXELS_PER_SIGMA` texels; `warpir.render.bridge.rasterize` averages lobes of any width.
+        `TEXELS_PER_SIGMA` texels; `warpir.scene.light.rasterize_lobes` averages lobes of any width.
         """
         directions = _directions(height, self.axis.device, self.axis.dtype)
         axis = self.axis / self.axis.norm(dim=1, keepdim=True)

@@ -243,9 +243,9 @@ class MaterialRefinement(Optimization):
         """Return the composite with the materials as they are."""
         found: MaterialTensors = self.unknowns()
         factors = found.base_color, found.metallic, found.roughness, found.emission
-        light = (None,) * 4  # all of it is in the arguments: it stands still
+        # The light stands still, so it has no map to differentiate.
         foreground: Tensor = ShadeForeground.apply(
-            self.mis, self.lit.args_fg, seed, torch.is_grad_enabled(), *light, *factors
+            self.mis, self.lit.args_fg, seed, torch.is_grad_enabled(), None, *factors
         )
         return self.lit.image(foreground, *self.curves)
 

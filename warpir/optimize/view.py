@@ -16,7 +16,7 @@ from torch import Tensor
 
 from warpir.core.arrays import FloatArray, IntArray, PixelArray
 from warpir.render.bridge import ComposeConstants, compose
-from warpir.render.integrator import Integrator, LightTensors, Radiance
+from warpir.render.integrator import Integrator, Radiance
 from warpir.render.mis import MisIntegrator
 from warpir.render.renderer import Renderer, light_args
 from warpir.render.tone_curve import Knots
@@ -119,8 +119,7 @@ class View:
 
     def radiance(self, texels_fg: Tensor, texels_shadow: Tensor, seed: int) -> Radiance:
         """Return what the integrator does; arguments are those of `image`."""
-        light_fg, light_shadow = LightTensors(texels=texels_fg), LightTensors(texels=texels_shadow)
-        return self.integrator.radiance(light_fg, light_shadow, seed)
+        return self.integrator.radiance(texels_fg, texels_shadow, seed)
 
     def compose(self, radiance: Radiance, curve_fg: Knots, curve_shadow: Knots) -> Tensor:
         """Return the composite of rendered radiance, display-encoded, shape [1, 3, H, W]."""

@@ -15,14 +15,12 @@ from torch import Tensor
 
 from warpir.core.arrays import FloatArray, IntArray
 from warpir.kernels import composite as composite_kernels
-from warpir.kernels.rasterize import rasterize as rasterize_kernel
 from warpir.kernels.shadow_ratio import shadow_ratio as ratio_kernel
 from warpir.kernels.types import LightArgs
-from warpir.render.integrator import LightTensors
 from warpir.render.renderer import index_of
 from warpir.render.samples import Gradients, ObjectSamples, PlaneSamples
 from warpir.render.tone_curve import Knots
-from warpir.scene.light import Light, Lobes
+from warpir.scene.light import Light
 
 if TYPE_CHECKING:
     from warpir.render.mis import MisIntegrator
@@ -58,13 +56,9 @@ def _host(tensor: Tensor) -> FloatArray:
     return tensor.detach().cpu().numpy().astype(np.float32)
 
 
-def host_light(light: LightTensors) -> Light:
-    """Return plain arrays of a light's current values."""
-    lobes = None
-    if light.amplitude is not None:
-        assert light.axis is not None and light.sharpness is not None
-        lobes = Lobes(_host(light.amplitude), _host(light.axis), _host(light.sharpness))
-    return Light(lobes, _host(light.texels) if light.texels is not None else None)
+def host_light(texels: Tensor) -> Light:
+    """Return the current values of a map [He, We, 3] as a light."""
+    return Light(texels=_host(texels))
 
 
 class ShadeForeground(torch.autograd.Function):
@@ -79,9 +73,9 @@ class ShadeForeground(torch.autograd.Function):
         is_recording: bool,
         *tensors: Tensor | None,
     ) -> Tensor:
-        """Trace; the light's four tensors are in ``args``, the materials' replace the scene's."""
+        """Trace; the map is in ``args``, the materials replace the scene's."""
         free = ctx.needs_input_grad[4:] if is_recording else (False,) * len(tensors)
-        factors = [None if t is None else _host(t) for t in tensors[4:]]
+        factors = [None if t is None else _host(t) for t in tensors[1:]]
         ctx.like, ctx.samples = tensors, ObjectSamples(mis, args, seed, factors, free)
         return torch.from_numpy(ctx.samples.render()).to(_device_of(tensors))
 
@@ -103,7 +97,7 @@ class ShadeProxy(torch.autograd.Function):
         is_recording: bool,
         *tensors: Tensor | None,
     ) -> tuple[Tensor, Tensor]:
-        """Trace; the light's four tensors are in ``args``."""
+        """Trace; the map is in ``args``."""
         free = ctx.needs_input_grad[4:] if is_recording else (False,) * len(tensors)
         ctx.like, ctx.samples = tensors, PlaneSamples(mis, args, seed, free)
         out, where = ctx.samples.render(), _device_of(tensors)
@@ -128,61 +122,6 @@ def _device_of(tensors: tuple[Tensor | None, ...]) -> torch.device:
         if tensor is not None:
             return tensor.device
     return torch.device("cpu")
-
-
-class _Rasterize(torch.autograd.Function):
-    @staticmethod
-    def forward(
-        ctx: Any,
-        height: int,
-        device: wp.Device,
-        amplitude: Tensor,
-        axis: Tensor,
-        sharpness: Tensor,
-    ) -> Tensor:
-        arrays = [
-            _from_torch(amplitude, wp.vec3, device, grad=True),
-            _from_torch(axis, wp.vec3, device, grad=True),
-            _from_torch(sharpness, wp.float32, device, grad=True),
-        ]
-        texels = wp.zeros((height, 2 * height), dtype=wp.vec3, device=device, requires_grad=True)
-        ctx.tape = wp.Tape()
-        with ctx.tape:
-            wp.launch(
-                rasterize_kernel,
-                dim=(height, 2 * height),
-                inputs=[height, 2 * height, *arrays, len(amplitude)],
-                outputs=[texels],
-                device=device,
-            )
-        ctx.arrays, ctx.texels, ctx.like = arrays, texels, (amplitude, axis, sharpness)
-        return _to_torch(texels, amplitude)
-
-    @staticmethod
-    def backward(ctx: Any, *d_outputs: Tensor) -> tuple[Tensor | None, ...]:
-        ctx.tape.backward(grads={ctx.texels: _from_torch(d_outputs[0], wp.vec3, ctx.texels.device)})
-        grads = [_to_torch(a.grad, t) for a, t in zip(ctx.arrays, ctx.like, strict=True)]
-        ctx.tape.zero()
-        return (None, None, *grads)
-
-
-def rasterize(
-    amplitude: Tensor, axis: Tensor, sharpness: Tensor, height: int, device: str
-) -> Tensor:
-    """Average lobes over the texels of a lat-long map; differentiable in all three.
-
-    Args:
-        amplitude: Lobe peaks, relative [W/(m^2 sr)], shape [lobe, 3].
-        axis: Unit lobe axes, world frame, shape [lobe, 3].
-        sharpness: Lobe concentration [1], shape [lobe].
-        height: Rows of the map; it is twice as wide.
-        device: Warp device.
-
-    Returns:
-        Radiance, shape [height, 2 height, 3].
-    """
-    out: Tensor = _Rasterize.apply(height, wp.get_device(device), amplitude, axis, sharpness)
-    return out
 
 
 class _Compose(torch.autograd.Function):

@@ -90,14 +90,14 @@ def _order_kernels(is_deterministic: bool) -> None:
     """Let Warp add in a fixed order on CUDA, or again in any; before the modules are compiled."""
     import warp as wp
 
-    from warpir.kernels import composite, light_gradient, rasterize, shade
+    from warpir.kernels import composite, light_gradient, shade
 
     mode = (
         wp.DeterministicMode.RUN_TO_RUN if is_deterministic else wp.DeterministicMode.NOT_GUARANTEED
     )
     # Those whose threads add to common places, most of them in their backward pass. The threads of
     # `warpir.render.transport.rows` each get a row of their own instead.
-    for module in (composite, light_gradient, rasterize, shade):
+    for module in (composite, light_gradient, shade):
         if wp.get_module_options(module)["deterministic"] != mode:
             records = MAX_RECORDS if is_deterministic else 0
             wp.set_module_options(

@@ -150,14 +150,6 @@ def _extensions(material: Material) -> Extensions:
     return out
 
 
-def _copied(args: Any) -> Any:
-    """Return another struct that holds the same arrays and numbers."""
-    copy = type(args)()
-    for name in args._cls.vars:
-        setattr(copy, name, getattr(args, name))
-    return copy
-
-
 class Scene:
     """Geometry, materials, plane and camera on one device; owns every Warp handle for the run.
 
@@ -170,7 +162,6 @@ class Scene:
     Attributes:
         origin: World point that is the recentred origin [m], shape [3].
         diagonal: Diagonal of the objects' bounding box [m].
-        dark_proxy_args: The place, whose mesh sends nothing.
         has_glass: Whether some material lets light through that it does not reflect.
     """
 
@@ -206,8 +197,6 @@ class Scene:
         self._upload_textures(textures)
         self.camera_args = self.camera_args_at(camera)
         self.proxy_args = self._proxy_args()
-        self.dark_proxy_args = _copied(self.proxy_args)
-        self.dark_proxy_args.shines = 0
 
     def _proxy_args(self) -> ProxyArgs:
         proxy, camera = self.proxy, self.camera

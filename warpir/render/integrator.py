@@ -1,26 +1,9 @@
-"""What every integrator takes and gives: a light and materials in, three radiance arrays out."""
+"""What every integrator takes and gives: maps and materials in, three radiance arrays out."""
 
 from dataclasses import dataclass
 from typing import Protocol
 
 from torch import Tensor
-
-
-@dataclass(frozen=True)
-class LightTensors:
-    """A light as the optimiser holds it: lobes plus one map, either may be absent.
-
-    Frames, units and shapes are those of `warpir.scene.light.Light`.
-    """
-
-    amplitude: Tensor | None = None
-    """Lobe peaks, relative [W/(m^2 sr)], shape [lobe, 3]."""
-    axis: Tensor | None = None
-    """Unit lobe axes, world frame, shape [lobe, 3]."""
-    sharpness: Tensor | None = None
-    """Lobe concentration [1], shape [lobe]."""
-    texels: Tensor | None = None
-    """Lat-long radiance, shape [He, We, 3]."""
 
 
 @dataclass(frozen=True)
@@ -57,10 +40,13 @@ class Integrator(Protocol):
 
     def radiance(
         self,
-        light_fg: LightTensors,
-        light_shadow: LightTensors,
+        light_fg: Tensor,
+        light_shadow: Tensor,
         seed: int,
         materials: MaterialTensors | None = None,
     ) -> Radiance:
-        """Render the object under ``light_fg`` and the plane under ``light_shadow``."""
+        """Render the object under ``light_fg`` and the plane under ``light_shadow``.
+
+        Both are lat-long radiance, relative [W/(m^2 sr)], shape [He, We, 3].
+        """
         ...

@@ -15,7 +15,7 @@ from torch import Tensor
 
 from warpir.core.arrays import IntArray
 from warpir.render.bridge import ShadeForeground, ShadeProxy, host_light
-from warpir.render.integrator import LightTensors, MaterialTensors, Radiance
+from warpir.render.integrator import MaterialTensors, Radiance
 from warpir.render.renderer import Renderer, index_of, light_args
 
 
@@ -29,7 +29,6 @@ class MisIntegrator:
         spp: Camera samples per pixel.
         rays: Directions per technique and camera sample.
         depth: Surface interactions of the object's paths.
-        mesh_shines: Whether the place's mesh sends what the photo shows, or only blocks light.
     """
 
     differentiates = frozenset({"light", "material", "emission"})
@@ -42,7 +41,6 @@ class MisIntegrator:
         spp: int = 128,
         rays: int = 4,
         depth: int = 5,
-        mesh_shines: bool = True,
     ) -> None:
         self.renderer = renderer
         self.object_pixels = object_pixels
@@ -51,12 +49,11 @@ class MisIntegrator:
         rows = index_of(object_pixels, camera.width * camera.height)
         self.may_see_object: IntArray = (rows[proxy_pixels] >= 0).astype(np.int32)
         self.spp, self.rays, self.depth = spp, rays, depth
-        self.mesh_shines = mesh_shines
 
     def radiance(
         self,
-        light_fg: LightTensors,
-        light_shadow: LightTensors,
+        light_fg: Tensor,
+        light_shadow: Tensor,
         seed: int,
         materials: MaterialTensors | None = None,
     ) -> Radiance:
@@ -71,16 +68,10 @@ class MisIntegrator:
             args_shadow = light_args(host_light(light_shadow), scene.device)
         is_recording = torch.is_grad_enabled()
         foreground: Tensor = ShadeForeground.apply(
-            self, args_fg, seed, is_recording, *_light(light_fg), *_material(materials)
+            self, args_fg, seed, is_recording, light_fg, *_material(materials)
         )
-        lit, unoccluded = ShadeProxy.apply(
-            self, args_shadow, seed, is_recording, *_light(light_shadow)
-        )
+        lit, unoccluded = ShadeProxy.apply(self, args_shadow, seed, is_recording, light_shadow)
         return Radiance(foreground, lit, unoccluded)
-
-
-def _light(light: LightTensors) -> tuple[Tensor | None, ...]:
-    return light.amplitude, light.axis, light.sharpness, light.texels
 
 
 def _material(materials: MaterialTensors) -> tuple[Tensor | None, ...]:

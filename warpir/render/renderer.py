@@ -490,7 +490,6 @@ class Renderer:
         indirect_limit: float = 0.0,
         light_record: LightRecord | None = None,
         vertex_record: VertexRecord | None = None,
-        mesh_shines: bool = True,
     ) -> Foreground:
         """Path-trace the object alone (DiPIR, eq. 4).
 
@@ -506,7 +505,6 @@ class Renderer:
             light_record: Filled on the way where given; rows are ``pixels``, `lanes` of each.
                 Without a limit only.
             vertex_record: The same.
-            mesh_shines: Whether the place's mesh sends what the photo shows, or only blocks light.
         """
         scene, lanes = self.scene, self.lanes(len(pixels), spp)
         kernel = foreground_kernel(
@@ -532,7 +530,7 @@ class Renderer:
                     scene.mesh_args,
                     scene.material_args,
                     scene.texture_args,
-                    scene.proxy_args if mesh_shines else scene.dark_proxy_args,
+                    scene.proxy_args,
                     light,
                     spp // lanes,
                     rays,
@@ -580,7 +578,6 @@ class Renderer:
         seed: int,
         camera_args: CameraArgs | None = None,
         record: LightRecord | None = None,
-        mesh_shines: bool = True,
     ) -> ProxyRadiance:
         """Radiance of the white place with and without the object (both halves of DiPIR, eq. 5).
 
@@ -593,7 +590,6 @@ class Renderer:
             seed: Base seed.
             camera_args: Another resolution of the view, or the scene's own.
             record: Filled on the way where given; rows are ``pixels``.
-            mesh_shines: Whether the place's mesh sends what the photo shows, or only blocks light.
         """
         scene = self.scene
 
@@ -612,7 +608,7 @@ class Renderer:
                     scene.mesh_args,
                     scene.material_args,
                     scene.texture_args,
-                    scene.proxy_args if mesh_shines else scene.dark_proxy_args,
+                    scene.proxy_args,
                     light,
                     spp,
                     rays,

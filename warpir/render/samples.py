@@ -30,8 +30,8 @@ if TYPE_CHECKING:
     from warpir.render.mis import MisIntegrator
 
 Gradients = list[Float64Array | None]
-"""Of amplitude, axis, sharpness, texels (and base colour, metallic, roughness, emission), in this
-order; None for what is not asked for."""
+"""Of the map (and base colour, metallic, roughness, emission), in this order; None for what is not
+asked for."""
 
 RECORD_BYTES = 1 << 30
 """Memory that the records of one picture may take; beyond it samples are drawn again, in parts.
@@ -39,8 +39,6 @@ What is not filled is not touched: four fifths of it on a convex object at five 
 ENTRY_BYTES = 24
 VERTEX_BYTES = 112
 LAYERS_BYTES = 72
-LOBE_BLOCK = 4096
-"""Directions that one thread of `lobe_gradient` adds up; on the CPU they stay in its cache."""
 PART_PATHS = 4096
 """Least paths of a part: a path costs about 1 us, the launches of a part about 1 ms."""
 RECORDING, LOWER = "the samples of mis", "--mis-samples or --guidance-width"
@@ -107,8 +105,8 @@ class ObjectSamples:
         self.mis, self.args, self.seed, self.free = mis, args, seed, free
         self.materials = SceneMaterials(mis.renderer, factors)
         self.path_count = mis.spp * mis.rays
-        self.entries = 2 * self.path_count * mis.depth * any(free[:4])
-        self.vertices = self.path_count * (mis.depth + 1) * any(free[4:])
+        self.entries = 2 * self.path_count * mis.depth * free[0]
+        self.vertices = self.path_count * (mis.depth + 1) * any(free[1:])
         self.has_layers = self.materials.args.any_layers == 1
         vertex_bytes = VERTEX_BYTES + LAYERS_BYTES * self.has_layers
         row_bytes = ENTRY_BYTES * self.entries + vertex_bytes * self.vertices
@@ -153,13 +151,12 @@ class ObjectSamples:
                 self.seed,
                 light_record=light,
                 vertex_record=vertex,
-                mesh_shines=mis.mesh_shines,
             )
         return out.radiance, light, vertex
 
     def gradient(self, d_radiance: FloatArray) -> Gradients:
         """Return the loss gradient of light and materials from that of `render`."""
-        total: Gradients = [None] * 8
+        total: Gradients = [None] * 5
         for rows in self.parts:
             light, vertex = self.kept or self.draw(rows)[1:]
             # Records serve one backward pass, so that two steps' never live side by side.
@@ -168,11 +165,11 @@ class ObjectSamples:
             d_rows = np.repeat(d_radiance[rows], lanes, axis=0)
             if light is not None:
                 d_pixel = d_rows[:, :, None] * np.eye(3, dtype=np.float32)
-                found = light_gradient(self.mis.renderer, self.args, light, d_pixel, self.free[:4])
-                total[:4] = _add(total[:4], found)
+                found = map_gradient(self.mis.renderer, self.args, light, d_pixel)
+                total[:1] = _add(total[:1], [found])
             if vertex is not None:
-                total[4:] = _add(
-                    total[4:], self.material_gradient(vertex, d_rows, self.path_count // lanes)
+                total[1:] = _add(
+                    total[1:], self.material_gradient(vertex, d_rows, self.path_count // lanes)
                 )
         return total
 
@@ -190,7 +187,7 @@ class ObjectSamples:
         )
         d_factors = [
             wp.zeros((parts, len(a)), dtype=a.dtype, device=device) if is_free else None
-            for a, is_free in zip(self.materials.arrays, self.free[4:], strict=True)
+            for a, is_free in zip(self.materials.arrays, self.free[1:], strict=True)
         ]
 
         def one(part: int) -> None:
@@ -259,7 +256,7 @@ class PlaneSamples:
         self, mis: MisIntegrator, args: LightArgs, seed: int, free: Sequence[bool]
     ) -> None:
         self.mis, self.args, self.seed, self.free = mis, args, seed, free
-        self.entries = 2 * mis.spp * mis.rays * any(free)
+        self.entries = 2 * mis.spp * mis.rays * free[0]
         self.parts = _parts(len(mis.proxy_pixels), ENTRY_BYTES * self.entries)
         self.kept: LightRecord | None = None
 
@@ -293,32 +290,27 @@ class PlaneSamples:
             mis.rays,
             self.seed,
             record=record,
-            mesh_shines=mis.mesh_shines,
         )
         return out, record
 
     def gradient(self, d_lit: FloatArray, d_unoccluded: FloatArray) -> Gradients:
         """Return the loss gradient of the light from those of `render`."""
-        total: Gradients = [None] * 4
+        total: Gradients = [None]
         for rows in self.parts:
             record = self.kept or self.draw(rows)[1]
             self.kept = None
             assert record is not None, "no gradient was announced"
             d_pixel = np.zeros((len(d_lit[rows]), 3, 3), np.float32)
             d_pixel[:, :, 0], d_pixel[:, :, 1] = d_lit[rows], d_unoccluded[rows]
-            found = light_gradient(self.mis.renderer, self.args, record, d_pixel, self.free)
-            total = _add(total, found)
+            found = map_gradient(self.mis.renderer, self.args, record, d_pixel)
+            total = _add(total, [found])
         return total
 
 
-def light_gradient(
-    renderer: Renderer,
-    args: LightArgs,
-    record: LightRecord,
-    d_pixel: FloatArray,
-    free: Sequence[bool],
-) -> Gradients:
-    """Return the loss gradient of a light over recorded directions.
+def map_gradient(
+    renderer: Renderer, args: LightArgs, record: LightRecord, d_pixel: FloatArray
+) -> Float64Array:
+    """Return the loss gradient of a light's map over recorded directions, shape [He, We, 3].
 
     Args:
         renderer: Whose device and threads are used.
@@ -326,7 +318,6 @@ def light_gradient(
         record: Directions and weights, rows are pixels; used up.
         d_pixel: Times a weight it is the loss gradient of the radiance from there, shape
             [pixel, 3, 3].
-        free: Which of the four are asked for.
     """
     device = renderer.device
     pixels, capacity = record.wi.shape
@@ -334,51 +325,27 @@ def light_gradient(
     renderer.launch(
         light_kernels.radiance_gradient, pixels, [Rows(d_array), Rows(record)], capacity, "light"
     )
-    out: Gradients = [None] * 4
-    if any(free[:3]):
-        block_size = max(1, LOBE_BLOCK // capacity)
-        first = np.arange(0, pixels, block_size, dtype=np.int32)
-        shape = (len(first), args.lobe_count)
-        sums = [wp.empty(shape, dtype=t, device=device) for t in (wp.vec3, wp.vec3, wp.float32)]
-        renderer.launch(
-            light_kernels.lobe_gradient,
-            len(first),
-            [
-                record,
-                Rows(wp.array(first, dtype=wp.int32, device=device)),
-                block_size,
-                args.amplitude,
-                args.axis,
-                args.sharpness,
-                *map(Rows, sums),
-            ],
-            block_size * capacity,
-            "light",
-            width=args.lobe_count,
+    height, width = args.map_height, args.map_width
+    # A private map pays where more is added into it than there is to add up of it.
+    parts = max(1, min(PART_COUNT, pixels * capacity // (height * width)))
+    parts = parts if device.is_cpu else 1
+    texels = wp.zeros((parts, height, width), dtype=wp.vec3, device=device)
+
+    def one(part: int) -> None:
+        start, stop = pixels * part // parts, pixels * (part + 1) // parts
+        wp.launch(
+            light_kernels.map_gradient,
+            dim=stop - start,
+            inputs=[Rows(record).cut(start, stop), height, width],
+            outputs=[texels[part]],
+            device=device,
+            record_tape=False,
         )
-        out[:3] = [a.numpy().sum(axis=0, dtype=np.float64) for a in sums]
-    if free[3]:
-        height, width = args.map_height, args.map_width
-        # A private map pays where more is added into it than there is to add up of it.
-        parts = max(1, min(PART_COUNT, pixels * capacity // (height * width)))
-        parts = parts if device.is_cpu else 1
-        texels = wp.zeros((parts, height, width), dtype=wp.vec3, device=device)
 
-        def one(part: int) -> None:
-            start, stop = pixels * part // parts, pixels * (part + 1) // parts
-            wp.launch(
-                light_kernels.map_gradient,
-                dim=stop - start,
-                inputs=[Rows(record).cut(start, stop), height, width],
-                outputs=[texels[part]],
-                device=device,
-                record_tape=False,
-            )
-
-        wp.load_module(light_kernels, device=device)
-        renderer.in_threads(one, range(parts if pixels else 0), "light")
-        out[3] = texels.numpy().sum(axis=0, dtype=np.float64)
-    return out
+    wp.load_module(light_kernels, device=device)
+    renderer.in_threads(one, range(parts if pixels else 0), "light")
+    total: Float64Array = texels.numpy().sum(axis=0, dtype=np.float64)
+    return total
 
 
 def _add(total: Gradients, found: Gradients) -> Gradients:

@@ -219,8 +219,8 @@ class LightSummary:
 def rasterize_lobes(lobes: Lobes, height: int, width: int, side: int = 6) -> FloatArray:
     """Return the mean radiance of the lobes in each texel, shape [height, width, 3].
 
-    The NumPy twin of `warpir.kernels.rasterize`, for files and summaries; power within 1 %. A lobe
-    whose standard deviation is below a quarter of a texel is put into its texel with its flux.
+    For files and summaries; power within 1 %. A lobe whose standard deviation is below a quarter of
+    a texel is put into its texel with its flux.
 
     Args:
         lobes: The lobes.
@@ -238,8 +238,8 @@ def rasterize_lobes(lobes: Lobes, height: int, width: int, side: int = 6) -> Flo
             return texels.astype(np.float32)
     omega = texel_solid_angles(height, width)
     narrow = lobes.sharpness > (4.0 * height / np.pi) ** 2
-    # Rows at the two-point Gauss-Legendre nodes of even bands, as in the kernel: midpoints misjudge
-    # a lobe at a pole by up to 4 %.
+    # Rows at the two-point Gauss-Legendre nodes of even bands: midpoints misjudge a lobe at a pole
+    # by up to 4 %.
     step = np.pi / (height * side)
     theta = (np.arange(height * side) // 2 * 2 + 1.0) * step
     theta += np.tile([-1.0, 1.0], height * side // 2) * step / np.sqrt(3.0)

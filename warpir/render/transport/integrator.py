@@ -8,9 +8,7 @@ its gradient ``T^T d``; no ray is cast. The kernels are `warpir.kernels.transpor
 What an open plane receives is one analytic row. With a mesh of the place, each pixel has a row of
 its own for that too (``T_place``), and what the mesh sends is a constant, as emission is.
 
-What the numbers are unbiased for is the map they are handed: lobes are averaged over its texels
-first. `edge_width` says what that costs a shadow's edge. Lobes too narrow for the texels are left
-to `warpir.render.mis` (`TransportSettings.sharp_samples`), so that a sun is never blurred silently.
+The numbers are unbiased for the map they are handed, at the resolution of the rows.
 """
 
 from __future__ import annotations
@@ -27,9 +25,7 @@ from torch import Tensor
 from warpir.core.arrays import Float64Array, FloatArray, IntArray
 from warpir.core.errors import ExitCode, InputError
 from warpir.core.memory import Need
-from warpir.render.bridge import rasterize
-from warpir.render.integrator import LightTensors, MaterialTensors, Radiance
-from warpir.render.mis import MisIntegrator
+from warpir.render.integrator import MaterialTensors, Radiance
 from warpir.render.renderer import Renderer, index_of
 from warpir.render.transport.cache import content_key, load_rows, save_rows
 from warpir.render.transport.matrix import DenseRows, SparseRows, product
@@ -43,10 +39,9 @@ from warpir.render.transport.rows import (
     object_rows,
     place_rows,
     proxy_rows,
-    sharpness_limit,
     tent_irradiance,
 )
-from warpir.scene.light import Light
+from warpir.scene.light import Light, rasterize_lobes
 
 DTYPES = {"bfloat16": torch.bfloat16, "float32": torch.float32}
 
@@ -97,8 +92,7 @@ class TransportIntegrator:
         start = time.perf_counter()
         expected = expected or Light(texels=np.ones((8, 16, 3), np.float32))
         self.expected = tuple(
-            to_texels(expected, h, renderer.device)
-            for h in (self.settings.height_fg, self.settings.height_shadow)
+            to_texels(expected, h) for h in (self.settings.height_fg, self.settings.height_shadow)
         )
         height = self.settings.height_shadow
         self.has_mesh = renderer.scene.proxy.mesh is not None
@@ -145,16 +139,6 @@ class TransportIntegrator:
         self.bytes = self.T_fg.bytes + self.T_shadow.bytes
         if self.T_place is not None:
             self.bytes += self.T_place.bytes
-        self.sharp = MisIntegrator(
-            renderer,
-            object_pixels,
-            proxy_pixels,
-            spp=max(self.settings.sharp_samples, 1),
-            rays=1,
-            depth=depth,
-            # The rows hold what the place's mesh sends.
-            mesh_shines=False,
-        )
 
     def _check_memory(self, entries: int) -> None:
         """Compare the size of both matrices, with so many sparse entries, with the limit."""
@@ -279,22 +263,21 @@ class TransportIntegrator:
         budget, worst = self.settings.bright_directions, 0.0
         for light, expected in zip((light_fg, light_shadow), self.expected, strict=True):
             counts = direction_counts(expected, budget)
-            texels = to_texels(light, len(expected), self.renderer.device)
+            texels = to_texels(light, len(expected))
             own = direction_counts(texels, budget)
             worst = max(worst, flux_noise(texels, counts) / max(flux_noise(texels, own), 1e-30))
         return worst
 
     def radiance(
         self,
-        light_fg: LightTensors,
-        light_shadow: LightTensors,
+        light_fg: Tensor,
+        light_shadow: Tensor,
         seed: int,
         materials: MaterialTensors | None = None,
     ) -> Radiance:
         """Render the object under ``light_fg`` and the plane under ``light_shadow``.
 
-        ``seed`` only matters to lobes that are left to `warpir.render.mis`; the stored rows are
-        frozen.
+        ``seed`` does not matter: the stored rows are frozen.
 
         Raises:
             ValueError: Materials are given: the stored rows hold the scene's own.
@@ -302,11 +285,9 @@ class TransportIntegrator:
         if materials is not None and any(v is not None for v in vars(materials).values()):
             raise ValueError("transport is frozen for the scene's materials: use mis")
         settings = self.settings
-        sharp_fg, broad_fg = self._split(light_fg, settings.height_fg)
-        sharp_shadow, broad_shadow = self._split(light_shadow, settings.height_shadow)
-        texels = self._texels(broad_fg, settings.height_fg)
+        texels = self._texels(light_fg, settings.height_fg)
         foreground = product(self.T_fg, texels) + self.emission
-        falling = self._texels(broad_shadow, settings.height_shadow)[self.above]
+        falling = self._texels(light_shadow, settings.height_shadow)[self.above]
         blocked = product(self.T_shadow, falling)
         if self.T_place is None:
             unoccluded = (self.irradiance @ falling).expand(len(self.proxy_pixels), 3)
@@ -315,46 +296,12 @@ class TransportIntegrator:
             blocked = blocked + self.bounced_blocked
         # Rounding alone may take more than there is.
         lit = (unoccluded - blocked).clamp(min=0.0)
-        if sharp_fg is not None or sharp_shadow is not None:
-            dark = _dark(light_fg)
-            # The rows hold what the object emits.
-            count = len(self.renderer.scene.material_names)
-            unlit = MaterialTensors(emission=torch.zeros((max(count, 1), 3)))
-            own = self.sharp.radiance(sharp_fg or dark, sharp_shadow or dark, seed, unlit)
-            foreground = foreground + own.foreground.to(self.device)
-            lit = lit + own.lit.to(self.device)
-            unoccluded = unoccluded + own.unoccluded.to(self.device)
-        where = _device_of(light_fg)
+        where = light_fg.device
         return Radiance(foreground.to(where), lit.to(where), unoccluded.to(where))
 
-    def _split(self, light: LightTensors, height: int) -> tuple[LightTensors | None, LightTensors]:
-        """Separate the lobes that the texels cannot hold; `warpir.render.mis` adds them."""
-        if light.sharpness is None or self.settings.sharp_samples == 0:
-            return None, light
-        assert light.amplitude is not None and light.axis is not None
-        limit = self.settings.sharpness_max or sharpness_limit(height)
-        is_sharp = light.sharpness.detach() > limit
-        if not bool(is_sharp.any()):
-            return None, light
-
-        def part(chosen: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-            assert light.amplitude is not None and light.axis is not None
-            assert light.sharpness is not None
-            return light.amplitude[chosen], light.axis[chosen], light.sharpness[chosen]
-
-        return LightTensors(*part(is_sharp)), LightTensors(*part(~is_sharp), light.texels)
-
-    def _texels(self, light: LightTensors, height: int) -> Tensor:
-        """Return the whole light as one map on our device, shape [texel, 3]; differentiable."""
-        texels = torch.zeros((2 * height * height, 3), device=self.device)
-        if light.texels is not None:
-            texels = texels + resize(light.texels.to(self.device), height).reshape(-1, 3)
-        if light.sharpness is not None and len(light.sharpness):
-            assert light.amplitude is not None and light.axis is not None
-            name = str(self.renderer.device.alias)
-            lobes = rasterize(light.amplitude, light.axis, light.sharpness, height, name)
-            texels = texels + lobes.to(self.device).reshape(-1, 3)
-        return texels
+    def _texels(self, light: Tensor, height: int) -> Tensor:
+        """Return a map at ``height`` rows on our device, shape [texel, 3]; differentiable."""
+        return resize(light.to(self.device), height).reshape(-1, 3)
 
 
 class _Entries:
@@ -383,30 +330,14 @@ class _Entries:
         return {n: torch.cat(p) for n, p in zip(names, zip(*self.parts, strict=True), strict=True)}
 
 
-def to_texels(light: Light, height: int, device: wp.Device) -> FloatArray:
-    """Return a light as the map that the rows are multiplied with, shape [height, 2 height, 3].
-
-    Lobes are averaged over texels exactly as `TransportIntegrator.radiance` does.
-    """
-    texels = torch.zeros((height, 2 * height, 3))
+def to_texels(light: Light, height: int) -> FloatArray:
+    """Return a light as a map, shape [height, 2 height, 3]."""
+    texels = np.zeros((height, 2 * height, 3), np.float32)
     if light.texels is not None:
-        texels += resize(torch.from_numpy(np.ascontiguousarray(light.texels)), height)
-    if light.lobes is not None and len(light.lobes.sharpness):
-        parts = (light.lobes.amplitude, light.lobes.axis, light.lobes.sharpness)
-        amplitude, axis, sharpness = (torch.from_numpy(np.ascontiguousarray(p)) for p in parts)
-        texels += rasterize(amplitude, axis, sharpness, height, str(device.alias))
-    averaged: FloatArray = texels.numpy()
-    return averaged
-
-
-def edge_width(sharpness: float, height: int) -> tuple[float, float]:
-    """Return the standard deviation of a lobe and of its image on a map [rad].
-
-    A texel's mean adds the variance of a texel's width, interpolation that of a tent: together
-    ``(pi / He)^2 / 4`` per axis. A shadow's edge widens by the same factor.
-    """
-    texel = np.pi / height
-    return 1.0 / np.sqrt(sharpness), float(np.sqrt(1.0 / sharpness + 0.25 * texel * texel))
+        texels += resize(torch.from_numpy(np.ascontiguousarray(light.texels)), height).numpy()
+    if light.lobes is not None:
+        texels += rasterize_lobes(light.lobes, height, 2 * height)
+    return texels
 
 
 def resize(texels: Tensor, height: int) -> Tensor:
@@ -447,18 +378,3 @@ def _shares(
 
     by_column = overlaps(np.linspace(0, 1, columns + 1), np.linspace(0, 1, 2 * height + 1))
     return overlaps(heights(rows), heights(height)), by_column
-
-
-def _device_of(light: LightTensors) -> torch.device:
-    tensors = (light.amplitude, light.texels)
-    return next(t.device for t in tensors if t is not None)
-
-
-def _dark(like: LightTensors) -> LightTensors:
-    """Return a light of no radiance."""
-    where = _device_of(like)
-    return LightTensors(
-        torch.zeros((1, 3), device=where),
-        torch.tensor([[0.0, 1.0, 0.0]], device=where),
-        torch.ones(1, device=where),
-    )

@@ -69,19 +69,10 @@ class TransportSettings:
     bright_directions: int = 1024
     """Directions per pixel and map that are shared out by where light is expected, on top of one
     per texel."""
-    sharpness_max: float | None = None
-    """Lobes sharper than this are left to `mis`; None: those narrower than half a texel."""
-    sharp_samples: int = 4
-    """Camera samples per step of those lobes; with 0 they are averaged over texels like all."""
     dtype: str = "bfloat16"
     """Type in which the object's rows are stored, ``bfloat16`` or ``float32``."""
     memory_mib: int = 1024
     """Most memory that the stored rows may take [MiB]."""
-
-
-def sharpness_limit(height: int) -> float:
-    """Return the sharpness whose standard deviation is half a texel of a map of that height."""
-    return 4.0 * (height / np.pi) ** 2
 
 
 def tent_solid_angles(height: int) -> Float64Array:
