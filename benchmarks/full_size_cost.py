@@ -43,7 +43,7 @@ from warpir.diffusion.personalization.personalize import LoraTraining
 from warpir.diffusion.prompts import make_prompts
 from warpir.insert import insert
 from warpir.optimize.light import LightOptimization
-from warpir.render.renderer import choose_device
+from warpir.render.device import choose_device
 
 PROMPT = "a small red car"
 TARGETS = {"whole_run_s": 180.0, "peak_gb": 12.0, "rendering_share": 0.10}

@@ -17,10 +17,12 @@ import trimesh
 from benchmarks.measure import context, peak_mib, report, seconds
 from warpir.core.arrays import IntArray
 from warpir.io.assets import load_asset
+from warpir.render.device import choose_device
+from warpir.render.device_light import light_args
 from warpir.render.device_scene import Placed, Proxy, Scene
 from warpir.render.integrator import MaterialTensors
 from warpir.render.mis import MisIntegrator
-from warpir.render.renderer import Renderer, choose_device, light_args
+from warpir.render.renderer import Renderer
 from warpir.scene.asset import Asset, Material, Primitive
 from warpir.scene.camera import camera_from_fov
 from warpir.scene.light import Light, Lobes, as_map

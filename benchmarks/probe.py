@@ -19,7 +19,7 @@ from torch import Tensor
 
 from warpir.diffusion.models.embedded import EmbeddedPrior, load_embedded, random_embedded
 from warpir.lighting.regressor import load_regressor
-from warpir.render.renderer import choose_device
+from warpir.render.device import choose_device
 from warpir.train.batches import PriorBatch
 from warpir.train.command import files_in
 from warpir.train.lights import load_panoramas

@@ -29,8 +29,9 @@ from warpir.demo import ASSET, LIGHT
 from warpir.io.assets import load_asset
 from warpir.io.images.photos import Photo, read_envmap
 from warpir.render.composite import Quality, make_picture, photo_radiance
+from warpir.render.device import choose_device
 from warpir.render.device_scene import Placed, Proxy, Scene
-from warpir.render.renderer import Renderer, choose_device
+from warpir.render.renderer import Renderer
 from warpir.scene.asset import Asset, Material, Primitive, Texture, TextureSlot
 from warpir.scene.camera import Camera, camera_from_fov
 from warpir.scene.lamps import lamp_axes

@@ -31,9 +31,10 @@ from warpir.io.images.photos import read_envmap
 from warpir.optimize.light import LightOptimization, Unknowns
 from warpir.optimize.view import Frame
 from warpir.render.bridge import ComposeConstants, compose
+from warpir.render.device_light import light_args
 from warpir.render.device_scene import Placed, Proxy, Scene
 from warpir.render.mis import MisIntegrator
-from warpir.render.renderer import Renderer, light_args
+from warpir.render.renderer import Renderer
 from warpir.render.tone_curve import Knots, ToneCurve
 from warpir.scene.asset import Asset
 from warpir.scene.light import (

@@ -25,8 +25,9 @@ from warpir.kernels.trace import (
     visibility,
 )
 from warpir.kernels.types import CameraArgs, MaterialArgs, MeshArgs, TextureArgs
+from warpir.render.device import Rows, choose_device
 from warpir.render.device_scene import Placed, Proxy, Scene
-from warpir.render.renderer import Renderer, Rows, choose_device
+from warpir.render.renderer import Renderer
 from warpir.scene.camera import Camera
 
 wp.set_module_options({"enable_backward": False})

@@ -115,7 +115,7 @@ def sheen_lobe(wo: wp.vec3, wi: wp.vec3, wm: wp.vec3, roughness: float) -> float
 
 @wp.func
 def sheen_albedo_at(table: wp.array2d[float], cos_o: float, roughness: float) -> float:
-    """Read `warpir.render.sheen.sheen_albedo_table` bilinearly."""
+    """Read `warpir.scene.sheen.sheen_albedo_table` bilinearly."""
     last = table.shape[0] - 1
     x = wp.sqrt(wp.sqrt(wp.clamp(cos_o, 0.0, 1.0))) * float(last)
     y = wp.clamp(roughness, 0.0, 1.0) * float(last)
@@ -152,7 +152,7 @@ def layers_toward(
             stand for them too.
         sheen_color: Linear RGB [1].
         sheen_roughness: Perceptual roughness [1].
-        sheen_albedo: From `warpir.render.sheen.sheen_albedo_table`.
+        sheen_albedo: From `warpir.scene.sheen.sheen_albedo_table`.
         clearcoat: Share of the surface that the coat covers [1].
         coat_roughness: Perceptual roughness [1].
         coat_n: Unit normal of the coat, local frame.

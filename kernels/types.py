@@ -148,7 +148,7 @@ class MaterialArgs:
     extensions: wp.array[Extensions]
     """Shape [material]; in one array, since functions take these arguments by value."""
     sheen_albedo: wp.array2d[float]
-    """From `warpir.render.sheen.sheen_albedo_table`."""
+    """From `warpir.scene.sheen.sheen_albedo_table`."""
     slot_texture: wp.array2d[int]
     """Texture index or -1, shape [material, slot]."""
     slot_uv_set: wp.array2d[int]

@@ -13,7 +13,7 @@ import warp as wp
 
 from tests.builders.insertions import write_inputs
 from tests.cases import CaseReport
-from warpir.render.renderer import start_warp
+from warpir.render.device import start_warp
 
 # A shell's background job ignores Ctrl-C, and so would every program that the tests start.
 if signal.getsignal(signal.SIGINT) == signal.SIG_IGN:

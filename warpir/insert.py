@@ -172,7 +172,8 @@ def _insert_one(config: InsertConfig, loaders: "Loaders | None" = None) -> Inser
         # Warp is loaded here, after everything that can be wrong was looked at.
         with timings.stage("load"):
             from warpir.render.composite import Quality, make_picture, scene_of
-            from warpir.render.renderer import Renderer, choose_device
+            from warpir.render.device import choose_device
+            from warpir.render.renderer import Renderer
 
             device = choose_device(config.render.device)
             memory.device = device

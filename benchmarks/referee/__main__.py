@@ -29,7 +29,7 @@ from warpir.mitsuba.render import (
     passes,
     shadow_ratio,
 )
-from warpir.render.renderer import choose_device
+from warpir.render.device import choose_device
 from warpir.scene.asset import Asset
 from warpir.scene.camera import Camera
 from warpir.scene.light import map_directions

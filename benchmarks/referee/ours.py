@@ -5,8 +5,9 @@ from typing import NamedTuple
 import numpy as np
 
 from warpir.core.arrays import Float64Array, FloatArray
+from warpir.render.device_light import light_args
 from warpir.render.device_scene import Placed, Proxy, Scene
-from warpir.render.renderer import Renderer, light_args
+from warpir.render.renderer import Renderer
 from warpir.scene.asset import Asset
 from warpir.scene.camera import Camera
 from warpir.scene.light import Light

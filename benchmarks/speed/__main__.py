@@ -39,7 +39,7 @@ from benchmarks.speed.ratios import combined, ratios
 from benchmarks.speed.references import References
 from benchmarks.speed.report import keep_run, summary, write_documents
 from benchmarks.speed.scenes import NAMES, make_scene
-from warpir.render.renderer import choose_device, default_threads
+from warpir.render.device import choose_device, default_threads
 
 RUN_SEED = 100
 """First seed of what is measured; references and warm-up have others."""

@@ -18,7 +18,7 @@ from torch import Tensor
 from benchmarks.speed.candidates import PARTS, Bench, MisPart, MitsubaPart, numpy
 from benchmarks.speed.ratios import rmse
 from warpir.core.arrays import BoolArray, Float64Array
-from warpir.render.renderer import light_args
+from warpir.render.device_light import light_args
 from warpir.scene.light import Light
 
 TRIMMED = 0.02

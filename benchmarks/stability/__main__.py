@@ -20,7 +20,7 @@ import warp as wp
 from benchmarks.measure import context, report
 from benchmarks.stability import brdf, geometry, light, lobes
 from benchmarks.stability.case import Case
-from warpir.render.renderer import choose_device
+from warpir.render.device import choose_device
 
 TITLES = {
     "lobes": "Spherical Gaussians",

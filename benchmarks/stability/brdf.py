@@ -24,8 +24,9 @@ from tests.builders.shapes import all_pixels, camera, constant, ground, placed, 
 from warpir.kernels.brdf import brdf_eval, brdf_sample
 from warpir.kernels.frame import basis
 from warpir.kernels.types import Layers
+from warpir.render.device_light import light_args
 from warpir.render.device_scene import Scene
-from warpir.render.renderer import Renderer, light_args
+from warpir.render.renderer import Renderer
 from warpir.scene.asset import Material, Primitive
 
 GROUP = "brdf"

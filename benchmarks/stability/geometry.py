@@ -26,8 +26,9 @@ from tests import oracles as o
 from tests.builders.shapes import all_pixels, box, camera, constant, ground, placed, quad, sphere
 from warpir.kernels.trace import closest_hit, face_normal, hit_position, offset_origin, visibility
 from warpir.kernels.types import MaterialArgs, MeshArgs, TextureArgs
+from warpir.render.device_light import light_args
 from warpir.render.device_scene import Proxy, Scene
-from warpir.render.renderer import Renderer, light_args
+from warpir.render.renderer import Renderer
 from warpir.scene.asset import Material, Primitive
 from warpir.scene.camera import Camera
 from warpir.scene.light import Light

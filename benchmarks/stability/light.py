@@ -31,9 +31,10 @@ from warpir.kernels.shadow_ratio import shadow_ratio
 from warpir.kernels.tone import reinhard, tone_curve
 from warpir.kernels.types import LightArgs
 from warpir.lighting.fusion import fuse
+from warpir.render.device_light import light_args
 from warpir.render.device_scene import Scene
 from warpir.render.mis import MisIntegrator
-from warpir.render.renderer import Renderer, light_args
+from warpir.render.renderer import Renderer
 from warpir.render.tone_curve import ToneCurve
 from warpir.scene.light import Light, resize_map, summarize
 

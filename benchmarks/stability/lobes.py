@@ -20,8 +20,9 @@ from tests import oracles as o
 from tests.builders.shapes import all_pixels, camera, ground, lobe
 from warpir.kernels.sampling import light_eval, lobe_sample
 from warpir.kernels.types import LightArgs
+from warpir.render.device_light import light_args
 from warpir.render.device_scene import Scene
-from warpir.render.renderer import Renderer, light_args
+from warpir.render.renderer import Renderer
 from warpir.scene.light import Light, Lobes, rasterize_lobes
 
 GROUP = "lobes"

@@ -180,7 +180,7 @@ def test_one_bad_of_a_hundred(
 
 LOADED = """
 import sys
-from warpir.render.renderer import load_kernels, start_warp
+from warpir.render.device import load_kernels, start_warp
 start_warp()
 import warp
 from warpir.insert import main

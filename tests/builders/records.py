@@ -9,7 +9,9 @@ from tests import oracles
 from warpir.core.arrays import BoolArray, Float64Array, FloatArray
 from warpir.kernels.shade import shade_vertex
 from warpir.kernels.types import LightRecord, VertexRecord
+from warpir.render.device_scene import FACTORS
 from warpir.render.integrator import MaterialTensors
+from warpir.render.renderer import Renderer
 from warpir.render.samples import ObjectSamples
 
 
@@ -17,6 +19,12 @@ def plain_factors(materials: MaterialTensors) -> list[FloatArray | None]:
     """The four material factors as arrays."""
     tensors = (materials.base_color, materials.metallic, materials.roughness, materials.emission)
     return [None if t is None else t.detach().cpu().numpy() for t in tensors]
+
+
+def factor_arrays(renderer: Renderer, factors: list[FloatArray | None]) -> list[wp.array]:
+    """The four factors on the device; the scene's own where None."""
+    materials = renderer.scene.materials_with(factors)
+    return [getattr(materials, name) for name, _ in FACTORS]
 
 
 def used(record: LightRecord) -> BoolArray:

@@ -283,7 +283,7 @@ KERNEL = """
 import numpy as np
 import warp as wp
 from warpir.core.cache import take_notices
-from warpir.render.renderer import start_warp
+from warpir.render.device import start_warp
 
 start_warp()
 

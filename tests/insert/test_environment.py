@@ -68,10 +68,10 @@ def test_driver_is_too_old_for_torch(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 BUSY = """
-import warpir.render.renderer
+import warpir.render.device
 def busy(name):
     raise RuntimeError("Failed to allocate 1073741824 bytes on device 'cuda:0'")
-warpir.render.renderer.choose_device = busy
+warpir.render.device.choose_device = busy
 """
 
 

@@ -20,7 +20,7 @@ from tests.oracles import LayeredMaterial
 from tests.statistics import chi_square, compare_gradients
 from warpir.kernels.brdf import brdf_eval, brdf_sample, layers_toward, lobe_probabilities
 from warpir.kernels.types import Extensions, Layers
-from warpir.render.sheen import TABLE_SIZE, sheen_albedo_table
+from warpir.scene.sheen import TABLE_SIZE, sheen_albedo_table
 
 SAMPLE_COUNT = 50_000
 TABLE_ERROR, TABLE_ERROR_ROUGH = 0.02, 0.004

@@ -15,7 +15,7 @@ from warpir.kernels.sampling import (
     power_heuristic,
 )
 from warpir.kernels.types import LightArgs
-from warpir.render.renderer import light_args
+from warpir.render.device_light import light_args
 from warpir.scene.light import Light, Lobes
 
 SAMPLE_COUNT = 200_000

@@ -38,7 +38,8 @@ from warpir.optimize.loop import BACK_OFF, GOOD_STEPS
 from warpir.optimize.recover import as_input_errors
 from warpir.render import bad_pixels
 from warpir.render.bad_pixels import NAMED, BadPixels
-from warpir.render.renderer import Renderer, light_args
+from warpir.render.device_light import light_args
+from warpir.render.renderer import Renderer
 from warpir.render.tone_curve import Knots
 
 pytestmark = pytest.mark.usefixtures("one_thread")

@@ -13,7 +13,7 @@ from torch import Tensor
 from benchmarks.recovery import TowardTruth
 from tests import oracles as o
 from tests.builders.insertions import ALWAYS, arguments, digest, write_inputs
-from tests.builders.records import path_means, plain_factors, shade_vertices
+from tests.builders.records import factor_arrays, path_means, plain_factors, shade_vertices
 from tests.builders.refusals import assert_fails
 from tests.builders.shapes import camera, ground, sphere
 from tests.builders.stops import Killed, stop_at, stop_hard
@@ -47,7 +47,7 @@ from warpir.render.bridge import ShadeForeground
 from warpir.render.composite import Quality, make_picture
 from warpir.render.device_scene import Placed, Scene
 from warpir.render.renderer import Renderer
-from warpir.render.samples import ObjectSamples, SceneMaterials
+from warpir.render.samples import ObjectSamples
 from warpir.render.tone_curve import ToneCurve
 from warpir.scene.asset import Asset, Material
 from warpir.scene.light import Light, Lobes, plain_sky
@@ -336,7 +336,7 @@ def test_material_gradient_matches_central_differences(part: str) -> None:
     assert record is not None
 
     def pinned() -> float:
-        arrays = SceneMaterials(loop.mis.renderer, plain_factors(loop.unknowns())).arrays
+        arrays = factor_arrays(loop.mis.renderer, plain_factors(loop.unknowns()))
         means = path_means(samples, shade_vertices(samples, record, arrays))
         foreground = torch.from_numpy(means).float()
         return float((weight * lit.image(foreground, *loop.curves)).double().sum())

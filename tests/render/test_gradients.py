@@ -12,6 +12,7 @@ from torch import Tensor
 from torch.func import functional_call
 
 from tests.builders.records import (
+    factor_arrays,
     object_sums,
     path_means,
     plain_factors,
@@ -22,11 +23,12 @@ from tests.conftest import devices
 from tests.statistics import compare_gradients
 from warpir.render import renderer as render
 from warpir.render.bridge import ComposeConstants, compose, host_light
+from warpir.render.device_light import light_args
 from warpir.render.device_scene import Placed, Proxy, Scene
 from warpir.render.integrator import MaterialTensors, Radiance
 from warpir.render.mis import MisIntegrator
-from warpir.render.renderer import Renderer, light_args
-from warpir.render.samples import ObjectSamples, PlaneSamples, SceneMaterials
+from warpir.render.renderer import Renderer
+from warpir.render.samples import ObjectSamples, PlaneSamples
 from warpir.render.tone_curve import ToneCurve
 from warpir.scene.asset import Asset, Material, Primitive
 from warpir.scene.camera import Camera
@@ -135,7 +137,7 @@ class Pipeline:
             lit, unoccluded = plane_sums(plane_record, raw["texels"])
         if any(not torch.equal(raw[name], self.raw[name]) for name in MATERIAL):
             factors = plain_factors(self.materials(raw))
-            arrays = SceneMaterials(self.mis.renderer, factors).arrays
+            arrays = factor_arrays(self.mis.renderer, factors)
             shaded = shade_vertices(self.samples[0], vertex_record, arrays)
             foreground = torch.from_numpy(path_means(self.samples[0], shaded))
         with torch.no_grad():
@@ -217,7 +219,7 @@ def test_pinned_render_equals_the_free_one(pipeline: Pipeline) -> None:
         free = pipeline.mis.radiance(light, light, SEED, materials)
         lit, unoccluded = plane_sums(plane_record, light)
         reflected = object_sums(light_record, light)
-        arrays = SceneMaterials(pipeline.mis.renderer, plain_factors(materials)).arrays
+        arrays = factor_arrays(pipeline.mis.renderer, plain_factors(materials))
     shaded = path_means(
         pipeline.samples[0], shade_vertices(pipeline.samples[0], vertex_record, arrays)
     )

@@ -9,17 +9,24 @@ import torch
 import warp as wp
 from torch import Tensor
 
-from tests.builders.records import object_sums, plain_factors, plane_sums, shade_vertices
+from tests.builders.records import (
+    factor_arrays,
+    object_sums,
+    plain_factors,
+    plane_sums,
+    shade_vertices,
+)
 from tests.render.test_gradients import two_objects
 from tests.statistics import compare_gradients
 from warpir.render import renderer as render
 from warpir.render import samples as samples_module
 from warpir.render.bridge import host_light
+from warpir.render.device_light import light_args
 from warpir.render.device_scene import Placed, Proxy, Scene
 from warpir.render.integrator import MaterialTensors, Radiance
 from warpir.render.mis import MisIntegrator
-from warpir.render.renderer import Renderer, light_args
-from warpir.render.samples import ObjectSamples, PlaneSamples, SceneMaterials
+from warpir.render.renderer import Renderer
+from warpir.render.samples import ObjectSamples, PlaneSamples
 from warpir.scene.camera import Camera
 
 WIDTH, HEIGHT = 48, 32
@@ -147,7 +154,7 @@ def test_material_gradient_is_that_of_the_tape(device: str) -> None:
     samples = ObjectSamples(mis, args, SEED, factors, (False,) + (True,) * 4)
     radiance, light_record, record = samples.draw(slice(None))
     assert light_record is None and record is not None
-    arrays = SceneMaterials(mis.renderer, factors).arrays
+    arrays = factor_arrays(mis.renderer, factors)
     for array in arrays:
         array.requires_grad = True
     tape = wp.Tape()

@@ -13,8 +13,9 @@ from warpir.core.arrays import CodeArray, Int64Array
 from warpir.io.images.photos import Photo
 from warpir.render.bridge import ComposeConstants, compose
 from warpir.render.composite import Picture, Quality, as_file_map, balls, make_picture, resize
+from warpir.render.device_light import light_args
 from warpir.render.device_scene import Scene
-from warpir.render.renderer import Renderer, light_args
+from warpir.render.renderer import Renderer
 from warpir.render.tone_curve import Knots, ToneCurve
 from warpir.scene.asset import Material
 from warpir.scene.camera import Camera

@@ -31,10 +31,11 @@ from warpir.insert import main
 from warpir.lighting.scene_light import make_light
 from warpir.render.bridge import host_light
 from warpir.render.composite import Quality, make_picture, scene_of
+from warpir.render.device_light import light_args
 from warpir.render.device_scene import Placed, Scene
 from warpir.render.integrator import MaterialTensors
 from warpir.render.mis import MisIntegrator
-from warpir.render.renderer import Renderer, light_args
+from warpir.render.renderer import Renderer
 from warpir.render.samples import PlaneSamples
 from warpir.render.transport.integrator import TransportIntegrator
 from warpir.render.transport.rows import TransportSettings

@@ -35,8 +35,9 @@ from tests.oracles import (
 from tests.statistics import z_test
 from warpir.core.arrays import Float64Array, FloatArray, Int64Array
 from warpir.core.color import srgb_to_linear
+from warpir.render.device_light import light_args
 from warpir.render.device_scene import Placed, Scene
-from warpir.render.renderer import Foreground, Renderer, light_args
+from warpir.render.renderer import Foreground, Renderer
 from warpir.scene.asset import Material, Primitive, Texture, TextureSlot
 from warpir.scene.camera import Camera
 from warpir.scene.light import Light

@@ -23,12 +23,8 @@ from warpir.render.transport import cache as transport_cache
 from warpir.render.transport import rows as transport_rows
 from warpir.render.transport.integrator import TransportIntegrator
 from warpir.render.transport.matrix import DenseRows, product
-from warpir.render.transport.rows import (
-    TransportSettings,
-    direction_counts,
-    tent_irradiance,
-    tent_solid_angles,
-)
+from warpir.render.transport.rows import TransportSettings
+from warpir.render.transport.tents import direction_counts, tent_irradiance, tent_solid_angles
 from warpir.scene.asset import Material
 from warpir.scene.light import Light, Lobes, as_map, map_directions, texel_solid_angles
 

@@ -21,7 +21,7 @@ from warpir.core.errors import ExitCode, InputError
 from warpir.io.images.photos import Photo
 from warpir.lighting.fit import LAMP_COUNT_MAX, fit_lobes
 from warpir.lighting.scene_light import SKIES, SUN_TO_SKY, make_light
-from warpir.render.renderer import light_args
+from warpir.render.device_light import light_args
 from warpir.scene.asset import Asset, Material
 from warpir.scene.light import (
     Light,

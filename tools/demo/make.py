@@ -85,8 +85,10 @@ def render(with_car: bool, samples: int, device: str | None, seed: int = 0) -> N
         Linear Rec.709 radiance, shape [H, W, 3].
     """
     from warpir.io.images.photos import read_envmap
+    from warpir.render.device import choose_device
+    from warpir.render.device_light import light_args
     from warpir.render.device_scene import Placed, Proxy, Scene
-    from warpir.render.renderer import Renderer, choose_device, light_args
+    from warpir.render.renderer import Renderer
     from warpir.scene.light import Light
 
     view = camera()

@@ -204,7 +204,7 @@ def _compile(task: Task) -> dict[str, Any]:
 
     Where nothing is said of places, only the devices are looked for.
     """
-    from warpir.render.renderer import choose_device, cuda_count, load_kernels
+    from warpir.render.device import choose_device, cuda_count, load_kernels
 
     places = task.config["places"]
     for device in [choose_device(name) for name in task.config["devices"]]:

@@ -234,7 +234,7 @@ def evaluate(
     notices += places.notices
     predictions = _exchange(options, [place for place, _ in scenes], notices)
 
-    from warpir.render.renderer import choose_device
+    from warpir.render.device import choose_device
 
     device = choose_device(options.device)
     say(f"device: {device} (the first run compiles the kernels)")

@@ -17,8 +17,9 @@ from warpir.core.color import linear_to_gamma
 from warpir.core.errors import InputError
 from warpir.evaluate.scenes import RESPONSES, Subject
 from warpir.render.bridge import ComposeConstants, compose
+from warpir.render.device_light import light_args
 from warpir.render.device_scene import Placed, Proxy, Scene
-from warpir.render.renderer import Foreground, Renderer, light_args
+from warpir.render.renderer import Foreground, Renderer
 from warpir.render.tone_curve import ToneCurve
 from warpir.scene.light import Light
 from warpir.scene.tone_curves import Curves, ToneKnots

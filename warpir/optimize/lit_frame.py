@@ -9,7 +9,8 @@ from torch import Tensor
 from warpir.lighting.scene_light import SceneLight
 from warpir.optimize.view import Frame
 from warpir.render.bridge import ComposeConstants, compose
-from warpir.render.renderer import index_of, light_args
+from warpir.render.device_light import light_args
+from warpir.render.renderer import index_of
 from warpir.render.tone_curve import Knots
 
 STILL_SAMPLES = 64

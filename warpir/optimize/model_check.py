@@ -35,7 +35,7 @@ from warpir.diffusion.personalization.personalize import LoraTraining, personali
 from warpir.diffusion.prior import Condition, NonFiniteError
 from warpir.diffusion.prompts import Prompts, make_prompts
 from warpir.optimize.recover import as_input_errors
-from warpir.render.renderer import choose_device
+from warpir.render.device import choose_device
 
 PROMPT = "a small red car"
 """What is to be put into the demo's photo, or into any street."""

@@ -7,7 +7,7 @@ away inside a path hides the fault that made it. pbrt does the same with each sa
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -105,3 +105,22 @@ class BadPixels:
         if self.count:
             places = ", ".join(self.named)
             yield f"{self.count} pixels were not finite and were set to black, such as {places}"
+
+
+def all_finite(values: Sequence[FloatArray]) -> bool:
+    """Return whether no number is NaN or infinite."""
+    return all(bool(np.isfinite(v).all()) for v in values)
+
+
+def first_bad_sample_of(is_bad: Callable[[int], bool], spp: int) -> int | None:
+    """Return the first of ``spp`` samples with which a sum is bad; None: it is not bad now.
+
+    Samples are a function of their number: rendering fewer leaves out the last ones.
+    """
+    if not is_bad(spp):
+        return None
+    good, bad = 0, spp
+    while bad - good > 1:
+        middle = (good + bad) // 2
+        good, bad = (good, middle) if is_bad(middle) else (middle, bad)
+    return good

@@ -11,8 +11,10 @@ from warpir.core.arrays import BoolArray, CodeArray, FloatArray, IntArray
 from warpir.core.color import linear_to_gamma
 from warpir.io.images.photos import Photo
 from warpir.io.layers import Layers
+from warpir.kernels.types import LightArgs
+from warpir.render.device_light import light_args
 from warpir.render.device_scene import Placed, Proxy, Scene
-from warpir.render.renderer import Foreground, GBuffer, Renderer, light_args
+from warpir.render.renderer import Foreground, GBuffer, Renderer
 from warpir.scene.camera import Camera
 from warpir.scene.lamps import without_lamps
 from warpir.scene.light import Light, as_map, map_directions, texel_solid_angles
@@ -84,9 +86,9 @@ def make_picture(
         occluder: Share of the photo that stays in front of the object [1], shape [H, W].
         shadow_mask: Where the photo's ground is in shadow already.
     """
-    camera = renderer.scene.camera
     dimmed = light_fg if shadow_mask is None else without_lamps(light_fg, shadow_mask.at_object)
     args_fg = light_args(dimmed, renderer.device)
+    args_shadow = args_fg if light_shadow is dimmed else light_args(light_shadow, renderer.device)
     gbuffer = renderer.gbuffer(quality.seed)
     foreground = renderer.foreground(
         args_fg,
@@ -97,12 +99,47 @@ def make_picture(
         quality.seed,
         quality.indirect_limit,
     )
-    is_object = np.zeros(camera.width * camera.height, np.int32)
-    is_object[gbuffer.object_pixels] = 1
+    proxy_pixels, ratio = _shadow(
+        renderer, args_shadow, light_shadow, gbuffer.object_pixels, quality, shadow_mask
+    )
+    fg_display, ratio_display = renderer.tone(
+        foreground, ratio, curve_fg, curve_shadow, is_reinhard
+    )
+    planes = _planes(
+        renderer.scene.camera, gbuffer, foreground, fg_display, (proxy_pixels, ratio_display)
+    )
+    if planes["matte"].shape != photo.srgb.shape[:2]:
+        planes = _resize_planes(planes, *photo.srgb.shape[:2])
+    if occluder is not None:
+        planes = _behind(planes, occluder)
+    layers = _layers(planes, photo)
+    changed = (layers.matte > 0.0) | (layers.shadow_ratio != 1.0).any(axis=-1)
+    return Picture(
+        layers,
+        linear_to_gamma(layers.composite).astype(np.float32),
+        changed,
+        len(gbuffer.object_pixels),
+        len(proxy_pixels),
+    )
 
-    def shaded(light: Light, wanted: BoolArray) -> tuple[IntArray, FloatArray]:
-        """Return which of the wanted pixels the object shades, and their ratio."""
-        args = args_fg if light is dimmed else light_args(light, renderer.device)
+
+def _shadow(
+    renderer: Renderer,
+    args: LightArgs,
+    light: Light,
+    object_pixels: IntArray,
+    quality: Quality,
+    shadow_mask: ShadowMask | None,
+) -> tuple[IntArray, FloatArray]:
+    """Return the pixels that the object shades, and their ratio; ``args`` are those of ``light``.
+
+    Where the photo's ground is in shadow already, the lamps do not count.
+    """
+    camera = renderer.scene.camera
+    is_object = np.zeros(camera.width * camera.height, np.int32)
+    is_object[object_pixels] = 1
+
+    def shaded(args: LightArgs, wanted: BoolArray) -> tuple[IntArray, FloatArray]:
         pixels = renderer.shaded_pixels(args, quality.seed)
         pixels = pixels[wanted[pixels]]
         radiance = renderer.proxy(
@@ -110,35 +147,38 @@ def make_picture(
         )
         return pixels, renderer.ratio(radiance)
 
-    shares = np.zeros(len(is_object), np.float32)
-    if shadow_mask is not None:
-        resized = resize(shadow_mask.shares, camera.height, camera.width)
-        shares = np.clip(resized, 0.0, 1.0).reshape(-1)
-    proxy_pixels, ratio = shaded(light_shadow, shares < 1.0)
-    if shadow_mask is not None:
-        rest = shaded(without_lamps(light_shadow), shares > 0.0)
-        proxy_pixels, ratio = _mixed((proxy_pixels, ratio), rest, shares)
-    fg_display, ratio_display = renderer.tone(
-        foreground, ratio, curve_fg, curve_shadow, is_reinhard
-    )
+    if shadow_mask is None:
+        return shaded(args, np.ones(len(is_object), bool))
+    resized = resize(shadow_mask.shares, camera.height, camera.width)
+    shares = np.clip(resized, 0.0, 1.0).reshape(-1)
+    lit = shaded(args, shares < 1.0)
+    rest = shaded(light_args(without_lamps(light), renderer.device), shares > 0.0)
+    return _mixed(lit, rest, shares)
 
-    # Planes of the rendering's size, then of the photo's
+
+def _planes(
+    camera: Camera,
+    gbuffer: GBuffer,
+    foreground: Foreground,
+    fg_display: FloatArray,
+    shadow: tuple[IntArray, FloatArray],
+) -> dict[str, FloatArray]:
+    """Spread the tone-mapped rows over planes of the rendering's size."""
     size = (camera.height, camera.width)
     objects, mask = gbuffer.object_pixels, foreground.mask
     premultiplied = fg_display * mask[:, None]
     parts = _parts(foreground, premultiplied)
-    planes = {
+    return {
         "foreground": _plane(size, objects, premultiplied),
         "matte": _plane(size, objects, mask),
-        "shadow_ratio": _plane(size, proxy_pixels, ratio_display, outside=1.0),
+        "shadow_ratio": _plane(size, *shadow, outside=1.0),
         **{name: _plane(size, objects, values) for name, values in parts.items()},
         **_geometry(size, gbuffer, camera),
     }
-    height, width = photo.srgb.shape[:2]
-    if size != (height, width):
-        planes = _resize_planes(planes, height, width)
-    if occluder is not None:
-        planes = _behind(planes, occluder)
+
+
+def _layers(planes: dict[str, FloatArray], photo: Photo) -> Layers:
+    """Put the planes over the photo, both of one size."""
     plate = photo.linear()
     if not photo.is_deep:
         # The composite is made of what the file of layers holds, so that they recompose it exactly;
@@ -148,19 +188,11 @@ def make_picture(
             planes[name] = _halves(planes[name])
     matte = planes["matte"]
     composite = planes["foreground"] + (1.0 - matte)[..., None] * plate * planes["shadow_ratio"]
-    layers = Layers(
+    return Layers(
         composite=composite,
         foreground=np.concatenate([planes["foreground"], matte[..., None]], axis=-1),
         plate=plate,
         **{k: v for k, v in planes.items() if k != "foreground"},
-    )
-    changed = (matte > 0.0) | (planes["shadow_ratio"] != 1.0).any(axis=-1)
-    return Picture(
-        layers,
-        linear_to_gamma(composite).astype(np.float32),
-        changed,
-        len(objects),
-        len(proxy_pixels),
     )
 
 

@@ -25,10 +25,10 @@ from warpir.kernels.types import (
     ProxyArgs,
     TextureArgs,
 )
-from warpir.render.sheen import sheen_albedo_table
 from warpir.scene.asset import Asset, Material, Primitive, Texture, TextureSlot
 from warpir.scene.camera import Camera
 from warpir.scene.receiver import ProxyMesh
+from warpir.scene.sheen import sheen_albedo_table
 
 ALPHA_MODES = {"OPAQUE": 0, "MASK": 1, "BLEND": 2}
 SLOTS = (
@@ -40,6 +40,13 @@ SLOTS = (
 WRAP_MODES = {"repeat": 0, "clamp": 1, "mirror": 2}
 
 
+FACTORS = (
+    ("base_color", wp.vec3),
+    ("metallic", wp.float32),
+    ("roughness", wp.float32),
+    ("emission", wp.vec3),
+)
+"""Material factors that may be replaced, and differentiated."""
 PROXY_EPSILON = 2e-6
 """Ray offset over the diagonal of the place's mesh [1]; rays from it meet it again below 1e-7."""
 
@@ -153,6 +160,8 @@ def _extensions(material: Material) -> Extensions:
 class Scene:
     """Geometry, materials, plane and camera on one device; owns every Warp handle for the run.
 
+    Nothing of it changes once it is uploaded.
+
     Args:
         objects: What is rendered; may be empty (no triangles, no shadow).
         camera: The view.
@@ -259,6 +268,27 @@ class Scene:
         args.rotation = wp.mat33(*camera.c2w[:3, :3].astype(np.float32).reshape(-1))
         args.fx, args.fy, args.cx, args.cy = camera.fx, camera.fy, camera.cx, camera.cy
         args.width = camera.width
+        return args
+
+    def geometry(self, materials: MaterialArgs | None = None) -> tuple[Any, ...]:
+        """Return triangles, materials, textures and place, in the order of the kernels' arguments.
+
+        Args:
+            materials: In place of the scene's own.
+        """
+        own = self.material_args if materials is None else materials
+        return self.mesh_args, own, self.texture_args, self.proxy_args
+
+    def materials_with(self, factors: Sequence[FloatArray | None]) -> MaterialArgs:
+        """Return the scene's materials with other factors, in the order of `FACTORS`; None: own."""
+        args = MaterialArgs()
+        for name in self.material_args._cls.vars:
+            setattr(args, name, getattr(self.material_args, name))
+        for factor, (name, dtype) in zip(factors, FACTORS, strict=True):
+            if factor is not None:
+                setattr(args, name, wp.array(factor, dtype=dtype, device=self.device))
+        if factors[3] is not None:
+            args.any_emission = 1
         return args
 
     def contents(self) -> Iterator[NDArray[np.generic]]:

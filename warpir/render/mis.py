@@ -15,8 +15,9 @@ from torch import Tensor
 
 from warpir.core.arrays import IntArray
 from warpir.render.bridge import ShadeForeground, ShadeProxy, host_light
+from warpir.render.device_light import light_args
 from warpir.render.integrator import MaterialTensors, Radiance
-from warpir.render.renderer import Renderer, index_of, light_args
+from warpir.render.renderer import Renderer, index_of
 
 
 class MisIntegrator:

@@ -21,10 +21,11 @@ from warpir.kernels.types import (
     Layers,
     LightArgs,
     LightRecord,
-    MaterialArgs,
     VertexRecord,
 )
-from warpir.render.renderer import SAMPLES_PER_SLICE, ProxyRadiance, Renderer, Rows
+from warpir.render.device import SAMPLES_PER_SLICE, Rows
+from warpir.render.device_scene import FACTORS
+from warpir.render.renderer import ProxyRadiance, Renderer
 
 if TYPE_CHECKING:
     from warpir.render.mis import MisIntegrator
@@ -47,42 +48,6 @@ PART_COUNT = 16
 """Private sums of texels and materials; fixed, so that their order does not depend on threads."""
 
 
-class SceneMaterials:
-    """Material factors on the device; within the context the scene renders with them.
-
-    Args:
-        renderer: Whose scene.
-        factors: Base colour, metallic, roughness and emission; the scene's own where None.
-    """
-
-    NAMES = (
-        ("base_color", wp.vec3),
-        ("metallic", wp.float32),
-        ("roughness", wp.float32),
-        ("emission", wp.vec3),
-    )
-
-    def __init__(self, renderer: Renderer, factors: Sequence[FloatArray | None]) -> None:
-        self.args: MaterialArgs = renderer.scene.material_args
-        self.own = [getattr(self.args, name) for name, _ in self.NAMES]
-        self.arrays = [
-            own if factor is None else wp.array(factor, dtype=dtype, device=renderer.device)
-            for own, factor, (_, dtype) in zip(self.own, factors, self.NAMES, strict=True)
-        ]
-        self.own_any_emission = self.args.any_emission
-        self.any_emission = self.own_any_emission if factors[3] is None else 1
-
-    def __enter__(self) -> None:
-        for (name, _), array in zip(self.NAMES, self.arrays, strict=True):
-            setattr(self.args, name, array)
-        self.args.any_emission = self.any_emission
-
-    def __exit__(self, *_: object) -> None:
-        for (name, _), array in zip(self.NAMES, self.own, strict=True):
-            setattr(self.args, name, array)
-        self.args.any_emission = self.own_any_emission
-
-
 class ObjectSamples:
     """Samples of the object at one light, one set of materials and one seed.
 
@@ -90,7 +55,7 @@ class ObjectSamples:
         mis: The integrator.
         args: The light that samples are drawn from, and whose radiance they carry.
         seed: Base seed.
-        factors: See `SceneMaterials`.
+        factors: Base colour, metallic, roughness and emission; the scene's own where None.
         free: What gradients will be asked for, in the order of `Gradients`.
     """
 
@@ -103,11 +68,12 @@ class ObjectSamples:
         free: Sequence[bool],
     ) -> None:
         self.mis, self.args, self.seed, self.free = mis, args, seed, free
-        self.materials = SceneMaterials(mis.renderer, factors)
+        self.materials = mis.renderer.scene.materials_with(factors)
+        self.factors = [getattr(self.materials, name) for name, _ in FACTORS]
         self.path_count = mis.spp * mis.rays
         self.entries = 2 * self.path_count * mis.depth * free[0]
         self.vertices = self.path_count * (mis.depth + 1) * any(free[1:])
-        self.has_layers = self.materials.args.any_layers == 1
+        self.has_layers = self.materials.any_layers == 1
         vertex_bytes = VERTEX_BYTES + LAYERS_BYTES * self.has_layers
         row_bytes = ENTRY_BYTES * self.entries + vertex_bytes * self.vertices
         self.parts = _parts(len(mis.object_pixels), row_bytes)
@@ -141,17 +107,17 @@ class ObjectSamples:
             vertex = _new_vertex_record(
                 len(pixels) * lanes, self.vertices // lanes, self.has_layers, device
             )
-        with self.materials:
-            out = mis.renderer.foreground(
-                self.args,
-                pixels,
-                mis.spp,
-                mis.rays,
-                mis.depth,
-                self.seed,
-                light_record=light,
-                vertex_record=vertex,
-            )
+        out = mis.renderer.foreground(
+            self.args,
+            pixels,
+            mis.spp,
+            mis.rays,
+            mis.depth,
+            self.seed,
+            light_record=light,
+            vertex_record=vertex,
+            materials=self.materials,
+        )
         return out.radiance, light, vertex
 
     def gradient(self, d_radiance: FloatArray) -> Gradients:
@@ -187,7 +153,7 @@ class ObjectSamples:
         )
         d_factors = [
             wp.zeros((parts, len(a)), dtype=a.dtype, device=device) if is_free else None
-            for a, is_free in zip(self.materials.arrays, self.free[1:], strict=True)
+            for a, is_free in zip(self.factors, self.free[1:], strict=True)
         ]
 
         def one(part: int) -> None:
@@ -229,7 +195,7 @@ class ObjectSamples:
             wp.launch(
                 shade_kernels.shade_vertex,
                 dim=paths,
-                inputs=[record, count, k, *self.materials.arrays, throughput[k]],
+                inputs=[record, count, k, *self.factors, throughput[k]],
                 outputs=[unused, throughput[k + 1]],
                 device=device,
                 record_tape=False,

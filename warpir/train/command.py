@@ -88,7 +88,7 @@ def _run(arguments: list[str]) -> int:
 
     import torch
 
-    from warpir.render.renderer import choose_device
+    from warpir.render.device import choose_device
     from warpir.train.lights import load_panoramas
     from warpir.train.meshes import make_meshes, read_meshes
     from warpir.train.scenes import Stock

@@ -34,13 +34,11 @@ from warpir.render.transport.rows import (
     LOWER_SHADOW,
     TRACING,
     TransportSettings,
-    direction_counts,
-    flux_noise,
     object_rows,
     place_rows,
     proxy_rows,
-    tent_irradiance,
 )
+from warpir.render.transport.tents import direction_counts, flux_noise, tent_irradiance
 from warpir.scene.light import Light, rasterize_lobes
 
 DTYPES = {"bfloat16": torch.bfloat16, "float32": torch.float32}
@@ -94,18 +92,12 @@ class TransportIntegrator:
         self.expected = tuple(
             to_texels(expected, h) for h in (self.settings.height_fg, self.settings.height_shadow)
         )
-        height = self.settings.height_shadow
         self.has_mesh = renderer.scene.proxy.mesh is not None
-        if self.has_mesh:
-            irradiance = np.ones(2 * height * height)
-        else:
-            x, y, z = (float(c) for c in renderer.scene.proxy.normal)
-            irradiance = tent_irradiance((x, y, z), height).reshape(-1)
-        above = np.flatnonzero(irradiance > 0.0).astype(np.int32)
+        above, irradiance = self._open_irradiance()
         self.above = torch.from_numpy(above.astype(np.int64)).to(self.device)
-        self.irradiance = torch.from_numpy(irradiance[above].astype(np.float32)).to(self.device)
+        self.irradiance = torch.from_numpy(irradiance).to(self.device)
 
-        stored = None
+        file = None
         if cache is not None:
             key = content_key(
                 renderer.scene,
@@ -117,25 +109,48 @@ class TransportIntegrator:
                 seed,
                 renderer.is_ordered,
             )
-            stored = load_rows(cache / f"{key}.safetensors", self.device)
+            file = cache / f"{key}.safetensors"
+        stored = None if file is None else load_rows(file, self.device)
         self.is_cached = stored is not None
         if stored is None:
-            self._check_memory(0)
-            traced = self._trace_place(seed) if self.has_mesh else self._trace_proxy(above, seed)
-            stored = self._trace_object(seed) | traced
-            if cache is not None:
-                save_rows(cache / f"{key}.safetensors", stored)
+            stored = self._trace(above, seed)
+            if file is not None:
+                save_rows(file, stored)
+        self._hold(stored)
+        wp.synchronize_device(renderer.device)
+        self.seconds_traced = time.perf_counter() - start
+
+    def _open_irradiance(self) -> tuple[IntArray, FloatArray]:
+        """Return the texels that light the open plane, all with a mesh, and what each gives it."""
+        height = self.settings.height_shadow
+        if self.has_mesh:
+            irradiance = np.ones(2 * height * height)
+        else:
+            x, y, z = (float(c) for c in self.renderer.scene.proxy.normal)
+            irradiance = tent_irradiance((x, y, z), height).reshape(-1)
+        above = np.flatnonzero(irradiance > 0.0).astype(np.int32)
+        return above, irradiance[above].astype(np.float32)
+
+    def _trace(self, above: IntArray, seed: int) -> dict[str, Tensor]:
+        """Trace all rows; names are those of the cache's arrays."""
+        self._check_memory(0)
+        traced = self._trace_place(seed) if self.has_mesh else self._trace_proxy(above, seed)
+        return self._trace_object(seed) | traced
+
+    def _hold(self, stored: dict[str, Tensor]) -> None:
+        """Make matrices of what was traced or read."""
         self.T_fg = DenseRows(stored["T_fg"])
         self.T_shadow = SparseRows(
-            stored["row"], stored["column"], stored["blocked"], (len(proxy_pixels), len(above))
+            stored["row"],
+            stored["column"],
+            stored["blocked"],
+            (len(self.proxy_pixels), len(self.above)),
         )
         self.T_place = DenseRows(stored["T_place"]) if self.has_mesh else None
         if self.has_mesh:
             self.bounced, self.bounced_blocked = stored["bounced"]
         self.emission = stored["emission"]
         self.mask = stored["mask"].cpu().numpy()
-        wp.synchronize_device(renderer.device)
-        self.seconds_traced = time.perf_counter() - start
         self.bytes = self.T_fg.bytes + self.T_shadow.bytes
         if self.T_place is not None:
             self.bytes += self.T_place.bytes

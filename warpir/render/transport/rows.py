@@ -4,25 +4,23 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
-from functools import lru_cache
 from typing import TypeVar
 
 import numpy as np
 import warp as wp
 
-from warpir.core.arrays import Float64Array, FloatArray, IntArray
+from warpir.core.arrays import FloatArray, IntArray
 from warpir.core.color import luminance
 from warpir.kernels import transport as kernels
-from warpir.kernels.types import Layers
-from warpir.render.renderer import Renderer, Rows, light_args
-from warpir.scene.light import Light, map_directions, texel_solid_angles
+from warpir.kernels.types import Layers, LightArgs
+from warpir.render.device import Rows
+from warpir.render.device_light import light_args
+from warpir.render.renderer import Renderer
+from warpir.render.transport.tents import direction_counts, texel_args
+from warpir.scene.light import Light, texel_solid_angles
 
 Traced = TypeVar("Traced")
 
-LANES = 256
-"""Threads of a pixel on CUDA."""
-ITEM_SIZE = 16
-"""Directions that one of them draws in a row."""
 CHUNK_BYTES = 64 << 20
 """Memory of the rows that are traced at once, before they are stored in a small type."""
 TRACING = "tracing light transport"
@@ -75,118 +73,49 @@ class TransportSettings:
     """Most memory that the stored rows may take [MiB]."""
 
 
-def tent_solid_angles(height: int) -> Float64Array:
-    """Return the solid angle of a texel's tent in each row [sr], shape [height].
+@dataclass(frozen=True)
+class _ObjectTrace:
+    """A tracing of the object's rows, less the rows and their samples."""
 
-    That is what bilinear interpolation weighs a texel with; all texels sum to 4 pi. Within the map
-    ``2 (1 - cos d) / d sin(theta)``, in the polar rows the lookup is clamped.
-    """
-    step = np.pi / height
-    centre = (np.arange(height) + 0.5) * step
-    rows = np.sin(centre) * 2.0 * (1.0 - np.cos(step)) / step
-    polar = 1.0 - np.cos(0.5 * step)
-    beyond = np.cos(0.5 * step) - (np.sin(1.5 * step) - np.sin(0.5 * step)) / step
-    rows[0] = rows[-1] = polar + beyond
-    solid: Float64Array = rows * np.pi / height
-    return solid
+    renderer: Renderer
+    texels: kernels.TexelArgs
+    proposal: LightArgs
+    """Where later vertices look for light."""
+    depth: int
+    seed: int
+    direction_count: int
+    """Of all texels."""
 
-
-@lru_cache(maxsize=8)
-def tent_irradiance(normal: tuple[float, float, float], height: int) -> Float64Array:
-    """Return what a texel of radiance 1 makes a white plane reflect [1], shape [height, 2 height].
-
-    ``integral of tent cos / pi`` by quadrature; all texels of a constant sky sum to 1.
-    """
-    side = max(4, 1024 // height)
-    fine = side * height
-    cosine = np.maximum(map_directions(fine, 2 * fine) @ np.array(normal), 0.0) / np.pi
-    cosine *= texel_solid_angles(fine, 2 * fine)[:, None]
-
-    def tents(count: int, wraps: bool) -> Float64Array:
-        """Interpolation weights of ``side * count`` positions, shape [side * count, count]."""
-        x = (np.arange(side * count) + 0.5) / side - 0.5
-        low = np.floor(x).astype(int)
-        weight = x - low
-        first, second = low % count, (low + 1) % count
-        if not wraps:
-            first, second = np.clip(low, 0, count - 1), np.clip(low + 1, 0, count - 1)
-        matrix = np.zeros((side * count, count))
-        np.add.at(matrix, (np.arange(side * count), first), 1.0 - weight)
-        np.add.at(matrix, (np.arange(side * count), second), weight)
-        return matrix
-
-    irradiance: Float64Array = tents(height, False).T @ cosine @ tents(2 * height, True)
-    return irradiance
-
-
-def direction_counts(expected: FloatArray, budget: int) -> IntArray:
-    """Return how many directions each texel gets: one, and more where light is expected.
-
-    A texel's noise is proportional to its flux, so equal-cost directions are best shared out in
-    proportion to it (Neyman's allocation); powers of two keep the sequences stratified.
-
-    Args:
-        expected: Likely radiance of the map, shape [He, 2 He, 3].
-        budget: Directions to share out.
-
-    Returns:
-        Shape [He * 2 He].
-    """
-    flux = luminance(expected.astype(np.float64)) * tent_solid_angles(len(expected))[:, None]
-    share = budget * flux / max(float(flux.sum()), 1e-30)
-    counts = np.exp2(np.floor(np.log2(np.maximum(share, 1.0)))).astype(np.int32)
-    flat: IntArray = counts.reshape(-1)
-    return flat
-
-
-def flux_noise(texels: FloatArray, counts: IntArray) -> float:
-    """Return how much of a pixel's noise is left with these directions, under this light [1].
-
-    ``sqrt(sum flux_t^2 / count_t)`` over the whole flux: the standard deviation of a pixel if each
-    direction's light were as uncertain as it is strong. A light that has moved shows by it.
-    """
-    flux = luminance(texels.astype(np.float64)) * tent_solid_angles(len(texels))[:, None]
-    total = max(float(flux.sum()), 1e-30)
-    return float(np.sqrt((np.square(flux.reshape(-1)) / counts).sum()) / total)
-
-
-def _texel_args(
-    counts: IntArray,
-    height: int,
-    renderer: Renderer,
-    columns: IntArray,
-    normal: Float64Array | None = None,
-) -> kernels.TexelArgs:
-    """Describe a map's texels; directions follow the cosine with ``normal`` where it is given.
-
-    ``columns`` are the texels that the rows hold.
-    """
-    device = renderer.device
-    args = kernels.TexelArgs()
-    args.height, args.width = height, 2 * height
-    step = np.pi / height
-    rows = np.arange(height)
-    low, high = np.maximum(rows - 0.5, 0.0) * step, np.minimum(rows + 1.5, height) * step
-    across = np.where((low < 0.5 * np.pi) & (high > 0.5 * np.pi), 1.0, np.sin([low, high]).max(0))
-    bound = np.repeat(across[:, None], 2 * height, axis=1)
-    centres = map_directions(height, 2 * height)
-    if normal is not None:
-        angle = np.arccos(np.clip(centres @ normal, -1.0, 1.0))
-        bound *= np.cos(np.clip(angle - kernels.TENT_REACH * step, 0.0, 0.5 * np.pi))
-    for name, values in (("d_omega", tent_solid_angles(height)), ("bound", bound.reshape(-1))):
-        setattr(args, name, wp.array(values.astype(np.float32), dtype=float, device=device))
-    args.direction_count = wp.array(counts, dtype=int, device=device)
-    args.centre = wp.array(centres.reshape(-1, 3).astype(np.float32), dtype=wp.vec3, device=device)
-    # On CUDA one thread must not draw a sun's directions while its neighbours wait; but a pixel's
-    # sums have one order only where one thread adds them up.
-    args.lanes, args.item_size = (1, 1 << 30) if renderer.is_ordered else (LANES, ITEM_SIZE)
-    pieces = -(-counts[columns] // args.item_size)
-    which = np.repeat(np.arange(len(columns)), pieces)
-    first = np.arange(len(which)) - np.repeat(np.cumsum(pieces) - pieces, pieces)
-    args.item_count = len(which)
-    for name, values in (("item_column", which), ("item_first", first * args.item_size)):
-        setattr(args, name, wp.array(values.astype(np.int32), dtype=int, device=device))
-    return args
+    def rows(self, rows: IntArray, pixels: IntArray, subsamples: int, paths: int) -> ObjectRows:
+        """Trace some rows, by one interaction and by more."""
+        renderer, texels, seed = self.renderer, self.texels, self.seed
+        geometry = renderer.scene.geometry()
+        points, emission = _surface_points(renderer, pixels, subsamples, seed)
+        texel_count = texels.height * texels.width
+        T = wp.zeros((len(pixels), texel_count), dtype=wp.vec3, device=renderer.device)
+        launched = Rows(renderer.upload(pixels, wp.int32))
+        renderer.launch(
+            kernels.trace_direct,
+            len(pixels),
+            [launched, Rows(points), *geometry, texels, subsamples, paths, seed, Rows(T)],
+            self.direction_count,
+            "transport",
+            texels.lanes,
+        )
+        # Threads of a pixel add to one row: in one order if one runs at a time, as on the CPU.
+        step = 1 if renderer.is_ordered and renderer.device.is_cuda else max(paths, 1)
+        for first in range(0, paths, step):
+            counts = (subsamples, first, paths, self.depth, seed)
+            outputs = (Rows(T), Rows(emission))
+            renderer.launch(
+                kernels.trace_paths,
+                len(pixels),
+                [launched, Rows(points), *geometry, texels, self.proposal, *counts, *outputs],
+                step * self.depth,
+                "transport",
+                step,
+            )
+        return ObjectRows(rows, T, emission, points.count, subsamples)
 
 
 def object_rows(
@@ -198,72 +127,35 @@ def object_rows(
     seed: int,
 ) -> Iterator[ObjectRows]:
     """Trace the object's rows chunk by chunk, pixels that mirror with more samples than others."""
-    scene, device, height = renderer.scene, renderer.device, settings.height_fg
+    height = settings.height_fg
     counts = direction_counts(expected, settings.bright_directions)
-    texel_count = 2 * height * height
-    texels = _texel_args(counts, height, renderer, np.arange(texel_count, dtype=np.int32))
-    # Half of the later vertices' directions look for the expected light, half everywhere.
-    flux = luminance(expected.astype(np.float64))
-    mean = float((flux * texel_solid_angles(height, 2 * height)[:, None]).sum()) / (4.0 * np.pi)
-    flat = 0.5 + 0.5 * flux / mean if mean > 0.0 else np.ones_like(flux)
-    proposal = light_args(
-        Light(texels=np.repeat(flat[..., None], 3, axis=2).astype(np.float32)), device
-    )
-    geometry = (scene.mesh_args, scene.material_args, scene.texture_args)
-    for rows, factor in _groups(renderer, pixels, settings, seed):
+    every = np.arange(2 * height * height, dtype=np.int32)
+    texels = texel_args(counts, height, renderer, every)
+    proposal = light_args(_proposal(expected), renderer.device)
+    trace = _ObjectTrace(renderer, texels, proposal, depth, seed, int(counts.sum()))
+    for group, factor in _groups(renderer, pixels, settings, seed):
         subsamples, paths = factor * settings.subsamples, factor * settings.paths
 
-        def trace(
+        def part(
             start: int,
             stop: int,
-            rows: IntArray = rows,
+            group: IntArray = group,
             subsamples: int = subsamples,
             paths: int = paths,
         ) -> ObjectRows:
-            rows = rows[start:stop]
-            chunk = pixels[rows]
-            points, emission = _surface_points(renderer, chunk, subsamples, seed)
-            T = wp.zeros((len(chunk), texel_count), dtype=wp.vec3, device=device)
-            launched = Rows(wp.array(chunk, dtype=wp.int32, device=device))
-            renderer.launch(
-                kernels.trace_direct,
-                len(chunk),
-                [
-                    *(launched, Rows(points), *geometry, scene.proxy_args),
-                    *(texels, subsamples, paths, seed, Rows(T)),
-                ],
-                int(counts.sum()),
-                "transport",
-                texels.lanes,
-            )
-            # Threads of a pixel add to one row: in one order if one runs at a time, as on the CPU.
-            step = 1 if renderer.is_ordered and device.is_cuda else max(paths, 1)
-            for first in range(0, paths, step):
-                renderer.launch(
-                    kernels.trace_paths,
-                    len(chunk),
-                    [
-                        launched,
-                        Rows(points),
-                        *geometry,
-                        scene.proxy_args,
-                        texels,
-                        proposal,
-                        subsamples,
-                        first,
-                        paths,
-                        depth,
-                        seed,
-                        Rows(T),
-                        Rows(emission),
-                    ],
-                    step * depth,
-                    "transport",
-                    step,
-                )
-            return ObjectRows(rows, T, emission, points.count, subsamples)
+            rows = group[start:stop]
+            return trace.rows(rows, pixels[rows], subsamples, paths)
 
-        yield from renderer.memory.in_chunks(trace, len(rows), TRACING, LOWER_OBJECT)
+        yield from renderer.memory.in_chunks(part, len(group), TRACING, LOWER_OBJECT)
+
+
+def _proposal(expected: FloatArray) -> Light:
+    """Return the light of later vertices: half of their directions look everywhere."""
+    height = len(expected)
+    flux = luminance(expected.astype(np.float64))
+    mean = float((flux * texel_solid_angles(height, 2 * height)[:, None]).sum()) / (4.0 * np.pi)
+    flat = 0.5 + 0.5 * flux / mean if mean > 0.0 else np.ones_like(flux)
+    return Light(texels=np.repeat(flat[..., None], 3, axis=2).astype(np.float32))
 
 
 def _groups(
@@ -313,10 +205,7 @@ def _surface_points(
         [
             Rows(wp.array(pixels, dtype=wp.int32, device=device)),
             scene.camera_args,
-            scene.mesh_args,
-            scene.material_args,
-            scene.texture_args,
-            scene.proxy_args,
+            *scene.geometry(),
             subsamples,
             seed,
             Rows(points),
@@ -363,10 +252,7 @@ def _place_points(
             points.pixels,
             Rows(wp.array(may_see_object, dtype=int, device=device)),
             scene.camera_args,
-            scene.mesh_args,
-            scene.material_args,
-            scene.texture_args,
-            scene.proxy_args,
+            *scene.geometry(),
             subsamples,
             seed,
             points.count,
@@ -397,11 +283,11 @@ def proxy_rows(
     """
     scene, device, height = renderer.scene, renderer.device, settings.height_shadow
     counts = direction_counts(expected, settings.bright_directions)
-    texels = _texel_args(counts, height, renderer, columns, scene.proxy.normal)
+    texels = texel_args(counts, height, renderer, columns, scene.proxy.normal)
     size = max(1, CHUNK_BYTES // (4 * len(columns)))
     if scene.triangle_count == 0:
         return
-    geometry = (scene.mesh_args, scene.material_args, scene.texture_args, scene.proxy_args)
+    geometry = scene.geometry()
     wp_columns = wp.array(columns, dtype=int, device=device)
 
     def trace(first: int, last: int) -> wp.array:
@@ -472,9 +358,9 @@ def place_rows(
     scene, device, height = renderer.scene, renderer.device, settings.height_shadow
     texel_count = 2 * height * height
     counts = direction_counts(expected, settings.bright_directions)
-    texels = _texel_args(counts, height, renderer, np.arange(texel_count, dtype=np.int32))
+    texels = texel_args(counts, height, renderer, np.arange(texel_count, dtype=np.int32))
     size = max(1, CHUNK_BYTES // (8 * texel_count))
-    geometry = (scene.mesh_args, scene.material_args, scene.texture_args, scene.proxy_args)
+    geometry = scene.geometry()
 
     def trace(first: int, last: int) -> PlaceRows:
         chunk, count = slice(first, last), last - first

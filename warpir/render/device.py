@@ -1,0 +1,217 @@
+"""Warp on one device: its start, its kernel cache, and launches cut into slices of rows.
+
+On the CPU a Warp launch runs on one core, so every launch is cut into row slices that a thread pool
+works through; on CUDA it is one launch. A row's numbers depend on its own arguments alone, so
+slices and threads do not change a result.
+"""
+
+from __future__ import annotations
+
+import logging
+import os
+from collections.abc import Callable, Iterable, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from functools import cache
+from itertools import product
+from typing import Any
+
+import numpy as np
+import warp as wp
+from numpy.typing import NDArray
+
+from warpir.core.cache import KernelCache
+from warpir.core.errors import ExitCode, InputError
+from warpir.io.images.decoder import captured_stderr
+from warpir.kernels.composite import tone_foreground
+from warpir.kernels.path import foreground_kernel
+from warpir.kernels.proxy import trace_proxy
+from warpir.kernels.shadow_ratio import shadow_ratio
+from warpir.kernels.trace import trace_gbuffer
+
+SAMPLES_PER_SLICE = 1 << 16
+"""CPU work of one launch; keeps launches under half a second, so that Ctrl-C is answered."""
+
+_kernel_caches: list[KernelCache] = []
+"""Of this process, if it has one of its own."""
+
+
+@dataclass(frozen=True)
+class Rows:
+    """An array, or a struct of arrays, whose first axis is the launch's; both are cut alike."""
+
+    array: Any
+
+    def cut(self, start: int, stop: int) -> Any:
+        """Return the part of rows ``start`` to ``stop``."""
+        if isinstance(self.array, wp.array):
+            return self.array[start:stop]
+        part = type(self.array)()
+        for name in self.array._cls.vars:
+            array = getattr(self.array, name)
+            # One that is not there has no rows, and Warp cannot slice nothing.
+            setattr(part, name, array[start:stop] if array.size else array)
+        return part
+
+
+def start_warp() -> None:
+    """Start Warp with a kernel cache that can be written and believed, unless it has started."""
+    # The banner, the lines of each loaded module and "no CUDA driver" are for `--debug`.
+    if not logging.getLogger().isEnabledFor(logging.DEBUG):
+        wp.config.log_level = wp.LOG_ERROR
+    if wp.config.kernel_cache_dir is None:  # set by Warp when it starts, or by the caller
+        cache = KernelCache(wp.config.version)
+        wp.config.kernel_cache_dir = str(cache.folder)
+        _kernel_caches.append(cache)
+    with captured_stderr():
+        wp.init()
+
+
+def choose_device(name: str | None) -> str:
+    """Return the Warp device to use: the one asked for, else CUDA where there is one, else CPU.
+
+    Raises:
+        InputError: The device does not exist.
+    """
+    start_warp()
+    known = [d.alias for d in wp.get_devices()]
+    if name is None:
+        return "cuda:0" if wp.is_cuda_available() else "cpu"
+    alias = "cuda:0" if name == "cuda" else name
+    if alias not in known:
+        raise InputError(
+            "--device",
+            f"no device {name} here (found {', '.join(known)})",
+            "use --device cpu",
+            ExitCode.USAGE,
+        )
+    return alias
+
+
+def default_threads() -> int:
+    """Return the number of cores this process may use."""
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+
+
+def cuda_count() -> int:
+    """Return how many CUDA devices this process may use."""
+    start_warp()
+    return len(wp.get_cuda_devices())
+
+
+def load_kernels(device: str, variants: Iterable[tuple[bool, bool]]) -> None:
+    """Compile what renders a picture, or find it compiled, and keep it for processes yet to start.
+
+    A run does so when it needs it, and keeps it at its end.
+
+    Args:
+        device: Warp's name of it.
+        variants: Of `foreground_kernel`.
+    """
+    on = wp.get_device(device)
+    settle_hashes(on.is_cpu)
+    kernels = [trace_gbuffer, trace_proxy, shadow_ratio, tone_foreground]
+    for kernel in (*kernels, *(foreground_kernel(*flags) for flags in variants)):
+        # As a launch does: on the CPU there are no blocks.
+        kernel.module.load(on, 1 if on.is_cpu else kernel.module.options["block_dim"])
+    for kept in _kernel_caches:
+        kept.keep()
+
+
+@cache
+def settle_hashes(is_cpu: bool) -> None:
+    """Compute the hashes that Warp finds compiled modules by, before any is compiled.
+
+    Modules share functions, and building one changes what Warp 1.19 hashes of the next: without
+    this a second run finds the first run's module under another hash and compiles it again (26 s
+    on an H200).
+    """
+    kernels = [trace_gbuffer, trace_proxy, shadow_ratio, tone_foreground]
+    kernels += [foreground_kernel(*flags) for flags in product((False, True), repeat=2)]
+    for kernel in kernels:
+        kernel.module.get_module_hash(1 if is_cpu else None)
+
+
+class Launcher:
+    """Launches kernels over rows on one device.
+
+    Args:
+        device: Warp device.
+        threads: CPU threads; 0 means one per core. Ignored on CUDA.
+        progress: Called with the share of a stage that is done, 0 to 1, from worker threads.
+    """
+
+    def __init__(
+        self,
+        device: wp.Device,
+        threads: int = 0,
+        progress: Callable[[str, float], None] | None = None,
+    ) -> None:
+        self.device = device
+        self.threads = threads or default_threads()
+        self._progress = progress or (lambda stage, share: None)
+        settle_hashes(bool(device.is_cpu))
+
+    def launch(
+        self,
+        kernel: wp.Kernel,
+        count: int,
+        args: Sequence[object],
+        work: int,
+        stage: str = "",
+        width: int | None = None,
+    ) -> None:
+        """Run ``kernel`` over ``count`` threads; `Rows` among ``args`` are cut with the launch.
+
+        Args:
+            kernel: A kernel without backward pass.
+            count: Number of Warp threads.
+            args: Kernel arguments in order.
+            work: Samples that one row of the launch takes, for sizing the slices.
+            stage: What to call this in progress reports.
+            width: Threads of each row, for kernels of two indices.
+        """
+        if count == 0:
+            return
+        wp.load_module(kernel.module, device=self.device)
+        size = count
+        if self.device.is_cpu:
+            rows = min(SAMPLES_PER_SLICE // max(work, 1), -(-count // (4 * self.threads)))
+            size = max(16 if width is None else 1, rows)
+        starts = range(0, count, size)
+
+        def one(start: int) -> None:
+            stop = min(start + size, count)
+            cut = [a.cut(start, stop) if isinstance(a, Rows) else a for a in args]
+            dim = stop - start if width is None else (stop - start, width)
+            wp.launch(kernel, dim=dim, inputs=cut, device=self.device, record_tape=False)
+
+        self.in_threads(one, starts, stage)
+
+    def in_threads(self, one: Callable[[int], object], starts: Sequence[int], stage: str) -> None:
+        """Call ``one`` for each of ``starts``, on as many threads as the launcher has.
+
+        Within ``one``, launches go with ``record_tape=False``: a tape belongs to one thread.
+        """
+        if len(starts) == 1 or self.threads == 1:
+            for done, start in enumerate(starts):
+                one(start)
+                self._progress(stage, (done + 1) / len(starts))
+            return
+        with ThreadPoolExecutor(self.threads) as pool:
+            futures = [pool.submit(one, start) for start in starts]
+            try:
+                for done, future in enumerate(futures):
+                    future.result()
+                    self._progress(stage, (done + 1) / len(futures))
+            except BaseException:
+                pool.shutdown(cancel_futures=True)
+                raise
+
+    def upload(self, values: NDArray[np.generic], dtype: type) -> wp.array:
+        """Copy values to the device."""
+        return wp.array(values, dtype=dtype, device=self.device)
+
+    def zeros(self, count: int, dtype: type) -> wp.array:
+        """Return a zeroed output of ``count`` rows; one row where there are none."""
+        return wp.zeros(max(count, 1), dtype=dtype, device=self.device)
