@@ -1,7 +1,7 @@
 """Path tracing of the object under a light at infinity, ``PathTrace(X, L_fg, D)`` (DiPIR, eq. 4).
 
-Each vertex draws one direction from the light and one from the BRDF and combines them with the
-power heuristic; the BRDF's direction continues the path. `trace_foreground` sums radiance and, if
+Each vertex draws one direction from the light and one from the BSDF (`warpir.kernels.scatter`); the
+BSDF's direction continues the path. `trace_foreground` sums radiance and, if
 asked, writes down what the two adjoints need: `warpir.kernels.light_gradient` for the light,
 `warpir.kernels.shade` for the materials. Detached: no backward pass.
 """
@@ -10,22 +10,19 @@ from functools import cache
 
 import warp as wp
 
-from warpir.kernels.brdf import brdf_eval, brdf_sample
-from warpir.kernels.frame import basis, to_local, to_world
+from warpir.kernels.frame import basis
 from warpir.kernels.light_gradient import keep_direction
-from warpir.kernels.proxy_mesh import proxy_mesh_hit, proxy_radiance, proxy_visibility
 from warpir.kernels.rng import hash_pair, pixel_seed, sobol_pair
-from warpir.kernels.sampling import light_eval, light_sample, power_heuristic
-from warpir.kernels.trace import (
-    Hit,
-    Surface,
-    camera_hit,
-    camera_ray,
-    closest_hit,
-    offset_origin,
-    surface_at,
-    visibility,
+from warpir.kernels.sampling import light_eval
+from warpir.kernels.scatter import (
+    BsdfSample,
+    EmitterSample,
+    bsdf_weight,
+    sample_bsdf,
+    sample_emitter,
+    surface_bsdf,
 )
+from warpir.kernels.trace import Hit, Surface, camera_hit, camera_ray, surface_at
 from warpir.kernels.types import (
     CameraArgs,
     LightArgs,
@@ -52,24 +49,12 @@ class Scatter:
     """``f cos / pdf`` of the continued path."""
     throughput_diffuse: wp.vec3
     """The diffuse lobe's part of it."""
-    wi_light: wp.vec3
-    f_light: wp.vec3
-    """BRDF value of the light's direction [1/sr]."""
-    L_light: wp.vec3
-    """Radiance from there."""
-    weight_light: float
-    """``cos visible mis / pdf`` of it, without f."""
-    wi_brdf: wp.vec3
-    f_brdf: wp.vec3
-    L_brdf: wp.vec3
-    weight_brdf: float
-    """The same of the BRDF's direction; 0 when it met the object."""
-    from_place: int
-    """1 when the BRDF's direction met the place's mesh: what it brings is a constant to the
-    light."""
-    weight_next: float
-    """``cos / pdf`` of the BRDF's direction when it met the object, else 0."""
-    next: Hit
+    emitter: EmitterSample
+    bsdf: BsdfSample
+    L_bsdf: wp.vec3
+    """Radiance that arrives along the BSDF's direction, of the light or of the place's mesh."""
+    weight_bsdf: float
+    """``cos visible mis / pdf`` of it; 0 when it met the object."""
 
 
 @wp.func
@@ -89,106 +74,52 @@ def scatter(
 ) -> Scatter:
     """Draw, weigh and trace the two directions of one path vertex.
 
-    A direction counts only if it leaves both the shading and the geometric surface. ``is_last``
-    says that nothing behind this vertex can add light, so that any hit will do. ``keep_dark`` asks
-    for the weight of directions that bring nothing now: a gradient needs them.
+    ``is_last`` and ``keep_dark`` are those of `sample_bsdf` and `sample_emitter`.
     """
     out = Scatter()
     out.direct = wp.vec3(0.0)
     out.direct_diffuse = wp.vec3(0.0)
     out.throughput = wp.vec3(0.0)
     out.throughput_diffuse = wp.vec3(0.0)
-    out.f_light = wp.vec3(0.0)
-    out.L_light = wp.vec3(0.0)
-    out.weight_light = 0.0
-    out.f_brdf = wp.vec3(0.0)
-    out.L_brdf = wp.vec3(0.0)
-    out.weight_brdf = 0.0
-    out.from_place = 0
-    out.weight_next = 0.0
-    out.next.valid = 0
+    out.L_bsdf = wp.vec3(0.0)
+    out.weight_bsdf = 0.0
     frame = basis(surface.n)
-    wo_local = to_local(wo, frame)
-    pick = sobol_pair(index, key, 3 * vertex + 1)
+    bsdf = surface_bsdf(surface, wo, frame)
+    u_parts = sobol_pair(index, key, 3 * vertex + 1)
 
-    # Next-event estimation from the light's proposal
-    wi = light_sample(light, sobol_pair(index, key, 3 * vertex + 2), pick[0])
-    wi_local = to_local(wi, frame)
-    out.wi_light = wi
-    if wi_local[2] > 0.0 and wp.dot(wi, surface.ng) > 0.0 and wo_local[2] > 0.0:
-        f = brdf_eval(
-            wo_local,
-            wi_local,
-            surface.base_color,
-            surface.metallic,
-            surface.roughness,
-            surface.layers,
-        )
-        Li = light_eval(light, wi)
-        out.f_light = f.diffuse + f.specular
-        out.L_light = Li.radiance
-        unshadowed = wp.cw_mul(out.f_light, Li.radiance)
-        if Li.pdf > 0.0 and (wp.max(unshadowed) > 0.0 or keep_dark == 1):
-            weight = wi_local[2] * power_heuristic(Li.pdf, f.pdf) / Li.pdf
-            origin = offset_origin(surface.position, surface.ng, wi, mesh.epsilon)
-            weight = weight * visibility(mesh, material, texture, origin, wi)
-            weight = weight * proxy_visibility(proxy, origin, wi)
-            out.weight_light = weight
-            out.direct = unshadowed * weight
-            out.direct_diffuse = wp.cw_mul(f.diffuse, Li.radiance) * weight
-
-    # The BRDF's own direction: it sees the light, or the path goes on
-    wi_local = brdf_sample(
-        wo_local,
-        sobol_pair(index, key, 3 * vertex + 3),
-        pick[1],
-        surface.base_color,
-        surface.metallic,
-        surface.roughness,
-        surface.layers,
+    # Sample the emitter
+    u = sobol_pair(index, key, 3 * vertex + 2)
+    emitter = sample_emitter(
+        mesh, material, texture, proxy, light, surface, bsdf, frame, u, u_parts[0], keep_dark
     )
-    wi = to_world(wi_local, frame)
-    out.wi_brdf = wi
-    if wi_local[2] > 0.0 and wp.dot(wi, surface.ng) > 0.0 and wo_local[2] > 0.0:
-        f = brdf_eval(
-            wo_local,
-            wi_local,
-            surface.base_color,
-            surface.metallic,
-            surface.roughness,
-            surface.layers,
-        )
-        if f.pdf > 0.0:
-            origin = offset_origin(surface.position, surface.ng, wi, mesh.epsilon)
-            escaped = float(0.0)
-            slope = wi_local[2] / f.pdf
-            out.f_brdf = f.diffuse + f.specular
-            place = proxy_mesh_hit(proxy, origin, wi)
-            if is_last == 1 and place.valid == 0:
-                escaped = visibility(mesh, material, texture, origin, wi)
-            else:
-                ray_key = hash_pair(hash_pair(key, wp.uint32(index)), wp.uint32(vertex + 1))
-                out.next = closest_hit(mesh, material, texture, origin, wi, place.t, 0, ray_key)
-                if out.next.valid == 0 and place.valid == 0:
-                    escaped = 1.0
-                elif out.next.valid == 0:
-                    # No light is sampled from there, so this technique has all of it.
-                    out.from_place = 1
-                    out.L_brdf = proxy_radiance(proxy, place)
-                    out.weight_brdf = slope
-                    out.direct += wp.cw_mul(out.f_brdf, out.L_brdf) * slope
-                    out.direct_diffuse += wp.cw_mul(f.diffuse, out.L_brdf) * slope
-            if escaped > 0.0:
-                Li = light_eval(light, wi)
-                weight = slope * escaped * power_heuristic(f.pdf, Li.pdf)
-                out.L_brdf = Li.radiance
-                out.weight_brdf = weight
-                out.direct += wp.cw_mul(out.f_brdf, Li.radiance) * weight
-                out.direct_diffuse += wp.cw_mul(f.diffuse, Li.radiance) * weight
-            if out.next.valid == 1:
-                out.weight_next = slope
-                out.throughput = out.f_brdf * slope
-                out.throughput_diffuse = f.diffuse * slope
+    out.emitter = emitter
+    if emitter.valid == 1:
+        f = emitter.f
+        out.direct = wp.cw_mul(f.diffuse + f.specular, emitter.L) * emitter.weight
+        out.direct_diffuse = wp.cw_mul(f.diffuse, emitter.L) * emitter.weight
+
+    # Sample the BSDF, continue the path
+    u = sobol_pair(index, key, 3 * vertex + 3)
+    ray_key = hash_pair(hash_pair(key, wp.uint32(index)), wp.uint32(vertex + 1))
+    sample = sample_bsdf(
+        mesh, material, texture, proxy, surface, bsdf, frame, u, u_parts[1], is_last, ray_key
+    )
+    out.bsdf = sample
+    f_sample = sample.f.diffuse + sample.f.specular
+    if sample.from_place == 1:
+        # No light is sampled from there, so this technique has all of it.
+        out.L_bsdf = sample.L_place
+        out.weight_bsdf = sample.cos_over_pdf
+    if sample.visible > 0.0:
+        Li = light_eval(light, sample.wi)
+        out.L_bsdf = Li.radiance
+        out.weight_bsdf = bsdf_weight(sample, Li.pdf)
+    if sample.from_place == 1 or sample.visible > 0.0:
+        out.direct += wp.cw_mul(f_sample, out.L_bsdf) * out.weight_bsdf
+        out.direct_diffuse += wp.cw_mul(sample.f.diffuse, out.L_bsdf) * out.weight_bsdf
+    if sample.next.valid == 1:
+        out.throughput = f_sample * sample.cos_over_pdf
+        out.throughput_diffuse = sample.f.diffuse * sample.cos_over_pdf
     return out
 
 
@@ -212,8 +143,8 @@ def keep_surface(record: VertexRecord, i: int, j: int, surface: Surface, wo: wp.
     record.texture_roughness[i, j] = surface.texture_roughness
     record.texture_emission[i, j] = surface.texture_emission
     record.incident_light[i, j] = wp.vec3(0.0)
-    record.incident_brdf[i, j] = wp.vec3(0.0)
-    record.weight_next[i, j] = 0.0
+    record.incident_bsdf[i, j] = wp.vec3(0.0)
+    record.cos_over_pdf[i, j] = 0.0
     if record.layers.shape[1] > 0:
         record.layers[i, j] = surface.layers
 
@@ -221,11 +152,12 @@ def keep_surface(record: VertexRecord, i: int, j: int, surface: Surface, wo: wp.
 @wp.func
 def keep_event(record: VertexRecord, i: int, j: int, event: Scatter):
     """Write down what a path gathers at a vertex and how it goes on."""
-    record.wi_light[i, j] = event.wi_light
-    record.incident_light[i, j] = event.L_light * event.weight_light
-    record.wi_brdf[i, j] = event.wi_brdf
-    record.incident_brdf[i, j] = event.L_brdf * event.weight_brdf
-    record.weight_next[i, j] = event.weight_next
+    record.wi_light[i, j] = event.emitter.wi
+    record.incident_light[i, j] = event.emitter.L * event.emitter.weight
+    record.wi_bsdf[i, j] = event.bsdf.wi
+    record.incident_bsdf[i, j] = event.L_bsdf * event.weight_bsdf
+    if event.bsdf.next.valid == 1:
+        record.cos_over_pdf[i, j] = event.bsdf.cos_over_pdf
 
 
 @cache
@@ -364,11 +296,14 @@ def foreground_kernel(has_layers: bool, has_place: bool) -> wp.Kernel:
             if vertex_record.material.shape[1] > 0:
                 keep_event(vertex_record, i, k * spp * rays + index, event)
             if light_record.wi.shape[1] > 0:
-                gain = wp.cw_mul(throughput, event.f_light) * (event.weight_light * scale)
-                entries += keep_direction(light_record, i, entries, event.wi_light, gain)
-                if event.from_place == 0:
-                    gain = wp.cw_mul(throughput, event.f_brdf) * (event.weight_brdf * scale)
-                    entries += keep_direction(light_record, i, entries, event.wi_brdf, gain)
+                if event.emitter.valid == 1:
+                    f = event.emitter.f.diffuse + event.emitter.f.specular
+                    gain = wp.cw_mul(throughput, f) * (event.emitter.weight * scale)
+                    entries += keep_direction(light_record, i, entries, event.emitter.wi, gain)
+                if event.bsdf.visible > 0.0:
+                    f = event.bsdf.f.diffuse + event.bsdf.f.specular
+                    gain = wp.cw_mul(throughput, f) * (event.weight_bsdf * scale)
+                    entries += keep_direction(light_record, i, entries, event.bsdf.wi, gain)
             if k == 0:
                 radiance += event.direct
                 radiance_diffuse += event.direct_diffuse
@@ -380,11 +315,11 @@ def foreground_kernel(has_layers: bool, has_place: bool) -> wp.Kernel:
                 radiance_diffuse += wp.cw_mul(throughput_diffuse, event.direct) * kept
                 throughput_diffuse = wp.cw_mul(throughput_diffuse, event.throughput)
             k += 1
-            alive = event.next.valid
+            alive = event.bsdf.next.valid
             if alive == 1:
                 throughput = wp.cw_mul(throughput, event.throughput)
-                wo = -event.wi_brdf
-                surface = surface_at(mesh, material, texture, event.next, wo)
+                wo = -event.bsdf.wi
+                surface = surface_at(mesh, material, texture, event.bsdf.next, wo)
                 radiance += wp.cw_mul(throughput, surface.emission)
                 radiance_diffuse += wp.cw_mul(throughput_diffuse, surface.emission)
                 if vertex_record.material.shape[1] > 0:

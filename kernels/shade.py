@@ -1,14 +1,14 @@
 """The attached half of `mis`: recorded vertices times materials, differentiated by Warp.
 
 Directions, densities, MIS weights, visibility and the light are constants here (detached sampling),
-so gradients flow through the BRDF's value and the emission alone, as in path replay (Vicini et al.
+so gradients flow through the BSDF's value and the emission alone, as in path replay (Vicini et al.
 2021); the light's own gradient is `warpir.kernels.light_gradient`. One launch per path vertex: Warp
 does not replay what a loop multiplies.
 """
 
 import warp as wp
 
-from warpir.kernels.brdf import brdf_eval
+from warpir.kernels.bsdf import bsdf_f, bsdf_of
 from warpir.kernels.frame import basis, to_local
 from warpir.kernels.types import Layers, VertexRecord
 
@@ -64,24 +64,24 @@ def shade_vertex(
     metal = metallic[m] * record.texture_metallic[i, j]
     rough = roughness[m] * record.texture_roughness[i, j]
     frame = basis(record.n[i, j])
-    layers = layers_of(record, i, j)
     wo = to_local(record.wo[i, j], frame)
+    bsdf = bsdf_of(wo, color, metal, rough, layers_of(record, i, j))
     gathered = wp.cw_mul(emission[m], record.texture_emission[i, j])
 
+    # The emitter's direction
     incident_light = record.incident_light[i, j]
     if wp.max(incident_light) > 0.0:
-        wi = to_local(record.wi_light[i, j], frame)
-        f_light = brdf_eval(wo, wi, color, metal, rough, layers)
+        f_light = bsdf_f(bsdf, to_local(record.wi_light[i, j], frame))
         gathered = gathered + wp.cw_mul(f_light.diffuse + f_light.specular, incident_light)
 
-    incident_brdf = record.incident_brdf[i, j]
-    weight_next = record.weight_next[i, j]
+    # The BSDF's direction, along which the path goes on
+    incident_bsdf = record.incident_bsdf[i, j]
+    cos_over_pdf = record.cos_over_pdf[i, j]
     onward = wp.vec3(0.0)
-    if wp.max(incident_brdf) > 0.0 or weight_next > 0.0:
-        wi2 = to_local(record.wi_brdf[i, j], frame)
-        f_brdf = brdf_eval(wo, wi2, color, metal, rough, layers)
-        f = f_brdf.diffuse + f_brdf.specular
-        onward = f * weight_next
-        gathered = gathered + wp.cw_mul(f, incident_brdf)
+    if wp.max(incident_bsdf) > 0.0 or cos_over_pdf > 0.0:
+        f_bsdf = bsdf_f(bsdf, to_local(record.wi_bsdf[i, j], frame))
+        f = f_bsdf.diffuse + f_bsdf.specular
+        onward = f * cos_over_pdf
+        gathered = gathered + wp.cw_mul(f, incident_bsdf)
     contribution[path] = wp.cw_mul(throughput[path], gathered)
     throughput_next[path] = wp.cw_mul(throughput[path], onward)

@@ -5,7 +5,7 @@ Detached: no backward pass.
 
 import warp as wp
 
-from warpir.kernels.brdf import F0_COAT, layers_toward, luminance, schlick
+from warpir.kernels.bsdf import F0_COAT, layers_toward, luminance, schlick
 from warpir.kernels.frame import basis, to_local
 from warpir.kernels.proxy_mesh import INFINITY, proxy_distance, proxy_mesh_hit
 from warpir.kernels.rng import hash_pair, pixel_seed, sobol_pair, to_unit

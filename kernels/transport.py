@@ -12,20 +12,15 @@ texels around it, a direction would let a sun in one texel flicker by its interp
 
 import warp as wp
 
-from warpir.kernels.brdf import (
-    brdf_eval,
-    brdf_sample,
-    narrowest_roughness,
-    roughness_to_alpha,
-)
+from warpir.kernels.bsdf import bsdf_f, bsdf_of, narrowest_roughness, roughness_to_alpha
 from warpir.kernels.frame import basis, to_local, to_world
 from warpir.kernels.latlong import BilinearTap, bilinear_tap, direction_to_uv, uv_to_direction
 from warpir.kernels.proxy import Receiver, proxy_point, receiver_origin
 from warpir.kernels.proxy_mesh import proxy_mesh_hit, proxy_radiance, proxy_visibility
 from warpir.kernels.rng import hash_pair, hash_uint, pixel_seed, sobol_pair, to_unit
-from warpir.kernels.sampling import cosine_sample, light_eval, light_sample, power_heuristic, tent
+from warpir.kernels.sampling import cosine_sample, light_eval, power_heuristic, tent
+from warpir.kernels.scatter import bsdf_weight, sample_bsdf, sample_emitter, surface_bsdf
 from warpir.kernels.trace import (
-    Hit,
     Surface,
     camera_hit,
     camera_ray,
@@ -53,7 +48,7 @@ TRIES_MAX = wp.constant(32)
 TENT_REACH = wp.constant(1.5)
 """No direction of a tent is farther than this many texel heights from the texel's centre."""
 NARROW = wp.constant(4.0)
-"""Specular lobes with ``alpha`` below this many texel sides are sampled by the BRDF too."""
+"""Specular lobes with ``alpha`` below this many texel sides are sampled by the BSDF too."""
 GOLDEN_ROW = wp.constant(0.5698402909980532)
 GOLDEN_COLUMN = wp.constant(0.7548776662466927)
 """Steps of the R2 sequence (Roberts 2018): neighbouring texels use different points of a pixel."""
@@ -278,14 +273,10 @@ def direct_row(
                 frame = basis(n)
                 roughness = points.roughness[p, s]
                 layers = layers_of(points, material, p, s)
-                f = brdf_eval(
-                    to_local(points.wo[p, s], frame),
-                    to_local(wi, frame),
-                    points.base_color[p, s],
-                    points.metallic[p, s],
-                    roughness,
-                    layers,
-                )
+                wo = to_local(points.wo[p, s], frame)
+                base_color = points.base_color[p, s]
+                bsdf = bsdf_of(wo, base_color, points.metallic[p, s], roughness, layers)
+                f = bsdf_f(bsdf, to_local(wi, frame))
                 specular = f.specular
                 if path_count > 0 and is_narrow(roughness, layers, texels.height) == 1:
                     tap = bilinear_tap(direction_to_uv(wi), texels.height, texels.width)
@@ -444,94 +435,53 @@ def trace_paths(
     scale = float(count) / float(subsamples * path_count)
     throughput = wp.vec3(scale, scale, scale)
     for k in range(depth):
-        hit = Hit()
-        hit.valid = 0
         frame = basis(surface.n)
-        wo_local = to_local(wo, frame)
-        if wo_local[2] <= 0.0:
-            break
+        bsdf = surface_bsdf(surface, wo, frame)
+        is_narrow_first = int(0)
+        if k == 0:
+            is_narrow_first = is_narrow(surface.roughness, surface.layers, texels.height)
         is_last = int(0)
         if k == depth - 1 and material.any_emission == 0:
             is_last = 1
-        pick = sobol_pair(q, key, 3 * k + 1)
+        if k == 0 and is_last == 1 and is_narrow_first == 0 and proxy.mesh == wp.uint64(0):
+            break
+        u_parts = sobol_pair(q, key, 3 * k + 1)
 
-        # Toward where light is expected; the first vertex has its directions already
+        # Sample the emitter: where light is expected; the first vertex has its directions already
         if k > 0:
-            wi = light_sample(proposal, sobol_pair(q, key, 3 * k + 2), pick[0])
-            wi_local = to_local(wi, frame)
-            if wi_local[2] > 0.0 and wp.dot(wi, surface.ng) > 0.0:
-                f = brdf_eval(
-                    wo_local,
-                    wi_local,
-                    surface.base_color,
-                    surface.metallic,
-                    surface.roughness,
-                    surface.layers,
-                )
-                expected = light_eval(proposal, wi)
-                value = wp.cw_mul(throughput, f.diffuse + f.specular)
-                if wp.max(value) > 0.0 and expected.pdf > 0.0:
-                    origin = offset_origin(surface.position, surface.ng, wi, mesh.epsilon)
-                    weight = wi_local[2] * power_heuristic(expected.pdf, f.pdf) / expected.pdf
-                    weight = weight * visibility(mesh, material, texture, origin, wi)
-                    weight = weight * proxy_visibility(proxy, origin, wi)
-                    if weight > 0.0:
-                        add_to_texels(T, p, texels, wi, value * weight, wp.vec3(0.0), 0.0)
+            u = sobol_pair(q, key, 3 * k + 2)
+            emitter = sample_emitter(
+                mesh, material, texture, proxy, proposal, surface, bsdf, frame, u, u_parts[0], 0
+            )
+            if emitter.weight > 0.0:
+                value = wp.cw_mul(throughput, emitter.f.diffuse + emitter.f.specular)
+                add_to_texels(T, p, texels, emitter.wi, value * emitter.weight, wp.vec3(0.0), 0.0)
 
-        # The BRDF's own direction: it leaves the scene, or the path goes on
-        wi_local = brdf_sample(
-            wo_local,
-            sobol_pair(q, key, 3 * k + 3),
-            pick[1],
-            surface.base_color,
-            surface.metallic,
-            surface.roughness,
-            surface.layers,
+        # Sample the BSDF, continue the path
+        u = sobol_pair(q, key, 3 * k + 3)
+        ray_key = hash_pair(hash_pair(key, wp.uint32(q)), wp.uint32(k + 1))
+        sample = sample_bsdf(
+            mesh, material, texture, proxy, surface, bsdf, frame, u, u_parts[1], is_last, ray_key
         )
-        wi = to_world(wi_local, frame)
-        if wi_local[2] <= 0.0 or wp.dot(wi, surface.ng) <= 0.0:
+        f = sample.f.diffuse + sample.f.specular
+        if sample.from_place == 1:
+            reflected = wp.cw_mul(throughput, f) * sample.cos_over_pdf
+            wp.atomic_add(emission, p, wp.cw_mul(reflected, sample.L_place))
+        if sample.visible > 0.0:
+            if k > 0:
+                expected = light_eval(proposal, sample.wi)
+                value = wp.cw_mul(throughput, f) * bsdf_weight(sample, expected.pdf)
+                add_to_texels(T, p, texels, sample.wi, value, wp.vec3(0.0), 0.0)
+            elif is_narrow_first == 1:
+                arriving = sample.cos_over_pdf * sample.visible
+                specular = wp.cw_mul(throughput, sample.f.specular) * arriving
+                drawn = float(path_count) * sample.f.pdf
+                add_to_texels(T, p, texels, sample.wi, wp.vec3(0.0), specular, drawn)
+        if is_last == 1 or sample.next.valid == 0:
             break
-        f = brdf_eval(
-            wo_local,
-            wi_local,
-            surface.base_color,
-            surface.metallic,
-            surface.roughness,
-            surface.layers,
-        )
-        if f.pdf <= 0.0:
-            break
-        slope = wi_local[2] / f.pdf
-        origin = offset_origin(surface.position, surface.ng, wi, mesh.epsilon)
-        escaped = float(0.0)
-        place = proxy_mesh_hit(proxy, origin, wi)
-        if is_last == 1 and place.valid == 0:
-            if k > 0 or is_narrow(surface.roughness, surface.layers, texels.height) == 1:
-                escaped = visibility(mesh, material, texture, origin, wi)
-        else:
-            ray_key = hash_pair(hash_pair(key, wp.uint32(q)), wp.uint32(k + 1))
-            hit = closest_hit(mesh, material, texture, origin, wi, place.t, 0, ray_key)
-            if hit.valid == 0 and place.valid == 0:
-                escaped = 1.0
-            elif hit.valid == 0:
-                f_all = wp.cw_mul(throughput, f.diffuse + f.specular) * slope
-                wp.atomic_add(emission, p, wp.cw_mul(f_all, proxy_radiance(proxy, place)))
-        if escaped > 0.0:
-            if k == 0:
-                if is_narrow(surface.roughness, surface.layers, texels.height) == 1:
-                    specular = wp.cw_mul(throughput, f.specular) * (slope * escaped)
-                    drawn = float(path_count) * f.pdf
-                    add_to_texels(T, p, texels, wi, wp.vec3(0.0), specular, drawn)
-            else:
-                expected = light_eval(proposal, wi)
-                weight = slope * escaped * power_heuristic(f.pdf, expected.pdf)
-                value = wp.cw_mul(throughput, f.diffuse + f.specular) * weight
-                add_to_texels(T, p, texels, wi, value, wp.vec3(0.0), 0.0)
-        if is_last == 1 or hit.valid == 0:
-            break
-        throughput = wp.cw_mul(throughput, (f.diffuse + f.specular) * slope)
-        wo = -wi
-        surface = surface_at(mesh, material, texture, hit, wo)
+        throughput = wp.cw_mul(throughput, f * sample.cos_over_pdf)
+        wo = -sample.wi
+        surface = surface_at(mesh, material, texture, sample.next, wo)
         if material.any_emission == 1:
             wp.atomic_add(emission, p, wp.cw_mul(throughput, surface.emission))
 

@@ -83,7 +83,7 @@ class MeshArgs:
 class Layers:
     """What glTF's extensions add to metallic-roughness at one point, as seen from ``wo``.
 
-    What depends on ``wo`` alone is worked out once, by `warpir.kernels.brdf.layers_toward`.
+    What depends on ``wo`` alone is worked out once, by `warpir.kernels.bsdf.layers_toward`.
     """
 
     present: int
@@ -247,10 +247,10 @@ class VertexRecord:
     wi_light: wp.array2d[wp.vec3]
     incident_light: wp.array2d[wp.vec3]
     """``L cos visible mis / pdf`` of the light's direction, without f."""
-    wi_brdf: wp.array2d[wp.vec3]
-    incident_brdf: wp.array2d[wp.vec3]
-    """The same of the BRDF's direction; 0 when it met the object."""
-    weight_next: wp.array2d[float]
-    """``cos / pdf`` of the BRDF's direction when it met the object, else 0."""
+    wi_bsdf: wp.array2d[wp.vec3]
+    incident_bsdf: wp.array2d[wp.vec3]
+    """The same of the BSDF's direction; 0 when it met the object."""
+    cos_over_pdf: wp.array2d[float]
+    """``cos / pdf`` of the BSDF's direction when it met the object, else 0."""
     layers: wp.array2d[Layers]
     """Without columns where no material is layered."""

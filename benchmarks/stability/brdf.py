@@ -21,7 +21,7 @@ from benchmarks.stability.case import (
 )
 from tests import oracles as o
 from tests.builders.shapes import all_pixels, camera, constant, ground, placed, quad
-from warpir.kernels.brdf import brdf_eval, brdf_sample
+from warpir.kernels.bsdf import bsdf_f, bsdf_of, bsdf_sample
 from warpir.kernels.frame import basis
 from warpir.kernels.types import Layers
 from warpir.render.device_light import light_args
@@ -58,7 +58,7 @@ def eval_kernel(
 ):
     """Value and density of the material."""
     i = wp.tid()
-    value = brdf_eval(wo[i], wi[i], base_color[i], metallic[i], roughness[i], Layers())
+    value = bsdf_f(bsdf_of(wo[i], base_color[i], metallic[i], roughness[i], Layers()), wi[i])
     f[i] = value.diffuse + value.specular
     pdf[i] = value.pdf
 
@@ -67,7 +67,7 @@ def eval_kernel(
 def sample_kernel(wo: wp.vec3, u: wp.array[wp.vec2], roughness: float, wi: wp.array[wp.vec3]):
     """Draw directions from given numbers."""
     i = wp.tid()
-    wi[i] = brdf_sample(wo, u[i], 0.5, wp.vec3(1.0), 1.0, roughness, Layers())
+    wi[i] = bsdf_sample(bsdf_of(wo, wp.vec3(1.0), 1.0, roughness, Layers()), u[i], 0.5)
 
 
 @wp.kernel(enable_backward=False)

@@ -6,7 +6,7 @@ import warp as wp
 
 from tests import oracles as o
 from tests.statistics import chi_square, compare_gradients, graded_edges
-from warpir.kernels.brdf import brdf_eval, brdf_sample, lobe_probabilities
+from warpir.kernels.bsdf import bsdf_f, bsdf_of, bsdf_pdf, bsdf_sample, lobe_probabilities
 from warpir.kernels.types import Layers
 
 VALUE_RTOL = 1e-4
@@ -37,7 +37,7 @@ def eval_kernel(
     specular: wp.array[wp.vec3],
 ):
     i = wp.tid()
-    value = brdf_eval(wo[i], wi[i], base_color[i], metallic[i], roughness[i], Layers())
+    value = bsdf_f(bsdf_of(wo[i], base_color[i], metallic[i], roughness[i], Layers()), wi[i])
     diffuse[i] = value.diffuse
     specular[i] = value.specular
 
@@ -53,8 +53,10 @@ def pdf_kernel(
     p_specular: wp.array[float],
 ):
     i = wp.tid()
-    pdf[i] = brdf_eval(wo[i], wi[i], base_color[i], metallic[i], roughness[i], Layers()).pdf
-    p_specular[i] = lobe_probabilities(wo[i], base_color[i], metallic[i], Layers())[1]
+    pdf[i] = bsdf_pdf(bsdf_of(wo[i], base_color[i], metallic[i], roughness[i], Layers()), wi[i])
+    p_specular[i] = lobe_probabilities(
+        bsdf_of(wo[i], base_color[i], metallic[i], roughness[i], Layers())
+    )[1]
 
 
 @wp.kernel
@@ -68,7 +70,7 @@ def sample_kernel(
     wi: wp.array[wp.vec3],
 ):
     i = wp.tid()
-    wi[i] = brdf_sample(wo, u[i], u_lobe[i], base_color, metallic, roughness, Layers())
+    wi[i] = bsdf_sample(bsdf_of(wo, base_color, metallic, roughness, Layers()), u[i], u_lobe[i])
 
 
 def upload(values: np.ndarray, dtype: type, device: str, requires_grad: bool = False) -> wp.array:

@@ -18,7 +18,13 @@ from tests.kernels.test_brdf import (
 )
 from tests.oracles import LayeredMaterial
 from tests.statistics import chi_square, compare_gradients
-from warpir.kernels.brdf import brdf_eval, brdf_sample, layers_toward, lobe_probabilities
+from warpir.kernels.bsdf import (
+    bsdf_f,
+    bsdf_of,
+    bsdf_sample,
+    layers_toward,
+    lobe_probabilities,
+)
 from warpir.kernels.types import Extensions, Layers
 from warpir.scene.sheen import TABLE_SIZE, sheen_albedo_table
 
@@ -85,11 +91,12 @@ def eval_kernel(
 ):
     i = wp.tid()
     layers = layers_of(wo, e, coat_n, transmitted, table)
-    value = brdf_eval(wo, wi[i], base_color[i], metallic[i], roughness[i], layers)
+    bsdf = bsdf_of(wo, base_color[i], metallic[i], roughness[i], layers)
+    value = bsdf_f(bsdf, wi[i])
     diffuse[i] = value.diffuse
     specular[i] = value.specular
     pdf[i] = value.pdf
-    p[i] = lobe_probabilities(wo, base_color[i], metallic[i], layers)
+    p[i] = lobe_probabilities(bsdf)
 
 
 @wp.kernel(enable_backward=False)
@@ -107,7 +114,7 @@ def sample_kernel(
     i = wp.tid()
     layers = layers_of(wo, e, coat_n, 0.0, table)
     pair = wp.vec2(u[i][0], u[i][1])
-    wi[i] = brdf_sample(wo, pair, u[i][2], base_color, metallic, roughness, layers)
+    wi[i] = bsdf_sample(bsdf_of(wo, base_color, metallic, roughness, layers), pair, u[i][2])
 
 
 def extensions(layers: LayeredMaterial, device: str) -> wp.array:

@@ -277,7 +277,7 @@ def reflected(
     """Return the glTF 2.0 metallic-roughness BRDF times ``cos_i`` [1/sr], 0 below the surface.
 
     For a grey material whose `metallic` is 0 or 1; the formulas are those of
-    `warpir.kernels.brdf`.
+    `warpir.kernels.bsdf`.
 
     Args:
         cos_o: Cosine between normal and the direction to the camera.

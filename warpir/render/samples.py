@@ -344,11 +344,11 @@ def _new_vertex_record(
     record = VertexRecord()
     vectors = (
         "n", "wo", "texture_color", "texture_emission",
-        "wi_light", "incident_light", "wi_brdf", "incident_brdf",
+        "wi_light", "incident_light", "wi_bsdf", "incident_bsdf",
     )  # fmt: skip
     for name in vectors:
         setattr(record, name, wp.empty((pixels, capacity), dtype=wp.vec3, device=device))
-    for name in ("texture_metallic", "texture_roughness", "weight_next"):
+    for name in ("texture_metallic", "texture_roughness", "cos_over_pdf"):
         setattr(record, name, wp.empty((pixels, capacity), dtype=wp.float32, device=device))
     record.layers = wp.empty((pixels, capacity * has_layers), dtype=Layers, device=device)
     record.material = wp.full((pixels, capacity), -1, dtype=wp.int32, device=device)

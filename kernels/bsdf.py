@@ -1,4 +1,4 @@
-"""The BRDF of glTF 2.0, metallic-roughness and its layers, in the frame of the shading normal (z).
+"""The BSDF of glTF 2.0, metallic-roughness and its layers, in the frame of the shading normal (z).
 
 glTF 2.0 specification, appendix B: ``mix(dielectric_brdf, metal_brdf, metallic)`` with GGX
 (Trowbridge-Reitz), height-correlated Smith masking, Schlick's Fresnel term, and a Lambert base that
@@ -12,8 +12,10 @@ normal of its own, and the sheen of cloth over the base, which it scales by what
 (the specification's form that depends on the camera's direction alone). The coat's lobe goes with
 the cosine to its own normal.
 
-Sampling draws visible normals (Heitz 2018; Dupuy & Benyoub 2023, "Sampling Visible GGX Normals with
-Spherical Caps"). `brdf_eval` returns value and density of `brdf_sample`.
+A `Bsdf` is a point's scattering as seen from one direction. As in pbrt it has three functions:
+`bsdf_f`, the value (with the density, since both share half of their terms), `bsdf_sample` and
+`bsdf_pdf`. Sampling draws visible normals (Heitz 2018; Dupuy & Benyoub 2023, "Sampling Visible GGX
+Normals with Spherical Caps").
 """
 
 import warp as wp
@@ -31,15 +33,45 @@ F0_COAT = wp.constant(0.04)
 
 
 @wp.struct
-class BrdfValue:
-    """A BRDF value split as the renderer's layers need it, without the cosine, and its density."""
+class Bsdf:
+    """Scattering at one point as seen from ``wo``; directions are in the shading normal's frame."""
+
+    wo: wp.vec3
+    """Unit direction toward the camera."""
+    base_color: wp.vec3
+    """Linear RGB [1]."""
+    metallic: float
+    """0 dielectric to 1 metal [1]."""
+    roughness: float
+    """Perceptual roughness [1]."""
+    layers: Layers
+    """What goes beyond that, as seen from ``wo``."""
+
+
+@wp.struct
+class BsdfValue:
+    """A BSDF's value, split as the renderer's layers need it, without cosine, and its density."""
 
     diffuse: wp.vec3
     """Of base and sheen [1/sr]."""
     specular: wp.vec3
     """Of base and coat [1/sr]."""
     pdf: float
-    """Density of `brdf_sample` [1/sr]; zero outside its support."""
+    """Density of `bsdf_sample` [1/sr]; zero outside its support."""
+
+
+@wp.func
+def bsdf_of(
+    wo: wp.vec3, base_color: wp.vec3, metallic: float, roughness: float, layers: Layers
+) -> Bsdf:
+    """Gather a `Bsdf`."""
+    bsdf = Bsdf()
+    bsdf.wo = wo
+    bsdf.base_color = base_color
+    bsdf.metallic = metallic
+    bsdf.roughness = roughness
+    bsdf.layers = layers
+    return bsdf
 
 
 @wp.func
@@ -181,13 +213,14 @@ def layers_toward(
 
 
 @wp.func
-def lobe_probabilities(
-    wo: wp.vec3, base_color: wp.vec3, metallic: float, layers: Layers
-) -> wp.vec2:
+def lobe_probabilities(bsdf: Bsdf) -> wp.vec2:
     """Probabilities of sampling the coat, and else the specular lobe of the base.
 
     A lobe's share of the reflected luminance, roughly.
     """
+    base_color = bsdf.base_color
+    metallic = bsdf.metallic
+    layers = bsdf.layers
     f0 = wp.vec3(F0_DIELECTRIC)
     f90 = float(1.0)
     matte = float(1.0)
@@ -197,7 +230,7 @@ def lobe_probabilities(
         matte = layers.matte
     f0 = f0 * (1.0 - metallic) + base_color * metallic
     f90 = f90 * (1.0 - metallic) + metallic
-    specular = luminance(f0 + (wp.vec3(f90) - f0) * schlick(wo[2]))
+    specular = luminance(f0 + (wp.vec3(f90) - f0) * schlick(bsdf.wo[2]))
     diffuse = (1.0 - metallic) * (1.0 - specular) * matte * luminance(base_color)
     coat = float(0.0)
     if layers.present == 1:
@@ -217,28 +250,20 @@ def lobe_probabilities(
 
 
 @wp.func
-def brdf_eval(
-    wo: wp.vec3,
-    wi: wp.vec3,
-    base_color: wp.vec3,
-    metallic: float,
-    roughness: float,
-    layers: Layers,
-) -> BrdfValue:
-    """Evaluate the BRDF, without the cosine; zero unless both directions are above the surface.
+def bsdf_f(bsdf: Bsdf, wi: wp.vec3) -> BsdfValue:
+    """Evaluate value, without the cosine, and density; zero unless both directions are above.
 
-    Value and density share half of their terms, so both are returned. The value is differentiable
-    in ``base_color``, ``metallic`` and ``roughness``.
+    The value is differentiable in base colour, metallic and roughness.
 
     Args:
-        wo: Unit direction toward the camera, local frame.
+        bsdf: Where light is scattered.
         wi: Unit direction toward the light, local frame.
-        base_color: Linear RGB [1].
-        metallic: 0 dielectric to 1 metal [1].
-        roughness: Perceptual roughness [1].
-        layers: What goes beyond that, as seen from ``wo``.
     """
-    value = BrdfValue()
+    wo = bsdf.wo
+    base_color = bsdf.base_color
+    metallic = bsdf.metallic
+    layers = bsdf.layers
+    value = BsdfValue()
     value.diffuse = wp.vec3(0.0)
     value.specular = wp.vec3(0.0)
     value.pdf = 0.0
@@ -251,7 +276,7 @@ def brdf_eval(
             f90 = layers.f90
             matte = layers.matte
         wm = wp.normalize(wo + wi)
-        alpha = roughness_to_alpha(roughness)
+        alpha = roughness_to_alpha(bsdf.roughness)
         weight = schlick(wp.abs(wp.dot(wo, wm)))
         F_dielectric = f0 + (wp.vec3(f90) - f0) * weight
         F_metal = base_color + (wp.vec3(1.0, 1.0, 1.0) - base_color) * weight
@@ -264,7 +289,7 @@ def brdf_eval(
         G2 = 1.0 / (1.0 + lambda_o + smith_lambda(wi, alpha))
         specular = F * (D * G2 / wp.max(4.0 * wo[2] * wi[2], 1.0e-30))
         # Visible normals: G1(wo) max(0, wo.wm) D(wm) / cos_o, over the Jacobian 4 wo.wm.
-        p = lobe_probabilities(wo, base_color, metallic, layers)
+        p = lobe_probabilities(bsdf)
         G1 = 1.0 / (1.0 + lambda_o)
         pdf = p[1] * G1 * D / wp.max(4.0 * wo[2], 1.0e-30) + (1.0 - p[1]) * wi[2] * INV_PI
         if layers.present == 1:
@@ -316,26 +341,26 @@ def visible_normal_sample(wo: wp.vec3, alpha: float, u: wp.vec2) -> wp.vec3:
 
 
 @wp.func
-def brdf_sample(
-    wo: wp.vec3,
-    u: wp.vec2,
-    u_lobe: float,
-    base_color: wp.vec3,
-    metallic: float,
-    roughness: float,
-    layers: Layers,
-) -> wp.vec3:
+def bsdf_sample(bsdf: Bsdf, u: wp.vec2, u_lobe: float) -> wp.vec3:
     """Draw a direction; one that falls below the surface has density 0 and must be dropped."""
-    p = lobe_probabilities(wo, base_color, metallic, layers)
+    wo = bsdf.wo
+    layers = bsdf.layers
+    p = lobe_probabilities(bsdf)
     if u_lobe < p[0]:
         frame = basis(layers.coat_n)
         o = to_local(wo, frame)
         wm = visible_normal_sample(o, roughness_to_alpha(layers.coat_roughness), u)
         return wp.normalize(to_world(wm * (2.0 * wp.dot(o, wm)) - o, frame))
     if u_lobe < p[0] + (1.0 - p[0]) * p[1]:
-        wm = visible_normal_sample(wo, roughness_to_alpha(roughness), u)
+        wm = visible_normal_sample(wo, roughness_to_alpha(bsdf.roughness), u)
         return wp.normalize(wm * (2.0 * wp.dot(wo, wm)) - wo)
     return cosine_sample(u)
+
+
+@wp.func
+def bsdf_pdf(bsdf: Bsdf, wi: wp.vec3) -> float:
+    """Return the density of `bsdf_sample` at ``wi`` [1/sr]; zero outside its support."""
+    return bsdf_f(bsdf, wi).pdf
 
 
 @wp.func

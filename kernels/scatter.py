@@ -1,0 +1,176 @@
+"""One scattering event of a path: a direction toward the emitter, and one drawn from the BSDF.
+
+Both techniques are shared by the path tracer (`warpir.kernels.path`), which adds radiance up, and
+the tracer of light transport (`warpir.kernels.transport`), which adds to the texels that the
+directions meet. They are combined with the power heuristic. A direction counts only if it leaves
+both the shading and the geometric surface. Detached: no backward pass.
+"""
+
+import warp as wp
+
+from warpir.kernels.bsdf import Bsdf, BsdfValue, bsdf_f, bsdf_of, bsdf_sample
+from warpir.kernels.frame import Frame, to_local, to_world
+from warpir.kernels.proxy_mesh import proxy_mesh_hit, proxy_radiance, proxy_visibility
+from warpir.kernels.sampling import light_eval, light_sample, power_heuristic
+from warpir.kernels.trace import Hit, Surface, closest_hit, offset_origin, visibility
+from warpir.kernels.types import LightArgs, MaterialArgs, MeshArgs, ProxyArgs, TextureArgs
+
+wp.set_module_options({"enable_backward": False})
+
+
+@wp.struct
+class EmitterSample:
+    """A direction drawn from the light's proposal; what it brings is 0 where it does not count."""
+
+    valid: int
+    """1 where value, radiance and weight are set."""
+    wi: wp.vec3
+    """World frame."""
+    f: BsdfValue
+    L: wp.vec3
+    """Radiance from there."""
+    weight: float
+    """``cos visible mis / pdf``, without f."""
+
+
+@wp.struct
+class BsdfSample:
+    """A direction drawn from the BSDF, and what it met."""
+
+    wi: wp.vec3
+    """World frame."""
+    f: BsdfValue
+    cos_over_pdf: float
+    visible: float
+    """Share of light from infinity that arrives along it."""
+    from_place: int
+    """1 when it met the place's mesh: what that sends is a constant to the light."""
+    L_place: wp.vec3
+    """Radiance of that mesh."""
+    next: Hit
+    """Where it met the object, and the path goes on."""
+
+
+@wp.func
+def surface_bsdf(surface: Surface, wo: wp.vec3, frame: Frame) -> Bsdf:
+    """Return the scattering of a surface toward ``wo``, world frame; ``frame`` has its normal."""
+    return bsdf_of(
+        to_local(wo, frame),
+        surface.base_color,
+        surface.metallic,
+        surface.roughness,
+        surface.layers,
+    )
+
+
+@wp.func
+def sample_emitter(
+    mesh: MeshArgs,
+    material: MaterialArgs,
+    texture: TextureArgs,
+    proxy: ProxyArgs,
+    light: LightArgs,
+    surface: Surface,
+    bsdf: Bsdf,
+    frame: Frame,
+    u: wp.vec2,
+    u_part: float,
+    keep_dark: int,
+) -> EmitterSample:
+    """Draw a direction from the light's proposal, weigh it and trace it.
+
+    Args:
+        mesh: The object's triangles.
+        material: Their materials.
+        texture: Their textures.
+        proxy: The place's mesh, which stands in the light's way.
+        light: The light.
+        surface: Where light is scattered.
+        bsdf: How, toward the camera.
+        frame: Of the shading normal.
+        u: Uniform numbers.
+        u_part: Another, which picks the lobe or the map.
+        keep_dark: 1 weighs directions too that bring nothing now: a gradient needs them.
+    """
+    sample = EmitterSample()
+    sample.valid = 0
+    sample.L = wp.vec3(0.0)
+    sample.weight = 0.0
+    sample.wi = light_sample(light, u, u_part)
+    wi = to_local(sample.wi, frame)
+    if wi[2] > 0.0 and wp.dot(sample.wi, surface.ng) > 0.0 and bsdf.wo[2] > 0.0:
+        f = bsdf_f(bsdf, wi)
+        Li = light_eval(light, sample.wi)
+        reflected = wp.cw_mul(f.diffuse + f.specular, Li.radiance)
+        if Li.pdf > 0.0 and (wp.max(reflected) > 0.0 or keep_dark == 1):
+            weight = wi[2] * power_heuristic(Li.pdf, f.pdf) / Li.pdf
+            origin = offset_origin(surface.position, surface.ng, sample.wi, mesh.epsilon)
+            weight = weight * visibility(mesh, material, texture, origin, sample.wi)
+            weight = weight * proxy_visibility(proxy, origin, sample.wi)
+            sample.valid = 1
+            sample.f = f
+            sample.L = Li.radiance
+            sample.weight = weight
+    return sample
+
+
+@wp.func
+def sample_bsdf(
+    mesh: MeshArgs,
+    material: MaterialArgs,
+    texture: TextureArgs,
+    proxy: ProxyArgs,
+    surface: Surface,
+    bsdf: Bsdf,
+    frame: Frame,
+    u: wp.vec2,
+    u_lobe: float,
+    is_last: int,
+    ray_key: wp.uint32,
+) -> BsdfSample:
+    """Draw a direction from the BSDF and trace it; the path may go on along it.
+
+    Args:
+        mesh: The object's triangles.
+        material: Their materials.
+        texture: Their textures.
+        proxy: The place's mesh, which stands in the light's way and sends what the photo shows.
+        surface: Where light is scattered.
+        bsdf: How, toward the camera.
+        frame: Of the shading normal.
+        u: Uniform numbers.
+        u_lobe: Another, which picks the lobe.
+        is_last: 1 when nothing behind this vertex can add light, so that any hit will do.
+        ray_key: Of the ray's own random numbers.
+    """
+    sample = BsdfSample()
+    sample.cos_over_pdf = 0.0
+    sample.visible = 0.0
+    sample.from_place = 0
+    sample.next.valid = 0
+    wi = bsdf_sample(bsdf, u, u_lobe)
+    sample.wi = to_world(wi, frame)
+    if wi[2] > 0.0 and wp.dot(sample.wi, surface.ng) > 0.0 and bsdf.wo[2] > 0.0:
+        sample.f = bsdf_f(bsdf, wi)
+        if sample.f.pdf > 0.0:
+            sample.cos_over_pdf = wi[2] / sample.f.pdf
+            origin = offset_origin(surface.position, surface.ng, sample.wi, mesh.epsilon)
+            place = proxy_mesh_hit(proxy, origin, sample.wi)
+            if is_last == 1 and place.valid == 0:
+                sample.visible = visibility(mesh, material, texture, origin, sample.wi)
+            else:
+                sample.next = closest_hit(
+                    mesh, material, texture, origin, sample.wi, place.t, 0, ray_key
+                )
+                if sample.next.valid == 0 and place.valid == 0:
+                    sample.visible = 1.0
+                elif sample.next.valid == 0:
+                    sample.from_place = 1
+                    sample.L_place = proxy_radiance(proxy, place)
+    return sample
+
+
+@wp.func
+def bsdf_weight(sample: BsdfSample, light_pdf: float) -> float:
+    """Return ``cos visible mis / pdf`` of the BSDF's direction, without f."""
+    return sample.cos_over_pdf * sample.visible * power_heuristic(sample.f.pdf, light_pdf)
