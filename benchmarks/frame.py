@@ -18,7 +18,7 @@ from warpir.io.assets import load_asset
 from warpir.io.images.photos import Photo, read_envmap
 from warpir.render.composite import Quality, make_picture
 from warpir.render.device import choose_device
-from warpir.render.device_scene import Placed, Proxy, Scene
+from warpir.render.device_scene import Placed, Receiver, Scene
 from warpir.render.renderer import Renderer
 from warpir.scene.camera import camera_from_fov
 from warpir.scene.light import Light
@@ -56,7 +56,7 @@ def main() -> None:
     scene = Scene(
         [Placed(asset, placement.asset_to_world)],
         camera,
-        Proxy(ground[:3], -float(ground[3])),
+        Receiver(ground[:3], -float(ground[3])),
         device,
     )
     renderer = Renderer(scene)
@@ -75,7 +75,7 @@ def main() -> None:
             "depth": options.depth,
             "size_m": options.size,
             "object_pixels": picture.object_pixel_count,
-            "shadow_pixels": picture.proxy_pixel_count,
+            "shadow_pixels": picture.receiver_pixel_count,
             "first_s": round(times[0], 3),
             "warm_s": [round(t, 3) for t in times[1:]],
             "peak_mib": round(peak_mib(scene.device)),

@@ -19,7 +19,7 @@ from warpir.core.arrays import IntArray
 from warpir.io.assets import load_asset
 from warpir.render.device import choose_device
 from warpir.render.device_light import light_args
-from warpir.render.device_scene import Placed, Proxy, Scene
+from warpir.render.device_scene import Placed, Receiver, Scene
 from warpir.render.integrator import MaterialTensors
 from warpir.render.mis import MisIntegrator
 from warpir.render.renderer import Renderer
@@ -94,7 +94,7 @@ def renderer(asset: Asset, device: str, threads: int) -> Renderer:
     scene = Scene(
         [Placed(asset, placement.asset_to_world)],
         camera,
-        Proxy(ground[:3], -float(ground[3])),
+        Receiver(ground[:3], -float(ground[3])),
         device,
     )
     return Renderer(scene, threads)

@@ -30,14 +30,14 @@ from warpir.io.assets import load_asset
 from warpir.io.images.photos import Photo, read_envmap
 from warpir.render.composite import Quality, make_picture, photo_radiance
 from warpir.render.device import choose_device
-from warpir.render.device_scene import Placed, Proxy, Scene
+from warpir.render.device_scene import Placed, Receiver, Scene
 from warpir.render.renderer import Renderer
 from warpir.scene.asset import Asset, Material, Primitive, Texture, TextureSlot
 from warpir.scene.camera import Camera, camera_from_fov
 from warpir.scene.lamps import lamp_axes
 from warpir.scene.light import Light, angles_from_axis, resize_map, rotate_map
 from warpir.scene.placement import Placement, place_asset
-from warpir.scene.receiver import ProxyMesh, first_hit, mesh_of
+from warpir.scene.receiver import ReceiverMesh, first_hit, mesh_of
 from warpir.scene.shadow_mask import shadow_mask
 from warpir.scene.tone_curves import Curves, ToneKnots
 
@@ -129,7 +129,7 @@ def photograph(asset: Asset, camera: Camera, texels: FloatArray, samples: int) -
     return np.asarray(shot.mean + (1.0 - shot.coverage)[..., None] * sky)
 
 
-def painted_mask(wall: ProxyMesh, camera: Camera, sun: Float64Array) -> FloatArray:
+def painted_mask(wall: ReceiverMesh, camera: Camera, sun: Float64Array) -> FloatArray:
     """Return what a user would paint: ground that the wall keeps from the sun's centre."""
     rays = pixel_directions(camera).reshape(-1, 3)
     eye = np.broadcast_to(camera.c2w[:3, 3], rays.shape)
@@ -154,7 +154,7 @@ def insertions(
     camera: Camera,
     light: Light,
     photo: Photo,
-    meshes: tuple[ProxyMesh, ProxyMesh],
+    meshes: tuple[ReceiverMesh, ReceiverMesh],
     mask: FloatArray,
     samples: int,
     device: str,
@@ -164,7 +164,7 @@ def insertions(
     ``meshes`` are the wall, and the wall with the ground, which makes the plane needless.
     """
     up = np.array([0.0, 1.0, 0.0])
-    plain = Proxy(up, 0.0)
+    plain = Receiver(up, 0.0)
     wall, whole = (
         replace(plain, mesh=m, radiance=photo_radiance(photo, Curves.identity("linear")))
         for m in meshes
@@ -278,7 +278,7 @@ def main() -> None:
 def _coverage(car: Asset, placement: Placement, camera: Camera, device: str) -> IntArray:
     """Return 1 in pixels that show the car."""
     up = np.array([0.0, 1.0, 0.0])
-    scene = Scene([Placed(car, placement.asset_to_world)], camera, Proxy(up, 0.0), device)
+    scene = Scene([Placed(car, placement.asset_to_world)], camera, Receiver(up, 0.0), device)
     seen_pixels = np.zeros(camera.width * camera.height, np.int32)
     gbuffer = Renderer(scene).gbuffer(0)
     seen_pixels[gbuffer.object_pixels[gbuffer.coverage > 0.0]] = 1

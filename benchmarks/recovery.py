@@ -32,7 +32,7 @@ from warpir.optimize.light import LightOptimization, Unknowns
 from warpir.optimize.view import Frame
 from warpir.render.bridge import ComposeConstants, compose
 from warpir.render.device_light import light_args
-from warpir.render.device_scene import Placed, Proxy, Scene
+from warpir.render.device_scene import Placed, Receiver, Scene
 from warpir.render.mis import MisIntegrator
 from warpir.render.renderer import Renderer
 from warpir.render.tone_curve import Knots, ToneCurve
@@ -182,7 +182,7 @@ def make_truth(
         size=scene.size,
     )
     placed = Placed(asset, placement.asset_to_world)
-    renderer = Renderer(Scene([placed], camera, Proxy(np.array([0.0, 1.0, 0.0]), 0.0), device))
+    renderer = Renderer(Scene([placed], camera, Receiver(np.array([0.0, 1.0, 0.0]), 0.0), device))
     frame = Frame(renderer, photo_lin, True, 3, seed=1)
     curves = true_curves(scene.contrast)
     with torch.no_grad():

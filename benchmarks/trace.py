@@ -26,7 +26,7 @@ from warpir.kernels.trace import (
 )
 from warpir.kernels.types import CameraArgs, MaterialArgs, MeshArgs, TextureArgs
 from warpir.render.device import Rows, choose_device
-from warpir.render.device_scene import Placed, Proxy, Scene
+from warpir.render.device_scene import Placed, Receiver, Scene
 from warpir.render.renderer import Renderer
 from warpir.scene.camera import Camera
 
@@ -93,7 +93,7 @@ def main() -> None:
         pose[:3, 3] = 0.5 * (low + high) + [0.0, 0.0, 4.0 * radius]
         focal = 0.5 * SIDE * 3.9
         camera = Camera(SIDE, SIDE, focal, focal, 0.5 * SIDE, 0.5 * SIDE, pose)
-        proxy = Proxy(np.array([0.0, 1.0, 0.0]), float(low[1]) - radius)
+        proxy = Receiver(np.array([0.0, 1.0, 0.0]), float(low[1]) - radius)
         renderer = Renderer(Scene([Placed(asset, np.eye(4))], camera, proxy, device))
         scene = renderer.scene
         pixels = wp.array(np.arange(SIDE * SIDE, dtype=np.int32), dtype=int, device=device)

@@ -7,7 +7,7 @@ Frames and units
     their support.
 
 Two kinds of files
-    *Detached* files (``trace``, ``path``, ``proxy``, ``transport``) trace rays and draw samples,
+    *Detached* files (``trace``, ``path``, ``receiver``, ``transport``) trace rays and draw samples,
     with no backward pass; ``light_gradient`` is one, written down. *Attached* files (``shade``,
     ``shadow_ratio``, ``composite``) evaluate what those samples see and are differentiated by
     Warp.

@@ -91,7 +91,7 @@ def tone_shadow(
 def compose(
     photo_lin: wp.array[wp.vec3],
     object_index: wp.array[int],
-    proxy_index: wp.array[int],
+    receiver_index: wp.array[int],
     mask: wp.array[float],
     foreground_display: wp.array[wp.vec3],
     ratio_display: wp.array[wp.vec3],
@@ -102,15 +102,15 @@ def compose(
     Args:
         photo_lin: Linear photo, shape [pixel].
         object_index: Row of the object's arrays or -1, shape [pixel].
-        proxy_index: Row of the plane's arrays or -1, shape [pixel].
+        receiver_index: Row of the plane's arrays or -1, shape [pixel].
         mask: Coverage, shape [object_pixel].
         foreground_display: Tone-mapped object, not premultiplied, shape [object_pixel].
-        ratio_display: Tone-mapped shadow ratio, shape [proxy_pixel].
+        ratio_display: Tone-mapped shadow ratio, shape [receiver_pixel].
         image: Output, display-encoded, shape [pixel].
     """
     i = wp.tid()
     x = photo_lin[i]
-    p = proxy_index[i]
+    p = receiver_index[i]
     if p >= 0:
         x = wp.cw_mul(x, ratio_display[p])
     o = object_index[i]

@@ -29,7 +29,7 @@ from warpir.kernels.types import (
     LightRecord,
     MaterialArgs,
     MeshArgs,
-    ProxyArgs,
+    ReceiverArgs,
     TextureArgs,
     VertexRecord,
 )
@@ -52,7 +52,7 @@ class Scatter:
     emitter: EmitterSample
     bsdf: BsdfSample
     L_bsdf: wp.vec3
-    """Radiance that arrives along the BSDF's direction, of the light or of the place's mesh."""
+    """Radiance that arrives along the BSDF's direction, of the light or of the receiver's mesh."""
     weight_bsdf: float
     """``cos visible mis / pdf`` of it; 0 when it met the object."""
 
@@ -62,7 +62,7 @@ def scatter(
     mesh: MeshArgs,
     material: MaterialArgs,
     texture: TextureArgs,
-    proxy: ProxyArgs,
+    receiver: ReceiverArgs,
     light: LightArgs,
     surface: Surface,
     wo: wp.vec3,
@@ -90,7 +90,7 @@ def scatter(
     # Sample the emitter
     u = sobol_pair(index, key, 3 * vertex + 2)
     emitter = sample_emitter(
-        mesh, material, texture, proxy, light, surface, bsdf, frame, u, u_parts[0], keep_dark
+        mesh, material, texture, receiver, light, surface, bsdf, frame, u, u_parts[0], keep_dark
     )
     out.emitter = emitter
     if emitter.valid == 1:
@@ -102,19 +102,19 @@ def scatter(
     u = sobol_pair(index, key, 3 * vertex + 3)
     ray_key = hash_pair(hash_pair(key, wp.uint32(index)), wp.uint32(vertex + 1))
     sample = sample_bsdf(
-        mesh, material, texture, proxy, surface, bsdf, frame, u, u_parts[1], is_last, ray_key
+        mesh, material, texture, receiver, surface, bsdf, frame, u, u_parts[1], is_last, ray_key
     )
     out.bsdf = sample
     f_sample = sample.f.diffuse + sample.f.specular
-    if sample.from_place == 1:
+    if sample.from_receiver == 1:
         # No light is sampled from there, so this technique has all of it.
-        out.L_bsdf = sample.L_place
+        out.L_bsdf = sample.L_receiver
         out.weight_bsdf = sample.cos_over_pdf
     if sample.visible > 0.0:
         Li = light_eval(light, sample.wi)
         out.L_bsdf = Li.radiance
         out.weight_bsdf = bsdf_weight(sample, Li.pdf)
-    if sample.from_place == 1 or sample.visible > 0.0:
+    if sample.from_receiver == 1 or sample.visible > 0.0:
         out.direct += wp.cw_mul(f_sample, out.L_bsdf) * out.weight_bsdf
         out.direct_diffuse += wp.cw_mul(sample.f.diffuse, out.L_bsdf) * out.weight_bsdf
     if sample.next.valid == 1:
@@ -161,7 +161,7 @@ def keep_event(record: VertexRecord, i: int, j: int, event: Scatter):
 
 
 @cache
-def foreground_kernel(has_layers: bool, has_place: bool) -> wp.Kernel:
+def foreground_kernel(has_layers: bool, has_receiver_mesh: bool) -> wp.Kernel:
     """Return `trace_foreground` for scenes with or without these; what is not there costs nothing.
 
     A flag that is looked at while tracing would do on the CPU. On CUDA the registers of code that
@@ -169,7 +169,7 @@ def foreground_kernel(has_layers: bool, has_place: bool) -> wp.Kernel:
 
     Args:
         has_layers: Whether some material has extensions (``MaterialArgs.any_layers``).
-        has_place: Whether there is a mesh of the place (``ProxyArgs.mesh``).
+        has_receiver_mesh: Whether there is a mesh of the receiver (``ReceiverArgs.mesh``).
     """
 
     @wp.kernel(module="unique", enable_backward=False)
@@ -179,7 +179,7 @@ def foreground_kernel(has_layers: bool, has_place: bool) -> wp.Kernel:
         mesh: MeshArgs,
         material: MaterialArgs,
         texture: TextureArgs,
-        proxy: ProxyArgs,
+        receiver: ReceiverArgs,
         light: LightArgs,
         spp: int,
         rays: int,
@@ -194,7 +194,7 @@ def foreground_kernel(has_layers: bool, has_place: bool) -> wp.Kernel:
         light_record: LightRecord,
         vertex_record: VertexRecord,
     ):
-        """Path-trace the object in each listed pixel; plane and place hide it but are not lit.
+        """Path-trace the object in each listed pixel; the receiver hide it but are not lit.
 
         A pixel may stand in the list ``lanes`` times, one after the other: each row then takes its
         share of the samples, and the rows' results add up to the pixel's.
@@ -205,8 +205,8 @@ def foreground_kernel(has_layers: bool, has_place: bool) -> wp.Kernel:
             mesh: The object's triangles.
             material: Their materials.
             texture: Their textures.
-            proxy: The ground plane, which hides what is below it from the camera, and the place's
-                mesh, which also stands in the light's way.
+            receiver: The ground plane, which hides what is below it from the camera, and the mesh,
+                which also stands in the light's way.
             light: The light.
             spp: Camera samples per row.
             rays: Paths that share one camera sample.
@@ -227,8 +227,8 @@ def foreground_kernel(has_layers: bool, has_place: bool) -> wp.Kernel:
         """
         if wp.static(not has_layers):
             material.any_layers = 0
-        if wp.static(not has_place):
-            proxy.mesh = wp.uint64(0)
+        if wp.static(not has_receiver_mesh):
+            receiver.mesh = wp.uint64(0)
         i = wp.tid()
         pixel = pixels[i]
         key = pixel_seed(seed, pixel)
@@ -259,7 +259,7 @@ def foreground_kernel(has_layers: bool, has_place: bool) -> wp.Kernel:
                 s = before + index // rays
                 ray_dir = camera_ray(camera, pixel, sobol_pair(s, key, 0))
                 if index % rays == 0:
-                    first = camera_hit(camera, mesh, material, texture, proxy, s, key, ray_dir)
+                    first = camera_hit(camera, mesh, material, texture, receiver, s, key, ray_dir)
                     if first.valid == 1:
                         count += 1.0
                 if first.valid == 0:
@@ -283,7 +283,7 @@ def foreground_kernel(has_layers: bool, has_place: bool) -> wp.Kernel:
                 mesh,
                 material,
                 texture,
-                proxy,
+                receiver,
                 light,
                 surface,
                 wo,

@@ -10,10 +10,10 @@ import warp as wp
 
 from warpir.kernels.bsdf import Bsdf, BsdfValue, bsdf_f, bsdf_of, bsdf_sample
 from warpir.kernels.frame import Frame, to_local, to_world
-from warpir.kernels.proxy_mesh import proxy_mesh_hit, proxy_radiance, proxy_visibility
+from warpir.kernels.receiver_mesh import receiver_mesh_hit, receiver_radiance, receiver_visibility
 from warpir.kernels.sampling import light_eval, light_sample, power_heuristic
 from warpir.kernels.trace import Hit, Surface, closest_hit, offset_origin, visibility
-from warpir.kernels.types import LightArgs, MaterialArgs, MeshArgs, ProxyArgs, TextureArgs
+from warpir.kernels.types import LightArgs, MaterialArgs, MeshArgs, ReceiverArgs, TextureArgs
 
 wp.set_module_options({"enable_backward": False})
 
@@ -43,9 +43,9 @@ class BsdfSample:
     cos_over_pdf: float
     visible: float
     """Share of light from infinity that arrives along it."""
-    from_place: int
-    """1 when it met the place's mesh: what that sends is a constant to the light."""
-    L_place: wp.vec3
+    from_receiver: int
+    """1 when it met the receiver's mesh: what that sends is a constant to the light."""
+    L_receiver: wp.vec3
     """Radiance of that mesh."""
     next: Hit
     """Where it met the object, and the path goes on."""
@@ -68,7 +68,7 @@ def sample_emitter(
     mesh: MeshArgs,
     material: MaterialArgs,
     texture: TextureArgs,
-    proxy: ProxyArgs,
+    receiver: ReceiverArgs,
     light: LightArgs,
     surface: Surface,
     bsdf: Bsdf,
@@ -83,7 +83,7 @@ def sample_emitter(
         mesh: The object's triangles.
         material: Their materials.
         texture: Their textures.
-        proxy: The place's mesh, which stands in the light's way.
+        receiver: The receiver's mesh, which stands in the light's way.
         light: The light.
         surface: Where light is scattered.
         bsdf: How, toward the camera.
@@ -106,7 +106,7 @@ def sample_emitter(
             weight = wi[2] * power_heuristic(Li.pdf, f.pdf) / Li.pdf
             origin = offset_origin(surface.position, surface.ng, sample.wi, mesh.epsilon)
             weight = weight * visibility(mesh, material, texture, origin, sample.wi)
-            weight = weight * proxy_visibility(proxy, origin, sample.wi)
+            weight = weight * receiver_visibility(receiver, origin, sample.wi)
             sample.valid = 1
             sample.f = f
             sample.L = Li.radiance
@@ -119,7 +119,7 @@ def sample_bsdf(
     mesh: MeshArgs,
     material: MaterialArgs,
     texture: TextureArgs,
-    proxy: ProxyArgs,
+    receiver: ReceiverArgs,
     surface: Surface,
     bsdf: Bsdf,
     frame: Frame,
@@ -134,7 +134,7 @@ def sample_bsdf(
         mesh: The object's triangles.
         material: Their materials.
         texture: Their textures.
-        proxy: The place's mesh, which stands in the light's way and sends what the photo shows.
+        receiver: Its mesh stands in the light's way and sends what the photo shows.
         surface: Where light is scattered.
         bsdf: How, toward the camera.
         frame: Of the shading normal.
@@ -146,7 +146,7 @@ def sample_bsdf(
     sample = BsdfSample()
     sample.cos_over_pdf = 0.0
     sample.visible = 0.0
-    sample.from_place = 0
+    sample.from_receiver = 0
     sample.next.valid = 0
     wi = bsdf_sample(bsdf, u, u_lobe)
     sample.wi = to_world(wi, frame)
@@ -155,18 +155,18 @@ def sample_bsdf(
         if sample.f.pdf > 0.0:
             sample.cos_over_pdf = wi[2] / sample.f.pdf
             origin = offset_origin(surface.position, surface.ng, sample.wi, mesh.epsilon)
-            place = proxy_mesh_hit(proxy, origin, sample.wi)
-            if is_last == 1 and place.valid == 0:
+            receiver_hit = receiver_mesh_hit(receiver, origin, sample.wi)
+            if is_last == 1 and receiver_hit.valid == 0:
                 sample.visible = visibility(mesh, material, texture, origin, sample.wi)
             else:
                 sample.next = closest_hit(
-                    mesh, material, texture, origin, sample.wi, place.t, 0, ray_key
+                    mesh, material, texture, origin, sample.wi, receiver_hit.t, 0, ray_key
                 )
-                if sample.next.valid == 0 and place.valid == 0:
+                if sample.next.valid == 0 and receiver_hit.valid == 0:
                     sample.visible = 1.0
                 elif sample.next.valid == 0:
-                    sample.from_place = 1
-                    sample.L_place = proxy_radiance(proxy, place)
+                    sample.from_receiver = 1
+                    sample.L_receiver = receiver_radiance(receiver, receiver_hit)
     return sample
 
 

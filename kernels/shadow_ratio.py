@@ -19,7 +19,7 @@ def safe_ratio(numerator: float, denominator: float) -> float:
 
 @wp.kernel
 def shadow_ratio(lit: wp.array[wp.vec3], unoccluded: wp.array[wp.vec3], ratio: wp.array[wp.vec3]):
-    """``beta = lit / unoccluded`` per channel (DiPIR, eq. 5), shape [proxy_pixel] each."""
+    """``beta = lit / unoccluded`` per channel (DiPIR, eq. 5), shape [receiver_pixel] each."""
     i = wp.tid()
     a = lit[i]
     b = unoccluded[i]

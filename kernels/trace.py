@@ -7,7 +7,7 @@ import warp as wp
 
 from warpir.kernels.bsdf import F0_COAT, layers_toward, luminance, schlick
 from warpir.kernels.frame import basis, to_local
-from warpir.kernels.proxy_mesh import INFINITY, proxy_distance, proxy_mesh_hit
+from warpir.kernels.receiver_mesh import INFINITY, plane_distance, receiver_mesh_hit
 from warpir.kernels.rng import hash_pair, pixel_seed, sobol_pair, to_unit
 from warpir.kernels.types import (
     CameraArgs,
@@ -15,7 +15,7 @@ from warpir.kernels.types import (
     Layers,
     MaterialArgs,
     MeshArgs,
-    ProxyArgs,
+    ReceiverArgs,
     TextureArgs,
 )
 
@@ -81,21 +81,21 @@ def camera_ray(camera: CameraArgs, pixel: int, jitter: wp.vec2) -> wp.vec3:
 
 
 @wp.func
-def camera_reach(proxy: ProxyArgs, origin: wp.vec3, direction: wp.vec3) -> float:
-    """Return how far a camera ray sees [m]: to plane or mesh of the place and to what lies there.
+def camera_reach(receiver: ReceiverArgs, origin: wp.vec3, direction: wp.vec3) -> float:
+    """Return how far a camera ray sees [m]: to the receiver's plane or mesh and what lies there.
 
     Without the tolerance a sheet on the ground would be seen in a random part of its samples.
     """
-    reach = proxy_distance(proxy, origin, direction)
+    reach = plane_distance(receiver, origin, direction)
     if reach < 0.0:
         reach = INFINITY
     else:
-        reach = reach - proxy.tolerance / wp.dot(proxy.normal, direction)
-    hit = proxy_mesh_hit(proxy, origin, direction)
+        reach = reach - receiver.tolerance / wp.dot(receiver.normal, direction)
+    hit = receiver_mesh_hit(receiver, origin, direction)
     if hit.valid == 1:
         # Along a wall a ray may graze for any distance.
         slope = wp.max(-wp.dot(hit.normal, direction), 1.0e-6)
-        reach = wp.min(reach, hit.t + proxy.tolerance / slope)
+        reach = wp.min(reach, hit.t + receiver.tolerance / slope)
     return reach
 
 
@@ -401,7 +401,7 @@ def camera_hit(
     mesh: MeshArgs,
     material: MaterialArgs,
     texture: TextureArgs,
-    proxy: ProxyArgs,
+    receiver: ReceiverArgs,
     s: int,
     key: wp.uint32,
     ray_dir: wp.vec3,
@@ -410,7 +410,7 @@ def camera_hit(
 
     ``ray_dir`` is `camera_ray` at ``sobol_pair(s, key, 0)``.
     """
-    reach = camera_reach(proxy, camera.origin, ray_dir)
+    reach = camera_reach(receiver, camera.origin, ray_dir)
     return closest_hit(
         mesh, material, texture, camera.origin, ray_dir, reach, 1, hash_pair(key, wp.uint32(s))
     )
@@ -642,7 +642,7 @@ def trace_gbuffer(
     mesh: MeshArgs,
     material: MaterialArgs,
     texture: TextureArgs,
-    proxy: ProxyArgs,
+    receiver: ReceiverArgs,
     spp: int,
     seed: int,
     coverage: wp.array[float],
@@ -667,7 +667,7 @@ def trace_gbuffer(
     emitted = wp.vec3(0.0)
     for s in range(spp):
         ray_dir = camera_ray(camera, pixel, sobol_pair(s, key, 0))
-        hit = camera_hit(camera, mesh, material, texture, proxy, s, key, ray_dir)
+        hit = camera_hit(camera, mesh, material, texture, receiver, s, key, ray_dir)
         if hit.valid == 1:
             surface = surface_at(mesh, material, texture, hit, -ray_dir)
             count += 1.0

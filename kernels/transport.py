@@ -15,8 +15,8 @@ import warp as wp
 from warpir.kernels.bsdf import bsdf_f, bsdf_of, narrowest_roughness, roughness_to_alpha
 from warpir.kernels.frame import basis, to_local, to_world
 from warpir.kernels.latlong import BilinearTap, bilinear_tap, direction_to_uv, uv_to_direction
-from warpir.kernels.proxy import Receiver, proxy_point, receiver_origin
-from warpir.kernels.proxy_mesh import proxy_mesh_hit, proxy_radiance, proxy_visibility
+from warpir.kernels.receiver import ReceiverPoint, receiver_origin, receiver_point
+from warpir.kernels.receiver_mesh import receiver_mesh_hit, receiver_radiance, receiver_visibility
 from warpir.kernels.rng import hash_pair, hash_uint, pixel_seed, sobol_pair, to_unit
 from warpir.kernels.sampling import cosine_sample, light_eval, power_heuristic, tent
 from warpir.kernels.scatter import bsdf_weight, sample_bsdf, sample_emitter, surface_bsdf
@@ -36,7 +36,7 @@ from warpir.kernels.types import (
     LightArgs,
     MaterialArgs,
     MeshArgs,
-    ProxyArgs,
+    ReceiverArgs,
     TextureArgs,
 )
 
@@ -105,7 +105,7 @@ def trace_points(
     mesh: MeshArgs,
     material: MaterialArgs,
     texture: TextureArgs,
-    proxy: ProxyArgs,
+    receiver: ReceiverArgs,
     subsamples: int,
     seed: int,
     points: SurfacePoints,
@@ -122,7 +122,7 @@ def trace_points(
     emitted = wp.vec3(0.0)
     for s in range(subsamples):
         ray_dir = camera_ray(camera, pixel, sobol_pair(s, key, 0))
-        hit = camera_hit(camera, mesh, material, texture, proxy, s, key, ray_dir)
+        hit = camera_hit(camera, mesh, material, texture, receiver, s, key, ray_dir)
         if hit.valid == 1:
             surface = surface_at(mesh, material, texture, hit, -ray_dir)
             points.position[i, count] = surface.position
@@ -231,7 +231,7 @@ def direct_row(
     mesh: MeshArgs,
     material: MaterialArgs,
     texture: TextureArgs,
-    proxy: ProxyArgs,
+    receiver: ReceiverArgs,
     texels: TexelArgs,
     subsamples: int,
     path_count: int,
@@ -286,7 +286,7 @@ def direct_row(
                 if wp.max(throughput) > 0.0:
                     origin = offset_origin(points.position[p, s], ng, wi, mesh.epsilon)
                     arriving = visibility(mesh, material, texture, origin, wi)
-                    total += throughput * (arriving * proxy_visibility(proxy, origin, wi))
+                    total += throughput * (arriving * receiver_visibility(receiver, origin, wi))
     return total * (texels.d_omega[i] * float(count) / float(subsamples * directions))
 
 
@@ -297,7 +297,7 @@ def trace_direct(
     mesh: MeshArgs,
     material: MaterialArgs,
     texture: TextureArgs,
-    proxy: ProxyArgs,
+    receiver: ReceiverArgs,
     texels: TexelArgs,
     subsamples: int,
     path_count: int,
@@ -312,7 +312,7 @@ def trace_direct(
         mesh: The object's triangles.
         material: Their materials.
         texture: Their textures.
-        proxy: The place's mesh, which stands in the light's way.
+        receiver: The receiver's mesh, which stands in the light's way.
         texels: The map and how many directions each texel gets.
         subsamples: Camera samples per pixel.
         path_count: Paths that `trace_paths` will add, for the weights of narrow lobes.
@@ -330,7 +330,7 @@ def trace_direct(
             mesh,
             material,
             texture,
-            proxy,
+            receiver,
             texels,
             subsamples,
             path_count,
@@ -386,7 +386,7 @@ def trace_paths(
     mesh: MeshArgs,
     material: MaterialArgs,
     texture: TextureArgs,
-    proxy: ProxyArgs,
+    receiver: ReceiverArgs,
     texels: TexelArgs,
     proposal: LightArgs,
     subsamples: int,
@@ -405,7 +405,7 @@ def trace_paths(
         mesh: The object's triangles.
         material: Their materials.
         texture: Their textures.
-        proxy: The place's mesh, which stands in the light's way and sends what the photo shows.
+        receiver: Its mesh stands in the light's way and sends what the photo shows.
         texels: The map.
         proposal: Where light is expected, for the second and later vertices; any positive map.
         subsamples: Camera samples per pixel.
@@ -443,7 +443,7 @@ def trace_paths(
         is_last = int(0)
         if k == depth - 1 and material.any_emission == 0:
             is_last = 1
-        if k == 0 and is_last == 1 and is_narrow_first == 0 and proxy.mesh == wp.uint64(0):
+        if k == 0 and is_last == 1 and is_narrow_first == 0 and receiver.mesh == wp.uint64(0):
             break
         u_parts = sobol_pair(q, key, 3 * k + 1)
 
@@ -451,7 +451,7 @@ def trace_paths(
         if k > 0:
             u = sobol_pair(q, key, 3 * k + 2)
             emitter = sample_emitter(
-                mesh, material, texture, proxy, proposal, surface, bsdf, frame, u, u_parts[0], 0
+                mesh, material, texture, receiver, proposal, surface, bsdf, frame, u, u_parts[0], 0
             )
             if emitter.weight > 0.0:
                 value = wp.cw_mul(throughput, emitter.f.diffuse + emitter.f.specular)
@@ -461,12 +461,12 @@ def trace_paths(
         u = sobol_pair(q, key, 3 * k + 3)
         ray_key = hash_pair(hash_pair(key, wp.uint32(q)), wp.uint32(k + 1))
         sample = sample_bsdf(
-            mesh, material, texture, proxy, surface, bsdf, frame, u, u_parts[1], is_last, ray_key
+            mesh, material, texture, receiver, surface, bsdf, frame, u, u_parts[1], is_last, ray_key
         )
         f = sample.f.diffuse + sample.f.specular
-        if sample.from_place == 1:
+        if sample.from_receiver == 1:
             reflected = wp.cw_mul(throughput, f) * sample.cos_over_pdf
-            wp.atomic_add(emission, p, wp.cw_mul(reflected, sample.L_place))
+            wp.atomic_add(emission, p, wp.cw_mul(reflected, sample.L_receiver))
         if sample.visible > 0.0:
             if k > 0:
                 expected = light_eval(proposal, sample.wi)
@@ -487,14 +487,14 @@ def trace_paths(
 
 
 @wp.kernel
-def trace_proxy_points(
+def trace_receiver_points(
     pixels: wp.array[int],
     may_see_object: wp.array[int],
     camera: CameraArgs,
     mesh: MeshArgs,
     material: MaterialArgs,
     texture: TextureArgs,
-    proxy: ProxyArgs,
+    receiver: ReceiverArgs,
     subsamples: int,
     seed: int,
     count: wp.array[int],
@@ -503,24 +503,24 @@ def trace_proxy_points(
     spread: wp.array[float],
     share: wp.array[float],
 ):
-    """Find the place, plane or mesh, under ``subsamples`` positions of each listed pixel.
+    """Find the receiver, plane or mesh, under ``subsamples`` positions of each listed pixel.
 
     Args:
         pixels: Row-major pixel indices, shape [pixel].
-        may_see_object: 1 where the object may hide the place from the camera, shape [pixel].
+        may_see_object: 1 where the object may hide the receiver from the camera, shape [pixel].
         camera: The view.
         mesh: The object's triangles.
         material: Their materials.
         texture: Their textures.
-        proxy: The place: plane and mesh.
+        receiver: The receiver: plane and mesh.
         subsamples: Camera samples per pixel.
         seed: Base seed.
         count: Filled points of each pixel, shape [pixel].
-        position: Points of the place, recentred [m], shape [pixel, subsample].
+        position: Points of the receiver, recentred [m], shape [pixel, subsample].
         normal: Its unit normals there, shape [pixel, subsample].
         spread: Largest distance of a pixel's points from its first one [m], shape [pixel].
-        share: Of its subsamples that do not see the object, those that see the place and not what
-            is behind the end of its mesh [1], shape [pixel].
+        share: Of its subsamples that do not see the object, those that see the receiver and
+            not what is behind the end of its mesh [1], shape [pixel].
     """
     i = wp.tid()
     pixel = pixels[i]
@@ -529,8 +529,8 @@ def trace_proxy_points(
     is_open = int(0)
     farthest = float(0.0)
     for s in range(subsamples):
-        point = proxy_point(
-            camera, mesh, material, texture, proxy, pixel, may_see_object[i], s, key
+        point = receiver_point(
+            camera, mesh, material, texture, receiver, pixel, may_see_object[i], s, key
         )
         is_open += point.is_open
         if point.valid == 1:
@@ -549,7 +549,7 @@ def blocked_share(
     mesh: MeshArgs,
     material: MaterialArgs,
     texture: TextureArgs,
-    proxy: ProxyArgs,
+    receiver: ReceiverArgs,
     texels: TexelArgs,
     p: int,
     t: int,
@@ -575,9 +575,9 @@ def blocked_share(
         u = random_pair(key, -1)
         if directions > 1:
             u = sobol_pair(r, key, 0)
-        wi = tent_direction(texels, i, j, u, ray_key, 1, proxy.normal)
-        origin = position[p, (start + r) % filled] + proxy.normal * mesh.epsilon
-        if wp.dot(wi, proxy.normal) > 0.0 and meets_box(origin, wi, mesh.low, mesh.high) == 1:
+        wi = tent_direction(texels, i, j, u, ray_key, 1, receiver.normal)
+        origin = position[p, (start + r) % filled] + receiver.normal * mesh.epsilon
+        if wp.dot(wi, receiver.normal) > 0.0 and meets_box(origin, wi, mesh.low, mesh.high) == 1:
             total += 1.0 - visibility(mesh, material, texture, origin, wi)
     return total / float(directions)
 
@@ -591,7 +591,7 @@ def trace_blocked(
     mesh: MeshArgs,
     material: MaterialArgs,
     texture: TextureArgs,
-    proxy: ProxyArgs,
+    receiver: ReceiverArgs,
     texels: TexelArgs,
     columns: wp.array[int],
     seed: int,
@@ -606,11 +606,11 @@ def trace_blocked(
         pixels: Row-major pixel indices, shape [pixel].
         count: Filled points of each pixel, shape [pixel].
         position: Points of the plane [m], shape [pixel, subsample].
-        spread: From `trace_proxy_points` [m], shape [pixel].
+        spread: From `trace_receiver_points` [m], shape [pixel].
         mesh: The object's triangles.
         material: Their materials.
         texture: Their textures.
-        proxy: The plane.
+        receiver: The plane.
         texels: The map and how many directions each texel gets.
         columns: Texels whose tents rise above the plane, shape [column].
         seed: Base seed.
@@ -636,7 +636,7 @@ def trace_blocked(
                 mesh,
                 material,
                 texture,
-                proxy,
+                receiver,
                 texels,
                 p,
                 t,
@@ -658,13 +658,13 @@ def trace_received(
     mesh: MeshArgs,
     material: MaterialArgs,
     texture: TextureArgs,
-    proxy: ProxyArgs,
+    receiver: ReceiverArgs,
     texels: TexelArgs,
     seed: int,
     received: wp.array2d[float],
     blocked: wp.array2d[float],
 ):
-    """Write what each texel sends to a place with a mesh, and what the object keeps; (pixel, lane).
+    """Write what each texel sends to a receiving mesh, and what the object keeps; (pixel, lane).
 
     Normals differ within a pixel there and the mesh hides part of the sky, so no row is known
     beforehand. Directions are spread evenly over the tent.
@@ -672,16 +672,16 @@ def trace_received(
     Args:
         pixels: Row-major pixel indices, shape [pixel].
         count: Filled points of each pixel, shape [pixel].
-        position: Points of the place [m], shape [pixel, subsample].
+        position: Points of the receiver [m], shape [pixel, subsample].
         normal: Its unit normals there, shape [pixel, subsample].
-        share: From `trace_proxy_points` [1], shape [pixel].
+        share: From `trace_receiver_points` [1], shape [pixel].
         mesh: The object's triangles.
         material: Their materials.
         texture: Their textures.
-        proxy: The place: plane and mesh.
+        receiver: The receiver: plane and mesh.
         texels: The map and how many directions each texel gets.
         seed: Base seed.
-        received: Radiance of the white place without the object per texel radiance [1], zero,
+        received: Radiance of the white receiver without the object per texel radiance [1], zero,
             shape [pixel, texel].
         blocked: The part of it that the object keeps away [1], zero, shape [pixel, texel].
     """
@@ -705,7 +705,7 @@ def trace_received(
         kept = float(0.0)
         for r in range(first, wp.min(first + texels.item_size, directions)):
             s = (start + r) % filled
-            point = Receiver()
+            point = ReceiverPoint()
             point.position = position[p, s]
             point.normal = normal[p, s]
             u = random_pair(key, -1)
@@ -714,8 +714,8 @@ def trace_received(
             wi = tent_direction(texels, i, j, u, hash_pair(key, wp.uint32(r)), 0, point.normal)
             cos_i = wp.dot(wi, point.normal)
             if cos_i > 0.0:
-                origin = receiver_origin(mesh, proxy, point)
-                arriving = cos_i * proxy_visibility(proxy, origin, wi)
+                origin = receiver_origin(mesh, receiver, point)
+                arriving = cos_i * receiver_visibility(receiver, origin, wi)
                 total += arriving
                 if arriving > 0.0 and meets_box(origin, wi, mesh.low, mesh.high) == 1:
                     kept += arriving * (1.0 - visibility(mesh, material, texture, origin, wi))
@@ -734,27 +734,27 @@ def trace_bounced(
     mesh: MeshArgs,
     material: MaterialArgs,
     texture: TextureArgs,
-    proxy: ProxyArgs,
+    receiver: ReceiverArgs,
     path_count: int,
     seed: int,
     received: wp.array[wp.vec3],
     blocked: wp.array[wp.vec3],
 ):
-    """Add up what the place's mesh sends to the place, and what the object keeps of it.
+    """Add up what the receiver's mesh sends to the receiver, and what the object keeps of it.
 
     Args:
         pixels: Row-major pixel indices, shape [pixel].
         count: Filled points of each pixel, shape [pixel].
-        position: Points of the place [m], shape [pixel, subsample].
+        position: Points of the receiver [m], shape [pixel, subsample].
         normal: Its unit normals there, shape [pixel, subsample].
-        share: From `trace_proxy_points` [1], shape [pixel].
+        share: From `trace_receiver_points` [1], shape [pixel].
         mesh: The object's triangles.
         material: Their materials.
         texture: Their textures.
-        proxy: The place: plane and mesh.
+        receiver: The receiver: plane and mesh.
         path_count: Directions per pixel.
         seed: Base seed.
-        received: Radiance of the white place without the object, shape [pixel].
+        received: Radiance of the white receiver without the object, shape [pixel].
         blocked: The part of it that the object keeps away, shape [pixel].
     """
     p = wp.tid()
@@ -765,17 +765,17 @@ def trace_bounced(
     total = wp.vec3(0.0)
     kept = wp.vec3(0.0)
     for q in range(path_count):
-        point = Receiver()
+        point = ReceiverPoint()
         point.position = position[p, q % filled]
         point.normal = normal[p, q % filled]
         wi = to_world(cosine_sample(sobol_pair(q, key, 0)), basis(point.normal))
-        origin = receiver_origin(mesh, proxy, point)
-        place = proxy_mesh_hit(proxy, origin, wi)
-        if place.valid == 1:
-            L = proxy_radiance(proxy, place)
+        origin = receiver_origin(mesh, receiver, point)
+        receiver_hit = receiver_mesh_hit(receiver, origin, wi)
+        if receiver_hit.valid == 1:
+            L = receiver_radiance(receiver, receiver_hit)
             total += L
             ray_key = hash_pair(key, wp.uint32(q))
-            hit = closest_hit(mesh, material, texture, origin, wi, place.t, 0, ray_key)
+            hit = closest_hit(mesh, material, texture, origin, wi, receiver_hit.t, 0, ray_key)
             if hit.valid == 1:
                 kept += L
     received[p] = total / float(path_count)

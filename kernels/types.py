@@ -21,8 +21,8 @@ class CameraArgs:
 
 
 @wp.struct
-class ProxyArgs:
-    """What is known of the photo's place: a ground plane, a mesh, or both."""
+class ReceiverArgs:
+    """The receiver, on which the object's shadow falls: a ground plane, a mesh, or both."""
 
     normal: wp.vec3
     """Of the plane ``dot(normal, x) = offset``, analytic and unbounded: unit normal, toward the
@@ -32,7 +32,7 @@ class ProxyArgs:
     tolerance: float
     """How far below plane and mesh the object still counts as lying on them [m]."""
     mesh: wp.uint64
-    """Handle of the place's ``wp.Mesh``; 0 when there is none, and nothing below is read."""
+    """Handle of the receiver's ``wp.Mesh``; 0 when there is none, and nothing below is read."""
     epsilon: float
     """Ray offset that depends on the mesh's size alone [m]."""
     positions: wp.array[wp.vec3]

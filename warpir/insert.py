@@ -596,7 +596,7 @@ def _write(
         **({} if mask is None else {"shadow_mask_at_object": mask.at_object}),
         **({} if inputs.proxy is None else {"proxy_triangles": len(inputs.proxy.indices)}),
         "object_pixels": picture.object_pixel_count,
-        "shadow_pixels": picture.proxy_pixel_count,
+        "shadow_pixels": picture.receiver_pixel_count,
         "changed_pixels": int(changed.sum()),
         "values_clamped_to_half": clamped,
         **handed,

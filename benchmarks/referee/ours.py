@@ -6,7 +6,7 @@ import numpy as np
 
 from warpir.core.arrays import Float64Array, FloatArray
 from warpir.render.device_light import light_args
-from warpir.render.device_scene import Placed, Proxy, Scene
+from warpir.render.device_scene import Placed, Receiver, Scene
 from warpir.render.renderer import Renderer
 from warpir.scene.asset import Asset
 from warpir.scene.camera import Camera
@@ -35,7 +35,7 @@ class Ratio(NamedTuple):
 
 def renderer(asset: Asset, matrix: Float64Array, camera: Camera, device: str = "cpu") -> Renderer:
     """Set an object over the plane ``y = 0``."""
-    proxy = Proxy(np.array([0.0, 1.0, 0.0]), 0.0)
+    proxy = Receiver(np.array([0.0, 1.0, 0.0]), 0.0)
     return Renderer(Scene([Placed(asset, matrix)], camera, proxy, device))
 
 
@@ -89,7 +89,7 @@ def shadow_ratio(
     may_see = np.ones(len(pixels), np.int32)
     lit, unoccluded = [], []
     for k in range(SEED_COUNT):
-        out = render.proxy(
+        out = render.receiver(
             light, pixels, may_see, max(1, spp // SEED_COUNT), 1, SEED_COUNT * seed + k
         )
         lit.append(out.lit.astype(np.float64))

@@ -435,7 +435,7 @@ def main(arguments: list[str] | None = None) -> None:
                 "triangles": scene.triangles,
                 "depth": scene.depth,
                 "object_pixels": len(scene.object_pixels),
-                "proxy_pixels": len(scene.proxy_pixels),
+                "receiver_pixels": len(scene.receiver_pixels),
             }
         )
         del bench, references

@@ -103,12 +103,12 @@ class MisPart:
         self.bench, self.part, self.height, self.spp = bench, part, height, spp
         self.warm_key = (self.integrator, part)
         self.mis = MisIntegrator(
-            scene.renderer, scene.object_pixels, scene.proxy_pixels, spp, 1, scene.depth
+            scene.renderer, scene.object_pixels, scene.receiver_pixels, spp, 1, scene.depth
         )
         # Emptied after it was made: the plane must know where the object may hide it
         nothing = np.zeros(0, np.int32)
         if part == "foreground":
-            self.mis.proxy_pixels = self.mis.may_see_object = nothing
+            self.mis.receiver_pixels = self.mis.may_see_object = nothing
         else:
             self.mis.object_pixels = nothing
 
@@ -211,7 +211,7 @@ class Transport:
         self.traced = made = TransportIntegrator(
             scene.renderer,
             scene.object_pixels,
-            scene.proxy_pixels,
+            scene.receiver_pixels,
             depth=scene.depth,
             settings=TransportSettings(height_fg=heights[0], height_shadow=heights[1], **fields),
             expected=Light(scene.lobes) if settings.get("expects_light", True) else None,
@@ -255,7 +255,7 @@ def mitsuba_synchronize() -> None:
 
 
 def shadow_ratio(radiance: Radiance) -> Tensor:
-    """Return lit / unoccluded, 1 where no light arrives, shape [proxy_pixel, 3]."""
+    """Return lit / unoccluded, 1 where no light arrives, shape [receiver_pixel, 3]."""
     seen = radiance.unoccluded > 0.0
     below = torch.where(seen, radiance.unoccluded, torch.ones_like(radiance.unoccluded))
     return torch.where(seen, radiance.lit / below, torch.ones_like(below))

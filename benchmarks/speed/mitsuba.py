@@ -26,7 +26,7 @@ stratified together."""
 
 
 @dataclass
-class PlaneSamples:
+class ReceiverSamples:
     """What the lookups of one pass need: two directions per camera sample, detached."""
 
     d_light: Any
@@ -79,7 +79,7 @@ class MitsubaScene:
         self.integrator = mi.load_dict(
             {"type": integrator, "max_depth": scene.depth + 1, "hide_emitters": True}
         )
-        self.plane_count = len(scene.proxy_pixels)
+        self.plane_count = len(scene.receiver_pixels)
         self.parameters = mi.traverse(self.setup.scene)
         dr.enable_grad(self.parameters["light.texels"])
         self.parameters.update()
@@ -91,7 +91,7 @@ class MitsubaScene:
             "sensor": _sensor(scene.camera, self.setup, (left, top, self.crop[1], height), sampler),
             "texels": self.parameters["light.texels"],
             "d_image": mi.TensorXf(d_image.reshape(*self.crop, 3)),
-            "pixels": mi.UInt32(scene.proxy_pixels.astype(np.uint32)),
+            "pixels": mi.UInt32(scene.receiver_pixels.astype(np.uint32)),
             "weight_ratio": self.weight_ratio,
         }
         """All arrays that a frozen function reads."""
@@ -201,7 +201,7 @@ class MitsubaScene:
         return ratio, dr.grad(given["texels"])
 
     def _backward(
-        self, samples: PlaneSamples, d_lit: mi.Color3f, d_unoccluded: mi.Color3f, spp: int
+        self, samples: ReceiverSamples, d_lit: mi.Color3f, d_unoccluded: mi.Color3f, spp: int
     ) -> None:
         """Add one pass's gradient to the texels'."""
         index = dr.arange(mi.UInt32, self.plane_count * spp) // spp
@@ -218,7 +218,7 @@ class MitsubaScene:
     def _lookup(self, d: mi.Vector3f) -> mi.Color3f:
         return self.setup.scene.environment().radiance(d, mi.Bool(True))
 
-    def _radiance(self, samples: PlaneSamples, spp: int) -> tuple[mi.Color3f, mi.Color3f]:
+    def _radiance(self, samples: ReceiverSamples, spp: int) -> tuple[mi.Color3f, mi.Color3f]:
         by_light = self._lookup(samples.d_light) * samples.weight_light
         by_cosine = self._lookup(samples.d_cosine) * samples.weight_cosine
         lit = dr.select(samples.free_light, by_light, 0.0)
@@ -234,7 +234,7 @@ class MitsubaScene:
 
         return reduce(lit), reduce(unoccluded)
 
-    def _trace(self, given: dict[str, Any], seed: mi.UInt32, spp: int) -> PlaneSamples:
+    def _trace(self, given: dict[str, Any], seed: mi.UInt32, spp: int) -> ReceiverSamples:
         """Draw one emitter and one cosine direction per camera sample and test both."""
         scene = given["scene"]
         emitter: LatlongEmitter = scene.environment()
@@ -283,7 +283,7 @@ class MitsubaScene:
         other.d = d
         by_cosine = mis_weight(d.y * dr.inv_pi, emitter.pdf_direction(it, other, seen))
         by_cosine = dr.select(seen & (d.y > 0.0), by_cosine, 0.0)
-        return PlaneSamples(ds.d, by_light, free_light, d, by_cosine, free(d, seen))
+        return ReceiverSamples(ds.d, by_light, free_light, d, by_cosine, free(d, seen))
 
 
 def _passes(pixels: int, spp: int, seed: int) -> Iterator[tuple[mi.UInt32, int]]:

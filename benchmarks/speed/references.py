@@ -182,7 +182,7 @@ class References:
             ]
             settings += (scene.depth, materials, self.bench.mitsuba_integrator)
         else:
-            arrays = [scene.proxy_pixels, scene.weight_ratio]
+            arrays = [scene.receiver_pixels, scene.weight_ratio]
         arrays += [*light, scene.matrix, scene.camera.c2w]
         arrays += [p.positions for p in scene.asset.primitives]
         digest = hashlib.sha256(repr(settings).encode())
@@ -271,7 +271,7 @@ def _own_lobes(bench: Bench, part: str, spp: int) -> Float64Array:
         if part == "ratio":
             mis = run.mis
             runs = [
-                renderer.proxy(light, mis.proxy_pixels, mis.may_see_object, chunk, 1, seed)
+                renderer.receiver(light, mis.receiver_pixels, mis.may_see_object, chunk, 1, seed)
                 for seed in seeds
             ]
             lit = np.mean([r.lit.astype(np.float64) for r in runs], axis=0)

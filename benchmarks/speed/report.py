@@ -210,7 +210,7 @@ def device_text(result: dict[str, Any]) -> str:
     threads = f", {c['threads']} threads" if c["threads"] else ""
     pixels = "; ".join(
         f"{s['name']}: {s['triangles']} triangles, D = {s['depth']}, {s['object_pixels']} object "
-        f"pixels, {s['proxy_pixels']} of the plane"
+        f"pixels, {s['receiver_pixels']} of the plane"
         for s in result["scenes"]
     )
     parts = [

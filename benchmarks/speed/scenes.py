@@ -50,12 +50,13 @@ class SpeedScene:
     renderer: Renderer
     object_pixels: IntArray
     """Row-major, shape [object_pixel]."""
-    proxy_pixels: IntArray
-    """Row-major pixels whose plane the object may shade and at most half hides, [proxy_pixel]."""
+    receiver_pixels: IntArray
+    """Row-major pixels whose plane the object may shade and at most half hides, shape
+    [receiver_pixel]."""
     weight_fg: FloatArray
     """Loss gradient of the foreground, shape [object_pixel, 3]."""
     weight_ratio: FloatArray
-    """Loss gradient of the shadow ratio, shape [proxy_pixel, 3]."""
+    """Loss gradient of the shadow ratio, shape [receiver_pixel, 3]."""
 
     def texels(self, height: int) -> FloatArray:
         """Return the light as a map, relative [W/(m^2 sr)], shape [height, 2 height, 3]."""
@@ -158,7 +159,7 @@ def make_scene(
         light, object_pixels, COVERAGE_SAMPLES, 1, 1, seed=2
     ).mask
     shaded = renderer.shaded_pixels(light, seed=3)
-    proxy_pixels = shaded[hidden[shaded] <= 0.5]
+    receiver_pixels = shaded[hidden[shaded] <= 0.5]
     weight = loss_weights(width, height)
     return SpeedScene(
         name,
@@ -170,9 +171,9 @@ def make_scene(
         sum(len(p.indices) for p in asset.primitives),
         renderer,
         object_pixels,
-        proxy_pixels,
+        receiver_pixels,
         weight[0].reshape(-1, 3)[object_pixels],
-        weight[1].reshape(-1, 3)[proxy_pixels],
+        weight[1].reshape(-1, 3)[receiver_pixels],
     )
 
 

@@ -27,7 +27,7 @@ from tests.builders.shapes import all_pixels, box, camera, constant, ground, pla
 from warpir.kernels.trace import closest_hit, face_normal, hit_position, offset_origin, visibility
 from warpir.kernels.types import MaterialArgs, MeshArgs, TextureArgs
 from warpir.render.device_light import light_args
-from warpir.render.device_scene import Proxy, Scene
+from warpir.render.device_scene import Receiver, Scene
 from warpir.render.renderer import Renderer
 from warpir.scene.asset import Material, Primitive
 from warpir.scene.camera import Camera
@@ -334,11 +334,11 @@ def foot(view: Camera, side: int) -> Float64Array:
 
 def ratio_of(part: Primitive, view: Camera, height: float, device: str, light: Light) -> Any:
     """Shadow ratio of the plane in every pixel, whatever stands before it."""
-    plane = Proxy(np.array([0.0, 1.0, 0.0]), height)
+    plane = Receiver(np.array([0.0, 1.0, 0.0]), height)
     renderer = Renderer(Scene([placed(part)], view, plane, device))
     pixels = all_pixels(view)
     args = light_args(light, renderer.device)
-    radiance = renderer.proxy(args, pixels, np.zeros(len(pixels), np.int32), SHADOW_SPP, 1, 0)
+    radiance = renderer.receiver(args, pixels, np.zeros(len(pixels), np.int32), SHADOW_SPP, 1, 0)
     return renderer.ratio(radiance)[:, 0].astype(np.float64), radiance
 
 

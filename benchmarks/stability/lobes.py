@@ -169,7 +169,7 @@ def plane(device: str, sharpness: float) -> Measured:
     pixels = all_pixels(view)
     axis = o.normalize([0.5, 0.6, 0.2]).astype(np.float32)
     args = light_args(lobe(axis, sharpness), renderer.device)
-    white = renderer.proxy(args, pixels, np.zeros(len(pixels), np.int32), 256, 1, 5)
+    white = renderer.receiver(args, pixels, np.zeros(len(pixels), np.int32), 256, 1, 5)
     truth = o.sg_irradiance([0.0, 1.0, 0.0], axis, float(np.float32(sharpness))) / np.pi
     found = white.unoccluded.astype(np.float64).mean(axis=0)
     return Measured(max_relative(found, np.full(3, truth)), finite(found))

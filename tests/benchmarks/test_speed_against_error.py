@@ -80,7 +80,7 @@ def result(rows: list[dict[str, Any]]) -> dict[str, Any]:
             "seconds": 1.0,
         },
         "scenes": [
-            {"name": "ball", "triangles": 1, "depth": 3, "object_pixels": 2, "proxy_pixels": 3}
+            {"name": "ball", "triangles": 1, "depth": 3, "object_pixels": 2, "receiver_pixels": 3}
         ],
         "skipped": ["toycar: mesh/ToyCar.glb is not in the folder of assets (--assets)"],
         "ratios": r.ratios(rows),

@@ -7,7 +7,7 @@ import trimesh
 from numpy.typing import ArrayLike
 
 from warpir.core.arrays import IntArray
-from warpir.render.device_scene import Placed, Proxy
+from warpir.render.device_scene import Placed, Receiver
 from warpir.scene.asset import Asset, Material, Primitive, Texture
 from warpir.scene.camera import Camera
 from warpir.scene.light import Light, Lobes
@@ -70,9 +70,9 @@ def placed(
     return Placed(whole, np.eye(4) if matrix is None else np.asarray(matrix, np.float64))
 
 
-def ground(height: float = DEEP) -> Proxy:
+def ground(height: float = DEEP) -> Receiver:
     """A level ground plane."""
-    return Proxy(np.array([0.0, 1.0, 0.0]), height)
+    return Receiver(np.array([0.0, 1.0, 0.0]), height)
 
 
 def camera(

@@ -324,7 +324,7 @@ def render_all(renderer: Renderer) -> list[np.ndarray[Any, Any]]:
     gbuffer = renderer.gbuffer(1)
     seen = renderer.foreground(light, gbuffer.object_pixels, 8, 1, 3, 1)
     shaded = renderer.shaded_pixels(light, 1)
-    plane = renderer.proxy(light, shaded, np.zeros(len(shaded), np.int32), 8, 1, 1)
+    plane = renderer.receiver(light, shaded, np.zeros(len(shaded), np.int32), 8, 1, 1)
     groups = (gbuffer, seen, plane)
     return [shaded, *(array for group in groups for array in vars(group).values())]
 

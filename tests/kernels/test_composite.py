@@ -39,11 +39,11 @@ class Scene:
 
     def __init__(self, rng: np.random.Generator, raw_scale: float = 0.7) -> None:
         self.photo = rng.uniform(0.05, 0.8, (96, 3)).astype(np.float32)
-        object_pixels, proxy_pixels = np.arange(0, 40), np.arange(24, 80)
+        object_pixels, receiver_pixels = np.arange(0, 40), np.arange(24, 80)
         self.object_index = np.full(96, -1)
         self.object_index[object_pixels] = rng.permutation(40)
-        self.proxy_index = np.full(96, -1)
-        self.proxy_index[proxy_pixels] = rng.permutation(56)
+        self.receiver_index = np.full(96, -1)
+        self.receiver_index[receiver_pixels] = rng.permutation(56)
         self.mask = rng.uniform(0.05, 1.0, 40).astype(np.float32)
         self.mask[::3] = 1.0
         self.foreground = (rng.gamma(1.0, 1.0, (40, 3)) * self.mask[:, None]).astype(np.float32)
@@ -67,11 +67,11 @@ class Scene:
             [o.spline(ratio[:, c], *(k[c] for k in knots_shadow))[0] for c in range(3)], -1
         )
         tone = o.spline(o.reinhard(foreground / self.mask[:, None]), *(k[0] for k in knots_fg))[0]
-        on_object, on_proxy = self.object_index >= 0, self.proxy_index >= 0
+        on_object, on_proxy = self.object_index >= 0, self.receiver_index >= 0
         mask, ratio_image, tone_image = np.zeros(96), np.ones((96, 3)), np.zeros((96, 3))
         mask[on_object] = self.mask[self.object_index[on_object]]
         tone_image[on_object] = tone[self.object_index[on_object]]
-        ratio_image[on_proxy] = ratio[self.proxy_index[on_proxy]]
+        ratio_image[on_proxy] = ratio[self.receiver_index[on_proxy]]
         return o.encode(o.composite(self.photo, mask, tone_image, ratio_image))
 
     def free(self) -> list[np.ndarray]:
@@ -101,7 +101,7 @@ class Scene:
                 outputs=[display],
                 device=device,
             )
-            index = [ints(self.object_index, device), ints(self.proxy_index, device)]
+            index = [ints(self.object_index, device), ints(self.receiver_index, device)]
             wp.launch(
                 compose,
                 96,
@@ -178,7 +178,7 @@ def test_untouched_photo_depends_on_nothing_but_the_photo(
     """Neither object nor plane: the photo's encoding alone (method 2.5)."""
     scene = Scene(rng)
     image = scene.launch(device)[1].numpy()
-    free = (scene.object_index < 0) & (scene.proxy_index < 0)
+    free = (scene.object_index < 0) & (scene.receiver_index < 0)
     np.testing.assert_allclose(image[free], o.encode(scene.photo[free]), atol=5e-7)
 
 
@@ -187,7 +187,7 @@ def test_ratio_of_one_leaves_the_photo_alone(device: str, rng: np.random.Generat
     scene = Scene(rng, raw_scale=2.0)
     scene.lit = scene.unoccluded.copy()
     with_plane = scene.launch(device)[1].numpy()
-    scene.proxy_index[:] = -1
+    scene.receiver_index[:] = -1
     assert np.array_equal(with_plane, scene.launch(device)[1].numpy())
 
 

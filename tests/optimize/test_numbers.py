@@ -83,7 +83,7 @@ def test_bad_pixels_are_black_counted_and_named(
         if stage == "object":
             found = renderer.foreground(args, chosen, spp, 1, 2, 1)
             return [found.radiance, found.diffuse, found.emission]
-        plane = renderer.proxy(args, chosen, np.zeros(len(chosen), np.int32), spp, 1, 1)
+        plane = renderer.receiver(args, chosen, np.zeros(len(chosen), np.int32), spp, 1, 1)
         return [plane.lit, plane.unoccluded]
 
     clean = planes(light_args(sky(), renderer.device), spp)

@@ -24,11 +24,11 @@ from tests.statistics import compare_gradients
 from warpir.render import renderer as render
 from warpir.render.bridge import ComposeConstants, compose, host_light
 from warpir.render.device_light import light_args
-from warpir.render.device_scene import Placed, Proxy, Scene
+from warpir.render.device_scene import Placed, Receiver, Scene
 from warpir.render.integrator import MaterialTensors, Radiance
 from warpir.render.mis import MisIntegrator
 from warpir.render.renderer import Renderer
-from warpir.render.samples import ObjectSamples, PlaneSamples
+from warpir.render.samples import ObjectSamples, ReceiverSamples
 from warpir.render.tone_curve import ToneCurve
 from warpir.scene.asset import Asset, Material, Primitive
 from warpir.scene.camera import Camera
@@ -110,12 +110,12 @@ class Pipeline:
         return self.loss(raw, self.mis.radiance(light, light, SEED, self.materials(raw)))
 
     @cached_property
-    def samples(self) -> tuple[ObjectSamples, PlaneSamples]:
+    def samples(self) -> tuple[ObjectSamples, ReceiverSamples]:
         """What is drawn at `raw`."""
         args = light_args(host_light(self.raw["texels"]), self.mis.renderer.device)
         factors = plain_factors(self.materials(self.raw))
         of_object = ObjectSamples(self.mis, args, SEED, factors, (True,) * 5)
-        return of_object, PlaneSamples(self.mis, args, SEED, (True,))
+        return of_object, ReceiverSamples(self.mis, args, SEED, (True,))
 
     @cached_property
     def drawn(self) -> tuple[Any, Any]:
@@ -171,7 +171,7 @@ def make_pipeline(device: str, depth: int, *materials: Material) -> Pipeline:
     camera = Camera(WIDTH, HEIGHT, focal, focal, WIDTH / 2, HEIGHT / 2, pose)
     stand = np.eye(4)
     stand[:3, 3] = [0.0, 0.5, -4.0]
-    proxy = Proxy(np.array([0.0, 1.0, 0.0]), 0.0)
+    proxy = Receiver(np.array([0.0, 1.0, 0.0]), 0.0)
     renderer = Renderer(Scene([Placed(two_objects(*materials), stand)], camera, proxy, device))
     generator = torch.Generator().manual_seed(0)
 

@@ -22,11 +22,11 @@ from warpir.render import renderer as render
 from warpir.render import samples as samples_module
 from warpir.render.bridge import host_light
 from warpir.render.device_light import light_args
-from warpir.render.device_scene import Placed, Proxy, Scene
+from warpir.render.device_scene import Placed, Receiver, Scene
 from warpir.render.integrator import MaterialTensors, Radiance
 from warpir.render.mis import MisIntegrator
 from warpir.render.renderer import Renderer
-from warpir.render.samples import ObjectSamples, PlaneSamples
+from warpir.render.samples import ObjectSamples, ReceiverSamples
 from warpir.scene.camera import Camera
 
 WIDTH, HEIGHT = 48, 32
@@ -56,7 +56,7 @@ def integrator(device: str, threads: int = 0, spp: int = 4, depth: int = 3) -> M
     stand = np.eye(4)
     stand[:3, 3] = [0.0, 0.5, -4.0]
     scene = Scene(
-        [Placed(two_objects(), stand)], camera, Proxy(np.array([0.0, 1.0, 0.0]), 0.0), device
+        [Placed(two_objects(), stand)], camera, Receiver(np.array([0.0, 1.0, 0.0]), 0.0), device
     )
     pixels = np.arange(WIDTH * HEIGHT, dtype=np.int32)
     return MisIntegrator(Renderer(scene, threads), pixels, pixels, spp, 2, depth)
@@ -130,7 +130,7 @@ def test_light_gradient_is_that_of_the_recorded_sum(device: str, depth: int) -> 
     args = light_args(host_light(some_light()), mis.renderer.device)
     none = [None] * 4
     of_object = ObjectSamples(mis, args, SEED, none, (True,) + (False,) * 4)
-    of_plane = PlaneSamples(mis, args, SEED, (True,))
+    of_plane = ReceiverSamples(mis, args, SEED, (True,))
     radiance, record, _ = of_object.draw(slice(None))
     plane, plane_record = of_plane.draw(slice(None))
     assert record is not None and plane_record is not None

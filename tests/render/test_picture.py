@@ -102,7 +102,7 @@ def test_picture_equals_the_differentiable_composite(
     shaded = r.shaded_pixels(args, QUALITY.seed)
     out = r.foreground(args, objects, QUALITY.samples, QUALITY.rays, QUALITY.depth, QUALITY.seed)
     sees = np.isin(shaded, objects).astype(np.int32)
-    plane = r.proxy(args, shaded, sees, QUALITY.samples, QUALITY.rays, QUALITY.seed)
+    plane = r.receiver(args, shaded, sees, QUALITY.samples, QUALITY.rays, QUALITY.seed)
     constants = ComposeConstants(photo().linear(), objects, shaded, out.mask, device, is_reinhard)
     image = compose(
         constants,
@@ -112,7 +112,7 @@ def test_picture_equals_the_differentiable_composite(
     found = image[0].permute(1, 2, 0).numpy()
     assert found.shape == final.image.shape
     assert np.abs(found - np.clip(final.image, 0.0, 1.0)).max() < COMPOSITE
-    assert final.object_pixel_count == len(objects) and final.proxy_pixel_count == len(shaded)
+    assert final.object_pixel_count == len(objects) and final.receiver_pixel_count == len(shaded)
 
 
 def test_picture_is_recomputed_from_its_layers(device: str) -> None:

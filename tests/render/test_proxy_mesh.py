@@ -36,7 +36,7 @@ from warpir.render.device_scene import Placed, Scene
 from warpir.render.integrator import MaterialTensors
 from warpir.render.mis import MisIntegrator
 from warpir.render.renderer import Renderer
-from warpir.render.samples import PlaneSamples
+from warpir.render.samples import ReceiverSamples
 from warpir.render.transport.integrator import TransportIntegrator
 from warpir.render.transport.rows import TransportSettings
 from warpir.scene.asset import Material, Primitive
@@ -44,7 +44,7 @@ from warpir.scene.camera import Camera
 from warpir.scene.lamps import lamp_axes, without_lamps
 from warpir.scene.light import Light, Lobes, as_map, axis_from_angles, plain_sky, sun_lobe
 from warpir.scene.placement import place_asset
-from warpir.scene.receiver import ProxyMesh, first_hit, is_in_view
+from warpir.scene.receiver import ReceiverMesh, first_hit, is_in_view
 from warpir.scene.tone_curves import Curves, ToneKnots
 
 LINEAR = Curves.identity("linear")
@@ -64,11 +64,11 @@ SETTINGS = TransportSettings(
 )
 
 
-def mesh(*parts: Primitive) -> ProxyMesh:
+def mesh(*parts: Primitive) -> ReceiverMesh:
     """Several primitives as one mesh of the place."""
     offsets = np.cumsum([0, *(len(p.positions) for p in parts)])
     indices = [p.indices + o for p, o in zip(parts, offsets[:-1], strict=True)]
-    return ProxyMesh(
+    return ReceiverMesh(
         np.concatenate([p.positions for p in parts]), np.concatenate(indices).astype(np.int32)
     )
 
@@ -77,7 +77,7 @@ def make(
     objects: Placed | list[Placed],
     view: Camera,
     device: str,
-    place: ProxyMesh,
+    place: ReceiverMesh,
     height: float | None = 0.0,
     photo: float | FloatArray | None = None,
 ) -> Renderer:
@@ -215,7 +215,7 @@ def test_place_sends_what_the_photo_shows(device: str) -> None:
     front = placed(quad((0.0, 1.0, -4.0), (0.5, 0, 0), (0, 0.5, 0)), mirror)
     renderer = make([floor, front], view, device, mesh(wall, unseen), None, photo)
     mean = 0.5 * (photo[0, 0] + photo[0, -1])
-    np.testing.assert_allclose(list(renderer.scene.proxy_args.elsewhere), mean, atol=1e-6)
+    np.testing.assert_allclose(list(renderer.scene.receiver_args.elsewhere), mean, atol=1e-6)
     out = render(renderer, constant((7.0,) * 3), 16)
     shown, whole = out.radiance.reshape(32, 32, 3), out.mask.reshape(32, 32) == 1.0
     for rows, columns, color in (
@@ -336,8 +336,10 @@ def test_transport_in_a_place_stays_exact_at_both_ends(device: str) -> None:
     free &= (made.bounced_blocked == 0.0).all(dim=1).cpu()
     assert bool(free.any()) and bool((ratio[free] == 1.0).all())
     assert float(ratio.max()) <= 1.0 and float(ratio.min()) < 0.6
-    assert made.T_place is not None
-    kept = made.T_shadow.by_row.to_dense().cpu() / made.T_place.T[0].float().cpu().clamp(min=1e-30)
+    assert made.T_receiver is not None
+    kept = made.T_shadow.by_row.to_dense().cpu() / made.T_receiver.T[0].float().cpu().clamp(
+        min=1e-30
+    )
     assert float(kept.max()) <= 1.0 + 1e-6
 
 
@@ -369,12 +371,12 @@ def test_mis_gradients_match_central_differences(device: str) -> None:
     mis = MisIntegrator(renderer, objects, proxies, spp=16, rays=2, depth=2)
     texels = torch.tensor(as_map(Light(some_lobes()), HEIGHT), requires_grad=True)
     args = light_args(host_light(texels), renderer.device)
-    samples = PlaneSamples(mis, args, 5, (True,))
+    samples = ReceiverSamples(mis, args, 5, (True,))
     drawn = samples.render()
     assert samples.kept is not None
     lit, unoccluded = plane_sums(samples.kept, texels)
     black = MisIntegrator(corner(device, is_black=True), objects, proxies, 16, 2, 2)
-    dark = PlaneSamples(black, args, 5, (False,)).render()
+    dark = ReceiverSamples(black, args, 5, (False,)).render()
     np.testing.assert_allclose(lit.detach(), dark.lit, rtol=1e-4, atol=1e-6)
     np.testing.assert_allclose(unoccluded.detach(), dark.unoccluded, rtol=1e-4, atol=1e-6)
     assert (drawn.unoccluded - dark.unoccluded).max() > 0.05

@@ -85,7 +85,7 @@ def shadow(
     pixels = all_pixels(renderer.scene.camera)
     args = light_args(light, renderer.device)
     flags = np.full(len(pixels), sees, np.int32)
-    radiance = renderer.proxy(args, pixels, flags, spp, rays, seed)
+    radiance = renderer.receiver(args, pixels, flags, spp, rays, seed)
     return renderer.ratio(radiance), radiance.lit, radiance.unoccluded
 
 
@@ -1051,7 +1051,7 @@ def peak():
 peaks = []
 for spp in (64, 64, 1024):
     renderer.foreground(args, pixels, spp, 2, 3, 0)
-    renderer.proxy(args, pixels, np.ones(len(pixels), np.int32), spp, 2, 0)
+    renderer.receiver(args, pixels, np.ones(len(pixels), np.int32), spp, 2, 0)
     peaks.append(peak())
 print(peaks[2] - peaks[1])
 """

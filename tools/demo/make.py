@@ -87,7 +87,7 @@ def render(with_car: bool, samples: int, device: str | None, seed: int = 0) -> N
     from warpir.io.images.photos import read_envmap
     from warpir.render.device import choose_device
     from warpir.render.device_light import light_args
-    from warpir.render.device_scene import Placed, Proxy, Scene
+    from warpir.render.device_scene import Placed, Receiver, Scene
     from warpir.render.renderer import Renderer
     from warpir.scene.light import Light
 
@@ -96,7 +96,7 @@ def render(with_car: bool, samples: int, device: str | None, seed: int = 0) -> N
     if with_car:
         objects.append(Placed(car(), placement().matrix()))
     # The ground is part of the place; the analytic plane is put out of the way.
-    buried = Proxy(np.array([0.0, 1.0, 0.0]), -1000.0)
+    buried = Receiver(np.array([0.0, 1.0, 0.0]), -1000.0)
     scene = Scene(objects, view, buried, choose_device(device))
     renderer = Renderer(scene)
     light = light_args(Light(texels=read_envmap(LIGHT)), renderer.device)

@@ -31,7 +31,7 @@ from warpir.scene.camera import Camera, camera_from_exif, camera_from_fov
 from warpir.scene.free_space import find_place, points_in_way
 from warpir.scene.light import Light
 from warpir.scene.placement import Placement, place_asset, up_to_y, upright_plane
-from warpir.scene.receiver import ProxyMesh, first_hit, is_in_view, mesh_of
+from warpir.scene.receiver import ReceiverMesh, first_hit, is_in_view, mesh_of
 from warpir.scene.shadow_mask import ShadowMask, shadow_mask
 
 DEFAULT_FOV = 60.0
@@ -59,7 +59,7 @@ class Inputs:
     """What --light holds, turned by --light-rotate; absent: --sun and --sky describe it."""
     run: EarlierRun | None = None
     """What --reuse holds, as the run left it; in place of any other light."""
-    proxy: ProxyMesh | None = None
+    proxy: ReceiverMesh | None = None
     """What --proxy holds."""
     is_plane: bool = True
     """Whether the ground plane receives shadows too."""
@@ -322,7 +322,7 @@ def read_asset(path: str, config: InsertConfig, loaders: Loaders, assumed: list[
 
 
 def _place(
-    config: InsertConfig, asset: Asset, world: PhotoWorld, mesh: ProxyMesh | None
+    config: InsertConfig, asset: Asset, world: PhotoWorld, mesh: ReceiverMesh | None
 ) -> Placement:
     """Set the asset on the ground: where it was asked for, or where the points leave space."""
     low, high = asset.bounds()
@@ -368,7 +368,7 @@ def _read_proxy(path: str, limits: Limits) -> Asset:
 
 
 def _about_mesh(
-    mesh: ProxyMesh, asset: Asset, placement: Placement, camera: Camera
+    mesh: ReceiverMesh, asset: Asset, placement: Placement, camera: Camera
 ) -> Iterator[str]:
     """Yield what looks odd of the place's mesh."""
     if not is_in_view(mesh, camera):

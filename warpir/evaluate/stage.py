@@ -18,7 +18,7 @@ from warpir.core.errors import InputError
 from warpir.evaluate.scenes import RESPONSES, Subject
 from warpir.render.bridge import ComposeConstants, compose
 from warpir.render.device_light import light_args
-from warpir.render.device_scene import Placed, Proxy, Scene
+from warpir.render.device_scene import Placed, Receiver, Scene
 from warpir.render.renderer import Foreground, Renderer
 from warpir.render.tone_curve import ToneCurve
 from warpir.scene.light import Light
@@ -70,10 +70,10 @@ class Rendered:
     """A scene under one light, before any tone."""
 
     foreground: Foreground
-    proxy_pixels: IntArray
-    """Row-major, shape [proxy_pixel]."""
+    receiver_pixels: IntArray
+    """Row-major, shape [receiver_pixel]."""
     ratio: FloatArray
-    """Shadow ratio, shape [proxy_pixel, 3]."""
+    """Shadow ratio, shape [receiver_pixel, 3]."""
 
 
 class Stage:
@@ -101,7 +101,7 @@ class Stage:
         self.place, self.quality, self.seed = subject.place, quality, seed
         placed = Placed(subject.asset, subject.placement.asset_to_world)
         ground = subject.placement.ground
-        scene = Scene([placed], self.place.camera, Proxy(ground[:3], -float(ground[3])), device)
+        scene = Scene([placed], self.place.camera, Receiver(ground[:3], -float(ground[3])), device)
         self.renderer = Renderer(scene, threads)
         self.objects: IntArray = self.renderer.gbuffer(seed).object_pixels
         if len(self.objects) == 0:
@@ -109,7 +109,7 @@ class Stage:
         self.true = self.render(self.true_prediction())
         self.truth = self.compose(self.true, None)
         self.mask = self._plane(self.objects, self.true.foreground.mask, 0.0)
-        self.ratio = self._plane(self.true.proxy_pixels, self.true.ratio, 1.0)
+        self.ratio = self._plane(self.true.receiver_pixels, self.true.ratio, 1.0)
 
     def true_prediction(self) -> Prediction:
         """Return the place's own light, shown by the camera's own response."""
@@ -130,7 +130,7 @@ class Stage:
         proxies = renderer.shaded_pixels(shadow, self.seed)
         is_object = np.zeros(self.place.photo.shape[0] * self.place.photo.shape[1], np.int32)
         is_object[self.objects] = 1
-        radiance = renderer.proxy(
+        radiance = renderer.receiver(
             shadow, proxies, is_object[proxies], quality.samples, quality.rays, seed
         )
         return Rendered(foreground, proxies, renderer.ratio(radiance))
@@ -169,7 +169,7 @@ class Stage:
     def _behind(self, rendered: Rendered, curves: Curves | None) -> FloatArray:
         """Return the photograph under the shadow, display-linear, shape [pixel, 3]."""
         behind = self.place.photo_lin.reshape(-1, 3).copy()
-        proxies = rendered.proxy_pixels
+        proxies = rendered.receiver_pixels
         if curves is None:
             # The shadow falls onto the scene, and the camera's response comes after it.
             response = RESPONSES[self.place.response]
@@ -219,7 +219,7 @@ class Stage:
         constants = ComposeConstants(
             self.place.photo_lin,
             self.objects,
-            self.true.proxy_pixels,
+            self.true.receiver_pixels,
             foreground.mask,
             str(self.renderer.device.alias),
             True,

@@ -45,7 +45,7 @@ class LitFrame:
         height, width = frame.photo_lin.shape[:2]
         is_object = (index_of(self.object_pixels, height * width) >= 0).astype(np.int32)
         proxies = renderer.shaded_pixels(args_shadow, seed)
-        plane = renderer.proxy(args_shadow, proxies, is_object[proxies], samples, 1, seed)
+        plane = renderer.receiver(args_shadow, proxies, is_object[proxies], samples, 1, seed)
         seen = renderer.foreground(self.args_fg, self.object_pixels, samples, 1, frame.depth, seed)
         self.foreground, self.lit, self.unoccluded = (
             torch.from_numpy(values).to(device)

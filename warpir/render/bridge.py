@@ -18,7 +18,7 @@ from warpir.kernels import composite as composite_kernels
 from warpir.kernels.shadow_ratio import shadow_ratio as ratio_kernel
 from warpir.kernels.types import LightArgs
 from warpir.render.renderer import index_of
-from warpir.render.samples import Gradients, ObjectSamples, PlaneSamples
+from warpir.render.samples import Gradients, ObjectSamples, ReceiverSamples
 from warpir.render.tone_curve import Knots
 from warpir.scene.light import Light
 
@@ -85,8 +85,8 @@ class ShadeForeground(torch.autograd.Function):
         return (None,) * 4 + _tensors(ctx.samples.gradient(_host(d_outputs[0])), ctx.like)
 
 
-class ShadeProxy(torch.autograd.Function):
-    """White plane with and without the object, shape [proxy_pixel, 3] each."""
+class ShadeReceiver(torch.autograd.Function):
+    """White plane with and without the object, shape [receiver_pixel, 3] each."""
 
     @staticmethod
     def forward(
@@ -99,7 +99,7 @@ class ShadeProxy(torch.autograd.Function):
     ) -> tuple[Tensor, Tensor]:
         """Trace; the map is in ``args``."""
         free = ctx.needs_input_grad[4:] if is_recording else (False,) * len(tensors)
-        ctx.like, ctx.samples = tensors, PlaneSamples(mis, args, seed, free)
+        ctx.like, ctx.samples = tensors, ReceiverSamples(mis, args, seed, free)
         out, where = ctx.samples.render(), _device_of(tensors)
         return torch.from_numpy(out.lit).to(where), torch.from_numpy(out.unoccluded).to(where)
 
@@ -135,17 +135,21 @@ class _Compose(torch.autograd.Function):
         knots = [
             _from_torch(t.repeat(copies, 1), wp.float32, device, grad=True) for t in tensors[3:]
         ]
-        objects, proxies = len(tensors[0]), len(tensors[1])
+        objects, receivers = len(tensors[0]), len(tensors[1])
         pixels = constants.height * constants.width
         new = [
             wp.zeros(max(n, 1), dtype=wp.vec3, device=device, requires_grad=True)
-            for n in (proxies, objects, proxies, pixels)
+            for n in (receivers, objects, receivers, pixels)
         ]
         ratio, fg_display, ratio_display, image = new
         ctx.tape = wp.Tape()
         with ctx.tape:
             wp.launch(
-                ratio_kernel, dim=proxies, inputs=[lit, unoccluded], outputs=[ratio], device=device
+                ratio_kernel,
+                dim=receivers,
+                inputs=[lit, unoccluded],
+                outputs=[ratio],
+                device=device,
             )
             wp.launch(
                 composite_kernels.tone_foreground,
@@ -162,7 +166,7 @@ class _Compose(torch.autograd.Function):
             )
             wp.launch(
                 composite_kernels.tone_shadow,
-                dim=proxies,
+                dim=receivers,
                 inputs=[ratio, *knots[3:], constants.bins_shadow],
                 outputs=[ratio_display],
                 device=device,
@@ -173,7 +177,7 @@ class _Compose(torch.autograd.Function):
                 inputs=[
                     constants.photo_lin,
                     constants.object_index,
-                    constants.proxy_index,
+                    constants.receiver_index,
                     constants.mask,
                     fg_display,
                     ratio_display,
@@ -204,7 +208,7 @@ class ComposeConstants:
     Args:
         photo_lin: Linear photo, shape [H, W, 3].
         object_pixels: Row-major, shape [object_pixel].
-        proxy_pixels: Row-major, shape [proxy_pixel].
+        receiver_pixels: Row-major, shape [receiver_pixel].
         mask: Coverage of the object pixels [1], shape [object_pixel].
         device: Warp device.
         is_reinhard: Whether Reinhard's operator precedes the foreground curve.
@@ -214,7 +218,7 @@ class ComposeConstants:
         self,
         photo_lin: np.ndarray[Any, np.dtype[np.float32]],
         object_pixels: IntArray,
-        proxy_pixels: IntArray,
+        receiver_pixels: IntArray,
         mask: np.ndarray[Any, np.dtype[np.float32]],
         device: str,
         is_reinhard: bool = True,
@@ -227,8 +231,8 @@ class ComposeConstants:
         self.object_index = wp.array(
             index_of(object_pixels, count), dtype=wp.int32, device=self.device
         )
-        self.proxy_index = wp.array(
-            index_of(proxy_pixels, count), dtype=wp.int32, device=self.device
+        self.receiver_index = wp.array(
+            index_of(receiver_pixels, count), dtype=wp.int32, device=self.device
         )
         self.mask = wp.array(
             mask if len(mask) else np.zeros(1, np.float32), dtype=wp.float32, device=self.device
@@ -250,8 +254,8 @@ def compose(
     Args:
         constants: Photo, pixel lists and coverage.
         foreground: Object radiance, premultiplied, shape [object_pixel, 3].
-        lit: White plane with the object, shape [proxy_pixel, 3].
-        unoccluded: White plane without it, shape [proxy_pixel, 3].
+        lit: White plane with the object, shape [receiver_pixel, 3].
+        unoccluded: White plane without it, shape [receiver_pixel, 3].
         curve_fg: One curve.
         curve_shadow: Three curves.
 

@@ -13,7 +13,7 @@ from warpir.io.images.photos import Photo
 from warpir.io.layers import Layers
 from warpir.kernels.types import LightArgs
 from warpir.render.device_light import light_args
-from warpir.render.device_scene import Placed, Proxy, Scene
+from warpir.render.device_scene import Placed, Receiver, Scene
 from warpir.render.renderer import Foreground, GBuffer, Renderer
 from warpir.scene.camera import Camera
 from warpir.scene.lamps import without_lamps
@@ -21,7 +21,7 @@ from warpir.scene.light import Light, as_map, map_directions, texel_solid_angles
 from warpir.scene.shadow_mask import ShadowMask
 from warpir.scene.tone_curves import Curves, ToneKnots
 
-PLACE_WIDTH = 1024
+RECEIVER_WIDTH = 1024
 """Most columns of the photo that sends light back into the scene [px]."""
 GREY_BALL = 0.18
 """Reflectance of the matte ball in ``balls.png``."""
@@ -55,7 +55,7 @@ class Picture:
     """Pixels that differ from the photo, shape [H, W]."""
     object_pixel_count: int
     """Pixels whose object was traced, at the rendering resolution."""
-    proxy_pixel_count: int
+    receiver_pixel_count: int
     """Pixels whose shadow was traced, at the rendering resolution."""
 
 
@@ -99,14 +99,14 @@ def make_picture(
         quality.seed,
         quality.indirect_limit,
     )
-    proxy_pixels, ratio = _shadow(
+    receiver_pixels, ratio = _shadow(
         renderer, args_shadow, light_shadow, gbuffer.object_pixels, quality, shadow_mask
     )
     fg_display, ratio_display = renderer.tone(
         foreground, ratio, curve_fg, curve_shadow, is_reinhard
     )
     planes = _planes(
-        renderer.scene.camera, gbuffer, foreground, fg_display, (proxy_pixels, ratio_display)
+        renderer.scene.camera, gbuffer, foreground, fg_display, (receiver_pixels, ratio_display)
     )
     if planes["matte"].shape != photo.srgb.shape[:2]:
         planes = _resize_planes(planes, *photo.srgb.shape[:2])
@@ -119,7 +119,7 @@ def make_picture(
         linear_to_gamma(layers.composite).astype(np.float32),
         changed,
         len(gbuffer.object_pixels),
-        len(proxy_pixels),
+        len(receiver_pixels),
     )
 
 
@@ -142,7 +142,7 @@ def _shadow(
     def shaded(args: LightArgs, wanted: BoolArray) -> tuple[IntArray, FloatArray]:
         pixels = renderer.shaded_pixels(args, quality.seed)
         pixels = pixels[wanted[pixels]]
-        radiance = renderer.proxy(
+        radiance = renderer.receiver(
             args, pixels, is_object[pixels], quality.samples, quality.rays, quality.seed
         )
         return pixels, renderer.ratio(radiance)
@@ -244,19 +244,19 @@ def _mixed(
 
 
 def scene_of(inputs: Inputs, camera: Camera, device: str, curves: Curves) -> Scene:
-    """Put the object onto its plane or into the mesh of its place.
+    """Put the object onto its plane or onto the mesh that --proxy gave.
 
     Args:
-        inputs: Photo, asset, place and placement.
+        inputs: Photo, asset, receiver and placement.
         camera: At the resolution that is to be rendered.
         device: Warp device.
-        curves: Of the picture; what the photo shows of the place is taken to have passed them.
+        curves: Of the picture; what the photo shows of the receiver is taken to have passed them.
     """
     ground = inputs.placement.ground
     placed = Placed(inputs.asset, inputs.placement.asset_to_world)
     radiance = None if inputs.proxy is None else photo_radiance(inputs.photo, curves)
-    proxy = Proxy(ground[:3], -float(ground[3]), inputs.proxy, radiance, inputs.is_plane)
-    return Scene([placed], camera, proxy, device)
+    receiver = Receiver(ground[:3], -float(ground[3]), inputs.proxy, radiance, inputs.is_plane)
+    return Scene([placed], camera, receiver, device)
 
 
 def photo_radiance(photo: Photo, curves: Curves) -> FloatArray:
@@ -267,12 +267,12 @@ def photo_radiance(photo: Photo, curves: Curves) -> FloatArray:
         curves: Of the picture.
 
     Returns:
-        Relative [W/(m^2 sr)], shape [height, width, 3], at most `PLACE_WIDTH` wide.
+        Relative [W/(m^2 sr)], shape [height, width, 3], at most `RECEIVER_WIDTH` wide.
     """
     linear = photo.linear()
     height, width = linear.shape[:2]
-    if width > PLACE_WIDTH:
-        linear = resize(linear, max(1, round(height * PLACE_WIDTH / width)), PLACE_WIDTH)
+    if width > RECEIVER_WIDTH:
+        linear = resize(linear, max(1, round(height * RECEIVER_WIDTH / width)), RECEIVER_WIDTH)
     return curves.radiance(linear).astype(np.float32)
 
 

@@ -25,7 +25,7 @@ from warpir.core.errors import ExitCode, InputError
 from warpir.io.images.decoder import captured_stderr
 from warpir.kernels.composite import tone_foreground
 from warpir.kernels.path import foreground_kernel
-from warpir.kernels.proxy import trace_proxy
+from warpir.kernels.receiver import trace_receiver
 from warpir.kernels.shadow_ratio import shadow_ratio
 from warpir.kernels.trace import trace_gbuffer
 
@@ -110,7 +110,7 @@ def load_kernels(device: str, variants: Iterable[tuple[bool, bool]]) -> None:
     """
     on = wp.get_device(device)
     settle_hashes(on.is_cpu)
-    kernels = [trace_gbuffer, trace_proxy, shadow_ratio, tone_foreground]
+    kernels = [trace_gbuffer, trace_receiver, shadow_ratio, tone_foreground]
     for kernel in (*kernels, *(foreground_kernel(*flags) for flags in variants)):
         # As a launch does: on the CPU there are no blocks.
         kernel.module.load(on, 1 if on.is_cpu else kernel.module.options["block_dim"])
@@ -126,7 +126,7 @@ def settle_hashes(is_cpu: bool) -> None:
     this a second run finds the first run's module under another hash and compiles it again (26 s
     on an H200).
     """
-    kernels = [trace_gbuffer, trace_proxy, shadow_ratio, tone_foreground]
+    kernels = [trace_gbuffer, trace_receiver, shadow_ratio, tone_foreground]
     kernels += [foreground_kernel(*flags) for flags in product((False, True), repeat=2)]
     for kernel in kernels:
         kernel.module.get_module_hash(1 if is_cpu else None)

@@ -1,4 +1,4 @@
-"""The scene on one device: triangles, materials, textures, place and camera as Warp sees them.
+"""The scene on one device: triangles, materials, textures, receiver, camera.
 
 Everything is checked here once. Coordinates are recentred on the object, in float64, before they
 become float32, so an object 100 km from the origin keeps its precision.
@@ -16,18 +16,18 @@ from numpy.typing import NDArray
 
 from warpir.core.arrays import Float64Array, FloatArray, IntArray
 from warpir.core.color import srgb_to_linear
-from warpir.kernels.proxy_mesh import trace_seen
+from warpir.kernels.receiver_mesh import trace_seen
 from warpir.kernels.types import (
     CameraArgs,
     Extensions,
     MaterialArgs,
     MeshArgs,
-    ProxyArgs,
+    ReceiverArgs,
     TextureArgs,
 )
 from warpir.scene.asset import Asset, Material, Primitive, Texture, TextureSlot
 from warpir.scene.camera import Camera
-from warpir.scene.receiver import ProxyMesh
+from warpir.scene.receiver import ReceiverMesh
 from warpir.scene.sheen import sheen_albedo_table
 
 ALPHA_MODES = {"OPAQUE": 0, "MASK": 1, "BLEND": 2}
@@ -47,19 +47,19 @@ FACTORS = (
     ("emission", wp.vec3),
 )
 """Material factors that may be replaced, and differentiated."""
-PROXY_EPSILON = 2e-6
-"""Ray offset over the diagonal of the place's mesh [1]; rays from it meet it again below 1e-7."""
+RECEIVER_EPSILON = 2e-6
+"""Ray offset over the diagonal of the receiver's mesh [1]; rays meet it again below 1e-7."""
 
 
 @dataclass(frozen=True)
-class Proxy:
-    """What is known of the photo's place: the plane ``dot(normal, x) = offset``, and a mesh."""
+class Receiver:
+    """What the object's shadow falls on: the plane ``dot(normal, x) = offset``, a mesh, or both."""
 
     normal: Float64Array
     """Unit, world frame, toward the lit side, shape [3]."""
     offset: float
     """[m]."""
-    mesh: ProxyMesh | None = None
+    mesh: ReceiverMesh | None = None
     """Receives shadows and blocks light."""
     radiance: FloatArray | None = None
     """What the photo shows, before its tone operator, in the view of the scene's camera at any
@@ -165,7 +165,7 @@ class Scene:
     Args:
         objects: What is rendered; may be empty (no triangles, no shadow).
         camera: The view.
-        proxy: The ground plane, the place's mesh, or both.
+        receiver: The ground plane, the receiver's mesh, or both.
         device: ``cpu`` or ``cuda``.
 
     Attributes:
@@ -175,11 +175,11 @@ class Scene:
     """
 
     def __init__(
-        self, objects: Sequence[Placed], camera: Camera, proxy: Proxy, device: str
+        self, objects: Sequence[Placed], camera: Camera, receiver: Receiver, device: str
     ) -> None:
         self.device = wp.get_device(device)
         self.camera = camera
-        self.proxy = proxy
+        self.receiver = receiver
         parts: list[tuple[_Vertices, int]] = []
         materials: list[tuple[Material, int]] = []
         textures: list[Texture] = []
@@ -205,15 +205,15 @@ class Scene:
         self._upload_materials(materials)
         self._upload_textures(textures)
         self.camera_args = self.camera_args_at(camera)
-        self.proxy_args = self._proxy_args()
+        self.receiver_args = self._receiver_args()
 
-    def _proxy_args(self) -> ProxyArgs:
-        proxy, camera = self.proxy, self.camera
-        args = ProxyArgs()
+    def _receiver_args(self) -> ReceiverArgs:
+        receiver, camera = self.receiver, self.camera
+        args = ReceiverArgs()
         # No ray comes down on a plane without a normal.
-        normal = proxy.normal if proxy.is_plane else np.zeros(3)
+        normal = receiver.normal if receiver.is_plane else np.zeros(3)
         args.normal = wp.vec3(*normal.astype(np.float32))
-        args.offset = float(proxy.offset - proxy.normal @ self.origin)
+        args.offset = float(receiver.offset - receiver.normal @ self.origin)
         # A sheet that lies on the plane is hit before or behind it by a few units in the last place
         # of the camera's coordinates.
         eye = np.abs(camera.c2w[:3, 3] - self.origin).max()
@@ -223,24 +223,24 @@ class Scene:
         args.positions = self._array(np.zeros((1, 3), np.float32), wp.vec3)
         args.indices = self._array(np.zeros(3, np.int32), wp.int32)
         args.radiance = self._array(np.zeros((1, 1, 3), np.float32), wp.vec3)
-        mesh = proxy.mesh
+        mesh = receiver.mesh
         if mesh is None:
             return args
         positions = mesh.positions - self.origin
         args.positions = self._array(positions.astype(np.float32), wp.vec3)
         args.indices = self._array(mesh.indices.reshape(-1), wp.int32)
-        self.proxy_mesh = wp.Mesh(
+        self.receiver_mesh = wp.Mesh(
             points=args.positions, indices=args.indices, bvh_constructor="sah"
         )
-        args.mesh = self.proxy_mesh.id
-        args.epsilon = PROXY_EPSILON * float(np.linalg.norm(np.ptp(positions, axis=0)))
+        args.mesh = self.receiver_mesh.id
+        args.epsilon = RECEIVER_EPSILON * float(np.linalg.norm(np.ptp(positions, axis=0)))
         args.eye = wp.vec3(*(camera.c2w[:3, 3] - self.origin).astype(np.float32))
-        if proxy.radiance is not None:
-            self._upload_radiance(args, proxy.radiance)
+        if receiver.radiance is not None:
+            self._upload_radiance(args, receiver.radiance)
         return args
 
-    def _upload_radiance(self, args: ProxyArgs, radiance: FloatArray) -> None:
-        """Let the place's mesh send what the photo shows, and elsewhere the mean of that."""
+    def _upload_radiance(self, args: ReceiverArgs, radiance: FloatArray) -> None:
+        """Let the receiver's mesh send what the photo shows, and elsewhere the mean of that."""
         height, width = radiance.shape[:2]
         view = self.camera.scaled(width, height)
         # Columns right, down and ahead; the camera looks along its own -Z.
@@ -271,13 +271,13 @@ class Scene:
         return args
 
     def geometry(self, materials: MaterialArgs | None = None) -> tuple[Any, ...]:
-        """Return triangles, materials, textures and place, in the order of the kernels' arguments.
+        """Return triangles, materials, textures, receiver, in the order of the kernels' arguments.
 
         Args:
             materials: In place of the scene's own.
         """
         own = self.material_args if materials is None else materials
-        return self.mesh_args, own, self.texture_args, self.proxy_args
+        return self.mesh_args, own, self.texture_args, self.receiver_args
 
     def materials_with(self, factors: Sequence[FloatArray | None]) -> MaterialArgs:
         """Return the scene's materials with other factors, in the order of `FACTORS`; None: own."""
@@ -298,7 +298,7 @@ class Scene:
             self.material_args,
             self.texture_args,
             self.camera_args,
-            self.proxy_args,
+            self.receiver_args,
         )
         for args in structs:
             for name in args._cls.vars:

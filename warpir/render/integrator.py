@@ -27,9 +27,9 @@ class Radiance:
     foreground: Tensor
     """Object radiance, premultiplied by coverage, shape [object_pixel, 3]."""
     lit: Tensor
-    """White plane with the object, shape [proxy_pixel, 3]."""
+    """White plane with the object, shape [receiver_pixel, 3]."""
     unoccluded: Tensor
-    """White plane without it, shape [proxy_pixel, 3]."""
+    """White plane without it, shape [receiver_pixel, 3]."""
 
 
 class Integrator(Protocol):

@@ -14,7 +14,7 @@ import torch
 from torch import Tensor
 
 from warpir.core.arrays import IntArray
-from warpir.render.bridge import ShadeForeground, ShadeProxy, host_light
+from warpir.render.bridge import ShadeForeground, ShadeReceiver, host_light
 from warpir.render.device_light import light_args
 from warpir.render.integrator import MaterialTensors, Radiance
 from warpir.render.renderer import Renderer, index_of
@@ -26,7 +26,7 @@ class MisIntegrator:
     Args:
         renderer: The scene to render.
         object_pixels: Row-major pixels that may show the object, shape [object_pixel].
-        proxy_pixels: Row-major pixels whose plane the object may shade, shape [proxy_pixel].
+        receiver_pixels: Row-major pixels whose plane the object may shade, shape [receiver_pixel].
         spp: Camera samples per pixel.
         rays: Directions per technique and camera sample.
         depth: Surface interactions of the object's paths.
@@ -38,17 +38,17 @@ class MisIntegrator:
         self,
         renderer: Renderer,
         object_pixels: IntArray,
-        proxy_pixels: IntArray,
+        receiver_pixels: IntArray,
         spp: int = 128,
         rays: int = 4,
         depth: int = 5,
     ) -> None:
         self.renderer = renderer
         self.object_pixels = object_pixels
-        self.proxy_pixels = proxy_pixels
+        self.receiver_pixels = receiver_pixels
         camera = renderer.scene.camera
         rows = index_of(object_pixels, camera.width * camera.height)
-        self.may_see_object: IntArray = (rows[proxy_pixels] >= 0).astype(np.int32)
+        self.may_see_object: IntArray = (rows[receiver_pixels] >= 0).astype(np.int32)
         self.spp, self.rays, self.depth = spp, rays, depth
 
     def radiance(
@@ -71,7 +71,7 @@ class MisIntegrator:
         foreground: Tensor = ShadeForeground.apply(
             self, args_fg, seed, is_recording, light_fg, *_material(materials)
         )
-        lit, unoccluded = ShadeProxy.apply(self, args_shadow, seed, is_recording, light_shadow)
+        lit, unoccluded = ShadeReceiver.apply(self, args_shadow, seed, is_recording, light_shadow)
         return Radiance(foreground, lit, unoccluded)
 
 

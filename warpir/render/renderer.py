@@ -19,7 +19,7 @@ from warpir.core.arrays import BoolArray, Float64Array, FloatArray, IntArray
 from warpir.core.memory import Memory
 from warpir.kernels.composite import tone_foreground, tone_shadow
 from warpir.kernels.path import foreground_kernel
-from warpir.kernels.proxy import trace_proxy
+from warpir.kernels.receiver import trace_receiver
 from warpir.kernels.shadow_ratio import shadow_ratio
 from warpir.kernels.trace import trace_gbuffer
 from warpir.kernels.types import CameraArgs, LightArgs, LightRecord, MaterialArgs, VertexRecord
@@ -75,13 +75,13 @@ class Foreground:
 
 
 @dataclass(frozen=True)
-class ProxyRadiance:
+class ReceiverRadiance:
     """A white plane with and without the object; rows are the traced pixels."""
 
     lit: FloatArray
-    """With the object, relative [W/(m^2 sr)], shape [proxy_pixel, 3]."""
+    """With the object, relative [W/(m^2 sr)], shape [receiver_pixel, 3]."""
     unoccluded: FloatArray
-    """Without it, shape [proxy_pixel, 3]."""
+    """Without it, shape [receiver_pixel, 3]."""
 
 
 @dataclass(frozen=True)
@@ -106,7 +106,7 @@ class _ObjectLaunch:
     ) -> tuple[FloatArray, ...]:
         """Return radiance, its diffuse and emitted parts, and coverage, a row a pixel."""
         scene, count = renderer.scene, len(pixels) * lanes
-        kernel = foreground_kernel(bool(self.materials.any_layers), bool(scene.proxy_args.mesh))
+        kernel = foreground_kernel(bool(self.materials.any_layers), bool(scene.receiver_args.mesh))
         out = [renderer.zeros(count, t) for t in (wp.vec3, wp.vec3, wp.vec3, float)]
         renderer.launch(
             kernel,
@@ -134,8 +134,8 @@ class _ObjectLaunch:
 
 
 @dataclass(frozen=True)
-class _PlaneLaunch:
-    """A launch over pixels of the white place, less the pixels and their samples."""
+class _ReceiverLaunch:
+    """A launch over pixels of the white receiver, less the pixels and their samples."""
 
     light: LightArgs
     camera_args: CameraArgs
@@ -154,7 +154,7 @@ class _PlaneLaunch:
         count = len(pixels)
         out = [renderer.zeros(count, wp.vec3) for _ in range(2)]
         renderer.launch(
-            trace_proxy,
+            trace_receiver,
             count,
             [
                 Rows(renderer.upload(pixels, wp.int32)),
@@ -335,7 +335,7 @@ class Renderer(Launcher):
         radiance, diffuse, emission = traced
         return Foreground(radiance, diffuse, emission, mask)
 
-    def proxy(
+    def receiver(
         self,
         light: LightArgs,
         pixels: IntArray,
@@ -345,13 +345,13 @@ class Renderer(Launcher):
         seed: int,
         camera_args: CameraArgs | None = None,
         record: LightRecord | None = None,
-    ) -> ProxyRadiance:
-        """Radiance of the white place with and without the object (both halves of DiPIR, eq. 5).
+    ) -> ReceiverRadiance:
+        """Radiance of the white receiver with and without the object (both halves of DiPIR, eq. 5).
 
         Args:
             light: From `light_args`.
-            pixels: Row-major pixel indices, shape [proxy_pixel].
-            may_see_object: 1 where the object may hide the place, shape [proxy_pixel].
+            pixels: Row-major pixel indices, shape [receiver_pixel].
+            may_see_object: 1 where the object may hide the receiver, shape [receiver_pixel].
             spp: Camera samples per pixel.
             rays: Directions per technique and camera sample.
             seed: Base seed.
@@ -359,7 +359,7 @@ class Renderer(Launcher):
             record: Filled on the way where given; rows are ``pixels``.
         """
         view = self.scene.camera_args if camera_args is None else camera_args
-        launch = _PlaneLaunch(light, view, rays, seed)
+        launch = _ReceiverLaunch(light, view, rays, seed)
 
         def trace(start: int, stop: int) -> tuple[FloatArray, ...]:
             cut = None if record is None else Rows(record).cut(start, stop)
@@ -378,7 +378,7 @@ class Renderer(Launcher):
         traced = self._in_chunks(trace, len(pixels), stage)
         # Black with and without the object: there the photo stays as it is.
         traced = self.bad_pixels.blackened(traced, pixels, width, stage, first_bad_sample)
-        return ProxyRadiance(*traced)
+        return ReceiverRadiance(*traced)
 
     def shaded_pixels(self, light: LightArgs, seed: int) -> IntArray:
         """Return the pixels where the object may change the plane's light, row-major.
@@ -402,7 +402,7 @@ class Renderer(Launcher):
         if self.scene.triangle_count == 0:
             return np.zeros(0, np.int32)
         pixels = np.arange(width * height, dtype=np.int32)
-        pilot = self.proxy(
+        pilot = self.receiver(
             light,
             pixels,
             np.zeros(len(pixels), np.int32),
@@ -418,8 +418,8 @@ class Renderer(Launcher):
         full = np.repeat(np.repeat(blocks, PILOT_SCALE, axis=0), PILOT_SCALE, axis=1)
         return np.flatnonzero(full[: camera.height, : camera.width]).astype(np.int32)
 
-    def ratio(self, radiance: ProxyRadiance) -> FloatArray:
-        """Return the shadow ratio per channel, shape [proxy_pixel, 3]."""
+    def ratio(self, radiance: ReceiverRadiance) -> FloatArray:
+        """Return the shadow ratio per channel, shape [receiver_pixel, 3]."""
         count = len(radiance.lit)
         out = self.zeros(count, wp.vec3)
         self.launch(
@@ -444,9 +444,9 @@ class Renderer(Launcher):
         is_reinhard: bool,
     ) -> tuple[FloatArray, FloatArray]:
         """Map object radiance and shadow ratio to display-linear values, shapes [row, 3]."""
-        objects, proxies = len(foreground.mask), len(ratio)
+        objects, receivers = len(foreground.mask), len(ratio)
         fg = self.zeros(objects, wp.vec3)
-        shadow = self.zeros(proxies, wp.vec3)
+        shadow = self.zeros(receivers, wp.vec3)
         self.launch(
             tone_foreground,
             objects,
@@ -462,7 +462,7 @@ class Renderer(Launcher):
         )
         self.launch(
             tone_shadow,
-            proxies,
+            receivers,
             [
                 Rows(self.upload(ratio, wp.vec3)),
                 *(self.upload(k, wp.float32) for k in curve_shadow.arrays()),
@@ -471,7 +471,7 @@ class Renderer(Launcher):
             ],
             1,
         )
-        return fg.numpy()[:objects], shadow.numpy()[:proxies]
+        return fg.numpy()[:objects], shadow.numpy()[:receivers]
 
 
 def index_of(pixels: IntArray, count: int) -> IntArray:

@@ -25,7 +25,7 @@ from warpir.kernels.types import (
 )
 from warpir.render.device import SAMPLES_PER_SLICE, Rows
 from warpir.render.device_scene import FACTORS
-from warpir.render.renderer import ProxyRadiance, Renderer
+from warpir.render.renderer import ReceiverRadiance, Renderer
 
 if TYPE_CHECKING:
     from warpir.render.mis import MisIntegrator
@@ -215,7 +215,7 @@ class ObjectSamples:
             d_next = d_throughput
 
 
-class PlaneSamples:
+class ReceiverSamples:
     """Samples of the plane; as `ObjectSamples`."""
 
     def __init__(
@@ -223,16 +223,16 @@ class PlaneSamples:
     ) -> None:
         self.mis, self.args, self.seed, self.free = mis, args, seed, free
         self.entries = 2 * mis.spp * mis.rays * free[0]
-        self.parts = _parts(len(mis.proxy_pixels), ENTRY_BYTES * self.entries)
+        self.parts = _parts(len(mis.receiver_pixels), ENTRY_BYTES * self.entries)
         self.kept: LightRecord | None = None
 
-    def render(self) -> ProxyRadiance:
+    def render(self) -> ReceiverRadiance:
         """Trace the plane with and without the object; keep the record if it fits."""
 
-        def drawn() -> ProxyRadiance:
+        def drawn() -> ReceiverRadiance:
             if len(self.parts) > 1:
                 return self.draw(slice(None), is_recording=False)[0]
-            whole, self.parts = self.parts[0], _halves(len(self.mis.proxy_pixels))
+            whole, self.parts = self.parts[0], _halves(len(self.mis.receiver_pixels))
             radiance, self.kept = self.draw(whole)
             self.parts = [whole]
             return radiance
@@ -241,14 +241,14 @@ class PlaneSamples:
 
     def draw(
         self, rows: slice, is_recording: bool = True
-    ) -> tuple[ProxyRadiance, LightRecord | None]:
+    ) -> tuple[ReceiverRadiance, LightRecord | None]:
         """Trace some of the plane's pixels, with their record if it is asked for."""
         mis = self.mis
-        pixels = mis.proxy_pixels[rows]
+        pixels = mis.receiver_pixels[rows]
         record = None
         if is_recording and self.entries:
             record = _new_light_record(len(pixels), self.entries, mis.renderer.device)
-        out = mis.renderer.proxy(
+        out = mis.renderer.receiver(
             self.args,
             pixels,
             mis.may_see_object[rows],

@@ -13,7 +13,7 @@ import numpy as np
 from warpir.core.arrays import Float64Array
 from warpir.core.errors import InputError
 from warpir.scene.camera import Camera, ground_point
-from warpir.scene.receiver import ProxyMesh, first_hit
+from warpir.scene.receiver import ReceiverMesh, first_hit
 
 DEFAULT_STAND = (0.5, 0.75)
 """Where an object stands that was given no place: fractions of the photo's width and height."""
@@ -51,7 +51,7 @@ def place_asset(
     rotate_y: float = 0.0,
     scale: float | None = None,
     size: float | None = None,
-    mesh: ProxyMesh | None = None,
+    mesh: ReceiverMesh | None = None,
     is_plane: bool = True,
 ) -> Placement:
     """Set an asset on the ground.
@@ -179,7 +179,7 @@ def _point_on_place(
     at: tuple[float, float],
     camera: Camera,
     plane: Float64Array,
-    mesh: ProxyMesh,
+    mesh: ReceiverMesh,
     is_plane: bool,
 ) -> tuple[Float64Array, list[str]]:
     """Return what a pixel shows first, mesh or plane, world frame [m], and what looks odd."""

@@ -1,7 +1,7 @@
-"""The photo's place as plain triangles, and the first of them that a ray meets, in float64.
+"""The receiver as plain triangles, and the first of them that a ray meets, in float64.
 
 For what is asked before a renderer is there: where a pixel's ray lands, whether a lamp reaches a
-point of the ground. The kernels' half is `warpir.kernels.proxy_mesh`.
+point of the ground. The kernels' half is `warpir.kernels.receiver_mesh`.
 """
 
 from dataclasses import dataclass
@@ -17,7 +17,7 @@ CHUNK = 1 << 21
 
 
 @dataclass(frozen=True)
-class ProxyMesh:
+class ReceiverMesh:
     """Triangles where they stand; both of their sides count."""
 
     positions: Float64Array
@@ -26,11 +26,11 @@ class ProxyMesh:
     """Shape [triangle, 3]."""
 
 
-def mesh_of(asset: Asset) -> ProxyMesh:
+def mesh_of(asset: Asset) -> ReceiverMesh:
     """Return all triangles of an asset whose frame is the photo's world."""
     counts = [len(p.positions) for p in asset.primitives]
     offsets = np.cumsum([0, *counts[:-1]])
-    return ProxyMesh(
+    return ReceiverMesh(
         np.concatenate([p.positions for p in asset.primitives]),
         np.concatenate(
             [p.indices + o for p, o in zip(asset.primitives, offsets, strict=True)]
@@ -39,7 +39,7 @@ def mesh_of(asset: Asset) -> ProxyMesh:
 
 
 def first_hit(
-    mesh: ProxyMesh, origins: Float64Array, directions: Float64Array
+    mesh: ReceiverMesh, origins: Float64Array, directions: Float64Array
 ) -> tuple[Float64Array, Int64Array]:
     """Return how far each ray gets, every triangle tried (Moeller and Trumbore 1997).
 
@@ -74,7 +74,7 @@ def first_hit(
     return nearest, triangle
 
 
-def is_in_view(mesh: ProxyMesh, camera: Camera) -> bool:
+def is_in_view(mesh: ReceiverMesh, camera: Camera) -> bool:
     """Return whether a triangle may be seen: not all of its corners are beyond one of the edges."""
     local = (mesh.positions - camera.c2w[:3, 3]) @ camera.c2w[:3, :3]
     x, y, depth = local[:, 0], local[:, 1], -local[:, 2]

@@ -22,14 +22,14 @@ if TYPE_CHECKING:
     from warpir.render.device_scene import Scene
 
 
-FORMAT = 1
+FORMAT = 2
 """Layout and meaning of the stored arrays; part of every key."""
 
 
 def content_key(
     scene: Scene,
     object_pixels: IntArray,
-    proxy_pixels: IntArray,
+    receiver_pixels: IntArray,
     depth: int,
     settings: TransportSettings,
     expected: Light,
@@ -57,7 +57,7 @@ def content_key(
     for content in scene.contents():
         add(content)
     add(object_pixels)
-    add(proxy_pixels)
+    add(receiver_pixels)
     lobes = expected.lobes
     for array in (
         *((lobes.amplitude, lobes.axis, lobes.sharpness) if lobes is not None else ()),

@@ -5,8 +5,8 @@ writes for each pixel what each texel of a lat-long map sends into it (``T_fg``:
 or how much of it the object keeps from the ground plane (``T_shadow``). A step is then ``T L`` and
 its gradient ``T^T d``; no ray is cast. The kernels are `warpir.kernels.transport`.
 
-What an open plane receives is one analytic row. With a mesh of the place, each pixel has a row of
-its own for that too (``T_place``), and what the mesh sends is a constant, as emission is.
+What an open plane receives is one analytic row. Where the receiver is a mesh, each pixel has a row
+of its own for that too (``T_receiver``), and what the mesh sends is a constant, as emission is.
 
 The numbers are unbiased for the map they are handed, at the resolution of the rows.
 """
@@ -34,9 +34,9 @@ from warpir.render.transport.rows import (
     LOWER_SHADOW,
     TRACING,
     TransportSettings,
+    mesh_rows,
     object_rows,
-    place_rows,
-    proxy_rows,
+    plane_rows,
 )
 from warpir.render.transport.tents import direction_counts, flux_noise, tent_irradiance
 from warpir.scene.light import Light, rasterize_lobes
@@ -50,7 +50,7 @@ class TransportIntegrator:
     Args:
         renderer: The scene to trace.
         object_pixels: Row-major pixels that may show the object, shape [object_pixel].
-        proxy_pixels: Row-major pixels whose plane the object may shade, shape [proxy_pixel].
+        receiver_pixels: Row-major pixels whose plane the object may shade, shape [receiver_pixel].
         depth: Surface interactions of the object's paths.
         settings: Resolution and counts.
         expected: Light that is likely, for putting directions where they matter; what is stored is
@@ -74,7 +74,7 @@ class TransportIntegrator:
         self,
         renderer: Renderer,
         object_pixels: IntArray,
-        proxy_pixels: IntArray,
+        receiver_pixels: IntArray,
         depth: int = 5,
         settings: TransportSettings | None = None,
         expected: Light | None = None,
@@ -83,7 +83,7 @@ class TransportIntegrator:
     ) -> None:
         self.renderer = renderer
         self.object_pixels = object_pixels
-        self.proxy_pixels = proxy_pixels
+        self.receiver_pixels = receiver_pixels
         self.depth = depth
         self.settings = settings or TransportSettings()
         self.device = torch.device(str(wp.device_to_torch(renderer.device)))
@@ -92,7 +92,7 @@ class TransportIntegrator:
         self.expected = tuple(
             to_texels(expected, h) for h in (self.settings.height_fg, self.settings.height_shadow)
         )
-        self.has_mesh = renderer.scene.proxy.mesh is not None
+        self.has_mesh = renderer.scene.receiver.mesh is not None
         above, irradiance = self._open_irradiance()
         self.above = torch.from_numpy(above.astype(np.int64)).to(self.device)
         self.irradiance = torch.from_numpy(irradiance).to(self.device)
@@ -102,7 +102,7 @@ class TransportIntegrator:
             key = content_key(
                 renderer.scene,
                 object_pixels,
-                proxy_pixels,
+                receiver_pixels,
                 depth,
                 self.settings,
                 expected,
@@ -126,7 +126,7 @@ class TransportIntegrator:
         if self.has_mesh:
             irradiance = np.ones(2 * height * height)
         else:
-            x, y, z = (float(c) for c in self.renderer.scene.proxy.normal)
+            x, y, z = (float(c) for c in self.renderer.scene.receiver.normal)
             irradiance = tent_irradiance((x, y, z), height).reshape(-1)
         above = np.flatnonzero(irradiance > 0.0).astype(np.int32)
         return above, irradiance[above].astype(np.float32)
@@ -134,7 +134,7 @@ class TransportIntegrator:
     def _trace(self, above: IntArray, seed: int) -> dict[str, Tensor]:
         """Trace all rows; names are those of the cache's arrays."""
         self._check_memory(0)
-        traced = self._trace_place(seed) if self.has_mesh else self._trace_proxy(above, seed)
+        traced = self._trace_mesh(seed) if self.has_mesh else self._trace_plane(above, seed)
         return self._trace_object(seed) | traced
 
     def _hold(self, stored: dict[str, Tensor]) -> None:
@@ -144,16 +144,16 @@ class TransportIntegrator:
             stored["row"],
             stored["column"],
             stored["blocked"],
-            (len(self.proxy_pixels), len(self.above)),
+            (len(self.receiver_pixels), len(self.above)),
         )
-        self.T_place = DenseRows(stored["T_place"]) if self.has_mesh else None
+        self.T_receiver = DenseRows(stored["T_receiver"]) if self.has_mesh else None
         if self.has_mesh:
             self.bounced, self.bounced_blocked = stored["bounced"]
         self.emission = stored["emission"]
         self.mask = stored["mask"].cpu().numpy()
         self.bytes = self.T_fg.bytes + self.T_shadow.bytes
-        if self.T_place is not None:
-            self.bytes += self.T_place.bytes
+        if self.T_receiver is not None:
+            self.bytes += self.T_receiver.bytes
 
     def _check_memory(self, entries: int) -> None:
         """Compare the size of both matrices, with so many sparse entries, with the limit."""
@@ -162,7 +162,7 @@ class TransportIntegrator:
         wide = 2 if settings.dtype == "bfloat16" else 4
         needed = 3 * wide * len(self.object_pixels) * texels + SparseRows.BYTES * entries
         if self.has_mesh:
-            needed += wide * len(self.proxy_pixels) * 2 * settings.height_shadow**2
+            needed += wide * len(self.receiver_pixels) * 2 * settings.height_shadow**2
         if entries == 0:
             rows = Need("the rows of light transport", needed, LOWER_OBJECT)
             self.renderer.memory.require(rows)
@@ -170,7 +170,7 @@ class TransportIntegrator:
             raise InputError(
                 "--transport-memory",
                 f"light transport of {len(self.object_pixels)} object pixels"
-                + (f", {len(self.proxy_pixels)} of --proxy" if self.has_mesh else "")
+                + (f", {len(self.receiver_pixels)} of --proxy" if self.has_mesh else "")
                 + f" and {texels} texels needs {needed / 2**20:.0f} MiB or more, the limit is "
                 f"{settings.memory_mib} MiB",
                 "raise it (memory_mib), or lower --object-light-height or --guidance-width",
@@ -215,15 +215,15 @@ class TransportIntegrator:
     def _may_see_object(self) -> IntArray:
         camera = self.renderer.scene.camera
         index = index_of(self.object_pixels, camera.width * camera.height)
-        seen: IntArray = (index[self.proxy_pixels] >= 0).astype(np.int32)
+        seen: IntArray = (index[self.receiver_pixels] >= 0).astype(np.int32)
         return seen
 
-    def _trace_proxy(self, above: IntArray, seed: int) -> dict[str, Tensor]:
+    def _trace_plane(self, above: IntArray, seed: int) -> dict[str, Tensor]:
         """Keep what is not zero: most of the plane loses little of the sky."""
         entries = _Entries(self.device)
-        for share in proxy_rows(
+        for share in plane_rows(
             self.renderer,
-            self.proxy_pixels,
+            self.receiver_pixels,
             self._may_see_object(),
             above,
             self.settings,
@@ -232,14 +232,14 @@ class TransportIntegrator:
         ):
             rows = wp.to_torch(share)
             part = slice(entries.row_count, entries.row_count + len(rows))
-            self._blacken(self.proxy_pixels[part], "shadow's transport", rows)
+            self._blacken(self.receiver_pixels[part], "shadow's transport", rows)
             entries.add(rows, self.irradiance)
             self._check_memory(entries.count)
         return entries.tensors()
 
-    def _trace_place(self, seed: int) -> dict[str, Tensor]:
+    def _trace_mesh(self, seed: int) -> dict[str, Tensor]:
         """Store what each pixel receives, and what is not zero of what the object keeps."""
-        settings, count = self.settings, len(self.proxy_pixels)
+        settings, count = self.settings, len(self.receiver_pixels)
         entries = _Entries(self.device)
         shape = (1, count, 2 * settings.height_shadow**2)
         T = self.renderer.memory.again(
@@ -248,9 +248,9 @@ class TransportIntegrator:
             LOWER_SHADOW,
         )
         bounced = torch.empty((2, count, 3), device=self.device)
-        for part in place_rows(
+        for part in mesh_rows(
             self.renderer,
-            self.proxy_pixels,
+            self.receiver_pixels,
             self._may_see_object(),
             settings,
             self.expected[1],
@@ -259,15 +259,15 @@ class TransportIntegrator:
             received, blocked = wp.to_torch(part.received), wp.to_torch(part.blocked)
             rows = slice(entries.row_count, entries.row_count + len(received))
             sent, kept = wp.to_torch(part.bounced), wp.to_torch(part.bounced_blocked)
-            pixels = self.proxy_pixels[rows]
-            self._blacken(pixels, "place's transport", received, blocked, sent, kept)
+            pixels = self.receiver_pixels[rows]
+            self._blacken(pixels, "receiver's transport", received, blocked, sent, kept)
             T[0, rows] = received.to(T.dtype)
-            # The part of what is stored, so that rounding leaves a dark place dark.
+            # The part of what is stored, so that rounding leaves a dark point dark.
             share = blocked / received.clamp(min=1e-30)
             entries.add(share * T[0, rows].to(torch.float32))
             bounced[0, rows], bounced[1, rows] = sent, kept
             self._check_memory(entries.count)
-        return entries.tensors() | {"T_place": T, "bounced": bounced}
+        return entries.tensors() | {"T_receiver": T, "bounced": bounced}
 
     def staleness(self, light_fg: Light, light_shadow: Light) -> float:
         """Return how much noisier the rows are under these lights than under the expected one [1].
@@ -304,10 +304,10 @@ class TransportIntegrator:
         foreground = product(self.T_fg, texels) + self.emission
         falling = self._texels(light_shadow, settings.height_shadow)[self.above]
         blocked = product(self.T_shadow, falling)
-        if self.T_place is None:
-            unoccluded = (self.irradiance @ falling).expand(len(self.proxy_pixels), 3)
+        if self.T_receiver is None:
+            unoccluded = (self.irradiance @ falling).expand(len(self.receiver_pixels), 3)
         else:
-            unoccluded = product(self.T_place, falling) + self.bounced
+            unoccluded = product(self.T_receiver, falling) + self.bounced
             blocked = blocked + self.bounced_blocked
         # Rounding alone may take more than there is.
         lit = (unoccluded - blocked).clamp(min=0.0)

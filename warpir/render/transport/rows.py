@@ -218,8 +218,8 @@ def _surface_points(
 
 
 @dataclass(frozen=True)
-class _PlacePoints:
-    """What the camera sees of the place under each pixel's subsamples."""
+class _ReceiverPoints:
+    """What the camera sees of the receiver under each pixel's subsamples."""
 
     pixels: Rows
     count: Rows
@@ -231,14 +231,14 @@ class _PlacePoints:
     spread: Rows
     """Largest distance of a pixel's points from its first one [m], shape [pixel]."""
     share: Rows
-    """Of what the object does not hide, what is place and not open [1], shape [pixel]."""
+    """Of what the object does not hide, what is receiver and not open [1], shape [pixel]."""
 
 
-def _place_points(
+def _receiver_points(
     renderer: Renderer, pixels: IntArray, may_see_object: IntArray, subsamples: int, seed: int
-) -> _PlacePoints:
+) -> _ReceiverPoints:
     scene, device, count = renderer.scene, renderer.device, len(pixels)
-    points = _PlacePoints(
+    points = _ReceiverPoints(
         Rows(wp.array(pixels, dtype=wp.int32, device=device)),
         Rows(wp.zeros(count, dtype=int, device=device)),
         Rows(wp.empty((count, subsamples), dtype=wp.vec3, device=device)),
@@ -246,7 +246,7 @@ def _place_points(
         *(Rows(wp.zeros(count, dtype=float, device=device)) for _ in range(2)),
     )
     renderer.launch(
-        kernels.trace_proxy_points,
+        kernels.trace_receiver_points,
         count,
         [
             points.pixels,
@@ -267,7 +267,7 @@ def _place_points(
     return points
 
 
-def proxy_rows(
+def plane_rows(
     renderer: Renderer,
     pixels: IntArray,
     may_see_object: IntArray,
@@ -283,7 +283,7 @@ def proxy_rows(
     """
     scene, device, height = renderer.scene, renderer.device, settings.height_shadow
     counts = direction_counts(expected, settings.bright_directions)
-    texels = texel_args(counts, height, renderer, columns, scene.proxy.normal)
+    texels = texel_args(counts, height, renderer, columns, scene.receiver.normal)
     size = max(1, CHUNK_BYTES // (4 * len(columns)))
     if scene.triangle_count == 0:
         return
@@ -292,7 +292,7 @@ def proxy_rows(
 
     def trace(first: int, last: int) -> wp.array:
         chunk = slice(first, last)
-        points = _place_points(
+        points = _receiver_points(
             renderer, pixels[chunk], may_see_object[chunk], settings.subsamples, seed
         )
         blocked = wp.zeros((last - first, len(columns)), dtype=float, device=device)
@@ -333,28 +333,29 @@ def _chunks(
 
 
 @dataclass(frozen=True)
-class PlaceRows:
-    """Traced rows of a place with a mesh; what the object keeps is part of what is received."""
+class MeshRows:
+    """Traced rows of a receiver with a mesh; what the object keeps is part of what is received."""
 
     received: wp.array
-    """Radiance of the white place without the object per texel radiance [1], shape [row, texel]."""
+    """Radiance of the white receiver without the object per texel radiance [1], shape [row,
+    texel]."""
     blocked: wp.array
     """What the object keeps of it, shape [row, texel]."""
     bounced: wp.array
-    """Radiance of the white place that the mesh sends it, vec3, shape [row]."""
+    """Radiance of the white receiver that the mesh sends it, vec3, shape [row]."""
     bounced_blocked: wp.array
     """What the object keeps of it, vec3, shape [row]."""
 
 
-def place_rows(
+def mesh_rows(
     renderer: Renderer,
     pixels: IntArray,
     may_see_object: IntArray,
     settings: TransportSettings,
     expected: FloatArray,
     seed: int,
-) -> Iterator[PlaceRows]:
-    """Trace the rows of a place with a mesh chunk by chunk: nothing is known beforehand."""
+) -> Iterator[MeshRows]:
+    """Trace the rows of a receiver with a mesh chunk by chunk: nothing is known beforehand."""
     scene, device, height = renderer.scene, renderer.device, settings.height_shadow
     texel_count = 2 * height * height
     counts = direction_counts(expected, settings.bright_directions)
@@ -362,13 +363,19 @@ def place_rows(
     size = max(1, CHUNK_BYTES // (8 * texel_count))
     geometry = scene.geometry()
 
-    def trace(first: int, last: int) -> PlaceRows:
+    def trace(first: int, last: int) -> MeshRows:
         chunk, count = slice(first, last), last - first
-        points = _place_points(
+        points = _receiver_points(
             renderer, pixels[chunk], may_see_object[chunk], settings.subsamples, seed
         )
-        places = (points.count, points.position, points.normal, points.share)
-        seen = (points.pixels, *places, *geometry)
+        seen = (
+            points.pixels,
+            points.count,
+            points.position,
+            points.normal,
+            points.share,
+            *geometry,
+        )
         received, blocked = (
             wp.zeros((count, texel_count), dtype=float, device=device) for _ in range(2)
         )
@@ -388,6 +395,6 @@ def place_rows(
             settings.paths,
             "transport",
         )
-        return PlaceRows(received, blocked, bounced, kept)
+        return MeshRows(received, blocked, bounced, kept)
 
     yield from _chunks(renderer, trace, len(pixels), size)

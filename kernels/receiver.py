@@ -1,8 +1,8 @@
-"""The photo's place with and without the object: numerator and denominator of the shadow ratio.
+"""The receiver with and without the object: numerator and denominator of the shadow ratio.
 
 ``beta = PathTrace(X + P, L, 1) / PathTrace(P, L, 1)`` per channel (DiPIR, eq. 5). Both use the same
 directions, so the ratio lies in [0, 1] and is exactly 1 where nothing is blocked; and their noise
-cancels, which a closed form of the denominator would undo. P is the ground plane and the place's
+cancels, which a closed form of the denominator would undo. P is the ground plane and the receiver's
 mesh, whichever the camera sees first. The mesh shades both halves: where a wall keeps the sun away
 the object can take away only what is left, so shadows do not double. Detached.
 """
@@ -11,11 +11,11 @@ import warp as wp
 
 from warpir.kernels.frame import basis, to_world
 from warpir.kernels.light_gradient import keep_direction
-from warpir.kernels.proxy_mesh import (
-    proxy_distance,
-    proxy_mesh_hit,
-    proxy_radiance,
-    proxy_visibility,
+from warpir.kernels.receiver_mesh import (
+    plane_distance,
+    receiver_mesh_hit,
+    receiver_radiance,
+    receiver_visibility,
 )
 from warpir.kernels.rng import hash_pair, pixel_seed, sobol_pair
 from warpir.kernels.sampling import (
@@ -37,7 +37,7 @@ from warpir.kernels.types import (
     LightRecord,
     MaterialArgs,
     MeshArgs,
-    ProxyArgs,
+    ReceiverArgs,
     TextureArgs,
 )
 
@@ -47,37 +47,37 @@ INV_PI = wp.constant(0.318309886183791)
 
 
 BOUNCE_KEY = wp.constant(wp.uint32(0x2545F491))
-"""Sets the draws of what the object lets through of the place's light apart from the camera's."""
+"""Keeps the draws of what the object lets through of the mesh's light apart from the camera's."""
 
 
 @wp.struct
-class Receiver:
-    """A point of the place that the camera sees."""
+class ReceiverPoint:
+    """A point of the receiver that the camera sees."""
 
     valid: int
     is_open: int
-    """1 where a place with a mesh ends: the camera sees neither it nor the object."""
+    """1 where a receiver with a mesh ends: the camera sees neither it nor the object."""
     position: wp.vec3
     normal: wp.vec3
     """Unit, toward the side that receives light; of the mesh, toward the camera."""
 
 
 @wp.func
-def receiver_origin(mesh: MeshArgs, proxy: ProxyArgs, point: Receiver) -> wp.vec3:
-    """Return where rays from a receiver start, off the plane and the place's mesh."""
-    if proxy.mesh == wp.uint64(0):
+def receiver_origin(mesh: MeshArgs, receiver: ReceiverArgs, point: ReceiverPoint) -> wp.vec3:
+    """Return where rays from a receiver start, off the plane and the receiver's mesh."""
+    if receiver.mesh == wp.uint64(0):
         return point.position + point.normal * mesh.epsilon
-    epsilon = wp.max(mesh.epsilon, proxy.epsilon)
+    epsilon = wp.max(mesh.epsilon, receiver.epsilon)
     return offset_origin(point.position, point.normal, point.normal, epsilon)
 
 
 @wp.struct
-class ProxySample:
-    """Two directions from one point of the place; ``weight`` is ``cos / pi * mis / pdf``."""
+class ReceiverSample:
+    """Two directions from one point of the receiver; ``weight`` is ``cos / pi * mis / pdf``."""
 
     wi_light: wp.vec3
     weight_light: float
-    """0 where the place's mesh is in the way; so is the other."""
+    """0 where the receiver's mesh is in the way; so is the other."""
     visible_light: float
     radiance_light: wp.vec3
     wi_cosine: wp.vec3
@@ -85,33 +85,33 @@ class ProxySample:
     visible_cosine: float
     radiance_cosine: wp.vec3
     bounced: wp.vec3
-    """Radiance from the place's mesh where the second direction meets it; a constant to the
+    """Radiance from the receiver's mesh where the second direction meets it; a constant to the
     light."""
 
 
 @wp.func
-def proxy_sample(
+def receiver_sample(
     mesh: MeshArgs,
     material: MaterialArgs,
     texture: TextureArgs,
-    proxy: ProxyArgs,
+    receiver: ReceiverArgs,
     light: LightArgs,
-    point: Receiver,
+    point: ReceiverPoint,
     keep_dark: int,
     index: int,
     key: wp.uint32,
-) -> ProxySample:
+) -> ReceiverSample:
     """Draw one direction from the light and one from the cosine, and trace both.
 
     ``keep_dark`` asks for directions that bring no light now, too: a gradient needs them.
     """
-    out = ProxySample()
+    out = ReceiverSample()
     out.weight_light = 0.0
     out.visible_light = 1.0
     out.weight_cosine = 0.0
     out.visible_cosine = 1.0
     out.bounced = wp.vec3(0.0)
-    origin = receiver_origin(mesh, proxy, point)
+    origin = receiver_origin(mesh, receiver, point)
     pick = sobol_pair(index, key, 1)
     wi = light_sample(light, sobol_pair(index, key, 2), pick[0])
     cos_i = wp.dot(wi, point.normal)
@@ -121,18 +121,18 @@ def proxy_sample(
         if Li.pdf > 0.0 and (wp.max(Li.radiance) > 0.0 or keep_dark == 1):
             pdf = cos_i * INV_PI
             out.weight_light = pdf * power_heuristic(Li.pdf, pdf) / Li.pdf
-            out.weight_light = out.weight_light * proxy_visibility(proxy, origin, wi)
+            out.weight_light = out.weight_light * receiver_visibility(receiver, origin, wi)
             out.radiance_light = Li.radiance
             out.visible_light = visibility(mesh, material, texture, origin, wi)
     wi = to_world(cosine_sample(sobol_pair(index, key, 3)), basis(point.normal))
     cos_i = wp.dot(wi, point.normal)
     out.wi_cosine = wi
     if cos_i > 0.0:
-        place = proxy_mesh_hit(proxy, origin, wi)
-        if place.valid == 1:
-            out.bounced = proxy_radiance(proxy, place)
+        receiver_hit = receiver_mesh_hit(receiver, origin, wi)
+        if receiver_hit.valid == 1:
+            out.bounced = receiver_radiance(receiver, receiver_hit)
             ray_key = hash_pair(hash_pair(key, BOUNCE_KEY), wp.uint32(index))
-            hit = closest_hit(mesh, material, texture, origin, wi, place.t, 0, ray_key)
+            hit = closest_hit(mesh, material, texture, origin, wi, receiver_hit.t, 0, ray_key)
             out.visible_cosine = 1.0 - float(hit.valid)
             return out
         Li = light_eval(light, wi)
@@ -144,41 +144,41 @@ def proxy_sample(
 
 
 @wp.func
-def proxy_point(
+def receiver_point(
     camera: CameraArgs,
     mesh: MeshArgs,
     material: MaterialArgs,
     texture: TextureArgs,
-    proxy: ProxyArgs,
+    receiver: ReceiverArgs,
     pixel: int,
     may_see_object: int,
     s: int,
     key: wp.uint32,
-) -> Receiver:
-    """Find the point of plane or place that camera sample ``s`` sees, if it sees one."""
-    point = Receiver()
+) -> ReceiverPoint:
+    """Find the point of plane or mesh that camera sample ``s`` sees, if it sees one."""
+    point = ReceiverPoint()
     point.valid = 0
     point.is_open = 0
     ray_dir = camera_ray(camera, pixel, sobol_pair(s, key, 0))
-    t = proxy_distance(proxy, camera.origin, ray_dir)
-    place = proxy_mesh_hit(proxy, camera.origin, ray_dir)
-    if t <= 0.0 and place.valid == 0 and proxy.mesh == wp.uint64(0):
+    t = plane_distance(receiver, camera.origin, ray_dir)
+    receiver_hit = receiver_mesh_hit(receiver, camera.origin, ray_dir)
+    if t <= 0.0 and receiver_hit.valid == 0 and receiver.mesh == wp.uint64(0):
         return point
     if may_see_object == 1:
-        if camera_hit(camera, mesh, material, texture, proxy, s, key, ray_dir).valid == 1:
+        if camera_hit(camera, mesh, material, texture, receiver, s, key, ray_dir).valid == 1:
             return point
-    if t <= 0.0 and place.valid == 0:
+    if t <= 0.0 and receiver_hit.valid == 0:
         point.is_open = 1
         return point
     point.valid = 1
-    if place.valid == 1 and (t <= 0.0 or place.t < t):
-        point.position = place.position
-        point.normal = place.normal
+    if receiver_hit.valid == 1 and (t <= 0.0 or receiver_hit.t < t):
+        point.position = receiver_hit.position
+        point.normal = receiver_hit.normal
         return point
     p = camera.origin + ray_dir * t
     # Back onto the plane: far hits lose digits along the ray.
-    point.position = p - proxy.normal * (wp.dot(proxy.normal, p) - proxy.offset)
-    point.normal = proxy.normal
+    point.position = p - receiver.normal * (wp.dot(receiver.normal, p) - receiver.offset)
+    point.normal = receiver.normal
     return point
 
 
@@ -189,14 +189,14 @@ def plane_weight(weight: float, visible: float) -> wp.vec3:
 
 
 @wp.kernel
-def trace_proxy(
+def trace_receiver(
     pixels: wp.array[int],
     may_see_object: wp.array[int],
     camera: CameraArgs,
     mesh: MeshArgs,
     material: MaterialArgs,
     texture: TextureArgs,
-    proxy: ProxyArgs,
+    receiver: ReceiverArgs,
     light: LightArgs,
     spp: int,
     rays: int,
@@ -205,21 +205,21 @@ def trace_proxy(
     unoccluded: wp.array[wp.vec3],
     record: LightRecord,
 ):
-    """Sum the radiance of the place in white, with and without the object, in each listed pixel.
+    """Sum the radiance of the receiver in white, with and without the object, in each listed pixel.
 
     Args:
-        pixels: Row-major pixel indices, shape [proxy_pixel].
-        may_see_object: 1 where the object may hide the place from the camera, shape [proxy_pixel].
+        pixels: Row-major pixel indices, shape [receiver_pixel].
+        may_see_object: 1 where the object may hide the receiver, shape [receiver_pixel].
         camera: The view.
         mesh: The object's triangles.
         material: Their materials.
         texture: Their textures.
-        proxy: The place: plane and mesh.
+        receiver: The receiver: plane and mesh.
         light: The light.
         spp: Camera samples per pixel.
         rays: Directions per technique that share one camera sample.
         seed: Base seed.
-        lit: Mean radiance with the object over the samples that see the place. Where a mesh ends
+        lit: Mean radiance with the object over the samples that see the receiver. Where a mesh ends
             within a pixel, what is open there loses nothing.
         unoccluded: The same without the object.
         record: Output: the weights of each direction in both, or without arrays.
@@ -236,15 +236,15 @@ def trace_proxy(
     count = float(0.0)
     open_count = float(0.0)
     for s in range(spp):
-        point = proxy_point(
-            camera, mesh, material, texture, proxy, pixel, may_see_object[i], s, key
+        point = receiver_point(
+            camera, mesh, material, texture, receiver, pixel, may_see_object[i], s, key
         )
         open_count += float(point.is_open)
         if point.valid == 1:
             count += 1.0
             for r in range(rays):
-                x = proxy_sample(
-                    mesh, material, texture, proxy, light, point, keep_dark, s * rays + r, key
+                x = receiver_sample(
+                    mesh, material, texture, receiver, light, point, keep_dark, s * rays + r, key
                 )
                 from_light = x.radiance_light * x.weight_light
                 from_cosine = x.radiance_cosine * x.weight_cosine + x.bounced
