@@ -135,55 +135,38 @@ class _Compose(torch.autograd.Function):
         knots = [
             _from_torch(t.repeat(copies, 1), wp.float32, device, grad=True) for t in tensors[3:]
         ]
-        objects, receivers = len(tensors[0]), len(tensors[1])
+        objects, shaded = len(tensors[0]), len(tensors[1])
         pixels = constants.height * constants.width
-        new = [
+        ratio, fg_display, ratio_display, image = (
             wp.zeros(max(n, 1), dtype=wp.vec3, device=device, requires_grad=True)
-            for n in (receivers, objects, receivers, pixels)
-        ]
-        ratio, fg_display, ratio_display, image = new
+            for n in (shaded, objects, shaded, pixels)
+        )
+
+        def launch(kernel: wp.Kernel, dim: int, inputs: list[object], output: wp.array) -> None:
+            wp.launch(kernel, dim=dim, inputs=inputs, outputs=[output], device=device)
+
+        of_object = [foreground, constants.mask, constants.is_reinhard]
+        indices = [constants.object_index, constants.receiver_index]
         ctx.tape = wp.Tape()
         with ctx.tape:
-            wp.launch(
-                ratio_kernel,
-                dim=receivers,
-                inputs=[lit, unoccluded],
-                outputs=[ratio],
-                device=device,
-            )
-            wp.launch(
+            launch(ratio_kernel, shaded, [lit, unoccluded], ratio)
+            launch(
                 composite_kernels.tone_foreground,
-                dim=objects,
-                inputs=[
-                    foreground,
-                    constants.mask,
-                    constants.is_reinhard,
-                    *knots[:3],
-                    constants.bins_fg,
-                ],
-                outputs=[fg_display],
-                device=device,
+                objects,
+                [*of_object, *knots[:3], constants.bins_fg],
+                fg_display,
             )
-            wp.launch(
+            launch(
                 composite_kernels.tone_shadow,
-                dim=receivers,
-                inputs=[ratio, *knots[3:], constants.bins_shadow],
-                outputs=[ratio_display],
-                device=device,
+                shaded,
+                [ratio, *knots[3:], constants.bins_shadow],
+                ratio_display,
             )
-            wp.launch(
+            launch(
                 composite_kernels.compose,
-                dim=pixels,
-                inputs=[
-                    constants.photo_lin,
-                    constants.object_index,
-                    constants.receiver_index,
-                    constants.mask,
-                    fg_display,
-                    ratio_display,
-                ],
-                outputs=[image],
-                device=device,
+                pixels,
+                [constants.photo_lin, *indices, constants.mask, fg_display, ratio_display],
+                image,
             )
         ctx.arrays = [foreground, lit, unoccluded, *knots]
         ctx.image, ctx.like = image, tensors

@@ -102,12 +102,8 @@ def make_picture(
     receiver_pixels, ratio = _shadow(
         renderer, args_shadow, light_shadow, gbuffer.object_pixels, quality, shadow_mask
     )
-    fg_display, ratio_display = renderer.tone(
-        foreground, ratio, curve_fg, curve_shadow, is_reinhard
-    )
-    planes = _planes(
-        renderer.scene.camera, gbuffer, foreground, fg_display, (receiver_pixels, ratio_display)
-    )
+    fg, beta = renderer.tone(foreground, ratio, curve_fg, curve_shadow, is_reinhard)
+    planes = _planes(renderer.scene.camera, gbuffer, foreground, fg, (receiver_pixels, beta))
     if planes["matte"].shape != photo.srgb.shape[:2]:
         planes = _resize_planes(planes, *photo.srgb.shape[:2])
     if occluder is not None:
