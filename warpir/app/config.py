@@ -251,6 +251,7 @@ LIGHTS = ("light", "sun", "sky", "reuse")
 
 
 Check = Callable[[str, bool, str], Iterator[InputError]]
+Needs = Iterator[tuple[str, bool, str]]
 
 
 def _values_out_of_range(config: InsertConfig) -> Iterator[InputError]:
@@ -366,67 +367,72 @@ def replaced_by(changes: Mapping[str, Any], among: Container[str]) -> dict[str, 
 
 def _values_that_clash(config: InsertConfig) -> Iterator[InputError]:
     values = config.flat()
-
-    def given(name: str) -> bool:
-        return bool(values[name] != DEFAULTS[name])
-
-    def needs(name: str, fulfilled: bool, what: str) -> Iterator[InputError]:
-        if given(name) and not fulfilled:
-            yield usage(flag(name), f"needs {what}")
-
+    given = {name for name, value in values.items() if value != DEFAULTS[name]}
     for first, second in EXCLUSIVE:
-        if given(first) and given(second):
+        if {first, second} <= given:
             yield usage(flag(second), f"cannot be used with {flag(first)}", "leave one of them out")
-    guided, with_words = config.guided_by != "none", config.guided_by == "stable-diffusion"
-    if given("reuse") and guided and not given("refine"):
+    if "reuse" in given and config.guided_by != "none" and "refine" not in given:
         yield usage(
-            "--guidance" if given("guidance") else "--model",
+            "--guidance" if "guidance" in given else "--model",
             "cannot be used with --reuse, whose light is known",
             "leave one of them out, or say with --refine what is to change under that light",
         )
-    yield from needs("plane", given("proxy"), "--proxy, without which there is no other ground")
-    if given("shadow_mask") and config.is_guided:
+    if "shadow_mask" in given and config.is_guided:
         yield usage(
             "--shadow-mask",
             "cannot be used while a prior changes the light or the object",
             "recover the light first, then give the mask with --reuse",
         )
-    yield from needs("mitsuba", config.output.hand_off, "the files that --no-hand-off leaves out")
-    yield from needs("fit_lobes", given("light"), "--light with a panorama to fit")
-    yield from needs("light_convention", given("light"), "--light with a panorama")
-    yield from needs("up", given("camera"), "--camera; without a camera file the world is Y up")
-    for name in ("frame", "undistort", "ground_points"):
-        yield from needs(name, given("camera"), "--camera with a camera file")
-    yield from needs("sequence", given("reuse"), "--reuse: one light for all frames")
-    yield from needs("fps", given("sequence"), "--sequence, of which the video is made")
-    yield from needs("show_prior", with_words, "--guidance stable-diffusion and its --model")
-    if given("show_prior") and with_words and config.adapter.personalize is False:
-        yield usage("--no-personalize", "cannot be used with --show-prior, which shows its effect")
-    if given("lora") and config.adapter.personalize is False:
-        yield usage("--no-personalize", "cannot be used with --lora", "leave one of them out")
-    asks = f"--guidance with a prior (--model, or --steps {EMBEDDED_STEPS} for the embedded one)"
-    yield from needs("resume", config.is_guided, f"{asks}: nothing else has checkpoints")
-    asks_embedded = config.is_guided and not with_words
-    steps = f"--guidance embedded and --steps {EMBEDDED_STEPS}: the prior is not asked without"
-    yield from needs("prior", asks_embedded, steps)
-    yield from needs("accept", config.is_guided, f"{asks}, whose result it judges")
-    is_demo_lit = given("demo") and (not guided or given("refine"))
-    lit = any(map(given, LIGHTS)) or is_demo_lit
-    level = "--light, --sun or --sky: with --guidance alone the light's level is recovered"
-    yield from needs("exposure", lit or not config.is_guided, level)
-    turned = given("light") or given("reuse") or is_demo_lit
-    yield from needs("light_rotate", turned, "--light or --reuse; of --sun, give another azimuth")
-    yield from needs("refine", lit, "a known light: --reuse, --light, --sun or --sky")
-    who_judges = "--guidance stable-diffusion, which judges the change: no other knows colours"
-    yield from needs("refine", with_words, who_judges)
-    yield from needs("refine_parts", config.task.refine == "material", "--refine material")
-    with_materials = config.task.refine in ("material", "emission")
-    yield from needs("refine_materials", with_materials, "--refine material or emission")
+    for name, fulfilled, what in (*_needs_of_scene(config, given), *_needs_of_prior(config, given)):
+        if name in given and not fulfilled:
+            yield usage(flag(name), f"needs {what}")
+    if config.adapter.personalize is False:
+        if "show_prior" in given and config.guided_by == "stable-diffusion":
+            what = "cannot be used with --show-prior, which shows its effect"
+            yield usage("--no-personalize", what)
+        if "lora" in given:
+            what = "cannot be used with --lora"
+            yield usage("--no-personalize", what, "leave one of them out")
     if config.task.refine == "tone" and config.optimize.tone_curve is False:
-        yield usage(
-            "--no-tone-curve", "cannot be used with --refine tone, which changes nothing else"
-        )
+        what = "cannot be used with --refine tone, which changes nothing else"
+        yield usage("--no-tone-curve", what)
     yield from _losses_that_clash(config)
+
+
+def _needs_of_scene(config: InsertConfig, given: Container[str]) -> Needs:
+    """Yield (name, whether it has what it needs, what that is) of camera, light and output."""
+    yield "plane", "proxy" in given, "--proxy, without which there is no other ground"
+    yield "mitsuba", config.output.hand_off, "the files that --no-hand-off leaves out"
+    yield "fit_lobes", "light" in given, "--light with a panorama to fit"
+    yield "light_convention", "light" in given, "--light with a panorama"
+    yield "up", "camera" in given, "--camera; without a camera file the world is Y up"
+    for name in ("frame", "undistort", "ground_points"):
+        yield name, "camera" in given, "--camera with a camera file"
+    yield "sequence", "reuse" in given, "--reuse: one light for all frames"
+    yield "fps", "sequence" in given, "--sequence, of which the video is made"
+    is_demo_lit = "demo" in given and (config.guided_by == "none" or "refine" in given)
+    is_lit = is_demo_lit or any(name in given for name in LIGHTS)
+    level = "--light, --sun or --sky: with --guidance alone the light's level is recovered"
+    yield "exposure", is_lit or not config.is_guided, level
+    is_turned = "light" in given or "reuse" in given or is_demo_lit
+    yield "light_rotate", is_turned, "--light or --reuse; of --sun, give another azimuth"
+    yield "refine", is_lit, "a known light: --reuse, --light, --sun or --sky"
+
+
+def _needs_of_prior(config: InsertConfig, given: Container[str]) -> Needs:
+    """As `_needs_of_scene`, of what a prior is asked."""
+    with_words = config.guided_by == "stable-diffusion"
+    yield "show_prior", with_words, "--guidance stable-diffusion and its --model"
+    asks = f"--guidance with a prior (--model, or --steps {EMBEDDED_STEPS} for the embedded one)"
+    yield "resume", config.is_guided, f"{asks}: nothing else has checkpoints"
+    steps = f"--guidance embedded and --steps {EMBEDDED_STEPS}: the prior is not asked without"
+    yield "prior", config.is_guided and not with_words, steps
+    yield "accept", config.is_guided, f"{asks}, whose result it judges"
+    who_judges = "--guidance stable-diffusion, which judges the change: no other knows colours"
+    yield "refine", with_words, who_judges
+    yield "refine_parts", config.task.refine == "material", "--refine material"
+    with_materials = config.task.refine in ("material", "emission")
+    yield "refine_materials", with_materials, "--refine material or emission"
 
 
 def _losses_that_clash(config: InsertConfig) -> Iterator[InputError]:

@@ -77,6 +77,29 @@ def _load(path: str, limits: Limits) -> Any:
             raise
     import yaml
 
+    try:
+        loader = _yaml_loader(path, limits)(_read_text(path, limits))
+        try:
+            node = loader.get_single_node()
+            _refuse_double_keys(path, node)
+            return loader.construct_document(node) if node is not None else {}
+        finally:
+            loader.dispose()
+    except yaml.MarkedYAMLError as error:
+        mark = error.problem_mark
+        line = f"line {mark.line + 1}: " if mark is not None else ""
+        raise usage(path, f"{line}not YAML ({error.problem})") from None
+    except (LookupError, AttributeError):  # of !!bool maybe, !!float "", !!timestamp x
+        raise usage(path, "not usable YAML (a value is not what its tag says)") from None
+    except (yaml.YAMLError, ValueError, TypeError) as error:
+        reason = "".join(str(error).splitlines()[:1])[:120]
+        raise usage(path, f"not usable YAML ({reason})") from None
+
+
+def _yaml_loader(path: str, limits: Limits) -> Callable[[str], Any]:
+    """Return PyYAML's safe loader without what a configuration does not need."""
+    import yaml
+
     class Loader(yaml.SafeLoader):
         level = 0
 
@@ -110,23 +133,7 @@ def _load(path: str, limits: Limits) -> Any:
             if any(key.tag == f"{YAML}merge" for key, _ in node.value):
                 raise usage(path, f"line {node.start_mark.line + 1}: merge keys (<<) are not read")
 
-    try:
-        loader = Loader(_read_text(path, limits))
-        try:
-            node = loader.get_single_node()
-            _refuse_double_keys(path, node)
-            return loader.construct_document(node) if node is not None else {}
-        finally:
-            loader.dispose()
-    except yaml.MarkedYAMLError as error:
-        mark = error.problem_mark
-        line = f"line {mark.line + 1}: " if mark is not None else ""
-        raise usage(path, f"{line}not YAML ({error.problem})") from None
-    except (LookupError, AttributeError):  # of !!bool maybe, !!float "", !!timestamp x
-        raise usage(path, "not usable YAML (a value is not what its tag says)") from None
-    except (yaml.YAMLError, ValueError, TypeError) as error:
-        reason = "".join(str(error).splitlines()[:1])[:120]
-        raise usage(path, f"not usable YAML ({reason})") from None
+    return Loader
 
 
 def _within(limits: Limits, name: str, found: int, path: str, what: str, more: str) -> None:
