@@ -308,8 +308,7 @@ def test_disk_estimate_covers_a_run(inputs: Path, tmp_path: Path) -> None:
 
     plain = InsertConfig(demo=True, out=str(tmp_path), guidance="none")
     for mitsuba, written in ((False, 15.3e6), (True, 22.7e6)):
-        config = demo_config(plain if not mitsuba else InsertConfig(**{
-            **vars(plain), "mitsuba": True}))  # fmt: skip
+        config = demo_config(plain.changed(mitsuba=mitsuba))
         needed = needed_bytes(config, read_inputs(config))
         assert written < needed < 5 * written
 
