@@ -13,102 +13,25 @@ terms mean, and a mean underflows in a half-precision autoencoder.
 from __future__ import annotations
 
 import math
-from collections import deque
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from statistics import median
-from typing import Any, Protocol, cast
+from typing import Any
 
 import torch
 from torch import Tensor
 
-from warpir.diffusion.crop import Crop, box_of, draw_crop, shrink
-from warpir.diffusion.draws import generator_of, seed_of
-from warpir.diffusion.models.model_error import ModelError
-from warpir.diffusion.prior import (
-    Condition,
-    Counts,
-    InChunks,
-    Prior,
-    at_once,
-)
+from warpir.diffusion.crop import box_of, draw_crop, shrink
+from warpir.diffusion.dataset_update import DATASET_UPDATE, DatasetUpdate
+from warpir.diffusion.draws import generator_of
+from warpir.diffusion.gradient_gate import GradientGate
+from warpir.diffusion.prior import Condition, Counts, Prior
 from warpir.diffusion.schedule import time_range, weight
 from warpir.diffusion.settings import GuidanceSettings
 
-DATASET_UPDATE = "dataset-update"
-"""The loss that has no row: the picture is edited, and the edit is the target."""
-"""Steps in a row without a finite gradient that end the run."""
-NORM_WINDOW = 101
-"""Past steps whose median norm tells what an outlier is."""
-NORM_COUNT_MIN = 10
-"""Past steps before anything is clipped: the norm varies tenfold with the time alone."""
 PAIR_COUNT = 8
 """Crops, times and noises of a score."""
-EDIT_COUNT = 4
-"""Edited crops of a score of `DatasetUpdate`, each of which costs many passes."""
 CHECK_COUNT = 4
 """Crops, times and noises of a check of the precision."""
-VALUES_PER_LATENT = 48
-"""Values of a picture for each of its latents: Stable Diffusion makes 4 of 8 x 8 x 3."""
-
-
-class Guide(Protocol):
-    """What turns a picture into a gradient."""
-
-    @property
-    def counts(self) -> Counts:
-        """What the user is told in the end."""
-
-    def gradient(self, image: Tensor, step: int) -> Tensor | None:
-        """Return the loss gradient of an image, same shape, dtype and device; see `Guidance`.
-
-        Args:
-            image: Display-encoded, in [0, 1], shape [1, 3, H, W].
-            step: From 0.
-
-        Returns:
-            None when this step has no finite gradient.
-        """
-
-    def score(self, image: Tensor, seed: int | None = None) -> float | None:
-        """Return how wrong an image looks, lower is better; None when that is not finite.
-
-        The same times, noises and crops every time, so that states of a run can be compared.
-
-        Args:
-            image: Display-encoded, in [0, 1], shape [1, 3, H, W].
-            seed: Of what is drawn; the guidance's own by default.
-        """
-
-    def state_dict(self) -> dict[str, Any]:
-        """Return what a later run needs to go on: tensors, numbers and lists of numbers."""
-
-    def load_state_dict(self, state: Mapping[str, Any]) -> None:
-        """Go on from `state_dict`."""
-
-
-class EditingPrior(Prior, Protocol):
-    """A prior that can also change a picture."""
-
-    def edit(
-        self,
-        image: Tensor,
-        prompt: str,
-        seed: int,
-        *,
-        strength: float,
-        steps: int,
-        scale: float,
-        adapter: str | None = None,
-    ) -> Tensor:
-        """Return the picture after noise and denoising (SDEdit), in [0, 1], of the same shape."""
-
-
-class PrecisePrior(Prior, Protocol):
-    """A prior that may compute in less than full precision."""
-
-    def ensure_precision(self, difference: Callable[[], Tensor]) -> float:
-        """Go on in full precision if the difference needs it; return its cosine with the exact."""
 
 
 @dataclass(frozen=True)
@@ -190,47 +113,6 @@ def terms_of(settings: GuidanceSettings, condition: Condition, adapter: str | No
         Term(row.k_n, negative_prompt, other, keeps),
     ]
     return [term for term in terms if term.scale]
-
-
-class GradientGate:
-    """Lets finite gradients pass, shortens outliers, and counts those.
-
-    Args:
-        clip: Greatest norm in running medians; 0 for no limit.
-    """
-
-    def __init__(self, clip: float) -> None:
-        self.clip = clip
-        self.counts = Counts()
-        self.norms: deque[float] = deque(maxlen=NORM_WINDOW)
-
-    def passed(self, d_image: Tensor | None) -> Tensor | None:
-        """Return the gradient, no longer than allowed; None when it is not finite.
-
-        Args:
-            d_image: Any shape; None when it is known not to be finite.
-        """
-        norm = math.nan
-        if d_image is not None:
-            # In float64 the norm is finite exactly when every element is.
-            norm = float(torch.linalg.vector_norm(d_image, dtype=torch.float64))
-        if d_image is None or not math.isfinite(norm):
-            return None
-        limit = self.clip * median(self.norms) if len(self.norms) >= NORM_COUNT_MIN else 0.0
-        self.norms.append(norm)
-        if not 0.0 < limit < norm:
-            return d_image
-        self.counts.clipped_steps += 1
-        return d_image * (limit / norm)
-
-    def state_dict(self) -> dict[str, Any]:
-        """Return numbers and lists of numbers."""
-        return {"norms": list(self.norms), "clipped_steps": self.counts.clipped_steps}
-
-    def load_state_dict(self, state: Mapping[str, Any]) -> None:
-        """Go on from `state_dict`."""
-        self.norms = deque(state["norms"], maxlen=NORM_WINDOW)
-        self.counts.clipped_steps = int(state["clipped_steps"])
 
 
 @dataclass(frozen=True)
@@ -331,9 +213,8 @@ class Guidance:
             (d_image,) = torch.autograd.grad(crops.latents, leaf, residual / scale)
             return d_image * scale.to(d_image)
 
-        in_chunks: InChunks = getattr(self.prior, "in_chunks", at_once)
-        spare = getattr(self.prior, "spare_memory", lambda: None)
-        parts = in_chunks(of, s.noises, "guidance", "--noises or --guidance-width", spare)
+        flags = "--noises or --guidance-width"
+        parts = self.prior.in_chunks(of, s.noises, "guidance", flags, self.prior.spare_memory)
         total = next(parts)
         for part in parts:
             total = total + part
@@ -341,10 +222,10 @@ class Guidance:
 
     def _overflows(self, image: Tensor, d_image: Tensor) -> bool:
         """Return whether half precision may have spoilt a gradient and was given up for fp32."""
-        upcast: Callable[[], bool] = getattr(self.prior, "upcast", lambda: False)
         if bool(d_image.isfinite().all()) or not bool(image.isfinite().all()):
             return False
-        return upcast()
+        half = self.prior.half_precision
+        return half is not None and half.upcast()
 
     def with_loss(self, loss: str) -> Guidance:
         """Return the same guidance with another loss.
@@ -438,10 +319,11 @@ class Guidance:
             Cosine between delta as computed before and in full precision; None when the prior has
             but one.
         """
-        if not hasattr(self.prior, "ensure_precision"):
+        half = self.prior.half_precision
+        if half is None:
             return None
         batches = self._fixed_crops(image, "precision", self.seed, CHECK_COUNT)
-        return cast(PrecisePrior, self.prior).ensure_precision(
+        return half.ensure_precision(
             lambda: torch.cat([self._delta(crops, self._predictions(crops)) for crops in batches])
         )
 
@@ -540,141 +422,6 @@ def _upload(values: Tensor, device: torch.device) -> Tensor:
     if device.type != "cuda":
         return values.to(device)
     return values.pin_memory().to(device, non_blocking=True)
-
-
-class DatasetUpdate:
-    """The picture is edited now and then, and drawn towards its edit (DiPIR, table 3).
-
-    Every ``update_every`` steps a crop is edited by SDEdit with the adapted model; its strength is
-    the greatest time of that step. Until the next edit the gradient is that of the L1 distance
-    between this crop and its edit: its mean times the number of latents, so that it counts as much
-    as a sum over latents does in the other losses. One crop at a time, however many noises.
-
-    Args:
-        prior: Must also be able to edit.
-        condition: What the picture is to be judged by; its prompt alone counts.
-        settings: Times, crops and edits.
-        mask: Coverage of the object, shape [H, W].
-        steps: Length of the run, over which the strength falls.
-        seed: Of what is drawn.
-        adapter: Name of the LoRA of this photo, or None for the base model.
-
-    Raises:
-        ValueError: The mask is empty.
-        ModelError: The prior cannot edit pictures.
-    """
-
-    def __init__(
-        self,
-        prior: Prior,
-        condition: Condition,
-        settings: GuidanceSettings,
-        mask: Tensor,
-        steps: int,
-        seed: int,
-        adapter: str | None,
-    ) -> None:
-        if not hasattr(prior, "edit"):
-            raise ModelError(prior.name, f"cannot edit pictures, as {DATASET_UPDATE} needs")
-        self.prior = cast(EditingPrior, prior)
-        # An edit asks for the same two; by then the text encoder may be gone.
-        prior.embed([condition.prompt, ""])
-        self.condition, self.settings, self.adapter = condition, settings, adapter
-        self.box, self.steps, self.seed = box_of(mask), steps, seed
-        self.gate = GradientGate(settings.gradient_clip)
-        self.crop: Crop | None = None
-        self.edited: Tensor | None = None
-
-    @property
-    def counts(self) -> Counts:
-        """What the user is told in the end."""
-        return self.gate.counts
-
-    def gradient(self, image: Tensor, step: int) -> Tensor | None:
-        """Return the gradient of the L1 distance between the crop and its edit.
-
-        Args:
-            image: Display-encoded, in [0, 1], shape [1, 3, H, W].
-            step: From 0.
-
-        Returns:
-            Same shape, dtype and device; None when it is not finite.
-        """
-        s = self.settings
-        if self.crop is None or self.edited is None or step % s.update_every == 0:
-            strength = time_range(step, self.steps, s.time_min, s.time_max, s.time_max_end)[1]
-            self.crop = self._draw(image, self.seed, step)
-            self.edited = self._edit(image, self.crop, strength, self.seed, step)
-        leaf = image.detach().requires_grad_()
-        distance = self._distance(leaf, self.crop, self.edited)
-        # The derivative of |x| is a sign, and that of NaN is 0: only the distance tells.
-        if not math.isfinite(distance.item()):
-            self.edited = None
-            return self.gate.passed(None)
-        (d_image,) = torch.autograd.grad(distance, leaf)
-        return self.gate.passed(d_image)
-
-    @torch.no_grad()
-    def score(
-        self, image: Tensor, seed: int | None = None, edits: int = EDIT_COUNT
-    ) -> float | None:
-        """Return how much the model would change an image; None when that is not finite.
-
-        The mean distance between crops and their edits, all of the run's greatest strength.
-
-        Args:
-            image: Display-encoded, in [0, 1], shape [1, 3, H, W].
-            seed: Of edits and crops; the guidance's own by default.
-            edits: Crops.
-        """
-        seed = self.seed if seed is None else seed
-        distances = []
-        for k in range(edits):
-            crop = self._draw(image, seed, "score", k)
-            edited = self._edit(image, crop, self.settings.time_max, seed, "score", k)
-            distances.append(self._distance(image, crop, edited).item())
-        score = sum(distances) / edits
-        return score if math.isfinite(score) else None
-
-    def state_dict(self) -> dict[str, Any]:
-        """Return numbers, lists of numbers and the edited crop."""
-        state = self.gate.state_dict()
-        if self.crop is not None and self.edited is not None:
-            state["crop"] = [self.crop.x, self.crop.y, self.crop.side]
-            state["edited"] = self.edited.cpu()
-        return state
-
-    def load_state_dict(self, state: Mapping[str, Any]) -> None:
-        """Go on from `state_dict`."""
-        self.gate.load_state_dict(state)
-        self.crop = Crop(*state["crop"]) if "crop" in state else None
-        self.edited = state["edited"].to(self.prior.device) if "edited" in state else None
-
-    def _draw(self, image: Tensor, *key: int | str) -> Crop:
-        height, width = image.shape[-2:]
-        return draw_crop(self.box, (height, width), self.settings, generator_of(*key))
-
-    @torch.no_grad()
-    def _edit(self, image: Tensor, crop: Crop, strength: float, *key: int | str) -> Tensor:
-        """Return the edited crop, shape [1, 3, R, R]."""
-
-        def edited(first: int, last: int) -> Tensor:
-            return self.prior.edit(
-                crop.apply(image, self.prior.resolution).to(self.prior.device),
-                self.condition.prompt,
-                seed_of(*key, "edit"),
-                strength=strength,
-                steps=self.settings.update_steps,
-                scale=self.settings.update_scale,
-                adapter=self.adapter,
-            )
-
-        in_chunks: InChunks = getattr(self.prior, "in_chunks", at_once)
-        return next(in_chunks(edited, 1, "an edit of the picture", "--precision"))
-
-    def _distance(self, image: Tensor, crop: Crop, edited: Tensor) -> Tensor:
-        difference = crop.apply(image, self.prior.resolution) - edited.to(image)
-        return difference.abs().sum() / VALUES_PER_LATENT
 
 
 def make_guidance(

@@ -77,6 +77,40 @@ class Condition:
     the photo (`warpir.diffusion.models.embedded.GBUFFER_CHANNELS`), shape [1, 13, H, W]."""
 
 
+class Editor(Protocol):
+    """Changes a picture towards a prompt; an ability that a prior may lack."""
+
+    def edit(
+        self,
+        image: Tensor,
+        prompt: str,
+        seed: int,
+        *,
+        strength: float,
+        steps: int,
+        scale: float,
+        adapter: str | None = None,
+    ) -> Tensor:
+        """Return the picture after noise and denoising (SDEdit), in [0, 1], of the same shape."""
+
+
+class HalfPrecision(Protocol):
+    """Networks that compute in less than full precision, and can be switched over to it."""
+
+    def upcast(self) -> bool:
+        """Compute in fp32 from now on; return False where that is so already."""
+
+    def ensure_precision(self, difference: Callable[[], Tensor]) -> float:
+        """Compute in fp32 from now on if a difference of predictions needs it.
+
+        Args:
+            difference: Predicts and subtracts; called twice, with all else equal.
+
+        Returns:
+            Cosine between the difference as computed before and in fp32.
+        """
+
+
 class Prior(Protocol):
     """A denoiser and its schedule; weights never change, adapters are added beside them."""
 
@@ -90,6 +124,19 @@ class Prior(Protocol):
     device: torch.device
     adapters: set[str]
     """Names of the LoRAs that were loaded or trained."""
+    in_chunks: InChunks
+    """How its larger batches are computed, such as in halves where memory is short."""
+
+    @property
+    def editor(self) -> Editor | None:
+        """Return what edits pictures, or None."""
+
+    @property
+    def half_precision(self) -> HalfPrecision | None:
+        """Return what switches to full precision, or None where nothing else is computed in."""
+
+    def spare_memory(self) -> None:
+        """Free what only makes it faster."""
 
     def embed(self, prompts: Sequence[str]) -> Tensor:
         """Return the prompts' embeddings, shape [prompt, token, channel]; each is computed once.

@@ -46,7 +46,7 @@ from warpir.diffusion.models.embedded import (
 )
 from warpir.diffusion.models.model_error import ModelError
 from warpir.diffusion.models.network_prior import no_tf32
-from warpir.diffusion.personalization.lora_files import read_safetensors, serialize
+from warpir.diffusion.models.tensor_files import read_safetensors, serialize
 from warpir.diffusion.schedule import NoiseSchedule
 
 FORMAT = 1

@@ -32,10 +32,11 @@ from torch.nn import functional
 from warpir.core.atomic import write_file
 from warpir.diffusion.models.model_error import ModelError
 from warpir.diffusion.models.network_prior import NetworkPrior
+from warpir.diffusion.models.tensor_files import read_safetensors, serialize
 from warpir.diffusion.models.weight_files import PRIOR_FORMAT as FORMAT
 from warpir.diffusion.models.weight_files import PRIOR_KEY as HEADER_KEY
 from warpir.diffusion.models.weight_files import SHIPPED, values_hash
-from warpir.diffusion.personalization.lora_files import read_safetensors, serialize
+from warpir.diffusion.prior import InChunks, at_once
 from warpir.diffusion.prompts import Prompts, make_prompts
 from warpir.diffusion.schedule import NoiseSchedule
 from warpir.diffusion.settings import PersonalizeSettings
@@ -372,6 +373,7 @@ class EmbeddedPrior(NetworkPrior):
         file_hashes: sha256 by name of every file that it was made of.
         training: How the weights came about, from their file; empty for random ones.
         graphs: Record what is done often as CUDA graphs; the device must be one.
+        in_chunks: How larger batches are computed.
     """
 
     name = "embedded"
@@ -382,6 +384,7 @@ class EmbeddedPrior(NetworkPrior):
         file_hashes: Mapping[str, str],
         training: Mapping[str, Any] | None = None,
         graphs: bool = False,
+        in_chunks: InChunks = at_once,
     ) -> None:
         self.network = network.requires_grad_(False).eval()
         self.training = dict(training or {})
@@ -395,7 +398,14 @@ class EmbeddedPrior(NetworkPrior):
         }
         shape = (3, RESOLUTION, RESOLUTION)
         super().__init__(
-            network.unet, schedule, solver_config, shape, RESOLUTION, file_hashes, graphs
+            network.unet,
+            schedule,
+            solver_config,
+            shape,
+            RESOLUTION,
+            file_hashes,
+            graphs,
+            in_chunks,
         )
 
     def encode(self, image: Tensor) -> Tensor:
@@ -505,7 +515,10 @@ def save_embedded(network: EmbeddedNetwork, path: Path, training: Mapping[str, A
 
 
 def load_embedded(
-    weights: Path | str | None, device: torch.device | str, graphs: bool = False
+    weights: Path | str | None,
+    device: torch.device | str,
+    graphs: bool = False,
+    in_chunks: InChunks = at_once,
 ) -> EmbeddedPrior:
     """Load a prior.
 
@@ -513,6 +526,7 @@ def load_embedded(
         weights: A file of `save_embedded`; None: the one that is part of the package.
         device: Where it computes.
         graphs: Record what is done often as CUDA graphs; the device must be one.
+        in_chunks: How larger batches are computed.
 
     Raises:
         ModelError: The file is not there, is damaged or holds something else.
@@ -524,7 +538,7 @@ def load_embedded(
     network, training = read_network(path)
     with path.open("rb") as file:
         digest = hashlib.file_digest(file, "sha256").hexdigest()
-    return EmbeddedPrior(network.to(device), {path.name: digest}, training, graphs)
+    return EmbeddedPrior(network.to(device), {path.name: digest}, training, graphs, in_chunks)
 
 
 def read_network(path: Path) -> tuple[EmbeddedNetwork, dict[str, Any]]:

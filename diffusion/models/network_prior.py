@@ -42,6 +42,7 @@ class NetworkPrior(ABC):
         resolution: Side of the pictures that it judges [px].
         file_hashes: sha256 by name of every file that it was made of.
         graphs: Record what is done often as CUDA graphs; the device must be one.
+        in_chunks: How larger batches are computed.
     """
 
     name: str
@@ -56,6 +57,7 @@ class NetworkPrior(ABC):
         resolution: int,
         file_hashes: Mapping[str, str],
         graphs: bool,
+        in_chunks: InChunks = at_once,
     ) -> None:
         unet.requires_grad_(False).eval()
         self.unet, self.schedule = unet, schedule
@@ -67,8 +69,7 @@ class NetworkPrior(ABC):
         self.file_hashes = dict(sorted(file_hashes.items()))
         lines = "".join(f"{name} {sha256}\n" for name, sha256 in self.file_hashes.items())
         self.digest = hashlib.sha256(lines.encode()).hexdigest()
-        self.in_chunks: InChunks = at_once
-        """How batches are done; replaced by who watches over memory."""
+        self.in_chunks = in_chunks
         self.adapters: set[str] = set()
         """Whoever adds an adapter to the UNet names it here."""
         self.notices: tuple[str, ...] = ()
@@ -80,6 +81,16 @@ class NetworkPrior(ABC):
     def precision(self) -> dict[str, str]:
         """Arithmetic of each network that decides what is made, such as ``unet``: ``fp16``."""
         return {"unet": name_of_dtype(self.unet_dtype)}
+
+    @property
+    def editor(self) -> NetworkPrior:
+        """Return what edits pictures."""
+        return self
+
+    @property
+    def half_precision(self) -> NetworkPrior:
+        """Return what switches to full precision."""
+        return self
 
     def state_dict(self) -> dict[str, Any]:
         """Return what a run has changed in it beside adapters: plain values."""

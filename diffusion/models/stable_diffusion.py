@@ -30,6 +30,7 @@ from warpir.diffusion.models.model_folder import (
     hub_offline,
 )
 from warpir.diffusion.models.network_prior import DTYPES, NetworkPrior, name_of_dtype
+from warpir.diffusion.prior import InChunks, at_once
 from warpir.diffusion.schedule import NoiseSchedule
 from warpir.diffusion.settings import ModelSettings
 
@@ -61,6 +62,7 @@ class StableDiffusion(NetworkPrior):
         file_hashes: sha256 by name of every file that it was made of.
         checkpoint_vae: Recompute the VAE's encoder in the backward pass instead of keeping it.
         graphs: Record what is done often as CUDA graphs; the device must be one.
+        in_chunks: How larger batches are computed.
     """
 
     name = "stable-diffusion"
@@ -75,6 +77,7 @@ class StableDiffusion(NetworkPrior):
         file_hashes: dict[str, str],
         checkpoint_vae: bool = True,
         graphs: bool = False,
+        in_chunks: InChunks = at_once,
     ) -> None:
         self.vae, self.tokenizer = vae, tokenizer
         self.text_encoder: CLIPTextModel | None = text_encoder
@@ -94,6 +97,7 @@ class StableDiffusion(NetworkPrior):
             side * 2 ** (len(vae.config.block_out_channels) - 1),
             file_hashes,
             graphs,
+            in_chunks,
         )
         self._mean = _PosteriorMean(vae)
         self._recorded_mean = self.graphs.recorded_module(self._mean) if self.graphs else None
@@ -247,12 +251,15 @@ class _PosteriorMean(nn.Module):
         return (self.vae.encode(pixels).latent_dist.mean,)
 
 
-def load_stable_diffusion(settings: ModelSettings, device: torch.device | str) -> StableDiffusion:
+def load_stable_diffusion(
+    settings: ModelSettings, device: torch.device | str, in_chunks: InChunks = at_once
+) -> StableDiffusion:
     """Load a model from a folder, or from a hub id in the local cache.
 
     Args:
         settings: Which model, and how it is computed; on the CPU always in fp32.
         device: Where UNet, VAE and text encoder go.
+        in_chunks: How larger batches are computed.
 
     Raises:
         ModelError: The model is not there, is another one or is damaged; one sentence says how.
@@ -289,6 +296,7 @@ def load_stable_diffusion(settings: ModelSettings, device: torch.device | str) -
             dict(hashes),
             settings.vae_checkpointing,
             settings.graphs and device.type == "cuda",
+            in_chunks,
         )
     if asked != (unet_precision, vae_precision):
         prior.notices += (f"the CPU computes in fp32 (asked for: {', '.join(sorted(set(asked)))})",)

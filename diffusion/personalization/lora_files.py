@@ -26,15 +26,14 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import torch
-from safetensors import SafetensorError, safe_open
-from safetensors.torch import save
 from torch import Tensor, nn
 
 from warpir.core.atomic import write_file
 from warpir.diffusion.draws import generator_of
 from warpir.diffusion.models.model_error import ModelError
 from warpir.diffusion.models.model_folder import read_json
-from warpir.diffusion.models.weight_files import beside_lora, fault_of, not_a_lora, read_header
+from warpir.diffusion.models.tensor_files import read_safetensors, serialize
+from warpir.diffusion.models.weight_files import beside_lora, not_a_lora
 
 if TYPE_CHECKING:
     from warpir.diffusion.models.network_prior import NetworkPrior
@@ -187,20 +186,6 @@ def read_lora(path: str | Path) -> Lora:
     partial = config.get("layers_to_transform") or config.get("exclude_modules")
     listed = isinstance(targets, list) and not partial
     return Lora(weights, alphas, tuple(sorted(targets)) if listed and targets else ())
-
-
-def read_safetensors(path: Path) -> tuple[dict[str, Tensor], dict[str, str]]:
-    """Return tensors and what the header says of a safetensors file.
-
-    Raises:
-        ModelError: It is not there, or not a whole safetensors file.
-    """
-    header = read_header(path)
-    try:
-        with safe_open(path, framework="pt", device="cpu") as file:
-            return {key: file.get_tensor(key) for key in file.keys()}, header.about
-    except (SafetensorError, OSError, RuntimeError) as error:
-        raise ModelError(str(path), *fault_of(path)) from error
 
 
 def _own_config(path: Path, header: dict[str, str]) -> dict[str, Any]:
@@ -465,14 +450,3 @@ def save_lora(
     kohya_file = Path(folder) / "lora_kohya.safetensors"
     write_file(kohya_file, serialize(kohya, header))
     return diffusers_file, kohya_file
-
-
-def serialize(tensors: Mapping[str, Tensor], header: Mapping[str, str]) -> bytes:
-    """Return a safetensors file; unlike the library's its header is always in the same order."""
-    content = save({k: v.detach().cpu().contiguous() for k, v in tensors.items()}, dict(header))
-    length = int.from_bytes(content[:8], "little")
-    names = json.loads(content[8 : 8 + length])
-    names["__metadata__"] = dict(sorted(names["__metadata__"].items()))
-    text = json.dumps(names, separators=(",", ":"), ensure_ascii=False).encode()
-    text += b" " * (-len(text) % 8)
-    return len(text).to_bytes(8, "little") + text + content[8 + length :]

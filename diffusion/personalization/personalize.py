@@ -29,6 +29,7 @@ from warpir.diffusion.cache import content_key, model_key
 from warpir.diffusion.crop import Crop
 from warpir.diffusion.draws import generator_of
 from warpir.diffusion.models.model_error import ModelError
+from warpir.diffusion.models.tensor_files import serialize
 from warpir.diffusion.personalization.class_images import (
     Report,
     class_image_count,
@@ -43,7 +44,6 @@ from warpir.diffusion.personalization.lora_files import (
     lora_parameters,
     put_weights,
     remove_lora,
-    serialize,
 )
 from warpir.diffusion.prior import BAD_STEPS_MAX, NonFiniteError
 from warpir.diffusion.prompts import Prompts

@@ -469,10 +469,8 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def watched(folder: Path, device: str) -> tuple[StableDiffusion, Memory]:
     settings = ModelSettings(model=str(folder), precision="fp32", vae_precision="fp32")
-    prior = load_stable_diffusion(settings, device)
     memory = Memory()
-    prior.in_chunks = memory.in_chunks
-    return prior, memory
+    return load_stable_diffusion(settings, device, memory.in_chunks), memory
 
 
 @pytest.mark.case("R7")

@@ -16,20 +16,13 @@ from torch import Tensor
 from tests.builders.tiny_stable_diffusion import make_tiny_stable_diffusion
 from tests.statistics import central_differences, compare_gradients
 from warpir.diffusion.crop import Crop, shrink
+from warpir.diffusion.dataset_update import VALUES_PER_LATENT, DatasetUpdate
 from warpir.diffusion.draws import seed_of
-from warpir.diffusion.guidance import (
-    NORM_COUNT_MIN,
-    NORM_WINDOW,
-    VALUES_PER_LATENT,
-    DatasetUpdate,
-    GradientGate,
-    Guidance,
-    coefficients,
-    make_guidance,
-)
+from warpir.diffusion.gradient_gate import NORM_COUNT_MIN, NORM_WINDOW, GradientGate
+from warpir.diffusion.guidance import Guidance, coefficients, make_guidance
 from warpir.diffusion.models.model_error import ModelError
 from warpir.diffusion.models.stable_diffusion import StableDiffusion, load_stable_diffusion
-from warpir.diffusion.prior import Condition
+from warpir.diffusion.prior import Condition, Editor, HalfPrecision, InChunks, at_once
 from warpir.diffusion.schedule import NoiseSchedule
 from warpir.diffusion.settings import GuidanceSettings, ModelSettings
 
@@ -82,6 +75,12 @@ class GaussianPrior:
     calls: list[Call] = field(default_factory=list)
     prompts: list[str] = field(default_factory=list)
     embed_count: int = 0
+    in_chunks: InChunks = at_once
+    editor: Editor | None = None
+    half_precision: HalfPrecision | None = None
+
+    def spare_memory(self) -> None:
+        """There is nothing to free."""
 
     def __post_init__(self) -> None:
         self.schedule = schedule(self.prediction_type)
@@ -688,6 +687,14 @@ class Rounded(GaussianPrior):
 
     precise = False
 
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        self.half_precision = self
+
+    def upcast(self) -> bool:
+        """Return False: nothing of these tests overflows."""
+        return False
+
     def ensure_precision(self, difference: Callable[[], Tensor]) -> float:
         low = difference()
         self.precise = True
@@ -755,10 +762,14 @@ def test_base_prompt_defaults_to_the_prompt() -> None:
 
 
 @dataclass
-class Editor(GaussianPrior):
+class EditingPrior(GaussianPrior):
     """Moves a picture towards grey, by the strength asked for."""
 
     edits: list[tuple[str, int, float, int, float, str | None]] = field(default_factory=list)
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        self.editor = self
 
     def edit(
         self,
@@ -785,19 +796,19 @@ def update(prior: GaussianPrior, mask: Tensor = MASK, **changes: object) -> Data
 
 def test_dataset_update_pulls_to_the_edit(rng: np.random.Generator) -> None:
     """The gradient is the sign of the difference, one latent for 48 values, through the crop."""
-    prior = Editor()
+    prior = EditingPrior()
     x = picture(rng)
     found = update(prior).gradient(x, 0)
     assert found is not None
     torch.testing.assert_close(found, (x - 0.5).sign() / VALUES_PER_LATENT)
-    enlarged = update(Editor(resolution=32)).gradient(torch.full_like(x, 0.9), 0)
+    enlarged = update(EditingPrior(resolution=32)).gradient(torch.full_like(x, 0.9), 0)
     assert enlarged is not None
     assert float(enlarged.sum()) == pytest.approx(3 * 32 * 32 / VALUES_PER_LATENT)
 
 
 def test_dataset_update_edits_now_and_then(rng: np.random.Generator) -> None:
     """Every ten steps, with the adapted model, the schedule's strength and a seed of its own."""
-    prior = Editor()
+    prior = EditingPrior()
     made = update(prior, update_steps=12, update_scale=5.0)
     x = picture(rng)
     for step in range(100):
@@ -816,11 +827,11 @@ def test_dataset_update_restored_between_edits_continues_identically(
     mask = torch.zeros(24, 36)
     mask[8:16, 10:26] = 1.0
     pictures = [picture(rng, 24, 36) for _ in range(25)]
-    whole, first = update(Editor(), mask), update(Editor(), mask)
+    whole, first = update(EditingPrior(), mask), update(EditingPrior(), mask)
     expected = [whole.gradient(x, step) for step, x in enumerate(pictures)]
     for step in range(13):
         first.gradient(pictures[step], step)
-    prior = Editor()
+    prior = EditingPrior()
     second = update(prior, mask)
     second.load_state_dict(first.state_dict())
     for step in range(13, 25):
@@ -832,7 +843,7 @@ def test_dataset_update_restored_between_edits_continues_identically(
 
 def test_dataset_update_skips_what_is_not_finite(rng: np.random.Generator) -> None:
     """NaN has a sign of 0, so that the distance is looked at; the bad edit is not kept."""
-    prior = Editor()
+    prior = EditingPrior()
     made = update(prior)
     bad = torch.full((1, 3, 4, 4), math.nan, dtype=torch.float64)
     for step in range(4):
@@ -845,7 +856,7 @@ def test_dataset_update_skips_what_is_not_finite(rng: np.random.Generator) -> No
 
 def test_dataset_update_scores_how_much_would_change(rng: np.random.Generator) -> None:
     """The mean distance to edits of strength 0.6: a function of the picture, 0 when all is well."""
-    made = update(Editor())
+    made = update(EditingPrior())
     x = picture(rng)
     first = made.score(x)
     made.gradient(x, 0)

@@ -19,6 +19,7 @@ from warpir.core.cache import take_notices
 from warpir.diffusion.models.model_error import ModelError
 from warpir.diffusion.models.network_prior import NetworkPrior
 from warpir.diffusion.models.stable_diffusion import StableDiffusion, load_stable_diffusion
+from warpir.diffusion.models.tensor_files import serialize
 from warpir.diffusion.personalization.lora_files import (
     Lora,
     initial_lora,
@@ -26,7 +27,6 @@ from warpir.diffusion.personalization.lora_files import (
     lora_parameters,
     remove_lora,
     save_lora,
-    serialize,
 )
 from warpir.diffusion.personalization.personalize import (
     EVALUATION_COUNT,

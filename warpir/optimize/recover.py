@@ -26,7 +26,8 @@ from warpir.core.color import gamma_to_linear, linear_to_gamma
 from warpir.core.errors import ExitCode, InputError
 from warpir.core.memory import Memory, needs_of_model, release
 from warpir.core.progress import StepProgress
-from warpir.diffusion.guidance import DatasetUpdate, Guidance, make_guidance
+from warpir.diffusion.dataset_update import DatasetUpdate
+from warpir.diffusion.guidance import Guidance, make_guidance
 from warpir.diffusion.models.embedded import embedded_prompts, load_embedded
 from warpir.diffusion.models.model_error import ModelError
 from warpir.diffusion.models.model_folder import check_model_folder, find_model, hub_offline
@@ -330,7 +331,6 @@ def prepare_guidance(run: Run, checkpoints: Checkpoints) -> tuple[Guided, Checkp
     config = run.config
     with run.timings.stage("model"):
         prior, prompts, negative = run.memory.again(lambda: load_prior(run), "the model", "--model")
-        prior.in_chunks = run.memory.in_chunks
         use_threads_for(prior.unet)
         shown = [*(config.guidance.show_prior or ())]
         prior.embed([prompts.photo, prompts.class_, prompts.guidance, "", *shown])
@@ -433,14 +433,14 @@ def load_prior(run: Run) -> tuple[NetworkPrior, Prompts, str]:
         )
         device = run.torch_device
         graphs = config.diffusion.graphs and device.type == "cuda"
-        prior = load_embedded(_path(config.guidance.prior), device, graphs)
+        prior = load_embedded(_path(config.guidance.prior), device, graphs, run.memory.in_chunks)
         if prompts.unknown:
             words = ", ".join(prompts.unknown)
             prior.notices += (f"the embedded prior does not know: {words}",)
         return prior, prompts, config.guidance.negative_prompt or prompts.negative
     assert config.guidance.prompt is not None
     require_memory(run)
-    model = load_stable_diffusion(config.diffusion, run.torch_device)
+    model = load_stable_diffusion(config.diffusion, run.torch_device, run.memory.in_chunks)
     return (
         model,
         make_prompts(config.guidance.prompt, config.adapter),
