@@ -39,7 +39,7 @@ from warpir.app.record import Timings, versions
 from warpir.core.progress import StepProgress
 from warpir.diffusion.models.stable_diffusion import StableDiffusion, load_stable_diffusion
 from warpir.diffusion.personalization.lora_files import initial_lora
-from warpir.diffusion.personalization.personalize import LoraTraining
+from warpir.diffusion.personalization.lora_training import LoraTraining
 from warpir.diffusion.prompts import make_prompts
 from warpir.insert import insert
 from warpir.optimize.light import LightOptimization

@@ -42,8 +42,8 @@ from warpir.diffusion.models.embedded import (
     cosine_schedule,
     network_of,
     save_embedded,
-    training_tokens,
 )
+from warpir.diffusion.models.embedded_words import training_tokens
 from warpir.diffusion.models.model_error import ModelError
 from warpir.diffusion.models.network_prior import no_tf32
 from warpir.diffusion.models.tensor_files import read_safetensors, serialize

@@ -11,7 +11,7 @@ import contextlib
 import hashlib
 import io
 import os
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -98,18 +98,7 @@ def make_class_images(
         for text, noise in zip(texts, seeds, strict=True)
     ]
     files = [cache / f"{key}.png" if cache else None for key in keys]
-    notices = []
-    missing: set[int] = set()
-    for index, file in enumerate(files):
-        try:
-            found = _read_png(file, side) if file and file.is_file() else None
-        except Exception as error:  # Pillow says in a dozen ways that a file is damaged
-            notices.append(f"{file}: not readable, made again ({error})")
-            found = None
-        if found is None:
-            missing.add(index)
-        else:
-            images[index] = found
+    missing, notices = _read_kept(files, images)
     if report and count:
         report("class images", count - len(missing), count)
 
@@ -148,6 +137,28 @@ def make_class_images(
         with contextlib.suppress(OSError):  # a folder that is too full harms no run
             make_room(cache.glob("*.png"), CACHE_BYTES)
     return ClassImages(images, texts, seeds, len(missing), tuple(notices))
+
+
+def _read_kept(files: Sequence[Path | None], images: Tensor) -> tuple[set[int], list[str]]:
+    """Fill in the pictures that are on disk; return the places of the others, and notices.
+
+    Args:
+        files: Where each picture is kept; None: nowhere.
+        images: uint8, shape [N, 3, resolution, resolution]; changed in place.
+    """
+    missing: set[int] = set()
+    notices: list[str] = []
+    for index, file in enumerate(files):
+        try:
+            found = _read_png(file, images.shape[-1]) if file and file.is_file() else None
+        except Exception as error:  # Pillow says in a dozen ways that a file is damaged
+            notices.append(f"{file}: not readable, made again ({error})")
+            found = None
+        if found is None:
+            missing.add(index)
+        else:
+            images[index] = found
+    return missing, notices
 
 
 def to_bytes(pictures: Tensor) -> Tensor:

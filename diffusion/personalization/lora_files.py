@@ -409,10 +409,7 @@ def save_lora(
     Raises:
         OSError: A file cannot be written; older ones are still whole.
     """
-    from diffusers.utils.state_dict_utils import (
-        convert_state_dict_to_diffusers,
-        convert_state_dict_to_kohya,
-    )
+    from diffusers.utils.state_dict_utils import convert_state_dict_to_diffusers
 
     config = lora.config()
     keyed = convert_state_dict_to_diffusers(lora.weights)
@@ -431,6 +428,16 @@ def save_lora(
 
     if base != "stable-diffusion":
         return (diffusers_file,)
+    kohya_file = Path(folder) / "lora_kohya.safetensors"
+    write_file(kohya_file, _kohya_bytes(lora, cross_attention, prediction_type, trigger))
+    return diffusers_file, kohya_file
+
+
+def _kohya_bytes(lora: Lora, cross_attention: int, prediction_type: str, trigger: str) -> bytes:
+    """Return a LoRA in kohya's form; arguments as in `save_lora`."""
+    from diffusers.utils.state_dict_utils import convert_state_dict_to_kohya
+
+    config = lora.config()
     named = {f"unet.{key}": value for key, value in lora.weights.items()}
     kohya = convert_state_dict_to_kohya(named)
     for layer, alpha in lora.alphas.items():
@@ -447,6 +454,4 @@ def save_lora(
         "modelspec.trigger_phrase": trigger,
         "modelspec.prediction_type": "v" if prediction_type == "v_prediction" else prediction_type,
     }
-    kohya_file = Path(folder) / "lora_kohya.safetensors"
-    write_file(kohya_file, serialize(kohya, header))
-    return diffusers_file, kohya_file
+    return serialize(kohya, header)

@@ -28,7 +28,8 @@ from warpir.diffusion.personalization.lora_files import (
     lora_parameters,
     remove_lora,
 )
-from warpir.diffusion.personalization.personalize import LoraTraining, personalize
+from warpir.diffusion.personalization.lora_training import LoraTraining
+from warpir.diffusion.personalization.personalize import personalize
 from warpir.diffusion.prior import Condition
 from warpir.diffusion.prompts import make_prompts
 from warpir.diffusion.settings import GuidanceSettings, ModelSettings, PersonalizeSettings

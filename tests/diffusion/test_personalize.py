@@ -28,9 +28,9 @@ from warpir.diffusion.personalization.lora_files import (
     remove_lora,
     save_lora,
 )
+from warpir.diffusion.personalization.lora_training import LoraTraining
 from warpir.diffusion.personalization.personalize import (
     EVALUATION_COUNT,
-    LoraTraining,
     Personalization,
     evaluate,
     personalize,

@@ -315,7 +315,7 @@ def mark(owner, name, event, after=None):
     setattr(owner, name, marked)
 import warpir.diffusion.personalization.personalize, warpir.insert, warpir.io.results
 import warpir.optimize.checkpoint, warpir.optimize.loop
-mark(warpir.diffusion.personalization.personalize.LoraTraining, "prepare", "iteration")
+mark(warpir.diffusion.personalization.lora_training.LoraTraining, "prepare", "iteration")
 mark(warpir.optimize.loop.Optimization, "step", "iteration")
 mark(warpir.optimize.checkpoint.Checkpoints, "save", "checkpoint", "iteration ends")
 mark(sys.modules["warpir.insert"], "_write", "write")

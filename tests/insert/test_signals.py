@@ -139,7 +139,7 @@ def hook(place: str, turn: int, act: str) -> str:
     return HOOK + f"\nat({place!r}, {turn}, {act})\n"
 
 
-UPDATE = "warpir.diffusion.personalization.personalize:LoraTraining:update"
+UPDATE = "warpir.diffusion.personalization.lora_training:LoraTraining:update"
 STEP = "warpir.optimize.loop:Optimization:step"
 SAVE = "warpir.optimize.checkpoint:write_folder"
 WRITE = "warpir.insert:_write"

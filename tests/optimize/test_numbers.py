@@ -27,7 +27,8 @@ from warpir.core.errors import ExitCode, InputError
 from warpir.diffusion.guidance import Guidance
 from warpir.diffusion.models.stable_diffusion import StableDiffusion, load_stable_diffusion
 from warpir.diffusion.personalization.class_images import make_class_images
-from warpir.diffusion.personalization.personalize import LoraTraining, initial_lora
+from warpir.diffusion.personalization.lora_files import initial_lora
+from warpir.diffusion.personalization.lora_training import LoraTraining
 from warpir.diffusion.prior import BAD_STEPS_MAX, Condition, NonFiniteError
 from warpir.diffusion.prompts import make_prompts
 from warpir.diffusion.settings import GuidanceSettings, ModelSettings, PersonalizeSettings

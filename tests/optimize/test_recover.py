@@ -134,8 +134,8 @@ def test_guided_run_again_reuses_the_lora_and_gives_the_same_bytes(
 
 STOPS = {
     "class images": ("diffusion.personalization.class_images._png", 2),
-    "lora before a checkpoint": ("diffusion.personalization.personalize:LoraTraining.update", 2),
-    "lora": ("diffusion.personalization.personalize:LoraTraining.update", 4),
+    "lora before a checkpoint": ("diffusion.personalization.lora_training:LoraTraining.update", 2),
+    "lora": ("diffusion.personalization.lora_training:LoraTraining.update", 4),
     "first trace": ("optimize.view:View.__init__", 1),
     "optimisation before a checkpoint": ("optimize.loop:Optimization.step", 2),
     "optimisation": ("optimize.loop:Optimization.step", 6),
@@ -256,7 +256,7 @@ def test_resume_stands_on_its_checkpoint_alone(
     """Whoever empties the cache loses no step: the adapter is in the checkpoint."""
     shutil.rmtree(tmp_path / "cache")
     monkeypatch.setattr(
-        "warpir.diffusion.personalization.personalize.LoraTraining.update", pytest.fail
+        "warpir.diffusion.personalization.lora_training.LoraTraining.update", pytest.fail
     )
     monkeypatch.setattr("warpir.diffusion.models.network_prior.NetworkPrior.sample", pytest.fail)
     assert main([*argv(folder, unfinished), "--resume"]) == ExitCode.DONE

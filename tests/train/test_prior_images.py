@@ -8,7 +8,7 @@ import pytest
 import torch
 import warp as wp
 
-from warpir.diffusion.models.embedded import KINDS, NOUNS
+from warpir.diffusion.models.embedded_words import KINDS, NOUNS
 from warpir.kernels import training_scene as kernel
 from warpir.lighting.regressor import hints, random_regressor
 from warpir.scene.light import map_directions, texel_solid_angles

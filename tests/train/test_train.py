@@ -19,13 +19,8 @@ from torch import Tensor, nn
 import warpir.diffusion.train as module
 from warpir.core import atomic
 from warpir.core.errors import ExitCode
-from warpir.diffusion.models.embedded import (
-    NetworkConfig,
-    build_network,
-    load_embedded,
-    tokenize,
-    training_tokens,
-)
+from warpir.diffusion.models.embedded import NetworkConfig, build_network, load_embedded
+from warpir.diffusion.models.embedded_words import tokenize, training_tokens
 from warpir.diffusion.models.model_error import ModelError
 from warpir.diffusion.train import (
     CURVE,

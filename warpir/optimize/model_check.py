@@ -31,7 +31,8 @@ from warpir.diffusion.models.stable_diffusion import (
     StableDiffusion,
     load_stable_diffusion,
 )
-from warpir.diffusion.personalization.personalize import LoraTraining, personalize
+from warpir.diffusion.personalization.lora_training import LoraTraining
+from warpir.diffusion.personalization.personalize import personalize
 from warpir.diffusion.prior import Condition, NonFiniteError
 from warpir.diffusion.prompts import Prompts, make_prompts
 from warpir.optimize.recover import as_input_errors

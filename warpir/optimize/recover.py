@@ -28,7 +28,8 @@ from warpir.core.memory import Memory, needs_of_model, release
 from warpir.core.progress import StepProgress
 from warpir.diffusion.dataset_update import DatasetUpdate
 from warpir.diffusion.guidance import Guidance, make_guidance
-from warpir.diffusion.models.embedded import embedded_prompts, load_embedded
+from warpir.diffusion.models.embedded import load_embedded
+from warpir.diffusion.models.embedded_words import embedded_prompts
 from warpir.diffusion.models.model_error import ModelError
 from warpir.diffusion.models.model_folder import check_model_folder, find_model, hub_offline
 from warpir.diffusion.models.network_prior import NetworkPrior

@@ -25,7 +25,7 @@ class PriorBatch:
     (`warpir.lighting.regressor.Regression.hint`): a picture, all 0 beside the object, and a
     direction that is the same everywhere; shape [B, 13, 64, 64]."""
     noun: Tensor
-    """Index into `warpir.diffusion.models.embedded.NOUNS`, int64, shape [B]."""
+    """Index into `warpir.diffusion.models.embedded_words.NOUNS`, int64, shape [B]."""
     setting: Tensor
     """Index into ``SETTINGS`` there, int64, shape [B]."""
     weather: Tensor

@@ -18,7 +18,7 @@ import torch
 import warp as wp
 from torch import Tensor
 
-from warpir.diffusion.models.embedded import KINDS, NOUNS
+from warpir.diffusion.models.embedded_words import KINDS, NOUNS
 from warpir.kernels import training_scene as kernel
 from warpir.lighting.regressor import Hint, Regressor, hints
 from warpir.scene.light import map_directions
