@@ -46,6 +46,8 @@ class Bsdf:
     """Perceptual roughness [1]."""
     layers: Layers
     """What goes beyond that, as seen from ``wo``."""
+    p: wp.vec2
+    """Probabilities of sampling the coat, and else the specular lobe of the base."""
 
 
 @wp.struct
@@ -58,20 +60,6 @@ class BsdfValue:
     """Of base and coat [1/sr]."""
     pdf: float
     """Density of `bsdf_sample` [1/sr]; zero outside its support."""
-
-
-@wp.func
-def bsdf_of(
-    wo: wp.vec3, base_color: wp.vec3, metallic: float, roughness: float, layers: Layers
-) -> Bsdf:
-    """Gather a `Bsdf`."""
-    bsdf = Bsdf()
-    bsdf.wo = wo
-    bsdf.base_color = base_color
-    bsdf.metallic = metallic
-    bsdf.roughness = roughness
-    bsdf.layers = layers
-    return bsdf
 
 
 @wp.func
@@ -213,14 +201,13 @@ def layers_toward(
 
 
 @wp.func
-def lobe_probabilities(bsdf: Bsdf) -> wp.vec2:
+def lobe_probabilities(
+    wo: wp.vec3, base_color: wp.vec3, metallic: float, layers: Layers
+) -> wp.vec2:
     """Probabilities of sampling the coat, and else the specular lobe of the base.
 
     A lobe's share of the reflected luminance, roughly.
     """
-    base_color = bsdf.base_color
-    metallic = bsdf.metallic
-    layers = bsdf.layers
     f0 = wp.vec3(F0_DIELECTRIC)
     f90 = float(1.0)
     matte = float(1.0)
@@ -230,7 +217,7 @@ def lobe_probabilities(bsdf: Bsdf) -> wp.vec2:
         matte = layers.matte
     f0 = f0 * (1.0 - metallic) + base_color * metallic
     f90 = f90 * (1.0 - metallic) + metallic
-    specular = luminance(f0 + (wp.vec3(f90) - f0) * schlick(bsdf.wo[2]))
+    specular = luminance(f0 + (wp.vec3(f90) - f0) * schlick(wo[2]))
     diffuse = (1.0 - metallic) * (1.0 - specular) * matte * luminance(base_color)
     coat = float(0.0)
     if layers.present == 1:
@@ -247,6 +234,21 @@ def lobe_probabilities(bsdf: Bsdf) -> wp.vec2:
     if total <= 0.0 or diffuse <= 0.0:
         return wp.vec2(coat, 1.0)
     return wp.vec2(coat, wp.clamp(specular / total, 0.1, 0.9))
+
+
+@wp.func
+def bsdf_of(
+    wo: wp.vec3, base_color: wp.vec3, metallic: float, roughness: float, layers: Layers
+) -> Bsdf:
+    """Gather a `Bsdf`."""
+    bsdf = Bsdf()
+    bsdf.wo = wo
+    bsdf.base_color = base_color
+    bsdf.metallic = metallic
+    bsdf.roughness = roughness
+    bsdf.layers = layers
+    bsdf.p = lobe_probabilities(wo, base_color, metallic, layers)
+    return bsdf
 
 
 @wp.func
@@ -289,7 +291,7 @@ def bsdf_f(bsdf: Bsdf, wi: wp.vec3) -> BsdfValue:
         G2 = 1.0 / (1.0 + lambda_o + smith_lambda(wi, alpha))
         specular = F * (D * G2 / wp.max(4.0 * wo[2] * wi[2], 1.0e-30))
         # Visible normals: G1(wo) max(0, wo.wm) D(wm) / cos_o, over the Jacobian 4 wo.wm.
-        p = lobe_probabilities(bsdf)
+        p = bsdf.p
         G1 = 1.0 / (1.0 + lambda_o)
         pdf = p[1] * G1 * D / wp.max(4.0 * wo[2], 1.0e-30) + (1.0 - p[1]) * wi[2] * INV_PI
         if layers.present == 1:
@@ -345,7 +347,7 @@ def bsdf_sample(bsdf: Bsdf, u: wp.vec2, u_lobe: float) -> wp.vec3:
     """Draw a direction; one that falls below the surface has density 0 and must be dropped."""
     wo = bsdf.wo
     layers = bsdf.layers
-    p = lobe_probabilities(bsdf)
+    p = bsdf.p
     if u_lobe < p[0]:
         frame = basis(layers.coat_n)
         o = to_local(wo, frame)

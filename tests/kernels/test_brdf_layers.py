@@ -23,7 +23,6 @@ from warpir.kernels.bsdf import (
     bsdf_of,
     bsdf_sample,
     layers_toward,
-    lobe_probabilities,
 )
 from warpir.kernels.types import Extensions, Layers
 from warpir.scene.sheen import TABLE_SIZE, sheen_albedo_table
@@ -96,7 +95,7 @@ def eval_kernel(
     diffuse[i] = value.diffuse
     specular[i] = value.specular
     pdf[i] = value.pdf
-    p[i] = lobe_probabilities(bsdf)
+    p[i] = bsdf.p
 
 
 @wp.kernel(enable_backward=False)
