@@ -10,6 +10,7 @@ from PIL import Image
 
 from warpir.core.arrays import FloatArray
 from warpir.core.errors import ExitCode, InputError
+from warpir.core.latlong import map_directions, rotate_map, texel_solid_angles
 from warpir.diffusion.models.embedded import NetworkConfig, build_network, save_embedded
 from warpir.evaluate.command import light_figures, main, usable_rows
 from warpir.evaluate.light_errors import light_errors
@@ -27,16 +28,7 @@ from warpir.evaluate.scenes import (
 from warpir.evaluate.stage import Prediction, Quality, Stage
 from warpir.io.results import OutputFolder
 from warpir.lighting.regressor import random_regressor, save_regressor
-from warpir.scene.light import (
-    Light,
-    Lobes,
-    as_map,
-    axis_from_angles,
-    map_directions,
-    rasterize_lobes,
-    rotate_map,
-    texel_solid_angles,
-)
+from warpir.scene.light import Light, Lobes, as_map, axis_from_angles, rasterize_lobes
 from warpir.scene.tone_curves import Curves
 
 SUNS = {"east": (70.0, 35.0), "west": (-110.0, 50.0), "north": (10.0, 20.0)}

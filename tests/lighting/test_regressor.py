@@ -15,6 +15,7 @@ from safetensors.torch import load_file, save_file
 from scipy.integrate import quad
 
 from warpir.core.errors import ExitCode, InputError
+from warpir.core.latlong import map_directions
 from warpir.diffusion.models.weight_files import read_header, values_hash
 from warpir.lighting.regressor import (
     AMBIENT_SHARPNESS,
@@ -38,13 +39,7 @@ from warpir.lighting.regressor import (
     yaw_to_world,
 )
 from warpir.scene.camera import Camera, camera_from_fov
-from warpir.scene.light import (
-    Light,
-    Lobes,
-    fibonacci,
-    map_directions,
-    rasterize_lobes,
-)
+from warpir.scene.light import Light, Lobes, fibonacci, rasterize_lobes
 from warpir.train.batches import PhotoBatch
 from warpir.train.regressor import (
     LightLoss,

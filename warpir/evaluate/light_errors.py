@@ -23,7 +23,8 @@ from scipy.sparse.csgraph import connected_components
 
 from warpir.core.arrays import BoolArray, Float64Array, FloatArray, Int64Array, IntArray
 from warpir.core.color import luminance
-from warpir.scene.light import angles_from_axis, map_directions, resize_map, texel_solid_angles
+from warpir.core.latlong import map_directions, resize_map, texel_solid_angles
+from warpir.scene.light import angles_from_axis
 
 HEIGHT = 128
 """Rows of the maps that are compared; there are twice as many columns."""

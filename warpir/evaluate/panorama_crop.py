@@ -12,6 +12,7 @@ import numpy as np
 
 from warpir.core.arrays import Float64Array, FloatArray
 from warpir.core.color import GAMMA, linear_to_gamma
+from warpir.core.latlong import look_up
 from warpir.scene.camera import Camera, camera_from_fov
 from warpir.scene.placement import turn
 
@@ -38,29 +39,6 @@ def crop_camera(
     c2w = camera.c2w.copy()
     c2w[:3, :3] = turn(np.array([0.0, 1.0, 0.0]), -np.radians(azimuth)) @ c2w[:3, :3]
     return replace(camera, c2w=c2w)
-
-
-def look_up(texels: FloatArray, directions: Float64Array) -> Float64Array:
-    """Return the panorama's radiance in some directions, bilinear between texel centres.
-
-    Args:
-        texels: Lat-long map, image centre = +Z, left quarter = +X, shape [He, We, 3].
-        directions: Unit vectors, world frame, shape [..., 3].
-
-    Returns:
-        Radiance, shape [..., 3].
-    """
-    height, width = texels.shape[:2]
-    x, y, z = np.moveaxis(directions, -1, 0)
-    u = (0.5 - np.arctan2(x, z) / (2.0 * np.pi)) * width - 0.5
-    v = np.clip(np.arctan2(np.hypot(x, z), y) / np.pi * height - 0.5, 0.0, height - 1.0)
-    left, top = np.floor(u).astype(int), np.minimum(v.astype(int), height - 2)
-    across, down = (u - left)[..., None], (v - top)[..., None]
-    columns = left % width, (left + 1) % width
-    above = texels[top, columns[0]] * (1.0 - across) + texels[top, columns[1]] * across
-    below = texels[top + 1, columns[0]] * (1.0 - across) + texels[top + 1, columns[1]] * across
-    radiance: Float64Array = above * (1.0 - down) + below * down
-    return radiance
 
 
 def crop_radiance(texels: FloatArray, camera: Camera, side: int = 2) -> Float64Array:

@@ -22,6 +22,7 @@ from scipy.ndimage import uniform_filter1d
 from warpir.core.arrays import Float64Array, FloatArray
 from warpir.core.color import gamma_to_linear
 from warpir.core.errors import InputError, raise_all
+from warpir.core.latlong import latitudes, map_directions, rotate_map
 from warpir.core.limits import LIMITS
 from warpir.core.strict_json import read_json_object
 from warpir.evaluate.three_spheres import from_camera_frame, lookup_matrix
@@ -29,7 +30,7 @@ from warpir.io.images.kinds import check_regular_file
 from warpir.io.images.photos import read_envmap
 from warpir.io.results import OutputFolder
 from warpir.scene.camera import Camera
-from warpir.scene.light import angles_from_axis, map_directions, rotate_map
+from warpir.scene.light import angles_from_axis
 
 INDEX = "crops.json"
 SUFFIXES = (".exr", ".hdr", ".npy")
@@ -230,8 +231,8 @@ def to_world(texels: FloatArray, camera: Camera, frame: str) -> FloatArray:
     height = len(texels)
     # Toward the poles texels get narrower than the look-ups' spacing: average them to it first.
     wide = seen.astype(np.float64)
-    for row, sine in enumerate(np.sin(np.pi * (np.arange(height) + 0.5) / height)):
-        wide[row] = uniform_filter1d(wide[row], 2 * int(0.5 / sine) + 1, axis=0, mode="wrap")
+    for row, breadth in enumerate(np.cos(latitudes(height))):
+        wide[row] = uniform_filter1d(wide[row], 2 * int(0.5 / breadth) + 1, axis=0, mode="wrap")
     flat = wide.reshape(-1, 3)
     total = np.zeros_like(flat)
     fine = map_directions(2 * height, 4 * height)

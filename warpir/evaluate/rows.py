@@ -22,6 +22,7 @@ from warpir.app.record import Timings
 from warpir.core.arrays import CodeArray, Float64Array, FloatArray
 from warpir.core.color import luminance
 from warpir.core.errors import InputError
+from warpir.core.latlong import rotate_map
 from warpir.core.progress import StepProgress
 from warpir.diffusion.models.embedded import build_network, save_embedded
 from warpir.evaluate.scenes import Place, Subject, mirrored
@@ -33,7 +34,7 @@ from warpir.lighting.fit import fit_lobes
 from warpir.lighting.regressor import Regressor, mean_training_light, random_regressor, regress
 from warpir.lighting.scene_light import make_light
 from warpir.optimize.recover import Run, recover
-from warpir.scene.light import Light, Lobes, rotate_map
+from warpir.scene.light import Light, Lobes
 from warpir.scene.placement import Placement
 
 ORACLE_LOBES = 64

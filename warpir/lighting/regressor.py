@@ -33,11 +33,12 @@ from warpir.core.arrays import Float64Array, FloatArray
 from warpir.core.atomic import write_file
 from warpir.core.color import GAMMA, LUMINANCE_WEIGHTS
 from warpir.core.errors import ExitCode, InputError
+from warpir.core.latlong import map_directions
 from warpir.diffusion.models.model_error import ModelError
 from warpir.diffusion.models.weight_files import REGRESSOR_FORMAT as FORMAT
 from warpir.diffusion.models.weight_files import check_regressor, values_hash
 from warpir.scene.camera import Camera
-from warpir.scene.light import Lobes, angles_from_axis, fibonacci, map_directions
+from warpir.scene.light import Lobes, angles_from_axis, fibonacci
 
 HEIGHT, WIDTH = 96, 144
 """Size that the network sees [px]; photos of other shapes are stretched, and the rays say so."""

@@ -16,9 +16,10 @@ import torch
 from torch import Tensor
 
 from warpir.core.arrays import Float64Array, FloatArray
-from warpir.core.color import LUMINANCE_WEIGHTS, luminance
+from warpir.core.color import luminance
+from warpir.core.latlong import map_directions, resize_map, texel_solid_angles
 from warpir.io.images.photos import read_envmap
-from warpir.scene.light import map_directions, resize_map, texel_solid_angles
+from warpir.lighting import latlong_tensors as tensors
 
 HEIGHT = 32
 """Rows of the map of everything but the sun."""
@@ -119,14 +120,15 @@ class LightPool:
 
     def flux_share(self) -> Tensor:
         """Return the sun's share of the light's flux, which is that of a sphere's irradiance."""
-        omega = solid_angles(self.fine)
-        rest = (gray(self.fine) * omega).sum(dim=(1, 2))
-        sun = gray(self.sun)
+        omega = tensors.solid_angles(self.fine)
+        rest = (tensors.luminance(self.fine) * omega).sum(dim=(1, 2))
+        sun = tensors.luminance(self.sun)
         return sun / (sun + rest).clamp(min=1e-20)
 
     def levels(self) -> tuple[Tensor, Tensor, Tensor]:
         """Return the maps at full, half and quarter size."""
-        return self.fine, halved(self.fine), halved(halved(self.fine))
+        half = tensors.shrunk(self.fine, HEIGHT // 2)
+        return self.fine, half, tensors.shrunk(half, HEIGHT // 4)
 
     def with_skies(self, skies: LightPool) -> LightPool:
         """Return the panoramas of this pool with other made-up lights behind them."""
@@ -136,26 +138,6 @@ class LightPool:
             k: torch.cat([getattr(self, k)[:n], getattr(skies, k)]) for k in names
         }
         return replace(self, **joined)
-
-
-def gray(rgb: Tensor) -> Tensor:
-    """Return the luminance of the last axis."""
-    return (rgb * torch.tensor(LUMINANCE_WEIGHTS, dtype=rgb.dtype, device=rgb.device)).sum(dim=-1)
-
-
-def solid_angles(maps: Tensor) -> Tensor:
-    """Return the solid angle of each texel of maps [..., He, We, 3], shape [He, 1] [sr]."""
-    height, width = maps.shape[-3:-1]
-    omega = torch.from_numpy(texel_solid_angles(height, width)).to(maps)
-    return omega[:, None]
-
-
-def halved(maps: Tensor) -> Tensor:
-    """Return maps of half the size; each texel is the mean over its solid angle."""
-    weighted = maps * solid_angles(maps)[..., None]
-    n, height, width, _ = maps.shape
-    summed = weighted.view(n, height // 2, 2, width // 2, 2, 3).sum(dim=(2, 4))
-    return summed / solid_angles(summed)[..., None]
 
 
 def load_panoramas(paths: list[Path], device: torch.device | str) -> LightPool:
@@ -215,7 +197,7 @@ def make_lights(count: int, generator: torch.Generator, device: torch.device | s
         return low + (high - low) * torch.rand(count, *shape, generator=generator, device=device)
 
     height, width = HEIGHT, 2 * HEIGHT
-    directions = torch.from_numpy(map_directions(height, width)).float().to(device)
+    directions = tensors.map_directions(height, width, torch.device(device))
     y = directions[..., 1]
     # Kinds: 0 clear, 1 broken clouds, 2 overcast, 3 low sun, 4 room, 5 night.
     shares = torch.tensor([0.34, 0.14, 0.12, 0.12, 0.18, 0.10], device=device)
@@ -246,7 +228,7 @@ def make_lights(count: int, generator: torch.Generator, device: torch.device | s
         1.0 + c * (torch.exp(d * chi) - torch.exp(d * np.pi / 2.0)) + e * cosine.square()
     )
     sky = sky.clamp(min=0.02) * (y > 0.0)
-    omega = torch.from_numpy(texel_solid_angles(height, width)).float().to(device)[:, None]
+    omega = tensors.solid_angles(directions)
     sky = sky / (sky * y.clamp(min=0.0) * omega).sum(dim=(1, 2), keepdim=True)
     # Colours: blue above, paler at the horizon; grey under clouds; warm near a low sun.
     blue = torch.tensor([0.42, 0.62, 1.0], device=device)
@@ -300,13 +282,13 @@ def make_lights(count: int, generator: torch.Generator, device: torch.device | s
         wall = wall + torch.exp(near)[..., None] * (u(0.0, 1.0, 1, 1, 1) ** 3 * 6.0) * u(
             0.6, 1.0, 1, 1, 3
         )
-    wall = wall / (gray(wall) * omega).sum(dim=(1, 2))[:, None, None, None] * 4.0
+    wall = wall / (tensors.luminance(wall) * omega).sum(dim=(1, 2))[:, None, None, None] * 4.0
     lamp_tint = 1.0 - u(0.0, 0.45, 1) * torch.tensor([0.0, 0.45, 1.0], device=device)
     lamp = torch.exp(u(np.log(0.1), np.log(4.0)))[:, None] * lamp_tint
     within = is_room | is_night
     chooser = within[:, None, None, None]
     ground_albedo = u(0.05, 0.4, 3) * torch.tensor([1.0, 0.92, 0.8], device=device)
-    falling = (gray(maps) * y.clamp(min=0.0) * omega).sum(dim=(1, 2))[:, None]
+    falling = (tensors.luminance(maps) * y.clamp(min=0.0) * omega).sum(dim=(1, 2))[:, None]
     below = ground_albedo * (falling + sun * axis[:, 1:2].clamp(min=0.0)) / np.pi
     maps = torch.where(y[None, ..., None] > 0.0, maps, below[:, None, None, :])
     maps = torch.where(chooser, wall, maps)

@@ -31,6 +31,7 @@ from torch import Tensor
 from warpir.core.atomic import write_folder
 from warpir.core.color import GAMMA, LUMINANCE_WEIGHTS
 from warpir.core.errors import ExitCode, InputError
+from warpir.core.latlong import map_directions, texel_solid_angles
 from warpir.core.strict_json import read_json_object
 from warpir.lighting.regressor import (
     AMBIENT_SHARPNESS,
@@ -44,7 +45,7 @@ from warpir.lighting.regressor import (
     random_regressor,
     save_regressor,
 )
-from warpir.scene.light import fibonacci, map_directions, texel_solid_angles
+from warpir.scene.light import fibonacci
 from warpir.train.batches import PhotoBatch
 
 NORMALS = 32

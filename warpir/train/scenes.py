@@ -20,10 +20,10 @@ from torch import Tensor
 
 from warpir.diffusion.models.embedded import KINDS, NOUNS
 from warpir.kernels import training_scene as kernel
+from warpir.lighting.latlong_tensors import luminance, map_directions, shrunk, solid_angles, uv_of
 from warpir.lighting.regressor import Hint, Regressor, hints
-from warpir.scene.light import map_directions
 from warpir.train.batches import PhotoBatch, PriorBatch
-from warpir.train.lights import LightPool, gray, make_lights, solid_angles
+from warpir.train.lights import LightPool, make_lights
 from warpir.train.meshes import TrainingMesh
 from warpir.train.photo_look import Look, draw_faults, draw_looks
 
@@ -319,8 +319,8 @@ class SceneGenerator:
         scenes = self._draw(index, count, self._generator(2, index), with_object=True)
         light = scenes.object_lighting
         rest = self._rest_map(light)
-        flux = (gray(rest) * solid_angles(rest)).sum(dim=(1, 2))
-        return gray(light.sun) / (gray(light.sun) + flux).clamp(min=1e-20)
+        flux = (luminance(rest) * solid_angles(rest)).sum(dim=(1, 2))
+        return luminance(light.sun) / (luminance(light.sun) + flux).clamp(min=1e-20)
 
     def _shoot(self, scenes: Scenes, generator: torch.Generator) -> Shot:
         """Take the photos: exposed as a whole, seen through the crop's window."""
@@ -376,8 +376,7 @@ class SceneGenerator:
         axes = torch.stack([scenes.right, scenes.up, scenes.back], dim=1)
         n = torch.einsum("bchw,bcd->bdhw", normal, axes)
         # Lat-long coordinates in [-1, 1] for grid_sample; a column beyond each side wraps.
-        u = -torch.atan2(n[:, 0], n[:, 2]) / np.pi
-        v = 2.0 * torch.arccos(n[:, 1].clamp(-1.0, 1.0)) / np.pi - 1.0
+        u, v = (2.0 * part - 1.0 for part in uv_of(n.movedim(1, -1)))
         maps = hint.irradiance.permute(0, 3, 1, 2)
         maps = torch.cat([maps[..., -1:], maps, maps[..., :1]], dim=-1)
         grid = torch.stack([u * (32.0 / 34.0), v], dim=-1)
@@ -399,8 +398,8 @@ class SceneGenerator:
         ambient = self._rest_map(light) * look.gain[:, None, None]
         sun = light.sun * look.gain
         omega = solid_angles(ambient)
-        rest = (gray(ambient) * omega).sum(dim=(1, 2))
-        share = gray(sun) / (gray(sun) + rest).clamp(min=1e-20)
+        rest = (luminance(ambient) * omega).sum(dim=(1, 2))
+        share = luminance(sun) / (luminance(sun) + rest).clamp(min=1e-20)
         toward = torch.einsum("bchw,bc->bhw", rays, light.axis).flatten(1).max(dim=1).values
         in_view = toward > float(np.cos(np.radians(3.0)))
         shows_solid = made.solid.mean(dim=(1, 2, 3)) > 0.015
@@ -414,18 +413,13 @@ class SceneGenerator:
         """Return what is not sun in the world's frame, shape [B, 8, 16, 3]."""
         fine = self._levels[0]
         height, width = fine.shape[1:3]
-        directions = torch.from_numpy(map_directions(height, width)).float().to(fine)
+        directions = map_directions(height, width, fine.device)
         d = to_map(light, directions.reshape(1, -1, 3).expand(len(light.map), -1, -1))
-        u = 0.5 - torch.atan2(d[..., 0], d[..., 2]) / (2.0 * np.pi)
-        v = torch.arccos(d[..., 1].clamp(-1.0, 1.0)) / np.pi
+        u, v = uv_of(d)
         column = (u * width).long() % width
         row = (v * height).long().clamp(0, height - 1)
         texels = fine[light.map.long()[:, None], row, column].view(-1, height, width, 3)
-        weighted = texels * solid_angles(texels)[..., None]
-        factor = height // AMBIENT_HEIGHT
-        shape = (len(d), AMBIENT_HEIGHT, factor, 2 * AMBIENT_HEIGHT, factor, 3)
-        summed = weighted.view(shape).sum(dim=(2, 4))
-        return summed / solid_angles(summed)[..., None] * light.gain[:, None, None]
+        return shrunk(texels, AMBIENT_HEIGHT) * light.gain[:, None, None]
 
     def _directions(self, light: Lighting, generator: torch.Generator) -> dict[str, Tensor]:
         """Return directions that stand for the lights, and the flux of each.
@@ -436,7 +430,7 @@ class SceneGenerator:
         fine = self._levels[0][light.map.long()]
         count, height, width, _ = fine.shape
         omega = solid_angles(fine)
-        power = gray(fine) * omega
+        power = luminance(fine) * omega
         p = 0.5 * power / power.sum(dim=(1, 2), keepdim=True).clamp(min=1e-20)
         p = (p + 0.5 * omega / (4.0 * np.pi)).flatten(1)
         p = p / p.sum(dim=1, keepdim=True)
@@ -663,14 +657,14 @@ class SceneGenerator:
         turned = replace(turned, axis=axis)
         # Without a sun nothing shows a direction: a sun is put there.
         omega = solid_angles(self._levels[0])
-        rest = (gray(self._levels[0][light.map.long()]) * omega).sum(dim=(1, 2))
+        rest = (luminance(self._levels[0][light.map.long()]) * omega).sum(dim=(1, 2))
         weak = self._share[light.map.long()] < 0.12
         added = rest[:, None] * (0.3 + 1.5 * rand(1)) * (1.0 - 0.3 * rand(3))
         turned = replace(turned, sun=torch.where(weak[:, None], added, turned.sun))
         # Another scene's light, at about the same exposure.
         order = torch.randperm(count, generator=generator, device=device)
         other = Lighting(**{k: v[order] for k, v in vars(light).items()})
-        level = rest + gray(light.sun)
+        level = rest + luminance(light.sun)
         balance = (level / level[order].clamp(min=1e-9))[:, None].clamp(0.02, 50.0)
         other = replace(other, gain=other.gain * balance, sun=other.sun * balance)
         far = (other.axis * light.axis).sum(dim=1) < 0.85
@@ -681,7 +675,7 @@ class SceneGenerator:
         cast = cast / cast.mean(dim=1, keepdim=True)
         tinted = replace(light, gain=light.gain * cast, sun=light.sun * cast)
         # Softness: the sun's light moved to the sky, or the sky's to a sun.
-        moved = gray(light.sun)[:, None] / rest.clamp(min=1e-9)[:, None]
+        moved = luminance(light.sun)[:, None] / rest.clamp(min=1e-9)[:, None]
         part = 0.6 + 0.4 * rand(1)
         softer = replace(
             light, gain=light.gain * (1.0 + part * moved), sun=light.sun * (1.0 - part)
