@@ -21,18 +21,10 @@ from warpir.train.lights import (
 )
 from warpir.train.meshes import FAMILIES, make_meshes
 from warpir.train.photo_look import draw_faults, draw_looks
-from warpir.train.scenes import (
-    SOLIDS,
-    Lighting,
-    Mixture,
-    SceneGenerator,
-    Stock,
-    about_y,
-    packed_solids,
-    rays_of,
-    to_map,
-    to_world,
-)
+from warpir.train.scenes.generator import PHOTO_SIZE, Mixture, SceneGenerator
+from warpir.train.scenes.lighting import Lighting, about_y, to_map, to_world
+from warpir.train.scenes.render import Stock, render, sun_reaches
+from warpir.train.scenes.solids import SOLIDS, packed_solids
 
 
 def lights_of(device: str, fine: torch.Tensor, sun: float, axis: tuple[float, ...]) -> LightPool:
@@ -145,7 +137,7 @@ def test_the_sun_is_seen_where_the_photo_says(device: str) -> None:
     scenes = generator(device, even(device, 40.0, (0.3, 0.15, -0.94)), **CROPS)
     batch = scenes.photo_batch(0, 48)
     drawn = scenes._draw(0, 48, scenes._generator(3, 0), with_object=False)
-    shot = scenes._render(drawn, drawn.photo_window, (96, 144), 2, with_object=False)
+    shot = render(scenes.stock, drawn, drawn.photo_window, (96, 144), 2, with_object=False)
     brightest = shot.background.mean(dim=1).flatten(1).argmax(dim=1)
     ray = batch.rays.flatten(2)[torch.arange(48), :, brightest]
     angle = torch.rad2deg(torch.arccos((ray * batch.axis).sum(dim=1).clamp(-1.0, 1.0)))
@@ -162,7 +154,7 @@ def test_the_photos_light_has_the_photos_unit(device: str) -> None:
     scenes = generator(device, even(device, 0.0), **CROPS)
     batch = scenes.photo_batch(4, 16)
     drawn = scenes._draw(4, 16, scenes._generator(3, 4), with_object=False)
-    shot = scenes._render(drawn, drawn.photo_window, (96, 144), 2, with_object=False)
+    shot = render(scenes.stock, drawn, drawn.photo_window, (96, 144), 2, with_object=False)
     look = draw_looks(shot.background, _after_draw(scenes, 4, 16))
     # An even panorama: every pixel has the gain's radiance, and so has the ambient map.
     expected = (shot.background * look.gain[:, :, None, None]).mean(dim=(2, 3))
@@ -214,12 +206,12 @@ def test_solids_block_the_sun(device: str) -> None:
     slant = torch.nn.functional.normalize(torch.tensor([[1.0, 0.6, 0.0]] * count), dim=1).to(device)
     below = torch.zeros(count, 3, device=device)
     # From below a cylinder shows its lower cap, which is left out: it stands on the ground.
-    blocked = scenes._sun_reaches(solids, below, up).tolist()
+    blocked = sun_reaches(scenes.stock, solids, below, up).tolist()
     assert blocked[:2] == [0.0, 0.0]
-    assert scenes._sun_reaches(solids, below, slant).tolist() == [1.0] * 3
+    assert sun_reaches(scenes.stock, solids, below, slant).tolist() == [1.0] * 3
     level = torch.tensor([[-6.0, 5.0, 0.0]] * count, device=device)
     across = torch.tensor([[1.0, 0.0, 0.0]] * count, device=device)
-    assert scenes._sun_reaches(solids, level, across).tolist() == [0.0] * 3
+    assert sun_reaches(scenes.stock, solids, level, across).tolist() == [0.0] * 3
     wp.synchronize()
 
 
@@ -326,7 +318,7 @@ def test_the_prior_is_told_what_the_regressor_says(device: str) -> None:
     scenes._draw(0, 4, draws, with_object=True)
     shot = scenes._shoot(drawn, draws)
     assert shot.hint is not None
-    expected = hints(network, shot.whole_photo, rays_of(drawn))
+    expected = hints(network, shot.whole_photo, drawn.rays(PHOTO_SIZE))
     torch.testing.assert_close(shot.hint.toward, expected.toward, atol=2e-2, rtol=2e-2)
     for k in range(4):
         axes = torch.stack([drawn.right[k], drawn.up[k], drawn.back[k]])

@@ -487,7 +487,8 @@ def procedural_errors(
     from warpir.lighting.regressor import least_angle
     from warpir.train.lights import load_panoramas
     from warpir.train.meshes import make_meshes
-    from warpir.train.scenes import Mixture, SceneGenerator, Stock
+    from warpir.train.scenes.generator import Mixture, SceneGenerator
+    from warpir.train.scenes.render import Stock
 
     where = network.directions.device
     stock = Stock(make_meshes(24, UNSEEN_SEED + seed), load_panoramas([], where), device)

@@ -51,6 +51,13 @@ def uv_of(directions: Tensor) -> tuple[Tensor, Tensor]:
     return u, torch.arccos(directions[..., 1].clamp(-1.0, 1.0)) / torch.pi
 
 
+def directions_of(u: Tensor, v: Tensor) -> Tensor:
+    """Return the unit directions of map coordinates in [0, 1], shape [..., 3]; see `uv_of`."""
+    lon, theta = torch.pi * (1.0 - 2.0 * u), torch.pi * v
+    s = theta.sin()
+    return torch.stack([lon.sin() * s, theta.cos(), lon.cos() * s], dim=-1)
+
+
 def shrunk(maps: Tensor, height: int) -> Tensor:
     """Return maps of fewer rows; each texel is the mean over its solid angle.
 
