@@ -40,19 +40,12 @@ from warpir.lighting.regressor import (
 )
 from warpir.scene.camera import Camera, camera_from_fov
 from warpir.scene.light import Light, Lobes, fibonacci, rasterize_lobes
+from warpir.train.augmentation import discolour, erase, mirror, stretch
 from warpir.train.batches import PhotoBatch
-from warpir.train.regressor import (
-    LightLoss,
-    TrainingSettings,
-    calibrated_temperature,
-    discolour,
-    erase,
-    measure,
-    mirror,
-    region_mass,
-    stretch,
-    train_regressor,
-)
+from warpir.train.light_loss import LightLoss
+from warpir.train.regressor import train_regressor
+from warpir.train.settings import TrainingSettings
+from warpir.train.validation import calibrated_temperature, measure, region_mass
 
 SMALL = RegressorConfig(
     channels=(8, 16, 32), blocks=(1, 1), depth=1, heads=2, directions=300, dropout=0.0, skipped=0.0

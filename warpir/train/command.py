@@ -279,8 +279,9 @@ def _train_regressor(
     record: dict[str, Any],
 ) -> dict[str, Any]:
     from warpir.lighting.regressor import load_regressor
-    from warpir.train.regressor import TrainingSettings, train_regressor
+    from warpir.train.regressor import train_regressor
     from warpir.train.scenes.generator import Mixture, SceneGenerator
+    from warpir.train.settings import TrainingSettings
 
     learned, unseen = stocks
     # Fewer panorama crops than the prior sees: they are few places, and could be learned by heart.

@@ -71,9 +71,7 @@ def draw_looks(radiance: Tensor, generator: torch.Generator) -> Look:
     return Look(
         gain,
         contrast,
-        torch.where(
-            is_plain | draw.chance(0.4), torch.full_like(stops, 2.0), draw.uniform(0.4, 0.9)
-        ),
+        torch.where(clips, torch.full_like(stops, 2.0), draw.uniform(0.4, 0.9)),
         draw.chance(0.5),
     )
 
