@@ -22,12 +22,12 @@ from warpir.core.arrays import Float64Array, FloatArray
 from warpir.core.color import gamma_to_linear, linear_to_gamma, luminance
 from warpir.core.errors import InputError
 from warpir.core.latlong import resize_map, rotate_map
-from warpir.evaluate.panorama_crop import crop_camera, crop_radiance, expose
 from warpir.io.assets import load_asset
 from warpir.io.images.photos import read_envmap
 from warpir.scene.asset import Asset, Material
 from warpir.scene.camera import Camera
 from warpir.scene.light import Light, summarize
+from warpir.scene.panorama_crop import crop_camera, crop_radiance, expose
 from warpir.scene.placement import Placement, place_asset, point_on_ground, upright_plane
 
 Read = TypeVar("Read")
