@@ -114,25 +114,7 @@ def export_crops(scenes: Sequence[SceneCrop], folder: str | Path, overwrite: boo
             public = public_crop(scene.photo, scene.camera)
             if public is not None:
                 output.write_png(f"{scene.name}.public.png", _codes(public), mark=False)
-            rotation = scene.camera.c2w[:3, :3]
-            azimuth, pitch = angles_from_axis(-rotation[:, 2])
-            entries.append(
-                {
-                    "name": scene.name,
-                    "photo": photo,
-                    "public_photo": None if public is None else f"{scene.name}.public.png",
-                    "panorama": Path(scene.panorama).name,
-                    "azimuth_deg": azimuth,
-                    "pitch_deg": pitch,
-                    "exposure": scene.exposure,
-                    "camera": scene.camera.record(),
-                    "world_direction_of_a_map_in_the_camera_frame": {
-                        "image_centre": (-rotation[:, 2]).tolist(),
-                        "middle_row_three_quarters_to_the_right": rotation[:, 0].tolist(),
-                        "top_row": rotation[:, 1].tolist(),
-                    },
-                }
-            )
+            entries.append(_crop_entry(scene, photo, public is not None))
         output.write_json(
             INDEX,
             {
@@ -158,6 +140,27 @@ def export_crops(scenes: Sequence[SceneCrop], folder: str | Path, overwrite: boo
                 "crops": entries,
             },
         )
+
+
+def _crop_entry(scene: SceneCrop, photo: str, has_public: bool) -> dict[str, Any]:
+    """Return what the index says of a crop."""
+    rotation = scene.camera.c2w[:3, :3]
+    azimuth, pitch = angles_from_axis(-rotation[:, 2])
+    return {
+        "name": scene.name,
+        "photo": photo,
+        "public_photo": f"{scene.name}.public.png" if has_public else None,
+        "panorama": Path(scene.panorama).name,
+        "azimuth_deg": azimuth,
+        "pitch_deg": pitch,
+        "exposure": scene.exposure,
+        "camera": scene.camera.record(),
+        "world_direction_of_a_map_in_the_camera_frame": {
+            "image_centre": (-rotation[:, 2]).tolist(),
+            "middle_row_three_quarters_to_the_right": rotation[:, 0].tolist(),
+            "top_row": rotation[:, 1].tolist(),
+        },
+    }
 
 
 def read_predictions(folder: str | Path, scenes: Sequence[SceneCrop]) -> Predictions:
