@@ -22,7 +22,8 @@ from warpir.core.latlong import map_directions, texel_solid_angles
 from warpir.io.assets import load_asset
 from warpir.io.cameras.reader import read_camera
 from warpir.io.images.photos import read_envmap, read_photo
-from warpir.lighting.regressor import load_regressor, regress
+from warpir.lighting.regression import regress
+from warpir.lighting.regressor import load_regressor
 from warpir.scene.asset import Asset
 
 SHIPPED_MAX = 5_000_000

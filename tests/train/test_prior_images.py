@@ -12,7 +12,8 @@ from warpir.core.latlong import map_directions, texel_solid_angles
 from warpir.diffusion.models.embedded import KINDS, NOUNS
 from warpir.kernels import training_scene as kernel
 from warpir.lighting.latlong_tensors import luminance, shrunk, solid_angles
-from warpir.lighting.regressor import hints, random_regressor
+from warpir.lighting.regression import estimate_shading_light
+from warpir.lighting.regressor import random_regressor
 from warpir.train.lights import (
     LightPool,
     load_panoramas,
@@ -308,7 +309,7 @@ def test_cameras_expose_and_spoil_within_range() -> None:
 
 @pytest.mark.slow
 def test_the_prior_is_told_what_the_regressor_says(device: str) -> None:
-    """The planes of a level, unturned camera are those of ``Regression.hint``."""
+    """The planes of a level, unturned camera are those of ``Regression.matte_picture``."""
     stock = Stock(make_meshes(12, 3), even(device, 3.0), device)
     network = random_regressor(1).to(device)
     scenes = SceneGenerator(stock, 5, regressor=network)
@@ -318,7 +319,7 @@ def test_the_prior_is_told_what_the_regressor_says(device: str) -> None:
     scenes._draw(0, 4, draws, with_object=True)
     shot = scenes._shoot(drawn, draws)
     assert shot.hint is not None
-    expected = hints(network, shot.whole_photo, drawn.rays(PHOTO_SIZE))
+    expected = estimate_shading_light(network, shot.whole_photo, drawn.rays(PHOTO_SIZE))
     torch.testing.assert_close(shot.hint.toward, expected.toward, atol=2e-2, rtol=2e-2)
     for k in range(4):
         axes = torch.stack([drawn.right[k], drawn.up[k], drawn.back[k]])

@@ -31,7 +31,8 @@ from warpir.io.images.photos import Photo, read_photo
 from warpir.io.images.writers import png_bytes
 from warpir.io.results import OutputFolder
 from warpir.lighting.fit import fit_lobes
-from warpir.lighting.regressor import Regressor, mean_training_light, random_regressor, regress
+from warpir.lighting.regression import mean_training_light, regress
+from warpir.lighting.regressor import Regressor, random_regressor
 from warpir.lighting.scene_light import make_light
 from warpir.optimize.recover import Run, recover
 from warpir.scene.light import Light, Lobes

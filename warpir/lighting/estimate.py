@@ -9,7 +9,8 @@ import numpy as np
 
 from warpir.app.config import InsertConfig
 from warpir.app.inputs import Inputs
-from warpir.lighting.regressor import Regression, load_regressor, regress
+from warpir.lighting.regression import Regression, regress
+from warpir.lighting.regressor import load_regressor
 from warpir.lighting.scene_light import SceneLight, start_level
 from warpir.scene.light import Light, angles_from_axis
 from warpir.scene.tone_curves import Curves

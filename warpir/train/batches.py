@@ -22,7 +22,7 @@ class PriorBatch:
     gbuffer: Tensor
     """Mask in [0, 1], albedo display-encoded in [0, 1], camera-space unit normals (x right, y up, z
     toward the camera), and what the regressor makes of it
-    (`warpir.lighting.regressor.Regression.hint`): a picture, all 0 beside the object, and a
+    (`warpir.lighting.regression.Regression.matte_picture`): a picture, all 0 beside the object, and a
     direction that is the same everywhere; shape [B, 13, 64, 64]."""
     noun: Tensor
     """Index into `warpir.diffusion.models.embedded.NOUNS`, int64, shape [B]."""

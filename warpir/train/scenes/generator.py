@@ -18,7 +18,8 @@ import torch
 from torch import Tensor
 
 from warpir.lighting.latlong_tensors import luminance, map_directions, shrunk, solid_angles, uv_of
-from warpir.lighting.regressor import Hint, Regressor, hints
+from warpir.lighting.regression import ShadingLight, estimate_shading_light
+from warpir.lighting.regressor import Regressor
 from warpir.train.batches import PhotoBatch, PriorBatch
 from warpir.train.lights import LightPool, make_lights
 from warpir.train.photo_look import Look, draw_faults, draw_looks
@@ -80,12 +81,12 @@ class Shot:
     """What it is a crop of, likewise, shape [B, 3, 96, 144]."""
     whole: Tensor
     """The same, squeezed to the crop's size."""
-    hint: Hint | None
+    hint: ShadingLight | None
     """What the regressor reads off the whole photo."""
 
     def next(self) -> Shot:
         """Return for each scene what belongs to the next one; looks and radiance stay."""
-        hint = self.hint and Hint(*(part.roll(-1, dims=0) for part in self.hint))
+        hint = self.hint and ShadingLight(*(part.roll(-1, dims=0) for part in self.hint))
         return replace(
             self, photo=self.photo.roll(-1, dims=0), whole=self.whole.roll(-1, dims=0), hint=hint
         )
@@ -193,7 +194,7 @@ class SceneGenerator:
         if self.regressor is not None:
             is_cuda = whole_photo.device.type == "cuda"
             with torch.autocast("cuda", torch.bfloat16) if is_cuda else nullcontext():
-                hint = hints(self.regressor, whole_photo, scenes.rays(PHOTO_SIZE))
+                hint = estimate_shading_light(self.regressor, whole_photo, scenes.rays(PHOTO_SIZE))
         small = torch.nn.functional.interpolate(
             whole_photo, (SIDE, SIDE), mode="bilinear", antialias=True
         )
@@ -220,9 +221,9 @@ class SceneGenerator:
         return PriorBatch(image.clamp(0.0, 1.0), background, gbuffer, *words)
 
     def _light_planes(
-        self, scenes: Scenes, hint: Hint | None, albedo: Tensor, normal: Tensor
+        self, scenes: Scenes, hint: ShadingLight | None, albedo: Tensor, normal: Tensor
     ) -> Tensor:
-        """Return what the regressor makes of the objects; see `Regression.hint`.
+        """Return what the regressor makes of the objects; see `Regression.matte_picture`.
 
         Args:
             scenes: Their cameras.
