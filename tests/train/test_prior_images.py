@@ -318,20 +318,20 @@ def test_the_prior_is_told_what_the_regressor_says(device: str) -> None:
     draws = scenes._generator(2, 0)
     scenes._draw(0, 4, draws, with_object=True)
     shot = scenes._shoot(drawn, draws)
-    assert shot.hint is not None
+    assert shot.estimate is not None
     expected = estimate_shading_light(network, shot.whole_photo, drawn.rays(PHOTO_SIZE))
-    torch.testing.assert_close(shot.hint.toward, expected.toward, atol=2e-2, rtol=2e-2)
+    torch.testing.assert_close(shot.estimate.toward, expected.toward, atol=2e-2, rtol=2e-2)
     for k in range(4):
         axes = torch.stack([drawn.right[k], drawn.up[k], drawn.back[k]])
         told = batch.gbuffer[k, 10:]
         assert float((told - told[:, :1, :1]).abs().max()) == 0.0
-        torch.testing.assert_close(told[:, 0, 0], axes @ shot.hint.toward[k], atol=1e-5, rtol=0)
+        torch.testing.assert_close(told[:, 0, 0], axes @ shot.estimate.toward[k], atol=1e-5, rtol=0)
         # Pixel by pixel: irradiance of the nearest texel's direction, which is smooth.
         inside = batch.gbuffer[k, 0] > 0.999
         normals = batch.gbuffer[k, 4:7, inside].T @ axes
         directions = torch.from_numpy(map_directions(16, 32).reshape(-1, 3)).float().to(device)
         nearest = (normals @ directions.T).argmax(dim=1)
-        e = shot.hint.irradiance[k].flatten(0, 1)[nearest]
+        e = shot.estimate.irradiance[k].flatten(0, 1)[nearest]
         albedo = batch.gbuffer[k, 1:4, inside].T ** 2.2
         shown = (albedo * e / np.pi).clamp(0.0, 1.0) ** (1.0 / 2.2)
         assert float((shown - batch.gbuffer[k, 7:10, inside].T).abs().mean()) < 0.02

@@ -1,4 +1,4 @@
-"""From one photograph and its camera to its HDR light, with how sure that is.
+"""The network that estimates HDR light, with its uncertainty, from a photo and its camera.
 
 A small network sees the photo and the viewing direction of each pixel. It answers with a
 distribution over fixed directions for the dominant light (so that "ahead or behind" can stay open),
@@ -67,7 +67,7 @@ class RegressorConfig:
 
 
 class Prediction(NamedTuple):
-    """What the network says of B photos, camera-yaw frame; levels are natural logarithms."""
+    """The network's output for B photos, camera-yaw frame; levels are natural logarithms."""
 
     logits: Tensor
     """Of the candidate directions, shape [B, K]."""

@@ -81,14 +81,19 @@ class Shot:
     """What it is a crop of, likewise, shape [B, 3, 96, 144]."""
     whole: Tensor
     """The same, squeezed to the crop's size."""
-    hint: ShadingLight | None
-    """What the regressor reads off the whole photo."""
+    estimate: ShadingLight | None
+    """The regressor's estimate from the whole photo, or None without a regressor."""
 
     def next(self) -> Shot:
         """Return for each scene what belongs to the next one; looks and radiance stay."""
-        hint = self.hint and ShadingLight(*(part.roll(-1, dims=0) for part in self.hint))
+        estimate = self.estimate and ShadingLight(
+            *(part.roll(-1, dims=0) for part in self.estimate)
+        )
         return replace(
-            self, photo=self.photo.roll(-1, dims=0), whole=self.whole.roll(-1, dims=0), hint=hint
+            self,
+            photo=self.photo.roll(-1, dims=0),
+            whole=self.whole.roll(-1, dims=0),
+            estimate=estimate,
         )
 
 
@@ -190,15 +195,17 @@ class SceneGenerator:
         plain = look.show(made.background)
         photo = draw_faults(plain, generator)
         whole_photo = draw_faults(look.show(whole.background), generator)
-        hint = None
+        estimate = None
         if self.regressor is not None:
             is_cuda = whole_photo.device.type == "cuda"
             with torch.autocast("cuda", torch.bfloat16) if is_cuda else nullcontext():
-                hint = estimate_shading_light(self.regressor, whole_photo, scenes.rays(PHOTO_SIZE))
+                estimate = estimate_shading_light(
+                    self.regressor, whole_photo, scenes.rays(PHOTO_SIZE)
+                )
         small = torch.nn.functional.interpolate(
             whole_photo, (SIDE, SIDE), mode="bilinear", antialias=True
         )
-        return Shot(look, made.background, plain, photo, whole_photo, small, hint)
+        return Shot(look, made.background, plain, photo, whole_photo, small, estimate)
 
     def _inserted(self, scenes: Scenes, shot: Shot) -> PriorBatch:
         """Insert the objects into the photos."""
@@ -212,7 +219,7 @@ class SceneGenerator:
         normal = made.normal / made.normal.norm(dim=1, keepdim=True).clamp(min=1e-6)
         albedo = (made.albedo / covered.clamp(min=1e-6)).clamp(0.0, 1.0) ** (1.0 / 2.2)
         is_covered = (covered > 0.0).float()
-        light = self._light_planes(scenes, shot.hint, albedo**2.2, normal) * torch.cat(
+        light = self._light_planes(scenes, shot.estimate, albedo**2.2, normal) * torch.cat(
             [is_covered.expand(-1, 3, -1, -1), torch.ones_like(normal)], dim=1
         )
         gbuffer = torch.cat([covered, albedo * is_covered, normal * is_covered, light], dim=1)
@@ -221,30 +228,30 @@ class SceneGenerator:
         return PriorBatch(image.clamp(0.0, 1.0), background, gbuffer, *words)
 
     def _light_planes(
-        self, scenes: Scenes, hint: ShadingLight | None, albedo: Tensor, normal: Tensor
+        self, scenes: Scenes, estimate: ShadingLight | None, albedo: Tensor, normal: Tensor
     ) -> Tensor:
-        """Return what the regressor makes of the objects; see `Regression.matte_picture`.
+        """Return the objects as the regressor's light shows them; see `Regression.matte_picture`.
 
         Args:
             scenes: Their cameras.
-            hint: The light, or None: nothing is known of it.
+            estimate: The light, or None if it is unknown.
             albedo: Linear, shape [B, 3, H, W].
             normal: Camera frame, same shape.
         """
-        if hint is None:
+        if estimate is None:
             return torch.zeros_like(torch.cat([normal, normal], dim=1))
         axes = torch.stack([scenes.right, scenes.up, scenes.back], dim=1)
         n = torch.einsum("bchw,bcd->bdhw", normal, axes)
         # Lat-long coordinates in [-1, 1] for grid_sample; a column beyond each side wraps.
         u, v = (2.0 * part - 1.0 for part in uv_of(n.movedim(1, -1)))
-        maps = hint.irradiance.permute(0, 3, 1, 2)
+        maps = estimate.irradiance.permute(0, 3, 1, 2)
         maps = torch.cat([maps[..., -1:], maps, maps[..., :1]], dim=-1)
         grid = torch.stack([u * (32.0 / 34.0), v], dim=-1)
         irradiance = torch.nn.functional.grid_sample(
             maps, grid, padding_mode="border", align_corners=False
         )
         shown = (albedo * irradiance / np.pi).clamp(0.0, 1.0) ** (1.0 / 2.2)
-        toward = torch.einsum("bd,bcd->bc", hint.toward, axes)
+        toward = torch.einsum("bd,bcd->bc", estimate.toward, axes)
         return torch.cat([shown, toward[:, :, None, None].expand_as(normal)], dim=1)
 
     def photo_batch(self, index: int, count: int) -> PhotoBatch:
