@@ -8,7 +8,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from warpir.diffusion.embedded import KINDS
+from warpir.diffusion.models.embedded import KINDS
 from warpir.lighting.latlong_tensors import directions_of, luminance, solid_angles
 from warpir.train.lights import LightPool
 from warpir.train.sampler import Sampler

@@ -11,7 +11,7 @@ import torch
 import warp as wp
 from torch import Tensor
 
-from warpir.diffusion.embedded import NOUNS
+from warpir.diffusion.models.embedded import NOUNS
 from warpir.kernels import training_scene as kernel
 from warpir.train.lights import LightPool
 from warpir.train.meshes import TrainingMesh
