@@ -31,7 +31,6 @@ from warpir.core.arrays import Float64Array
 from warpir.core.atomic import write_file
 from warpir.core.color import GAMMA, LUMINANCE_WEIGHTS
 from warpir.core.errors import ExitCode, InputError
-from warpir.core.latlong import map_directions
 from warpir.diffusion.models.model_error import ModelError
 from warpir.diffusion.models.weight_files import REGRESSOR_FORMAT as FORMAT
 from warpir.diffusion.models.weight_files import check_regressor, values_hash
