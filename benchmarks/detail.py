@@ -24,7 +24,7 @@ from warpir.lighting.detail import HEIGHT, Detail, seen_from, with_detail
 from warpir.lighting.fit import fit_lobes
 from warpir.lighting.regression import regress
 from warpir.lighting.regressor import load_regressor
-from warpir.render.renderer import choose_device
+from warpir.render.device import choose_device
 from warpir.scene.asset import Asset, Material, Primitive
 from warpir.scene.camera import Camera
 from warpir.scene.light import Light, as_map

@@ -177,7 +177,7 @@ def evaluate(
     started = time.perf_counter()
     from warpir.evaluate.judge import Judge, procedural_errors
     from warpir.evaluate.results import run_record
-    from warpir.render.renderer import choose_device
+    from warpir.render.device import choose_device
 
     lpips = _load_lpips(options)
     notices = _missing_measures(lpips)
