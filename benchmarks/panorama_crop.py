@@ -1,6 +1,6 @@
 """Write a view into a panorama as a photo whose camera, light and exposure are known.
 
-`warpir.scene.panorama_crop` makes it. With ``--tone linear`` and the exposure that
+`warpir.evaluate.scenes` makes it. With ``--tone linear`` and the exposure that
 ``light.json`` holds, an object is lit and shown exactly as the place itself.
 """
 
@@ -12,9 +12,9 @@ from typing import Any
 import numpy as np
 from PIL import Image
 
+from warpir.evaluate.scenes import crop_camera, crop_radiance, expose
 from warpir.io.images.photos import read_envmap
 from warpir.scene.camera import Camera
-from warpir.scene.panorama_crop import crop_camera, crop_radiance, expose
 
 
 def write_crop(panorama: Path, camera: Camera, out: Path) -> dict[str, Any]:

@@ -159,7 +159,7 @@ def test_the_camera_frame_has_ahead_at_minus_z(scenes: list[tuple[Place, list[Su
 
 def test_photographs_are_the_light_at_its_exposure(data: Path) -> None:
     """What is not clipped decodes to radiance times exposure, through the camera's response."""
-    from warpir.scene.panorama_crop import crop_radiance
+    from warpir.evaluate.scenes import crop_radiance
 
     for response in RESPONSES:
         place, _ = make_places(data, response=response).make(1)[0]
@@ -245,7 +245,7 @@ def test_the_brightest_region_is_where_the_sun_is_seen(
     """A panorama turned so that its sun is in the picture."""
     from dataclasses import replace
 
-    from warpir.scene.panorama_crop import crop_camera, crop_radiance, expose
+    from warpir.evaluate.scenes import crop_camera, crop_radiance, expose
 
     azimuth, elevation = SUNS["north"]
     camera = crop_camera(96, 64, 80.0, azimuth - 15.0, 0.0, 1.6)

@@ -10,9 +10,9 @@ from PIL import Image
 from benchmarks.panorama_crop import write_crop
 from warpir.app.command import parse
 from warpir.core.latlong import look_up, map_directions
+from warpir.evaluate.scenes import crop_camera, crop_radiance, expose
 from warpir.io.cameras.reader import read_camera
 from warpir.scene.light import angles_from_axis, axis_from_angles
-from warpir.scene.panorama_crop import crop_camera, crop_radiance, expose
 
 
 def one_texel(row: int, column: int) -> np.ndarray:
