@@ -17,16 +17,17 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
 
-from warpir.evaluate.panorama_crop import look_up
+from warpir.core.latlong import look_up, map_directions, resize_map, texel_solid_angles
 from warpir.evaluate.scenes import PANORAMA_SUFFIXES, Place, Places, Subject, find_files
 from warpir.evaluate.stage import Prediction, Quality, Stage
 from warpir.lighting.detail import HEIGHT, Detail, seen_from, with_detail
 from warpir.lighting.fit import fit_lobes
-from warpir.lighting.regressor import load_regressor, regress
+from warpir.lighting.regression import regress
+from warpir.lighting.regressor import load_regressor
 from warpir.render.device import choose_device
 from warpir.scene.asset import Asset, Material, Primitive
 from warpir.scene.camera import Camera
-from warpir.scene.light import Light, as_map, map_directions, resize_map, texel_solid_angles
+from warpir.scene.light import Light, as_map
 from warpir.scene.placement import place_asset
 from warpir.scene.tone_curves import Curves
 

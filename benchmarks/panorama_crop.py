@@ -1,6 +1,6 @@
 """Write a view into a panorama as a photo whose camera, light and exposure are known.
 
-`warpir.evaluate.panorama_crop` makes it. With ``--tone linear`` and the exposure that
+`warpir.evaluate.scenes` makes it. With ``--tone linear`` and the exposure that
 ``light.json`` holds, an object is lit and shown exactly as the place itself.
 """
 
@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 from PIL import Image
 
-from warpir.evaluate.panorama_crop import crop_camera, crop_radiance, expose
+from warpir.evaluate.scenes import crop_camera, crop_radiance, expose
 from warpir.io.images.photos import read_envmap
 from warpir.scene.camera import Camera
 

@@ -24,7 +24,9 @@ from warpir.train.batches import PriorBatch
 from warpir.train.command import files_in
 from warpir.train.lights import load_panoramas
 from warpir.train.meshes import make_meshes
-from warpir.train.scenes import Lighting, Mixture, SceneGenerator, Stock
+from warpir.train.scenes.generator import Mixture, SceneGenerator
+from warpir.train.scenes.lighting import Lighting
+from warpir.train.scenes.render import Stock
 
 SEED = 2_000_000
 """No training draws these scenes, nor these objects."""

@@ -22,9 +22,9 @@ from PIL import Image
 from benchmarks.referee.__main__ import foreground
 from tools.demo.make import pixel_directions
 from tools.demo.place import paving_texture
-from tools.demo.sky import seen
 from warpir.core.arrays import Float64Array, FloatArray, IntArray, PixelArray
 from warpir.core.color import linear_to_gamma
+from warpir.core.latlong import look_up, resize_map, rotate_map
 from warpir.demo import ASSET, LIGHT
 from warpir.io.assets import load_asset
 from warpir.io.images.photos import Photo, read_envmap
@@ -35,7 +35,7 @@ from warpir.render.renderer import Renderer
 from warpir.scene.asset import Asset, Material, Primitive, Texture, TextureSlot
 from warpir.scene.camera import Camera, camera_from_fov
 from warpir.scene.lamps import lamp_axes
-from warpir.scene.light import Light, angles_from_axis, resize_map, rotate_map
+from warpir.scene.light import Light, angles_from_axis
 from warpir.scene.placement import Placement, place_asset
 from warpir.scene.receiver import ReceiverMesh, first_hit, mesh_of
 from warpir.scene.shadow_mask import shadow_mask
@@ -125,7 +125,7 @@ def joined(parts: list[tuple[Asset, Float64Array]]) -> Asset:
 def photograph(asset: Asset, camera: Camera, texels: FloatArray, samples: int) -> PixelArray:
     """Return the place's linear radiance as Mitsuba path-traces it, the sky behind it."""
     shot = foreground(asset, np.eye(4), camera, texels, DEPTH, samples, 0)
-    sky = seen(texels, pixel_directions(camera))
+    sky = look_up(texels, pixel_directions(camera))
     return np.asarray(shot.mean + (1.0 - shot.coverage)[..., None] * sky)
 
 

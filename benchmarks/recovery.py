@@ -25,7 +25,8 @@ from benchmarks.measure import context
 from warpir.app.settings import OptimizeSettings
 from warpir.core.arrays import Float64Array, FloatArray
 from warpir.core.color import gamma_to_linear, luminance
-from warpir.evaluate.panorama_crop import crop_camera, crop_radiance, expose
+from warpir.core.latlong import map_directions, resize_map, texel_solid_angles
+from warpir.evaluate.scenes import crop_camera, crop_radiance, expose
 from warpir.io.assets import load_asset
 from warpir.io.images.photos import read_envmap
 from warpir.optimize.light import LightOptimization, Unknowns
@@ -37,13 +38,7 @@ from warpir.render.mis import MisIntegrator
 from warpir.render.renderer import Renderer
 from warpir.render.tone_curve import Knots, ToneCurve
 from warpir.scene.asset import Asset
-from warpir.scene.light import (
-    Light,
-    angles_from_axis,
-    map_directions,
-    resize_map,
-    texel_solid_angles,
-)
+from warpir.scene.light import Light, angles_from_axis
 from warpir.scene.placement import place_asset
 
 MEASURE_HEIGHT = 128

@@ -21,6 +21,7 @@ from benchmarks.presets import PRESETS, ScenePreset
 from benchmarks.referee import ours
 from benchmarks.referee.sheet import compare_images, write_sheet
 from warpir.core.arrays import AnyFloatArray, Float64Array, FloatArray
+from warpir.core.latlong import map_directions
 from warpir.io.assets import load_asset
 from warpir.mitsuba.render import (
     Ratio,
@@ -32,7 +33,6 @@ from warpir.mitsuba.render import (
 from warpir.render.device import choose_device
 from warpir.scene.asset import Asset
 from warpir.scene.camera import Camera
-from warpir.scene.light import map_directions
 
 
 def foreground_gradient(

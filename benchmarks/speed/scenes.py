@@ -12,6 +12,7 @@ import numpy as np
 
 from benchmarks.referee import ours
 from warpir.core.arrays import Float64Array, FloatArray, IntArray
+from warpir.core.latlong import resize_map
 from warpir.io.assets import load_asset
 from warpir.io.images.photos import read_envmap
 from warpir.lighting.fit import fit_lobes
@@ -19,7 +20,7 @@ from warpir.render.device_light import light_args
 from warpir.render.renderer import Renderer
 from warpir.scene.asset import Asset, Material, Primitive
 from warpir.scene.camera import Camera, camera_from_fov
-from warpir.scene.light import Light, Lobes, axis_from_angles, rasterize_lobes, resize_map
+from warpir.scene.light import Light, Lobes, axis_from_angles, rasterize_lobes
 from warpir.scene.placement import place_asset
 
 NAMES = ("ball", "toycar", "metal")

@@ -25,6 +25,7 @@ from benchmarks.stability.case import (
 from tests import oracles as o
 from tests.builders.shapes import all_pixels, camera, ground
 from tests.statistics import central_differences
+from warpir.core.latlong import resize_map
 from warpir.kernels.composite import compose
 from warpir.kernels.sampling import light_eval, light_sample
 from warpir.kernels.shadow_ratio import shadow_ratio
@@ -36,7 +37,7 @@ from warpir.render.device_scene import Scene
 from warpir.render.mis import MisIntegrator
 from warpir.render.renderer import Renderer
 from warpir.render.tone_curve import ToneCurve
-from warpir.scene.light import Light, resize_map, summarize
+from warpir.scene.light import Light, summarize
 
 LIGHT, TONE, FUSION = "light", "tone", "fusion"
 UP = np.array([0.0, 1.0, 0.0])

@@ -28,10 +28,10 @@ from warpir.app.config import InsertConfig
 from warpir.app.inputs import read_inputs
 from warpir.app.reuse import read_run
 from warpir.core.errors import ExitCode, InputError
+from warpir.core.latlong import rotate_map
 from warpir.io.curves_file import curves_to_json, read_curves
 from warpir.io.images.photos import read_envmap
 from warpir.lighting.scene_light import make_light
-from warpir.scene.light import rotate_map
 from warpir.scene.tone_curves import Curves, ToneKnots
 
 ROUNDING = 1e-6

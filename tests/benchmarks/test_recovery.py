@@ -32,10 +32,11 @@ from tests import oracles as o
 from tests.builders.shapes import box
 from warpir.app.settings import OptimizeSettings
 from warpir.core.arrays import FloatArray
+from warpir.core.latlong import resize_map
 from warpir.io.images.photos import read_envmap
 from warpir.optimize.light import LightOptimization
 from warpir.scene.asset import Asset, Material
-from warpir.scene.light import axis_from_angles, resize_map
+from warpir.scene.light import axis_from_angles
 
 WIDTH, HEIGHT = 48, 32
 """Of the picture [px]."""

@@ -10,8 +10,10 @@ from PIL import Image
 
 from warpir.core.arrays import FloatArray
 from warpir.core.errors import ExitCode, InputError
+from warpir.core.latlong import map_directions, rotate_map, texel_solid_angles
 from warpir.diffusion.models.embedded import NetworkConfig, build_network, save_embedded
-from warpir.evaluate.command import light_figures, main, usable_rows
+from warpir.evaluate.command import main, usable_rows
+from warpir.evaluate.judge import light_figures
 from warpir.evaluate.light_errors import light_errors
 from warpir.evaluate.report import Entry, bootstrap, compare, mean_of, summarize
 from warpir.evaluate.rows import ROWS, Bench, chosen_rows
@@ -27,16 +29,7 @@ from warpir.evaluate.scenes import (
 from warpir.evaluate.stage import Prediction, Quality, Stage
 from warpir.io.results import OutputFolder
 from warpir.lighting.regressor import random_regressor, save_regressor
-from warpir.scene.light import (
-    Light,
-    Lobes,
-    as_map,
-    axis_from_angles,
-    map_directions,
-    rasterize_lobes,
-    rotate_map,
-    texel_solid_angles,
-)
+from warpir.scene.light import Light, Lobes, as_map, axis_from_angles, rasterize_lobes
 from warpir.scene.tone_curves import Curves
 
 SUNS = {"east": (70.0, 35.0), "west": (-110.0, 50.0), "north": (10.0, 20.0)}
@@ -166,7 +159,7 @@ def test_the_camera_frame_has_ahead_at_minus_z(scenes: list[tuple[Place, list[Su
 
 def test_photographs_are_the_light_at_its_exposure(data: Path) -> None:
     """What is not clipped decodes to radiance times exposure, through the camera's response."""
-    from warpir.evaluate.panorama_crop import crop_radiance
+    from warpir.evaluate.scenes import crop_radiance
 
     for response in RESPONSES:
         place, _ = make_places(data, response=response).make(1)[0]
@@ -252,7 +245,7 @@ def test_the_brightest_region_is_where_the_sun_is_seen(
     """A panorama turned so that its sun is in the picture."""
     from dataclasses import replace
 
-    from warpir.evaluate.panorama_crop import crop_camera, crop_radiance, expose
+    from warpir.evaluate.scenes import crop_camera, crop_radiance, expose
 
     azimuth, elevation = SUNS["north"]
     camera = crop_camera(96, 64, 80.0, azimuth - 15.0, 0.0, 1.6)

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from tests import oracles
+from warpir.core.latlong import map_directions, rotate_map, texel_solid_angles
 from warpir.evaluate.light_errors import (
     CHANCE_DEG,
     SUN_RADIUS_DEG,
@@ -14,14 +15,7 @@ from warpir.evaluate.light_errors import (
     lights_of,
     sun_sky_ratio_error,
 )
-from warpir.scene.light import (
-    Lobes,
-    axis_from_angles,
-    map_directions,
-    rasterize_lobes,
-    rotate_map,
-    texel_solid_angles,
-)
+from warpir.scene.light import Lobes, axis_from_angles, rasterize_lobes
 
 TEXEL_DEG = 180.0 / 128
 """Directions are those of texel centres, so they are known to about half a diagonal."""

@@ -9,9 +9,10 @@ from PIL import Image
 
 from benchmarks.panorama_crop import write_crop
 from warpir.app.command import parse
-from warpir.evaluate.panorama_crop import crop_camera, crop_radiance, expose, look_up
+from warpir.core.latlong import look_up, map_directions
+from warpir.evaluate.scenes import crop_camera, crop_radiance, expose
 from warpir.io.cameras.reader import read_camera
-from warpir.scene.light import angles_from_axis, axis_from_angles, map_directions
+from warpir.scene.light import angles_from_axis, axis_from_angles
 
 
 def one_texel(row: int, column: int) -> np.ndarray:

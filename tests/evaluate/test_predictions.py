@@ -11,6 +11,7 @@ from PIL import Image
 from tests import oracles
 from warpir.core.color import linear_to_gamma
 from warpir.core.errors import InputError
+from warpir.core.latlong import map_directions, texel_solid_angles
 from warpir.evaluate.predictions import (
     INDEX,
     export_crops,
@@ -21,7 +22,6 @@ from warpir.evaluate.predictions import (
 from warpir.io.cameras.reader import read_camera
 from warpir.io.results import OutputFolder
 from warpir.scene.camera import Camera, camera_from_fov
-from warpir.scene.light import map_directions, texel_solid_angles
 from warpir.scene.placement import turn
 
 

@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 from tests import oracles
+from warpir.core.latlong import map_directions, rotate_map
 from warpir.evaluate import three_spheres
 from warpir.evaluate.three_spheres import (
     AZIMUTH_COUNT,
@@ -27,7 +28,7 @@ from warpir.evaluate.three_spheres import (
     sphere_errors,
     to_camera_frame,
 )
-from warpir.scene.light import angles_from_axis, axis_from_angles, map_directions, rotate_map
+from warpir.scene.light import angles_from_axis, axis_from_angles
 
 QUADRATURE = 5e-3
 """Of radiance, relative to the picture's root mean square: bins of 1 degree against the texels'

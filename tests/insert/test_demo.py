@@ -14,16 +14,16 @@ from tools.demo.sky import (
     SKY_IRRADIANCE,
     SUN_TO_SKY,
     sky,
-    solid_angles,
     sun_direction,
-    texel_directions,
 )
 from warpir import demo
 from warpir.app.config import InsertConfig
+from warpir.core.latlong import map_directions, texel_solid_angles
 from warpir.io.assets import load_asset
 from warpir.io.cameras.reader import read_camera
 from warpir.io.images.photos import read_envmap, read_photo
-from warpir.lighting.regressor import load_regressor, regress
+from warpir.lighting.regression import regress
+from warpir.lighting.regressor import load_regressor
 from warpir.scene.asset import Asset
 
 SHIPPED_MAX = 5_000_000
@@ -67,8 +67,10 @@ def test_sky_has_the_stated_energy() -> None:
     """Level irradiance is the sky's plus the sun's, whatever texels the disc falls on."""
     for height in (128, 256, 512):
         texels = sky(height) @ LUMINANCE
-        direction = texel_directions(height)
-        falling = np.maximum(direction[..., 1], 0.0) * solid_angles(height)[:, None]
+        direction = map_directions(height, 2 * height)
+        falling = (
+            np.maximum(direction[..., 1], 0.0) * texel_solid_angles(height, 2 * height)[:, None]
+        )
         near_sun = direction @ sun_direction() > np.cos(np.radians(3.0))
         total = float((texels * falling).sum())
         assert total == pytest.approx(SKY_IRRADIANCE * (1.0 + SUN_TO_SKY), rel=1e-4)

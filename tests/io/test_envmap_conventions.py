@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from warpir.core.latlong import map_directions, rotate_map, texel_solid_angles
 from warpir.io.images.envmap_conventions import (
     IN_CAMERA_AXES,
     SEAM_SHIFTS,
@@ -13,7 +14,7 @@ from warpir.io.images.envmap_conventions import (
     rotate_directions,
     to_ours,
 )
-from warpir.scene.light import fibonacci, map_directions, rotate_map, texel_solid_angles
+from warpir.scene.light import fibonacci
 
 HEIGHT = 64
 LOBES = {  # red, green, blue and yellow, one a quarter; nothing about it is symmetric

@@ -11,9 +11,9 @@ from PIL import Image
 from tests.builders.image_files import LOBES, codes8, directions, four_lobes, write_image
 from warpir.core import color
 from warpir.core.errors import InputError
+from warpir.core.latlong import rotate_map
 from warpir.io.images.envmap_conventions import IN_CAMERA_AXES, SEAM_SHIFTS
 from warpir.io.images.photos import read_envmap, read_photo
-from warpir.scene.light import rotate_map
 
 SHARED = Path(__file__).resolve().parents[3] / "shared" / "data"
 needs_shared = pytest.mark.skipif(not SHARED.is_dir(), reason=f"no development data at {SHARED}")

@@ -25,11 +25,12 @@ from warpir.app.config import InsertConfig
 from warpir.app.inputs import Inputs, read_inputs
 from warpir.core import color
 from warpir.core.errors import InputError
+from warpir.core.latlong import map_directions
 from warpir.io import export as handoff
 from warpir.io.assets import load_asset
 from warpir.io.cameras.reader import read_camera
 from warpir.io.export import CUBE_SIZE, tone_curve_cube, web_map
-from warpir.scene.light import fibonacci, map_directions
+from warpir.scene.light import fibonacci
 from warpir.scene.tone_curves import ToneKnots
 
 HANDED = {

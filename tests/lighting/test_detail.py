@@ -5,10 +5,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from warpir.evaluate.panorama_crop import crop_camera, crop_radiance
+from warpir.core.latlong import map_directions
+from warpir.evaluate.scenes import crop_camera, crop_radiance
 from warpir.lighting.detail import HEIGHT, seen_from, with_detail
 from warpir.scene.camera import camera_from_fov
-from warpir.scene.light import Light, map_directions, sun_lobe
+from warpir.scene.light import Light, sun_lobe
 from warpir.scene.tone_curves import Curves, ToneKnots
 
 GROUND = np.array([0.0, 1.0, 0.0, 0.0])

@@ -15,49 +15,39 @@ from safetensors.torch import load_file, save_file
 from scipy.integrate import quad
 
 from warpir.core.errors import ExitCode, InputError
+from warpir.core.latlong import map_directions
 from warpir.diffusion.models.weight_files import read_header, values_hash
+from warpir.lighting.regression import (
+    Regression,
+    _regression,
+    camera_rays,
+    estimate_shading_light,
+    facing_irradiance,
+    mean_training_light,
+    regress,
+    yaw_to_world,
+)
 from warpir.lighting.regressor import (
     AMBIENT_SHARPNESS,
     Prediction,
-    Regression,
     Regressor,
     RegressorConfig,
-    _regression,
     ambient_axes,
-    camera_rays,
     candidates,
-    facing_irradiance,
-    hints,
     least_angle,
     load_regressor,
     mean_luminance,
-    mean_training_light,
     random_regressor,
-    regress,
     save_regressor,
-    yaw_to_world,
 )
 from warpir.scene.camera import Camera, camera_from_fov
-from warpir.scene.light import (
-    Light,
-    Lobes,
-    fibonacci,
-    map_directions,
-    rasterize_lobes,
-)
+from warpir.scene.light import Light, Lobes, fibonacci, rasterize_lobes
+from warpir.train.augmentation import discolour, erase, mirror, stretch
 from warpir.train.batches import PhotoBatch
-from warpir.train.regressor import (
-    LightLoss,
-    TrainingSettings,
-    calibrated_temperature,
-    discolour,
-    erase,
-    measure,
-    mirror,
-    region_mass,
-    stretch,
-    train_regressor,
-)
+from warpir.train.light_loss import LightLoss
+from warpir.train.regressor import train_regressor
+from warpir.train.settings import TrainingSettings
+from warpir.train.validation import calibrated_temperature, measure, region_mass
 
 SMALL = RegressorConfig(
     channels=(8, 16, 32), blocks=(1, 1), depth=1, heads=2, directions=300, dropout=0.0, skipped=0.0
@@ -668,16 +658,16 @@ def test_hint_is_the_expected_picture_of_a_matte_object() -> None:
 
     albedo = np.full((40, 3), 0.4)
     turn = camera.c2w[:3, :3]
-    shown, toward = found.hint(albedo, normals @ turn, camera.c2w)
+    shown, toward = found.matte_picture(albedo, normals @ turn, camera.c2w)
     np.testing.assert_allclose(
         shown, np.clip(0.4 * expected / np.pi, 0.0, 1.0) ** (1.0 / 2.2), rtol=5e-3, atol=1e-4
     )
     mean = found.probability @ found.directions
     np.testing.assert_allclose(turn @ toward, found.share * mean, atol=1e-5)
 
-    # The same temperature by the buffer, so that `hints` sees this very distribution.
+    # The same temperature by the buffer, so that the batch has this very distribution.
     network.temperature.div_(3.0)
-    batch = hints(network, photo, rays)
+    batch = estimate_shading_light(network, photo, rays)
     texels = map_directions(16, 32).reshape(-1, 3)
     np.testing.assert_allclose(
         batch.irradiance[0].reshape(-1, 3).numpy(), found.irradiance(texels), rtol=2e-3

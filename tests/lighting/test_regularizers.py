@@ -8,7 +8,8 @@ from torch import Tensor
 from tests import oracles as o
 from tests.statistics import central_differences, compare_gradients
 from warpir.core.arrays import Float64Array
-from warpir.lighting.regularizers import bend, chroma, consistency, solid_angles, spread
+from warpir.lighting.latlong_tensors import solid_angles
+from warpir.lighting.regularizers import bend, chroma, consistency, spread
 from warpir.lighting.sg_light import WIDEST, LightBounds, SGLight, narrowest
 from warpir.render.tone_curve import Knots, ToneCurve
 from warpir.scene.light import Lobes

@@ -15,6 +15,7 @@ from warpir.core import cache as caches
 from warpir.core.arrays import Float64Array, IntArray
 from warpir.core.cache import take_notices
 from warpir.core.errors import ExitCode, InputError
+from warpir.core.latlong import map_directions, texel_solid_angles
 from warpir.render.device_scene import Scene
 from warpir.render.integrator import MaterialTensors, Radiance
 from warpir.render.mis import MisIntegrator
@@ -26,7 +27,7 @@ from warpir.render.transport.matrix import DenseRows, product
 from warpir.render.transport.rows import TransportSettings
 from warpir.render.transport.tents import direction_counts, tent_irradiance, tent_solid_angles
 from warpir.scene.asset import Material
-from warpir.scene.light import Light, Lobes, as_map, map_directions, texel_solid_angles
+from warpir.scene.light import Light, Lobes, as_map
 
 HEIGHT = 12
 SMALL = TransportSettings(

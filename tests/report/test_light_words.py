@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 from warpir.core.arrays import Float64Array, FloatArray
+from warpir.core.latlong import map_directions
 from warpir.report.words import (
     LightCharacter,
     characterize,
@@ -13,16 +14,7 @@ from warpir.report.words import (
     strength_words,
 )
 from warpir.scene.camera import camera_from_fov
-from warpir.scene.light import (
-    Light,
-    Lobes,
-    as_map,
-    axis_from_angles,
-    bearing,
-    map_directions,
-    plain_sky,
-    sun_lobe,
-)
+from warpir.scene.light import Light, Lobes, as_map, axis_from_angles, bearing, plain_sky, sun_lobe
 
 UP = np.array([0.0, 1.0, 0.0])
 AHEAD = np.eye(4)

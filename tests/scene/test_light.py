@@ -18,6 +18,7 @@ from warpir.app.config import InsertConfig
 from warpir.app.inputs import Inputs
 from warpir.core.arrays import Float64Array, FloatArray
 from warpir.core.errors import ExitCode, InputError
+from warpir.core.latlong import map_directions, resize_map, rotate_map, texel_solid_angles
 from warpir.io.images.photos import Photo
 from warpir.lighting.fit import LAMP_COUNT_MAX, fit_lobes
 from warpir.lighting.scene_light import SKIES, SUN_TO_SKY, make_light
@@ -30,14 +31,10 @@ from warpir.scene.light import (
     as_map,
     axis_from_angles,
     lobe_cosine,
-    map_directions,
     plain_sky,
     rasterize_lobes,
-    resize_map,
-    rotate_map,
     summarize,
     sun_lobe,
-    texel_solid_angles,
 )
 from warpir.scene.placement import place_asset
 

@@ -8,33 +8,24 @@ import pytest
 import torch
 import warp as wp
 
+from warpir.core.latlong import map_directions, texel_solid_angles
 from warpir.diffusion.models.embedded_words import KINDS, NOUNS
 from warpir.kernels import training_scene as kernel
-from warpir.lighting.regressor import hints, random_regressor
-from warpir.scene.light import map_directions, texel_solid_angles
+from warpir.lighting.latlong_tensors import luminance, shrunk, solid_angles
+from warpir.lighting.regression import estimate_shading_light
+from warpir.lighting.regressor import random_regressor
 from warpir.train.lights import (
     LightPool,
-    gray,
-    halved,
     load_panoramas,
     make_lights,
-    solid_angles,
     split_sun,
 )
 from warpir.train.meshes import FAMILIES, make_meshes
 from warpir.train.photo_look import draw_faults, draw_looks
-from warpir.train.scenes import (
-    SOLIDS,
-    Lighting,
-    Mixture,
-    SceneGenerator,
-    Stock,
-    about_y,
-    packed_solids,
-    rays_of,
-    to_map,
-    to_world,
-)
+from warpir.train.scenes.generator import PHOTO_SIZE, Mixture, SceneGenerator
+from warpir.train.scenes.lighting import Lighting, about_y, to_map, to_world
+from warpir.train.scenes.render import Stock, render, sun_reaches
+from warpir.train.scenes.solids import SOLIDS, packed_solids
 
 
 def lights_of(device: str, fine: torch.Tensor, sun: float, axis: tuple[float, ...]) -> LightPool:
@@ -147,7 +138,7 @@ def test_the_sun_is_seen_where_the_photo_says(device: str) -> None:
     scenes = generator(device, even(device, 40.0, (0.3, 0.15, -0.94)), **CROPS)
     batch = scenes.photo_batch(0, 48)
     drawn = scenes._draw(0, 48, scenes._generator(3, 0), with_object=False)
-    shot = scenes._render(drawn, drawn.photo_window, (96, 144), 2, with_object=False)
+    shot = render(scenes.stock, drawn, drawn.photo_window, (96, 144), 2, with_object=False)
     brightest = shot.background.mean(dim=1).flatten(1).argmax(dim=1)
     ray = batch.rays.flatten(2)[torch.arange(48), :, brightest]
     angle = torch.rad2deg(torch.arccos((ray * batch.axis).sum(dim=1).clamp(-1.0, 1.0)))
@@ -164,7 +155,7 @@ def test_the_photos_light_has_the_photos_unit(device: str) -> None:
     scenes = generator(device, even(device, 0.0), **CROPS)
     batch = scenes.photo_batch(4, 16)
     drawn = scenes._draw(4, 16, scenes._generator(3, 4), with_object=False)
-    shot = scenes._render(drawn, drawn.photo_window, (96, 144), 2, with_object=False)
+    shot = render(scenes.stock, drawn, drawn.photo_window, (96, 144), 2, with_object=False)
     look = draw_looks(shot.background, _after_draw(scenes, 4, 16))
     # An even panorama: every pixel has the gain's radiance, and so has the ambient map.
     expected = (shot.background * look.gain[:, :, None, None]).mean(dim=(2, 3))
@@ -216,12 +207,12 @@ def test_solids_block_the_sun(device: str) -> None:
     slant = torch.nn.functional.normalize(torch.tensor([[1.0, 0.6, 0.0]] * count), dim=1).to(device)
     below = torch.zeros(count, 3, device=device)
     # From below a cylinder shows its lower cap, which is left out: it stands on the ground.
-    blocked = scenes._sun_reaches(solids, below, up).tolist()
+    blocked = sun_reaches(scenes.stock, solids, below, up).tolist()
     assert blocked[:2] == [0.0, 0.0]
-    assert scenes._sun_reaches(solids, below, slant).tolist() == [1.0] * 3
+    assert sun_reaches(scenes.stock, solids, below, slant).tolist() == [1.0] * 3
     level = torch.tensor([[-6.0, 5.0, 0.0]] * count, device=device)
     across = torch.tensor([[1.0, 0.0, 0.0]] * count, device=device)
-    assert scenes._sun_reaches(solids, level, across).tolist() == [0.0] * 3
+    assert sun_reaches(scenes.stock, solids, level, across).tolist() == [0.0] * 3
     wp.synchronize()
 
 
@@ -244,12 +235,11 @@ def test_a_split_map_is_the_sum_of_its_parts() -> None:
     np.testing.assert_allclose(rest + split.sun, total, rtol=0.01)
 
 
-def test_halving_keeps_the_flux() -> None:
+def test_shrinking_keeps_the_flux() -> None:
     torch.manual_seed(1)
     maps = torch.rand(2, 32, 64, 3)
-    for before, after in ((maps, halved(maps)),):
-        sums = [(x * solid_angles(x)[..., None]).sum(dim=(1, 2)) for x in (before, after)]
-        torch.testing.assert_close(*sums)
+    sums = [(x * solid_angles(x)[..., None]).sum(dim=(1, 2)) for x in (maps, shrunk(maps, 16))]
+    torch.testing.assert_close(*sums)
 
 
 def test_made_up_lights_are_sound() -> None:
@@ -265,7 +255,7 @@ def test_made_up_lights_are_sound() -> None:
         "hwc,nc->nhw", torch.from_numpy(map_directions(32, 64)).float(), lights.axis
     )
     up = torch.from_numpy(map_directions(32, 64)[..., 1]).float() > 0.1
-    sky = gray(lights.fine)
+    sky = luminance(lights.fine)
     for k in torch.nonzero(lights.weather == 0).flatten()[:40].tolist():
         toward, away = (near[k] > 0.8) & up, (near[k] < 0.0) & up
         if toward.any() and away.any():
@@ -283,7 +273,7 @@ def test_panoramas_of_nothing_but_sky_come_last(tmp_path: Path) -> None:
     pool = load_panoramas(paths, "cpu")
     assert pool.panorama_count == 3 and pool.grounded_count == 2
     # Whatever the file's unit, the mean luminance is 1.
-    mean = (gray(pool.fine) * solid_angles(pool.fine)).sum(dim=(1, 2)) / (4.0 * np.pi)
+    mean = (luminance(pool.fine) * solid_angles(pool.fine)).sum(dim=(1, 2)) / (4.0 * np.pi)
     torch.testing.assert_close(mean, torch.ones(3), atol=1e-3, rtol=0)
 
 
@@ -319,7 +309,7 @@ def test_cameras_expose_and_spoil_within_range() -> None:
 
 @pytest.mark.slow
 def test_the_prior_is_told_what_the_regressor_says(device: str) -> None:
-    """The planes of a level, unturned camera are those of ``Regression.hint``."""
+    """The planes of a level, unturned camera are those of ``Regression.matte_picture``."""
     stock = Stock(make_meshes(12, 3), even(device, 3.0), device)
     network = random_regressor(1).to(device)
     scenes = SceneGenerator(stock, 5, regressor=network)
@@ -328,20 +318,20 @@ def test_the_prior_is_told_what_the_regressor_says(device: str) -> None:
     draws = scenes._generator(2, 0)
     scenes._draw(0, 4, draws, with_object=True)
     shot = scenes._shoot(drawn, draws)
-    assert shot.hint is not None
-    expected = hints(network, shot.whole_photo, rays_of(drawn))
-    torch.testing.assert_close(shot.hint.toward, expected.toward, atol=2e-2, rtol=2e-2)
+    assert shot.estimate is not None
+    expected = estimate_shading_light(network, shot.whole_photo, drawn.rays(PHOTO_SIZE))
+    torch.testing.assert_close(shot.estimate.toward, expected.toward, atol=2e-2, rtol=2e-2)
     for k in range(4):
         axes = torch.stack([drawn.right[k], drawn.up[k], drawn.back[k]])
         told = batch.gbuffer[k, 10:]
         assert float((told - told[:, :1, :1]).abs().max()) == 0.0
-        torch.testing.assert_close(told[:, 0, 0], axes @ shot.hint.toward[k], atol=1e-5, rtol=0)
+        torch.testing.assert_close(told[:, 0, 0], axes @ shot.estimate.toward[k], atol=1e-5, rtol=0)
         # Pixel by pixel: irradiance of the nearest texel's direction, which is smooth.
         inside = batch.gbuffer[k, 0] > 0.999
         normals = batch.gbuffer[k, 4:7, inside].T @ axes
         directions = torch.from_numpy(map_directions(16, 32).reshape(-1, 3)).float().to(device)
         nearest = (normals @ directions.T).argmax(dim=1)
-        e = shot.hint.irradiance[k].flatten(0, 1)[nearest]
+        e = shot.estimate.irradiance[k].flatten(0, 1)[nearest]
         albedo = batch.gbuffer[k, 1:4, inside].T ** 2.2
         shown = (albedo * e / np.pi).clamp(0.0, 1.0) ** (1.0 / 2.2)
         assert float((shown - batch.gbuffer[k, 7:10, inside].T).abs().mean()) < 0.02

@@ -20,7 +20,8 @@ from PIL import Image
 
 from tools.demo.car import car
 from tools.demo.place import background, camera, placement
-from tools.demo.sky import seen, sky
+from tools.demo.sky import sky
+from warpir.core.latlong import look_up
 from warpir.demo import ASSET, CAMERA, LIGHT, PHOTO
 from warpir.io.gltf.writer import write_glb
 from warpir.scene.camera import Camera
@@ -108,7 +109,7 @@ def render(with_car: bool, samples: int, device: str | None, seed: int = 0) -> N
     shape = (view.height, view.width, -1)
     radiance = without_fireflies(np.stack([b.radiance for b in batches])).reshape(shape)
     empty = 1.0 - np.mean([b.mask for b in batches], axis=0).reshape(shape)
-    picture = radiance + empty * seen(sky(FINE_SKY), pixel_directions(view))
+    picture = radiance + empty * look_up(sky(FINE_SKY), pixel_directions(view))
     return np.asarray(picture, dtype=np.float32)
 
 

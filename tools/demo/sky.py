@@ -8,6 +8,8 @@ import numpy as np
 
 from tools.demo.noise import value_noise
 from warpir.core.arrays import Float64Array, FloatArray
+from warpir.core.latlong import directions_at, map_directions, texel_solid_angles, uv_of
+from warpir.scene.light import axis_from_angles
 
 SUN_AZIMUTH, SUN_ELEVATION = -136.0, 37.0
 """Sun: azimuth from -Z toward +X (negative: to the left, behind the camera); elevation [deg]."""
@@ -50,36 +52,7 @@ ZENITH = {
 
 def sun_direction() -> Float64Array:
     """Return the unit direction toward the sun, world frame, shape [3]."""
-    azimuth, elevation = np.radians(SUN_AZIMUTH), np.radians(SUN_ELEVATION)
-    return np.array(
-        [
-            np.sin(azimuth) * np.cos(elevation),
-            np.sin(elevation),
-            -np.cos(azimuth) * np.cos(elevation),
-        ]
-    )
-
-
-def latlong_directions(height: int, rows: Float64Array, columns: Float64Array) -> Float64Array:
-    """Return directions at fractional rows and columns of a map, shape [row, column, 3]."""
-    lat = np.pi * (0.5 - rows / height)[:, None]
-    lon = np.pi * (1.0 - columns / height)[None, :]
-    return np.stack(
-        [np.sin(lon) * np.cos(lat), np.sin(lat) + 0.0 * lon, np.cos(lon) * np.cos(lat)], axis=2
-    )
-
-
-def texel_directions(height: int) -> Float64Array:
-    """Return the directions of all texel centres, shape [height, 2 height, 3]."""
-    centers: Float64Array = np.arange(2 * height, dtype=np.float64) + 0.5
-    return latlong_directions(height, centers[:height], centers)
-
-
-def solid_angles(height: int) -> Float64Array:
-    """Return the solid angle of a texel in each row [sr], shape [row]."""
-    edge = np.cos(np.pi * np.arange(height + 1) / height)
-    omega: Float64Array = (np.pi / height) * (edge[:-1] - edge[1:])
-    return omega
+    return axis_from_angles(SUN_AZIMUTH, SUN_ELEVATION)
 
 
 def _perez(
@@ -127,38 +100,22 @@ def _clouds(direction: Float64Array) -> Float64Array:
 def _sun(height: int) -> Float64Array:
     """Return the share of each texel that the sun's disc covers [1], shape [H, W]."""
     sun = sun_direction()
-    row = height * (0.5 - np.arcsin(sun[1]) / np.pi)
-    column = height * (1.0 - np.arctan2(sun[0], sun[2]) / np.pi)
+    u, v = uv_of(sun)
+    row, column = float(v) * height, float(u) * 2 * height
     reach = int(np.ceil(SUN_RADIUS / 180.0 * height / np.cos(np.radians(SUN_ELEVATION)))) + 1
     rows = np.arange(int(row) - reach, int(row) + reach + 1)
     columns = np.arange(int(column) - reach, int(column) + reach + 1)
     fine = 16
     inner: Float64Array = (np.arange(fine) + 0.5) / fine
-    direction = latlong_directions(
-        height,
-        np.add.outer(rows, inner).ravel().astype(np.float64),
-        np.add.outer(columns, inner).ravel().astype(np.float64),
+    direction = directions_at(
+        np.pi * (0.5 - np.add.outer(rows, inner).ravel() / height),
+        np.pi * (1.0 - np.add.outer(columns, inner).ravel() / height),
     )
     inside = direction @ sun > np.cos(np.radians(SUN_RADIUS))
     share = inside.reshape(len(rows), fine, len(columns), fine).mean(axis=(1, 3))
     cover = np.zeros((height, 2 * height))
     cover[np.ix_(rows, columns % (2 * height))] = share
     return cover
-
-
-def seen(texels: FloatArray, direction: Float64Array) -> Float64Array:
-    """Interpolate a map along unit directions of any shape [..., 3]; shape [..., 3]."""
-    height = len(texels)
-    row = height * (0.5 - np.arcsin(np.clip(direction[..., 1], -1.0, 1.0)) / np.pi) - 0.5
-    column = height * (1.0 - np.arctan2(direction[..., 0], direction[..., 2]) / np.pi) - 0.5
-    i, j = np.floor(row).astype(int), np.floor(column).astype(int)
-    s, t = (row - i)[..., None], (column - j)[..., None]
-    i0, i1 = np.clip(i, 0, height - 1), np.clip(i + 1, 0, height - 1)
-    j0, j1 = j % (2 * height), (j + 1) % (2 * height)
-    upper = texels[i0, j0] * (1.0 - t) + texels[i0, j1] * t
-    lower = texels[i1, j0] * (1.0 - t) + texels[i1, j1] * t
-    radiance: Float64Array = upper * (1.0 - s) + lower * s
-    return radiance
 
 
 def sky(height: int = 512) -> FloatArray:
@@ -172,8 +129,8 @@ def sky(height: int = 512) -> FloatArray:
     Returns:
         Radiance, linear Rec.709, relative [W/(m^2 sr)], shape [height, 2 height, 3].
     """
-    direction = texel_directions(height)
-    omega = solid_angles(height)[:, None]
+    direction = map_directions(height, 2 * height)
+    omega = texel_solid_angles(height, 2 * height)[:, None]
     up = direction[..., 1]
     texels = _clear_sky(direction)
     cover = _clouds(direction)[..., None]

@@ -17,7 +17,6 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-import warpir
 from warpir.app.config import EMBEDDED_STEPS, InsertConfig, usage
 from warpir.app.program import run_program, say
 from warpir.core.atomic import write_file
@@ -26,26 +25,17 @@ from warpir.core.errors import ExitCode, InputError
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-    from warpir.evaluate.contact_sheet import Panel
     from warpir.evaluate.image_errors import Distance
     from warpir.evaluate.report import Entry
+    from warpir.evaluate.results import Panel
     from warpir.evaluate.rows import Bench
     from warpir.evaluate.scenes import Place, Subject
-    from warpir.evaluate.stage import Prediction
     from warpir.io.results import OutputFolder
-    from warpir.lighting.regressor import Regressor
 
     FloatArray = NDArray[np.float32]
 
-FORMAT, VERSION = "warpir-evaluation", 1
-LIGHT_HEIGHT = 128
-"""Rows of the maps on which lights are compared."""
 SHEET_ROWS = ("lds-regression", "lds-uniform", "regression", "predictions", "brightest-region")
 """Whose pictures the contact sheet shows: the first of these that was asked for."""
-UNSEEN_SEED = 0xE7A1
-"""Added to the seed of made-up photographs; training and its validation use others."""
-PROCEDURAL_BATCH = 64
-"""Of those, rendered at once."""
 SAVED = ("tables.md", "contact_sheet.png")
 
 
@@ -65,83 +55,52 @@ def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(
         prog="python -m warpir.evaluate", description=__doc__.partition("\n")[0]
     )
+    _add_scene_flags(parser)
     add = parser.add_argument
-    add(
-        "--panoramas",
-        type=Path,
-        nargs="+",
-        metavar="PATH",
-        help="lat-long .hdr and .exr files, or folders of them",
-    )
+    add("--out", type=Path, metavar="DIR", help="folder for " + " and ".join(SAVED))
+    add("--overwrite", action="store_true", help="replace results in --out")
+    add("--predictions", type=Path, metavar="DIR", help="another system's maps of exported crops")
+    add("--export-crops", type=Path, metavar="DIR", help="write the photographs for another system")
+    words = "rendered photographs on which the regressor's direction is measured too"
+    add("--procedural", type=_count, default=0, metavar="N", help=words)
+    _add_model_flags(parser)
+    add("--debug", action="store_true", help="tracebacks and the libraries' messages")
+    return parser
+
+
+def _add_scene_flags(parser: argparse.ArgumentParser) -> None:
+    add = parser.add_argument
+    words = "lat-long .hdr and .exr files, or folders of them"
+    add("--panoramas", type=Path, nargs="+", metavar="PATH", help=words)
     add("--assets", type=Path, nargs="+", metavar="PATH", help="objects, or folders of them")
     add("--scenes", type=_count, default=20, metavar="N", help="photographs (default: 20)")
     add("--seed", type=_count, default=0, metavar="S", help="of everything that is random")
     add("--json", type=Path, metavar="FILE", help="all numbers")
-    add(
-        "--rows", metavar="A,B,...", help="names of rows or of groups of rows, or all (--list-rows)"
-    )
+    words = "names of rows or of groups of rows, or all (--list-rows)"
+    add("--rows", metavar="A,B,...", help=words)
     add("--list-rows", action="store_true", help="print the rows and end")
-    add(
-        "--width",
-        type=_count,
-        default=384,
-        metavar="W",
-        help="of the photographs [px] (default: 384)",
-    )
-    add(
-        "--fov",
-        type=float,
-        default=60.0,
-        metavar="DEG",
-        help="vertical field of view (default: 60)",
-    )
-    add(
-        "--curve",
-        default="gamma",
-        metavar="NAME",
-        help="the camera's response: gamma (default) or filmic, which no row is told of",
-    )
+    words = "of the photographs [px] (default: 384)"
+    add("--width", type=_count, default=384, metavar="W", help=words)
+    words = "vertical field of view (default: 60)"
+    add("--fov", type=float, default=60.0, metavar="DEG", help=words)
+    words = "the camera's response, which no row knows: gamma (default) or filmic"
+    add("--curve", default="gamma", metavar="NAME", help=words)
     add("--samples", type=_count, default=64, metavar="N", help="per pixel (default: 64)")
     add("--device", metavar="NAME", help="cpu, cuda or cuda:N")
     add("--threads", type=_count, default=0, metavar="N", help="on the CPU (default: one per core)")
-    add("--out", type=Path, metavar="DIR", help="folder for " + " and ".join(SAVED))
-    add("--overwrite", action="store_true", help="replace results in --out")
-    add(
-        "--predictions",
-        type=Path,
-        metavar="DIR",
-        help="maps that another system made of the exported crops",
-    )
-    add("--export-crops", type=Path, metavar="DIR", help="write the photographs for another system")
-    add(
-        "--procedural",
-        type=_count,
-        default=0,
-        metavar="N",
-        help="made-up photographs on which the regressor's direction is measured too",
-    )
-    add(
-        "--lpips",
-        type=Path,
-        metavar="FILE",
-        help="weights of LPIPS (warpir/evaluate/lpips.py says which)",
-    )
+
+
+def _add_model_flags(parser: argparse.ArgumentParser) -> None:
+    add = parser.add_argument
+    words = "weights of LPIPS (warpir/evaluate/lpips.py says which)"
+    add("--lpips", type=Path, metavar="FILE", help=words)
     add("--prior", metavar="FILE", help="weights of the embedded prior (default: warpir's own)")
-    add(
-        "--regressor",
-        type=Path,
-        metavar="FILE",
-        help="weights of the regressor (default: warpir's own)",
-    )
-    add(
-        "--model",
-        metavar="DIR",
-        help="a Stable Diffusion that guides in place of the embedded prior",
-    )
+    words = "weights of the regressor (default: warpir's own)"
+    add("--regressor", type=Path, metavar="FILE", help=words)
+    words = "a Stable Diffusion that guides in place of the embedded prior"
+    add("--model", metavar="DIR", help=words)
     add("--prompt", metavar="TEXT", help="what all objects are (default: their files' names)")
     add("--steps", type=_count, metavar="N", help="of the guided rows")
-    add("--debug", action="store_true", help="tracebacks and the libraries' messages")
-    return parser
 
 
 def _count(text: str) -> int:
@@ -216,12 +175,49 @@ def evaluate(
         What the JSON file holds.
     """
     started = time.perf_counter()
-    from warpir.evaluate.report import as_plain, compare, pair_table, summarize, tables
-    from warpir.evaluate.rows import ROWS
-    from warpir.evaluate.scenes import ASSET_SUFFIXES, PANORAMA_SUFFIXES, Places, find_files
+    from warpir.evaluate.judge import Judge, procedural_errors
+    from warpir.evaluate.results import run_record
+    from warpir.render.device import choose_device
 
     lpips = _load_lpips(options)
     notices = _missing_measures(lpips)
+    scenes = _make_scenes(options, notices)
+    predictions = _exchange(options, [place for place, _ in scenes], notices)
+    device = choose_device(options.device)
+    say(f"device: {device} (the first run compiles the kernels)")
+    bench = _make_bench(options, scenes, device, predictions)
+    rows = usable_rows(bench, rows, options.rows is not None, notices)
+    for notice in notices:
+        say(f"notice: {notice}")
+    sheet_row = next((r for r in SHEET_ROWS if r in rows), rows[0])
+    judge = Judge(bench, rows, options.samples, options.threads, lpips, sheet_row)
+    entries: list[Entry] = []
+    panels: list[Panel] = []
+    for place, subjects in scenes:
+        judged, shown = judge.place(place, subjects)
+        entries += judged
+        panels += shown
+        error = np.mean([e.figures["image.box.rmse"] for e in judged if e.row == sheet_row])
+        say(f"{place.name}: {sheet_row}, RMSE of the box {float(error):.4f}")
+    record = run_record(options, bench, scenes, notices)
+    if options.procedural:
+        record["procedural"] = procedural_errors(
+            bench.network, options.procedural, options.seed, device
+        )
+    record["seconds"] = round(time.perf_counter() - started, 1)
+    lines = _summarize(record, entries, rows)
+    for line in lines:
+        say(line)
+    _write(options, record, lines, panels, sheet_row, output)
+    return record
+
+
+def _make_scenes(
+    options: argparse.Namespace, notices: list[str]
+) -> "list[tuple[Place, list[Subject]]]":
+    """Cut the photographs out of the panoramas; what was assumed is added to the notices."""
+    from warpir.evaluate.scenes import ASSET_SUFFIXES, PANORAMA_SUFFIXES, Places, find_files
+
     places = Places(
         find_files(options.panoramas, PANORAMA_SUFFIXES, "--panoramas"),
         find_files(options.assets, ASSET_SUFFIXES, "--assets"),
@@ -232,38 +228,20 @@ def evaluate(
     )
     scenes = places.make(options.scenes)
     notices += places.notices
-    predictions = _exchange(options, [place for place, _ in scenes], notices)
+    return scenes
 
-    from warpir.render.device import choose_device
 
-    device = choose_device(options.device)
-    say(f"device: {device} (the first run compiles the kernels)")
-    bench = _make_bench(options, scenes, device, predictions)
-    rows = usable_rows(bench, rows, options.rows is not None, notices)
-    for notice in notices:
-        say(f"notice: {notice}")
-    sheet_row = next((r for r in SHEET_ROWS if r in rows), rows[0])
-    entries: list[Entry] = []
-    panels: list[Panel] = []
-    for place, subjects in scenes:
-        made, shown = _judge(bench, place, subjects, rows, options, lpips, sheet_row)
-        entries += made
-        panels += shown
-        best = [e for e in made if e.row == sheet_row]
-        error = float(np.mean([e.figures["image.box.rmse"] for e in best]))
-        say(f"{place.name}: {sheet_row}, RMSE of the box {error:.4f}")
+def _summarize(record: dict[str, Any], entries: "list[Entry]", rows: Sequence[str]) -> list[str]:
+    """Add the entries and their summary to the record, and return the tables as lines."""
+    from warpir.evaluate.report import as_plain, compare, pair_table, summarize, tables
+    from warpir.evaluate.results import head_lines, verdict_lines
+    from warpir.evaluate.rows import ROWS
 
     starts = {name: row.start for name, row in ROWS.items() if row.start is not None}
     summary, pairs = summarize(entries), compare(entries, starts)
-    record = _record(options, bench, scenes, notices)
-    if options.procedural:
-        record["procedural"] = procedural_errors(
-            bench.network, options.procedural, options.seed, device
-        )
-    record["seconds"] = round(time.perf_counter() - started, 1)
     lines = [
-        *_head(record),
-        *_verdicts(entries),
+        *head_lines(record),
+        *verdict_lines(entries),
         *tables(summary, {name: ROWS[name].words for name in rows}),
         # What is known of the truth needs no comparison; the JSON file has it all the same.
         *pair_table([p for p in pairs if ROWS[p.row].group != "references"]),
@@ -271,19 +249,27 @@ def evaluate(
     record["entries"] = [asdict(entry) for entry in entries]
     record["summary"] = as_plain(summary)
     record["pairs"] = [asdict(pair) for pair in pairs]
-    for line in lines:
-        say(line)
-    if output is not None:
-        from warpir.evaluate.contact_sheet import contact_sheet
+    return lines
 
+
+def _write(
+    options: argparse.Namespace,
+    record: dict[str, Any],
+    lines: list[str],
+    panels: "list[Panel]",
+    sheet_row: str,
+    output: "OutputFolder | None",
+) -> None:
+    from warpir.evaluate.results import contact_sheet, plain_values
+
+    if output is not None:
         output.write_bytes("tables.md", ("\n".join(lines) + "\n").encode())
         sheet = contact_sheet(panels, sheet_row)
         output.write_png("contact_sheet.png", sheet, mark=False, description="Evaluation")
     if options.json is not None:
-        text = json.dumps(_plain(record), indent=1, allow_nan=False) + "\n"
+        text = json.dumps(plain_values(record), indent=1, allow_nan=False) + "\n"
         write_file(options.json, text.encode())
         say(f"written: {options.json}")
-    return record
 
 
 def _load_lpips(options: argparse.Namespace) -> "Distance | None":
@@ -378,262 +364,3 @@ def usable_rows(
         else:
             usable.append(name)
     return usable
-
-
-def _judge(
-    bench: "Bench",
-    place: "Place",
-    subjects: "list[Subject]",
-    rows: Sequence[str],
-    options: argparse.Namespace,
-    lpips: "Distance | None",
-    sheet_row: str,
-) -> "tuple[list[Entry], list[Panel]]":
-    """Return what every row gets in one place, and what the contact sheet shows of it."""
-    from warpir.evaluate.contact_sheet import Panel, to_codes
-    from warpir.evaluate.image_errors import image_errors, make_regions
-    from warpir.evaluate.light_errors import light_errors
-    from warpir.evaluate.report import Entry
-    from warpir.evaluate.rows import ROWS
-    from warpir.evaluate.stage import Quality, Stage
-    from warpir.scene.light import as_map
-
-    entries, panels = [], []
-    of_place: dict[str, tuple[Prediction, FloatArray, dict[str, float]]] = {}
-    for subject in subjects:
-        quality = Quality(samples=options.samples)
-        stage = Stage(subject, bench.device, quality, options.seed, options.threads)
-        regions = make_regions(stage.mask, stage.ratio)
-        lights: dict[str, FloatArray] = {}
-        for name in rows:
-            row = ROWS[name]
-            if row.of_subject is not None:
-                prediction = row.of_subject(bench, stage, subject)
-                texels = as_map(prediction.light, LIGHT_HEIGHT)
-                of_light = light_figures(place, texels)
-            elif name in of_place:
-                prediction, texels, of_light = of_place[name]
-            else:
-                assert row.of_place is not None
-                prediction = row.of_place(bench, place)
-                texels = as_map(prediction.light, LIGHT_HEIGHT)
-                of_light = light_figures(place, texels)
-                of_place[name] = prediction, texels, of_light
-            lights[name], figures = texels, dict(of_light)
-            if row.same_as in lights:
-                figures["light.same_deg"] = light_errors(texels, lights[row.same_as])[
-                    "peak_angle_deg"
-                ]
-            rendered = stage.render(prediction)
-            image = stage.compose(rendered, prediction.curves)
-            figures |= _flat("image", image_errors(image, stage.truth, regions, lpips))
-            gain = stage.fit_exposure(rendered, prediction.curves)
-            fitted = stage.compose(rendered, prediction.curves, gain)
-            figures |= _flat("fitted", image_errors(fitted, stage.truth, regions, lpips))
-            figures["fitted.ev"] = float(np.log2(gain))
-            entries.append(
-                Entry(
-                    name,
-                    place.name,
-                    place.panorama,
-                    place.is_sunny,
-                    subject.material,
-                    figures,
-                    prediction.about,
-                )
-            )
-            if name == sheet_row:
-                error = figures["image.box.rmse"]
-                pictures = (place.photo, image, stage.truth)
-                panels.append(Panel(subject.name, error, *map(to_codes, pictures)))
-    return entries, panels
-
-
-def light_figures(place: "Place", texels: "FloatArray") -> dict[str, float]:
-    """Return the errors of a light, ``light.*`` and ``spheres.*``, in the camera-yaw frame.
-
-    Args:
-        place: Knows the truth.
-        texels: Lat-long radiance, world frame, shape [He, 2 He, 3].
-    """
-    from warpir.evaluate.light_errors import light_errors
-    from warpir.evaluate.three_spheres import sphere_errors
-
-    found, true = place.to_camera(texels), place.to_camera(place.texels)
-    errors = light_errors(found, true)
-    for name in [n for n in errors if n.startswith("log_")]:
-        errors[f"abs_{name}"] = abs(errors[name])
-    return _flat("", {"light": errors, "spheres": sphere_errors(found, true)})
-
-
-def procedural_errors(
-    network: "Regressor", count: int, seed: int, device: str
-) -> dict[str, dict[str, float]]:
-    """Return how well the regressor finds the direction in made-up photographs never seen.
-
-    Args:
-        network: The regressor.
-        count: Photographs.
-        seed: Objects, lights and photographs are those of no training run.
-        device: Warp device.
-
-    Returns:
-        Angle between found and true dominant direction [deg]: median, mean and 95 % interval of the
-        mean, of the photographs with a visible cue and of those without; beside it that of a guess,
-        the direction of the mean training light.
-    """
-    import torch
-
-    from warpir.lighting.regressor import least_angle
-    from warpir.train.lights import load_panoramas
-    from warpir.train.meshes import make_meshes
-    from warpir.train.scenes import Mixture, SceneGenerator, Stock
-
-    where = network.directions.device
-    stock = Stock(make_meshes(24, UNSEEN_SEED + seed), load_panoramas([], where), device)
-    scenes = SceneGenerator(stock, UNSEEN_SEED + seed, Mixture(made_up=1.0, hybrid=0.0))
-    guess, _ = least_angle(
-        network.directions, network.split(network.mean_light[None]).logits.softmax(dim=1)
-    )
-    angles: dict[str, list[float]] = {"found": [], "guessed": []}
-    cues: list[bool] = []
-    for index, first in enumerate(range(0, count, PROCEDURAL_BATCH)):
-        batch = scenes.photo_batch(index, PROCEDURAL_BATCH)
-        said = network.predict(batch.photo, batch.rays)
-        axis, _ = least_angle(network.directions, said.logits.softmax(dim=1))
-        wanted = min(PROCEDURAL_BATCH, count - first)
-        cues += batch.has_cue[:wanted].tolist()
-        for name, directions in (("found", axis), ("guessed", guess.expand_as(axis))):
-            cosine = (directions * batch.axis).sum(dim=1).clamp(-1.0, 1.0)
-            angles[name] += torch.rad2deg(torch.acos(cosine))[:wanted].tolist()
-    return {
-        f"{name}, {words}": _spread([a for a, c in zip(values, cues, strict=True) if c == is_cue])
-        for name, values in angles.items()
-        for words, is_cue in (("visible cue", True), ("no cue", False))
-        if is_cue in cues
-    }
-
-
-def _spread(angles: list[float]) -> dict[str, float]:
-    from warpir.evaluate.report import bootstrap
-
-    low, high = bootstrap(angles, [str(k) for k in range(len(angles))], rounds=1000)
-    return {
-        "median_deg": float(np.median(angles)),
-        "mean_deg": float(np.mean(angles)),
-        "mean_low_deg": low,
-        "mean_high_deg": high,
-        "count": len(angles),
-    }
-
-
-def _flat(prefix: str, nested: dict[str, dict[str, float]]) -> dict[str, float]:
-    """Return nested figures by dotted name."""
-    start = f"{prefix}." if prefix else ""
-    return {f"{start}{k}.{n}": v for k, errors in nested.items() for n, v in errors.items()}
-
-
-# ---------------------------------------------------------------------------------- what is written
-
-
-def _record(
-    options: argparse.Namespace,
-    bench: "Bench",
-    scenes: "list[tuple[Place, list[Subject]]]",
-    notices: list[str],
-) -> dict[str, Any]:
-    """Return what the numbers depend on, as plain values."""
-    from warpir.app.record import versions
-
-    return {
-        "format": FORMAT,
-        "version": VERSION,
-        "warpir": warpir.__version__,
-        "commit": _commit(),
-        "versions": versions(),
-        "device": bench.device,
-        "date": time.strftime("%Y-%m-%d"),
-        "options": vars(options),
-        "weights": bench.digests(),
-        "notices": notices,
-        "scenes": [
-            {
-                "name": place.name,
-                "panorama": place.panorama,
-                "is_sunny": place.is_sunny,
-                "azimuth_deg": place.azimuth,
-                "pitch_deg": place.pitch,
-                "exposure": place.exposure,
-                "asset": subjects[0].asset_path.name,
-                "asset_to_world": subjects[0].placement.asset_to_world.tolist(),
-            }
-            for place, subjects in scenes
-        ],
-    }
-
-
-def _plain(value: Any) -> Any:
-    """Return what JSON can hold; a number that it lacks is null."""
-    if isinstance(value, dict):
-        return {str(k): _plain(v) for k, v in value.items()}
-    if isinstance(value, list | tuple):
-        return [_plain(v) for v in value]
-    if isinstance(value, float) and not np.isfinite(value):
-        return None
-    return value if isinstance(value, bool | int | float | str | None) else str(value)
-
-
-def _commit() -> str:
-    """Return the commit of this checkout, or "unknown" for an installed package."""
-    import subprocess
-
-    found = subprocess.run(
-        ["git", "-C", str(Path(__file__).parent), "rev-parse", "--short", "HEAD"],
-        capture_output=True,
-        text=True,
-        check=False,
-    )
-    return found.stdout.strip() or "unknown"
-
-
-def _head(record: dict[str, Any]) -> list[str]:
-    """Return what stands above the tables, as lines of Markdown."""
-    options, panoramas = record["options"], {s["panorama"] for s in record["scenes"]}
-    sunny = sum(s["is_sunny"] for s in record["scenes"])
-    lines = [
-        "# Evaluation",
-        "",
-        f"{len(record['scenes'])} photographs ({sunny} sunny) of {len(panoramas)} panoramas, seed "
-        f"{options['seed']}, {options['width']} pixels wide, response {options['curve']}; "
-        f"{record['date']}, {record['device']}, warpir {record['warpir']}, commit "
-        f"{record['commit']}.",
-        "",
-        "Means over scenes with 95 % bootstrap intervals; scenes of one panorama are not",
-        "independent (the JSON file has intervals over panoramas too). Angles are in degrees.",
-        "",
-        *(f"Notice: {notice}." for notice in record["notices"]),
-        "",
-    ]  # fmt: skip
-    if "procedural" in record:
-        lines += ["## Made-up photographs never seen", ""]
-        lines += [
-            f"* {name}: median {s['median_deg']:.1f}, mean {s['mean_deg']:.1f} degrees "
-            f"({s['mean_low_deg']:.1f} .. {s['mean_high_deg']:.1f}), {s['count']} photographs"
-            for name, s in record["procedural"].items()
-        ]
-        lines.append("")
-    return lines
-
-
-def _verdicts(entries: "list[Entry]") -> list[str]:
-    """Return how often guidance could show that its end is better than its start, by row."""
-    verdicts: dict[str, list[bool]] = {}
-    for entry in entries:
-        acceptance = entry.about.get("record", {}).get("acceptance")
-        if acceptance is not None:
-            verdicts.setdefault(entry.row, []).append(bool(acceptance["is_accepted"]))
-    if not verdicts:
-        return []
-    lines = ["## What guidance said of its own end", ""]
-    lines += [f"* {row}: accepted in {sum(v)} of {len(v)} runs" for row, v in verdicts.items()]
-    return [*lines, ""]

@@ -23,7 +23,14 @@ from scipy.sparse.csgraph import connected_components
 
 from warpir.core.arrays import BoolArray, Float64Array, FloatArray, Int64Array, IntArray
 from warpir.core.color import luminance
-from warpir.scene.light import angles_from_axis, map_directions, resize_map, texel_solid_angles
+from warpir.core.latlong import (
+    directions_at,
+    latitudes,
+    map_directions,
+    resize_map,
+    texel_solid_angles,
+)
+from warpir.scene.light import angles_from_axis
 
 HEIGHT = 128
 """Rows of the maps that are compared; there are twice as many columns."""
@@ -111,17 +118,7 @@ def light_errors(predicted: FloatArray, true: FloatArray) -> dict[str, float]:
     flux = [texels * _solid_angles()[..., None] for texels in maps]
     found, wanted = (_directions(values) for values in lum)
     total, true_total = (part.sum(axis=(0, 1)) for part in flux)
-    errors = {
-        "peak_angle_deg": _angle_deg(found.peak, wanted.peak),
-        "bright_angle_deg": _angle_deg(found.bright, wanted.bright),
-        "blob_angle_deg": _angle_deg(found.blob, wanted.blob),
-    }
-    if found.peak is not None and wanted.peak is not None:
-        azimuth, elevation = angles_from_axis(found.peak)
-        true_azimuth, true_elevation = angles_from_axis(wanted.peak)
-        turn = (azimuth - true_azimuth + 180.0) % 360.0 - 180.0
-        errors["azimuth_error_deg"] = abs(turn)
-        errors["elevation_error_deg"] = abs(elevation - true_elevation)
+    errors = _angle_errors(found, wanted)
     shared = _sun_axis(wanted.blob, found.blob)
     errors["log_sun_sky_ratio_error"] = _log_ratio(lum[0], shared) - _log_ratio(lum[1], shared)
     errors["log_own_sun_sky_ratio_error"] = _log_ratio(
@@ -135,6 +132,28 @@ def light_errors(predicted: FloatArray, true: FloatArray) -> dict[str, float]:
     errors["true_peak_share"] = share
     errors["true_is_sunny"] = float(share >= SUNNY_SHARE)
     errors["predicted_has_direction"] = float(found.peak is not None)
+    return errors | _directional_errors(maps)
+
+
+def _angle_errors(found: _Directions, wanted: _Directions) -> dict[str, float]:
+    """Return the angles between the directions of two maps [deg]."""
+    errors = {
+        "peak_angle_deg": _angle_deg(found.peak, wanted.peak),
+        "bright_angle_deg": _angle_deg(found.bright, wanted.bright),
+        "blob_angle_deg": _angle_deg(found.blob, wanted.blob),
+    }
+    if found.peak is not None and wanted.peak is not None:
+        azimuth, elevation = angles_from_axis(found.peak)
+        true_azimuth, true_elevation = angles_from_axis(wanted.peak)
+        turn = (azimuth - true_azimuth + 180.0) % 360.0 - 180.0
+        errors["azimuth_error_deg"] = abs(turn)
+        errors["elevation_error_deg"] = abs(elevation - true_elevation)
+    return errors
+
+
+def _directional_errors(maps: list[Float64Array]) -> dict[str, float]:
+    """Return the directional errors of a predicted map and a true one, as far as they exist."""
+    errors = {}
     true_lights = lights_of(maps[1])
     if len(true_lights):
         errors["directional_deg"] = directional_error(lights_of(maps[0]), true_lights)
@@ -361,8 +380,7 @@ def published_lights_of(texels: Float64Array) -> Float64Array:
     grey = texels[..., 2]
     if grey.max() <= PEAK_CONTRAST * grey.mean():
         return np.zeros((0, 3))
-    rows = np.pi * (np.arange(HEIGHT) + 0.5) / HEIGHT
-    energy = grey * np.sin(rows)[:, None]
+    energy = grey * np.cos(latitudes(HEIGHT))[:, None]
 
     def touching(mask: BoolArray, seeds: BoolArray) -> BoolArray:
         parts, _ = label(mask, np.ones((3, 3)))
@@ -376,10 +394,10 @@ def published_lights_of(texels: Float64Array) -> Float64Array:
         if blob.mean() <= AREA_MAX and not is_long:
             mask |= blob
     parts, count = label(binary_dilation(mask, np.ones((2, 2))), np.ones((3, 3)))
-    lights = []
-    for part in range(1, min(count, LIGHT_COUNT_MAX) + 1):
-        row, column = (float(np.mean(where)) for where in np.nonzero(parts == part))
-        theta = np.pi * (row + 1.0) / HEIGHT
-        lon = np.pi * (1.0 - (column + 1.0) / HEIGHT)
-        lights.append([np.sin(theta) * np.sin(lon), np.cos(theta), np.sin(theta) * np.cos(lon)])
-    return np.array(lights).reshape(-1, 3)
+    centres = [
+        [float(np.mean(where)) for where in np.nonzero(parts == part)]
+        for part in range(1, min(count, LIGHT_COUNT_MAX) + 1)
+    ]
+    rows, columns = np.array(centres).reshape(-1, 2).T
+    lat, lon = np.pi * (0.5 - (rows + 1.0) / HEIGHT), np.pi * (1.0 - (columns + 1.0) / HEIGHT)
+    return np.diagonal(directions_at(lat, lon)).T

@@ -22,6 +22,7 @@ from scipy.ndimage import uniform_filter1d
 from warpir.core.arrays import Float64Array, FloatArray
 from warpir.core.color import gamma_to_linear
 from warpir.core.errors import InputError, raise_all
+from warpir.core.latlong import latitudes, map_directions, rotate_map
 from warpir.core.limits import LIMITS
 from warpir.core.strict_json import read_json_object
 from warpir.evaluate.three_spheres import from_camera_frame, lookup_matrix
@@ -29,7 +30,7 @@ from warpir.io.images.kinds import check_regular_file
 from warpir.io.images.photos import read_envmap
 from warpir.io.results import OutputFolder
 from warpir.scene.camera import Camera
-from warpir.scene.light import angles_from_axis, map_directions, rotate_map
+from warpir.scene.light import angles_from_axis
 
 INDEX = "crops.json"
 SUFFIXES = (".exr", ".hdr", ".npy")
@@ -113,25 +114,7 @@ def export_crops(scenes: Sequence[SceneCrop], folder: str | Path, overwrite: boo
             public = public_crop(scene.photo, scene.camera)
             if public is not None:
                 output.write_png(f"{scene.name}.public.png", _codes(public), mark=False)
-            rotation = scene.camera.c2w[:3, :3]
-            azimuth, pitch = angles_from_axis(-rotation[:, 2])
-            entries.append(
-                {
-                    "name": scene.name,
-                    "photo": photo,
-                    "public_photo": None if public is None else f"{scene.name}.public.png",
-                    "panorama": Path(scene.panorama).name,
-                    "azimuth_deg": azimuth,
-                    "pitch_deg": pitch,
-                    "exposure": scene.exposure,
-                    "camera": scene.camera.record(),
-                    "world_direction_of_a_map_in_the_camera_frame": {
-                        "image_centre": (-rotation[:, 2]).tolist(),
-                        "middle_row_three_quarters_to_the_right": rotation[:, 0].tolist(),
-                        "top_row": rotation[:, 1].tolist(),
-                    },
-                }
-            )
+            entries.append(_crop_entry(scene, photo, public is not None))
         output.write_json(
             INDEX,
             {
@@ -157,6 +140,27 @@ def export_crops(scenes: Sequence[SceneCrop], folder: str | Path, overwrite: boo
                 "crops": entries,
             },
         )
+
+
+def _crop_entry(scene: SceneCrop, photo: str, has_public: bool) -> dict[str, Any]:
+    """Return what the index says of a crop."""
+    rotation = scene.camera.c2w[:3, :3]
+    azimuth, pitch = angles_from_axis(-rotation[:, 2])
+    return {
+        "name": scene.name,
+        "photo": photo,
+        "public_photo": f"{scene.name}.public.png" if has_public else None,
+        "panorama": Path(scene.panorama).name,
+        "azimuth_deg": azimuth,
+        "pitch_deg": pitch,
+        "exposure": scene.exposure,
+        "camera": scene.camera.record(),
+        "world_direction_of_a_map_in_the_camera_frame": {
+            "image_centre": (-rotation[:, 2]).tolist(),
+            "middle_row_three_quarters_to_the_right": rotation[:, 0].tolist(),
+            "top_row": rotation[:, 1].tolist(),
+        },
+    }
 
 
 def read_predictions(folder: str | Path, scenes: Sequence[SceneCrop]) -> Predictions:
@@ -230,8 +234,8 @@ def to_world(texels: FloatArray, camera: Camera, frame: str) -> FloatArray:
     height = len(texels)
     # Toward the poles texels get narrower than the look-ups' spacing: average them to it first.
     wide = seen.astype(np.float64)
-    for row, sine in enumerate(np.sin(np.pi * (np.arange(height) + 0.5) / height)):
-        wide[row] = uniform_filter1d(wide[row], 2 * int(0.5 / sine) + 1, axis=0, mode="wrap")
+    for row, breadth in enumerate(np.cos(latitudes(height))):
+        wide[row] = uniform_filter1d(wide[row], 2 * int(0.5 / breadth) + 1, axis=0, mode="wrap")
     flat = wide.reshape(-1, 3)
     total = np.zeros_like(flat)
     fine = map_directions(2 * height, 4 * height)

@@ -22,6 +22,7 @@ from warpir.app.record import Timings
 from warpir.core.arrays import CodeArray, Float64Array, FloatArray
 from warpir.core.color import luminance
 from warpir.core.errors import InputError
+from warpir.core.latlong import rotate_map
 from warpir.core.progress import StepProgress
 from warpir.diffusion.models.embedded import build_network, save_embedded
 from warpir.evaluate.scenes import Place, Subject, mirrored
@@ -30,10 +31,11 @@ from warpir.io.images.photos import Photo, read_photo
 from warpir.io.images.writers import png_bytes
 from warpir.io.results import OutputFolder
 from warpir.lighting.fit import fit_lobes
-from warpir.lighting.regressor import Regressor, mean_training_light, random_regressor, regress
+from warpir.lighting.regression import mean_training_light, regress
+from warpir.lighting.regressor import Regressor, random_regressor
 from warpir.lighting.scene_light import make_light
 from warpir.optimize.recover import Run, recover
-from warpir.scene.light import Light, Lobes, rotate_map
+from warpir.scene.light import Light, Lobes
 from warpir.scene.placement import Placement
 
 ORACLE_LOBES = 64

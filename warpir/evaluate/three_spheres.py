@@ -32,8 +32,8 @@ from scipy.sparse import csr_array
 
 from warpir.core.arrays import Float64Array, FloatArray
 from warpir.core.color import luminance
+from warpir.core.latlong import map_directions, rotate_map, texel_solid_angles, uv_of
 from warpir.evaluate.light_errors import HEIGHT, checked_maps, sun_sky_ratio_error
-from warpir.scene.light import map_directions, rotate_map, texel_solid_angles
 
 CAMERA = np.array([16.0, 2.0, 0.0])
 """Position of the spheres' camera; the unit sphere is at the origin (camera-yaw frame)."""
@@ -388,10 +388,8 @@ def lookup_matrix(directions: Float64Array, height: int) -> csr_array:
     Returns:
         Weights, shape [direction, height * 2 * height]; each row sums to 1.
     """
-    x, y, z = directions.T
-    rows = np.arctan2(np.hypot(x, z), y) / np.pi * height - 0.5
-    columns = (0.5 - np.arctan2(x, z) / (2.0 * np.pi)) * 2 * height - 0.5
-    return bilinear_matrix(rows, columns, height, 2 * height)
+    u, v = uv_of(directions)
+    return bilinear_matrix(v * height - 0.5, u * 2 * height - 0.5, height, 2 * height)
 
 
 def bilinear_matrix(

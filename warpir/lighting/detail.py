@@ -16,10 +16,11 @@ import numpy as np
 
 from warpir.app.inputs import Inputs
 from warpir.core.arrays import Float64Array, FloatArray
+from warpir.core.latlong import map_directions, texel_solid_angles
 from warpir.render.composite import photo_radiance, resize
 from warpir.scene.camera import Camera
 from warpir.scene.lamps import without_lamps
-from warpir.scene.light import Light, as_map, map_directions, texel_solid_angles
+from warpir.scene.light import Light, as_map
 from warpir.scene.tone_curves import Curves
 
 HEIGHT = 512

@@ -1,4 +1,4 @@
-"""The light that the regressor sees in a photo, where nobody says what it is."""
+"""The light that the regressor estimates from a photo, for runs that are given none."""
 
 from __future__ import annotations
 
@@ -9,7 +9,8 @@ import numpy as np
 
 from warpir.app.config import InsertConfig
 from warpir.app.inputs import Inputs
-from warpir.lighting.regressor import Regression, load_regressor, regress
+from warpir.lighting.regression import Regression, regress
+from warpir.lighting.regressor import load_regressor
 from warpir.lighting.scene_light import SceneLight, start_level
 from warpir.scene.light import Light, angles_from_axis
 from warpir.scene.tone_curves import Curves
@@ -17,16 +18,16 @@ from warpir.scene.tone_curves import Curves
 
 @dataclass(frozen=True)
 class Estimate:
-    """What was read off a photo."""
+    """The light estimated from a photo."""
 
     regression: Regression
     gain: float
-    """What its light is multiplied with, so that the tone operator shows it as the photo does."""
+    """Factor on its light, so that the tone operator shows it as the photo does."""
     light: SceneLight
 
 
 def estimate_light(inputs: Inputs, config: InsertConfig, device: str) -> Estimate:
-    """Return the light that the regressor sees in the photo.
+    """Estimate the light of the photo with the regressor.
 
     Args:
         inputs: Photo and camera.

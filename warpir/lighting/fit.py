@@ -11,15 +11,9 @@ import numpy as np
 
 from warpir.core.arrays import BoolArray, Float64Array, FloatArray
 from warpir.core.color import luminance
+from warpir.core.latlong import map_directions, resize_map, texel_solid_angles
 from warpir.scene.lamps import LAMP_COUNT_MAX, lamps_of
-from warpir.scene.light import (
-    Lobes,
-    fibonacci,
-    map_directions,
-    rasterize_lobes,
-    resize_map,
-    texel_solid_angles,
-)
+from warpir.scene.light import Lobes, fibonacci, rasterize_lobes
 
 FIT_HEIGHT = 64
 """Rows of the map on which amplitudes are solved."""

@@ -12,13 +12,7 @@ second factor lies in [0, 1]. The factor on ``L_fg`` is at least ``2 sqrt(2) - 2
 import torch
 from torch import Tensor
 
-from warpir.core.color import LUMINANCE_WEIGHTS
-
-
-def luminance(texels: Tensor) -> Tensor:
-    """Return the luminance of linear Rec.709 radiance, shape [..., 3] to [...]."""
-    red, green, blue = LUMINANCE_WEIGHTS
-    return red * texels[..., 0] + green * texels[..., 1] + blue * texels[..., 2]
+from warpir.lighting.latlong_tensors import luminance
 
 
 def fused_light(texels_fg: Tensor, texels_shadow: Tensor) -> Tensor:

@@ -6,30 +6,17 @@ loss that is summed over its latents.
 
 from __future__ import annotations
 
-from functools import lru_cache
-
 import torch
 from torch import Tensor
 
-from warpir.lighting.fusion import luminance
+from warpir.lighting.latlong_tensors import luminance, solid_angles
 from warpir.lighting.sg_light import SGLight
 from warpir.render.tone_curve import Knots
-from warpir.scene.light import texel_solid_angles
 
 LOG_FLOOR = 1e-8
 """Added to a normalised luminance before its logarithm [1/sr]."""
 FLUX_FLOOR = 1e-20
 """Least flux that a map is normalised by; with less it is black, and its gradient stays finite."""
-
-
-def solid_angles(texels: Tensor) -> Tensor:
-    """Return the solid angle of each row's texels [sr], shape [He, 1]."""
-    return _solid_angles(texels.shape[0], texels.shape[1], texels.device, texels.dtype)
-
-
-@lru_cache(maxsize=8)
-def _solid_angles(rows: int, columns: int, device: torch.device, dtype: torch.dtype) -> Tensor:
-    return torch.from_numpy(texel_solid_angles(rows, columns)).to(device, dtype)[:, None]
 
 
 def consistency(texels_fg: Tensor, texels_shadow: Tensor) -> Tensor:

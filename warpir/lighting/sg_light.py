@@ -10,14 +10,14 @@ bounded smoothly: far beyond daylight and white lamps, and inside the bound noth
 from __future__ import annotations
 
 from dataclasses import dataclass
-from functools import lru_cache
 
 import numpy as np
 import torch
 from torch import Tensor
 
 from warpir.core.color import luminance
-from warpir.scene.light import Lobes, fibonacci, map_directions
+from warpir.lighting.latlong_tensors import map_directions
+from warpir.scene.light import Lobes, fibonacci
 
 WIDTH_FACTOR = 0.6
 """Start width of a lobe in spacings of the lobes: the sum of 64 ripples by 1.8 % (rms)."""
@@ -133,10 +133,10 @@ class SGLight(torch.nn.Module):
         Each texel holds the light at its centre, which is exact enough for lobes of at least
         `TEXELS_PER_SIGMA` texels; `warpir.scene.light.rasterize_lobes` averages lobes of any width.
         """
-        directions = _directions(height, self.axis.device, self.axis.dtype)
+        directions = map_directions(height, 2 * height, self.axis.device, self.axis.dtype)
         axis = self.axis / self.axis.norm(dim=1, keepdim=True)
         sharpness = torch.exp(-2.0 * self.log_sigma)
-        exponent = (directions @ axis.T - 1.0) * sharpness
+        exponent = (directions.reshape(-1, 3) @ axis.T - 1.0) * sharpness
         return (torch.exp(exponent) @ self.amplitude()).reshape(height, 2 * height, 3)
 
     def lobes(self) -> Lobes:
@@ -152,8 +152,3 @@ class SGLight(torch.nn.Module):
 def narrowest(height: int) -> float:
     """Return the width of the narrowest lobe that a map of that height holds, sigma [rad]."""
     return TEXELS_PER_SIGMA * np.pi / height
-
-
-@lru_cache(maxsize=8)
-def _directions(height: int, device: torch.device, dtype: torch.dtype) -> Tensor:
-    return torch.from_numpy(map_directions(height, 2 * height).reshape(-1, 3)).to(device, dtype)

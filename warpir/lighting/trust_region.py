@@ -16,7 +16,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from warpir.lighting.fusion import luminance
+from warpir.lighting.latlong_tensors import luminance
 from warpir.lighting.sg_light import SGLight
 
 SPREAD_MIN = float(torch.pi) / 36.0

@@ -15,6 +15,8 @@ import mitsuba as mi
 import numpy as np
 from numpy.typing import NDArray
 
+from warpir.core.latlong import row_edges, texel_solid_angles
+
 
 def half_texel_energy(texels: NDArray[np.float32]) -> NDArray[np.float64]:
     """Mean radiance, summed over RGB, of the bilinear map on a grid of twice its resolution.
@@ -60,8 +62,7 @@ class LatlongEmitter(mi.Emitter):
         self.texels = mi.TensorXf(np.ascontiguousarray(texels, dtype=np.float32))
 
         rows, columns = 2 * self.height, 2 * self.width
-        cos_edge = np.cos(np.pi * np.arange(rows + 1) / rows)
-        d_omega = (cos_edge[:-1] - cos_edge[1:]) * 2.0 * np.pi / columns
+        cos_edge, d_omega = row_edges(rows), texel_solid_angles(rows, columns)
         energy = half_texel_energy(texels) * d_omega[:, None]
         if energy.sum() == 0.0:
             energy = np.ones_like(energy) * d_omega[:, None]

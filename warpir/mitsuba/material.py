@@ -305,8 +305,7 @@ class GltfBSDF(mi.BSDF):
         """Textured material and oriented normals at the hit."""
         material = self.material
         base_color = mi.Color3f(*material.base_color)
-        if self.base_color_image is not None:
-            base_color *= _rgb(self._read(self.base_color_image, si, active))
+        base_color *= self._tint(self.base_color_image, si, active)
         if self.colors is not None:
             base_color *= _rgb(self._interpolate(self.colors, mi.Vector4f, si, active))
         metallic, roughness = mi.Float(material.metallic), mi.Float(material.roughness)
@@ -331,8 +330,7 @@ class GltfBSDF(mi.BSDF):
         # KHR_materials_ior, _specular
         f0 = ((1.0 - material.ior) / (1.0 + material.ior)) ** 2
         f0 = f0 * mi.Color3f(*material.specular_color)
-        if self.specular_color_image is not None:
-            f0 *= _rgb(self._read(self.specular_color_image, si, active))
+        f0 *= self._tint(self.specular_color_image, si, active)
         f90 = self._factor(material.specular, self.specular_image, 3, si, active)
         f0 = dr.minimum(f0, 1.0) * f90
 
@@ -343,8 +341,7 @@ class GltfBSDF(mi.BSDF):
             material.clearcoat_roughness, self.clearcoat_roughness_image, 1, si, active
         )
         sheen = mi.Color3f(*material.sheen_color)
-        if self.sheen_color_image is not None:
-            sheen *= _rgb(self._read(self.sheen_color_image, si, active))
+        sheen *= self._tint(self.sheen_color_image, si, active)
         sheen_roughness = self._factor(
             material.sheen_roughness, self.sheen_roughness_image, 3, si, active
         )
@@ -378,6 +375,12 @@ class GltfBSDF(mi.BSDF):
             coat_n=coat_n,
             stopped=1.0 - passes,
         )
+
+    def _tint(
+        self, image: Image | None, si: mi.SurfaceInteraction3f, active: mi.Bool
+    ) -> mi.Color3f:
+        """Read a colour texture at the hit; white without one."""
+        return mi.Color3f(1.0) if image is None else _rgb(self._read(image, si, active))
 
     def _factor(
         self,

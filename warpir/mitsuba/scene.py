@@ -16,8 +16,8 @@ import warpir
 from warpir.app.inputs import Inputs
 from warpir.core.arrays import CodeArray, Float64Array, FloatArray, IntArray
 from warpir.core.color import linear_to_srgb, srgb_to_linear
+from warpir.core.latlong import interpolate
 from warpir.io.export import OBJECT
-from warpir.io.images.envmap_conventions import read_map
 from warpir.io.images.writers import png_bytes
 from warpir.io.results import OutputFolder
 from warpir.scene.asset import Asset, Material, Primitive, Texture, TextureSlot
@@ -80,7 +80,7 @@ def mitsuba_rows(texels: FloatArray) -> FloatArray:
     v = np.arange(rows) / (rows - 1) * height - 0.5
     u = (np.arange(columns) + 0.5) / columns * 2 * height - 0.5
     across, down = np.meshgrid(u, v)
-    return read_map(texels, across, down).astype(np.float32)
+    return interpolate(texels, across, down).astype(np.float32)
 
 
 def ply_bytes(

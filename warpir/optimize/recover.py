@@ -47,7 +47,8 @@ from warpir.io.lobes_file import lobes_to_json
 from warpir.io.results import OutputFolder
 from warpir.lighting.estimate import Estimate, estimate_light
 from warpir.lighting.fit import fit_lobes
-from warpir.lighting.regressor import Regression, load_regressor, regress
+from warpir.lighting.regression import Regression, regress
+from warpir.lighting.regressor import load_regressor
 from warpir.lighting.scene_light import SceneLight, start_level
 from warpir.lighting.sg_light import narrowest
 from warpir.lighting.trust_region import TrustRegion
@@ -576,7 +577,9 @@ def with_light(gbuffer: torch.Tensor, regression: Regression, camera: Camera) ->
         camera: Of the picture.
     """
     planes = gbuffer[0].permute(1, 2, 0).double().numpy()
-    shown, toward = regression.hint(gamma_to_linear(planes[..., 1:4]), planes[..., 4:7], camera.c2w)
+    shown, toward = regression.matte_picture(
+        gamma_to_linear(planes[..., 1:4]), planes[..., 4:7], camera.c2w
+    )
     shown = shown * (planes[..., :1] > 0.0)
     light = np.concatenate([shown, np.broadcast_to(toward, shown.shape)], axis=2)
     more = torch.from_numpy(light.astype(np.float32)).permute(2, 0, 1)[None]

@@ -9,6 +9,7 @@ import numpy as np
 from warpir.app.inputs import Inputs
 from warpir.core.arrays import BoolArray, CodeArray, FloatArray, IntArray
 from warpir.core.color import linear_to_gamma
+from warpir.core.latlong import map_directions, texel_solid_angles, uv_of
 from warpir.io.images.photos import Photo
 from warpir.io.layers import Layers
 from warpir.kernels.types import LightArgs
@@ -17,7 +18,7 @@ from warpir.render.device_scene import Placed, Receiver, Scene
 from warpir.render.renderer import Foreground, GBuffer, Renderer
 from warpir.scene.camera import Camera
 from warpir.scene.lamps import without_lamps
-from warpir.scene.light import Light, as_map, map_directions, texel_solid_angles
+from warpir.scene.light import Light, as_map
 from warpir.scene.shadow_mask import ShadowMask
 from warpir.scene.tone_curves import Curves, ToneKnots
 
@@ -369,10 +370,9 @@ def balls(light: Light, camera: Camera, is_reinhard: bool, size: int = 192) -> C
     view = camera.c2w[:3, 2]
     reflected = 2.0 * (normal @ view)[..., None] * normal - view
     sharp = as_map(light, 256)
-    lon = np.arctan2(reflected[..., 0], reflected[..., 2])
-    lat = np.arcsin(np.clip(reflected[..., 1], -1.0, 1.0))
-    column = ((0.5 - 0.5 * lon / np.pi) * sharp.shape[1]).astype(int) % sharp.shape[1]
-    row = np.minimum((0.5 - lat / np.pi) * sharp.shape[0], sharp.shape[0] - 1).astype(int)
+    u, v = uv_of(reflected)
+    column = (u * sharp.shape[1]).astype(int) % sharp.shape[1]
+    row = np.minimum(v * sharp.shape[0], sharp.shape[0] - 1).astype(int)
     mirror = sharp[row, column].astype(np.float64)
     coarse = as_map(light, 32).astype(np.float64)
     weighted = (coarse * texel_solid_angles(32, 64)[:, None, None]).reshape(-1, 3)

@@ -8,8 +8,9 @@ import warp as wp
 from warpir.core.arrays import AnyFloatArray, Float64Array, FloatArray
 from warpir.core.color import luminance
 from warpir.core.errors import ExitCode, InputError
+from warpir.core.latlong import texel_solid_angles
 from warpir.kernels.types import LightArgs
-from warpir.scene.light import Light, Lobes, texel_solid_angles
+from warpir.scene.light import Light, Lobes
 
 
 def light_args(light: Light, device: wp.Device) -> LightArgs:

@@ -12,9 +12,10 @@ import numpy as np
 
 from warpir.core.arrays import CodeArray, Float64Array, FloatArray
 from warpir.core.color import luminance
+from warpir.core.latlong import resize_map, rotate_map
 from warpir.report.pictures import Shown, encoded, jpeg
 from warpir.report.words import EVEN, LightCharacter
-from warpir.scene.light import bearing, resize_map, rotate_map
+from warpir.scene.light import bearing
 
 HEIGHT = 192
 """Rows of the panorama in the report."""

@@ -14,13 +14,8 @@ from scipy.ndimage import label
 
 from warpir.core.arrays import Float64Array, FloatArray
 from warpir.core.color import luminance
-from warpir.scene.light import (
-    angles_from_axis,
-    bearing,
-    map_directions,
-    resize_map,
-    texel_solid_angles,
-)
+from warpir.core.latlong import map_directions, resize_map, texel_solid_angles
+from warpir.scene.light import angles_from_axis, bearing
 
 HEIGHT = 128
 """Rows of the map that is measured; a texel is 1.4 degrees."""

@@ -10,7 +10,8 @@ import numpy as np
 
 from warpir.core.arrays import BoolArray, Float64Array, FloatArray
 from warpir.core.color import luminance
-from warpir.scene.light import Light, map_directions, texel_solid_angles
+from warpir.core.latlong import map_directions, texel_solid_angles
+from warpir.scene.light import Light
 
 LAMP_SHARE = 0.03
 """Share of the flux above which a compact source counts [1]."""

@@ -7,12 +7,20 @@ Radiance is linear Rec.709, relative [W/(m^2 sr)].
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from itertools import pairwise
 
 import numpy as np
 
-from warpir.core.arrays import AnyFloatArray, BoolArray, Float64Array, FloatArray
+from warpir.core.arrays import BoolArray, Float64Array, FloatArray
 from warpir.core.color import luminance
+from warpir.core.latlong import (
+    latitudes,
+    longitudes,
+    map_directions,
+    resize_map,
+    rotate_map,
+    texel_solid_angles,
+    uv_of,
+)
 
 SUN_RADIUS_DEG = 0.2665
 """Mean angular radius of the sun [deg]."""
@@ -72,8 +80,7 @@ class Light:
         total = np.zeros(3)
         if self.texels is not None:
             height, width = self.texels.shape[:2]
-            lon = np.pi * (1.0 - 2.0 * (np.arange(width) + 0.5) / width)
-            lat = np.pi * (0.5 - (np.arange(height) + 0.5) / height)
+            lon, lat = longitudes(width), latitudes(height)
             across = normal[0] * np.sin(lon) + normal[2] * np.cos(lon)
             solid_angles = texel_solid_angles(height, width)
             for row in range(height):  # the directions of a large map would take gigabytes
@@ -105,26 +112,6 @@ def lobe_cosine(cos_axis: float, sharpness: float) -> float:
     return float(np.maximum(cosine, 0.0).mean())
 
 
-def texel_solid_angles(height: int, width: int) -> Float64Array:
-    """Return the solid angle of a texel in each row [sr], shape [height]; the map sums to 4 pi."""
-    edges = np.cos(np.pi * np.arange(height + 1) / height)
-    return (2.0 * np.pi / width) * (edges[:-1] - edges[1:])
-
-
-def map_directions(height: int, width: int) -> Float64Array:
-    """Return the unit direction of each texel centre, world frame, shape [height, width, 3]."""
-    lon = np.pi * (1.0 - 2.0 * (np.arange(width) + 0.5) / width)
-    lat = np.pi * (0.5 - (np.arange(height) + 0.5) / height)
-    return np.stack(
-        [
-            np.cos(lat)[:, None] * np.sin(lon)[None, :],
-            np.broadcast_to(np.sin(lat)[:, None], (height, width)),
-            np.cos(lat)[:, None] * np.cos(lon)[None, :],
-        ],
-        axis=-1,
-    )
-
-
 def fibonacci(count: int) -> Float64Array:
     """Return evenly spread unit directions, world frame, shape [count, 3] (a Fibonacci spiral)."""
     k = np.arange(count) + 0.5
@@ -132,24 +119,6 @@ def fibonacci(count: int) -> Float64Array:
     lon = np.pi * (1.0 + np.sqrt(5.0)) * k
     r = np.sqrt(1.0 - y * y)
     return np.stack([r * np.sin(lon), y, r * np.cos(lon)], axis=1)
-
-
-def rotate_map(texels: FloatArray, degrees: float) -> FloatArray:
-    """Turn a map about +Y, counter-clockwise seen from above; each row keeps its sum.
-
-    Whole columns are moved exactly.
-
-    The map's u falls with longitude (``lon = pi (1 - 2u)``), so content moves to smaller columns.
-    """
-    columns = -(degrees / 360.0) * texels.shape[1]
-    if abs(columns - round(columns)) < 1e-6:  # what 360 degrees in float64 leave behind
-        columns = round(columns)
-    whole = int(np.floor(columns))
-    part = np.float32(columns - whole)
-    moved = np.roll(texels, whole, axis=1)
-    if part > 0.0:
-        moved = (np.float32(1.0) - part) * moved + part * np.roll(texels, whole + 1, axis=1)
-    return np.ascontiguousarray(moved, dtype=np.float32)
 
 
 def axis_from_angles(azimuth_deg: float, elevation_deg: float) -> Float64Array:
@@ -243,7 +212,7 @@ def rasterize_lobes(lobes: Lobes, height: int, width: int, side: int = 6) -> Flo
     step = np.pi / (height * side)
     theta = (np.arange(height * side) // 2 * 2 + 1.0) * step
     theta += np.tile([-1.0, 1.0], height * side // 2) * step / np.sqrt(3.0)
-    lon = np.pi * (1.0 - 2.0 * (np.arange(width * side) + 0.5) / (width * side))
+    lon = longitudes(width * side)
     sin_theta = np.sin(theta)[:, None]
     big = np.stack(
         np.broadcast_arrays(
@@ -262,9 +231,8 @@ def rasterize_lobes(lobes: Lobes, height: int, width: int, side: int = 6) -> Flo
         fine = (fine * share[:, :, None]).sum(axis=1)
         texels += fine[..., None] * amplitude
     for flux, axis in zip(lobes.flux()[narrow], lobes.axis[narrow], strict=True):
-        x, y, z = (float(c) for c in axis)
-        j = int((0.5 - 0.5 * np.arctan2(x, z) / np.pi) * width) % width
-        i = min(int(np.arctan2(np.hypot(x, z), y) / np.pi * height), height - 1)
+        u, v = uv_of(axis.astype(np.float64))
+        i, j = min(int(v * height), height - 1), int(u * width) % width
         texels[i, j] += flux / omega[i]
     return texels.astype(np.float32)
 
@@ -285,37 +253,6 @@ def as_map(light: Light, height: int) -> FloatArray:
     if light.lobes is not None:
         texels += rasterize_lobes(light.lobes, height, width)
     return texels
-
-
-def resize_map(texels: FloatArray, height: int) -> FloatArray:
-    """Resample a map to ``height`` rows: each texel is the mean over its solid angle.
-
-    Texels are taken as constant, so energy is kept exactly at any size.
-    """
-
-    def boxes(values: AnyFloatArray, old: Float64Array, new: Float64Array) -> Float64Array:
-        """Average rows between rising ``old`` edges over rising ``new`` ones."""
-        averaged = np.empty((len(new) - 1, *values.shape[1:]))
-        # One row at a time: a float64 copy of an 8k map and its running sum would take 3 GiB.
-        for k, (low, high) in enumerate(pairwise(new)):
-            first = max(int(np.searchsorted(old, low, side="right")) - 1, 0)
-            last = max(int(np.searchsorted(old, high, side="left")), first + 1)
-            share = np.diff(np.clip(old[first : last + 1], low, high)) / (high - low)
-            averaged[k] = np.tensordot(share, values[first:last], axes=1)
-        return averaged
-
-    def heights(rows: int) -> Float64Array:
-        # Solid angle is proportional to the height on the sphere (Archimedes).
-        edges: Float64Array = -np.cos(np.pi * np.arange(rows + 1) / rows)
-        return edges
-
-    if texels.shape[0] == height and texels.shape[1] == 2 * height:
-        return texels
-    old_height, old_width = texels.shape[:2]
-    rows = boxes(texels, heights(old_height), heights(height))
-    columns = (np.linspace(0.0, 1.0, count + 1) for count in (old_width, 2 * height))
-    resized = boxes(np.moveaxis(rows, 1, 0), *columns)
-    return np.moveaxis(resized, 0, 1).astype(np.float32)
 
 
 def summarize(light: Light) -> LightSummary:

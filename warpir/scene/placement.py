@@ -97,18 +97,7 @@ def place_asset(
             warnings += steep
 
     sides = high - low
-    longest = float(sides.max())
-    if size is not None:
-        if longest <= 0.0:
-            raise InputError("--size", "the asset is a single point", "use another asset")
-        scale = size / longest
-    elif scale is None:
-        scale = 1.0
-        shown = " x ".join(f"{side:.3g}" for side in sides)
-        assumed.append(f"the asset keeps its own size of {shown} m (--size, --scale)")
-    if not SMALLEST_PLAUSIBLE <= longest * scale <= LARGEST_PLAUSIBLE:
-        warnings.append(f"the object is {longest * scale:.3g} m large; meant? (--size, --scale)")
-
+    scale = _scale_of(sides, scale, size, assumed, warnings)
     rotation = turn(plane[:3], math.radians(rotate_y)) @ y_to(plane[:3])
     foot = np.array([(low[0] + high[0]) / 2.0, low[1], (low[2] + high[2]) / 2.0])
     asset_to_world = np.eye(4)
@@ -121,6 +110,32 @@ def place_asset(
     away = float(np.linalg.norm(stand - origin))
     summary = f"the object of {shown} m stands {away:.3g} m from the camera, {seen}"
     return Placement(asset_to_world, plane, tuple(assumed), tuple(warnings), summary)
+
+
+def _scale_of(
+    sides: Float64Array,
+    scale: float | None,
+    size: float | None,
+    assumed: list[str],
+    warnings: list[str],
+) -> float:
+    """Return the factor on the asset's own size; what is assumed or doubtful is added.
+
+    Raises:
+        InputError: A single point cannot be brought to a size.
+    """
+    longest = float(sides.max())
+    if size is not None:
+        if longest <= 0.0:
+            raise InputError("--size", "the asset is a single point", "use another asset")
+        scale = size / longest
+    elif scale is None:
+        scale = 1.0
+        shown = " x ".join(f"{side:.3g}" for side in sides)
+        assumed.append(f"the asset keeps its own size of {shown} m (--size, --scale)")
+    if not SMALLEST_PLAUSIBLE <= longest * scale <= LARGEST_PLAUSIBLE:
+        warnings.append(f"the object is {longest * scale:.3g} m large; meant? (--size, --scale)")
+    return scale
 
 
 def upright_plane(

@@ -21,9 +21,9 @@ class PriorBatch:
     squeezed into the same square, shape [B, 6, 64, 64]."""
     gbuffer: Tensor
     """Mask in [0, 1], albedo display-encoded in [0, 1], camera-space unit normals (x right, y up, z
-    toward the camera), and what the regressor makes of it
-    (`warpir.lighting.regressor.Regression.hint`): a picture, all 0 beside the object, and a
-    direction that is the same everywhere; shape [B, 13, 64, 64]."""
+    toward the camera), and the regressor's estimate
+    (`warpir.lighting.regression.Regression.matte_picture`): a picture, all 0 beside the object,
+    and a direction that is the same everywhere; shape [B, 13, 64, 64]."""
     noun: Tensor
     """Index into `warpir.diffusion.models.embedded_words.NOUNS`, int64, shape [B]."""
     setting: Tensor

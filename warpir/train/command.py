@@ -30,7 +30,7 @@ if TYPE_CHECKING:
     import torch
 
     from warpir.train.batches import PhotoBatch, PriorBatch
-    from warpir.train.scenes import Stock
+    from warpir.train.scenes.render import Stock
 
 MADE_UP_OBJECTS = 240
 """Made-up objects to learn from."""
@@ -91,7 +91,7 @@ def _run(arguments: list[str]) -> int:
     from warpir.render.device import choose_device
     from warpir.train.lights import load_panoramas
     from warpir.train.meshes import make_meshes, read_meshes
-    from warpir.train.scenes import Stock
+    from warpir.train.scenes.render import Stock
 
     rank = int(os.environ.get("LOCAL_RANK", "0"))
     device = f"cuda:{rank}" if "LOCAL_RANK" in os.environ else choose_device(options.device)
@@ -213,7 +213,7 @@ def _train_prior(
     from warpir.diffusion.models.embedded import read_network
     from warpir.diffusion.train import TrainSettings, export_prior, train_prior
     from warpir.lighting.regressor import load_regressor
-    from warpir.train.scenes import Mixture, SceneGenerator
+    from warpir.train.scenes.generator import Mixture, SceneGenerator
 
     learned, unseen = stocks
     regressor = load_regressor(options.regressor, device)
@@ -279,8 +279,9 @@ def _train_regressor(
     record: dict[str, Any],
 ) -> dict[str, Any]:
     from warpir.lighting.regressor import load_regressor
-    from warpir.train.regressor import TrainingSettings, train_regressor
-    from warpir.train.scenes import Mixture, SceneGenerator
+    from warpir.train.regressor import train_regressor
+    from warpir.train.scenes.generator import Mixture, SceneGenerator
+    from warpir.train.settings import TrainingSettings
 
     learned, unseen = stocks
     # Fewer panorama crops than the prior sees: they are few places, and could be learned by heart.

@@ -16,9 +16,11 @@ import torch
 from torch import Tensor
 
 from warpir.core.arrays import Float64Array, FloatArray
-from warpir.core.color import LUMINANCE_WEIGHTS, luminance
+from warpir.core.color import luminance
+from warpir.core.latlong import map_directions, resize_map, texel_solid_angles
 from warpir.io.images.photos import read_envmap
-from warpir.scene.light import map_directions, resize_map, texel_solid_angles
+from warpir.lighting import latlong_tensors as tensors
+from warpir.train.sampler import Sampler
 
 HEIGHT = 32
 """Rows of the map of everything but the sun."""
@@ -41,6 +43,18 @@ CIE_SKIES = (
     (-1.0, -0.15, 16.0, -3.0, 0.30), (-1.0, -0.15, 24.0, -2.8, 0.15),
 )  # fmt: skip
 """Parameters a to e of the CIE standard general sky (ISO 15469:2004), overcast to clear."""
+
+
+CLEAR, BROKEN, OVERCAST, LOW_SUN, ROOM, NIGHT = range(6)
+KIND_SHARES = [0.34, 0.14, 0.12, 0.12, 0.18, 0.10]
+"""Of each kind of made-up light, in their order."""
+KIND_SKIES = ((11, 14), (6, 10), (0, 5), (8, 14), (0, 4), (0, 4))
+"""First and last row of `CIE_SKIES` for each kind."""
+KIND_WEATHERS = (0, 0, 1, 2, 4, 3)
+"""Of each kind, an index into `WEATHERS`: sunny, sunny or overcast, overcast, twilight, lamp,
+night."""
+SKY_COLOURS = ((0.42, 0.62, 1.0), (0.85, 0.93, 1.0), (0.95, 0.98, 1.0), (1.0, 0.62, 0.32))
+"""Blue, pale, grey and warm, linear RGB."""
 
 
 @dataclass(frozen=True)
@@ -119,14 +133,15 @@ class LightPool:
 
     def flux_share(self) -> Tensor:
         """Return the sun's share of the light's flux, which is that of a sphere's irradiance."""
-        omega = solid_angles(self.fine)
-        rest = (gray(self.fine) * omega).sum(dim=(1, 2))
-        sun = gray(self.sun)
+        omega = tensors.solid_angles(self.fine)
+        rest = (tensors.luminance(self.fine) * omega).sum(dim=(1, 2))
+        sun = tensors.luminance(self.sun)
         return sun / (sun + rest).clamp(min=1e-20)
 
     def levels(self) -> tuple[Tensor, Tensor, Tensor]:
         """Return the maps at full, half and quarter size."""
-        return self.fine, halved(self.fine), halved(halved(self.fine))
+        half = tensors.shrunk(self.fine, HEIGHT // 2)
+        return self.fine, half, tensors.shrunk(half, HEIGHT // 4)
 
     def with_skies(self, skies: LightPool) -> LightPool:
         """Return the panoramas of this pool with other made-up lights behind them."""
@@ -136,26 +151,6 @@ class LightPool:
             k: torch.cat([getattr(self, k)[:n], getattr(skies, k)]) for k in names
         }
         return replace(self, **joined)
-
-
-def gray(rgb: Tensor) -> Tensor:
-    """Return the luminance of the last axis."""
-    return (rgb * torch.tensor(LUMINANCE_WEIGHTS, dtype=rgb.dtype, device=rgb.device)).sum(dim=-1)
-
-
-def solid_angles(maps: Tensor) -> Tensor:
-    """Return the solid angle of each texel of maps [..., He, We, 3], shape [He, 1] [sr]."""
-    height, width = maps.shape[-3:-1]
-    omega = torch.from_numpy(texel_solid_angles(height, width)).to(maps)
-    return omega[:, None]
-
-
-def halved(maps: Tensor) -> Tensor:
-    """Return maps of half the size; each texel is the mean over its solid angle."""
-    weighted = maps * solid_angles(maps)[..., None]
-    n, height, width, _ = maps.shape
-    summed = weighted.view(n, height // 2, 2, width // 2, 2, 3).sum(dim=(2, 4))
-    return summed / solid_angles(summed)[..., None]
 
 
 def load_panoramas(paths: list[Path], device: torch.device | str) -> LightPool:
@@ -203,42 +198,77 @@ def load_panoramas(paths: list[Path], device: torch.device | str) -> LightPool:
 
 
 def make_lights(count: int, generator: torch.Generator, device: torch.device | str) -> LightPool:
-    """Make up lights: CIE skies with a sun over a ground, and rooms with lamps and windows.
+    """Draw lights: CIE skies with a sun over a ground, and rooms with lamps and windows.
 
     Args:
         count: How many.
         generator: Of this device.
-        device: Where they are made.
+        device: Of the tensors.
     """
-
-    def u(low: float, high: float, *shape: int) -> Tensor:
-        return low + (high - low) * torch.rand(count, *shape, generator=generator, device=device)
-
-    height, width = HEIGHT, 2 * HEIGHT
-    directions = torch.from_numpy(map_directions(height, width)).float().to(device)
+    draw = Sampler(count, generator)
+    directions = tensors.map_directions(HEIGHT, 2 * HEIGHT, torch.device(device))
+    omega = tensors.solid_angles(directions)
     y = directions[..., 1]
-    # Kinds: 0 clear, 1 broken clouds, 2 overcast, 3 low sun, 4 room, 5 night.
-    shares = torch.tensor([0.34, 0.14, 0.12, 0.12, 0.18, 0.10], device=device)
-    kind = torch.multinomial(shares, count, replacement=True, generator=generator)
-    is_room, is_night = kind == 4, kind == 5
-    elevation = torch.deg2rad(u(8.0, 78.0))
-    elevation = torch.where(kind == 3, torch.deg2rad(u(1.0, 14.0)), elevation)
-    elevation = torch.where(is_room | is_night, torch.deg2rad(u(5.0, 88.0)), elevation)
-    azimuth = u(0.0, 2.0 * np.pi)
-    axis = torch.stack(
-        [
-            elevation.cos() * azimuth.sin(),
-            elevation.sin(),
-            -elevation.cos() * azimuth.cos(),
-        ],
-        dim=1,
+    kind = draw.category(KIND_SHARES)
+    is_night = kind == NIGHT
+    within = (kind == ROOM) | is_night
+    elevation = torch.deg2rad(draw.uniform(8.0, 78.0))
+    elevation = torch.where(kind == LOW_SUN, torch.deg2rad(draw.uniform(1.0, 14.0)), elevation)
+    elevation = torch.where(within, torch.deg2rad(draw.uniform(5.0, 88.0)), elevation)
+    azimuth = draw.uniform(0.0, 2.0 * np.pi)
+    level = elevation.cos()
+    axis = torch.stack([level * azimuth.sin(), elevation.sin(), -level * azimuth.cos()], dim=1)
+    maps = _draw_skies(draw, kind, directions, axis, elevation)
+    sun, sigma, ratio = _draw_suns(draw, kind, elevation)
+    walls = _draw_walls(draw, directions)
+    lamp_tint = 1.0 - draw.uniform(0.0, 0.45, 1) * torch.tensor([0.0, 0.45, 1.0], device=device)
+    lamp = draw.log_uniform(0.1, 4.0)[:, None] * lamp_tint
+    ground_albedo = draw.uniform(0.05, 0.4, 3) * torch.tensor([1.0, 0.92, 0.8], device=device)
+    falling = (tensors.luminance(maps) * y.clamp(min=0.0) * omega).sum(dim=(1, 2))[:, None]
+    below = ground_albedo * (falling + sun * axis[:, 1:2].clamp(min=0.0)) / np.pi
+    maps = torch.where(y[None, ..., None] > 0.0, maps, below[:, None, None, :])
+    maps = torch.where(_per_texel(within), walls, maps)
+    night_level = _per_texel(draw.log_uniform(0.05, 0.6))
+    maps = torch.where(_per_texel(is_night), maps * night_level, maps)
+    lamp_sigma = torch.deg2rad(draw.log_uniform(1.5, 13.0))
+    lamp_sigma = torch.where(is_night, 0.4 * lamp_sigma, lamp_sigma)
+    weather = torch.tensor(KIND_WEATHERS, device=device)[kind]
+    weather = torch.where((kind == BROKEN) & (ratio < 0.6), torch.ones_like(weather), weather)
+    return LightPool(
+        maps.contiguous(),
+        axis,
+        torch.where(within[:, None], lamp, sun).contiguous(),
+        torch.where(within, lamp_sigma, sigma),
+        weather,
+        (kind == ROOM).long(),
+        torch.zeros(1, 2, 4, 3, device=device),
+        0,
+        0,
     )
+
+
+def _per_texel(values: Tensor) -> Tensor:
+    return values[:, None, None, None]
+
+
+def _draw_skies(
+    draw: Sampler, kind: Tensor, directions: Tensor, axis: Tensor, elevation: Tensor
+) -> Tensor:
+    """Draw skies of irradiance 1 on level ground but for colour and clouds, shape [B, H, W, 3].
+
+    Args:
+        draw: For the lights.
+        kind: Of each light, shape [B].
+        directions: Of the texels, shape [H, W, 3].
+        axis: Unit direction toward the sun, shape [B, 3].
+        elevation: Of the sun [rad], shape [B].
+    """
+    device, y = draw.device, directions[..., 1]
     cosine = torch.einsum("hwc,nc->nhw", directions, axis).clamp(-1.0, 1.0)
     # Luminance of the sky (ISO 15469): gradation from the zenith times indicatrix around the sun.
     table = torch.tensor(CIE_SKIES, device=device)
-    first = torch.tensor([11, 6, 0, 8, 0, 0], device=device)[kind]
-    last = torch.tensor([14, 10, 5, 14, 4, 4], device=device)[kind]
-    chosen = first + (u(0.0, 1.0) * (last - first + 1)).long().clamp(max=4)
+    first, last = torch.tensor(KIND_SKIES, device=device)[kind].T
+    chosen = first + (draw.unit() * (last - first + 1)).long().clamp(max=4)
     a, b, c, d, e = table[chosen.clamp(max=14)].T[:, :, None, None]
     chi = torch.arccos(cosine)
     zenith = torch.exp(b / y.clamp(min=0.02))
@@ -246,86 +276,59 @@ def make_lights(count: int, generator: torch.Generator, device: torch.device | s
         1.0 + c * (torch.exp(d * chi) - torch.exp(d * np.pi / 2.0)) + e * cosine.square()
     )
     sky = sky.clamp(min=0.02) * (y > 0.0)
-    omega = torch.from_numpy(texel_solid_angles(height, width)).float().to(device)[:, None]
+    omega = tensors.solid_angles(directions)
     sky = sky / (sky * y.clamp(min=0.0) * omega).sum(dim=(1, 2), keepdim=True)
     # Colours: blue above, paler at the horizon; grey under clouds; warm near a low sun.
-    blue = torch.tensor([0.42, 0.62, 1.0], device=device)
-    pale = torch.tensor([0.85, 0.93, 1.0], device=device)
-    grey = torch.tensor([0.95, 0.98, 1.0], device=device)
-    warm = torch.tensor([1.0, 0.62, 0.32], device=device)
+    blue, pale, grey, warm = torch.tensor(SKY_COLOURS, device=device)
     up = y.clamp(min=0.0).sqrt()[None, ..., None]
     clear = pale * (1.0 - up) + blue * up
-    cloudy = torch.where(kind <= 0, u(0.0, 0.25), u(0.3, 1.0))[:, None, None, None]
+    cloudy = torch.where(kind <= CLEAR, draw.uniform(0.0, 0.25), draw.uniform(0.3, 1.0))
+    cloudy = _per_texel(cloudy)
     colour = clear * (1.0 - cloudy) + grey * cloudy
-    glow = (torch.exp(-2.0 * chi) * (1.0 - (elevation / 0.5).clamp(0.0, 1.0))[:, None, None]) * u(
-        0.3, 1.0, 1, 1
-    )
+    lowness = (1.0 - (elevation / 0.5).clamp(0.0, 1.0))[:, None, None]
+    glow = torch.exp(-2.0 * chi) * lowness * draw.uniform(0.3, 1.0, 1, 1)
     glow = glow[..., None] * (1.0 - 0.8 * up)
     colour = colour * (1.0 - glow) + warm * glow
     maps = sky[..., None] * colour
     # Clouds: patches that brighten and darken.
-    coarse = torch.randn(count, 1, 5, 10, generator=generator, device=device)
-    finer = torch.randn(count, 1, 10, 20, generator=generator, device=device)
+    coarse, finer = draw.normal(1, 5, 10), draw.normal(1, 10, 20)
     patches = sum(
-        torch.nn.functional.interpolate(x, (height, width), mode="bicubic")[:, 0] * s
+        torch.nn.functional.interpolate(x, directions.shape[:2], mode="bicubic")[:, 0] * s
         for x, s in ((coarse, 1.0), (finer, 0.6))
     )
-    strength = torch.where(kind == 1, u(0.2, 0.7), u(0.0, 0.25))[:, None, None]
-    maps = maps * torch.exp(strength * patches)[..., None]
+    strength = torch.where(kind == BROKEN, draw.uniform(0.2, 0.7), draw.uniform(0.0, 0.25))
+    return maps * torch.exp(strength[:, None, None] * patches)[..., None]
+
+
+def _draw_suns(draw: Sampler, kind: Tensor, elevation: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """Draw irradiances facing the sun, [B, 3], its sigmas [rad] and its ratio to the sky, [B]."""
     # The sun, facing it, over the sky on level ground. The air that it passes colours it more than
     # it weakens that ratio, for the sky darkens with it: clear panoramas have 4 to 13, at all
     # elevations.
-    ratio = torch.exp(u(np.log(2.0), np.log(16.0)))
-    ratio = torch.where(kind == 1, torch.exp(u(np.log(0.2), np.log(5.0))), ratio)
-    ratio = torch.where(kind == 2, u(0.0, 0.03), ratio)
+    ratio = draw.log_uniform(2.0, 16.0)
+    ratio = torch.where(kind == BROKEN, draw.log_uniform(0.2, 5.0), ratio)
+    ratio = torch.where(kind == OVERCAST, draw.uniform(0.0, 0.03), ratio)
     sine = elevation.sin().clamp(min=0.03)
     air = torch.exp(-0.12 / sine)
     tint = torch.stack([torch.ones_like(air), 0.55 + 0.42 * air, 0.25 + 0.65 * air], dim=1)
     sun = (ratio * torch.exp(-0.03 / sine))[:, None] * tint
-    sigma = torch.deg2rad(torch.exp(u(np.log(0.27), np.log(1.5))))
-    sigma = torch.where(kind == 1, sigma * u(1.0, 4.0), sigma)
-    # Rooms and nights: walls, and blobs of light of which the strongest is the "sun".
+    sigma = torch.deg2rad(draw.log_uniform(0.27, 1.5))
+    return sun, torch.where(kind == BROKEN, sigma * draw.uniform(1.0, 4.0), sigma), ratio
+
+
+def _draw_walls(draw: Sampler, directions: Tensor) -> Tensor:
+    """Draw walls with blobs of light, of mean luminance 1 / pi, shape [B, H, W, 3]."""
     wall = (
-        u(0.05, 0.4, 1, 1, 1)
-        * u(0.75, 1.25, 1, 1, 3)
-        * (1.0 + 0.6 * y[None, ..., None] * u(-0.5, 1.0, 1, 1, 1))
+        draw.uniform(0.05, 0.4, 1, 1, 1)
+        * draw.uniform(0.75, 1.25, 1, 1, 3)
+        * (1.0 + 0.6 * directions[None, ..., 1:2] * draw.uniform(-0.5, 1.0, 1, 1, 1))
     )
+    above = torch.tensor([0.0, 0.6, 0.0], device=draw.device)
     for _ in range(3):
-        spot = torch.nn.functional.normalize(
-            torch.randn(count, 3, generator=generator, device=device)
-            + torch.tensor([0.0, 0.6, 0.0], device=device),
-            dim=1,
-        )
-        near = (torch.einsum("hwc,nc->nhw", directions, spot) - 1.0) / u(0.06, 0.35, 1, 1).square()
-        wall = wall + torch.exp(near)[..., None] * (u(0.0, 1.0, 1, 1, 1) ** 3 * 6.0) * u(
-            0.6, 1.0, 1, 1, 3
-        )
-    wall = wall / (gray(wall) * omega).sum(dim=(1, 2))[:, None, None, None] * 4.0
-    lamp_tint = 1.0 - u(0.0, 0.45, 1) * torch.tensor([0.0, 0.45, 1.0], device=device)
-    lamp = torch.exp(u(np.log(0.1), np.log(4.0)))[:, None] * lamp_tint
-    within = is_room | is_night
-    chooser = within[:, None, None, None]
-    ground_albedo = u(0.05, 0.4, 3) * torch.tensor([1.0, 0.92, 0.8], device=device)
-    falling = (gray(maps) * y.clamp(min=0.0) * omega).sum(dim=(1, 2))[:, None]
-    below = ground_albedo * (falling + sun * axis[:, 1:2].clamp(min=0.0)) / np.pi
-    maps = torch.where(y[None, ..., None] > 0.0, maps, below[:, None, None, :])
-    maps = torch.where(chooser, wall, maps)
-    night_level = torch.exp(u(np.log(0.05), np.log(0.6)))[:, None, None, None]
-    maps = torch.where(is_night[:, None, None, None], maps * night_level, maps)
-    sun = torch.where(within[:, None], lamp, sun)
-    lamp_sigma = torch.deg2rad(torch.exp(u(np.log(1.5), np.log(13.0))))
-    sigma = torch.where(within, torch.where(is_night, 0.4 * lamp_sigma, lamp_sigma), sigma)
-    # sunny, sunny or overcast, overcast, twilight, lamp, night
-    weather = torch.tensor([0, 0, 1, 2, 4, 3], device=device)[kind]
-    weather = torch.where((kind == 1) & (ratio < 0.6), torch.ones_like(weather), weather)
-    return LightPool(
-        maps.contiguous(),
-        axis,
-        sun.contiguous(),
-        sigma,
-        weather,
-        is_room.long(),
-        torch.zeros(1, 2, 4, 3, device=device),
-        0,
-        0,
-    )
+        spot = torch.nn.functional.normalize(draw.normal(3) + above, dim=1)
+        cosine = torch.einsum("hwc,nc->nhw", directions, spot)
+        near = (cosine - 1.0) / draw.uniform(0.06, 0.35, 1, 1).square()
+        strength = draw.unit(1, 1, 1) ** 3 * 6.0
+        wall = wall + torch.exp(near)[..., None] * strength * draw.uniform(0.6, 1.0, 1, 1, 3)
+    flux = (tensors.luminance(wall) * tensors.solid_angles(directions)).sum(dim=(1, 2))
+    return wall / _per_texel(flux) * 4.0

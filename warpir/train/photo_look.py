@@ -11,6 +11,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from warpir.train.sampler import Sampler
+
 GRAY = 0.18
 """Radiance that every tone curve leaves alone, so that exposure keeps its meaning."""
 WHITE_PERCENTILE, WHITE = 0.99, 0.9
@@ -52,28 +54,25 @@ def draw_looks(radiance: Tensor, generator: torch.Generator) -> Look:
         radiance: The photos, without the object, shape [B, 3, H, W].
         generator: Of their device.
     """
-    count, device = len(radiance), radiance.device
-
-    def u(low: float, high: float, *shape: int) -> Tensor:
-        return low + (high - low) * torch.rand(count, *shape, generator=generator, device=device)
-
-    def normal(*shape: int) -> Tensor:
-        return torch.randn(count, *shape, generator=generator, device=device)
-
+    draw = Sampler(len(radiance), generator)
     # Of what is not black, as in the benchmark; a kth value is a quantile without its size limit.
     values = radiance.flatten(1)
     rank = max(1, round(WHITE_PERCENTILE * values.shape[1]))
     white = values.kthvalue(rank, dim=1).values.clamp(min=1e-6)
-    is_plain = u(0.0, 1.0) < 0.35
-    stops = torch.where(is_plain, 0.15 * normal(), (0.6 * normal()).clamp(-1.6, 1.6))
-    balance = torch.exp(torch.where(is_plain[:, None], 0.04 * normal(3), 0.10 * normal(3)))
+    is_plain = draw.chance(0.35)
+    stops = torch.where(is_plain, 0.15 * draw.normal(), (0.6 * draw.normal()).clamp(-1.6, 1.6))
+    balance = torch.exp(
+        torch.where(is_plain[:, None], 0.04 * draw.normal(3), 0.10 * draw.normal(3))
+    )
     balance = balance / balance.mean(dim=1, keepdim=True)
     gain = (WHITE**2.2 / white * torch.exp2(stops))[:, None] * balance
+    contrast = torch.where(is_plain, torch.ones_like(stops), draw.uniform(0.85, 1.25))
+    clips = is_plain | draw.chance(0.4)
     return Look(
         gain,
-        torch.where(is_plain, torch.ones_like(stops), u(0.85, 1.25)),
-        torch.where(is_plain | (u(0.0, 1.0) < 0.4), torch.full_like(stops, 2.0), u(0.4, 0.9)),
-        u(0.0, 1.0) < 0.5,
+        contrast,
+        torch.where(clips, torch.full_like(stops, 2.0), draw.uniform(0.4, 0.9)),
+        draw.chance(0.5),
     )
 
 
@@ -85,11 +84,10 @@ def draw_faults(shown: Tensor, generator: torch.Generator) -> Tensor:
         generator: Of their device.
     """
     count, _, height, width = shown.shape
-    device = shown.device
+    device, draw = shown.device, Sampler(count, generator)
 
     def u(low: float, high: float) -> Tensor:
-        drawn = torch.rand(count, generator=generator, device=device)
-        return (low + (high - low) * drawn)[:, None, None, None]
+        return draw.uniform(low, high, 1, 1, 1)
 
     y = torch.linspace(-1.0, 1.0, height, device=device)[:, None]
     x = torch.linspace(-1.0, 1.0, width, device=device)[None]

@@ -23,7 +23,7 @@ from __future__ import annotations
 import numpy as np
 
 from warpir.core.arrays import Float64Array, FloatArray
-from warpir.scene.light import map_directions, rotate_map
+from warpir.core.latlong import latitudes, look_up, map_directions, rotate_map
 
 SEAM_SHIFTS = {
     "openexr": 0.0,
@@ -91,40 +91,13 @@ def rotate_directions(texels: FloatArray, rotation: Float64Array, side: int = 3)
     if np.allclose(rotation[1], (0.0, 1.0, 0.0), atol=1e-7):
         return rotate_map(texels, float(np.degrees(np.arctan2(rotation[0, 2], rotation[0, 0]))))
     height, width = texels.shape[:2]
-    rows = np.arange(height)
     turned = np.zeros(texels.shape)
     fine = map_directions(height * side, width * side).reshape(height, side, width, side, 3)
     # Within a texel, the points nearer to a pole stand for less of the sphere.
-    share = np.sin(np.pi * (np.arange(height * side) + 0.5) / (height * side))
-    share = share.reshape(height, side) / share.reshape(height, side).sum(axis=1, keepdims=True)
+    share = np.cos(latitudes(height * side)).reshape(height, side)
+    share = share / share.sum(axis=1, keepdims=True)
     for i in range(side):
         for j in range(side):
-            x, y, z = np.moveaxis(fine[:, i, :, j] @ rotation, -1, 0)
-            u = np.arctan2(x, -z) / (2.0 * np.pi) % 1.0 * width - 0.5
-            v = np.arctan2(np.hypot(x, z), y) / np.pi * height - 0.5
-            turned += (share[rows, i] / side)[:, None, None] * read_map(texels, u, v)
+            seen = look_up(texels, fine[:, i, :, j] @ rotation)
+            turned += (share[:, i] / side)[:, None, None] * seen
     return turned.astype(np.float32)
-
-
-def read_map(texels: FloatArray, u: Float64Array, v: Float64Array) -> Float64Array:
-    """Read a map bilinearly.
-
-    Args:
-        texels: Shape [He, We, 3].
-        u: Column, wrapped; 0 is the first one's centre, shape [...].
-        v: Row, clamped; 0 is the first one's centre, shape [...].
-
-    Returns:
-        Values, shape [..., 3].
-    """
-    height, width = texels.shape[:2]
-    v = np.clip(v, 0.0, height - 1.0)
-    left, top = np.floor(u), np.floor(v)
-    x, y = (u - left)[..., None], (v - top)[..., None]
-    column, row = left.astype(int), top.astype(int)
-    below = np.minimum(row + 1, height - 1)
-    j, k = column % width, (column + 1) % width
-    upper = texels[row, j] * (1.0 - x) + texels[row, k] * x
-    lower = texels[below, j] * (1.0 - x) + texels[below, k] * x
-    read: Float64Array = upper * (1.0 - y) + lower * y
-    return read

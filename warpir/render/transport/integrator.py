@@ -24,6 +24,7 @@ from torch import Tensor
 
 from warpir.core.arrays import Float64Array, FloatArray, IntArray
 from warpir.core.errors import ExitCode, InputError
+from warpir.core.latlong import row_edges
 from warpir.core.memory import Need
 from warpir.render.integrator import MaterialTensors, Radiance
 from warpir.render.renderer import Renderer, index_of
@@ -358,7 +359,7 @@ def to_texels(light: Light, height: int) -> FloatArray:
 def resize(texels: Tensor, height: int) -> Tensor:
     """Resample a map to ``height`` rows: each texel is the mean over its solid angle.
 
-    The differentiable twin of `warpir.scene.light.resize_map`.
+    The differentiable twin of `warpir.core.latlong.resize_map`.
 
     Args:
         texels: Lat-long radiance, shape [He, We, 3].
@@ -387,9 +388,5 @@ def _shares(
         share = np.maximum(high - low, 0.0) / np.diff(new)[:, None]
         return torch.from_numpy(share.astype(np.float32)).to(device, dtype)
 
-    def heights(count: int) -> Float64Array:
-        # Solid angle is proportional to the height on the sphere (Archimedes).
-        return -np.cos(np.pi * np.arange(count + 1) / count)
-
     by_column = overlaps(np.linspace(0, 1, columns + 1), np.linspace(0, 1, 2 * height + 1))
-    return overlaps(heights(rows), heights(height)), by_column
+    return overlaps(-row_edges(rows), -row_edges(height)), by_column

@@ -11,13 +11,14 @@ import warp as wp
 
 from warpir.core.arrays import FloatArray, IntArray
 from warpir.core.color import luminance
+from warpir.core.latlong import texel_solid_angles
 from warpir.kernels import transport as kernels
 from warpir.kernels.types import Layers, LightArgs
 from warpir.render.device import Rows
 from warpir.render.device_light import light_args
 from warpir.render.renderer import Renderer
 from warpir.render.transport.tents import direction_counts, texel_args
-from warpir.scene.light import Light, texel_solid_angles
+from warpir.scene.light import Light
 
 Traced = TypeVar("Traced")
 

@@ -9,9 +9,9 @@ import warp as wp
 
 from warpir.core.arrays import Float64Array, FloatArray, IntArray
 from warpir.core.color import luminance
+from warpir.core.latlong import map_directions, texel_solid_angles
 from warpir.kernels import transport as kernels
 from warpir.render.renderer import Renderer
-from warpir.scene.light import map_directions, texel_solid_angles
 
 LANES = 256
 """Threads of a pixel on CUDA."""

@@ -1,0 +1,184 @@
+"""The figures of every row's light in one place, and of the pictures that it makes."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+import torch
+
+from warpir.core.arrays import BoolArray, FloatArray
+from warpir.evaluate.image_errors import Distance, image_errors, make_regions
+from warpir.evaluate.light_errors import light_errors
+from warpir.evaluate.report import Entry, bootstrap
+from warpir.evaluate.results import Panel, to_codes
+from warpir.evaluate.rows import ROWS, Bench
+from warpir.evaluate.scenes import Place, Subject
+from warpir.evaluate.stage import Prediction, Quality, Stage
+from warpir.evaluate.three_spheres import sphere_errors
+from warpir.lighting.regressor import Regressor, least_angle
+from warpir.scene.light import as_map
+from warpir.train.lights import load_panoramas
+from warpir.train.meshes import make_meshes
+from warpir.train.scenes.generator import Mixture, SceneGenerator
+from warpir.train.scenes.render import Stock
+
+LIGHT_HEIGHT = 128
+"""Rows of the maps on which lights are compared."""
+UNSEEN_SEED = 0xE7A1
+"""Added to the seed of rendered photographs; training and its validation use others."""
+PROCEDURAL_BATCH = 64
+"""Of those, rendered at once."""
+
+
+class Judge:
+    """Judges the rows in one place after the other.
+
+    Args:
+        bench: What the rows may use.
+        rows: Their names.
+        samples: Per pixel.
+        threads: On the CPU; 0: one per core.
+        lpips: The perceptual distance, or None.
+        sheet_row: Whose pictures the contact sheet shows.
+    """
+
+    def __init__(
+        self,
+        bench: Bench,
+        rows: Sequence[str],
+        samples: int,
+        threads: int,
+        lpips: Distance | None,
+        sheet_row: str,
+    ) -> None:
+        self.bench, self.rows, self.lpips, self.sheet_row = bench, rows, lpips, sheet_row
+        self.quality, self.threads = Quality(samples=samples), threads
+
+    def place(self, place: Place, subjects: list[Subject]) -> tuple[list[Entry], list[Panel]]:
+        """Return the figures of every row in one place, and the contact sheet's pictures of it."""
+        entries, panels = [], []
+        of_place: dict[str, tuple[Prediction, FloatArray, dict[str, float]]] = {}
+        for subject in subjects:
+            stage = Stage(subject, self.bench.device, self.quality, self.bench.seed, self.threads)
+            regions = make_regions(stage.mask, stage.ratio)
+            lights: dict[str, FloatArray] = {}
+            for name in self.rows:
+                row = ROWS[name]
+                if row.of_subject is not None:
+                    judged = _judge_light(place, row.of_subject(self.bench, stage, subject))
+                else:
+                    if name not in of_place:
+                        assert row.of_place is not None
+                        of_place[name] = _judge_light(place, row.of_place(self.bench, place))
+                    judged = of_place[name]
+                prediction, lights[name], of_light = judged
+                figures = dict(of_light)
+                if row.same_as in lights:
+                    same = light_errors(lights[name], lights[row.same_as])
+                    figures["light.same_deg"] = same["peak_angle_deg"]
+                image, errors = self._judge_picture(stage, prediction, regions)
+                figures |= errors
+                entries.append(
+                    Entry(
+                        name, place.name, place.panorama, place.is_sunny, subject.material,
+                        figures, prediction.about,
+                    )
+                )  # fmt: skip
+                if name == self.sheet_row:
+                    pictures = (place.photo, image, stage.truth)
+                    error = figures["image.box.rmse"]
+                    panels.append(Panel(subject.name, error, *map(to_codes, pictures)))
+        return entries, panels
+
+    def _judge_picture(
+        self, stage: Stage, prediction: Prediction, regions: dict[str, BoolArray]
+    ) -> tuple[FloatArray, dict[str, float]]:
+        """Return the picture under a light, and its errors as it is and at the best exposure."""
+        rendered = stage.render(prediction)
+        image = stage.compose(rendered, prediction.curves)
+        figures = _flat("image", image_errors(image, stage.truth, regions, self.lpips))
+        gain = stage.fit_exposure(rendered, prediction.curves)
+        fitted = stage.compose(rendered, prediction.curves, gain)
+        figures |= _flat("fitted", image_errors(fitted, stage.truth, regions, self.lpips))
+        figures["fitted.ev"] = float(np.log2(gain))
+        return image, figures
+
+
+def _judge_light(
+    place: Place, prediction: Prediction
+) -> tuple[Prediction, FloatArray, dict[str, float]]:
+    texels = as_map(prediction.light, LIGHT_HEIGHT)
+    return prediction, texels, light_figures(place, texels)
+
+
+def light_figures(place: Place, texels: FloatArray) -> dict[str, float]:
+    """Return the errors of a light, ``light.*`` and ``spheres.*``, in the camera-yaw frame.
+
+    Args:
+        place: Knows the truth.
+        texels: Lat-long radiance, world frame, shape [He, 2 He, 3].
+    """
+    found, true = place.to_camera(texels), place.to_camera(place.texels)
+    errors = light_errors(found, true)
+    for name in [n for n in errors if n.startswith("log_")]:
+        errors[f"abs_{name}"] = abs(errors[name])
+    return _flat("", {"light": errors, "spheres": sphere_errors(found, true)})
+
+
+def procedural_errors(
+    network: Regressor, count: int, seed: int, device: str
+) -> dict[str, dict[str, float]]:
+    """Return how well the regressor finds the direction in rendered photographs never seen.
+
+    Args:
+        network: The regressor.
+        count: Photographs.
+        seed: Objects, lights and photographs are those of no training run.
+        device: Warp device.
+
+    Returns:
+        Angle between found and true dominant direction [deg]: median, mean and 95 % interval of the
+        mean, of the photographs with a visible cue and of those without; beside it that of a guess,
+        the direction of the mean training light.
+    """
+    where = network.directions.device
+    stock = Stock(make_meshes(24, UNSEEN_SEED + seed), load_panoramas([], where), device)
+    scenes = SceneGenerator(stock, UNSEEN_SEED + seed, Mixture(made_up=1.0, hybrid=0.0))
+    guess, _ = least_angle(
+        network.directions, network.split(network.mean_light[None]).logits.softmax(dim=1)
+    )
+    angles: dict[str, list[float]] = {"found": [], "guessed": []}
+    cues: list[bool] = []
+    for index, first in enumerate(range(0, count, PROCEDURAL_BATCH)):
+        batch = scenes.photo_batch(index, PROCEDURAL_BATCH)
+        prediction = network.predict(batch.photo, batch.rays)
+        axis, _ = least_angle(network.directions, prediction.logits.softmax(dim=1))
+        wanted = min(PROCEDURAL_BATCH, count - first)
+        cues += batch.has_cue[:wanted].tolist()
+        for name, directions in (("found", axis), ("guessed", guess.expand_as(axis))):
+            cosine = (directions * batch.axis).sum(dim=1).clamp(-1.0, 1.0)
+            angles[name] += torch.rad2deg(torch.acos(cosine))[:wanted].tolist()
+    return {
+        f"{name}, {words}": _spread([a for a, c in zip(values, cues, strict=True) if c == is_cue])
+        for name, values in angles.items()
+        for words, is_cue in (("visible cue", True), ("no cue", False))
+        if is_cue in cues
+    }
+
+
+def _spread(angles: list[float]) -> dict[str, float]:
+    low, high = bootstrap(angles, [str(k) for k in range(len(angles))], rounds=1000)
+    return {
+        "median_deg": float(np.median(angles)),
+        "mean_deg": float(np.mean(angles)),
+        "mean_low_deg": low,
+        "mean_high_deg": high,
+        "count": len(angles),
+    }
+
+
+def _flat(prefix: str, nested: dict[str, dict[str, float]]) -> dict[str, float]:
+    """Return nested figures by dotted name."""
+    start = f"{prefix}." if prefix else ""
+    return {f"{start}{k}.{n}": v for k, errors in nested.items() for n, v in errors.items()}

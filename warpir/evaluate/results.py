@@ -1,0 +1,169 @@
+"""What an evaluation writes: the record, the head of the tables, and a contact sheet."""
+
+from __future__ import annotations
+
+import argparse
+import subprocess
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from PIL import Image, ImageDraw
+
+import warpir
+from warpir.app.record import versions
+from warpir.core.arrays import CodeArray, FloatArray
+from warpir.evaluate.report import Entry
+from warpir.evaluate.rows import Bench
+from warpir.evaluate.scenes import Place, Subject
+
+FORMAT, VERSION = "warpir-evaluation", 1
+DIFFERENCE_GAIN = 4.0
+"""Factor on the difference, round mid grey."""
+LINE = 14
+"""Height of a line of words [px]."""
+COLUMNS = ("photo", "{row}", "truth", "{row} - truth, x 4")
+
+
+@dataclass(frozen=True)
+class Panel:
+    """One scene of the sheet, 8-bit codes, shape [H, W, 3] each."""
+
+    name: str
+    error: float
+    """What the scenes are sorted by."""
+    photo: CodeArray
+    image: CodeArray
+    truth: CodeArray
+
+
+def to_codes(picture: FloatArray) -> CodeArray:
+    """Return a display-encoded picture as 8-bit codes."""
+    codes: CodeArray = np.round(255.0 * np.clip(picture, 0.0, 1.0)).astype(np.uint8)
+    return codes
+
+
+def contact_sheet(panels: Sequence[Panel], row: str, count: int = 40) -> CodeArray:
+    """Return the sheet, worst scenes first.
+
+    Args:
+        panels: All of one size.
+        row: Whose pictures they are.
+        count: Most scenes that are shown.
+    """
+    strips = []
+    for panel in sorted(panels, key=lambda p: -p.error)[:count]:
+        width = panel.photo.shape[1]
+        difference = panel.image.astype(np.float32) - panel.truth.astype(np.float32)
+        shown = np.clip(128.0 + DIFFERENCE_GAIN * difference, 0.0, 255.0).astype(np.uint8)
+        caption = Image.new("RGB", (4 * width, 2 * LINE), "white")
+        draw = ImageDraw.Draw(caption)
+        draw.text((2, 1), f"{panel.name}: RMSE of the box {panel.error:.4f}", fill="black")
+        for k, words in enumerate(COLUMNS):
+            draw.text((k * width + 2, LINE + 1), words.format(row=row), fill="black")
+        pictures = np.concatenate([panel.photo, panel.image, panel.truth, shown], axis=1)
+        strips += [np.asarray(caption), pictures]
+    sheet: CodeArray = np.concatenate(strips, axis=0)
+    return sheet
+
+
+def run_record(
+    options: argparse.Namespace,
+    bench: Bench,
+    scenes: list[tuple[Place, list[Subject]]],
+    notices: list[str],
+) -> dict[str, Any]:
+    """Return what the numbers depend on, as plain values."""
+    return {
+        "format": FORMAT,
+        "version": VERSION,
+        "warpir": warpir.__version__,
+        "commit": _commit(),
+        "versions": versions(),
+        "device": bench.device,
+        "date": time.strftime("%Y-%m-%d"),
+        "options": vars(options),
+        "weights": bench.digests(),
+        "notices": notices,
+        "scenes": [
+            {
+                "name": place.name,
+                "panorama": place.panorama,
+                "is_sunny": place.is_sunny,
+                "azimuth_deg": place.azimuth,
+                "pitch_deg": place.pitch,
+                "exposure": place.exposure,
+                "asset": subjects[0].asset_path.name,
+                "asset_to_world": subjects[0].placement.asset_to_world.tolist(),
+            }
+            for place, subjects in scenes
+        ],
+    }
+
+
+def plain_values(value: Any) -> Any:
+    """Return what JSON can hold; a number that it lacks is null."""
+    if isinstance(value, dict):
+        return {str(k): plain_values(v) for k, v in value.items()}
+    if isinstance(value, list | tuple):
+        return [plain_values(v) for v in value]
+    if isinstance(value, float) and not np.isfinite(value):
+        return None
+    return value if isinstance(value, bool | int | float | str | None) else str(value)
+
+
+def _commit() -> str:
+    """Return the commit of this checkout, or "unknown" for an installed package."""
+    found = subprocess.run(
+        ["git", "-C", str(Path(__file__).parent), "rev-parse", "--short", "HEAD"],
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    return found.stdout.strip() or "unknown"
+
+
+def head_lines(record: dict[str, Any]) -> list[str]:
+    """Return what stands above the tables, as lines of Markdown."""
+    options, panoramas = record["options"], {s["panorama"] for s in record["scenes"]}
+    sunny = sum(s["is_sunny"] for s in record["scenes"])
+    lines = [
+        "# Evaluation",
+        "",
+        f"{len(record['scenes'])} photographs ({sunny} sunny) of {len(panoramas)} panoramas, seed "
+        f"{options['seed']}, {options['width']} pixels wide, response {options['curve']}; "
+        f"{record['date']}, {record['device']}, warpir {record['warpir']}, commit "
+        f"{record['commit']}.",
+        "",
+        "Means over scenes with 95 % bootstrap intervals; scenes of one panorama are not",
+        "independent (the JSON file has intervals over panoramas too). Angles are in degrees.",
+        "",
+        *(f"Notice: {notice}." for notice in record["notices"]),
+        "",
+    ]  # fmt: skip
+    if "procedural" in record:
+        lines += ["## Made-up photographs never seen", ""]
+        lines += [
+            f"* {name}: median {s['median_deg']:.1f}, mean {s['mean_deg']:.1f} degrees "
+            f"({s['mean_low_deg']:.1f} .. {s['mean_high_deg']:.1f}), {s['count']} photographs"
+            for name, s in record["procedural"].items()
+        ]
+        lines.append("")
+    return lines
+
+
+def verdict_lines(entries: list[Entry]) -> list[str]:
+    """Return how often guidance could show that its end is better than its start, by row."""
+    verdicts: dict[str, list[bool]] = {}
+    for entry in entries:
+        acceptance = entry.about.get("record", {}).get("acceptance")
+        if acceptance is not None:
+            verdicts.setdefault(entry.row, []).append(bool(acceptance["is_accepted"]))
+    if not verdicts:
+        return []
+    lines = ["## What guidance said of its own end", ""]
+    lines += [f"* {row}: accepted in {sum(v)} of {len(v)} runs" for row, v in verdicts.items()]
+    return [*lines, ""]

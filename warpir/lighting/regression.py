@@ -1,0 +1,305 @@
+"""The light that the regressor estimates from a photo, in the world and in the photo's units."""
+
+from __future__ import annotations
+
+import copy
+import math
+from dataclasses import dataclass
+from typing import Any, NamedTuple
+
+import numpy as np
+import torch
+import torch.nn.functional as F
+from torch import Tensor
+
+from warpir.core.arrays import AnyFloatArray, Float64Array, FloatArray
+from warpir.core.color import GAMMA, LUMINANCE_WEIGHTS
+from warpir.core.latlong import map_directions
+from warpir.lighting.regressor import (
+    AMBIENT_SHARPNESS,
+    HEIGHT,
+    WIDTH,
+    Prediction,
+    Regressor,
+    ambient_axes,
+    least_angle,
+    mean_luminance,
+)
+from warpir.scene.camera import Camera
+from warpir.scene.light import Lobes, angles_from_axis, fibonacci
+
+
+@dataclass(frozen=True)
+class Regression:
+    """The light that the network estimates from a photo, world frame, photo-linear units."""
+
+    axis: Float64Array
+    """Unit direction toward the dominant light: least expected angle, shape [3]."""
+    spread_deg: float
+    """Expected angle between `axis` and the truth [deg]."""
+    concentration: float
+    """kappa of the von Mises-Fisher distribution about `axis` nearest to the predicted one."""
+    directions: Float64Array
+    """Candidates for the direction, shape [K, 3]."""
+    probability: Float64Array
+    """Of each, sums to 1, shape [K]."""
+    sun: Float64Array
+    """Irradiance of a surface that faces the dominant light, linear RGB, shape [3]."""
+    sun_log_std: float
+    """Standard deviation of the logarithm of its luminance."""
+    sigma: float
+    """Angular standard deviation of the dominant light [rad]."""
+    share: float
+    """Share of a sphere's mean irradiance that the dominant light gives, in [0, 1]."""
+    ambient: Lobes
+    """All other light."""
+    ambient_log_std: float
+    """Standard deviation of the logarithm of the ambient irradiance."""
+
+    def lobes(self, sigma_min: float = 0.0) -> Lobes:
+        """Return the light as lobes, the dominant one first.
+
+        Args:
+            sigma_min: Least angular standard deviation of the dominant lobe [rad]; its irradiance
+                stays.
+        """
+        sharpness = 1.0 / max(self.sigma, sigma_min) ** 2
+        amplitude = self.sun / facing_irradiance(sharpness)
+        return Lobes(
+            np.concatenate([amplitude[None], self.ambient.amplitude]).astype(np.float32),
+            np.concatenate([self.axis[None], self.ambient.axis]).astype(np.float32),
+            np.append(sharpness, self.ambient.sharpness).astype(np.float32),
+        )
+
+    def irradiance(self, normals: Float64Array) -> Float64Array:
+        """Return the expected irradiance of surfaces, photo-linear RGB, shape [..., 3].
+
+        Args:
+            normals: Unit, world frame, shape [..., 3].
+        """
+        cosine = np.maximum(normals @ self.directions.T, 0.0)
+        ambient = self.ambient.axis.astype(np.float64)
+        lobes = lobe_irradiance(normals @ ambient.T) @ self.ambient.amplitude.astype(np.float64)
+        expected: Float64Array = (cosine @ self.probability)[..., None] * self.sun + lobes
+        return expected
+
+    def matte_picture(
+        self, albedo: AnyFloatArray, normals: Float64Array, c2w: Float64Array
+    ) -> tuple[FloatArray, FloatArray]:
+        """Return a matte object's estimated picture, and where its light comes from.
+
+        Args:
+            albedo: Linear, shape [..., 3].
+            normals: Unit, camera frame (x right, y up, z toward the camera), shape [..., 3].
+            c2w: Pose of the camera, shape [4, 4].
+
+        Returns:
+            Display-encoded picture, shape [..., 3], and the expected direction toward the dominant
+            light in the camera's frame times its share, shape [3].
+        """
+        turn = np.asarray(c2w)[:3, :3]
+        shown = np.clip(albedo * self.irradiance(normals @ turn.T) / np.pi, 0.0, 1.0)
+        toward = self.share * (self.probability @ self.directions) @ turn
+        return (shown ** (1.0 / GAMMA)).astype(np.float32), toward.astype(np.float32)
+
+    def record(self) -> dict[str, Any]:
+        """Return plain values for ``run.json``."""
+        azimuth, elevation = angles_from_axis(self.axis)
+        return {
+            "axis": self.axis.tolist(),
+            "azimuth_deg": azimuth,
+            "elevation_deg": elevation,
+            "spread_deg": self.spread_deg,
+            "concentration": self.concentration,
+            "sun": self.sun.tolist(),
+            "sun_log_std": self.sun_log_std,
+            "sigma": self.sigma,
+            "share": self.share,
+            "ambient": {
+                "amplitude": self.ambient.amplitude.tolist(),
+                "axis": self.ambient.axis.tolist(),
+                "sharpness": self.ambient.sharpness.tolist(),
+            },
+            "ambient_log_std": self.ambient_log_std,
+        }
+
+
+def facing_irradiance(sharpness: float) -> float:
+    """Return the irradiance that a lobe of amplitude 1 gives a surface that faces it.
+
+    ``2 pi integral_0^1 t exp(s (t - 1)) dt = 2 pi (s - 1 + exp(-s)) / s^2``.
+    """
+    return 2.0 * math.pi * (sharpness + math.expm1(-sharpness)) / sharpness**2
+
+
+def lobe_irradiance(cosine: Float64Array) -> Float64Array:
+    """Return the irradiance that an ambient lobe of amplitude 1 gives a surface, same shape.
+
+    By a table over the angle to the lobe's axis, of sums over the sphere.
+
+    Args:
+        cosine: Of the angle between normal and axis.
+    """
+    angle = np.arccos(np.clip(cosine, -1.0, 1.0)) * ((len(_LOBE_TABLE) - 1) / math.pi)
+    values: Float64Array = np.interp(angle, np.arange(len(_LOBE_TABLE)), _LOBE_TABLE)
+    return values
+
+
+def _lobe_table(count: int = 65) -> Float64Array:
+    directions = fibonacci(20_000)
+    radiance = np.exp(AMBIENT_SHARPNESS * (directions[:, 1] - 1.0)) * (4.0 * math.pi / 20_000)
+    theta = np.linspace(0.0, math.pi, count)
+    normals = np.stack([np.sin(theta), np.cos(theta), np.zeros(count)], axis=1)
+    table: Float64Array = np.maximum(normals @ directions.T, 0.0) @ radiance
+    return table
+
+
+_LOBE_TABLE = _lobe_table()
+
+
+class ShadingLight(NamedTuple):
+    """The light of a batch of photos as far as matte surfaces need it, camera-yaw frame."""
+
+    irradiance: Tensor
+    """Expected irradiance by normal, a lat-long map, photo-linear RGB, shape [B, 16, 32, 3]."""
+    toward: Tensor
+    """Expected direction toward the dominant light times its share, shape [B, 3]."""
+
+
+@torch.no_grad()
+def estimate_shading_light(network: Regressor, photo: Tensor, rays: Tensor) -> ShadingLight:
+    """Estimate the light of photos, to shade many objects by it; see `Regression.matte_picture`.
+
+    Without the mirror image: half the time, for training.
+
+    Args:
+        network: In evaluation mode.
+        photo: Display-encoded, shape [B, 3, 96, 144].
+        rays: Unit viewing directions, camera-yaw frame, shape [B, 3, 96, 144].
+    """
+    prediction = network.split(network(photo, rays).float())
+    probability = (prediction.logits / network.temperature).softmax(dim=1)
+    luminance = mean_luminance(photo)[:, None]
+    log_red, log_blue = prediction.tint.unbind(dim=1)
+    ratios = torch.stack([log_red, torch.zeros_like(log_red), log_blue], dim=1).exp()
+    weights = ratios.new_tensor(LUMINANCE_WEIGHTS)
+    sun = luminance * prediction.level.clamp(-12, 12).exp()[:, None] * ratios
+    sun = sun / (ratios @ weights)[:, None]
+    normals = map_directions(16, 32).reshape(-1, 3)
+    cosine = torch.from_numpy(normals).to(network.directions) @ network.directions.T
+    of_lobes = torch.from_numpy(lobe_irradiance(normals @ ambient_axes().T)).to(cosine)
+    facing = probability @ cosine.clamp(min=0.0).T
+    ambient = luminance[..., None] * prediction.ambient.clamp(-12, 8).exp()
+    irradiance = facing[..., None] * sun[:, None] + of_lobes @ ambient
+    toward = prediction.share.sigmoid()[:, None] * (probability @ network.directions)
+    return ShadingLight(irradiance.unflatten(1, (16, 32)), toward)
+
+
+def yaw_to_world(camera: Camera) -> Float64Array:
+    """Return the rotation from the camera-yaw frame to the world, shape [3, 3].
+
+    A camera that looks straight up or down is turned as its up axis says.
+    """
+    _, up, back = camera.c2w[:3, :3].T
+    ahead = -back * (1.0, 0.0, 1.0)
+    if np.linalg.norm(ahead) < 1e-6:
+        ahead = up * (1.0, 0.0, 1.0) * np.sign(back[1])
+    ahead = ahead / np.linalg.norm(ahead)
+    vertical = np.array([0.0, 1.0, 0.0])
+    return np.stack([np.cross(ahead, vertical), vertical, -ahead], axis=1)
+
+
+def camera_rays(camera: Camera, height: int = HEIGHT, width: int = WIDTH) -> FloatArray:
+    """Return the unit viewing direction of each pixel, camera-yaw frame, shape [height, width, 3].
+
+    Args:
+        camera: Of the photo at any size; the picture is stretched to the size asked for.
+        height: Rows.
+        width: Columns.
+    """
+    view = camera.scaled(width, height)
+    u, v = np.meshgrid(np.arange(width) + 0.5, np.arange(height) + 0.5)
+    local = np.stack([(u - view.cx) / view.fx, (view.cy - v) / view.fy, -np.ones_like(u)], axis=-1)
+    rays = local @ (yaw_to_world(camera).T @ camera.c2w[:3, :3]).T
+    unit: FloatArray = (rays / np.linalg.norm(rays, axis=-1, keepdims=True)).astype(np.float32)
+    return unit
+
+
+def regress(network: Regressor, photo_srgb: AnyFloatArray, camera: Camera) -> Regression:
+    """Estimate the light of a photo.
+
+    Args:
+        network: Of `load_regressor`.
+        photo_srgb: Display-encoded, in [0, 1], shape [H, W, 3].
+        camera: Of the photo; of any size with the photo's aspect.
+    """
+    device = network.directions.device
+    photo = _network_photo(photo_srgb).to(device)
+    rays = torch.from_numpy(camera_rays(camera)).to(device).permute(2, 0, 1)[None].double()
+    # In float64, so that kinds of processors, which round sums differently, agree on the light.
+    prediction = copy.deepcopy(network).double().predict(photo, rays)
+    return _regression(network, prediction, float(mean_luminance(photo)), camera)
+
+
+def mean_training_light(
+    network: Regressor, photo_srgb: AnyFloatArray, camera: Camera
+) -> Regression:
+    """Return the training set's mean light at a photo's exposure: a guess without looking.
+
+    Args:
+        network: Whose training set.
+        photo_srgb: Only its mean luminance counts; display-encoded, shape [H, W, 3].
+        camera: Only its yaw counts.
+    """
+    luminance = float(mean_luminance(_network_photo(photo_srgb)))
+    return _regression(network, network.split(network.mean_light[None]), luminance, camera)
+
+
+def _network_photo(photo_srgb: AnyFloatArray) -> Tensor:
+    """Bring a photo to the network's size by area, float64, shape [1, 3, 96, 144]."""
+    photo = torch.from_numpy(np.ascontiguousarray(photo_srgb, np.float64)).permute(2, 0, 1)[None]
+    return F.interpolate(
+        photo, (HEIGHT, WIDTH), mode="bilinear", align_corners=False, antialias=True
+    ).clamp(0.0, 1.0)
+
+
+def _regression(
+    network: Regressor, prediction: Prediction, luminance: float, camera: Camera
+) -> Regression:
+    """Turn one prediction into numbers in the world.
+
+    Args:
+        network: Holds the candidate directions.
+        prediction: Of one photo, camera-yaw frame.
+        luminance: The photo's mean decoded luminance.
+        camera: Gives the yaw.
+    """
+    to_world = yaw_to_world(camera)
+    one = Prediction(*(part.detach().cpu().double() for part in prediction))
+    directions = network.directions.cpu().double()
+    probability = one.logits.softmax(dim=1)
+    axis, spread = least_angle(directions, probability)
+    # Most likely kappa for samples about a known mean direction: coth(kappa) - 1 / kappa = R; the
+    # inverse is Banerjee et al. 2005, eq. 4 in 3 dimensions.
+    resultant = min(max(float(probability[0] @ directions @ axis[0]), 0.0), 1.0 - 1e-6)
+    log_red, log_blue = one.tint[0].tolist()
+    ratios = np.exp([log_red, 0.0, log_blue])
+    level = luminance * math.exp(float(one.level[0]))
+    ambient_axis = ambient_axes() @ to_world.T
+    return Regression(
+        axis=to_world @ axis[0].numpy(),
+        spread_deg=math.degrees(float(spread)),
+        concentration=resultant * (3.0 - resultant**2) / (1.0 - resultant**2),
+        directions=directions.numpy() @ to_world.T,
+        probability=probability[0].numpy(),
+        sun=level * ratios / float(ratios @ LUMINANCE_WEIGHTS),
+        sun_log_std=math.exp(0.5 * float(one.level_log_var)),
+        sigma=min(math.exp(float(one.softness)), 1.0),
+        share=float(one.share.sigmoid()),
+        ambient=Lobes(
+            (luminance * one.ambient[0].exp().numpy()).astype(np.float32),
+            ambient_axis.astype(np.float32),
+            np.full(len(ambient_axis), AMBIENT_SHARPNESS, np.float32),
+        ),
+        ambient_log_std=math.exp(0.5 * float(one.ambient_log_var)),
+    )

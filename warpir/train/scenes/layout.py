@@ -1,0 +1,199 @@
+"""The cameras of a batch of scenes, where the objects stand, and what the ground looks like."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from warpir.train.sampler import Sampler
+from warpir.train.scenes.lighting import about_y
+
+ASPECTS = (1.5, 1.5, 1.5, 1.5, 1.333, 1.333, 1.778, 1.0, 0.75)
+"""Width over height of the photos, by frequency."""
+CAMERA_HEIGHTS = ((1.2, 2.0), (1.1, 1.9), (0.25, 0.7), (1.0, 1.7))
+"""Least and most above the ground, of streets, yards, tables and rooms [m]."""
+
+
+@dataclass(frozen=True)
+class Views:
+    """Cameras, world frame (that is the camera-yaw frame)."""
+
+    origin: Tensor
+    """Shape [B, 3] [m]."""
+    right: Tensor
+    """Unit axes of the camera, shape [B, 3] each; it looks along -back."""
+    up: Tensor
+    back: Tensor
+    tilt: Tensor
+    """Above the horizon [rad], shape [B]."""
+    half_width: Tensor
+    """Of the photo on the image plane at depth 1, shape [B]."""
+    half_height: Tensor
+
+    @property
+    def height(self) -> Tensor:
+        """Above the ground [m], shape [B]."""
+        return self.origin[:, 1]
+
+    @property
+    def window(self) -> Tensor:
+        """The photo's left, upper, width and height on the image plane, shape [B, 4]."""
+        w, h = self.half_width, self.half_height
+        return torch.stack([-w, -h, 2.0 * w, 2.0 * h], dim=1)
+
+
+@dataclass(frozen=True)
+class Stands:
+    """Where the objects stand, how large and how turned."""
+
+    place: Tensor
+    """On the ground, world frame [m], shape [B, 3]."""
+    scale: Tensor
+    """Of the mesh [m], shape [B]."""
+    mesh: Tensor
+    """Index, int64, shape [B]."""
+    sphere: Tensor
+    """Centre and radius round the mesh, in its own units, shape [B, 4]."""
+    yaw: Tensor
+    """About +Y [rad], shape [B]."""
+
+    @property
+    def middle(self) -> Tensor:
+        """Of the object, world frame [m], shape [B, 3]."""
+        return self.place + about_y(self.sphere[:, :3], self.yaw) * self.scale[:, None]
+
+
+def rays_in(
+    window: Tensor, size: tuple[int, int], right: Tensor, up: Tensor, back: Tensor
+) -> Tensor:
+    """Return the unit viewing directions of a window's pixels, world frame, shape [B, 3, H, W].
+
+    Args:
+        window: Left, upper, width and height on the image plane at depth 1, shape [B, 4].
+        size: Height and width [px].
+        right: Unit axis of the cameras, shape [B, 3].
+        up: Likewise.
+        back: Likewise.
+    """
+    height, width = size
+    across = (torch.arange(width, device=window.device) + 0.5) / width
+    down = (torch.arange(height, device=window.device) + 0.5) / height
+    u = (window[:, 0:1] + across * window[:, 2:3])[:, None, :, None]
+    v = (window[:, 1:2] + down * window[:, 3:4])[:, :, None, None]
+    right, up, back = (x[:, None, None] for x in (right, up, back))
+    rays = torch.nn.functional.normalize(right * u - up * v - back, dim=-1)
+    return rays.permute(0, 3, 1, 2).contiguous()
+
+
+def draw_views(draw: Sampler, place_kind: Tensor) -> Views:
+    """Draw cameras for scenes of some kinds: 0 street, 1 yard, 2 table, 3 room, shape [B]."""
+    device = draw.device
+    fov = torch.deg2rad(draw.uniform(32.0, 74.0))
+    half_height = torch.tan(fov / 2.0)
+    half_width = half_height * torch.tensor(ASPECTS, device=device)[draw.index(len(ASPECTS))]
+    half_width = half_width.clamp(max=1.6)
+    steepest = torch.atan(half_height * 0.7)
+    tilt = torch.deg2rad(-5.0 + 9.0 * draw.normal())
+    tilt = torch.minimum(tilt.clamp(min=-0.6), steepest)
+    low, high = torch.tensor(CAMERA_HEIGHTS, device=device)[place_kind].T
+    camera_height = low + (high - low) * draw.unit()
+    zero, one = torch.zeros_like(tilt), torch.ones_like(tilt)
+    return Views(
+        origin=torch.stack([zero, camera_height, zero], dim=1),
+        right=torch.stack([one, zero, zero], dim=1),
+        up=torch.stack([zero, tilt.cos(), tilt.sin()], dim=1),
+        back=torch.stack([zero, -tilt.sin(), tilt.cos()], dim=1),
+        tilt=tilt,
+        half_width=half_width,
+        half_height=half_height,
+    )
+
+
+def draw_stands(draw: Sampler, views: Views, spheres: Tensor) -> Stands:
+    """Draw where the objects stand: at a pixel below the horizon.
+
+    Args:
+        draw: For the scenes of the batch.
+        views: Their cameras.
+        spheres: Round each mesh, shape [mesh, 4].
+    """
+    a = draw.uniform(-0.65, 0.65) * views.half_width
+    horizon = torch.tan(views.tilt)
+    top = torch.maximum(horizon + 0.12 * views.half_height, -0.1 * views.half_height)
+    b = top + draw.unit() * (0.95 * views.half_height - top).clamp(min=0.02)
+    d = views.right * a[:, None] - views.up * b[:, None] - views.back
+    place = views.origin + d * (-views.height / d[:, 1].clamp(max=-0.03))[:, None]
+    depth = -((place - views.origin) * views.back).sum(dim=1)
+    scale = draw.log_uniform(0.14, 0.55) * 2.0 * views.half_height * depth
+    mesh = draw.index(len(spheres))
+    return Stands(place, scale, mesh, spheres[mesh], draw.uniform(0.0, 2.0 * np.pi))
+
+
+def draw_crops(draw: Sampler, views: Views, stands: Stands) -> Tensor:
+    """Draw square windows round the objects, as the optimiser does, shape [B, 4]."""
+    half_width, half_height = views.half_width, views.half_height
+    offset = stands.middle - views.origin
+    depth = -(offset * views.back).sum(dim=1)
+    cu = (offset * views.right).sum(dim=1) / depth
+    cv = -(offset * views.up).sum(dim=1) / depth
+    half_box = 0.8 * stands.sphere[:, 3] * stands.scale / depth
+    shorter = 2.0 * torch.minimum(half_width, half_height)
+    side = torch.minimum(draw.log_uniform(1.2, 4.0) * 2.0 * half_box, shorter)
+    left = cu + draw.uniform(-1.0, 1.0) * half_box - side / 2.0
+    upper = cv + draw.uniform(-1.0, 1.0) * half_box - side / 2.0
+    left = torch.minimum(torch.maximum(left, -half_width), half_width - side)
+    upper = torch.minimum(torch.maximum(upper, -half_height), half_height - side)
+    return torch.stack([left, upper, side, side], dim=1)
+
+
+def draw_colours(draw: Sampler, low: float, high: float) -> Tensor:
+    """Draw albedos of some level and of any hue, shape [B, 3]."""
+    tint = 1.0 + draw.uniform(-0.35, 0.35, 3) * draw.uniform(0.0, 1.0, 1)
+    return (draw.log_uniform(low, high)[:, None] * tint).clamp(0.02, 0.9)
+
+
+def draw_grounds(
+    draw: Sampler, is_panorama: Tensor, seen: Tensor, camera_height: Tensor, texture_count: int
+) -> dict[str, Tensor]:
+    """Draw the grounds, columns of the kernel's ``GroundTable``.
+
+    Args:
+        draw: For the scenes of the batch.
+        is_panorama: Scenes whose photo is a panorama crop: their ground is only assumed.
+        seen: Panorama behind each scene, -1 for none, shape [B].
+        camera_height: Above the ground [m], shape [B].
+        texture_count: Panoramas whose texels may cover a ground.
+    """
+    zero = torch.zeros_like(camera_height)
+    albedo = draw_colours(draw, 0.06, 0.55)
+    second = albedo * torch.exp(draw.uniform(-0.7, 0.7, 1) + draw.uniform(-0.15, 0.15, 3))
+    second = second.clamp(0.02, 0.9)
+    return {
+        "is_seen": (~is_panorama).int(),
+        "seen": seen.int(),
+        "albedo": albedo,
+        "second": torch.where(draw.chance(0.25)[:, None], albedo, second),
+        "pattern": torch.where(
+            draw.chance(0.5) if texture_count else zero.bool(), 4, draw.index(4)
+        ).int(),
+        "texture": (draw.unit() * max(texture_count, 1)).int(),
+        "size": camera_height * draw.log_uniform(0.08, 1.5),
+        "turn": draw.uniform(0.0, np.pi),
+        "roughen": draw.uniform(0.0, 0.4),
+        "wetness": torch.where(draw.chance(0.15), draw.uniform(0.2, 1.0), zero),
+    }
+
+
+def draw_surfaces(draw: Sampler) -> dict[str, Tensor]:
+    """Draw the objects' materials, columns of the kernel's ``ObjectTable``."""
+    zero = torch.zeros(draw.count, device=draw.device)
+    return {
+        "tint": draw_colours(draw, 0.03, 0.85),
+        "recolour": torch.where(draw.chance(0.45), draw.uniform(0.4, 1.0), zero),
+        "pattern": torch.where(draw.chance(0.2), draw.uniform(0.2, 0.8), zero),
+        "roughness": torch.where(draw.chance(0.6), draw.uniform(0.5, 1.0), draw.uniform(0.12, 0.6)),
+        "metallic": torch.where(draw.chance(0.15), draw.uniform(0.3, 1.0), zero),
+    }
