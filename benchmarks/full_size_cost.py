@@ -195,7 +195,7 @@ class Watch:
                 ("warpir.app.record.Timings", WatchedTimings),
                 ("warpir.core.progress.StepProgress", WatchedProgress),
                 (
-                    "warpir.optimize.recover.load_stable_diffusion",
+                    "warpir.optimize.model.load_stable_diffusion",
                     kept("prior", load_stable_diffusion),
                 ),
                 ("warpir.optimize.recover.LightOptimization", kept("loop", LightOptimization)),

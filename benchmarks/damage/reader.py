@@ -138,7 +138,7 @@ def _regressor(path: Path) -> None:
 
 
 def _told(error: Any) -> InputError:
-    """Return what the program makes of an error of a model (`warpir.optimize.recover`)."""
+    """Return what the program makes of an error of a model (`warpir.optimize.model`)."""
     return InputError(error.where, error.what, error.advice, ExitCode.MODEL)
 
 

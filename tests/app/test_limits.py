@@ -22,8 +22,8 @@ from tests.builders.insertions import arguments, read_layers, write_inputs
 from tests.insert.test_faults import NO_POSE
 from warpir.app.config import OPTIONS, InsertConfig
 from warpir.app.config_file import YAML_SHARE
-from warpir.app.disk_space import needed_bytes
 from warpir.app.inputs import read_inputs
+from warpir.app.run import needed_bytes
 from warpir.core.errors import ExitCode
 from warpir.core.limits import LIMITS, Limits
 from warpir.io.curves_file import curves_to_json

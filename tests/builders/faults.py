@@ -197,6 +197,8 @@ PRELOADED_WARM = (
     *(
         "warpir.optimize.recover",
         "warpir.optimize.materials",
+        "warpir.optimize.find_light",
+        "warpir.report.result",
         "warpir.lighting.detail",
         "warpir.io.export",
         "warpir.mitsuba.scene",

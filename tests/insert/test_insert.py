@@ -506,13 +506,13 @@ def test_failure_while_rendering_keeps_old_results(
     inputs: Path, results: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     """What goes wrong after the folder was locked leaves it as it was, lock and staging gone."""
-    import warpir.render.composite
+    import warpir.report.result
 
     def fail(*args: object, **kwargs: object) -> None:
         raise MemoryError
 
     before = digest(results)
-    monkeypatch.setattr(warpir.render.composite, "make_picture", fail)
+    monkeypatch.setattr(warpir.report.result, "make_picture", fail)
     assert main([*arguments(inputs, results), "--overwrite"]) == ExitCode.RESOURCES
     assert "error: memory:" in capsys.readouterr().err
     assert digest(results) == before
@@ -570,11 +570,11 @@ def test_inputs_that_change_while_it_renders(
     inputs: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, change: str
 ) -> None:
     """What was read counts: run.json tells its sha256, and nothing is read again at the end."""
-    import warpir.render.composite
+    import warpir.report.result
 
     photo = tmp_path / "photo.png"
     photo.write_bytes((inputs / "photo.png").read_bytes())
-    make = warpir.render.composite.make_picture
+    make = warpir.report.result.make_picture
 
     def disturbed(*args: Any, **kwargs: Any) -> Any:
         if change == "removed":
@@ -583,7 +583,7 @@ def test_inputs_that_change_while_it_renders(
             photo.write_bytes(b"another")
         return make(*args, **kwargs)
 
-    monkeypatch.setattr(warpir.render.composite, "make_picture", disturbed)
+    monkeypatch.setattr(warpir.report.result, "make_picture", disturbed)
     out = tmp_path / "out"
     changes = {"photo": str(photo), "asset": str(inputs / "box.obj")}
     done = go(arguments(inputs, out, **changes), out)

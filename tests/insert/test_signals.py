@@ -142,7 +142,7 @@ def hook(place: str, turn: int, act: str) -> str:
 UPDATE = "warpir.diffusion.personalization.lora_training:LoraTraining:update"
 STEP = "warpir.optimize.loop:Optimization:step"
 SAVE = "warpir.optimize.checkpoint:write_folder"
-WRITE = "warpir.insert:_write"
+WRITE = "warpir.report.result:write_results"
 COMMIT = "warpir.io.results:OutputFolder:_put_in_place"
 
 
@@ -197,8 +197,8 @@ def what_is_kept(out: Path, old: dict[str, str]) -> str:
 
 TERM, INT, HUP = signal.SIGTERM, signal.SIGINT, signal.SIGHUP
 STOPS = [
-    pytest.param("warpir.optimize.recover:load_prior", 1, (TERM,), "", id="R2-load"),
-    pytest.param("warpir.optimize.recover:load_prior", 1, (INT,), "", id="R2-load-int"),
+    pytest.param("warpir.optimize.model:load_prior", 1, (TERM,), "", id="R2-load"),
+    pytest.param("warpir.optimize.model:load_prior", 1, (INT,), "", id="R2-load-int"),
     pytest.param(UPDATE, 3, (TERM,), "000002-personalize-3", id="R2-lora"),
     pytest.param(STEP, 3, (INT,), "000004-optimize-3", id="R2-iteration-int"),
     pytest.param(STEP, 3, (HUP,), "000004-optimize-3", id="R2-iteration-hup"),

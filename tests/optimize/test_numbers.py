@@ -36,7 +36,7 @@ from warpir.insert import main
 from warpir.optimize.checkpoint import Checkpoints
 from warpir.optimize.light import LightOptimization
 from warpir.optimize.loop import BACK_OFF, GOOD_STEPS
-from warpir.optimize.recover import as_input_errors
+from warpir.optimize.model import as_input_errors
 from warpir.render import bad_pixels
 from warpir.render.bad_pixels import NAMED, BadPixels
 from warpir.render.device_light import light_args

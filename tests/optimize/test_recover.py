@@ -140,7 +140,7 @@ STOPS = {
     "optimisation before a checkpoint": ("optimize.loop:Optimization.step", 2),
     "optimisation": ("optimize.loop:Optimization.step", 6),
     "checkpoint": ("atomic.write_staged", 16),
-    "last render": ("render.composite.make_picture", 1),
+    "last render": ("report.result.make_picture", 1),
     "final files": ("io.results:OutputFolder._commit", 1),
 }
 
@@ -150,7 +150,8 @@ STOPS = {
 def test_stopped_run_resumes_as_if_it_had_not_been(
     folder: Path, finished: Path, tmp_path: Path, where: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    import warpir.optimize.recover  # noqa: F401  all modules that are to be stopped in
+    import warpir.optimize.recover
+    import warpir.report.result  # noqa: F401  all modules that are to be stopped in
 
     out = tmp_path / "out"
     with pytest.MonkeyPatch.context() as patch:
@@ -396,9 +397,9 @@ def test_start_keeps_the_flux_of_a_sun_that_is_too_narrow(monkeypatch: pytest.Mo
     monkeypatch.setattr(recover, "start_level", lambda *_: 0.5)
     config = InsertConfig(sun=(30.0, 40.0), lobes=4, light_height=16)
     sun = Light(sun_lobe(30.0, 40.0, (5.0, 4.0, 3.0)))
-    run = cast(recover.Run, SimpleNamespace(config=config, inputs=None, estimate=None))
+    run = cast(recover.Run, SimpleNamespace(config=config, inputs=None))
     curves = Curves.identity("reinhard")
-    unknowns = recover.start_of(run, SceneLight(sun, sun, curves, 0.0, ()))
+    unknowns = recover.unknowns_of(run, recover.Start(SceneLight(sun, sun, curves, 0.0, ())))
     lobes = unknowns.light_fg.lobes()
     assert (1.0 / np.sqrt(lobes.sharpness)).min() > 0.999 * narrowest(16)
     assert sun.lobes is not None

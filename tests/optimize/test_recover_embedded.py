@@ -5,7 +5,6 @@ Random weights know nothing about light. What is tested is what a run does with 
 
 import json
 import math
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -17,9 +16,8 @@ from tests.builders.insertions import ALWAYS, DETAIL, arguments, digest, write_i
 from tests.builders.stops import Killed, stop_at, stop_hard
 from warpir.app.config import InsertConfig
 from warpir.app.inputs import read_inputs
-from warpir.app.record import Timings
+from warpir.app.run import Run
 from warpir.core.errors import ExitCode
-from warpir.core.progress import StepProgress
 from warpir.demo import demo_config
 from warpir.diffusion.models import embedded
 from warpir.diffusion.models.embedded import GBUFFER_CHANNELS
@@ -32,6 +30,8 @@ from warpir.lighting.sg_light import narrowest
 from warpir.lighting.trust_region import SPREAD_MAX
 from warpir.optimize import recover
 from warpir.optimize.acceptance import Verdict
+from warpir.optimize.course import make_frame
+from warpir.optimize.view import gbuffer_of, with_light
 
 CHEAP = {
     "guidance_width": "32",
@@ -281,11 +281,11 @@ def test_absent_package_weights_say_so(
     assert "not in this installation" in capsys.readouterr().err
 
 
-def made_run(config: InsertConfig, folder: Path) -> recover.Run:
+def made_run(config: InsertConfig, folder: Path) -> Run:
     """A run whose output nobody looks at."""
     config = config.settled(on_cuda=False)
-    with OutputFolder(folder / "unused", overwrite=True) as output, StepProgress(print) as progress:
-        return recover.Run(config, read_inputs(config), "cpu", output, Timings(), print, progress)
+    with OutputFolder(folder / "unused", overwrite=True) as output:
+        return Run(config, read_inputs(config), output)
 
 
 def config_of(folder: Path, **changes: Any) -> InsertConfig:
@@ -304,8 +304,8 @@ def test_prior_sees_the_object_as_in_its_training(folder: Path, tmp_path: Path) 
     """
     config = config_of(folder).changed(pitch=-30.0, camera_height=3.0)
     run = made_run(config, tmp_path)
-    frame = recover.make_frame(run)
-    gbuffer = recover.gbuffer_of(frame)
+    frame = make_frame(run)
+    gbuffer = gbuffer_of(frame)
     assert gbuffer.shape == (1, 7, 32, 48) and gbuffer.dtype == torch.float32
     mask, albedo, normals = gbuffer[0].split([1, 3, 3])
     np.testing.assert_array_equal(mask[0].numpy(), frame.coverage())
@@ -327,12 +327,12 @@ def test_prior_is_told_the_regressed_light(folder: Path, tmp_path: Path) -> None
     """A first guess of the object's picture, dark beside it, and one direction for all pixels."""
     config = config_of(folder)
     run = made_run(config, tmp_path)
-    frame = recover.make_frame(run)
+    frame = make_frame(run)
     camera = frame.renderer.scene.camera
     network = load_regressor(folder / "regressor.safetensors")
     regression = regress(network, run.inputs.photo.srgb, run.inputs.camera)
-    plain = recover.gbuffer_of(frame)
-    told = recover.with_light(plain, regression, camera)
+    plain = gbuffer_of(frame)
+    told = with_light(plain, regression, camera)
     assert told.shape == (1, GBUFFER_CHANNELS, 32, 48) and told.dtype == torch.float32
     assert torch.equal(told[:, :7], plain)
     mask = plain[0, 0]
@@ -353,8 +353,8 @@ def test_start_is_the_regressed_light(folder: Path, tmp_path: Path) -> None:
     for tone in ("linear", "reinhard"):
         run = made_run(config_of(folder, tone=tone), tmp_path)
         estimate = estimate_light(run.inputs, run.config, "cpu")
-        run = replace(run, estimate=estimate)
-        unknowns = recover.start_of(run, estimate.light)
+        start = recover.Start(estimate.light, estimate)
+        unknowns = recover.unknowns_of(run, start)
         found = estimate.regression
         for light in (unknowns.light_fg, unknowns.light_shadow):
             lobes = light.lobes()
@@ -362,7 +362,7 @@ def test_start_is_the_regressed_light(folder: Path, tmp_path: Path) -> None:
             assert 1.0 / math.sqrt(lobes.sharpness[0]) >= 0.999 * narrowest(16)
             expected = found.lobes(narrowest(16)).flux() * estimate.gain
             np.testing.assert_allclose(lobes.flux(), expected, rtol=2e-3)
-        region = recover.region_of(run, unknowns)
+        region = recover.region_of(start, unknowns)
         assert region is not None
         believed = min(math.radians(found.spread_deg), SPREAD_MAX)
         assert region.spread == pytest.approx(believed)

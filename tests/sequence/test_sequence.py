@@ -9,7 +9,7 @@ from typing import Any, NoReturn
 
 import pytest
 
-import warpir.render.composite
+import warpir.report.result
 from tests.builders.insertions import ALWAYS, Run, arguments, digest, go, write_inputs
 from tests.builders.refusals import assert_fails, refused
 from warpir import insert
@@ -138,7 +138,7 @@ def test_finished_frames_are_left_alone(
     """The same command again renders nothing, changes no byte and says so."""
     argv, out = frames
     before = digest(out)
-    monkeypatch.setattr(warpir.render.composite, "make_picture", refuse_to_render)
+    monkeypatch.setattr(warpir.report.result, "make_picture", refuse_to_render)
     assert main(argv) == ExitCode.DONE
     said = capsys.readouterr().out
     assert [f"frame 000{k}: done already" in said for k in (1, 2, 3)] == [True] * 3
@@ -160,7 +160,7 @@ def test_interrupted_sequence_goes_on(
     argv, finished = frames
     argv = [*argv]
     argv[argv.index("--out") + 1] = str(tmp_path / "out")
-    make_picture, calls = warpir.render.composite.make_picture, []
+    make_picture, calls = warpir.report.result.make_picture, []
 
     def stop_at_the_second(*args: Any, **kwargs: Any) -> Any:
         calls.append(1)
@@ -168,7 +168,7 @@ def test_interrupted_sequence_goes_on(
             raise KeyboardInterrupt
         return make_picture(*args, **kwargs)
 
-    monkeypatch.setattr(warpir.render.composite, "make_picture", stop_at_the_second)
+    monkeypatch.setattr(warpir.report.result, "make_picture", stop_at_the_second)
     assert main(argv) == 130
     assert (tmp_path / "out" / "0001" / "run.json").exists()
     assert not (tmp_path / "out" / "0002").exists()
@@ -221,7 +221,7 @@ def test_renewed_sequence_keeps_what_is_done(
     copy_of(frames[1], out)
     changed = [FRAMES[0], *({**frame, "seed": 9} for frame in FRAMES[1:])]
     config = parse(argv_of(inputs, first, write_lines(tmp_path / "s", changed, inputs), out)).config
-    make_picture, calls = warpir.render.composite.make_picture, []
+    make_picture, calls = warpir.report.result.make_picture, []
 
     def stop_at_the_second(*args: Any, **kwargs: Any) -> Any:
         calls.append(1)
@@ -229,7 +229,7 @@ def test_renewed_sequence_keeps_what_is_done(
             raise KeyboardInterrupt
         return make_picture(*args, **kwargs)
 
-    monkeypatch.setattr(warpir.render.composite, "make_picture", stop_at_the_second)
+    monkeypatch.setattr(warpir.report.result, "make_picture", stop_at_the_second)
     with pytest.raises(KeyboardInterrupt):
         insert_now(config, renews=True)
     insert_now(config, renews=True)
@@ -443,7 +443,7 @@ def test_page_is_there_before_the_summary(
     argv, out = frames
     page = (out / "sequence.html").read_bytes()
     (out / "sequence.html").unlink()
-    monkeypatch.setattr("warpir.sequence.frames.write_summary", stop)
+    monkeypatch.setattr("warpir.sequence.run.write_summary", stop)
     assert main(argv) == 130
     assert (out / "sequence.html").read_bytes() == page
 

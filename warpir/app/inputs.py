@@ -12,14 +12,14 @@ import numpy as np
 
 from warpir.app.config import InsertConfig, usage
 from warpir.app.model_files import require_model
-from warpir.app.photo_world import PhotoWorld, make_world
+from warpir.app.photo_world import PhotoWorld, make_world, photo_camera, stand_on_ground
 from warpir.app.record import file_hash, input_files
 from warpir.app.reuse import EarlierRun, read_run
 from warpir.core.arrays import Float64Array, FloatArray
 from warpir.core.errors import InputError, raise_all
 from warpir.core.limits import Limits
+from warpir.core.progress import Log
 from warpir.io.assets import load_asset
-from warpir.io.cameras.reader import read_photo_camera
 from warpir.io.cameras.source import PhotoCamera
 from warpir.io.images.photos import Photo, read_envmap, read_mask, read_photo
 from warpir.io.images.undistort import undistort_photo, undistorted
@@ -27,17 +27,11 @@ from warpir.io.lobes_file import read_lobes
 from warpir.io.meshes.materials_file import with_materials
 from warpir.io.meshes.point_cloud import read_point_cloud
 from warpir.scene.asset import Asset
-from warpir.scene.camera import Camera, camera_from_exif, camera_from_fov
-from warpir.scene.free_space import find_place, points_in_way
+from warpir.scene.camera import Camera
 from warpir.scene.light import Light
-from warpir.scene.placement import Placement, place_asset, up_to_y, upright_plane
+from warpir.scene.placement import Placement, up_to_y
 from warpir.scene.receiver import ReceiverMesh, first_hit, is_in_view, mesh_of
 from warpir.scene.shadow_mask import ShadowMask, shadow_mask
-
-DEFAULT_FOV = 60.0
-"""Horizontal field of view without --camera, --fov and EXIF [deg]: a phone's main camera."""
-DEFAULT_CAMERA_HEIGHT = 1.6
-"""Height of a photographer's eyes [m]."""
 
 STATED_UP = (".glb", ".gltf")
 """Kinds of asset whose format says which way is up."""
@@ -87,6 +81,24 @@ class Loaders:
         self.run: Callable[[str, Limits], EarlierRun] = lru_cache(maxsize=1)(read_run)
 
 
+@dataclass(frozen=True)
+class _Files:
+    """What the files of one insertion hold, each by itself."""
+
+    photo: Photo
+    view: PhotoCamera
+    asset: Asset
+    occluder: FloatArray | None
+    shaded: FloatArray | None
+    light: Light | None
+    run: EarlierRun | None
+    points: Float64Array | None
+    proxy: Asset | None
+    hashes: dict[str, str]
+    log: Log
+    """What was assumed and repaired on the way, but for what photo and meshes say themselves."""
+
+
 def read_inputs(config: InsertConfig, loaders: Loaders | None = None) -> Inputs:
     """Read and check every input, so that all problems are known before anything is rendered.
 
@@ -98,8 +110,40 @@ def read_inputs(config: InsertConfig, loaders: Loaders | None = None) -> Inputs:
         InputError: The first problem; the others are in its ``also``.
     """
     config.require_inputs()
-    loaders = loaders or Loaders()
-    problems: list[InputError] = []
+    files = _read_files(config, loaders or Loaders())
+    straight = _straightened(files)
+    world = make_world(config, files.view, files.points)
+    mesh = None if files.proxy is None else mesh_of(files.proxy)
+    placement = stand_on_ground(config, files.asset, world, mesh)
+    shade = None
+    if straight.shaded is not None:
+        bounds = files.asset.bounds()
+        shade = shadow_mask(straight.shaded, *bounds, placement.asset_to_world, world.camera)
+    return Inputs(
+        straight.photo,
+        files.asset,
+        world.camera,
+        placement,
+        files.light,
+        files.run,
+        proxy=mesh,
+        is_plane=config.camera.plane,
+        shadow_mask=shade,
+        assumed=tuple(_assumptions(config, files, world, placement, shade)),
+        notices=tuple(_notices(config, files, straight, world, placement, mesh)),
+        occluder=straight.occluder,
+        measured=straight.measured | world.measured,
+        hashes=files.hashes,
+    )
+
+
+def _read_files(config: InsertConfig, loaders: Loaders) -> _Files:
+    """Read each file by itself; one that is damaged does not hide what is wrong with the others.
+
+    Raises:
+        InputError: The first problem; the others are in its ``also``.
+    """
+    problems = _inputs_in_out(config)
 
     def attempt(read: Callable[[], Read]) -> Read | None:
         try:
@@ -108,120 +152,140 @@ def read_inputs(config: InsertConfig, loaders: Loaders | None = None) -> Inputs:
             problems.append(error)
             return None
 
-    assert config.inputs.photo is not None and config.inputs.asset is not None
-    photo_path, asset_path = config.inputs.photo, config.inputs.asset
     states: dict[str, tuple[Path, _State | None]] = {}
     with suppress(InputError):  # the reader tells
         states = {name: (path, _state(path)) for name, path in input_files(config).items()}
-    problems += _inputs_in_out(config)
-    notices: list[str] = []
-    assumed: list[str] = []
-    photo = attempt(
-        lambda: read_photo(
-            photo_path,
-            max_pixels=config.limits.pixels,
-            alpha="ignore" if config.inputs.alpha == "ignore" else "refuse",
-            layer=config.inputs.layer,
-            strict=config.inputs.strict,
-        )
-    )
-    occluder = attempt(lambda: _read_mask(config.inputs.occluder_mask, photo, config, notices))
-    shaded = attempt(lambda: _read_mask(config.camera.shadow_mask, photo, config, notices))
-    asset = attempt(lambda: read_asset(asset_path, config, loaders, assumed))
-    reuse = config.light.reuse
-    run = attempt(lambda: loaders.run(reuse, config.limits)) if reuse is not None else None
-    view = attempt(lambda: photo_camera(config, photo, assumed)) if photo is not None else None
+    log, limits = Log(), config.limits
+    photo = attempt(lambda: _read_photo(config))
+    occluder = attempt(lambda: _read_mask(config.inputs.occluder_mask, photo, config, log))
+    shaded = attempt(lambda: _read_mask(config.camera.shadow_mask, photo, config, log))
+    asset = attempt(lambda: read_asset(config, loaders, log))
+    run = view = points = proxy = None
+    if (reuse := config.light.reuse) is not None:
+        run = attempt(lambda: loaders.run(reuse, limits))
+    if photo is not None:
+        view = attempt(lambda: photo_camera(config, photo, log))
     # Without a camera the run ends below, but all that is wrong with the light is told too.
     pose = view.camera.c2w if view is not None else np.eye(4)
-    light = attempt(lambda: _read_light(config, pose, notices))
-    points_path, proxy_path = config.camera.ground_points, config.camera.proxy
-    limits = config.limits
-    points = proxy = None
-    if points_path is not None:
+    light = attempt(lambda: _read_light(config, pose, log))
+    if (points_path := config.camera.ground_points) is not None:
         points = attempt(lambda: read_point_cloud(points_path, limits))
-    if proxy_path is not None:
+    if (proxy_path := config.camera.proxy) is not None:
         proxy = attempt(lambda: loaders.proxy(proxy_path, limits))
     attempt(lambda: require_model(config))
     raise_all(problems)
     assert photo is not None and asset is not None and view is not None
     hashes = {name: file_hash(path) for name, (path, _) in states.items()}
     raise_all([_changed(path) for path, before in states.values() if _state(path) != before])
-    for name, mesh_read in (("asset", asset), ("proxy", proxy)):
-        for file, digest in mesh_read.hashes.items() if mesh_read is not None else ():
-            hashes[f"{name}/{file}" if file else name] = digest
-            folder = Path(config.flat()[name]).parent.resolve()
-            problems += _within_out(config, folder / file) if file else []
-    raise_all(problems)
+    hashes |= _hashes_beside(config, asset, proxy)
     if run is not None:
         hashes["reuse"] = run.digest
+    return _Files(photo, view, asset, occluder, shaded, light, run, points, proxy, hashes, log)
 
-    measured: dict[str, Any] = {}
-    straight = photo
-    if not view.lens.is_straight:
-        straight, border = undistort_photo(photo, view.camera, view.lens)
-        measured["undistorted"] = {**view.lens.record(), "border_share": border}
-        masks = [mask for mask in (occluder, shaded) if mask is not None]
-        bent = iter(undistorted(masks, view.camera, view.lens)[0])
-        occluder = None if occluder is None else next(bent)
-        shaded = None if shaded is None else next(bent)
-    elif config.camera.undistort:
-        notices.append("--undistort: the camera has no distortion, nothing was undone")
-    world = make_world(config, view, points)
-    camera = world.camera
-    mesh = None if proxy is None else mesh_of(proxy)
-    placement = _place(config, asset, world, mesh)
-    notices = [
-        *_about(photo_path, straight.notices),
-        *_about(asset_path, asset.notices),
-        *(_about(config.camera.proxy, proxy.notices) if config.camera.proxy and proxy else ()),
-        *notices,
-        *camera.notices,
-        *world.notices,
-        *placement.warnings,
-    ]
-    if config.render.width is not None and config.render.width < camera.width:
-        notices.append(
-            f"a preview: object and shadow are rendered {config.render.width} px wide and enlarged "
-            f"to the photo's {camera.width} px (--width)"
-        )
-    assumed += [*camera.assumed, *world.assumed, *placement.assumed]
-    measured |= world.measured
-    if mesh is not None:
-        notices += _about_mesh(mesh, asset, placement, camera)
-        if not np.allclose(camera.c2w, view.camera.c2w):
-            notices.append("--proxy counts after that turn, in the world of camera.json")
-    shade = None
-    if shaded is not None:
-        shade = shadow_mask(shaded, *asset.bounds(), placement.asset_to_world, camera)
-        assumed.append(
+
+def _hashes_beside(config: InsertConfig, asset: Asset, proxy: Asset | None) -> dict[str, str]:
+    """Return the sha256 of the meshes' files by their names; see `Inputs.hashes`.
+
+    Raises:
+        InputError: One that a mesh brings along is in --out.
+    """
+    hashes: dict[str, str] = {}
+    problems: list[InputError] = []
+    meshes = (("asset", config.inputs.asset, asset), ("proxy", config.camera.proxy, proxy))
+    for name, path, mesh in meshes:
+        for file, digest in mesh.hashes.items() if mesh is not None and path is not None else ():
+            hashes[f"{name}/{file}" if file else name] = digest
+            problems += _within_out(config, Path(path).parent.resolve() / file) if file else []
+    raise_all(problems)
+    return hashes
+
+
+@dataclass(frozen=True)
+class _Straight:
+    """Photo and masks without the lens' distortion."""
+
+    photo: Photo
+    occluder: FloatArray | None
+    shaded: FloatArray | None
+    measured: dict[str, Any]
+    """What ``run.json`` says of it."""
+
+
+def _straightened(files: _Files) -> _Straight:
+    view = files.view
+    if view.lens.is_straight:
+        return _Straight(files.photo, files.occluder, files.shaded, {})
+    photo, border = undistort_photo(files.photo, view.camera, view.lens)
+    masks = [mask for mask in (files.occluder, files.shaded) if mask is not None]
+    bent = iter(undistorted(masks, view.camera, view.lens)[0])
+    return _Straight(
+        photo,
+        None if files.occluder is None else next(bent),
+        None if files.shaded is None else next(bent),
+        {"undistorted": {**view.lens.record(), "border_share": border}},
+    )
+
+
+def _assumptions(
+    config: InsertConfig,
+    files: _Files,
+    world: PhotoWorld,
+    placement: Placement,
+    shade: ShadowMask | None,
+) -> Iterator[str]:
+    """Yield what was chosen because nothing was given."""
+    yield from files.log.assumed
+    yield from world.camera.assumed
+    yield from world.assumed
+    yield from placement.assumed
+    if shade is not None:
+        yield (
             f"{100.0 * shade.at_object:.0f} % of the lamps' light is kept from the object, the "
             "mean of --shadow-mask under its footprint"
         )
-    if run is not None and (assumption := run.assumption(camera.c2w, config.camera.file)):
-        assumed.append(assumption)
+    if files.run is not None:
+        assumption = files.run.assumption(world.camera.c2w, config.camera.file)
+        if assumption:
+            yield assumption
+
+
+def _notices(
+    config: InsertConfig,
+    files: _Files,
+    straight: _Straight,
+    world: PhotoWorld,
+    placement: Placement,
+    mesh: ReceiverMesh | None,
+) -> Iterator[str]:
+    """Yield what was repaired, converted, left out or looks odd."""
+    assert config.inputs.photo is not None and config.inputs.asset is not None
+    camera, run = world.camera, files.run
+    yield from _about(config.inputs.photo, straight.photo.notices)
+    yield from _about(config.inputs.asset, files.asset.notices)
+    if config.camera.proxy and files.proxy:
+        yield from _about(config.camera.proxy, files.proxy.notices)
+    yield from files.log.notices
+    if config.camera.undistort and files.view.lens.is_straight:
+        yield "--undistort: the camera has no distortion, nothing was undone"
+    yield from camera.notices
+    yield from world.notices
+    yield from placement.warnings
+    if config.render.width is not None and config.render.width < camera.width:
+        yield (
+            f"a preview: object and shadow are rendered {config.render.width} px wide and enlarged "
+            f"to the photo's {camera.width} px (--width)"
+        )
+    if mesh is not None:
+        yield from _about_mesh(mesh, files.asset, placement, camera)
+        if not np.allclose(camera.c2w, files.view.camera.c2w):
+            yield "--proxy counts after that turn, in the world of camera.json"
     if run is not None and run.materials is not None and config.inputs.materials is None:
-        notices.append(
+        yield (
             f"{run.path} had changed its object's materials, this run has not (--materials "
             f"{run.materials} does the same to that object)"
         )
-    if occluder is not None and config.is_guided:
-        notices.append("guidance does not see --occluder-mask; the pictures it leads to do")
-    return Inputs(
-        straight,
-        asset,
-        camera,
-        placement,
-        light,
-        run,
-        proxy=mesh,
-        is_plane=config.camera.plane,
-        shadow_mask=shade,
-        assumed=tuple(assumed),
-        notices=tuple(notices),
-        occluder=occluder,
-        measured=measured,
-        hashes=hashes,
-    )
+    if files.occluder is not None and config.is_guided:
+        yield "guidance does not see --occluder-mask; the pictures it leads to do"
 
 
 _State = tuple[int, int, int]
@@ -242,27 +306,12 @@ def _changed(path: Path) -> InputError:
 
 def _inputs_in_out(config: InsertConfig) -> list[InputError]:
     """Refuse an --out that holds an input: --overwrite could replace it."""
+    inputs, camera, light = config.inputs, config.camera, config.light
     named = (
-        *(
-            config.inputs.photo,
-            config.inputs.asset,
-            config.inputs.materials,
-            config.camera.file,
-            config.light.file,
-        ),
-        *(
-            config.inputs.occluder_mask,
-            config.camera.shadow_mask,
-            config.camera.proxy,
-            config.light.reuse,
-            config.diffusion.model,
-        ),
-        *(
-            config.adapter.lora,
-            config.guidance.prior,
-            config.light.regressor,
-            config.camera.ground_points,
-        ),
+        *(inputs.photo, inputs.asset, inputs.materials, camera.file, light.file),
+        *(inputs.occluder_mask, camera.shadow_mask, camera.proxy, light.reuse),
+        *(config.diffusion.model, config.adapter.lora, config.guidance.prior),
+        *(light.regressor, camera.ground_points),
     )
     return _within_out(config, *(path for path in named if path is not None))
 
@@ -292,70 +341,45 @@ def _places(path: str | Path) -> list[Path]:
         return []
 
 
-def read_asset(path: str, config: InsertConfig, loaders: Loaders, assumed: list[str]) -> Asset:
+def _read_photo(config: InsertConfig) -> Photo:
+    assert config.inputs.photo is not None
+    return read_photo(
+        config.inputs.photo,
+        max_pixels=config.limits.pixels,
+        alpha="ignore" if config.inputs.alpha == "ignore" else "refuse",
+        layer=config.inputs.layer,
+        strict=config.inputs.strict,
+    )
+
+
+def read_asset(config: InsertConfig, loaders: Loaders, log: Log) -> Asset:
     """Read --asset as its flags say: which way is up, and its materials.
 
     Args:
-        path: The file.
         config: The flags.
         loaders: Of earlier insertions.
-        assumed: What was chosen because nothing was given is appended here.
+        log: What was chosen because nothing was given is added here.
 
     Raises:
         InputError: The asset or its materials cannot be used.
     """
-    asset = loaders.asset(path, config.inputs.missing_textures, config.limits)
-    if config.inputs.asset_up is not None:
-        turned = f"turned: its {config.inputs.asset_up} axis points up (--asset-up)"
-        asset = asset.turned(up_to_y(config.inputs.asset_up))
+    inputs = config.inputs
+    assert inputs.asset is not None
+    asset = loaders.asset(inputs.asset, inputs.missing_textures, config.limits)
+    if inputs.asset_up is not None:
+        turned = f"turned: its {inputs.asset_up} axis points up (--asset-up)"
+        asset = asset.turned(up_to_y(inputs.asset_up))
         asset = replace(asset, notices=(*asset.notices, turned))
-    elif Path(path).suffix.lower() not in STATED_UP:
-        assumed.append("the asset's +y axis points up (--asset-up)")
-    if config.inputs.materials is not None:
-        asset = with_materials(asset, config.inputs.materials, config.limits)
+    elif Path(inputs.asset).suffix.lower() not in STATED_UP:
+        log.assume("the asset's +y axis points up (--asset-up)")
+    if inputs.materials is not None:
+        asset = with_materials(asset, inputs.materials, config.limits)
     for name in config.task.refine_materials or ():
         if not asset.materials_named([name]):
             found = ", ".join(dict.fromkeys(ascii(m.name) for m in asset.materials))
-            what = f"no material {name[:60]!a} in {path} (found {found[:400]})"
+            what = f"no material {name[:60]!a} in {inputs.asset} (found {found[:400]})"
             raise usage("--refine-materials", what, "name some of these, or leave it out for all")
     return asset
-
-
-def _place(
-    config: InsertConfig, asset: Asset, world: PhotoWorld, mesh: ReceiverMesh | None
-) -> Placement:
-    """Set the asset on the ground: where it was asked for, or where the points leave space."""
-    low, high = asset.bounds()
-
-    def put(place: tuple[float, float, float] | None) -> Placement:
-        return place_asset(
-            low,
-            high,
-            world.camera,
-            world.ground,
-            place=place,
-            at=config.placement.at if place is None else None,
-            rotate_y=config.placement.rotate_y,
-            scale=config.placement.scale,
-            size=config.placement.size,
-            mesh=mesh,
-            is_plane=config.camera.plane,
-        )
-
-    if world.cloud is None:
-        return put(world.place)
-    if world.place is None and config.placement.at is None:
-        plane = upright_plane(world.ground, world.camera.c2w[:3, 3])
-        place = find_place(put, low, high, world.camera, plane, world.cloud)
-        placement = put(place)
-        shown = ",".join(f"{x:.3g}" for x in place)
-        line = f"the object stands at {shown}, where no points are in its way (--at, --place)"
-        return replace(placement, assumed=(*placement.assumed, line))
-    placement = put(world.place)
-    if count := len(points_in_way(placement.asset_to_world, low, high, world.cloud)):
-        warning = f"{count} points of --ground-points stand where the object does; is it free?"
-        placement = replace(placement, warnings=(*placement.warnings, warning))
-    return placement
 
 
 def _read_proxy(path: str, limits: Limits) -> Asset:
@@ -380,91 +404,40 @@ def _about_mesh(
         yield "the mesh of --proxy hides the object's middle from the camera"
 
 
-def photo_camera(config: InsertConfig, photo: Photo, assumed: list[str]) -> PhotoCamera:
-    """Return the camera of --camera, else of the numbers given, the photo's EXIF and what is usual.
-
-    Args:
-        config: The flags.
-        photo: The upright photo.
-        assumed: What was chosen because nothing was given is appended here.
-
-    Raises:
-        InputError: The camera file cannot be used, or does not fit the photo.
-    """
-    height, width = photo.codes.shape[:2]
-    if config.camera.file is not None:
-        assert config.inputs.photo is not None
-        return read_photo_camera(
-            config.camera.file,
-            (width, height),
-            config.camera.up,
-            frame=config.camera.frame,
-            photo_name=Path(config.inputs.photo).name,
-            undistort=config.camera.undistort,
-            limits=config.limits,
-        )
-    return PhotoCamera(_camera_from_numbers(config, photo, assumed))
-
-
-def _camera_from_numbers(config: InsertConfig, photo: Photo, assumed: list[str]) -> Camera:
-    height, width = photo.codes.shape[:2]
-    camera_height, pitch = config.camera.height, config.camera.pitch
-    if camera_height is None:
-        camera_height = DEFAULT_CAMERA_HEIGHT
-        assumed.append(f"the camera is {camera_height} m above the ground (--camera-height)")
-    if pitch is None:
-        pitch = 0.0
-        if config.camera.horizon is None:
-            assumed.append("the camera is level (--pitch, --horizon)")
-    pose = (pitch, camera_height, config.camera.horizon)
-    if config.camera.fov is None and photo.focal_35mm is not None:
-        return camera_from_exif(photo.focal_35mm, width, height, *pose)
-    if config.camera.fov is None:
-        assumed.append(f"the horizontal field of view is {DEFAULT_FOV:g} degrees (--fov)")
-    return camera_from_fov(width, height, config.camera.fov or DEFAULT_FOV, *pose)
-
-
 def _read_mask(
-    path: str | None, photo: Photo | None, config: InsertConfig, notices: list[str]
+    path: str | None, photo: Photo | None, config: InsertConfig, log: Log
 ) -> FloatArray | None:
     if path is None or photo is None:
         return None
     height, width = photo.codes.shape[:2]
     found: list[str] = []
     mask = read_mask(path, (width, height), max_pixels=config.limits.pixels, notices=found)
-    notices += _about(path, found)
+    log.notice(*_about(path, found))
     return mask
 
 
-def _read_light(
-    config: InsertConfig, camera_to_world: Float64Array, notices: list[str]
-) -> Light | None:
-    if config.light.file is None:
+def _read_light(config: InsertConfig, camera_to_world: Float64Array, log: Log) -> Light | None:
+    asked = config.light
+    if asked.file is None:
         return None
-    if Path(config.light.file).suffix.lower() == ".json":
-        if config.light.fit_lobes is not None:
-            raise usage(
-                "--fit-lobes", f"needs a panorama to fit (found lobes: {config.light.file})"
-            )
-        if config.light.convention != "openexr":
-            raise usage(
-                "--light-convention", f"is for panoramas (found lobes: {config.light.file})"
-            )
-        return Light(lobes=read_lobes(config.light.file, config.limits)).rotated(
-            config.light.rotate
-        )
+    if Path(asked.file).suffix.lower() == ".json":
+        if asked.fit_lobes is not None:
+            raise usage("--fit-lobes", f"needs a panorama to fit (found lobes: {asked.file})")
+        if asked.convention != "openexr":
+            raise usage("--light-convention", f"is for panoramas (found lobes: {asked.file})")
+        return Light(lobes=read_lobes(asked.file, config.limits)).rotated(asked.rotate)
     found: list[str] = []
     texels = read_envmap(
-        config.light.file,
-        convention=config.light.convention,
+        asked.file,
+        convention=asked.convention,
         camera_to_world=camera_to_world,
         pictures=True,
         strict=config.inputs.strict,
         max_width=config.limits.envmap_width,
         notices=found,
     )
-    notices += _about(config.light.file, found)
-    return Light(texels=texels).rotated(config.light.rotate)
+    log.notice(*_about(asked.file, found))
+    return Light(texels=texels).rotated(asked.rotate)
 
 
 def _about(path: str, notices: tuple[str, ...] | list[str]) -> list[str]:

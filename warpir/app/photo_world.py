@@ -1,6 +1,7 @@
-"""Brings camera, ground and points into one world whose up is known."""
+"""Brings camera, ground, points and object into one world whose up is known."""
 
 from dataclasses import dataclass, field, replace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -8,11 +9,21 @@ import numpy as np
 from warpir.app.config import InsertConfig
 from warpir.core.arrays import Float64Array
 from warpir.core.errors import InputError
+from warpir.core.progress import Log
+from warpir.io.cameras.reader import read_photo_camera
 from warpir.io.cameras.source import PhotoCamera, turned
-from warpir.scene.camera import Camera
-from warpir.scene.free_space import Cloud
+from warpir.io.images.photos import Photo
+from warpir.scene.asset import Asset
+from warpir.scene.camera import Camera, camera_from_exif, camera_from_fov
+from warpir.scene.free_space import Cloud, find_place, points_in_way
 from warpir.scene.ground import fit_ground
-from warpir.scene.placement import upright_plane, y_to
+from warpir.scene.placement import Placement, place_asset, upright_plane, y_to
+from warpir.scene.receiver import ReceiverMesh
+
+DEFAULT_FOV = 60.0
+"""Horizontal field of view without --camera, --fov and EXIF [deg]: a phone's main camera."""
+DEFAULT_CAMERA_HEIGHT = 1.6
+"""Height of a photographer's eyes [m]."""
 
 
 @dataclass(frozen=True)
@@ -33,6 +44,50 @@ class PhotoWorld:
     """What was turned, one line each."""
     measured: dict[str, Any] = field(default_factory=dict)
     """What ``run.json`` says of the fit."""
+
+
+def photo_camera(config: InsertConfig, photo: Photo, log: Log) -> PhotoCamera:
+    """Return the camera of --camera, else of the numbers given, the photo's EXIF and what is usual.
+
+    Args:
+        config: The flags.
+        photo: The upright photo.
+        log: What was chosen because nothing was given is added here.
+
+    Raises:
+        InputError: The camera file cannot be used, or does not fit the photo.
+    """
+    height, width = photo.codes.shape[:2]
+    if config.camera.file is not None:
+        assert config.inputs.photo is not None
+        return read_photo_camera(
+            config.camera.file,
+            (width, height),
+            config.camera.up,
+            frame=config.camera.frame,
+            photo_name=Path(config.inputs.photo).name,
+            undistort=config.camera.undistort,
+            limits=config.limits,
+        )
+    return PhotoCamera(_camera_from_numbers(config, photo, log))
+
+
+def _camera_from_numbers(config: InsertConfig, photo: Photo, log: Log) -> Camera:
+    height, width = photo.codes.shape[:2]
+    camera_height, pitch = config.camera.height, config.camera.pitch
+    if camera_height is None:
+        camera_height = DEFAULT_CAMERA_HEIGHT
+        log.assume(f"the camera is {camera_height} m above the ground (--camera-height)")
+    if pitch is None:
+        pitch = 0.0
+        if config.camera.horizon is None:
+            log.assume("the camera is level (--pitch, --horizon)")
+    pose = (pitch, camera_height, config.camera.horizon)
+    if config.camera.fov is None and photo.focal_35mm is not None:
+        return camera_from_exif(photo.focal_35mm, width, height, *pose)
+    if config.camera.fov is None:
+        log.assume(f"the horizontal field of view is {DEFAULT_FOV:g} degrees (--fov)")
+    return camera_from_fov(width, height, config.camera.fov or DEFAULT_FOV, *pose)
 
 
 def make_world(config: InsertConfig, view: PhotoCamera, points: Float64Array | None) -> PhotoWorld:
@@ -77,6 +132,53 @@ def make_world(config: InsertConfig, view: PhotoCamera, points: Float64Array | N
     cloud = Cloud(points, points @ np.array(ground[:3]) + ground[3], fit.rms)
     measured = {"ground_fit": {**fit.record(), "plane": list(ground)}}
     return PhotoWorld(camera, ground, place, cloud, (fit.about,), tuple(notices), measured)
+
+
+def stand_on_ground(
+    config: InsertConfig, asset: Asset, world: PhotoWorld, mesh: ReceiverMesh | None
+) -> Placement:
+    """Set the asset on the ground: where it was asked for, or where the points leave space.
+
+    Args:
+        config: Place, turn and size.
+        asset: The object.
+        world: Camera, ground and points.
+        mesh: What --proxy holds.
+
+    Raises:
+        InputError: There is no such place, or no free one.
+    """
+    low, high = asset.bounds()
+
+    def put(place: tuple[float, float, float] | None) -> Placement:
+        return place_asset(
+            low,
+            high,
+            world.camera,
+            world.ground,
+            place=place,
+            at=config.placement.at if place is None else None,
+            rotate_y=config.placement.rotate_y,
+            scale=config.placement.scale,
+            size=config.placement.size,
+            mesh=mesh,
+            is_plane=config.camera.plane,
+        )
+
+    if world.cloud is None:
+        return put(world.place)
+    if world.place is None and config.placement.at is None:
+        plane = upright_plane(world.ground, world.camera.c2w[:3, 3])
+        place = find_place(put, low, high, world.camera, plane, world.cloud)
+        placement = put(place)
+        shown = ",".join(f"{x:.3g}" for x in place)
+        line = f"the object stands at {shown}, where no points are in its way (--at, --place)"
+        return replace(placement, assumed=(*placement.assumed, line))
+    placement = put(world.place)
+    if count := len(points_in_way(placement.asset_to_world, low, high, world.cloud)):
+        warning = f"{count} points of --ground-points stand where the object does; is it free?"
+        placement = replace(placement, warnings=(*placement.warnings, warning))
+    return placement
 
 
 def _four(plane: Float64Array) -> tuple[float, float, float, float]:

@@ -16,6 +16,7 @@ from warpir.core.errors import DISK_FULL, LISTED, ExitCode, InputError, disk_err
 from warpir.core.memory import MIB, free_host, is_shortage
 from warpir.diffusion.models.model_error import ModelError
 
+_LOG = logging.getLogger(__name__)
 INTERRUPTED = 130
 """Of a Ctrl-C where nobody handles signals: 128 and the number of SIGINT."""
 LONGEST = 10_000
@@ -55,6 +56,26 @@ def _open_closed_streams() -> None:
     # Python has no stream where the descriptor was closed at its start.
     sys.stdout = sys.stdout or open(1, "w", closefd=False)
     sys.stderr = sys.stderr or open(2, "w", closefd=False)
+
+
+def attempt(page: str, make: Callable[[], None]) -> list[str]:
+    """Make a page about results; where that fails return, having printed it, a notice.
+
+    Raises:
+        InputError: There is no room for it (exit 5).
+    """
+    try:
+        make()
+    # Whatever it is: all results are there, and a page about them must not cost them.
+    except Exception as error:
+        if isinstance(error, InputError) and error.code == ExitCode.RESOURCES:
+            raise
+        _LOG.debug(page, exc_info=True)
+        why = str(error) if isinstance(error, InputError) else f"{type(error).__name__}: {error}"
+        line = f"{page} could not be made ({why})"
+        say(f"notice: {line}")
+        return [line]
+    return []
 
 
 def require_packages(*names: str) -> None:

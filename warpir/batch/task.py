@@ -16,14 +16,14 @@ from pathlib import Path
 from typing import Any
 
 from warpir.app.config import InsertConfig
-from warpir.app.disk_space import needed_bytes, require_space
 from warpir.app.finished import OtherRun, config_of_record, is_done
 from warpir.app.inputs import Inputs, Loaders, read_inputs
 from warpir.app.program import explain, say, stay_offline
+from warpir.app.run import memory_needs, needed_bytes, require_space
 from warpir.core import signals
 from warpir.core.errors import ExitCode, InputError, disk_error
 from warpir.core.memory import lacked_memory, release
-from warpir.insert import insert, needs_of
+from warpir.insert import insert
 from warpir.io.results import OutputFolder
 from warpir.lighting.scene_light import make_light
 from warpir.sequence.frames import Frame, is_whole, read_sequence
@@ -142,7 +142,7 @@ def _filled(config: InsertConfig) -> InsertConfig:
 
 def _memory(config: InsertConfig, inputs: Inputs) -> int:
     """Return the least memory that a scene takes of the host beside the program [byte]."""
-    of_photo, of_scene = needs_of(inputs)
+    of_photo, of_scene = memory_needs(inputs)
     total = of_photo.bytes + sum(need.bytes for need in of_scene)
     if config.guided_by == "stable-diffusion" and config.diffusion.model is not None:
         total += sum(f.stat().st_size for f in Path(config.diffusion.model).rglob("*.safetensors"))

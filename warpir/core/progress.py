@@ -1,4 +1,4 @@
-"""What a waiting person sees: stages, steps, the time that is left."""
+"""What a waiting person sees: what was assumed, notices, stages, steps, the time that is left."""
 
 from __future__ import annotations
 
@@ -6,11 +6,36 @@ import sys
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from dataclasses import dataclass, field
 from types import TracebackType
 from typing import Any, Self
 
 LINE_SECONDS = 10.0
 """Least time between two lines where there is no terminal [s]."""
+
+
+@dataclass
+class Log:
+    """Lines for a person, by kind; each is printed when it is added, and kept for ``run.json``."""
+
+    say: Callable[[str], None] = lambda _: None
+    """Prints a line."""
+    assumed: list[str] = field(default_factory=list)
+    """What was chosen because nothing was given."""
+    notices: list[str] = field(default_factory=list)
+    """What was repaired, converted, left out or looks odd."""
+
+    def assume(self, *lines: str) -> None:
+        """Add what was assumed."""
+        for line in lines:
+            self.assumed.append(line)
+            self.say(f"assumed: {line}")
+
+    def notice(self, *lines: str) -> None:
+        """Add notices."""
+        for line in lines:
+            self.notices.append(line)
+            self.say(f"notice: {line}")
 
 
 @contextmanager

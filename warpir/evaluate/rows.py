@@ -18,12 +18,11 @@ import torch
 from warpir.app.config import InsertConfig, usage
 from warpir.app.inputs import Inputs
 from warpir.app.model_files import require_model
-from warpir.app.record import Timings
+from warpir.app.run import Run
 from warpir.core.arrays import CodeArray, Float64Array, FloatArray
 from warpir.core.color import luminance
 from warpir.core.errors import InputError
 from warpir.core.latlong import rotate_map
-from warpir.core.progress import StepProgress
 from warpir.diffusion.models.embedded import build_network, save_embedded
 from warpir.evaluate.scenes import Place, Subject, mirrored
 from warpir.evaluate.stage import Prediction, Stage
@@ -34,7 +33,7 @@ from warpir.lighting.fit import fit_lobes
 from warpir.lighting.regression import mean_training_light, regress
 from warpir.lighting.regressor import Regressor, random_regressor
 from warpir.lighting.scene_light import make_light
-from warpir.optimize.recover import Run, recover
+from warpir.optimize.recover import recover
 from warpir.scene.light import Light, Lobes
 from warpir.scene.placement import Placement
 
@@ -352,19 +351,16 @@ def recover_light(
             **changes,
         )
         inputs = Inputs(picture, subject.asset, place.camera, subject.placement)
-        timings = Timings()
         started = time.perf_counter()
-        with (
-            StepProgress(lambda _: None) as progress,
-            OutputFolder(out) as output,
-        ):
-            run = Run(config, inputs, bench.device, output, timings, lambda _: None, progress)
-            light, record, _ = recover(run, make_light(inputs, config))
+        with OutputFolder(out) as output:
+            run = Run(config, inputs, output, device=bench.device)
+            outcome = recover(run, make_light(inputs, config))
+    light = outcome.light
     return Prediction(
         light.light,
         light.light_shadow,
         light.curves,
-        about={"seconds": round(time.perf_counter() - started, 2), "record": record},
+        about={"seconds": round(time.perf_counter() - started, 2), "record": outcome.record},
     )
 
 

@@ -56,6 +56,11 @@ class SceneLight:
     the place that another photo could use."""
 
     @property
+    def has_lamps(self) -> bool:
+        """Whether a part of it is as narrow as a lamp's light."""
+        return any(len(lamp_axes(light)) > 0 for light in (self.light, self.light_shadow))
+
+    @property
     def on_object(self) -> Light:
         """What the object is rendered under."""
         return self.light if self.detailed is None else self.detailed

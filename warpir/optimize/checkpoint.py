@@ -22,10 +22,10 @@ from typing import TYPE_CHECKING, Any
 from safetensors import SafetensorError
 
 from warpir.core.atomic import remove_folder, write_folder
-from warpir.core.errors import InputError, disk_error
-from warpir.core.signals import whole
+from warpir.core.errors import ExitCode, InputError, disk_error
+from warpir.core.signals import is_pending, whole
 from warpir.core.strict_json import read_json_object
-from warpir.io.results import remove_unfinished
+from warpir.io.results import OutputFolder, remove_unfinished
 
 if TYPE_CHECKING:
     from torch import Tensor
@@ -238,3 +238,47 @@ def _differences(then: Any, now: Any, place: str = "") -> Iterator[str]:
 def _shown(value: Any) -> str:
     text = json.dumps(value)
     return text if len(text) <= 80 else text[:77] + "..."  # a sha256 is shown whole
+
+
+def is_due(step: int, every: int) -> bool:
+    """Return whether a checkpoint is due: every so many steps, and when the run is to stop."""
+    return bool(every) and (step % every == 0 or is_pending())
+
+
+def output_folder(out: str, *, resume: bool, overwrite: bool, is_guided: bool) -> OutputFolder:
+    """Return the folder that is to be written, not yet entered.
+
+    Args:
+        out: Its name.
+        resume: Whether an unfinished run in it is to go on.
+        overwrite: Whether results in it are to be replaced.
+        is_guided: Whether the run is one that leaves checkpoints.
+
+    Raises:
+        InputError: The run in it is finished, or is an unfinished one that nobody said what to do
+            with (`ExitCode.OUTPUT`).
+    """
+    newest = Checkpoints(Path(out), {}).newest
+    if resume and newest is None and os.path.exists(Path(out, "run.json")):
+        raise InputError(
+            "--resume",
+            f"the run in {out} is finished",
+            "to run it again, give --overwrite in place of --resume",
+            ExitCode.OUTPUT,
+        )
+    if newest is not None and not (resume or overwrite):
+        raise InputError(
+            out,
+            f"holds an unfinished run ({newest})",
+            "--resume goes on with it, --overwrite starts it again",
+            ExitCode.OUTPUT,
+        )
+    if resume and newest is not None and not is_guided:
+        raise InputError(
+            "--resume",
+            f"the unfinished run in {out} was guided, this one is not",
+            "give its flags, or --overwrite in place of --resume",
+            ExitCode.OUTPUT,
+        )
+    # A run to resume was allowed to replace what is there, or has made it: no other run gets in.
+    return OutputFolder(out, overwrite=overwrite or (resume and newest is not None))

@@ -16,30 +16,22 @@ import torch
 from torch import Tensor
 
 from warpir.app.config import REFINE_PARTS, InsertConfig
+from warpir.app.run import Run
 from warpir.app.settings import OptimizeSettings
 from warpir.core.memory import release
 from warpir.io.meshes.materials_file import MATERIALS, materials_to_json
 from warpir.lighting.regularizers import bend
 from warpir.lighting.scene_light import SceneLight
+from warpir.optimize.course import (
+    Outcome,
+    follow,
+    knots_of,
+    make_frame,
+    open_checkpoints,
+)
 from warpir.optimize.lit_frame import LitFrame
 from warpir.optimize.loop import Guide, Optimization
-from warpir.optimize.recover import (
-    Run,
-    as_input_errors,
-    convergence,
-    counts_of,
-    knots_of,
-    loop_notices,
-    make_frame,
-    make_guide,
-    open_checkpoints,
-    optimize,
-    prepare_guidance,
-    settled,
-    summary_of,
-    who_spoke,
-    write_lora,
-)
+from warpir.optimize.model import as_input_errors, make_guide, prepare_guidance
 from warpir.render.bridge import ShadeForeground
 from warpir.render.integrator import MaterialTensors
 from warpir.render.mis import MisIntegrator
@@ -329,9 +321,7 @@ def _words(part: str, value: float | tuple[float, ...]) -> str:
 # ---------------------------------------------------------------------------------- the run
 
 
-def refine(
-    run: Run, light: SceneLight
-) -> tuple[SceneLight, Asset, dict[str, Any], tuple[str, ...]]:
+def refine(run: Run, light: SceneLight) -> Outcome:
     """Change by the prompt what ``--refine`` names.
 
     Args:
@@ -339,13 +329,13 @@ def refine(
         light: The known light, and the tone curves to start from.
 
     Returns:
-        Light with its curves, the asset with its materials, what run.json says, and notices.
+        Light with its curves, and the asset with its materials.
 
     Raises:
         InputError: As `warpir.optimize.recover.recover`.
     """
-    run = settled(run)
-    config, asset = run.config, run.inputs.asset
+    run = replace(run, config=run.config.settled(on_cuda=run.device != "cpu"))
+    asset = run.inputs.asset
     with as_input_errors():
         checkpoints = open_checkpoints(run)
         with run.timings.stage("scene"):
@@ -355,42 +345,36 @@ def refine(
         with run.timings.stage("trace"):
             release()
             guide = make_guide(run, guided, frame)
-            lit = LitFrame(frame, light, run.torch_device)
-        loop: MaterialRefinement | ToneRefinement
-        if config.task.refine == "tone":
-            loop = ToneRefinement(
-                lit, guide, config.optimize, ToneUnknowns(light.curves).to(run.torch_device)
-            )
-        else:
-            chosen = asset.materials_named(config.task.refine_materials)
-            unknowns = Factors(asset, chosen, free_parts(config)).to(run.torch_device)
-            loop = MaterialRefinement(lit, light.curves, guide, config.optimize, unknowns)
-        record = what_moves(config, asset)
-        run.say(f"free: {', '.join(record['free'])}; frozen: {', '.join(record['frozen'])}")
-        with run.timings.stage("optimize"), torch.no_grad():
-            first = loop.guide.score(loop.final_image(config.render.seed))
-        optimize(run, loop, guided, frame.renderer, checkpoints, resumed)
+            lit = LitFrame(frame, light, torch.device(run.device))
+        loop = _loop_of(run, lit, light.curves, guide)
+        moves = what_moves(run.config, asset)
+        run.log.say(f"free: {', '.join(moves['free'])}; frozen: {', '.join(moves['frozen'])}")
+        course = follow(run, loop, guided, guide, frame.renderer, checkpoints, resumed)
         with run.timings.stage("write"):
-            write_lora(run, guided)
-    notices = (*guided.prior.notices, *guided.notices, *loop_notices(loop, frame.renderer))
+            course.write()
+    notices = tuple(course.notices())
     if isinstance(loop, ToneRefinement):
-        curves = (knots_of(c) for c in (loop.unknowns.curve_fg, loop.unknowns.curve_shadow))
-        light = replace(light, curves=Curves(light.curves.tone, *curves))
+        fitted = (knots_of(c) for c in (loop.unknowns.curve_fg, loop.unknowns.curve_shadow))
+        light = replace(light, curves=Curves(light.curves.tone, *fitted))
     else:
         refined = loop.unknowns.materials()
         run.output.write_json(MATERIALS, materials_to_json(asset.materials, refined))
         asset = replace(asset, materials=refined)
-        if config.task.refine == "emission":
+        if run.config.task.refine == "emission":
             notices = (*notices, GROUND_IS_DARK)
-    run.output.write_json("optimization.json", convergence(loop, first))
-    record = {
-        **guided.record,
-        **who_spoke(run, guided),
-        "loop_integrator": "mis",
-        "refine": record,
-        "optimization": summary_of(loop, first) | counts_of(guide, frame),
-    }
-    return light, asset, record, notices
+    return Outcome(light, asset, {**course.record("mis"), "refine": moves}, notices)
+
+
+def _loop_of(
+    run: Run, lit: LitFrame, curves: Curves, guide: Guide
+) -> MaterialRefinement | ToneRefinement:
+    """Return the loop over what ``--refine`` names, at its start."""
+    task, settings, asset = run.config.task, run.config.optimize, run.inputs.asset
+    if task.refine == "tone":
+        return ToneRefinement(lit, guide, settings, ToneUnknowns(curves).to(run.device))
+    chosen = asset.materials_named(task.refine_materials)
+    unknowns = Factors(asset, chosen, free_parts(run.config)).to(run.device)
+    return MaterialRefinement(lit, curves, guide, settings, unknowns)
 
 
 def free_parts(config: InsertConfig) -> list[str]:

@@ -35,7 +35,7 @@ from warpir.diffusion.personalization.lora_training import LoraTraining
 from warpir.diffusion.personalization.personalize import personalize
 from warpir.diffusion.prior import Condition, NonFiniteError
 from warpir.diffusion.prompts import Prompts, make_prompts
-from warpir.optimize.recover import as_input_errors
+from warpir.optimize.model import as_input_errors
 from warpir.render.device import choose_device
 
 PROMPT = "a small red car"

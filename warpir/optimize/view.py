@@ -15,6 +15,8 @@ import torch
 from torch import Tensor
 
 from warpir.core.arrays import FloatArray, IntArray, PixelArray
+from warpir.core.color import gamma_to_linear, linear_to_gamma
+from warpir.lighting.regression import Regression
 from warpir.render.bridge import ComposeConstants, compose
 from warpir.render.device_light import light_args
 from warpir.render.integrator import Integrator, Radiance
@@ -23,6 +25,7 @@ from warpir.render.renderer import Renderer
 from warpir.render.tone_curve import Knots
 from warpir.render.transport.integrator import TransportIntegrator
 from warpir.render.transport.rows import TransportSettings
+from warpir.scene.camera import Camera
 from warpir.scene.light import Light
 
 COVERAGE_SAMPLES = 64
@@ -158,3 +161,43 @@ def expected_light(texels_fg: Tensor, texels_shadow: Tensor) -> Light:
     with torch.no_grad():
         both = [t / t.mean().clamp(min=1e-20) for t in (texels_fg, texels_shadow)]
     return Light(texels=(0.5 * (both[0] + both[1])).cpu().numpy())
+
+
+def gbuffer_of(frame: Frame) -> torch.Tensor:
+    """Return what the object is, as the embedded prior sees it, shape [1, 7, H, W].
+
+    Mask in [0, 1], albedo display-encoded, unit normals in the camera's frame (x right, y up, z
+    toward the camera); all 0 beside the object. `warpir.train.batches.PriorBatch` is the same.
+    """
+    scene = frame.renderer.scene
+    found = frame.renderer.gbuffer(frame.seed)
+    seen = found.coverage > 0.0
+    height, width = frame.photo_lin.shape[:2]
+    plane = np.zeros((height * width, 7), np.float32)
+    plane[found.object_pixels[seen]] = np.concatenate(
+        [
+            found.coverage[seen, None],
+            linear_to_gamma(np.clip(found.base_color[seen], 0.0, 1.0)),
+            found.normal[seen] @ scene.camera.c2w[:3, :3],
+        ],
+        axis=1,
+    )
+    return torch.from_numpy(plane.reshape(height, width, 7)).permute(2, 0, 1)[None].contiguous()
+
+
+def with_light(gbuffer: torch.Tensor, regression: Regression, camera: Camera) -> torch.Tensor:
+    """Return a G-buffer with what the regressor makes of the object, shape [1, 13, H, W].
+
+    Args:
+        gbuffer: Of `gbuffer_of`, shape [1, 7, H, W].
+        regression: The light, world frame.
+        camera: Of the picture.
+    """
+    planes = gbuffer[0].permute(1, 2, 0).double().numpy()
+    shown, toward = regression.matte_picture(
+        gamma_to_linear(planes[..., 1:4]), planes[..., 4:7], camera.c2w
+    )
+    shown = shown * (planes[..., :1] > 0.0)
+    light = np.concatenate([shown, np.broadcast_to(toward, shown.shape)], axis=2)
+    more = torch.from_numpy(light.astype(np.float32)).permute(2, 0, 1)[None]
+    return torch.cat([gbuffer, more], dim=1)

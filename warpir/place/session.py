@@ -18,11 +18,12 @@ import numpy as np
 
 from warpir.app.command import read_values
 from warpir.app.config import DEFAULTS, SKY_PRESETS, InsertConfig
-from warpir.app.inputs import Loaders, photo_camera, read_asset
-from warpir.app.photo_world import make_world
+from warpir.app.inputs import Loaders, read_asset
+from warpir.app.photo_world import make_world, photo_camera
 from warpir.core.arrays import Float64Array
 from warpir.core.atomic import replacing, write_staged
 from warpir.core.errors import ExitCode, InputError, disk_error
+from warpir.core.progress import Log
 from warpir.io.cameras.source import number
 from warpir.io.gltf.writer import write_glb
 from warpir.io.images.photos import Photo, read_photo
@@ -81,7 +82,7 @@ def open_session(config: InsertConfig) -> Session:
         InputError: One of them cannot be used, or the place that was named is not in the photo.
     """
     assert config.inputs.photo is not None and config.inputs.asset is not None
-    assumed: list[str] = []
+    log = Log()
     photo = read_photo(
         config.inputs.photo,
         max_pixels=config.limits.pixels,
@@ -89,10 +90,10 @@ def open_session(config: InsertConfig) -> Session:
         layer=config.inputs.layer,
         strict=config.inputs.strict,
     )
-    view = photo_camera(config, photo, assumed)
-    asset = read_asset(config.inputs.asset, config, Loaders(), assumed)
+    view = photo_camera(config, photo, log)
+    asset = read_asset(config, Loaders(), log)
     world = make_world(config, view, None)
-    assumed += [*world.camera.assumed, *world.camera.notices]
+    assumed = [*log.assumed, *world.camera.assumed, *world.camera.notices]
     low, high = asset.bounds()
     stands = (
         config.placement.place,

@@ -1,4 +1,4 @@
-"""The report of a run, one page for a person: pictures, plots, facts and words.
+"""What a run leaves: the picture under its light, its files, and the report for a person.
 
-Reads what a run has written; computes no picture of its own.
+The report itself reads what a run has written, and computes no picture of its own.
 """

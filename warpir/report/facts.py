@@ -206,6 +206,24 @@ def light_sources(record: Mapping[str, Any], config: InsertConfig) -> Rows:
     return rows
 
 
+def summary_line(record: Mapping[str, Any]) -> str:
+    """Return in a line what the light comes from and what computed it, for the end of a run."""
+    measured = record["measured"]
+    digest = measured.get("prior_sha256")
+    prior = measured["prior"] + (f" (sha256 {digest[:16]}...)" if digest else "")
+    accepted = measured.get("acceptance", {}).get("is_accepted")
+    words = {True: ", its end accepted", False: ", its start kept", None: ""}[accepted]
+    parts = [f"prior {prior}{words}"]
+    if "regression" in measured:
+        spread = measured["regression"]["spread_deg"]
+        parts.append(f"light regressed from the photo, +- {spread:.0f} degrees")
+    if measured["prior"] == "none" and "prior_about" in measured:
+        parts.append(measured["prior_about"])
+    integrators = (measured.get("loop_integrator"), measured["integrator"])
+    rendered = " and ".join(dict.fromkeys(name for name in integrators if name))
+    return f"summary: {'; '.join(parts)}; {rendered} on {record['device']}"
+
+
 def _source(measured: Mapping[str, Any], config: InsertConfig) -> str:
     if config.light.reuse is not None:
         text = f"that of an earlier run, {name_of(config.light.reuse)}"

@@ -1,0 +1,105 @@
+"""The light of a run: given, estimated from the photo or recovered, with what the photo shows.
+
+torch and the networks are imported by the ways that need them.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+from warpir.app.config import EMBEDDED_STEPS
+from warpir.app.run import Run
+from warpir.core.memory import release
+from warpir.lighting.scene_light import SceneLight
+from warpir.render.determinism import fixed_arithmetic
+
+NOT_ASKED = (
+    f"the embedded prior was not asked (--steps {EMBEDDED_STEPS}: experimental, it failed its "
+    "release gate)"
+)
+
+
+@dataclass(frozen=True)
+class LitRun:
+    """A run whose light is known."""
+
+    run: Run
+    """Its asset is as it is to be rendered."""
+    light: SceneLight
+    measured: dict[str, Any]
+    """What ``run.json`` says of where the light comes from."""
+
+
+def find_light(run: Run, given: SceneLight | None) -> LitRun:
+    """Return the run under its light, whichever way that is found.
+
+    Args:
+        run: On its device.
+        given: The light that the user gave or described; None: it is estimated from the photo.
+
+    Raises:
+        InputError: As `warpir.optimize.recover.recover`.
+    """
+    if run.config.is_guided:
+        with run.progress, fixed_arithmetic(run.device, run.config.render.deterministic):
+            lit = _guided(run, given)
+        with run.timings.stage("scene"):  # the garbage of guidance makes room for it
+            release()
+        return _with_detail(lit)
+    light, measured = given, dict[str, Any]()
+    if light is None:
+        light, measured = _estimated(run)
+    if run.config.guided_by == "embedded":
+        measured["prior_about"] = NOT_ASKED
+    if run.inputs.shadow_mask is not None and not light.has_lamps:
+        run.log.notice("the light has no lamp that --shadow-mask could take")
+    return _with_detail(LitRun(run, light, measured))
+
+
+def _guided(run: Run, given: SceneLight | None) -> LitRun:
+    """Let the prior find the light, or change the object under the light it has."""
+    if run.config.task.refine is None:
+        from warpir.optimize.recover import recover
+
+        outcome = recover(run, given)
+    else:
+        from warpir.optimize.materials import refine
+
+        assert given is not None  # the configuration names it
+        outcome = refine(run, given)
+    run.log.notice(*outcome.notices)
+    run = replace(run, inputs=replace(run.inputs, asset=outcome.asset))
+    return LitRun(run, outcome.light, outcome.record)
+
+
+def _estimated(run: Run) -> tuple[SceneLight, dict[str, Any]]:
+    """Estimate the light from the photo; return it, and what run.json says of it."""
+    is_fixed = run.config.render.deterministic
+    with run.timings.stage("regress"), fixed_arithmetic(run.device, is_fixed):
+        from warpir.lighting.estimate import estimate_light
+
+        estimate = estimate_light(run.inputs, run.config, run.device)
+    run.log.assume(*estimate.light.assumed)
+    return estimate.light, {"regression": estimate.regression.record()}
+
+
+def _with_detail(lit: LitRun) -> LitRun:
+    """Put into the light what the photo shows of it, unless a panorama has its own detail."""
+    run, light = lit.run, lit.light
+    has_own = run.config.light.file is not None and light.light.lobes is None
+    if run.inputs.run is not None:  # lit by what an earlier run was lit by, with or without
+        has_own = not Path(run.inputs.run.path, "envmap_detail.exr").exists()
+    if not run.config.light.detail or has_own:
+        return lit
+    with run.timings.stage("detail"):
+        from warpir.lighting.detail import detail_of, with_detail
+
+        detail = detail_of(run.inputs, light.curves)
+        light = replace(light, detailed=with_detail(light.light, detail))
+    run.log.say(
+        f"detail: the photo shows {100.0 * detail.seen:.0f} % of what is round the object, which "
+        "may be reflected in it (--no-detail)"
+    )
+    return replace(lit, light=light, measured={**lit.measured, "detail_seen": detail.seen})

@@ -1,0 +1,289 @@
+"""The model that judges: loaded, adapted to the photo, and made into the guidance of a loop."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+
+from warpir.app.config import PRIOR_DEFAULTS
+from warpir.app.run import Run
+from warpir.core import signals
+from warpir.core.cache import cache_folder
+from warpir.core.color import linear_to_gamma
+from warpir.core.errors import ExitCode, InputError
+from warpir.core.memory import needs_of_model
+from warpir.diffusion.dataset_update import DatasetUpdate
+from warpir.diffusion.guidance import Guidance, make_guidance
+from warpir.diffusion.models.embedded import load_embedded
+from warpir.diffusion.models.embedded_words import embedded_prompts
+from warpir.diffusion.models.model_error import ModelError
+from warpir.diffusion.models.model_folder import check_model_folder, find_model, hub_offline
+from warpir.diffusion.models.network_prior import NetworkPrior
+from warpir.diffusion.models.stable_diffusion import load_stable_diffusion
+from warpir.diffusion.personalization.personalize import (
+    Personalization,
+    personalize,
+    restore_personalization,
+)
+from warpir.diffusion.personalization.show_prior import show_personalization
+from warpir.diffusion.prior import Condition, NonFiniteError
+from warpir.diffusion.prompts import Prompts, make_prompts
+from warpir.lighting.regression import regress
+from warpir.lighting.regressor import load_regressor
+from warpir.optimize.checkpoint import Checkpoint, Checkpoints, is_due
+from warpir.optimize.view import Frame, gbuffer_of, with_light
+from warpir.render.determinism import use_threads_for
+
+SHOWN_SEEDS = (0, 1, 2)
+"""Of the pictures of --show-prior."""
+ANYTHING = "object"
+"""What the embedded prior is asked for when nobody says what the object is."""
+ABOUT_EMBEDDED = (
+    "prior: embedded, trained on rendered scenes, experimental: it failed its release gate; for "
+    "photographs Stable Diffusion is recommended (--model)"
+)
+LOSSES_WITHOUT_LORA = ("csd", "sds-base", "good-bad")
+"""They ask the unadapted model alone."""
+
+
+@dataclass(frozen=True)
+class Asked:
+    """A model, and what it is asked."""
+
+    prior: NetworkPrior
+    prompts: Prompts
+    negative_prompt: str
+    """What the negative term asks for; empty: the null prompt."""
+
+
+@dataclass(frozen=True)
+class Guided:
+    """A model that has seen the photo, ready to judge composites of it."""
+
+    asked: Asked
+    learnt: Personalization | None
+    """What the model learnt from the photo; None: it is asked as it is."""
+    notices: tuple[str, ...]
+
+    @property
+    def prior(self) -> NetworkPrior:
+        """The model."""
+        return self.asked.prior
+
+    def state_dict(self) -> dict[str, Any]:
+        """Return what a checkpoint of the loop holds beside it: precision and adapter."""
+        learnt = None if self.learnt is None else self.learnt.state_dict()
+        return {"prior": self.prior.state_dict(), "learnt": learnt}
+
+    def record(self, run: Run) -> dict[str, Any]:
+        """Return what ``run.json`` says of the model, its adapter, and what was left open to it."""
+        prior, learnt = self.prior, self.learnt
+        record: dict[str, Any] = {
+            "model": {"name": prior.name, "sha256": prior.file_hashes},
+            "prompts": asdict(self.asked.prompts),
+        }
+        if learnt is not None:
+            record["personalization"] = {
+                "reused": learnt.is_reused,
+                "class_prompts": list(learnt.class_prompts),
+                "error_before_after": learnt.evaluation and list(learnt.evaluation),
+                "seconds": learnt.seconds,
+            }
+        record |= {"prior": prior.name, "prior_sha256": prior.digest}
+        if prior.name == "embedded":
+            record["prior_about"] = ABOUT_EMBEDDED
+        flat = run.config.flat()
+        settings = {name: flat[name] for name in PRIOR_DEFAULTS[prior.name]}
+        record["settings"] = {**settings, "tone": run.config.tone_operator}
+        return record
+
+
+def prepare_guidance(run: Run, checkpoints: Checkpoints) -> tuple[Guided, Checkpoint | None]:
+    """Load the model and adapt it to the photo; return it, and the checkpoint to go on from.
+
+    Raises:
+        InputError: The checkpoint is another run's; every difference is named.
+        ModelError: The model cannot be loaded or adapted.
+    """
+    config = run.config
+    with run.timings.stage("model"):
+        asked = run.memory.again(lambda: load_prior(run), "the model", "--model")
+        prior, prompts = asked.prior, asked.prompts
+        use_threads_for(prior.unet)
+        shown = config.guidance.show_prior or ()
+        prior.embed([prompts.photo, prompts.class_, prompts.guidance, "", *shown])
+        others = config.guidance.null_prompt, config.guidance.base_prompt
+        prior.embed([asked.negative_prompt, *others])
+    weights = config.diffusion.model or config.guidance.prior or "as shipped"
+    run.log.say(f"model: {prior.name} {weights}, sha256 {prior.digest[:16]}...")
+    resumed = checkpoint_of(run, checkpoints, prior)
+    run.log.say(f'guidance asks for "{prompts.guidance}"')
+    guided = adapted(run, asked, checkpoints, resumed)
+    if resumed is not None and resumed.stage == "optimize":
+        # After the adapter, which was rounded as the model was when it came.
+        prior.load_state_dict(resumed.state["guided"]["prior"])
+    return guided, resumed
+
+
+def load_prior(run: Run) -> Asked:
+    """Return the prior that is asked for, what it is asked, and what the negative term asks.
+
+    Raises:
+        InputError: Its memory is certain to be short (`ExitCode.RESOURCES`).
+        ModelError: It cannot be loaded.
+    """
+    config = run.config
+    prompt, negative = config.guidance.prompt, config.guidance.negative_prompt
+    if config.guided_by == "embedded":
+        is_adapted = bool(config.adapter.personalize)
+        known = embedded_prompts(prompt or ANYTHING, config.adapter, is_adapted)
+        graphs = config.diffusion.graphs and run.device != "cpu"
+        path = config.guidance.prior
+        prior = load_embedded(
+            None if path is None else Path(path), run.device, graphs, run.memory.in_chunks
+        )
+        if known.unknown:
+            prior.notices += (f"the embedded prior does not know: {', '.join(known.unknown)}",)
+        return Asked(prior, known, negative or known.negative)
+    assert prompt is not None
+    require_memory(run)
+    model = load_stable_diffusion(config.diffusion, run.device, run.memory.in_chunks)
+    return Asked(model, make_prompts(prompt, config.adapter), negative)
+
+
+def require_memory(run: Run) -> None:
+    """Compare what Stable Diffusion will take with what is free.
+
+    Raises:
+        InputError: It is certain not to fit (`ExitCode.RESOURCES`).
+        ModelError: It cannot be used.
+    """
+    model = run.config.diffusion
+    with hub_offline(not model.allow_download):
+        found = find_model(model.model, model.allow_download, model.allow_pickle)
+        folder = check_model_folder(found, model.allow_pickle)
+    files = (file for weights in folder.weights.values() for file in weights.files)
+    side = 8 * int(folder.configs["unet"]["sample_size"])
+    is_half = run.device != "cpu" and model.precision != "fp32"
+    pictures = run.config.guidance_settings().noises
+    size = sum(file.stat().st_size for file in files)
+    run.memory.require(*needs_of_model(size, side, pictures, is_half=is_half))
+
+
+def checkpoint_of(run: Run, checkpoints: Checkpoints, prior: NetworkPrior) -> Checkpoint | None:
+    """Return the checkpoint to go on from, which is of this very model; None: there is none.
+
+    Raises:
+        InputError: It is another run's; every difference is named.
+    """
+    checkpoints.identity["model"] = prior.file_hashes
+    if checkpoints.newest is None:
+        return None
+    found = checkpoints.load(lambda text: run.log.say(f"notice: {text}"))
+    run.log.say(f"resumed: {found.stage}, step {found.step}")
+    return found
+
+
+def adapted(run: Run, asked: Asked, checkpoints: Checkpoints, resumed: Checkpoint | None) -> Guided:
+    """Adapt a model to the photo, as far as the loss asks for it; its text encoder is freed.
+
+    Raises:
+        ModelError: The model cannot be adapted.
+    """
+    config, prior = run.config, asked.prior
+    loss, shown = config.guidance.loss, config.guidance.show_prior
+    notices: tuple[str, ...] = (ABOUT_EMBEDDED,) if prior.name == "embedded" else ()
+    does_without = loss in LOSSES_WITHOUT_LORA and config.adapter.lora is None and not shown
+    learnt = None
+    if config.adapter.personalize and does_without:
+        notices = (*notices, f"--loss {loss} does without a LoRA: none was trained")
+    elif config.adapter.personalize:
+        with run.timings.stage("personalize"):
+            learnt = personalized(run, asked, checkpoints, resumed)
+        notices = (*notices, *learnt.notices)
+    prior.free_text_encoder()
+    return Guided(asked, learnt, notices)
+
+
+def personalized(
+    run: Run, asked: Asked, checkpoints: Checkpoints, resumed: Checkpoint | None
+) -> Personalization:
+    """Train the adapter on the photo, and show what the model makes of it where that is wanted.
+
+    A loop that is resumed goes on with the very adapter that it had, whatever has become of the
+    cache.
+
+    Raises:
+        ModelError: The model cannot be adapted.
+    """
+    config, prior = run.config, asked.prior
+    photo = torch.from_numpy(run.inputs.photo.srgb).permute(2, 0, 1)[None].contiguous()
+    given = (prior, photo, asked.prompts, config.adapter, config.render.seed, cache_folder())
+
+    def on_step(training: Any) -> None:
+        if is_due(training.step_count, config.optimize.checkpoint_every):
+            checkpoints.save("personalize", training.step_count, training.state_dict())
+
+    def report(stage: str, done: int, total: int) -> None:
+        run.progress.report(stage, done, total)
+        signals.check()
+
+    if resumed is not None and resumed.stage == "optimize":
+        learnt = restore_personalization(prior, resumed.state["guided"]["learnt"])
+    else:
+        state = None if resumed is None else resumed.state
+        with signals.deferred():
+            learnt = personalize(*given, report=report, on_step=on_step, resume=state)
+    if shown := config.guidance.show_prior:
+        sheet = show_personalization(*given, shown, SHOWN_SEEDS, run.progress.report)
+        run.output.write_png("prior.png", sheet, mark=False, description="The model's idea")
+    return learnt
+
+
+def make_guide(run: Run, guided: Guided, frame: Frame) -> Guidance | DatasetUpdate:
+    """Return the guidance of the configured loss over a picture of the frame's size."""
+    config, prior, prompts = run.config, guided.prior, guided.asked.prompts
+    shown = linear_to_gamma(frame.photo_lin).astype(np.float32)
+    background = torch.from_numpy(shown).permute(2, 0, 1)[None].to(run.device)
+    gbuffer = gbuffer_of(frame)
+    if prior.name == "embedded":
+        path = config.light.regressor
+        network = load_regressor(None if path is None else Path(path), run.device)
+        regression = regress(network, run.inputs.photo.srgb, run.inputs.camera)
+        gbuffer = with_light(gbuffer, regression, frame.renderer.scene.camera)
+    condition = Condition(
+        prompts.guidance,
+        negative_prompt=guided.asked.negative_prompt,
+        background=background,
+        gbuffer=gbuffer.to(run.device),
+    )
+    guide = make_guidance(
+        prior,
+        condition,
+        config.guidance_settings(),
+        torch.from_numpy(frame.coverage()),
+        config.optimize.step_count,
+        config.render.seed,
+        None if guided.learnt is None else guided.learnt.adapter,
+    )
+    if isinstance(guide, Guidance):
+        guide.ensure_precision(background)
+    return guide
+
+
+@contextmanager
+def as_input_errors() -> Iterator[None]:
+    """Turn the model's errors into the program's."""
+    try:
+        yield
+    except ModelError as error:
+        raise InputError(error.where, error.what, error.advice, ExitCode.MODEL) from None
+    except NonFiniteError as error:
+        advice = "try --precision fp32; the last checkpoint holds the state before"
+        raise InputError("guidance", str(error), advice, ExitCode.NUMERIC) from None

@@ -1,0 +1,245 @@
+"""The result of a run: the picture under its light, and the files, for other tools too."""
+
+from __future__ import annotations
+
+from dataclasses import asdict, dataclass
+from typing import Any
+
+from warpir.app.record import config_of_picture
+from warpir.app.run import Run
+from warpir.core.arrays import CodeArray, FloatArray
+from warpir.core.progress import progress_bar
+from warpir.io.curves_file import curves_to_json
+from warpir.io.export import write_hand_off
+from warpir.io.layers import write_layers
+from warpir.io.lobes_file import lobes_to_json
+from warpir.io.results import OutputFolder
+from warpir.lighting.scene_light import SceneLight
+from warpir.render.composite import (
+    Picture,
+    Quality,
+    as_file_map,
+    balls,
+    make_picture,
+    scene_of,
+)
+from warpir.render.renderer import Renderer
+from warpir.report.page import Results
+from warpir.scene.camera import Camera
+from warpir.scene.light import LightSummary, summarize
+
+PREVIEW_SAMPLES = 16
+"""Camera samples per pixel of the preview of a run that nothing guides."""
+
+
+# ------------------------------------------------------------------------------ the picture
+
+
+def render_result(run: Run, light: SceneLight) -> tuple[Picture, Renderer]:
+    """Render object and shadow, and put them into the photo."""
+    with run.timings.stage("scene"):
+        camera = _rendering_camera(run.inputs.camera, run.config.render.width)
+        placed = run.memory.again(
+            lambda: scene_of(run.inputs, camera, run.device, light.curves), "the scene", "--asset"
+        )
+    with run.timings.stage("render"), progress_bar() as report:
+        renderer = Renderer(placed, run.config.render.threads or 0, report, run.memory)
+        picture = _picture(run, light, renderer, run.config.render.samples, run.config.render.rays)
+    run.log.notices += run.memory.notices()  # printed when it happened
+    run.log.notice(*renderer.bad_pixels.notices())
+    return picture, renderer
+
+
+def write_preview(run: Run, light: SceneLight) -> None:
+    """Write the composite as it will be, small and grainy, where previews are asked for."""
+    settings = run.config.settled(on_cuda=run.device != "cpu").optimize
+    if not settings.preview_every:
+        return
+    camera = _rendering_camera(run.inputs.camera, run.config.render.width)
+    camera = _rendering_camera(run.inputs.camera, min(settings.picture_width, camera.width))
+    placed = scene_of(run.inputs, camera, run.device, light.curves)
+    renderer = Renderer(placed, run.config.render.threads or 0)
+    picture = _picture(run, light, renderer, PREVIEW_SAMPLES, 1)
+    codes = run.inputs.photo.encode(picture.image, picture.changed)
+    run.log.say(f"preview: {run.output.write_preview(0, codes, run.inputs.photo.icc)}")
+
+
+def _picture(run: Run, light: SceneLight, renderer: Renderer, samples: int, rays: int) -> Picture:
+    inputs, quality = run.inputs, run.config.render
+    return make_picture(
+        renderer,
+        light.on_object,
+        light.light_shadow,
+        inputs.photo,
+        Quality(samples, rays, quality.depth, quality.seed, quality.indirect_limit),
+        light.curves.foreground,
+        light.curves.shadow_ratio,
+        is_reinhard=light.curves.tone == "reinhard",
+        occluder=inputs.occluder,
+        shadow_mask=inputs.shadow_mask,
+    )
+
+
+def _rendering_camera(camera: Camera, width: int | None) -> Camera:
+    """Return the photo's camera, or the same view at another width [px]."""
+    if width is None:
+        return camera
+    return camera.scaled(width, max(1, round(width * camera.height / camera.width)))
+
+
+# -------------------------------------------------------------------------------- the files
+
+
+@dataclass(frozen=True)
+class Maps:
+    """The lights of a result as they are in its files, each of shape [He, 2 He, 3]."""
+
+    light: FloatArray
+    shadow: FloatArray | None
+    """That casts the shadow, where it is another one."""
+    detail: FloatArray | None
+    """With what the photo shows of the surroundings, where that is wanted."""
+
+    @property
+    def on_object(self) -> FloatArray:
+        """What the object was rendered under."""
+        return self.light if self.detail is None else self.detail
+
+    @property
+    def name_on_object(self) -> str:
+        """Name of that file."""
+        return "envmap.exr" if self.detail is None else "envmap_detail.exr"
+
+
+@dataclass(frozen=True)
+class Written:
+    """What was written."""
+
+    results: Results
+    """The same, for the report."""
+    maps: Maps
+    measured: dict[str, Any]
+    """What ``run.json`` says of it."""
+
+
+def write_results(run: Run, light: SceneLight, picture: Picture) -> Written:
+    """Stage all files of a result but Mitsuba's scene, the report and ``run.json``.
+
+    Raises:
+        InputError: The disk is full (exit 5).
+    """
+    inputs, output, photo = run.inputs, run.output, run.inputs.photo
+    codes = photo.encode(picture.image, picture.changed)
+    # Many shadows are too faint for a code; a linear plate has no codes of the same kind.
+    changed = picture.changed if photo.is_linear else (codes != photo.codes).any(axis=-1)
+    output.write_png("composite.png", codes, icc=photo.icc, mark=run.config.output.mark)
+    clamped = write_layers(
+        output,
+        picture.layers,
+        inputs.camera,
+        is_deep=photo.is_deep,
+        config=config_of_picture(run.config),
+        inputs=inputs.hashes,
+    )
+    maps = _write_light(output, light)
+    output.write_json("curves.json", curves_to_json(light.curves))
+    output.write_json("camera.json", inputs.camera.record())
+    pair = _write_balls(run, light)
+    handed = _hand_off(run, light, maps) if run.config.output.hand_off else {}
+    summary = summarize(light.light)
+    _say_what_is_seen(run, summary, picture)
+    measured = {
+        **_measured(run, light, summary),
+        "object_pixels": picture.object_pixel_count,
+        "shadow_pixels": picture.receiver_pixel_count,
+        "changed_pixels": int(changed.sum()),
+        "values_clamped_to_half": clamped,
+        **handed,
+    }
+    results = Results(
+        layers=picture.layers,
+        light=maps.light,
+        light_shadow=maps.shadow,
+        light_detail=maps.detail,
+        balls=pair,
+        curves=light.curves,
+        camera=inputs.camera.record(),
+    )
+    return Written(results, maps, measured)
+
+
+def _write_light(output: OutputFolder, light: SceneLight) -> Maps:
+    """Write the lights, and the lobes of one that has them."""
+    shadow = detail = None
+    texels = as_file_map(light.light)
+    output.write_envmap(texels)
+    if light.light_shadow is not light.light:
+        shadow = as_file_map(light.light_shadow)
+        output.write_envmap(shadow, "envmap_shadow")
+    if light.detailed is not None:
+        detail = as_file_map(light.on_object)
+        output.write_envmap(detail, "envmap_detail")
+    if light.light.lobes is not None:
+        output.write_json("lobes.json", lobes_to_json(light.light.lobes))
+    return Maps(texels, shadow, detail)
+
+
+def _write_balls(run: Run, light: SceneLight) -> CodeArray:
+    pair = balls(light.on_object, run.inputs.camera, light.curves.tone == "reinhard")
+    about = "Mirror ball and grey diffuse ball under the light"
+    run.output.write_png("balls.png", pair, mark=False, description=about)
+    return pair
+
+
+def _hand_off(run: Run, light: SceneLight, maps: Maps) -> dict[str, Any]:
+    """Write the files for Blender, three.js and colour tools; return what run.json says of them."""
+    inputs = run.inputs
+    handed, notices = write_hand_off(
+        run.output,
+        inputs.photo,
+        inputs.asset,
+        inputs.camera,
+        inputs.placement,
+        light.curves,
+        maps.on_object,
+        maps.name_on_object,
+    )
+    for line in notices:
+        run.log.say(f"notice: {line}")
+    return handed
+
+
+def _say_what_is_seen(run: Run, summary: LightSummary, picture: Picture) -> None:
+    run.log.say(
+        f"light: brightest toward azimuth {summary.azimuth_deg:.0f}, elevation "
+        f"{summary.elevation_deg:.0f} degrees; {100.0 * summary.peak_share:.0f} % of its flux "
+        "comes from there"
+    )
+    if not (picture.layers.matte > 0.0).any():
+        run.log.say("notice: the object is not seen in the photo")
+
+
+def _measured(run: Run, light: SceneLight, summary: LightSummary) -> dict[str, Any]:
+    """Return what run.json says of placement, light, mask and mesh."""
+    inputs, fit = run.inputs, light.fit
+    measured: dict[str, Any] = {
+        "prior": "none",
+        "integrator": "mis",
+        "placement": {
+            "summary": inputs.placement.summary,
+            "ground": inputs.placement.ground.tolist(),
+        },
+        "exposure_ev": light.exposure,
+        "light": asdict(summary),
+        "lobe_fit": fit
+        and {
+            "irradiance_error": fit.irradiance_error,
+            "flux_error": fit.flux_error,
+            "lamps": fit.lamp_count,
+        },
+    }
+    if inputs.shadow_mask is not None:
+        measured["shadow_mask_at_object"] = inputs.shadow_mask.at_object
+    if inputs.proxy is not None:
+        measured["proxy_triangles"] = len(inputs.proxy.indices)
+    return measured

@@ -1,0 +1,72 @@
+"""A sequence from its first frame to its summary: what is done already is left as it is."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+from warpir.app.config import InsertConfig
+from warpir.app.inputs import Loaders
+from warpir.app.program import attempt, say
+from warpir.core.signals import Stopped
+from warpir.io.results import OutputFolder
+from warpir.sequence.frames import SUMMARY, read_sequence, write_summary
+from warpir.sequence.page import PAGE, refuse_other_page, write_sequence_report
+
+
+def check_frames(config: InsertConfig) -> None:
+    """Check everything that can be checked before the first frame is rendered.
+
+    Raises:
+        InputError: A line or a frame cannot be used, or the folder not written.
+    """
+    frames = read_sequence(config, Loaders())
+    refuse_other_page(config)
+    assert config.output.out is not None
+    OutputFolder(config.output.out, overwrite=True).check()  # the frames' folders were looked at
+    say(f"frames: {len(frames)}, of which {sum(f.is_done for f in frames)} are done already")
+
+
+def insert_frames(
+    config: InsertConfig, insert_one: Callable[[InsertConfig, Loaders], object], renews: bool
+) -> tuple[Path, tuple[str, ...], dict[str, Any]]:
+    """Insert into every frame that is not done, then write summary, page and video.
+
+    Args:
+        config: Of the sequence.
+        insert_one: Inserts into one photograph.
+        renews: Whether a frame of other settings or other files is replaced.
+
+    Returns:
+        The folder, the names of the composites, video and summary in it, and the summary.
+
+    Raises:
+        InputError: A line or a frame cannot be used, or the disk is full.
+    """
+    assert config.output.out is not None
+    out = Path(config.output.out)
+    loaders = Loaders()
+    frames = read_sequence(config, loaders, renews=renews)
+    refuse_other_page(config)
+    done = 0
+    try:
+        for frame in frames:
+            if frame.is_done:
+                say(f"frame {frame.folder.name}: done already")
+            else:
+                say(f"frame {frame.folder.name}: line {frame.line} of {config.task.sequence}")
+                if frame.config.output.overwrite and not config.output.overwrite:
+                    say("notice: its settings or inputs have changed: it is rendered again")
+                insert_one(frame.config, loaders)
+            done += 1
+    except Stopped as error:
+        done += bool(error.kept)  # the signal came while this frame's results were put in place
+        how = "renders them again" if config.output.overwrite else "goes on with the rest"
+        error.kept = f"kept: {done} of {len(frames)} frames; the same command {how}"
+        raise
+    if config.output.report:  # before the summary, by which others see that nothing is left to do
+        attempt(PAGE, lambda: write_sequence_report(config, frames))
+    record = write_summary(config, frames, say)
+    composites = (f"{frame.folder.name}/composite.png" for frame in frames)
+    return out, (*composites, *record["video"], SUMMARY), record
