@@ -159,7 +159,7 @@ def test_guidance_that_is_never_finite_is_a_verdict(
     monkeypatch.setattr(model_check.Guidance, "_delta", lambda *args: delta(*args) * math.nan)
     monkeypatch.setattr(model_check.Guidance, "ensure_precision", lambda self, image: 1.0)
     assert main(["--model", str(folder / "epsilon"), "--device", "cpu"]) == ExitCode.MODEL
-    assert "guidance: 0 of 5 gradients usable: NOT AS" in capsys.readouterr().out
+    assert "guidance: 0 of 10 gradients usable: NOT AS" in capsys.readouterr().out
 
 
 @pytest.mark.parametrize(

@@ -158,12 +158,17 @@ def file_hash(path: Path) -> str:
 
 def sources_hash() -> str:
     """Return the sha256 of warpir's own modules: a checkout changes without another version."""
-    digest = hashlib.sha256()
+    files: dict[str, Path] = {}
     for package in ("warpir", "warpir.kernels", "warpir.diffusion"):
         spec = importlib.util.find_spec(package)
         assert spec is not None and spec.origin is not None
-        for file in sorted(Path(spec.origin).parent.glob("*.py")):
-            digest.update(f"{package}/{file.name}\0".encode() + file.read_bytes())
+        folder = Path(spec.origin).parent
+        for file in folder.rglob("*.py"):
+            # In a wheel the folders kernels and diffusion lie in warpir: the same names there.
+            files[f"{package.replace('.', '/')}/{file.relative_to(folder).as_posix()}"] = file
+    digest = hashlib.sha256()
+    for name, file in sorted(files.items()):
+        digest.update(f"{name}\0".encode() + file.read_bytes())
     return digest.hexdigest()
 
 
