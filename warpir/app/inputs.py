@@ -193,7 +193,9 @@ def _hashes_beside(config: InsertConfig, asset: Asset, proxy: Asset | None) -> d
     problems: list[InputError] = []
     meshes = (("asset", config.inputs.asset, asset), ("proxy", config.camera.proxy, proxy))
     for name, path, mesh in meshes:
-        for file, digest in mesh.hashes.items() if mesh is not None and path is not None else ():
+        if mesh is None or path is None:
+            continue
+        for file, digest in mesh.hashes.items():
             hashes[f"{name}/{file}" if file else name] = digest
             problems += _within_out(config, Path(path).parent.resolve() / file) if file else []
     raise_all(problems)

@@ -6,8 +6,10 @@ Only modules that documents showed are listed.
 
 import sys
 from importlib import import_module
+from importlib.abc import Loader
 from importlib.machinery import ModuleSpec
 from types import ModuleType
+from typing import cast
 
 MOVED = {
     "asset": "scene.asset",
@@ -39,7 +41,8 @@ class MovedModules:
     def find_spec(cls, name: str, path: object = None, target: object = None) -> ModuleSpec | None:
         """Return how to load ``warpir.config``; None for every other module."""
         package, _, leaf = name.partition(".")
-        return ModuleSpec(name, cls()) if package == "warpir" and leaf in MOVED else None
+        loads = package == "warpir" and leaf in MOVED
+        return ModuleSpec(name, cast(Loader, cls())) if loads else None
 
     def create_module(self, spec: ModuleSpec) -> ModuleType:
         """Import the module by its present name."""
@@ -56,4 +59,4 @@ class MovedModules:
 def find_moved_modules() -> None:
     """Let ``import`` look here after everywhere else; once is enough."""
     if not any(finder is MovedModules for finder in sys.meta_path):
-        sys.meta_path.append(MovedModules)  # type: ignore[arg-type]
+        sys.meta_path.append(MovedModules)

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 import warp as wp
@@ -282,7 +282,7 @@ class Scene:
     def materials_with(self, factors: Sequence[FloatArray | None]) -> MaterialArgs:
         """Return the scene's materials with other factors, in the order of `FACTORS`; None: own."""
         args = MaterialArgs()
-        for name in self.material_args._cls.vars:
+        for name in cast(Any, self.material_args)._cls.vars:
             setattr(args, name, getattr(self.material_args, name))
         for factor, (name, dtype) in zip(factors, FACTORS, strict=True):
             if factor is not None:

@@ -222,7 +222,8 @@ def _object_layers(layers: Layers) -> Iterator[Layer]:
 
     def straight(premultiplied: FloatArray) -> Shown:
         plane = shrink(premultiplied, LAYER_LARGEST)
-        return _with_alpha(encoded(plane / np.maximum(matte, np.float32(1e-6))[..., None]), matte)
+        covered: FloatArray = plane / np.maximum(matte, np.float32(1e-6))[..., None]
+        return _with_alpha(encoded(covered), matte)
 
     about = "The object alone, lit and tone-mapped, premultiplied by its coverage (RGBA)."
     yield Layer("fg", about, straight(layers.foreground[..., :3]))
@@ -246,11 +247,12 @@ def _surface_layers(layers: Layers) -> Iterator[Layer]:
     is_surface = np.isfinite(layers.depth)
     share = shrink(is_surface.astype(np.float32), LAYER_LARGEST)
     is_shown = share > 0.0
-    weight = np.where(is_shown, share, np.float32(1.0))
+    weight: FloatArray = np.where(is_shown, share, np.float32(1.0))
 
     def mean(plane: FloatArray) -> FloatArray:
         shrunk = shrink(plane, LAYER_LARGEST)
-        return shrunk / (weight if shrunk.ndim == 2 else weight[..., None])
+        average: FloatArray = shrunk / (weight if shrunk.ndim == 2 else weight[..., None])
+        return average
 
     if layers.albedo is not None:
         about = "Base colour of the surface, without any light."

@@ -59,7 +59,9 @@ class Entry:
         """
         pointer = self.pointer or "/"
         what, reason = f"{pointer}: {what}", f"gltf.{reason}"
-        return InputError(self.path, what, advice, reason=reason, pointer=pointer, **fields)
+        error = InputError(self.path, what, advice, reason=reason)
+        error.fields = {"pointer": pointer, **fields}
+        return error
 
     def out_of_range(self, what: str, found: int, limit: int, of: str) -> InputError:
         """Return the error of an index: ``what`` is ``found``, but there are ``limit`` of them."""

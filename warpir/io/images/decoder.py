@@ -45,7 +45,7 @@ class DecodedImage:
     @property
     def is_grey(self) -> bool:
         """Whether there is one channel, not three."""
-        return self.pixels.shape[-1] == 1
+        return int(self.pixels.shape[-1]) == 1
 
 
 def decode_image(

@@ -58,9 +58,14 @@ def read_obj(path: Path, missing_textures: str = "error", limits: Limits = LIMIT
         library.add(name)
     triangle_count = sum(len(c) - 2 for faces in text.faces.values() for _, c in faces)
     check_triangle_count(path, triangle_count, limits)
+    positions, uvs, normals = (
+        np.array(rows, dtype=np.float64).reshape(-1, n) for rows, n in text.tables()
+    )
     vertices = Vertices(
-        *(np.array(rows, dtype=np.float64).reshape(-1, n) for rows, n in text.tables()),
-        colors=_vertex_colors(text.colors, len(text.positions), notices),
+        positions,
+        uvs,
+        normals,
+        _vertex_colors(text.colors, len(text.positions), notices),
     )
     primitives = []
     for name, faces in text.faces.items():
