@@ -222,8 +222,8 @@ def _object_layers(layers: Layers) -> Iterator[Layer]:
 
     def straight(premultiplied: FloatArray) -> Shown:
         plane = shrink(premultiplied, LAYER_LARGEST)
-        covered: FloatArray = plane / np.maximum(matte, np.float32(1e-6))[..., None]
-        return _with_alpha(encoded(covered), matte)
+        covered = plane / np.maximum(matte, np.float32(1e-6))[..., None]
+        return _with_alpha(encoded(covered.astype(np.float32, copy=False)), matte)
 
     about = "The object alone, lit and tone-mapped, premultiplied by its coverage (RGBA)."
     yield Layer("fg", about, straight(layers.foreground[..., :3]))

@@ -297,8 +297,8 @@ def _draw_skies(
         for x, s in ((coarse, 1.0), (finer, 0.6))
     )
     strength = torch.where(kind == BROKEN, draw.uniform(0.2, 0.7), draw.uniform(0.0, 0.25))
-    cloudy: Tensor = maps * torch.exp(strength[:, None, None] * patches)[..., None]
-    return cloudy
+    clouded: Tensor = maps * torch.exp(strength[:, None, None] * patches)[..., None]
+    return clouded
 
 
 def _draw_suns(draw: Sampler, kind: Tensor, elevation: Tensor) -> tuple[Tensor, Tensor, Tensor]:
