@@ -139,7 +139,7 @@ STOPS = {
     "first trace": ("optimize.view:View.__init__", 1),
     "optimisation before a checkpoint": ("optimize.loop:Optimization.step", 2),
     "optimisation": ("optimize.loop:Optimization.step", 6),
-    "checkpoint": ("atomic.write_staged", 16),
+    "checkpoint": ("core.atomic.write_staged", 16),
     "last render": ("report.result.make_picture", 1),
     "final files": ("io.results:OutputFolder._commit", 1),
 }

@@ -381,4 +381,4 @@ def test_demo_does_the_real_job(folder: Path, tmp_path: Path) -> None:
     assert main(flags) == ExitCode.DONE
     run = record(out)
     assert run["measured"]["prior"] == "embedded" and "light" not in run["inputs"]
-    assert demo_config(InsertConfig(demo=True, out="o")).light is None
+    assert demo_config(InsertConfig(demo=True, out="o")).light.file is None

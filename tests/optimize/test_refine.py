@@ -233,7 +233,7 @@ def test_start_is_the_unrefined_image() -> None:
     lit = loop.lit
     with torch.no_grad():
         refined = loop.final_image(3)
-        plain = ShadeForeground.apply(loop.mis, lit.args_fg, 3, False, *(None,) * 8)
+        plain = ShadeForeground.apply(loop.mis, lit.args_fg, 3, False, *(None,) * 5)
         assert torch.equal(refined, lit.image(plain, *loop.curves))
         # With the same samples this is the object that was rendered once.
         assert torch.equal(plain, lit.foreground)
