@@ -1,4 +1,4 @@
-"""Put an object into a photograph: the program, from the command line to the files written.
+"""Insert an object into a photograph, from the command line to the files on disk.
 
     python -m warpir.insert --photo street.jpg --asset car.glb --light street.hdr --out out
 
@@ -9,9 +9,9 @@ or from Python, where the module itself can be called:
 
     insertion = insert(InsertConfig(photo="street.jpg", asset="car.glb", out="out"))
 
-The order of the checks: arguments, all inputs and the models' files, the output folder and its
-lock, disk space. torch and Warp are imported when all of it is known to be good, so ``--help``,
-wrong arguments and ``--validate`` answer without them.
+Checked in this order: arguments, all inputs and the models' files, the output folder and its lock,
+disk space. torch and Warp are imported after these checks, so ``--help``, wrong arguments and
+``--validate`` answer without them.
 """
 
 import sys
@@ -25,10 +25,9 @@ from typing import TYPE_CHECKING, Any
 from warpir.app.command import parse
 from warpir.app.config import InsertConfig, usage
 from warpir.app.program import attempt, require_packages, run_program, say, stay_offline
-from warpir.core.errors import ExitCode, InputError
+from warpir.core.errors import ExitCode
 from warpir.core.limits import LIMITS
 from warpir.core.memory import Memory
-from warpir.core.signals import Stopped
 
 if TYPE_CHECKING:
     from warpir.app.inputs import Loaders
@@ -36,8 +35,7 @@ if TYPE_CHECKING:
     from warpir.io.layers import Layers
     from warpir.lighting.scene_light import SceneLight
     from warpir.optimize.find_light import LitRun
-    from warpir.render.composite import Picture
-    from warpir.render.renderer import Renderer
+    from warpir.report.result import RenderedResult
 
 __all__ = ["InsertConfig", "Insertion", "insert", "main"]
 
@@ -49,19 +47,19 @@ class Insertion:
     """A finished insertion."""
 
     out: Path
-    """Folder that holds the files."""
+    """Folder of the files."""
     files: tuple[str, ...]
-    """Names of the files in `out`, ``run.json`` last; of a sequence the composites and
+    """Names of the files in `out`, ``run.json`` last; of a sequence, the composites and
     ``sequence.json``."""
     record: dict[str, Any]
-    """Content of the last file; ``run.json`` holds inputs, settings, what was assumed, device and
+    """Content of the last file; ``run.json`` holds inputs, settings, assumptions, device and
     seconds."""
 
     def layers(self) -> "Layers":
-        """Read ``layers.exr`` back as arrays; a sequence has one in each frame's folder.
+        """Read ``layers.exr`` as arrays; each frame of a sequence has one in its own folder.
 
         Raises:
-            InputError: It is not there, or damaged.
+            InputError: The file is absent or damaged.
         """
         from warpir.io.layers import read_layers
 
@@ -72,16 +70,16 @@ class Insertion:
 def insert(config: InsertConfig, *, renews: bool = False) -> Insertion:
     """Insert one object into one photograph, or into a sequence of them, and write the files.
 
-    Calls from several threads wait for each other: Warp's tape, torch's threads and the handling of
-    signals belong to the process.
+    Calls from several threads are serialised: Warp's tape, torch's threads and signal handlers
+    belong to the process.
 
     Args:
-        config: What to do. Assumptions and notices are printed on standard output.
-        renews: Whether frames of a sequence that were made of other settings or other files are
-            replaced, one after another, without ``overwrite``.
+        config: The insertion. Assumptions and notices are printed on standard output.
+        renews: Whether frames of a sequence that have other settings or inputs are replaced, one
+            after another, without ``overwrite``.
 
     Raises:
-        InputError: An input or the output folder cannot be used; nothing was written then.
+        InputError: An input or the output folder cannot be used; no result was written.
     """
     config.require_inputs()
     with _ONE_AT_A_TIME:
@@ -92,41 +90,25 @@ def insert(config: InsertConfig, *, renews: bool = False) -> Insertion:
         try:
             return _insert_one(config)
         except BaseException as error:
-            _say_what_is_kept(config, error)
+            from warpir.optimize.checkpoint import report_kept
+
+            report_kept(config.output, error)
             raise
-
-
-def _say_what_is_kept(config: InsertConfig, error: BaseException) -> None:
-    """Name the checkpoint that a run has left when it was stopped or broke down on its way."""
-    from warpir.optimize.checkpoint import Checkpoints
-
-    assert config.output.out is not None
-    if isinstance(error, InputError) and error.code not in (ExitCode.RESOURCES, ExitCode.NUMERIC):
-        return  # refused before it began
-    checkpoints = Checkpoints(Path(config.output.out), {})
-    how = ""
-    if checkpoints.newest is not None:
-        kept = checkpoints.folder / checkpoints.newest
-        how = f"kept: {kept}; the same command with --resume goes on from there"
-    if isinstance(error, Stopped):  # its line is the last one, and may know better
-        error.kept = error.kept or how or "there was no checkpoint to keep yet"
-    elif how:
-        say(how)
 
 
 # ---------------------------------------------------------------------------- the story
 
 
 def _insert_one(config: InsertConfig, loaders: "Loaders | None" = None) -> Insertion:
-    """Insert into one photograph: read, light (which may be guided), render, write."""
+    """Insert into one photograph: read, find the light, render, write."""
     from warpir.core.strict_json import read_json_object
-    from warpir.optimize.find_light import find_light
     from warpir.report.facts import summary_line
 
     run, given = _read(config, loaders)
     with run.output as output:
         run.require_room()
-        with run.timings.stage("load"):  # Warp is loaded here: all that can be wrong was looked at
+        with run.timings.stage("load"):  # loads torch and Warp
+            from warpir.optimize.find_light import find_light
             from warpir.render.device import choose_device
             from warpir.report.result import render_result, write_preview
 
@@ -136,8 +118,8 @@ def _insert_one(config: InsertConfig, loaders: "Loaders | None" = None) -> Inser
         if not run.config.is_guided:
             with lit.run.timings.stage("preview"):
                 write_preview(lit.run, lit.light)
-        picture, renderer = render_result(lit.run, lit.light)
-        record = _written(lit, picture, renderer, config)
+        rendered = render_result(lit.run, lit.light)
+        record = _write(lit, rendered, config)
     say(summary_line(record))
     record = read_json_object(output.path / "run.json")
     return Insertion(output.path, (*record["files"], "run.json"), record)
@@ -146,7 +128,7 @@ def _insert_one(config: InsertConfig, loaders: "Loaders | None" = None) -> Inser
 def _read(
     config: InsertConfig, loaders: "Loaders | None" = None
 ) -> "tuple[Run, SceneLight | None]":
-    """Read and check all inputs and say what was assumed; the demo brings its own.
+    """Read and check all inputs and print the assumptions; the demo has inputs of its own.
 
     The light is None where it is to be estimated from the photo. Nothing is written, and the output
     folder is not entered.
@@ -169,18 +151,12 @@ def _read(
         say(f"placement: {inputs.placement.summary}")
         log.assume(*inputs.assumed, *(light.assumed if light is not None else ()))
         log.notice(*inputs.notices)
-    asked = config.output
-    assert asked.out is not None
-    output = output_folder(
-        asked.out, resume=asked.resume, overwrite=asked.overwrite, is_guided=config.is_guided
-    )
+    output = output_folder(config.output, config.is_guided)
     run = Run(config, inputs, output, log, timings, Memory(say=say), StepProgress(say))
     return run, light
 
 
-def _written(
-    lit: "LitRun", picture: "Picture", renderer: "Renderer", asked: InsertConfig
-) -> dict[str, Any]:
+def _write(lit: "LitRun", rendered: "RenderedResult", asked: InsertConfig) -> dict[str, Any]:
     """Stage all files, ``run.json`` last; return its content."""
     from warpir.mitsuba.scene import write_mitsuba
     from warpir.optimize.checkpoint import FOLDER
@@ -189,22 +165,14 @@ def _written(
 
     run = lit.run
     with run.timings.stage("write"):
-        written = write_results(run, lit.light, picture)
+        written = write_results(run, lit.light, rendered.picture)
         if run.config.output.mitsuba:
             depth = run.config.render.depth
             write_mitsuba(run.output, run.inputs, written.maps.on_object, depth)
-    # With the results in place, what was kept for a run that stops is not needed any more.
-    run.output.supersede(run.output.path / FOLDER)
+    run.output.supersede(run.output.path / FOLDER)  # a finished run needs no checkpoints
     run.take_cache_notices()
-    measured = {
-        "triangles": renderer.scene.triangle_count,
-        **run.inputs.measured,
-        **written.measured,
-        **lit.measured,
-        "bad_pixels": renderer.bad_pixels.count,
-        "memory_retries": run.memory.retries,
-    }
-    record = run.record(asked, str(renderer.scene.device), measured)
+    measured = run.inputs.measured | written.measured | lit.measured | rendered.measured
+    record = run.record(asked, rendered.device, measured)
     if run.config.output.report:
         results = replace(written.results, record=record)
         with run.timings.stage("report"):
@@ -237,7 +205,7 @@ def _run(arguments: list[str]) -> int:
     require_packages("warp", "torch", *guides)
     if guides and sys.flags.optimize > 1:
         advice = "run without -OO and PYTHONOPTIMIZE=2"
-        raise usage("python -OO", "the libraries of the model need their docstrings", advice)
+        raise usage("python -OO", "the model's libraries need their docstrings", advice)
     if command.validate:
         _validate(command.config)
         say("inputs are valid")
@@ -251,7 +219,7 @@ def _run(arguments: list[str]) -> int:
 
 
 def _validate(config: InsertConfig) -> None:
-    """Check everything that can be checked without torch and Warp; nothing is written."""
+    """Check everything that can be checked without torch and Warp; write nothing."""
     if config.task.sequence is not None:
         from warpir.sequence.run import check_frames
 

@@ -318,7 +318,7 @@ import warpir.optimize.checkpoint, warpir.optimize.loop
 mark(warpir.diffusion.personalization.lora_training.LoraTraining, "prepare", "iteration")
 mark(warpir.optimize.loop.Optimization, "step", "iteration")
 mark(warpir.optimize.checkpoint.Checkpoints, "save", "checkpoint", "iteration ends")
-mark(sys.modules["warpir.insert"], "_written", "write")
+mark(sys.modules["warpir.insert"], "_write", "write")
 mark(warpir.io.results.OutputFolder, "_commit", "commit", "end")
 note("load")
 """

@@ -1,11 +1,11 @@
-"""Checkpoints of a run: safetensors and JSON, whole or not there, and of this very run.
+"""Checkpoints of a run: safetensors and JSON, written atomically and bound to the run's inputs.
 
-    checkpoints/000003-optimize-150/state.safetensors  tensors, named by their place in the state
+    checkpoints/000003-optimize-150/state.safetensors  tensors, named by their path in the state
     checkpoints/000003-optimize-150/manifest.json      plain values, sha256, what it depends on
 
-A checkpoint is built under a temporary name, its manifest last, and renamed once. Its serial number
-grows, so the newest needs no clock to be known. The one before stays until the newer is complete;
-nothing is pickled.
+A checkpoint is built under a temporary name, its manifest last, and renamed once. Serial numbers
+increase, so the newest is known without a clock. The previous one is removed after the newer is
+complete; nothing is pickled.
 """
 
 from __future__ import annotations
@@ -21,9 +21,11 @@ from typing import TYPE_CHECKING, Any
 
 from safetensors import SafetensorError
 
+from warpir.app.program import say
+from warpir.app.settings import OutputConfig
 from warpir.core.atomic import remove_folder, write_folder
 from warpir.core.errors import ExitCode, InputError, disk_error
-from warpir.core.signals import is_pending, whole
+from warpir.core.signals import Stopped, is_pending, whole
 from warpir.core.strict_json import read_json_object
 from warpir.io.results import OutputFolder, remove_unfinished
 
@@ -31,28 +33,28 @@ if TYPE_CHECKING:
     from torch import Tensor
 
 FORMAT = 2
-"""Layout of a checkpoint; another is refused."""
+"""Version of the layout; others are refused."""
 KEPT = 2
-"""Checkpoints that stay on disk."""
+"""Number of checkpoints that stay on disk."""
 FOLDER = "checkpoints"
 UNUSABLE: tuple[type[Exception], ...] = (
     *(InputError, OSError, SafetensorError, RecursionError),
     *(AttributeError, KeyError, TypeError, ValueError),
 )
-"""What reading a damaged checkpoint raises; the latter for JSON values of other kinds."""
+"""Exceptions of reading a damaged checkpoint; the second line for JSON values of other types."""
 STATE, MANIFEST = "state.safetensors", "manifest.json"
 
 
 @dataclass(frozen=True)
 class Checkpoint:
-    """A state that was read back."""
+    """A state read from disk."""
 
     stage: str
     """Part of the run that wrote it, such as ``personalize`` or ``optimize``."""
     step: int
-    """Steps of that part that were done."""
+    """Number of finished steps of that part."""
     state: dict[str, Any]
-    """Nested tensors and plain values, as they were given to `Checkpoints.save`."""
+    """Nested tensors and plain values, as passed to `Checkpoints.save`."""
 
 
 class Checkpoints:
@@ -60,7 +62,7 @@ class Checkpoints:
 
     Args:
         out: The output folder.
-        identity: What the run depends on: settings, input hashes, versions; plain values.
+        identity: Settings, input hashes and versions of the run; plain values.
     """
 
     def __init__(self, out: Path, identity: Mapping[str, Any]) -> None:
@@ -78,7 +80,7 @@ class Checkpoints:
 
         Args:
             stage: Part of the run.
-            step: Steps of it that are done.
+            step: Number of its finished steps.
             state: Nested mappings of tensors and plain values.
 
         Raises:
@@ -116,7 +118,7 @@ class Checkpoints:
         """Return the newest checkpoint that is whole.
 
         Args:
-            notice: Told of each damaged one that was passed over.
+            notice: Called with a line about each damaged checkpoint that is skipped.
 
         Raises:
             InputError: There is none, none is whole, or the run has changed; every field that
@@ -129,10 +131,10 @@ class Checkpoints:
         return found
 
     def check(self) -> None:
-        """Compare what is known of the run so far with the checkpoint that it will go on from.
+        """Compare the identity so far with that of the checkpoint to resume from.
 
         Raises:
-            InputError: As of `load`; what is not part of `identity` yet counts as the same.
+            InputError: As `load`; parts that `identity` lacks so far are not compared.
         """
         path, _, identity, _ = self._newest_whole()
         self._compare(path, {key: value for key, value in identity.items() if key in self.identity})
@@ -147,7 +149,7 @@ class Checkpoints:
             )
 
     def _newest_whole(self) -> tuple[Path, Checkpoint, dict[str, Any], list[str]]:
-        """Return the newest whole checkpoint, of which run it is, and what is wrong with others."""
+        """Return the newest whole checkpoint, its path and identity, and problems of newer ones."""
         from safetensors.torch import load
 
         problems: list[str] = []
@@ -185,17 +187,17 @@ class Checkpoints:
         )
 
     def remove(self) -> None:
-        """Delete all of them: the run starts again."""
+        """Delete all checkpoints before the run starts again."""
         remove_unfinished(self.folder)
 
     def _names(self) -> Iterator[str]:
-        """Yield the checkpoints, the newest first; damaged ones too, that they may be reported."""
+        """Yield the names of checkpoints, newest first, damaged ones included."""
         found = self.folder.glob("[0-9]*-*-*") if os.path.isdir(self.folder) else ()
         yield from sorted((path.name for path in found), reverse=True)
 
 
 def manifest_digest(manifest: Mapping[str, Any]) -> str:
-    """Return the sha256 of all of a manifest but this."""
+    """Return the sha256 of a manifest without its own digest."""
     text = json.dumps(manifest, sort_keys=True, allow_nan=False)
     return hashlib.sha256(text.encode()).hexdigest()
 
@@ -224,7 +226,7 @@ def _join(plain: Any, tensors: Mapping[str, Tensor]) -> Any:
 
 
 def _differences(then: Any, now: Any, place: str = "") -> Iterator[str]:
-    """Yield what differs between two plain trees, one line a leaf."""
+    """Yield the differences of two plain trees, one line a leaf."""
     if isinstance(then, dict) and isinstance(now, dict):
         for key in sorted({*then, *now}):
             absent = "absent"
@@ -245,19 +247,40 @@ def is_due(step: int, every: int) -> bool:
     return bool(every) and (step % every == 0 or is_pending())
 
 
-def output_folder(out: str, *, resume: bool, overwrite: bool, is_guided: bool) -> OutputFolder:
-    """Return the folder that is to be written, not yet entered.
+def report_kept(asked: OutputConfig, error: BaseException) -> None:
+    """Print which checkpoint remains of a run that was stopped or failed.
 
     Args:
-        out: Its name.
-        resume: Whether an unfinished run in it is to go on.
-        overwrite: Whether results in it are to be replaced.
-        is_guided: Whether the run is one that leaves checkpoints.
+        asked: Output settings of the run.
+        error: What ended it; a `Stopped` carries the line instead.
+    """
+    if isinstance(error, InputError) and error.code not in (ExitCode.RESOURCES, ExitCode.NUMERIC):
+        return  # refused before it began
+    assert asked.out is not None
+    checkpoints = Checkpoints(Path(asked.out), {})
+    line = ""
+    if checkpoints.newest is not None:
+        kept = checkpoints.folder / checkpoints.newest
+        line = f"kept: {kept}; the same command with --resume goes on from there"
+    if isinstance(error, Stopped):  # printed last; the stage may have set a better one
+        error.kept = error.kept or line or "there was no checkpoint to keep yet"
+    elif line:
+        say(line)
+
+
+def output_folder(asked: OutputConfig, is_guided: bool) -> OutputFolder:
+    """Return the output folder, not yet entered.
+
+    Args:
+        asked: Output settings: the folder, and whether its run is resumed or overwritten.
+        is_guided: Whether this run writes checkpoints.
 
     Raises:
-        InputError: The run in it is finished, or is an unfinished one that nobody said what to do
-            with (`ExitCode.OUTPUT`).
+        InputError: ``--resume`` of a finished or unguided run, or an unfinished run without
+            ``--resume`` or ``--overwrite`` (`ExitCode.OUTPUT`).
     """
+    out, resume, overwrite = asked.out, asked.resume, asked.overwrite
+    assert out is not None
     newest = Checkpoints(Path(out), {}).newest
     if resume and newest is None and os.path.exists(Path(out, "run.json")):
         raise InputError(
@@ -280,5 +303,5 @@ def output_folder(out: str, *, resume: bool, overwrite: bool, is_guided: bool) -
             "give its flags, or --overwrite in place of --resume",
             ExitCode.OUTPUT,
         )
-    # A run to resume was allowed to replace what is there, or has made it: no other run gets in.
+    # A run that is resumed was allowed to replace these results, or wrote them itself.
     return OutputFolder(out, overwrite=overwrite or (resume and newest is not None))

@@ -1,4 +1,4 @@
-"""The result of a run: the picture under its light, and the files, for other tools too."""
+"""Result of a run: the final render and the files, those for other tools included."""
 
 from __future__ import annotations
 
@@ -29,14 +29,25 @@ from warpir.scene.camera import Camera
 from warpir.scene.light import LightSummary, summarize
 
 PREVIEW_SAMPLES = 16
-"""Camera samples per pixel of the preview of a run that nothing guides."""
+"""Camera samples per pixel of the preview of an unguided run."""
 
 
 # ------------------------------------------------------------------------------ the picture
 
 
-def render_result(run: Run, light: SceneLight) -> tuple[Picture, Renderer]:
-    """Render object and shadow, and put them into the photo."""
+@dataclass(frozen=True)
+class RenderedResult:
+    """The rendered picture of a run."""
+
+    picture: Picture
+    device: str
+    """Name of the Warp device that rendered it."""
+    measured: dict[str, Any]
+    """Triangles, bad pixels and repeated launches, for ``run.json``."""
+
+
+def render_result(run: Run, light: SceneLight) -> RenderedResult:
+    """Render object and shadow, and composite them into the photo."""
     with run.timings.stage("scene"):
         camera = _rendering_camera(run.inputs.camera, run.config.render.width)
         placed = run.memory.again(
@@ -47,11 +58,16 @@ def render_result(run: Run, light: SceneLight) -> tuple[Picture, Renderer]:
         picture = _picture(run, light, renderer, run.config.render.samples, run.config.render.rays)
     run.log.notices += run.memory.notices()  # printed when it happened
     run.log.notice(*renderer.bad_pixels.notices())
-    return picture, renderer
+    measured = {
+        "triangles": renderer.scene.triangle_count,
+        "bad_pixels": renderer.bad_pixels.count,
+        "memory_retries": run.memory.retries,
+    }
+    return RenderedResult(picture, str(renderer.scene.device), measured)
 
 
 def write_preview(run: Run, light: SceneLight) -> None:
-    """Write the composite as it will be, small and grainy, where previews are asked for."""
+    """Write a small and noisy preview of the composite, if previews are asked for."""
     settings = run.config.settled(on_cuda=run.device != "cpu").optimize
     if not settings.preview_every:
         return
@@ -92,34 +108,34 @@ def _rendering_camera(camera: Camera, width: int | None) -> Camera:
 
 @dataclass(frozen=True)
 class Maps:
-    """The lights of a result as they are in its files, each of shape [He, 2 He, 3]."""
+    """Lights of a result as in its files, shape [He, 2 He, 3] each."""
 
     light: FloatArray
     shadow: FloatArray | None
-    """That casts the shadow, where it is another one."""
+    """Light that casts the shadow, if it is another one."""
     detail: FloatArray | None
-    """With what the photo shows of the surroundings, where that is wanted."""
+    """Light with the photo's detail, if that is asked for."""
 
     @property
     def on_object(self) -> FloatArray:
-        """What the object was rendered under."""
+        """The light on the object."""
         return self.light if self.detail is None else self.detail
 
     @property
     def name_on_object(self) -> str:
-        """Name of that file."""
+        """File name of `on_object`."""
         return "envmap.exr" if self.detail is None else "envmap_detail.exr"
 
 
 @dataclass(frozen=True)
 class Written:
-    """What was written."""
+    """Written results."""
 
     results: Results
-    """The same, for the report."""
+    """Results in memory, for the report."""
     maps: Maps
     measured: dict[str, Any]
-    """What ``run.json`` says of it."""
+    """Entries of ``run.json``."""
 
 
 def write_results(run: Run, light: SceneLight, picture: Picture) -> Written:
@@ -169,7 +185,7 @@ def write_results(run: Run, light: SceneLight, picture: Picture) -> Written:
 
 
 def _write_light(output: OutputFolder, light: SceneLight) -> Maps:
-    """Write the lights, and the lobes of one that has them."""
+    """Write the maps of the lights, and the lobes if there are any."""
     shadow = detail = None
     texels = as_file_map(light.light)
     output.write_envmap(texels)
@@ -192,7 +208,7 @@ def _write_balls(run: Run, light: SceneLight) -> CodeArray:
 
 
 def _hand_off(run: Run, light: SceneLight, maps: Maps) -> dict[str, Any]:
-    """Write the files for Blender, three.js and colour tools; return what run.json says of them."""
+    """Write the files for Blender, three.js and colour tools; return entries of ``run.json``."""
     inputs = run.inputs
     handed, notices = write_hand_off(
         run.output,
@@ -220,7 +236,7 @@ def _say_what_is_seen(run: Run, summary: LightSummary, picture: Picture) -> None
 
 
 def _measured(run: Run, light: SceneLight, summary: LightSummary) -> dict[str, Any]:
-    """Return what run.json says of placement, light, mask and mesh."""
+    """Return the entries of ``run.json`` about placement, light, mask and mesh."""
     inputs, fit = run.inputs, light.fit
     measured: dict[str, Any] = {
         "prior": "none",
