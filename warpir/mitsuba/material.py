@@ -10,7 +10,6 @@ of each method.
 """
 
 from dataclasses import dataclass
-from functools import cache
 from typing import Any
 
 import drjit as dr
@@ -18,61 +17,33 @@ import mitsuba as mi
 import numpy as np
 from numpy.typing import NDArray
 
-from warpir.scene.asset import Asset, Material, Primitive, Texture, TextureSlot
+from warpir.mitsuba.lobes import (
+    MIN_ALPHA,
+    charlie,
+    ggx,
+    read_sheen_table,
+    sample_visible_normal,
+    schlick_weight,
+    sheen_table,
+)
+from warpir.mitsuba.texture import Image, face_tangents, wound
+from warpir.scene.asset import Asset, Primitive
 
-MIN_ALPHA = 1e-3
-SHEEN_ROWS, SHEEN_COLUMNS = 64, 96
-"""Of the table of the sheen's albedo, by roughness and by the square root of the cosine."""
-
-
-def srgb_decode(codes: NDArray[np.uint8]) -> NDArray[np.float32]:
-    """Linear values of sRGB codes (IEC 61966-2-1), same shape [1]."""
-    x = np.arange(256) / 255.0
-    table = np.where(x <= 0.04045, x / 12.92, ((x + 0.055) / 1.055) ** 2.4)
-    return table.astype(np.float32)[codes]
-
-
-class Image:
-    """A texture on the device, read bilinearly between texel centres."""
-
-    def __init__(self, texture: Texture, slot: TextureSlot, is_color: bool) -> None:
-        """Decode before filtering: RGB as sRGB where ``is_color``, alpha always linear."""
-        texels = texture.pixels.astype(np.float32) / np.float32(255.0)
-        if is_color:
-            texels[..., :3] = srgb_decode(texture.pixels[..., :3])
-        self.height, self.width = texels.shape[:2]
-        self.texels = mi.Float(texels.ravel())
-        self.wrap_u, self.wrap_v = texture.wrap_u, texture.wrap_v
-        self.slot = slot
-
-    def read(self, uv: mi.Point2f, active: mi.Bool) -> mi.Vector4f:
-        """RGBA at untransformed texture coordinates, v down from the image's top."""
-        a, b, c, d, e, f = self.slot.transform
-        x = (a * uv.x + b * uv.y + c) * self.width - 0.5
-        y = (d * uv.x + e * uv.y + f) * self.height - 0.5
-        left, top = dr.floor(x), dr.floor(y)
-        x -= left
-        y -= top
-        column, row = mi.Int32(left), mi.Int32(top)
-
-        def texel(i: mi.Int32, j: mi.Int32) -> mi.Vector4f:
-            index = _wrap(i, self.height, self.wrap_v) * self.width
-            index += _wrap(j, self.width, self.wrap_u)
-            return dr.gather(mi.Vector4f, self.texels, mi.UInt32(index), active)
-
-        upper = texel(row, column) * (1.0 - x) + texel(row, column + 1) * x
-        lower = texel(row + 1, column) * (1.0 - x) + texel(row + 1, column + 1) * x
-        return upper * (1.0 - y) + lower * y
-
-
-def _wrap(i: mi.Int32, size: int, mode: str) -> mi.Int32:
-    """Texel index inside ``[0, size)`` of an index anywhere, by glTF wrap mode."""
-    if mode == "clamp":
-        return dr.clip(i, 0, size - 1)
-    period = 2 * size if mode == "mirror" else size
-    i = i % period
-    i = dr.select(i < 0, i + period, i)
-    return dr.select(i < size, i, period - 1 - i)
+IS_COLOR = {
+    "base_color": True,
+    "metallic_roughness": False,
+    "normal": False,
+    "emission": True,
+    "specular": False,
+    "specular_color": True,
+    "clearcoat": False,
+    "clearcoat_roughness": False,
+    "clearcoat_normal": False,
+    "sheen_color": True,
+    "sheen_roughness": False,
+    "transmission": False,
+}
+"""Textures of a `Material` by name, and whether their RGB is sRGB."""
 
 
 @dataclass
@@ -130,53 +101,35 @@ class GltfBSDF(mi.BSDF):
             linear: Asset-to-world linear part, shape [3, 3]; turns tangents.
         """
         super().__init__(mi.Properties())
-        material: Material = asset.materials[primitive.material]
+        material = asset.materials[primitive.material]
         flags = mi.BSDFFlags.GlossyReflection | mi.BSDFFlags.FrontSide
         if material.double_sided:
             flags = flags | mi.BSDFFlags.BackSide
         self.m_components = [flags]
         self.m_flags = flags
         self.material = material
-
-        def image(slot: TextureSlot | None, is_color: bool) -> Image | None:
-            return None if slot is None else Image(asset.textures[slot.texture], slot, is_color)
-
-        self.base_color_image = image(material.base_color_texture, True)
-        self.metallic_roughness_image = image(material.metallic_roughness_texture, False)
-        self.normal_image = image(material.normal_texture, False)
-        self.emission_image = image(material.emission_texture, True)
-        self.specular_image = image(material.specular_texture, False)
-        self.specular_color_image = image(material.specular_color_texture, True)
-        self.clearcoat_image = image(material.clearcoat_texture, False)
-        self.clearcoat_roughness_image = image(material.clearcoat_roughness_texture, False)
-        self.clearcoat_normal_image = image(material.clearcoat_normal_texture, False)
-        self.sheen_color_image = image(material.sheen_color_texture, True)
-        self.sheen_roughness_image = image(material.sheen_roughness_texture, False)
-        self.transmission_image = image(material.transmission_texture, False)
+        slots = {name: getattr(material, f"{name}_texture") for name in IS_COLOR}
+        self.images = {
+            name: Image(asset.textures[slot.texture], slot, IS_COLOR[name])
+            for name, slot in slots.items()
+            if slot is not None
+        }
         has_sheen = max(material.sheen_color) > 0.0
         self.sheen_table = mi.Float(sheen_table().ravel()) if has_sheen else None
 
-        self.indices = mi.UInt32(_wound(primitive, linear).astype(np.uint32).ravel())
-        self.uvs = [
-            None if uv is None else mi.Float(np.ascontiguousarray(uv).ravel())
-            for uv in (primitive.uv0, primitive.uv1)
-        ]
-        self.colors = None
-        if primitive.colors is not None:
-            self.colors = mi.Float(np.ascontiguousarray(primitive.colors).ravel())
+        self.indices = mi.UInt32(wound(primitive, linear).astype(np.uint32).ravel())
+        self.uvs = [_uploaded(uv) for uv in (primitive.uv0, primitive.uv1)]
+        self.colors = _uploaded(primitive.colors)
         self.vertex_tangents = self.face_tangents = None
-        mapped = self.normal_image or self.clearcoat_normal_image
-        if mapped is not None:
-            if primitive.tangents is not None:
-                turned = primitive.tangents.astype(np.float64)
-                turned[:, :3] = turned[:, :3] @ linear.T
-                # A mirroring matrix turns the handedness of (n, t, b) around
-                turned[:, 3] *= np.sign(np.linalg.det(linear))
-                self.vertex_tangents = mi.Float(turned.astype(np.float32).ravel())
-            else:
-                self.face_tangents = mi.Float(
-                    face_tangents(primitive, mapped.slot.uv_set, linear).ravel()
-                )
+        mapped = self.images.get("normal") or self.images.get("clearcoat_normal")
+        if mapped is not None and primitive.tangents is not None:
+            turned = primitive.tangents.astype(np.float64)
+            turned[:, :3] = turned[:, :3] @ linear.T
+            # A mirroring matrix turns the handedness of (n, t, b) around
+            turned[:, 3] *= np.sign(np.linalg.det(linear))
+            self.vertex_tangents = _uploaded(turned.astype(np.float32))
+        elif mapped is not None:
+            self.face_tangents = _uploaded(face_tangents(primitive, mapped.slot.uv_set, linear))
 
     def sample(
         self,
@@ -249,9 +202,7 @@ class GltfBSDF(mi.BSDF):
         """Share of light that passes straight through: 1 - coverage, and what glass transmits."""
         alpha = mi.Float(1.0)
         if self.material.alpha_mode != "OPAQUE":
-            alpha *= self.material.alpha
-            if self.base_color_image is not None:
-                alpha *= self._read(self.base_color_image, si, active).w
+            alpha *= self._factor("alpha", "base_color", 3, si, active)
             if self.colors is not None:
                 alpha *= self._interpolate(self.colors, mi.Vector4f, si, active).w
         if self.material.alpha_mode == "MASK":
@@ -269,11 +220,8 @@ class GltfBSDF(mi.BSDF):
         self, name: str, si: mi.SurfaceInteraction3f, active: mi.Bool = True
     ) -> mi.Color3f:
         """Emitted radiance, the same in all directions, relative [W/(m^2 sr)]."""
-        emission = mi.Color3f(*self.material.emission)
-        if self.emission_image is not None:
-            emission *= _rgb(self._read(self.emission_image, si, active))
         surface = self._surface(si, active)
-        return emission * (1.0 - surface.coat) / surface.stopped & active
+        return self._color("emission", si, active) * (1.0 - surface.coat) / surface.stopped & active
 
     def traverse(self, callback: mi.TraversalCallback) -> None:
         """Expose nothing: materials are fixed here."""
@@ -294,64 +242,56 @@ class GltfBSDF(mi.BSDF):
         first, second, third = (dr.gather(kind, attribute, corner[k], active) for k in range(3))
         return first * (1.0 - si.uv.x - si.uv.y) + second * si.uv.x + third * si.uv.y
 
-    def _read(self, image: Image, si: mi.SurfaceInteraction3f, active: mi.Bool) -> mi.Vector4f:
-        """Texture of one slot at the hit, RGBA [1]."""
+    def _read(self, name: str, si: mi.SurfaceInteraction3f, active: mi.Bool) -> mi.Vector4f:
+        """RGBA of a texture at the hit, white where the material has none [1]."""
+        image = self.images.get(name)
+        if image is None:
+            return mi.Vector4f(1.0)
         uv = self.uvs[image.slot.uv_set]
         if uv is None:
             return image.read(mi.Point2f(0.0), active)
         return image.read(self._interpolate(uv, mi.Point2f, si, active), active)
 
+    def _color(self, name: str, si: mi.SurfaceInteraction3f, active: mi.Bool) -> mi.Color3f:
+        """A colour of the material times its texture, linear RGB."""
+        return mi.Color3f(*getattr(self.material, name)) * _rgb(self._read(name, si, active))
+
+    def _factor(
+        self, name: str, texture: str, channel: int, si: mi.SurfaceInteraction3f, active: mi.Bool
+    ) -> mi.Float:
+        """A factor of the material times one channel of a texture [1]."""
+        return getattr(self.material, name) * self._read(texture, si, active)[channel]
+
     def _surface(self, si: mi.SurfaceInteraction3f, active: mi.Bool) -> Surface:
         """Textured material and oriented normals at the hit."""
-        material = self.material
-        base_color = mi.Color3f(*material.base_color)
-        base_color *= self._tint(self.base_color_image, si, active)
+        material, hit = self.material, (si, active)
+        base_color = self._color("base_color", *hit)
         if self.colors is not None:
-            base_color *= _rgb(self._interpolate(self.colors, mi.Vector4f, si, active))
-        metallic, roughness = mi.Float(material.metallic), mi.Float(material.roughness)
-        if self.metallic_roughness_image is not None:
-            texel = self._read(self.metallic_roughness_image, si, active)
-            roughness *= texel.y
-            metallic *= texel.z
-
-        # Both normals turn to the viewer; where the shading normal still faces away, ng
+            base_color *= _rgb(self._interpolate(self.colors, mi.Vector4f, *hit))
+        roughness = self._factor("roughness", "metallic_roughness", 1, *hit)
+        metallic = self._factor("metallic", "metallic_roughness", 2, *hit)
         wo = si.to_world(si.wi)
-        ng = mi.Vector3f(si.n)
-        side = dr.select(dr.dot(ng, wo) < 0.0, mi.Float(-1.0), 1.0)
-        ng = ng * side
-
-        def oriented(image: Image | None, scale: float) -> mi.Vector3f:
-            n = self._shading_normal(si, image, scale, active) * side
-            return dr.select(dr.dot(n, wo) > 0.0, n, ng)
-
-        n = oriented(self.normal_image, material.normal_scale)
-        coat_n = oriented(self.clearcoat_normal_image, material.clearcoat_normal_scale)
+        n, coat_n, ng = self._oriented_normals(wo, *hit)
 
         # KHR_materials_ior, _specular
         f0 = ((1.0 - material.ior) / (1.0 + material.ior)) ** 2
-        f0 = f0 * mi.Color3f(*material.specular_color)
-        f0 *= self._tint(self.specular_color_image, si, active)
-        f90 = self._factor(material.specular, self.specular_image, 3, si, active)
+        f0 = f0 * self._color("specular_color", *hit)
+        f90 = self._factor("specular", "specular", 3, *hit)
         f0 = dr.minimum(f0, 1.0) * f90
 
         # KHR_materials_clearcoat, _sheen
-        clearcoat = self._factor(material.clearcoat, self.clearcoat_image, 0, si, active)
+        clearcoat = self._factor("clearcoat", "clearcoat", 0, *hit)
         coat = clearcoat * (0.04 + 0.96 * schlick_weight(dr.abs(dr.dot(wo, coat_n))))
-        coat_roughness = self._factor(
-            material.clearcoat_roughness, self.clearcoat_roughness_image, 1, si, active
-        )
-        sheen = mi.Color3f(*material.sheen_color)
-        sheen *= self._tint(self.sheen_color_image, si, active)
-        sheen_roughness = self._factor(
-            material.sheen_roughness, self.sheen_roughness_image, 3, si, active
-        )
+        coat_roughness = self._factor("clearcoat_roughness", "clearcoat_roughness", 1, *hit)
+        sheen = self._color("sheen_color", *hit)
+        sheen_roughness = self._factor("sheen_roughness", "sheen_roughness", 3, *hit)
         sheen_scale = mi.Float(1.0)
         if self.sheen_table is not None:
             E = read_sheen_table(self.sheen_table, dr.dot(n, wo), sheen_roughness)
             sheen_scale = 1.0 - dr.max(sheen) * E
 
         # KHR_materials_transmission, at the angle with the normal before any map
-        transmission = self._factor(material.transmission, self.transmission_image, 0, si, active)
+        transmission = self._factor("transmission", "transmission", 0, *hit)
         weight = schlick_weight(dr.abs(dr.dot(si.sh_frame.n, wo)))
         enters = 1.0 - dr.max(f0 + (f90 - f0) * weight)
         enters *= 1.0 - clearcoat * (0.04 + 0.96 * weight)
@@ -376,33 +316,32 @@ class GltfBSDF(mi.BSDF):
             stopped=1.0 - passes,
         )
 
-    def _tint(
-        self, image: Image | None, si: mi.SurfaceInteraction3f, active: mi.Bool
-    ) -> mi.Color3f:
-        """Read a colour texture at the hit; white without one."""
-        return mi.Color3f(1.0) if image is None else _rgb(self._read(image, si, active))
+    def _oriented_normals(
+        self, wo: mi.Vector3f, si: mi.SurfaceInteraction3f, active: mi.Bool
+    ) -> tuple[mi.Vector3f, mi.Vector3f, mi.Vector3f]:
+        """Normals of the base, the coat and the triangle, turned to the viewer.
 
-    def _factor(
-        self,
-        factor: float,
-        image: Image | None,
-        channel: int,
-        si: mi.SurfaceInteraction3f,
-        active: mi.Bool,
-    ) -> mi.Float:
-        """Factor times one channel of its texture [1]."""
-        if image is None:
-            return mi.Float(factor)
-        return factor * self._read(image, si, active)[channel]
+        Where a shading normal still faces away, the triangle's takes its place.
+        """
+        ng = mi.Vector3f(si.n)
+        side = dr.select(dr.dot(ng, wo) < 0.0, mi.Float(-1.0), 1.0)
+        ng = ng * side
+
+        def oriented(name: str, scale: float) -> mi.Vector3f:
+            n = self._shading_normal(name, scale, si, active) * side
+            return dr.select(dr.dot(n, wo) > 0.0, n, ng)
+
+        n = oriented("normal", self.material.normal_scale)
+        return n, oriented("clearcoat_normal", self.material.clearcoat_normal_scale), ng
 
     def _shading_normal(
-        self, si: mi.SurfaceInteraction3f, image: Image | None, scale: float, active: mi.Bool
+        self, name: str, scale: float, si: mi.SurfaceInteraction3f, active: mi.Bool
     ) -> mi.Vector3f:
         """Unit normal after a normal map, on the side the triangle's winding gives."""
         n = mi.Vector3f(si.sh_frame.n)
-        if image is None:
+        if name not in self.images:
             return n
-        texel = self._read(image, si, active) * 2.0 - 1.0
+        texel = self._read(name, si, active) * 2.0 - 1.0
         if self.vertex_tangents is not None:
             tangent = self._interpolate(self.vertex_tangents, mi.Vector4f, si, active)
         else:
@@ -460,147 +399,9 @@ class GltfBSDF(mi.BSDF):
         return dr.select(valid, f_cos / surface.stopped, 0.0), dr.select(valid, pdf, 0.0)
 
 
-def schlick_weight(cosine: mi.Float) -> mi.Float:
-    """Schlick's ``(1 - cos)^5`` [1]."""
-    x = dr.clip(1.0 - cosine, 0.0, 1.0)
-    x2 = x * x
-    return x2 * x2 * x
-
-
-def ggx(
-    n: mi.Vector3f, alpha: mi.Float, wo: mi.Vector3f, wi: mi.Vector3f
-) -> tuple[mi.Float, mi.Float]:
-    """GGX lobe about ``n`` without Fresnel term, and the density of reflecting at visible normals.
-
-    The value is 0 where either direction is below ``n``; visible normals also draw directions below
-    it, so the density is not. Both [1/sr].
-    """
-    frame = mi.Frame3f(n)
-    wm = dr.normalize(frame.to_local(wo) + frame.to_local(wi))
-    cos_o, cos_i = dr.dot(n, wo), dr.dot(n, wi)
-    # From tangents: 1 - cos^2 would lose the narrow lobes to rounding
-    alpha2 = dr.square(alpha)
-    slope = (dr.square(wm.x) + dr.square(wm.y)) / alpha2 + dr.square(wm.z)
-    D = dr.select(wm.z > 0.0, dr.rcp(dr.pi * alpha2 * dr.square(slope)), 0.0)
-    root_o = dr.sqrt(alpha2 + (1.0 - alpha2) * dr.square(cos_o))
-    root_i = dr.sqrt(alpha2 + (1.0 - alpha2) * dr.square(cos_i))
-    visibility = 0.5 / (cos_i * root_o + cos_o * root_i)
-    value = dr.select((cos_o > 0.0) & (cos_i > 0.0), D * visibility, 0.0)
-    # G1(wo) D / (4 cos_o), with G1 = 2 cos_o / (cos_o + root_o)
-    return value, dr.select(cos_o > 0.0, D * 0.5 / (cos_o + root_o), 0.0)
-
-
-def charlie(cos_m: mi.Float, cos_o: mi.Float, cos_i: mi.Float, alpha: mi.Float) -> mi.Float:
-    """Sheen lobe times ``cos_i``: Charlie's distribution and its visibility [1/sr]."""
-    inverse = dr.rcp(alpha)
-    sin2 = dr.maximum(1.0 - dr.square(cos_m), 0.0)
-    D = (2.0 + inverse) * sin2 ** (0.5 * inverse) * (0.5 * dr.inv_pi)
-    return D / (4.0 * cos_o * (1.0 + fibre_lambda(cos_o, alpha) + fibre_lambda(cos_i, alpha)))
-
-
-def fibre_lambda(cosine: Any, alpha: Any) -> Any:
-    """``lambda_sheen`` of KHR_materials_sheen, for Dr.Jit and NumPy alike."""
-    is_array = isinstance(cosine, np.ndarray)
-    exp, where = (np.exp, np.where) if is_array else (dr.exp, dr.select)
-    t = (1.0 - alpha) * (1.0 - alpha)
-    a = 21.5473 + (25.3245 - 21.5473) * t
-    b = 3.82987 + (3.32435 - 3.82987) * t
-    c = 0.19823 + (0.16801 - 0.19823) * t
-    d = -1.97760 + (-1.27393 + 1.97760) * t
-    e = -4.32054 + (-4.85967 + 4.32054) * t
-    near = abs(where(cosine < 0.5, cosine, 1.0 - cosine))
-    curve = a / (1.0 + b * near**c) + d * near + e
-    middle = a / (1.0 + b * 0.5**c) + d * 0.5 + e
-    return exp(where(cosine < 0.5, curve, 2.0 * middle - curve))
-
-
-@cache
-def sheen_table() -> NDArray[np.float32]:
-    """Albedo of the sheen's lobe by midpoint sums, at most 1, shape [roughness, sqrt(cosine)]."""
-    cosine = np.maximum(np.linspace(0.0, 1.0, SHEEN_COLUMNS) ** 2, 1e-5)
-    steps = (np.arange(200) + 0.5) / 200.0
-    cos_i, phi = (steps**3)[:, None], (np.pi * steps**2)[None, :]
-    area = 2.0 * (3.0 * steps**2)[:, None] * (2.0 * np.pi * steps)[None, :] / 200.0**2
-    table = np.zeros((SHEEN_ROWS, SHEEN_COLUMNS))
-    for row, roughness in enumerate(np.linspace(0.0, 1.0, SHEEN_ROWS)):
-        alpha = max(roughness**2, MIN_ALPHA)
-        shade = 1.0 + fibre_lambda(cos_i, alpha)
-        for column, cos_o in enumerate(cosine):
-            dot = cos_o * cos_i - np.sqrt((1.0 - cos_o**2) * (1.0 - cos_i**2)) * np.cos(phi)
-            sin2 = np.clip(1.0 - (cos_o + cos_i) ** 2 / (2.0 + 2.0 * dot), 0.0, 1.0)
-            D = (2.0 + 1.0 / alpha) * sin2 ** (0.5 / alpha) / (2.0 * np.pi)
-            masked = shade + fibre_lambda(np.array(cos_o), alpha)
-            table[row, column] = np.sum(D / (4.0 * cos_o * masked) * area)
-    return np.minimum(table, 1.0).astype(np.float32)
-
-
-def read_sheen_table(table: mi.Float, cosine: mi.Float, roughness: mi.Float) -> mi.Float:
-    """Bilinear lookup of `sheen_table`."""
-    x = dr.sqrt(dr.clip(cosine, 0.0, 1.0)) * (SHEEN_COLUMNS - 1)
-    y = dr.clip(roughness, 0.0, 1.0) * (SHEEN_ROWS - 1)
-    column = dr.minimum(mi.UInt32(x), SHEEN_COLUMNS - 2)
-    row = dr.minimum(mi.UInt32(y), SHEEN_ROWS - 2)
-    x, y = x - mi.Float(column), y - mi.Float(row)
-
-    def at(i: mi.UInt32, j: mi.UInt32) -> mi.Float:
-        return dr.gather(mi.Float, table, i * SHEEN_COLUMNS + j)
-
-    low = dr.lerp(at(row, column), at(row, column + 1), x)
-    high = dr.lerp(at(row + 1, column), at(row + 1, column + 1), x)
-    return dr.lerp(low, high, y)
-
-
-def sample_visible_normal(wo: mi.Vector3f, alpha: mi.Float, u: mi.Point2f) -> mi.Vector3f:
-    """Draw a GGX normal visible from ``wo`` (Dupuy and Benyoub 2023, spherical caps)."""
-    stretched = dr.normalize(mi.Vector3f(wo.x * alpha, wo.y * alpha, wo.z))
-    z = dr.fma(1.0 - u.y, 1.0 + stretched.z, -stretched.z)
-    sin_phi, cos_phi = dr.sincos(dr.two_pi * u.x)
-    r = dr.safe_sqrt((1.0 - z) * (1.0 + z))
-    h = mi.Vector3f(r * cos_phi, r * sin_phi, z) + stretched
-    return dr.normalize(mi.Vector3f(h.x * alpha, h.y * alpha, dr.maximum(h.z, 1e-9)))
-
-
-def face_tangents(
-    primitive: Primitive, uv_set: int, linear: NDArray[np.float64]
-) -> NDArray[np.float32]:
-    """World tangent and handedness of each triangle from its texture coordinates.
-
-    glTF's v runs down the image and its normal maps have +Y up, so the bitangent points
-    against ``dp_dv``: ``w = sign(dot(cross(n, t), -dp_dv))``.
-
-    Args:
-        primitive: Triangles, asset frame.
-        uv_set: 0 or 1.
-        linear: Asset-to-world linear part, shape [3, 3].
-
-    Returns:
-        Direction of increasing u and handedness, 0 where the mapping is degenerate,
-        shape [triangle, 4].
-    """
-    indices = _wound(primitive, linear)
-    tangents = np.zeros((len(indices), 4), dtype=np.float32)
-    uv = (primitive.uv0, primitive.uv1)[uv_set]
-    if uv is None:
-        return tangents
-    p = (primitive.positions @ linear.T)[indices]
-    st = uv.astype(np.float64)[indices]
-    e1, e2 = p[:, 1] - p[:, 0], p[:, 2] - p[:, 0]
-    s1, s2 = st[:, 1] - st[:, 0], st[:, 2] - st[:, 0]
-    det = s1[:, 0] * s2[:, 1] - s2[:, 0] * s1[:, 1]
-    good = np.abs(det) > 1e-20
-    inverse = np.where(good, 1.0 / np.where(good, det, 1.0), 0.0)[:, None]
-    dp_du = (e1 * s2[:, 1:] - e2 * s1[:, 1:]) * inverse
-    dp_dv = (e2 * s1[:, :1] - e1 * s2[:, :1]) * inverse
-    n = np.cross(e1, e2)
-    length = np.linalg.norm(dp_du, axis=1, keepdims=True)
-    tangents[:, :3] = dp_du / np.where(length > 0.0, length, 1.0)
-    tangents[:, 3] = np.sign(np.einsum("ij,ij->i", np.cross(n, dp_du), -dp_dv))
-    return tangents
-
-
-def _wound(primitive: Primitive, linear: NDArray[np.float64]) -> NDArray[np.int32]:
-    """Triangle indices, reversed where the matrix mirrors, so that outside stays outside."""
-    return primitive.indices if np.linalg.det(linear) > 0.0 else primitive.indices[:, ::-1]
+def _uploaded(attribute: NDArray[np.float32] | None) -> mi.Float | None:
+    """Copy an attribute of the vertices or triangles to the device."""
+    return None if attribute is None else mi.Float(np.ascontiguousarray(attribute).ravel())
 
 
 def _rgb(v: mi.Vector4f) -> mi.Color3f:

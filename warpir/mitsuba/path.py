@@ -103,24 +103,9 @@ class GltfPath(RBIntegrator):
             bsdf = si.bsdf(ray)
             emitted = throughput * bsdf.eval_attribute_3("emission", si, active)
             bounce = active & (depth + 1 < self.max_depth)
+            direct = self._direct(scene, sampler, si, throughput, bounce, primal)
 
-            # Light sample
-            ds, em_weight = scene.sample_emitter_direction(si, sampler.next_2d(), False, bounce)
-            shadow_ray = spawn(si, ds.d)
-            lit = bounce & (ds.pdf > 0.0)
-            if dr.hint(self.has_alpha, mode="scalar"):
-                lit &= ~intersect(scene, shadow_ray, sampler, False, True, lit).is_valid()
-            else:
-                lit &= ~scene.ray_test(shadow_ray, False, active=lit)
-            f_cos, pdf = bsdf.eval_pdf(context, si, si.to_local(ds.d), lit)
-            with dr.resume_grad(when=not primal):
-                if dr.hint(not primal, mode="scalar"):
-                    em_weight = scene.eval_emitter_direction(si, ds, lit) / ds.pdf
-                direct = dr.select(
-                    lit, throughput * f_cos * mis_weight(ds.pdf, pdf) * em_weight, 0.0
-                )
-
-            # BSDF sample: the next vertex, or the light
+            # Sample the BSDF: the next vertex, or the light
             bs, weight = bsdf.sample(context, si, sampler.next_1d(), sampler.next_2d(), bounce)
             throughput = dr.select(bounce, throughput * weight, 0.0)
             bounce &= dr.max(throughput) > 0.0
@@ -145,6 +130,29 @@ class GltfPath(RBIntegrator):
             depth += 1
             active = bounce & si.is_valid()
         return L if primal else d_L, seen, [], L
+
+    def _direct(
+        self,
+        scene: mi.Scene,
+        sampler: mi.Sampler,
+        si: mi.SurfaceInteraction3f,
+        throughput: mi.Spectrum,
+        active: mi.Bool,
+        primal: bool,
+    ) -> mi.Spectrum:
+        """Radiance of one emitter sample; attached to the light unless ``primal``."""
+        ds, em_weight = scene.sample_emitter_direction(si, sampler.next_2d(), False, active)
+        ray = spawn(si, ds.d)
+        lit = active & (ds.pdf > 0.0)
+        if self.has_alpha:
+            lit &= ~intersect(scene, ray, sampler, False, True, lit).is_valid()
+        else:
+            lit &= ~scene.ray_test(ray, False, active=lit)
+        f_cos, pdf = si.bsdf().eval_pdf(mi.BSDFContext(), si, si.to_local(ds.d), lit)
+        with dr.resume_grad(when=not primal):
+            if not primal:
+                em_weight = scene.eval_emitter_direction(si, ds, lit) / ds.pdf
+            return dr.select(lit, throughput * f_cos * mis_weight(ds.pdf, pdf) * em_weight, 0.0)
 
 
 mi.register_integrator("gltf_path", lambda props: GltfPath(props))

@@ -399,14 +399,7 @@ def render_run(
     camera = read_camera(folder / "camera.json", (plate.shape[1], plate.shape[0]))
     asset, matrix = load_asset(folder / OBJECT), np.eye(4)
     curves = read_curves(folder / "curves.json")
-    texels, texels_shadow = (
-        read_envmap(
-            own if (own := folder / f"envmap_{name}.exr").exists() else folder / "envmap.exr"
-        )
-        for name in ("detail", "shadow")
-    )
-
-    lit = foreground(asset, matrix, camera, texels, depth, spp, seed)
+    lit = foreground(asset, matrix, camera, _light(folder, "detail"), depth, spp, seed)
     coverage = lit.coverage[..., None]
     share = np.where(coverage > 0.0, coverage, 1.0)
 
@@ -415,7 +408,8 @@ def render_run(
         return curves.foreground.evaluate(x)[..., 0]
 
     displayed, slope = _through(tone, lit.mean / share)
-    plane = shadow_ratio(asset, matrix, camera, texels_shadow, spp, seed + 1, ground)
+    texels = _light(folder, "shadow")
+    plane = shadow_ratio(asset, matrix, camera, texels, spp, seed + 1, ground)
 
     def bend(ratio: Float64Array) -> Float64Array:
         curved = curves.shadow_ratio.evaluate(ratio)

@@ -1,0 +1,117 @@
+"""Scattering lobes of the glTF material in Dr.Jit: GGX, Charlie's sheen, and their sampling.
+
+Directions ``wo`` and ``wi`` point away from the surface, toward the camera and the light.
+"""
+
+from functools import cache
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+from numpy.typing import NDArray
+
+MIN_ALPHA = 1e-3
+"""Least GGX width [1]."""
+SHEEN_ROWS, SHEEN_COLUMNS = 64, 96
+"""Size of the table of the sheen's albedo, by roughness and by the square root of the cosine."""
+
+
+def schlick_weight(cosine: mi.Float) -> mi.Float:
+    """Schlick's ``(1 - cos)^5`` [1]."""
+    x = dr.clip(1.0 - cosine, 0.0, 1.0)
+    x2 = x * x
+    return x2 * x2 * x
+
+
+def ggx(
+    n: mi.Vector3f, alpha: mi.Float, wo: mi.Vector3f, wi: mi.Vector3f
+) -> tuple[mi.Float, mi.Float]:
+    """GGX lobe about ``n`` without Fresnel term, and the density of reflecting at visible normals.
+
+    The value is 0 where either direction is below ``n``; visible normals also draw directions below
+    it, so the density is not. Both [1/sr].
+    """
+    frame = mi.Frame3f(n)
+    wm = dr.normalize(frame.to_local(wo) + frame.to_local(wi))
+    cos_o, cos_i = dr.dot(n, wo), dr.dot(n, wi)
+    # From tangents: 1 - cos^2 would lose the narrow lobes to rounding
+    alpha2 = dr.square(alpha)
+    slope = (dr.square(wm.x) + dr.square(wm.y)) / alpha2 + dr.square(wm.z)
+    D = dr.select(wm.z > 0.0, dr.rcp(dr.pi * alpha2 * dr.square(slope)), 0.0)
+    root_o = dr.sqrt(alpha2 + (1.0 - alpha2) * dr.square(cos_o))
+    root_i = dr.sqrt(alpha2 + (1.0 - alpha2) * dr.square(cos_i))
+    visibility = 0.5 / (cos_i * root_o + cos_o * root_i)
+    value = dr.select((cos_o > 0.0) & (cos_i > 0.0), D * visibility, 0.0)
+    # G1(wo) D / (4 cos_o), with G1 = 2 cos_o / (cos_o + root_o)
+    return value, dr.select(cos_o > 0.0, D * 0.5 / (cos_o + root_o), 0.0)
+
+
+def charlie(cos_m: mi.Float, cos_o: mi.Float, cos_i: mi.Float, alpha: mi.Float) -> mi.Float:
+    """Sheen lobe times ``cos_i``: Charlie's distribution and its visibility [1/sr]."""
+    inverse = dr.rcp(alpha)
+    sin2 = dr.maximum(1.0 - dr.square(cos_m), 0.0)
+    D = (2.0 + inverse) * sin2 ** (0.5 * inverse) * (0.5 * dr.inv_pi)
+    return D / (4.0 * cos_o * (1.0 + fibre_lambda(cos_o, alpha) + fibre_lambda(cos_i, alpha)))
+
+
+def fibre_lambda(cosine: Any, alpha: Any) -> Any:
+    """``lambda_sheen`` of KHR_materials_sheen, for Dr.Jit and NumPy alike."""
+    is_array = isinstance(cosine, np.ndarray)
+    exp, where = (np.exp, np.where) if is_array else (dr.exp, dr.select)
+    t = (1.0 - alpha) * (1.0 - alpha)
+    a = 21.5473 + (25.3245 - 21.5473) * t
+    b = 3.82987 + (3.32435 - 3.82987) * t
+    c = 0.19823 + (0.16801 - 0.19823) * t
+    d = -1.97760 + (-1.27393 + 1.97760) * t
+    e = -4.32054 + (-4.85967 + 4.32054) * t
+    near = abs(where(cosine < 0.5, cosine, 1.0 - cosine))
+    curve = a / (1.0 + b * near**c) + d * near + e
+    middle = a / (1.0 + b * 0.5**c) + d * 0.5 + e
+    return exp(where(cosine < 0.5, curve, 2.0 * middle - curve))
+
+
+@cache
+def sheen_table() -> NDArray[np.float32]:
+    """Albedo of the sheen's lobe by midpoint sums, at most 1, shape [roughness, sqrt(cosine)]."""
+    cosine = np.maximum(np.linspace(0.0, 1.0, SHEEN_COLUMNS) ** 2, 1e-5)
+    steps = (np.arange(200) + 0.5) / 200.0
+    cos_i, phi = (steps**3)[:, None], (np.pi * steps**2)[None, :]
+    area = 2.0 * (3.0 * steps**2)[:, None] * (2.0 * np.pi * steps)[None, :] / 200.0**2
+    table = np.zeros((SHEEN_ROWS, SHEEN_COLUMNS))
+    for row, roughness in enumerate(np.linspace(0.0, 1.0, SHEEN_ROWS)):
+        alpha = max(roughness**2, MIN_ALPHA)
+        shade = 1.0 + fibre_lambda(cos_i, alpha)
+        for column, cos_o in enumerate(cosine):
+            dot = cos_o * cos_i - np.sqrt((1.0 - cos_o**2) * (1.0 - cos_i**2)) * np.cos(phi)
+            sin2 = np.clip(1.0 - (cos_o + cos_i) ** 2 / (2.0 + 2.0 * dot), 0.0, 1.0)
+            D = (2.0 + 1.0 / alpha) * sin2 ** (0.5 / alpha) / (2.0 * np.pi)
+            masked = shade + fibre_lambda(np.array(cos_o), alpha)
+            table[row, column] = np.sum(D / (4.0 * cos_o * masked) * area)
+    return np.minimum(table, 1.0).astype(np.float32)
+
+
+def read_sheen_table(table: mi.Float, cosine: mi.Float, roughness: mi.Float) -> mi.Float:
+    """Bilinear lookup of `sheen_table`."""
+    x = dr.sqrt(dr.clip(cosine, 0.0, 1.0)) * (SHEEN_COLUMNS - 1)
+    y = dr.clip(roughness, 0.0, 1.0) * (SHEEN_ROWS - 1)
+    column = dr.minimum(mi.UInt32(x), SHEEN_COLUMNS - 2)
+    row = dr.minimum(mi.UInt32(y), SHEEN_ROWS - 2)
+    x, y = x - mi.Float(column), y - mi.Float(row)
+
+    def at(i: mi.UInt32, j: mi.UInt32) -> mi.Float:
+        return dr.gather(mi.Float, table, i * SHEEN_COLUMNS + j)
+
+    low = dr.lerp(at(row, column), at(row, column + 1), x)
+    high = dr.lerp(at(row + 1, column), at(row + 1, column + 1), x)
+    return dr.lerp(low, high, y)
+
+
+def sample_visible_normal(wo: mi.Vector3f, alpha: mi.Float, u: mi.Point2f) -> mi.Vector3f:
+    """Draw a GGX normal visible from ``wo`` (Dupuy and Benyoub 2023, spherical caps)."""
+    stretched = dr.normalize(mi.Vector3f(wo.x * alpha, wo.y * alpha, wo.z))
+    z = dr.fma(1.0 - u.y, 1.0 + stretched.z, -stretched.z)
+    sin_phi, cos_phi = dr.sincos(dr.two_pi * u.x)
+    r = dr.safe_sqrt((1.0 - z) * (1.0 + z))
+    h = mi.Vector3f(r * cos_phi, r * sin_phi, z) + stretched
+    return dr.normalize(mi.Vector3f(h.x * alpha, h.y * alpha, dr.maximum(h.z, 1e-9)))
