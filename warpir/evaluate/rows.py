@@ -1,4 +1,4 @@
-"""The rows of the evaluation: whose light is judged."""
+"""Rows of the evaluation: each is one way to predict the light of a scene."""
 
 from __future__ import annotations
 
@@ -19,14 +19,14 @@ from warpir.app.config import InsertConfig, usage
 from warpir.app.inputs import Inputs
 from warpir.app.model_files import require_model
 from warpir.app.run import Run
-from warpir.core.arrays import CodeArray, Float64Array, FloatArray
+from warpir.core.arrays import FloatArray
 from warpir.core.color import luminance
 from warpir.core.errors import InputError
 from warpir.core.latlong import rotate_map
 from warpir.diffusion.models.embedded import build_network, save_embedded
 from warpir.evaluate.scenes import Place, Subject, mirrored
 from warpir.evaluate.stage import Prediction, Stage
-from warpir.io.images.photos import Photo, read_photo
+from warpir.io.images.photos import read_photo
 from warpir.io.images.writers import png_bytes
 from warpir.io.results import OutputFolder
 from warpir.lighting.fit import fit_lobes
@@ -35,21 +35,20 @@ from warpir.lighting.regressor import Regressor, random_regressor
 from warpir.lighting.scene_light import make_light
 from warpir.optimize.recover import recover
 from warpir.scene.light import Light, Lobes
-from warpir.scene.placement import Placement
 
 ORACLE_LOBES = 64
-"""Lobes that the oracle has: as many as the recovered light."""
+"""Number of lobes of the oracle: as many as of the recovered light."""
 BRIGHT_SIGMA = np.radians(5.0)
-"""Width of the lobe that stands for the brightest visible region [rad]."""
+"""Width of the lobe in place of the brightest visible region [rad]."""
 MEAN_OVER_PHOTO = 2.0
-"""Mean radiance of all directions over the photo's mean: of 120 crops of 20 panoramas the middle
-one had 2.1, because lamps and suns are seldom in the picture."""
+"""Mean radiance of all directions over the photo's mean; the median of 120 crops of 20 panoramas
+was 2.1, because lamps and suns are seldom in the picture."""
 BLUR_SHARE = 0.02
-"""Standard deviation of the blur under which it is sought, over the photo's width [1]."""
+"""Standard deviation of the blur before the brightest pixel is sought, over the photo width [1]."""
 
 
 class Bench:
-    """What the rows may use.
+    """Scenes, models and settings that the rows use.
 
     Args:
         scenes: All places and their subjects.
@@ -102,18 +101,15 @@ class Bench:
         found: dict[str, str | None] = {}
         for name in ("regressor", "prior"):
             given = self.config.flat()[name]
-            path = Path(str(where / f"{name}.safetensors")) if given is None else Path(given)
-            found[name] = None
-            if path.is_file():
-                with path.open("rb") as stream:
-                    found[name] = hashlib.file_digest(stream, "sha256").hexdigest()
+            path = Path(given or str(where / f"{name}.safetensors"))
+            is_there = path.is_file()
+            found[name] = hashlib.sha256(path.read_bytes()).hexdigest() if is_there else None
         return found
 
     @cached_property
     def random_network(self) -> Regressor:
-        """A regressor that has learnt nothing."""
-        where = torch.device("cpu" if self.device == "cpu" else self.device)
-        return random_regressor(self.seed).to(where)
+        """A regressor with random weights."""
+        return random_regressor(self.seed).to(torch.device(self.device))
 
     def other(self, place: Place) -> Place:
         """Return the next place of another panorama.
@@ -136,17 +132,17 @@ class Row:
     group: str
     """A key of `GROUPS`."""
     words: str
-    """What it is, for a reader of the tables."""
+    """Description for a reader of the tables."""
     of_place: Callable[[Bench, Place], Prediction] | None = None
-    """Of a row that asks the photograph alone."""
+    """Predicts from the photograph alone."""
     of_subject: Callable[[Bench, Stage, Subject], Prediction] | None = None
-    """Of a row that depends on the object too."""
+    """Predicts from the photograph and the object."""
     start: str | None = None
     """The row that it starts from and should be better than."""
     same_as: str | None = None
     """The row whose light it should give."""
     needs: tuple[str, ...] = ()
-    """Some of ``regressor``, ``prior`` and ``panoramas``, two of them."""
+    """Some of ``regressor``, ``prior`` and ``panoramas``; the last means two panoramas."""
 
     def require(self, bench: Bench) -> None:
         """Check that what the row needs is there.
@@ -170,16 +166,13 @@ GROUPS = {
     "controls": "what must fail, or flip",
     "ablations": "the authors' Table S3, each from an even light and without the acceptance test",
 }
-"""Of rows; a group's name stands for all of its rows."""
-
-
-def _even(level: float) -> Light:
-    return Light(texels=np.full((8, 16, 3), level, np.float32))
+"""Description of each group of rows; a group's name stands for all of its rows."""
 
 
 def uniform(bench: Bench, place: Place) -> Prediction:
     """Return an even grey light, as bright as the photograph lets one expect."""
-    return Prediction.of(_even(MEAN_OVER_PHOTO * float(luminance(place.photo_lin).mean())))
+    level = MEAN_OVER_PHOTO * float(luminance(place.photo_lin).mean())
+    return Prediction.of(Light(texels=np.full((8, 16, 3), level, np.float32)))
 
 
 def brightest(bench: Bench, place: Place) -> Prediction:
@@ -210,34 +203,23 @@ def mean_training(bench: Bench, place: Place) -> Prediction:
     )
 
 
-def regression(bench: Bench, place: Place) -> Prediction:
-    """Return what the regressor sees."""
-    return _regressed(bench.network, place)
-
-
-def _regressed(network: Regressor, place: Place) -> Prediction:
-    found = regress(network, place.photo, place.camera)
-    return Prediction.of(Light(lobes=found.lobes()), spread_deg=found.spread_deg)
-
-
-def random_regression(bench: Bench, place: Place) -> Prediction:
-    """Return what a network says that has learnt nothing."""
-    return _regressed(bench.random_network, place)
+def regression(network: Regressor, place: Place) -> Prediction:
+    """Return the light that a regressor estimates from the photograph."""
+    estimate = regress(network, place.photo, place.camera)
+    return Prediction.of(Light(lobes=estimate.lobes()), spread_deg=estimate.spread_deg)
 
 
 def other_photo(bench: Bench, place: Place) -> Prediction:
-    """Return what the regressor sees in another place, as if this camera had been there."""
+    """Return the estimate from another place's photograph, as if this camera had been there."""
     other = bench.other(place)
-    found = regress(bench.network, other.photo, other.camera)
-    turned = Light(lobes=found.lobes()).rotated(other.azimuth - place.azimuth)
-    return Prediction.of(turned)
+    light = regression(bench.network, other).light
+    return Prediction.of(light.rotated(other.azimuth - place.azimuth))
 
 
 def mirrored_photo(bench: Bench, place: Place) -> Prediction:
-    """Return what the regressor sees in the mirrored photograph, mirrored back."""
-    flipped = np.ascontiguousarray(place.photo[:, ::-1])
-    found = regress(bench.network, flipped, place.camera)
-    return Prediction.of(mirrored(Light(lobes=found.lobes()), place.azimuth))
+    """Return the estimate from the mirrored photograph, mirrored back."""
+    flipped = replace(place, photo=np.ascontiguousarray(place.photo[:, ::-1]))
+    return Prediction.of(mirrored(regression(bench.network, flipped).light, place.azimuth))
 
 
 def turned(bench: Bench, place: Place) -> Prediction:
@@ -273,7 +255,7 @@ def tone_floor(bench: Bench, stage: Stage, subject: Subject) -> Prediction:
 
 
 def predicted(bench: Bench, place: Place) -> Prediction:
-    """Return what another system said."""
+    """Return the light that another system predicted."""
     if place.name not in bench.predictions:
         raise InputError("--predictions", f"nothing for {place.name}")
     return Prediction.of(Light(texels=bench.predictions[place.name]))
@@ -289,7 +271,7 @@ def guided(**changes: Any) -> Callable[[Bench, Stage, Subject], Prediction]:
 
 
 def guided_randomly(bench: Bench, stage: Stage, subject: Subject) -> Prediction:
-    """Return what a prior finds that has learnt nothing."""
+    """Return the light that guidance by a prior with random weights recovers."""
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "random.safetensors"
         save_embedded(build_network(seed=bench.seed), path, {})
@@ -298,18 +280,19 @@ def guided_randomly(bench: Bench, stage: Stage, subject: Subject) -> Prediction:
 
 
 def guided_elsewhere(bench: Bench, stage: Stage, subject: Subject) -> Prediction:
-    """Return what guidance finds in another place's photograph, taken by this camera."""
+    """Return the light that guidance recovers from another place's photograph."""
     other = bench.other(subject.place)
     return recover_light(bench, subject, other.photo, {"start": "regressed"})
 
 
 def guided_mirrored(bench: Bench, stage: Stage, subject: Subject) -> Prediction:
-    """Return what guidance finds in the mirrored photograph of the mirrored object, mirrored."""
+    """Return the light recovered from mirrored photograph and object, mirrored back."""
     place, placement = subject.place, subject.placement
     right = np.array([np.cos(np.radians(place.azimuth)), 0.0, np.sin(np.radians(place.azimuth))])
     reflect = np.eye(4)
     reflect[:3, :3] -= 2.0 * np.outer(right, right)
-    flipped = replace(subject, placement=_moved(placement, reflect @ placement.asset_to_world))
+    reflected = replace(placement, asset_to_world=reflect @ placement.asset_to_world)
+    flipped = replace(subject, placement=reflected)
     photo = np.ascontiguousarray(place.photo[:, ::-1])
     found = recover_light(bench, flipped, photo, {"start": "regressed"})
     light = mirrored(found.light, place.azimuth)
@@ -317,10 +300,6 @@ def guided_mirrored(bench: Bench, stage: Stage, subject: Subject) -> Prediction:
     if found.light_shadow is not found.light:
         shadow = mirrored(found.light_shadow, place.azimuth)
     return replace(found, light=light, light_shadow=shadow)
-
-
-def _moved(placement: Placement, asset_to_world: Float64Array) -> Placement:
-    return replace(placement, asset_to_world=asset_to_world)
 
 
 def recover_light(
@@ -337,10 +316,10 @@ def recover_light(
     place = subject.place
     with tempfile.TemporaryDirectory() as folder:
         codes = np.round(255.0 * photo).astype(np.uint8)
-        picture = _written(codes, Path(folder) / "photo.png")
-        out = Path(folder) / "out"
+        path, out = Path(folder) / "photo.png", Path(folder) / "out"
+        path.write_bytes(png_bytes(codes, None, False, "a crop of a panorama"))
         config = bench.config.changed(
-            photo=str(Path(folder) / "photo.png"),
+            photo=str(path),
             asset=str(subject.asset_path),
             out=str(out),
             prompt=bench.config.guidance.prompt or f"a {_words(subject.asset_path.stem)}",
@@ -350,23 +329,14 @@ def recover_light(
             preview_every=0,
             **changes,
         )
-        inputs = Inputs(picture, subject.asset, place.camera, subject.placement)
+        inputs = Inputs(read_photo(path), subject.asset, place.camera, subject.placement)
         started = time.perf_counter()
         with OutputFolder(out) as output:
             run = Run(config, inputs, output, device=bench.device)
             outcome = recover(run, make_light(inputs, config))
     light = outcome.light
-    return Prediction(
-        light.light,
-        light.light_shadow,
-        light.curves,
-        about={"seconds": round(time.perf_counter() - started, 2), "record": outcome.record},
-    )
-
-
-def _written(codes: CodeArray, path: Path) -> Photo:
-    path.write_bytes(png_bytes(codes, None, False, "a crop of a panorama"))
-    return read_photo(path)
+    about = {"seconds": round(time.perf_counter() - started, 2), "record": outcome.record}
+    return Prediction(light.light, light.light_shadow, light.curves, about=about)
 
 
 def _words(stem: str) -> str:
@@ -415,11 +385,14 @@ ROWS = {
         needs=("regressor",),
     ),
     "brightest-region": Row(
-        "baselines",
-        "the same, half of it from the brightest visible region",
-        of_place=brightest,
+        "baselines", "the same, half of it from the brightest visible region", of_place=brightest
     ),
-    "regression": Row("methods", "the regressor alone", of_place=regression, needs=("regressor",)),
+    "regression": Row(
+        "methods",
+        "the regressor alone",
+        of_place=lambda bench, place: regression(bench.network, place),
+        needs=("regressor",),
+    ),
     "lds-uniform": Row(
         "methods",
         "guidance from an even light",
@@ -436,7 +409,9 @@ ROWS = {
     ),
     "predictions": Row("predictions", "the lights of --predictions", of_place=predicted),
     "random-regression": Row(
-        "controls", "a regressor with random weights", of_place=random_regression
+        "controls",
+        "a regressor with random weights",
+        of_place=lambda bench, place: regression(bench.random_network, place),
     ),
     "other-photo": Row(
         "controls",
@@ -487,7 +462,7 @@ ROWS = {
         "adapted model in both terms", loss="lds-lora-both", personalize=True
     ),
 }
-"""By name; the order is that of the tables."""
+"""All rows by name, in the order of the tables."""
 DEFAULT_ROWS = (
     *(name for name, row in ROWS.items() if row.group in ("references", "baselines", "methods")),
     *("random-regression", "other-photo", "mirrored"),

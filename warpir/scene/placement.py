@@ -1,4 +1,4 @@
-"""Where the object stands: the matrix from the asset's frame to the world.
+"""Placement of the object: the matrix from the asset's frame to the world.
 
 The asset's +Y becomes the ground's normal, its front +Z faces world +Z (toward a level camera) at
 ``rotate_y = 0``, and its lowest point touches the ground. What stands at the chosen point is the
@@ -16,28 +16,28 @@ from warpir.scene.camera import Camera, ground_point
 from warpir.scene.receiver import ReceiverMesh, first_hit
 
 DEFAULT_STAND = (0.5, 0.75)
-"""Where an object stands that was given no place: fractions of the photo's width and height."""
+"""Default place of an object, as fractions of the photo's width and height."""
 SMALLEST_PLAUSIBLE = 0.01
 LARGEST_PLAUSIBLE = 100.0
-"""Sizes [m] outside of these are more often a unit mistake than meant."""
+"""Range of plausible sizes [m]; others are more often a mistake of the unit."""
 STEEP = 0.5
 """Cosine between a surface and the ground below which nothing is expected to stand on it [1]."""
 
 
 @dataclass(frozen=True)
 class Placement:
-    """Where the object stands."""
+    """Pose of the object and its ground plane."""
 
     asset_to_world: Float64Array
     """Rotation, uniform scale and translation, column vectors [m], shape [4, 4]."""
     ground: Float64Array
     """Ground plane (a, b, c, d): unit normal on the camera's side, offset [m], shape [4]."""
     assumed: tuple[str, ...] = ()
-    """What was chosen because nothing was given, one line each."""
+    """Assumed values, one line each."""
     warnings: tuple[str, ...] = ()
-    """What may not be meant, one line each."""
+    """Doubtful values, one line each."""
     summary: str = ""
-    """How far away, how large and where in the photo the object is, one line."""
+    """Distance, size and position in the photo of the object, one line."""
 
 
 def place_asset(
@@ -81,35 +81,37 @@ def place_asset(
         assumed.append("the ground is the plane y = 0")
 
     if place is not None:
-        where = "--place"
         stand = np.asarray(place, dtype=np.float64)
         if is_plane:
             stand = stand - plane[:3] * (plane[:3] @ stand + plane[3])
     else:
-        where = "--at"
         if at is None:
             at = (DEFAULT_STAND[0] * camera.width, DEFAULT_STAND[1] * camera.height)
             assumed.append(f"the object stands at pixel {at[0]:g},{at[1]:g} (--at, --place)")
-        if mesh is None:
-            stand = point_on_ground(at, camera, plane)
-        else:
-            stand, steep = _point_on_place(at, camera, plane, mesh, is_plane)
-            warnings += steep
+        stand, steep = _point_at_pixel(at, camera, plane, mesh, is_plane)
+        warnings += steep
 
-    sides = high - low
-    scale = _scale_of(sides, scale, size, assumed, warnings)
+    scale = _scale_of(high - low, scale, size, assumed, warnings)
     rotation = turn(plane[:3], math.radians(rotate_y)) @ y_to(plane[:3])
-    foot = np.array([(low[0] + high[0]) / 2.0, low[1], (low[2] + high[2]) / 2.0])
-    asset_to_world = np.eye(4)
-    asset_to_world[:3, :3] = scale * rotation
-    asset_to_world[:3, 3] = stand - scale * (rotation @ foot)
-
-    shown = " x ".join(f"{scale * side:.3g}" for side in sides)
+    asset_to_world = _standing(low, high, scale, rotation, stand)
+    shown = " x ".join(f"{scale * side:.3g}" for side in high - low)
+    where = "--at" if place is None else "--place"
     seen, cut = _check_in_view(where, shown, _corners(low, high), asset_to_world, camera)
     warnings += cut
     away = float(np.linalg.norm(stand - origin))
     summary = f"the object of {shown} m stands {away:.3g} m from the camera, {seen}"
     return Placement(asset_to_world, plane, tuple(assumed), tuple(warnings), summary)
+
+
+def _standing(
+    low: Float64Array, high: Float64Array, scale: float, rotation: Float64Array, stand: Float64Array
+) -> Float64Array:
+    """Return the matrix that puts the centre of a bounding box's lowest face at a point."""
+    foot = np.array([(low[0] + high[0]) / 2.0, low[1], (low[2] + high[2]) / 2.0])
+    asset_to_world = np.eye(4)
+    asset_to_world[:3, :3] = scale * rotation
+    asset_to_world[:3, 3] = stand - scale * (rotation @ foot)
+    return asset_to_world
 
 
 def _scale_of(
@@ -119,7 +121,7 @@ def _scale_of(
     assumed: list[str],
     warnings: list[str],
 ) -> float:
-    """Return the factor on the asset's own size; what is assumed or doubtful is added.
+    """Return the factor on the asset's own size; add to assumptions and warnings.
 
     Raises:
         InputError: A single point cannot be brought to a size.
@@ -190,14 +192,16 @@ def _check_in_photo(at: tuple[float, float], camera: Camera) -> None:
         )
 
 
-def _point_on_place(
+def _point_at_pixel(
     at: tuple[float, float],
     camera: Camera,
     plane: Float64Array,
-    mesh: ReceiverMesh,
+    mesh: ReceiverMesh | None,
     is_plane: bool,
 ) -> tuple[Float64Array, list[str]]:
-    """Return what a pixel shows first, mesh or plane, world frame [m], and what looks odd."""
+    """Return the first point of mesh or plane at a pixel, world frame [m], and warnings."""
+    if mesh is None:
+        return point_on_ground(at, camera, plane), []
     _check_in_photo(at, camera)
     origin, direction = camera.ray(*at)
     distances, triangles = first_hit(mesh, origin[None], direction[None])
@@ -257,7 +261,7 @@ def _check_in_view(
 ) -> tuple[str, list[str]]:
     """Refuse an object that the camera cannot see; return where in the photo it is, and warnings.
 
-    The bounding box is looked at, so an object may be reported as cut that just fits.
+    The bounding box is tested, so an object that just fits may be reported as cut.
     """
     eye = np.linalg.solve(asset_to_world, camera.c2w[:, 3])[:3]
     if np.all((eye > corners[0]) & (eye < corners[-1])):
