@@ -330,7 +330,7 @@ def light_step_split(loop: LightOptimization, prior: StableDiffusion) -> dict[st
             watch.around(prior, "encode", "vae_forward"),
             watch.around(prior, "predict", "unet"),
             watch.around(loop.guide, "gradient", "guidance"),
-            watch.around(loop, "image", "render_forward"),
+            watch.around(loop, "composite", "render_forward"),
             watch.around(loop, "step", "step"),
         ):
             stack.enter_context(part)
@@ -339,7 +339,7 @@ def light_step_split(loop: LightOptimization, prior: StableDiffusion) -> dict[st
         light_steps(loop, TIMED_STEPS)
     step = loop.settings.step_count // 2 + 1
     for k in range(WARM_STEPS + TIMED_STEPS):
-        image = loop.image(step)
+        image = loop.composite(step).image
         if k >= WARM_STEPS:
             watch.start("render_backward")
         torch.autograd.backward([image], [torch.ones_like(image)])

@@ -488,7 +488,7 @@ def test_rows_that_are_traced_again_are_recorded_again() -> None:
         loop.expected = expected_light(even, even)
         loop.view = loop._trace()
     for step in range(CALLS):
-        found, expected = recorded.image(step), plain.image(step)
+        found, expected = recorded.composite(step).image, plain.composite(step).image
         torch.testing.assert_close(found, expected, rtol=0, atol=1e-4)
 
 

@@ -35,7 +35,7 @@ from warpir.diffusion.settings import GuidanceSettings, ModelSettings, Personali
 from warpir.insert import main
 from warpir.optimize.checkpoint import Checkpoints
 from warpir.optimize.light import LightOptimization
-from warpir.optimize.loop import BACK_OFF, GOOD_STEPS
+from warpir.optimize.loop import BACK_OFF, GOOD_STEPS, Composite
 from warpir.optimize.model import as_input_errors
 from warpir.render import bad_pixels
 from warpir.render.bad_pixels import NAMED, BadPixels
@@ -197,15 +197,15 @@ def plant_gradient(loop: LightOptimization, now: Callable[[], bool]) -> None:
 
 
 def plant_loss(loop: LightOptimization, now: Callable[[], bool]) -> None:
-    own = loop.terms
+    own = loop.composite
 
-    def terms() -> dict[str, tuple[float, Tensor]]:
-        found = own()
+    def composite(step: int) -> Composite:
+        found = own(step)
         if now():
-            found["consistency"] = (1.0, found["consistency"][1] * NAN)
+            found.terms["consistency"] = (1.0, found.terms["consistency"][1] * NAN)
         return found
 
-    loop.terms = terms  # type: ignore[method-assign]
+    loop.composite = composite  # type: ignore[method-assign]
 
 
 def plant_texel(loop: LightOptimization, now: Callable[[], bool]) -> None:

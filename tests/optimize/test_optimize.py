@@ -134,8 +134,9 @@ def check_gradient(loop: LightOptimization, step: int, names: tuple[str, ...]) -
 
     def objective() -> float:
         with torch.no_grad():
-            image = loop.image(step).cpu().double()
-            terms = sum(weight * float(term) for weight, term in loop.terms().values())
+            composite = loop.composite(step)
+            image = composite.image.cpu().double()
+            terms = sum(weight * float(term) for weight, term in composite.terms.values())
         return float((guide.d_image.double() * image).sum()) + terms
 
     for name, parameter in loop.unknowns.named_parameters():
@@ -222,7 +223,7 @@ def test_steps_are_what_adam_makes_of_the_gradient(device: str) -> None:
 
     loop = a_loop(device, Watch(), unknowns=bent())
     with torch.no_grad():
-        image = loop.image(0)
+        image = loop.composite(0).image
     before = values(loop)
     loop.step()
     torch.testing.assert_close(seen[0], image, rtol=0.0, atol=unordered(device))
@@ -469,7 +470,7 @@ def test_score_is_of_what_would_be_delivered(device: str) -> None:
         fused = loop.view.image(
             *loop.lights(1.0), loop.unknowns.curve_fg(), loop.unknowns.curve_shadow(), 0
         )
-        assert float((loop.image(1) - fused).abs().max()) > 1e-3
+        assert float((loop.composite(1).image - fused).abs().max()) > 1e-3
     torch.testing.assert_close(seen[0], fused, rtol=0.0, atol=unordered(device))
 
 
@@ -611,7 +612,7 @@ def test_view_changes_what_the_object_reaches(device: str, integrator: str) -> N
     """The sky shows the photo, the covered pixels show the ball, and shadows take light alone."""
     loop = a_loop(device, settings=replace(SETTINGS, integrator=integrator))
     with torch.no_grad():
-        image = loop.image(0).cpu().numpy()[0]
+        image = loop.composite(0).image.cpu().numpy()[0]
     photo = o.encode(loop.frame.photo_lin).transpose(2, 0, 1)
     difference = np.abs(image - photo).max(axis=0)
     coverage = loop.frame.coverage()
@@ -631,7 +632,11 @@ def test_mis_draws_other_samples_in_every_step(device: str) -> None:
     """And the same ones again for the same step: a run is a function of its seed."""
     loop = a_loop(device, settings=replace(SETTINGS, integrator="mis"))
     with torch.no_grad():
-        first, again, other = loop.image(0), loop.image(0), loop.image(1)
+        first, again, other = (
+            loop.composite(0).image,
+            loop.composite(0).image,
+            loop.composite(1).image,
+        )
     assert torch.equal(first, again) and not torch.equal(first, other)
 
 
@@ -646,7 +651,7 @@ def test_mis_takes_its_gradient_from_other_samples(device: str) -> None:
         image = loop.view.image(*loop.lights(loop.fusion(2)), *curves, seed)
         return image.detach(), torch.autograd.grad((image.cpu() * weight).sum(), leaf)[0]
 
-    image = loop.image(2)
+    image = loop.composite(2).image
     (gradient,) = torch.autograd.grad((image.cpu() * weight).sum(), leaf)
     found = [picture(loop.seed + k) for k in range(10)]
     same_image = [torch.allclose(image, other, rtol=0.0, atol=1e-6) for other, _ in found]

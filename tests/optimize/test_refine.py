@@ -292,7 +292,7 @@ def test_image_shows_other_samples_than_its_gradient() -> None:
     loop = material_loop(balls(TRUE), ("roughness",), settings=replace(SETTINGS, mis_samples=2))
     with torch.no_grad():
         replayed, shown = loop.final_image(3 + 8), loop.final_image(3 + 9)
-    image = loop.image(4)
+    image = loop.composite(4).image
     torch.testing.assert_close(image.detach(), shown, rtol=0.0, atol=1e-6)
     assert (shown - replayed).abs().max() > 0.01
     (found,) = torch.autograd.grad(image.sum(), loop.unknowns.parts["roughness"].raw)

@@ -1,4 +1,4 @@
-"""The optimisation: loop, unknowns, guidance, checkpoints; light and curves, or the materials.
+"""Optimisation of light and curves, or of materials: loop, unknowns, guidance, checkpoints.
 
 The only room that drives the networks of `warpir.diffusion`; knows nothing of pages or commands.
 """

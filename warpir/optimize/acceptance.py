@@ -1,9 +1,9 @@
-"""Did guidance help? The work of its force from where the light started to where it ended.
+"""Acceptance test of guidance: the work of its force from the start of the loop to its end.
 
-A loop follows the force downhill, so along its own way the potential falls by construction. Asked
-anew, with noises, times and crops that no step used, along the straight way through the space of
-the unknowns, the force tells whether the end is better; if it does not clearly say so, the start is
-kept. What a prior does not know it contradicts itself about, and then the start stands.
+A loop follows the force downhill, so along its own path the potential falls by construction. The
+force is therefore evaluated again, with noises, times and crops that no step used, along the
+straight path through the space of the unknowns. Unless the potential clearly falls there, the start
+is kept: where a prior knows nothing, its forces contradict each other and the test fails.
 """
 
 from __future__ import annotations
@@ -18,18 +18,18 @@ import torch
 from torch import Tensor
 
 PIECES = 8
-"""Of the way; the force is asked in the middle of each."""
+"""Number of pieces of the path; the force is evaluated in the middle of each."""
 DRAWS = 16
-"""Noises, times and crops, the same along the whole way."""
+"""Number of draws of noise, time and crop, the same along the whole path."""
 ONE_SIDED = 1.64
 """Standard errors that a fall must exceed: 95 % of a normal distribution."""
 
 
 class Force(Protocol):
-    """What pulls at a picture."""
+    """A force on an image, as the gradient of a potential."""
 
     def work(self, start: Tensor, middle: Tensor, end: Tensor, draws: Sequence[int]) -> list[float]:
-        """Return by draw what the potential rises by on a short way from one picture to another.
+        """Return the rise of the potential from one image to a near one, for each draw.
 
         Args:
             start: Display-encoded, in [0, 1], shape [1, 3, H, W].
@@ -41,13 +41,13 @@ class Force(Protocol):
 
 @dataclass(frozen=True)
 class Verdict:
-    """Whether the end is kept, and why."""
+    """Result of the acceptance test."""
 
     is_accepted: bool
     rise: float
     """Mean of the potential's rise from start to end over the draws."""
     error: float
-    """Its standard error."""
+    """Standard error of `rise`."""
     draws: int
 
     def record(self) -> dict[str, Any]:
@@ -57,7 +57,7 @@ class Verdict:
 
     @property
     def line(self) -> str:
-        """What is printed."""
+        """Verdict in one line."""
         numbers = f"dU = {self.rise:.3g} +- {self.error:.2g}"
         if self.is_accepted:
             return f"accepted: guidance, asked anew, prefers the end ({numbers})"
@@ -71,13 +71,13 @@ def judge(
     pieces: int = PIECES,
     draws: int = DRAWS,
 ) -> Verdict:
-    """Return whether the potential clearly falls along a way.
+    """Return whether the potential clearly falls along a path.
 
     Args:
-        force: Asked in the middle of each piece.
-        image: The picture at a share of the way, 0 to 1, without noise of its own.
-        pieces: Of the way.
-        draws: At least 2.
+        force: Evaluated in the middle of each piece.
+        image: Image at a share of the path, 0 to 1, without noise of its own.
+        pieces: Number of pieces of the path.
+        draws: Number of draws, at least 2.
     """
     seeds = range(draws)
     total = np.zeros(draws)
@@ -92,5 +92,5 @@ def judge(
 
 
 def blend(start: dict[str, Tensor], end: dict[str, Tensor], share: float) -> dict[str, Tensor]:
-    """Return a state on the straight way between two; directions are to be normalised again."""
+    """Return a state on the straight line between two; directions need normalising again."""
     return {name: torch.lerp(value, end[name], share) for name, value in start.items()}

@@ -1,4 +1,4 @@
-"""The course of a loop: its frame, its checkpoints, previews and progress, and how it went."""
+"""Running a loop: its frame, checkpoints, previews and progress, and its summary."""
 
 from __future__ import annotations
 
@@ -32,33 +32,33 @@ from warpir.scene.asset import Asset
 from warpir.scene.tone_curves import Curves, ToneKnots
 
 SAY_EVERY = 25
-"""Steps between two looks at the unknowns, for people."""
+"""Steps between two progress lines that describe the unknowns."""
 PREVIEW_SAMPLES = 16
-"""Camera samples per pixel of the first preview, which is to be there soon."""
+"""Camera samples per pixel of the first preview, which is written before the slow stages."""
 NOT_IDENTITY = frozenset(
     {"out", "overwrite", "resume", "preview_every", "checkpoint_every", "threads", "mark"}
     | {"allow_download", "show_prior", "samples", "rays", "indirect_limit", "width", "device"}
     | {"accept", "report"}
     | {name for name in DEFAULTS if name.startswith("max_")}
 )
-"""Settings that an interrupted run may change: they do not reach the optimisation, or, as the
-device that was chosen, count by what came of them."""
+"""Settings that a resumed run may change: they do not affect the optimisation, or, as the device,
+are compared by their resolved value."""
 
 
 @dataclass(frozen=True)
 class Outcome:
-    """What guidance has led to, as it is to be rendered."""
+    """Light and asset after guidance, ready for the final render."""
 
     light: SceneLight
     asset: Asset
     record: dict[str, Any]
-    """What ``run.json`` says of it."""
+    """Entries of ``run.json`` about model and loop."""
     notices: tuple[str, ...]
 
 
 @dataclass(frozen=True)
 class Course:
-    """A loop, what guides it, and how it went."""
+    """A finished loop, its guidance and its start."""
 
     run: Run
     loop: Optimization
@@ -66,10 +66,10 @@ class Course:
     guide: Guidance | DatasetUpdate
     renderer: Renderer
     first: float | None
-    """Score of where the loop started."""
+    """Score of the loop's start."""
 
     def summary(self) -> dict[str, Any]:
-        """Return the few numbers that say how the loop went."""
+        """Return counts and scores of the loop."""
         state = self.loop.state
         return {
             "steps": state.step,
@@ -81,7 +81,7 @@ class Course:
         }
 
     def record(self, integrator: str) -> dict[str, Any]:
-        """Return what ``run.json`` says of model and loop, which rendered by an integrator."""
+        """Return the entries of ``run.json`` about model, loop and its integrator."""
         counts = {
             "clipped_steps": self.guide.counts.clipped_steps,
             "bad_pixels": self.renderer.bad_pixels.count,
@@ -93,7 +93,7 @@ class Course:
         }
 
     def notices(self) -> Iterator[str]:
-        """Yield what the user should know of it."""
+        """Yield the notices of model, loop and renderer."""
         yield from self.guided.prior.notices
         yield from self.guided.notices
         if self.loop.state.skipped:
@@ -131,7 +131,7 @@ class Course:
 
 
 def open_checkpoints(run: Run) -> Checkpoints:
-    """Return the run's checkpoints; the model is not among what they depend on yet.
+    """Return the run's checkpoints; their identity does not include the model yet.
 
     Raises:
         InputError: --out holds an unfinished run that is neither resumed nor overwritten, or
@@ -159,7 +159,7 @@ def make_frame(run: Run) -> Frame:
     """Return scene and photo at the loop's resolution.
 
     Raises:
-        InputError: The object is not seen in it; better known before the model is adapted.
+        InputError: The object covers no pixel; checked before the model is adapted.
     """
     config, camera = run.config, run.inputs.camera
     width = min(config.optimize.picture_width, camera.width)
@@ -237,7 +237,7 @@ def follow(
 
 
 class _Watch:
-    """Shows a person who waits how far a loop is, and what its picture looks like."""
+    """Prints progress lines and writes previews of a loop."""
 
     def __init__(self, run: Run) -> None:
         self.run, self.words = run, ""
@@ -256,7 +256,7 @@ class _Watch:
 
 
 def write_start(run: Run, frame: Frame, start: SceneLight) -> None:
-    """Write the composite under the light of the start, before anything slow is done."""
+    """Write the composite under the start's light, before the slow stages."""
     lit = LitFrame(frame, start, torch.device(run.device), PREVIEW_SAMPLES)
     curves = (ToneCurve(n).to(run.device)() for n in (1, 3))
     with torch.no_grad():
@@ -264,7 +264,7 @@ def write_start(run: Run, frame: Frame, start: SceneLight) -> None:
 
 
 def write_preview(run: Run, image: torch.Tensor, step: int) -> None:
-    """Write a composite, shape [1, 3, H, W], to ``progress/``; earlier results are not touched."""
+    """Write a composite, shape [1, 3, H, W], to ``progress/``; earlier results stay."""
     shown = image[0].permute(1, 2, 0).cpu().numpy()
     path = run.output.write_preview(step, np.round(shown * 255.0).astype(np.uint8))
     run.log.say(f"preview: {path}")

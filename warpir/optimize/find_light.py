@@ -1,6 +1,6 @@
-"""The light of a run: given, estimated from the photo or recovered, with what the photo shows.
+"""Light of a run: given, estimated from the photo or recovered, with the photo's detail.
 
-torch and the networks are imported by the ways that need them.
+torch and the networks are imported where they are needed.
 """
 
 from __future__ import annotations
@@ -26,18 +26,18 @@ class LitRun:
     """A run whose light is known."""
 
     run: Run
-    """Its asset is as it is to be rendered."""
+    """The run, with the asset of the final render."""
     light: SceneLight
     measured: dict[str, Any]
-    """What ``run.json`` says of where the light comes from."""
+    """Entries of ``run.json`` about the light's origin."""
 
 
 def find_light(run: Run, given: SceneLight | None) -> LitRun:
-    """Return the run under its light, whichever way that is found.
+    """Return the run with its light.
 
     Args:
         run: On its device.
-        given: The light that the user gave or described; None: it is estimated from the photo.
+        given: Light of a file or of flags; None to estimate it from the photo.
 
     Raises:
         InputError: As `warpir.optimize.recover.recover`.
@@ -45,7 +45,7 @@ def find_light(run: Run, given: SceneLight | None) -> LitRun:
     if run.config.is_guided:
         with run.progress, fixed_arithmetic(run.device, run.config.render.deterministic):
             lit = _guided(run, given)
-        with run.timings.stage("scene"):  # the garbage of guidance makes room for it
+        with run.timings.stage("scene"):  # frees the memory of guidance
             release()
         return _with_detail(lit)
     light, measured = given, dict[str, Any]()
@@ -59,7 +59,7 @@ def find_light(run: Run, given: SceneLight | None) -> LitRun:
 
 
 def _guided(run: Run, given: SceneLight | None) -> LitRun:
-    """Let the prior find the light, or change the object under the light it has."""
+    """Recover the light by guidance, or refine the object under the given light."""
     if run.config.task.refine is None:
         from warpir.optimize.recover import recover
 
@@ -75,7 +75,7 @@ def _guided(run: Run, given: SceneLight | None) -> LitRun:
 
 
 def _estimated(run: Run) -> tuple[SceneLight, dict[str, Any]]:
-    """Estimate the light from the photo; return it, and what run.json says of it."""
+    """Estimate the light from the photo; return it and its entry in ``run.json``."""
     is_fixed = run.config.render.deterministic
     with run.timings.stage("regress"), fixed_arithmetic(run.device, is_fixed):
         from warpir.lighting.estimate import estimate_light
@@ -86,10 +86,10 @@ def _estimated(run: Run) -> tuple[SceneLight, dict[str, Any]]:
 
 
 def _with_detail(lit: LitRun) -> LitRun:
-    """Put into the light what the photo shows of it, unless a panorama has its own detail."""
+    """Add the photo's detail to the light, unless a panorama has its own."""
     run, light = lit.run, lit.light
     has_own = run.config.light.file is not None and light.light.lobes is None
-    if run.inputs.run is not None:  # lit by what an earlier run was lit by, with or without
+    if run.inputs.run is not None:  # the earlier run's light may have detail of its own
         has_own = not Path(run.inputs.run.path, "envmap_detail.exr").exists()
     if not run.config.light.detail or has_own:
         return lit

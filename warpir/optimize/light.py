@@ -19,7 +19,7 @@ from warpir.lighting.fusion import fuse
 from warpir.lighting.regularizers import bend, chroma, consistency, spread
 from warpir.lighting.sg_light import LightBounds, SGLight, narrowest
 from warpir.lighting.trust_region import TrustRegion
-from warpir.optimize.loop import Guide, Optimization
+from warpir.optimize.loop import Composite, Guide, Optimization
 from warpir.optimize.view import Frame, View, expected_light
 from warpir.render.integrator import Radiance
 from warpir.render.tone_curve import Knots, ToneCurve
@@ -28,19 +28,19 @@ from warpir.scene.camera import Camera
 from warpir.scene.light import Light, Lobes, describe, summarize
 
 RETRACE_EVERY = 25
-"""Steps between two looks at whether the light has left what was expected of it."""
+"""Steps between two checks of the traced rows' staleness."""
 
 Function = Callable[..., tuple[Tensor, ...]]
 Record = Callable[[torch.nn.Module], Function]
-"""Given a module, returns what does the same faster, such as a CUDA graph's replay."""
+"""Returns a faster function equal to a module, such as the replay of its CUDA graph."""
 
 
 class Unknowns(torch.nn.Module):
-    """All that is recovered: two lights and four curves.
+    """The unknowns of the recovery: two lights and four tone curves.
 
     Args:
-        light_fg: Lights the object.
-        light_shadow: Casts its shadow.
+        light_fg: Light on the object.
+        light_shadow: Light that casts its shadow.
         bins: Bins of each tone curve.
     """
 
@@ -72,7 +72,7 @@ class Unknowns(torch.nn.Module):
 
 @dataclass(frozen=True)
 class Parts:
-    """What a step makes before it is composed."""
+    """Inputs of a step's composite, and its regularisers."""
 
     radiance: Radiance
     curve_fg: Knots
@@ -81,13 +81,13 @@ class Parts:
     """Regularisers by name."""
 
     def tensors(self) -> tuple[Tensor, ...]:
-        """Return all of them in a fixed order."""
+        """Return all tensors in a fixed order."""
         groups = (self.radiance, self.curve_fg, self.curve_shadow)
         return *(x for group in groups for x in vars(group).values()), *self.terms.values()
 
     @staticmethod
     def of(tensors: Sequence[Tensor], names: Sequence[str]) -> Parts:
-        """Return the parts again, with the names of their terms."""
+        """Undo `tensors`; ``names`` are those of the terms."""
         radiance, curve_fg, curve_shadow = tensors[:3], tensors[3:6], tensors[6:9]
         terms = dict(zip(names, tensors[9:], strict=True))
         return Parts(Radiance(*radiance), Knots(*curve_fg), Knots(*curve_shadow), terms)
@@ -98,13 +98,13 @@ class LightOptimization(Optimization):
 
     Args:
         frame: Scene, photo, tone operator.
-        guide: What looks right.
+        guide: Gradient and score of the image.
         settings: Steps, rates, weights, schedules.
-        unknowns: Where to start; changed in place.
+        unknowns: Parameters at their start; changed in place.
         cache: Folder for traced rows, or None.
-        transport: How finely light is traced; by default the heights are those of the settings.
-        record: Makes steps with `transport` faster; by default they are taken as they are.
-        region: Where the light is expected, or None where nothing is known.
+        transport: Resolution of light transport; by default the settings'.
+        record: Speeds up steps with `transport`, such as by CUDA graphs.
+        region: Trust region of the light, or None.
     """
 
     unknowns: Unknowns
@@ -132,22 +132,20 @@ class LightOptimization(Optimization):
         self.retraced = 0
         self.region = region if settings.trust > 0.0 else None
         self._record = record
-        self._terms: dict[str, Tensor] = {}
-        self.term_names: tuple[str, ...] = ()
         with torch.no_grad():
             self.expected = expected_light(*self.lights(0.0))
         self.view = self._trace()
 
     def _trace(self) -> View:
         view = View(self.frame, self.expected, self.rows, self.settings.mis_samples, self.cache)
-        # What was recorded reads the rows of the view before.
+        # A recording reads the rows of the previous view.
         self._recorded = None
         if self._record is not None and view.transport is not None:
             self._recorded = self._record(_TorchHalf(self))
         return view
 
     def fusion(self, step: int) -> float:
-        """Return ``s_fuse`` of a step: how far both lights have become one [1]."""
+        """Return ``s_fuse`` of a step: 0 for two lights, 1 for one [1]."""
         if self.settings.fusion_kind == "schedule":
             share = step / max(self.settings.step_count - 1, 1)
             start, end = self.settings.fusion_start, self.settings.fusion_end
@@ -156,7 +154,7 @@ class LightOptimization(Optimization):
 
     @property
     def final_fusion(self) -> float:
-        """``s_fuse`` of what is delivered."""
+        """``s_fuse`` of the delivered light."""
         return 1.0 if self.settings.fusion_kind == "schedule" else 0.0
 
     def lights(self, scale: float, height: int | None = None) -> tuple[Tensor, Tensor]:
@@ -176,38 +174,53 @@ class LightOptimization(Optimization):
         return texels_fg, self.unknowns.light_shadow.texels(height)
 
     def parts(self, scale: float | Tensor, seed: int = 0) -> Parts:
-        """Return everything up to the composite; of torch alone with `transport`."""
+        """Return the inputs of the composite; by torch alone with `transport`."""
         unknowns, maps = self.unknowns, self._separate(self.settings.light_rows)
         curves = unknowns.curve_fg(), unknowns.curve_shadow()
         radiance = self.view.radiance(*self._fused(maps, scale), seed)
-        return Parts(radiance, *curves, self._terms_of(maps, curves))
+        return Parts(radiance, *curves, self._terms(maps, curves))
 
     def _fused(self, maps: tuple[Tensor, Tensor], scale: float | Tensor) -> tuple[Tensor, Tensor]:
         return maps if self.settings.fusion_kind == "single" else fuse(*maps, scale)
 
-    def _terms_of(
-        self, maps: tuple[Tensor, Tensor], curves: tuple[Knots, Knots]
-    ) -> dict[str, Tensor]:
-        """Return the authors' terms (eq. 10, 11) and ours, of which trust is there if asked for."""
-        unknowns = self.unknowns
-        terms: dict[str, Tensor] = {}
-        if self.settings.has_lobe_shape:
-            terms["chroma"] = 0.5 * (chroma(unknowns.light_fg) + chroma(unknowns.light_shadow))
-        if self.settings.fusion_kind != "single":
-            terms |= {"consistency": consistency(*maps), "spread": spread(maps[1])}
-        if self.settings.has_tone_curve:
-            terms["bend"] = bend(curves[0]) + bend(curves[1])
-        if self.region is not None:
-            terms["trust"] = self.region.distance(unknowns.light_fg)
-            if self.settings.fusion_kind != "single":
-                terms["trust"] = terms["trust"] + self.region.distance(unknowns.light_shadow)
-        return terms
+    @property
+    def term_names(self) -> tuple[str, ...]:
+        """Names of the regularisers, in the order of `Parts.terms`."""
+        has_two = self.settings.fusion_kind != "single"
+        is_used = {
+            "chroma": self.settings.has_lobe_shape,
+            "consistency": has_two,
+            "spread": has_two,
+            "bend": self.settings.has_tone_curve,
+            "trust": self.region is not None,
+        }
+        return tuple(name for name, used in is_used.items() if used)
 
-    def image(self, step: int) -> Tensor:
-        """Return the composite of a step under lights fused as far as the schedule says.
+    def _terms(self, maps: tuple[Tensor, Tensor], curves: tuple[Knots, Knots]) -> dict[str, Tensor]:
+        """Return the regularisers: the authors' (eq. 10, 11), plain curves, the trust region."""
+        fg, shadow = self.unknowns.light_fg, self.unknowns.light_shadow
+        formulas: dict[str, Callable[[], Tensor]] = {
+            "chroma": lambda: 0.5 * (chroma(fg) + chroma(shadow)),
+            "consistency": lambda: consistency(*maps),
+            "spread": lambda: spread(maps[1]),
+            "bend": lambda: bend(curves[0]) + bend(curves[1]),
+            "trust": self._distance,
+        }
+        return {name: formulas[name]() for name in self.term_names}
 
-        What is asked of a picture by `mis` follows its noise too, so its gradient comes from other
-        samples; with the same ones it would also lessen that noise, by a light that moves.
+    def _distance(self) -> Tensor:
+        """Return the distance of the lights from where they are expected."""
+        assert self.region is not None
+        distance = self.region.distance(self.unknowns.light_fg)
+        if self.settings.fusion_kind == "single":
+            return distance
+        return distance + self.region.distance(self.unknowns.light_shadow)
+
+    def composite(self, step: int) -> Composite:
+        """Return the composite of a step under lights fused by the schedule, with regularisers.
+
+        Guidance follows the noise of an image by `mis` too, so the gradient comes from other
+        samples; with the same ones, the light would also move to lessen that noise.
         """
         scale = self.fusion(step)
         self.frame.renderer.bad_pixels.iteration = step
@@ -215,28 +228,24 @@ class LightOptimization(Optimization):
             parts = self.parts(scale, self.seed + 2 * step)
         else:
             device = self.unknowns.light_fg.axis.device
-            made = self._recorded(torch.full((), scale, device=device))
-            parts = Parts.of(made, self.term_names)
-        self._terms = parts.terms
+            tensors = self._recorded(torch.full((), scale, device=device))
+            parts = Parts.of(tensors, self.term_names)
         curves = parts.curve_fg, parts.curve_shadow
-        replayed = self.view.compose(parts.radiance, *curves)
-        if self.view.transport is not None:
-            return replayed
-        with torch.no_grad():
-            shown = self.view.image(*self.lights(scale), *curves, self.seed + 2 * step + 1)
-        return replayed + (shown - replayed.detach())
+        image = self.view.compose(parts.radiance, *curves)
+        if self.view.transport is None:
+            with torch.no_grad():
+                shown = self.view.image(*self.lights(scale), *curves, self.seed + 2 * step + 1)
+            image = image + (shown - image.detach())
+        terms = {name: (getattr(self.settings, name), term) for name, term in parts.terms.items()}
+        return Composite(image, terms)
 
     def final_image(self, seed: int) -> Tensor:
-        """Return the composite under the light that would be delivered."""
+        """Return the composite under the light as it would be delivered."""
         curves = self.unknowns.curve_fg(), self.unknowns.curve_shadow()
         return self.view.image(*self.lights(self.final_fusion), *curves, seed)
 
-    def terms(self) -> dict[str, tuple[float, Tensor]]:
-        """Return the regularisers of what `image` rendered last."""
-        return {name: (getattr(self.settings, name), term) for name, term in self._terms.items()}
-
     def describe(self, camera: Camera) -> str:
-        """Return where the light comes from, and how much of it."""
+        """Return the direction of the light and its share in a few words."""
         with torch.no_grad():
             texels = self.lights(self.final_fusion)[1].cpu().numpy()
         return describe(summarize(Light(texels=texels)), camera.c2w)
@@ -247,7 +256,7 @@ class LightOptimization(Optimization):
         self.unknowns.light_shadow.project()
 
     def prepare(self, step: int) -> None:
-        """Trace light transport again once the light has left what was expected of it."""
+        """Trace light transport again when its rows have become too noisy for the light."""
         if self.view.transport is None or step == 0 or step % RETRACE_EVERY:
             return
         with torch.no_grad():
@@ -267,7 +276,7 @@ class LightOptimization(Optimization):
         return light_fg, Light(texels=shadow.cpu().numpy())
 
     def state_dict(self) -> dict[str, Any]:
-        """Return the loop's state and the light that the rows were traced for."""
+        """Return the loop's state and the light that guided the tracing of the rows."""
         assert self.expected.texels is not None
         return {
             **super().state_dict(),
@@ -276,7 +285,7 @@ class LightOptimization(Optimization):
         }
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
-        """Go on from `state_dict`; light transport is traced again, or found in the cache."""
+        """Restore `state_dict`; light transport is traced again or read from the cache."""
         super().load_state_dict(state)
         self.retraced = state["retraced"]
         expected = Light(texels=state["expected"].numpy())
@@ -294,9 +303,7 @@ class _TorchHalf(torch.nn.Module):
 
     def forward(self, scale: Tensor) -> tuple[Tensor, ...]:
         """Return the parts of a step; ``scale`` is ``s_fuse`` [1]."""
-        parts = self.loop.parts(scale)
-        self.loop.term_names = tuple(parts.terms)
-        return parts.tensors()
+        return self.loop.parts(scale).tensors()
 
 
 def _groups(unknowns: Unknowns, settings: OptimizeSettings) -> list[dict[str, Any]]:

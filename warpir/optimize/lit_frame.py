@@ -1,4 +1,4 @@
-"""A frame of the loop's size under a light that stands still."""
+"""A frame of the loop's size under a fixed light."""
 
 from __future__ import annotations
 
@@ -14,16 +14,16 @@ from warpir.render.renderer import index_of
 from warpir.render.tone_curve import Knots
 
 STILL_SAMPLES = 64
-"""Camera samples per pixel of what is rendered once."""
+"""Camera samples per pixel of the parts that are rendered once."""
 
 
 class LitFrame:
-    """A frame under a light that stands still; what no unknown reaches is rendered here, once.
+    """A frame under a fixed light; parts that do not depend on the unknowns are rendered once.
 
     Args:
         frame: Scene, photo, tone operator.
         light: The light.
-        device: Where the unknowns are.
+        device: Device of the unknowns.
         samples: Camera samples per pixel.
 
     Attributes:

@@ -1,16 +1,16 @@
-"""The loop of every optimisation: unknowns follow a gradient on the composite (DiPIR, section 4.3).
+"""Optimisation loop: unknowns follow a diffusion model's gradient (DiPIR, section 4.3).
 
     for step in range(step_count):
-        image = render and compose(unknowns)               `Optimization.image`, of the subclasses
-        d_image = guide.gradient(image, step)              of a diffusion model, or of a test
-        d_image and the regularisers, backward (eq. 9)     `Optimization.differentiate`
+        composite = render and compose(unknowns)           `Optimization.composite`, of a subclass
+        d_image = guide.gradient(composite.image, step)    of a diffusion model or a test
+        composite.backward(d_image)                        with the regularisers (eq. 9)
         Adam's step, then back within bounds               `Optimization.step`
 
-Everything random is a function of the seed and the step, and the whole state is plain tensors and
-numbers: a run that was stopped and restored ends as if it had not been.
+All random numbers are functions of the seed and the step, and the state is plain tensors and
+numbers: a run that was stopped and restored ends with the same bits as one that was not.
 
-A step whose picture, loss or gradient is not finite is not taken: it is counted, and the learning
-rate is halved until steps are good again. What lacks memory is tried once more.
+A step whose composite, loss or gradient is not finite is skipped and counted, and the learning rate
+is halved until steps are finite again. A gradient that lacks memory is computed a second time.
 """
 
 from __future__ import annotations
@@ -32,19 +32,19 @@ from warpir.diffusion.prior import BAD_STEPS_MAX
 from warpir.scene.camera import Camera
 
 BACK_OFF = 0.5
-"""Share of the learning rate that a step without a finite gradient leaves to the next ones."""
+"""Factor on the learning rate after a step without a finite gradient."""
 GOOD_STEPS = 10
-"""Steps in a row after which it doubles again, up to what the schedule says."""
+"""Finite steps in a row after which the rate doubles again, up to the schedule's."""
 LOWER = "--guidance-width"
-"""What lowers the memory of a step."""
+"""Flag that lowers the memory of a step."""
 SCORE_SEED = 0x5C0E5
-"""Added to the seed for the renders that judge a state."""
+"""Added to the seed for the renders that are scored."""
 
 log = logging.getLogger(__name__)
 
 
 class Guide(Protocol):
-    """Says what looks right: a diffusion model's guidance, or a stand-in with a known answer."""
+    """Gradient and score of an image: a diffusion model's, or a test's with a known answer."""
 
     def gradient(self, image: Tensor, step: int) -> Tensor | None:
         """Return the loss gradient of an image, or None when this step has none that is finite.
@@ -55,47 +55,63 @@ class Guide(Protocol):
         """
 
     def score(self, image: Tensor) -> float | None:
-        """Return how wrong an image looks, lower is better; None when that is unknown."""
+        """Return the loss of an image, lower is better; None when it is unknown."""
 
     def state_dict(self) -> dict[str, Any]:
-        """Return what a later run needs to go on: tensors and plain values."""
+        """Return the state that a resumed run needs: tensors and plain values."""
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
         """Go on from `state_dict`."""
 
 
+@dataclass(frozen=True)
+class Composite:
+    """The composite of one step, and the regularisers at the same unknowns."""
+
+    image: Tensor
+    """Display-encoded, differentiable, shape [1, 3, H, W]."""
+    terms: dict[str, tuple[float, Tensor]] = field(default_factory=dict)
+    """Weight and value of each regulariser."""
+
+    def backward(self, d_image: Tensor) -> None:
+        """Add the gradient of ``<d_image, image> + sum(weight * term)`` (eq. 9) to ``grad``."""
+        weighted = [weight * term for weight, term in self.terms.values()]
+        ones = [torch.ones_like(term) for term in weighted]
+        torch.autograd.backward([self.image, *weighted], [d_image, *ones])
+
+
 @dataclass
 class State:
-    """Where an optimisation stands, beside its parameters and Adam's moments."""
+    """Progress of an optimisation, beside its parameters and Adam's moments."""
 
     step: int = 0
-    """Steps that are done."""
+    """Number of finished steps."""
     history: list[dict[str, float]] = field(default_factory=list)
     """One entry a step: norm of the image's gradient, regularisers, and sometimes the score."""
     bad_steps: int = 0
-    """Without a finite gradient, in a row."""
+    """Number of the latest steps in a row without a finite gradient."""
     skipped: int = 0
-    """Without a finite gradient, in all."""
+    """Number of all steps without a finite gradient."""
     rate_share: float = 1.0
-    """What bad steps have left of the learning rate [1]."""
+    """Factor on the learning rate that bad steps have left [1]."""
     good_steps: int = 0
-    """Since `rate_share` fell or rose."""
+    """Number of finite steps since `rate_share` last changed."""
     best_score: float | None = None
-    """Lower is better."""
+    """Lowest score so far."""
     best_step: int = -1
-    """The step after which that state stood; -1: none was scored."""
+    """Step after which `best_score` was reached; -1: none was scored."""
 
 
 class Optimization(ABC):
-    """A loop over some unknowns; subclasses say how they become an image.
+    """A loop over some unknowns; subclasses compose the image.
 
     Args:
-        unknowns: What is optimised, from where it starts; changed in place.
+        unknowns: Parameters at their start; changed in place.
         groups: Adam's parameter groups: ``params`` and ``rate``, the rate before the schedule.
-        guide: What looks right.
+        guide: Gradient and score of the image.
         settings: Steps, rates, weights, schedules.
         seed: Base seed of the renders.
-        memory: Is told where memory was short.
+        memory: Counts the gradients that were computed twice for want of memory.
     """
 
     def __init__(
@@ -119,20 +135,16 @@ class Optimization(ABC):
         self.best: dict[str, Tensor] = {}
 
     @abstractmethod
-    def image(self, step: int) -> Tensor:
-        """Return the composite of a step, differentiable, shape [1, 3, H, W]."""
+    def composite(self, step: int) -> Composite:
+        """Return the composite of a step, with its regularisers."""
 
     @abstractmethod
     def final_image(self, seed: int) -> Tensor:
         """Return the composite as the current state would be delivered, shape [1, 3, H, W]."""
 
     @abstractmethod
-    def terms(self) -> dict[str, tuple[float, Tensor]]:
-        """Return the regularisers by name, each with its weight."""
-
-    @abstractmethod
     def describe(self, camera: Camera) -> str:
-        """Return in a few words where the unknowns stand, for a person who waits."""
+        """Return the unknowns' values in a few words, for the progress line."""
 
     @abstractmethod
     def project(self) -> None:
@@ -140,10 +152,10 @@ class Optimization(ABC):
 
     @abstractmethod
     def prepare(self, step: int) -> None:
-        """Do what must be done before a step's image is rendered."""
+        """Update what a step's composite depends on besides the unknowns."""
 
     def run(self, on_step: Callable[[Self], None] = lambda _: None) -> None:
-        """Take all steps that are left; ``on_step`` sees the loop after each. Keep the best state.
+        """Take the remaining steps, ``on_step`` after each, and restore the best state.
 
         Raises:
             InputError: The gradient stayed non-finite (`ExitCode.NUMERIC`).
@@ -155,13 +167,13 @@ class Optimization(ABC):
             self.unknowns.load_state_dict(self.best)
 
     def step(self) -> None:
-        """Take one step; where memory is short, its gradient is tried once more, with equal result.
+        """Take one step of Adam; a step without a finite gradient changes no unknown.
 
         Raises:
-            InputError: Memory is short again, or there was no finite gradient for too long.
+            InputError: Memory is short, or there was no finite gradient for too long.
         """
         step = self.state.step
-        before = self.guide.state_dict()  # it counts and remembers gradients
+        before = self.guide.state_dict()  # the guide counts and remembers gradients
         numbers = self.memory.again(
             lambda: self.differentiate(step),
             "the gradient of a step",
@@ -181,28 +193,25 @@ class Optimization(ABC):
             self._keep_if_best(numbers)
 
     def differentiate(self, step: int) -> dict[str, float]:
-        """Leave the gradient of guidance and regularisers (eq. 9) in the unknowns' ``grad``.
+        """Set the unknowns' ``grad`` to the gradient of guidance and regularisers (eq. 9).
 
         Returns:
-            The regularisers by name, and the norm of the guidance as ``gradient``, which is absent
-            where there is none that is finite: nothing is left in ``grad`` then. Checkpoints hold
-            no number that JSON lacks, so others that are not finite are absent too.
+            Finite values of the regularisers, and the norm of the guidance as ``gradient``, which
+            is absent where guidance is not finite; ``grad`` is then empty.
         """
         self.optimizer.zero_grad()
         try:
             self.prepare(step)
-            image, terms = self.image(step), self.terms()
+            composite = self.composite(step)
         except InputError as error:
             if error.code != ExitCode.NUMERIC:
                 raise
             log.warning("step %d: %s", step, error)
             return {}
-        d_image = self.guide.gradient(image.detach(), step)
-        numbers = {name: float(term.detach()) for name, (_, term) in terms.items()}
+        d_image = self.guide.gradient(composite.image.detach(), step)
+        numbers = {name: float(term.detach()) for name, (_, term) in composite.terms.items()}
         if d_image is not None and bool(d_image.isfinite().all()):
-            weighted = [weight * term for weight, term in terms.values()]
-            ones = [torch.ones_like(term) for term in weighted]
-            torch.autograd.backward([image, *weighted], [d_image, *ones])
+            composite.backward(d_image)
             numbers["gradient"] = float(d_image.double().norm())
         return {name: value for name, value in numbers.items() if np.isfinite(value)}
 
@@ -223,7 +232,7 @@ class Optimization(ABC):
         return bool(torch.stack([g.isfinite().all() for g in found]).all())
 
     def _count(self, is_finite: bool) -> None:
-        """Count a step, and let the learning rate back off from those that are not finite.
+        """Count a step, and lower the learning rate after one that is not finite.
 
         Raises:
             InputError: `BAD_STEPS_MAX` in a row are not (`ExitCode.NUMERIC`).
@@ -246,9 +255,9 @@ class Optimization(ABC):
             state.rate_share, state.good_steps = state.rate_share / BACK_OFF, 0
 
     def _keep_if_best(self, numbers: dict[str, float]) -> None:
-        """Judge the state as it would be delivered, and keep it if it is the best so far.
+        """Score the state as it would be delivered, and keep it if it is the best so far.
 
-        Only the second half counts: before it, the lights were not the ones that fusion leads to.
+        Only states of the second half are kept: before it, the two lights are not fused.
         """
         state = self.state
         with torch.no_grad():
@@ -262,7 +271,7 @@ class Optimization(ABC):
             self.best = {k: v.detach().clone() for k, v in self.unknowns.state_dict().items()}
 
     def state_dict(self) -> dict[str, Any]:
-        """Return everything that a later run needs to go on: nested tensors and plain values."""
+        """Return the state that a resumed run needs: nested tensors and plain values."""
         moments = self.optimizer.state_dict()["state"]
         return {
             "state": vars(self.state) | {"history": _columns(self.state.history)},
@@ -287,7 +296,7 @@ class Optimization(ABC):
 def _columns(history: Sequence[Mapping[str, float]]) -> dict[str, Tensor]:
     """Return a history as one tensor a name, NaN where a step has no such number.
 
-    Beside the tensors of a checkpoint they are short; as text they would outgrow it.
+    Tensors, since a long history as JSON would be larger than the rest of a checkpoint.
     """
     names = sorted({name for entry in history for name in entry})
     return {

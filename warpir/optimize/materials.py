@@ -1,8 +1,8 @@
-"""Change materials, emission or tone curves by a prompt, under a known light (DiPIR, section 6).
+"""Refine materials, emission or tone curves by a prompt, under a known light (DiPIR, section 6).
 
-The light never moves here: a picture cannot tell its colour from the object's, so that only one of
-the two may be free. What no unknown reaches is rendered once: the plane always, and for tone curves
-the object too, whose steps then cost no ray.
+The light is fixed: an image does not separate its colour from the object's, so only one of the two
+can be free. Parts that do not depend on the unknowns are rendered once: the plane always, and for
+tone curves the object too, so that their steps trace no ray.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ from warpir.optimize.course import (
     open_checkpoints,
 )
 from warpir.optimize.lit_frame import LitFrame
-from warpir.optimize.loop import Guide, Optimization
+from warpir.optimize.loop import Composite, Guide, Optimization
 from warpir.optimize.model import as_input_errors, make_guide, prepare_guidance
 from warpir.render.bridge import ShadeForeground
 from warpir.render.integrator import MaterialTensors
@@ -41,14 +41,14 @@ from warpir.scene.camera import Camera
 from warpir.scene.tone_curves import Curves, ToneKnots
 
 MARGIN = 0.05
-"""How far beyond its bounds a factor's sigmoid reaches, in spans: raw values of 0 and 1 are finite,
-3 either way, and there the sigmoid still has a fifth of its slope."""
+"""Overshoot of a factor's sigmoid beyond its bounds, in spans: raw values of 0 and 1 are finite,
+3 either way, where the sigmoid still has a fifth of its slope."""
 RAW_LIMIT = 0.9999 * float(np.log((1.0 + MARGIN) / MARGIN))
 """Greatest raw value, just inside the bound's: rounding then never leaves the bounds."""
 LOWEST = {"base_color": 0.0, "metallic": 0.0, "roughness": 0.05}
-"""Least factor [1]; the greatest is 1. A smoother surface, which is a mirror, starts at it."""
+"""Lower bounds of the factors [1]; the upper bound is 1."""
 EMISSION_START = 0.01
-"""Where the emission of a material that has less starts, relative [W/(m^2 sr)]."""
+"""Least start of a material's emission, relative [W/(m^2 sr)]."""
 GROUND_IS_DARK = "what the object emits does not light the ground"
 
 
@@ -105,16 +105,16 @@ class Positive(torch.nn.Module):
         return torch.nn.functional.softplus(self.raw)
 
     def project(self) -> None:
-        """Nothing bounds them."""
+        """Do nothing: the values have no upper bound."""
 
 
 class Factors(torch.nn.Module):
     """Factors of an asset's materials, some of them free.
 
     Args:
-        asset: Whose materials.
+        asset: Asset whose materials change.
         chosen: Indices of the materials that change.
-        parts: Which of their factors: ``base_color``, ``metallic``, ``roughness``, ``emission``.
+        parts: Free factors, some of ``base_color``, ``metallic``, ``roughness``, ``emission``.
     """
 
     indices: Tensor
@@ -169,7 +169,7 @@ class Factors(torch.nn.Module):
 
 
 class ToneUnknowns(torch.nn.Module):
-    """The four curves of a picture.
+    """The unknowns of tone refinement: four curves.
 
     Args:
         curves: Where they start.
@@ -219,38 +219,34 @@ class MaterialRefinement(Optimization):
             frame.renderer, lit.object_pixels, nowhere, settings.mis_samples, 1, frame.depth
         )
 
-    def image(self, step: int) -> Tensor:
+    def composite(self, step: int) -> Composite:
         """Return the composite of a step; its gradient comes from other samples.
 
-        What is asked of a picture follows its noise too. With the same samples the gradient would
-        also lessen that noise: smoother metal, darker paint.
+        Guidance follows the noise of an image too. With the same samples the gradient would also
+        lessen that noise: smoother metal, darker paint. Bounds replace regularisers.
         """
         self.lit.frame.renderer.bad_pixels.iteration = step
-        replayed = self.final_image(self.seed + 2 * step)
+        image = self.final_image(self.seed + 2 * step)
         with torch.no_grad():
             shown = self.final_image(self.seed + 2 * step + 1)
-        return replayed + (shown - replayed.detach())
+        return Composite(image + (shown - image.detach()))
 
     def final_image(self, seed: int) -> Tensor:
         """Return the composite with the materials as they are."""
         found: MaterialTensors = self.unknowns()
         factors = found.base_color, found.metallic, found.roughness, found.emission
-        # The light stands still, so it has no map to differentiate.
+        # The light is fixed, so there is no map to differentiate.
         foreground: Tensor = ShadeForeground.apply(
             self.mis, self.lit.args_fg, seed, torch.is_grad_enabled(), None, *factors
         )
         return self.lit.image(foreground, *self.curves)
-
-    def terms(self) -> dict[str, tuple[float, Tensor]]:
-        """Return none: their bounds are all that holds factors."""
-        return {}
 
     def project(self) -> None:
         """Keep the factors within their bounds."""
         self.unknowns.project()
 
     def prepare(self, step: int) -> None:
-        """Nothing is to be done: the light stands still."""
+        """Do nothing: the light is fixed."""
 
     def describe(self, camera: Camera) -> str:
         """Return the factors of the first material that changes."""
@@ -281,28 +277,25 @@ class ToneRefinement(Optimization):
         super().__init__(unknowns, groups, guide, settings, lit.frame.seed, memory)
         self.lit = lit
 
-    def image(self, step: int) -> Tensor:
-        """Return the composite; nothing in it is drawn anew."""
-        return self.final_image(self.seed)
+    def composite(self, step: int) -> Composite:
+        """Return the composite, of the same samples at every step, with the curves' prior."""
+        curves = self.unknowns.curve_fg(), self.unknowns.curve_shadow()
+        image = self.lit.image(self.lit.foreground, *curves)
+        return Composite(image, {"bend": (self.settings.bend, bend(curves[0]) + bend(curves[1]))})
 
     def final_image(self, seed: int) -> Tensor:
         """Return the composite with the curves as they are; it has the samples of `LitFrame`."""
         curves = self.unknowns.curve_fg(), self.unknowns.curve_shadow()
         return self.lit.image(self.lit.foreground, *curves)
 
-    def terms(self) -> dict[str, tuple[float, Tensor]]:
-        """Return the prior of plain curves, as in the recovery."""
-        curves = self.unknowns.curve_fg(), self.unknowns.curve_shadow()
-        return {"bend": (self.settings.bend, bend(curves[0]) + bend(curves[1]))}
-
     def project(self) -> None:
-        """Nothing bounds the curves' parameters."""
+        """Do nothing: the parameters of curves are unbounded."""
 
     def prepare(self, step: int) -> None:
-        """Nothing is to be done: the light stands still."""
+        """Do nothing: the light is fixed."""
 
     def describe(self, camera: Camera) -> str:
-        """Return what becomes of mid tones, by straight lines between the knots."""
+        """Return the mid tones after the curves, by linear interpolation between knots."""
         fg, shadow = self.unknowns.curve_fg.arrays(), self.unknowns.curve_shadow.arrays()
         shown = np.interp(0.5, fg[0][0], fg[1][0])
         ratios = (f"{np.interp(0.5, x, y):.2f}" for x, y in zip(*shadow[:2], strict=True))
@@ -322,7 +315,7 @@ def _words(part: str, value: float | tuple[float, ...]) -> str:
 
 
 def refine(run: Run, light: SceneLight) -> Outcome:
-    """Change by the prompt what ``--refine`` names.
+    """Optimise what ``--refine`` names toward the prompt.
 
     Args:
         run: Configuration, inputs, output folder.
@@ -339,7 +332,7 @@ def refine(run: Run, light: SceneLight) -> Outcome:
     with as_input_errors():
         checkpoints = open_checkpoints(run)
         with run.timings.stage("scene"):
-            # Curves of an earlier run are made for its operator.
+            # Curves of an earlier run belong to its tone operator.
             frame = replace(make_frame(run), is_reinhard=light.curves.tone == "reinhard")
         guided, resumed = prepare_guidance(run, checkpoints)
         with run.timings.stage("trace"):
@@ -388,7 +381,7 @@ def free_parts(config: InsertConfig) -> list[str]:
 
 
 def what_moves(config: InsertConfig, asset: Asset) -> dict[str, Any]:
-    """Return what run.json says of what was free and what was frozen."""
+    """Return the entry of ``run.json`` about free and frozen parameters."""
     parts = free_parts(config)
     known = ("tone curves", *LOWEST, "emission")
     free = parts or ["tone curves"]

@@ -1,4 +1,4 @@
-"""The model that judges: loaded, adapted to the photo, and made into the guidance of a loop."""
+"""The diffusion model of a run: loading, personalisation to the photo, guidance."""
 
 from __future__ import annotations
 
@@ -41,34 +41,34 @@ from warpir.optimize.view import Frame, gbuffer_of, with_light
 from warpir.render.determinism import use_threads_for
 
 SHOWN_SEEDS = (0, 1, 2)
-"""Of the pictures of --show-prior."""
+"""Seeds of the images of --show-prior."""
 ANYTHING = "object"
-"""What the embedded prior is asked for when nobody says what the object is."""
+"""Default prompt of the embedded prior."""
 ABOUT_EMBEDDED = (
     "prior: embedded, trained on rendered scenes, experimental: it failed its release gate; for "
     "photographs Stable Diffusion is recommended (--model)"
 )
 LOSSES_WITHOUT_LORA = ("csd", "sds-base", "good-bad")
-"""They ask the unadapted model alone."""
+"""Losses that use the base model alone."""
 
 
 @dataclass(frozen=True)
 class Asked:
-    """A model, and what it is asked."""
+    """A model and its prompts."""
 
     prior: NetworkPrior
     prompts: Prompts
     negative_prompt: str
-    """What the negative term asks for; empty: the null prompt."""
+    """Prompt of the negative term; empty for the null prompt."""
 
 
 @dataclass(frozen=True)
 class Guided:
-    """A model that has seen the photo, ready to judge composites of it."""
+    """A model adapted to the photo, ready for guidance."""
 
     asked: Asked
     learnt: Personalization | None
-    """What the model learnt from the photo; None: it is asked as it is."""
+    """Personalisation to the photo; None where the base model is used."""
     notices: tuple[str, ...]
 
     @property
@@ -77,12 +77,12 @@ class Guided:
         return self.asked.prior
 
     def state_dict(self) -> dict[str, Any]:
-        """Return what a checkpoint of the loop holds beside it: precision and adapter."""
+        """Return precision and adapter for a checkpoint of the loop."""
         learnt = None if self.learnt is None else self.learnt.state_dict()
         return {"prior": self.prior.state_dict(), "learnt": learnt}
 
     def record(self, run: Run) -> dict[str, Any]:
-        """Return what ``run.json`` says of the model, its adapter, and what was left open to it."""
+        """Return the entries of ``run.json`` about model, adapter and resolved settings."""
         prior, learnt = self.prior, self.learnt
         record: dict[str, Any] = {
             "model": {"name": prior.name, "sha256": prior.file_hashes},
@@ -105,7 +105,7 @@ class Guided:
 
 
 def prepare_guidance(run: Run, checkpoints: Checkpoints) -> tuple[Guided, Checkpoint | None]:
-    """Load the model and adapt it to the photo; return it, and the checkpoint to go on from.
+    """Load the model and adapt it to the photo; return it and the checkpoint to resume from.
 
     Raises:
         InputError: The checkpoint is another run's; every difference is named.
@@ -132,7 +132,7 @@ def prepare_guidance(run: Run, checkpoints: Checkpoints) -> tuple[Guided, Checkp
 
 
 def load_prior(run: Run) -> Asked:
-    """Return the prior that is asked for, what it is asked, and what the negative term asks.
+    """Load the configured prior and its prompts.
 
     Raises:
         InputError: Its memory is certain to be short (`ExitCode.RESOURCES`).
@@ -158,7 +158,7 @@ def load_prior(run: Run) -> Asked:
 
 
 def require_memory(run: Run) -> None:
-    """Compare what Stable Diffusion will take with what is free.
+    """Compare Stable Diffusion's estimated memory with the free memory.
 
     Raises:
         InputError: It is certain not to fit (`ExitCode.RESOURCES`).
@@ -177,7 +177,7 @@ def require_memory(run: Run) -> None:
 
 
 def checkpoint_of(run: Run, checkpoints: Checkpoints, prior: NetworkPrior) -> Checkpoint | None:
-    """Return the checkpoint to go on from, which is of this very model; None: there is none.
+    """Return the checkpoint to resume from, written with this model; None where there is none.
 
     Raises:
         InputError: It is another run's; every difference is named.
@@ -191,7 +191,7 @@ def checkpoint_of(run: Run, checkpoints: Checkpoints, prior: NetworkPrior) -> Ch
 
 
 def adapted(run: Run, asked: Asked, checkpoints: Checkpoints, resumed: Checkpoint | None) -> Guided:
-    """Adapt a model to the photo, as far as the loss asks for it; its text encoder is freed.
+    """Adapt a model to the photo if the loss needs it; free its text encoder.
 
     Raises:
         ModelError: The model cannot be adapted.
@@ -214,10 +214,9 @@ def adapted(run: Run, asked: Asked, checkpoints: Checkpoints, resumed: Checkpoin
 def personalized(
     run: Run, asked: Asked, checkpoints: Checkpoints, resumed: Checkpoint | None
 ) -> Personalization:
-    """Train the adapter on the photo, and show what the model makes of it where that is wanted.
+    """Train the adapter on the photo, and write the images of ``--show-prior``.
 
-    A loop that is resumed goes on with the very adapter that it had, whatever has become of the
-    cache.
+    A resumed loop restores its adapter from the checkpoint, not from the cache.
 
     Raises:
         ModelError: The model cannot be adapted.

@@ -1,7 +1,7 @@
-"""Measures and judges a diffusion model by what tells a trained one from a broken one.
+"""Health check of a diffusion model: measurements that separate a trained one from a broken one.
 
-How well it denoises a photo, what a prompt changes, what half precision loses, whether a LoRA
-learns, and what a step costs. Whether its guidance is good is for people to see.
+Measured are the error of denoising a photo, the effect of a prompt, the loss by half precision, the
+learning of a LoRA and the time of a step; the quality of guidance is not.
 """
 
 from __future__ import annotations
@@ -39,19 +39,19 @@ from warpir.optimize.model import as_input_errors
 from warpir.render.device import choose_device
 
 PROMPT = "a small red car"
-"""What is to be put into the demo's photo, or into any street."""
+"""Default prompt: a plausible object for a street."""
 NOISE_TIME = 0.5
 """Time at which `StableDiffusion.self_check` measures the error of the noise."""
 NOISE_ERROR_MAX = 0.5
-"""Greatest error, as a share of a network's that predicts nothing. Random weights have 1 or more, a
-trained network that is taken for one of another prediction type about 0.9."""
+"""Greatest error, over that of a zero prediction [1]. Random weights have 1 or more, a trained
+network read with the wrong prediction type about 0.9."""
 EFFECT_MIN, EFFECT_MAX = 1e-4, 1.0
-"""Between no effect of the prompt and one as great as the noise itself, root mean square."""
+"""Range of a prompt's effect, root mean square; the noise itself has 1."""
 LORA_STEPS, LORA_RATE = 30, 5e-4
-"""Few steps, so at a greater rate than a run's: what they change must be seen."""
+"""Few steps, with a larger rate than a run's so that their effect can be measured."""
 GUIDANCE_STEPS = 10
 WARM_STEPS = 3
-"""Steps that are not timed: they record graphs and choose algorithms."""
+"""Untimed first steps, which record graphs and choose algorithms."""
 KNOWN = {
     (512, "epsilon"): "as Stable Diffusion 2.1-base and 1.5",
     (768, "v_prediction"): "as Stable Diffusion 2.1",
@@ -60,39 +60,39 @@ KNOWN = {
 
 @dataclass(frozen=True)
 class Verdict:
-    """One check."""
+    """Result of one check."""
 
     name: str
     ok: bool
     found: str
-    """What was measured, in words."""
+    """Measurement in words."""
     expected: str
     values: dict[str, float]
-    """The same as plain numbers."""
+    """Measurement as plain numbers."""
 
     @property
     def line(self) -> str:
-        """What is printed."""
+        """Verdict in one line."""
         end = "ok" if self.ok else f"NOT AS A TRAINED MODEL (expected {self.expected})"
         return f"{self.name}: {self.found}: {end}"
 
 
 @dataclass(frozen=True)
 class Report:
-    """What was found out about a model."""
+    """All verdicts on a model, and its timings."""
 
     model: dict[str, Any]
     verdicts: tuple[Verdict, ...]
     seconds: dict[str, float]
-    """Of a LoRA step and a guidance step [s]."""
+    """Time of a LoRA step and of a guidance step [s]."""
 
     @property
     def ok(self) -> bool:
-        """Whether all is as expected."""
+        """Whether all checks passed."""
         return all(verdict.ok for verdict in self.verdicts)
 
     def record(self) -> dict[str, Any]:
-        """Return what ``--json`` writes."""
+        """Return the content of ``--json``."""
         return {
             "format": "warpir-model-check",
             "version": 1,
@@ -107,7 +107,7 @@ class Report:
 def load_and_check(
     config: InsertConfig, photo: NDArray[np.float32], say: Callable[[str], None]
 ) -> Report:
-    """Load the model that is configured, and check it.
+    """Load the configured model and check it.
 
     Args:
         config: Model, device, and what `check_model` asks for.
@@ -132,7 +132,7 @@ def check_model(
     config: InsertConfig,
     say: Callable[[str], None],
 ) -> Report:
-    """Measure and judge a model, and say each verdict as soon as it is known.
+    """Measure and judge a model; report each verdict at once.
 
     Args:
         prior: The model.
@@ -185,7 +185,7 @@ def check_model(
 
 
 def judge_noise(error: float, silent: float) -> Verdict:
-    """Judge the error of the noise against that of a network that predicts nothing.
+    """Judge the error of the noise against that of a zero prediction.
 
     Args:
         error: Mean squared error at `NOISE_TIME`.
@@ -202,7 +202,7 @@ def judge_noise(error: float, silent: float) -> Verdict:
 
 
 def judge_effect(sizes: Sequence[float]) -> Verdict:
-    """Judge what the prompt changes in the prediction, root mean square by `CHECK_TIMES`."""
+    """Judge the change of the prediction by the prompt, root mean square by `CHECK_TIMES`."""
     by_time = dict(zip(CHECK_TIMES, sizes, strict=True))
     return Verdict(
         "prompt",
@@ -285,7 +285,7 @@ class _StepClock:
         self.device, self.count, self.start = device, 0, math.nan
 
     def tick(self) -> None:
-        """Count a step that was taken."""
+        """Count a finished step."""
         self.count += 1
         if self.count == WARM_STEPS:
             self.start = self._now()
@@ -303,7 +303,7 @@ class _StepClock:
 def _try_lora(
     prior: StableDiffusion, image: Tensor, prompts: Prompts, config: InsertConfig
 ) -> tuple[Verdict, float]:
-    """Train a LoRA for a moment, without class images; it stays, for the guidance."""
+    """Train a LoRA for a few steps without class images; return with it attached."""
     clock, spent = _StepClock(prior.device), [math.nan]
 
     def on_step(training: LoraTraining) -> None:
@@ -320,7 +320,7 @@ def _try_lora(
 def _try_guidance(
     prior: StableDiffusion, image: Tensor, prompts: Prompts, config: InsertConfig
 ) -> tuple[Verdict, float]:
-    """Take the model's part of some steps of a run, with the photo for a composite."""
+    """Compute guidance gradients of the photo for some steps."""
     image = image.to(prior.device)
     settings = config.settled(on_cuda=prior.device.type == "cuda").guidance_settings()
     mask = torch.zeros(image.shape[-2:])

@@ -1,8 +1,7 @@
-"""Recover the light of a photograph: model, personalisation, guidance, optimisation, in that order.
+"""Light recovery from a photograph: model, personalisation, guidance, optimisation.
 
-What comes out stands in the place of a light that the user gave
-(`warpir.lighting.scene_light.SceneLight`), so that everything behind it, from the final render to
-the files, is one and the same.
+The result has the type of a given light (`warpir.lighting.scene_light.SceneLight`), so that the
+final render and the files need not know where the light came from.
 """
 
 from __future__ import annotations
@@ -38,21 +37,21 @@ from warpir.scene.light import Lobes, as_map, summarize
 from warpir.scene.tone_curves import Curves
 
 LIGHT_HEIGHT = 256
-"""Rows of the map that is delivered."""
+"""Rows of the delivered map."""
 START_HEIGHT = 128
-"""Rows of the map to which a given light is fitted as a start."""
+"""Rows of the map of a given light to which the start's lobes are fitted."""
 CHECK_DRAWS = 16
-"""Noises of the scores that stand beside a verdict."""
+"""Number of noises of the scores beside a verdict."""
 
 
 @dataclass(frozen=True)
 class Start:
-    """Where a recovery starts."""
+    """Start of a recovery."""
 
     light: SceneLight
-    """That was given, that stands for none, or that was estimated."""
+    """Given, default or estimated light."""
     estimate: Estimate | None = None
-    """What the regressor sees in the photo, where that is the start."""
+    """The regressor's estimate, if it is the start."""
 
 
 def recover(run: Run, given: SceneLight | None) -> Outcome:
@@ -60,11 +59,10 @@ def recover(run: Run, given: SceneLight | None) -> Outcome:
 
     Args:
         run: Configuration, inputs, output folder.
-        given: The light that was given, or the one that stands for none; None: it is estimated from
-            the photo.
+        given: Given or default light; None to estimate it from the photo.
 
     Returns:
-        Light and curves, those of the start where guidance could show no improvement.
+        Light and curves; those of the start where the acceptance test fails.
 
     Raises:
         InputError: The model cannot be used (exit 4), memory is short (5), the numbers stayed
@@ -114,7 +112,7 @@ def recover(run: Run, given: SceneLight | None) -> Outcome:
 
 
 def _estimated(run: Run) -> Start:
-    """Return the light that the regressor sees in the photo, and say so."""
+    """Return the regressor's estimate from the photo; log its assumptions."""
     with run.timings.stage("regress"):
         estimate = estimate_light(run.inputs, run.config, run.device)
     run.log.assume(*estimate.light.assumed)
@@ -122,7 +120,7 @@ def _estimated(run: Run) -> Start:
 
 
 def unknowns_of(run: Run, start: Start) -> Unknowns:
-    """Return the unknowns: lobes of the light that was given or estimated, else an even light."""
+    """Return the unknowns: lobes of the given or estimated light, else an even light."""
     config, settings = run.config, run.config.optimize
     lobes, least = None, narrowest(settings.light_rows)
     if start.estimate is not None:
@@ -135,7 +133,7 @@ def unknowns_of(run: Run, start: Start) -> Unknowns:
 
 
 def region_of(start: Start, unknowns: Unknowns) -> TrustRegion | None:
-    """Return where an estimated light is expected, with its uncertainty; None without one."""
+    """Return the trust region around an estimated light; None without an estimate."""
     if start.estimate is None:
         return None
     found = start.estimate.regression
@@ -161,7 +159,7 @@ def delivered(run: Run, loop: LightOptimization, start: Start) -> SceneLight:
 
 
 def _measured(start: Start, found: SceneLight, judged: Judged | None) -> dict[str, Any]:
-    """Return what ``run.json`` says of both ends, and of which one is better."""
+    """Return the entries of ``run.json`` about start, end and acceptance."""
     measured: dict[str, Any] = {
         "start_light": asdict(summarize(start.light.light)),
         "end_light": asdict(summarize(found.light)),
@@ -175,7 +173,7 @@ def _measured(start: Start, found: SceneLight, judged: Judged | None) -> dict[st
 
 @dataclass(frozen=True)
 class Judged:
-    """A verdict on a loop's end, and what stands beside it."""
+    """Acceptance verdict on a loop, and scores of both ends."""
 
     verdict: Verdict
     compared: dict[str, float | None]
@@ -188,11 +186,11 @@ class Judged:
 
 
 def judge_end(loop: LightOptimization, guide: Guidance, before: dict[str, torch.Tensor]) -> Judged:
-    """Return whether the loop's end is better than its start, by guidance that is asked anew.
+    """Test whether the loop's end is better than its start, by fresh evaluations of guidance.
 
     Args:
-        loop: At its end, where it also is afterwards.
-        guide: Its guidance.
+        loop: A finished loop; left unchanged.
+        guide: Guidance of the loop.
         before: The unknowns at the start.
     """
     after = _state_of(loop.unknowns)

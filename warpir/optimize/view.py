@@ -1,8 +1,7 @@
-"""The picture inside the optimisation: one small view, rendered again for every step's light.
+"""Differentiable view of the optimisation loop, rendered under every step's light.
 
-Two integrators can stand behind it. `transport` traces once for a light that is expected and makes
-each step a product; when the light has moved away from what was expected, it is traced again. `mis`
-traces in every step.
+There are two integrators. `transport` traces once, with samples for an expected light, so that a
+step is a matrix product; it traces again when the light has moved away. `mis` traces every step.
 """
 
 from __future__ import annotations
@@ -29,12 +28,12 @@ from warpir.scene.camera import Camera
 from warpir.scene.light import Light
 
 COVERAGE_SAMPLES = 64
-"""Camera samples that find each pixel's share of the object for `mis`."""
+"""Camera samples per pixel of the object's coverage for `mis`."""
 
 
 @dataclass(frozen=True)
 class Frame:
-    """What stands still while the light is optimised."""
+    """Constants of the loop: scene, photo and sampling."""
 
     renderer: Renderer
     """The scene, with a camera of the loop's resolution."""
@@ -60,8 +59,8 @@ class View:
 
     Args:
         frame: Scene, photo, tone operator.
-        expected: The light that directions are shared out by.
-        transport: How finely `transport` is traced; None: `mis`.
+        expected: Light that directions are sampled by.
+        transport: Resolution of `transport`; None for `mis`.
         mis_samples: Camera samples per pixel of `mis`.
         cache: Folder for traced rows, or None.
 
@@ -122,7 +121,7 @@ class View:
         return self.compose(radiance, curve_fg, curve_shadow)
 
     def radiance(self, texels_fg: Tensor, texels_shadow: Tensor, seed: int) -> Radiance:
-        """Return what the integrator does; arguments are those of `image`."""
+        """Return the integrator's radiance; arguments are those of `image`."""
         return self.integrator.radiance(texels_fg, texels_shadow, seed)
 
     def compose(self, radiance: Radiance, curve_fg: Knots, curve_shadow: Knots) -> Tensor:
@@ -137,7 +136,7 @@ class View:
         )
 
     def staleness(self, texels_fg: Tensor, texels_shadow: Tensor) -> float:
-        """Return how much noisier the frozen rows are under this light than where expected [1]."""
+        """Return the traced rows' noise under this light over that under the expected one [1]."""
         if self.transport is None:
             return 1.0
         fg, shadow = (t.detach().cpu().numpy() for t in (texels_fg, texels_shadow))
@@ -147,8 +146,8 @@ class View:
 def _shaded(renderer: Renderer, expected: Light, seed: int) -> IntArray:
     """Return the pixels whose ground the object may shade, under an even sky or the expected light.
 
-    What no light of the loop has shaded yet keeps a ratio of 1 and has no gradient, so the even sky
-    stands for all that is not expected.
+    Other pixels keep a ratio of 1 and have no gradient, so the even sky covers lights that are not
+    expected.
     """
     even = Light(texels=np.ones((8, 16, 3), np.float32))
     found = [renderer.shaded_pixels(light_args(x, renderer.device), seed) for x in (even, expected)]
@@ -157,14 +156,14 @@ def _shaded(renderer: Renderer, expected: Light, seed: int) -> IntArray:
 
 
 def expected_light(texels_fg: Tensor, texels_shadow: Tensor) -> Light:
-    """Return the light that the next tracing should expect: both maps, each at mean 1."""
+    """Return the light to sample by at the next tracing: both maps, each at mean 1."""
     with torch.no_grad():
         both = [t / t.mean().clamp(min=1e-20) for t in (texels_fg, texels_shadow)]
     return Light(texels=(0.5 * (both[0] + both[1])).cpu().numpy())
 
 
 def gbuffer_of(frame: Frame) -> torch.Tensor:
-    """Return what the object is, as the embedded prior sees it, shape [1, 7, H, W].
+    """Return the object's G-buffer for the embedded prior, shape [1, 7, H, W].
 
     Mask in [0, 1], albedo display-encoded, unit normals in the camera's frame (x right, y up, z
     toward the camera); all 0 beside the object. `warpir.train.batches.PriorBatch` is the same.
@@ -186,7 +185,7 @@ def gbuffer_of(frame: Frame) -> torch.Tensor:
 
 
 def with_light(gbuffer: torch.Tensor, regression: Regression, camera: Camera) -> torch.Tensor:
-    """Return a G-buffer with what the regressor makes of the object, shape [1, 13, H, W].
+    """Return a G-buffer with the object shaded under the regressor's light, shape [1, 13, H, W].
 
     Args:
         gbuffer: Of `gbuffer_of`, shape [1, 7, H, W].
