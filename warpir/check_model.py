@@ -1,4 +1,4 @@
-"""Does a Stable Diffusion work here, and is it worth a guided run?
+"""Health check of a Stable Diffusion model before a guided run.
 
     python -m warpir.check_model --model DIR [--photo FILE] [--prompt TEXT] [--json FILE]
 

@@ -1,4 +1,4 @@
-"""Thins an asset so that a browser moves it smoothly."""
+"""Simplified assets for the browser."""
 
 from dataclasses import replace
 
@@ -8,11 +8,11 @@ from warpir.core.arrays import Float64Array, FloatArray
 from warpir.scene.asset import Asset, Primitive, Texture
 
 TRIANGLES = 300_000
-"""Most triangles that the browser gets: without a graphics card, more are slow to drag."""
+"""Largest number of triangles for the browser: without a GPU, more are slow to drag."""
 TEXTURE_SIDE = 1024
-"""Longest side of a texture that it gets [px]."""
+"""Longest side of a texture for the browser [px]."""
 FINEST = 1024
-"""Cells along the asset's longest side with which thinning begins."""
+"""Initial number of grid cells along the asset's longest side."""
 
 
 def preview_asset(asset: Asset, triangles: int = TRIANGLES) -> Asset:
@@ -38,7 +38,7 @@ def preview_asset(asset: Asset, triangles: int = TRIANGLES) -> Asset:
 
 
 def triangle_count(asset: Asset) -> int:
-    """Return how many triangles an asset has."""
+    """Return the number of an asset's triangles."""
     return sum(len(p.indices) for p in asset.primitives)
 
 

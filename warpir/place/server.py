@@ -1,4 +1,4 @@
-"""Serves the page of `warpir.place` to the browser of this machine, and to nobody else.
+"""HTTP server of `warpir.place`, for the browser of this user on this machine only.
 
 It listens on 127.0.0.1 alone. Every request must name that host and begin with a token that was
 drawn for this session, so that neither a page from elsewhere (DNS rebinding) nor another user gets
@@ -24,7 +24,7 @@ from warpir.report.html import source_hash
 
 HOST = "127.0.0.1"
 LARGEST_REQUEST = 1 << 16
-"""Most bytes that the page sends."""
+"""Largest request body [byte]."""
 PAGE = Path(__file__).parent / "page"
 FILES = {
     "": "index.html",
@@ -108,7 +108,7 @@ class PlaceServer(ThreadingHTTPServer):
 
     @property
     def address(self) -> str:
-        """Of the page."""
+        """Address of the page."""
         return f"http://{self.host}/{self.token}/"
 
     def content(self, name: str) -> bytes | None:

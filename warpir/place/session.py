@@ -1,4 +1,4 @@
-"""Placing by hand: the values that the page starts from, and the files of a saved placement.
+"""Session of placing by hand: the page's initial values, and the files of a saved placement.
 
 A saved placement is two files in one folder: ``camera.json``, as `warpir.insert` writes it, and
 ``insert.json``, a configuration for ``--config`` that names photo, asset, camera, place and light.
@@ -37,17 +37,17 @@ from warpir.scene.placement import place_asset, upright_plane
 CAMERA, CONFIG = "camera.json", "insert.json"
 """Names of the two files."""
 PHOTO_SIDE = 2048
-"""Longest side of the photo that the page gets [px]."""
+"""Longest side of the photo for the page [px]."""
 PLACED = ("place", "at", "rotate_y", "scale", "size", "sun", "sky")
-"""Fields that the page decides."""
+"""Fields that the page sets."""
 SEEN_BY = ("camera", "frame", "up", "fov", "pitch", "horizon", "camera_height", "ground")
-"""Fields that the camera file and the ground in its world stand for."""
+"""Fields that the saved camera file replaces."""
 DEFAULT_SUN = (-60.0, 45.0)
 """Azimuth and elevation of the sun with which the page starts [deg]: from the left, in front."""
 LARGEST_START = 0.6
-"""Longest side of an asset of unknown scale, as a share of its distance, with which it starts."""
+"""Initial longest side of an asset of unknown scale, over its distance [1]."""
 PAGE = Path("the page")
-"""Where errors about numbers that the page sends are located."""
+"""Location in errors about numbers from the page."""
 
 
 @dataclass(frozen=True)
@@ -55,7 +55,7 @@ class Session:
     """A photo and an asset that is to be placed in it."""
 
     config: InsertConfig
-    """What the command line said; its `out` is the folder of the two files."""
+    """Configuration of the command line; its `out` is the folder of the two files."""
     photo: Photo
     asset: Asset
     camera: Camera
@@ -67,7 +67,7 @@ class Session:
     rotate_y: float
     """Initial turn about the vertical [deg]."""
     assumed: tuple[str, ...]
-    """What was chosen because nothing was given, and what looks odd, one line each."""
+    """Assumed and doubtful values, one line each."""
 
     @property
     def frame(self) -> Float64Array:
@@ -76,7 +76,7 @@ class Session:
 
 
 def open_session(config: InsertConfig) -> Session:
-    """Read photo, asset and camera as `warpir.insert` does, and choose where the page starts.
+    """Read photo, asset and camera as `warpir.insert` does, and choose the initial placement.
 
     Raises:
         InputError: One of them cannot be used, or the place that was named is not in the photo.
@@ -156,7 +156,7 @@ def _in_view(
 
 
 def start_record(session: Session) -> dict[str, Any]:
-    """Return what the page starts from, as plain values.
+    """Return the page's initial values, as plain values.
 
     Lengths are metres, angles degrees, pixels those of the upright photo.
     """
@@ -204,7 +204,7 @@ def start_record(session: Session) -> dict[str, Any]:
 
 
 def _start_sun(config: InsertConfig) -> list[float | None]:
-    """Return azimuth, elevation and strength; the last is open where nobody names it."""
+    """Return azimuth, elevation and strength of the sun; the strength may be absent."""
     if config.light.sun is None:
         return [*DEFAULT_SUN, 0.0 if config.light.sky is not None else None]
     return [*config.light.sun, None][:3]

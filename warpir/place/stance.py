@@ -1,4 +1,4 @@
-"""How a camera stands over the ground, in the numbers that a person turns.
+"""Pose of a camera over the ground, in the numbers that the page edits.
 
 The ground frame is right-handed and metric; the ground is its plane y = 0. The pose is
 ``translate(x, height, z) turn_y(heading) turn_x(pitch) turn_z(roll)``, which every pose is.
@@ -20,13 +20,13 @@ class Stance:
     """A camera's pose in the ground frame."""
 
     x: float
-    """Position [m]."""
+    """Position along x [m]."""
     height: float
-    """Above the ground [m]."""
+    """Height above the ground [m]."""
     z: float
-    """Position [m]."""
+    """Position along z [m]."""
     heading: float
-    """Where it looks: counter-clockwise seen from above, 0 along -Z [deg]."""
+    """Viewing direction, counter-clockwise from above, 0 along -Z [deg]."""
     pitch: float
     """Upward tilt [deg]."""
     roll: float

@@ -16,17 +16,17 @@ from warpir.core.arrays import BoolArray, FloatArray, IntArray
 from warpir.core.errors import ExitCode, InputError
 
 BAD_SHARE = 0.01
-"""Of the pixels of one rendering: more than this is no picture any more."""
+"""Largest share of bad pixels in one rendering [1]; more are an error."""
 NAMED = 5
-"""Bad pixels whose place is told."""
+"""Number of bad pixels whose position is reported."""
 
 
 class BadPixels:
     """Counts the bad pixels of a renderer.
 
     Attributes:
-        count: How many there were in all renderings.
-        named: The first of them: column, row, sample where it is known, iteration within a loop.
+        count: Number of bad pixels in all renderings.
+        named: The first of them: column, row, sample if known, iteration of a loop.
         iteration: Set by a loop to its step, None outside of one.
     """
 
@@ -43,7 +43,7 @@ class BadPixels:
         stage: str,
         first_sample: Callable[[int], int | None] = lambda pixel: None,
     ) -> tuple[FloatArray, ...]:
-        """Return what was rendered with bad pixels black in all planes.
+        """Return the rendered planes with bad pixels black.
 
         Args:
             planes: Values of the traced pixels, shape [pixel, ...] each.
@@ -101,7 +101,7 @@ class BadPixels:
         self.count, self.named = int(state["count"]), list(state["named"])
 
     def notices(self) -> Iterator[str]:
-        """Yield what the user should know of them."""
+        """Yield a notice if there were any."""
         if self.count:
             places = ", ".join(self.named)
             yield f"{self.count} pixels were not finite and were set to black, such as {places}"

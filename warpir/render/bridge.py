@@ -186,7 +186,7 @@ class _Compose(torch.autograd.Function):
 
 
 class ComposeConstants:
-    """What `compose` needs and never differentiates, uploaded once.
+    """Constant inputs of `compose`, uploaded once.
 
     Args:
         photo_lin: Linear photo, shape [H, W, 3].

@@ -1,4 +1,4 @@
-"""From rendered radiance to the picture: layers at the photo's resolution, codes, ball preview."""
+"""Compositing: rendered radiance to layers at the photo's size, codes, ball preview."""
 
 from __future__ import annotations
 
@@ -23,26 +23,26 @@ from warpir.scene.shadow_mask import ShadowMask
 from warpir.scene.tone_curves import Curves, ToneKnots
 
 RECEIVER_WIDTH = 1024
-"""Most columns of the photo that sends light back into the scene [px]."""
+"""Largest width of the photo as a radiance texture of the receiver [px]."""
 GREY_BALL = 0.18
 """Reflectance of the matte ball in ``balls.png``."""
 SLIVER = 1e-4
-"""Share of a pixel [1] below which the object's surface is not described there."""
+"""Share of a pixel below which its surface layers are left empty [1]."""
 
 
 @dataclass(frozen=True)
 class Quality:
-    """How finely a picture is sampled."""
+    """Sampling of a rendering."""
 
     samples: int
-    """Per pixel."""
+    """Camera samples per pixel."""
     rays: int
-    """Per sample and technique."""
+    """Rays per camera sample and sampling technique."""
     depth: int
-    """Surface interactions."""
+    """Largest number of surface interactions of a path."""
     seed: int
     indirect_limit: float = 0.0
-    """Most radiance that one path may add behind its first vertex; 0 for no limit, unbiased."""
+    """Clamp on a path's indirect radiance; 0 for none, which is unbiased."""
 
 
 @dataclass(frozen=True)

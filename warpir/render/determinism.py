@@ -1,11 +1,11 @@
-"""The same bytes from the same inputs: what a result may not depend on is held fixed here.
+"""Bit-reproducible results: thread counts and summation order are fixed.
 
 On the CPU the last bits of a sum depend on how many threads share it: convolutions, matrix products
 and reductions of torch. So the number of its threads is a constant, never that of the machine's
 cores or of an environment variable; `warpir.app.program` does the same for NumPy's.
 (`warpir.render.renderer` may use all cores: a pixel's numbers do not depend on the slices that it
-cuts.) On a GPU the order in which threads add is open as well, unless `fixed_arithmetic` is told to
-hold it: that costs time.
+cuts.) On a GPU the order of additions is open as well, unless `fixed_arithmetic` fixes it, which
+costs time.
 """
 
 from __future__ import annotations
@@ -21,16 +21,16 @@ if TYPE_CHECKING:
     from torch import nn
 
 THREADS = 1
-"""torch's threads on the CPU: the networks that come with warpir are too small to be shared out."""
+"""Number of torch's threads on the CPU; the shipped networks are too small for more."""
 LARGE_THREADS = 8
-"""Those of a network of Stable Diffusion's size; with fewer cores it takes no longer than with as
-many threads as cores."""
+"""Number of threads for a network of Stable Diffusion's size; with fewer cores it takes no longer
+than with as many threads as cores."""
 LARGE_PARAMETERS = 10**8
-"""Parameters from which on a network counts as large."""
+"""Number of parameters from which a network counts as large."""
 MAX_RECORDS = 1024
-"""Additions by one thread of a kernel that Warp can put in order."""
+"""Largest number of ordered additions of one thread in a Warp kernel."""
 WORKSPACE = ":4096:8"
-"""cuBLAS's buffers of which none is shared between streams, as NVIDIA asks for."""
+"""Workspace of cuBLAS with which its results are reproducible, by NVIDIA's documentation."""
 
 
 @contextmanager
@@ -79,7 +79,7 @@ def fixed_arithmetic(device: str, is_deterministic: bool) -> Iterator[None]:
 
 
 def use_threads_for(network: nn.Module) -> None:
-    """Give torch the threads that a network is worth: a number that its size alone decides."""
+    """Set the number of torch's threads, which depends on the network's size alone."""
     import torch
 
     count = sum(parameter.numel() for parameter in network.parameters())
@@ -87,7 +87,7 @@ def use_threads_for(network: nn.Module) -> None:
 
 
 def _order_kernels(is_deterministic: bool) -> None:
-    """Let Warp add in a fixed order on CUDA, or again in any; before the modules are compiled."""
+    """Switch Warp's ordered addition on CUDA on or off, before the modules are compiled."""
     import warp as wp
 
     from warpir.kernels import composite, light_gradient, shade

@@ -33,7 +33,7 @@ SAMPLES_PER_SLICE = 1 << 16
 """CPU work of one launch; keeps launches under half a second, so that Ctrl-C is answered."""
 
 _kernel_caches: list[KernelCache] = []
-"""Of this process, if it has one of its own."""
+"""Kernel cache of this process, if it has its own."""
 
 
 @dataclass(frozen=True)
@@ -55,7 +55,7 @@ class Rows:
 
 
 def start_warp() -> None:
-    """Start Warp with a kernel cache that can be written and believed, unless it has started."""
+    """Start Warp once, with a kernel cache that is writable and valid."""
     # The banner, the lines of each loaded module and "no CUDA driver" are for `--debug`.
     if not logging.getLogger().isEnabledFor(logging.DEBUG):
         wp.config.log_level = wp.LOG_ERROR
@@ -100,9 +100,9 @@ def cuda_count() -> int:
 
 
 def load_kernels(device: str, variants: Iterable[tuple[bool, bool]]) -> None:
-    """Compile what renders a picture, or find it compiled, and keep it for processes yet to start.
+    """Compile the rendering kernels, or load them, and cache them for later processes.
 
-    A run does so when it needs it, and keeps it at its end.
+    A run compiles when a kernel is first launched, and fills the cache at its end.
 
     Args:
         device: Warp's name of it.
@@ -120,7 +120,7 @@ def load_kernels(device: str, variants: Iterable[tuple[bool, bool]]) -> None:
 
 @cache
 def settle_hashes(is_cpu: bool) -> None:
-    """Compute the hashes that Warp finds compiled modules by, before any is compiled.
+    """Compute the hashes by which Warp caches modules, before any is compiled.
 
     Modules share functions, and building one changes what Warp 1.19 hashes of the next: without
     this a second run finds the first run's module under another hash and compiles it again (26 s

@@ -1,4 +1,4 @@
-"""A light on one device, with the proposal that samples are drawn from."""
+"""Light on one device, with the proposal distribution of its samples."""
 
 from __future__ import annotations
 

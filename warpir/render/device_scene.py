@@ -36,7 +36,7 @@ SLOTS = (
     "specular", "specular_color", "clearcoat", "clearcoat_roughness", "clearcoat_normal",
     "sheen_color", "sheen_roughness", "transmission",
 )  # fmt: skip
-"""In the order of `warpir.kernels.trace`."""
+"""Texture slots in the order of `warpir.kernels.trace`."""
 WRAP_MODES = {"repeat": 0, "clamp": 1, "mirror": 2}
 
 
@@ -46,35 +46,35 @@ FACTORS = (
     ("roughness", wp.float32),
     ("emission", wp.vec3),
 )
-"""Material factors that may be replaced, and differentiated."""
+"""Material factors that can be replaced and differentiated."""
 RECEIVER_EPSILON = 2e-6
 """Ray offset over the diagonal of the receiver's mesh [1]; rays meet it again below 1e-7."""
 
 
 @dataclass(frozen=True)
 class Receiver:
-    """What the object's shadow falls on: the plane ``dot(normal, x) = offset``, a mesh, or both."""
+    """Receiver of the shadow: the plane ``dot(normal, x) = offset``, a mesh, or both."""
 
     normal: Float64Array
-    """Unit, world frame, toward the lit side, shape [3]."""
+    """Unit normal of the plane, world frame, toward the lit side, shape [3]."""
     offset: float
-    """[m]."""
+    """Offset of the plane [m]."""
     mesh: ReceiverMesh | None = None
-    """Receives shadows and blocks light."""
+    """Mesh that receives shadows and blocks light."""
     radiance: FloatArray | None = None
-    """What the photo shows, before its tone operator, in the view of the scene's camera at any
+    """Radiance of the photo before its tone operator, in the view of the scene's camera at any
     resolution, shape [height, width, 3]; without it the mesh is black."""
     is_plane: bool = True
-    """Whether there is a plane; without one the mesh is all."""
+    """Whether the receiver has a plane beside the mesh."""
 
 
 @dataclass(frozen=True)
 class Placed:
-    """An asset and where it stands."""
+    """An asset and its pose."""
 
     asset: Asset
     asset_to_world: Float64Array
-    """Affine, column vectors, shape [4, 4]."""
+    """Affine map to the world, column vectors, shape [4, 4]."""
 
 
 @dataclass
@@ -98,7 +98,7 @@ def _unit(v: Float64Array) -> Float64Array:
 
 
 def _to_world(primitive: Primitive, matrix: Float64Array) -> _Vertices:
-    """Transform one primitive and fill in what it leaves out."""
+    """Transform one primitive and fill in absent attributes."""
     linear = matrix[:3, :3]
     positions = primitive.positions @ linear.T + matrix[:3, 3]
     indices = primitive.indices
@@ -138,7 +138,7 @@ def _slot(slot: TextureSlot | None, first_texture: int) -> tuple[int, int, list[
 
 
 def _extensions(material: Material) -> Extensions:
-    """Return what a material has beyond metallic-roughness."""
+    """Return a material's glTF extensions for the kernels."""
     plain = Material()
     names = ("ior", "specular", "specular_color", "clearcoat", "sheen_color", "transmission")
     out = Extensions()
@@ -160,7 +160,7 @@ def _extensions(material: Material) -> Extensions:
 class Scene:
     """Geometry, materials, plane and camera on one device; owns every Warp handle for the run.
 
-    Nothing of it changes once it is uploaded.
+    The scene does not change after its upload.
 
     Args:
         objects: What is rendered; may be empty (no triangles, no shadow).
@@ -240,7 +240,7 @@ class Scene:
         return args
 
     def _upload_radiance(self, args: ReceiverArgs, radiance: FloatArray) -> None:
-        """Let the receiver's mesh send what the photo shows, and elsewhere the mean of that."""
+        """Upload the photo's radiance for the receiver's mesh; outside the photo, its mean."""
         height, width = radiance.shape[:2]
         view = self.camera.scaled(width, height)
         # Columns right, down and ahead; the camera looks along its own -Z.

@@ -1,4 +1,4 @@
-"""What every integrator takes and gives: maps and materials in, three radiance arrays out."""
+"""Interface of the integrators: maps and materials to three radiance arrays."""
 
 from dataclasses import dataclass
 from typing import Protocol
@@ -8,7 +8,7 @@ from torch import Tensor
 
 @dataclass(frozen=True)
 class MaterialTensors:
-    """Material factors as the optimiser holds them; what is absent keeps the asset's value."""
+    """Material factors of the optimiser; absent ones keep the asset's value."""
 
     base_color: Tensor | None = None
     """Linear RGB factor [1], shape [material, 3]."""
@@ -22,7 +22,7 @@ class MaterialTensors:
 
 @dataclass(frozen=True)
 class Radiance:
-    """What an integrator returns; differentiable in what it declares."""
+    """Radiance of object and receiver, differentiable as the integrator declares."""
 
     foreground: Tensor
     """Object radiance, premultiplied by coverage, shape [object_pixel, 3]."""
@@ -36,7 +36,7 @@ class Integrator(Protocol):
     """Light transport for one scene and view."""
 
     differentiates: frozenset[str]
-    """What gradients reach: some of ``light``, ``material``, ``emission``."""
+    """Differentiable inputs: some of ``light``, ``material``, ``emission``."""
 
     def radiance(
         self,

@@ -1,4 +1,4 @@
-"""Renderer: what the camera sees of the object, its radiance, its shadow, and both tone-mapped.
+"""Renderer of the object's G-buffer, its radiance and shadow ratio, and their tone mapping.
 
 Pure Warp, no torch. A pixel's numbers depend on (seed, pixel, sample) alone. Pixels that do not fit
 into memory at once are traced in two halves (`warpir.core.memory`), those whose radiance is not
@@ -32,61 +32,61 @@ from warpir.scene.tone_curves import ToneKnots
 FULL_THREADS = 1 << 18
 """Threads that fill a CUDA device; with fewer pixels, several threads share a pixel's samples."""
 GLASS_SAMPLES = 8
-"""How many times as many samples find the object where clear glass stops few of them."""
+"""Factor on the samples of the G-buffer for clear glass, which few samples hit."""
 PILOT_SCALE = 4
-"""Edge of the pixel blocks that decide where the plane's shadow is worth tracing [px]."""
+"""Side of the pixel blocks of the pilot pass for the receiver's shadow [px]."""
 PILOT_SAMPLES = 32
 UNSEEN_SHADOW = 1e-3
-"""Loss of the plane's light that is not worth tracing [1]: an eighth of an 8-bit code at white."""
+"""Loss of light below which no shadow is traced [1]: an eighth of an 8-bit code at white."""
 
 
 @dataclass(frozen=True)
 class GBuffer:
-    """What the camera sees of the object, averaged over each pixel; rows are ``object_pixels``."""
+    """Geometry and material of the object, averaged over each pixel; a row an object pixel."""
 
     object_pixels: IntArray
     """Row-major pixel indices, shape [object_pixel]."""
     coverage: FloatArray
     """Share of the pixel that shows the object [1]; a first, coarse estimate of the mask."""
     position: Float64Array
-    """World frame [m], shape [object_pixel, 3]."""
+    """Position, world frame [m], shape [object_pixel, 3]."""
     normal: FloatArray
     """Unit shading normal, world frame, shape [object_pixel, 3]."""
     base_color: FloatArray
-    """Linear RGB [1], shape [object_pixel, 3]."""
+    """Base colour, linear RGB [1], shape [object_pixel, 3]."""
     roughness: FloatArray
-    """Perceptual [1], shape [object_pixel]."""
+    """Perceptual roughness [1], shape [object_pixel]."""
     emission: FloatArray
-    """Relative [W/(m^2 sr)], shape [object_pixel, 3]."""
+    """Emitted radiance, relative [W/(m^2 sr)], shape [object_pixel, 3]."""
 
 
 @dataclass(frozen=True)
 class Foreground:
-    """The object alone under its light; rows are the traced pixels."""
+    """Radiance of the object alone; a row a traced pixel."""
 
     radiance: FloatArray
-    """Premultiplied by ``mask``, relative [W/(m^2 sr)], shape [object_pixel, 3]."""
+    """Radiance premultiplied by ``mask``, relative [W/(m^2 sr)], shape [object_pixel, 3]."""
     diffuse: FloatArray
-    """The part that the first hit's diffuse lobe reflects, shape [object_pixel, 3]."""
+    """Part reflected by the first hit's diffuse lobe, shape [object_pixel, 3]."""
     emission: FloatArray
-    """The part that the first hit emits, shape [object_pixel, 3]."""
+    """Part emitted by the first hit, shape [object_pixel, 3]."""
     mask: FloatArray
-    """Coverage [1], shape [object_pixel]."""
+    """Coverage of the pixel [1], shape [object_pixel]."""
 
 
 @dataclass(frozen=True)
 class ReceiverRadiance:
-    """A white plane with and without the object; rows are the traced pixels."""
+    """Radiance of the white receiver with and without the object; a row a traced pixel."""
 
     lit: FloatArray
-    """With the object, relative [W/(m^2 sr)], shape [receiver_pixel, 3]."""
+    """Radiance with the object, relative [W/(m^2 sr)], shape [receiver_pixel, 3]."""
     unoccluded: FloatArray
-    """Without it, shape [receiver_pixel, 3]."""
+    """Radiance without the object, shape [receiver_pixel, 3]."""
 
 
 @dataclass(frozen=True)
 class _ObjectLaunch:
-    """A launch of the path tracer over some pixels, less the pixels and their samples."""
+    """Arguments of a path-tracing launch that all pixels share."""
 
     light: LightArgs
     materials: MaterialArgs
@@ -135,7 +135,7 @@ class _ObjectLaunch:
 
 @dataclass(frozen=True)
 class _ReceiverLaunch:
-    """A launch over pixels of the white receiver, less the pixels and their samples."""
+    """Arguments of a launch over the white receiver that all pixels share."""
 
     light: LightArgs
     camera_args: CameraArgs
@@ -150,7 +150,7 @@ class _ReceiverLaunch:
         spp: int,
         record: LightRecord | None = None,
     ) -> tuple[FloatArray, ...]:
-        """Return its radiance with and without the object, a row a pixel."""
+        """Return the radiance with and without the object, a row a pixel."""
         count = len(pixels)
         out = [renderer.zeros(count, wp.vec3) for _ in range(2)]
         renderer.launch(
@@ -205,7 +205,7 @@ class Renderer(Launcher):
         self.bad_pixels = BadPixels()
 
     def candidate_pixels(self, camera: Camera) -> IntArray:
-        """Return the pixels that the object's bounding box may cover, row-major, conservative."""
+        """Return a superset of the object's pixels by its bounding box, row-major."""
         low, high = self.scene.bounds
         corners = np.array(np.meshgrid(*zip(low, high, strict=True))).reshape(3, -1).T
         uv = camera.project(corners)
@@ -221,7 +221,7 @@ class Renderer(Launcher):
         return (rows + np.arange(left, right)[None]).reshape(-1).astype(np.int32)
 
     def gbuffer(self, seed: int, spp: int = 8) -> GBuffer:
-        """Trace what the camera sees of the object.
+        """Trace the object's geometry and materials.
 
         ``object_pixels`` are those that a sample hits and their neighbours, so that a pixel whose
         corner alone is covered is still traced.
@@ -269,12 +269,12 @@ class Renderer(Launcher):
     def _in_chunks(
         self, trace: Callable[[int, int], tuple[FloatArray, ...]], count: int, stage: str
     ) -> tuple[FloatArray, ...]:
-        """Return what ``trace`` makes of all pixels, in halves where memory is short."""
+        """Return ``trace`` of all pixels, in halves where memory is short."""
         parts = [*self.memory.in_chunks(trace, count, f"rendering the {stage}", self.lower)]
         return tuple(p[0] if len(p) == 1 else np.concatenate(p) for p in zip(*parts, strict=True))
 
     def lanes(self, count: int, spp: int) -> int:
-        """Return how many threads share the camera samples of each of ``count`` pixels."""
+        """Return the number of threads that share the samples of each of ``count`` pixels."""
         lanes = 1
         if self.device.is_cuda:
             while 0 < count * lanes * 2 <= FULL_THREADS and spp % (2 * lanes) == 0:

@@ -1,4 +1,4 @@
-"""Samples of `mis` that are drawn once, for a picture and for its gradient. Pure Warp, no torch.
+"""Samples of `mis`, drawn once for an image and its gradient. Pure Warp, no torch.
 
 While the kernels trace, they write down what the gradient needs. Radiance is linear in the light,
 so the light's gradient is a sum over the recorded directions; the materials' goes through the
@@ -35,15 +35,15 @@ Gradients = list[Float64Array | None]
 asked for."""
 
 RECORD_BYTES = 1 << 30
-"""Memory that the records of one picture may take; beyond it samples are drawn again, in parts.
-What is not filled is not touched: four fifths of it on a convex object at five interactions."""
+"""Memory limit of an image's records; beyond it, samples are drawn again in parts.
+Unused records cost no physical memory: four fifths of a convex object's at five interactions."""
 ENTRY_BYTES = 24
 VERTEX_BYTES = 112
 LAYERS_BYTES = 72
 PART_PATHS = 4096
 """Least paths of a part: a path costs about 1 us, the launches of a part about 1 ms."""
 RECORDING, LOWER = "the samples of mis", "--mis-samples or --guidance-width"
-"""What is short of memory, and what lowers it."""
+"""Subject of a memory error, and the flag that lowers its need."""
 PART_COUNT = 16
 """Private sums of texels and materials; fixed, so that their order does not depend on threads."""
 
@@ -216,7 +216,7 @@ class ObjectSamples:
 
 
 class ReceiverSamples:
-    """Samples of the plane; as `ObjectSamples`."""
+    """Samples of the plane, with the methods of `ObjectSamples`."""
 
     def __init__(
         self, mis: MisIntegrator, args: LightArgs, seed: int, free: Sequence[bool]

@@ -17,9 +17,9 @@ from warpir.core.arrays import FloatArray
 MIN_BIN = 1e-3
 """Least width, height and slope of a bin [1]."""
 BETA = float(np.log(2.0) / (1.0 - MIN_BIN))
-"""Of the slopes' softplus: softplus(0) = 1 - MIN_BIN, so that a zero parameter is slope 1."""
+"""Sharpness of the slopes' softplus: softplus(0) = 1 - MIN_BIN, so a zero parameter is slope 1."""
 LEAST = 1e-6
-"""What stands for nothing above `MIN_BIN` where raw parameters are sought [1]."""
+"""Least excess over `MIN_BIN` when raw parameters are computed from knots [1]."""
 
 
 @dataclass(frozen=True)
@@ -32,7 +32,7 @@ class Knots:
 
     @property
     def bin_count(self) -> int:
-        """Number of bins."""
+        """Number of bins of each curve."""
         return int(self.x.shape[1]) - 1
 
 
@@ -86,7 +86,7 @@ class ToneCurve(torch.nn.Module):
         return curve
 
     def forward(self) -> Knots:
-        """Return the knots that the current parameters mean."""
+        """Return the knots of the current parameters."""
         slope = MIN_BIN + torch.nn.functional.softplus(self.slopes, beta=BETA)
         return Knots(_edges(self.widths), _edges(self.heights), slope)
 

@@ -1,4 +1,4 @@
-"""What a run leaves: the picture under its light, its files, and the report for a person.
+"""Results of a run: the final render, its files and the report.
 
-The report itself reads what a run has written, and computes no picture of its own.
+The report reads the files of a run and renders nothing.
 """

@@ -78,7 +78,7 @@ def _run(arguments: list[str]) -> int:
 
 
 def read_results(folder: Path, limits: Limits = LIMITS) -> Results:
-    """Return what a finished run left in its folder.
+    """Return the results in a finished run's folder.
 
     Args:
         folder: The run's ``--out``.

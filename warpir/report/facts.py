@@ -31,7 +31,7 @@ class Setting:
     is_set: bool
     """Whether it differs from the default."""
     is_settled: bool
-    """Whether it was left open and the prior's own value was used."""
+    """Whether the prior's default was used for an open value."""
 
 
 ABOUT_FILES = (
@@ -71,10 +71,10 @@ def about_file(name: str) -> str:
 
 
 def without_folders(text: str, config: InsertConfig) -> str:
-    """Return a line of the run in which files are called by their names alone.
+    """Return a line of the run with file names in place of paths.
 
-    Folders of configured files go first, as these may be relative; then whatever looks like a whole
-    path. A place inside a glTF file, such as ``/materials/0``, stays.
+    Folders of configured files are removed first, as these may be relative; then those of absolute
+    paths. A JSON pointer of glTF, such as ``/materials/0``, stays.
     """
     given = {path for name in PATHS if (path := config.flat()[name]) is not None}
     if is_hub_id(config.diffusion.model):
@@ -99,7 +99,7 @@ def _last_part(separators: str, found: re.Match[str]) -> str:
 
 
 _START = r"(?<![\w./\\~-])"
-"""Start of a word or of a path, with its separators."""
+"""Pattern of the start of a word or path."""
 
 
 def _path_pattern(root: str, separators: str) -> re.Pattern[str]:
@@ -118,12 +118,12 @@ _WHOLE_PATHS = (
     # A file's address, a home, the root; an address of the web is no path.
     (_path_pattern(rf"file:/+|{_START}~[\w.-]*/+|(?<![:\w./\\~)<-])/+|(?<=\w:)/(?!/)", "/"), "/"),
 )
-"""Patterns of whole paths, each with its separators."""
+"""Patterns of absolute paths, each with its separators."""
 _POINTER = re.compile(
     r"/(?:accessors|animations|buffers|bufferViews|cameras|images|materials|meshes|nodes|samplers|"
     r"scenes|skins|textures|extensions/[A-Z]+_\w+(?:/lights)?)(?:/\d+(?:/\w+)*)?[^\w/]*"
 )
-"""A JSON pointer of glTF 2.0, by the names of its top level."""
+"""Pattern of a JSON pointer of glTF 2.0, by the names of its top level."""
 
 
 def command_line(config: InsertConfig) -> str:
@@ -144,7 +144,7 @@ def command_line(config: InsertConfig) -> str:
 
 
 def in_words(name: str, value: Any) -> str:
-    """Return a setting's value as the command line takes it; of True and False yes and no."""
+    """Return a setting's value as on the command line; yes and no for True and False."""
     if isinstance(value, bool):
         return "yes" if value else "no"
     if isinstance(value, tuple | list):
@@ -179,7 +179,7 @@ def settings(config: InsertConfig, record: Mapping[str, Any]) -> dict[str, list[
 
 
 def light_sources(record: Mapping[str, Any], config: InsertConfig) -> Rows:
-    """Return where the light comes from, with the uncertainty of estimates."""
+    """Return the origin of the light, with the uncertainty of estimates."""
     measured = record["measured"]
     rows: Rows = [("the light", _source(measured, config))]
     if "regression" in measured:
@@ -207,7 +207,7 @@ def light_sources(record: Mapping[str, Any], config: InsertConfig) -> Rows:
 
 
 def summary_line(record: Mapping[str, Any]) -> str:
-    """Return in a line what the light comes from and what computed it, for the end of a run."""
+    """Return the light's origin and the device of a run in one line."""
     measured = record["measured"]
     digest = measured.get("prior_sha256")
     prior = measured["prior"] + (f" (sha256 {digest[:16]}...)" if digest else "")

@@ -41,13 +41,13 @@ from warpir.scene.tone_curves import Curves, ToneKnots
 
 REPORT = "report.html"
 CLOCK, END = "<!--clock-->", "<!--/clock-->"
-"""Enclose what differs from one run of a command to the next: seconds and memory."""
+"""Comments around the part that differs between equal runs: seconds and memory."""
 MADE_BY = b'<meta name="generator" content="warpir '
-"""Identifies a page of warpir's; it stands within the first 4096 bytes."""
+"""Marker of warpir's pages, within the first 4096 bytes."""
 LEAST_PHOTO = 8.0
-"""Share of the picture that the slider at first leaves to the photo [%]."""
+"""Initial share of the photo at the comparison's slider [%]."""
 OPEN_END = 1e-3
-"""How far a tone curve may be from the diagonal to count as the identity [1]."""
+"""Largest distance from the diagonal of a tone curve that counts as the identity [1]."""
 
 
 @dataclass(frozen=True)
@@ -66,7 +66,7 @@ class Results:
     light_shadow: FloatArray | None = None
     """The light of the shadow, where it has one of its own."""
     light_detail: FloatArray | None = None
-    """The light on the object with what the photo shows in it, where there is one."""
+    """The light on the object with the photo's detail, where there is one."""
     balls: CodeArray | None = None
     """Content of ``balls.png``."""
     curves: Curves | None = None
@@ -75,7 +75,7 @@ class Results:
     optimization: Mapping[str, Any] | None = None
     """Content of ``optimization.json``, where a prior guided."""
     missing: tuple[str, ...] = ()
-    """Files that are gone, or differ from what the run wrote."""
+    """Files that are gone or have changed since the run."""
 
     @cached_property
     def character(self) -> LightCharacter | None:
@@ -174,7 +174,7 @@ def _lead(results: Results) -> str:
 
 
 def _comparison(layers: Layers) -> dict[str, Any]:
-    """Return photo and result, whole and around the object, and where the slider starts."""
+    """Return photo and result, whole and around the object, and the slider's start."""
     height, width = layers.matte.shape
     views = [("view-whole", "Whole picture", before_and_after(layers))]
     start = 50.0
@@ -274,7 +274,7 @@ def _convergence(optimization: Mapping[str, Any]) -> list[tuple[str, Plot]]:
 
 
 def _clock(record: Mapping[str, Any]) -> dict[str, Any]:
-    """Return what differs from one run to the next."""
+    """Return seconds and memory, which differ between equal runs."""
     seconds = {stage: s for stage, s in record["seconds"].items() if stage != "report"}
     peak = record.get("peak_mib", {})
     return {

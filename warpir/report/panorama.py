@@ -20,9 +20,9 @@ from warpir.scene.light import bearing
 HEIGHT = 192
 """Rows of the panorama in the report."""
 STOPS = 8
-"""Most that the panorama can be brightened or darkened by [EV]."""
+"""Largest change of the panorama's exposure [EV]."""
 BRIGHT = 90.0
-"""Percentile of the panorama's luminance that is shown as white [%]."""
+"""Percentile of the panorama's luminance that maps to white [%]."""
 RING = 7
 """Radius of the mark around the brightest direction [px]."""
 
@@ -34,11 +34,11 @@ class Panorama:
     id: str
     name: str
     picture: Shown
-    """At `stops`."""
+    """Picture of the panorama at `stops`."""
     stops: float
     """Change of the photo's exposure at which the light can be looked at [EV]."""
     rgbe: str
-    """The same values for other exposures: zlib-compressed RGBE, base64, row by row."""
+    """Radiance for other exposures: zlib-compressed RGBE, base64, row by row."""
     tone: str
     """The picture's operator, ``linear`` or ``reinhard``."""
     marks: list[tuple[str, str]]

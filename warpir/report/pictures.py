@@ -23,7 +23,7 @@ from warpir.io.images.decoder import decode_image
 from warpir.io.layers import Layers
 
 Box = tuple[int, int, int, int]
-"""Left, top, right, bottom, half-open [px]."""
+"""A box: left, top, right, bottom, half-open [px]."""
 
 LARGEST = 1600
 """Longest side of the picture in the report [px]."""
@@ -32,11 +32,11 @@ LAYER_LARGEST = 960
 THUMBNAIL = 320
 """Longest side of a frame in the report of a sequence [px]."""
 MARGIN = 0.12
-"""Round the object, in its own sides [1]."""
+"""Margin around the object, over its own sides [1]."""
 SHADED = 0.9
-"""Green of the shadow ratio below which a pixel belongs to what is looked at closely [1]."""
+"""Green of the shadow ratio below which a pixel belongs to the close-up [1]."""
 WHOLE = 0.7
-"""Share of both sides of the photo from which a closer look shows nothing more [1]."""
+"""Share of both sides of the photo from which a close-up is left out [1]."""
 
 
 @dataclass(frozen=True)
@@ -98,13 +98,13 @@ def encoded(linear: FloatArray) -> CodeArray:
 
 
 def plain(values: FloatArray) -> CodeArray:
-    """Return codes of values in [0, 1] that are no light."""
+    """Return codes of values in [0, 1] without display encoding."""
     codes: CodeArray = np.round(255.0 * np.clip(values, 0.0, 1.0)).astype(np.uint8)
     return codes
 
 
 def thumbnail(path: Path, max_pixels: int) -> Shown:
-    """Return a picture file in small, in its own colour profile.
+    """Return a thumbnail of a picture file, in its own colour profile.
 
     Args:
         path: The file.
@@ -184,7 +184,7 @@ class Layer:
 
     @property
     def id(self) -> str:
-        """Of its element in the page."""
+        """Identifier of the layer's element in the page."""
         return f"layer-{self.name}"
 
 

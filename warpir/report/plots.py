@@ -17,9 +17,9 @@ WIDTH, HEIGHT = 360, 250
 LEFT, RIGHT, TOP, BOTTOM = 58, 346, 14, 206
 """Edges of the area between the axes [px]."""
 POINTS_MAX = 400
-"""Most points of a line: more cannot be told apart."""
+"""Largest number of points of a line; more are not distinguishable."""
 DOTS_MAX = 12
-"""Most points that are also drawn as dots."""
+"""Largest number of points that are also drawn as dots."""
 
 Point = tuple[float, float]
 
@@ -52,15 +52,15 @@ class Plot:
     """A plot in pixels: axes with ticks, lines, and vertical marks."""
 
     title: str
-    """What is plotted, for those who cannot see it."""
+    """Description of the plot for screen readers."""
     labels: tuple[str, str]
-    """Of the axes."""
+    """Labels of the axes."""
     x_ticks: list[tuple[float, str]]
-    """Position and text."""
+    """Position and text of each tick."""
     y_ticks: list[tuple[float, str]]
     lines: list[Line]
     marks: list[tuple[float, str]]
-    """Position and name."""
+    """Position and name of each mark."""
     width: int = WIDTH
     height: int = HEIGHT
     left: int = LEFT
@@ -81,11 +81,11 @@ class _Axis:
     low: float
     high: float
     start: int
-    """Where `low` is [px]."""
+    """Position of `low` [px]."""
     end: int
 
     def at(self, value: float) -> float:
-        """Return where a value is [px]."""
+        """Return the position of a value [px]."""
         share = (value - self.low) / (self.high - self.low)
         return round(float(self.start + share * (self.end - self.start)), 1)
 

@@ -18,11 +18,11 @@ from warpir.core.latlong import map_directions, resize_map, texel_solid_angles
 from warpir.scene.light import angles_from_axis, bearing
 
 HEIGHT = 128
-"""Rows of the map that is measured; a texel is 1.4 degrees."""
+"""Rows of the measured map; a texel is 1.4 degrees."""
 OVERHEAD_DEG, LOW_DEG = 75.0, 20.0
 """Elevation from which a light is overhead, and up to which it is not in the upper part [deg]."""
 REACH_DEG = 60.0
-"""Farthest from its brightest direction that light counts as direct [deg]."""
+"""Largest angle of direct light from the brightest direction [deg]."""
 EVEN = 0.1
 """Share of direct light on the ground below which no shadow has an edge [1]."""
 EDGES = (
@@ -35,25 +35,25 @@ EDGES = (
 NEUTRAL, SLIGHT, STRONG = 0.08, 0.25, 0.55
 """Saturation (max - min) / max below which a colour is neutral or slight, and above strong [1]."""
 HUES = ("red", "orange", "yellow", "green", "green", "turquoise", "blue", "blue", "violet", "pink")
-"""Of hue angles, a tenth of the circle each, from 342 degrees on."""
+"""Names of hue angles, a tenth of the circle each, from 342 degrees on."""
 
 
 @dataclass(frozen=True)
 class LightCharacter:
-    """A light as it falls on the ground."""
+    """Direction, size and colour of a light on the ground."""
 
     azimuth_deg: float
-    """Of the middle of the brightest area, world frame, clockwise from -Z seen from above [deg]."""
+    """Azimuth of the brightest area's middle, world frame, clockwise from -Z from above [deg]."""
     elevation_deg: float
-    """Above the horizon [deg]."""
+    """Elevation of the brightest area's middle [deg]."""
     bearing_deg: float
-    """The same azimuth, from where the camera looks [deg]."""
+    """Azimuth relative to the camera's viewing direction [deg]."""
     half_width_deg: float
-    """Mean distance from there to where the radiance falls to half of its peak [deg]."""
+    """Mean angle from the middle to half of the peak radiance [deg]."""
     direct: Float64Array
-    """Irradiance of the ground by what exceeds the surroundings there, RGB, relative [W/m^2]."""
+    """Irradiance of the ground by the direct light, RGB, relative [W/m^2]."""
     sky: Float64Array
-    """By all the rest."""
+    """Irradiance of the ground by all other light, RGB, relative [W/m^2]."""
 
     @property
     def direct_share(self) -> float:
@@ -156,7 +156,7 @@ def light_rows(
 
 
 def origin_words(character: LightCharacter) -> str:
-    """Return where a light comes from, or that it is even and where it is brightest."""
+    """Return the origin of a light in words, or its brightest side if it is even."""
     words = direction_words(character.bearing_deg, character.elevation_deg)
     return words if character.direct_share >= EVEN else f"from all around, brightest {words}"
 
@@ -187,7 +187,7 @@ def direction_words(bearing_deg: float, elevation_deg: float) -> str:
 
 
 def strength_words(character: LightCharacter) -> str:
-    """Return how the direct light compares with all the rest, on the ground."""
+    """Return the ratio of direct to other light on the ground in words."""
     share = character.direct_share
     if share < EVEN:
         return "no direct light to speak of: the light comes from all around"
@@ -205,7 +205,7 @@ def strength_words(character: LightCharacter) -> str:
 
 
 def softness_words(character: LightCharacter) -> str:
-    """Return what kind of shadow a light casts."""
+    """Return the softness of a light's shadow in words."""
     if character.direct_share < EVEN:
         return "no edge: only where the object closes off the sky the ground is darker"
     width = character.half_width_deg

@@ -1,8 +1,7 @@
-"""What a 3D asset is once it is loaded: triangles, materials and textures as plain arrays.
+"""A loaded 3D asset: triangles, materials and textures as plain arrays.
 
-The readers of `warpir.io.assets` fill these records after checking the file; nothing behind them
-checks again. Frame: the asset's own, right-handed, +Y up, front +Z, in
-metres.
+The readers of `warpir.io.assets` fill these records after checking the file; later stages rely on
+those checks. Frame: the asset's own, right-handed, +Y up, front +Z, in metres.
 """
 
 from collections.abc import Mapping, Sequence
@@ -13,12 +12,12 @@ import numpy as np
 from warpir.core.arrays import CodeArray, Float64Array, FloatArray, IntArray
 
 ABSENT = "absent"
-"""In place of a sha256, where grey stands for a file that could not be read."""
+"""Replaces the sha256 of a texture file that could not be read; grey replaces its texels."""
 
 
 @dataclass(frozen=True)
 class Texture:
-    """An image in memory; whether it is colour or plain numbers is decided by the slot using it."""
+    """An image in memory; the slot that uses it decides whether it is colour or plain numbers."""
 
     pixels: CodeArray
     """RGBA codes, row 0 at the top (v = 0), shape [height, width, 4]."""
@@ -30,12 +29,12 @@ class Texture:
 
 @dataclass(frozen=True)
 class TextureSlot:
-    """How a material reads one texture."""
+    """Texture of a material, with its coordinates and transform."""
 
     texture: int
     """Index into ``Asset.textures``."""
     uv_set: int = 0
-    """0 or 1: which texture coordinates of the primitive."""
+    """Set of the primitive's texture coordinates, 0 or 1."""
     transform: tuple[float, float, float, float, float, float] = (1.0, 0.0, 0.0, 0.0, 1.0, 0.0)
     """Affine map (a, b, c, d, e, f): ``u' = a u + b v + c``, ``v' = d u + e v + f``."""
 
@@ -83,32 +82,32 @@ class Material:
     """Share of the light that is not reflected and passes a thin wall (KHR_materials_transmission)
     instead of reaching the diffuse base [1]."""
     base_color_texture: TextureSlot | None = None
-    """sRGB-encoded RGB, linear alpha."""
+    """Factor on `base_color` and `alpha`: sRGB-encoded RGB, linear alpha."""
     metallic_roughness_texture: TextureSlot | None = None
-    """G roughness, B metallic, linear."""
+    """Factors on `roughness` (G) and `metallic` (B), linear."""
     normal_texture: TextureSlot | None = None
-    """Tangent space, linear, +Y up."""
+    """Normal map in tangent space, linear, +Y up."""
     emission_texture: TextureSlot | None = None
     """sRGB-encoded RGB."""
     specular_texture: TextureSlot | None = None
-    """A: factor on `specular`."""
+    """Factor on `specular` in its alpha."""
     specular_color_texture: TextureSlot | None = None
     """sRGB-encoded RGB."""
     clearcoat_texture: TextureSlot | None = None
-    """R: factor on `clearcoat`."""
+    """Factor on `clearcoat` in its red channel."""
     clearcoat_roughness_texture: TextureSlot | None = None
-    """G: factor on `clearcoat_roughness`."""
+    """Factor on `clearcoat_roughness` in its green channel."""
     clearcoat_normal_texture: TextureSlot | None = None
-    """As `normal_texture`; without it the coat has the geometry's interpolated normal."""
+    """Normal map of the coat; without it the coat has the geometry's interpolated normal."""
     sheen_color_texture: TextureSlot | None = None
     """sRGB-encoded RGB."""
     sheen_roughness_texture: TextureSlot | None = None
-    """A: factor on `sheen_roughness`."""
+    """Factor on `sheen_roughness` in its alpha."""
     transmission_texture: TextureSlot | None = None
-    """R: factor on `transmission`."""
+    """Factor on `transmission` in its red channel."""
 
     def texture_slots(self) -> list[TextureSlot]:
-        """Return how the material reads its textures, in the order of the fields."""
+        """Return the slot of each texture, in the order of the fields."""
         return [value for value in vars(self).values() if isinstance(value, TextureSlot)]
 
 
@@ -117,9 +116,9 @@ class Primitive:
     """Triangles of one material, already in the asset's frame (node transforms applied)."""
 
     positions: Float64Array
-    """Asset frame [m], shape [vertex, 3]; float64 so that recentring loses nothing."""
+    """Vertex positions, asset frame [m], shape [vertex, 3]; float64 so that recentring is exact."""
     indices: IntArray
-    """Counter-clockwise seen from outside, shape [triangle, 3]."""
+    """Vertices of each triangle, counter-clockwise from outside, shape [triangle, 3]."""
     material: int
     """Index into ``Asset.materials``."""
     normals: FloatArray | None = None
@@ -143,10 +142,10 @@ class Asset:
     materials: tuple[Material, ...]
     textures: tuple[Texture, ...] = ()
     notices: tuple[str, ...] = field(default=())
-    """What was repaired, assumed or left out, one line each; printed and kept in ``run.json``."""
+    """Repairs, assumptions and omissions, one line each; printed and kept in ``run.json``."""
     hashes: Mapping[str, str] = field(default_factory=dict)
-    """sha256 of what was read: of the asset's file as ``""``, of others by their relative names;
-    `ABSENT` where grey stands for a file."""
+    """sha256 of the files read: the asset's as ``""``, others by their relative names;
+    `ABSENT` where a file is missing."""
 
     def bounds(self) -> tuple[Float64Array, Float64Array]:
         """Return the lowest and highest corner of all vertices, asset frame [m], shape [3] each."""

@@ -36,9 +36,9 @@ class Camera:
     c2w: Float64Array
     """Camera to world, rigid, column vectors, shape [4, 4]."""
     notices: tuple[str, ...] = field(default=(), compare=False)
-    """What was scaled or looks odd, one line each; printed and kept in ``run.json``."""
+    """Scalings and doubtful values, one line each; printed and kept in ``run.json``."""
     assumed: tuple[str, ...] = field(default=(), compare=False)
-    """What was chosen because nothing was given, one line each; likewise."""
+    """Assumed values, one line each; printed and kept in ``run.json``."""
 
     def scaled(self, width: int, height: int) -> "Camera":
         """Return the same view at another resolution."""
@@ -143,7 +143,7 @@ def blender_camera(camera: Camera) -> dict[str, Any]:
 
 
 def square_pixel_error(camera: Camera) -> float:
-    """Return how far rows are off where fx has to stand for fy too, at the worst pixel [px]."""
+    """Return the largest error of rows where fx replaces fy, over all pixels [px]."""
     farthest = max(abs(camera.cy), abs(camera.height - camera.cy))
     return float(abs(camera.fx / camera.fy - 1.0) * farthest)
 
@@ -193,7 +193,7 @@ def camera_from_exif(
     camera_height: float,
     horizon: float | None = None,
 ) -> Camera:
-    """As `camera_from_fov`, from EXIF's 35 mm equivalent focal length [mm], by the diagonal."""
+    """Return an upright camera from EXIF's 35 mm equivalent focal length [mm], by the diagonal."""
     if not (np.isfinite(focal_35mm) and focal_35mm > 0.0):
         raise InputError(
             "--photo",

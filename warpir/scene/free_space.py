@@ -1,4 +1,4 @@
-"""Where on the ground an object can stand: free of points, seen by the camera.
+"""Places on the ground where an object can stand: free of points, seen by the camera.
 
 Points above the ground by a tenth of the object's height, and lower than its top, are obstacles (of
 a car: between 0.15 m and 1.5 m). Lengths go by the object's size, because the scale of a point
@@ -20,13 +20,13 @@ Place = tuple[float, float, float]
 MARGIN = 0.1
 """Space kept free around the object, as a share of its longest side."""
 STEP = 0.1
-"""Height above the ground from which a point is in the way, as a share of the object's."""
+"""Height above the ground from which a point is an obstacle, over the object's height [1]."""
 STRAY = 2
-"""So many points in the way are taken for noise of the cloud."""
+"""Number of obstacle points that counts as noise of the cloud."""
 NEAR, FAR = 1.2, 7.0
 """Preferred distance, in longest sides of the object: 5 m to 30 m for a car."""
 GRID = (25, 24)
-"""Places tried, across the photo and down."""
+"""Number of places tried, across the photo and down."""
 
 
 @dataclass(frozen=True)
@@ -34,14 +34,14 @@ class Cloud:
     """Points over a ground plane."""
 
     points: Float64Array
-    """World frame [m], shape [point, 3]."""
+    """Points, world frame [m], shape [point, 3]."""
     heights: Float64Array
-    """Above the ground [m], shape [point]."""
+    """Heights above the ground [m], shape [point]."""
     noise: float
     """Standard deviation of the ground's points from the plane [m]."""
 
     def least_height(self, height: float) -> float:
-        """Return the height from which a point is in the way of an object of that height [m]."""
+        """Return the height from which a point obstructs an object of that height [m]."""
         return max(STEP * height, 4.0 * self.noise)
 
 
@@ -146,12 +146,12 @@ class _Box:
 
     @property
     def is_cut(self) -> bool:
-        """Whether the frame cuts it, or it reaches behind the camera."""
+        """Whether the frame cuts the box, or the box reaches behind the camera."""
         size = (self.camera.width, self.camera.height)
         return not ((self.pixels >= 0.0) & (self.pixels <= size)).all()
 
     def hidden(self, cloud: Cloud) -> int:
-        """Return how many points stand between it and the camera."""
+        """Return the number of points between the box and the camera."""
         raised = cloud.points[cloud.heights > 4.0 * cloud.noise]
         pixels = self.camera.project(raised)
         within = (pixels >= self.pixels.min(axis=0)) & (pixels <= self.pixels.max(axis=0))

@@ -1,4 +1,4 @@
-"""The ground as a plane through a point cloud, found robustly, as for LiDAR of driving scenes.
+"""Robust fit of the ground plane to a point cloud, as for LiDAR of driving scenes.
 
 Hypotheses through three points each are scored by MSAC (Torr and Zisserman 2000: the sum of squared
 distances, cut off at a threshold), the best is refined by total least squares on its inliers.
@@ -13,18 +13,18 @@ from warpir.core.errors import InputError
 from warpir.scene.camera import Camera
 
 HYPOTHESES = 50_000
-"""Triples tried: ground that makes up 5 % of the points is hit about six times."""
+"""Number of triples tried: ground that holds 5 % of the points is drawn about six times."""
 SCORED_ON = 1000
-"""Points on which hypotheses are compared."""
+"""Number of points on which hypotheses are scored."""
 THRESHOLD_SHARE = 0.005
 """Cut-off distance, as a share of the points' median distance from the camera: 7 cm at 15 m."""
 LEAST_INLIERS = 30
 LEAST_SHARE = 0.05
-"""A plane through points without order holds a tenth of this."""
+"""Least share of inliers [1]; a plane through unordered points has a tenth of it."""
 TILT_LIMIT = 30.0
-"""How far the ground's normal may be from up [deg]."""
+"""Largest angle of the ground's normal from up [deg]."""
 TILT_LIMIT_OF_CAMERA = 45.0
-"""The same from the camera's own up, where nothing else says which way is up [deg]."""
+"""Largest angle of the normal from the camera's up, where the world's is unknown [deg]."""
 REFINEMENTS = 10
 
 
@@ -33,22 +33,22 @@ class GroundFit:
     """A plane through the points that show the ground."""
 
     plane: Float64Array
-    """(a, b, c, d): unit normal on the camera's side, offset, shape [4]."""
+    """Plane (a, b, c, d): unit normal on the camera's side, offset, shape [4]."""
     rms: float
-    """Of the inliers' distances from the plane [m]."""
+    """Root mean square of the inliers' distances from the plane [m]."""
     inliers: int
     points: int
-    """In view of the camera, which the fit was made from."""
+    """Number of points in view of the camera, which were fitted."""
     tilt_deg: float
-    """Angle of the normal from up, or else from the camera's up [deg]."""
+    """Angle of the normal from the world's up, or from the camera's where unknown [deg]."""
     camera_height: float
-    """Of the camera above the plane [m]."""
+    """Height of the camera above the plane [m]."""
     has_up: bool = True
     """Whether the world's up was known."""
 
     @property
     def about(self) -> str:
-        """One line for the user."""
+        """Summary of the fit in one line."""
         share = 100.0 * self.inliers / self.points
         level = "level" if self.has_up else "the camera's"
         return (
@@ -58,7 +58,7 @@ class GroundFit:
         )
 
     def record(self) -> dict[str, object]:
-        """Return what ``run.json`` says of it."""
+        """Return the fit's entry in ``run.json``."""
         return {
             "plane": self.plane.tolist(),
             "rms": self.rms,

@@ -1,4 +1,4 @@
-"""Lamps: the narrow strong parts of a light, such as the sun, apart from all that surrounds them.
+"""Lamps: narrow strong parts of a light, such as the sun, separated from their surroundings.
 
 One definition for lobes and maps: a lamp is what exceeds its surroundings within `LAMP_RADIUS_DEG`
 and sends more than `LAMP_SHARE` of the light's flux.
@@ -16,8 +16,8 @@ from warpir.scene.light import Light
 LAMP_SHARE = 0.03
 """Share of the flux above which a compact source counts [1]."""
 LAMP_RADIUS_DEG = 6.0
-"""Surroundings within which a compact source is measured [deg]; of a lobe, what its standard
-deviation is below."""
+"""Surroundings within which a compact source is measured [deg]; also the limit on a
+lobe's standard deviation."""
 LAMP_COUNT_MAX = 8
 LAMP_SHARPNESS_MAX = 1e5
 
@@ -29,11 +29,11 @@ class MapLamps:
     axes: Float64Array
     """Unit directions, world frame, shape [lamp, 3]."""
     sharpness: Float64Array
-    """Of lobes with their spread, shape [lamp]."""
+    """Sharpness of lobes with the lamps' spread, shape [lamp]."""
     near: list[BoolArray]
-    """Surroundings of each, shape [He, We]."""
+    """Texels of each lamp's surroundings, shape [He, We]."""
     rest: Float64Array
-    """Luminance of the map without them, shape [He, We]."""
+    """Luminance of the map without the lamps, shape [He, We]."""
 
 
 def lamps_of(texels: FloatArray, limit: int = LAMP_COUNT_MAX) -> MapLamps:

@@ -15,7 +15,7 @@ import numpy as np
 from warpir.core.arrays import Float64Array
 
 NEGLIGIBLE = 1e-6
-"""A lens none of whose coefficients is larger is taken to be straight."""
+"""Largest coefficient of a lens that counts as undistorted [1]."""
 
 
 @dataclass(frozen=True)
@@ -23,13 +23,13 @@ class Lens:
     """Distortion in normalised image coordinates, so the same at every resolution."""
 
     radial: tuple[float, float, float, float] = (0.0, 0.0, 0.0, 0.0)
-    """k1, k2, k3, k4 [1]."""
+    """Radial coefficients k1, k2, k3, k4 [1]."""
     tangential: tuple[float, float] = (0.0, 0.0)
-    """p1, p2 [1]."""
+    """Tangential coefficients p1, p2 [1]."""
 
     @property
     def is_straight(self) -> bool:
-        """Whether no coefficient is large enough to matter."""
+        """Whether all coefficients are negligible."""
         return all(abs(k) <= NEGLIGIBLE for k in (*self.radial, *self.tangential))
 
     def reach(self) -> float:
@@ -40,7 +40,7 @@ class Lens:
         return float(np.sqrt(real.min())) if len(real) else float("inf")
 
     def distort(self, x: Float64Array, y: Float64Array) -> tuple[Float64Array, Float64Array]:
-        """Return where points of the plane at depth 1 are seen through the lens; y is down."""
+        """Return the distorted positions of points of the plane at depth 1; y is down."""
         k1, k2, k3, k4 = self.radial
         p1, p2 = self.tangential
         rr = x * x + y * y
@@ -51,7 +51,7 @@ class Lens:
         )
 
     def record(self) -> dict[str, list[float]]:
-        """Return what ``run.json`` says of it."""
+        """Return the lens's entry in ``run.json``."""
         return {"radial": list(self.radial), "tangential": list(self.tangential)}
 
 

@@ -49,7 +49,7 @@ class Light:
 
     lobes: Lobes | None = None
     texels: FloatArray | None = None
-    """Shape [He, We, 3]."""
+    """Lat-long radiance, shape [He, We, 3]."""
 
     def scaled(self, factor: float) -> Light:
         """Return the light times ``factor``."""
@@ -173,16 +173,16 @@ def plain_sky(sky: tuple[float, float, float], ground: tuple[float, float, float
 
 @dataclass(frozen=True)
 class LightSummary:
-    """What a person wants to know of a light."""
+    """Brightness, main direction and concentration of a light."""
 
     peak_luminance: float
     mean_luminance: float
-    """Solid-angle weighted."""
+    """Mean luminance over the sphere, relative [W/(m^2 sr)]."""
     azimuth_deg: float
     elevation_deg: float
-    """Direction of the brightest part."""
+    """Elevation of the brightest part [deg]."""
     peak_share: float
-    """Share of the total flux within 5 degrees of it [1]."""
+    """Share of the total flux within 5 degrees of the brightest part [1]."""
 
 
 def rasterize_lobes(lobes: Lobes, height: int, width: int, side: int = 6) -> FloatArray:

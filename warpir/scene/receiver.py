@@ -1,7 +1,7 @@
-"""The receiver as plain triangles, and the first of them that a ray meets, in float64.
+"""Receiver mesh as plain triangles, and its ray intersection in float64.
 
-For what is asked before a renderer is there: where a pixel's ray lands, whether a lamp reaches a
-point of the ground. The kernels' half is `warpir.kernels.receiver_mesh`.
+Used before there is a renderer: for the point that a pixel shows, and for the visibility of lamps
+from the ground. The kernels' half is `warpir.kernels.receiver_mesh`.
 """
 
 from dataclasses import dataclass
@@ -13,17 +13,17 @@ from warpir.scene.asset import Asset
 from warpir.scene.camera import Camera
 
 CHUNK = 1 << 21
-"""Pairs of ray and triangle that are tested at once."""
+"""Number of ray-triangle pairs tested at once."""
 
 
 @dataclass(frozen=True)
 class ReceiverMesh:
-    """Triangles where they stand; both of their sides count."""
+    """Two-sided triangles in the world."""
 
     positions: Float64Array
-    """World frame [m], shape [vertex, 3]."""
+    """Vertex positions, world frame [m], shape [vertex, 3]."""
     indices: IntArray
-    """Shape [triangle, 3]."""
+    """Vertices of each triangle, shape [triangle, 3]."""
 
 
 def mesh_of(asset: Asset) -> ReceiverMesh:
@@ -41,7 +41,7 @@ def mesh_of(asset: Asset) -> ReceiverMesh:
 def first_hit(
     mesh: ReceiverMesh, origins: Float64Array, directions: Float64Array
 ) -> tuple[Float64Array, Int64Array]:
-    """Return how far each ray gets, every triangle tried (Moeller and Trumbore 1997).
+    """Return the distance of each ray's first hit by brute force (Moeller and Trumbore 1997).
 
     Args:
         mesh: Triangles.

@@ -1,8 +1,8 @@
-"""Where the photo's ground lies in shadow already, as the user painted it (``--shadow-mask``).
+"""Mask of the ground that is already in shadow in the photo (``--shadow-mask``).
 
-A shadow takes the lamps (`warpir.scene.lamps`) and leaves the rest of the light. The object can
-take no more from the ground there than its share of that rest, and where it stands in the shadow
-itself no lamp lights it.
+A shadow removes the lamps (`warpir.scene.lamps`) and leaves the rest of the light. There, the
+object removes no more than its share of that rest, and no lamp lights an object that stands in
+the shadow.
 """
 
 from dataclasses import dataclass
@@ -13,17 +13,17 @@ from warpir.core.arrays import Float64Array, FloatArray
 from warpir.scene.camera import Camera
 
 FOOTPRINT_SIDE = 16
-"""Points along each side of the object's footprint that the mask is read at."""
+"""Number of points along each side of the footprint at which the mask is read."""
 
 
 @dataclass(frozen=True)
 class ShadowMask:
-    """Share of the lamps that the photo's own shadows take."""
+    """Share of the lamps' light that the photo's own shadows remove."""
 
     shares: FloatArray
-    """Of the ground in each pixel, 1 in full shadow, shape [H, W]."""
+    """Share removed from the ground in each pixel, 1 in full shadow, shape [H, W]."""
     at_object: float
-    """Of the object: their mean under its footprint [1]."""
+    """Share removed from the object: the mean under its footprint [1]."""
 
 
 def shadow_mask(

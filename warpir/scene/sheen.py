@@ -1,4 +1,4 @@
-"""How much light the sheen of cloth reflects, so that the base below it gets the rest.
+"""Directional albedo of the sheen of cloth, by which the base below it is scaled.
 
 KHR_materials_sheen scales the base by ``1 - max(sheenColor) E(cos)``, where E is the directional
 albedo of the Charlie lobe (Conty & Kulla 2017, "Production Friendly Microfacet Sheen BRDF"). The
@@ -13,9 +13,9 @@ from warpir.core.arrays import Float64Array
 
 TABLE_SIZE = 32
 ALPHA_MIN = 1e-3
-"""The kernels' least width of a lobe."""
+"""Least width of a lobe in the kernels [1]."""
 COSINE_MIN = 1e-5
-"""Stands for grazing, where the lobe is 0 times infinity."""
+"""Cosine that replaces 0 at grazing angles, where the lobe is 0 times infinity [1]."""
 
 
 @cache
