@@ -13,6 +13,7 @@ DIRECTION = (
     {"core"},
     {"scene"},
     {"io"},
+    {"look"},
     {"app"},
     {"demo"},
     {"render"},

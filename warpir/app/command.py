@@ -34,6 +34,7 @@ HEADINGS = {
     "placement": "placement",
     "light": "light",
     "render": "rendering",
+    "look": "look of the photo",
     "guidance": "guidance",
     "diffusion": "diffusion model",
     "adapter": "personalisation",

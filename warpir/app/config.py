@@ -17,6 +17,7 @@ from warpir.app.settings import (
     GuidanceConfig,
     InputConfig,
     LightConfig,
+    LookConfig,
     OptimizeSettings,
     OutputConfig,
     PlacementConfig,
@@ -62,6 +63,7 @@ class InsertConfig:
     placement: PlacementConfig
     light: LightConfig
     render: RenderConfig
+    look: LookConfig
     guidance: GuidanceConfig
     diffusion: ModelSettings
     adapter: PersonalizeSettings

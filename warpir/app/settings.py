@@ -16,6 +16,10 @@ from warpir.diffusion.settings import GuidanceChoices
 AXES = ("x", "+x", "-x", "y", "+y", "-y", "z", "+z", "-z")
 
 
+AUTO = ("auto", "off")
+"""Words that may stand in place of a number that can be estimated from the photo."""
+
+
 @dataclass(frozen=True)
 class InputConfig:
     """The photograph, the object, and how strictly their files are read."""
@@ -172,6 +176,18 @@ class RenderConfig:
     """Seed of all random numbers"""
     deterministic: bool = option(False)
     """Repeat the same bytes on a GPU too, slower; on the CPU every run does"""
+
+
+@dataclass(frozen=True)
+class LookConfig:
+    """What the photo's camera did to the scene, and is done to the object."""
+
+    sharpness: float | str = option("auto", "auto|off|PX", choices=AUTO, low=0, high=32)
+    """Blur of the object's outline and texture (default auto: that of the photo's sharpest edges
+    around it); its standard deviation in pixels"""
+    grain: float | str = option("auto", "auto|off|CODES", choices=AUTO, low=0, high=64)
+    """Noise on the object and its shadow (default auto: like the photo's); its standard deviation
+    in codes of 255"""
 
 
 @dataclass(frozen=True)

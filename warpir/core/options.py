@@ -31,7 +31,7 @@ class Rule:
     below: float | None = None
     """Value that must exceed it."""
     choices: tuple[str, ...] = ()
-    """All values, where these are words."""
+    """All words that it may be; of a number, those that may stand in its place."""
     is_prompt: bool = False
     """Whether it is a text for a text encoder, whose length is limited."""
     may_be_empty: bool = False
@@ -49,6 +49,10 @@ class Rule:
 
     def problem(self, value: Any) -> str:
         """Return what a value should be, or nothing if it is that; NaN is for others to find."""
+        if isinstance(value, str):
+            of_numbers = "" if self.low is None else f", or {self.low:g} to {self.high:g}"
+            accepted = not self.choices or value in self.choices
+            return "" if accepted else " or ".join(self.choices) + of_numbers
         if self.above is not None and self.below is not None:
             inside = not (value <= self.above or value >= self.below)
             return "" if inside else f"between {self.above:g} and {self.below:g}"
@@ -58,8 +62,6 @@ class Rule:
             return f"at least {self.low}"
         if self.high is not None and value > self.high:
             return f"at most {self.high}"
-        if self.choices and value not in self.choices:
-            return " or ".join(self.choices)
         return ""
 
 

@@ -27,7 +27,8 @@ class Layers:
     """What ``layers.exr`` holds, all linear Rec.709; buffers that a run has not made are absent."""
 
     composite: PixelArray
-    """``foreground.rgb + (1 - foreground.a) * plate * shadow_ratio`` [1], shape [H, W, 3]."""
+    """``foreground.rgb + (1 - foreground.a) * plate * shadow_ratio``, plus `grain` where there is
+    any [1], shape [H, W, 3]."""
     foreground: PixelArray
     """Object alone, premultiplied by coverage [1], shape [H, W, 4]."""
     shadow_ratio: PixelArray
@@ -52,6 +53,8 @@ class Layers:
     """Part of `foreground` reflected diffusely [1], shape [H, W, 3]."""
     specular: PixelArray | None = None
     """Part of `foreground` reflected specularly [1], shape [H, W, 3]."""
+    grain: PixelArray | None = None
+    """What the sensor's grain adds to the composite, of either sign [1], shape [H, W, 3]."""
 
 
 _CHANNELS = {
@@ -68,10 +71,11 @@ _CHANNELS = {
     "emission": ("emission", "RGB"),
     "diffuse": ("diffuse", "RGB"),
     "specular": ("specular", "RGB"),
+    "grain": ("grain", "RGB"),
 }
 """Layer and channels that each plane has in ``layers.exr``."""
 _FULL_FLOATS = {"depth", "position", "normal"}
-_DEEP = {"composite", "foreground", "shadow_ratio", "plate"}
+_DEEP = {"composite", "foreground", "shadow_ratio", "plate", "grain"}
 """What is stored as float32: always, and of a photograph of more than 8 bits."""
 
 
@@ -142,9 +146,13 @@ def write_layers(
         layers.foreground[..., :3]
         + (1.0 - layers.foreground[..., 3:]) * layers.plate * layers.shadow_ratio
     )
+    formula = "RGB = fg.RGB + (1 - fg.A) * plate.RGB * shadow.RGB"
+    if layers.grain is not None:
+        recomputed = recomputed + layers.grain
+        formula += " + grain.RGB"
     if not np.allclose(layers.composite, recomputed, rtol=2e-3, atol=2e-3, equal_nan=True):
         worst = float(np.nanmax(np.abs(layers.composite - recomputed)))
-        raise ValueError(f"composite differs from fg + (1 - a) plate shadow by up to {worst:g}")
+        raise ValueError(f"composite differs from its layers by up to {worst:g}")
 
     channels, clamped = _stored_channels(layers, height, width, is_deep)
     channels["A"] = np.ones((height, width), np.float16)
@@ -157,7 +165,7 @@ def write_layers(
             **color_header(),
             "worldToCamera": world_to_camera.astype(np.float32),
             "worldToNDC": world_to_ndc.astype(np.float32),
-            "warpir/formula": "RGB = fg.RGB + (1 - fg.A) * plate.RGB * shadow.RGB",
+            "warpir/formula": formula,
             "warpir/config": json.dumps(config or {}, sort_keys=True, default=str),
             "warpir/inputs": json.dumps(inputs or {}, sort_keys=True),
         },

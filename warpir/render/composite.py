@@ -2,17 +2,18 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
 from warpir.app.inputs import Inputs
 from warpir.core.arrays import BoolArray, CodeArray, FloatArray, IntArray
-from warpir.core.color import linear_to_gamma
+from warpir.core.color import GAMMA, linear_to_gamma
 from warpir.core.latlong import map_directions, texel_solid_angles, uv_of
 from warpir.io.images.photos import Photo
 from warpir.io.layers import Layers
 from warpir.kernels.types import LightArgs
+from warpir.look.camera_look import CameraLook
 from warpir.render.device_light import light_args
 from warpir.render.device_scene import Placed, Receiver, Scene
 from warpir.render.renderer import Foreground, GBuffer, Renderer
@@ -58,6 +59,8 @@ class Picture:
     """Pixels whose object was traced, at the rendering resolution."""
     receiver_pixel_count: int
     """Pixels whose shadow was traced, at the rendering resolution."""
+    look: CameraLook = field(default_factory=CameraLook)
+    """What the camera did to the photo, repeated on object and shadow."""
 
 
 def make_picture(
@@ -72,6 +75,7 @@ def make_picture(
     *,
     occluder: FloatArray | None = None,
     shadow_mask: ShadowMask | None = None,
+    look: CameraLook | None = None,
 ) -> Picture:
     """Render object and shadow at the scene camera's resolution and put them into the photo.
 
@@ -86,6 +90,7 @@ def make_picture(
         is_reinhard: Whether Reinhard's operator precedes the foreground curve.
         occluder: Share of the photo that stays in front of the object [1], shape [H, W].
         shadow_mask: Where the photo's ground is in shadow already.
+        look: What the camera did to the photo, to be repeated on object and shadow.
     """
     dimmed = light_fg if shadow_mask is None else without_lamps(light_fg, shadow_mask.at_object)
     args_fg = light_args(dimmed, renderer.device)
@@ -107,16 +112,23 @@ def make_picture(
     planes = _planes(renderer.scene.camera, gbuffer, foreground, fg, (receiver_pixels, beta))
     if planes["matte"].shape != photo.srgb.shape[:2]:
         planes = _resize_planes(planes, *photo.srgb.shape[:2])
+    if look is not None:
+        planes = look.sharpened_like_photo(
+            planes, photo.srgb.shape[1] / renderer.scene.camera.width
+        )
     if occluder is not None:
         planes = _behind(planes, occluder)
     layers = _layers(planes, photo)
     changed = (layers.matte > 0.0) | (layers.shadow_ratio != 1.0).any(axis=-1)
+    if look is not None:
+        layers = _with_grain(layers, look, changed, quality.seed, photo.is_deep)
     return Picture(
         layers,
         linear_to_gamma(layers.composite).astype(np.float32),
         changed,
         len(gbuffer.object_pixels),
         len(receiver_pixels),
+        look or CameraLook(),
     )
 
 
@@ -191,6 +203,17 @@ def _layers(planes: dict[str, FloatArray], photo: Photo) -> Layers:
         plate=plate,
         **{k: v for k, v in planes.items() if k != "foreground"},
     )
+
+
+def _with_grain(
+    layers: Layers, look: CameraLook, changed: BoolArray, seed: int, is_deep: bool
+) -> Layers:
+    """Add the photo's grain to what has changed, in a layer of its own."""
+    grain = look.grain_on(layers.composite, layers.plate, layers.matte, changed, seed, GAMMA)
+    if grain is None:
+        return layers
+    grain = grain if is_deep else _halves(grain)
+    return replace(layers, composite=layers.composite + grain, grain=grain)
 
 
 def _behind(planes: dict[str, FloatArray], occluder: FloatArray) -> dict[str, FloatArray]:

@@ -296,6 +296,7 @@ def figures(record: Mapping[str, Any]) -> Rows:
         ("pixels whose shadow was traced, as rendered", f"{measured['shadow_pixels']:,}"),
         ("pixels of the picture that differ from the photo", f"{measured['changed_pixels']:,}"),
         ("exposure of the light", f"{measured['exposure_ev']:+.2f} EV"),
+        *_look(measured.get("look", {})),
     ]
     for key, what in (
         ("values_clamped_to_half", "values clamped to half precision"),
@@ -303,6 +304,18 @@ def figures(record: Mapping[str, Any]) -> Rows:
     ):
         if measured[key]:
             rows.append((what, f"{measured[key]:,}"))
+    return rows
+
+
+def _look(look: Mapping[str, Any]) -> Rows:
+    """Return what of the photo's camera the object got; files of older runs say nothing."""
+    rows: Rows = []
+    if blur := look.get("blur"):
+        rows.append(("blur of the object, as of the photo's edges", f"{blur['sigma']:.2f} px"))
+    if grain := look.get("grain"):
+        weakest, strongest = (255.0 * f(map(f, grain["strength"])) for f in (min, max))
+        text = f"{weakest:.1f} to {strongest:.1f} codes of 255, {grain['size']:.1f} px wide"
+        rows.append(("grain on the object, as of the photo", text))
     return rows
 
 

@@ -204,13 +204,18 @@ def _opaque_layers(layers: Layers) -> Iterator[Layer]:
     def opaque(plane: FloatArray) -> Shown:
         return jpeg(encoded(shrink(plane, LAYER_LARGEST)))
 
-    about = "The picture: fg + (1 − fg.A) × plate × shadow, pixel by pixel."
+    about = "The picture: fg + (1 − fg.A) × plate × shadow, pixel by pixel"
+    about += "." if layers.grain is None else ", plus grain."
     yield Layer("composite", about, opaque(layers.composite), has_alpha=False)
     about = "What the photo is multiplied with: white where the object changes nothing."
     if (darkest := float(luminance(layers.shadow_ratio).min())) < 1.0:
         about += f" Its darkest pixel keeps {100.0 * max(darkest, 0.0):.0f} % of the light."
     yield Layer("shadow", about, opaque(layers.shadow_ratio), has_alpha=False)
     yield Layer("plate", "The photo, linearised.", opaque(layers.plate), has_alpha=False)
+    if layers.grain is not None:
+        about = "The photo's grain on what has changed, of either sign: grey is none, tenfold."
+        shown = jpeg(plain(shrink(0.5 + 10.0 * layers.grain, LAYER_LARGEST)))
+        yield Layer("grain", about, shown, has_alpha=False)
     matte = jpeg(plain(shrink(layers.matte, LAYER_LARGEST)))
     about = "How much of each pixel the object covers: white is all."
     yield Layer("matte", about, matte, has_alpha=False)

@@ -5,6 +5,8 @@ from __future__ import annotations
 from dataclasses import asdict, dataclass
 from typing import Any
 
+import numpy as np
+
 from warpir.app.record import config_of_picture
 from warpir.app.run import Run
 from warpir.core.arrays import CodeArray, FloatArray
@@ -15,6 +17,7 @@ from warpir.io.layers import write_layers
 from warpir.io.lobes_file import lobes_to_json
 from warpir.io.results import OutputFolder
 from warpir.lighting.scene_light import SceneLight
+from warpir.look.camera_look import CameraLook, estimate_look, region_around
 from warpir.render.composite import (
     Picture,
     Quality,
@@ -53,9 +56,11 @@ def render_result(run: Run, light: SceneLight) -> RenderedResult:
         placed = run.memory.again(
             lambda: scene_of(run.inputs, camera, run.device, light.curves), "the scene", "--asset"
         )
+    look = _look(run)
     with run.timings.stage("render"), progress_bar() as report:
         renderer = Renderer(placed, run.config.render.threads or 0, report, run.memory)
-        picture = _picture(run, light, renderer, run.config.render.samples, run.config.render.rays)
+        quality = run.config.render
+        picture = _picture(run, light, renderer, quality.samples, quality.rays, look)
     run.log.notices += run.memory.notices()  # printed when it happened
     run.log.notice(*renderer.bad_pixels.notices())
     measured = {
@@ -80,7 +85,28 @@ def write_preview(run: Run, light: SceneLight) -> None:
     run.log.say(f"preview: {run.output.write_preview(0, codes, run.inputs.photo.icc)}")
 
 
-def _picture(run: Run, light: SceneLight, renderer: Renderer, samples: int, rays: int) -> Picture:
+def _look(run: Run) -> CameraLook:
+    """Return what the camera did to the photo, as far as the object is to share it."""
+    photo, asked = run.inputs.photo, run.config.look
+    inputs = run.inputs
+    corners = np.stack(np.meshgrid(*zip(*inputs.asset.bounds(), strict=True)), axis=-1)
+    to_world = inputs.placement.asset_to_world
+    world = corners.reshape(-1, 3) @ to_world[:3, :3].T + to_world[:3, 3]
+    around = region_around(inputs.camera.project(world), photo.srgb.shape[0], photo.srgb.shape[1])
+    look = estimate_look(photo.srgb, photo.linear(), around, asked.sharpness, asked.grain)
+    if "auto" in (asked.sharpness, asked.grain):
+        run.log.assume(*look.lines())
+    return look
+
+
+def _picture(
+    run: Run,
+    light: SceneLight,
+    renderer: Renderer,
+    samples: int,
+    rays: int,
+    look: CameraLook | None = None,
+) -> Picture:
     inputs, quality = run.inputs, run.config.render
     return make_picture(
         renderer,
@@ -93,6 +119,7 @@ def _picture(run: Run, light: SceneLight, renderer: Renderer, samples: int, rays
         is_reinhard=light.curves.tone == "reinhard",
         occluder=inputs.occluder,
         shadow_mask=inputs.shadow_mask,
+        look=look,
     )
 
 
@@ -170,6 +197,7 @@ def write_results(run: Run, light: SceneLight, picture: Picture) -> Written:
         "shadow_pixels": picture.receiver_pixel_count,
         "changed_pixels": int(changed.sum()),
         "values_clamped_to_half": clamped,
+        "look": picture.look.record(),
         **handed,
     }
     results = Results(

@@ -1,0 +1,94 @@
+"""The blur of edges: pictures blurred by a known Gaussian, and layers behind it."""
+
+import numpy as np
+import pytest
+from scipy import ndimage
+
+from warpir.core.arrays import FloatArray
+from warpir.look.camera_look import CameraLook, region_around
+from warpir.look.sharpness import PIXEL_SIGMA, EdgeBlur, blurred_layers, estimate_blur
+
+FINER = 6
+"""Rows and columns of the ideal picture in a pixel."""
+
+
+def boxes(sigma: float, seed: int = 0, height: int = 160, width: int = 240) -> FloatArray:
+    """Turned boxes of random levels behind a Gaussian [px] and square pixels, [H, W, 3]."""
+    rng = np.random.default_rng(seed)
+    y, x = np.mgrid[0 : height * FINER, 0 : width * FINER]
+    image = np.full(y.shape, 0.3, np.float32)
+    for _ in range(12):
+        turn, value = rng.uniform(0.0, np.pi), rng.uniform(0.05, 0.8)
+        cx, cy = rng.uniform(0.0, 1.0, 2) * (width * FINER, height * FINER)
+        half = rng.uniform(12, 40) * FINER
+        across = (x - cx) * np.cos(turn) + (y - cy) * np.sin(turn)
+        along = (y - cy) * np.cos(turn) - (x - cx) * np.sin(turn)
+        image[(np.abs(across) < half) & (np.abs(along) < half)] = value
+    if sigma > 0.0:
+        image = ndimage.gaussian_filter(image, sigma * FINER)
+    pixels = image.reshape(height, FINER, width, FINER).mean(axis=(1, 3))
+    return np.repeat(pixels[..., None], 3, axis=2)
+
+
+@pytest.mark.parametrize("sigma", [0.0, 0.5, 1.0, 1.6])
+@pytest.mark.parametrize("noise", [0.0, 2.0])
+def test_known_blur_is_found(sigma: float, noise: float) -> None:
+    """Within .12 px, with two codes of noise too."""
+    linear = boxes(sigma)
+    codes = linear ** (1 / 2.2) + noise / 255.0 * np.random.default_rng(1).normal(size=linear.shape)
+    found = estimate_blur(np.clip(codes, 0.0, 1.0) ** 2.2)
+    assert found is not None and found.edges > 300
+    assert found.sigma == pytest.approx(np.hypot(sigma, PIXEL_SIGMA), abs=0.12)
+
+
+def test_region_decides_where_it_has_edges() -> None:
+    """Sharp left, soft right: each half has its own blur, and an empty region asks the photo."""
+    image = np.concatenate([boxes(0.2), boxes(1.8)], axis=1)
+    left = np.zeros(image.shape[:2], bool)
+    left[:, :230] = True
+    sharp, soft = estimate_blur(image, left), estimate_blur(image, ~left)
+    assert sharp is not None and soft is not None
+    assert sharp.sigma < 0.6 and soft.sigma > 1.4
+    nowhere = estimate_blur(image, np.zeros_like(left))
+    assert nowhere == estimate_blur(image)
+
+
+@pytest.mark.parametrize("value", [0.0, 0.5, 1.0])
+def test_no_edges_tell_nothing(value: float) -> None:
+    """An even picture, black and white ones too."""
+    assert estimate_blur(np.full((64, 64, 3), value)) is None
+
+
+def test_layers_are_blurred_alike() -> None:
+    """The outline keeps its colour, the contact its shadow, and far ground stays exactly 1."""
+    matte = np.zeros((60, 60), np.float32)
+    matte[20:40, 20:40] = 1.0
+    colour = np.array([0.6, 0.3, 0.1], np.float32)
+    ratio = np.ones((60, 60, 3), np.float32)
+    ratio[36:44, 16:44] = 0.2
+    planes = {"matte": matte, "foreground": matte[..., None] * colour, "shadow_ratio": ratio}
+    blurred = blurred_layers(planes, 1.2, ("foreground",))
+    soft = blurred["matte"]
+    assert soft.sum() == pytest.approx(matte.sum(), rel=1e-4)
+    np.testing.assert_allclose(blurred["foreground"], soft[..., None] * colour, atol=1e-6)
+    # Beside the object's foot the shadow is as dark as before: nothing leaks from under it.
+    assert blurred["shadow_ratio"][41, 30].max() < 0.25
+    assert (blurred["shadow_ratio"][:10] == 1.0).all()
+    assert blurred_layers(planes, 0.0, ("foreground",)) is planes
+
+
+def test_nothing_is_sharpened() -> None:
+    """An enlarged rendering is softer than the photo already."""
+    look = CameraLook(blur=EdgeBlur(0.8, 100))
+    assert look.blur_to_add() == pytest.approx(np.sqrt(0.64 - 1 / 12))
+    assert look.blur_to_add(enlarged=4.0) == 0.0
+    assert CameraLook(blur=EdgeBlur(0.1, 100)).blur_to_add() == 0.0
+
+
+def test_region_is_three_times_the_box() -> None:
+    """Points behind the camera do not count; none at all mean everywhere."""
+    points = np.array([[40.0, 30.0], [50.0, 40.0], [np.nan, np.nan]])
+    region = region_around(points, 100, 60)
+    rows, columns = np.flatnonzero(region.any(axis=1)), np.flatnonzero(region.any(axis=0))
+    assert (rows[0], rows[-1], columns[0], columns[-1]) == (20, 49, 30, 59)
+    assert region_around(points[2:], 10, 10).all()

@@ -1,0 +1,141 @@
+"""All that is repeated on the object of what the camera did to the scene."""
+
+from __future__ import annotations
+
+from dataclasses import asdict, dataclass, replace
+from typing import Any
+
+import numpy as np
+
+from warpir.core.arrays import AnyFloatArray, BoolArray, Float64Array, FloatArray
+from warpir.look.grain import Grain, estimate_grain, grain_over
+from warpir.look.sharpness import PIXEL_SIGMA, EdgeBlur, blurred_layers, estimate_blur
+
+UPSAMPLED = 2.5
+"""Variance of a rendered edge that was enlarged bilinearly, over that of its own pixel [1]."""
+FAINT = 1e-4
+"""Coverage and darkening below which the blurred object and shadow end [1]."""
+SUMMED = ("foreground", "diffuse", "specular", "emission")
+"""Premultiplied planes of the object."""
+
+
+@dataclass(frozen=True)
+class CameraLook:
+    """Blur and grain of a photo, where they are repeated on the object."""
+
+    blur: EdgeBlur | None = None
+    """Of the sharpest edges, given or estimated."""
+    grain: Grain | None = None
+
+    def blur_to_add(self, enlarged: float = 1.0) -> float:
+        """Return the Gaussian that a rendered object lacks [px].
+
+        Args:
+            enlarged: Width of the photo over that of the rendering [1].
+        """
+        if self.blur is None:
+            return 0.0
+        own = PIXEL_SIGMA**2
+        if enlarged > 1.0:
+            own *= UPSAMPLED * enlarged**2
+        return float(np.sqrt(max(self.blur.sigma**2 - own, 0.0)))
+
+    def sharpened_like_photo(
+        self, planes: dict[str, FloatArray], enlarged: float = 1.0
+    ) -> dict[str, FloatArray]:
+        """Return the planes of `blurred_layers` behind the photo's blur; nothing is sharpened."""
+        sigma = self.blur_to_add(enlarged)
+        if sigma < 0.05:
+            return planes
+        blurred = blurred_layers(planes, sigma, SUMMED)
+        faint = blurred["matte"] < FAINT
+        for name in (*SUMMED, "matte"):
+            blurred[name][faint] = 0.0
+        unshaded = blurred["shadow_ratio"] > 1.0 - FAINT
+        blurred["shadow_ratio"][unshaded] = 1.0
+        return blurred
+
+    def grain_on(
+        self,
+        composite: FloatArray,
+        plate: FloatArray,
+        matte: FloatArray,
+        changed: BoolArray,
+        seed: int,
+        gamma: float,
+    ) -> FloatArray | None:
+        """Return what `grain_over` adds, or None without grain."""
+        if self.grain is None:
+            return None
+        return grain_over(self.grain, composite, plate, matte, changed, seed, gamma)
+
+    def lines(self) -> list[str]:
+        """Return what was estimated, a sentence each."""
+        found = []
+        if self.blur is not None:
+            found.append(
+                f"the photo's sharpest edges are blurred by {self.blur.sigma:.2f} px, and so is "
+                "the object (--sharpness)"
+            )
+        if self.grain is not None:
+            found.append(
+                f"the photo has grain of {255.0 * self.grain.typical:.1f} codes of 255, and so "
+                "has the object (--grain)"
+            )
+        return found
+
+    def record(self) -> dict[str, Any]:
+        """Return what ``run.json`` holds: pixels, and display values in [0, 1]."""
+        return {
+            "blur": None if self.blur is None else asdict(self.blur),
+            "grain": None if self.grain is None else asdict(self.grain),
+        }
+
+
+def estimate_look(
+    srgb: AnyFloatArray,
+    linear: AnyFloatArray,
+    region: BoolArray | None = None,
+    sharpness: float | str = "auto",
+    grain: float | str = "auto",
+) -> CameraLook:
+    """Estimate what a camera did to a photo.
+
+    Args:
+        srgb: Display-encoded photo, shape [H, W, 3].
+        linear: The same display-linear.
+        region: Where the object will stand; what surrounds it is looked at first, shape [H, W].
+        sharpness: ``auto``, ``off``, or the standard deviation of the blur [px].
+        grain: ``auto``, ``off``, or its standard deviation [codes of 255].
+    """
+    look = CameraLook()
+    if sharpness == "auto":
+        look = replace(look, blur=estimate_blur(linear, region))
+    elif sharpness != "off":
+        look = replace(look, blur=EdgeBlur(float(sharpness), 0))
+    if grain == "auto":
+        look = replace(look, grain=estimate_grain(srgb))
+    elif grain != "off":
+        strength = float(grain) / 255.0
+        look = replace(look, grain=Grain((0.5,), ((strength,) * 3,), 0.0, 0.0))
+    return look
+
+
+def region_around(points: Float64Array, height: int, width: int) -> BoolArray:
+    """Return the pixels of the box round some points, three times as wide and high.
+
+    Args:
+        points: Image positions [px]; those behind the camera are NaN; shape [N, 2].
+        height: Of the photo [px].
+        width: Of the photo [px].
+    """
+    region = np.zeros((height, width), bool)
+    seen = points[np.isfinite(points).all(axis=1)]
+    if len(seen) == 0:
+        return ~region
+    low, high = seen.min(axis=0), seen.max(axis=0)
+    limit = np.array([width, height])
+    first = np.clip(2.0 * low - high, 0, limit).astype(int)
+    last = np.ceil(np.clip(2.0 * high - low, 0, limit)).astype(int)
+    region[first[1] : last[1], first[0] : last[0]] = True
+    return region

@@ -1,0 +1,207 @@
+"""The grain of a photo: its strength by level and channel, its size, and grain drawn like it."""
+
+from __future__ import annotations
+
+import itertools
+import zlib
+from dataclasses import dataclass
+
+import numpy as np
+from scipy import ndimage
+
+from warpir.core.arrays import AnyFloatArray, BoolArray, Float64Array, FloatArray
+
+SIDE = 12
+"""Side of the patches in which grain is looked for [px]."""
+LEVELS = 8
+"""Bins of the display value."""
+FLAT_SHARE = 0.08
+"""Share of a bin's patches, the flattest, that are taken to show nothing but grain."""
+LEAST_PATCHES = 6
+"""Flat patches that a bin needs."""
+UNCLIPPED = (0.02, 0.98)
+"""Display values between which a patch lies: beyond, grain is cut off."""
+LEAST = 0.4 / 255.0
+"""Strength in display values below which there is no grain to speak of: rounding to 8 bits alone
+has .29 codes."""
+EXCESS = 1.3
+"""Strength of a level over the weakest quarter of levels [1], beyond which it is taken for texture:
+the noise of a sensor changes little over the display values of a picture."""
+WIDEST = 2.0
+"""Largest standard deviation of the blur that stands for the grain's size [px]."""
+
+
+@dataclass(frozen=True)
+class Grain:
+    """Noise of a photo, in display values; spatially stationary, Gaussian."""
+
+    level: tuple[float, ...]
+    """Display values at which the strength is known, rising [1]."""
+    strength: tuple[tuple[float, float, float], ...]
+    """Standard deviation of red, green and blue at each level, in display values [1]."""
+    size: float
+    """Standard deviation of the Gaussian that white noise was blurred with [px]."""
+    correlation: float
+    """Mean correlation between two channels [1]."""
+
+    def deviation(self, display: AnyFloatArray) -> Float64Array:
+        """Return the standard deviation at display values, both shape [..., 3]."""
+        table = np.asarray(self.strength)
+        return np.stack(
+            [np.interp(display[..., k], self.level, table[:, k]) for k in range(3)], axis=-1
+        )
+
+    @property
+    def typical(self) -> float:
+        """Standard deviation of the luminous middle of the range, over channels [1]."""
+        return float(np.mean(self.deviation(np.full(3, 0.4))))
+
+    def draw(self, shape: tuple[int, int], *seed: int) -> Float64Array:
+        """Return noise of unit variance with the grain's size and correlation, shape [H, W, 3]."""
+        rng = np.random.Generator(np.random.Philox(np.random.SeedSequence(seed)))
+        shared, own = rng.standard_normal((*shape, 1)), rng.standard_normal((*shape, 3))
+        common = min(max(self.correlation, 0.0), 1.0)
+        noise = np.sqrt(common) * shared + np.sqrt(1.0 - common) * own
+        if self.size > 0.0:
+            noise = ndimage.gaussian_filter(noise, (self.size, self.size, 0.0), mode="wrap")
+            impulse = np.zeros((33, 33))
+            impulse[16, 16] = 1.0
+            kernel = ndimage.gaussian_filter(impulse, self.size)
+            noise /= np.sqrt((kernel**2).sum())
+        return noise
+
+
+def estimate_grain(srgb: AnyFloatArray) -> Grain | None:
+    """Estimate a photo's grain from its flattest patches.
+
+    Each patch loses its best plane; what is left in the flattest patches of each level is taken for
+    grain (after Liu et al. 2008, "Automatic estimation and removal of noise from a single image",
+    section 3, whose lower envelope this is). Flatness is judged by another channel's residual than
+    the one whose strength is estimated, so that choosing does not make the estimate small; the
+    correlation of neighbours gives the grain's size.
+
+    Args:
+        srgb: Display-encoded photo in [0, 1], shape [H, W, 3].
+
+    Returns:
+        The grain, or None where no level has flat patches enough, or less than `LEAST` of it.
+    """
+    patches = _patches(np.asarray(srgb, np.float64))
+    means = patches.mean(axis=(1, 2))
+    inside = ((patches > UNCLIPPED[0]) & (patches < UNCLIPPED[1])).all(axis=(1, 2, 3))
+    rest = _without_plane(patches[inside])
+    means = means[inside]
+    if len(rest) < LEAST_PATCHES:
+        return None
+    # Structure is smooth where grain is not: the mean over 4 x 4 blocks keeps the former.
+    blocks = rest.reshape(len(rest), SIDE // 4, 4, SIDE // 4, 4, 3).mean(axis=(2, 4))
+    structure = np.sqrt((blocks**2).mean(axis=(1, 2, 3)))
+    brightness = means.mean(axis=1)
+    edges = np.quantile(brightness, np.linspace(0.0, 1.0, LEVELS + 1))
+    levels, strengths, flat = [], [], []
+    for low, high in itertools.pairwise(edges):
+        rows = np.flatnonzero((brightness >= low) & (brightness <= high))
+        count = max(LEAST_PATCHES, round(FLAT_SHARE * len(rows)))
+        if len(rows) < count:
+            continue
+        rows = rows[np.argsort(structure[rows], kind="stable")[:count]]
+        # The median over patches: one with an edge that is left must not count.
+        variance = np.median((rest[rows] ** 2).sum(axis=(1, 2)) / (SIDE**2 - 3), axis=0)
+        level = float(np.median(brightness[rows]))
+        if levels and level <= levels[-1] + 1e-4:
+            continue
+        levels.append(level)
+        strengths.append(np.sqrt(variance))
+        flat.append(rows)
+    if not levels or np.quantile(strengths, 0.25) < LEAST:
+        return None
+    limit = EXCESS * np.quantile(strengths, 0.25, axis=0)
+    kept = [k for k, strength in enumerate(strengths) if (strength <= limit).all()] or [
+        int(np.argmin(np.sum(strengths, axis=1)))
+    ]
+    chosen = rest[np.concatenate([flat[k] for k in kept])]
+    capped = np.minimum(strengths, limit)
+    return Grain(
+        tuple(levels),
+        tuple((float(r), float(g), float(b)) for r, g, b in capped),
+        _size(chosen),
+        _correlation(chosen),
+    )
+
+
+def _patches(srgb: Float64Array) -> Float64Array:
+    """Return the photo's whole patches, shape [N, SIDE, SIDE, 3]."""
+    rows, columns = srgb.shape[0] // SIDE, srgb.shape[1] // SIDE
+    tiles = srgb[: rows * SIDE, : columns * SIDE].reshape(rows, SIDE, columns, SIDE, 3)
+    return tiles.transpose(0, 2, 1, 3, 4).reshape(-1, SIDE, SIDE, 3)
+
+
+def _without_plane(patches: Float64Array) -> Float64Array:
+    """Return patches less their least-squares planes."""
+    y, x = np.mgrid[0:SIDE, 0:SIDE] - (SIDE - 1) / 2.0
+    basis = np.stack([np.ones(SIDE**2), x.ravel(), y.ravel()], axis=1)
+    basis /= np.linalg.norm(basis, axis=0)
+    flat = patches.reshape(len(patches), SIDE**2, 3)
+    planes = np.einsum("pk,nkc->npc", basis, np.einsum("pk,npc->nkc", basis, flat))
+    rest: Float64Array = (flat - planes).reshape(patches.shape)
+    return rest
+
+
+def _size(rest: Float64Array) -> float:
+    """Return the Gaussian blur of white noise with the correlation of neighbours that is found.
+
+    White noise behind a Gaussian of deviation s has the autocorrelation ``exp(-d^2 / (4 s^2))`` at
+    distance d, so the correlation r of neighbours gives ``s = 1 / (2 sqrt(-ln r))``.
+    """
+    power = (rest**2).mean()
+    along = (rest[:, :, 1:] * rest[:, :, :-1]).mean() + (rest[:, 1:] * rest[:, :-1]).mean()
+    neighbour = float(0.5 * along / max(power, 1e-20))
+    # The plane that was taken away left neighbours of white noise with a negative correlation.
+    neighbour += 3.0 / SIDE**2
+    if neighbour <= 0.02:
+        return 0.0
+    return float(min(0.5 / np.sqrt(-np.log(min(neighbour, 0.99))), WIDEST))
+
+
+def _correlation(rest: Float64Array) -> float:
+    flat = rest.reshape(-1, 3)
+    matrix = np.corrcoef(flat.T)
+    return float(np.clip(np.nan_to_num(matrix[np.triu_indices(3, 1)].mean()), 0.0, 1.0))
+
+
+def grain_over(
+    grain: Grain,
+    composite: FloatArray,
+    plate: FloatArray,
+    matte: FloatArray,
+    changed: BoolArray,
+    seed: int,
+    gamma: float,
+) -> FloatArray:
+    """Return what the sensor's grain adds to a composite, display-linear, shape [H, W, 3].
+
+    The object gets the grain of its level. The photo's own grain is still in the ground, scaled by
+    the shadow; what its darker level lacks is added.
+
+    Args:
+        grain: Of the photo.
+        composite: Display-linear, without new grain, shape [H, W, 3].
+        plate: Display-linear photo, same shape.
+        matte: Object coverage, shape [H, W].
+        changed: Pixels that may change; the others get 0.
+        seed: Of the noise.
+        gamma: Exponent from display values to display-linear ones.
+    """
+    shown = np.clip(composite, 0.0, 1.0) ** (1.0 / gamma)
+    wanted = grain.deviation(shown)
+    before = np.clip(plate, 1e-6, 1.0) ** (1.0 / gamma)
+    share = (1.0 - matte)[..., None]
+    # Of the photo's grain the uncovered share is left, scaled as its signal is.
+    kept = share * grain.deviation(before) * np.minimum(shown / before, 1.0)
+    lacking = np.sqrt(np.maximum(wanted**2 - kept**2, 0.0))
+    # Other frames of a sequence have other grain.
+    frame = zlib.crc32(np.ascontiguousarray(plate[::8, ::8], np.float32).tobytes())
+    noise = grain.draw((matte.shape[0], matte.shape[1]), seed, frame)
+    noisy = np.clip(shown + lacking * noise, 0.0, 1.0) ** gamma
+    added = (noisy - np.clip(composite, 0.0, 1.0)) * changed[..., None]
+    return np.asarray(added, np.float32)

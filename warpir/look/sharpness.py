@@ -1,0 +1,136 @@
+"""The blur of a photo's sharpest edges, by which an object is as sharp as what stands around it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy import ndimage
+
+from warpir.core.arrays import AnyFloatArray, BoolArray, FloatArray
+from warpir.core.color import luminance
+
+FINE, COARSE, WIDE = 1.0, 2.0, 3.0
+"""Standard deviations of the Gaussian derivatives [px]; the ratio of the first two tells the blur,
+the third tells steps from lines and from crowded edges."""
+STEP_ERROR = 0.06
+"""How far the third slope may be from that of a step [1]."""
+SHARP_SHARE = 0.35
+"""Quantile of the blurs of all edges that counts as the lens's: most edges of a scene are soft."""
+LEAST_EDGES = 60
+"""Edge pixels below which a photo, or a part of it, tells no blur."""
+LEAST_CONTRAST = 0.03
+"""Luminance step over the photo's 99th percentile from which an edge counts [1]."""
+CLIPPED = 0.97
+"""Display-linear value from which a channel may be clipped, which makes edges look sharper."""
+PIXEL_SIGMA = 12.0**-0.5
+"""Standard deviation of a square pixel, the blur that a rendered edge has already [px]."""
+
+
+@dataclass(frozen=True)
+class EdgeBlur:
+    """How blurred the sharpest edges of a picture are."""
+
+    sigma: float
+    """Standard deviation of the Gaussian that blurred an ideal step, the pixel included [px]."""
+    edges: int
+    """Edge pixels it was estimated from."""
+
+
+def estimate_blur(linear: AnyFloatArray, region: BoolArray | None = None) -> EdgeBlur | None:
+    """Estimate the blur of the sharpest edges.
+
+    A step of height A behind a Gaussian of deviation s has, seen through a Gaussian derivative of
+    deviation t, the largest slope ``A / sqrt(2 pi (s^2 + t^2))``; the ratio R of two such slopes
+    gives ``s^2 = (t2^2 - R^2 t1^2) / (R^2 - 1)`` without A (Zhuo and Sim 2011, "Defocus map
+    estimation from a single image", equation 5, with both derivatives Gaussian). Edges are the
+    ridges of the slope that stand clear of noise and of clipped highlights.
+
+    Args:
+        linear: Display-linear photo, shape [H, W, 3].
+        region: Where to look, shape [H, W]; everywhere where that has too few edges.
+
+    Returns:
+        The blur, or None where the photo has too few edges.
+    """
+    lum = luminance(np.asarray(linear, np.float32))
+    gy, gx = (ndimage.gaussian_filter(lum, FINE, order=order) for order in ((1, 0), (0, 1)))
+    fine = np.hypot(gx, gy)
+    coarse, wide = (
+        np.hypot(*(ndimage.gaussian_filter(lum, s, order=order) for order in ((1, 0), (0, 1))))
+        for s in (COARSE, WIDE)
+    )
+    clipped = ndimage.binary_dilation(linear.max(axis=-1) > CLIPPED, iterations=4)
+    white = max(float(np.quantile(lum, 0.99)), 1e-6)
+    noise = 1.4826 * float(np.median(np.abs(fine - np.median(fine))))
+    # A step of contrast c has at least this slope for all blurs up to 3 px.
+    least = max(LEAST_CONTRAST * white / np.sqrt(2.0 * np.pi * (9.0 + FINE**2)), 10.0 * noise)
+    edge = _is_ridge(fine, gx, gy) & (fine > least) & ~clipped
+    border = np.zeros_like(edge)
+    border[6:-6, 6:-6] = True
+    edge &= border
+    if region is not None and int((edge & region).sum()) >= LEAST_EDGES:
+        edge &= region
+    if int(edge.sum()) < LEAST_EDGES:
+        return None
+    ratio = (fine[edge] / np.maximum(coarse[edge], 1e-12)) ** 2
+    limit = (COARSE / FINE) ** 2
+    variance = (COARSE**2 - ratio * FINE**2) / np.maximum(ratio - 1.0, 1e-3)
+    # Thin lines have larger ratios than any step, crowded edges smaller ones.
+    plain = np.maximum(variance, 0.0)
+    expected = fine[edge] * np.sqrt((plain + FINE**2) / (plain + WIDE**2))
+    is_step = np.abs(wide[edge] / np.maximum(expected, 1e-12) - 1.0) < STEP_ERROR
+    is_step &= (ratio > 1.02) & (ratio < 1.05 * limit)
+    if int(is_step.sum()) < LEAST_EDGES:
+        return None
+    sigma = float(np.quantile(np.sqrt(np.maximum(variance[is_step], 0.0)), SHARP_SHARE))
+    return EdgeBlur(max(sigma, PIXEL_SIGMA), int(is_step.sum()))
+
+
+def _is_ridge(slope: FloatArray, gx: FloatArray, gy: FloatArray) -> BoolArray:
+    """Return where a slope is the largest across its edge, shape [H, W]."""
+    across = np.abs(gx) >= np.abs(gy)
+    left, right = np.roll(slope, 1, axis=1), np.roll(slope, -1, axis=1)
+    above, below = np.roll(slope, 1, axis=0), np.roll(slope, -1, axis=0)
+    first = np.where(across, left, above)
+    second = np.where(across, right, below)
+    ridge: BoolArray = (slope >= first) & (slope > second)
+    return ridge
+
+
+def blurred_layers(
+    planes: dict[str, FloatArray], sigma: float, summed: tuple[str, ...]
+) -> dict[str, FloatArray]:
+    """Blur the object, its matte and its shadow by the lens.
+
+    Premultiplied colours and the matte are blurred alike, so the outline keeps its colour. The
+    shadow ratio is averaged over the ground that is seen, so what lies below the object's edge has
+    the ratio beside it, and no light leaks in at the contact.
+
+    Args:
+        planes: ``matte`` [H, W], ``shadow_ratio`` [H, W, 3] and the planes of ``summed``.
+        sigma: Standard deviation [px].
+        summed: Names of premultiplied planes, [H, W, 3].
+
+    Returns:
+        All planes; pixels without any share of the object or its shadow keep their values.
+    """
+    if sigma <= 0.0:
+        return planes
+    result = dict(planes)
+
+    def blur(plane: FloatArray) -> FloatArray:
+        widths = (sigma, sigma, 0.0)[: plane.ndim]
+        return np.asarray(ndimage.gaussian_filter(plane, widths, truncate=3.5), np.float32)
+
+    for name in (*summed, "matte"):
+        result[name] = blur(planes[name])
+    seen = 1.0 - planes["matte"]
+    weight = blur(seen)[..., None]
+    # In differences from 1, so that ground beyond the shadow stays exactly 1.
+    darker = blur((1.0 - planes["shadow_ratio"]) * seen[..., None])
+    ratio = 1.0 - darker / np.maximum(weight, 1e-6)
+    inside = weight[..., 0] < 1e-3
+    ratio[inside] = planes["shadow_ratio"][inside]
+    result["shadow_ratio"] = np.clip(ratio, 0.0, 1.0).astype(np.float32)
+    return result
