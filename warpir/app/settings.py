@@ -183,11 +183,11 @@ class LookConfig:
     """What the photo's camera did to the scene, and is done to the object."""
 
     sharpness: float | str = option("auto", "auto|off|PX", choices=AUTO, low=0, high=32)
-    """Blur of the object's outline and texture (default auto: that of the photo's sharpest edges
-    around it); its standard deviation in pixels"""
+    """Blur of the object [px]; auto: that of the photo's sharpest edges around it; a value is the
+    standard deviation"""
     grain: float | str = option("auto", "auto|off|CODES", choices=AUTO, low=0, high=64)
-    """Noise on the object and its shadow (default auto: like the photo's); its standard deviation
-    in codes of 255"""
+    """Noise on object and shadow; auto: the photo's; a value is the standard deviation in codes of
+    255"""
 
 
 @dataclass(frozen=True)
