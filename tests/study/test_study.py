@@ -769,13 +769,12 @@ def test_figures_replace_nothing_but_figures(
         return {p: p.read_bytes() for p in tmp_path.rglob("*") if p.is_file()}
 
     before = files()
+    named = ("linked.json", "hard.json", "to-key.json")
+    kept = {path: content for path, content in before.items() if path.name not in named}
     for answers, targets, words in (
         ("back/a.json", ["--json", "back/a.json"], "a file of answers"),
         ("back/a.json", ["--markdown", "study/../back/a.json"], "a file of answers"),
-        ("back/a.json", ["--json", "linked.json"], "a file of answers"),
         ("linked.json", ["--json", "back/a.json"], "a file of answers"),
-        ("back/a.json", ["--json", "hard.json"], "a file of answers"),
-        ("back", ["--json", "back/figures.json"], "in a folder of them"),
         ("back", ["--json", "f", "--markdown", "f"], "the same file as --json"),
         ("back", ["--json", "f", "--markdown", "alias/../f"], "the same file as --json"),
         ("back", ["--json", f"study/pages/{page_name}"], "a file of the study"),
@@ -783,7 +782,6 @@ def test_figures_replace_nothing_but_figures(
         ("back", ["--json", "study/new.json"], "a file of the study"),
         ("back", ["--markdown", "alias/pages/new/figures.md"], "a file of the study"),
         ("back", ["--markdown", "study/pages/out.md"], "a file of the study"),
-        ("back", ["--json", "to-key.json"], "a file of the study"),
         ("back", ["--json", "back"], "exists"),
     ):
         capsys.readouterr()
@@ -794,6 +792,11 @@ def test_figures_replace_nothing_but_figures(
         assert files() == before
     argv = ["score", "study", "--answers", "back", "--json", "f.json", "--markdown", "f.md"]
     assert main(argv) == 0 and main(argv) == 7 and main([*argv, "--overwrite"]) == 0
+    # Other names of a file are replaced, and what they lead to is not.
+    for name in named:
+        argv = ["score", "study", "--answers", "back/a.json", "--overwrite", "--json", name]
+        assert main(argv) == 0 and not (tmp_path / name).is_symlink()
+    assert {path: content for path, content in files().items() if path in kept} == kept
 
 
 def test_answers_of_people_are_scored_without_a_warning(scenes: Path, tmp_path: Path) -> None:

@@ -304,38 +304,26 @@ def _require_targets(options: argparse.Namespace, inputs: Sequence[Path]) -> Non
         InputError: A file exists, is an input, belongs to the study, or is to hold both the figures
             and the tables (`ExitCode.OUTPUT`).
     """
-    advice = "choose another"
+    study = Path(os.path.realpath(options.study))
+    # A file is replaced by its name: what a link leads to stays, unless it is itself named.
+    answers = {name for path in inputs for name in (_place(path), Path(os.path.realpath(path)))}
     for flag, target in (("--json", options.json), ("--markdown", options.markdown)):
         if target is None:
             continue
-        taken = _taken(target, options, inputs)
-        if taken is None and flag == "--markdown" and options.json is not None:
-            taken = "the same file as --json" if _is_same(target, options.json) else None
-        if taken is not None:
-            raise InputError(target, f"{taken} ({flag})", advice, ExitCode.OUTPUT)
-        if os.path.isdir(target) or (os.path.lexists(target) and not options.overwrite):
-            advice = "--overwrite replaces it, unless it is a folder"
-            raise InputError(target, f"exists ({flag})", advice, ExitCode.OUTPUT)
+        place, advice = _place(target), "choose another"
+        if place.is_relative_to(study):
+            what = "a file of the study"
+        elif place in answers:
+            what = "a file of answers"
+        elif flag == "--markdown" and options.json and place == _place(options.json):
+            what = "the same file as --json"
+        elif os.path.isdir(target) or (os.path.lexists(target) and not options.overwrite):
+            what, advice = "exists", "--overwrite replaces it, unless it is a folder"
+        else:
+            continue
+        raise InputError(target, f"{what} ({flag})", advice, ExitCode.OUTPUT)
 
 
-def _taken(target: Path, options: argparse.Namespace, inputs: Sequence[Path]) -> str | None:
-    """Return what a target is that nothing may replace; None where it is nothing of the kind."""
-    # Where its name is, and what it leads to: a link is replaced, not followed.
-    named = Path(os.path.realpath(target.parent), target.name)
-    folders = {*named.parents, *Path(os.path.realpath(target)).parents}
-    if any(_is_same(folder, options.study) for folder in folders):
-        return "a file of the study"
-    if any(_is_same(target, path) for path in inputs):
-        return "a file of answers"
-    answers = [path for path in options.answers or () if os.path.isdir(path)]
-    if target.suffix == ".json" and any(_is_same(target.parent, path) for path in answers):
-        return "would be read as answers, being in a folder of them"
-    return None
-
-
-def _is_same(one: Path, other: Path) -> bool:
-    """Return whether two paths lead to one file or folder, which need not exist."""
-    if os.path.realpath(one) == os.path.realpath(other):
-        return True
-    # By another name: a hard link, or other letters where case does not count.
-    return os.path.exists(one) and os.path.exists(other) and os.path.samefile(one, other)
+def _place(path: Path) -> Path:
+    """Return where a name stands, links to its folder followed."""
+    return Path(os.path.realpath(path.parent), path.name)
