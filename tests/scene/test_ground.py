@@ -14,6 +14,7 @@ from tests.builders.poses import pose, write_json
 from warpir.app.config import InsertConfig
 from warpir.app.inputs import read_inputs
 from warpir.app.photo_world import make_world
+from warpir.app.settings import CameraConfig
 from warpir.core.errors import ExitCode, InputError
 from warpir.io.cameras.source import PhotoCamera, turned
 from warpir.io.images.photos import read_photo
@@ -213,17 +214,13 @@ def test_no_ground_is_refused(seed: int) -> None:
 # -------------------------------------------------------------------------------------- the world
 
 
-def config(**values: object) -> InsertConfig:
-    return InsertConfig(camera="c", photo="p", asset="a", out="o", **values)
-
-
 def test_points_turn_with_the_camera_file_s_world(rng: np.random.Generator) -> None:
     """A Z-up cloud and its camera come out as if both had been Y-up."""
     world = np.array([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]])
     points = street(rng)
     view = PhotoCamera(CAMERA, world=world)
-    made = make_world(config(ground_points="x"), view, points @ world)
-    straight = make_world(config(ground_points="x"), PhotoCamera(CAMERA), points)
+    made = make_world(CameraConfig(ground_points="x"), None, view, points @ world)
+    straight = make_world(CameraConfig(ground_points="x"), None, PhotoCamera(CAMERA), points)
     assert made.ground == pytest.approx(straight.ground, abs=1e-9)
     assert made.cloud is not None
     np.testing.assert_allclose(made.cloud.points, points, atol=1e-12)
@@ -237,7 +234,7 @@ def test_a_world_without_up_is_levelled_by_its_ground(rng: np.random.Generator) 
     camera = replace(CAMERA, c2w=turned(CAMERA.c2w, rotation))
     points = street(rng)
     view = PhotoCamera(camera, has_up=False)
-    made = make_world(config(ground_points="x"), view, points @ rotation.T)
+    made = make_world(CameraConfig(ground_points="x"), None, view, points @ rotation.T)
     assert made.ground is not None and made.cloud is not None
     assert made.ground[:3] == pytest.approx((0, 1, 0), abs=1e-12)
     assert made.camera.c2w[1, 3] + made.ground[3] == pytest.approx(1.7, abs=0.01)
@@ -247,13 +244,13 @@ def test_a_world_without_up_is_levelled_by_its_ground(rng: np.random.Generator) 
     # The same with --ground; --place is turned too.
     normal = rotation @ [0, 1, 0]
     stand = np.array([0.5, 0.0, -9.0])
-    told = config(ground=(*normal, 0.0), place=tuple(rotation @ stand))
-    made = make_world(told, view, None)
+    x, y, z = (float(component) for component in rotation @ stand)
+    made = make_world(CameraConfig(ground=(*normal, 0.0)), (x, y, z), view, None)
     assert made.ground == pytest.approx((0, 1, 0, 0), abs=1e-12)
     seen = made.camera.project(np.array([made.place]))
     np.testing.assert_allclose(seen, camera.project((rotation @ stand)[None]), atol=1e-6)
     with pytest.raises(InputError, match="which way is up"):
-        make_world(config(), view, None)
+        make_world(CameraConfig(), None, view, None)
 
 
 # -------------------------------------------------------------------------------------- free space

@@ -37,8 +37,6 @@ from warpir.diffusion.settings import (
 SKY_PRESETS = ("clear", "overcast", "sunset")
 REFINE_STEPS = {"material": 300, "emission": 300, "tone": 200}
 REFINE_PARTS = ("base-color", "metallic", "roughness")
-SEED_LIMIT = 2**32
-"""Seeds are the 32-bit words that the kernels hash."""
 DEVICE_FORM = re.compile(r"cpu|cuda(:\d+)?")
 DEMO_HINT = "--demo needs neither --photo nor --asset"
 EMBEDDED_STEPS = 60

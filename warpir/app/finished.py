@@ -95,7 +95,7 @@ def _same_model(config: InsertConfig, record: Mapping[str, Any]) -> bool:
     guide = measured.get("model") if isinstance(measured, dict) else None
     if not isinstance(guide, dict) or guide.get("name") != "stable-diffusion":
         return True
-    return bool(guide.get("sha256") == model_hashes(config))
+    return bool(guide.get("sha256") == model_hashes(config.diffusion))
 
 
 def _something_else(out: Path, found: str, kind: type[InputError] = InputError) -> InputError:

@@ -1,7 +1,7 @@
 """All inputs of one insertion, read and checked; torch and Warp are not needed here."""
 
 import os
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from functools import lru_cache
@@ -15,6 +15,7 @@ from warpir.app.model_files import require_model
 from warpir.app.photo_world import PhotoWorld, make_world, photo_camera, stand_on_ground
 from warpir.app.record import file_hash, input_files
 from warpir.app.reuse import EarlierRun, read_run
+from warpir.app.settings import InputConfig, LightConfig
 from warpir.core.arrays import Float64Array, FloatArray
 from warpir.core.errors import InputError, raise_all
 from warpir.core.limits import Limits
@@ -112,9 +113,9 @@ def read_inputs(config: InsertConfig, loaders: Loaders | None = None) -> Inputs:
     config.require_inputs()
     files = _read_files(config, loaders or Loaders())
     straight = _straightened(files)
-    world = make_world(config, files.view, files.points)
+    world = make_world(config.camera, config.placement.place, files.view, files.points)
     mesh = None if files.proxy is None else mesh_of(files.proxy)
-    placement = stand_on_ground(config, files.asset, world, mesh)
+    placement = stand_on_ground(config.placement, files.asset, world, mesh, config.camera.plane)
     shade = None
     if straight.shaded is not None:
         bounds = files.asset.bounds()
@@ -155,19 +156,22 @@ def _read_files(config: InsertConfig, loaders: Loaders) -> _Files:
     states: dict[str, tuple[Path, _State | None]] = {}
     with suppress(InputError):  # the reader tells
         states = {name: (path, _state(path)) for name, path in input_files(config).items()}
-    log, limits = Log(), config.limits
-    photo = attempt(lambda: _read_photo(config))
-    occluder = attempt(lambda: _read_mask(config.inputs.occluder_mask, photo, config, log))
-    shaded = attempt(lambda: _read_mask(config.camera.shadow_mask, photo, config, log))
-    asset = attempt(lambda: read_asset(config, loaders, log))
+    log, limits, inputs = Log(), config.limits, config.inputs
+    photo = attempt(lambda: _read_photo(inputs, limits))
+    occluder = attempt(lambda: _read_mask(inputs.occluder_mask, photo, limits, log))
+    shaded = attempt(lambda: _read_mask(config.camera.shadow_mask, photo, limits, log))
+    asset = attempt(lambda: read_asset(inputs, limits, loaders, log))
+    if asset is not None:
+        problems += _absent_materials(config.task.refine_materials or (), asset, inputs)
     run = view = points = proxy = None
     if (reuse := config.light.reuse) is not None:
         run = attempt(lambda: loaders.run(reuse, limits))
     if photo is not None:
-        view = attempt(lambda: photo_camera(config, photo, log))
+        name = Path(str(inputs.photo)).name
+        view = attempt(lambda: photo_camera(config.camera, photo, name, log, limits))
     # Without a camera the run ends below, but all that is wrong with the light is told too.
     pose = view.camera.c2w if view is not None else np.eye(4)
-    light = attempt(lambda: _read_light(config, pose, log))
+    light = attempt(lambda: _read_light(config.light, inputs.strict, pose, limits, log))
     if (points_path := config.camera.ground_points) is not None:
         points = attempt(lambda: read_point_cloud(points_path, limits))
     if (proxy_path := config.camera.proxy) is not None:
@@ -343,31 +347,31 @@ def _places(path: str | Path) -> list[Path]:
         return []
 
 
-def _read_photo(config: InsertConfig) -> Photo:
-    assert config.inputs.photo is not None
+def _read_photo(inputs: InputConfig, limits: Limits) -> Photo:
+    assert inputs.photo is not None
     return read_photo(
-        config.inputs.photo,
-        max_pixels=config.limits.pixels,
-        alpha="ignore" if config.inputs.alpha == "ignore" else "refuse",
-        layer=config.inputs.layer,
-        strict=config.inputs.strict,
+        inputs.photo,
+        max_pixels=limits.pixels,
+        alpha=inputs.alpha,
+        layer=inputs.layer,
+        strict=inputs.strict,
     )
 
 
-def read_asset(config: InsertConfig, loaders: Loaders, log: Log) -> Asset:
+def read_asset(inputs: InputConfig, limits: Limits, loaders: Loaders, log: Log) -> Asset:
     """Read --asset as its flags say: which way is up, and its materials.
 
     Args:
-        config: The flags.
+        inputs: The flags.
+        limits: How large the files may be.
         loaders: Of earlier insertions.
         log: What was chosen because nothing was given is added here.
 
     Raises:
         InputError: The asset or its materials cannot be used.
     """
-    inputs = config.inputs
     assert inputs.asset is not None
-    asset = loaders.asset(inputs.asset, inputs.missing_textures, config.limits)
+    asset = loaders.asset(inputs.asset, inputs.missing_textures, limits)
     if inputs.asset_up is not None:
         turned = f"turned: its {inputs.asset_up} axis points up (--asset-up)"
         asset = asset.turned(up_to_y(inputs.asset_up))
@@ -375,13 +379,19 @@ def read_asset(config: InsertConfig, loaders: Loaders, log: Log) -> Asset:
     elif Path(inputs.asset).suffix.lower() not in STATED_UP:
         log.assume("the asset's +y axis points up (--asset-up)")
     if inputs.materials is not None:
-        asset = with_materials(asset, inputs.materials, config.limits)
-    for name in config.task.refine_materials or ():
-        if not asset.materials_named([name]):
-            found = ", ".join(dict.fromkeys(ascii(m.name) for m in asset.materials))
-            what = f"no material {name[:60]!a} in {inputs.asset} (found {found[:400]})"
-            raise usage("--refine-materials", what, "name some of these, or leave it out for all")
+        asset = with_materials(asset, inputs.materials, limits)
     return asset
+
+
+def _absent_materials(
+    names: Iterable[str], asset: Asset, inputs: InputConfig
+) -> Iterator[InputError]:
+    """Yield what is wrong with --refine-materials."""
+    found = ", ".join(dict.fromkeys(ascii(m.name) for m in asset.materials))[:400]
+    for name in names:
+        if not asset.materials_named([name]):
+            what = f"no material {name[:60]!a} in {inputs.asset} (found {found})"
+            yield usage("--refine-materials", what, "name some of these, or leave it out for all")
 
 
 def _read_proxy(path: str, limits: Limits) -> Asset:
@@ -407,19 +417,20 @@ def _about_mesh(
 
 
 def _read_mask(
-    path: str | None, photo: Photo | None, config: InsertConfig, log: Log
+    path: str | None, photo: Photo | None, limits: Limits, log: Log
 ) -> FloatArray | None:
     if path is None or photo is None:
         return None
     height, width = photo.codes.shape[:2]
     found: list[str] = []
-    mask = read_mask(path, (width, height), max_pixels=config.limits.pixels, notices=found)
+    mask = read_mask(path, (width, height), max_pixels=limits.pixels, notices=found)
     log.notice(*_about(path, found))
     return mask
 
 
-def _read_light(config: InsertConfig, camera_to_world: Float64Array, log: Log) -> Light | None:
-    asked = config.light
+def _read_light(
+    asked: LightConfig, strict: bool, camera_to_world: Float64Array, limits: Limits, log: Log
+) -> Light | None:
     if asked.file is None:
         return None
     if Path(asked.file).suffix.lower() == ".json":
@@ -427,15 +438,15 @@ def _read_light(config: InsertConfig, camera_to_world: Float64Array, log: Log) -
             raise usage("--fit-lobes", f"needs a panorama to fit (found lobes: {asked.file})")
         if asked.convention != "openexr":
             raise usage("--light-convention", f"is for panoramas (found lobes: {asked.file})")
-        return Light(lobes=read_lobes(asked.file, config.limits)).rotated(asked.rotate)
+        return Light(lobes=read_lobes(asked.file, limits)).rotated(asked.rotate)
     found: list[str] = []
     texels = read_envmap(
         asked.file,
         convention=asked.convention,
         camera_to_world=camera_to_world,
         pictures=True,
-        strict=config.inputs.strict,
-        max_width=config.limits.envmap_width,
+        strict=strict,
+        max_width=limits.envmap_width,
         notices=found,
     )
     log.notice(*_about(asked.file, found))

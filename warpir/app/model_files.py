@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, TypeVar
 from warpir.app.config import InsertConfig
 from warpir.core.errors import ExitCode, InputError, raise_all
 from warpir.diffusion.models.model_error import ModelError
+from warpir.diffusion.settings import ModelSettings
 
 if TYPE_CHECKING:
     from warpir.diffusion.models.model_folder import ModelFolder
@@ -42,7 +43,7 @@ def require_model(config: InsertConfig) -> None:
     is_told = config.is_light_described or config.light.reuse is not None
     embedding_width: int | None = None
     if config.guided_by == "stable-diffusion":
-        embedding_width = attempt(lambda: _model_width(config))
+        embedding_width = attempt(lambda: _model_width(config.diffusion))
     if prior is not None or (config.guided_by == "embedded" and config.is_guided):
         embedding_width = attempt(lambda: check_prior(prior))
     if lora is not None:
@@ -52,21 +53,19 @@ def require_model(config: InsertConfig) -> None:
     raise_all(problems)
 
 
-def _model_width(config: InsertConfig) -> int | None:
+def _model_width(asked: ModelSettings) -> int | None:
     """Check the folder of Stable Diffusion; return the width of its prompts' embeddings."""
     from warpir.diffusion.models.model_folder import check_model_folder, find_model
 
-    if config.diffusion.allow_download and not os.path.isdir(config.diffusion.model or ""):
+    if asked.allow_download and not os.path.isdir(asked.model or ""):
         return None
-    found = find_model(
-        config.diffusion.model, allow_download=False, allow_pickle=config.diffusion.allow_pickle
-    )
-    folder = check_model_folder(found, config.diffusion.allow_pickle)
+    found = find_model(asked.model, allow_download=False, allow_pickle=asked.allow_pickle)
+    folder = check_model_folder(found, asked.allow_pickle)
     width: int = folder.configs["unet"]["cross_attention_dim"]
     return width
 
 
-def model_hashes(config: InsertConfig) -> dict[str, str] | None:
+def model_hashes(asked: ModelSettings) -> dict[str, str] | None:
     """Return the sha256 of every file of Stable Diffusion's that a run would read, by its name.
 
     None: there is no such model now, or it is damaged.
@@ -74,10 +73,8 @@ def model_hashes(config: InsertConfig) -> dict[str, str] | None:
     from warpir.diffusion.models.model_folder import check_model_folder, find_model
 
     try:
-        found = find_model(
-            config.diffusion.model, allow_download=False, allow_pickle=config.diffusion.allow_pickle
-        )
-        folder = check_model_folder(found, config.diffusion.allow_pickle)
+        found = find_model(asked.model, allow_download=False, allow_pickle=asked.allow_pickle)
+        folder = check_model_folder(found, asked.allow_pickle)
         states = [(file, file.stat()) for file in folder.files]
         return dict(
             _hash(folder, file, (state.st_ino, state.st_size, state.st_mtime_ns))

@@ -1,14 +1,14 @@
 """Brings camera, ground, points and object into one world whose up is known."""
 
 from dataclasses import dataclass, field, replace
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from warpir.app.config import InsertConfig
+from warpir.app.settings import CameraConfig, PlacementConfig
 from warpir.core.arrays import Float64Array
 from warpir.core.errors import InputError
+from warpir.core.limits import LIMITS, Limits
 from warpir.core.progress import Log
 from warpir.io.cameras.reader import read_photo_camera
 from warpir.io.cameras.source import PhotoCamera, turned
@@ -46,62 +46,71 @@ class PhotoWorld:
     """What ``run.json`` says of the fit."""
 
 
-def photo_camera(config: InsertConfig, photo: Photo, log: Log) -> PhotoCamera:
+def photo_camera(
+    asked: CameraConfig, photo: Photo, photo_name: str, log: Log, limits: Limits = LIMITS
+) -> PhotoCamera:
     """Return the camera of --camera, else of the numbers given, the photo's EXIF and what is usual.
 
     Args:
-        config: The flags.
+        asked: The file or the numbers.
         photo: The upright photo.
+        photo_name: Its file name, which tells the images of a file apart.
         log: What was chosen because nothing was given is added here.
+        limits: How large the file may be.
 
     Raises:
         InputError: The camera file cannot be used, or does not fit the photo.
     """
     height, width = photo.codes.shape[:2]
-    if config.camera.file is not None:
-        assert config.inputs.photo is not None
+    if asked.file is not None:
         return read_photo_camera(
-            config.camera.file,
+            asked.file,
             (width, height),
-            config.camera.up,
-            frame=config.camera.frame,
-            photo_name=Path(config.inputs.photo).name,
-            undistort=config.camera.undistort,
-            limits=config.limits,
+            asked.up,
+            frame=asked.frame,
+            photo_name=photo_name,
+            undistort=asked.undistort,
+            limits=limits,
         )
-    return PhotoCamera(_camera_from_numbers(config, photo, log))
+    return PhotoCamera(_camera_from_numbers(asked, photo, log))
 
 
-def _camera_from_numbers(config: InsertConfig, photo: Photo, log: Log) -> Camera:
+def _camera_from_numbers(asked: CameraConfig, photo: Photo, log: Log) -> Camera:
     height, width = photo.codes.shape[:2]
-    camera_height, pitch = config.camera.height, config.camera.pitch
+    camera_height, pitch = asked.height, asked.pitch
     if camera_height is None:
         camera_height = DEFAULT_CAMERA_HEIGHT
         log.assume(f"the camera is {camera_height} m above the ground (--camera-height)")
     if pitch is None:
         pitch = 0.0
-        if config.camera.horizon is None:
+        if asked.horizon is None:
             log.assume("the camera is level (--pitch, --horizon)")
-    pose = (pitch, camera_height, config.camera.horizon)
-    if config.camera.fov is None and photo.focal_35mm is not None:
+    pose = (pitch, camera_height, asked.horizon)
+    if asked.fov is None and photo.focal_35mm is not None:
         return camera_from_exif(photo.focal_35mm, width, height, *pose)
-    if config.camera.fov is None:
+    if asked.fov is None:
         log.assume(f"the horizontal field of view is {DEFAULT_FOV:g} degrees (--fov)")
-    return camera_from_fov(width, height, config.camera.fov or DEFAULT_FOV, *pose)
+    return camera_from_fov(width, height, asked.fov or DEFAULT_FOV, *pose)
 
 
-def make_world(config: InsertConfig, view: PhotoCamera, points: Float64Array | None) -> PhotoWorld:
+def make_world(
+    asked: CameraConfig,
+    place: tuple[float, float, float] | None,
+    view: PhotoCamera,
+    points: Float64Array | None,
+) -> PhotoWorld:
     """Find the ground in the points, and level a world whose up is not known by its ground.
 
     Args:
-        config: Names the ground and the place.
+        asked: Names the ground.
+        place: ``--place``, in the world of the camera's file.
         view: The camera, and how its file's world was turned.
         points: Points of ``--ground-points``, in the world of the camera's file, shape [point, 3].
 
     Raises:
         InputError: No ground in the points, or nothing that tells which way is up.
     """
-    camera, ground, place = view.camera, config.camera.ground, config.placement.place
+    camera, ground = view.camera, asked.ground
     fit = None
     if points is not None:
         points = points @ view.world.T
@@ -111,7 +120,7 @@ def make_world(config: InsertConfig, view: PhotoCamera, points: Float64Array | N
     if not view.has_up:
         if ground is None:
             raise InputError(
-                str(config.camera.file),
+                str(asked.file),
                 "nothing says which way is up (a COLMAP world lies as it happens to)",
                 "give --ground-points with its points, or --ground, or --up",
             )
@@ -135,15 +144,20 @@ def make_world(config: InsertConfig, view: PhotoCamera, points: Float64Array | N
 
 
 def stand_on_ground(
-    config: InsertConfig, asset: Asset, world: PhotoWorld, mesh: ReceiverMesh | None
+    asked: PlacementConfig,
+    asset: Asset,
+    world: PhotoWorld,
+    mesh: ReceiverMesh | None = None,
+    is_plane: bool = True,
 ) -> Placement:
     """Set the asset on the ground: where it was asked for, or where the points leave space.
 
     Args:
-        config: Place, turn and size.
+        asked: Place, turn and size.
         asset: The object.
         world: Camera, ground and points.
         mesh: What --proxy holds.
+        is_plane: Whether the object may stand on the ground plane.
 
     Raises:
         InputError: There is no such place, or no free one.
@@ -157,17 +171,17 @@ def stand_on_ground(
             world.camera,
             world.ground,
             place=place,
-            at=config.placement.at if place is None else None,
-            rotate_y=config.placement.rotate_y,
-            scale=config.placement.scale,
-            size=config.placement.size,
+            at=asked.at if place is None else None,
+            rotate_y=asked.rotate_y,
+            scale=asked.scale,
+            size=asked.size,
             mesh=mesh,
-            is_plane=config.camera.plane,
+            is_plane=is_plane,
         )
 
     if world.cloud is None:
         return put(world.place)
-    if world.place is None and config.placement.at is None:
+    if world.place is None and asked.at is None:
         plane = upright_plane(world.ground, world.camera.c2w[:3, 3])
         place = find_place(put, low, high, world.camera, plane, world.cloud)
         placement = put(place)

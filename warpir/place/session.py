@@ -90,9 +90,9 @@ def open_session(config: InsertConfig) -> Session:
         layer=config.inputs.layer,
         strict=config.inputs.strict,
     )
-    view = photo_camera(config, photo, log)
-    asset = read_asset(config, Loaders(), log)
-    world = make_world(config, view, None)
+    view = photo_camera(config.camera, photo, Path(config.inputs.photo).name, log, config.limits)
+    asset = read_asset(config.inputs, config.limits, Loaders(), log)
+    world = make_world(config.camera, config.placement.place, view, None)
     assumed = [*log.assumed, *world.camera.assumed, *world.camera.notices]
     low, high = asset.bounds()
     stands = (
