@@ -7,6 +7,7 @@ import zlib
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy import ndimage
 
 from warpir.core.arrays import AnyFloatArray, BoolArray, Float64Array, FloatArray
@@ -61,7 +62,7 @@ class Grain:
         rng = np.random.Generator(np.random.Philox(np.random.SeedSequence(seed)))
         shared, own = rng.standard_normal((*shape, 1)), rng.standard_normal((*shape, 3))
         common = min(max(self.correlation, 0.0), 1.0)
-        noise = np.sqrt(common) * shared + np.sqrt(1.0 - common) * own
+        noise: Float64Array = np.sqrt(common) * shared + np.sqrt(1.0 - common) * own
         if self.size > 0.0:
             noise = ndimage.gaussian_filter(noise, (self.size, self.size, 0.0), mode="wrap")
             impulse = np.zeros((33, 33))
@@ -98,7 +99,9 @@ def estimate_grain(srgb: AnyFloatArray) -> Grain | None:
     structure = np.sqrt((blocks**2).mean(axis=(1, 2, 3)))
     brightness = means.mean(axis=1)
     edges = np.quantile(brightness, np.linspace(0.0, 1.0, LEVELS + 1))
-    levels, strengths, flat = [], [], []
+    levels: list[float] = []
+    strengths: list[Float64Array] = []
+    flat: list[NDArray[np.int64]] = []
     for low, high in itertools.pairwise(edges):
         rows = np.flatnonzero((brightness >= low) & (brightness <= high))
         count = max(LEAST_PATCHES, round(FLAT_SHARE * len(rows)))
@@ -165,7 +168,7 @@ def _size(rest: Float64Array) -> float:
 
 def _correlation(rest: Float64Array) -> float:
     flat = rest.reshape(-1, 3)
-    matrix = np.corrcoef(flat.T)
+    matrix = np.atleast_2d(np.corrcoef(flat.T))
     return float(np.clip(np.nan_to_num(matrix[np.triu_indices(3, 1)].mean()), 0.0, 1.0))
 
 

@@ -214,7 +214,8 @@ def _opaque_layers(layers: Layers) -> Iterator[Layer]:
     yield Layer("plate", "The photo, linearised.", opaque(layers.plate), has_alpha=False)
     if layers.grain is not None:
         about = "The photo's grain on what has changed, of either sign: grey is none, tenfold."
-        shown = jpeg(plain(shrink(0.5 + 10.0 * layers.grain, LAYER_LARGEST)))
+        grey = (0.5 + 10.0 * layers.grain).astype(np.float32)
+        shown = jpeg(plain(shrink(grey, LAYER_LARGEST)))
         yield Layer("grain", about, shown, has_alpha=False)
     matte = jpeg(plain(shrink(layers.matte, LAYER_LARGEST)))
     about = "How much of each pixel the object covers: white is all."
