@@ -34,13 +34,13 @@ def main() -> None:
     parser.add_argument("--scenes", type=int, default=12)
     parser.add_argument("--samples", type=int, default=16)
     parser.add_argument("--out", type=Path, help="where results go for a while (default: TMPDIR)")
-    parser.add_argument("--json", help="append the figures to this file")
+    parser.add_argument("--json", type=Path, help="append the figures to this file")
     options = parser.parse_args()
     with tempfile.TemporaryDirectory(dir=options.out, prefix="warpir-bench-") as folder:
         measure(Path(folder), options.scenes, options.samples, options.json)
 
 
-def measure(folder: Path, count: int, samples: int, path: str | None) -> None:
+def measure(folder: Path, count: int, samples: int, path: Path | None) -> None:
     """Do the same scenes in each way.
 
     Raises:

@@ -6,13 +6,11 @@ ToyCar at 1280 x 853 under a sunny 1k panorama, five surface interactions: G-buf
 shadow, tone and all layers; everything behind reading files and before writing them.
 """
 
-import argparse
 import time
-from pathlib import Path
 
 import numpy as np
 
-from benchmarks.measure import context, peak_mib, report
+from benchmarks.measure import context, flags, peak_mib, report
 from warpir.core.color import linear_to_gamma
 from warpir.io.assets import load_asset
 from warpir.io.images.photos import Photo, read_envmap
@@ -30,16 +28,13 @@ WIDTH, HEIGHT = 1280, 853
 
 def main() -> None:
     """Render the frame twice: cold, with compilation, and warm."""
-    parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
-    parser.add_argument("--assets", type=Path, default=Path("../shared/data"))
-    parser.add_argument("--device", default=None)
+    parser = flags(__doc__)
     parser.add_argument("--samples", type=int, default=64)
     parser.add_argument("--depth", type=int, default=5)
     parser.add_argument(
         "--size", type=float, default=2.0, help="2 m fills half of the width, 3.2 m nearly all"
     )
     parser.add_argument("--repeats", type=int, default=3)
-    parser.add_argument("--json", default=None)
     parser.add_argument("--preview", default=None, help="write the measured image here (PNG)")
     options = parser.parse_args()
     asset = load_asset(options.assets / "mesh/ToyCar.glb")

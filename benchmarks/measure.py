@@ -1,5 +1,6 @@
-"""What every benchmark shares: timing, peak memory, and the line that says what was measured."""
+"""What benchmarks share: flags, timing, peak memory, and the line that says what was measured."""
 
+import argparse
 import json
 import platform
 import resource
@@ -7,10 +8,26 @@ import subprocess
 import time
 from collections.abc import Callable
 from importlib.metadata import version
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 import warp as wp
+
+
+def flags(doc: str | None, *, has_assets: bool = True) -> argparse.ArgumentParser:
+    """Return a parser with the flags that benchmarks share; ``doc`` is the module's docstring."""
+    parser = argparse.ArgumentParser(description=(doc or "").partition("\n")[0])
+    if has_assets:
+        parser.add_argument(
+            "--assets",
+            type=Path,
+            default=Path("../shared/data"),
+            help="folder that holds mesh/ and hdri/",
+        )
+    parser.add_argument("--device", default=None, help="cpu or cuda")
+    parser.add_argument("--json", type=Path, default=None, help="file for the figures")
+    return parser
 
 
 def seconds(work: Callable[[], object], device: wp.Device, repeats: int = 7) -> tuple[float, float]:
@@ -49,7 +66,7 @@ def context(device: wp.Device, threads: int) -> dict[str, Any]:
     }
 
 
-def report(line: dict[str, Any], path: str | None) -> None:
+def report(line: dict[str, Any], path: Path | None) -> None:
     """Print a figure as one JSON line and append it to ``path``."""
     text = json.dumps(line)
     print(text, flush=True)

@@ -1,6 +1,6 @@
 """Scenes that benchmarks and previews share: an asset on the ground, a camera, a light."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -88,29 +88,20 @@ class ScenePreset:
         return np.roll(small, shift, axis=1).astype(np.float32)
 
 
+TOYCAR = ScenePreset(
+    "toycar_sunny",
+    "mesh/ToyCar.glb",
+    "hdri/modern_buildings_2_1k.hdr",
+    size=0.3,
+    distance=0.8,
+    camera_height=0.35,
+    aim=0.22,
+    fov=22.0,
+    rotate_y=-50.0,
+)
 PRESETS = (
-    ScenePreset(
-        "toycar_sunny",
-        "mesh/ToyCar.glb",
-        "hdri/modern_buildings_2_1k.hdr",
-        size=0.3,
-        distance=0.8,
-        camera_height=0.35,
-        aim=0.22,
-        fov=22.0,
-        rotate_y=-50.0,
-    ),
-    ScenePreset(
-        "toycar_overcast",
-        "mesh/ToyCar.glb",
-        "hdri/potsdamer_platz_1k.hdr",
-        size=0.3,
-        distance=0.8,
-        camera_height=0.35,
-        aim=0.22,
-        fov=22.0,
-        rotate_y=-50.0,
-    ),
+    TOYCAR,
+    replace(TOYCAR, name="toycar_overcast", light="hdri/potsdamer_platz_1k.hdr"),
     ScenePreset(
         "truck_overcast",
         "mesh/kenney_trucks/vehicle-truck-red.glb",

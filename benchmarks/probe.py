@@ -6,7 +6,6 @@ a potential. Where that is lowest is what the loss would find. Times, noises and
 for all lights of a scene.
 """
 
-import argparse
 import json
 from collections.abc import Callable, Sequence
 from dataclasses import replace
@@ -17,6 +16,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from benchmarks.measure import flags
 from warpir.diffusion.models.embedded import EmbeddedPrior, load_embedded, random_embedded
 from warpir.lighting.regressor import load_regressor
 from warpir.render.device import choose_device
@@ -181,7 +181,7 @@ def measure(
 
 def main() -> None:
     """Print a table and one JSON line."""
-    parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
+    parser = flags(__doc__, has_assets=False)
     parser.add_argument("--panoramas", type=Path, nargs="*", default=[])
     parser.add_argument("--only", nargs="*", default=[], help="names of panoramas that are used")
     parser.add_argument("--prior", type=Path, default=None)
@@ -190,8 +190,6 @@ def main() -> None:
     parser.add_argument("--other", action="store_true", help="another background: must fail")
     parser.add_argument("--scenes", type=int, default=32)
     parser.add_argument("--noises", type=int, default=4)
-    parser.add_argument("--device", default=None)
-    parser.add_argument("--json", type=Path)
     options = parser.parse_args()
     name = choose_device(options.device)
     device = torch.device(name)

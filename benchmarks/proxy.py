@@ -21,7 +21,7 @@ from PIL import Image
 
 from benchmarks.referee.__main__ import foreground
 from tools.demo.make import pixel_directions
-from tools.demo.place import paving_texture
+from tools.demo.textures import paving_texture
 from warpir.core.arrays import Float64Array, FloatArray, IntArray, PixelArray
 from warpir.core.color import linear_to_gamma
 from warpir.core.latlong import look_up, resize_map, rotate_map

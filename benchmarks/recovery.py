@@ -8,7 +8,6 @@ diffusion model. What is left is renderer, fusion, curves and optimiser. The tru
 with `mis` under the full panorama; the loop knows lobes, coarse maps and `transport` only.
 """
 
-import argparse
 import json
 import time
 from collections.abc import Mapping
@@ -21,7 +20,7 @@ import torch
 import warp as wp
 from torch import Tensor
 
-from benchmarks.measure import context
+from benchmarks.measure import context, flags
 from warpir.app.settings import OptimizeSettings
 from warpir.core.arrays import Float64Array, FloatArray
 from warpir.core.color import gamma_to_linear, luminance
@@ -70,49 +69,18 @@ class RecoveryScene:
     """Raw height of the true foreground curve: its bend."""
 
 
-SCENES = (
-    RecoveryScene(
-        "plaza_spot",
-        "modern_buildings_2_1k",
-        "mesh/spot/spot.obj",
-        1.6,
-        100.0,
-        4.5,
-        1.6,
-        200.0,
-        0.4,
-    ),
-    RecoveryScene(
-        "park_truck",
-        "rooitou_park_1k",
-        "mesh/kenney_trucks/vehicle-truck-red.glb",
-        4.0,
-        300.0,
-        9.0,
-        2.2,
-        35.0,
-        -0.3,
-    ),
-    RecoveryScene(
-        "clouds_ball", "pmndrs_sky", "mesh/shaderball.glb", 1.2, 150.0, 4.5, 1.6, 20.0, 0.2
-    ),
-    RecoveryScene(
-        "hills_truck",
-        "hilly_terrain_01_1k",
-        "mesh/kenney_trucks/vehicle-truck-yellow.glb",
-        4.0,
-        120.0,
-        9.0,
-        2.2,
-        -60.0,
-        0.5,
-    ),
-    RecoveryScene(
-        "noon_spot", "noon_grass_1k", "mesh/spot/spot.obj", 1.6, 20.0, 4.5, 1.6, 130.0, -0.4
-    ),
-    RecoveryScene(
-        "meadow_ball", "pmndrs_sunrise", "mesh/shaderball.glb", 1.2, 330.0, 4.5, 1.6, -70.0, 0.0
-    ),
+SPOT, BALL = "mesh/spot/spot.obj", "mesh/shaderball.glb"
+RED, YELLOW = (f"mesh/kenney_trucks/vehicle-truck-{color}.glb" for color in ("red", "yellow"))
+SCENES = tuple(
+    RecoveryScene(*row)
+    for row in (
+        ("plaza_spot", "modern_buildings_2_1k", SPOT, 1.6, 100.0, 4.5, 1.6, 200.0, 0.4),
+        ("park_truck", "rooitou_park_1k", RED, 4.0, 300.0, 9.0, 2.2, 35.0, -0.3),
+        ("clouds_ball", "pmndrs_sky", BALL, 1.2, 150.0, 4.5, 1.6, 20.0, 0.2),
+        ("hills_truck", "hilly_terrain_01_1k", YELLOW, 4.0, 120.0, 9.0, 2.2, -60.0, 0.5),
+        ("noon_spot", "noon_grass_1k", SPOT, 1.6, 20.0, 4.5, 1.6, 130.0, -0.4),
+        ("meadow_ball", "pmndrs_sunrise", BALL, 1.2, 330.0, 4.5, 1.6, -70.0, 0.0),
+    )
 )
 """Six places with a sun between 8 and 86 degrees high, seen from different sides of it."""
 
@@ -403,15 +371,11 @@ def table(record: Mapping[str, Any]) -> str:
 
 def main() -> None:
     """Recover six scenes and write what was found."""
-    parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
-    parser.add_argument(
-        "--assets", type=Path, default=Path("../shared/data"), help="folder with mesh/ and hdri/"
-    )
+    parser = flags(__doc__)
+    parser.set_defaults(device="cpu")
     parser.add_argument("--quick", action="store_true", help="96 x 64, 200 steps")
-    parser.add_argument("--json", type=Path, help="file for the figures")
     parser.add_argument("--pictures", type=Path, help="folder for truth, result, difference")
     parser.add_argument("--scenes", default="", help="names, separated by commas")
-    parser.add_argument("--device", default="cpu")
     parser.add_argument("--noise", type=float, default=0.0, help="of the guidance, see TowardTruth")
     parser.add_argument("--markdown", type=Path, help="file for the table")
     parser.add_argument("--set", action="append", default=[], help="field=value of the settings")

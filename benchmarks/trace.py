@@ -5,13 +5,12 @@
 The object fills the view; shadow rays start on its surface in cosine-distributed directions.
 """
 
-import argparse
-from pathlib import Path
+from functools import partial
 
 import numpy as np
 import warp as wp
 
-from benchmarks.measure import context, report, seconds
+from benchmarks.measure import context, flags, report, seconds
 from warpir.io.assets import load_asset
 from warpir.kernels.frame import basis, to_world
 from warpir.kernels.rng import hash_pair, pixel_seed, sobol_pair
@@ -75,11 +74,7 @@ def cast(
 
 def main() -> None:
     """Measure the assets of the referee's presets."""
-    parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
-    parser.add_argument("--assets", type=Path, default=Path("../shared/data"))
-    parser.add_argument("--device", default=None)
-    parser.add_argument("--json", default=None)
-    options = parser.parse_args()
+    options = flags(__doc__).parse_args()
     device = choose_device(options.device)
     for name in (
         "mesh/ToyCar.glb",
@@ -99,25 +94,20 @@ def main() -> None:
         pixels = wp.array(np.arange(SIDE * SIDE, dtype=np.int32), dtype=int, device=device)
         hits = wp.zeros(SIDE * SIDE, dtype=float, device=device)
 
-        def run(shadow_rays: int) -> None:
-            renderer.launch(  # noqa: B023
-                cast,
-                SIDE * SIDE,
-                [
-                    Rows(pixels),  # noqa: B023
-                    scene.camera_args,  # noqa: B023
-                    scene.mesh_args,  # noqa: B023
-                    scene.material_args,  # noqa: B023
-                    scene.texture_args,  # noqa: B023
-                    shadow_rays,
-                    Rows(hits),  # noqa: B023
-                ],
-                1 + shadow_rays,
-            )
+        def run(
+            shadow_rays: int,
+            renderer: Renderer = renderer,
+            pixels: wp.array = pixels,
+            hits: wp.array = hits,
+        ) -> None:
+            scene = renderer.scene
+            inputs = [scene.camera_args, scene.mesh_args, scene.material_args, scene.texture_args]
+            arguments = [Rows(pixels), *inputs, shadow_rays, Rows(hits)]
+            renderer.launch(cast, SIDE * SIDE, arguments, 1 + shadow_rays)
 
-        primary, primary_spread = seconds(lambda: run(0), scene.device)
+        primary, primary_spread = seconds(partial(run, 0), scene.device)
         share = float(hits.numpy().mean())
-        both, both_spread = seconds(lambda: run(SHADOW_RAYS), scene.device)
+        both, both_spread = seconds(partial(run, SHADOW_RAYS), scene.device)
         shadow_count = share * SIDE * SIDE * SHADOW_RAYS
         report(
             {

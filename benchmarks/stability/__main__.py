@@ -8,7 +8,6 @@ test_stability.py` asserts the bounds of the same cases. Mitsuba's part is left 
 where it is not installed. ``--quick`` takes only cases of less than a second.
 """
 
-import argparse
 import math
 import time
 from importlib.metadata import version
@@ -17,7 +16,7 @@ from typing import Any
 
 import warp as wp
 
-from benchmarks.measure import context, report
+from benchmarks.measure import context, flags, report
 from benchmarks.stability import brdf, geometry, light, lobes
 from benchmarks.stability.case import Case
 from warpir.render.device import choose_device
@@ -132,10 +131,8 @@ def document(records: list[dict[str, Any]], where: dict[str, Any], command: str)
 
 def main() -> None:
     """Run the cases, print one JSON line each, and write the table."""
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else "")
-    parser.add_argument("--device", default=None)
+    parser = flags(__doc__, has_assets=False)
     parser.add_argument("--quick", action="store_true", help="only cases of less than a second")
-    parser.add_argument("--json", default=None, help="append one line a case to this file")
     parser.add_argument("--docs", default=None, help="write the table to this file")
     args = parser.parse_args()
     device = choose_device(args.device)

@@ -1,6 +1,5 @@
 """Hard cases of the material: roughness down to the clamp, grazing angles, normals facing away."""
 
-from functools import partial
 from typing import Any
 
 import numpy as np
@@ -13,9 +12,14 @@ from benchmarks.stability.case import (
     Case,
     Float64Array,
     Measured,
-    download,
+    Quantity,
+    differentiate,
     finite,
+    from_mitsuba,
+    launch,
     max_relative,
+    table,
+    to_mitsuba,
     upload,
     worst_l2,
 )
@@ -29,7 +33,6 @@ from warpir.render.device_scene import Scene
 from warpir.render.renderer import Renderer
 from warpir.scene.asset import Material, Primitive
 
-GROUP = "brdf"
 CLAMP = 0.0317
 """Roughness just above the clamp: its square is 1.005e-3, the least GGX width 1e-3."""
 ROUGHNESS = (0.0, CLAMP, 0.1, 0.5, 1.0)
@@ -88,7 +91,7 @@ def evaluate(
     roughness: np.ndarray,
     y: np.ndarray | None = None,
 ) -> tuple[Float64Array, Float64Array, list[Float64Array]]:
-    """Return value, density and, with output weights ``y``, gradients of the material."""
+    """Return value, density and gradients of the material; ``y`` weights the value, or 1."""
     arrays = [
         upload(wo, wp.vec3, device),
         upload(wi, wp.vec3, device),
@@ -96,14 +99,9 @@ def evaluate(
         upload(metallic, float, device, True),
         upload(roughness, float, device, True),
     ]
-    f = wp.zeros(len(wo), dtype=wp.vec3, device=device, requires_grad=True)
-    pdf = wp.zeros(len(wo), dtype=float, device=device)
-    with wp.Tape() as tape:
-        wp.launch(eval_kernel, len(wo), inputs=arrays, outputs=[f, pdf], device=device)
-    if y is None:
-        return download(f), download(pdf), []
-    tape.backward(grads={f: upload(y, wp.vec3, device)})
-    return download(f), download(pdf), [download(a.grad) for a in arrays[2:]]
+    weights = np.ones(np.shape(wo)) if y is None else y
+    (f, pdf), gradients = differentiate(eval_kernel, arrays, weights, wp.vec3, float, device=device)
+    return f, pdf, gradients
 
 
 def pairs(roughness: float, count: int = 20000) -> tuple[np.ndarray, np.ndarray]:
@@ -172,10 +170,8 @@ def own_samples(device: str, roughness: float) -> Measured:
     u = np.random.default_rng(6).random((20000, 2), dtype=np.float32)
     for cos_o in (1.0, 0.3, 0.02, 1e-3):
         wo = eye(cos_o)
-        wi = wp.zeros(len(u), dtype=wp.vec3, device=device)
         inputs = [wp.vec3(*map(float, wo)), upload(u, wp.vec2, device), roughness]
-        wp.launch(sample_kernel, len(u), inputs=inputs, outputs=[wi], device=device)
-        d = download(wi)
+        (d,) = launch(sample_kernel, len(u), inputs, wp.vec3, device=device)
         above = d[:, 2] > 0.0
         everywhere = np.broadcast_to(wo, d.shape)
         _, pdf, _ = evaluate(device, everywhere, d, *metal(len(d), roughness))
@@ -277,10 +273,9 @@ def frame_error(n: np.ndarray, x: Float64Array, y: Float64Array) -> float:
 def frame(device: str) -> Measured:
     """Is the frame round a normal orthonormal, next to -Z too?"""
     n = hard_normals()
-    x, y = (wp.zeros(len(n), dtype=wp.vec3, device=device) for _ in range(2))
     source = upload(n, wp.vec3, device)
-    wp.launch(frame_kernel, len(n), inputs=[source], outputs=[x, y], device=device)
-    return Measured(frame_error(n, download(x), download(y)), finite(x.numpy(), y.numpy()))
+    x, y = launch(frame_kernel, len(n), [source], wp.vec3, wp.vec3, device=device)
+    return Measured(frame_error(n, x, y), finite(x, y))
 
 
 # ------------------------------------------------------------------------------ Mitsuba
@@ -306,7 +301,7 @@ def interaction(wo: np.ndarray) -> Any:
     import mitsuba as mi
 
     si = dr.zeros(mi.SurfaceInteraction3f, len(wo))
-    si.wi = mi.Vector3f(np.ascontiguousarray(wo.T))
+    si.wi = to_mitsuba(wo)
     return si
 
 
@@ -323,7 +318,7 @@ def mitsuba_eval(wo: np.ndarray, wi: np.ndarray, roughness: float) -> tuple[floa
     import mitsuba as mi
 
     bsdf, si = conductor(roughness), interaction(wo)
-    toward = mi.Vector3f(np.ascontiguousarray(wi.T))
+    toward = to_mitsuba(wi)
     f = np.array(bsdf.eval(mi.BSDFContext(), si, toward))[0]
     pdf = np.array(bsdf.pdf(mi.BSDFContext(), si, toward))
     truth = o.vndf_reflection_pdf(wo, wi, o.ggx_alpha(np.float32(roughness)))
@@ -358,7 +353,7 @@ def mitsuba_own_samples(roughness: float) -> float:
         sample, _ = bsdf.sample(
             mi.BSDFContext(), interaction(wo), mi.Float(0.5), mi.Point2f(np.ascontiguousarray(u.T))
         )
-        d = np.array(sample.wo).T.astype(np.float64)
+        d = from_mitsuba(sample.wo)
         truth = o.vndf_reflection_pdf(wo, d, o.ggx_alpha(np.float32(roughness)))
         above = d[:, 2] > 0.0
         errors.append(max_relative(np.array(sample.pdf)[above], truth[above]))
@@ -370,90 +365,42 @@ def mitsuba_frame() -> float:
     import mitsuba as mi
 
     n = hard_normals()
-    x, y = mi.coordinate_system(mi.Vector3f(np.ascontiguousarray(n.T)))
-    return frame_error(n, np.array(x).T.astype(np.float64), np.array(y).T.astype(np.float64))
+    x, y = mi.coordinate_system(to_mitsuba(n))
+    return frame_error(n, from_mitsuba(x), from_mitsuba(y))
 
 
 def cases() -> list[Case]:
     """Return the rows of this group."""
-    rows = []
-    for r in ROUGHNESS:
-        name = f"roughness {r:g}"
-        rows += [
-            Case(
-                GROUP,
-                name,
-                "value",
-                MAX_RELATIVE,
-                partial(value, roughness=r),
-                VALUE,
-                GRADIENT,
-                partial(mitsuba_value, r),
-            ),
-            Case(
-                GROUP,
-                name,
-                "density",
-                MAX_RELATIVE,
-                partial(density, roughness=r),
-                VALUE,
-                mitsuba=partial(mitsuba_density, r),
-            ),
-            Case(
-                GROUP,
-                name,
-                "density at own samples",
-                MAX_RELATIVE,
-                partial(own_samples, roughness=r),
-                VALUE,
-                mitsuba=partial(mitsuba_own_samples, r),
-            ),
-        ]
-    for c in GRAZING:
-        rows.append(
-            Case(
-                GROUP,
-                f"both cosines {c:g}",
-                "value and density",
-                MAX_RELATIVE,
-                partial(grazing, cosine=c),
-                VALUE,
-                mitsuba=partial(mitsuba_grazing, c),
-            )
-        )
-    rows.append(
-        Case(
-            GROUP,
-            "directions below the surface",
-            "value, density, gradient",
-            MAX_ABSOLUTE,
-            facing_away,
-            0.0,
-            mitsuba="zero by definition there as well",
-        )
-    )
-    for tilt in (30.0, 60.0, 85.0, 100.0, 180.0):
-        rows.append(
-            Case(
-                GROUP,
-                f"shading normal {tilt:g} deg off",
-                "radiance",
-                RELATIVE,
-                partial(shading_normal, tilt_deg=tilt),
-                NORMALS,
-                mitsuba="another integral: it lets light through below the geometric surface",
-                cost="medium",
-            )
-        )
-    rows.append(
-        Case(
-            GROUP,
-            "normals next to -Z and +Z",
-            "frame",
-            MAX_ABSOLUTE,
-            frame,
-            FRAME,
-            mitsuba=mitsuba_frame,
-        )
-    )
-    return rows
+    below = "zero by definition there as well"
+    own = "density at own samples"
+    through = "another integral: it lets light through below the geometric surface"
+    return [
+        *table(
+            "brdf",
+            {f"roughness {r:g}": (r,) for r in ROUGHNESS},
+            Quantity("value", MAX_RELATIVE, value, VALUE, GRADIENT, mitsuba_value),
+            Quantity("density", MAX_RELATIVE, density, VALUE, None, mitsuba_density),
+            Quantity(own, MAX_RELATIVE, own_samples, VALUE, None, mitsuba_own_samples),
+        ),
+        *table(
+            "brdf",
+            {f"both cosines {c:g}": (c,) for c in GRAZING},
+            Quantity("value and density", MAX_RELATIVE, grazing, VALUE, None, mitsuba_grazing),
+        ),
+        *table(
+            "brdf",
+            {"directions below the surface": ()},
+            Quantity("value, density, gradient", MAX_ABSOLUTE, facing_away, 0.0, None, below),
+        ),
+        *table(
+            "brdf",
+            {f"shading normal {t:g} deg off": (t,) for t in (30.0, 60.0, 85.0, 100.0, 180.0)},
+            Quantity("radiance", RELATIVE, shading_normal, NORMALS, None, through),
+            cost="medium",
+        ),
+        *table(
+            "brdf",
+            {"normals next to -Z and +Z": ()},
+            Quantity("frame", MAX_ABSOLUTE, frame, FRAME, None, mitsuba_frame),
+        ),
+    ]

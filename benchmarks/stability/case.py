@@ -1,8 +1,9 @@
 """What a hard case is: a measurement against float64, its bound, and Mitsuba's error on it."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from typing import Any
+from functools import partial
+from typing import Any, NamedTuple
 
 import numpy as np
 import warp as wp
@@ -31,7 +32,7 @@ class Measured:
 
 @dataclass(frozen=True)
 class Case:
-    """One row of the table; `run` makes its numbers."""
+    """One row of the table; `run` measures it."""
 
     group: str
     name: str
@@ -56,6 +57,39 @@ class Case:
         return f"{self.group}-{self.name}-{self.quantity}".replace(" ", "_")
 
 
+class Quantity(NamedTuple):
+    """What is measured on each input of a `table`; its functions take the input's values."""
+
+    name: str
+    measure: str
+    run: Callable[..., Measured]
+    """Takes the Warp device, then the input's values."""
+    bound: float | Callable[..., float]
+    gradient_bound: float | None
+    mitsuba: Callable[..., float] | str
+
+
+def table(
+    group: str, inputs: Mapping[str, tuple[Any, ...]], *quantities: Quantity, cost: str = "quick"
+) -> list[Case]:
+    """Return a case for each quantity on each input, whose name stands beside its values."""
+    return [
+        Case(
+            group,
+            name,
+            quantity.name,
+            quantity.measure,
+            lambda device, run=quantity.run, values=values: run(device, *values),
+            quantity.bound(*values) if callable(quantity.bound) else quantity.bound,
+            quantity.gradient_bound,
+            partial(quantity.mitsuba, *values) if callable(quantity.mitsuba) else quantity.mitsuba,
+            cost,
+        )
+        for name, values in inputs.items()
+        for quantity in quantities
+    ]
+
+
 def upload(values: ArrayLike, dtype: Any, device: str, grad: bool = False) -> wp.array:
     """Return a float32 Warp array of ``values``."""
     plain = np.ascontiguousarray(values, np.float32)
@@ -65,6 +99,54 @@ def upload(values: ArrayLike, dtype: Any, device: str, grad: bool = False) -> wp
 def download(array: wp.array) -> Float64Array:
     """Return a Warp array's values in float64."""
     return np.asarray(array.numpy(), np.float64)
+
+
+def launch(
+    kernel: wp.Kernel, count: int, inputs: list[Any], *dtypes: Any, device: str
+) -> list[Float64Array]:
+    """Run a kernel of ``count`` threads; return an output of ``count`` values for each type."""
+    outputs = [wp.zeros(count, dtype=dtype, device=device) for dtype in dtypes]
+    wp.launch(kernel, count, inputs=inputs, outputs=outputs, device=device)
+    return [download(output) for output in outputs]
+
+
+def differentiate(
+    kernel: wp.Kernel, inputs: list[Any], y: ArrayLike, dtype: Any, *others: Any, device: str
+) -> tuple[list[Float64Array], list[Float64Array]]:
+    """Run a kernel forward and backward.
+
+    Args:
+        kernel: Its thread i writes element i of every output.
+        inputs: Its inputs; an array that wants its gradient has ``requires_grad``.
+        y: Weights of the first output's elements in the loss.
+        dtype: Element type of the first output.
+        *others: Those of the other outputs, which are not differentiated.
+        device: Warp device.
+
+    Returns:
+        The outputs, and the gradients of the inputs that want one.
+    """
+    weights = upload(y, dtype, device)
+    count = len(weights)
+    outputs = [wp.zeros(count, dtype=dtype, device=device, requires_grad=True)]
+    outputs += [wp.zeros(count, dtype=other, device=device) for other in others]
+    with wp.Tape() as tape:
+        wp.launch(kernel, count, inputs=inputs, outputs=outputs, device=device)
+    tape.backward(grads={outputs[0]: weights})
+    free = [a for a in inputs if isinstance(a, wp.array) and a.requires_grad]
+    return [download(output) for output in outputs], [download(a.grad) for a in free]
+
+
+def to_mitsuba(vectors: ArrayLike) -> Any:
+    """Return Mitsuba's vectors of an array [n, 3]."""
+    import mitsuba as mi
+
+    return mi.Vector3f(np.ascontiguousarray(np.transpose(vectors), np.float32))
+
+
+def from_mitsuba(vectors: Any) -> Float64Array:
+    """Return Mitsuba's vectors as an array [n, 3]."""
+    return np.array(vectors).T.astype(np.float64)
 
 
 def finite(*values: ArrayLike) -> bool:

@@ -1,7 +1,5 @@
 """Hard cases of spherical Gaussians: sharpness 1e-3, a flat sky, to 1e6, narrower than a sun."""
 
-from functools import partial
-
 import numpy as np
 import warp as wp
 
@@ -11,24 +9,29 @@ from benchmarks.stability.case import (
     Case,
     Float64Array,
     Measured,
-    download,
+    Quantity,
     finite,
+    from_mitsuba,
+    launch,
     max_relative,
+    table,
+    to_mitsuba,
     upload,
 )
+from benchmarks.stability.maps import evaluate
 from tests import oracles as o
 from tests.builders.shapes import all_pixels, camera, ground, lobe
-from warpir.kernels.sampling import light_eval, lobe_sample
-from warpir.kernels.types import LightArgs
+from warpir.kernels.sampling import lobe_sample
 from warpir.render.device_light import light_args
 from warpir.render.device_scene import Scene
 from warpir.render.renderer import Renderer
 from warpir.scene.light import Light, Lobes, rasterize_lobes
 
-GROUP = "lobes"
 SHARPNESS = (1e-3, 1e-1, 1.0, 30.0, 1e3, 6e3, 1e5, 1e6)
 AXIS = np.array([0.48, -0.6, 0.64], np.float32)
 """A general direction: no component is 0."""
+Z = np.array([0.0, 0.0, 1.0], np.float32)
+"""The axis of Mitsuba's lobes."""
 EXPONENT = 20.0
 """Cases reach out to ``exp(-20)``, 2e-9 of the peak."""
 NO_LOBES = "has no spherical-Gaussian light"
@@ -49,24 +52,10 @@ FLUX = 1e-12
 
 
 @wp.kernel(enable_backward=False)
-def radiance_kernel(light: LightArgs, wi: wp.array[wp.vec3], L: wp.array[wp.vec3]):
-    """Radiance of a light."""
-    i = wp.tid()
-    L[i] = light_eval(light, wi[i]).radiance
-
-
-@wp.kernel(enable_backward=False)
 def sample_kernel(u: wp.array[wp.vec2], axis: wp.vec3, sharpness: float, wi: wp.array[wp.vec3]):
     """Draw directions from given numbers."""
     i = wp.tid()
     wi[i] = lobe_sample(u[i], axis, sharpness)
-
-
-@wp.kernel(enable_backward=False)
-def pdf_kernel(light: LightArgs, wi: wp.array[wp.vec3], pdf: wp.array[float]):
-    """Density of the light's proposal."""
-    i = wp.tid()
-    pdf[i] = light_eval(light, wi[i]).pdf
 
 
 def directions(sharpness: float, axis: np.ndarray, count: int = 20000) -> np.ndarray:
@@ -84,11 +73,9 @@ def radiance(device: str, sharpness: float) -> Measured:
     amplitude, s = np.array([[0.7, 1.3, 2.0]], np.float32), np.array([sharpness], np.float32)
     light = light_args(Light(Lobes(amplitude, AXIS[None], s)), wp.get_device(device))
     v = directions(sharpness, AXIS)
-    out = wp.zeros(len(v), dtype=wp.vec3, device=device)
-    source = upload(v, wp.vec3, device)
-    wp.launch(radiance_kernel, len(v), inputs=[light, source], outputs=[out], device=device)
+    found, _ = evaluate(device, light, v)
     truth = o.sg_radiance(v, amplitude, o.normalize(AXIS)[None], s)
-    return Measured(max_relative(download(out), truth), finite(out.numpy()))
+    return Measured(max_relative(found, truth), finite(found))
 
 
 def sampling_error(wi: Float64Array, u: Float64Array, axis: np.ndarray, sharpness: float) -> float:
@@ -107,11 +94,9 @@ def numbers(count: int = 20000) -> np.ndarray:
 def sampling(device: str, sharpness: float) -> Measured:
     """Draw from one lobe: does the direction lie where the inverted CDF says?"""
     u = numbers()
-    wi = wp.zeros(len(u), dtype=wp.vec3, device=device)
-    inputs = [upload(u, wp.vec2, device), wp.vec3(*map(float, AXIS)), float(np.float32(sharpness))]
-    wp.launch(sample_kernel, len(u), inputs=inputs, outputs=[wi], device=device)
-    d = download(wi)
     s = float(np.float32(sharpness))
+    inputs = [upload(u, wp.vec2, device), wp.vec3(*map(float, AXIS)), s]
+    (d,) = launch(sample_kernel, len(u), inputs, wp.vec3, device=device)
     return Measured(sampling_error(d, u[:, 0].astype(np.float64), AXIS, s), finite(d))
 
 
@@ -119,11 +104,9 @@ def density(device: str, sharpness: float) -> Measured:
     """Density of the light's proposal, at directions out to `EXPONENT`."""
     light = light_args(lobe(AXIS, sharpness), wp.get_device(device))
     v = directions(sharpness, AXIS)
-    pdf = wp.zeros(len(v), dtype=float, device=device)
-    source = upload(v, wp.vec3, device)
-    wp.launch(pdf_kernel, len(v), inputs=[light, source], outputs=[pdf], device=device)
+    _, pdf = evaluate(device, light, v)
     truth = o.sg_pdf(v, AXIS, float(np.float32(sharpness)))
-    return Measured(max_relative(download(pdf), truth), finite(pdf.numpy()))
+    return Measured(max_relative(pdf, truth), finite(pdf))
 
 
 def host_map(device: str, sharpness: float) -> Measured:
@@ -178,26 +161,27 @@ def plane(device: str, sharpness: float) -> Measured:
 # ------------------------------------------------------------------------------ Mitsuba
 
 
-def mitsuba_density(sharpness: float) -> float:
-    """Error of Mitsuba's von Mises-Fisher density at the same directions about +Z."""
+def mitsuba_pdf(sharpness: float) -> tuple[np.ndarray, Float64Array]:
+    """Return the same directions about +Z and Mitsuba's von Mises-Fisher density there."""
     import mitsuba as mi
 
-    z = np.array([0.0, 0.0, 1.0], np.float32)
-    v = directions(sharpness, z)
-    pdf = mi.warp.square_to_von_mises_fisher_pdf(mi.Vector3f(v.T), mi.Float(sharpness))
-    return max_relative(np.array(pdf), o.sg_pdf(v, z, float(np.float32(sharpness))))
+    v = directions(sharpness, Z)
+    pdf = mi.warp.square_to_von_mises_fisher_pdf(to_mitsuba(v), mi.Float(sharpness))
+    return v, np.array(pdf).astype(np.float64)
+
+
+def mitsuba_density(sharpness: float) -> float:
+    """Error of that density."""
+    v, pdf = mitsuba_pdf(sharpness)
+    return max_relative(pdf, o.sg_pdf(v, Z, float(np.float32(sharpness))))
 
 
 def mitsuba_radiance(sharpness: float) -> float:
     """Error of the same density over its peak, which is a lobe of amplitude 1."""
-    import mitsuba as mi
-
-    z = np.array([0.0, 0.0, 1.0], np.float32)
-    v = directions(sharpness, z)
-    pdf = mi.warp.square_to_von_mises_fisher_pdf(mi.Vector3f(v.T), mi.Float(sharpness))
-    found = np.array(pdf).astype(np.float64) * float(o.sg_flux(float(np.float32(sharpness))))
-    truth = o.sg_radiance(v, np.ones((1, 1)), z[None], np.array([np.float32(sharpness)]))[:, 0]
-    return max_relative(found, truth)
+    v, pdf = mitsuba_pdf(sharpness)
+    s = float(np.float32(sharpness))
+    truth = o.sg_radiance(v, np.ones((1, 1)), Z[None], np.array([s]))[:, 0]
+    return max_relative(pdf * float(o.sg_flux(s)), truth)
 
 
 def mitsuba_sampling(sharpness: float) -> float:
@@ -209,80 +193,25 @@ def mitsuba_sampling(sharpness: float) -> float:
     d = mi.warp.square_to_von_mises_fisher(
         mi.Point2f(u[:, 1].copy(), u[:, 0].copy()), mi.Float(sharpness)
     )
-    z = np.array([0.0, 0.0, 1.0])
     s = float(np.float32(sharpness))
-    return sampling_error(np.array(d).T, u[:, 0].astype(np.float64), z, s)
+    return sampling_error(from_mitsuba(d), u[:, 0].astype(np.float64), Z, s)
+
+
+def cdf_bound(sharpness: float) -> float:
+    """Return what the arithmetic and the float32 direction do to a lobe's CDF."""
+    return CDF_ARITHMETIC + CDF_DIRECTION * max(1.0, float(np.sqrt(sharpness)))
 
 
 def cases() -> list[Case]:
     """Return the rows of this group."""
-    rows = []
-    for s in SHARPNESS:
-        name = f"sharpness {s:g}"
-        width = CDF_ARITHMETIC + CDF_DIRECTION * max(1.0, float(np.sqrt(s)))
-        rows += [
-            Case(
-                GROUP,
-                name,
-                "radiance",
-                MAX_RELATIVE,
-                partial(radiance, sharpness=s),
-                VALUE,
-                mitsuba=partial(mitsuba_radiance, s),
-            ),
-            Case(
-                GROUP,
-                name,
-                "sampling",
-                "max CDF distance",
-                partial(sampling, sharpness=s),
-                width,
-                mitsuba=partial(mitsuba_sampling, s),
-            ),
-            Case(
-                GROUP,
-                name,
-                "density",
-                MAX_RELATIVE,
-                partial(density, sharpness=s),
-                VALUE,
-                mitsuba=partial(mitsuba_density, s),
-            ),
-            Case(
-                GROUP,
-                name,
-                "integral",
-                RELATIVE,
-                partial(flux, sharpness=s),
-                FLUX,
-                mitsuba=NO_LOBES,
-            ),
-            Case(
-                GROUP,
-                name,
-                "power on a 64 x 128 map, host",
-                RELATIVE,
-                partial(host_map, sharpness=s),
-                POWER,
-                mitsuba=NO_LOBES,
-            ),
-            Case(
-                GROUP,
-                name,
-                "irradiance, host",
-                "max over the flux",
-                partial(host_irradiance, sharpness=s),
-                HOST,
-                mitsuba=NO_LOBES,
-            ),
-            Case(
-                GROUP,
-                name,
-                "white plane",
-                RELATIVE,
-                partial(plane, sharpness=s),
-                PLANE,
-                mitsuba=NO_LOBES,
-            ),
-        ]
-    return rows
+    return table(
+        "lobes",
+        {f"sharpness {s:g}": (s,) for s in SHARPNESS},
+        Quantity("radiance", MAX_RELATIVE, radiance, VALUE, None, mitsuba_radiance),
+        Quantity("sampling", "max CDF distance", sampling, cdf_bound, None, mitsuba_sampling),
+        Quantity("density", MAX_RELATIVE, density, VALUE, None, mitsuba_density),
+        Quantity("integral", RELATIVE, flux, FLUX, None, NO_LOBES),
+        Quantity("power on a 64 x 128 map, host", RELATIVE, host_map, POWER, None, NO_LOBES),
+        Quantity("irradiance, host", "max over the flux", host_irradiance, HOST, None, NO_LOBES),
+        Quantity("white plane", RELATIVE, plane, PLANE, None, NO_LOBES),
+    )

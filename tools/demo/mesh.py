@@ -247,13 +247,7 @@ def mesh_distance(distance: Distance, low: ArrayLike, high: ArrayLike, step: flo
     corners = np.concatenate(quads)
     quad = number[corners[..., 0], corners[..., 1], corners[..., 2]]
 
-    points = project(distance, points)
-    edges = np.concatenate([quad[:, [k, (k + 1) % 4]] for k in range(4)])
-    for _ in range(3):
-        mean, degree = np.zeros_like(points), np.zeros((len(points), 1))
-        np.add.at(mean, edges[:, 0], points[edges[:, 1]])
-        np.add.at(degree, edges[:, 0], 1.0)
-        points = project(distance, 0.5 * points + 0.5 * mean / degree, 2)
+    points = _evened(distance, project(distance, points), quad)
     # Each quad is cut along its shorter diagonal, which keeps bent ones from folding.
     diagonals = [
         np.linalg.norm(points[quad[:, k]] - points[quad[:, k + 2]], axis=1) for k in (0, 1)
@@ -261,6 +255,17 @@ def mesh_distance(distance: Distance, low: ArrayLike, high: ArrayLike, step: flo
     quad = np.where((diagonals[1] < diagonals[0])[:, None], np.roll(quad, -1, axis=1), quad)
     triangles = np.concatenate([quad[:, [0, 1, 2]], quad[:, [0, 2, 3]]])
     return Surface(points, normalized(gradient(distance, points, 0.5 * step)), triangles)
+
+
+def _evened(distance: Distance, points: Float64Array, quad: Int64Array) -> Float64Array:
+    """Move each point toward the mean of its neighbours, and back onto the zero level."""
+    edges = np.concatenate([quad[:, [k, (k + 1) % 4]] for k in range(4)])
+    for _ in range(3):
+        mean, degree = np.zeros_like(points), np.zeros((len(points), 1))
+        np.add.at(mean, edges[:, 0], points[edges[:, 1]])
+        np.add.at(degree, edges[:, 0], 1.0)
+        points = project(distance, 0.5 * points + 0.5 * mean / degree, 2)
+    return points
 
 
 def split(surface: Surface, values: Float64Array) -> tuple[Surface, Surface]:
