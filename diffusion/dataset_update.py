@@ -9,13 +9,10 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from warpir.diffusion.crop import Crop, box_of, draw_crop
+from warpir.diffusion.crop import Crop, draw_crop
 from warpir.diffusion.draws import generator_of, seed_of
-from warpir.diffusion.gradient_gate import GradientGate
+from warpir.diffusion.gradient_gate import GatedGuidance
 from warpir.diffusion.models.model_error import ModelError
-from warpir.diffusion.prior import Condition, Counts, Prior
-from warpir.diffusion.schedule import time_range
-from warpir.diffusion.settings import GuidanceSettings
 
 DATASET_UPDATE = "dataset-update"
 """Name of this loss."""
@@ -25,7 +22,7 @@ VALUES_PER_LATENT = 48
 """Values of a picture for each of its latents: Stable Diffusion makes 4 of 8 x 8 x 3."""
 
 
-class DatasetUpdate:
+class DatasetUpdate(GatedGuidance):
     """The picture is edited now and then, and drawn towards its edit (DiPIR, table 3).
 
     Every ``update_every`` steps a crop is edited by SDEdit with the adapted model; its strength is
@@ -33,45 +30,21 @@ class DatasetUpdate:
     between this crop and its edit: its mean times the number of latents, so that it counts as much
     as a sum over latents does in the other losses. One crop at a time, however many noises.
 
-    Args:
-        prior: Has an editor.
-        condition: What the picture is to be judged by; its prompt alone counts.
-        settings: Times, crops and edits.
-        mask: Coverage of the object, shape [H, W].
-        steps: Length of the run, over which the strength falls.
-        seed: Of what is drawn.
-        adapter: Name of the LoRA of this photo, or None for the base model.
+    Arguments as of `GatedGuidance`; of the condition the prompt alone counts.
 
     Raises:
         ValueError: The mask is empty.
         ModelError: The prior cannot edit pictures.
     """
 
-    def __init__(
-        self,
-        prior: Prior,
-        condition: Condition,
-        settings: GuidanceSettings,
-        mask: Tensor,
-        steps: int,
-        seed: int,
-        adapter: str | None,
-    ) -> None:
-        if prior.editor is None:
-            raise ModelError(prior.name, f"cannot edit pictures, as {DATASET_UPDATE} needs")
-        self.prior, self.editor = prior, prior.editor
-        # An edit asks for the same two; by then the text encoder may be gone.
-        prior.embed([condition.prompt, ""])
-        self.condition, self.settings, self.adapter = condition, settings, adapter
-        self.box, self.steps, self.seed = box_of(mask), steps, seed
-        self.gate = GradientGate(settings.gradient_clip)
+    def prepare(self) -> None:
+        """Embed the prompts that an edit asks for; by then the text encoder may be gone."""
+        if self.prior.editor is None:
+            raise ModelError(self.prior.name, f"cannot edit pictures, as {DATASET_UPDATE} needs")
+        self.editor = self.prior.editor
+        self.prior.embed([self.condition.prompt, ""])
         self.crop: Crop | None = None
         self.edited: Tensor | None = None
-
-    @property
-    def counts(self) -> Counts:
-        """What the user is told in the end."""
-        return self.gate.counts
 
     def gradient(self, image: Tensor, step: int) -> Tensor | None:
         """Return the gradient of the L1 distance between the crop and its edit.
@@ -83,11 +56,10 @@ class DatasetUpdate:
         Returns:
             Same shape, dtype and device; None when it is not finite.
         """
-        s = self.settings
-        if self.crop is None or self.edited is None or step % s.update_every == 0:
-            strength = time_range(step, self.steps, s.time_min, s.time_max, s.time_max_end)[1]
+        is_due = step % self.settings.update_every == 0
+        if self.crop is None or self.edited is None or is_due:
             self.crop = self._draw(image, self.seed, step)
-            self.edited = self._edit(image, self.crop, strength, self.seed, step)
+            self.edited = self._edit(image, self.crop, self.times(step)[1], self.seed, step)
         leaf = image.detach().requires_grad_()
         distance = self._distance(leaf, self.crop, self.edited)
         # The derivative of |x| is a sign, and that of NaN is 0: only the distance tells.
@@ -121,7 +93,7 @@ class DatasetUpdate:
 
     def state_dict(self) -> dict[str, Any]:
         """Return numbers, lists of numbers and the edited crop."""
-        state = self.gate.state_dict()
+        state = super().state_dict()
         if self.crop is not None and self.edited is not None:
             state["crop"] = [self.crop.x, self.crop.y, self.crop.side]
             state["edited"] = self.edited.cpu()
@@ -129,7 +101,7 @@ class DatasetUpdate:
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
         """Go on from `state_dict`."""
-        self.gate.load_state_dict(state)
+        super().load_state_dict(state)
         self.crop = Crop(*state["crop"]) if "crop" in state else None
         self.edited = state["edited"].to(self.prior.device) if "edited" in state else None
 

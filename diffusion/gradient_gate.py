@@ -1,4 +1,4 @@
-"""The last stop of every guidance gradient: non-finite ones end here, outliers are shortened."""
+"""What every guidance knows, and the last stop of its gradients: outliers are shortened there."""
 
 from __future__ import annotations
 
@@ -11,7 +11,10 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from warpir.diffusion.prior import Counts
+from warpir.diffusion.crop import box_of
+from warpir.diffusion.prior import Condition, Counts, Prior
+from warpir.diffusion.schedule import time_range
+from warpir.diffusion.settings import GuidanceSettings
 
 NORM_WINDOW = 101
 """Number of past steps whose median norm defines an outlier."""
@@ -58,3 +61,57 @@ class GradientGate:
         """Go on from `state_dict`."""
         self.norms = deque(state["norms"], maxlen=NORM_WINDOW)
         self.counts.clipped_steps = int(state["clipped_steps"])
+
+
+class GatedGuidance:
+    """A guidance whose gradients pass a `GradientGate`.
+
+    Args:
+        prior: The frozen denoiser.
+        condition: What the picture is to be judged by.
+        settings: Loss, weights, times, crops and edits.
+        mask: Coverage of the object, shape [H, W].
+        steps: Length of the run, over which the times fall.
+        seed: Of what is drawn.
+        adapter: Name of the LoRA of this photo, or None for the base model.
+
+    Raises:
+        ValueError: The mask is empty.
+    """
+
+    def __init__(
+        self,
+        prior: Prior,
+        condition: Condition,
+        settings: GuidanceSettings,
+        mask: Tensor,
+        steps: int,
+        seed: int,
+        adapter: str | None,
+    ) -> None:
+        self.prior, self.condition, self.settings = prior, condition, settings
+        self.mask, self.adapter = mask, adapter
+        self.box, self.steps, self.seed = box_of(mask), steps, seed
+        self.gate = GradientGate(settings.gradient_clip)
+        self.prepare()
+
+    def prepare(self) -> None:
+        """Compute once what every step needs."""
+
+    @property
+    def counts(self) -> Counts:
+        """What the user is told in the end."""
+        return self.gate.counts
+
+    def times(self, step: int) -> tuple[float, float]:
+        """Return the least and the greatest time of a step."""
+        s = self.settings
+        return time_range(step, self.steps, s.time_min, s.time_max, s.time_max_end)
+
+    def state_dict(self) -> dict[str, Any]:
+        """Return tensors, numbers and lists of numbers."""
+        return self.gate.state_dict()
+
+    def load_state_dict(self, state: Mapping[str, Any]) -> None:
+        """Go on from `state_dict`."""
+        self.gate.load_state_dict(state)

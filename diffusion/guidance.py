@@ -13,19 +13,18 @@ terms mean, and a mean underflows in a half-precision autoencoder.
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Any
 
 import torch
 from torch import Tensor
 
-from warpir.diffusion.crop import box_of, draw_crop, shrink
+from warpir.diffusion.crop import draw_crop, shrink
 from warpir.diffusion.dataset_update import DATASET_UPDATE, DatasetUpdate
 from warpir.diffusion.draws import generator_of
-from warpir.diffusion.gradient_gate import GradientGate
-from warpir.diffusion.prior import Condition, Counts, Prior
-from warpir.diffusion.schedule import time_range, weight
+from warpir.diffusion.gradient_gate import GatedGuidance
+from warpir.diffusion.prior import Condition
+from warpir.diffusion.schedule import weight
 from warpir.diffusion.settings import GuidanceSettings
 
 PAIR_COUNT = 8
@@ -135,7 +134,7 @@ class NoisyCrops:
     """The G-buffer's crops, shape [noise, 13, R, R]."""
 
 
-class Guidance:
+class Guidance(GatedGuidance):
     """Score distillation with one row of coefficients (DiPIR, eq. 7 and 8).
 
     Each noise has a crop and a time of its own, so several of them also average over places and
@@ -143,43 +142,19 @@ class Guidance:
     What is drawn is a function of seed, step and noise alone: resumed runs continue with it, and
     all losses of an ablation share it.
 
-    Args:
-        prior: The frozen denoiser.
-        condition: What the picture is to be judged by.
-        settings: Loss, weights, times and crops.
-        mask: Coverage of the object, shape [H, W].
-        steps: Length of the run, over which the times fall.
-        seed: Of what is drawn.
-        adapter: Name of the LoRA of this photo, or None where the loss does without.
+    Arguments as of `GatedGuidance`; the adapter is None where the loss does without.
 
     Raises:
         ValueError: The loss is unknown, needs an adapter, or the mask is empty.
     """
 
-    def __init__(
-        self,
-        prior: Prior,
-        condition: Condition,
-        settings: GuidanceSettings,
-        mask: Tensor,
-        steps: int,
-        seed: int,
-        adapter: str | None,
-    ) -> None:
-        self.prior, self.condition, self.settings = prior, condition, settings
-        self.mask, self.adapter = mask, adapter
-        self.box, self.steps, self.seed = box_of(mask), steps, seed
-        self.row = coefficients(settings, adapter is not None)
-        self.terms = terms_of(settings, condition, adapter)
-        self.embeddings = prior.embed([term.prompt for term in self.terms])
-        photo = condition.background
+    def prepare(self) -> None:
+        """Embed the prompts of the terms that count, and shrink the photo."""
+        self.row = coefficients(self.settings, self.adapter is not None)
+        self.terms = terms_of(self.settings, self.condition, self.adapter)
+        self.embeddings = self.prior.embed([term.prompt for term in self.terms])
+        photo, prior = self.condition.background, self.prior
         self.whole = None if photo is None else shrink(photo, prior.resolution).to(prior.device)
-        self.gate = GradientGate(settings.gradient_clip)
-
-    @property
-    def counts(self) -> Counts:
-        """What the user is told in the end."""
-        return self.gate.counts
 
     def gradient(self, image: Tensor, step: int) -> Tensor | None:
         """Return the gradient of ``< stopgrad(w(t) delta), latents >``, averaged over the noises.
@@ -199,7 +174,7 @@ class Guidance:
     def _gradient(self, image: Tensor, step: int) -> Tensor:
         """Return the gradient as it comes, of all noises at once or of halves."""
         s = self.settings
-        low, high = time_range(step, self.steps, s.time_min, s.time_max, s.time_max_end)
+        low, high = self.times(step)
 
         def of(first: int, last: int) -> Tensor:
             generators = [generator_of(self.seed, step, k) for k in range(first, last)]
@@ -300,10 +275,9 @@ class Guidance:
 
     def _time_of_a_run(self, generator: torch.Generator) -> Tensor:
         """Return a time as some step of the run draws it, shape [1]."""
-        s = self.settings
         u_step, u_time = torch.rand(2, generator=generator).tolist()
         step = min(int(u_step * self.steps), max(self.steps - 1, 0))
-        low, high = time_range(step, self.steps, s.time_min, s.time_max, s.time_max_end)
+        low, high = self.times(step)
         return torch.tensor([low + (high - low) * u_time])
 
     @torch.no_grad()
@@ -327,20 +301,12 @@ class Guidance:
             lambda: torch.cat([self._delta(crops, self._predictions(crops)) for crops in batches])
         )
 
-    def state_dict(self) -> dict[str, Any]:
-        """Return numbers and lists of numbers."""
-        return self.gate.state_dict()
-
-    def load_state_dict(self, state: Mapping[str, Any]) -> None:
-        """Go on from `state_dict`."""
-        self.gate.load_state_dict(state)
-
     def _fixed_crops(
         self, image: Tensor, purpose: str, seed: int | None, count: int
     ) -> Sequence[NoisyCrops]:
         """Return crops at fixed times, in batches of the size of a step's."""
         s = self.settings
-        low, high = time_range(0, self.steps, s.time_min, s.time_max, s.time_max_end)
+        low, high = self.times(0)
         times = low + (high - low) * (torch.arange(count) + 0.5) / count
         seed = self.seed if seed is None else seed
         generators = [generator_of(seed, purpose, k) for k in range(count)]
@@ -424,15 +390,6 @@ def _upload(values: Tensor, device: torch.device) -> Tensor:
     return values.pin_memory().to(device, non_blocking=True)
 
 
-def make_guidance(
-    prior: Prior,
-    condition: Condition,
-    settings: GuidanceSettings,
-    mask: Tensor,
-    steps: int,
-    seed: int,
-    adapter: str | None,
-) -> Guidance | DatasetUpdate:
-    """Return the guidance that the settings' loss asks for; arguments and errors are theirs."""
-    kind = DatasetUpdate if settings.loss == DATASET_UPDATE else Guidance
-    return kind(prior, condition, settings, mask, steps, seed, adapter)
+def kind_of(settings: GuidanceSettings) -> type[Guidance] | type[DatasetUpdate]:
+    """Return the guidance that the settings' loss asks for."""
+    return DatasetUpdate if settings.loss == DATASET_UPDATE else Guidance

@@ -56,6 +56,22 @@ BAD_STEPS_MAX = 5
 """Steps in a row without a finite gradient that end a training or an optimisation."""
 
 
+@dataclass
+class BadSteps:
+    """Counts the steps of a training or an optimisation that had no finite gradient."""
+
+    bad_steps: int = 0
+    """Number of the latest steps in a row without a finite gradient."""
+    skipped: int = 0
+    """Number of all steps without a finite gradient."""
+
+    def count_step(self, is_finite: bool) -> bool:
+        """Count a step; return whether it is the last of too many bad ones in a row."""
+        self.bad_steps = 0 if is_finite else self.bad_steps + 1
+        self.skipped += not is_finite
+        return self.bad_steps >= BAD_STEPS_MAX
+
+
 class NonFiniteError(Exception):
     """Numbers stayed non-finite; the program says so and exits with 6."""
 

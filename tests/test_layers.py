@@ -29,7 +29,7 @@ KERNELS_IN = {"render", "train"}
 """Who launches kernels; `warpir.kernels` itself sees Warp and nothing else."""
 NETWORKS_IN = {"optimize", "train", "evaluate"}
 """Who drives the networks of `warpir.diffusion`, which itself sees `warpir.core` alone."""
-PLAIN = {"settings", "prompts", "model_error", "model_folder", "weight_files"}
+PLAIN = {"settings", "prompts", "model_error", "model_folder", "hub", "weight_files"}
 """Modules of `warpir.diffusion` for every room: words, settings and files; torch is not loaded."""
 PACKAGES = {
     "warp": {"kernels", *KERNELS_IN},

@@ -158,8 +158,8 @@ def _read(
 
 def _write(lit: "LitRun", rendered: "RenderedResult", asked: InsertConfig) -> dict[str, Any]:
     """Stage all files, ``run.json`` last; return its content."""
+    from warpir.core.atomic import FOLDER
     from warpir.mitsuba.scene import write_mitsuba
-    from warpir.optimize.checkpoint import FOLDER
     from warpir.report.page import REPORT, write_report
     from warpir.report.result import write_results
 

@@ -404,9 +404,9 @@ def weights() -> Iterator[Format]:
     import torch
     from safetensors.torch import save
 
+    from warpir.core.atomic import Checkpoints
     from warpir.diffusion.models.embedded import NetworkConfig, build_network, save_embedded
     from warpir.lighting.regressor import RegressorConfig, random_regressor, save_regressor
-    from warpir.optimize.checkpoint import Checkpoints
 
     def file(name: str, reader: str, sound: bytes) -> Format:
         damage = damaged_safetensors(sound)

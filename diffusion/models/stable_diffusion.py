@@ -21,13 +21,12 @@ from torch import Tensor, nn
 from torch.utils.checkpoint import checkpoint
 from transformers import CLIPTextModel, CLIPTokenizer
 
+from warpir.diffusion.models.hub import find_model, hub_offline
 from warpir.diffusion.models.model_error import ModelError
 from warpir.diffusion.models.model_folder import (
     LATENT_CHANNELS,
     ModelFolder,
     check_model_folder,
-    find_model,
-    hub_offline,
 )
 from warpir.diffusion.models.network_prior import DTYPES, NetworkPrior, name_of_dtype
 from warpir.diffusion.prior import InChunks, at_once

@@ -129,14 +129,14 @@ def fault_of(path: Path) -> tuple[str, str]:
     return "not a whole safetensors file (cut or damaged)", ""
 
 
-def check_prior(path: Path | None) -> int:
+def check_prior(path: Path | None) -> dict[str, Any]:
     """Check the weights of the embedded prior.
 
     Args:
         path: The file; None: the one that is part of the package.
 
     Returns:
-        The width of its prompts' embeddings.
+        What its header says of it; the sizes in ``network`` are within their ranges.
 
     Raises:
         ModelError: Not there, damaged, or something else.
@@ -165,7 +165,7 @@ def check_prior(path: Path | None) -> int:
         if _object(str(shipped), ours.about[PRIOR_KEY])["network"] == network:
             _check_shapes(file, ours)
     _check_written(file, described.get("weights"))
-    return int(network["embedding_width"])
+    return described
 
 
 def check_regressor(path: Path | None) -> WeightFile:

@@ -73,7 +73,7 @@ def make_class_images(
     """Return the class images, from disk where they are there and else from the unadapted model.
 
     Each depends on its own prompt and seed; the batch it is made in changes its last bits, so
-    batches are always the same ones.
+    batches are always the same ones, also where a stopped run goes on.
 
     Args:
         prior: The model.
@@ -90,74 +90,73 @@ def make_class_images(
     count = class_image_count(settings)
     texts = draw_class_prompts(prompts.noun, count, seed)
     seeds = tuple(seed_of(seed, "class image", index) for index in range(count))
-    side = prior.resolution
-    images = torch.zeros(count, 3, side, side, dtype=torch.uint8)
+    images = torch.zeros(count, 3, prior.resolution, prior.resolution, dtype=torch.uint8)
     model = model_key(prior)
     keys = [
         content_key(FORMAT, model, text, noise, settings.class_steps, settings.class_scale)
         for text, noise in zip(texts, seeds, strict=True)
     ]
-    files = [cache / f"{key}.png" if cache else None for key in keys]
+    files = [cache / f"{key}.png" for key in keys] if cache else []
     missing, notices = _read_kept(files, images)
+    done = count - len(missing)
     if report and count:
-        report("class images", count - len(missing), count)
-
-    # Always the same batches, so that a run that goes on makes each picture to the same bit.
-    size, done = settings.class_batch, count - len(missing)
-    for start in range(0, count, size):
-        batch = range(start, min(start + size, count))
-        wanted = [index for index in batch if index in missing]
+        report("class images", done, count)
+    for start in range(0, count, settings.class_batch):
+        batch = slice(start, min(start + settings.class_batch, count))
+        wanted = [index for index in range(batch.start, batch.stop) if index in missing]
         if not wanted:
             continue
-
-        def made(batch: range = batch) -> Tensor:
-            return prior.sample(
-                [texts[index] for index in batch],
-                [seeds[index] for index in batch],
-                steps=settings.class_steps,
-                scale=settings.class_scale,
-                batch=settings.class_batch,
-            )
-
-        pictures = to_bytes(prior.finite(made, "pictures of the class"))
+        pictures = _made(prior, texts[batch], seeds[batch], settings)
         for index in wanted:
-            images[index] = picture = pictures[index - start]
-            file = files[index]
-            if file is None or cache is None:
-                continue
-            try:
-                write_file(file, _png(picture, texts[index], seeds[index]))
-            except OSError as error:  # without a cache the run still ends as it would have
-                notices.append(f"{cache}: class images are not kept ({error})")
-                cache = None
+            images[index] = pictures[index - start]
+        try:
+            for index in wanted if files else ():
+                write_file(files[index], _png(images[index], texts[index], seeds[index]))
+        except OSError as error:  # without a cache the run still ends as it would have
+            notices.append(f"{cache}: class images are not kept ({error})")
+            files = []
         done += len(wanted)
         if report:
             report("class images", done, count)
-    if cache is not None and missing:
+    if cache is not None and files and missing:
         with contextlib.suppress(OSError):  # a folder that is too full harms no run
             make_room(cache.glob("*.png"), CACHE_BYTES)
     return ClassImages(images, texts, seeds, len(missing), tuple(notices))
 
 
-def _read_kept(files: Sequence[Path | None], images: Tensor) -> tuple[set[int], list[str]]:
+def _made(
+    prior: NetworkPrior, texts: Sequence[str], seeds: Sequence[int], settings: PersonalizeSettings
+) -> Tensor:
+    """Return one batch of pictures by the unadapted model, uint8, shape [B, 3, R, R]."""
+
+    def made() -> Tensor:
+        return prior.sample(
+            texts,
+            seeds,
+            steps=settings.class_steps,
+            scale=settings.class_scale,
+            batch=settings.class_batch,
+        )
+
+    return to_bytes(prior.finite(made, "pictures of the class"))
+
+
+def _read_kept(files: Sequence[Path], images: Tensor) -> tuple[set[int], list[str]]:
     """Fill in the pictures that are on disk; return the places of the others, and notices.
 
     Args:
-        files: Where each picture is kept; None: nowhere.
+        files: Where each picture is kept; empty: nowhere.
         images: uint8, shape [N, 3, resolution, resolution]; changed in place.
     """
-    missing: set[int] = set()
+    missing = set(range(len(images)))
     notices: list[str] = []
     for index, file in enumerate(files):
         try:
-            found = _read_png(file, images.shape[-1]) if file and file.is_file() else None
+            if file.is_file():
+                images[index] = _read_png(file, images.shape[-1])
+                missing.discard(index)
         except Exception as error:  # Pillow says in a dozen ways that a file is damaged
             notices.append(f"{file}: not readable, made again ({error})")
-            found = None
-        if found is None:
-            missing.add(index)
-        else:
-            images[index] = found
     return missing, notices
 
 
@@ -182,7 +181,7 @@ def encode_pictures(
         batch: Pictures at once.
         report: Is told "class latents", the number done and the number in all.
     """
-    latents = []
+    latents = [torch.zeros(0, *prior.latent_shape)]
     with torch.no_grad():
         for start in range(0, len(pictures), batch):
             part = from_bytes(pictures[start : start + batch], prior.device)

@@ -33,14 +33,14 @@ from warpir.diffusion.draws import generator_of
 from warpir.diffusion.models.model_error import ModelError
 from warpir.diffusion.models.model_folder import read_json
 from warpir.diffusion.models.tensor_files import read_safetensors, serialize
-from warpir.diffusion.models.weight_files import beside_lora, not_a_lora
+from warpir.diffusion.models.weight_files import beside_lora, check_lora, not_a_lora
 
 if TYPE_CHECKING:
     from warpir.diffusion.models.network_prior import NetworkPrior
 
 HEADER_KEY = "lora_adapter_metadata"
 """Where diffusers keeps peft's configuration in a file's header."""
-KOHYA = ("lora_unet_", "lora_te_", "lora_te1_", "lora_te2_")
+KOHYA = "lora_unet_"
 _LAYER_PATTERN = re.compile(r"\^?(?:[A-Za-z0-9_]|\\?[.-])+\$?")
 KOHYA_PARTS = (".lora_down.weight", ".lora_up.weight", ".alpha")
 
@@ -154,26 +154,18 @@ def read_lora(path: str | Path) -> Lora:
             the UNet, has rank 0 or values that are not finite.
     """
     path = Path(path)
+    check_lora(path, None)
     tensors, header = read_safetensors(path)
     config = _own_config(path, header)
     weights, alphas = _parts(path, tensors)
     layers = sorted({key.rsplit(".lora_", 1)[0] for key in weights})
-    if set(weights) != {f"{layer}.lora_{part}.weight" for layer in layers for part in "AB"}:
-        raise ModelError(str(path), "a layer has only one of its two parts; the file is not whole")
     for key, tensor in weights.items():
         if not bool(torch.isfinite(tensor).all()):
             raise ModelError(str(path), f"{key}: values are not finite (found nan or inf)")
     for layer in layers:
-        a, b = (weights[f"{layer}.lora_{part}.weight"] for part in "AB")
-        if a.ndim not in (2, 4) or a.ndim != b.ndim or a.shape[0] != b.shape[1]:
-            found = f"{list(a.shape)} and {list(b.shape)}"
-            raise ModelError(
-                str(path), f"{layer}: its parts do not fit (found {found}; expected [r, i], [o, r])"
-            )
-        if a.shape[0] == 0:
-            raise ModelError(str(path), f"{layer}: rank 0 (expected at least 1)")
+        rank = len(weights[f"{layer}.lora_A.weight"])
         try:
-            alphas.setdefault(layer, _alpha(config, layer, rank=a.shape[0]))
+            alphas.setdefault(layer, _alpha(config, layer, rank))
         except (TypeError, ValueError, AttributeError) as error:
             what = "its configuration is damaged (lora_alpha, alpha_pattern)"
             raise ModelError(str(path), what) from error
@@ -237,14 +229,8 @@ def _parts(path: Path, tensors: dict[str, Tensor]) -> tuple[dict[str, Tensor], d
 
     alphas: dict[str, Any] = {}
     named = {key.removeprefix("base_model.model."): value for key, value in tensors.items()}
-    if any(key.startswith(("text_encoder", *KOHYA[1:])) for key in named):
-        raise ModelError(
-            str(path),
-            "adapts the text encoder too, which stays as it is here",
-            "give a LoRA of the UNet alone",
-        )
-    if any(key.startswith(KOHYA[0]) for key in named):
-        odd = [k for k in named if not (k.startswith(KOHYA[0]) and k.endswith(KOHYA_PARTS))]
+    if any(key.startswith(KOHYA) for key in named):
+        odd = [k for k in named if not (k.startswith(KOHYA) and k.endswith(KOHYA_PARTS))]
         if odd:
             raise not_a_lora(path, odd, len(named))
         alphas = {k: v for k, v in named.items() if k.endswith(".alpha")}
@@ -261,8 +247,9 @@ def _parts(path: Path, tensors: dict[str, Tensor]) -> tuple[dict[str, Tensor], d
         return dict(convert_unet_state_dict_to_peft(parts))
 
     weights = renamed(named)
-    odd = [key for key in weights if not key.endswith((".lora_A.weight", ".lora_B.weight"))]
-    if odd or not weights:
+    layers = {key.rsplit(".lora_", 1)[0] for key in weights}
+    odd = sorted(set(weights) ^ {f"{k}.lora_{part}.weight" for k in layers for part in "AB"})
+    if odd:
         raise not_a_lora(path, odd, len(weights))
     # The converter calls an alpha after the part that stood beside it.
     by_layer = {

@@ -19,7 +19,7 @@ from warpir.diffusion.personalization.lora_files import (
     put_weights,
     remove_lora,
 )
-from warpir.diffusion.prior import BAD_STEPS_MAX, NonFiniteError
+from warpir.diffusion.prior import BAD_STEPS_MAX, BadSteps, NonFiniteError
 from warpir.diffusion.settings import PersonalizeSettings
 
 if TYPE_CHECKING:
@@ -65,6 +65,8 @@ class LoraTraining:
         self.start = lora
         self.step_count = 0
         """Steps that were taken."""
+        self.skipped = 0
+        """Of these, those without a finite gradient, when `losses` was last called."""
         self.class_count = settings.lora_class_batch if len(classes) else 0
         self.part_count = 1
         """Parts that a step's samples are taken in; more need less memory."""
@@ -189,25 +191,21 @@ class LoraTraining:
     def losses(self) -> Tensor:
         """Return the photo's and the class images' losses by step, shape [step_count, 2].
 
-        Those of steps that were skipped are not a number.
+        Those of steps that were skipped are not a number; they are counted in `skipped`.
 
         Raises:
             NonFiniteError: `BAD_STEPS_MAX` in a row were.
         """
         losses = _to_cpu(self._losses[: self.step_count])
-        in_a_row = 0
+        counter = BadSteps()
         for step, is_finite in enumerate(losses.isfinite().all(dim=1).tolist()):
-            in_a_row = 0 if is_finite else in_a_row + 1
-            if in_a_row == BAD_STEPS_MAX:
+            if counter.count_step(is_finite):
                 first = step + 2 - BAD_STEPS_MAX
                 raise NonFiniteError(
                     f"the LoRA's loss is not finite from step {first} on (try a lower --lora-rate)"
                 )
+        self.skipped = counter.skipped
         return losses
-
-    def skipped(self) -> int:
-        """Return how many steps had no finite gradient."""
-        return int((~self.losses().isfinite().all(dim=1)).sum())
 
     def state_dict(self) -> dict[str, Any]:
         """Return what a later run needs to go on: tensors on the CPU and plain values."""

@@ -13,7 +13,7 @@ from __future__ import annotations
 import json
 import time
 from collections.abc import Callable, Mapping
-from dataclasses import asdict, dataclass, fields
+from dataclasses import asdict, dataclass, fields, replace
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -28,6 +28,7 @@ from warpir.diffusion.crop import Crop
 from warpir.diffusion.draws import generator_of
 from warpir.diffusion.models.tensor_files import serialize
 from warpir.diffusion.personalization.class_images import (
+    ClassImages,
     Report,
     class_image_count,
     encode_pictures,
@@ -158,50 +159,81 @@ def personalize(
         return Personalization(name, lora, torch.zeros(0, 2), None, (), {}, True, ())
     key = lora_key(prior, photo, prompts, settings, seed)
     stored = cache / "lora" / f"{key}.safetensors" if cache else None
-    notices: list[str] = []
-    found = _read_stored(stored, name, settings) if stored else None
-    if found is not None:
+    if stored is not None and (found := _read_stored(stored, name, settings)) is not None:
         install_lora(prior, found.lora, name, str(stored))
         return found
-
     clock = _Clock(prior.device)
     embeddings = prior.embed([prompts.photo, prompts.class_])
-    class_images = make_class_images(
-        prior, prompts, settings, seed, cache / "class-images" if cache else None, report
-    )
+    folder = cache / "class-images" if cache else None
+    class_images = make_class_images(prior, prompts, settings, seed, folder, report)
     clock.stop("class images")
     crops = photo_latents(prior, photo, settings, seed)
-    kept = crops[:0]
-    if len(class_images.images):
-        kept = encode_pictures(prior, class_images.images, ENCODE_BATCH, report)
+    kept = encode_pictures(prior, class_images.images, ENCODE_BATCH, report)
     clock.stop("encoding")
     before = evaluate(prior, crops, embeddings[:1], seed, None)
     lora = initial_lora(prior, settings.lora_layers, settings.lora_rank, seed)
     clock.stop("evaluation")
+    training = LoraTraining(prior, lora, crops, kept, embeddings, settings, seed, key, name)
+    return _learn(training, before, class_images, stored, clock, report, on_step, resume, record)
 
-    with LoraTraining(prior, lora, crops, kept, embeddings, settings, seed, key, name) as training:
+
+def _learn(
+    training: LoraTraining,
+    before: float,
+    class_images: ClassImages,
+    stored: Path | None,
+    clock: _Clock,
+    report: Report | None,
+    on_step: Callable[[LoraTraining], None] | None,
+    resume: Mapping[str, Any] | None,
+    record: Callable[[LoraTraining], Callable[[], None]] | None,
+) -> Personalization:
+    """Train an adapter, put it to use, judge it, and keep it.
+
+    Args:
+        training: Has not begun.
+        before: `evaluate` without the adapter.
+        class_images: What it also learns.
+        stored: Where it is kept, or None.
+        clock: Adds up the time of stages.
+        report: As of `personalize`, with its errors, and so the others.
+        on_step: Sees the training after each step.
+        resume: State to go on from.
+        record: Replaces its `update`.
+    """
+    prior, settings, name = training.prior, training.settings, training.name
+    embedding = training.embeddings[:1]
+    with training:
         if resume is not None:
             training.load_state_dict(resume)
         _train(training, report, on_step, record)
         lora, losses = training.lora(), training.losses()
-        skipped = training.skipped()
     install_lora(prior, lora, name)
     clock.stop("training")
-    after = evaluate(prior, crops, embeddings[:1], seed, name)
+    after = evaluate(prior, training.photo, embedding, training.seed, name)
     clock.stop("evaluation")
 
-    notices += class_images.notices
-    if skipped:
+    notices = list(class_images.notices)
+    if skipped := training.skipped:
         notices.append(f"{skipped} steps of the LoRA had no finite gradient and were skipped")
     if settings.lora_steps and not after < before:
         notices.append(
             f"the model came no closer to the photo: its error on fixed draws was {before:.4g} and "
             f"is {after:.4g}; try more --lora-steps or another --lora-rank"
         )
-    texts, errors = class_images.prompts, (before, after)
-    if stored is not None:
-        _store(stored, lora, losses, errors, texts, notices)
-    return Personalization(name, lora, losses, errors, texts, clock.seconds, False, tuple(notices))
+    learnt = Personalization(
+        name,
+        lora,
+        losses,
+        (before, after),
+        class_images.prompts,
+        clock.seconds,
+        False,
+        tuple(notices),
+    )
+    if stored is None:
+        return learnt
+    return replace(learnt, notices=(*learnt.notices, *_store(stored, learnt)))
 
 
 def _train(
@@ -328,22 +360,21 @@ def lora_key(
 # What is kept between runs
 
 
-def _store(
-    path: Path,
-    lora: Lora,
-    losses: Tensor,
-    errors: tuple[float, float],
-    class_prompts: tuple[str, ...],
-    notices: list[str],
-) -> None:
-    """Keep a trained LoRA; where that fails, the run still ends as it would have."""
-    header = {"errors": errors, "class_prompts": class_prompts, "notices": notices}
+def _store(path: Path, learnt: Personalization) -> tuple[str, ...]:
+    """Keep a trained LoRA; return a notice where that fails: the run ends as it would have."""
+    header = {
+        "errors": learnt.evaluation,
+        "class_prompts": learnt.class_prompts,
+        "notices": learnt.notices,
+    }
+    tensors = {**learnt.lora.weights, "losses": learnt.losses}
     try:
-        content = serialize({**lora.weights, "losses": losses}, {"record": json.dumps(header)})
+        content = serialize(tensors, {"record": json.dumps(header)})
         write_file(path, content)
         seal(path, "*.safetensors.*")
     except OSError as error:
-        notices.append(f"{path}: the LoRA is not kept ({error})")
+        return (f"{path}: the LoRA is not kept ({error})",)
+    return ()
 
 
 def _read_stored(path: Path, name: str, settings: PersonalizeSettings) -> Personalization | None:

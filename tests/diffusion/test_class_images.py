@@ -1,7 +1,6 @@
 """Class images and prompts: worded well, made once, found again, whatever the batch."""
 
 import os
-from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -35,17 +34,10 @@ from warpir.diffusion.prompts import (
 from warpir.diffusion.schedule import NoiseSchedule
 from warpir.diffusion.settings import ModelSettings, PersonalizeSettings
 
+pytestmark = pytest.mark.usefixtures("one_thread")
+
 SETTINGS = PersonalizeSettings(class_images=5, class_steps=3, class_batch=2)
 PROMPTS = make_prompts("a black SUV car", SETTINGS)
-
-
-@pytest.fixture(autouse=True)
-def _one_thread() -> Iterator[None]:
-    """Threads cost more than they give on layers this small."""
-    count = torch.get_num_threads()
-    torch.set_num_threads(1)
-    yield
-    torch.set_num_threads(count)
 
 
 @pytest.fixture(scope="module")

@@ -4,7 +4,6 @@ The plain functions are the reference. What cannot run without a CUDA device is 
 stays what makes a recording possible at all.
 """
 
-from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -35,6 +34,8 @@ from warpir.diffusion.prompts import make_prompts
 from warpir.diffusion.settings import GuidanceSettings, ModelSettings, PersonalizeSettings
 from warpir.optimize.light import Function, LightOptimization, Record
 from warpir.optimize.view import expected_light
+
+pytestmark = pytest.mark.usefixtures("one_thread")
 
 needs_cuda = pytest.mark.skipif(not torch.cuda.is_available(), reason="CUDA graphs need CUDA")
 DEVICE = "cuda"
@@ -534,12 +535,3 @@ def test_rare_calls_are_not_recorded() -> None:
     for k in range(5):
         assert graphs.run("double", double, torch.full((3,), float(k), device=DEVICE))[0] == 2 * k
     assert graphs.seconds > 0.0 and len(calls) == PLAIN_CALLS + 2
-
-
-@pytest.fixture(autouse=True)
-def _one_thread() -> Iterator[None]:
-    """Threads cost more than they give on layers this small."""
-    count = torch.get_num_threads()
-    torch.set_num_threads(1)
-    yield
-    torch.set_num_threads(count)

@@ -4,7 +4,7 @@ import hashlib
 import json
 import math
 from collections.abc import Iterator
-from dataclasses import replace
+from dataclasses import asdict, replace
 from pathlib import Path
 
 import pytest
@@ -18,8 +18,6 @@ from warpir.diffusion.models.embedded import (
     CONDITIONS,
     GBUFFER_CHANNELS,
     HEADER_KEY,
-    LORA_LAYERS,
-    LORA_RANK,
     WEIGHTS,
     EmbeddedPrior,
     NetworkConfig,
@@ -62,6 +60,7 @@ from warpir.diffusion.personalization.personalize import personalize
 from warpir.diffusion.prior import Condition
 from warpir.diffusion.settings import GuidanceSettings, ModelSettings, PersonalizeSettings
 
+LORA_RANK, LORA_LAYERS = 8, ("to_q", "to_k", "to_v", "to_out.0", "conv1", "conv2")
 TINY = NetworkConfig(
     widths=(16, 32), layers=1, attention_from=1, head_width=16, groups=8, embedding_width=16
 )
@@ -501,7 +500,7 @@ def test_faulty_files_are_refused_in_one_line(tmp_path: Path) -> None:
     whole = file.read_bytes()
     flipped = bytearray(whole)
     flipped[-100] ^= 1
-    odd = {"widths": [16, 32], "layers": 1}
+    size = asdict(TINY)
     foreign = Lora({"a.lora_A.weight": torch.ones(1, 2), "a.lora_B.weight": torch.ones(2, 1)}, {})
     save_lora(replace(foreign, alphas={"a": 1.0}), tmp_path, 16, "v_prediction", "", "embedded")
     for content, reason in (
@@ -511,9 +510,11 @@ def test_faulty_files_are_refused_in_one_line(tmp_path: Path) -> None:
         ((tmp_path / "lora_diffusers.safetensors").read_bytes(), "holds no embedded prior"),
         (changed_header(whole, format=99), "format 99"),
         (changed_header(whole, vocabulary=["car"]), "another vocabulary"),
-        (changed_header(whole, network=odd), "do not fit"),
+        (changed_header(whole, network={**size, "layers": 3}), "do not fit"),
         (changed_header(whole, network={"depth": 3, "widths": [1]}), "header is damaged"),
-        (changed_header(whole, network={"widths": [16, 32], "groups": 0}), "no such network"),
+        (changed_header(whole, network={**size, "groups": 0}), "groups 0"),
+        (changed_header(whole, network={**size, "groups": 1, "widths": [5]}), "no such network"),
+        (changed_header(whole, training=[]), "header is damaged"),
     ):
         bad.write_bytes(content)
         with pytest.raises(ModelError, match=reason) as caught:

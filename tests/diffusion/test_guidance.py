@@ -19,7 +19,7 @@ from warpir.diffusion.crop import Crop, shrink
 from warpir.diffusion.dataset_update import VALUES_PER_LATENT, DatasetUpdate
 from warpir.diffusion.draws import seed_of
 from warpir.diffusion.gradient_gate import NORM_COUNT_MIN, NORM_WINDOW, GradientGate
-from warpir.diffusion.guidance import Guidance, coefficients, make_guidance
+from warpir.diffusion.guidance import Guidance, coefficients, kind_of
 from warpir.diffusion.models.model_error import ModelError
 from warpir.diffusion.models.stable_diffusion import StableDiffusion, load_stable_diffusion
 from warpir.diffusion.prior import Condition, Editor, HalfPrecision, InChunks, at_once
@@ -145,7 +145,9 @@ def at_time(t: float, **changes: object) -> GuidanceSettings:
 def guidance(
     prior: GaussianPrior, settings: GuidanceSettings, mask: Tensor = MASK, seed: int = 3
 ) -> Guidance:
-    made = make_guidance(prior, CONDITION, settings, mask, steps=100, seed=seed, adapter="scene")
+    made = kind_of(settings)(
+        prior, CONDITION, settings, mask, steps=100, seed=seed, adapter="scene"
+    )
     assert isinstance(made, Guidance)
     return made
 
@@ -730,10 +732,10 @@ def test_loss_without_its_adapter_is_refused() -> None:
     for loss in LOSSES:
         settings = replace(GuidanceSettings(), loss=loss)
         if loss in ("csd", "sds-base", "good-bad", "sds-good-bad"):
-            make_guidance(GaussianPrior(), CONDITION, settings, MASK, 10, 0, None)
+            kind_of(settings)(GaussianPrior(), CONDITION, settings, MASK, 10, 0, None)
         else:
             with pytest.raises(ValueError, match=f"{loss} needs an adapter"):
-                make_guidance(GaussianPrior(), CONDITION, settings, MASK, 10, 0, None)
+                kind_of(settings)(GaussianPrior(), CONDITION, settings, MASK, 10, 0, None)
 
 
 def test_loss_of_another_name_is_refused() -> None:
@@ -789,7 +791,7 @@ class EditingPrior(GaussianPrior):
 
 def update(prior: GaussianPrior, mask: Tensor = MASK, **changes: object) -> DatasetUpdate:
     settings = replace(GuidanceSettings(), loss="dataset-update", **changes)
-    made = make_guidance(prior, CONDITION, settings, mask, steps=100, seed=3, adapter="scene")
+    made = kind_of(settings)(prior, CONDITION, settings, mask, steps=100, seed=3, adapter="scene")
     assert isinstance(made, DatasetUpdate)
     return made
 
@@ -986,12 +988,10 @@ def test_guidance_works_without_the_text_encoder(rng: np.random.Generator, folde
     """Every loss embeds what it needs when it is made; score and precision need no more."""
     x, mask = photo(rng)
     prior = load_adapted(folder, 0.5)
-    made = [
-        make_guidance(
-            prior, CONDITION, replace(SD_SETTINGS, loss=loss, update_steps=2), mask, 10, 3, "scene"
-        )
-        for loss in (*LOSSES, "dataset-update")
-    ]
+    asked = (
+        replace(SD_SETTINGS, loss=loss, update_steps=2) for loss in (*LOSSES, "dataset-update")
+    )
+    made = [kind_of(s)(prior, CONDITION, s, mask, 10, 3, "scene") for s in asked]
     prior.free_text_encoder()
     for each in made:
         d_image = each.gradient(x, 0)

@@ -4,7 +4,6 @@ import copy
 import errno
 import json
 import os
-from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
@@ -31,18 +30,11 @@ from warpir.diffusion.personalization.lora_files import (
     serialize,
 )
 
+pytestmark = pytest.mark.usefixtures("one_thread")
+
 ATTENTION = ("to_q", "to_k", "to_v", "to_out.0")
 MORE = (*ATTENTION, "proj_in", "ff.net.0.proj", "ff.net.2", "conv1", "time_emb_proj", "conv_in")
 TRIGGER = "a scene in the style of sks rendering"
-
-
-@pytest.fixture(autouse=True)
-def _one_thread() -> Iterator[None]:
-    """Threads cost more than they give on layers this small."""
-    count = torch.get_num_threads()
-    torch.set_num_threads(1)
-    yield
-    torch.set_num_threads(count)
 
 
 def tiny_unet(cross_attention: int = 32, seed: int = 0) -> nn.Module:
@@ -509,8 +501,8 @@ def broken(kind: str, folder: Path) -> Path:
         pytest.param("parts that do not fit", "do not fit", id="L8-parts-that-do-not-fit"),
         pytest.param("text encoder", "text encoder", id="L8-text-encoder"),
         pytest.param("weight decomposed", "foreign", id="L8-weight-decomposed"),
-        pytest.param("kohya without up", "whole kohya LoRA", id="L8-kohya-without-up"),
-        pytest.param("alpha nan", "alpha is not finite", id="L8-alpha-nan"),
+        pytest.param("kohya without up", "only one of its two parts", id="L8-kohya-without-up"),
+        pytest.param("alpha nan", "alpha: values are not finite", id="L8-alpha-nan"),
         pytest.param("header not JSON", "not JSON", id="L8-header-not-JSON"),
         pytest.param("header a list", "not a JSON object", id="L8-header-a-list"),
         pytest.param("header alpha text", "configuration is damaged", id="L8-header-alpha-text"),

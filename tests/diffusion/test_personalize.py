@@ -49,20 +49,13 @@ from warpir.diffusion.prior import NonFiniteError
 from warpir.diffusion.prompts import make_prompts
 from warpir.diffusion.settings import ModelSettings, PersonalizeSettings
 
+pytestmark = pytest.mark.usefixtures("one_thread")
+
 KINDS = ("epsilon", "v_prediction")
 SETTINGS = PersonalizeSettings(
     class_images=3, class_steps=2, lora_steps=6, lora_rate=3e-3, lora_class_batch=2
 )
 PROMPTS = make_prompts("a black SUV car", SETTINGS)
-
-
-@pytest.fixture(autouse=True)
-def _one_thread() -> Iterator[None]:
-    """Threads cost more than they give on layers this small."""
-    count = torch.get_num_threads()
-    torch.set_num_threads(1)
-    yield
-    torch.set_num_threads(count)
 
 
 @pytest.fixture(autouse=True)

@@ -168,7 +168,7 @@ def _things(
 
     import torch
 
-    from warpir.optimize.checkpoint import Checkpoints
+    from warpir.core.atomic import Checkpoints
 
     def save(folder: Path, steps: tuple[int, ...] = (3,)) -> None:
         for step in steps:
@@ -314,10 +314,10 @@ def mark(owner, name, event, after=None):
         return result
     setattr(owner, name, marked)
 import warpir.diffusion.personalization.personalize, warpir.insert, warpir.io.results
-import warpir.optimize.checkpoint, warpir.optimize.loop
+import warpir.core.atomic, warpir.optimize.loop
 mark(warpir.diffusion.personalization.lora_training.LoraTraining, "prepare", "iteration")
 mark(warpir.optimize.loop.Optimization, "step", "iteration")
-mark(warpir.optimize.checkpoint.Checkpoints, "save", "checkpoint", "iteration ends")
+mark(warpir.core.atomic.Checkpoints, "save", "checkpoint", "iteration ends")
 mark(sys.modules["warpir.insert"], "_write", "write")
 mark(warpir.io.results.OutputFolder, "_commit", "commit", "end")
 note("load")

@@ -14,10 +14,10 @@ import pytest
 from tests.builders.faults import Ended, assert_fails, run_case, snapshot
 from tests.builders.guided_runs import guided_argv, results_of, write_guided_inputs
 from warpir.core import signals
+from warpir.core.atomic import manifest_digest
 from warpir.core.errors import ExitCode
 from warpir.core.signals import Stopped
 from warpir.io.results import OutputFolder
-from warpir.optimize.checkpoint import manifest_digest
 
 # ----------------------------------------------------------------------- where a signal is raised
 
@@ -141,7 +141,7 @@ def hook(place: str, turn: int, act: str) -> str:
 
 UPDATE = "warpir.diffusion.personalization.lora_training:LoraTraining:update"
 STEP = "warpir.optimize.loop:Optimization:step"
-SAVE = "warpir.optimize.checkpoint:write_folder"
+SAVE = "warpir.core.atomic:write_folder"
 WRITE = "warpir.report.result:write_results"
 COMMIT = "warpir.io.results:OutputFolder:_put_in_place"
 

@@ -18,7 +18,7 @@ from PIL import Image
 
 from tests.builders.image_files import directions, four_lobes, matrix_profile
 from warpir.core import color, signals
-from warpir.core.atomic import restore_folders, write_folder
+from warpir.core.atomic import write_folder
 from warpir.core.errors import ExitCode, InputError
 from warpir.io import results as files
 from warpir.io.images.photos import read_envmap, read_photo
@@ -595,24 +595,6 @@ def test_an_exception_gives_the_folder_back(
     with pytest.raises(KeyboardInterrupt):
         replace_folder(path)
     assert os.listdir(tmp_path) == ["state"] and os.listdir(path) == ["a.txt"]
-
-
-@pytest.mark.case("R1")
-def test_a_kill_leaves_a_folder_that_can_be_restored(tmp_path: Path) -> None:
-    """Between the two renames; one whose name is there again is left alone."""
-    path = tmp_path / "state-000018"
-    write_folder(path, [("a.txt", b"old")])
-    code = "import os, sys; from pathlib import Path; from warpir.core.atomic import write_folder\n"
-    code += "rename = os.rename\n"
-    code += "os.rename = lambda *names: (rename(*names), os.kill(os.getpid(), 9))\n"
-    code += "write_folder(Path(sys.argv[1]), [('a.txt', b'new')])"
-    assert subprocess.run([sys.executable, "-c", code, path], check=False).returncode == -9
-    assert not path.exists()
-    restore_folders(tmp_path)
-    assert (path / "a.txt").read_bytes() == b"old"
-    replace_folder(path)
-    restore_folders(tmp_path)
-    assert (path / "a.txt").read_bytes() == b"new"
 
 
 @pytest.mark.case("F5")

@@ -45,7 +45,7 @@ from warpir.scene.light import Light, Lobes, fibonacci, rasterize_lobes
 from warpir.train.augmentation import discolour, erase, mirror, stretch
 from warpir.train.batches import PhotoBatch
 from warpir.train.light_loss import LightLoss
-from warpir.train.regressor import train_regressor
+from warpir.train.regressor import checkpoints_of, train_regressor
 from warpir.train.settings import TrainingSettings
 from warpir.train.validation import calibrated_temperature, measure, region_mass
 
@@ -573,22 +573,28 @@ def test_training_learns_where_the_blob_is(tmp_path: Path) -> None:
     )
 
 
+def part_of(out: Path, name: str) -> dict[str, torch.Tensor]:
+    """Return a part of the newest checkpoint: weights or moments by name."""
+    part: dict[str, torch.Tensor] = checkpoints_of(out).load(pytest.fail).state[name]
+    return part
+
+
 def test_training_goes_on_where_it_stopped(tmp_path: Path) -> None:
     """A resumed call has the steps, weights, moments and curve of the one before."""
     short = replace(TOY, batch=4, step_limit=3)
     first = train_regressor(
         blobs, HELD_OUT, tmp_path, short, "cpu", 5.0, 5.0, network=random_regressor(0, SMALL)
     )
-    weights = load_file(tmp_path / "state-000000003" / "weights.safetensors")
+    weights = part_of(tmp_path, "weights")
     longer = replace(short, step_limit=4, learning_rate=1e-9)
     second = train_regressor(blobs, HELD_OUT, tmp_path, longer, "cpu", 5.0, 5.0, resume=True)
     assert (first.steps, second.steps) == (3, 4) and second.minutes > first.minutes
-    assert [p.name for p in tmp_path.glob("state-*")] == ["state-000000004"]
-    later = load_file(tmp_path / "state-000000004" / "weights.safetensors")
+    assert checkpoints_of(tmp_path).newest == "000002-regressor-4"
+    later = part_of(tmp_path, "weights")
     for name, tensor in weights.items():  # a step of next to no length
         torch.testing.assert_close(later[name], tensor, atol=1e-7, rtol=1e-6)
-    moments = load_file(tmp_path / "state-000000004" / "second.safetensors")
-    fresh = train_regressor(
+    moments = part_of(tmp_path, "second")
+    train_regressor(
         blobs,
         HELD_OUT,
         tmp_path / "fresh",
@@ -598,7 +604,7 @@ def test_training_goes_on_where_it_stopped(tmp_path: Path) -> None:
         5.0,
         network=random_regressor(0, SMALL),
     )
-    alone = load_file(tmp_path / "fresh" / f"state-{fresh.steps:09d}" / "second.safetensors")
+    alone = part_of(tmp_path / "fresh", "second")
     # After 4 steps with beta 0.99 the second moment has about 4 times that of one step.
     assert sum(m.sum() for m in moments.values()) > 2.0 * sum(m.sum() for m in alone.values())
     lines = [json.loads(line) for line in (tmp_path / "curve.jsonl").read_text().splitlines()]
@@ -613,8 +619,8 @@ def test_training_refuses_what_it_cannot_resume(tmp_path: Path) -> None:
     tiny = replace(TOY, batch=2, step_limit=1)
     start = random_regressor(0, SMALL)
     train_regressor(blobs, HELD_OUT, tmp_path, tiny, "cpu", 1.0, 1.0, network=start)
-    cut(tmp_path / "state-000000001" / "first.safetensors")
-    with pytest.raises(InputError, match="damaged"):
+    cut(tmp_path / "checkpoints" / "000001-regressor-1" / "state.safetensors")
+    with pytest.raises(InputError, match="cannot be used"):
         train_regressor(blobs, HELD_OUT, tmp_path, tiny, "cpu", 1.0, 1.0, resume=True)
 
 

@@ -6,8 +6,9 @@ from pathlib import Path
 import pytest
 import torch
 
+from warpir.core.atomic import FORMAT, MANIFEST, STATE, Checkpoints
 from warpir.core.errors import ExitCode, InputError
-from warpir.optimize.checkpoint import FORMAT, MANIFEST, STATE, Checkpoints
+from warpir.io.results import remove_unfinished
 
 IDENTITY = {"config": {"steps": 10, "sun": (1.0, 2.0)}, "inputs": {"photo": "ab"}}
 
@@ -135,7 +136,7 @@ def test_checkpoint_that_cannot_be_written_is_an_error(tmp_path: Path) -> None:
 def test_checkpoint_remove(tmp_path: Path) -> None:
     checkpoints = Checkpoints(tmp_path, IDENTITY)
     checkpoints.save("optimize", 50, a_state(1))
-    checkpoints.remove()
+    remove_unfinished(checkpoints.folder)
     assert checkpoints.newest is None and list(tmp_path.iterdir()) == []
 
 
@@ -160,5 +161,5 @@ def test_checkpoint_removal_leaves_what_is_not_ours(tmp_path: Path) -> None:
     checkpoints = Checkpoints(tmp_path, {})
     checkpoints.save("optimize", 3, {})
     (tmp_path / "checkpoints" / "model.safetensors").write_text("three days")
-    checkpoints.remove()
+    remove_unfinished(checkpoints.folder)
     assert [p.name for p in (tmp_path / "checkpoints").iterdir()] == ["model.safetensors"]

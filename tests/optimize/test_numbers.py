@@ -23,6 +23,7 @@ from tests.builders.loops import SETTINGS, Pull, a_loop, bent, values
 from tests.builders.tiny_stable_diffusion import make_tiny_stable_diffusion
 from tests.core.test_memory import a_scene, sky
 from tests.test_layers import sources
+from warpir.core.atomic import Checkpoints
 from warpir.core.errors import ExitCode, InputError
 from warpir.diffusion.guidance import Guidance
 from warpir.diffusion.models.stable_diffusion import StableDiffusion, load_stable_diffusion
@@ -33,7 +34,6 @@ from warpir.diffusion.prior import BAD_STEPS_MAX, Condition, NonFiniteError
 from warpir.diffusion.prompts import make_prompts
 from warpir.diffusion.settings import GuidanceSettings, ModelSettings, PersonalizeSettings
 from warpir.insert import main
-from warpir.optimize.checkpoint import Checkpoints
 from warpir.optimize.light import LightOptimization
 from warpir.optimize.loop import BACK_OFF, GOOD_STEPS, Composite
 from warpir.optimize.model import as_input_errors
@@ -456,8 +456,8 @@ def test_lora_skips_a_bad_step(training: LoraTraining) -> None:
         assert all(torch.equal(v, before[k]) for k, v in training.lora().weights.items())
         training.step_count = 0
         trained(training, {1, 2, 3, 4}, 6)
-        assert training.skipped() == 4
         assert training.losses().isfinite().all(dim=1).tolist() == [True, *[False] * 4, True]
+        assert training.skipped == 4
         weights = training.lora().weights
         assert all(bool(v.isfinite().all()) for v in weights.values())
         assert any(not torch.equal(v, before[k]) for k, v in weights.items())

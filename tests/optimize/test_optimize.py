@@ -32,11 +32,11 @@ from tests.builders.loops import (
 )
 from tests.statistics import central_differences, compare_gradients
 from warpir.core.arrays import Float64Array
+from warpir.core.atomic import Checkpoints
 from warpir.core.errors import ExitCode, InputError
 from warpir.diffusion.prior import BAD_STEPS_MAX
 from warpir.lighting.sg_light import WIDEST
 from warpir.optimize import light as light_optimization
-from warpir.optimize.checkpoint import Checkpoints
 from warpir.optimize.light import LightOptimization
 from warpir.optimize.view import View, expected_light
 from warpir.render.transport.rows import TransportSettings

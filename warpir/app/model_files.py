@@ -45,7 +45,8 @@ def require_model(config: InsertConfig) -> None:
     if config.guided_by == "stable-diffusion":
         embedding_width = attempt(lambda: _model_width(config.diffusion))
     if prior is not None or (config.guided_by == "embedded" and config.is_guided):
-        embedding_width = attempt(lambda: check_prior(prior))
+        described = attempt(lambda: check_prior(prior))
+        embedding_width = described["network"]["embedding_width"] if described else None
     if lora is not None:
         attempt(lambda: check_lora(lora, embedding_width))
     if regressor is not None or (config.light.start != "uniform" and not is_told):
@@ -55,7 +56,8 @@ def require_model(config: InsertConfig) -> None:
 
 def _model_width(asked: ModelSettings) -> int | None:
     """Check the folder of Stable Diffusion; return the width of its prompts' embeddings."""
-    from warpir.diffusion.models.model_folder import check_model_folder, find_model
+    from warpir.diffusion.models.hub import find_model
+    from warpir.diffusion.models.model_folder import check_model_folder
 
     if asked.allow_download and not os.path.isdir(asked.model or ""):
         return None
@@ -70,7 +72,8 @@ def model_hashes(asked: ModelSettings) -> dict[str, str] | None:
 
     None: there is no such model now, or it is damaged.
     """
-    from warpir.diffusion.models.model_folder import check_model_folder, find_model
+    from warpir.diffusion.models.hub import find_model
+    from warpir.diffusion.models.model_folder import check_model_folder
 
     try:
         found = find_model(asked.model, allow_download=False, allow_pickle=asked.allow_pickle)

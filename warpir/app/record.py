@@ -106,7 +106,7 @@ def config_of_picture(config: InsertConfig) -> dict[str, Any]:
 
 def is_hub_id(model: str | None) -> bool:
     """Return whether a model is called by its name in the hub, and is no folder here."""
-    from warpir.diffusion.models.model_folder import HUB_ID
+    from warpir.diffusion.models.hub import HUB_ID
 
     return model is not None and HUB_ID.fullmatch(model) is not None and not os.path.isdir(model)
 

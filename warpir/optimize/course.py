@@ -14,13 +14,15 @@ from warpir.app.config import DEFAULTS
 from warpir.app.record import versions
 from warpir.app.run import Run
 from warpir.core import signals
+from warpir.core.atomic import Checkpoint, Checkpoints
 from warpir.core.errors import ExitCode, InputError
 from warpir.diffusion.dataset_update import DatasetUpdate
 from warpir.diffusion.guidance import Guidance
 from warpir.diffusion.personalization.lora_files import save_lora
 from warpir.diffusion.prior import NonFiniteError
+from warpir.io.results import remove_unfinished
 from warpir.lighting.scene_light import SceneLight
-from warpir.optimize.checkpoint import Checkpoint, Checkpoints, is_due
+from warpir.optimize.checkpoint import is_due
 from warpir.optimize.lit_frame import LitFrame
 from warpir.optimize.loop import Optimization
 from warpir.optimize.model import Guided
@@ -151,7 +153,7 @@ def open_checkpoints(run: Run) -> Checkpoints:
     if run.config.output.resume:
         folder = checkpoints.folder
         run.log.say(f"notice: no checkpoint in {folder}: the run starts at its beginning")
-    checkpoints.remove()
+    remove_unfinished(checkpoints.folder)
     return checkpoints
 
 

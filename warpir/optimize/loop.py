@@ -28,7 +28,7 @@ from torch import Tensor
 from warpir.app.settings import OptimizeSettings
 from warpir.core.errors import ExitCode, InputError
 from warpir.core.memory import Memory
-from warpir.diffusion.prior import BAD_STEPS_MAX
+from warpir.diffusion.prior import BAD_STEPS_MAX, BadSteps
 from warpir.scene.camera import Camera
 
 BACK_OFF = 0.5
@@ -81,17 +81,13 @@ class Composite:
 
 
 @dataclass
-class State:
+class State(BadSteps):
     """Progress of an optimisation, beside its parameters and Adam's moments."""
 
     step: int = 0
     """Number of finished steps."""
     history: list[dict[str, float]] = field(default_factory=list)
     """One entry a step: norm of the image's gradient, regularisers, and sometimes the score."""
-    bad_steps: int = 0
-    """Number of the latest steps in a row without a finite gradient."""
-    skipped: int = 0
-    """Number of all steps without a finite gradient."""
     rate_share: float = 1.0
     """Factor on the learning rate that bad steps have left [1]."""
     good_steps: int = 0
@@ -238,9 +234,7 @@ class Optimization(ABC):
             InputError: `BAD_STEPS_MAX` in a row are not (`ExitCode.NUMERIC`).
         """
         state = self.state
-        state.bad_steps = 0 if is_finite else state.bad_steps + 1
-        state.skipped += not is_finite
-        if state.bad_steps >= BAD_STEPS_MAX:
+        if state.count_step(is_finite):
             raise InputError(
                 "guidance",
                 f"no finite gradient in {BAD_STEPS_MAX} steps in a row (step {state.step})",

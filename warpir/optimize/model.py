@@ -14,16 +14,18 @@ import torch
 from warpir.app.config import PRIOR_DEFAULTS
 from warpir.app.run import Run
 from warpir.core import signals
+from warpir.core.atomic import Checkpoint, Checkpoints
 from warpir.core.cache import cache_folder
 from warpir.core.color import linear_to_gamma
 from warpir.core.errors import ExitCode, InputError
 from warpir.core.memory import needs_of_model
 from warpir.diffusion.dataset_update import DatasetUpdate
-from warpir.diffusion.guidance import Guidance, make_guidance
+from warpir.diffusion.guidance import Guidance, kind_of
 from warpir.diffusion.models.embedded import load_embedded
 from warpir.diffusion.models.embedded_words import embedded_prompts
+from warpir.diffusion.models.hub import find_model, hub_offline
 from warpir.diffusion.models.model_error import ModelError
-from warpir.diffusion.models.model_folder import check_model_folder, find_model, hub_offline
+from warpir.diffusion.models.model_folder import check_model_folder
 from warpir.diffusion.models.network_prior import NetworkPrior
 from warpir.diffusion.models.stable_diffusion import load_stable_diffusion
 from warpir.diffusion.personalization.personalize import (
@@ -36,7 +38,7 @@ from warpir.diffusion.prior import Condition, NonFiniteError
 from warpir.diffusion.prompts import Prompts, make_prompts
 from warpir.lighting.regression import regress
 from warpir.lighting.regressor import load_regressor
-from warpir.optimize.checkpoint import Checkpoint, Checkpoints, is_due
+from warpir.optimize.checkpoint import is_due
 from warpir.optimize.view import Frame, gbuffer_of, with_light
 from warpir.render.determinism import use_threads_for
 
@@ -262,10 +264,11 @@ def make_guide(run: Run, guided: Guided, frame: Frame) -> Guidance | DatasetUpda
         background=background,
         gbuffer=gbuffer.to(run.device),
     )
-    guide = make_guidance(
+    settings = config.guidance_settings()
+    guide = kind_of(settings)(
         prior,
         condition,
-        config.guidance_settings(),
+        settings,
         torch.from_numpy(frame.coverage()),
         config.optimize.step_count,
         config.render.seed,

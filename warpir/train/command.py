@@ -23,7 +23,7 @@ from typing import TYPE_CHECKING, Any
 
 from warpir.app.config import usage
 from warpir.app.program import run_program, say
-from warpir.core.atomic import restore_folders
+from warpir.core.atomic import Checkpoints
 from warpir.core.errors import ExitCode, InputError
 
 if TYPE_CHECKING:
@@ -146,8 +146,7 @@ def _check(options: argparse.Namespace) -> None:
             raise InputError(path, "no such file", code=ExitCode.MODEL)
     if options.out.exists() and not options.out.is_dir():
         raise InputError(options.out, "not a folder", "choose another --out", ExitCode.OUTPUT)
-    restore_folders(options.out)
-    begun = any(options.out.glob("checkpoint-*")) or any(options.out.glob("state-*"))
+    begun = Checkpoints(options.out, {}).newest is not None
     if begun and not options.resume:
         advice = "--resume goes on with it; or choose another --out"
         raise InputError(options.out, "holds a training that was begun", advice, ExitCode.OUTPUT)
@@ -211,7 +210,8 @@ def _train_prior(
     record: dict[str, Any],
 ) -> dict[str, Any]:
     from warpir.diffusion.models.embedded import read_network
-    from warpir.diffusion.train import TrainSettings, export_prior, train_prior
+    from warpir.diffusion.train.loop import export_prior, train_prior
+    from warpir.diffusion.train.objective import TrainSettings
     from warpir.lighting.regressor import load_regressor
     from warpir.train.scenes.generator import Mixture, SceneGenerator
 
@@ -258,7 +258,7 @@ def _train_prior(
         say=say if is_first() else _nobody,
     )
     if is_first():
-        export_prior(options.out, options.out / "prior.safetensors", record)
+        export_prior(options.out, options.out / "prior.safetensors", settings.network, record)
     return {"step": progress.step, "samples": progress.samples, "seconds": progress.seconds}
 
 

@@ -10,9 +10,8 @@ from __future__ import annotations
 
 import copy
 import json
+import logging
 import math
-import os
-import shutil
 import time
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import nullcontext
@@ -21,14 +20,11 @@ from pathlib import Path
 from typing import Any
 
 import torch
-import torch.distributed as dist
-from safetensors import SafetensorError
-from safetensors.torch import load_file, save
 from torch import Tensor
 
-from warpir.core.atomic import write_folder
+from warpir.core.atomic import Checkpoints
 from warpir.core.errors import ExitCode, InputError
-from warpir.core.strict_json import read_json_object
+from warpir.diffusion.train.worker import Worker
 from warpir.lighting.regressor import (
     Regressor,
     RegressorConfig,
@@ -42,14 +38,11 @@ from warpir.train.light_loss import TERM_WEIGHTS, LightLoss, MeanLight
 from warpir.train.settings import TrainingSettings
 from warpir.train.validation import calibrate, measure, score
 
-WEIGHTS, BEST, CURVE, STATE = (
-    "regressor.safetensors",
-    "best.safetensors",
-    "curve.jsonl",
-    "state.json",
-)
-STATE_FILES = ("weights", "average", "first", "second", "mean")
-"""Parts of a state: the network, its average, Adam's two moments, sums of the training light."""
+WEIGHTS, BEST, CURVE = "regressor.safetensors", "best.safetensors", "curve.jsonl"
+STAGE = "regressor"
+"""What the checkpoints of this training are called."""
+
+log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True)
@@ -88,106 +81,37 @@ def train_regressor(
     Args:
         batches: Gives that many photos on ``device``, drawn with the generator given.
         validation: Fixed batches by the set's name, such as ``procedural`` and ``panoramas``.
-        out: Folder of the weights, the curve and the state to resume from (files <= 16 MiB).
+        out: Folder of the weights, the curve and the checkpoints to resume from.
         settings: How.
         device: Where the network is trained.
         minutes: Time for this call.
         total_minutes: Time for all calls.
-        resume: Go on from the state in ``out``.
+        resume: Go on from the newest checkpoint in ``out``.
         seed: Of the weights and of the scenes; each call draws new scenes.
         network: To start from; default: random weights.
         record: Put into the weights file beside what is known here; plain values.
 
     Raises:
-        InputError: Nothing to resume from, a state that is not whole, or ``out`` holds a training
+        InputError: Nothing to resume from, no checkpoint that is whole, or ``out`` holds a training
             that was begun.
     """
-    began = time.monotonic()
-    peers = _Peers(torch.device(device))
-    out.mkdir(parents=True, exist_ok=True)
-    if resume:
-        run = _Run.resumed(out, settings, device)
-    else:
-        run = _Run.begun(out, network or random_regressor(seed), settings, device, peers.is_first)
-    generator = torch.Generator(device)
-    for draws in (generator, torch):
-        draws.manual_seed((seed * 1_000_003 + run.step) * peers.count + peers.rank)
-    step = run.compiled_step(peers)
-    earlier, first = run.minutes, run.step
-    validated = saved = began
-    while True:
-        run.minutes = earlier + peers.agree(time.monotonic() - began) / 60.0
-        by_steps = run.step / settings.step_limit if settings.step_limit else 0.0
-        progress = max(run.minutes / total_minutes, by_steps)
-        if progress >= 1.0 or run.minutes - earlier >= minutes:
-            break
-        with torch.no_grad():
-            batch = augment(batches(settings.batch, generator), settings, generator)
-        step(batch, _rate(settings, progress, run.step - first))
-        if not peers.is_first:
-            continue
-        if time.monotonic() - validated >= 60.0 * settings.validate_minutes:
-            run.validate(validation)
-            validated = time.monotonic()
-        if time.monotonic() - saved >= 60.0 * settings.save_minutes:
-            run.save()
-            saved = time.monotonic()
-    finished: dict[str, dict[str, float]] = {}
-    if peers.is_first:
-        if run.step > first:
-            run.validate(validation)
-            run.save()
-        known = {"settings": asdict(settings), "seed": seed, "processes": peers.count}
-        finished = run.finish(validation, dict(record or {}) | known)
-    peers.leave()
-    return TrainingEnd(run.step, run.minutes, progress >= 1.0, finished)
-
-
-class _Peers:
-    """The processes that train one network together, each with scenes of its own (``torchrun``).
-
-    Args:
-        device: Of this process.
-    """
-
-    def __init__(self, device: torch.device) -> None:
-        self.rank, self.count = (
-            int(os.environ.get(name, default)) for name, default in (("RANK", 0), ("WORLD_SIZE", 1))
-        )
-        self.device = device
-        if self.count > 1:
-            if device.type == "cuda":
-                torch.cuda.set_device(device)
-            dist.init_process_group("nccl" if device.type == "cuda" else "gloo")
-
-    @property
-    def is_first(self) -> bool:
-        """Whether this process is the one that validates and writes."""
-        return self.rank == 0
-
-    def agree(self, seconds: float) -> float:
-        """Return the first process's seconds: rates and the end depend on them."""
-        if self.count == 1:
-            return seconds
-        shared = torch.tensor(seconds, dtype=torch.float64, device=self.device)
-        dist.broadcast(shared, 0)
-        return float(shared)
-
-    def average(self, network: Regressor) -> None:
-        """Replace the gradients by their means over the processes."""
-        if self.count == 1:
-            return
-        gradients = [p.grad for p in network.parameters() if p.grad is not None]
-        flat = torch.cat([g.flatten() for g in gradients])
-        dist.all_reduce(flat)
-        parts = (flat / self.count).split([g.numel() for g in gradients])
-        for gradient, mean in zip(gradients, parts, strict=True):
-            gradient.copy_(mean.view_as(gradient))
-
-    def leave(self) -> None:
-        """Wait for the others, and end what was shared."""
-        if self.count > 1:
-            dist.destroy_process_group()
+    began, device, worker = time.monotonic(), torch.device(device), Worker.this()
+    with worker.joined(device):
+        out.mkdir(parents=True, exist_ok=True)
+        if resume:
+            run = _Run.resumed(out, settings, device)
+        else:
+            run = _Run.begun(out, network or random_regressor(seed), settings, device, worker)
+        first = run.step
+        is_complete = run.go(batches, validation, worker, seed, began, minutes, total_minutes)
+        finished: dict[str, dict[str, float]] = {}
+        if worker.is_first:
+            if run.step > first:
+                run.validate(validation)
+                run.save()
+            known = {"settings": asdict(settings), "seed": seed, "processes": worker.count}
+            finished = run.finish(validation, dict(record or {}) | known)
+    return TrainingEnd(run.step, run.minutes, is_complete, finished)
 
 
 def _rate(settings: TrainingSettings, progress: float, steps: int) -> float:
@@ -195,6 +119,11 @@ def _rate(settings: TrainingSettings, progress: float, steps: int) -> float:
     left = min((1.0 - progress) / (1.0 - settings.constant_share), 1.0)
     share = settings.final_rate + (1.0 - settings.final_rate) * left
     return settings.learning_rate * share * min((steps + 1) / settings.warmup_steps, 1.0)
+
+
+def checkpoints_of(out: Path) -> Checkpoints:
+    """Return the checkpoints of a training in its folder."""
+    return Checkpoints(out, {"trained": STAGE}, "another --out")
 
 
 class _Run:
@@ -218,7 +147,8 @@ class _Run:
             ],
             betas=(0.9, 0.99),
         )
-        self.settings = settings
+        self.settings, self.device = settings, torch.device(device)
+        self.checkpoints = checkpoints_of(out)
         self.step, self.minutes, self.best = 0, 0.0, math.inf
         self.losses: dict[str, Tensor] = {}
         """Running means of the terms of the loss."""
@@ -229,57 +159,92 @@ class _Run:
         out: Path,
         network: Regressor,
         settings: TrainingSettings,
-        device: str | torch.device,
-        is_first: bool,
+        device: torch.device,
+        worker: Worker,
     ) -> _Run:
         """Start a training in a folder that holds none.
 
         Raises:
-            InputError: The folder holds the state of a training.
+            InputError: The folder holds the checkpoints of a training.
         """
-        if any(out.glob("state-*")):
+        if checkpoints_of(out).newest is not None:
             advice = "resume it, or give another folder"
             raise InputError(out, "holds a training that was begun", advice, ExitCode.OUTPUT)
-        if is_first:
+        if worker.is_first:
             (out / CURVE).unlink(missing_ok=True)
         return cls(out, network, settings, device)
 
     @classmethod
-    def resumed(cls, out: Path, settings: TrainingSettings, device: str | torch.device) -> _Run:
-        """Read the newest state back.
+    def resumed(cls, out: Path, settings: TrainingSettings, device: torch.device) -> _Run:
+        """Read the newest whole checkpoint back.
 
         Raises:
-            InputError: There is none, or it is not whole.
+            InputError: There is none.
         """
-        states = sorted(out.glob(f"state-*/{STATE}"))
-        if not states:
-            raise InputError("--resume", f"nothing to go on from (no state in {out})")
-        folder = states[-1].parent
-        try:
-            about = read_json_object(folder / STATE)
-            config: dict[str, Any] = {
-                k: tuple(v) if isinstance(v, list) else v for k, v in about["config"].items()
+        held = checkpoints_of(out).load(log.warning).state
+        config: dict[str, Any] = {
+            k: tuple(v) if isinstance(v, list) else v for k, v in held["config"].items()
+        }
+        run = cls(out, Regressor(RegressorConfig(**config)), settings, device)
+        run.network.load_state_dict(held["weights"])
+        run.average.load_state_dict(held["average"])
+        run.step, run.minutes = held["step"], held["minutes"]
+        run.best = math.inf if held["best"] is None else held["best"]
+        for name, parameter in run.network.named_parameters():
+            run.optimizer.state[parameter] = {
+                "step": torch.tensor(float(run.step)),
+                "exp_avg": held["first"][name].to(parameter.device),
+                "exp_avg_sq": held["second"][name].to(parameter.device),
             }
-            run = cls(out, Regressor(RegressorConfig(**config)), settings, device)
-            held = {name: load_file(folder / f"{name}.safetensors") for name in STATE_FILES}
-            run.network.load_state_dict(held["weights"])
-            run.average.load_state_dict(held["average"])
-            for name, parameter in run.network.named_parameters():
-                run.optimizer.state[parameter] = {
-                    "step": torch.tensor(float(about["step"])),
-                    "exp_avg": held["first"][name].to(parameter.device),
-                    "exp_avg_sq": held["second"][name].to(parameter.device),
-                }
-            run.mean.sums = {k: v.to(device) for k, v in held["mean"].items()}
-            run.step, run.minutes = int(about["step"]), float(about["minutes"])
-            run.best = float(about["best"])
-        except (SafetensorError, OSError, KeyError, TypeError, ValueError, RuntimeError) as error:
-            raise InputError(folder, f"damaged ({str(error).splitlines()[0][:120]})") from error
+        run.mean.sums = {k: v.to(device) for k, v in held["mean"].items()}
         return run
 
-    def compiled_step(self, peers: _Peers) -> Callable[[PhotoBatch, float], None]:
+    def go(
+        self,
+        batches: Callable[[int, torch.Generator], PhotoBatch],
+        validation: Mapping[str, Sequence[PhotoBatch]],
+        worker: Worker,
+        seed: int,
+        began: float,
+        minutes: float,
+        total_minutes: float,
+    ) -> bool:
+        """Take steps until the time is over; validate and save now and then.
+
+        Arguments as of `train_regressor`; ``began`` is when it was called, by a clock that only
+        runs forward [s].
+
+        Returns:
+            Whether the time for all calls is used up.
+        """
+        settings, earlier, first = self.settings, self.minutes, self.step
+        generator = torch.Generator(self.device)
+        for draws in (generator, torch):
+            draws.manual_seed((seed * 1_000_003 + first) * worker.count + worker.rank)
+        step = self.compiled_step(worker)
+        validated = saved = began
+        while True:
+            seconds = worker.agree(time.monotonic() - began, self.device)
+            self.minutes = earlier + seconds / 60.0
+            by_steps = self.step / settings.step_limit if settings.step_limit else 0.0
+            progress = max(self.minutes / total_minutes, by_steps)
+            if progress >= 1.0 or self.minutes - earlier >= minutes:
+                return progress >= 1.0
+            with torch.no_grad():
+                batch = augment(batches(settings.batch, generator), settings, generator)
+            step(batch, _rate(settings, progress, self.step - first))
+            if not worker.is_first:
+                continue
+            if time.monotonic() - validated >= 60.0 * settings.validate_minutes:
+                self.validate(validation)
+                validated = time.monotonic()
+            if time.monotonic() - saved >= 60.0 * settings.save_minutes:
+                self.save()
+                saved = time.monotonic()
+
+    def compiled_step(self, worker: Worker) -> Callable[[PhotoBatch, float], None]:
         """Return what takes a step of the optimiser on a batch, at a learning rate."""
-        is_cuda = peers.device.type == "cuda"
+        is_cuda = self.device.type == "cuda"
         if is_cuda:
             self.network.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
         use_compiler = self.settings.compile and is_cuda
@@ -298,7 +263,7 @@ class _Run:
             weighted = [TERM_WEIGHTS[name] * term for name, term in terms.items()]
             self.optimizer.zero_grad(set_to_none=True)
             torch.stack(weighted).sum().backward()
-            peers.average(self.network)
+            worker.average_gradients(self.network.parameters())
             torch.nn.utils.clip_grad_norm_(self.network.parameters(), self.settings.clip)
             self.optimizer.step()
             self.step += 1
@@ -333,33 +298,20 @@ class _Run:
             save_regressor(self.average, self.out / BEST, {"step": self.step, "score": mark})
 
     def save(self) -> None:
-        """Write the state in files of at most 16 MiB, then remove the one before."""
+        """Write a checkpoint."""
         moments = {k: self.optimizer.state[p] for k, p in self.network.named_parameters()}
-        held: dict[str, Mapping[str, Tensor]] = {
+        state = {
+            "config": asdict(self.network.config),
             "weights": self.network.state_dict(),
             "average": self.average.state_dict(),
             "first": {k: m["exp_avg"] for k, m in moments.items()},
             "second": {k: m["exp_avg_sq"] for k, m in moments.items()},
             "mean": self.mean.sums,
-        }
-        about = {
-            "config": asdict(self.network.config),
             "step": self.step,
             "minutes": self.minutes,
-            "best": self.best,
+            "best": None if math.isinf(self.best) else self.best,  # JSON has no infinity
         }
-        earlier = list(self.out.glob("state-*"))
-        folder = self.out / f"state-{self.step:09d}"
-        files = {
-            f"{name}.safetensors": save(
-                {k: v.detach().cpu().contiguous() for k, v in tensors.items()}
-            )
-            for name, tensors in held.items()
-        }
-        write_folder(folder, [*files.items(), (STATE, json.dumps(about).encode())])
-        for old in earlier:
-            if old != folder:
-                shutil.rmtree(old)
+        self.checkpoints.save(STAGE, self.step, state)
 
     def finish(
         self, validation: Mapping[str, Sequence[PhotoBatch]], record: Mapping[str, Any]

@@ -1,0 +1,1 @@
+"""Training of the embedded prior; knows nothing of where its pictures come from."""
