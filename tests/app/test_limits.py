@@ -18,7 +18,7 @@ from PIL import Image
 from tests.builders.faults import Ended, assert_fails, run_case, snapshot
 from tests.builders.gltf_files import Builder
 from tests.builders.image_files import png_chunk
-from tests.builders.insertions import arguments, read_layers, write_inputs
+from tests.builders.insertions import arguments, read_layers
 from tests.insert.test_faults import NO_POSE
 from warpir.app.config import OPTIONS, InsertConfig
 from warpir.app.config_file import YAML_SHARE
@@ -46,14 +46,6 @@ FULL = (
     "shutil.disk_usage = lambda path: usage(2**40, 2**40 - 2**20, 2**20)"
 )
 """Leaves a MiB of the disk."""
-
-
-@pytest.fixture(scope="module")
-def inputs(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The good inputs of every case."""
-    folder = tmp_path_factory.mktemp("inputs")
-    write_inputs(folder)
-    return folder
 
 
 def sparse(path: Path, size: int) -> Path:
@@ -660,25 +652,6 @@ def test_deep_scene_is_valid(inputs: Path, tmp_path: Path) -> None:
 def test_camera_with_a_byte_order_mark(inputs: Path, tmp_path: Path) -> None:
     (tmp_path / "c.json").write_bytes(b"\xef\xbb\xbf" + json.dumps(CAMERA).encode())
     validated(arguments(inputs, "out", camera="c.json", **NO_POSE), tmp_path)
-
-
-@pytest.mark.parametrize(
-    ("text", "words"),
-    [
-        ('{"w": 48,\n"h": NaN}', "line 2: NaN is not JSON"),
-        ('{"w": 48,\n\n"h": -Infinity}', "line 3: -Infinity is not JSON"),
-        ('{"w": 48,\n"h": 2,\n"w": 4}', 'line 3: key "w" appears twice'),
-        ('{"w": 48,\n}', "line 2: not JSON"),
-        ("[\n1]", "line 1: not a JSON object"),
-        ('{"w":\n"\xff"}', "line 2: not UTF-8"),
-        ('{"w": ' + "9" * 5000 + "}", "not JSON that can be read"),
-    ],
-    ids=["C9-nan", "C9-inf", "C9-twice", "C9-comma", "C9-list", "C9-utf8", "C9-long-integer"],
-)
-def test_camera_json_names_its_line(text: str, words: str, inputs: Path, tmp_path: Path) -> None:
-    (tmp_path / "c.json").write_bytes(text.encode("latin-1"))
-    argv = [*arguments(inputs, "out", camera="c.json", **NO_POSE), "--validate"]
-    assert_fails(argv, ExitCode.INPUT, "c.json", words, cwd=tmp_path)
 
 
 # -------------------------------------------------------------------- configuration and prompt

@@ -20,7 +20,6 @@ from tests.builders.insertions import (
     go,
     read_layers,
     rgb,
-    write_inputs,
 )
 from tests.builders.refusals import assert_fails
 from warpir.app.command import parse
@@ -37,13 +36,6 @@ from warpir.scene.tone_curves import Curves, ToneKnots
 ROUNDING = 1e-6
 """float32 values in [0, 1]."""
 CHEAP = {"samples": "2", "depth": "2"}
-
-
-@pytest.fixture(scope="module")
-def inputs(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    folder = tmp_path_factory.mktemp("inputs")
-    write_inputs(folder)
-    return folder
 
 
 @pytest.fixture(scope="module")

@@ -10,7 +10,7 @@ from typing import Any, NoReturn
 import pytest
 
 import warpir.report.result
-from tests.builders.insertions import ALWAYS, Run, arguments, digest, go, write_inputs
+from tests.builders.insertions import ALWAYS, Run, arguments, digest, go
 from tests.builders.refusals import assert_fails, refused
 from warpir import insert
 from warpir.app.command import parse
@@ -29,13 +29,6 @@ FRAMES: list[dict[str, Any]] = [
     {"photo": "deep.png", "at": "24,24", "size": 0.8, "exposure": -1, "seed": 5},
 ]
 """Nothing changed; another object and pose; another photo, and --at in place of --place."""
-
-
-@pytest.fixture(scope="module")
-def inputs(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    folder = tmp_path_factory.mktemp("inputs")
-    write_inputs(folder)
-    return folder
 
 
 @pytest.fixture(scope="module")
