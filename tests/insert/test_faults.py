@@ -239,7 +239,7 @@ BAD = {
         "buffers": [{"uri": "none.bin", "byteLength": 36}]}), "asset")),
     "M7-index": Bad(3, ("bad.glb", "999"), glb(far_index)),
     "M8-nan": Bad(3, ("bad.glb",), glb(not_a_number)),
-    "M18-emission": Bad(3, ("bad.glb", "emission of 1e+38"), glb(
+    "M18-emission": Bad(3, ("bad.glb", "emission out of range (found 1e+38"), glb(
         lambda b: b.material.update(emissiveFactor=[1e38, 1, 1]))),
     "M18-emission-of-mtl": Bad(3, ("m.obj", "1e+13"), emitting_obj),
     "M8-texture-transform": Bad(3, ("bad.glb", "1e+300"), glb(far_texture)),

@@ -162,8 +162,10 @@ def test_colmap_image_of_the_photo_is_chosen(tmp_path: Path) -> None:
     for chosen in ({}, {"photo_name": "photo.png"}, {"frame": "20.jpg"}):
         with pytest.raises(InputError) as caught:
             read_photo_camera(folder, SIZE, **chosen)
-        assert "found 20: 0.jpg, 1.jpg" in caught.value.what and "12 more" in caught.value.what
-        assert "--frame" in caught.value.advice
+        error = caught.value
+        assert (error.reason, error.fields["found"]) == ("camera.frame", 20)
+        assert ": 0.jpg, 1.jpg" in error.what and "12 more (found 20)" in error.what
+        assert "--frame" in error.advice
     one = write_text_model(tmp_path / "one", *text_of("PINHOLE"), still())
     read_photo_camera(one, SIZE, photo_name="photo.png")
     with pytest.raises(InputError, match="no one image"):
@@ -183,38 +185,71 @@ def edited(file: str, old: str, new: str) -> Callable[[Path], None]:
     return edit
 
 
-WRONG_MODELS: dict[str, tuple[Callable[[Path], None], str]] = {
-    "C6-model": (edited("cameras.txt", "PINHOLE", "FOV"), "wrong parameter count"),
+WRONG_MODELS: dict[str, tuple[Callable[[Path], None], str, dict[str, Any]]] = {
+    "C6-model": (edited("cameras.txt", "PINHOLE", "FOV"), "colmap.parameter_count", {}),
     "C7-fisheye": (
         edited("cameras.txt", "PINHOLE 640 480", "OPENCV_FISHEYE 640 480 0 0 0 0"),
-        "model OPENCV_FISHEYE is not supported",
+        "colmap.model", {"pointer": "camera 7", "found": "OPENCV_FISHEYE"},
     ),
-    "C6-unknown": (edited("cameras.txt", "PINHOLE", "MYSTERY"), "model MYSTERY is not supported"),
-    "C6-count": (edited("cameras.txt", "239.25", ""), "wrong parameter count (found 3; expected 4"),
-    "camera-id": (edited("images.txt", " 7 0.jpg", " 8 0.jpg"), "camera 8 is missing"),
-    "cut-camera": (edited("cameras.txt", "PINHOLE 640", "\n"), "line 2"),
-    "cut-image": (edited("images.txt", " 7 0.jpg", ""), "line 2: damaged (found 8 values"),
-    "points": (edited("images.txt", "1.5 2.5 -1 ", "1.5 "), "line 3: damaged (found 4 values"),
-    "nan": (edited("images.txt", "1 1.0", "1 nan"), "finite numbers"),
-    "quaternion": (edited("images.txt", "1 1.0", "1 1.1"), "unit quaternion"),
-    "focal": (edited("cameras.txt", "500.0", "-500.0"), "focal length"),
-    "size": (edited("cameras.txt", "480", "0"), "image size"),
-    "no-images": (lambda folder: (folder / "images.txt").unlink(), "no COLMAP model"),
+    "C6-unknown": (edited("cameras.txt", "PINHOLE", "MYSTERY"), "colmap.model", {}),
+    "C6-count": (
+        edited("cameras.txt", "239.25", ""), "colmap.parameter_count", {"found": 3, "expected": 4}
+    ),
+    "camera-id": (
+        edited("images.txt", " 7 0.jpg", " 8 0.jpg"), "colmap.no_camera", {"camera": 8}
+    ),
+    "cut-camera": (edited("cameras.txt", "PINHOLE 640", "\n"), "colmap.line", {}),
+    "cut-image": (
+        edited("images.txt", " 7 0.jpg", ""),
+        "colmap.line", {"pointer": "line 2", "found": "8 values"},
+    ),
+    "points": (
+        edited("images.txt", "1.5 2.5 -1 ", "1.5 "),
+        "colmap.line", {"pointer": "line 3", "found": "4 values"},
+    ),
+    "nan": (
+        edited("images.txt", "1 1.0", "1 nan"), "colmap.line", {"expected": "finite numbers"}
+    ),
+    "quaternion": (edited("images.txt", "1 1.0", "1 1.1"), "colmap.quaternion", {"found": 1.1}),
+    "focal": (
+        edited("cameras.txt", "500.0", "-500.0"), "camera.focal_length", {"found": -500.0}
+    ),
+    "size": (edited("cameras.txt", "480", "0"), "colmap.line", {"found": "640 x 0"}),
+    "no-images": (lambda folder: (folder / "images.txt").unlink(), "colmap.missing", {}),
+}  # fmt: skip
+MODEL_SENTENCES = {
+    "C7-fisheye": "camera 7: this camera model is not supported (found OPENCV_FISHEYE; expected "
+    "SIMPLE_PINHOLE, PINHOLE, SIMPLE_RADIAL, RADIAL, OPENCV)",
+    "C6-count": "line 2: wrong parameter count (found 3; expected 4)",
+    "camera-id": "image 0.jpg was taken with camera 8, which is missing (found 1)",
+    "points": "line 3: damaged (found 4 values; expected x y id of the image's points)",
+    "quaternion": "image 0.jpg: not a unit quaternion, by its length (found 1.1; expected 1)",
+    "focal": "camera 7: not a focal length (found -500)",
+    "no-images": "no COLMAP model there (expected cameras.txt and images.txt or cameras.bin and "
+    "images.bin)",
 }
+"""The sentence of each reason, read once."""
 
 
 @pytest.mark.parametrize("case", WRONG_MODELS)
 def test_wrong_colmap_texts_are_named(tmp_path: Path, case: str) -> None:
     """Unknown models, wrong counts and damaged lines say where and what (C6, C7)."""
-    edit, words = WRONG_MODELS[case]
+    edit, reason, fields = WRONG_MODELS[case]
     folder = write_text_model(tmp_path / "0", *text_of("PINHOLE"), still())
     read_photo_camera(folder, SIZE)
     edit(folder)
     with pytest.raises(InputError) as caught:
         read_photo_camera(folder, SIZE)
-    assert words in caught.value.what
-    assert caught.value.code == ExitCode.INPUT
-    assert caught.value.where.startswith(str(folder))
+    error = caught.value
+    assert (error.reason, error.code) == (reason, ExitCode.INPUT)
+    assert fields.items() <= error.fields.items()
+    assert error.what == MODEL_SENTENCES.get(case, error.what)
+    assert error.where.startswith(str(folder))
+
+
+def test_every_reason_of_a_model_has_a_sentence() -> None:
+    reasons = {reason for _, reason, _ in WRONG_MODELS.values()}
+    assert {WRONG_MODELS[case][1] for case in MODEL_SENTENCES} == reasons
 
 
 @pytest.mark.case("C6")
@@ -226,12 +261,14 @@ def test_cut_or_long_colmap_binaries_are_refused(tmp_path: Path, file: str) -> N
     wrong = [content[:n] for n in range(len(content))]
     for changed in (*wrong, content + b"\0", struct.pack("<Q", 2**60) + content[8:]):
         (folder / file).write_bytes(changed)
-        with pytest.raises(InputError, match=r"truncated|damaged"):
+        with pytest.raises(InputError) as caught:
             read_photo_camera(folder, SIZE, frame="1.jpg")
+        assert caught.value.reason in ("colmap.truncated", "colmap.count", "colmap.rest")
     changed = content[:12] + struct.pack("<i", 99) + content[16:]
     (folder / file).write_bytes(changed if file == "cameras.bin" else content[:-1])
-    with pytest.raises(InputError, match=r"unknown model|truncated"):
+    with pytest.raises(InputError) as caught:
         read_photo_camera(folder, SIZE, frame="1.jpg")
+    assert caught.value.reason == "colmap.id" if file == "cameras.bin" else "colmap.truncated"
 
 
 # ------------------------------------------------------------------------------------- nerfstudio
@@ -283,32 +320,46 @@ def test_blender_scene_gives_an_angle_alone(tmp_path: Path, rng: np.random.Gener
 
 
 SCALED = np.diag([2.0, 2.0, 2.0, 1.0])
-WRONG_TRANSFORMS: dict[str, tuple[dict[str, Any], str]] = {
-    "C7-fisheye": (transforms(np.eye(4), camera_model="OPENCV_FISHEYE"), "not a perspective"),
-    "C7-ngp-fisheye": (transforms(np.eye(4), is_fisheye=True), "not a perspective"),
-    "C7-distorted": (transforms(np.eye(4), k1=-0.2), "is distorted (found a coefficient of -0.2"),
-    "C4-scaled": (transforms(SCALED), "scaled"),
-    "C4-missing": (transforms(np.eye(4), frame={"transform_matrix": None}), "matrix of numbers"),
-    "C2-aspect": (transforms(np.eye(4), h=640), "another shape"),
-    "C2-tiny": (transforms(np.eye(4), w=3, h=2), "another shape"),
-    "focal": (transforms(np.eye(4), frame={"fl_x": 0}), "/fl_x"),
-    "no-focal": ({"frames": [{"file_path": "2.png"}]}, "no focal length"),
-    "no-size": ({"fl_x": 5, "frames": [{"file_path": "2.png"}]}, "/w"),
-    "C3-angle": ({"camera_angle_x": 3.2, "frames": [{"file_path": "2.png"}]}, "field of view"),
-    "frames": ({"frames": [3]}, "/frames/0/file_path"),
-    "no-frames": ({"frames": []}, "found 0: none"),
-}
+WRONG_TRANSFORMS: dict[str, tuple[dict[str, Any], str, dict[str, Any]]] = {
+    "C7-fisheye": (
+        transforms(np.eye(4), camera_model="OPENCV_FISHEYE"), "camera.not_perspective", {}
+    ),
+    "C7-ngp-fisheye": (
+        transforms(np.eye(4), is_fisheye=True), "camera.not_perspective", {"found": "is_fisheye"}
+    ),
+    "C7-distorted": (transforms(np.eye(4), k1=-0.2), "camera.distorted", {"found": -0.2}),
+    "C4-scaled": (
+        transforms(SCALED), "camera.scaled", {"pointer": "/frames/1/transform_matrix"}
+    ),
+    "C4-missing": (transforms(np.eye(4), frame={"transform_matrix": None}), "camera.matrix", {}),
+    "C2-aspect": (transforms(np.eye(4), h=640), "camera.aspect", {"found": (640, 640)}),
+    "C2-tiny": (transforms(np.eye(4), w=3, h=2), "camera.aspect", {"found": (3, 2)}),
+    "focal": (
+        transforms(np.eye(4), frame={"fl_x": 0}), "camera.focal_length", {"pointer": "/fl_x"}
+    ),
+    "no-focal": ({"frames": [{"file_path": "2.png"}]}, "camera.no_focal_length", {}),
+    "no-size": (
+        {"fl_x": 5, "frames": [{"file_path": "2.png"}]}, "camera.number", {"pointer": "/w"}
+    ),
+    "C3-angle": (
+        {"camera_angle_x": 3.2, "frames": [{"file_path": "2.png"}]},
+        "camera.field_of_view", {"pointer": "/camera_angle_x"},
+    ),
+    "frames": ({"frames": [3]}, "camera.type", {"pointer": "/frames/0/file_path"}),
+    "no-frames": ({"frames": []}, "camera.frame", {"found": 0, "names": "none"}),
+}  # fmt: skip
 
 
 @pytest.mark.parametrize("case", WRONG_TRANSFORMS)
 def test_wrong_transforms_are_named(tmp_path: Path, case: str) -> None:
     """What a transforms.json may have wrong; distortion without --undistort is refused (C7)."""
-    content, words = WRONG_TRANSFORMS[case]
+    content, reason, fields = WRONG_TRANSFORMS[case]
     path = write_json(tmp_path / "transforms.json", content)
     with pytest.raises(InputError) as caught:
         read_photo_camera(path, SIZE, photo_name="2.png")
-    assert words in caught.value.what
-    assert (caught.value.where, caught.value.code) == (str(path), ExitCode.INPUT)
+    error = caught.value
+    assert (error.reason, error.where, error.code) == (reason, str(path), ExitCode.INPUT)
+    assert fields.items() <= error.fields.items()
 
 
 @pytest.mark.case("C7")
@@ -361,17 +412,17 @@ def test_waymo_projects_as_waymo_does(tmp_path: Path, rng: np.random.Generator, 
 def test_wrong_waymo_calibrations_are_named(tmp_path: Path) -> None:
     """Counts, focal lengths and names."""
     good = calibration(np.eye(4))
-    for content, words in (
-        ({**good, "intrinsic": WAYMO_NUMBERS[:8]}, "/intrinsic"),
-        ({**good, "intrinsic": [0.0, *WAYMO_NUMBERS[1:]]}, "focal length"),
-        ({**good, "extrinsic": {"transform": [1.0] * 12}}, "/extrinsic/transform"),
-        ({**good, "extrinsic": None}, "/extrinsic"),
-        ({"camera_calibrations": [good, calibration(np.eye(4), 2)]}, "FRONT, FRONT_LEFT"),
-        ({"camera_calibrations": 3}, "list of objects"),
+    for content, reason, pointer in (
+        ({**good, "intrinsic": WAYMO_NUMBERS[:8]}, "json.type", "/intrinsic"),
+        ({**good, "intrinsic": [0.0, *WAYMO_NUMBERS[1:]]}, "camera.focal_length", "/intrinsic"),
+        ({**good, "extrinsic": {"transform": [1.0] * 12}}, "json.type", "/extrinsic/transform"),
+        ({**good, "extrinsic": None}, "camera.type", "/extrinsic"),
+        ({"camera_calibrations": [good, calibration(np.eye(4), 2)]}, "camera.frame", None),
+        ({"camera_calibrations": 3}, "camera.type", "/camera_calibrations"),
     ):
         with pytest.raises(InputError) as caught:
             read_photo_camera(write_json(tmp_path / "c.json", content), SIZE, undistort=True)
-        assert words in caught.value.what
+        assert (caught.value.reason, caught.value.fields.get("pointer")) == (reason, pointer)
 
 
 # ------------------------------------------------------------------------------------------- glTF
@@ -453,8 +504,9 @@ def test_C2_tiny_camera_has_the_shape_of_the_photo(tmp_path: Path) -> None:
     """4 x 3 was never 3:2; 150 x 100 was, to a pixel."""
     camera = {"fx": 3.0, "fy": 3.0, "cx": 2.0, "cy": 1.5, "w": 4, "h": 3, "c2w": np.eye(4).tolist()}
     write_json(tmp_path / "c.json", camera)
-    with pytest.raises(InputError, match="another shape"):
+    with pytest.raises(InputError, match="another shape") as caught:
         read_photo_camera(tmp_path / "c.json", (1280, 853))
+    assert caught.value.reason == "camera.aspect"
     write_json(tmp_path / "c.json", {**camera, "w": 150, "h": 100})
     assert read_photo_camera(tmp_path / "c.json", (1280, 853)).camera.width == 1280
 
@@ -475,24 +527,28 @@ def test_C6_name_without_an_end(tmp_path: Path) -> None:
     (tmp_path / "cameras.bin").write_bytes(camera)
     image = struct.pack("<QI7dI", 1, 1, 1, 0, 0, 0, 0, 0, 0, 1)
     (tmp_path / "images.bin").write_bytes(image + b"a" * 10_000)
-    with pytest.raises(InputError, match="a name of more than 4096 bytes"):
+    with pytest.raises(InputError, match="a name too long") as caught:
         read_photo_camera(tmp_path, (64, 48))
+    assert (caught.value.reason, caught.value.fields["limit"]) == ("colmap.name", 4096)
 
 
 @pytest.mark.case("C3")
 def test_wrong_gltf_cameras_are_named(tmp_path: Path) -> None:
     """Orthographic, without an angle, several without a name, and none at all."""
     path = tmp_path / "scene.gltf"
-    write_json(path, gltf_scene(np.eye(4)))
-    for frame, words in (("flat", "orthographic"), (None, "found 2: lens, flat"), ("x", "no one")):
-        with pytest.raises(InputError, match=words):
-            read_photo_camera(path, SIZE, frame=frame)
-    write_json(path, gltf_scene(np.eye(4), yfov=3.2))
-    with pytest.raises(InputError, match="yfov"):
-        read_photo_camera(path, SIZE, frame="lens")
-    write_json(path, {"asset": {"version": "2.0"}, "nodes": [{}]})
-    with pytest.raises(InputError, match="found 0: none"):
-        read_photo_camera(path, SIZE)
+    scene, steep = gltf_scene(np.eye(4)), gltf_scene(np.eye(4), yfov=3.2)
+    empty = {"asset": {"version": "2.0"}, "nodes": [{}]}
+    for content, frame, reason, fields in (
+        (scene, "flat", "gltf.camera", {"found": "orthographic"}),
+        (scene, None, "camera.frame", {"found": 2, "names": "lens, flat"}),
+        (scene, "x", "camera.frame", {"problem": "no one camera is 'x'"}),
+        (steep, "lens", "gltf.range", {"what": "yfov", "found": 3.2}),
+        (empty, None, "camera.frame", {"found": 0, "names": "none"}),
+    ):
+        with pytest.raises(InputError) as caught:
+            read_photo_camera(write_json(path, content), SIZE, frame=frame)
+        assert caught.value.reason == reason
+        assert fields.items() <= caught.value.fields.items()
 
 
 # -------------------------------------------------------------------------------------------- EXR

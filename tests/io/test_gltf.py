@@ -407,18 +407,24 @@ SENTENCES: dict[str, tuple[str, ...]] = {
     "M6-G8-sparse-without-indices": ("/accessors/0/sparse/indices: componentType is missing",),
     "M6-G8-sparse-index-out-of-range": ("/accessors/0/sparse/indices: index 4, but 4 elements",),
     "M6-G8-sparse-indices-not-increasing": ("/accessors/0/sparse/indices", "do not increase"),
-    "M6-G8-sparse-signed-indices": ("/accessors/0/sparse/indices: componentType 5120",),
+    "M6-G8-sparse-signed-indices": (
+        "/accessors/0/sparse/indices: componentType of a wrong",
+        "5120",
+    ),
     "M6-G8-sparse-values-too-short": ("/accessors/0/sparse/values: 2 elements end at byte 24",),
-    "M6-G8-sparse-NaN": ("/accessors/0: 1 elements are NaN",),
+    "M6-G8-sparse-NaN": (
+        "/accessors/0: 1 elements, first",
+        "are NaN",
+    ),
     "M17-G12-unknown-extension": ("/extensionsRequired", "ACME_holograms", "re-export without"),
     "G16-M10-cycle": ("cycle",),
-    "G16-M10-two-parents": ("/nodes/1: child 2 is already a child of node 0",),
-    "M12-G19-mode-7": ("mode is 7, expected 0 to 6",),
+    "G16-M10-two-parents": ("/nodes/1: node 2 is listed twice",),
+    "M12-G19-mode-7": ("mode out of range (found 7; expected 0 to 6)",),
     "M12-G19-empty-scene": ("nothing to render",),
-    "G22-mesh-is-text": ('/nodes/0: mesh is "0", expected an integer',),
+    "G22-mesh-is-text": ('/nodes/0: mesh of another type (found "0"; expected an integer)',),
     "G22-counts-differ": ("3 NORMAL, but 4 vertices",),
     "G22-asset-version-1": ("asset version is '1.0'",),
-    "G22-texCoord-2": ("texCoord 2, but only sets 0 and 1",),
+    "G22-texCoord-2": ("texCoord 2, but only sets 0 to 1",),
     "M6-G23-count-2^31-limit": ("too many triangles", "715827882", "20000000"),
     "M11-G25-zero-scale": ("/nodes/0: singular transform",),
     "M11-G25-zero-quaternion": ("/nodes/0: rotation is the zero quaternion",),
@@ -444,16 +450,6 @@ def test_every_reason_has_a_sentence() -> None:
     """Of each reason that the planted faults have, one sentence is read."""
     reasons = {reason for _, reason, _, _ in FAULTS.values()}
     assert reasons == {FAULTS[case][1] for case in SENTENCES}
-
-
-@pytest.fixture(scope="module")
-def inputs(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Photo and light of a run; never changed."""
-    from tests.builders.insertions import write_inputs
-
-    folder = tmp_path_factory.mktemp("inputs")
-    write_inputs(folder)
-    return folder
 
 
 COSTLY = [
@@ -1562,7 +1558,7 @@ def test_emission_beyond_all_light_is_refused(
     builder = Builder()
     extension = {"KHR_materials_emissive_strength": {"emissiveStrength": strength}}
     builder.material.update(emissiveFactor=[factor, 1, 1], extensions=extension)
-    with pytest.raises(InputError, match=r"/materials/0: emission of .*at most 1e\+12"):
+    with pytest.raises(InputError, match=r"/materials/0: emission out of range .*limit 1e\+12"):
         load(tmp_path, builder)
 
 

@@ -110,10 +110,10 @@ FAULTS: dict[str, tuple[str, tuple[str, ...]]] = {
     "M20-uv-index-too-large": (SQUARE + "f 1/9 2/1 3/1\n", ("line 10", "'1/9'", "4 vt")),
     "M20-normal-index-0": (SQUARE + "f 1//0 2//1 3//1\n", ("line 10", "'1//0'", "1 vn")),
     "M20-negative-too-far": (SQUARE + "f -5 -1 -2\n", ("line 10", "-5", "4 v")),
-    "M20-index-minus-0": (SQUARE + "f -0 -1 -2\n", ("line 10", "index -0", "4 v")),
+    "M20-index-minus-0": (SQUARE + "f -0 -1 -2\n", ("line 10", "corner -0", "4 v")),
     "M20-index-of-4000-digits": (
         SQUARE + f"f -1 -2 -{'9' * 4000}\n",
-        ("line 10", f"index -{'9' * 19}, but 4 v"),
+        ("line 10", f"corner -{'9' * 19}, but 4 v"),
     ),
     "M20-decimal-comma": ("v 0,5 0 0\n" + SQUARE + FACES, ("line 1", "0,5", "decimal points")),
     "M20-nan": (SQUARE.replace("v 1 1 0", "v 1 nan 0") + FACES, ("line 3", "numbers up to")),
@@ -758,7 +758,10 @@ STL_FAULTS = {
     "word-for-a-number": (ascii_stl().replace("vertex 1 0 0", "vertex 1 x 0"), "x"),
     "cut": (ascii_stl()[:-30], "1 solid and 0 endsolid"),
     "cut-inside": (ascii_stl().replace(" endfacet\nendsolid", "endsolid"), "facet 1 is not one"),
-    "M8-word-of-1000-characters": (ascii_stl().replace("1 0 0", f"1{'0' * 999} 0 0"), "of 1000 c"),
+    "M8-word-of-1000-characters": (
+        ascii_stl().replace("1 0 0", f"1{'0' * 999} 0 0"),
+        "(found 1000; limit 64)",
+    ),
     "inf": (ascii_stl().replace("vertex 1 0 0", "vertex 1 inf 0"), "NaN or infinite"),
 }
 

@@ -144,47 +144,108 @@ MOVED[:3, 3] = [1.0, 2.0, 3.0]
 SHEARED = np.eye(4)
 SHEARED[0, 1] = 0.1
 
-WRONG_FILES = {
-    "C1-null": ('{"cameraParameters": null}', "no camera"),
-    "C2-aspect": (own(w=40, h=40), "another shape"),
-    "C3-fov": (json.dumps(fspy_parameters(40, 30, np.eye(4), angle=3.2)), "field of view"),
-    "C4-transposed": (own(c2w=MOVED.T.tolist()), "transposed"),
-    "C4-left-handed": (own(c2w=np.diag([1.0, 1.0, -1.0, 1.0]).tolist()), "left-handed"),
-    "C4-scaled": (own(c2w=np.diag([2.0, 2.0, 2.0, 1.0]).tolist()), "scaled"),
-    "C4-sheared": (own(c2w=SHEARED.tolist()), "not orthonormal"),
-    "C4-shape": (own(c2w=[[1, 0], [0, 1]]), "shape"),
-    "C4-ragged": (own(c2w=[[1, 0, 0, 0], [0, 1]]), "matrix of numbers"),
-    "C4-text": (own(c2w=[["1", "0", "0", "0"]] * 4), "matrix of numbers"),
-    "C9-nan": ('{\n"fx": NaN}', "line 2: NaN"),
-    "C9-overflow": ('{\n\n"fx": 1e400}', "line 3"),
-    "C9-duplicate": ('{\n"fx": 1,\n"fy": 2,\n"fx": 3}', 'line 4: key "fx" appears twice'),
-    "C9-comma": ('{\n"fx": 1,\n}', "line 3"),
-    "C9-list": ("[1, 2]", "object"),
-    "C9-nested": ("[" * 100_000, "JSON"),
-    "foreign": ('{"camera_angle_x": 1}', "not a camera"),
-    "focal": (own(fx=-1.0), "/fx"),
-    "focal-bool": (own(fx=True), "/fx"),
-    "focal-huge": (own(fx=10**400), "/fx"),
-    "size": (own(w=0), "/w"),
+WRONG_FILES: dict[str, tuple[str, str, dict[str, Any]]] = {
+    "C1-null": ('{"cameraParameters": null}', "camera.unsolved", {}),
+    "C2-aspect": (own(w=40, h=40), "camera.aspect", {"found": (40, 40), "expected": (40, 30)}),
+    "C3-fov": (
+        json.dumps(fspy_parameters(40, 30, np.eye(4), angle=3.2)),
+        "camera.field_of_view",
+        {"pointer": "/horizontalFieldOfView", "found": 3.2},
+    ),
+    "C4-transposed": (own(c2w=MOVED.T.tolist()), "camera.transposed", {"pointer": "/c2w"}),
+    "C4-left-handed": (
+        own(c2w=np.diag([1.0, 1.0, -1.0, 1.0]).tolist()), "camera.left_handed", {}
+    ),
+    "C4-scaled": (
+        own(c2w=np.diag([2.0, 2.0, 2.0, 1.0]).tolist()), "camera.scaled", {"found": 2.0}
+    ),
+    "C4-sheared": (own(c2w=SHEARED.tolist()), "camera.not_rigid", {"limit": 1e-4}),
+    "C4-shape": (own(c2w=[[1, 0], [0, 1]]), "camera.shape", {"found": (2, 2)}),
+    "C4-ragged": (own(c2w=[[1, 0, 0, 0], [0, 1]]), "camera.matrix", {}),
+    "C4-text": (own(c2w=[["1", "0", "0", "0"]] * 4), "camera.matrix", {}),
+    "C4-projective": (
+        own(c2w=[*np.eye(4)[:3].tolist(), [0, 0, 0, 2]]), "camera.last_row", {"found": "0 0 0 2"}
+    ),
+    "C4-beyond": (own(c2w=(np.eye(4)[:3] * 1e16).tolist()), "camera.too_large", {"found": 1e16}),
+    "C9-nan": ('{\n"fx": NaN}', "json.constant", {"line": 2, "word": "NaN"}),
+    "C9-inf": ('{\n\n"fx": -Infinity}', "json.constant", {"line": 3, "word": "-Infinity"}),
+    "C9-utf8": ('{"w":\n"\xff"}', "json.utf8", {"line": 2}),
+    "C9-long-integer": ('{"fx": ' + "9" * 5000 + "}", "json.long_integer", {}),
+    "C9-overflow": ('{\n\n"fx": 1e400}', "json.overflow", {"line": 3, "digits": "1e400"}),
+    "C9-duplicate": (
+        '{\n"fx": 1,\n"fy": 2,\n"fx": 3}', "json.twice", {"line": 4, "key": '"fx"'}
+    ),
+    "C9-comma": ('{\n"fx": 1,\n}', "json.syntax", {"line": 3}),
+    "C9-list": ("[1, 2]", "json.not_an_object", {"found": "list"}),
+    "C9-nested": ("[" * 100_000, "json.nesting", {"limit": 100}),
+    "foreign": ('{"camera_angle_x": 1}', "camera.kind", {"found": "keys 'camera_angle_x'"}),
+    "focal": (own(fx=-1.0), "camera.focal_length", {"pointer": "/fx", "found": -1.0}),
+    "focal-bool": (own(fx=True), "camera.number", {"pointer": "/fx", "found": "True"}),
+    "focal-huge": (own(fx=10**400), "camera.number", {"pointer": "/fx"}),
+    "size": (own(w=0), "camera.size", {"pointer": "/w", "found": 0.0}),
+}  # fmt: skip
+SENTENCES = {
+    "C1-null": "fSpy found no camera in this project (cameraParameters is null)",
+    "C2-aspect": "made for a picture of another shape (found 40 x 40; expected 40 x 30)",
+    "C3-fov": "/horizontalFieldOfView: not a field of view (found 3.2; expected 0 to pi)",
+    "C4-transposed": "/c2w: transposed (found the translation in the last row)",
+    "C4-left-handed": "/c2w: left-handed (found determinant -1)",
+    "C4-scaled": "/c2w: scaled (found 2; expected 1)",
+    "C4-sheared": "/c2w: not orthonormal, its axes are off (found 0.1; limit 0.0001)",
+    "C4-shape": "/c2w: not a matrix of this shape (found 2 x 2; expected 4 x 4 or 3 x 4)",
+    "C4-text": "/c2w: not a matrix of numbers",
+    "C4-projective": "/c2w: last row is not 0 0 0 1 (found 0 0 0 2)",
+    "C4-beyond": "/c2w: numbers beyond every use (found 1e+16; limit 1e+15)",
+    "C9-nan": "line 2: NaN is not JSON",
+    "C9-utf8": "line 2: not UTF-8 text",
+    "C9-long-integer": "not JSON that can be read (a number of 5000 digits)",
+    "C9-overflow": "line 3: number 1e400 is too large",
+    "C9-duplicate": 'line 4: key "fx" appears twice',
+    "C9-comma": "line 3: not JSON (Expecting property name enclosed in double quotes)",
+    "C9-list": "line 1: not a JSON object (found list)",
+    "C9-nested": "JSON nested too deeply (limit 100); --max-nesting raises it",
+    "foreign": "not a camera that warpir reads (found keys 'camera_angle_x'; expected fx fy cx cy "
+    "w h c2w, or a file of fSpy, COLMAP, nerfstudio, Waymo or glTF)",
+    "focal": "/fx: not a focal length (found -1; expected > 0)",
+    "focal-bool": "/fx: not a number that can be used (found True)",
+    "size": "/w: not an image size (found 0; expected whole pixels)",
 }
+"""The sentence of each reason, read once."""
 
 
 @pytest.mark.parametrize("case", WRONG_FILES)
 def test_wrong_camera_files_are_named(tmp_path: Path, case: str) -> None:
-    text, words = WRONG_FILES[case]
+    text, reason, fields = WRONG_FILES[case]
     path = tmp_path / "camera.json"
-    path.write_text(text)
+    path.write_bytes(text.encode("latin-1"))
     with pytest.raises(InputError) as caught:
         read_camera(path, (40, 30))
-    assert words in caught.value.what
-    assert caught.value.where == str(path)
-    assert caught.value.code == ExitCode.INPUT
-    assert "\n" not in str(caught.value)
+    error = caught.value
+    assert (error.reason, error.where, error.code) == (reason, str(path), ExitCode.INPUT)
+    assert fields.items() <= error.fields.items()
+    assert error.what == SENTENCES.get(case, error.what)
+    assert "\n" not in str(error)
+
+
+def test_every_reason_of_a_camera_file_has_a_sentence() -> None:
+    assert {WRONG_FILES[c][1] for c in SENTENCES} == {
+        reason for _, reason, _ in WRONG_FILES.values()
+    }
+
+
+FSPY_REASONS = {
+    "version": "camera.version",
+    "cut-header": "camera.truncated",
+    "cut-state": "camera.truncated",
+    "cut-image": "camera.truncated",
+    "lying-size": "limit.json_bytes",
+    "no-image": "camera.no_image",
+}
 
 
 @pytest.mark.parametrize(
     "case",
-    ["version", "cut-header", "cut-state", "cut-image", "lying-size", "no-image"],
+    FSPY_REASONS,
     ids="C1-{}".format,
 )
 def test_wrong_fspy_projects_are_refused(tmp_path: Path, case: str) -> None:
@@ -201,15 +262,14 @@ def test_wrong_fspy_projects_are_refused(tmp_path: Path, case: str) -> None:
     path.write_bytes(content)
     with pytest.raises(InputError) as caught:
         read_camera(path, (40, 30))
-    assert any(
-        word in caught.value.what for word in ("version", "truncated", "too large", "without")
-    )
+    assert caught.value.reason == FSPY_REASONS[case]
 
 
 def test_missing_camera_and_folder(tmp_path: Path) -> None:
-    for path, words in ((tmp_path / "no.json", "no such"), (tmp_path, "no COLMAP model")):
-        with pytest.raises(InputError, match=words):
+    for path, reason in ((tmp_path / "no.json", "json.missing"), (tmp_path, "colmap.missing")):
+        with pytest.raises(InputError) as caught:
             read_camera(path, (40, 30))
+        assert caught.value.reason == reason
 
 
 def test_fov_spans_the_width_and_pitch_looks_up() -> None:

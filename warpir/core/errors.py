@@ -1,7 +1,7 @@
 """The one error a user can cause, and the exit codes that tell schedulers the truth."""
 
 import errno
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from enum import IntEnum
 from pathlib import Path
 
@@ -76,6 +76,56 @@ class InputError(Exception):
         self.fields = fields
         self.also: tuple[InputError, ...] = ()
         """Further problems found in the same pass; printed, but they decide nothing."""
+
+
+class Faults:
+    """The faults of one kind of input, each with a reason, a sentence and what to do about it.
+
+    Args:
+        kind: First part of the reasons, as in ``camera.scaled``.
+        sentences: What is wrong, by the second part, or that and the advice. The fields of an error
+            stand in it as in `str.format`.
+    """
+
+    def __init__(self, kind: str, sentences: Mapping[str, str | tuple[str, str]]) -> None:
+        self.kind = kind
+        self.sentences = sentences
+
+    def error(
+        self, where: str | Path, reason: str, /, *, advice: str = "", **fields: object
+    ) -> InputError:
+        """Return the error of a reason.
+
+        Args:
+            where: The file or flag at fault.
+            reason: Of the table.
+            advice: What to do about it, where the table does not say.
+            fields: What the sentence says. ``pointer`` and ``line``, the place in the file, go
+                before it; ``found``, ``expected`` and ``limit`` follow unless they stand in it.
+        """
+        stated = self.sentences[reason]
+        sentence, usual = (stated, "") if isinstance(stated, str) else stated
+        what = sentence.format(**fields)
+        if "line" in fields:
+            what = f"line {fields['line']}: {what}"
+        if "pointer" in fields:
+            what = f"{fields['pointer']}: {what}"
+        values = [
+            f"{name} {_as_text(fields[name])}"
+            for name in ("found", "expected", "limit")
+            if name in fields and f"{{{name}" not in sentence
+        ]
+        if values:
+            what += f" ({'; '.join(values)})"
+        error = InputError(where, what, advice or usual, reason=f"{self.kind}.{reason}")
+        error.fields = fields  # under any names
+        return error
+
+
+def _as_text(value: object) -> str:
+    if isinstance(value, tuple):
+        return " x ".join(map(_as_text, value))
+    return f"{value:.6g}" if isinstance(value, float) else str(value)
 
 
 def raise_all(problems: Sequence[InputError]) -> None:

@@ -7,17 +7,40 @@ import re
 from pathlib import Path
 from typing import Any
 
-from warpir.core.errors import ExitCode, InputError
+from warpir.core.errors import ExitCode, Faults, InputError
 from warpir.core.limits import LIMITS, Limits
+
+JSON = Faults(
+    "json",
+    {
+        "constant": "{word} is not JSON",
+        "format": "not {what}",
+        "line_count": "{what} miscounted",
+        "long_integer": "not JSON that can be read (a number of 5000 digits)",
+        "missing": "no such file",
+        "nesting": "JSON nested too deeply (limit {limit}); --max-nesting raises it",
+        "not_an_object": "not a JSON object",
+        "not_regular": "not a regular file",
+        "number": "a number beyond every use",
+        "overflow": "number {digits} is too large",
+        "syntax": "not JSON ({problem})",
+        "twice": "key {key} appears twice",
+        "type": "missing or of another kind",
+        "unreadable": "cannot be read",
+        "utf8": "not UTF-8 text",
+    },
+)
+"""What a JSON file may have wrong."""
 
 
 class _Refused(Exception):
     """A construct that the standard forbids; `pattern` finds it in the text."""
 
-    def __init__(self, what: str, pattern: str) -> None:
-        super().__init__(what)
-        self.what = what
+    def __init__(self, pattern: str, reason: str, **fields: str) -> None:
+        super().__init__(reason)
         self.pattern = pattern
+        self.reason = reason
+        self.fields = fields
 
 
 def read_json_object(path: str | Path, limits: Limits = LIMITS) -> dict[str, Any]:
@@ -41,11 +64,11 @@ def _read(path: Path, limits: Limits) -> bytes:
     """
     try:
         if not path.is_file():
-            raise InputError(path, "no such file" if not path.exists() else "not a regular file")
+            raise JSON.error(path, "not_regular" if path.exists() else "missing")
         limits.check("json_bytes", path.stat().st_size, path, "too large", more=" bytes")
         return path.read_bytes()
     except OSError as error:
-        raise InputError(path, f"cannot be read ({error.strerror})") from error
+        raise JSON.error(path, "unreadable", found=error.strerror) from error
 
 
 def parse_json_object(where: str | Path, raw: bytes, limits: Limits = LIMITS) -> dict[str, Any]:
@@ -60,12 +83,12 @@ def parse_json_object(where: str | Path, raw: bytes, limits: Limits = LIMITS) ->
     limits.check("json_values", values, where, "too many values in JSON")
 
     def constant(word: str) -> float:
-        raise _Refused(f"{word} is not JSON", rf"(?<![\w\"]){re.escape(word)}(?![\w\"])")
+        raise _Refused(rf"(?<![\w\"]){re.escape(word)}(?![\w\"])", "constant", word=word)
 
     def number(digits: str) -> float:
         value = float(digits)
         if not math.isfinite(value):
-            raise _Refused(f"number {digits[:20]} is too large", re.escape(digits))
+            raise _Refused(re.escape(digits), "overflow", digits=digits[:20])
         return value
 
     def unique(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
@@ -73,10 +96,8 @@ def parse_json_object(where: str | Path, raw: bytes, limits: Limits = LIMITS) ->
         for key, value in pairs:
             if key in record:
                 shown = json.dumps(key)
-                raise _Refused(
-                    f"key {shown[:60]} appears twice",
-                    rf"{re.escape(shown)}\s*:[\s\S]*?{re.escape(shown)}\s*(?=:)",
-                )
+                pattern = rf"{re.escape(shown)}\s*:[\s\S]*?{re.escape(shown)}\s*(?=:)"
+                raise _Refused(pattern, "twice", key=shown[:60])
             record[key] = value
         return record
 
@@ -84,27 +105,23 @@ def parse_json_object(where: str | Path, raw: bytes, limits: Limits = LIMITS) ->
         text = raw.decode("utf-8-sig")
     except UnicodeDecodeError as error:
         line = raw.count(b"\n", 0, error.start) + 1
-        raise InputError(where, f"line {line}: not UTF-8 text") from error
+        raise JSON.error(where, "utf8", line=line) from error
     try:
         root = json.loads(
             text, parse_constant=constant, parse_float=number, object_pairs_hook=unique
         )
     except json.JSONDecodeError as error:
-        raise InputError(where, f"line {error.lineno}: not JSON ({error.msg})") from error
+        raise JSON.error(where, "syntax", line=error.lineno, problem=error.msg) from error
     except _Refused as refused:
         found = re.search(refused.pattern, text)
         line = text.count("\n", 0, found.end()) + 1 if found else 1
-        raise InputError(where, f"line {line}: {refused.what}") from refused
+        raise JSON.error(where, refused.reason, line=line, **refused.fields) from refused
     except RecursionError as error:  # beyond every limit that can be given
-        deepest = limits.nesting
-        what = f"JSON nested too deeply (limit {deepest}); --max-nesting raises it"
-        raise InputError(where, what) from error
+        raise JSON.error(where, "nesting", limit=limits.nesting) from error
     except ValueError as error:  # integers of 5000 digits
-        raise InputError(where, "not JSON that can be read (a number of 5000 digits)") from error
+        raise JSON.error(where, "long_integer") from error
     if not isinstance(root, dict):
-        raise InputError(
-            where, f"line 1: not a JSON object (found {type(root).__name__}; expected an object)"
-        )
+        raise JSON.error(where, "not_an_object", line=1, found=type(root).__name__)
     limits.check("nesting", _depth(root), where, "JSON nested too deeply", more=" levels")
     return root
 
@@ -133,8 +150,9 @@ def read_json_lines(
         raise
     lines = [(number, line) for number, line in enumerate(raw.split(b"\n"), 1) if line.strip()]
     if not 1 <= len(lines) <= most:
-        found = f"{what} miscounted (found {len(lines)}; expected 1 to {most})"
-        raise InputError(path, found, code=ExitCode.USAGE)
+        error = JSON.error(path, "line_count", what=what, found=len(lines), expected=f"1 to {most}")
+        error.code = ExitCode.USAGE
+        raise error
     return lines, hashlib.sha256(raw).hexdigest()
 
 
@@ -168,11 +186,30 @@ def read_numbers(path: str | Path, pointer: str, value: Any, count: int) -> list
     numeric = isinstance(value, list) and len(value) == count
     if not numeric or any(isinstance(v, bool) or not isinstance(v, int | float) for v in value):
         expected = "a number" if count == 1 else f"a list of {count} numbers"
-        raise InputError(path, f"{pointer}: {expected} expected")
-    numbers = []
-    for v in value:
-        try:
-            numbers.append(float(v))
-        except OverflowError:
-            raise InputError(path, f"{pointer}: a number beyond every use") from None
-    return numbers
+        raise JSON.error(path, "type", pointer=pointer, expected=expected)
+    try:
+        return [float(v) for v in value]
+    except OverflowError:
+        raise JSON.error(path, "number", pointer=pointer) from None
+
+
+def read_versioned(
+    path: str | Path, what: str, version: int, limits: Limits = LIMITS
+) -> dict[str, Any]:
+    """Read one of our own files: a JSON object whose ``format`` is ``warpir-`` and its content.
+
+    Args:
+        path: The file.
+        what: The content, such as ``lobes``.
+        version: The one that is read.
+        limits: How large it may be.
+
+    Raises:
+        InputError: Missing, not strict JSON, or of another format.
+    """
+    root = read_json_object(path, limits)
+    if root.get("format") != f"warpir-{what}" or root.get("version") != version:
+        found = f"{root.get('format')!r:.40} version {root.get('version')!r:.10}"
+        expected = f"'warpir-{what}' version {version}"
+        raise JSON.error(path, "format", what=what, found=found, expected=expected)
+    return root

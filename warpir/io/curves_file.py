@@ -17,7 +17,7 @@ import numpy as np
 from warpir.core.arrays import FloatArray
 from warpir.core.errors import InputError
 from warpir.core.limits import LIMITS, Limits
-from warpir.core.strict_json import read_json_object
+from warpir.core.strict_json import read_versioned
 from warpir.scene.tone_curves import CURVE_COUNTS, TONES, Curves, ToneKnots
 
 FORMAT = "warpir-curves"
@@ -52,10 +52,7 @@ def read_curves(path: str | Path, limits: Limits = LIMITS) -> Curves:
         InputError: Missing, of another format, or not monotone curves from (0, 0) to (1, 1); names
             the curve.
     """
-    root = read_json_object(path, limits)
-    if root.get("format") != FORMAT or root.get("version") != VERSION:
-        found = f"{root.get('format')!r:.40} version {root.get('version')!r:.10}"
-        raise InputError(path, f"not curves (found {found}; expected {FORMAT!r} version {VERSION})")
+    root = read_versioned(path, "curves", VERSION, limits)
     tone = root.get("tone")
     if tone not in TONES:
         expected = " or ".join(TONES)

@@ -15,7 +15,7 @@ import numpy as np
 
 from warpir.core.errors import InputError
 from warpir.core.limits import LIMITS, Limits
-from warpir.core.strict_json import read_json_object, read_numbers
+from warpir.core.strict_json import read_numbers, read_versioned
 from warpir.scene.light import Lobes
 
 FORMAT = "warpir-lobes"
@@ -39,10 +39,7 @@ def read_lobes(path: str | Path, limits: Limits = LIMITS) -> Lobes:
     Raises:
         InputError: Missing, of another format, or a lobe is out of range; names the lobe.
     """
-    root = read_json_object(path, limits)
-    if root.get("format") != FORMAT or root.get("version") != VERSION:
-        found = f"{root.get('format')!r:.40} version {root.get('version')!r:.10}"
-        raise InputError(path, f"not lobes (found {found}; expected {FORMAT!r} version {VERSION})")
+    root = read_versioned(path, "lobes", VERSION, limits)
     lobes = root.get("lobes")
     if not isinstance(lobes, list) or not 1 <= len(lobes) <= LOBE_COUNT_LIMIT:
         raise InputError(path, f"/lobes: a list of 1 to {LOBE_COUNT_LIMIT} lobes expected")

@@ -11,9 +11,9 @@ from pathlib import Path
 import numpy as np
 
 from warpir.core.arrays import Float64Array
-from warpir.core.errors import InputError
 from warpir.core.limits import LIMITS, Limits
 from warpir.io.cameras.colmap_model import (
+    COLMAP,
     MODELS,
     Image,
     Intrinsics,
@@ -21,7 +21,8 @@ from warpir.io.cameras.colmap_model import (
     read_cameras,
     read_images,
 )
-from warpir.io.cameras.source import StoredCamera, choose_frame
+from warpir.io.cameras.source import CAMERA, StoredCamera, choose_frame
+from warpir.io.gltf.nodes import from_trs
 from warpir.scene.camera import Camera
 from warpir.scene.lens import Lens
 
@@ -48,11 +49,8 @@ def read_colmap(
     cameras, images = read_cameras(cameras_path), read_images(images_path)
     image = images[choose_frame(images_path, [i.name for i in images], frame, photo)]
     if image.camera_id not in cameras:
-        raise InputError(
-            cameras_path,
-            f"camera {image.camera_id} is missing (image {image.name[:80]} was taken with it; "
-            f"found {len(cameras)} cameras)",
-        )
+        taken_with, name, count = image.camera_id, image.name[:80], len(cameras)
+        raise COLMAP.error(cameras_path, "no_camera", camera=taken_with, image=name, found=count)
     camera, lens = _pinhole(cameras_path, image.camera_id, cameras[image.camera_id])
     notice = (
         "the scale of a COLMAP world is arbitrary: lengths are in its units, not in metres (--size)"
@@ -68,17 +66,15 @@ def _pinhole(
     """Return size, fx, fy, cx, cy and the lens of a camera."""
     model, numbers = intrinsics.model, intrinsics.parameters
     if model not in UNDERSTOOD:
-        raise InputError(
-            path,
-            f"camera {camera_id}: model {model[:40]} is not supported (expected "
-            f"{', '.join(UNDERSTOOD)})",
-            "undistort the images with COLMAP's image_undistorter",
+        expected = ", ".join(UNDERSTOOD)
+        raise COLMAP.error(
+            path, "model", pointer=f"camera {camera_id}", found=model[:40], expected=expected
         )
     focal_count = 2 if model in ("PINHOLE", "OPENCV") else 1
     fx, fy = numbers[0], numbers[focal_count - 1]
     cx, cy, *bends = numbers[focal_count:]
     if not (fx > 0.0 and fy > 0.0):
-        raise InputError(path, f"camera {camera_id}: not a focal length (found {fx:g}, {fy:g})")
+        raise CAMERA.error(path, "focal_length", pointer=f"camera {camera_id}", found=min(fx, fy))
     k1, k2, p1, p2 = (*bends, 0.0, 0.0, 0.0, 0.0)[:4]
     size = (intrinsics.width, intrinsics.height)
     return (*size, fx, fy, cx, cy), Lens((k1, k2, 0.0, 0.0), (p1, p2))
@@ -88,19 +84,11 @@ def _pose(path: Path, image: Image) -> Float64Array:
     """Return the pose of an image from its world to camera transform, [4, 4]."""
     length = math.hypot(*image.quaternion)
     if abs(length - 1.0) > UNIT_TOLERANCE:
-        raise InputError(
-            path,
-            f"image {image.name[:80]}: not a unit quaternion (found a length of {length:.6g}; "
-            "expected 1)",
+        raise COLMAP.error(
+            path, "quaternion", pointer=f"image {image.name[:80]}", found=length, expected=1
         )
-    w, x, y, z = (q / length for q in image.quaternion)
-    world_to_camera = np.array(
-        [
-            [1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)],
-            [2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)],
-            [2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)],
-        ]
-    )
+    w, x, y, z = image.quaternion
+    world_to_camera = from_trs((0.0,) * 3, (x, y, z, w), (1.0,) * 3)[:3, :3]
     c2w = np.eye(4)
     # OpenCV's camera axes become ours: y and z change their signs.
     c2w[:3, :3] = world_to_camera.T * [1.0, -1.0, -1.0]

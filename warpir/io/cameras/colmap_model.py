@@ -14,7 +14,7 @@ from typing import Any, BinaryIO
 import numpy as np
 
 from warpir.core.arrays import Float64Array
-from warpir.core.errors import InputError
+from warpir.core.errors import Faults, InputError
 from warpir.core.limits import LIMITS, Limits
 
 MODELS = {
@@ -36,6 +36,28 @@ POINT_BYTES = 24
 """Of an image's point in ``images.bin``: two coordinates and the id of its 3D point."""
 SIZE_LIMIT = 1_000_000
 """Widest image taken for one [px]."""
+COLMAP = Faults(
+    "colmap",
+    {
+        "count": "damaged: records of {least} bytes or more, in {size} bytes",
+        "id": "unknown model",
+        "line": "damaged",
+        "missing": ("no COLMAP model there", "give its folder, such as sparse/0"),
+        "model": (
+            "this camera model is not supported",
+            "undistort the images with COLMAP's image_undistorter",
+        ),
+        "name": "damaged: a name too long",
+        "no_camera": "image {image} was taken with camera {camera}, which is missing",
+        "parameter_count": "wrong parameter count",
+        "quaternion": "not a unit quaternion, by its length",
+        "rest": "damaged: bytes after the last record",
+        "text": "not UTF-8 text",
+        "truncated": "truncated: its bytes end in a record",
+        "unreadable": "cannot be read",
+    },
+)
+"""What a model may have wrong."""
 
 
 @dataclass(frozen=True)
@@ -88,8 +110,7 @@ def model_files(path: Path, *stems: str, limits: Limits = LIMITS) -> list[Path]:
                 limits.check("file_bytes", size, file, "too large", more=" bytes")
             return files
     expected = " or ".join(" and ".join(stem + kind for stem in stems) for kind in kinds[::-1])
-    hint = ", such as sparse/0" if path.is_dir() else ""
-    raise InputError(path, f"no COLMAP model there (expected {expected})", f"give its folder{hint}")
+    raise COLMAP.error(path, "missing", expected=expected)
 
 
 def read_cameras(path: Path) -> dict[int, Intrinsics]:
@@ -182,14 +203,14 @@ def _lines(path: Path, with_blank: bool = False) -> Iterator[tuple[str, str]]:
                 if (line or with_blank) and not line.startswith("#"):
                     yield f"line {number}", line
     except UnicodeDecodeError as error:
-        raise InputError(path, "not UTF-8 text") from error
+        raise COLMAP.error(path, "text") from error
     except OSError as error:
-        raise InputError(path, f"cannot be read ({error.strerror})") from error
+        raise COLMAP.error(path, "unreadable", found=error.strerror) from error
 
 
 def _require(path: Path, where: str, fulfilled: bool, found: str, expected: str) -> None:
     if not fulfilled:
-        raise InputError(path, f"{where}: damaged (found {found}; expected {expected})")
+        raise COLMAP.error(path, "line", pointer=where, found=found, expected=expected)
 
 
 def _integer(path: Path, where: str, word: str) -> int:
@@ -211,10 +232,9 @@ def _intrinsics(
 ) -> Intrinsics:
     """Check what text and binary have in common."""
     if model in MODELS and len(parameters) != MODELS[model]:
-        raise InputError(
-            path,
-            f"{where}: wrong parameter count (found {len(parameters)}; expected "
-            f"{MODELS[model]} of {model})",
+        found, expected = len(parameters), MODELS[model]
+        raise COLMAP.error(
+            path, "parameter_count", pointer=where, found=found, expected=expected, model=model
         )
     sized = 1 <= width <= SIZE_LIMIT and 1 <= height <= SIZE_LIMIT
     _require(path, where, sized, f"{width} x {height}", "an image size")
@@ -237,7 +257,7 @@ class _Binary:
         try:
             self.stream: BinaryIO = path.open("rb")
         except OSError as error:
-            raise InputError(path, f"cannot be read ({error.strerror})") from error
+            raise COLMAP.error(path, "unreadable", found=error.strerror) from error
 
     def __enter__(self) -> "_Binary":
         return self
@@ -257,9 +277,7 @@ class _Binary:
         """Read how many records follow, each of at least so many bytes."""
         (number,) = self.take("<Q")
         if number * least > self.size:
-            raise InputError(
-                self.path, f"damaged: {number} records of {least} bytes in {self.size} bytes"
-            )
+            raise COLMAP.error(self.path, "count", found=number, least=least, size=self.size)
         return int(number)
 
     def skip(self, size: int) -> None:
@@ -276,17 +294,17 @@ class _Binary:
                 raise self.truncated()
             raw += byte
             if len(raw) > NAME_BYTES:
-                raise InputError(self.path, f"damaged: a name of more than {NAME_BYTES} bytes")
+                raise COLMAP.error(self.path, "name", limit=NAME_BYTES)
         return raw.decode("utf-8", "replace")
 
     def end(self) -> None:
         """Require that nothing follows."""
         if (left := self.size - self.stream.tell()) > 0:
-            raise InputError(self.path, f"damaged: {left} bytes after the last record")
+            raise COLMAP.error(self.path, "rest", found=left)
 
     def truncated(self) -> InputError:
         """Return the error of a file that ends too early."""
-        return InputError(self.path, f"truncated (found {self.size} bytes, which end in a record)")
+        return COLMAP.error(self.path, "truncated", found=self.size)
 
 
 def _binary_cameras(path: Path) -> dict[int, Intrinsics]:
@@ -297,7 +315,7 @@ def _binary_cameras(path: Path) -> dict[int, Intrinsics]:
             camera_id, model_id, width, height = file.take("<IiQQ")
             where = f"camera {camera_id}"
             if not 0 <= model_id < len(names):
-                raise InputError(path, f"{where}: unknown model (found id {model_id})")
+                raise COLMAP.error(path, "id", pointer=where, found=model_id)
             parameters = file.take(f"<{MODELS[names[model_id]]}d")
             finite = all(map(math.isfinite, parameters))
             _require(path, where, finite, "NaN or infinity", "finite numbers")

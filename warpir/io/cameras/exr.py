@@ -10,8 +10,7 @@ from typing import Any
 import numpy as np
 
 from warpir.core.arrays import Float64Array
-from warpir.core.errors import InputError
-from warpir.io.cameras.source import StoredCamera, rigid
+from warpir.io.cameras.source import CAMERA, StoredCamera, rigid
 from warpir.io.images.decoder import read_exr_header
 from warpir.scene.camera import Camera
 
@@ -36,7 +35,7 @@ def read_exr_camera(path: Path) -> StoredCamera:
     if not (projection[0, 0] > 0.0 > projection[1, 1]) or (
         np.abs(rest).max() > AFFINE_TOLERANCE * scale
     ):
-        raise InputError(path, "worldToNDC: not the projection of a pinhole camera")
+        raise CAMERA.error(path, "projection", pointer="worldToNDC")
     width, height = header["size"]
     camera = Camera(
         width,
@@ -54,6 +53,6 @@ def _matrix(path: Path, header: dict[str, Any], name: str) -> Float64Array:
     """Return a matrix of the header, which multiplies row vectors, shape [4, 4]."""
     values = header[name]
     if not isinstance(values, tuple) or len(values) != 16 or not np.isfinite(values).all():
-        raise InputError(path, f"{name}: missing (expected a matrix in the EXR header)")
+        raise CAMERA.error(path, "type", pointer=name, expected="a matrix in the EXR header")
     matrix: Float64Array = np.reshape(np.array(values, dtype=np.float64), (4, 4))
     return matrix

@@ -9,10 +9,18 @@ from typing import Any
 
 import numpy as np
 
-from warpir.core.errors import InputError
 from warpir.core.limits import LIMITS, Limits
 from warpir.core.strict_json import parse_json_object
-from warpir.io.cameras.source import UP_TO_Y, StoredCamera, count, member, number, rigid
+from warpir.io.cameras.source import (
+    CAMERA,
+    UP_TO_Y,
+    StoredCamera,
+    angle,
+    count,
+    member,
+    number,
+    rigid,
+)
 from warpir.scene.camera import Camera
 
 
@@ -21,23 +29,17 @@ def read_fspy_project(path: Path, limits: Limits = LIMITS) -> StoredCamera:
     with path.open("rb") as stream:
         header = stream.read(16)
         if len(header) < 16:
-            raise InputError(
-                path, f"truncated fSpy project (found {len(header)} bytes; expected a header of 16)"
-            )
+            raise CAMERA.error(path, "truncated", found=len(header), expected=16)
         version, state_size, image_size = struct.unpack("<3I", header[4:])
         if version != 1:
-            raise InputError(path, f"fSpy project of another version (found {version}; expected 1)")
+            raise CAMERA.error(path, "version", found=version, expected=1)
         if image_size == 0:
-            raise InputError(path, "fSpy project without an image", "open and save it in fSpy")
+            raise CAMERA.error(path, "no_image")
         limits.check("json_bytes", state_size, path, "fSpy state too large", more=" bytes")
         state = stream.read(state_size)
-    found = path.stat().st_size
-    if len(state) < state_size or found < 16 + state_size + image_size:
-        raise InputError(
-            path,
-            f"truncated fSpy project (found {found} bytes; expected "
-            f"{16 + state_size + image_size})",
-        )
+    found, expected = path.stat().st_size, 16 + state_size + image_size
+    if len(state) < state_size or found < expected:
+        raise CAMERA.error(path, "truncated", found=found, expected=expected)
     return read_fspy(path, parse_json_object(path, state, limits))
 
 
@@ -45,24 +47,14 @@ def read_fspy(path: Path, content: dict[str, Any]) -> StoredCamera:
     """Read fSpy's camera parameters; its camera axes are ours, its world may stand otherwise."""
     parameters = content.get("cameraParameters", content)
     if parameters is None:
-        raise InputError(
-            path,
-            "fSpy found no camera in this project (cameraParameters is null)",
-            "place the vanishing lines in fSpy until it shows a camera, save again",
-        )
+        raise CAMERA.error(path, "unsolved")
     width = count(path, parameters, "imageWidth")
     height = count(path, parameters, "imageHeight")
     centre = member(path, parameters, "principalPoint")
     px, py = number(path, centre, "x"), number(path, centre, "y")
-    angle = number(path, parameters, "horizontalFieldOfView")
-    if not 0.0 < angle < np.pi:
-        raise InputError(
-            path,
-            f"not a field of view (found horizontalFieldOfView {angle}; "
-            "expected radians between 0 and pi)",
-        )
     # fSpy's "horizontal" angle spans the longer side; its principal point has y up.
-    focal = max(width, height) / 2.0 / float(np.tan(angle / 2.0))
+    fov = angle(path, parameters, "horizontalFieldOfView")
+    focal = max(width, height) / 2.0 / float(np.tan(fov / 2.0))
     aspect = width / height
     if aspect > 1.0:
         cx, cy = width / 2.0 * (px + 1.0), height / 2.0 * (1.0 - py * aspect)

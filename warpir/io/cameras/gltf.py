@@ -48,15 +48,11 @@ def read_gltf_camera(
         k = choose_frame(path, names, frame, None, noun="camera")
     entry = cameras[k]
     if entry.text("type") != "perspective":
-        raise entry.error(
-            f"camera of type {entry.text('type')!r}, expected perspective", reason="camera"
-        )
+        raise entry.error("camera", found=entry.text("type"))
     perspective = entry.child("perspective")
     yfov = perspective.number("yfov", 0.0)
     if not 0.0 < yfov < np.pi:
-        raise perspective.error(
-            f"yfov is {yfov:g}, expected radians from 0 to pi", reason="range", found=yfov
-        )
+        raise perspective.error("range", what="yfov", found=yfov, expected="0 to pi")
     width, height = photo_size
     notices = []
     aspect = perspective.number("aspectRatio", width / height)
@@ -84,14 +80,10 @@ def _world(nodes: list[Entry], parents: dict[int, int], index: int) -> Float64Ar
 def _unscaled(node: Entry, world: Float64Array) -> Float64Array:
     """Return a pose whose axes have length 1."""
     if not (np.abs(world) <= LARGEST).all():  # nor are NaN and infinity
-        raise node.error(
-            f"the camera's transform holds numbers beyond {LARGEST:g}",
-            reason="transform_too_large",
-            limit=LARGEST,
-        )
+        raise node.error("transform_too_large", what="the camera's transform", limit=LARGEST)
     lengths = np.linalg.norm(world[:3, :3], axis=0)
     if not (lengths > 0.0).all():
-        raise node.error("the camera's transform is singular", reason="singular")
+        raise node.error("singular", what="transform of the camera")
     pose = world.copy()
     pose[:3, :3] /= lengths
     return rigid(node.path, node.pointer.lstrip("/"), pose)

@@ -9,8 +9,17 @@ from typing import Any
 
 import numpy as np
 
-from warpir.core.errors import InputError
-from warpir.io.cameras.source import UP_TO_Y, StoredCamera, choose_frame, count, number, rigid
+from warpir.io.cameras.source import (
+    CAMERA,
+    UP_TO_Y,
+    StoredCamera,
+    angle,
+    choose_frame,
+    count,
+    focal_length,
+    number,
+    rigid,
+)
 from warpir.scene.camera import Camera
 from warpir.scene.lens import Lens
 
@@ -41,24 +50,20 @@ def read_nerfstudio(
     names = [f.get("file_path") if isinstance(f, dict) else None for f in frames]
     for k, name in enumerate(names):
         if not isinstance(name, str):
-            raise InputError(path, f"/frames/{k}/file_path: missing or not a text")
+            raise CAMERA.error(path, "type", pointer=f"/frames/{k}/file_path", expected="a text")
     k = choose_frame(path, [str(name) for name in names], frame, photo, noun="frame")
     said = {**content, **frames[k]}
     model = said.get("camera_model", "OPENCV")
     if model not in PERSPECTIVE or said.get("is_fisheye"):
         found = "is_fisheye" if said.get("is_fisheye") else f"camera_model {ascii(model)[:60]}"
-        raise InputError(
-            path,
-            f"not a perspective camera (found {found}; expected {', '.join(PERSPECTIVE)})",
-            "undistort the images first",
-        )
+        raise CAMERA.error(path, "not_perspective", found=found, expected=", ".join(PERSPECTIVE))
     width, height = photo_size
     if "w" in said or "h" in said or "fl_x" in said:
         width, height = count(path, said, "w"), count(path, said, "h")
     fx = _focal(path, said, "x", width)
     fy = _focal(path, said, "y", height)
     if fx is None:
-        raise InputError(path, "no focal length (expected fl_x or camera_angle_x)")
+        raise CAMERA.error(path, "no_focal_length", expected="fl_x or camera_angle_x")
     coefficients = [number(path, said, key) if key in said else 0.0 for key in BENDS]
     matrix = f"frames/{k}/transform_matrix"
     camera = Camera(
@@ -86,17 +91,9 @@ BENDS = ("k1", "k2", "k3", "k4", "p1", "p2")
 def _focal(path: Path, said: dict[str, Any], axis: str, side: int) -> float | None:
     """Return the focal length along an axis [px], from itself or the field of view."""
     if f"fl_{axis}" in said:
-        focal = number(path, said, f"fl_{axis}")
-        if focal <= 0.0:
-            raise InputError(path, f"/fl_{axis}: not a focal length (found {focal:g})")
-        return focal
+        return focal_length(path, said, f"fl_{axis}")
     key = f"camera_angle_{axis}"
     # Instant-NGP writes angles beside focal lengths: then fl_x stands for both axes.
     if key not in said or (axis == "y" and "fl_x" in said):
         return None
-    angle = number(path, said, key)
-    if not 0.0 < angle < np.pi:
-        raise InputError(
-            path, f"/{key}: not a field of view (found {angle:g}; expected radians from 0 to pi)"
-        )
-    return float(side / 2.0 / np.tan(angle / 2.0))
+    return float(side / 2.0 / np.tan(angle(path, said, key) / 2.0))

@@ -20,10 +20,12 @@ from warpir.io.cameras.fspy import read_fspy, read_fspy_project
 from warpir.io.cameras.gltf import read_gltf_camera
 from warpir.io.cameras.nerfstudio import read_nerfstudio
 from warpir.io.cameras.source import (
+    CAMERA,
     UP_TO_Y,
     PhotoCamera,
     StoredCamera,
     count,
+    focal_length,
     number,
     rigid,
     turned,
@@ -69,11 +71,7 @@ def read_photo_camera(
     stored = _read(path, photo_size, frame, photo_name, limits)
     if not (stored.lens.is_straight or undistort):
         worst = max((*stored.lens.radial, *stored.lens.tangential), key=abs)
-        raise InputError(
-            path,
-            f"the photograph is distorted (found a coefficient of {worst:.4g}; expected 0)",
-            "--undistort straightens photo and composite; or give a photo without distortion",
-        )
+        raise CAMERA.error(path, "distorted", found=worst, expected=0)
     world = stored.world if axis is None else np.array(UP_TO_Y[axis], dtype=np.float64)
     has_up = world is not None
     if world is None:
@@ -128,19 +126,13 @@ def _read(
     if "fx" in content or "c2w" in content:
         return _read_own(path, content)
     keys = [shown(key) for key in list(content)[:8]]
-    raise InputError(
-        path,
-        f"not a camera that warpir reads (found keys {', '.join(keys) or 'none'}; "
-        "expected fx fy cx cy w h c2w, or a file of fSpy, COLMAP, nerfstudio, Waymo or glTF)",
-    )
+    expected = "fx fy cx cy w h c2w, or a file of fSpy, COLMAP, nerfstudio, Waymo or glTF"
+    raise CAMERA.error(path, "kind", found=f"keys {', '.join(keys) or 'none'}", expected=expected)
 
 
 def _read_own(path: Path, content: dict[str, Any]) -> StoredCamera:
     """Read our own ``camera.json``."""
-    focal = {key: number(path, content, key) for key in ("fx", "fy")}
-    for key, value in focal.items():
-        if value <= 0.0:
-            raise InputError(path, f"/{key}: not a focal length (found {value}; expected > 0)")
+    focal = {key: focal_length(path, content, key) for key in ("fx", "fy")}
     c2w = rigid(path, "c2w", content.get("c2w"))
     camera = Camera(
         count(path, content, "w"),
@@ -165,12 +157,8 @@ def _fit(path: Path, camera: Camera, photo_size: tuple[int, int]) -> Camera:
         abs(camera.width * height / camera.height - width) > slack
         and abs(camera.height * width / camera.width - height) > slack
     ):
-        raise InputError(
-            path,
-            f"made for a picture of another shape (found {camera.width} x "
-            f"{camera.height}; expected the aspect of {width} x {height})",
-            "use the camera of this photograph, before cropping or turning it",
-        )
+        size = camera.width, camera.height
+        raise CAMERA.error(path, "aspect", found=size, expected=photo_size)
     notices = list(camera.notices)
     if (camera.width, camera.height) != photo_size:
         notices.append(

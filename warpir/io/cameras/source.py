@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from warpir.core.arrays import Float64Array
-from warpir.core.errors import InputError
+from warpir.core.errors import Faults
 from warpir.scene.camera import Camera
 from warpir.scene.lens import STRAIGHT, Lens
 
@@ -17,6 +17,49 @@ RIGID_TOLERANCE = 1e-4
 LARGEST = 1e15
 """Largest number of a camera: of a matrix, an offset, a focal length."""
 NAMES_SHOWN = 8
+CAMERA = Faults(
+    "camera",
+    {
+        "aspect": (
+            "made for a picture of another shape",
+            "use the camera of this photograph, before cropping or turning it",
+        ),
+        "distorted": (
+            "the photograph is distorted by a coefficient",
+            "--undistort straightens photo and composite; or give a photo without distortion",
+        ),
+        "field_of_view": "not a field of view",
+        "focal_length": "not a focal length",
+        "frame": ("{problem}: {names}", "name one with --frame"),
+        "kind": "not a camera that warpir reads",
+        "last_row": "last row is not 0 0 0 1",
+        "left_handed": (
+            "left-handed",
+            "export it with right-handed axes: camera along -Z, +Y up, +X right",
+        ),
+        "matrix": "not a matrix of numbers",
+        "no_focal_length": "no focal length",
+        "no_image": ("fSpy project without an image", "open and save it in fSpy"),
+        "not_finite": "numbers that are not finite",
+        "not_perspective": ("not a perspective camera", "undistort the images first"),
+        "not_rigid": "not orthonormal, its axes are off",
+        "number": "not a number that can be used",
+        "projection": "not the projection of a pinhole camera",
+        "scaled": ("scaled", "remove the scale from the camera"),
+        "shape": "not a matrix of this shape",
+        "size": "not an image size",
+        "too_large": "numbers beyond every use",
+        "transposed": ("transposed", "transpose the matrix"),
+        "truncated": "truncated fSpy project",
+        "type": "missing or of another kind",
+        "unsolved": (
+            "fSpy found no camera in this project (cameraParameters is null)",
+            "place the vanishing lines in fSpy until it shows a camera, save again",
+        ),
+        "version": "fSpy project of another version",
+    },
+)
+"""What a camera file may have wrong; ``pointer`` is the place in it."""
 
 UP_TO_Y = {
     "+x": [[0, -1, 0], [1, 0, 0], [0, 0, 1]],
@@ -101,40 +144,29 @@ def choose_frame(
     rest = len(names) - NAMES_SHOWN
     listed += f" and {rest} more" if rest > 0 else ""
     what = f"which {noun} is meant" if wanted is None else f"no one {noun} is {ascii(wanted)[:80]}"
-    raise InputError(
-        path, f"{what} (found {len(names)}: {listed or 'none'})", "name one with --frame"
-    )
+    raise CAMERA.error(path, "frame", problem=what, found=len(names), names=listed or "none")
 
 
 def rigid(path: Path, name: str, rows: Any) -> Float64Array:
     """Check a camera-to-world matrix given as 3 or 4 rows; return it exactly rigid, [4, 4]."""
-    matrix = _affine(path, name, rows)
+    pointer = f"/{name}"
+    matrix = _affine(path, pointer, rows)
     rotation = matrix[:3, :3]
     if (largest := float(np.abs(matrix).max())) > LARGEST:
-        raise InputError(
-            path, f"/{name}: numbers beyond every use (found {largest:g}; limit {LARGEST:g})"
-        )
+        raise CAMERA.error(path, "too_large", pointer=pointer, found=largest, limit=LARGEST)
     product = rotation.T @ rotation
     scale = float(np.trace(product)) / 3.0
     deviation = float(np.abs(product - np.eye(3)).max())
     if deviation > RIGID_TOLERANCE:
         if scale > 0.0 and np.abs(product / scale - np.eye(3)).max() <= RIGID_TOLERANCE:
-            raise InputError(
-                path,
-                f"/{name}: scaled (found a factor of {np.sqrt(scale):.6g}; expected 1)",
-                "remove the scale from the camera",
+            raise CAMERA.error(
+                path, "scaled", pointer=pointer, found=float(np.sqrt(scale)), expected=1
             )
-        raise InputError(
-            path,
-            f"/{name}: not orthonormal (found axes off by {deviation:.3g}; "
-            f"expected at most {RIGID_TOLERANCE})",
+        raise CAMERA.error(
+            path, "not_rigid", pointer=pointer, found=deviation, limit=RIGID_TOLERANCE
         )
     if np.linalg.det(rotation) < 0.0:
-        raise InputError(
-            path,
-            f"/{name}: left-handed (found determinant -1; expected +1)",
-            "export it with right-handed axes: camera along -Z, +Y up, +X right",
-        )
+        raise CAMERA.error(path, "left_handed", pointer=pointer, found="determinant -1")
     left, _, right = np.linalg.svd(rotation)
     rigid = np.eye(4)
     rigid[:3, :3] = left @ right
@@ -142,7 +174,7 @@ def rigid(path: Path, name: str, rows: Any) -> Float64Array:
     return rigid
 
 
-def _affine(path: Path, name: str, rows: Any) -> Float64Array:
+def _affine(path: Path, pointer: str, rows: Any) -> Float64Array:
     """Return a finite matrix whose last row is 0 0 0 1, [4, 4].
 
     Raises:
@@ -154,28 +186,23 @@ def _affine(path: Path, name: str, rows: Any) -> Float64Array:
             raise ValueError
         matrix = matrix.astype(np.float64)
     except (TypeError, ValueError) as error:
-        raise InputError(path, f"/{name}: not a matrix of numbers") from error
+        raise CAMERA.error(path, "matrix", pointer=pointer) from error
     if matrix.shape == (3, 4):
         matrix = np.vstack([matrix, [0.0, 0.0, 0.0, 1.0]])
     if matrix.shape != (4, 4):
-        raise InputError(
-            path, f"/{name}: not a matrix (found shape {matrix.shape}; expected 4 x 4 or 3 x 4)"
+        raise CAMERA.error(
+            path, "shape", pointer=pointer, found=matrix.shape, expected="4 x 4 or 3 x 4"
         )
     if not np.isfinite(matrix).all():
-        raise InputError(path, f"/{name}: numbers that are not finite")
+        raise CAMERA.error(path, "not_finite", pointer=pointer)
     last = np.array([0.0, 0.0, 0.0, 1.0])
     if np.abs(matrix[3] - last).max() > RIGID_TOLERANCE:
         if np.abs(matrix[:, 3] - last).max() <= RIGID_TOLERANCE:
-            raise InputError(
-                path,
-                f"/{name}: transposed (found the translation in the last row; "
-                "expected it in the last column)",
-                "transpose the matrix",
+            raise CAMERA.error(
+                path, "transposed", pointer=pointer, found="the translation in the last row"
             )
-        raise InputError(
-            path,
-            f"/{name}: last row is not 0 0 0 1 (found {' '.join(f'{x:g}' for x in matrix[3])})",
-        )
+        found = " ".join(f"{x:g}" for x in matrix[3])
+        raise CAMERA.error(path, "last_row", pointer=pointer, found=found)
     return matrix
 
 
@@ -183,7 +210,7 @@ def member(path: Path, content: Any, key: str) -> dict[str, Any]:
     """Return an object within an object, or refuse the file."""
     value = content.get(key) if isinstance(content, dict) else None
     if not isinstance(value, dict):
-        raise InputError(path, f"/{key}: missing or not an object")
+        raise CAMERA.error(path, "type", pointer=f"/{key}", expected="an object")
     return value
 
 
@@ -191,15 +218,31 @@ def number(path: Path, content: Any, key: str) -> float:
     """Return a number of an object, or refuse the file."""
     value = content.get(key) if isinstance(content, dict) else None
     if isinstance(value, bool) or not isinstance(value, int | float) or abs(value) > LARGEST:
-        raise InputError(path, f"/{key}: not a number that can be used (found {str(value)[:40]})")
+        raise CAMERA.error(path, "number", pointer=f"/{key}", found=str(value)[:40])
     return float(value)
+
+
+def focal_length(path: Path, content: Any, key: str) -> float:
+    """Return a focal length of an object [px], or refuse the file."""
+    value = number(path, content, key)
+    if value <= 0.0:
+        raise CAMERA.error(path, "focal_length", pointer=f"/{key}", found=value, expected="> 0")
+    return value
+
+
+def angle(path: Path, content: Any, key: str) -> float:
+    """Return a field of view of an object [rad], between 0 and pi, or refuse the file."""
+    value = number(path, content, key)
+    if not 0.0 < value < np.pi:
+        raise CAMERA.error(
+            path, "field_of_view", pointer=f"/{key}", found=value, expected="0 to pi"
+        )
+    return value
 
 
 def count(path: Path, content: Any, key: str) -> int:
     """Return an image size of an object [px], or refuse the file."""
     value = number(path, content, key)
     if value != int(value) or not 1 <= value <= 1_000_000:
-        raise InputError(
-            path, f"/{key}: not an image size (found {value:g}; expected whole pixels)"
-        )
+        raise CAMERA.error(path, "size", pointer=f"/{key}", found=value, expected="whole pixels")
     return int(value)

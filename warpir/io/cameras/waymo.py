@@ -10,9 +10,8 @@ from typing import Any
 
 import numpy as np
 
-from warpir.core.errors import InputError
 from warpir.core.strict_json import read_numbers
-from warpir.io.cameras.source import StoredCamera, choose_frame, count, member, rigid
+from warpir.io.cameras.source import CAMERA, StoredCamera, choose_frame, count, member, rigid
 from warpir.scene.camera import Camera
 from warpir.scene.lens import Lens
 
@@ -35,13 +34,14 @@ def read_waymo(path: Path, content: dict[str, Any], frame: str | None) -> Stored
     """
     listed = content.get("camera_calibrations", content.get("cameraCalibrations", [content]))
     if not isinstance(listed, list) or not all(isinstance(entry, dict) for entry in listed):
-        raise InputError(path, "/camera_calibrations: not a list of objects")
+        pointer = "/camera_calibrations"
+        raise CAMERA.error(path, "type", pointer=pointer, expected="a list of objects")
     names = [_name(entry.get("name", 0)) for entry in listed]
     entry = listed[choose_frame(path, names, frame, None, noun="camera")]
     numbers = read_numbers(path, "/intrinsic", entry.get("intrinsic"), 9)
     fx, fy, cx, cy, k1, k2, p1, p2, k3 = numbers
     if not (fx > 0.0 and fy > 0.0):
-        raise InputError(path, f"/intrinsic: not a focal length (found {fx:g}, {fy:g})")
+        raise CAMERA.error(path, "focal_length", pointer="/intrinsic", found=min(fx, fy))
     transform = member(path, entry, "extrinsic").get("transform")
     flat = read_numbers(path, "/extrinsic/transform", transform, 16)
     camera_to_vehicle = rigid(path, "extrinsic/transform", np.reshape(flat, (4, 4)))

@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from warpir.core.errors import InputError
+from warpir.core.errors import Faults, InputError
 from warpir.core.limits import LIMITS, Limits
 from warpir.core.strict_json import parse_json_object
 from warpir.io.meshes.asset_files import read_regular, read_uri
@@ -32,6 +32,39 @@ WIDTHS = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4, "MAT4": 16}
 ZERO_BYTES = 256 << 20
 """Largest sparse accessor that begins as zeros and not as a buffer view [byte]."""
 RE_EXPORT_MESH = "re-export without mesh compression (Draco, meshopt)"
+GLTF = Faults(
+    "gltf",
+    {
+        "beyond_data": "{what} end at byte {found}, but there are {limit}",
+        "camera": "camera of type {found!r}, expected perspective",
+        "component_type": "{what} of a wrong kind of number",
+        "container": ("damaged .glb: {what} at byte {found}", "export or copy it again"),
+        "count": "{found} {what}, but {limit} {of}",
+        "cycle": "the nodes form a cycle ({found} nodes hang on no root)",
+        "extension": "{found} is not supported",
+        "index_out_of_range": "{what} {found}, but {limit} {of}",
+        "kind": ("not a .glb file (starts with {found!r}; expected b'glTF')", "convert it to GLB"),
+        "matrix": "{what}",
+        "missing": "{what} is missing",
+        "no_weight": "vertex {found} has no weight",
+        "not_finite": "{what} NaN or infinite",
+        "range": "{what} out of range",
+        "singular": (
+            "singular {what} (a scale of zero?)",
+            "give the object a thickness, or remove it",
+        ),
+        "sparse_order": "the indices do not increase",
+        "stride": "byteStride {found}, but elements of {limit} bytes",
+        "texture_format": "only a {found} image",
+        "too_large": ("{found} bytes of zeros (limit {limit})", RE_EXPORT_MESH),
+        "transform_too_large": "{what} with numbers beyond {limit:g}",
+        "two_parents": "node {found} is listed twice",
+        "type": "{what} of another type",
+        "uv_set": "texCoord {found}, but only sets 0 to {limit} are supported",
+        "version": ("asset version is {found!r}, expected 2.0", "convert it to glTF 2.0"),
+    },
+)
+"""What a file may have wrong; ``pointer`` is its JSON pointer, ``what`` the member or thing."""
 
 
 class Entry:
@@ -48,25 +81,13 @@ class Entry:
         self.pointer = pointer
         self.value = value
 
-    def error(self, what: str, advice: str = "", *, reason: str, **fields: object) -> InputError:
-        """Return an error that names the file and this place in it.
-
-        Args:
-            what: The sentence.
-            advice: What to do about it.
-            reason: The fault, without ``gltf.``.
-            fields: What the sentence says, as values; ``pointer`` is added.
-        """
-        pointer = self.pointer or "/"
-        what, reason = f"{pointer}: {what}", f"gltf.{reason}"
-        error = InputError(self.path, what, advice, reason=reason)
-        error.fields = {"pointer": pointer, **fields}
-        return error
+    def error(self, reason: str, /, *, advice: str = "", **fields: object) -> InputError:
+        """Return the error of a reason of `GLTF` that names the file and this place in it."""
+        return GLTF.error(self.path, reason, advice=advice, pointer=self.pointer or "/", **fields)
 
     def out_of_range(self, what: str, found: int, limit: int, of: str) -> InputError:
         """Return the error of an index: ``what`` is ``found``, but there are ``limit`` of them."""
-        text = f"{what} {found}, but {limit} {of}"
-        return self.error(text, reason="index_out_of_range", found=found, limit=limit)
+        return self.error("index_out_of_range", what=what, found=found, limit=limit, of=of)
 
     def __contains__(self, key: str) -> bool:
         return key in self.value
@@ -76,12 +97,11 @@ class Entry:
         if key not in self.value:
             if default is not None:
                 return default
-            raise self.error(f"{key} is missing", reason="missing")
+            raise self.error("missing", what=key)
         value = self.value[key]
         if not isinstance(value, kinds) or (isinstance(value, bool) and bool not in kinds):
-            raise self.error(
-                f"{key} is {json.dumps(value)[:40]}, expected {expected}", reason="type"
-            )
+            found = json.dumps(value)[:40]
+            raise self.error("type", what=key, found=found, expected=expected)
         return value
 
     def text(self, key: str, default: str | None = None) -> str:
@@ -96,9 +116,7 @@ class Entry:
         """Return an integer of at least ``low``; without ``default`` it must be there."""
         value = self._get(key, (int,), "an integer", default)
         if value < low:
-            raise self.error(
-                f"{key} is {value}, expected at least {low}", reason="range", found=value, limit=low
-            )
+            raise self.error("range", what=key, found=value, limit=low)
         return int(value)
 
     def number(self, key: str, default: float) -> float:
@@ -109,11 +127,9 @@ class Entry:
         """Return as many finite numbers as ``default`` has."""
         values = self._get(key, (list,), "a list of numbers", list(default))
         if len(values) != len(default):
-            raise self.error(
-                f"{key} has {len(values)} numbers, expected {len(default)}", reason="type"
-            )
+            raise self.error("type", what=key, expected=f"{len(default)} numbers")
         if not all(isinstance(v, int | float) and not isinstance(v, bool) for v in values):
-            raise self.error(f"{key} holds something else than numbers", reason="type")
+            raise self.error("type", what=key, expected="numbers alone")
         return tuple(self._finite(key, v) for v in values)
 
     def _finite(self, key: str, value: float) -> float:
@@ -122,7 +138,7 @@ class Entry:
         except OverflowError:
             number = math.inf
         if not math.isfinite(number):
-            raise self.error(f"{key} is not finite", reason="not_finite")
+            raise self.error("not_finite", what=f"{key} is")
         return number
 
     def integers(self, key: str) -> list[int]:
@@ -130,9 +146,8 @@ class Entry:
         values = self._get(key, (list,), "a list of indices", [])
         for value in values:
             if not isinstance(value, int) or isinstance(value, bool) or value < 0:
-                raise self.error(
-                    f"{key} holds {json.dumps(value)[:40]}, expected indices", reason="type"
-                )
+                found = json.dumps(value)[:40]
+                raise self.error("type", what=key, found=found, expected="indices")
         return list(values)
 
     def child(self, key: str) -> "Entry":
@@ -159,7 +174,7 @@ class Entry:
         value = self.value[key][index]
         pointer = f"{self.pointer}/{key}/{index}"
         if not isinstance(value, dict):
-            raise Entry(self.path, pointer, value).error("not an object", reason="type")
+            raise Entry(self.path, pointer, value).error("type", what="entry", expected="an object")
         return Entry(self.path, pointer, value)
 
     def items(self, key: str) -> Iterator["Entry"]:
@@ -205,12 +220,7 @@ class GltfFile:
         self.root = Entry(path, "", parse_json_object(path, text.rstrip(b"\0"), limits))
         version = self.root.child("asset").text("version", "")
         if version.split(".")[0] != "2":
-            raise self.root.error(
-                f"asset version is {version!r}, expected 2.0",
-                "convert it to glTF 2.0",
-                reason="version",
-                found=version,
-            )
+            raise self.root.error("version", found=version)
         self._buffers: dict[int, memoryview] = {}
 
     def _check_json(self, length: int) -> None:
@@ -221,21 +231,10 @@ class GltfFile:
         """Return the JSON chunk of a ``.glb`` and keep its binary chunk."""
 
         def damaged(what: str, offset: int) -> InputError:
-            return InputError(
-                self.path,
-                f"damaged .glb: {what} at byte {offset}",
-                "export or copy it again",
-                reason="gltf.container",
-                found=offset,
-            )
+            return GLTF.error(self.path, "container", what=what, found=offset)
 
         if content[:4] != b"glTF":
-            raise InputError(
-                self.path,
-                f"not a .glb file (starts with {content[:4]!r}; expected b'glTF')",
-                "convert it to GLB",
-                reason="gltf.kind",
-            )
+            raise GLTF.error(self.path, "kind", found=content[:4])
         if len(content) < 20:
             raise damaged(f"the file ends ({len(content)} bytes)", len(content))
         version, total = struct.unpack_from("<II", content, 4)
@@ -271,15 +270,11 @@ class GltfFile:
             elif index == 0 and self._binary is not None:
                 content = self._binary
             else:
-                raise entry.error("no uri and no binary chunk", RE_EXPORT_MESH, reason="missing")
+                raise entry.error("missing", what="uri, and a binary chunk,", advice=RE_EXPORT_MESH)
             length = entry.integer("byteLength", low=1)
             if length > len(content):
-                raise entry.error(
-                    f"byteLength {length}, but {len(content)} bytes",
-                    reason="beyond_data",
-                    found=length,
-                    limit=len(content),
-                )
+                limit = len(content)
+                raise entry.error("beyond_data", what="its bytes", found=length, limit=limit)
             self._buffers[index] = content[:length]
         return self._buffers[index]
 
@@ -288,14 +283,10 @@ class GltfFile:
         entry = self.root.item("bufferViews", index, user, "bufferView")
         content = self.buffer(entry.integer("buffer"), entry)
         start, length = entry.integer("byteOffset", 0), entry.integer("byteLength", low=1)
-        if start + length > len(content):
-            raise entry.error(
-                f"bytes {start} to {start + length}, but the buffer has {len(content)} bytes",
-                reason="beyond_data",
-                found=start + length,
-                limit=len(content),
-            )
-        return content[start : start + length], entry
+        end = start + length
+        if end > len(content):
+            raise entry.error("beyond_data", what="its bytes", found=end, limit=len(content))
+        return content[start:end], entry
 
     def count(self, index: int, user: Entry, what: str) -> int:
         """Return how many elements accessor ``index`` promises, without reading them."""
@@ -317,40 +308,28 @@ class GltfFile:
         entry = self.root.item("accessors", index, user, what)
         kind, component = entry.text("type"), entry.integer("componentType")
         if kind not in types:
-            raise entry.error(
-                f"type {kind} for {what}, expected {' or '.join(types)}", reason="type", found=kind
-            )
+            raise entry.error("type", what=what, found=kind, expected=" or ".join(types))
         if component not in COMPONENTS:
-            raise entry.error(
-                f"componentType {component}, expected {sorted(COMPONENTS)}",
-                reason="component_type",
-                found=component,
-            )
+            raise entry.error("component_type", what="componentType", found=component)
         dtype, width, count = COMPONENTS[component], WIDTHS[kind], entry.integer("count", low=1)
         if "bufferView" in entry:
             elements = self._stored(entry, count, width, dtype)
         elif "sparse" in entry:
             size = count * width * dtype.itemsize
             if size > ZERO_BYTES:
-                raise entry.error(
-                    f"{size} bytes of zeros (limit {ZERO_BYTES})",
-                    RE_EXPORT_MESH,
-                    reason="too_large",
-                    found=size,
-                    limit=ZERO_BYTES,
-                )
+                raise entry.error("too_large", found=size, limit=ZERO_BYTES)
             elements = np.zeros((count, width), dtype)
         else:
-            raise entry.error(
-                f"no bufferView, used by {user.pointer} ({what})", RE_EXPORT_MESH, reason="missing"
-            )
+            used = f"bufferView, used by {user.pointer} ({what}),"
+            raise entry.error("missing", what=used, advice=RE_EXPORT_MESH)
         if "sparse" in entry:
             elements = self._replaced(entry.child("sparse"), elements)
         if dtype.kind == "f":
             self._check_finite(elements, entry)
         elif entry.flag("normalized"):
             if component == 5125:
-                raise entry.error("32-bit integers cannot be normalized", reason="component_type")
+                what = "normalized 32-bit integers are"
+                raise entry.error("component_type", what=what)
             elements = np.maximum(elements / np.float32(np.iinfo(dtype).max), np.float32(-1.0))
         return elements
 
@@ -360,21 +339,12 @@ class GltfFile:
         size = dtype.itemsize * width
         stride = view.integer("byteStride", size, low=-(1 << 62))
         if stride < size:
-            raise view.error(
-                f"byteStride {stride}, but elements of {size} bytes",
-                reason="stride",
-                found=stride,
-                limit=size,
-            )
+            raise view.error("stride", found=stride, limit=size)
         start = entry.integer("byteOffset", 0)
         end = start + stride * (count - 1) + size
         if end > len(content):
-            raise entry.error(
-                f"{count} elements end at byte {end}, but {view.pointer} has {len(content)} bytes",
-                reason="beyond_data",
-                found=end,
-                limit=len(content),
-            )
+            what = f"{count} elements"
+            raise entry.error("beyond_data", what=what, found=end, limit=len(content))
         return np.ndarray((count, width), dtype, content, start, (stride, dtype.itemsize))
 
     def _replaced(self, sparse: Entry, elements: NDArray[Any]) -> NDArray[Any]:
@@ -383,14 +353,10 @@ class GltfFile:
         indices, values = sparse.child("indices"), sparse.child("values")
         component = indices.integer("componentType")
         if component not in (5121, 5123, 5125):
-            raise indices.error(
-                f"componentType {component}, expected 5121, 5123 or 5125",
-                reason="component_type",
-                found=component,
-            )
+            raise indices.error("component_type", what="componentType", found=component)
         where = self._stored(indices, count, 1, COMPONENTS[component])[:, 0].astype(np.int64)
         if (np.diff(where) <= 0).any():
-            raise indices.error("the indices do not increase", reason="sparse_order")
+            raise indices.error("sparse_order")
         if where[-1] >= total:
             raise indices.out_of_range("index", int(where[-1]), total, "elements")
         replaced = elements.copy()
@@ -398,11 +364,7 @@ class GltfFile:
         return replaced
 
     def _check_finite(self, elements: NDArray[Any], entry: Entry) -> None:
-        finite = np.isfinite(elements).all(axis=1)
-        if not finite.all():
-            bad = int(np.flatnonzero(~finite)[0])
-            raise entry.error(
-                f"{int((~finite).sum())} elements are NaN or infinite, first is {bad}",
-                reason="not_finite",
-                found=int((~finite).sum()),
-            )
+        bad = np.flatnonzero(~np.isfinite(elements).all(axis=1))
+        if len(bad):
+            what = f"{len(bad)} elements, first {bad[0]}, are"
+            raise entry.error("not_finite", what=what, found=len(bad))

@@ -65,18 +65,13 @@ def check_extensions(root: Entry, notices: list[str]) -> None:
     for key in ("extensionsRequired", "extensionsUsed"):
         listed = root.value.get(key, [])
         if not isinstance(listed, list) or not all(isinstance(name, str) for name in listed):
-            raise root.error(f"{key} is not a list of names", reason="type")
+            raise root.error("type", what=key, expected="a list of names")
         names[key] = dict.fromkeys(listed)
     for name in names["extensionsRequired"]:
         if name not in HONOURED | BASE_MATERIAL and name not in LEFT_OUT:
-            raise InputError(
-                root.path,
-                f"/extensionsRequired: {name} is not supported",
-                ADVICE.get(name, f"re-export without {name}"),
-                reason="gltf.extension",
-                pointer="/extensionsRequired",
-                found=name,
-            )
+            advice = ADVICE.get(name, f"re-export without {name}")
+            required = Entry(root.path, "/extensionsRequired", listed)
+            raise required.error("extension", found=name, advice=advice)
     for name in names["extensionsUsed"]:
         if name in LEFT_OUT:
             notices.append(f"{name}: {LEFT_OUT[name]}")
@@ -142,21 +137,16 @@ class MaterialReader:
         *base_color, alpha = self._factors(pbr, "baseColorFactor", (1.0,) * 4, 0.0, 1.0)
         mode = entry.text("alphaMode", "OPAQUE")
         if mode not in ("OPAQUE", "MASK", "BLEND"):
-            raise entry.error(
-                f"alphaMode is {mode!r}, expected OPAQUE, MASK or BLEND", reason="range", found=mode
-            )
+            expected = "OPAQUE, MASK or BLEND"
+            raise entry.error("range", what="alphaMode", found=mode, expected=expected)
         strength = entry.extension("KHR_materials_emissive_strength")
         gain = 1.0 if strength is None else strength.number("emissiveStrength", 1.0)
         if gain < 0:
             self.notices.append(f"{entry.pointer}: emissiveStrength {gain:g} clamped to 0")
         emission = self._factors(entry, "emissiveFactor", (0.0,) * 3, 0.0, math.inf)
         if max(emission) * max(gain, 0.0) > EMISSION_LIMIT:
-            found = f"emission of {max(emission) * gain:g}"
-            raise entry.error(
-                f"{found}, expected at most {EMISSION_LIMIT:g}",
-                reason="range",
-                limit=EMISSION_LIMIT,
-            )
+            found = max(emission) * gain
+            raise entry.error("range", what="emission", found=found, limit=EMISSION_LIMIT)
         material = Material(
             name=name,
             base_color=(base_color[0], base_color[1], base_color[2]),
@@ -352,12 +342,7 @@ class MaterialReader:
             # translation * rotation * scale, as in the extension's own GLSL.
             affine = (c * sx, s * sy, ox, -s * sx, c * sy, oy)
         if uv_set > 1:
-            raise entry.error(
-                f"texCoord {uv_set}, but only sets 0 and 1 are supported",
-                reason="uv_set",
-                found=uv_set,
-                limit=1,
-            )
+            raise entry.error("uv_set", found=uv_set, limit=1)
         return TextureSlot(texture, uv_set, affine)
 
     def _texture(self, user: Entry, is_base_color: bool) -> int | None:
@@ -372,11 +357,8 @@ class MaterialReader:
             for k, key in enumerate(("wrapS", "wrapT")):
                 code = sampler.integer(key, 10497)
                 if code not in WRAPS:
-                    raise sampler.error(
-                        f"{key} is {code}, expected one of {sorted(WRAPS)}",
-                        reason="range",
-                        found=code,
-                    )
+                    expected = " or ".join(map(str, WRAPS))
+                    raise sampler.error("range", what=key, found=code, expected=expected)
                 wraps[k] = WRAPS[code]
             if sampler.integer("magFilter", 9729) in NEAREST:
                 self.notices.append(f"{sampler.pointer}: nearest filter replaced by bilinear")
@@ -395,7 +377,7 @@ class MaterialReader:
     def _load(self, source: int, texture: Entry) -> PixelArray | None:
         """Return the pixels of an image; None when it is missing and that is allowed."""
         if source == -1 and texture.extension("KHR_texture_basisu") is None:
-            raise texture.error("no image source", reason="missing")
+            raise texture.error("missing", what="image source")
         image = texture
         if source != -1:
             image = self.file.root.item("images", source, texture, "source")
@@ -405,12 +387,8 @@ class MaterialReader:
             locate(uri, self.file.path, where)  # outside the folder is refused in any case
         try:
             if source == -1:
-                raise texture.error(
-                    "only a KTX2 image",
-                    ADVICE["KHR_texture_basisu"],
-                    reason="texture_format",
-                    found="KTX2",
-                )
+                advice = ADVICE["KHR_texture_basisu"]
+                raise texture.error("texture_format", found="KTX2", advice=advice)
             if "uri" in image:
                 file = self.file
                 encoded = read_uri(uri, file.path, where, file.limits, file.hashes)

@@ -26,11 +26,7 @@ def read_forest(root: Entry, limits: Limits) -> tuple[list[Entry], dict[int, int
             if child >= count:
                 raise node.out_of_range("child", child, count, "nodes")
             if child in parents:
-                raise node.error(
-                    f"child {child} is already a child of node {parents[child]}",
-                    reason="two_parents",
-                    found=child,
-                )
+                raise node.error("two_parents", found=child)
             parents[child] = index
     # Every node has at most one parent, so whatever the roots do not reach is a cycle.
     reached = 0
@@ -39,11 +35,7 @@ def read_forest(root: Entry, limits: Limits) -> tuple[list[Entry], dict[int, int
         reached += 1
         stack += nodes[stack.pop()].integers("children")
     if reached < count:
-        raise root.error(
-            f"the nodes form a cycle ({count - reached} nodes hang on no root)",
-            reason="cycle",
-            found=count - reached,
-        )
+        raise root.error("cycle", found=count - reached)
     return nodes, parents
 
 
@@ -64,7 +56,7 @@ def scene_nodes(
         if index in parents:
             notices.append(f"{scene.pointer}: node {index} is not a root; drawn below its parents")
     if len(set(listed)) < len(listed):
-        raise scene.error("the same node twice", reason="two_parents")
+        raise scene.error("two_parents", found=max(listed, key=listed.count))
     return set(listed)
 
 
@@ -73,16 +65,17 @@ def local_matrix(node: Entry) -> Float64Array:
     parts = [key for key in ("translation", "rotation", "scale") if key in node]
     if "matrix" in node:
         if parts:
-            raise node.error(f"both matrix and {parts[0]}", reason="matrix")
+            raise node.error("matrix", what=f"both matrix and {parts[0]}")
         matrix = np.array(node.numbers("matrix", (0.0,) * 16)).reshape(4, 4).T
         if not np.allclose(matrix[3], [0.0, 0.0, 0.0, 1.0]):
-            raise node.error("matrix is not affine (last row is not 0 0 0 1)", reason="matrix")
+            what = "matrix is not affine (last row is not 0 0 0 1)"
+            raise node.error("matrix", what=what)
         return matrix
     if not parts:
         return np.eye(4)
     rotation = node.numbers("rotation", (0.0, 0.0, 0.0, 1.0))
     if math.hypot(*rotation) < 1e-6:
-        raise node.error("rotation is the zero quaternion", reason="matrix")
+        raise node.error("matrix", what="rotation is the zero quaternion")
     return from_trs(
         node.numbers("translation", (0.0, 0.0, 0.0)), rotation, node.numbers("scale", (1.0,) * 3)
     )
@@ -129,20 +122,17 @@ def read_instances(file: GltfFile, node: Entry, world: Float64Array) -> list[Flo
             file.limits.check("instances", count, file.path, what)
             stored = file.accessor(accessor, attributes, name, (kind,))
             if stored.dtype.kind != "f":
-                raise attributes.error(
-                    f"{name} holds integers that are not normalized", reason="component_type"
-                )
+                raise attributes.error("component_type", what=f"{name} is")
             read[name] = stored.tolist()
     counts = {name: len(values) for name, values in read.items()}
     if len(set(counts.values())) != 1:
-        found = ", ".join(f"{count} {name}" for name, count in counts.items()) or "none"
-        raise attributes.error(
-            f"expected equally many of each attribute (found {found})", reason="count"
-        )
+        found = ", ".join(f"{count} {name}" for name, count in counts.items()) or "no"
+        what, limit = "of the attributes", "equally many"
+        raise attributes.error("count", found=found, what=what, limit=limit, of="are expected")
     (count,) = set(counts.values())
     rotations = read.get("ROTATION", [[0.0, 0.0, 0.0, 1.0]] * count)
     if any(math.hypot(*rotation) < 1e-6 for rotation in rotations):
-        raise attributes.error("ROTATION holds the zero quaternion", reason="matrix")
+        raise attributes.error("matrix", what="ROTATION holds the zero quaternion")
     shifts = read.get("TRANSLATION", [[0.0] * 3] * count)
     scales = read.get("SCALE", [[1.0] * 3] * count)
     with np.errstate(over="ignore", invalid="ignore"):  # `check_invertible` refuses such sizes
@@ -186,16 +176,13 @@ class Skins:
             return bound
         accessor = skin.integer("inverseBindMatrices")
         if self._file.count(accessor, skin, "inverseBindMatrices") < len(joints):
-            raise skin.error(
-                f"fewer inverseBindMatrices than joints ({len(joints)})",
-                reason="count",
-                limit=len(joints),
-            )
+            limit, what = len(joints), "inverseBindMatrices"
+            raise skin.error("count", found="too few", what=what, limit=limit, of="joints")
         stored = self._file.accessor(accessor, skin, "inverseBindMatrices", ("MAT4",))[
             : len(joints)
         ]
         if stored.dtype.kind != "f":
-            raise skin.error("inverseBindMatrices are not floats", reason="component_type")
+            raise skin.error("component_type", what="inverseBindMatrices are")
         inverse = stored.astype(np.float64).reshape(-1, 4, 4).transpose(0, 2, 1)
         with np.errstate(over="ignore", invalid="ignore"):
             return np.asarray(bound @ inverse)
@@ -217,15 +204,7 @@ def check_invertible(node: Entry, world: Float64Array, which: str = "") -> None:
     """Refuse a transform that flattens the mesh or overflows."""
     linear = world[:3, :3]
     if not (np.abs(world) < EXTENT).all():
-        raise node.error(
-            f"transform{which} with numbers beyond {EXTENT:g}",
-            reason="transform_too_large",
-            limit=EXTENT,
-        )
+        raise node.error("transform_too_large", what=f"transform{which}", limit=EXTENT)
     volume = np.linalg.norm(linear, axis=0).prod()
     if abs(np.linalg.det(linear)) <= 1e-9 * volume:
-        raise node.error(
-            f"singular transform{which} (a scale of zero?)",
-            "give the object a thickness, or remove it",
-            reason="singular",
-        )
+        raise node.error("singular", what=f"transform{which}")

@@ -201,17 +201,7 @@ def read_geometry(
         return None
 
     def read(name: str, types: tuple[str, ...]) -> PixelArray | None:
-        if name not in attributes:
-            return None
-        count = file.count(attributes.integer(name), entry, name)
-        if count != len(positions):
-            raise entry.error(
-                f"{count} {name}, but {len(positions)} vertices",
-                reason="count",
-                found=count,
-                limit=len(positions),
-            )
-        return file.accessor(attributes.integer(name), entry, name, types)
+        return _attribute(file, entry, name, types, len(positions)) if name in attributes else None
 
     normals, tangents = None, None
     stored = read("NORMAL", ("VEC3",))
@@ -236,12 +226,23 @@ def read_geometry(
     return Geometry(positions, indices, normals, tangents, uvs[0], uvs[1], colors)
 
 
+def _attribute(
+    file: GltfFile, entry: Entry, name: str, types: tuple[str, ...], vertex_count: int
+) -> PixelArray:
+    """Return an attribute of a primitive, of as many elements as it has vertices."""
+    accessor = entry.child("attributes").integer(name)
+    count = file.count(accessor, entry, name)
+    if count != vertex_count:
+        raise entry.error("count", found=count, what=name, limit=vertex_count, of="vertices")
+    return file.accessor(accessor, entry, name, types)
+
+
 def read_triangles(file: GltfFile, entry: Entry, vertex_count: int, notices: list[str]) -> IntArray:
     """Return the triangles of a list, strip or fan, shape [triangle, 3]."""
     if "indices" in entry:
         stored = file.accessor(entry.integer("indices"), entry, "indices", ("SCALAR",))[:, 0]
         if stored.dtype.kind != "u":
-            raise entry.error("indices are not unsigned integers", reason="component_type")
+            raise entry.error("component_type", what="indices are")
         highest = int(stored.max())
         if highest >= vertex_count:
             raise entry.out_of_range("index", highest, vertex_count, "vertices")
@@ -250,7 +251,7 @@ def read_triangles(file: GltfFile, entry: Entry, vertex_count: int, notices: lis
         corners = np.arange(vertex_count, dtype=np.int32)
     mode = entry.integer("mode", 4)
     if mode not in (4, STRIP, FAN):
-        raise entry.error(f"mode is {mode}, expected 0 to 6", reason="range", found=mode)
+        raise entry.error("range", what="mode", found=mode, expected="0 to 6")
     if mode == 4:
         spare = len(corners) % 3
         if spare:
@@ -268,7 +269,7 @@ def read_colors(stored: PixelArray | None, entry: Entry, notices: list[str]) -> 
     if stored is None:
         return None
     if stored.dtype.kind != "f":
-        raise entry.error("COLOR_0 holds integers that are not normalized", reason="component_type")
+        raise entry.error("component_type", what="COLOR_0 is")
     if stored.min() < 0 or stored.max() > 1:
         notices.append(f"{entry.pointer}: COLOR_0 clamped to 0 ... 1")
     colors = np.ones((len(stored), 4), dtype=np.float32)
@@ -291,9 +292,7 @@ def pose(file: GltfFile, entry: Entry, geometry: Geometry, joints: Float64Array)
         volume = np.linalg.norm(linear, axis=1).prod(axis=1)
         sign = np.linalg.det(linear)
     if not ((np.abs(moved) < EXTENT).all() and (np.abs(sign) > 1e-9 * volume).all()):
-        raise entry.error(
-            "the joints flatten the mesh, or are beyond all bounds", reason="singular"
-        )
+        raise entry.error("singular", what="transforms of the joints, or beyond all bounds")
     mirrored = bool(np.median(sign) < 0)
     normals, tangents = geometry.normals, geometry.tangents
     if normals is not None:
@@ -321,29 +320,17 @@ def _blended_joints(file: GltfFile, entry: Entry, count: int, joints: Float64Arr
     total = np.zeros(count)
     sets = sum(f"JOINTS_{k}" in attributes for k in range(len(attributes.value)))
     for k in range(max(sets, 1)):
-        stored = []
-        for name in (f"JOINTS_{k}", f"WEIGHTS_{k}"):
-            found = file.count(attributes.integer(name), entry, name)
-            if found != count:
-                raise entry.error(
-                    f"{found} {name}, but {count} vertices",
-                    reason="count",
-                    found=found,
-                    limit=count,
-                )
-            stored.append(file.accessor(attributes.integer(name), entry, name, ("VEC4",)))
-        index, weight = stored
+        index = _attribute(file, entry, f"JOINTS_{k}", ("VEC4",), count)
+        weight = _attribute(file, entry, f"WEIGHTS_{k}", ("VEC4",), count)
         if index.dtype.kind != "u" or weight.dtype.kind != "f":
-            raise entry.error(
-                f"JOINTS_{k} or WEIGHTS_{k} are of a wrong kind of number", reason="component_type"
-            )
+            raise entry.error("component_type", what=f"JOINTS_{k} or WEIGHTS_{k} are")
         if index.max() >= len(joints):
             raise entry.out_of_range(f"JOINTS_{k} index", int(index.max()), len(joints), "joints")
         for column in range(4):
             moved += weight[:, column, None, None] * joints[index[:, column]]
             total += weight[:, column]
     if not (total > 0.0).all():
-        raise entry.error(f"vertex {int(np.argmin(total > 0.0))} has no weight", reason="no_weight")
+        raise entry.error("no_weight", found=int(np.argmin(total > 0.0)))
     moved /= total[:, None, None]
     return moved
 

@@ -10,7 +10,7 @@ import io
 import math
 import struct
 import tempfile
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -60,6 +60,8 @@ def png_profile(path: Path, icc: bytes | None) -> tuple[bytes | None, list[str]]
                 path,
                 f"high dynamic range in a PNG is not supported (found {found})",
                 "save it as a linear EXR, or as sRGB",
+                reason="icc.high_dynamic_range",
+                found=found,
             )
         if primaries in _CICP_PRIMARIES and curve in _CICP_CURVES and not matrix and is_full:
             if (primaries, curve) == (1, 13):
@@ -85,14 +87,8 @@ def png_profile(path: Path, icc: bytes | None) -> tuple[bytes | None, list[str]]
 
 def grey_profile(icc: bytes) -> bytes:
     """Return an RGB profile with the curve of a grey one, or the profile itself if it is none."""
-    if icc[16:20] != b"GRAY" or not _profile_is_whole(icc):
-        return icc
-    (count,) = struct.unpack_from(">I", icc, 128)
-    for k in range(count):
-        name, offset, size = struct.unpack_from(">4sII", icc, 132 + 12 * k)
-        if name == b"kTRC":
-            return matrix_profile(color.REC709_CHROMATICITIES, icc[offset : offset + size])
-    return icc
+    curve = _tags(icc).get(b"kTRC") if icc[16:20] == b"GRAY" else None
+    return icc if curve is None else matrix_profile(color.REC709_CHROMATICITIES, curve)
 
 
 def matrix_profile(chromaticities: Sequence[float], curve: bytes) -> bytes:
@@ -119,14 +115,37 @@ def matrix_profile(chromaticities: Sequence[float], curve: bytes) -> bytes:
     for letter, column in zip((b"r", b"g", b"b"), columns, strict=True):
         tags[letter + b"XYZ"] = b"XYZ \0\0\0\0" + fixed(*column)
         tags[letter + b"TRC"] = curve
+    head = struct.pack(">8xI4s4s4s", 0x04300000, b"mntr", b"RGB ", b"XYZ ")
+    head += struct.pack(">6H4s", 2026, 1, 1, 0, 0, 0, b"acsp") + bytes(28) + fixed(*_D50_XYZ)
+    return _packed(head.ljust(128, b"\0"), tags)
+
+
+def _packed(head: bytes, tags: Mapping[bytes, bytes]) -> bytes:
+    """Return the profile of a header, whose length is set, and some tags."""
     table, body, start = struct.pack(">I", len(tags)), b"", 132 + 12 * len(tags)
     for name, content in tags.items():
         table += name + struct.pack(">II", start + len(body), len(content))
         body += content + bytes(-len(content) % 4)
-    size = start + len(body)
-    head = struct.pack(">I4xI4s4s4s", size, 0x04300000, b"mntr", b"RGB ", b"XYZ ")
-    head += struct.pack(">6H4s", 2026, 1, 1, 0, 0, 0, b"acsp") + bytes(28) + fixed(*_D50_XYZ)
-    return head.ljust(128, b"\0") + table + body
+    return struct.pack(">I", start + len(body)) + head[4:] + table + body
+
+
+def _tags(icc: bytes) -> dict[bytes, bytes]:
+    """Return the tags of a profile by their names; none where one does not lie inside it.
+
+    OpenColorIO believes the counts: a flipped byte in them costs a minute and gigabytes.
+    """
+    if len(icc) < 132 or icc[36:40] != b"acsp":
+        return {}
+    (count,) = struct.unpack_from(">I", icc, 128)
+    if 132 + 12 * count > len(icc):
+        return {}
+    tags = {}
+    for k in range(count):
+        name, offset, size = struct.unpack_from(">4sII", icc, 132 + 12 * k)
+        tags[name] = icc[offset : offset + size]
+        if size < 8 or offset + size > len(icc) or not _tag_is_whole(tags[name]):
+            return {}
+    return tags
 
 
 def _parametric(numbers: Sequence[float]) -> bytes:
@@ -158,7 +177,7 @@ def convert_profile(
 ) -> tuple[PixelArray, FloatArray, bytes | None, str]:
     """Return (codes, srgb, profile to keep, notice) of an image that carries a profile."""
     broken = "colour profile is broken: taken as sRGB"
-    if not _profile_is_whole(icc):
+    if not _tags(icc):
         return codes, srgb, None, broken
     probe = np.stack(np.meshgrid(*[np.linspace(0.0, 1.0, 9, dtype=np.float32)] * 3), axis=-1)
     probe = probe.reshape(27, 27, 3)
@@ -181,39 +200,13 @@ def convert_profile(
     return codes, np.clip(converted, 0.0, 1.0), icc, notice
 
 
-def _profile_is_whole(icc: bytes) -> bool:
-    """Check that the tags of a profile lie inside it.
-
-    OpenColorIO believes the counts: a flipped byte in them costs a minute and gigabytes.
-    """
-    if len(icc) < 132 or icc[36:40] != b"acsp":
-        return False
-    (tag_count,) = struct.unpack_from(">I", icc, 128)
-    if 132 + 12 * tag_count > len(icc):
-        return False
-    for k in range(tag_count):
-        offset, size = struct.unpack_from(">4xII", icc, 132 + 12 * k)
-        if size < 8 or offset + size > len(icc):
-            return False
-        if not _table_is_whole(icc[offset : offset + size]):
-            return False
-        if icc[offset : offset + 4] == b"curv":
-            if size < 12 or 12 + 2 * struct.unpack_from(">I", icc, offset + 8)[0] > size:
-                return False
-    return True
-
-
 def _primaries_are_apart(icc: bytes) -> bool:
     """Return whether codes can be told from the colours that a profile's primaries mix."""
-    (count,) = struct.unpack_from(">I", icc, 128)
-    columns = {}
-    for k in range(count):
-        name, offset, size = struct.unpack_from(">4sII", icc, 132 + 12 * k)
-        if name in (b"rXYZ", b"gXYZ", b"bXYZ") and size >= 20:
-            columns[name] = struct.unpack_from(">3i", icc, offset + 8)
-    if len(columns) < 3:  # tables mix them
+    tags = _tags(icc)
+    columns = [tags.get(name, b"") for name in (b"rXYZ", b"gXYZ", b"bXYZ")]
+    if min(map(len, columns)) < 20:  # tables mix them
         return True
-    primaries = np.array([*columns.values()]) / 65536.0
+    primaries = np.array([struct.unpack_from(">3i", column, 8) for column in columns]) / 65536.0
     return bool(np.linalg.cond(primaries) < _MOST_CONDITION)
 
 
@@ -225,16 +218,14 @@ _COLOR_TAGS = (
 
 def _colors_alone(icc: bytes) -> bytes:
     """Return a profile without its texts, whose lengths OpenColorIO believes, up to gigabytes."""
-    (count,) = struct.unpack_from(">I", icc, 128)
-    entries = [icc[132 + 12 * k : 144 + 12 * k] for k in range(count)]
-    kept = [entry for entry in entries if entry.startswith(_COLOR_TAGS)]
-    table = struct.pack(">I", len(kept)) + b"".join(kept)
-    # What the others pointed to stays where it was, so that no offset changes.
-    return icc[:128] + table + bytes(12 * (count - len(kept))) + icc[132 + 12 * count :]
+    tags = _tags(icc).items()
+    return _packed(icc[:128], {name: tag for name, tag in tags if name.startswith(_COLOR_TAGS)})
 
 
-def _table_is_whole(tag: bytes) -> bool:
-    """Check that the numbers of a lookup table are as many as its sizes say, where it is one."""
+def _tag_is_whole(tag: bytes) -> bool:
+    """Check that the numbers of a curve or a lookup table are as many as its sizes say."""
+    if tag[:4] == b"curv":
+        return len(tag) >= 12 and 12 + 2 * struct.unpack_from(">I", tag, 8)[0] <= len(tag)
     if tag[:4] in (b"mft1", b"mft2"):
         width = 1 if tag[:4] == b"mft1" else 2
         if len(tag) < 52:
@@ -275,6 +266,8 @@ def _convert_lut_profile(
             path,
             "colour profile with tables on a 16-bit image is not supported",
             "convert the image to sRGB or Display P3",
+            reason="icc.table_depth",
+            found=codes.dtype.name,
         )
     try:
         picture = ImageCms.profileToProfile(

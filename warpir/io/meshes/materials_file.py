@@ -15,7 +15,7 @@ from typing import Any
 
 from warpir.core.errors import InputError
 from warpir.core.limits import LIMITS, Limits
-from warpir.core.strict_json import read_json_object, read_numbers
+from warpir.core.strict_json import read_numbers, read_versioned
 from warpir.scene.asset import Asset, Material
 
 FORMAT = "warpir-materials"
@@ -44,11 +44,7 @@ def with_materials(asset: Asset, path: str | Path, limits: Limits = LIMITS) -> A
         InputError: Missing, of another format, made for another asset, or a factor is out of range;
             names the material.
     """
-    root = read_json_object(path, limits)
-    if root.get("format") != FORMAT or root.get("version") != VERSION:
-        found = f"{root.get('format')!r:.40} version {root.get('version')!r:.10}"
-        expected = f"{FORMAT!r} version {VERSION}"
-        raise InputError(path, f"not materials (found {found}; expected {expected})")
+    root = read_versioned(path, "materials", VERSION, limits)
     entries = root.get("materials")
     if not isinstance(entries, list) or len(entries) != len(asset.materials):
         count = f"{len(entries)}" if isinstance(entries, list) else "no list"

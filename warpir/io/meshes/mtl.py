@@ -15,7 +15,7 @@ from pathlib import Path, PurePosixPath
 import numpy as np
 
 from warpir.core.arrays import CodeArray
-from warpir.core.errors import InputError, shown
+from warpir.core.errors import Faults, InputError, shown
 from warpir.core.limits import LIMITS, Limits
 from warpir.io.meshes.asset_files import (
     TextureDecoder,
@@ -27,6 +27,15 @@ from warpir.io.meshes.asset_files import (
 from warpir.io.meshes.materials_file import EMISSION_LIMIT
 from warpir.scene.asset import Material, Texture, TextureSlot
 
+MTL = Faults(
+    "mtl",
+    {
+        "map": "map without a file name",
+        "number": "{found!r}, expected {expected}",
+        "range": "Ke {found:g}, expected at most {limit:g}",
+    },
+)
+"""What a file may have wrong; ``pointer`` is the file and the line, or the material."""
 GREY = (0.8, 0.8, 0.8)
 """Base colour where the file states none."""
 ROUGHNESS = 0.5
@@ -198,22 +207,12 @@ class MaterialLibrary:
                 key = "map_bump" if key == "bump" else key
                 entry.maps[key] = self._parse_map(rest, where, str(PurePosixPath(file).parent))
             elif key in NUMBERS:
-                if key[0] == "k" and words[1:2] in (["spectral"], ["xyz"]):
-                    raise InputError(
-                        self.path,
-                        f"{where}: {words[0]} {words[1]}, expected RGB",
-                        reason="mtl.number",
-                    )
                 values = words[2:] if words[1:2] == ["-halo"] else words[1:]
+                if key[0] == "k" and (len(values) == 2 or values[:1] in (["spectral"], ["xyz"])):
+                    raise self._bad_number(where, raw, "RGB")
                 numbers = self._numbers(values[:3], where, raw)
                 # One number stands for three, as in Kd 0.5.
                 entry.numbers[key] = numbers * 3 if key[0] == "k" and len(numbers) == 1 else numbers
-                if key[0] == "k" and len(entry.numbers[key]) != 3:
-                    raise InputError(
-                        self.path,
-                        f"{where}: {raw.strip()[:60]!r}, expected RGB",
-                        reason="mtl.number",
-                    )
             elif key not in MEANINGLESS:
                 entry.left_out.append(words[0])
 
@@ -225,12 +224,12 @@ class MaterialLibrary:
         if any("_" in word for word in words):  # Python reads 1_0 as 10
             numbers = ()
         if not numbers or not all(math.isfinite(number) for number in numbers):
-            raise InputError(
-                self.path,
-                f"{where}: {raw.strip()[:60]!r}, expected finite numbers",
-                reason="mtl.number",
-            )
+            raise self._bad_number(where, raw, "finite numbers")
         return numbers
+
+    def _bad_number(self, where: str, raw: str, expected: str) -> InputError:
+        found = raw.strip()[:60]
+        return MTL.error(self.path, "number", pointer=where, found=found, expected=expected)
 
     def _parse_map(self, rest: str, where: str, folder: str) -> MapStatement:
         """Read options and file name; the name may contain spaces."""
@@ -249,7 +248,7 @@ class MaterialLibrary:
             if option not in HONOURED_OPTIONS:
                 self.notices.append(f"{where}: {option} {' '.join(values)} ignored")
         if not rest:
-            raise InputError(self.path, f"{where}: map without a file name", reason="mtl.map")
+            raise MTL.error(self.path, "map", pointer=where)
         name = rest.replace("\\", "/")
 
         def pair(option: str, default: float) -> tuple[float, float]:
@@ -274,13 +273,8 @@ class MaterialLibrary:
         normal = maps.get("norm", maps.get("map_bump"))
         emission = self._color(name, entry, "ke", (0.0,) * 3)
         if max(emission) > EMISSION_LIMIT:
-            what = f"material {shown(name)}: Ke {max(emission):g}"
-            raise InputError(
-                self.path,
-                f"{what}, expected at most {EMISSION_LIMIT:g}",
-                reason="mtl.range",
-                limit=EMISSION_LIMIT,
-            )
+            where, found = f"material {shown(name)}", max(emission)
+            raise MTL.error(self.path, "range", pointer=where, found=found, limit=EMISSION_LIMIT)
         color = self._color(name, entry, "kd", GREY)
         red, green, blue = (min(max(value, 0.0), 1.0) for value in color)
         if (red, green, blue) != color:

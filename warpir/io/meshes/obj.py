@@ -14,7 +14,7 @@ from pathlib import Path
 import numpy as np
 
 from warpir.core.arrays import Float64Array, FloatArray, Int64Array, IntArray
-from warpir.core.errors import InputError
+from warpir.core.errors import Faults, InputError
 from warpir.core.limits import LIMITS, Limits
 from warpir.io.meshes.asset_files import concise, read_regular
 from warpir.io.meshes.mtl import MaterialLibrary
@@ -28,6 +28,20 @@ from warpir.io.meshes.triangles import (
 )
 from warpir.scene.asset import Asset, Primitive
 
+OBJ = Faults(
+    "obj",
+    {
+        "color": (
+            "v with {found} numbers (expected x y z r g b)",
+            "export colours of three numbers, or as GLB",
+        ),
+        "face": "face with {found} corners",
+        "index_out_of_range": "corner {found}, but {limit} {word} (indices start at 1)",
+        "kind": ("not an OBJ file", "convert it to GLB"),
+        "number": "{found}, expected {count} numbers up to {limit:g}",
+    },
+)
+"""What a file may have wrong."""
 WORDS = ("v", "vt", "vn")
 """Statements that the three indices of a corner count."""
 NAMED = ("usemtl", "mtllib")
@@ -107,16 +121,7 @@ class Statements:
             InputError: They are of another count, or not numbers.
         """
         if len(values) > 6:  # a weight before the colour, or an opacity behind it
-            what = f"line {line}: v with {len(values)} numbers (expected x y z r g b)"
-            raise InputError(
-                path,
-                what,
-                "export colours of three numbers, or as GLB",
-                reason="obj.number",
-                line=line,
-                found=len(values),
-                limit=6,
-            )
+            raise OBJ.error(path, "color", line=line, found=len(values))
         if len(values) == 6:
             color = _numbers(path, line, "v", values[3:], 3)
             self.colors[len(self.positions)] = color
@@ -152,7 +157,7 @@ def _read_statements(path: Path, content: bytes, notices: list[str]) -> Statemen
         InputError: A number or face is damaged, or this is no OBJ file.
     """
     if b"\0" in content[:4096]:
-        raise InputError(path, "not an OBJ text file", "convert it to GLB", reason="obj.kind")
+        raise OBJ.error(path, "kind", found="no text")
     try:
         whole = content.decode("utf-8-sig")
     except UnicodeDecodeError:
@@ -173,13 +178,7 @@ def _read_statements(path: Path, content: bytes, notices: list[str]) -> Statemen
                 text.normals.append(_numbers(path, line, word, values, 3))
             case "f":
                 if len(values) < 3:
-                    raise InputError(
-                        path,
-                        f"line {line}: face with {len(values)} corners",
-                        reason="obj.face",
-                        line=line,
-                        found=len(values),
-                    )
+                    raise OBJ.error(path, "face", line=line, found=len(values))
                 if "-" in statement:
                     values = [_absolute(path, line, v, text.counts()) for v in values]
                 text.faces.setdefault(material, []).append((line, values))
@@ -190,12 +189,7 @@ def _read_statements(path: Path, content: bytes, notices: list[str]) -> Statemen
             case _ if word not in IGNORED:
                 left_out[word] += 1
     if not (text.positions or text.faces):
-        raise InputError(
-            path,
-            "not an OBJ file (no v and no f statements)",
-            "convert it to GLB",
-            reason="obj.kind",
-        )
+        raise OBJ.error(path, "kind", found="no v and no f statements")
     notices += [f"{count} {word[:20]!r} statements ignored" for word, count in left_out.items()]
     return text
 
@@ -230,15 +224,10 @@ def _numbers(path: Path, line: int, word: str, values: list[str], width: int) ->
     except ValueError:
         sound = False
     if not sound or any("_" in value for value in values[:width]):  # Python reads 1_0 as 10
-        shown = " ".join([word, *values])[:60]
-        what = f"line {line}: {shown!r}, expected {width} numbers up to {LARGEST:g}"
-        raise InputError(
-            path,
-            what,
-            "write numbers with decimal points" if "," in shown else "",
-            reason="obj.number",
-            line=line,
-            limit=LARGEST,
+        found = repr(" ".join([word, *values])[:60])
+        advice = "write numbers with decimal points" if "," in found else ""
+        raise OBJ.error(
+            path, "number", line=line, found=found, count=width, limit=LARGEST, advice=advice
         )
     return numbers
 
@@ -250,12 +239,17 @@ def _absolute(path: Path, line: int, corner: str, counts: tuple[int, int, int]) 
         if re.fullmatch(r"-[0-9]+", part):  # what else begins so is refused by `_unique_corners`
             value = counts[k] + 1 - int(part[1:20])  # of more digits it is out of range anyway
             if not 1 <= value <= counts[k]:
-                what = f"line {line}: index {part[:20]}, but {counts[k]} {WORDS[k]}"
-                raise InputError(
-                    path, what, reason="obj.index_out_of_range", line=line, limit=counts[k]
-                )
+                raise _no_such(path, line, part[:20], k, counts)
             parts[k] = str(value)
     return "/".join(parts)
+
+
+def _no_such(path: Path, line: int, found: str, k: int, counts: tuple[int, int, int]) -> InputError:
+    """Return the error of a corner's index ``k`` that counts none of its statements."""
+    limit = counts[k % 3]
+    return OBJ.error(
+        path, "index_out_of_range", line=line, found=found, limit=limit, word=WORDS[k % 3]
+    )
 
 
 def _vertex_colors(
@@ -346,13 +340,6 @@ def _unique_corners(
             value = int(part) if is_index else 0
             if not 1 <= value <= counts[k % 3]:
                 line = next(line for line, corners in faces if corner in corners)
-                raise InputError(
-                    path,
-                    f"line {line}: corner {corner[:40]!r}, but {counts[k % 3]} {WORDS[k % 3]} "
-                    "(indices start at 1)",
-                    reason="obj.index_out_of_range",
-                    line=line,
-                    limit=counts[k % 3],
-                )
+                raise _no_such(path, line, repr(corner[:40]), k, counts)
             triples[row, k] = value - 1
     return triples, {size: np.array(p, dtype=np.int32) for size, p in by_size.items()}

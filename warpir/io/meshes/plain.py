@@ -10,13 +10,13 @@ from pathlib import Path
 import numpy as np
 
 from warpir.core.arrays import Float64Array, FloatArray, IntArray
-from warpir.core.errors import InputError
 from warpir.core.limits import LIMITS, Limits
 from warpir.io.meshes.asset_files import concise, plain_material, read_regular
-from warpir.io.meshes.ply import Element, Lists, read_ply
+from warpir.io.meshes.ply import PLY, Element, Lists, read_ply
 from warpir.io.meshes.stl import read_stl
 from warpir.io.meshes.triangles import (
     LARGEST,
+    MESH,
     check_drawable,
     check_triangle_count,
     drop_without_area,
@@ -41,18 +41,12 @@ def read_ply_mesh(path: Path, limits: Limits = LIMITS) -> Asset:
     vertex, face = ply.element("vertex"), ply.element("face")
     positions = _finite(path, vertex, ("x", "y", "z"))
     if positions is None:
-        raise InputError(
-            path, "no x, y and z of vertices", "convert it to GLB", reason="ply.no_positions"
-        )
+        raise PLY.error(path, "no_positions")
     corners = face.lists.get("vertex_indices", face.lists.get("vertex_index"))
     if corners is None or not len(corners.lengths):
-        others = ", ".join(f"{e.count} {e.name}" for e in ply.elements.values())
-        raise InputError(
-            path,
-            f"nothing to render (found {others[:80]}; expected faces)",
-            "a point cloud of the place belongs to --ground-points",
-            reason="mesh.nothing_to_render",
-        )
+        found = ", ".join(f"{e.count} {e.name}" for e in ply.elements.values())[:80]
+        advice = "a point cloud of the place belongs to --ground-points"
+        raise MESH.error(path, "nothing_to_render", found=found, expected="faces", advice=advice)
     check_triangle_count(path, int(np.maximum(corners.lengths - 2, 0).sum()), limits)
     polygons = _polygons(path, corners, len(positions), notices)
     normals = _finite(path, vertex, ("nx", "ny", "nz"))
@@ -76,7 +70,7 @@ def read_stl_mesh(path: Path, limits: Limits = LIMITS) -> Asset:
     corners = read_stl(path, read_regular(path, path, limits=limits, hashes=hashes), notices)
     check_triangle_count(path, len(corners), limits)
     if not np.isfinite(corners).all():
-        raise InputError(path, "vertices are NaN or infinite", reason="mesh.not_finite")
+        raise MESH.error(path, "not_finite", what="vertices")
     indices = np.arange(3 * len(corners), dtype=np.int32).reshape(-1, 3)
     return _asset(path, corners.reshape(-1, 3), indices, None, None, notices, hashes)
 
@@ -138,20 +132,10 @@ def _polygons(
     """
     used = corners.values
     if (used != np.round(used)).any():
-        raise InputError(
-            path,
-            f"index {used[used != np.round(used)][0]:g} is no whole number",
-            reason="ply.index",
-        )
+        raise PLY.error(path, "index", found=float(used[used != np.round(used)][0]))
     if len(used) and not 0 <= used.min() <= used.max() < vertex_count:
-        worst = used.min() if used.min() < 0 else used.max()
-        raise InputError(
-            path,
-            f"index {worst:g}, but {vertex_count} vertices",
-            reason="ply.index_out_of_range",
-            found=int(worst),
-            limit=vertex_count,
-        )
+        worst = int(used.min() if used.min() < 0 else used.max())
+        raise PLY.error(path, "index_out_of_range", found=worst, limit=vertex_count)
     if lines := int((corners.lengths < 3).sum()):
         notices.append(f"{lines} faces of fewer than 3 corners ignored")
     return {n: rows.astype(np.int32) for n, rows in corners.by_length().items() if n >= 3}
@@ -166,12 +150,7 @@ def _finite(path: Path, element: Element, names: tuple[str, ...]) -> Float64Arra
     table = element.table(*names)
     if table is not None and not (usable := np.abs(table) < LARGEST).all():
         row = int(np.flatnonzero(~usable.all(axis=1))[0])
-        raise InputError(
-            path,
-            f"{' '.join(names)} of {element.name} {row} are NaN or infinite",
-            reason="mesh.not_finite",
-            found=row,
-        )
+        raise MESH.error(path, "not_finite", what=f"{' '.join(names)} of {element.name} {row}")
     return table
 
 
@@ -191,7 +170,6 @@ def _colors(path: Path, vertex: Element) -> FloatArray | None:
             colors[:, k] = vertex.columns[name] / scale
         if not ((colors >= 0.0) & (colors <= 1.0)).all():
             found = f"{colors.min():g} to {colors.max():g}"
-            what = f"vertex colours from {found} (expected 0 to 1, or integers)"
-            raise InputError(path, what, reason="ply.color")
+            raise PLY.error(path, "color", found=found)
         return colors.astype(np.float32)
     return None

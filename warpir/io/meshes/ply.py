@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from warpir.core.errors import InputError
+from warpir.core.errors import Faults, InputError
 
 TYPES = {
     "char": "i1", "int8": "i1", "uchar": "u1", "uint8": "u1", "short": "i2", "int16": "i2",
@@ -22,6 +22,20 @@ ORDERS = {"ascii": "<", "binary_little_endian": "<", "binary_big_endian": ">"}
 HEADER_BYTES = 1 << 20
 """Longest header [byte]."""
 ADVICE = "export it again, or as GLB"
+PLY = Faults(
+    "ply",
+    {
+        "color": "vertex colours from {found} (expected 0 to 1, or integers)",
+        "damaged": ("damaged PLY: {what}", ADVICE),
+        "header": ("damaged PLY: {what}", ADVICE),
+        "index": "index {found:g} is no whole number",
+        "index_out_of_range": "index {found}, but {limit} vertices",
+        "kind": ("not a PLY file (does not start with 'ply')", "convert it to GLB"),
+        "no_positions": ("no x, y and z of vertices", "convert it to GLB"),
+        "range": ("damaged PLY: {element} {name} {found:g} is no {kind}", ADVICE),
+    },
+)
+"""What a file may have wrong."""
 
 
 @dataclass(frozen=True)
@@ -93,17 +107,15 @@ def read_ply(path: Path, content: bytes) -> Ply:
                 raise ValueError("a number with _")
             body = np.array(body.split(), dtype=np.float64).astype("<f8").tobytes()
         except ValueError as error:
-            raise InputError(
-                path, f"damaged PLY: {str(error)[:80]}", ADVICE, reason="ply.damaged"
-            ) from None
+            raise PLY.error(path, "damaged", what=str(error)[:80]) from None
         cell = "f8"
     at = 0
     for element in ply.elements.values():
         try:
             at = _read_element(element, body, at, ORDERS[order], cell)
         except (struct.error, ValueError, OverflowError):
-            what = f"damaged PLY: it ends within its {element.count} {element.name} elements"
-            raise InputError(path, what, ADVICE, reason="ply.damaged") from None
+            what = f"it ends within its {element.count} {element.name} elements"
+            raise PLY.error(path, "damaged", what=what) from None
         for name, column in element.columns.items():
             element.columns[name] = _as_stated(path, element, name, column)
         for name, lists in element.lists.items():
@@ -111,9 +123,7 @@ def read_ply(path: Path, content: bytes) -> Ply:
             element.lists[name] = Lists(lists.lengths, stated)
     rest = len(body) - at
     if order == "ascii" and rest:
-        raise InputError(
-            path, f"damaged PLY: {rest // 8} numbers too many", ADVICE, reason="ply.damaged"
-        )
+        raise PLY.error(path, "damaged", what=f"{rest // 8} numbers too many")
     return ply
 
 
@@ -124,16 +134,11 @@ def read_header(path: Path, content: bytes) -> tuple[Ply, str, int]:
         InputError: With the line at fault.
     """
     if not content.startswith(b"ply"):
-        raise InputError(
-            path,
-            "not a PLY file (does not start with 'ply')",
-            "convert it to GLB",
-            reason="ply.kind",
-        )
+        raise PLY.error(path, "kind")
     newline = b"\r" if content[3:4] == b"\r" and content[4:5] != b"\n" else b"\n"
     end = content.find(newline + b"end_header", 0, HEADER_BYTES) + 1  # a comment may hold the word
     if not end:
-        raise InputError(path, "damaged PLY: no end_header", ADVICE, reason="ply.header")
+        raise PLY.error(path, "header", what="no end_header")
     start = content.find(newline, end) + 1 or len(content)
     ply, order = Ply({}, ()), ""
     comments: list[str] = []
@@ -141,13 +146,7 @@ def read_header(path: Path, content: bytes) -> tuple[Ply, str, int]:
     for line, text in enumerate(content[:end].decode("latin-1").splitlines(), 1):
 
         def wrong(what: str, line: int = line, text: str = text) -> InputError:
-            return InputError(
-                path,
-                f"damaged PLY: line {line}: {text[:40]!r}, {what}",
-                ADVICE,
-                reason="ply.header",
-                line=line,
-            )
+            return PLY.error(path, "header", what=f"{text[:40]!r}, {what}", line=line)
 
         match text.split():
             case ["ply"] | ["obj_info", *_] | []:
@@ -171,7 +170,7 @@ def read_header(path: Path, content: bytes) -> tuple[Ply, str, int]:
             case _:
                 raise wrong("expected a statement of PLY 1.0")
     if not order:
-        raise InputError(path, "damaged PLY: no format", ADVICE, reason="ply.header")
+        raise PLY.error(path, "header", what="no format")
     return Ply(ply.elements, tuple(comments)), order, start
 
 
@@ -273,11 +272,6 @@ def _as_stated(path: Path, element: Element, name: str, column: NDArray[Any]) ->
     with np.errstate(invalid="ignore"):
         stated = column.astype(kind)
     if (stated != column).any():
-        found = column[stated != column][0]
-        raise InputError(
-            path,
-            f"damaged PLY: {element.name} {name} {found:g} is no {kind}",
-            ADVICE,
-            reason="ply.range",
-        )
+        found = float(column[stated != column][0])
+        raise PLY.error(path, "range", element=element.name, name=name, found=found, kind=kind)
     return stated

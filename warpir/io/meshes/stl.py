@@ -8,12 +8,13 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from warpir.core.errors import InputError
+from warpir.core.errors import Faults
 
 HEADER = 84
 """A binary file begins with 80 bytes of anything and the number of its triangles [byte]."""
 FACET = np.dtype([("normal", "<f4", (3,)), ("corners", "<f4", (3, 3)), ("attribute", "<u2")])
-ADVICE = "export it again, or as GLB"
+STL = Faults("stl", {"damaged": ("damaged STL: {what}", "export it again, or as GLB")})
+"""What a file may have wrong."""
 VERTEX = ["vertex", "", "", ""]
 WORDS = np.array(
     ["facet", "normal", "", "", "", "outer", "loop", *VERTEX * 3, "endloop", "endfacet"],
@@ -43,14 +44,8 @@ def read_stl(path: Path, content: bytes, notices: list[str]) -> NDArray[np.float
     if content.lstrip()[:5].lower() == b"solid" and len(content) != promised:
         return _read_ascii(path, content)
     if len(content) < max(promised, HEADER):
-        raise InputError(
-            path,
-            f"damaged STL: {count} triangles need {promised} bytes (found {len(content)})",
-            ADVICE,
-            reason="stl.damaged",
-            found=len(content),
-            limit=promised,
-        )
+        what = f"{count} triangles need {promised} bytes"
+        raise STL.error(path, "damaged", what=what, found=len(content))
     if len(content) > promised:
         notices.append(f"{len(content) - promised} bytes after the last triangle ignored")
     facets = np.frombuffer(content, FACET, count, HEADER)
@@ -64,32 +59,22 @@ def _read_ascii(path: Path, content: bytes) -> NDArray[np.float64]:
     solids = sum(line[:5].lower() == b"solid" for line in lines)
     ends = sum(line[:8].lower() == b"endsolid" for line in lines)
     if solids != ends:
-        what = f"damaged STL: {solids} solid and {ends} endsolid"
-        raise InputError(path, what, ADVICE, reason="stl.damaged")
+        raise STL.error(path, "damaged", what=f"{solids} solid and {ends} endsolid")
     inner = [
         line for line in lines if line[:5].lower() != b"solid" and line[:8].lower() != b"endsolid"
     ]
     listed = b" ".join(inner).split()
     longest = max(map(len, listed), default=1)
     if longest > LONGEST:
-        what = f"damaged STL: a word of {longest} characters (limit {LONGEST})"
-        raise InputError(path, what, ADVICE, reason="stl.damaged", found=longest, limit=LONGEST)
+        raise STL.error(path, "damaged", what="a word too long", found=longest, limit=LONGEST)
     words = np.array(listed, dtype=f"S{longest}")
     width = len(WORDS)
     whole = words[: len(words) // width * width].reshape(-1, width)
     wrong = (np.char.lower(whole) != WORDS)[:, WORDS != b""].any(axis=1)
     if wrong.any() or whole.size < words.size:
         number = int(wrong.argmax()) if wrong.any() else len(whole)
-        raise InputError(
-            path,
-            f"damaged STL: facet {number} is not one (counted from 0)",
-            ADVICE,
-            reason="stl.damaged",
-            found=number,
-        )
+        raise STL.error(path, "damaged", what=f"facet {number} is not one (counted from 0)")
     try:
         return whole[:, NUMBERS].astype(np.float64).reshape(-1, 3, 3)
     except ValueError as error:
-        raise InputError(
-            path, f"damaged STL: {str(error)[:80]}", ADVICE, reason="stl.damaged"
-        ) from None
+        raise STL.error(path, "damaged", what=str(error)[:80]) from None

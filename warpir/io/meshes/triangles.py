@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 
 from warpir.core.arrays import BoolArray, Float64Array, FloatArray, IntArray
-from warpir.core.errors import InputError
+from warpir.core.errors import Faults
 from warpir.core.limits import Limits
 from warpir.scene.asset import Primitive
 
@@ -17,6 +17,16 @@ LARGEST = 3e38
 """Largest number of a mesh: what a float32 holds; of positions `EXTENT` is the limit."""
 CROSSINGS = 100
 """After as many cuts that were no ears a polygon is taken for a tangle and cut into a fan."""
+MESH = Faults(
+    "mesh",
+    {
+        "concave": ("concave polygons of too many corners", "triangulate the faces on export"),
+        "not_finite": "{what} are NaN or infinite",
+        "nothing_to_render": "nothing to render",
+        "too_large": ("coordinates up to {found:g} (expected below {limit:g})", "scale it down"),
+    },
+)
+"""What the triangles of any file may have wrong."""
 CONCAVE_COST = 100_000_000
 """Largest sum of the squared numbers of corners of all concave polygons of a material."""
 
@@ -51,13 +61,8 @@ def triangulate(
             concave = (along < -1e-9 * np.abs(along).max(axis=1, keepdims=True)).any(axis=1)
         cost += int(concave.sum()) * size**2
         if cost > CONCAVE_COST:
-            raise InputError(
-                path,
-                f"concave polygons of too many corners (found {concave.sum()} of {size}; the limit "
-                f"for one is {math.isqrt(CONCAVE_COST)})",
-                "triangulate the faces on export",
-                reason="mesh.concave",
-            )
+            found, limit = f"{concave.sum()} of {size}", f"one of {math.isqrt(CONCAVE_COST)}"
+            raise MESH.error(path, "concave", found=found, limit=limit)
         fan = np.stack([np.array([0, k, k + 1]) for k in range(1, size - 1)])
         triangles.append(polygon[~concave][:, fan].reshape(-1, 3))
         for row in polygon[concave]:
@@ -263,18 +268,7 @@ def check_drawable(where: Path, primitives: list[Primitive], found: str) -> None
         InputError: ``primitives`` is empty or a coordinate is not below ``EXTENT``.
     """
     if not primitives:
-        raise InputError(
-            where,
-            f"nothing to render (found {found}; expected triangles)",
-            reason="mesh.nothing_to_render",
-        )
+        raise MESH.error(where, "nothing_to_render", found=found, expected="triangles")
     largest = max(float(np.abs(p.positions).max()) for p in primitives)
     if not largest < EXTENT:
-        raise InputError(
-            where,
-            f"coordinates up to {largest:g} (expected below {EXTENT:g})",
-            "scale it down",
-            reason="mesh.too_large",
-            found=largest,
-            limit=EXTENT,
-        )
+        raise MESH.error(where, "too_large", found=largest, limit=EXTENT)
