@@ -225,7 +225,8 @@ def _colors_alone(icc: bytes) -> bytes:
 def _tag_is_whole(tag: bytes) -> bool:
     """Check that the numbers of a curve or a lookup table are as many as its sizes say."""
     if tag[:4] == b"curv":
-        return len(tag) >= 12 and 12 + 2 * struct.unpack_from(">I", tag, 8)[0] <= len(tag)
+        count = int.from_bytes(tag[8:12])
+        return len(tag) >= 12 and 12 + 2 * count <= len(tag)
     if tag[:4] in (b"mft1", b"mft2"):
         width = 1 if tag[:4] == b"mft1" else 2
         if len(tag) < 52:
