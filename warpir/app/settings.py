@@ -139,6 +139,9 @@ class LightConfig:
     light is given: as the regressor sees it in the photo, or an even light"""
     regressor: str | None = option(None, "FILE")
     """Weights of the regressor (default: those in the package)"""
+    visible_sun: bool = option(True)
+    """Take the direction of a sun that the photo shows; it overrules the regressor's, and the sun
+    is as strong as suns in view are"""
     exposure: float | None = option(None, "EV", low=-30, high=30)
     """Factor on the light, in stops (default: from the photo); [EV]"""
     tone: str | None = option(
@@ -328,8 +331,8 @@ class OptimizeSettings:
     bend: float = option(0.1, "W", expert=True, low=0)
     """Weight of the prior that keeps tone curves near the identity"""
     trust: float = option(4.0, "W", low=0)
-    """Weight that holds the light near the regressed one (0: none); in squares of what that is
-    uncertain by"""
+    """Weight that holds the light near the regressed one; in squares of what that is uncertain by;
+    0: not at all"""
     chroma_limit: float = option(1.5, "LOG", expert=True, above=0, high=20)
     """Greatest log colour ratio of a lobe"""
     intensity_limit: float = option(1e6, "FACTOR", expert=True, low=1, high=1e12)

@@ -33,6 +33,7 @@ from warpir.lighting.fit import fit_lobes
 from warpir.lighting.regression import mean_training_light, regress
 from warpir.lighting.regressor import Regressor, random_regressor
 from warpir.lighting.scene_light import make_light
+from warpir.lighting.visible_sun import with_visible_sun
 from warpir.optimize.recover import recover
 from warpir.scene.light import Light, Lobes
 
@@ -204,9 +205,14 @@ def mean_training(bench: Bench, place: Place) -> Prediction:
 
 
 def regression(network: Regressor, place: Place) -> Prediction:
-    """Return the light that a regressor estimates from the photograph."""
+    """Return the light that a regressor estimates, with the sun where the photograph shows it."""
     estimate = regress(network, place.photo, place.camera)
-    return Prediction.of(Light(lobes=estimate.lobes()), spread_deg=estimate.spread_deg)
+    estimate = with_visible_sun(estimate, place.photo, place.camera)
+    return Prediction.of(
+        Light(lobes=estimate.lobes()),
+        spread_deg=estimate.spread_deg,
+        sun_in_view=estimate.sun_in_view,
+    )
 
 
 def other_photo(bench: Bench, place: Place) -> Prediction:

@@ -12,6 +12,7 @@ from warpir.app.inputs import Inputs
 from warpir.lighting.regression import Regression, regress
 from warpir.lighting.regressor import load_regressor
 from warpir.lighting.scene_light import SceneLight, start_level
+from warpir.lighting.visible_sun import with_visible_sun
 from warpir.scene.light import Light, angles_from_axis
 from warpir.scene.tone_curves import Curves
 
@@ -39,6 +40,8 @@ def estimate_light(inputs: Inputs, config: InsertConfig, device: str) -> Estimat
     """
     path = None if config.light.regressor is None else Path(config.light.regressor)
     regression = regress(load_regressor(path, device), inputs.photo.srgb, inputs.camera)
+    if config.light.visible_sun:
+        regression = with_visible_sun(regression, inputs.photo.srgb, inputs.camera)
     gain = tone_gain(inputs, config) * 2.0 ** (config.light.exposure or 0.0)
     light = Light(lobes=regression.lobes()).scaled(gain)
     curves = Curves.identity(config.tone_operator)
@@ -59,6 +62,12 @@ def tone_gain(inputs: Inputs, config: InsertConfig) -> float:
 def in_words(regression: Regression) -> str:
     """Return what is assumed, in a line."""
     azimuth, elevation = angles_from_axis(regression.axis)
+    if regression.sun_in_view is not None:
+        return (
+            f"the photo shows the sun: azimuth {azimuth:.0f}, elevation {elevation:.0f}, as strong "
+            "as suns in view are; all other light is what the regressor sees in the photo "
+            "(--no-visible-sun, --sun, --light)"
+        )
     return (
         "the light is what the regressor sees in the photo: mainly from azimuth "
         f"{azimuth:.0f}, elevation {elevation:.0f}, +- {regression.spread_deg:.0f} degrees "

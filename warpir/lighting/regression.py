@@ -55,6 +55,9 @@ class Regression:
     """All other light."""
     ambient_log_std: float
     """Standard deviation of the logarithm of the ambient irradiance."""
+    sun_in_view: float | None = None
+    """Probability that a spot of the photo is the sun, whose direction `axis` then is; None: no
+    spot looks like it [1]."""
 
     def lobes(self, sigma_min: float = 0.0) -> Lobes:
         """Return the light as lobes, the dominant one first.
@@ -121,6 +124,7 @@ class Regression:
                 "sharpness": self.ambient.sharpness.tolist(),
             },
             "ambient_log_std": self.ambient_log_std,
+            "sun_in_view": self.sun_in_view,
         }
 
 

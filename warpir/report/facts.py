@@ -238,6 +238,8 @@ def _source(measured: Mapping[str, Any], config: InsertConfig) -> str:
             f"estimated from the photo by warpir's regressor: azimuth {found['azimuth_deg']:.0f}°, "
             f"elevation {found['elevation_deg']:.0f}°"
         )
+        if found.get("sun_in_view") is not None:
+            text += f", where the photo shows the sun ({100.0 * found['sun_in_view']:.0f} % sure)"
     elif config.inputs.demo and config.light.start != "uniform":
         text = "the demo's own"
     else:
