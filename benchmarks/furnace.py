@@ -2,8 +2,9 @@
 
 Appendix B of the specification couples its lobes by ``(1 - F)`` with F at the half vector, so
 the diffuse lobe does not give up what the specular lobe really reflects. This module integrates
-``E(cos_o) = integral of f cos_i over the hemisphere`` in float64, without Mitsuba and without
-warpir. Run as ``python -m benchmarks.furnace``; prints the largest E over angle per roughness.
+``E(cos_o) = integral of f cos_i over the hemisphere`` in float64 by products of Gauss-Legendre and
+periodic trapezoid rules, without Mitsuba and without warpir. Run as
+``python -m benchmarks.furnace``; prints the largest E over angle per roughness.
 """
 
 import numpy as np
@@ -16,10 +17,6 @@ def directional_albedo(
 ) -> float:
     """Return ``E(cos_o)`` of one channel [1].
 
-    The specular lobe is integrated over the visible normals (spherical caps, Dupuy and Benyoub
-    2023), where its integrand ``F G2 / G1`` is smooth at any roughness; the diffuse lobe over
-    the cosine hemisphere. Both by a product of Gauss-Legendre and periodic trapezoid rules.
-
     Args:
         cos_o: Cosine between view and normal, in (0, 1].
         roughness: Perceptual roughness [1].
@@ -27,57 +24,56 @@ def directional_albedo(
         metallic: 0 dielectric to 1 metal [1].
         order: Nodes along each axis.
     """
-    alpha = max(roughness**2, 1e-3)
     f0 = 0.04 + (base_color - 0.04) * metallic
     c_diff = base_color * (1.0 - metallic)
     wo = np.array([np.sqrt(1.0 - cos_o**2), 0.0, cos_o])
-    node, node_weight = np.polynomial.legendre.leggauss(order)
-    node, node_weight = 0.5 * (node + 1.0), 0.5 * node_weight
+    node, weight = np.polynomial.legendre.leggauss(order)
+    node, weight = 0.5 * (node + 1.0), 0.5 * weight
     phi = 2.0 * np.pi * (np.arange(order) + 0.5) / order
+    specular = specular_ring(wo, max(roughness**2, 1e-3), f0, node, phi) @ weight
+    return float(specular + c_diff * (diffuse_ring(wo, node, phi) @ weight))
 
-    def schlick(cosine: Float64Array, f0: float = f0) -> Float64Array:
-        return f0 + (1.0 - f0) * (1.0 - np.abs(cosine)) ** 5
+
+def schlick(cosine: Float64Array, f0: float) -> Float64Array:
+    """Return Schlick's Fresnel factor [1]."""
+    return f0 + (1.0 - f0) * (1.0 - np.abs(cosine)) ** 5
+
+
+def specular_ring(
+    wo: Float64Array, alpha: float, f0: float, node: Float64Array, phi: Float64Array
+) -> Float64Array:
+    """Return the mean of ``F G2 / G1`` over visible normals at each node, shape [node].
+
+    Normals are drawn by spherical caps (Dupuy and Benyoub 2023), over which the integrand is smooth
+    at any roughness.
+    """
 
     def smith(cosine: Float64Array | float) -> Float64Array:
         return np.sqrt(alpha**2 + (1.0 - alpha**2) * np.square(cosine))
 
-    # Specular: mean of F G2 / G1 over visible normals
-    stretched = np.array([alpha * wo[0], 0.0, wo[2]])
+    cos_o, shape = wo[2], (len(node), len(phi))
+    stretched = np.array([alpha * wo[0], 0.0, cos_o])
     stretched /= np.linalg.norm(stretched)
     z = (1.0 - node)[:, None] * (1.0 + stretched[2]) - stretched[2]
     r = np.sqrt(np.maximum(1.0 - z**2, 0.0))
-    wm = np.stack(
-        [
-            alpha * (r * np.cos(phi) + stretched[0]),
-            alpha * r * np.sin(phi),
-            np.broadcast_to(z + stretched[2], (order, order)),
-        ],
-        axis=-1,
-    )
+    x, y = alpha * (r * np.cos(phi) + stretched[0]), alpha * r * np.sin(phi)
+    wm = np.stack([x, y, np.broadcast_to(z + stretched[2], shape)], axis=-1)
     wm /= np.maximum(np.linalg.norm(wm, axis=-1, keepdims=True), 1e-300)
     cos_h = wm @ wo
     cos_i = 2.0 * cos_h * wm[..., 2] - cos_o
-    ratio = (
-        cos_i
-        * (cos_o + smith(cos_o))
-        / np.where(cos_i > 0.0, cos_i * smith(cos_o) + cos_o * smith(cos_i), 1.0)
-    )
-    specular = np.where(cos_i > 0.0, schlick(cos_h) * ratio, 0.0).mean(axis=1) @ node_weight
+    both = np.where(cos_i > 0.0, cos_i * smith(cos_o) + cos_o * smith(cos_i), 1.0)
+    ratio = cos_i * (cos_o + smith(cos_o)) / both
+    return np.asarray(np.where(cos_i > 0.0, schlick(cos_h, f0) * ratio, 0.0).mean(axis=1))
 
-    # Diffuse: mean of (1 - F) c_diff over a cosine-weighted hemisphere
+
+def diffuse_ring(wo: Float64Array, node: Float64Array, phi: Float64Array) -> Float64Array:
+    """Return the mean of ``1 - F`` over a cosine-weighted hemisphere at each node, shape [node]."""
     cos_i = np.sqrt(node)[:, None]
-    wi = np.stack(
-        [
-            np.sqrt(1.0 - cos_i**2) * np.cos(phi),
-            np.sqrt(1.0 - cos_i**2) * np.sin(phi),
-            np.broadcast_to(cos_i, (order, order)),
-        ],
-        axis=-1,
-    )
-    wm = wi + wo
+    sine = np.sqrt(1.0 - cos_i**2)
+    z = np.broadcast_to(cos_i, (len(node), len(phi)))
+    wm = np.stack([sine * np.cos(phi), sine * np.sin(phi), z], axis=-1) + wo
     wm /= np.linalg.norm(wm, axis=-1, keepdims=True)
-    diffuse = ((1.0 - schlick(wm @ wo, 0.04)) * c_diff).mean(axis=1) @ node_weight
-    return float(specular + diffuse)
+    return np.asarray((1.0 - schlick(wm @ wo, 0.04)).mean(axis=1))
 
 
 def main() -> None:

@@ -69,6 +69,10 @@ class Quantity(NamedTuple):
     mitsuba: Callable[..., float] | str
 
 
+def _on_device(run: Callable[..., Measured], values: tuple[Any, ...], device: str) -> Measured:
+    return run(device, *values)
+
+
 def table(
     group: str, inputs: Mapping[str, tuple[Any, ...]], *quantities: Quantity, cost: str = "quick"
 ) -> list[Case]:
@@ -79,7 +83,7 @@ def table(
             name,
             quantity.name,
             quantity.measure,
-            lambda device, run=quantity.run, values=values: run(device, *values),
+            partial(_on_device, quantity.run, values),
             quantity.bound(*values) if callable(quantity.bound) else quantity.bound,
             quantity.gradient_bound,
             partial(quantity.mitsuba, *values) if callable(quantity.mitsuba) else quantity.mitsuba,

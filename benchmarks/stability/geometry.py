@@ -60,7 +60,7 @@ def needle_bound(width: float) -> float:
 
 def cases() -> list[Case]:
     """Return the rows of this group."""
-    return [*in_places(), *near_the_plane(), *of_meshes()]
+    return [*in_places(), *near_the_plane(), *of_meshes(), *of_shading()]
 
 
 def in_places() -> list[Case]:
@@ -122,11 +122,10 @@ def near_the_plane() -> list[Case]:
 
 
 def of_meshes() -> list[Case]:
-    """Return the rows on broken, thin and large meshes."""
+    """Return the rows on broken and thin meshes."""
     surface = "coverage, position, normal"
     opaque = "has no ray query with transparency apart from its integrators"
     sheets = "sunlight through both, as one"
-    wound = {"wound as they should be": (False,), "inside out": (True,)}
     cards = {
         f"two cards in one place, {'against each other' if opposite else 'alike'}, "
         f"{'double' if double else 'single'} sided": (opposite, double)
@@ -156,6 +155,13 @@ def of_meshes() -> list[Case]:
         ),
         *table(GROUP, {needle_name(w): (w,) for w in (1e-2, 1e-3)}, needles),
         *table(GROUP, {needle_name(w): (w,) for w in (1e-4, 1e-5)}, needles, cost="medium"),
+    ]
+
+
+def of_shading() -> list[Case]:
+    """Return the rows on radiance, and on a mesh of two million triangles."""
+    wound = {"wound as they should be": (False,), "inside out": (True,)}
+    return [
         *table(
             GROUP,
             {f"ball, triangles {name}": reverse for name, reverse in wound.items()},
