@@ -19,11 +19,12 @@ from PIL import Image
 
 from warpir.core.latlong import look_up, map_directions, resize_map, texel_solid_angles
 from warpir.evaluate.scenes import PANORAMA_SUFFIXES, Place, Places, Subject, find_files
-from warpir.evaluate.stage import Prediction, Quality, Stage
+from warpir.evaluate.stage import Prediction, Stage
 from warpir.lighting.detail import HEIGHT, Detail, seen_from, with_detail
 from warpir.lighting.fit import fit_lobes
 from warpir.lighting.regression import regress
 from warpir.lighting.regressor import load_regressor
+from warpir.render.composite import Quality
 from warpir.render.device import choose_device
 from warpir.scene.asset import Asset, Material, Primitive
 from warpir.scene.camera import Camera
@@ -130,8 +131,8 @@ def main() -> None:
         }
         for name, material in MATERIALS.items():
             asset = replace(subject.asset, materials=(material,))
-            quality = Quality(options.samples, 1, 1)
-            stage = Stage(replace(subject, asset=asset), device, quality, options.seed)
+            quality = Quality(options.samples, 1, 1, options.seed, 8.0)
+            stage = Stage(replace(subject, asset=asset), device, quality)
 
             def picture(light: Light, stage: Stage = stage) -> NDArray[np.float32]:
                 prediction = Prediction.of(light)

@@ -77,6 +77,12 @@ def one_thread() -> Iterator[None]:
     torch.set_num_threads(before)
 
 
+@pytest.fixture
+def own_cache(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Keep the caches of a test in its own folder."""
+    monkeypatch.setenv("WARPIR_CACHE", str(tmp_path / "cache"))
+
+
 @pytest.fixture(autouse=True)
 def _no_network(monkeypatch: pytest.MonkeyPatch) -> None:
     """Raise as soon as a test opens a socket or resolves a name."""

@@ -26,9 +26,10 @@ from warpir.evaluate.scenes import (
     find_files,
     mirrored,
 )
-from warpir.evaluate.stage import Prediction, Quality, Stage
+from warpir.evaluate.stage import Prediction, Stage
 from warpir.io.results import OutputFolder
 from warpir.lighting.regressor import random_regressor, save_regressor
+from warpir.render.composite import Quality
 from warpir.scene.light import Light, Lobes, as_map, axis_from_angles, rasterize_lobes
 from warpir.scene.tone_curves import Curves
 
@@ -80,7 +81,7 @@ def scenes(data: Path) -> list[tuple[Place, list[Subject]]]:
 
 
 def sunlit(subject: Subject, samples: int = 32) -> Stage:
-    return Stage(subject, "cpu", Quality(samples=samples, depth=2), seed=1)
+    return Stage(subject, "cpu", Quality(samples, 2, 2, 1, 8.0))
 
 
 def make_bench(scenes: list[tuple[Place, list[Subject]]]) -> Bench:

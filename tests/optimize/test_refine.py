@@ -73,12 +73,7 @@ MATTE = tuple(replace(m, base_color=(0.5,) * 3, metallic=0.0, roughness=1.0) for
 """The authors' start: a purely diffuse asset."""
 
 
-pytestmark = pytest.mark.usefixtures("one_thread")
-
-
-@pytest.fixture(autouse=True)
-def _own_cache(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setenv("WARPIR_CACHE", str(tmp_path / "cache"))
+pytestmark = pytest.mark.usefixtures("one_thread", "own_cache")
 
 
 def scene_light(curves: Curves | None = None) -> SceneLight:
@@ -511,11 +506,12 @@ def test_what_moves_and_what_does_not() -> None:
         ("tone", {}, {"tone curves"}),
     ]
     for kind, changes, free in cases:
-        moves = what_moves(refining(kind, **changes), asset)
+        moves = what_moves(refining(kind, **changes).task, asset)
         assert set(moves["free"]) == free and set(moves["frozen"]) == every - free
         names = {"tone": [], "emission": ["left"]}.get(kind, ["left", "right"])
         assert moves["what"] == kind and moves["materials"] == names
-    assert free_parts(refining("material")) == [part.replace("-", "_") for part in REFINE_PARTS]
+    parts = [part.replace("-", "_") for part in REFINE_PARTS]
+    assert free_parts(refining("material").task) == parts
 
 
 def test_each_kind_has_its_own_number_of_steps() -> None:

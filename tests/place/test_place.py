@@ -22,6 +22,7 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from tests.builders.browser import Fingers, Opened, needs_chromium, open_browser
+from tests.builders.children import output_of
 from tests.builders.insertions import read_layers
 from warpir.app.config import InsertConfig
 from warpir.core.errors import ExitCode, InputError
@@ -334,8 +335,7 @@ def ask(served: Served, *requests: tuple[str, str, str, str]) -> list[tuple[int,
         "    r = c.getresponse()\n"
         "    print(r.status, base64.b64encode(r.read()).decode())"
     )
-    run = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
-    answers = (line.partition(" ") for line in run.stdout.splitlines())
+    answers = (line.partition(" ") for line in output_of(code).splitlines())
     return [(int(status), base64.b64decode(content)) for status, _, content in answers]
 
 
@@ -380,11 +380,9 @@ def test_server_says_who_may_show_it(inputs: Path, tmp_path: Path) -> None:
             f"c.request('GET', '/{token}/')\n"
             "print(dict(c.getresponse().getheaders()))"
         )
-        run = subprocess.run(
-            [sys.executable, "-c", code], capture_output=True, text=True, check=True
-        )
-        assert "default-src 'none'" in run.stdout and "unsafe" not in run.stdout
-        assert "frame-ancestors 'none'" in run.stdout and "'no-referrer'" in run.stdout
+        headers = output_of(code)
+        assert "default-src 'none'" in headers and "unsafe" not in headers
+        assert "frame-ancestors 'none'" in headers and "'no-referrer'" in headers
 
 
 def test_browser_is_not_started_with_the_token(
@@ -439,8 +437,7 @@ def test_place_loads_neither_torch_nor_warp() -> None:
         "import sys, warpir.place, warpir.place.session, warpir.place.server\n"
         "print([m for m in ('torch', 'warp', 'trimesh', 'scipy') if m in sys.modules])"
     )
-    run = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
-    assert run.stdout == "[]\n"
+    assert output_of(code) == "[]\n"
 
 
 # --------------------------------------------------------------------------------- in the browser

@@ -1,6 +1,5 @@
 """The integrator `mis`: what it records, the sums over it, threads, memory."""
 
-import subprocess
 import sys
 
 import numpy as np
@@ -9,6 +8,7 @@ import torch
 import warp as wp
 from torch import Tensor
 
+from tests.builders.children import output_of
 from tests.builders.records import (
     factor_arrays,
     object_sums,
@@ -308,13 +308,7 @@ print(used() - before)
 @pytest.mark.slow
 def test_steps_keep_no_memory(device: str) -> None:
     """Forty steps of an optimisation leave the process as large as the first ones made it."""
-    child = subprocess.run(
-        [sys.executable, "-c", MEMORY_CHILD.format(device=device)],
-        capture_output=True,
-        text=True,
-        check=True,
-    )
-    assert int(child.stdout.split()[-1]) < MEMORY_GROWTH
+    assert int(output_of(MEMORY_CHILD.format(device=device)).split()[-1]) < MEMORY_GROWTH
 
 
 def test_threads_that_share_a_pixel_change_nothing(

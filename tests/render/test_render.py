@@ -1,14 +1,12 @@
 """The renderer: closed forms, furnaces, linearity, shadows, geometry and determinism."""
 
-import subprocess
-import sys
-
 import numpy as np
 import pytest
 from numpy.typing import NDArray
 from scipy.interpolate import CubicSpline
 from scipy.ndimage import maximum_filter, minimum_filter
 
+from tests.builders.children import output_of
 from tests.builders.shapes import (
     DEEP,
     all_pixels,
@@ -1060,10 +1058,4 @@ print(peaks[2] - peaks[1])
 @pytest.mark.slow
 def test_memory_is_flat_in_samples(device: str) -> None:
     """Peak memory at 1024 samples is that at 64: nothing is kept per sample (issue 2)."""
-    child = subprocess.run(
-        [sys.executable, "-c", MEMORY_CHILD.format(device=device)],
-        capture_output=True,
-        text=True,
-        check=True,
-    )
-    assert int(child.stdout.split()[-1]) < MEMORY_GROWTH
+    assert int(output_of(MEMORY_CHILD.format(device=device)).split()[-1]) < MEMORY_GROWTH

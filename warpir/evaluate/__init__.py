@@ -1,4 +1,4 @@
-"""How right are light and insertions? Measured where the light is known.
+"""Evaluation of light and insertions on scenes whose light is known.
 
-Measures the other rooms from outside; nothing that a run needs is here.
+Uses the other packages through their public functions; a run does not need it.
 """

@@ -1,10 +1,10 @@
-"""How right is the light, and how right are the insertions that it makes?
+"""Evaluation of the light and of the insertions under it.
 
     python -m warpir.evaluate --panoramas PATH ... --assets PATH ... --scenes N --json FILE
 
 Photographs are cut out of panoramas, so that their light is known; a diffuse and a glossy object is
 put into each under the true light and under the light of every row (`warpir.evaluate.rows`), and
-light and picture are compared. `docs/evaluation.md` says how.
+light and picture are compared. `docs/evaluation.md` describes the method.
 """
 
 import argparse
@@ -35,7 +35,7 @@ if TYPE_CHECKING:
     FloatArray = NDArray[np.float32]
 
 SHEET_ROWS = ("lds-regression", "lds-uniform", "regression", "predictions", "brightest-region")
-"""Whose pictures the contact sheet shows: the first of these that was asked for."""
+"""Rows for the contact sheet; the first of these that was asked for is shown."""
 SAVED = ("tables.md", "contact_sheet.png")
 
 
@@ -137,7 +137,7 @@ def _run(arguments: list[str]) -> int:
 
 
 def _check(options: argparse.Namespace) -> None:
-    """Refuse what cannot be meant.
+    """Check the options.
 
     Raises:
         InputError: A flag is missing or out of range (`ExitCode.USAGE`).
@@ -164,10 +164,10 @@ def _check(options: argparse.Namespace) -> None:
 def evaluate(
     options: argparse.Namespace, rows: Sequence[str], output: "OutputFolder | None"
 ) -> dict[str, Any]:
-    """Make the scenes, ask every row, print and write what came of it.
+    """Make the scenes, evaluate every row, print and write the results.
 
     Args:
-        options: Of the command line.
+        options: Options of the command line.
         rows: Names in `warpir.evaluate.rows.ROWS`.
         output: For tables and contact sheet, or None.
 
@@ -215,7 +215,7 @@ def evaluate(
 def _make_scenes(
     options: argparse.Namespace, notices: list[str]
 ) -> "list[tuple[Place, list[Subject]]]":
-    """Cut the photographs out of the panoramas; what was assumed is added to the notices."""
+    """Cut the photographs out of the panoramas; add assumptions to the notices."""
     from warpir.evaluate.scenes import ASSET_SUFFIXES, PANORAMA_SUFFIXES, Places, find_files
 
     places = Places(
@@ -304,11 +304,11 @@ def _exchange(
         say(f"written: {len(places)} crops in {options.export_crops}")
     if options.predictions is None:
         return None
-    found = read_predictions(options.predictions, places)
-    if found.missing:
-        notices.append(f"{len(found.missing)} scenes have no map in {options.predictions}")
-    notices += [f"{options.predictions}: {name} is of no scene" for name in found.unused]
-    return found.maps
+    predictions = read_predictions(options.predictions, places)
+    if predictions.missing:
+        notices.append(f"{len(predictions.missing)} scenes have no map in {options.predictions}")
+    notices += [f"{options.predictions}: {name} is of no scene" for name in predictions.unused]
+    return predictions.maps
 
 
 def _make_bench(
@@ -346,7 +346,7 @@ def _make_bench(
 def usable_rows(
     bench: "Bench", rows: Sequence[str], is_asked: bool, notices: list[str]
 ) -> list[str]:
-    """Return the rows that can be made; those that cannot end the run only if they were named.
+    """Return the usable rows; an unusable one is an error only if it was named.
 
     Raises:
         InputError: A row that was asked for needs what is not there.

@@ -1,4 +1,4 @@
-"""How far a composite is from the true one: RMSE, si-RMSE, SSIM, FLIP and LPIPS, by region.
+"""Errors of a composite against the true one: RMSE, si-RMSE, SSIM, FLIP and LPIPS, by region.
 
 Pictures are display-encoded floats in [0, 1], shape [H, W, 3]. With a full picture most pixels are
 the photograph itself and equal, so every figure is given for smaller regions too.
@@ -13,18 +13,17 @@ import numpy as np
 from warpir.core.arrays import BoolArray, Float64Array, FloatArray
 from warpir.core.color import gamma_to_linear
 
-REGIONS = ("full", "box", "asset", "shadow")
 SHADOW_RATIO = 0.95
-"""Where less than this share of the light is left, the ground is in the object's shadow [1]."""
+"""Shadow ratio below which the ground counts as the object's shadow [1]."""
 BOX_GROWTH = 0.5
-"""How much wider and higher than the object the box is, half of it to each side [1]."""
+"""Excess of the box over the object's width and height, half of it to each side [1]."""
 
 Distance = Callable[[FloatArray, FloatArray], float]
-"""Of two pictures of one size, such as LPIPS."""
+"""Distance of two pictures of one size, such as LPIPS."""
 
 
 def make_regions(mask: FloatArray, ratio: FloatArray) -> dict[str, BoolArray]:
-    """Return the regions that are looked at apart, by name, shape [H, W] each.
+    """Return the regions of separate figures by name, shape [H, W] each.
 
     ``full``; ``box``, the object's bounding box grown by `BOX_GROWTH`; ``asset``, where any of the
     object is seen; ``shadow``, beside it where the true shadow is darker than `SHADOW_RATIO`.
@@ -39,8 +38,8 @@ def make_regions(mask: FloatArray, ratio: FloatArray) -> dict[str, BoolArray]:
     if asset.any():
         rows, columns = np.flatnonzero(asset.any(axis=1)), np.flatnonzero(asset.any(axis=0))
         edges = []
-        for found, size in ((rows, height), (columns, width)):
-            first, last = int(found[0]), int(found[-1]) + 1
+        for hit, size in ((rows, height), (columns, width)):
+            first, last = int(hit[0]), int(hit[-1]) + 1
             grow = round(0.5 * BOX_GROWTH * (last - first))
             edges.append(slice(max(first - grow, 0), min(last + grow, size)))
         box[edges[0], edges[1]] = True
@@ -61,9 +60,9 @@ def image_errors(
     ``lpips`` is of the full picture alone.
 
     Args:
-        image: What is judged.
-        truth: What it should be.
-        regions: Of `make_regions`.
+        image: Composite to judge.
+        truth: True composite.
+        regions: Regions of `make_regions`.
         lpips: LPIPS, when its weights are there.
     """
     maps = {"ssim": ssim_map(image, truth)}

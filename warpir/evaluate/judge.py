@@ -1,4 +1,4 @@
-"""The figures of every row's light in one place, and of the pictures that it makes."""
+"""Errors of every row's light and of its composites, place by place."""
 
 from __future__ import annotations
 
@@ -14,9 +14,10 @@ from warpir.evaluate.report import Entry, bootstrap
 from warpir.evaluate.results import Panel, to_codes
 from warpir.evaluate.rows import ROWS, Bench
 from warpir.evaluate.scenes import Place, Subject
-from warpir.evaluate.stage import Prediction, Quality, Stage
+from warpir.evaluate.stage import Prediction, Stage
 from warpir.evaluate.three_spheres import sphere_errors
 from warpir.lighting.regressor import Regressor, least_angle
+from warpir.render.composite import Quality
 from warpir.scene.light import as_map
 from warpir.train.lights import load_panoramas
 from warpir.train.meshes import make_meshes
@@ -24,23 +25,23 @@ from warpir.train.scenes.generator import Mixture, SceneGenerator
 from warpir.train.scenes.render import Stock
 
 LIGHT_HEIGHT = 128
-"""Rows of the maps on which lights are compared."""
+"""Rows of the maps that are compared."""
 UNSEEN_SEED = 0xE7A1
 """Added to the seed of rendered photographs; training and its validation use others."""
 PROCEDURAL_BATCH = 64
-"""Of those, rendered at once."""
+"""Number of photographs rendered at once."""
 
 
 class Judge:
-    """Judges the rows in one place after the other.
+    """Computes the errors of the rows, place by place.
 
     Args:
-        bench: What the rows may use.
-        rows: Their names.
-        samples: Per pixel.
-        threads: On the CPU; 0: one per core.
+        bench: Scenes and models of the rows.
+        rows: Names of the rows.
+        samples: Camera samples per pixel.
+        threads: Threads on the CPU; 0 for one per core.
         lpips: The perceptual distance, or None.
-        sheet_row: Whose pictures the contact sheet shows.
+        sheet_row: Row on the contact sheet.
     """
 
     def __init__(
@@ -53,14 +54,14 @@ class Judge:
         sheet_row: str,
     ) -> None:
         self.bench, self.rows, self.lpips, self.sheet_row = bench, rows, lpips, sheet_row
-        self.quality, self.threads = Quality(samples=samples), threads
+        self.quality, self.threads = Quality(samples, 2, 5, bench.seed, 8.0), threads
 
     def place(self, place: Place, subjects: list[Subject]) -> tuple[list[Entry], list[Panel]]:
-        """Return the figures of every row in one place, and the contact sheet's pictures of it."""
+        """Return the errors of every row in one place, and its panels of the contact sheet."""
         entries, panels = [], []
         of_place: dict[str, tuple[Prediction, FloatArray, dict[str, float]]] = {}
         for subject in subjects:
-            stage = Stage(subject, self.bench.device, self.quality, self.bench.seed, self.threads)
+            stage = Stage(subject, self.bench.device, self.quality, self.threads)
             regions = make_regions(stage.mask, stage.ratio)
             lights: dict[str, FloatArray] = {}
             for name in self.rows:
@@ -116,14 +117,14 @@ def light_figures(place: Place, texels: FloatArray) -> dict[str, float]:
     """Return the errors of a light, ``light.*`` and ``spheres.*``, in the camera-yaw frame.
 
     Args:
-        place: Knows the truth.
+        place: The place, with the true light.
         texels: Lat-long radiance, world frame, shape [He, 2 He, 3].
     """
-    found, true = place.to_camera(texels), place.to_camera(place.texels)
-    errors = light_errors(found, true)
+    predicted, true = place.to_camera(texels), place.to_camera(place.texels)
+    errors = light_errors(predicted, true)
     for name in [n for n in errors if n.startswith("log_")]:
         errors[f"abs_{name}"] = abs(errors[name])
-    return _flat("", {"light": errors, "spheres": sphere_errors(found, true)})
+    return _flat("", {"light": errors, "spheres": sphere_errors(predicted, true)})
 
 
 def procedural_errors(

@@ -1,10 +1,10 @@
-"""How far a light is from the true one: directions, ratios, exposure and colour.
+"""Errors of a light against the true one: directions, ratios, exposure and colour.
 
 Both maps are lat-long, in one and the same frame (+Y up) and unit; errors are measured after both
 were averaged down to 128 x 256 texels.
 
 A map of one colour has no brightest direction. Wherever a direction is missing, an angle counts
-as 90 degrees: the mean over random guesses, so that saying nothing never beats guessing.
+as 90 degrees, the mean over random guesses, so that an absent answer never beats guessing.
 
 Sources: the angle between brightest directions after Hold-Geoffroy et al. 2019
 (https://arxiv.org/abs/1905.03897) and LuxDiT (https://arxiv.org/abs/2509.03680), who do not state
@@ -66,7 +66,7 @@ REST_AREA = 0.1
 AREA_MAX = 0.5
 """A blob of more than this share of the map is ambient light [1]."""
 LENGTH_MAX = 0.9
-"""So is one that is longer than this share of the map's width [1]."""
+"""A blob longer than this share of the map's width is ambient light too [1]."""
 
 Axis = Float64Array | None
 """A unit direction, or nothing where a map has none."""
@@ -74,10 +74,10 @@ Axis = Float64Array | None
 
 @dataclass(frozen=True)
 class _Directions:
-    """Where the light of one map comes from."""
+    """Main directions of one map."""
 
     peak: Axis
-    """Of the brightest texel; the centroid where several are equally bright."""
+    """Direction of the brightest texel; the centroid of several equally bright ones."""
     bright: Axis
     """Luminance centroid above `BRIGHT_PERCENTILE`."""
     blob: Axis
@@ -89,7 +89,7 @@ def light_errors(predicted: FloatArray, true: FloatArray) -> dict[str, float]:
 
     Args:
         predicted: Radiance, lat-long, shape [He, 2 He, 3].
-        true: The same in the same frame and unit; another size is fine.
+        true: True light in the same frame and unit, of any size.
 
     Returns:
         * ``peak_angle_deg``, ``bright_angle_deg``, ``blob_angle_deg``: angle between the brightest
@@ -116,13 +116,13 @@ def light_errors(predicted: FloatArray, true: FloatArray) -> dict[str, float]:
     maps = checked_maps(predicted, true)
     lum = [_luminance(texels) for texels in maps]
     flux = [texels * _solid_angles()[..., None] for texels in maps]
-    found, wanted = (_directions(values) for values in lum)
+    predicted_axes, wanted = (_directions(values) for values in lum)
     total, true_total = (part.sum(axis=(0, 1)) for part in flux)
-    errors = _angle_errors(found, wanted)
-    shared = _sun_axis(wanted.blob, found.blob)
+    errors = _angle_errors(predicted_axes, wanted)
+    shared = _sun_axis(wanted.blob, predicted_axes.blob)
     errors["log_sun_sky_ratio_error"] = _log_ratio(lum[0], shared) - _log_ratio(lum[1], shared)
     errors["log_own_sun_sky_ratio_error"] = _log_ratio(
-        lum[0], _sun_axis(found.blob, wanted.blob)
+        lum[0], _sun_axis(predicted_axes.blob, wanted.blob)
     ) - _log_ratio(lum[1], shared)
     errors["log_flux_error"] = float(np.log(luminance(total) / luminance(true_total)))
     errors["rgb_angle_deg"] = _angle_deg(
@@ -131,19 +131,19 @@ def light_errors(predicted: FloatArray, true: FloatArray) -> dict[str, float]:
     share = 0.0 if wanted.peak is None else _cap_share(lum[1], wanted.peak, SUNNY_RADIUS_DEG)
     errors["true_peak_share"] = share
     errors["true_is_sunny"] = float(share >= SUNNY_SHARE)
-    errors["predicted_has_direction"] = float(found.peak is not None)
+    errors["predicted_has_direction"] = float(predicted_axes.peak is not None)
     return errors | _directional_errors(maps)
 
 
-def _angle_errors(found: _Directions, wanted: _Directions) -> dict[str, float]:
+def _angle_errors(predicted: _Directions, wanted: _Directions) -> dict[str, float]:
     """Return the angles between the directions of two maps [deg]."""
     errors = {
-        "peak_angle_deg": _angle_deg(found.peak, wanted.peak),
-        "bright_angle_deg": _angle_deg(found.bright, wanted.bright),
-        "blob_angle_deg": _angle_deg(found.blob, wanted.blob),
+        "peak_angle_deg": _angle_deg(predicted.peak, wanted.peak),
+        "bright_angle_deg": _angle_deg(predicted.bright, wanted.bright),
+        "blob_angle_deg": _angle_deg(predicted.blob, wanted.blob),
     }
-    if found.peak is not None and wanted.peak is not None:
-        azimuth, elevation = angles_from_axis(found.peak)
+    if predicted.peak is not None and wanted.peak is not None:
+        azimuth, elevation = angles_from_axis(predicted.peak)
         true_azimuth, true_elevation = angles_from_axis(wanted.peak)
         turn = (azimuth - true_azimuth + 180.0) % 360.0 - 180.0
         errors["azimuth_error_deg"] = abs(turn)
@@ -206,13 +206,13 @@ def _solid_angles() -> Float64Array:
 
 
 def _luminance(texels: Float64Array) -> Float64Array:
-    """Return `luminance` with its type known: float64."""
+    """Return the luminance of a map in float64."""
     lum: Float64Array = luminance(texels).astype(np.float64, copy=False)
     return lum
 
 
 def _directions(lum: Float64Array) -> _Directions:
-    """Find where a map of luminance [128, 256] shines from."""
+    """Return the main directions of a map of luminance, shape [128, 256]."""
     energy = lum * _solid_angles()
     top = float(lum.max())
     if top <= PEAK_CONTRAST * energy.sum() / (4.0 * np.pi):
@@ -310,7 +310,7 @@ def directional_error(predicted: Float64Array, true: Float64Array) -> float:
     Args:
         predicted: Unit directions of the predicted lights, shape [light, 3]; none give
             `CHANCE_DEG`.
-        true: Of the true ones, at least one.
+        true: Directions of the true lights, at least one.
     """
     if not len(predicted):
         return CHANCE_DEG
@@ -328,8 +328,8 @@ def _blobs(
     """Yield blobs of light, each around the brightest texel that is left.
 
     Args:
-        values: What a blob's peak and its edge are judged by, shape [128, 256].
-        energy: Of each texel; decides when enough is found.
+        values: Values that define a blob's peak and edge, shape [128, 256].
+        energy: Energy of each texel; ends the search.
         touching: Like `_touching`.
     """
     left = np.ones(values.shape, bool)
@@ -360,9 +360,9 @@ def lights_of(texels: Float64Array) -> Float64Array:
         if float(_solid_angles()[blob].sum()) <= AREA_MAX * 4.0 * np.pi:
             mask |= blob
     parts = _parts(mask)
-    found = [(energy * (parts == part), parts == part) for part in np.unique(parts[mask])]
-    found.sort(key=lambda light: -float(light[0].sum()))
-    axes = [_centroid(light, where) for light, where in found[:LIGHT_COUNT_MAX]]
+    blobs = [(energy * (parts == part), parts == part) for part in np.unique(parts[mask])]
+    blobs.sort(key=lambda light: -float(light[0].sum()))
+    axes = [_centroid(light, where) for light, where in blobs[:LIGHT_COUNT_MAX]]
     return np.array([axis for axis in axes if axis is not None]).reshape(-1, 3)
 
 

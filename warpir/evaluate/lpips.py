@@ -31,13 +31,13 @@ LAYERS = (
 )
 """Name, stride, padding, and whether a 3 x 3 maximum of stride 2 comes first."""
 SHIFT, SCALE = (-0.030, -0.088, -0.188), (0.458, 0.448, 0.450)
-"""ImageNet's colours on [-1, 1]."""
+"""Mean and scale of ImageNet's colours on [-1, 1]."""
 SIDE_MIN = 64
-"""AlexNet's strides leave nothing of a smaller picture [px]."""
+"""Least side of a picture, by AlexNet's strides [px]."""
 
 
 class Lpips:
-    """The distance, with weights from a file.
+    """LPIPS distance with weights from a file.
 
     Args:
         path: State dict of the authors' ``LPIPS(net="alex")``, a safetensors file.

@@ -1,12 +1,12 @@
-"""Crops for other systems to estimate light from, and the maps they made of them.
+"""Crops as input of other systems, and the maps that they predict.
 
-`export_crops` writes one photo per scene and ``crops.json``, which says in words and numbers how a
-map must stand; `read_predictions` takes the maps back, named as the crops are.
+`export_crops` writes one photo per scene and ``crops.json``, which describes the orientation of a
+map; `read_predictions` takes the maps back, named as the crops are.
 
 A map is expected as DiffusionLight, StyleLight and LuxDiT write it: lat-long, the image centre
 shows what the photo's centre shows, what lies to the right of the camera is right of the centre, up
-is up. That leaves open what "up" is for a camera that looks up or down; ``maps.frame`` in
-``crops.json`` says it, see `FRAMES`.
+is up. For a camera that looks up or down, ``maps.frame`` in ``crops.json`` defines
+"up", see `FRAMES`.
 """
 
 from collections.abc import Sequence
@@ -34,7 +34,7 @@ from warpir.scene.light import angles_from_axis
 
 INDEX = "crops.json"
 SUFFIXES = (".exr", ".hdr", ".npy")
-"""Kinds of files that a map can come in."""
+"""Accepted file types of a map."""
 
 FRAMES = {
     "camera": "tilted with the camera: image centre = optical axis, top = the photo's up "
@@ -42,23 +42,23 @@ FRAMES = {
     "level": "the horizon is the middle row: image centre = optical axis without its pitch, "
     "top = the sky",
 }
-"""What a map can be aligned with; the same for a camera that looks straight ahead."""
+"""Alignments of a map; all are the same for a camera that looks straight ahead."""
 DEFAULT_FRAME = "camera"
 
 PUBLIC_SIZE = (192, 256)
 """Rows and columns of the crop of the public three-sphere protocol [px]."""
 PUBLIC_FOV_DEG = 60.0
-"""Its vertical field of view [deg]."""
+"""Vertical field of view of that crop [deg]."""
 PUBLIC_GAMMA = 2.4
 PUBLIC_PERCENTILE = 99.0
 PUBLIC_WHITE = 0.9
-"""Its tone: ``(alpha x) ** (1 / 2.4)`` with this percentile of the non-zero values at .9."""
+"""Tone mapping: ``(alpha x) ** (1 / 2.4)`` with this percentile of the non-zero values at .9."""
 LEVEL_TOLERANCE = 1e-9
 """A camera whose up axis differs less from +Y is level: its maps are turned without resampling."""
 
 
 class SceneCrop(Protocol):
-    """What `export_crops` and `read_predictions` want to know of a scene."""
+    """A scene as `export_crops` and `read_predictions` use it."""
 
     @property
     def name(self) -> str:
@@ -83,16 +83,16 @@ class SceneCrop(Protocol):
 
 @dataclass(frozen=True)
 class Predictions:
-    """The maps of another system."""
+    """Maps predicted by another system."""
 
     maps: dict[str, FloatArray]
     """Radiance by scene name, world frame, our orientation, shape [He, 2 He, 3]."""
     missing: tuple[str, ...]
-    """Scenes without a map."""
+    """Names of scenes without a map."""
     unused: tuple[str, ...]
-    """Files that have the name of no scene."""
+    """Names of files that match no scene."""
     frame: str
-    """A key of `FRAMES`."""
+    """Alignment of the maps, a key of `FRAMES`."""
 
 
 def export_crops(scenes: Sequence[SceneCrop], folder: str | Path, overwrite: bool = False) -> None:
@@ -143,7 +143,7 @@ def export_crops(scenes: Sequence[SceneCrop], folder: str | Path, overwrite: boo
 
 
 def _crop_entry(scene: SceneCrop, photo: str, has_public: bool) -> dict[str, Any]:
-    """Return what the index says of a crop."""
+    """Return a crop's entry in the index."""
     rotation = scene.camera.c2w[:3, :3]
     azimuth, pitch = angles_from_axis(-rotation[:, 2])
     return {
@@ -179,14 +179,14 @@ def read_predictions(folder: str | Path, scenes: Sequence[SceneCrop]) -> Predict
     if not folder.is_dir():
         raise InputError(folder, "not a folder (expected a folder of environment maps)")
     frame, scale = _options(folder)
-    found: dict[str, list[Path]] = {}
+    paths_by_name: dict[str, list[Path]] = {}
     for path in sorted(folder.iterdir()):
         if path.suffix.lower() in SUFFIXES:
-            found.setdefault(path.stem, []).append(path)
+            paths_by_name.setdefault(path.stem, []).append(path)
     maps: dict[str, FloatArray] = {}
     problems: list[InputError] = []
     for scene in scenes:
-        paths = found.pop(scene.name, [])
+        paths = paths_by_name.pop(scene.name, [])
         try:
             if len(paths) > 1:
                 names = " and ".join(path.name for path in paths)
@@ -197,7 +197,7 @@ def read_predictions(folder: str | Path, scenes: Sequence[SceneCrop]) -> Predict
         except InputError as problem:
             problems.append(problem)
     raise_all(problems)
-    unused = tuple(path.name for paths in found.values() for path in paths)
+    unused = tuple(path.name for paths in paths_by_name.values() for path in paths)
     if not maps:
         raise InputError(
             folder,
@@ -251,7 +251,7 @@ def public_crop(photo: FloatArray, camera: Camera) -> Float64Array | None:
 
     Args:
         photo: Display-encoded with gamma 2.2, shape [H, W, 3].
-        camera: Its camera.
+        camera: Camera of the photo.
 
     Returns:
         Display-encoded with gamma 2.4, or nothing where the photo's vertical field of view is not

@@ -1,4 +1,4 @@
-"""From the numbers of every scene to means, intervals, comparisons and tables.
+"""Statistics over scenes: means, intervals, comparisons and tables.
 
 Intervals are bootstrap percentiles over scenes: a scene is drawn with both of its objects, and two
 rows are compared on the same scenes. Scenes of one panorama are not independent of each other, so
@@ -17,31 +17,31 @@ import numpy as np
 from warpir.core.arrays import Float64Array
 
 ROUNDS = 10_000
-"""Samples drawn by the bootstrap."""
+"""Number of bootstrap samples."""
 LEVEL = 95.0
-"""Of the intervals [%]."""
+"""Level of the intervals [%]."""
 FEWEST = 6
-"""Scenes from which on a percentile interval means anything: of two it is just both values."""
+"""Least number of scenes for an interval: that of two scenes is just both values."""
 COMPARED = ("image.box.rmse", "image.full.rmse", "image.asset.rmse", "light.peak_angle_deg")
 """Figures on which rows are compared in pairs."""
 AGAINST = ("uniform", "brightest-region")
-"""Rows that every other is compared with, beside its own start."""
+"""Rows that every other row is compared with, beside its own start."""
 
 
 @dataclass(frozen=True)
 class Entry:
-    """What one row got on one subject."""
+    """Figures of one row on one subject."""
 
     row: str
     scene: str
     panorama: str
     is_sunny: bool
     material: str
-    """Of the object, `diffuse` or `glossy`."""
+    """Material of the object, `diffuse` or `glossy`."""
     figures: Mapping[str, float]
-    """By dotted name, such as ``image.box.rmse``."""
+    """Figures by dotted name, such as ``image.box.rmse``."""
     about: Mapping[str, Any]
-    """Of `warpir.evaluate.stage.Prediction`."""
+    """Notes of `warpir.evaluate.stage.Prediction`."""
 
 
 GROUPS: dict[str, Callable[[Entry], bool]] = {
@@ -51,7 +51,7 @@ GROUPS: dict[str, Callable[[Entry], bool]] = {
     "sunny": lambda e: e.is_sunny,
     "other": lambda e: not e.is_sunny,
 }
-"""Entries that are averaged apart."""
+"""Groups of entries that are averaged separately."""
 
 
 @dataclass(frozen=True)
@@ -64,10 +64,10 @@ class Mean:
     """95 % bootstrap interval over scenes."""
     low_panorama: float
     high_panorama: float
-    """The same over panoramas, each with all of its scenes."""
+    """95 % bootstrap interval over panoramas, each with all of its scenes."""
     median: float
     count: int
-    """Scenes."""
+    """Number of scenes."""
 
     @property
     def is_sure(self) -> bool:
@@ -82,8 +82,8 @@ def bootstrap(
 
     Args:
         values: One a scene.
-        groups: Which scenes are drawn together.
-        seed: Of the draws; equal groups give equal draws, so intervals of rows go together.
+        groups: Group of each scene; groups are drawn whole.
+        seed: Seed of the draws; equal groups give equal draws, so intervals of rows go together.
         rounds: Samples.
     """
     names = sorted(set(groups))
@@ -124,11 +124,11 @@ def figure_by_scene(
     entries: Sequence[Entry], row: str, figure: str, group: str
 ) -> dict[str, float]:
     """Return a figure of a row by scene, the mean over the scene's objects that are in a group."""
-    found: dict[str, list[float]] = {}
+    values_by_scene: dict[str, list[float]] = {}
     for entry in entries:
         if entry.row == row and GROUPS[group](entry) and figure in entry.figures:
-            found.setdefault(entry.scene, []).append(entry.figures[figure])
-    return {scene: float(np.mean(values)) for scene, values in found.items()}
+            values_by_scene.setdefault(entry.scene, []).append(entry.figures[figure])
+    return {scene: float(np.mean(values)) for scene, values in values_by_scene.items()}
 
 
 def summarize(entries: Sequence[Entry]) -> dict[str, dict[str, dict[str, Mean]]]:
@@ -149,7 +149,7 @@ def summarize(entries: Sequence[Entry]) -> dict[str, dict[str, dict[str, Mean]]]
 
 @dataclass(frozen=True)
 class Pair:
-    """How a row compares with another on the scenes that both have; lower figures are better."""
+    """Comparison of two rows on their common scenes; lower figures are better."""
 
     row: str
     against: str
@@ -161,14 +161,14 @@ class Pair:
     """Row minus the other: below 0 the row is better."""
     better: int
     worse: int
-    """Scenes."""
+    """Number of scenes."""
 
 
 def compare(entries: Sequence[Entry], starts: Mapping[str, str]) -> list[Pair]:
     """Compare every row with `AGAINST` and with the row that it starts from.
 
     Args:
-        entries: Of all rows.
+        entries: Entries of all rows.
         starts: The row that a row starts from, by name.
     """
     panoramas = {e.scene: e.panorama for e in entries}
@@ -265,8 +265,8 @@ def tables(
     """Yield the tables as lines of Markdown.
 
     Args:
-        summary: Of `summarize`.
-        words: What each row is.
+        summary: Summary of `summarize`.
+        words: Description of each row.
     """
     for title, columns in TABLES:
         is_light = columns[0][1].startswith(OF_LIGHT)

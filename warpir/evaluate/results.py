@@ -1,4 +1,4 @@
-"""What an evaluation writes: the record, the head of the tables, and a contact sheet."""
+"""Files of an evaluation: the record, the head of the tables, and a contact sheet."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ FORMAT, VERSION = "warpir-evaluation", 1
 DIFFERENCE_GAIN = 4.0
 """Factor on the difference, round mid grey."""
 LINE = 14
-"""Height of a line of words [px]."""
+"""Height of a line of text [px]."""
 COLUMNS = ("photo", "{row}", "truth", "{row} - truth, x 4")
 
 
@@ -34,7 +34,7 @@ class Panel:
 
     name: str
     error: float
-    """What the scenes are sorted by."""
+    """Error by which the scenes are sorted."""
     photo: CodeArray
     image: CodeArray
     truth: CodeArray
@@ -51,7 +51,7 @@ def contact_sheet(panels: Sequence[Panel], row: str, count: int = 40) -> CodeArr
 
     Args:
         panels: All of one size.
-        row: Whose pictures they are.
+        row: Name of the row whose pictures these are.
         count: Most scenes that are shown.
     """
     strips = []
@@ -76,7 +76,7 @@ def run_record(
     scenes: list[tuple[Place, list[Subject]]],
     notices: list[str],
 ) -> dict[str, Any]:
-    """Return what the numbers depend on, as plain values."""
+    """Return versions, settings and inputs of the numbers, as plain values."""
     return {
         "format": FORMAT,
         "version": VERSION,
@@ -105,7 +105,7 @@ def run_record(
 
 
 def plain_values(value: Any) -> Any:
-    """Return what JSON can hold; a number that it lacks is null."""
+    """Return values for JSON; numbers that are not finite become null."""
     if isinstance(value, dict):
         return {str(k): plain_values(v) for k, v in value.items()}
     if isinstance(value, list | tuple):
@@ -117,17 +117,17 @@ def plain_values(value: Any) -> Any:
 
 def _commit() -> str:
     """Return the commit of this checkout, or "unknown" for an installed package."""
-    found = subprocess.run(
+    git = subprocess.run(
         ["git", "-C", str(Path(__file__).parent), "rev-parse", "--short", "HEAD"],
         capture_output=True,
         text=True,
         check=False,
     )
-    return found.stdout.strip() or "unknown"
+    return git.stdout.strip() or "unknown"
 
 
 def head_lines(record: dict[str, Any]) -> list[str]:
-    """Return what stands above the tables, as lines of Markdown."""
+    """Return the head of the tables, as lines of Markdown."""
     options, panoramas = record["options"], {s["panorama"] for s in record["scenes"]}
     sunny = sum(s["is_sunny"] for s in record["scenes"])
     lines = [
@@ -156,7 +156,7 @@ def head_lines(record: dict[str, Any]) -> list[str]:
 
 
 def verdict_lines(entries: list[Entry]) -> list[str]:
-    """Return how often guidance could show that its end is better than its start, by row."""
+    """Return how often the acceptance test passed, by row."""
     verdicts: dict[str, list[bool]] = {}
     for entry in entries:
         acceptance = entry.about.get("record", {}).get("acceptance")

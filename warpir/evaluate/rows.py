@@ -54,8 +54,8 @@ class Bench:
     Args:
         scenes: All places and their subjects.
         device: Warp device; torch uses the same.
-        seed: Of guided runs and of random weights.
-        config: What guided runs start from, without files: model or prior, steps, precision.
+        seed: Seed of guided runs and of random weights.
+        config: Base configuration of guided runs, without files: model or prior, steps, precision.
         network: The regressor, or None.
         missing: Why there is no regressor.
         predictions: Lights of another system by the place's name, world frame.
@@ -99,13 +99,13 @@ class Bench:
     def digests(self) -> dict[str, str | None]:
         """Return the sha256 of the weights that were used, by what they are."""
         where = files("warpir.diffusion") / "weights"
-        found: dict[str, str | None] = {}
+        digests: dict[str, str | None] = {}
         for name in ("regressor", "prior"):
             given = self.config.flat()[name]
             path = Path(given or str(where / f"{name}.safetensors"))
             is_there = path.is_file()
-            found[name] = hashlib.sha256(path.read_bytes()).hexdigest() if is_there else None
-        return found
+            digests[name] = hashlib.sha256(path.read_bytes()).hexdigest() if is_there else None
+        return digests
 
     @cached_property
     def random_network(self) -> Regressor:
@@ -300,12 +300,12 @@ def guided_mirrored(bench: Bench, stage: Stage, subject: Subject) -> Prediction:
     reflected = replace(placement, asset_to_world=reflect @ placement.asset_to_world)
     flipped = replace(subject, placement=reflected)
     photo = np.ascontiguousarray(place.photo[:, ::-1])
-    found = recover_light(bench, flipped, photo, {"start": "regressed"})
-    light = mirrored(found.light, place.azimuth)
+    prediction = recover_light(bench, flipped, photo, {"start": "regressed"})
+    light = mirrored(prediction.light, place.azimuth)
     shadow = light
-    if found.light_shadow is not found.light:
-        shadow = mirrored(found.light_shadow, place.azimuth)
-    return replace(found, light=light, light_shadow=shadow)
+    if prediction.light_shadow is not prediction.light:
+        shadow = mirrored(prediction.light_shadow, place.azimuth)
+    return replace(prediction, light=light, light_shadow=shadow)
 
 
 def recover_light(
@@ -316,7 +316,7 @@ def recover_light(
     Args:
         bench: Names prior or model.
         subject: The object and where it stands.
-        photo: What guidance is shown, display-encoded, shape [H, W, 3].
+        photo: Photo for guidance, display-encoded, shape [H, W, 3].
         changes: Settings that differ from the bench's.
     """
     place = subject.place
@@ -355,8 +355,8 @@ AUTHORS: dict[str, Any] = {
     "null_background": "keep", "guidance_scale": 100.0, "time_min": 0.05, "time_max": 0.8,
     "time_max_end": 0.4, "fusion": "schedule", "lobe_shape": True, "tone_curve": True, "rate": 1.0,
 }  # fmt: skip
-"""What ablations change of the embedded prior's defaults to be the authors' method: all unknowns,
-and their times on its schedule. Stable Diffusion's defaults are theirs already."""
+"""Settings by which the embedded prior's defaults become the authors' method: all unknowns, and
+their times on its schedule. Stable Diffusion's defaults are theirs already."""
 
 
 def _ablation(words: str, **changes: Any) -> Row:
@@ -491,11 +491,11 @@ def chosen_rows(text: str | None, has_predictions: bool, is_guided: bool = True)
     if text is not None:
         names = set()
         for word in (w.strip() for w in text.split(",")):
-            found = {k for k, row in ROWS.items() if word in (k, row.group, "all")}
-            if not found:
+            chosen = {k for k, row in ROWS.items() if word in (k, row.group, "all")}
+            if not chosen:
                 known = ", ".join(dict.fromkeys((*GROUPS, *ROWS)))
                 raise usage("--rows", f"no row {word!a}", f"known: all, {known}")
-            names |= found
+            names |= chosen
         if not has_predictions and text != "all" and "predictions" in names:
             raise usage("--rows", "predictions needs --predictions DIR")
     if has_predictions:

@@ -45,7 +45,7 @@ AZIMUTHS = 256
 PITCH = (-15.0, 5.0)
 """Least and greatest upward tilt of the camera [deg]."""
 CAMERA_HEIGHT = 1.6
-"""Above the ground [m]."""
+"""Height of the camera above the ground [m]."""
 ASPECT = 1.5
 """Width of the photograph over its height [1]."""
 HEIGHT_SHARE = (0.20, 0.35)
@@ -53,15 +53,15 @@ HEIGHT_SHARE = (0.20, 0.35)
 WIDTH_SHARE = 0.45
 """Greatest width of the object over that of the photograph [1]."""
 FOOT_COLUMN = (0.3, 0.7)
-"""Where the object stands, as shares of the photograph's width [1]."""
+"""Range of the object's foot, over the photograph's width [1]."""
 FOOT_ROW = (0.35, 0.75)
-"""Where it stands, as shares of the way from the horizon to the lower edge [1]."""
+"""Range of the object's foot, over the distance from the horizon to the lower edge [1]."""
 EDGE = 0.02
 """Share of the photograph that the object keeps away from its edges [1]."""
 SUNNY_SHARE = 0.25
 """A sunny place sends at least this share of its flux from within 5 degrees of the peak [1]."""
 SUNNY_PEAK = 3000.0
-"""Its peak is at least this many times its mean: lamps and soft boxes are larger than a sun [1]."""
+"""Least peak of a sunny place over its mean: lamps and soft boxes are larger than a sun [1]."""
 MATERIALS = {"diffuse": (0.0, 1.0), "glossy": (1.0, 0.3)}
 """Metallic and roughness of the two objects of a place; their colours are the asset's own."""
 WHITE_PERCENTILE = 99.0
@@ -82,8 +82,8 @@ def crop_camera(
         width: Image width [px].
         height: Image height [px].
         fov: Horizontal field of view [deg].
-        azimuth: Where it looks, clockwise from -Z seen from above [deg].
-        pitch: How far it looks up [deg].
+        azimuth: Azimuth of the camera, clockwise from -Z seen from above [deg].
+        pitch: Upward tilt of the camera [deg].
         camera_height: Above the ground y = 0 [m].
     """
     camera = camera_from_fov(width, height, fov, pitch, camera_height)
@@ -141,7 +141,7 @@ def _filmic_inverse(y: Float64Array) -> Float64Array:
 
 @dataclass(frozen=True)
 class Response:
-    """How the camera turned radiance into display-linear values, and back; both elementwise."""
+    """Response of a camera, radiance to display-linear values, and its inverse; elementwise."""
 
     show: Callable[[Float64Array], Float64Array]
     """Radiance, photo-linear, to display-linear values in [0, 1]."""
@@ -153,7 +153,7 @@ RESPONSES = {
     "gamma": Response(lambda x: np.clip(x, 0.0, 1.0), lambda y: y),
     "filmic": Response(_filmic, _filmic_inverse),
 }
-"""By name: clipping alone (DiPIR's photographs), and a film's curve that no method is told of."""
+"""Responses by name: clipping alone (DiPIR's photographs), and a film curve unknown to methods."""
 
 
 # --------------------------------------------------------------------------------------- places
@@ -168,21 +168,21 @@ class Place:
     panorama: str
     """File name without its ending."""
     camera: Camera
-    """Above the world's origin, turned by `azimuth`; the ground is y = 0."""
+    """Camera above the world's origin, turned by `azimuth`; the ground is y = 0."""
     azimuth: float
-    """Where the camera looks, clockwise from -Z seen from above [deg]."""
+    """Viewing direction, clockwise from -Z seen from above [deg]."""
     pitch: float
-    """How far it looks up [deg]."""
+    """Upward tilt of the camera [deg]."""
     photo: FloatArray
     """Display-encoded, 8-bit codes as floats in [0, 1], shape [H, W, 3]."""
     exposure: float
     """Photo-linear radiance over the panorama's [1]."""
     response: str
-    """A key of `RESPONSES`."""
+    """Response of the camera, a key of `RESPONSES`."""
     radiance: FloatArray
     """The panorama itself, unturned, shape [512, 1024, 3]."""
     seed: tuple[int, ...]
-    """Of everything that is drawn for this place."""
+    """Seed of all random numbers of this place."""
 
     @cached_property
     def texels(self) -> FloatArray:
@@ -220,13 +220,13 @@ class Subject:
 
     place: Place
     asset: Asset
-    """With the materials of `material`."""
+    """The asset with the surface of `material`."""
     asset_path: Path
-    """The file it was read from."""
+    """File of the asset."""
     material: str
-    """A key of `MATERIALS`."""
+    """Surface of the asset, a key of `MATERIALS`."""
     placement: Placement
-    """Where it stands: on y = 0."""
+    """Pose on the ground y = 0."""
 
     @property
     def name(self) -> str:
@@ -258,7 +258,7 @@ def find_files(paths: Sequence[Path], suffixes: Sequence[str], where: str) -> li
 
 
 class Places:
-    """A sequence of places, made when they are asked for, each with its subjects.
+    """A sequence of places, generated on demand, each with its subjects.
 
     Every panorama is seen once before any is seen again; so are the assets. A file that cannot be
     used is left out with a notice.
@@ -266,8 +266,8 @@ class Places:
     Args:
         panoramas: Files of lat-long radiance.
         assets: Files of objects.
-        seed: Of everything.
-        width: Of the photographs [px]; their height is two thirds of it.
+        seed: Seed of all random numbers.
+        width: Width of the photographs [px]; their height is two thirds of it.
         fov: Vertical field of view [deg].
         response: A key of `RESPONSES`.
     """
@@ -326,11 +326,11 @@ class Places:
         Raises:
             InputError: None of the panoramas or assets can be used.
         """
-        made = []
+        places = []
         for k in range(number):
             place = self._place(k, *next(self._panoramas))
-            made.append((place, self._stand(place, *next(self._subjects))))
-        return made
+            places.append((place, self._stand(place, *next(self._subjects))))
+        return places
 
     def _place(self, k: int, path: Path, panorama: FloatArray) -> Place:
         seed = (self.seed, k, zlib.crc32(path.stem.encode()))
@@ -398,9 +398,9 @@ def _largest(
         low: Lowest corner of the asset's box, asset frame [m], shape [3].
         high: Highest corner, shape [3].
         camera: The view.
-        stand: Where the object stands, world frame [m], shape [3].
-        yaw: Its turn, counter-clockwise seen from above [deg].
-        share: Of the photograph's height [1].
+        stand: Place of the object, world frame [m], shape [3].
+        yaw: Turn of the object, counter-clockwise seen from above [deg].
+        share: Height of the object over that of the photograph [1].
     """
     sides = (high - low) / max(float((high - low).max()), 1e-12)
     grid = np.stack(np.meshgrid(*[(0.0, 1.0)] * 3, indexing="ij"), -1).reshape(-1, 3)
@@ -429,7 +429,7 @@ def _largest(
 def with_surface(asset: Asset, metallic: float, roughness: float) -> Asset:
     """Return the asset with other roughness and metallic, its own colours, and no emission.
 
-    What glows by itself says nothing about the light.
+    Emission carries no information about the light.
     """
 
     def changed(material: Material) -> Material:
@@ -450,7 +450,7 @@ def mirrored(light: Light, azimuth: float) -> Light:
 
     Args:
         light: World frame.
-        azimuth: Where the camera looks, clockwise from -Z seen from above [deg].
+        azimuth: Azimuth of the camera, clockwise from -Z seen from above [deg].
     """
     lobes, texels = light.lobes, light.texels
     if lobes is not None:

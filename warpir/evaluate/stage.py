@@ -1,4 +1,4 @@
-"""A subject in its place, ready to be lit: how a light and tone curves become a composite.
+"""Composites of a subject in its place under given lights and tone curves.
 
 Every light is rendered by the same renderer with the same geometry, samples and random numbers.
 """
@@ -17,6 +17,7 @@ from warpir.core.color import linear_to_gamma
 from warpir.core.errors import InputError
 from warpir.evaluate.scenes import RESPONSES, Subject
 from warpir.render.bridge import ComposeConstants, compose
+from warpir.render.composite import Quality
 from warpir.render.device_light import light_args
 from warpir.render.device_scene import Placed, Receiver, Scene
 from warpir.render.renderer import Foreground, Renderer
@@ -25,44 +26,30 @@ from warpir.scene.light import Light
 from warpir.scene.tone_curves import Curves, ToneKnots
 
 FLOOR_EVALUATIONS = 60
-"""Times that the tone floor's curves are tried while they are sought."""
+"""Largest number of evaluations in the fit of the tone floor's curves."""
 EXPOSURE_EV = 8.0
-"""How far the fitted exposure may go, either way [EV]."""
+"""Largest change by the fitted exposure, either way [EV]."""
 
 
 @dataclass(frozen=True)
 class Prediction:
-    """What a row says of one scene."""
+    """Light and tone curves that a row predicts for a scene."""
 
     light: Light
-    """Lights the object, world frame, photo-linear."""
+    """Light on the object, world frame, photo-linear."""
     light_shadow: Light
-    """Casts its shadow; the same object where there is one light."""
+    """Light that casts the shadow; the same object where there is one light."""
     curves: Curves | None
     """Tone operator and curves; None: the camera's own response, which only the truth knows."""
     seed: int = 0
     """Added to the seed of the samples."""
     about: Mapping[str, Any] = field(default_factory=dict)
-    """What a reader may want to know of how it came about; plain values."""
+    """Notes on the prediction for the report; plain values."""
 
     @staticmethod
     def of(light: Light, **about: Any) -> Prediction:
-        """Return what is said by a light alone: identity curves, clipped as a photo is."""
+        """Return the prediction of a light alone: identity curves, clipped as a photo is."""
         return Prediction(light, light, Curves.identity("linear"), about=about)
-
-
-@dataclass(frozen=True)
-class Quality:
-    """How finely pictures are sampled."""
-
-    samples: int = 64
-    """Per pixel."""
-    rays: int = 2
-    """Per sample and technique."""
-    depth: int = 5
-    """Surface interactions."""
-    indirect_limit: float = 8.0
-    """Most radiance that one path may add behind its first vertex; 0 for no limit."""
 
 
 @dataclass(frozen=True)
@@ -71,23 +58,22 @@ class Rendered:
 
     foreground: Foreground
     receiver_pixels: IntArray
-    """Row-major, shape [receiver_pixel]."""
+    """Row-major pixel indices, shape [receiver_pixel]."""
     ratio: FloatArray
     """Shadow ratio, shape [receiver_pixel, 3]."""
 
 
 class Stage:
-    """One subject in its place, ready to be lit.
+    """Renders one subject in its place under any light.
 
     Args:
         subject: The object and the photograph.
         device: Warp device.
-        quality: Samples.
-        seed: Of the samples; the same for every light.
-        threads: On the CPU; 0: one per core.
+        quality: Sampling, the same for every light.
+        threads: Threads on the CPU; 0 for one per core.
 
     Raises:
-        InputError: Nothing of the object is seen.
+        InputError: The object covers no pixel.
 
     Attributes:
         truth: The true composite, display-encoded, shape [H, W, 3].
@@ -95,15 +81,13 @@ class Stage:
         ratio: True shadow ratio, shape [H, W, 3].
     """
 
-    def __init__(
-        self, subject: Subject, device: str, quality: Quality, seed: int, threads: int = 0
-    ) -> None:
-        self.place, self.quality, self.seed = subject.place, quality, seed
+    def __init__(self, subject: Subject, device: str, quality: Quality, threads: int = 0) -> None:
+        self.place, self.quality = subject.place, quality
         placed = Placed(subject.asset, subject.placement.asset_to_world)
         ground = subject.placement.ground
         scene = Scene([placed], self.place.camera, Receiver(ground[:3], -float(ground[3])), device)
         self.renderer = Renderer(scene, threads)
-        self.objects: IntArray = self.renderer.gbuffer(seed).object_pixels
+        self.objects: IntArray = self.renderer.gbuffer(quality.seed).object_pixels
         if len(self.objects) == 0:
             raise InputError(subject.asset_path, f"nothing of it is seen in {self.place.name}")
         self.true = self.render(self.true_prediction())
@@ -112,13 +96,14 @@ class Stage:
         self.ratio = self._plane(self.true.receiver_pixels, self.true.ratio, 1.0)
 
     def true_prediction(self) -> Prediction:
-        """Return the place's own light, shown by the camera's own response."""
+        """Return the place's true light with the camera's own response."""
         light = Light(texels=self.place.texels)
         return Prediction(light, light, None)
 
     def render(self, prediction: Prediction) -> Rendered:
         """Return object and shadow under a row's light."""
-        renderer, quality, seed = self.renderer, self.quality, self.seed + prediction.seed
+        renderer, quality = self.renderer, self.quality
+        seed = quality.seed + prediction.seed
         args = light_args(prediction.light, renderer.device)
         shadow = args
         if prediction.light_shadow is not prediction.light:
@@ -127,7 +112,7 @@ class Stage:
             args, self.objects, quality.samples, quality.rays, quality.depth, seed,
             quality.indirect_limit,
         )  # fmt: skip
-        proxies = renderer.shaded_pixels(shadow, self.seed)
+        proxies = renderer.shaded_pixels(shadow, quality.seed)
         is_object = np.zeros(self.place.photo.shape[0] * self.place.photo.shape[1], np.int32)
         is_object[self.objects] = 1
         radiance = renderer.receiver(
@@ -139,7 +124,7 @@ class Stage:
         """Return the composite, display-encoded, shape [H, W, 3].
 
         Args:
-            rendered: Of `render`.
+            rendered: Radiance of `render`.
             curves: Tone operator and curves; None: the camera's own response.
             gain: Factor on the object's radiance [1].
         """
@@ -213,7 +198,7 @@ class Stage:
     def tone_floor(self) -> Curves:
         """Return the curves after Reinhard's operator that come nearest to the truth.
 
-        What they leave is the least error of any method that has this tone model.
+        Their error is the least of any method with this tone model.
         """
         foreground, ratio = self.true.foreground, torch.from_numpy(self.true.ratio)
         constants = ComposeConstants(

@@ -56,7 +56,7 @@ MIRROR_STEPS = 4
 GAMMA = 2.4
 """Exponent of the published chain [1]."""
 MEDIAN = 0.5
-"""What its median of the non-zero values becomes [1]."""
+"""Median of the non-zero values after the published chain's scaling [1]."""
 MEAN_LUMINANCE = 0.5
 """Mean luminance of the true diffuse sphere in the linear variant [1]."""
 LOG_OFFSET = 1e-3
@@ -72,9 +72,9 @@ class Material:
     """A metallic-roughness material without texture."""
 
     base_color: float
-    """Linear, grey [1]."""
+    """Base colour, linear, grey [1]."""
     metallic: float
-    """0 or 1."""
+    """Metallic, 0 or 1."""
     roughness: float
     """Perceptual [1]; the GGX width is its square."""
 
@@ -91,7 +91,7 @@ def to_camera_frame(texels: FloatArray, azimuth_deg: float) -> FloatArray:
 
     Args:
         texels: Radiance, lat-long, shape [He, 2 He, 3].
-        azimuth_deg: Where the camera looks, clockwise from -Z seen from above [deg].
+        azimuth_deg: Azimuth of the camera, clockwise from -Z seen from above [deg].
     """
     return rotate_map(texels, azimuth_deg)
 
@@ -106,7 +106,7 @@ def sphere_errors(predicted: FloatArray, true: FloatArray) -> dict[str, float]:
 
     Args:
         predicted: Radiance, lat-long, camera-yaw frame, shape [He, 2 He, 3].
-        true: The same in the same unit; another size is fine.
+        true: True light in the same unit, of any size.
 
     Returns:
         For M in ``diffuse``, ``matte``, ``mirror``:
@@ -283,7 +283,7 @@ def reflected(
         cos_o: Cosine between normal and the direction to the camera.
         cos_i: Cosine between normal and the direction to the light.
         cos_oi: Cosine between the two directions.
-        material: What it is made of.
+        material: Material of the sphere.
     """
     cos_i = np.maximum(cos_i, 0.0)
     # The half vector h = (wo + wi) / |wo + wi|: |wo + wi| = 2 (wo . h)

@@ -63,13 +63,13 @@ class Surface:
     dielectric_f0: Any
     """Reflectance of the dielectric at normal incidence [1]."""
     dielectric_f90: Any
-    """The same at grazing incidence [1]."""
+    """Reflectance of the dielectric at grazing incidence [1]."""
     transmission: Any
     """Share of what enters the dielectric that goes through [1]."""
     sheen_color: Any
     sheen_alpha: Any
     sheen_scale: Any
-    """What the sheen leaves to the base [1]."""
+    """Factor on the base below the sheen [1]."""
     coat: Any
     """Clear coat times its Fresnel term [1]."""
     coat_alpha: Any
@@ -213,7 +213,7 @@ class GltfBSDF(mi.BSDF):
         return mi.Color3f(1.0 - alpha) & active
 
     def has_attribute(self, name: str, active: mi.Bool = True) -> mi.Bool:
-        """Say which attributes exist: ``emission``."""
+        """Return whether the attribute is ``emission``, the only one."""
         return name == "emission"
 
     def eval_attribute_3(

@@ -1,4 +1,4 @@
-"""An insertion rendered by Mitsuba 3: object, shadow, and a whole run's composite.
+"""Rendering of an insertion by Mitsuba 3: object, shadow, and a run's composite.
 
 `foreground` and `shadow` are what ``benchmarks/referee/__main__.py`` judges warpir by; `render_run`
 puts them together as a run with ``--mitsuba`` was, for the ``render.py`` in its folder. Material,

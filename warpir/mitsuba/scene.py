@@ -1,4 +1,4 @@
-"""An insertion as a scene of Mitsuba 3, in the folder ``mitsuba`` of a run.
+"""Export of an insertion as a scene of Mitsuba 3, in the folder ``mitsuba`` of a run.
 
 ``scene.xml`` needs nothing but Mitsuba: meshes, camera, our light on Mitsuba's rows, and materials
 as its ``principled``, the nearest of its own to glTF's; emission is left out. ``render.py`` renders
@@ -25,15 +25,15 @@ from warpir.scene.camera import Camera, mitsuba_sensor
 
 FOLDER = "mitsuba"
 LEAST_ROWS, FINE_ROWS = 512, 2048
-"""Maps are refined to twice their rows, and small ones to the first, up to the second: irradiance
-is then right to 2e-5."""
+"""Least and greatest rows of a refined map, which otherwise has twice its own: irradiance is then
+right to 2e-5."""
 
 
 def write_mitsuba(output: OutputFolder, inputs: Inputs, texels: FloatArray, depth: int) -> None:
     """Stage the folder.
 
     Args:
-        output: Where; ``render.py`` reads the files of the hand-off beside the folder.
+        output: Output folder; ``render.py`` reads the files of the hand-off beside the new one.
         inputs: Camera, and the object with its place.
         texels: The light on the object, relative [W/(m^2 sr)], shape [He, 2 He, 3].
         depth: Surface interactions of the longest path.
@@ -119,7 +119,7 @@ def ply_bytes(
 
 @dataclass
 class _Scene:
-    """``scene.xml`` as it grows; meshes and textures are staged on the way."""
+    """Builder of ``scene.xml``, which stages meshes and textures."""
 
     output: OutputFolder
     asset: Asset
@@ -186,7 +186,7 @@ class _Scene:
         self.lines.append("</shape>")
 
     def _material(self, material: Material) -> None:
-        """Write the nearest ``principled``, under a mask and a normal map where there are any."""
+        """Write the nearest ``principled``, under a mask and a normal map if there are any."""
         open_tags = 1
         self.lines.append(f"    <!-- {_comment(material.name)} -->")
         if material.alpha_mode != "OPAQUE":

@@ -23,7 +23,7 @@ def report_kept(asked: OutputConfig, error: BaseException) -> None:
 
     Args:
         asked: Output settings of the run.
-        error: What ended it; a `Stopped` carries the line instead.
+        error: Error that ended the run; a `Stopped` carries the line instead.
     """
     if isinstance(error, InputError) and error.code not in (ExitCode.RESOURCES, ExitCode.NUMERIC):
         return  # refused before it began

@@ -195,8 +195,6 @@ def follow(
     guided: Guided,
     guide: Guidance | DatasetUpdate,
     renderer: Renderer,
-    checkpoints: Checkpoints,
-    resumed: Checkpoint | None,
 ) -> Course:
     """Run a loop to its end, with checkpoints, previews and progress.
 
@@ -205,6 +203,7 @@ def follow(
     """
     with run.timings.stage("optimize"), torch.no_grad():
         first = loop.guide.score(loop.final_image(run.config.render.seed))
+    resumed = guided.resumed
     if resumed is not None and resumed.stage == "optimize":
         loop.load_state_dict(resumed.state["loop"])
         renderer.bad_pixels.load_state_dict(resumed.state["bad_pixels"])
@@ -215,7 +214,7 @@ def follow(
             "guided": guided.state_dict(),
             "bad_pixels": renderer.bad_pixels.state_dict(),
         }
-        checkpoints.save("optimize", loop.state.step, state)
+        guided.checkpoints.save("optimize", loop.state.step, state)
 
     watch = _Watch(run)
 

@@ -224,8 +224,8 @@ class Optimization(ABC):
         return float(end + (1.0 - end) * 0.5 * (1.0 + np.cos(np.pi * share)))
 
     def _gradients_are_finite(self) -> bool:
-        found = [p.grad for p in self.unknowns.parameters() if p.grad is not None]
-        return bool(torch.stack([g.isfinite().all() for g in found]).all())
+        gradients = [p.grad for p in self.unknowns.parameters() if p.grad is not None]
+        return bool(torch.stack([g.isfinite().all() for g in gradients]).all())
 
     def _count(self, is_finite: bool) -> None:
         """Count a step, and lower the learning rate after one that is not finite.

@@ -15,9 +15,9 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from warpir.app.config import REFINE_PARTS, InsertConfig
+from warpir.app.config import REFINE_PARTS
 from warpir.app.run import Run
-from warpir.app.settings import OptimizeSettings
+from warpir.app.settings import OptimizeSettings, TaskConfig
 from warpir.core.memory import release
 from warpir.io.meshes.materials_file import MATERIALS, materials_to_json
 from warpir.lighting.regularizers import bend
@@ -152,7 +152,7 @@ class Factors(torch.nn.Module):
     def materials(self) -> tuple[Material, ...]:
         """Return the asset's materials with the factors as they are."""
         with torch.no_grad():  # on CUDA a start at a bound may be a rounding beyond it
-            found = {
+            rows_by_part = {
                 part: values()
                 .clamp(LOWEST.get(part, 0.0), 1.0 if part in LOWEST else None)
                 .tolist()
@@ -162,7 +162,7 @@ class Factors(torch.nn.Module):
         for row, index in enumerate(self.chosen):
             factors: dict[str, Any] = {
                 part: tuple(rows[row]) if isinstance(rows[row], list) else rows[row]
-                for part, rows in found.items()
+                for part, rows in rows_by_part.items()
             }
             materials[index] = replace(materials[index], **factors)
         return tuple(materials)
@@ -172,7 +172,7 @@ class ToneUnknowns(torch.nn.Module):
     """The unknowns of tone refinement: four curves.
 
     Args:
-        curves: Where they start.
+        curves: Curves at the start.
     """
 
     def __init__(self, curves: Curves) -> None:
@@ -190,9 +190,9 @@ class MaterialRefinement(Optimization):
     Args:
         lit: The frame under its light.
         curves: The light's tone curves, which stand still.
-        guide: What looks right.
+        guide: Gradient and score of the image.
         settings: Steps, rates, samples.
-        unknowns: Where to start; changed in place.
+        unknowns: Parameters at their start; changed in place.
     """
 
     unknowns: Factors
@@ -233,8 +233,8 @@ class MaterialRefinement(Optimization):
 
     def final_image(self, seed: int) -> Tensor:
         """Return the composite with the materials as they are."""
-        found: MaterialTensors = self.unknowns()
-        factors = found.base_color, found.metallic, found.roughness, found.emission
+        free: MaterialTensors = self.unknowns()
+        factors = free.base_color, free.metallic, free.roughness, free.emission
         # The light is fixed, so there is no map to differentiate.
         foreground: Tensor = ShadeForeground.apply(
             self.mis, self.lit.args_fg, seed, torch.is_grad_enabled(), None, *factors
@@ -262,9 +262,9 @@ class ToneRefinement(Optimization):
 
     Args:
         lit: The frame under its light.
-        guide: What looks right.
+        guide: Gradient and score of the image.
         settings: Steps, rates, weights.
-        unknowns: Where to start; changed in place.
+        unknowns: Parameters at their start; changed in place.
     """
 
     unknowns: ToneUnknowns
@@ -334,15 +334,15 @@ def refine(run: Run, light: SceneLight) -> Outcome:
         with run.timings.stage("scene"):
             # Curves of an earlier run belong to its tone operator.
             frame = replace(make_frame(run), is_reinhard=light.curves.tone == "reinhard")
-        guided, resumed = prepare_guidance(run, checkpoints)
+        guided = prepare_guidance(run, checkpoints)
         with run.timings.stage("trace"):
             release()
             guide = make_guide(run, guided, frame)
             lit = LitFrame(frame, light, torch.device(run.device))
         loop = _loop_of(run, lit, light.curves, guide)
-        moves = what_moves(run.config, asset)
+        moves = what_moves(run.config.task, asset)
         run.log.say(f"free: {', '.join(moves['free'])}; frozen: {', '.join(moves['frozen'])}")
-        course = follow(run, loop, guided, guide, frame.renderer, checkpoints, resumed)
+        course = follow(run, loop, guided, guide, frame.renderer)
         with run.timings.stage("write"):
             course.write()
     notices = tuple(course.notices())
@@ -366,28 +366,28 @@ def _loop_of(
     if task.refine == "tone":
         return ToneRefinement(lit, guide, settings, ToneUnknowns(curves).to(run.device))
     chosen = asset.materials_named(task.refine_materials)
-    unknowns = Factors(asset, chosen, free_parts(run.config)).to(run.device)
+    unknowns = Factors(asset, chosen, free_parts(task)).to(run.device)
     return MaterialRefinement(lit, curves, guide, settings, unknowns)
 
 
-def free_parts(config: InsertConfig) -> list[str]:
+def free_parts(task: TaskConfig) -> list[str]:
     """Return the fields of `Material` that ``--refine`` changes; none of them for tone."""
     chosen = {
-        "material": config.task.refine_parts or REFINE_PARTS,
+        "material": task.refine_parts or REFINE_PARTS,
         "emission": ("emission",),
         "tone": (),
-    }[config.task.refine or "tone"]
+    }[task.refine or "tone"]
     return [name.replace("-", "_") for name in chosen]
 
 
-def what_moves(config: InsertConfig, asset: Asset) -> dict[str, Any]:
+def what_moves(task: TaskConfig, asset: Asset) -> dict[str, Any]:
     """Return the entry of ``run.json`` about free and frozen parameters."""
-    parts = free_parts(config)
+    parts = free_parts(task)
     known = ("tone curves", *LOWEST, "emission")
     free = parts or ["tone curves"]
-    chosen = asset.materials_named(config.task.refine_materials) if parts else []
+    chosen = asset.materials_named(task.refine_materials) if parts else []
     return {
-        "what": config.task.refine,
+        "what": task.refine,
         "free": free,
         "frozen": ["light", *(name for name in known if name not in free)],
         "materials": [asset.materials[index].name for index in chosen],

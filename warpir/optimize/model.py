@@ -72,6 +72,9 @@ class Guided:
     learnt: Personalization | None
     """Personalisation to the photo; None where the base model is used."""
     notices: tuple[str, ...]
+    checkpoints: Checkpoints
+    resumed: Checkpoint | None
+    """Checkpoint to resume from, if there is one."""
 
     @property
     def prior(self) -> NetworkPrior:
@@ -106,8 +109,8 @@ class Guided:
         return record
 
 
-def prepare_guidance(run: Run, checkpoints: Checkpoints) -> tuple[Guided, Checkpoint | None]:
-    """Load the model and adapt it to the photo; return it and the checkpoint to resume from.
+def prepare_guidance(run: Run, checkpoints: Checkpoints) -> Guided:
+    """Load the model and adapt it to the photo, or restore both from a checkpoint.
 
     Raises:
         InputError: The checkpoint is another run's; every difference is named.
@@ -130,7 +133,7 @@ def prepare_guidance(run: Run, checkpoints: Checkpoints) -> tuple[Guided, Checkp
     if resumed is not None and resumed.stage == "optimize":
         # After the adapter, which was rounded as the model was when it came.
         prior.load_state_dict(resumed.state["guided"]["prior"])
-    return guided, resumed
+    return guided
 
 
 def load_prior(run: Run) -> Asked:
@@ -168,8 +171,8 @@ def require_memory(run: Run) -> None:
     """
     model = run.config.diffusion
     with hub_offline(not model.allow_download):
-        found = find_model(model.model, model.allow_download, model.allow_pickle)
-        folder = check_model_folder(found, model.allow_pickle)
+        path = find_model(model.model, model.allow_download, model.allow_pickle)
+        folder = check_model_folder(path, model.allow_pickle)
     files = (file for weights in folder.weights.values() for file in weights.files)
     side = 8 * int(folder.configs["unet"]["sample_size"])
     is_half = run.device != "cpu" and model.precision != "fp32"
@@ -187,9 +190,9 @@ def checkpoint_of(run: Run, checkpoints: Checkpoints, prior: NetworkPrior) -> Ch
     checkpoints.identity["model"] = prior.file_hashes
     if checkpoints.newest is None:
         return None
-    found = checkpoints.load(lambda text: run.log.say(f"notice: {text}"))
-    run.log.say(f"resumed: {found.stage}, step {found.step}")
-    return found
+    checkpoint = checkpoints.load(lambda text: run.log.say(f"notice: {text}"))
+    run.log.say(f"resumed: {checkpoint.stage}, step {checkpoint.step}")
+    return checkpoint
 
 
 def adapted(run: Run, asked: Asked, checkpoints: Checkpoints, resumed: Checkpoint | None) -> Guided:
@@ -210,7 +213,7 @@ def adapted(run: Run, asked: Asked, checkpoints: Checkpoints, resumed: Checkpoin
             learnt = personalized(run, asked, checkpoints, resumed)
         notices = (*notices, *learnt.notices)
     prior.free_text_encoder()
-    return Guided(asked, learnt, notices)
+    return Guided(asked, learnt, notices, checkpoints, resumed)
 
 
 def personalized(

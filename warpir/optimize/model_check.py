@@ -35,6 +35,7 @@ from warpir.diffusion.personalization.lora_training import LoraTraining
 from warpir.diffusion.personalization.personalize import personalize
 from warpir.diffusion.prior import Condition, NonFiniteError
 from warpir.diffusion.prompts import Prompts, make_prompts
+from warpir.diffusion.settings import GuidanceSettings, PersonalizeSettings
 from warpir.optimize.model import as_input_errors
 from warpir.render.device import choose_device
 
@@ -156,21 +157,23 @@ def check_model(
     prompts = make_prompts(config.guidance.prompt or PROMPT, config.adapter)
     verdicts: list[Verdict] = []
 
-    def judged(*found: Verdict) -> None:
-        for verdict in found:
+    def judged(*new: Verdict) -> None:
+        for verdict in new:
             say(verdict.line)
-        verdicts.extend(found)
+        verdicts.extend(new)
 
+    seed = config.render.seed
+    settings = config.settled(on_cuda=prior.device.type == "cuda").guidance_settings()
     square = _middle(image).apply(image, prior.resolution)
-    figures = prior.self_check(square, prompts.guidance, config.render.seed)
+    figures = prior.self_check(square, prompts.guidance, seed)
     judged(
-        judge_noise(figures["noise_error"], _silent_error(prior, square, config.render.seed)),
+        judge_noise(figures["noise_error"], _silent_error(prior, square, seed)),
         judge_effect([figures[f"difference_{t}"] for t in CHECK_TIMES]),
         judge_precision(figures["precision"], model["unet_precision"]),
     )
-    verdict, lora_seconds = _try_lora(prior, image, prompts, config)
+    verdict, lora_seconds = _try_lora(prior, image, prompts, config.adapter, seed)
     judged(verdict)
-    verdict, guidance_seconds = _try_guidance(prior, image, prompts, config)
+    verdict, guidance_seconds = _try_guidance(prior, image, prompts, settings, seed)
     judged(verdict)
     seconds = {"lora_step": lora_seconds, "guidance_step": guidance_seconds}
     minutes = (
@@ -189,7 +192,7 @@ def judge_noise(error: float, silent: float) -> Verdict:
 
     Args:
         error: Mean squared error at `NOISE_TIME`.
-        silent: The same of the prediction 0; 1 where that is the noise, less where it is v.
+        silent: The same of a zero prediction; 1 where that is the noise, less where it is v.
     """
     share = error / silent
     return Verdict(
@@ -274,8 +277,8 @@ def _silent_error(prior: StableDiffusion, square: Tensor, seed: int) -> float:
     noise = torch.randn(latents.shape, generator=torch.Generator().manual_seed(seed))
     t = torch.tensor([NOISE_TIME])
     noisy = prior.schedule.add_noise(latents, noise, t)
-    found = prior.schedule.to_noise(torch.zeros_like(noisy), noisy, t)
-    return float((found - noise).square().mean())
+    predicted = prior.schedule.to_noise(torch.zeros_like(noisy), noisy, t)
+    return float((predicted - noise).square().mean())
 
 
 class _StepClock:
@@ -301,7 +304,7 @@ class _StepClock:
 
 
 def _try_lora(
-    prior: StableDiffusion, image: Tensor, prompts: Prompts, config: InsertConfig
+    prior: StableDiffusion, image: Tensor, prompts: Prompts, adapter: PersonalizeSettings, seed: int
 ) -> tuple[Verdict, float]:
     """Train a LoRA for a few steps without class images; return with it attached."""
     clock, spent = _StepClock(prior.device), [math.nan]
@@ -311,30 +314,22 @@ def _try_lora(
         if training.step_count == LORA_STEPS:
             spent[0] = clock.seconds()
 
-    settings = replace(config.adapter, class_images=0, lora_steps=LORA_STEPS, lora_rate=LORA_RATE)
-    made = personalize(prior, image, prompts, settings, config.render.seed, None, on_step=on_step)
-    assert made.evaluation is not None
-    return judge_lora(*made.evaluation), spent[0]
+    settings = replace(adapter, class_images=0, lora_steps=LORA_STEPS, lora_rate=LORA_RATE)
+    learnt = personalize(prior, image, prompts, settings, seed, None, on_step=on_step)
+    assert learnt.evaluation is not None
+    return judge_lora(*learnt.evaluation), spent[0]
 
 
 def _try_guidance(
-    prior: StableDiffusion, image: Tensor, prompts: Prompts, config: InsertConfig
+    prior: StableDiffusion, image: Tensor, prompts: Prompts, settings: GuidanceSettings, seed: int
 ) -> tuple[Verdict, float]:
     """Compute guidance gradients of the photo for some steps."""
     image = image.to(prior.device)
-    settings = config.settled(on_cuda=prior.device.type == "cuda").guidance_settings()
     mask = torch.zeros(image.shape[-2:])
     height, width = mask.shape
     mask[height // 3 : height - height // 3, width // 3 : width - width // 3] = 1.0
-    guide = Guidance(
-        prior,
-        Condition(prompts.guidance),
-        settings,
-        mask,
-        GUIDANCE_STEPS,
-        config.render.seed,
-        "scene",
-    )
+    condition = Condition(prompts.guidance)
+    guide = Guidance(prior, condition, settings, mask, GUIDANCE_STEPS, seed, "scene")
     guide.ensure_precision(image)
     clock, norms = _StepClock(prior.device), []
     for step in range(GUIDANCE_STEPS):

@@ -80,7 +80,7 @@ def recover(run: Run, given: SceneLight | None) -> Outcome:
         if settings.preview_every:
             with run.timings.stage("preview"):
                 write_start(run, frame, start.light)
-        guided, resumed = prepare_guidance(run, checkpoints)
+        guided = prepare_guidance(run, checkpoints)
         with run.timings.stage("trace"):
             release()
             guide = make_guide(run, guided, frame)
@@ -91,7 +91,7 @@ def recover(run: Run, given: SceneLight | None) -> Outcome:
                 frame, guide, settings, unknowns, cache, record=record, region=region
             )
         before = _state_of(unknowns)
-        course = follow(run, loop, guided, guide, frame.renderer, checkpoints, resumed)
+        course = follow(run, loop, guided, guide, frame.renderer)
         judged = None
         if run.config.guidance.accept:
             assert isinstance(guide, Guidance)
@@ -99,16 +99,16 @@ def recover(run: Run, given: SceneLight | None) -> Outcome:
                 judged = judge_end(loop, guide, before)
             run.log.say(judged.verdict.line)
         with run.timings.stage("write"):
-            found = delivered(run, loop, start)
+            light = delivered(run, loop, start)
             course.write()
-    measured = course.record(settings.integrator) | _measured(start, found, judged)
+    measured = course.record(settings.integrator) | _measured(start, light, judged)
     notices = tuple(course.notices())
     if judged is not None and not judged.verdict.is_accepted:
         return Outcome(start.light, run.inputs.asset, measured, (*notices, judged.verdict.line))
     run.output.write_json("lobes.json", lobes_to_json(unknowns.light_fg.lobes()))
     if settings.fusion_kind != "single":
         run.output.write_json("lobes_shadow.json", lobes_to_json(unknowns.light_shadow.lobes()))
-    return Outcome(found, run.inputs.asset, measured, notices)
+    return Outcome(light, run.inputs.asset, measured, notices)
 
 
 def _estimated(run: Run) -> Start:
@@ -136,10 +136,10 @@ def region_of(start: Start, unknowns: Unknowns) -> TrustRegion | None:
     """Return the trust region around an estimated light; None without an estimate."""
     if start.estimate is None:
         return None
-    found = start.estimate.regression
-    spread = float(np.radians(found.spread_deg))
+    regression = start.estimate.regression
+    spread = float(np.radians(regression.spread_deg))
     light = unknowns.light_fg
-    return TrustRegion.around(light, spread, found.sun_log_std, found.ambient_log_std)
+    return TrustRegion.around(light, spread, regression.sun_log_std, regression.ambient_log_std)
 
 
 def widened(lobes: Lobes, sigma_min: float) -> Lobes:
@@ -158,11 +158,11 @@ def delivered(run: Run, loop: LightOptimization, start: Start) -> SceneLight:
     return SceneLight(light_fg, light_shadow, curves, 0.0, start.light.assumed)
 
 
-def _measured(start: Start, found: SceneLight, judged: Judged | None) -> dict[str, Any]:
+def _measured(start: Start, end: SceneLight, judged: Judged | None) -> dict[str, Any]:
     """Return the entries of ``run.json`` about start, end and acceptance."""
     measured: dict[str, Any] = {
         "start_light": asdict(summarize(start.light.light)),
-        "end_light": asdict(summarize(found.light)),
+        "end_light": asdict(summarize(end.light)),
     }
     if start.estimate is not None:
         measured = {"regression": start.estimate.regression.record()} | measured

@@ -115,7 +115,7 @@ class View:
             texels_shadow: Lat-long radiance that casts its shadow, shape [He, We, 3].
             curve_fg: One tone curve.
             curve_shadow: Three tone curves.
-            seed: Of this step's samples; `transport` has none.
+            seed: Seed of this step's samples; `transport` has none.
         """
         radiance = self.radiance(texels_fg, texels_shadow, seed)
         return self.compose(radiance, curve_fg, curve_shadow)
@@ -150,8 +150,8 @@ def _shaded(renderer: Renderer, expected: Light, seed: int) -> IntArray:
     expected.
     """
     even = Light(texels=np.ones((8, 16, 3), np.float32))
-    found = [renderer.shaded_pixels(light_args(x, renderer.device), seed) for x in (even, expected)]
-    union: PixelArray = np.union1d(*found)
+    args = (light_args(light, renderer.device) for light in (even, expected))
+    union: PixelArray = np.union1d(*(renderer.shaded_pixels(arg, seed) for arg in args))
     return union.astype(np.int32)
 
 
@@ -169,15 +169,15 @@ def gbuffer_of(frame: Frame) -> torch.Tensor:
     toward the camera); all 0 beside the object. `warpir.train.batches.PriorBatch` is the same.
     """
     scene = frame.renderer.scene
-    found = frame.renderer.gbuffer(frame.seed)
-    seen = found.coverage > 0.0
+    gbuffer = frame.renderer.gbuffer(frame.seed)
+    seen = gbuffer.coverage > 0.0
     height, width = frame.photo_lin.shape[:2]
     plane = np.zeros((height * width, 7), np.float32)
-    plane[found.object_pixels[seen]] = np.concatenate(
+    plane[gbuffer.object_pixels[seen]] = np.concatenate(
         [
-            found.coverage[seen, None],
-            linear_to_gamma(np.clip(found.base_color[seen], 0.0, 1.0)),
-            found.normal[seen] @ scene.camera.c2w[:3, :3],
+            gbuffer.coverage[seen, None],
+            linear_to_gamma(np.clip(gbuffer.base_color[seen], 0.0, 1.0)),
+            gbuffer.normal[seen] @ scene.camera.c2w[:3, :3],
         ],
         axis=1,
     )
@@ -188,9 +188,9 @@ def with_light(gbuffer: torch.Tensor, regression: Regression, camera: Camera) ->
     """Return a G-buffer with the object shaded under the regressor's light, shape [1, 13, H, W].
 
     Args:
-        gbuffer: Of `gbuffer_of`, shape [1, 7, H, W].
+        gbuffer: G-buffer of `gbuffer_of`, shape [1, 7, H, W].
         regression: The light, world frame.
-        camera: Of the picture.
+        camera: Camera of the picture.
     """
     planes = gbuffer[0].permute(1, 2, 0).double().numpy()
     shown, toward = regression.matte_picture(

@@ -20,6 +20,7 @@ from warpir.app.command import read_values
 from warpir.app.config import DEFAULTS, SKY_PRESETS, InsertConfig
 from warpir.app.inputs import Loaders, read_asset
 from warpir.app.photo_world import make_world, photo_camera
+from warpir.app.settings import LightConfig
 from warpir.core.arrays import Float64Array
 from warpir.core.atomic import replacing, write_staged
 from warpir.core.errors import ExitCode, InputError, disk_error
@@ -191,7 +192,7 @@ def start_record(session: Session) -> dict[str, Any]:
         "rotate_y": session.rotate_y,
         "size": scale * float((high - low).max()),
         "ground_to_world": session.frame.tolist(),
-        "sun": _start_sun(config),
+        "sun": _start_sun(config.light),
         "sky": config.light.sky or SKY_PRESETS[0],
         "keeps_light": config.light.sun is not None or config.light.sky is not None,
         "sky_radiance": sky_radiance,
@@ -203,11 +204,11 @@ def start_record(session: Session) -> dict[str, Any]:
     }
 
 
-def _start_sun(config: InsertConfig) -> list[float | None]:
+def _start_sun(light: LightConfig) -> list[float | None]:
     """Return azimuth, elevation and strength of the sun; the strength may be absent."""
-    if config.light.sun is None:
-        return [*DEFAULT_SUN, 0.0 if config.light.sky is not None else None]
-    return [*config.light.sun, None][:3]
+    if light.sun is None:
+        return [*DEFAULT_SUN, 0.0 if light.sky is not None else None]
+    return [*light.sun, None][:3]
 
 
 def photo_jpeg(photo: Photo) -> bytes:
@@ -226,12 +227,12 @@ def asset_glb(asset: Asset) -> bytes:
     return write_glb(preview_asset(asset), np.eye(4))
 
 
-def placement_files(session: Session, said: Mapping[str, Any]) -> dict[str, dict[str, Any]]:
+def placement_files(session: Session, sent: Mapping[str, Any]) -> dict[str, dict[str, Any]]:
     """Return the two files of a placement, the configuration last.
 
     Args:
-        session: What was placed.
-        said: What the page says: ``fx``, ``fy`` [px], ``stance``, ``stand`` (``x`` and ``z`` in the
+        session: Session of the placement.
+        sent: Page values: ``fx``, ``fy`` [px], ``stance``, ``stand`` (``x`` and ``z`` in the
             ground frame) [m], ``rotate_y`` [deg], ``size`` [m], and ``sun`` and ``sky`` as the
             flags, or null where the light is to be estimated from the photo.
 
@@ -239,15 +240,15 @@ def placement_files(session: Session, said: Mapping[str, Any]) -> dict[str, dict
         InputError: Numbers out of range, or an object that the camera does not see.
     """
     assert session.config.output.out is not None
-    stance = Stance(*(number(PAGE, said.get("stance"), f.name) for f in fields(Stance)))
+    stance = Stance(*(number(PAGE, sent.get("stance"), f.name) for f in fields(Stance)))
     pose = session.frame @ stance.c2w()
-    fx, fy = (number(PAGE, said, name) for name in ("fx", "fy"))
+    fx, fy = (number(PAGE, sent, name) for name in ("fx", "fy"))
     if min(fx, fy, stance.height) <= 0.0:
         raise InputError(PAGE, "camera height and focal length must be more than 0")
     camera = replace(session.camera, fx=fx, fy=fy, c2w=pose)
-    stand = [number(PAGE, said.get("stand"), axis) for axis in "xz"]
+    stand = [number(PAGE, sent.get("stand"), axis) for axis in "xz"]
     x, y, z = (float(c) for c in (session.frame @ (stand[0], 0.0, stand[1], 1.0))[:3])
-    asked = {name: said.get(name) for name in ("rotate_y", "size", "sun", "sky")}
+    asked = {name: sent.get(name) for name in ("rotate_y", "size", "sun", "sky")}
     asked = {name: value for name, value in asked.items() if value is not None}
     chosen = read_values({k: (v, f"--{k.replace('_', '-')}") for k, v in asked.items()})
     config = InsertConfig(place=(x, y, z), **chosen)

@@ -48,8 +48,8 @@ class BadPixels:
         Args:
             planes: Values of the traced pixels, shape [pixel, ...] each.
             pixels: Row-major pixel indices, shape [pixel].
-            width: Of the picture [px].
-            stage: What was rendered, for a person.
+            width: Width of the picture [px].
+            stage: Name of the rendering stage, for the message.
             first_sample: Given a bad pixel, returns its first bad sample, or None.
 
         Raises:
@@ -74,8 +74,8 @@ class BadPixels:
         first_sample: Callable[[int], int | None] = lambda pixel: None,
     ) -> None:
         """Count bad pixels and name the first; arguments and errors are those of `blackened`."""
-        found = int(bad.sum())
-        self.count += found
+        count = int(bad.sum())
+        self.count += count
         for pixel in pixels[bad][: NAMED - len(self.named)]:
             place = f"{stage}, x {pixel % width}, y {pixel // width}"
             sample = first_sample(int(pixel))
@@ -83,10 +83,10 @@ class BadPixels:
             place += "" if self.iteration is None else f", iteration {self.iteration}"
             self.named.append(f"({place})")
         # One alone is a speck, however few there are.
-        if found > max(BAD_SHARE * len(pixels), 1.0):
+        if count > max(BAD_SHARE * len(pixels), 1.0):
             raise InputError(
                 stage,
-                f"{found} of {len(pixels)} pixels are not finite (at most {BAD_SHARE:.0%} may be; "
+                f"{count} of {len(pixels)} pixels are not finite (at most {BAD_SHARE:.0%} may be; "
                 f"the first: {', '.join(self.named)})",
                 "look for extreme values in the materials and the light",
                 ExitCode.NUMERIC,

@@ -89,7 +89,7 @@ def make_picture(
         curve_shadow: Three tone curves.
         is_reinhard: Whether Reinhard's operator precedes the foreground curve.
         occluder: Share of the photo that stays in front of the object [1], shape [H, W].
-        shadow_mask: Where the photo's ground is in shadow already.
+        shadow_mask: Mask of the ground that is in shadow already.
         look: What the camera did to the photo, to be repeated on object and shadow.
     """
     dimmed = light_fg if shadow_mask is None else without_lamps(light_fg, shadow_mask.at_object)
@@ -270,7 +270,7 @@ def scene_of(inputs: Inputs, camera: Camera, device: str, curves: Curves) -> Sce
         inputs: Photo, asset, receiver and placement.
         camera: At the resolution that is to be rendered.
         device: Warp device.
-        curves: Of the picture; what the photo shows of the receiver is taken to have passed them.
+        curves: Tone curves of the picture, which the photo of the receiver is taken to have passed.
     """
     ground = inputs.placement.ground
     placed = Placed(inputs.asset, inputs.placement.asset_to_world)
@@ -284,7 +284,7 @@ def photo_radiance(photo: Photo, curves: Curves) -> FloatArray:
 
     Args:
         photo: The photograph.
-        curves: Of the picture.
+        curves: Tone curves of the picture.
 
     Returns:
         Relative [W/(m^2 sr)], shape [height, width, 3], at most `RECEIVER_WIDTH` wide.

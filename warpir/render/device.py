@@ -106,7 +106,7 @@ def load_kernels(device: str, variants: Iterable[tuple[bool, bool]]) -> None:
 
     Args:
         device: Warp's name of it.
-        variants: Of `foreground_kernel`.
+        variants: Variants of `foreground_kernel`.
     """
     on = wp.get_device(device)
     settle_hashes(on.is_cpu)
@@ -168,7 +168,7 @@ class Launcher:
             count: Number of Warp threads.
             args: Kernel arguments in order.
             work: Samples that one row of the launch takes, for sizing the slices.
-            stage: What to call this in progress reports.
+            stage: Name of the launch in progress reports.
             width: Threads of each row, for kernels of two indices.
         """
         if count == 0:

@@ -114,5 +114,5 @@ def _cumulated(weight: Float64Array) -> tuple[FloatArray, FloatArray]:
 def _require_finite(values: AnyFloatArray, what: str) -> None:
     bad = int(values.size - np.isfinite(values).sum())
     if bad:
-        found = f"{bad} of the {values.size} values of its {what} are not finite"
-        raise InputError("light", found, code=ExitCode.NUMERIC)
+        what_is_bad = f"{bad} of the {values.size} values of its {what} are not finite"
+        raise InputError("light", what_is_bad, code=ExitCode.NUMERIC)

@@ -163,7 +163,7 @@ class Scene:
     The scene does not change after its upload.
 
     Args:
-        objects: What is rendered; may be empty (no triangles, no shadow).
+        objects: Objects to render; may be empty (no triangles, no shadow).
         camera: The view.
         receiver: The ground plane, the receiver's mesh, or both.
         device: ``cpu`` or ``cuda``.

@@ -178,15 +178,15 @@ class Renderer(Launcher):
     """Launches the kernels over one scene.
 
     Args:
-        scene: What to render; it is never changed.
+        scene: Scene to render, never changed.
         threads: CPU threads; 0 means one per core. Ignored on CUDA.
         progress: Called with the share of a stage that is done, 0 to 1, from worker threads.
-        memory: Is told where memory was short.
-        lower: What makes pictures smaller, for errors.
+        memory: Counts repeated launches for want of memory.
+        lower: Flag that lowers the memory of a picture, for errors.
         is_ordered: Whether sums are to have one order on CUDA too, where that costs time.
 
     Attributes:
-        bad_pixels: What came out that is not finite.
+        bad_pixels: Counts of pixels that are not finite.
     """
 
     def __init__(

@@ -31,7 +31,7 @@ if TYPE_CHECKING:
     from warpir.render.mis import MisIntegrator
 
 Gradients = list[Float64Array | None]
-"""Of the map (and base colour, metallic, roughness, emission), in this order; None for what is not
+"""Gradients of the map, then of base colour, metallic, roughness and emission; None for those not
 asked for."""
 
 RECORD_BYTES = 1 << 30
@@ -56,7 +56,7 @@ class ObjectSamples:
         args: The light that samples are drawn from, and whose radiance they carry.
         seed: Base seed.
         factors: Base colour, metallic, roughness and emission; the scene's own where None.
-        free: What gradients will be asked for, in the order of `Gradients`.
+        free: Whether each of `Gradients` will be asked for.
     """
 
     def __init__(
@@ -131,8 +131,8 @@ class ObjectSamples:
             d_rows = np.repeat(d_radiance[rows], lanes, axis=0)
             if light is not None:
                 d_pixel = d_rows[:, :, None] * np.eye(3, dtype=np.float32)
-                found = map_gradient(self.mis.renderer, self.args, light, d_pixel)
-                total[:1] = _add(total[:1], [found])
+                part = map_gradient(self.mis.renderer, self.args, light, d_pixel)
+                total[:1] = _add(total[:1], [part])
             if vertex is not None:
                 total[1:] = _add(
                     total[1:], self.material_gradient(vertex, d_rows, self.path_count // lanes)
@@ -183,7 +183,7 @@ class ObjectSamples:
             record: Vertices, rows are pixels.
             d_path: Loss gradient of each path's radiance, shape [path].
             count: Paths of a row.
-            d_factors: Where to add, shape [material] each, or None.
+            d_factors: Accumulated gradients, shape [material] each, or None.
         """
         device, paths, depth = d_path.device, len(d_path), self.mis.depth
         throughput = [wp.full(paths, wp.vec3(1.0), dtype=wp.vec3, device=device)]
@@ -268,8 +268,8 @@ class ReceiverSamples:
             assert record is not None, "no gradient was announced"
             d_pixel = np.zeros((len(d_lit[rows]), 3, 3), np.float32)
             d_pixel[:, :, 0], d_pixel[:, :, 1] = d_lit[rows], d_unoccluded[rows]
-            found = map_gradient(self.mis.renderer, self.args, record, d_pixel)
-            total = _add(total, [found])
+            part = map_gradient(self.mis.renderer, self.args, record, d_pixel)
+            total = _add(total, [part])
         return total
 
 
@@ -279,7 +279,7 @@ def map_gradient(
     """Return the loss gradient of a light's map over recorded directions, shape [He, We, 3].
 
     Args:
-        renderer: Whose device and threads are used.
+        renderer: Renderer, whose device and threads are used.
         args: The light.
         record: Directions and weights, rows are pixels; used up.
         d_pixel: Times a weight it is the loss gradient of the radiance from there, shape
@@ -314,8 +314,8 @@ def map_gradient(
     return total
 
 
-def _add(total: Gradients, found: Gradients) -> Gradients:
-    return [f if t is None or f is None else t + f for t, f in zip(total, found, strict=True)]
+def _add(total: Gradients, part: Gradients) -> Gradients:
+    return [f if t is None or f is None else t + f for t, f in zip(total, part, strict=True)]
 
 
 def _parts(count: int, bytes_per_row: int) -> list[slice]:

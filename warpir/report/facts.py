@@ -91,8 +91,8 @@ def without_folders(text: str, config: InsertConfig) -> str:
     return text
 
 
-def _last_part(separators: str, found: re.Match[str]) -> str:
-    path = found[0]
+def _last_part(separators: str, match: re.Match[str]) -> str:
+    path = match[0]
     if _POINTER.fullmatch(path):
         return path
     return re.split(f"[{separators}]", path.rstrip(separators))[-1]
@@ -129,9 +129,9 @@ _POINTER = re.compile(
 def command_line(config: InsertConfig) -> str:
     """Return a command that makes the same result, files by their names alone."""
     words = ["python", "-m", "warpir.insert"]
-    told = config_of_picture(config)
+    changed = config_of_picture(config)
     for name in FORMS:
-        value = told.get(name, DEFAULTS[name])
+        value = changed.get(name, DEFAULTS[name])
         if value == DEFAULTS[name]:
             continue
         if isinstance(value, bool):
@@ -156,23 +156,23 @@ def settings(config: InsertConfig, record: Mapping[str, Any]) -> dict[str, list[
     """Return all settings by heading, without those that concern this one run alone.
 
     Args:
-        config: As it was asked for.
-        record: Its ``measured`` holds what was left open and then settled.
+        config: Configuration as it was asked for.
+        record: Content of ``run.json``; ``measured`` holds the prior's defaults that were used.
     """
     settled = record["measured"].get("settings", {})
-    told = config_of_picture(config)
-    found: dict[str, list[Setting]] = {}
+    changed = config_of_picture(config)
+    by_heading: dict[str, list[Setting]] = {}
     for heading, forms in FLAGS.items():
-        for name in (n for n in forms if n in told):
-            value, is_set = told[name], told[name] != DEFAULTS[name]
+        for name in (n for n in forms if n in changed):
+            value, is_set = changed[name], changed[name] != DEFAULTS[name]
             is_settled = value is None and name in settled
             if is_settled:
                 value = settled[name]
             words = "" if value is None or value == "" else in_words(name, value)
-            found.setdefault(heading, []).append(
+            by_heading.setdefault(heading, []).append(
                 Setting(name.replace("_", "-"), words, is_set, is_settled)
             )
-    return found
+    return by_heading
 
 
 # ------------------------------------------------------------------- where the light comes from
@@ -183,14 +183,14 @@ def light_sources(record: Mapping[str, Any], config: InsertConfig) -> Rows:
     measured = record["measured"]
     rows: Rows = [("the light", _source(measured, config))]
     if "regression" in measured:
-        found = measured["regression"]
+        regression = measured["regression"]
         rows += [
             (
                 "how sure the regressor was",
-                f"± {found['spread_deg']:.0f}° in the direction (concentration "
-                f"{found['concentration']:.1f}; 0 would be no idea); a factor of "
-                f"{2.718281828 ** found['sun_log_std']:.1f} either way in the main light's "
-                f"strength, {2.718281828 ** found['ambient_log_std']:.1f} in the rest's",
+                f"± {regression['spread_deg']:.0f}° in the direction (concentration "
+                f"{regression['concentration']:.1f}; 0 would be no idea); a factor of "
+                f"{2.718281828 ** regression['sun_log_std']:.1f} either way in the main light's "
+                f"strength, {2.718281828 ** regression['ambient_log_std']:.1f} in the rest's",
             ),
         ]
     if "detail_seen" in measured:

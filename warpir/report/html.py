@@ -34,9 +34,9 @@ def render_page(
 
     Args:
         name: ``NAME.html.j2`` in the package's ``templates`` or in this package's own.
-        package: Where templates are looked up first.
+        package: Package of the templates that are looked up first.
         style: ``STYLE.css`` and ``STYLE.js`` beside the template.
-        images: Where the page may load images from, as in its content security policy.
+        images: Sources of images for the content security policy.
         **values: What the template names; each is escaped.
     """
     environment = _environment(package)

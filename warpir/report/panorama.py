@@ -57,11 +57,11 @@ def panorama(
     """Return a light as a person at the camera would see it, turning all the way round.
 
     Args:
-        name: What it is called on the page.
-        identifier: Of its element.
+        name: Name of the panorama on the page.
+        identifier: Identifier of the panorama's element.
         texels: Radiance in our orientation, relative [W/(m^2 sr)], shape [He, 2 He, 3].
         camera: Content of ``camera.json``; the photo's frame is drawn where it is known.
-        character: Of the light; its brightest direction is marked where it has direct light.
+        character: Character of the light; the brightest direction of direct light is marked.
         tone: The picture's operator, ``linear`` or ``reinhard``.
     """
     pose = pose_of(camera)

@@ -72,7 +72,7 @@ def shrink(plane: FloatArray, largest: int) -> FloatArray:
     Args:
         plane: Shape [H, W] or [H, W, channel]; what is left over at the right and lower edge is cut
             off.
-        largest: Of both sides [px].
+        largest: Longest side of the result [px].
     """
     k = math.ceil(max(plane.shape[:2]) / largest)
     if k == 1:

@@ -106,9 +106,9 @@ def line_plot(
 
     Args:
         series: At least one, each with at least one point.
-        title: What is plotted, for those who cannot see it.
-        labels: Of the axes.
-        x_range: Of the axis; that of the values when absent.
+        title: Description of the plot for screen readers.
+        labels: Labels of the axes.
+        x_range: Range of the x axis; that of the values when absent.
         y_range: Likewise.
         marks: Vertical lines, by their names.
     """

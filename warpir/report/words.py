@@ -67,7 +67,7 @@ def characterize(texels: FloatArray, normal: Float64Array, c2w: Float64Array) ->
 
     Args:
         texels: Lat-long radiance in our orientation, relative [W/(m^2 sr)], shape [He, 2 He, 3].
-        normal: Of the ground, world frame, shape [3].
+        normal: Normal of the ground, world frame, shape [3].
         c2w: Pose of the camera, shape [4, 4].
     """
     texels = resize_map(texels, HEIGHT).astype(np.float64)
@@ -109,8 +109,8 @@ def _brightest(
         return directions[row, column], 180.0
     # With the brightest texel in the middle column, the map's seam cuts no area that matters.
     turn = lum.shape[1] // 2 - int(column)
-    found = label(np.roll(lum > 0.5 * (base + top), turn, axis=1), np.ones((3, 3)))[0]
-    area = np.roll(found == found[row, lum.shape[1] // 2], -turn, axis=1)
+    parts = label(np.roll(lum > 0.5 * (base + top), turn, axis=1), np.ones((3, 3)))[0]
+    area = np.roll(parts == parts[row, lum.shape[1] // 2], -turn, axis=1)
     width = float(np.degrees(np.arccos(1.0 - solid_angles[area].sum() / (2.0 * np.pi))))
     if area.sum() <= 4:  # no more than where texels meet: its size is not resolved
         width = min(width, 0.99 * 180.0 / HEIGHT)
@@ -130,8 +130,8 @@ def light_rows(
     """Describe a light as rows of a name and a text.
 
     Args:
-        character: Of the light.
-        shadow: Of the light that casts the shadow, where it has one of its own.
+        character: Character of the light.
+        shadow: Character of the light that casts the shadow, where it has one of its own.
     """
     direct, sky = color_words(character.direct), color_words(character.sky)
     rows = [("direction", origin_words(character))]

@@ -70,7 +70,7 @@ def find_place(
     Raises:
         InputError: Every place is occupied or hidden.
     """
-    found: list[tuple[float, Place, Float64Array]] = []
+    candidates: list[tuple[float, Place, Float64Array]] = []
     for v in (np.arange(GRID[1]) + 0.5) / GRID[1]:
         for u in (np.arange(GRID[0]) + 0.5) / GRID[0]:
             try:
@@ -82,9 +82,9 @@ def find_place(
             sides = float(np.linalg.norm(stand - camera.c2w[:3, 3])) / _longest(matrix, low, high)
             off = max(np.log(NEAR / sides), np.log(sides / FAR), 0.0)
             cost = float(np.hypot(u - DEFAULT_STAND[0], v - DEFAULT_STAND[1]) + off)
-            found.append((cost, place, matrix))
+            candidates.append((cost, place, matrix))
     fallback: tuple[int, Place] | None = None
-    for _, place, matrix in sorted(found, key=lambda entry: entry[0]):
+    for _, place, matrix in sorted(candidates, key=lambda entry: entry[0]):
         box = _Box(matrix, low, high, camera)
         if len(points_in_way(matrix, low, high, cloud)) > STRAY or box.hidden(cloud) > STRAY:
             continue
@@ -96,7 +96,7 @@ def find_place(
     if fallback is None:
         raise InputError(
             "--ground-points",
-            f"no free place for the object in view (tried {len(found)})",
+            f"no free place for the object in view (tried {len(candidates)})",
             "give --at or --place, or a smaller --size",
         )
     return fallback[1]

@@ -80,7 +80,7 @@ def fit_ground(
         points: World frame [m], shape [point, 3].
         camera: The camera.
         has_up: Whether +Y of the world is up; if not, the camera's up stands for it.
-        where: What to blame.
+        where: Location in errors.
 
     Raises:
         InputError: Too few points in view, or no plane that enough of them lie on.

@@ -88,10 +88,10 @@ def without_lamps(light: Light, share: float = 1.0) -> Light:
         kept = np.where(is_lamp, 1.0 - share, 1.0)[:, None]
         lobes = replace(lobes, amplitude=(lobes.amplitude * kept).astype(np.float32))
     if texels is not None:
-        found = lamps_of(texels)
-        if len(found.axes):
+        lamps = lamps_of(texels)
+        if len(lamps.axes):
             whole = luminance(texels.astype(np.float64))
-            rest = np.where(whole > 0.0, found.rest / np.where(whole > 0.0, whole, 1.0), 1.0)
+            rest = np.where(whole > 0.0, lamps.rest / np.where(whole > 0.0, whole, 1.0), 1.0)
             kept = 1.0 - share * (1.0 - rest)
             texels = (texels * kept[..., None]).astype(np.float32)
     if lobes is light.lobes and texels is light.texels:
@@ -119,5 +119,5 @@ def _lamp_lobes(light: Light) -> BoolArray:
         omega = texel_solid_angles(*light.texels.shape[:2])[:, None]
         total += float((luminance(light.texels.astype(np.float64)) * omega).sum())
     narrow = light.lobes.sharpness > 1.0 / np.radians(LAMP_RADIUS_DEG) ** 2
-    found: BoolArray = narrow & (flux > LAMP_SHARE * total)
-    return found
+    is_lamp: BoolArray = narrow & (flux > LAMP_SHARE * total)
+    return is_lamp

@@ -145,7 +145,7 @@ def sun_lobe(
     Args:
         azimuth_deg: See `axis_from_angles` [deg].
         elevation_deg: Above the horizon [deg].
-        irradiance: Of a surface that faces the sun, linear RGB, relative [W/m^2].
+        irradiance: Irradiance of a surface that faces the sun, linear RGB, relative [W/m^2].
     """
     # A uniform disc of radius r has the per-axis variance r^2 / 4; a lobe has 1 / sharpness.
     sharpness = 4.0 / np.radians(SUN_RADIUS_DEG) ** 2
@@ -297,7 +297,7 @@ def describe(summary: LightSummary, c2w: Float64Array) -> str:
     """Return a light in words, as a person at the camera would point at it.
 
     Args:
-        summary: Of the light, in the world frame.
+        summary: Summary of the light, in the world frame.
         c2w: Pose of the camera, shape [4, 4].
     """
     axis = axis_from_angles(summary.azimuth_deg, summary.elevation_deg)

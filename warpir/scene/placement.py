@@ -61,12 +61,12 @@ def place_asset(
         high: Highest corner of the asset's bounding box, asset frame [m], shape [3].
         camera: Camera of the photo at the photo's resolution.
         ground: Plane ``a x + b y + c z + d = 0``, world frame; absent means ``y = 0``.
-        place: Where the object stands, world frame [m]; moved onto the ground along its normal.
-        at: Where the object stands, as a pixel of the ground or of ``mesh`` in the photo [px].
+        place: Place of the object, world frame [m]; moved onto the ground along its normal.
+        at: Place of the object, as a pixel of the ground or of ``mesh`` in the photo [px].
         rotate_y: Turn about the ground's normal, counter-clockwise seen from above [deg].
         scale: Factor on the asset's own size [1].
         size: Longest side of the bounding box after scaling [m].
-        mesh: Of the photo's place, which the object may stand on.
+        mesh: Receiver mesh that the object may stand on.
         is_plane: Whether it may stand on the ground plane too; without, ``place`` is not moved and
             the plane only says what is upright.
 

@@ -46,7 +46,7 @@ def first_hit(
     Args:
         mesh: Triangles.
         origins: Starts of the rays, world frame [m], shape [ray, 3].
-        directions: Of the rays, world frame, shape [ray, 3].
+        directions: Directions of the rays, world frame, shape [ray, 3].
 
     Returns:
         Distances in lengths of ``directions``, infinite where nothing is met, and the triangles

@@ -39,7 +39,7 @@ def shadow_mask(
         shares: 1 where the photo's ground is in full shadow, shape [H, W].
         low: Lowest corner of the asset's bounding box, asset frame [m], shape [3].
         high: Highest corner, shape [3].
-        asset_to_world: Where it stands, shape [4, 4].
+        asset_to_world: Pose of the object, shape [4, 4].
         camera: Camera of the photo at the photo's resolution.
     """
     step = (np.arange(FOOTPRINT_SIDE) + 0.5) / FOOTPRINT_SIDE

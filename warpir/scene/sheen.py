@@ -38,7 +38,7 @@ def sheen_albedo(cosine: Float64Array, roughness: float, nodes: int = 64) -> Flo
     """Integrate the lobe times the cosine over all directions toward the light [1].
 
     Args:
-        cosine: Of the directions toward the camera, above 0, shape [angle].
+        cosine: Cosines of the directions toward the camera, above 0, shape [angle].
         roughness: Perceptual roughness [1].
         nodes: Gauss-Legendre nodes in azimuth and in the cosine.
     """

@@ -43,7 +43,7 @@ class ToneKnots:
 
         Args:
             y: Values; clamped to [0, 1]. Any shape.
-            curve: Which curve.
+            curve: Index of the curve.
         """
         knot_x, knot_y, slope = (k[curve].astype(np.float64) for k in self.arrays())
         y = np.clip(np.asarray(y, np.float64), 0.0, 1.0)
@@ -62,7 +62,7 @@ class ToneKnots:
         """Evaluate every curve (Durkan et al. 2019, eq. 4), as `warpir.kernels.tone` does.
 
         Args:
-            x: Where; clamped to [0, 1], shape [...].
+            x: Positions, clamped to [0, 1], shape [...].
 
         Returns:
             Values in [0, 1], shape [..., curve].

@@ -1,4 +1,4 @@
-"""Traced rows on disk, found again by their content: another prompt traces nothing."""
+"""Cache of traced rows on disk, keyed by the scene's content: another prompt traces nothing."""
 
 from __future__ import annotations
 
@@ -38,10 +38,8 @@ def content_key(
 ) -> str:
     """Return a hash of everything that the rows depend on, as 64 hexadecimal digits.
 
-    The device counts, and whether its sums had one order: it decides the last bits.
-
-    The scene counts by what is on the device: geometry where it stands, materials, textures,
-    camera and plane. Names, files and prompts do not.
+    It covers the device and its order of summation, which affect the last bits, and the uploaded
+    scene: geometry in place, materials, textures, camera and plane; not names, files or prompts.
     """
     digest = hashlib.sha256()
 
@@ -68,7 +66,7 @@ def content_key(
 
 
 def load_rows(path: Path, device: torch.device) -> dict[str, Tensor] | None:
-    """Return the arrays of a cached file, or None when there is none that is whole."""
+    """Return the arrays of a cached file, or None if it is absent or damaged."""
     from safetensors.torch import load_file
 
     kept = find_kept(path)
@@ -76,7 +74,7 @@ def load_rows(path: Path, device: torch.device) -> dict[str, Tensor] | None:
 
 
 def save_rows(path: Path, rows: dict[str, Tensor]) -> None:
-    """Write the arrays, whole or not at all, and make room; a full disk is only a notice."""
+    """Write the arrays atomically and evict old files; a full disk is only a notice."""
     from safetensors import SafetensorError
     from safetensors.torch import save_file
 

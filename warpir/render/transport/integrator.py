@@ -1,14 +1,14 @@
 """`transport`, the integrator inside the optimisation: trace once, then every step is a product.
 
-Light transport is linear in the light, and geometry, camera and materials stand still. Tracing
-writes for each pixel what each texel of a lat-long map sends into it (``T_fg``: object, any depth)
-or how much of it the object keeps from the ground plane (``T_shadow``). A step is then ``T L`` and
-its gradient ``T^T d``; no ray is cast. The kernels are `warpir.kernels.transport`.
+Light transport is linear in the light, and geometry, camera and materials are fixed. Tracing
+computes for each pixel the radiance per texel of a lat-long map (``T_fg``: object, any depth), or
+the share of it that the object blocks from the ground plane (``T_shadow``). A step is then ``T L``
+and its gradient ``T^T d``; no ray is cast. The kernels are `warpir.kernels.transport`.
 
-What an open plane receives is one analytic row. Where the receiver is a mesh, each pixel has a row
-of its own for that too (``T_receiver``), and what the mesh sends is a constant, as emission is.
+The irradiance of an open plane is one analytic row. If the receiver is a mesh, each pixel has a row
+for it (``T_receiver``), and the radiance of the mesh is a constant, as emission is.
 
-The numbers are unbiased for the map they are handed, at the resolution of the rows.
+The numbers are unbiased for the given map, at the resolution of the rows.
 """
 
 from __future__ import annotations
@@ -61,7 +61,7 @@ class TransportIntegrator:
 
     Attributes:
         mask: Coverage of the object pixels [1], shape [object_pixel].
-        seconds_traced: What tracing took, or reading the cache [s].
+        seconds_traced: Time of tracing, or of reading the cache [s].
         is_cached: Whether the rows came from the cache.
         bytes: Memory that the rows take.
 
@@ -139,7 +139,7 @@ class TransportIntegrator:
         return self._trace_object(seed) | traced
 
     def _hold(self, stored: dict[str, Tensor]) -> None:
-        """Make matrices of what was traced or read."""
+        """Store traced or cached rows as matrices."""
         self.T_fg = DenseRows(stored["T_fg"])
         self.T_shadow = SparseRows(
             stored["row"],
@@ -220,7 +220,7 @@ class TransportIntegrator:
         return seen
 
     def _trace_plane(self, above: IntArray, seed: int) -> dict[str, Tensor]:
-        """Keep what is not zero: most of the plane loses little of the sky."""
+        """Trace the plane and keep nonzero entries: most of it loses little of the sky."""
         entries = _Entries(self.device)
         for share in plane_rows(
             self.renderer,
@@ -239,7 +239,7 @@ class TransportIntegrator:
         return entries.tensors()
 
     def _trace_mesh(self, seed: int) -> dict[str, Tensor]:
-        """Store what each pixel receives, and what is not zero of what the object keeps."""
+        """Store each pixel's received light, and the nonzero entries of the blocked light."""
         settings, count = self.settings, len(self.receiver_pixels)
         entries = _Entries(self.device)
         shape = (1, count, 2 * settings.height_shadow**2)
@@ -271,10 +271,10 @@ class TransportIntegrator:
         return entries.tensors() | {"T_receiver": T, "bounced": bounced}
 
     def staleness(self, light_fg: Light, light_shadow: Light) -> float:
-        """Return how much noisier the rows are under these lights than under the expected one [1].
+        """Return the noise of the rows under these lights over that under the expected one [1].
 
-        1 when nothing has changed; a sun that has moved to texels of one direction each shows by
-        the square root of the directions that it had. Trace again when this is large.
+        1 for an unchanged light. A sun that has moved to texels of one direction each has the
+        square root of its former number of directions. Trace again when this is large.
         """
         budget, worst = self.settings.bright_directions, 0.0
         for light, expected in zip((light_fg, light_shadow), self.expected, strict=True):
@@ -293,7 +293,7 @@ class TransportIntegrator:
     ) -> Radiance:
         """Render the object under ``light_fg`` and the plane under ``light_shadow``.
 
-        ``seed`` does not matter: the stored rows are frozen.
+        ``seed`` is unused: the stored rows are fixed.
 
         Raises:
             ValueError: Materials are given: the stored rows hold the scene's own.

@@ -15,14 +15,14 @@ class SparseRows:
     Where torch is to be deterministic on CUDA it is stored with its zeros.
 
     Args:
-        row: Of each entry, int32, rising, shape [entry].
-        column: Of each entry, int32, rising within a row, shape [entry].
+        row: Row of each entry, int32, rising, shape [entry].
+        column: Column of each entry, int32, rising within a row, shape [entry].
         values: float32, shape [entry].
         shape: Rows and columns.
     """
 
     BYTES = 16
-    """Memory of one entry: value and int32 index, twice."""
+    """Memory of one entry, value and int32 index, in both copies [byte]."""
 
     def __init__(self, row: Tensor, column: Tensor, values: Tensor, shape: tuple[int, int]) -> None:
         self.entry_count = values.numel()
@@ -37,7 +37,7 @@ class SparseRows:
 
     @property
     def bytes(self) -> int:
-        """Memory of both copies."""
+        """Memory of both copies [byte]."""
         if not self.by_row.is_sparse_csr:
             return self.by_row.numel() * self.by_row.element_size()
         parts = [
@@ -78,7 +78,7 @@ class DenseRows:
 
     @property
     def bytes(self) -> int:
-        """Memory."""
+        """Memory of the matrix [byte]."""
         return self.T.numel() * self.T.element_size()
 
     def times(self, x: Tensor) -> Tensor:

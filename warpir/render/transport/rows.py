@@ -27,11 +27,11 @@ CHUNK_BYTES = 64 << 20
 TRACING = "tracing light transport"
 LOWER_OBJECT = "--object-light-height or --guidance-width"
 LOWER_SHADOW = "--light-height or --guidance-width"
-"""What lowers the memory of tracing."""
+"""Flags that lower the memory of tracing."""
 
 PILOT_SUBSAMPLES = 8
 PILOT_SEED = 0x2F6E2B1
-"""Of the samples that find mirrors."""
+"""Seed of the samples that classify mirrors."""
 
 
 @dataclass(frozen=True)
@@ -39,7 +39,7 @@ class ObjectRows:
     """Traced rows of ``T_fg``."""
 
     rows: IntArray
-    """Which, shape [row]."""
+    """Indices of the rows, shape [row]."""
     T: wp.array
     """Pixel radiance per texel radiance [1], vec3, shape [row, texel]."""
     emission: wp.array
@@ -47,45 +47,45 @@ class ObjectRows:
     count: wp.array
     """Subsamples that met the object, shape [row]."""
     subsamples: int
-    """Of how many."""
+    """Number of subsamples."""
 
 
 @dataclass(frozen=True)
 class TransportSettings:
-    """How finely light transport is traced and stored."""
+    """Resolution and storage of traced light transport."""
 
     height_fg: int = 32
-    """Rows of the map that lights the object; it is twice as wide."""
+    """Rows of the map that lights the object; the map is twice as wide."""
     height_shadow: int = 32
     """Rows of the map that casts the shadow."""
     subsamples: int = 32
-    """Positions within each pixel."""
+    """Number of positions within each pixel."""
     paths: int = 64
     """Paths per pixel, for narrow specular lobes and for all light of two or more interactions."""
     mirror_factor: int = 16
-    """Times as many of both for pixels that mirror: there the light that they see changes with
-    every normal in the pixel."""
+    """Factor on `subsamples` and `paths` for mirroring pixels, whose reflection changes with every
+    normal in the pixel."""
     bright_directions: int = 1024
-    """Directions per pixel and map that are shared out by where light is expected, on top of one
-    per texel."""
+    """Directions per pixel and map that are allocated by the expected light, on top of one per
+    texel."""
     dtype: str = "bfloat16"
     """Type in which the object's rows are stored, ``bfloat16`` or ``float32``."""
     memory_mib: int = 1024
-    """Most memory that the stored rows may take [MiB]."""
+    """Memory limit of the stored rows [MiB]."""
 
 
 @dataclass(frozen=True)
 class _ObjectTrace:
-    """A tracing of the object's rows, less the rows and their samples."""
+    """Arguments of tracing the object's rows that all rows share."""
 
     renderer: Renderer
     texels: kernels.TexelArgs
     proposal: LightArgs
-    """Where later vertices look for light."""
+    """Proposal of light directions at later vertices."""
     depth: int
     seed: int
     direction_count: int
-    """Of all texels."""
+    """Number of directions of all texels."""
 
     def rows(self, rows: IntArray, pixels: IntArray, subsamples: int, paths: int) -> ObjectRows:
         """Trace some rows, by one interaction and by more."""
@@ -189,7 +189,7 @@ def _groups(
 def _surface_points(
     renderer: Renderer, pixels: IntArray, subsamples: int, seed: int
 ) -> tuple[kernels.SurfacePoints, wp.array]:
-    """Find what the camera sees in each pixel: points, and mean emitted radiance."""
+    """Trace the surface points of each pixel and its mean emitted radiance."""
     scene, device, count = renderer.scene, renderer.device, len(pixels)
     points = kernels.SurfacePoints()
     points.count = wp.zeros(count, dtype=int, device=device)
@@ -220,19 +220,19 @@ def _surface_points(
 
 @dataclass(frozen=True)
 class _ReceiverPoints:
-    """What the camera sees of the receiver under each pixel's subsamples."""
+    """Points of the receiver under each pixel's subsamples."""
 
     pixels: Rows
     count: Rows
-    """Filled points, shape [pixel]."""
+    """Number of points, shape [pixel]."""
     position: Rows
-    """Recentred [m], shape [pixel, subsample]."""
+    """Positions, recentred [m], shape [pixel, subsample]."""
     normal: Rows
-    """Shape [pixel, subsample]."""
+    """Unit normals, shape [pixel, subsample]."""
     spread: Rows
     """Largest distance of a pixel's points from its first one [m], shape [pixel]."""
     share: Rows
-    """Of what the object does not hide, what is receiver and not open [1], shape [pixel]."""
+    """Share of the pixel's unhidden part that shows the receiver [1], shape [pixel]."""
 
 
 def _receiver_points(
@@ -280,7 +280,7 @@ def plane_rows(
     """Trace the plane's rows chunk by chunk.
 
     Yields:
-        Share of each texel's irradiance that the object keeps away [1], shape [row, column].
+        Share of each texel's irradiance that the object blocks [1], shape [row, column].
     """
     scene, device, height = renderer.scene, renderer.device, settings.height_shadow
     counts = direction_counts(expected, settings.bright_directions)
@@ -323,7 +323,7 @@ def plane_rows(
 def _chunks(
     renderer: Renderer, trace: Callable[[int, int], Traced], count: int, size: int
 ) -> Iterator[Traced]:
-    """Yield what ``trace`` makes of each ``size`` pixels, of halves where memory is short."""
+    """Yield ``trace`` of each ``size`` pixels, in halves where memory is short."""
     for start in range(0, count, size):
 
         def part(first: int, last: int, start: int = start) -> Traced:
@@ -335,17 +335,17 @@ def _chunks(
 
 @dataclass(frozen=True)
 class MeshRows:
-    """Traced rows of a receiver with a mesh; what the object keeps is part of what is received."""
+    """Traced rows of a receiver with a mesh; blocked light is a part of the received light."""
 
     received: wp.array
     """Radiance of the white receiver without the object per texel radiance [1], shape [row,
     texel]."""
     blocked: wp.array
-    """What the object keeps of it, shape [row, texel]."""
+    """Part of `received` that the object blocks, shape [row, texel]."""
     bounced: wp.array
     """Radiance of the white receiver that the mesh sends it, vec3, shape [row]."""
     bounced_blocked: wp.array
-    """What the object keeps of it, vec3, shape [row]."""
+    """Part of `bounced` that the object blocks, vec3, shape [row]."""
 
 
 def mesh_rows(

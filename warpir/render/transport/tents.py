@@ -14,9 +14,9 @@ from warpir.kernels import transport as kernels
 from warpir.render.renderer import Renderer
 
 LANES = 256
-"""Threads of a pixel on CUDA."""
+"""Threads per pixel on CUDA."""
 ITEM_SIZE = 16
-"""Directions that one of them draws in a row."""
+"""Directions that one thread draws in sequence."""
 
 
 def tent_solid_angles(height: int) -> Float64Array:
@@ -64,7 +64,7 @@ def tent_irradiance(normal: tuple[float, float, float], height: int) -> Float64A
 
 
 def direction_counts(expected: FloatArray, budget: int) -> IntArray:
-    """Return how many directions each texel gets: one, and more where light is expected.
+    """Return the number of directions of each texel: one, and more where light is expected.
 
     A texel's noise is proportional to its flux, so equal-cost directions are best shared out in
     proportion to it (Neyman's allocation); powers of two keep the sequences stratified.
@@ -84,7 +84,7 @@ def direction_counts(expected: FloatArray, budget: int) -> IntArray:
 
 
 def flux_noise(texels: FloatArray, counts: IntArray) -> float:
-    """Return how much of a pixel's noise is left with these directions, under this light [1].
+    """Return the relative noise of a pixel with these directions under this light [1].
 
     ``sqrt(sum flux_t^2 / count_t)`` over the whole flux: the standard deviation of a pixel if each
     direction's light were as uncertain as it is strong. A light that has moved shows by it.
