@@ -2,7 +2,7 @@
 
     python -m warpir.check_model --model DIR [--photo FILE] [--prompt TEXT] [--json FILE]
 
-`warpir.optimize.model_check` says what is measured. Ends with status 0 when all is as expected of a
+`warpir.optimize.model_check` describes the checks. Ends with status 0 when all is as expected of a
 trained model, with 4 when it is not, and otherwise as `warpir.insert`.
 """
 

@@ -302,7 +302,7 @@ def _options(folder: Path) -> tuple[str, float]:
 
 
 def _read_map(path: Path) -> FloatArray:
-    """Read one map as it stands; refuse what is not clean radiance with some light in it."""
+    """Read one map unchanged; refuse invalid or black radiance."""
     if path.suffix.lower() == ".npy":
         texels = _read_array(path)
     else:

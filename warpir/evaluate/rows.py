@@ -476,7 +476,7 @@ DEFAULT_ROWS = (
 
 
 def chosen_rows(text: str | None, has_predictions: bool, is_guided: bool = True) -> list[str]:
-    """Return the rows that a list of names and groups stands for, in the tables' order.
+    """Return the rows of a list of names and groups, in the tables' order.
 
     Args:
         text: Names of rows and groups, separated by commas; None: `DEFAULT_ROWS`.

@@ -292,7 +292,7 @@ class Places:
     def _usable(
         self, paths: Sequence[Path], read: Callable[[Path], Read], where: str, stream: int
     ) -> Iterator[tuple[Path, Read]]:
-        """Yield usable files and what is in them for ever, in a new random order each round."""
+        """Yield usable files and their content without end, in a new random order each round."""
         left = list(paths)
         for lap in count():
             order = np.random.default_rng([self.seed, stream, lap]).permutation(len(left))
@@ -308,7 +308,7 @@ class Places:
                 raise InputError(where, "none of the files found can be used", self.notices[-1])
 
     def _read_panorama(self, path: Path) -> FloatArray:
-        """Return a panorama's full map; what is kept of it is the light."""
+        """Return a panorama's full map, and keep the light averaged from it."""
         texels = read_envmap(path)
         if not texels.any():
             raise InputError(path, "all black")

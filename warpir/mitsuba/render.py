@@ -82,7 +82,7 @@ class Ratio(NamedTuple):
 
 @dataclass(frozen=True)
 class ObjectScene:
-    """A Mitsuba scene with what is needed to render it."""
+    """A Mitsuba scene with its sensor, integrator and normalisation."""
 
     scene: mi.Scene
     sensor: mi.Sensor

@@ -130,7 +130,7 @@ def _run(arguments: list[str]) -> int:
         try:
             server.serve_forever(poll_interval=0.1)
         except Stopped as stopped:
-            with server.working:  # what is being saved is saved
+            with server.working:  # lets a save finish
                 stopped.kept = (
                     f"the placement is in {config.output.out}" if folder.is_written else ""
                 )

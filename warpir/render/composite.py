@@ -190,8 +190,8 @@ def _layers(planes: dict[str, FloatArray], photo: Photo) -> Layers:
     """Put the planes over the photo, both of one size."""
     plate = photo.linear()
     if not photo.is_deep:
-        # The composite is made of what the file of layers holds, so that they recompose it exactly;
-        # against codes of 8 bits the rounding to half is nothing, .06 of a code at most.
+        # Rounded as in the file of layers, so that they recompose exactly; rounding to
+        # half changes 8-bit codes by .06 at most.
         plate = _halves(plate)
         for name in ("foreground", "matte", "shadow_ratio"):
             planes[name] = _halves(planes[name])

@@ -68,7 +68,7 @@ def fixed_arithmetic(device: str, is_deterministic: bool) -> Iterator[None]:
     torch.set_num_threads(THREADS)
     # Of `torch.use_deterministic_algorithms`, without the compiler that it loads (2 s).
     torch.set_deterministic_debug_mode("error" if is_strict else "default")
-    # It finds reads of memory that nobody wrote, at the cost of writing all of it.
+    # It exposes reads of uninitialised memory, at the cost of writing all of it.
     memory.fill_uninitialized_memory = False
     try:
         yield

@@ -1,6 +1,6 @@
 """The pictures of the report: small, display-encoded, as data URIs.
 
-All of them are made of the linear layers, with the gamma of 2.2 by which the renderer sees the
+All of them show the linear layers, with the gamma of 2.2 by which the renderer sees the
 photo, so that they look as ``composite.png`` does and agree with each other to the pixel.
 """
 

@@ -79,7 +79,7 @@ def fit_ground(
     Args:
         points: World frame [m], shape [point, 3].
         camera: The camera.
-        has_up: Whether +Y of the world is up; if not, the camera's up stands for it.
+        has_up: Whether +Y of the world is up; if not, the camera's up replaces it.
         where: Location in errors.
 
     Raises:

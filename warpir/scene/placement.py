@@ -68,7 +68,7 @@ def place_asset(
         size: Longest side of the bounding box after scaling [m].
         mesh: Receiver mesh that the object may stand on.
         is_plane: Whether it may stand on the ground plane too; without, ``place`` is not moved and
-            the plane only says what is upright.
+            the plane only defines the upright direction.
 
     Raises:
         InputError: The place is not on the visible ground, or the camera cannot see the object.

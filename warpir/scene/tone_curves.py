@@ -18,7 +18,7 @@ TONES = ("reinhard", "linear")
 """Operators between radiance and the foreground's curve: ``x / (1 + x)``, or clipped."""
 CURVE_COUNTS = {"foreground": 1, "shadow_ratio": 3}
 RESOLVED = 0.97
-"""Display-linear value up to which a photo says how bright a thing is [1]: more may be clipped."""
+"""Largest display-linear value that counts as unclipped [1]."""
 
 
 @dataclass(frozen=True)
