@@ -14,7 +14,7 @@ from warpir.app.config import DEFAULTS
 from warpir.app.record import versions
 from warpir.app.run import Run
 from warpir.core import signals
-from warpir.core.atomic import Checkpoint, Checkpoints
+from warpir.core.atomic import Checkpoints
 from warpir.core.errors import ExitCode, InputError
 from warpir.diffusion.dataset_update import DatasetUpdate
 from warpir.diffusion.guidance import Guidance
