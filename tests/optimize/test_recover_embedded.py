@@ -345,8 +345,8 @@ def test_start_is_the_regressed_light(folder: Path, tmp_path: Path) -> None:
     """Both sets of lobes begin with it: same directions, same irradiance, a width the maps hold."""
     from warpir.lighting.estimate import estimate_light
 
-    for tone in ("linear", "reinhard"):
-        run = made_run(config_of(folder, tone=tone), tmp_path)
+    for tone, albedo in (("linear", None), ("reinhard", None), ("linear", 0.9)):
+        run = made_run(config_of(folder, tone=tone, ground_albedo=albedo), tmp_path)
         estimate = estimate_light(run.inputs, run.config, "cpu")
         start = recover.Start(estimate.light, estimate)
         unknowns = recover.unknowns_of(run, start)
@@ -361,8 +361,10 @@ def test_start_is_the_regressed_light(folder: Path, tmp_path: Path) -> None:
         assert region is not None
         believed = min(math.radians(found.spread_deg), SPREAD_MAX)
         assert region.spread == pytest.approx(believed)
-        # Only an operator that darkens is made up for.
-        assert (estimate.gain == 1.0) == (tone == "linear") and estimate.gain >= 1.0
+        # Only an operator that darkens is made up for, and ground of a stated albedo.
+        assert estimate.ground is not None and (estimate.ground.stops == 0.0) == (albedo is None)
+        of_tone = estimate.gain / 2.0**estimate.ground.stops
+        assert of_tone == pytest.approx(1.0) if tone == "linear" else of_tone > 1.0
 
 
 @pytest.mark.slow

@@ -149,11 +149,18 @@ class LightConfig:
     )
     """Object's radiance to display values: linear or reinhard; clipped, as the photo was, or x / (1
     + x), which is paler and does not clip"""
-    ground_albedo: float = option(0.25, "SHARE", low=1e-6, high=1)
-    """Reflectance of the ground, for the exposure; which is automatic without --exposure"""
+    ground_albedo: float | None = option(None, "SHARE", low=1e-6, high=1)
+    """Reflectance of the ground, for the exposure; which is automatic without --exposure: 0.25
+    where a light is given; one that is estimated from the photo follows the ground only where this
+    is stated"""
     detail: bool = option(True)
     """Let the object reflect what the photo shows around it; where the light has no panorama's
     detail of its own"""
+
+    @property
+    def assumed_albedo(self) -> float:
+        """Reflectance of the ground under a light that is given [1]."""
+        return 0.25 if self.ground_albedo is None else self.ground_albedo
 
 
 @dataclass(frozen=True)

@@ -26,9 +26,10 @@ from warpir.core.latlong import rotate_map
 from warpir.diffusion.models.embedded import build_network, save_embedded
 from warpir.evaluate.scenes import Place, Subject, mirrored
 from warpir.evaluate.stage import Prediction, Stage
-from warpir.io.images.photos import read_photo
+from warpir.io.images.photos import Photo, read_photo
 from warpir.io.images.writers import png_bytes
 from warpir.io.results import OutputFolder
+from warpir.lighting.exposure import ask_ground
 from warpir.lighting.fit import fit_lobes
 from warpir.lighting.regression import mean_training_light, regress
 from warpir.lighting.regressor import Regressor, random_regressor
@@ -215,6 +216,16 @@ def regression(network: Regressor, place: Place) -> Prediction:
     )
 
 
+def regression_on_ground(bench: Bench, stage: Stage, subject: Subject) -> Prediction:
+    """Return what the regressor sees, its level weighed against the ground's."""
+    place = subject.place
+    found = regress(bench.network, place.photo, place.camera)
+    photo = Photo(np.round(255.0 * place.photo).astype(np.uint8), place.photo, "png")
+    ground = ask_ground(found, Inputs(photo, subject.asset, place.camera, subject.placement))
+    gain = 1.0 if ground is None else 2.0**ground.weighed
+    return Prediction.of(Light(lobes=found.lobes()).scaled(gain), spread_deg=found.spread_deg)
+
+
 def other_photo(bench: Bench, place: Place) -> Prediction:
     """Return the estimate from another place's photograph, as if this camera had been there."""
     other = bench.other(place)
@@ -397,6 +408,13 @@ ROWS = {
         "methods",
         "the regressor alone",
         of_place=lambda bench, place: regression(bench.network, place),
+        needs=("regressor",),
+    ),
+    "regression-ground": Row(
+        "methods",
+        "the same, its level weighed against the ground's albedo",
+        of_subject=regression_on_ground,
+        start="regression",
         needs=("regressor",),
     ),
     "lds-uniform": Row(

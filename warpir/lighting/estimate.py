@@ -4,11 +4,13 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from warpir.app.config import InsertConfig
 from warpir.app.inputs import Inputs
+from warpir.lighting.exposure import GroundWitness, ask_ground
 from warpir.lighting.regression import Regression, regress
 from warpir.lighting.regressor import load_regressor
 from warpir.lighting.scene_light import SceneLight, start_level
@@ -22,17 +24,25 @@ class Estimate:
     """The light estimated from a photo."""
 
     regression: Regression
+    ground: GroundWitness | None
+    """What the ground says of its level; None where it was not asked, or not seen."""
     gain: float
-    """Factor on its light, so that the tone operator shows it as the photo does."""
+    """Factor on its light: the ground's, and what the tone operator needs to show it as the photo
+    does."""
     light: SceneLight
+
+    def record(self) -> dict[str, Any]:
+        """Return what ``run.json`` says of it, plain values."""
+        ground = None if self.ground is None else self.ground.record()
+        return {"regression": self.regression.record(), "ground": ground}
 
 
 def estimate_light(inputs: Inputs, config: InsertConfig, device: str) -> Estimate:
-    """Estimate the light of the photo with the regressor.
+    """Estimate the light of the photo with the regressor, and check its level by the ground.
 
     Args:
-        inputs: Photo and camera.
-        config: Weights, tone operator, exposure.
+        inputs: Photo, camera and placement.
+        config: Weights, tone operator, exposure, albedo of the ground.
         device: torch's name of it.
 
     Raises:
@@ -42,11 +52,17 @@ def estimate_light(inputs: Inputs, config: InsertConfig, device: str) -> Estimat
     regression = regress(load_regressor(path, device), inputs.photo.srgb, inputs.camera)
     if config.light.visible_sun:
         regression = with_visible_sun(regression, inputs.photo.srgb, inputs.camera)
-    gain = tone_gain(inputs, config) * 2.0 ** (config.light.exposure or 0.0)
+    stops, ground = config.light.exposure, None
+    assumed = [_describe_direction(regression)]
+    if stops is None:
+        ground = ask_ground(regression, inputs, config.light.ground_albedo)
+        stops = 0.0 if ground is None else ground.stops
+        assumed.append(_describe_level(ground))
+    gain = tone_gain(inputs, config) * 2.0**stops
     light = Light(lobes=regression.lobes()).scaled(gain)
     curves = Curves.identity(config.tone_operator)
-    scene_light = SceneLight(light, light, curves, float(np.log2(gain)), (in_words(regression),))
-    return Estimate(regression, gain, scene_light)
+    scene_light = SceneLight(light, light, curves, float(np.log2(gain)), tuple(assumed))
+    return Estimate(regression, ground, gain, scene_light)
 
 
 def tone_gain(inputs: Inputs, config: InsertConfig) -> float:
@@ -59,8 +75,7 @@ def tone_gain(inputs: Inputs, config: InsertConfig) -> float:
     return 1.0 if linear else 1.0 + start_level(inputs, config)
 
 
-def in_words(regression: Regression) -> str:
-    """Return what is assumed, in a line."""
+def _describe_direction(regression: Regression) -> str:
     azimuth, elevation = angles_from_axis(regression.axis)
     if regression.sun_in_view is not None:
         return (
@@ -72,4 +87,22 @@ def in_words(regression: Regression) -> str:
         "the light is what the regressor sees in the photo: mainly from azimuth "
         f"{azimuth:.0f}, elevation {elevation:.0f}, +- {regression.spread_deg:.0f} degrees "
         "(--light, --sun, --sky)"
+    )
+
+
+def _describe_level(ground: GroundWitness | None) -> str:
+    if ground is None:
+        return (
+            "the light's level is the estimated one: the photo shows too little of the ground to "
+            "check it (--exposure)"
+        )
+    if ground.is_stated:
+        return (
+            f"the light is {ground.stops:+.2f} EV from the estimated one: the albedo of the "
+            f"ground is {ground.albedo:.2g} instead of {ground.implied:.2g} (--exposure)"
+        )
+    return (
+        "the light's level is the estimated one, under which the ground's albedo is "
+        f"{ground.implied:.2g}; weighed against what grounds have, it would be "
+        f"{ground.weighed:+.2f} EV (--ground-albedo, --exposure)"
     )

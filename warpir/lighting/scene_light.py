@@ -7,7 +7,7 @@ import numpy as np
 from warpir.app.config import InsertConfig, usage
 from warpir.app.inputs import Inputs
 from warpir.app.reuse import EarlierRun
-from warpir.core.arrays import Float64Array
+from warpir.core.arrays import BoolArray, Float64Array
 from warpir.core.color import luminance
 from warpir.core.errors import InputError
 from warpir.lighting.fit import LobeFit, fit_lobes
@@ -88,7 +88,7 @@ def make_light(inputs: Inputs, config: InsertConfig) -> SceneLight | None:
         exposure = _automatic_exposure(light, inputs, config)
         assumed.append(
             f"the light is {exposure:+.2f} EV, so that ground of albedo "
-            f"{config.light.ground_albedo:g} looks as bright as the photo's lit ground "
+            f"{config.light.assumed_albedo:g} looks as bright as the photo's lit ground "
             "(--exposure, --ground-albedo)"
         )
     light = light.scaled(2.0**exposure)
@@ -147,7 +147,7 @@ def _described(config: InsertConfig, assumed: list[str]) -> Light:
         r, g, b = (float(strength * c) for c in tint)
         lobes = sun_lobe(sun[0], sun[1], (r, g, b))
         horizontal += strength * tint * max(np.sin(np.radians(sun[1])), 0.0)
-    r, g, b = (float(c) for c in config.light.ground_albedo * horizontal / np.pi)
+    r, g, b = (float(c) for c in config.light.assumed_albedo * horizontal / np.pi)
     return Light(lobes, plain_sky(sky_color, (r, g, b)))
 
 
@@ -155,17 +155,10 @@ def _automatic_exposure(light: Light, inputs: Inputs, config: InsertConfig) -> f
     """Choose the light's scale so that Lambertian ground appears as the photo shows it.
 
     The tone curve's start is the identity, so display value = Reinhard(albedo * E / pi), or the
-    value itself with ``--tone linear``. Where mesh or mask say what the lamps reach, that part of
-    the ground is measured; where they reach none of it, the light without them is.
+    value itself with ``--tone linear``.
     """
-    normal = inputs.placement.ground[:3]
-    points = _ring(inputs)
-    reached = _reached(points, light, inputs)
-    if (reached > 0.5).mean() >= LIT_SHARE:
-        points = points[reached > 0.5]
-    else:
-        light = without_lamps(light, 1.0 - float(reached.mean()))
-    irradiance = float(luminance(light.irradiance(normal)))
+    points, light = lit_ground(_ring(inputs), light, inputs)
+    irradiance = float(luminance(light.irradiance(inputs.placement.ground[:3])))
     if not irradiance > 0.0:
         raise InputError(
             config.light.file or "--sun",
@@ -174,7 +167,23 @@ def _automatic_exposure(light: Light, inputs: Inputs, config: InsertConfig) -> f
         )
     level = np.clip(_level(inputs, points, LIT_PERCENTILE), 1e-3, 0.9)
     wanted = level / (1.0 - level) if config.tone_operator == "reinhard" else level
-    return float(np.log2(wanted * np.pi / (config.light.ground_albedo * irradiance)))
+    return float(np.log2(wanted * np.pi / (config.light.assumed_albedo * irradiance)))
+
+
+def lit_ground(points: Float64Array, light: Light, inputs: Inputs) -> tuple[Float64Array, Light]:
+    """Return those points of the ground that the lamps reach, and the light that reaches them.
+
+    Where mesh and mask say that they reach too few, all points and the light without its lamps.
+
+    Args:
+        points: World frame [m], shape [point, 3].
+        light: Its lamps may be kept from the ground.
+        inputs: Hold mesh, mask and camera.
+    """
+    reached = _reached(points, light, inputs)
+    if (reached > 0.5).mean() >= LIT_SHARE:
+        return points[reached > 0.5], light
+    return points, without_lamps(light, 1.0 - float(reached.mean()))
 
 
 def ground_level(inputs: Inputs, percentile: float) -> float:
@@ -192,9 +201,6 @@ def _ring(inputs: Inputs) -> Float64Array:
     camera, placement = inputs.camera, inputs.placement
     low, high = inputs.asset.bounds()
     size = float(np.linalg.norm((high - low) * np.linalg.norm(placement.asset_to_world[:3, 0])))
-    foot = placement.asset_to_world @ np.array(
-        [(low[0] + high[0]) / 2.0, low[1], (low[2] + high[2]) / 2.0, 1.0]
-    )
     rings = np.linspace(0.2, 1.5, 16) * size
     angles = np.linspace(0.0, 2.0 * np.pi, 64, endpoint=False)
     if inputs.proxy is not None:
@@ -203,12 +209,26 @@ def _ring(inputs: Inputs) -> Float64Array:
     side = np.cross(placement.ground[:3], camera.c2w[:3, 0])
     across = np.cross(side, placement.ground[:3])
     circle = np.cos(angles)[:, None] * _unit(across) + np.sin(angles)[:, None] * _unit(side)
-    points: Float64Array = (foot[:3] + rings[:, None, None] * circle[None]).reshape(-1, 3)
-    if inputs.proxy is not None:
-        eye = np.broadcast_to(camera.c2w[:3, 3], points.shape)
-        is_seen = first_hit(inputs.proxy, eye, points - eye)[0] > SEEN
-        points = points[is_seen] if is_seen.any() else points
-    return points
+    points: Float64Array = (foot_of(inputs) + rings[:, None, None] * circle[None]).reshape(-1, 3)
+    is_seen = seen_past_mesh(points, inputs)
+    return points[is_seen] if is_seen.any() else points
+
+
+def foot_of(inputs: Inputs) -> Float64Array:
+    """Return the middle of the lower side of the object's box, world frame [m], shape [3]."""
+    low, high = inputs.asset.bounds()
+    middle = np.array([(low[0] + high[0]) / 2.0, low[1], (low[2] + high[2]) / 2.0, 1.0])
+    foot: Float64Array = (inputs.placement.asset_to_world @ middle)[:3]
+    return foot
+
+
+def seen_past_mesh(points: Float64Array, inputs: Inputs) -> BoolArray:
+    """Return whether no --proxy hides points [m] from the camera, shape [point]."""
+    if inputs.proxy is None:
+        return np.ones(len(points), bool)
+    eye = np.broadcast_to(inputs.camera.c2w[:3, 3], points.shape)
+    is_seen: BoolArray = first_hit(inputs.proxy, eye, points - eye)[0] > SEEN
+    return is_seen
 
 
 def _reached(points: Float64Array, light: Light, inputs: Inputs) -> Float64Array:
@@ -227,13 +247,30 @@ def _reached(points: Float64Array, light: Light, inputs: Inputs) -> Float64Array
 
 
 def _level(inputs: Inputs, points: Float64Array, percentile: float) -> float:
-    """Return a percentile of the photo's linear luminance at world points [1]."""
+    """Return a percentile of the photo's linear luminance at world points [1].
+
+    Where the photo shows none of them, of the whole photo.
+    """
+    seen = photo_luminance(inputs, points)
+    if not len(seen):
+        seen = luminance(inputs.photo.linear().astype(np.float64))
+    return float(np.percentile(seen, percentile))
+
+
+def photo_luminance(inputs: Inputs, points: Float64Array) -> Float64Array:
+    """Return the photo's linear luminance at those world points that it shows [1], shape [seen].
+
+    Points outside the frame are left out, and those behind what --occluder-mask names.
+    """
     camera = inputs.camera
     uv = camera.project(points)
     inside = (uv >= 0.0).all(axis=1) & (uv[:, 0] < camera.width) & (uv[:, 1] < camera.height)
     columns, rows = uv[inside].astype(int).T
-    photo = inputs.photo.linear((rows, columns) if inside.any() else ...)
-    return float(np.percentile(luminance(photo.astype(np.float64)), percentile))
+    if inputs.occluder is not None:
+        is_free = inputs.occluder[rows, columns] < 0.5
+        columns, rows = columns[is_free], rows[is_free]
+    seen: Float64Array = luminance(inputs.photo.linear((rows, columns)).astype(np.float64))
+    return seen
 
 
 def _unit(v: Float64Array) -> Float64Array:

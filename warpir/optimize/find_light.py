@@ -82,7 +82,7 @@ def _estimated(run: Run) -> tuple[SceneLight, dict[str, Any]]:
 
         estimate = estimate_light(run.inputs, run.config, run.device)
     run.log.assume(*estimate.light.assumed)
-    return estimate.light, {"regression": estimate.regression.record()}
+    return estimate.light, estimate.record()
 
 
 def _with_detail(lit: LitRun) -> LitRun:

@@ -165,7 +165,7 @@ def _measured(start: Start, end: SceneLight, judged: Judged | None) -> dict[str,
         "end_light": asdict(summarize(end.light)),
     }
     if start.estimate is not None:
-        measured = {"regression": start.estimate.regression.record()} | measured
+        measured = start.estimate.record() | measured
     if judged is not None:
         measured["acceptance"] = judged.record()
     return measured

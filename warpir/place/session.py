@@ -198,7 +198,7 @@ def start_record(session: Session) -> dict[str, Any]:
         "sky_radiance": sky_radiance,
         "sun_color": sun_color,
         "sun_to_sky": SUN_TO_SKY,
-        "ground_albedo": config.light.ground_albedo,
+        "ground_albedo": config.light.assumed_albedo,
         "assumed": list(session.assumed),
         "folder": str(config.output.out),
     }

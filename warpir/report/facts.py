@@ -193,6 +193,13 @@ def light_sources(record: Mapping[str, Any], config: InsertConfig) -> Rows:
                 f"strength, {2.718281828 ** regression['ambient_log_std']:.1f} in the rest's",
             ),
         ]
+    if ground := measured.get("ground"):
+        text = (
+            f"{ground['implied_albedo']:.2g} under the light as it was regressed, "
+            f"{ground['albedo']:.2g} after {ground['stops']:+.2f} EV on all of the light; both "
+            f"witnesses of its level together give {ground['weighed_stops']:+.2f} EV"
+        )
+        rows.append(("albedo of the ground", text))
     if "detail_seen" in measured:
         seen = 100.0 * measured["detail_seen"]
         rows.append(("reflections", f"the photo shows {seen:.0f} % of what is around the object"))
