@@ -183,7 +183,7 @@ def insertions(
         for _ in range(2):
             start = time.perf_counter()
             picture = make_picture(
-                Renderer(scene), light, light, photo, quality, *curves, False, own_mask
+                Renderer(scene), light, light, photo, quality, *curves, False, shadow_mask=own_mask
             )
             seconds = time.perf_counter() - start
         found[name] = (np.clip(picture.image, 0.0, 1.0), seconds)

@@ -16,7 +16,7 @@ from warpir.evaluate.command import main, usable_rows
 from warpir.evaluate.judge import light_figures
 from warpir.evaluate.light_errors import light_errors
 from warpir.evaluate.report import Entry, bootstrap, compare, mean_of, summarize
-from warpir.evaluate.rows import ROWS, Bench, chosen_rows
+from warpir.evaluate.rows import ROWS, chosen_rows
 from warpir.evaluate.scenes import (
     HEIGHT_SHARE,
     RESPONSES,
@@ -26,7 +26,7 @@ from warpir.evaluate.scenes import (
     find_files,
     mirrored,
 )
-from warpir.evaluate.stage import Prediction, Stage
+from warpir.evaluate.stage import Bench, Prediction, Stage
 from warpir.io.results import OutputFolder
 from warpir.lighting.regressor import random_regressor, save_regressor
 from warpir.render.composite import Quality

@@ -7,14 +7,14 @@ import pytest
 import torch
 
 from tests.statistics import central_differences, compare_gradients
-from warpir.lighting.sg_light import LightBounds, SGLight
-from warpir.lighting.trust_region import (
+from warpir.lighting.regularizers import (
     LOG_STD_MIN,
     SHAPE_STD,
     SPREAD_MIN,
     TrustRegion,
     squared_angle,
 )
+from warpir.lighting.sg_light import LightBounds, SGLight
 from warpir.scene.light import Lobes, fibonacci
 
 BOUNDS = LightBounds(0.05)

@@ -26,8 +26,8 @@ from warpir.io.images.photos import read_photo
 from warpir.io.results import OutputFolder
 from warpir.lighting.regression import regress
 from warpir.lighting.regressor import load_regressor, random_regressor, save_regressor
+from warpir.lighting.regularizers import SPREAD_MAX
 from warpir.lighting.sg_light import narrowest
-from warpir.lighting.trust_region import SPREAD_MAX
 from warpir.optimize import recover
 from warpir.optimize.acceptance import Verdict
 from warpir.optimize.course import make_frame

@@ -28,8 +28,8 @@ if TYPE_CHECKING:
     from warpir.evaluate.image_errors import Distance
     from warpir.evaluate.report import Entry
     from warpir.evaluate.results import Panel
-    from warpir.evaluate.rows import Bench
     from warpir.evaluate.scenes import Place, Subject
+    from warpir.evaluate.stage import Bench
     from warpir.io.results import OutputFolder
 
     FloatArray = NDArray[np.float32]
@@ -317,7 +317,7 @@ def _make_bench(
     device: str,
     predictions: "dict[str, FloatArray] | None",
 ) -> "Bench":
-    from warpir.evaluate.rows import Bench
+    from warpir.evaluate.stage import Bench
     from warpir.lighting.regressor import load_regressor
 
     network, missing = None, None

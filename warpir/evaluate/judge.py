@@ -12,9 +12,9 @@ from warpir.evaluate.image_errors import Distance, image_errors, make_regions
 from warpir.evaluate.light_errors import light_errors
 from warpir.evaluate.report import Entry, bootstrap
 from warpir.evaluate.results import Panel, to_codes
-from warpir.evaluate.rows import ROWS, Bench
+from warpir.evaluate.rows import ROWS
 from warpir.evaluate.scenes import Place, Subject
-from warpir.evaluate.stage import Prediction, Stage
+from warpir.evaluate.stage import Bench, Prediction, Stage
 from warpir.evaluate.three_spheres import sphere_errors
 from warpir.lighting.regressor import Regressor, least_angle
 from warpir.render.composite import Quality

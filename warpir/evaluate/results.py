@@ -17,8 +17,8 @@ import warpir
 from warpir.app.record import versions
 from warpir.core.arrays import CodeArray, FloatArray
 from warpir.evaluate.report import Entry
-from warpir.evaluate.rows import Bench
 from warpir.evaluate.scenes import Place, Subject
+from warpir.evaluate.stage import Bench
 
 FORMAT, VERSION = "warpir-evaluation", 1
 DIFFERENCE_GAIN = 4.0

@@ -5,17 +5,24 @@ Every light is rendered by the same renderer with the same geometry, samples and
 
 from __future__ import annotations
 
+import hashlib
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
+from functools import cache, cached_property
+from importlib.resources import files
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 import torch
 
+from warpir.app.config import InsertConfig
+from warpir.app.model_files import require_model
 from warpir.core.arrays import FloatArray, IntArray
 from warpir.core.color import linear_to_gamma
 from warpir.core.errors import InputError
-from warpir.evaluate.scenes import RESPONSES, Subject
+from warpir.evaluate.scenes import RESPONSES, Place, Subject
+from warpir.lighting.regressor import Regressor, random_regressor
 from warpir.render.bridge import ComposeConstants, compose
 from warpir.render.composite import Quality
 from warpir.render.device_light import light_args
@@ -238,3 +245,81 @@ class Stage:
 
 def _encoded(linear: FloatArray) -> FloatArray:
     return np.minimum(linear_to_gamma(linear), 1.0).astype(np.float32)
+
+
+class Bench:
+    """Scenes, models and settings that the rows use.
+
+    Args:
+        scenes: All places and their subjects.
+        device: Warp device; torch uses the same.
+        seed: Seed of guided runs and of random weights.
+        config: Base configuration of guided runs, without files: model or prior, steps, precision.
+        network: The regressor, or None.
+        missing: Why there is no regressor.
+        predictions: Lights of another system by the place's name, world frame.
+    """
+
+    def __init__(
+        self,
+        scenes: list[tuple[Place, list[Subject]]],
+        device: str,
+        seed: int,
+        config: InsertConfig,
+        network: Regressor | None = None,
+        missing: InputError | None = None,
+        predictions: Mapping[str, FloatArray] | None = None,
+    ) -> None:
+        self.scenes, self.device, self.seed, self.config = scenes, device, seed, config
+        self._network, self._missing = network, missing
+        self.predictions = predictions or {}
+
+    @property
+    def network(self) -> Regressor:
+        """The regressor.
+
+        Raises:
+            InputError: There is none (`ExitCode.MODEL`).
+        """
+        if self._network is None:
+            assert self._missing is not None
+            raise self._missing
+        return self._network
+
+    @cache  # noqa: B019, a bench lives as long as the program
+    def require_prior(self) -> None:
+        """Check that something can guide.
+
+        Raises:
+            InputError: The weights are not there, or not what they should be (`ExitCode.MODEL`).
+        """
+        require_model(self.config.changed(start="uniform"))
+
+    def digests(self) -> dict[str, str | None]:
+        """Return the sha256 of the weights that were used, by what they are."""
+        where = files("warpir.diffusion") / "weights"
+        digests: dict[str, str | None] = {}
+        for name in ("regressor", "prior"):
+            given = self.config.flat()[name]
+            path = Path(given or str(where / f"{name}.safetensors"))
+            is_there = path.is_file()
+            digests[name] = hashlib.sha256(path.read_bytes()).hexdigest() if is_there else None
+        return digests
+
+    @cached_property
+    def random_network(self) -> Regressor:
+        """A regressor with random weights."""
+        return random_regressor(self.seed).to(torch.device(self.device))
+
+    def other(self, place: Place) -> Place:
+        """Return the next place of another panorama.
+
+        Raises:
+            InputError: There is only one panorama.
+        """
+        places = [p for p, _ in self.scenes]
+        k = places.index(place)
+        for candidate in (*places[k + 1 :], *places[:k]):
+            if candidate.panorama != place.panorama:
+                return candidate
+        raise InputError("--panoramas", "another scene's row needs two panoramas or more")

@@ -24,6 +24,7 @@ from warpir.app.inputs import Inputs
 from warpir.core.arrays import Float64Array
 from warpir.core.color import luminance
 from warpir.lighting.regression import Regression
+from warpir.lighting.regularizers import LOG_STD_MAX
 from warpir.lighting.scene_light import (
     GROUND_PERCENTILE,
     foot_of,
@@ -31,7 +32,6 @@ from warpir.lighting.scene_light import (
     photo_luminance,
     seen_past_mesh,
 )
-from warpir.lighting.trust_region import LOG_STD_MAX
 from warpir.scene.light import Light
 
 ALBEDO = 0.19

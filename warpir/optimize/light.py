@@ -16,9 +16,8 @@ from torch import Tensor
 
 from warpir.app.settings import OptimizeSettings
 from warpir.lighting.fusion import fuse
-from warpir.lighting.regularizers import bend, chroma, consistency, spread
+from warpir.lighting.regularizers import TrustRegion, bend, chroma, consistency, spread
 from warpir.lighting.sg_light import LightBounds, SGLight, narrowest
-from warpir.lighting.trust_region import TrustRegion
 from warpir.optimize.loop import Composite, Guide, Optimization
 from warpir.optimize.view import Frame, View, expected_light
 from warpir.render.integrator import Radiance

@@ -19,9 +19,9 @@ from warpir.diffusion.guidance import Guidance
 from warpir.io.lobes_file import lobes_to_json
 from warpir.lighting.estimate import Estimate, estimate_light
 from warpir.lighting.fit import fit_lobes
+from warpir.lighting.regularizers import TrustRegion
 from warpir.lighting.scene_light import SceneLight, start_level
 from warpir.lighting.sg_light import narrowest
-from warpir.lighting.trust_region import TrustRegion
 from warpir.optimize.acceptance import Verdict, blend, judge
 from warpir.optimize.course import (
     Outcome,
