@@ -382,6 +382,26 @@ def test_sphere_shadow_matches_the_closed_form(device: str) -> None:
     assert np.abs(error).max() < SHADOW_NOISE
 
 
+@pytest.mark.parametrize("gap", [0.0, 0.01], ids=["touches", "1cm"])
+def test_contact_shadow_matches_the_closed_form(device: str, gap: float) -> None:
+    """Below and beside a long box on the ground or 1 cm above it, in a constant sky.
+
+    In the plane across a long bar the directions at angle t from the ground carry ``sin t / 2``, so
+    what lies between the angles a and b takes ``(cos a - cos b) / 2`` of the irradiance.
+    """
+    bar = placed(box((-0.5, gap + 0.5, 0.0), (1.0, 1.0, 40.0)))
+    renderer = make(bar, from_above(24, 1, 0.01), device, 0.0)
+    ratio, _, _ = shadow(renderer, constant(), SHADOW_SPP)
+    x = foot(from_above(24 * 16, 1, 0.01 / 16))[:, 0]
+    corners = [(a, b) for a in (-1.0, 0.0) for b in (gap, gap + 1.0)]
+    angles = np.array([np.arctan2(up, x - across) for across, up in corners])
+    open_sky = 1.0 - 0.5 * (np.cos(angles.min(axis=0)) - np.cos(angles.max(axis=0)))
+    truth = open_sky.reshape(24, 16).mean(axis=1)
+    noise = 4.5 * np.sqrt(truth * (1.0 - truth) / SHADOW_SPP) + 4.0 / SHADOW_SPP
+    assert truth.min() < 0.02 and truth.max() > 0.5
+    assert (np.abs(ratio[:, 0] - truth) / noise).max() < 1.0
+
+
 def test_box_on_the_ground_makes_no_speckle(device: str) -> None:
     """A box whose bottom lies in the plane: 0 under it, smooth beside it, 1 on the sunny side."""
     rest = placed(box((0.0, 0.5, 0.0), (1.0, 1.0, 1.0)))

@@ -1,19 +1,23 @@
 """Where the object stands: `warpir.scene.placement`."""
 
+import math
+
 import numpy as np
 import pytest
 
-from warpir.core.arrays import Float64Array
+from warpir.core.arrays import Float64Array, IntArray
 from warpir.core.errors import InputError
 from warpir.scene.asset import Asset, Material, Primitive
 from warpir.scene.camera import Camera, camera_from_fov
-from warpir.scene.placement import place_asset, turn, up_to_y, upright_plane, y_to
+from warpir.scene.placement import place_asset, settled, turn, up_to_y, upright_plane, y_to
+from warpir.scene.receiver import ReceiverMesh
 
 # float64 and a handful of products
 EXACT = 1e-12
 
 LOW, HIGH = np.array([-1.0, 0.5, -2.0]), np.array([3.0, 2.5, 4.0])
 """A box whose origin is neither at its foot nor in its middle."""
+PLACE = (0.0, 0.0, -4.0)
 
 
 @pytest.fixture
@@ -203,3 +207,68 @@ def test_M16_up_axis_of_an_asset_becomes_y(axis: str) -> None:
 def test_M16_z_up_is_turned_by_the_stated_map() -> None:
     """(x, y, z) becomes (x, z, -y), as everywhere in the project."""
     np.testing.assert_array_equal(up_to_y("z") @ (1.0, 2.0, 3.0), (1.0, 3.0, -2.0))
+
+
+def _stool(foot: float) -> Float64Array:
+    """Return the vertices of a stool of 0.5 m on three thin feet, whose tips are this high [m]."""
+    angles = np.radians((90.0, 210.0, 330.0))
+    feet = np.stack([0.2 * np.cos(angles), np.full(3, foot), 0.2 * np.sin(angles)], axis=1)
+    return np.concatenate([feet, feet * (1.0, 0.0, 1.0) + (0.0, 0.5, 0.0)])
+
+
+def _table(height: float, tilt: float = 0.0) -> ReceiverMesh:
+    """Return a square of 4 m around (0, height, -4), whose height grows by the tilt along x."""
+    corners = [(x, height + tilt * x, z) for x, z in ((-2, -6), (2, -6), (2, -2), (-2, -2))]
+    return ReceiverMesh(np.array(corners), np.array([[0, 2, 1], [0, 3, 2]], np.int32))
+
+
+@pytest.mark.parametrize(
+    ("foot", "rise"),
+    [(0.004, -0.004), (-0.004, 0.004), (0.03, 0.0), (-0.03, 0.0), (0.0, 0.0)],
+    ids=["hovers", "sunk", "hangs", "buried", "stands"],
+)
+def test_a_small_gap_is_closed_and_a_large_one_is_meant(
+    camera: Camera, foot: float, rise: float
+) -> None:
+    """Up to 5 mm or 1 % of the size, along the normal alone; the line states the millimetres."""
+    placed = place_asset(-np.array([0.2, 0, 0.2]), np.array([0.2, 0.5, 0.2]), camera, place=PLACE)
+    for mesh, is_plane in ((None, True), (_table(0.0), True), (_table(0.0), False)):
+        down = settled(placed, _stool(foot), mesh, is_plane=is_plane)
+        moved = down.asset_to_world - placed.asset_to_world
+        np.testing.assert_allclose(moved[:3, 3], (0.0, rise, 0.0), atol=1e-12)
+        np.testing.assert_array_equal(moved[:3, :3], 0.0)
+        said = down.assumed[len(placed.assumed) :]
+        assert len(said) == (rise != 0.0) and all("by 4 mm (--no-settle)" in line for line in said)
+    assert settled(placed, _stool(foot), settles=False) is placed
+
+
+def test_feet_on_a_slope_meet_it_without_a_tilt(camera: Camera) -> None:
+    """On a mesh that rises by 1 % the uphill foot touches it: 0.2 cos(30) of the foot's radius."""
+    placed = place_asset(-np.array([0.2, 0, 0.2]), np.array([0.2, 0.5, 0.2]), camera, place=PLACE)
+    down = settled(placed, _stool(0.0), _table(0.0, 0.01), is_plane=False)
+    rise = 0.01 * 0.2 * math.cos(math.radians(30.0))
+    moved = down.asset_to_world - placed.asset_to_world
+    np.testing.assert_allclose(moved[:3, 3], (0.0, rise, 0.0), atol=1e-12)
+    np.testing.assert_array_equal(moved[:3, :3], 0.0)
+    under = settled(placed, _stool(0.004), ReceiverMesh(*_both(_table(0.0), _table(0.7))))
+    assert under.asset_to_world[1, 3] == pytest.approx(placed.asset_to_world[1, 3] - 0.004)
+
+
+def _both(*meshes: ReceiverMesh) -> tuple[Float64Array, IntArray]:
+    """Return positions and triangles of two meshes of four vertices as one."""
+    a, b = meshes
+    return np.concatenate([a.positions, b.positions]), np.concatenate([a.indices, b.indices + 4])
+
+
+def test_an_object_sinks_along_the_normal_by_what_is_asked(camera: Camera) -> None:
+    """After the gap is closed; one that would vanish is refused."""
+    normal = np.array([0.1, 1.0, 0.2]) / math.hypot(0.1, 1.0, 0.2)
+    low, high = -np.array([0.2, 0, 0.2]), np.array([0.2, 0.5, 0.2])
+    placed = place_asset(low, high, camera, np.append(normal, 0.0), place=PLACE)
+    sunk = settled(placed, _stool(0.004), sink=0.02)
+    np.testing.assert_allclose(
+        sunk.asset_to_world[:3, 3] - placed.asset_to_world[:3, 3], -0.024 * normal, atol=1e-12
+    )
+    with pytest.raises(InputError) as caught:
+        settled(placed, _stool(0.0), sink=0.51)
+    assert caught.value.where == "--sink"

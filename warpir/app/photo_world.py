@@ -17,7 +17,7 @@ from warpir.scene.asset import Asset
 from warpir.scene.camera import Camera, camera_from_exif, camera_from_fov
 from warpir.scene.free_space import Cloud, find_place, points_in_way
 from warpir.scene.ground import fit_ground
-from warpir.scene.placement import Placement, place_asset, upright_plane, y_to
+from warpir.scene.placement import Placement, place_asset, settled, upright_plane, y_to
 from warpir.scene.receiver import ReceiverMesh
 
 DEFAULT_FOV = 60.0
@@ -150,18 +150,36 @@ def stand_on_ground(
     mesh: ReceiverMesh | None = None,
     is_plane: bool = True,
 ) -> Placement:
-    """Set the asset on the ground: where it was asked for, or where the points leave space.
+    """Set the asset on the ground, so that it neither hovers nor sinks unless that is asked for.
 
     Args:
-        asked: Place, turn and size.
+        asked: Place, turn, size and depth.
         asset: The object.
         world: Camera, ground and points.
         mesh: What --proxy holds.
         is_plane: Whether the object may stand on the ground plane.
 
     Raises:
-        InputError: There is no such place, or no free one.
+        InputError: There is no such place, or no free one, or the object would be below the ground.
     """
+    return settled(
+        _stood(asked, asset, world, mesh, is_plane),
+        asset.corners(),
+        mesh,
+        is_plane=is_plane,
+        settles=asked.settle,
+        sink=asked.sink,
+    )
+
+
+def _stood(
+    asked: PlacementConfig,
+    asset: Asset,
+    world: PhotoWorld,
+    mesh: ReceiverMesh | None,
+    is_plane: bool,
+) -> Placement:
+    """Place the asset where it was asked for, or where the points leave space."""
     low, high = asset.bounds()
 
     def put(place: tuple[float, float, float] | None) -> Placement:

@@ -104,6 +104,11 @@ class PlacementConfig:
     """Factor on the asset's own size [1]"""
     size: float | None = option(None, "METRES", low=1e-6, high=1e9)
     """Longest side of the asset after scaling [m]; of its bounding box"""
+    settle: bool = option(True, expert=True)
+    """Closing of gaps of up to 5 mm or 1 % of its size below the object; if sunk by as much, it is
+    raised"""
+    sink: float = option(0.0, "METRES", expert=True, low=0, high=1e9)
+    """How deep the object sinks into soft ground [m]; grass, sand, snow"""
 
 
 @dataclass(frozen=True)

@@ -153,6 +153,10 @@ class Asset:
         high = np.max([p.positions.max(axis=0) for p in self.primitives], axis=0)
         return low, high
 
+    def corners(self) -> Float64Array:
+        """Return the vertices that triangles use, asset frame [m], shape [vertex, 3]."""
+        return np.concatenate([p.positions[np.unique(p.indices)] for p in self.primitives])
+
     def turned(self, rotation: Float64Array) -> "Asset":
         """Return the same turned about its origin.
 

@@ -6,7 +6,7 @@ centre of its footprint, since an asset's origin can be anywhere.
 """
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -20,6 +20,12 @@ DEFAULT_STAND = (0.5, 0.75)
 SMALLEST_PLAUSIBLE = 0.01
 LARGEST_PLAUSIBLE = 100.0
 """Range of plausible sizes [m]; others are more often a mistake of the unit."""
+SETTLED, SETTLED_SHARE = 0.005, 0.01
+"""Largest gap that is closed below an object: length [m], or share of its longest side [1]."""
+UNSEEN_GAP = 1e-5
+"""Share of the longest side below which a gap is rounding [1]."""
+FOOT_CELLS = 32
+"""Cells along each side of an object's footprint, of which the lowest vertex each is measured."""
 STEEP = 0.5
 """Cosine between a surface and the ground below which nothing is expected to stand on it [1]."""
 
@@ -101,6 +107,87 @@ def place_asset(
     away = float(np.linalg.norm(stand - origin))
     summary = f"the object of {shown} m stands {away:.3g} m from the camera, {seen}"
     return Placement(asset_to_world, plane, tuple(assumed), tuple(warnings), summary)
+
+
+def settled(
+    placement: Placement,
+    vertices: Float64Array,
+    mesh: ReceiverMesh | None = None,
+    *,
+    is_plane: bool = True,
+    settles: bool = True,
+    sink: float = 0.0,
+) -> Placement:
+    """Close a small gap between an object and what it stands on, then sink it into soft ground.
+
+    The object moves along the ground's normal alone, so that three feet stay as level as they were.
+    A gap above `SETTLED` and `SETTLED_SHARE` is taken as meant.
+
+    Args:
+        placement: Of `place_asset`.
+        vertices: Corners of the object's triangles, asset frame [m], shape [vertex, 3].
+        mesh: Of the photo's place.
+        is_plane: Whether the ground plane receives the object too.
+        settles: Whether a gap is closed.
+        sink: How deep it sinks after that [m].
+
+    Raises:
+        InputError: All of it would be below the ground.
+    """
+    normal = placement.ground[:3]
+    world = vertices @ placement.asset_to_world[:3, :3].T + placement.asset_to_world[:3, 3]
+    height = float(np.ptp(world @ normal))
+    scale = float(np.linalg.norm(placement.asset_to_world[:3, 0]))
+    longest = scale * float(np.ptp(vertices, axis=0).max())
+    assumed, rise = list(placement.assumed), 0.0
+    if settles:
+        gap = gap_below(world, placement.ground, mesh, is_plane)
+        if UNSEEN_GAP * longest < abs(gap) <= max(SETTLED, SETTLED_SHARE * longest):
+            rise = -gap
+            how = "hovered: it is set down" if gap > 0.0 else "was sunk: it is raised"
+            assumed.append(f"the object {how} by {1000.0 * abs(gap):.3g} mm (--no-settle)")
+    if sink > 0.0:
+        if sink >= height:
+            what = f"the object is only {height:.3g} m high (found {sink:g})"
+            raise InputError("--sink", what, "give less")
+        rise -= sink
+    if rise == 0.0:
+        return placement
+    moved = placement.asset_to_world.copy()
+    moved[:3, 3] += rise * normal
+    return replace(placement, asset_to_world=moved, assumed=tuple(assumed))
+
+
+def gap_below(
+    points: Float64Array, plane: Float64Array, mesh: ReceiverMesh | None, is_plane: bool
+) -> float:
+    """Return the least height of points above the receiver below them [m]; negative if below it.
+
+    What is higher than the highest point is no ground: an object may stand under a table.
+
+    Args:
+        points: Vertices of the object, world frame [m], shape [point, 3].
+        plane: Ground plane of `upright_plane`, shape [4].
+        mesh: Of the photo's place.
+        is_plane: Whether the plane is a receiver; with neither the gap is infinite.
+    """
+    up = y_to(plane[:3])
+    local = points @ up  # +Y is the ground's normal
+    level = -float(plane[3])
+    if mesh is None:
+        return float(local[:, 1].min()) - level if is_plane else math.inf
+    low, high = local.min(axis=0), local.max(axis=0)
+    cell = (local[:, (0, 2)] - low[[0, 2]]) / np.maximum(high - low, 1e-30)[[0, 2]] * FOOT_CELLS
+    cells = np.minimum(cell.astype(np.int64), FOOT_CELLS - 1) @ np.array([FOOT_CELLS, 1])
+    order = np.lexsort((local[:, 1], cells))
+    lowest = local[order[np.unique(cells[order], return_index=True)[1]]]
+    corners = (mesh.positions @ up)[mesh.indices]
+    near = ((corners.min(axis=1) <= high) & (corners.max(axis=1) >= low))[:, (0, 2)].all(axis=1)
+    top = lowest * (1.0, 0.0, 1.0) + (0.0, high[1] + SETTLED, 0.0)
+    below = ReceiverMesh(mesh.positions @ up, mesh.indices[near])
+    reach = first_hit(below, top, np.tile((0.0, -1.0, 0.0), (len(top), 1)))[0]
+    floor = np.maximum(top[:, 1] - reach, level if is_plane else -math.inf)
+    return float((lowest[:, 1] - floor).min())
 
 
 def _standing(
