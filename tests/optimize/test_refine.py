@@ -547,9 +547,18 @@ BAD = {
     "name": (lambda c: c["materials"][1].update(name="door"), "/materials/1/name: of another"),
     "kind": (lambda c: c.update(materials=[1, 2]), "/materials/0: an object"),
     "unknown": (lambda c: c["materials"][0].update(sheen=1), "/materials/0: an object with"),
-    "missing": (lambda c: c["materials"][0].pop("metallic"), "/materials/0/metallic: a number"),
-    "text": (lambda c: c["materials"][0].update(roughness="0.5"), "/roughness: a number"),
-    "short": (lambda c: c["materials"][0].update(base_color=[1, 1]), "/base_color: a list of 3"),
+    "missing": (
+        lambda c: c["materials"][0].pop("metallic"),
+        "/0/metallic: missing or of another kind (expected a number)",
+    ),
+    "text": (
+        lambda c: c["materials"][0].update(roughness="0.5"),
+        "/roughness: missing or of another kind (expected a number)",
+    ),
+    "short": (
+        lambda c: c["materials"][0].update(base_color=[1, 1]),
+        "/base_color: missing or of another kind (expected a list of 3",
+    ),
     "bright": (lambda c: c["materials"][0].update(base_color=[0, 1.1, 0]), "/base_color: 0 to 1"),
     "negative": (lambda c: c["materials"][0].update(emission=[0, 0, -1]), "/emission: 0 to 1e+12"),
     "huge": (lambda c: c["materials"][0].update(metallic=10**400), "/metallic: a number beyond"),

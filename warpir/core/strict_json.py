@@ -150,9 +150,9 @@ def read_json_lines(
         raise
     lines = [(number, line) for number, line in enumerate(raw.split(b"\n"), 1) if line.strip()]
     if not 1 <= len(lines) <= most:
-        error = JSON.error(path, "line_count", what=what, found=len(lines), expected=f"1 to {most}")
-        error.code = ExitCode.USAGE
-        raise error
+        wrong = JSON.error(path, "line_count", what=what, found=len(lines), expected=f"1 to {most}")
+        wrong.code = ExitCode.USAGE
+        raise wrong
     return lines, hashlib.sha256(raw).hexdigest()
 
 

@@ -80,7 +80,7 @@ class GroundWitness:
     @property
     def albedo(self) -> float:
         """Albedo that the ground has under the light after `stops` [1]."""
-        return self.implied / 2.0**self.stops
+        return float(self.implied / 2.0**self.stops)
 
     def record(self) -> dict[str, Any]:
         """Return plain values for ``run.json``."""

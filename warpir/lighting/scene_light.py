@@ -253,7 +253,7 @@ def _level(inputs: Inputs, points: Float64Array, percentile: float) -> float:
     """
     seen = photo_luminance(inputs, points)
     if not len(seen):
-        seen = luminance(inputs.photo.linear().astype(np.float64))
+        seen = np.asarray(luminance(inputs.photo.linear().astype(np.float64)), np.float64)
     return float(np.percentile(seen, percentile))
 
 
@@ -269,8 +269,8 @@ def photo_luminance(inputs: Inputs, points: Float64Array) -> Float64Array:
     if inputs.occluder is not None:
         is_free = inputs.occluder[rows, columns] < 0.5
         columns, rows = columns[is_free], rows[is_free]
-    seen: Float64Array = luminance(inputs.photo.linear((rows, columns)).astype(np.float64))
-    return seen
+    linear = inputs.photo.linear((rows, columns)).astype(np.float64)
+    return np.asarray(luminance(linear), np.float64)
 
 
 def _unit(v: Float64Array) -> Float64Array:
