@@ -8,15 +8,18 @@ The truth is the panorama with its lower half laid on the ground plane, as the o
 for comparison the panorama at infinity. Error: RMSE over the sphere, display-encoded.
 """
 
-import argparse
 import json
 from dataclasses import replace
+from itertools import product
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
 
+from benchmarks.measure import flags
+from benchmarks.referee.subjects import ball
 from warpir.core.latlong import look_up, map_directions, resize_map, texel_solid_angles
 from warpir.evaluate.scenes import PANORAMA_SUFFIXES, Place, Places, Subject, find_files
 from warpir.evaluate.stage import Prediction, Stage
@@ -26,7 +29,7 @@ from warpir.lighting.regression import regress
 from warpir.lighting.regressor import load_regressor
 from warpir.render.composite import Quality
 from warpir.render.device import choose_device
-from warpir.scene.asset import Asset, Material, Primitive
+from warpir.scene.asset import Asset, Material
 from warpir.scene.camera import Camera
 from warpir.scene.light import Light, as_map
 from warpir.scene.placement import place_asset
@@ -42,21 +45,6 @@ MATERIALS = {
 COARSE, SIGMA_DEG = 32, 20.0
 """Rows and width of the low pass of `keeping_low_frequencies`."""
 TILE = 96
-
-
-def sphere(segments: int = 96) -> Primitive:
-    """Return a sphere of radius 1."""
-    theta, phi = np.meshgrid(
-        np.linspace(0.0, np.pi, segments + 1), np.linspace(0.0, 2.0 * np.pi, 2 * segments + 1)
-    )
-    points = np.stack(
-        [np.sin(theta) * np.cos(phi), np.cos(theta), np.sin(theta) * np.sin(phi)], axis=-1
-    )
-    index = np.arange(points[..., 0].size).reshape(theta.shape)
-    a, b, c, d = index[:-1, :-1], index[1:, :-1], index[1:, 1:], index[:-1, 1:]
-    faces = np.concatenate([np.stack([a, b, c], -1), np.stack([a, c, d], -1)]).reshape(-1, 3)
-    flat = points.reshape(-1, 3)
-    return Primitive(flat, faces.astype(np.int32), 0, normals=flat.astype(np.float32))
 
 
 def on_the_ground(place: Place, centre: NDArray[np.float64]) -> Light:
@@ -98,21 +86,63 @@ def stand(subject: Subject, camera: Camera) -> tuple[Subject, NDArray[np.float64
     matrix = subject.placement.asset_to_world
     size = float((high - low).max() * np.linalg.norm(matrix[:3, 0]))
     x, _, z = (matrix @ np.append((low + high) / 2.0, 1.0))[:3]
-    asset = Asset("sphere", (sphere(),), (Material(),))
+    asset = Asset("sphere", (ball(96),), (Material(),))
     placement = place_asset(*asset.bounds(), camera, place=(x, 0.0, z), size=size)
     return replace(subject, asset=asset, placement=placement), np.array([x, size / 2.0, z])
 
 
+Pictures = dict[str, NDArray[np.float32]]
+
+
+def insertions(
+    stage: Stage, place: Place, centre: NDArray[np.float64], lights: dict[str, Light]
+) -> tuple[Pictures, dict[str, Pictures]]:
+    """Return the true pictures by what is true, and those of each light by what it is given."""
+    shown = Curves.identity("linear").radiance(place.photo_lin).astype(np.float32)
+    detail = seen_from(centre, shown, place.camera, GROUND)
+
+    def picture(light: Light) -> NDArray[np.float32]:
+        prediction = Prediction.of(light)
+        return stage.compose(stage.render(prediction), prediction.curves)
+
+    truths = {"on the ground": picture(on_the_ground(place, centre)), "far": stage.truth}
+    return truths, {
+        kind: {
+            "without": picture(light),
+            "detail": picture(with_detail(light, detail)),
+            "low frequencies kept": picture(keeping_low_frequencies(light, detail)),
+        }
+        for kind, light in lights.items()
+    }
+
+
+def tile(pictures: list[NDArray[np.float32]], covered: NDArray[np.bool_]) -> NDArray[np.float32]:
+    """Return cuts round the sphere side by side."""
+    v, u = (int(k.mean()) for k in np.nonzero(covered))
+    h, w = covered.shape
+    top, left = min(max(v - TILE // 2, 0), h - TILE), min(max(u - TILE // 2, 0), w - TILE)
+    cut = (slice(top, top + TILE), slice(left, left + TILE))
+    return np.concatenate([p[cut] for p in pictures], axis=1)
+
+
+def print_table(rows: list[dict[str, Any]]) -> None:
+    """Print the mean errors, three designs a line."""
+    print("| material | light | truth | without | detail | low frequencies kept |")
+    print("|---|---|---|---|---|---|")
+    for k in range(0, len(rows), 3):
+        first = rows[k]
+        cells = " | ".join(f"{r['rmse']:.4f}" for r in rows[k : k + 3])
+        print(f"| {first['material']} | {first['light']} | {first['truth']} | {cells} |")
+
+
 def main() -> None:
     """Run it."""
-    parser = argparse.ArgumentParser(description=__doc__)
+    parser = flags(__doc__, has_assets=False)
     parser.add_argument("--panoramas", type=Path, nargs="+", required=True)
     parser.add_argument("--assets", type=Path, nargs="+", required=True, help="give their places")
     parser.add_argument("--places", type=int, default=8)
     parser.add_argument("--seed", type=int, default=3)
     parser.add_argument("--samples", type=int, default=16)
-    parser.add_argument("--device")
-    parser.add_argument("--json", type=Path)
     parser.add_argument("--sheet", type=Path)
     options = parser.parse_args()
     device = choose_device(options.device)
@@ -123,8 +153,6 @@ def main() -> None:
     tiles = []
     for place, subjects in Places(panoramas, assets, options.seed).make(options.places):
         subject, centre = stand(subjects[0], place.camera)
-        shown = Curves.identity("linear").radiance(place.photo_lin).astype(np.float32)
-        detail = seen_from(centre, shown, place.camera, GROUND)
         lights = {
             "regressed": Light(lobes=regress(regressor, place.photo, place.camera).lobes()),
             "32 lobes": Light(lobes=fit_lobes(place.texels, 32).lobes),
@@ -133,43 +161,21 @@ def main() -> None:
             asset = replace(subject.asset, materials=(material,))
             quality = Quality(options.samples, 1, 1, options.seed, 8.0)
             stage = Stage(replace(subject, asset=asset), device, quality)
-
-            def picture(light: Light, stage: Stage = stage) -> NDArray[np.float32]:
-                prediction = Prediction.of(light)
-                return stage.compose(stage.render(prediction), prediction.curves)
-
-            truths = {"on the ground": picture(on_the_ground(place, centre)), "far": stage.truth}
+            truths, pictures = insertions(stage, place, centre, lights)
             covered = stage.mask > 0.5
-            row = list(truths.values())
-            for kind, light in lights.items():
-                pictures = {
-                    "without": picture(light),
-                    "detail": picture(with_detail(light, detail)),
-                    "low frequencies kept": picture(keeping_low_frequencies(light, detail)),
-                }
-                for truth, true in truths.items():
-                    for which, made in pictures.items():
-                        error = float(np.sqrt(((made - true)[covered] ** 2).mean()))
-                        errors.setdefault((name, kind, truth, which), []).append(error)
-                row += list(pictures.values())[:2]
+            for kind, truth in product(lights, truths):
+                for which, image in pictures[kind].items():
+                    error = float(np.sqrt(((image - truths[truth])[covered] ** 2).mean()))
+                    errors.setdefault((name, kind, truth, which), []).append(error)
             if name in ("mirror", "paint"):
-                v, u = (int(k.mean()) for k in np.nonzero(covered))
-                h, w = covered.shape
-                top = min(max(v - TILE // 2, 0), h - TILE)
-                left = min(max(u - TILE // 2, 0), w - TILE)
-                cut = (slice(top, top + TILE), slice(left, left + TILE))
-                tiles.append(np.concatenate([p[cut] for p in row], axis=1))
+                two = [image for by in pictures.values() for image in list(by.values())[:2]]
+                tiles.append(tile([*truths.values(), *two], covered))
     rows = [
         dict(zip(("material", "light", "truth", "which"), key, strict=True))
         | {"rmse": float(np.mean(values))}
         for key, values in errors.items()
     ]
-    print("| material | light | truth | without | detail | low frequencies kept |")
-    print("|---|---|---|---|---|---|")
-    for k in range(0, len(rows), 3):
-        first = rows[k]
-        cells = " | ".join(f"{r['rmse']:.4f}" for r in rows[k : k + 3])
-        print(f"| {first['material']} | {first['light']} | {first['truth']} | {cells} |")
+    print_table(rows)
     if options.json is not None:
         record = {"device": device, "places": options.places, "seed": options.seed, "rows": rows}
         options.json.write_text(json.dumps(record) + "\n")

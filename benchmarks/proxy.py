@@ -10,16 +10,17 @@ shadow mask, with the wall as the mesh of `--proxy`, and with wall and ground as
 of display values, over the box of all that the car changes in the truth and over the whole picture.
 """
 
-import argparse
 import json
 import time
 from dataclasses import dataclass, replace
+from functools import cached_property
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from PIL import Image
 
-from benchmarks.referee.__main__ import foreground
+from benchmarks.measure import flags
 from tools.demo.make import pixel_directions
 from tools.demo.textures import paving_texture
 from warpir.core.arrays import Float64Array, FloatArray, IntArray, PixelArray
@@ -28,6 +29,7 @@ from warpir.core.latlong import look_up, resize_map, rotate_map
 from warpir.demo import ASSET, LIGHT
 from warpir.io.assets import load_asset
 from warpir.io.images.photos import Photo, read_envmap
+from warpir.mitsuba.render import foreground
 from warpir.render.composite import Quality, make_picture, photo_radiance
 from warpir.render.device import choose_device
 from warpir.render.device_scene import Placed, Receiver, Scene
@@ -70,7 +72,7 @@ BURIED = np.array([[1.0, 0, 0, 0], [0, 1, 0, -5], [0, 0, 1, 0], [0, 0, 0, 1]])
 WALL_CENTRE, WALL_SIZE = np.array([0.6, 1.6, -9.2]), np.array([6.0, 3.2, 0.3])
 
 
-def yard() -> tuple[Asset, Asset]:
+def ground_and_wall() -> tuple[Asset, Asset]:
     """Return the ground, and the wall that stands on it."""
     from trimesh.creation import box
 
@@ -206,69 +208,109 @@ def changed_box(truth: PixelArray, photo: PixelArray, seen_car: IntArray) -> tup
     return slice(rows[0], rows[-1] + 1), slice(columns[0], columns[-1] + 1)
 
 
+@dataclass(frozen=True)
+class Yard:
+    """Ground, wall and car, and the camera that looks at them."""
+
+    ground: Asset
+    wall: Asset
+    car: Asset
+    camera: Camera
+    samples: int
+    """Of photo and truth, per pixel."""
+
+    @property
+    def place(self) -> list[tuple[Asset, Float64Array]]:
+        """What stands in the photo.
+
+        A second car, buried, lets photo and truth draw the same random numbers: Mitsuba draws one
+        more where any material is transparent.
+        """
+        return [(self.ground, np.eye(4)), (self.wall, np.eye(4)), (self.car, BURIED)]
+
+    @cached_property
+    def meshes(self) -> tuple[ReceiverMesh, ReceiverMesh]:
+        """The wall, and the wall with the ground."""
+        return mesh_of(self.wall), mesh_of(joined(self.place[:2]))
+
+    def empty(self, texels: FloatArray) -> tuple[float, PixelArray]:
+        """Return the exposure, and the radiance of the place without the car."""
+        radiance = photograph(joined(self.place), self.camera, texels, self.samples)
+        lit = np.percentile(radiance[-self.camera.height // 4 :].mean(axis=-1), 60.0)
+        return LIT_LEVEL / float(lit), radiance
+
+
+def compare(
+    case: Case, yard: Yard, texels: FloatArray, exposure: float, empty: PixelArray, device: str
+) -> tuple[FloatArray, list[dict[str, Any]]]:
+    """Render truth and insertions of a case; return the sheet's row and the figures.
+
+    Args:
+        case: Where the car stands.
+        yard: Where it stands in.
+        texels: The light, sun where the case wants it, shape [256, 512, 3].
+        exposure: Display-linear value of a radiance of 1.
+        empty: Radiance of the place without the car, shape [H, W, 3].
+        device: Warp device.
+    """
+    camera, car = yard.camera, yard.car
+    photo = as_photo(linear_to_gamma(np.clip(exposure * empty, 0.0, 1.0)))
+    placement = place_asset(
+        *car.bounds(), camera, None, place=case.place, rotate_y=case.rotate_y, size=2.2
+    )
+    with_car = joined([*yard.place, (car, placement.asset_to_world)])
+    shot = photograph(with_car, camera, texels, yard.samples)
+    truth = linear_to_gamma(np.clip(exposure * shot, 0.0, 1.0))
+    # Below the horizon a panorama from there would show the ground.
+    lower = texels.copy()
+    lower[128:] = np.mean(empty[-camera.height // 8 :], axis=(0, 1))
+    light = Light(texels=lower).scaled(exposure)
+    mask = painted_mask(yard.meshes[0], camera, lamp_axes(Light(texels=texels))[0])
+    found = insertions(
+        car, placement, camera, light, photo, yard.meshes, mask, yard.samples // 2, device
+    )
+    box = changed_box(truth, photo.srgb, _coverage(car, placement, camera, device))
+    whole = (slice(None), slice(None))
+    figures = [
+        {
+            "case": case.name,
+            "known": name,
+            "rmse_box": round(rmse(image, truth, box), 4),
+            "rmse_picture": round(rmse(image, truth, whole), 4),
+            "seconds": round(seconds, 2),
+        }
+        for name, (image, seconds) in found.items()
+    ]
+    tiles = [photo.srgb, *(image for image, _ in found.values()), truth]
+    return np.concatenate(tiles, axis=1), figures
+
+
 def main() -> None:
     """Render truth and insertions of every case; write the sheet and the figures."""
-    parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
+    parser = flags(__doc__, has_assets=False)
     parser.add_argument("--out", type=Path, required=True)
     parser.add_argument("--panorama", type=Path, default=LIGHT, help="default: the demo's sky")
     parser.add_argument("--samples", type=int, default=256, help="of truth and photo, per pixel")
     parser.add_argument("--width", type=int, default=480)
-    parser.add_argument("--device", default=None)
-    parser.add_argument("--json", type=Path, default=None)
     options = parser.parse_args()
     options.out.mkdir(parents=True, exist_ok=True)
     device = choose_device(options.device)
     camera = camera_from_fov(options.width, options.width * 2 // 3, 58.0, -9.0, 1.9)
-    ground, wall_asset = yard()
-    wall, car = mesh_of(wall_asset), load_asset(ASSET)
-    meshes = wall, mesh_of(joined([(ground, np.eye(4)), (wall_asset, np.eye(4))]))
+    yard = Yard(*ground_and_wall(), load_asset(ASSET), camera, options.samples)
     texels = read_envmap(options.panorama)
     azimuth = angles_from_axis(lamp_axes(Light(texels=texels))[0])[0]
     rows, figures = [], []
     photos: dict[float, tuple[FloatArray, float, PixelArray]] = {}
     for case in CASES:
-        # Counter-clockwise, azimuths run clockwise.
-        turned = resize_map(rotate_map(texels, azimuth - case.sun_azimuth), 256)
-        sun = lamp_axes(Light(texels=turned))[0]
-        # A second car, buried, lets photo and truth draw the same random numbers: Mitsuba draws one
-        # more where any material is transparent.
-        place = [(ground, np.eye(4)), (wall_asset, np.eye(4)), (car, BURIED)]
         if case.sun_azimuth not in photos:
-            empty = photograph(joined(place), camera, turned, options.samples)
-            lit = np.percentile(empty[-camera.height // 4 :].mean(axis=-1), 60.0)
-            photos[case.sun_azimuth] = (turned, LIT_LEVEL / float(lit), empty)
-        turned, exposure, empty = photos[case.sun_azimuth]
-        photo = as_photo(linear_to_gamma(np.clip(exposure * empty, 0.0, 1.0)))
-        placement = place_asset(
-            *car.bounds(), camera, None, place=case.place, rotate_y=case.rotate_y, size=2.2
-        )
-        with_car = joined([*place, (car, placement.asset_to_world)])
-        shot = photograph(with_car, camera, turned, options.samples)
-        truth = linear_to_gamma(np.clip(exposure * shot, 0.0, 1.0))
-        # Below the horizon a panorama from there would show the ground.
-        lower = turned.copy()
-        lower[128:] = np.mean(empty[-camera.height // 8 :], axis=(0, 1))
-        light = Light(texels=lower).scaled(exposure)
-        mask = painted_mask(wall, camera, sun)
-        found = insertions(
-            car, placement, camera, light, photo, meshes, mask, options.samples // 2, device
-        )
-        shape = _coverage(car, placement, camera, device)
-        box = changed_box(truth, photo.srgb, shape)
-        whole = (slice(None), slice(None))
-        tiles = [photo.srgb, *(image for image, _ in found.values()), truth]
-        rows.append(np.concatenate(tiles, axis=1))
-        for name, (image, seconds) in found.items():
-            figures.append(
-                {
-                    "case": case.name,
-                    "known": name,
-                    "rmse_box": round(rmse(image, truth, box), 4),
-                    "rmse_picture": round(rmse(image, truth, whole), 4),
-                    "seconds": round(seconds, 2),
-                }
-            )
-            print(figures[-1], flush=True)
+            # Counter-clockwise, azimuths run clockwise.
+            turned = resize_map(rotate_map(texels, azimuth - case.sun_azimuth), 256)
+            photos[case.sun_azimuth] = (turned, *yard.empty(turned))
+        row, lines = compare(case, yard, *photos[case.sun_azimuth], device)
+        rows.append(row)
+        figures += lines
+        for line in lines:
+            print(line, flush=True)
     sheet = np.round(255.0 * np.clip(np.concatenate(rows, axis=0), 0.0, 1.0)).astype(np.uint8)
     Image.fromarray(sheet).save(options.out / "proxy.png")
     if options.json is not None:

@@ -9,6 +9,7 @@ from dataclasses import replace
 import numpy as np
 
 from benchmarks import furnace
+from benchmarks.referee.subjects import sphere, square, sun_and_sky, view
 from warpir.core.arrays import FloatArray
 
 from benchmarks.referee import __main__ as referee  # isort: skip  (sets the variant)
@@ -24,71 +25,6 @@ from warpir.scene.camera import Camera
 
 SIGMAS = 4.5
 """Allowed error in standard errors: one false alarm in 1e5 checks, with room for heavy tails."""
-
-
-def sphere(material: Material, textures: tuple[Texture, ...] = (), rings: int = 64) -> Asset:
-    """Unit sphere about the origin, +Y poles, shading normals exact."""
-    polar = np.linspace(0.0, np.pi, rings + 1)
-    azimuth = np.linspace(0.0, 2.0 * np.pi, 2 * rings + 1)
-    theta, phi = np.meshgrid(polar, azimuth, indexing="ij")
-    positions = np.stack(
-        [np.sin(theta) * np.sin(phi), np.cos(theta), np.sin(theta) * np.cos(phi)], axis=-1
-    ).reshape(-1, 3)
-    uv = np.stack([phi / (2.0 * np.pi), theta / np.pi], axis=-1).reshape(-1, 2)
-    i, j = np.meshgrid(np.arange(rings), np.arange(2 * rings), indexing="ij")
-    a = (i * (2 * rings + 1) + j).ravel()
-    b, c, d = a + 1, a + 2 * rings + 1, a + 2 * rings + 2
-    upper = np.stack([a, c, b], axis=1)[i.ravel() > 0]
-    lower = np.stack([b, c, d], axis=1)[i.ravel() < rings - 1]
-    primitive = Primitive(
-        positions,
-        np.concatenate([upper, lower]).astype(np.int32),
-        0,
-        normals=positions.astype(np.float32),
-        uv0=uv.astype(np.float32),
-    )
-    return Asset("sphere", (primitive,), (material,), textures)
-
-
-def square(material: Material, side: float, height: float, up: bool = False) -> Asset:
-    """Square in the plane y = ``height`` (or standing in z = 0), facing +Y (or +Z)."""
-    h = 0.5 * side
-    corners = np.array([[-h, -h], [h, -h], [h, h], [-h, h]])
-    if up:
-        positions = np.column_stack([corners[:, 0], corners[:, 1] + height, np.zeros(4)])
-    else:
-        positions = np.column_stack([corners[:, 0], np.full(4, height), -corners[:, 1]])
-    uv = np.array([[0.0, 1.0], [1.0, 1.0], [1.0, 0.0], [0.0, 0.0]], dtype=np.float32)
-    primitive = Primitive(positions, np.array([[0, 1, 2], [0, 2, 3]], dtype=np.int32), 0, uv0=uv)
-    return Asset("square", (primitive,), (material,))
-
-
-def view(
-    distance: float,
-    width: int = 32,
-    height: int = 32,
-    fov: float = 25.0,
-    lift: float = 0.0,
-    turn: float = 0.0,
-) -> Camera:
-    """Camera at ``(0, lift, distance)`` turned about +Y to look from another side, along -Z."""
-    focal = 0.5 * width / np.tan(np.radians(0.5 * fov))
-    angle = np.radians(turn)
-    c2w = np.eye(4)
-    c2w[:3, :3] = [
-        [np.cos(angle), 0.0, np.sin(angle)],
-        [0.0, 1.0, 0.0],
-        [-np.sin(angle), 0.0, np.cos(angle)],
-    ]
-    c2w[:3, 3] = c2w[:3, :3] @ [0.0, lift, distance]
-    return Camera(width, height, focal, focal, 0.5 * width, 0.5 * height, c2w)
-
-
-def sun_and_sky(rng: np.random.Generator, rows: int = 32) -> FloatArray:
-    """Noisy coloured sky with one texel 2000 times brighter, shape [rows, 2 rows, 3]."""
-    texels = rng.exponential(size=(rows, 2 * rows, 3))
-    texels[rows // 4, rows // 2] *= 2000.0
-    return texels.astype(np.float32)
 
 
 def report(name: str, value: float, expected: float, error: float) -> None:
@@ -162,120 +98,108 @@ def chi2(name: str, draw: object, density: object, dimensions: int) -> None:
         raise AssertionError(f"{name}: {test.messages}")
 
 
-def check_material(rng: np.random.Generator) -> None:
-    """Sample the material with its density, mapped normals included; reciprocity."""
+def on_triangle(material: Material) -> GltfBSDF:
+    """Return Mitsuba's plugin for a material on a triangle whose normal map leans."""
     corners = np.array([[0.0, 0.0, 0.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])
     uv = np.array([[0.0, 1.0], [1.0, 1.0], [0.0, 0.0]], dtype=np.float32)
     codes = np.array([[[190, 60, 220, 255]]], dtype=np.uint8)
+    triangle = Primitive(corners, np.array([[0, 1, 2]], dtype=np.int32), 0, uv0=uv)
+    asset = Asset("triangle", (triangle,), (material,), (Texture(codes),))
+    return GltfBSDF(asset, triangle, np.eye(3))
+
+
+def seen_from(polar: float) -> mi.SurfaceInteraction3f:
+    """Return a point on the triangle seen at an angle from its normal [rad]."""
+    si = dr.zeros(mi.SurfaceInteraction3f)
+    si.n = mi.Normal3f(0.0, 0.0, 1.0)
+    si.sh_frame = mi.Frame3f(si.n)
+    sine, cosine = float(np.sin(polar)), float(np.cos(polar))
+    si.wi = si.to_local(mi.Vector3f(0.6 * sine, 0.8 * sine, cosine))
+    return si
+
+
+def check_sampling(name: str, bsdf: GltfBSDF, si: mi.SurfaceInteraction3f) -> None:
+    """Sample a material with the density that it states."""
+
+    def draw(u: mi.Vector3f) -> tuple[mi.Vector3f, mi.Float]:
+        bs, weight = bsdf.sample(mi.BSDFContext(), si, u.x, mi.Point2f(u.y, u.z))
+        return si.to_world(bs.wo), dr.select(dr.max(weight) > 0.0, mi.Float(1.0), 0.0)
+
+    def density(d: mi.Vector3f) -> mi.Float:
+        return bsdf.pdf(mi.BSDFContext(), si, si.to_local(d))
+
+    chi2(name, draw, density, 3)
+
+
+def energy_by_sampler(
+    bsdf: GltfBSDF, si: mi.SurfaceInteraction3f, u: FloatArray
+) -> tuple[float, float]:
+    """Return mean and standard deviation of the red weights for numbers, shape [3, n]."""
+    _, weight = bsdf.sample(mi.BSDFContext(), si, mi.Float(u[0]), mi.Point2f(u[1:]))
+    red = np.asarray(weight)[0].astype(np.float64)
+    return float(red.mean()), float(red.std())
+
+
+def energy_by_uniform(
+    bsdf: GltfBSDF, si: mi.SurfaceInteraction3f, u: FloatArray
+) -> tuple[float, float]:
+    """Return the same by uniform directions for numbers, shape [2, n]."""
+    d = mi.warp.square_to_uniform_hemisphere(mi.Point2f(u))
+    f_cos = np.asarray(bsdf.eval(mi.BSDFContext(), si, si.to_local(d)))[0].astype(np.float64)
+    return float(2.0 * np.pi * f_cos.mean()), float(2.0 * np.pi * f_cos.std())
+
+
+def check_material(rng: np.random.Generator) -> None:
+    """Sample the material with its density, mapped normals included; its energy."""
+    count = 4_000_000
     for roughness, metallic, mapped in (
         (0.15, 0.0, False),
         (0.5, 0.0, True),
         (0.8, 0.7, True),
         (0.3, 1.0, False),
     ):
-        material = Material(
-            base_color=(0.8, 0.5, 0.2),
-            metallic=metallic,
-            roughness=roughness,
-            normal_texture=TextureSlot(0) if mapped else None,
+        bsdf = on_triangle(
+            Material(
+                base_color=(0.8, 0.5, 0.2),
+                metallic=metallic,
+                roughness=roughness,
+                normal_texture=TextureSlot(0) if mapped else None,
+            )
         )
-        triangle = Primitive(corners, np.array([[0, 1, 2]], dtype=np.int32), 0, uv0=uv)
-        asset = Asset("triangle", (triangle,), (material,), (Texture(codes),))
-        bsdf = GltfBSDF(asset, triangle, np.eye(3))
         for polar in (0.2, 1.3):
-            si = dr.zeros(mi.SurfaceInteraction3f)
-            si.n = mi.Normal3f(0.0, 0.0, 1.0)
-            si.sh_frame = mi.Frame3f(si.n)
-            wo = mi.Vector3f(
-                float(np.sin(polar)) * 0.6, float(np.sin(polar)) * 0.8, float(np.cos(polar))
-            )
-            si.wi = si.to_local(wo)
-            context = mi.BSDFContext()
-
-            def draw(
-                u: mi.Vector3f, si: mi.SurfaceInteraction3f = si, bsdf: GltfBSDF = bsdf
-            ) -> tuple[mi.Vector3f, mi.Float]:
-                bs, weight = bsdf.sample(mi.BSDFContext(), si, u.x, mi.Point2f(u.y, u.z))
-                keep = dr.select(dr.max(weight) > 0.0, mi.Float(1.0), 0.0)
-                return si.to_world(bs.wo), keep
-
-            def density(
-                d: mi.Vector3f, si: mi.SurfaceInteraction3f = si, bsdf: GltfBSDF = bsdf
-            ) -> mi.Float:
-                return bsdf.pdf(mi.BSDFContext(), si, si.to_local(d))
-
-            chi2(
-                f"material: roughness {roughness}, metallic {metallic}, map {mapped}, "
-                f"polar {polar}",
-                draw,
-                density,
-                3,
-            )
-
-            # Its energy: by its own sampler, and in closed form or by uniform directions
-            u = rng.random((3, 4_000_000), dtype=np.float32)
-            _, weight = bsdf.sample(context, si, mi.Float(u[0]), mi.Point2f(u[1:]))
-            found = np.asarray(weight)[0].astype(np.float64)
-            error = found.std() / 2e3
+            name = f"roughness {roughness}, metallic {metallic}, map {mapped}, polar {polar}"
+            si = seen_from(polar)
+            check_sampling(f"material: {name}", bsdf, si)
+            found, spread = energy_by_sampler(bsdf, si, rng.random((3, count), dtype=np.float32))
+            # In closed form, or by uniform directions where there is none.
             expected = furnace.directional_albedo(np.cos(polar), roughness, 0.8, metallic)
             if mapped:
-                u = rng.random((2, 4_000_000), dtype=np.float32)
-                d = mi.warp.square_to_uniform_hemisphere(mi.Point2f(u))
-                f_cos = np.asarray(bsdf.eval(context, si, si.to_local(d)))[0]
-                expected = 2.0 * np.pi * f_cos.mean(dtype=np.float64)
-                error = np.hypot(error, np.pi * f_cos.std() / 1e3)
-            report("material: its energy by its sampler", found.mean(), expected, error + 1e-5)
+                u = rng.random((2, count), dtype=np.float32)
+                expected, other = energy_by_uniform(bsdf, si, u)
+                spread = float(np.hypot(spread, other))
+            error = spread / np.sqrt(count)
+            report("material: its energy by its sampler", found, expected, error + 1e-5)
 
 
 def check_layers(rng: np.random.Generator) -> None:
     """Sample coat, cloth and glass with their density; its energy by two ways of drawing."""
-    corners = np.array([[0.0, 0.0, 0.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])
-    uv = np.array([[0.0, 1.0], [1.0, 1.0], [0.0, 0.0]], dtype=np.float32)
-    codes = np.array([[[190, 60, 220, 255]]], dtype=np.uint8)
+    count = 1_000_000
     base = Material(base_color=(0.8, 0.5, 0.2), metallic=0.3, roughness=0.6)
+    coat = replace(base, clearcoat=0.9, clearcoat_roughness=0.3)
     for name, material in (
-        ("coat", replace(base, clearcoat=0.9, clearcoat_roughness=0.3)),
+        ("coat", replace(coat, clearcoat_normal_texture=TextureSlot(0))),
         ("cloth", replace(base, sheen_color=(0.9, 0.4, 0.2), sheen_roughness=0.5)),
         ("glass", replace(base, transmission=0.8, ior=1.7, specular_color=(1.0, 0.5, 2.0))),
     ):
-        if name == "coat":
-            material = replace(material, clearcoat_normal_texture=TextureSlot(0))
-        triangle = Primitive(corners, np.array([[0, 1, 2]], dtype=np.int32), 0, uv0=uv)
-        bsdf = GltfBSDF(
-            Asset("triangle", (triangle,), (material,), (Texture(codes),)), triangle, np.eye(3)
-        )
+        bsdf = on_triangle(material)
         for polar in (0.2, 1.3):
-            si = dr.zeros(mi.SurfaceInteraction3f)
-            si.n = mi.Normal3f(0.0, 0.0, 1.0)
-            si.sh_frame = mi.Frame3f(si.n)
-            sine, cosine = float(np.sin(polar)), float(np.cos(polar))
-            si.wi = si.to_local(mi.Vector3f(0.6 * sine, 0.8 * sine, cosine))
-
-            def draw(
-                u: mi.Vector3f, si: mi.SurfaceInteraction3f = si, bsdf: GltfBSDF = bsdf
-            ) -> tuple[mi.Vector3f, mi.Float]:
-                bs, weight = bsdf.sample(mi.BSDFContext(), si, u.x, mi.Point2f(u.y, u.z))
-                return si.to_world(bs.wo), dr.select(dr.max(weight) > 0.0, mi.Float(1.0), 0.0)
-
-            def density(
-                d: mi.Vector3f, si: mi.SurfaceInteraction3f = si, bsdf: GltfBSDF = bsdf
-            ) -> mi.Float:
-                return bsdf.pdf(mi.BSDFContext(), si, si.to_local(d))
-
-            chi2(f"layers: {name}, polar {polar}", draw, density, 3)
-            context = mi.BSDFContext()
-            u = rng.random((3, 1_000_000), dtype=np.float32)
-            _, weight = bsdf.sample(context, si, mi.Float(u[0]), mi.Point2f(u[1:]))
-            found = np.asarray(weight)[0].astype(np.float64)
-            d = mi.warp.square_to_uniform_hemisphere(mi.Point2f(u[:2]))
-            f_cos = np.asarray(bsdf.eval(context, si, si.to_local(d)))[0].astype(np.float64)
-            error = np.hypot(found.std(), 2.0 * np.pi * f_cos.std()) / 1e3
-            report(
-                f"layers: energy of {name} by its sampler",
-                found.mean(),
-                2.0 * np.pi * f_cos.mean(),
-                error + 1e-5,
-            )
+            si = seen_from(polar)
+            check_sampling(f"layers: {name}, polar {polar}", bsdf, si)
+            u = rng.random((3, count), dtype=np.float32)
+            found, spread = energy_by_sampler(bsdf, si, u)
+            expected, other = energy_by_uniform(bsdf, si, u[:2])
+            error = np.hypot(spread, other) / np.sqrt(count)
+            report(f"layers: energy of {name} by its sampler", found, expected, error + 1e-5)
 
 
 def check_textures(rng: np.random.Generator) -> None:

@@ -16,21 +16,15 @@ SEED_COUNT = 32
 """Independent runs behind each variance; quasi-random samples of one run are not independent."""
 
 
-class Foreground(NamedTuple):
-    """The object alone; the fields of `warpir.mitsuba.render.Foreground`."""
+class Estimate(NamedTuple):
+    """A picture of the object or of the shadow ratio; the fields of the referee's."""
 
     mean: Float64Array
+    """Radiance, relative [W/(m^2 sr)], or ratio, 1 where the plane is not seen; [H, W, 3]."""
     variance: Float64Array
+    """Variance of ``mean``, shape [H, W, 3]."""
     coverage: Float64Array
-
-
-class Ratio(NamedTuple):
-    """Shadow ratio of the plane, 1 where it is not seen, with the variance of the mean."""
-
-    mean: Float64Array
-    variance: Float64Array
-    coverage: Float64Array
-    """1 where the plane is seen, shape [H, W]."""
+    """Share of samples that see the object, or 1 where the plane is seen; shape [H, W]."""
 
 
 def renderer(asset: Asset, matrix: Float64Array, camera: Camera, device: str = "cpu") -> Renderer:
@@ -53,7 +47,7 @@ def foreground(
     spp: int,
     seed: int,
     device: str = "cpu",
-) -> Foreground:
+) -> Estimate:
     """Render the object alone; arguments are those of `warpir.mitsuba.render.foreground`."""
     render = renderer(asset, matrix, camera, device)
     light = light_args(Light(texels=texels), render.device)
@@ -70,7 +64,7 @@ def foreground(
         cover[pixels] = out.mask
         runs.append(image.reshape(camera.height, camera.width, 3))
         covers.append(cover.reshape(camera.height, camera.width))
-    return Foreground(*_moments(runs), np.mean(covers, axis=0))
+    return Estimate(*_moments(runs), np.mean(covers, axis=0))
 
 
 def shadow_ratio(
@@ -81,7 +75,7 @@ def shadow_ratio(
     spp: int,
     seed: int,
     device: str = "cpu",
-) -> Ratio:
+) -> Estimate:
     """Render the shadow ratio; each run is long, since the quotient is biased by 1 / samples."""
     render = renderer(asset, matrix, camera, device)
     light = light_args(Light(texels=texels), render.device)
@@ -97,14 +91,14 @@ def shadow_ratio(
     return quotient(np.stack(lit), np.stack(unoccluded), (camera.height, camera.width))
 
 
-def quotient(lit: Float64Array, unoccluded: Float64Array, size: tuple[int, int]) -> Ratio:
+def quotient(lit: Float64Array, unoccluded: Float64Array, size: tuple[int, int]) -> Estimate:
     """Divide the means of several runs, shape [run, pixel, 3]; variance by linearisation."""
     a, u = lit.mean(axis=0), unoccluded.mean(axis=0)
     seen = u > 0.0
     ratio = np.where(seen, a / np.where(seen, u, 1.0), 1.0)
     residual = (lit - ratio * unoccluded) / np.where(seen, u, 1.0)
     variance = np.where(seen, residual.var(axis=0, ddof=1) / len(lit), 0.0)
-    return Ratio(
+    return Estimate(
         ratio.reshape(*size, 3),
         variance.reshape(*size, 3),
         seen.any(-1).astype(float).reshape(size),

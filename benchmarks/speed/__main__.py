@@ -23,8 +23,9 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import warp as wp
 
-from benchmarks.measure import context
+from benchmarks.measure import context, flags
 from benchmarks.speed.candidates import (
     PARTS,
     Bench,
@@ -38,7 +39,7 @@ from benchmarks.speed.candidates import (
 from benchmarks.speed.ratios import combined, ratios
 from benchmarks.speed.references import References
 from benchmarks.speed.report import keep_run, summary, write_documents
-from benchmarks.speed.scenes import NAMES, make_scene
+from benchmarks.speed.scenes import NAMES, SpeedScene, make_scene
 from warpir.render.device import choose_device, default_threads
 
 RUN_SEED = 100
@@ -340,33 +341,11 @@ def disagreements(agreement: Sequence[dict[str, Any]], rows: Sequence[dict[str, 
     return found
 
 
-def command(options: argparse.Namespace) -> str:
-    """Return the command that measures the same again; where it writes does not matter."""
-    words = ["python -m benchmarks.speed"]
-    words += ["--quick"] if options.quick else []
-    words += ["--scenes", *options.scenes] if options.scenes != list(NAMES) else []
-    words += [f"--maps {' '.join(options.maps)}"] if options.maps else []
-    for name in ("device", "reference_spp", "own_reference_spp", "rounds", "budget"):
-        value = getattr(options, name)
-        words += [] if value is None else [f"--{name.replace('_', '-')} {value}"]
-    words += [f"--threads {options.threads}"] if options.threads else []
-    words += ["--no-freeze"] if options.no_freeze else []
-    words += [f"--sampler {options.sampler}"] if options.sampler != "ldsampler" else []
-    return " ".join(words)
-
-
-def main(arguments: list[str] | None = None) -> None:
-    """Measure, write the JSON and, after a full run, the documents."""
-    parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
+def parse(arguments: list[str] | None) -> argparse.Namespace:
+    """Return the options of a command line."""
+    parser = flags(__doc__)
     parser.add_argument("--quick", action="store_true", help="64 rows, short sweeps: two minutes")
     parser.add_argument("--scenes", nargs="*", default=list(NAMES), choices=NAMES)
-    parser.add_argument(
-        "--assets",
-        type=Path,
-        default=Path("../shared/data"),
-        help="folder that holds mesh/ and hdri/",
-    )
-    parser.add_argument("--device", default=None, help="cpu or cuda")
     parser.add_argument("--threads", type=int, default=0, help="CPU threads of every renderer")
     parser.add_argument("--sampler", default="ldsampler", help="of Mitsuba")
     parser.add_argument(
@@ -382,11 +361,14 @@ def main(arguments: list[str] | None = None) -> None:
     parser.add_argument("--rounds", type=int, default=None)
     parser.add_argument("--budget", type=float, default=None, help="seconds per candidate")
     parser.add_argument("--cache", type=Path, default=Path("out/speed"), help="of references")
-    parser.add_argument("--json", type=Path, default=None, help="write rows and ratios here")
     parser.add_argument(
         "--docs", type=Path, default=None, help="write table and plot here (docs, unless --quick)"
     )
-    options = parser.parse_args(arguments)
+    return parser.parse_args(arguments)
+
+
+def plan_of(options: argparse.Namespace) -> Plan:
+    """Return the plan with what the options change in it."""
     plan = QUICK if options.quick else FULL
     plan = replace(
         plan,
@@ -398,40 +380,34 @@ def main(arguments: list[str] | None = None) -> None:
     if options.maps:
         pairs = [tuple(int(h) for h in pair.split(":")) for pair in options.maps]
         plan = replace(plan, maps=tuple((pair[0], pair[-1]) for pair in pairs))
-    device = choose_device(options.device)
-    threads = options.threads or default_threads()
-    use_device("cpu" if device == "cpu" else "cuda", threads)
+    return plan
 
-    import drjit as dr
-    import mitsuba as mi
 
-    rows: list[dict[str, Any]] = []
-    agreement: list[dict[str, Any]] = []
-    scenes: list[dict[str, Any]] = []
-    reasons: list[str] = []
-    for name in options.scenes:
-        try:
-            scene = make_scene(name, plan.width, plan.height, options.assets, device, threads)
-        except FileNotFoundError as error:
-            reasons.append(f"{name}: {error} (--assets)")
-            log(f"skipped {reasons[-1]}")
-            continue
+@dataclass
+class Found:
+    """What was measured of all scenes."""
+
+    rows: list[dict[str, Any]] = field(default_factory=list)
+    agreement: list[dict[str, Any]] = field(default_factory=list)
+    scenes: list[dict[str, Any]] = field(default_factory=list)
+    reasons: list[str] = field(default_factory=list)
+    """Why something was left out."""
+
+    def add(self, scene: SpeedScene, plan: Plan, options: argparse.Namespace) -> None:
+        """Measure a scene."""
+        import drjit as dr
+
         bench = Bench(scene, plan.maps, options.sampler, not options.no_freeze)
-        references = References(
-            bench,
-            plan.reference_spp,
-            plan.own_reference_spp,
-            options.cache,
-            log,
-        )
-        rows += measure_scene(bench, plan, references, reasons)
-        agreement += [
-            {"scene": name, "part": part, "height": height, **reference.agreement()}
+        spp = plan.reference_spp, plan.own_reference_spp
+        references = References(bench, *spp, options.cache, log)
+        self.rows += measure_scene(bench, plan, references, self.reasons)
+        self.agreement += [
+            {"scene": scene.name, "part": part, "height": height, **reference.agreement()}
             for (part, height), reference in references.by_map.items()
         ]
-        scenes.append(
+        self.scenes.append(
             {
-                "name": name,
+                "name": scene.name,
                 "triangles": scene.triangles,
                 "depth": scene.depth,
                 "object_pixels": len(scene.object_pixels),
@@ -441,9 +417,44 @@ def main(arguments: list[str] | None = None) -> None:
         del bench, references
         gc.collect()
         dr.flush_malloc_cache()
-    wp_device = scene.renderer.device
+
+    def result(self, conditions: dict[str, Any]) -> dict[str, Any]:
+        """Return the record of the run."""
+        for row in self.rows:
+            row["device"] = conditions["device"]
+        return {
+            "conditions": conditions,
+            "scenes": self.scenes,
+            "skipped": self.reasons,
+            "ratios": ratios(self.rows),
+            "references": self.agreement,
+            "disagreements": disagreements(self.agreement, self.rows),
+            "rows": self.rows,
+        }
+
+
+def main(arguments: list[str] | None = None) -> None:
+    """Measure, write the JSON and, after a full run, the documents."""
+    options = parse(arguments)
+    plan = plan_of(options)
+    device = choose_device(options.device)
+    threads = options.threads or default_threads()
+    use_device("cpu" if device == "cpu" else "cuda", threads)
+
+    import drjit as dr
+    import mitsuba as mi
+
+    found = Found()
+    for name in options.scenes:
+        try:
+            scene = make_scene(name, plan.width, plan.height, options.assets, device, threads)
+        except FileNotFoundError as error:
+            found.reasons.append(f"{name}: {error} (--assets)")
+            log(f"skipped {found.reasons[-1]}")
+            continue
+        found.add(scene, plan, options)
     conditions = {
-        **context(wp_device, threads),
+        **context(wp.get_device(device), threads),
         "mitsuba": mi.__version__,
         "drjit": dr.__version__,
         "variant": mi.variant(),
@@ -453,17 +464,7 @@ def main(arguments: list[str] | None = None) -> None:
         "command": "python -m benchmarks.speed " + " ".join(arguments or sys.argv[1:]),
         "seconds": round(time.perf_counter() - STARTED, 1),
     }
-    for row in rows:
-        row["device"] = conditions["device"]
-    result = {
-        "conditions": conditions,
-        "scenes": scenes,
-        "skipped": reasons,
-        "ratios": ratios(rows),
-        "references": agreement,
-        "disagreements": disagreements(agreement, rows),
-        "rows": rows,
-    }
+    result = found.result(conditions)
     if options.json is not None:
         options.json.write_text(json.dumps(result, indent=1) + "\n", encoding="utf-8")
     print(summary(result))

@@ -1,0 +1,76 @@
+"""What is looked at in checks: a sphere, a square, a camera and a light."""
+
+import numpy as np
+
+from warpir.core.arrays import FloatArray
+from warpir.scene.asset import Asset, Material, Primitive, Texture
+from warpir.scene.camera import Camera
+
+
+def ball(rings: int = 64) -> Primitive:
+    """Return the unit sphere about the origin, poles on the Y axis, shading normals exact."""
+    polar = np.linspace(0.0, np.pi, rings + 1)
+    azimuth = np.linspace(0.0, 2.0 * np.pi, 2 * rings + 1)
+    theta, phi = np.meshgrid(polar, azimuth, indexing="ij")
+    positions = np.stack(
+        [np.sin(theta) * np.sin(phi), np.cos(theta), np.sin(theta) * np.cos(phi)], axis=-1
+    ).reshape(-1, 3)
+    uv = np.stack([phi / (2.0 * np.pi), theta / np.pi], axis=-1).reshape(-1, 2)
+    i, j = np.meshgrid(np.arange(rings), np.arange(2 * rings), indexing="ij")
+    a = (i * (2 * rings + 1) + j).ravel()
+    b, c, d = a + 1, a + 2 * rings + 1, a + 2 * rings + 2
+    upper = np.stack([a, c, b], axis=1)[i.ravel() > 0]
+    lower = np.stack([b, c, d], axis=1)[i.ravel() < rings - 1]
+    return Primitive(
+        positions,
+        np.concatenate([upper, lower]).astype(np.int32),
+        0,
+        normals=positions.astype(np.float32),
+        uv0=uv.astype(np.float32),
+    )
+
+
+def sphere(material: Material, textures: tuple[Texture, ...] = (), rings: int = 64) -> Asset:
+    """Return the unit sphere in one material."""
+    return Asset("sphere", (ball(rings),), (material,), textures)
+
+
+def square(material: Material, side: float, height: float, up: bool = False) -> Asset:
+    """Square in the plane y = ``height`` (or standing in z = 0), facing +Y (or +Z)."""
+    h = 0.5 * side
+    corners = np.array([[-h, -h], [h, -h], [h, h], [-h, h]])
+    if up:
+        positions = np.column_stack([corners[:, 0], corners[:, 1] + height, np.zeros(4)])
+    else:
+        positions = np.column_stack([corners[:, 0], np.full(4, height), -corners[:, 1]])
+    uv = np.array([[0.0, 1.0], [1.0, 1.0], [1.0, 0.0], [0.0, 0.0]], dtype=np.float32)
+    primitive = Primitive(positions, np.array([[0, 1, 2], [0, 2, 3]], dtype=np.int32), 0, uv0=uv)
+    return Asset("square", (primitive,), (material,))
+
+
+def view(
+    distance: float,
+    width: int = 32,
+    height: int = 32,
+    fov: float = 25.0,
+    lift: float = 0.0,
+    turn: float = 0.0,
+) -> Camera:
+    """Camera at ``(0, lift, distance)`` turned about +Y to look from another side, along -Z."""
+    focal = 0.5 * width / np.tan(np.radians(0.5 * fov))
+    angle = np.radians(turn)
+    c2w = np.eye(4)
+    c2w[:3, :3] = [
+        [np.cos(angle), 0.0, np.sin(angle)],
+        [0.0, 1.0, 0.0],
+        [-np.sin(angle), 0.0, np.cos(angle)],
+    ]
+    c2w[:3, 3] = c2w[:3, :3] @ [0.0, lift, distance]
+    return Camera(width, height, focal, focal, 0.5 * width, 0.5 * height, c2w)
+
+
+def sun_and_sky(rng: np.random.Generator, rows: int = 32) -> FloatArray:
+    """Noisy coloured sky with one texel 2000 times brighter, shape [rows, 2 rows, 3]."""
+    texels = rng.exponential(size=(rows, 2 * rows, 3))
+    texels[rows // 4, rows // 2] *= 2000.0
+    return texels.astype(np.float32)
