@@ -69,14 +69,14 @@ def measure(place: Place, subject: Subject, samples: int) -> dict[str, dict[str,
     renderer = Renderer(Scene([placed], place.camera, receiver, "cpu"), 0)
     light, curves = Light(texels=place.texels), Curves.identity("linear")
 
-    def insert(photo: Photo, look: CameraLook | None, seed: int) -> Picture:
+    def insert(photo: Photo, look: CameraLook, seed: int) -> Picture:
         quality = Quality(samples, 1, 5, seed, 8.0)
         return make_picture(
             renderer, light, light, photo, quality, curves.foreground, curves.shadow_ratio,
             is_reinhard=False, look=look,
         )  # fmt: skip
 
-    clean = insert(photo_of(place.photo), None, 1)
+    clean = insert(photo_of(place.photo), CameraLook(), 1)
     truth = shoot(clean.layers.composite, blur, grain, noise)
     photo = photo_of(shoot(place.photo_lin, blur, grain, noise))
     regions = make_regions(clean.layers.matte, clean.layers.shadow_ratio)

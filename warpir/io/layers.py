@@ -153,18 +153,17 @@ def write_layers(
     if not np.allclose(layers.composite, recomputed, rtol=2e-3, atol=2e-3, equal_nan=True):
         worst = float(np.nanmax(np.abs(layers.composite - recomputed)))
         raise ValueError(f"composite differs from its layers by up to {worst:g}")
-
     channels, clamped = _stored_channels(layers, height, width, is_deep)
     channels["A"] = np.ones((height, width), np.float16)
 
-    world_to_camera, world_to_ndc = exr_matrices(camera)
+    world_to_camera, world_to_ndc = (m.astype(np.float32) for m in exr_matrices(camera))
     folder.write_exr(
         "layers.exr",
         channels,
         {
             **color_header(),
-            "worldToCamera": world_to_camera.astype(np.float32),
-            "worldToNDC": world_to_ndc.astype(np.float32),
+            "worldToCamera": world_to_camera,
+            "worldToNDC": world_to_ndc,
             "warpir/formula": formula,
             "warpir/config": json.dumps(config or {}, sort_keys=True, default=str),
             "warpir/inputs": json.dumps(inputs or {}, sort_keys=True),

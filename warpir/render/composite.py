@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -46,6 +46,10 @@ class Quality:
     """Clamp on a path's indirect radiance; 0 for none, which is unbiased."""
 
 
+UNCHANGED = CameraLook()
+"""Look of a camera that neither blurs nor has noise."""
+
+
 @dataclass(frozen=True)
 class Picture:
     """A finished composite and its layers, at the photo's resolution."""
@@ -59,7 +63,7 @@ class Picture:
     """Pixels whose object was traced, at the rendering resolution."""
     receiver_pixel_count: int
     """Pixels whose shadow was traced, at the rendering resolution."""
-    look: CameraLook = field(default_factory=CameraLook)
+    look: CameraLook = UNCHANGED
     """What the camera did to the photo, repeated on object and shadow."""
 
 
@@ -75,7 +79,7 @@ def make_picture(
     *,
     occluder: FloatArray | None = None,
     shadow_mask: ShadowMask | None = None,
-    look: CameraLook | None = None,
+    look: CameraLook = UNCHANGED,
 ) -> Picture:
     """Render object and shadow at the scene camera's resolution and put them into the photo.
 
@@ -112,24 +116,15 @@ def make_picture(
     planes = _planes(renderer.scene.camera, gbuffer, foreground, fg, (receiver_pixels, beta))
     if planes["matte"].shape != photo.srgb.shape[:2]:
         planes = _resize_planes(planes, *photo.srgb.shape[:2])
-    if look is not None:
-        planes = look.sharpened_like_photo(
-            planes, photo.srgb.shape[1] / renderer.scene.camera.width
-        )
+    planes = look.sharpened_like_photo(planes, photo.srgb.shape[1] / renderer.scene.camera.width)
     if occluder is not None:
         planes = _behind(planes, occluder)
     layers = _layers(planes, photo)
     changed = (layers.matte > 0.0) | (layers.shadow_ratio != 1.0).any(axis=-1)
-    if look is not None:
-        layers = _with_grain(layers, look, changed, quality.seed, photo.is_deep)
-    return Picture(
-        layers,
-        linear_to_gamma(layers.composite).astype(np.float32),
-        changed,
-        len(gbuffer.object_pixels),
-        len(receiver_pixels),
-        look or CameraLook(),
-    )
+    layers = _with_grain(layers, look, changed, quality.seed, photo.is_deep)
+    image = linear_to_gamma(layers.composite).astype(np.float32)
+    counts = len(gbuffer.object_pixels), len(receiver_pixels)
+    return Picture(layers, image, changed, *counts, look)
 
 
 def _shadow(

@@ -19,6 +19,7 @@ from warpir.io.results import OutputFolder
 from warpir.lighting.scene_light import SceneLight
 from warpir.look.camera_look import CameraLook, estimate_look, region_around
 from warpir.render.composite import (
+    UNCHANGED,
     Picture,
     Quality,
     as_file_map,
@@ -105,7 +106,7 @@ def _picture(
     renderer: Renderer,
     samples: int,
     rays: int,
-    look: CameraLook | None = None,
+    look: CameraLook = UNCHANGED,
 ) -> Picture:
     inputs, quality = run.inputs, run.config.render
     return make_picture(

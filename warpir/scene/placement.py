@@ -85,7 +85,6 @@ def place_asset(
     plane = upright_plane(ground, origin)
     if ground is None:
         assumed.append("the ground is the plane y = 0")
-
     if place is not None:
         stand = np.asarray(place, dtype=np.float64)
         if is_plane:
