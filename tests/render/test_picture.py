@@ -11,6 +11,9 @@ from tests.builders.shapes import box, camera, constant, ground, lobe, placed, q
 from tests.oracles import composite, encode, luminance, reinhard, spline
 from warpir.core.arrays import CodeArray, Int64Array
 from warpir.io.images.photos import Photo
+from warpir.look.camera_look import CameraLook
+from warpir.look.grain import Grain
+from warpir.look.sharpness import EdgeBlur
 from warpir.render.bridge import ComposeConstants, compose
 from warpir.render.composite import Picture, Quality, as_file_map, balls, make_picture, resize
 from warpir.render.device_light import light_args
@@ -222,6 +225,28 @@ def test_geometry_layers_describe_the_surface(device: str) -> None:
     np.testing.assert_allclose(layers.roughness[ball], 0.3, rtol=1e-6)
 
 
+def test_blur_and_grain_recompose(device: str) -> None:
+    """The layers add up with a camera's look too, and what did not change keeps its codes."""
+    light, knots = sunny(), (ToneKnots.identity(1), ToneKnots.identity(3))
+    look = CameraLook(EdgeBlur(1.0, 0), Grain((0.5,), ((0.02,) * 3,), 0.5, 0.3))
+    plain = make_picture(renderer(device), light, light, photo(), QUALITY, *knots)
+    final = make_picture(renderer(device), light, light, photo(), QUALITY, *knots, look=look)
+    layers = final.layers
+    assert layers.grain is not None and np.abs(layers.grain).max() > 0.01
+    added = layers.foreground[..., :3] + layers.grain
+    left = (1.0 - layers.matte)[..., None] * layers.plate * layers.shadow_ratio
+    np.testing.assert_allclose(layers.composite, added + left, atol=1e-6)
+    parts = layers.diffuse + layers.specular + layers.emission
+    np.testing.assert_allclose(parts, layers.foreground[..., :3], atol=1e-4)
+    codes = photo().encode(final.image, final.changed)
+    np.testing.assert_array_equal(codes[~final.changed], photo().codes[~final.changed])
+    # The outline is softer, and no coverage is lost.
+    assert layers.matte.sum() == pytest.approx(plain.layers.matte.sum(), rel=0.01)
+    assert (layers.matte == 1.0).sum() < (plain.layers.matte == 1.0).sum()
+    again = make_picture(renderer(device), light, light, photo(), QUALITY, *knots, look=look)
+    np.testing.assert_array_equal(again.image, final.image)
+
+
 @pytest.mark.parametrize("size", [(24, 16), (96, 64), (31, 21)], ids=["half", "double", "odd"])
 def test_another_rendering_size_gives_the_photos_size(device: str, size: tuple[int, int]) -> None:
     """--width changes the sampling, not the picture's size, nor where the object is."""
@@ -229,6 +254,9 @@ def test_another_rendering_size_gives_the_photos_size(device: str, size: tuple[i
     other = picture(device, view=VIEW.scaled(*size))
     for field in fields(other.layers):
         plane = getattr(other.layers, field.name)
+        if field.name == "grain":
+            assert plane is None, "this picture's camera has none"
+            continue
         assert plane.shape == getattr(full.layers, field.name).shape, field.name
         assert not np.isnan(plane).any(), field.name
     np.testing.assert_array_equal(other.layers.plate, full.layers.plate)
