@@ -26,7 +26,7 @@ from warpir.io.images.writers import png_bytes
 from warpir.io.results import OutputFolder
 from warpir.lighting.exposure import ask_ground
 from warpir.lighting.fit import fit_lobes
-from warpir.lighting.regression import mean_training_light, regress
+from warpir.lighting.regression import Regression, mean_training_light, regress
 from warpir.lighting.regressor import Regressor
 from warpir.lighting.scene_light import make_light
 from warpir.lighting.visible_sun import with_visible_sun
@@ -124,8 +124,7 @@ def mean_training(bench: Bench, place: Place) -> Prediction:
 
 def regression(network: Regressor, place: Place) -> Prediction:
     """Return the light that a regressor estimates, with the sun where the photograph shows it."""
-    estimate = regress(network, place.photo, place.camera)
-    estimate = with_visible_sun(estimate, place.photo, place.camera)
+    estimate = _estimate(network, place)
     return Prediction.of(
         Light(lobes=estimate.lobes()),
         spread_deg=estimate.spread_deg,
@@ -136,11 +135,17 @@ def regression(network: Regressor, place: Place) -> Prediction:
 def regression_on_ground(bench: Bench, stage: Stage, subject: Subject) -> Prediction:
     """Return what the regressor sees, its level weighed against the ground's."""
     place = subject.place
-    found = regress(bench.network, place.photo, place.camera)
+    estimate = _estimate(bench.network, place)
     photo = Photo(np.round(255.0 * place.photo).astype(np.uint8), place.photo, "png")
-    ground = ask_ground(found, Inputs(photo, subject.asset, place.camera, subject.placement))
+    ground = ask_ground(estimate, Inputs(photo, subject.asset, place.camera, subject.placement))
     gain = 1.0 if ground is None else 2.0**ground.weighed
-    return Prediction.of(Light(lobes=found.lobes()).scaled(gain), spread_deg=found.spread_deg)
+    light = Light(lobes=estimate.lobes()).scaled(gain)
+    return Prediction.of(light, spread_deg=estimate.spread_deg)
+
+
+def _estimate(network: Regressor, place: Place) -> Regression:
+    estimate = regress(network, place.photo, place.camera)
+    return with_visible_sun(estimate, place.photo, place.camera)
 
 
 def other_photo(bench: Bench, place: Place) -> Prediction:
