@@ -15,6 +15,7 @@ from benchmarks.speed import __main__ as bench
 from benchmarks.speed import ratios as r
 from benchmarks.speed import report
 from benchmarks.speed.references import Reference, quiet
+from tests.builders.llvm import LIBRARY, llvm
 
 HALF = -0.5
 """Exponent of error over time of plain Monte Carlo."""
@@ -263,6 +264,7 @@ def test_number(value: float | None, text: str) -> None:
 @pytest.mark.skipif(
     importlib.util.find_spec("mitsuba") is None, reason="Mitsuba is not installed (bench extra)"
 )
+@pytest.mark.skipif(llvm() is None, reason=f"no LLVM for Mitsuba: name it in {LIBRARY}")
 def test_a_quick_run_holds_what_it_promises(tmp_path: Path) -> None:
     """In a process of its own: a process has one Mitsuba variant."""
     path = tmp_path / "run.json"

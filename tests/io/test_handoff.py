@@ -20,6 +20,7 @@ from PIL.PngImagePlugin import PngInfo
 from tests import oracles
 from tests.builders.gltf_files import Builder
 from tests.builders.insertions import ALWAYS, arguments, go, read_image, write_inputs
+from tests.builders.llvm import LIBRARY, llvm
 from tests.io.test_envmap_conventions import radiance, read, threejs
 from warpir.app.config import InsertConfig
 from warpir.app.inputs import Inputs, read_inputs
@@ -55,7 +56,6 @@ AROUND = np.array(
 )
 """Unit directions along the axes, up, down and to the sun. At a pole itself all longitudes meet,
 and within half a texel of it Cycles mixes in the other pole's row."""
-LIBRARY = "DRJIT_LIBLLVM_PATH"
 
 
 @pytest.fixture(scope="module")
@@ -455,12 +455,6 @@ def test_blender_shows_the_same_insertion(folder: Path, tmp_path: Path) -> None:
 
 
 # ------------------------------------------------------------------------------------ Mitsuba
-
-
-def llvm() -> str | None:
-    """A library of LLVM that Mitsuba can use; 15 and older abort."""
-    found = sorted(Path("/usr/lib").glob("*/libLLVM.so.2?.*"))
-    return os.environ.get(LIBRARY) or (str(found[-1]) if found else None)
 
 
 MITSUBA = importlib.util.find_spec("mitsuba") is not None

@@ -168,8 +168,11 @@ def _size(rest: Float64Array) -> float:
 
 def _correlation(rest: Float64Array) -> float:
     flat = rest.reshape(-1, 3)
-    matrix = np.atleast_2d(np.corrcoef(flat.T))
-    return float(np.clip(np.nan_to_num(matrix[np.triu_indices(3, 1)].mean()), 0.0, 1.0))
+    covariance = flat.T @ flat / len(flat)
+    deviation = np.sqrt(np.diag(covariance))
+    # An even channel varies with no other.
+    matrix = covariance / np.maximum(np.outer(deviation, deviation), 1e-12)
+    return float(np.clip(matrix[np.triu_indices(3, 1)].mean(), 0.0, 1.0))
 
 
 def grain_over(
