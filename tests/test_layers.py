@@ -16,7 +16,7 @@ DIRECTION = (
     {"look"},
     {"app"},
     {"demo"},
-    {"render"},
+    {"render", "calibration"},
     {"lighting"},
     {"optimize", "report"},
     {"sequence", "place", "mitsuba", "train"},
@@ -33,7 +33,16 @@ PLAIN = {"settings", "prompts", "model_error", "model_folder", "hub", "weight_fi
 """Modules of `warpir.diffusion` for every room: words, settings and files; torch is not loaded."""
 PACKAGES = {
     "warp": {"kernels", *KERNELS_IN},
-    "torch": {"diffusion", "render", "lighting", "optimize", "train", "evaluate", "insert"},
+    "torch": {
+        "diffusion",
+        "calibration",
+        "render",
+        "lighting",
+        "optimize",
+        "train",
+        "evaluate",
+        "insert",
+    },
     "diffusers": {"diffusion"},
     "transformers": {"diffusion"},
     "peft": {"diffusion"},

@@ -26,6 +26,7 @@ PRIOR_KEY = "warpir_prior"
 """Where a file's header describes the embedded prior that it holds."""
 PRIOR_FORMAT = 2
 REGRESSOR_FORMAT = "warpir-regressor-1"
+CALIBRATOR_FORMAT = "warpir-calibrator-1"
 Sizes = Mapping[str, tuple[int, int, type, float, float]]
 PRIOR_SIZES: Sizes = {
     "widths": (1, 8, int, 1, 4096),
@@ -47,6 +48,8 @@ REGRESSOR_SIZES: Sizes = {
     "skipped": (1, 1, float, 0, 0.99),
 }
 """The same of a `warpir.lighting.regressor.RegressorConfig`."""
+CALIBRATOR_SIZES: Sizes = {k: v for k, v in REGRESSOR_SIZES.items() if k != "directions"}
+"""The same of a `warpir.calibration.network.CalibratorConfig`."""
 
 EXPONENTS = {
     "F16": ("<u2", 0x7C00),
@@ -180,24 +183,8 @@ def check_regressor(path: Path | None) -> WeightFile:
     Raises:
         ModelError: Not there, damaged, or something else.
     """
-    shipped = SHIPPED / "regressor.safetensors"
-    file = read_header(path or shipped)
+    file = _check_photo_network(path, "regressor", REGRESSOR_FORMAT, REGRESSOR_SIZES)
     where = str(file.path)
-    if file.about.get("format") != REGRESSOR_FORMAT:
-        found = str(file.about.get("format"))[:40]
-        what = f"no weights of the light regressor (found {found!r})"
-        raise ModelError(where, what, f"expected {REGRESSOR_FORMAT!r}")
-    config = _object(where, file.about.get("config", ""))
-    _object(where, file.about.get("record", ""))
-    _check_sizes(where, config, REGRESSOR_SIZES)
-    if any(width % 8 for width in config["channels"]) or config["channels"][2] % config["heads"]:
-        what = f"network: channels {config['channels']} of {config['heads']} heads"
-        raise ModelError(where, f"{what} (expected multiples of 8, the last of the heads too)")
-    if path is not None and shipped.is_file():
-        ours = read_header(shipped)
-        if _object(str(shipped), ours.about["config"]) == config:
-            _check_shapes(file, ours)
-    _check_written(file, file.about.get("weights"), file.about["config"])
     temperature, directions = (_value(file, name) for name in ("temperature", "directions"))
     if temperature is None or temperature.shape != () or not temperature > 0.0:
         raise ModelError(where, "temperature: not a number above 0")
@@ -207,6 +194,59 @@ def check_regressor(path: Path | None) -> WeightFile:
         or not np.allclose(np.linalg.norm(directions, axis=1), 1.0, atol=1e-3)
     ):
         raise ModelError(where, "directions: not of length 1")
+    return file
+
+
+def check_calibrator(path: Path | None) -> WeightFile:
+    """Check the weights of the network that estimates cameras.
+
+    Args:
+        path: The file; None: the one that is part of the package.
+
+    Returns:
+        Its header; ``config`` in it is a JSON object whose numbers are within their ranges.
+
+    Raises:
+        ModelError: Not there, damaged, or something else.
+    """
+    file = _check_photo_network(path, "calibrator", CALIBRATOR_FORMAT, CALIBRATOR_SIZES)
+    spread = _value(file, "spread")
+    if spread is None or spread.ndim != 1 or not (spread > 0.0).all():
+        raise ModelError(str(file.path), "spread: not numbers above 0")
+    return file
+
+
+def _check_photo_network(path: Path | None, name: str, format_: str, sizes: Sizes) -> WeightFile:
+    """Check the header and the values of one of our networks that see a photo.
+
+    Args:
+        path: The file; None: the one that is part of the package.
+        name: Of that one, without its suffix.
+        format_: What the header's ``format`` must be.
+        sizes: What its ``config`` may hold.
+
+    Raises:
+        ModelError: Not there, damaged, or something else.
+    """
+    shipped = SHIPPED / f"{name}.safetensors"
+    file = read_header(path or shipped)
+    where = str(file.path)
+    if file.about.get("format") != format_:
+        found = str(file.about.get("format"))[:40]
+        label = {"regressor": "light regressor", "calibrator": "camera network"}[name]
+        what = f"no weights of the {label} (found {found!r})"
+        raise ModelError(where, what, f"expected {format_!r}")
+    config = _object(where, file.about.get("config", ""))
+    _object(where, file.about.get("record", ""))
+    _check_sizes(where, config, sizes)
+    if any(width % 8 for width in config["channels"]) or config["channels"][2] % config["heads"]:
+        what = f"network: channels {config['channels']} of {config['heads']} heads"
+        raise ModelError(where, f"{what} (expected multiples of 8, the last of the heads too)")
+    if path is not None and shipped.is_file():
+        ours = read_header(shipped)
+        if _object(str(shipped), ours.about["config"]) == config:
+            _check_shapes(file, ours)
+    _check_written(file, file.about.get("weights"), file.about["config"])
     return file
 
 

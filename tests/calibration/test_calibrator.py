@@ -1,0 +1,135 @@
+"""The network that estimates cameras: its file, its symmetry, and photos of every shape."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from warpir.calibration.estimate import estimate_camera
+from warpir.calibration.network import (
+    HEIGHT,
+    NUMBERS,
+    WIDTH,
+    CalibratorConfig,
+    load_calibrator,
+    random_calibrator,
+    save_calibrator,
+    seen,
+    soften,
+)
+from warpir.core.errors import ExitCode, InputError
+from warpir.scene.camera import camera_from_fov
+
+SMALL = CalibratorConfig(channels=(8, 8, 16), blocks=(1, 1), depth=1, heads=2)
+
+
+def test_file_gives_the_same_network_back(tmp_path: Path) -> None:
+    network = random_calibrator(0, SMALL)
+    path = tmp_path / "calibrator.safetensors"
+    save_calibrator(network, path, {"seed": 3})
+    found = load_calibrator(path)
+    assert found.record == {"seed": 3}
+    photo = np.random.default_rng(0).random((60, 90, 3)).astype(np.float32)
+    first, second = (estimate_camera(photo, n) for n in (network, found))
+    assert second.pitch_deg == pytest.approx(first.pitch_deg, abs=0.1)
+    assert second.vfov_deg == pytest.approx(first.vfov_deg, abs=0.1)
+
+
+def test_damaged_file_is_refused(tmp_path: Path) -> None:
+    path = tmp_path / "calibrator.safetensors"
+    save_calibrator(random_calibrator(0, SMALL), path, {})
+    content = bytearray(path.read_bytes())
+    content[-7] ^= 1
+    path.write_bytes(content)
+    with pytest.raises(InputError, match="damaged") as caught:
+        load_calibrator(path)
+    assert caught.value.code == ExitCode.MODEL
+    with pytest.raises(InputError, match="no such file"):
+        load_calibrator(tmp_path / "none.safetensors")
+
+
+def test_mirrored_photo_gives_the_mirrored_camera() -> None:
+    network = random_calibrator(1, SMALL)
+    with torch.no_grad():
+        for answer in network.numbers.values():
+            answer[-1].weight.mul_(100.0)  # a random network's distributions are nearly even
+    photo = np.random.default_rng(1).random((96, 144, 3)).astype(np.float32)
+    plain = estimate_camera(photo, network)
+    mirrored = estimate_camera(photo[:, ::-1].copy(), network)
+    assert abs(plain.roll_deg) > 0.1
+    assert mirrored.pitch_deg == pytest.approx(plain.pitch_deg, abs=1e-2)
+    assert mirrored.roll_deg == pytest.approx(-plain.roll_deg, abs=1e-2)
+    assert mirrored.principal[0] == pytest.approx(1.0 - plain.principal[0], abs=1e-3)
+    assert mirrored.principal[1] == pytest.approx(plain.principal[1], abs=1e-3)
+
+
+@pytest.mark.parametrize("shape", [(1, 1), (1, 700), (700, 1), (130, 190), (2000, 1500)])
+def test_photo_of_any_shape_has_an_answer(shape: tuple[int, int]) -> None:
+    photo = np.full((*shape, 3), 0.5, np.float32)
+    estimate = estimate_camera(photo, random_calibrator(2, SMALL))
+    values = (estimate.pitch_deg, estimate.roll_deg, estimate.vfov_deg, *estimate.principal)
+    assert np.isfinite(values).all()
+    assert estimate.pitch_sigma_deg > 20.0  # an untrained network knows nothing
+
+
+def test_photo_without_pixels_is_refused() -> None:
+    with pytest.raises(InputError, match="no pixels"):
+        estimate_camera(np.zeros((0, 4, 3), np.float32), random_calibrator(0, SMALL))
+
+
+def test_known_field_of_view_is_kept() -> None:
+    photo = np.full((20, 30, 3), 0.5, np.float32)
+    estimate = estimate_camera(photo, random_calibrator(0, SMALL), vfov_deg=41.0)
+    assert (estimate.vfov_deg, estimate.vfov_sigma_deg) == (41.0, 0.0)
+
+
+def test_seen_photo_keeps_its_mean_and_its_ramp() -> None:
+    ramp = torch.linspace(0.0, 1.0, 900)[None, None, None].expand(1, 3, 600, 900)
+    small = seen(ramp)
+    assert small.shape == (1, 3, HEIGHT, WIDTH)
+    centres = (torch.arange(WIDTH) + 0.5) / WIDTH
+    assert small[0, 1, 7, 8:-8] == pytest.approx(centres[8:-8], abs=2e-3)
+
+
+def test_soften_has_the_asked_standard_deviation() -> None:
+    point = torch.zeros(2, 1, 41, 41)
+    point[:, :, 20, 20] = 1.0
+    blurred = soften(point, torch.tensor([[1.5, 3.0], [0.0, 2.0]]))
+    offsets = torch.arange(41.0) - 20.0
+    for picture, (down, across) in zip(blurred[:, 0], [(1.5, 3.0), (0.0, 2.0)], strict=True):
+        assert float(picture.sum()) == pytest.approx(1.0, abs=1e-4)
+        assert float((picture.sum(1) * offsets**2).sum()) == pytest.approx(down**2, rel=0.03)
+        assert float((picture.sum(0) * offsets**2).sum()) == pytest.approx(across**2, rel=0.03)
+
+
+def test_quantiles_of_an_even_histogram() -> None:
+    bins = NUMBERS["roll"]
+    even = torch.full((1, bins.count), 1.0 / bins.count)
+    for share in (0.1, 0.5, 0.84):
+        expected = bins.low + share * (bins.high - bins.low)
+        assert float(bins.quantile(even, share)) == pytest.approx(expected, abs=1e-2)
+
+
+def test_camera_without_roll_is_the_camera_of_the_flags() -> None:
+    photo = np.full((40, 60, 3), 0.5, np.float32)
+    estimate = estimate_camera(photo, random_calibrator(0, SMALL), vfov_deg=40.0)
+    camera = type(estimate)(
+        **vars(estimate) | {"roll_deg": 0.0, "pitch_deg": -9.0, "principal": (0.5, 0.5)}
+    ).camera(60, 40, 1.6)
+    hfov = np.degrees(2.0 * np.arctan(1.5 * np.tan(np.radians(20.0))))
+    expected = camera_from_fov(60, 40, hfov, -9.0, 1.6)
+    assert camera.fx == pytest.approx(expected.fx)
+    np.testing.assert_allclose(camera.c2w, expected.c2w, atol=1e-12)
+
+
+def test_positive_roll_lets_the_horizon_fall_to_the_right() -> None:
+    photo = np.full((40, 60, 3), 0.5, np.float32)
+    estimate = estimate_camera(photo, random_calibrator(0, SMALL), vfov_deg=40.0)
+    camera = type(estimate)(
+        **vars(estimate) | {"roll_deg": 10.0, "pitch_deg": 0.0, "principal": (0.5, 0.5)}
+    ).camera(60, 40, 1.6)
+    left, right = camera.project(np.array([[-10.0, 1.6, -50.0], [10.0, 1.6, -50.0]]))
+    assert right[1] > left[1]
+    slope = (right[1] - left[1]) / (right[0] - left[0])
+    assert slope == pytest.approx(np.tan(np.radians(10.0)))
