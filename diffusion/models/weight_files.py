@@ -25,7 +25,7 @@ SHIPPED = Path(__file__).parents[1] / "weights"
 PRIOR_KEY = "warpir_prior"
 """Where a file's header describes the embedded prior that it holds."""
 PRIOR_FORMAT = 2
-REGRESSOR_FORMAT = "warpir-regressor-1"
+REGRESSOR_FORMAT = "warpir-regressor-2"
 CALIBRATOR_FORMAT = "warpir-calibrator-1"
 Sizes = Mapping[str, tuple[int, int, type, float, float]]
 PRIOR_SIZES: Sizes = {
@@ -46,9 +46,14 @@ REGRESSOR_SIZES: Sizes = {
     "directions": (1, 1, int, 8, 10_000),
     "dropout": (1, 1, float, 0, 0.99),
     "skipped": (1, 1, float, 0, 0.99),
+    "hidden": (1, 1, float, 0, 0.99),
+    "members": (1, 1, int, 1, 16),
 }
 """The same of a `warpir.lighting.regressor.RegressorConfig`."""
-CALIBRATOR_SIZES: Sizes = {k: v for k, v in REGRESSOR_SIZES.items() if k != "directions"}
+CALIBRATOR_SIZES: Sizes = {
+    name: REGRESSOR_SIZES[name]
+    for name in ("channels", "blocks", "depth", "heads", "dropout", "skipped")
+}
 """The same of a `warpir.calibration.network.CalibratorConfig`."""
 
 EXPONENTS = {

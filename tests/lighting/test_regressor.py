@@ -351,7 +351,7 @@ def cut(path: Path) -> None:
 def poison(path: Path) -> None:
     content = path.read_bytes()
     state = load_file(path)
-    state["stem.bias"][0] = torch.nan
+    state["members.0.stem.bias"][0] = torch.nan
     length = int.from_bytes(content[:8], "little")
     save_file(state, path, metadata=json.loads(content[8 : 8 + length])["__metadata__"])
 

@@ -5,7 +5,9 @@ distribution over fixed directions for the dominant light (so that "ahead or beh
 that light's irradiance, colour, softness and share, and broad spherical Gaussians for all other
 light; each level comes with a variance. Levels are logarithms relative to the photo's own mean
 decoded luminance, so exposure drops out. It is asked twice, for the photo and for its mirror image,
-and the answers are averaged: a mirrored photo gives the mirrored light by construction.
+and the answers are averaged: a mirrored photo gives the mirrored light by construction. What ships
+holds several such networks, each trained without some of the places; their answers are averaged,
+and where they disagree the variances grow.
 
 The camera-yaw frame is the world turned about +Y so that the camera looks along -Z.
 """
@@ -63,6 +65,10 @@ class RegressorConfig:
     dropout: float = 0.1
     skipped: float = 0.1
     """Chance that a block is left out in training (stochastic depth)."""
+    hidden: float = 0.3
+    """Share of the tokens that training hides: no single corner of a place may tell its light."""
+    members: int = 1
+    """Networks whose answers are averaged."""
 
 
 class Prediction(NamedTuple):
@@ -188,33 +194,23 @@ def _head(channels: int, dropout: float, count: int) -> nn.Sequential:
     return nn.Sequential(nn.LayerNorm(channels), nn.Dropout(dropout), last)
 
 
-class Regressor(nn.Module):
-    """Photo and rays to `Prediction`.
+class _Member(nn.Module):
+    """One network: photo and rays to a flat prediction.
 
     There are 12 x 18 tokens of 8 x 8 pixels, and two learned ones that ask them. Each of the two
     heads, for direction and for levels, reads one learned token plus weighted means of the others.
     The means matter: without them training stays long at the one answer that fits all photos.
+
+    Args:
+        config: Of the regressor.
+        direction_count: Candidate directions.
+        level_count: All other numbers of a flat prediction.
     """
 
-    directions: Tensor
-    """Candidates, camera-yaw frame, shape [K, 3]; in the file, so that weights keep their own."""
-    temperature: Tensor
-    """Divides the logits; calibrated on validation photos, shape []."""
-    mean_light: Tensor
-    """The training set's mean light as one constant prediction, flat as `split` takes it."""
-
-    def __init__(self, config: RegressorConfig) -> None:
+    def __init__(self, config: RegressorConfig, direction_count: int, level_count: int) -> None:
         super().__init__()
-        self.config = config
-        self.record: dict[str, Any] = {}
-        """How it was trained; plain values."""
         fine, middle, wide = config.channels
-        directions = torch.from_numpy(candidates(config.directions)).float()
-        self.register_buffer("directions", directions)
-        self.register_buffer("temperature", torch.ones(()))
-        self.level_count = 10 + 3 * len(ambient_axes())
-        self.register_buffer("mean_light", torch.zeros(len(directions) + self.level_count))
-
+        self.hidden = config.hidden
         # Space to depth keeps every pixel: the edges of shadows are what tells the direction.
         self.stem = nn.Conv2d(4 * 6, fine, 3, padding=1)
         self.fine = nn.Sequential(*(_ConvBlock(fine, 0.0) for _ in range(config.blocks[0])))
@@ -234,22 +230,21 @@ class Regressor(nn.Module):
         self.gather = nn.Linear(wide, 2 * GATHERINGS, bias=False)
         # Clearly different weights from the start: an even mean tells nothing of where.
         nn.init.normal_(self.gather.weight, std=3.0 / math.sqrt(wide))
-        self.direction_head = _head(wide, config.dropout, len(directions))
-        self.level_head = _head(wide, config.dropout, self.level_count)
+        self.direction_head = _head(wide, config.dropout, direction_count)
+        self.level_head = _head(wide, config.dropout, level_count)
 
     def forward(self, photo: Tensor, rays: Tensor) -> Tensor:
-        """Return flat predictions, shape [B, K + level_count]; `split` names the parts.
-
-        Args:
-            photo: Display-encoded, shape [B, 3, 96, 144].
-            rays: Unit viewing directions, camera-yaw frame, shape [B, 3, 96, 144].
-        """
+        """Return a flat prediction; arguments are those of `Regressor.forward`."""
         x = torch.cat([photo * 2.0 - 1.0, rays], dim=1)
         x = self.fine(self.stem(F.pixel_unshuffle(x, 2)))
         x = self.middle(self.down1(x))
         x = self.norm(self.down2(x))
         looking = F.adaptive_avg_pool2d(rays, x.shape[2:]).flatten(2).transpose(1, 2)
         tokens = x.flatten(2).transpose(1, 2) + self.place(looking)
+        if self.training and self.hidden > 0.0:
+            count = max(1, round(tokens.shape[1] * (1.0 - self.hidden)))
+            order = torch.rand(tokens.shape[:2], device=tokens.device).argsort(dim=1)[:, :count]
+            tokens = tokens.gather(1, order[..., None].expand(-1, -1, tokens.shape[2]))
         tokens = torch.cat([self.asking.expand(len(tokens), -1, -1), tokens], dim=1)
         for block in self.blocks:
             tokens = block(tokens)
@@ -262,6 +257,62 @@ class Regressor(nn.Module):
             gathered = torch.einsum("btag,btgc->bagc", weights, groups).flatten(2)
             direction, levels = (asked + gathered).unbind(dim=1)
             return torch.cat([self.direction_head(direction), self.level_head(levels)], dim=1)
+
+
+class Regressor(nn.Module):
+    """Photo and rays to `Prediction`, by one network or by several whose answers are averaged."""
+
+    directions: Tensor
+    """Candidates, camera-yaw frame, shape [K, 3]; in the file, so that weights keep their own."""
+    temperature: Tensor
+    """Divides the logits; calibrated on validation photos, shape []."""
+    mean_light: Tensor
+    """The training set's mean light as one constant prediction, flat as `split` takes it."""
+
+    def __init__(self, config: RegressorConfig) -> None:
+        super().__init__()
+        self.config = config
+        self.record: dict[str, Any] = {}
+        """How it was trained; plain values."""
+        directions = torch.from_numpy(candidates(config.directions)).float()
+        self.register_buffer("directions", directions)
+        self.register_buffer("temperature", torch.ones(()))
+        self.level_count = 10 + 3 * len(ambient_axes())
+        self.register_buffer("mean_light", torch.zeros(len(directions) + self.level_count))
+        self.members = nn.ModuleList(
+            _Member(config, len(directions), self.level_count) for _ in range(config.members)
+        )
+
+    def forward(self, photo: Tensor, rays: Tensor) -> Tensor:
+        """Return flat predictions, shape [B, K + level_count]; `split` names the parts.
+
+        Logits and levels are means over the members. The variance of a level is that of the
+        mixture: the mean of the members' variances plus the variance of their answers.
+
+        Args:
+            photo: Display-encoded, shape [B, 3, 96, 144].
+            rays: Unit viewing directions, camera-yaw frame, shape [B, 3, 96, 144].
+        """
+        flats = torch.stack([member(photo, rays) for member in self.members])
+        mean = flats.mean(dim=0)
+        if len(self.members) == 1:
+            return mean
+        each = self.split(flats.flatten(0, 1))
+
+        def mixture(levels: Tensor, log_var: Tensor) -> Tensor:
+            levels, log_var = (part.unflatten(0, flats.shape[:2]) for part in (levels, log_var))
+            return torch.log(log_var.exp().mean(dim=0) + levels.var(dim=0, correction=0))
+
+        of_level = mixture(each.level, each.level_log_var)
+        of_tint = mixture(each.tint, each.tint_log_var)
+        of_softness = mixture(each.softness, each.softness_log_var)
+        brightness = each.ambient.logsumexp(dim=(1, 2))
+        of_ambient = mixture(brightness, each.ambient_log_var)
+        mean = mean.clone()
+        first = len(self.directions)
+        mean[:, first + 1], mean[:, first + 4 : first + 6] = of_level, of_tint
+        mean[:, first + 7], mean[:, -1] = of_softness, of_ambient
+        return mean
 
     def split(self, flat: Tensor) -> Prediction:
         """Name the parts of a flat prediction, shape [B, K + level_count]."""

@@ -1,6 +1,6 @@
 r"""Train the networks that warpir ships: the embedded prior, and the regressor of the first light.
 
-    python -m warpir.train regressor --panoramas DIR --assets DIR --out DIR --minutes 9
+    python -m warpir.train regressor --panoramas DIR --out DIR --minutes 12 --networks 5
     python -m warpir.train prior --panoramas DIR --assets DIR --out DIR --minutes 9 \
         --total-minutes 18
     python -m warpir.train prior ... --resume
@@ -17,6 +17,8 @@ import argparse
 import json
 import math
 import os
+import subprocess
+import sys
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -40,6 +42,9 @@ VALIDATION_SEED = 10**6
 REUSES = 2
 """Steps in a row with the same composites, at other times, noises and words: rendering takes as
 long as learning."""
+REPLAYS, REPLAYED = 3, 12
+"""Steps that each photo is learned from, on average, and batches that they are drawn from: photos
+take longer to render than to learn from, and each is varied anew."""
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -67,6 +72,12 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument(
         "--regressor", type=Path, metavar="FILE", help="weights that the prior is told the light by"
     )
+    words = "networks, each without a share of the places; their answers are averaged"
+    parser.add_argument("--networks", type=int, default=1, metavar="N", help=words)
+    words = "hold out the places of fold K of N, for validation and calibration"
+    parser.add_argument("--fold", type=_fold, metavar="K/N", help=words)
+    words = "panoramas to learn from, whole places drawn at random"
+    parser.add_argument("--places", type=int, metavar="N", help=words)
     parser.add_argument("--no-compile", action="store_true", help="do without torch.compile")
     return parser
 
@@ -79,6 +90,8 @@ def _run(arguments: list[str]) -> int:
     options = _parser().parse_args(arguments)
     if options.resume and options.start is not None:
         raise usage("--start", "what is resumed has its own weights")
+    if options.networks > 1:
+        return _train_members(options, arguments)
     _check(options)
     panoramas = files_in(options.panoramas, (".hdr", ".exr"))
     assets = files_in(options.assets, (".glb", ".gltf", ".obj", ".stl", ".ply"))
@@ -91,13 +104,20 @@ def _run(arguments: list[str]) -> int:
     from warpir.render.device import choose_device
     from warpir.train.lights import load_panoramas
     from warpir.train.meshes import make_meshes, read_meshes
+    from warpir.train.places import of_fold, some_places
     from warpir.train.scenes.render import Stock
 
     rank = int(os.environ.get("LOCAL_RANK", "0"))
     device = f"cuda:{rank}" if "LOCAL_RANK" in os.environ else choose_device(options.device)
-    kept_out = {*options.without, *options.validation}
+    names = [p.stem for p in panoramas if p.stem not in options.without]
+    known = _places_of(options.start)
+    watched_names = {*options.validation, *of_fold(names, options.fold, known)}
+    kept_out = {*options.without, *watched_names}
+    kept_out |= {*names} - some_places(
+        [n for n in names if n not in kept_out], options.places, known
+    )
     learned = [p for p in panoramas if p.stem not in kept_out]
-    watched = [p for p in panoramas if p.stem in options.validation]
+    watched = [p for p in panoramas if p.stem in watched_names]
     meshes = [*make_meshes(MADE_UP_OBJECTS, options.seed)]
     meshes += read_meshes(p for p in assets if p.stem not in kept_out)
     if is_first():
@@ -125,6 +145,30 @@ def _run(arguments: list[str]) -> int:
     if is_first():
         say(json.dumps(result))
     return ExitCode.DONE
+
+
+def _places_of(start: Path | None) -> list[str]:
+    """Return the panoramas that a network, and those it started from, have learned from."""
+    if start is None:
+        return []
+    from warpir.lighting.regressor import load_regressor
+
+    names: list[str] = []
+    records = [load_regressor(start).record]
+    while records:
+        record = records.pop()
+        names += record.get("panoramas", [])
+        records += record.get("members", [])
+        records += [record["started_from"]] if "started_from" in record else []
+    return names
+
+
+def _fold(text: str) -> tuple[int, int]:
+    """Read ``K/N``: fold K of N, counted from 0."""
+    fold, _, count = text.partition("/")
+    if not (fold.isdecimal() and count.isdecimal() and int(fold) < int(count)):
+        raise argparse.ArgumentTypeError(f"expected K/N with K below N (found {text!r})")
+    return int(fold), int(count)
 
 
 def _check(options: argparse.Namespace) -> None:
@@ -200,6 +244,41 @@ def _reused(
         return held.pop()
 
     return repeated
+
+
+class Replay:
+    """Batches of photos drawn at random from the newest that were rendered.
+
+    Args:
+        batches: Renders new ones.
+        uses: Of each photo, on average.
+        kept: Batches to draw from.
+    """
+
+    def __init__(
+        self, batches: Callable[[int, torch.Generator], PhotoBatch], uses: int, kept: int
+    ) -> None:
+        self.batches, self.uses, self.kept = batches, uses, kept
+        self.held: dict[str, torch.Tensor] = {}
+        self.drawn = self.rendered = 0
+
+    def __call__(self, count: int, generator: torch.Generator) -> PhotoBatch:
+        """Return a batch; arguments are those of `SceneGenerator.photo_batch`'s callers."""
+        import torch
+
+        from warpir.train.batches import PhotoBatch
+
+        if self.rendered * self.uses <= self.drawn:
+            slot = self.rendered % self.kept * count
+            for name, part in vars(self.batches(count, generator)).items():
+                shape = (self.kept * count, *part.shape[1:])
+                held = self.held.setdefault(name, part.new_empty(shape))
+                held[slot : slot + count] = part
+            self.rendered += 1
+        self.drawn += 1
+        filled = min(self.rendered, self.kept) * count
+        index = torch.randint(filled, (count,), generator=generator, device=generator.device)
+        return PhotoBatch(**{name: held[index] for name, held in self.held.items()})
 
 
 def _train_prior(
@@ -279,27 +358,27 @@ def _train_regressor(
     record: dict[str, Any],
 ) -> dict[str, Any]:
     from warpir.lighting.regressor import load_regressor
-    from warpir.train.regressor import train_regressor
+    from warpir.train.regressor import PANORAMAS, train_regressor
     from warpir.train.scenes.generator import Mixture, SceneGenerator
     from warpir.train.settings import TrainingSettings
 
     learned, unseen = stocks
-    # Fewer panorama crops than the prior sees: they are few places, and could be learned by heart.
-    scenes = SceneGenerator(learned, seed, Mixture(made_up=0.45, hybrid=0.35))
+    scenes = SceneGenerator(learned, seed, Mixture(made_up=0.15, hybrid=0.35))
 
     def drawn(**shares: float) -> list[PhotoBatch]:
-        made = SceneGenerator(unseen, VALIDATION_SEED, Mixture(**shares, proxies=0.0))
+        mixture = Mixture(**shares, proxies=0.0, misjudged=0.0)
+        made = SceneGenerator(unseen, VALIDATION_SEED, mixture)
         return [made.photo_batch(k, 128) for k in range(VALIDATION_PICTURES // 128)]
 
     validation = {"procedural": drawn(made_up=1.0, hybrid=0.0)}
     if unseen.panoramas.panorama_count:
-        validation["panoramas"] = drawn(made_up=0.0, hybrid=0.0)
-    settings = TrainingSettings(batch=options.batch or 256, compile=not options.no_compile)
+        validation[PANORAMAS] = drawn(made_up=0.0, hybrid=0.0)
+    settings = TrainingSettings(batch=options.batch or 512, compile=not options.no_compile)
     start = None if options.start is None else load_regressor(options.start, device)
     if start is not None:
         record = record | {"started_from": start.record}
     end = train_regressor(
-        _counted(scenes.photo_batch),
+        Replay(_counted(scenes.photo_batch), REPLAYS, REPLAYED),
         validation,
         options.out,
         settings,
@@ -312,3 +391,27 @@ def _train_regressor(
         record=record,
     )
     return vars(end)
+
+
+def _train_members(options: argparse.Namespace, arguments: list[str]) -> int:
+    """Train one network for each fold at the same time, and join them.
+
+    Each network is trained without its fold's places, and its uncertainty is calibrated on them.
+
+    Raises:
+        InputError: A training failed; its output says why.
+    """
+    from warpir.train.regressor import WEIGHTS, join_members
+
+    folders = [options.out / f"member_{fold}" for fold in range(options.networks)]
+    commands = []
+    for fold, folder in enumerate(folders):
+        # Of a flag that stands twice the last one counts.
+        own = ["--networks", "1", "--fold", f"{fold}/{options.networks}", "--out", str(folder)]
+        commands.append([sys.executable, "-m", "warpir.train", *arguments, *own])
+    running = [subprocess.Popen(command) for command in commands]
+    for folder, process in zip(folders, running, strict=True):
+        if process.wait():
+            raise InputError(folder, f"its training failed (exit {process.returncode})")
+    join_members([folder / WEIGHTS for folder in folders], options.out / WEIGHTS)
+    return ExitCode.DONE

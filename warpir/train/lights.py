@@ -212,7 +212,9 @@ def make_lights(count: int, generator: torch.Generator, device: torch.device | s
     kind = draw.category(KIND_SHARES)
     is_night = kind == NIGHT
     within = (kind == ROOM) | is_night
-    elevation = torch.deg2rad(draw.uniform(8.0, 78.0))
+    # Half of the clear days have a sun below 45 degrees, as those that people photograph.
+    highest = torch.where(draw.chance(0.5), 45.0, 78.0)
+    elevation = torch.deg2rad(8.0 + (highest - 8.0) * draw.unit())
     elevation = torch.where(kind == LOW_SUN, torch.deg2rad(draw.uniform(1.0, 14.0)), elevation)
     elevation = torch.where(within, torch.deg2rad(draw.uniform(5.0, 88.0)), elevation)
     azimuth = draw.uniform(0.0, 2.0 * np.pi)

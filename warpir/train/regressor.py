@@ -15,7 +15,7 @@ import math
 import time
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import nullcontext
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -39,6 +39,8 @@ from warpir.train.settings import TrainingSettings
 from warpir.train.validation import calibrate, measure, score
 
 WEIGHTS, BEST, CURVE = "regressor.safetensors", "best.safetensors", "curve.jsonl"
+PANORAMAS = "panoramas"
+"""Name of the validation set of crops of panoramas that are not learned from."""
 STAGE = "regressor"
 """What the checkpoints of this training are called."""
 
@@ -114,6 +116,31 @@ def train_regressor(
     return TrainingEnd(run.step, run.minutes, is_complete, finished)
 
 
+def join_members(paths: Sequence[Path], out: Path) -> Regressor:
+    """Join networks of one size into one regressor that averages their answers, and write it.
+
+    Args:
+        paths: A file for each, calibrated.
+        out: The file to write; its record holds those of the members.
+
+    Raises:
+        InputError: A file cannot be used (`ExitCode.MODEL`).
+    """
+    networks = [load_regressor(path) for path in paths]
+    joined = Regressor(replace(networks[0].config, members=len(networks))).eval()
+    with torch.no_grad():
+        for place, network in enumerate(networks):
+            (member,) = network.members
+            # Each member's own temperature goes into its logits, since these are what is averaged.
+            last = member.direction_head[-1]
+            last.weight.div_(network.temperature)
+            last.bias.div_(network.temperature)
+            joined.members[place].load_state_dict(member.state_dict())
+        joined.mean_light.copy_(torch.stack([n.mean_light for n in networks]).mean(dim=0))
+    save_regressor(joined, out, {"members": [n.record for n in networks]})
+    return joined
+
+
 def _rate(settings: TrainingSettings, progress: float, steps: int) -> float:
     """Return the learning rate: warm-up by steps of this call, then constant, then linear down."""
     left = min((1.0 - progress) / (1.0 - settings.constant_share), 1.0)
@@ -138,8 +165,10 @@ class _Run:
         self.loss = LightLoss(self.network, settings.label_sigma_deg)
         self.mean = MeanLight(self.loss)
         # Norms, biases and tokens are not pulled toward 0.
-        pulled = [p for p in network.parameters() if p.dim() > 1 and p is not network.asking]
-        plain = [p for p in network.parameters() if p.dim() < 2 or p is network.asking]
+        named = list(network.named_parameters())
+        is_plain = [p.dim() < 2 or name.endswith("asking") for name, p in named]
+        pulled = [p for (_, p), plain in zip(named, is_plain, strict=True) if not plain]
+        plain = [p for (_, p), plain in zip(named, is_plain, strict=True) if plain]
         self.optimizer = torch.optim.AdamW(
             [
                 {"params": pulled, "weight_decay": settings.weight_decay},
@@ -320,7 +349,9 @@ class _Run:
         device = self.network.directions.device
         network = load_regressor(self.out / BEST, device)
         network.mean_light.copy_(self.mean.flat())
-        calibrate(network, self.loss, validation)
+        # By real places where there are some: made-up ones are easier to read.
+        real = {name: v for name, v in validation.items() if name == PANORAMAS}
+        calibrate(network, self.loss, real or validation)
         measured = {k: measure(network, self.loss, v) for k, v in validation.items()}
         known = {
             "steps": self.step,

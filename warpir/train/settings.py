@@ -7,7 +7,7 @@ from dataclasses import dataclass
 class TrainingSettings:
     """How a network is trained."""
 
-    batch: int = 256
+    batch: int = 512
     learning_rate: float = 1e-3
     weight_decay: float = 0.05
     warmup_steps: int = 300
@@ -18,11 +18,11 @@ class TrainingSettings:
     """Share of the learning rate that is left at the end."""
     clip: float = 1.0
     """Largest norm of a step's gradient."""
-    average: float = 0.9995
+    average: float = 0.998
     """Decay of the moving average of the weights."""
     label_sigma_deg: float = 6.0
     """Width of the direction's soft label [deg]."""
-    crop_share: float = 0.3
+    crop_share: float = 0.5
     """Share of photos of which a random part is stretched over the picture."""
     erase_share: float = 0.3
     """Chance of each of three patches to be painted over."""

@@ -181,8 +181,8 @@ def calibrate(
             if counts.any():
                 z = (error.abs() * torch.exp(-0.5 * log_var))[counts]
                 scales.setdefault(place, []).append(float(z.quantile(COVERAGE)))
-    last = network.level_head[-1]
-    assert isinstance(last, torch.nn.Linear)
     for place, found in scales.items():
         # The geometric mean: one place that is misread altogether must not decide for all photos.
-        last.bias[place] += 2.0 * sum(math.log(max(z, 1e-3)) for z in found) / len(found)
+        wider = 2.0 * sum(math.log(max(z, 1e-3)) for z in found) / len(found)
+        for member in network.members:
+            member.level_head[-1].bias[place] += wider

@@ -30,6 +30,7 @@ from warpir.train.scenes.layout import (
     draw_stands,
     draw_surfaces,
     draw_views,
+    misjudged_rays,
 )
 from warpir.train.scenes.lighting import (
     Lighting,
@@ -65,6 +66,8 @@ class Mixture:
     """Of made-up scenes without anything that casts a shadow."""
     proxies: float = 0.25
     """Of panorama crops with solids put into them, lit rightly."""
+    misjudged: float = 0.5
+    """Of photos whose camera is known as an estimate knows it."""
 
 
 @dataclass(frozen=True)
@@ -270,6 +273,11 @@ class SceneGenerator:
         in_view = toward > float(np.cos(np.radians(3.0)))
         shows_solid = made.solid.mean(dim=(1, 2, 3)) > 0.015
         has_cue = (share > 0.15) & (scenes.is_panorama | in_view | shows_solid)
+        draw = Sampler(count, generator)
+        axes = scenes.right, scenes.up, scenes.back
+        is_misjudged = draw.chance(self.mixture.misjudged)[:, None, None, None]
+        wrong = misjudged_rays(draw, scenes.photo_window, PHOTO_SIZE, axes)
+        rays = torch.where(is_misjudged, wrong, rays)
         return PhotoBatch(
             photo, rays, light.axis, share, sun, light.sigma,
             ambient, has_cue,
@@ -359,8 +367,9 @@ class SceneGenerator:
             (first + (draw.unit() * (last - first)).long()).clamp(max=pool.count - 1)
             for _ in range(2)
         )
-        # Few panoramas have a sun: made-up scenes are lit by the sunnier of two.
-        is_sunnier = self._share[second] > self._share[index]
-        index = torch.where(~made_up & ~is_panorama & is_sunnier, second, index)
+        # Few panoramas have a sun: made-up scenes and a third of the crops have the sunnier of two.
+        is_sunnier = (self._share[second] > self._share[index]) & ~made_up
+        is_sunnier &= ~is_panorama | draw.chance(1.0 / 3.0)
+        index = torch.where(is_sunnier, second, index)
         light = lighting_of(pool, index, draw.uniform(0.0, 2.0 * np.pi), draw.chance(0.5))
         return light, made_up, is_panorama

@@ -88,6 +88,52 @@ def rays_in(
     return rays.permute(0, 3, 1, 2).contiguous()
 
 
+def turned_about(axis: Tensor, vector: Tensor, angle: Tensor) -> Tensor:
+    """Turn vectors about unit axes that stand at right angles to them, shape [B, 3].
+
+    Args:
+        axis: Shape [B, 3].
+        vector: Shape [B, 3].
+        angle: [rad], shape [B].
+    """
+    across = torch.linalg.cross(axis, vector)
+    return angle.cos()[:, None] * vector + angle.sin()[:, None] * across
+
+
+def misjudged_rays(
+    draw: Sampler, window: Tensor, size: tuple[int, int], axes: tuple[Tensor, Tensor, Tensor]
+) -> Tensor:
+    """Return the viewing directions that a camera estimated from the photo would give.
+
+    Pitch, roll and field of view are off as estimates are; the yaw stays, since the frame is the
+    camera's own.
+
+    Args:
+        draw: For the scenes of the batch.
+        window: Of the photo on the image plane, shape [B, 4].
+        size: Height and width [px].
+        axes: The true right, up and back, shape [B, 3] each.
+
+    Returns:
+        Unit directions, camera-yaw frame, shape [B, 3, H, W].
+    """
+    right, up, back = axes
+    pitch, roll = (torch.deg2rad(sigma * draw.normal()) for sigma in (4.0, 2.0))
+    # About +X of the camera-yaw frame: what is ahead stays ahead.
+    level = torch.zeros_like(right)
+    level[:, 0] = 1.0
+    right, up, back = (_rotated(level, v, pitch) for v in (right, up, back))
+    right, up = turned_about(back, right, roll), turned_about(back, up, roll)
+    zoom = torch.exp((0.12 * draw.normal()).clamp(-0.4, 0.4))
+    return rays_in(window * zoom[:, None], size, right, up, back)
+
+
+def _rotated(axis: Tensor, vector: Tensor, angle: Tensor) -> Tensor:
+    """Rotate vectors about unit axes (Rodrigues), shape [B, 3]."""
+    along = (axis * vector).sum(dim=1, keepdim=True) * axis
+    return along + turned_about(axis, vector - along, angle)
+
+
 def draw_views(draw: Sampler, place_kind: Tensor) -> Views:
     """Draw cameras for scenes of some kinds: 0 street, 1 yard, 2 table, 3 room, shape [B]."""
     device = draw.device
@@ -101,11 +147,16 @@ def draw_views(draw: Sampler, place_kind: Tensor) -> Views:
     low, high = torch.tensor(CAMERA_HEIGHTS, device=device)[place_kind].T
     camera_height = low + (high - low) * draw.unit()
     zero, one = torch.zeros_like(tilt), torch.ones_like(tilt)
+    right = torch.stack([one, zero, zero], dim=1)
+    up = torch.stack([zero, tilt.cos(), tilt.sin()], dim=1)
+    back = torch.stack([zero, -tilt.sin(), tilt.cos()], dim=1)
+    roll = torch.deg2rad((4.0 * draw.normal()).clamp(-15.0, 15.0))
+    roll = torch.where(draw.chance(0.4), roll, zero)
     return Views(
         origin=torch.stack([zero, camera_height, zero], dim=1),
-        right=torch.stack([one, zero, zero], dim=1),
-        up=torch.stack([zero, tilt.cos(), tilt.sin()], dim=1),
-        back=torch.stack([zero, -tilt.sin(), tilt.cos()], dim=1),
+        right=turned_about(back, right, roll),
+        up=turned_about(back, up, roll),
+        back=back,
         tilt=tilt,
         half_width=half_width,
         half_height=half_height,

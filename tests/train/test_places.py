@@ -1,0 +1,103 @@
+"""Folds of whole places, replayed photos and joined networks."""
+
+import itertools
+from pathlib import Path
+
+import pytest
+import torch
+
+from tests.lighting.test_regressor import SMALL
+from warpir.lighting.regressor import load_regressor, random_regressor, save_regressor
+from warpir.train.batches import PhotoBatch
+from warpir.train.command import Replay
+from warpir.train.places import of_fold, place_of, some_places
+from warpir.train.regressor import join_members
+from warpir.train.sampler import Sampler
+from warpir.train.scenes.layout import misjudged_rays, rays_in
+
+NAMES = [f"{place}_{kind}" for place in "abcdefghijk" for kind in ("noon", "night")]
+
+
+def test_folds_hold_whole_places_each_once() -> None:
+    known = ["a_other"]
+    folds = [of_fold(NAMES, (k, 4), known) for k in range(4)]
+    assert sorted(itertools.chain(*folds)) == sorted(NAMES[2:])
+    for fold in folds:
+        assert fold and all(
+            {f"{place_of(name)}_noon", f"{place_of(name)}_night"} <= set(fold) for name in fold
+        )
+    assert of_fold(NAMES, None, known) == []
+    assert place_of("qwantani_puresky") == place_of("rustig_koppie_puresky")
+
+
+def test_some_places_begin_with_the_known_ones() -> None:
+    few = some_places(NAMES, 6, ["k"])
+    assert {"k_noon", "k_night"} < few and len(few) == 6
+    assert few < some_places(NAMES, 12, ["k"])
+    assert some_places(NAMES, None, []) == set(NAMES)
+
+
+def test_replayed_photos_are_drawn_from_the_newest() -> None:
+    made = []
+
+    def batches(count: int, generator: torch.Generator) -> PhotoBatch:
+        made.append(len(made))
+        value = torch.full((count,), float(made[-1]))
+        return PhotoBatch(**dict.fromkeys(PhotoBatch.__annotations__, value))
+
+    replay, generator = Replay(batches, uses=3, kept=4), torch.Generator().manual_seed(0)
+    drawn = [replay(8, generator).share for _ in range(30)]
+    assert len(made) == 10
+    for step, values in enumerate(drawn):
+        newest = step // 3
+        assert float(values.max()) <= newest and float(values.min()) >= max(newest - 3, 0)
+    assert len(drawn[-1].unique()) > 1
+
+
+def test_a_misjudged_camera_keeps_its_yaw() -> None:
+    """On average the rays are the true ones, and what is ahead stays ahead."""
+    count = 4000
+    draw = Sampler(count, torch.Generator().manual_seed(0))
+    window = torch.tensor([-0.6, -0.4, 1.2, 0.8]).expand(count, 4)
+    axes = tuple(torch.eye(3)[k].expand(count, 3) for k in range(3))
+    rays = misjudged_rays(draw, window, (4, 6), axes)
+    torch.testing.assert_close(rays.norm(dim=1), torch.ones(count, 4, 6))
+    truth = rays_in(window[:1], (4, 6), *(axis[:1] for axis in axes))
+    angle = torch.rad2deg(torch.acos((rays * truth).sum(dim=1).clamp(-1.0, 1.0)))
+    assert 2.0 < float(angle.mean()) < 6.0
+    middle = rays[:, :, 1:3, 2:4].mean(dim=(2, 3))
+    assert float(middle[:, 0].abs().max()) < 0.02
+    torch.testing.assert_close(rays.mean(dim=0), truth[0], atol=0.01, rtol=0)
+
+
+def test_joined_networks_answer_with_the_mean_and_its_doubt(tmp_path: Path) -> None:
+    """Logits at each member's temperature and levels are averaged; disagreement adds variance."""
+    paths, networks = [], []
+    for seed, temperature in ((0, 2.0), (1, 0.5)):
+        network = random_regressor(seed, SMALL)
+        network.temperature.fill_(temperature)
+        torch.nn.init.normal_(network.members[0].level_head[-1].weight)
+        paths.append(tmp_path / f"{seed}.safetensors")
+        save_regressor(network, paths[-1], {"panoramas": [f"place_{seed}"]})
+        networks.append(load_regressor(paths[-1]))
+    join_members(paths, tmp_path / "joined.safetensors")
+    joined = load_regressor(tmp_path / "joined.safetensors")
+    assert joined.config.members == 2 and float(joined.temperature) == 1.0
+    assert [m["panoramas"] for m in joined.record["members"]] == [["place_0"], ["place_1"]]
+    photo = torch.rand(3, 3, 96, 144)
+    rays = torch.nn.functional.normalize(torch.randn(3, 3, 96, 144), dim=1)
+    each = [n.split(n(photo, rays)) for n in networks]
+    both = joined.split(joined(photo, rays))
+    logits = [p.logits / n.temperature for p, n in zip(each, networks, strict=True)]
+    torch.testing.assert_close(both.logits, sum(logits) / 2.0, atol=2e-2, rtol=2e-2)
+    torch.testing.assert_close(both.level, sum(p.level for p in each) / 2.0, atol=1e-3, rtol=1e-3)
+    gap = 0.5 * (each[0].level - each[1].level)
+    variance = sum(p.level_log_var.exp() for p in each) / 2.0 + gap**2
+    torch.testing.assert_close(both.level_log_var, variance.log(), atol=1e-2, rtol=1e-2)
+
+
+def test_a_fold_that_makes_no_sense_is_refused(capsys: pytest.CaptureFixture[str]) -> None:
+    from warpir.train.command import main
+
+    assert main(["regressor", "--panoramas", ".", "--out", "out", "--fold", "5/5"]) == 2
+    assert "--fold" in capsys.readouterr().err
