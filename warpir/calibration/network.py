@@ -35,7 +35,7 @@ from warpir.diffusion.models.weight_files import CALIBRATOR_FORMAT, check_calibr
 
 HEIGHT, WIDTH = 128, 192
 """Size that the network sees [px]; photos of other shapes are stretched."""
-BLUR = 1.3
+BLUR = 1.4
 """Standard deviation of the blur of every photo that the network sees, over the photo's height
 times `HEIGHT`: 1 is a row of what it sees."""
 GATHERINGS = 4

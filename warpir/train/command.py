@@ -1,9 +1,10 @@
-r"""Train the networks that warpir ships: the embedded prior, and the regressor of the first light.
+r"""Train the networks that warpir ships: for the first light, for the camera, and the prior.
 
     python -m warpir.train regressor --panoramas DIR --out DIR --minutes 12 --networks 5
     python -m warpir.train prior --panoramas DIR --assets DIR --out DIR --minutes 9 \
         --total-minutes 18
     python -m warpir.train prior ... --resume
+    python -m warpir.train camera --panoramas DIR --out DIR --minutes 4 --fold 0/5
 
 Scenes are rendered as they are needed and then forgotten; the prior learns from each twice.
 A command stops after ``--minutes`` and ``--resume`` goes on, until ``--total-minutes`` are used up.
@@ -54,7 +55,7 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser("python -m warpir.train", description=_first_line())
-    parser.add_argument("network", choices=("prior", "regressor"))
+    parser.add_argument("network", choices=("camera", "prior", "regressor"))
     parser.add_argument("--panoramas", type=Path, nargs="+", required=True, metavar="DIR")
     parser.add_argument("--assets", type=Path, nargs="*", default=[], metavar="DIR", help="objects")
     parser.add_argument("--without", nargs="*", default=[], metavar="NAME", help="not learned from")
@@ -98,6 +99,10 @@ def _run(arguments: list[str]) -> int:
     unknown = sorted({*options.without, *options.validation} - {p.stem for p in panoramas + assets})
     if unknown:
         say(f"notice: no panorama or asset is called {', '.join(unknown)}")
+
+    if options.network == "camera":
+        say(json.dumps(_train_camera(options, panoramas)))
+        return ExitCode.DONE
 
     import torch
 
@@ -145,6 +150,50 @@ def _run(arguments: list[str]) -> int:
     if is_first():
         say(json.dumps(result))
     return ExitCode.DONE
+
+
+def _train_camera(options: argparse.Namespace, panoramas: Sequence[Path]) -> dict[str, float]:
+    """Train the network that estimates cameras; photographs are cut without Warp."""
+    import torch
+
+    from warpir.calibration.network import load_calibrator
+    from warpir.train.camera.crops import read_panoramas
+    from warpir.train.camera.loop import CameraSettings, train_camera
+    from warpir.train.lights import SKY_ONLY
+    from warpir.train.places import of_fold
+
+    device = torch.device(options.device or ("cuda" if torch.cuda.is_available() else "cpu"))
+    # What shows no ground shows no camera.
+    usable = [p for p in panoramas if SKY_ONLY not in p.stem and p.stem not in options.without]
+    names = [p.stem for p in usable]
+    held_out = {*options.validation, *of_fold(names, options.fold, ())}
+    learned = [p for p in usable if p.stem not in held_out]
+    watched = [p for p in usable if p.stem in held_out]
+    if not learned:
+        raise InputError("--panoramas", "none to learn from")
+    say(f"device: {device}; {len(learned)} panoramas; validation on {len(watched)}")
+    start = None if options.start is None else load_calibrator(options.start, device)
+    record = {
+        "panoramas": [p.stem for p in learned],
+        "validation_panoramas": [p.stem for p in watched],
+        "started_from": None if start is None else start.record,
+        "device": torch.cuda.get_device_name(device) if device.type == "cuda" else "cpu",
+    }
+    settings = CameraSettings(
+        batch=options.batch or CameraSettings.batch,
+        learning_rate=CameraSettings.learning_rate * (1.0 if start is None else 0.5),
+    )
+    return train_camera(
+        read_panoramas(learned, device),
+        read_panoramas(watched, device) if watched else None,
+        options.out,
+        settings,
+        device,
+        options.minutes,
+        seed=options.seed,
+        start=start,
+        record=record,
+    )
 
 
 def _places_of(start: Path | None) -> list[str]:

@@ -1,0 +1,247 @@
+"""The training loop of the network that estimates cameras.
+
+It takes minutes, so it is not resumed; a training that shall go on starts from the weights of
+another. What is kept is the best moving average of the weights on places that are only looked at.
+"""
+
+from __future__ import annotations
+
+import copy
+import json
+import math
+import time
+from collections.abc import Callable, Mapping, Sequence
+from contextlib import nullcontext
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor
+
+from warpir.calibration.network import (
+    NUMBERS,
+    Calibrator,
+    random_calibrator,
+    save_calibrator,
+)
+from warpir.train.camera.crops import CameraBatch, Panoramas, draw_batch
+
+WEIGHTS, CURVE = "calibrator.safetensors", "curve.jsonl"
+NUMBER_WEIGHTS = {"pitch": 1.0, "roll": 1.0, "focal": 1.0, "x": 0.3, "y": 0.6}
+"""Of each number's histogram in the loss."""
+FIELD_WEIGHT = 2.0
+"""Of the perspective field's errors, in radians, in the loss."""
+COVERAGE = 0.68
+"""Share of errors within one standard deviation."""
+VALIDATION_SEED = 10**6
+
+
+@dataclass(frozen=True)
+class CameraSettings:
+    """How the network is trained."""
+
+    batch: int = 512
+    learning_rate: float = 1.2e-3
+    weight_decay: float = 0.05
+    warmup_steps: int = 150
+    constant_share: float = 0.4
+    """Share of the time at full rate; then it falls along a cosine to 0."""
+    clip: float = 1.0
+    """Largest norm of a step's gradient."""
+    average: float = 0.998
+    """Decay of the moving average of the weights."""
+    validate_minutes: float = 0.5
+    validation_photos: int = 1536
+
+
+def train_camera(
+    learned: Panoramas,
+    watched: Panoramas | None,
+    out: Path,
+    settings: CameraSettings,
+    device: torch.device,
+    minutes: float,
+    seed: int = 0,
+    start: Calibrator | None = None,
+    record: Mapping[str, Any] | None = None,
+) -> dict[str, float]:
+    """Train until the time is over; write ``calibrator.safetensors`` and ``curve.jsonl`` to out.
+
+    Args:
+        learned: Panoramas to learn from.
+        watched: Others, of which only the errors are looked at: they choose which weights are kept,
+            and calibrate the standard deviations. None: the last weights are kept, with the
+            calibration of ``start``.
+        out: Folder of the results.
+        settings: How.
+        device: Where.
+        minutes: Time, on the wall clock.
+        seed: Of the weights and the photos.
+        start: Network to begin with; default: random weights.
+        record: Put into the weights file beside what is known here; plain values.
+
+    Returns:
+        What `measure` finds on the places that are looked at; without any, nothing.
+
+    Raises:
+        OSError: The results cannot be written.
+    """
+    out.mkdir(parents=True, exist_ok=True)
+    (out / CURVE).unlink(missing_ok=True)
+    network = (start or random_calibrator(seed)).to(device).requires_grad_(True)
+    average = copy.deepcopy(network).eval().requires_grad_(False)
+    known = dict(record or {}) | {"settings": asdict(settings), "seed": seed}
+    validation = (
+        [] if watched is None else validation_batches(watched, settings.validation_photos, device)
+    )
+    kept, best = average, math.inf
+    steps, losses = 0, torch.zeros((), device=device)
+
+    def validate(spent: float) -> None:
+        nonlocal kept, best
+        found = measure(average, validation)
+        if found["score"] < best:
+            kept, best = copy.deepcopy(average), found["score"]
+        line = {"step": steps, "minutes": round(spent, 3), "loss": float(losses)} | found
+        with (out / CURVE).open("a", encoding="utf-8") as curve:
+            curve.write(json.dumps(line, allow_nan=False) + "\n")
+
+    step = _step_of(network, settings)
+    generator = torch.Generator(device).manual_seed(seed)
+    torch.manual_seed(seed)
+    began = validated = time.monotonic()
+    while (progress := (time.monotonic() - began) / (60.0 * minutes)) < 1.0:
+        with torch.no_grad():
+            batch = draw_batch(learned, settings.batch, generator)
+        losses = losses.lerp(step(batch, _rate(settings, progress, steps)), 0.05)
+        share = 1.0 - min(settings.average, (1.0 + steps) / (10.0 + steps))
+        torch._foreach_lerp_(
+            [p.detach() for p in average.parameters()],
+            [p.detach() for p in network.parameters()],
+            share,
+        )
+        steps += 1
+        if validation and time.monotonic() - validated >= 60.0 * settings.validate_minutes:
+            validate(progress * minutes)
+            validated = time.monotonic()
+    finished: dict[str, float] = {}
+    if validation:
+        validate(minutes)
+        calibrate(kept, validation)
+        finished = measure(kept, validation)
+    known |= {"steps": steps, "minutes": minutes, "validation": finished}
+    save_calibrator(kept, out / WEIGHTS, known)
+    return finished
+
+
+def _rate(settings: CameraSettings, progress: float, steps: int) -> float:
+    """Return the learning rate: warm-up by steps, then constant, then a cosine down to 0."""
+    left = min((1.0 - progress) / (1.0 - settings.constant_share), 1.0)
+    share = 0.5 - 0.5 * math.cos(math.pi * left)
+    return settings.learning_rate * share * min((steps + 1) / settings.warmup_steps, 1.0)
+
+
+def _step_of(
+    network: Calibrator, settings: CameraSettings
+) -> Callable[[CameraBatch, float], Tensor]:
+    """Return what takes a step of the optimiser on a batch, at a rate, and returns the loss."""
+    is_cuda = network.spread.is_cuda
+    if is_cuda:
+        network.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
+    # Norms, biases and tokens are not pulled toward 0.
+    pulled = [p for p in network.parameters() if p.dim() > 1 and p is not network.asking]
+    plain = [p for p in network.parameters() if p.dim() < 2 or p is network.asking]
+    groups = [
+        {"params": pulled, "weight_decay": settings.weight_decay},
+        {"params": plain, "weight_decay": 0.0},
+    ]
+    optimizer = torch.optim.AdamW(groups, betas=(0.9, 0.99), fused=is_cuda)
+    network.train()
+
+    def step(batch: CameraBatch, rate: float) -> Tensor:
+        for group in optimizer.param_groups:
+            group["lr"] = rate
+        with torch.autocast("cuda", torch.bfloat16) if is_cuda else nullcontext():
+            logits, field = network(batch.photo, batch.aspect, batch.focal)
+        loss = camera_loss(logits, field, batch)
+        optimizer.zero_grad(set_to_none=True)
+        loss.backward()
+        torch.nn.utils.clip_grad_norm_(network.parameters(), settings.clip)
+        optimizer.step()
+        return loss.detach()
+
+    return step
+
+
+def camera_loss(logits: Mapping[str, Tensor], field: Tensor, batch: CameraBatch) -> Tensor:
+    """Return the loss of predictions: cross entropies of the histograms, and the field's errors.
+
+    The truth of a histogram is spread over the neighbouring bins, by a Gaussian of one bin.
+    """
+    total = torch.zeros((), device=field.device)
+    for (name, bins), truth in zip(NUMBERS.items(), batch.numbers.T, strict=True):
+        centres = bins.centres(truth)
+        step = centres[1] - centres[0]
+        labels = (-0.5 * ((centres - truth[:, None]) / step) ** 2).softmax(dim=1)
+        entropy = -(labels * logits[name].float().log_softmax(dim=1)).sum(dim=1)
+        # A focal length that was given teaches nothing.
+        weight = batch.focal.isnan().float() if name == "focal" else torch.ones_like(entropy)
+        total = total + NUMBER_WEIGHTS[name] * (entropy * weight).mean()
+    up = F.normalize(field[..., :2], dim=-1, eps=1e-4)
+    off = (up - batch.field[..., :2]).norm(dim=-1) + (field[..., 2] - batch.field[..., 2]).abs()
+    return total + FIELD_WEIGHT * off.mean()
+
+
+def validation_batches(
+    watched: Panoramas, count: int, device: torch.device
+) -> Sequence[CameraBatch]:
+    """Return photos that are the same in every training, without known focal lengths."""
+    generator = torch.Generator(device).manual_seed(VALIDATION_SEED)
+    sizes = [min(128, count - first) for first in range(0, count, 128)]
+    drawn = [draw_batch(watched, size, generator) for size in sizes]
+    return [batch._replace(focal=torch.full_like(batch.focal, math.nan)) for batch in drawn]
+
+
+def errors_of(
+    network: Calibrator, batches: Sequence[CameraBatch]
+) -> tuple[dict[str, Tensor], dict[str, Tensor]]:
+    """Return errors and standard deviations, by number, shape [count] each.
+
+    Angles are in degrees, the focal length a vertical field of view; the principal point is in
+    shares.
+    """
+    answers = [network.predict(b.photo, b.aspect, b.focal) for b in batches]
+    value = torch.cat([a.value for a in answers]).T
+    sigma = torch.cat([a.sigma for a in answers]).T
+    truth = torch.cat([b.numbers for b in batches]).T
+    error, spread = {}, {}
+    for name, found, true, width in zip(NUMBERS, value, truth, sigma, strict=True):
+        if name == "focal":
+            fov, true_fov = (2.0 * torch.atan(0.5 * torch.exp(-x)) for x in (found, true))
+            error["vfov"] = torch.rad2deg((fov - true_fov).abs())
+            spread["vfov"] = torch.rad2deg(torch.sin(fov) * width)
+        else:
+            error[name], spread[name] = (found - true).abs(), width
+    return error, spread
+
+
+def measure(network: Calibrator, batches: Sequence[CameraBatch]) -> dict[str, float]:
+    """Return median errors, the share within one standard deviation, and a score, by name."""
+    error, spread = errors_of(network, batches)
+    found = {f"{name}_median": float(e.median()) for name, e in error.items()}
+    for name, e in error.items():
+        found[f"{name}_covered"] = float((e <= spread[name]).float().mean())
+    # Each over what shall be reached: 3, 1.5 and 6 degrees.
+    goals = {"pitch": 3.0, "roll": 1.5, "vfov": 6.0}
+    score = sum(found[f"{name}_median"] / goal for name, goal in goals.items()) / len(goals)
+    return found | {"score": score}
+
+
+def calibrate(network: Calibrator, batches: Sequence[CameraBatch]) -> None:
+    """Set the network's spread, so that 68 % of errors lie within one standard deviation."""
+    network.spread.fill_(1.0)
+    error, spread = errors_of(network, batches)
+    factors = [torch.quantile(error[n] / spread[n].clamp(min=1e-6), COVERAGE) for n in error]
+    network.spread.copy_(torch.stack(factors))
