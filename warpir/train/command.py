@@ -66,6 +66,8 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument("--minutes", type=float, default=9.0, help="of this command")
     parser.add_argument("--total-minutes", type=float, help="of all commands together")
     parser.add_argument("--batch", type=int, default=None)
+    words = "largest learning rate (default: 1e-3; 3e-4 suits weights to begin with)"
+    parser.add_argument("--rate", type=float, metavar="R", help=words)
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--device", default=None)
     parser.add_argument("--resume", action="store_true")
@@ -227,7 +229,7 @@ def _check(options: argparse.Namespace) -> None:
         InputError: A number makes no sense (exit 2), there is nothing to resume (3), or --out holds
             a training that would be lost (7).
     """
-    for name in ("minutes", "total_minutes"):
+    for name in ("minutes", "total_minutes", "rate"):
         value = getattr(options, name)
         if value is not None and not 0.0 < value < math.inf:
             raise usage(f"--{name.replace('_', '-')}", f"expected above 0 (found {value})")
@@ -422,7 +424,11 @@ def _train_regressor(
     validation = {"procedural": drawn(made_up=1.0, hybrid=0.0)}
     if unseen.panoramas.panorama_count:
         validation[PANORAMAS] = drawn(made_up=0.0, hybrid=0.0)
-    settings = TrainingSettings(batch=options.batch or 512, compile=not options.no_compile)
+    settings = TrainingSettings(
+        batch=options.batch or 512,
+        learning_rate=options.rate or TrainingSettings.learning_rate,
+        compile=not options.no_compile,
+    )
     start = None if options.start is None else load_regressor(options.start, device)
     if start is not None:
         record = record | {"started_from": start.record}

@@ -10,7 +10,7 @@ class TrainingSettings:
     batch: int = 512
     learning_rate: float = 1e-3
     weight_decay: float = 0.05
-    warmup_steps: int = 300
+    warmup_steps: int = 150
     """After every start: Adam's moments are kept, but the scenes are new."""
     constant_share: float = 0.5
     """Share of the planned training at full rate; then it falls linearly."""
@@ -30,7 +30,7 @@ class TrainingSettings:
     """Share of photos without colour; their light has none either."""
     noise: float = 0.02
     """Largest standard deviation of noise on the encoded photo."""
-    validate_minutes: float = 1.0
+    validate_minutes: float = 0.5
     save_minutes: float = 2.0
     compile: bool = False
     """``torch.compile`` on CUDA."""
