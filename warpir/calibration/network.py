@@ -148,9 +148,6 @@ def seen(photo: Tensor) -> Tensor:
         photo: Display-encoded, shape [B, 3, H, W].
     """
     height, width = photo.shape[2:]
-    # Whole blocks first: the antialiased filter of a large photo would take seconds.
-    block = (max(1, height // (2 * HEIGHT)), max(1, width // (2 * WIDTH)))
-    photo = F.avg_pool2d(photo, block, ceil_mode=True)
     small = F.interpolate(photo, (HEIGHT, WIDTH), mode="bilinear", antialias=True)
     rows = torch.full((len(photo),), BLUR, device=photo.device)
     return soften(small, blur_sigma(rows, torch.full_like(rows, width / height)).clamp(max=WIDTH))
@@ -249,12 +246,13 @@ class Calibrator(nn.Module):
             focal: Logarithm of the focal length over the height where it is known, else NaN,
                 shape [B].
         """
-        plain, _ = self(photo, aspect, focal)
-        mirrored, _ = self(photo.flip(-1), aspect, focal)
+        both = torch.cat([photo, photo.flip(-1)])
+        logits, _ = self(both, aspect.repeat(2), focal.repeat(2))
         value, sigma = [], []
         for name, bins in NUMBERS.items():
-            turned = mirrored[name].flip(-1) if name in MIRRORED else mirrored[name]
-            probability = 0.5 * (plain[name].softmax(dim=1) + turned.softmax(dim=1))
+            plain, mirrored = logits[name].softmax(dim=1).chunk(2)
+            turned = mirrored.flip(-1) if name in MIRRORED else mirrored
+            probability = 0.5 * (plain + turned)
             value.append(bins.quantile(probability, 0.5))
             # A Gaussian has 68 % between these two, one standard deviation to either side.
             low, high = (bins.quantile(probability, share) for share in (0.16, 0.84))

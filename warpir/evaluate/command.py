@@ -1,10 +1,12 @@
 """Evaluation of the light and of the insertions under it.
 
     python -m warpir.evaluate --panoramas PATH ... --assets PATH ... --scenes N --json FILE
+    python -m warpir.evaluate --camera --panoramas PATH ... --scenes N --seed S --json FILE
 
 Photographs are cut out of panoramas, so that their light is known; a diffuse and a glossy object is
 put into each under the true light and under the light of every row (`warpir.evaluate.rows`), and
-light and picture are compared. `docs/evaluation.md` describes the method.
+light and picture are compared. `docs/evaluation.md` describes the method. With ``--camera`` the
+estimated cameras of photographs are compared instead, and nothing is rendered (`docs/camera.md`).
 """
 
 import argparse
@@ -64,6 +66,10 @@ def _parser() -> argparse.ArgumentParser:
     words = "rendered photographs on which the regressor's direction is measured too"
     add("--procedural", type=_count, default=0, metavar="N", help=words)
     _add_model_flags(parser)
+    words = "measure the estimated cameras instead of the light; nothing is rendered"
+    add("--camera", action="store_true", help=words)
+    words = "weights of the network that estimates cameras (default: warpir's own)"
+    add("--calibrator", type=Path, metavar="FILE", help=words)
     add("--debug", action="store_true", help="tracebacks and the libraries' messages")
     return parser
 
@@ -112,6 +118,10 @@ def _count(text: str) -> int:
 
 def _run(arguments: list[str]) -> int:
     options = _parser().parse_args(arguments)
+    if options.camera:
+        _check(options, ("panoramas",))
+        _evaluate_cameras(options)
+        return ExitCode.DONE
 
     from warpir.evaluate.rows import GROUPS, ROWS, chosen_rows
 
@@ -123,7 +133,7 @@ def _run(arguments: list[str]) -> int:
         for group, words in GROUPS.items():
             say(f"group {group}: {words}")
         return ExitCode.DONE
-    _check(options)
+    _check(options, ("panoramas", "assets"))
     if options.out is None:
         evaluate(options, rows, None)
         return ExitCode.DONE
@@ -136,15 +146,19 @@ def _run(arguments: list[str]) -> int:
     return ExitCode.DONE
 
 
-def _check(options: argparse.Namespace) -> None:
+def _check(options: argparse.Namespace, needed: Sequence[str]) -> None:
     """Check the options.
+
+    Args:
+        options: Of the command line.
+        needed: Names of those that must be given.
 
     Raises:
         InputError: A flag is missing or out of range (`ExitCode.USAGE`).
     """
     from warpir.evaluate.scenes import RESPONSES
 
-    for name in ("panoramas", "assets"):
+    for name in needed:
         if getattr(options, name) is None:
             raise usage(f"--{name}", "needed", "a folder or files")
     if options.scenes < 1:
@@ -159,6 +173,38 @@ def _check(options: argparse.Namespace) -> None:
         raise usage("--curve", f"no response {options.curve!a}", f"known: {', '.join(RESPONSES)}")
     if options.json is not None and not options.json.absolute().parent.is_dir():
         raise InputError(options.json, "its folder does not exist", code=ExitCode.RESOURCES)
+
+
+def _evaluate_cameras(options: argparse.Namespace) -> None:
+    """Measure estimated cameras, print their errors and write them.
+
+    Raises:
+        InputError: The weights or a panorama cannot be used.
+    """
+    from warpir.calibration.network import load_calibrator
+    from warpir.evaluate.camera.measure import lines_of, measure_cameras, unlearned
+    from warpir.evaluate.scenes import PANORAMA_SUFFIXES, find_files
+    from warpir.train.lights import SKY_ONLY
+
+    network = load_calibrator(options.calibrator)
+    files = find_files(options.panoramas, PANORAMA_SUFFIXES, "--panoramas")
+    panoramas, notices = unlearned([p for p in files if SKY_ONLY not in p.stem], network)
+    for notice in notices:
+        say(f"notice: {notice}")
+    measured = measure_cameras(panoramas, options.scenes, options.seed, options.width, network)
+    for line in lines_of(measured):
+        say(line)
+    if options.json is not None:
+        record = {
+            "camera": measured,
+            "scenes": options.scenes,
+            "seed": options.seed,
+            "width": options.width,
+            "panoramas": [path.stem for path in panoramas],
+            "notices": notices,
+        }
+        write_file(options.json, (json.dumps(record, indent=1, allow_nan=False) + "\n").encode())
+        say(f"written: {options.json}")
 
 
 def evaluate(

@@ -183,16 +183,23 @@ def draw_cameras(draw: Sampler) -> DrawnCameras:
     return DrawnCameras(pitch, roll, focal, x, y, aspect, bend)
 
 
-def cut(panoramas: Panoramas, cameras: DrawnCameras, which: Tensor, draw: Sampler) -> Tensor:
-    """Return the radiance that cameras see, looking anywhere around, shape [B, 3, 128, 192].
+def cut(
+    panoramas: Panoramas,
+    cameras: DrawnCameras,
+    which: Tensor,
+    draw: Sampler,
+    size: tuple[int, int] = (HEIGHT, WIDTH),
+) -> Tensor:
+    """Return the radiance that cameras see, looking anywhere around, shape [B, 3, H, W].
 
     Args:
         panoramas: To photograph.
         cameras: The cameras.
         which: Panorama of each, shape [B].
         draw: Of the azimuths, and of which panoramas are mirrored.
+        size: Height and width of the photos [px].
     """
-    plane = cameras.plane(SAMPLES * HEIGHT, SAMPLES * WIDTH)
+    plane = cameras.plane(SAMPLES * size[0], SAMPLES * size[1])
     x, y, z = cameras.world(plane).unbind(-1)
     mirror, yaw = draw.sign()[:, None, None], draw.uniform(0.0, 1.0)[:, None, None]
     # Image centre +Z, left quarter +X.
@@ -204,6 +211,20 @@ def cut(panoramas: Panoramas, cameras: DrawnCameras, which: Tensor, draw: Sample
     grid = torch.stack([across, 2.0 * v - 1.0, layer], dim=-1)
     seen = F.grid_sample(panoramas.texels, grid[None], padding_mode="border", align_corners=False)
     return F.avg_pool2d(seen[0].transpose(0, 1).clamp(min=0.0), SAMPLES)
+
+
+def with_blur(photo: Tensor, cameras: DrawnCameras, coarseness: Tensor, rows: Tensor) -> Tensor:
+    """Blur photos until each has the blur that it should, as far as its panorama allows.
+
+    Args:
+        photo: Shape [B, 3, 128, 192].
+        cameras: Of the photos.
+        coarseness: Of their panoramas, shape [B].
+        rows: The blur, in the units of `warpir.calibration.network.BLUR`, shape [B].
+    """
+    texel = cameras.focal * HEIGHT * math.pi / ROWS * coarseness
+    missing = (rows**2 - (OWN_BLUR * texel) ** 2).clamp(min=0.0).sqrt()
+    return soften(photo, blur_sigma(missing, cameras.aspect))
 
 
 def draw_batch(panoramas: Panoramas, count: int, generator: torch.Generator) -> CameraBatch:
@@ -223,10 +244,7 @@ def draw_batch(panoramas: Panoramas, count: int, generator: torch.Generator) -> 
     photo = draw_looks(radiance, generator).show(radiance)
     grey = photo.mean(dim=1, keepdim=True).expand_as(photo)
     photo = torch.where(draw.chance(GREY_SHARE, 1, 1, 1), grey, photo)
-    texel = cameras.focal * HEIGHT * math.pi / ROWS * panoramas.coarseness[which]
-    missing = draw.log_uniform(*BLURS) ** 2 - (OWN_BLUR * texel) ** 2
-    rows = missing.clamp(min=0.0).sqrt()
-    photo = soften(photo, blur_sigma(rows, cameras.aspect))
+    photo = with_blur(photo, cameras, panoramas.coarseness[which], draw.log_uniform(*BLURS))
     is_blank = draw.chance(BLANK_SHARE, 1, 1, 1)
     photo = torch.where(is_blank, photo.mean(dim=(2, 3), keepdim=True), photo)
     photo = erase(draw_faults(photo, generator), ERASE_SHARE, generator)

@@ -97,7 +97,7 @@ def train_camera(
         [] if watched is None else validation_batches(watched, settings.validation_photos, device)
     )
     kept, best = average, math.inf
-    steps, losses = 0, torch.zeros((), device=device)
+    steps, losses = 0, torch.full((), math.nan, device=device)
 
     def validate(spent: float) -> None:
         nonlocal kept, best
@@ -115,7 +115,8 @@ def train_camera(
     while (progress := (time.monotonic() - began) / (60.0 * minutes)) < 1.0:
         with torch.no_grad():
             batch = draw_batch(learned, settings.batch, generator)
-        losses = losses.lerp(step(batch, _rate(settings, progress, steps)), 0.05)
+        loss = step(batch, _rate(settings, progress, steps))
+        losses = torch.where(losses.isnan(), loss, losses.lerp(loss, 0.05))
         share = 1.0 - min(settings.average, (1.0 + steps) / (10.0 + steps))
         torch._foreach_lerp_(
             [p.detach() for p in average.parameters()],
