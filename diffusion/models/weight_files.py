@@ -51,8 +51,8 @@ REGRESSOR_SIZES: Sizes = {
 }
 """The same of a `warpir.lighting.regressor.RegressorConfig`."""
 CALIBRATOR_SIZES: Sizes = {
-    name: REGRESSOR_SIZES[name]
-    for name in ("channels", "blocks", "depth", "heads", "dropout", "skipped")
+    "channels": (2, 2, int, 8, 512),
+    **{name: REGRESSOR_SIZES[name] for name in ("blocks", "depth", "heads", "dropout", "skipped")},
 }
 """The same of a `warpir.calibration.network.CalibratorConfig`."""
 
@@ -244,7 +244,7 @@ def _check_photo_network(path: Path | None, name: str, format_: str, sizes: Size
     config = _object(where, file.about.get("config", ""))
     _object(where, file.about.get("record", ""))
     _check_sizes(where, config, sizes)
-    if any(width % 8 for width in config["channels"]) or config["channels"][2] % config["heads"]:
+    if any(width % 8 for width in config["channels"]) or config["channels"][-1] % config["heads"]:
         what = f"network: channels {config['channels']} of {config['heads']} heads"
         raise ModelError(where, f"{what} (expected multiples of 8, the last of the heads too)")
     if path is not None and shipped.is_file():

@@ -21,7 +21,7 @@ from warpir.calibration.network import (
 from warpir.core.errors import ExitCode, InputError
 from warpir.scene.camera import camera_from_fov
 
-SMALL = CalibratorConfig(channels=(8, 8, 16), blocks=(1, 1), depth=1, heads=2)
+SMALL = CalibratorConfig(channels=(8, 16), blocks=(1, 1), depth=1, heads=2)
 
 
 def test_file_gives_the_same_network_back(tmp_path: Path) -> None:

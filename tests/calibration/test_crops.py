@@ -21,6 +21,7 @@ from warpir.train.camera.crops import (
     Panoramas,
     cut,
     draw_cameras,
+    panoramas_of,
     with_blur,
 )
 from warpir.train.camera.loop import CameraSettings, train_camera
@@ -30,9 +31,9 @@ from warpir.train.sampler import Sampler
 def level_panorama() -> Panoramas:
     """Return a panorama whose red is the elevation: 0 at the nadir, 1 at the zenith."""
     rows = 1.0 - (torch.arange(512.0) + 0.5) / 512.0
-    texels = torch.ones(1, 3, 1, 512, 1026)
-    texels[0, 0, 0] = rows[:, None]
-    return Panoramas(texels, torch.ones(1))
+    texels = torch.ones(1, 3, 512, 1024)
+    texels[0, 0] = rows[:, None]
+    return panoramas_of(texels, torch.ones(1))
 
 
 def cameras(**given: float) -> DrawnCameras:
@@ -115,20 +116,21 @@ def test_barrel_shows_more_at_the_corner() -> None:
 def test_sharpness_does_not_tell_the_field_of_view() -> None:
     """A photograph of noise, a panorama's finest detail, varies alike from row to row."""
     torch.manual_seed(0)
-    panoramas = Panoramas(torch.rand(1, 3, 1, 512, 1026), torch.ones(1))
+    panoramas = panoramas_of(torch.rand(1, 3, 512, 1024), torch.ones(1))
     changes = []
     for focal in (2.6, 1.2, 0.5):
         camera = cameras(focal=focal)
         draw = Sampler(1, torch.Generator().manual_seed(1))
-        photo = cut(panoramas, camera, torch.tensor([0]), draw)
-        photo = with_blur(photo, camera, torch.ones(1), torch.tensor([1.5]))
+        layers = panoramas.layers(torch.tensor([0]), camera.focal)
+        photo = cut(panoramas, camera, layers, draw)
+        photo = with_blur(photo, camera, panoramas.coarseness[layers], torch.tensor([1.5]))
         inner = photo[0, :, 32:96, 48:144]
         changes.append(float(inner.diff(dim=1).std() / inner.std()))
     assert changes == pytest.approx([changes[0]] * 3, rel=0.15)
 
 
 def test_training_writes_weights_that_are_calibrated(tmp_path: Path) -> None:
-    small = CalibratorConfig(channels=(8, 8, 16), blocks=(1, 1), depth=1, heads=2)
+    small = CalibratorConfig(channels=(8, 16), blocks=(1, 1), depth=1, heads=2)
     found = train_camera(
         level_panorama(),
         level_panorama(),

@@ -89,11 +89,11 @@ SHAPE = (8, 8)
 class CalibratorConfig:
     """Size of the network."""
 
-    channels: tuple[int, int, int] = (48, 96, 192)
-    """Features at 1/2, 1/4 and 1/8 of the resolution."""
-    blocks: tuple[int, int] = (2, 2)
-    """Residual blocks at 1/2 and 1/4."""
-    depth: int = 6
+    channels: tuple[int, int] = (96, 192)
+    """Features at 1/4 and 1/8 of the resolution."""
+    blocks: tuple[int, int] = (3, 1)
+    """Residual blocks at 1/4 and 1/8."""
+    depth: int = 4
     """Transformer blocks over the 16 x 24 tokens."""
     heads: int = 6
     dropout: float = 0.1
@@ -169,16 +169,15 @@ class Calibrator(nn.Module):
         self.config = config
         self.record: dict[str, Any] = {}
         """How it was trained; plain values."""
-        fine, middle, wide = config.channels
+        fine, wide = config.channels
         self.register_buffer("spread", torch.ones(len(NUMBERS)))
         # Space to depth keeps every pixel.
-        self.stem = nn.Conv2d(4 * 5, fine, 3, padding=1)
+        self.stem = nn.Conv2d(16 * 3, fine, 3, padding=1)
         self.fine = nn.Sequential(*(ConvBlock(fine, 0.0) for _ in range(config.blocks[0])))
-        self.down1 = nn.Conv2d(fine, middle, 3, stride=2, padding=1)
-        self.middle = nn.Sequential(
-            *(ConvBlock(middle, config.skipped / 2.0) for _ in range(config.blocks[1]))
+        self.down = nn.Conv2d(fine, wide, 3, stride=2, padding=1)
+        self.coarse = nn.Sequential(
+            *(ConvBlock(wide, config.skipped / 2.0) for _ in range(config.blocks[1]))
         )
-        self.down2 = nn.Conv2d(middle, wide, 3, stride=2, padding=1)
         self.norm = nn.GroupNorm(8, wide)
         self.place = nn.Sequential(nn.Linear(5, wide), nn.GELU(), nn.Linear(wide, wide))
         self.asking = nn.Parameter(torch.randn(len(NUMBERS), wide) * 0.02)
@@ -192,7 +191,10 @@ class Calibrator(nn.Module):
         self.numbers = nn.ModuleDict(
             {name: head(wide, config.dropout, bins.count) for name, bins in NUMBERS.items()}
         )
-        self.field = head(wide, 0.0, 3)
+        self.field = head(wide, 0.0, 5)
+        self.fit = nn.Sequential(
+            nn.Linear(10, wide), nn.GELU(), nn.Linear(wide, len(NUMBERS) * wide)
+        )
 
     def forward(
         self, photo: Tensor, aspect: Tensor, focal: Tensor
@@ -207,13 +209,10 @@ class Calibrator(nn.Module):
 
         Returns:
             Logits of shape [B, K] by the names of `NUMBERS`; and, shape [B, 384, 3], where up is
-            in the picture (right, up; any length) and the elevation [rad] of what a token sees.
+            in the picture (right and up) and the elevation [rad] of what a token sees.
         """
-        plane = _coordinates(aspect, HEIGHT, WIDTH)
-        x = torch.cat([photo * 2.0 - 1.0, plane], dim=1)
-        x = self.fine(self.stem(F.pixel_unshuffle(x, 2)))
-        x = self.middle(self.down1(x))
-        x = self.norm(self.down2(x))
+        x = self.fine(self.stem(F.pixel_unshuffle(photo * 2.0 - 1.0, 4)))
+        x = self.norm(self.coarse(self.down(x)))
         known = ~focal.isnan()
         about = torch.stack([aspect.log(), known.to(aspect.dtype), focal.nan_to_num()], dim=1)
         where = _coordinates(aspect, *x.shape[2:]).flatten(2).transpose(1, 2)
@@ -230,8 +229,14 @@ class Calibrator(nn.Module):
             weights = self.gather(others).softmax(dim=1).unflatten(2, (count, GATHERINGS))
             groups = others.unflatten(2, (GATHERINGS, -1))
             read = asked + torch.einsum("btag,btgc->bagc", weights, groups).flatten(2)
+            answer = self.field(others)
+            # Level cameras are the start: up is up.
+            field = answer[..., :3] + answer.new_tensor([0.0, 1.0, 0.0])
+            fitted = _fit_planes(where, field, answer[..., 3:])
+            features = torch.cat([fitted.flatten(1), aspect.log()[:, None]], dim=1)
+            read = read + self.fit(features).unflatten(1, (count, -1))
             heads = zip(self.numbers.items(), read.unbind(dim=1), strict=True)
-            return {name: answer(part) for (name, answer), part in heads}, self.field(others)
+            return {name: number(part) for (name, number), part in heads}, field
 
     @torch.no_grad()
     def predict(self, photo: Tensor, aspect: Tensor, focal: Tensor) -> CameraNumbers:
@@ -258,6 +263,26 @@ class Calibrator(nn.Module):
             low, high = (bins.quantile(probability, share) for share in (0.16, 0.84))
             sigma.append(0.5 * (high - low))
         return CameraNumbers(torch.stack(value, 1), torch.stack(sigma, 1) * self.spread)
+
+
+def _fit_planes(where: Tensor, field: Tensor, confidence: Tensor) -> Tensor:
+    """Return constant and gradients of the perspective field, shape [B, 3, 3].
+
+    Elevation is nearly a plane over the picture whose gradient tells the field of view, and where
+    up is at the middle tells the roll: weighted least squares, so that what is seen of one part of
+    a photo counts as it is trusted.
+
+    Args:
+        where: Right and down of the tokens in units of the photo's height, shape [B, T, 2].
+        field: Shape [B, T, 3].
+        confidence: Logarithms of the weights of the up direction and the elevation, [B, T, 2].
+    """
+    basis = torch.cat([torch.ones_like(where[..., :1]), where], dim=2)
+    weights = confidence.softmax(dim=1)[..., [0, 0, 1]]
+    normal = torch.einsum("bti,btj,btc->bcij", basis, basis, weights)
+    normal = normal + 1e-3 * torch.eye(3, device=where.device)
+    right = torch.einsum("bti,btc->bci", basis, weights * field)
+    return torch.linalg.solve(normal, right)
 
 
 def _coordinates(aspect: Tensor, height: int, width: int) -> Tensor:

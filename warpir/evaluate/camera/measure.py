@@ -1,8 +1,7 @@
 """Errors of estimated cameras, on photographs cut out of panoramas with cameras drawn at random.
 
-The cameras are those of the training (`warpir.train.camera.crops.draw_cameras`): most nearly level,
-some steep, rolled, cropped off the centre, corrected to upright or with a lens that bends lines.
-Panoramas that the network has learned from are left out where others remain.
+Pitch, roll and field of view are drawn evenly over wide ranges, so that no constant guess can score
+well. Panoramas that the network has learned from are left out where others remain.
 """
 
 from __future__ import annotations
@@ -21,15 +20,26 @@ from warpir.calibration.estimate import CameraEstimate, estimate_camera
 from warpir.calibration.network import Calibrator
 from warpir.core.arrays import FloatArray
 from warpir.core.errors import InputError
-from warpir.train.camera.crops import DrawnCameras, cut, draw_cameras, read_panoramas
+from warpir.train.camera.crops import ASPECTS, DrawnCameras, cut, read_panoramas
 from warpir.train.photo_look import draw_faults, draw_looks
 from warpir.train.sampler import Sampler
 
 CONSTANT_FOV = 60.0
 """Horizontal field of view that is assumed where nothing is known [deg]."""
+RANGES = {"pitch": (-40.0, 25.0), "roll": (-20.0, 20.0), "fov": (25.0, 95.0)}
+"""Least and greatest pitch, roll and field of view of the shorter side [deg]."""
 SIDE = 8
 """Sides of the photographs are multiples of this, as JPEG's blocks are [px]."""
 Errors = dict[str, list[float]]
+
+
+def even_cameras(draw: Sampler) -> DrawnCameras:
+    """Draw cameras with even pitch, roll and field of view of the shorter side, within `RANGES`."""
+    pitch, roll, fov = (torch.deg2rad(draw.uniform(*RANGES[k])) for k in ("pitch", "roll", "fov"))
+    aspect = torch.tensor(ASPECTS)[draw.index(len(ASPECTS))]
+    focal = 0.5 / torch.tan(fov / 2.0) * aspect.clamp(max=1.0)
+    middle = torch.full_like(pitch, 0.5)
+    return DrawnCameras(pitch, roll, focal, middle, middle, aspect, torch.zeros_like(pitch))
 
 
 def truth_of(cameras: DrawnCameras, row: int) -> dict[str, float]:
@@ -62,10 +72,11 @@ def photograph(
         InputError: The panorama cannot be used.
     """
     draw = Sampler(1, generator)
-    only = torch.zeros(1, dtype=torch.int64)
     panorama = read_panoramas([path], "cpu")
     size = _size(float(cameras.aspect[0]), width)
-    radiance = cut(panorama, cameras, only, draw, size)
+    # Four rays a pixel.
+    radiance = cut(panorama, cameras, torch.zeros(1), draw, (2 * size[0], 2 * size[1]))
+    radiance = torch.nn.functional.avg_pool2d(radiance, 2)
     shown = draw_faults(draw_looks(radiance, generator).show(radiance), generator)
     photo: FloatArray = shown[0].permute(1, 2, 0).contiguous().numpy()
     return photo
@@ -119,7 +130,7 @@ def measure_cameras(
     rounds = math.ceil(scenes / len(panoramas))
     shuffled = np.random.default_rng(seed)
     order = [panoramas[k] for _ in range(rounds) for k in shuffled.permutation(len(panoramas))]
-    drawn = draw_cameras(Sampler(scenes, generator))
+    drawn = even_cameras(Sampler(scenes, generator))
     estimated, constant, covered = Errors(), Errors(), Errors()
     seconds = []
     for row, path in enumerate(order[:scenes]):

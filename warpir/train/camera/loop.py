@@ -17,7 +17,6 @@ from pathlib import Path
 from typing import Any
 
 import torch
-import torch.nn.functional as F
 from torch import Tensor
 
 from warpir.calibration.network import (
@@ -31,8 +30,10 @@ from warpir.train.camera.crops import CameraBatch, Panoramas, draw_batch
 WEIGHTS, CURVE = "calibrator.safetensors", "curve.jsonl"
 NUMBER_WEIGHTS = {"pitch": 1.0, "roll": 1.0, "focal": 1.0, "x": 0.3, "y": 0.6}
 """Of each number's histogram in the loss."""
-FIELD_WEIGHT = 2.0
-"""Of the perspective field's errors, in radians, in the loss."""
+SCALES = {"pitch": 10.0, "roll": 5.0, "focal": 0.3, "x": 0.2, "y": 0.2}
+"""Errors of each histogram's mean that weigh as much as 1 in the loss, in the number's units."""
+FIELD_WEIGHT = 6.0
+"""Of the perspective field's errors in the loss."""
 COVERAGE = 0.68
 """Share of errors within one standard deviation."""
 VALIDATION_SEED = 10**6
@@ -42,15 +43,15 @@ VALIDATION_SEED = 10**6
 class CameraSettings:
     """How the network is trained."""
 
-    batch: int = 512
-    learning_rate: float = 1.2e-3
+    batch: int = 256
+    learning_rate: float = 1e-3
     weight_decay: float = 0.05
-    warmup_steps: int = 150
-    constant_share: float = 0.4
+    warmup_steps: int = 200
+    constant_share: float = 0.3
     """Share of the time at full rate; then it falls along a cosine to 0."""
     clip: float = 1.0
     """Largest norm of a step's gradient."""
-    average: float = 0.998
+    average: float = 0.999
     """Decay of the moving average of the weights."""
     validate_minutes: float = 0.5
     validation_photos: int = 1536
@@ -177,22 +178,24 @@ def _step_of(
 
 
 def camera_loss(logits: Mapping[str, Tensor], field: Tensor, batch: CameraBatch) -> Tensor:
-    """Return the loss of predictions: cross entropies of the histograms, and the field's errors.
+    """Return the loss of predictions.
 
-    The truth of a histogram is spread over the neighbouring bins, by a Gaussian of one bin.
+    Of each histogram the cross entropy, with the truth spread over the neighbouring bins by a
+    Gaussian of one bin, and the error of its mean, which pulls from afar; and the errors of the
+    perspective field.
     """
-    total = torch.zeros((), device=field.device)
+    total = FIELD_WEIGHT * (field - batch.field).abs().mean()
     for (name, bins), truth in zip(NUMBERS.items(), batch.numbers.T, strict=True):
         centres = bins.centres(truth)
         step = centres[1] - centres[0]
         labels = (-0.5 * ((centres - truth[:, None]) / step) ** 2).softmax(dim=1)
-        entropy = -(labels * logits[name].float().log_softmax(dim=1)).sum(dim=1)
+        log_share = logits[name].float().log_softmax(dim=1)
+        entropy = -(labels * log_share).sum(dim=1)
+        error = (log_share.exp() @ centres - truth).abs() / SCALES[name]
         # A focal length that was given teaches nothing.
         weight = batch.focal.isnan().float() if name == "focal" else torch.ones_like(entropy)
-        total = total + NUMBER_WEIGHTS[name] * (entropy * weight).mean()
-    up = F.normalize(field[..., :2], dim=-1, eps=1e-4)
-    off = (up - batch.field[..., :2]).norm(dim=-1) + (field[..., 2] - batch.field[..., 2]).abs()
-    return total + FIELD_WEIGHT * off.mean()
+        total = total + NUMBER_WEIGHTS[name] * ((entropy + error) * weight).mean()
+    return total
 
 
 def validation_batches(
