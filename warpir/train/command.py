@@ -4,7 +4,7 @@ r"""Train the networks that warpir ships: for the first light, for the camera, a
     python -m warpir.train prior --panoramas DIR --assets DIR --out DIR --minutes 9 \
         --total-minutes 18
     python -m warpir.train prior ... --resume
-    python -m warpir.train camera --panoramas DIR --out DIR --minutes 4 --fold 0/5
+    python -m warpir.train camera --panoramas DIR --out DIR --minutes 20 --fold 0/5
 
 Scenes are rendered as they are needed and then forgotten; the prior learns from each twice.
 A command stops after ``--minutes`` and ``--resume`` goes on, until ``--total-minutes`` are used up.
@@ -158,7 +158,6 @@ def _train_camera(options: argparse.Namespace, panoramas: Sequence[Path]) -> dic
     """Train the network that estimates cameras; photographs are cut without Warp."""
     import torch
 
-    from warpir.calibration.network import load_calibrator
     from warpir.train.camera.crops import read_panoramas
     from warpir.train.camera.loop import CameraSettings, train_camera
     from warpir.train.lights import SKY_ONLY
@@ -171,29 +170,22 @@ def _train_camera(options: argparse.Namespace, panoramas: Sequence[Path]) -> dic
     held_out = {*options.validation, *of_fold(names, options.fold, ())}
     learned = [p for p in usable if p.stem not in held_out]
     watched = [p for p in usable if p.stem in held_out]
-    if not learned:
-        raise InputError("--panoramas", "none to learn from")
+    if not learned or not watched:
+        what = f"{len(learned)} to learn from, {len(watched)} to calibrate with (both are needed)"
+        raise InputError("--panoramas", what, "give --fold 0/5 or --validation")
     say(f"device: {device}; {len(learned)} panoramas; validation on {len(watched)}")
-    start = None if options.start is None else load_calibrator(options.start, device)
     record = {
         "panoramas": [p.stem for p in learned],
         "validation_panoramas": [p.stem for p in watched],
-        "started_from": None if start is None else start.record,
         "device": torch.cuda.get_device_name(device) if device.type == "cuda" else "cpu",
     }
-    settings = CameraSettings(
-        batch=options.batch or CameraSettings.batch,
-        learning_rate=CameraSettings.learning_rate * (1.0 if start is None else 0.5),
-    )
     return train_camera(
         read_panoramas(learned, device),
-        read_panoramas(watched, device) if watched else None,
+        read_panoramas(watched, device),
         options.out,
-        settings,
-        device,
+        CameraSettings(batch=options.batch or CameraSettings.batch),
         options.minutes,
         seed=options.seed,
-        start=start,
         record=record,
     )
 

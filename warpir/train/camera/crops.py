@@ -13,7 +13,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from warpir.calibration.network import HEIGHT, SHAPE, WIDTH, blur_sigma, soften
+from warpir.calibration.network import HEIGHT, WIDTH, blur_sigma, soften
 from warpir.core.color import luminance
 from warpir.core.latlong import resize_map, texel_solid_angles
 from warpir.io.images.photos import read_envmap
@@ -28,14 +28,12 @@ ASPECTS = (1.5, 1.5, 1.5, 1.333, 1.333, 1.778, 1.778, 1.0, 0.75, 0.75, 0.667, 0.
 OWN_BLUR = 0.5
 """Standard deviation of the blur of a panorama that is magnified, over one texel: that of the texel
 (.29) and of linear interpolation (.41)."""
-BLURS = (1.2, 1.8)
+BLURS = (0.6, 0.9)
 """Least and greatest blur of a photo, in the units of `warpir.calibration.network.BLUR`; it is
 drawn alike for all fields of view."""
-WIDE_FOCAL = 0.7
+WIDE_FOCAL = 1.3
 """Focal length over the height below which averaged texels are looked up: one row then spans two
 texels."""
-KNOWN_SHARE = 0.2
-"""Share of photos whose focal length the network is given."""
 BLANK_SHARE = 0.01
 """Share of photos of one colour, so that those too have an answer: that nothing is known."""
 GREY_SHARE = 0.1
@@ -125,20 +123,6 @@ class DrawnCameras:
         c, s = self.pitch.cos()[:, None, None], self.pitch.sin()[:, None, None]
         return F.normalize(torch.stack([x, c * y + s, s * y - c], dim=-1), dim=-1)
 
-    def field(self) -> Tensor:
-        """Return the perspective field of the tokens, shape [B, 384, 3].
-
-        The unit direction in the picture (right, up) of what lies straight above the scene point
-        that a token sees, and that point's elevation above the horizon [rad].
-        """
-        plane = self.plane(HEIGHT // SHAPE[0], WIDTH // SHAPE[1])
-        elevation = torch.asin(self.world(plane)[..., 1].clamp(-1.0, 1.0))
-        # World up in the camera's axes; a point of the plane at depth 1 that moves along it.
-        up = torch.stack([self.roll.sin() * self.pitch.cos(), self.roll.cos() * self.pitch.cos()])
-        forward = -self.pitch.sin()[:, None, None, None]
-        moved = F.normalize(up.T[:, None, None] + plane * forward, dim=-1)
-        return torch.cat([moved, elevation[..., None]], dim=-1).flatten(1, 2)
-
     def numbers(self) -> Tensor:
         """Return the truth in the units and the order of `NUMBERS`, shape [B, 5]."""
         degrees = torch.rad2deg(torch.stack([self.pitch, self.roll]))
@@ -149,15 +133,11 @@ class CameraBatch(NamedTuple):
     """Photos and their cameras."""
 
     photo: Tensor
-    """As the network sees them, shape [B, 3, 128, 192]."""
+    """As the network sees them, shape [B, 3, 64, 96]."""
     aspect: Tensor
     """Shape [B]."""
-    focal: Tensor
-    """What the network is given of the focal length: its logarithm or NaN, shape [B]."""
     numbers: Tensor
     """The truth, as `DrawnCameras.numbers`."""
-    field: Tensor
-    """As `DrawnCameras.field`."""
 
 
 def read_panoramas(paths: Sequence[Path], device: torch.device | str) -> Panoramas:
@@ -245,7 +225,7 @@ def with_blur(photo: Tensor, cameras: DrawnCameras, coarseness: Tensor, rows: Te
     """Blur photos until each has the blur that it should, as far as its panorama allows.
 
     Args:
-        photo: Shape [B, 3, 128, 192].
+        photo: Shape [B, 3, 64, 96].
         cameras: Of the photos.
         coarseness: Of their panoramas, shape [B].
         rows: The blur, in the units of `warpir.calibration.network.BLUR`, shape [B].
@@ -278,6 +258,4 @@ def draw_batch(panoramas: Panoramas, count: int, generator: torch.Generator) -> 
     is_blank = draw.chance(BLANK_SHARE, 1, 1, 1)
     photo = torch.where(is_blank, photo.mean(dim=(2, 3), keepdim=True), photo)
     photo = erase(draw_faults(photo, generator), ERASE_SHARE, generator)
-    unknown = torch.full_like(cameras.focal, math.nan)
-    focal = torch.where(draw.chance(KNOWN_SHARE), cameras.focal.log(), unknown)
-    return CameraBatch(photo, cameras.aspect, focal, cameras.numbers(), cameras.field())
+    return CameraBatch(photo, cameras.aspect, cameras.numbers())
