@@ -7,11 +7,14 @@ import pytest
 import torch
 
 from warpir.calibration.estimate import estimate_camera
+from warpir.calibration.lines import find_segments, upright_tilt
 from warpir.calibration.network import (
+    FINE_DIRECTIONS,
     HEIGHT,
     NUMBERS,
     WIDTH,
     CalibratorConfig,
+    describe,
     load_calibrator,
     random_calibrator,
     save_calibrator,
@@ -21,7 +24,7 @@ from warpir.calibration.network import (
 from warpir.core.errors import ExitCode, InputError
 from warpir.scene.camera import camera_from_fov
 
-SMALL = CalibratorConfig(channels=(8, 16), blocks=(1, 1), depth=1, heads=2)
+SMALL = CalibratorConfig(hidden=16)
 
 
 def test_file_gives_the_same_network_back(tmp_path: Path) -> None:
@@ -52,8 +55,7 @@ def test_damaged_file_is_refused(tmp_path: Path) -> None:
 def test_mirrored_photo_gives_the_mirrored_camera() -> None:
     network = random_calibrator(1, SMALL)
     with torch.no_grad():
-        for answer in network.numbers.values():
-            answer[-1].weight.mul_(100.0)  # a random network's distributions are nearly even
+        network.layers[-1].weight.mul_(50.0)  # a random network's distributions are nearly even
     photo = np.random.default_rng(1).random((96, 144, 3)).astype(np.float32)
     plain = estimate_camera(photo, network)
     mirrored = estimate_camera(photo[:, ::-1].copy(), network)
@@ -90,6 +92,18 @@ def test_seen_photo_keeps_its_mean_and_its_ramp() -> None:
     assert small.shape == (1, 3, HEIGHT, WIDTH)
     centres = (torch.arange(WIDTH) + 0.5) / WIDTH
     assert small[0, 1, 7, 8:-8] == pytest.approx(centres[8:-8], abs=2e-3)
+
+
+def test_features_follow_the_photo_before_it_was_stretched() -> None:
+    """An edge at 45 degrees is one in every shape of photo."""
+    for height, width in ((400, 600), (600, 400), (500, 500)):
+        down, across = np.mgrid[:height, :width]
+        edge = np.clip((across - width / 2 + down - height / 2) / 20.0 + 0.5, 0.0, 1.0)
+        photo = torch.from_numpy(edge.astype(np.float32))[None, None].expand(1, 3, -1, -1)
+        features = describe(seen(photo), torch.tensor([width / height]))
+        whole = features[0, -1 - FINE_DIRECTIONS : -1]
+        # The brightness rises to the right and down: 135 degrees from the right, upward.
+        assert int(whole.argmax()) == pytest.approx(0.75 * FINE_DIRECTIONS, abs=1)
 
 
 def test_soften_has_the_asked_standard_deviation() -> None:
@@ -133,3 +147,30 @@ def test_positive_roll_lets_the_horizon_fall_to_the_right() -> None:
     assert right[1] > left[1]
     slope = (right[1] - left[1]) / (right[0] - left[0])
     assert slope == pytest.approx(np.tan(np.radians(10.0)))
+
+
+def test_upright_edges_tell_pitch_and_roll() -> None:
+    """Posts in front of a known camera, found from a first guess that is far off."""
+    photo = np.full((40, 60, 3), 0.5, np.float32)
+    start = estimate_camera(photo, random_calibrator(0, SMALL), vfov_deg=50.0)
+    known = {"roll_deg": 6.0, "pitch_deg": -12.0, "principal": (0.5, 0.5)}
+    camera = type(start)(**vars(start) | known).camera(480, 320, 1.6)
+    posts = [(x, z) for x in np.linspace(-4.0, 4.0, 9) for z in (-6.0, -9.0)]
+    ends = [camera.project(np.array([[x, 0.2, z], [x, 1.8, z]])).ravel() for x, z in posts]
+    rng = np.random.default_rng(0)
+    clutter = rng.uniform(0.0, 300.0, (6, 4))
+    segments = np.concatenate([np.array(ends) + 0.2 * rng.normal(size=(18, 4)), clutter])
+    tilt = upright_tilt(segments, (240.0, 160.0), camera.fx, -4.0, 1.0)
+    assert tilt is not None
+    assert tilt.pitch_deg == pytest.approx(-12.0, abs=1.5)
+    assert tilt.roll_deg == pytest.approx(6.0, abs=0.5)
+    assert upright_tilt(segments[:8], (240.0, 160.0), camera.fx, -4.0, 1.0) is None
+
+
+def test_segments_of_a_drawn_post() -> None:
+    photo = np.zeros((200, 300, 3), np.float32)
+    photo[20:180, 140:160] = 1.0
+    segments = find_segments(photo)
+    upright = segments[np.abs(segments[:, 0] - segments[:, 2]) < 3.0]
+    assert len(upright) >= 2
+    assert {round(x / 20.0) for x in upright[:, 0]} <= {7, 8}

@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
+import torch.nn.functional as F
 
+from warpir.calibration import lines
 from warpir.calibration.network import NUMBERS, Calibrator, load_calibrator, seen
 from warpir.core.arrays import FloatArray
 from warpir.core.errors import InputError
@@ -15,6 +17,8 @@ from warpir.scene.camera import Camera
 
 NETWORK = "network"
 """Name of the network among the witnesses."""
+LINES = "vanishing point of upright edges"
+"""Name of the second witness."""
 
 
 @dataclass(frozen=True)
@@ -45,7 +49,7 @@ class CameraEstimate:
     principal_sigma: tuple[float, float]
     """Standard deviations of the principal point, in the same shares."""
     witnesses: tuple[str, ...]
-    """What the estimate rests on, such as ``network``."""
+    """What the estimate rests on: `NETWORK`, and `LINES` where enough straight edges agree."""
 
     def camera(self, width: int, height: int, camera_height: float) -> Camera:
         """Return the estimated camera at (0, camera_height, 0), turned toward -Z.
@@ -105,7 +109,7 @@ def estimate_camera(
         vfov_deg = math.degrees(fov)
     else:
         fov_sigma = 0.0
-    return CameraEstimate(
+    estimate = CameraEstimate(
         pitch_deg=value["pitch"],
         roll_deg=value["roll"],
         vfov_deg=vfov_deg,
@@ -116,3 +120,51 @@ def estimate_camera(
         principal_sigma=(sigma["x"], sigma["y"]),
         witnesses=(NETWORK,),
     )
+    return _with_lines(estimate, picture.cpu())
+
+
+def _with_lines(estimate: CameraEstimate, picture: torch.Tensor) -> CameraEstimate:
+    """Join an estimate with the tilt that upright edges tell, by inverse variances.
+
+    Args:
+        estimate: The network's.
+        picture: The photo, display-encoded, shape [H, W, 3].
+    """
+    height, width = picture.shape[:2]
+    factor = min(1.0, lines.LONGER_SIDE / max(height, width))
+    size = (max(1, round(height * factor)), max(1, round(width * factor)))
+    if min(size) < lines.SHORTEST:
+        return estimate
+    small = F.interpolate(picture.permute(2, 0, 1)[None], size, mode="bilinear", antialias=True)
+    camera = estimate.camera(size[1], size[0], 1.0)
+    tilt = lines.upright_tilt(
+        lines.find_segments(small[0].permute(1, 2, 0).numpy()),
+        (camera.cx, camera.cy),
+        camera.fx,
+        estimate.pitch_deg,
+        estimate.roll_deg,
+    )
+    if tilt is None:
+        return estimate
+    pitch, pitch_sigma = _joined(
+        (estimate.pitch_deg, estimate.pitch_sigma_deg), (tilt.pitch_deg, lines.PITCH_SIGMA_DEG)
+    )
+    roll, roll_sigma = _joined(
+        (estimate.roll_deg, estimate.roll_sigma_deg), (tilt.roll_deg, lines.ROLL_SIGMA_DEG)
+    )
+    return replace(
+        estimate,
+        pitch_deg=pitch,
+        pitch_sigma_deg=pitch_sigma,
+        roll_deg=roll,
+        roll_sigma_deg=roll_sigma,
+        witnesses=(*estimate.witnesses, LINES),
+    )
+
+
+def _joined(*witnesses: tuple[float, float]) -> tuple[float, float]:
+    """Return the mean of values by inverse variance, and its standard deviation."""
+    weights = [1.0 / max(sigma, 1e-3) ** 2 for _, sigma in witnesses]
+    total = sum(weights)
+    mean = sum(w * value for w, (value, _) in zip(weights, witnesses, strict=True)) / total
+    return mean, total**-0.5
