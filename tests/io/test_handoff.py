@@ -19,7 +19,15 @@ from PIL.PngImagePlugin import PngInfo
 
 from tests import oracles
 from tests.builders.gltf_files import Builder
-from tests.builders.insertions import ALWAYS, arguments, go, read_image, write_inputs
+from tests.builders.insertions import (
+    ALWAYS,
+    arguments,
+    go,
+    read_image,
+    read_layers,
+    rgb,
+    write_inputs,
+)
 from tests.builders.llvm import LIBRARY, llvm
 from tests.io.test_envmap_conventions import radiance, read, threejs
 from warpir.app.config import InsertConfig
@@ -31,6 +39,7 @@ from warpir.io import export as handoff
 from warpir.io.assets import load_asset
 from warpir.io.cameras.reader import read_camera
 from warpir.io.export import CUBE_SIZE, tone_curve_cube, web_map
+from warpir.look.response import Response
 from warpir.scene.light import fibonacci
 from warpir.scene.tone_curves import ToneKnots
 
@@ -270,6 +279,29 @@ def test_cube_of_a_run_is_the_identity_and_says_what_it_maps(folder: Path) -> No
         x = np.linspace(0.0, 1.0, CUBE_SIZE)
         np.testing.assert_allclose(lut.table, np.stack([x] * 3, -1), atol=CUBE_ABS)  # type: ignore[attr-defined]
         assert layer in lut.comments[0] and "clipped" in lut.comments[0]  # type: ignore[attr-defined]
+
+
+def test_response_is_a_step_of_its_own(folder: Path) -> None:
+    """`response.cube` and `curves.json` take the object of a run without it to that with it."""
+    changes = {"light": str(folder / "lobes.exr"), "sharpness": "off", "grain": "off"}
+    runs = {}
+    for name, response in (("plain", "off"), ("bent", "1.3")):
+        out = folder / name
+        runs[name] = go(arguments(folder, out, response=response, **changes), out)
+    before, after = (read_layers(folder / name / "layers.exr") for name in runs)
+    seen = before["fg.A"] > 0.9
+    np.testing.assert_array_equal(before["fg.A"], after["fg.A"])
+    lut = read_cube(folder / "bent" / "response.cube")
+    share = before["fg.A"][seen][:, None]
+    bent = lut.apply(rgb(before, "fg.")[seen] / share) * share  # type: ignore[attr-defined]
+    np.testing.assert_allclose(rgb(after, "fg.")[seen], bent, atol=1e-3)
+    assert np.abs(rgb(after, "fg.")[seen] - rgb(before, "fg.")[seen]).max() > 0.01
+    knots = json.loads((folder / "bent" / "curves.json").read_text())["response"]
+    np.testing.assert_allclose(knots["y"], Response(1.3).knots().y)
+    assert runs["bent"].record["measured"]["look"]["response"]["exponent"] == 1.3
+    assert "contrast 1.30" in (folder / "bent" / "report.html").read_text("utf-8")
+    assert not (folder / "plain" / "response.cube").exists()
+    assert "response" not in json.loads((folder / "plain" / "curves.json").read_text())
 
 
 # -------------------------------------------------------------------------------------- light

@@ -1,6 +1,6 @@
 """From radiance to the picture: both composites agree, parts add up, resizing, ball preview."""
 
-from dataclasses import fields
+from dataclasses import fields, replace
 
 import numpy as np
 import pytest
@@ -12,7 +12,9 @@ from tests.oracles import composite, encode, luminance, reinhard, spline
 from warpir.core.arrays import CodeArray, Int64Array
 from warpir.io.images.photos import Photo
 from warpir.look.camera_look import CameraLook
+from warpir.look.denoise import denoiser_version
 from warpir.look.grain import Grain
+from warpir.look.response import Response
 from warpir.look.sharpness import EdgeBlur
 from warpir.render.bridge import ComposeConstants, compose
 from warpir.render.composite import Picture, Quality, as_file_map, balls, make_picture, resize
@@ -225,10 +227,10 @@ def test_geometry_layers_describe_the_surface(device: str) -> None:
     np.testing.assert_allclose(layers.roughness[ball], 0.3, rtol=1e-6)
 
 
-def test_blur_and_grain_recompose(device: str) -> None:
+def test_blur_response_and_grain_recompose(device: str) -> None:
     """The layers add up with a camera's look too, and what did not change keeps its codes."""
     light, knots = sunny(), (ToneKnots.identity(1), ToneKnots.identity(3))
-    look = CameraLook(EdgeBlur(1.0, 0), Grain((0.5,), ((0.02,) * 3,), 0.5, 0.3))
+    look = CameraLook(EdgeBlur(1.0, 0), Grain((0.5,), ((0.02,) * 3,), 0.5, 0.3), Response(1.2))
     plain = make_picture(renderer(device), light, light, photo(), QUALITY, *knots)
     final = make_picture(renderer(device), light, light, photo(), QUALITY, *knots, look=look)
     layers = final.layers
@@ -245,6 +247,27 @@ def test_blur_and_grain_recompose(device: str) -> None:
     assert (layers.matte == 1.0).sum() < (plain.layers.matte == 1.0).sum()
     again = make_picture(renderer(device), light, light, photo(), QUALITY, *knots, look=look)
     np.testing.assert_array_equal(again.image, final.image)
+
+
+@pytest.mark.skipif(denoiser_version() is None, reason="pyoidn is not installed")
+def test_denoised_picture_is_nearer_to_the_truth(device: str) -> None:
+    """Less error on object and shadow; layers recompose, parts add up, other pixels keep codes."""
+    light, knots = sunny(), (ToneKnots.identity(1), ToneKnots.identity(3))
+
+    def final(samples: int, is_denoised: bool) -> Picture:
+        quality = replace(QUALITY, samples=samples, is_denoised=is_denoised)
+        return make_picture(renderer(device), light, light, photo(), quality, *knots)
+
+    truth, noisy, clean = final(512, False), final(8, False), final(8, True)
+    for where in (truth.layers.matte > 0.5, truth.changed & (truth.layers.matte == 0.0)):
+        before, after = (np.abs(p.image - truth.image)[where].mean() for p in (noisy, clean))
+        assert after < before
+    layers = clean.layers
+    parts = layers.diffuse + layers.specular + layers.emission
+    np.testing.assert_allclose(parts, layers.foreground[..., :3], atol=1e-3)
+    codes = photo().encode(clean.image, clean.changed)
+    np.testing.assert_array_equal(codes[~clean.changed], photo().codes[~clean.changed])
+    np.testing.assert_array_equal(final(8, True).image, clean.image)
 
 
 @pytest.mark.parametrize("size", [(24, 16), (96, 64), (31, 21)], ids=["half", "double", "odd"])

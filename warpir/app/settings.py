@@ -181,6 +181,9 @@ class RenderConfig:
     indirect_limit: float = option(8.0, "RADIANCE", low=0)
     """Most radiance after a path's first bounce (0: any); the limit removes bright specks where a
     mirror throws sunlight onto the object"""
+    denoise: str = option("auto", "auto|off", expert=True, choices=("auto", "off"))
+    """Take the renderer's noise out of object and shadow; auto: where pyoidn is installed (pip
+    install warpir[denoise])"""
     width: int | None = option(None, "W", low=8, high=65_536)
     """Width at which the object is rendered (default: the photo's); [px]"""
     device: str | None = option(None, "NAME")
@@ -200,6 +203,11 @@ class LookConfig:
     sharpness: float | str = option("auto", "auto|off|PX", choices=AUTO, low=0, high=32)
     """Blur of the object [px]; auto: that of the photo's sharpest edges around it; a value is the
     standard deviation"""
+    response: float | str = option(
+        "auto", "auto|off|EXPONENT", expert=True, choices=AUTO, low=0.25, high=4
+    )
+    """Contrast of the object's dark and bright tones; auto: as the photo's values suggest, where no
+    tone curve was recovered; a value is the slope at mid grey over that of gamma 2.2"""
     grain: float | str = option("auto", "auto|off|CODES", choices=AUTO, low=0, high=64)
     """Noise on object and shadow; auto: the photo's; a value is the standard deviation in codes of
     255"""

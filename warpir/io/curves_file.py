@@ -2,9 +2,11 @@
 
     {"format": "warpir-curves", "version": 1, "tone": "linear",
      "foreground": {"x": [[0, ..., 1]], "y": [[0, ..., 1]], "slope": [[1, ..., 1]]},
-     "shadow_ratio": {...}}
+     "shadow_ratio": {...}, "response": {...}}
 
-``tone`` is the operator between radiance and the foreground's curve.
+``tone`` is the operator between radiance and the foreground's curve. ``response`` is there where
+the picture repeats a camera's response (`warpir.look.response`), which follows both; it belongs to
+the picture, is estimated from each photo, and is not read back.
 """
 
 from __future__ import annotations
@@ -28,11 +30,13 @@ END_TOLERANCE = 1e-6
 """How far the outer knots may be from 0 and 1 [1]: a rounding, not another curve."""
 
 
-def curves_to_json(curves: Curves) -> dict[str, Any]:
-    """Return what `read_curves` reads."""
+def curves_to_json(curves: Curves, response: ToneKnots | None = None) -> dict[str, Any]:
+    """Return what `read_curves` reads, and the response that follows the curves."""
     content: dict[str, Any] = {"format": FORMAT, "version": VERSION, "tone": curves.tone}
-    for name in CURVE_COUNTS:
-        knots: ToneKnots = getattr(curves, name)
+    written = {name: getattr(curves, name) for name in CURVE_COUNTS}
+    if response is not None:
+        written["response"] = response
+    for name, knots in written.items():
         content[name] = {
             "x": knots.x.tolist(),
             "y": knots.y.tolist(),

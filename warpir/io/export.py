@@ -26,6 +26,7 @@ from warpir.scene.tone_curves import Curves, ToneKnots
 
 PHOTO, OBJECT, BLENDER_SETUP = "photo.png", "object.glb", "blender_setup.py"
 OBJECT_CURVE, SHADOW_CURVE = "tone_curve_object.cube", "tone_curve_shadow.cube"
+RESPONSE = "response.cube"
 
 CUBE_SIZE = 4096
 """Entries of a tone curve's table: interpolated, a curve of the narrowest bins is right to 1e-3."""
@@ -44,6 +45,7 @@ def write_hand_off(
     curves: Curves,
     texels: FloatArray,
     envmap: str = "envmap.exr",
+    response: ToneKnots | None = None,
 ) -> tuple[dict[str, Any], tuple[str, ...]]:
     """Stage the files for other tools.
 
@@ -56,6 +58,7 @@ def write_hand_off(
         curves: Tone curves of the picture.
         texels: The light on the object, relative [W/(m^2 sr)], shape [He, 2 He, 3].
         envmap: Name of the file that holds that map.
+        response: The camera's, which the picture repeats behind the curves.
 
     Returns:
         Numbers for ``run.json``, and notices.
@@ -63,8 +66,7 @@ def write_hand_off(
     Raises:
         InputError: The disk is full (exit 5).
     """
-    output.write_bytes(OBJECT_CURVE, tone_curve_cube(curves.foreground, _OBJECT_TEXT[curves.tone]))
-    output.write_bytes(SHADOW_CURVE, tone_curve_cube(curves.shadow_ratio, _SHADOW_TEXT))
+    _write_curves(output, curves, response)
     web, clamped = web_map(texels)
     output.write_hdr("envmap_web.hdr", web)
     output.write_bytes(OBJECT, write_glb(asset, placement.asset_to_world, camera))
@@ -86,11 +88,23 @@ def write_hand_off(
 
 # -------------------------------------------------------------------------------- tone curves
 
-_OBJECT_TEXT = {
-    "linear": "radiance clipped to [0, 1] -> fg.RGB of layers.exr, coverage divided out",
-    "reinhard": "x / (1 + x) of radiance x -> fg.RGB of layers.exr, coverage divided out",
+_RADIANCE = {
+    "linear": "radiance clipped to [0, 1]",
+    "reinhard": "x / (1 + x) of radiance x",
 }
-_SHADOW_TEXT = "shadow ratio clipped to [0, 1] -> shadow.RGB of layers.exr"
+
+
+def _write_curves(output: OutputFolder, curves: Curves, response: ToneKnots | None) -> None:
+    """Write the tables; each states what it maps to what."""
+    of_object, of_shadow = "fg.RGB of layers.exr, coverage divided out", "shadow.RGB of layers.exr"
+    if response is not None:
+        of_object, of_shadow = f"input of {RESPONSE}", f"share of the light before {RESPONSE}"
+        about = "what the tone curve gives -> fg.RGB of layers.exr, coverage divided out"
+        output.write_bytes(RESPONSE, tone_curve_cube(response, about))
+    about = f"{_RADIANCE[curves.tone]} -> {of_object}"
+    output.write_bytes(OBJECT_CURVE, tone_curve_cube(curves.foreground, about))
+    about = f"shadow ratio clipped to [0, 1] -> {of_shadow}"
+    output.write_bytes(SHADOW_CURVE, tone_curve_cube(curves.shadow_ratio, about))
 
 
 def tone_curve_cube(knots: ToneKnots, about: str) -> bytes:

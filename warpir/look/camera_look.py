@@ -9,6 +9,7 @@ import numpy as np
 
 from warpir.core.arrays import AnyFloatArray, BoolArray, Float64Array, FloatArray
 from warpir.look.grain import Grain, estimate_grain, grain_over
+from warpir.look.response import Response, estimate_response
 from warpir.look.sharpness import PIXEL_SIGMA, EdgeBlur, blurred_layers, estimate_blur
 
 UPSAMPLED = 2.5
@@ -21,11 +22,12 @@ SUMMED = ("foreground", "diffuse", "specular", "emission")
 
 @dataclass(frozen=True)
 class CameraLook:
-    """Blur and grain of a photo, where they are repeated on the object."""
+    """Blur, response and grain of a photo, where they are repeated on the object."""
 
     blur: EdgeBlur | None = None
     """Of the sharpest edges, given or estimated."""
     grain: Grain | None = None
+    response: Response | None = None
 
     def blur_to_add(self, enlarged: float = 1.0) -> float:
         """Return the Gaussian that a rendered object lacks [px].
@@ -55,6 +57,33 @@ class CameraLook:
         blurred["shadow_ratio"][unshaded] = 1.0
         return blurred
 
+    def shown_like_photo(
+        self, planes: dict[str, FloatArray], plate: FloatArray
+    ) -> dict[str, FloatArray]:
+        """Return the planes behind the photo's response; parts keep their share of the object.
+
+        Args:
+            planes: Those of `blurred_layers`.
+            plate: Display-linear photo, shape [H, W, 3].
+        """
+        if self.response is None:
+            return planes
+        changed = (*SUMMED, "shadow_ratio")
+        planes = planes | {name: planes[name].copy() for name in changed}
+        seen = planes["matte"] > 0.0
+        coverage = planes["matte"][seen][:, None]
+        before = planes["foreground"][seen]
+        after = self.response.colour(before / coverage) * coverage
+        share = after / np.maximum(before, 1e-30)
+        for name in ("diffuse", "specular", "emission"):
+            planes[name][seen] *= share
+        planes["foreground"][seen] = after
+        shaded = (planes["shadow_ratio"] != 1.0).any(axis=-1)
+        ratio = planes["shadow_ratio"][shaded]
+        bent = self.response.shadow_ratio(ratio, plate[shaded])
+        planes["shadow_ratio"][shaded] = np.where(ratio == 1.0, ratio, bent)
+        return planes
+
     def grain_on(
         self,
         composite: FloatArray,
@@ -72,6 +101,11 @@ class CameraLook:
     def lines(self) -> list[str]:
         """Return what was estimated, a sentence each."""
         found = []
+        if self.response is not None:
+            found.append(
+                f"the photo's blacks and highlights have the contrast {self.response.exponent:.2f} "
+                "of gamma 2.2, and so has the object (--response)"
+            )
         if self.blur is not None:
             found.append(
                 f"the photo's sharpest edges are blurred by {self.blur.sigma:.2f} px, and so is "
@@ -89,6 +123,7 @@ class CameraLook:
         return {
             "blur": None if self.blur is None else asdict(self.blur),
             "grain": None if self.grain is None else asdict(self.grain),
+            **({} if self.response is None else {"response": asdict(self.response)}),
         }
 
 
@@ -98,6 +133,7 @@ def estimate_look(
     region: BoolArray | None = None,
     sharpness: float | str = "auto",
     grain: float | str = "auto",
+    response: float | str = "off",
 ) -> CameraLook:
     """Estimate what a camera did to a photo.
 
@@ -107,6 +143,7 @@ def estimate_look(
         region: Where the object will stand; what surrounds it is looked at first, shape [H, W].
         sharpness: ``auto``, ``off``, or the standard deviation of the blur [px].
         grain: ``auto``, ``off``, or its standard deviation [codes of 255].
+        response: ``auto``, ``off``, or the exponent of its contrast [1].
     """
     look = CameraLook()
     if sharpness == "auto":
@@ -118,6 +155,10 @@ def estimate_look(
     elif grain != "off":
         strength = float(grain) / 255.0
         look = replace(look, grain=Grain((0.5,), ((strength,) * 3,), 0.0, 0.0))
+    if response == "auto":
+        look = replace(look, response=estimate_response(linear))
+    elif response != "off":
+        look = replace(look, response=Response(float(response)))
     return look
 
 

@@ -14,6 +14,7 @@ from warpir.io.images.photos import Photo
 from warpir.io.layers import Layers
 from warpir.kernels.types import LightArgs
 from warpir.look.camera_look import CameraLook
+from warpir.look.denoise import denoised_object, denoised_ratio
 from warpir.render.device_light import light_args
 from warpir.render.device_scene import Placed, Receiver, Scene
 from warpir.render.renderer import Foreground, GBuffer, Renderer
@@ -44,10 +45,23 @@ class Quality:
     seed: int
     indirect_limit: float = 0.0
     """Clamp on a path's indirect radiance; 0 for none, which is unbiased."""
+    is_denoised: bool = False
+    """Whether the noise of object and shadow is taken out (`warpir.look.denoise`)."""
 
 
 UNCHANGED = CameraLook()
 """Look of a camera that neither blurs nor has noise."""
+
+
+@dataclass(frozen=True)
+class Rendering:
+    """Object and shadow at the rendering's resolution, tone-mapped."""
+
+    planes: dict[str, FloatArray]
+    """``foreground`` (premultiplied), ``matte``, ``shadow_ratio``, the parts of the foreground and
+    the geometry, shape [H, W] or [H, W, 3]."""
+    object_pixel_count: int
+    receiver_pixel_count: int
 
 
 @dataclass(frozen=True)
@@ -83,18 +97,43 @@ def make_picture(
 ) -> Picture:
     """Render object and shadow at the scene camera's resolution and put them into the photo.
 
+    The arguments are those of `render` and `composite`.
+    """
+    rendering = render(
+        renderer,
+        light_fg,
+        light_shadow,
+        quality,
+        curve_fg,
+        curve_shadow,
+        is_reinhard,
+        shadow_mask=shadow_mask,
+    )
+    return composite(rendering, photo, quality.seed, occluder, look)
+
+
+def render(
+    renderer: Renderer,
+    light_fg: Light,
+    light_shadow: Light,
+    quality: Quality,
+    curve_fg: ToneKnots,
+    curve_shadow: ToneKnots,
+    is_reinhard: bool = True,
+    *,
+    shadow_mask: ShadowMask | None = None,
+) -> Rendering:
+    """Render object and shadow at the scene camera's resolution.
+
     Args:
         renderer: The scene; its camera may be smaller than the photo, never of another aspect.
         light_fg: Lights the object.
         light_shadow: Casts its shadow; often the same object as ``light_fg``.
-        photo: The photograph.
         quality: Samples, rays, depth, seed.
         curve_fg: One tone curve.
         curve_shadow: Three tone curves.
         is_reinhard: Whether Reinhard's operator precedes the foreground curve.
-        occluder: Share of the photo that stays in front of the object [1], shape [H, W].
         shadow_mask: Mask of the ground that is in shadow already.
-        look: What the camera did to the photo, to be repeated on object and shadow.
     """
     dimmed = light_fg if shadow_mask is None else without_lamps(light_fg, shadow_mask.at_object)
     args_fg = light_args(dimmed, renderer.device)
@@ -112,19 +151,61 @@ def make_picture(
     receiver_pixels, ratio = _shadow(
         renderer, args_shadow, light_shadow, gbuffer.object_pixels, quality, shadow_mask
     )
+    if quality.is_denoised:
+        camera = renderer.scene.camera
+        foreground = _denoised(foreground, gbuffer, camera)
+        ratio = denoised_ratio(ratio, receiver_pixels, (camera.height, camera.width))
     fg, beta = renderer.tone(foreground, ratio, curve_fg, curve_shadow, is_reinhard)
     planes = _planes(renderer.scene.camera, gbuffer, foreground, fg, (receiver_pixels, beta))
+    counts = len(gbuffer.object_pixels), len(receiver_pixels)
+    return Rendering(planes, *counts)
+
+
+def composite(
+    rendering: Rendering,
+    photo: Photo,
+    seed: int,
+    occluder: FloatArray | None = None,
+    look: CameraLook = UNCHANGED,
+) -> Picture:
+    """Put a rendering into the photo, behind what the photo's camera did.
+
+    Args:
+        rendering: Of a camera that may be smaller than the photo; its planes are not changed.
+        photo: The photograph.
+        seed: Of the grain.
+        occluder: Share of the photo that stays in front of the object [1], shape [H, W].
+        look: What the camera did to the photo, to be repeated on object and shadow.
+    """
+    planes = dict(rendering.planes)
+    enlarged = photo.srgb.shape[1] / planes["matte"].shape[1]
     if planes["matte"].shape != photo.srgb.shape[:2]:
         planes = _resize_planes(planes, *photo.srgb.shape[:2])
-    planes = look.sharpened_like_photo(planes, photo.srgb.shape[1] / renderer.scene.camera.width)
+    planes = look.sharpened_like_photo(planes, enlarged)
+    planes = look.shown_like_photo(planes, photo.linear())
     if occluder is not None:
         planes = _behind(planes, occluder)
     layers = _layers(planes, photo)
     changed = (layers.matte > 0.0) | (layers.shadow_ratio != 1.0).any(axis=-1)
-    layers = _with_grain(layers, look, changed, quality.seed, photo.is_deep)
+    layers = _with_grain(layers, look, changed, seed, photo.is_deep)
     image = linear_to_gamma(layers.composite).astype(np.float32)
-    counts = len(gbuffer.object_pixels), len(receiver_pixels)
+    counts = rendering.object_pixel_count, rendering.receiver_pixel_count
     return Picture(layers, image, changed, *counts, look)
+
+
+def _denoised(foreground: Foreground, gbuffer: GBuffer, camera: Camera) -> Foreground:
+    """Return the object without noise: its diffuse and its other reflections each by themselves."""
+    other = np.maximum(foreground.radiance - foreground.diffuse - foreground.emission, 0.0)
+    diffuse, other = denoised_object(
+        (foreground.diffuse, other),
+        foreground.mask,
+        gbuffer.base_color,
+        gbuffer.normal,
+        gbuffer.object_pixels,
+        (camera.height, camera.width),
+    )
+    radiance = diffuse + other + foreground.emission
+    return replace(foreground, radiance=radiance, diffuse=diffuse)
 
 
 def _shadow(

@@ -48,6 +48,7 @@ ABOUT_FILES = (
     ("curves.json", "Knots of the tone curves"),
     ("tone_curve_object.cube", "The object's tone curve as a table for Nuke, Resolve, OCIO"),
     ("tone_curve_shadow.cube", "The shadow's tone curves as a table"),
+    ("response.cube", "The camera's response, behind the tone curves, as a table"),
     ("camera.json", "The camera: --camera reads it back"),
     ("balls.png", "A mirror ball and a grey ball under the light"),
     ("materials.json", "Every material's factors, before and after: --materials reads them back"),
@@ -305,6 +306,7 @@ def figures(record: Mapping[str, Any]) -> Rows:
         ("pixels whose shadow was traced, as rendered", f"{measured['shadow_pixels']:,}"),
         ("pixels of the picture that differ from the photo", f"{measured['changed_pixels']:,}"),
         ("exposure of the light", f"{measured['exposure_ev']:+.2f} EV"),
+        *([("noise taken out by", found)] if (found := measured.get("denoiser")) else []),
         *_look(measured.get("look", {})),
     ]
     for key, what in (
@@ -319,6 +321,11 @@ def figures(record: Mapping[str, Any]) -> Rows:
 def _look(look: Mapping[str, Any]) -> Rows:
     """Return what of the photo's camera the object got; files of older runs say nothing."""
     rows: Rows = []
+    if response := look.get("response"):
+        text = f"contrast {response['exponent']:.2f} of gamma 2.2"
+        if response["black"] is not None:
+            text += f"; the photo's blacks are at code {255.0 * response['black']:.0f}"
+        rows.append(("response of the object, as of the photo", text))
     if blur := look.get("blur"):
         rows.append(("blur of the object, as of the photo's edges", f"{blur['sigma']:.2f} px"))
     if grain := look.get("grain"):

@@ -37,7 +37,7 @@ from warpir.report.panorama import Panorama, panorama, pose_of
 from warpir.report.pictures import before_and_after, jpeg, layers_shown, object_box
 from warpir.report.plots import Plot, Series, line_plot
 from warpir.report.words import LightCharacter, characterize, light_rows, origin_words
-from warpir.scene.tone_curves import Curves, ToneKnots
+from warpir.scene.tone_curves import Curves
 
 REPORT = "report.html"
 CLOCK, END = "<!--clock-->", "<!--/clock-->"
@@ -46,8 +46,6 @@ MADE_BY = b'<meta name="generator" content="warpir '
 """Marker of warpir's pages, within the first 4096 bytes."""
 LEAST_PHOTO = 8.0
 """Initial share of the photo at the comparison's slider [%]."""
-OPEN_END = 1e-3
-"""Largest distance from the diagonal of a tone curve that counts as the identity [1]."""
 
 
 @dataclass(frozen=True)
@@ -214,7 +212,7 @@ def _skies(results: Results) -> list[Panorama]:
 
 def _tone_plots(curves: Curves) -> list[Plot]:
     """Plot both tone curves; nothing where both are the identity."""
-    if all(_is_identity(knots) for knots in (curves.foreground, curves.shadow_ratio)):
+    if all(knots.is_identity for knots in (curves.foreground, curves.shadow_ratio)):
         return []
     x = np.linspace(0.0, 1.0, 101)
     unchanged = Series(np.array([0.0, 1.0]), np.array([0.0, 1.0]), "same")
@@ -230,11 +228,6 @@ def _tone_plots(curves: Curves) -> list[Plot]:
             line_plot([unchanged, *lines], title, ("in", "out"), x_range=unit, y_range=unit)
         )
     return plots
-
-
-def _is_identity(knots: ToneKnots) -> bool:
-    x = np.linspace(0.0, 1.0, 33)
-    return bool(np.abs(knots.evaluate(x) - x[:, None]).max() < OPEN_END)
 
 
 _TERMS = {

@@ -18,6 +18,7 @@ from warpir.io.lobes_file import lobes_to_json
 from warpir.io.results import OutputFolder
 from warpir.lighting.scene_light import SceneLight
 from warpir.look.camera_look import CameraLook, estimate_look, region_around
+from warpir.look.denoise import denoiser_version
 from warpir.render.composite import (
     UNCHANGED,
     Picture,
@@ -31,6 +32,7 @@ from warpir.render.renderer import Renderer
 from warpir.report.page import Results
 from warpir.scene.camera import Camera
 from warpir.scene.light import LightSummary, summarize
+from warpir.scene.tone_curves import ToneKnots
 
 PREVIEW_SAMPLES = 16
 """Camera samples per pixel of the preview of an unguided run."""
@@ -57,7 +59,7 @@ def render_result(run: Run, light: SceneLight) -> RenderedResult:
         placed = run.memory.again(
             lambda: scene_of(run.inputs, camera, run.device, light.curves), "the scene", "--asset"
         )
-    look = _look(run)
+    look = _look(run, light)
     with run.timings.stage("render"), progress_bar() as report:
         renderer = Renderer(placed, run.config.render.threads or 0, report, run.memory)
         quality = run.config.render
@@ -68,6 +70,7 @@ def render_result(run: Run, light: SceneLight) -> RenderedResult:
         "triangles": renderer.scene.triangle_count,
         "bad_pixels": renderer.bad_pixels.count,
         "memory_retries": run.memory.retries,
+        "denoiser": denoiser_version() if quality.denoise == "auto" else None,
     }
     return RenderedResult(picture, str(renderer.scene.device), measured)
 
@@ -86,16 +89,25 @@ def write_preview(run: Run, light: SceneLight) -> None:
     run.log.say(f"preview: {run.output.write_preview(0, codes, run.inputs.photo.icc)}")
 
 
-def _look(run: Run) -> CameraLook:
-    """Return what the camera did to the photo, as far as the object is to share it."""
+def _look(run: Run, light: SceneLight) -> CameraLook:
+    """Return what the camera did to the photo, as far as the object is to share it.
+
+    A recovered tone curve was judged beside the photo, so it holds the response already; Reinhard's
+    operator has a shoulder of its own, and a linear plate has no response.
+    """
     photo, asked = run.inputs.photo, run.config.look
     inputs = run.inputs
     corners = np.stack(np.meshgrid(*zip(*inputs.asset.bounds(), strict=True)), axis=-1)
     to_world = inputs.placement.asset_to_world
     world = corners.reshape(-1, 3) @ to_world[:3, :3].T + to_world[:3, 3]
     around = region_around(inputs.camera.project(world), photo.srgb.shape[0], photo.srgb.shape[1])
-    look = estimate_look(photo.srgb, photo.linear(), around, asked.sharpness, asked.grain)
-    if "auto" in (asked.sharpness, asked.grain):
+    response = asked.response
+    is_shown = light.curves.tone == "reinhard" or not light.curves.foreground.is_identity
+    if response == "auto" and (is_shown or photo.is_linear):
+        response = "off"
+    words = asked.sharpness, asked.grain, response
+    look = estimate_look(photo.srgb, photo.linear(), around, *words)
+    if "auto" in words:
         run.log.assume(*look.lines())
     return look
 
@@ -114,7 +126,14 @@ def _picture(
         light.on_object,
         light.light_shadow,
         inputs.photo,
-        Quality(samples, rays, quality.depth, quality.seed, quality.indirect_limit),
+        Quality(
+            samples,
+            rays,
+            quality.depth,
+            quality.seed,
+            quality.indirect_limit,
+            is_denoised=quality.denoise == "auto" and denoiser_version() is not None,
+        ),
         light.curves.foreground,
         light.curves.shadow_ratio,
         is_reinhard=light.curves.tone == "reinhard",
@@ -186,10 +205,11 @@ def write_results(run: Run, light: SceneLight, picture: Picture) -> Written:
         inputs=inputs.hashes,
     )
     maps = _write_light(output, light)
-    output.write_json("curves.json", curves_to_json(light.curves))
+    response = None if picture.look.response is None else picture.look.response.knots()
+    output.write_json("curves.json", curves_to_json(light.curves, response))
     output.write_json("camera.json", inputs.camera.record())
     pair = _write_balls(run, light)
-    handed = _hand_off(run, light, maps) if run.config.output.hand_off else {}
+    handed = _hand_off(run, light, maps, response) if run.config.output.hand_off else {}
     summary = summarize(light.light)
     _say_what_is_seen(run, summary, picture)
     measured = {
@@ -236,7 +256,9 @@ def _write_balls(run: Run, light: SceneLight) -> CodeArray:
     return pair
 
 
-def _hand_off(run: Run, light: SceneLight, maps: Maps) -> dict[str, Any]:
+def _hand_off(
+    run: Run, light: SceneLight, maps: Maps, response: ToneKnots | None
+) -> dict[str, Any]:
     """Write the files for Blender, three.js and colour tools; return entries of ``run.json``."""
     inputs = run.inputs
     handed, notices = write_hand_off(
@@ -248,6 +270,7 @@ def _hand_off(run: Run, light: SceneLight, maps: Maps) -> dict[str, Any]:
         light.curves,
         maps.on_object,
         maps.name_on_object,
+        response,
     )
     for line in notices:
         run.log.say(f"notice: {line}")

@@ -20,6 +20,9 @@ CURVE_COUNTS = {"foreground": 1, "shadow_ratio": 3}
 RESOLVED = 0.97
 """Largest display-linear value that counts as unclipped [1]."""
 
+UNSEEN = 1e-3
+"""Difference of display-linear values that counts as none [1]."""
+
 
 @dataclass(frozen=True)
 class ToneKnots:
@@ -33,6 +36,12 @@ class ToneKnots:
     def bin_count(self) -> int:
         """Number of bins."""
         return int(self.x.shape[1]) - 1
+
+    @property
+    def is_identity(self) -> bool:
+        """Whether no curve changes a value by as much as `UNSEEN`."""
+        x = np.linspace(0.0, 1.0, 33)
+        return bool(np.abs(self.evaluate(x) - x[:, None]).max() < UNSEEN)
 
     def arrays(self) -> tuple[FloatArray, FloatArray, FloatArray]:
         """Return the arrays in the kernels' order."""

@@ -1,0 +1,102 @@
+"""The camera's response: its curve, what it does to object and shadow, when it is estimated."""
+
+import numpy as np
+import pytest
+
+from warpir.core.arrays import FloatArray
+from warpir.look.camera_look import CameraLook, estimate_look
+from warpir.look.response import GREY, RANGE, Response, estimate_response
+
+
+def ramp(low: float, high: float) -> FloatArray:
+    """A picture whose display values run evenly from one to the other, decoded, [H, W, 3]."""
+    shown = np.linspace(low, high, 320)[None, :, None] * np.ones((200, 1, 3))
+    return (shown**2.2).astype(np.float32)
+
+
+@pytest.mark.parametrize("exponent", [0.8, 1.0, 1.1, 1.35])
+def test_curve_is_monotone_and_a_power_in_the_dark(exponent: float) -> None:
+    """Grey and both ends stay; below grey within .1 codes of the power; it never falls."""
+    response = Response(exponent)
+    x = np.linspace(0.0, 1.0, 2001)
+    y = response.colour(x)
+    assert (np.diff(y) > 0.0).all() and y[0] == 0.0 and y[-1] == 1.0
+    assert response.colour(np.array(GREY)) == pytest.approx(GREY, abs=1e-6)
+    dark = np.geomspace(0.0005, GREY, 200)
+    codes = 255.0 * response.colour(dark) ** (1 / 2.2)
+    wanted = 255.0 * (GREY * (dark / GREY) ** exponent) ** (1 / 2.2)
+    np.testing.assert_allclose(codes, wanted, atol=0.1)
+    bright = response.colour(np.array([0.3, 0.5, 0.8])) - [0.3, 0.5, 0.8]
+    assert (np.sign(bright.round(4)) == np.sign(exponent - 1.0)).all()
+
+
+def test_shadow_is_what_the_camera_shows_of_less_light() -> None:
+    """A photo of a scene through the curve, and the same scene under a share of the light."""
+    response = Response(1.25)
+    scene = np.random.default_rng(0).uniform(0.01, 0.9, (50, 3))
+    share = np.random.default_rng(1).uniform(0.1, 0.95, (50, 3)).astype(np.float32)
+    plate = response.colour(scene)
+    shaded = plate * response.shadow_ratio(share, plate)
+    np.testing.assert_allclose(shaded, response.colour(scene * share), atol=1e-5)
+    # What no curve shows, black and brighter than white, keeps its ratio.
+    odd = np.array([[0.0, 1.5, 0.0]], np.float32)
+    np.testing.assert_array_equal(response.shadow_ratio(share[:1], odd), share[:1])
+
+
+def test_layers_keep_their_parts_and_untouched_ground() -> None:
+    """Parts add up to the object, coverage stays, a ratio of exactly 1 stays exactly 1."""
+    rng = np.random.default_rng(2)
+    matte = rng.uniform(0.0, 1.0, (20, 30)).astype(np.float32)
+    matte[:5] = 0.0
+    parts = {
+        name: (rng.uniform(0.0, 0.3, (20, 30, 3)) * matte[..., None]).astype(np.float32)
+        for name in ("diffuse", "specular", "emission")
+    }
+    ratio = np.ones((20, 30, 3), np.float32)
+    ratio[10:, :, :2] = 0.4
+    planes = {"matte": matte, "shadow_ratio": ratio, "foreground": sum(parts.values()), **parts}
+    before = {name: plane.copy() for name, plane in planes.items()}
+    plate = np.full((20, 30, 3), 0.1, np.float32)
+    shown = CameraLook(response=Response(1.3)).shown_like_photo(planes, plate)
+    total = shown["diffuse"] + shown["specular"] + shown["emission"]
+    np.testing.assert_allclose(total, shown["foreground"], atol=1e-6)
+    np.testing.assert_array_equal(shown["matte"], before["matte"])
+    assert (shown["foreground"][:5] == 0.0).all()
+    assert (shown["shadow_ratio"][:10] == 1.0).all() and (shown["shadow_ratio"][..., 2] == 1).all()
+    assert (shown["shadow_ratio"][10:, :, :2] < 0.4).all()
+    seen = matte > 0.0
+    colour = before["foreground"][seen] / matte[seen][:, None]
+    wanted = Response(1.3).colour(colour) * matte[seen][:, None]
+    np.testing.assert_allclose(shown["foreground"][seen], wanted, atol=1e-6)
+
+
+@pytest.mark.parametrize(("low", "high"), [(0.45, 0.8), (0.7, 1.0), (0.25, 0.6), (1.0, 1.0)])
+def test_no_dark_regions_tell_nothing(low: float, high: float) -> None:
+    """Fog, snow, a pale wall and white: the curve stays the identity."""
+    assert estimate_response(ramp(low, high)) is None
+    look = estimate_look(ramp(low, high) ** (1 / 2.2), ramp(low, high), None, "off", "off", "auto")
+    assert look.response is None and look.record().keys() == {"blur", "grain"}
+
+
+def test_contrast_raises_the_estimate_within_its_range() -> None:
+    """The same scene through a steeper camera; black and the steepest pictures stay in range."""
+    rng = np.random.default_rng(3)
+    scene = np.exp(rng.normal(-3.0, 1.2, (60, 90, 1))) * rng.uniform(0.8, 1.2, (60, 90, 3))
+    scene = np.repeat(np.repeat(np.clip(scene, 0.0, 1.0), 4, axis=0), 4, axis=1)
+    found = [estimate_response(Response(c).colour(scene)) for c in (0.85, 1.0, 1.3)]
+    exponents = [r.exponent for r in found if r is not None]
+    assert len(exponents) == 3 and exponents[0] < exponents[1] < exponents[2]
+    for linear in (np.zeros((40, 60, 3), np.float32), ramp(0.0, 1.0) ** 8):
+        response = estimate_response(linear)
+        assert response is not None and RANGE[0] <= response.exponent <= RANGE[1]
+
+
+def test_words_and_numbers_decide() -> None:
+    """``off`` leaves it out, a number is taken as it is."""
+    photo = ramp(0.0, 1.0)
+    assert estimate_look(photo, photo, None, "off", "off", "off").response is None
+    given = estimate_look(photo, photo, None, "off", "off", 1.4)
+    assert given.response == Response(1.4) and given.record()["response"]["black"] is None
+    auto = estimate_look(photo, photo, None, "off", "off", "auto")
+    assert auto.response is not None and len(auto.lines()) == 1
+    assert auto.response.black is not None and auto.response.black < 0.02
