@@ -21,7 +21,7 @@ from warpir.io.images.photos import read_photo
 from warpir.io.layers import read_layers
 from warpir.look.camera_look import region_around
 
-HALF_WIDTH = 480
+HALF_WIDTH = 400
 """Width of each half of the picture [px]."""
 
 
@@ -74,7 +74,7 @@ def write_pair(path: Path, before: FloatArray, after: FloatArray, seen: FloatArr
         if image.width > HALF_WIDTH:
             image = image.resize((HALF_WIDTH, HALF_WIDTH), Image.Resampling.LANCZOS)
         halves.append(np.asarray(image))
-    Image.fromarray(np.concatenate(halves, axis=1)).save(path, quality=88)
+    Image.fromarray(np.concatenate(halves, axis=1)).save(path, quality=85)
 
 
 if __name__ == "__main__":
