@@ -74,7 +74,7 @@ class CameraEstimate:
 def estimate_camera(
     photo: FloatArray, network: Calibrator | None = None, vfov_deg: float | None = None
 ) -> CameraEstimate:
-    """Estimate the camera of a photo.
+    """Estimate the camera of a photo, by the network and by upright edges where enough agree.
 
     Args:
         photo: Display-encoded (sRGB) in [0, 1], shape [H, W, 3].
@@ -86,9 +86,19 @@ def estimate_camera(
         InputError: The photo has no pixels, or the network's file cannot be used
             (`ExitCode.MODEL`).
     """
+    return with_lines(network_estimate(photo, network or load_calibrator(), vfov_deg), photo)
+
+
+def network_estimate(
+    photo: FloatArray, network: Calibrator, vfov_deg: float | None = None
+) -> CameraEstimate:
+    """Estimate the camera of a photo by the network alone; arguments as of `estimate_camera`.
+
+    Raises:
+        InputError: The photo has no pixels.
+    """
     if photo.ndim != 3 or photo.shape[2] != 3 or 0 in photo.shape:
         raise InputError("--photo", f"no pixels (found an array of shape {list(photo.shape)})")
-    network = network or load_calibrator()
     device = network.spread.device
     height, width = photo.shape[:2]
     known = math.nan
@@ -109,7 +119,7 @@ def estimate_camera(
         vfov_deg = math.degrees(fov)
     else:
         fov_sigma = 0.0
-    estimate = CameraEstimate(
+    return CameraEstimate(
         pitch_deg=value["pitch"],
         roll_deg=value["roll"],
         vfov_deg=vfov_deg,
@@ -120,22 +130,22 @@ def estimate_camera(
         principal_sigma=(sigma["x"], sigma["y"]),
         witnesses=(NETWORK,),
     )
-    return _with_lines(estimate, picture.cpu())
 
 
-def _with_lines(estimate: CameraEstimate, picture: torch.Tensor) -> CameraEstimate:
+def with_lines(estimate: CameraEstimate, photo: FloatArray) -> CameraEstimate:
     """Join an estimate with the tilt that upright edges tell, by inverse variances.
 
     Args:
         estimate: The network's.
-        picture: The photo, display-encoded, shape [H, W, 3].
+        photo: Display-encoded in [0, 1], shape [H, W, 3].
     """
-    height, width = picture.shape[:2]
+    height, width = photo.shape[:2]
     factor = min(1.0, lines.LONGER_SIDE / max(height, width))
     size = (max(1, round(height * factor)), max(1, round(width * factor)))
     if min(size) < lines.SHORTEST:
         return estimate
-    small = F.interpolate(picture.permute(2, 0, 1)[None], size, mode="bilinear", antialias=True)
+    whole = torch.from_numpy(np.ascontiguousarray(photo, np.float32)).permute(2, 0, 1)[None]
+    small = F.interpolate(whole, size, mode="bilinear", antialias=True)
     camera = estimate.camera(size[1], size[0], 1.0)
     tilt = lines.upright_tilt(
         lines.find_segments(small[0].permute(1, 2, 0).numpy()),

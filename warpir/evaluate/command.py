@@ -189,18 +189,19 @@ def _evaluate_cameras(options: argparse.Namespace) -> None:
     network = load_calibrator(options.calibrator)
     files = find_files(options.panoramas, PANORAMA_SUFFIXES, "--panoramas")
     panoramas, notices = unlearned([p for p in files if SKY_ONLY not in p.stem], network)
+    measured = measure_cameras(panoramas, options.scenes, options.seed, options.width, network)
+    notices += measured.pop("notices")
     for notice in notices:
         say(f"notice: {notice}")
-    measured = measure_cameras(panoramas, options.scenes, options.seed, options.width, network)
     for line in lines_of(measured):
         say(line)
     if options.json is not None:
         record = {
+            "panoramas": measured.pop("panoramas"),
             "camera": measured,
             "scenes": options.scenes,
             "seed": options.seed,
             "width": options.width,
-            "panoramas": [path.stem for path in panoramas],
             "notices": notices,
         }
         write_file(options.json, (json.dumps(record, indent=1, allow_nan=False) + "\n").encode())

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -16,11 +16,11 @@ from typing import Any
 import numpy as np
 import torch
 
-from warpir.calibration.estimate import CameraEstimate, estimate_camera
+from warpir.calibration.estimate import LINES, CameraEstimate, network_estimate, with_lines
 from warpir.calibration.network import Calibrator
 from warpir.core.arrays import FloatArray
 from warpir.core.errors import InputError
-from warpir.train.camera.crops import ASPECTS, DrawnCameras, cut, read_panoramas
+from warpir.train.camera.crops import ASPECTS, DrawnCameras, Panoramas, cut, read_panoramas
 from warpir.train.photo_look import draw_faults, draw_looks
 from warpir.train.sampler import Sampler
 
@@ -58,21 +58,17 @@ def constant_camera(aspect: float) -> dict[str, float]:
 
 
 def photograph(
-    path: Path, cameras: DrawnCameras, width: int, generator: torch.Generator
+    panorama: Panoramas, cameras: DrawnCameras, width: int, generator: torch.Generator
 ) -> FloatArray:
     """Return one photograph as a camera would store it, display-encoded, shape [H, W, 3].
 
     Args:
-        path: The panorama.
+        panorama: One, on the CPU.
         cameras: One camera; its aspect is that of whole multiples of `SIDE`.
         width: Longer side [px].
         generator: On the CPU: of azimuth, look and faults.
-
-    Raises:
-        InputError: The panorama cannot be used.
     """
     draw = Sampler(1, generator)
-    panorama = read_panoramas([path], "cpu")
     size = _size(float(cameras.aspect[0]), width)
     # Four rays a pixel.
     radiance = cut(panorama, cameras, torch.zeros(1), draw, (2 * size[0], 2 * size[1]))
@@ -117,69 +113,97 @@ def measure_cameras(
         network: That estimates.
 
     Returns:
-        ``estimated`` and ``constant``, each with ``pitch_deg``, ``roll_deg`` and ``vfov_deg``:
-        ``median`` and ``mean`` absolute error; the first also ``within_sigma``, the share of errors
-        within one estimated standard deviation, and ``seconds`` per photograph (median).
+        ``estimated``, ``network`` (the same without upright edges) and ``constant``, each with
+        ``pitch_deg``, ``roll_deg`` and ``vfov_deg``: ``median`` and ``mean`` absolute error; the
+        first also ``within_sigma``, the share of errors within one estimated standard deviation,
+        ``seconds`` per photograph (median) and ``with_lines``, the share of photographs in which
+        enough upright edges agree; ``panoramas``, the names of those that were photographed; and
+        ``notices``, what could not be read.
 
     Raises:
-        InputError: A panorama cannot be used.
+        InputError: None of the panoramas can be used.
     """
-    if not panoramas:
-        raise InputError("--panoramas", "none with a ground", "sky-only maps show no camera")
     generator = torch.Generator().manual_seed(seed)
-    rounds = math.ceil(scenes / len(panoramas))
-    shuffled = np.random.default_rng(seed)
-    order = [panoramas[k] for _ in range(rounds) for k in shuffled.permutation(len(panoramas))]
     drawn = even_cameras(Sampler(scenes, generator))
-    estimated, constant, covered = Errors(), Errors(), Errors()
-    seconds = []
-    for row, path in enumerate(order[:scenes]):
+    errors: dict[str, Errors] = {"estimated": {}, "network": {}, "constant": {}}
+    covered = Errors()
+    seconds, by_lines, used = [], 0, set[str]()
+    notices: list[str] = []
+    for row, (panorama, name) in enumerate(_shuffled(panoramas, scenes, seed, notices)):
+        used.add(name)
         one = DrawnCameras(**{k: v[row : row + 1] for k, v in vars(drawn).items()})
         height, columns = _size(float(one.aspect[0]), width)
         one = replace(one, aspect=torch.tensor([columns / height]))
-        photo = photograph(path, one, width, generator)
+        photo = photograph(panorama, one, width, generator)
         began = time.perf_counter()
-        estimate = estimate_camera(photo, network)
+        alone = network_estimate(photo, network)
+        estimate = with_lines(alone, photo)
         seconds.append(time.perf_counter() - began)
-        _add(estimated, covered, constant, estimate, truth_of(one, 0), columns / height)
-    return {
-        "estimated": {
-            name: _summary(values) | {"within_sigma": float(np.mean(covered[name]))}
-            for name, values in estimated.items()
-        }
-        | {"seconds": float(np.median(seconds))},
-        "constant": {name: _summary(values) for name, values in constant.items()},
-    }
+        by_lines += LINES in estimate.witnesses
+        truth = truth_of(one, 0)
+        _add(errors["estimated"], truth, vars(estimate))
+        _add(errors["network"], truth, vars(alone))
+        _add(errors["constant"], truth, constant_camera(columns / height))
+        _add_covered(covered, truth, estimate)
+    summary: dict[str, Any] = {row: _summary(parts) for row, parts in errors.items()}
+    for name, inside in covered.items():
+        summary["estimated"][name]["within_sigma"] = float(np.mean(inside))
+    summary["estimated"]["seconds"] = float(np.median(seconds))
+    summary["estimated"]["with_lines"] = by_lines / scenes
+    summary |= {"panoramas": sorted(used), "notices": notices}
+    return summary
 
 
-def _add(
-    estimated: Errors,
-    covered: Errors,
-    constant: Errors,
-    estimate: CameraEstimate,
-    truth: dict[str, float],
-    aspect: float,
-) -> None:
-    """Append the errors of one photograph to the lists by number."""
-    assumed = constant_camera(aspect)
+def _shuffled(
+    panoramas: Sequence[Path], scenes: int, seed: int, notices: list[str]
+) -> Iterator[tuple[Panoramas, str]]:
+    """Yield so many panoramas and their names, all in a new order each round.
+
+    Raises:
+        InputError: None of them can be used.
+    """
+    left, order = list(panoramas), np.random.default_rng(seed)
+    while left and scenes > 0:
+        for path in [left[k] for k in order.permutation(len(left))][:scenes]:
+            try:
+                panorama = read_panoramas([path], "cpu")
+            except InputError as error:
+                notices.append(f"left out: {error.where}: {error.what}")
+                left.remove(path)
+            else:
+                scenes -= 1
+                yield panorama, path.stem
+    if scenes > 0:
+        raise InputError("--panoramas", "none can be used", "sky-only maps show no camera")
+
+
+def _add(errors: Errors, truth: dict[str, float], found: dict[str, Any]) -> None:
+    """Append the absolute errors of one photograph to the lists by number."""
     for name, true in truth.items():
-        error = abs(getattr(estimate, name) - true)
+        errors.setdefault(name, []).append(abs(found[name] - true))
+
+
+def _add_covered(covered: Errors, truth: dict[str, float], estimate: CameraEstimate) -> None:
+    """Append whether each number lies within its standard deviation."""
+    for name, true in truth.items():
         sigma = getattr(estimate, name.replace("_deg", "_sigma_deg"))
-        estimated.setdefault(name, []).append(error)
-        covered.setdefault(name, []).append(float(error <= sigma))
-        constant.setdefault(name, []).append(abs(assumed[name] - true))
+        inside = abs(getattr(estimate, name) - true) <= sigma
+        covered.setdefault(name, []).append(float(inside))
 
 
-def _summary(values: list[float]) -> dict[str, float]:
-    """Return median and mean."""
-    return {"median": float(np.median(values)), "mean": float(np.mean(values))}
+def _summary(errors: Errors) -> dict[str, dict[str, float]]:
+    """Return median and mean of each number's errors."""
+    return {
+        name: {"median": float(np.median(values)), "mean": float(np.mean(values))}
+        for name, values in errors.items()
+    }
 
 
 def lines_of(measured: dict[str, Any]) -> list[str]:
     """Return the errors as a table, one line of text each."""
     head = "| camera | pitch, median / mean [deg] | roll | vertical field of view |"
     lines = [head, "|---|---|---|---|"]
-    for row in ("estimated", "constant"):
+    for row in ("estimated", "network", "constant"):
         cells = [
             f"{measured[row][name]['median']:.2f} / {measured[row][name]['mean']:.2f}"
             for name in ("pitch_deg", "roll_deg", "vfov_deg")

@@ -277,8 +277,14 @@ def measure(network: Calibrator, photos: Drawn) -> dict[str, float]:
 
 
 def calibrate(network: Calibrator, photos: Drawn) -> None:
-    """Set the network's spread, so that 68 % of errors lie within one standard deviation."""
+    """Set the network's spread, so that 68 % of errors of each angle lie within one sigma.
+
+    The principal point keeps its distribution's own width: most photos are centred, and a factor
+    that suits those would make the network look sure of the others.
+    """
     network.spread.fill_(1.0)
     error, spread = errors_of(network, photos)
-    factors = [torch.quantile(error[n] / spread[n].clamp(min=1e-6), COVERAGE) for n in error]
-    network.spread.copy_(torch.stack(factors))
+    for place, name in enumerate(error):
+        if name in GOALS:
+            ratio = error[name] / spread[name].clamp(min=1e-6)
+            network.spread[place] = torch.quantile(ratio, COVERAGE)

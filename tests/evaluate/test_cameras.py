@@ -1,0 +1,93 @@
+"""Errors of estimated cameras: the command, and the constant guess beside the estimate."""
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from warpir.calibration.network import CalibratorConfig, random_calibrator, save_calibrator
+from warpir.evaluate.camera.measure import (
+    constant_camera,
+    even_cameras,
+    photograph,
+    unlearned,
+)
+from warpir.evaluate.command import main
+from warpir.io.results import OutputFolder
+from warpir.scene.camera import camera_from_fov
+from warpir.train.camera.crops import DrawnCameras, read_panoramas
+from warpir.train.sampler import Sampler
+
+
+@pytest.fixture
+def panoramas(tmp_path: Path) -> Path:
+    """A folder with a panorama, dark ground and bright sky, and with a file that is none."""
+    texels = np.full((64, 128, 3), 0.2, np.float32)
+    texels[:32] = 1.0
+    with OutputFolder(tmp_path / "field") as output:
+        output.write_envmap(texels, "field")
+    for path in (tmp_path / "field").iterdir():
+        if path.name != "field.exr":
+            path.unlink()
+    (tmp_path / "field" / "broken.hdr").write_bytes(b"#?RADIANCE")
+    return tmp_path / "field"
+
+
+def weights(folder: Path, learned: list[str]) -> Path:
+    path = folder / "calibrator.safetensors"
+    network = random_calibrator(0, CalibratorConfig(hidden=16))
+    save_calibrator(network, path, {"panoramas": learned})
+    return path
+
+
+def test_command_writes_errors_of_both_rows(panoramas: Path, tmp_path: Path) -> None:
+    out = tmp_path / "camera.json"
+    arguments = ["--camera", "--panoramas", str(panoramas), "--scenes", "3", "--seed", "4"]
+    arguments += ["--width", "96", "--calibrator", str(weights(tmp_path, []))]
+    assert main([*arguments, "--json", str(out)]) == 0
+    record = json.loads(out.read_text())
+    camera = record["camera"]
+    assert record["panoramas"] == ["field"]
+    assert len(record["notices"]) == 1 and "broken.hdr" in record["notices"][0]
+    for row in ("estimated", "constant"):
+        for name in ("pitch_deg", "roll_deg", "vfov_deg"):
+            assert 0.0 <= camera[row][name]["median"] < 180.0
+            assert 0.0 < camera[row][name]["mean"] < 180.0
+    assert 0.0 <= camera["estimated"]["roll_deg"]["within_sigma"] <= 1.0
+    # Roll is even in -20 .. 20 degrees, so a level guess errs by the roll itself.
+    rolls = even_cameras(Sampler(3, torch.Generator().manual_seed(4))).roll
+    expected = float(torch.rad2deg(rolls.abs()).mean())
+    assert camera["constant"]["roll_deg"]["mean"] == pytest.approx(expected, abs=1e-4)
+
+
+def test_missing_weights_are_named(panoramas: Path, tmp_path: Path) -> None:
+    arguments = ["--camera", "--panoramas", str(panoramas), "--scenes", "1"]
+    assert main([*arguments, "--calibrator", str(tmp_path / "none.safetensors")]) == 4
+
+
+def test_constant_camera_is_that_of_the_flags() -> None:
+    camera = camera_from_fov(600, 400, 60.0, 0.0, 1.6)
+    vfov = np.degrees(2.0 * np.arctan(200.0 / camera.fy))
+    assert constant_camera(1.5)["vfov_deg"] == pytest.approx(vfov)
+
+
+def test_photograph_shows_the_horizon_of_its_camera(panoramas: Path) -> None:
+    """Level, 90 degrees high: bright above the middle, dark below."""
+    level = dict.fromkeys(("pitch", "roll", "bend"), torch.zeros(1))
+    half = {name: torch.tensor([0.5]) for name in ("focal", "x", "y")}
+    camera = DrawnCameras(**level, **half, aspect=torch.tensor([1.5]))
+    field = read_panoramas([panoramas / "field.exr"], "cpu")
+    photo = photograph(field, camera, 96, torch.Generator().manual_seed(0))
+    assert photo.shape == (64, 96, 3)
+    assert photo[:28].mean() > photo[36:].mean() + 0.2
+
+
+def test_panoramas_that_were_learned_from_are_left_out(tmp_path: Path) -> None:
+    network = random_calibrator(0, CalibratorConfig(hidden=16))
+    network.record = {"panoramas": ["a"]}
+    fresh, notices = unlearned([tmp_path / "a.exr", tmp_path / "b.exr"], network)
+    assert [path.stem for path in fresh] == ["b"] and "1 panoramas" in notices[0]
+    known, notices = unlearned([tmp_path / "a.exr"], network)
+    assert [path.stem for path in known] == ["a"] and "learned from all" in notices[0]
