@@ -99,7 +99,7 @@ def denoised_object(
     found = []
     for part in reflected:
         colour = part / np.maximum(mask, 1e-6)[:, None]
-        filled = _filled(window.spread(colour), is_seen)
+        filled = _filled(window.spread(colour.astype(np.float32)), is_seen)
         clean = np.maximum(window.gather(_filter(filled, *guides)), 0.0)
         found.append(np.where(seen[:, None], clean * mask[:, None], part).astype(np.float32))
     return tuple(found)
