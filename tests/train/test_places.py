@@ -76,6 +76,7 @@ def test_joined_networks_answer_with_the_mean_and_its_doubt(tmp_path: Path) -> N
     for seed, temperature in ((0, 2.0), (1, 0.5)):
         network = random_regressor(seed, SMALL)
         network.temperature.fill_(temperature)
+        network.directions.copy_(network.directions.flip(0))
         torch.nn.init.normal_(network.members[0].level_head[-1].weight)
         paths.append(tmp_path / f"{seed}.safetensors")
         save_regressor(network, paths[-1], {"panoramas": [f"place_{seed}"]})
@@ -84,6 +85,7 @@ def test_joined_networks_answer_with_the_mean_and_its_doubt(tmp_path: Path) -> N
     joined = load_regressor(tmp_path / "joined.safetensors")
     assert joined.config.members == 2 and float(joined.temperature) == 1.0
     assert [m["panoramas"] for m in joined.record["members"]] == [["place_0"], ["place_1"]]
+    torch.testing.assert_close(joined.directions, networks[0].directions)
     photo = torch.rand(3, 3, 96, 144)
     rays = torch.nn.functional.normalize(torch.randn(3, 3, 96, 144), dim=1)
     each = [n.split(n(photo, rays)) for n in networks]

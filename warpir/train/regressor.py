@@ -127,6 +127,10 @@ def join_members(paths: Sequence[Path], out: Path) -> Regressor:
         InputError: A file cannot be used (`ExitCode.MODEL`).
     """
     networks = [load_regressor(path) for path in paths]
+    for path, network in zip(paths, networks, strict=True):
+        if not torch.equal(network.directions, networks[0].directions):
+            what = f"its candidate directions are not those of {paths[0]}"
+            raise InputError(path, what, code=ExitCode.MODEL)
     joined = Regressor(replace(networks[0].config, members=len(networks))).eval()
     with torch.no_grad():
         for place, network in enumerate(networks):
@@ -137,6 +141,8 @@ def join_members(paths: Sequence[Path], out: Path) -> Regressor:
             last.bias.div_(network.temperature)
             joined.members[place].load_state_dict(member.state_dict())
         joined.mean_light.copy_(torch.stack([n.mean_light for n in networks]).mean(dim=0))
+        # A file keeps the directions that its network was trained with.
+        joined.directions.copy_(networks[0].directions)
     save_regressor(joined, out, {"members": [n.record for n in networks]})
     return joined
 
