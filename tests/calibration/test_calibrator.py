@@ -1,12 +1,15 @@
 """The network that estimates cameras: its file, its symmetry, and photos of every shape."""
 
+import json
 from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
+from PIL import Image
 
-from warpir.calibration.estimate import estimate_camera
+import warpir.demo
+from warpir.calibration.estimate import LINES, estimate_camera
 from warpir.calibration.lines import find_segments, upright_tilt
 from warpir.calibration.network import (
     FINE_DIRECTIONS,
@@ -174,3 +177,26 @@ def test_segments_of_a_drawn_post() -> None:
     upright = segments[np.abs(segments[:, 0] - segments[:, 2]) < 3.0]
     assert len(upright) >= 2
     assert {round(x / 20.0) for x in upright[:, 0]} <= {7, 8}
+
+
+def test_shipped_network_estimates_the_camera_of_the_demo() -> None:
+    """A photo with a known camera: pitch -3.8 degrees, no roll, 34.5 degrees high."""
+    demo = Path(warpir.demo.__file__).parent
+    truth = json.loads((demo / "camera.json").read_text())
+    with Image.open(demo / "photo.png") as picture:
+        photo = np.asarray(picture.convert("RGB"), np.float32) / 255.0
+    estimate = estimate_camera(photo)
+    pitch = np.degrees(np.arcsin(-truth["c2w"][1][2]))
+    vfov = np.degrees(2.0 * np.arctan(truth["h"] / 2.0 / truth["fy"]))
+    assert LINES in estimate.witnesses
+    assert abs(estimate.pitch_deg - pitch) < min(2.0 * estimate.pitch_sigma_deg, 6.0)
+    assert abs(estimate.roll_deg) < min(2.0 * estimate.roll_sigma_deg, 2.0)
+    assert abs(estimate.vfov_deg - vfov) < min(2.0 * estimate.vfov_sigma_deg, 12.0)
+
+
+def test_shipped_network_knows_little_of_even_photos() -> None:
+    flat = estimate_camera(np.full((300, 450, 3), 0.5, np.float32))
+    assert flat.pitch_sigma_deg > 8.0 and flat.vfov_sigma_deg > 15.0
+    ground = 0.3 + 0.02 * np.random.default_rng(0).normal(size=(300, 450, 1))
+    texture = estimate_camera(np.repeat(ground, 3, axis=2).astype(np.float32))
+    assert texture.pitch_sigma_deg > 8.0 and texture.vfov_sigma_deg > 10.0
