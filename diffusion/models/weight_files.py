@@ -50,7 +50,10 @@ REGRESSOR_SIZES: Sizes = {
     "members": (1, 1, int, 1, 16),
 }
 """The same of a `warpir.lighting.regressor.RegressorConfig`."""
-CALIBRATOR_SIZES: Sizes = {"hidden": (1, 1, int, 8, 4096), "dropout": (1, 1, float, 0, 0.99)}
+CALIBRATOR_SIZES: Sizes = {
+    name: REGRESSOR_SIZES[name]
+    for name in ("channels", "blocks", "depth", "heads", "dropout", "skipped")
+}
 """The same of a `warpir.calibration.network.CalibratorConfig`."""
 
 EXPONENTS = {
@@ -241,9 +244,8 @@ def _check_photo_network(path: Path | None, name: str, format_: str, sizes: Size
     config = _object(where, file.about.get("config", ""))
     _object(where, file.about.get("record", ""))
     _check_sizes(where, config, sizes)
-    channels = config.get("channels")
-    if channels and (any(width % 8 for width in channels) or channels[-1] % config["heads"]):
-        what = f"network: channels {channels} of {config['heads']} heads"
+    if any(width % 8 for width in config["channels"]) or config["channels"][2] % config["heads"]:
+        what = f"network: channels {config['channels']} of {config['heads']} heads"
         raise ModelError(where, f"{what} (expected multiples of 8, the last of the heads too)")
     if path is not None and shipped.is_file():
         ours = read_header(shipped)

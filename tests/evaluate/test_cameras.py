@@ -20,6 +20,8 @@ from warpir.scene.camera import camera_from_fov
 from warpir.train.camera.crops import DrawnCameras, read_panoramas
 from warpir.train.sampler import Sampler
 
+SMALL = CalibratorConfig(channels=(8, 8, 16), blocks=(1, 1), depth=1, heads=2)
+
 
 @pytest.fixture
 def panoramas(tmp_path: Path) -> Path:
@@ -37,7 +39,7 @@ def panoramas(tmp_path: Path) -> Path:
 
 def weights(folder: Path, learned: list[str]) -> Path:
     path = folder / "calibrator.safetensors"
-    network = random_calibrator(0, CalibratorConfig(hidden=16))
+    network = random_calibrator(0, SMALL)
     save_calibrator(network, path, {"panoramas": learned})
     return path
 
@@ -85,7 +87,7 @@ def test_photograph_shows_the_horizon_of_its_camera(panoramas: Path) -> None:
 
 
 def test_panoramas_that_were_learned_from_are_left_out(tmp_path: Path) -> None:
-    network = random_calibrator(0, CalibratorConfig(hidden=16))
+    network = random_calibrator(0, SMALL)
     network.record = {"panoramas": ["a"]}
     fresh, notices = unlearned([tmp_path / "a.exr", tmp_path / "b.exr"], network)
     assert [path.stem for path in fresh] == ["b"] and "1 panoramas" in notices[0]

@@ -133,7 +133,7 @@ def network_estimate(
 
 
 def with_lines(estimate: CameraEstimate, photo: FloatArray) -> CameraEstimate:
-    """Join an estimate with the tilt that upright edges tell, by inverse variances.
+    """Join an estimate with the roll that upright edges tell, by inverse variances.
 
     Args:
         estimate: The network's.
@@ -147,29 +147,18 @@ def with_lines(estimate: CameraEstimate, photo: FloatArray) -> CameraEstimate:
     whole = torch.from_numpy(np.ascontiguousarray(photo, np.float32)).permute(2, 0, 1)[None]
     small = F.interpolate(whole, size, mode="bilinear", antialias=True)
     camera = estimate.camera(size[1], size[0], 1.0)
-    tilt = lines.upright_tilt(
+    found = lines.upright_roll(
         lines.find_segments(small[0].permute(1, 2, 0).numpy()),
         (camera.cx, camera.cy),
         camera.fx,
         estimate.pitch_deg,
         estimate.roll_deg,
     )
-    if tilt is None:
+    if found is None:
         return estimate
-    pitch, pitch_sigma = _joined(
-        (estimate.pitch_deg, estimate.pitch_sigma_deg), (tilt.pitch_deg, lines.PITCH_SIGMA_DEG)
-    )
-    roll, roll_sigma = _joined(
-        (estimate.roll_deg, estimate.roll_sigma_deg), (tilt.roll_deg, lines.ROLL_SIGMA_DEG)
-    )
-    return replace(
-        estimate,
-        pitch_deg=pitch,
-        pitch_sigma_deg=pitch_sigma,
-        roll_deg=roll,
-        roll_sigma_deg=roll_sigma,
-        witnesses=(*estimate.witnesses, LINES),
-    )
+    roll, sigma = _joined((estimate.roll_deg, estimate.roll_sigma_deg), (found, lines.SIGMA_DEG))
+    witnesses = (*estimate.witnesses, LINES)
+    return replace(estimate, roll_deg=roll, roll_sigma_deg=sigma, witnesses=witnesses)
 
 
 def _joined(*witnesses: tuple[float, float]) -> tuple[float, float]:

@@ -1,4 +1,4 @@
-"""A second witness of a camera's tilt: the vanishing point of the photo's upright edges.
+"""A second witness of a camera's roll: the vanishing point of the photo's upright edges.
 
 Straight segments come from scikit-image (Canny's edges, then the probabilistic Hough transform of
 Galamhos et al. 1999). Each segment and the camera's centre span a plane; the normals of the planes
@@ -6,8 +6,6 @@ of all upright edges are at right angles to the world's up, which RANSAC finds.
 """
 
 from __future__ import annotations
-
-from typing import NamedTuple
 
 import numpy as np
 
@@ -34,15 +32,8 @@ FEWEST = 10
 """Segments that must agree before they are believed."""
 LEAST_SHARE = 0.6
 """Of the length of all nearly upright segments that must agree."""
-PITCH_SIGMA_DEG, ROLL_SIGMA_DEG = 3.5, 0.7
-"""Standard deviations of what is believed, on crops of places that the network has not seen."""
-
-
-class Tilt(NamedTuple):
-    """What upright edges tell."""
-
-    pitch_deg: float
-    roll_deg: float
+SIGMA_DEG = 0.7
+"""Standard deviation of what is believed, on crops of places that the network has not seen."""
 
 
 def find_segments(photo: FloatArray) -> Float64Array:
@@ -64,14 +55,17 @@ def find_segments(photo: FloatArray) -> Float64Array:
     return np.array(lines, np.float64).reshape(-1, 4)
 
 
-def upright_tilt(
+def upright_roll(
     segments: Float64Array,
     centre: tuple[float, float],
     focal: float,
     pitch_deg: float,
     roll_deg: float,
-) -> Tilt | None:
-    """Estimate pitch and roll from upright edges; None where too few agree.
+) -> float | None:
+    """Estimate the roll [deg] from upright edges; None where too few agree.
+
+    The pitch that they tell is left out: it depends on the focal length, which is less sure, and on
+    held-out places it was no better than the network's.
 
     Args:
         segments: As `find_segments` gives them.
@@ -110,7 +104,4 @@ def upright_tilt(
     is_clear = lengths[chosen].sum() >= LEAST_SHARE * lengths.sum()
     if chosen.sum() < FEWEST or not is_clear or up @ guess < np.cos(np.radians(CONE_DEG)):
         return None
-    return Tilt(
-        pitch_deg=float(np.degrees(-np.arcsin(up[2].clip(-1.0, 1.0)))),
-        roll_deg=float(np.degrees(np.arctan2(up[0], up[1]))),
-    )
+    return float(np.degrees(np.arctan2(up[0], up[1])))

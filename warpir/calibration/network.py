@@ -1,11 +1,10 @@
-"""The network that estimates cameras from a photo: a distribution over each of its numbers.
+"""The network that estimates a camera from a photo: a distribution over each of its numbers.
 
-A photo is stretched to 64 x 96 pixels and described by fixed features: histograms of the directions
-of its edges in 8 x 12 cells and in the whole (histograms of oriented gradients: Dalal and Triggs
-2005), the strength of edges and the colour of each cell. Directions are measured in the photo's own
-shape, before it was stretched. A perceptron of three layers answers with a histogram of each
-number, so that "looks up" and "was corrected to upright" can both stay open. It is small enough to
-be trained on two cores.
+A photo is stretched to 128 x 192 pixels; the coordinates of its pixels, in units of its height,
+come along and say how it was stretched. A distribution is a histogram, so that "looks up" and "was
+corrected to upright" can both stay open. In training each token of 8 x 8 pixels also answers where
+up is in the picture and how high above the horizon it looks (the perspective field of Jin et al.
+2023, arXiv:2212.03239), which teaches the tokens far faster than one answer for the whole photo.
 
 Photos are blurred alike before they are seen. The panoramas that it learned from are coarse beside
 photos, so sharpness would otherwise tell the field of view in training and mislead afterwards.
@@ -28,22 +27,19 @@ import torch.nn.functional as F
 from safetensors.torch import load_file, save
 from torch import Tensor, nn
 
+from warpir.calibration.blocks import ConvBlock, TokenBlock, head
 from warpir.core.atomic import write_file
-from warpir.core.color import LUMINANCE_WEIGHTS
 from warpir.core.errors import ExitCode, InputError
 from warpir.diffusion.models.model_error import ModelError
 from warpir.diffusion.models.weight_files import CALIBRATOR_FORMAT, check_calibrator, values_hash
 
-HEIGHT, WIDTH = 64, 96
+HEIGHT, WIDTH = 128, 192
 """Size that the network sees [px]; photos of other shapes are stretched."""
-CELL = 8
-"""Side of the squares that are described [px]."""
-DIRECTIONS, FINE_DIRECTIONS = 18, 60
-"""Bins over 180 degrees of the directions of edges, of a cell and of the whole photo."""
-FEATURES = (HEIGHT // CELL) * (WIDTH // CELL) * (DIRECTIONS + 4) + FINE_DIRECTIONS + 1
-BLUR = 0.7
+BLUR = 1.4
 """Standard deviation of the blur of every photo that the network sees, over the photo's height
 times `HEIGHT`: 1 is a row of what it sees."""
+GATHERINGS = 4
+"""Weighted means of the tokens that each head reads, of an equal part of the features each."""
 MIRRORED = ("roll", "x")
 """Numbers whose distribution turns over when the photo is mirrored."""
 
@@ -85,15 +81,24 @@ NUMBERS = {
 }
 """Pitch [deg], roll [deg], natural logarithm of the focal length over the photo's height, and the
 principal point as shares of width and height from the top left; the order of the heads."""
+SHAPE = (8, 8)
+"""Pixels of a token, rows and columns."""
 
 
 @dataclass(frozen=True)
 class CalibratorConfig:
     """Size of the network."""
 
-    hidden: int = 384
-    """Features of both hidden layers."""
-    dropout: float = 0.35
+    channels: tuple[int, int, int] = (48, 96, 192)
+    """Features at 1/2, 1/4 and 1/8 of the resolution."""
+    blocks: tuple[int, int] = (2, 2)
+    """Residual blocks at 1/2 and 1/4."""
+    depth: int = 4
+    """Transformer blocks over the 16 x 24 tokens."""
+    heads: int = 6
+    dropout: float = 0.1
+    skipped: float = 0.1
+    """Chance that a block is left out in training (stochastic depth)."""
 
 
 class CameraNumbers(NamedTuple):
@@ -137,7 +142,7 @@ def blur_sigma(rows: Tensor, aspect: Tensor) -> Tensor:
 
 
 def seen(photo: Tensor) -> Tensor:
-    """Return photos as the network sees them: stretched to 64 x 96 and blurred.
+    """Return photos as the network sees them: stretched to 128 x 192 and blurred.
 
     Args:
         photo: Display-encoded, shape [B, 3, H, W].
@@ -148,54 +153,14 @@ def seen(photo: Tensor) -> Tensor:
     return soften(small, blur_sigma(rows, torch.full_like(rows, width / height)).clamp(max=WIDTH))
 
 
-def describe(photo: Tensor, aspect: Tensor) -> Tensor:
-    """Return the features of photos, shape [B, FEATURES].
-
-    Args:
-        photo: As `seen` gives it, shape [B, 3, 64, 96].
-        aspect: Width over height before it was stretched, shape [B].
-    """
-    grey = torch.einsum("bchw,c->bhw", photo, photo.new_tensor(LUMINANCE_WEIGHTS))
-    padded = F.pad(grey[:, None], (1, 1, 1, 1), mode="replicate")[:, 0]
-    # Per height of the photo; up is positive.
-    right = (padded[:, 1:-1, 2:] - padded[:, 1:-1, :-2]) * (WIDTH / HEIGHT) / aspect[:, None, None]
-    up = padded[:, :-2, 1:-1] - padded[:, 2:, 1:-1]
-    strength = torch.sqrt(right**2 + up**2)
-    direction = torch.atan2(up, right) / math.pi % 1.0
-    cells = F.avg_pool2d(_directions(direction, strength, DIRECTIONS), CELL)
-    edges = cells.sum(dim=1, keepdim=True)
-    # The floors keep the noise of even areas from looking like edges.
-    parts = [torch.sqrt(cells / (edges + 0.01)), 0.3 * torch.log(edges + 0.003)]
-    parts.append(2.0 * F.avg_pool2d(photo, CELL) - 1.0)
-    whole = _directions(direction, strength, FINE_DIRECTIONS).mean(dim=(2, 3))
-    whole = torch.sqrt(whole / (whole.sum(dim=1, keepdim=True) + 0.005))
-    return torch.cat([torch.cat(parts, dim=1).flatten(1), whole, aspect.log()[:, None]], dim=1)
-
-
-def _directions(direction: Tensor, strength: Tensor, count: int) -> Tensor:
-    """Return edges by their direction, each shared by the two nearest bins, [B, count, H, W].
-
-    Args:
-        direction: Over 180 degrees, in [0, 1], shape [B, H, W].
-        strength: Shape [B, H, W].
-        count: Bins, round the circle.
-    """
-    position = direction * count
-    below = position.floor()
-    share = position - below
-    first = below.long() % count
-    bins = strength.new_zeros(len(strength), count, *strength.shape[1:])
-    bins.scatter_(1, first[:, None], (strength * (1.0 - share))[:, None])
-    return bins.scatter_add_(1, (first[:, None] + 1) % count, (strength * share)[:, None])
-
-
 class Calibrator(nn.Module):
-    """Features of a photo, and perhaps its focal length, to distributions of the numbers."""
+    """Photo, its shape and perhaps its focal length to distributions over the camera's numbers.
 
-    mean: Tensor
-    """Of each feature over the training, shape [FEATURES]."""
-    deviation: Tensor
-    """Standard deviation of each feature over the training, shape [FEATURES]."""
+    There are 16 x 24 tokens of 8 x 8 pixels, and a learned one for each number that asks them. Each
+    head reads its learned token plus weighted means of the others, as in
+    `warpir.lighting.regressor.Regressor`.
+    """
+
     spread: Tensor
     """Factor on the width of each distribution; calibrated on held-out places, shape [5]."""
 
@@ -204,33 +169,69 @@ class Calibrator(nn.Module):
         self.config = config
         self.record: dict[str, Any] = {}
         """How it was trained; plain values."""
-        self.register_buffer("mean", torch.zeros(FEATURES))
-        self.register_buffer("deviation", torch.ones(FEATURES))
+        fine, middle, wide = config.channels
         self.register_buffer("spread", torch.ones(len(NUMBERS)))
-        hidden, last = config.hidden, sum(bins.count for bins in NUMBERS.values())
-        self.layers = nn.Sequential(
-            nn.Dropout(0.1),
-            nn.Linear(FEATURES + 2, hidden),
-            nn.GELU(),
-            nn.Dropout(config.dropout),
-            nn.Linear(hidden, hidden),
-            nn.GELU(),
-            nn.Dropout(config.dropout),
-            nn.Linear(hidden, last),
+        # Space to depth keeps every pixel.
+        self.stem = nn.Conv2d(4 * 5, fine, 3, padding=1)
+        self.fine = nn.Sequential(*(ConvBlock(fine, 0.0) for _ in range(config.blocks[0])))
+        self.down1 = nn.Conv2d(fine, middle, 3, stride=2, padding=1)
+        self.middle = nn.Sequential(
+            *(ConvBlock(middle, config.skipped / 2.0) for _ in range(config.blocks[1]))
         )
+        self.down2 = nn.Conv2d(middle, wide, 3, stride=2, padding=1)
+        self.norm = nn.GroupNorm(8, wide)
+        self.place = nn.Sequential(nn.Linear(5, wide), nn.GELU(), nn.Linear(wide, wide))
+        self.asking = nn.Parameter(torch.randn(len(NUMBERS), wide) * 0.02)
+        self.blocks = nn.ModuleList(
+            TokenBlock(wide, config.heads, config.dropout, config.skipped)
+            for _ in range(config.depth)
+        )
+        self.gather = nn.Linear(wide, len(NUMBERS) * GATHERINGS, bias=False)
+        # Clearly different weights from the start: an even mean tells nothing of where.
+        nn.init.normal_(self.gather.weight, std=3.0 / math.sqrt(wide))
+        self.numbers = nn.ModuleDict(
+            {name: head(wide, config.dropout, bins.count) for name, bins in NUMBERS.items()}
+        )
+        self.field = head(wide, 0.0, 3)
 
-    def forward(self, features: Tensor, focal: Tensor) -> dict[str, Tensor]:
-        """Return the logits of each number's bins, shape [B, K], by the names of `NUMBERS`.
+    def forward(
+        self, photo: Tensor, aspect: Tensor, focal: Tensor
+    ) -> tuple[dict[str, Tensor], Tensor]:
+        """Return the logits of each number's bins, and the perspective field of the tokens.
 
         Args:
-            features: As `describe` gives them, shape [B, FEATURES].
+            photo: As `seen` gives it, shape [B, 3, 128, 192].
+            aspect: Width over height before it was stretched, shape [B].
             focal: Logarithm of the focal length over the height where it is known, else NaN,
                 shape [B].
+
+        Returns:
+            Logits of shape [B, K] by the names of `NUMBERS`; and, shape [B, 384, 3], where up is
+            in the picture (right, up; any length) and the elevation [rad] of what a token sees.
         """
-        known = torch.stack([~focal.isnan(), focal.nan_to_num()], dim=1)
-        inputs = torch.cat([(features - self.mean) / self.deviation, known], dim=1)
-        counts = [bins.count for bins in NUMBERS.values()]
-        return dict(zip(NUMBERS, self.layers(inputs).split(counts, dim=1), strict=True))
+        plane = _coordinates(aspect, HEIGHT, WIDTH)
+        x = torch.cat([photo * 2.0 - 1.0, plane], dim=1)
+        x = self.fine(self.stem(F.pixel_unshuffle(x, 2)))
+        x = self.middle(self.down1(x))
+        x = self.norm(self.down2(x))
+        known = ~focal.isnan()
+        about = torch.stack([aspect.log(), known.to(aspect.dtype), focal.nan_to_num()], dim=1)
+        where = _coordinates(aspect, *x.shape[2:]).flatten(2).transpose(1, 2)
+        about = about[:, None].expand(-1, where.shape[1], -1)
+        tokens = x.flatten(2).transpose(1, 2) + self.place(torch.cat([where, about], dim=2))
+        count = len(self.asking)
+        tokens = torch.cat([self.asking.expand(len(tokens), -1, -1), tokens], dim=1)
+        for block in self.blocks:
+            tokens = block(tokens)
+        # Softmax and exponentials of the answers need more digits than autocast leaves.
+        with torch.autocast(tokens.device.type, enabled=False):
+            tokens = tokens.to(self.gather.weight.dtype)
+            asked, others = tokens[:, :count], tokens[:, count:]
+            weights = self.gather(others).softmax(dim=1).unflatten(2, (count, GATHERINGS))
+            groups = others.unflatten(2, (GATHERINGS, -1))
+            read = asked + torch.einsum("btag,btgc->bagc", weights, groups).flatten(2)
+            heads = zip(self.numbers.items(), read.unbind(dim=1), strict=True)
+            return {name: answer(part) for (name, answer), part in heads}, self.field(others)
 
     @torch.no_grad()
     def predict(self, photo: Tensor, aspect: Tensor, focal: Tensor) -> CameraNumbers:
@@ -240,26 +241,32 @@ class Calibrator(nn.Module):
         are averaged: a mirrored photo gives the mirrored camera by construction.
 
         Args:
-            photo: As `seen` gives it, shape [B, 3, 64, 96].
+            photo: As `seen` gives it, shape [B, 3, 128, 192].
             aspect: Width over height before it was stretched, shape [B].
-            focal: As of `forward`.
+            focal: Logarithm of the focal length over the height where it is known, else NaN,
+                shape [B].
         """
-        both = (describe(picture, aspect) for picture in (photo, photo.flip(-1)))
-        return self.answer(*both, focal)
-
-    @torch.no_grad()
-    def answer(self, features: Tensor, mirrored: Tensor, focal: Tensor) -> CameraNumbers:
-        """Return the same from the features of photos and of their mirror images."""
-        plain, turned = (self(part, focal) for part in (features, mirrored))
+        both = torch.cat([photo, photo.flip(-1)])
+        logits, _ = self(both, aspect.repeat(2), focal.repeat(2))
         value, sigma = [], []
         for name, bins in NUMBERS.items():
-            other = turned[name].flip(-1) if name in MIRRORED else turned[name]
-            probability = 0.5 * (plain[name].softmax(dim=1) + other.softmax(dim=1))
+            plain, mirrored = logits[name].softmax(dim=1).chunk(2)
+            turned = mirrored.flip(-1) if name in MIRRORED else mirrored
+            probability = 0.5 * (plain + turned)
             value.append(bins.quantile(probability, 0.5))
             # A Gaussian has 68 % between these two, one standard deviation to either side.
             low, high = (bins.quantile(probability, share) for share in (0.16, 0.84))
             sigma.append(0.5 * (high - low))
         return CameraNumbers(torch.stack(value, 1), torch.stack(sigma, 1) * self.spread)
+
+
+def _coordinates(aspect: Tensor, height: int, width: int) -> Tensor:
+    """Return right and down from the middle, in units of the photo's height, [B, 2, H, W]."""
+    across = (torch.arange(width, device=aspect.device) + 0.5) / width - 0.5
+    down = (torch.arange(height, device=aspect.device) + 0.5) / height - 0.5
+    x = (aspect[:, None] * across)[:, None, :].expand(-1, height, -1)
+    y = down[None, :, None].expand(len(aspect), -1, width)
+    return torch.stack([x, y.to(x.dtype)], dim=1)
 
 
 def random_calibrator(seed: int, config: CalibratorConfig | None = None) -> Calibrator:

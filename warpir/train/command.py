@@ -4,7 +4,8 @@ r"""Train the networks that warpir ships: for the first light, for the camera, a
     python -m warpir.train prior --panoramas DIR --assets DIR --out DIR --minutes 9 \
         --total-minutes 18
     python -m warpir.train prior ... --resume
-    python -m warpir.train camera --panoramas DIR --out DIR --minutes 20 --fold 0/5
+    python -m warpir.train camera --panoramas DIR --regressor FILE --out DIR --minutes 6 \
+        --fold 0/5
 
 Scenes are rendered as they are needed and then forgotten; the prior learns from each twice.
 A command stops after ``--minutes`` and ``--resume`` goes on, until ``--total-minutes`` are used up.
@@ -72,9 +73,8 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument("--device", default=None)
     parser.add_argument("--resume", action="store_true")
     parser.add_argument("--start", type=Path, metavar="FILE", help="weights to begin with")
-    parser.add_argument(
-        "--regressor", type=Path, metavar="FILE", help="weights that the prior is told the light by"
-    )
+    words = "weights that tell the prior the light, or whose first layers the camera begins with"
+    parser.add_argument("--regressor", type=Path, metavar="FILE", help=words)
     words = "networks, each without a share of the places; their answers are averaged"
     parser.add_argument("--networks", type=int, default=1, metavar="N", help=words)
     words = "hold out the places of fold K of N, for validation and calibration"
@@ -158,8 +158,10 @@ def _train_camera(options: argparse.Namespace, panoramas: Sequence[Path]) -> dic
     """Train the network that estimates cameras; photographs are cut without Warp."""
     import torch
 
+    from warpir.calibration.network import load_calibrator, random_calibrator
+    from warpir.lighting.regressor import load_regressor
     from warpir.train.camera.crops import read_panoramas
-    from warpir.train.camera.loop import CameraSettings, train_camera
+    from warpir.train.camera.loop import CameraSettings, begin_with_trunk, train_camera
     from warpir.train.lights import SKY_ONLY
     from warpir.train.places import of_fold
 
@@ -170,22 +172,35 @@ def _train_camera(options: argparse.Namespace, panoramas: Sequence[Path]) -> dic
     held_out = {*options.validation, *of_fold(names, options.fold, ())}
     learned = [p for p in usable if p.stem not in held_out]
     watched = [p for p in usable if p.stem in held_out]
-    if not learned or not watched:
-        what = f"{len(learned)} to learn from, {len(watched)} to calibrate with (both are needed)"
-        raise InputError("--panoramas", what, "give --fold 0/5 or --validation")
+    if not learned:
+        raise InputError("--panoramas", "none to learn from")
     say(f"device: {device}; {len(learned)} panoramas; validation on {len(watched)}")
+    start = None if options.start is None else load_calibrator(options.start, device)
+    started_from = None if start is None else start.record
+    if options.regressor is not None:
+        regressor = load_regressor(options.regressor)
+        start = start or random_calibrator(options.seed)
+        begin_with_trunk(start, regressor)
+        started_from = {"regressor": regressor.record}
     record = {
         "panoramas": [p.stem for p in learned],
         "validation_panoramas": [p.stem for p in watched],
+        "started_from": started_from,
         "device": torch.cuda.get_device_name(device) if device.type == "cuda" else "cpu",
     }
+    settings = CameraSettings(
+        batch=options.batch or CameraSettings.batch,
+        learning_rate=CameraSettings.learning_rate * (1.0 if start is None else 0.5),
+    )
     return train_camera(
         read_panoramas(learned, device),
-        read_panoramas(watched, device),
+        read_panoramas(watched, device) if watched else None,
         options.out,
-        CameraSettings(batch=options.batch or CameraSettings.batch),
+        settings,
+        device,
         options.minutes,
         seed=options.seed,
+        start=start,
         record=record,
     )
 

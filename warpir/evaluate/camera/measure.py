@@ -70,9 +70,7 @@ def photograph(
     """
     draw = Sampler(1, generator)
     size = _size(float(cameras.aspect[0]), width)
-    # Four rays a pixel.
-    radiance = cut(panorama, cameras, torch.zeros(1), draw, (2 * size[0], 2 * size[1]))
-    radiance = torch.nn.functional.avg_pool2d(radiance, 2)
+    radiance = cut(panorama, cameras, torch.zeros(1), draw, size)
     shown = draw_faults(draw_looks(radiance, generator).show(radiance), generator)
     photo: FloatArray = shown[0].permute(1, 2, 0).contiguous().numpy()
     return photo

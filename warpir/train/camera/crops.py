@@ -13,7 +13,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from warpir.calibration.network import HEIGHT, WIDTH, blur_sigma, soften
+from warpir.calibration.network import HEIGHT, SHAPE, WIDTH, blur_sigma, soften
 from warpir.core.color import luminance
 from warpir.core.latlong import resize_map, texel_solid_angles
 from warpir.io.images.photos import read_envmap
@@ -25,15 +25,16 @@ ROWS = 512
 """Rows of a panorama, over 180 degrees."""
 ASPECTS = (1.5, 1.5, 1.5, 1.333, 1.333, 1.778, 1.778, 1.0, 0.75, 0.75, 0.667, 0.5625)
 """Width over height of the photos, by frequency."""
+SAMPLES = 2
+"""Rays along each side of a pixel."""
 OWN_BLUR = 0.5
 """Standard deviation of the blur of a panorama that is magnified, over one texel: that of the texel
 (.29) and of linear interpolation (.41)."""
-BLURS = (0.6, 0.9)
+BLURS = (1.2, 1.8)
 """Least and greatest blur of a photo, in the units of `warpir.calibration.network.BLUR`; it is
 drawn alike for all fields of view."""
-WIDE_FOCAL = 1.3
-"""Focal length over the height below which averaged texels are looked up: one row then spans two
-texels."""
+KNOWN_SHARE = 0.2
+"""Share of photos whose focal length the network is given."""
 BLANK_SHARE = 0.01
 """Share of photos of one colour, so that those too have an answer: that nothing is known."""
 GREY_SHARE = 0.1
@@ -45,39 +46,10 @@ class Panoramas(NamedTuple):
     """Panoramas to photograph, on one device."""
 
     texels: Tensor
-    """Radiance of mean luminance 1, first and last column repeated on the other side: the
-    panoramas, then all of them averaged over 3 x 3 texels, shape [1, 3, 2 P, 512, 1026]."""
+    """Radiance of mean luminance 1, first and last column repeated on the other side, shape
+    [1, 3, P, 512, 1026]."""
     coarseness: Tensor
-    """Size of a texel's blur over one of 512 rows, at least 1, shape [2 P]."""
-
-    @property
-    def count(self) -> int:
-        """Number of panoramas, P."""
-        return len(self.coarseness) // 2
-
-    def layers(self, which: Tensor, focal: Tensor) -> Tensor:
-        """Return the texels to look up: averaged ones where a row of the photo spans several.
-
-        Args:
-            which: Panorama of each photo, shape [B].
-            focal: Focal length over the photo's height, shape [B].
-        """
-        return which + self.count * (focal < WIDE_FOCAL)
-
-
-def panoramas_of(texels: Tensor, coarseness: Tensor) -> Panoramas:
-    """Return panoramas with their averages.
-
-    Args:
-        texels: Radiance, shape [P, 3, 512, 1024].
-        coarseness: Of each, shape [P].
-    """
-    wrapped = torch.cat([texels[..., -2:], texels, texels[..., :2]], dim=3)
-    averaged = F.avg_pool2d(F.pad(wrapped, (0, 0, 1, 1), mode="replicate"), 3, stride=1)
-    both = torch.cat([wrapped[..., 1:-1], averaged]).transpose(0, 1)[None].contiguous()
-    # The box of three texels and the blur of one: variances of 9 / 12 and OWN_BLUR^2.
-    coarser = math.sqrt(0.75 / OWN_BLUR**2 + 1.0)
-    return Panoramas(both, torch.cat([coarseness, coarseness * coarser]))
+    """Rows here over rows of the file, at least 1, shape [P]."""
 
 
 @dataclass(frozen=True)
@@ -123,6 +95,20 @@ class DrawnCameras:
         c, s = self.pitch.cos()[:, None, None], self.pitch.sin()[:, None, None]
         return F.normalize(torch.stack([x, c * y + s, s * y - c], dim=-1), dim=-1)
 
+    def field(self) -> Tensor:
+        """Return the perspective field of the tokens, shape [B, 384, 3].
+
+        The unit direction in the picture (right, up) of what lies straight above the scene point
+        that a token sees, and that point's elevation above the horizon [rad].
+        """
+        plane = self.plane(HEIGHT // SHAPE[0], WIDTH // SHAPE[1])
+        elevation = torch.asin(self.world(plane)[..., 1].clamp(-1.0, 1.0))
+        # World up in the camera's axes; a point of the plane at depth 1 that moves along it.
+        up = torch.stack([self.roll.sin() * self.pitch.cos(), self.roll.cos() * self.pitch.cos()])
+        forward = -self.pitch.sin()[:, None, None, None]
+        moved = F.normalize(up.T[:, None, None] + plane * forward, dim=-1)
+        return torch.cat([moved, elevation[..., None]], dim=-1).flatten(1, 2)
+
     def numbers(self) -> Tensor:
         """Return the truth in the units and the order of `NUMBERS`, shape [B, 5]."""
         degrees = torch.rad2deg(torch.stack([self.pitch, self.roll]))
@@ -133,11 +119,15 @@ class CameraBatch(NamedTuple):
     """Photos and their cameras."""
 
     photo: Tensor
-    """As the network sees them, shape [B, 3, 64, 96]."""
+    """As the network sees them, shape [B, 3, 128, 192]."""
     aspect: Tensor
     """Shape [B]."""
+    focal: Tensor
+    """What the network is given of the focal length: its logarithm or NaN, shape [B]."""
     numbers: Tensor
     """The truth, as `DrawnCameras.numbers`."""
+    field: Tensor
+    """As `DrawnCameras.field`."""
 
 
 def read_panoramas(paths: Sequence[Path], device: torch.device | str) -> Panoramas:
@@ -150,7 +140,7 @@ def read_panoramas(paths: Sequence[Path], device: torch.device | str) -> Panoram
     Raises:
         InputError: A file cannot be used.
     """
-    stack = torch.empty(len(paths), 3, ROWS, 2 * ROWS)
+    stack = torch.empty(1, 3, len(paths), ROWS, 2 * ROWS + 2)
     coarseness = []
     for k, path in enumerate(paths):
         texels = read_envmap(path)
@@ -158,25 +148,26 @@ def read_panoramas(paths: Sequence[Path], device: torch.device | str) -> Panoram
         omega = texel_solid_angles(*texels.shape[:2])[:, None]
         mean = float((luminance(texels.astype(np.float64)) * omega).sum() / (4.0 * np.pi))
         texels = resize_map((texels / max(mean, 1e-20)).astype(np.float32), ROWS)
-        stack[k] = torch.from_numpy(texels).permute(2, 0, 1)
-    return panoramas_of(stack.to(device), torch.tensor(coarseness, device=device))
+        stack[0, :, k, :, 1:-1] = torch.from_numpy(texels).permute(2, 0, 1)
+    stack[..., 0], stack[..., -1] = stack[..., -2], stack[..., 1]
+    return Panoramas(stack.to(device), torch.tensor(coarseness, device=device))
 
 
 def draw_cameras(draw: Sampler) -> DrawnCameras:
     """Draw cameras: most nearly level, some steep, cropped or corrected to upright."""
     device = draw.device
     pitch = torch.where(draw.chance(0.4), -18.0 + 14.0 * draw.normal(), -4.0 + 8.0 * draw.normal())
-    pitch = torch.where(draw.chance(0.35), draw.uniform(-50.0, 40.0), pitch)
+    pitch = torch.where(draw.chance(0.25), draw.uniform(-50.0, 40.0), pitch)
     pitch = torch.where(draw.chance(0.03), draw.uniform(-90.0, -50.0), pitch).clamp(-90.0, 60.0)
-    roll = torch.where(draw.chance(0.4), 0.7 * draw.normal(), 4.0 * draw.normal())
-    roll = torch.where(draw.chance(0.4), draw.uniform(-30.0, 30.0), roll).clamp(-44.0, 44.0)
+    roll = torch.where(draw.chance(0.35), 0.7 * draw.normal(), 4.0 * draw.normal())
+    roll = torch.where(draw.chance(0.2), draw.uniform(-30.0, 30.0), roll).clamp(-44.0, 44.0)
     # Of the shorter side: a portrait photo is a landscape one whose camera was turned.
     fov = torch.where(draw.chance(0.6), draw.log_uniform(25.0, 90.0), draw.uniform(20.0, 100.0))
     aspect = torch.tensor(ASPECTS, device=device)[draw.index(len(ASPECTS))]
     aspect = aspect * torch.where(draw.chance(0.3), draw.log_uniform(0.8, 1.25), 1.0)
     half = torch.tan(torch.deg2rad(fov) / 2.0) / aspect.clamp(max=1.0)
     x, y = 0.5 + 0.004 * draw.normal(), 0.5 + 0.004 * draw.normal()
-    kind = draw.category([0.74, 0.12, 0.14])
+    kind = draw.category([0.68, 0.14, 0.18])
     is_cropped, is_upright = kind == 1, kind == 2
     x = torch.where(is_cropped, draw.uniform(0.2, 0.8), x)
     y = torch.where(is_cropped, draw.uniform(0.2, 0.8), y)
@@ -195,7 +186,7 @@ def draw_cameras(draw: Sampler) -> DrawnCameras:
 def cut(
     panoramas: Panoramas,
     cameras: DrawnCameras,
-    layers: Tensor,
+    which: Tensor,
     draw: Sampler,
     size: tuple[int, int] = (HEIGHT, WIDTH),
 ) -> Tensor:
@@ -204,28 +195,29 @@ def cut(
     Args:
         panoramas: To photograph.
         cameras: The cameras.
-        layers: Of the panoramas' texels, shape [B].
+        which: Panorama of each, shape [B].
         draw: Of the azimuths, and of which panoramas are mirrored.
         size: Height and width of the photos [px].
     """
-    x, y, z = cameras.world(cameras.plane(*size)).unbind(-1)
+    plane = cameras.plane(SAMPLES * size[0], SAMPLES * size[1])
+    x, y, z = cameras.world(plane).unbind(-1)
     mirror, yaw = draw.sign()[:, None, None], draw.uniform(0.0, 1.0)[:, None, None]
     # Image centre +Z, left quarter +X.
     u = (0.5 - torch.atan2(mirror * x, z) / (2.0 * math.pi) + yaw) % 1.0
     v = torch.acos(y.clamp(-1.0, 1.0)) / math.pi
     count, columns = panoramas.texels.shape[2], panoramas.texels.shape[4]
     across = 2.0 * (u * (columns - 2) + 1.0) / columns - 1.0
-    layer = ((2.0 * layers + 1.0) / count - 1.0)[:, None, None].expand_as(u)
+    layer = ((2.0 * which + 1.0) / count - 1.0)[:, None, None].expand_as(u)
     grid = torch.stack([across, 2.0 * v - 1.0, layer], dim=-1)
     seen = F.grid_sample(panoramas.texels, grid[None], padding_mode="border", align_corners=False)
-    return seen[0].transpose(0, 1).clamp(min=0.0).contiguous()
+    return F.avg_pool2d(seen[0].transpose(0, 1).clamp(min=0.0), SAMPLES)
 
 
 def with_blur(photo: Tensor, cameras: DrawnCameras, coarseness: Tensor, rows: Tensor) -> Tensor:
     """Blur photos until each has the blur that it should, as far as its panorama allows.
 
     Args:
-        photo: Shape [B, 3, 64, 96].
+        photo: Shape [B, 3, 128, 192].
         cameras: Of the photos.
         coarseness: Of their panoramas, shape [B].
         rows: The blur, in the units of `warpir.calibration.network.BLUR`, shape [B].
@@ -247,15 +239,15 @@ def draw_batch(panoramas: Panoramas, count: int, generator: torch.Generator) -> 
         generator: Of the panoramas' device.
     """
     draw = Sampler(count, generator)
-    cameras = draw_cameras(draw)
-    layers = panoramas.layers(draw.index(panoramas.count), cameras.focal)
-    radiance = cut(panoramas, cameras, layers, draw)
-    # Exposure follows a percentile, which every fourth pixel tells as well.
-    photo = draw_looks(radiance[..., ::4, ::4], generator).show(radiance)
+    cameras, which = draw_cameras(draw), draw.index(panoramas.texels.shape[2])
+    radiance = cut(panoramas, cameras, which, draw)
+    photo = draw_looks(radiance, generator).show(radiance)
     grey = photo.mean(dim=1, keepdim=True).expand_as(photo)
     photo = torch.where(draw.chance(GREY_SHARE, 1, 1, 1), grey, photo)
-    photo = with_blur(photo, cameras, panoramas.coarseness[layers], draw.log_uniform(*BLURS))
+    photo = with_blur(photo, cameras, panoramas.coarseness[which], draw.log_uniform(*BLURS))
     is_blank = draw.chance(BLANK_SHARE, 1, 1, 1)
     photo = torch.where(is_blank, photo.mean(dim=(2, 3), keepdim=True), photo)
     photo = erase(draw_faults(photo, generator), ERASE_SHARE, generator)
-    return CameraBatch(photo, cameras.aspect, cameras.numbers())
+    unknown = torch.full_like(cameras.focal, math.nan)
+    focal = torch.where(draw.chance(KNOWN_SHARE), cameras.focal.log(), unknown)
+    return CameraBatch(photo, cameras.aspect, focal, cameras.numbers(), cameras.field())
