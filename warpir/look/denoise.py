@@ -95,12 +95,13 @@ def denoised_object(
         return reflected
     window = Window.around(pixels, *size)
     is_seen = window.spread(seen.astype(np.float32)) > 0.5
-    guides = tuple(_filled(window.spread(g), is_seen) for g in (albedo.clip(0.0, 1.0), normal))
+    surface = _filled(window.spread(albedo.clip(0.0, 1.0)), is_seen)
+    facing = _filled(window.spread(normal), is_seen)
     found = []
     for part in reflected:
         colour = part / np.maximum(mask, 1e-6)[:, None]
         filled = _filled(window.spread(colour.astype(np.float32)), is_seen)
-        clean = np.maximum(window.gather(_filter(filled, *guides)), 0.0)
+        clean = np.maximum(window.gather(_filter(filled, surface, facing)), 0.0)
         found.append(np.where(seen[:, None], clean * mask[:, None], part).astype(np.float32))
     return tuple(found)
 
