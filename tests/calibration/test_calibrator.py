@@ -109,7 +109,7 @@ def test_soften_has_the_asked_standard_deviation() -> None:
 
 def test_quantiles_of_an_even_histogram() -> None:
     bins = NUMBERS["roll"]
-    even = torch.full((1, bins.count), 1.0 / bins.count)
+    even = torch.full((1, bins.number), 1.0 / bins.number)
     for share in (0.1, 0.5, 0.84):
         expected = bins.low + share * (bins.high - bins.low)
         assert float(bins.quantile(even, share)) == pytest.approx(expected, abs=1e-2)

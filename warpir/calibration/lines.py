@@ -50,8 +50,12 @@ def find_segments(photo: FloatArray) -> Float64Array:
     smooth = gaussian_filter(grey, EDGE_SIGMA)
     strength = np.hypot(sobel(smooth, axis=0), sobel(smooth, axis=1))
     low, high = np.quantile(strength, EDGE_QUANTILES).clip(min=WEAKEST)
-    edges = canny(grey, EDGE_SIGMA, low_threshold=low, high_threshold=high)
-    lines = probabilistic_hough_line(edges, VOTES, SHORTEST, GAP, rng=0)
+    edges = canny(  # type: ignore[no-untyped-call]
+        grey, EDGE_SIGMA, low_threshold=low, high_threshold=high
+    )
+    lines = probabilistic_hough_line(  # type: ignore[no-untyped-call]
+        edges, VOTES, SHORTEST, GAP, rng=0
+    )
     return np.array(lines, np.float64).reshape(-1, 4)
 
 

@@ -49,12 +49,12 @@ class Bins(NamedTuple):
 
     low: float
     high: float
-    count: int
+    number: int
 
     def centres(self, like: Tensor) -> Tensor:
         """Return the middle of each bin, shape [K]."""
-        step = (self.high - self.low) / self.count
-        return self.low + step * (torch.arange(self.count, device=like.device) + 0.5)
+        step = (self.high - self.low) / self.number
+        return self.low + step * (torch.arange(self.number, device=like.device) + 0.5)
 
     def quantile(self, probability: Tensor, share: float) -> Tensor:
         """Return the value below which a share of each distribution lies, shape [B].
@@ -64,10 +64,10 @@ class Bins(NamedTuple):
             share: In (0, 1).
         """
         above = probability.cumsum(dim=1)
-        index = (above < share).sum(dim=1, keepdim=True).clamp(max=self.count - 1)
+        index = (above < share).sum(dim=1, keepdim=True).clamp(max=self.number - 1)
         inside = probability.gather(1, index).clamp(min=1e-12)
         below = above.gather(1, index) - inside
-        step = (self.high - self.low) / self.count
+        step = (self.high - self.low) / self.number
         position = index + ((share - below) / inside).clamp(0.0, 1.0)
         return self.low + step * position[:, 0]
 
@@ -190,7 +190,7 @@ class Calibrator(nn.Module):
         # Clearly different weights from the start: an even mean tells nothing of where.
         nn.init.normal_(self.gather.weight, std=3.0 / math.sqrt(wide))
         self.numbers = nn.ModuleDict(
-            {name: head(wide, config.dropout, bins.count) for name, bins in NUMBERS.items()}
+            {name: head(wide, config.dropout, bins.number) for name, bins in NUMBERS.items()}
         )
         self.field = head(wide, 0.0, 3)
 

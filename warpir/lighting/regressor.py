@@ -194,7 +194,7 @@ def _head(channels: int, dropout: float, count: int) -> nn.Sequential:
     return nn.Sequential(nn.LayerNorm(channels), nn.Dropout(dropout), last)
 
 
-class _Member(nn.Module):
+class Member(nn.Module):
     """One network: photo and rays to a flat prediction.
 
     There are 12 x 18 tokens of 8 x 8 pixels, and two learned ones that ask them. Each of the two
@@ -232,6 +232,12 @@ class _Member(nn.Module):
         nn.init.normal_(self.gather.weight, std=3.0 / math.sqrt(wide))
         self.direction_head = _head(wide, config.dropout, direction_count)
         self.level_head = _head(wide, config.dropout, level_count)
+
+    def last_layers(self) -> tuple[nn.Linear, nn.Linear]:
+        """Return what gives the logits of the directions, and what gives the levels."""
+        direction, levels = self.direction_head[-1], self.level_head[-1]
+        assert isinstance(direction, nn.Linear) and isinstance(levels, nn.Linear)
+        return direction, levels
 
     def forward(self, photo: Tensor, rays: Tensor) -> Tensor:
         """Return a flat prediction; arguments are those of `Regressor.forward`."""
@@ -280,8 +286,12 @@ class Regressor(nn.Module):
         self.level_count = 10 + 3 * len(ambient_axes())
         self.register_buffer("mean_light", torch.zeros(len(directions) + self.level_count))
         self.members = nn.ModuleList(
-            _Member(config, len(directions), self.level_count) for _ in range(config.members)
+            Member(config, len(directions), self.level_count) for _ in range(config.members)
         )
+
+    def last_layers(self) -> list[tuple[nn.Linear, nn.Linear]]:
+        """Return `Member.last_layers` of each member."""
+        return [m.last_layers() for m in self.members if isinstance(m, Member)]
 
     def forward(self, photo: Tensor, rays: Tensor) -> Tensor:
         """Return flat predictions, shape [B, K + level_count]; `split` names the parts.

@@ -134,12 +134,11 @@ def join_members(paths: Sequence[Path], out: Path) -> Regressor:
     joined = Regressor(replace(networks[0].config, members=len(networks))).eval()
     with torch.no_grad():
         for place, network in enumerate(networks):
-            (member,) = network.members
-            # Each member's own temperature goes into its logits, since these are what is averaged.
-            last = member.direction_head[-1]
-            last.weight.div_(network.temperature)
-            last.bias.div_(network.temperature)
-            joined.members[place].load_state_dict(member.state_dict())
+            # Each network's own temperature goes into its logits, since these are averaged.
+            ((direction, _),) = network.last_layers()
+            direction.weight.div_(network.temperature)
+            direction.bias.div_(network.temperature)
+            joined.members[place].load_state_dict(network.members[0].state_dict())
         joined.mean_light.copy_(torch.stack([n.mean_light for n in networks]).mean(dim=0))
         # A file keeps the directions that its network was trained with.
         joined.directions.copy_(networks[0].directions)

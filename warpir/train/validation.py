@@ -184,5 +184,5 @@ def calibrate(
     for place, found in scales.items():
         # The geometric mean: one place that is misread altogether must not decide for all photos.
         wider = 2.0 * sum(math.log(max(z, 1e-3)) for z in found) / len(found)
-        for member in network.members:
-            member.level_head[-1].bias[place] += wider
+        for _, levels in network.last_layers():
+            levels.bias[place] += wider

@@ -195,7 +195,8 @@ def camera_loss(logits: Mapping[str, Tensor], field: Tensor, batch: CameraBatch)
         total = total + NUMBER_WEIGHTS[name] * (entropy * weight).mean()
     up = F.normalize(field[..., :2], dim=-1, eps=1e-4)
     off = (up - batch.field[..., :2]).norm(dim=-1) + (field[..., 2] - batch.field[..., 2]).abs()
-    return total + FIELD_WEIGHT * off.mean()
+    loss: Tensor = total + FIELD_WEIGHT * off.mean()
+    return loss
 
 
 def validation_batches(
@@ -265,14 +266,14 @@ def begin_with_trunk(network: Calibrator, regressor: Regressor) -> None:
         network: Changed in place; the coordinates that it sees beside the photo begin with 0.
         regressor: Its first member is taken; of the same sizes at 1/2 and 1/4.
     """
-    trunk = regressor.members[0]
+    # These share their memory with the parameters.
+    own, trunk = network.state_dict(), regressor.members[0].state_dict()
     colours = 3 * 4
-    with torch.no_grad():
-        network.stem.weight[:, colours:] = 0.0
-        network.stem.weight[:, :colours] = trunk.stem.weight[:, :colours]
-        network.stem.bias.copy_(trunk.stem.bias)
-        for name in ("fine", "down1", "middle"):
-            getattr(network, name).load_state_dict(getattr(trunk, name).state_dict())
-        wide = min(len(network.down2.weight), len(trunk.down2.weight))
-        network.down2.weight[:wide] = trunk.down2.weight[:wide]
-        network.down2.bias[:wide] = trunk.down2.bias[:wide]
+    own["stem.weight"][:, colours:] = 0.0
+    own["stem.weight"][:, :colours] = trunk["stem.weight"][:, :colours]
+    for name, part in trunk.items():
+        if name == "stem.bias" or name.startswith(("fine.", "down1.", "middle.")):
+            own[name].copy_(part)
+    for name in ("down2.weight", "down2.bias"):
+        wide = min(len(own[name]), len(trunk[name]))
+        own[name][:wide] = trunk[name][:wide]

@@ -130,7 +130,7 @@ def misjudged_rays(
 
 def _rotated(axis: Tensor, vector: Tensor, angle: Tensor) -> Tensor:
     """Rotate vectors about unit axes (Rodrigues), shape [B, 3]."""
-    along = (axis * vector).sum(dim=1, keepdim=True) * axis
+    along: Tensor = (axis * vector).sum(dim=1, keepdim=True) * axis
     return along + turned_about(axis, vector - along, angle)
 
 
