@@ -96,7 +96,7 @@ def turned_about(axis: Tensor, vector: Tensor, angle: Tensor) -> Tensor:
         vector: Shape [B, 3].
         angle: [rad], shape [B].
     """
-    across = torch.linalg.cross(axis, vector)
+    across: Tensor = torch.linalg.cross(axis, vector)
     return angle.cos()[:, None] * vector + angle.sin()[:, None] * across
 
 
