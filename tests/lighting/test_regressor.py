@@ -50,7 +50,14 @@ from warpir.train.settings import TrainingSettings
 from warpir.train.validation import calibrated_temperature, measure, region_mass
 
 SMALL = RegressorConfig(
-    channels=(8, 16, 32), blocks=(1, 1), depth=1, heads=2, directions=300, dropout=0.0, skipped=0.0
+    channels=(8, 16, 32),
+    blocks=(1, 1),
+    depth=1,
+    heads=2,
+    directions=300,
+    dropout=0.0,
+    skipped=0.0,
+    hidden=0.0,
 )
 FLIP = np.array([-1.0, 1.0, 1.0])
 FLOAT32 = 1e-5
