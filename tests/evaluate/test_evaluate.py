@@ -15,7 +15,15 @@ from warpir.diffusion.models.embedded import NetworkConfig, build_network, save_
 from warpir.evaluate.command import main, usable_rows
 from warpir.evaluate.judge import light_figures
 from warpir.evaluate.light_errors import light_errors
-from warpir.evaluate.report import Entry, bootstrap, compare, mean_of, summarize
+from warpir.evaluate.report import (
+    Entry,
+    bootstrap,
+    by_kind,
+    compare,
+    kind_table,
+    mean_of,
+    summarize,
+)
 from warpir.evaluate.rows import ROWS, chosen_rows
 from warpir.evaluate.scenes import (
     HEIGHT_SHARE,
@@ -314,6 +322,17 @@ def test_bootstrap_draws_groups_as_a_whole(rng: np.random.Generator) -> None:
 
 def entry(row: str, scene: str, value: float, material: str = "diffuse") -> Entry:
     return Entry(row, scene, scene[0], True, material, {"image.box.rmse": value}, {})
+
+
+def test_kinds_of_places_have_means_of_their_own() -> None:
+    entries = [
+        Entry("a", scene, scene[0], False, "diffuse", {"image.box.rmse": error}, {}, kind)
+        for scene, error, kind in (("x1", 0.1, "night"), ("x2", 0.3, "night"), ("y", 0.5, ""))
+    ]
+    kinds = by_kind(entries)
+    assert kinds == {"night": {"a": {"scenes": 2, "panoramas": 1, "image.box.rmse": 0.2}}}
+    assert any("| night | 2 (1) | a |" in line for line in kind_table(kinds))
+    assert list(kind_table(by_kind(entries[2:]))) == []
 
 
 def test_pairs_are_compared_scene_by_scene() -> None:

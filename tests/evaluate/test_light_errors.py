@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from tests import oracles
+from warpir.core.color import luminance
 from warpir.core.latlong import map_directions, rotate_map, texel_solid_angles
 from warpir.evaluate.light_errors import (
     CHANCE_DEG,
@@ -49,6 +50,7 @@ def test_errors_of_a_light_against_itself_are_zero() -> None:
         *("azimuth_error_deg", "elevation_error_deg"),
         *("log_sun_sky_ratio_error", "log_own_sun_sky_ratio_error", "log_flux_error"),
         *("rgb_angle_deg", "directional_deg", "directional_published_deg"),
+        *("ambient_log_error", "ambient_red_log_error", "ambient_blue_log_error"),
     }
     assert list(errors.values()) == pytest.approx([0.0] * len(errors), abs=1e-5)
 
@@ -133,6 +135,18 @@ def test_exposure_and_colour_of_the_whole_light() -> None:
     tinted = light_errors(light * np.float32([1.0, 0.0, 0.0]), light)
     assert tinted["rgb_angle_deg"] == pytest.approx(np.degrees(np.arccos(1.0 / np.sqrt(3.0))))
     assert tinted["log_flux_error"] == pytest.approx(np.log(0.2126), abs=1e-6)
+
+
+def test_ambient_errors_leave_the_sun_out() -> None:
+    """Of suns unlike in strength and place under skies of known ratio and colour."""
+    truth = sky(30.0, 40.0, ambient=(1.0, 1.0, 1.0))
+    tinted = sky(120.0, 20.0, sun=3000.0, sharpness=1000.0, ambient=(2.4, 2.0, 1.5))
+    errors = light_errors(tinted, truth)
+    assert errors["ambient_red_log_error"] == pytest.approx(np.log(1.2), abs=1e-3)
+    assert errors["ambient_blue_log_error"] == pytest.approx(-np.log(0.75), abs=1e-3)
+    # What the two caps hide differs from surface to surface.
+    level = np.log(luminance(np.array([2.4, 2.0, 1.5])))
+    assert errors["ambient_log_error"] == pytest.approx(level, abs=0.05)
 
 
 def test_sunny_means_a_large_share_from_one_place() -> None:

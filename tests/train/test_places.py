@@ -7,6 +7,7 @@ import pytest
 import torch
 
 from tests.lighting.test_regressor import SMALL
+from warpir.evaluate.stage import unseen_by
 from warpir.lighting.regressor import load_regressor, random_regressor, save_regressor
 from warpir.train.batches import PhotoBatch
 from warpir.train.command import Replay
@@ -103,3 +104,22 @@ def test_a_fold_that_makes_no_sense_is_refused(capsys: pytest.CaptureFixture[str
 
     assert main(["regressor", "--panoramas", ".", "--out", "out", "--fold", "5/5"]) == 2
     assert "--fold" in capsys.readouterr().err
+
+
+def test_a_panorama_is_judged_by_the_networks_that_have_not_learned_from_it(
+    tmp_path: Path,
+) -> None:
+    paths = []
+    for k in range(3):
+        paths.append(tmp_path / f"{k}.safetensors")
+        record = {"panoramas": ["all", f"p{k}"], "started_from": {"panoramas": ["old"]}}
+        save_regressor(random_regressor(k, SMALL), paths[-1], record)
+    joined = join_members(paths, tmp_path / "joined.safetensors")
+    joined.record = load_regressor(tmp_path / "joined.safetensors").record
+    assert unseen_by(joined, "new") is joined
+    assert unseen_by(joined, "old") is None and unseen_by(joined, "all") is None
+    part = unseen_by(joined, "p1")
+    assert part is not None and len(part.members) == part.config.members == 2
+    photo, rays = torch.rand(1, 3, 96, 144), torch.zeros(1, 3, 96, 144)
+    alone = [load_regressor(paths[k]).predict(photo, rays).level for k in (0, 2)]
+    torch.testing.assert_close(part.predict(photo, rays).level, sum(alone) / 2.0)

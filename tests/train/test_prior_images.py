@@ -57,6 +57,20 @@ def generator(device: str, pool: LightPool, **shares: float) -> SceneGenerator:
 CROPS = {"made_up": 0.0, "hybrid": 0.0, "proxies": 0.0, "misjudged": 0.0}
 
 
+def test_a_wrong_black_point_changes_the_object_alone() -> None:
+    scenes = SceneGenerator(Stock(make_meshes(12, 3), even("cpu"), "cpu"), 5, Mixture(mismatched=1))
+    drawn = scenes._draw(0, 64, scenes._generator(2, 0), with_object=True)
+    is_black = drawn.kind == KINDS.index("shadow")
+    assert 4 < int(is_black.sum()) < 30
+    assert bool((drawn.black.abs() >= 0.03)[is_black].all())
+    assert not drawn.black[~is_black].any()
+    shot = scenes._shoot(drawn, scenes._generator(9))
+    wrong = scenes._inserted(drawn, shot).image
+    right = scenes._inserted(replace(drawn, black=0 * drawn.black), shot).image
+    changed = (wrong - right).abs().amax(dim=(1, 2, 3))
+    assert bool((changed[is_black] > 0.01).any()) and not changed[~is_black].any()
+
+
 @pytest.mark.slow
 def test_batches_hold_what_they_promise(device: str) -> None:
     scenes = generator(device, even(device, 3.0))

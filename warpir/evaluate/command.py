@@ -82,6 +82,8 @@ def _add_scene_flags(parser: argparse.ArgumentParser) -> None:
     add("--scenes", type=_count, default=20, metavar="N", help="photographs (default: 20)")
     add("--seed", type=_count, default=0, metavar="S", help="of everything that is random")
     add("--json", type=Path, metavar="FILE", help="all numbers")
+    words = "JSON: kind of place by the panorama's name; adds a table by kind"
+    add("--kinds", type=Path, metavar="FILE", help=words)
     words = "names of rows or of groups of rows, or all (--list-rows)"
     add("--rows", metavar="A,B,...", help=words)
     add("--list-rows", action="store_true", help="print the rows and end")
@@ -237,7 +239,8 @@ def evaluate(
     for notice in notices:
         say(f"notice: {notice}")
     sheet_row = next((r for r in SHEET_ROWS if r in rows), rows[0])
-    judge = Judge(bench, rows, options.samples, options.threads, lpips, sheet_row)
+    kinds = _kinds(options.kinds)
+    judge = Judge(bench, rows, options.samples, options.threads, lpips, sheet_row, kinds)
     entries: list[Entry] = []
     panels: list[Panel] = []
     for place, subjects in scenes:
@@ -280,15 +283,25 @@ def _make_scenes(
 
 def _summarize(record: dict[str, Any], entries: "list[Entry]", rows: Sequence[str]) -> list[str]:
     """Add the entries and their summary to the record, and return the tables as lines."""
-    from warpir.evaluate.report import as_plain, compare, pair_table, summarize, tables
+    from warpir.evaluate.report import (
+        as_plain,
+        by_kind,
+        compare,
+        kind_table,
+        pair_table,
+        summarize,
+        tables,
+    )
     from warpir.evaluate.results import head_lines, verdict_lines
     from warpir.evaluate.rows import ROWS
 
     starts = {name: row.start for name, row in ROWS.items() if row.start is not None}
     summary, pairs = summarize(entries), compare(entries, starts)
+    record["kinds"] = by_kind(entries)
     lines = [
         *head_lines(record),
         *verdict_lines(entries),
+        *kind_table(record["kinds"]),
         *tables(summary, {name: ROWS[name].words for name in rows}),
         # What is known of the truth needs no comparison; the JSON file has it all the same.
         *pair_table([p for p in pairs if ROWS[p.row].group != "references"]),
@@ -317,6 +330,22 @@ def _write(
         text = json.dumps(plain_values(record), indent=1, allow_nan=False) + "\n"
         write_file(options.json, text.encode())
         say(f"written: {options.json}")
+
+
+def _kinds(path: Path | None) -> dict[str, str]:
+    """Read the kinds of places by the panoramas' names.
+
+    Raises:
+        InputError: The file cannot be read, or holds something else.
+    """
+    if path is None:
+        return {}
+    from warpir.core.strict_json import read_json_object
+
+    kinds = read_json_object(path)
+    if not all(isinstance(kind, str) for kind in kinds.values()):
+        raise InputError(path, "expected one word for each panorama's name")
+    return kinds
 
 
 def _load_lpips(options: argparse.Namespace) -> "Distance | None":

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 import torch
@@ -42,6 +42,7 @@ class Judge:
         threads: Threads on the CPU; 0 for one per core.
         lpips: The perceptual distance, or None.
         sheet_row: Row on the contact sheet.
+        kinds: Kind of place by the panorama's name.
     """
 
     def __init__(
@@ -52,7 +53,9 @@ class Judge:
         threads: int,
         lpips: Distance | None,
         sheet_row: str,
+        kinds: Mapping[str, str] | None = None,
     ) -> None:
+        self.kinds = kinds or {}
         self.bench, self.rows, self.lpips, self.sheet_row = bench, rows, lpips, sheet_row
         self.quality, self.threads = Quality(samples, 2, 5, bench.seed, 8.0), threads
 
@@ -83,7 +86,7 @@ class Judge:
                 entries.append(
                     Entry(
                         name, place.name, place.panorama, place.is_sunny, subject.material,
-                        figures, prediction.about,
+                        figures, prediction.about, self.kinds.get(place.panorama, ""),
                     )
                 )  # fmt: skip
                 if name == self.sheet_row:

@@ -15,6 +15,7 @@ https://arxiv.org/abs/2011.10687).
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from functools import cache
+from itertools import product
 
 import numpy as np
 from scipy.ndimage import binary_dilation, label
@@ -50,6 +51,8 @@ SUNNY_RADIUS_DEG = 5.0
 SUN_RADIUS_DEG = 20.0
 """Half angle of the cap whose flux is the sun's in the sun/sky ratio [deg]; wide enough for a lobe
 that stands for a sun without knowing it sharply."""
+DARK = 1e-9
+"""Added to every texel's flux, over the true map's mean, so that black has a logarithm [1]."""
 SHARE_FLOOR = 1e-4
 """Shares of the flux are clipped this far from 0 and 1 before their logarithm."""
 
@@ -103,6 +106,10 @@ def light_errors(predicted: FloatArray, true: FloatArray) -> dict[str, float]:
           that a sun of the right strength in the wrong place counts as right.
         * ``log_flux_error``: natural logarithm of predicted over true mean luminance (exposure).
         * ``rgb_angle_deg``: angle between the RGB vectors of the total flux [deg].
+        * ``ambient_log_error``, ``ambient_red_log_error``, ``ambient_blue_log_error``: of all light
+          beyond 20 degrees of each map's own blob, the mean over directions of the absolute log
+          ratio of irradiances, and the absolute errors of the logarithms of red over green and blue
+          over green of the flux.
         * ``true_peak_share``, ``true_is_sunny``: share of the true flux within 5 degrees of its
           peak, and 1 where it is at least `SUNNY_SHARE`, else 0.
         * ``predicted_has_direction``: 0 for a map of one colour, else 1.
@@ -128,11 +135,41 @@ def light_errors(predicted: FloatArray, true: FloatArray) -> dict[str, float]:
     errors["rgb_angle_deg"] = _angle_deg(
         total / np.linalg.norm(total), true_total / np.linalg.norm(true_total)
     )
+    errors |= _ambient_errors(maps, [predicted_axes.blob, wanted.blob])
     share = 0.0 if wanted.peak is None else _cap_share(lum[1], wanted.peak, SUNNY_RADIUS_DEG)
     errors["true_peak_share"] = share
     errors["true_is_sunny"] = float(share >= SUNNY_SHARE)
     errors["predicted_has_direction"] = float(predicted_axes.peak is not None)
     return errors | _directional_errors(maps)
+
+
+def _ambient_errors(maps: list[Float64Array], blobs: list[Axis]) -> dict[str, float]:
+    """Return the errors of what lies beyond `SUN_RADIUS_DEG` of each map's own blob."""
+    irradiance, ratios = [], []
+    for texels, blob in zip(maps, blobs, strict=True):
+        flux = texels * _solid_angles()[..., None]
+        if blob is not None:
+            flux[_texel_directions() @ blob > np.cos(np.radians(SUN_RADIUS_DEG))] = 0.0
+        flux = flux.reshape(-1, 3) + DARK * maps[1].mean()
+        red, green, blue = flux.sum(axis=0)
+        ratios.append(np.log([red / green, blue / green]))
+        irradiance.append(_surface_cosines() @ luminance(flux))
+    off = np.abs(ratios[0] - ratios[1])
+    level = np.abs(np.log(irradiance[0] / irradiance[1])).mean()
+    names = ("ambient_log_error", "ambient_red_log_error", "ambient_blue_log_error")
+    return dict(zip(names, map(float, (level, *off)), strict=True))
+
+
+@cache
+def _surface_cosines() -> Float64Array:
+    """Return the positive part of the cosines of 26 surfaces and texels, shape [26, texel].
+
+    The surfaces face the faces, edges and corners of a cube.
+    """
+    steps = np.array(list(product((-1.0, 0.0, 1.0), repeat=3)))
+    normals = steps[np.abs(steps).sum(axis=1) > 0.0]
+    normals /= np.linalg.norm(normals, axis=1, keepdims=True)
+    return np.maximum(normals @ _texel_directions().reshape(-1, 3).T, 0.0)
 
 
 def _angle_errors(predicted: _Directions, wanted: _Directions) -> dict[str, float]:

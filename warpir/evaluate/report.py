@@ -42,6 +42,8 @@ class Entry:
     """Figures by dotted name, such as ``image.box.rmse``."""
     about: Mapping[str, Any]
     """Notes of `warpir.evaluate.stage.Prediction`."""
+    kind: str = ""
+    """Kind of place, such as ``indoor``; empty where none is known."""
 
 
 GROUPS: dict[str, Callable[[Entry], bool]] = {
@@ -235,6 +237,9 @@ TABLES: tuple[tuple[str, tuple[tuple[str, str], ...]], ...] = (
             ("abs log sun/sky", "light.abs_log_sun_sky_ratio_error"),
             ("abs log flux", "light.abs_log_flux_error"),
             ("RGB angle", "light.rgb_angle_deg"),
+            ("log ambient", "light.ambient_log_error"),
+            ("log red/green", "light.ambient_red_log_error"),
+            ("log blue/green", "light.ambient_blue_log_error"),
         ),
     ),
     (
@@ -291,6 +296,63 @@ def tables(
     yield "|---|---|"
     for row in summary:
         yield f"| {row} | {words[row]} |"
+    yield ""
+
+
+KIND_COLUMNS = (
+    ("peak angle", "light.peak_angle_deg"),
+    ("abs log sun/sky", "light.abs_log_sun_sky_ratio_error"),
+    ("abs log flux", "light.abs_log_flux_error"),
+    ("log ambient", "light.ambient_log_error"),
+    ("log red/green", "light.ambient_red_log_error"),
+    ("log blue/green", "light.ambient_blue_log_error"),
+    ("RMSE box", "image.box.rmse"),
+    ("RMSE object", "image.asset.rmse"),
+    ("RMSE shadow", "image.shadow.rmse"),
+)
+"""Columns (words, figure) of the table by kind of place."""
+
+
+def by_kind(entries: Sequence[Entry]) -> dict[str, dict[str, dict[str, float]]]:
+    """Return the means of `KIND_COLUMNS` by kind of place, row and figure; nothing without kinds.
+
+    ``scenes`` and ``panoramas`` are counts.
+    """
+    found: dict[str, dict[str, dict[str, float]]] = {}
+    for kind in sorted({e.kind for e in entries if e.kind}):
+        of_kind = [e for e in entries if e.kind == kind]
+        for row in dict.fromkeys(e.row for e in of_kind):
+            chosen = [e for e in of_kind if e.row == row]
+            means: dict[str, float] = {
+                "scenes": float(len({e.scene for e in chosen})),
+                "panoramas": float(len({e.panorama for e in chosen})),
+            }
+            for _, figure in KIND_COLUMNS:
+                values = figure_by_scene(chosen, row, figure, "all").values()
+                if values:
+                    means[figure] = float(np.mean(list(values)))
+            found.setdefault(kind, {})[row] = means
+    return found
+
+
+def kind_table(kinds: Mapping[str, Mapping[str, Mapping[str, float]]]) -> Iterator[str]:
+    """Yield the table of `by_kind` as lines of Markdown."""
+    if not kinds:
+        return
+    yield "## By kind of place"
+    yield ""
+    yield "| kind | scenes (places) | row | " + " | ".join(w for w, _ in KIND_COLUMNS) + " |"
+    yield "|---" * (len(KIND_COLUMNS) + 3) + "|"
+    for kind, rows in kinds.items():
+        for row, means in rows.items():
+            cells = [
+                f"{means[figure]:.{1 if figure.endswith('_deg') else 4}f}"
+                if figure in means
+                else ""
+                for _, figure in KIND_COLUMNS
+            ]
+            counts = f"{means['scenes']:.0f} ({means['panoramas']:.0f})"
+            yield f"| {kind} | {counts} | {row} | " + " | ".join(cells) + " |"
     yield ""
 
 

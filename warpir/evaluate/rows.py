@@ -135,7 +135,7 @@ def regression(network: Regressor, place: Place) -> Prediction:
 def regression_on_ground(bench: Bench, stage: Stage, subject: Subject) -> Prediction:
     """Return what the regressor sees, its level weighed against the ground's."""
     place = subject.place
-    estimate = _estimate(bench.network, place)
+    estimate = _estimate(bench.network_for(place.panorama), place)
     photo = Photo(np.round(255.0 * place.photo).astype(np.uint8), place.photo, "png")
     ground = ask_ground(estimate, Inputs(photo, subject.asset, place.camera, subject.placement))
     gain = 1.0 if ground is None else 2.0**ground.weighed
@@ -151,14 +151,15 @@ def _estimate(network: Regressor, place: Place) -> Regression:
 def other_photo(bench: Bench, place: Place) -> Prediction:
     """Return the estimate from another place's photograph, as if this camera had been there."""
     other = bench.other(place)
-    light = regression(bench.network, other).light
+    light = regression(bench.network_for(other.panorama), other).light
     return Prediction.of(light.rotated(other.azimuth - place.azimuth))
 
 
 def mirrored_photo(bench: Bench, place: Place) -> Prediction:
     """Return the estimate from the mirrored photograph, mirrored back."""
     flipped = replace(place, photo=np.ascontiguousarray(place.photo[:, ::-1]))
-    return Prediction.of(mirrored(regression(bench.network, flipped).light, place.azimuth))
+    found = regression(bench.network_for(place.panorama), flipped)
+    return Prediction.of(mirrored(found.light, place.azimuth))
 
 
 def turned(bench: Bench, place: Place) -> Prediction:
@@ -329,7 +330,7 @@ ROWS = {
     "regression": Row(
         "methods",
         "the regressor alone",
-        of_place=lambda bench, place: regression(bench.network, place),
+        of_place=lambda bench, place: regression(bench.network_for(place.panorama), place),
         needs=("regressor",),
     ),
     "regression-ground": Row(

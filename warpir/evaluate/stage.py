@@ -15,6 +15,7 @@ from typing import Any
 
 import numpy as np
 import torch
+from torch import nn
 
 from warpir.app.config import InsertConfig
 from warpir.app.model_files import require_model
@@ -31,6 +32,7 @@ from warpir.render.renderer import Foreground, Renderer
 from warpir.render.tone_curve import ToneCurve
 from warpir.scene.light import Light
 from warpir.scene.tone_curves import Curves, ToneKnots
+from warpir.train.places import learned_from
 
 FLOOR_EVALUATIONS = 60
 """Largest number of evaluations in the fit of the tone floor's curves."""
@@ -287,6 +289,15 @@ class Bench:
         return self._network
 
     @cache  # noqa: B019, a bench lives as long as the program
+    def network_for(self, panorama: str) -> Regressor:
+        """Return the networks that have not learned from a panorama; all, if all have.
+
+        Raises:
+            InputError: There is no regressor (`ExitCode.MODEL`).
+        """
+        return unseen_by(self.network, panorama) or self.network
+
+    @cache  # noqa: B019, a bench lives as long as the program
     def require_prior(self) -> None:
         """Check that something can guide.
 
@@ -323,3 +334,25 @@ class Bench:
             if candidate.panorama != place.panorama:
                 return candidate
         raise InputError("--panoramas", "another scene's row needs two panoramas or more")
+
+
+def unseen_by(network: Regressor, panorama: str) -> Regressor | None:
+    """Return the mean of the networks that have not learned from a panorama; None without any.
+
+    Args:
+        network: Its record names what each of its networks has learned from.
+        panorama: Name of the file, without its ending.
+    """
+    records = network.record.get("members", [network.record])
+    kept = [k for k, record in enumerate(records) if panorama not in learned_from(record)]
+    if len(kept) == len(records):
+        return network
+    if not kept:
+        return None
+    device = network.directions.device
+    part = Regressor(replace(network.config, members=len(kept))).to(device)
+    # Means and temperature are buffers of the whole; the networks themselves are shared.
+    part.load_state_dict(network.state_dict(), strict=False)
+    part.members = nn.ModuleList(network.members[k] for k in kept)
+    part.record = {"members": [records[k] for k in kept]}
+    return part.eval().requires_grad_(False)

@@ -117,7 +117,7 @@ def _run(arguments: list[str]) -> int:
     rank = int(os.environ.get("LOCAL_RANK", "0"))
     device = f"cuda:{rank}" if "LOCAL_RANK" in os.environ else choose_device(options.device)
     names = [p.stem for p in panoramas if p.stem not in options.without]
-    known = _places_of(options.start)
+    known = _places_of(options)
     watched_names = {*options.validation, *of_fold(names, options.fold, known)}
     kept_out = {*options.without, *watched_names}
     kept_out |= {*names} - some_places(
@@ -205,20 +205,14 @@ def _train_camera(options: argparse.Namespace, panoramas: Sequence[Path]) -> dic
     )
 
 
-def _places_of(start: Path | None) -> list[str]:
-    """Return the panoramas that a network, and those it started from, have learned from."""
-    if start is None:
-        return []
+def _places_of(options: argparse.Namespace) -> set[str]:
+    """Return the panoramas that the regressor to start from has learned from."""
+    if options.start is None or options.network != "regressor":
+        return set()
     from warpir.lighting.regressor import load_regressor
+    from warpir.train.places import learned_from
 
-    names: list[str] = []
-    records = [load_regressor(start).record]
-    while records:
-        record = records.pop()
-        names += record.get("panoramas", [])
-        records += record.get("members", [])
-        records += [record["started_from"]] if "started_from" in record else []
-    return names
+    return learned_from(load_regressor(options.start).record)
 
 
 def _fold(text: str) -> tuple[int, int]:

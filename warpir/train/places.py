@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Sequence
+from collections.abc import Collection, Mapping, Sequence
+from typing import Any
 
 import numpy as np
 
@@ -63,3 +64,19 @@ def some_places(names: Sequence[str], count: int | None, known: Collection[str])
             break
         chosen |= {name for name in names if place_of(name) == place}
     return chosen
+
+
+def learned_from(record: Mapping[str, Any]) -> set[str]:
+    """Return the panoramas that a network, and those it started from, have learned from.
+
+    Args:
+        record: Of the network's weights (`warpir.lighting.regressor.Regressor.record`).
+    """
+    names: set[str] = set()
+    records = [record]
+    while records:
+        each = records.pop()
+        names |= set(each.get("panoramas", ()))
+        records += each.get("members", [])
+        records += [each["started_from"]] if "started_from" in each else []
+    return names

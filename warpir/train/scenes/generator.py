@@ -218,6 +218,8 @@ class SceneGenerator:
         factor = (shaded.clamp(min=1e-4) / shot.plain.clamp(min=1e-4)).clamp(max=1.0)
         covered = made.coverage
         part = shot.look.show(made.object / covered.clamp(min=1e-6))
+        black = scenes.black[:, None, None, None]
+        part = ((part + black) / (1.0 + black)).clamp(0.0, 1.0)
         image = covered * part + (1.0 - covered) * shot.photo * factor
         normal = made.normal / made.normal.norm(dim=1, keepdim=True).clamp(min=1e-6)
         albedo = (made.albedo / covered.clamp(min=1e-6)).clamp(0.0, 1.0) ** (1.0 / 2.2)
@@ -316,7 +318,7 @@ class SceneGenerator:
         seen = torch.where(made_up, -1, lights)
         ground = draw_grounds(draw, is_panorama, seen, views.height, panoramas)
         rest = (luminance(self._levels[0][lights]) * solid_angles(self._levels[0])).sum(dim=(1, 2))
-        kind, object_light = draw_wrong_lights(
+        kind, object_light, black = draw_wrong_lights(
             light, rest, self._share[lights] < 0.12, self.mixture.mismatched, generator
         )
         if with_object:
@@ -348,6 +350,7 @@ class SceneGenerator:
             crop_window=crop_window,
             is_panorama=is_panorama,
             kind=kind,
+            black=black,
             noun=stock.nouns[stands.mesh],
             setting=torch.where(indoors >= 0, indoors, -1),
             weather=pool.weather[lights],

@@ -15,8 +15,11 @@ from warpir.train.sampler import Sampler
 
 DIRECTIONS, SUN_DIRECTIONS = 96, 16
 """Directions that stand for a light, shared by a pixel's four points."""
-WRONG_SHARES = [0.52, 0.14, 0.12, 0.12, 0.10]
-"""Of each kind of wrong light, in the order of `KINDS` after the right one."""
+WRONG_SHARES = [0.12, 0.26, 0.20, 0.24, 0.18]
+"""Of each kind of wrong composite, in the order of `KINDS` after the right one: what a composite
+shows best is drawn most. The last has the right light, and a wrong black point."""
+BLACK_POINTS = (0.03, 0.18)
+"""Least and most by which a wrong black point is off, display-encoded [1]."""
 
 
 @dataclass
@@ -149,7 +152,7 @@ def draw_wrong_lights(
     is_weak: Tensor,
     mismatched: float,
     generator: torch.Generator,
-) -> tuple[Tensor, Lighting]:
+) -> tuple[Tensor, Lighting, Tensor]:
     """Draw what is wrong with the objects' lights.
 
     Args:
@@ -160,7 +163,8 @@ def draw_wrong_lights(
         generator: Of the lights' device.
 
     Returns:
-        Index into `KINDS`, int64, shape [B], and the objects' lights.
+        Index into `KINDS`, int64, shape [B], the objects' lights, and by how much their display
+        values are lifted, or below 0 lowered, where they are black, shape [B].
     """
     draw = Sampler(len(rest), generator)
     drawn = 1 + draw.category(WRONG_SHARES)
@@ -175,7 +179,8 @@ def draw_wrong_lights(
     for number, choice in enumerate(choices, start=1):
         result = result.chosen(choice, kind == number)
     assert KINDS[1:] == ("direction", "exposure", "colour", "softness", "shadow")
-    return kind, result
+    black = torch.where(kind == 5, draw.uniform(*BLACK_POINTS) * draw.sign(), 0.0)
+    return kind, result, black
 
 
 def _draw_wrong_direction(

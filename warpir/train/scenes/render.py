@@ -90,6 +90,8 @@ class Scenes:
     is_panorama: Tensor
     """Bool: the photo is a panorama crop."""
     kind: Tensor
+    black: Tensor
+    """By how much the object's display values are lifted where they are black, shape [B]."""
     noun: Tensor
     setting: Tensor
     weather: Tensor
