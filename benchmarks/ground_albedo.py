@@ -4,10 +4,11 @@
 
 Crops of every panorama are photographs as `warpir.evaluate` makes them, each with a place for an
 object. The ground's radiance near it times pi, over the irradiance that the panorama gives level
-ground, is the ground's albedo; under the regressed light it is the implied albedo. The panoramas,
-in the order of their names, are dealt in turn to two halves: location, scale and degrees of freedom
-of the albedo's logarithm are fitted on the first, and the second says how far the level of the
-regressed light is off, before and after the ground is asked (`warpir.lighting.exposure`).
+ground, is the ground's albedo; under the regressed light it is the implied albedo. A panorama is
+judged by the networks that have not learned from it. The panoramas, in the order of their names,
+are dealt in turn to two halves: location, scale and degrees of freedom of the albedo's logarithm
+are fitted on the first, and the second says how far the level of the regressed light is off, before
+and after the ground is asked (`warpir.lighting.exposure`).
 """
 
 from __future__ import annotations
@@ -33,6 +34,7 @@ from warpir.evaluate.scenes import (
     Subject,
     find_files,
 )
+from warpir.evaluate.stage import unseen_by
 from warpir.io.images.photos import Photo
 from warpir.lighting.exposure import ALBEDO, ask_ground, level_log_std
 from warpir.lighting.regression import regress
@@ -155,7 +157,11 @@ def main() -> None:
     network = load_regressor(None)
     halves: list[list[Crop]] = [[], []]
     for k, path in enumerate(find_files(options.panoramas, PANORAMA_SUFFIXES, "--panoramas")):
-        halves[k % 2] += crops_of(path, assets, network, options.crops)
+        unseen = unseen_by(network, path.stem)
+        if unseen is None:
+            print(f"{path.stem}: left out, all networks have learned from it")
+            continue
+        halves[k % 2] += crops_of(path, assets, unseen, options.crops)
     freedom, location, scale = student.fit(np.array([c.albedo for c in halves[0]]))
     print(
         f"first half: the albedo's logarithm is Student's t with {freedom:.1f} degrees of freedom "

@@ -4,10 +4,10 @@
 
 Photographs are crops of panoramas, 288 x 192, with the peak of the light inside (at most four of a
 place) and outside (seven): pitch -15 to 35 degrees, vertical field of view 35 to 75, exposure off
-by half a stop, the camera's glare in half of them, one of two responses, 8 bits. Places are halved
-by the checksum of their names; ``--fit`` fits the rule's weights to one half. The errors of the
-light are those of crops with an unclouded sun in them, before and after; ``--asset`` renders
-composites of some of them.
+by half a stop, the camera's glare in half of them, one of two responses, 8 bits. A panorama is
+judged by the networks that have not learned from it. Places are halved by the checksum of their
+names; ``--fit`` fits the rule's weights to one half. The errors of the light are those of crops
+with an unclouded sun in them, before and after; ``--asset`` renders composites of some of them.
 """
 
 import argparse
@@ -38,7 +38,7 @@ from warpir.evaluate.scenes import (
     find_files,
     with_surface,
 )
-from warpir.evaluate.stage import Prediction, Quality, Stage
+from warpir.evaluate.stage import Prediction, Quality, Stage, unseen_by
 from warpir.io.assets import load_asset
 from warpir.io.images.photos import read_envmap
 from warpir.lighting import visible_sun
@@ -364,8 +364,11 @@ def main() -> None:
     network = load_regressor(None, "cpu")
     judged = []
     for path in find_files(options.panoramas, PANORAMA_SUFFIXES, "--panoramas"):
-        truth = truth_of(path)
-        judged += [judge(crop, network) for crop in crops_of(truth)]
+        truth, unseen = truth_of(path), unseen_by(network, path.stem)
+        if unseen is None:
+            print(f"{path.stem}: left out, all networks have learned from it")
+            continue
+        judged += [judge(crop, unseen) for crop in crops_of(truth)]
     halves = {
         "tuned on": [j for j in judged if j.crop.truth.is_for_tuning],
         "held out": [j for j in judged if not j.crop.truth.is_for_tuning],

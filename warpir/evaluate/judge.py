@@ -23,6 +23,7 @@ from warpir.train.lights import load_panoramas
 from warpir.train.meshes import make_meshes
 from warpir.train.scenes.generator import Mixture, SceneGenerator
 from warpir.train.scenes.render import Stock
+from warpir.train.validation import COVERAGE
 
 LIGHT_HEIGHT = 128
 """Rows of the maps that are compared."""
@@ -113,7 +114,10 @@ def _judge_light(
     place: Place, prediction: Prediction
 ) -> tuple[Prediction, FloatArray, dict[str, float]]:
     texels = as_map(prediction.light, LIGHT_HEIGHT)
-    return prediction, texels, light_figures(place, texels)
+    figures = light_figures(place, texels)
+    if "truth_mass" in prediction.about:
+        figures["light.in_region"] = float(prediction.about["truth_mass"] <= COVERAGE)
+    return prediction, texels, figures
 
 
 def light_figures(place: Place, texels: FloatArray) -> dict[str, float]:

@@ -232,6 +232,7 @@ TABLES: tuple[tuple[str, tuple[tuple[str, str], ...]], ...] = (
         "Light",
         (
             ("peak angle", "light.peak_angle_deg"),
+            ("in its 68 % region", "light.in_region"),
             ("centroid angle", "light.bright_angle_deg"),
             ("blob angle", "light.blob_angle_deg"),
             ("abs log sun/sky", "light.abs_log_sun_sky_ratio_error"),
@@ -301,6 +302,7 @@ def tables(
 
 KIND_COLUMNS = (
     ("peak angle", "light.peak_angle_deg"),
+    ("in its 68 % region", "light.in_region"),
     ("abs log sun/sky", "light.abs_log_sun_sky_ratio_error"),
     ("abs log flux", "light.abs_log_flux_error"),
     ("log ambient", "light.ambient_log_error"),
