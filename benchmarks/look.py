@@ -2,27 +2,30 @@
 
     python -m benchmarks.look --panoramas DIR --assets DIR --scenes 20 --json FILE
 
-Panorama crops pass through a camera that is drawn: blur, response, and grain by level; the
-responses are those that the regressor trains with (`warpir.train.photo_look`). The truth is the
-object in the crop under the crop's own light, through the same camera. The light is given, so all
-that is left between truth and composite is what the camera did. The places are those that
-`benchmarks.response` does not fit its estimate to.
+Panorama crops pass through a camera that is drawn: blur, response, grain by level, and in half of
+them the blocks of JPEG; the responses are those that the regressor trains with
+(`warpir.train.photo_look`). The truth is the object in the crop under the crop's own light, through
+the same camera. The light is given, so all that is left between truth and composite is what the
+camera did. The places are those that `benchmarks.response` does not fit its estimate to.
 """
 
 import argparse
 import json
+import tempfile
 from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
 import torch
+from PIL import Image
 from scipy import ndimage
 
 from benchmarks.response import LEVELS, codes_of, curve, is_for_fitting
-from warpir.core.arrays import Float64Array, FloatArray
+from warpir.core.arrays import CodeArray, Float64Array, FloatArray
 from warpir.core.color import luminance
 from warpir.evaluate.image_errors import image_errors, make_regions
 from warpir.evaluate.scenes import Place, Places, Subject, find_files
+from warpir.io.images.jpeg import JpegCoding, read_coding
 from warpir.io.images.photos import Photo
 from warpir.look.camera_look import estimate_look
 from warpir.look.grain import Grain
@@ -38,9 +41,13 @@ ROWS = {
     "response": ("off", "off", "auto"),
     "sharpness": ("auto", "off", "off"),
     "grain": ("off", "auto", "off"),
+    "blocks": ("off", "auto", "off"),
     "auto": ("auto", "auto", "auto"),
 }
-"""Sharpness, grain and response of each row."""
+"""Sharpness, grain and response of each row. `--grain` stands for the blocks of JPEG too; of these
+two rows each keeps one of both."""
+QUALITY = (40, 95)
+"""Least and most quality of the JPEG files that half of the cameras write."""
 BLUR, GRAIN = (0.0, 1.6), (0.0, 6.0)
 """Least and most deviation of the drawn blur [px] and of the drawn grain [codes of 255]."""
 
@@ -56,6 +63,8 @@ class Shot:
     """Of unit variance, shape [H, W, 3]."""
     response: Look
     """Without its exposure and white balance."""
+    quality: int | None
+    """Of the JPEG file that it writes; None: it writes none."""
 
     def shoot(self, linear: FloatArray) -> FloatArray:
         """Return codes of 255 over 255, [H, W, 3]."""
@@ -64,7 +73,22 @@ class Shot:
         shown = self.response.show(torch.from_numpy(seen).permute(2, 0, 1)[None].float())
         shown = shown[0].permute(1, 2, 0).numpy()
         noisy = shown + self.grain.deviation(shown) * self.noise
-        return (np.round(255.0 * np.clip(noisy, 0.0, 1.0)) / 255.0).astype(np.float32)
+        codes = np.round(255.0 * np.clip(noisy, 0.0, 1.0)).astype(np.uint8)
+        if self.quality is not None:
+            codes = jpeg_of(codes, self.quality)[0]
+        return (codes / np.float32(255.0)).astype(np.float32)
+
+
+def jpeg_of(codes: CodeArray, quality: int) -> tuple[CodeArray, JpegCoding]:
+    """Return a picture as a JPEG file leaves it, and how the file is coded."""
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / "photo.jpg"
+        Image.fromarray(codes).save(path, quality=quality)
+        with Image.open(path) as image:
+            coded = np.asarray(image)
+        coding = read_coding(path, 1)
+    assert coding is not None
+    return coded, coding
 
 
 def laplacian(image: FloatArray, matte: FloatArray) -> float:
@@ -92,7 +116,8 @@ def measure(place: Place, subject: Subject, samples: int) -> dict[str, dict[str,
     generator = torch.Generator().manual_seed(int(rng.integers(2**31)))
     response = draw_looks(torch.from_numpy(place.photo_lin).permute(2, 0, 1)[None], generator)
     plain = replace(response, gain=torch.ones_like(response.gain))
-    camera = Shot(blur, grain, noise, plain)
+    quality = int(rng.integers(*QUALITY)) if rng.random() < 0.5 else None
+    camera = Shot(blur, grain, noise, plain, quality)
     ground = subject.placement.ground
     receiver = Receiver(ground[:3], -float(ground[3]))
     placed = Placed(subject.asset, subject.placement.asset_to_world)
@@ -107,11 +132,15 @@ def measure(place: Place, subject: Subject, samples: int) -> dict[str, dict[str,
     clean, again = composite(rendered(1), photo_of(place.photo), 1), rendered(2)
     truth = camera.shoot(clean.layers.composite)
     photo = photo_of(camera.shoot(place.photo_lin))
+    coding = None if quality is None else jpeg_of(photo.codes, quality)[1]
     regions = make_regions(clean.layers.matte, clean.layers.shadow_ratio)
     detail = laplacian(truth, clean.layers.matte)
     found = {}
     for name, words in ROWS.items():
-        look = estimate_look(photo.srgb, photo.linear(), regions["box"], *words)
+        jpeg = None if name == "grain" else coding
+        look = estimate_look(photo.srgb, photo.linear(), regions["box"], *words, jpeg)
+        if name == "blocks":
+            look = replace(look, grain=None)
         picture = composite(again, photo, 2, look=look)
         shown = photo.encode(picture.image, picture.changed).astype(np.float32) / 255.0
         errors = image_errors(shown, truth, regions)["box"]
@@ -128,6 +157,7 @@ def measure(place: Place, subject: Subject, samples: int) -> dict[str, dict[str,
     found["camera"] = {
         "blur": blur,
         "grain": 255.0 * float(grain.deviation(np.full(3, 0.4))[0]),
+        "quality": float(quality or 100),
         "response at .003": float(grey[0]),
     }
     return found

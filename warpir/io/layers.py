@@ -54,7 +54,7 @@ class Layers:
     specular: PixelArray | None = None
     """Part of `foreground` reflected specularly [1], shape [H, W, 3]."""
     grain: PixelArray | None = None
-    """What the sensor's grain adds to the composite, of either sign [1], shape [H, W, 3]."""
+    """What grain and JPEG blocks add to the composite, of either sign [1], shape [H, W, 3]."""
 
 
 _CHANNELS = {

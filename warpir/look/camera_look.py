@@ -8,7 +8,8 @@ from typing import Any
 import numpy as np
 
 from warpir.core.arrays import AnyFloatArray, BoolArray, Float64Array, FloatArray
-from warpir.look.grain import Grain, estimate_grain, grain_over
+from warpir.io.images.jpeg import JpegCoding
+from warpir.look.grain import Grain, blocks_over, estimate_grain, grain_over
 from warpir.look.response import Response, estimate_response
 from warpir.look.sharpness import PIXEL_SIGMA, EdgeBlur, blurred_layers, estimate_blur
 
@@ -22,12 +23,13 @@ SUMMED = ("foreground", "diffuse", "specular", "emission")
 
 @dataclass(frozen=True)
 class CameraLook:
-    """Blur, response and grain of a photo, where they are repeated on the object."""
+    """Blur, response, grain and JPEG blocks of a photo, where they are repeated on the object."""
 
     blur: EdgeBlur | None = None
     """Of the sharpest edges, given or estimated."""
     grain: Grain | None = None
     response: Response | None = None
+    jpeg: JpegCoding | None = None
 
     def blur_to_add(self, enlarged: float = 1.0) -> float:
         """Return the Gaussian that a rendered object lacks [px].
@@ -93,10 +95,15 @@ class CameraLook:
         seed: int,
         gamma: float,
     ) -> FloatArray | None:
-        """Return what `grain_over` adds, or None without grain."""
-        if self.grain is None:
-            return None
-        return grain_over(self.grain, composite, plate, matte, changed, seed, gamma)
+        """Return what `grain_over` and then `blocks_over` add; None without both."""
+        added = None
+        if self.grain is not None:
+            added = grain_over(self.grain, composite, plate, matte, changed, seed, gamma)
+            composite = composite + added
+        if self.jpeg is not None:
+            blocks = blocks_over(self.jpeg, composite, changed, gamma)
+            added = blocks if added is None else added + blocks
+        return added
 
     def lines(self) -> list[str]:
         """Return what was estimated, a sentence each."""
@@ -116,6 +123,11 @@ class CameraLook:
                 f"the photo has grain of {255.0 * self.grain.typical:.1f} codes of 255, and so "
                 "has the object (--grain)"
             )
+        if self.jpeg is not None:
+            found.append(
+                f"the photo is a JPEG of quality {self.jpeg.quality}, and so are the object and "
+                "the ground that it changes (--grain)"
+            )
         return found
 
     def record(self) -> dict[str, Any]:
@@ -124,6 +136,7 @@ class CameraLook:
             "blur": None if self.blur is None else asdict(self.blur),
             "grain": None if self.grain is None else asdict(self.grain),
             **({} if self.response is None else {"response": asdict(self.response)}),
+            **({} if self.jpeg is None else {"jpeg": {"quality": self.jpeg.quality}}),
         }
 
 
@@ -134,6 +147,7 @@ def estimate_look(
     sharpness: float | str = "auto",
     grain: float | str = "auto",
     response: float | str = "off",
+    jpeg: JpegCoding | None = None,
 ) -> CameraLook:
     """Estimate what a camera did to a photo.
 
@@ -142,10 +156,12 @@ def estimate_look(
         linear: The same display-linear.
         region: Where the object will stand; what surrounds it is looked at first, shape [H, W].
         sharpness: ``auto``, ``off``, or the standard deviation of the blur [px].
-        grain: ``auto``, ``off``, or its standard deviation [codes of 255].
+        grain: ``auto``, ``off`` (then without the blocks too), or its standard deviation [codes of
+            255].
         response: ``auto``, ``off``, or the exponent of its contrast [1].
+        jpeg: How the photo's file was coded, or None.
     """
-    look = CameraLook()
+    look = CameraLook(jpeg=None if grain == "off" else jpeg)
     if sharpness == "auto":
         look = replace(look, blur=estimate_blur(linear, region))
     elif sharpness != "off":

@@ -1,4 +1,7 @@
-"""The grain of a photo: its strength by level and channel, its size, and grain drawn like it."""
+"""The grain of a photo: its strength by level and channel, its size, and grain drawn like it.
+
+The blocks of the photo's JPEG coding are repeated too.
+"""
 
 from __future__ import annotations
 
@@ -11,6 +14,7 @@ from numpy.typing import NDArray
 from scipy import ndimage
 
 from warpir.core.arrays import AnyFloatArray, BoolArray, Float64Array, FloatArray
+from warpir.io.images.jpeg import JpegCoding
 
 SIDE = 12
 """Side of the patches in which grain is looked for [px]."""
@@ -211,3 +215,22 @@ def grain_over(
     noisy = np.clip(shown + lacking * noise, 0.0, 1.0) ** gamma
     added = (noisy - np.clip(composite, 0.0, 1.0)) * changed[..., None]
     return np.asarray(added, np.float32)
+
+
+def blocks_over(
+    coding: JpegCoding, composite: FloatArray, changed: BoolArray, gamma: float
+) -> FloatArray:
+    """Return what the photo's JPEG coding adds to a composite, display-linear, shape [H, W, 3].
+
+    Args:
+        coding: Of the photo.
+        composite: Display-linear, with the grain, shape [H, W, 3].
+        changed: Pixels that may change; the others get 0.
+        gamma: Exponent from display values to display-linear ones.
+    """
+    linear = np.clip(composite, 0.0, 1.0)
+    shown = linear ** (1.0 / gamma)
+    codes = np.round(255.0 * shown).astype(np.uint8)
+    off = (coding.recoded(codes).astype(np.float32) - codes) / np.float32(255.0)
+    coded = np.clip(shown + off, 0.0, 1.0) ** gamma
+    return np.asarray((coded - linear) * changed[..., None], np.float32)

@@ -106,7 +106,7 @@ def _look(run: Run, light: SceneLight) -> CameraLook:
     if response == "auto" and (is_shown or photo.is_linear):
         response = "off"
     words = asked.sharpness, asked.grain, response
-    look = estimate_look(photo.srgb, photo.linear(), around, *words)
+    look = estimate_look(photo.srgb, photo.linear(), around, *words, photo.jpeg)
     if "auto" in words:
         run.log.assume(*look.lines())
     return look

@@ -24,6 +24,7 @@ from warpir.io.images.color_profile import (
 )
 from warpir.io.images.decoder import DecodedImage, decode_image, upright
 from warpir.io.images.envmap_conventions import SEAM_SHIFTS, to_ours
+from warpir.io.images.jpeg import JpegCoding, read_coding
 
 RADIANCE_LIMIT = 1e12
 """Of a panorama, relative [W/(m^2 sr)]; float32 products overflow from 10^19 on."""
@@ -47,6 +48,8 @@ class Photo:
     """EXIF focal length, 35 mm equivalent [mm]."""
     notices: tuple[str, ...] = ()
     """What was assumed, expanded, repaired or left out, one line each."""
+    jpeg: JpegCoding | None = None
+    """How the file's blocks were quantised; None of other files, and of codes in a profile."""
 
     @property
     def is_linear(self) -> bool:
@@ -154,6 +157,7 @@ def read_photo(
         icc,
         image.focal_35mm,
         tuple(notices),
+        read_coding(path, image.orientation) if image.kind == "jpeg" and icc is None else None,
     )
 
 
