@@ -147,7 +147,7 @@ def _read(
 
             config = demo_config(config)
         inputs = read_inputs(config, loaders)
-        light = make_light(inputs, config)
+        light = make_light(inputs, config.light, config.tone_operator)
         say(f"placement: {inputs.placement.summary}")
         log.assume(*inputs.assumed, *(light.assumed if light is not None else ()))
         log.notice(*inputs.notices)
@@ -172,7 +172,7 @@ def _write(lit: "LitRun", rendered: "RenderedResult", asked: InsertConfig) -> di
     run.output.supersede(run.output.path / FOLDER)  # a finished run needs no checkpoints
     run.take_cache_notices()
     measured = run.inputs.measured | written.measured | lit.measured | rendered.measured
-    record = run.record(asked, rendered.device, measured)
+    record = run.record(asked.flat(), rendered.device, measured)
     if run.config.output.report:
         results = replace(written.results, record=record)
         with run.timings.stage("report"):

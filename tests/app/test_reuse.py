@@ -111,7 +111,7 @@ def test_light_rotate_and_exposure_change_the_runs_light(
         photo=str(inputs / "photo.png"), asset=str(inputs / "box.glb"), out=str(tmp_path / "o"),
         reuse=str(first.out), light_rotate=90.0, exposure=1.0,
     )  # fmt: skip
-    light = make_light(read_inputs(config), config)
+    light = make_light(read_inputs(config), config.light, config.tone_operator)
     expected = 2.0 * rotate_map(read_envmap(first.out / "envmap.exr"), 90.0)
     assert light.light is light.light_shadow and light.light.texels is not None
     np.testing.assert_allclose(light.light.texels, expected, rtol=1e-6)
@@ -147,7 +147,7 @@ def test_curves_and_tone_of_the_run_are_applied(
     assert written.tone == "reinhard"
     with pytest.raises(InputError, match="--tone: cannot be reinhard"):
         config = parse(run.argv).config.changed(reuse=str(first.out), tone="reinhard")
-        make_light(read_inputs(config), config)
+        make_light(read_inputs(config), config.light, config.tone_operator)
 
 
 def test_shadow_light_of_the_run_casts_the_shadow(

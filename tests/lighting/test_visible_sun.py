@@ -281,7 +281,8 @@ def test_run_says_that_it_saw_the_sun(is_wanted: bool, monkeypatch: pytest.Monke
     monkeypatch.setattr(estimate, "load_regressor", lambda path, device: None)
     monkeypatch.setattr(estimate, "regress", lambda network, photo, camera: regression)
     config = InsertConfig(out="o", demo=True, visible_sun=is_wanted)
-    seen = estimate.estimate_light(inputs_of(sunny(view, axis), view), config, "cpu")
+    inputs = inputs_of(sunny(view, axis), view)
+    seen = estimate.estimate_light(inputs, config.light, config.tone_operator, "cpu")
     assert ("the photo shows the sun" in seen.light.assumed[0]) == is_wanted
     assert (seen.regression is regression) != is_wanted
     assert (seen.regression.record()["sun_in_view"] is not None) == is_wanted

@@ -28,7 +28,13 @@ from warpir.app.config import InsertConfig
 from warpir.core.errors import ExitCode, InputError
 from warpir.io.assets import load_asset
 from warpir.place.preview_asset import preview_asset, triangle_count
-from warpir.place.session import PlacementFolder, open_session, placement_files, start_record
+from warpir.place.session import (
+    PlacementFolder,
+    Session,
+    open_session,
+    placement_files,
+    start_record,
+)
 from warpir.place.stance import Stance, ground_to_world, stance_of
 from warpir.scene.camera import Camera, camera_from_fov, ground_point
 from warpir.scene.placement import place_asset
@@ -63,6 +69,11 @@ def inputs(tmp_path_factory: pytest.TempPathFactory) -> Path:
     write_wedge(folder / "wedge.glb")
     write_wedge(folder / "wedge's <b>.stl")
     return folder
+
+
+def session_of(config: InsertConfig) -> Session:
+    """A session of this configuration."""
+    return open_session(config.inputs, config.camera, config.placement, config.limits)
 
 
 def command(folder: Path, out: Path, *more: str, asset: str = "wedge.glb") -> list[str]:
@@ -164,10 +175,10 @@ def test_placement_in_the_world_of_the_camera_file(inputs: Path, tmp_path: Path)
         rotate_y=70.0,
         size=1.5,
     )
-    session = open_session(config)
-    start = start_record(session)
+    session = session_of(config)
+    start = start_record(session, config.light, str(config.output.out))
     said = {**start["camera"], **{k: start[k] for k in ("stance", "stand", "rotate_y", "size")}}
-    files = placement_files(session, said)
+    files = placement_files(session, config.flat(), said)
     np.testing.assert_allclose(files["camera.json"]["c2w"], pose, atol=EXACT)
     saved = files["insert.json"]
     low, high = session.asset.bounds()
@@ -184,14 +195,14 @@ def test_start_shows_what_insert_would_refuse(inputs: Path, tmp_path: Path) -> N
     photo, asset = str(inputs / "photo.png"), str(tmp_path / "huge.stl")
     for pitch in (0.0, 30.0, -60.0, -90.0):
         config = InsertConfig(photo=photo, asset=asset, out=str(tmp_path / "o"), pitch=pitch)
-        session = open_session(config)
-        start = start_record(session)
+        session = session_of(config)
+        start = start_record(session, config.light, str(config.output.out))
         said = {**start["camera"], **{k: start[k] for k in ("stance", "stand", "rotate_y", "size")}}
         assert 0.01 < start["size"] < 20.0
         if pitch < 30.0:
-            assert placement_files(session, said)
+            assert placement_files(session, config.flat(), said)
     with pytest.raises(InputError, match="camera is inside"):
-        open_session(config.changed(pitch=0.0, place=(0.0, 0.0, -5.0)))
+        session_of(config.changed(pitch=0.0, place=(0.0, 0.0, -5.0)))
 
 
 # ---------------------------------------------------------------------------- what the page gets
@@ -226,10 +237,10 @@ def placed_files(inputs: Path, out: Path) -> dict[str, dict[str, Any]]:
     config = InsertConfig(
         photo=str(inputs / "photo.png"), asset=str(inputs / "wedge.glb"), out=str(out)
     )
-    session = open_session(config)
-    start = start_record(session)
+    session = session_of(config)
+    start = start_record(session, config.light, str(config.output.out))
     said = {**start["camera"], **{k: start[k] for k in ("stance", "stand", "rotate_y", "size")}}
-    return placement_files(session, {**said, **SAID})
+    return placement_files(session, config.flat(), {**said, **SAID})
 
 
 def test_folder_replaces_its_own_only(inputs: Path, tmp_path: Path) -> None:
@@ -270,11 +281,11 @@ def test_placement_refuses_wrong_numbers(
     config = InsertConfig(
         photo=str(inputs / "photo.png"), asset=str(inputs / "wedge.glb"), out=str(tmp_path / "o")
     )
-    session = open_session(config)
-    start = start_record(session)
+    session = session_of(config)
+    start = start_record(session, config.light, str(config.output.out))
     said = {**start["camera"], **{k: start[k] for k in ("stance", "stand", "rotate_y", "size")}}
     with pytest.raises(InputError) as error:
-        placement_files(session, {**said, **SAID, **change})
+        placement_files(session, config.flat(), {**said, **SAID, **change})
     assert words in str(error.value)
 
 

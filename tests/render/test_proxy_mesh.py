@@ -595,7 +595,7 @@ def test_exposure_looks_at_ground_that_the_sun_reaches(files: Path) -> None:
 
     def exposure(**flags: str) -> float:
         config = config_of(files, exposure=None, place="0,0,-6.2", **flags)
-        light = make_light(read_inputs(config), config)
+        light = make_light(read_inputs(config), config.light, config.tone_operator)
         assert light is not None
         return light.exposure
 

@@ -211,7 +211,7 @@ def test_page_tells_no_folder(run: Run, page: str, folder: Path) -> None:
 def test_paths_of_a_line_keep_their_last_part(line: str, told: str) -> None:
     """Whether anybody gave them or not; fractions, pointers and addresses are no paths."""
     config = InsertConfig(asset="models/a car/a.obj", photo="../x.png", reuse=".", out="/o")
-    assert without_folders(line, config) == told
+    assert without_folders(line, config.flat()) == told
 
 
 def test_folder_of_a_dot_is_told_by_its_name(
@@ -220,7 +220,7 @@ def test_folder_of_a_dot_is_told_by_its_name(
     """The run in which somebody stands."""
     (tmp_path / "street").mkdir()
     monkeypatch.chdir(tmp_path / "street")
-    assert "--reuse street " in command_line(InsertConfig(reuse=".", photo="a.png"))
+    assert "--reuse street " in command_line(InsertConfig(reuse=".", photo="a.png").flat())
 
 
 def test_hostile_texts_stay_texts(page: str, guided: report.Results) -> None:
@@ -330,7 +330,7 @@ def test_command_line_repeats_the_settings(argv: list[str]) -> None:
     if "--graphs" in argv:
         argv = [*argv[:-1], "--no-graphs"]
     config = parse([*argv, "--out", "OUT"]).config
-    words = shlex.split(command_line(config))
+    words = shlex.split(command_line(config.flat()))
     assert words[:3] == ["python", "-m", "warpir.insert"]
     assert parse(words[3:]).config == config
 
@@ -346,10 +346,10 @@ def test_the_same_again_runs_with_a_model_of_the_hub(
     assert "warpir.insert --config run.json --allow-download --out OUT<" in text
     assert "--model someone/a-model " in text and "--allow-pickle" not in text
     config = report.config_of(record)
-    assert without_folders("someone/a-model: odd", config) == "someone/a-model: odd"
+    assert without_folders("someone/a-model: odd", config.flat()) == "someone/a-model: odd"
     (tmp_path / "someone" / "a-model").mkdir(parents=True)
     monkeypatch.chdir(tmp_path)
-    assert "--model a-model " in command_line(config)
+    assert "--model a-model " in command_line(config.flat())
 
 
 @pytest.mark.parametrize(
@@ -361,7 +361,9 @@ def test_the_same_again_runs_with_a_model_of_the_hub(
 )
 def test_light_of_the_demo_is_told_where_it_is_used(values: dict[str, Any], words: str) -> None:
     """Not where an even light was asked for."""
-    ((_, text),) = light_sources({"measured": {"prior": "none"}}, InsertConfig(**values))
+    config = InsertConfig(**values)
+    record = {"measured": {"prior": "none"}, "config": config.flat()}
+    ((_, text),) = light_sources(record, config.light)
     assert text.startswith(words)
 
 

@@ -21,7 +21,7 @@ from warpir.core.errors import ExitCode, InputError
 from warpir.core.latlong import map_directions, resize_map, rotate_map, texel_solid_angles
 from warpir.io.images.photos import Photo
 from warpir.lighting.fit import LAMP_COUNT_MAX, fit_lobes
-from warpir.lighting.scene_light import SKIES, SUN_TO_SKY, make_light
+from warpir.lighting.scene_light import SKIES, SUN_TO_SKY, SceneLight, make_light
 from warpir.render.device_light import light_args
 from warpir.scene.asset import Asset, Material
 from warpir.scene.light import (
@@ -461,6 +461,12 @@ def config_for(tone: str = "reinhard", **values: object) -> InsertConfig:
     return InsertConfig(photo="p", asset="a", out="o", tone=tone, **values)
 
 
+def light_for(inputs: Inputs, **values: object) -> SceneLight | None:
+    """The light of these values."""
+    config = config_for(**values)
+    return make_light(inputs, config.light, config.tone_operator)
+
+
 def ground_level(light: Light, albedo: float) -> float:
     """Linear luminance of Lambertian ground before the tone operator."""
     return albedo * float(luminance(light.irradiance(UP))) / np.pi
@@ -475,7 +481,7 @@ def test_exposure_puts_the_ground_at_the_photos_level(
     """Display value of ground of the stated albedo = the photo's; a white photo counts as 0.9."""
     given = Light(lobe((0.3, 0.8, 0.2), 500.0, (90.0, 80.0, 70.0)).lobes, noise_map(8))
     config = config_for(light="l.hdr", tone=tone, ground_albedo=albedo)
-    made = make_light(inputs_for(level, given), config)
+    made = make_light(inputs_for(level, given), config.light, config.tone_operator)
     shown = ground_level(made.light, albedo)
     if tone == "reinhard":
         shown = float(reinhard(shown))
@@ -493,7 +499,7 @@ def test_exposure_reads_the_ground_round_the_object() -> None:
     level[:6] = 0.9
     level[:, :3] = 0.9
     light = constant()
-    made = make_light(inputs_for(level, light), config_for(light="l.hdr"))
+    made = light_for(inputs_for(level, light), light="l.hdr")
     assert float(reinhard(ground_level(made.light, 0.25))) == pytest.approx(0.1, rel=1e-3)
 
 
@@ -501,21 +507,21 @@ def test_exposure_stands_for_lit_ground() -> None:
     """Where a third of the ground is in shadow, the lit part sets the level."""
     level = np.full((32, 48, 3), 0.4, np.float32)
     level[:, :20] = 0.05
-    made = make_light(inputs_for(level, constant()), config_for(light="l.hdr"))
+    made = light_for(inputs_for(level, constant()), light="l.hdr")
     assert float(reinhard(ground_level(made.light, 0.25))) == pytest.approx(0.4, rel=1e-3)
 
 
 def test_given_exposure_is_taken_and_nothing_assumed() -> None:
     """--exposure multiplies by 2^EV, and then nothing about the light was assumed."""
-    made = make_light(inputs_for(0.2, constant()), config_for(light="l.hdr", exposure=-1.5))
+    made = light_for(inputs_for(0.2, constant()), light="l.hdr", exposure=-1.5)
     assert made.exposure == -1.5 and made.assumed == ()
     np.testing.assert_allclose(made.light.texels, 2.0**-1.5, rtol=FLOAT32)
 
 
 def test_nothing_said_means_that_the_photo_is_asked() -> None:
     """There is no light of our own making, except the even one that --start uniform asks for."""
-    assert make_light(inputs_for(0.2), config_for()) is None
-    even = make_light(inputs_for(0.2), config_for(start="uniform"))
+    assert light_for(inputs_for(0.2)) is None
+    even = light_for(inputs_for(0.2), start="uniform")
     assert even is not None and even.light.texels is not None
     # Reinhard shows radiance .25 as .2.
     np.testing.assert_allclose(even.light.texels, 0.25, rtol=1e-3)
@@ -524,7 +530,7 @@ def test_nothing_said_means_that_the_photo_is_asked() -> None:
 
 def test_sun_alone_stands_in_a_clear_sky() -> None:
     """A sun without a strength has the stated ratio to the sky, and points where it is said."""
-    made = make_light(inputs_for(0.2), config_for(sun=(-120.0, 40.0), exposure=0.0))
+    made = light_for(inputs_for(0.2), sun=(-120.0, 40.0), exposure=0.0)
     assert made is not None
     assert made.light.lobes is not None and made.light.texels is not None
     axis = axis_from_angles(-120.0, 40.0)
@@ -538,7 +544,7 @@ def test_sun_alone_stands_in_a_clear_sky() -> None:
 @pytest.mark.parametrize("preset", SKIES)
 def test_sky_alone_has_no_sun(preset: str) -> None:
     """--sky gives its radiance above and what the ground sends back below, and no lobe."""
-    made = make_light(inputs_for(0.2), config_for(sky=preset, exposure=0.0))
+    made = light_for(inputs_for(0.2), sky=preset, exposure=0.0)
     assert made.light.lobes is None and made.light.texels is not None
     sky = np.array(SKIES[preset][0])
     np.testing.assert_allclose(made.light.texels[0, 0], sky, rtol=FLOAT32)
@@ -549,7 +555,7 @@ def test_sky_alone_has_no_sun(preset: str) -> None:
 def test_sun_and_sky_flags_are_taken_as_given() -> None:
     """--sun AZ,EL,STRENGTH and --sky R,G,B: both at their values, the ground by its albedo."""
     config = config_for(sun=(30.0, 60.0, 7.0), sky=(0.1, 0.2, 0.3), exposure=0.0, ground_albedo=0.5)
-    light = make_light(inputs_for(0.2), config).light
+    light = make_light(inputs_for(0.2), config.light, config.tone_operator).light
     assert light.lobes is not None and light.texels is not None
     axis = axis_from_angles(30.0, 60.0)
     np.testing.assert_allclose(light.lobes.axis[0], axis, atol=1e-6)
@@ -561,7 +567,7 @@ def test_sun_and_sky_flags_are_taken_as_given() -> None:
 
 def test_sun_below_the_horizon_lights_no_ground() -> None:
     """A set sun adds nothing to what the ground sends back."""
-    made = make_light(inputs_for(0.2), config_for(sun=(0.0, -10.0), exposure=0.0))
+    made = light_for(inputs_for(0.2), sun=(0.0, -10.0), exposure=0.0)
     assert any("below the horizon" in line for line in made.assumed)
     light = made.light
     assert light.texels is not None
@@ -583,10 +589,10 @@ def test_light_that_misses_the_ground_is_refused(
 ) -> None:
     """No exposure follows from a dark ground: the error names the flag; --exposure still works."""
     with pytest.raises(InputError, match="no light reaches the ground") as caught:
-        make_light(inputs_for(0.2, light), config_for(**config))
+        light_for(inputs_for(0.2, light), **config)
     assert caught.value.where == config.get("light", "--sun")
     assert "--exposure" in caught.value.advice
-    made = make_light(inputs_for(0.2, light), config_for(exposure=1.0, **config))
+    made = light_for(inputs_for(0.2, light), exposure=1.0, **config)
     assert made.exposure == 1.0
 
 
@@ -594,7 +600,7 @@ def test_fit_lobes_replaces_the_panorama() -> None:
     """--fit-lobes leaves lobes alone, at the photo's exposure, with the fit's errors."""
     texels = FIT_MAPS["sun"][0]
     given = Light(texels=texels)
-    made = make_light(inputs_for(0.2, given), config_for(light="l.hdr", fit_lobes=16))
+    made = light_for(inputs_for(0.2, given), light="l.hdr", fit_lobes=16)
     assert made.light.texels is None and made.light.lobes is not None
     assert len(made.light.lobes.sharpness) == 16
     assert made.fit is not None and made.fit.irradiance_error < 0.05

@@ -100,13 +100,8 @@ class InsertConfig:
             return self.guidance.kind
         if self.diffusion.model is not None:
             return "stable-diffusion"
-        is_lit = self.light.reuse is not None or self.is_light_described
+        is_lit = self.light.reuse is not None or self.light.is_described
         return "none" if is_lit else "embedded"
-
-    @property
-    def is_light_described(self) -> bool:
-        """Whether the user said anything about the light."""
-        return any(v is not None for v in (self.light.file, self.light.sun, self.light.sky))
 
     @property
     def is_guided(self) -> bool:

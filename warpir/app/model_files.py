@@ -40,7 +40,7 @@ def require_model(config: InsertConfig) -> None:
     lora, prior, regressor = (
         _path(f) for f in (config.adapter.lora, config.guidance.prior, config.light.regressor)
     )
-    is_told = config.is_light_described or config.light.reuse is not None
+    is_told = config.light.is_described or config.light.reuse is not None
     embedding_width: int | None = None
     if config.guided_by == "stable-diffusion":
         embedding_width = attempt(lambda: _model_width(config.diffusion))

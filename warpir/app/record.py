@@ -56,7 +56,7 @@ class Timings:
 
 
 def run_record(
-    config: InsertConfig,
+    values: Mapping[str, Any],
     *,
     inputs: Mapping[str, str],
     device: str,
@@ -68,7 +68,7 @@ def run_record(
     """Return the content of ``run.json``; ``--config run.json`` runs it again.
 
     Args:
-        config: What was asked for.
+        values: What was asked for, from `InsertConfig.flat`.
         inputs: sha256 of the files that were read, from `warpir.app.inputs.Inputs.hashes`.
         device: What computed it, such as ``cpu`` or the name of a card.
         timings: Seconds by stage.
@@ -79,7 +79,7 @@ def run_record(
     return {
         "format": RUN_FORMAT,
         "warpir": warpir.__version__,
-        "config": config.flat(),
+        "config": dict(values),
         "inputs": dict(inputs),
         "assumed": list(assumed),
         "notices": list(notices),
@@ -91,17 +91,20 @@ def run_record(
     }
 
 
-def config_of_picture(config: InsertConfig) -> dict[str, Any]:
+def config_of_picture(values: Mapping[str, Any]) -> dict[str, Any]:
     """Return the configuration as a picture carries it, which may be given to others.
 
     Of paths only the names are left: where somebody keeps their files is for ``run.json``. A
     model's name in the hub is no path.
+
+    Args:
+        values: From `InsertConfig.flat`.
     """
     return {
         name: name_of(value) if name in PATHS and value is not None else value
-        for name, value in config.flat().items()
+        for name, value in values.items()
         if name not in OF_THE_RUN
-    } | ({"model": config.diffusion.model} if is_hub_id(config.diffusion.model) else {})
+    } | ({"model": values["model"]} if is_hub_id(values["model"]) else {})
 
 
 def is_hub_id(model: str | None) -> bool:

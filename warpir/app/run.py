@@ -82,18 +82,19 @@ class Run:
         self.log.notice(*take_notices())
 
     def record(
-        self, asked: InsertConfig, device: str, measured: Mapping[str, Any]
+        self, asked: Mapping[str, Any], device: str, measured: Mapping[str, Any]
     ) -> dict[str, Any]:
         """Return the content of ``run.json``; see `warpir.app.record.run_record`.
 
         Args:
-            asked: What was asked for; how the folder was found is left out, as a resumed run leaves
-                what an uninterrupted one does. The demo's files are no part of it.
+            asked: What was asked for, from `InsertConfig.flat`; how the folder was found is left
+                out, as a resumed run leaves what an uninterrupted one does. The demo's files are no
+                part of it.
             device: Name of what computed it.
             measured: Plain numbers about the result.
         """
         return run_record(
-            asked.changed(resume=False, overwrite=False),
+            {**asked, "resume": False, "overwrite": False},
             inputs=self.inputs.hashes,
             device=device,
             timings=self.timings,

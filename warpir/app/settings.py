@@ -163,6 +163,11 @@ class LightConfig:
     detail of its own"""
 
     @property
+    def is_described(self) -> bool:
+        """Whether the user stated anything about the light."""
+        return any(value is not None for value in (self.file, self.sun, self.sky))
+
+    @property
     def assumed_albedo(self) -> float:
         """Reflectance of the ground under a light that is given [1]."""
         return 0.25 if self.ground_albedo is None else self.ground_albedo

@@ -119,7 +119,7 @@ def _check(task: Task) -> dict[str, Any]:
         pass  # of earlier settings or inputs: done again
     config = filled
     inputs = read_inputs(config)
-    make_light(inputs, config)
+    make_light(inputs, config.light, config.tone_operator)
     OutputFolder(str(config.output.out), overwrite=True).check()  # what is in it was looked at
     disk = needed_bytes(config, inputs)
     require_space(str(config.output.out), disk)

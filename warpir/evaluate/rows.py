@@ -285,7 +285,7 @@ def recover_light(
         started = time.perf_counter()
         with OutputFolder(out) as output:
             run = Run(config, inputs, output, device=bench.device)
-            outcome = recover(run, make_light(inputs, config))
+            outcome = recover(run, make_light(inputs, config.light, config.tone_operator))
     light = outcome.light
     about = {"seconds": round(time.perf_counter() - started, 2), "record": outcome.record}
     return Prediction(light.light, light.light_shadow, light.curves, about=about)

@@ -8,8 +8,8 @@ from typing import Any
 
 import numpy as np
 
-from warpir.app.config import InsertConfig
 from warpir.app.inputs import Inputs
+from warpir.app.settings import LightConfig
 from warpir.lighting.exposure import GroundWitness, ask_ground
 from warpir.lighting.regression import Regression, regress
 from warpir.lighting.regressor import load_regressor
@@ -37,42 +37,42 @@ class Estimate:
         return {"regression": self.regression.record(), "ground": ground}
 
 
-def estimate_light(inputs: Inputs, config: InsertConfig, device: str) -> Estimate:
+def estimate_light(inputs: Inputs, asked: LightConfig, tone: str, device: str) -> Estimate:
     """Estimate the light of the photo with the regressor, and check its level by the ground.
 
     Args:
         inputs: Photo, camera and placement.
-        config: Weights, tone operator, exposure, albedo of the ground.
+        asked: Weights, exposure, albedo of the ground.
+        tone: Operator that shows the light, from `InsertConfig.tone_operator`.
         device: torch's name of it.
 
     Raises:
         InputError: The weights are absent or damaged (`ExitCode.MODEL`).
     """
-    path = None if config.light.regressor is None else Path(config.light.regressor)
+    path = None if asked.regressor is None else Path(asked.regressor)
     regression = regress(load_regressor(path, device), inputs.photo.srgb, inputs.camera)
-    if config.light.visible_sun:
+    if asked.visible_sun:
         regression = with_visible_sun(regression, inputs.photo.srgb, inputs.camera)
-    stops, ground = config.light.exposure, None
+    stops, ground = asked.exposure, None
     assumed = [_describe_direction(regression)]
     if stops is None:
-        ground = ask_ground(regression, inputs, config.light.ground_albedo)
+        ground = ask_ground(regression, inputs, asked.ground_albedo)
         stops = 0.0 if ground is None else ground.stops
         assumed.append(_describe_level(ground))
-    gain = tone_gain(inputs, config) * 2.0**stops
+    gain = tone_gain(inputs, tone) * 2.0**stops
     light = Light(lobes=regression.lobes()).scaled(gain)
-    curves = Curves.identity(config.tone_operator)
+    curves = Curves.identity(tone)
     scene_light = SceneLight(light, light, curves, float(np.log2(gain)), tuple(assumed))
     return Estimate(regression, ground, gain, scene_light)
 
 
-def tone_gain(inputs: Inputs, config: InsertConfig) -> float:
+def tone_gain(inputs: Inputs, tone: str) -> float:
     """Return by what a light in the photo's own unit is to be multiplied for the tone operator.
 
     An operator that never clips shows everything darker than it is; with this factor, white ground
     under an even light looks as the photo's ground does.
     """
-    linear = config.tone_operator == "linear"
-    return 1.0 if linear else 1.0 + start_level(inputs, config)
+    return 1.0 if tone == "linear" else 1.0 + start_level(inputs, tone)
 
 
 def _describe_direction(regression: Regression) -> str:

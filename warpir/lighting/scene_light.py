@@ -4,9 +4,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from warpir.app.config import InsertConfig, usage
+from warpir.app.config import usage
 from warpir.app.inputs import Inputs
 from warpir.app.reuse import EarlierRun
+from warpir.app.settings import LightConfig
 from warpir.core.arrays import BoolArray, Float64Array
 from warpir.core.color import luminance
 from warpir.core.errors import InputError
@@ -66,61 +67,64 @@ class SceneLight:
         return self.light if self.detailed is None else self.detailed
 
 
-def make_light(inputs: Inputs, config: InsertConfig) -> SceneLight | None:
-    """Build the light and set its exposure; None: it is to be read off the photo.
+def make_light(inputs: Inputs, asked: LightConfig, tone: str) -> SceneLight | None:
+    """Build the light and set its exposure; None: it is to be estimated from the photo.
+
+    Args:
+        inputs: Photo, camera, placement; panorama, lobes or earlier run where one is named.
+        asked: What the user stated about the light.
+        tone: Operator that shows it, from `InsertConfig.tone_operator`.
 
     Raises:
         InputError: The light is black, so no exposure can be chosen; or --tone contradicts the run
             whose light is used again.
     """
     if inputs.run is not None:
-        return _reused(inputs.run, config)
-    if not config.is_light_described and inputs.light is None:
-        return _even(inputs, config) if config.light.start == "uniform" else None
+        return _reused(inputs.run, asked)
+    if not asked.is_described and inputs.light is None:
+        return _even(inputs, tone) if asked.start == "uniform" else None
     assumed: list[str] = []
-    light = inputs.light if inputs.light is not None else _described(config, assumed)
+    light = inputs.light if inputs.light is not None else _described(asked, assumed)
     fit = None
-    if config.light.fit_lobes is not None and light.texels is not None:
-        fit = fit_lobes(light.texels, config.light.fit_lobes)
+    if asked.fit_lobes is not None and light.texels is not None:
+        fit = fit_lobes(light.texels, asked.fit_lobes)
         light = Light(lobes=fit.lobes)
-    exposure = config.light.exposure
+    exposure = asked.exposure
     if exposure is None:
-        exposure = _automatic_exposure(light, inputs, config)
+        exposure = _automatic_exposure(light, inputs, asked, tone)
         assumed.append(
             f"the light is {exposure:+.2f} EV, so that ground of albedo "
-            f"{config.light.assumed_albedo:g} looks as bright as the photo's lit ground "
+            f"{asked.assumed_albedo:g} looks as bright as the photo's lit ground "
             "(--exposure, --ground-albedo)"
         )
     light = light.scaled(2.0**exposure)
-    curves = Curves.identity(config.tone_operator)
+    curves = Curves.identity(tone)
     return SceneLight(light, light, curves, exposure, tuple(assumed), fit)
 
 
-def _even(inputs: Inputs, config: InsertConfig) -> SceneLight:
+def _even(inputs: Inputs, tone: str) -> SceneLight:
     """Return an even light at the ground's level (ours)."""
-    level = start_level(inputs, config)
+    level = start_level(inputs, tone)
     light = Light(texels=np.full((8, 16, 3), level, np.float32))
-    assumed = "nothing about the light: an even one (--start, --light, --sun)"
-    if config.is_guided:
-        assumed = "nothing about the light: the recovery starts from an even one (--light, --sun)"
-    return SceneLight(light, light, Curves.identity(config.tone_operator), 0.0, (assumed,))
+    assumed = "no light is given: it starts as an even one (--start, --light, --sun)"
+    return SceneLight(light, light, Curves.identity(tone), 0.0, (assumed,))
 
 
-def start_level(inputs: Inputs, config: InsertConfig) -> float:
+def start_level(inputs: Inputs, tone: str) -> float:
     """Return the radiance of an even light under which white ground looks as the photo's does."""
     level = float(np.clip(ground_level(inputs, GROUND_PERCENTILE), 1e-3, 0.9))
-    return level / (1.0 - level) if config.tone_operator == "reinhard" else level
+    return level / (1.0 - level) if tone == "reinhard" else level
 
 
-def _reused(run: EarlierRun, config: InsertConfig) -> SceneLight:
+def _reused(run: EarlierRun, asked: LightConfig) -> SceneLight:
     """Return an earlier run's light and curves; they are at the exposure of that run's photo."""
-    if config.light.tone not in (None, run.curves.tone):
+    if asked.tone not in (None, run.curves.tone):
         found = f"the curves of {run.path} are made for {run.curves.tone}"
-        raise usage("--tone", f"cannot be {config.light.tone}: {found}", "leave --tone out")
-    exposure = config.light.exposure or 0.0
+        raise usage("--tone", f"cannot be {asked.tone}: {found}", "leave --tone out")
+    exposure = asked.exposure or 0.0
 
     def adapted(light: Light) -> Light:
-        return light.rotated(config.light.rotate).scaled(2.0**exposure)
+        return light.rotated(asked.rotate).scaled(2.0**exposure)
 
     light = light_shadow = adapted(run.light_fg)
     if run.light_shadow is not run.light_fg:
@@ -128,9 +132,9 @@ def _reused(run: EarlierRun, config: InsertConfig) -> SceneLight:
     return SceneLight(light, light_shadow, run.curves, exposure, ())
 
 
-def _described(config: InsertConfig, assumed: list[str]) -> Light:
+def _described(asked: LightConfig, assumed: list[str]) -> Light:
     """Return the sun and sky of the flags."""
-    sun, sky = config.light.sun, config.light.sky
+    sun, sky = asked.sun, asked.sky
     preset = sky if isinstance(sky, str) else "clear"
     sky_color, sun_color = SKIES[preset]
     if isinstance(sky, tuple):
@@ -147,11 +151,11 @@ def _described(config: InsertConfig, assumed: list[str]) -> Light:
         r, g, b = (float(strength * c) for c in tint)
         lobes = sun_lobe(sun[0], sun[1], (r, g, b))
         horizontal += strength * tint * max(np.sin(np.radians(sun[1])), 0.0)
-    r, g, b = (float(c) for c in config.light.assumed_albedo * horizontal / np.pi)
+    r, g, b = (float(c) for c in asked.assumed_albedo * horizontal / np.pi)
     return Light(lobes, plain_sky(sky_color, (r, g, b)))
 
 
-def _automatic_exposure(light: Light, inputs: Inputs, config: InsertConfig) -> float:
+def _automatic_exposure(light: Light, inputs: Inputs, asked: LightConfig, tone: str) -> float:
     """Choose the light's scale so that Lambertian ground appears as the photo shows it.
 
     The tone curve's start is the identity, so display value = Reinhard(albedo * E / pi), or the
@@ -161,13 +165,13 @@ def _automatic_exposure(light: Light, inputs: Inputs, config: InsertConfig) -> f
     irradiance = float(luminance(light.irradiance(inputs.placement.ground[:3])))
     if not irradiance > 0.0:
         raise InputError(
-            config.light.file or "--sun",
+            asked.file or "--sun",
             "no light reaches the ground, so no exposure follows from the photo",
             "give --exposure",
         )
     level = np.clip(_level(inputs, points, LIT_PERCENTILE), 1e-3, 0.9)
-    wanted = level / (1.0 - level) if config.tone_operator == "reinhard" else level
-    return float(np.log2(wanted * np.pi / (config.light.assumed_albedo * irradiance)))
+    wanted = level / (1.0 - level) if tone == "reinhard" else level
+    return float(np.log2(wanted * np.pi / (asked.assumed_albedo * irradiance)))
 
 
 def lit_ground(points: Float64Array, light: Light, inputs: Inputs) -> tuple[Float64Array, Light]:

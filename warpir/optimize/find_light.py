@@ -80,7 +80,8 @@ def _estimated(run: Run) -> tuple[SceneLight, dict[str, Any]]:
     with run.timings.stage("regress"), fixed_arithmetic(run.device, is_fixed):
         from warpir.lighting.estimate import estimate_light
 
-        estimate = estimate_light(run.inputs, run.config, run.device)
+        config = run.config
+        estimate = estimate_light(run.inputs, config.light, config.tone_operator, run.device)
     run.log.assume(*estimate.light.assumed)
     return estimate.light, estimate.record()
 

@@ -114,7 +114,9 @@ def recover(run: Run, given: SceneLight | None) -> Outcome:
 def _estimated(run: Run) -> Start:
     """Return the regressor's estimate from the photo; log its assumptions."""
     with run.timings.stage("regress"):
-        estimate = estimate_light(run.inputs, run.config, run.device)
+        estimate = estimate_light(
+            run.inputs, run.config.light, run.config.tone_operator, run.device
+        )
     run.log.assume(*estimate.light.assumed)
     return Start(estimate.light, estimate)
 
@@ -126,10 +128,10 @@ def unknowns_of(run: Run, start: Start) -> Unknowns:
     if start.estimate is not None:
         lobes = start.estimate.regression.lobes(least)
         lobes = replace(lobes, amplitude=(start.estimate.gain * lobes.amplitude).astype(np.float32))
-    elif config.is_light_described:
+    elif config.light.is_described:
         fitted = fit_lobes(as_map(start.light.light, START_HEIGHT), settings.lobes).lobes
         lobes = widened(fitted, least)
-    return Unknowns.start(lobes, start_level(run.inputs, config), settings)
+    return Unknowns.start(lobes, start_level(run.inputs, config.tone_operator), settings)
 
 
 def region_of(start: Start, unknowns: Unknowns) -> TrustRegion | None:

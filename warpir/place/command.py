@@ -106,16 +106,17 @@ def _run(arguments: list[str]) -> int:
     assert config.output.out is not None
     folder = PlacementFolder(config.output.out, config.output.overwrite)
     folder.check()
-    session = open_session(config)
+    session = open_session(config.inputs, config.camera, config.placement, config.limits)
     for line in session.assumed:
         say(f"assumed: {line}")
     contents: dict[str, Callable[[], bytes]] = {
-        "start.json": lambda: _json(start_record(session)),
+        "start.json": lambda: _json(start_record(session, config.light, str(config.output.out))),
         "photo.jpg": partial(photo_jpeg, session.photo),
         "asset.glb": partial(asset_glb, session.asset),
     }
+    save = partial(_save, session, folder, config.flat())
     with (
-        PlaceServer(port, contents, partial(_save, session, folder), once=once) as server,
+        PlaceServer(port, contents, save, once=once) as server,
         ExitStack() as until_end,
     ):
         say(f"page: {server.address}")
@@ -160,12 +161,14 @@ def way_to(address: str) -> Iterator[Path]:
         yield path
 
 
-def _save(session: "Session", folder: "PlacementFolder", body: bytes) -> dict[str, Any]:
+def _save(
+    session: "Session", folder: "PlacementFolder", asked: dict[str, Any], body: bytes
+) -> dict[str, Any]:
     """Write the placement that the page sends; print and return the command that uses it."""
     from warpir.core.strict_json import parse_json_object
     from warpir.place.session import placement_files
 
-    path = folder.write(placement_files(session, parse_json_object("the page", body)))
+    path = folder.write(placement_files(session, asked, parse_json_object("the page", body)))
     command = f"python -m warpir.insert --config {shlex.quote(str(path))}"
     say(f"saved: {path}")
     say(command)

@@ -20,10 +20,11 @@ from warpir.app.command import read_values
 from warpir.app.config import DEFAULTS, SKY_PRESETS, InsertConfig
 from warpir.app.inputs import Loaders, read_asset
 from warpir.app.photo_world import make_world, photo_camera
-from warpir.app.settings import LightConfig
+from warpir.app.settings import CameraConfig, InputConfig, LightConfig, PlacementConfig
 from warpir.core.arrays import Float64Array
 from warpir.core.atomic import replacing, write_staged
 from warpir.core.errors import ExitCode, InputError, disk_error
+from warpir.core.limits import Limits
 from warpir.core.progress import Log
 from warpir.io.cameras.source import number
 from warpir.io.gltf.writer import write_glb
@@ -55,10 +56,10 @@ PAGE = Path("the page")
 class Session:
     """A photo and an asset that is to be placed in it."""
 
-    config: InsertConfig
-    """Configuration of the command line; its `out` is the folder of the two files."""
     photo: Photo
+    photo_name: str
     asset: Asset
+    asset_name: str
     camera: Camera
     """Initial camera, at the photo's resolution."""
     ground: tuple[float, float, float, float] | None
@@ -76,60 +77,58 @@ class Session:
         return ground_to_world(upright_plane(self.ground, self.camera.c2w[:3, 3]))
 
 
-def open_session(config: InsertConfig) -> Session:
+def open_session(
+    inputs: InputConfig, camera: CameraConfig, placement: PlacementConfig, limits: Limits
+) -> Session:
     """Read photo, asset and camera as `warpir.insert` does, and choose the initial placement.
 
     Raises:
         InputError: One of them cannot be used, or the place that was named is not in the photo.
     """
-    assert config.inputs.photo is not None and config.inputs.asset is not None
+    assert inputs.photo is not None and inputs.asset is not None
     log = Log()
     photo = read_photo(
-        config.inputs.photo,
-        max_pixels=config.limits.pixels,
-        alpha=config.inputs.alpha,
-        layer=config.inputs.layer,
-        strict=config.inputs.strict,
+        inputs.photo,
+        max_pixels=limits.pixels,
+        alpha=inputs.alpha,
+        layer=inputs.layer,
+        strict=inputs.strict,
     )
-    view = photo_camera(config.camera, photo, Path(config.inputs.photo).name, log, config.limits)
-    asset = read_asset(config.inputs, config.limits, Loaders(), log)
-    world = make_world(config.camera, config.placement.place, view, None)
+    view = photo_camera(camera, photo, Path(inputs.photo).name, log, limits)
+    asset = read_asset(inputs, limits, Loaders(), log)
+    world = make_world(camera, placement.place, view, None)
     assumed = [*log.assumed, *world.camera.assumed, *world.camera.notices]
     low, high = asset.bounds()
-    stands = (
-        config.placement.place,
-        config.placement.at,
-        config.placement.scale,
-        config.placement.size,
-    )
+    stands = (placement.place, placement.at, placement.scale, placement.size)
     try:
-        placement = place_asset(
+        placed = place_asset(
             low,
             high,
             world.camera,
             world.ground,
             place=world.place,
-            at=config.placement.at,
-            rotate_y=config.placement.rotate_y,
-            scale=config.placement.scale,
-            size=config.placement.size,
+            at=placement.at,
+            rotate_y=placement.rotate_y,
+            scale=placement.scale,
+            size=placement.size,
         )
-        asset_to_world = placement.asset_to_world
-        assumed += [*placement.assumed, *placement.warnings]
+        asset_to_world = placed.asset_to_world
+        assumed += [*placed.assumed, *placed.warnings]
     except InputError as error:
         if any(value is not None for value in stands):
             raise
         # It is here that this can be put right: begin with something that is seen.
-        asset_to_world = _in_view(asset, world.camera, world.ground, config.placement.rotate_y)
+        asset_to_world = _in_view(asset, world.camera, world.ground, placement.rotate_y)
         assumed.append(f"{error.what}: it starts in front of the camera, and smaller")
     return Session(
-        config,
         photo,
+        Path(inputs.photo).name,
         asset,
+        Path(inputs.asset).name,
         world.camera,
         world.ground,
         asset_to_world,
-        config.placement.rotate_y,
+        placement.rotate_y,
         tuple(assumed),
     )
 
@@ -156,13 +155,17 @@ def _in_view(
     return pose
 
 
-def start_record(session: Session) -> dict[str, Any]:
+def start_record(session: Session, light: LightConfig, folder: str) -> dict[str, Any]:
     """Return the page's initial values, as plain values.
 
     Lengths are metres, angles degrees, pixels those of the upright photo.
+
+    Args:
+        session: Session of the page.
+        light: Sun and sky with which the page starts.
+        folder: Of the two files.
     """
-    camera, asset, config = session.camera, session.asset, session.config
-    assert config.inputs.photo is not None and config.inputs.asset is not None
+    camera, asset = session.camera, session.asset
     low, high = asset.bounds()
     to_ground = np.linalg.inv(session.frame)
     foot = np.array([(low[0] + high[0]) / 2.0, low[1], (low[2] + high[2]) / 2.0, 1.0])
@@ -172,12 +175,12 @@ def start_record(session: Session) -> dict[str, Any]:
     sun_color = {name: color for name, (_, color) in SKIES.items()}
     return {
         "photo": {
-            "name": Path(config.inputs.photo).name,
+            "name": session.photo_name,
             "width": camera.width,
             "height": camera.height,
         },
         "asset": {
-            "name": Path(config.inputs.asset).name,
+            "name": session.asset_name,
             "low": low.tolist(),
             "high": high.tolist(),
             "triangles": triangle_count(asset),
@@ -192,15 +195,15 @@ def start_record(session: Session) -> dict[str, Any]:
         "rotate_y": session.rotate_y,
         "size": scale * float((high - low).max()),
         "ground_to_world": session.frame.tolist(),
-        "sun": _start_sun(config.light),
-        "sky": config.light.sky or SKY_PRESETS[0],
-        "keeps_light": config.light.sun is not None or config.light.sky is not None,
+        "sun": _start_sun(light),
+        "sky": light.sky or SKY_PRESETS[0],
+        "keeps_light": light.sun is not None or light.sky is not None,
         "sky_radiance": sky_radiance,
         "sun_color": sun_color,
         "sun_to_sky": SUN_TO_SKY,
-        "ground_albedo": config.light.assumed_albedo,
+        "ground_albedo": light.assumed_albedo,
         "assumed": list(session.assumed),
-        "folder": str(config.output.out),
+        "folder": folder,
     }
 
 
@@ -227,11 +230,15 @@ def asset_glb(asset: Asset) -> bytes:
     return write_glb(preview_asset(asset), np.eye(4))
 
 
-def placement_files(session: Session, sent: Mapping[str, Any]) -> dict[str, dict[str, Any]]:
+def placement_files(
+    session: Session, asked: Mapping[str, Any], sent: Mapping[str, Any]
+) -> dict[str, dict[str, Any]]:
     """Return the two files of a placement, the configuration last.
 
     Args:
         session: Session of the placement.
+        asked: Values of the command line, from `InsertConfig.flat`; ``out`` is the folder of the
+            two files.
         sent: Page values: ``fx``, ``fy`` [px], ``stance``, ``stand`` (``x`` and ``z`` in the
             ground frame) [m], ``rotate_y`` [deg], ``size`` [m], and ``sun`` and ``sky`` as the
             flags, or null where the light is to be estimated from the photo.
@@ -239,7 +246,6 @@ def placement_files(session: Session, sent: Mapping[str, Any]) -> dict[str, dict
     Raises:
         InputError: Numbers out of range, or an object that the camera does not see.
     """
-    assert session.config.output.out is not None
     stance = Stance(*(number(PAGE, sent.get("stance"), f.name) for f in fields(Stance)))
     pose = session.frame @ stance.c2w()
     fx, fy = (number(PAGE, sent, name) for name in ("fx", "fy"))
@@ -248,9 +254,9 @@ def placement_files(session: Session, sent: Mapping[str, Any]) -> dict[str, dict
     camera = replace(session.camera, fx=fx, fy=fy, c2w=pose)
     stand = [number(PAGE, sent.get("stand"), axis) for axis in "xz"]
     x, y, z = (float(c) for c in (session.frame @ (stand[0], 0.0, stand[1], 1.0))[:3])
-    asked = {name: sent.get(name) for name in ("rotate_y", "size", "sun", "sky")}
-    asked = {name: value for name, value in asked.items() if value is not None}
-    chosen = read_values({k: (v, f"--{k.replace('_', '-')}") for k, v in asked.items()})
+    sets = ("rotate_y", "size", "sun", "sky")
+    given = {name: sent[name] for name in sets if sent.get(name) is not None}
+    chosen = read_values({k: (v, f"--{k.replace('_', '-')}") for k, v in given.items()})
     config = InsertConfig(place=(x, y, z), **chosen)
     place_asset(
         *session.asset.bounds(),
@@ -260,10 +266,10 @@ def placement_files(session: Session, sent: Mapping[str, Any]) -> dict[str, dict
         rotate_y=config.placement.rotate_y,
         size=config.placement.size,
     )
-    folder = Path(os.path.abspath(session.config.output.out))
+    folder = Path(os.path.abspath(asked["out"]))
     kept = {
         name: value
-        for name, value in session.config.flat().items()
+        for name, value in asked.items()
         if value != DEFAULTS[name] and name not in (*PLACED, *SEEN_BY, "overwrite", "demo")
     }
     own = ("photo", "asset", "materials")

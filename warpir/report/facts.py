@@ -15,8 +15,9 @@ from pathlib import PurePath
 from typing import Any
 
 from warpir.app.command import FLAGS, FORMS, SEPARATORS
-from warpir.app.config import DEFAULTS, InsertConfig, flag
+from warpir.app.config import DEFAULTS, flag
 from warpir.app.record import PATHS, config_of_picture, is_hub_id, name_of
+from warpir.app.settings import LightConfig
 
 Rows = list[tuple[str, str]]
 """Name and text of each row."""
@@ -71,15 +72,19 @@ def about_file(name: str) -> str:
     return next((about for p, about in ABOUT_FILES if fnmatchcase(name, p)), "")
 
 
-def without_folders(text: str, config: InsertConfig) -> str:
+def without_folders(text: str, asked: Mapping[str, Any]) -> str:
     """Return a line of the run with file names in place of paths.
 
     Folders of configured files are removed first, as these may be relative; then those of absolute
     paths. A JSON pointer of glTF, such as ``/materials/0``, stays.
+
+    Args:
+        text: The line.
+        asked: Settings of the run by their names; those that name files are looked at.
     """
-    given = {path for name in PATHS if (path := config.flat()[name]) is not None}
-    if is_hub_id(config.diffusion.model):
-        given.discard(config.diffusion.model)
+    given = {path for name in PATHS if (path := asked.get(name)) is not None}
+    if is_hub_id(asked.get("model")):
+        given.discard(asked["model"])
     for path in sorted(given, key=len, reverse=True):
         if path != (called := name_of(path)) and set(path) - set("./~"):
             literal = called.replace("\\", r"\\")
@@ -127,10 +132,14 @@ _POINTER = re.compile(
 """Pattern of a JSON pointer of glTF 2.0, by the names of its top level."""
 
 
-def command_line(config: InsertConfig) -> str:
-    """Return a command that makes the same result, files by their names alone."""
+def command_line(asked: Mapping[str, Any]) -> str:
+    """Return a command that makes the same result, files by their names alone.
+
+    Args:
+        asked: Settings of the run, from `InsertConfig.flat`.
+    """
     words = ["python", "-m", "warpir.insert"]
-    changed = config_of_picture(config)
+    changed = config_of_picture(asked)
     for name in FORMS:
         value = changed.get(name, DEFAULTS[name])
         if value == DEFAULTS[name]:
@@ -153,15 +162,15 @@ def in_words(name: str, value: Any) -> str:
     return str(value)
 
 
-def settings(config: InsertConfig, record: Mapping[str, Any]) -> dict[str, list[Setting]]:
+def settings(asked: Mapping[str, Any], record: Mapping[str, Any]) -> dict[str, list[Setting]]:
     """Return all settings by heading, without those that concern this one run alone.
 
     Args:
-        config: Configuration as it was asked for.
+        asked: Settings as they were asked for, from `InsertConfig.flat`.
         record: Content of ``run.json``; ``measured`` holds the prior's defaults that were used.
     """
     settled = record["measured"].get("settings", {})
-    changed = config_of_picture(config)
+    changed = config_of_picture(asked)
     by_heading: dict[str, list[Setting]] = {}
     for heading, forms in FLAGS.items():
         for name in (n for n in forms if n in changed):
@@ -179,10 +188,15 @@ def settings(config: InsertConfig, record: Mapping[str, Any]) -> dict[str, list[
 # ------------------------------------------------------------------- where the light comes from
 
 
-def light_sources(record: Mapping[str, Any], config: InsertConfig) -> Rows:
-    """Return the origin of the light, with the uncertainty of estimates."""
+def light_sources(record: Mapping[str, Any], asked: LightConfig) -> Rows:
+    """Return the origin of the light, with the uncertainty of estimates.
+
+    Args:
+        record: Content of ``run.json``.
+        asked: What the user stated about the light.
+    """
     measured = record["measured"]
-    rows: Rows = [("the light", _source(measured, config))]
+    rows: Rows = [("the light", _source(record, asked))]
     if "regression" in measured:
         regression = measured["regression"]
         rows += [
@@ -209,7 +223,7 @@ def light_sources(record: Mapping[str, Any], config: InsertConfig) -> Rows:
         if "prior_about" in measured:
             rows.append(("prior", measured["prior_about"]))
         return rows
-    rows.append(("prior", without_folders(_prior(prior, measured), config)))
+    rows.append(("prior", without_folders(_prior(prior, measured), record["config"])))
     rows += _guided(measured)
     return rows
 
@@ -232,13 +246,14 @@ def summary_line(record: Mapping[str, Any]) -> str:
     return f"summary: {'; '.join(parts)}; {rendered} on {record['device']}"
 
 
-def _source(measured: Mapping[str, Any], config: InsertConfig) -> str:
-    if config.light.reuse is not None:
-        text = f"that of an earlier run, {name_of(config.light.reuse)}"
-    elif config.light.file is not None:
-        text = f"given: {name_of(config.light.file)}"
-    elif config.light.sun is not None or config.light.sky is not None:
-        parts = [f"--{n} {in_words(n, v)}" for n in ("sun", "sky") if (v := config.flat()[n])]
+def _source(record: Mapping[str, Any], asked: LightConfig) -> str:
+    measured, values = record["measured"], record["config"]
+    if asked.reuse is not None:
+        text = f"that of an earlier run, {name_of(asked.reuse)}"
+    elif asked.file is not None:
+        text = f"given: {name_of(asked.file)}"
+    elif asked.sun is not None or asked.sky is not None:
+        parts = [f"--{n} {in_words(n, v)}" for n in ("sun", "sky") if (v := getattr(asked, n))]
         text = f"described: {' '.join(parts)}"
     elif "regression" in measured:
         found = measured["regression"]
@@ -248,11 +263,11 @@ def _source(measured: Mapping[str, Any], config: InsertConfig) -> str:
         )
         if found.get("sun_in_view") is not None:
             text += f", where the photo shows the sun ({100.0 * found['sun_in_view']:.0f} % sure)"
-    elif config.inputs.demo and config.light.start != "uniform":
+    elif values.get("demo") and asked.start != "uniform":
         text = "the demo's own"
     else:
         text = "even, as none was given"
-    if measured["prior"] != "none" and config.task.refine is None:
+    if measured["prior"] != "none" and values.get("refine") is None:
         verdict = measured.get("acceptance")
         if verdict is not None and not verdict["is_accepted"]:
             return f"{text}; guidance proposed another, which was not accepted"

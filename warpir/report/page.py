@@ -113,6 +113,7 @@ def write_report(output: OutputFolder, results: Results) -> None:
 def report_page(results: Results) -> bytes:
     """Return the page, in UTF-8."""
     record, config = results.record, config_of(results.record)
+    asked = config.flat()
     photo = (
         "the demo's photo" if config.inputs.demo else PurePath(config.inputs.photo or "photo").name
     )
@@ -129,21 +130,21 @@ def report_page(results: Results) -> bytes:
         skies=_skies(results),
         light=light_rows(character, results.character_shadow) if character is not None else [],
         balls=jpeg(results.balls) if results.balls is not None else None,
-        light_sources=light_sources(record, config),
+        light_sources=light_sources(record, config.light),
         tone_plots=_tone_plots(results.curves) if results.curves is not None else [],
         tone=results.curves.tone if results.curves is not None else "linear",
         convergence=_convergence(results.optimization) if results.optimization is not None else [],
         notices=[
-            (name == "notices", without_folders(line, config))
+            (name == "notices", without_folders(line, asked))
             for name in ("notices", "assumed")
             for line in record[name]
         ],
         figures=figures(record),
         **_clock(record),
-        command_by_record=_command_by_record(config),
-        command_by_flags=command_line(config),
-        settings=settings(config, record),
-        inputs=_inputs(config, record),
+        command_by_record=_command_by_record(asked),
+        command_by_flags=command_line(asked),
+        settings=settings(asked, record),
+        inputs=_inputs(asked, record),
         files=_files(results),
         about_record=(about := about_file("run.json"))[:1].lower() + about[1:],
         versions=[(str(name), str(text)) for name, text in record["versions"].items()],
@@ -279,21 +280,21 @@ def _clock(record: Mapping[str, Any]) -> dict[str, Any]:
     }
 
 
-def _command_by_record(config: InsertConfig) -> str:
-    by_hand = [flag(name) for name in BY_HAND if config.flat()[name]]
+def _command_by_record(asked: Mapping[str, Any]) -> str:
+    by_hand = [flag(name) for name in BY_HAND if asked[name]]
     return " ".join(["python -m warpir.insert --config run.json", *by_hand, "--out OUT"])
 
 
-def _inputs(config: InsertConfig, record: Mapping[str, Any]) -> list[tuple[str, str, str]]:
+def _inputs(asked: Mapping[str, Any], record: Mapping[str, Any]) -> list[tuple[str, str, str]]:
     """Return (input, file, sha256) of each input."""
     rows = []
     for name, digest in record["inputs"].items():
         field_name, _, file = name.partition("/")
-        given = config.flat().get(field_name)
+        given = asked.get(field_name)
         called = file or (name_of(given) if isinstance(given, str) else "")
-        if not called and config.inputs.demo:
+        if not called and asked["demo"]:
             called = "the demo's own"
-        rows.append((name, called, without_folders(str(digest), config)))
+        rows.append((name, called, without_folders(str(digest), asked)))
     return rows
 
 

@@ -201,7 +201,7 @@ def write_results(run: Run, light: SceneLight, picture: Picture) -> Written:
         picture.layers,
         inputs.camera,
         is_deep=photo.is_deep,
-        config=config_of_picture(run.config),
+        config=config_of_picture(run.config.flat()),
         inputs=inputs.hashes,
     )
     maps = _write_light(output, light)

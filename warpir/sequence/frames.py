@@ -99,7 +99,7 @@ def read_sequence(
         try:
             frame = _read_line(config, number, line, raw)
             inputs = read_inputs(frame.config, loaders)
-            make_light(inputs, frame.config)
+            make_light(inputs, frame.config.light, frame.config.tone_operator)
             frames.append(_looked_up(frame, renews))
             look_at(frames[-1], inputs)
         except InputError as error:

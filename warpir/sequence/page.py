@@ -77,13 +77,12 @@ def _card(frame: Frame, has_picture: bool) -> dict[str, Any]:
     picture = None
     if has_picture:
         picture = thumbnail(frame.folder / "composite.png", frame.config.limits.pixels)
-    changes = ", ".join(
-        f"{n.replace('_', '-')} {in_words(n, frame.config.flat()[n])}" for n in frame.changed
-    )
+    asked = frame.config.flat()
+    changes = ", ".join(f"{n.replace('_', '-')} {in_words(n, asked[n])}" for n in frame.changed)
     return {
         "name": frame.folder.name,
         "target": REPORT if (frame.folder / REPORT).exists() else "composite.png",
         "picture": picture,
-        "changes": without_folders(changes, frame.config),
+        "changes": without_folders(changes, asked),
         "notices": len(read_json_object(frame.folder / "run.json").get("notices", ())),
     }
