@@ -8,7 +8,9 @@ from typing import Any
 import pytest
 import torch
 
-from benchmarks.full_size_cost import EXTRA_STAGES, TARGETS, Stopwatch, full_size_parts, main
+from benchmarks.full_size_cost.__main__ import EXTRA_STAGES, TARGETS, main
+from benchmarks.full_size_cost.model import full_size_parts
+from benchmarks.full_size_cost.steps import Stopwatch
 
 ROOT = Path(__file__).resolve().parents[2]
 

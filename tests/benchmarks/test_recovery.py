@@ -1,8 +1,8 @@
 """Recovery of light and tone curves at a small size, with guidance that knows the true composite.
 
-`benchmarks.recovery` measures the same at full size on six panoramas. Here a ball and a box stand
-on a plane, in pictures of 48 x 32 pixels under panoramas that are made in the test, and under the
-demo's sky, whose sun is a real one. No diffusion model takes part.
+`benchmarks.light.recovery` measures the same at full size on six panoramas. Here a ball and a box
+stand on a plane, in pictures of 48 x 32 pixels under panoramas that are made in the test, and under
+the demo's sky, whose sun is a real one. No diffusion model takes part.
 """
 
 from collections.abc import Iterator
@@ -14,7 +14,7 @@ import pytest
 import torch
 
 import warpir.demo
-from benchmarks.recovery import (
+from benchmarks.light.recovery import (
     RecoveryScene,
     TowardTruth,
     Truth,

@@ -15,7 +15,7 @@ from benchmarks.speed import __main__ as bench
 from benchmarks.speed import ratios as r
 from benchmarks.speed import report
 from benchmarks.speed.references import Reference, quiet
-from tests.builders.llvm import LIBRARY, llvm
+from tests.builders.programs.llvm import LIBRARY, llvm
 
 HALF = -0.5
 """Exponent of error over time of plain Monte Carlo."""

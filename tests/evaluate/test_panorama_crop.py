@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from benchmarks.panorama_crop import write_crop
+from benchmarks.light.panorama_crop import write_crop
 from warpir.app.command import parse
 from warpir.core.latlong import look_up, map_directions
 from warpir.evaluate.scenes import crop_camera, crop_radiance, expose

@@ -28,7 +28,7 @@ from tests.builders.insertions import (
     rgb,
     write_inputs,
 )
-from tests.builders.llvm import LIBRARY, llvm
+from tests.builders.programs.llvm import LIBRARY, llvm
 from tests.io.test_envmap_conventions import radiance, read, threejs
 from warpir.app.config import InsertConfig
 from warpir.app.inputs import Inputs, read_inputs

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from tests.builders.gltf_files import CORNERS, NORMALS, UVS, Builder, png
-from tests.builders.khronos import validate
+from tests.builders.programs.khronos import validate
 from tests.io.test_gltf import DATA, REAL, TANGENTS, instanced, node, skinned, sparse
 from tests.io.test_gltf_writer import EXTENDED, IDENTITY, everything, extended, patch, placed
 from warpir import demo

@@ -18,7 +18,7 @@ import torch
 from safetensors.torch import load_file, save_file
 
 from tests.builders.insertions import ALWAYS, DETAIL, arguments, digest, write_inputs
-from tests.builders.stops import Killed, stop_at, stop_hard
+from tests.builders.programs.stops import Killed, stop_at, stop_hard
 from tests.builders.tiny_stable_diffusion import make_tiny_stable_diffusion
 from warpir.app.command import parse
 from warpir.app.config import InsertConfig

@@ -13,7 +13,7 @@ import pytest
 import torch
 
 from tests.builders.insertions import ALWAYS, DETAIL, arguments, digest, write_inputs
-from tests.builders.stops import Killed, stop_at, stop_hard
+from tests.builders.programs.stops import Killed, stop_at, stop_hard
 from warpir.app.config import InsertConfig
 from warpir.app.inputs import read_inputs
 from warpir.app.run import Run

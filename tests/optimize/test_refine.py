@@ -10,13 +10,13 @@ import pytest
 import torch
 from torch import Tensor
 
-from benchmarks.recovery import TowardTruth
+from benchmarks.light.recovery import TowardTruth
 from tests import oracles as o
 from tests.builders.insertions import ALWAYS, arguments, digest, write_inputs
+from tests.builders.programs.stops import Killed, stop_at, stop_hard
 from tests.builders.records import factor_arrays, path_means, plain_factors, shade_vertices
 from tests.builders.refusals import assert_fails
 from tests.builders.shapes import camera, ground, sphere
-from tests.builders.stops import Killed, stop_at, stop_hard
 from tests.builders.tiny_stable_diffusion import make_tiny_stable_diffusion
 from tests.conftest import devices
 from tests.statistics import compare_gradients

@@ -21,9 +21,9 @@ import trimesh
 from numpy.typing import NDArray
 from PIL import Image
 
-from tests.builders.browser import Fingers, Opened, needs_chromium, open_browser
-from tests.builders.children import output_of
 from tests.builders.insertions import read_layers
+from tests.builders.programs.browser import Fingers, Opened, needs_chromium, open_browser
+from tests.builders.programs.children import output_of
 from warpir.app.config import InsertConfig
 from warpir.core.errors import ExitCode, InputError
 from warpir.io.assets import load_asset

@@ -8,7 +8,7 @@ import torch
 import warp as wp
 from torch import Tensor
 
-from tests.builders.children import output_of
+from tests.builders.programs.children import output_of
 from tests.builders.records import (
     factor_arrays,
     object_sums,

@@ -6,7 +6,7 @@ from numpy.typing import NDArray
 from scipy.interpolate import CubicSpline
 from scipy.ndimage import maximum_filter, minimum_filter
 
-from tests.builders.children import output_of
+from tests.builders.programs.children import output_of
 from tests.builders.shapes import (
     DEEP,
     all_pixels,

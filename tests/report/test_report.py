@@ -20,10 +20,10 @@ from numpy.typing import NDArray
 from PIL import Image
 from playwright.sync_api import Locator
 
-from tests.builders.browser import Opened, needs_chromium, open_browser
 from tests.builders.insertions import Run, arguments, go, write_inputs
 from tests.builders.insertions import read_layers as read_planes
 from tests.builders.outcome import outcome
+from tests.builders.programs.browser import Opened, needs_chromium, open_browser
 from warpir.app.command import parse
 from warpir.app.config import InsertConfig
 from warpir.core.errors import ExitCode, InputError

@@ -13,8 +13,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from tests.builders.browser import Fingers, Opened, needs_chromium, open_browser
 from tests.builders.faults import NO_TORCH, assert_fails, run_case
+from tests.builders.programs.browser import Fingers, Opened, needs_chromium, open_browser
 from warpir.core.errors import InputError
 from warpir.core.strict_json import parse_json_object
 from warpir.io.images.writers import png_bytes

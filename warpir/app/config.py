@@ -191,9 +191,10 @@ PRIOR_DEFAULTS: dict[str, dict[str, Any]] = {
 }
 """What a value that is None stands for, by the prior that guides.
 
-The embedded prior's are those for which its potential is least biased (benchmarks/probe.py): the
-photo's own share in what it expects, at noise levels of .76 to .99. One light and no curves: a
-small prior cannot tell more apart, and it learnt from photos that are clipped, not bent.
+The embedded prior's are those for which its potential is least biased
+(benchmarks/light/probe.py): the photo's own share in what it expects, at noise levels of .76 to
+.99. One light and no curves: a small prior cannot tell more apart, and it learnt from photos that
+are clipped, not bent.
 """
 CPU_DEFAULTS: dict[str, dict[str, Any]] = {
     "stable-diffusion": {},

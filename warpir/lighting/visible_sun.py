@@ -44,7 +44,7 @@ SPREAD_DEG = 0.6
 """Expected angle between a spot's centre and the sun [deg], see ``docs/evaluation.md``."""
 WEIGHTS = np.array([0.86, 8.78, 4.58, 14.7, 5.98, 0.9])
 """Of `features_of`, with `BIAS`: logistic regression on half of the places of
-``benchmarks/visible_sun.py``."""
+``benchmarks/light/visible_sun.py``."""
 BIAS = -6.96
 PROBABILITY_MIN = 0.82
 """Least probability with which a spot is taken for the sun [1]."""

@@ -1,6 +1,6 @@
 """How well the ground in a photo tells the level of the light: albedos of panoramas' grounds.
 
-    python -m benchmarks.ground_albedo --panoramas DIR --assets DIR [--crops 8] [--json FILE]
+    python -m benchmarks.light.ground_albedo --panoramas DIR --assets DIR [--crops 8] [--json FILE]
 
 Crops of every panorama are photographs as `warpir.evaluate` makes them, each with a place for an
 object. The ground's radiance near it times pi, over the irradiance that the panorama gives level

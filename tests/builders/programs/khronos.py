@@ -13,7 +13,7 @@ import pytest
 
 PACKAGE = Path(
     os.environ.get("WARPIR_GLTF_VALIDATOR")
-    or Path(__file__).parents[2] / ".ci" / "node_modules" / "gltf-validator"
+    or Path(__file__).parents[3] / ".ci" / "node_modules" / "gltf-validator"
 )
 SCRIPT = """
 const fs = require("fs"), validator = require(process.argv[1]);

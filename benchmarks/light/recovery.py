@@ -1,6 +1,6 @@
 """Does the loop find light and tone curves again when the guidance is right?
 
-    python -m benchmarks.recovery [--quick] [--assets DIR] --json FILE
+    python -m benchmarks.light.recovery [--quick] [--assets DIR] --json FILE
 
 A photo is cut out of a panorama, an object is set into it under that very panorama and unknown tone
 curves, and the optimisation is guided by the squared distance to this true composite, in place of a
@@ -346,7 +346,7 @@ def table(record: Mapping[str, Any]) -> str:
     lines = [
         "# Recovery of light and tone curves with guidance that is right",
         "",
-        "Made by `python -m benchmarks.recovery --markdown docs/recovery.md`: the",
+        "Made by `python -m benchmarks.light.recovery --markdown docs/recovery.md`: the",
         "optimisation is guided by the squared distance to the true composite in place of a",
         "diffusion model. The truth is path-traced under the full panorama, through tone curves",
         "that the loop does not know; the result is path-traced too, at an unseen seed.",

@@ -1,6 +1,6 @@
 """What does a mesh of the place save, where the photo holds shadows already?
 
-    python -m benchmarks.proxy --out DIR [--panorama FILE] [--samples 256] [--width 480]
+    python -m benchmarks.light.proxy --out DIR [--panorama FILE] [--samples 256] [--width 480]
         [--json FILE]
 
 A made-up yard, open ground and one wall, is path-traced by Mitsuba 3 (`benchmarks.referee`, which

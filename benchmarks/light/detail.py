@@ -1,6 +1,6 @@
 """Is what the photo shows of the surroundings nearer to the truth than a smooth light alone?
 
-    python -m benchmarks.detail --panoramas DIR --places 8 --json detail.json --sheet detail.png
+    python -m benchmarks.light.detail --panoramas DIR --places 8 --json FILE --sheet detail.png
 
 Photographs are crops of panoramas; a sphere stands in each, once as a mirror, once as polished
 paint, satin metal and matte. The light is the regressor's, and once the best that 32 lobes can be.

@@ -1,6 +1,6 @@
 """Is a sun that a photo shows found, is nothing else taken for one, and is the light better for it?
 
-    python -m benchmarks.visible_sun --panoramas DIR --json visible_sun.json
+    python -m benchmarks.light.visible_sun --panoramas DIR --json visible_sun.json
 
 Photographs are crops of panoramas, 288 x 192, with the peak of the light inside (at most four of a
 place) and outside (seven): pitch -15 to 35 degrees, vertical field of view 35 to 75, exposure off

@@ -1,0 +1,93 @@
+"""What the program reports of itself while it runs: memory by stage, and its prior and its loop."""
+
+import os
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack, contextmanager
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+from unittest import mock
+
+import torch
+import warp as wp
+
+from benchmarks.measure import peak_mib
+from warpir.app.record import Timings
+from warpir.core.progress import StepProgress
+from warpir.diffusion.models.stable_diffusion import load_stable_diffusion
+from warpir.optimize.light import LightOptimization
+
+
+class Memory:
+    """Peak memory by stage [GB]: torch's reserved memory and Warp's on CUDA, else resident."""
+
+    def __init__(self, device: wp.Device) -> None:
+        self.device = device
+        self.by_stage: dict[str, float] = {}
+        self.allocated = 0.0
+        """Greatest memory that torch had given out, of what it had reserved [GB]."""
+
+    def mark(self, stage: str) -> None:
+        """Count what was used since the last mark as a stage's."""
+        if self.device.is_cuda:
+            # Warp's mark cannot be set back; its share is small.
+            used = torch.cuda.max_memory_reserved() + wp.get_mempool_used_mem_high(self.device)
+            self.allocated = max(self.allocated, torch.cuda.max_memory_allocated() / 1e9)
+            torch.cuda.reset_peak_memory_stats()
+            peak = used / 1e9
+        else:
+            peak = peak_mib(self.device) * 2**20 / 1e9
+        self.by_stage[stage] = max(self.by_stage.get(stage, 0.0), peak)
+
+
+@dataclass
+class Watch:
+    """Looks over the program's shoulder: memory by stage, and the objects that it makes."""
+
+    memory: Memory
+    made: dict[str, Any] = field(default_factory=dict)
+
+    @contextmanager
+    def installed(self) -> Iterator[None]:
+        """Within this context the program's own hooks report here."""
+        memory, made = self.memory, self.made
+
+        class WatchedTimings(Timings):
+            @contextmanager
+            def stage(self, name: str) -> Iterator[None]:
+                memory.mark("between stages")
+                with super().stage(name):
+                    yield
+                memory.mark(name)
+
+        class WatchedProgress(StepProgress):
+            def report(self, stage: str, done: int, total: int, words: str = "") -> None:
+                memory.mark(stage)
+                super().report(stage, done, total, words)
+
+        def kept(name: str, make: Callable[..., Any]) -> Callable[..., Any]:
+            def keep(*args: Any, **kwargs: Any) -> Any:
+                made[name] = make(*args, **kwargs)
+                return made[name]
+
+            return keep
+
+        with ExitStack() as stack:
+            for name, substitute in (
+                ("warpir.app.record.Timings", WatchedTimings),
+                ("warpir.core.progress.StepProgress", WatchedProgress),
+                (
+                    "warpir.optimize.model.load_stable_diffusion",
+                    kept("prior", load_stable_diffusion),
+                ),
+                ("warpir.optimize.recover.LightOptimization", kept("loop", LightOptimization)),
+            ):
+                stack.enter_context(mock.patch(name, substitute))
+            yield
+
+
+@contextmanager
+def own_cache(folder: Path) -> Iterator[None]:
+    """Within this context nothing of earlier runs is found."""
+    with mock.patch.dict(os.environ, {"WARPIR_CACHE": str(folder)}):
+        yield

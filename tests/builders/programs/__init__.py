@@ -1,0 +1,1 @@
+"""Other processes that tests start: browsers, validators, compilers, children that are stopped."""
