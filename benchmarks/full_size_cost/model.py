@@ -5,7 +5,7 @@ from typing import Any
 
 import torch
 
-from tests.builders.tiny_stable_diffusion import END, START, write_tokenizer
+from tests.builders.tiny_stable_diffusion import END, START, write_pipeline, write_tokenizer
 
 
 def full_size_parts(device: torch.device, start: int, end: int) -> tuple[Any, Any, Any]:
@@ -55,25 +55,5 @@ def full_size_parts(device: torch.device, start: int, end: int) -> tuple[Any, An
 
 def write_model(folder: Path, device: torch.device) -> None:
     """Write a random pipeline with the shapes of Stable Diffusion 2.1-base."""
-    from diffusers import DDIMScheduler, StableDiffusionPipeline
-    from transformers import CLIPTokenizer
-
     vocabulary = write_tokenizer(folder / "tokenizer")
-    unet, vae, text_encoder = full_size_parts(device, vocabulary[START], vocabulary[END])
-    StableDiffusionPipeline(
-        vae=vae,
-        text_encoder=text_encoder,
-        tokenizer=CLIPTokenizer.from_pretrained(folder / "tokenizer"),
-        unet=unet,
-        scheduler=DDIMScheduler(
-            beta_schedule="scaled_linear",
-            beta_start=0.00085,
-            beta_end=0.012,
-            steps_offset=1,
-            clip_sample=False,
-            set_alpha_to_one=False,
-        ),
-        safety_checker=None,
-        feature_extractor=None,
-        requires_safety_checker=False,
-    ).save_pretrained(folder)
+    write_pipeline(folder, full_size_parts(device, vocabulary[START], vocabulary[END]))

@@ -7,6 +7,7 @@ model. As in the real 2.1, the tokenizer has no ``tokenizer.json`` and pads with
 
 import json
 from pathlib import Path
+from typing import Any
 
 import torch
 
@@ -40,13 +41,8 @@ def make_tiny_stable_diffusion(
         ``folder``.
     """
     # Not at the top: warpir.diffusion has to come before them, as it hides our kernels folder.
-    from diffusers import (
-        AutoencoderKL,
-        DDIMScheduler,
-        StableDiffusionPipeline,
-        UNet2DConditionModel,
-    )
-    from transformers import CLIPTextConfig, CLIPTextModel, CLIPTokenizer
+    from diffusers import AutoencoderKL, UNet2DConditionModel
+    from transformers import CLIPTextConfig, CLIPTextModel
 
     vocabulary = write_tokenizer(folder / "tokenizer")
     with torch.random.fork_rng(devices=[]):
@@ -83,31 +79,48 @@ def make_tiny_stable_diffusion(
                 eos_token_id=vocabulary[END],
             )
         )
-    scheduler = DDIMScheduler(
-        beta_schedule="scaled_linear",
-        beta_start=0.00085,
-        beta_end=0.012,
-        steps_offset=1,
-        clip_sample=False,
-        set_alpha_to_one=False,
+    write_pipeline(
+        folder,
+        (unet, vae, text_encoder),
         prediction_type=prediction_type,
         rescale_betas_zero_snr=zero_terminal_snr,
         timestep_spacing="trailing" if zero_terminal_snr else "leading",
     )
-    pipeline = StableDiffusionPipeline(
+    (folder / "tokenizer" / "tokenizer.json").unlink()
+    write_tokenizer(folder / "tokenizer")
+    return folder
+
+
+def write_pipeline(folder: Path, parts: tuple[Any, Any, Any], **schedule: Any) -> None:
+    """Write a pipeline beside its tokenizer, with the schedule of Stable Diffusion.
+
+    Args:
+        folder: Where; the tokenizer is in it.
+        parts: UNet, autoencoder and text encoder.
+        schedule: What the scheduler has besides.
+    """
+    from diffusers import DDIMScheduler, StableDiffusionPipeline
+    from transformers import CLIPTokenizer
+
+    unet, vae, text_encoder = parts
+    StableDiffusionPipeline(
         vae=vae,
         text_encoder=text_encoder,
         tokenizer=CLIPTokenizer.from_pretrained(folder / "tokenizer"),
         unet=unet,
-        scheduler=scheduler,
+        scheduler=DDIMScheduler(
+            beta_schedule="scaled_linear",
+            beta_start=0.00085,
+            beta_end=0.012,
+            steps_offset=1,
+            clip_sample=False,
+            set_alpha_to_one=False,
+            **schedule,
+        ),
         safety_checker=None,
         feature_extractor=None,
         requires_safety_checker=False,
-    )
-    pipeline.save_pretrained(folder)
-    (folder / "tokenizer" / "tokenizer.json").unlink()
-    write_tokenizer(folder / "tokenizer")
-    return folder
+    ).save_pretrained(folder)
 
 
 def write_tokenizer(folder: Path) -> dict[str, int]:

@@ -18,6 +18,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
+from benchmarks.damage.mutations import places
 from tests.builders.faults import assert_fails
 from tests.builders.gltf_files import CODES, CORNERS, NORMALS, TWO, UVS, Builder, png
 from warpir.app.config import InsertConfig
@@ -1595,16 +1596,6 @@ ODD: tuple[Any, ...] = (
     None, True, -1, 0, 1, 2, 99, 2**31, 2**63, 1e300, -0.5, "", "x", [], {}, [0], [{}], [None],
     "\ud800", [1, 2, 3], [0] * 16, 5126, 5121, "VEC3", "MASK",
 )  # fmt: skip
-
-
-def places(value: Any, path: tuple[Any, ...] = ()) -> list[tuple[Any, ...]]:
-    """Return the paths to everything below a JSON value."""
-    keys = list(value) if isinstance(value, dict) else range(len(value))
-    found = [(*path, key) for key in keys]
-    for key in keys:
-        if isinstance(value[key], dict | list):
-            found += places(value[key], (*path, key))
-    return found
 
 
 @pytest.mark.parametrize("kind", ["instances", "skin"])

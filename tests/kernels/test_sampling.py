@@ -4,13 +4,12 @@ import numpy as np
 import pytest
 import warp as wp
 
+from benchmarks.stability.maps import eval_kernel, sample_kernel
 from tests import oracles as o
 from tests.statistics import ChiSquare, chi_square, graded_edges
 from warpir.kernels.frame import basis, to_local, to_world
 from warpir.kernels.sampling import (
     cosine_sample,
-    light_eval,
-    light_sample,
     lobe_sample,
     power_heuristic,
 )
@@ -65,24 +64,6 @@ def lobe_kernel(u: wp.array[wp.vec2], axis: wp.vec3, sharpness: float, wi: wp.ar
     wi[i] = lobe_sample(u[i], axis, sharpness)
 
 
-@wp.kernel
-def light_sample_kernel(
-    light: LightArgs, u: wp.array[wp.vec2], pick: wp.array[float], wi: wp.array[wp.vec3]
-):
-    i = wp.tid()
-    wi[i] = light_sample(light, u[i], pick[i])
-
-
-@wp.kernel
-def light_eval_kernel(
-    light: LightArgs, wi: wp.array[wp.vec3], radiance: wp.array[wp.vec3], pdf: wp.array[float]
-):
-    i = wp.tid()
-    value = light_eval(light, wi[i])
-    radiance[i] = value.radiance
-    pdf[i] = value.pdf
-
-
 def vec3s(values: np.ndarray, device: str) -> wp.array:
     return wp.array(np.ascontiguousarray(values, np.float32), dtype=wp.vec3, device=device)
 
@@ -97,7 +78,7 @@ def draw_light(
     wi = wp.zeros(count, dtype=wp.vec3, device=device)
     pick = wp.array(rng.random(count, dtype=np.float32), dtype=float, device=device)
     wp.launch(
-        light_sample_kernel,
+        sample_kernel,
         count,
         inputs=[light, uniform2(rng, count, device), pick],
         outputs=[wi],
@@ -111,9 +92,7 @@ def eval_light(light: LightArgs, wi: np.ndarray, device: str) -> tuple[np.ndarra
     radiance = wp.zeros(count, dtype=wp.vec3, device=device)
     pdf = wp.zeros(count, dtype=float, device=device)
     source = vec3s(wi.reshape(-1, 3), device)
-    wp.launch(
-        light_eval_kernel, count, inputs=[light, source], outputs=[radiance, pdf], device=device
-    )
+    wp.launch(eval_kernel, count, inputs=[light, source], outputs=[radiance, pdf], device=device)
     return (
         radiance.numpy().astype(np.float64).reshape(wi.shape),
         pdf.numpy().astype(np.float64).reshape(wi.shape[:-1]),

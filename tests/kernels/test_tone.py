@@ -5,9 +5,10 @@ import pytest
 import warp as wp
 from warp import autograd
 
+from benchmarks.stability.tone import reinhard_kernel
 from tests import oracles as o
 from tests.statistics import central_differences, compare_gradients
-from warpir.kernels.tone import reinhard, tone_curve
+from warpir.kernels.tone import tone_curve
 
 VALUE_ABS = 1e-6
 """float32 values in [0, 1] after about ten operations."""
@@ -29,12 +30,6 @@ def curve_kernel(
 ):
     i = wp.tid()
     y[i] = tone_curve(x[i], curve[i], knot_x, knot_y, knot_slope, bin_count)
-
-
-@wp.kernel
-def reinhard_kernel(x: wp.array[float], y: wp.array[float]):
-    i = wp.tid()
-    y[i] = reinhard(x[i])
 
 
 def upload(values: np.ndarray, device: str, requires_grad: bool = False) -> wp.array:

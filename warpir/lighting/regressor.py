@@ -29,6 +29,7 @@ import torch.nn.functional as F
 from safetensors.torch import load_file, save
 from torch import Tensor, nn
 
+from warpir.calibration.blocks import ConvBlock, TokenBlock, head
 from warpir.core.arrays import Float64Array
 from warpir.core.atomic import write_file
 from warpir.core.color import GAMMA, LUMINANCE_WEIGHTS
@@ -132,68 +133,6 @@ def mean_luminance(photo: Tensor) -> Tensor:
     return (mean @ weights).clamp(min=DARKEST)
 
 
-class _Skippable(nn.Module):
-    """A residual branch that is left out for some samples in training (1603.09382)."""
-
-    def __init__(self, skipped: float) -> None:
-        super().__init__()
-        self.skipped = skipped
-
-    def add(self, x: Tensor, branch: Tensor) -> Tensor:
-        if self.training and self.skipped > 0.0:
-            kept = torch.rand(len(x), *(1,) * (x.dim() - 1), device=x.device) >= self.skipped
-            branch = branch * kept / (1.0 - self.skipped)
-        return x + branch
-
-
-class _ConvBlock(_Skippable):
-    def __init__(self, channels: int, skipped: float) -> None:
-        super().__init__(skipped)
-        self.branch = nn.Sequential(
-            nn.GroupNorm(8, channels),
-            nn.SiLU(),
-            nn.Conv2d(channels, channels, 3, padding=1),
-            nn.GroupNorm(8, channels),
-            nn.SiLU(),
-            nn.Conv2d(channels, channels, 3, padding=1),
-        )
-
-    def forward(self, x: Tensor) -> Tensor:
-        return self.add(x, self.branch(x))
-
-
-class _TokenBlock(_Skippable):
-    def __init__(self, channels: int, heads: int, dropout: float, skipped: float) -> None:
-        super().__init__(skipped)
-        self.heads = heads
-        self.norm = nn.LayerNorm(channels)
-        self.qkv = nn.Linear(channels, 3 * channels)
-        self.out = nn.Linear(channels, channels)
-        self.mlp = nn.Sequential(
-            nn.LayerNorm(channels),
-            nn.Linear(channels, 4 * channels),
-            nn.GELU(),
-            nn.Dropout(dropout),
-            nn.Linear(4 * channels, channels),
-        )
-
-    def forward(self, x: Tensor) -> Tensor:
-        batch, count, _ = x.shape
-        qkv = self.qkv(self.norm(x)).view(batch, count, 3, self.heads, -1)
-        q, k, v = qkv.permute(2, 0, 3, 1, 4)
-        mixed = F.scaled_dot_product_attention(q, k, v).transpose(1, 2).reshape(x.shape)
-        x = self.add(x, self.out(mixed))
-        return self.add(x, self.mlp(x))
-
-
-def _head(channels: int, dropout: float, count: int) -> nn.Sequential:
-    """Return a head whose first answers are nearly the same for all photos."""
-    last = nn.Linear(channels, count)
-    nn.init.normal_(last.weight, std=0.01)
-    nn.init.zeros_(last.bias)
-    return nn.Sequential(nn.LayerNorm(channels), nn.Dropout(dropout), last)
-
-
 class Member(nn.Module):
     """One network: photo and rays to a flat prediction.
 
@@ -213,10 +152,10 @@ class Member(nn.Module):
         self.hidden = config.hidden
         # Space to depth keeps every pixel: the edges of shadows are what tells the direction.
         self.stem = nn.Conv2d(4 * 6, fine, 3, padding=1)
-        self.fine = nn.Sequential(*(_ConvBlock(fine, 0.0) for _ in range(config.blocks[0])))
+        self.fine = nn.Sequential(*(ConvBlock(fine, 0.0) for _ in range(config.blocks[0])))
         self.down1 = nn.Conv2d(fine, middle, 3, stride=2, padding=1)
         self.middle = nn.Sequential(
-            *(_ConvBlock(middle, config.skipped / 2.0) for _ in range(config.blocks[1]))
+            *(ConvBlock(middle, config.skipped / 2.0) for _ in range(config.blocks[1]))
         )
         self.down2 = nn.Conv2d(middle, wide, 3, stride=2, padding=1)
         self.norm = nn.GroupNorm(8, wide)
@@ -224,14 +163,14 @@ class Member(nn.Module):
         self.place = nn.Sequential(nn.Linear(3, wide), nn.GELU(), nn.Linear(wide, wide))
         self.asking = nn.Parameter(torch.randn(2, wide) * 0.02)
         self.blocks = nn.ModuleList(
-            _TokenBlock(wide, config.heads, config.dropout, config.skipped)
+            TokenBlock(wide, config.heads, config.dropout, config.skipped)
             for _ in range(config.depth)
         )
         self.gather = nn.Linear(wide, 2 * GATHERINGS, bias=False)
         # Clearly different weights from the start: an even mean tells nothing of where.
         nn.init.normal_(self.gather.weight, std=3.0 / math.sqrt(wide))
-        self.direction_head = _head(wide, config.dropout, direction_count)
-        self.level_head = _head(wide, config.dropout, level_count)
+        self.direction_head = head(wide, config.dropout, direction_count)
+        self.level_head = head(wide, config.dropout, level_count)
 
     def last_layers(self) -> tuple[nn.Linear, nn.Linear]:
         """Return what gives the logits of the directions, and what gives the levels."""

@@ -21,7 +21,7 @@ import math
 import os
 import subprocess
 import sys
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -103,9 +103,18 @@ def _run(arguments: list[str]) -> int:
         say(f"notice: no panorama or asset is called {', '.join(unknown)}")
 
     if options.network == "camera":
-        say(json.dumps(_train_camera(options, panoramas)))
-        return ExitCode.DONE
+        result: Mapping[str, Any] = _train_camera(options, panoramas)
+    else:
+        result = _train_light(options, panoramas, assets)
+    if is_first():
+        say(json.dumps(result))
+    return ExitCode.DONE
 
+
+def _train_light(
+    options: argparse.Namespace, panoramas: Sequence[Path], assets: Sequence[Path]
+) -> dict[str, Any]:
+    """Train the regressor or the embedded prior on rendered scenes."""
     import torch
 
     from warpir.render.device import choose_device
@@ -148,10 +157,7 @@ def _run(arguments: list[str]) -> int:
         "device": torch.cuda.get_device_name(torch_device) if device != "cpu" else "cpu",
     }
     train = _train_prior if options.network == "prior" else _train_regressor
-    result = train(options, stocks, options.seed * 1000 + rank, torch_device, record)
-    if is_first():
-        say(json.dumps(result))
-    return ExitCode.DONE
+    return train(options, stocks, options.seed * 1000 + rank, torch_device, record)
 
 
 def _train_camera(options: argparse.Namespace, panoramas: Sequence[Path]) -> dict[str, float]:

@@ -94,23 +94,11 @@ def train_camera(
     out.mkdir(parents=True, exist_ok=True)
     (out / CURVE).unlink(missing_ok=True)
     network = (start or random_calibrator(seed)).to(device).requires_grad_(True)
-    average = copy.deepcopy(network).eval().requires_grad_(False)
     known = dict(record or {}) | {"settings": asdict(settings), "seed": seed}
     validation = (
         [] if watched is None else validation_batches(watched, settings.validation_photos, device)
     )
-    kept, best = average, math.inf
-    steps, losses = 0, torch.full((), math.nan, device=device)
-
-    def validate(spent: float) -> None:
-        nonlocal kept, best
-        found = measure(average, validation)
-        if found["score"] < best:
-            kept, best = copy.deepcopy(average), found["score"]
-        line = {"step": steps, "minutes": round(spent, 3), "loss": float(losses)} | found
-        with (out / CURVE).open("a", encoding="utf-8") as curve:
-            curve.write(json.dumps(line, allow_nan=False) + "\n")
-
+    course = _Course(network, validation, out / CURVE)
     step = _step_of(network, settings)
     generator = torch.Generator(device).manual_seed(seed)
     torch.manual_seed(seed)
@@ -118,26 +106,45 @@ def train_camera(
     while (progress := (time.monotonic() - began) / (60.0 * minutes)) < 1.0:
         with torch.no_grad():
             batch = draw_batch(learned, settings.batch, generator)
-        loss = step(batch, _rate(settings, progress, steps))
-        losses = torch.where(losses.isnan(), loss, losses.lerp(loss, 0.05))
-        share = 1.0 - min(settings.average, (1.0 + steps) / (10.0 + steps))
-        torch._foreach_lerp_(
-            [p.detach() for p in average.parameters()],
-            [p.detach() for p in network.parameters()],
-            share,
-        )
-        steps += 1
+        course.follow(step(batch, _rate(settings, progress, course.steps)), settings.average)
         if validation and time.monotonic() - validated >= 60.0 * settings.validate_minutes:
-            validate(progress * minutes)
+            course.validate(progress * minutes)
             validated = time.monotonic()
     finished: dict[str, float] = {}
     if validation:
-        validate(minutes)
-        calibrate(kept, validation)
-        finished = measure(kept, validation)
-    known |= {"steps": steps, "minutes": minutes, "validation": finished}
-    save_calibrator(kept, out / WEIGHTS, known)
+        course.validate(minutes)
+        calibrate(course.kept, validation)
+        finished = measure(course.kept, validation)
+    known |= {"steps": course.steps, "minutes": minutes, "validation": finished}
+    save_calibrator(course.kept, out / WEIGHTS, known)
     return finished
+
+
+class _Course:
+    """A training as it goes: the moving average of the weights, and the best one so far."""
+
+    def __init__(self, network: Calibrator, validation: Sequence[CameraBatch], curve: Path) -> None:
+        self.network, self.validation, self.curve = network, validation, curve
+        self.average = copy.deepcopy(network).eval().requires_grad_(False)
+        self.kept, self.best, self.steps = self.average, math.inf, 0
+        self.loss = torch.full((), math.nan, device=network.spread.device)
+
+    def follow(self, loss: Tensor, decay: float) -> None:
+        """Move the average toward the weights after a step; at first it follows closely."""
+        self.loss = torch.where(self.loss.isnan(), loss, self.loss.lerp(loss, 0.05))
+        average = [p.detach() for p in self.average.parameters()]
+        share = 1.0 - min(decay, (1.0 + self.steps) / (10.0 + self.steps))
+        torch._foreach_lerp_(average, [p.detach() for p in self.network.parameters()], share)
+        self.steps += 1
+
+    def validate(self, minutes: float) -> None:
+        """Measure the average, write a line of the curve, and keep it if it is the best so far."""
+        found = measure(self.average, self.validation)
+        if found["score"] < self.best:
+            self.kept, self.best = copy.deepcopy(self.average), found["score"]
+        line = {"step": self.steps, "minutes": round(minutes, 3), "loss": float(self.loss)} | found
+        with self.curve.open("a", encoding="utf-8") as curve:
+            curve.write(json.dumps(line, allow_nan=False) + "\n")
 
 
 def _rate(settings: CameraSettings, progress: float, steps: int) -> float:
