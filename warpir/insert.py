@@ -11,7 +11,7 @@ or from Python, where the module itself can be called:
 
 Checked in this order: arguments, all inputs and the models' files, the output folder and its lock,
 disk space. torch and Warp are imported after these checks, so ``--help``, wrong arguments and
-``--validate`` answer without them.
+``--validate`` answer without them; a camera that is to be estimated needs torch with the inputs.
 """
 
 import sys
@@ -101,10 +101,12 @@ def insert(config: InsertConfig, *, renews: bool = False) -> Insertion:
 
 def _insert_one(config: InsertConfig, loaders: "Loaders | None" = None) -> Insertion:
     """Insert into one photograph: read, find the light, render, write."""
+    from warpir.app.inputs import Loaders
+    from warpir.calibration.photos import estimate_photo
     from warpir.core.strict_json import read_json_object
     from warpir.report.facts import summary_line
 
-    run, given = _read(config, loaders)
+    run, given = _read(config, loaders or Loaders(estimate_photo))
     with run.output as output:
         run.require_room()
         with run.timings.stage("load"):  # loads torch and Warp

@@ -1,6 +1,7 @@
 """The network that estimates cameras: its file, its symmetry, and photos of every shape."""
 
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -9,7 +10,7 @@ import torch
 from PIL import Image
 
 import warpir.demo
-from warpir.calibration.estimate import LINES, estimate_camera
+from warpir.calibration.estimate import LINES, decided, estimate_camera, network_estimate
 from warpir.calibration.lines import find_segments, upright_roll
 from warpir.calibration.network import (
     HEIGHT,
@@ -22,6 +23,7 @@ from warpir.calibration.network import (
     seen,
     soften,
 )
+from warpir.calibration.photos import FirstPhoto
 from warpir.core.errors import ExitCode, InputError
 from warpir.scene.camera import camera_from_fov
 
@@ -185,3 +187,55 @@ def test_shipped_network_knows_little_of_even_photos() -> None:
     ground = 0.3 + 0.02 * np.random.default_rng(0).normal(size=(300, 450, 1))
     texture = estimate_camera(np.repeat(ground, 3, axis=2).astype(np.float32))
     assert texture.pitch_sigma_deg > 8.0 and texture.vfov_sigma_deg > 10.0
+
+
+def test_axis_near_the_middle_is_the_middle_and_the_horizon_stays() -> None:
+    photo = np.full((40, 60, 3), 0.5, np.float32)
+    start = network_estimate(photo, random_calibrator(0, SMALL), vfov_deg=50.0)
+    near = replace(start, pitch_deg=-9.0, roll_deg=5.0, principal=(0.47, 0.55))
+    centred = decided(near)
+    assert centred.principal == (0.5, 0.5) and not centred.is_upright_corrected
+    assert centred.pitch_deg > -9.0
+    rows = []
+    for estimate in (replace(near, principal=(0.5, 0.55)), centred):
+        camera = estimate.camera(600, 400, 1.6)
+        far = camera.c2w[:3, 3] - 1e4 * np.array([0.0, 0.0, 1.0])
+        sideways = far + np.array([[-1e3, 0.0, 0.0], [1e3, 0.0, 0.0]])
+        left, right = camera.project(sideways)
+        along = (300.0 - left[0]) / (right[0] - left[0])
+        rows.append(left[1] + along * (right[1] - left[1]))
+    assert rows[0] == pytest.approx(rows[1], abs=1e-3)
+
+
+def test_axis_far_from_the_middle_is_that_of_a_corrected_photo() -> None:
+    photo = np.full((40, 60, 3), 0.5, np.float32)
+    start = network_estimate(photo, random_calibrator(0, SMALL), vfov_deg=50.0)
+    found = decided(replace(start, pitch_deg=0.5, roll_deg=0.0, principal=(0.46, 0.24)))
+    assert found.principal == (0.5, 0.24) and found.is_upright_corrected
+    assert found.pitch_deg == 0.5
+
+
+def test_estimate_leaves_the_number_of_threads_as_it_was() -> None:
+    before = torch.get_num_threads()
+    torch.set_num_threads(2)
+    try:
+        estimate_camera(np.zeros((8, 8, 3), np.float32), random_calibrator(0, SMALL))
+        assert torch.get_num_threads() == 2
+    finally:
+        torch.set_num_threads(before)
+
+
+def test_first_photo_of_a_size_stands_for_the_others(monkeypatch: pytest.MonkeyPatch) -> None:
+    """One camera for a sequence; another size or focal length is another camera."""
+    asked = []
+
+    def estimate(photo: np.ndarray, vfov_deg: float | None) -> int:
+        asked.append((photo.shape, vfov_deg))
+        return len(asked)
+
+    monkeypatch.setattr("warpir.calibration.photos.estimate_photo", estimate)
+    first = FirstPhoto()
+    small, large = np.zeros((4, 6, 3), np.float32), np.zeros((8, 12, 3), np.float32)
+    found = [first(small, None), first(small + 1.0, None), first(large, None), first(small, 40.0)]
+    assert found == [1, 1, 2, 3]
+    assert asked == [((4, 6, 3), None), ((8, 12, 3), None), ((4, 6, 3), 40.0)]

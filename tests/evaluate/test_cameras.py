@@ -1,6 +1,7 @@
 """Errors of estimated cameras: the command, and the constant guess beside the estimate."""
 
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -10,6 +11,7 @@ import torch
 from warpir.calibration.network import CalibratorConfig, random_calibrator, save_calibrator
 from warpir.evaluate.camera.measure import (
     constant_camera,
+    corrected_to_upright,
     even_cameras,
     photograph,
     unlearned,
@@ -58,6 +60,9 @@ def test_command_writes_errors_of_both_rows(panoramas: Path, tmp_path: Path) -> 
             assert 0.0 <= camera[row][name]["median"] < 180.0
             assert 0.0 < camera[row][name]["mean"] < 180.0
     assert 0.0 <= camera["estimated"]["roll_deg"]["within_sigma"] <= 1.0
+    corrected = camera["corrected"]
+    assert 0.0 <= corrected["recognised"] <= 1.0 and 0.0 <= corrected["mistaken"] <= 1.0
+    assert 0.1 <= corrected["axis_constant"] <= 0.4 and 0.0 <= corrected["axis"] < 1.0
     # Roll is even in -20 .. 20 degrees, so a level guess errs by the roll itself.
     rolls = even_cameras(Sampler(3, torch.Generator().manual_seed(4))).roll
     expected = float(torch.rad2deg(rolls.abs()).mean())
@@ -84,6 +89,22 @@ def test_photograph_shows_the_horizon_of_its_camera(panoramas: Path) -> None:
     photo = photograph(field, camera, 96, torch.Generator().manual_seed(0))
     assert photo.shape == (64, 96, 3)
     assert photo[:28].mean() > photo[36:].mean() + 0.2
+
+
+def test_corrected_photograph_shows_the_horizon_at_its_axis(panoramas: Path) -> None:
+    """Level and off the middle by a tenth to four tenths of the height, up or down."""
+    drawn = even_cameras(Sampler(200, torch.Generator().manual_seed(2)))
+    level = corrected_to_upright(drawn, Sampler(200, torch.Generator().manual_seed(3)))
+    shifts = (level.y - 0.5).abs()
+    assert not level.pitch.any() and not level.roll.any()
+    assert 0.1 <= shifts.min() < 0.12 and 0.38 < shifts.max() <= 0.4
+    assert 0.4 < (level.y > 0.5).float().mean() < 0.6
+    one = DrawnCameras(**{k: v[:1] for k, v in vars(level).items()})
+    one = replace(one, aspect=torch.tensor([1.5]), focal=torch.tensor([0.8]))
+    field = read_panoramas([panoramas / "field.exr"], "cpu")
+    photo = photograph(field, one, 96, torch.Generator().manual_seed(0))
+    row = round(float(one.y[0]) * 64)
+    assert photo[: row - 4].mean() > photo[row + 4 :].mean() + 0.2
 
 
 def test_panoramas_that_were_learned_from_are_left_out(tmp_path: Path) -> None:

@@ -1,6 +1,7 @@
 """The evaluation: scenes from a seed, rows that must be right or wrong, intervals, the command."""
 
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -38,6 +39,7 @@ from warpir.evaluate.stage import Bench, Prediction, Stage
 from warpir.io.results import OutputFolder
 from warpir.lighting.regressor import random_regressor, save_regressor
 from warpir.render.composite import Quality
+from warpir.scene.camera import CameraEstimate
 from warpir.scene.light import Light, Lobes, as_map, axis_from_angles, rasterize_lobes
 from warpir.scene.tone_curves import Curves
 
@@ -498,6 +500,28 @@ def test_other_scenes_are_seen_by_this_camera(
     assert np.array_equal(place.to_camera(texels), other.to_camera(other.texels))
     seen, own = (as_map(p.light, 32) for p in (from_photo(bench, place), regression(bench, other)))
     assert light_errors(place.to_camera(seen), other.to_camera(own))["peak_angle_deg"] < 6.0
+
+
+def test_estimated_camera_that_is_right_gives_the_same_light(
+    scenes: list[tuple[Place, list[Subject]]], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Of the true camera only the azimuth is used; another pitch gives another light."""
+    bench = make_bench(scenes)
+    place = scenes[0][0]
+    known, estimated = ROWS["regression"].of_place, ROWS["regression-estimated-camera"].of_place
+    assert known is not None and estimated is not None
+    vfov = np.degrees(2.0 * np.arctan(place.camera.height / 2.0 / place.camera.fy))
+    angles = {"pitch_deg": place.pitch, "roll_deg": 0.0, "vfov_deg": float(vfov)}
+    sigmas = {"pitch_sigma_deg": 1.0, "roll_sigma_deg": 1.0, "vfov_sigma_deg": 1.0}
+    found = CameraEstimate(
+        **angles, **sigmas, principal=(0.5, 0.5), principal_sigma=(0.1, 0.1), witnesses=()
+    )
+    monkeypatch.setattr("warpir.evaluate.rows.estimate_camera", lambda *_: found)
+    expected, seen = (as_map(row(bench, place).light, 32) for row in (known, estimated))
+    np.testing.assert_allclose(seen, expected, rtol=1e-3, atol=1e-5)
+    wrong = replace(found, pitch_deg=place.pitch + 30.0)
+    monkeypatch.setattr("warpir.evaluate.rows.estimate_camera", lambda *_: wrong)
+    assert not np.allclose(as_map(estimated(bench, place).light, 32), expected, rtol=1e-2)
 
 
 @pytest.mark.slow

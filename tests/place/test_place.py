@@ -10,7 +10,7 @@ import sys
 import time
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import combinations
 from pathlib import Path
 from typing import Any
@@ -36,7 +36,7 @@ from warpir.place.session import (
     start_record,
 )
 from warpir.place.stance import Stance, ground_to_world, stance_of
-from warpir.scene.camera import Camera, camera_from_fov, ground_point
+from warpir.scene.camera import Camera, CameraEstimate, camera_from_fov, ground_point
 from warpir.scene.placement import place_asset
 
 WIDTH, HEIGHT = 480, 320
@@ -241,6 +241,34 @@ def placed_files(inputs: Path, out: Path) -> dict[str, dict[str, Any]]:
     start = start_record(session, config.light, str(config.output.out))
     said = {**start["camera"], **{k: start[k] for k in ("stance", "stand", "rotate_y", "size")}}
     return placement_files(session, config.flat(), {**said, **SAID})
+
+
+def test_page_starts_with_the_estimated_camera(
+    inputs: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Its numbers, and that they are estimates; a camera that sees no ground gives way."""
+    values = {"pitch": -8.0, "roll": 3.0, "vfov": 40.0}
+    sigmas = {f"{name}_sigma_deg": 2.0 for name in values}
+    found = CameraEstimate(
+        **{f"{name}_deg": value for name, value in values.items()},
+        **sigmas,
+        principal=(0.5, 0.5),
+        principal_sigma=(0.1, 0.1),
+        witnesses=("network",),
+    )
+    photo, asset = str(inputs / "photo.png"), str(inputs / "wedge.glb")
+    config = InsertConfig(photo=photo, asset=asset, out=str(tmp_path / "o"))
+    monkeypatch.setattr("warpir.place.session.estimate_photo", lambda *_: found)
+    start = start_record(session_of(config), config.light, "o")
+    assert start["stance"]["pitch"] == pytest.approx(-8.0)
+    assert start["stance"]["roll"] == pytest.approx(3.0)
+    assert start["camera"]["fy"] == pytest.approx(HEIGHT / 2.0 / np.tan(np.radians(20.0)))
+    assert any("estimated from the photo" in line for line in start["assumed"])
+    up = replace(found, pitch_deg=60.0)
+    monkeypatch.setattr("warpir.place.session.estimate_photo", lambda *_: up)
+    start = start_record(session_of(config), config.light, "o")
+    assert start["stance"]["pitch"] == pytest.approx(0.0)
+    assert any("assumed, not estimated" in line for line in start["assumed"])
 
 
 def test_folder_replaces_its_own_only(inputs: Path, tmp_path: Path) -> None:

@@ -171,6 +171,7 @@ def test_page_tells_what_the_run_measured(run: Run, page: str) -> None:
     assert (
         "given: lobes.json" in text and run.record["measured"]["placement"]["summary"][1:] in text
     )
+    assert "camera: pitch" in text and "-15.0° (--pitch)" in text
     # The strongest lobe of the light: azimuth 121, elevation 54 degrees.
     assert "from the upper right, behind the camera, 5" in text
     for name in ("fg", "shadow", "plate", "matte", "depth", "normal", "albedo", "position"):

@@ -12,7 +12,16 @@ import numpy as np
 
 from warpir.app.config import InsertConfig, usage
 from warpir.app.model_files import require_model
-from warpir.app.photo_world import PhotoWorld, make_world, photo_camera, stand_on_ground
+from warpir.app.photo_world import (
+    NO_PLACE,
+    PENDING,
+    CameraEstimator,
+    PhotoWorld,
+    is_estimated,
+    make_world,
+    photo_camera,
+    stand_on_ground,
+)
 from warpir.app.record import file_hash, input_files
 from warpir.app.reuse import EarlierRun, read_run
 from warpir.app.settings import InputConfig, LightConfig
@@ -34,6 +43,8 @@ from warpir.scene.placement import Placement, up_to_y
 from warpir.scene.receiver import ReceiverMesh, first_hit, is_in_view, mesh_of
 from warpir.scene.shadow_mask import ShadowMask, shadow_mask
 
+LOOKING_DOWN = -30.0
+"""Pitch of a camera that sees ground nearly everywhere [deg]."""
 STATED_UP = (".glb", ".gltf")
 """Kinds of asset whose format says which way is up."""
 
@@ -67,16 +78,22 @@ class Inputs:
     occluder: FloatArray | None = None
     """What --occluder-mask holds: share of the photo in front of the object [1], shape [H, W]."""
     measured: dict[str, Any] = field(default_factory=dict)
-    """What ``run.json`` says of the undone distortion and of the ground's fit."""
+    """What ``run.json`` says of the camera, the undone distortion and the ground's fit."""
     hashes: dict[str, str] = field(default_factory=dict)
     """sha256 of what was read, by the field's name; of files that an asset brings along, by
     ``asset/`` and their names, relative to it."""
 
 
 class Loaders:
-    """Reads assets, places and earlier runs; remembers the last of each, for many insertions."""
+    """Reads assets, places and earlier runs; remembers the last of each, for many insertions.
 
-    def __init__(self) -> None:
+    Args:
+        estimator: Estimates the camera of a photo; None: nothing is estimated, because the inputs
+            are only checked.
+    """
+
+    def __init__(self, estimator: CameraEstimator | None = None) -> None:
+        self.estimator = estimator
         self.asset: Callable[[str, str, Limits], Asset] = lru_cache(maxsize=1)(load_asset)
         self.proxy: Callable[[str, Limits], Asset] = lru_cache(maxsize=1)(_read_proxy)
         self.run: Callable[[str, Limits], EarlierRun] = lru_cache(maxsize=1)(read_run)
@@ -111,7 +128,43 @@ def read_inputs(config: InsertConfig, loaders: Loaders | None = None) -> Inputs:
         InputError: The first problem; the others are in its ``also``.
     """
     config.require_inputs()
-    files = _read_files(config, loaders or Loaders())
+    loaders = loaders or Loaders()
+    files = _read_files(config, loaders)
+    try:
+        return _joined(config, files)
+    except InputError as error:
+        other = _other_camera(config, files.view.camera)
+        if other is None:
+            raise
+        changed, notice = other
+        try:
+            inputs = read_inputs(config.changed(camera_from="assume", **changed), loaders)
+        except InputError:
+            raise error from None
+        return replace(inputs, notices=(f"{notice} ({error.what})", *inputs.notices))
+
+
+def _other_camera(config: InsertConfig, camera: Camera) -> tuple[dict[str, Any], str] | None:
+    """Return what to try where a camera sees no place for the object, and what to say of it.
+
+    None where the camera is not an estimate. What would be estimated may look down: an object
+    above a level camera's horizon is no reason yet to refuse the inputs.
+    """
+    if is_estimated(camera):
+        return {}, NO_PLACE
+    if camera.sources and camera.sources["pitch_deg"].name == PENDING:
+        return {"pitch": LOOKING_DOWN}, (
+            "whether there is a place for the object is known when the camera is estimated"
+        )
+    return None
+
+
+def _joined(config: InsertConfig, files: _Files) -> Inputs:
+    """Set the object into the photo's world.
+
+    Raises:
+        InputError: There is no place for it, or no ground.
+    """
     straight = _straightened(files)
     world = make_world(config.camera, config.placement.place, files.view, files.points)
     mesh = None if files.proxy is None else mesh_of(files.proxy)
@@ -133,7 +186,7 @@ def read_inputs(config: InsertConfig, loaders: Loaders | None = None) -> Inputs:
         assumed=tuple(_assumptions(config, files, world, placement, shade)),
         notices=tuple(_notices(config, files, straight, world, placement, mesh)),
         occluder=straight.occluder,
-        measured=straight.measured | world.measured,
+        measured=straight.measured | world.measured | {"camera": world.camera.numbers()},
         hashes=files.hashes,
     )
 
@@ -168,7 +221,9 @@ def _read_files(config: InsertConfig, loaders: Loaders) -> _Files:
         run = attempt(lambda: loaders.run(reuse, limits))
     if photo is not None:
         name = Path(str(inputs.photo)).name
-        view = attempt(lambda: photo_camera(config.camera, photo, name, log, limits))
+        # What stops the run anyway is not worth the seconds of an estimate.
+        estimator = None if problems else loaders.estimator
+        view = attempt(lambda: photo_camera(config.camera, photo, name, estimator, limits))
     # Without a camera the run ends below, but all that is wrong with the light is told too.
     pose = view.camera.c2w if view is not None else np.eye(4)
     light = attempt(lambda: _read_light(config.light, inputs.strict, pose, limits, log))

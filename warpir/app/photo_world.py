@@ -1,21 +1,32 @@
 """Brings camera, ground, points and object into one world whose up is known."""
 
+import math
+from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
 
 from warpir.app.settings import CameraConfig, PlacementConfig
-from warpir.core.arrays import Float64Array
+from warpir.core.arrays import Float64Array, FloatArray
 from warpir.core.errors import InputError
 from warpir.core.limits import LIMITS, Limits
-from warpir.core.progress import Log
 from warpir.io.cameras.reader import read_photo_camera
 from warpir.io.cameras.source import PhotoCamera, turned
 from warpir.io.images.photos import Photo
 from warpir.scene.asset import Asset
-from warpir.scene.camera import Camera, camera_from_exif, camera_from_fov
-from warpir.scene.free_space import Cloud, find_place, points_in_way
+from warpir.scene.camera import (
+    ASSUMED,
+    ESTIMATE,
+    Camera,
+    CameraEstimate,
+    Source,
+    camera_from_exif,
+    camera_from_fov,
+    camera_pose,
+    horizon_row,
+)
+from warpir.scene.free_space import Cloud, find_place, is_well_seen, points_in_way, share_of_height
 from warpir.scene.ground import fit_ground
 from warpir.scene.placement import Placement, place_asset, settled, upright_plane, y_to
 from warpir.scene.receiver import ReceiverMesh
@@ -24,6 +35,26 @@ DEFAULT_FOV = 60.0
 """Horizontal field of view without --camera, --fov and EXIF [deg]: a phone's main camera."""
 DEFAULT_CAMERA_HEIGHT = 1.6
 """Height of a photographer's eyes [m]."""
+WIDE = {"pitch_deg": 8.0, "roll_deg": 5.0, "vfov_deg": 18.0}
+"""Standard deviation above which an estimate is doubtful [deg]."""
+WORDS = {"pitch_deg": "pitch", "roll_deg": "roll", "vfov_deg": "vertical field of view"}
+"""What the numbers are called where they are printed."""
+SEEN = (0.04, 1.0)
+"""Longest side of an object that was given no size, over the photo's height, within which it keeps
+its own: smaller ones are hardly seen, larger ones not whole."""
+SHOWN = 0.25
+"""The same where it does not."""
+PENDING = "to be estimated"
+"""Name of the source of numbers that a run would estimate, where nothing may be estimated yet."""
+NO_PLACE = (
+    "the camera is assumed, not estimated, since the estimated one sees no place for the object; "
+    "give --horizon and --fov"
+)
+"""Where an estimate gives way, so that what a level camera can do is done."""
+
+CameraEstimator = Callable[[FloatArray, float | None], CameraEstimate]
+"""Estimates the camera of a display-encoded photo, given its vertical field of view where that is
+known [deg]; see `warpir.calibration.estimate.estimate_camera`."""
 
 
 @dataclass(frozen=True)
@@ -47,15 +78,20 @@ class PhotoWorld:
 
 
 def photo_camera(
-    asked: CameraConfig, photo: Photo, photo_name: str, log: Log, limits: Limits = LIMITS
+    asked: CameraConfig,
+    photo: Photo,
+    photo_name: str,
+    estimator: CameraEstimator | None = None,
+    limits: Limits = LIMITS,
 ) -> PhotoCamera:
-    """Return the camera of --camera, else of the numbers given, the photo's EXIF and what is usual.
+    """Return the camera of --camera, else of the numbers given, the photo's EXIF and an estimate.
 
     Args:
         asked: The file or the numbers.
         photo: The upright photo.
         photo_name: Its file name, which tells the images of a file apart.
-        log: What was chosen because nothing was given is added here.
+        estimator: Asked for the numbers that nothing else gives; None: the usual ones stand for
+            them, as where only the inputs are checked.
         limits: How large the file may be.
 
     Raises:
@@ -72,25 +108,120 @@ def photo_camera(
             undistort=asked.undistort,
             limits=limits,
         )
-    return PhotoCamera(_camera_from_numbers(asked, photo, log))
+    camera = _camera_of_flags(asked, photo)
+    if asked.source == "estimate" and any(
+        camera.sources[name].name == ASSUMED for name in ("pitch_deg", "vfov_deg")
+    ):
+        if estimator is None:
+            camera = _pending(camera)
+        else:
+            camera = _estimated(camera, asked, photo, estimator)
+    assumed, doubtful = _about_sources(camera)
+    if asked.height is None:
+        line = f"the camera is {DEFAULT_CAMERA_HEIGHT} m above the ground (--camera-height)"
+        assumed.insert(0, line)
+    assumed = [*assumed, *camera.assumed]
+    notices = (*camera.notices, *doubtful)
+    return PhotoCamera(replace(camera, assumed=tuple(assumed), notices=notices))
 
 
-def _camera_from_numbers(asked: CameraConfig, photo: Photo, log: Log) -> Camera:
+def _camera_of_flags(asked: CameraConfig, photo: Photo) -> Camera:
+    """Return the camera of flags and EXIF; the usual numbers stand for what they leave open."""
     height, width = photo.codes.shape[:2]
-    camera_height, pitch = asked.height, asked.pitch
-    if camera_height is None:
-        camera_height = DEFAULT_CAMERA_HEIGHT
-        log.assume(f"the camera is {camera_height} m above the ground (--camera-height)")
-    if pitch is None:
-        pitch = 0.0
-        if asked.horizon is None:
-            log.assume("the camera is level (--pitch, --horizon)")
-    pose = (pitch, camera_height, asked.horizon)
+    sources = dict.fromkeys((*WORDS, "principal"), Source(ASSUMED))
+    if asked.pitch is not None or asked.horizon is not None:
+        sources["pitch_deg"] = Source("--pitch" if asked.horizon is None else "--horizon")
+    pose = (asked.pitch or 0.0, asked.height or DEFAULT_CAMERA_HEIGHT, asked.horizon)
     if asked.fov is None and photo.focal_35mm is not None:
-        return camera_from_exif(photo.focal_35mm, width, height, *pose)
-    if asked.fov is None:
-        log.assume(f"the horizontal field of view is {DEFAULT_FOV:g} degrees (--fov)")
-    return camera_from_fov(width, height, asked.fov or DEFAULT_FOV, *pose)
+        camera = camera_from_exif(photo.focal_35mm, width, height, *pose)
+        sources["vfov_deg"] = Source("EXIF")
+    else:
+        camera = camera_from_fov(width, height, asked.fov or DEFAULT_FOV, *pose)
+        if asked.fov is not None:
+            sources["vfov_deg"] = Source("--fov")
+    return replace(camera, sources=sources)
+
+
+def _pending(camera: Camera) -> Camera:
+    """Return a camera whose assumed numbers are marked as those that a run estimates."""
+    sources = {k: Source(PENDING) if s.name == ASSUMED else s for k, s in camera.sources.items()}
+    return replace(camera, sources=sources)
+
+
+def _estimated(
+    camera: Camera, asked: CameraConfig, photo: Photo, estimator: CameraEstimator
+) -> Camera:
+    """Return a camera with estimates in place of its assumed numbers.
+
+    They are rounded to a tenth of a degree, far less than their errors: other processors add up in
+    another order, and shall give the same camera.
+    """
+    sources = dict(camera.sources)
+    is_known = sources["vfov_deg"].name != ASSUMED
+    fov = math.degrees(2.0 * math.atan(camera.height / 2.0 / camera.fy))
+    found = estimator(photo.srgb, fov if is_known else None)
+    focal, centre, roll = camera.fy, camera.cy, round(found.roll_deg, 1)
+    if not is_known:
+        focal = camera.height / 2.0 / math.tan(math.radians(round(found.vfov_deg, 1)) / 2.0)
+        sources["vfov_deg"] = Source(ESTIMATE, found.vfov_sigma_deg)
+    if found.is_upright_corrected and asked.pitch is None:
+        centre = round(found.principal[1], 2) * camera.height
+        sources["principal"] = Source(ESTIMATE, found.principal_sigma[1])
+    if found.roll_sigma_deg <= WIDE["roll_deg"]:
+        sources["roll_deg"] = Source(ESTIMATE, found.roll_sigma_deg)
+    else:  # nothing to go by, and most photos are level
+        roll = 0.0
+    if asked.horizon is not None:
+        row = horizon_row(asked.horizon, camera.height)
+        across = math.cos(math.radians(roll))
+        pitch = math.degrees(math.atan2((row - centre) * across, focal))
+    elif asked.pitch is not None:
+        pitch = asked.pitch
+    else:
+        pitch = round(found.pitch_deg, 1)
+        sources["pitch_deg"] = Source(ESTIMATE, found.pitch_sigma_deg)
+    pose = camera_pose(pitch, roll, float(camera.c2w[1, 3]))
+    return replace(camera, fx=focal, fy=focal, cy=centre, c2w=pose, sources=sources)
+
+
+def _about_sources(camera: Camera) -> tuple[list[str], list[str]]:
+    """Return what is assumed and estimated of a camera, and which estimates are doubtful."""
+    assumed, doubtful = [], []
+    numbers = camera.numbers()
+    estimated = [k for k in WORDS if camera.sources[k].name == ESTIMATE]
+    shown = [
+        f"{WORDS[k]} {numbers[k]['value']:.1f} +- {numbers[k]['sigma']:.1f}" for k in estimated
+    ]
+    if estimated:
+        line = f"estimated from the photo: {', '.join(shown)} degrees"
+        if camera.sources["principal"].name == ESTIMATE:
+            line += f", corrected to upright (optical axis at row {camera.cy:.0f})"
+        assumed.append(f"camera {line} (--pitch, --horizon, --fov; --camera-from assume)")
+    wide = [WORDS[k] for k in estimated if numbers[k]["sigma"] > WIDE[k]]
+    if wide:
+        doubtful.append(
+            f"the photo hardly shows the camera's {' and '.join(wide)}: give --horizon and --fov, "
+            "or place the object by hand (python -m warpir.place)"
+        )
+    pending = [WORDS[k] for k in WORDS if camera.sources[k].name == PENDING]
+    if pending:
+        assumed.append(
+            f"the camera's {', '.join(pending)} will be estimated from the photo; checked as "
+            f"level and {DEFAULT_FOV:g} degrees wide (--pitch, --horizon, --fov)"
+        )
+    if camera.sources["pitch_deg"].name == ASSUMED:
+        assumed.append("the camera is level (--pitch, --horizon)")
+    if camera.sources["vfov_deg"].name == ASSUMED:
+        assumed.append(f"the horizontal field of view is {DEFAULT_FOV:g} degrees (--fov)")
+    return assumed, doubtful
+
+
+def is_estimated(camera: Camera) -> bool:
+    """Return whether pitch or field of view of a camera were estimated from the photo."""
+    return any(
+        name in camera.sources and camera.sources[name].name == ESTIMATE
+        for name in ("pitch_deg", "vfov_deg")
+    )
 
 
 def make_world(
@@ -182,7 +313,7 @@ def _stood(
     """Place the asset where it was asked for, or where the points leave space."""
     low, high = asset.bounds()
 
-    def put(place: tuple[float, float, float] | None) -> Placement:
+    def put(place: tuple[float, float, float] | None, size: float | None = None) -> Placement:
         return place_asset(
             low,
             high,
@@ -192,25 +323,80 @@ def _stood(
             at=asked.at if place is None else None,
             rotate_y=asked.rotate_y,
             scale=asked.scale,
-            size=asked.size,
+            size=asked.size if size is None else size,
             mesh=mesh,
             is_plane=is_plane,
         )
 
-    if world.cloud is None:
-        return put(world.place)
     if world.place is None and asked.at is None:
-        plane = upright_plane(world.ground, world.camera.c2w[:3, 3])
-        place = find_place(put, low, high, world.camera, plane, world.cloud)
-        placement = put(place)
-        shown = ",".join(f"{x:.3g}" for x in place)
-        line = f"the object stands at {shown}, where no points are in its way (--at, --place)"
-        return replace(placement, assumed=(*placement.assumed, line))
+        is_sized = asked.size is not None or asked.scale is not None
+        return _set_free(put, asset, world, mesh, is_sized)
     placement = put(world.place)
+    if world.cloud is None:
+        return placement
     if count := len(points_in_way(placement.asset_to_world, low, high, world.cloud)):
         warning = f"{count} points of --ground-points stand where the object does; is it free?"
         placement = replace(placement, warnings=(*placement.warnings, warning))
     return placement
+
+
+def _set_free(
+    put: Callable[..., Placement],
+    asset: Asset,
+    world: PhotoWorld,
+    mesh: ReceiverMesh | None,
+    is_sized: bool,
+) -> Placement:
+    """Place an object that was not placed: in the lower middle, else where it is seen whole.
+
+    Args:
+        put: Sets it down at a place, or at the usual pixel, with a longest side [m] or its own.
+        asset: The object.
+        world: Camera, ground and points.
+        mesh: What --proxy holds; then only the usual pixel is tried.
+        is_sized: Whether its size was asked for.
+
+    Raises:
+        InputError: There is no free place, or no ground in view.
+    """
+    low, high = asset.bounds()
+    view = (low, high, world.camera)
+    if mesh is not None and world.cloud is None:
+        return put(None)
+    if world.cloud is None:
+        try:
+            usual = put(None)
+        except InputError:
+            pass  # above the horizon, or outside the photo: the search below tells
+        else:
+            if is_well_seen(usual.asset_to_world, *view):
+                return usual
+    eye = world.camera.c2w[:3, 3]
+    plane = upright_plane(world.ground, eye)
+    lines = []
+    try:
+        place = find_place(put, *view, plane, world.cloud)
+    except InputError:
+        if is_sized or world.cloud is not None:
+            raise
+        # So large that the camera is inside wherever it stands: begin with what lies ahead.
+        away, seen = 2.0 * float(plane[:3] @ eye + plane[3]), math.inf
+    else:
+        placement = put(place)
+        away = float(np.linalg.norm(np.subtract(place, eye)))
+        seen = share_of_height(placement.asset_to_world, *view)
+    if not is_sized and not SEEN[0] <= seen <= SEEN[1]:
+        size = float(f"{SHOWN * away * world.camera.height / world.camera.fy:.2g}")
+        place = find_place(lambda there: put(there, size), *view, plane, world.cloud)
+        placement = put(place, size)
+        lines.append(
+            f"the object is {size:g} m large, since with its own {float((high - low).max()):.3g} m "
+            f"it would be {'hardly seen' if seen < SHOWN else 'cut'} (--size, --scale)"
+        )
+    shown = ",".join(f"{x:.3g}" for x in place)
+    why = "it is seen whole" if world.cloud is None else "no points are in its way"
+    lines.append(f"the object stands at {shown}, where {why} (--at, --place)")
+    return replace(placement, assumed=(*placement.assumed, *lines))
 
 
 def _four(plane: Float64Array) -> tuple[float, float, float, float]:

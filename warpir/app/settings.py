@@ -71,6 +71,8 @@ class CameraConfig:
     top; a share when between 0 and 1; in place of --pitch"""
     height: float | None = option(None, "M", name="camera_height", low=1e-6, high=1e9)
     """Height of the camera above the ground [m]"""
+    source: str = option("estimate", "SOURCE", name="camera_from", choices=("estimate", "assume"))
+    """Numbers not given: estimate or assume; from the photo, or level and 60 degrees wide"""
     up: str | None = option(None, "AXIS", expert=True, choices=AXES)
     """Which axis of the camera file's world points up"""
     ground: tuple[float, float, float, float] | None = option(None, "A,B,C,D")
@@ -420,7 +422,7 @@ class TaskConfig:
     --reuse, --light, --sun or --sky"""
     refine_parts: tuple[str, ...] | None = option(None, "NAME,NAME")
     """Parts that --refine material changes (default: all); base-color, metallic, roughness"""
-    refine_materials: tuple[str, ...] | None = option(None, "NAME,NAME")
+    refine_materials: tuple[str, ...] | None = option(None, "NAMES")
     """Materials that --refine changes, by name (default: all); of the asset"""
 
 

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, replace
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import replace
 
 import numpy as np
 import torch
@@ -13,68 +15,23 @@ from warpir.calibration import lines
 from warpir.calibration.network import NUMBERS, Calibrator, load_calibrator, seen
 from warpir.core.arrays import FloatArray
 from warpir.core.errors import InputError
-from warpir.scene.camera import Camera
+from warpir.scene.camera import CameraEstimate
 
 NETWORK = "network"
 """Name of the network among the witnesses."""
+CORRECTED_SHIFT = 0.08
+"""Distance of the estimated principal point from the middle, over the height, from which a photo
+counts as corrected to upright."""
 LINES = "vanishing point of upright edges"
 """Name of the second witness."""
-
-
-@dataclass(frozen=True)
-class CameraEstimate:
-    """What a photo shows of its camera.
-
-    Standard deviations are calibrated: about 68 % of errors on places that were not learned from
-    are smaller.
-    """
-
-    pitch_deg: float
-    """Tilt of the optical axis [deg]: positive looks up, negative looks down, as ``--pitch``."""
-    roll_deg: float
-    """Turn about the camera's own +Z, which points out of the photo toward the viewer [deg]:
-    positive is counter-clockwise from behind the camera, so the photo's horizon falls to the right.
-    The camera's rotation to the world is Ry(yaw) Rx(pitch) Rz(roll)."""
-    vfov_deg: float
-    """Vertical field of view [deg]: 2 atan(height / 2 f), wherever the principal point is."""
-    principal: tuple[float, float]
-    """Principal point as shares of width and height from the top left; (.5, .5) is the middle. In a
-    photo that was corrected to upright it is off the middle, and the pitch about 0."""
-    pitch_sigma_deg: float
-    """Standard deviation of the pitch [deg]."""
-    roll_sigma_deg: float
-    """Standard deviation of the roll [deg]."""
-    vfov_sigma_deg: float
-    """Standard deviation of the vertical field of view [deg]."""
-    principal_sigma: tuple[float, float]
-    """Standard deviations of the principal point, in the same shares."""
-    witnesses: tuple[str, ...]
-    """What the estimate rests on: `NETWORK`, and `LINES` where enough straight edges agree."""
-
-    def camera(self, width: int, height: int, camera_height: float) -> Camera:
-        """Return the estimated camera at (0, camera_height, 0), turned toward -Z.
-
-        Args:
-            width: Image width [px].
-            height: Image height [px].
-            camera_height: Height above the ground [m].
-        """
-        focal = height / 2.0 / math.tan(math.radians(self.vfov_deg) / 2.0)
-        pitch, roll = math.radians(self.pitch_deg), math.radians(self.roll_deg)
-        tilt = [[1, 0, 0], [0, math.cos(pitch), -math.sin(pitch)]]
-        tilt.append([0, math.sin(pitch), math.cos(pitch)])
-        turn = [[math.cos(roll), -math.sin(roll), 0], [math.sin(roll), math.cos(roll), 0]]
-        c2w = np.eye(4)
-        c2w[:3, :3] = np.array(tilt) @ np.array([*turn, [0, 0, 1]])
-        c2w[1, 3] = camera_height
-        cx, cy = self.principal[0] * width, self.principal[1] * height
-        return Camera(width, height, focal, focal, cx, cy, c2w)
 
 
 def estimate_camera(
     photo: FloatArray, network: Calibrator | None = None, vfov_deg: float | None = None
 ) -> CameraEstimate:
     """Estimate the camera of a photo, by the network and by upright edges where enough agree.
+
+    The principal point is the middle, unless the photo looks corrected to upright (`decided`).
 
     Args:
         photo: Display-encoded (sRGB) in [0, 1], shape [H, W, 3].
@@ -86,7 +43,24 @@ def estimate_camera(
         InputError: The photo has no pixels, or the network's file cannot be used
             (`ExitCode.MODEL`).
     """
-    return with_lines(network_estimate(photo, network or load_calibrator(), vfov_deg), photo)
+    with _one_thread():
+        alone = network_estimate(photo, network or load_calibrator(), vfov_deg)
+        return decided(with_lines(alone, photo))
+
+
+@contextmanager
+def _one_thread() -> Iterator[None]:
+    """Run torch on one thread of the CPU.
+
+    The network is small: more threads gain .1 s on free cores and lose seconds on busy ones, where
+    they wait for each other; and one thread gives the same digits on every machine of a kind.
+    """
+    before = torch.get_num_threads()
+    torch.set_num_threads(1)
+    try:
+        yield
+    finally:
+        torch.set_num_threads(before)
 
 
 def network_estimate(
@@ -130,6 +104,26 @@ def network_estimate(
         principal_sigma=(sigma["x"], sigma["y"]),
         witnesses=(NETWORK,),
     )
+
+
+def decided(estimate: CameraEstimate) -> CameraEstimate:
+    """Return an estimate whose principal point is the middle, or clearly above or below it.
+
+    Nearly all photos are either as the lens drew them, then the optical axis is in the middle, or
+    corrected to upright, then it is far off. Where it is put into the middle the pitch changes such
+    that the horizon stays, of which the photo shows more than of either.
+
+    Args:
+        estimate: With the distributions' medians for both.
+    """
+    shift = estimate.principal[1] - 0.5
+    if abs(shift) > CORRECTED_SHIFT:
+        return replace(estimate, principal=(0.5, estimate.principal[1]))
+    focal = 0.5 / math.tan(math.radians(estimate.vfov_deg) / 2.0)
+    # The horizon is y + f tan(pitch) / cos(roll) in the middle column, in heights.
+    risen = shift * math.cos(math.radians(estimate.roll_deg)) / focal
+    pitch = math.atan(math.tan(math.radians(estimate.pitch_deg)) + risen)
+    return replace(estimate, principal=(0.5, 0.5), pitch_deg=math.degrees(pitch))
 
 
 def with_lines(estimate: CameraEstimate, photo: FloatArray) -> CameraEstimate:

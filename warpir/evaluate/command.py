@@ -416,7 +416,9 @@ def _make_bench(
         steps=options.steps or (EMBEDDED_STEPS if options.model is None else None),
         threads=options.threads or None,
     )
-    return Bench(scenes, device, options.seed, config, network, missing, predictions)
+    return Bench(
+        scenes, device, options.seed, config, network, missing, predictions, options.calibrator
+    )
 
 
 def usable_rows(

@@ -15,12 +15,13 @@ import torch
 from warpir.app.config import usage
 from warpir.app.inputs import Inputs
 from warpir.app.run import Run
+from warpir.calibration.estimate import estimate_camera
 from warpir.core.arrays import FloatArray
 from warpir.core.color import luminance
 from warpir.core.errors import InputError
 from warpir.core.latlong import rotate_map
 from warpir.diffusion.models.embedded import build_network, save_embedded
-from warpir.evaluate.scenes import Place, Subject, mirrored
+from warpir.evaluate.scenes import CAMERA_HEIGHT, Place, Subject, mirrored, turned_to
 from warpir.evaluate.stage import Bench, Prediction, Stage
 from warpir.io.images.photos import Photo, read_photo
 from warpir.io.images.writers import png_bytes
@@ -63,7 +64,8 @@ class Row:
     same_as: str | None = None
     """The row whose light it should give."""
     needs: tuple[str, ...] = ()
-    """Some of ``regressor``, ``prior`` and ``panoramas``; the last means two panoramas."""
+    """Some of ``regressor``, ``calibrator``, ``prior`` and ``panoramas``; the last means two
+    panoramas."""
 
     def require(self, bench: Bench) -> None:
         """Check that what the row needs is there.
@@ -75,6 +77,8 @@ class Row:
             bench.other(bench.scenes[0][0])
         if "regressor" in self.needs:
             _ = bench.network
+        if "calibrator" in self.needs:
+            _ = bench.calibrator
         if "prior" in self.needs:
             bench.require_prior()
 
@@ -142,6 +146,17 @@ def _truth_mass(estimate: Regression, place: Place) -> float:
     axis = axis_from_angles(peak.azimuth_deg, peak.elevation_deg)
     rows = (estimate.directions, estimate.probability[None], axis[None])
     return float(region_mass(*(torch.from_numpy(np.asarray(r)) for r in rows))[0])
+
+
+def regression_with_estimated_camera(bench: Bench, place: Place) -> Prediction:
+    """Return the light that a regressor estimates with a camera that is estimated too.
+
+    Only the azimuth is the true one, which no photograph tells.
+    """
+    height, width = place.photo.shape[:2]
+    found = estimate_camera(place.photo, bench.calibrator)
+    camera = turned_to(found.camera(width, height, CAMERA_HEIGHT), place.azimuth)
+    return regression(bench.network, replace(place, camera=camera))
 
 
 def regression_on_ground(bench: Bench, stage: Stage, subject: Subject) -> Prediction:
@@ -344,6 +359,13 @@ ROWS = {
         "the regressor alone",
         of_place=lambda bench, place: regression(bench.network_for(place.panorama), place),
         needs=("regressor",),
+    ),
+    "regression-estimated-camera": Row(
+        "methods",
+        "the same, the camera estimated too",
+        of_place=regression_with_estimated_camera,
+        start="regression",
+        needs=("regressor", "calibrator"),
     ),
     "regression-ground": Row(
         "methods",

@@ -86,7 +86,16 @@ def crop_camera(
         pitch: Upward tilt of the camera [deg].
         camera_height: Above the ground y = 0 [m].
     """
-    camera = camera_from_fov(width, height, fov, pitch, camera_height)
+    return turned_to(camera_from_fov(width, height, fov, pitch, camera_height), azimuth)
+
+
+def turned_to(camera: Camera, azimuth: float) -> Camera:
+    """Return a camera that looks toward -Z, turned to an azimuth.
+
+    Args:
+        camera: Above the origin.
+        azimuth: Clockwise from -Z seen from above [deg].
+    """
     c2w = camera.c2w.copy()
     c2w[:3, :3] = turn(np.array([0.0, 1.0, 0.0]), -np.radians(azimuth)) @ c2w[:3, :3]
     return replace(camera, c2w=c2w)

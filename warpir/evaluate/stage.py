@@ -19,6 +19,7 @@ from torch import nn
 
 from warpir.app.config import InsertConfig
 from warpir.app.model_files import require_model
+from warpir.calibration.network import Calibrator, load_calibrator
 from warpir.core.arrays import FloatArray, IntArray
 from warpir.core.color import linear_to_gamma
 from warpir.core.errors import InputError
@@ -260,6 +261,7 @@ class Bench:
         network: The regressor, or None.
         missing: Why there is no regressor.
         predictions: Lights of another system by the place's name, world frame.
+        calibrator_file: Weights of the network that estimates cameras; None: warpir's own.
     """
 
     def __init__(
@@ -271,10 +273,12 @@ class Bench:
         network: Regressor | None = None,
         missing: InputError | None = None,
         predictions: Mapping[str, FloatArray] | None = None,
+        calibrator_file: Path | None = None,
     ) -> None:
         self.scenes, self.device, self.seed, self.config = scenes, device, seed, config
         self._network, self._missing = network, missing
         self.predictions = predictions or {}
+        self._calibrator_file = calibrator_file
 
     @property
     def network(self) -> Regressor:
@@ -310,12 +314,21 @@ class Bench:
         """Return the sha256 of the weights that were used, by what they are."""
         where = files("warpir.diffusion") / "weights"
         digests: dict[str, str | None] = {}
-        for name in ("regressor", "prior"):
-            given = self.config.flat()[name]
+        for name in ("regressor", "prior", "calibrator"):
+            given = self._calibrator_file if name == "calibrator" else self.config.flat()[name]
             path = Path(given or str(where / f"{name}.safetensors"))
             is_there = path.is_file()
             digests[name] = hashlib.sha256(path.read_bytes()).hexdigest() if is_there else None
         return digests
+
+    @cached_property
+    def calibrator(self) -> Calibrator:
+        """The network that estimates cameras.
+
+        Raises:
+            InputError: Its file cannot be used (`ExitCode.MODEL`).
+        """
+        return load_calibrator(self._calibrator_file)
 
     @cached_property
     def random_network(self) -> Regressor:

@@ -4,7 +4,8 @@
 
 opens a page on this machine: the horizon, the ground and the object are dragged into place, and
 Save writes ``camera.json`` and ``insert.json`` into --out, which ``python -m warpir.insert --config
-placed/street/insert.json`` takes. Neither torch nor Warp is loaded.
+placed/street/insert.json`` takes. Warp is not loaded, and torch only for a camera that has to be
+estimated.
 """
 
 import os
@@ -41,6 +42,7 @@ FLAGS = {
         "pitch",
         "horizon",
         "camera_height",
+        "camera_from",
         "up",
         "ground",
         "place",

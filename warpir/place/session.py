@@ -19,8 +19,16 @@ import numpy as np
 from warpir.app.command import read_values
 from warpir.app.config import DEFAULTS, SKY_PRESETS, InsertConfig
 from warpir.app.inputs import Loaders, read_asset
-from warpir.app.photo_world import make_world, photo_camera
+from warpir.app.photo_world import (
+    NO_PLACE,
+    PhotoWorld,
+    is_estimated,
+    make_world,
+    photo_camera,
+    stand_on_ground,
+)
 from warpir.app.settings import CameraConfig, InputConfig, LightConfig, PlacementConfig
+from warpir.calibration.photos import estimate_photo
 from warpir.core.arrays import Float64Array
 from warpir.core.atomic import replacing, write_staged
 from warpir.core.errors import ExitCode, InputError, disk_error
@@ -42,7 +50,10 @@ PHOTO_SIDE = 2048
 """Longest side of the photo for the page [px]."""
 PLACED = ("place", "at", "rotate_y", "scale", "size", "sun", "sky")
 """Fields that the page sets."""
-SEEN_BY = ("camera", "frame", "up", "fov", "pitch", "horizon", "camera_height", "ground")
+SEEN_BY = (
+    *("camera", "frame", "up", "fov", "pitch", "horizon", "camera_height", "camera_from"),
+    "ground",
+)
 """Fields that the saved camera file replaces."""
 DEFAULT_SUN = (-60.0, 45.0)
 """Azimuth and elevation of the sun with which the page starts [deg]: from the left, in front."""
@@ -94,32 +105,11 @@ def open_session(
         layer=inputs.layer,
         strict=inputs.strict,
     )
-    view = photo_camera(camera, photo, Path(inputs.photo).name, log, limits)
+    name = Path(inputs.photo).name
     asset = read_asset(inputs, limits, Loaders(), log)
-    world = make_world(camera, placement.place, view, None)
-    assumed = [*log.assumed, *world.camera.assumed, *world.camera.notices]
-    low, high = asset.bounds()
-    stands = (placement.place, placement.at, placement.scale, placement.size)
-    try:
-        placed = place_asset(
-            low,
-            high,
-            world.camera,
-            world.ground,
-            place=world.place,
-            at=placement.at,
-            rotate_y=placement.rotate_y,
-            scale=placement.scale,
-            size=placement.size,
-        )
-        asset_to_world = placed.asset_to_world
-        assumed += [*placed.assumed, *placed.warnings]
-    except InputError as error:
-        if any(value is not None for value in stands):
-            raise
-        # It is here that this can be put right: begin with something that is seen.
-        asset_to_world = _in_view(asset, world.camera, world.ground, placement.rotate_y)
-        assumed.append(f"{error.what}: it starts in front of the camera, and smaller")
+    start = _Start(photo, name, asset, placement, limits)
+    world, asset_to_world, lines = start.seen_by(camera)
+    assumed = [*log.assumed, *world.camera.assumed, *world.camera.notices, *lines]
     return Session(
         photo,
         Path(inputs.photo).name,
@@ -131,6 +121,40 @@ def open_session(
         placement.rotate_y,
         tuple(assumed),
     )
+
+
+@dataclass(frozen=True)
+class _Start:
+    """What the page starts with, but for the camera."""
+
+    photo: Photo
+    photo_name: str
+    asset: Asset
+    placement: PlacementConfig
+    limits: Limits
+
+    def seen_by(self, asked: CameraConfig) -> tuple[PhotoWorld, Float64Array, list[str]]:
+        """Return camera and ground, the asset's pose, and what is to be said of it.
+
+        Raises:
+            InputError: The camera cannot be used, or the place that was named is not in the photo.
+        """
+        view = photo_camera(asked, self.photo, self.photo_name, estimate_photo, self.limits)
+        world = make_world(asked, self.placement.place, view, None)
+        try:
+            placed = stand_on_ground(self.placement, self.asset, world)
+        except InputError as error:
+            if is_estimated(view.camera):
+                world, pose, lines = self.seen_by(replace(asked, source="assume"))
+                return world, pose, [NO_PLACE, *lines]
+            asked_for = self.placement
+            named = (asked_for.place, asked_for.at, asked_for.scale, asked_for.size)
+            if any(value is not None for value in named):
+                raise
+            # It is here that this can be put right: begin with something that is seen.
+            pose = _in_view(self.asset, world.camera, world.ground, asked_for.rotate_y)
+            return world, pose, [f"{error.what}: it starts in front of the camera, and smaller"]
+        return world, placed.asset_to_world, [*placed.assumed, *placed.warnings]
 
 
 def _in_view(

@@ -35,6 +35,12 @@ class Setting:
     """Whether the prior's default was used for an open value."""
 
 
+CAMERA_WORDS = {
+    "pitch_deg": "camera: pitch",
+    "roll_deg": "camera: roll",
+    "vfov_deg": "camera: vertical field of view",
+}
+"""What the report calls the numbers of the camera."""
 ABOUT_FILES = (
     ("composite.png", "The result, at the photo's own resolution, depth and profile"),
     ("layers.exr", "The composite and its layers, linear, for Nuke, Natron, Fusion, Blender"),
@@ -320,6 +326,7 @@ def figures(record: Mapping[str, Any]) -> Rows:
         ("pixels of the object, as rendered", f"{measured['object_pixels']:,}"),
         ("pixels whose shadow was traced, as rendered", f"{measured['shadow_pixels']:,}"),
         ("pixels of the picture that differ from the photo", f"{measured['changed_pixels']:,}"),
+        *_camera(measured.get("camera", {})),
         ("exposure of the light", f"{measured['exposure_ev']:+.2f} EV"),
         *([("noise taken out by", found)] if (found := measured.get("denoiser")) else []),
         *_look(measured.get("look", {})),
@@ -330,6 +337,20 @@ def figures(record: Mapping[str, Any]) -> Rows:
     ):
         if measured[key]:
             rows.append((what, f"{measured[key]:,}"))
+    return rows
+
+
+def _camera(numbers: Mapping[str, Any]) -> Rows:
+    """Return the camera's numbers and their sources; files of older runs say nothing."""
+    rows: Rows = []
+    for name, what in CAMERA_WORDS.items():
+        if number := numbers.get(name):
+            sigma = "" if number["sigma"] is None else f" ± {number['sigma']:.1f}"
+            rows.append((what, f"{number['value']:.1f}{sigma}° ({number['source']})"))
+    if axis := numbers.get("principal"):
+        across, down = (100.0 * share for share in axis["value"])
+        text = f"{across:.0f} % from the left, {down:.0f} % from the top ({axis['source']})"
+        rows.append(("optical axis in the photo", text))
     return rows
 
 

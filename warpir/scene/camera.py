@@ -4,9 +4,10 @@ World right-handed, +Y up, metres; the camera looks along its own -Z with +Y up 
 Pixel (column j, row i) has its centre at (j + 0.5, i + 0.5), origin top left, y down.
 """
 
-from collections.abc import Sequence
+import math
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -15,6 +16,19 @@ from warpir.core.errors import ExitCode, InputError
 
 FILM_DIAGONAL_35MM = 43.267
 """Diagonal of the 36 x 24 mm frame that EXIF's equivalent focal length refers to [mm]."""
+
+
+class Source(NamedTuple):
+    """Where a number of a camera comes from, and how wrong it may be."""
+
+    name: str
+    """Such as ``--fov``, ``EXIF``, ``estimate`` or ``assumed``."""
+    sigma: float | None = None
+    """Standard deviation, in the number's unit; None where it is not known."""
+
+
+ESTIMATE, ASSUMED, CAMERA_FILE = "estimate", "assumed", "camera file"
+"""Names of sources: estimated from the photo, usual where nothing is known, of a camera file."""
 
 
 @dataclass(frozen=True)
@@ -39,6 +53,9 @@ class Camera:
     """Scalings and doubtful values, one line each; printed and kept in ``run.json``."""
     assumed: tuple[str, ...] = field(default=(), compare=False)
     """Assumed values, one line each; printed and kept in ``run.json``."""
+    sources: Mapping[str, Source] = field(default_factory=dict, compare=False)
+    """Where ``pitch_deg``, ``roll_deg``, ``vfov_deg`` and ``principal`` come from; a number without
+    an entry is that of a camera file."""
 
     def scaled(self, width: int, height: int) -> "Camera":
         """Return the same view at another resolution."""
@@ -83,6 +100,28 @@ class Camera:
             "cy": self.cy,
             "c2w": self.c2w.tolist(),
         }
+
+    def numbers(self) -> dict[str, dict[str, Any]]:
+        """Return what ``run.json`` says of pitch, roll, field of view and principal point.
+
+        By name: ``value``, ``sigma`` (standard deviation, None where it is not known) and
+        ``source``. Angles are degrees above the world's horizon; the principal point is given as
+        shares of width and height from the top left.
+        """
+        _, up, back = self.c2w[:3, :3].T
+        values = {
+            "pitch_deg": math.degrees(math.asin(float(np.clip(-back[1], -1.0, 1.0)))),
+            "roll_deg": math.degrees(math.atan2(float(self.c2w[1, 0]), float(up[1]))),
+            "vfov_deg": math.degrees(2.0 * math.atan(self.height / 2.0 / self.fy)),
+            "principal": [self.cx / self.width, self.cy / self.height],
+        }
+        record = {}
+        for name, value in values.items():
+            source = self.sources.get(name, Source(CAMERA_FILE))
+            sigma = None if source.sigma is None else round(source.sigma, 3)
+            rounded = np.round(value, 6).tolist()
+            record[name] = {"value": rounded, "sigma": sigma, "source": source.name}
+        return record
 
 
 def exr_matrices(camera: Camera) -> tuple[Float64Array, Float64Array]:
@@ -151,6 +190,92 @@ def square_pixel_error(camera: Camera) -> float:
 # ----------------------------------------------------------------------- cameras from few numbers
 
 
+@dataclass(frozen=True)
+class CameraEstimate:
+    """What a photo shows of its camera.
+
+    Standard deviations are calibrated: about 68 % of errors on places that were not learned from
+    are smaller.
+    """
+
+    pitch_deg: float
+    """Tilt of the optical axis [deg]: positive looks up, negative looks down, as ``--pitch``."""
+    roll_deg: float
+    """Turn about the camera's own +Z, which points out of the photo toward the viewer [deg]:
+    positive is counter-clockwise from behind the camera, so the photo's horizon falls to the right.
+    The camera's rotation to the world is Ry(yaw) Rx(pitch) Rz(roll)."""
+    vfov_deg: float
+    """Vertical field of view [deg]: 2 atan(height / 2 f), wherever the principal point is."""
+    principal: tuple[float, float]
+    """Principal point as shares of width and height from the top left; (.5, .5) is the middle. In a
+    photo that was corrected to upright it is off the middle, and the pitch about 0."""
+    pitch_sigma_deg: float
+    """Standard deviation of the pitch [deg]."""
+    roll_sigma_deg: float
+    """Standard deviation of the roll [deg]."""
+    vfov_sigma_deg: float
+    """Standard deviation of the vertical field of view [deg]."""
+    principal_sigma: tuple[float, float]
+    """Standard deviations of the principal point, in the same shares."""
+    witnesses: tuple[str, ...]
+    """What the estimate rests on, one name each."""
+
+    @property
+    def is_upright_corrected(self) -> bool:
+        """Whether the photo was corrected to upright: level, its optical axis off the middle."""
+        return self.principal[1] != 0.5
+
+    def camera(self, width: int, height: int, camera_height: float) -> Camera:
+        """Return the estimated camera at (0, camera_height, 0), turned toward -Z.
+
+        Args:
+            width: Image width [px].
+            height: Image height [px].
+            camera_height: Height above the ground [m].
+        """
+        focal = height / 2.0 / math.tan(math.radians(self.vfov_deg) / 2.0)
+        pose = camera_pose(self.pitch_deg, self.roll_deg, camera_height)
+        cx, cy = self.principal[0] * width, self.principal[1] * height
+        return Camera(width, height, focal, focal, cx, cy, pose)
+
+
+def camera_pose(pitch_deg: float, roll_deg: float, camera_height: float) -> Float64Array:
+    """Return the pose of a camera at (0, camera_height, 0), turned toward -Z, shape [4, 4].
+
+    Args:
+        pitch_deg: Upward tilt [deg]; negative looks down.
+        roll_deg: Turn about the camera's own +Z [deg]; positive lets the horizon fall to the right.
+        camera_height: Height above the ground [m].
+    """
+    pitch, roll = math.radians(pitch_deg), math.radians(roll_deg)
+    tilt = [[1, 0, 0], [0, math.cos(pitch), -math.sin(pitch)]]
+    tilt.append([0, math.sin(pitch), math.cos(pitch)])
+    turn = [[math.cos(roll), -math.sin(roll), 0], [math.sin(roll), math.cos(roll), 0], [0, 0, 1]]
+    pose = np.eye(4)
+    pose[:3, :3] = np.array(tilt) @ np.array(turn)
+    pose[1, 3] = camera_height
+    return pose
+
+
+def focal_from_fov(width: int, fov_deg: float) -> float:
+    """Return the focal length of a horizontal field of view [px].
+
+    Args:
+        width: Image width [px].
+        fov_deg: Horizontal field of view [deg].
+
+    Raises:
+        InputError: Out of range (`ExitCode.USAGE`).
+    """
+    if not (np.isfinite(fov_deg) and 0.0 < fov_deg < 180.0):
+        raise InputError(
+            "--fov",
+            f"not a field of view (found {fov_deg}; expected degrees between 0 and 180)",
+            code=ExitCode.USAGE,
+        )
+    return float(width / 2.0 / np.tan(np.radians(fov_deg) / 2.0))
+
+
 def camera_from_fov(
     width: int,
     height: int,
@@ -173,16 +298,10 @@ def camera_from_fov(
         InputError: A number outside its range; the text names the flag.
     """
     notices = []
-    if not (np.isfinite(fov_deg) and 0.0 < fov_deg < 180.0):
-        raise InputError(
-            "--fov",
-            f"not a field of view (found {fov_deg}; expected degrees between 0 and 180)",
-            code=ExitCode.USAGE,
-        )
+    focal = focal_from_fov(width, fov_deg)
     if fov_deg < 3.2:
         notices.append(f"--fov: {fov_deg} degrees is very narrow; was it meant in radians?")
-    fx = width / 2.0 / np.tan(np.radians(fov_deg) / 2.0)
-    return _level_camera(width, height, float(fx), pitch_deg, camera_height, horizon, notices)
+    return _level_camera(width, height, focal, pitch_deg, camera_height, horizon, notices)
 
 
 def camera_from_exif(
@@ -207,6 +326,21 @@ def camera_from_exif(
         f"{focal_35mm:g} mm (35 mm equivalent, by the diagonal); wrong if cropped"
     ]
     return _level_camera(width, height, fx, pitch_deg, camera_height, horizon, assumed=assumed)
+
+
+def horizon_row(horizon: float, height: int) -> float:
+    """Return the row of ``--horizon`` [px].
+
+    Args:
+        horizon: A share of the height when within (0, 1), else a row [px].
+        height: Image height [px].
+
+    Raises:
+        InputError: Not finite (`ExitCode.USAGE`).
+    """
+    if not np.isfinite(horizon):
+        raise InputError("--horizon", f"not a row (found {horizon})", code=ExitCode.USAGE)
+    return horizon * height if 0.0 < horizon < 1.0 else horizon
 
 
 def _level_camera(
@@ -238,9 +372,7 @@ def _level_camera(
             )
         pitch = float(np.radians(pitch_deg))
     else:
-        if not np.isfinite(horizon):
-            raise InputError("--horizon", f"not a row (found {horizon})", code=ExitCode.USAGE)
-        row = horizon * height if 0.0 < horizon < 1.0 else horizon
+        row = horizon_row(horizon, height)
         # A level direction straight ahead projects to row cy + f tan(pitch).
         pitch = float(np.arctan2(row - cy, focal))
     cos, sin = np.cos(pitch), np.sin(pitch)

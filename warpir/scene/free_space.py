@@ -1,4 +1,4 @@
-"""Places on the ground where an object can stand: free of points, seen by the camera.
+"""Places on the ground where an object can stand: seen whole by the camera, free of points.
 
 Points above the ground by a tenth of the object's height, and lower than its top, are obstacles (of
 a car: between 0.15 m and 1.5 m). Lengths go by the object's size, because the scale of a point
@@ -51,13 +51,14 @@ def find_place(
     high: Float64Array,
     camera: Camera,
     plane: Float64Array,
-    cloud: Cloud,
+    cloud: Cloud | None = None,
 ) -> Place:
     """Return where the object stands free, world frame [m].
 
     Of the places where it is seen whole, on ground that has points, with none in its way or in
     front of it, the one nearest to the default pixel and the preferred distance. Where no place
-    is like that, the ground may lack points, and then the frame may cut the object.
+    is like that, the ground may lack points, and then the frame may cut the object. Without points
+    only the frame decides.
 
     Args:
         put: Sets the object down at a place; refuses those that the camera cannot see.
@@ -65,10 +66,10 @@ def find_place(
         high: Highest corner of it, shape [3].
         camera: The camera.
         plane: The ground, unit normal on the camera's side, shape [4].
-        cloud: The points.
+        cloud: The points, if there are any.
 
     Raises:
-        InputError: Every place is occupied or hidden.
+        InputError: Every place is occupied or hidden, or the photo shows no ground.
     """
     candidates: list[tuple[float, Place, Float64Array]] = []
     for v in (np.arange(GRID[1]) + 0.5) / GRID[1]:
@@ -86,13 +87,21 @@ def find_place(
     fallback: tuple[int, Place] | None = None
     for _, place, matrix in sorted(candidates, key=lambda entry: entry[0]):
         box = _Box(matrix, low, high, camera)
-        if len(points_in_way(matrix, low, high, cloud)) > STRAY or box.hidden(cloud) > STRAY:
-            continue
-        rank = 2 * box.is_cut + (_ground_points(matrix, low, high, cloud) <= STRAY)
+        rank = 2 * box.is_cut
+        if cloud is not None:
+            if len(points_in_way(matrix, low, high, cloud)) > STRAY or box.hidden(cloud) > STRAY:
+                continue
+            rank += _ground_points(matrix, low, high, cloud) <= STRAY
         if rank == 0:
             return place
         if fallback is None or rank < fallback[0]:
             fallback = rank, place
+    if fallback is None and cloud is None:
+        raise InputError(
+            "--at",
+            "the photo shows no ground on which the object could stand",
+            "give --horizon and --fov, or --at",
+        )
     if fallback is None:
         raise InputError(
             "--ground-points",
@@ -100,6 +109,39 @@ def find_place(
             "give --at or --place, or a smaller --size",
         )
     return fallback[1]
+
+
+def is_well_seen(
+    matrix: Float64Array, low: Float64Array, high: Float64Array, camera: Camera
+) -> bool:
+    """Return whether the frame holds an object whole, and it is neither close nor far away.
+
+    Args:
+        matrix: Asset to world, shape [4, 4].
+        low: Lowest corner of the asset's bounding box, asset frame [m], shape [3].
+        high: Highest corner of it, shape [3].
+        camera: The camera.
+    """
+    middle = matrix[:3, :3] @ (0.5 * (low + high)) + matrix[:3, 3]
+    away = float(np.linalg.norm(middle - camera.c2w[:3, 3]))
+    sides = away / _longest(matrix, low, high)
+    return NEAR <= sides <= FAR and not _Box(matrix, low, high, camera).is_cut
+
+
+def share_of_height(
+    matrix: Float64Array, low: Float64Array, high: Float64Array, camera: Camera
+) -> float:
+    """Return how large an object is seen, by its longest side over the photo's height [1].
+
+    Args:
+        matrix: Asset to world, shape [4, 4].
+        low: Lowest corner of the asset's bounding box, asset frame [m], shape [3].
+        high: Highest corner of it, shape [3].
+        camera: The camera.
+    """
+    foot = np.array([(low[0] + high[0]) / 2.0, low[1], (low[2] + high[2]) / 2.0])
+    away = np.linalg.norm(matrix[:3, :3] @ foot + matrix[:3, 3] - camera.c2w[:3, 3])
+    return float(_longest(matrix, low, high) / away * camera.fy / camera.height)
 
 
 def points_in_way(

@@ -38,7 +38,8 @@ SUMMARY = "sequence.json"
 FRAME_COUNT_LIMIT = 9999
 FRAME_FIELDS = (
     "photo", "occluder_mask", "asset", "camera", "frame", "fov", "pitch", "horizon",
-    "camera_height", "up", "ground", "ground_points", "proxy", "plane", "shadow_mask", "asset_up",
+    "camera_height", "camera_from", "up", "ground", "ground_points", "proxy", "plane",
+    "shadow_mask", "asset_up",
     "place", "at", "rotate_y", "scale", "size", "light_rotate", "exposure", "width", "seed",
 )  # fmt: skip
 """What a line may change. The light, its curves and the quality are one for all frames."""
@@ -51,7 +52,8 @@ class Frame:
     line: int
     """Of the file, from 1."""
     config: InsertConfig
-    """Complete: it makes the same result without the sequence."""
+    """Complete: it makes the same result without the sequence, but for a camera that is estimated:
+    the first frame's holds for all of its size."""
     changed: tuple[str, ...]
     """The fields that the line names."""
     is_done: bool = False

@@ -9,6 +9,7 @@ from typing import Any
 from warpir.app.config import InsertConfig
 from warpir.app.inputs import Loaders
 from warpir.app.program import attempt, say
+from warpir.calibration.photos import FirstPhoto
 from warpir.core.signals import Stopped
 from warpir.io.results import OutputFolder
 from warpir.sequence.frames import SUMMARY, read_sequence, write_summary
@@ -46,7 +47,7 @@ def insert_frames(
     """
     assert config.output.out is not None
     out = Path(config.output.out)
-    loaders = Loaders()
+    loaders = Loaders(FirstPhoto())
     frames = read_sequence(config, loaders, renews=renews)
     refuse_other_page(config)
     done = 0

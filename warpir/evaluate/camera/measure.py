@@ -16,16 +16,20 @@ from typing import Any
 import numpy as np
 import torch
 
-from warpir.calibration.estimate import LINES, CameraEstimate, network_estimate, with_lines
+from warpir.calibration.estimate import LINES, decided, network_estimate, with_lines
 from warpir.calibration.network import Calibrator
 from warpir.core.arrays import FloatArray
 from warpir.core.errors import InputError
+from warpir.scene.camera import CameraEstimate
 from warpir.train.camera.crops import ASPECTS, DrawnCameras, Panoramas, cut, read_panoramas
 from warpir.train.photo_look import draw_faults, draw_looks
 from warpir.train.sampler import Sampler
 
 CONSTANT_FOV = 60.0
 """Horizontal field of view that is assumed where nothing is known [deg]."""
+SHIFTS = (0.1, 0.4)
+"""Least and greatest distance of the optical axis from the middle, over the height, of photographs
+that are corrected to upright."""
 RANGES = {"pitch": (-40.0, 25.0), "roll": (-20.0, 20.0), "fov": (25.0, 95.0)}
 """Least and greatest pitch, roll and field of view of the shorter side [deg]."""
 SIDE = 8
@@ -40,6 +44,17 @@ def even_cameras(draw: Sampler) -> DrawnCameras:
     focal = 0.5 / torch.tan(fov / 2.0) * aspect.clamp(max=1.0)
     middle = torch.full_like(pitch, 0.5)
     return DrawnCameras(pitch, roll, focal, middle, middle, aspect, torch.zeros_like(pitch))
+
+
+def corrected_to_upright(cameras: DrawnCameras, draw: Sampler) -> DrawnCameras:
+    """Return cameras that are level, with the optical axis off the middle by a share of `SHIFTS`.
+
+    Args:
+        cameras: Field of view and shape are kept.
+        draw: Of as many.
+    """
+    level, sign = torch.zeros_like(cameras.pitch), torch.where(draw.unit() < 0.5, -1.0, 1.0)
+    return replace(cameras, pitch=level, roll=level, y=0.5 + sign * draw.uniform(*SHIFTS))
 
 
 def truth_of(cameras: DrawnCameras, row: int) -> dict[str, float]:
@@ -115,14 +130,19 @@ def measure_cameras(
         ``pitch_deg``, ``roll_deg`` and ``vfov_deg``: ``median`` and ``mean`` absolute error; the
         first also ``within_sigma``, the share of errors within one estimated standard deviation,
         ``seconds`` per photograph (median) and ``with_lines``, the share of photographs in which
-        enough upright edges agree; ``panoramas``, the names of those that were photographed; and
-        ``notices``, what could not be read.
+        enough upright edges agree; ``corrected``, of one more photograph of each panorama that is
+        corrected to upright: the share ``recognised``, the share ``mistaken`` of the other
+        photographs, the median error of the optical axis' row over the height, ``axis``, and
+        that of the middle, ``axis_constant``; ``panoramas``, the names of those that were
+        photographed; and ``notices``, what could not be read.
 
     Raises:
         InputError: None of the panoramas can be used.
     """
     generator = torch.Generator().manual_seed(seed)
     drawn = even_cameras(Sampler(scenes, generator))
+    other = torch.Generator().manual_seed(seed + 1)  # its photographs leave the others as they are
+    upright = _Upright()
     errors: dict[str, Errors] = {"estimated": {}, "network": {}, "constant": {}}
     covered = Errors()
     seconds, by_lines, used = [], 0, set[str]()
@@ -135,7 +155,7 @@ def measure_cameras(
         photo = photograph(panorama, one, width, generator)
         began = time.perf_counter()
         alone = network_estimate(photo, network)
-        estimate = with_lines(alone, photo)
+        estimate = decided(with_lines(alone, photo))
         seconds.append(time.perf_counter() - began)
         by_lines += LINES in estimate.witnesses
         truth = truth_of(one, 0)
@@ -143,13 +163,39 @@ def measure_cameras(
         _add(errors["network"], truth, vars(alone))
         _add(errors["constant"], truth, constant_camera(columns / height))
         _add_covered(covered, truth, estimate)
+        level = corrected_to_upright(one, Sampler(1, other))
+        seen = network_estimate(photograph(panorama, level, width, other), network)
+        upright.add(estimate, decided(seen), float(level.y[0]))
     summary: dict[str, Any] = {row: _summary(parts) for row, parts in errors.items()}
     for name, inside in covered.items():
         summary["estimated"][name]["within_sigma"] = float(np.mean(inside))
     summary["estimated"]["seconds"] = float(np.median(seconds))
     summary["estimated"]["with_lines"] = by_lines / scenes
-    summary |= {"panoramas": sorted(used), "notices": notices}
+    summary |= {"corrected": upright.summary(), "panoramas": sorted(used), "notices": notices}
     return summary
+
+
+class _Upright:
+    """What is recognised of photographs that are corrected to upright."""
+
+    def __init__(self) -> None:
+        self.recognised: list[bool] = []
+        self.mistaken: list[bool] = []
+        self.axis: list[float] = []
+        self.axis_constant: list[float] = []
+
+    def add(self, plain: CameraEstimate, corrected: CameraEstimate, row: float) -> None:
+        """Add the estimates of one photograph of either kind, and the second's true axis."""
+        self.mistaken.append(plain.is_upright_corrected)
+        self.recognised.append(corrected.is_upright_corrected)
+        self.axis.append(abs(corrected.principal[1] - row))
+        self.axis_constant.append(abs(0.5 - row))
+
+    def summary(self) -> dict[str, float]:
+        """Return shares and median errors."""
+        shares = {k: float(np.mean(getattr(self, k))) for k in ("recognised", "mistaken")}
+        medians = {k: float(np.median(getattr(self, k))) for k in ("axis", "axis_constant")}
+        return shares | medians
 
 
 def _shuffled(
@@ -207,4 +253,12 @@ def lines_of(measured: dict[str, Any]) -> list[str]:
             for name in ("pitch_deg", "roll_deg", "vfov_deg")
         ]
         lines.append(f"| {row} | {' | '.join(cells)} |")
-    return lines
+    upright = measured["corrected"]
+    return [
+        *lines,
+        "",
+        f"corrected to upright: {100.0 * upright['recognised']:.0f} % recognised, "
+        f"{100.0 * upright['mistaken']:.0f} % of the other photographs mistaken for it; optical "
+        f"axis off by {upright['axis']:.3f} of the height (median; the middle would be by "
+        f"{upright['axis_constant']:.3f})",
+    ]
