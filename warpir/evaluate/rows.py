@@ -151,12 +151,14 @@ def _truth_mass(estimate: Regression, place: Place) -> float:
 def regression_with_estimated_camera(bench: Bench, place: Place) -> Prediction:
     """Return the light that a regressor estimates with a camera that is estimated too.
 
-    Only the azimuth is the true one, which no photograph tells.
+    Only the azimuth is the true one, which no photograph tells. Panoramas that the cameras' network
+    has learned from are not left out.
     """
     height, width = place.photo.shape[:2]
     found = estimate_camera(place.photo, bench.calibrator)
     camera = turned_to(found.camera(width, height, CAMERA_HEIGHT), place.azimuth)
-    return regression(bench.network, replace(place, camera=camera))
+    network = bench.network_for(place.panorama)
+    return regression(network, replace(place, camera=camera))
 
 
 def regression_on_ground(bench: Bench, stage: Stage, subject: Subject) -> Prediction:
