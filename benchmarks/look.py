@@ -46,6 +46,8 @@ ROWS = {
 }
 """Sharpness, grain and response of each row. `--grain` stands for the blocks of JPEG too; of these
 two rows each keeps one of both."""
+TRUE = "true camera"
+"""Row of the object through the camera itself, with other grain and other samples: the floor."""
 QUALITY = (40, 95)
 """Least and most quality of the JPEG files that half of the cameras write."""
 BLUR, GRAIN = (0.0, 1.6), (0.0, 6.0)
@@ -135,6 +137,16 @@ def measure(place: Place, subject: Subject, samples: int) -> dict[str, dict[str,
     coding = None if quality is None else jpeg_of(photo.codes, quality)[1]
     regions = make_regions(clean.layers.matte, clean.layers.shadow_ratio)
     detail = laplacian(truth, clean.layers.matte)
+
+    def errors(shown: FloatArray) -> dict[str, float]:
+        of_box = image_errors(shown, truth, regions)["box"]
+        return {
+            "rmse": of_box["rmse"],
+            "flip": of_box.get("flip", float("nan")),
+            "laplacian": laplacian(shown, clean.layers.matte) / detail,
+            "blacks": blacks(shown, clean.layers.matte) - blacks(truth, clean.layers.matte),
+        }
+
     found = {}
     for name, words in ROWS.items():
         jpeg = None if name == "grain" else coding
@@ -143,16 +155,14 @@ def measure(place: Place, subject: Subject, samples: int) -> dict[str, dict[str,
             look = replace(look, grain=None)
         picture = composite(again, photo, 2, look=look)
         shown = photo.encode(picture.image, picture.changed).astype(np.float32) / 255.0
-        errors = image_errors(shown, truth, regions)["box"]
-        found[name] = {
-            "rmse": errors["rmse"],
-            "flip": errors.get("flip", float("nan")),
-            "laplacian": laplacian(shown, clean.layers.matte) / detail,
-            "blacks": blacks(shown, clean.layers.matte) - blacks(truth, clean.layers.matte),
+        found[name] = errors(shown) | {
             "response": look.response.exponent if look.response else 1.0,
             "blur": look.blur.sigma if look.blur else float("nan"),
             "grain": 255.0 * look.grain.typical if look.grain else 0.0,
         }
+    other = replace(camera, noise=grain.draw(place.photo.shape[:2], int(rng.integers(2**31))))
+    perfect = composite(again, photo_of(place.photo), 2).layers.composite
+    found[TRUE] = errors(other.shoot(perfect))
     grey = codes_of(plain, LEVELS) - curve(1.0, LEVELS)
     found["camera"] = {
         "blur": blur,
@@ -187,15 +197,15 @@ def main() -> None:
         for subject in subjects:
             measured.append({"scene": subject.name, **measure(place, subject, options.samples)})
             print(subject.name, json.dumps({k: measured[-1][k] for k in ("camera", "auto")}))
-    print("row          RMSE    FLIP    Laplacian: median, within 25 %; blacks: off by, within 3")
-    for name in ROWS:
+    print("row           RMSE    FLIP    Laplacian: median, within 25 %; blacks: off by, within 3")
+    for name in (*ROWS, TRUE):
         rows = [m[name] for m in measured]
         mean = {key: float(np.nanmean([r[key] for r in rows])) for key in ("rmse", "flip")}
         ratio = np.array([r["laplacian"] for r in rows])
         within = float((np.abs(ratio - 1.0) < 0.25).mean())
         off = np.abs([r["blacks"] for r in rows])
         errors = f"{mean['rmse']:.4f}  {mean['flip']:.4f}  {np.median(ratio):.2f}  {within:.2f}"
-        print(f"{name:10s} {errors}  {off.mean():.1f}  {(off < 3.0).mean():.2f}")
+        print(f"{name:11s} {errors}  {off.mean():.1f}  {(off < 3.0).mean():.2f}")
     if options.json:
         options.json.write_text(json.dumps(measured, indent=1) + "\n", encoding="utf-8")
 
