@@ -595,3 +595,20 @@ def test_inputs_that_change_while_it_renders(
         }.items()
     }  # fmt: skip
     assert done.record["inputs"] == expected
+
+
+@pytest.mark.slow
+def test_camera_that_nothing_tells_is_estimated(inputs: Path, tmp_path: Path) -> None:
+    """From the photo to ``run.json`` and ``camera.json``; the same bytes a second time."""
+    nothing = {"fov": None, "pitch": None, "camera_height": None, "place": None}
+    first, second = (
+        go(arguments(inputs, tmp_path / name, **nothing), tmp_path / name) for name in ("a", "b")
+    )
+    numbers = first.record["measured"]["camera"]
+    assert {numbers[name]["source"] for name in ("pitch_deg", "vfov_deg")} == {"estimate"}
+    assert numbers["pitch_deg"]["sigma"] > 0.1
+    camera = read_camera(first.out / "camera.json", (WIDTH, HEIGHT))
+    assert camera.numbers()["pitch_deg"]["value"] == pytest.approx(numbers["pitch_deg"]["value"])
+    assert any("estimated from the photo" in line for line in first.record["assumed"])
+    for name in ("composite.png", "camera.json"):
+        assert (first.out / name).read_bytes() == (second.out / name).read_bytes()
