@@ -3,6 +3,7 @@
 import json
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -24,6 +25,7 @@ from warpir.calibration.network import (
     soften,
 )
 from warpir.calibration.photos import FirstPhoto
+from warpir.core.arrays import FloatArray
 from warpir.core.errors import ExitCode, InputError
 from warpir.scene.camera import camera_from_fov
 
@@ -227,15 +229,20 @@ def test_estimate_leaves_the_number_of_threads_as_it_was() -> None:
 
 def test_first_photo_of_a_size_stands_for_the_others(monkeypatch: pytest.MonkeyPatch) -> None:
     """One camera for a sequence; another size or focal length is another camera."""
-    asked = []
+    asked: list[tuple[tuple[int, ...], float | None]] = []
 
-    def estimate(photo: np.ndarray, vfov_deg: float | None) -> int:
+    def estimate(photo: FloatArray, vfov_deg: float | None) -> int:
         asked.append((photo.shape, vfov_deg))
         return len(asked)
 
     monkeypatch.setattr("warpir.calibration.photos.estimate_photo", estimate)
     first = FirstPhoto()
     small, large = np.zeros((4, 6, 3), np.float32), np.zeros((8, 12, 3), np.float32)
-    found = [first(small, None), first(small + 1.0, None), first(large, None), first(small, 40.0)]
+    found: list[Any] = [
+        first(small, None),
+        first(small + 1.0, None),
+        first(large, None),
+        first(small, 40.0),
+    ]
     assert found == [1, 1, 2, 3]
     assert asked == [((4, 6, 3), None), ((8, 12, 3), None), ((4, 6, 3), 40.0)]

@@ -511,10 +511,16 @@ def test_estimated_camera_that_is_right_gives_the_same_light(
     known, estimated = ROWS["regression"].of_place, ROWS["regression-estimated-camera"].of_place
     assert known is not None and estimated is not None
     vfov = np.degrees(2.0 * np.arctan(place.camera.height / 2.0 / place.camera.fy))
-    angles = {"pitch_deg": place.pitch, "roll_deg": 0.0, "vfov_deg": float(vfov)}
-    sigmas = {"pitch_sigma_deg": 1.0, "roll_sigma_deg": 1.0, "vfov_sigma_deg": 1.0}
     found = CameraEstimate(
-        **angles, **sigmas, principal=(0.5, 0.5), principal_sigma=(0.1, 0.1), witnesses=()
+        pitch_deg=place.pitch,
+        roll_deg=0.0,
+        vfov_deg=float(vfov),
+        principal=(0.5, 0.5),
+        pitch_sigma_deg=1.0,
+        roll_sigma_deg=1.0,
+        vfov_sigma_deg=1.0,
+        principal_sigma=(0.1, 0.1),
+        witnesses=(),
     )
     monkeypatch.setattr("warpir.evaluate.rows.estimate_camera", lambda *_: found)
     expected, seen = (as_map(row(bench, place).light, 32) for row in (known, estimated))

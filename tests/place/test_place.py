@@ -247,12 +247,14 @@ def test_page_starts_with_the_estimated_camera(
     inputs: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Its numbers, and that they are estimates; a camera that sees no ground gives way."""
-    values = {"pitch": -8.0, "roll": 3.0, "vfov": 40.0}
-    sigmas = {f"{name}_sigma_deg": 2.0 for name in values}
     found = CameraEstimate(
-        **{f"{name}_deg": value for name, value in values.items()},
-        **sigmas,
+        pitch_deg=-8.0,
+        roll_deg=3.0,
+        vfov_deg=40.0,
         principal=(0.5, 0.5),
+        pitch_sigma_deg=2.0,
+        roll_sigma_deg=2.0,
+        vfov_sigma_deg=2.0,
         principal_sigma=(0.1, 0.1),
         witnesses=("network",),
     )

@@ -109,7 +109,7 @@ class Camera:
         shares of width and height from the top left.
         """
         _, up, back = self.c2w[:3, :3].T
-        values = {
+        values: dict[str, Any] = {
             "pitch_deg": math.degrees(math.asin(float(np.clip(-back[1], -1.0, 1.0)))),
             "roll_deg": math.degrees(math.atan2(float(self.c2w[1, 0]), float(up[1]))),
             "vfov_deg": math.degrees(2.0 * math.atan(self.height / 2.0 / self.fy)),
