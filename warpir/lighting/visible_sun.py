@@ -54,9 +54,6 @@ over the flux of all other light, over places."""
 LOG_TOTAL, LOG_TOTAL_STD = 2.3, 0.6
 """Mean and standard deviation of the logarithm of the sum of both over the mean luminance of a
 photo that shows the sun, over photos."""
-DOUBT = 2.0
-"""Factor on the standard deviations of the regressor where a sun is in view: its suns are too weak
-and too wide there, more than it knows."""
 
 
 @dataclass(frozen=True)
@@ -266,7 +263,7 @@ def with_sun(
 
 
 def _weighed(own: float, variance: float, usual: float, usual_std: float) -> tuple[float, float]:
-    """Return mean and deviation of a logarithm by two witnesses, the regressor's doubted.
+    """Return mean and deviation of a logarithm by two witnesses.
 
     Args:
         own: The regressor's.
@@ -274,5 +271,5 @@ def _weighed(own: float, variance: float, usual: float, usual_std: float) -> tup
         usual: That of suns in view.
         usual_std: Its deviation.
     """
-    by_own, by_usual = 1.0 / (DOUBT**2 * variance), usual_std**-2
+    by_own, by_usual = 1.0 / variance, usual_std**-2
     return (by_own * own + by_usual * usual) / (by_own + by_usual), (by_own + by_usual) ** -0.5
