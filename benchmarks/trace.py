@@ -12,17 +12,13 @@ import warp as wp
 
 from benchmarks.measure import context, flags, report, seconds
 from warpir.io.assets import load_asset
-from warpir.kernels.frame import basis, to_world
-from warpir.kernels.rng import hash_pair, pixel_seed, sobol_pair
+from warpir.kernels.maths.frame import basis, to_world
+from warpir.kernels.maths.rng import hash_pair, pixel_seed, sobol_pair
+from warpir.kernels.receiver_mesh import INFINITY
 from warpir.kernels.sampling import cosine_sample
-from warpir.kernels.trace import (
-    INFINITY,
-    camera_ray,
-    closest_hit,
-    offset_origin,
-    surface_at,
-    visibility,
-)
+from warpir.kernels.tracing.hit import offset_origin
+from warpir.kernels.tracing.ray import camera_ray, closest_hit, visibility
+from warpir.kernels.tracing.surface import surface_at
 from warpir.kernels.types import CameraArgs, MaterialArgs, MeshArgs, TextureArgs
 from warpir.render.device import Rows, choose_device
 from warpir.render.device_scene import Placed, Receiver, Scene

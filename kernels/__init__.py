@@ -7,10 +7,10 @@ Frames and units
     their support.
 
 Two kinds of files
-    *Detached* files (``trace``, ``path``, ``receiver``, ``transport``) trace rays and draw samples,
-    with no backward pass; ``light_gradient`` is one, written down. *Attached* files (``shade``,
-    ``shadow_ratio``, ``composite``) evaluate what those samples see and are differentiated by
-    Warp.
+    *Detached* files (``path``, ``receiver``, ``tracing``, ``transport``) trace rays and draw
+    samples, with no backward pass; ``light_gradient`` is one, written down. *Attached* files
+    (``shade``, ``shadow_ratio``, ``composite``) evaluate what those samples see and are
+    differentiated by Warp.
 
 Rules that Warp 1.19 does not enforce, and that give silently wrong gradients when broken
     A func or kernel with a loop ends in its raw sums; only ``+=`` is carried between iterations; no

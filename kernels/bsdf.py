@@ -20,7 +20,7 @@ Normals with Spherical Caps").
 
 import warp as wp
 
-from warpir.kernels.frame import basis, to_local, to_world
+from warpir.kernels.maths.frame import basis, to_local, to_world
 from warpir.kernels.sampling import cosine_sample
 from warpir.kernels.types import Layers
 

@@ -7,7 +7,7 @@ no ray, no tape. Detached: it *is* the backward pass.
 
 import warp as wp
 
-from warpir.kernels.latlong import bilinear_tap, direction_to_uv
+from warpir.kernels.maths.latlong import bilinear_tap, direction_to_uv
 from warpir.kernels.types import LightRecord
 
 wp.set_module_options({"enable_backward": False})

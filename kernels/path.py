@@ -10,9 +10,9 @@ from functools import cache
 
 import warp as wp
 
-from warpir.kernels.frame import basis
 from warpir.kernels.light_gradient import keep_direction
-from warpir.kernels.rng import hash_pair, pixel_seed, sobol_pair
+from warpir.kernels.maths.frame import basis
+from warpir.kernels.maths.rng import hash_pair, pixel_seed, sobol_pair
 from warpir.kernels.sampling import light_eval
 from warpir.kernels.scatter import (
     BsdfSample,
@@ -22,7 +22,9 @@ from warpir.kernels.scatter import (
     sample_emitter,
     surface_bsdf,
 )
-from warpir.kernels.trace import Hit, Surface, camera_hit, camera_ray, surface_at
+from warpir.kernels.tracing.hit import Hit
+from warpir.kernels.tracing.ray import camera_hit, camera_ray
+from warpir.kernels.tracing.surface import Surface, surface_at
 from warpir.kernels.types import (
     CameraArgs,
     LightArgs,

@@ -9,28 +9,23 @@ the object can take away only what is left, so shadows do not double. Detached.
 
 import warp as wp
 
-from warpir.kernels.frame import basis, to_world
 from warpir.kernels.light_gradient import keep_direction
+from warpir.kernels.maths.frame import basis, to_world
+from warpir.kernels.maths.rng import hash_pair, pixel_seed, sobol_pair
 from warpir.kernels.receiver_mesh import (
     plane_distance,
     receiver_mesh_hit,
     receiver_radiance,
     receiver_visibility,
 )
-from warpir.kernels.rng import hash_pair, pixel_seed, sobol_pair
 from warpir.kernels.sampling import (
     cosine_sample,
     light_eval,
     light_sample,
     power_heuristic,
 )
-from warpir.kernels.trace import (
-    camera_hit,
-    camera_ray,
-    closest_hit,
-    offset_origin,
-    visibility,
-)
+from warpir.kernels.tracing.hit import offset_origin
+from warpir.kernels.tracing.ray import camera_hit, camera_ray, closest_hit, visibility
 from warpir.kernels.types import (
     CameraArgs,
     LightArgs,

@@ -2,15 +2,15 @@
 
 import warp as wp
 
-from warpir.kernels.frame import basis, to_world
-from warpir.kernels.latlong import (
+from warpir.kernels.maths.frame import basis, to_world
+from warpir.kernels.maths.latlong import (
     bilinear_tap,
     direction_to_uv,
     map_radiance,
     map_scalar,
     uv_to_direction,
 )
-from warpir.kernels.sg import sg_shape
+from warpir.kernels.maths.sg import sg_shape
 from warpir.kernels.types import LightArgs
 
 PI = wp.constant(3.14159265358979)

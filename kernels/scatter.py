@@ -9,10 +9,12 @@ both the shading and the geometric surface. Detached: no backward pass.
 import warp as wp
 
 from warpir.kernels.bsdf import Bsdf, BsdfValue, bsdf_f, bsdf_of, bsdf_sample
-from warpir.kernels.frame import Frame, to_local, to_world
+from warpir.kernels.maths.frame import Frame, to_local, to_world
 from warpir.kernels.receiver_mesh import receiver_mesh_hit, receiver_radiance, receiver_visibility
 from warpir.kernels.sampling import light_eval, light_sample, power_heuristic
-from warpir.kernels.trace import Hit, Surface, closest_hit, offset_origin, visibility
+from warpir.kernels.tracing.hit import Hit, offset_origin
+from warpir.kernels.tracing.ray import closest_hit, visibility
+from warpir.kernels.tracing.surface import Surface
 from warpir.kernels.types import LightArgs, MaterialArgs, MeshArgs, ReceiverArgs, TextureArgs
 
 wp.set_module_options({"enable_backward": False})

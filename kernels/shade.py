@@ -9,7 +9,7 @@ does not replay what a loop multiplies.
 import warp as wp
 
 from warpir.kernels.bsdf import bsdf_f, bsdf_of
-from warpir.kernels.frame import basis, to_local
+from warpir.kernels.maths.frame import basis, to_local
 from warpir.kernels.types import Layers, VertexRecord
 
 

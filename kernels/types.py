@@ -107,7 +107,7 @@ class Layers:
     """Factor on the coat's lobe, its Fresnel term included [1]."""
     coat_roughness: float
     coat_n: wp.vec3
-    """Unit normal of the coat, in the shading normal's frame (`warpir.kernels.frame.basis`)."""
+    """Unit normal of the coat, in the shading normal's frame (`maths.frame.basis`)."""
 
 
 @wp.struct
@@ -132,7 +132,7 @@ class Extensions:
 
 @wp.struct
 class MaterialArgs:
-    """Material factors and texture slots; `warpir.kernels.trace` numbers the slots."""
+    """Material factors and texture slots; `warpir.kernels.tracing.texture` numbers the slots."""
 
     base_color: wp.array[wp.vec3]
     metallic: wp.array[float]

@@ -132,9 +132,11 @@ def test_layers_have_no_cycle() -> None:
 
 def test_layers_rooms_are_small_and_say_what_they_are() -> None:
     """At most a dozen modules a folder, and a head that says what is inside and what it ignores."""
-    for folder in {path.parent for path in sources("warpir", "diffusion")}:
+    installed = {path.parent for path in sources("warpir", "diffusion", "kernels")}
+    for folder in installed | {path.parent for path in sources("benchmarks", "tests/builders")}:
         modules = [p for p in folder.glob("*.py") if not p.stem.startswith("__")]
         assert len(modules) <= 12, f"{folder.name}: {len(modules)} modules"
+    for folder in installed:
         assert ast.get_docstring(ast.parse((folder / "__init__.py").read_text())), folder
     assert {p.stem for p in (ROOT / "warpir").glob("*.py")} == {
         *("__init__", "__main__", "insert", "check_model"),

@@ -26,7 +26,7 @@ from benchmarks.stability.case import (
 from tests import oracles as o
 from tests.builders.shapes import all_pixels, camera, constant, ground, placed, quad
 from warpir.kernels.bsdf import bsdf_f, bsdf_of, bsdf_sample
-from warpir.kernels.frame import basis
+from warpir.kernels.maths.frame import basis
 from warpir.kernels.types import Layers
 from warpir.render.device_light import light_args
 from warpir.render.device_scene import Scene

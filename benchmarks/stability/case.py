@@ -12,7 +12,6 @@ from numpy.typing import ArrayLike
 from warpir.core.arrays import Float64Array
 
 MAX_RELATIVE = "max relative"
-RMS_RELATIVE = "RMS relative"
 MAX_ABSOLUTE = "max absolute"
 RELATIVE = "relative"
 SHARE = "share"

@@ -21,7 +21,8 @@ from benchmarks.stability.case import (
 )
 from tests import oracles as o
 from tests.builders.shapes import camera, ground, placed, quad, sphere
-from warpir.kernels.trace import closest_hit, face_normal, hit_position, offset_origin, visibility
+from warpir.kernels.tracing.hit import face_normal, hit_position, offset_origin
+from warpir.kernels.tracing.ray import closest_hit, visibility
 from warpir.kernels.types import MaterialArgs, MeshArgs, TextureArgs
 from warpir.render.device_scene import Scene
 from warpir.scene.asset import Material, Primitive

@@ -382,7 +382,7 @@ def test_tracing_in_halves_is_the_same(
 ) -> None:
     """Rows of light transport, traced in two halves: equal to the bit where sums have an order."""
     expected = transported(device)
-    kernel = getattr(transport_rows.kernels, name)
+    kernel = getattr(transport_rows, name)
     failing(monkeypatch, Renderer, "launch", 1, warp_short, lambda *args: args[1] is kernel)
     found = transported(device)
     assert found.renderer.memory.retries == {transport_rows.TRACING: 1}

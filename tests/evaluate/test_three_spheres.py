@@ -26,7 +26,6 @@ from warpir.evaluate.three_spheres import (
     rmse,
     si_rmse,
     sphere_errors,
-    to_camera_frame,
 )
 from warpir.scene.light import angles_from_axis, axis_from_angles
 
@@ -314,19 +313,15 @@ def brightest(texels: np.ndarray) -> np.ndarray:
 
 
 @pytest.mark.parametrize("azimuth", [90.0, -45.0, 180.0])
-def test_camera_frame_has_the_view_straight_ahead(azimuth: float) -> None:
-    """Whole columns are moved exactly, and back; what is to the right comes to +X."""
-    world = with_sun(azimuth + 10.0, 12.0, 5.0)
-    camera = to_camera_frame(world, azimuth)
-    before, elevation = angles_from_axis(brightest(world))
-    after, same = angles_from_axis(brightest(camera))
-    assert (before - after - azimuth + 180.0) % 360.0 - 180.0 == pytest.approx(0.0, abs=1e-9)
+def test_what_is_straight_ahead_is_seen_at_the_cameras_azimuth(azimuth: float) -> None:
+    """Whole columns are moved exactly, by the azimuth of the camera; elevations stay."""
+    camera = with_sun(10.0, 12.0, 5.0)
+    world = from_camera_frame(camera, azimuth)
+    before, elevation = angles_from_axis(brightest(camera))
+    after, same = angles_from_axis(brightest(world))
+    assert (after - before - azimuth + 180.0) % 360.0 - 180.0 == pytest.approx(0.0, abs=1e-9)
     assert same == pytest.approx(elevation, abs=1e-9)
-    assert after == pytest.approx(10.0, abs=1.0)
     assert np.array_equal(np.sort(camera, axis=1), np.sort(world, axis=1))
-    assert np.array_equal(from_camera_frame(camera, azimuth), world)
-    right = to_camera_frame(with_sun(azimuth + 90.0, 0.0, 5.0), azimuth)
-    assert brightest(right)[0] > 0.99
 
 
 def test_errors_depend_on_direction_in_the_camera_frame() -> None:

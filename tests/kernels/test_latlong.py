@@ -5,12 +5,11 @@ import pytest
 import warp as wp
 
 from tests import oracles as o
-from warpir.kernels.latlong import (
+from warpir.kernels.maths.latlong import (
     bilinear_tap,
     direction_to_uv,
     map_radiance,
     map_scalar,
-    texel_solid_angle,
     uv_to_direction,
 )
 
@@ -34,12 +33,6 @@ def uv_kernel(d: wp.array[wp.vec3], uv: wp.array[wp.vec2]):
 def direction_kernel(uv: wp.array[wp.vec2], d: wp.array[wp.vec3]):
     i = wp.tid()
     d[i] = uv_to_direction(uv[i][0], uv[i][1])
-
-
-@wp.kernel
-def solid_angle_kernel(height: int, width: int, d_omega: wp.array[float]):
-    i = wp.tid()
-    d_omega[i] = texel_solid_angle(i, height, width)
 
 
 @wp.kernel
@@ -128,18 +121,6 @@ def test_latlong_round_trip(device: str, rng: np.random.Generator) -> None:
     """``direction(uv(d)) = d`` for every direction."""
     d = o.normalize(rng.normal(size=(20000, 3)))
     assert np.abs(to_direction(to_uv(d, device), device) - d).max() < 3 * DIRECTION_ABS
-
-
-@pytest.mark.parametrize("height, width", [(1, 1), (2, 4), (128, 256), (2048, 4096)])
-def test_texel_solid_angle(device: str, height: int, width: int) -> None:
-    """Solid angles match the formula at the poles too, and sum to 4 pi (method 2.0)."""
-    out = wp.zeros(height, dtype=float, device=device)
-    wp.launch(solid_angle_kernel, height, inputs=[height, width], outputs=[out], device=device)
-    d_omega = out.numpy().astype(np.float64)
-    # At the last row the sine is taken next to pi, where one ulp of the angle is 2.4e-7.
-    row_angle = 0.5 * np.pi / height
-    assert d_omega == pytest.approx(o.texel_solid_angle(height, width), rel=1e-5 + 5e-7 / row_angle)
-    assert d_omega.sum() * width == pytest.approx(4 * np.pi, rel=1e-5)
 
 
 MAP_SIZES = [(1, 1), (1, 2), (2, 1), (3, 2), (16, 32), (128, 256)]

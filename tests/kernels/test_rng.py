@@ -6,7 +6,7 @@ import warp as wp
 from scipy import stats
 
 from tests.statistics import SIGNIFICANCE, chi_square_counts, sidak
-from warpir.kernels.rng import pixel_seed, sobol_pair
+from warpir.kernels.maths.rng import pixel_seed, sobol_pair
 
 SEED_COUNT = 1 << 15
 """Independent scrambles of a uniformity test; 128 expected in each of 16 x 16 cells."""

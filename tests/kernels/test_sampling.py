@@ -7,7 +7,7 @@ import warp as wp
 from benchmarks.stability.maps import eval_kernel, sample_kernel
 from tests import oracles as o
 from tests.statistics import ChiSquare, chi_square, graded_edges
-from warpir.kernels.frame import basis, to_local, to_world
+from warpir.kernels.maths.frame import basis, to_local, to_world
 from warpir.kernels.sampling import (
     cosine_sample,
     lobe_sample,

@@ -5,7 +5,7 @@ import pytest
 import warp as wp
 
 from tests import oracles as o
-from warpir.kernels.sg import sg_shape
+from warpir.kernels.maths.sg import sg_shape
 
 VALUE_RTOL = 1e-4
 """float32, few operations; the exponent is at most 20 where it is compared."""

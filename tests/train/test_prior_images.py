@@ -10,7 +10,7 @@ import warp as wp
 
 from warpir.core.latlong import map_directions, texel_solid_angles
 from warpir.diffusion.models.embedded_words import KINDS, NOUNS
-from warpir.kernels import training_scene as kernel
+from warpir.kernels.training.scene import BOX, CYLINDER, ELLIPSOID
 from warpir.lighting.latlong_tensors import luminance, shrunk, solid_angles
 from warpir.lighting.regression import estimate_shading_light
 from warpir.lighting.regressor import random_regressor
@@ -212,7 +212,7 @@ def test_solids_block_the_sun(device: str) -> None:
         "albedo": torch.ones(count, SOLIDS, 3, device=device),
         "texture": torch.full((count, SOLIDS), -1, dtype=torch.int32, device=device),
     }
-    solids["kind"][:, 3] = torch.tensor([kernel.BOX, kernel.ELLIPSOID, kernel.CYLINDER])
+    solids["kind"][:, 3] = torch.tensor([BOX, ELLIPSOID, CYLINDER])
     solids["centre"][:, 3, 1] = 5.0
     solids = packed_solids(solids)
     assert solids["count"].tolist() == [1] * count

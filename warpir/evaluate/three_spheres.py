@@ -86,18 +86,13 @@ MATERIALS = {
 }
 
 
-def to_camera_frame(texels: FloatArray, azimuth_deg: float) -> FloatArray:
-    """Turn a map from the world frame into the camera-yaw frame; exact for whole columns.
+def from_camera_frame(texels: FloatArray, azimuth_deg: float) -> FloatArray:
+    """Turn a map from the camera-yaw frame into the world frame; exact for whole columns.
 
     Args:
         texels: Radiance, lat-long, shape [He, 2 He, 3].
         azimuth_deg: Azimuth of the camera, clockwise from -Z seen from above [deg].
     """
-    return rotate_map(texels, azimuth_deg)
-
-
-def from_camera_frame(texels: FloatArray, azimuth_deg: float) -> FloatArray:
-    """Turn a map from the camera-yaw frame into the world frame: undo `to_camera_frame`."""
     return rotate_map(texels, -azimuth_deg)
 
 

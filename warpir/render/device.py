@@ -27,7 +27,7 @@ from warpir.kernels.composite import tone_foreground
 from warpir.kernels.path import foreground_kernel
 from warpir.kernels.receiver import trace_receiver
 from warpir.kernels.shadow_ratio import shadow_ratio
-from warpir.kernels.trace import trace_gbuffer
+from warpir.kernels.tracing.gbuffer import trace_gbuffer
 
 SAMPLES_PER_SLICE = 1 << 16
 """CPU work of one launch; keeps launches under half a second, so that Ctrl-C is answered."""

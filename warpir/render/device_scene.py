@@ -36,7 +36,7 @@ SLOTS = (
     "specular", "specular_color", "clearcoat", "clearcoat_roughness", "clearcoat_normal",
     "sheen_color", "sheen_roughness", "transmission",
 )  # fmt: skip
-"""Texture slots in the order of `warpir.kernels.trace`."""
+"""Texture slots in the order of `warpir.kernels.tracing.texture`."""
 WRAP_MODES = {"repeat": 0, "clamp": 1, "mirror": 2}
 
 
@@ -199,7 +199,6 @@ class Scene:
         self.origin: Float64Array = 0.5 * (low + high)
         self.diagonal = float(np.linalg.norm(high - low))
         self.triangle_count = sum(len(v.indices) for v, _ in parts)
-        self.material_names = [m.name for m, _ in materials]
 
         self._upload_mesh(parts)
         self._upload_materials(materials)

@@ -33,10 +33,7 @@ class Radiance:
 
 
 class Integrator(Protocol):
-    """Light transport for one scene and view."""
-
-    differentiates: frozenset[str]
-    """Differentiable inputs: some of ``light``, ``material``, ``emission``."""
+    """Light transport for one scene and view; each states in which inputs it is differentiable."""
 
     def radiance(
         self,

@@ -32,8 +32,6 @@ class MisIntegrator:
         depth: Surface interactions of the object's paths.
     """
 
-    differentiates = frozenset({"light", "material", "emission"})
-
     def __init__(
         self,
         renderer: Renderer,

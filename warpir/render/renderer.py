@@ -21,7 +21,7 @@ from warpir.kernels.composite import tone_foreground, tone_shadow
 from warpir.kernels.path import foreground_kernel
 from warpir.kernels.receiver import trace_receiver
 from warpir.kernels.shadow_ratio import shadow_ratio
-from warpir.kernels.trace import trace_gbuffer
+from warpir.kernels.tracing.gbuffer import trace_gbuffer
 from warpir.kernels.types import CameraArgs, LightArgs, LightRecord, MaterialArgs, VertexRecord
 from warpir.render.bad_pixels import BadPixels, all_finite, first_bad_sample_of
 from warpir.render.device import Launcher, Rows

@@ -69,8 +69,6 @@ class TransportIntegrator:
         InputError: The rows need more memory than the settings allow.
     """
 
-    differentiates = frozenset({"light"})
-
     def __init__(
         self,
         renderer: Renderer,

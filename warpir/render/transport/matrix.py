@@ -25,7 +25,6 @@ class SparseRows:
     """Memory of one entry, value and int32 index, in both copies [byte]."""
 
     def __init__(self, row: Tensor, column: Tensor, values: Tensor, shape: tuple[int, int]) -> None:
-        self.entry_count = values.numel()
         self.by_row = _csr(row, column, values, shape)
         if values.is_cuda and torch.are_deterministic_algorithms_enabled():
             # cuSPARSE adds a row's parts in any order, and torch does not say so.

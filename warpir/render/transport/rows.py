@@ -12,7 +12,19 @@ import warp as wp
 from warpir.core.arrays import FloatArray, IntArray
 from warpir.core.color import luminance
 from warpir.core.latlong import texel_solid_angles
-from warpir.kernels import transport as kernels
+from warpir.kernels.transport.foreground import (
+    SurfacePoints,
+    trace_direct,
+    trace_paths,
+    trace_points,
+)
+from warpir.kernels.transport.receiver import (
+    trace_blocked,
+    trace_bounced,
+    trace_received,
+    trace_receiver_points,
+)
+from warpir.kernels.transport.texels import TexelArgs
 from warpir.kernels.types import Layers, LightArgs
 from warpir.render.device import Rows
 from warpir.render.device_light import light_args
@@ -79,7 +91,7 @@ class _ObjectTrace:
     """Arguments of tracing the object's rows that all rows share."""
 
     renderer: Renderer
-    texels: kernels.TexelArgs
+    texels: TexelArgs
     proposal: LightArgs
     """Proposal of light directions at later vertices."""
     depth: int
@@ -96,7 +108,7 @@ class _ObjectTrace:
         T = wp.zeros((len(pixels), texel_count), dtype=wp.vec3, device=renderer.device)
         launched = Rows(renderer.upload(pixels, wp.int32))
         renderer.launch(
-            kernels.trace_direct,
+            trace_direct,
             len(pixels),
             [launched, Rows(points), *geometry, texels, subsamples, paths, seed, Rows(T)],
             self.direction_count,
@@ -109,7 +121,7 @@ class _ObjectTrace:
             counts = (subsamples, first, paths, self.depth, seed)
             outputs = (Rows(T), Rows(emission))
             renderer.launch(
-                kernels.trace_paths,
+                trace_paths,
                 len(pixels),
                 [launched, Rows(points), *geometry, texels, self.proposal, *counts, *outputs],
                 step * self.depth,
@@ -188,10 +200,10 @@ def _groups(
 
 def _surface_points(
     renderer: Renderer, pixels: IntArray, subsamples: int, seed: int
-) -> tuple[kernels.SurfacePoints, wp.array]:
+) -> tuple[SurfacePoints, wp.array]:
     """Trace the surface points of each pixel and its mean emitted radiance."""
     scene, device, count = renderer.scene, renderer.device, len(pixels)
-    points = kernels.SurfacePoints()
+    points = SurfacePoints()
     points.count = wp.zeros(count, dtype=int, device=device)
     for name in ("position", "ng", "n", "wo", "base_color"):
         setattr(points, name, wp.empty((count, subsamples), dtype=wp.vec3, device=device))
@@ -201,7 +213,7 @@ def _surface_points(
     points.layers = wp.empty((count, columns), dtype=Layers, device=device)
     emission = wp.zeros(count, dtype=wp.vec3, device=device)
     renderer.launch(
-        kernels.trace_points,
+        trace_points,
         count,
         [
             Rows(wp.array(pixels, dtype=wp.int32, device=device)),
@@ -247,7 +259,7 @@ def _receiver_points(
         *(Rows(wp.zeros(count, dtype=float, device=device)) for _ in range(2)),
     )
     renderer.launch(
-        kernels.trace_receiver_points,
+        trace_receiver_points,
         count,
         [
             points.pixels,
@@ -298,7 +310,7 @@ def plane_rows(
         )
         blocked = wp.zeros((last - first, len(columns)), dtype=float, device=device)
         renderer.launch(
-            kernels.trace_blocked,
+            trace_blocked,
             last - first,
             [
                 points.pixels,
@@ -381,7 +393,7 @@ def mesh_rows(
             wp.zeros((count, texel_count), dtype=float, device=device) for _ in range(2)
         )
         renderer.launch(
-            kernels.trace_received,
+            trace_received,
             count,
             [*seen, texels, seed, Rows(received), Rows(blocked)],
             int(counts.sum()),
@@ -390,7 +402,7 @@ def mesh_rows(
         )
         bounced, kept = (wp.zeros(count, dtype=wp.vec3, device=device) for _ in range(2))
         renderer.launch(
-            kernels.trace_bounced,
+            trace_bounced,
             count,
             [*seen, settings.paths, seed, Rows(bounced), Rows(kept)],
             settings.paths,

@@ -10,7 +10,7 @@ import warp as wp
 from warpir.core.arrays import Float64Array, FloatArray, IntArray
 from warpir.core.color import luminance
 from warpir.core.latlong import map_directions, texel_solid_angles
-from warpir.kernels import transport as kernels
+from warpir.kernels.transport.texels import TENT_REACH, TexelArgs
 from warpir.render.renderer import Renderer
 
 LANES = 256
@@ -100,13 +100,13 @@ def texel_args(
     renderer: Renderer,
     columns: IntArray,
     normal: Float64Array | None = None,
-) -> kernels.TexelArgs:
+) -> TexelArgs:
     """Describe a map's texels; directions follow the cosine with ``normal`` where it is given.
 
     ``columns`` are the texels that the rows hold.
     """
     device = renderer.device
-    args = kernels.TexelArgs()
+    args = TexelArgs()
     args.height, args.width = height, 2 * height
     step = np.pi / height
     rows = np.arange(height)
@@ -116,7 +116,7 @@ def texel_args(
     centres = map_directions(height, 2 * height)
     if normal is not None:
         angle = np.arccos(np.clip(centres @ normal, -1.0, 1.0))
-        bound *= np.cos(np.clip(angle - kernels.TENT_REACH * step, 0.0, 0.5 * np.pi))
+        bound *= np.cos(np.clip(angle - TENT_REACH * step, 0.0, 0.5 * np.pi))
     for name, values in (("d_omega", tent_solid_angles(height)), ("bound", bound.reshape(-1))):
         setattr(args, name, wp.array(values.astype(np.float32), dtype=float, device=device))
     args.direction_count = wp.array(counts, dtype=int, device=device)

@@ -12,7 +12,16 @@ import warp as wp
 from torch import Tensor
 
 from warpir.diffusion.models.embedded_words import NOUNS
-from warpir.kernels import training_scene as kernel
+from warpir.kernels.training.render import Pixels, render_scenes
+from warpir.kernels.training.render import sun_reaches as sun_reaches_kernel
+from warpir.kernels.training.scene import (
+    GroundTable,
+    LightTable,
+    MapTable,
+    ObjectTable,
+    OccluderTable,
+    ViewTable,
+)
 from warpir.train.lights import LightPool
 from warpir.train.meshes import TrainingMesh
 from warpir.train.scenes.layout import Stands, rays_in
@@ -118,9 +127,9 @@ def sun_reaches(stock: Stock, solids: dict[str, Tensor], point: Tensor, axis: Te
     """Return 1 where no solid stands between the points and the sun, else 0, shape [B]."""
     reached = torch.empty(len(point), device=point.device)
     wp.launch(
-        kernel.sun_reaches,
+        sun_reaches_kernel,
         dim=len(point),
-        inputs=[_struct(kernel.OccluderTable, solids), _vectors(point), _vectors(axis)],
+        inputs=[_struct(OccluderTable, solids), _vectors(point), _vectors(axis)],
         outputs=[wp.from_torch(reached)],
         device=stock.device,
     )
@@ -153,7 +162,7 @@ def render(
     planes |= {name: torch.empty(pixels, device=device) for name in ("coverage", "solid")}
     lights = [
         _struct(
-            kernel.LightTable,
+            LightTable,
             tables[name]
             | {"map": x.map, "yaw": x.yaw, "mirror": x.mirror, "gain": x.gain}
             | {"sun_axis": x.axis, "sun": x.sun, "sun_sigma": x.sigma},
@@ -164,18 +173,18 @@ def render(
     if not with_object:
         objects = objects | {"mesh": torch.zeros_like(objects["mesh"])}
     wp.launch(
-        kernel.render_scenes,
+        render_scenes,
         dim=pixels,
         inputs=[
             width, height, side, wp.from_torch(tables["blur_min"]),
-            _struct(kernel.ViewTable, tables["views"] | {"window": window.contiguous()}),
+            _struct(ViewTable, tables["views"] | {"window": window.contiguous()}),
             *lights,
-            _struct(kernel.MapTable, tables["maps"]),
-            _struct(kernel.OccluderTable, tables["solids"]),
-            _struct(kernel.GroundTable, tables["ground"]),
-            _struct(kernel.ObjectTable, objects),
+            _struct(MapTable, tables["maps"]),
+            _struct(OccluderTable, tables["solids"]),
+            _struct(GroundTable, tables["ground"]),
+            _struct(ObjectTable, objects),
         ],
-        outputs=[_struct(kernel.Pixels, planes)],
+        outputs=[_struct(Pixels, planes)],
         device=stock.device,
     )  # fmt: skip
 

@@ -29,17 +29,6 @@ def uv_to_direction(u: float, v: float) -> wp.vec3:
     return wp.vec3(wp.sin(lon) * s, wp.cos(theta), wp.cos(lon) * s)
 
 
-@wp.func
-def texel_solid_angle(i: int, height: int, width: int) -> float:
-    """Return the solid angle of a texel in row ``i`` [sr]; all texels sum to 4 pi.
-
-    ``(2 pi / W)(cos(pi i / H) - cos(pi (i + 1) / H))``, as a product that keeps small differences.
-    """
-    middle = PI * (float(i) + 0.5) / float(height)
-    half = 0.5 * PI / float(height)
-    return (2.0 * PI / float(width)) * 2.0 * wp.sin(middle) * wp.sin(half)
-
-
 @wp.struct
 class BilinearTap:
     """The four texels around a direction and their weights."""

@@ -1,0 +1,1 @@
+"""Mathematics that knows no scene: frames, lat-long maps, random numbers, spherical Gaussians."""

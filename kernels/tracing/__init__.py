@@ -1,0 +1,1 @@
+"""Rays against the object's mesh, its textures, and surfaces at hits."""

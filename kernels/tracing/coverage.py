@@ -1,0 +1,127 @@
+"""What stops a ray at a hit: opacity, masks, and light that passes a thin wall."""
+
+import warp as wp
+
+from warpir.kernels.bsdf import F0_COAT, luminance, schlick
+from warpir.kernels.tracing.hit import Hit
+from warpir.kernels.tracing.texture import (
+    SLOT_BASE_COLOR,
+    SLOT_CLEARCOAT,
+    SLOT_CLEARCOAT_NORMAL,
+    SLOT_CLEARCOAT_ROUGHNESS,
+    SLOT_METALLIC_ROUGHNESS,
+    SLOT_SHEEN_COLOR,
+    SLOT_SHEEN_ROUGHNESS,
+    SLOT_SPECULAR,
+    SLOT_SPECULAR_COLOR,
+    sample_texture,
+    slot_uv,
+)
+from warpir.kernels.types import Extensions, MaterialArgs, MeshArgs, TextureArgs
+
+
+@wp.func
+def hit_coverage(mesh: MeshArgs, material: MaterialArgs, texture: TextureArgs, hit: Hit) -> float:
+    """Return the coverage at a hit: 1 for opaque materials, 0 or 1 for masked ones."""
+    m = mesh.face_material[hit.face]
+    if material.alpha_mode[m] == 0:
+        return 1.0
+    a = mesh.colors[mesh.indices[3 * hit.face]][3]
+    b = mesh.colors[mesh.indices[3 * hit.face + 1]][3]
+    c = mesh.colors[mesh.indices[3 * hit.face + 2]][3]
+    # Written so that equal corners give exactly their value: the cutoff compares with it.
+    alpha = material.alpha[m] * (c + (a - c) * hit.u + (b - c) * hit.v)
+    k = material.slot_texture[m, SLOT_BASE_COLOR]
+    if k >= 0:
+        uv = slot_uv(mesh, material, m, SLOT_BASE_COLOR, hit)
+        alpha = alpha * sample_texture(texture, k, uv, 0)[3]
+    if material.alpha_mode[m] == 1:
+        if alpha >= material.alpha_cutoff[m]:
+            return 1.0
+        return 0.0
+    return wp.clamp(alpha, 0.0, 1.0)
+
+
+@wp.func
+def extensions_at(
+    mesh: MeshArgs, material: MaterialArgs, texture: TextureArgs, m: int, hit: Hit
+) -> Extensions:
+    """Read the extensions of material ``m`` at a hit."""
+    e = material.extensions[m]
+    # In a loop: eight inlined lookups slow down scenes that need none of them.
+    for slot in range(SLOT_SPECULAR, material.slot_texture.shape[1]):
+        k = material.slot_texture[m, slot]
+        if k >= 0 and slot != SLOT_CLEARCOAT_NORMAL:
+            is_color = int(0)
+            if slot == SLOT_SPECULAR_COLOR or slot == SLOT_SHEEN_COLOR:
+                is_color = 1
+            uv = slot_uv(mesh, material, m, slot, hit)
+            code = sample_texture(texture, k, uv, is_color)
+            color = wp.vec3(code[0], code[1], code[2])
+            if slot == SLOT_SPECULAR:
+                e.specular = e.specular * code[3]
+            elif slot == SLOT_SPECULAR_COLOR:
+                e.f0 = wp.cw_mul(e.f0, color)
+            elif slot == SLOT_CLEARCOAT:
+                e.clearcoat = e.clearcoat * code[0]
+            elif slot == SLOT_CLEARCOAT_ROUGHNESS:
+                e.clearcoat_roughness = e.clearcoat_roughness * code[1]
+            elif slot == SLOT_SHEEN_COLOR:
+                e.sheen_color = wp.cw_mul(e.sheen_color, color)
+            elif slot == SLOT_SHEEN_ROUGHNESS:
+                e.sheen_roughness = e.sheen_roughness * code[3]
+            else:
+                e.transmission = e.transmission * code[0]
+    return e
+
+
+@wp.func
+def transmitted_share(
+    mesh: MeshArgs,
+    material: MaterialArgs,
+    texture: TextureArgs,
+    m: int,
+    hit: Hit,
+    direction: wp.vec3,
+) -> float:
+    """Return the share of light that passes a thin transmissive wall straight on.
+
+    KHR_materials_transmission for a surface of roughness 0, its tint reduced to luminance: what
+    coat and dielectric do not reflect, times the base colour. The angle is that with the
+    interpolated normal, so that rays need not read normal maps.
+    """
+    e = extensions_at(mesh, material, texture, m, hit)
+    a = mesh.indices[3 * hit.face]
+    b = mesh.indices[3 * hit.face + 1]
+    c = mesh.indices[3 * hit.face + 2]
+    w = 1.0 - hit.u - hit.v
+    n = mesh.normals[a] * hit.u + mesh.normals[b] * hit.v + mesh.normals[c] * w
+    vertex = mesh.colors[a] * hit.u + mesh.colors[b] * hit.v + mesh.colors[c] * w
+    tint = wp.cw_mul(material.base_color[m], wp.vec3(vertex[0], vertex[1], vertex[2]))
+    k = material.slot_texture[m, SLOT_BASE_COLOR]
+    if k >= 0:
+        code = sample_texture(texture, k, slot_uv(mesh, material, m, SLOT_BASE_COLOR, hit), 1)
+        tint = wp.cw_mul(tint, wp.vec3(code[0], code[1], code[2]))
+    metallic = material.metallic[m]
+    k = material.slot_texture[m, SLOT_METALLIC_ROUGHNESS]
+    if k >= 0:
+        uv = slot_uv(mesh, material, m, SLOT_METALLIC_ROUGHNESS, hit)
+        metallic *= sample_texture(texture, k, uv, 0)[2]
+    weight = schlick(wp.abs(wp.dot(wp.normalize(n), direction)))
+    f0 = wp.min(wp.max(e.f0), 1.0)
+    reflected = e.specular * (f0 + (1.0 - f0) * weight)
+    coat = e.clearcoat * (F0_COAT + (1.0 - F0_COAT) * weight)
+    share = e.transmission * (1.0 - metallic) * luminance(tint)
+    return share * (1.0 - reflected) * (1.0 - coat)
+
+
+@wp.func
+def hit_alpha(
+    mesh: MeshArgs, material: MaterialArgs, texture: TextureArgs, hit: Hit, ray_dir: wp.vec3
+) -> float:
+    """Return the share of rays that a hit stops: its coverage, less what passes the material."""
+    alpha = hit_coverage(mesh, material, texture, hit)
+    m = mesh.face_material[hit.face]
+    if material.any_layers == 1 and material.extensions[m].transmission > 0.0:
+        alpha *= 1.0 - transmitted_share(mesh, material, texture, m, hit, ray_dir)
+    return alpha

@@ -1,0 +1,199 @@
+"""Rays against the object: camera rays, the closest hit, visibility.
+
+Detached: no backward pass.
+"""
+
+import warp as wp
+
+from warpir.kernels.maths.rng import hash_pair, to_unit
+from warpir.kernels.receiver_mesh import INFINITY, plane_distance, receiver_mesh_hit
+from warpir.kernels.tracing.coverage import hit_alpha
+from warpir.kernels.tracing.hit import ULP, Hit, face_normal, hit_position, offset_origin
+from warpir.kernels.types import CameraArgs, MaterialArgs, MeshArgs, ReceiverArgs, TextureArgs
+
+LAYERS_MAX = wp.constant(64)
+"""Surfaces that one ray may pass through; a safety bound, not a quality setting."""
+
+
+@wp.func
+def camera_ray(camera: CameraArgs, pixel: int, jitter: wp.vec2) -> wp.vec3:
+    """Return the unit direction through ``pixel`` (row-major index) at a position inside it."""
+    x = float(pixel % camera.width) + jitter[0]
+    y = float(pixel // camera.width) + jitter[1]
+    local = wp.vec3((x - camera.cx) / camera.fx, -(y - camera.cy) / camera.fy, -1.0)
+    return wp.normalize(camera.rotation * local)
+
+
+@wp.func
+def camera_reach(receiver: ReceiverArgs, origin: wp.vec3, direction: wp.vec3) -> float:
+    """Return how far a camera ray sees [m]: to the receiver's plane or mesh and what lies there.
+
+    Without the tolerance a sheet on the ground would be seen in a random part of its samples.
+    """
+    reach = plane_distance(receiver, origin, direction)
+    if reach < 0.0:
+        reach = INFINITY
+    else:
+        reach = reach - receiver.tolerance / wp.dot(receiver.normal, direction)
+    hit = receiver_mesh_hit(receiver, origin, direction)
+    if hit.valid == 1:
+        # Along a wall a ray may graze for any distance.
+        slope = wp.max(-wp.dot(hit.normal, direction), 1.0e-6)
+        reach = wp.min(reach, hit.t + receiver.tolerance / slope)
+    return reach
+
+
+@wp.func
+def facing_twin(mesh: MeshArgs, position: wp.vec3, ray_dir: wp.vec3) -> Hit:
+    """Find a triangle in the place of a culled one that faces the ray; ``valid`` is 0 without one.
+
+    Sheets are often modelled as two single-sided ones in one place, and a query returns either. A
+    ray that goes on from the culled one starts beyond both.
+    """
+    twin = Hit()
+    twin.valid = 0
+    largest = wp.max(wp.max(wp.abs(position[0]), wp.abs(position[1])), wp.abs(position[2]))
+    reach = 4.0 * ULP * largest + mesh.epsilon
+    margin = wp.vec3(reach, reach, reach)
+    query = wp.mesh_query_aabb(mesh.id, position - margin, position + margin)
+    face = int(0)
+    while wp.mesh_query_aabb_next(query, face):
+        a = mesh.positions[mesh.indices[3 * face]]
+        b = mesh.positions[mesh.indices[3 * face + 1]]
+        c = mesh.positions[mesh.indices[3 * face + 2]]
+        n = wp.cross(b - a, c - a)
+        area = wp.length(n)
+        if wp.dot(n, ray_dir) < 0.0 and wp.abs(wp.dot(position - a, n)) <= reach * area:
+            u = wp.dot(wp.cross(c - b, position - b), n) / (area * area)
+            v = wp.dot(wp.cross(a - c, position - c), n) / (area * area)
+            # Rounding must not drop a point between two halves of the twin.
+            if wp.min(wp.min(u, v), 1.0 - u - v) >= -1.0e-5:
+                twin.valid = 1
+                twin.face = face
+                twin.u = wp.clamp(u, 0.0, 1.0)
+                twin.v = wp.clamp(v, 0.0, 1.0 - twin.u)
+    return twin
+
+
+@wp.func
+def closest_hit(
+    mesh: MeshArgs,
+    material: MaterialArgs,
+    texture: TextureArgs,
+    ray_origin: wp.vec3,
+    ray_dir: wp.vec3,
+    max_t: float,
+    is_camera_ray: int,
+    key: wp.uint32,
+) -> Hit:
+    """Find the first surface that the ray does not pass through.
+
+    A camera ray passes the back of a single-sided material; any ray passes a point of opacity alpha
+    with probability ``1 - alpha``, drawn from ``key``.
+    """
+    hit = Hit()
+    hit.valid = 0
+    if mesh.id == wp.uint64(0):
+        return hit
+    origin = ray_origin
+    for layer in range(LAYERS_MAX):
+        query = wp.mesh_query_ray(mesh.id, origin, ray_dir, max_t)
+        if not query.result:
+            return hit
+        hit.face = query.face
+        hit.u = query.u
+        hit.v = query.v
+        accept = int(1)
+        if is_camera_ray == 1 and material.any_culled == 1:
+            if material.double_sided[mesh.face_material[query.face]] == 0:
+                if wp.dot(face_normal(mesh, query.face), ray_dir) > 0.0:
+                    twin = facing_twin(mesh, hit_position(mesh, hit), ray_dir)
+                    accept = twin.valid
+                    if twin.valid == 1:
+                        hit = twin
+        if accept == 1 and material.any_alpha == 1:
+            alpha = hit_alpha(mesh, material, texture, hit, ray_dir)
+            if alpha < 1.0:
+                if to_unit(hash_pair(key, wp.uint32(layer))) >= alpha:
+                    accept = 0
+        if accept == 1:
+            hit.valid = 1
+            return hit
+        # Bounds on max_t apply to the whole ray; what is left of it shrinks with each layer.
+        position = hit_position(mesh, hit)
+        max_t = max_t - wp.length(position - origin)
+        origin = offset_origin(position, face_normal(mesh, query.face), ray_dir, mesh.epsilon)
+    return hit
+
+
+@wp.func
+def camera_hit(
+    camera: CameraArgs,
+    mesh: MeshArgs,
+    material: MaterialArgs,
+    texture: TextureArgs,
+    receiver: ReceiverArgs,
+    s: int,
+    key: wp.uint32,
+    ray_dir: wp.vec3,
+) -> Hit:
+    """Find what a pixel's camera sample ``s`` sees of the object; the plane hides what is below.
+
+    ``ray_dir`` is `camera_ray` at ``sobol_pair(s, key, 0)``.
+    """
+    reach = camera_reach(receiver, camera.origin, ray_dir)
+    return closest_hit(
+        mesh, material, texture, camera.origin, ray_dir, reach, 1, hash_pair(key, wp.uint32(s))
+    )
+
+
+@wp.func
+def meets_box(origin: wp.vec3, wi: wp.vec3, low: wp.vec3, high: wp.vec3) -> int:
+    """Return 1 when the ray may meet the box; most rays from a plane do not."""
+    near = float(0.0)
+    far = float(INFINITY)
+    for axis in range(3):
+        if wp.abs(wi[axis]) > 1.0e-12:
+            a = (low[axis] - origin[axis]) / wi[axis]
+            b = (high[axis] - origin[axis]) / wi[axis]
+            near = wp.max(near, wp.min(a, b))
+            far = wp.min(far, wp.max(a, b))
+        elif origin[axis] < low[axis] or origin[axis] > high[axis]:
+            return 0
+    if near <= far:
+        return 1
+    return 0
+
+
+@wp.func
+def visibility(
+    mesh: MeshArgs,
+    material: MaterialArgs,
+    texture: TextureArgs,
+    ray_origin: wp.vec3,
+    ray_dir: wp.vec3,
+) -> float:
+    """Return the share of light that reaches ``ray_origin`` from infinity along ``ray_dir``."""
+    if mesh.id == wp.uint64(0):
+        return 1.0
+    if material.any_alpha == 0:
+        if wp.mesh_query_ray_anyhit(mesh.id, ray_origin, ray_dir, INFINITY):
+            return 0.0
+        return 1.0
+    transmitted = float(1.0)
+    origin = ray_origin
+    hit = Hit()
+    for _layer in range(LAYERS_MAX):
+        query = wp.mesh_query_ray(mesh.id, origin, ray_dir, INFINITY)
+        if not query.result:
+            return transmitted
+        hit.face = query.face
+        hit.u = query.u
+        hit.v = query.v
+        transmitted = transmitted * (1.0 - hit_alpha(mesh, material, texture, hit, ray_dir))
+        if transmitted <= 0.0:
+            return 0.0
+        origin = offset_origin(
+            hit_position(mesh, hit), face_normal(mesh, query.face), ray_dir, mesh.epsilon
+        )
+    return 0.0

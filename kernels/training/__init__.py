@@ -1,0 +1,1 @@
+"""Small pictures of made-up scenes, from which the networks learn."""
