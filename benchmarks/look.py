@@ -27,7 +27,7 @@ from warpir.evaluate.image_errors import image_errors, make_regions
 from warpir.evaluate.scenes import Place, Places, Subject, find_files
 from warpir.io.images.jpeg import JpegCoding, read_coding
 from warpir.io.images.photos import Photo
-from warpir.look.camera_look import estimate_look
+from warpir.look.camera_look import CameraLook, estimate_look
 from warpir.look.grain import Grain
 from warpir.render.composite import Quality, Rendering, composite, render
 from warpir.render.device_scene import Placed, Receiver, Scene
@@ -155,11 +155,7 @@ def measure(place: Place, subject: Subject, samples: int) -> dict[str, dict[str,
             look = replace(look, grain=None)
         picture = composite(again, photo, 2, look=look)
         shown = photo.encode(picture.image, picture.changed).astype(np.float32) / 255.0
-        found[name] = errors(shown) | {
-            "response": look.response.exponent if look.response else 1.0,
-            "blur": look.blur.sigma if look.blur else float("nan"),
-            "grain": 255.0 * look.grain.typical if look.grain else 0.0,
-        }
+        found[name] = errors(shown) | _estimates(look)
     other = replace(camera, noise=grain.draw(place.photo.shape[:2], int(rng.integers(2**31))))
     perfect = composite(again, photo_of(place.photo), 2).layers.composite
     found[TRUE] = errors(other.shoot(perfect))
@@ -171,6 +167,15 @@ def measure(place: Place, subject: Subject, samples: int) -> dict[str, dict[str,
         "response at .003": float(grey[0]),
     }
     return found
+
+
+def _estimates(look: CameraLook) -> dict[str, float]:
+    """Return the figures of a look: exponent, blur [px], grain [codes of 255]."""
+    return {
+        "response": look.response.exponent if look.response else 1.0,
+        "blur": look.blur.sigma if look.blur else float("nan"),
+        "grain": 255.0 * look.grain.typical if look.grain else 0.0,
+    }
 
 
 def main() -> None:

@@ -1,6 +1,5 @@
 """All inputs of one insertion, read and checked; torch and Warp are not needed here."""
 
-import os
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
@@ -36,6 +35,7 @@ from warpir.io.images.undistort import undistort_photo, undistorted
 from warpir.io.lobes_file import read_lobes
 from warpir.io.meshes.materials_file import with_materials
 from warpir.io.meshes.point_cloud import read_point_cloud
+from warpir.io.results import inputs_within
 from warpir.scene.asset import Asset
 from warpir.scene.camera import Camera
 from warpir.scene.light import Light
@@ -256,7 +256,9 @@ def _hashes_beside(config: InsertConfig, asset: Asset, proxy: Asset | None) -> d
             continue
         for file, digest in mesh.hashes.items():
             hashes[f"{name}/{file}" if file else name] = digest
-            problems += _within_out(config, Path(path).parent.resolve() / file) if file else []
+            problems += (
+                inputs_within(config.output.out, Path(path).parent.resolve() / file) if file else []
+            )
     raise_all(problems)
     return hashes
 
@@ -374,32 +376,7 @@ def _inputs_in_out(config: InsertConfig) -> list[InputError]:
         *(config.diffusion.model, config.adapter.lora, config.guidance.prior),
         *(light.regressor, camera.ground_points),
     )
-    return _within_out(config, *(path for path in named if path is not None))
-
-
-def _within_out(config: InsertConfig, *paths: str | Path) -> list[InputError]:
-    """Refuse the first path that is --out or below it: by links, or in a folder of the results."""
-    if config.output.out is None:
-        return []
-    out = _places(config.output.out)[:1]
-    if not out or out[0] == out[0].parent:
-        return []  # no name, or the root: `warpir.io.results.OutputFolder` says so
-    for path in paths:
-        if any(place.is_relative_to(out[0]) for place in _places(path)):
-            return [usage("--out", f"holds the input {path}", "choose a folder of its own")]
-    return []
-
-
-def _places(path: str | Path) -> list[Path]:
-    """Return where a path leads, and where it lies itself if it is a link: either can be replaced.
-
-    None for what no file can be called: the reader tells.
-    """
-    folder, name = os.path.split(os.path.abspath(path))
-    try:
-        return [Path(os.path.realpath(path)), Path(os.path.realpath(folder), name)]
-    except ValueError:
-        return []
+    return inputs_within(config.output.out, *(path for path in named if path is not None))
 
 
 def _read_photo(inputs: InputConfig, limits: Limits) -> Photo:

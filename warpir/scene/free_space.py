@@ -71,21 +71,9 @@ def find_place(
     Raises:
         InputError: Every place is occupied or hidden, or the photo shows no ground.
     """
-    candidates: list[tuple[float, Place, Float64Array]] = []
-    for v in (np.arange(GRID[1]) + 0.5) / GRID[1]:
-        for u in (np.arange(GRID[0]) + 0.5) / GRID[0]:
-            try:
-                stand = point_on_ground((u * camera.width, v * camera.height), camera, plane)
-                place = (float(stand[0]), float(stand[1]), float(stand[2]))
-                matrix = put(place).asset_to_world
-            except InputError:
-                continue
-            sides = float(np.linalg.norm(stand - camera.c2w[:3, 3])) / _longest(matrix, low, high)
-            off = max(np.log(NEAR / sides), np.log(sides / FAR), 0.0)
-            cost = float(np.hypot(u - DEFAULT_STAND[0], v - DEFAULT_STAND[1]) + off)
-            candidates.append((cost, place, matrix))
+    candidates = _candidates(put, low, high, camera, plane)
     fallback: tuple[int, Place] | None = None
-    for _, place, matrix in sorted(candidates, key=lambda entry: entry[0]):
+    for _, place, matrix in candidates:
         box = _Box(matrix, low, high, camera)
         rank = 2 * box.is_cut
         if cloud is not None:
@@ -109,6 +97,30 @@ def find_place(
             "give --at or --place, or a smaller --size",
         )
     return fallback[1]
+
+
+def _candidates(
+    put: Callable[[Place], Placement],
+    low: Float64Array,
+    high: Float64Array,
+    camera: Camera,
+    plane: Float64Array,
+) -> list[tuple[float, Place, Float64Array]]:
+    """Return (cost, place, pose) on a grid over the photo, cheapest first."""
+    found: list[tuple[float, Place, Float64Array]] = []
+    for v in (np.arange(GRID[1]) + 0.5) / GRID[1]:
+        for u in (np.arange(GRID[0]) + 0.5) / GRID[0]:
+            try:
+                stand = point_on_ground((u * camera.width, v * camera.height), camera, plane)
+                place = (float(stand[0]), float(stand[1]), float(stand[2]))
+                matrix = put(place).asset_to_world
+            except InputError:
+                continue
+            sides = float(np.linalg.norm(stand - camera.c2w[:3, 3])) / _longest(matrix, low, high)
+            off = max(np.log(NEAR / sides), np.log(sides / FAR), 0.0)
+            cost = float(np.hypot(u - DEFAULT_STAND[0], v - DEFAULT_STAND[1]) + off)
+            found.append((cost, place, matrix))
+    return sorted(found, key=lambda entry: entry[0])
 
 
 def is_well_seen(
