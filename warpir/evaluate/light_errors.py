@@ -169,7 +169,8 @@ def _surface_cosines() -> Float64Array:
     steps = np.array(list(product((-1.0, 0.0, 1.0), repeat=3)))
     normals = steps[np.abs(steps).sum(axis=1) > 0.0]
     normals /= np.linalg.norm(normals, axis=1, keepdims=True)
-    return np.maximum(normals @ _texel_directions().reshape(-1, 3).T, 0.0)
+    cosines: Float64Array = np.maximum(normals @ _texel_directions().reshape(-1, 3).T, 0.0)
+    return cosines
 
 
 def _angle_errors(predicted: _Directions, wanted: _Directions) -> dict[str, float]:
