@@ -27,6 +27,7 @@ TOUCHING = (
 ABOVE = {
     "box 1e-7 of its size above": (1e-7, 1.0),
     "box 1e-3 of its size above": (1e-3, 1.0),
+    "box of 1 m, 1 cm above": (1e-2, 1.0),
 }
 """The same."""
 
