@@ -7,7 +7,6 @@ from io import BytesIO
 from pathlib import Path
 
 import numpy as np
-from PIL import Image, JpegImagePlugin
 
 from warpir.core.arrays import CodeArray
 from warpir.io.images.decoder import upright
@@ -42,6 +41,8 @@ class JpegCoding:
         Args:
             codes: Upright, 8 bits, of the photo's size, shape [H, W, 3].
         """
+        from PIL import Image
+
         stored = upright(codes, BACK.get(self.orientation, self.orientation))
         file = BytesIO()
         tables = [list(table) for table in self.tables]
@@ -60,6 +61,8 @@ def read_coding(path: Path, orientation: int) -> JpegCoding | None:
         path: A file that `decode_image` has read.
         orientation: Of its EXIF data.
     """
+    from PIL import Image, JpegImagePlugin
+
     with Image.open(path) as image:
         if not isinstance(image, JpegImagePlugin.JpegImageFile) or image.mode not in ("RGB", "L"):
             return None
