@@ -2,15 +2,10 @@
 
 import base64
 import json
-import re
 import signal
 import stat
-import subprocess
-import sys
 import time
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from itertools import combinations
 from pathlib import Path
 from typing import Any
@@ -19,11 +14,22 @@ import numpy as np
 import pytest
 import trimesh
 from numpy.typing import NDArray
-from PIL import Image
 
 from tests.builders.insertions import read_layers
 from tests.builders.programs.browser import Fingers, Opened, needs_chromium, open_browser
 from tests.builders.programs.children import output_of
+from tests.builders.programs.placing import (
+    HEIGHT,
+    STATE,
+    WIDTH,
+    Served,
+    command,
+    drag,
+    handle_at,
+    open_page,
+    serve,
+    settle,
+)
 from warpir.app.config import InsertConfig
 from warpir.core.errors import ExitCode, InputError
 from warpir.io.assets import load_asset
@@ -39,7 +45,6 @@ from warpir.place.stance import Stance, ground_to_world, stance_of
 from warpir.scene.camera import Camera, CameraEstimate, camera_from_fov, ground_point
 from warpir.scene.placement import place_asset
 
-WIDTH, HEIGHT = 480, 320
 EXACT = 1e-9
 """Float64 on both sides, a few dozen operations on numbers up to 1000."""
 TILTED = Stance(0.4, 1.7, -0.3, 25.0, -11.0, 6.0)
@@ -49,77 +54,9 @@ TILTED = Stance(0.4, 1.7, -0.3, 25.0, -11.0, 6.0)
 SAID = {"sun": [-40, 50, 8], "sky": "clear"}
 
 
-def write_wedge(path: Path) -> None:
-    """An object without any symmetry, off its origin, with a corner cut off."""
-    box = trimesh.creation.box(extents=(1.0, 0.6, 2.0))
-    fin = trimesh.creation.box(extents=(0.2, 0.9, 0.5))
-    fin.apply_translation((0.35, 0.5, -0.6))
-    both = trimesh.util.concatenate([box, fin])
-    both.apply_translation((3.0, 0.2, -1.0))
-    both.export(path)
-
-
-@pytest.fixture(scope="module")
-def inputs(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A photo with bright ground, and assets of two kinds."""
-    folder = tmp_path_factory.mktemp("place")
-    rows = np.linspace(90, 190, HEIGHT)[:, None, None]
-    codes = np.broadcast_to(rows, (HEIGHT, WIDTH, 3)).astype(np.uint8)
-    Image.fromarray(codes).save(folder / "photo.png")
-    write_wedge(folder / "wedge.glb")
-    write_wedge(folder / "wedge's <b>.stl")
-    return folder
-
-
 def session_of(config: InsertConfig) -> Session:
     """A session of this configuration."""
     return open_session(config.inputs, config.camera, config.placement, config.limits)
-
-
-def command(folder: Path, out: Path, *more: str, asset: str = "wedge.glb") -> list[str]:
-    """A command line that opens no browser."""
-    named = ["--photo", str(folder / "photo.png"), "--asset", str(folder / asset)]
-    return [*named, "--out", str(out), "--no-browser", *more]
-
-
-@dataclass(frozen=True)
-class Served:
-    """A running server."""
-
-    process: subprocess.Popen[str]
-    address: str
-
-    @property
-    def parts(self) -> tuple[int, str]:
-        """Port and token."""
-        found = re.fullmatch(r"http://127\.0\.0\.1:(\d+)/([\w-]+)/", self.address)
-        assert found is not None
-        return int(found[1]), found[2]
-
-
-@contextmanager
-def serve(argv: Sequence[str]) -> Iterator[Served]:
-    """Run the command in a child process; it is told to end where the test has not."""
-    process = subprocess.Popen(
-        [sys.executable, "-m", "warpir.place", *argv],
-        stdout=subprocess.PIPE,
-        stderr=subprocess.STDOUT,
-        text=True,
-        cwd=Path(argv[argv.index("--out") + 1]).parent,
-    )
-    assert process.stdout is not None
-    try:
-        lines = []
-        for line in process.stdout:
-            lines.append(line)
-            if line.startswith("page: "):
-                yield Served(process, line.split()[1])
-                return
-        raise AssertionError("".join(lines))
-    finally:
-        if process.poll() is None:
-            process.send_signal(signal.SIGINT)
-        process.communicate(timeout=30)
 
 
 # --------------------------------------------------------------------------- numbers of a camera
@@ -492,38 +429,6 @@ def test_server_knows_every_file_of_the_page() -> None:
     assert there == set(FILES.values()) | {"vendor/LICENSE", "vendor/README.md"}
 
 
-def open_page(opened: Opened, served: Served) -> None:
-    """Go to the page and wait until the object is in it."""
-    opened.page.goto(served.address)
-    opened.page.wait_for_selector("#save:not([disabled])", timeout=60_000)
-    opened.page.wait_for_selector("[data-handle=foot][transform]")
-
-
-def settle(opened: Opened) -> None:
-    """Wait until what was changed is drawn."""
-    opened.page.evaluate(
-        "new Promise((r) => requestAnimationFrame(() => requestAnimationFrame(r)))"
-    )
-
-
-def handle_at(opened: Opened, name: str) -> tuple[float, float]:
-    """Where a handle is, in pixels of the window."""
-    box = opened.page.locator(f"[data-handle={name}]").bounding_box()
-    assert box is not None
-    return box["x"] + box["width"] / 2.0, box["y"] + box["height"] / 2.0
-
-
-def drag(opened: Opened, name: str, by: tuple[float, float]) -> None:
-    """Drag a handle by some pixels."""
-    mouse, (x, y) = opened.page.mouse, handle_at(opened, name)
-    mouse.move(x, y)
-    mouse.down()
-    mouse.move(x + by[0] / 2.0, y + by[1] / 2.0)
-    mouse.move(x + by[0], y + by[1])
-    mouse.up()
-    settle(opened)
-
-
 def drag_away_and_back(opened: Opened, selector: str) -> None:
     """Drag the thumb of a slider and let it go where it was: it tells of no change then."""
     slider = opened.page.locator(selector)
@@ -546,7 +451,6 @@ def drag_away_and_back(opened: Opened, selector: str) -> None:
     assert "input" in told and "change" not in told, told
 
 
-STATE = "import('./page.js').then((m) => m.state)"
 SILHOUETTE = """async ([width, height]) => {
   const { stage } = await import('./page.js');
   const THREE = await import('three');

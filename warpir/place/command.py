@@ -4,30 +4,24 @@
 
 opens a page on this machine: the horizon, the ground and the object are dragged into place, and
 Save writes ``camera.json`` and ``insert.json`` into --out, which ``python -m warpir.insert --config
-placed/street/insert.json`` takes. Warp is not loaded, and torch only for a camera that has to be
-estimated.
+placed/street/insert.json`` takes. torch is loaded here only for a camera that has to be estimated;
+the light is estimated in a process of its own.
 """
 
 import os
-import shlex
 import sys
 import threading
 import webbrowser
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import ExitStack, contextmanager
-from functools import partial
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import TYPE_CHECKING, Any
 
 from warpir.app.command import flags_of, make_parser, read_arguments, read_values
 from warpir.app.config import DEMO_HINT, InsertConfig, flag, usage
 from warpir.app.program import run_program, say
 from warpir.core.errors import ExitCode, raise_all
 from warpir.core.signals import Stopped
-
-if TYPE_CHECKING:
-    from warpir.place.session import PlacementFolder, Session
 
 USAGE = "python -m warpir.place --photo FILE --asset FILE [--out DIR] [FLAG ...]"
 DESCRIPTION = "Place a 3D object in a photograph by hand, in the browser."
@@ -96,14 +90,9 @@ def _run(arguments: list[str]) -> int:
     config = InsertConfig(**read_values({name: (text, flag(name)) for name, text in texts.items()}))
     config = _with_inputs(config)
 
+    from warpir.place.answers import Answers
     from warpir.place.server import PlaceServer
-    from warpir.place.session import (
-        PlacementFolder,
-        asset_glb,
-        open_session,
-        photo_jpeg,
-        start_record,
-    )
+    from warpir.place.session import PlacementFolder, open_session
 
     assert config.output.out is not None
     folder = PlacementFolder(config.output.out, config.output.overwrite)
@@ -111,16 +100,11 @@ def _run(arguments: list[str]) -> int:
     session = open_session(config.inputs, config.camera, config.placement, config.limits)
     for line in session.assumed:
         say(f"assumed: {line}")
-    contents: dict[str, Callable[[], bytes]] = {
-        "start.json": lambda: _json(start_record(session, config.light, str(config.output.out))),
-        "photo.jpg": partial(photo_jpeg, session.photo),
-        "asset.glb": partial(asset_glb, session.asset),
-    }
-    save = partial(_save, session, folder, config.flat())
-    with (
-        PlaceServer(port, contents, save, once=once) as server,
-        ExitStack() as until_end,
-    ):
+    with ExitStack() as until_end:
+        answers = Answers(session, folder, config)
+        until_end.callback(answers.close)
+        server = PlaceServer(port, answers.contents, answers.posts, once=once)
+        until_end.enter_context(server)
         say(f"page: {server.address}")
         if not once:
             say("Ctrl-C ends it")
@@ -163,20 +147,6 @@ def way_to(address: str) -> Iterator[Path]:
         yield path
 
 
-def _save(
-    session: "Session", folder: "PlacementFolder", asked: dict[str, Any], body: bytes
-) -> dict[str, Any]:
-    """Write the placement that the page sends; print and return the command that uses it."""
-    from warpir.core.strict_json import parse_json_object
-    from warpir.place.session import placement_files
-
-    path = folder.write(placement_files(session, asked, parse_json_object("the page", body)))
-    command = f"python -m warpir.insert --config {shlex.quote(str(path))}"
-    say(f"saved: {path}")
-    say(command)
-    return {"command": command, "file": str(path)}
-
-
 def _with_inputs(config: InsertConfig) -> InsertConfig:
     """Return the configuration with the demo's files, and with a folder for what is saved.
 
@@ -202,12 +172,6 @@ def _port(text: str) -> int:
     if not (text.isascii() and text.isdigit() and len(text) < 20 and int(text) < 65_536):
         raise usage("--port", f"expected a whole number up to 65535 (found {text[:60]!a})")
     return int(text)
-
-
-def _json(record: dict[str, Any]) -> bytes:
-    import json
-
-    return json.dumps(record, allow_nan=False).encode()
 
 
 def _has_screen() -> bool:

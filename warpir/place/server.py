@@ -14,6 +14,7 @@ import re
 import secrets
 import threading
 from collections.abc import Callable, Mapping
+from contextlib import nullcontext
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
 from typing import Any
@@ -34,7 +35,10 @@ FILES = {
             "page.css",
             "icon.svg",
             "camera.js",
+            "fields.js",
             "handles.js",
+            "history.js",
+            "light.js",
             "page.js",
             "stage.js",
             "vendor/three.core.min.js",
@@ -63,7 +67,9 @@ class PlaceServer(ThreadingHTTPServer):
         port: Port to listen on; 0 for any that is free.
         contents: Functions that build the other files, by address; each is called once, when its
             file is first requested.
-        save: Called with the bytes that the page sends; returns its answer. Raises `InputError`.
+        answers: By address, what is called with the bytes that the page sends there and returns the
+            answer, in a thread of each request's own. ``save`` is among them; it is called while
+            nothing else is read, built or saved. Each raises `InputError`.
         once: Whether the first placement that was saved ends `serve_forever`.
 
     Raises:
@@ -76,7 +82,7 @@ class PlaceServer(ThreadingHTTPServer):
         self,
         port: int,
         contents: Mapping[str, Callable[[], bytes]],
-        save: Callable[[bytes], dict[str, Any]],
+        answers: Mapping[str, Callable[[bytes], dict[str, Any]]],
         once: bool = False,
     ) -> None:
         try:
@@ -85,7 +91,7 @@ class PlaceServer(ThreadingHTTPServer):
             what = f"cannot be listened on (found {port}: {error.strerror})"
             raise usage("--port", what, "leave it out for any that is free") from None
         self.token = secrets.token_urlsafe(24)
-        self.save = save
+        self.answers = dict(answers)
         self.once = once
         self.working = threading.Lock()
         """Held while files are read, built or saved."""
@@ -110,6 +116,15 @@ class PlaceServer(ThreadingHTTPServer):
     def address(self) -> str:
         """Address of the page."""
         return f"http://{self.host}/{self.token}/"
+
+    def answer(self, name: str, body: bytes) -> dict[str, Any]:
+        """Return the answer to what the page sends to an address behind the token.
+
+        Raises:
+            InputError: It cannot be used.
+        """
+        with self.working if name == "save" else nullcontext():
+            return self.answers[name](body)
 
     def content(self, name: str) -> bytes | None:
         """Return the file at an address behind the token; None where there is none."""
@@ -141,7 +156,7 @@ class _Handler(BaseHTTPRequestHandler):
         if name is None:
             return
         length = self.headers.get("Content-Length", "")
-        if name != "save":
+        if name not in self.server.answers:
             self._refuse(404)
         elif not (length.isascii() and length.isdigit() and len(length) < 10):
             self._refuse(413)
@@ -150,13 +165,12 @@ class _Handler(BaseHTTPRequestHandler):
         else:
             body = self.rfile.read(int(length))
             try:
-                with self.server.working:
-                    status, answer = 200, self.server.save(body)
+                status, answer = 200, self.server.answer(name, body)
             except InputError as error:
                 status = 422
                 answer = {"where": error.where, "what": error.what, "advice": error.advice}
             self._answer(status, KINDS["json"], json.dumps(answer).encode())
-            if self.server.once and status == 200:
+            if self.server.once and name == "save" and status == 200:
                 # From a thread of its own: it waits for the loop, which may wait for this one.
                 threading.Thread(target=self.server.shutdown).start()
 

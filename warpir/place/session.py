@@ -55,8 +55,6 @@ SEEN_BY = (
     "ground",
 )
 """Fields that the saved camera file replaces."""
-DEFAULT_SUN = (-60.0, 45.0)
-"""Azimuth and elevation of the sun with which the page starts [deg]: from the left, in front."""
 LARGEST_START = 0.6
 """Initial longest side of an asset of unknown scale, over its distance [1]."""
 PAGE = Path("the page")
@@ -214,12 +212,13 @@ def start_record(session: Session, light: LightConfig, folder: str) -> dict[str,
             "height": camera.height,
             **{name: getattr(camera, name) for name in ("fx", "fy", "cx", "cy")},
         },
+        "camera_numbers": camera.numbers(),
         "stance": stance_of(to_ground @ camera.c2w).record(),
         "stand": {"x": x, "z": z},
         "rotate_y": session.rotate_y,
         "size": scale * float((high - low).max()),
         "ground_to_world": session.frame.tolist(),
-        "sun": _start_sun(light),
+        "sun": None if light.sun is None else [*light.sun, None][:3],
         "sky": light.sky or SKY_PRESETS[0],
         "keeps_light": light.sun is not None or light.sky is not None,
         "sky_radiance": sky_radiance,
@@ -229,13 +228,6 @@ def start_record(session: Session, light: LightConfig, folder: str) -> dict[str,
         "assumed": list(session.assumed),
         "folder": folder,
     }
-
-
-def _start_sun(light: LightConfig) -> list[float | None]:
-    """Return azimuth, elevation and strength of the sun; the strength may be absent."""
-    if light.sun is None:
-        return [*DEFAULT_SUN, 0.0 if light.sky is not None else None]
-    return [*light.sun, None][:3]
 
 
 def photo_jpeg(photo: Photo) -> bytes:
@@ -254,6 +246,23 @@ def asset_glb(asset: Asset) -> bytes:
     return write_glb(preview_asset(asset), np.eye(4))
 
 
+def sent_camera(session: Session, sent: Mapping[str, Any]) -> Camera:
+    """Return the camera that the page sends.
+
+    Args:
+        session: Session of the page.
+        sent: ``fx`` and ``fy`` [px], and ``stance`` (`Stance.record`).
+
+    Raises:
+        InputError: Numbers out of range.
+    """
+    stance = Stance(*(number(PAGE, sent.get("stance"), f.name) for f in fields(Stance)))
+    fx, fy = (number(PAGE, sent, name) for name in ("fx", "fy"))
+    if min(fx, fy, stance.height) <= 0.0:
+        raise InputError(PAGE, "camera height and focal length must be more than 0")
+    return replace(session.camera, fx=fx, fy=fy, c2w=session.frame @ stance.c2w())
+
+
 def placement_files(
     session: Session, asked: Mapping[str, Any], sent: Mapping[str, Any]
 ) -> dict[str, dict[str, Any]]:
@@ -263,19 +272,14 @@ def placement_files(
         session: Session of the placement.
         asked: Values of the command line, from `InsertConfig.flat`; ``out`` is the folder of the
             two files.
-        sent: Page values: ``fx``, ``fy`` [px], ``stance``, ``stand`` (``x`` and ``z`` in the
-            ground frame) [m], ``rotate_y`` [deg], ``size`` [m], and ``sun`` and ``sky`` as the
-            flags, or null where the light is to be estimated from the photo.
+        sent: Page values: those of `sent_camera`, ``stand`` (``x`` and ``z`` in the ground frame)
+            [m], ``rotate_y`` [deg], ``size`` [m], and ``sun`` and ``sky`` as the flags, or null
+            where the light is to be estimated from the photo.
 
     Raises:
         InputError: Numbers out of range, or an object that the camera does not see.
     """
-    stance = Stance(*(number(PAGE, sent.get("stance"), f.name) for f in fields(Stance)))
-    pose = session.frame @ stance.c2w()
-    fx, fy = (number(PAGE, sent, name) for name in ("fx", "fy"))
-    if min(fx, fy, stance.height) <= 0.0:
-        raise InputError(PAGE, "camera height and focal length must be more than 0")
-    camera = replace(session.camera, fx=fx, fy=fy, c2w=pose)
+    camera = sent_camera(session, sent)
     stand = [number(PAGE, sent.get("stand"), axis) for axis in "xz"]
     x, y, z = (float(c) for c in (session.frame @ (stand[0], 0.0, stand[1], 1.0))[:3])
     sets = ("rotate_y", "size", "sun", "sky")
@@ -291,19 +295,11 @@ def placement_files(
         size=config.placement.size,
     )
     folder = Path(os.path.abspath(asked["out"]))
-    kept = {
-        name: value
-        for name, value in asked.items()
-        if value != DEFAULTS[name] and name not in (*PLACED, *SEEN_BY, "overwrite", "demo")
-    }
-    own = ("photo", "asset", "materials")
-    files: dict[str, Any] = {name: os.path.abspath(kept[name]) for name in own if name in kept}
     ground = {} if session.ground is None else {"ground": session.ground}
     return {
         CAMERA: camera.record(),
         CONFIG: {
-            **kept,
-            **files,
+            **kept_values(asked),
             "camera": str(folder / CAMERA),
             **ground,
             "place": config.placement.place,
@@ -311,6 +307,21 @@ def placement_files(
             "out": str(folder / "result"),
         },
     }
+
+
+def kept_values(asked: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the values of the command line that a placement keeps, files by their whole paths.
+
+    Args:
+        asked: From `InsertConfig.flat`.
+    """
+    kept = {
+        name: value
+        for name, value in asked.items()
+        if value != DEFAULTS[name] and name not in (*PLACED, *SEEN_BY, "overwrite", "demo", "out")
+    }
+    own = ("photo", "asset", "materials")
+    return {**kept, **{name: os.path.abspath(kept[name]) for name in own if name in kept}}
 
 
 class PlacementFolder:

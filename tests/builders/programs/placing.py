@@ -1,0 +1,95 @@
+"""Runs `warpir.place` for tests, and uses its page as a person would."""
+
+import re
+import signal
+import subprocess
+import sys
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+
+from tests.builders.programs.browser import Opened
+
+WIDTH, HEIGHT = 480, 320
+"""Size of the photo of the tests [px]."""
+STATE = "import('./page.js').then((m) => m.state)"
+"""The page's state, for `Page.evaluate`."""
+
+
+def command(folder: Path, out: Path, *more: str, asset: str = "wedge.glb") -> list[str]:
+    """A command line that opens no browser."""
+    named = ["--photo", str(folder / "photo.png"), "--asset", str(folder / asset)]
+    return [*named, "--out", str(out), "--no-browser", *more]
+
+
+@dataclass(frozen=True)
+class Served:
+    """A running server."""
+
+    process: subprocess.Popen[str]
+    address: str
+
+    @property
+    def parts(self) -> tuple[int, str]:
+        """Port and token."""
+        found = re.fullmatch(r"http://127\.0\.0\.1:(\d+)/([\w-]+)/", self.address)
+        assert found is not None
+        return int(found[1]), found[2]
+
+
+@contextmanager
+def serve(argv: Sequence[str]) -> Iterator[Served]:
+    """Run the command in a child process; it is told to end where the test has not."""
+    process = subprocess.Popen(
+        [sys.executable, "-m", "warpir.place", *argv],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.STDOUT,
+        text=True,
+        cwd=Path(argv[argv.index("--out") + 1]).parent,
+    )
+    assert process.stdout is not None
+    try:
+        lines = []
+        for line in process.stdout:
+            lines.append(line)
+            if line.startswith("page: "):
+                yield Served(process, line.split()[1])
+                return
+        raise AssertionError("".join(lines))
+    finally:
+        if process.poll() is None:
+            process.send_signal(signal.SIGINT)
+        process.communicate(timeout=30)
+
+
+def open_page(opened: Opened, served: Served) -> None:
+    """Go to the page and wait until the object is in it."""
+    opened.page.goto(served.address)
+    opened.page.wait_for_selector("#save:not([disabled])", timeout=60_000)
+    opened.page.wait_for_selector("[data-handle=foot][transform]")
+
+
+def settle(opened: Opened) -> None:
+    """Wait until what was changed is drawn."""
+    opened.page.evaluate(
+        "new Promise((r) => requestAnimationFrame(() => requestAnimationFrame(r)))"
+    )
+
+
+def handle_at(opened: Opened, name: str) -> tuple[float, float]:
+    """Where a handle is, in pixels of the window."""
+    box = opened.page.locator(f"[data-handle={name}]").bounding_box()
+    assert box is not None
+    return box["x"] + box["width"] / 2.0, box["y"] + box["height"] / 2.0
+
+
+def drag(opened: Opened, name: str, by: tuple[float, float]) -> None:
+    """Drag a handle by some pixels."""
+    mouse, (x, y) = opened.page.mouse, handle_at(opened, name)
+    mouse.move(x, y)
+    mouse.down()
+    mouse.move(x + by[0] / 2.0, y + by[1] / 2.0)
+    mouse.move(x + by[0], y + by[1])
+    mouse.up()
+    settle(opened)

@@ -1,0 +1,125 @@
+"""The page's light: estimated from the photo, and without a direction where none is clear."""
+
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from tests.builders.programs.browser import needs_chromium, open_browser
+from tests.builders.programs.placing import STATE, command, open_page, serve, settle
+from warpir.core.errors import InputError
+from warpir.lighting.regression import Regression, regress
+from warpir.lighting.regressor import load_regressor
+from warpir.place.work import CLEAR_DEG, light_record
+from warpir.place.worker import Worker
+from warpir.scene.camera import camera_from_fov
+
+FLAT = np.full((64, 96, 3), 0.4)
+"""A photo that shows nothing."""
+
+
+@pytest.fixture(scope="module")
+def found() -> Regression:
+    """An estimate of the shipped networks."""
+    return regress(load_regressor(None, "cpu"), FLAT, camera_from_fov(96, 64, 60.0, -8.0, 1.6))
+
+
+def test_light_record_keeps_the_light_of_the_ground(found: Regression) -> None:
+    """With and without a direction the ground gets the estimated irradiance."""
+    overhead = replace(
+        found,
+        axis=np.array([0.0, 1.0, 0.0]),
+        directions=np.array([[0.0, 1.0, 0.0]]),
+        probability=np.ones(1),
+    )
+    wanted = overhead.irradiance(np.array([0.0, 1.0, 0.0]))
+    clear = light_record(replace(overhead, spread_deg=CLEAR_DEG))
+    assert clear["direction"][1] == pytest.approx(90.0)
+    np.testing.assert_allclose(np.pi * np.array(clear["sky"]) + clear["sun"], wanted, rtol=1e-12)
+    unclear = light_record(replace(overhead, spread_deg=CLEAR_DEG + 0.1))
+    assert unclear["direction"] is None and unclear["sun"] == [0.0, 0.0, 0.0]
+    np.testing.assert_allclose(np.pi * np.array(unclear["sky"]), wanted, rtol=1e-12)
+
+
+def test_a_photo_that_shows_nothing_has_no_direction(found: Regression) -> None:
+    """The networks say of it that they do not know."""
+    assert light_record(found)["direction"] is None
+
+
+@pytest.mark.slow
+def test_worker_answers_refuses_and_starts_again(inputs: Path) -> None:
+    """A job that cannot be done is an error, one whose process was ended too; then another runs."""
+    worker = Worker()
+    camera = camera_from_fov(480, 320, 60.0, -8.0, 1.6).record()
+    job = {"kind": "light", "config": {"photo": str(inputs / "photo.png")}, "camera": camera}
+    try:
+        with pytest.raises(InputError, match="none"):
+            worker.ask({**job, "config": {"photo": "none.png"}})
+        assert worker.ask(job)["spread_deg"] > 0.0
+        worker.stop()
+        assert worker.ask(job)["spread_deg"] > 0.0
+    finally:
+        worker.stop()
+
+
+@needs_chromium
+@pytest.mark.slow
+def test_page_opens_with_the_estimated_light(tmp_path: Path) -> None:
+    """Of the demo's photo: marked as an estimate, drawn with its doubt, saved only when changed."""
+    argv = ["--demo", "--out", str(tmp_path / "out"), "--no-browser"]
+    with serve(argv) as served, open_browser() as opened:
+        open_page(opened, served)
+        page = opened.page
+        page.wait_for_selector("#light[data-source=estimate]", timeout=60_000)
+        words = page.inner_text("#light-words")
+        assert words.startswith("Estimated from the photo: azimuth")
+        azimuth, elevation = (float(page.input_value(f"#{n}")) for n in ("azimuth", "elevation"))
+        assert f"azimuth {azimuth:.0f}°, elevation {elevation:.0f}°, ±" in words
+        assert page.locator("#dial .doubt").is_visible() and page.locator(".sun").is_visible()
+        assert not page.is_checked("#keep-light")
+        axis = page.evaluate("import('./page.js').then(({ stage }) => stage.axis.toArray())")
+        a, e = np.radians([azimuth, elevation])
+        wanted = [np.cos(e) * np.sin(a), np.sin(e), -np.cos(e) * np.cos(a)]
+        np.testing.assert_allclose(axis, wanted, atol=0.02)  # shown in whole degrees
+        page.fill("#elevation", "30")
+        page.keyboard.press("Enter")
+        settle(opened)
+        assert page.is_checked("#keep-light") and page.locator(".doubt").is_hidden()
+        assert page.evaluate(STATE)["light"]["azimuth"] == pytest.approx(azimuth, abs=0.6)
+        page.keyboard.press("Control+z")
+        settle(opened)
+        assert not page.is_checked("#keep-light") and page.locator(".doubt").is_visible()
+        page.check("#keep-light")
+        page.click("#save")
+        page.wait_for_selector("#done:not([hidden])")
+        assert opened.errors == []
+    saved = json.loads((tmp_path / "out" / "insert.json").read_text())
+    assert saved["sun"][:2] == pytest.approx([azimuth, elevation], abs=0.6)
+    assert len(saved["sky"]) == 3
+
+
+@needs_chromium
+@pytest.mark.slow
+def test_page_draws_no_sun_at_night(inputs: Path, tmp_path: Path) -> None:
+    """Of a dark photo no direction is invented; one that is clicked is the user's."""
+    noise = np.random.default_rng(0).normal(8.0, 2.0, (320, 480, 3))
+    Image.fromarray(np.clip(noise, 0, 255).astype(np.uint8)).save(tmp_path / "night.png")
+    argv = command(inputs, tmp_path / "out")
+    argv[argv.index("--photo") + 1] = str(tmp_path / "night.png")
+    with serve(argv) as served, open_browser(390, 844) as opened:
+        page = opened.page
+        open_page(opened, served)
+        assert page.locator("#dial .sun").is_hidden()  # nor before anything is known
+        page.wait_for_selector("#light[data-source=unclear]", timeout=60_000)
+        assert "no clear direction" in page.inner_text("#light-words")
+        assert page.locator("#dial .sun").is_hidden() and page.input_value("#azimuth") == ""
+        sun = "import('./page.js').then(({ stage }) => stage.sun.visible)"
+        assert page.evaluate(sun) is False
+        page.locator("#dial").click(position={"x": 60.0, "y": 40.0})
+        settle(opened)
+        assert page.is_checked("#keep-light") and page.evaluate(sun) is True
+        assert page.locator("#dial .sun").is_visible()
+        assert opened.errors == []
