@@ -41,6 +41,7 @@ FILES = {
             "light.js",
             "page.js",
             "stage.js",
+            "view.js",
             "vendor/three.core.min.js",
             "vendor/three.module.min.js",
             "vendor/loaders/GLTFLoader.js",

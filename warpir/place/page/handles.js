@@ -142,15 +142,15 @@ export class Handles {
     const foot = project(camera, stance, [stand.x, 0, stand.z]);
     if (name === 'pitch') return shifted(before, dv);
     if (name === 'roll' || name === 'tilt') {
-      // The middle of the horizon stays; this end follows the pointer.
-      const [row, middle] = [horizonRow(camera, stance, from[0]), camera.width / 2];
+      // The middle of what is seen of the horizon stays; this end follows the pointer.
+      const [row, { middle }] = [horizonRow(camera, stance, from[0]), this];
       const ends = [[middle, horizonRow(camera, stance, middle)], [from[0], row + dv]];
       return withCamera(before, camera, levelled(camera, stance, ...ends));
     }
     if (name === 'fov') {
       // What is under the pointer goes with it: away from the principal point the view narrows.
-      const reach = Math.abs(from[0] - camera.cx);
-      const factor = Math.max((reach + du * Math.sign(from[0] - camera.cx)) / reach, 0.1);
+      const reach = Math.max(Math.abs(from[0] - camera.cx), camera.width / 10);
+      const factor = Math.max((reach + du * (from[0] < camera.cx ? -1 : 1)) / reach, 0.1);
       const fx = Math.min(Math.max(camera.fx * factor, camera.width / 20), camera.width * 20);
       const changed = zoomed(camera, stance, fx);
       return withCamera(before, changed.camera, changed.stance);
@@ -178,14 +178,15 @@ export class Handles {
     return u > left - slack && u < right + slack && v > top - slack && v < bottom + slack;
   }
 
-  draw(state) {
+  // `seen` is the part of the photo that is shown, in its pixels.
+  draw(state, seen) {
     const { camera, stance, stand, turn, size } = state;
-    const box = this.stage.getBoundingClientRect();
-    this.scale = box.width / camera.width;
+    this.scale = this.stage.getBoundingClientRect().width / camera.width;
+    this.middle = seen.x + seen.width / 2;
     const onStage = (pixel) => pixel && pixel.map((part) => part * this.scale);
-    const inside = ([x, y]) => [
-      Math.min(Math.max(x, RIM), box.width - RIM), Math.min(Math.max(y, RIM), box.height - RIM),
-    ];
+    const low = [seen.x, seen.y].map((part) => part * this.scale + RIM);
+    const high = [seen.x + seen.width, seen.y + seen.height].map((part) => part * this.scale - RIM);
+    const inside = (at) => at.map((part, k) => Math.min(Math.max(part, low[k]), high[k]));
     const put = (name, pixel) => {
       this.knobs[name].style.display = pixel ? '' : 'none';
       if (pixel) this.knobs[name].setAttribute('transform', `translate(${inside(pixel)})`);
@@ -194,7 +195,10 @@ export class Handles {
       for (const part of ['rim', 'line', 'hit']) line[part].setAttribute('d', path);
     };
 
-    const level = (share) => onStage([share * camera.width, horizonRow(camera, stance, share * camera.width)]);
+    const level = (share) => {
+      const u = seen.x + share * seen.width;
+      return onStage([u, horizonRow(camera, stance, u)]);
+    };
     draw(this.horizon, `M${level(0)}L${level(1)}`);
     put('pitch', level(0.5));
     put('fov', level(0.76));

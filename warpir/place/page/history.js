@@ -29,8 +29,10 @@ export class History {
     this.page.begun();
   }
 
-  // Replace the state by a change of that at the gesture's beginning; null changes nothing.
+  // Replace the state by a change of that at the gesture's beginning; null changes nothing. Nor
+  // does a gesture that was cancelled meanwhile.
   move(change) {
+    if (!this.isOn) return;
     const next = change(this.#before);
     if (!next) return;
     this.#show(next);
@@ -38,6 +40,7 @@ export class History {
   }
 
   end(name = '') {
+    if (!this.isOn) return;
     if (this.#past.at(-1) === this.state) this.#past.pop();
     else this.#future = [];
     this.#before = null;

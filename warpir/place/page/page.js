@@ -5,6 +5,7 @@ import { Handles, shifted, stoodAt, withCamera } from './handles.js';
 import { History } from './history.js';
 import { Dial, Lighting, photoPixels } from './light.js';
 import { Stage } from './stage.js';
+import { View } from './view.js';
 
 const $ = (id) => document.getElementById(id);
 
@@ -13,6 +14,7 @@ export const stage = new Stage($('canvas'));
 export let state;
 let spacing = 1;
 let isDue = false;
+let seen; // part of the photo that the room shows, in its pixels
 
 const lighting = new Lighting(start, await photoPixels($('photo')), {
   get state() {
@@ -37,7 +39,7 @@ const once = (name, change) => history.once(name, change);
 state = history.state;
 const fields = new Fields(start, lighting, history);
 const dial = new Dial($('dial'), lighting, history);
-const handles = new Handles($('handles'), $('stage'), start.asset, history);
+export const handles = new Handles($('handles'), $('stage'), start.asset, history);
 
 // Send values to warpir; returns its answer. The error's message is for the user.
 async function post(address, values) {
@@ -71,7 +73,7 @@ function draw() {
     stage.setObject(state.stand, state.turn, state.size);
     stage.setLight(lighting.onStage(state));
     const more = stage.render();
-    handles.draw(state);
+    handles.draw(state, seen);
     handles.say(fields.spoken(state));
     fields.show(state);
     dial.draw(state);
@@ -107,16 +109,6 @@ function readOut() {
   $('readout').hidden = false;
 }
 
-function fit() {
-  const room = $('room').getBoundingClientRect();
-  const { width, height: tall } = start.photo;
-  const scale = Math.min(room.width / width, room.height / tall);
-  const [w, h] = [width * scale, tall * scale];
-  Object.assign($('stage').style, { width: `${w}px`, height: `${h}px`, left: `${(room.width - w) / 2}px`, top: `${(room.height - h) / 2}px` });
-  stage.resize(w, h, Math.min(window.devicePixelRatio, 2));
-  draw();
-}
-
 // A choice of skies.
 const skies = document.createElement('select');
 skies.id = 'sky';
@@ -131,12 +123,22 @@ $('keep-light').addEventListener('change', ({ target }) => once('keep', (before)
 // ------------------------------------------------------------------------ pointer, wheel and keys
 
 const canvas = $('canvas');
-canvas.addEventListener('pointerdown', (event) => {
-  if (handles.isOnObject(event)) handles.drag(event, canvas, 'foot');
+const view = new View($('room'), $('stage'), canvas, start.photo, {
+  changed: (part, [width, height]) => {
+    seen = part;
+    stage.setWindow(part, width, height, Math.min(window.devicePixelRatio, 2));
+    $('zoom-fit').textContent = `${Math.round(100 * view.scale)} %`;
+    draw();
+  },
+  pressed: (event) => history.isOn || (handles.isOnObject(event) && handles.drag(event, canvas, 'foot')),
+  cancel: () => history.cancel(),
 });
+$('zoom-in').addEventListener('click', () => view.step(1));
+$('zoom-out').addEventListener('click', () => view.step(-1));
+$('zoom-fit').addEventListener('click', () => view.fit());
 canvas.addEventListener('pointermove', (event) => canvas.classList.toggle('grabs', Boolean(handles.isOnObject(event))));
 canvas.addEventListener('dblclick', (event) => {
-  const box = canvas.getBoundingClientRect();
+  const box = $('stage').getBoundingClientRect();
   const scale = start.photo.width / box.width;
   once('double click', (before) => stoodAt(before, (event.clientX - box.left) * scale, (event.clientY - box.top) * scale));
 });
@@ -164,6 +166,10 @@ const KEYS = {
   '-': (by) => sized(1.03 ** -by), _: (by) => sized(1.03 ** -by), w: (by) => lifted(-0.01 * by), s: (by) => lifted(0.01 * by),
   a: (by) => tilted(0.5 * by), d: (by) => tilted(-0.5 * by),
 };
+const VIEWS = {
+  z: () => view.step(1), x: () => view.step(-1), 0: () => view.fit(),
+  i: () => view.pan(0, -1), k: () => view.pan(0, 1), j: () => view.pan(-1, 0), l: () => view.pan(1, 0),
+};
 // A handle that has the focus gives the arrows its own meaning, right that of up and left of down.
 const ON_HANDLE = { pitch: ['w', 's'], roll: ['a', 'd'], tilt: ['d', 'a'], turn: ['q', 'e'], size: ['+', '-'] };
 const UP_DOWN = { arrowup: 0, arrowright: 0, arrowdown: 1, arrowleft: 1 };
@@ -187,6 +193,8 @@ window.addEventListener('keydown', (event) => {
     once('fov key', (before) => fields.byName.fov.set(before, clamp(fields.byName.fov.get(before) * factor, fields.byName.fov.low, fields.byName.fov.high)));
   } else if (key === 'g') {
     $('guides').click();
+  } else if (VIEWS[key]) {
+    VIEWS[key]();
   } else {
     const change = KEYS[ON_HANDLE[handle]?.[UP_DOWN[key]] ?? key];
     if (!change) return;
@@ -259,7 +267,7 @@ try {
   await stage.load('asset.glb', start.asset);
   $('loading').hidden = true;
   $('save').disabled = false;
-  new ResizeObserver(fit).observe($('room'));
+  new ResizeObserver(() => view.show()).observe($('room'));
 } catch (error) {
   $('loading').textContent = `The object cannot be shown: ${error.message}`;
 }

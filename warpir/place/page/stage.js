@@ -133,7 +133,9 @@ export class Stage {
     this.#prepareSky(glb.scene);
   }
 
-  resize(width, height, ratio) {
+  // Show a part of the photo, in its pixels, at a size on the screen.
+  setWindow(seen, width, height, ratio) {
+    this.window = seen;
     this.renderer.setPixelRatio(ratio);
     this.renderer.setSize(width, height, false);
   }
@@ -283,7 +285,9 @@ export class Stage {
     const { camera, height } = this.view;
     const near = Math.max(Math.min(0.05 * height, 0.5 * (away - this.radius)), 1e-3 * height);
     const far = 2 * GRID_REACH * height + 2 * (Math.abs(away) + this.radius);
-    this.camera.projectionMatrix.fromArray(projection(camera, near, far));
+    const { x, y, width, height: rows } = this.window;
+    const seen = { ...camera, width, height: rows, cx: camera.cx - x, cy: camera.cy - y };
+    this.camera.projectionMatrix.fromArray(projection(seen, near, far));
     this.camera.projectionMatrixInverse.copy(this.camera.projectionMatrix).invert();
     this.#aimSun();
     this.renderer.render(this.scene, this.camera);

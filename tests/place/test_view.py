@@ -1,0 +1,151 @@
+"""Zoom and pan of the placing page."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from tests.builders.programs.browser import Fingers, Opened, needs_chromium, open_browser
+from tests.builders.programs.placing import (
+    STATE,
+    command,
+    drag,
+    handle_at,
+    open_page,
+    serve,
+    settle,
+)
+
+FOOT_ON_CANVAS = """import('./page.js').then(async ({ stage, state }) => {
+  const { Vector3 } = await import('three');
+  const at = new Vector3(state.stand.x, 0, state.stand.z);
+  at.applyMatrix4(stage.camera.matrixWorldInverse).applyMatrix4(stage.camera.projectionMatrix);
+  const box = document.getElementById('canvas').getBoundingClientRect();
+  return [box.left + (at.x + 1) / 2 * box.width, box.top + (1 - at.y) / 2 * box.height];
+})"""
+"""Where the canvas draws the object's foot, in pixels of the window."""
+
+
+def photo_box(opened: Opened) -> tuple[float, float, float, float]:
+    """Left, top, width and height of the photo, in pixels of the window."""
+    box = opened.page.locator("#photo").bounding_box()
+    assert box is not None
+    return box["x"], box["y"], box["width"], box["height"]
+
+
+def share_at(opened: Opened, x: float, y: float) -> list[float]:
+    """Where in the photo a point of the window lies, as shares of its sides."""
+    left, top, width, height = photo_box(opened)
+    return [(x - left) / width, (y - top) / height]
+
+
+def check_agreement(opened: Opened) -> None:
+    """The canvas and the handles show the foot at one place."""
+    settle(opened)
+    drawn = opened.page.evaluate(FOOT_ON_CANVAS)
+    assert drawn == pytest.approx(handle_at(opened, "foot"), abs=0.6)
+
+
+@needs_chromium
+@pytest.mark.slow
+def test_page_zooms_where_the_pointer_is(inputs: Path, tmp_path: Path) -> None:
+    """What is under the pointer stays there; placing goes on at any zoom; undo leaves it alone."""
+    with serve(command(inputs, tmp_path / "out")) as served, open_browser(1000, 640) as opened:
+        page = opened.page
+        open_page(opened, served)
+        before, whole = page.evaluate(STATE), photo_box(opened)
+        check_agreement(opened)
+        x, y = handle_at(opened, "foot")
+        share = share_at(opened, x + 30.0, y + 20.0)
+        page.mouse.move(x + 30.0, y + 20.0)
+        page.mouse.wheel(0, -600)
+        settle(opened)
+        zoomed = photo_box(opened)
+        assert zoomed[2] > 2.0 * whole[2]
+        assert share_at(opened, x + 30.0, y + 20.0) == pytest.approx(share, abs=1e-3)
+        check_agreement(opened)
+        assert page.evaluate(STATE) == before
+        # The foot follows the pointer, and the photo stays.
+        x, y = handle_at(opened, "foot")
+        drag(opened, "foot", (40.0, 15.0))
+        assert handle_at(opened, "foot") == pytest.approx((x + 40.0, y + 15.0), abs=0.6)
+        assert photo_box(opened) == zoomed
+        page.keyboard.press("Control+z")
+        settle(opened)
+        assert page.evaluate(STATE) == before and photo_box(opened) == zoomed
+        # Beside the object the photo is dragged, never past its edge.
+        room = page.locator("#room").bounding_box()
+        assert room is not None
+        page.mouse.move(40.0, 40.0)
+        page.mouse.down()
+        page.mouse.move(100.0, 60.0)
+        page.mouse.up()
+        settle(opened)
+        panned = photo_box(opened)
+        assert panned[0] - zoomed[0] == pytest.approx(min(60.0, room["x"] - zoomed[0]), abs=0.6)
+        assert panned[0] <= room["x"] + 0.5
+        assert page.evaluate(STATE) == before
+        check_agreement(opened)
+        page.keyboard.press("0")
+        settle(opened)
+        assert photo_box(opened) == pytest.approx(whole, abs=0.5)
+        # Keys; the closest is 16 times.
+        for key in ("z", "z", "l", "k"):
+            page.keyboard.press(key)
+        settle(opened)
+        assert photo_box(opened)[2] == pytest.approx(whole[2] * 1.25**2, rel=1e-3)
+        for _ in range(20):
+            page.keyboard.press("z")
+        settle(opened)
+        assert photo_box(opened)[2] == pytest.approx(16.0 * whole[2], rel=1e-3)
+        for _ in range(20):
+            page.click("#zoom-out")
+        settle(opened)
+        assert photo_box(opened) == pytest.approx(whole, abs=0.5)
+        assert page.evaluate(STATE) == before
+        assert opened.errors == []
+
+
+@needs_chromium
+@pytest.mark.slow
+def test_fingers_zoom_and_do_not_move_the_object(inputs: Path, tmp_path: Path) -> None:
+    """A pinch whose first finger was on the object zooms, and takes back what that had moved."""
+    argv = command(inputs, tmp_path / "out", "--size", "4")
+    with serve(argv) as served, open_browser(390, 844) as opened:
+        page = opened.page
+        open_page(opened, served)
+        before, whole = page.evaluate(STATE), photo_box(opened)
+        bounds = "import('./page.js').then(({ handles }) => [handles.bounds, handles.scale])"
+        (left, top, right, bottom), scale = page.evaluate(bounds)
+        # Beside the knobs, which go on with what they do whatever other fingers touch.
+        x, y = (
+            whole[0] + scale * (0.2 * left + 0.8 * right),
+            whole[1] + scale * (top + bottom) / 2.0,
+        )
+        fingers = Fingers(page)
+        fingers.press(0, x, y)
+        fingers.move(0, x - 8.0, y)
+        assert page.evaluate(STATE)["stand"] != before["stand"]
+        fingers.press(1, x + 40.0, y)
+        share = share_at(opened, x + 16.0, y)
+        fingers.move(1, x + 88.0, y)
+        fingers.lift(1)
+        fingers.lift(0)
+        settle(opened)
+        assert page.evaluate(STATE) == before
+        zoomed = photo_box(opened)
+        assert zoomed[2] == pytest.approx(2.0 * whole[2], rel=0.02)
+        assert share_at(opened, x + 40.0, y) == pytest.approx(share, abs=0.01)
+        check_agreement(opened)
+        # One finger beside the object pans.
+        fingers.press(0, 20.0, 40.0)
+        fingers.move(0, 60.0, 40.0)
+        fingers.lift(0)
+        settle(opened)
+        assert photo_box(opened)[0] > zoomed[0] + 5.0
+        assert page.evaluate(STATE) == before
+        assert page.is_disabled("#undo")
+        page.click("#zoom-fit")
+        settle(opened)
+        assert np.allclose(photo_box(opened), whole, atol=0.5)
+        assert opened.errors == []
