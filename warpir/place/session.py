@@ -251,16 +251,17 @@ def sent_camera(session: Session, sent: Mapping[str, Any]) -> Camera:
 
     Args:
         session: Session of the page.
-        sent: ``fx`` and ``fy`` [px], and ``stance`` (`Stance.record`).
+        sent: ``fx``, ``fy``, ``cx`` and ``cy`` [px], and ``stance`` (`Stance.record`).
 
     Raises:
         InputError: Numbers out of range.
     """
     stance = Stance(*(number(PAGE, sent.get("stance"), f.name) for f in fields(Stance)))
-    fx, fy = (number(PAGE, sent, name) for name in ("fx", "fy"))
+    fx, fy, cx, cy = (number(PAGE, sent, name) for name in ("fx", "fy", "cx", "cy"))
     if min(fx, fy, stance.height) <= 0.0:
         raise InputError(PAGE, "camera height and focal length must be more than 0")
-    return replace(session.camera, fx=fx, fy=fy, c2w=session.frame @ stance.c2w())
+    pose = session.frame @ stance.c2w()
+    return replace(session.camera, fx=fx, fy=fy, cx=cx, cy=cy, c2w=pose)
 
 
 def placement_files(

@@ -56,7 +56,21 @@ export function stoodAt(before, u, v) {
   return { ...before, stand: { x: point[0], z: point[1] } };
 }
 
-export const shifted = (before, rows) => withCamera(before, before.camera, lowered(before.camera, before.stance, rows));
+// The same with the horizon some rows lower: of an upright photo by its principal point.
+export function shifted(before, rows) {
+  const { camera, stance } = before;
+  if (before.isUpright) return withCamera(before, { ...camera, cy: camera.cy + rows }, stance);
+  return withCamera(before, camera, lowered(camera, stance, rows));
+}
+
+// The same with the horizon through two pixels.
+function tilted(before, one, other) {
+  const { camera, stance } = before;
+  const changed = levelled(camera, stance, one, other);
+  if (!before.isUpright) return withCamera(before, camera, changed);
+  const level = { ...stance, roll: changed.roll };
+  return withCamera(before, { ...camera, cy: camera.cy + one[1] - horizonRow(camera, level, one[0]) }, level);
+}
 
 // Let an element follow the pointer that was pressed on it; returns whether it does. Other buttons
 // do nothing, nor do other fingers while a gesture goes on.
@@ -144,8 +158,7 @@ export class Handles {
     if (name === 'roll' || name === 'tilt') {
       // The middle of what is seen of the horizon stays; this end follows the pointer.
       const [row, { middle }] = [horizonRow(camera, stance, from[0]), this];
-      const ends = [[middle, horizonRow(camera, stance, middle)], [from[0], row + dv]];
-      return withCamera(before, camera, levelled(camera, stance, ...ends));
+      return tilted(before, [middle, horizonRow(camera, stance, middle)], [from[0], row + dv]);
     }
     if (name === 'fov') {
       // What is under the pointer goes with it: away from the principal point the view narrows.

@@ -4,6 +4,7 @@ import { Fields, clamp, fromPolar, plain, polar, wrapped } from './fields.js';
 import { Handles, shifted, stoodAt, withCamera } from './handles.js';
 import { History } from './history.js';
 import { Dial, Lighting, photoPixels } from './light.js';
+import { Lines } from './lines.js';
 import { Stage } from './stage.js';
 import { View } from './view.js';
 
@@ -24,7 +25,7 @@ const lighting = new Lighting(start, await photoPixels($('photo')), {
   ask: (camera) => post('light', sentCamera(camera)),
 });
 const { camera, stance, stand, rotate_y: turn, size } = start;
-const history = new History({ camera, stance, stand, turn, size, light: lighting.opening() }, {
+const history = new History({ camera, stance, stand, turn, size, light: lighting.opening(), lines: null, isUpright: looksUpright() }, {
   show,
   begun: () => $('stage').classList.add('dragging'),
   moved: readOut,
@@ -35,10 +36,19 @@ const history = new History({ camera, stance, stand, turn, size, light: lighting
     $('redo').disabled = !canRedo;
   },
 });
+// Whether the photo's own camera is level and yet sees the horizon off the middle.
+function looksUpright() {
+  return Math.abs(stance.pitch) < 0.5 && Math.abs(camera.cy / camera.height - 0.5) > 0.02;
+}
+
 const once = (name, change) => history.once(name, change);
 state = history.state;
 const fields = new Fields(start, lighting, history);
 const dial = new Dial($('dial'), lighting, history);
+const lines = new Lines($('handles'), $('stage'), history, {
+  toggle: $('lines'), upright: $('upright'), options: $('axes'), words: $('lines-words'),
+  axes: { a: $('axis-a'), b: $('axis-b'), c: $('axis-c') },
+});
 export const handles = new Handles($('handles'), $('stage'), start.asset, history);
 
 // Send values to warpir; returns its answer. The error's message is for the user.
@@ -74,6 +84,7 @@ function draw() {
     stage.setLight(lighting.onStage(state));
     const more = stage.render();
     handles.draw(state, seen);
+    lines.draw(state);
     handles.say(fields.spoken(state));
     fields.show(state);
     dial.draw(state);
@@ -226,8 +237,8 @@ $('copy').addEventListener('click', async () => {
 });
 
 // What warpir/place/session.py reads.
-function sentCamera({ camera: { fx, fy }, stance: pose }) {
-  return { fx, fy, stance: pose };
+function sentCamera({ camera: { fx, fy, cx, cy }, stance: pose }) {
+  return { fx, fy, cx, cy, stance: pose };
 }
 
 function sentPlacement(now) {
