@@ -1,0 +1,72 @@
+"""The look stage end to end: all of it off leaves no trace, and each part reaches the picture."""
+
+import json
+from pathlib import Path
+
+import numpy as np
+import OpenImageIO as oiio
+import pytest
+from scipy import ndimage
+
+from tests.builders.insertions import arguments, go, read_image, read_layers, rgb
+from tests.builders.outcome import outcome
+from warpir.look.camera_look import CameraLook
+
+OFF = {"response": "off", "sharpness": "off", "grain": "off"}
+
+
+def write_photographed(path: Path, bits: int) -> None:
+    """Write turned squares from black to white behind a blur of 1 px and two codes of grain."""
+    rng = np.random.default_rng(4)
+    y, x = np.mgrid[0:96, 0:144]
+    scene = np.full(y.shape, 0.2)
+    for value in (0.0, 0.002, 0.02, 0.3, 0.6, 0.05, 0.0, 0.8):
+        turn, (cy, cx) = rng.uniform(0.0, np.pi), rng.uniform(0.1, 0.9, 2) * y.shape
+        across = (x - cx) * np.cos(turn) + (y - cy) * np.sin(turn)
+        along = (y - cy) * np.cos(turn) - (x - cx) * np.sin(turn)
+        scene[(np.abs(across) < 16) & (np.abs(along) < 16)] = value
+    shown = np.repeat(ndimage.gaussian_filter(scene, 1.0)[..., None], 3, axis=2) ** (1 / 2.2)
+    shown += 2.0 / 255.0 * rng.normal(size=shown.shape)
+    codes = np.round((2**bits - 1) * np.clip(shown, 0.0, 1.0))
+    buffer = oiio.ImageBuf(codes.astype(np.uint8 if bits == 8 else np.uint16))
+    assert buffer.write(str(path)), buffer.geterror()
+
+
+@pytest.mark.parametrize("bits", [8, 16])
+def test_all_off_gives_the_bytes_of_a_run_without_the_stage(
+    inputs: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, device: str, bits: int
+) -> None:
+    """Every file is that of a program that has no such stage; untouched pixels keep their codes."""
+    photo = tmp_path / "photo.png"
+    write_photographed(photo, bits)
+    words = {"photo": str(photo), "device": device}
+    (tmp_path / "auto").mkdir()
+    auto = go(arguments(inputs, tmp_path / "auto" / "out", **words), tmp_path / "auto" / "out")
+    outcomes = []
+    for name in ("off", "without"):
+        (tmp_path / name).mkdir()
+        monkeypatch.chdir(tmp_path / name)
+        with monkeypatch.context() as patch:
+            if name == "without":
+                patch.setattr("warpir.report.result.estimate_look", lambda *_: CameraLook())
+                for step in ("sharpened_like_photo", "shown_like_photo"):
+                    patch.setattr(CameraLook, step, lambda _, planes, *__: planes)
+                patch.setattr(CameraLook, "grain_on", lambda *_: None)
+            go(arguments(inputs, "out", **words, **OFF), Path("out"))
+        outcomes.append(outcome(Path("out")))
+    assert outcomes[0] == outcomes[1]
+    # The stage would have changed this picture, by all of its parts.
+    look = auto.record["measured"]["look"]
+    assert look["blur"]["sigma"] > 0.8 and look["response"]["exponent"] != 1.0
+    assert max(max(level) for level in look["grain"]["strength"]) > 1.0 / 255.0
+    record = json.loads((tmp_path / "off" / "out" / "run.json").read_text())
+    assert record["measured"]["look"] == {"blur": None, "grain": None}
+    before = read_image(photo)[0]
+    for folder in ("auto", "off"):
+        codes = read_image(tmp_path / folder / "out" / "composite.png")[0]
+        assert codes.dtype == before.dtype == (np.uint8 if bits == 8 else np.uint16)
+        planes = read_layers(tmp_path / folder / "out" / "layers.exr")
+        same = (planes["matte.A"] == 0.0) & (rgb(planes, "shadow.") == 1.0).all(axis=-1)
+        assert 2000 < same.sum() < same.size - 500
+        np.testing.assert_array_equal(codes[same], before[same])
+    assert (codes != auto.image()).any(axis=-1).sum() > 500
