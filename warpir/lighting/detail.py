@@ -34,9 +34,9 @@ class Detail:
     """What the photo shows of the directions round a point."""
 
     radiance: FloatArray
-    """World frame, relative [W/(m^2 sr)], shape [HEIGHT, 2 HEIGHT, 3]."""
+    """World frame, relative [W/(m^2 sr)], shape [He, 2 He, 3]."""
     weight: FloatArray
-    """1 where the photo shows it, 0 where not, shape [HEIGHT, 2 HEIGHT]."""
+    """1 where the photo shows it, 0 where not, shape [He, 2 He]."""
 
     @property
     def seen(self) -> float:
@@ -45,17 +45,18 @@ class Detail:
         return float((self.weight * omega).sum() / (4.0 * np.pi))
 
 
-def detail_of(inputs: Inputs, curves: Curves) -> Detail:
+def detail_of(inputs: Inputs, curves: Curves, height: int = HEIGHT) -> Detail:
     """Return what the photo shows round the object's centre.
 
     Args:
         inputs: Photo, camera, asset and placement.
         curves: What turns radiance into the photo's values; inverted here.
+        height: Rows of the map.
     """
     low, high = inputs.asset.bounds()
     centre = inputs.placement.asset_to_world @ np.append((low + high) / 2.0, 1.0)
     radiance = photo_radiance(inputs.photo, curves)
-    return seen_from(centre[:3], radiance, inputs.camera, inputs.placement.ground)
+    return seen_from(centre[:3], radiance, inputs.camera, inputs.placement.ground, height)
 
 
 def with_detail(light: Light, detail: Detail) -> Light:
@@ -67,14 +68,19 @@ def with_detail(light: Light, detail: Detail) -> Light:
         light: What lights the object.
         detail: Of the same frame and exposure.
     """
-    whole = as_map(light, HEIGHT)
-    rest = np.minimum(as_map(without_lamps(light), HEIGHT), whole)
+    height = detail.weight.shape[0]
+    whole = as_map(light, height)
+    rest = np.minimum(as_map(without_lamps(light), height), whole)
     weight = detail.weight[..., None]
     return Light(texels=whole - rest + weight * detail.radiance + (1.0 - weight) * rest)
 
 
 def seen_from(
-    viewpoint: Float64Array, radiance: FloatArray, camera: Camera, ground: Float64Array
+    viewpoint: Float64Array,
+    radiance: FloatArray,
+    camera: Camera,
+    ground: Float64Array,
+    height: int = HEIGHT,
 ) -> Detail:
     """Look round at a point and find what of it is in a photo.
 
@@ -86,8 +92,9 @@ def seen_from(
         radiance: The photo before its tone curve, shape [H, W, 3].
         camera: At the photo's resolution.
         ground: Plane (a, b, c, d), unit normal on the camera's side, shape [4].
+        height: Rows of the map.
     """
-    rays = map_directions(HEIGHT, 2 * HEIGHT)
+    rays = map_directions(height, 2 * height)
     above = float(ground[:3] @ viewpoint + ground[3])
     slope = rays @ ground[:3]
     below = (slope < 0.0) & (above > 0.0)
@@ -103,13 +110,13 @@ def seen_from(
     weight = np.where(ahead, share * share * (3.0 - 2.0 * share), 0.0)
     seen = weight > 0.0
     shown = np.zeros((*weight.shape, 3), np.float32)
-    shown[seen] = _look_up(_texel_sized(radiance, camera), u[seen], v[seen], camera)
+    shown[seen] = _look_up(_texel_sized(radiance, camera, height), u[seen], v[seen], camera)
     return Detail(shown, weight.astype(np.float32))
 
 
-def _texel_sized(radiance: FloatArray, camera: Camera) -> FloatArray:
+def _texel_sized(radiance: FloatArray, camera: Camera, rows: int) -> FloatArray:
     """Average the photo until a pixel in its middle is as large as a texel of the map."""
-    scale = HEIGHT / np.pi / camera.fx
+    scale = rows / np.pi / camera.fx
     if scale >= 1.0:
         return radiance
     height, width = (max(2, round(side * scale)) for side in radiance.shape[:2])

@@ -1,16 +1,19 @@
-"""Answers to what the page sends: a light for its camera, a saved placement."""
+"""Answers to what the page sends: a light for its camera, a saved placement, a picture."""
 
 from __future__ import annotations
 
 import json
 import shlex
+import threading
 from collections.abc import Callable
 from functools import partial
+from pathlib import Path
 from typing import Any
 
 from warpir.app.config import InsertConfig
 from warpir.app.program import say
 from warpir.core.strict_json import parse_json_object
+from warpir.place.renderings import Renderings
 from warpir.place.session import (
     PAGE,
     PlacementFolder,
@@ -39,6 +42,7 @@ class Answers:
         self.folder = folder
         self.asked = config.flat()
         self.worker = Worker()
+        self.renderings = Renderings(self.worker)
         start = partial(start_record, session, config.light, str(config.output.out))
         self.contents: dict[str, Callable[[], bytes]] = {
             "start.json": lambda: json.dumps(start(), allow_nan=False).encode(),
@@ -49,17 +53,26 @@ class Answers:
         self.posts: dict[str, Callable[[bytes], dict[str, Any]]] = {
             "save": self.save,
             "light": self.light,
+            "preview": self.preview,
+            "insert": self.insert,
+            "cancel": lambda _: self.renderings.cancel(),
         }
         """What is called with what the page sends, by address."""
 
     def close(self) -> None:
         """End what still works for the page."""
+        self.renderings.close()
         self.worker.stop()
+
+    def file(self, name: str) -> bytes | None:
+        """Return what changes while the page is open, by its address: progress and pictures."""
+        if name == "progress.json":
+            return json.dumps(self.renderings.progress()).encode()
+        return self.renderings.file(name)
 
     def save(self, body: bytes) -> dict[str, Any]:
         """Write the placement that the page sends; print and return the command that uses it."""
-        sent = parse_json_object(PAGE, body)
-        path = self.folder.write(placement_files(self.session, self.asked, sent))
+        path = self.folder.write(self._files(body))
         command = f"python -m warpir.insert --config {shlex.quote(str(path))}"
         say(f"saved: {path}")
         say(command)
@@ -69,4 +82,19 @@ class Answers:
         """Estimate the light that the photo shows, by the camera that the page sends."""
         camera = sent_camera(self.session, parse_json_object(PAGE, body))
         config = kept_values(self.asked)
-        return self.worker.ask({"kind": "light", "config": config, "camera": camera.record()})
+        found = self.worker.ask({"kind": "light", "config": config, "camera": camera.record()})
+        threading.Thread(target=self.renderings.warm_up, daemon=True).start()
+        return found
+
+    def preview(self, body: bytes) -> dict[str, Any]:
+        """Begin a preview of the placement that the page sends."""
+        return self.renderings.preview(self._files(body))
+
+    def insert(self, body: bytes) -> dict[str, Any]:
+        """Save the placement that the page sends, and begin its insertion."""
+        saved = self.save(body)
+        return {**saved, **self.renderings.insert(Path(saved["file"]), self.folder.overwrite)}
+
+    def _files(self, body: bytes) -> dict[str, dict[str, Any]]:
+        sent = parse_json_object(PAGE, body)
+        return placement_files(self.session, self.asked, sent)

@@ -103,7 +103,7 @@ def _run(arguments: list[str]) -> int:
     with ExitStack() as until_end:
         answers = Answers(session, folder, config)
         until_end.callback(answers.close)
-        server = PlaceServer(port, answers.contents, answers.posts, once=once)
+        server = PlaceServer(port, answers.contents, answers.posts, answers.file, once=once)
         until_end.enter_context(server)
         say(f"page: {server.address}")
         if not once:

@@ -21,6 +21,7 @@ from typing import Any
 
 from warpir.app.config import usage
 from warpir.core.errors import InputError
+from warpir.place.renderings import policy_of
 from warpir.report.html import source_hash
 
 HOST = "127.0.0.1"
@@ -41,6 +42,7 @@ FILES = {
             "light.js",
             "lines.js",
             "page.js",
+            "pictures.js",
             "stage.js",
             "vanishing.js",
             "view.js",
@@ -58,6 +60,7 @@ KINDS = {
     "js": "text/javascript; charset=utf-8",
     "svg": "image/svg+xml",
     "jpg": "image/jpeg",
+    "png": "image/png",
     "glb": "model/gltf-binary",
     "json": "application/json",
 }
@@ -73,6 +76,8 @@ class PlaceServer(ThreadingHTTPServer):
         answers: By address, what is called with the bytes that the page sends there and returns the
             answer, in a thread of each request's own. ``save`` is among them; it is called while
             nothing else is read, built or saved. Each raises `InputError`.
+        changing: Returns a file that may be another one the next time, by its address; None where
+            there is none.
         once: Whether the first placement that was saved ends `serve_forever`.
 
     Raises:
@@ -86,6 +91,7 @@ class PlaceServer(ThreadingHTTPServer):
         port: int,
         contents: Mapping[str, Callable[[], bytes]],
         answers: Mapping[str, Callable[[bytes], dict[str, Any]]],
+        changing: Callable[[str], bytes | None] = lambda _: None,
         once: bool = False,
     ) -> None:
         try:
@@ -95,6 +101,7 @@ class PlaceServer(ThreadingHTTPServer):
             raise usage("--port", what, "leave it out for any that is free") from None
         self.token = secrets.token_urlsafe(24)
         self.answers = dict(answers)
+        self.changing = changing
         self.once = once
         self.working = threading.Lock()
         """Held while files are read, built or saved."""
@@ -149,10 +156,15 @@ class _Handler(BaseHTTPRequestHandler):
         if name is None:
             return
         content = self.server.content(name)
+        policy = self.server.policy
+        if content is None:
+            content = self.server.changing(name)
+            policy = policy_of(content or b"") or policy
         if content is None:
             self._refuse(404)
-        else:
-            self._answer(200, KINDS[FILES.get(name, name).rpartition(".")[2]], content)
+            return
+        suffix = FILES.get(name, name).rpartition(".")[2]
+        self._answer(200, KINDS.get(suffix, "application/octet-stream"), content, policy)
 
     def do_POST(self) -> None:
         name = self._name()
@@ -190,12 +202,12 @@ class _Handler(BaseHTTPRequestHandler):
     def _refuse(self, status: int) -> None:
         self._answer(status, "text/plain", b"")
 
-    def _answer(self, status: int, kind: str, content: bytes) -> None:
+    def _answer(self, status: int, kind: str, content: bytes, policy: str = "") -> None:
         self.send_response(status)
         headers = {
             "Content-Type": kind,
             "Content-Length": str(len(content)),
-            "Content-Security-Policy": self.server.policy,
+            "Content-Security-Policy": policy or self.server.policy,
             "X-Content-Type-Options": "nosniff",
             "Referrer-Policy": "no-referrer",
             "Cross-Origin-Resource-Policy": "same-origin",

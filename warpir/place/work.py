@@ -15,13 +15,17 @@ import sys
 from collections.abc import Callable, Mapping
 from dataclasses import replace
 from functools import lru_cache
+from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from PIL import Image
 
 from warpir.app.command import read_values
 from warpir.app.config import InsertConfig, flag
+from warpir.app.inputs import Inputs, Loaders, read_inputs
 from warpir.app.program import explain
+from warpir.core.arrays import FloatArray
 from warpir.core.errors import InputError
 from warpir.io.images.photos import Photo, read_photo
 from warpir.scene.camera import Camera
@@ -33,6 +37,11 @@ if TYPE_CHECKING:
 CLEAR_DEG = 40.0
 """Expected angle to the truth up to which a direction of the light counts as seen [deg]: that of a
 network that sees nothing is 65, an even distribution over its directions."""
+
+PREVIEW_SAMPLES, PREVIEW_DEPTH, PREVIEW_LIMIT = 12, 3, 8.0
+"""Samples per pixel, longest light path, and most radiance after its first bounce of a preview."""
+PREVIEW_ROWS = 160
+"""Rows of its map of what the photo shows of the surroundings."""
 
 Say = Callable[[dict[str, Any]], None]
 
@@ -58,6 +67,86 @@ def estimated_light(job: Mapping[str, Any], say: Say) -> dict[str, Any]:
     photo, camera = photo_of(config), camera_of(job["camera"])
     found = regress(load_regressor(None, "cpu"), photo.srgb, camera)
     return light_record(with_visible_sun(found, photo.srgb, camera))
+
+
+def render_preview(job: Mapping[str, Any], say: Say) -> dict[str, Any]:
+    """Insert as `warpir.insert` does, at preview quality, and write the composite.
+
+    The photo is shrunk first, so that everything that follows is fast; its grain and its sharpness
+    are those of the shrunk photo.
+
+    Args:
+        job: ``config`` of a placement; ``width`` of the picture [px] and ``picture``, the PNG file
+            that is written.
+        say: Hears of the progress: ``stage``, and ``share`` of it that is done [1].
+
+    Returns:
+        ``width`` [px], ``assumed``: one line each.
+
+    Raises:
+        InputError: As `warpir.insert` refuses it.
+    """
+    from warpir.lighting.detail import detail_of, with_detail
+    from warpir.lighting.estimate import estimate_light
+    from warpir.lighting.scene_light import make_light
+    from warpir.render.composite import Quality, make_picture, scene_of
+    from warpir.render.device import choose_device
+    from warpir.render.renderer import Renderer
+
+    say({"stage": "reading", "share": 0.0})
+    config = config_of(job["config"])
+    device, tone = choose_device(config.render.device), config.tone_operator
+    inputs = shrunk(read_inputs(config, LOADERS), int(job["width"]))
+    say({"stage": "light", "share": None})
+    lit = make_light(inputs, config.light, tone)
+    if lit is None:
+        lit = estimate_light(inputs, config.light, tone, device).light
+    detail = detail_of(inputs, lit.curves, PREVIEW_ROWS)
+    lit = replace(lit, detailed=with_detail(lit.light, detail))
+    say({"stage": "picture", "share": 0.0})
+    scene = scene_of(inputs, inputs.camera, device, lit.curves)
+
+    def report(stage: str, share: float) -> None:
+        say({"stage": stage or "picture", "share": share})
+
+    picture = make_picture(
+        Renderer(scene, config.render.threads or 0, report),
+        lit.on_object,
+        lit.light_shadow,
+        inputs.photo,
+        Quality(PREVIEW_SAMPLES, 1, PREVIEW_DEPTH, config.render.seed, PREVIEW_LIMIT),
+        lit.curves.foreground,
+        lit.curves.shadow_ratio,
+        is_reinhard=lit.curves.tone == "reinhard",
+        occluder=inputs.occluder,
+    )
+    codes = np.round(np.clip(picture.image, 0.0, 1.0) * 255.0).astype(np.uint8)
+    Image.fromarray(codes).save(job["picture"], "PNG", compress_level=1)
+    return {"width": inputs.camera.width, "assumed": [*inputs.assumed, *lit.assumed]}
+
+
+def shrunk(inputs: Inputs, width: int) -> Inputs:
+    """Return the inputs with the photo, its camera and its mask at most this wide [px]."""
+    photo, camera = inputs.photo, inputs.camera
+    if camera.width <= width:
+        return inputs
+    size = width, max(1, round(width * camera.height / camera.width))
+
+    def small(plane: FloatArray) -> FloatArray:
+        return np.asarray(Image.fromarray(plane).resize(size, Image.Resampling.BOX))
+
+    def each(planes: FloatArray) -> FloatArray:
+        return np.stack([small(planes[..., k]) for k in range(3)], axis=-1)
+
+    srgb = each(photo.srgb)
+    codes = each(photo.codes) if photo.is_linear else np.round(srgb * 255.0).astype(np.uint8)
+    occluder = inputs.occluder
+    return replace(
+        inputs,
+        photo=replace(photo, codes=codes, srgb=srgb, kind="png", icc=None, jpeg=None),
+        camera=camera.scaled(*size),
+        occluder=None if occluder is None else small(occluder),
+    )
 
 
 def light_record(found: Regression) -> dict[str, Any]:
@@ -104,7 +193,22 @@ def photo_of(config: InsertConfig) -> Photo:
     return _photo(asked.photo, asked.layer, asked.alpha, asked.strict, config.limits.pixels)
 
 
-JOBS: dict[str, Callable[[Mapping[str, Any], Say], dict[str, Any]]] = {"light": estimated_light}
+def warm_up(job: Mapping[str, Any], say: Say) -> dict[str, Any]:
+    """Load what a preview needs, while nobody waits."""
+    import_module("warpir.lighting.estimate")
+    import_module("warpir.render.composite")
+    from warpir.render.device import choose_device
+
+    return {"device": choose_device(None)}
+
+
+LOADERS = Loaders()
+"""Keeps the asset between two previews."""
+JOBS: dict[str, Callable[[Mapping[str, Any], Say], dict[str, Any]]] = {
+    "light": estimated_light,
+    "preview": render_preview,
+    "warm": warm_up,
+}
 """What is answered, by the job's kind."""
 
 

@@ -6,6 +6,7 @@ It is started with the first job; to cancel a job is to end it, and the next job
 from __future__ import annotations
 
 import json
+import os
 import subprocess
 import sys
 import threading
@@ -67,5 +68,8 @@ class Worker:
                 stdout=subprocess.PIPE,
                 text=True,
                 encoding="utf-8",
+                # Its networks are small: beside other work, threads of torch wait for each other
+                # longer than they save. Warp's are its own.
+                env={"OMP_NUM_THREADS": "1", **os.environ},
             )
         return self._process

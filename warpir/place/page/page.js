@@ -5,6 +5,7 @@ import { Handles, shifted, stoodAt, withCamera } from './handles.js';
 import { History } from './history.js';
 import { Dial, Lighting, photoPixels } from './light.js';
 import { Lines } from './lines.js';
+import { Pictures } from './pictures.js';
 import { Stage } from './stage.js';
 import { View } from './view.js';
 
@@ -49,6 +50,17 @@ const lines = new Lines($('handles'), $('stage'), history, {
   toggle: $('lines'), upright: $('upright'), options: $('axes'), words: $('lines-words'),
   axes: { a: $('axis-a'), b: $('axis-b'), c: $('axis-c') },
 });
+const pictures = new Pictures({
+  preview: $('preview'), insert: $('insert'), cancel: $('cancel'), picture: $('picture'), bar: $('bar'),
+  words: $('rendering-words'), report: $('report'),
+}, {
+  get state() {
+    return state;
+  },
+  placement: sentPlacement,
+  post,
+  saved: showSaved,
+});
 export const handles = new Handles($('handles'), $('stage'), start.asset, history);
 
 // Send values to warpir; returns its answer. The error's message is for the user.
@@ -85,6 +97,7 @@ function draw() {
     const more = stage.render();
     handles.draw(state, seen);
     lines.draw(state);
+    pictures.draw(state);
     handles.say(fields.spoken(state));
     fields.show(state);
     dial.draw(state);
@@ -247,6 +260,12 @@ function sentPlacement(now) {
 
 let saved = state;
 
+function showSaved(sent, command) {
+  $('command').textContent = command;
+  $('done').hidden = false;
+  saved = sent;
+}
+
 async function save() {
   if ($('save').disabled) return;
   const sent = state;
@@ -254,9 +273,7 @@ async function save() {
   $('problem').hidden = $('done').hidden = true;
   try {
     const { command } = await post('save', sentPlacement(sent));
-    $('command').textContent = command;
-    $('done').hidden = false;
-    saved = sent;
+    showSaved(sent, command);
   } catch (error) {
     $('problem').textContent = `Not saved: ${error.message}`;
     $('problem').hidden = false;
@@ -277,7 +294,7 @@ for (const line of start.assumed) $('assumed').append(Object.assign(document.cre
 try {
   await stage.load('asset.glb', start.asset);
   $('loading').hidden = true;
-  $('save').disabled = false;
+  $('save').disabled = $('preview').disabled = $('insert').disabled = false;
   new ResizeObserver(() => view.show()).observe($('room'));
 } catch (error) {
   $('loading').textContent = `The object cannot be shown: ${error.message}`;

@@ -1,0 +1,148 @@
+"""Pictures that warpir renders for the placing page."""
+
+import json
+import time
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from tests.builders.programs.browser import needs_chromium, open_browser
+from tests.builders.programs.placing import STATE, command, open_page, serve, settle
+from warpir.core.errors import InputError
+from warpir.place.renderings import Renderings, policy_of
+from warpir.place.worker import Worker
+
+
+class Silent(Worker):
+    """A worker that works until it is stopped."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.is_stopped = False
+
+    def ask(self, job: Any, heard: Any = None) -> dict[str, Any]:
+        """Wait for the end."""
+        while not self.is_stopped and job["kind"] == "preview":
+            time.sleep(0.01)
+        raise InputError("the page", "stopped before it was done")
+
+    def stop(self) -> None:
+        """Let it go."""
+        self.is_stopped = True
+
+
+def test_one_picture_at_a_time_and_cancelled() -> None:
+    """A second one is refused while the first is rendered; what is cancelled is no failure."""
+    renderings = Renderings(Silent())
+    files: dict[str, dict[str, Any]] = {"camera.json": {}, "insert.json": {}}
+    try:
+        assert renderings.preview(files)["state"] == "running"
+        with pytest.raises(InputError, match="already"):
+            renderings.preview(files)
+        renderings.cancel()
+        until = time.monotonic() + 10.0
+        while renderings.progress()["state"] == "running" and time.monotonic() < until:
+            time.sleep(0.01)
+        assert renderings.progress()["state"] == "cancelled"
+    finally:
+        renderings.close()
+
+
+def test_files_of_results_only(tmp_path: Path) -> None:
+    """Of a result the files that its record names can be read, and none before it is there."""
+    renderings = Renderings(Silent())
+    try:
+        for name in ("a.png", "other.txt", "run.json"):
+            (tmp_path / name).write_text(json.dumps({"files": ["a.png"]}))
+        (tmp_path.parent / "secret").write_text("x")
+        assert renderings.file("result/a.png") is None
+        renderings._results = tmp_path
+        assert renderings.file("result/a.png") is not None
+        for name in ("result/other.txt", "result/../secret", "result/", "a.png", "preview-1.png"):
+            assert renderings.file(name) is None
+    finally:
+        renderings.close()
+
+
+def test_policy_of_a_page_is_its_own() -> None:
+    """A report's policy names its own script; other files have none."""
+    page = b'<meta http-equiv="Content-Security-Policy" content="default-src &#39;none&#39;">'
+    assert policy_of(page) == "default-src 'none'"
+    assert policy_of(b"\x89PNG") is None
+
+
+@needs_chromium
+@pytest.mark.slow
+def test_page_renders_what_insert_does(inputs: Path, tmp_path: Path) -> None:
+    """The preview is the composite of the saved placement; it can be cancelled, and grows stale.
+
+    Beside a full insertion it has fewer samples and a coarser map of reflections, so that noise of
+    some codes stays; object and shadow are where they are there.
+    """
+    out = tmp_path / "out"
+    argv = command(inputs, out, "--size", "2", "--sun=-60,45,3", "--sky", "clear")
+    with serve(argv) as served, open_browser(1000, 640) as opened:
+        page = opened.page
+        open_page(opened, served)
+        page.click("#preview")
+        page.wait_for_selector("#cancel:not([hidden])")
+        page.click("#cancel")
+        page.wait_for_selector("#cancel", state="hidden", timeout=30_000)
+        assert page.inner_text("#rendering-words") == "Cancelled."
+        page.click("#preview")
+        page.wait_for_selector("#picture:not([hidden])", timeout=240_000)
+        assert "Preview" in page.inner_text("#rendering-words")
+        source = page.get_attribute("#picture", "src")
+        page.locator("#stage").focus()
+        page.keyboard.press("q")
+        settle(opened)
+        assert page.locator("#picture").is_hidden()
+        page.keyboard.press("Control+z")
+        settle(opened)
+        assert page.locator("#picture").is_visible()
+        before = page.evaluate(STATE)
+        # The pixels of the preview, through a canvas of the page.
+        code = """async (address) => {
+          const image = new Image();
+          image.src = address;
+          await image.decode();
+          const size = { width: image.naturalWidth, height: image.naturalHeight };
+          const brush = Object.assign(document.createElement('canvas'), size).getContext('2d');
+          brush.drawImage(image, 0, 0);
+          const { data } = brush.getImageData(0, 0, size.width, size.height);
+          return [size.width, size.height, Array.from(data)];
+        }"""
+        width, height, codes = page.evaluate(code, source)
+        shown = np.array(codes, np.float64).reshape(height, width, 4)[..., :3]
+        page.click("#insert")
+        page.wait_for_selector("#report:not([hidden])", timeout=400_000)
+        assert page.evaluate(STATE) == before
+        with page.expect_popup() as popup:
+            page.click("#report")
+        popup.value.wait_for_selector("h1")
+        assert popup.value.url.endswith("/result/report.html")
+        assert opened.errors == []
+    composite = np.asarray(Image.open(out / "result" / "composite.png"), np.float64)
+    photo = np.asarray(Image.open(inputs / "photo.png"), np.float64)
+    assert shown.shape == composite.shape
+    changed = np.abs(composite - photo).max(axis=-1) > 12.0
+    assert changed.sum() > 2000
+    assert np.abs(shown - composite)[changed].mean() < 6.0
+    assert np.abs(shown - composite)[~changed].mean() < 1.5
+
+
+@pytest.mark.slow
+def test_preview_refuses_as_insert_does(inputs: Path, tmp_path: Path) -> None:
+    """A photo that went away is one line, and the next preview is answered again."""
+    worker = Worker()
+    config = {"photo": str(tmp_path / "none.png"), "asset": str(inputs / "wedge.glb")}
+    job = {"kind": "preview", "config": {**config, "out": "x"}, "width": 64, "picture": "y.png"}
+    try:
+        with pytest.raises(InputError, match="none"):
+            worker.ask(job)
+        assert worker.ask({"kind": "warm"})["device"]
+    finally:
+        worker.stop()

@@ -1,0 +1,74 @@
+// Pictures that warpir renders for the page: a preview over the photo, and the full insertion.
+
+const PAUSE = 300; // ms between two questions how far it is
+const STAGES = { starting: 'Starting', reading: 'Reading', light: 'Estimating the light', picture: 'Rendering' };
+
+export class Pictures {
+  #polls = false;
+
+  // `elements` has preview, insert, cancel, picture, bar, words, report; `page` has state,
+  // placement(state), post(address, values), saved(state, command).
+  constructor(elements, page) {
+    Object.assign(this, elements, { page });
+    this.preview.addEventListener('click', () => this.#begin('preview'));
+    this.insert.addEventListener('click', () => this.#begin('insert'));
+    this.cancel.addEventListener('click', () => page.post('cancel', {}).catch(() => {}));
+  }
+
+  // The picture belongs to one state: of any other it is not shown.
+  draw(state) {
+    const isOld = state !== this.of;
+    this.picture.hidden = isOld || !this.picture.src;
+    this.picture.closest('#stage').classList.toggle('rendered', !this.picture.hidden);
+  }
+
+  async #begin(kind) {
+    const { state } = this.page;
+    this.report.hidden = true;
+    this.#show({ state: 'running', kind, line: 'starting', share: null, seconds: 0 });
+    try {
+      const begun = await this.page.post(kind, this.page.placement(state));
+      if (begun.command) this.page.saved(state, begun.command);
+      this.of = kind === 'preview' ? state : this.of;
+      await this.#wait();
+    } catch (error) {
+      this.#show({ state: 'failed', problem: error.message });
+    }
+  }
+
+  async #wait() {
+    if (this.#polls) return;
+    this.#polls = true;
+    try {
+      for (;;) {
+        const now = await (await fetch('progress.json')).json();
+        this.#show(now);
+        if (now.state !== 'running') break;
+        await new Promise((resolve) => { setTimeout(resolve, PAUSE); });
+      }
+    } finally {
+      this.#polls = false;
+    }
+  }
+
+  #show({ state, kind, line, share, seconds, problem, address }) {
+    const isRunning = state === 'running';
+    this.bar.hidden = this.cancel.hidden = !isRunning;
+    this.preview.disabled = this.insert.disabled = isRunning;
+    if (share === null || share === undefined) this.bar.removeAttribute('value');
+    else this.bar.value = share;
+    this.words.classList.toggle('warn', state === 'failed');
+    if (isRunning) this.words.textContent = `${STAGES[line] ?? line} … ${Math.round(seconds)} s`;
+    else if (state === 'failed') this.words.textContent = problem;
+    else if (state === 'cancelled') this.words.textContent = 'Cancelled.';
+    else if (kind === 'insert') {
+      this.words.textContent = `Inserted in ${seconds} s. `;
+      this.report.href = address;
+      this.report.hidden = false;
+    } else {
+      this.words.textContent = `Preview, ${seconds} s: the composite at low quality. Any change hides it.`;
+      this.picture.src = address;
+      this.picture.decode().then(() => this.draw(this.page.state), () => {});
+    }
+  }
+}
