@@ -69,22 +69,6 @@ class Crop:
         return rows @ image @ columns.T
 
 
-def shrink(image: Tensor, size: int) -> Tensor:
-    """Return the whole image squeezed into a square, filtered as `Crop.apply` does.
-
-    Args:
-        image: Shape [B, C, H, W].
-        size: Side of the square [px].
-
-    Returns:
-        Shape [B, C, size, size].
-    """
-    height, width = image.shape[-2:]
-    rows = _filter(0.0, height, size, height, image.device).to(image)
-    columns = _filter(0.0, width, size, width, image.device).to(image)
-    return rows @ image @ columns.T
-
-
 def _filter(start: float, side: float, size: int, length: int, device: torch.device) -> Tensor:
     """Return the weights of an axis' pixels in each pixel of the crop, float64 [size, length]."""
     pixel = side / size

@@ -30,7 +30,7 @@ class DatasetUpdate(GatedGuidance):
     between this crop and its edit: its mean times the number of latents, so that it counts as much
     as a sum over latents does in the other losses. One crop at a time, however many noises.
 
-    Arguments as of `GatedGuidance`; of the condition the prompt alone counts.
+    Arguments as of `GatedGuidance`; of the prompts this one alone counts.
 
     Raises:
         ValueError: The mask is empty.
@@ -42,7 +42,7 @@ class DatasetUpdate(GatedGuidance):
         if self.prior.editor is None:
             raise ModelError(self.prior.name, f"cannot edit pictures, as {DATASET_UPDATE} needs")
         self.editor = self.prior.editor
-        self.prior.embed([self.condition.prompt, ""])
+        self.prior.embed([self.prompt, ""])
         self.crop: Crop | None = None
         self.edited: Tensor | None = None
 
@@ -116,7 +116,7 @@ class DatasetUpdate(GatedGuidance):
         def edited(first: int, last: int) -> Tensor:
             return self.editor.edit(
                 crop.apply(image, self.prior.resolution).to(self.prior.device),
-                self.condition.prompt,
+                self.prompt,
                 seed_of(*key, "edit"),
                 strength=strength,
                 steps=self.settings.update_steps,

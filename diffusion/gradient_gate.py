@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 
 from warpir.diffusion.crop import box_of
-from warpir.diffusion.prior import Condition, Counts, Prior
+from warpir.diffusion.prior import Counts, Prior
 from warpir.diffusion.schedule import time_range
 from warpir.diffusion.settings import GuidanceSettings
 
@@ -68,7 +68,7 @@ class GatedGuidance:
 
     Args:
         prior: The frozen denoiser.
-        condition: What the picture is to be judged by.
+        prompt: What the adapted model is asked for; what the others are is in the settings.
         settings: Loss, weights, times, crops and edits.
         mask: Coverage of the object, shape [H, W].
         steps: Length of the run, over which the times fall.
@@ -82,14 +82,14 @@ class GatedGuidance:
     def __init__(
         self,
         prior: Prior,
-        condition: Condition,
+        prompt: str,
         settings: GuidanceSettings,
         mask: Tensor,
         steps: int,
         seed: int,
         adapter: str | None,
     ) -> None:
-        self.prior, self.condition, self.settings = prior, condition, settings
+        self.prior, self.prompt, self.settings = prior, prompt, settings
         self.mask, self.adapter = mask, adapter
         self.box, self.steps, self.seed = box_of(mask), steps, seed
         self.gate = GradientGate(settings.gradient_clip)

@@ -19,11 +19,10 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
-from warpir.diffusion.crop import draw_crop, shrink
+from warpir.diffusion.crop import draw_crop
 from warpir.diffusion.dataset_update import DATASET_UPDATE, DatasetUpdate
 from warpir.diffusion.draws import generator_of
 from warpir.diffusion.gradient_gate import GatedGuidance
-from warpir.diffusion.prior import Condition
 from warpir.diffusion.schedule import weight
 from warpir.diffusion.settings import GuidanceSettings
 
@@ -87,14 +86,10 @@ class Term:
     scale: float
     prompt: str
     adapter: str | None
-    keeps_background: bool = True
-    """Whether it sees the photo."""
 
 
-def terms_of(settings: GuidanceSettings, condition: Condition, adapter: str | None) -> list[Term]:
+def terms_of(settings: GuidanceSettings, prompt: str, adapter: str | None) -> list[Term]:
     """Return the terms of a loss that count, those whose coefficient is not 0.
-
-    The negative prompt is the condition's, else the settings', else the null prompt.
 
     Raises:
         ValueError: The loss is unknown, or its adapter is missing.
@@ -103,13 +98,11 @@ def terms_of(settings: GuidanceSettings, condition: Condition, adapter: str | No
     if adapter is None and (row.k_p or row.null_adapter):
         raise ValueError(f"loss: {settings.loss} needs an adapter; csd and sds-base do without")
     other = adapter if row.null_adapter else None
-    keeps = settings.null_background == "keep"
-    negative_prompt = condition.negative_prompt or settings.negative_prompt
     terms = [
-        Term(row.k_p, condition.prompt, adapter),
-        Term(row.k_c, condition.base_prompt or settings.base_prompt or condition.prompt, None),
-        Term(row.k_0, settings.null_prompt, other, keeps),
-        Term(row.k_n, negative_prompt, other, keeps),
+        Term(row.k_p, prompt, adapter),
+        Term(row.k_c, settings.base_prompt or prompt, None),
+        Term(row.k_0, settings.null_prompt, other),
+        Term(row.k_n, settings.negative_prompt, other),
     ]
     return [term for term in terms if term.scale]
 
@@ -128,10 +121,6 @@ class NoisyCrops:
     """Shape [noise]."""
     weight: Tensor
     """w(t), shape [noise, 1, 1, 1]."""
-    background: Tensor | None
-    """The photo's crops, and the whole photo with each, shape [noise, 6, R, R]."""
-    gbuffer: Tensor | None
-    """The G-buffer's crops, shape [noise, 13, R, R]."""
 
 
 class Guidance(GatedGuidance):
@@ -149,12 +138,10 @@ class Guidance(GatedGuidance):
     """
 
     def prepare(self) -> None:
-        """Embed the prompts of the terms that count, and shrink the photo."""
+        """Embed the prompts of the terms that count."""
         self.row = coefficients(self.settings, self.adapter is not None)
-        self.terms = terms_of(self.settings, self.condition, self.adapter)
+        self.terms = terms_of(self.settings, self.prompt, self.adapter)
         self.embeddings = self.prior.embed([term.prompt for term in self.terms])
-        photo, prior = self.condition.background, self.prior
-        self.whole = None if photo is None else shrink(photo, prior.resolution).to(prior.device)
 
     def gradient(self, image: Tensor, step: int) -> Tensor | None:
         """Return the gradient of ``< stopgrad(w(t) delta), latents >``, averaged over the noises.
@@ -210,7 +197,7 @@ class Guidance(GatedGuidance):
         """
         other = replace(self.settings, loss=loss)
         return Guidance(
-            self.prior, self.condition, other, self.mask, self.steps, self.seed, self.adapter
+            self.prior, self.prompt, other, self.mask, self.steps, self.seed, self.adapter
         )
 
     @torch.no_grad()
@@ -322,31 +309,15 @@ class Guidance(GatedGuidance):
         prior, settings, device = self.prior, self.settings, self.prior.device
         height, width = image.shape[-2:]
         crops = [draw_crop(self.box, (height, width), settings, g) for g in generators]
-
-        def cropped(whole: Tensor) -> Tensor:
-            return torch.cat([c.apply(whole, prior.resolution) for c in crops]).to(device)
-
         w = weight(settings.weight, *prior.schedule.alpha_sigma(t), settings.literal_alpha)
         w, t = _upload(w.view(-1, 1, 1, 1), device), _upload(t, device)
-        latents = prior.encode(cropped(image))
+        cropped = torch.cat([crop.apply(image, prior.resolution) for crop in crops])
+        latents = prior.encode(cropped.to(device))
         shape = latents.shape[1:]
         drawn = torch.stack([torch.randn(shape, generator=g) for g in generators])
         noise = _upload(drawn, device)
-        background, gbuffer = self.condition.background, self.condition.gbuffer
-        return NoisyCrops(
-            latents,
-            noise,
-            prior.schedule.add_noise(latents.detach(), noise, t),
-            t,
-            w,
-            None if background is None else self._shown(cropped(background)),
-            None if gbuffer is None else cropped(gbuffer),
-        )
-
-    def _shown(self, crops: Tensor) -> Tensor:
-        """Return crops of the photo with the whole of it beside each, shape [noise, 6, R, R]."""
-        assert self.whole is not None
-        return torch.cat([crops, self.whole.expand(len(crops), -1, -1, -1)], dim=1)
+        noisy = prior.schedule.add_noise(latents.detach(), noise, t)
+        return NoisyCrops(latents, noise, noisy, t, w)
 
     @torch.no_grad()
     def _predictions(self, crops: NoisyCrops) -> Tensor:
@@ -356,15 +327,11 @@ class Guidance(GatedGuidance):
         def repeated(per_noise: Tensor) -> Tensor:
             return per_noise.repeat(term_count, *[1] * (per_noise.ndim - 1))
 
-        keeps = [term.keeps_background for term in self.terms for _ in range(noise_count)]
         predicted = self.prior.predict(
             repeated(crops.latents_noisy),
             repeated(crops.t),
             self.embeddings.repeat_interleave(noise_count, dim=0),
             [term.adapter for term in self.terms for _ in range(noise_count)],
-            None if crops.background is None else repeated(crops.background),
-            None if crops.gbuffer is None else repeated(crops.gbuffer),
-            *(() if all(keeps) else (keeps,)),
         )
         return predicted.view(term_count, *crops.noise.shape)
 

@@ -1,4 +1,4 @@
-"""What every diffusion prior promises, and what it is told about the picture it judges.
+"""What every diffusion prior promises, and what a picture is judged by.
 
 A prior is a frozen denoiser: it turns pictures into latents, knows its noise schedule, and predicts
 the noise in noisy latents for a prompt, with or without an adapter (a LoRA). Guidance
@@ -76,23 +76,6 @@ class NonFiniteError(Exception):
     """Numbers stayed non-finite; the program says so and exits with 6."""
 
 
-@dataclass(frozen=True)
-class Condition:
-    """What a picture is to be judged by."""
-
-    prompt: str
-    """What the adapted model is asked for."""
-    base_prompt: str = ""
-    """What the unadapted model is asked for in its conditional term; empty: `prompt`."""
-    negative_prompt: str = ""
-    """What the picture is to move away from; empty: the null prompt."""
-    background: Tensor | None = None
-    """The photo without the object, display-encoded, in [0, 1], shape [1, 3, H, W]."""
-    gbuffer: Tensor | None = None
-    """Mask, albedo, camera-space normals of the object, and the light that the regressor reads off
-    the photo (`warpir.diffusion.models.embedded.GBUFFER_CHANNELS`), shape [1, 13, H, W]."""
-
-
 class Editor(Protocol):
     """Changes a picture towards a prompt; an ability that a prior may lack."""
 
@@ -131,7 +114,7 @@ class Prior(Protocol):
     """A denoiser and its schedule; weights never change, adapters are added beside them."""
 
     name: str
-    """``stable-diffusion`` or ``embedded``; goes into every run's record."""
+    """Such as ``stable-diffusion``; goes into every run's record."""
     digest: str
     """sha256 of the weights."""
     resolution: int
@@ -174,9 +157,6 @@ class Prior(Protocol):
         t: Tensor,
         embeddings: Tensor,
         adapters: Sequence[str | None],
-        background: Tensor | None = None,
-        gbuffer: Tensor | None = None,
-        keep_background: Sequence[bool] | None = None,
     ) -> Tensor:
         """Return the predicted noise (epsilon, whatever the network predicts), float32, detached.
 
@@ -187,11 +167,6 @@ class Prior(Protocol):
             t: Times in [0, 1], shape [B].
             embeddings: From `embed`, one per sample, shape [B, token, channel].
             adapters: Per sample the name of its adapter, or None for the base weights.
-            background: Crop of `Condition.background` and, in three more channels, the whole of it
-                squeezed into the same square, shape [B, 6, resolution, resolution], or None;
-                Stable Diffusion ignores it.
-            gbuffer: Crop of `Condition.gbuffer`, or None; Stable Diffusion ignores it.
-            keep_background: Per sample whether the background is told; None: wherever it is given.
 
         Raises:
             ModelError: An adapter is unknown.

@@ -2,12 +2,12 @@
 
 Each field is one flag of `warpir.insert`: its range and form stand on it (`warpir.core.options`),
 and its help below it. Defaults are the authors' (DiPIR, Liang et al. 2024) where they state one,
-else ours. What is None is open: the prior that guides decides it.
+else ours.
 """
 
 from dataclasses import dataclass
 
-from warpir.core.options import left_open, option
+from warpir.core.options import option
 
 PREDICTION_TYPES = ("epsilon", "v_prediction", "sample")
 """What a network may predict: the noise, v, or the clean sample."""
@@ -40,7 +40,7 @@ class ModelSettings:
 class PersonalizeSettings:
     """How the model is adapted to the photo (DiPIR, section 4.2.1)."""
 
-    personalize: bool | None = option(None, expert=True, stable_diffusion=True, embedded=False)
+    personalize: bool = option(True, expert=True)
     """Adapt the model to the photo by a LoRA before it guides"""
     token: str = option("sks", "WORD", expert=True, is_prompt=True)
     """Rare word that stands for the photo's style in the prompts"""
@@ -82,12 +82,11 @@ class PersonalizeSettings:
 
 
 @dataclass(frozen=True)
-class GuidanceOptions:
-    """What every prior is asked in the same way."""
+class GuidanceSettings:
+    """How a prior's opinion becomes a gradient (DiPIR, eq. 7, 8)."""
 
     negative_prompt: str = option("", "TEXT", expert=True, is_prompt=True, may_be_empty=True)
-    """What the losses with a negative term move away from (default: of the embedded prior, the same
-    words with another light)"""
+    """What the losses with a negative term move away from"""
     base_prompt: str = option("", "TEXT", expert=True, is_prompt=True, may_be_empty=True)
     """What the terms without the LoRA ask for (default: what the adapted model is asked for)"""
     null_prompt: str = option("", "TEXT", expert=True, is_prompt=True, may_be_empty=True)
@@ -102,12 +101,6 @@ class GuidanceOptions:
     """Denoising steps of such an edit (DDIM)"""
     update_scale: float = option(7.5, "G", expert=True, low=0, high=1000)
     """Classifier-free guidance of such an edit"""
-
-
-@dataclass(frozen=True)
-class GuidanceSettings(GuidanceOptions):
-    """How a prior's opinion becomes a gradient (DiPIR, eq. 7, 8); Stable Diffusion's defaults."""
-
     loss: str = option(
         "lds",
         "NAME",
@@ -122,46 +115,22 @@ class GuidanceSettings(GuidanceOptions):
             "sds-good-bad",
             "dataset-update",
         ),
-        embedded="sds-base",
     )
     """How the prior's opinion becomes a gradient; lds, sds, sds-base (no LoRA), csd, lds-lora-both,
     lds-negative, good-bad, sds-good-bad, or dataset-update"""
-    guidance_scale: float = option(100.0, "G", expert=True, low=0, high=10_000, embedded=4.0)
+    guidance_scale: float = option(100.0, "G", expert=True, low=0, high=10_000)
     """g of the SDS losses: g e(prompt) + (1 - g) e(null) - noise"""
-    null_background: str = option(
-        "keep", "RULE", expert=True, choices=("keep", "drop"), embedded="drop"
-    )
-    """Whether the null and negative terms see the photo: keep or drop (Stable Diffusion sees only
-    the composite)"""
-    time_min: float = option(0.02, "SHARE", expert=True, low=0, high=1, embedded=0.55)
+    time_min: float = option(0.02, "SHARE", expert=True, low=0, high=1)
     """Least noise level, as a share of the schedule"""
-    time_max: float = option(0.6, "SHARE", expert=True, low=0, high=1, embedded=0.9)
+    time_max: float = option(0.6, "SHARE", expert=True, low=0, high=1)
     """Greatest noise level at the start, as a share of the schedule"""
-    time_max_end: float = option(0.3, "SHARE", expert=True, low=0, high=1, embedded=0.9)
+    time_max_end: float = option(0.3, "SHARE", expert=True, low=0, high=1)
     """Greatest noise level at the end; falls linearly"""
-    weight: str = option(
-        "sigma2", "NAME", expert=True, choices=("sigma2", "sigma", "uniform"), embedded="sigma"
-    )
+    weight: str = option("sigma2", "NAME", expert=True, choices=("sigma2", "sigma", "uniform"))
     """Weight w(t) of the residual: sigma2 (1 - alpha_bar), sigma or uniform"""
-    noises: int = option(1, "N", expert=True, low=1, high=64, embedded=4, embedded_on_cpu=2)
+    noises: int = option(1, "N", expert=True, low=1, high=64)
     """Noises and times per rendered picture"""
-    crop_min: float = option(0.5, "SIDES", expert=True, low=0.01, high=100, embedded=1.3)
+    crop_min: float = option(0.5, "SIDES", expert=True, low=0.01, high=100)
     """Smallest side of a crop, in sides of the object's box"""
-    crop_max: float = option(3.0, "SIDES", expert=True, low=0.01, high=100, embedded=4.0)
+    crop_max: float = option(3.0, "SIDES", expert=True, low=0.01, high=100)
     """Greatest side of a crop, in sides of the object's box"""
-
-
-@dataclass(frozen=True)
-class GuidanceChoices(GuidanceOptions):
-    """`GuidanceSettings` as a user may leave them open; their help is there."""
-
-    loss: str | None = left_open(GuidanceSettings, "loss")
-    guidance_scale: float | None = left_open(GuidanceSettings, "guidance_scale")
-    null_background: str | None = left_open(GuidanceSettings, "null_background")
-    time_min: float | None = left_open(GuidanceSettings, "time_min")
-    time_max: float | None = left_open(GuidanceSettings, "time_max")
-    time_max_end: float | None = left_open(GuidanceSettings, "time_max_end")
-    weight: str | None = left_open(GuidanceSettings, "weight")
-    noises: int | None = left_open(GuidanceSettings, "noises")
-    crop_min: float | None = left_open(GuidanceSettings, "crop_min")
-    crop_max: float | None = left_open(GuidanceSettings, "crop_max")

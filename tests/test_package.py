@@ -65,7 +65,6 @@ def test_wheel_holds_the_weights_and_their_card(wheel: zipfile.ZipFile) -> None:
     }
     assert names <= set(sizes)
     assert sizes["warpir/diffusion/weights/calibrator.safetensors"] <= 8_000_000
-    assert sizes.pop("warpir/diffusion/weights/prior.safetensors") <= 21_000_000
     assert sum(sizes.values()) <= 30_000_000
 
 

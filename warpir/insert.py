@@ -117,7 +117,7 @@ def _insert_one(config: InsertConfig, loaders: "Loaders | None" = None) -> Inser
             run = run.on_device(choose_device(run.config.render.device))
         run.take_cache_notices()
         lit = find_light(run, given)
-        if not run.config.is_guided:
+        if given is None and not run.config.is_guided:
             with lit.run.timings.stage("preview"):
                 write_preview(lit.run, lit.light)
         rendered = render_result(lit.run, lit.light)

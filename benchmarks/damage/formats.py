@@ -405,7 +405,6 @@ def weights() -> Iterator[Format]:
     from safetensors.torch import save
 
     from warpir.core.atomic import Checkpoints
-    from warpir.diffusion.models.embedded import NetworkConfig, build_network, save_embedded
     from warpir.lighting.regressor import RegressorConfig, random_regressor, save_regressor
 
     def file(name: str, reader: str, sound: bytes) -> Format:
@@ -417,9 +416,6 @@ def weights() -> Iterator[Format]:
         tiny = RegressorConfig(channels=(8, 8, 8), blocks=(1, 1), depth=1, heads=1, directions=20)
         save_regressor(random_regressor(1, tiny), path, {"steps": 1})
         yield file("regressor", "regressor", path.read_bytes())
-        size = NetworkConfig((8, 8), layers=1, head_width=8, groups=4, embedding_width=8)
-        save_embedded(build_network(size, 1), path, {"steps": 7})
-        yield file("prior", "prior", path.read_bytes())
         checkpoints = Checkpoints(Path(folder), {"config": {"seed": 1}})
         checkpoints.save("optimize", 50, {"light": torch.ones(3), "history": [{"loss": 0.5}]})
         (found,) = (Path(folder) / "checkpoints").iterdir()

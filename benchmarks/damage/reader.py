@@ -142,16 +142,6 @@ def _told(error: Any) -> InputError:
     return InputError(error.where, error.what, error.advice, ExitCode.MODEL)
 
 
-def _prior(path: Path) -> None:
-    from warpir.diffusion.models.embedded import load_embedded
-    from warpir.diffusion.models.model_error import ModelError
-
-    try:
-        load_embedded(path, "cpu")
-    except ModelError as error:
-        raise _told(error) from error
-
-
 def _lora(path: Path) -> None:
     from warpir.diffusion.models.model_error import ModelError
     from warpir.diffusion.personalization.lora_files import read_lora
@@ -174,7 +164,7 @@ READERS: dict[str, Callable[[Path], int | None]] = {
         *(("_photo", _photo), ("_envmap", _envmap), ("_mask", _mask), ("_asset", _asset)),
         *(("_camera", _camera), ("_points", _points), ("_lobes", _lobes), ("_curves", _curves)),
         *(("_materials", _materials), ("_config", _config), ("_run", _run)),
-        *(("_sequence", _sequence), ("_regressor", _regressor), ("_prior", _prior)),
+        *(("_sequence", _sequence), ("_regressor", _regressor)),
         *(("_lora", _lora), ("_checkpoint", _checkpoint)),
     )
 }

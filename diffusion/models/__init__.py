@@ -1,4 +1,4 @@
-"""The priors as networks: Stable Diffusion, the embedded prior, and their folders and weights.
+"""Stable Diffusion as a prior, its folder, and files of weights.
 
 Knows no guidance and no optimisation.
 """

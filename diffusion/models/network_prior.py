@@ -2,8 +2,8 @@
 
 Differences between predictions are tiny beside the predictions, so the UNet computes in fp16 or
 fp32 rather than bf16, and `NetworkPrior.ensure_precision` tells whether fp16 is enough. Each sample
-of a batch has its own prompt and adapter. What a prior adds is how pictures become latents, how
-latents and conditions become the UNet's input, and how words become embeddings.
+of a batch has its own prompt and adapter. What a prior adds is how pictures become latents and how
+words become embeddings.
 """
 
 from __future__ import annotations
@@ -47,7 +47,7 @@ class NetworkPrior(ABC):
     """
 
     name: str
-    """``stable-diffusion`` or ``embedded``."""
+    """Such as ``stable-diffusion``."""
 
     def __init__(
         self,
@@ -119,20 +119,6 @@ class NetworkPrior(ABC):
     def _encode_text(self, prompt: str) -> Tensor:
         """Return a prompt's embedding, float32, shape [token, channel]."""
 
-    def pack(
-        self,
-        latents_noisy: Tensor,
-        background: Tensor | None = None,
-        gbuffer: Tensor | None = None,
-        keep_background: Sequence[bool] | None = None,
-    ) -> Tensor:
-        """Return the UNet's input for noisy latents and conditions; here the latents alone."""
-        return latents_noisy
-
-    def unpack(self, predicted: Tensor) -> Tensor:
-        """Return what the UNet put out in the shape of latents."""
-        return predicted
-
     def embed(self, prompts: Sequence[str]) -> Tensor:
         """Return the prompts' embeddings, float32, shape [prompt, token, channel].
 
@@ -152,9 +138,6 @@ class NetworkPrior(ABC):
         t: Tensor,
         embeddings: Tensor,
         adapters: Sequence[str | None],
-        background: Tensor | None = None,
-        gbuffer: Tensor | None = None,
-        keep_background: Sequence[bool] | None = None,
     ) -> Tensor:
         """Return the predicted noise, float32, detached; see `warpir.diffusion.prior.Prior`.
 
@@ -163,9 +146,9 @@ class NetworkPrior(ABC):
         """
         self._check_adapters(adapters)
         latents_noisy, t = latents_noisy.detach().to(self.device), t.to(self.device)
-        packed = self.pack(latents_noisy, background, gbuffer, keep_background)
-        predicted = self._denoise(packed, self.schedule.timestep(t), embeddings, tuple(adapters))
-        return self.schedule.to_noise(self.unpack(predicted), latents_noisy, t)
+        timesteps = self.schedule.timestep(t)
+        predicted = self._denoise(latents_noisy, timesteps, embeddings, tuple(adapters))
+        return self.schedule.to_noise(predicted, latents_noisy, t)
 
     def sample(
         self,
@@ -349,7 +332,7 @@ class NetworkPrior(ABC):
             self.graphs.clear()
 
     def denoise(self, latents_noisy: Tensor, timesteps: Tensor, embeddings: Tensor) -> Tensor:
-        """Return what the network predicts without conditions, whatever that is; differentiable.
+        """Return what the network predicts, whatever that is; differentiable.
 
         With the adapters that are switched on, for personalisation.
 
@@ -359,9 +342,9 @@ class NetworkPrior(ABC):
             embeddings: Shape [B, token, channel].
         """
         predicted: Tensor = self.unet(
-            self.pack(latents_noisy), timesteps, encoder_hidden_states=embeddings
+            latents_noisy, timesteps, encoder_hidden_states=embeddings
         ).sample
-        return self.unpack(predicted)
+        return predicted
 
     @torch.no_grad()
     def _denoise(
@@ -374,7 +357,7 @@ class NetworkPrior(ABC):
         """Return what the UNet predicts, whatever that is, float32; its only call.
 
         Args:
-            latents: Noisy and packed.
+            latents: Noisy, shape [B, C, h, w].
             timesteps: Shape [B], int64.
             embeddings: Shape [B, token, channel].
             adapters: One name per sample, or None.
@@ -438,13 +421,11 @@ class NetworkPrior(ABC):
         embeddings = wanted if scale == 1.0 else torch.cat([wanted, null.expand_as(wanted)])
         repeats = len(embeddings) // count
         for timestep in solver.timesteps:
-            predicted = self.unpack(
-                self._denoise(
-                    self.pack(latents.repeat(repeats, 1, 1, 1)),
-                    timestep.expand(repeats * count),
-                    embeddings,
-                    (adapter,) * (repeats * count),
-                )
+            predicted = self._denoise(
+                latents.repeat(repeats, 1, 1, 1),
+                timestep.expand(repeats * count),
+                embeddings,
+                (adapter,) * (repeats * count),
             )
             if repeats == 2:
                 prompted, unprompted = predicted.chunk(2)

@@ -22,22 +22,9 @@ from warpir.diffusion.models.model_error import ModelError
 
 SHIPPED = Path(__file__).parents[1] / "weights"
 """Folder of the weights that are part of the package."""
-PRIOR_KEY = "warpir_prior"
-"""Where a file's header describes the embedded prior that it holds."""
-PRIOR_FORMAT = 2
 REGRESSOR_FORMAT = "warpir-regressor-2"
 CALIBRATOR_FORMAT = "warpir-calibrator-1"
 Sizes = Mapping[str, tuple[int, int, type, float, float]]
-PRIOR_SIZES: Sizes = {
-    "widths": (1, 8, int, 1, 4096),
-    "layers": (1, 1, int, 1, 64),
-    "attention_from": (1, 1, int, 0, 8),
-    "head_width": (1, 1, int, 1, 4096),
-    "groups": (1, 1, int, 1, 4096),
-    "embedding_width": (1, 1, int, 1, 65_536),
-}
-"""Of each field of a `NetworkConfig` of the embedded prior: the least and the greatest count of
-numbers, which are a list where there may be several; their kind, and the least and the greatest."""
 REGRESSOR_SIZES: Sizes = {
     "channels": (3, 3, int, 8, 512),
     "blocks": (2, 2, int, 0, 16),
@@ -49,7 +36,9 @@ REGRESSOR_SIZES: Sizes = {
     "hidden": (1, 1, float, 0, 0.99),
     "members": (1, 1, int, 1, 16),
 }
-"""The same of a `warpir.lighting.regressor.RegressorConfig`."""
+"""Of each field of a `warpir.lighting.regressor.RegressorConfig`: the least and the greatest count
+of numbers, which are a list where there may be several; their kind, and the least and the greatest.
+"""
 CALIBRATOR_SIZES: Sizes = {
     name: REGRESSOR_SIZES[name]
     for name in ("channels", "blocks", "depth", "heads", "dropout", "skipped")
@@ -135,45 +124,6 @@ def fault_of(path: Path) -> tuple[str, str]:
     if not start:
         return "an empty file (expected a safetensors file)", "fetch or write it again"
     return "not a whole safetensors file (cut or damaged)", ""
-
-
-def check_prior(path: Path | None) -> dict[str, Any]:
-    """Check the weights of the embedded prior.
-
-    Args:
-        path: The file; None: the one that is part of the package.
-
-    Returns:
-        What its header says of it; the sizes in ``network`` are within their ranges.
-
-    Raises:
-        ModelError: Not there, damaged, or something else.
-    """
-    shipped = SHIPPED / "prior.safetensors"
-    if path is None and not shipped.is_file():
-        what = "the embedded prior's weights are not in this installation"
-        raise ModelError(str(shipped), what, "name some by --prior, or leave --steps out")
-    file = read_header(path or shipped)
-    where = str(file.path)
-    if PRIOR_KEY not in file.about:
-        raise ModelError(where, f"holds no embedded prior (no {PRIOR_KEY} in its header)")
-    described = _object(where, file.about[PRIOR_KEY])
-    if described.get("format") != PRIOR_FORMAT:
-        what = f"format {described.get('format')!r:.40} (expected {PRIOR_FORMAT})"
-        raise ModelError(where, what, "fetch the weights of this version of warpir")
-    network = described.get("network")
-    if not isinstance(network, dict):
-        raise ModelError(where, "its header is damaged (network)")
-    _check_sizes(where, network, PRIOR_SIZES)
-    if any(width % network["groups"] for width in network["widths"]):
-        what = f"network: widths {network['widths']} in {network['groups']} groups"
-        raise ModelError(where, f"{what} (expected multiples)")
-    if path is not None and shipped.is_file():
-        ours = read_header(shipped)
-        if _object(str(shipped), ours.about[PRIOR_KEY])["network"] == network:
-            _check_shapes(file, ours)
-    _check_written(file, described.get("weights"))
-    return described
 
 
 def check_regressor(path: Path | None) -> WeightFile:

@@ -1,8 +1,6 @@
 """Made-up scenes for training: their tables, solids, ground and sky.
 
-A scene is a ground plane, a few boxes, ellipsoids and cylinders, one inserted object (a triangle
-mesh), and a distant light for each of the two: what lights the scene need not be what lights the
-object.
+A scene is a ground plane, a few boxes, ellipsoids and cylinders, and a distant light.
 
 Frame: +Y up, ground ``y = 0``, the camera looks toward -Z (camera-yaw frame).
 """
@@ -63,11 +61,10 @@ class LightTable:
 
 @wp.struct
 class MapTable:
-    """Lat-long maps by index, each level half the size of the one before."""
+    """Lat-long maps by index."""
 
-    fine: wp.array3d[wp.vec3]
-    middle: wp.array3d[wp.vec3]
-    coarse: wp.array3d[wp.vec3]
+    light: wp.array3d[wp.vec3]
+    """Lights without their suns."""
     seen: wp.array3d[wp.vec3]
     """Panoramas as a camera sees them, sun included."""
 
@@ -112,31 +109,6 @@ class GroundTable:
     """Amplitude of the noise on the albedo [1]."""
     wetness: wp.array[float]
     """Share of a mirror's Fresnel reflection [1]."""
-
-
-@wp.struct
-class ObjectTable:
-    """Inserted objects, one per scene; vertices and faces of all meshes in common arrays."""
-
-    mesh: wp.array[wp.uint64]
-    """0: nothing is inserted."""
-    place: wp.array[wp.vec3]
-    yaw: wp.array[float]
-    scale: wp.array[float]
-    sphere: wp.array[wp.vec4]
-    """Centre and radius of the mesh's bounding sphere, its own frame."""
-    first_face: wp.array[int]
-    normals: wp.array[wp.vec3]
-    """Normals of the corners, three per face, all meshes."""
-    albedos: wp.array[wp.vec3]
-    """One per face, all meshes."""
-    tint: wp.array[wp.vec3]
-    recolour: wp.array[float]
-    """0 the mesh's own albedo, 1 the tint alone."""
-    pattern: wp.array[float]
-    """Contrast of a checkered second tint [1]."""
-    roughness: wp.array[float]
-    metallic: wp.array[float]
 
 
 @wp.struct
@@ -276,20 +248,6 @@ def is_open(solids: OccluderTable, scene: int, o: wp.vec3, d: wp.vec3) -> float:
 
 
 @wp.func
-def misses_object(objects: ObjectTable, scene: int, o: wp.vec3, d: wp.vec3) -> float:
-    """Return 1 if the object does not stand in the way, else 0; ``o`` and ``d`` in its frame."""
-    sphere = objects.sphere[scene]
-    to = wp.vec3(sphere[0], sphere[1], sphere[2]) - o
-    along = wp.dot(to, d)
-    outside = wp.dot(to, to) - sphere[3] * sphere[3]
-    if outside > 0.0 and (along < 0.0 or along * along < outside):
-        return 1.0
-    if wp.mesh_query_ray_anyhit(objects.mesh[scene], o, d, 1.0e3):
-        return 0.0
-    return 1.0
-
-
-@wp.func
 def map_at(maps: wp.array3d[wp.vec3], index: int, d: wp.vec3) -> wp.vec3:
     """Interpolate a map in a direction of its own frame."""
     tap = bilinear_tap(direction_to_uv(d), maps.shape[1], maps.shape[2])
@@ -305,16 +263,9 @@ def into_map(lights: LightTable, scene: int, d: wp.vec3) -> wp.vec3:
 
 
 @wp.func
-def blurred(maps: MapTable, lights: LightTable, scene: int, d: wp.vec3, blur: float) -> wp.vec3:
-    """Return the light's map without its sun; blur 0 is the fine level, 2 the coarse one."""
-    m = into_map(lights, scene, d)
-    index = lights.map[scene]
-    low = map_at(maps.middle, index, m)
-    if blur < 1.0:
-        radiance = map_at(maps.fine, index, m) * (1.0 - blur) + low * blur
-    else:
-        share = wp.min(blur - 1.0, 1.0)
-        radiance = low * (1.0 - share) + map_at(maps.coarse, index, m) * share
+def without_sun(maps: MapTable, lights: LightTable, scene: int, d: wp.vec3) -> wp.vec3:
+    """Return the radiance of the light's map, without its sun."""
+    radiance = map_at(maps.light, lights.map[scene], into_map(lights, scene, d))
     return wp.cw_mul(radiance, lights.gain[scene])
 
 
@@ -330,7 +281,7 @@ def seen_sky(
     sigma = wp.max(lights.sun_sigma[scene], 0.005)
     away = (1.0 - wp.dot(d, lights.sun_axis[scene])) / (sigma * sigma)
     disc = lights.sun[scene] * (wp.exp(-away) / (2.0 * PI * sigma * sigma))
-    return blurred(maps, lights, scene, d, 0.0) + disc
+    return without_sun(maps, lights, scene, d) + disc
 
 
 @wp.func
@@ -440,38 +391,3 @@ def irradiance_among_solids(
             if is_blocked == 0.0 or is_open(solids, scene, p, d) > 0.0:
                 total = total + lights.sun[scene] * (cosine / count)
     return total
-
-
-@wp.func
-def fresnel_mix(f0: wp.vec3, roughness: float, cosine: float) -> wp.vec3:
-    """Return the reflectance of GGX under an even light (Karis 2014, mobile approximation)."""
-    c0 = 1.0 - roughness
-    c1 = 0.0425 - 0.0275 * roughness
-    c2 = 1.04 - 0.572 * roughness
-    c3 = 0.022 * roughness - 0.04
-    a004 = wp.min(c0 * c0, wp.pow(2.0, -9.28 * cosine)) * c0 + c1
-    a = -1.04 * a004 + c2
-    b = 1.04 * a004 + c3
-    return f0 * a + wp.vec3(b, b, b)
-
-
-@wp.func
-def sun_highlight(
-    n: wp.vec3, wo: wp.vec3, wi: wp.vec3, f0: wp.vec3, roughness: float, sigma: float
-) -> wp.vec3:
-    """Return GGX's reflectance of the sun, widened by the sun's size (Heitz 2014, eq. 3 and 72)."""
-    alpha = wp.sqrt(roughness * roughness * roughness * roughness + sigma * sigma)
-    h = wp.normalize(wi + wo)
-    nh = wp.max(wp.dot(n, h), 0.0)
-    no = wp.max(wp.dot(n, wo), 1.0e-3)
-    ni = wp.max(wp.dot(n, wi), 1.0e-3)
-    a2 = alpha * alpha
-    q = nh * nh * (a2 - 1.0) + 1.0
-    density = a2 / (PI * q * q)
-    lambda_o = wp.sqrt(1.0 + a2 * (1.0 / (no * no) - 1.0))
-    lambda_i = wp.sqrt(1.0 + a2 * (1.0 / (ni * ni) - 1.0))
-    masking = 2.0 / (lambda_o + lambda_i)
-    c = 1.0 - wp.max(wp.dot(h, wo), 0.0)
-    c5 = c * c * c * c * c
-    fresnel = f0 * (1.0 - c5) + wp.vec3(c5, c5, c5)
-    return fresnel * (density * masking / (4.0 * no * ni))

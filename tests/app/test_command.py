@@ -21,11 +21,8 @@ import warpir.insert
 from tests.builders.refusals import assert_fails, refused
 from warpir.app.command import BY_HAND, FLAGS, parse
 from warpir.app.config import (
-    CPU_DEFAULTS,
-    DEFAULTS,
     EXCLUSIVE,
     OPTIONS,
-    PRIOR_DEFAULTS,
     InsertConfig,
     flag,
 )
@@ -126,85 +123,31 @@ def test_dotted_names_mean_the_same(tmp_path: Path) -> None:
     assert "no such flag" in refused([*NEEDED, "--output.report"]).what
 
 
-def test_command_help_tells_what_each_prior_gets(capsys: pytest.CaptureFixture[str]) -> None:
-    """What is open has no default of its own: the help names those of both priors, by the table."""
-    assert warpir.insert.main(["--help-all"]) == 0
-    text = " ".join(capsys.readouterr().out.split())
-    assert "(default: embedded sds-base; Stable Diffusion lds)" in text
-    assert "(default: embedded 4, on the CPU 2; Stable Diffusion 1)" in text
-    assert "(default: embedded 0; Stable Diffusion 600)" in text
-    assert text.count("it failed its release gate") == 2
-    for name in set(PRIOR_DEFAULTS["embedded"]) | set(PRIOR_DEFAULTS["stable-diffusion"]):
-        assert DEFAULTS[name] is None
-        for values in (*PRIOR_DEFAULTS.values(), *CPU_DEFAULTS.values()):
-            assert values.get(name, "") is not None
-
-
-def test_open_values_are_the_priors() -> None:
-    """Each prior has its own; what was given stays; a known device decides the rest."""
-    plain = GuidanceSettings()
-    painter = InsertConfig(guidance="stable-diffusion", model="m").settled()
-    assert painter.guidance_settings() == plain and painter.optimize.step_count == 600
-    assert (
-        painter.adapter.personalize
-        and not painter.guidance.accept
-        and painter.optimize.preview_every == 0
-    )
-    for on_cuda, noises, width in ((True, 4, 384), (False, 2, 256)):
-        config = InsertConfig(weight="uniform", steps=9).settled(on_cuda)
-        assert (config.guidance.noises, config.optimize.picture_width) == (noises, width)
-        assert (config.guidance.loss, config.guidance.weight) == ("sds-base", "uniform")
-        assert (
-            config.guidance.accept
-            and config.adapter.personalize is False
-            and config.tone_operator == "linear"
-        )
-        assert config.settled(not on_cuda) == config
-    assert InsertConfig(loss="dataset-update", steps=9).settled().guidance.accept is False
-    adapted = InsertConfig(lora="l.safetensors").settled()
-    assert adapted.adapter.personalize is True
-    refined = InsertConfig(refine="tone", reuse="r", model="m", prompt="p").settled()
-    assert refined.optimize.step_count == 200 and not refined.guidance.accept
-
-
-@pytest.mark.parametrize(
-    ("values", "guide"),
-    [
-        ({}, "embedded"),
-        ({"model": "m"}, "stable-diffusion"),
-        ({"sun": (1.0, 2.0)}, "none"),
-        ({"sky": "clear"}, "none"),
-        ({"light": "l.hdr"}, "none"),
-        ({"reuse": "r"}, "none"),
-        ({"demo": True}, "embedded"),
-        ({"light": "l.hdr", "model": "m"}, "stable-diffusion"),
-        ({"light": "l.hdr", "guidance": "embedded"}, "embedded"),
-        ({"model": "m", "guidance": "none"}, "none"),
-    ],
-)
-def test_who_guides(values: dict[str, Any], guide: str) -> None:
-    """The embedded prior, unless a model or a light is given; what is said counts first."""
-    assert InsertConfig(**values).guided_by == guide
+def test_steps_of_a_refinement_are_its_own() -> None:
+    """What was given stays."""
+    values = {"refine": "tone", "reuse": "r", "model": "m", "prompt": "p"}
+    assert InsertConfig(**values).settled().optimize.step_count == 200
+    assert InsertConfig(**values, steps=9).settled().optimize.step_count == 9
+    assert InsertConfig(model="m").settled().optimize.step_count == 600
 
 
 @pytest.mark.parametrize(
     ("values", "is_guided"),
     [
         ({}, False),
-        ({"steps": 0}, False),
-        ({"steps": 200}, True),
-        ({"sun": (1.0, 2.0), "guidance": "embedded"}, False),
+        ({"demo": True}, False),
+        ({"sun": (1.0, 2.0)}, False),
         ({"model": "m"}, True),
-        ({"model": "m", "steps": 0}, True),
-        ({"guidance": "none", "steps": 200}, False),
+        ({"light": "l.hdr", "model": "m"}, True),
+        ({"model": "m", "guidance": "none"}, False),
+        ({"guidance": "stable-diffusion"}, True),
     ],
 )
-def test_embedded_prior_is_asked_with_steps_alone(values: dict[str, Any], is_guided: bool) -> None:
-    """It failed its release gate: it speaks when somebody says for how long, and never else."""
+def test_a_model_guides(values: dict[str, Any], is_guided: bool) -> None:
+    """Where one is named, unless --guidance says something else; its tone operator follows."""
     config = InsertConfig(**values)
     assert config.is_guided is is_guided
-    if config.guided_by == "embedded":
-        assert (config.settled().optimize.steps > 0) is is_guided
+    assert config.tone_operator == ("reinhard" if is_guided else "linear")
 
 
 @pytest.mark.case("F1", "F8")
@@ -214,7 +157,7 @@ def test_every_value_has_a_rule() -> None:
         "horizon", "ground", "place", "at", "rotate_y", "light_rotate", "sun", "sky",
         "device", "refine_parts", "refine_materials", "lora_layers",
         "photo", "layer", "occluder_mask", "asset", "materials", "out", "camera", "light", "lora",
-        "model", "reuse", "sequence", "prior", "regressor", "frame", "ground_points", "proxy",
+        "model", "reuse", "sequence", "regressor", "frame", "ground_points", "proxy",
         "shadow_mask",
     }  # fmt: skip
     for name, option in OPTIONS.items():
@@ -320,10 +263,8 @@ def test_only_a_light_that_is_given_is_turned(values: Any) -> None:
         (["--photo", "-x.png"], "photo", "-x.png"),
         (["--width", "8"], "width", 8),
         (["--no-personalize"], "personalize", False),
-        (["--personalize"], "personalize", True),
-        (["--steps", "9", "--no-accept"], "accept", False),
-        (["--steps", "9", "--accept"], "accept", True),
-        (["--steps", "9", "--prior", "own.safetensors"], "prior", "own.safetensors"),
+        ([*PAINTER, "--accept"], "accept", True),
+        (["--regressor", "own.safetensors"], "regressor", "own.safetensors"),
         (["--no-tone-curve"], "tone_curve", False),
         (["--allow-download"], "allow_download", True),
         (["--lora-layers", "to_q, to_k"], "lora_layers", ("to_q", "to_k")),
@@ -378,7 +319,7 @@ def test_command_reads_values(argv: list[str], name: str, value: object) -> None
         (["--device", "tpu"], "--device", "cuda"),
         (["--sky", "purple"], "--sky", "overcast"),
         (["--sun", "0,91"], "--sun", "elevation"),
-        (["--guidance", "lds"], "--guidance", "embedded or stable-diffusion or none (found lds)"),
+        (["--guidance", "lds"], "--guidance", "stable-diffusion or none (found lds)"),
         (["--guidance", "stable-diffusion", "--prompt", "p"], "--model", "needed"),
         (["--guidance", "stable-diffusion", "--model", "m"], "--prompt", "needed"),
         (
@@ -393,7 +334,7 @@ def test_command_reads_values(argv: list[str], name: str, value: object) -> None
         (["--prompt", "p", "--class-noun", "a"], "--class-noun", "empty (found 'a'"),
         (["--prompt", "p", "--token", " "], "--token", "empty (found ' '"),
         (["--show-prior", "a||b"], "--show-prior", "not empty"),
-        (["--show-prior", "a"], "--show-prior", "needs --guidance"),
+        (["--show-prior", "a"], "--show-prior", "needs --model"),
         (
             "--guidance stable-diffusion --show-prior a --no-personalize".split(),
             "--no-personalize",
@@ -408,21 +349,13 @@ def test_command_reads_values(argv: list[str], name: str, value: object) -> None
             "--time-min",
             "at most --time-max (found 0.7 and 0.6)",
         ),
-        (["--time-min", "0.95"], "--time-min", "at most --time-max (found 0.95 and 0.9)"),
         ([*PAINTER, "--crop-min", "4"], "--crop-min", "at most --crop-max"),
-        (["--crop-min", "5"], "--crop-min", "at most --crop-max (found 5 and 4)"),
-        (["--loss", "lds"], "--loss", "lds compares the adapted model"),
-        (
-            ["--steps", "9", "--accept", "--loss", "dataset-update"],
-            "--accept",
-            "--loss dataset-update",
-        ),
-        (["--guidance", "none", "--no-accept"], "--accept", "needs --guidance"),
-        (["--guidance", "none", "--prior", "p"], "--prior", "needs --guidance embedded"),
-        (["--prior", "p"], "--prior", "and --steps 60: the prior is not asked without"),
-        (["--accept"], "--accept", "--steps 60 for the embedded one"),
-        (["--resume", "--steps", "0"], "--resume", "--steps 60 for the embedded one"),
-        (["--steps", "9", "--exposure", "1"], "--exposure", "is recovered"),
+        (["--crop-min", "5"], "--crop-min", "at most --crop-max (found 5 and 3)"),
+        ([*PAINTER, "--accept", "--loss", "dataset-update"], "--accept", "--loss dataset-update"),
+        (["--accept"], "--accept", "needs --model"),
+        (["--prior", "p"], "--prior", "no such flag"),
+        (["--guidance", "embedded"], "--guidance", "stable-diffusion or none (found embedded)"),
+        ([*PAINTER, "--exposure", "1"], "--exposure", "is recovered"),
         ([*PAINTER, "--lora", "l", "--no-personalize"], "--no-personalize", "--lora"),
         (["--start", "sunny"], "--start", "regressed or uniform"),
         (["--trust", "-1"], "--trust", "at least 0"),
@@ -435,15 +368,11 @@ def test_command_reads_values(argv: list[str], name: str, value: object) -> None
         (["--steps", "-1"], "--steps", "at least 0"),
         (["--class-images", "1.5"], "--class-images", "whole number"),
         (["--sequence", "f"], "--sequence", "needs --reuse"),
-        (["--guidance", "none", "--resume"], "--resume", "needs --guidance"),
+        (["--guidance", "none", "--resume"], "--resume", "needs --model"),
         (["--refine", "light"], "--refine", "material or emission or tone"),
         (["--refine", "tone", "--prompt", "p"], "--refine", "known light"),
-        (["--refine", "tone", "--prompt", "p", "--reuse", "r"], "--refine", "needs --guidance"),
-        (
-            ["--refine", "material", "--light", "l", "--guidance", "embedded"],
-            "--refine",
-            "no other knows colours",
-        ),
+        (["--refine", "tone", "--prompt", "p", "--reuse", "r"], "--refine", "needs --model"),
+        (["--refine", "material", "--light", "l"], "--refine", "which judges the change"),
         (["--refine-parts", "metallic"], "--refine-parts", "--refine material"),
         (
             ["--reuse", "r", "--guidance", "stable-diffusion", "--model", "m", "--prompt", "p"],
@@ -976,7 +905,7 @@ def test_demo_leaves_its_light_to_guidance() -> None:
     )
     assert demo_config(InsertConfig(demo=True, out="o")).light.file is None
     sunny = demo_config(InsertConfig(demo=True, out="o", sun=(10.0, 20.0)))
-    assert sunny.light.file is None and sunny.guided_by == "none"
+    assert sunny.light.file is None and not sunny.is_guided
     recovered = demo_config(guided)
     assert recovered.light == replace(plain.light, file=None, exposure=None, tone="reinhard")
     assert recovered.inputs == plain.inputs and recovered.placement == plain.placement

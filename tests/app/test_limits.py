@@ -73,7 +73,7 @@ def test_validate_of_the_demo_is_torch_free_in_a_process_of_its_own(tmp_path: Pa
     """The program as a user starts it: seconds, no torch, no Warp, nothing left behind."""
     code = (
         f"{TELL}\nfrom warpir.insert import main\n"
-        "sys.exit(main(['--demo', '--out', 'out', '--steps', '60', '--validate']))"
+        "sys.exit(main(['--demo', '--out', 'out', '--validate']))"
     )
     done = subprocess.run(
         [sys.executable, "-c", code], cwd=tmp_path, capture_output=True, text=True, check=False
@@ -88,10 +88,8 @@ def test_validate_of_the_demo_is_torch_free_in_a_process_of_its_own(tmp_path: Pa
     [
         ["--guidance", "none"],
         [],
-        ["--steps", "60"],
-        ["--steps", "60", "--personalize"],
     ],
-    ids=["light-given", "regressor", "embedded-prior", "adapted-prior"],
+    ids=["light-given", "regressor"],
 )
 def test_validate_asks_for_models_without_torch(argv: list[str], tmp_path: Path) -> None:
     ended = validated(["--demo", "--out", "out", *argv], tmp_path, before=TELL)
@@ -132,7 +130,7 @@ def weights(change: Callable[[bytearray], None], name: str) -> Callable[[Path], 
         content = bytearray((SHIPPED / f"{name}.safetensors").read_bytes())
         change(content)
         (folder / "own.safetensors").write_bytes(content)
-        return [f"--{name}", "own.safetensors", *(["--steps", "9"] if name == "prior" else [])]
+        return [f"--{name}", "own.safetensors"]
 
     return make
 
@@ -156,16 +154,16 @@ def not_finite(content: bytearray) -> None:
 @pytest.mark.parametrize(
     ("make", "words"),
     [
-        (weights(cut, "prior"), "cut or damaged"),
-        (weights(flip, "prior"), "not those that were written"),
+        (weights(cut, "regressor"), "cut or damaged"),
+        (weights(flip, "regressor"), "not those that were written"),
         (weights(huge_header, "regressor"), "cut or damaged"),
         (weights(not_finite, "regressor"), "not finite"),
         (lambda folder: ["--regressor", "none.safetensors"], "no such file"),
         (lambda folder: ["--model", "nowhere", "--prompt", "car"], "no such folder"),
     ],
     ids=[
-        "L2-cut-prior",
-        "L2-flipped-prior",
+        "L2-cut-regressor",
+        "L2-flipped-regressor",
         "L2-header-2^62",
         "L2-nan-regressor",
         "missing-regressor",

@@ -1,4 +1,4 @@
-"""Cheap guided runs with random weights, and ways to stop one."""
+"""Cheap guided runs on a tiny Stable Diffusion with random weights."""
 
 import json
 from pathlib import Path
@@ -7,12 +7,15 @@ from tests.builders.outcome import outcome, without_clock
 
 
 def guided_flags(inputs: Path, out: str | Path, **changes: str | None) -> list[str]:
-    """Return a run that the inputs' prior guides, as cheap as can be."""
+    """Return a run that the inputs' model guides, as cheap as can be."""
     from tests.builders.insertions import arguments
 
     flags: dict[str, str | None] = {
-        name: str(inputs / f"{name}.safetensors") for name in ("prior", "regressor")
+        "model": str(inputs / "model"),
+        "prompt": "a box",
+        "regressor": str(inputs / "regressor.safetensors"),
     }
+    flags |= {"lora_steps": "4", "class_images": "2", "class_steps": "2", "lobes": "16"}
     flags |= {"guidance_width": "32", "light_height": "16", "object_light_height": "8"}
     flags |= {"samples": "2", "light": None}
     return arguments(inputs, out, **{**flags, **changes})
@@ -20,22 +23,18 @@ def guided_flags(inputs: Path, out: str | Path, **changes: str | None) -> list[s
 
 def guided_argv(inputs: Path) -> list[str]:
     """Return a cheap run through every stage, but for the name of its folder."""
-    changes = {"lora_steps": "4", "class_images": "2", "class_steps": "2", "personalize": ""}
-    changes |= {"steps": "6", "score_every": "2", "checkpoint_every": "2", "preview_every": "2"}
-    changes |= {"no_accept": "", "no_hand_off": "", "device": "cpu"}
-    return guided_flags(inputs, "out", **changes)
+    every = dict.fromkeys(("score_every", "checkpoint_every", "preview_every"), "2")
+    return guided_flags(inputs, "out", steps="6", no_hand_off="", device="cpu", **every)
 
 
 def write_guided_inputs(folder: Path) -> None:
-    """Write photo, box, and random weights of both networks."""
+    """Write photo, box, a tiny model, and random weights of the regressor."""
     from tests.builders.insertions import write_inputs
-    from tests.optimize.test_recover_embedded import NETWORK
-    from warpir.diffusion.models import embedded
+    from tests.builders.tiny_stable_diffusion import make_tiny_stable_diffusion
     from warpir.lighting.regressor import random_regressor, save_regressor
 
     write_inputs(folder)
-    network = embedded.build_network(NETWORK, seed=1)
-    embedded.save_embedded(network, folder / "prior.safetensors", {})
+    make_tiny_stable_diffusion(folder / "model")
     save_regressor(random_regressor(1), folder / "regressor.safetensors", {})
 
 

@@ -13,14 +13,12 @@ from pathlib import Path
 import pytest
 
 from tests.builders.faults import run_case
-from tests.builders.insertions import arguments, write_inputs
+from tests.builders.guided_runs import guided_flags, write_guided_inputs
 from tests.builders.outcome import outcome
-from tests.optimize.test_recover_embedded import CHEAP, NETWORK
 from warpir.app.program import explain
 from warpir.core import cache as caches
 from warpir.core.cache import KernelCache, cache_folder, take_notices
 from warpir.core.errors import ExitCode, InputError
-from warpir.diffusion.models import embedded
 
 VERSION = "1.2"
 
@@ -366,11 +364,9 @@ def test_warp_without_a_cache(tmp_path: Path) -> None:
 @pytest.mark.case("R9")
 def test_guided_run_without_a_cache(tmp_path: Path) -> None:
     """The same result, the notice in run.json, nothing left behind."""
-    write_inputs(tmp_path)
-    network = embedded.build_network(NETWORK, seed=1)
-    embedded.save_embedded(network, tmp_path / "prior.safetensors", {})
+    write_guided_inputs(tmp_path)
     (tmp_path / "file").write_text("in the way")
-    argv = arguments(tmp_path, "out", **CHEAP, prior=str(tmp_path / "prior.safetensors"))
+    argv = guided_flags(tmp_path, "out", steps="4", checkpoint_every="2")
     results = []
     for name, cache in (("a", None), ("b", str(tmp_path / "file"))):
         (tmp_path / name).mkdir()

@@ -10,7 +10,7 @@ from scipy import stats
 from torch.nn.functional import interpolate
 
 from tests.statistics import SIGNIFICANCE, sidak
-from warpir.diffusion.crop import BOX_MIN, Crop, box_of, draw_crop, shrink
+from warpir.diffusion.crop import BOX_MIN, Crop, box_of, draw_crop
 from warpir.diffusion.settings import GuidanceSettings
 
 FLOAT32 = 2e-6
@@ -192,13 +192,6 @@ def test_draw_depends_on_the_seed_alone() -> None:
     assert first != draw_crop((10, 10, 50, 50), (256, 384), GuidanceSettings(), one)
     draw_crop((0, 0, 384, 256), (256, 384), GuidanceSettings(), other)
     assert torch.rand(1, generator=one) == torch.rand(1, generator=other)
-
-
-def test_a_shrunk_image_is_the_whole_of_it(rng: np.random.Generator) -> None:
-    """Each axis is filtered by its own factor, as torch's antialiased bilinear filter does."""
-    whole = image(rng, 1, 3, 90, 144)
-    expected = interpolate(whole, (32, 32), mode="bilinear", antialias=True)
-    torch.testing.assert_close(shrink(whole, 32), expected, atol=FLOAT64, rtol=0)
 
 
 @pytest.mark.parametrize(

@@ -29,7 +29,6 @@ from warpir.diffusion.personalization.lora_files import (
 )
 from warpir.diffusion.personalization.lora_training import LoraTraining
 from warpir.diffusion.personalization.personalize import personalize
-from warpir.diffusion.prior import Condition
 from warpir.diffusion.prompts import make_prompts
 from warpir.diffusion.settings import GuidanceSettings, ModelSettings, PersonalizeSettings
 from warpir.optimize.light import Function, LightOptimization, Record
@@ -339,10 +338,10 @@ def test_guidance_equals_plain_guidance(both: tuple[StableDiffusion, StableDiffu
     mask = torch.zeros(40, 60)
     mask[10:30, 20:40] = 1.0
     image = torch.rand(1, 3, 40, 60, generator=torch.Generator().manual_seed(0)).to(DEVICE)
-    condition, settings = Condition("scene"), GuidanceSettings(noises=2)
+    prompt, settings = "scene", GuidanceSettings(noises=2)
     found = []
     for prior in both:
-        guide = Guidance(prior, condition, settings, mask, 20, 0, "scene")
+        guide = Guidance(prior, prompt, settings, mask, 20, 0, "scene")
         steps = [guide.gradient(image, step) for step in range(CALLS)]
         assert all(step is not None for step in steps)
         found.append((torch.cat([s for s in steps if s is not None]), guide.score(image)))

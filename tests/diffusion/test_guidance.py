@@ -15,14 +15,14 @@ from torch import Tensor
 
 from tests.builders.tiny_stable_diffusion import make_tiny_stable_diffusion
 from tests.statistics import central_differences, compare_gradients
-from warpir.diffusion.crop import Crop, shrink
+from warpir.diffusion.crop import Crop
 from warpir.diffusion.dataset_update import VALUES_PER_LATENT, DatasetUpdate
 from warpir.diffusion.draws import seed_of
 from warpir.diffusion.gradient_gate import NORM_COUNT_MIN, NORM_WINDOW, GradientGate
 from warpir.diffusion.guidance import Guidance, coefficients, kind_of
 from warpir.diffusion.models.model_error import ModelError
 from warpir.diffusion.models.stable_diffusion import StableDiffusion, load_stable_diffusion
-from warpir.diffusion.prior import Condition, Editor, HalfPrecision, InChunks, at_once
+from warpir.diffusion.prior import Editor, HalfPrecision, InChunks, at_once
 from warpir.diffusion.schedule import NoiseSchedule
 from warpir.diffusion.settings import GuidanceSettings, ModelSettings
 
@@ -32,7 +32,8 @@ LOSSES = (
 )
 FLOAT32 = 1e-5
 """About a hundred float32 operations; times, a and s are float32."""
-CONDITION = Condition("a car in sks", base_prompt="a car", negative_prompt="a wrong shadow")
+PROMPT = "a car in sks"
+ASKED = GuidanceSettings(base_prompt="a car", negative_prompt="a wrong shadow")
 MASK = torch.ones(4, 4)
 """Of an object so small that every crop of 4 x 4 pixels is the whole picture."""
 
@@ -51,9 +52,6 @@ class Call:
     t: Tensor
     prompts: list[str]
     adapters: list[str | None]
-    background: Tensor | None
-    gbuffer: Tensor | None
-    keep_background: list[bool] | None = None
 
 
 @dataclass
@@ -110,16 +108,10 @@ class GaussianPrior:
         t: Tensor,
         embeddings: Tensor,
         adapters: Sequence[str | None],
-        background: Tensor | None = None,
-        gbuffer: Tensor | None = None,
-        keep_background: Sequence[bool] | None = None,
     ) -> Tensor:
         prompts = [self.prompts[int(e)] for e in embeddings.flatten()]
         assert len(latents_noisy) == len(t) == len(prompts) == len(adapters)
-        kept = None if keep_background is None else list(keep_background)
-        self.calls.append(
-            Call(latents_noisy, t, prompts, list(adapters), background, gbuffer, kept)
-        )
+        self.calls.append(Call(latents_noisy, t, prompts, list(adapters)))
         samples = zip(latents_noisy, t, prompts, adapters, strict=True)
         noise = torch.stack([self.noise(*sample) for sample in samples])
         # A network of the other kinds would say the same in its own way.
@@ -138,16 +130,14 @@ def picture(rng: np.random.Generator, height: int = 4, width: int = 4) -> Tensor
 
 def at_time(t: float, **changes: object) -> GuidanceSettings:
     """Return settings whose time is fixed."""
-    fixed = replace(GuidanceSettings(), time_min=t, time_max=t, time_max_end=t)
+    fixed = replace(ASKED, time_min=t, time_max=t, time_max_end=t)
     return replace(fixed, **changes)
 
 
 def guidance(
     prior: GaussianPrior, settings: GuidanceSettings, mask: Tensor = MASK, seed: int = 3
 ) -> Guidance:
-    made = kind_of(settings)(
-        prior, CONDITION, settings, mask, steps=100, seed=seed, adapter="scene"
-    )
+    made = kind_of(settings)(prior, PROMPT, settings, mask, steps=100, seed=seed, adapter="scene")
     assert isinstance(made, Guidance)
     return made
 
@@ -188,7 +178,7 @@ def test_row_is_its_printed_formula(
     """w(t) times the literal residual, mean over the noises, for networks of all three kinds."""
     prior = GaussianPrior(prediction_type=prediction_type)
     x = picture(rng)
-    settings = replace(GuidanceSettings(), loss=loss, noises=noises, guidance_scale=7.5)
+    settings = replace(ASKED, loss=loss, noises=noises, guidance_scale=7.5)
     found = guidance(prior, settings).gradient(x, step=5)
     (call,) = prior.calls
     expected = torch.zeros_like(x)
@@ -210,7 +200,7 @@ def test_row_is_its_printed_formula(
 def test_terms_are_one_call_without_idle_branches(rng: np.random.Generator, loss: str) -> None:
     """One batch of terms x noises; prompts of coefficient 0 are neither embedded nor predicted."""
     prior = GaussianPrior()
-    guidance(prior, replace(GuidanceSettings(), loss=loss, noises=3)).gradient(picture(rng), 0)
+    guidance(prior, replace(ASKED, loss=loss, noises=3)).gradient(picture(rng), 0)
     (call,) = prior.calls
     names = [name for name in TERMS[loss] for _ in range(3)]
     assert call.prompts == [PROMPTS[name.rstrip("+")] for name in names]
@@ -228,7 +218,7 @@ def test_losses_of_the_embedded_prior_do_without_an_adapter(
     prior = GaussianPrior()
     x = picture(rng)
     settings = at_time(0.4, loss=loss, weight="uniform")
-    found = Guidance(prior, CONDITION, settings, MASK, 100, 3, None).gradient(x, 0)
+    found = Guidance(prior, PROMPT, settings, MASK, 100, 3, None).gradient(x, 0)
     (call,) = prior.calls
     assert call.prompts == ["a car", "a wrong shadow"] and call.adapters == [None, None]
     z, t = call.latents_noisy[0], call.t[0]
@@ -237,21 +227,6 @@ def test_losses_of_the_embedded_prior_do_without_an_adapter(
     expected = good - bad if loss == "good-bad" else 3 * good - 2 * bad - (z - a * x[0]) / s
     assert found is not None
     torch.testing.assert_close(found[0], expected, rtol=FLOAT32, atol=FLOAT32)
-
-
-@pytest.mark.parametrize(
-    ("loss", "keeps"),
-    [("csd", [True, False]), ("sds-good-bad", [True, False]), ("sds-base", [True, False])],
-)
-def test_null_and_negative_terms_may_go_without_the_photo(
-    rng: np.random.Generator, loss: str, keeps: list[bool]
-) -> None:
-    """What is asked for always sees it; by default all terms do, and nothing is said of it."""
-    for rule, expected in (("keep", None), ("drop", [k for k in keeps for _ in range(2)])):
-        prior = GaussianPrior()
-        settings = replace(GuidanceSettings(), loss=loss, null_background=rule, noises=2)
-        guidance(prior, settings).gradient(picture(rng), 0)
-        assert prior.calls[0].keep_background == expected
 
 
 def test_work_is_the_difference_of_the_potential(rng: np.random.Generator) -> None:
@@ -283,7 +258,7 @@ def test_work_is_the_difference_of_the_potential(rng: np.random.Generator) -> No
 def test_work_draws_what_no_step_does(rng: np.random.Generator) -> None:
     """Times of the whole run, noises of none of its steps, and the same ones for each call."""
     prior = GaussianPrior()
-    made = guidance(prior, replace(GuidanceSettings(), noises=50))
+    made = guidance(prior, replace(ASKED, noises=50))
     x = picture(rng)
     made.work(x, x, x, range(1000))
     t = torch.cat([call.t[:50] for call in prior.calls]).double().numpy()
@@ -302,7 +277,7 @@ def test_work_draws_what_no_step_does(rng: np.random.Generator) -> None:
 def test_sds_without_guidance_has_one_term(rng: np.random.Generator) -> None:
     """At g = 1 the null prompt counts 0 and is not computed."""
     prior = GaussianPrior()
-    settings = replace(GuidanceSettings(), loss="sds-base", guidance_scale=1.0)
+    settings = replace(ASKED, loss="sds-base", guidance_scale=1.0)
     guidance(prior, settings).gradient(picture(rng), 0)
     assert prior.calls[0].prompts == ["a car"]
 
@@ -336,12 +311,11 @@ def test_sds_is_the_score_of_the_noised_density(rng: np.random.Generator, t: flo
 @pytest.mark.parametrize("loss", ["lds", "lds-lora-both"])
 def test_zero_adapter_makes_lds_equal_csd(rng: np.random.Generator, loss: str) -> None:
     """With an adapter that adds nothing and one prompt, LDS is CSD bit for bit."""
-    condition = Condition("a car in sks")
     found = []
     for name in (loss, "csd"):
-        settings = replace(GuidanceSettings(), loss=name, noises=2)
+        settings = GuidanceSettings(loss=name, noises=2)
         prior = GaussianPrior(adapter_shift=0.0)
-        found.append(Guidance(prior, condition, settings, MASK, 100, 3, "scene"))
+        found.append(Guidance(prior, PROMPT, settings, MASK, 100, 3, "scene"))
     for step in (0, 50, 99):
         x = picture(rng).float()
         first, second = (made.gradient(x, step) for made in found)
@@ -373,7 +347,7 @@ def test_times_are_uniform_in_the_steps_range(
 ) -> None:
     """Times fill the range of the first and the last step (Kolmogorov-Smirnov)."""
     prior = GaussianPrior()
-    guidance(prior, replace(GuidanceSettings(), noises=1000)).gradient(picture(rng), step)
+    guidance(prior, replace(ASKED, noises=1000)).gradient(picture(rng), step)
     shares = (prior.calls[0].t[:1000].double() - 0.02) / (top - 0.02)
     assert stats.kstest(shares.numpy(), "uniform").pvalue > 0.01
 
@@ -386,7 +360,7 @@ def test_draws_are_a_function_of_seed_step_and_noise(rng: np.random.Generator) -
 
     def seen(loss: str, seed: int, step: int, noises: int) -> Tensor:
         prior = GaussianPrior()
-        settings = replace(GuidanceSettings(), loss=loss, noises=noises)
+        settings = replace(ASKED, loss=loss, noises=noises)
         guidance(prior, settings, mask, seed).gradient(x, step)
         return prior.calls[0].latents_noisy[:noises]
 
@@ -396,33 +370,6 @@ def test_draws_are_a_function_of_seed_step_and_noise(rng: np.random.Generator) -
     assert torch.equal(seen("lds", 3, 7, 3)[:1], first)
     others = [*seen("lds", 3, 7, 3)[1:], *seen("lds", 3, 8, 1), *seen("lds", 4, 7, 1)]
     assert all((other - first).abs().max() > 0.1 for other in others)
-
-
-def test_condition_is_cropped_as_the_picture(rng: np.random.Generator) -> None:
-    """Background and G-buffer come in the crops of each noise, once for every term."""
-    x = picture(rng, 24, 36)
-    gbuffer = torch.tensor(rng.random((1, 7, 24, 36)))
-    mask = torch.zeros(24, 36)
-    mask[8:16, 10:26] = 1.0
-    encoded: list[Tensor] = []
-
-    class Watched(GaussianPrior):
-        def encode(self, image: Tensor) -> Tensor:
-            encoded.append(image.detach())
-            return image
-
-    prior = Watched(resolution=6)
-    condition = replace(CONDITION, background=x, gbuffer=gbuffer)
-    made = Guidance(prior, condition, at_time(0.02, noises=2), mask, 100, 3, "scene")
-    made.gradient(x, 0)
-    (call,) = prior.calls
-    assert call.background is not None and call.gbuffer is not None
-    assert torch.equal(call.background[:, :3], encoded[0].repeat(2, 1, 1, 1))
-    # Beside each crop the whole photo.
-    assert torch.equal(call.background[:, 3:], shrink(x, 6).expand(4, -1, -1, -1))
-    assert not torch.equal(encoded[0][0], encoded[0][1])
-    assert call.gbuffer.shape == (4, 7, 6, 6)
-    assert torch.equal(call.gbuffer[:2], call.gbuffer[2:])
 
 
 def test_residual_is_summed_over_the_latents() -> None:
@@ -533,7 +480,7 @@ def test_steps_without_finite_gradient_are_skipped(
             return noise
 
     prior = Faulty()
-    made = guidance(prior, GuidanceSettings())
+    made = guidance(prior, ASKED)
     good, broken = picture(rng), picture(rng)
     if where == "image":
         broken[0, 0, 0, 0] = bad
@@ -582,7 +529,7 @@ def test_median_forgets_and_zero_is_no_limit() -> None:
 
 def test_restored_state_continues_identically(rng: np.random.Generator) -> None:
     """Through JSON, a restored run clips, counts and draws as if it had not been stopped."""
-    settings = replace(GuidanceSettings(), gradient_clip=1.1)
+    settings = replace(ASKED, gradient_clip=1.1)
     x = picture(rng)
     whole, first, second = (guidance(GaussianPrior(), settings) for _ in range(3))
     for step in range(30):
@@ -601,7 +548,7 @@ def test_restored_state_continues_identically(rng: np.random.Generator) -> None:
 def test_prompts_are_embedded_once(rng: np.random.Generator) -> None:
     """Steps and scores use the embeddings of the start: the text encoder may be freed."""
     prior = GaussianPrior()
-    made = guidance(prior, GuidanceSettings())
+    made = guidance(prior, ASKED)
     for step in range(3):
         made.gradient(picture(rng), step)
     made.score(picture(rng))
@@ -612,7 +559,7 @@ def test_gradient_has_the_pictures_shape_and_type(rng: np.random.Generator) -> N
     """float32 in, float32 out, detached; the picture itself is left alone."""
     x = picture(rng, 20, 30).float()
     before = x.clone()
-    found = guidance(GaussianPrior(), GuidanceSettings(), torch.ones(20, 30)).gradient(x, 0)
+    found = guidance(GaussianPrior(), ASKED, torch.ones(20, 30)).gradient(x, 0)
     assert found is not None
     assert (found.shape, found.dtype, found.requires_grad) == (x.shape, torch.float32, False)
     assert torch.equal(x, before) and not x.requires_grad
@@ -624,7 +571,7 @@ def test_score_is_its_printed_formula(rng: np.random.Generator, loss: str, noise
     """Errors of both predictions, or |delta|^2 with noise, over 8 times of equal spacing."""
     prior = GaussianPrior()
     x = picture(rng)
-    settings = replace(GuidanceSettings(), loss=loss, noises=noises, guidance_scale=7.5)
+    settings = replace(ASKED, loss=loss, noises=noises, guidance_scale=7.5)
     found = guidance(prior, settings).score(x, seed=11)
     expected, times = [], []
     for call in prior.calls:
@@ -653,7 +600,7 @@ def test_score_is_a_function_of_the_picture(rng: np.random.Generator, loss: str)
     x = picture(rng, 20, 30)
     mask = torch.zeros(20, 30)
     mask[5:15, 5:25] = 1.0
-    settings = replace(GuidanceSettings(), loss=loss)
+    settings = replace(ASKED, loss=loss)
     made = guidance(GaussianPrior(), settings, mask)
     first = made.score(x)
     made.gradient(x, 0)
@@ -667,7 +614,7 @@ def test_score_is_a_function_of_the_picture(rng: np.random.Generator, loss: str)
 @pytest.mark.parametrize("loss", ["lds", "csd", "lds-lora-both", "lds-negative"])
 def test_score_falls_along_the_gradient(rng: np.random.Generator, loss: str) -> None:
     """Steps against the gradient lower the score: both name the same pictures better."""
-    made = guidance(GaussianPrior(), replace(GuidanceSettings(), loss=loss))
+    made = guidance(GaussianPrior(), replace(ASKED, loss=loss))
     x = picture(rng)
     scores = [made.score(x)]
     for step in range(20):
@@ -680,7 +627,7 @@ def test_score_falls_along_the_gradient(rng: np.random.Generator, loss: str) -> 
 
 def test_score_that_is_not_finite_is_unknown(rng: np.random.Generator) -> None:
     """A picture with NaN has no score."""
-    made = guidance(GaussianPrior(), GuidanceSettings())
+    made = guidance(GaussianPrior(), ASKED)
     assert made.score(torch.full((1, 3, 4, 4), math.nan)) is None
 
 
@@ -717,49 +664,45 @@ def test_precision_is_judged_by_the_difference(rng: np.random.Generator, noises:
     cosines = {}
     for loss in ("csd", "sds-base"):
         prior = Rounded()
-        settings = replace(GuidanceSettings(), loss=loss, guidance_scale=1.0, noises=noises)
+        settings = replace(ASKED, loss=loss, guidance_scale=1.0, noises=noises)
         made = guidance(prior, settings)
         cosines[loss] = made.ensure_precision(x)
         assert prior.precise
         assert sum(len(call.t) for call in prior.calls) == 2 * 4 * len(made.terms)
     assert cosines["sds-base"] is not None and cosines["sds-base"] > 0.999
     assert cosines["csd"] is not None and cosines["csd"] < 0.9
-    assert guidance(GaussianPrior(), GuidanceSettings()).ensure_precision(x) is None
+    assert guidance(GaussianPrior(), ASKED).ensure_precision(x) is None
 
 
 def test_loss_without_its_adapter_is_refused() -> None:
     """LDS without a LoRA would be CSD under another name."""
     for loss in LOSSES:
-        settings = replace(GuidanceSettings(), loss=loss)
+        settings = replace(ASKED, loss=loss)
         if loss in ("csd", "sds-base", "good-bad", "sds-good-bad"):
-            kind_of(settings)(GaussianPrior(), CONDITION, settings, MASK, 10, 0, None)
+            kind_of(settings)(GaussianPrior(), PROMPT, settings, MASK, 10, 0, None)
         else:
             with pytest.raises(ValueError, match=f"{loss} needs an adapter"):
-                kind_of(settings)(GaussianPrior(), CONDITION, settings, MASK, 10, 0, None)
+                kind_of(settings)(GaussianPrior(), PROMPT, settings, MASK, 10, 0, None)
 
 
 def test_loss_of_another_name_is_refused() -> None:
     """The error lists all losses."""
     with pytest.raises(ValueError, match=r"lds, sds, .*, dataset-update \(found 'vsd'\)"):
-        coefficients(replace(GuidanceSettings(), loss="vsd"))
+        coefficients(replace(ASKED, loss="vsd"))
 
 
-def test_negative_prompt_is_the_conditions_or_the_settings() -> None:
-    """The condition's comes first; with neither it is the null prompt."""
-    settings = replace(GuidanceSettings(), loss="lds-negative", negative_prompt="from the flag")
-    for condition, chosen, expected in (
-        (Condition("p", negative_prompt="own"), settings, "own"),
-        (Condition("p"), settings, "from the flag"),
-        (Condition("p"), replace(settings, negative_prompt=""), ""),
-    ):
-        made = Guidance(GaussianPrior(), condition, chosen, MASK, 10, 0, "scene")
-        assert [term.prompt for term in made.terms] == ["p", expected]
+def test_negative_prompt_defaults_to_the_null_prompt() -> None:
+    """It is asked for where it is named."""
+    for asked in ("a wrong shadow", ""):
+        settings = GuidanceSettings(loss="lds-negative", negative_prompt=asked)
+        made = Guidance(GaussianPrior(), "p", settings, MASK, 10, 0, "scene")
+        assert [term.prompt for term in made.terms] == ["p", asked]
 
 
 def test_base_prompt_defaults_to_the_prompt() -> None:
     """The unadapted model is asked for the same, unless told otherwise."""
-    settings = replace(GuidanceSettings(), loss="csd")
-    made = Guidance(GaussianPrior(), Condition("p"), settings, MASK, 10, 0, None)
+    settings = GuidanceSettings(loss="csd")
+    made = Guidance(GaussianPrior(), "p", settings, MASK, 10, 0, None)
     assert [term.prompt for term in made.terms] == ["p", ""]
 
 
@@ -790,8 +733,8 @@ class EditingPrior(GaussianPrior):
 
 
 def update(prior: GaussianPrior, mask: Tensor = MASK, **changes: object) -> DatasetUpdate:
-    settings = replace(GuidanceSettings(), loss="dataset-update", **changes)
-    made = kind_of(settings)(prior, CONDITION, settings, mask, steps=100, seed=3, adapter="scene")
+    settings = replace(ASKED, loss="dataset-update", **changes)
+    made = kind_of(settings)(prior, PROMPT, settings, mask, steps=100, seed=3, adapter="scene")
     assert isinstance(made, DatasetUpdate)
     return made
 
@@ -895,7 +838,7 @@ def load_adapted(folder: Path, gain: float) -> StableDiffusion:
     return prior
 
 
-SD_SETTINGS = replace(GuidanceSettings(), noises=2, weight="uniform")
+SD_SETTINGS = GuidanceSettings(noises=2, weight="uniform")
 
 
 def photo(rng: np.random.Generator) -> tuple[Tensor, Tensor]:
@@ -908,11 +851,11 @@ def photo(rng: np.random.Generator) -> tuple[Tensor, Tensor]:
 def test_zero_lora_makes_lds_equal_csd_exactly(rng: np.random.Generator, folder: Path) -> None:
     """On a real UNet: LoRAs of zero in a batch with base samples change no bit; others do."""
     x, mask = photo(rng)
-    condition = Condition("a car in the style of sks rendering")
+    prompt = "a car in the style of sks rendering"
     for gain in (0.0, 0.5):
         prior = load_adapted(folder, gain)
         lds, csd = (
-            Guidance(prior, condition, replace(SD_SETTINGS, loss=loss), mask, 10, 3, "scene")
+            Guidance(prior, prompt, replace(SD_SETTINGS, loss=loss), mask, 10, 3, "scene")
             for loss in ("lds", "csd")
         )
         first, second = lds.gradient(x, 4), csd.gradient(x, 4)
@@ -927,7 +870,7 @@ def test_batch_of_terms_and_noises_equals_separate_calls(
     x, mask = photo(rng)
     prior = load_adapted(folder, 0.5)
     settings = replace(SD_SETTINGS, loss="sds", guidance_scale=7.5)
-    made = Guidance(prior, CONDITION, settings, mask, 10, 3, "scene")
+    made = Guidance(prior, PROMPT, settings, mask, 10, 3, "scene")
     together = made.gradient(x, 4)
     predict = prior.predict
     sizes = []
@@ -956,7 +899,7 @@ def test_gradient_passes_autoencoder_and_crop(rng: np.random.Generator, folder: 
     prior = load_adapted(folder, 0.5)
     prior.vae.double()
     settings = replace(SD_SETTINGS, noises=1)
-    made = Guidance(prior, CONDITION, settings, mask, 10, 3, "scene")
+    made = Guidance(prior, PROMPT, settings, mask, 10, 3, "scene")
     said: list[Tensor] = []
     predict = prior.predict
 
@@ -991,7 +934,7 @@ def test_guidance_works_without_the_text_encoder(rng: np.random.Generator, folde
     asked = (
         replace(SD_SETTINGS, loss=loss, update_steps=2) for loss in (*LOSSES, "dataset-update")
     )
-    made = [kind_of(s)(prior, CONDITION, s, mask, 10, 3, "scene") for s in asked]
+    made = [kind_of(s)(prior, PROMPT, s, mask, 10, 3, "scene") for s in asked]
     prior.free_text_encoder()
     for each in made:
         d_image = each.gradient(x, 0)

@@ -231,15 +231,6 @@ def test_right_networks_of_all_types_agree(
     torch.testing.assert_close(edited, expected, rtol=0, atol=1e-3)
 
 
-def test_predict_takes_conditions_and_ignores_them(prior: StableDiffusion) -> None:
-    """Background and G-buffer are for the embedded prior."""
-    arguments = (noise(1), torch.tensor([0.4]), prior.embed(["scene"]), [None])
-    without = prior.predict(*arguments)
-    size = (1, 3, RESOLUTION, RESOLUTION)
-    with_both = prior.predict(*arguments, torch.rand(size), torch.rand(1, 7, *size[2:]))
-    assert torch.equal(without, with_both)
-
-
 # Adapters
 
 

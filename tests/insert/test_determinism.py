@@ -35,15 +35,6 @@ LOWER = {
 """A processor without AVX-512, as far as torch and NumPy are concerned."""
 TINY = {
     "regressed": {"light": None},
-    "embedded": {
-        "light": None,
-        "guidance_width": "32",
-        "light_height": "16",
-        "object_light_height": "8",
-        "steps": "2",
-        "score_every": "1",
-        "checkpoint_every": "1",
-    },
     "stable-diffusion": {**GUIDED, "steps": "4", "lora_steps": "4"},
     "refine": {
         **GUIDED,
@@ -55,12 +46,6 @@ TINY = {
     },
 }
 """A cheap run of each kind."""
-FEW_DRAWS = """
-from functools import partial
-import warpir.optimize.recover as recover
-recover.judge, recover.CHECK_DRAWS = partial(recover.judge, draws=2), 2
-"""
-"""Judges the end of a run by two draws of noise in place of sixteen: most of its time."""
 
 
 @pytest.fixture(scope="module")
@@ -103,9 +88,8 @@ def run(
 @pytest.mark.parametrize("kind", [pytest.param(k, id=f"R13-threads-{k}") for k in TINY])
 def test_threads_change_no_byte(folder: Path, tmp_path: Path, kind: str) -> None:
     """Every file, whatever --threads and the environment say of threads."""
-    before = FEW_DRAWS if kind == "embedded" else ""
-    few = run(argv(folder, kind, threads="1"), tmp_path / "few", ONE, before)
-    many = run(argv(folder, kind, threads="8"), tmp_path / "many", MANY, before)
+    few = run(argv(folder, kind, threads="1"), tmp_path / "few", ONE)
+    many = run(argv(folder, kind, threads="8"), tmp_path / "many", MANY)
     assert len(few) > 15 and many == few
 
 
@@ -238,7 +222,6 @@ def test_deterministic_is_accepted_on_the_cpu(
     ("kind", "changes"),
     [
         pytest.param("regressed", {}, id="R13-cuda-regressed"),
-        pytest.param("embedded", {}, id="R13-cuda-embedded"),
         pytest.param("stable-diffusion", {}, id="R13-cuda-stable-diffusion"),
         pytest.param("stable-diffusion", {"integrator": "mis"}, id="R13-cuda-mis"),
         pytest.param("refine", {}, id="R13-cuda-refine"),

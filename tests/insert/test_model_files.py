@@ -1,7 +1,7 @@
-"""Files of weights at the command line: LoRA, the embedded prior's and the regressor's.
+"""Files of weights at the command line: LoRA and the regressor's.
 
 Each fault is met before torch is loaded. What only the networks can tell is in the tests of their
-readers (test_lora_files, test_embedded, test_regressor).
+readers (test_lora_files, test_regressor).
 """
 
 import json
@@ -22,17 +22,15 @@ from safetensors.numpy import save_file
 from tests.builders.faults import NO_TORCH, assert_fails
 from tests.builders.insertions import arguments, write_inputs
 from tests.builders.tiny_stable_diffusion import make_tiny_stable_diffusion
-from tests.diffusion.test_embedded import TINY
 from tests.lighting.test_regressor import SMALL
 from warpir.app.config import InsertConfig
 from warpir.app.record import input_files
-from warpir.diffusion.models.embedded import build_network, save_embedded
 from warpir.diffusion.models.weight_files import values_hash
 from warpir.lighting.regressor import random_regressor, save_regressor
 
 WRITTEN = "damaged (its weights are not those that were written)"
 LAYER = "mid_block.attentions.0.transformer_blocks.0.attn2.to_k"
-FLAGS = ("lora", "prior", "regressor")
+FLAGS = ("lora", "regressor")
 
 
 @pytest.fixture(scope="module")
@@ -48,7 +46,6 @@ def inputs(tmp_path_factory: pytest.TempPathFactory) -> Path:
         },
         folder / "lora.safetensors",
     )
-    save_embedded(build_network(TINY), folder / "prior.safetensors", {})
     save_regressor(random_regressor(0, SMALL), folder / "regressor.safetensors", {})
     return folder
 
@@ -57,7 +54,6 @@ def run_with(inputs: Path, flag: str, file: Path | str) -> list[str]:
     """Arguments of a run that reads one of the files."""
     changes: dict[str, str | None] = {
         "lora": {"model": str(inputs / "model"), "prompt": "a red ball"},
-        "prior": {"guidance": "embedded", "steps": "1"},
         "regressor": {"light": None},
     }[flag]  # type: ignore[assignment]
     return arguments(inputs, "out", device="cpu", **{flag: str(file), **changes})
@@ -149,7 +145,7 @@ def test_weights_of_another_kind_are_refused(
     """Each reader knows its own files by their header or names."""
     unet = inputs / "model/unet/diffusion_pytorch_model.safetensors"
     file = unet if other == "unet" else inputs / f"{other}.safetensors"
-    words = {"lora": "not a LoRA", "prior": "no embedded prior", "regressor": "no weights of the"}
+    words = {"lora": "not a LoRA", "regressor": "no weights of the"}
     assert_fails(
         run_with(inputs, flag, file), 4, str(file), words[flag], cwd=tmp_path, before=NO_TORCH
     )
@@ -168,17 +164,6 @@ def configured(**changes: object) -> Callable[[Path], None]:
     return edited(change)
 
 
-def networked(name: str, value: object) -> Callable[[Path], None]:
-    """Change what the header of a prior says of its network."""
-
-    def change(tensors: dict[str, Any], about: dict[str, str]) -> None:
-        described = json.loads(about["warpir_prior"])
-        described["network"][name] = value
-        about["warpir_prior"] = json.dumps(described)
-
-    return edited(change)
-
-
 def as_written(spoil: Callable[[dict[str, Any]], object]) -> Callable[[Path], None]:
     """Change weights, and the hash of them too."""
 
@@ -192,16 +177,6 @@ def as_written(spoil: Callable[[dict[str, Any]], object]) -> Callable[[Path], No
 @pytest.mark.parametrize(
     ("flag", "damage", "words"),
     [
-        pytest.param("prior", describe("warpir_prior", "{"), "header", id="L2-prior-header-cut"),
-        pytest.param(
-            "prior", describe("warpir_prior", "[" * 100_000), "header", id="L2-prior-header-nested"
-        ),
-        pytest.param(
-            "prior", describe("warpir_prior", '{"format": 99}'), "format 99", id="L2-prior-newer"
-        ),
-        pytest.param(
-            "prior", set_first(0.123), "not those that were written", id="L2-prior-changed"
-        ),
         pytest.param(
             "regressor",
             describe("format", "warpir-regressor-9"),
@@ -231,21 +206,6 @@ def as_written(spoil: Callable[[dict[str, Any]], object]) -> Callable[[Path], No
                 ("channels", [48], "network: channels"),
                 ("dropout", "x", "network: dropout"),
                 ("more", 1, "header is damaged"),
-            )
-        ),
-        *(
-            pytest.param("prior", networked(name, value), words, id=f"L2-prior-{name}-{value}")
-            for name, value, words in (
-                ("groups", 0, "network: groups"),
-                ("groups", 7, "in 7 groups"),
-                ("groups", [8], "network: groups"),
-                ("widths", 64, "network: widths"),
-                ("embedding_width", [32], "network: embedding_width"),
-                ("head_width", 0, "network: head_width"),
-                ("widths", [16, 32_000], "network: widths"),
-                ("widths", [], "network: widths"),
-                ("layers", 10**8, "network: layers"),
-                ("embedding_width", True, "network: embedding_width"),
             )
         ),
         *(
@@ -346,8 +306,6 @@ def test_a_large_file_is_looked_at_in_pieces(inputs: Path, tmp_path: Path, flag:
         try:
             if flag == "lora":
                 weight_files.check_lora(file, None)
-            elif flag == "prior":
-                weight_files.check_prior(file)
             else:
                 weight_files.check_regressor(file)
         except ModelError as error:

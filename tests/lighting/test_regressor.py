@@ -19,9 +19,7 @@ from warpir.core.latlong import map_directions
 from warpir.diffusion.models.weight_files import read_header, values_hash
 from warpir.lighting.regression import (
     Regression,
-    _regression,
     camera_rays,
-    estimate_shading_light,
     facing_irradiance,
     mean_training_light,
     regress,
@@ -647,42 +645,3 @@ def test_training_collects_the_mean_light(tmp_path: Path) -> None:
     for normal in (np.array([0.0, 1.0, 0.0]), np.array([0.6, 0.0, 0.8])):
         found = Light(mean.ambient).irradiance(normal)
         np.testing.assert_allclose(found, math.pi * np.array([0.3, 0.4, 0.5]), rtol=0.1)
-
-
-def test_hint_is_the_expected_picture_of_a_matte_object() -> None:
-    """By sums over the sphere, and the batch's map says the same as one photo's regression."""
-    network = random_regressor(3)
-    camera = camera_from_fov(144, 96, 60.0, -8.0, 1.6)
-    generator = torch.Generator().manual_seed(2)
-    photo = torch.rand(1, 3, 96, 144, generator=generator)
-    rays = torch.from_numpy(camera_rays(camera)).permute(2, 0, 1)[None]
-    with torch.no_grad():
-        prediction = network.split(network(photo, rays))
-    prediction = prediction._replace(logits=3.0 * prediction.logits / network.temperature)
-    found = _regression(network, prediction, float(mean_luminance(photo)), camera)
-    normals = fibonacci(40)
-    sphere = fibonacci(20_000)
-    lobes = found.ambient
-    radiance = np.exp(lobes.sharpness * (sphere @ lobes.axis.T - 1.0)) @ lobes.amplitude
-    expected = np.maximum(normals @ sphere.T, 0.0) @ radiance * (4.0 * np.pi / len(sphere))
-    for place, share in zip(found.directions, found.probability, strict=True):
-        expected += share * np.maximum(normals @ place, 0.0)[:, None] * found.sun
-    np.testing.assert_allclose(found.irradiance(normals), expected, rtol=5e-3)
-
-    albedo = np.full((40, 3), 0.4)
-    turn = camera.c2w[:3, :3]
-    shown, toward = found.matte_picture(albedo, normals @ turn, camera.c2w)
-    np.testing.assert_allclose(
-        shown, np.clip(0.4 * expected / np.pi, 0.0, 1.0) ** (1.0 / 2.2), rtol=5e-3, atol=1e-4
-    )
-    mean = found.probability @ found.directions
-    np.testing.assert_allclose(turn @ toward, found.share * mean, atol=1e-5)
-
-    # The same temperature by the buffer, so that the batch has this very distribution.
-    network.temperature.div_(3.0)
-    batch = estimate_shading_light(network, photo, rays)
-    texels = map_directions(16, 32).reshape(-1, 3)
-    np.testing.assert_allclose(
-        batch.irradiance[0].reshape(-1, 3).numpy(), found.irradiance(texels), rtol=2e-3
-    )
-    np.testing.assert_allclose(batch.toward[0].numpy(), found.share * mean, atol=1e-4)

@@ -30,7 +30,7 @@ from warpir.diffusion.models.stable_diffusion import StableDiffusion, load_stabl
 from warpir.diffusion.personalization.class_images import make_class_images
 from warpir.diffusion.personalization.lora_files import initial_lora
 from warpir.diffusion.personalization.lora_training import LoraTraining
-from warpir.diffusion.prior import BAD_STEPS_MAX, Condition, NonFiniteError
+from warpir.diffusion.prior import BAD_STEPS_MAX, NonFiniteError
 from warpir.diffusion.prompts import make_prompts
 from warpir.diffusion.settings import GuidanceSettings, ModelSettings, PersonalizeSettings
 from warpir.insert import main
@@ -317,7 +317,7 @@ def test_rate_backs_off_and_comes_back(device: str) -> None:
     settings = replace(SETTINGS, steps=40)
     loop = a_loop(device, Toward(), settings, bent())
     plant_gradient(loop, lambda: loop.state.step in bad)
-    base = [group["rate"] * settings.rate_of_all for group in loop.optimizer.param_groups]
+    base = [group["rate"] * settings.rate for group in loop.optimizer.param_groups]
     shares = []
     for step in range(40):
         if step == 20:
@@ -402,7 +402,7 @@ def test_guidance_goes_on_in_fp32(prior: StableDiffusion, monkeypatch: pytest.Mo
     in_low_precision(prior)
     overflow(prior, monkeypatch, always=False)
     image, mask = torch.rand(1, 3, 64, 64), torch.ones(64, 64)
-    guide = Guidance(prior, Condition("a box"), GuidanceSettings(loss="csd"), mask, 9, 0, None)
+    guide = Guidance(prior, "a box", GuidanceSettings(loss="csd"), mask, 9, 0, None)
     assert guide.gradient(image * NAN, 0) is None and prior.unet_dtype is torch.bfloat16
     d_image = guide.gradient(image, 1)
     assert d_image is not None and bool(d_image.isfinite().all())
@@ -550,7 +550,7 @@ def test_guided_run_counts_bad_steps(
     monkeypatch.setattr(Guidance, "_gradient", gradient)
     out = tmp_path / "out"
     flags = guided_flags(inputs, out, steps="7", checkpoint_every="0")
-    assert main([*flags, "--no-accept"]) == status
+    assert main(flags) == status
     captured = capsys.readouterr()
     if status == ExitCode.DONE:
         assert record(out)["measured"]["optimization"]["skipped_steps"] == 1

@@ -318,8 +318,16 @@ def test_report_that_fails_does_not_cost_the_run(
     "argv",
     [
         ["--photo", "a b.png", "--asset", "x.glb", "--place", "-1,0,-3.5", "--no-detail"],
-        ["--demo", "--steps", "60", "--accept", "--guidance", "embedded", "--allow-pickle"],
-        ["--demo", "--no-accept", "--model", "m", "--prompt", 'it\'s a "car"; $HOME', "--graphs"],
+        ["--demo", "--accept", "--model", "m", "--prompt", "p", "--steps", "60", "--allow-pickle"],
+        [
+            "--demo",
+            "--no-tone-curve",
+            "--model",
+            "m",
+            "--prompt",
+            'it\'s a "car"; $HOME',
+            "--graphs",
+        ],
         ["--demo", "--model", "m", "--prompt", "p", "--show-prior", "a, b|c", "--lora-rank", "8"],
         ["--demo", "--sun", "-30,40", "--sky", "0.1,0.2,0.3"],
     ],

@@ -11,12 +11,10 @@ from typing import Any, NoReturn, get_args
 
 import warpir
 from warpir.app.config import (
-    CPU_DEFAULTS,
     DEFAULTS,
     DOTTED,
     OPTIONS,
     PARTS,
-    PRIOR_DEFAULTS,
     InsertConfig,
     Option,
     flag,
@@ -26,7 +24,6 @@ from warpir.app.config_file import closest, kind_of, read_config_file
 from warpir.core.errors import InputError, raise_all, shown
 from warpir.core.limits import Limits
 from warpir.core.options import convert, help_of
-from warpir.diffusion.settings import GuidanceSettings
 
 HEADINGS = {
     "inputs": "inputs",
@@ -240,8 +237,6 @@ def make_parser(
         for name, form in forms.items():
             if form:
                 group.add_argument(flag(name), dest=name, metavar=form)
-            elif DEFAULTS[name] is None:
-                group.add_argument(flag(name), dest=name, action=argparse.BooleanOptionalAction)
             else:
                 action = "store_false" if DEFAULTS[name] else "store_true"
                 group.add_argument(flag(name), dest=name, action=action)
@@ -273,8 +268,6 @@ def read_arguments(parser: argparse.ArgumentParser, argv: Sequence[str]) -> dict
 def _help_of(name: str, about: str, is_whole: bool) -> str:
     default = DEFAULTS[name]
     about = about if is_whole else about.partition("; ")[0]
-    if name in PRIOR_DEFAULTS["embedded"]:
-        return f"{about} (default: {_by_prior(name)})" if is_whole else about
     if default is True:
         return f"Leave out: {about[0].lower()}{about[1:]}"
     # An optional value says in its own words what happens without it.
@@ -284,19 +277,6 @@ def _help_of(name: str, about: str, is_whole: bool) -> str:
     return f"{about} (default: {shown})"
 
 
-def _by_prior(name: str) -> str:
-    """Return in words what an open field stands for."""
-    names = {"embedded": "embedded", "stable-diffusion": "Stable Diffusion"}
-    found = {}
-    for prior, words in names.items():
-        value = _words(PRIOR_DEFAULTS[prior][name])
-        on_cpu = CPU_DEFAULTS[prior].get(name)
-        found[words] = value if on_cpu is None else f"{value}, on the CPU {_words(on_cpu)}"
-    if len(set(found.values())) == 1:
-        return found["embedded"]
-    return "; ".join(f"{words} {value}" for words, value in found.items())
-
-
 def _words(value: object) -> str:
     return str(value) if not isinstance(value, bool) else "yes" if value else "no"
 
@@ -304,9 +284,8 @@ def _words(value: object) -> str:
 def field_docs() -> dict[str, str]:
     """Return the help of every value, from the sources of the parts."""
     docs: dict[tuple[str, str], str] = {}
-    # `GuidanceChoices` has its help at `GuidanceSettings`.
     sources = [(name, base) for name, part in PARTS.items() for base in part.__mro__[:-1]]
-    for part, settings in (*sources, ("guidance", GuidanceSettings)):
+    for part, settings in sources:
         docs |= {(part, field): text for field, text in help_of(settings).items()}
     return {name: docs[option.part, option.field] for name, option in OPTIONS.items()}
 

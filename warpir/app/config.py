@@ -28,19 +28,13 @@ from warpir.core.errors import ExitCode, InputError, raise_all
 from warpir.core.limits import Limits
 from warpir.core.options import Rule, is_a, plain, rule_of
 from warpir.diffusion.prompts import make_prompts
-from warpir.diffusion.settings import (
-    GuidanceSettings,
-    ModelSettings,
-    PersonalizeSettings,
-)
+from warpir.diffusion.settings import ModelSettings, PersonalizeSettings
 
 SKY_PRESETS = ("clear", "overcast", "sunset")
 REFINE_STEPS = {"material": 300, "emission": 300, "tone": 200}
 REFINE_PARTS = ("base-color", "metallic", "roughness")
 DEVICE_FORM = re.compile(r"cpu|cuda(:\d+)?")
 DEMO_HINT = "--demo needs neither --photo nor --asset"
-EMBEDDED_STEPS = 60
-"""Steps with which the embedded prior was tried; it is not asked unless --steps says so."""
 
 
 @dataclass(frozen=True, init=False)
@@ -94,39 +88,21 @@ class InsertConfig:
         return InsertConfig(**{**self.flat(), **values})
 
     @property
-    def guided_by(self) -> str:
-        """``guidance``, or what stands for it: embedded, stable-diffusion or none."""
-        if self.guidance.kind is not None:
-            return self.guidance.kind
-        if self.diffusion.model is not None:
-            return "stable-diffusion"
-        is_lit = self.light.reuse is not None or self.light.is_described
-        return "none" if is_lit else "embedded"
-
-    @property
     def is_guided(self) -> bool:
-        """Whether a prior is asked: the embedded one is where `steps` says how often."""
-        return self.guided_by == "stable-diffusion" or (
-            self.guided_by == "embedded" and bool(self.optimize.steps)
-        )
+        """Whether a diffusion model guides."""
+        asked, model = self.guidance.kind, self.diffusion.model
+        return asked == "stable-diffusion" or (asked is None and model is not None)
 
     @property
     def tone_operator(self) -> str:
         """`tone`, or what stands for it; a light far from its start wants one that never clips."""
-        return self.light.tone or PRIOR_DEFAULTS.get(self.guided_by, {"tone": "linear"})["tone"]
+        return self.light.tone or ("reinhard" if self.is_guided else "linear")
 
-    def settled(self, on_cuda: bool = True) -> "InsertConfig":
-        """Return the same with nothing left open to the prior; without one, as Stable Diffusion's.
-
-        Args:
-            on_cuda: Whether it runs on a CUDA device.
-        """
-        return self.changed(**_open_values(self, on_cuda))
-
-    def guidance_settings(self) -> GuidanceSettings:
-        """Return what guidance is asked to do; nothing may be open (`settled`)."""
-        names = (field.name for field in fields(GuidanceSettings))
-        return GuidanceSettings(**{name: getattr(self.guidance, name) for name in names})
+    def settled(self) -> "InsertConfig":
+        """Return the same with the steps that ``--refine`` takes where none are named."""
+        if self.optimize.steps is not None or self.task.refine is None:
+            return self
+        return self.changed(steps=REFINE_STEPS[self.task.refine])
 
     def require_inputs(self) -> None:
         """Check that what every run needs is named.
@@ -140,7 +116,7 @@ class InsertConfig:
         is_whole = self.inputs.demo or self.task.sequence
         needed = {} if is_whole else dict.fromkeys(("photo", "asset"), DEMO_HINT)
         needed["out"] = ""
-        if self.guided_by == "stable-diffusion":
+        if self.is_guided:
             needed["model"] = "--guidance stable-diffusion needs a folder or a hub id"
             needed["prompt"] = "say in a few words what the object is"
         values = self.flat()
@@ -181,49 +157,6 @@ DOTTED = {f"{option.part}.{option.field}": name for name, option in OPTIONS.item
 """The same names by part and field, as ``camera.height``."""
 DEFAULTS = {name: option.default for name, option in OPTIONS.items()}
 """What a value is when nobody names it."""
-PRIOR_DEFAULTS: dict[str, dict[str, Any]] = {
-    prior: {
-        name: getattr(option.rule, prior.replace("-", "_"))
-        for name, option in OPTIONS.items()
-        if option.rule.embedded is not None
-    }
-    for prior in ("stable-diffusion", "embedded")
-}
-"""What a value that is None stands for, by the prior that guides.
-
-The embedded prior's are those for which its potential is least biased
-(benchmarks/light/probe.py): the photo's own share in what it expects, at noise levels of .76 to
-.99. One light and no curves: a small prior cannot tell more apart, and it learnt from photos that
-are clipped, not bent.
-"""
-CPU_DEFAULTS: dict[str, dict[str, Any]] = {
-    "stable-diffusion": {},
-    "embedded": {
-        name: option.rule.embedded_on_cpu
-        for name, option in OPTIONS.items()
-        if option.rule.embedded_on_cpu is not None
-    },
-}
-"""What it stands for on the CPU, where that differs."""
-
-
-def _open_values(config: InsertConfig, on_cuda: bool = True) -> dict[str, Any]:
-    """Return what stands for the fields that are open; without a prior, Stable Diffusion's."""
-    prior = config.guided_by if config.guided_by in PRIOR_DEFAULTS else "stable-diffusion"
-    chosen = PRIOR_DEFAULTS[prior] | ({} if on_cuda else CPU_DEFAULTS[prior])
-    if config.task.refine in REFINE_STEPS:
-        chosen |= {"steps": REFINE_STEPS[config.task.refine], "accept": False}
-    if config.adapter.lora is not None:
-        chosen |= {"personalize": True}
-    if prior == "embedded" and (config.adapter.lora is not None or config.adapter.personalize):
-        chosen |= {"loss": "sds"}  # the same, asked of the adapted model
-    if config.guidance.loss == "dataset-update":
-        chosen |= {"accept": False}
-    if not config.is_guided:
-        del chosen["accept"]  # there is no end that could be judged
-    values = config.flat()
-    # The tone belongs to the light: `InsertConfig.tone_operator`.
-    return {k: v for k, v in chosen.items() if k != "tone" and values[k] is None}
 
 
 def flag(name: str) -> str:
@@ -367,7 +300,7 @@ def _values_that_clash(config: InsertConfig) -> Iterator[InputError]:
     for first, second in EXCLUSIVE:
         if {first, second} <= given:
             yield usage(flag(second), f"cannot be used with {flag(first)}", "leave one of them out")
-    if "reuse" in given and config.guided_by != "none" and "refine" not in given:
+    if "reuse" in given and config.is_guided and "refine" not in given:
         yield usage(
             "--guidance" if "guidance" in given else "--model",
             "cannot be used with --reuse, whose light is known",
@@ -376,20 +309,20 @@ def _values_that_clash(config: InsertConfig) -> Iterator[InputError]:
     if "shadow_mask" in given and config.is_guided:
         yield usage(
             "--shadow-mask",
-            "cannot be used while a prior changes the light or the object",
+            "cannot be used while a model changes the light or the object",
             "recover the light first, then give the mask with --reuse",
         )
     for name, fulfilled, what in (*_needs_of_scene(config, given), *_needs_of_prior(config, given)):
         if name in given and not fulfilled:
             yield usage(flag(name), f"needs {what}")
-    if config.adapter.personalize is False:
-        if "show_prior" in given and config.guided_by == "stable-diffusion":
+    if not config.adapter.personalize:
+        if "show_prior" in given and config.is_guided:
             what = "cannot be used with --show-prior, which shows its effect"
             yield usage("--no-personalize", what)
         if "lora" in given:
             what = "cannot be used with --lora"
             yield usage("--no-personalize", what, "leave one of them out")
-    if config.task.refine == "tone" and config.optimize.tone_curve is False:
+    if config.task.refine == "tone" and not config.optimize.tone_curve:
         what = "cannot be used with --refine tone, which changes nothing else"
         yield usage("--no-tone-curve", what)
     yield from _losses_that_clash(config)
@@ -406,9 +339,9 @@ def _needs_of_scene(config: InsertConfig, given: Container[str]) -> Needs:
         yield name, "camera" in given, "--camera with a camera file"
     yield "sequence", "reuse" in given, "--reuse: one light for all frames"
     yield "fps", "sequence" in given, "--sequence, of which the video is made"
-    is_demo_lit = "demo" in given and (config.guided_by == "none" or "refine" in given)
+    is_demo_lit = "demo" in given and (config.guidance.kind == "none" or "refine" in given)
     is_lit = is_demo_lit or any(name in given for name in LIGHTS)
-    level = "--light, --sun or --sky: with --guidance alone the light's level is recovered"
+    level = "--light, --sun or --sky: with --model alone the light's level is recovered"
     yield "exposure", is_lit or not config.is_guided, level
     is_turned = "light" in given or "reuse" in given or is_demo_lit
     yield "light_rotate", is_turned, "--light or --reuse; of --sun, give another azimuth"
@@ -416,43 +349,32 @@ def _needs_of_scene(config: InsertConfig, given: Container[str]) -> Needs:
 
 
 def _needs_of_prior(config: InsertConfig, given: Container[str]) -> Needs:
-    """As `_needs_of_scene`, of what a prior is asked."""
-    with_words = config.guided_by == "stable-diffusion"
-    yield "show_prior", with_words, "--guidance stable-diffusion and its --model"
-    asks = f"--guidance with a prior (--model, or --steps {EMBEDDED_STEPS} for the embedded one)"
-    yield "resume", config.is_guided, f"{asks}: nothing else has checkpoints"
-    steps = f"--guidance embedded and --steps {EMBEDDED_STEPS}: the prior is not asked without"
-    yield "prior", config.is_guided and not with_words, steps
-    yield "accept", config.is_guided, f"{asks}, whose result it judges"
-    who_judges = "--guidance stable-diffusion, which judges the change: no other knows colours"
-    yield "refine", with_words, who_judges
+    """As `_needs_of_scene`, of what a model is asked."""
+    guided = config.is_guided
+    yield "show_prior", guided, "--model"
+    yield "resume", guided, "--model: nothing else has checkpoints"
+    yield "accept", guided, "--model, whose result it judges"
+    yield "refine", guided, "--model, which judges the change"
     yield "refine_parts", config.task.refine == "material", "--refine material"
     with_materials = config.task.refine in ("material", "emission")
     yield "refine_materials", with_materials, "--refine material or emission"
 
 
 def _losses_that_clash(config: InsertConfig) -> Iterator[InputError]:
-    """Find what a loss lacks, and ranges that are empty; with what is open as the prior has it."""
-    made = {**config.flat(), **_open_values(config)}
-    loss = made["loss"]
-    if config.guided_by != "none" and not made["personalize"] and loss not in LOSSES_OF_BASE:
-        losses = " or ".join(LOSSES_OF_BASE)
-        if config.adapter.personalize is False:
-            yield usage(
-                "--no-personalize",
-                f"cannot be used with --loss {loss}, which compares the adapted model",
-                f"add --loss {losses}, or leave it out",
-            )
-        else:
-            what = f"{loss} compares the adapted model"
-            yield usage("--loss", what, f"add --personalize, or choose {losses}")
-    says_itself = config.guided_by == "embedded" or config.guidance.negative_prompt
-    if loss in LOSSES_AWAY and not says_itself:
+    """Find what a loss lacks, and ranges that are empty."""
+    asked, loss = config.guidance, config.guidance.loss
+    if config.is_guided and not config.adapter.personalize and loss not in LOSSES_OF_BASE:
+        yield usage(
+            "--no-personalize",
+            f"cannot be used with --loss {loss}, which compares the adapted model",
+            f"add --loss {' or '.join(LOSSES_OF_BASE)}, or leave it out",
+        )
+    if loss in LOSSES_AWAY and not asked.negative_prompt:
         yield usage("--loss", f"{loss} needs --negative-prompt, which it moves away from")
-    if config.guidance.accept and loss == "dataset-update":
+    if asked.accept and loss == "dataset-update":
         yield usage("--accept", "cannot be used with --loss dataset-update, which has no potential")
     for low, high in (("time_min", "time_max"), ("crop_min", "crop_max")):
-        least, greatest = made[low], made[high]
+        least, greatest = getattr(asked, low), getattr(asked, high)
         if least > greatest:
             yield usage(flag(low), f"at most {flag(high)} (found {least:g} and {greatest:g})")
 

@@ -373,7 +373,7 @@ def _inputs_in_out(config: InsertConfig) -> list[InputError]:
     named = (
         *(inputs.photo, inputs.asset, inputs.materials, camera.file, light.file),
         *(inputs.occluder_mask, camera.shadow_mask, camera.proxy, light.reuse),
-        *(config.diffusion.model, config.adapter.lora, config.guidance.prior),
+        *(config.diffusion.model, config.adapter.lora),
         *(light.regressor, camera.ground_points),
     )
     return inputs_within(config.output.out, *(path for path in named if path is not None))

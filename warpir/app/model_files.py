@@ -26,7 +26,7 @@ def require_model(config: InsertConfig) -> None:
         InputError: Something is not there, or not what it should be (`ExitCode.MODEL`); the other
             problems are in its ``also``.
     """
-    from warpir.diffusion.models.weight_files import check_lora, check_prior, check_regressor
+    from warpir.diffusion.models.weight_files import check_lora, check_regressor
 
     problems: list[InputError] = []
 
@@ -37,16 +37,11 @@ def require_model(config: InsertConfig) -> None:
             problems.append(InputError(error.where, error.what, error.advice, ExitCode.MODEL))
             return None
 
-    lora, prior, regressor = (
-        _path(f) for f in (config.adapter.lora, config.guidance.prior, config.light.regressor)
-    )
+    lora, regressor = (_path(f) for f in (config.adapter.lora, config.light.regressor))
     is_told = config.light.is_described or config.light.reuse is not None
     embedding_width: int | None = None
-    if config.guided_by == "stable-diffusion":
+    if config.is_guided:
         embedding_width = attempt(lambda: _model_width(config.diffusion))
-    if prior is not None or (config.guided_by == "embedded" and config.is_guided):
-        described = attempt(lambda: check_prior(prior))
-        embedding_width = described["network"]["embedding_width"] if described else None
     if lora is not None:
         attempt(lambda: check_lora(lora, embedding_width))
     if regressor is not None or (config.light.start != "uniform" and not is_told):

@@ -20,7 +20,7 @@ OF_THE_RUN = ("out", "overwrite", "resume", "threads", "report")
 """Settings that change nothing in a result, so that its pictures do not hold them."""
 PATHS = (
     *("photo", "occluder_mask", "asset", "materials", "camera", "ground_points", "proxy"),
-    *("shadow_mask", "light", "prior", "regressor", "model", "lora", "reuse", "sequence", "out"),
+    *("shadow_mask", "light", "regressor", "model", "lora", "reuse", "sequence", "out"),
 )
 """Settings that name a file or a folder."""
 RUN_FORMAT = 1
@@ -130,7 +130,7 @@ def input_files(config: InsertConfig) -> dict[str, Path]:
 
     names = (
         *("photo", "occluder_mask", "materials", "camera", "light", "lora"),
-        *("prior", "regressor", "ground_points", "shadow_mask"),
+        *("regressor", "ground_points", "shadow_mask"),
     )
     paths = {name: Path(path) for name in names if (path := config.flat()[name]) is not None}
     for name, stems in MODEL_STEMS.items():

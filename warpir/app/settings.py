@@ -4,14 +4,13 @@ Each field is one flag of the command line (``height`` of `CameraConfig` is ``--
 one key of a configuration file and one entry under ``config`` in ``run.json``. Its range and form
 stand on it (`warpir.core.options`), and its help below it. Angles are degrees here and at the
 command line, radians everywhere inside. Defaults are the authors' (DiPIR, Liang et al. 2024) where
-they state one, else ours. What is None is open: it follows from other values, or from the prior
-that guides (`warpir.app.config.PRIOR_DEFAULTS`).
+they state one, else ours. What is None is open: it follows from other values.
 """
 
 from dataclasses import dataclass
 
 from warpir.core.options import option
-from warpir.diffusion.settings import GuidanceChoices
+from warpir.diffusion.settings import GuidanceSettings
 
 AXES = ("x", "+x", "-x", "y", "+y", "-y", "z", "+z", "-z")
 
@@ -151,11 +150,9 @@ class LightConfig:
     is as strong as suns in view are"""
     exposure: float | None = option(None, "EV", low=-30, high=30)
     """Factor on the light, in stops (default: from the photo); [EV]"""
-    tone: str | None = option(
-        None, "NAME", choices=("reinhard", "linear"), stable_diffusion="reinhard", embedded="linear"
-    )
+    tone: str | None = option(None, "NAME", choices=("reinhard", "linear"))
     """Object's radiance to display values: linear or reinhard; clipped, as the photo was, or x / (1
-    + x), which is paler and does not clip"""
+    + x), which is paler and does not clip (default: reinhard where a model guides, else linear)"""
     ground_albedo: float | None = option(None, "SHARE", low=1e-6, high=1)
     """Reflectance of the ground, for the exposure; which is automatic without --exposure: 0.25
     where a light is given; one that is estimated from the photo follows the ground only where this
@@ -221,22 +218,16 @@ class LookConfig:
 
 
 @dataclass(frozen=True)
-class GuidanceConfig(GuidanceChoices):
+class GuidanceConfig(GuidanceSettings):
     """Which prior guides, and what it is asked."""
 
-    kind: str | None = option(
-        None, "NAME", name="guidance", choices=("embedded", "stable-diffusion", "none")
-    )
-    """Prior: embedded, stable-diffusion or none; what recovers the light from the photo. embedded
-    comes with warpir: the light that a regressor sees in the photo, which with --steps 60 a small
-    prior refines (experimental: it failed its release gate). With none the light is used as given,
-    or else as the regressor sees it (default: stable-diffusion with --model, none where a light is
-    given, else embedded)"""
+    kind: str | None = option(None, "NAME", name="guidance", choices=("stable-diffusion", "none"))
+    """Prior: stable-diffusion or none; what changes the light so that the picture looks right. With
+    none the light is used as given, or else as it is estimated from the photo (default:
+    stable-diffusion with --model)"""
     prompt: str | None = option(None, "TEXT", is_prompt=True)
     """What the object is, such as 'a black SUV car'; in a few words; stable-diffusion needs it"""
-    prior: str | None = option(None, "FILE")
-    """Weights of the embedded prior (default: in the package); which --steps asks"""
-    accept: bool | None = option(None, stable_diffusion=False, embedded=True)
+    accept: bool = option(False)
     """Keep the start of the recovery unless its end is better; guidance, asked anew, must clearly
     prefer the end"""
     show_prior: tuple[str, ...] | None = option(None, "TEXT|TEXT", is_prompt=True, separator="|")
@@ -248,70 +239,33 @@ class GuidanceConfig(GuidanceChoices):
 class OptimizeSettings:
     """How light and tone curves are recovered from the guidance's gradient."""
 
-    preview_every: int | None = option(
-        None, "N", low=0, high=10**6, stable_diffusion=0, embedded=50
-    )
+    preview_every: int = option(50, "N", low=0, high=10**6)
     """Steps between two preview pictures (0: none); of the optimisation, the first of which is the
     start"""
     checkpoint_every: int = option(50, "N", expert=True, low=0, high=10**6)
     """Steps between two checkpoints of the optimisation; 0: none"""
-    steps: int | None = option(None, "N", low=0, high=10**6, stable_diffusion=600, embedded=0)
-    """Steps of the optimisation; with --refine 300, or 200 for tone; the embedded prior is asked
-    with more than 0 alone (experimental: it failed its release gate)"""
-    guidance_width: int | None = option(
-        None,
-        "W",
-        expert=True,
-        low=8,
-        high=4096,
-        stable_diffusion=384,
-        embedded=384,
-        embedded_on_cpu=256,
-    )
+    steps: int | None = option(None, "N", low=0, high=10**6)
+    """Steps of the optimisation (default: 600); with --refine 300, or 200 for tone"""
+    guidance_width: int = option(384, "W", expert=True, low=8, high=4096)
     """Width of the picture inside the loop [px]; its height follows the photo's shape"""
     lobes: int = option(64, "N", expert=True, low=1, high=4096)
     """Spherical-Gaussian lobes of each light, the object's and the shadow's"""
     lobe_width: float = option(0.6, "SPACINGS", expert=True, low=0.05, high=10)
     """Width of the lobes at the start of an even light, sigma in spacings of the lobes"""
-    light_height: int | None = option(
-        None,
-        "ROWS",
-        expert=True,
-        low=4,
-        high=512,
-        stable_diffusion=64,
-        embedded=64,
-        embedded_on_cpu=48,
-    )
+    light_height: int = option(64, "ROWS", expert=True, low=4, high=512)
     """Rows of the maps in which the two lights are fused"""
-    object_light_height: int | None = option(
-        None,
-        "ROWS",
-        expert=True,
-        low=4,
-        high=512,
-        stable_diffusion=32,
-        embedded=32,
-        embedded_on_cpu=24,
-    )
+    object_light_height: int = option(32, "ROWS", expert=True, low=4, high=512)
     """Rows of the map that lights the object while its light transport is stored"""
-    fusion: str | None = option(
-        None,
-        "NAME",
-        expert=True,
-        choices=("schedule", "single", "none"),
-        stable_diffusion="schedule",
-        embedded="single",
-    )
+    fusion: str = option("schedule", "NAME", expert=True, choices=("schedule", "single", "none"))
     """How the two lights become one: schedule (blended from none to all over the run), single (one
     light from the start) or none (two lights to the end)"""
     fusion_start: float = option(0.0, "SHARE", expert=True, low=0, high=1)
     """Where in the run the lights begin to become one, as a share of the steps"""
     fusion_end: float = option(1.0, "SHARE", expert=True, low=0, high=1)
     """Where in the run they are one, as a share of the steps"""
-    lobe_shape: bool | None = option(None, expert=True, stable_diffusion=True, embedded=False)
+    lobe_shape: bool = option(True, expert=True)
     """Recover widths and colours of the lobes too, not their directions and strengths alone"""
-    tone_curve: bool | None = option(None, expert=True, stable_diffusion=True, embedded=False)
+    tone_curve: bool = option(True, expert=True)
     """Recover tone curves for the object and its shadow"""
     integrator: str = option("transport", "NAME", expert=True, choices=("transport", "mis"))
     """What renders inside the loop: transport (light transport is traced once and then reused) or
@@ -323,9 +277,7 @@ class OptimizeSettings:
     retrace_at: float = option(3.0, "FACTOR", expert=True, low=1)
     """Light transport is traced again when the lights have changed so much that its noise has grown
     by this factor"""
-    rate: float | None = option(
-        None, "FACTOR", expert=True, low=0, high=10, stable_diffusion=1.0, embedded=0.35
-    )
+    rate: float = option(1.0, "FACTOR", expert=True, low=0, high=10)
     """Factor on all learning rates"""
     rate_end: float = option(0.1, "FACTOR", expert=True, low=0, high=1)
     """Factor to which all learning rates fall over the second half of the run, by a cosine"""
@@ -371,41 +323,6 @@ class OptimizeSettings:
     def step_count(self) -> int:
         """`steps`, or the authors' number."""
         return 600 if self.steps is None else self.steps
-
-    @property
-    def fusion_kind(self) -> str:
-        """`fusion`, or the authors'."""
-        return self.fusion or "schedule"
-
-    @property
-    def has_lobe_shape(self) -> bool:
-        """`lobe_shape`, or what the authors do."""
-        return self.lobe_shape is not False
-
-    @property
-    def rate_of_all(self) -> float:
-        """`rate`, or 1."""
-        return 1.0 if self.rate is None else self.rate
-
-    @property
-    def has_tone_curve(self) -> bool:
-        """`tone_curve`, or what the authors do."""
-        return self.tone_curve is not False
-
-    @property
-    def picture_width(self) -> int:
-        """`guidance_width`, or the authors' number [px]."""
-        return 384 if self.guidance_width is None else self.guidance_width
-
-    @property
-    def light_rows(self) -> int:
-        """`light_height`, or what Stable Diffusion gets."""
-        return 64 if self.light_height is None else self.light_height
-
-    @property
-    def object_light_rows(self) -> int:
-        """`object_light_height`, or what Stable Diffusion gets."""
-        return 32 if self.object_light_height is None else self.object_light_height
 
 
 @dataclass(frozen=True)

@@ -144,7 +144,7 @@ def _memory(config: InsertConfig, inputs: Inputs) -> int:
     """Return the least memory that a scene takes of the host beside the program [byte]."""
     of_photo, of_scene = memory_needs(inputs)
     total = of_photo.bytes + sum(need.bytes for need in of_scene)
-    if config.guided_by == "stable-diffusion" and config.diffusion.model is not None:
+    if config.is_guided and config.diffusion.model is not None:
         total += sum(f.stat().st_size for f in Path(config.diffusion.model).rglob("*.safetensors"))
     return total
 

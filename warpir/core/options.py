@@ -6,7 +6,7 @@ The help is the docstring below the field: ``--help`` shows it up to the first s
 import ast
 import inspect
 import os
-from dataclasses import Field, dataclass, field, fields, replace
+from dataclasses import Field, dataclass, field
 from numbers import Integral, Real
 from types import UnionType
 from typing import Any, Union, get_args, get_origin
@@ -40,12 +40,6 @@ class Rule:
     """What parts the texts of a list."""
     by_hand: bool = False
     """Whether the command line alone may set it: it opens the network, or runs code."""
-    stable_diffusion: Any = None
-    """What an open value stands for with Stable Diffusion."""
-    embedded: Any = None
-    """What it stands for with the embedded prior."""
-    embedded_on_cpu: Any = None
-    """What it stands for with the embedded prior on the CPU, where that differs."""
 
     def problem(self, value: Any) -> str:
         """Return what a value should be, or nothing if it is that; NaN is for others to find."""
@@ -74,13 +68,6 @@ def rule_of(field: Field[Any]) -> Rule:
     """Return the rule of a field that `option` made."""
     rule: Rule = field.metadata["rule"]
     return rule
-
-
-def left_open(settings: type, name: str) -> Any:
-    """Return a field that is open: Stable Diffusion gets the default of a field of ``settings``."""
-    stated = next(field for field in fields(settings) if field.name == name)
-    rule = replace(rule_of(stated), stable_diffusion=stated.default)
-    return field(default=None, metadata={"rule": rule})
 
 
 def help_of(settings: type) -> dict[str, str]:

@@ -27,7 +27,7 @@ def demo_config(config: InsertConfig) -> InsertConfig:
     """
     is_placed = config.placement.place is not None or config.placement.at is not None
     is_given = any(config.flat()[name] is not None for name in LIGHTS)
-    is_recovered = is_given or (config.guided_by != "none" and config.task.refine is None)
+    is_recovered = is_given or (config.guidance.kind != "none" and config.task.refine is None)
     return config.changed(
         demo=False,
         photo=str(PHOTO),

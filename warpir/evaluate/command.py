@@ -19,7 +19,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from warpir.app.config import EMBEDDED_STEPS, InsertConfig, usage
+from warpir.app.config import InsertConfig, usage
 from warpir.app.program import run_program, say
 from warpir.core.atomic import write_file
 from warpir.core.errors import ExitCode, InputError
@@ -102,11 +102,9 @@ def _add_model_flags(parser: argparse.ArgumentParser) -> None:
     add = parser.add_argument
     words = "weights of LPIPS (warpir/evaluate/lpips.py says which)"
     add("--lpips", type=Path, metavar="FILE", help=words)
-    add("--prior", metavar="FILE", help="weights of the embedded prior (default: warpir's own)")
     words = "weights of the regressor (default: warpir's own)"
     add("--regressor", type=Path, metavar="FILE", help=words)
-    words = "a Stable Diffusion that guides in place of the embedded prior"
-    add("--model", metavar="DIR", help=words)
+    add("--model", metavar="DIR", help="a Stable Diffusion for the rows that guide")
     add("--prompt", metavar="TEXT", help="what all objects are (default: their files' names)")
     add("--steps", type=_count, metavar="N", help="of the guided rows")
 
@@ -127,8 +125,7 @@ def _run(arguments: list[str]) -> int:
 
     from warpir.evaluate.rows import GROUPS, ROWS, chosen_rows
 
-    is_guided = bool(options.model or options.prior or options.steps)
-    rows = chosen_rows(options.rows, options.predictions is not None, is_guided)
+    rows = chosen_rows(options.rows, options.predictions is not None, options.model is not None)
     if options.list_rows:
         for name, row in ROWS.items():
             say(f"{name:20} {row.group:12} {row.words}")
@@ -251,9 +248,7 @@ def evaluate(
         say(f"{place.name}: {sheet_row}, RMSE of the box {float(error):.4f}")
     record = run_record(options, bench, scenes, notices)
     if options.procedural:
-        record["procedural"] = procedural_errors(
-            bench.network, options.procedural, options.seed, device
-        )
+        record["procedural"] = procedural_errors(bench.network, options.procedural, options.seed)
     record["seconds"] = round(time.perf_counter() - started, 1)
     lines = _summarize(record, entries, rows)
     for line in lines:
@@ -403,17 +398,11 @@ def _make_bench(
         if options.regressor is not None:
             raise
         missing = error
-    # Ablations that adapt the small prior do so in proportion: its recipe of 150 to 300 steps.
-    adaptation: dict[str, Any] = {"class_images": 40, "lora_steps": 200, "lora_rank": 8}
     config = InsertConfig(
-        **({} if options.model is not None else adaptation),
-        guidance="stable-diffusion" if options.model is not None else "embedded",
         model=options.model,
-        prior=options.prior,
         regressor=None if options.regressor is None else str(options.regressor),
         prompt=options.prompt,
-        # Rows that guide ask the embedded prior, which a plain run does not.
-        steps=options.steps or (EMBEDDED_STEPS if options.model is None else None),
+        steps=options.steps or None,
         threads=options.threads or None,
     )
     return Bench(

@@ -20,9 +20,7 @@ from warpir.lighting.regressor import Regressor, least_angle
 from warpir.render.composite import Quality
 from warpir.scene.light import as_map
 from warpir.train.lights import load_panoramas
-from warpir.train.meshes import make_meshes
 from warpir.train.scenes.generator import Mixture, SceneGenerator
-from warpir.train.scenes.render import Stock
 from warpir.train.validation import COVERAGE
 
 LIGHT_HEIGHT = 128
@@ -134,16 +132,13 @@ def light_figures(place: Place, texels: FloatArray) -> dict[str, float]:
     return _flat("", {"light": errors, "spheres": sphere_errors(predicted, true)})
 
 
-def procedural_errors(
-    network: Regressor, count: int, seed: int, device: str
-) -> dict[str, dict[str, float]]:
+def procedural_errors(network: Regressor, count: int, seed: int) -> dict[str, dict[str, float]]:
     """Return how well the regressor finds the direction in rendered photographs never seen.
 
     Args:
         network: The regressor.
         count: Photographs.
-        seed: Objects, lights and photographs are those of no training run.
-        device: Warp device.
+        seed: Lights and photographs are those of no training run.
 
     Returns:
         Angle between found and true dominant direction [deg]: median, mean and 95 % interval of the
@@ -151,8 +146,9 @@ def procedural_errors(
         the direction of the mean training light.
     """
     where = network.directions.device
-    stock = Stock(make_meshes(24, UNSEEN_SEED + seed), load_panoramas([], where), device)
-    scenes = SceneGenerator(stock, UNSEEN_SEED + seed, Mixture(made_up=1.0, hybrid=0.0))
+    scenes = SceneGenerator(
+        load_panoramas([], where), UNSEEN_SEED + seed, Mixture(made_up=1.0, hybrid=0.0)
+    )
     guess, _ = least_angle(
         network.directions, network.split(network.mean_light[None]).logits.softmax(dim=1)
     )

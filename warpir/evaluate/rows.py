@@ -20,7 +20,6 @@ from warpir.core.arrays import FloatArray
 from warpir.core.color import luminance
 from warpir.core.errors import InputError
 from warpir.core.latlong import rotate_map
-from warpir.diffusion.models.embedded import build_network, save_embedded
 from warpir.evaluate.scenes import CAMERA_HEIGHT, Place, Subject, mirrored, turned_to
 from warpir.evaluate.stage import Bench, Prediction, Stage
 from warpir.io.images.photos import Photo, read_photo
@@ -64,7 +63,7 @@ class Row:
     same_as: str | None = None
     """The row whose light it should give."""
     needs: tuple[str, ...] = ()
-    """Some of ``regressor``, ``calibrator``, ``prior`` and ``panoramas``; the last means two
+    """Some of ``regressor``, ``calibrator``, ``model`` and ``panoramas``; the last means two
     panoramas."""
 
     def require(self, bench: Bench) -> None:
@@ -79,8 +78,8 @@ class Row:
             _ = bench.network
         if "calibrator" in self.needs:
             _ = bench.calibrator
-        if "prior" in self.needs:
-            bench.require_prior()
+        if "model" in self.needs:
+            bench.require_guide()
 
 
 GROUPS = {
@@ -239,15 +238,6 @@ def guided(**changes: Any) -> Callable[[Bench, Stage, Subject], Prediction]:
     return predict
 
 
-def guided_randomly(bench: Bench, stage: Stage, subject: Subject) -> Prediction:
-    """Return the light that guidance by a prior with random weights recovers."""
-    with tempfile.TemporaryDirectory() as folder:
-        path = Path(folder) / "random.safetensors"
-        save_embedded(build_network(seed=bench.seed), path, {})
-        changes = {"guidance": "embedded", "model": None, "prior": str(path), "start": "regressed"}
-        return recover_light(bench, subject, subject.place.photo, changes)
-
-
 def guided_elsewhere(bench: Bench, stage: Stage, subject: Subject) -> Prediction:
     """Return the light that guidance recovers from another place's photograph."""
     other = bench.other(subject.place)
@@ -277,7 +267,7 @@ def recover_light(
     """Run what `warpir.insert` runs, up to the recovered light and curves.
 
     Args:
-        bench: Names prior or model.
+        bench: Names the model.
         subject: The object and where it stands.
         photo: Photo for guidance, display-encoded, shape [H, W, 3].
         changes: Settings that differ from the bench's.
@@ -314,21 +304,12 @@ def _words(stem: str) -> str:
     return " ".join(letters.lower().split()) or "object"
 
 
-AUTHORS: dict[str, Any] = {
-    "null_background": "keep", "guidance_scale": 100.0, "time_min": 0.05, "time_max": 0.8,
-    "time_max_end": 0.4, "fusion": "schedule", "lobe_shape": True, "tone_curve": True, "rate": 1.0,
-}  # fmt: skip
-"""Settings by which the embedded prior's defaults become the authors' method: all unknowns, and
-their times on its schedule. Stable Diffusion's defaults are theirs already."""
-
-
 def _ablation(words: str, **changes: Any) -> Row:
     def predict(bench: Bench, stage: Stage, subject: Subject) -> Prediction:
-        theirs = AUTHORS if bench.config.diffusion.model is None else {}
-        settings = {"start": "uniform", "accept": False, **theirs, **changes}
+        settings = {"start": "uniform", "accept": False, **changes}
         return recover_light(bench, subject, subject.place.photo, settings)
 
-    return Row("ablations", words, of_subject=predict, start="uniform", needs=("prior",))
+    return Row("ablations", words, of_subject=predict, start="uniform", needs=("model",))
 
 
 ROWS = {
@@ -381,14 +362,14 @@ ROWS = {
         "guidance from an even light",
         of_subject=guided(start="uniform"),
         start="uniform",
-        needs=("prior",),
+        needs=("model",),
     ),
     "lds-regression": Row(
         "methods",
         "guidance from the regressor's light",
         of_subject=guided(start="regressed"),
         start="regression",
-        needs=("prior", "regressor"),
+        needs=("model", "regressor"),
     ),
     "predictions": Row("predictions", "the lights of --predictions", of_place=predicted),
     "random-regression": Row(
@@ -409,41 +390,28 @@ ROWS = {
         same_as="regression",
         needs=("regressor",),
     ),
-    "lds-random": Row(
-        "controls",
-        "guidance by a prior with random weights, from the regressor's light",
-        of_subject=guided_randomly,
-        start="regression",
-        needs=("regressor",),
-    ),
     "lds-other-photo": Row(
         "controls",
         "guidance in another scene's photo",
         of_subject=guided_elsewhere,
-        needs=("prior", "regressor", "panoramas"),
+        needs=("model", "regressor", "panoramas"),
     ),
     "lds-mirrored": Row(
         "controls",
         "guidance in the mirrored photo; its light mirrored back",
         of_subject=guided_mirrored,
         same_as="lds-regression",
-        needs=("prior", "regressor"),
+        needs=("model", "regressor"),
     ),
-    "s3-full": _ablation("the authors' method", loss="lds", personalize=True),
+    "s3-full": _ablation("the authors' method", loss="lds"),
     "s3-dataset-update": _ablation("a picture edited again and again", loss="dataset-update"),
-    "s3-sds": _ablation("score distillation, adapted model", loss="sds", personalize=True),
+    "s3-sds": _ablation("score distillation, adapted model", loss="sds"),
     "s3-sds-no-lora": _ablation("the same, base model", loss="sds-base"),
-    "s3-no-class-images": _ablation(
-        "no concept preservation", loss="lds", personalize=True, class_images=0
-    ),
-    "s3-no-tone-curve": _ablation("no tone curves", loss="lds", personalize=True, tone_curve=False),
-    "s3-no-fusion": _ablation("two lights to the end", loss="lds", personalize=True, fusion="none"),
-    "s3-single": _ablation(
-        "one light from the start", loss="lds", personalize=True, fusion="single"
-    ),
-    "s3-lora-both": _ablation(
-        "adapted model in both terms", loss="lds-lora-both", personalize=True
-    ),
+    "s3-no-class-images": _ablation("no concept preservation", loss="lds", class_images=0),
+    "s3-no-tone-curve": _ablation("no tone curves", loss="lds", tone_curve=False),
+    "s3-no-fusion": _ablation("two lights to the end", loss="lds", fusion="none"),
+    "s3-single": _ablation("one light from the start", loss="lds", fusion="single"),
+    "s3-lora-both": _ablation("adapted model in both terms", loss="lds-lora-both"),
 }
 """All rows by name, in the order of the tables."""
 DEFAULT_ROWS = (
@@ -464,7 +432,7 @@ def chosen_rows(text: str | None, has_predictions: bool, is_guided: bool = True)
     Raises:
         InputError: A name is unknown.
     """
-    names = {k for k in DEFAULT_ROWS if is_guided or "prior" not in ROWS[k].needs}
+    names = {k for k in DEFAULT_ROWS if is_guided or "model" not in ROWS[k].needs}
     if text is not None:
         names = set()
         for word in (w.strip() for w in text.split(",")):

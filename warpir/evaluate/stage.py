@@ -22,7 +22,7 @@ from warpir.app.model_files import require_model
 from warpir.calibration.network import Calibrator, load_calibrator
 from warpir.core.arrays import FloatArray, IntArray
 from warpir.core.color import linear_to_gamma
-from warpir.core.errors import InputError
+from warpir.core.errors import ExitCode, InputError
 from warpir.evaluate.scenes import RESPONSES, Place, Subject
 from warpir.lighting.regressor import Regressor, random_regressor
 from warpir.render.bridge import ComposeConstants, compose
@@ -257,7 +257,7 @@ class Bench:
         scenes: All places and their subjects.
         device: Warp device; torch uses the same.
         seed: Seed of guided runs and of random weights.
-        config: Base configuration of guided runs, without files: model or prior, steps, precision.
+        config: Base configuration of guided runs, without files: model, steps, precision.
         network: The regressor, or None.
         missing: Why there is no regressor.
         predictions: Lights of another system by the place's name, world frame.
@@ -302,19 +302,21 @@ class Bench:
         return unseen_by(self.network, panorama) or self.network
 
     @cache  # noqa: B019, a bench lives as long as the program
-    def require_prior(self) -> None:
-        """Check that something can guide.
+    def require_guide(self) -> None:
+        """Check that a model can guide.
 
         Raises:
-            InputError: The weights are not there, or not what they should be (`ExitCode.MODEL`).
+            InputError: None is named, or it is not what it should be (`ExitCode.MODEL`).
         """
+        if not self.config.is_guided:
+            raise InputError("--model", "needed: nothing else guides", code=ExitCode.MODEL)
         require_model(self.config.changed(start="uniform"))
 
     def digests(self) -> dict[str, str | None]:
         """Return the sha256 of the weights that were used, by what they are."""
         where = files("warpir.diffusion") / "weights"
         digests: dict[str, str | None] = {}
-        for name in ("regressor", "prior", "calibrator"):
+        for name in ("regressor", "calibrator"):
             given = self._calibrator_file if name == "calibrator" else self.config.flat()[name]
             path = Path(given or str(where / f"{name}.safetensors"))
             is_there = path.is_file()

@@ -5,7 +5,7 @@ from __future__ import annotations
 import copy
 import math
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 import torch
@@ -13,8 +13,7 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from warpir.core.arrays import AnyFloatArray, Float64Array, FloatArray
-from warpir.core.color import GAMMA, LUMINANCE_WEIGHTS
-from warpir.core.latlong import map_directions
+from warpir.core.color import LUMINANCE_WEIGHTS
 from warpir.lighting.regressor import (
     AMBIENT_SHARPNESS,
     HEIGHT,
@@ -26,7 +25,7 @@ from warpir.lighting.regressor import (
     mean_luminance,
 )
 from warpir.scene.camera import Camera
-from warpir.scene.light import Lobes, angles_from_axis, fibonacci
+from warpir.scene.light import Lobes, angles_from_axis
 
 
 @dataclass(frozen=True)
@@ -74,37 +73,6 @@ class Regression:
             np.append(sharpness, self.ambient.sharpness).astype(np.float32),
         )
 
-    def irradiance(self, normals: Float64Array) -> Float64Array:
-        """Return the expected irradiance of surfaces, photo-linear RGB, shape [..., 3].
-
-        Args:
-            normals: Unit, world frame, shape [..., 3].
-        """
-        cosine = np.maximum(normals @ self.directions.T, 0.0)
-        ambient = self.ambient.axis.astype(np.float64)
-        lobes = lobe_irradiance(normals @ ambient.T) @ self.ambient.amplitude.astype(np.float64)
-        expected: Float64Array = (cosine @ self.probability)[..., None] * self.sun + lobes
-        return expected
-
-    def matte_picture(
-        self, albedo: AnyFloatArray, normals: Float64Array, c2w: Float64Array
-    ) -> tuple[FloatArray, FloatArray]:
-        """Return a matte object's estimated picture, and where its light comes from.
-
-        Args:
-            albedo: Linear, shape [..., 3].
-            normals: Unit, camera frame (x right, y up, z toward the camera), shape [..., 3].
-            c2w: Pose of the camera, shape [4, 4].
-
-        Returns:
-            Display-encoded picture, shape [..., 3], and the expected direction toward the dominant
-            light in the camera's frame times its share, shape [3].
-        """
-        turn = np.asarray(c2w)[:3, :3]
-        shown = np.clip(albedo * self.irradiance(normals @ turn.T) / np.pi, 0.0, 1.0)
-        toward = self.share * (self.probability @ self.directions) @ turn
-        return (shown ** (1.0 / GAMMA)).astype(np.float32), toward.astype(np.float32)
-
     def record(self) -> dict[str, Any]:
         """Return plain values for ``run.json``."""
         azimuth, elevation = angles_from_axis(self.axis)
@@ -134,69 +102,6 @@ def facing_irradiance(sharpness: float) -> float:
     ``2 pi integral_0^1 t exp(s (t - 1)) dt = 2 pi (s - 1 + exp(-s)) / s^2``.
     """
     return 2.0 * math.pi * (sharpness + math.expm1(-sharpness)) / sharpness**2
-
-
-def lobe_irradiance(cosine: Float64Array) -> Float64Array:
-    """Return the irradiance that an ambient lobe of amplitude 1 gives a surface, same shape.
-
-    By a table over the angle to the lobe's axis, of sums over the sphere.
-
-    Args:
-        cosine: Of the angle between normal and axis.
-    """
-    angle = np.arccos(np.clip(cosine, -1.0, 1.0)) * ((len(_LOBE_TABLE) - 1) / math.pi)
-    values: Float64Array = np.interp(angle, np.arange(len(_LOBE_TABLE)), _LOBE_TABLE)
-    return values
-
-
-def _lobe_table(count: int = 65) -> Float64Array:
-    directions = fibonacci(20_000)
-    radiance = np.exp(AMBIENT_SHARPNESS * (directions[:, 1] - 1.0)) * (4.0 * math.pi / 20_000)
-    theta = np.linspace(0.0, math.pi, count)
-    normals = np.stack([np.sin(theta), np.cos(theta), np.zeros(count)], axis=1)
-    table: Float64Array = np.maximum(normals @ directions.T, 0.0) @ radiance
-    return table
-
-
-_LOBE_TABLE = _lobe_table()
-
-
-class ShadingLight(NamedTuple):
-    """The light of a batch of photos as far as matte surfaces need it, camera-yaw frame."""
-
-    irradiance: Tensor
-    """Expected irradiance by normal, a lat-long map, photo-linear RGB, shape [B, 16, 32, 3]."""
-    toward: Tensor
-    """Expected direction toward the dominant light times its share, shape [B, 3]."""
-
-
-@torch.no_grad()
-def estimate_shading_light(network: Regressor, photo: Tensor, rays: Tensor) -> ShadingLight:
-    """Estimate the light of photos, to shade many objects by it; see `Regression.matte_picture`.
-
-    Without the mirror image: half the time, for training.
-
-    Args:
-        network: In evaluation mode.
-        photo: Display-encoded, shape [B, 3, 96, 144].
-        rays: Unit viewing directions, camera-yaw frame, shape [B, 3, 96, 144].
-    """
-    prediction = network.split(network(photo, rays).float())
-    probability = (prediction.logits / network.temperature).softmax(dim=1)
-    luminance = mean_luminance(photo)[:, None]
-    log_red, log_blue = prediction.tint.unbind(dim=1)
-    ratios = torch.stack([log_red, torch.zeros_like(log_red), log_blue], dim=1).exp()
-    weights = ratios.new_tensor(LUMINANCE_WEIGHTS)
-    sun = luminance * prediction.level.clamp(-12, 12).exp()[:, None] * ratios
-    sun = sun / (ratios @ weights)[:, None]
-    normals = map_directions(16, 32).reshape(-1, 3)
-    cosine = torch.from_numpy(normals).to(network.directions) @ network.directions.T
-    of_lobes = torch.from_numpy(lobe_irradiance(normals @ ambient_axes().T)).to(cosine)
-    facing = probability @ cosine.clamp(min=0.0).T
-    ambient = luminance[..., None] * prediction.ambient.clamp(-12, 8).exp()
-    irradiance = facing[..., None] * sun[:, None] + of_lobes @ ambient
-    toward = prediction.share.sigmoid()[:, None] * (probability @ network.directions)
-    return ShadingLight(irradiance.unflatten(1, (16, 32)), toward)
 
 
 def yaw_to_world(camera: Camera) -> Float64Array:

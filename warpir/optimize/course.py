@@ -164,7 +164,7 @@ def make_frame(run: Run) -> Frame:
         InputError: The object covers no pixel; checked before the model is adapted.
     """
     config, camera = run.config, run.inputs.camera
-    width = min(config.optimize.picture_width, camera.width)
+    width = min(config.optimize.guidance_width, camera.width)
     small = camera.scaled(width, max(1, round(width * camera.height / camera.width)))
     curves = Curves.identity(config.tone_operator)
     scene = run.memory.again(

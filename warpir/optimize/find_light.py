@@ -9,16 +9,10 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-from warpir.app.config import EMBEDDED_STEPS
 from warpir.app.run import Run
 from warpir.core.memory import release
 from warpir.lighting.scene_light import SceneLight
 from warpir.render.determinism import fixed_arithmetic
-
-NOT_ASKED = (
-    f"the embedded prior was not asked (--steps {EMBEDDED_STEPS}: experimental, it failed its "
-    "release gate)"
-)
 
 
 @dataclass(frozen=True)
@@ -51,8 +45,6 @@ def find_light(run: Run, given: SceneLight | None) -> LitRun:
     light, measured = given, dict[str, Any]()
     if light is None:
         light, measured = _estimated(run)
-    if run.config.guided_by == "embedded":
-        measured["prior_about"] = NOT_ASKED
     if run.inputs.shadow_mask is not None and not light.has_lamps:
         run.log.notice("the light has no lamp that --shadow-mask could take")
     return _with_detail(LitRun(run, light, measured))

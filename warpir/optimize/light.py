@@ -58,7 +58,7 @@ class Unknowns(torch.nn.Module):
             settings: Count and bounds of the lobes.
         """
         bounds = LightBounds(
-            narrowest(settings.light_rows), settings.chroma_limit, settings.intensity_limit
+            narrowest(settings.light_height), settings.chroma_limit, settings.intensity_limit
         )
 
         def light() -> SGLight:
@@ -124,8 +124,8 @@ class LightOptimization(Optimization):
         self.frame, self.cache, self.rows = frame, cache, transport
         if transport is None and settings.integrator == "transport":
             self.rows = TransportSettings(
-                height_fg=settings.object_light_rows,
-                height_shadow=settings.light_rows,
+                height_fg=settings.object_light_height,
+                height_shadow=settings.light_height,
                 memory_mib=settings.transport_memory,
             )
         self.retraced = 0
@@ -145,7 +145,7 @@ class LightOptimization(Optimization):
 
     def fusion(self, step: int) -> float:
         """Return ``s_fuse`` of a step: 0 for two lights, 1 for one [1]."""
-        if self.settings.fusion_kind == "schedule":
+        if self.settings.fusion == "schedule":
             share = step / max(self.settings.step_count - 1, 1)
             start, end = self.settings.fusion_start, self.settings.fusion_end
             return min(max((share - start) / max(end - start, 1e-9), 0.0), 1.0)
@@ -154,7 +154,7 @@ class LightOptimization(Optimization):
     @property
     def final_fusion(self) -> float:
         """``s_fuse`` of the delivered light."""
-        return 1.0 if self.settings.fusion_kind == "schedule" else 0.0
+        return 1.0 if self.settings.fusion == "schedule" else 0.0
 
     def lights(self, scale: float, height: int | None = None) -> tuple[Tensor, Tensor]:
         """Return the maps that light the object and cast its shadow, shape [He, We, 3].
@@ -163,34 +163,34 @@ class LightOptimization(Optimization):
             scale: ``s_fuse`` [1].
             height: Rows; the settings' when absent.
         """
-        return self._fused(self._separate(height or self.settings.light_rows), scale)
+        return self._fused(self._separate(height or self.settings.light_height), scale)
 
     def _separate(self, height: int) -> tuple[Tensor, Tensor]:
         """Return the maps of both sets of lobes, before fusion."""
         texels_fg = self.unknowns.light_fg.texels(height)
-        if self.settings.fusion_kind == "single":
+        if self.settings.fusion == "single":
             return texels_fg, texels_fg
         return texels_fg, self.unknowns.light_shadow.texels(height)
 
     def parts(self, scale: float | Tensor, seed: int = 0) -> Parts:
         """Return the inputs of the composite; by torch alone with `transport`."""
-        unknowns, maps = self.unknowns, self._separate(self.settings.light_rows)
+        unknowns, maps = self.unknowns, self._separate(self.settings.light_height)
         curves = unknowns.curve_fg(), unknowns.curve_shadow()
         radiance = self.view.radiance(*self._fused(maps, scale), seed)
         return Parts(radiance, *curves, self._terms(maps, curves))
 
     def _fused(self, maps: tuple[Tensor, Tensor], scale: float | Tensor) -> tuple[Tensor, Tensor]:
-        return maps if self.settings.fusion_kind == "single" else fuse(*maps, scale)
+        return maps if self.settings.fusion == "single" else fuse(*maps, scale)
 
     @property
     def term_names(self) -> tuple[str, ...]:
         """Names of the regularisers, in the order of `Parts.terms`."""
-        has_two = self.settings.fusion_kind != "single"
+        has_two = self.settings.fusion != "single"
         is_used = {
-            "chroma": self.settings.has_lobe_shape,
+            "chroma": self.settings.lobe_shape,
             "consistency": has_two,
             "spread": has_two,
-            "bend": self.settings.has_tone_curve,
+            "bend": self.settings.tone_curve,
             "trust": self.region is not None,
         }
         return tuple(name for name, used in is_used.items() if used)
@@ -211,7 +211,7 @@ class LightOptimization(Optimization):
         """Return the distance of the lights from where they are expected."""
         assert self.region is not None
         distance = self.region.distance(self.unknowns.light_fg)
-        if self.settings.fusion_kind == "single":
+        if self.settings.fusion == "single":
             return distance
         return distance + self.region.distance(self.unknowns.light_shadow)
 
@@ -270,7 +270,7 @@ class LightOptimization(Optimization):
         with torch.no_grad():
             fg, shadow = self.lights(self.final_fusion, height)
         light_fg = Light(texels=fg.cpu().numpy())
-        if self.settings.fusion_kind in ("schedule", "single"):
+        if self.settings.fusion in ("schedule", "single"):
             return light_fg, light_fg
         return light_fg, Light(texels=shadow.cpu().numpy())
 
@@ -317,12 +317,12 @@ def _groups(unknowns: Unknowns, settings: OptimizeSettings) -> list[dict[str, An
     for light in (unknowns.light_fg, unknowns.light_shadow):
         for name, rate in rates.items():
             parameter = getattr(light, name)
-            if settings.has_lobe_shape or name in ("log_intensity", "axis"):
+            if settings.lobe_shape or name in ("log_intensity", "axis"):
                 groups.append({"params": [parameter], "rate": rate})
             else:
                 parameter.requires_grad_(False)
     curves = [*unknowns.curve_fg.parameters(), *unknowns.curve_shadow.parameters()]
-    if settings.has_tone_curve:
+    if settings.tone_curve:
         groups.append({"params": curves, "rate": settings.rate_tone})
     else:
         for parameter in curves:

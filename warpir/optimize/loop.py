@@ -123,7 +123,7 @@ class Optimization(ABC):
         self.unknowns, self.guide, self.settings, self.seed = unknowns, guide, settings, seed
         # Adam ignores the overall scale of a gradient; this eps keeps that true of tiny ones.
         self.optimizer = torch.optim.Adam(
-            [{**group, "lr": settings.rate_of_all * group["rate"]} for group in groups],
+            [{**group, "lr": settings.rate * group["rate"]} for group in groups],
             betas=(settings.adam_beta1, settings.adam_beta2),
             eps=1e-15,
         )
@@ -213,7 +213,7 @@ class Optimization(ABC):
 
     def _set_rates(self, step: int) -> None:
         """Give each group its rate: constant in the first half, then falling by a cosine."""
-        share = self.settings.rate_of_all * self._rate_factor(step) * self.state.rate_share
+        share = self.settings.rate * self._rate_factor(step) * self.state.rate_share
         for group in self.optimizer.param_groups:
             group["lr"] = group["rate"] * share
 

@@ -327,7 +327,7 @@ def refine(run: Run, light: SceneLight) -> Outcome:
     Raises:
         InputError: As `warpir.optimize.recover.recover`.
     """
-    run = replace(run, config=run.config.settled(on_cuda=run.device != "cpu"))
+    run = replace(run, config=run.config.settled())
     asset = run.inputs.asset
     with as_input_errors():
         checkpoints = open_checkpoints(run)

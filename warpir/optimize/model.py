@@ -5,13 +5,11 @@ from __future__ import annotations
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 import torch
 
-from warpir.app.config import PRIOR_DEFAULTS
 from warpir.app.run import Run
 from warpir.core import signals
 from warpir.core.atomic import Checkpoint, Checkpoints
@@ -21,8 +19,6 @@ from warpir.core.errors import ExitCode, InputError
 from warpir.core.memory import needs_of_model
 from warpir.diffusion.dataset_update import DatasetUpdate
 from warpir.diffusion.guidance import Guidance, kind_of
-from warpir.diffusion.models.embedded import load_embedded
-from warpir.diffusion.models.embedded_words import embedded_prompts
 from warpir.diffusion.models.hub import find_model, hub_offline
 from warpir.diffusion.models.model_error import ModelError
 from warpir.diffusion.models.model_folder import check_model_folder
@@ -34,22 +30,14 @@ from warpir.diffusion.personalization.personalize import (
     restore_personalization,
 )
 from warpir.diffusion.personalization.show_prior import show_personalization
-from warpir.diffusion.prior import Condition, NonFiniteError
+from warpir.diffusion.prior import NonFiniteError
 from warpir.diffusion.prompts import Prompts, make_prompts
-from warpir.lighting.regression import regress
-from warpir.lighting.regressor import load_regressor
 from warpir.optimize.checkpoint import is_due
-from warpir.optimize.view import Frame, gbuffer_of, with_light
+from warpir.optimize.view import Frame
 from warpir.render.determinism import use_threads_for
 
 SHOWN_SEEDS = (0, 1, 2)
 """Seeds of the images of --show-prior."""
-ANYTHING = "object"
-"""Default prompt of the embedded prior."""
-ABOUT_EMBEDDED = (
-    "prior: embedded, trained on rendered scenes, experimental: it failed its release gate; for "
-    "photographs Stable Diffusion is recommended (--model)"
-)
 LOSSES_WITHOUT_LORA = ("csd", "sds-base", "good-bad")
 """Losses that use the base model alone."""
 
@@ -60,8 +48,6 @@ class Asked:
 
     prior: NetworkPrior
     prompts: Prompts
-    negative_prompt: str
-    """Prompt of the negative term; empty for the null prompt."""
 
 
 @dataclass(frozen=True)
@@ -101,12 +87,8 @@ class Guided:
                 "seconds": learnt.seconds,
             }
         record |= {"prior": prior.name, "prior_sha256": prior.digest}
-        if prior.name == "embedded":
-            record["prior_about"] = ABOUT_EMBEDDED
-        flat = run.config.flat()
-        settings = {name: flat[name] for name in PRIOR_DEFAULTS[prior.name]}
-        record["settings"] = {**settings, "tone": run.config.tone_operator}
-        return record
+        steps, tone = run.config.optimize.step_count, run.config.tone_operator
+        return record | {"settings": {"steps": steps, "tone": tone}}
 
 
 def prepare_guidance(run: Run, checkpoints: Checkpoints) -> Guided:
@@ -123,10 +105,9 @@ def prepare_guidance(run: Run, checkpoints: Checkpoints) -> Guided:
         use_threads_for(prior.unet)
         shown = config.guidance.show_prior or ()
         prior.embed([prompts.photo, prompts.class_, prompts.guidance, "", *shown])
-        others = config.guidance.null_prompt, config.guidance.base_prompt
-        prior.embed([asked.negative_prompt, *others])
-    weights = config.diffusion.model or config.guidance.prior or "as shipped"
-    run.log.say(f"model: {prior.name} {weights}, sha256 {prior.digest[:16]}...")
+        asks = config.guidance
+        prior.embed([asks.negative_prompt, asks.null_prompt, asks.base_prompt])
+    run.log.say(f"model: {prior.name} {config.diffusion.model}, sha256 {prior.digest[:16]}...")
     resumed = checkpoint_of(run, checkpoints, prior)
     run.log.say(f'guidance asks for "{prompts.guidance}"')
     guided = adapted(run, asked, checkpoints, resumed)
@@ -144,22 +125,11 @@ def load_prior(run: Run) -> Asked:
         ModelError: It cannot be loaded.
     """
     config = run.config
-    prompt, negative = config.guidance.prompt, config.guidance.negative_prompt
-    if config.guided_by == "embedded":
-        is_adapted = bool(config.adapter.personalize)
-        known = embedded_prompts(prompt or ANYTHING, config.adapter, is_adapted)
-        graphs = config.diffusion.graphs and run.device != "cpu"
-        path = config.guidance.prior
-        prior = load_embedded(
-            None if path is None else Path(path), run.device, graphs, run.memory.in_chunks
-        )
-        if known.unknown:
-            prior.notices += (f"the embedded prior does not know: {', '.join(known.unknown)}",)
-        return Asked(prior, known, negative or known.negative)
+    prompt = config.guidance.prompt
     assert prompt is not None
     require_memory(run)
     model = load_stable_diffusion(config.diffusion, run.device, run.memory.in_chunks)
-    return Asked(model, make_prompts(prompt, config.adapter), negative)
+    return Asked(model, make_prompts(prompt, config.adapter))
 
 
 def require_memory(run: Run) -> None:
@@ -176,7 +146,7 @@ def require_memory(run: Run) -> None:
     files = (file for weights in folder.weights.values() for file in weights.files)
     side = 8 * int(folder.configs["unet"]["sample_size"])
     is_half = run.device != "cpu" and model.precision != "fp32"
-    pictures = run.config.guidance_settings().noises
+    pictures = run.config.guidance.noises
     size = sum(file.stat().st_size for file in files)
     run.memory.require(*needs_of_model(size, side, pictures, is_half=is_half))
 
@@ -203,15 +173,15 @@ def adapted(run: Run, asked: Asked, checkpoints: Checkpoints, resumed: Checkpoin
     """
     config, prior = run.config, asked.prior
     loss, shown = config.guidance.loss, config.guidance.show_prior
-    notices: tuple[str, ...] = (ABOUT_EMBEDDED,) if prior.name == "embedded" else ()
+    notices: tuple[str, ...] = ()
     does_without = loss in LOSSES_WITHOUT_LORA and config.adapter.lora is None and not shown
     learnt = None
     if config.adapter.personalize and does_without:
-        notices = (*notices, f"--loss {loss} does without a LoRA: none was trained")
+        notices = (f"--loss {loss} does without a LoRA: none was trained",)
     elif config.adapter.personalize:
         with run.timings.stage("personalize"):
             learnt = personalized(run, asked, checkpoints, resumed)
-        notices = (*notices, *learnt.notices)
+        notices = learnt.notices
     prior.free_text_encoder()
     return Guided(asked, learnt, notices, checkpoints, resumed)
 
@@ -253,24 +223,10 @@ def personalized(
 def make_guide(run: Run, guided: Guided, frame: Frame) -> Guidance | DatasetUpdate:
     """Return the guidance of the configured loss over a picture of the frame's size."""
     config, prior, prompts = run.config, guided.prior, guided.asked.prompts
-    shown = linear_to_gamma(frame.photo_lin).astype(np.float32)
-    background = torch.from_numpy(shown).permute(2, 0, 1)[None].to(run.device)
-    gbuffer = gbuffer_of(frame)
-    if prior.name == "embedded":
-        path = config.light.regressor
-        network = load_regressor(None if path is None else Path(path), run.device)
-        regression = regress(network, run.inputs.photo.srgb, run.inputs.camera)
-        gbuffer = with_light(gbuffer, regression, frame.renderer.scene.camera)
-    condition = Condition(
-        prompts.guidance,
-        negative_prompt=guided.asked.negative_prompt,
-        background=background,
-        gbuffer=gbuffer.to(run.device),
-    )
-    settings = config.guidance_settings()
+    settings = config.guidance
     guide = kind_of(settings)(
         prior,
-        condition,
+        prompts.guidance,
         settings,
         torch.from_numpy(frame.coverage()),
         config.optimize.step_count,
@@ -278,7 +234,8 @@ def make_guide(run: Run, guided: Guided, frame: Frame) -> Guidance | DatasetUpda
         None if guided.learnt is None else guided.learnt.adapter,
     )
     if isinstance(guide, Guidance):
-        guide.ensure_precision(background)
+        shown = linear_to_gamma(frame.photo_lin).astype(np.float32)
+        guide.ensure_precision(torch.from_numpy(shown).permute(2, 0, 1)[None].to(run.device))
     return guide
 
 

@@ -33,7 +33,7 @@ from warpir.diffusion.models.stable_diffusion import (
 )
 from warpir.diffusion.personalization.lora_training import LoraTraining
 from warpir.diffusion.personalization.personalize import personalize
-from warpir.diffusion.prior import Condition, NonFiniteError
+from warpir.diffusion.prior import NonFiniteError
 from warpir.diffusion.prompts import Prompts, make_prompts
 from warpir.diffusion.settings import GuidanceSettings, PersonalizeSettings
 from warpir.optimize.model import as_input_errors
@@ -163,7 +163,7 @@ def check_model(
         verdicts.extend(new)
 
     seed = config.render.seed
-    settings = config.settled(on_cuda=prior.device.type == "cuda").guidance_settings()
+    settings = config.guidance
     square = _middle(image).apply(image, prior.resolution)
     figures = prior.self_check(square, prompts.guidance, seed)
     judged(
@@ -328,8 +328,7 @@ def _try_guidance(
     mask = torch.zeros(image.shape[-2:])
     height, width = mask.shape
     mask[height // 3 : height - height // 3, width // 3 : width - width // 3] = 1.0
-    condition = Condition(prompts.guidance)
-    guide = Guidance(prior, condition, settings, mask, GUIDANCE_STEPS, seed, "scene")
+    guide = Guidance(prior, prompts.guidance, settings, mask, GUIDANCE_STEPS, seed, "scene")
     guide.ensure_precision(image)
     clock, norms = _StepClock(prior.device), []
     for step in range(GUIDANCE_STEPS):

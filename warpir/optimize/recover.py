@@ -68,7 +68,6 @@ def recover(run: Run, given: SceneLight | None) -> Outcome:
         InputError: The model cannot be used (exit 4), memory is short (5), the numbers stayed
             non-finite (6), or what ``--resume`` finds is another run's.
     """
-    run = replace(run, config=run.config.settled(on_cuda=run.device != "cpu"))
     settings = run.config.optimize
     start = Start(given) if given is not None else _estimated(run)
     with as_input_errors():
@@ -106,7 +105,7 @@ def recover(run: Run, given: SceneLight | None) -> Outcome:
     if judged is not None and not judged.verdict.is_accepted:
         return Outcome(start.light, run.inputs.asset, measured, (*notices, judged.verdict.line))
     run.output.write_json("lobes.json", lobes_to_json(unknowns.light_fg.lobes()))
-    if settings.fusion_kind != "single":
+    if settings.fusion != "single":
         run.output.write_json("lobes_shadow.json", lobes_to_json(unknowns.light_shadow.lobes()))
     return Outcome(light, run.inputs.asset, measured, notices)
 
@@ -124,7 +123,7 @@ def _estimated(run: Run) -> Start:
 def unknowns_of(run: Run, start: Start) -> Unknowns:
     """Return the unknowns: lobes of the given or estimated light, else an even light."""
     config, settings = run.config, run.config.optimize
-    lobes, least = None, narrowest(settings.light_rows)
+    lobes, least = None, narrowest(settings.light_height)
     if start.estimate is not None:
         lobes = start.estimate.regression.lobes(least)
         lobes = replace(lobes, amplitude=(start.estimate.gain * lobes.amplitude).astype(np.float32))
@@ -203,7 +202,7 @@ def judge_end(loop: LightOptimization, guide: Guidance, before: dict[str, torch.
 
     verdict = judge(guide, image)
     judges = {"score": guide}
-    if guide.condition.negative_prompt and guide.settings.loss != "good-bad":
+    if guide.settings.negative_prompt and guide.settings.loss != "good-bad":
         judges["good_bad"] = guide.with_loss("good-bad")
     compared = {}
     with torch.no_grad():

@@ -14,8 +14,6 @@ import torch
 from torch import Tensor
 
 from warpir.core.arrays import FloatArray, IntArray, PixelArray
-from warpir.core.color import gamma_to_linear, linear_to_gamma
-from warpir.lighting.regression import Regression
 from warpir.render.bridge import ComposeConstants, compose
 from warpir.render.device_light import light_args
 from warpir.render.integrator import Integrator, Radiance
@@ -24,7 +22,6 @@ from warpir.render.renderer import Renderer
 from warpir.render.tone_curve import Knots
 from warpir.render.transport.integrator import TransportIntegrator
 from warpir.render.transport.rows import TransportSettings
-from warpir.scene.camera import Camera
 from warpir.scene.light import Light
 
 COVERAGE_SAMPLES = 64
@@ -160,43 +157,3 @@ def expected_light(texels_fg: Tensor, texels_shadow: Tensor) -> Light:
     with torch.no_grad():
         both = [t / t.mean().clamp(min=1e-20) for t in (texels_fg, texels_shadow)]
     return Light(texels=(0.5 * (both[0] + both[1])).cpu().numpy())
-
-
-def gbuffer_of(frame: Frame) -> torch.Tensor:
-    """Return the object's G-buffer for the embedded prior, shape [1, 7, H, W].
-
-    Mask in [0, 1], albedo display-encoded, unit normals in the camera's frame (x right, y up, z
-    toward the camera); all 0 beside the object. `warpir.train.batches.PriorBatch` is the same.
-    """
-    scene = frame.renderer.scene
-    gbuffer = frame.renderer.gbuffer(frame.seed)
-    seen = gbuffer.coverage > 0.0
-    height, width = frame.photo_lin.shape[:2]
-    plane = np.zeros((height * width, 7), np.float32)
-    plane[gbuffer.object_pixels[seen]] = np.concatenate(
-        [
-            gbuffer.coverage[seen, None],
-            linear_to_gamma(np.clip(gbuffer.base_color[seen], 0.0, 1.0)),
-            gbuffer.normal[seen] @ scene.camera.c2w[:3, :3],
-        ],
-        axis=1,
-    )
-    return torch.from_numpy(plane.reshape(height, width, 7)).permute(2, 0, 1)[None].contiguous()
-
-
-def with_light(gbuffer: torch.Tensor, regression: Regression, camera: Camera) -> torch.Tensor:
-    """Return a G-buffer with the object shaded under the regressor's light, shape [1, 13, H, W].
-
-    Args:
-        gbuffer: G-buffer of `gbuffer_of`, shape [1, 7, H, W].
-        regression: The light, world frame.
-        camera: Camera of the picture.
-    """
-    planes = gbuffer[0].permute(1, 2, 0).double().numpy()
-    shown, toward = regression.matte_picture(
-        gamma_to_linear(planes[..., 1:4]), planes[..., 4:7], camera.c2w
-    )
-    shown = shown * (planes[..., :1] > 0.0)
-    light = np.concatenate([shown, np.broadcast_to(toward, shown.shape)], axis=2)
-    more = torch.from_numpy(light.astype(np.float32)).permute(2, 0, 1)[None]
-    return torch.cat([gbuffer, more], dim=1)

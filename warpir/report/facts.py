@@ -173,7 +173,7 @@ def settings(asked: Mapping[str, Any], record: Mapping[str, Any]) -> dict[str, l
 
     Args:
         asked: Settings as they were asked for, from `InsertConfig.flat`.
-        record: Content of ``run.json``; ``measured`` holds the prior's defaults that were used.
+        record: Content of ``run.json``; ``measured`` holds what stood for open settings.
     """
     settled = record["measured"].get("settings", {})
     changed = config_of_picture(asked)
@@ -226,8 +226,6 @@ def light_sources(record: Mapping[str, Any], asked: LightConfig) -> Rows:
         rows.append(("reflections", f"the photo shows {seen:.0f} % of what is around the object"))
     prior = measured["prior"]
     if prior == "none":
-        if "prior_about" in measured:
-            rows.append(("prior", measured["prior_about"]))
         return rows
     rows.append(("prior", without_folders(_prior(prior, measured), record["config"])))
     rows += _guided(measured)
@@ -245,8 +243,6 @@ def summary_line(record: Mapping[str, Any]) -> str:
     if "regression" in measured:
         spread = measured["regression"]["spread_deg"]
         parts.append(f"light regressed from the photo, +- {spread:.0f} degrees")
-    if measured["prior"] == "none" and "prior_about" in measured:
-        parts.append(measured["prior_about"])
     integrators = (measured.get("loop_integrator"), measured["integrator"])
     rendered = " and ".join(dict.fromkeys(name for name in integrators if name))
     return f"summary: {'; '.join(parts)}; {rendered} on {record['device']}"
@@ -283,7 +279,6 @@ def _source(record: Mapping[str, Any], asked: LightConfig) -> str:
 
 def _prior(name: str, measured: Mapping[str, Any]) -> str:
     text = "Stable Diffusion" if name == "stable-diffusion" else name
-    text = str(measured.get("prior_about", text)).removeprefix("prior: ")
     if measured.get("prior_sha256"):
         text += f" (sha256 {measured['prior_sha256'][:16]}...)"
     return text

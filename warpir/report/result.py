@@ -77,11 +77,11 @@ def render_result(run: Run, light: SceneLight) -> RenderedResult:
 
 def write_preview(run: Run, light: SceneLight) -> None:
     """Write a small and noisy preview of the composite, if previews are asked for."""
-    settings = run.config.settled(on_cuda=run.device != "cpu").optimize
+    settings = run.config.optimize
     if not settings.preview_every:
         return
     camera = _rendering_camera(run.inputs.camera, run.config.render.width)
-    camera = _rendering_camera(run.inputs.camera, min(settings.picture_width, camera.width))
+    camera = _rendering_camera(run.inputs.camera, min(settings.guidance_width, camera.width))
     placed = scene_of(run.inputs, camera, run.device, light.curves)
     renderer = Renderer(placed, run.config.render.threads or 0)
     picture = _picture(run, light, renderer, PREVIEW_SAMPLES, 1)

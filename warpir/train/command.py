@@ -1,16 +1,14 @@
-r"""Train the networks that warpir ships: for the first light, for the camera, and the prior.
+r"""Train the networks that warpir ships: for the light, and for the camera.
 
     python -m warpir.train regressor --panoramas DIR --out DIR --minutes 12 --networks 5
-    python -m warpir.train prior --panoramas DIR --assets DIR --out DIR --minutes 9 \
-        --total-minutes 18
-    python -m warpir.train prior ... --resume
+    python -m warpir.train regressor ... --resume
     python -m warpir.train camera --panoramas DIR --regressor FILE --out DIR --minutes 6 \
         --fold 0/5
 
-Scenes are rendered as they are needed and then forgotten; the prior learns from each twice.
-A command stops after ``--minutes`` and ``--resume`` goes on, until ``--total-minutes`` are used up.
-With torchrun a network is trained on several cards. ``--without`` names panoramas and assets that
-must not be learned from; of those that ``--validation`` names only the errors are looked at.
+Scenes are rendered as they are needed and then forgotten. A command stops after ``--minutes``, and
+``--resume`` goes on until ``--total-minutes`` are used up. With torchrun a network is trained on
+several cards. ``--without`` names panoramas that must not be learned from; of those that
+``--validation`` names only the errors are looked at.
 """
 
 from __future__ import annotations
@@ -18,7 +16,6 @@ from __future__ import annotations
 import argparse
 import json
 import math
-import os
 import subprocess
 import sys
 from collections.abc import Callable, Mapping, Sequence
@@ -33,17 +30,12 @@ from warpir.core.errors import ExitCode, InputError
 if TYPE_CHECKING:
     import torch
 
-    from warpir.train.batches import PhotoBatch, PriorBatch
-    from warpir.train.scenes.render import Stock
+    from warpir.train.batches import PhotoBatch
+    from warpir.train.lights import LightPool
 
-MADE_UP_OBJECTS = 240
-"""Made-up objects to learn from."""
 VALIDATION_PICTURES = 768
 """Of each kind."""
 VALIDATION_SEED = 10**6
-REUSES = 2
-"""Steps in a row with the same composites, at other times, noises and words: rendering takes as
-long as learning."""
 REPLAYS, REPLAYED = 3, 12
 """Steps that each photo is learned from, on average, and batches that they are drawn from: photos
 take longer to render than to learn from, and each is varied anew."""
@@ -56,9 +48,8 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser("python -m warpir.train", description=_first_line())
-    parser.add_argument("network", choices=("camera", "prior", "regressor"))
+    parser.add_argument("network", choices=("camera", "regressor"))
     parser.add_argument("--panoramas", type=Path, nargs="+", required=True, metavar="DIR")
-    parser.add_argument("--assets", type=Path, nargs="*", default=[], metavar="DIR", help="objects")
     parser.add_argument("--without", nargs="*", default=[], metavar="NAME", help="not learned from")
     parser.add_argument(
         "--validation", nargs="*", default=[], metavar="NAME", help="only looked at"
@@ -73,7 +64,7 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument("--device", default=None)
     parser.add_argument("--resume", action="store_true")
     parser.add_argument("--start", type=Path, metavar="FILE", help="weights to begin with")
-    words = "weights that tell the prior the light, or whose first layers the camera begins with"
+    words = "weights whose first layers the camera's network begins with"
     parser.add_argument("--regressor", type=Path, metavar="FILE", help=words)
     words = "networks, each without a share of the places; their answers are averaged"
     parser.add_argument("--networks", type=int, default=1, metavar="N", help=words)
@@ -97,34 +88,32 @@ def _run(arguments: list[str]) -> int:
         return _train_members(options, arguments)
     _check(options)
     panoramas = files_in(options.panoramas, (".hdr", ".exr"))
-    assets = files_in(options.assets, (".glb", ".gltf", ".obj", ".stl", ".ply"))
-    unknown = sorted({*options.without, *options.validation} - {p.stem for p in panoramas + assets})
+    unknown = sorted({*options.without, *options.validation} - {p.stem for p in panoramas})
     if unknown:
-        say(f"notice: no panorama or asset is called {', '.join(unknown)}")
+        say(f"notice: no panorama is called {', '.join(unknown)}")
 
     if options.network == "camera":
         result: Mapping[str, Any] = _train_camera(options, panoramas)
     else:
-        result = _train_light(options, panoramas, assets)
-    if is_first():
+        result = _train_regressor(options, panoramas)
+    from warpir.train.worker import Worker
+
+    if Worker.this().is_first:
         say(json.dumps(result))
     return ExitCode.DONE
 
 
-def _train_light(
-    options: argparse.Namespace, panoramas: Sequence[Path], assets: Sequence[Path]
-) -> dict[str, Any]:
-    """Train the regressor or the embedded prior on rendered scenes."""
+def _train_regressor(options: argparse.Namespace, panoramas: Sequence[Path]) -> dict[str, Any]:
+    """Train the network that estimates the light, on rendered scenes and cut photographs."""
     import torch
 
     from warpir.render.device import choose_device
     from warpir.train.lights import load_panoramas
-    from warpir.train.meshes import make_meshes, read_meshes
     from warpir.train.places import of_fold, some_places
-    from warpir.train.scenes.render import Stock
+    from warpir.train.worker import Worker
 
-    rank = int(os.environ.get("LOCAL_RANK", "0"))
-    device = f"cuda:{rank}" if "LOCAL_RANK" in os.environ else choose_device(options.device)
+    worker = Worker.this()
+    device = f"cuda:{worker.local_rank}" if worker.count > 1 else choose_device(options.device)
     names = [p.stem for p in panoramas if p.stem not in options.without]
     known = _places_of(options)
     watched_names = {*options.validation, *of_fold(names, options.fold, known)}
@@ -134,30 +123,17 @@ def _train_light(
     )
     learned = [p for p in panoramas if p.stem not in kept_out]
     watched = [p for p in panoramas if p.stem in watched_names]
-    meshes = [*make_meshes(MADE_UP_OBJECTS, options.seed)]
-    meshes += read_meshes(p for p in assets if p.stem not in kept_out)
-    if is_first():
-        say(
-            f"device: {device}; {len(learned)} panoramas, {len(meshes)} objects; "
-            f"validation on {len(watched)} panoramas"
-        )
-    torch_device = torch.device("cpu" if device == "cpu" else device)
-    # What is validated on has other panoramas and other objects.
-    others = make_meshes(48, VALIDATION_SEED + options.seed)
-    stocks = (
-        Stock(meshes, load_panoramas(learned, torch_device), device),
-        Stock(others, load_panoramas(watched, torch_device), device),
-    )
+    if worker.is_first:
+        say(f"device: {device}; {len(learned)} panoramas; validation on {len(watched)} panoramas")
+    torch_device = torch.device(device)
     record = {
         "panoramas": [p.stem for p in learned],
         "validation_panoramas": [p.stem for p in watched],
         "kept_out": list(options.without),
-        "assets": [p.stem for p in assets if p.stem not in kept_out],
-        "made_up_objects": MADE_UP_OBJECTS,
         "device": torch.cuda.get_device_name(torch_device) if device != "cpu" else "cpu",
     }
-    train = _train_prior if options.network == "prior" else _train_regressor
-    return train(options, stocks, options.seed * 1000 + rank, torch_device, record)
+    pools = load_panoramas(learned, torch_device), load_panoramas(watched, torch_device)
+    return _train_on(pools, options, options.seed * 1000 + worker.local_rank, torch_device, record)
 
 
 def _train_camera(options: argparse.Namespace, panoramas: Sequence[Path]) -> dict[str, float]:
@@ -290,20 +266,6 @@ def _counted(
     return batches
 
 
-def _reused(
-    batches: Callable[[int, torch.Generator], Any], times: int
-) -> Callable[[int, torch.Generator], Any]:
-    """Return a callable that gives each batch several times in a row."""
-    held: list[Any] = []
-
-    def repeated(count: int, generator: torch.Generator) -> Any:
-        if not held:
-            held.extend([batches(count, generator)] * times)
-        return held.pop()
-
-    return repeated
-
-
 class Replay:
     """Batches of photos drawn at random from the newest that were rendered.
 
@@ -339,89 +301,21 @@ class Replay:
         return PhotoBatch(**{name: held[index] for name, held in self.held.items()})
 
 
-def _train_prior(
+def _train_on(
+    pools: tuple[LightPool, LightPool],
     options: argparse.Namespace,
-    stocks: tuple[Stock, Stock],
     seed: int,
     device: torch.device,
     record: dict[str, Any],
 ) -> dict[str, Any]:
-    from warpir.diffusion.models.embedded import read_network
-    from warpir.diffusion.train.loop import export_prior, train_prior
-    from warpir.diffusion.train.objective import TrainSettings
-    from warpir.lighting.regressor import load_regressor
-    from warpir.train.scenes.generator import Mixture, SceneGenerator
-
-    learned, unseen = stocks
-    regressor = load_regressor(options.regressor, device)
-    record = record | {"regressor": regressor.record}
-    start = None
-    if options.start is not None:
-        start, begun = read_network(options.start)
-        record |= {"started_from": begun}
-
-    def drawn(mixture: Mixture) -> list[PriorBatch]:
-        scenes = SceneGenerator(unseen, VALIDATION_SEED, mixture, regressor)
-        return [scenes.prior_batch(k, 128) for k in range(3)]
-
-    kinds = {"procedural": {"made_up": 1.0, "hybrid": 0.0}}
-    if unseen.panoramas.panorama_count:
-        kinds["panoramas"] = {"made_up": 0.0, "hybrid": 0.0}
-    validation = {name: drawn(Mixture(**shares)) for name, shares in kinds.items()}
-    pairs = {
-        name: [
-            *zip(
-                drawn(Mixture(**shares, mismatched=0.0)),
-                drawn(Mixture(**shares, mismatched=1.0)),
-                strict=True,
-            )
-        ]
-        for name, shares in kinds.items()
-    }
-    settings = TrainSettings(batch=options.batch or 256, compile=not options.no_compile)
-    scenes = SceneGenerator(learned, seed, regressor=regressor)
-    progress = train_prior(
-        _reused(_counted(scenes.prior_batch), REUSES),
-        options.out,
-        settings,
-        device,
-        options.minutes,
-        options.total_minutes or options.minutes,
-        resume=options.resume,
-        seed=options.seed,
-        validation=validation,
-        pairs=pairs,
-        network=start,
-        say=say if is_first() else _nobody,
-    )
-    if is_first():
-        export_prior(options.out, options.out / "prior.safetensors", settings.network, record)
-    return {"step": progress.step, "samples": progress.samples, "seconds": progress.seconds}
-
-
-def is_first() -> bool:
-    """Return whether this process is the one that talks and writes."""
-    return os.environ.get("RANK", "0") == "0"
-
-
-def _nobody(text: str) -> None:
-    """Take what the other processes would say."""
-
-
-def _train_regressor(
-    options: argparse.Namespace,
-    stocks: tuple[Stock, Stock],
-    seed: int,
-    device: torch.device,
-    record: dict[str, Any],
-) -> dict[str, Any]:
+    """Train on the first panoramas, validate on the second ones; return how it ended."""
     from warpir.lighting.regressor import load_regressor
     from warpir.train.regressor import PANORAMAS, train_regressor
     from warpir.train.scenes.generator import Mixture, SceneGenerator
     from warpir.train.settings import TrainingSettings
 
-    learned, unseen = stocks
-    scenes = SceneGenerator(learned, seed, Mixture(made_up=0.15, hybrid=0.35))
+    learned, unseen = pools
+    scenes = SceneGenerator(learned, seed)
 
     def drawn(**shares: float) -> list[PhotoBatch]:
         mixture = Mixture(**shares, proxies=0.0, misjudged=0.0)
@@ -429,7 +323,7 @@ def _train_regressor(
         return [made.photo_batch(k, 128) for k in range(VALIDATION_PICTURES // 128)]
 
     validation = {"procedural": drawn(made_up=1.0, hybrid=0.0)}
-    if unseen.panoramas.panorama_count:
+    if unseen.panorama_count:
         validation[PANORAMAS] = drawn(made_up=0.0, hybrid=0.0)
     settings = TrainingSettings(
         batch=options.batch or 512,

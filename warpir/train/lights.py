@@ -50,9 +50,6 @@ KIND_SHARES = [0.34, 0.14, 0.12, 0.12, 0.18, 0.10]
 """Of each kind of made-up light, in their order."""
 KIND_SKIES = ((11, 14), (6, 10), (0, 5), (8, 14), (0, 4), (0, 4))
 """First and last row of `CIE_SKIES` for each kind."""
-KIND_WEATHERS = (0, 0, 1, 2, 4, 3)
-"""Of each kind, an index into `WEATHERS`: sunny, sunny or overcast, overcast, twilight, lamp,
-night."""
 SKY_COLOURS = ((0.42, 0.62, 1.0), (0.85, 0.93, 1.0), (0.95, 0.98, 1.0), (1.0, 0.62, 0.32))
 """Blue, pale, grey and warm, linear RGB."""
 
@@ -116,8 +113,6 @@ class LightPool:
     """Shape [light, 3]."""
     sigma: Tensor
     """Shape [light]."""
-    weather: Tensor
-    """Index into `WEATHERS`, -1 unknown, int64, shape [light]."""
     indoors: Tensor
     """1 indoors, 0 outdoors, -1 unknown, int64, shape [light]."""
     seen: Tensor
@@ -138,15 +133,10 @@ class LightPool:
         sun = tensors.luminance(self.sun)
         return sun / (sun + rest).clamp(min=1e-20)
 
-    def levels(self) -> tuple[Tensor, Tensor, Tensor]:
-        """Return the maps at full, half and quarter size."""
-        half = tensors.shrunk(self.fine, HEIGHT // 2)
-        return self.fine, half, tensors.shrunk(half, HEIGHT // 4)
-
     def with_skies(self, skies: LightPool) -> LightPool:
         """Return the panoramas of this pool with other made-up lights behind them."""
         n = self.panorama_count
-        names = ("fine", "axis", "sun", "sigma", "weather", "indoors")
+        names = ("fine", "axis", "sun", "sigma", "indoors")
         joined: dict[str, Any] = {
             k: torch.cat([getattr(self, k)[:n], getattr(skies, k)]) for k in names
         }
@@ -183,13 +173,12 @@ def load_panoramas(paths: list[Path], device: torch.device | str) -> LightPool:
         black = torch.zeros(1, 2, 4, 3, device=device)
         nothing = torch.zeros(0, 3, device=device)
         maps = torch.zeros(0, HEIGHT, 2 * HEIGHT, 3, device=device)
-        return LightPool(maps, nothing, nothing, nothing[:, 0], unknown, unknown, black, 0, 0)
+        return LightPool(maps, nothing, nothing, nothing[:, 0], unknown, black, 0, 0)
     return LightPool(
         stacked(fine),
         stacked([s.axis for s in splits]),
         stacked([s.sun for s in splits]),
         torch.tensor([s.sigma for s in splits], dtype=torch.float32, device=device),
-        unknown,
         unknown,
         stacked(seen),
         len(paths),
@@ -221,7 +210,7 @@ def make_lights(count: int, generator: torch.Generator, device: torch.device | s
     level = elevation.cos()
     axis = torch.stack([level * azimuth.sin(), elevation.sin(), -level * azimuth.cos()], dim=1)
     maps = _draw_skies(draw, kind, directions, axis, elevation)
-    sun, sigma, ratio = _draw_suns(draw, kind, elevation)
+    sun, sigma = _draw_suns(draw, kind, elevation)
     walls = _draw_walls(draw, directions)
     lamp_tint = 1.0 - draw.uniform(0.0, 0.45, 1) * torch.tensor([0.0, 0.45, 1.0], device=device)
     lamp = draw.log_uniform(0.1, 4.0)[:, None] * lamp_tint
@@ -234,14 +223,11 @@ def make_lights(count: int, generator: torch.Generator, device: torch.device | s
     maps = torch.where(_per_texel(is_night), maps * night_level, maps)
     lamp_sigma = torch.deg2rad(draw.log_uniform(1.5, 13.0))
     lamp_sigma = torch.where(is_night, 0.4 * lamp_sigma, lamp_sigma)
-    weather = torch.tensor(KIND_WEATHERS, device=device)[kind]
-    weather = torch.where((kind == BROKEN) & (ratio < 0.6), torch.ones_like(weather), weather)
     return LightPool(
         maps.contiguous(),
         axis,
         torch.where(within[:, None], lamp, sun).contiguous(),
         torch.where(within, lamp_sigma, sigma),
-        weather,
         (kind == ROOM).long(),
         torch.zeros(1, 2, 4, 3, device=device),
         0,
@@ -303,8 +289,8 @@ def _draw_skies(
     return clouded
 
 
-def _draw_suns(draw: Sampler, kind: Tensor, elevation: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """Draw irradiances facing the sun, [B, 3], its sigmas [rad] and its ratio to the sky, [B]."""
+def _draw_suns(draw: Sampler, kind: Tensor, elevation: Tensor) -> tuple[Tensor, Tensor]:
+    """Draw irradiances facing the sun, shape [B, 3], and its sigmas [rad], shape [B]."""
     # The sun, facing it, over the sky on level ground. The air that it passes colours it more than
     # it weakens that ratio, for the sky darkens with it: clear panoramas have 4 to 13, at all
     # elevations.
@@ -316,7 +302,7 @@ def _draw_suns(draw: Sampler, kind: Tensor, elevation: Tensor) -> tuple[Tensor, 
     tint = torch.stack([torch.ones_like(air), 0.55 + 0.42 * air, 0.25 + 0.65 * air], dim=1)
     sun = (ratio * torch.exp(-0.03 / sine))[:, None] * tint
     sigma = torch.deg2rad(draw.log_uniform(0.27, 1.5))
-    return sun, torch.where(kind == BROKEN, sigma * draw.uniform(1.0, 4.0), sigma), ratio
+    return sun, torch.where(kind == BROKEN, sigma * draw.uniform(1.0, 4.0), sigma)
 
 
 def _draw_walls(draw: Sampler, directions: Tensor) -> Tensor:

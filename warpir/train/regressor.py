@@ -24,7 +24,6 @@ from torch import Tensor
 
 from warpir.core.atomic import Checkpoints
 from warpir.core.errors import ExitCode, InputError
-from warpir.diffusion.train.worker import Worker
 from warpir.lighting.regressor import (
     Regressor,
     RegressorConfig,
@@ -37,6 +36,7 @@ from warpir.train.batches import PhotoBatch
 from warpir.train.light_loss import TERM_WEIGHTS, LightLoss, MeanLight
 from warpir.train.settings import TrainingSettings
 from warpir.train.validation import calibrate, measure, score
+from warpir.train.worker import Worker
 
 WEIGHTS, BEST, CURVE = "regressor.safetensors", "best.safetensors", "curve.jsonl"
 PANORAMAS = "panoramas"

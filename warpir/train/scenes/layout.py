@@ -1,4 +1,4 @@
-"""The cameras of a batch of scenes, where the objects stand, and what the ground looks like."""
+"""The cameras of a batch of scenes, what their solids stand around, and their grounds."""
 
 from __future__ import annotations
 
@@ -9,7 +9,6 @@ import torch
 from torch import Tensor
 
 from warpir.train.sampler import Sampler
-from warpir.train.scenes.lighting import about_y
 
 ASPECTS = (1.5, 1.5, 1.5, 1.5, 1.333, 1.333, 1.778, 1.0, 0.75)
 """Width over height of the photos, by frequency."""
@@ -43,27 +42,6 @@ class Views:
         """The photo's left, upper, width and height on the image plane, shape [B, 4]."""
         w, h = self.half_width, self.half_height
         return torch.stack([-w, -h, 2.0 * w, 2.0 * h], dim=1)
-
-
-@dataclass(frozen=True)
-class Stands:
-    """Where the objects stand, how large and how turned."""
-
-    place: Tensor
-    """On the ground, world frame [m], shape [B, 3]."""
-    scale: Tensor
-    """Of the mesh [m], shape [B]."""
-    mesh: Tensor
-    """Index, int64, shape [B]."""
-    sphere: Tensor
-    """Centre and radius round the mesh, in its own units, shape [B, 4]."""
-    yaw: Tensor
-    """About +Y [rad], shape [B]."""
-
-    @property
-    def middle(self) -> Tensor:
-        """Of the object, world frame [m], shape [B, 3]."""
-        return self.place + about_y(self.sphere[:, :3], self.yaw) * self.scale[:, None]
 
 
 def rays_in(
@@ -163,13 +141,15 @@ def draw_views(draw: Sampler, place_kind: Tensor) -> Views:
     )
 
 
-def draw_stands(draw: Sampler, views: Views, spheres: Tensor) -> Stands:
-    """Draw where the objects stand: at a pixel below the horizon.
+def draw_stands(draw: Sampler, views: Views) -> tuple[Tensor, Tensor]:
+    """Draw what the solids of each scene stand around: a point on the ground, below the horizon.
 
     Args:
         draw: For the scenes of the batch.
         views: Their cameras.
-        spheres: Round each mesh, shape [mesh, 4].
+
+    Returns:
+        Points, world frame [m], shape [B, 3], and the size of what could stand there [m], [B].
     """
     a = draw.uniform(-0.65, 0.65) * views.half_width
     horizon = torch.tan(views.tilt)
@@ -178,26 +158,7 @@ def draw_stands(draw: Sampler, views: Views, spheres: Tensor) -> Stands:
     d = views.right * a[:, None] - views.up * b[:, None] - views.back
     place = views.origin + d * (-views.height / d[:, 1].clamp(max=-0.03))[:, None]
     depth = -((place - views.origin) * views.back).sum(dim=1)
-    scale = draw.log_uniform(0.14, 0.55) * 2.0 * views.half_height * depth
-    mesh = draw.index(len(spheres))
-    return Stands(place, scale, mesh, spheres[mesh], draw.uniform(0.0, 2.0 * np.pi))
-
-
-def draw_crops(draw: Sampler, views: Views, stands: Stands) -> Tensor:
-    """Draw square windows round the objects, as the optimiser does, shape [B, 4]."""
-    half_width, half_height = views.half_width, views.half_height
-    offset = stands.middle - views.origin
-    depth = -(offset * views.back).sum(dim=1)
-    cu = (offset * views.right).sum(dim=1) / depth
-    cv = -(offset * views.up).sum(dim=1) / depth
-    half_box = 0.8 * stands.sphere[:, 3] * stands.scale / depth
-    shorter = 2.0 * torch.minimum(half_width, half_height)
-    side = torch.minimum(draw.log_uniform(1.2, 4.0) * 2.0 * half_box, shorter)
-    left = cu + draw.uniform(-1.0, 1.0) * half_box - side / 2.0
-    upper = cv + draw.uniform(-1.0, 1.0) * half_box - side / 2.0
-    left = torch.minimum(torch.maximum(left, -half_width), half_width - side)
-    upper = torch.minimum(torch.maximum(upper, -half_height), half_height - side)
-    return torch.stack([left, upper, side, side], dim=1)
+    return place, draw.log_uniform(0.14, 0.55) * 2.0 * views.half_height * depth
 
 
 def draw_colours(draw: Sampler, low: float, high: float) -> Tensor:
@@ -235,16 +196,4 @@ def draw_grounds(
         "turn": draw.uniform(0.0, np.pi),
         "roughen": draw.uniform(0.0, 0.4),
         "wetness": torch.where(draw.chance(0.15), draw.uniform(0.2, 1.0), zero),
-    }
-
-
-def draw_surfaces(draw: Sampler) -> dict[str, Tensor]:
-    """Draw the objects' materials, columns of the kernel's ``ObjectTable``."""
-    zero = torch.zeros(draw.count, device=draw.device)
-    return {
-        "tint": draw_colours(draw, 0.03, 0.85),
-        "recolour": torch.where(draw.chance(0.45), draw.uniform(0.4, 1.0), zero),
-        "pattern": torch.where(draw.chance(0.2), draw.uniform(0.2, 0.8), zero),
-        "roughness": torch.where(draw.chance(0.6), draw.uniform(0.5, 1.0), draw.uniform(0.12, 0.6)),
-        "metallic": torch.where(draw.chance(0.15), draw.uniform(0.3, 1.0), zero),
     }

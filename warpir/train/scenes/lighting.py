@@ -1,4 +1,4 @@
-"""Lights of a batch of scenes: their frames, the directions that stand for them, wrong ones."""
+"""Lights of a batch of scenes: their frames, and the directions that stand for them."""
 
 from __future__ import annotations
 
@@ -8,18 +8,12 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from warpir.diffusion.models.embedded_words import KINDS
 from warpir.lighting.latlong_tensors import directions_of, luminance, solid_angles
 from warpir.train.lights import LightPool
 from warpir.train.sampler import Sampler
 
 DIRECTIONS, SUN_DIRECTIONS = 96, 16
 """Directions that stand for a light, shared by a pixel's four points."""
-WRONG_SHARES = [0.12, 0.26, 0.20, 0.24, 0.18]
-"""Of each kind of wrong composite, in the order of `KINDS` after the right one: what a composite
-shows best is drawn most. The last has the right light, and a wrong black point."""
-BLACK_POINTS = (0.03, 0.18)
-"""Least and most by which a wrong black point is off, display-encoded [1]."""
 
 
 @dataclass
@@ -34,23 +28,6 @@ class Lighting:
     sun: Tensor
     """Gain included."""
     sigma: Tensor
-
-    def turned(self, angle: Tensor) -> Lighting:
-        """Return the lights turned about +Y [rad]."""
-        # World directions w become turn(w, angle); the map's frame stays: yaw' o turn = yaw.
-        return replace(self, yaw=self.yaw - self.mirror * angle, axis=about_y(self.axis, angle))
-
-    def chosen(self, other: Lighting, use_other: Tensor) -> Lighting:
-        """Return these lights, or the others where asked for, bool [B]."""
-
-        def pick(a: Tensor, b: Tensor) -> Tensor:
-            return torch.where(use_other.view(-1, *[1] * (a.ndim - 1)), b, a)
-
-        return Lighting(**{k: pick(v, getattr(other, k)) for k, v in vars(self).items()})
-
-    def brightened(self, factor: Tensor) -> Lighting:
-        """Return the lights times a factor, shape [B, 1] or, by channel, [B, 3]."""
-        return replace(self, gain=self.gain * factor, sun=self.sun * factor)
 
 
 def about_y(v: Tensor, angle: Tensor) -> Tensor:
@@ -144,82 +121,3 @@ def _draw_sun_directions(light: Lighting, draw: Sampler) -> Tensor:
         angle.cos()[..., None] * x[:, None] + angle.sin()[..., None] * y[:, None]
     )
     return torch.nn.functional.normalize(sun, dim=-1).contiguous()
-
-
-def draw_wrong_lights(
-    light: Lighting,
-    rest: Tensor,
-    is_weak: Tensor,
-    mismatched: float,
-    generator: torch.Generator,
-) -> tuple[Tensor, Lighting, Tensor]:
-    """Draw what is wrong with the objects' lights.
-
-    Args:
-        light: The scenes' lights.
-        rest: Luminance of their irradiance without the sun, shape [B].
-        is_weak: Whether the sun hardly counts, bool, shape [B].
-        mismatched: Share of scenes whose object has another light.
-        generator: Of the lights' device.
-
-    Returns:
-        Index into `KINDS`, int64, shape [B], the objects' lights, and by how much their display
-        values are lifted, or below 0 lowered, where they are black, shape [B].
-    """
-    draw = Sampler(len(rest), generator)
-    drawn = 1 + draw.category(WRONG_SHARES)
-    kind = torch.where(draw.chance(mismatched), drawn, 0)
-    wrong = _draw_wrong_direction(light, rest, is_weak, draw)
-    stops = torch.exp2((0.6 + 1.9 * draw.unit(1)) * draw.sign()[:, None])
-    cast = torch.exp(draw.normal(3) * 0.35)
-    cast = cast / cast.mean(dim=1, keepdim=True)
-    soft = _draw_wrong_softness(light, rest, is_weak, draw)
-    result = light
-    choices = (wrong, light.brightened(stops), light.brightened(cast), soft)
-    for number, choice in enumerate(choices, start=1):
-        result = result.chosen(choice, kind == number)
-    assert KINDS[1:] == ("direction", "exposure", "colour", "softness", "shadow")
-    black = torch.where(kind == 5, draw.uniform(*BLACK_POINTS) * draw.sign(), 0.0)
-    return kind, result, black
-
-
-def _draw_wrong_direction(
-    light: Lighting, rest: Tensor, is_weak: Tensor, draw: Sampler
-) -> Lighting:
-    """Turn the whole light and raise or lower its sun, or take another scene's light."""
-    device = draw.device
-    near = draw.chance(0.3)
-    angle = torch.where(near, 0.2 + 0.4 * draw.unit(), 0.6 + (np.pi - 0.6) * draw.unit())
-    turned = light.turned(angle * draw.sign())
-    old = torch.arcsin(turned.axis[:, 1].clamp(-1.0, 1.0))
-    new = torch.where(
-        near, old + 0.25 * (draw.unit() - 0.5), torch.deg2rad(5.0 + 75.0 * draw.unit())
-    )
-    new = torch.where(draw.chance(0.5) | (old < 0.0), new.clamp(0.03, 1.5), old)
-    flat = torch.nn.functional.normalize(
-        turned.axis * torch.tensor([1.0, 0.0, 1.0], device=device) + 1e-6, dim=1
-    )
-    axis = flat * new.cos()[:, None]
-    axis[:, 1] = new.sin()
-    # Without a sun nothing shows a direction: a sun is put there.
-    added = rest[:, None] * (0.3 + 1.5 * draw.unit(1)) * (1.0 - 0.3 * draw.unit(3))
-    sun = torch.where(is_weak[:, None], added, turned.sun)
-    turned = replace(turned, axis=axis, sun=sun)
-    # Another scene's light, at about the same exposure.
-    order = torch.randperm(draw.count, generator=draw.generator, device=device)
-    other = Lighting(**{k: v[order] for k, v in vars(light).items()})
-    level = rest + luminance(light.sun)
-    balance = (level / level[order].clamp(min=1e-9))[:, None].clamp(0.02, 50.0)
-    far = (other.axis * light.axis).sum(dim=1) < 0.85
-    return turned.chosen(other.brightened(balance), far & ~near & draw.chance(0.35) & ~is_weak)
-
-
-def _draw_wrong_softness(light: Lighting, rest: Tensor, is_weak: Tensor, draw: Sampler) -> Lighting:
-    """Move the sun's light to the sky, or the sky's to a sun where there is hardly any."""
-    moved = luminance(light.sun)[:, None] / rest.clamp(min=1e-9)[:, None]
-    part = 0.6 + 0.4 * draw.unit(1)
-    softer = replace(light, gain=light.gain * (1.0 + part * moved), sun=light.sun * (1.0 - part))
-    harder = replace(
-        light, gain=light.gain * 0.45, sun=0.55 * rest[:, None] * (0.7 + draw.unit(3) * 0.3)
-    )
-    return softer.chosen(harder, is_weak)
