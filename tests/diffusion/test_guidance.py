@@ -211,7 +211,7 @@ def test_terms_are_one_call_without_idle_branches(rng: np.random.Generator, loss
 
 
 @pytest.mark.parametrize("loss", ["good-bad", "sds-good-bad"])
-def test_losses_of_the_embedded_prior_do_without_an_adapter(
+def test_losses_of_the_base_model_do_without_an_adapter(
     rng: np.random.Generator, loss: str
 ) -> None:
     """The base model says what is good and what is bad."""
