@@ -158,7 +158,8 @@ def light_record(found: Regression) -> dict[str, Any]:
     """
     is_clear = found.spread_deg <= CLEAR_DEG
     rest = replace(found, sun=np.zeros(3)) if is_clear else found
-    above, below = rest.irradiance(np.array([[0.0, 1.0, 0.0], [0.0, -1.0, 0.0]])) / math.pi
+    up = np.array([0.0, 1.0, 0.0])
+    above, below = (rest.irradiance(normal) / math.pi for normal in (up, -up))
     return {
         "direction": list(angles_from_axis(found.axis)) if is_clear else None,
         "spread_deg": found.spread_deg,
