@@ -176,3 +176,56 @@ def test_lines_are_dragged_and_saved(inputs: Path, tmp_path: Path, width: int) -
     saved = json.loads((out / "camera.json").read_text())
     assert saved["cy"] == pytest.approx(upright["camera"]["cy"])
     assert saved["fx"] == pytest.approx(upright["camera"]["fx"])
+
+
+@needs_chromium
+@pytest.mark.slow
+@pytest.mark.parametrize("width", [1100, 390])
+def test_known_length_tells_the_height(inputs: Path, tmp_path: Path, width: int) -> None:
+    """A pole and a distance on the ground, of a known camera, in closed form and on the page."""
+    camera = camera_of(Stance(0.3, 1.7, -0.2, 25.0, -11.0, 6.0))
+    numbers = {name: getattr(camera, name) for name in ("width", "height", "fx", "fy", "cx", "cy")}
+    ground = np.array([[-2.5, 0.0, -5.0], [-1.0, 0.0, -7.5]])
+    pole = np.array([[-2.5, 0.0, -5.0], [-2.5, 2.1, -5.0]])
+    argv = command(inputs, tmp_path / "out", "--fov", "60", "--pitch", "-8")
+    with serve(argv) as served, open_browser(width, 800) as opened:
+        page = opened.page
+        open_page(opened, served)
+        code = "(given) => import('./camera.js').then((m) => m.lengthSeen(...given))"
+        for points, is_upright in ((ground, False), (pole, True)):
+            ends = camera.project(points).tolist()
+            wanted = float(np.linalg.norm(points[0] - points[1]))
+            # The stance counts with half the height: everything is half as long.
+            for height, share in ((1.7, 1.0), (0.85, 0.5)):
+                stance = Stance(0.3, height, -0.2, 25.0, -11.0, 6.0).record()
+                found = page.evaluate(code, [numbers, stance, ends[::-1], is_upright])
+                assert found == pytest.approx(share * wanted)
+        sky = [[10.0, 3.0], [50.0, 4.0]]
+        assert page.evaluate(code, [numbers, stance, sky, False]) is None
+        before = page.evaluate(STATE)
+        page.click("#ruler")
+        settle(opened)
+        begun = page.evaluate(STATE)
+        assert begun["stance"] == before["stance"]
+        length = begun["ruler"]["metres"]
+        page.fill("#metres", str(2.0 * length))
+        page.keyboard.press("Enter")
+        settle(opened)
+        doubled = page.evaluate(STATE)
+        assert doubled["stance"]["height"] == pytest.approx(2.0 * before["stance"]["height"])
+        assert doubled["size"] == before["size"]
+        # Half of the line for the same length: twice as high again, nearly.
+        x, y = handle_at(opened, "r1")
+        _, foot = handle_at(opened, "r0")
+        page.mouse.move(x, y)
+        page.mouse.down()
+        page.mouse.move(x, (y + foot) / 2.0, steps=3)
+        page.mouse.up()
+        settle(opened)
+        higher = page.evaluate(STATE)["stance"]["height"]
+        assert 1.7 < higher / doubled["stance"]["height"] < 2.3
+        for _ in range(3):
+            page.keyboard.press("Control+z")
+        settle(opened)
+        assert page.evaluate(STATE) == before
+        assert opened.errors == []

@@ -7,6 +7,7 @@ import pytest
 
 from tests.builders.programs.browser import Fingers, Opened, needs_chromium, open_browser
 from tests.builders.programs.placing import (
+    FOOT_ON_CANVAS,
     STATE,
     command,
     drag,
@@ -15,15 +16,6 @@ from tests.builders.programs.placing import (
     serve,
     settle,
 )
-
-FOOT_ON_CANVAS = """import('./page.js').then(async ({ stage, state }) => {
-  const { Vector3 } = await import('three');
-  const at = new Vector3(state.stand.x, 0, state.stand.z);
-  at.applyMatrix4(stage.camera.matrixWorldInverse).applyMatrix4(stage.camera.projectionMatrix);
-  const box = document.getElementById('canvas').getBoundingClientRect();
-  return [box.left + (at.x + 1) / 2 * box.width, box.top + (1 - at.y) / 2 * box.height];
-})"""
-"""Where the canvas draws the object's foot, in pixels of the window."""
 
 
 def photo_box(opened: Opened) -> tuple[float, float, float, float]:

@@ -95,6 +95,6 @@ class Answers:
         saved = self.save(body)
         return {**saved, **self.renderings.insert(Path(saved["file"]), self.folder.overwrite)}
 
-    def _files(self, body: bytes) -> dict[str, dict[str, Any]]:
+    def _files(self, body: bytes) -> dict[str, dict[str, Any] | bytes]:
         sent = parse_json_object(PAGE, body)
         return placement_files(self.session, self.asked, sent)

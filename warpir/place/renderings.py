@@ -22,7 +22,7 @@ from typing import Any
 from warpir.core.atomic import write_file
 from warpir.core.errors import InputError
 from warpir.core.strict_json import read_json_object
-from warpir.place.session import CAMERA, CONFIG, PAGE
+from warpir.place.session import CAMERA, CONFIG, MASK, PAGE
 from warpir.place.worker import Worker
 
 PREVIEW_WIDTH = 640
@@ -48,7 +48,7 @@ class Renderings:
 
     # ------------------------------------------------------------------------ what the page asks
 
-    def preview(self, files: Mapping[str, Mapping[str, Any]]) -> dict[str, Any]:
+    def preview(self, files: Mapping[str, Any]) -> dict[str, Any]:
         """Begin a preview of a placement.
 
         Args:
@@ -155,11 +155,14 @@ class Renderings:
         with self._lock:
             self._progress.update(line=line, share=share)
 
-    def _preview(self, files: Mapping[str, Mapping[str, Any]]) -> str:
+    def _preview(self, files: Mapping[str, Any]) -> str:
         folder = Path(self._folder.name)
         camera, name = folder / CAMERA, f"preview-{self._count}.png"
         write_file(camera, json.dumps(files[CAMERA]).encode())
         config = {**files[CONFIG], "camera": str(camera), "out": str(folder / "unused")}
+        if MASK in files:
+            write_file(folder / MASK, files[MASK])
+            config["occluder_mask"] = str(folder / MASK)
         job = {"kind": "preview", "config": config, "width": PREVIEW_WIDTH}
         self.worker.ask(
             {**job, "picture": str(folder / name)},

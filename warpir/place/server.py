@@ -25,8 +25,8 @@ from warpir.place.renderings import policy_of
 from warpir.report.html import source_hash
 
 HOST = "127.0.0.1"
-LARGEST_REQUEST = 1 << 16
-"""Largest request body [byte]."""
+LARGEST_REQUEST = 1 << 23
+"""Largest request body [byte]: a mask of 2048 x 2048 pixels in base64."""
 PAGE = Path(__file__).parent / "page"
 FILES = {
     "": "index.html",
@@ -41,6 +41,7 @@ FILES = {
             "history.js",
             "light.js",
             "lines.js",
+            "mask.js",
             "page.js",
             "pictures.js",
             "stage.js",

@@ -1,15 +1,18 @@
 """Session of placing by hand: the page's initial values, and the files of a saved placement.
 
 A saved placement is two files in one folder: ``camera.json``, as `warpir.insert` writes it, and
-``insert.json``, a configuration for ``--config`` that names photo, asset, camera, place and light.
+``insert.json``, a configuration for ``--config`` that names photo, asset, camera, place and light;
+and ``occluder.png``, where a mask was painted.
 """
 
 from __future__ import annotations
 
+import base64
 import io
 import json
 import os
 from collections.abc import Mapping
+from contextlib import ExitStack
 from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from typing import Any
@@ -44,8 +47,10 @@ from warpir.scene.asset import Asset
 from warpir.scene.camera import Camera
 from warpir.scene.placement import place_asset, upright_plane
 
-CAMERA, CONFIG = "camera.json", "insert.json"
-"""Names of the two files."""
+CAMERA, CONFIG, MASK = "camera.json", "insert.json", "occluder.png"
+"""Names of the files."""
+MASK_SIDE = 2048
+"""Longest side of the page's mask [px]."""
 PHOTO_SIDE = 2048
 """Longest side of the photo for the page [px]."""
 PLACED = ("place", "at", "rotate_y", "scale", "size", "sun", "sky")
@@ -266,8 +271,8 @@ def sent_camera(session: Session, sent: Mapping[str, Any]) -> Camera:
 
 def placement_files(
     session: Session, asked: Mapping[str, Any], sent: Mapping[str, Any]
-) -> dict[str, dict[str, Any]]:
-    """Return the two files of a placement, the configuration last.
+) -> dict[str, dict[str, Any] | bytes]:
+    """Return the files of a placement: JSON as plain values, the mask as PNG.
 
     Args:
         session: Session of the placement.
@@ -275,10 +280,11 @@ def placement_files(
             two files.
         sent: Page values: those of `sent_camera`, ``stand`` (``x`` and ``z`` in the ground frame)
             [m], ``rotate_y`` [deg], ``size`` [m], and ``sun`` and ``sky`` as the flags, or null
-            where the light is to be estimated from the photo.
+            where the light is to be estimated from the photo; `mask_png`'s.
 
     Raises:
-        InputError: Numbers out of range, or an object that the camera does not see.
+        InputError: Numbers out of range, an object that the camera does not see, or a mask that is
+            no picture.
     """
     camera = sent_camera(session, sent)
     stand = [number(PAGE, sent.get("stand"), axis) for axis in "xz"]
@@ -297,7 +303,10 @@ def placement_files(
     )
     folder = Path(os.path.abspath(asked["out"]))
     ground = {} if session.ground is None else {"ground": session.ground}
+    mask = mask_png((camera.width, camera.height), sent)
+    occluder = {} if mask is None else {"occluder_mask": str(folder / MASK)}
     return {
+        **({} if mask is None else {MASK: mask}),
         CAMERA: camera.record(),
         CONFIG: {
             **kept_values(asked),
@@ -305,9 +314,40 @@ def placement_files(
             **ground,
             "place": config.placement.place,
             **chosen,
+            **occluder,
             "out": str(folder / "result"),
         },
     }
+
+
+def mask_png(size: tuple[int, int], sent: Mapping[str, Any]) -> bytes | None:
+    """Return the mask that the page sends, at the photo's size, as a grey PNG.
+
+    Args:
+        size: Width and height of the photo [px].
+        sent: ``mask``: a PNG in base64, white where the photo stays in front; absent or null where
+            nothing was painted.
+
+    Raises:
+        InputError: It is no such picture.
+    """
+    from PIL import Image
+
+    text = sent.get("mask")
+    if text is None:
+        return None
+    try:
+        picture = Image.open(io.BytesIO(base64.b64decode(text, validate=True)), formats=["PNG"])
+        if max(picture.size) > MASK_SIDE:
+            raise InputError(PAGE, f"the mask is too large (found {max(picture.size)} px)")
+        mask = picture.convert("L")
+    except (TypeError, ValueError, OSError, SyntaxError):
+        raise InputError(PAGE, "the mask is not a PNG in base64") from None
+    if mask.getextrema() == (0, 0):
+        return None
+    stream = io.BytesIO()
+    mask.resize(size, Image.Resampling.BILINEAR).save(stream, "PNG")
+    return stream.getvalue()
 
 
 def kept_values(asked: Mapping[str, Any]) -> dict[str, Any]:
@@ -326,13 +366,13 @@ def kept_values(asked: Mapping[str, Any]) -> dict[str, Any]:
 
 
 class PlacementFolder:
-    """The folder of the two files; it replaces its own, and others' where `overwrite` allows it."""
+    """The folder of these files; it replaces its own, and others' where `overwrite` allows it."""
 
     def __init__(self, path: str, overwrite: bool) -> None:
         """Name the folder, which is created with the first file.
 
         Args:
-            path: The folder.
+            path: The folder of the files.
             overwrite: Whether a placement that is there may be replaced.
         """
         self.path = Path(path)
@@ -353,7 +393,7 @@ class PlacementFolder:
         if self.path.exists() and not self.path.is_dir():
             what = "not a folder (found a file)"
             raise InputError(self.path, what, "choose another --out", ExitCode.OUTPUT)
-        for name in (CAMERA, CONFIG):
+        for name in (CAMERA, CONFIG, MASK):
             path = self.path / name
             if self.overwrite or not os.path.lexists(path):
                 continue
@@ -366,8 +406,10 @@ class PlacementFolder:
                 advice = "pass --overwrite to replace it, or choose another --out"
                 raise InputError(path, what, advice, ExitCode.OUTPUT)
 
-    def write(self, files: Mapping[str, Mapping[str, Any]]) -> Path:
-        """Write both files, each whole or not at all; return the configuration's path.
+    def write(self, files: Mapping[str, Mapping[str, Any] | bytes]) -> Path:
+        """Write the files, each whole or not at all; return the configuration's path.
+
+        The mask of an earlier placement is removed when this one has none.
 
         Raises:
             InputError: There is one already (`ExitCode.OUTPUT`), or it cannot be written
@@ -375,16 +417,23 @@ class PlacementFolder:
         """
         self.check()
         contents = {
-            name: (json.dumps(content, indent=2, allow_nan=False) + "\n").encode()
+            name: content if isinstance(content, bytes) else _json_file(content)
             for name, content in files.items()
         }
         config = self.path / CONFIG
         try:
-            # Both are on the disk before either gets its name, the one that names the other last.
-            with replacing(config) as staged, replacing(self.path / CAMERA) as staged_camera:
-                write_staged(staged, contents[CONFIG])
-                write_staged(staged_camera, contents[CAMERA])
+            # All are on the disk before any gets its name, the one that names the others last.
+            with ExitStack() as renamed:
+                for name in (CONFIG, *(other for other in contents if other != CONFIG)):
+                    staged = renamed.enter_context(replacing(self.path / name))
+                    write_staged(staged, contents[name])
+            if MASK not in contents:
+                (self.path / MASK).unlink(missing_ok=True)
         except OSError as error:
             raise disk_error(error.filename or self.path, error) from error
         self._written = contents
         return Path(os.path.abspath(config))
+
+
+def _json_file(content: Mapping[str, Any]) -> bytes:
+    return (json.dumps(content, indent=2, allow_nan=False) + "\n").encode()

@@ -178,8 +178,8 @@ def config_of(values: Mapping[str, Any]) -> InsertConfig:
 
 def camera_of(record: Mapping[str, Any]) -> Camera:
     """Return the camera of a record that `warpir.scene.camera.Camera.record` has made."""
-    numbers = (record[name] for name in ("w", "h", "fx", "fy", "cx", "cy"))
-    return Camera(*numbers, np.array(record["c2w"]))
+    width, height, fx, fy, cx, cy = (record[name] for name in ("w", "h", "fx", "fy", "cx", "cy"))
+    return Camera(width, height, fx, fy, cx, cy, np.array(record["c2w"]))
 
 
 @lru_cache(maxsize=1)

@@ -15,6 +15,14 @@ WIDTH, HEIGHT = 480, 320
 """Size of the photo of the tests [px]."""
 STATE = "import('./page.js').then((m) => m.state)"
 """The page's state, for `Page.evaluate`."""
+FOOT_ON_CANVAS = """import('./page.js').then(async ({ stage, state }) => {
+  const { Vector3 } = await import('three');
+  const at = new Vector3(state.stand.x, 0, state.stand.z);
+  at.applyMatrix4(stage.camera.matrixWorldInverse).applyMatrix4(stage.camera.projectionMatrix);
+  const box = document.getElementById('canvas').getBoundingClientRect();
+  return [box.left + (at.x + 1) / 2 * box.width, box.top + (1 - at.y) / 2 * box.height];
+})"""
+"""Where the canvas draws the object's foot, in pixels of the window."""
 
 
 def command(folder: Path, out: Path, *more: str, asset: str = "wedge.glb") -> list[str]:

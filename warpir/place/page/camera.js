@@ -64,6 +64,23 @@ export function groundPoint(camera, stance, u, v) {
   return [stance.x + reach * direction[0], stance.z + reach * direction[2]];
 }
 
+// Length of what a segment of the photo shows [m]: of ground between its ends, or of something upright
+// that stands on the ground at the lower end (the ray through the upper one passes the vertical there
+// at this height). It grows with the camera's height. Null where the photo shows no such thing.
+export function lengthSeen(camera, stance, ends, isUpright) {
+  const [low, high] = [...ends].sort((a, b) => b[1] - a[1]);
+  const foot = groundPoint(camera, stance, ...low);
+  if (!foot) return null;
+  if (!isUpright) {
+    const other = groundPoint(camera, stance, ...high);
+    return other && Math.hypot(other[0] - foot[0], other[1] - foot[1]);
+  }
+  const [x, y, z] = ray(camera, stance, ...high);
+  const reach = ((foot[0] - stance.x) * x + (foot[1] - stance.z) * z) / (x * x + z * z);
+  const length = stance.height + reach * y;
+  return reach > 0 && length > 0 ? length : null;
+}
+
 // Row of the horizon in a column: level directions d fulfil d.y = 0, with the second row of the
 // rotation sin(roll) X - cos(roll) Y + tan(pitch) = 0 in X = (u - cx) / fx, Y = (v - cy) / fy.
 export function horizonRow(camera, stance, u) {

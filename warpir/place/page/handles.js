@@ -7,6 +7,10 @@ const RIM = 14; // handles stay this far inside the stage
 const APART = 26; // between the middles of an object's knobs
 const LEAST_RING = 44; // radius on the screen, however small the object is
 const FARTHEST = 400; // camera heights
+const CARRIED = 4; // how many times as far a change of the camera may carry the object
+const LOWEST = 0.97; // of the photo's height: the lowest row where such a change sets it
+const BESIDE = 34; // between the object's box and its knobs beside it
+const ROOMY = 480; // a narrower stage has them there
 const ICONS = {
   pitch: 'M0-5V5M-2.6-2.6 0-5.2 2.6-2.6M-2.6 2.6 0 5.2 2.6 2.6',
   roll: 'M-4.5 2A5 5 0 0 1 4.5 2M4.9-1.4 4.6 2.2 1.2 1.4',
@@ -40,12 +44,33 @@ function above([x, y], [u, v]) {
   return [x, Math.abs(y - v) < clear ? v - clear : y];
 }
 
-// The same with the camera changed: what stood at a pixel of the ground goes on standing there.
+// The same with the camera changed: what stood at a pixel of the ground goes on standing there, so
+// far as that does not carry it off: then it stands lower in the photo, at `CARRIED` times its
+// distance. Null where the photo shows no such ground: the change is not for this object.
 export function withCamera(before, camera, stance) {
-  const foot = project(before.camera, before.stance, [before.stand.x, 0, before.stand.z]);
-  const point = foot && groundPoint(camera, stance, ...foot);
-  const isNear = point && Math.hypot(point[0] - stance.x, point[1] - stance.z) < FARTHEST * stance.height;
-  return { ...before, camera, stance, stand: isNear ? { x: point[0], z: point[1] } : before.stand };
+  const { stand } = before;
+  const foot = project(before.camera, before.stance, [stand.x, 0, stand.z]);
+  const isSeen = foot && foot[0] >= 0 && foot[0] <= camera.width && foot[1] >= 0 && foot[1] <= camera.height;
+  if (!isSeen) return { ...before, camera, stance };
+  const away = (point, from) => Math.hypot(point[0] - from.x, point[1] - from.z) / from.height;
+  const most = Math.min(CARRIED * Math.max(away([stand.x, stand.z], before.stance), 1), FARTHEST);
+  const pointAt = (v) => {
+    const point = groundPoint(camera, stance, foot[0], v);
+    return point && away(point, stance) <= most * (1 + 1e-9) ? point : null;
+  };
+  let point = pointAt(foot[1]);
+  if (!point) {
+    // Nearer ground is lower, but for a camera on its head: the lowest row is the nearest there is.
+    let [far, near] = [foot[1], LOWEST * camera.height];
+    if (near <= far || !pointAt(near)) return null;
+    for (let k = 0; k < 40; k += 1) {
+      const row = (far + near) / 2;
+      if (pointAt(row)) near = row;
+      else far = row;
+    }
+    point = pointAt(near);
+  }
+  return { ...before, camera, stance, stand: { x: point[0], z: point[1] } };
 }
 
 // The same with the object's foot at a pixel of the photo; as it was where that shows no ground.
@@ -56,11 +81,22 @@ export function stoodAt(before, u, v) {
   return { ...before, stand: { x: point[0], z: point[1] } };
 }
 
-// The same with the horizon some rows lower: of an upright photo by its principal point.
+// The same with the horizon some rows lower, or as far as the object allows: of an upright photo by
+// its principal point.
 export function shifted(before, rows) {
   const { camera, stance } = before;
-  if (before.isUpright) return withCamera(before, { ...camera, cy: camera.cy + rows }, stance);
-  return withCamera(before, camera, lowered(camera, stance, rows));
+  const by = (share) => (before.isUpright
+    ? withCamera(before, { ...camera, cy: camera.cy + share * rows }, stance)
+    : withCamera(before, camera, lowered(camera, stance, share * rows)));
+  const all = by(1);
+  if (all) return all;
+  let [good, bad] = [0, 1];
+  for (let k = 0; k < 20; k += 1) {
+    const share = (good + bad) / 2;
+    if (by(share)) good = share;
+    else bad = share;
+  }
+  return by(good);
 }
 
 // The same with the horizon through two pixels.
@@ -170,6 +206,8 @@ export class Handles {
     }
     if (!foot) return before;
     if (name === 'foot') return stoodAt(before, foot[0] + du, foot[1] + dv);
+    if (this.isBeside && name === 'turn') return { ...before, turn: before.turn + 0.8 * du * this.scale };
+    if (this.isBeside && name === 'size') return { ...before, size: before.size * Math.exp((-dv * this.scale) / 90) };
     if (name === 'size') {
       const height = Math.max(foot[1] - from[1], 8 / this.scale);
       return { ...before, size: before.size * Math.max((height - dv) / height, 0.02) };
@@ -208,23 +246,35 @@ export class Handles {
       for (const part of ['rim', 'line', 'hit']) line[part].setAttribute('d', path);
     };
 
+    const at = corners(this.box, placed(this.box, stand, turn, size)).map((p) => project(camera, stance, p));
+    this.bounds = at.every(Boolean) ? [
+      Math.min(...at.map((p) => p[0])), Math.min(...at.map((p) => p[1])),
+      Math.max(...at.map((p) => p[0])), Math.max(...at.map((p) => p[1])),
+    ] : null;
+    this.isBeside = Boolean(this.bounds) && this.stage.parentElement.clientWidth < ROOMY;
     const level = (share) => {
       const u = seen.x + share * seen.width;
       return onStage([u, horizonRow(camera, stance, u)]);
     };
     draw(this.horizon, `M${level(0)}L${level(1)}`);
-    put('pitch', level(0.5));
-    put('fov', level(0.76));
+    // On a phone they leave the object free.
+    const free = (...shares) => shares.map(level).find((pixel) => !this.isBeside || !this.#isOver(inside(pixel))) ?? level(shares[0]);
+    put('pitch', free(0.5, 0.3, 0.7, 0.2, 0.85));
+    put('fov', free(0.76, 0.82, 0.18));
     put('tilt', level(0.06));
     put('roll', level(0.94));
+    const { foot, onRing } = this.#drawRing(state, draw, onStage);
+    if (this.isBeside) this.#putBeside(put, low, high);
+    else this.#putAround(put, state, onStage(foot), onStage(onRing), onStage);
+  }
 
-    const at = corners(this.box, placed(this.box, stand, turn, size)).map((p) => project(camera, stance, p));
-    const isWhole = at.every(Boolean);
-    this.bounds = isWhole ? [
-      Math.min(...at.map((p) => p[0])), Math.min(...at.map((p) => p[1])),
-      Math.max(...at.map((p) => p[0])), Math.max(...at.map((p) => p[1])),
-    ] : null;
-    const foot = project(camera, stance, [stand.x, 0, stand.z]);
+  // Whether a place on the stage is on the object, or so near that a knob would be.
+  #isOver([x, y]) {
+    const [left, top, right, bottom] = this.bounds.map((part) => part * this.scale);
+    return x > left - RIM && x < right + RIM && y > top - RIM && y < bottom + RIM;
+  }
+
+  #drawRing({ camera, stance, stand, turn, size }, draw, onStage) {
     const away = Math.hypot(stand.x - stance.x, stance.height, stand.z - stance.z);
     const side = Math.max(...this.box.high.map((top, k) => top - this.box.low[k]));
     const across = Math.hypot(this.box.high[0] - this.box.low[0], this.box.high[2] - this.box.low[2]);
@@ -234,15 +284,27 @@ export class Handles {
     ]);
     const ring = Array.from({ length: 73 }, (_, k) => onStage(round((k * Math.PI) / 36)));
     draw(this.ring, ring.every(Boolean) ? `M${ring.join('L')}Z` : '');
-    const top = this.bounds ? [(this.bounds[0] + this.bounds[2]) / 2, this.bounds[1]] : foot;
-    const [footAt, onRing, topAt] = [foot, round((turn * Math.PI) / 180), top].map(onStage);
+    return { foot: project(camera, stance, [stand.x, 0, stand.z]), onRing: round((turn * Math.PI) / 180) };
+  }
+
+  #putAround(put, { camera, stance }, footAt, onRing, onStage) {
+    const top = this.bounds ? onStage([(this.bounds[0] + this.bounds[2]) / 2, this.bounds[1]]) : footAt;
     const asideAt = footAt && onRing && outside(onRing, footAt);
     // Above the horizon it could not be dragged.
     const turnAt = asideAt && groundPoint(camera, stance, ...asideAt.map((part) => part / this.scale)) ? asideAt : onRing;
     const lowestFirst = [footAt, turnAt].filter(Boolean).sort((a, b) => b[1] - a[1]);
     put('foot', footAt);
     put('turn', turnAt);
-    put('size', topAt && lowestFirst.reduce(above, [topAt[0], topAt[1] - 30]));
+    put('size', top && lowestFirst.reduce(above, [top[0], top[1] - 30]));
+  }
+
+  // In a column to the object's right, or to its left where there is no room.
+  #putBeside(put, low, high) {
+    const [left, top, right, bottom] = this.bounds.map((part) => part * this.scale);
+    const x = right + BESIDE <= high[0] || left - BESIDE < low[0] ? right + BESIDE : left - BESIDE;
+    const step = 42;
+    const middle = Math.min(Math.max((top + bottom) / 2, low[1] + step), high[1] - step);
+    for (const [k, name] of ['size', 'turn', 'foot'].entries()) put(name, [x, middle + (k - 1) * step]);
   }
 
   // What each handle stands at, for those who do not see it.

@@ -4,7 +4,8 @@ import { Fields, clamp, fromPolar, plain, polar, wrapped } from './fields.js';
 import { Handles, shifted, stoodAt, withCamera } from './handles.js';
 import { History } from './history.js';
 import { Dial, Lighting, photoPixels } from './light.js';
-import { Lines } from './lines.js';
+import { Lines, Ruler } from './lines.js';
+import { Mask } from './mask.js';
 import { Pictures } from './pictures.js';
 import { Stage } from './stage.js';
 import { View } from './view.js';
@@ -26,7 +27,7 @@ const lighting = new Lighting(start, await photoPixels($('photo')), {
   ask: (camera) => post('light', sentCamera(camera)),
 });
 const { camera, stance, stand, rotate_y: turn, size } = start;
-const history = new History({ camera, stance, stand, turn, size, light: lighting.opening(), lines: null, isUpright: looksUpright() }, {
+const history = new History({ camera, stance, stand, turn, size, light: lighting.opening(), lines: null, ruler: null, mask: [], isUpright: looksUpright() }, {
   show,
   begun: () => $('stage').classList.add('dragging'),
   moved: readOut,
@@ -50,6 +51,13 @@ const lines = new Lines($('handles'), $('stage'), history, {
   toggle: $('lines'), upright: $('upright'), options: $('axes'), words: $('lines-words'),
   axes: { a: $('axis-a'), b: $('axis-b'), c: $('axis-c') },
 });
+const ruler = new Ruler($('handles'), $('stage'), history, {
+  toggle: $('ruler'), options: $('ruler-options'), metres: $('metres'), upright: $('standing'), words: $('ruler-words'),
+});
+const mask = new Mask({
+  front: $('front'), toggle: $('paint'), options: $('mask-options'), brush: $('brush'), eraser: $('eraser'),
+  width: $('brush-width'), clear: $('clear-mask'),
+}, $('photo'), start.photo, history, $('stage'));
 const pictures = new Pictures({
   preview: $('preview'), insert: $('insert'), cancel: $('cancel'), picture: $('picture'), bar: $('bar'),
   words: $('rendering-words'), report: $('report'),
@@ -97,6 +105,8 @@ function draw() {
     const more = stage.render();
     handles.draw(state, seen);
     lines.draw(state);
+    ruler.draw(state);
+    mask.draw(state);
     pictures.draw(state);
     handles.say(fields.spoken(state));
     fields.show(state);
@@ -154,7 +164,7 @@ const view = new View($('room'), $('stage'), canvas, start.photo, {
     $('zoom-fit').textContent = `${Math.round(100 * view.scale)} %`;
     draw();
   },
-  pressed: (event) => history.isOn || (handles.isOnObject(event) && handles.drag(event, canvas, 'foot')),
+  pressed: (event) => history.isOn || mask.press(event) || (handles.isOnObject(event) && handles.drag(event, canvas, 'foot')),
   cancel: () => history.cancel(),
 });
 $('zoom-in').addEventListener('click', () => view.step(1));
@@ -162,6 +172,7 @@ $('zoom-out').addEventListener('click', () => view.step(-1));
 $('zoom-fit').addEventListener('click', () => view.fit());
 canvas.addEventListener('pointermove', (event) => canvas.classList.toggle('grabs', Boolean(handles.isOnObject(event))));
 canvas.addEventListener('dblclick', (event) => {
+  if (mask.isPainting) return;
   const box = $('stage').getBoundingClientRect();
   const scale = start.photo.width / box.width;
   once('double click', (before) => stoodAt(before, (event.clientX - box.left) * scale, (event.clientY - box.top) * scale));
@@ -255,7 +266,9 @@ function sentCamera({ camera: { fx, fy, cx, cy }, stance: pose }) {
 }
 
 function sentPlacement(now) {
-  return { ...sentCamera(now), stand: now.stand, rotate_y: wrapped(now.turn), size: now.size, ...lighting.saved(now) };
+  return {
+    ...sentCamera(now), stand: now.stand, rotate_y: wrapped(now.turn), size: now.size, ...lighting.saved(now), mask: mask.sent(now),
+  };
 }
 
 let saved = state;

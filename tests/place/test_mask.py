@@ -1,0 +1,120 @@
+"""The mask of what stands in front of the object, painted on the placing page."""
+
+import base64
+import io
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from tests.builders.programs.browser import needs_chromium, open_browser
+from tests.builders.programs.placing import (
+    HEIGHT,
+    STATE,
+    WIDTH,
+    command,
+    open_page,
+    serve,
+    settle,
+)
+from warpir.core.errors import InputError
+from warpir.place.session import mask_png
+
+
+def encoded(picture: Image.Image, kind: str = "PNG") -> str:
+    """The picture's file in base64."""
+    stream = io.BytesIO()
+    picture.save(stream, kind)
+    return base64.b64encode(stream.getvalue()).decode()
+
+
+def test_mask_gets_the_size_of_the_photo() -> None:
+    """Half of the page's mask is half of the photo's; one in which all is erased is none."""
+    codes = np.zeros((20, 30), np.uint8)
+    codes[:, :15] = 255
+    content = mask_png((120, 80), {"mask": encoded(Image.fromarray(codes).convert("RGBA"))})
+    assert content is not None
+    mask = np.asarray(Image.open(io.BytesIO(content)))
+    assert mask.shape == (80, 120) and mask.dtype == np.uint8
+    assert (mask[:, :56] == 255).all() and (mask[:, 64:] == 0).all()
+    assert mask_png((120, 80), {}) is None
+    assert mask_png((120, 80), {"mask": encoded(Image.new("L", (30, 20)))}) is None
+
+
+@pytest.mark.parametrize(
+    "mask",
+    [5, "?", base64.b64encode(b"no picture").decode(), encoded(Image.new("L", (4, 4)), "GIF")],
+)
+def test_mask_that_is_none_is_refused(mask: object) -> None:
+    """Whatever is no PNG in base64 is one line."""
+    with pytest.raises(InputError, match="mask"):
+        mask_png((8, 8), {"mask": mask})
+
+
+@needs_chromium
+@pytest.mark.slow
+@pytest.mark.parametrize("width", [1000, 390])
+def test_page_paints_and_saves_what_stands_in_front(
+    inputs: Path, tmp_path: Path, width: int
+) -> None:
+    """A stroke hides the object, the eraser takes it back, undo both; the file is the photo's."""
+    out = tmp_path / "out"
+    with serve(command(inputs, out)) as served, open_browser(width, 800) as opened:
+        page = opened.page
+        open_page(opened, served)
+        before = page.evaluate(STATE)
+        page.click("#paint")
+        box = page.locator("#photo").bounding_box()
+        assert box is not None
+        scale = box["width"] / WIDTH
+
+        def stroke(*points: tuple[float, float]) -> None:
+            """Drag over these pixels of the photo."""
+            at = [(box["x"] + scale * u, box["y"] + scale * v) for u, v in points]
+            page.mouse.move(*at[0])
+            page.mouse.down()
+            for place in at[1:]:
+                page.mouse.move(*place, steps=5)
+            page.mouse.up()
+            settle(opened)
+
+        alpha = """([u, v]) => {
+          const front = document.getElementById('front');
+          const [x, y] = [u, v].map(Math.round);
+          return front.getContext('2d').getImageData(x, y, 1, 1).data[3];
+        }"""
+        page.locator("#brush-width").fill("30")
+        stroke((100.0, 200.0), (300.0, 200.0))
+        assert page.evaluate(alpha, [200.0, 200.0]) == 255
+        assert page.evaluate(alpha, [200.0, 200.0 + 25.0 / scale]) == 0
+        assert page.evaluate(STATE)["stand"] == before["stand"]
+        page.click("#eraser")
+        stroke((220.0, 120.0), (220.0, 280.0))
+        assert page.evaluate(alpha, [220.0, 200.0]) == 0
+        assert page.evaluate(alpha, [120.0, 200.0]) == 255
+        page.keyboard.press("Control+z")
+        settle(opened)
+        assert page.evaluate(alpha, [220.0, 200.0]) == 255
+        page.keyboard.press("Control+Shift+z")
+        settle(opened)
+        assert page.evaluate(alpha, [220.0, 200.0]) == 0
+        page.click("#paint")
+        page.click("#save")
+        page.wait_for_selector("#done:not([hidden])")
+        saved = json.loads((out / "insert.json").read_text())
+        assert saved["occluder_mask"] == str(out / "occluder.png")
+        mask = np.asarray(Image.open(out / "occluder.png"))
+        assert mask.shape == (HEIGHT, WIDTH)
+        assert mask[200, 120] == 255 and mask[200, 220] == 0 and mask[40, 200] == 0
+        # A placement without a mask leaves none behind.
+        page.click("#paint")
+        page.click("#clear-mask")
+        page.click("#save")
+        page.wait_for_selector("#save:not([disabled])")
+        settle(opened)
+        assert "occluder_mask" not in json.loads((out / "insert.json").read_text())
+        assert not (out / "occluder.png").exists()
+        # The test reads the canvas; the page does not.
+        assert [e for e in opened.errors if "willReadFrequently" not in e] == []

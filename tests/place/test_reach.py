@@ -1,0 +1,99 @@
+"""The object stays in the photo whatever is done to the camera, and its handles beside it."""
+
+from itertools import pairwise
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from tests.builders.programs.browser import needs_chromium, open_browser
+from tests.builders.programs.placing import (
+    STATE,
+    command,
+    drag,
+    handle_at,
+    open_page,
+    serve,
+    settle,
+)
+
+
+def away(state: dict[str, Any]) -> float:
+    """Distance of the object over the camera's height."""
+    stand, stance = state["stand"], state["stance"]
+    return float(np.hypot(stand["x"] - stance["x"], stand["z"] - stance["z"]) / stance["height"])
+
+
+@needs_chromium
+@pytest.mark.slow
+@pytest.mark.parametrize("width", [1000, 390])
+def test_horizon_never_throws_the_object_away(inputs: Path, tmp_path: Path, width: int) -> None:
+    """Dragged to the foot, below it and below the photo: the object stays in it, and comes back."""
+    argv = command(inputs, tmp_path / "out", "--size", "2")
+    with serve(argv) as served, open_browser(width, 800) as opened:
+        page = opened.page
+        open_page(opened, served)
+        photo = page.locator("#photo").bounding_box()
+        assert photo is not None
+        before = page.evaluate(STATE)
+        for share in (0.3, 0.5, 1.5):
+            # The line itself: the knob in its middle may lie below the object's.
+            x, y = photo["x"] + 0.25 * photo["width"], handle_at(opened, "tilt")[1]
+            page.mouse.move(x, y)
+            page.mouse.down()
+            page.mouse.move(x, y + share * photo["height"], steps=2)
+            page.mouse.up()
+            settle(opened)
+            state = page.evaluate(STATE)
+            assert state["stance"]["pitch"] > before["stance"]["pitch"]
+            bounds = page.evaluate("import('./page.js').then(({ handles }) => handles.bounds)")
+            assert bounds is not None
+            # Its foot is in the photo, and it is not a dot.
+            assert bounds[3] < 330.0 and bounds[1] > 0.0 and bounds[3] - bounds[1] > 12.0
+            assert away(state) <= 4.0 * away(before) * (1.0 + 1e-6)
+            page.locator("#stage").focus()
+            page.keyboard.press("Control+z")
+            settle(opened)
+            assert page.evaluate(STATE) == before
+        # A field does no more than the handle.
+        page.fill("#pitch", "80")
+        page.keyboard.press("Enter")
+        settle(opened)
+        assert page.evaluate(STATE) == before
+        assert float(page.input_value("#pitch")) == pytest.approx(before["stance"]["pitch"])
+        assert opened.errors == []
+
+
+@needs_chromium
+@pytest.mark.slow
+def test_handles_stand_beside_the_object_on_a_phone(inputs: Path, tmp_path: Path) -> None:
+    """None covers it, they are apart, and each does what it does elsewhere."""
+    argv = command(inputs, tmp_path / "out", "--size", "2.5")
+    with serve(argv) as served, open_browser(390, 844) as opened:
+        page = opened.page
+        open_page(opened, served)
+        for place in ((0.0, 0.0), (-120.0, 20.0), (200.0, 10.0)):
+            if place != (0.0, 0.0):
+                drag(opened, "foot", place)
+            bounds = "import('./page.js').then(({ handles }) => [handles.bounds, handles.scale])"
+            box, scale = page.evaluate(bounds)
+            photo = page.locator("#photo").bounding_box()
+            assert photo is not None
+            left, right = photo["x"] + scale * box[0], photo["x"] + scale * box[2]
+            top, bottom = photo["y"] + scale * box[1], photo["y"] + scale * box[3]
+            knobs = {
+                name: handle_at(opened, name) for name in ("size", "turn", "foot", "pitch", "fov")
+            }
+            for name, (x, y) in knobs.items():
+                assert 0.0 <= x <= 390.0, name
+                assert not (left < x < right and top < y < bottom), (name, place)
+            three = [np.array(knobs[name]) for name in ("size", "turn", "foot")]
+            assert min(np.linalg.norm(a - b) for a, b in pairwise(three)) > 35.0
+        before = page.evaluate(STATE)
+        drag(opened, "turn", (20.0, 0.0))
+        turned = page.evaluate(STATE)
+        assert turned["turn"] - before["turn"] > 5.0 and turned["stand"] == before["stand"]
+        drag(opened, "size", (0.0, -20.0))
+        assert page.evaluate(STATE)["size"] > 1.1 * before["size"]
+        assert opened.errors == []
