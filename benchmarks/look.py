@@ -29,6 +29,8 @@ from warpir.io.images.jpeg import JpegCoding, read_coding
 from warpir.io.images.photos import Photo
 from warpir.look.camera_look import CameraLook, estimate_look
 from warpir.look.grain import Grain
+from warpir.look.response import Response
+from warpir.look.sharpness import PIXEL_SIGMA, EdgeBlur
 from warpir.render.composite import Quality, Rendering, composite, render
 from warpir.render.device_scene import Placed, Receiver, Scene
 from warpir.render.renderer import Renderer
@@ -43,9 +45,10 @@ ROWS = {
     "grain": ("off", "auto", "off"),
     "blocks": ("off", "auto", "off"),
     "auto": ("auto", "auto", "auto"),
+    "true blur": ("off", "auto", "auto"),
 }
 """Sharpness, grain and response of each row. `--grain` stands for the blocks of JPEG too; of these
-two rows each keeps one of both."""
+two rows each keeps one of both. The last has the camera's own blur in place of the estimate."""
 TRUE = "true camera"
 """Row of the object through the camera itself, with other grain and other samples: the floor."""
 QUALITY = (40, 95)
@@ -153,13 +156,15 @@ def measure(place: Place, subject: Subject, samples: int) -> dict[str, dict[str,
         look = estimate_look(photo.srgb, photo.linear(), regions["box"], *words, jpeg)
         if name == "blocks":
             look = replace(look, grain=None)
+        if name == "true blur":
+            look = replace(look, blur=EdgeBlur(float(np.hypot(blur, PIXEL_SIGMA)), 0))
         picture = composite(again, photo, 2, look=look)
         shown = photo.encode(picture.image, picture.changed).astype(np.float32) / 255.0
         found[name] = errors(shown) | _estimates(look)
     other = replace(camera, noise=grain.draw(place.photo.shape[:2], int(rng.integers(2**31))))
     perfect = composite(again, photo_of(place.photo), 2).layers.composite
     found[TRUE] = errors(other.shoot(perfect))
-    grey = codes_of(plain, LEVELS) - curve(1.0, LEVELS)
+    grey = codes_of(plain, LEVELS) - curve(Response(1.0), LEVELS)
     found["camera"] = {
         "blur": blur,
         "grain": 255.0 * float(grain.deviation(np.full(3, 0.4))[0]),

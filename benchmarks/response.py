@@ -29,7 +29,7 @@ from warpir.evaluate.scenes import (
     find_files,
 )
 from warpir.io.images.photos import read_envmap
-from warpir.look.response import Response, estimate_response, statistics
+from warpir.look.response import PLACED, Response, estimate_response, statistics
 from warpir.train.photo_look import Look, draw_faults, draw_looks
 
 WIDTH, HEIGHT = 320, 216
@@ -38,8 +38,9 @@ CROPS, CAMERAS = 6, 4
 LEVELS = np.array([0.003, 0.01, 0.03, 0.1, 0.5])
 """Radiances at which curves are compared, mid grey at .18 [1]."""
 RAMP = np.geomspace(0.002, 0.6, 24)
-"""Radiances at which an exponent is fitted to a camera [1]."""
-EXPONENTS = np.linspace(0.75, 1.6, 86)
+"""Radiances at which the best curve is fitted to a camera [1]."""
+EXPONENTS, TOES = np.linspace(0.75, 1.6, 35), (0.0, 0.001, 0.002, 0.004, 0.006, 0.009, 0.013)
+"""Of the best curve."""
 RIDGE = 10.0
 """Weight of a coefficient's square, of standardised statistics."""
 
@@ -68,14 +69,14 @@ def codes_of(look: Look, radiance: Float64Array) -> Float64Array:
     return 255.0 * plain.show(grey)[0, 0, 0].numpy().astype(np.float64)
 
 
-def curve(exponent: float, radiance: Float64Array) -> Float64Array:
+def curve(response: Response, radiance: Float64Array) -> Float64Array:
     """Return what a response shows, in codes of 255."""
-    shown = Response(exponent).colour(radiance)
+    shown = response.colour(radiance)
     return 255.0 * shown.astype(np.float64) ** (1.0 / GAMMA)
 
 
-def judge(found: list[float], truth: Float64Array) -> str:
-    """Return mean distances of curves of some exponents from the true ones, in words."""
+def judge(found: list[Response], truth: Float64Array) -> str:
+    """Return mean distances of some curves from the true ones, in words."""
     errors = np.abs(np.stack([curve(c, LEVELS) for c in found]) - truth)
     within = float((errors[:, 0] < 3.0).mean())
     return "  ".join(f"{e:5.2f}" for e in errors.mean(axis=0)) + f"   {within:.2f}"
@@ -88,8 +89,10 @@ def main() -> None:
     parser.add_argument("--fit", action="store_true", help="print new coefficients")
     options = parser.parse_args()
     generator = torch.Generator().manual_seed(5)
-    table = np.stack([curve(c, RAMP) for c in EXPONENTS])
-    rows, best, shown, own, fits = [], [], [], [], []
+    curves = [Response(e, t) for e in EXPONENTS.tolist() for t in TOES]
+    table = np.stack([curve(c, RAMP) for c in curves])
+    placed = np.array(PLACED)
+    rows, best, shown, own, fits, wanted = [], [], [], [], [], []
     for path in find_files(options.panoramas, PANORAMA_SUFFIXES, "--panoramas"):
         for radiance in crops(path):
             seen = torch.from_numpy(radiance).permute(2, 0, 1)[None]
@@ -99,33 +102,37 @@ def main() -> None:
                 linear = (np.round(255.0 * photo) / 255.0) ** GAMMA
                 distance = np.abs(table - codes_of(look, RAMP)).mean(axis=1)
                 rows.append(statistics(linear))
-                best.append(EXPONENTS[distance.argmin()])
+                best.append(curves[distance.argmin()])
                 shown.append(codes_of(look, LEVELS))
+                wanted.append(codes_of(look, placed) / 255.0)
                 own.append(estimate_response(linear))
                 fits.append(is_for_fitting(path.stem))
-    values, exponents, truth, is_fit = map(np.array, (rows, best, shown, fits))
+    values, truth, is_fit, targets = map(np.array, (rows, shown, fits, wanted))
     if options.fit:
         mean, spread = values[is_fit].mean(axis=0), values[is_fit].std(axis=0)
         design = (values[is_fit] - mean) / spread
         gram = design.T @ design + RIDGE * np.eye(len(mean))
-        factors = np.linalg.solve(gram, design.T @ exponents[is_fit]) / spread
-        constant = exponents[is_fit].mean() - factors @ mean
-        print("COEFFICIENTS =", tuple(np.append(constant, factors).round(4).tolist()))
+        centred = targets[is_fit] - targets[is_fit].mean(axis=0)
+        factors = (np.linalg.solve(gram, design.T @ centred) / spread[:, None]).T
+        constants = targets[is_fit].mean(axis=0) - factors @ mean
+        table = np.concatenate([constants[:, None], factors], axis=1)
+        print("COEFFICIENTS =", tuple(tuple(row) for row in table.round(4).tolist()))
     judged = np.flatnonzero(~is_fit)
     told = [k for k in judged if own[k] is not None]
-    auto = np.array([1.0 if r is None else r.exponent for r in own])
+    plain = Response(1.0)
+    off, auto = [plain] * len(own), [r or plain for r in own]
     print(f"{len(judged)} photos of places not fitted, {len(told)} of them with blacks")
     print(
         "codes at           " + "  ".join(f"{x:5g}" for x in LEVELS) + "   within 3 in the blacks"
     )
     for name, guess, of in (
-        ("off", np.ones(len(own)), judged),
+        ("off", off, judged),
         ("auto", auto, judged),
-        ("best curve", exponents, judged),
-        ("off, with blacks", np.ones(len(own)), told),
+        ("best curve", best, judged),
+        ("off, with blacks", off, told),
         ("auto, with blacks", auto, told),
     ):
-        print(f"{name:18s} {judge(guess[of].tolist(), truth[of])}")
+        print(f"{name:18s} {judge([guess[k] for k in of], truth[of])}")
 
 
 if __name__ == "__main__":

@@ -5,7 +5,15 @@ import pytest
 
 from warpir.core.arrays import FloatArray
 from warpir.look.camera_look import CameraLook, estimate_look
-from warpir.look.response import GREY, RANGE, Response, estimate_response
+from warpir.look.response import (
+    BLACK,
+    GREY,
+    PLACED,
+    RANGE,
+    Response,
+    estimate_response,
+    response_through,
+)
 
 
 def ramp(low: float, high: float) -> FloatArray:
@@ -14,20 +22,23 @@ def ramp(low: float, high: float) -> FloatArray:
     return (shown**2.2).astype(np.float32)
 
 
+@pytest.mark.parametrize("toe", [0.0, 0.002, 0.0085, 0.02])
 @pytest.mark.parametrize("exponent", [0.8, 1.0, 1.1, 1.35])
-def test_curve_is_monotone_and_a_power_in_the_dark(exponent: float) -> None:
-    """Grey and both ends stay; below grey within .1 codes of the power; it never falls."""
-    response = Response(exponent)
+def test_curve_is_monotone_and_a_power_with_a_toe(exponent: float, toe: float) -> None:
+    """Grey and both ends stay; below grey within .1 codes of the formula; it never falls."""
+    response = Response(exponent, toe)
     x = np.linspace(0.0, 1.0, 2001)
     y = response.colour(x)
     assert (np.diff(y) > 0.0).all() and y[0] == 0.0 and y[-1] == 1.0
     assert response.colour(np.array(GREY)) == pytest.approx(GREY, abs=1e-6)
     dark = np.geomspace(0.0005, GREY, 200)
     codes = 255.0 * response.colour(dark) ** (1 / 2.2)
-    wanted = 255.0 * (GREY * (dark / GREY) ** exponent) ** (1 / 2.2)
+    left = dark * (GREY + toe) / (GREY * (dark + toe))
+    wanted = 255.0 * (GREY * (dark / GREY) ** exponent * left) ** (1 / 2.2)
     np.testing.assert_allclose(codes, wanted, atol=0.1)
-    bright = response.colour(np.array([0.3, 0.5, 0.8])) - [0.3, 0.5, 0.8]
-    assert (np.sign(bright.round(4)) == np.sign(exponent - 1.0)).all()
+    if toe == 0.0:
+        bright = response.colour(np.array([0.3, 0.5, 0.8])) - [0.3, 0.5, 0.8]
+        assert (np.sign(bright.round(4)) == np.sign(exponent - 1.0)).all()
 
 
 def test_shadow_is_what_the_camera_shows_of_less_light() -> None:
@@ -78,17 +89,46 @@ def test_no_dark_regions_tell_nothing(low: float, high: float) -> None:
     assert look.response is None and look.record().keys() == {"blur", "grain"}
 
 
-def test_contrast_raises_the_estimate_within_its_range() -> None:
-    """The same scene through a steeper camera; black and the steepest pictures stay in range."""
+def test_a_steeper_camera_gives_darker_blacks() -> None:
+    """The same scene through three cameras; black and the steepest pictures stay in range."""
     rng = np.random.default_rng(3)
     scene = np.exp(rng.normal(-3.0, 1.2, (60, 90, 1))) * rng.uniform(0.8, 1.2, (60, 90, 3))
     scene = np.repeat(np.repeat(np.clip(scene, 0.0, 1.0), 4, axis=0), 4, axis=1)
     found = [estimate_response(Response(c).colour(scene)) for c in (0.85, 1.0, 1.3)]
-    exponents = [r.exponent for r in found if r is not None]
-    assert len(exponents) == 3 and exponents[0] < exponents[1] < exponents[2]
+    blacks = [float(r.dark(np.array(0.005))) for r in found if r is not None]
+    assert len(blacks) == 3 and blacks[0] > blacks[1] > blacks[2]
     for linear in (np.zeros((40, 60, 3), np.float32), ramp(0.0, 1.0) ** 8):
         response = estimate_response(linear)
         assert response is not None and RANGE[0] <= response.exponent <= RANGE[1]
+
+
+def test_no_object_is_darker_than_the_photos_blacks() -> None:
+    """Where the darkest half percent is hardly below a black object's value, that is the limit."""
+    for low in (0.0, 0.05, 0.07, 0.085):
+        response = estimate_response(ramp(low, 0.9))
+        assert response is not None and response.black is not None
+        shown = float(response.dark(np.array(BLACK**2.2))) ** (1 / 2.2)
+        assert shown >= response.black - 1e-9
+        assert shown < BLACK
+
+
+@pytest.mark.parametrize("known", [Response(1.0), Response(1.1, 0.004), Response(0.9, 0.012)])
+def test_response_passes_through_two_values(known: Response) -> None:
+    """A known exponent and toe come back from the display values of two radiances."""
+    shown = known.dark(np.array(PLACED)) ** (1 / 2.2)
+    again = response_through(*shown)
+    assert again.exponent == pytest.approx(known.exponent, abs=1e-6)
+    assert again.toe == pytest.approx(known.toe, abs=1e-9)
+
+
+def test_srgb_is_a_toe() -> None:
+    """What sRGB shows, which gamma 2.2 decodes too dark, is met within a code and a half."""
+    x = np.geomspace(0.003, GREY, 30)
+    encoded = np.where(x <= 0.0031308, 12.92 * x, 1.055 * x ** (1 / 2.4) - 0.055)
+    placed = np.array(PLACED)
+    ends = np.where(placed <= 0.0031308, 12.92 * placed, 1.055 * placed ** (1 / 2.4) - 0.055)
+    shown = response_through(*ends).dark(x) ** (1 / 2.2)
+    np.testing.assert_allclose(255.0 * shown, 255.0 * encoded, atol=1.5)
 
 
 def test_words_and_numbers_decide() -> None:

@@ -8,9 +8,10 @@ from typing import Any
 import numpy as np
 
 from warpir.core.arrays import AnyFloatArray, BoolArray, Float64Array, FloatArray
+from warpir.core.color import GAMMA
 from warpir.io.images.jpeg import JpegCoding
 from warpir.look.grain import Grain, blocks_over, estimate_grain, grain_over
-from warpir.look.response import Response, estimate_response
+from warpir.look.response import PLACED, Response, estimate_response
 from warpir.look.sharpness import PIXEL_SIGMA, EdgeBlur, blurred_layers, estimate_blur
 
 UPSAMPLED = 2.5
@@ -109,9 +110,11 @@ class CameraLook:
         """Return what was estimated, a sentence each."""
         found = []
         if self.response is not None:
+            black = 255.0 * self.response.dark(np.array(PLACED[0])) ** (1.0 / GAMMA)
             found.append(
-                f"the photo's blacks and highlights have the contrast {self.response.exponent:.2f} "
-                "of gamma 2.2, and so has the object (--response)"
+                f"the camera has the contrast {self.response.exponent:.2f} and the toe "
+                f"{self.response.toe:.4f} on top of gamma 2.2, so that the object's blacks of "
+                f"{PLACED[0]} are shown as code {black:.0f}, not 18 (--response)"
             )
         if self.blur is not None:
             found.append(

@@ -16,10 +16,14 @@ from warpir.scene.tone_curves import ToneKnots
 
 GREY = 0.18
 """Display-linear value that the curve leaves alone [1]: there the light's exposure was judged."""
-TOE = (0.0005, 0.0015, 0.004, 0.01, 0.025, 0.06)
-"""Knots below `GREY`, where the curve is a power; a spline between them is right to .1 codes."""
-RANGE = (0.9, 1.35)
+DARK = (0.0005, 0.0015, 0.004, 0.01, 0.025, 0.06, 0.105)
+"""Knots below `GREY`; a spline between them is right to .1 codes."""
+RANGE = (0.8, 1.35)
 """Least and largest exponent that is estimated [1]."""
+TOES = tuple(0.0004 * k for k in range(51))
+"""Toes that are estimated [1]; encoding by sRGB has about .0085."""
+PLACED = (0.003, 0.03)
+"""Radiances whose display values are estimated, of a black and of a dark object [1]."""
 WIDTH = 160
 """Width that photos are averaged to before their values are counted [px], so that grain and tiny
 shadows count as little in a large photo as in a small one."""
@@ -29,8 +33,12 @@ DARKEST = 0.005
 """Share of a photo's pixels that are its blacks [1]."""
 BRIGHT = 0.97
 """Display value from which a channel is near clipping [1]."""
-COEFFICIENTS = (0.679, 0.3204, -0.08, 0.3711, 0.2334)
-"""Constant, and factors of `statistics`: of ``python -m benchmarks.response``."""
+COEFFICIENTS = (
+    (0.1216, -0.0143, 0.0135, -0.0678, -0.0344),
+    (0.2446, -0.0441, 0.0102, -0.047, -0.0306),
+)
+"""Display values at `PLACED`: constant, and factors of `statistics`, of ``python -m
+benchmarks.response``."""
 
 
 @dataclass(frozen=True)
@@ -38,19 +46,32 @@ class Response:
     """A camera's response as an S-curve about mid grey, equal for all channels."""
 
     exponent: float
-    """Slope at mid grey in logarithms, and power of all darker values [1]; 1 is no change."""
+    """Slope at mid grey in logarithms without the toe, and power of all darker values [1]; 1 is no
+    change."""
+    toe: float = 0.0
+    """Display-linear value at which about half is left of what the power gives [1]; 0: no toe."""
     black: float | None = None
     """Display value of the photo's blacks [1], where the photo was asked."""
+
+    def dark(self, x: AnyFloatArray) -> Float64Array:
+        """Return ``GREY (x / GREY)^exponent * x (GREY + toe) / (GREY (x + toe))``.
+
+        Args:
+            x: Display-linear values in (0, `GREY`], any shape.
+        """
+        share = x / GREY
+        left = share * (GREY + self.toe) / (x + self.toe)
+        return np.asarray(GREY * share**self.exponent * left, np.float64)
 
     def knots(self) -> ToneKnots:
         """Return the curve, display-linear to display-linear.
 
-        ``y = GREY (x / GREY)^exponent`` below `GREY`; above, one bin of the spline to (1, 1), where
-        the slope is the exponent's inverse.
+        Up to `GREY` that of `dark`; above, one bin of the spline to (1, 1), where the slope is the
+        exponent's inverse.
         """
-        dark = np.array([*TOE, GREY])
-        shown = GREY * (dark / GREY) ** self.exponent
-        slope = self.exponent * shown / dark
+        dark = np.array([*DARK, GREY])
+        shown = self.dark(dark)
+        slope = (self.exponent + self.toe / (dark + self.toe)) * shown / dark
         x = np.concatenate([[0.0], dark, [1.0]])
         y = np.concatenate([[0.0], shown, [1.0]])
         slope = np.concatenate([[shown[0] / dark[0]], slope, [1.0 / self.exponent]])
@@ -121,8 +142,24 @@ def estimate_response(linear: AnyFloatArray) -> Response | None:
     black = float(np.quantile(level, DARKEST))
     if black >= BLACK:
         return None
-    constant, *factors = COEFFICIENTS
-    exponent = np.clip(constant + statistics(linear) @ np.array(factors), *RANGE)
-    # BLACK (BLACK^GAMMA / GREY)^((limit - 1) / GAMMA) = black.
-    steps = np.log(BLACK / max(black, 1e-4)) / np.log(GREY / BLACK**GAMMA)
-    return Response(float(min(exponent, 1.0 + GAMMA * steps)), black)
+    response = response_through(*np.array(COEFFICIENTS) @ [1.0, *statistics(linear)])
+    for share in np.linspace(1.0, 0.0, 41):
+        exponent = 1.0 + share * (response.exponent - 1.0)
+        part = Response(float(exponent), float(share * response.toe), black)
+        if part.dark(np.array(BLACK**GAMMA)) >= black**GAMMA:
+            break
+    return part
+
+
+def response_through(black: float, dark: float) -> Response:
+    """Return the response that shows the radiances `PLACED` as two display values [1].
+
+    Exponent and toe stay in `RANGE` and `TOES`; where one of them ends, the dark value is met.
+    """
+    toes = np.array(TOES)
+    low, high = (x / GREY * (GREY + toes) / (x + toes) for x in PLACED)
+    shown = np.clip([black, dark], 1e-3, 1.0) ** GAMMA / GREY
+    exponents = np.clip(np.log(shown[1] / high) / np.log(PLACED[1] / GREY), *RANGE)
+    off = (PLACED[0] / GREY) ** exponents * low - shown[0]
+    best = int(np.abs(off).argmin())
+    return Response(float(exponents[best]), TOES[best])

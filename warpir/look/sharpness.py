@@ -13,12 +13,12 @@ from warpir.core.color import luminance
 FINE, COARSE, WIDE = 1.0, 2.0, 3.0
 """Standard deviations of the Gaussian derivatives [px]; the ratio of the first two tells the blur,
 the third tells steps from lines and from crowded edges."""
-STEP_ERROR = 0.06
-"""How far the third slope may be from that of a step [1]."""
+CLEAR, FAINT = (10.0, 0.06, 60), (6.0, 0.15, 20)
+"""Least slope over the noise's, how far the third slope may be from that of a step [1], and edge
+pixels below which a photo, or a part of it, tells no blur: of clear edges, and of the fainter ones
+that count where these are too few."""
 SHARP_SHARE = 0.35
 """Quantile of the blurs of all edges that counts as the lens's: most edges of a scene are soft."""
-LEAST_EDGES = 60
-"""Edge pixels below which a photo, or a part of it, tells no blur."""
 LEAST_CONTRAST = 0.03
 """Luminance step over the photo's 99th percentile from which an edge counts [1]."""
 CLIPPED = 0.97
@@ -64,27 +64,34 @@ def estimate_blur(linear: AnyFloatArray, region: BoolArray | None = None) -> Edg
     white = max(float(np.quantile(lum, 0.99)), 1e-6)
     noise = 1.4826 * float(np.median(np.abs(fine - np.median(fine))))
     # A step of contrast c has at least this slope for all blurs up to 3 px.
-    least = max(LEAST_CONTRAST * white / np.sqrt(2.0 * np.pi * (9.0 + FINE**2)), 10.0 * noise)
-    edge = _is_ridge(fine, gx, gy) & (fine > least) & ~clipped
-    border = np.zeros_like(edge)
+    least = LEAST_CONTRAST * white / np.sqrt(2.0 * np.pi * (9.0 + FINE**2))
+    ridge = _is_ridge(fine, gx, gy) & ~clipped
+    border = np.zeros_like(ridge)
     border[6:-6, 6:-6] = True
-    edge &= border
-    if region is not None and int((edge & region).sum()) >= LEAST_EDGES:
-        edge &= region
-    if int(edge.sum()) < LEAST_EDGES:
-        return None
-    ratio = (fine[edge] / np.maximum(coarse[edge], 1e-12)) ** 2
+    for over_noise, step_error, count in (CLEAR, FAINT):
+        edge = ridge & border & (fine > max(least, over_noise * noise))
+        if region is not None and int((edge & region).sum()) >= count:
+            edge &= region
+        sigmas = _step_blurs(fine[edge], coarse[edge], wide[edge], step_error)
+        if len(sigmas) >= count:
+            sigma = float(np.quantile(sigmas, SHARP_SHARE))
+            return EdgeBlur(max(sigma, PIXEL_SIGMA), len(sigmas))
+    return None
+
+
+def _step_blurs(
+    fine: FloatArray, coarse: FloatArray, wide: FloatArray, step_error: float
+) -> FloatArray:
+    """Return the blurs of those edges that are steps [px], from their three slopes [N]."""
+    ratio = (fine / np.maximum(coarse, 1e-12)) ** 2
     limit = (COARSE / FINE) ** 2
     variance = (COARSE**2 - ratio * FINE**2) / np.maximum(ratio - 1.0, 1e-3)
     # Thin lines have larger ratios than any step, crowded edges smaller ones.
     plain = np.maximum(variance, 0.0)
-    expected = fine[edge] * np.sqrt((plain + FINE**2) / (plain + WIDE**2))
-    is_step = np.abs(wide[edge] / np.maximum(expected, 1e-12) - 1.0) < STEP_ERROR
+    expected = fine * np.sqrt((plain + FINE**2) / (plain + WIDE**2))
+    is_step = np.abs(wide / np.maximum(expected, 1e-12) - 1.0) < step_error
     is_step &= (ratio > 1.02) & (ratio < 1.05 * limit)
-    if int(is_step.sum()) < LEAST_EDGES:
-        return None
-    sigma = float(np.quantile(np.sqrt(np.maximum(variance[is_step], 0.0)), SHARP_SHARE))
-    return EdgeBlur(max(sigma, PIXEL_SIGMA), int(is_step.sum()))
+    return np.asarray(np.sqrt(plain[is_step]))
 
 
 def _is_ridge(slope: FloatArray, gx: FloatArray, gy: FloatArray) -> BoolArray:

@@ -353,7 +353,8 @@ def _look(look: Mapping[str, Any]) -> Rows:
     """Return what of the photo's camera the object got; files of older runs say nothing."""
     rows: Rows = []
     if response := look.get("response"):
-        text = f"contrast {response['exponent']:.2f} of gamma 2.2"
+        toe = response.get("toe", 0.0)
+        text = f"contrast {response['exponent']:.2f}, toe {toe:.4f} over gamma 2.2"
         if response["black"] is not None:
             text += f"; the photo's blacks are at code {255.0 * response['black']:.0f}"
         rows.append(("response of the object, as of the photo", text))
