@@ -8,7 +8,9 @@ import pytest
 from tests.builders.programs.browser import Fingers, Opened, needs_chromium, open_browser
 from tests.builders.programs.placing import (
     FOOT_ON_CANVAS,
+    HEIGHT,
     STATE,
+    WIDTH,
     command,
     drag,
     handle_at,
@@ -31,11 +33,21 @@ def share_at(opened: Opened, x: float, y: float) -> list[float]:
     return [(x - left) / width, (y - top) / height]
 
 
+FOOT_IN_PHOTO = """import('./page.js').then(async ({ state: { stance, stand, camera } }) => {
+  const { project } = await import('./camera.js');
+  return project(camera, stance, [stand.x, 0, stand.z]);
+})"""
+"""Where in the photo the object's foot is [px]."""
+
+
 def check_agreement(opened: Opened) -> None:
-    """The canvas and the handles show the foot at one place."""
+    """The canvas shows the foot where it is in the photo below it."""
     settle(opened)
     drawn = opened.page.evaluate(FOOT_ON_CANVAS)
-    assert drawn == pytest.approx(handle_at(opened, "foot"), abs=0.6)
+    u, v = opened.page.evaluate(FOOT_IN_PHOTO)
+    left, top, width, height = photo_box(opened)
+    wanted = (left + u / WIDTH * width, top + v / HEIGHT * height)
+    assert drawn == pytest.approx(wanted, abs=0.6)
 
 
 @needs_chromium
