@@ -95,8 +95,10 @@ def test_nothing_given_is_estimated_and_said(folder: Path) -> None:
         ("exif.jpg", {}, ("estimate", "estimate", "EXIF"), True),
         ("photo.png", {"pitch": -20.0}, ("--pitch", "estimate", "estimate"), False),
         ("photo.png", {"horizon": 0.3}, ("--horizon", "estimate", "estimate"), False),
+        ("photo.png", {"roll": -7.0}, ("estimate", "--roll", "estimate"), False),
+        ("photo.png", {"roll": 7.0, "horizon": 0.3}, ("--horizon", "--roll", "estimate"), False),
     ],
-    ids=["fov", "exif", "pitch", "horizon"],
+    ids=["fov", "exif", "pitch", "horizon", "roll", "roll-horizon"],
 )
 def test_what_is_given_comes_before_the_estimate(
     folder: Path, photo: str, given: dict[str, Any], expected: tuple[str, ...], known: bool
@@ -106,7 +108,7 @@ def test_what_is_given_comes_before_the_estimate(
     found = sources(inputs)
     assert (found["pitch_deg"], found["roll_deg"], found["vfov_deg"]) == expected
     numbers = inputs.measured["camera"]
-    assert numbers["roll_deg"]["value"] == 2.0
+    assert numbers["roll_deg"]["value"] == pytest.approx(given.get("roll", 2.0))
     if known:
         assert estimator.known == [pytest.approx(numbers["vfov_deg"]["value"], abs=1e-5)]
         assert numbers["pitch_deg"]["value"] == -9.0
@@ -116,6 +118,27 @@ def test_what_is_given_comes_before_the_estimate(
         assert numbers["pitch_deg"]["value"] == -20.0
     if "horizon" in given:
         assert horizon_at_middle(inputs) == pytest.approx(0.3 * HEIGHT, abs=1e-6)
+
+
+@pytest.mark.parametrize("tilt", [{"horizon": 0.3}, {"pitch": 6.0}])
+def test_roll_turns_the_horizon(folder: Path, tilt: dict[str, float]) -> None:
+    """By its slope: a camera turned counter-clockwise shows a horizon that falls to the right."""
+    inputs = read(folder, None, fov=50.0, roll=5.0, camera_from="assume", **tilt)
+    camera = inputs.camera
+    level = read(folder, None, fov=50.0, camera_from="assume", **tilt)
+    assert sources(inputs)["roll_deg"] == "--roll"
+    # Directions at infinity in the horizon, projected: x right, y down.
+    points = []
+    for azimuth in (-10.0, 10.0):
+        way = np.array([np.sin(np.radians(azimuth)), 0.0, -np.cos(np.radians(azimuth))])
+        x, y, z = camera.c2w[:3, :3].T @ way
+        points.append((camera.cx - camera.fx * x / z, camera.cy + camera.fy * y / z))
+    slope = (points[1][1] - points[0][1]) / (points[1][0] - points[0][0])
+    assert slope == pytest.approx(np.tan(np.radians(5.0)))
+    if "horizon" in tilt:
+        assert horizon_at_middle(inputs) == pytest.approx(0.3 * HEIGHT, abs=1e-6)
+    else:
+        assert camera.c2w[1, 2] == pytest.approx(level.camera.c2w[1, 2])
 
 
 @pytest.mark.parametrize(

@@ -402,8 +402,9 @@ def test_command_refuses_flags_that_exclude_each_other(first: str, second: str) 
     """At most one of each pair may be given."""
     values = {
         "photo": "p.png", "asset": "a.glb", "camera": "c.json", "fov": "50", "pitch": "0",
-        "horizon": "5", "camera_height": "2", "place": "0,0,1", "at": "1,2", "scale": "1",
-        "size": "1", "light": "l.hdr", "sun": "1,2", "sky": "clear", "reuse": "r", "refine": "tone",
+        "roll": "1", "horizon": "5", "camera_height": "2", "place": "0,0,1", "at": "1,2",
+        "scale": "1", "size": "1", "light": "l.hdr", "sun": "1,2", "sky": "clear", "reuse": "r",
+        "refine": "tone",
         "sequence": "s.jsonl", "start": "uniform", "ground": "0,1,0,0", "ground_points": "p.ply",
     }  # fmt: skip
     argv = ["--out", "o"]
@@ -489,7 +490,7 @@ def test_config_file_of_an_older_version_replays(tmp_path: Path) -> None:
     newer -= {"guidance"}
     newer |= {"proxy", "plane", "shadow_mask", "layer", "occluder_mask", "light_convention"}
     newer |= {"strict", "detail", "visible_sun", "hand_off", "mitsuba", "asset_up"}
-    newer |= {"settle", "sink", "response", "denoise", "camera_from"}
+    newer |= {"settle", "sink", "response", "denoise", "camera_from", "roll"}
     newer |= {f"max_{field.name}" for field in fields(Limits)} - {"max_pixels"}
     newer |= {"max_prompt_bytes"}
     config = InsertConfig(photo="p.png", asset="a.glb", out="o", sky="clear", depth=2)

@@ -326,7 +326,7 @@ def test_line_replaces_what_excludes_it(inputs: Path, first: Run, tmp_path: Path
         and configs[3].placement.scale is None
     )
     inside = [pair for pair in EXCLUSIVE if set(pair) <= set(FRAME_FIELDS)]
-    assert len(inside) == 8
+    assert len(inside) == 9
 
 
 @pytest.mark.parametrize(

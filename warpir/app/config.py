@@ -257,6 +257,7 @@ EXCLUSIVE = (
     ("demo", "camera"),
     ("camera", "fov"),
     ("camera", "pitch"),
+    ("camera", "roll"),
     ("camera", "horizon"),
     ("camera", "camera_height"),
     ("pitch", "horizon"),

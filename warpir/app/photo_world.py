@@ -139,7 +139,26 @@ def _camera_of_flags(asked: CameraConfig, photo: Photo) -> Camera:
         camera = camera_from_fov(width, height, asked.fov or DEFAULT_FOV, *pose)
         if asked.fov is not None:
             sources["vfov_deg"] = Source("--fov")
+    if asked.roll is not None:
+        sources["roll_deg"] = Source("--roll")
+        pitch = _asked_pitch(asked, camera, camera.cy, asked.roll) or 0.0
+        camera = replace(camera, c2w=camera_pose(pitch, asked.roll, float(camera.c2w[1, 3])))
     return replace(camera, sources=sources)
+
+
+def _asked_pitch(asked: CameraConfig, camera: Camera, centre: float, roll: float) -> float | None:
+    """Return the pitch that flags name [deg], of a camera whose optical axis is at a row.
+
+    Args:
+        asked: The flags.
+        camera: Its size and focal length.
+        centre: The row [px].
+        roll: Of the camera [deg]: the horizon's row is that of the middle column.
+    """
+    if asked.horizon is None:
+        return asked.pitch
+    row = horizon_row(asked.horizon, camera.height)
+    return math.degrees(math.atan2((row - centre) * math.cos(math.radians(roll)), camera.fy))
 
 
 def _pending(camera: Camera) -> Camera:
@@ -160,28 +179,25 @@ def _estimated(
     is_known = sources["vfov_deg"].name != ASSUMED
     fov = math.degrees(2.0 * math.atan(camera.height / 2.0 / camera.fy))
     found = estimator(photo.srgb, fov if is_known else None)
-    focal, centre, roll = camera.fy, camera.cy, round(found.roll_deg, 1)
+    focal, centre = camera.fy, camera.cy
     if not is_known:
         focal = camera.height / 2.0 / math.tan(math.radians(round(found.vfov_deg, 1)) / 2.0)
         sources["vfov_deg"] = Source(ESTIMATE, found.vfov_sigma_deg)
     if found.is_upright_corrected and asked.pitch is None:
         centre = round(found.principal[1], 2) * camera.height
         sources["principal"] = Source(ESTIMATE, found.principal_sigma[1])
-    if found.roll_sigma_deg <= WIDE["roll_deg"]:
+    roll = asked.roll
+    if roll is None and found.roll_sigma_deg <= WIDE["roll_deg"]:
+        roll = round(found.roll_deg, 1)
         sources["roll_deg"] = Source(ESTIMATE, found.roll_sigma_deg)
-    else:  # nothing to go by, and most photos are level
-        roll = 0.0
-    if asked.horizon is not None:
-        row = horizon_row(asked.horizon, camera.height)
-        across = math.cos(math.radians(roll))
-        pitch = math.degrees(math.atan2((row - centre) * across, focal))
-    elif asked.pitch is not None:
-        pitch = asked.pitch
-    else:
+    roll = roll or 0.0  # where there is nothing to go by most photos are level
+    camera = replace(camera, fx=focal, fy=focal, cy=centre)
+    pitch = _asked_pitch(asked, camera, centre, roll)
+    if pitch is None:
         pitch = round(found.pitch_deg, 1)
         sources["pitch_deg"] = Source(ESTIMATE, found.pitch_sigma_deg)
     pose = camera_pose(pitch, roll, float(camera.c2w[1, 3]))
-    return replace(camera, fx=focal, fy=focal, cy=centre, c2w=pose, sources=sources)
+    return replace(camera, c2w=pose, sources=sources)
 
 
 def _about_sources(camera: Camera) -> tuple[list[str], list[str]]:
@@ -196,7 +212,7 @@ def _about_sources(camera: Camera) -> tuple[list[str], list[str]]:
         line = f"estimated from the photo: {', '.join(shown)} degrees"
         if camera.sources["principal"].name == ESTIMATE:
             line += f", corrected to upright (optical axis at row {camera.cy:.0f})"
-        assumed.append(f"camera {line} (--pitch, --horizon, --fov; --camera-from assume)")
+        assumed.append(f"camera {line} (--pitch, --roll, --horizon, --fov; --camera-from assume)")
     wide = [WORDS[k] for k in estimated if numbers[k]["sigma"] > WIDE[k]]
     if wide:
         doubtful.append(

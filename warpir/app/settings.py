@@ -65,6 +65,9 @@ class CameraConfig:
     """Horizontal field of view of the photo [deg]"""
     pitch: float | None = option(None, "DEG", low=-90, high=90)
     """How far the camera looks up, negative for down [deg]"""
+    roll: float | None = option(None, "DEG", low=-90, high=90)
+    """Turn of the camera about its axis [deg]; counter-clockwise as seen from behind it: a level
+    horizon falls to the right in the photo"""
     horizon: float | None = option(None, "ROW")
     """Row of the horizon [px], or its share of the height; in the photo's middle column, from the
     top; a share when between 0 and 1; in place of --pitch"""

@@ -34,6 +34,7 @@ FLAGS = {
         "frame",
         "fov",
         "pitch",
+        "roll",
         "horizon",
         "camera_height",
         "camera_from",

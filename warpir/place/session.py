@@ -56,7 +56,7 @@ PHOTO_SIDE = 2048
 PLACED = ("place", "at", "rotate_y", "scale", "size", "sun", "sky")
 """Fields that the page sets."""
 SEEN_BY = (
-    *("camera", "frame", "up", "fov", "pitch", "horizon", "camera_height", "camera_from"),
+    *("camera", "frame", "up", "fov", "pitch", "roll", "horizon", "camera_height", "camera_from"),
     "ground",
 )
 """Fields that the saved camera file replaces."""

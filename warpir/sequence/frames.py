@@ -37,7 +37,7 @@ VERSION = 1
 SUMMARY = "sequence.json"
 FRAME_COUNT_LIMIT = 9999
 FRAME_FIELDS = (
-    "photo", "occluder_mask", "asset", "camera", "frame", "fov", "pitch", "horizon",
+    "photo", "occluder_mask", "asset", "camera", "frame", "fov", "pitch", "roll", "horizon",
     "camera_height", "camera_from", "up", "ground", "ground_points", "proxy", "plane",
     "shadow_mask", "asset_up",
     "place", "at", "rotate_y", "scale", "size", "light_rotate", "exposure", "width", "seed",
