@@ -337,7 +337,7 @@ def _records() -> Iterator[Format]:
 
     config = {"photo": "p.png", "asset": "a.glb", "out": "out", "place": [-1, 0, -3], "fov": 60,
               "sun": "30,40,2", "samples": 16, "plane": True, "seed": 1, "size": 1, "prompt": "car",
-              "personalize": None, "lora_layers": ["to_q", "to_k"]}  # fmt: skip
+              "horizon": None, "personalize": False, "lora_layers": ["to_q", "to_k"]}  # fmt: skip
     yield as_json("config JSON", "config", "config.json", config, codes=(USAGE,))
     text = yaml.safe_dump(config).encode() + b"camera_height: &h 1.5\nexposure: *h\n"
     tree = st.one_of(

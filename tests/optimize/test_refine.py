@@ -753,7 +753,7 @@ def test_tone_refinement_runs_on_an_altered_photo(folder: Path, tmp_path: Path) 
         ("tone", {"refine_parts": "metallic"}, "--refine-parts"),
         ("material", {"refine_parts": "sheen"}, "--refine-parts"),
         ("material", {"reuse": None}, "--refine: needs a known light"),
-        ("material", {"guidance": None, "model": None}, "--refine: needs --guidance"),
+        ("material", {"guidance": None, "model": None}, "--refine: needs --model"),
     ],
 )
 def test_wrong_wishes_are_one_line(
