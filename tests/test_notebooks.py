@@ -37,10 +37,10 @@ def code_of(notebook: dict[str, Any]) -> list[str]:
     return ["".join(c["source"]) for c in notebook["cells"] if c["cell_type"] == "code"]
 
 
-def test_notebooks_are_the_three_of_the_design() -> None:
+def test_notebooks_are_those_of_the_design() -> None:
     """So that the tests below do not pass for want of notebooks."""
     names = ["01_insert_an_object", "02_light_and_shadow", "03_check_the_gradients"]
-    assert [path.stem for path in NOTEBOOKS] == names
+    assert [path.stem for path in NOTEBOOKS] == [*names, "04_your_photo_to_blender"]
 
 
 @pytest.mark.parametrize("path", NOTEBOOKS, ids=lambda p: p.stem)
@@ -78,7 +78,7 @@ def test_notebook_uses_what_a_user_has(path: Path) -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.skipif(find_spec("nbclient") is None, reason="needs the extra notebook")
+@pytest.mark.skipif(find_spec("nbclient") is None, reason="needs the extra dev")
 @pytest.mark.parametrize("path", NOTEBOOKS, ids=lambda p: p.stem)
 def test_notebook_runs(path: Path, tmp_path: Path) -> None:
     """Top to bottom in a folder of its own, without a warning; its claims it asserts itself."""

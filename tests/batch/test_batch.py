@@ -148,6 +148,8 @@ def check_batch(memory: Path, hooked: Path, count: int, capsys: Any) -> Path:
     changed = {path.parent.name for path in after if after[path] != before.get(path)}
     assert changed == {"scene-0", "scene-2"} and failures_of(out) == []
     assert json.loads((out / "scene-0" / "run.json").read_text())["config"]["seed"] == 77
+    page = (out / "batch.html").read_text()
+    assert all(f'href="{name}/report.html"' in page for name in states_of(out) if name)
     return out
 
 
@@ -338,7 +340,11 @@ def test_validate_looks_at_all_lines_and_writes_nothing(
     assert not out.exists()
     assert main([*argv, "--all-or-nothing"]) == ExitCode.INPUT
     assert "none was started" in capsys.readouterr().err
-    assert sorted(path.name for path in out.iterdir()) == ["batch.json", "failures.jsonl"]
+    names = sorted(path.name for path in out.iterdir())
+    assert names == ["batch.html", "batch.json", "failures.jsonl"]
+    page = (out / "batch.html").read_text()
+    assert "3 not run, 3 failed" in page or "3 failed, 3 not run" in page
+    assert "unknown key &#39;fotos&#39;" in page and "line 5, exit code 2" in page
     assert set(states_of(out).values()) == {"not run", "failed"} and len(failures_of(out)) == 3
     write_manifest(memory, scenes(2))
     assert main([*argv, "--validate"]) == ExitCode.DONE

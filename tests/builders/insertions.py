@@ -30,6 +30,7 @@ ALWAYS = (
     "report.html",
     "tone_curve_object.cube",
     "tone_curve_shadow.cube",
+    "viewer.html",
 )
 """Every run writes these, and ``run.json`` behind them."""
 

@@ -190,14 +190,21 @@ sys.meta_path.insert(0, Hide())
 
 
 @pytest.mark.parametrize(
-    ("name", "changes"),
+    ("name", "changes", "advice"),
     [
-        pytest.param("torch", {"light": None}, id="R15-torch"),
-        pytest.param("warp", {}, id="R15-warp"),
-        pytest.param("diffusers", {"light": None, "steps": "1"}, id="R15-diffusers"),
+        pytest.param("torch", {"light": None}, "--upgrade warpir", id="R15-torch"),
+        pytest.param("warp", {}, "--upgrade warpir", id="R15-warp"),
+        pytest.param(
+            "diffusers",
+            {"light": None, "model": "model", "prompt": "a box"},
+            "'warpir[guidance]'",
+            id="R15-diffusers",
+        ),
     ],
 )
-def test_missing_package(folder: Path, name: str, changes: dict[str, str | None]) -> None:
+def test_missing_package(
+    folder: Path, name: str, changes: dict[str, str | None], advice: str
+) -> None:
     lines = assert_fails(
         arguments(folder, "out", **changes),
         2,
@@ -205,7 +212,7 @@ def test_missing_package(folder: Path, name: str, changes: dict[str, str | None]
         cwd=folder,
         before=HIDDEN.format(name=name),
     )
-    assert lines[1] == "pip install --upgrade warpir brings it"
+    assert lines[1] == f"pip install {advice} brings it"
 
 
 @pytest.mark.case("R15")

@@ -10,6 +10,7 @@ import sys
 import xml.etree.ElementTree as ET
 from pathlib import Path
 
+import colour
 import numpy as np
 import OpenImageIO as oiio
 import pytest
@@ -32,7 +33,6 @@ from tests.builders.programs.llvm import LIBRARY, llvm
 from tests.io.test_envmap_conventions import radiance, read, threejs
 from warpir.app.config import InsertConfig
 from warpir.app.inputs import Inputs, read_inputs
-from warpir.core import color
 from warpir.core.errors import InputError
 from warpir.core.latlong import map_directions
 from warpir.io import export as handoff
@@ -50,6 +50,7 @@ HANDED = {
     "photo.png",
     "tone_curve_object.cube",
     "tone_curve_shadow.cube",
+    "viewer.html",
 }
 CUBE_ABS = 1e-5
 """Eight decimals in the file, float32 knots in front of it."""
@@ -248,7 +249,7 @@ def bent(curves: int) -> ToneKnots:
 
 
 def read_cube(path: Path) -> "object":
-    return color.colour_science().read_LUT(str(path))
+    return colour.read_LUT(str(path))
 
 
 @pytest.mark.parametrize("knots", [bent(1), bent(3), ToneKnots.identity(1)], ids="135")

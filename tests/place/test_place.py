@@ -424,9 +424,11 @@ def test_place_loads_neither_torch_nor_warp() -> None:
 
 def test_server_knows_every_file_of_the_page() -> None:
     """Nothing is in the folder that no address leads to, but for what is said of three.js."""
-    from warpir.place.server import FILES, PAGE
+    from warpir.place.server import FILES, PAGE, VENDOR
 
-    there = {path.relative_to(PAGE).as_posix() for path in PAGE.rglob("*") if path.is_file()}
+    files = [(path, path.relative_to(PAGE)) for path in PAGE.rglob("*")]
+    files += [(path, path.relative_to(VENDOR.parent)) for path in VENDOR.rglob("*")]
+    there = {name.as_posix() for path, name in files if path.is_file()}
     assert there == set(FILES.values()) | {"vendor/LICENSE", "vendor/README.md"}
 
 

@@ -6,6 +6,7 @@ import html
 import io
 import json
 import re
+import shlex
 import shutil
 from collections.abc import Iterator
 from dataclasses import fields, replace
@@ -149,7 +150,7 @@ def test_page_allows_nothing_but_its_own_style_and_script(page: str) -> None:
     for tag in ("style", "script"):
         (content,) = re.findall(f"<{tag}>(.*?)</{tag}>", page, re.DOTALL)
         assert f"{tag}-src {source_hash(content.encode())}" in policy
-    addresses = re.findall(r'(?:src|href|srcset|action)="([^"]{0,30})', page)
+    addresses = re.findall(r'(?:src|srcset|action)="([^"]{0,30})', page)
     assert addresses and all(address.startswith("data:image/") for address in addresses)
     assert "style=" not in page and " onclick" not in page
 
@@ -158,9 +159,9 @@ def test_page_tells_what_the_run_measured(run: Run, page: str) -> None:
     """Sections, files with their purposes and hashes, inputs, settings, notes."""
     text = html.unescape(page)
     assert headings(page) == [
-        "Photo and result", "Layers", "The light", "Where the light comes from",
-        "What was noticed and assumed", "Figures", "Time and memory", "The same again",
-        "Settings", "Inputs", "Files", "Versions",
+        "Photo and result", "Layers", "The light", "Where the camera stood",
+        "Where the light comes from", "What was noticed and assumed", "If it looks wrong",
+        "Figures", "Time and memory", "The same again", "Settings", "Inputs", "Files", "Versions",
     ]  # fmt: skip
     for name, digest in run.record["files"].items():
         assert name == "report.html" or (name in text and digest in text)
@@ -171,12 +172,55 @@ def test_page_tells_what_the_run_measured(run: Run, page: str) -> None:
     assert (
         "given: lobes.json" in text and run.record["measured"]["placement"]["summary"][1:] in text
     )
-    assert "camera: pitch" in text and "-15.0° (--pitch)" in text
+    assert "<dt>pitch</dt><dd>-15.0° (--pitch)</dd>" in text
     # The strongest lobe of the light: azimuth 121, elevation 54 degrees.
     assert "from the upper right, behind the camera, 5" in text
     for name in ("fg", "shadow", "plate", "matte", "depth", "normal", "albedo", "position"):
         assert f'id="layer-{name}"' in page
     assert re.search(r'samples</span><span class="mark">set</span></td><td>4<', page)
+
+
+def test_files_are_links_where_the_page_lies_beside_them(run: Run, page: str) -> None:
+    """Each leads to the file; a page elsewhere has names alone."""
+    links = [html.unescape(link) for link in re.findall(r'<a href="([^"]*)"', page)]
+    names = {name for name in run.record["files"] if name != "report.html"} | {"run.json"}
+    assert set(links) == names and all((run.out / link).is_file() for link in links)
+    assert b"<a href" not in report.report_page(read_results(run.out), is_beside=False)
+
+
+def commands(page: str) -> list[list[str]]:
+    """Return the commands of "If it looks wrong" as words."""
+    part = page.split("If it looks wrong")[1].split("<section>", maxsplit=1)[0]
+    return [
+        shlex.split(html.unescape(line)) for line in re.findall("<code>(python.*?)</code>", part)
+    ]
+
+
+@pytest.mark.parametrize(
+    ("changes", "flags"),
+    [
+        ({}, {"--light-rotate", "--exposure", "--fov", "--place", "--pitch"}),
+        ({"place": None, "at": "24,22", "size": "2"}, {"--at", "--size"}),
+        ({"light": None, "sun": "40,50", "pitch": None, "horizon": ".4"}, {"--sun", "--horizon"}),
+    ],
+)
+def test_what_to_change_are_commands_that_are_understood(
+    run: Run, folder: Path, changes: dict[str, str | None], flags: set[str], tmp_path: Path
+) -> None:
+    """Each by the run's own settings, of which it changes what it names and nothing else."""
+    asked = parse(arguments(folder, tmp_path / "out", **changes)).config
+    record = {**run.record, "config": asked.flat()}
+    (tmp_path / "run.json").write_text(json.dumps(record))
+    results = replace(read_results(run.out), record=record)
+    found = commands(report.report_page(results).decode())
+    given = {word for words in found for word in words if word.startswith("--")}
+    assert flags < given and len(found) >= 8
+    for words in found:
+        argv = [str(tmp_path / "run.json") if w == "run.json" else w for w in words[3:]]
+        changed = parse(argv).config.flat()
+        named = {w[2:].replace("-", "_") for w in words if w.startswith("--")} - {"config"}
+        assert {k for k, v in changed.items() if v != asked.flat()[k]} <= named, words
+        assert changed["out"] == "OUT"
 
 
 def test_page_tells_no_folder(run: Run, page: str, folder: Path) -> None:
@@ -629,6 +673,15 @@ def test_page_works_in_a_browser(browser: Opened, run: Run, tmp_path: Path) -> N
             break
         seen.wait_for_timeout(20)
     assert look_at(canvas, tmp_path).mean() > dark + 50.0
+    # 1:1: a pixel of the picture on a pixel of the screen, and back.
+    seen.locator("input[value=view-whole]").check(force=True)
+    stage, zoom = compare.locator(".stage"), seen.locator("#exact")
+    fitting = stage.evaluate("e => e.clientWidth")
+    zoom.click()
+    assert zoom.get_attribute("aria-pressed") == "true"
+    assert stage.evaluate("e => e.clientWidth * devicePixelRatio") == SMALL[0] != fitting
+    zoom.click()
+    assert stage.evaluate("e => e.clientWidth") == fitting
     assert browser.errors == []
     assert browser.requests == [(run.out / "report.html").as_uri()]
 

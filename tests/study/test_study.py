@@ -722,7 +722,7 @@ def test_score_refuses_bad_answers_and_lists_them(scenes: Path, tmp_path: Path) 
 
 def test_score_refuses_the_rest(scenes: Path, tmp_path: Path) -> None:
     study = make(scenes, tmp_path / "study")
-    refuse(["score", "study"], 3, "answers", cwd=tmp_path)
+    refuse(["score", "study"], 3, "no answers", cwd=tmp_path)
     refuse(["score", "scenes"], 3, "no study", cwd=tmp_path)
     refuse(["score", "x" * 300], 3, "no study", cwd=tmp_path)
     refuse(["make", "x" * 300, "--out", "s"], 3, "xxx", cwd=tmp_path)

@@ -21,12 +21,16 @@ INTERRUPTED = 130
 """Of a Ctrl-C where nobody handles signals: 128 and the number of SIGINT."""
 LONGEST = 10_000
 """Most characters of a line: two file names of any length and a sentence."""
-EXTRA_OF = {"ray": "ray", "mitsuba": "bench", "matplotlib": "bench"}
+EXTRA_OF = {
+    "ray": "ray",
+    "mitsuba": "bench",
+    "matplotlib": "bench",
+    **dict.fromkeys(("accelerate", "diffusers", "peft", "transformers"), "guidance"),
+}
 """Which extra brings a package that a plain install does not have."""
 BROUGHT = (
-    *("OpenEXR", "OpenImageIO", "PIL", "accelerate", "colour", "diffusers", "numpy", "peft"),
-    *("rich", "safetensors", "scipy", "skimage", "torch", "transformers", "trimesh", "warp"),
-    "yaml",
+    *("OpenEXR", "OpenImageIO", "PIL", "numpy", "rich", "safetensors", "scipy", "skimage"),
+    *("torch", "trimesh", "warp", "yaml"),
 )
 """What a plain install brings, so that only a broken one lacks it."""
 

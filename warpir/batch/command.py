@@ -19,6 +19,7 @@ from warpir.app.command import FLAGS, make_parser, read_arguments, read_values
 from warpir.app.config import InsertConfig, flag, usage
 from warpir.app.program import require_packages, run_program, say
 from warpir.batch.manifest import read_manifest
+from warpir.batch.page import PAGE
 from warpir.batch.ray import LOCAL
 from warpir.batch.run import FAILURES, FORMAT, NONE_STARTED, SUMMARY, Batch, Options
 from warpir.batch.scene import LOGS
@@ -83,7 +84,7 @@ def _run(arguments: list[str]) -> int:
             finally:
                 batch.write()
     batch.raise_failures(f"failed; {options.out / FAILURES} lists them")
-    say(f"all {len(batch.scenes)} scenes are done: {options.out / SUMMARY}")
+    say(f"all {len(batch.scenes)} scenes are done: {options.out / PAGE}")
     return ExitCode.DONE
 
 
@@ -143,7 +144,9 @@ def _refuse_other_files(options: Options) -> None:
     Raises:
         InputError: One would be replaced.
     """
-    there = [name for name in (SUMMARY, FAILURES, LOGS) if os.path.lexists(options.out / name)]
+    there = [
+        name for name in (SUMMARY, FAILURES, PAGE, LOGS) if os.path.lexists(options.out / name)
+    ]
     for name in there:
         path = options.out / name
         with suppress(OSError):  # a link to nothing is none
@@ -157,6 +160,7 @@ def _refuse_other_files(options: Options) -> None:
     what = {
         SUMMARY: "not the summary of a batch, which would replace it",
         FAILURES: "there without the summary of a batch, which would replace it",
+        PAGE: "there without the summary of a batch, whose page would replace it",
         LOGS: "there without the summary of a batch, which would write into it",
     }
     refused = [] if is_ours else there

@@ -25,7 +25,7 @@ from warpir.core.strict_json import parse_json_object, read_json_lines
 
 SCENE_COUNT_LIMIT = 100_000
 NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_.-]{0,99}")
-RESERVED = ("batch.json", "failures.jsonl", "logs")
+RESERVED = ("batch.html", "batch.json", "failures.jsonl", "logs")
 """What a batch itself writes beside its scenes, in small letters."""
 OF_THE_BATCH = {
     "out": "a scene is written to the folder of its name in --out",

@@ -14,6 +14,7 @@ from warpir.app.config import InsertConfig
 from warpir.app.program import explain, say
 from warpir.batch.local import LocalWorkers
 from warpir.batch.manifest import Manifest
+from warpir.batch.page import PAGE, batch_page
 from warpir.batch.ray import RayWorkers
 from warpir.batch.scene import LOGS, STATES, Scene
 from warpir.batch.task import CHECK, COMPILE, DONE_BEFORE, INSERT, Answer, Task
@@ -156,7 +157,7 @@ class Batch:
         run_tasks(self._workers, tasks, self._retry, ended)
 
     def write(self) -> None:
-        """Write the summary and the list of failures.
+        """Write the summary, the list of failures and the page.
 
         Raises:
             InputError: The disk is full or the folder is not writable (exit 5).
@@ -181,6 +182,10 @@ class Batch:
                 # First: a list of failures without a summary is somebody else's.
                 write_file(self.options.out / SUMMARY, content.encode())
                 write_file(self.options.out / FAILURES, lines.encode())
+            seconds = time.monotonic() - self.started
+            page = batch_page(self.options.manifest, self.options.out, self.scenes, seconds)
+            with whole():
+                write_file(self.options.out / PAGE, page)
         except OSError as error:
             raise disk_error(self.options.out / SUMMARY, error) from error
 

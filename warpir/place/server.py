@@ -19,6 +19,7 @@ from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
 from typing import Any
 
+import warpir.report
 from warpir.app.config import usage
 from warpir.core.errors import InputError
 from warpir.place.renderings import policy_of
@@ -28,6 +29,8 @@ HOST = "127.0.0.1"
 LARGEST_REQUEST = 1 << 23
 """Largest request body [byte]: a mask of 2048 x 2048 pixels in base64."""
 PAGE = Path(__file__).parent / "page"
+VENDOR = Path(warpir.report.__file__).parent / "vendor"
+"""Folder of three.js."""
 FILES = {
     "": "index.html",
     **{
@@ -141,7 +144,9 @@ class PlaceServer(ThreadingHTTPServer):
         """Return the file at an address behind the token; None where there is none."""
         with self.working:
             if name not in self._made:
-                if name in FILES:
+                if name.startswith("vendor/") and name in FILES:
+                    self._made[name] = (VENDOR.parent / name).read_bytes()
+                elif name in FILES:
                     self._made[name] = (PAGE / FILES[name]).read_bytes()
                 elif name in self._makers:
                     self._made[name] = self._makers[name]()

@@ -57,13 +57,14 @@ def _run(arguments: list[str]) -> int:
     values = read_values({name: (text, flag(name)) for name, text in texts.items()})
     results = read_results(given.folder, InsertConfig(**values).limits)
     try:
-        page = report_page(results)
+        path = given.to or given.folder / REPORT
+        is_beside = path.parent.resolve() == given.folder.resolve()
+        page = report_page(results, is_beside)
     except (KeyError, TypeError, ValueError, AttributeError, IndexError) as error:
         # A file of unknown origin may hold anything under the names that a run writes.
         what = f"not what a run of this version writes ({type(error).__name__}: {error})"
         raise InputError(given.folder / "run.json", what) from error
-    path = given.to or given.folder / REPORT
-    if path.name in results.files and path.parent.resolve() == given.folder.resolve():
+    if path.name in results.files and is_beside:
         # Its hash stands in run.json, by which others see that the results are unchanged.
         raise InputError(
             path, "is of the run itself", "name another file with --to", ExitCode.OUTPUT

@@ -36,9 +36,9 @@ class Setting:
 
 
 CAMERA_WORDS = {
-    "pitch_deg": "camera: pitch",
-    "roll_deg": "camera: roll",
-    "vfov_deg": "camera: vertical field of view",
+    "pitch_deg": "pitch",
+    "roll_deg": "roll",
+    "vfov_deg": "vertical field of view",
 }
 """What the report calls the numbers of the camera."""
 ABOUT_FILES = (
@@ -55,6 +55,7 @@ ABOUT_FILES = (
     ("curves.json", "Knots of the tone curves"),
     ("tone_curve_object.cube", "The object's tone curve as a table for Nuke, Resolve, OCIO"),
     ("tone_curve_shadow.cube", "The shadow's tone curves as a table"),
+    ("viewer.html", "The object on the photo in 3D, by three.js: one page that needs nothing else"),
     ("response.cube", "The camera's response, behind the tone curves, as a table"),
     ("camera.json", "The camera: --camera reads it back"),
     ("balls.png", "A mirror ball and a grey ball under the light"),
@@ -321,7 +322,6 @@ def figures(record: Mapping[str, Any]) -> Rows:
         ("pixels of the object, as rendered", f"{measured['object_pixels']:,}"),
         ("pixels whose shadow was traced, as rendered", f"{measured['shadow_pixels']:,}"),
         ("pixels of the picture that differ from the photo", f"{measured['changed_pixels']:,}"),
-        *_camera(measured.get("camera", {})),
         ("exposure of the light", f"{measured['exposure_ev']:+.2f} EV"),
         *([("noise taken out by", found)] if (found := measured.get("denoiser")) else []),
         *_look(measured.get("look", {})),
@@ -335,8 +335,12 @@ def figures(record: Mapping[str, Any]) -> Rows:
     return rows
 
 
-def _camera(numbers: Mapping[str, Any]) -> Rows:
-    """Return the camera's numbers and their sources; files of older runs say nothing."""
+def camera_sources(record: Mapping[str, Any]) -> Rows:
+    """Return the camera's numbers with their sources and, of estimates, their uncertainty.
+
+    Those of a camera file are in ``camera.json``; files of older runs say nothing.
+    """
+    numbers = record["measured"].get("camera", {})
     rows: Rows = []
     for name, what in CAMERA_WORDS.items():
         if number := numbers.get(name):

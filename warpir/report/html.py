@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import base64
 import hashlib
+from collections.abc import Sequence
 from functools import cache
 from typing import Any
 
@@ -28,6 +29,8 @@ def render_page(
     package: str = "warpir.report",
     style: str = "report",
     images: str = "data:",
+    scripts: Sequence[str] = (),
+    connections: str = "'none'",
     **values: Any,
 ) -> bytes:
     """Fill a template and return the page, in UTF-8.
@@ -37,13 +40,16 @@ def render_page(
         package: Package of the templates that are looked up first.
         style: ``STYLE.css`` and ``STYLE.js`` beside the template.
         images: Sources of images for the content security policy.
+        scripts: Sources of scripts beside the page's own.
+        connections: Sources of what the script reads.
         **values: What the template names; each is escaped.
     """
     environment = _environment(package)
     css, js = (_source(environment, f"{style}.{kind}") for kind in ("css", "js"))
+    allowed = " ".join([source_hash(js.encode()), *scripts])
     policy = (
         f"default-src 'none'; img-src {images}; style-src {source_hash(css.encode())}; "
-        f"script-src {source_hash(js.encode())}; base-uri 'none'; form-action 'none'"
+        f"script-src {allowed}; connect-src {connections}; base-uri 'none'; form-action 'none'"
     )
     page = environment.get_template(f"{name}.html.j2").render(
         css=css, js=js, policy=policy, version=warpir.__version__, **values

@@ -14,8 +14,7 @@ from typing import Any
 
 import numpy as np
 
-from warpir.app.command import BY_HAND
-from warpir.app.config import DEFAULTS, InsertConfig, flag
+from warpir.app.config import DEFAULTS, InsertConfig
 from warpir.app.finished import config_of_record
 from warpir.app.record import name_of
 from warpir.core.arrays import CodeArray, FloatArray
@@ -25,6 +24,7 @@ from warpir.io.layers import Layers
 from warpir.io.results import OutputFolder
 from warpir.report.facts import (
     about_file,
+    camera_sources,
     command_line,
     figures,
     light_sources,
@@ -36,6 +36,7 @@ from warpir.report.html import render_page
 from warpir.report.panorama import Panorama, panorama, pose_of
 from warpir.report.pictures import before_and_after, jpeg, layers_shown, object_box
 from warpir.report.plots import Plot, Series, line_plot
+from warpir.report.remedies import again, remedies
 from warpir.report.words import LightCharacter, characterize, light_rows, origin_words
 from warpir.scene.tone_curves import Curves
 
@@ -110,8 +111,13 @@ def write_report(output: OutputFolder, results: Results) -> None:
     output.write_bytes(REPORT, report_page(results))
 
 
-def report_page(results: Results) -> bytes:
-    """Return the page, in UTF-8."""
+def report_page(results: Results, is_beside: bool = True) -> bytes:
+    """Return the page, in UTF-8.
+
+    Args:
+        results: The run's.
+        is_beside: Whether the page lies beside the files, so that their names can be links.
+    """
     record, config = results.record, config_of(results.record)
     asked = config.flat()
     photo = (
@@ -125,11 +131,13 @@ def report_page(results: Results) -> bytes:
         title=f"{asset} in {photo}",
         lead=_lead(results),
         missing=results.missing,
-        comparison=_comparison(results.layers) if results.layers is not None else None,
+        is_beside=is_beside,
+        comparison=_comparison(results) if results.layers is not None else None,
         layers=layers_shown(results.layers) if results.layers is not None else [],
         skies=_skies(results),
         light=light_rows(character, results.character_shadow) if character is not None else [],
         balls=jpeg(results.balls) if results.balls is not None else None,
+        camera_sources=camera_sources(record),
         light_sources=light_sources(record, config.light),
         tone_plots=_tone_plots(results.curves) if results.curves is not None else [],
         tone=results.curves.tone if results.curves is not None else "linear",
@@ -141,7 +149,10 @@ def report_page(results: Results) -> bytes:
         ],
         figures=figures(record),
         **_clock(record),
-        command_by_record=_command_by_record(asked),
+        remedies=remedies(
+            config, record, results.layers.matte > 0.0 if results.layers is not None else None
+        ),
+        command_by_record=again(asked),
         command_by_flags=command_line(asked),
         settings=settings(asked, record),
         inputs=_inputs(asked, record),
@@ -172,14 +183,17 @@ def _lead(results: Results) -> str:
     return ". ".join(part[:1].upper() + part[1:] for part in parts) + ("." if parts else "")
 
 
-def _comparison(layers: Layers) -> dict[str, Any]:
+def _comparison(results: Results) -> dict[str, Any]:
     """Return photo and result, whole and around the object, and the slider's start."""
+    layers = results.layers
+    assert layers is not None
     height, width = layers.matte.shape
     views = [("view-whole", "Whole picture", before_and_after(layers))]
-    start = 50.0
+    start, focus = 50.0, (0.5, 0.5)
     if (box := object_box(layers)) is not None:
         # At first all of the object is seen, and beside it the photo as it was.
         start = max(100.0 * box[0] / width, LEAST_PHOTO)
+        focus = (box[0] + box[2]) / 2.0 / width, (box[1] + box[3]) / 2.0 / height
         views.append(("view-object", "The object", before_and_after(layers, box)))
     small = views[0][2][0]
     size = f"{width} × {height} pixels"
@@ -191,7 +205,9 @@ def _comparison(layers: Layers) -> dict[str, Any]:
             for id_, name, (before, after) in views
         ],
         "start": f"{start:.1f}",
+        "focus": [f"{share:.3f}" for share in focus],
         "size": size,
+        "there": [name for name in results.files if name in results.sizes],
         "is_seen": bool((layers.matte > 0.0).any()),
     }
 
@@ -278,11 +294,6 @@ def _clock(record: Mapping[str, Any]) -> dict[str, Any]:
         "total_seconds": sum(seconds.values()),
         "memory": "; ".join(f"{where} {mib:,.0f} MiB" for where, mib in peak.items()),
     }
-
-
-def _command_by_record(asked: Mapping[str, Any]) -> str:
-    by_hand = [flag(name) for name in BY_HAND if asked[name]]
-    return " ".join(["python -m warpir.insert --config run.json", *by_hand, "--out OUT"])
 
 
 def _inputs(asked: Mapping[str, Any], record: Mapping[str, Any]) -> list[tuple[str, str, str]]:

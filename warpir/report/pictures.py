@@ -25,8 +25,8 @@ from warpir.io.layers import Layers
 Box = tuple[int, int, int, int]
 """A box: left, top, right, bottom, half-open [px]."""
 
-LARGEST = 1600
-"""Longest side of the picture in the report [px]."""
+LARGEST = 4096
+"""Longest side of the picture in the report [px]: most photos are there at full resolution."""
 LAYER_LARGEST = 960
 """Longest side of a layer in the report [px]."""
 THUMBNAIL = 320

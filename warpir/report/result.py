@@ -9,10 +9,10 @@ import numpy as np
 
 from warpir.app.record import config_of_picture
 from warpir.app.run import Run
-from warpir.core.arrays import CodeArray, FloatArray
+from warpir.core.arrays import CodeArray, Float64Array, FloatArray
 from warpir.core.progress import progress_bar
 from warpir.io.curves_file import curves_to_json
-from warpir.io.export import write_hand_off
+from warpir.io.export import OBJECT, write_hand_off
 from warpir.io.layers import write_layers
 from warpir.io.lobes_file import lobes_to_json
 from warpir.io.results import OutputFolder
@@ -30,6 +30,7 @@ from warpir.render.composite import (
 )
 from warpir.render.renderer import Renderer
 from warpir.report.page import Results
+from warpir.report.viewer import VIEWER, viewer_page
 from warpir.scene.camera import Camera
 from warpir.scene.light import LightSummary, summarize
 from warpir.scene.tone_curves import ToneKnots
@@ -97,9 +98,8 @@ def _look(run: Run, light: SceneLight) -> CameraLook:
     """
     photo, asked = run.inputs.photo, run.config.look
     inputs = run.inputs
-    corners = np.stack(np.meshgrid(*zip(*inputs.asset.bounds(), strict=True)), axis=-1)
     to_world = inputs.placement.asset_to_world
-    world = corners.reshape(-1, 3) @ to_world[:3, :3].T + to_world[:3, 3]
+    world = corners_of(*inputs.asset.bounds()) @ to_world[:3, :3].T + to_world[:3, 3]
     around = region_around(inputs.camera.project(world), photo.srgb.shape[0], photo.srgb.shape[1])
     response = asked.response
     is_shown = light.curves.tone == "reinhard" or not light.curves.foreground.is_identity
@@ -110,6 +110,12 @@ def _look(run: Run, light: SceneLight) -> CameraLook:
     if "auto" in words:
         run.log.assume(*look.lines())
     return look
+
+
+def corners_of(low: Float64Array, high: Float64Array) -> Float64Array:
+    """Return the corners of a box, shape [8, 3]."""
+    corners: Float64Array = np.stack(np.meshgrid(*zip(low, high, strict=True)), axis=-1)
+    return corners.reshape(-1, 3)
 
 
 def _picture(
@@ -209,7 +215,10 @@ def write_results(run: Run, light: SceneLight, picture: Picture) -> Written:
     output.write_json("curves.json", curves_to_json(light.curves, response))
     output.write_json("camera.json", inputs.camera.record())
     pair = _write_balls(run, light)
-    handed = _hand_off(run, light, maps, response) if run.config.output.hand_off else {}
+    handed = {}
+    if run.config.output.hand_off:
+        handed = _hand_off(run, light, maps, response)
+        _write_viewer(run, light, maps, picture)
     summary = summarize(light.light)
     _say_what_is_seen(run, summary, picture)
     measured = {
@@ -277,6 +286,23 @@ def _hand_off(
     return handed
 
 
+def _write_viewer(run: Run, light: SceneLight, maps: Maps, picture: Picture) -> None:
+    """Write the page that shows the object on the photo in 3D."""
+    inputs, output = run.inputs, run.output
+    to_world = inputs.placement.asset_to_world
+    corners = corners_of(*inputs.asset.bounds()) @ to_world[:3, :3].T + to_world[:3, 3]
+    page = viewer_page(
+        (output.staging / OBJECT).read_bytes(),
+        (corners.min(axis=0), corners.max(axis=0)),
+        picture.layers.plate,
+        inputs.camera.record(),
+        inputs.placement.ground,
+        (maps.light, maps.light if maps.shadow is None else maps.shadow),
+        light.curves.tone,
+    )
+    output.write_bytes(VIEWER, page)
+
+
 def _say_what_is_seen(run: Run, summary: LightSummary, picture: Picture) -> None:
     run.log.say(
         f"light: brightest toward azimuth {summary.azimuth_deg:.0f}, elevation "
@@ -295,6 +321,7 @@ def _measured(run: Run, light: SceneLight, summary: LightSummary) -> dict[str, A
         "integrator": "mis",
         "placement": {
             "summary": inputs.placement.summary,
+            "scale": float(np.linalg.norm(inputs.placement.asset_to_world[:3, 0])),
             "ground": inputs.placement.ground.tolist(),
         },
         "exposure_ev": light.exposure,

@@ -266,7 +266,10 @@ def _score(options: argparse.Namespace) -> None:
     from warpir.study.score import score
 
     study = read_study(options.study)
-    paths = list(_answer_files(options.answers or [options.study / ANSWERS]))
+    default = options.study / ANSWERS
+    if options.answers is None and not default.is_dir():
+        raise _without_answers(default)
+    paths = list(_answer_files(options.answers or [default]))
     _require_targets(options, paths)
     sheets = read_sheets(paths, study.plan, include_automated=options.include_automated)
     report = score(study, sheets)
@@ -289,8 +292,16 @@ def _answer_files(given: Sequence[Path]) -> Iterator[Path]:
             continue
         found = sorted(path.glob("*.json"))
         if not found:
-            raise InputError(path, "no answers (found no .json files)")
+            raise _without_answers(path)
         yield from found
+
+
+def _without_answers(path: Path) -> InputError:
+    advice = (
+        "publish the study's folder pages, give each rater the address of one page, and put the "
+        "files that they send back there; --answers names another place"
+    )
+    return InputError(path, "no answers (found no .json files)", advice)
 
 
 def _require_targets(options: argparse.Namespace, inputs: Sequence[Path]) -> None:

@@ -26,10 +26,17 @@ if (range) {
   move(Number(range.value));
   for (const view of views) {
     const follow = (event) => {
+      if (view.classList.contains("exact")) {
+        view.scrollLeft -= event.movementX;
+        view.scrollTop -= event.movementY;
+        return;
+      }
       const box = view.getBoundingClientRect();
       move(Math.min(100, Math.max(0, (100 * (event.clientX - box.left)) / box.width)));
     };
     view.addEventListener("pointerdown", (event) => {
+      const isExact = view.classList.contains("exact");
+      if (isExact && (event.pointerType === "touch" || event.target === view)) return;
       event.preventDefault();
       view.setPointerCapture(event.pointerId);
       follow(event);
@@ -38,7 +45,20 @@ if (range) {
       if (view.hasPointerCapture(event.pointerId)) follow(event);
     });
   }
-  move(Number(range.value));
+  // 1:1: a pixel of the picture on a pixel of the screen, the object in the middle at first.
+  const button = document.getElementById("exact");
+  button.addEventListener("click", () => {
+    const isExact = button.getAttribute("aria-pressed") !== "true";
+    button.setAttribute("aria-pressed", String(isExact));
+    for (const view of views) {
+      const stage = view.querySelector(".stage");
+      const width = Number(view.querySelector("img").getAttribute("width"));
+      view.classList.toggle("exact", isExact);
+      stage.style.width = isExact ? width / window.devicePixelRatio + "px" : "";
+      view.scrollLeft = Number(view.dataset.x || 0.5) * stage.clientWidth - view.clientWidth / 2;
+      view.scrollTop = Number(view.dataset.y || 0.5) * stage.clientHeight - view.clientHeight / 2;
+    }
+  });
 }
 
 // Panoramas: the values themselves (RGBE), shown at another exposure with the picture's operator.
