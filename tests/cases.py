@@ -31,6 +31,7 @@ HEADINGS = {
     "F": "Configuration, prompt, command line",
     "L": "Model folder and LoRA",
     "R": "Checkpoints, disk, signals, memory, environment",
+    "N": "Found later, by an adversary's inputs",
 }
 EXCLUDED = {
     "E13": "read back by OpenImageIO; by Mitsuba too, but only where the extra bench is installed",

@@ -23,8 +23,23 @@ The rooms, each of which imports only those before it (tests/test_layers.py):
 losses, which know the core alone. ``insert.py`` tells the story.
 """
 
+import importlib.util
+import sys
+
 from warpir.core.moved import find_moved_modules
 
 __version__ = "0.1.0"
+
+if importlib.util.find_spec("warpir.diffusion") is None:
+    # The checkout's own folder, found before the installed package: an install maps kernels/ and
+    # diffusion/ into it.
+    _what = (
+        f"warpir: {__path__[0]} is the checkout, not the installed package; run from another "
+        "folder, or install it with pip install -e ."
+    )
+    if sys.argv[0] != "-m":  # which Python sets while it looks for what `python -m` names
+        raise ImportError(_what)
+    print(f"error: {_what}", file=sys.stderr)
+    raise SystemExit(2)
 
 find_moved_modules()

@@ -3,7 +3,7 @@
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
-from functools import lru_cache
+from functools import lru_cache, partial
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -210,6 +210,10 @@ def _read_files(config: InsertConfig, loaders: Loaders) -> _Files:
     with suppress(InputError):  # the reader tells
         states = {name: (path, _state(path)) for name, path in input_files(config).items()}
     log, limits, inputs = Log(), config.limits, config.inputs
+    for name, (path, state) in states.items():
+        if state is not None and name in PICTURES:  # all of it is read for its sha256
+            what, size = "too large", state[1]
+            attempt(partial(limits.check, "file_bytes", size, path, what, more=" bytes"))
     photo = attempt(lambda: _read_photo(inputs, limits))
     occluder = attempt(lambda: _read_mask(inputs.occluder_mask, photo, limits, log))
     shaded = attempt(lambda: _read_mask(config.camera.shadow_mask, photo, limits, log))
@@ -351,6 +355,8 @@ def _notices(
         yield "guidance does not see --occluder-mask; the pictures it leads to do"
 
 
+PICTURES = ("photo", "occluder_mask", "shadow_mask", "light")
+"""Inputs whose readers have a limit of pixels, but none of bytes."""
 _State = tuple[int, int, int]
 
 

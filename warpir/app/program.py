@@ -4,6 +4,7 @@ import atexit
 import importlib.util
 import logging
 import os
+import resource
 import sys
 import traceback
 from collections.abc import Callable, Sequence
@@ -19,6 +20,8 @@ from warpir.diffusion.models.model_error import ModelError
 _LOG = logging.getLogger(__name__)
 INTERRUPTED = 130
 """Of a Ctrl-C where nobody handles signals: 128 and the number of SIGINT."""
+LEAST_STACK = 1 << 20
+"""Stack of the main thread below which LLVM's may overflow [byte]; systems give 8 MiB."""
 LONGEST = 10_000
 """Most characters of a line: two file names of any length and a sentence."""
 EXTRA_OF = {
@@ -93,6 +96,23 @@ def require_packages(*names: str) -> None:
             raise ModuleNotFoundError(f"No module named {name!r}", name=name)
 
 
+def _require_process() -> None:
+    """Refuse a process in which libraries crash: without a folder, or with hardly any stack.
+
+    Raises:
+        InputError: It is so (`ExitCode.RESOURCES`).
+    """
+    try:
+        os.getcwd()
+    except OSError as error:
+        what, advice = "was removed", "change into one that is there"
+        raise InputError("working folder", what, advice, ExitCode.RESOURCES) from error
+    stack = resource.getrlimit(resource.RLIMIT_STACK)[0]
+    if stack != resource.RLIM_INFINITY and stack < LEAST_STACK:
+        what = f"too small for the renderer's compiler (found {stack}; needed {LEAST_STACK} bytes)"
+        raise InputError("stack", what, "ulimit -s 8192 sets the usual", ExitCode.RESOURCES)
+
+
 def stay_offline() -> None:
     """Tell Hugging Face's libraries, before they are loaded, to open no connection."""
     for name in ("HF_HUB_OFFLINE", "TRANSFORMERS_OFFLINE"):
@@ -125,6 +145,7 @@ def run_program(run: Callable[[list[str]], int], argv: Sequence[str] | None = No
     atexit.unregister(signals.ignore_at_exit)
     with signals.handled():
         try:
+            _require_process()
             return run(arguments)
         except BaseException as error:
             signals.ignore()

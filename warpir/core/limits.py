@@ -20,7 +20,8 @@ class Limits:
     envmap_width: int = option(16_384, "PX", expert=True, low=1, high=2**20)
     """Widest panorama that is opened [px]"""
     file_bytes: int = option(2 << 30, "BYTES", expert=True, low=1)
-    """Largest mesh, texture, point cloud or file of a COLMAP model that is read [byte]"""
+    """Largest photo, mask, panorama, mesh, texture, point cloud or file of a COLMAP model that is
+    read [byte]"""
     triangles: int = option(20_000_000, "N", expert=True, low=1)
     """Largest asset or proxy that is read, instances counted [triangles]"""
     texture_pixels: int = option(512_000_000, "N", expert=True, low=1)

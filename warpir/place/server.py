@@ -12,6 +12,7 @@ from __future__ import annotations
 import json
 import re
 import secrets
+import sys
 import threading
 from collections.abc import Callable, Mapping
 from contextlib import nullcontext
@@ -139,6 +140,11 @@ class PlaceServer(ThreadingHTTPServer):
         """
         with self.working if name == "save" else nullcontext():
             return self.answers[name](body)
+
+    def handle_error(self, request: Any, client_address: Any) -> None:
+        """Tell of a fault, unless it is a browser that went away in the middle of a request."""
+        if not isinstance(sys.exception(), ConnectionError):
+            super().handle_error(request, client_address)
 
     def content(self, name: str) -> bytes | None:
         """Return the file at an address behind the token; None where there is none."""

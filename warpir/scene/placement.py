@@ -17,6 +17,8 @@ from warpir.scene.receiver import ReceiverMesh, first_hit
 
 DEFAULT_STAND = (0.5, 0.75)
 """Default place of an object, as fractions of the photo's width and height."""
+MILLIMETRES = 500.0
+"""Longest side from which an object around the camera is taken to be in millimetres [m]."""
 SMALLEST_PLAUSIBLE = 0.01
 LARGEST_PLAUSIBLE = 100.0
 """Range of plausible sizes [m]; others are more often a mistake of the unit."""
@@ -351,10 +353,15 @@ def _check_in_view(
     """
     eye = np.linalg.solve(asset_to_world, camera.c2w[:, 3])[:3]
     if np.all((eye > corners[0]) & (eye < corners[-1])):
+        # Files in millimetres are a thousand times as large as what they show.
+        longest = float((corners[-1] - corners[0]).max()) * float(
+            np.linalg.norm(asset_to_world[:3, 0])
+        )
+        unit = ".001 for millimetres" if longest >= MILLIMETRES else ".01 for centimetres"
         raise InputError(
             where,
             f"the camera is inside the object of {size} m",
-            "move it away, or use --size or --scale (.01 for centimetres)",
+            f"move it away, or use --size or --scale ({unit})",
         )
     pixels = camera.project(corners @ asset_to_world[:3, :3].T + asset_to_world[:3, 3])
     seen = pixels[np.isfinite(pixels).all(axis=1)]

@@ -61,6 +61,7 @@ GLTF = Faults(
         "two_parents": "node {found} is listed twice",
         "type": "{what} of another type",
         "uv_set": "texCoord {found}, but only sets 0 to {limit} are supported",
+        "min_version": ("needs a reader of glTF {found!r}, this one reads 2.0", RE_EXPORT_MESH),
         "version": ("asset version is {found!r}, expected 2.0", "convert it to glTF 2.0"),
     },
 )
@@ -221,6 +222,9 @@ class GltfFile:
         version = self.root.child("asset").text("version", "")
         if version.split(".")[0] != "2":
             raise self.root.error("version", found=version)
+        least = self.root.child("asset").text("minVersion", "2.0")
+        if least != "2.0":
+            raise self.root.error("min_version", found=least)
         self._buffers: dict[int, memoryview] = {}
 
     def _check_json(self, length: int) -> None:

@@ -73,6 +73,8 @@ def decode_image(
     if kind not in kinds:
         what = f"not of a kind that can be used here (found {kind}; expected {' or '.join(kinds)})"
         raise InputError(path, what, reason="image.kind", found=kind)
+    if kind == "jpeg":
+        _check_scans(path)
     file = _File(path, kind, max_pixels, flag)
     # 64 bytes a pixel leave room for EXR layers; sizes are compared exactly below.
     with _opened(file, 64, {"oiio:UnassociatedAlpha": 1}) as reader:
@@ -88,6 +90,8 @@ def decode_image(
         notices = header_notices(spec, kind, head)
         notices += _check_parts(path, reader, specs, part, kind)
     pixels = np.asarray(pixels).reshape(spec.height, spec.width, last - first)
+    if kind == "tiff":
+        pixels = _tiff_codes(path, spec, pixels)
     if kind == "exr":
         pixels = _place_in_display_window(pixels, spec)
     if kind == "hdr":
@@ -153,11 +157,16 @@ class _File:
 
     def check_size(self, spec: Any) -> None:
         """Refuse an image or a part that is too large, before a pixel is decoded."""
-        for width, height in ((spec.width, spec.height), (spec.full_width, spec.full_height)):
+        sizes = [(spec.width, spec.height, "")]
+        sizes += [
+            (spec.full_width, spec.full_height, ""),
+            (spec.tile_width, spec.tile_height, "tiles of "),
+        ]
+        for width, height, what in sizes:
             if width * height > self.max_pixels:
                 raise InputError(
                     self.path,
-                    f"too large (found {width} x {height} pixels; limit {self.max_pixels}); "
+                    f"too large (found {what}{width} x {height} pixels; limit {self.max_pixels}); "
                     f"{self.flag} raises it",
                     reason="image.too_large",
                     found=(width, height),
@@ -189,6 +198,17 @@ class _File:
         )
 
 
+_FOREIGN_TIFF = {
+    4: "a transparency mask",
+    32803: "a colour filter array (camera raw)",
+    34892: "linear raw values (camera raw)",
+    51177: "a depth map",
+    52527: "a photometric mask",
+}
+"""What PhotometricInterpretation says of files that OpenImageIO reads as if they were pictures."""
+_WHITE_IS_ZERO, _PALETTE = 0, 3
+_MOST_SCANS = 100
+"""Scans of a JPEG; encoders write about 10, and each of them costs a pass over the picture."""
 _ARTICLES = {"exr": "an EXR", "hdr": "a Radiance HDR", "jpeg": "a JPEG", "png": "a PNG"}
 _ARTICLES |= {"tiff": "a TIFF", "webp": "a WebP"}
 
@@ -299,9 +319,59 @@ def _check_spec(path: Path, spec: Any) -> None:
             reason="image.variant",
             found=str(spec.format),
         )
+    photometric = spec.get_int_attribute("tiff:PhotometricInterpretation", 2)
+    if found := _FOREIGN_TIFF.get(photometric):
+        advice = "save it as RGB or greyscale"
+        what = f"a TIFF of {found}, not a picture"
+        raise InputError(path, what, advice, reason="image.variant", found=found)
     if "LAB" in str(spec.getattribute("tiff:ColorSpace") or "").upper():
         what = "CIE Lab images are not supported"
         raise InputError(path, what, "save it as RGB", reason="image.variant", found="Lab")
+
+
+def _check_scans(path: Path) -> None:
+    """Refuse a JPEG of so many scans that it takes minutes to decode.
+
+    Within a scan's data a byte of 255 is followed by a zero (ITU-T T.81, B.1.1.5), so what is
+    counted are markers, those of an embedded thumbnail too.
+    """
+    scans, last = 0, b""
+    with path.open("rb") as stream:
+        while block := stream.read(1 << 20):
+            scans += (last + block).count(b"\xff\xda")
+            last = block[-1:]
+    if scans > _MOST_SCANS:
+        what = f"a JPEG of too many scans (found {scans}; limit {_MOST_SCANS})"
+        raise InputError(path, what, "save it anew", reason="image.scans", found=scans)
+
+
+def _tiff_codes(path: Path, spec: Any, pixels: PixelArray) -> PixelArray:
+    """Return what OpenImageIO leaves undone: deep TIFFs whose zero is white, palettes of 8 bits.
+
+    Raises:
+        InputError: The palette's entries have 8 bits, of which OpenImageIO takes the upper 8 of 16.
+    """
+    photometric = spec.get_int_attribute("tiff:PhotometricInterpretation", 2)
+    if photometric == _WHITE_IS_ZERO and pixels.dtype == np.uint16:
+        inverted: PixelArray = np.iinfo(np.uint16).max - pixels
+        return inverted
+    if photometric == _PALETTE and not pixels.any() and (entries := _palette(path)):
+        if 0 < max(entries) < 256:
+            what = "a palette whose entries have 8 bits, not 16"
+            raise InputError(path, what, "save it as RGB", reason="image.variant", found="palette")
+    return pixels
+
+
+def _palette(path: Path) -> tuple[int, ...]:
+    """Return the entries of a TIFF's ColorMap; none where they cannot be read."""
+    from PIL import Image, TiffImagePlugin
+
+    try:
+        with Image.open(path) as picture:
+            assert isinstance(picture, TiffImagePlugin.TiffImageFile)
+            return tuple(picture.tag_v2.get(TiffImagePlugin.COLORMAP, ()))
+    except (OSError, ValueError, SyntaxError, Image.DecompressionBombError):
+        return ()
 
 
 def _choose_channels(
@@ -331,6 +401,17 @@ def _choose_channels(
             if {f"{prefix}ry", f"{prefix}by"} & set(names):
                 what = "luminance/chroma EXR is not supported"
                 raise InputError(path, what, "save it as RGB", reason="image.channels")
+            others = {prefix + "x", prefix + "z"} & set(names)
+            if wanted == ("y",) and prefix + "y" in names and others:
+                what = "neither RGB nor luminance alone"
+                found = ", ".join(spec.channelnames[:24])
+                raise InputError(
+                    path,
+                    f"{what} (found {found}; expected R, G, B)",
+                    "convert CIE XYZ to RGB, or leave the other channels out",
+                    reason="image.channels",
+                    found=found,
+                )
             if all(prefix + name in names for name in wanted):
                 colors = [names.index(prefix + name) for name in wanted]
                 alpha = names.index(f"{prefix}a") if f"{prefix}a" in names else None

@@ -38,12 +38,15 @@ OBJ = Faults(
         "face": "face with {found} corners",
         "index_out_of_range": "corner {found}, but {limit} {word} (indices start at 1)",
         "kind": ("not an OBJ file", "convert it to GLB"),
+        "polygon": ("face with more corners than can be triangulated", "triangulate it"),
         "number": "{found}, expected {count} numbers up to {limit:g}",
     },
 )
 """What a file may have wrong."""
 WORDS = ("v", "vt", "vn")
 """Statements that the three indices of a corner count."""
+MOST_CORNERS = 4096
+"""Corners of a face: the time to triangulate one grows with their square."""
 NAMED = ("usemtl", "mtllib")
 """Statements that end in a name, which may hold ``#`` (3ds Max: ``Material #1``)."""
 IGNORED = {"o", "g", "s", "vp", "shadow_obj", "trace_obj", "lod", "bevel", "c_interp", "d_interp"}
@@ -179,6 +182,10 @@ def _read_statements(path: Path, content: bytes, notices: list[str]) -> Statemen
             case "f":
                 if len(values) < 3:
                     raise OBJ.error(path, "face", line=line, found=len(values))
+                if len(values) > MOST_CORNERS:
+                    raise OBJ.error(
+                        path, "polygon", line=line, found=len(values), limit=MOST_CORNERS
+                    )
                 if "-" in statement:
                     values = [_absolute(path, line, v, text.counts()) for v in values]
                 text.faces.setdefault(material, []).append((line, values))
@@ -199,17 +206,22 @@ def _logical_lines(text: str) -> Iterator[tuple[int, str]]:
 
     Names are kept whole; of the other statements all from ``#`` on is a comment.
     """
-    pending, start = "", 0
+    pending: list[str] = []
+    start = 0
     for number, line in enumerate(re.split(r"\r\n|\n|\r", text), 1):
         start = start if pending else number
-        line = pending + line.strip()
-        if "#" in line and line.split()[0] not in NAMED:
+        line = line.strip()
+        word = (pending[0] if pending else line).split(maxsplit=1)
+        if "#" in line and word and word[0] not in NAMED:
             line = line.partition("#")[0].rstrip()
-        pending = line[:-1] + " " if line.endswith("\\") else ""
-        if line and not pending:
-            yield start, line
-    if pending.strip():
-        yield start, pending
+        if line.endswith("\\"):
+            pending.append(line[:-1] + " ")
+            continue
+        if statement := "".join([*pending, line]):
+            yield start, statement
+        pending = []
+    if statement := "".join(pending).strip():
+        yield start, statement
 
 
 def _numbers(path: Path, line: int, word: str, values: list[str], width: int) -> list[float]:
