@@ -215,7 +215,7 @@ def write_results(run: Run, light: SceneLight, picture: Picture) -> Written:
     output.write_json("curves.json", curves_to_json(light.curves, response))
     output.write_json("camera.json", inputs.camera.record())
     pair = _write_balls(run, light)
-    handed = {}
+    handed: dict[str, Any] = {}
     if run.config.output.hand_off:
         handed = _hand_off(run, light, maps, response)
         _write_viewer(run, light, maps, picture)

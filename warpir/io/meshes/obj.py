@@ -45,8 +45,8 @@ OBJ = Faults(
 """What a file may have wrong."""
 WORDS = ("v", "vt", "vn")
 """Statements that the three indices of a corner count."""
-MOST_CORNERS = 4096
-"""Corners of a face: the time to triangulate one grows with their square."""
+MOST_CORNERS = 1 << 16
+"""Corners of a face, which take a second; a concave one may have fewer (`triangulate`)."""
 NAMED = ("usemtl", "mtllib")
 """Statements that end in a name, which may hold ``#`` (3ds Max: ``Material #1``)."""
 IGNORED = {"o", "g", "s", "vp", "shadow_obj", "trace_obj", "lod", "bevel", "c_interp", "d_interp"}
