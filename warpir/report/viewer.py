@@ -141,15 +141,15 @@ def shadow_directions(texels: FloatArray, normal: Float64Array) -> Float64Array:
     is_large = share > 1.0 / (BANDS * SECTORS)
     other = np.where(is_large, 0.0, share).reshape(small.shape[:2])
     band = _parts(other.sum(axis=1), BANDS)
-    group = np.empty(other.shape, np.int64)
+    group: Int64Array = np.empty(other.shape, np.int64)
     for k in range(BANDS):
         group[band == k] = k * SECTORS + _parts(other[band == k].sum(axis=0), SECTORS)
-    group = group.ravel()
-    group[is_large] = BANDS * SECTORS + np.arange(int(is_large.sum()))
-    count = int(group.max()) + 1
+    part = group.reshape(-1)
+    part[is_large] = BANDS * SECTORS + np.arange(int(is_large.sum()))
+    count = int(part.max()) + 1
     axis, color = np.zeros((count, 3)), np.zeros((count, 3))
-    np.add.at(axis, group, directions * share[:, None])
-    np.add.at(color, group, brought / np.maximum(total, 1e-30))
+    np.add.at(axis, part, directions * share[:, None])
+    np.add.at(color, part, brought / np.maximum(total, 1e-30))
     length = np.linalg.norm(axis, axis=1)
     kept = (length > 0.0) & (color.sum(axis=1) > 0.0)
     return np.concatenate([axis[kept] / length[kept, None], color[kept]], axis=1)
