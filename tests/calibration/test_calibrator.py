@@ -191,6 +191,28 @@ def test_shipped_network_knows_little_of_even_photos() -> None:
     assert texture.pitch_sigma_deg > 8.0 and texture.vfov_sigma_deg > 10.0
 
 
+def test_shipped_network_sees_tiles_from_above() -> None:
+    """No horizon: square tiles, the camera looks straight down."""
+    tiles = np.full((320, 480, 3), 0.5, np.float32)
+    tiles[::40] = tiles[:, ::40] = 0.2
+    found = estimate_camera(tiles)
+    assert abs(found.pitch_deg + 90.0) < 2.0 * found.pitch_sigma_deg < 20.0
+
+
+def test_shipped_network_is_unsure_of_a_fisheye_picture() -> None:
+    """A circle in black corners, in which straight lines are bent."""
+    v, u = (np.mgrid[:320, :480] + 0.5 - np.array([160, 240])[:, None, None]) / 160.0
+    radius = np.hypot(u, v)
+    angle = np.minimum(radius * np.radians(85.0), 1.4)
+    x, y = (np.tan(angle) / np.maximum(radius, 1e-6) * part for part in (u, v))
+    # A street between walls with windows under a bright sky, by plane equations.
+    wall = (np.floor(x / 0.4) + np.floor(y / 0.4)) % 2
+    photo = np.where(y > 0.3, 0.35, np.where(y < -np.abs(x), 0.9, 0.3 + 0.3 * wall))
+    photo = np.where(radius < 1.0, photo, 0.0)
+    found = estimate_camera(np.repeat(photo[..., None], 3, axis=2).astype(np.float32))
+    assert found.pitch_sigma_deg > 8.0 and found.vfov_sigma_deg > 18.0
+
+
 def test_axis_near_the_middle_is_the_middle_and_the_horizon_stays() -> None:
     photo = np.full((40, 60, 3), 0.5, np.float32)
     start = network_estimate(photo, random_calibrator(0, SMALL), vfov_deg=50.0)

@@ -22,6 +22,9 @@ NETWORK = "network"
 CORRECTED_SHIFT = 0.08
 """Distance of the estimated principal point from the middle, over the height, from which a photo
 counts as corrected to upright."""
+CIRCLE_SIGMA_DEG = 30.0
+"""Standard deviation of pitch and field of view of a circular fisheye picture, which the network
+has never seen and answers as confidently as any other [deg]."""
 LINES = "vanishing point of upright edges"
 """Name of the second witness."""
 
@@ -31,7 +34,8 @@ def estimate_camera(
 ) -> CameraEstimate:
     """Estimate the camera of a photo, by the network and by upright edges where enough agree.
 
-    The principal point is the middle, unless the photo looks corrected to upright (`decided`).
+    The principal point is the middle, unless the photo looks corrected to upright (`decided`). A
+    circular fisheye picture, which no pinhole camera takes, has a wide uncertainty.
 
     Args:
         photo: Display-encoded (sRGB) in [0, 1], shape [H, W, 3].
@@ -45,6 +49,9 @@ def estimate_camera(
     """
     with _one_thread():
         alone = network_estimate(photo, network or load_calibrator(), vfov_deg)
+        if has_image_circle(photo):
+            fov_sigma = 0.0 if vfov_deg is not None else CIRCLE_SIGMA_DEG
+            return replace(alone, pitch_sigma_deg=CIRCLE_SIGMA_DEG, vfov_sigma_deg=fov_sigma)
         return decided(with_lines(alone, photo))
 
 
@@ -104,6 +111,22 @@ def network_estimate(
         principal_sigma=(sigma["x"], sigma["y"]),
         witnesses=(NETWORK,),
     )
+
+
+def has_image_circle(photo: FloatArray) -> bool:
+    """Tell whether a photo is a circle in corners of one colour, as a circular fisheye's.
+
+    Args:
+        photo: Display-encoded in [0, 1], shape [H, W, 3].
+    """
+    height, width = photo.shape[:2]
+    v, u = np.ogrid[:height, :width]
+    radius = np.hypot(v + 0.5 - height / 2.0, u + 0.5 - width / 2.0) / (min(height, width) / 2.0)
+    outside, rim = photo[radius > 1.1], photo[(radius > 0.8) & (radius < 0.95)]
+    if not (len(outside) and len(rim)):
+        return False
+    # JPEG leaves a code or two of noise in what was one colour.
+    return bool(outside.std(axis=0).max() < 0.01 and rim.std(axis=0).max() > 0.05)
 
 
 def decided(estimate: CameraEstimate) -> CameraEstimate:

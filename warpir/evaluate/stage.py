@@ -368,6 +368,9 @@ def unseen_by(network: Regressor, panorama: str) -> Regressor | None:
     part = Regressor(replace(network.config, members=len(kept))).to(device)
     # Means and temperature are buffers of the whole; the networks themselves are shared.
     part.load_state_dict(network.state_dict(), strict=False)
+    if len(kept) == 1:
+        # The temperature is that of the mean; each network's own is in its logits.
+        part.temperature.fill_(1.0)
     part.members = nn.ModuleList(network.members[k] for k in kept)
     part.record = {"members": [records[k] for k in kept]}
     return part.eval().requires_grad_(False)

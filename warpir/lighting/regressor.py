@@ -210,7 +210,7 @@ class Regressor(nn.Module):
     directions: Tensor
     """Candidates, camera-yaw frame, shape [K, 3]; in the file, so that weights keep their own."""
     temperature: Tensor
-    """Divides the logits; calibrated on validation photos, shape []."""
+    """Divides the mean logits; calibrated on places held out of every network, shape []."""
     mean_light: Tensor
     """The training set's mean light as one constant prediction, flat as `split` takes it."""
 

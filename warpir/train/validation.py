@@ -127,7 +127,7 @@ def calibrated_temperature(directions: Tensor, sets: Sequence[tuple[Tensor, Tens
         sets: Logits [B, K] and true axes [B, 3] of each set.
     """
     found, gap = 1.0, math.inf
-    for temperature in np.geomspace(0.5, 8.0, 100):
+    for temperature in np.geomspace(0.25, 8.0, 126):
         covered = [
             float(
                 (region_mass(directions, (logits / temperature).softmax(1), axis) <= COVERAGE)
