@@ -1,13 +1,7 @@
 """Guided runs end to end on a tiny Stable Diffusion: files, losses, ablations, stop and resume."""
 
 import json
-import os
-import random
 import shutil
-import signal
-import subprocess
-import sys
-import time
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any, cast
@@ -440,38 +434,6 @@ def test_bad_models_are_one_line(
     assert words in error and "Traceback" not in error
     assert error.count("error:") == 1
     assert not (out / "run.json").exists()
-
-
-@pytest.mark.slow
-def test_killed_run_resumes_to_the_same_bytes(folder: Path, tmp_path: Path) -> None:
-    """SIGKILL at two random moments of a real process, whatever it was doing."""
-    chance = random.Random(7)
-    environment = {**os.environ, "OMP_NUM_THREADS": "1"}
-    # Bytes are those of one number of threads, so the run to compare with is a process like these.
-    whole = [sys.executable, "-m", "warpir.insert", *argv(folder, tmp_path / "whole")]
-    own_cache = {**environment, "WARPIR_CACHE": str(tmp_path / "other")}
-    assert subprocess.run(whole, env=own_cache, check=False).returncode == 0
-    command = [sys.executable, "-m", "warpir.insert", *argv(folder, tmp_path / "out")]
-    for resumed in (False, True, True):
-        child = subprocess.Popen(
-            [*command, *(["--resume"] if resumed else [])],
-            env=environment,
-            stdout=subprocess.PIPE,
-            stderr=subprocess.STDOUT,
-            text=True,
-        )
-        # From the first checkpoint on, so that there is something to resume.
-        while child.poll() is None and not any((tmp_path / "out" / "checkpoints").glob("0*")):
-            time.sleep(0.05)
-        time.sleep(chance.uniform(0.0, 3.0))
-        child.send_signal(signal.SIGKILL)
-        child.communicate()
-        if (tmp_path / "out" / "run.json").exists():
-            break
-    else:
-        done = subprocess.run([*command, "--resume"], env=environment, check=False)
-        assert done.returncode == 0
-    assert results(tmp_path / "out") == results(tmp_path / "whole")
 
 
 @pytest.mark.case("R3")
