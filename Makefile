@@ -1,7 +1,8 @@
 # `make demo` and `make test` work from a fresh clone: the first call makes .venv and installs into
 # it, later calls find the stamp and go straight on. PYTHON chooses the interpreter (3.11 or newer).
 PYTHON ?= python3
-# Processes that share the tests; each computes with few threads and takes up to 3 GB.
+# Processes that share the tests; each computes with one thread, for torch's threads wait by spinning
+# and made some tests ten times as slow beside another process, and takes up to 3 GB.
 WORKERS ?= 2
 VENV := .venv
 BIN := $(VENV)/bin
@@ -13,7 +14,7 @@ demo: $(STAMP)
 	$(BIN)/python -m warpir.insert --demo --out out/demo --overwrite
 
 test: $(STAMP)
-	$(BIN)/python -m pytest -q -m "not slow" -n $(WORKERS) --dist loadfile $(PYTEST_ARGS)
+	OMP_NUM_THREADS=1 $(BIN)/python -m pytest -q -m "not slow" -n $(WORKERS) --dist loadfile $(PYTEST_ARGS)
 
 lint: $(STAMP)
 	$(BIN)/ruff check .

@@ -40,7 +40,7 @@ TARGETS = {"whole_run_s": 180.0, "peak_gb": 12.0, "rendering_share": 0.10}
 """On an H200; the authors state 26 minutes on an RTX A6000 and more than 12 GB."""
 AUTHORS = InsertConfig(
     demo=True, guidance="stable-diffusion", prompt=PROMPT, class_images=200, lora_steps=1000,
-    steps=600, guidance_width=384, start="uniform", detail=False, hand_off=False,
+    steps=600, guidance_width=384, start="uniform", preview_every=0, detail=False, hand_off=False,
     report=False,
 )  # fmt: skip
 """What the authors' run does; neither detail, files for other tools nor a report are theirs."""

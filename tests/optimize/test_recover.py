@@ -87,7 +87,10 @@ def record(out: Path) -> dict[str, Any]:
 
 
 def test_guided_run_writes_every_file_and_says_who_spoke(finished: Path) -> None:
-    assert {p.name for p in finished.iterdir()} == {*ALWAYS, *DETAIL, *GUIDED, "run.json"}
+    assert {p.name for p in finished.iterdir()} == {
+        *(*ALWAYS, *DETAIL, *GUIDED),
+        *("progress", "run.json"),
+    }
     run = record(finished)
     measured = run["measured"]
     assert measured["prior"] == "stable-diffusion" and measured["loop_integrator"] == "transport"

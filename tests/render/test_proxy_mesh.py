@@ -558,7 +558,7 @@ def test_picture_of_a_shaded_place(files: Path, device: str) -> None:
         ({"shadow_mask": "colour.png"}, ExitCode.INPUT, ["colour.png", "three channels"]),
         ({"shadow_mask": "box.glb"}, ExitCode.INPUT, ["not an image"]),
         ({"no_plane": ""}, ExitCode.USAGE, ["--no-plane", "--proxy"]),
-        ({"shadow_mask": "black.png", "light": None, "steps": "5"}, ExitCode.USAGE, ["--reuse"]),
+        ({"shadow_mask": "black.png", "light": None, "model": "any"}, ExitCode.USAGE, ["--reuse"]),
     ],
     ids=str,
 )
