@@ -32,8 +32,8 @@ EXTRA_OF = {
 }
 """Which extra brings a package that a plain install does not have."""
 BROUGHT = (
-    *("OpenEXR", "OpenImageIO", "PIL", "numpy", "rich", "safetensors", "scipy", "skimage"),
-    *("torch", "trimesh", "warp", "yaml"),
+    *("OpenEXR", "OpenImageIO", "PIL", "colour", "numpy", "rich", "safetensors", "scipy"),
+    *("skimage", "torch", "trimesh", "warp", "yaml"),
 )
 """What a plain install brings, so that only a broken one lacks it."""
 

@@ -5,7 +5,10 @@ functions exist on purpose: the sRGB pair describes what files mean, the gamma 2
 DiPIR uses between the photograph and the renderer (`photo_lin = photo_srgb ** 2.2`).
 """
 
+import sys
+import warnings
 from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 
@@ -31,19 +34,19 @@ XYZ_TO_REC709 = np.array(
 
 
 INTEROP_SPACES = {
-    "lin_ap1_scene": (0.713, 0.293, 0.165, 0.83, 0.128, 0.044, 0.32168, 0.33767),
-    "lin_ap0_scene": (0.7347, 0.2653, 0.0, 1.0, 0.0001, -0.077, 0.32168, 0.33767),
-    "lin_rec2020_scene": (0.708, 0.292, 0.17, 0.797, 0.131, 0.046, 0.3127, 0.329),
-    "lin_p3d65_scene": (0.68, 0.32, 0.265, 0.69, 0.15, 0.06, 0.3127, 0.329),
-    "lin_adobergb_scene": (0.64, 0.33, 0.21, 0.71, 0.15, 0.06, 0.3127, 0.329),
+    "lin_ap1_scene": "ACEScg",
+    "lin_ap0_scene": "ACES2065-1",
+    "lin_rec2020_scene": "ITU-R BT.2020",
+    "lin_p3d65_scene": "P3-D65",
+    "lin_adobergb_scene": "Adobe RGB (1998)",
 }
-"""CIE xy of red, green, blue and white of the linear spaces that the OpenEXR attribute
-``colorInteropID`` names: ACEScg, ACES2065-1, Rec.2020, P3-D65, Adobe RGB (1998)."""
+"""Linear spaces of the OpenEXR attribute ``colorInteropID``, by colour-science's names."""
 
-BRADFORD = np.array(
-    [[0.8951, 0.2664, -0.1614], [-0.7502, 1.7135, 0.0367], [0.0389, -0.0685, 1.0296]]
-)
-"""CIE XYZ to the cone responses in which whites are adapted (Lam 1985; ICC.1, annex E)."""
+
+def chromaticities_of(space: str) -> tuple[float, ...]:
+    """Return CIE xy of red, green, blue and white of one of colour-science's RGB spaces."""
+    found = colour_science().RGB_COLOURSPACES[space]
+    return (*found.primaries.ravel().tolist(), *np.asarray(found.whitepoint).tolist())
 
 
 def are_primaries(chromaticities: Sequence[float]) -> bool:
@@ -63,20 +66,13 @@ def primaries_to_xyz(chromaticities: Sequence[float], white: Sequence[float]) ->
         white: CIE xy of the white that theirs is adapted to (Bradford), with Y = 1.
     """
     xy = np.asarray(chromaticities, np.float64).reshape(4, 2)
-    rgb, own = _xyz_of(xy[:3]).T, _xyz_of(xy[3]) / xy[3, 1]
-    adapted = _xyz_of(np.asarray(white, np.float64)) / white[1]
-    # Each primary as strong as it must be for all of them together to give their white (SMPTE
-    # RP 177), then the whites' cone responses divided.
-    to_xyz = rgb * np.linalg.solve(rgb, own)
-    cones = (BRADFORD @ adapted) / (BRADFORD @ own)
-    matrix: AnyFloatArray = np.linalg.solve(BRADFORD, cones[:, None] * BRADFORD) @ to_xyz
+    colour = colour_science()
+    to_xyz = colour.models.normalised_primary_matrix(xy[:3], xy[3])
+    adapt = colour.adaptation.matrix_chromatic_adaptation_VonKries(
+        colour.xy_to_XYZ(xy[3]), colour.xy_to_XYZ(np.asarray(white)), transform="Bradford"
+    )
+    matrix: AnyFloatArray = adapt @ to_xyz
     return matrix
-
-
-def _xyz_of(xy: AnyFloatArray) -> AnyFloatArray:
-    """Return the CIE xyz of chromaticities, whose sum is 1, shape [..., 2] to [..., 3]."""
-    xyz: AnyFloatArray = np.concatenate([xy, 1.0 - xy.sum(axis=-1, keepdims=True)], axis=-1)
-    return xyz
 
 
 def primaries_to_rec709(chromaticities: Sequence[float]) -> AnyFloatArray:
@@ -85,6 +81,23 @@ def primaries_to_rec709(chromaticities: Sequence[float]) -> AnyFloatArray:
         chromaticities, REC709_CHROMATICITIES[6:]
     )
     return matrix
+
+
+def colour_science() -> Any:
+    """Import colour-science, which takes a second, for the few files that need it.
+
+    Where Matplotlib is absent, colour-science leaves a mock of it in ``sys.modules``, and then
+    diffusers, which looks for Matplotlib, cannot be imported any more. So the mock is taken out.
+    """
+    plotting = {n: m for n, m in sys.modules.items() if n.split(".")[0] == "matplotlib"}
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # Matplotlib, which we do not need, is absent
+        import colour
+    for name in [n for n in sys.modules if n.split(".")[0] == "matplotlib"]:
+        if getattr(sys.modules[name], "__spec__", None) is None:
+            del sys.modules[name]
+    sys.modules.update({n: m for n, m in plotting.items() if n not in sys.modules})
+    return colour
 
 
 def luminance(rgb: AnyFloatArray) -> AnyFloatArray:

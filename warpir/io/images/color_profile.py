@@ -26,11 +26,7 @@ _D50_XYZ = (0.9642, 1.0, 0.8249)
 """The same in XYZ, with the digits of the ICC specification."""
 _MOST_CONDITION = 100.0
 """Of the matrix of a profile's primaries; sRGB has 4.3, ProPhoto RGB 1.8."""
-_CICP_PRIMARIES = {
-    1: color.REC709_CHROMATICITIES,
-    9: color.INTEROP_SPACES["lin_rec2020_scene"],
-    12: color.INTEROP_SPACES["lin_p3d65_scene"],
-}
+_CICP_PRIMARIES = {1: "ITU-R BT.709", 9: "ITU-R BT.2020", 12: "P3-D65"}
 _CICP_CURVES = {
     4: (2.2,),
     8: (1.0,),
@@ -70,8 +66,8 @@ def png_profile(path: Path, icc: bytes | None) -> tuple[bytes | None, list[str]]
         if primaries in _CICP_PRIMARIES and curve in _CICP_CURVES and not matrix and is_full:
             if (primaries, curve) == (1, 13):
                 return None, []
-            profile = matrix_profile(_CICP_PRIMARIES[primaries], _parametric(_CICP_CURVES[curve]))
-            return profile, []
+            xy = color.chromaticities_of(_CICP_PRIMARIES[primaries])
+            return matrix_profile(xy, _parametric(_CICP_CURVES[curve])), []
         return icc, [f"cICP {primaries},{curve},{matrix},{is_full} of the header is not followed"]
     if icc is not None or b"sRGB" in chunks:
         return icc, []

@@ -51,7 +51,7 @@ def stated_primaries(
         with suppress(ValueError):
             stated = [float(number) for number in lines[-1].split()]
     elif stated is None and space in color.INTEROP_SPACES:
-        stated = color.INTEROP_SPACES[space]
+        stated = color.chromaticities_of(color.INTEROP_SPACES[space])
     elif stated is None:
         is_ours = space in ("", "unknown", "data", "lin_rec709_scene")
         return None, [] if is_ours else [f"colour space {space} is not followed"]
