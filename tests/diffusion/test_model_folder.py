@@ -361,6 +361,15 @@ for case, name, values, words in (
     ("prediction-list", "scheduler/scheduler_config.json", {"prediction_type": []}, "[]"),
 ):
     fault(f"L5-{case}", words)(config_of(name, **values))
+for case, name, values, words in (
+    ("unet-activation", "unet/config.json", {"act_fn": "snake"}, "act_fn 'snake'"),
+    ("vae-activation", "vae/config.json", {"act_fn": []}, "act_fn []"),
+    ("text-activation", "text_encoder/config.json", {"hidden_act": "x"}, "hidden_act 'x'"),
+):
+    fault(f"N12-{case}", words)(config_of(name, **values))
+fault("N12-tokens", "tokenizer", "tokens (expected")(
+    text_in("tokenizer/added_tokens.json", json.dumps({f"<{i}>": 2**20 + i for i in range(999)}))
+)
 
 
 @pytest.mark.parametrize("case", FAULTS)
