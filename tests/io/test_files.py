@@ -8,7 +8,6 @@ import signal
 import subprocess
 import sys
 from collections.abc import Callable
-from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -62,32 +61,6 @@ def test_results_are_not_overwritten_unless_asked(tmp_path: Path) -> None:  # F5
     assert sha256s(tmp_path / "out") == before
     write_small(tmp_path / "out", seed=1, overwrite=True)
     assert sha256s(tmp_path / "out") != before
-
-
-@pytest.mark.case("N8")
-def test_previews_beside_an_old_result_wait_for_the_new_one(tmp_path: Path) -> None:
-    """An overwriting run that stops leaves the old previews; a whole one replaces them."""
-    codes = np.zeros((2, 3, 3), np.uint8)
-
-    def run(steps: tuple[int, ...], level: int, is_whole: bool = True) -> None:
-        with suppress(KeyboardInterrupt), OutputFolder(tmp_path, overwrite=True) as folder:
-            for step in steps:
-                assert folder.write_preview(step, codes + np.uint8(level)).is_file()
-            if not is_whole:
-                raise KeyboardInterrupt
-            folder.write_json("run.json", {})
-
-    def shown() -> dict[str, bytes]:
-        return {p.name: p.read_bytes() for p in (tmp_path / "progress").iterdir()}
-
-    run((0, 50), 1)
-    old = shown()
-    assert sorted(old) == ["preview-000000.png", "preview-000050.png"]
-    run((0,), 2, is_whole=False)
-    assert shown() == old and (tmp_path / "run.json").exists()
-    run((0,), 2)
-    assert list(shown()) == ["preview-000000.png"] and shown()["preview-000000.png"] != old
-    assert not list(tmp_path.glob(".partial-*"))
 
 
 def test_overwriting_takes_away_what_the_old_run_wrote_and_nothing_else(tmp_path: Path) -> None:

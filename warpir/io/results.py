@@ -190,10 +190,7 @@ class OutputFolder:
         self.write_bytes(name, writers.png_bytes(codes, icc, mark, description))
 
     def write_preview(self, step: int, codes: PixelArray, icc: bytes | None = None) -> Path:
-        """Write a picture of the way to the result, at once.
-
-        It goes into ``progress/``, unless the folder holds a whole result: then it is staged, since
-        nothing beside an old result may change before the new one is whole.
+        """Write a picture of the way to the result, at once and outside of what is staged.
 
         Args:
             step: Of the optimisation; 0 is its start.
@@ -201,13 +198,12 @@ class OutputFolder:
             icc: Profile the codes are in.
 
         Returns:
-            The file; never seen half written.
+            The file, in ``progress/``; never seen half written.
 
         Raises:
             InputError: The disk is full or the folder is not writable (exit 5).
         """
-        folder = self.staging if (self.path / _RUN_JSON).exists() else self.path
-        path = folder / "progress" / f"preview-{step:06d}.png"
+        path = self.path / "progress" / f"preview-{step:06d}.png"
         staged = self.staging / path.name
         try:
             path.parent.mkdir(exist_ok=True)
@@ -337,7 +333,6 @@ class OutputFolder:
             for folder in {(self.staging / name).parent for name in names} | {self.staging}:
                 sync(folder)
             self._put_in_place(names, leftover)
-            self._put_previews_in_place()
         except OSError as error:
             raise disk_error(self.path / "results", error) from error
         for folder in self._superseded:
@@ -362,16 +357,6 @@ class OutputFolder:
             sync(folder)
         os.replace(self.staging / _RUN_JSON, self.path / _RUN_JSON)
         sync(self.path)
-
-    def _put_previews_in_place(self) -> None:
-        """Replace the old run's previews by those that were staged."""
-        staged, shown = self.staging / "progress", self.path / "progress"
-        if not staged.is_dir():
-            return
-        remove_unfinished(shown)
-        shown.mkdir(exist_ok=True)
-        for preview in staged.iterdir():
-            os.replace(preview, shown / preview.name)
 
     def _remove_staging(self) -> None:
         """Remove what was staged, here or by a killed run, and what of it is half in place."""
