@@ -1,0 +1,127 @@
+"""The nodes for ComfyUI, loaded as ComfyUI loads custom nodes, and called as it calls them."""
+
+import importlib.util
+import json
+import sys
+from pathlib import Path
+from types import ModuleType
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from PIL import Image
+
+from tests.builders.insertions import write_inputs
+from warpir.core.errors import InputError
+
+FOLDER = Path(__file__).resolve().parents[2] / "integrations/comfyui"
+OWN = {"LoadImage": ("IMAGE", "MASK"), "PreviewImage": (), "SaveImage": ()}
+"""ComfyUI's own nodes in the example, and what they return."""
+
+
+@pytest.fixture(scope="module")
+def nodes() -> ModuleType:
+    """The folder, under a name that is its path, as ComfyUI's loader has it."""
+    name = str(FOLDER).replace(".", "_x_")
+    spec = importlib.util.spec_from_file_location(name, FOLDER / "__init__.py")
+    assert spec is not None and spec.loader is not None
+    module = importlib.util.module_from_spec(spec)
+    sys.modules[name] = module
+    spec.loader.exec_module(module)
+    return module
+
+
+@pytest.fixture(autouse=True)
+def temporary(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Results are written here."""
+    monkeypatch.setattr("tempfile.tempdir", str(tmp_path))
+
+
+def called(nodes: ModuleType, name: str, **inputs: Any) -> tuple[Any, ...]:
+    kind = nodes.NODE_CLASS_MAPPINGS[name]
+    result: tuple[Any, ...] = getattr(kind(), kind.FUNCTION)(**inputs)
+    assert len(result) == len(kind.RETURN_TYPES)
+    types = {"FLOAT": float, "STRING": str, "IMAGE": torch.Tensor, "MASK": torch.Tensor}
+    for value, stated in zip(result, kind.RETURN_TYPES, strict=True):
+        assert isinstance(value, types[stated]), (value, stated)
+        if stated == "IMAGE":
+            assert value.dtype == torch.float32 and value.ndim == 4 and value.shape[3] == 3
+    return result
+
+
+def image_of(path: Path) -> torch.Tensor:
+    with Image.open(path) as picture:
+        return torch.from_numpy(np.asarray(picture.convert("RGB"), np.float32) / 255.0)[None]
+
+
+def test_nodes_state_what_comfyui_asks_for(nodes: ModuleType) -> None:
+    assert set(nodes.NODE_CLASS_MAPPINGS) == set(nodes.NODE_DISPLAY_NAME_MAPPINGS)
+    for kind in nodes.NODE_CLASS_MAPPINGS.values():
+        assert kind.CATEGORY == "warpir" and callable(getattr(kind, kind.FUNCTION))
+        assert len(kind.RETURN_TYPES) == len(kind.RETURN_NAMES) == len(kind.OUTPUT_TOOLTIPS)
+        groups = kind.INPUT_TYPES()
+        assert set(groups) <= {"required", "optional"}
+        for _, about in (entry for group in groups.values() for entry in group.values()):
+            assert about["tooltip"]
+
+
+def test_example_fits_the_nodes(nodes: ModuleType) -> None:
+    """Each link carries what its input takes, and nothing that is required is missing."""
+    graph = json.loads((FOLDER / "insert_object.json").read_text())
+    known = nodes.NODE_CLASS_MAPPINGS
+    for node in graph.values():
+        if node["class_type"] in OWN:
+            continue
+        groups = known[node["class_type"]].INPUT_TYPES()
+        stated = {**groups["required"], **groups.get("optional", {})}
+        assert set(groups["required"]) <= set(node["inputs"]) <= set(stated)
+        for name, value in node["inputs"].items():
+            if isinstance(value, list):
+                source = graph[value[0]]["class_type"]
+                returned = OWN.get(source) or known[source].RETURN_TYPES
+                assert returned[value[1]] == stated[name][0]
+
+
+def test_camera_and_light_are_estimated(nodes: ModuleType) -> None:
+    import warpir.demo
+
+    photo = image_of(Path(warpir.demo.__file__).parent / "photo.png")[:, ::4, ::4]
+    pitch, roll, vfov, horizon, summary = called(nodes, "WarpirEstimateCamera", image=photo)
+    assert -12.0 < pitch < 4.0 and abs(roll) < 3.0 and 20.0 < vfov < 45.0 and 0.2 < horizon < 0.6
+    assert "+-" in summary
+    light, _, _, azimuth, elevation, spread, numbers = called(
+        nodes, "WarpirEstimateLight", image=photo
+    )
+    assert Path(light).is_file() and json.loads(numbers)["elevation_deg"] == elevation
+    assert -180.0 <= azimuth <= 180.0 and 10.0 < elevation < 70.0 and 0.0 < spread < 60.0
+
+
+def test_object_is_inserted(nodes: ModuleType, tmp_path: Path) -> None:
+    write_inputs(tmp_path)
+    photo = image_of(tmp_path / "photo.png")
+    occluder = torch.zeros(photo.shape[:3])
+    composite, mask, alone, shadow, light, folder = called(
+        nodes,
+        "WarpirInsertObject",
+        image=photo,
+        asset=str(tmp_path / "box.obj"),
+        light=str(tmp_path / "sky.hdr"),
+        at_x=0.5,
+        at_y=0.7,
+        occluder=occluder,
+        size=0.4,
+        samples=4,
+    )
+    assert composite.shape == alone.shape == shadow.shape == photo.shape
+    assert mask.shape == photo.shape[:3] and 0.0 < float(mask.mean()) < 0.5
+    untouched = (mask == 0.0) & (shadow == 1.0).all(dim=-1)
+    assert untouched.any() and torch.equal(composite[untouched], photo[untouched])
+    assert (Path(folder) / "report.html").is_file() and Path(light).is_file()
+
+
+def test_missing_asset_is_named(nodes: ModuleType) -> None:
+    with pytest.raises(InputError, match=r"nowhere\.glb"):
+        called(
+            nodes, "WarpirInsertObject", image=torch.full((1, 40, 60, 3), 0.5), asset="nowhere.glb"
+        )
