@@ -22,7 +22,8 @@ from warpir.core.arrays import FloatArray, PixelArray
 from warpir.core.errors import ExitCode, InputError
 from warpir.core.limits import LIMITS
 from warpir.io.images.headers import exposure, header_notices, stated_primaries
-from warpir.io.images.kinds import KINDS, check_regular_file, sniff
+from warpir.io.images.kinds import KINDS, check_regular_file, check_scans, sniff
+from warpir.io.images.tiff import check_tiff, tiff_codes
 
 _LOG = logging.getLogger(__name__)
 
@@ -74,7 +75,7 @@ def decode_image(
         what = f"not of a kind that can be used here (found {kind}; expected {' or '.join(kinds)})"
         raise InputError(path, what, reason="image.kind", found=kind)
     if kind == "jpeg":
-        _check_scans(path)
+        check_scans(path)
     file = _File(path, kind, max_pixels, flag)
     # 64 bytes a pixel leave room for EXR layers; sizes are compared exactly below.
     with _opened(file, 64, {"oiio:UnassociatedAlpha": 1}) as reader:
@@ -90,12 +91,7 @@ def decode_image(
         notices = header_notices(spec, kind, head)
         notices += _check_parts(path, reader, specs, part, kind)
     pixels = np.asarray(pixels).reshape(spec.height, spec.width, last - first)
-    if kind == "tiff":
-        pixels = _tiff_codes(path, spec, pixels)
-    if kind == "exr":
-        pixels = _place_in_display_window(pixels, spec)
-    if kind == "hdr":
-        pixels = pixels / np.float32(exposure(path, head))
+    pixels = _as_the_file_means(pixels, path, kind, spec, head)
     primaries = None
     if pixels.dtype.kind == "f":
         primaries, unknown = stated_primaries(spec, kind, head)
@@ -110,6 +106,19 @@ def decode_image(
         focal_35mm=_focal_35mm(spec),
         notices=tuple(notices),
     )
+
+
+def _as_the_file_means(
+    pixels: PixelArray, path: Path, kind: str, spec: Any, head: bytes
+) -> PixelArray:
+    """Return what OpenImageIO leaves undone: TIFF codes, an EXR's window, the exposure of HDR."""
+    if kind == "tiff":
+        return tiff_codes(path, spec, pixels)
+    if kind == "exr":
+        return _place_in_display_window(pixels, spec)
+    if kind == "hdr":
+        return np.asarray(pixels / np.float32(exposure(path, head)))
+    return pixels
 
 
 def read_exr_header(path: Path, names: Sequence[str]) -> dict[str, Any]:
@@ -198,17 +207,6 @@ class _File:
         )
 
 
-_FOREIGN_TIFF = {
-    4: "a transparency mask",
-    32803: "a colour filter array (camera raw)",
-    34892: "linear raw values (camera raw)",
-    51177: "a depth map",
-    52527: "a photometric mask",
-}
-"""What PhotometricInterpretation says of files that OpenImageIO reads as if they were pictures."""
-_WHITE_IS_ZERO, _PALETTE = 0, 3
-_MOST_SCANS = 100
-"""Scans of a JPEG; encoders write about 10, and each of them costs a pass over the picture."""
 _ARTICLES = {"exr": "an EXR", "hdr": "a Radiance HDR", "jpeg": "a JPEG", "png": "a PNG"}
 _ARTICLES |= {"tiff": "a TIFF", "webp": "a WebP"}
 
@@ -319,59 +317,7 @@ def _check_spec(path: Path, spec: Any) -> None:
             reason="image.variant",
             found=str(spec.format),
         )
-    photometric = spec.get_int_attribute("tiff:PhotometricInterpretation", 2)
-    if found := _FOREIGN_TIFF.get(photometric):
-        advice = "save it as RGB or greyscale"
-        what = f"a TIFF of {found}, not a picture"
-        raise InputError(path, what, advice, reason="image.variant", found=found)
-    if "LAB" in str(spec.getattribute("tiff:ColorSpace") or "").upper():
-        what = "CIE Lab images are not supported"
-        raise InputError(path, what, "save it as RGB", reason="image.variant", found="Lab")
-
-
-def _check_scans(path: Path) -> None:
-    """Refuse a JPEG of so many scans that it takes minutes to decode.
-
-    Within a scan's data a byte of 255 is followed by a zero (ITU-T T.81, B.1.1.5), so what is
-    counted are markers, those of an embedded thumbnail too.
-    """
-    scans, last = 0, b""
-    with path.open("rb") as stream:
-        while block := stream.read(1 << 20):
-            scans += (last + block).count(b"\xff\xda")
-            last = block[-1:]
-    if scans > _MOST_SCANS:
-        what = f"a JPEG of too many scans (found {scans}; limit {_MOST_SCANS})"
-        raise InputError(path, what, "save it anew", reason="image.scans", found=scans)
-
-
-def _tiff_codes(path: Path, spec: Any, pixels: PixelArray) -> PixelArray:
-    """Return what OpenImageIO leaves undone: deep TIFFs whose zero is white, palettes of 8 bits.
-
-    Raises:
-        InputError: The palette's entries have 8 bits, of which OpenImageIO takes the upper 8 of 16.
-    """
-    photometric = spec.get_int_attribute("tiff:PhotometricInterpretation", 2)
-    if photometric == _WHITE_IS_ZERO and pixels.dtype == np.uint16:
-        inverted: PixelArray = np.iinfo(np.uint16).max - pixels
-        return inverted
-    if photometric == _PALETTE and not pixels.any() and (entries := _palette(path)):
-        if 0 < max(entries) < 256:
-            what = "a palette whose entries have 8 bits, not 16"
-            raise InputError(path, what, "save it as RGB", reason="image.variant", found="palette")
-    return pixels
-
-
-def _palette(path: Path) -> tuple[int, ...]:
-    """Return the entries of a TIFF's ColorMap; none where they cannot be read."""
-    from PIL import Image, TiffImagePlugin
-
-    try:
-        with Image.open(path) as picture:
-            assert isinstance(picture, TiffImagePlugin.TiffImageFile)
-            return tuple(picture.tag_v2.get(TiffImagePlugin.COLORMAP, ()))
-    except (OSError, ValueError, SyntaxError, Image.DecompressionBombError):
-        return ()
+    check_tiff(path, spec)
 
 
 def _choose_channels(

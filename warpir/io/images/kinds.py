@@ -8,6 +8,8 @@ from warpir.core.errors import InputError
 
 KINDS = ("jpeg", "png", "tiff", "webp", "exr", "hdr")
 """Kinds that are read."""
+_MOST_SCANS = 100
+"""Scans of a JPEG; encoders write about 10, and each of them costs a pass over the picture."""
 
 
 def check_regular_file(path: Path) -> int:
@@ -70,6 +72,25 @@ def sniff(path: Path) -> tuple[str, bytes]:
         reason="image.kind",
         found=found,
     )
+
+
+def check_scans(path: Path) -> None:
+    """Refuse a JPEG of so many scans that it takes minutes to decode.
+
+    Within a scan's data a byte of 255 is followed by a zero (ITU-T T.81, B.1.1.5), so what is
+    counted are markers, those of an embedded thumbnail too.
+
+    Raises:
+        InputError: More than `_MOST_SCANS`.
+    """
+    scans, last = 0, b""
+    with path.open("rb") as stream:
+        while block := stream.read(1 << 20):
+            scans += (last + block).count(b"\xff\xda")
+            last = block[-1:]
+    if scans > _MOST_SCANS:
+        what = f"a JPEG of too many scans (found {scans}; limit {_MOST_SCANS})"
+        raise InputError(path, what, "save it anew", reason="image.scans", found=scans)
 
 
 _FOREIGN_KINDS = {
