@@ -211,6 +211,7 @@ def test_shipped_network_is_unsure_of_a_fisheye_picture() -> None:
     photo = np.where(radius < 1.0, photo, 0.0)
     found = estimate_camera(np.repeat(photo[..., None], 3, axis=2).astype(np.float32))
     assert found.pitch_sigma_deg > 8.0 and found.vfov_sigma_deg > 18.0
+    assert not found.is_upright_corrected
 
 
 def test_axis_near_the_middle_is_the_middle_and_the_horizon_stays() -> None:

@@ -182,11 +182,9 @@ def test_material_extension_is_stated(name: str) -> None:
     assert written["extensionsUsed"] == [name]
 
 
-@pytest.mark.parametrize("name", EXTENDED)
+@pytest.mark.parametrize("name", sorted(EXTENDED.keys() & HONOURED))
 def test_material_extension_reads_back(name: str, tmp_path: Path) -> None:
     """What our reader knows of an extension is what was written."""
-    if name not in HONOURED:
-        pytest.skip(f"the reader leaves {name} out")
     asset = extended(EXTENDED[name][0])
     assert_same_slots(asset, read_back(tmp_path, write_glb(asset, IDENTITY)))
 

@@ -12,9 +12,11 @@ from numpy.typing import NDArray
 from tests.builders.insertions import read_layers
 from tests.builders.programs.browser import Fingers, Opened, needs_chromium, open_browser
 from tests.builders.programs.placing import (
+    EXACT,
     FOOT_ON_CANVAS,
     HEIGHT,
     STATE,
+    TILTED,
     WIDTH,
     command,
     drag,
@@ -25,14 +27,9 @@ from tests.builders.programs.placing import (
 )
 from warpir.core.errors import ExitCode
 from warpir.io.assets import load_asset
-from warpir.place.stance import Stance, stance_of
+from warpir.place.stance import stance_of
 from warpir.scene.camera import Camera, camera_from_fov, ground_point
 from warpir.scene.placement import place_asset
-
-EXACT = 1e-9
-"""Float64 on both sides, a few dozen operations on numbers up to 1000."""
-TILTED = Stance(0.4, 1.7, -0.3, 25.0, -11.0, 6.0)
-"""A camera that is level in nothing."""
 
 
 def drag_away_and_back(opened: Opened, selector: str) -> None:

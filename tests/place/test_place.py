@@ -9,10 +9,7 @@ import numpy as np
 import pytest
 import trimesh
 
-from tests.builders.programs.placing import (
-    HEIGHT,
-    WIDTH,
-)
+from tests.builders.programs.placing import EXACT, HEIGHT, TILTED, WIDTH
 from warpir.app.config import InsertConfig
 from warpir.core.errors import ExitCode, InputError
 from warpir.io.assets import load_asset
@@ -27,11 +24,6 @@ from warpir.place.session import (
 from warpir.place.stance import Stance, ground_to_world, stance_of
 from warpir.scene.camera import Camera, CameraEstimate, camera_from_fov
 from warpir.scene.placement import place_asset
-
-EXACT = 1e-9
-"""Float64 on both sides, a few dozen operations on numbers up to 1000."""
-TILTED = Stance(0.4, 1.7, -0.3, 25.0, -11.0, 6.0)
-"""A camera that is level in nothing."""
 
 # What is sent for a placement, from what the page starts with.
 SAID = {"sun": [-40, 50, 8], "sky": "clear"}

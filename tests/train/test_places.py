@@ -112,14 +112,20 @@ def test_a_panorama_is_judged_by_the_networks_that_have_not_learned_from_it(
     paths = []
     for k in range(3):
         paths.append(tmp_path / f"{k}.safetensors")
-        record = {"panoramas": ["all", f"p{k}"], "started_from": {"panoramas": ["old"]}}
+        two = ["two"] if k < 2 else []
+        record = {"panoramas": ["all", f"p{k}", *two], "started_from": {"panoramas": ["old"]}}
         save_regressor(random_regressor(k, SMALL), paths[-1], record)
     joined = join_members(paths, tmp_path / "joined.safetensors")
     joined.record = load_regressor(tmp_path / "joined.safetensors").record
+    joined.temperature.fill_(0.5)
     assert unseen_by(joined, "new") is joined
     assert unseen_by(joined, "old") is None and unseen_by(joined, "all") is None
     part = unseen_by(joined, "p1")
     assert part is not None and len(part.members) == part.config.members == 2
+    assert float(part.temperature) == 0.5  # that of the mean
+    single = unseen_by(joined, "two")
+    assert single is not None and len(single.members) == 1
+    assert float(single.temperature) == 1.0  # a network's own is in its logits
     photo, rays = torch.rand(1, 3, 96, 144), torch.zeros(1, 3, 96, 144)
     alone = [load_regressor(paths[k]).predict(photo, rays).level for k in (0, 2)]
     torch.testing.assert_close(part.predict(photo, rays).level, sum(alone) / 2.0)

@@ -27,6 +27,7 @@ from warpir.render.bad_pixels import BadPixels, all_finite, first_bad_sample_of
 from warpir.render.device import Launcher, Rows
 from warpir.render.device_scene import Scene
 from warpir.scene.camera import Camera
+from warpir.scene.placement import box_corners
 from warpir.scene.tone_curves import ToneKnots
 
 FULL_THREADS = 1 << 18
@@ -206,9 +207,7 @@ class Renderer(Launcher):
 
     def candidate_pixels(self, camera: Camera) -> IntArray:
         """Return a superset of the object's pixels by its bounding box, row-major."""
-        low, high = self.scene.bounds
-        corners = np.array(np.meshgrid(*zip(low, high, strict=True))).reshape(3, -1).T
-        uv = camera.project(corners)
+        uv = camera.project(box_corners(*self.scene.bounds))
         if np.isnan(uv).any():
             left, top, right, bottom = 0, 0, camera.width, camera.height
         else:

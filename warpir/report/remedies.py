@@ -104,8 +104,10 @@ def _camera(asked: Mapping[str, Any], measured: Mapping[str, Any]) -> Iterator[R
     fault = "The object tilts out of the photo's perspective"
     if asked["pitch"] is None:
         axis = numbers.get("principal", {}).get("value", (0.5, 0.5))[1]
-        angles = math.radians(pitch["value"]), math.radians(vfov["value"]) / 2.0
-        row = axis + math.tan(angles[0]) / (2.0 * math.tan(angles[1]))
+        roll = numbers.get("roll_deg", {}).get("value", 0.0)
+        angles = (math.radians(degrees) for degrees in (pitch["value"], vfov["value"] / 2.0, roll))
+        up, half, turn = (math.tan(next(angles)), math.tan(next(angles)), math.cos(next(angles)))
+        row = axis + up / (2.0 * half * turn)
         about = "height of the horizon in the photo, 0 at its top, 1 at its bottom; here "
         yield Remedy(fault, again(asked, horizon=round(row, 3)), f"{about}{row:.2f}")
     else:

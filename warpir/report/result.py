@@ -9,7 +9,7 @@ import numpy as np
 
 from warpir.app.record import config_of_picture
 from warpir.app.run import Run
-from warpir.core.arrays import CodeArray, Float64Array, FloatArray
+from warpir.core.arrays import CodeArray, FloatArray
 from warpir.core.progress import progress_bar
 from warpir.io.curves_file import curves_to_json
 from warpir.io.export import OBJECT, write_hand_off
@@ -33,6 +33,7 @@ from warpir.report.page import Results
 from warpir.report.viewer import VIEWER, viewer_page
 from warpir.scene.camera import Camera
 from warpir.scene.light import LightSummary, summarize
+from warpir.scene.placement import box_corners
 from warpir.scene.tone_curves import ToneKnots
 
 PREVIEW_SAMPLES = 16
@@ -99,7 +100,7 @@ def _look(run: Run, light: SceneLight) -> CameraLook:
     photo, asked = run.inputs.photo, run.config.look
     inputs = run.inputs
     to_world = inputs.placement.asset_to_world
-    world = corners_of(*inputs.asset.bounds()) @ to_world[:3, :3].T + to_world[:3, 3]
+    world = box_corners(*inputs.asset.bounds()) @ to_world[:3, :3].T + to_world[:3, 3]
     around = region_around(inputs.camera.project(world), photo.srgb.shape[0], photo.srgb.shape[1])
     response = asked.response
     is_shown = light.curves.tone == "reinhard" or not light.curves.foreground.is_identity
@@ -110,12 +111,6 @@ def _look(run: Run, light: SceneLight) -> CameraLook:
     if "auto" in words:
         run.log.assume(*look.lines())
     return look
-
-
-def corners_of(low: Float64Array, high: Float64Array) -> Float64Array:
-    """Return the corners of a box, shape [8, 3]."""
-    corners: Float64Array = np.stack(np.meshgrid(*zip(low, high, strict=True)), axis=-1)
-    return corners.reshape(-1, 3)
 
 
 def _picture(
@@ -290,7 +285,7 @@ def _write_viewer(run: Run, light: SceneLight, maps: Maps, picture: Picture) -> 
     """Write the page that shows the object on the photo in 3D."""
     inputs, output = run.inputs, run.output
     to_world = inputs.placement.asset_to_world
-    corners = corners_of(*inputs.asset.bounds()) @ to_world[:3, :3].T + to_world[:3, 3]
+    corners = box_corners(*inputs.asset.bounds()) @ to_world[:3, :3].T + to_world[:3, 3]
     page = viewer_page(
         (output.staging / OBJECT).read_bytes(),
         (corners.min(axis=0), corners.max(axis=0)),

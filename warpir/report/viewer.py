@@ -170,4 +170,4 @@ def _three() -> dict[str, str]:
 
 def _packed(content: bytes) -> str:
     """Return bytes compressed with zlib, in base64."""
-    return base64.b64encode(zlib.compress(content, 9)).decode()
+    return base64.b64encode(zlib.compress(content)).decode()

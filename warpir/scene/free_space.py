@@ -13,7 +13,7 @@ import numpy as np
 from warpir.core.arrays import BoolArray, Float64Array
 from warpir.core.errors import InputError
 from warpir.scene.camera import Camera
-from warpir.scene.placement import DEFAULT_STAND, Placement, point_on_ground
+from warpir.scene.placement import DEFAULT_STAND, Placement, box_corners, point_on_ground
 
 Place = tuple[float, float, float]
 
@@ -192,8 +192,7 @@ class _Box:
     def __init__(
         self, asset_to_world: Float64Array, low: Float64Array, high: Float64Array, camera: Camera
     ) -> None:
-        corners = np.stack(np.meshgrid(*zip(low, high, strict=True)), axis=-1).reshape(-1, 3)
-        world = corners @ asset_to_world[:3, :3].T + asset_to_world[:3, 3]
+        world = box_corners(low, high) @ asset_to_world[:3, :3].T + asset_to_world[:3, 3]
         self.camera = camera
         self.pixels = camera.project(world)
         self.depth = float(_depths(world, camera).min())

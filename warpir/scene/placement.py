@@ -103,7 +103,7 @@ def place_asset(
     asset_to_world = _standing(low, high, scale, rotation, stand)
     shown = " x ".join(f"{scale * side:.3g}" for side in high - low)
     where = "--at" if place is None else "--place"
-    seen, cut = _check_in_view(where, shown, _corners(low, high), asset_to_world, camera)
+    seen, cut = _check_in_view(where, shown, box_corners(low, high), asset_to_world, camera)
     warnings += cut
     away = float(np.linalg.norm(stand - origin))
     summary = f"the object of {shown} m stands {away:.3g} m from the camera, {seen}"
@@ -338,7 +338,8 @@ def turn(axis: Float64Array, angle: float) -> Float64Array:
     return rotation
 
 
-def _corners(low: Float64Array, high: Float64Array) -> Float64Array:
+def box_corners(low: Float64Array, high: Float64Array) -> Float64Array:
+    """Return the corners of a box, the lowest first and the highest last, shape [8, 3]."""
     return np.array(
         [[x, y, z] for x in (low[0], high[0]) for y in (low[1], high[1]) for z in (low[2], high[2])]
     )

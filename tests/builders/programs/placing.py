@@ -10,9 +10,14 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from tests.builders.programs.browser import Opened
+from warpir.place.stance import Stance
 
 WIDTH, HEIGHT = 480, 320
 """Size of the photo of the tests [px]."""
+EXACT = 1e-9
+"""Float64 on both sides, a few dozen operations on numbers up to 1000."""
+TILTED = Stance(0.4, 1.7, -0.3, 25.0, -11.0, 6.0)
+"""A camera that is level in nothing."""
 STATE = "import('./page.js').then((m) => m.state)"
 """The page's state, for `Page.evaluate`."""
 FOOT_ON_CANVAS = """import('./page.js').then(async ({ stage, state }) => {
