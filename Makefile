@@ -8,7 +8,7 @@ VENV := .venv
 BIN := $(VENV)/bin
 STAMP := $(VENV)/.installed
 
-.PHONY: demo test lint types clean
+.PHONY: demo test lint types clean blender-extension
 
 demo: $(STAMP)
 	$(BIN)/python -m warpir.insert --demo --out out/demo --overwrite
@@ -24,6 +24,13 @@ lint: $(STAMP)
 # warpir/ with the mapped packages and checks only a part of them.
 types: $(STAMP)
 	.ci/check-wheel types
+
+# One zip, without Blender; `blender --command extension build` in that folder makes its like.
+DIST ?= dist
+blender-extension:
+	mkdir -p $(DIST)
+	cd integrations/blender && $(PYTHON) -m zipfile -c $(abspath $(DIST))/warpir_blender.zip \
+		blender_manifest.toml *.py
 
 $(STAMP): pyproject.toml constraints.txt
 	test -x $(BIN)/python || $(PYTHON) -m venv $(VENV)

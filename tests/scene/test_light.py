@@ -24,6 +24,7 @@ from warpir.lighting.fit import LAMP_COUNT_MAX, fit_lobes
 from warpir.lighting.scene_light import SKIES, SUN_TO_SKY, SceneLight, make_light
 from warpir.render.device_light import light_args
 from warpir.scene.asset import Asset, Material
+from warpir.scene.lamps import LAMP_RADIUS_DEG, suns_of
 from warpir.scene.light import (
     Light,
     Lobes,
@@ -605,3 +606,35 @@ def test_fit_lobes_replaces_the_panorama() -> None:
     assert len(made.light.lobes.sharpness) == 16
     assert made.fit is not None and made.fit.irradiance_error < 0.05
     assert float(reinhard(ground_level(made.light, 0.25))) == pytest.approx(0.2, rel=1e-3)
+
+
+@pytest.mark.parametrize("height", [256, 1024])
+def test_suns_and_the_map_without_them_are_the_same_light(height: int) -> None:
+    """Two lamps on a sky with a horizon: directions, widths, and irradiance of every normal."""
+    axes = np.array([axis_from_angles(40.0, 50.0), axis_from_angles(-100.0, 20.0)])
+    lobes = Lobes(
+        np.array([[900.0, 700.0, 500.0], [200.0, 300.0, 400.0]], np.float32),
+        axes.astype(np.float32),
+        np.array([4000.0, 2000.0], np.float32),
+    )
+    sky = plain_sky((0.4, 0.6, 1.0), (0.2, 0.15, 0.1))
+    sky = np.broadcast_to(np.repeat(sky, height // sky.shape[0], 0)[:, :1], (height, 2 * height, 3))
+    texels = as_map(Light(lobes, np.array(sky, np.float32)), height)
+    suns = sorted(suns_of(texels), key=lambda sun: -sun.irradiance[0])
+    np.testing.assert_allclose([sun.axis for sun in suns], axes, atol=2e-3)
+    np.testing.assert_allclose([sun.irradiance for sun in suns], lobes.flux(), rtol=0.02)
+    # A disc of the lobes' mean 1 - cos, 1 / sharpness
+    spread = 1.0 - np.cos(0.5 * np.array([sun.angle for sun in suns]))
+    np.testing.assert_allclose(spread / 2.0, 1.0 / lobes.sharpness, rtol=0.1)
+    rest, directions = texels.copy(), map_directions(height, 2 * height)
+    for sun in suns:
+        rest[directions @ sun.axis > np.cos(np.radians(LAMP_RADIUS_DEG))] = sun.behind
+    assert rest.max() < 1.5
+    for normal in np.array([[0.0, 1.0, 0.0], [0.6, 0.0, -0.8], *axes]):
+        from_suns = sum(max(float(sun.axis @ normal), 0.0) * sun.irradiance for sun in suns)
+        split = Light(texels=rest).irradiance(normal) + from_suns
+        np.testing.assert_allclose(split, Light(texels=texels).irradiance(normal), rtol=0.01)
+
+
+def test_an_even_sky_has_no_suns() -> None:
+    assert suns_of(np.ones((32, 64, 3), np.float32)) == []

@@ -39,14 +39,25 @@ class Log:
 
 
 @contextmanager
-def progress_bar() -> Iterator[Callable[[str, float], None]]:
-    """Show the stages of a render on a terminal; nothing where output is not one.
+def progress_bar(say: Callable[[str], None]) -> Iterator[Callable[[str, float], None]]:
+    """Show the stages of a render: bars on a terminal, now and then a line where there is none.
+
+    Args:
+        say: Prints a line.
 
     Yields:
         A function to be called with a stage's name and the share of it that is done.
     """
     if not sys.stderr.isatty():
-        yield lambda stage, share: None
+        last_line = time.monotonic()
+
+        def report_line(stage: str, share: float) -> None:
+            nonlocal last_line
+            if stage and time.monotonic() - last_line >= LINE_SECONDS:
+                last_line = time.monotonic()
+                say(f"{stage}: {100.0 * share:.0f} of 100 %")
+
+        yield report_line
         return
     from rich.console import Console
     from rich.progress import Progress

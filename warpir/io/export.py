@@ -6,6 +6,8 @@ and refer to each other by bare names, so that the folder can be moved or handed
 
 from __future__ import annotations
 
+import math
+from collections.abc import Sequence
 from importlib.resources import files
 from string import Template
 from typing import Any
@@ -21,6 +23,7 @@ from warpir.io.layers import HALF_MAX
 from warpir.io.results import OutputFolder
 from warpir.scene.asset import Asset
 from warpir.scene.camera import Camera, blender_camera, square_pixel_error
+from warpir.scene.lamps import LAMP_RADIUS_DEG, Sun, suns_of
 from warpir.scene.placement import Placement, y_to
 from warpir.scene.tone_curves import Curves, ToneKnots
 
@@ -34,6 +37,9 @@ GROUND_SIDES = 40.0
 """Side of Blender's ground, in diagonals of the object."""
 SQUARE_ENOUGH = 0.5
 """How far rows may be off in a tool that knows square pixels only, before it is said [px]."""
+
+TO_Z_UP = np.array([[1, 0, 0, 0], [0, 0, -1, 0], [0, 1, 0, 0], [0, 0, 0, 1]], np.float64)
+"""Blender's world from ours, column vectors."""
 
 
 def write_hand_off(
@@ -75,7 +81,7 @@ def write_hand_off(
     if photo.is_linear:
         codes = photo.encode(photo.srgb, np.ones(codes.shape[:2], np.bool_))
     output.write_png(PHOTO, codes, icc=photo.icc, mark=False)
-    script = blender_setup(asset, camera, placement, envmap)
+    script = blender_setup(asset, camera, placement, envmap, suns_of(texels))
     output.write_bytes(BLENDER_SETUP, script.encode())
     notices = []
     if (off := square_pixel_error(camera)) > SQUARE_ENOUGH:
@@ -145,7 +151,9 @@ def web_map(texels: FloatArray) -> tuple[FloatArray, int]:
 # ------------------------------------------------------------------------------------ Blender
 
 
-def blender_setup(asset: Asset, camera: Camera, placement: Placement, envmap: str) -> str:
+def blender_setup(
+    asset: Asset, camera: Camera, placement: Placement, envmap: str, suns: Sequence[Sun]
+) -> str:
     """Return the script that builds the scene in Blender.
 
     Args:
@@ -153,6 +161,7 @@ def blender_setup(asset: Asset, camera: Camera, placement: Placement, envmap: st
         camera: Of the photo.
         placement: Where the object stands.
         envmap: Name of the map's file.
+        suns: Lamps of that map.
     """
     low, high = asset.bounds()
     diagonal = float(np.linalg.norm((high - low) * np.linalg.norm(placement.asset_to_world[:3, 0])))
@@ -179,13 +188,21 @@ def blender_setup(asset: Asset, camera: Camera, placement: Placement, envmap: st
         camera=_rows(values["matrix_world"]),
         ground=_rows(_z_up(ground)),
         ground_size=GROUND_SIDES * diagonal,
+        suns=[
+            (*_tuples(TO_Z_UP[:3, :3] @ sun.axis, sun.irradiance), sun.angle, *_tuples(sun.behind))
+            for sun in suns
+        ],
+        sun_cosine=math.cos(math.radians(LAMP_RADIUS_DEG)),
     )
+
+
+def _tuples(*vectors: Float64Array) -> tuple[tuple[float, ...], ...]:
+    return tuple(tuple(float(value) + 0.0 for value in vector) for vector in vectors)
 
 
 def _z_up(matrix: Float64Array) -> Float64Array:
     """Return a matrix of our frames, +Y up, as one of Blender's, +Z up on both sides."""
-    turn = np.array([[1, 0, 0, 0], [0, 0, -1, 0], [0, 1, 0, 0], [0, 0, 0, 1]], np.float64)
-    turned: Float64Array = turn @ matrix @ turn.T
+    turned: Float64Array = TO_Z_UP @ matrix @ TO_Z_UP.T
     return turned
 
 

@@ -62,7 +62,7 @@ def render_result(run: Run, light: SceneLight) -> RenderedResult:
             lambda: scene_of(run.inputs, camera, run.device, light.curves), "the scene", "--asset"
         )
     look = _look(run, light)
-    with run.timings.stage("render"), progress_bar() as report:
+    with run.timings.stage("render"), progress_bar(run.log.say) as report:
         renderer = Renderer(placed, run.config.render.threads or 0, report, run.memory)
         quality = run.config.render
         picture = _picture(run, light, renderer, quality.samples, quality.rays, look)

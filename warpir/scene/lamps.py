@@ -10,7 +10,7 @@ import numpy as np
 
 from warpir.core.arrays import BoolArray, Float64Array, FloatArray
 from warpir.core.color import luminance
-from warpir.core.latlong import map_directions, texel_solid_angles
+from warpir.core.latlong import map_directions, resize_map, texel_solid_angles
 from warpir.scene.light import Light
 
 LAMP_SHARE = 0.03
@@ -20,6 +20,8 @@ LAMP_RADIUS_DEG = 6.0
 lobe's standard deviation."""
 LAMP_COUNT_MAX = 8
 LAMP_SHARPNESS_MAX = 1e5
+SUN_ROWS = 512
+"""Most rows of a map whose lamps become suns [px]."""
 
 
 @dataclass(frozen=True)
@@ -97,6 +99,50 @@ def without_lamps(light: Light, share: float = 1.0) -> Light:
     if lobes is light.lobes and texels is light.texels:
         return light
     return Light(lobes, texels)
+
+
+@dataclass(frozen=True)
+class Sun:
+    """A lamp of a map as a disc at infinity."""
+
+    axis: Float64Array
+    """Unit direction toward it, world frame, shape [3]."""
+    irradiance: Float64Array
+    """Of a surface that faces it [W/m^2], RGB, shape [3]."""
+    angle: float
+    """Across the disc [rad]; its mean 1 - cos is the lamp's."""
+    behind: Float64Array
+    """Radiance within `LAMP_RADIUS_DEG` without it: the median of the ring around, RGB, shape [3].
+    """
+
+
+def suns_of(texels: FloatArray) -> list[Sun]:
+    """Return a map's lamps; they and the map, with ``behind`` in their places, are the same light.
+
+    Where two are near each other, the earlier one has been replaced before the later is measured.
+
+    Args:
+        texels: Radiance, shape [He, We, 3].
+    """
+    if texels.shape[0] > SUN_ROWS:
+        texels = resize_map(texels, SUN_ROWS)
+    lamps = lamps_of(texels)
+    directions = map_directions(*texels.shape[:2])
+    omega = texel_solid_angles(*texels.shape[:2])[:, None, None]
+    near, far = np.cos(np.radians((LAMP_RADIUS_DEG, 2.0 * LAMP_RADIUS_DEG)))
+    left = texels.astype(np.float64)
+    suns = []
+    for axis, sharpness in zip(lamps.axes, lamps.sharpness, strict=True):
+        cosine = directions @ axis
+        ring = (cosine > far) & (cosine <= near)
+        behind = np.median(left[ring], axis=0) if ring.any() else np.zeros(3)
+        excess = ((left - behind) * omega)[cosine > near].sum(axis=0)
+        left[cosine > near] = behind
+        # A disc of radius r, small: mean 1 - cos = r^2 / 4.
+        if excess.max() > 0.0:
+            angle = 4.0 / float(np.sqrt(sharpness))
+            suns.append(Sun(axis, np.maximum(excess, 0.0), angle, behind))
+    return suns
 
 
 def lamp_axes(light: Light) -> Float64Array:

@@ -1,0 +1,56 @@
+"""Runs in warpir's own environment: ``python estimate.py PHOTO FOLDER [FLAG ...]``.
+
+Camera and light are those of an insertion, whose object is a box that stands in for what will come;
+``FOLDER/result`` is an ordinary result. ``FOLDER/grain.exr`` is grain as strong as the photo's, in
+display values, where it has any.
+"""
+
+import json
+import sys
+from pathlib import Path
+
+BOX = (0.5, 0.5, 0.5)
+"""Its sides [m]."""
+QUICK = ("--samples", "1", "--width", "64")
+"""The picture of the box is not wanted."""
+
+
+def run(photo: str, folder: Path, flags: list[str]) -> int:
+    """Return warpir's exit status."""
+    from warpir.insert import main
+
+    write_box(folder / "box.glb")
+    named = ["--photo", photo, "--asset", str(folder / "box.glb"), "--out", str(folder / "result")]
+    status = main([*named, *QUICK, *flags])
+    if status == 0:
+        write_grain(folder / "result", folder / "grain.exr")
+    return status
+
+
+def write_box(path: Path) -> None:
+    """Write the object that stands in."""
+    import trimesh
+
+    trimesh.creation.box(extents=BOX).export(path)
+
+
+def write_grain(result: Path, path: Path) -> None:
+    """Write grain for the whole photo, RGB, float32; nothing where the photo has none."""
+    import numpy as np
+    from PIL import Image
+
+    from warpir.io.images.writers import exr_bytes
+    from warpir.look.grain import Grain
+
+    record = json.loads((result / "run.json").read_text("utf-8"))
+    if (found := record["measured"]["look"]["grain"]) is None:
+        return
+    grain = Grain(**found)
+    with Image.open(result / "photo.png") as picture:
+        display = np.asarray(picture.convert("RGB"), np.float64) / 255.0
+    noise = grain.deviation(display) * grain.draw(display.shape[:2], 0)
+    path.write_bytes(exr_bytes(path, {c: noise[..., k].astype("f4") for k, c in enumerate("RGB")}))
+
+
+if __name__ == "__main__":
+    sys.exit(run(sys.argv[1], Path(sys.argv[2]), sys.argv[3:]))
