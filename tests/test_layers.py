@@ -50,6 +50,7 @@ PACKAGES = {
     "drjit": {"mitsuba"},
     "OpenImageIO": {"io"},
     "OpenEXR": {"io"},
+    "pxr": {"io"},
     "trimesh": {"io", "train"},
     "yaml": {"app"},
     "ray": {"batch"},

@@ -27,6 +27,7 @@ LONGEST = 10_000
 EXTRA_OF = {
     "ray": "ray",
     "mitsuba": "bench",
+    "pxr": "usd",
     "matplotlib": "bench",
     **dict.fromkeys(("accelerate", "diffusers", "peft", "transformers"), "guidance"),
 }

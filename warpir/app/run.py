@@ -122,6 +122,8 @@ def needed_bytes(config: InsertConfig, inputs: Inputs) -> int:
         total += pixels * png + texels * 4 + mesh
     if config.output.mitsuba:
         total += texels * 12 + mesh
+    if config.output.usd:
+        total += texels * TEXEL_BYTES + mesh
     if config.is_guided and config.adapter.personalize:
         total += config.adapter.lora_rank * RANK_BYTES * LORA_COPIES
     return int(total)

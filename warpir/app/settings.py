@@ -135,7 +135,7 @@ class LightConfig:
     fit_lobes: int | None = option(None, "N", low=1, high=4096)
     """Replace the panorama by this many fitted lobes; spherical Gaussians"""
     sun: tuple[float, float] | tuple[float, float, float] | None = option(
-        None, "AZIMUTH,ELEVATION[,STRENGTH]"
+        None, "AZIM,ELEV[,STRENGTH]"
     )
     """A sun: azimuth, elevation [deg], strength; azimuth clockwise from -Z seen from above; the
     strength is the irradiance it gives a surface that faces it, relative [W/m^2]"""
@@ -364,3 +364,5 @@ class OutputConfig:
     """Write report.html; a page that shows the result, the light and all figures"""
     mitsuba: bool = option(False)
     """Write a scene of Mitsuba 3 as well; the insertion, into a folder of its own"""
+    usd: bool = option(False)
+    """Write scene.usdz for OpenUSD as well; object, light and camera (pip install 'warpir[usd]')"""

@@ -67,6 +67,7 @@ ABOUT_FILES = (
     ("object.glb", "The object where it stands, with the photo's camera, for any 3D tool"),
     ("photo.png", "The photo, upright, as Blender's script reads it"),
     ("blender_setup.py", "Builds the scene: blender --python blender_setup.py"),
+    ("scene.usdz", "Object, light and camera for OpenUSD"),
     ("mitsuba/*", "The insertion as a scene of Mitsuba 3"),
     ("report.html", "This page"),
     ("run.json", "Settings, hashes, versions, figures: --config reads it back; written last"),

@@ -1,0 +1,170 @@
+"""Writes a run's object, light and camera as one OpenUSD package, ``scene.usdz``.
+
+Frames agree: USD's stage is +Y up in metres, its camera looks along -Z, and its dome light reads a
+latitude-longitude map as OpenEXR orients it, so that nothing is turned. Matrices are USD's row
+vectors, the transpose of ours. https://openusd.org/release/spec_usdpreviewsurface.html.
+"""
+
+import tempfile
+from pathlib import Path
+from typing import Any
+
+from PIL import Image
+from pxr import Gf, Sdf, Usd, UsdGeom, UsdLux, UsdShade, UsdUtils, Vt
+
+from warpir.core.arrays import Float64Array
+from warpir.core.errors import InputError
+from warpir.io.gltf.writer import float32_center, translation
+from warpir.scene.asset import Asset, Material, Primitive, TextureSlot
+from warpir.scene.camera import Camera
+
+USDZ = "scene.usdz"
+APERTURE = 36.0
+"""Width of the written camera's film; only its ratio to the focal length counts [mm]."""
+TYPES = Sdf.ValueTypeNames
+Coordinates = tuple[int, tuple[float, ...]]
+"""Set and transform of a texture's coordinates; USD's v counts from the image's bottom."""
+
+
+def write_usdz(asset: Asset, asset_to_world: Float64Array, camera: Camera, envmap: Path) -> bytes:
+    """Return the scene as one ``.usdz`` file.
+
+    UsdPreviewSurface has no sheen, transmission, coloured specular or vertex colour, and no normal
+    map of the coat: those are left out.
+
+    Args:
+        asset: The object.
+        asset_to_world: Column vectors [m], shape [4, 4].
+        camera: The photo's, with its principal point.
+        envmap: The map on the object, OpenEXR's orientation, an ``.exr`` file.
+
+    Raises:
+        InputError: The package cannot be written.
+    """
+    with tempfile.TemporaryDirectory() as name:
+        folder = Path(name)
+        (folder / "envmap.exr").write_bytes(envmap.read_bytes())
+        for k, texture in enumerate(asset.textures):
+            Image.fromarray(texture.pixels).save(folder / f"texture_{k}.png")
+        stage = Usd.Stage.CreateNew(str(folder / "scene.usdc"))
+        UsdGeom.SetStageUpAxis(stage, UsdGeom.Tokens.y)
+        UsdGeom.SetStageMetersPerUnit(stage, 1.0)
+        stage.SetDefaultPrim(UsdGeom.Xform.Define(stage, "/scene").GetPrim())
+        _object(stage, asset, asset_to_world)
+        _camera(stage, camera)
+        dome = UsdLux.DomeLight.Define(stage, "/scene/light")
+        dome.CreateTextureFileAttr(Sdf.AssetPath("envmap.exr"))
+        dome.CreateTextureFormatAttr(UsdLux.Tokens.latlong)
+        stage.GetRootLayer().Save()
+        package = folder / USDZ
+        if not UsdUtils.CreateNewUsdzPackage(str(folder / "scene.usdc"), str(package)):
+            raise InputError(USDZ, "OpenUSD could not write it", "see its message above")
+        return package.read_bytes()
+
+
+def _matrix(matrix: Float64Array) -> Gf.Matrix4d:
+    return Gf.Matrix4d(*matrix.T.ravel().tolist())
+
+
+def _camera(stage: Usd.Stage, camera: Camera) -> None:
+    written = UsdGeom.Camera.Define(stage, "/scene/camera")
+    written.AddTransformOp().Set(_matrix(camera.c2w))
+    focal = APERTURE * camera.fx / camera.width
+    vertical = focal * camera.height / camera.fy
+    written.CreateFocalLengthAttr(focal)
+    written.CreateHorizontalApertureAttr(APERTURE)
+    written.CreateVerticalApertureAttr(vertical)
+    written.CreateHorizontalApertureOffsetAttr(APERTURE * (0.5 - camera.cx / camera.width))
+    written.CreateVerticalApertureOffsetAttr(vertical * (camera.cy / camera.height - 0.5))
+    # USD's default of 1 m would cut off what stands near.
+    written.CreateClippingRangeAttr(Gf.Vec2f(0.01, 1e6))
+
+
+def _object(stage: Usd.Stage, asset: Asset, asset_to_world: Float64Array) -> None:
+    center = float32_center(asset)
+    root = UsdGeom.Xform.Define(stage, "/scene/object")
+    root.AddTransformOp().Set(_matrix(asset_to_world @ translation(center)))
+    slots = [slot for material in asset.materials for slot in material.texture_slots()]
+    names = {_coordinates(slot): "" for slot in slots}
+    names = {key: f"st{k}" for k, key in enumerate(names)}
+    materials = [_material(stage, asset, m, k, names) for k, m in enumerate(asset.materials)]
+    for k, p in enumerate(asset.primitives):
+        mesh = UsdGeom.Mesh.Define(stage, f"/scene/object/mesh_{k}")
+        mesh.CreatePointsAttr(Vt.Vec3fArray.FromNumpy((p.positions - center).astype("f4")))
+        mesh.CreateExtentAttr(UsdGeom.PointBased.ComputeExtent(mesh.GetPointsAttr().Get()))
+        mesh.CreateFaceVertexCountsAttr([3] * len(p.indices))
+        mesh.CreateFaceVertexIndicesAttr(p.indices.ravel().tolist())
+        mesh.CreateSubdivisionSchemeAttr(UsdGeom.Tokens.none)
+        mesh.CreateDoubleSidedAttr(asset.materials[p.material].double_sided)
+        if p.normals is not None:
+            mesh.CreateNormalsAttr(Vt.Vec3fArray.FromNumpy(p.normals.astype("f4")))
+            mesh.SetNormalsInterpolation(UsdGeom.Tokens.vertex)
+        for slot in asset.materials[p.material].texture_slots():
+            _primvar(mesh, p, _coordinates(slot), names[_coordinates(slot)])
+        UsdShade.MaterialBindingAPI.Apply(mesh.GetPrim()).Bind(materials[p.material])
+
+
+def _coordinates(slot: TextureSlot) -> Coordinates:
+    return slot.uv_set, slot.transform
+
+
+def _primvar(mesh: UsdGeom.Mesh, p: Primitive, coordinates: Coordinates, name: str) -> None:
+    index, (a, b, c, d, e, f) = coordinates
+    if (uv := (p.uv0, p.uv1)[index]) is not None:
+        moved = uv @ [[a, -d], [b, -e]] + [c, 1.0 - f]
+        written = UsdGeom.PrimvarsAPI(mesh).CreatePrimvar(
+            name, TYPES.TexCoord2fArray, UsdGeom.Tokens.vertex
+        )
+        written.Set(Vt.Vec2fArray.FromNumpy(moved.astype("f4")))
+
+
+def _material(
+    stage: Usd.Stage, asset: Asset, m: Material, index: int, names: dict[Coordinates, str]
+) -> UsdShade.Material:
+    path = f"/scene/materials/material_{index}"
+    material = UsdShade.Material.Define(stage, path)
+    surface = UsdShade.Shader.Define(stage, f"{path}/surface")
+    surface.CreateIdAttr("UsdPreviewSurface")
+    alpha, coat = (1.0 if m.alpha_mode == "OPAQUE" else m.alpha), m.clearcoat_roughness
+    cutoff = m.alpha_cutoff if m.alpha_mode == "MASK" else 0.0
+    seen = m.base_color_texture if m.alpha_mode != "OPAQUE" else None
+    metal, bump, s = m.metallic_roughness_texture, m.normal_texture, m.normal_scale
+    rgb = TYPES.Color3f
+    inputs: tuple[tuple[str, Any, Any, TextureSlot | None, str], ...] = (
+        ("diffuseColor", rgb, m.base_color, m.base_color_texture, "rgb"),
+        ("opacity", TYPES.Float, alpha, seen, "a"),
+        ("opacityThreshold", TYPES.Float, cutoff, None, ""),
+        ("emissiveColor", rgb, m.emission, m.emission_texture, "rgb"),
+        ("metallic", TYPES.Float, m.metallic, metal, "b"),
+        ("roughness", TYPES.Float, m.roughness, metal, "g"),
+        ("ior", TYPES.Float, m.ior, None, ""),
+        ("clearcoat", TYPES.Float, m.clearcoat, m.clearcoat_texture, "r"),
+        ("clearcoatRoughness", TYPES.Float, coat, m.clearcoat_roughness_texture, "g"),
+        ("normal", TYPES.Normal3f, (0.0, 0.0, 1.0), bump, "rgb"),
+    )
+    for name, kind, value, slot, channel in inputs:
+        target = surface.CreateInput(name, kind)
+        if slot is None:
+            target.Set(value)
+            continue
+        read = UsdShade.Shader.Define(stage, f"{path}/{name}_st")
+        read.CreateIdAttr("UsdPrimvarReader_float2")
+        read.CreateInput("varname", TYPES.String).Set(names[_coordinates(slot)])
+        image = UsdShade.Shader.Define(stage, f"{path}/{name}_texture")
+        image.CreateIdAttr("UsdUVTexture")
+        image.CreateInput("file", TYPES.Asset).Set(Sdf.AssetPath(f"texture_{slot.texture}.png"))
+        image.CreateInput("st", TYPES.Float2).ConnectToSource(read.ConnectableAPI(), "result")
+        texture, is_color = asset.textures[slot.texture], kind == rgb or channel == "a"
+        space = "sRGB" if is_color else "raw"
+        image.CreateInput("sourceColorSpace", TYPES.Token).Set(space)
+        image.CreateInput("wrapS", TYPES.Token).Set(texture.wrap_u)
+        image.CreateInput("wrapT", TYPES.Token).Set(texture.wrap_v)
+        scale = (*value, 1.0) if kind == rgb else (value,) * 4 if kind == TYPES.Float else ()
+        if not scale:  # a normal map's codes stand for -1 to 1
+            scale = 2.0 * s, 2.0 * s, 2.0, 1.0
+            image.CreateInput("bias", TYPES.Float4).Set(Gf.Vec4f(-s, -s, -1.0, 0.0))
+        image.CreateInput("scale", TYPES.Float4).Set(Gf.Vec4f(*scale))
+        image.CreateOutput(channel, kind if channel == "rgb" else TYPES.Float)
+        target.ConnectToSource(image.ConnectableAPI(), channel)
+    material.CreateSurfaceOutput().ConnectToSource(surface.ConnectableAPI(), "surface")
+    return material
