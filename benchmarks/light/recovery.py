@@ -33,7 +33,7 @@ from warpir.optimize.view import Frame
 from warpir.render.bridge import ComposeConstants, compose
 from warpir.render.device_light import light_args
 from warpir.render.device_scene import Placed, Receiver, Scene
-from warpir.render.mis import MisIntegrator
+from warpir.render.mis.integrator import MisIntegrator
 from warpir.render.renderer import Renderer
 from warpir.render.tone_curve import Knots, ToneCurve
 from warpir.scene.asset import Asset

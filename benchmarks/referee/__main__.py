@@ -29,7 +29,7 @@ from warpir.io.assets import load_asset
 from warpir.lighting.fit import fit_lobes
 from warpir.mitsuba.render import Ratio, build, foreground, passes, shadow_ratio
 from warpir.render.device import choose_device
-from warpir.render.mis import MisIntegrator
+from warpir.render.mis.integrator import MisIntegrator
 from warpir.render.renderer import Renderer
 from warpir.scene.asset import Asset
 from warpir.scene.camera import Camera

@@ -17,7 +17,7 @@ from benchmarks.speed.memory import PeakMemory
 from benchmarks.speed.scenes import SpeedScene
 from warpir.core.arrays import Float64Array
 from warpir.render.integrator import Integrator, Radiance
-from warpir.render.mis import MisIntegrator
+from warpir.render.mis.integrator import MisIntegrator
 from warpir.scene.light import Light
 
 PARTS = ("foreground", "ratio")

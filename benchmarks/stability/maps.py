@@ -25,7 +25,7 @@ from warpir.kernels.sampling import light_eval, light_sample
 from warpir.kernels.types import LightArgs
 from warpir.render.device_light import light_args
 from warpir.render.device_scene import Scene
-from warpir.render.mis import MisIntegrator
+from warpir.render.mis.integrator import MisIntegrator
 from warpir.render.renderer import Renderer
 from warpir.scene.light import Light, summarize
 

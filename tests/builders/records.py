@@ -11,8 +11,8 @@ from warpir.kernels.shade import shade_vertex
 from warpir.kernels.types import LightRecord, VertexRecord
 from warpir.render.device_scene import FACTORS
 from warpir.render.integrator import MaterialTensors
+from warpir.render.mis.samples import ObjectSamples
 from warpir.render.renderer import Renderer
-from warpir.render.samples import ObjectSamples
 
 
 def plain_factors(materials: MaterialTensors) -> list[FloatArray | None]:

@@ -36,9 +36,9 @@ from warpir.diffusion.personalization.lora_training import LoraTraining
 from warpir.diffusion.prompts import make_prompts
 from warpir.diffusion.settings import GuidanceSettings, ModelSettings, PersonalizeSettings
 from warpir.insert import main
-from warpir.render import samples
 from warpir.render.device_light import light_args
 from warpir.render.device_scene import Scene
+from warpir.render.mis import samples
 from warpir.render.renderer import Renderer
 from warpir.render.transport import rows as transport_rows
 from warpir.render.transport.integrator import TransportIntegrator

@@ -26,9 +26,9 @@ from warpir.render.bridge import ComposeConstants, compose, host_light
 from warpir.render.device_light import light_args
 from warpir.render.device_scene import Placed, Receiver, Scene
 from warpir.render.integrator import MaterialTensors, Radiance
-from warpir.render.mis import MisIntegrator
+from warpir.render.mis.integrator import MisIntegrator
+from warpir.render.mis.samples import ObjectSamples, ReceiverSamples
 from warpir.render.renderer import Renderer
-from warpir.render.samples import ObjectSamples, ReceiverSamples
 from warpir.render.tone_curve import ToneCurve
 from warpir.scene.asset import Asset, Material, Primitive
 from warpir.scene.camera import Camera

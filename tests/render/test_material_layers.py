@@ -21,7 +21,7 @@ from tests.render.test_render import (
     shadow,
 )
 from tests.render.test_transport import EXACT, HEIGHT, lights, pixels_of
-from warpir.render.mis import MisIntegrator
+from warpir.render.mis.integrator import MisIntegrator
 from warpir.render.transport.integrator import TransportIntegrator
 from warpir.scene.asset import Material, Primitive, Texture, TextureSlot
 from warpir.scene.light import Light, as_map

@@ -19,14 +19,14 @@ from tests.builders.records import (
 from tests.render.test_gradients import two_objects
 from tests.statistics import compare_gradients
 from warpir.render import renderer as render
-from warpir.render import samples as samples_module
 from warpir.render.bridge import host_light
 from warpir.render.device_light import light_args
 from warpir.render.device_scene import Placed, Receiver, Scene
 from warpir.render.integrator import MaterialTensors, Radiance
-from warpir.render.mis import MisIntegrator
+from warpir.render.mis import samples as samples_module
+from warpir.render.mis.integrator import MisIntegrator
+from warpir.render.mis.samples import ObjectSamples, ReceiverSamples
 from warpir.render.renderer import Renderer
-from warpir.render.samples import ObjectSamples, ReceiverSamples
 from warpir.scene.camera import Camera
 
 WIDTH, HEIGHT = 48, 32

@@ -34,9 +34,9 @@ from warpir.render.composite import Quality, make_picture, scene_of
 from warpir.render.device_light import light_args
 from warpir.render.device_scene import Placed, Scene
 from warpir.render.integrator import MaterialTensors
-from warpir.render.mis import MisIntegrator
+from warpir.render.mis.integrator import MisIntegrator
+from warpir.render.mis.samples import ReceiverSamples
 from warpir.render.renderer import Renderer
-from warpir.render.samples import ReceiverSamples
 from warpir.render.transport.integrator import TransportIntegrator
 from warpir.render.transport.rows import TransportSettings
 from warpir.scene.asset import Material, Primitive

@@ -18,7 +18,7 @@ from warpir.core.errors import ExitCode, InputError
 from warpir.core.latlong import map_directions, texel_solid_angles
 from warpir.render.device_scene import Scene
 from warpir.render.integrator import MaterialTensors, Radiance
-from warpir.render.mis import MisIntegrator
+from warpir.render.mis.integrator import MisIntegrator
 from warpir.render.renderer import Renderer
 from warpir.render.transport import cache as transport_cache
 from warpir.render.transport import rows as transport_rows

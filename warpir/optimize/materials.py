@@ -34,7 +34,7 @@ from warpir.optimize.loop import Composite, Guide, Optimization
 from warpir.optimize.model import as_input_errors, make_guide, prepare_guidance
 from warpir.render.bridge import ShadeForeground
 from warpir.render.integrator import MaterialTensors
-from warpir.render.mis import MisIntegrator
+from warpir.render.mis.integrator import MisIntegrator
 from warpir.render.tone_curve import Knots, ToneCurve
 from warpir.scene.asset import Asset, Material
 from warpir.scene.camera import Camera

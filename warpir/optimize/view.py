@@ -17,7 +17,7 @@ from warpir.core.arrays import FloatArray, IntArray, PixelArray
 from warpir.render.bridge import ComposeConstants, compose
 from warpir.render.device_light import light_args
 from warpir.render.integrator import Integrator, Radiance
-from warpir.render.mis import MisIntegrator
+from warpir.render.mis.integrator import MisIntegrator
 from warpir.render.renderer import Renderer
 from warpir.render.tone_curve import Knots
 from warpir.render.transport.integrator import TransportIntegrator

@@ -17,13 +17,13 @@ from warpir.core.arrays import FloatArray, IntArray
 from warpir.kernels import composite as composite_kernels
 from warpir.kernels.shadow_ratio import shadow_ratio as ratio_kernel
 from warpir.kernels.types import LightArgs
+from warpir.render.mis.samples import Gradients, ObjectSamples, ReceiverSamples
 from warpir.render.renderer import index_of
-from warpir.render.samples import Gradients, ObjectSamples, ReceiverSamples
 from warpir.render.tone_curve import Knots
 from warpir.scene.light import Light
 
 if TYPE_CHECKING:
-    from warpir.render.mis import MisIntegrator
+    from warpir.render.mis.integrator import MisIntegrator
 
 
 KNOT_COPIES = 32
@@ -62,7 +62,7 @@ def host_light(texels: Tensor) -> Light:
 
 
 class ShadeForeground(torch.autograd.Function):
-    """Object radiance of `warpir.render.mis.MisIntegrator`, shape [object_pixel, 3]."""
+    """Object radiance of `warpir.render.mis.integrator.MisIntegrator`, shape [object_pixel, 3]."""
 
     @staticmethod
     def forward(

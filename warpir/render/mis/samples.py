@@ -28,7 +28,7 @@ from warpir.render.device_scene import FACTORS
 from warpir.render.renderer import ReceiverRadiance, Renderer
 
 if TYPE_CHECKING:
-    from warpir.render.mis import MisIntegrator
+    from warpir.render.mis.integrator import MisIntegrator
 
 Gradients = list[Float64Array | None]
 """Gradients of the map, then of base colour, metallic, roughness and emission; None for those not

@@ -1,10 +1,10 @@
 """`mis`, the reference integrator: multiple importance sampling of light and BRDF at any depth.
 
-The forward pass traces with the detached kernels; if a gradient is needed, it records its
-samples down (`warpir.render.samples`). Radiance is linear in the light, so the light's gradient is
-a sum over the recorded directions; the materials' goes through the attached kernel over the
-recorded vertices. Samples that do not fit `warpir.render.samples.RECORD_BYTES` are drawn again from
-the seed, part by part, so memory does not grow with the sample count.
+The forward pass traces with the detached kernels; if a gradient is needed, it records its samples
+(`warpir.render.mis.samples`). Radiance is linear in the light, so the light's gradient is a sum
+over the recorded directions; the materials' goes through the attached kernel over the recorded
+vertices. Samples that do not fit `warpir.render.mis.samples.RECORD_BYTES` are drawn again from the
+seed, part by part, so memory does not grow with the sample count.
 """
 
 from __future__ import annotations
