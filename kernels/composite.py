@@ -2,7 +2,7 @@
 
 import warp as wp
 
-from warpir.kernels.tone import reinhard, tone_curve
+from warpir.kernels.tone import ratio_curve, reinhard, tone_curve
 
 ENCODE_KNEE = wp.constant(1.0e-6)
 """Below this the power's slope explodes; there the encoding is linear (half a code of 8 bits)."""
@@ -80,9 +80,9 @@ def tone_shadow(
     curve = 3 * (i % (knot_x.shape[0] // 3))
     x = ratio[i]
     shown = wp.vec3(
-        tone_curve(x[0], curve, knot_x, knot_y, knot_slope, bin_count),
-        tone_curve(x[1], curve + 1, knot_x, knot_y, knot_slope, bin_count),
-        tone_curve(x[2], curve + 2, knot_x, knot_y, knot_slope, bin_count),
+        ratio_curve(x[0], curve, knot_x, knot_y, knot_slope, bin_count),
+        ratio_curve(x[1], curve + 1, knot_x, knot_y, knot_slope, bin_count),
+        ratio_curve(x[2], curve + 2, knot_x, knot_y, knot_slope, bin_count),
     )
     display[i] = unhidden(shown, x)
 

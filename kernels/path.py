@@ -1,5 +1,9 @@
 """Path tracing of the object under a light at infinity, ``PathTrace(X, L_fg, D)`` (DiPIR, eq. 4).
 
+The object is seen by the camera, or from the ground: what it throws on the receiver is the light
+that the receiver gains by it, the part of differential rendering that DiPIR's ratio leaves out
+(`warpir.kernels.receiver`).
+
 Each vertex draws one direction from the light and one from the BSDF (`warpir.kernels.scatter`); the
 BSDF's direction continues the path. `trace_foreground` sums radiance and, if
 asked, writes down what the two adjoints need: `warpir.kernels.light_gradient` for the light,
@@ -13,6 +17,8 @@ import warp as wp
 from warpir.kernels.light_gradient import keep_direction
 from warpir.kernels.maths.frame import basis
 from warpir.kernels.maths.rng import hash_pair, pixel_seed, sobol_pair
+from warpir.kernels.receiver import ReceiverPoint, object_ray, receiver_origin, receiver_point
+from warpir.kernels.receiver_mesh import receiver_mesh_hit
 from warpir.kernels.sampling import light_eval
 from warpir.kernels.scatter import (
     BsdfSample,
@@ -23,7 +29,7 @@ from warpir.kernels.scatter import (
     surface_bsdf,
 )
 from warpir.kernels.tracing.hit import Hit
-from warpir.kernels.tracing.ray import camera_hit, camera_ray
+from warpir.kernels.tracing.ray import camera_hit, camera_ray, closest_hit
 from warpir.kernels.tracing.surface import Surface, surface_at
 from warpir.kernels.types import (
     CameraArgs,
@@ -163,7 +169,7 @@ def keep_event(record: VertexRecord, i: int, j: int, event: Scatter):
 
 
 @cache
-def foreground_kernel(has_layers: bool, has_receiver_mesh: bool) -> wp.Kernel:
+def foreground_kernel(has_layers: bool, has_receiver_mesh: bool, is_from_ground: bool) -> wp.Kernel:
     """Return `trace_foreground` for scenes with or without these; what is not there costs nothing.
 
     A flag that is looked at while tracing would do on the CPU. On CUDA the registers of code that
@@ -172,11 +178,13 @@ def foreground_kernel(has_layers: bool, has_receiver_mesh: bool) -> wp.Kernel:
     Args:
         has_layers: Whether some material has extensions (``MaterialArgs.any_layers``).
         has_receiver_mesh: Whether there is a mesh of the receiver (``ReceiverArgs.mesh``).
+        is_from_ground: Whether the object is seen from the receiver in place of the camera.
     """
 
     @wp.kernel(module="unique", enable_backward=False)
     def trace_foreground(
         pixels: wp.array[int],
+        may_see_object: wp.array[int],
         camera: CameraArgs,
         mesh: MeshArgs,
         material: MaterialArgs,
@@ -196,13 +204,19 @@ def foreground_kernel(has_layers: bool, has_receiver_mesh: bool) -> wp.Kernel:
         light_record: LightRecord,
         vertex_record: VertexRecord,
     ):
-        """Path-trace the object in each listed pixel; the receiver hide it but are not lit.
+        """Path-trace the object in each listed pixel; the receiver hides it but is not lit.
 
         A pixel may stand in the list ``lanes`` times, one after the other: each row then takes its
         share of the samples, and the rows' results add up to the pixel's.
 
+        From the ground, ``foreground`` is the radiance of a white receiver by what the object
+        reflects and emits, the mean over the samples that see the receiver, in rows of one lane.
+        The receiver is the path's first vertex. It is black to the object: light that goes from the
+        ground to the object and back is left out, and the shadow stays dark at the contact.
+
         Args:
             pixels: Row-major pixel indices, shape [row].
+            may_see_object: From the ground: 1 where the object may hide the receiver, shape [row].
             camera: The view.
             mesh: The object's triangles.
             material: Their materials.
@@ -213,13 +227,14 @@ def foreground_kernel(has_layers: bool, has_receiver_mesh: bool) -> wp.Kernel:
             spp: Camera samples per row.
             rays: Paths that share one camera sample.
             lanes: Rows per pixel; the launch starts with a pixel's first.
-            depth: Surface interactions.
+            depth: Surface interactions, that with the receiver included.
             indirect_limit: Most radiance that one path may add behind its first vertex; 0 for no
                 limit. It takes the fireflies of light that a mirror throws onto a matte surface,
                 and with them some of that light.
             seed: Base seed.
             foreground: Radiance premultiplied by coverage, shape [row].
-            diffuse: The part of it that the first hit's diffuse lobe reflects, shape [row].
+            diffuse: The part of it that the first hit's diffuse lobe reflects, shape [row]; not
+                written from the ground, nor are the next two.
             emission: The part of it that the first hit emits, shape [row].
             coverage: Share of samples that see the object, shape [row].
             light_record: Output: the weight of each direction that saw the light, or without
@@ -231,6 +246,10 @@ def foreground_kernel(has_layers: bool, has_receiver_mesh: bool) -> wp.Kernel:
             material.any_layers = 0
         if wp.static(not has_receiver_mesh):
             receiver.mesh = wp.uint64(0)
+        receiver.is_solid = wp.static(int(is_from_ground))
+        if wp.static(is_from_ground):
+            receiver.shines = 0
+            point = ReceiverPoint()
         i = wp.tid()
         pixel = pixels[i]
         key = pixel_seed(seed, pixel)
@@ -259,21 +278,56 @@ def foreground_kernel(has_layers: bool, has_receiver_mesh: bool) -> wp.Kernel:
         while index < spp * rays:
             if alive == 0:
                 s = before + index // rays
-                ray_dir = camera_ray(camera, pixel, sobol_pair(s, key, 0))
-                if index % rays == 0:
-                    first = camera_hit(camera, mesh, material, texture, receiver, s, key, ray_dir)
-                    if first.valid == 1:
-                        count += 1.0
-                if first.valid == 0:
-                    index += rays
-                    continue
+                if wp.static(is_from_ground):
+                    if index % rays == 0:
+                        point = receiver_point(
+                            camera,
+                            mesh,
+                            material,
+                            texture,
+                            receiver,
+                            pixel,
+                            may_see_object[i],
+                            s,
+                            key,
+                        )
+                        count += float(point.valid + point.is_open)
+                    if point.valid == 0:
+                        index += rays
+                        continue
+                    origin = receiver_origin(mesh, receiver, point)
+                    ray = object_ray(mesh, origin, point.normal, sobol_pair(index, key, 3))
+                    first.valid = 0
+                    if ray.weight > 0.0:
+                        reach = receiver_mesh_hit(receiver, origin, ray.direction).t
+                        ray_key = hash_pair(hash_pair(key, wp.uint32(index)), wp.uint32(1))
+                        first = closest_hit(
+                            mesh, material, texture, origin, ray.direction, reach, 0, ray_key
+                        )
+                    if first.valid == 0:
+                        index += 1
+                        continue
+                    wo = -ray.direction
+                    throughput = wp.vec3(ray.weight)
+                    k = 1
+                else:
+                    ray_dir = camera_ray(camera, pixel, sobol_pair(s, key, 0))
+                    if index % rays == 0:
+                        first = camera_hit(
+                            camera, mesh, material, texture, receiver, s, key, ray_dir
+                        )
+                        if first.valid == 1:
+                            count += 1.0
+                    if first.valid == 0:
+                        index += rays
+                        continue
+                    wo = -ray_dir
+                    throughput = wp.vec3(1.0, 1.0, 1.0)
+                    k = 0
                 alive = 1
-                k = 0
-                wo = -ray_dir
                 surface = surface_at(mesh, material, texture, first, wo)
-                throughput = wp.vec3(1.0, 1.0, 1.0)
                 throughput_diffuse = wp.vec3(0.0)
-                radiance += surface.emission
+                radiance += wp.cw_mul(throughput, surface.emission)
                 radiance_emission += surface.emission
                 if vertex_record.material.shape[1] > 0:
                     keep_surface(vertex_record, i, index, surface, wo)
@@ -333,9 +387,16 @@ def foreground_kernel(has_layers: bool, has_receiver_mesh: bool) -> wp.Kernel:
 
         if light_record.wi.shape[1] > 0:
             light_record.count[i] = entries
-        foreground[i] = radiance * scale
-        diffuse[i] = radiance_diffuse * scale
-        emission[i] = radiance_emission * scale
-        coverage[i] = count / float(spp * lanes)
+        if wp.static(is_from_ground):
+            seen = float(spp) / wp.max(count, 1.0)
+            foreground[i] = radiance * (scale * seen)
+            if light_record.wi.shape[1] > 0:
+                for j in range(entries):
+                    light_record.weight[i, j] = light_record.weight[i, j] * seen
+        else:
+            foreground[i] = radiance * scale
+            diffuse[i] = radiance_diffuse * scale
+            emission[i] = radiance_emission * scale
+            coverage[i] = count / float(spp * lanes)
 
     return trace_foreground

@@ -177,6 +177,53 @@ def receiver_point(
     return point
 
 
+@wp.struct
+class ObjectRay:
+    """A direction in which a point of the receiver may see the object."""
+
+    direction: wp.vec3
+    weight: float
+    """``cos / pi / pdf``; 0 where there is no direction."""
+
+
+@wp.func
+def object_ray(mesh: MeshArgs, origin: wp.vec3, normal: wp.vec3, u: wp.vec2) -> ObjectRay:
+    """Draw a direction in proportion to its cosine, as far as it may meet the object.
+
+    The cosine is even on the unit disc below the hemisphere (Nusselt's analogue). There the sphere
+    around the object's box covers an ellipse, or a part of one; a point is drawn from the rectangle
+    around that, and from the square around the disc where ``origin`` is within the sphere.
+    """
+    frame = basis(normal)
+    low = wp.vec2(-1.0, -1.0)
+    high = wp.vec2(1.0, 1.0)
+    toward = 0.5 * (mesh.low + mesh.high) - origin
+    distance = wp.length(toward)
+    radius = 0.5 * wp.length(mesh.high - mesh.low)
+    if distance > radius:
+        # Elevation of the sphere's centre, and half the angle that the sphere covers
+        up = wp.clamp(wp.dot(toward, normal) / distance, -1.0, 1.0)
+        along = wp.sqrt(1.0 - up * up)
+        reach = radius / distance
+        spare = wp.sqrt(1.0 - reach * reach)
+        if along > 1.0e-4:
+            frame.x = wp.normalize(toward - normal * (up * distance))
+            frame.y = wp.cross(normal, frame.x)
+        low = wp.vec2(along * spare - up * reach, -reach)
+        high = wp.vec2(1.0, reach)
+        if up > reach:
+            high = wp.vec2(along * spare + up * reach, reach)
+    out = ObjectRay()
+    out.weight = 0.0
+    x = wp.lerp(low[0], high[0], u[0])
+    y = wp.lerp(low[1], high[1], u[1])
+    rest = 1.0 - x * x - y * y
+    if rest > 0.0:
+        out.weight = (high[0] - low[0]) * (high[1] - low[1]) * INV_PI
+        out.direction = to_world(wp.vec3(x, y, wp.sqrt(rest)), frame)
+    return out
+
+
 @wp.func
 def plane_weight(weight: float, visible: float) -> wp.vec3:
     """Return what a direction adds to ``lit`` and to ``unoccluded``."""

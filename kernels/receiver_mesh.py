@@ -72,6 +72,24 @@ def receiver_visibility(receiver: ReceiverArgs, origin: wp.vec3, direction: wp.v
 
 
 @wp.func
+def receiver_hit(receiver: ReceiverArgs, origin: wp.vec3, direction: wp.vec3) -> ReceiverHit:
+    """Find where a ray off the object meets the receiver: its mesh, and its plane if solid."""
+    hit = receiver_mesh_hit(receiver, origin, direction)
+    if receiver.is_solid == 1 and wp.dot(receiver.normal, direction) < 0.0:
+        hit.valid = 1
+        hit.t = wp.min(hit.t, wp.max(plane_distance(receiver, origin, direction), 0.0))
+    return hit
+
+
+@wp.func
+def sky_visibility(receiver: ReceiverArgs, origin: wp.vec3, direction: wp.vec3) -> float:
+    """Return 1 where light from infinity passes mesh and solid plane to the object, else 0."""
+    if receiver.is_solid == 1 and wp.dot(receiver.normal, direction) < 0.0:
+        return 0.0
+    return receiver_visibility(receiver, origin, direction)
+
+
+@wp.func
 def receiver_radiance(receiver: ReceiverArgs, hit: ReceiverHit) -> wp.vec3:
     """Return what the receiver's mesh sends from a hit back along the ray.
 

@@ -10,7 +10,7 @@ import warp as wp
 
 from warpir.kernels.bsdf import Bsdf, BsdfValue, bsdf_f, bsdf_of, bsdf_sample
 from warpir.kernels.maths.frame import Frame, to_local, to_world
-from warpir.kernels.receiver_mesh import receiver_mesh_hit, receiver_radiance, receiver_visibility
+from warpir.kernels.receiver_mesh import receiver_hit, receiver_radiance, sky_visibility
 from warpir.kernels.sampling import light_eval, light_sample, power_heuristic
 from warpir.kernels.tracing.hit import Hit, offset_origin
 from warpir.kernels.tracing.ray import closest_hit, visibility
@@ -108,7 +108,7 @@ def sample_emitter(
             weight = wi[2] * power_heuristic(Li.pdf, f.pdf) / Li.pdf
             origin = offset_origin(surface.position, surface.ng, sample.wi, mesh.epsilon)
             weight = weight * visibility(mesh, material, texture, origin, sample.wi)
-            weight = weight * receiver_visibility(receiver, origin, sample.wi)
+            weight = weight * sky_visibility(receiver, origin, sample.wi)
             sample.valid = 1
             sample.f = f
             sample.L = Li.radiance
@@ -157,18 +157,18 @@ def sample_bsdf(
         if sample.f.pdf > 0.0:
             sample.cos_over_pdf = wi[2] / sample.f.pdf
             origin = offset_origin(surface.position, surface.ng, sample.wi, mesh.epsilon)
-            receiver_hit = receiver_mesh_hit(receiver, origin, sample.wi)
-            if is_last == 1 and receiver_hit.valid == 0:
+            ended = receiver_hit(receiver, origin, sample.wi)
+            if is_last == 1 and ended.valid == 0:
                 sample.visible = visibility(mesh, material, texture, origin, sample.wi)
             else:
                 sample.next = closest_hit(
-                    mesh, material, texture, origin, sample.wi, receiver_hit.t, 0, ray_key
+                    mesh, material, texture, origin, sample.wi, ended.t, 0, ray_key
                 )
-                if sample.next.valid == 0 and receiver_hit.valid == 0:
+                if sample.next.valid == 0 and ended.valid == 0:
                     sample.visible = 1.0
                 elif sample.next.valid == 0:
                     sample.from_receiver = 1
-                    sample.L_receiver = receiver_radiance(receiver, receiver_hit)
+                    sample.L_receiver = receiver_radiance(receiver, ended)
     return sample
 
 

@@ -56,6 +56,25 @@ def tone_curve(
 
 
 @wp.func
+def ratio_curve(
+    x: float,
+    curve: int,
+    knot_x: wp.array2d[float],
+    knot_y: wp.array2d[float],
+    knot_slope: wp.array2d[float],
+    bin_count: int,
+) -> float:
+    """Evaluate a curve of the shadow ratio; beyond 1 it goes on straight, with its slope there.
+
+    Arguments and gradients are those of `tone_curve`.
+    """
+    shown = tone_curve(x, curve, knot_x, knot_y, knot_slope, bin_count)
+    if x > 1.0:
+        shown += (x - 1.0) * knot_slope[curve, bin_count]
+    return shown
+
+
+@wp.func
 def reinhard(x: float) -> float:
     """Map radiance [0, inf) to [0, 1): ``x / (1 + x)`` (Reinhard et al. 2002, eq. 3)."""
     x = wp.max(x, 0.0)

@@ -49,6 +49,8 @@ class ReceiverArgs:
     """Radiance of the mesh where the photo does not show it."""
     shines: int
     """0 leaves out what the mesh sends; it still blocks light."""
+    is_solid: int
+    """1 lets the plane, too, end the rays that leave the object; kernels set it."""
 
 
 @wp.struct

@@ -170,8 +170,8 @@ def _write(lit: "LitRun", rendered: "RenderedResult", asked: InsertConfig) -> di
     with run.timings.stage("write"):
         written = write_results(run, lit.light, rendered.picture)
         if run.config.output.mitsuba:
-            depth = run.config.render.depth
-            write_mitsuba(run.output, run.inputs, written.maps.on_object, depth)
+            depths = run.config.render.depth, run.config.render.bounce_depth
+            write_mitsuba(run.output, run.inputs, written.maps.on_object, *depths)
         if run.config.output.usd:
             _write_usd(run, written.maps.name_on_object)
     run.output.supersede(run.output.path / FOLDER)  # a finished run needs no checkpoints

@@ -198,18 +198,21 @@ def picture_lines(
             **compare_images(candidate, reference),
         }
         write_sheet(options.output / f"{preset.name}_d{depth}.png", candidate, reference)
-    ratio = shadow_ratio(*setting, spp, seed)
-    own = ours.shadow_ratio(*setting, spp, seed + 1, device)
-    seen = ratio.coverage
-    ratio, own = comparable(ratio, seen), comparable(own, seen)
-    yield {
-        "scene": preset.name,
-        "what": "shadow_ratio",
-        "spp": spp,
-        "size": size,
-        **compare_images(own, ratio),
-    }
-    write_sheet(options.output / f"{preset.name}_ratio.png", own, ratio)
+    for bounce in (0, *options.bounces):
+        ratio = shadow_ratio(*setting, spp, seed, bounce_depth=bounce)
+        own = ours.shadow_ratio(*setting, spp, seed + 1, device, bounce)
+        seen = ratio.coverage
+        ratio, own = comparable(ratio, seen), comparable(own, seen)
+        yield {
+            "scene": preset.name,
+            "what": "shadow_ratio",
+            "depth": bounce,
+            "spp": spp,
+            "size": size,
+            **compare_images(own, ratio),
+        }
+        name = f"{preset.name}_ratio" + f"_b{bounce}" * bool(bounce)
+        write_sheet(options.output / f"{name}.png", own, ratio)
 
 
 def main(arguments: list[str] | None = None) -> None:
@@ -218,6 +221,7 @@ def main(arguments: list[str] | None = None) -> None:
     parser.add_argument("--output", type=Path, default=Path("out/referee"))
     parser.add_argument("--scenes", nargs="*", default=[p.name for p in PRESETS])
     parser.add_argument("--depths", nargs="*", type=int, default=[1, 4])
+    parser.add_argument("--bounces", nargs="*", type=int, default=[4], help="depths, beside none")
     parser.add_argument("--spp", type=int, default=1024, help="camera samples per pixel")
     parser.add_argument("--gradients", nargs="*", default=["spot_night", "truck_overcast"])
     parser.add_argument("--seed", type=int, default=1)

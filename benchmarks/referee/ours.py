@@ -27,10 +27,17 @@ class Estimate(NamedTuple):
     """Share of samples that see the object, or 1 where the plane is seen; shape [H, W]."""
 
 
-def renderer(asset: Asset, matrix: Float64Array, camera: Camera, device: str = "cpu") -> Renderer:
-    """Set an object over the plane ``y = 0``."""
+def renderer(
+    asset: Asset,
+    matrix: Float64Array,
+    camera: Camera,
+    device: str = "cpu",
+    bounce_depth: int = 0,
+) -> Renderer:
+    """Set an object over the plane ``y = 0``, which it lights with a ``bounce_depth``."""
     proxy = Receiver(np.array([0.0, 1.0, 0.0]), 0.0)
-    return Renderer(Scene([Placed(asset, matrix)], camera, proxy, device))
+    scene = Scene([Placed(asset, matrix)], camera, proxy, device)
+    return Renderer(scene, bounce_depth=bounce_depth)
 
 
 def _moments(runs: list[Float64Array]) -> tuple[Float64Array, Float64Array]:
@@ -75,9 +82,10 @@ def shadow_ratio(
     spp: int,
     seed: int,
     device: str = "cpu",
+    bounce_depth: int = 0,
 ) -> Estimate:
     """Render the shadow ratio; each run is long, since the quotient is biased by 1 / samples."""
-    render = renderer(asset, matrix, camera, device)
+    render = renderer(asset, matrix, camera, device, bounce_depth)
     light = light_args(Light(texels=texels), render.device)
     pixels = np.arange(camera.height * camera.width, dtype=np.int32)
     may_see = np.ones(len(pixels), np.int32)

@@ -19,7 +19,10 @@ def images(lines: list[dict[str, Any]]) -> str:
     for line in lines:
         if line["what"] == "gradient":
             continue
-        what = "shadow ratio" if line["what"] == "shadow_ratio" else f"object, D = {line['depth']}"
+        what = f"object, D = {line['depth']}"
+        if line["what"] == "shadow_ratio":
+            bounce = line.get("depth", 0)
+            what = "shadow ratio" + f", bounce of D = {bounce}" * bool(bounce)
         rows.append(
             f"| {line['scene']} | {what} | {line['spp']} | {line['z_mean']:.2f} / "
             f"{line['z_std']:.2f} | {100 * line['beyond_3']:.2f} % | {line['block_z_std']:.2f} / "

@@ -28,6 +28,7 @@ from warpir.kernels.types import (
     CameraArgs,
     Layers,
     LightArgs,
+    LightRecord,
     MaterialArgs,
     MeshArgs,
     ReceiverArgs,
@@ -310,6 +311,7 @@ def trace_paths(
         T: From `trace_direct`, shape [pixel, texel].
         emission: Radiance that does not depend on the light, shape [pixel].
     """
+    receiver.is_solid = 0
     p, column = wp.tid()
     q = first_path + column
     count = points.count[p]
@@ -378,3 +380,21 @@ def trace_paths(
         surface = surface_at(mesh, material, texture, sample.next, wo)
         if material.any_emission == 1:
             wp.atomic_add(emission, p, wp.cw_mul(throughput, surface.emission))
+
+
+@wp.kernel
+def spread_record(record: LightRecord, height: int, width: int, T: wp.array2d[wp.vec3]):
+    """Turn recorded directions into rows of transport; a thread a pixel.
+
+    Args:
+        record: Directions and their weights, rows are pixels.
+        height: He.
+        width: We.
+        T: Pixel radiance per texel radiance [1], zero, shape [pixel, texel].
+    """
+    p = wp.tid()
+    texels = TexelArgs()
+    texels.height = height
+    texels.width = width
+    for j in range(record.count[p]):
+        add_to_texels(T, p, texels, record.wi[p, j], record.weight[p, j], wp.vec3(0.0), 0.0)

@@ -490,7 +490,7 @@ def test_config_file_of_an_older_version_replays(tmp_path: Path) -> None:
     newer -= {"guidance"}
     newer |= {"proxy", "plane", "shadow_mask", "layer", "occluder_mask", "light_convention"}
     newer |= {"strict", "detail", "visible_sun", "hand_off", "mitsuba", "usd", "asset_up"}
-    newer |= {"settle", "sink", "response", "denoise", "camera_from", "roll"}
+    newer |= {"settle", "sink", "response", "denoise", "camera_from", "roll", "bounce"}
     newer |= {f"max_{field.name}" for field in fields(Limits)} - {"max_pixels"}
     newer |= {"max_prompt_bytes"}
     config = InsertConfig(photo="p.png", asset="a.glb", out="o", sky="clear", depth=2)

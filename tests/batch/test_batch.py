@@ -188,7 +188,7 @@ import warp
 from warpir.insert import main
 def loaded():
     return {name for name, module in warp._src.context.user_modules.items() if module.execs}
-load_kernels("cpu", [(False, False)])
+load_kernels("cpu", [(False, False, False), (False, False, True)])
 before = loaded()
 assert before and main(sys.argv[1:]) == 0
 assert loaded() == before, loaded() ^ before

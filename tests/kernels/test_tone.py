@@ -8,7 +8,7 @@ from warp import autograd
 from benchmarks.stability.tone import reinhard_kernel
 from tests import oracles as o
 from tests.statistics import central_differences, compare_gradients
-from warpir.kernels.tone import tone_curve
+from warpir.kernels.tone import ratio_curve, tone_curve
 
 VALUE_ABS = 1e-6
 """float32 values in [0, 1] after about ten operations."""
@@ -30,6 +30,19 @@ def curve_kernel(
 ):
     i = wp.tid()
     y[i] = tone_curve(x[i], curve[i], knot_x, knot_y, knot_slope, bin_count)
+
+
+@wp.kernel
+def ratio_kernel(
+    x: wp.array[float],
+    knot_x: wp.array2d[float],
+    knot_y: wp.array2d[float],
+    knot_slope: wp.array2d[float],
+    bin_count: int,
+    y: wp.array[float],
+):
+    i = wp.tid()
+    y[i] = ratio_curve(x[i], 0, knot_x, knot_y, knot_slope, bin_count)
 
 
 def upload(values: np.ndarray, device: str, requires_grad: bool = False) -> wp.array:
@@ -174,6 +187,26 @@ def test_curve_gradcheck(device: str, rng: np.random.Generator) -> None:
         raise_exception=False,
         show_summary=False,
     )
+
+
+def test_ratio_curve_goes_on_straight(device: str, rng: np.random.Generator) -> None:
+    """Beyond 1 the last slope goes on, in value and gradient; below, it is the curve itself."""
+    knots = float32_knots(rng.normal(scale=0.8, size=(1, 16)))
+    below, beyond = np.array([0.0, 0.3, 0.9, 1.0]), np.array([1.0 + 1e-3, 1.5, 40.0])
+    x = upload(np.concatenate([below, beyond]), device, True)
+    arrays = [upload(k, device, True) for k in knots]
+    y = wp.zeros(len(x), dtype=float, device=device, requires_grad=True)
+    with wp.Tape() as tape:
+        wp.launch(ratio_kernel, len(x), inputs=[x, *arrays, 5], outputs=[y], device=device)
+    tape.backward(grads={y: upload(np.ones(len(x)), device)})
+    last = float(knots[2][0, -1])
+    plain = apply_curve(below, np.zeros(4), knots, device)
+    np.testing.assert_array_equal(y.numpy()[:4], plain)
+    np.testing.assert_allclose(y.numpy()[4:], 1.0 + last * (beyond - 1.0), rtol=1e-6)
+    np.testing.assert_allclose(x.grad.numpy()[4:], last, rtol=1e-6)
+    at_one = curve_gradients(below, np.zeros(4), knots, np.ones(4), device)[3]
+    d_last = arrays[2].grad.numpy()[0, -1] - at_one[0, -1]
+    assert d_last == pytest.approx((beyond - 1.0).sum(), rel=1e-5)
 
 
 def test_reinhard(device: str) -> None:

@@ -128,13 +128,13 @@ class Pipeline:
 
         Either the light or the materials may have moved, since each record holds the other fixed.
         """
-        (radiance, light_record, vertex_record), (plane, plane_record) = self.drawn
+        (radiance, light_record, vertex_record), (plane, *plane_records) = self.drawn
         foreground = torch.from_numpy(radiance).double()
         lit, unoccluded = torch.from_numpy(plane.lit), torch.from_numpy(plane.unoccluded)
         if not torch.equal(raw["texels"], self.raw["texels"]):
             after, before = (object_sums(light_record, at["texels"]) for at in (raw, self.raw))
             foreground += after - before
-            lit, unoccluded = plane_sums(plane_record, raw["texels"])
+            lit, unoccluded = receiver_sums(plane_records, raw["texels"])
         if any(not torch.equal(raw[name], self.raw[name]) for name in MATERIAL):
             factors = plain_factors(self.materials(raw))
             arrays = factor_arrays(self.mis.renderer, factors)
@@ -144,14 +144,21 @@ class Pipeline:
             return float(self.loss(raw, Radiance(foreground, lit, unoccluded)))
 
 
+def receiver_sums(records: list[Any], light: Tensor) -> tuple[Tensor, Tensor]:
+    """The receiver with and without the object, what that throws there included."""
+    record, thrown = records
+    lit, unoccluded = plane_sums(record, light)
+    return (lit if thrown is None else lit + object_sums(thrown, light)), unoccluded
+
+
 @pytest.fixture(
     scope="module",
-    params=[(device, depth) for device in devices() for depth in (1, 3)],
-    ids=lambda p: f"{p[0]}-depth{p[1]}",
+    params=[(device, *depths) for device in devices() for depths in ((1, 0), (3, 0), (3, 2))],
+    ids=lambda p: f"{p[0]}-depth{p[1]}" + f"-bounce{p[2]}" * bool(p[2]),
 )
 def pipeline(request: pytest.FixtureRequest) -> Pipeline:
-    device, depth = request.param
-    return make_pipeline(device, depth)
+    device, depth, bounce_depth = request.param
+    return make_pipeline(device, depth, bounce_depth=bounce_depth)
 
 
 def some_texels(generator: torch.Generator) -> Tensor:
@@ -163,7 +170,7 @@ def some_texels(generator: torch.Generator) -> Tensor:
     return texels
 
 
-def make_pipeline(device: str, depth: int, *materials: Material) -> Pipeline:
+def make_pipeline(device: str, depth: int, *materials: Material, bounce_depth: int = 0) -> Pipeline:
     """Set the two objects on the ground, of materials whose free factors are replaced."""
     focal = 40.0
     pose = np.eye(4)
@@ -172,7 +179,8 @@ def make_pipeline(device: str, depth: int, *materials: Material) -> Pipeline:
     stand = np.eye(4)
     stand[:3, 3] = [0.0, 0.5, -4.0]
     proxy = Receiver(np.array([0.0, 1.0, 0.0]), 0.0)
-    renderer = Renderer(Scene([Placed(two_objects(*materials), stand)], camera, proxy, device))
+    scene = Scene([Placed(two_objects(*materials), stand)], camera, proxy, device)
+    renderer = Renderer(scene, bounce_depth=bounce_depth)
     generator = torch.Generator().manual_seed(0)
 
     def normal(*shape: int) -> Tensor:
@@ -213,11 +221,11 @@ def gradient_of(pipeline: Pipeline) -> dict[str, Tensor]:
 
 def test_pinned_render_equals_the_free_one(pipeline: Pipeline) -> None:
     """Records hold the picture: its light summed in float64, its materials by the kernel."""
-    (radiance, light_record, vertex_record), (plane, plane_record) = pipeline.drawn
+    (radiance, light_record, vertex_record), (plane, *plane_records) = pipeline.drawn
     with torch.no_grad():
         light, materials = pipeline.raw["texels"], pipeline.materials(pipeline.raw)
         free = pipeline.mis.radiance(light, light, SEED, materials)
-        lit, unoccluded = plane_sums(plane_record, light)
+        lit, unoccluded = receiver_sums(plane_records, light)
         reflected = object_sums(light_record, light)
         arrays = factor_arrays(pipeline.mis.renderer, plain_factors(materials))
     shaded = path_means(

@@ -132,7 +132,7 @@ def test_light_gradient_is_that_of_the_recorded_sum(device: str, depth: int) -> 
     of_object = ObjectSamples(mis, args, SEED, none, (True,) + (False,) * 4)
     of_plane = ReceiverSamples(mis, args, SEED, (True,))
     radiance, record, _ = of_object.draw(slice(None))
-    plane, plane_record = of_plane.draw(slice(None))
+    plane, plane_record, _ = of_plane.draw(slice(None))
     assert record is not None and plane_record is not None
 
     truth = some_light()

@@ -19,7 +19,7 @@ from tests.oracles import (
     sg_irradiance,
 )
 from tests.render.test_render import DOWN, foot, render, shadow
-from tests.render.test_transport import FLOOR, _objects, _ratios
+from tests.render.test_transport import FLOOR, _objects, ratios_of
 from tests.statistics import compare_gradients, z_test
 from warpir.app.command import parse
 from warpir.app.config import InsertConfig
@@ -309,7 +309,7 @@ def test_transport_agrees_with_mis_in_a_place(device: str) -> None:
     for seed in range(12):
         other.append(reference.radiance(light, light, 1000 + seed))
         other_gradients.append(gradient(other[-1]))
-    for mine, theirs in ((_objects(own), _objects(other)), (_ratios(own), _ratios(other))):
+    for mine, theirs in ((_objects(own), _objects(other)), (ratios_of(own), ratios_of(other))):
         variance = mine[1] + theirs[1]
         # A dozen runs: outliers of a t distribution.
         assert z_test(mine[0], theirs[0], 2.0 * variance + FLOOR**2).passed
@@ -373,8 +373,7 @@ def test_mis_gradients_match_central_differences(device: str) -> None:
     args = light_args(host_light(texels), renderer.device)
     samples = ReceiverSamples(mis, args, 5, (True,))
     drawn = samples.render()
-    assert samples.kept is not None
-    lit, unoccluded = plane_sums(samples.kept, texels)
+    lit, unoccluded = plane_sums(samples.kept[0], texels)
     black = MisIntegrator(corner(device, is_black=True), objects, proxies, 16, 2, 2)
     dark = ReceiverSamples(black, args, 5, (False,)).render()
     np.testing.assert_allclose(lit.detach(), dark.lit, rtol=1e-4, atol=1e-6)

@@ -159,7 +159,7 @@ def test_transport_agrees_with_mis(
     other = [reference.radiance(texels, texels, 1000 + seed) for seed in range(RUNS)]
     for mine, theirs in (
         (_objects(own), _objects(other)),
-        (_ratios(own), _ratios(other)),
+        (ratios_of(own), ratios_of(other)),
     ):
         variance = mine[1] + theirs[1]
         assert z_test(mine[0], theirs[0], variance + FLOOR**2).passed
@@ -173,7 +173,7 @@ def _objects(runs: list[Radiance]) -> tuple[Float64Array, Float64Array]:
     return stack.mean(axis=0), stack.var(axis=0, ddof=1) / len(runs)
 
 
-def _ratios(runs: list[Radiance]) -> tuple[Float64Array, Float64Array]:
+def ratios_of(runs: list[Radiance]) -> tuple[Float64Array, Float64Array]:
     """Quotient of mean ``lit`` and ``unoccluded`` over runs, and its variance, linearised."""
     lit, unoccluded = (
         np.stack([getattr(r, name).detach().cpu().numpy() for r in runs]).astype(np.float64)
@@ -385,11 +385,15 @@ def test_transport_cache_is_keyed_by_content(device: str, tmp_path: Path) -> Non
     assert torch.equal(first.T_fg.T, again.T_fg.T)
     assert torch.equal(first.T_shadow.by_column.values(), again.T_shadow.by_column.values())
     assert np.array_equal(first.mask, again.mask) and torch.equal(first.emission, again.emission)
+    bouncing = [made(Renderer(scene_of(device).scene, bounce_depth=2)) for _ in range(2)]
+    assert bouncing[1].is_cached and torch.equal(*(b.T_thrown.T for b in bouncing))
+    assert torch.equal(*(b.emission_thrown for b in bouncing))
     for other in (
         made(scene_of(device), seed=1),
         made(scene_of(device), depth=3),
         made(scene_of(device, roughness=(0.31, 0.8))),
         made(scene_of(device, size=(25, 16))),
+        made(Renderer(scene_of(device).scene, bounce_depth=1)),
     ):
         assert not other.is_cached
     for file in tmp_path.iterdir():

@@ -188,6 +188,9 @@ class RenderConfig:
     indirect_limit: float = option(8.0, "RADIANCE", low=0)
     """Most radiance after a path's first bounce (0: any); the limit removes bright specks where a
     mirror throws sunlight onto the object"""
+    bounce: bool = option(True, expert=True)
+    """Let the object throw light on the ground; what it reflects and emits there is in the shadow
+    ratio, which --no-bounce leaves to what the object blocks, as DiPIR does"""
     denoise: str = option("auto", "auto|off", expert=True, choices=("auto", "off"))
     """Take the renderer's noise out of object and shadow; auto: where pyoidn is installed (pip
     install warpir[denoise])"""
@@ -201,6 +204,11 @@ class RenderConfig:
     """Seed of all random numbers"""
     deterministic: bool = option(False)
     """Repeat the same bytes on a GPU too, slower; on the CPU every run does"""
+
+    @property
+    def bounce_depth(self) -> int:
+        """Surface hits of light that the object throws on the ground; 0 without a bounce."""
+        return self.depth if self.bounce else 0
 
 
 @dataclass(frozen=True)

@@ -262,7 +262,8 @@ class Batch:
                 return cluster.gpus
             # Each machine compiles for what it has: one without a GPU gets no scene that needs it.
             devices = ["cpu" if self._config(key).render.device == "cpu" else None for key in keys]
-            task = Task(COMPILE, {"devices": [*dict.fromkeys(devices)], "places": places})
+            needed = {"devices": [*dict.fromkeys(devices)], "places": places}
+            task = Task(COMPILE, needed | {"bounces": self._bounces(keys)})
             cluster.prepare(self.options.out.absolute(), task)
             memory: dict[int, int] = {}
             for key in keys:
@@ -302,13 +303,18 @@ class Batch:
         """
         found: list[Answer] = []
         for device in dict.fromkeys(self._config(key).render.device for key in keys):
-            task = Task(COMPILE, {"devices": [device], "places": list(places)})
+            needed = {"devices": [device], "places": list(places)}
+            task = Task(COMPILE, needed | {"bounces": self._bounces(keys)})
             run_tasks(self._workers, {0: task}, lambda *_: False, lambda _, a: found.append(a))
             if found[-1].status:
                 for key in keys:
                     if self._config(key).render.device == device:
                         self.scenes[key].fail(found[-1].status, found[-1].lines)
         return max((int(answer.found.get("cuda", 0)) for answer in found), default=0)
+
+    def _bounces(self, keys: Sequence[int]) -> list[bool]:
+        """Return the variants of the path tracer's ``is_from_ground`` that scenes need."""
+        return sorted({False, *(self._config(key).render.bounce for key in keys)})
 
     def _fail_on_cuda(self, keys: Sequence[int]) -> list[int]:
         """Let scenes fail that ask for a GPU of a cluster without one; return the others."""

@@ -12,6 +12,7 @@ import traceback
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import dataclass, field
+from itertools import product
 from pathlib import Path
 from typing import Any
 
@@ -209,7 +210,7 @@ def _compile(task: Task) -> dict[str, Any]:
     places = task.config["places"]
     for device in [choose_device(name) for name in task.config["devices"]]:
         if places:
-            load_kernels(device, [(x, y) for x in (False, True) for y in places])
+            load_kernels(device, product((False, True), places, task.config["bounces"]))
     return {"cuda": cuda_count()}
 
 

@@ -404,6 +404,8 @@ def _make_bench(
         prompt=options.prompt,
         steps=options.steps or None,
         threads=options.threads or None,
+        # The truth is the paper's: its ratio, without light that the object throws on the ground.
+        bounce=False,
     )
     return Bench(
         scenes, device, options.seed, config, network, missing, predictions, options.calibrator

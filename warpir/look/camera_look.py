@@ -56,7 +56,7 @@ class CameraLook:
         faint = blurred["matte"] < FAINT
         for name in (*SUMMED, "matte"):
             blurred[name][faint] = 0.0
-        unshaded = blurred["shadow_ratio"] > 1.0 - FAINT
+        unshaded = np.abs(blurred["shadow_ratio"] - 1.0) < FAINT
         blurred["shadow_ratio"][unshaded] = 1.0
         return blurred
 

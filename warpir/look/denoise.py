@@ -118,7 +118,8 @@ def denoised_ratio(ratio: FloatArray, pixels: IntArray, size: tuple[int, int]) -
         return ratio
     window = Window.around(pixels, *size)
     clean = window.gather(_filter(window.spread(ratio, outside=1.0)))
-    return np.where(ratio == 1.0, ratio, np.clip(clean, 0.0, 1.0)).astype(np.float32)
+    most = max(1.0, float(ratio.max()))
+    return np.where(ratio == 1.0, ratio, np.clip(clean, 0.0, most)).astype(np.float32)
 
 
 def _filled(plane: FloatArray, known: BoolArray) -> FloatArray:

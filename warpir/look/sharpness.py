@@ -135,9 +135,9 @@ def blurred_layers(
     seen = 1.0 - planes["matte"]
     weight = blur(seen)[..., None]
     # In differences from 1, so that ground beyond the shadow stays exactly 1.
-    darker = blur((1.0 - planes["shadow_ratio"]) * seen[..., None])
-    ratio = 1.0 - darker / np.maximum(weight, 1e-6)
+    change = blur((planes["shadow_ratio"] - 1.0) * seen[..., None])
+    ratio = 1.0 + change / np.maximum(weight, 1e-6)
     inside = weight[..., 0] < 1e-3
     ratio[inside] = planes["shadow_ratio"][inside]
-    result["shadow_ratio"] = np.clip(ratio, 0.0, 1.0).astype(np.float32)
+    result["shadow_ratio"] = np.maximum(ratio, 0.0).astype(np.float32)
     return result

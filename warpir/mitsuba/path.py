@@ -86,7 +86,8 @@ class GltfPath(RBIntegrator):
     ) -> Any:
         """Trace paths of at most ``max_depth - 1`` surface interactions; see `RBIntegrator`.
 
-        Its ``state_in`` is not needed: no parameter but the light is differentiated.
+        Its ``state_in`` is not needed: no parameter but the light is differentiated. With
+        ``is_camera`` False the first rays are not those of a camera, and see all back faces.
         """
         primal = mode == dr.ADMode.Primal
         context = mi.BSDFContext()
@@ -96,7 +97,8 @@ class GltfPath(RBIntegrator):
         throughput = mi.Spectrum(1.0)
         depth = mi.UInt32(0)
         ray = mi.Ray3f(dr.detach(ray))
-        si = intersect(scene, ray, sampler, True, self.has_alpha, mi.Bool(active))
+        is_camera = kwargs.get("is_camera", True)
+        si = intersect(scene, ray, sampler, is_camera, self.has_alpha, mi.Bool(active))
         seen = mi.Bool(active) & si.is_valid()
         active = mi.Bool(seen)
         while dr.hint(active, max_iterations=self.max_depth, label=f"gltf path ({mode.name})"):

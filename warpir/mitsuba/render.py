@@ -39,6 +39,8 @@ from warpir.scene.camera import Camera, mitsuba_sensor
 
 SAMPLES_PER_PASS = 1 << 21
 """Camera samples traced at once; bounds memory at about 1 GB."""
+HORIZON = 1e5
+"""Where a ground of finite size ends, in radii of the object."""
 
 
 class Foreground(NamedTuple):
@@ -94,7 +96,12 @@ class ObjectScene:
 
 
 def build(
-    asset: Asset, matrix: Float64Array, camera: Camera, texels: FloatArray, depth: int
+    asset: Asset,
+    matrix: Float64Array,
+    camera: Camera,
+    texels: FloatArray,
+    depth: int,
+    ground: tuple[float, float, float, float] | None = None,
 ) -> ObjectScene:
     """Build the Mitsuba scene of one object under one light.
 
@@ -104,6 +111,7 @@ def build(
         camera: Pinhole with ``fx == fy``, world frame [m].
         texels: Lat-long radiance, relative [W/(m^2 sr)], shape [He, We, 3].
         depth: Surface interactions of the longest path.
+        ground: Black plane ``a x + b y + c z + d = 0`` with a unit normal, world frame [m].
 
     Raises:
         ValueError: Mitsuba's camera has square pixels only.
@@ -120,6 +128,16 @@ def build(
     parts = {"type": "scene", "light": LatlongEmitter(texels)}
     for k, positions in enumerate(world):
         parts[f"primitive_{k}"] = _mesh(asset, k, (positions - center) / radius, linear)
+    if ground is not None:
+        normal, offset = _in_unit_frame(ground, center, radius)
+        to_plane = mi.ScalarTransform4f().look_at(
+            origin=normal * offset, target=normal * (offset + 1.0), up=np.roll(normal, 1)
+        )
+        parts["ground"] = {
+            "type": "rectangle",
+            "to_world": to_plane @ mi.ScalarTransform4f().scale([HORIZON, HORIZON, 1.0]),
+            "bsdf": {"type": "diffuse", "reflectance": {"type": "rgb", "value": 0.0}},
+        }
     used_materials = [asset.materials[p.material] for p in asset.primitives]
     has_alpha = any(m.alpha_mode != "OPAQUE" or m.transmission > 0.0 for m in used_materials)
     integrator = mi.load_dict({"type": "gltf_path", "max_depth": depth + 1, "has_alpha": has_alpha})
@@ -176,11 +194,13 @@ def shadow(
     spp: int,
     seed: int,
     ground: tuple[float, float, float, float] = (0.0, 1.0, 0.0, 0.0),
+    bounce_depth: int = 0,
 ) -> Shadow:
-    """Render an infinite white plane, lit directly, with and without the object above it.
+    """Render an infinite white plane with and without the object above it.
 
     Only camera samples that meet the plane before the object count; both radiances use the
-    same ones, so their ratio is exactly 1 where nothing is blocked.
+    same ones, so their ratio is exactly 1 where nothing is blocked. It is lit directly and, with a
+    ``bounce_depth``, by paths of that many interactions with the object over black ground.
 
     Args:
         asset: Object, asset frame [m].
@@ -190,17 +210,20 @@ def shadow(
         spp: Camera samples per pixel, at least 2.
         seed: Base seed.
         ground: Plane ``a x + b y + c z + d = 0`` with a unit normal, world frame [m].
+        bounce_depth: Interactions of light that the object throws onto the plane; 0 for none.
     """
     setup = build(asset, matrix, camera, texels, 1)
-    normal = np.asarray(ground[:3])
-    offset = float(-(ground[3] + normal @ setup.center) / setup.radius)
+    normal, offset = _in_unit_frame(ground, setup.center, setup.radius)
+    bounce = None
+    if bounce_depth:
+        bounce = build(asset, matrix, camera, texels, bounce_depth, ground)
     shape = (camera.height, camera.width)
     moments = np.zeros((2, *shape, 6))
     products = np.zeros((*shape, 3))
     hits = np.zeros((*shape, 1))
     for pass_seed, pass_spp in passes(camera, spp, seed):
         with dr.suspend_grad():
-            lit, unoccluded, seen = _trace_plane(setup, normal, offset, pass_seed, pass_spp)
+            lit, unoccluded, seen = _trace_plane(setup, normal, offset, pass_seed, pass_spp, bounce)
         both = np.concatenate([np.asarray(lit), np.asarray(unoccluded)]).astype(np.float64)
         samples = both.T.reshape(*shape, pass_spp, 6)
         moments += np.stack([samples.sum(axis=2), np.square(samples).sum(axis=2)])
@@ -227,9 +250,10 @@ def shadow_ratio(
     spp: int,
     seed: int,
     ground: tuple[float, float, float, float] = (0.0, 1.0, 0.0, 0.0),
+    bounce_depth: int = 0,
 ) -> Ratio:
     """Return the quotient of `shadow`'s two radiances; arguments are `shadow`'s."""
-    plane = shadow(asset, matrix, camera, texels, spp, seed, ground)
+    plane = shadow(asset, matrix, camera, texels, spp, seed, ground, bounce_depth)
     seen = np.isfinite(plane.lit) & (plane.unoccluded > 0.0)
     u = np.where(seen, plane.unoccluded, 1.0)
     ratio = np.where(seen, np.where(seen, plane.lit, 0.0) / u, 1.0)
@@ -238,6 +262,14 @@ def shadow_ratio(
     )
     variance = np.where(seen & np.isfinite(residual), np.maximum(residual, 0.0) / u**2, 0.0)
     return Ratio(ratio, variance, plane.seen)
+
+
+def _in_unit_frame(
+    ground: tuple[float, float, float, float], center: Float64Array, radius: float
+) -> tuple[Float64Array, float]:
+    """Return normal and offset of the plane ``dot(normal, x) = offset`` in the scene's frame."""
+    normal = np.asarray(ground[:3])
+    return normal, float(-(ground[3] + normal @ center) / radius)
 
 
 def _mesh(asset: Asset, index: int, positions: Float64Array, linear: Float64Array) -> mi.Mesh:
@@ -314,9 +346,16 @@ def _mean_and_variance(
 
 
 def _trace_plane(
-    setup: ObjectScene, normal: Float64Array, offset: float, seed: int, spp: int
+    setup: ObjectScene,
+    normal: Float64Array,
+    offset: float,
+    seed: int,
+    spp: int,
+    bounce: ObjectScene | None = None,
 ) -> tuple[mi.Color3f, mi.Color3f, mi.Bool]:
     """Sample radiance of the plane ``dot(normal, x) = offset``, 0 where it is not seen.
+
+    ``bounce`` is the scene with the plane in it, in which the object lights it.
 
     Returns:
         With the object, without it, and whether the plane is seen.
@@ -364,6 +403,16 @@ def _trace_plane(
     by_cosine = dr.select(seen & (cos_i > 0.0), by_cosine, 0.0)
     unblocked_cosine = visible(d, seen)
     lit = dr.select(unblocked_light, by_light, 0.0) + dr.select(unblocked_cosine, by_cosine, 0.0)
+    if bounce is not None:
+        thrown, *_ = bounce.integrator.sample(
+            dr.ADMode.Primal,
+            bounce.scene,
+            sampler,
+            mi.Ray3f(it.p + n * RAY_OFFSET, d),
+            active=seen & (cos_i > 0.0),
+            is_camera=False,
+        )
+        lit += dr.select(seen, thrown, 0.0)
     return lit, by_light + by_cosine, seen
 
 
@@ -379,7 +428,12 @@ class Composite(NamedTuple):
 
 
 def render_run(
-    folder: Path, ground: tuple[float, float, float, float], depth: int, spp: int, seed: int
+    folder: Path,
+    ground: tuple[float, float, float, float],
+    depth: int,
+    spp: int,
+    seed: int,
+    bounce_depth: int = 0,
 ) -> Composite:
     """Render object and shadow of a finished run and put them into its photo.
 
@@ -391,6 +445,7 @@ def render_run(
         depth: Surface interactions of the longest path.
         spp: Camera samples per pixel, at least 2.
         seed: Base seed.
+        bounce_depth: Interactions of light that the object throws on the ground; 0 for none.
 
     Raises:
         InputError: A file of the run is missing or damaged.
@@ -409,13 +464,9 @@ def render_run(
 
     displayed, slope = _through(tone, lit.mean / share)
     texels = _light(folder, "shadow")
-    plane = shadow_ratio(asset, matrix, camera, texels, spp, seed + 1, ground)
+    plane = shadow_ratio(asset, matrix, camera, texels, spp, seed + 1, ground, bounce_depth)
 
-    def bend(ratio: Float64Array) -> Float64Array:
-        curved = curves.shadow_ratio.evaluate(ratio)
-        return np.stack([curved[..., k, k] for k in range(3)], axis=-1)
-
-    ratio, ratio_slope = _through(bend, plane.mean)
+    ratio, ratio_slope = _through(curves.shadow_ratio.evaluate_ratio, plane.mean)
     behind = (1.0 - coverage) * plate
     variance = slope**2 * lit.variance + (behind * ratio_slope) ** 2 * plane.variance
     return Composite(displayed * coverage + behind * ratio, np.sqrt(variance))
@@ -437,19 +488,25 @@ def write_composite(path: Path, composite: Composite) -> None:
     path.with_suffix(".png").write_bytes(png_bytes(codes, None, True, "Rendered by Mitsuba 3"))
 
 
-def main(folder: Path, ground: tuple[float, float, float, float], depth: int) -> None:
+def main(
+    folder: Path,
+    ground: tuple[float, float, float, float],
+    depth: int,
+    bounce_depth: int = 0,
+) -> None:
     """Run ``render.py`` of a run's folder; its command line has ``--samples`` and ``--seed``.
 
     Args:
         folder: The run's folder.
         ground: Plane of the shadow, world frame [m].
         depth: Surface interactions of the longest path.
+        bounce_depth: Interactions of light that the object throws on the ground; 0 for none.
     """
     parser = argparse.ArgumentParser(description="Render this insertion with Mitsuba 3.")
     parser.add_argument("--samples", type=int, default=256, help="camera samples per pixel")
     parser.add_argument("--seed", type=int, default=1)
     options = parser.parse_args()
-    composite = render_run(folder, ground, depth, options.samples, options.seed)
+    composite = render_run(folder, ground, depth, options.samples, options.seed, bounce_depth)
     path = folder / "mitsuba" / "composite"
     write_composite(path, composite)
     noisy = composite.error[composite.error > 0.0]

@@ -29,7 +29,9 @@ LEAST_ROWS, FINE_ROWS = 512, 2048
 right to 2e-5."""
 
 
-def write_mitsuba(output: OutputFolder, inputs: Inputs, texels: FloatArray, depth: int) -> None:
+def write_mitsuba(
+    output: OutputFolder, inputs: Inputs, texels: FloatArray, depth: int, bounce_depth: int
+) -> None:
     """Stage the folder.
 
     Args:
@@ -37,6 +39,7 @@ def write_mitsuba(output: OutputFolder, inputs: Inputs, texels: FloatArray, dept
         inputs: Camera, and the object with its place.
         texels: The light on the object, relative [W/(m^2 sr)], shape [He, 2 He, 3].
         depth: Surface interactions of the longest path.
+        bounce_depth: Interactions of light that the object throws on the ground; 0 for none.
 
     Raises:
         InputError: The disk is full (exit 5).
@@ -47,7 +50,8 @@ def write_mitsuba(output: OutputFolder, inputs: Inputs, texels: FloatArray, dept
     text = scene.xml(inputs.camera, depth)
     output.write_bytes(f"{FOLDER}/scene.xml", text.encode())
     ground = tuple(float(c) for c in inputs.placement.ground)
-    output.write_bytes(f"{FOLDER}/render.py", _RENDER.format(ground=ground, depth=depth).encode())
+    program = _RENDER.format(ground=ground, depth=depth, bounce_depth=bounce_depth)
+    output.write_bytes(f"{FOLDER}/render.py", program.encode())
 
 
 _RENDER = '''\
@@ -61,7 +65,8 @@ from pathlib import Path
 
 from warpir.mitsuba.render import main
 
-main(Path(__file__).resolve().parent.parent, ground={ground}, depth={depth})
+run = Path(__file__).resolve().parent.parent
+main(run, ground={ground}, depth={depth}, bounce_depth={bounce_depth})
 '''
 
 

@@ -176,6 +176,7 @@ def make_frame(run: Run) -> Frame:
         memory=run.memory,
         lower="--guidance-width",
         is_ordered=config.render.deterministic,
+        bounce_depth=config.render.bounce_depth,
     )
     photo = np.clip(resize(run.inputs.photo.linear(), small.height, small.width), 0.0, None)
     quality = config.render

@@ -228,8 +228,9 @@ def _shadow(
         pixels = renderer.shaded_pixels(args, quality.seed)
         pixels = pixels[wanted[pixels]]
         radiance = renderer.receiver(
-            args, pixels, is_object[pixels], quality.samples, quality.rays, quality.seed
-        )
+            args, pixels, is_object[pixels], quality.samples, quality.rays, quality.seed,
+            indirect_limit=quality.indirect_limit,
+        )  # fmt: skip
         return pixels, renderer.ratio(radiance)
 
     if shadow_mask is None:

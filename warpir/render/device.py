@@ -99,7 +99,7 @@ def cuda_count() -> int:
     return len(wp.get_cuda_devices())
 
 
-def load_kernels(device: str, variants: Iterable[tuple[bool, bool]]) -> None:
+def load_kernels(device: str, variants: Iterable[tuple[bool, bool, bool]]) -> None:
     """Compile the rendering kernels, or load them, and cache them for later processes.
 
     A run compiles when a kernel is first launched, and fills the cache at its end.
@@ -127,7 +127,7 @@ def settle_hashes(is_cpu: bool) -> None:
     on an H200).
     """
     kernels = [trace_gbuffer, trace_receiver, shadow_ratio, tone_foreground]
-    kernels += [foreground_kernel(*flags) for flags in product((False, True), repeat=2)]
+    kernels += [foreground_kernel(*flags) for flags in product((False, True), repeat=3)]
     for kernel in kernels:
         kernel.module.get_module_hash(1 if is_cpu else None)
 

@@ -218,7 +218,7 @@ class Scene:
         eye = np.abs(camera.c2w[:3, 3] - self.origin).max()
         args.tolerance = float(1e-5 * self.diagonal + 5e-7 * eye)
         # Plain numbers, as `contents` wants them.
-        args.mesh, args.epsilon, args.shines = 0, 0.0, 0
+        args.mesh, args.epsilon, args.shines, args.is_solid = 0, 0.0, 0, 0
         args.positions = self._array(np.zeros((1, 3), np.float32), wp.vec3)
         args.indices = self._array(np.zeros(3, np.int32), wp.int32)
         args.radiance = self._array(np.zeros((1, 1, 3), np.float32), wp.vec3)

@@ -18,14 +18,13 @@ from numpy.typing import NDArray
 from warpir.core.arrays import BoolArray, Float64Array, FloatArray, IntArray
 from warpir.core.memory import Memory
 from warpir.kernels.composite import tone_foreground, tone_shadow
-from warpir.kernels.path import foreground_kernel
-from warpir.kernels.receiver import trace_receiver
 from warpir.kernels.shadow_ratio import shadow_ratio
 from warpir.kernels.tracing.gbuffer import trace_gbuffer
 from warpir.kernels.types import CameraArgs, LightArgs, LightRecord, MaterialArgs, VertexRecord
 from warpir.render.bad_pixels import BadPixels, all_finite, first_bad_sample_of
 from warpir.render.device import Launcher, Rows
 from warpir.render.device_scene import Scene
+from warpir.render.launches import ObjectLaunch, ReceiverLaunch
 from warpir.scene.camera import Camera
 from warpir.scene.placement import box_corners
 from warpir.scene.tone_curves import ToneKnots
@@ -38,7 +37,7 @@ PILOT_SCALE = 4
 """Side of the pixel blocks of the pilot pass for the receiver's shadow [px]."""
 PILOT_SAMPLES = 32
 UNSEEN_SHADOW = 1e-3
-"""Loss of light below which no shadow is traced [1]: an eighth of an 8-bit code at white."""
+"""Change of light below which no shadow is traced [1]: an eighth of an 8-bit code at white."""
 
 
 @dataclass(frozen=True)
@@ -80,99 +79,10 @@ class ReceiverRadiance:
     """Radiance of the white receiver with and without the object; a row a traced pixel."""
 
     lit: FloatArray
-    """Radiance with the object, relative [W/(m^2 sr)], shape [receiver_pixel, 3]."""
+    """Radiance with the object, relative [W/(m^2 sr)], shape [receiver_pixel, 3]; what the object
+    throws there is in it where the renderer has a `bounce_depth`."""
     unoccluded: FloatArray
     """Radiance without the object, shape [receiver_pixel, 3]."""
-
-
-@dataclass(frozen=True)
-class _ObjectLaunch:
-    """Arguments of a path-tracing launch that all pixels share."""
-
-    light: LightArgs
-    materials: MaterialArgs
-    rays: int
-    depth: int
-    indirect_limit: float
-    seed: int
-
-    def sums(
-        self,
-        renderer: Renderer,
-        pixels: IntArray,
-        spp: int,
-        lanes: int,
-        light_record: LightRecord | None = None,
-        vertex_record: VertexRecord | None = None,
-    ) -> tuple[FloatArray, ...]:
-        """Return radiance, its diffuse and emitted parts, and coverage, a row a pixel."""
-        scene, count = renderer.scene, len(pixels) * lanes
-        kernel = foreground_kernel(bool(self.materials.any_layers), bool(scene.receiver_args.mesh))
-        out = [renderer.zeros(count, t) for t in (wp.vec3, wp.vec3, wp.vec3, float)]
-        renderer.launch(
-            kernel,
-            count,
-            [
-                Rows(renderer.upload(np.repeat(pixels, lanes), wp.int32)),
-                scene.camera_args,
-                *scene.geometry(self.materials),
-                self.light,
-                spp // lanes,
-                self.rays,
-                lanes,
-                self.depth,
-                self.indirect_limit,
-                self.seed,
-                *map(Rows, out),
-                LightRecord() if light_record is None else Rows(light_record),
-                VertexRecord() if vertex_record is None else Rows(vertex_record),
-            ],
-            spp // lanes * self.rays,
-            "object",
-        )
-        parts = (a.numpy()[:count] for a in out)
-        return tuple(p.reshape(-1, lanes, *p.shape[1:]).sum(axis=1) for p in parts)
-
-
-@dataclass(frozen=True)
-class _ReceiverLaunch:
-    """Arguments of a launch over the white receiver that all pixels share."""
-
-    light: LightArgs
-    camera_args: CameraArgs
-    rays: int
-    seed: int
-
-    def sums(
-        self,
-        renderer: Renderer,
-        pixels: IntArray,
-        may_see_object: IntArray,
-        spp: int,
-        record: LightRecord | None = None,
-    ) -> tuple[FloatArray, ...]:
-        """Return the radiance with and without the object, a row a pixel."""
-        count = len(pixels)
-        out = [renderer.zeros(count, wp.vec3) for _ in range(2)]
-        renderer.launch(
-            trace_receiver,
-            count,
-            [
-                Rows(renderer.upload(pixels, wp.int32)),
-                Rows(renderer.upload(may_see_object, wp.int32)),
-                self.camera_args,
-                *renderer.scene.geometry(),
-                self.light,
-                spp,
-                self.rays,
-                self.seed,
-                *map(Rows, out),
-                LightRecord() if record is None else Rows(record),
-            ],
-            spp * self.rays,
-            "shadow",
-        )
-        return tuple(a.numpy()[:count] for a in out)
 
 
 class Renderer(Launcher):
@@ -185,6 +95,8 @@ class Renderer(Launcher):
         memory: Counts repeated launches for want of memory.
         lower: Flag that lowers the memory of a picture, for errors.
         is_ordered: Whether sums are to have one order on CUDA too, where that costs time.
+        bounce_depth: Interactions with the object of light that it throws onto the receiver; 0
+            leaves that light out, as DiPIR's ratio does.
 
     Attributes:
         bad_pixels: Counts of pixels that are not finite.
@@ -198,8 +110,10 @@ class Renderer(Launcher):
         memory: Memory | None = None,
         lower: str = "--width",
         is_ordered: bool = False,
+        bounce_depth: int = 0,
     ) -> None:
         super().__init__(scene.device, threads, progress)
+        self.bounce_depth = bounce_depth if scene.triangle_count else 0
         self.scene = scene
         self.memory, self.lower = memory or Memory(str(self.device.alias)), lower
         self.is_ordered = is_ordered or bool(self.device.is_cpu)
@@ -309,9 +223,9 @@ class Renderer(Launcher):
             vertex_record: The same.
             materials: In place of the scene's own (`Scene.materials_with`).
         """
-        launch = _ObjectLaunch(
-            light, materials or self.scene.material_args, rays, depth, indirect_limit, seed
-        )
+        own = materials or self.scene.material_args
+        view = self.scene.camera_args
+        launch = ObjectLaunch(light, own, view, rays, depth, indirect_limit, seed)
         lanes = self.lanes(len(pixels), spp)
 
         def trace(start: int, stop: int) -> tuple[FloatArray, ...]:
@@ -344,8 +258,14 @@ class Renderer(Launcher):
         seed: int,
         camera_args: CameraArgs | None = None,
         record: LightRecord | None = None,
+        thrown_record: LightRecord | None = None,
+        indirect_limit: float = 0.0,
     ) -> ReceiverRadiance:
         """Radiance of the white receiver with and without the object (both halves of DiPIR, eq. 5).
+
+        With a `bounce_depth` the first half is that of differential rendering (Debevec 1998,
+        "Rendering Synthetic Objects into Real Scenes", eq. 3): all light that the ground receives
+        with the object there, also what the object reflects and emits.
 
         Args:
             light: From `light_args`.
@@ -356,13 +276,15 @@ class Renderer(Launcher):
             seed: Base seed.
             camera_args: Another resolution of the view, or the scene's own.
             record: Filled on the way where given; rows are ``pixels``.
+            thrown_record: The same of the light that the object throws there, RGB weights of `lit`.
+            indirect_limit: Most radiance that one path of that light may add, or 0: no limit.
         """
         view = self.scene.camera_args if camera_args is None else camera_args
-        launch = _ReceiverLaunch(light, view, rays, seed)
+        launch = ReceiverLaunch(light, view, rays, seed, self.bounce_depth, indirect_limit)
 
         def trace(start: int, stop: int) -> tuple[FloatArray, ...]:
-            cut = None if record is None else Rows(record).cut(start, stop)
-            return launch.sums(self, pixels[start:stop], may_see_object[start:stop], spp, cut)
+            cut = (r if r is None else Rows(r).cut(start, stop) for r in (record, thrown_record))
+            return launch.sums(self, pixels[start:stop], may_see_object[start:stop], spp, *cut)
 
         def first_bad_sample(pixel: int) -> int | None:
             alone = np.array([pixel], np.int32)
@@ -383,8 +305,8 @@ class Renderer(Launcher):
         """Return the pixels where the object may change the plane's light, row-major.
 
         A pilot pass traces the same shadow rays over blocks of `PILOT_SCALE` pixels, each sample at
-        a position of its own in the block. A block whose 3 x 3 neighbourhood loses less than
-        `UNSEEN_SHADOW` of its light is left alone and stays the photo, bit for bit.
+        a position of its own in the block. A block whose 3 x 3 neighbourhood loses or gains less
+        than `UNSEEN_SHADOW` of its light is left alone and stays the photo, bit for bit.
         """
         camera = self.scene.camera
         width, height = -(-camera.width // PILOT_SCALE), -(-camera.height // PILOT_SCALE)
@@ -411,9 +333,9 @@ class Renderer(Launcher):
             self.scene.camera_args_at(coarse),
         )
         with np.errstate(divide="ignore", invalid="ignore"):
-            lost = np.where(pilot.unoccluded > 0.0, 1.0 - pilot.lit / pilot.unoccluded, 0.0)
-        lost = lost.max(axis=1).reshape(height, width)
-        blocks = _dilate(_mean_of_neighbours(lost) > UNSEEN_SHADOW)
+            changed = np.where(pilot.unoccluded > 0.0, 1.0 - pilot.lit / pilot.unoccluded, 0.0)
+        changed = np.abs(changed).max(axis=1).reshape(height, width)
+        blocks = _dilate(_mean_of_neighbours(changed) > UNSEEN_SHADOW)
         full = np.repeat(np.repeat(blocks, PILOT_SCALE, axis=0), PILOT_SCALE, axis=1)
         return np.flatnonzero(full[: camera.height, : camera.width]).astype(np.int32)
 

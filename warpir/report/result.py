@@ -63,8 +63,10 @@ def render_result(run: Run, light: SceneLight) -> RenderedResult:
         )
     look = _look(run, light)
     with run.timings.stage("render"), progress_bar(run.log.say) as report:
-        renderer = Renderer(placed, run.config.render.threads or 0, report, run.memory)
         quality = run.config.render
+        renderer = Renderer(
+            placed, quality.threads or 0, report, run.memory, bounce_depth=quality.bounce_depth
+        )
         picture = _picture(run, light, renderer, quality.samples, quality.rays, look)
     run.log.notices += run.memory.notices()  # printed when it happened
     run.log.notice(*renderer.bad_pixels.notices())
@@ -85,7 +87,8 @@ def write_preview(run: Run, light: SceneLight) -> None:
     camera = _rendering_camera(run.inputs.camera, run.config.render.width)
     camera = _rendering_camera(run.inputs.camera, min(settings.guidance_width, camera.width))
     placed = scene_of(run.inputs, camera, run.device, light.curves)
-    renderer = Renderer(placed, run.config.render.threads or 0)
+    asked = run.config.render
+    renderer = Renderer(placed, asked.threads or 0, bounce_depth=asked.bounce_depth)
     picture = _picture(run, light, renderer, PREVIEW_SAMPLES, 1)
     codes = run.inputs.photo.encode(picture.image, picture.changed)
     run.log.say(f"preview: {run.output.write_preview(0, codes, run.inputs.photo.icc)}")

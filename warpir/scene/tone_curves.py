@@ -85,6 +85,19 @@ class ToneKnots:
             axis=-1,
         )
 
+    def evaluate_ratio(self, ratio: Float64Array) -> Float64Array:
+        """Evaluate the curves of the shadow ratio, a channel each; straight on beyond 1.
+
+        Args:
+            ratio: At least 0, shape [..., curve].
+
+        Returns:
+            Shape [..., curve].
+        """
+        shown = np.diagonal(self.evaluate(ratio), axis1=-2, axis2=-1)
+        beyond: Float64Array = shown + np.maximum(ratio - 1.0, 0.0) * self.slope[:, -1]
+        return beyond
+
     @staticmethod
     def identity(curves: int, bins: int = 5) -> ToneKnots:
         """Return curves that change nothing."""

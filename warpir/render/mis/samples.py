@@ -102,7 +102,7 @@ class ObjectSamples:
         lanes = mis.renderer.lanes(len(pixels), mis.spp)
         light, vertex = None, None
         if is_recording and self.entries:
-            light = _new_light_record(len(pixels) * lanes, self.entries // lanes, device)
+            light = new_light_record(len(pixels) * lanes, self.entries // lanes, device)
         if is_recording and self.vertices:
             vertex = _new_vertex_record(
                 len(pixels) * lanes, self.vertices // lanes, self.has_layers, device
@@ -130,8 +130,7 @@ class ObjectSamples:
             lanes = self.mis.renderer.lanes(len(d_radiance[rows]), self.mis.spp)
             d_rows = np.repeat(d_radiance[rows], lanes, axis=0)
             if light is not None:
-                d_pixel = d_rows[:, :, None] * np.eye(3, dtype=np.float32)
-                part = map_gradient(self.mis.renderer, self.args, light, d_pixel)
+                part = map_gradient(self.mis.renderer, self.args, light, _per_channel(d_rows))
                 total[:1] = _add(total[:1], [part])
             if vertex is not None:
                 total[1:] = _add(
@@ -216,38 +215,44 @@ class ObjectSamples:
 
 
 class ReceiverSamples:
-    """Samples of the plane, with the methods of `ObjectSamples`."""
+    """Samples of the receiver, with the methods of `ObjectSamples`."""
 
     def __init__(
         self, mis: MisIntegrator, args: LightArgs, seed: int, free: Sequence[bool]
     ) -> None:
         self.mis, self.args, self.seed, self.free = mis, args, seed, free
         self.entries = 2 * mis.spp * mis.rays * free[0]
-        self.parts = _parts(len(mis.receiver_pixels), ENTRY_BYTES * self.entries)
-        self.kept: LightRecord | None = None
+        self.thrown_entries = self.entries * mis.renderer.bounce_depth
+        row_bytes = ENTRY_BYTES * (self.entries + self.thrown_entries)
+        self.parts = _parts(len(mis.receiver_pixels), row_bytes)
+        self.kept: tuple[LightRecord | None, ...] = ()
 
     def render(self) -> ReceiverRadiance:
-        """Trace the plane with and without the object; keep the record if it fits."""
+        """Trace the receiver with and without the object; keep the records if they fit."""
 
         def drawn() -> ReceiverRadiance:
             if len(self.parts) > 1:
                 return self.draw(slice(None), is_recording=False)[0]
             whole, self.parts = self.parts[0], _halves(len(self.mis.receiver_pixels))
-            radiance, self.kept = self.draw(whole)
-            self.parts = [whole]
+            radiance, *kept = self.draw(whole)
+            self.parts, self.kept = [whole], tuple(kept)
             return radiance
 
         return self.mis.renderer.memory.again(drawn, RECORDING, LOWER)
 
     def draw(
         self, rows: slice, is_recording: bool = True
-    ) -> tuple[ReceiverRadiance, LightRecord | None]:
-        """Trace some of the plane's pixels, with their record if it is asked for."""
+    ) -> tuple[ReceiverRadiance, LightRecord | None, LightRecord | None]:
+        """Trace some of the receiver's pixels, with the records that are asked for.
+
+        They are of its light from the sky, and of what the object throws there.
+        """
         mis = self.mis
         pixels = mis.receiver_pixels[rows]
-        record = None
-        if is_recording and self.entries:
-            record = _new_light_record(len(pixels), self.entries, mis.renderer.device)
+        record, thrown = (
+            new_light_record(len(pixels), n, mis.renderer.device) if is_recording and n else None
+            for n in (self.entries, self.thrown_entries)
+        )
         out = mis.renderer.receiver(
             self.args,
             pixels,
@@ -256,20 +261,24 @@ class ReceiverSamples:
             mis.rays,
             self.seed,
             record=record,
+            thrown_record=thrown,
         )
-        return out, record
+        return out, record, thrown
 
     def gradient(self, d_lit: FloatArray, d_unoccluded: FloatArray) -> Gradients:
         """Return the loss gradient of the light from those of `render`."""
         total: Gradients = [None]
         for rows in self.parts:
-            record = self.kept or self.draw(rows)[1]
-            self.kept = None
+            record, thrown = self.kept or self.draw(rows)[1:]
+            self.kept = ()
             assert record is not None, "no gradient was announced"
             d_pixel = np.zeros((len(d_lit[rows]), 3, 3), np.float32)
             d_pixel[:, :, 0], d_pixel[:, :, 1] = d_lit[rows], d_unoccluded[rows]
             part = map_gradient(self.mis.renderer, self.args, record, d_pixel)
             total = _add(total, [part])
+            if thrown is not None:
+                d_thrown = _per_channel(d_lit[rows])
+                total = _add(total, [map_gradient(self.mis.renderer, self.args, thrown, d_thrown)])
         return total
 
 
@@ -314,6 +323,12 @@ def map_gradient(
     return total
 
 
+def _per_channel(d_pixel: FloatArray) -> FloatArray:
+    """Return what takes RGB weights to a gradient per channel, shape [pixel, 3, 3]."""
+    diagonal: FloatArray = d_pixel[:, :, None] * np.eye(3, dtype=np.float32)
+    return diagonal
+
+
 def _add(total: Gradients, part: Gradients) -> Gradients:
     return [f if t is None or f is None else t + f for t, f in zip(total, part, strict=True)]
 
@@ -330,7 +345,8 @@ def _halves(count: int) -> list[slice]:
     return [slice(0, middle), slice(middle, count)]
 
 
-def _new_light_record(pixels: int, capacity: int, device: wp.Device) -> LightRecord:
+def new_light_record(pixels: int, capacity: int, device: wp.Device) -> LightRecord:
+    """Return an empty record of ``capacity`` directions for each of ``pixels`` rows."""
     record = LightRecord()
     record.count = wp.zeros(pixels, dtype=wp.int32, device=device)
     record.wi = wp.empty((pixels, capacity), dtype=wp.vec3, device=device)

@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     from warpir.render.device_scene import Scene
 
 
-FORMAT = 2
+FORMAT = 3
 """Layout and meaning of the stored arrays; part of every key."""
 
 
@@ -35,6 +35,7 @@ def content_key(
     expected: Light,
     seed: int,
     is_ordered: bool,
+    bounce_depth: int,
 ) -> str:
     """Return a hash of everything that the rows depend on, as 64 hexadecimal digits.
 
@@ -50,7 +51,7 @@ def content_key(
 
     digest.update(
         f"{FORMAT} {warpir.__version__} {depth} {seed} {sorted(asdict(settings).items())} "
-        f"{scene.device.name} {is_ordered}".encode()
+        f"{scene.device.name} {is_ordered} {bounce_depth}".encode()
     )
     for content in scene.contents():
         add(content)

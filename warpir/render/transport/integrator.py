@@ -40,6 +40,7 @@ from warpir.render.transport.rows import (
     plane_rows,
 )
 from warpir.render.transport.tents import direction_counts, flux_noise, tent_irradiance
+from warpir.render.transport.thrown import thrown_rows
 from warpir.scene.light import Light, rasterize_lobes
 
 DTYPES = {"bfloat16": torch.bfloat16, "float32": torch.float32}
@@ -94,6 +95,8 @@ class TransportIntegrator:
         self.has_mesh = renderer.scene.receiver.mesh is not None
         above, irradiance = self._open_irradiance()
         self.above = torch.from_numpy(above.astype(np.int64)).to(self.device)
+        thrown = np.flatnonzero(self._irradiance(self.settings.height_fg))
+        self.above_object = torch.from_numpy(thrown).to(self.device)
         self.irradiance = torch.from_numpy(irradiance).to(self.device)
 
         file = None
@@ -107,6 +110,7 @@ class TransportIntegrator:
                 expected,
                 seed,
                 renderer.is_ordered,
+                renderer.bounce_depth,
             )
             file = cache / f"{key}.safetensors"
         stored = None if file is None else load_rows(file, self.device)
@@ -119,14 +123,16 @@ class TransportIntegrator:
         wp.synchronize_device(renderer.device)
         self.seconds_traced = time.perf_counter() - start
 
+    def _irradiance(self, height: int) -> Float64Array:
+        """Return what each texel gives the open plane, shape [texel]; 1 with a mesh."""
+        if self.has_mesh:
+            return np.ones(2 * height * height)
+        x, y, z = (float(c) for c in self.renderer.scene.receiver.normal)
+        return tent_irradiance((x, y, z), height).reshape(-1)
+
     def _open_irradiance(self) -> tuple[IntArray, FloatArray]:
         """Return the texels that light the open plane, all with a mesh, and what each gives it."""
-        height = self.settings.height_shadow
-        if self.has_mesh:
-            irradiance = np.ones(2 * height * height)
-        else:
-            x, y, z = (float(c) for c in self.renderer.scene.receiver.normal)
-            irradiance = tent_irradiance((x, y, z), height).reshape(-1)
+        irradiance = self._irradiance(self.settings.height_shadow)
         above = np.flatnonzero(irradiance > 0.0).astype(np.int32)
         return above, irradiance[above].astype(np.float32)
 
@@ -134,6 +140,8 @@ class TransportIntegrator:
         """Trace all rows; names are those of the cache's arrays."""
         self._check_memory(0)
         traced = self._trace_mesh(seed) if self.has_mesh else self._trace_plane(above, seed)
+        if self.renderer.bounce_depth:
+            traced |= self._trace_thrown(seed)
         return self._trace_object(seed) | traced
 
     def _hold(self, stored: dict[str, Tensor]) -> None:
@@ -146,13 +154,15 @@ class TransportIntegrator:
             (len(self.receiver_pixels), len(self.above)),
         )
         self.T_receiver = DenseRows(stored["T_receiver"]) if self.has_mesh else None
+        self.T_thrown = DenseRows(stored["T_thrown"]) if self.renderer.bounce_depth else None
+        if self.T_thrown is not None:
+            self.emission_thrown = stored["emission_thrown"]
         if self.has_mesh:
             self.bounced, self.bounced_blocked = stored["bounced"]
         self.emission = stored["emission"]
         self.mask = stored["mask"].cpu().numpy()
-        self.bytes = self.T_fg.bytes + self.T_shadow.bytes
-        if self.T_receiver is not None:
-            self.bytes += self.T_receiver.bytes
+        rows = (self.T_fg, self.T_shadow, self.T_receiver, self.T_thrown)
+        self.bytes = sum(T.bytes for T in rows if T is not None)
 
     def _check_memory(self, entries: int) -> None:
         """Compare the size of both matrices, with so many sparse entries, with the limit."""
@@ -162,6 +172,8 @@ class TransportIntegrator:
         needed = 3 * wide * len(self.object_pixels) * texels + SparseRows.BYTES * entries
         if self.has_mesh:
             needed += wide * len(self.receiver_pixels) * 2 * settings.height_shadow**2
+        if self.renderer.bounce_depth:
+            needed += 3 * wide * len(self.receiver_pixels) * len(self.above_object)
         if entries == 0:
             rows = Need("the rows of light transport", needed, LOWER_OBJECT)
             self.renderer.memory.require(rows)
@@ -268,6 +280,33 @@ class TransportIntegrator:
             self._check_memory(entries.count)
         return entries.tensors() | {"T_receiver": T, "bounced": bounced}
 
+    def _trace_thrown(self, seed: int) -> dict[str, Tensor]:
+        """Store what the object throws onto the receiver, of the map that lights the object."""
+        settings, count = self.settings, len(self.receiver_pixels)
+        shape = (3, count, len(self.above_object))
+        T = self.renderer.memory.again(
+            lambda: torch.empty(shape, dtype=DTYPES[settings.dtype], device=self.device),
+            TRACING,
+            LOWER_SHADOW,
+        )
+        emission = torch.empty((count, 3), device=self.device)
+        start = 0
+        for part, emitted in thrown_rows(
+            self.renderer,
+            self.receiver_pixels,
+            self._may_see_object(),
+            settings,
+            self.expected[0],
+            seed,
+        ):
+            rows = slice(start, start + len(emitted))
+            traced, constant = wp.to_torch(part), torch.from_numpy(emitted).to(self.device)
+            self._blacken(self.receiver_pixels[rows], "bounce's transport", traced, constant)
+            T[:, rows] = traced[:, self.above_object].permute(2, 0, 1).to(T.dtype)
+            emission[rows] = constant
+            start = rows.stop
+        return {"T_thrown": T, "emission_thrown": emission}
+
     def staleness(self, light_fg: Light, light_shadow: Light) -> float:
         """Return the noise of the rows under these lights over that under the expected one [1].
 
@@ -310,6 +349,9 @@ class TransportIntegrator:
             blocked = blocked + self.bounced_blocked
         # Rounding alone may take more than there is.
         lit = (unoccluded - blocked).clamp(min=0.0)
+        if self.T_thrown is not None:
+            texels = self._texels(light_shadow, settings.height_fg)[self.above_object]
+            lit = lit + product(self.T_thrown, texels) + self.emission_thrown
         where = light_fg.device
         return Radiance(foreground.to(where), lit.to(where), unoccluded.to(where))
 

@@ -144,7 +144,7 @@ def object_rows(
     counts = direction_counts(expected, settings.bright_directions)
     every = np.arange(2 * height * height, dtype=np.int32)
     texels = texel_args(counts, height, renderer, every)
-    proposal = light_args(_proposal(expected), renderer.device)
+    proposal = light_args(proposal_of(expected), renderer.device)
     trace = _ObjectTrace(renderer, texels, proposal, depth, seed, int(counts.sum()))
     for group, factor in _groups(renderer, pixels, settings, seed):
         subsamples, paths = factor * settings.subsamples, factor * settings.paths
@@ -162,7 +162,7 @@ def object_rows(
         yield from renderer.memory.in_chunks(part, len(group), TRACING, LOWER_OBJECT)
 
 
-def _proposal(expected: FloatArray) -> Light:
+def proposal_of(expected: FloatArray) -> Light:
     """Return the light of later vertices: half of their directions look everywhere."""
     height = len(expected)
     flux = luminance(expected.astype(np.float64))
@@ -329,10 +329,10 @@ def plane_rows(
         )
         return blocked
 
-    yield from _chunks(renderer, trace, len(pixels), size)
+    yield from chunks(renderer, trace, len(pixels), size)
 
 
-def _chunks(
+def chunks(
     renderer: Renderer, trace: Callable[[int, int], Traced], count: int, size: int
 ) -> Iterator[Traced]:
     """Yield ``trace`` of each ``size`` pixels, in halves where memory is short."""
@@ -410,4 +410,4 @@ def mesh_rows(
         )
         return MeshRows(received, blocked, bounced, kept)
 
-    yield from _chunks(renderer, trace, len(pixels), size)
+    yield from chunks(renderer, trace, len(pixels), size)
