@@ -225,11 +225,11 @@ def _shadow(
     is_object[object_pixels] = 1
 
     def shaded(args: LightArgs, wanted: BoolArray) -> tuple[IntArray, FloatArray]:
-        pixels = renderer.shaded_pixels(args, quality.seed)
-        pixels = pixels[wanted[pixels]]
+        pixels, gains = renderer.changed_pixels(args, quality.seed, quality.indirect_limit)
+        pixels, gains = pixels[wanted[pixels]], gains[wanted[pixels]]
         radiance = renderer.receiver(
             args, pixels, is_object[pixels], quality.samples, quality.rays, quality.seed,
-            indirect_limit=quality.indirect_limit,
+            indirect_limit=quality.indirect_limit, may_gain=gains,
         )  # fmt: skip
         return pixels, renderer.ratio(radiance)
 

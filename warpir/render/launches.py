@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 import warp as wp
 
-from warpir.core.arrays import FloatArray, IntArray
+from warpir.core.arrays import BoolArray, FloatArray, IntArray
 from warpir.kernels.path import foreground_kernel
 from warpir.kernels.receiver import trace_receiver
 from warpir.kernels.types import CameraArgs, LightArgs, LightRecord, MaterialArgs, VertexRecord
@@ -107,6 +107,11 @@ class ObjectLaunch:
         )
 
 
+THROWN_LIMIT = 0.125
+"""Of `ReceiverLaunch.indirect_limit`, for light on the ground: there 64 samples of a path of
+radiance 8 leave a speck of a tenth, and the whole bounce is a few hundredths."""
+
+
 @dataclass(frozen=True)
 class ReceiverLaunch:
     """Arguments of a launch over the white receiver that all pixels share."""
@@ -124,11 +129,15 @@ class ReceiverLaunch:
         renderer: Renderer,
         pixels: IntArray,
         may_see_object: IntArray,
+        may_gain: BoolArray,
         spp: int,
         record: LightRecord | None = None,
         thrown_record: LightRecord | None = None,
     ) -> tuple[FloatArray, ...]:
-        """Return the radiance with and without the object, a row a pixel."""
+        """Return the radiance with and without the object and what it throws there, a row a pixel.
+
+        Where ``may_gain`` is False the object throws nothing. The first includes the last.
+        """
         count = len(pixels)
         out = [renderer.zeros(count, wp.vec3) for _ in range(2)]
         renderer.launch(
@@ -150,11 +159,13 @@ class ReceiverLaunch:
             "shadow",
         )
         lit, unoccluded = (a.numpy()[:count] for a in out)
-        if self.bounce_depth:
-            lit = lit + self.thrown(renderer).thrown(
-                renderer, pixels, may_see_object, spp, thrown_record
+        thrown = np.zeros_like(lit)
+        if self.bounce_depth and may_gain.any():
+            launch = self.thrown(renderer)
+            thrown[may_gain] = launch.thrown(
+                renderer, pixels[may_gain], may_see_object[may_gain], spp, thrown_record
             )
-        return lit, unoccluded
+        return lit + thrown, unoccluded, thrown
 
     def thrown(self, renderer: Renderer) -> ObjectLaunch:
         """Return the launch that traces the object's light on the receiver."""
@@ -164,6 +175,6 @@ class ReceiverLaunch:
             self.camera_args,
             self.rays,
             self.bounce_depth,
-            self.indirect_limit,
+            THROWN_LIMIT * self.indirect_limit,
             self.seed,
         )

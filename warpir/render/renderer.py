@@ -37,7 +37,9 @@ PILOT_SCALE = 4
 """Side of the pixel blocks of the pilot pass for the receiver's shadow [px]."""
 PILOT_SAMPLES = 32
 UNSEEN_SHADOW = 1e-3
-"""Change of light below which no shadow is traced [1]: an eighth of an 8-bit code at white."""
+"""Loss of light below which no shadow is traced [1]: an eighth of an 8-bit code at white."""
+UNSEEN_GAIN = 2e-3
+"""Gain of light below which it is not traced [1]: a quarter of an 8-bit code at white."""
 
 
 @dataclass(frozen=True)
@@ -83,6 +85,8 @@ class ReceiverRadiance:
     throws there is in it where the renderer has a `bounce_depth`."""
     unoccluded: FloatArray
     """Radiance without the object, shape [receiver_pixel, 3]."""
+    thrown: FloatArray
+    """What the object throws there, a part of ``lit``, shape [receiver_pixel, 3]."""
 
 
 class Renderer(Launcher):
@@ -260,6 +264,7 @@ class Renderer(Launcher):
         record: LightRecord | None = None,
         thrown_record: LightRecord | None = None,
         indirect_limit: float = 0.0,
+        may_gain: BoolArray | None = None,
     ) -> ReceiverRadiance:
         """Radiance of the white receiver with and without the object (both halves of DiPIR, eq. 5).
 
@@ -277,20 +282,27 @@ class Renderer(Launcher):
             camera_args: Another resolution of the view, or the scene's own.
             record: Filled on the way where given; rows are ``pixels``.
             thrown_record: The same of the light that the object throws there, RGB weights of `lit`.
-            indirect_limit: Most radiance that one path of that light may add, or 0: no limit.
+            indirect_limit: Limit of `foreground`; `THROWN_LIMIT` of it is the most radiance that
+                one path of that light may add. 0: no limit.
+            may_gain: False where the object throws nothing, as `changed_pixels` returns it, shape
+                [receiver_pixel]; None: it may everywhere. A ``thrown_record`` needs all of them.
         """
         view = self.scene.camera_args if camera_args is None else camera_args
         launch = ReceiverLaunch(light, view, rays, seed, self.bounce_depth, indirect_limit)
 
+        gain = np.ones(len(pixels), np.bool_) if may_gain is None else may_gain
+        assert thrown_record is None or gain.all(), "rows of the record are pixels"
+
         def trace(start: int, stop: int) -> tuple[FloatArray, ...]:
+            part = slice(start, stop)
             cut = (r if r is None else Rows(r).cut(start, stop) for r in (record, thrown_record))
-            return launch.sums(self, pixels[start:stop], may_see_object[start:stop], spp, *cut)
+            return launch.sums(self, pixels[part], may_see_object[part], gain[part], spp, *cut)
 
         def first_bad_sample(pixel: int) -> int | None:
             alone = np.array([pixel], np.int32)
-            hidden = may_see_object[pixels == pixel]
+            hidden, gains = may_see_object[pixels == pixel], gain[pixels == pixel]
             return first_bad_sample_of(
-                lambda spp: not all_finite(launch.sums(self, alone, hidden, spp)), spp
+                lambda spp: not all_finite(launch.sums(self, alone, hidden, gains, spp)), spp
             )
 
         stage, width = "shadow", self.scene.camera.width
@@ -302,11 +314,23 @@ class Renderer(Launcher):
         return ReceiverRadiance(*traced)
 
     def shaded_pixels(self, light: LightArgs, seed: int) -> IntArray:
-        """Return the pixels where the object may change the plane's light, row-major.
+        """Return the pixels where the object may change the plane's light, row-major."""
+        return self.changed_pixels(light, seed)[0]
 
-        A pilot pass traces the same shadow rays over blocks of `PILOT_SCALE` pixels, each sample at
-        a position of its own in the block. A block whose 3 x 3 neighbourhood loses or gains less
-        than `UNSEEN_SHADOW` of its light is left alone and stays the photo, bit for bit.
+    def changed_pixels(
+        self, light: LightArgs, seed: int, indirect_limit: float = 0.0
+    ) -> tuple[IntArray, BoolArray]:
+        """Return `shaded_pixels`, and which of them the object may throw light on.
+
+        A pilot pass traces the same rays over blocks of `PILOT_SCALE` pixels, each sample at a
+        position of its own in the block. A block whose 3 x 3 neighbourhood loses less than
+        `UNSEEN_SHADOW` of its light and gains less than `UNSEEN_GAIN` is left alone and stays the
+        photo, bit for bit.
+
+        Args:
+            light: From `light_args`.
+            seed: Base seed.
+            indirect_limit: As `receiver` has it.
         """
         camera = self.scene.camera
         width, height = -(-camera.width // PILOT_SCALE), -(-camera.height // PILOT_SCALE)
@@ -321,7 +345,7 @@ class Renderer(Launcher):
             camera.c2w,
         )
         if self.scene.triangle_count == 0:
-            return np.zeros(0, np.int32)
+            return np.zeros(0, np.int32), np.zeros(0, np.bool_)
         pixels = np.arange(width * height, dtype=np.int32)
         pilot = self.receiver(
             light,
@@ -331,13 +355,22 @@ class Renderer(Launcher):
             1,
             seed,
             self.scene.camera_args_at(coarse),
+            indirect_limit=indirect_limit,
         )
-        with np.errstate(divide="ignore", invalid="ignore"):
-            changed = np.where(pilot.unoccluded > 0.0, 1.0 - pilot.lit / pilot.unoccluded, 0.0)
-        changed = np.abs(changed).max(axis=1).reshape(height, width)
-        blocks = _dilate(_mean_of_neighbours(changed) > UNSEEN_SHADOW)
-        full = np.repeat(np.repeat(blocks, PILOT_SCALE, axis=0), PILOT_SCALE, axis=1)
-        return np.flatnonzero(full[: camera.height, : camera.width]).astype(np.int32)
+        lost = pilot.unoccluded - (pilot.lit - pilot.thrown)
+
+        def pixels_of(change: FloatArray, unseen: float) -> BoolArray:
+            with np.errstate(divide="ignore", invalid="ignore"):
+                share = np.where(pilot.unoccluded > 0.0, np.abs(change) / pilot.unoccluded, 0.0)
+            share = share.max(axis=1).reshape(height, width)
+            blocks = _dilate(_mean_of_neighbours(share) > unseen)
+            full = blocks.repeat(PILOT_SCALE, axis=0).repeat(PILOT_SCALE, axis=1)
+            seen: BoolArray = full[: camera.height, : camera.width].reshape(-1)
+            return seen
+
+        gains = pixels_of(pilot.thrown, UNSEEN_GAIN)
+        shaded = np.flatnonzero(pixels_of(lost, UNSEEN_SHADOW) | gains).astype(np.int32)
+        return shaded, gains[shaded]
 
     def ratio(self, radiance: ReceiverRadiance) -> FloatArray:
         """Return the shadow ratio per channel, shape [receiver_pixel, 3]."""
