@@ -172,8 +172,6 @@ def _write(lit: "LitRun", rendered: "RenderedResult", asked: InsertConfig) -> di
         if run.config.output.mitsuba:
             depths = run.config.render.depth, run.config.render.bounce_depth
             write_mitsuba(run.output, run.inputs, written.maps.on_object, *depths)
-        if run.config.output.usd:
-            _write_usd(run, written.maps.name_on_object)
     run.output.supersede(run.output.path / FOLDER)  # a finished run needs no checkpoints
     run.take_cache_notices()
     measured = run.inputs.measured | written.measured | lit.measured | rendered.measured
@@ -185,15 +183,6 @@ def _write(lit: "LitRun", rendered: "RenderedResult", asked: InsertConfig) -> di
         record["seconds"] = run.timings.rounded()
     run.output.write_json("run.json", record)
     return record
-
-
-def _write_usd(run: "Run", envmap: str) -> None:
-    """Stage ``scene.usdz`` with a map that is staged."""
-    from warpir.io.usd import USDZ, write_usdz
-
-    inputs, light = run.inputs, run.output.staging / envmap
-    package = write_usdz(inputs.asset, inputs.placement.asset_to_world, inputs.camera, light)
-    run.output.write_bytes(USDZ, package)
 
 
 # ------------------------------------------------------------------------- the command line

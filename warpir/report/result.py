@@ -217,6 +217,8 @@ def write_results(run: Run, light: SceneLight, picture: Picture) -> Written:
     if run.config.output.hand_off:
         handed = _hand_off(run, light, maps, response)
         _write_viewer(run, light, maps, picture)
+    if run.config.output.usd:
+        _write_usd(run, maps.name_on_object)
     summary = summarize(light.light)
     _say_what_is_seen(run, summary, picture)
     measured = {
@@ -282,6 +284,15 @@ def _hand_off(
     for line in notices:
         run.log.say(f"notice: {line}")
     return handed
+
+
+def _write_usd(run: Run, envmap: str) -> None:
+    """Stage ``scene.usdz`` with a map that is staged."""
+    from warpir.io.usd import USDZ, write_usdz
+
+    inputs, light = run.inputs, run.output.staging / envmap
+    package = write_usdz(inputs.asset, inputs.placement.asset_to_world, inputs.camera, light)
+    run.output.write_bytes(USDZ, package)
 
 
 def _write_viewer(run: Run, light: SceneLight, maps: Maps, picture: Picture) -> None:
