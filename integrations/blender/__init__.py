@@ -1,8 +1,7 @@
 """warpir in Blender: camera and light of a photo, and objects put into it.
 
-A panel in the 3D view's sidebar and in the camera's properties. All work is done by warpir in a
-process of its own environment, named in the preferences; this add-on moves files between the two
-(``docs/blender.md``).
+All work is done by warpir in a process of its own environment, named in the preferences; this
+add-on moves files between the two (``docs/blender.md``).
 """
 
 from pathlib import Path
@@ -39,11 +38,7 @@ class Settings(bpy.types.PropertyGroup):
 
 
 class Run:
-    """Runs warpir while Blender goes on; in the background, where nobody waits, it blocks.
-
-    A kind states ``arguments``, which returns what the environment's Python is given, and ``show``,
-    which brings the results into a scene; both are functions of `scenes`.
-    """
+    """Runs warpir while Blender goes on; in the background, where nobody waits, it blocks."""
 
     bl_options = {"UNDO"}
 
@@ -62,7 +57,8 @@ class Run:
             self.report({"ERROR"}, str(error))
             return {"CANCELLED"}
         if bpy.app.background:
-            _jobs[0].wait()
+            while not _jobs[0].has_ended(1.0):
+                pass
             return self.end()
         self.timer = context.window_manager.event_timer_add(0.2, window=context.window)
         context.window_manager.modal_handler_add(self)
@@ -184,15 +180,14 @@ class WARPIR_PT_camera(Panel, bpy.types.Panel):
         return context.camera is not None
 
 
-CLASSES = (
-    *(Preferences, Settings, WARPIR_OT_photo, WARPIR_OT_estimate, WARPIR_OT_insert),
-    *(WARPIR_OT_cancel, WARPIR_OT_report, WARPIR_PT_view, WARPIR_PT_camera),
-)
+RUNS = WARPIR_OT_estimate, WARPIR_OT_insert, WARPIR_OT_cancel
+SHOWN = WARPIR_OT_photo, WARPIR_OT_report, WARPIR_PT_view, WARPIR_PT_camera
+CLASSES = Preferences, Settings, *RUNS, *SHOWN
+register_all, unregister_all = bpy.utils.register_classes_factory(CLASSES)
 
 
 def register() -> None:
-    for kind in CLASSES:
-        bpy.utils.register_class(kind)
+    register_all()
     bpy.types.Scene.warpir = PointerProperty(type=Settings)
 
 
@@ -200,5 +195,4 @@ def unregister() -> None:
     for job in _jobs:
         job.cancel()
     del bpy.types.Scene.warpir
-    for kind in reversed(CLASSES):
-        bpy.utils.unregister_class(kind)
+    unregister_all()

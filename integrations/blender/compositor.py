@@ -13,8 +13,6 @@ GAMMA = 2.2
 OWN = "warpir "
 """First letters of the names of nodes that are ours to replace."""
 CURVE_POINTS = 33
-UNTOUCHED = 1e-4
-"""Alpha up to which a pixel is the photo's own."""
 
 
 class Graph:
@@ -52,28 +50,23 @@ class Graph:
                 socket.default_value = value
         return node
 
-    def mix(self, name: str, how: str, factor: Any, first: Any, second: Any) -> Any:
+    def value(self, kind: str, name: str, *inputs: Any, **values: Any) -> Any:
+        """Return the first output of a new node."""
+        return self.node(kind, name, *inputs, **values).outputs[0]
+
+    def mix(self, how: str, factor: Any, first: Any, second: Any) -> Any:
         """Return the colour of a mix."""
-        return self.node("MixRGB", name, factor, first, second, blend_type=how).outputs[0]
-
-    def math(self, operation: str, first: Any, second: Any = 0.0) -> Any:
-        """Return a number."""
-        return self.node("Math", operation, first, second, operation=operation).outputs[0]
-
-    def power(self, name: str, color: Any, power: float) -> Any:
-        """Return a power of a colour."""
-        return self.node("Gamma", name, color, power).outputs[0]
+        return self.value("MixRGB", how, factor, first, second, blend_type=how)
 
     def image(self, name: str, path: Path) -> Any:
         """Return a file's values, not interpreted."""
         image = bpy.data.images.load(str(path))
         image.colorspace_settings.name = "Non-Color"
-        return self.node("Image", name, image=image).outputs[0]
+        return self.value("Image", name, image=image)
 
     def over(self, behind: Any, front: Any, alpha: Any) -> Any:
         """Return a premultiplied colour over another."""
-        rest = self.mix("behind", "MIX", alpha, behind, (0.0, 0.0, 0.0, 1.0))
-        return self.mix("object", "ADD", 1.0, rest, front)
+        return self.mix("ADD", 1.0, self.mix("MIX", alpha, behind, (0.0, 0.0, 0.0, 1.0)), front)
 
     def curve(self, name: str, color: Any, points: list[tuple[float, float]]) -> Any:
         """Return a colour behind a curve on all channels, from (0, 0) to (1, 1)."""
@@ -90,7 +83,7 @@ class Graph:
     def show(self, display: Any) -> None:
         """Make display values the scene's picture."""
         spaces = {"from_color_space": "sRGB", "to_color_space": "Linear Rec.709"}
-        picture = self.node("ConvertColorSpace", "codes", display, **spaces).outputs[0]
+        picture = self.value("ConvertColorSpace", "codes", display, **spaces)
         kind = "NodeGroupOutput" if self.is_group else "CompositorNodeComposite"
         ends = [node for node in self.tree.nodes if node.bl_idname == kind]
         self.tree.links.new(picture, (ends or [self.tree.nodes.new(kind)])[0].inputs[0])
@@ -100,12 +93,12 @@ def show_layers(scene: Any, layers: Path) -> None:
     """Compose ``layers.exr`` by the formula of docs/handoff.md."""
     graph = Graph(scene)
     planes = graph.node("Image", "layers", image=bpy.data.images.load(str(layers))).outputs
-    behind = graph.mix("shadow", "MULTIPLY", 1.0, planes["plate"], planes["shadow"])
+    behind = graph.mix("MULTIPLY", 1.0, planes["plate"], planes["shadow"])
     alpha = graph.node("SeparateColor", "coverage", planes["fg"]).outputs["Alpha"]
     picture = graph.over(behind, planes["fg"], alpha)
     if "grain" in planes:
-        picture = graph.mix("grain", "ADD", 1.0, picture, planes["grain"])
-    graph.show(graph.power("display", picture, 1.0 / GAMMA))
+        picture = graph.mix("ADD", 1.0, picture, planes["grain"])
+    graph.show(graph.value("Gamma", "display", picture, 1.0 / GAMMA))
 
 
 def show_render(scene: Any, photo: Path, grain: Path, response: Path) -> None:
@@ -123,17 +116,20 @@ def show_render(scene: Any, photo: Path, grain: Path, response: Path) -> None:
     points = _display_curve(response) if response.is_file() else []
     if points:
         shown = graph.curve("response undone", shown, [(y, x) for x, y in points])
-    light = graph.power("light", shown, GAMMA)
-    shown = graph.power("display", graph.over(light, render[0], render["Alpha"]), 1.0 / GAMMA)
+    light = graph.value("Gamma", "light", shown, GAMMA)
+    shown = graph.over(light, render[0], render["Alpha"])
+    shown = graph.value("Gamma", "display", shown, 1.0 / GAMMA)
     if points:
         shown = graph.curve("response", shown, points)
     if grain.is_file():
         # What is left of the photo's own grain and what is added keep its variance.
-        kept = graph.math("POWER", graph.math("SUBTRACT", 1.0, render["Alpha"]), 2.0)
-        share = graph.math("SQRT", graph.math("SUBTRACT", 1.0, kept))
-        shown = graph.mix("grain", "ADD", share, shown, graph.image("noise", grain))
-    touched = graph.math("GREATER_THAN", render["Alpha"], UNTOUCHED)
-    graph.show(graph.mix("untouched", "MIX", touched, plate, shown))
+        rest = graph.value("Math", "rest", 1.0, render["Alpha"], operation="SUBTRACT")
+        kept = graph.value("Math", "kept", rest, rest, operation="MULTIPLY")
+        lost = graph.value("Math", "lost", 1.0, kept, operation="SUBTRACT")
+        share = graph.value("Math", "share", lost, operation="SQRT")
+        shown = graph.mix("ADD", share, shown, graph.image("noise", grain))
+    touched = graph.value("Math", "touched", render["Alpha"], 1e-4, operation="GREATER_THAN")
+    graph.show(graph.mix("MIX", touched, plate, shown))
 
 
 def _display_curve(path: Path) -> list[tuple[float, float]]:

@@ -9,29 +9,22 @@ import json
 import sys
 from pathlib import Path
 
-BOX = (0.5, 0.5, 0.5)
-"""Its sides [m]."""
-QUICK = ("--samples", "1", "--width", "64")
-"""The picture of the box is not wanted."""
+BOX = (0.5, 0.5, 0.5)  # its sides [m]
+QUICK = ("--samples", "1", "--width", "64")  # the picture of the box is not wanted
 
 
 def run(photo: str, folder: Path, flags: list[str]) -> int:
     """Return warpir's exit status."""
+    import trimesh
+
     from warpir.insert import main
 
-    write_box(folder / "box.glb")
+    trimesh.creation.box(extents=BOX).export(folder / "box.glb")
     named = ["--photo", photo, "--asset", str(folder / "box.glb"), "--out", str(folder / "result")]
     status = main([*named, *QUICK, *flags])
     if status == 0:
         write_grain(folder / "result", folder / "grain.exr")
     return status
-
-
-def write_box(path: Path) -> None:
-    """Write the object that stands in."""
-    import trimesh
-
-    trimesh.creation.box(extents=BOX).export(path)
 
 
 def write_grain(result: Path, path: Path) -> None:

@@ -6,8 +6,9 @@ import subprocess
 import threading
 from pathlib import Path
 
-STEPS = re.compile(r": (\d+) of (\d+)\b")
-"""In warpir's lines about long stages."""
+STEPS = re.compile(r": (\d+) of (\d+)\b")  # in warpir's lines about long stages
+STREAMS = {"stdin": subprocess.DEVNULL, "stdout": subprocess.PIPE, "stderr": subprocess.STDOUT}
+TEXT = {"encoding": "utf-8", "errors": "replace"}
 
 
 class Failure(Exception):
@@ -23,35 +24,20 @@ class Job:
             raise Failure(f"{named} the Python that has warpir in the add-on's preferences")
         # Blender's own PYTHONPATH would lend its modules to another Python.
         environment = {k: v for k, v in os.environ.items() if not k.startswith("PYTHON")}
+        environment["PYTHONUNBUFFERED"] = "1"
         self.python, self.is_cancelled, self.lines = python, False, [""]
-        try:
-            self._process = subprocess.Popen(
-                [python, *arguments],
-                cwd=folder,
-                env={**environment, "PYTHONUNBUFFERED": "1"},
-                stdin=subprocess.DEVNULL,
-                stdout=subprocess.PIPE,
-                stderr=subprocess.STDOUT,
-                encoding="utf-8",
-                errors="replace",
-            )
-        except OSError as error:
-            raise Failure(f"{python} cannot be started: {error.strerror}") from error
+        command = [python, *arguments]
+        self._process = subprocess.Popen(command, cwd=folder, env=environment, **STREAMS, **TEXT)
         self._reader = threading.Thread(target=self._read, daemon=True)
         self._reader.start()
 
     def _read(self) -> None:
-        assert self._process.stdout is not None
         self.lines.extend(line.rstrip() for line in self._process.stdout)
 
-    def has_ended(self) -> bool:
-        """Return whether the process has ended and all of its lines are here."""
-        return self._process.poll() is not None and not self._reader.is_alive()
-
-    def wait(self) -> None:
-        """Wait for the end."""
-        self._reader.join()
-        self._process.wait()
+    def has_ended(self, seconds: float = 0.0) -> bool:
+        """Wait this long; return whether the process has ended and all of its lines are here."""
+        self._reader.join(seconds)
+        return not self._reader.is_alive() and self._process.wait() is not None
 
     def cancel(self) -> None:
         """End the process; warpir then leaves no half results behind."""
@@ -70,7 +56,7 @@ class Job:
             raise Failure("Cancelled")
         if self._process.returncode == 0:
             return
-        if any("No module named 'warpir" in line for line in self.lines[-3:]):
+        if any("No module named " in line for line in self.lines[-3:]):
             raise Failure(f"{self.python} has no warpir: install it there, or name another Python")
         errors = [k for k, line in enumerate(self.lines) if line.startswith("error: ")]
         told = self.lines[errors[0] : errors[0] + 2] if errors else self.lines[-1:]

@@ -15,8 +15,7 @@ from .job import Failure
 
 OWN = "warpir"
 """Custom property of objects that an estimate has added, and replaces."""
-MESHES = ("MESH", "CURVE", "SURFACE", "FONT", "META")
-"""Types of objects that can be inserted."""
+MESHES = ("MESH", "CURVE", "SURFACE", "FONT", "META")  # types that can be inserted
 
 
 def photo_of(scene: Any) -> tuple[Any, Path]:
@@ -44,8 +43,7 @@ def set_photo(scene: Any, path: str) -> None:
     except RuntimeError as error:
         raise Failure(f"The photo cannot be read: {path}") from error
     view = scene.camera.data
-    background = view.background_images[0] if view.background_images else None
-    background = background or view.background_images.new()
+    background = next(iter(view.background_images), None) or view.background_images.new()
     background.source, background.image, background.alpha = "IMAGE", image, 1.0
     view.show_background_images = True
 
@@ -77,9 +75,8 @@ def show_estimate(scene: Any, folder: Path) -> None:
     if tuple(background.image.size) != (script["WIDTH"], script["HEIGHT"]):
         # Blender does not turn pictures by their EXIF tag: this one is upright.
         background.image = bpy.data.images.load(str(result / script["PHOTO"]))
-    compositor.show_render(
-        scene, result / script["PHOTO"], folder / "grain.exr", result / "response.cube"
-    )
+    files = result / script["PHOTO"], folder / "grain.exr", result / "response.cube"
+    compositor.show_render(scene, *files)
     path = str(photo_of(scene)[1])
     scene.warpir.light, scene.warpir.light_of, scene.warpir.result = str(result), path, str(result)
 
@@ -95,9 +92,8 @@ def insert_arguments(context: Any, folder: Path) -> list[str]:
     asset, camera = folder / "selection.glb", folder / "camera.json"
     for thing in context.selected_objects:
         thing.select_set(thing in things)
-    bpy.ops.export_scene.gltf(
-        filepath=str(asset), use_selection=True, export_apply=True, export_animations=False
-    )
+    only = {"use_selection": True, "export_apply": True, "export_animations": False}
+    bpy.ops.export_scene.gltf(filepath=str(asset), **only)
     camera.write_text(json.dumps(_camera_record(context, *background.image.size)), "utf-8")
     settings = scene.warpir
     # Blender's +Z up as glTF's +Y up; the ground is level and touches the selection.
@@ -113,10 +109,8 @@ def insert_arguments(context: Any, folder: Path) -> list[str]:
 
 def show_insertion(scene: Any, folder: Path) -> None:
     """Show the composite in front of the camera, and its layers in the compositor."""
-    result = folder / "result"
-    background, _ = photo_of(scene)
-    render = scene.render
-    render.resolution_x, render.resolution_y = background.image.size
+    result, render = folder / "result", scene.render
+    render.resolution_x, render.resolution_y = photo_of(scene)[0].image.size
     render.resolution_percentage = 100
     compositor.show_layers(scene, result / "layers.exr")
     planes = scene.camera.data.background_images
@@ -129,20 +123,16 @@ def show_insertion(scene: Any, folder: Path) -> None:
 
 def _bounds(context: Any, things: list[Any]) -> tuple[np.ndarray, np.ndarray]:
     """Return the corners of the objects' box as they are rendered, world frame [m]."""
-    depsgraph = context.evaluated_depsgraph_get()
-    corners = []
+    corners: list[tuple[float, ...]] = []
     for thing in things:
-        evaluated = thing.evaluated_get(depsgraph)
+        evaluated = thing.evaluated_get(context.evaluated_depsgraph_get())
         mesh = evaluated.to_mesh()
-        points = np.empty(3 * len(mesh.vertices), np.float32)
-        mesh.vertices.foreach_get("co", points)
-        matrix = np.array(evaluated.matrix_world)
-        corners.append(points.reshape(-1, 3) @ matrix[:3, :3].T + matrix[:3, 3])
+        mesh.transform(evaluated.matrix_world)
+        corners += [vertex.co[:] for vertex in mesh.vertices]
         evaluated.to_mesh_clear()
-    points = np.concatenate(corners)
-    if len(points) == 0:
+    if not corners:
         raise Failure("Select the object to insert: what is selected has no vertices")
-    return points.min(axis=0), points.max(axis=0)
+    return np.min(corners, axis=0), np.max(corners, axis=0)
 
 
 def _camera_record(context: Any, width: int, height: int) -> dict[str, Any]:

@@ -87,7 +87,8 @@ def test_job_tells_progress_and_can_be_cancelled(job: ModuleType, tmp_path: Path
         time.sleep(0.01)
     assert run.lines[-1] == "object: 3 of 12 %" and run.share == 0.25
     run.cancel()
-    run.wait()
+    while not run.has_ended(1.0):
+        pass
     assert run.has_ended()
     with pytest.raises(job.Failure, match="Cancelled"):
         run.check()
@@ -107,7 +108,8 @@ def test_job_ends_with_one_message(
     job: ModuleType, tmp_path: Path, code: str, told: str | None
 ) -> None:
     run = job.Job(sys.executable, ["-c", code], tmp_path)
-    run.wait()
+    while not run.has_ended(1.0):
+        pass
     if told is None:
         run.check()
         return
@@ -171,6 +173,8 @@ scene.warpir.flags = ""
 manager = bpy.context.window_manager
 code = "import time; print('object: 1 of 4 %', flush=True); time.sleep(600)"
 module._jobs.append(module.Job(python, ["-c", code], Path(out)))
+while len(module._jobs[0].lines) == 1:
+    time.sleep(0.05)
 saw["busy"] = warpir.estimate.poll(), warpir.insert.poll()
 said, run = [], module.Run
 stand_in = SimpleNamespace(
@@ -180,6 +184,12 @@ tick = SimpleNamespace(type="TIMER")
 start = time.monotonic()
 saw["passes"] = list(run.modal(stand_in, bpy.context, tick))
 saw["took"] = time.monotonic() - start
+drawn = []
+class Layout:
+    def __getattr__(self, name):
+        return lambda *values, **more: drawn.append([name, *values[1:], more])
+module.Panel.draw(SimpleNamespace(layout=Layout()), bpy.context)
+saw["drawn"] = drawn
 warpir.cancel()
 while (state := run.modal(stand_in, bpy.context, tick)) == {"PASS_THROUGH"}:
     time.sleep(0.05)
@@ -285,6 +295,8 @@ def test_blender_refuses_in_one_line(seen: tuple[Path, dict[str, Any]]) -> None:
     assert said["busy"] == [False, False]
     assert said["passes"] == ["PASS_THROUGH"] and said["took"] < 0.5
     assert said["cancelled"] == ["CANCELLED", "Cancelled"]
+    assert ["label", {"text": "photo.png", "icon": "IMAGE_DATA"}] in said["drawn"]
+    assert ["progress", {"factor": 0.25, "text": "object: 1 of 4 %"}] in said["drawn"]
 
 
 @IN_BLENDER

@@ -19,11 +19,11 @@ from warpir.scene.asset import Asset, Material, Primitive, TextureSlot
 from warpir.scene.camera import Camera
 
 USDZ = "scene.usdz"
-APERTURE = 36.0
-"""Width of the written camera's film; only its ratio to the focal length counts [mm]."""
+APERTURE = 0.36
+"""Width of the written camera's film, in tenths of the stage's unit, as USD has it: 36 mm."""
 TYPES = Sdf.ValueTypeNames
-Coordinates = tuple[int, tuple[float, ...]]
-"""Set and transform of a texture's coordinates; USD's v counts from the image's bottom."""
+Names = dict[tuple[int, tuple[float, ...]], str]
+"""Primvars by the set and transform of the coordinates that they hold."""
 
 
 def write_usdz(asset: Asset, asset_to_world: Float64Array, camera: Camera, envmap: Path) -> bytes:
@@ -85,8 +85,8 @@ def _object(stage: Usd.Stage, asset: Asset, asset_to_world: Float64Array) -> Non
     root = UsdGeom.Xform.Define(stage, "/scene/object")
     root.AddTransformOp().Set(_matrix(asset_to_world @ translation(center)))
     slots = [slot for material in asset.materials for slot in material.texture_slots()]
-    names = {_coordinates(slot): "" for slot in slots}
-    names = {key: f"st{k}" for k, key in enumerate(names)}
+    keys = dict.fromkeys((slot.uv_set, slot.transform) for slot in slots)
+    names = {key: f"st{k}" for k, key in enumerate(keys)}
     materials = [_material(stage, asset, m, k, names) for k, m in enumerate(asset.materials)]
     for k, p in enumerate(asset.primitives):
         mesh = UsdGeom.Mesh.Define(stage, f"/scene/object/mesh_{k}")
@@ -100,26 +100,21 @@ def _object(stage: Usd.Stage, asset: Asset, asset_to_world: Float64Array) -> Non
             mesh.CreateNormalsAttr(Vt.Vec3fArray.FromNumpy(p.normals.astype("f4")))
             mesh.SetNormalsInterpolation(UsdGeom.Tokens.vertex)
         for slot in asset.materials[p.material].texture_slots():
-            _primvar(mesh, p, _coordinates(slot), names[_coordinates(slot)])
+            _primvar(mesh, p, slot, names[slot.uv_set, slot.transform])
         UsdShade.MaterialBindingAPI.Apply(mesh.GetPrim()).Bind(materials[p.material])
 
 
-def _coordinates(slot: TextureSlot) -> Coordinates:
-    return slot.uv_set, slot.transform
-
-
-def _primvar(mesh: UsdGeom.Mesh, p: Primitive, coordinates: Coordinates, name: str) -> None:
-    index, (a, b, c, d, e, f) = coordinates
-    if (uv := (p.uv0, p.uv1)[index]) is not None:
-        moved = uv @ [[a, -d], [b, -e]] + [c, 1.0 - f]
-        written = UsdGeom.PrimvarsAPI(mesh).CreatePrimvar(
-            name, TYPES.TexCoord2fArray, UsdGeom.Tokens.vertex
-        )
+def _primvar(mesh: UsdGeom.Mesh, p: Primitive, slot: TextureSlot, name: str) -> None:
+    a, b, c, d, e, f = slot.transform
+    if (uv := (p.uv0, p.uv1)[slot.uv_set]) is not None:
+        moved = uv @ [[a, -d], [b, -e]] + [c, 1.0 - f]  # USD's v counts from the image's bottom
+        kind, each = TYPES.TexCoord2fArray, UsdGeom.Tokens.vertex
+        written = UsdGeom.PrimvarsAPI(mesh).CreatePrimvar(name, kind, each)
         written.Set(Vt.Vec2fArray.FromNumpy(moved.astype("f4")))
 
 
 def _material(
-    stage: Usd.Stage, asset: Asset, m: Material, index: int, names: dict[Coordinates, str]
+    stage: Usd.Stage, asset: Asset, m: Material, index: int, names: Names
 ) -> UsdShade.Material:
     path = f"/scene/materials/material_{index}"
     material = UsdShade.Material.Define(stage, path)
@@ -149,7 +144,7 @@ def _material(
             continue
         read = UsdShade.Shader.Define(stage, f"{path}/{name}_st")
         read.CreateIdAttr("UsdPrimvarReader_float2")
-        read.CreateInput("varname", TYPES.String).Set(names[_coordinates(slot)])
+        read.CreateInput("varname", TYPES.String).Set(names[slot.uv_set, slot.transform])
         image = UsdShade.Shader.Define(stage, f"{path}/{name}_texture")
         image.CreateIdAttr("UsdUVTexture")
         image.CreateInput("file", TYPES.Asset).Set(Sdf.AssetPath(f"texture_{slot.texture}.png"))
