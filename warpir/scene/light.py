@@ -185,6 +185,10 @@ class LightSummary:
     """Share of the total flux within 5 degrees of the brightest part [1]."""
 
 
+FAINTEST = 40.0
+"""Exponent of a lobe's faintest part that a map holds [1]: below, float32 beside any light is 0."""
+
+
 def rasterize_lobes(lobes: Lobes, height: int, width: int, side: int = 6) -> FloatArray:
     """Return the mean radiance of the lobes in each texel, shape [height, width, 3].
 
@@ -213,28 +217,35 @@ def rasterize_lobes(lobes: Lobes, height: int, width: int, side: int = 6) -> Flo
     theta = (np.arange(height * side) // 2 * 2 + 1.0) * step
     theta += np.tile([-1.0, 1.0], height * side // 2) * step / np.sqrt(3.0)
     lon = longitudes(width * side)
-    sin_theta = np.sin(theta)[:, None]
-    big = np.stack(
-        np.broadcast_arrays(
-            sin_theta * np.sin(lon), np.cos(theta)[:, None], sin_theta * np.cos(lon)
-        ),
-        axis=-1,
-    )
     # Within the texels at a pole, the points nearer to it stand for less of the sphere.
     share = np.sin(theta).reshape(height, side)
     share /= share.sum(axis=1, keepdims=True)
     for amplitude, axis, s in zip(
         lobes.amplitude[~narrow], lobes.axis[~narrow], lobes.sharpness[~narrow], strict=True
     ):
-        shape = np.exp(s * (big @ axis.astype(np.float64) - 1.0))
-        fine = shape.reshape(height, side, width, side).mean(axis=3)
-        fine = (fine * share[:, :, None]).sum(axis=1)
-        texels += fine[..., None] * amplitude
+        rows = _rows_near(axis, s, height)
+        part = theta[rows.start * side : rows.stop * side]
+        x, y, z = axis.astype(np.float64)
+        cosine = np.outer(np.sin(part), x * np.sin(lon) + z * np.cos(lon))
+        cosine += (y * np.cos(part))[:, None]
+        shape = np.exp(s * (cosine - 1.0))
+        fine = shape.reshape(-1, side, width, side).mean(axis=3)
+        fine = (fine * share[rows, :, None]).sum(axis=1)
+        texels[rows] += fine[..., None] * amplitude
     for flux, axis in zip(lobes.flux()[narrow], lobes.axis[narrow], strict=True):
         u, v = uv_of(axis.astype(np.float64))
         i, j = min(int(v * height), height - 1), int(u * width) % width
         texels[i, j] += flux / omega[i]
     return texels.astype(np.float32)
+
+
+def _rows_near(axis: FloatArray, sharpness: float, height: int) -> slice:
+    """Return the rows of a map where a lobe is above ``exp(-FAINTEST)`` of its peak."""
+    polar = np.arccos(np.clip(float(axis[1]), -1.0, 1.0))
+    reach = np.arccos(1.0 - FAINTEST / max(float(sharpness), FAINTEST / 2.0))
+    first = int((polar - reach) / np.pi * height)
+    last = int((polar + reach) / np.pi * height)
+    return slice(max(first - 1, 0), min(last + 2, height))
 
 
 def _some(lobes: Lobes, chosen: BoolArray) -> Lobes:
