@@ -262,8 +262,8 @@ class Batch:
                 return cluster.gpus
             # Each machine compiles for what it has: one without a GPU gets no scene that needs it.
             devices = ["cpu" if self._config(key).render.device == "cpu" else None for key in keys]
-            needed = {"devices": [*dict.fromkeys(devices)], "places": places}
-            task = Task(COMPILE, needed | {"bounces": self._bounces(keys)})
+            kernels = {"devices": [*dict.fromkeys(devices)], "places": places}
+            task = Task(COMPILE, kernels | {"bounces": self._bounces(keys)})
             cluster.prepare(self.options.out.absolute(), task)
             memory: dict[int, int] = {}
             for key in keys:

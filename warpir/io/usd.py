@@ -86,7 +86,7 @@ def _object(stage: Usd.Stage, asset: Asset, asset_to_world: Float64Array) -> Non
     root.AddTransformOp().Set(_matrix(asset_to_world @ translation(center)))
     slots = [slot for material in asset.materials for slot in material.texture_slots()]
     keys = dict.fromkeys((slot.uv_set, slot.transform) for slot in slots)
-    names = {key: f"st{k}" for k, key in enumerate(keys)}
+    names: Names = {key: f"st{k}" for k, key in enumerate(keys)}
     materials = [_material(stage, asset, m, k, names) for k, m in enumerate(asset.materials)]
     for k, p in enumerate(asset.primitives):
         mesh = UsdGeom.Mesh.Define(stage, f"/scene/object/mesh_{k}")

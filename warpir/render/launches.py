@@ -81,7 +81,9 @@ class ObjectLaunch:
         kernel = foreground_kernel(
             bool(self.materials.any_layers), bool(scene.receiver_args.mesh), is_from_ground
         )
-        hidden = Rows(renderer.upload(may_see_object, wp.int32)) if is_from_ground else None
+        hidden = None
+        if may_see_object is not None:
+            hidden = Rows(renderer.upload(may_see_object, wp.int32))
         renderer.launch(
             kernel,
             len(pixels),
