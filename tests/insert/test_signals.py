@@ -173,7 +173,6 @@ def finished(inputs: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
 def old_results(finished: Path, folder: Path) -> dict[str, str]:
     """Put an earlier run's results in a folder and return what is there."""
     shutil.copytree(finished, folder / "out")
-    shutil.rmtree(folder / "out" / "progress")
     record = json.loads((folder / "out" / "run.json").read_text())
     record["seconds"] = {"of an earlier run": 1.0}
     (folder / "out" / "run.json").write_text(json.dumps(record))
@@ -185,7 +184,9 @@ def what_is_kept(out: Path, old: dict[str, str]) -> str:
     found = snapshot(out) if out.exists() else {}
     assert {name: found.get(name) for name in old} == old
     more = [name for name in found if name not in old]
-    assert all(name.split("/")[0] in ("checkpoints", "progress") for name in more), more
+    assert all(
+        name.split("/")[0] in ("checkpoints", "progress", "progress-new") for name in more
+    ), more
     for name in more:
         if name.endswith("manifest.json"):
             manifest = json.loads((out / name).read_text())

@@ -598,7 +598,7 @@ def test_an_exception_gives_the_folder_back(
 
 
 @pytest.mark.case("F5")
-@pytest.mark.parametrize("name", ["checkpoints", "progress", "mitsuba"])
+@pytest.mark.parametrize("name", ["checkpoints", "progress", "progress-new", "mitsuba"])
 def test_link_in_place_of_a_folder_is_refused(tmp_path: Path, name: str) -> None:
     """What is written into it would lie outside of --out, --overwrite or not."""
     (tmp_path / "else").mkdir()
@@ -610,6 +610,38 @@ def test_link_in_place_of_a_folder_is_refused(tmp_path: Path, name: str) -> None
             enter()
         assert caught.value.code == ExitCode.OUTPUT
     assert not list((tmp_path / "else").iterdir()) and (tmp_path / "out" / name).is_symlink()
+
+
+@pytest.mark.case("N8")
+@pytest.mark.parametrize("turn", ["killed before", "killed at the commit", "not killed"])
+def test_previews_of_an_earlier_result_stay_until_it_is_replaced(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, turn: str
+) -> None:
+    """Those of the new run stand beside them, and come with its result, also after a kill."""
+    out, codes = tmp_path / "out", np.zeros((2, 2, 3), np.uint8)
+    with OutputFolder(out) as folder:
+        folder.write_preview(0, codes)
+        folder.write_preview(50, codes)
+        folder.write_json("run.json", {})
+    old = (out / "progress" / "preview-000000.png").read_bytes()
+    killed = RuntimeError("stands for a kill: nothing of ours runs after it")
+    try:
+        with OutputFolder(out, overwrite=True) as folder:
+            assert folder.write_preview(0, codes + 255).parent.name == "progress-new"
+            assert (out / "progress" / "preview-000000.png").read_bytes() == old
+            folder.write_json("run.json", {})
+            if turn == "killed before":
+                raise killed
+            if turn == "killed at the commit":
+                monkeypatch.setattr(folder, "_show_previews", lambda: (_ for _ in ()).throw(killed))
+    except RuntimeError as error:
+        assert error is killed
+        assert (out / "progress" / "preview-000000.png").read_bytes() == old
+        with OutputFolder(out, overwrite=True) as folder:
+            folder.write_json("run.json", {})
+    assert [p.name for p in (out / "progress").iterdir()] == ["preview-000000.png"]
+    assert (out / "progress" / "preview-000000.png").read_bytes() != old
+    assert not (out / "progress-new").exists()
 
 
 @pytest.mark.case("R6")

@@ -328,6 +328,16 @@ def test_resize_keeps_coverage_and_constants() -> None:
         np.testing.assert_allclose(flat, 0.7, rtol=1e-5)
 
 
+def test_enlarging_is_linear_between_centres_and_even_beyond() -> None:
+    """A ramp stays that ramp at the new pixels' centres; outside the outermost it goes on level."""
+    ramp = np.broadcast_to(np.arange(30.0, dtype=np.float32), (20, 30))
+    at = (np.arange(90) + 0.5) / 3.0 - 0.5
+    found = resize(np.stack([ramp, 2.0 * ramp], axis=-1), 40, 90)
+    expected = np.broadcast_to(np.clip(at, 0.0, 29.0), (40, 90))
+    np.testing.assert_allclose(found[..., 0], expected, atol=1e-4)
+    np.testing.assert_allclose(found[..., 1], 2.0 * expected, atol=2e-4)
+
+
 def test_object_away_from_the_frame_leaves_the_photo(device: str) -> None:
     """Nothing of the object and no shadow in view: the composite is the photo."""
     far = placed(box((500.0, 0.5, -4.0), (1.0, 1.0, 1.0)))

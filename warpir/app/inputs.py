@@ -30,12 +30,12 @@ from warpir.core.limits import Limits
 from warpir.core.progress import Log
 from warpir.io.assets import load_asset
 from warpir.io.cameras.source import PhotoCamera
+from warpir.io.folder_lock import inputs_within
 from warpir.io.images.photos import Photo, read_envmap, read_mask, read_photo
 from warpir.io.images.undistort import undistort_photo, undistorted
 from warpir.io.lobes_file import read_lobes
 from warpir.io.meshes.materials_file import with_materials
 from warpir.io.meshes.point_cloud import read_point_cloud
-from warpir.io.results import inputs_within
 from warpir.scene.asset import Asset
 from warpir.scene.camera import Camera
 from warpir.scene.light import Light

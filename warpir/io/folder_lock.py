@@ -1,4 +1,4 @@
-"""Keeps a second run out of an output folder.
+"""Keeps a second run out of an output folder, and inputs out of it.
 
 The lock is on ``.lock`` in the folder; the kernel releases it with the process, so it is never
 stale.
@@ -168,3 +168,29 @@ def locked(path: Path) -> Iterator[None]:
         if is_new:
             with suppress(OSError):
                 path.rmdir()  # only succeeds when nothing was written
+
+
+def inputs_within(out: str | None, *paths: str | Path) -> list[InputError]:
+    """Return an error for the first path that is the output folder or below it, by links too."""
+    if out is None:
+        return []
+    folder = _places(out)[:1]
+    if not folder or folder[0] == folder[0].parent:
+        return []  # no name, or the root: the output folder refuses it
+    for path in paths:
+        if any(place.is_relative_to(folder[0]) for place in _places(path)):
+            what, advice = f"holds the input {path}", "choose a folder of its own"
+            return [InputError("--out", what, advice, ExitCode.USAGE)]
+    return []
+
+
+def _places(path: str | Path) -> list[Path]:
+    """Return where a path leads, and where it lies itself if it is a link: either can be replaced.
+
+    None for what no file can be called; its reader reports it.
+    """
+    folder, name = os.path.split(os.path.abspath(path))
+    try:
+        return [Path(os.path.realpath(path)), Path(os.path.realpath(folder), name)]
+    except ValueError:
+        return []

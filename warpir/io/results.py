@@ -27,9 +27,13 @@ from warpir.core.strict_json import read_json_object
 from warpir.io.folder_lock import FolderLock, make_folder, no_folder
 from warpir.io.images import writers
 
+_PREVIEWS, _NEW_PREVIEWS = "progress", "progress-new"
+"""The second holds those of a run that is to replace an earlier result, until it does."""
+_PREVIEW = re.compile(r"preview-[0-9]{6,}\.png")
 UNFINISHED = {
     "checkpoints": re.compile(r"[0-9]{6,}-[a-z-]+-[0-9]+|\.partial-.*"),
-    "progress": re.compile(r"preview-[0-9]{6,}\.png"),
+    _PREVIEWS: _PREVIEW,
+    _NEW_PREVIEWS: _PREVIEW,
 }
 """Folders of an output folder that hold what a run needs, or shows, before it has results."""
 _OWN_FOLDERS = (*UNFINISHED, "mitsuba")
@@ -80,6 +84,8 @@ class OutputFolder:
             self._refuse_links()
             self._remove_staging()
             self._refuse_results()
+            if not self._holds_a_result():
+                self._show_previews()  # of a run that was killed while it was put in place
             self.staging.mkdir()
         except BaseException as error:
             self._release()
@@ -198,12 +204,14 @@ class OutputFolder:
             icc: Profile the codes are in.
 
         Returns:
-            The file, in ``progress/``; never seen half written.
+            The file, in ``progress/``, or ``progress-new/`` while an earlier result stands; never
+            seen half written.
 
         Raises:
             InputError: The disk is full or the folder is not writable (exit 5).
         """
-        path = self.path / "progress" / f"preview-{step:06d}.png"
+        folder = _NEW_PREVIEWS if self._holds_a_result() else _PREVIEWS
+        path = self.path / folder / f"preview-{step:06d}.png"
         staged = self.staging / path.name
         try:
             path.parent.mkdir(exist_ok=True)
@@ -348,6 +356,7 @@ class OutputFolder:
         """
         (self.path / _RUN_JSON).unlink(missing_ok=True)
         sync(self.path)  # nothing is mixed under its name, not by a power cut
+        self._show_previews()
         for name in leftover:
             (self.path / name).unlink()
         for name in names:
@@ -357,6 +366,23 @@ class OutputFolder:
             sync(folder)
         os.replace(self.staging / _RUN_JSON, self.path / _RUN_JSON)
         sync(self.path)
+
+    def _holds_a_result(self) -> bool:
+        return (self.path / _RUN_JSON).exists()
+
+    def _show_previews(self) -> None:
+        """Put the previews of a run that replaces an earlier result in place of the earlier ones.
+
+        Raises:
+            OSError: A file cannot be removed or moved.
+        """
+        new, shown = self.path / _NEW_PREVIEWS, self.path / _PREVIEWS
+        if new.is_dir():
+            remove_unfinished(shown)
+            shown.mkdir(exist_ok=True)
+            for preview in sorted(new.iterdir()):
+                os.replace(preview, shown / preview.name)
+            new.rmdir()
 
     def _remove_staging(self) -> None:
         """Remove what was staged, here or by a killed run, and what of it is half in place."""
@@ -466,29 +492,3 @@ def _json_bytes(content: Mapping[str, Any]) -> bytes:
         raise TypeError(f"{type(value).__name__} does not belong in JSON")
 
     return (json.dumps(content, indent=2, allow_nan=False, default=plain) + "\n").encode()
-
-
-def inputs_within(out: str | None, *paths: str | Path) -> list[InputError]:
-    """Return an error for the first path that is the output folder or below it, by links too."""
-    if out is None:
-        return []
-    folder = _places(out)[:1]
-    if not folder or folder[0] == folder[0].parent:
-        return []  # no name, or the root: `OutputFolder` refuses it
-    for path in paths:
-        if any(place.is_relative_to(folder[0]) for place in _places(path)):
-            what, advice = f"holds the input {path}", "choose a folder of its own"
-            return [InputError("--out", what, advice, ExitCode.USAGE)]
-    return []
-
-
-def _places(path: str | Path) -> list[Path]:
-    """Return where a path leads, and where it lies itself if it is a link: either can be replaced.
-
-    None for what no file can be called; its reader reports it.
-    """
-    folder, name = os.path.split(os.path.abspath(path))
-    try:
-        return [Path(os.path.realpath(path)), Path(os.path.realpath(folder), name)]
-    except ValueError:
-        return []
