@@ -122,7 +122,7 @@ def test_pixels_that_differ_are_counted(run: Run, inputs: Path) -> None:
 
 
 def test_picture_shows_the_object_where_it_was_placed(run: Run) -> None:
-    """A box of 1 m at (0, 0, -5) covers the projection of its middle; the ground loses and gains light."""
+    """A box of 1 m at (0, 0, -5) covers where its middle is; the ground loses and gains light."""
     planes = read_layers(run.out / "layers.exr")
     view = read_camera(run.out / "camera.json", (WIDTH, HEIGHT))
     ((u, v),) = view.project(np.array([[0.0, 0.5, -4.5]]))

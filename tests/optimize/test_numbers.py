@@ -494,7 +494,7 @@ def spoil_render(monkeypatch: pytest.MonkeyPatch, count: int) -> None:
     def spoilt(self: Renderer, kernel: Any, size: int, args: Any, *rest: Any, **more: Any) -> None:
         launch(self, kernel, size, args, *rest, **more)
         if rest[1:2] == ("object",) and size > 1:
-            radiance = args[13].array
+            radiance = args[14].array
             radiance[: min(count, size)].fill_(wp.vec3(NAN, 0.0, 0.0))
 
     monkeypatch.setattr(Renderer, "launch", spoilt)

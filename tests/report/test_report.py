@@ -632,8 +632,9 @@ def test_page_works_in_a_browser(browser: Opened, run: Run, tmp_path: Path) -> N
     assert range_.input_value() == "99.5"
     planes = read_layers(run.out / "layers.exr")
     height, width = planes.matte.shape
-    row, column = np.argwhere(planes.matte == 1.0).mean(axis=0)
-    # Pixels of the page: the middle of the object, which only the result shows.
+    difference = np.abs(planes.composite - planes.plate).sum(axis=-1) * (planes.matte == 1.0)
+    row, column = np.unravel_index(np.argmax(difference), difference.shape)
+    # Pixels of the page: where the object differs most from the photo that it hides.
     y, x = int((row + 0.5) / height * photo.shape[0]), int((column + 0.5) / width * photo.shape[1])
     assert np.abs(result[y, x] - photo[y, x]).max() > 20
     # By the mouse: left of the pointer is the photo, right of it the result.
