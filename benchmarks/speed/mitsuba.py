@@ -17,7 +17,8 @@ from mitsuba.python.ad.integrators.common import mis_weight
 from benchmarks.speed.scenes import SpeedScene
 from warpir.core.arrays import Float64Array, FloatArray, PixelArray
 from warpir.mitsuba.light import LatlongEmitter
-from warpir.mitsuba.render import ObjectScene, build
+from warpir.mitsuba.plane import ObjectScene
+from warpir.mitsuba.render import build
 from warpir.scene.camera import Camera
 
 PASS_SAMPLES = {"llvm_ad_rgb": 1 << 25, "cuda_ad_rgb": 1 << 28}

@@ -17,10 +17,11 @@ from warpir.look.grain import Grain
 from warpir.look.response import Response
 from warpir.look.sharpness import EdgeBlur
 from warpir.render.bridge import ComposeConstants, compose
-from warpir.render.composite import Picture, Quality, as_file_map, balls, make_picture, resize
+from warpir.render.composite import Picture, Quality, as_file_map, balls, make_picture
 from warpir.render.device_light import light_args
 from warpir.render.device_scene import Scene
 from warpir.render.renderer import Renderer
+from warpir.render.resizing import resize
 from warpir.render.tone_curve import Knots, ToneCurve
 from warpir.scene.asset import Material
 from warpir.scene.camera import Camera

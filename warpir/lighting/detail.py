@@ -17,7 +17,8 @@ import numpy as np
 from warpir.app.inputs import Inputs
 from warpir.core.arrays import Float64Array, FloatArray
 from warpir.core.latlong import map_directions, texel_solid_angles
-from warpir.render.composite import photo_radiance, resize
+from warpir.render.composite import photo_radiance
+from warpir.render.resizing import resize
 from warpir.scene.camera import Camera
 from warpir.scene.lamps import without_lamps
 from warpir.scene.light import Light, as_map

@@ -10,7 +10,7 @@ radiance does not notice. The environment is at infinity in both.
 
 import argparse
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import NamedTuple
 
@@ -21,7 +21,6 @@ import numpy as np
 if mi.variant() is None:
     mi.set_variant("cuda_ad_rgb" if dr.has_backend(dr.JitBackend.CUDA) else "llvm_ad_rgb")
 
-from mitsuba.python.ad.integrators.common import mis_weight
 
 from warpir.core.arrays import Float64Array, FloatArray
 from warpir.core.color import linear_to_gamma
@@ -33,7 +32,7 @@ from warpir.io.images.photos import read_envmap
 from warpir.io.images.writers import png_bytes
 from warpir.mitsuba.light import LatlongEmitter
 from warpir.mitsuba.material import GltfBSDF
-from warpir.mitsuba.path import RAY_OFFSET, GltfPath, intersect
+from warpir.mitsuba.plane import ObjectScene, trace_plane
 from warpir.scene.asset import Asset
 from warpir.scene.camera import Camera, mitsuba_sensor
 
@@ -80,19 +79,6 @@ class Ratio(NamedTuple):
     """Variance of ``mean``, shape [H, W, 3]."""
     coverage: Float64Array
     """Share of camera samples that see the plane [1], shape [H, W]."""
-
-
-@dataclass(frozen=True)
-class ObjectScene:
-    """A Mitsuba scene with its sensor, integrator and normalisation."""
-
-    scene: mi.Scene
-    sensor: mi.Sensor
-    integrator: GltfPath
-    center: Float64Array
-    """World position that became the origin [m], shape [3]."""
-    radius: float
-    """World length that became 1 [m]."""
 
 
 def build(
@@ -223,7 +209,7 @@ def shadow(
     hits = np.zeros((*shape, 1))
     for pass_seed, pass_spp in passes(camera, spp, seed):
         with dr.suspend_grad():
-            lit, unoccluded, seen = _trace_plane(setup, normal, offset, pass_seed, pass_spp, bounce)
+            lit, unoccluded, seen = trace_plane(setup, normal, offset, pass_seed, pass_spp, bounce)
         both = np.concatenate([np.asarray(lit), np.asarray(unoccluded)]).astype(np.float64)
         samples = both.T.reshape(*shape, pass_spp, 6)
         moments += np.stack([samples.sum(axis=2), np.square(samples).sum(axis=2)])
@@ -343,77 +329,6 @@ def _mean_and_variance(
         mean = moments[0] / count
         variance = np.maximum(moments[1] / count - np.square(mean), 0.0) / (count - 1.0)
     return mean, variance
-
-
-def _trace_plane(
-    setup: ObjectScene,
-    normal: Float64Array,
-    offset: float,
-    seed: int,
-    spp: int,
-    bounce: ObjectScene | None = None,
-) -> tuple[mi.Color3f, mi.Color3f, mi.Bool]:
-    """Sample radiance of the plane ``dot(normal, x) = offset``, 0 where it is not seen.
-
-    ``bounce`` is the scene with the plane in it, in which the object lights it.
-
-    Returns:
-        With the object, without it, and whether the plane is seen.
-    """
-    scene, integrator = setup.scene, setup.integrator
-    sampler, _ = integrator.prepare(setup.sensor, seed, spp)
-    ray, _, _ = integrator.sample_rays(scene, setup.sensor, sampler)
-    ray = mi.Ray3f(ray)
-    has_alpha = integrator.has_alpha
-
-    # Which comes first
-    n = mi.Normal3f(normal)
-    t = (offset - dr.dot(n, ray.o)) / dr.dot(n, ray.d)
-    meets = (t > 0.0) & dr.isfinite(t)
-    si = intersect(scene, ray, sampler, True, has_alpha, mi.Bool(True))
-    nearer = si.is_valid() & (dr.dot(si.p - ray.o, ray.d) < t)
-    seen = meets & ~nearer
-
-    # Direct light on white: f cos_i = cos_i / pi, upper side
-    it = dr.zeros(mi.SurfaceInteraction3f, dr.width(t))
-    it.p = ray(dr.select(seen, t, 0.0))
-    it.p += n * (offset - dr.dot(n, it.p))
-    it.n = n
-    frame = mi.Frame3f(it.n)
-
-    def visible(d: mi.Vector3f, active: mi.Bool) -> mi.Bool:
-        start = mi.Ray3f(it.p + n * RAY_OFFSET, d)
-        return ~intersect(scene, start, sampler, False, has_alpha, active).is_valid()
-
-    ds, em_weight = scene.sample_emitter_direction(it, sampler.next_2d(), False, seen)
-    cos_i = dr.maximum(dr.dot(n, ds.d), 0.0)
-    by_light = em_weight * cos_i * dr.inv_pi * mis_weight(ds.pdf, cos_i * dr.inv_pi)
-    active = seen & (cos_i > 0.0)
-    by_light = dr.select(active, by_light, 0.0)
-    unblocked_light = visible(ds.d, active)
-
-    d = frame.to_world(mi.warp.square_to_cosine_hemisphere(sampler.next_2d()))
-    cos_i = dr.maximum(dr.dot(n, d), 0.0)
-    ds = dr.zeros(mi.DirectionSample3f, dr.width(t))
-    ds.d = d
-    ds.emitter = mi.EmitterPtr(scene.environment())
-    by_cosine = scene.eval_emitter_direction(it, ds, seen) * mis_weight(
-        cos_i * dr.inv_pi, scene.pdf_emitter_direction(it, ds, seen)
-    )
-    by_cosine = dr.select(seen & (cos_i > 0.0), by_cosine, 0.0)
-    unblocked_cosine = visible(d, seen)
-    lit = dr.select(unblocked_light, by_light, 0.0) + dr.select(unblocked_cosine, by_cosine, 0.0)
-    if bounce is not None:
-        thrown, *_ = bounce.integrator.sample(
-            dr.ADMode.Primal,
-            bounce.scene,
-            sampler,
-            mi.Ray3f(it.p + n * RAY_OFFSET, d),
-            active=seen & (cos_i > 0.0),
-            is_camera=False,
-        )
-        lit += dr.select(seen, thrown, 0.0)
-    return lit, by_light + by_cosine, seen
 
 
 # -------------------------------------------------------------------------------- a whole run

@@ -18,6 +18,7 @@ from warpir.look.denoise import denoised_object, denoised_ratio
 from warpir.render.device_light import light_args
 from warpir.render.device_scene import Placed, Receiver, Scene
 from warpir.render.renderer import Foreground, GBuffer, Renderer
+from warpir.render.resizing import resize, resize_planes
 from warpir.scene.camera import Camera
 from warpir.scene.lamps import without_lamps
 from warpir.scene.light import Light, as_map
@@ -28,8 +29,6 @@ RECEIVER_WIDTH = 1024
 """Largest width of the photo as a radiance texture of the receiver [px]."""
 GREY_BALL = 0.18
 """Reflectance of the matte ball in ``balls.png``."""
-SLIVER = 1e-4
-"""Share of a pixel below which its surface layers are left empty [1]."""
 
 
 @dataclass(frozen=True)
@@ -180,7 +179,7 @@ def composite(
     planes = dict(rendering.planes)
     enlarged = photo.srgb.shape[1] / planes["matte"].shape[1]
     if planes["matte"].shape != photo.srgb.shape[:2]:
-        planes = _resize_planes(planes, *photo.srgb.shape[:2])
+        planes = resize_planes(planes, *photo.srgb.shape[:2])
     planes = look.sharpened_like_photo(planes, enlarged)
     planes = look.shown_like_photo(planes, photo.linear())
     if occluder is not None:
@@ -414,45 +413,6 @@ def _plane(
     plane = np.full((size[0] * size[1], *values.shape[1:]), outside, np.float32)
     plane[pixels] = values
     return plane.reshape(*size, *values.shape[1:])
-
-
-def _resize_planes(planes: dict[str, FloatArray], height: int, width: int) -> dict[str, FloatArray]:
-    """Bring all planes to the photo's size.
-
-    What describes the object's surface is averaged over the object alone: mixed with the empty
-    background, its depth would fall to 0 along the outline.
-    """
-    seen = np.isfinite(planes["depth"])
-    share = resize(seen.astype(np.float32), height, width)
-    resized = {name: resize(plane, height, width) for name, plane in planes.items()}
-    shown = (share > SLIVER) & (resized["matte"] > 0.0)
-    weight = np.where(shown, share, 1.0)
-    for name in ("depth", "position", "normal", "albedo", "roughness"):
-        plane = resized[name]
-        plane /= weight if plane.ndim == 2 else weight[..., None]
-        plane[~shown] = np.inf if name == "depth" else 0.0
-    length = np.linalg.norm(resized["normal"], axis=-1, keepdims=True)
-    resized["normal"] /= np.where(length > 0.0, length, 1.0)
-    return resized
-
-
-def resize(plane: FloatArray, height: int, width: int) -> FloatArray:
-    """Bring a plane to the photo's size: bilinear up, area-filtered down."""
-    from skimage.transform import resize as resize_image
-    from torch import from_numpy
-    from torch.nn.functional import interpolate
-
-    finite = np.where(np.isfinite(plane), plane, np.float32(0.0))
-    if plane.shape[0] > height:
-        shape = (height, width, *plane.shape[2:])
-        resized = resize_image(  # type: ignore[no-untyped-call]
-            finite, shape, order=1, anti_aliasing=True, preserve_range=True
-        )
-        return np.asarray(resized, dtype=np.float32)
-    # scikit-image's, with mode="edge", within 1e-4 in a tenth of the time
-    channels = np.ascontiguousarray(np.atleast_3d(finite).transpose(2, 0, 1)[None])
-    larger = interpolate(from_numpy(channels), (height, width), mode="bilinear")[0].numpy()
-    return np.ascontiguousarray(larger.transpose(1, 2, 0)).reshape(height, width, *plane.shape[2:])
 
 
 def balls(light: Light, camera: Camera, is_reinhard: bool, size: int = 192) -> CodeArray:
