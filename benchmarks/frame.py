@@ -1,9 +1,10 @@
 """How long does one full frame take, and how much memory?
 
-    python -m benchmarks.frame [--assets DIR] [--device cpu|cuda] [--samples 64] [--json FILE]
+    python -m benchmarks.frame [--assets DIR] [--device cpu|cuda] [--samples 64] [--width 1280]
 
-ToyCar at 1280 x 853 under a sunny 1k panorama, five surface interactions: G-buffer, object, pilot,
-shadow, tone and all layers; everything behind reading files and before writing them.
+ToyCar at 1280 x 853, or another width, under a sunny 1k panorama, five surface interactions:
+G-buffer, object, pilot, shadow, tone and all layers; everything behind reading files and before
+writing them.
 """
 
 import time
@@ -23,8 +24,6 @@ from warpir.scene.light import Light
 from warpir.scene.placement import place_asset
 from warpir.scene.tone_curves import ToneKnots
 
-WIDTH, HEIGHT = 1280, 853
-
 
 def main() -> None:
     """Render the frame twice: cold, with compilation, and warm."""
@@ -36,14 +35,16 @@ def main() -> None:
     )
     parser.add_argument("--repeats", type=int, default=3)
     parser.add_argument("--preview", default=None, help="write the measured image here (PNG)")
+    parser.add_argument("--width", type=int, default=1280, help="4243: 12 megapixels")
     options = parser.parse_args()
+    width, height = options.width, round(options.width / 1.5)
     asset = load_asset(options.assets / "mesh/ToyCar.glb")
     light = Light(texels=read_envmap(options.assets / "hdri/modern_buildings_2_1k.hdr"))
-    camera = camera_from_fov(WIDTH, HEIGHT, 40.0, -12.0, 1.4)
+    camera = camera_from_fov(width, height, 40.0, -12.0, 1.4)
     placement = place_asset(
         *asset.bounds(), camera, None, place=(0.0, 0.0, -5.5), rotate_y=-35.0, size=options.size
     )
-    grey = np.full((HEIGHT, WIDTH, 3), 0.45, np.float32)
+    grey = np.full((height, width, 3), 0.45, np.float32)
     photo = Photo(codes=np.round(grey * 255.0).astype(np.uint8), srgb=grey, kind="png")
     start = time.perf_counter()
     device = choose_device(options.device)
@@ -65,7 +66,7 @@ def main() -> None:
     report(
         {
             "question": "frame",
-            "scene": "ToyCar, modern_buildings_2, 1280x853",
+            "scene": f"ToyCar, modern_buildings_2, {width}x{height}",
             "samples": options.samples,
             "depth": options.depth,
             "size_m": options.size,

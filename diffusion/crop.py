@@ -90,13 +90,8 @@ def draw_crop(
 
     The side is log-uniform between ``crop_min`` and ``crop_max`` longer sides of the box, at most
     the image's shorter side. The centre is uniform in the box; the crop is then moved into the
-    image.
-
-    Args:
-        box: ``(x0, y0, x1, y1)`` [px], from `box_of`.
-        image_size: Height and width [px].
-        settings: Range of the side.
-        generator: Gives three numbers, whatever the box.
+    image. The box is that of `box_of`, the image's size is height and width [px]; three numbers are
+    drawn, whatever the box.
     """
     height, width = image_size
     x0, y0, x1, y1 = box

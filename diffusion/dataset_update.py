@@ -75,12 +75,9 @@ class DatasetUpdate(GatedGuidance):
     ) -> float | None:
         """Return how much the model would change an image; None when that is not finite.
 
-        The mean distance between crops and their edits, all of the run's greatest strength.
-
-        Args:
-            image: Display-encoded, in [0, 1], shape [1, 3, H, W].
-            seed: Of edits and crops; the guidance's own by default.
-            edits: Crops.
+        The mean distance between so many crops and their edits, all of the run's greatest strength.
+        The image is display-encoded, in [0, 1], shape [1, 3, H, W]; the seed is the guidance's own
+        by default.
         """
         seed = self.seed if seed is None else seed
         distances = []

@@ -30,15 +30,7 @@ class InChunks(Protocol):
         flags: str,
         spare: Callable[[], object] = ...,
     ) -> Iterator[T]:
-        """Yield what is made of ``count`` things.
-
-        Args:
-            do: Makes it of the things from a first to before a last.
-            count: How many there are.
-            what: What is made, for a person.
-            flags: What lowers its memory.
-            spare: Called before a second attempt.
-        """
+        """Yield what is made of ``count`` things; see `warpir.core.memory.Memory.in_chunks`."""
 
 
 def at_once(

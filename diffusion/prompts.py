@@ -89,13 +89,7 @@ def make_prompts(prompt: str, settings: PersonalizeSettings) -> Prompts:
 
 
 def draw_class_prompts(noun: str, count: int, seed: int) -> tuple[str, ...]:
-    """Return class prompts with attributes drawn at random; a longer list begins as a shorter one.
-
-    Args:
-        noun: `Prompts.noun`.
-        count: How many.
-        seed: The run's seed.
-    """
+    """Return class prompts with random attributes; a longer list begins as a shorter one."""
     import torch
 
     from warpir.diffusion.draws import generator_of

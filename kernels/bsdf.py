@@ -7,10 +7,12 @@ specular lobes are one with ``f0 = mix(0.04, base_color, metallic)``. (An older,
 code took that F0 for the base as well; Khronos corrected it in glTF issue 2386.)
 
 Extensions, each as its specification has it (KHR_materials_ior, _specular, _clearcoat, _sheen,
-_transmission), are in `Layers`: the dielectric's F0 and F90, a clear coat over everything with a
-normal of its own, and the sheen of cloth over the base, which it scales by what the sheen leaves
-(the specification's form that depends on the camera's direction alone). The coat's lobe goes with
-the cosine to its own normal.
+_transmission, _anisotropy, _iridescence), are in `Layers`: the dielectric's F0 and F90, a clear
+coat over everything with a normal of its own, and the sheen of cloth over the base, which it scales
+by what the sheen leaves (the specification's form that depends on the camera's direction alone).
+The coat's lobe goes with the cosine to its own normal. Anisotropy stretches the base's specular
+lobe in one direction: GGX of two widths is that of one in coordinates of which one is scaled (Heitz
+2014, 5.3). Iridescence replaces its Fresnel term (`warpir.kernels.maths.fresnel`).
 
 A `Bsdf` is a point's scattering as seen from one direction. As in pbrt it has three functions:
 `bsdf_f`, the value (with the density, since both share half of their terms), `bsdf_sample` and
@@ -21,6 +23,7 @@ Normals with Spherical Caps").
 import warp as wp
 
 from warpir.kernels.maths.frame import basis, to_local, to_world
+from warpir.kernels.maths.fresnel import film_fresnel, schlick
 from warpir.kernels.sampling import cosine_sample
 from warpir.kernels.types import Layers
 
@@ -91,11 +94,39 @@ def smith_lambda(w: wp.vec3, alpha: float) -> float:
 
 
 @wp.func
-def schlick(cos_d: float) -> float:
-    """Schlick's ``(1 - cos)^5``."""
-    x = wp.clamp(1.0 - cos_d, 0.0, 1.0)
-    x2 = x * x
-    return x2 * x2 * x
+def widening(alpha: float, layers: Layers) -> float:
+    """Return how many times as wide the base's lobe is along its stretch as across it.
+
+    ``mix(alpha, 1, strength^2) / alpha`` (KHR_materials_anisotropy).
+    """
+    if layers.present == 0:
+        return 1.0
+    return 1.0 + layers.anisotropy * (1.0 / alpha - 1.0)
+
+
+@wp.func
+def along_stretch(w: wp.vec3, layers: Layers, scale: float) -> wp.vec3:
+    """Return ``w`` in the frame whose x is the stretch, its x scaled; as it is for a scale of 1."""
+    if scale == 1.0:
+        return w
+    x = w[0] * layers.stretch[0] + w[1] * layers.stretch[1]
+    y = w[1] * layers.stretch[0] - w[0] * layers.stretch[1]
+    return wp.vec3(scale * x, y, w[2])
+
+
+@wp.func
+def from_stretch(wm: wp.vec3, layers: Layers, scale: float) -> wp.vec3:
+    """Return ``wm`` from the frame whose x is the stretch, its x scaled first; a unit vector."""
+    if scale == 1.0:
+        return wm
+    x = scale * wm[0]
+    return wp.normalize(
+        wp.vec3(
+            x * layers.stretch[0] - wm[1] * layers.stretch[1],
+            x * layers.stretch[1] + wm[1] * layers.stretch[0],
+            wm[2],
+        )
+    )
 
 
 @wp.func
@@ -160,6 +191,11 @@ def layers_toward(
     clearcoat: float,
     coat_roughness: float,
     coat_n: wp.vec3,
+    anisotropy: float,
+    stretch: wp.vec3,
+    iridescence: float,
+    film_ior: float,
+    film_thickness: float,
 ) -> Layers:
     """Gather the extensions of one point as seen from ``wo``.
 
@@ -176,6 +212,11 @@ def layers_toward(
         clearcoat: Share of the surface that the coat covers [1].
         coat_roughness: Perceptual roughness [1].
         coat_n: Unit normal of the coat, local frame.
+        anisotropy: Strength [1].
+        stretch: Direction in which the base's lobe is wider, local frame; its z is not looked at.
+        iridescence: Share of the base that has a thin film [1].
+        film_ior: Its index of refraction.
+        film_thickness: Its thickness [nm].
     """
     layers = Layers()
     layers.present = 1
@@ -185,6 +226,14 @@ def layers_toward(
     layers.coat_roughness = coat_roughness
     layers.coat_n = coat_n
     layers.sheen_roughness = sheen_roughness
+    layers.iridescence = iridescence
+    layers.film_ior = film_ior
+    layers.film_thickness = film_thickness
+    layers.anisotropy = 0.0
+    length = wp.sqrt(stretch[0] * stretch[0] + stretch[1] * stretch[1])
+    if anisotropy > 0.0 and length > 1.0e-6:
+        layers.anisotropy = anisotropy * anisotropy
+        layers.stretch = wp.vec2(stretch[0], stretch[1]) / length
     gain = 1.0 / wp.max(1.0 - transmitted, 1.0e-6)
     coat = clearcoat * (F0_COAT + (1.0 - F0_COAT) * schlick(wp.abs(wp.dot(wo, coat_n))))
     below = gain * (1.0 - coat)
@@ -198,6 +247,15 @@ def layers_toward(
         layers.sheen_albedo = albedo
         layers.base_scale = below * wp.max(1.0 - wp.max(sheen_color) * albedo, 0.0)
     return layers
+
+
+@wp.func
+def under_film(fresnel: wp.vec3, f0: wp.vec3, layers: Layers, cos_d: float) -> wp.vec3:
+    """Return a Fresnel term of the base with its thin film, if it has one; ``f0`` is its own."""
+    if layers.present == 0 or layers.iridescence == 0.0:
+        return fresnel
+    film = film_fresnel(f0, layers.film_ior, layers.film_thickness, cos_d)
+    return fresnel + (film - fresnel) * layers.iridescence
 
 
 @wp.func
@@ -217,7 +275,8 @@ def lobe_probabilities(
         matte = layers.matte
     f0 = f0 * (1.0 - metallic) + base_color * metallic
     f90 = f90 * (1.0 - metallic) + metallic
-    specular = luminance(f0 + (wp.vec3(f90) - f0) * schlick(wo[2]))
+    fresnel = f0 + (wp.vec3(f90) - f0) * schlick(wo[2])
+    specular = luminance(under_film(fresnel, f0, layers, wo[2]))
     diffuse = (1.0 - metallic) * (1.0 - specular) * matte * luminance(base_color)
     coat = float(0.0)
     if layers.present == 1:
@@ -279,16 +338,20 @@ def bsdf_f(bsdf: Bsdf, wi: wp.vec3) -> BsdfValue:
             matte = layers.matte
         wm = wp.normalize(wo + wi)
         alpha = roughness_to_alpha(bsdf.roughness)
-        weight = schlick(wp.abs(wp.dot(wo, wm)))
+        cos_d = wp.abs(wp.dot(wo, wm))
+        weight = schlick(cos_d)
         F_dielectric = f0 + (wp.vec3(f90) - f0) * weight
+        F_dielectric = under_film(F_dielectric, f0, layers, cos_d)
         F_metal = base_color + (wp.vec3(1.0, 1.0, 1.0) - base_color) * weight
+        F_metal = under_film(F_metal, base_color, layers, cos_d)
         F = F_dielectric * (1.0 - metallic) + F_metal * metallic
         diffuse = base_color * ((1.0 - metallic) * matte * (1.0 - wp.max(F_dielectric)) * INV_PI)
-        D = ggx_d(wm, alpha)
-        lambda_o = smith_lambda(wo, alpha)
+        wide = widening(alpha, layers)
+        D = ggx_d(along_stretch(wm, layers, 1.0 / wide), alpha) / wide
+        lambda_o = smith_lambda(along_stretch(wo, layers, wide), alpha)
         # Height-correlated masking-shadowing (Heitz 2014, eq. 99). The floor only matters where the
         # product of the cosines leaves float32.
-        G2 = 1.0 / (1.0 + lambda_o + smith_lambda(wi, alpha))
+        G2 = 1.0 / (1.0 + lambda_o + smith_lambda(along_stretch(wi, layers, wide), alpha))
         specular = F * (D * G2 / wp.max(4.0 * wo[2] * wi[2], 1.0e-30))
         # Visible normals: G1(wo) max(0, wo.wm) D(wm) / cos_o, over the Jacobian 4 wo.wm.
         p = bsdf.p
@@ -333,7 +396,7 @@ def coat_lobe(wo: wp.vec3, wi: wp.vec3, coat_n: wp.vec3, roughness: float) -> wp
 
 @wp.func
 def visible_normal_sample(wo: wp.vec3, alpha: float, u: wp.vec2) -> wp.vec3:
-    """Draw a microfacet normal visible from ``wo`` (Dupuy & Benyoub 2023, listing 1)."""
+    """Draw a microfacet normal visible from ``wo`` of any length (Dupuy & Benyoub 2023, 1)."""
     stretched = wp.normalize(wp.vec3(alpha * wo[0], alpha * wo[1], wo[2]))
     phi = 2.0 * PI * u[0]
     z = (1.0 - u[1]) * (1.0 + stretched[2]) - stretched[2]
@@ -354,7 +417,10 @@ def bsdf_sample(bsdf: Bsdf, u: wp.vec2, u_lobe: float) -> wp.vec3:
         wm = visible_normal_sample(o, roughness_to_alpha(layers.coat_roughness), u)
         return wp.normalize(to_world(wm * (2.0 * wp.dot(o, wm)) - o, frame))
     if u_lobe < p[0] + (1.0 - p[0]) * p[1]:
-        wm = visible_normal_sample(wo, roughness_to_alpha(bsdf.roughness), u)
+        alpha = roughness_to_alpha(bsdf.roughness)
+        wide = widening(alpha, layers)
+        wm = visible_normal_sample(along_stretch(wo, layers, wide), alpha, u)
+        wm = from_stretch(wm, layers, wide)
         return wp.normalize(wm * (2.0 * wp.dot(wo, wm)) - wo)
     return cosine_sample(u)
 

@@ -2,7 +2,7 @@
 
 The object is seen by the camera, or from the ground: what it throws on the receiver is the light
 that the receiver gains by it, the part of differential rendering that DiPIR's ratio leaves out
-(`warpir.kernels.receiver`).
+(`warpir.kernels.receiver`). Or it is seen in a glossy ground, as a mirror image.
 
 Each vertex draws one direction from the light and one from the BSDF (`warpir.kernels.scatter`); the
 BSDF's direction continues the path. `trace_foreground` sums radiance and, if
@@ -10,20 +10,38 @@ asked, writes down what the two adjoints need: `warpir.kernels.light_gradient` f
 `warpir.kernels.shade` for the materials. Detached: no backward pass.
 """
 
+from enum import IntEnum
 from functools import cache
 
 import warp as wp
 
+from warpir.kernels.dielectric.glass import (
+    GLASS_DEPTH,
+    GlassPoint,
+    glass_at,
+    meets_glass,
+    metallic_beside,
+    scatter_at_glass,
+    transmittance,
+)
+from warpir.kernels.lamps.gather import gather_lamps
 from warpir.kernels.light_gradient import keep_direction
 from warpir.kernels.maths.frame import basis
 from warpir.kernels.maths.rng import hash_pair, pixel_seed, sobol_pair
-from warpir.kernels.receiver import ReceiverPoint, object_ray, receiver_origin, receiver_point
+from warpir.kernels.receiver import (
+    ReceiverPoint,
+    mirrored_ray,
+    object_ray,
+    object_window,
+    receiver_origin,
+    receiver_point,
+)
 from warpir.kernels.receiver_mesh import receiver_mesh_hit
 from warpir.kernels.sampling import light_eval
 from warpir.kernels.scatter import (
-    BsdfSample,
-    EmitterSample,
+    Scatter,
     bsdf_weight,
+    limited,
     sample_bsdf,
     sample_emitter,
     surface_bsdf,
@@ -33,6 +51,8 @@ from warpir.kernels.tracing.ray import camera_hit, camera_ray, closest_hit
 from warpir.kernels.tracing.surface import Surface, surface_at
 from warpir.kernels.types import (
     CameraArgs,
+    GlassArgs,
+    LampArgs,
     LightArgs,
     LightRecord,
     MaterialArgs,
@@ -44,34 +64,18 @@ from warpir.kernels.types import (
 
 wp.set_module_options({"enable_backward": False})
 
-
-@wp.struct
-class Scatter:
-    """One scattering event: both light estimates, and how the path goes on."""
-
-    direct: wp.vec3
-    """Light gathered here, both techniques [radiance]."""
-    direct_diffuse: wp.vec3
-    """The diffuse lobe's part of it."""
-    throughput: wp.vec3
-    """``f cos / pdf`` of the continued path."""
-    throughput_diffuse: wp.vec3
-    """The diffuse lobe's part of it."""
-    emitter: EmitterSample
-    bsdf: BsdfSample
-    L_bsdf: wp.vec3
-    """Radiance that arrives along the BSDF's direction, of the light or of the receiver's mesh."""
-    weight_bsdf: float
-    """``cos visible mis / pdf`` of it; 0 when it met the object."""
+BLOCK_DIM = 128
+"""Threads of a block on CUDA: 1.2 times as many paths a second as with 256 on an H100."""
 
 
-@wp.func
+@wp.func(inline=True)
 def scatter(
     mesh: MeshArgs,
     material: MaterialArgs,
     texture: TextureArgs,
     receiver: ReceiverArgs,
     light: LightArgs,
+    lamps: LampArgs,
     surface: Surface,
     wo: wp.vec3,
     is_last: int,
@@ -98,7 +102,7 @@ def scatter(
     # Sample the emitter
     u = sobol_pair(index, key, 3 * vertex + 2)
     emitter = sample_emitter(
-        mesh, material, texture, receiver, light, surface, bsdf, frame, u, u_parts[0], keep_dark
+        mesh, material, texture, receiver, light, surface, bsdf, frame, u, keep_dark
     )
     out.emitter = emitter
     if emitter.valid == 1:
@@ -125,6 +129,13 @@ def scatter(
     if sample.from_receiver == 1 or sample.visible > 0.0:
         out.direct += wp.cw_mul(f_sample, out.L_bsdf) * out.weight_bsdf
         out.direct_diffuse += wp.cw_mul(sample.f.diffuse, out.L_bsdf) * out.weight_bsdf
+    if lamps.count > 0:
+        near = gather_lamps(
+            mesh, material, texture, receiver, lamps,
+            surface, bsdf, frame, sample, index, key, vertex,
+        )  # fmt: skip
+        out.direct += near.whole
+        out.direct_diffuse += near.diffuse
     if sample.next.valid == 1:
         out.throughput = f_sample * sample.cos_over_pdf
         out.throughput_diffuse = sample.f.diffuse * sample.cos_over_pdf
@@ -132,12 +143,45 @@ def scatter(
 
 
 @wp.func
-def limited(radiance: wp.vec3, limit: float) -> float:
-    """Return the factor that brings the largest channel down to ``limit``; 1 without a limit."""
-    largest = wp.max(radiance)
-    if limit > 0.0 and largest > limit:
-        return limit / largest
-    return 1.0
+def scatter_with_glass(
+    mesh: MeshArgs,
+    material: MaterialArgs,
+    texture: TextureArgs,
+    receiver: ReceiverArgs,
+    light: LightArgs,
+    lamps: LampArgs,
+    glass: GlassArgs,
+    surface: Surface,
+    point: GlassPoint,
+    is_glass: int,
+    wo: wp.vec3,
+    keep_dark: int,
+    index: int,
+    key: wp.uint32,
+    vertex: int,
+) -> Scatter:
+    """Do `scatter` in a scene with solid glass, at glass (``is_glass``) or at what is beside it.
+
+    Nothing is the last vertex there, since light comes through glass.
+    """
+    event = Scatter()
+    if is_glass == 1:
+        event = scatter_at_glass(
+            mesh, material, texture, receiver, light, lamps,
+            surface, point, wo, keep_dark, index, key, vertex,
+        )  # fmt: skip
+    else:
+        rest = surface
+        rest.metallic = metallic_beside(surface.metallic, point)
+        event = scatter(
+            mesh, material, texture, receiver, light, lamps,
+            rest, wo, 0, keep_dark, index, key, vertex,
+        )  # fmt: skip
+    if event.bsdf.next.valid == 1:
+        left = transmittance(mesh, glass, surface, point, event.bsdf)
+        event.throughput = wp.cw_mul(event.throughput, left)
+        event.throughput_diffuse = wp.cw_mul(event.throughput_diffuse, left)
+    return event
 
 
 @wp.func
@@ -168,20 +212,40 @@ def keep_event(record: VertexRecord, i: int, j: int, event: Scatter):
         record.cos_over_pdf[i, j] = event.bsdf.cos_over_pdf
 
 
+class Viewer(IntEnum):
+    """From where the object is seen."""
+
+    CAMERA = 0
+    GROUND = 1
+    """From the white receiver, on which it throws light."""
+    MIRROR = 2
+    """From the camera, in the ground's coat."""
+
+
 @cache
-def foreground_kernel(has_layers: bool, has_receiver_mesh: bool, is_from_ground: bool) -> wp.Kernel:
+def foreground_kernel(
+    layers: int,
+    has_receiver_mesh: bool,
+    viewer: int,
+    has_lamps: bool,
+    has_solid_glass: bool = False,
+) -> wp.Kernel:
     """Return `trace_foreground` for scenes with or without these; what is not there costs nothing.
 
     A flag that is looked at while tracing would do on the CPU. On CUDA the registers of code that
     never runs slow down what does.
 
     Args:
-        has_layers: Whether some material has extensions (``MaterialArgs.any_layers``).
+        layers: What extensions some material has (``MaterialArgs.any_layers``).
         has_receiver_mesh: Whether there is a mesh of the receiver (``ReceiverArgs.mesh``).
-        is_from_ground: Whether the object is seen from the receiver in place of the camera.
+        viewer: From where the object is seen (`Viewer`).
+        has_lamps: Whether there are lamps near the object (`LampArgs`).
+        has_solid_glass: Whether some material is solid glass (`GlassArgs`); not on the ground.
     """
+    from_camera, from_ground = viewer == Viewer.CAMERA, viewer == Viewer.GROUND
+    in_mirror = viewer == Viewer.MIRROR
 
-    @wp.kernel(module="unique", enable_backward=False)
+    @wp.kernel(module="unique", enable_backward=False, module_options={"block_dim": BLOCK_DIM})
     def trace_foreground(
         pixels: wp.array[int],
         may_see_object: wp.array[int],
@@ -191,12 +255,16 @@ def foreground_kernel(has_layers: bool, has_receiver_mesh: bool, is_from_ground:
         texture: TextureArgs,
         receiver: ReceiverArgs,
         light: LightArgs,
+        behind: LightArgs,
+        lamps: LampArgs,
+        glass: GlassArgs,
         spp: int,
         rays: int,
         lanes: int,
         depth: int,
         indirect_limit: float,
         seed: int,
+        ground_alpha: float,
         foreground: wp.array[wp.vec3],
         diffuse: wp.array[wp.vec3],
         emission: wp.array[wp.vec3],
@@ -214,6 +282,11 @@ def foreground_kernel(has_layers: bool, has_receiver_mesh: bool, is_from_ground:
         The receiver is the path's first vertex. It is black to the object: light that goes from the
         ground to the object and back is left out, and the shadow stays dark at the contact.
 
+        In the mirror, ``foreground`` is the radiance of the object's image, ``diffuse`` that of the
+        light behind it, which the coat showed before, and ``emission`` that of the light beside it,
+        which it goes on showing; mean and rows as from the ground. The
+        coat is the path's first vertex.
+
         Args:
             pixels: Row-major pixel indices, shape [row].
             may_see_object: From the ground: 1 where the object may hide the receiver, shape [row].
@@ -224,17 +297,22 @@ def foreground_kernel(has_layers: bool, has_receiver_mesh: bool, is_from_ground:
             receiver: The ground plane, which hides what is below it from the camera, and the mesh,
                 which also stands in the light's way.
             light: The light.
+            behind: What the mirror shows where the object is not; only the mirror looks at it.
+            lamps: Lamps near the object.
+            glass: Solid glass.
             spp: Camera samples per row.
             rays: Paths that share one camera sample.
             lanes: Rows per pixel; the launch starts with a pixel's first.
-            depth: Surface interactions, that with the receiver included.
+            depth: Surface interactions, that with the receiver included; with solid glass those
+                with other materials, and `GLASS_DEPTH` in all at most.
             indirect_limit: Most radiance that one path may add behind its first vertex; 0 for no
                 limit. It takes the fireflies of light that a mirror throws onto a matte surface,
                 and with them some of that light.
             seed: Base seed.
+            ground_alpha: GGX alpha of the ground's coat; only the mirror looks at it.
             foreground: Radiance premultiplied by coverage, shape [row].
             diffuse: The part of it that the first hit's diffuse lobe reflects, shape [row]; not
-                written from the ground, nor are the next two.
+                written from the ground, nor are the next two there, or the coverage in the mirror.
             emission: The part of it that the first hit emits, shape [row].
             coverage: Share of samples that see the object, shape [row].
             light_record: Output: the weight of each direction that saw the light, or without
@@ -242,14 +320,18 @@ def foreground_kernel(has_layers: bool, has_receiver_mesh: bool, is_from_ground:
             vertex_record: Output: every vertex; ``material`` must come filled with -1. Or without
                 arrays.
         """
-        if wp.static(not has_layers):
-            material.any_layers = 0
+        material.any_layers = wp.static(int(layers))
         if wp.static(not has_receiver_mesh):
             receiver.mesh = wp.uint64(0)
-        receiver.is_solid = wp.static(int(is_from_ground))
-        if wp.static(is_from_ground):
+        if wp.static(not has_lamps):
+            lamps.count = 0
+        receiver.is_solid = wp.static(int(from_ground))
+        if wp.static(from_ground):
             receiver.shines = 0
+        if wp.static(not from_camera):
             point = ReceiverPoint()
+            hidden = wp.vec3(0.0)
+            beside = wp.vec3(0.0)
         i = wp.tid()
         pixel = pixels[i]
         key = pixel_seed(seed, pixel)
@@ -275,28 +357,30 @@ def foreground_kernel(has_layers: bool, has_receiver_mesh: bool, is_from_ground:
         wo = wp.vec3(0.0)
         throughput = wp.vec3(0.0)
         throughput_diffuse = wp.vec3(0.0)
+        if wp.static(has_solid_glass):
+            glassy = GlassPoint()
+            interfaces = int(0)
         while index < spp * rays:
             if alive == 0:
                 s = before + index // rays
-                if wp.static(is_from_ground):
+                if wp.static(not from_camera):
                     if index % rays == 0:
                         point = receiver_point(
-                            camera,
-                            mesh,
-                            material,
-                            texture,
-                            receiver,
-                            pixel,
-                            may_see_object[i],
-                            s,
-                            key,
-                        )
+                            camera, mesh, material, texture, receiver, pixel, may_see_object[i],
+                            s, key,
+                        )  # fmt: skip
                         count += float(point.valid + point.is_open)
                     if point.valid == 0:
                         index += rays
                         continue
                     origin = receiver_origin(mesh, receiver, point)
-                    ray = object_ray(mesh, origin, point.normal, sobol_pair(index, key, 3))
+                    u = sobol_pair(index, key, 3)
+                    if wp.static(from_ground):
+                        window = object_window(mesh, origin, point.normal)
+                        ray = object_ray(window, u)
+                    else:
+                        toward = wp.normalize(camera.origin - point.position)
+                        ray = mirrored_ray(point.normal, toward, ground_alpha, u)
                     first.valid = 0
                     if ray.weight > 0.0:
                         reach = receiver_mesh_hit(receiver, origin, ray.direction).t
@@ -304,6 +388,11 @@ def foreground_kernel(has_layers: bool, has_receiver_mesh: bool, is_from_ground:
                         first = closest_hit(
                             mesh, material, texture, origin, ray.direction, reach, 0, ray_key
                         )
+                    if wp.static(in_mirror):
+                        if ray.weight > 0.0:
+                            shown = light_eval(behind, ray.direction).radiance * ray.weight
+                            hidden += shown * float(first.valid)
+                            beside += shown * float(1 - first.valid)
                     if first.valid == 0:
                         index += 1
                         continue
@@ -326,29 +415,34 @@ def foreground_kernel(has_layers: bool, has_receiver_mesh: bool, is_from_ground:
                     k = 0
                 alive = 1
                 surface = surface_at(mesh, material, texture, first, wo)
+                if wp.static(has_solid_glass):
+                    glassy = glass_at(mesh, material, texture, glass, first, surface.metallic, wo)
+                    interfaces = 0
                 throughput_diffuse = wp.vec3(0.0)
                 radiance += wp.cw_mul(throughput, surface.emission)
                 radiance_emission += surface.emission
                 if vertex_record.material.shape[1] > 0:
                     keep_surface(vertex_record, i, index, surface, wo)
 
-            is_last = int(0)
-            if k == depth - 1 and material.any_emission == 0:
-                is_last = 1
-            event = scatter(
-                mesh,
-                material,
-                texture,
-                receiver,
-                light,
-                surface,
-                wo,
-                is_last,
-                keep_dark,
-                before * rays + index,
-                key,
-                k,
-            )
+            if wp.static(has_solid_glass):
+                is_glass = meets_glass(glassy, before * rays + index, key, k)
+                if is_glass == 0 and k - interfaces >= depth:
+                    alive = 0
+                    index += 1
+                    continue
+                interfaces += is_glass
+                event = scatter_with_glass(
+                    mesh, material, texture, receiver, light, lamps, glass,
+                    surface, glassy, is_glass, wo, keep_dark, before * rays + index, key, k,
+                )  # fmt: skip
+            else:
+                is_last = int(0)
+                if k == depth - 1 and material.any_emission == 0 and lamps.count == 0:
+                    is_last = 1  # lamps in front of a hit are seen by the closest alone
+                event = scatter(
+                    mesh, material, texture, receiver, light, lamps,
+                    surface, wo, is_last, keep_dark, before * rays + index, key, k,
+                )  # fmt: skip
             if vertex_record.material.shape[1] > 0:
                 keep_event(vertex_record, i, k * spp * rays + index, event)
             if light_record.wi.shape[1] > 0:
@@ -378,18 +472,31 @@ def foreground_kernel(has_layers: bool, has_receiver_mesh: bool, is_from_ground:
                 surface = surface_at(mesh, material, texture, event.bsdf.next, wo)
                 radiance += wp.cw_mul(throughput, surface.emission)
                 radiance_diffuse += wp.cw_mul(throughput_diffuse, surface.emission)
+                if wp.static(has_solid_glass):
+                    glassy = glass_at(
+                        mesh, material, texture, glass, event.bsdf.next, surface.metallic, wo
+                    )
                 if vertex_record.material.shape[1] > 0:
                     keep_surface(vertex_record, i, k * spp * rays + index, surface, wo)
-            if k == depth:
+            if wp.static(has_solid_glass):
+                # Light comes through glass that follows the last other surface.
+                if k - interfaces >= depth and glassy.share == 0.0:
+                    alive = 0
+                if k == wp.max(depth, GLASS_DEPTH):
+                    alive = 0
+            elif k == depth:
                 alive = 0
             if alive == 0:
                 index += 1
 
         if light_record.wi.shape[1] > 0:
             light_record.count[i] = entries
-        if wp.static(is_from_ground):
+        if wp.static(not from_camera):
             seen = float(spp) / wp.max(count, 1.0)
             foreground[i] = radiance * (scale * seen)
+            if wp.static(in_mirror):
+                diffuse[i] = hidden * (scale * seen)
+                emission[i] = beside * (scale * seen)
             if light_record.wi.shape[1] > 0:
                 for j in range(entries):
                     light_record.weight[i, j] = light_record.weight[i, j] * seen

@@ -1,16 +1,19 @@
 """The receiver with and without the object: numerator and denominator of the shadow ratio.
 
-``beta = PathTrace(X + P, L, 1) / PathTrace(P, L, 1)`` per channel (DiPIR, eq. 5). Both use the same
-directions, so the ratio lies in [0, 1] and is exactly 1 where nothing is blocked; and their noise
-cancels, which a closed form of the denominator would undo. P is the ground plane and the receiver's
-mesh, whichever the camera sees first. The mesh shades both halves: where a wall keeps the sun away
-the object can take away only what is left, so shadows do not double. Detached.
+``beta = PathTrace(X + P, L, 1) / PathTrace(P, L, 1)`` per channel (DiPIR, eq. 5). In
+`trace_receiver` both use the same directions, so the ratio lies in [0, 1] and is exactly 1 where
+nothing is blocked, and their noise cancels; `trace_plane_shadow` does so near the object, and else
+takes what the object blocks from the light of the open plane, which is the same everywhere. P is
+the ground plane and the receiver's mesh, whichever the camera sees first. The mesh shades both
+halves: where a wall keeps the sun away the object can take away only what is left, so shadows do
+not double. Detached.
 """
 
 import warp as wp
 
+from warpir.kernels.bsdf import smith_lambda, visible_normal_sample
 from warpir.kernels.light_gradient import keep_direction
-from warpir.kernels.maths.frame import basis, to_world
+from warpir.kernels.maths.frame import Frame, basis, to_local, to_world
 from warpir.kernels.maths.rng import hash_pair, pixel_seed, sobol_pair
 from warpir.kernels.receiver_mesh import (
     plane_distance,
@@ -25,7 +28,7 @@ from warpir.kernels.sampling import (
     power_heuristic,
 )
 from warpir.kernels.tracing.hit import offset_origin
-from warpir.kernels.tracing.ray import camera_hit, camera_ray, closest_hit, visibility
+from warpir.kernels.tracing.ray import camera_hit, camera_ray, closest_hit, meets_box, visibility
 from warpir.kernels.types import (
     CameraArgs,
     LightArgs,
@@ -40,6 +43,8 @@ wp.set_module_options({"enable_backward": False})
 
 INV_PI = wp.constant(0.318309886183791)
 
+GROUND_IOR = wp.constant(1.5)
+"""Refractive index of a glossy ground's coat [1]."""
 
 BOUNCE_KEY = wp.constant(wp.uint32(0x2545F491))
 """Keeps the draws of what the object lets through of the mesh's light apart from the camera's."""
@@ -57,7 +62,7 @@ class ReceiverPoint:
     """Unit, toward the side that receives light; of the mesh, toward the camera."""
 
 
-@wp.func
+@wp.func(inline=True)
 def receiver_origin(mesh: MeshArgs, receiver: ReceiverArgs, point: ReceiverPoint) -> wp.vec3:
     """Return where rays from a receiver start, off the plane and the receiver's mesh."""
     if receiver.mesh == wp.uint64(0):
@@ -84,7 +89,7 @@ class ReceiverSample:
     light."""
 
 
-@wp.func
+@wp.func(inline=True)
 def receiver_sample(
     mesh: MeshArgs,
     material: MaterialArgs,
@@ -107,17 +112,16 @@ def receiver_sample(
     out.visible_cosine = 1.0
     out.bounced = wp.vec3(0.0)
     origin = receiver_origin(mesh, receiver, point)
-    pick = sobol_pair(index, key, 1)
-    wi = light_sample(light, sobol_pair(index, key, 2), pick[0])
+    drawn = light_sample(light, sobol_pair(index, key, 2))
+    wi = drawn.wi
     cos_i = wp.dot(wi, point.normal)
     out.wi_light = wi
-    if cos_i > 0.0:
-        Li = light_eval(light, wi)
-        if Li.pdf > 0.0 and (wp.max(Li.radiance) > 0.0 or keep_dark == 1):
-            pdf = cos_i * INV_PI
-            out.weight_light = pdf * power_heuristic(Li.pdf, pdf) / Li.pdf
-            out.weight_light = out.weight_light * receiver_visibility(receiver, origin, wi)
-            out.radiance_light = Li.radiance
+    if cos_i > 0.0 and drawn.pdf > 0.0 and (wp.max(drawn.radiance) > 0.0 or keep_dark == 1):
+        pdf = cos_i * INV_PI
+        out.weight_light = pdf * power_heuristic(drawn.pdf, pdf) / drawn.pdf
+        out.weight_light = out.weight_light * receiver_visibility(receiver, origin, wi)
+        out.radiance_light = drawn.radiance
+        if meets_box(origin, wi, mesh.low, mesh.high) == 1:
             out.visible_light = visibility(mesh, material, texture, origin, wi)
     wi = to_world(cosine_sample(sobol_pair(index, key, 3)), basis(point.normal))
     cos_i = wp.dot(wi, point.normal)
@@ -134,11 +138,12 @@ def receiver_sample(
         if wp.max(Li.radiance) > 0.0 or keep_dark == 1:
             out.weight_cosine = power_heuristic(cos_i * INV_PI, Li.pdf)
             out.radiance_cosine = Li.radiance
-            out.visible_cosine = visibility(mesh, material, texture, origin, wi)
+            if meets_box(origin, wi, mesh.low, mesh.high) == 1:
+                out.visible_cosine = visibility(mesh, material, texture, origin, wi)
     return out
 
 
-@wp.func
+@wp.func(inline=True)
 def receiver_point(
     camera: CameraArgs,
     mesh: MeshArgs,
@@ -178,49 +183,107 @@ def receiver_point(
 
 
 @wp.struct
-class ObjectRay:
-    """A direction in which a point of the receiver may see the object."""
+class ObjectWindow:
+    """A rectangle of the unit disc below a point's hemisphere around what it sees of the object.
 
-    direction: wp.vec3
-    weight: float
-    """``cos / pi / pdf``; 0 where there is no direction."""
+    The cosine is even on that disc (Nusselt's analogue), so directions that are drawn from the
+    window have the density ``cos / area``.
+    """
+
+    frame: Frame
+    low: wp.vec2
+    high: wp.vec2
+    area: float
+    is_whole: int
+    """1 where the window holds all directions: ``origin`` is near the object."""
 
 
 @wp.func
-def object_ray(mesh: MeshArgs, origin: wp.vec3, normal: wp.vec3, u: wp.vec2) -> ObjectRay:
-    """Draw a direction in proportion to its cosine, as far as it may meet the object.
+def object_window(mesh: MeshArgs, origin: wp.vec3, normal: wp.vec3) -> ObjectWindow:
+    """Return the window of a point at ``origin`` with the unit ``normal``.
 
-    The cosine is even on the unit disc below the hemisphere (Nusselt's analogue). There the sphere
-    around the object's box covers an ellipse, or a part of one; a point is drawn from the rectangle
-    around that, and from the square around the disc where ``origin`` is within the sphere.
+    The sphere around the object's box covers an ellipse of the disc, or a part of one; the window
+    is the rectangle around that, and the square around the disc where ``origin`` is within the
+    sphere.
     """
-    frame = basis(normal)
-    low = wp.vec2(-1.0, -1.0)
-    high = wp.vec2(1.0, 1.0)
+    window = ObjectWindow()
+    window.frame = basis(normal)
+    window.low = wp.vec2(-1.0, -1.0)
+    window.high = wp.vec2(1.0, 1.0)
+    window.is_whole = 1
     toward = 0.5 * (mesh.low + mesh.high) - origin
     distance = wp.length(toward)
     radius = 0.5 * wp.length(mesh.high - mesh.low)
     if distance > radius:
+        window.is_whole = 0
         # Elevation of the sphere's centre, and half the angle that the sphere covers
         up = wp.clamp(wp.dot(toward, normal) / distance, -1.0, 1.0)
         along = wp.sqrt(1.0 - up * up)
         reach = radius / distance
         spare = wp.sqrt(1.0 - reach * reach)
         if along > 1.0e-4:
-            frame.x = wp.normalize(toward - normal * (up * distance))
-            frame.y = wp.cross(normal, frame.x)
-        low = wp.vec2(along * spare - up * reach, -reach)
-        high = wp.vec2(1.0, reach)
+            window.frame.x = wp.normalize(toward - normal * (up * distance))
+            window.frame.y = wp.cross(normal, window.frame.x)
+        window.low = wp.vec2(along * spare - up * reach, -reach)
+        window.high = wp.vec2(1.0, reach)
         if up > reach:
-            high = wp.vec2(along * spare + up * reach, reach)
+            window.high = wp.vec2(along * spare + up * reach, reach)
+    sides = window.high - window.low
+    window.area = sides[0] * sides[1]
+    return window
+
+
+@wp.struct
+class ObjectRay:
+    """A direction in which a point of the receiver may see the object."""
+
+    direction: wp.vec3
+    weight: float
+    """``f cos / pdf`` of white Lambert's ``f``, or of the coat's; 0 where there is no direction."""
+
+
+@wp.func
+def object_ray(window: ObjectWindow, u: wp.vec2) -> ObjectRay:
+    """Draw a direction from the window, in proportion to its cosine."""
     out = ObjectRay()
     out.weight = 0.0
-    x = wp.lerp(low[0], high[0], u[0])
-    y = wp.lerp(low[1], high[1], u[1])
+    x = wp.lerp(window.low[0], window.high[0], u[0])
+    y = wp.lerp(window.low[1], window.high[1], u[1])
     rest = 1.0 - x * x - y * y
     if rest > 0.0:
-        out.weight = (high[0] - low[0]) * (high[1] - low[1]) * INV_PI
-        out.direction = to_world(wp.vec3(x, y, wp.sqrt(rest)), frame)
+        out.weight = window.area * INV_PI
+        out.direction = to_world(wp.vec3(x, y, wp.sqrt(rest)), window.frame)
+    return out
+
+
+@wp.func
+def dielectric_fresnel(cos_i: float) -> float:
+    """Return the unpolarised reflectance of a coat of `GROUND_IOR` seen from air (Fresnel)."""
+    cos_t = wp.sqrt(1.0 - (1.0 - cos_i * cos_i) / (GROUND_IOR * GROUND_IOR))
+    across = (cos_i - GROUND_IOR * cos_t) / (cos_i + GROUND_IOR * cos_t)
+    along = (GROUND_IOR * cos_i - cos_t) / (GROUND_IOR * cos_i + cos_t)
+    return 0.5 * (across * across + along * along)
+
+
+@wp.func
+def mirrored_ray(normal: wp.vec3, wo: wp.vec3, alpha: float, u: wp.vec2) -> ObjectRay:
+    """Draw a direction that a coat reflects toward ``wo``, by its visible GGX normals.
+
+    The weight is ``F G2 / G1`` (Heitz 2018, "Sampling the GGX Distribution of Visible Normals",
+    eq. 19). With an ``alpha`` of 0 the direction is the mirror's, and the weight ``F``.
+    """
+    out = ObjectRay()
+    out.weight = 0.0
+    frame = basis(normal)
+    o = to_local(wo, frame)
+    if o[2] > 0.0:
+        wm = visible_normal_sample(o, alpha, u)
+        cos_d = wp.dot(o, wm)
+        wi = wm * (2.0 * cos_d) - o
+        if wi[2] > 0.0:
+            masked = 1.0 + smith_lambda(o, alpha)
+            out.weight = dielectric_fresnel(cos_d) * masked / (masked + smith_lambda(wi, alpha))
+            out.direction = to_world(wi, frame)
     return out
 
 
@@ -311,3 +374,100 @@ def trace_receiver(
         record.count[i] = entries
         for j in range(entries):
             record.weight[i, j] = record.weight[i, j] * scale
+
+
+@wp.kernel
+def trace_plane_shadow(
+    pixels: wp.array[int],
+    may_see_object: wp.array[int],
+    camera: CameraArgs,
+    mesh: MeshArgs,
+    material: MaterialArgs,
+    texture: TextureArgs,
+    receiver: ReceiverArgs,
+    light: LightArgs,
+    open_radiance: wp.vec3,
+    spp: int,
+    rays: int,
+    seed: int,
+    lit: wp.array[wp.vec3],
+    unoccluded: wp.array[wp.vec3],
+):
+    """Do what `trace_receiver` does, for a plane without a mesh, where no gradient is asked for.
+
+    What the open plane receives is the same everywhere, and the object takes a part of it: each
+    sample draws one direction from the light times the cosine and one from `object_window`, looks
+    what light the object blocks there, and combines both with the power heuristic. Near the object,
+    where the window holds all directions, the same directions say what both sums are, whose noise
+    cancels in the ratio.
+
+    Args:
+        pixels: Row-major pixel indices, shape [receiver_pixel].
+        may_see_object: 1 where the object may hide the receiver, shape [receiver_pixel].
+        camera: The view.
+        mesh: The object's triangles.
+        material: Their materials.
+        texture: Their textures.
+        receiver: The plane.
+        light: The light, its directions drawn for the plane.
+        open_radiance: Radiance of the plane without the object.
+        spp: Camera samples per pixel.
+        rays: Directions per technique that share one camera sample.
+        seed: Base seed.
+        lit: Mean radiance with the object over the samples that see the plane.
+        unoccluded: The same without the object.
+    """
+    i = wp.tid()
+    pixel = pixels[i]
+    key = pixel_seed(seed, pixel)
+    lit_near = wp.vec3(0.0)
+    open_near = wp.vec3(0.0)
+    lost_far = wp.vec3(0.0)
+    far = float(0.0)
+    count = float(0.0)
+    for s in range(spp):
+        point = receiver_point(
+            camera, mesh, material, texture, receiver, pixel, may_see_object[i], s, key
+        )
+        if point.valid == 1:
+            count += float(rays)
+            origin = receiver_origin(mesh, receiver, point)
+            window = object_window(mesh, origin, point.normal)
+            near = float(window.is_whole)
+            far += (1.0 - near) * float(rays)
+            for r in range(rays):
+                index = s * rays + r
+                drawn = light_sample(light, sobol_pair(index, key, 2))
+                cos_i = wp.dot(drawn.wi, point.normal)
+                if cos_i > 0.0 and drawn.pdf > 0.0:
+                    dark = float(0.0)
+                    if meets_box(origin, drawn.wi, mesh.low, mesh.high) == 1:
+                        dark = 1.0 - visibility(mesh, material, texture, origin, drawn.wi)
+                    share = power_heuristic(drawn.pdf, cos_i / window.area)
+                    value = drawn.radiance * (cos_i * INV_PI * share / drawn.pdf)
+                    open_near += value * near
+                    lit_near += value * (near * (1.0 - dark))
+                    lost_far += value * ((1.0 - near) * dark)
+                ray = object_ray(window, sobol_pair(index, key, 3))
+                if ray.weight > 0.0:
+                    dark = float(0.0)
+                    if meets_box(origin, ray.direction, mesh.low, mesh.high) == 1:
+                        dark = 1.0 - visibility(mesh, material, texture, origin, ray.direction)
+                    if dark > 0.0 or window.is_whole == 1:
+                        Li = light_eval(light, ray.direction)
+                        pdf = wp.dot(ray.direction, point.normal) / window.area
+                        value = Li.radiance * (ray.weight * power_heuristic(pdf, Li.pdf))
+                        open_near += value * near
+                        lit_near += value * (near * (1.0 - dark))
+                        lost_far += value * ((1.0 - near) * dark)
+    count = wp.max(count, 1.0)
+    open_far = wp.vec3(0.0)
+    if far > 0.0:
+        open_far = open_radiance * far
+    left_far = open_far - lost_far
+    for c in range(3):
+        # What noise takes beyond the whole is not there to be taken; a NaN stays one.
+        if left_far[c] < 0.0:
+            left_far[c] = 0.0
+    lit[i] = (lit_near + left_far) / count
+    unoccluded[i] = (open_near + open_far) / count

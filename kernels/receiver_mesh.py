@@ -90,14 +90,12 @@ def sky_visibility(receiver: ReceiverArgs, origin: wp.vec3, direction: wp.vec3) 
 
 
 @wp.func
-def receiver_radiance(receiver: ReceiverArgs, hit: ReceiverHit) -> wp.vec3:
-    """Return what the receiver's mesh sends from a hit back along the ray.
+def photo_at(receiver: ReceiverArgs, hit: ReceiverHit) -> wp.vec4:
+    """Return the photo's radiance at a point of plane or mesh, with 1 behind it.
 
-    That is the photo's radiance where the camera sees the same side of the same point, else the
-    mean of all that it sees of the mesh.
+    All is 0 where the camera does not see the same side of the same point.
     """
-    if receiver.shines == 0:
-        return wp.vec3(0.0)
+    nothing = wp.vec4(0.0, 0.0, 0.0, 0.0)
     from_eye = hit.position - receiver.eye
     if wp.dot(from_eye, hit.normal) < 0.0:
         q = receiver.to_image * from_eye
@@ -115,7 +113,23 @@ def receiver_radiance(receiver: ReceiverArgs, hit: ReceiverHit) -> wp.vec3:
                 plane = plane_distance(receiver, receiver.eye, direction)
                 if plane < 0.0 or plane > SEEN * distance:
                     if receiver_mesh_hit(receiver, receiver.eye, direction).t > SEEN * distance:
-                        return receiver.radiance[i, j]
+                        seen = receiver.radiance[i, j]
+                        return wp.vec4(seen[0], seen[1], seen[2], 1.0)
+    return nothing
+
+
+@wp.func
+def receiver_radiance(receiver: ReceiverArgs, hit: ReceiverHit) -> wp.vec3:
+    """Return what the receiver's mesh sends from a hit back along the ray.
+
+    That is the photo's radiance where the camera sees it, else the mean of all that it sees of the
+    mesh.
+    """
+    if receiver.shines == 0:
+        return wp.vec3(0.0)
+    seen = photo_at(receiver, hit)
+    if seen[3] > 0.0:
+        return wp.vec3(seen[0], seen[1], seen[2])
     return receiver.elsewhere
 
 

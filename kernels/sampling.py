@@ -10,6 +10,7 @@ from warpir.kernels.maths.latlong import (
     map_scalar,
     uv_to_direction,
 )
+from warpir.kernels.maths.rng import hash_pair, pixel_seed, to_unit
 from warpir.kernels.maths.sg import sg_shape
 from warpir.kernels.types import LightArgs
 
@@ -84,14 +85,13 @@ def light_eval(light: LightArgs, wi: wp.vec3) -> LightValue:
         L += light.amplitude[k] * g
         pdf += light.lobe_prob[k] * light.lobe_pdf_peak[k] * g
     if light.map_height > 0:
-        uv = direction_to_uv(wi)
-        tap = bilinear_tap(uv, light.map_height, light.map_width)
+        tap = bilinear_tap(direction_to_uv(wi), light.map_height, light.map_width)
         L += map_radiance(light.texels, tap)
         if light.map_prob > 0.0:
             # The sampler works in (u, v): d_omega = 2 pi^2 sin(theta) du dv.
             s = wp.max(wp.sqrt(wi[0] * wi[0] + wi[2] * wi[2]), 1.0e-7)
             density = map_scalar(light.texel_prob, tap) * float(light.map_height * light.map_width)
-            pdf += light.map_prob * density / (2.0 * PI * PI * s)
+            pdf += density / (2.0 * PI * PI * s)
     value.radiance = L
     value.pdf = pdf
     return value
@@ -106,21 +106,7 @@ def tent(u: float) -> float:
 
 
 @wp.func
-def row_search(cdf: wp.array[float], count: int, u: float) -> int:
-    """Return the largest i < count with ``cdf[i] <= u``."""
-    low = int(0)
-    high = int(count)
-    while high - low > 1:
-        middle = (low + high) // 2
-        if cdf[middle] <= u:
-            low = middle
-        else:
-            high = middle
-    return low
-
-
-@wp.func
-def column_search(cdf: wp.array2d[float], row: int, count: int, u: float) -> int:
+def row_search(cdf: wp.array2d[float], row: int, count: int, u: float) -> int:
     """Return the largest j < count with ``cdf[row, j] <= u``."""
     low = int(0)
     high = int(count)
@@ -134,22 +120,25 @@ def column_search(cdf: wp.array2d[float], row: int, count: int, u: float) -> int
 
 
 @wp.func
-def map_sample(light: LightArgs, u: wp.vec2) -> wp.vec3:
+def left_over(cdf: wp.array2d[float], row: int, j: int, u: float) -> float:
+    """Return what is left of ``u`` within cell ``j``; it is uniform again."""
+    width = wp.max(cdf[row, j + 1] - cdf[row, j], 1.0e-30)
+    return wp.clamp((u - cdf[row, j]) / width, 0.0, 0.99999994)
+
+
+@wp.func
+def map_sample(light: LightArgs, part: int, u: wp.vec2) -> wp.vec3:
     """Draw a direction from the map in proportion to its *bilinear* luminance times solid angle.
 
     A texel is drawn from the table, then a point from its tent: the sum of tents is the bilinear
     interpolant, so the neighbours of a sun that interpolation brightens are drawn as often as they
-    shine, and no firefly remains.
+    shine, and no firefly remains. ``part`` is 1 for the bright texels, 0 for the others.
     """
-    i = row_search(light.row_cdf, light.map_height, u[1])
-    j = column_search(light.column_cdf, i, light.map_width, u[0])
-    # What is left of each number within its cell is uniform again.
-    row_width = light.row_cdf[i + 1] - light.row_cdf[i]
-    column_width = light.column_cdf[i, j + 1] - light.column_cdf[i, j]
-    ri = wp.clamp((u[1] - light.row_cdf[i]) / wp.max(row_width, 1.0e-30), 0.0, 0.99999994)
-    rj = wp.clamp((u[0] - light.column_cdf[i, j]) / wp.max(column_width, 1.0e-30), 0.0, 0.99999994)
-    x = (float(j) + 0.5 + tent(rj)) / float(light.map_width)
-    y = (float(i) + 0.5 + tent(ri)) / float(light.map_height)
+    i = row_search(light.row_cdf, part, light.map_height, u[1])
+    row = part * light.map_height + i
+    j = row_search(light.column_cdf, row, light.map_width, u[0])
+    x = (float(j) + 0.5 + tent(left_over(light.column_cdf, row, j, u[0]))) / float(light.map_width)
+    y = (float(i) + 0.5 + tent(left_over(light.row_cdf, part, i, u[1]))) / float(light.map_height)
     x = x - wp.floor(x)
     # Folding at the poles is what clamping the lookup means: the two halves add up to weight 1.
     if y < 0.0:
@@ -160,15 +149,81 @@ def map_sample(light: LightArgs, u: wp.vec2) -> wp.vec3:
 
 
 @wp.func
-def light_sample(light: LightArgs, u: wp.vec2, u_pick: float) -> wp.vec3:
-    """Draw a direction from the light's proposal; its density is `light_eval`'s."""
-    if u_pick < light.map_prob or light.lobe_count == 0:
-        return map_sample(light, u)
-    rest = u_pick - light.map_prob
-    pick = int(light.lobe_count - 1)
-    for k in range(light.lobe_count):
-        rest -= light.lobe_prob[k]
-        if rest < 0.0:
-            pick = k
-            break
-    return lobe_sample(u, light.axis[pick], light.sharpness[pick])
+def proposal_sample(light: LightArgs, u: wp.vec2) -> wp.vec3:
+    """Draw a direction from the light's proposal; its density is `light_eval`'s.
+
+    The first number picks part of the map or a lobe; what is left of it is uniform again.
+    """
+    first = u[0]
+    if first < light.bright_prob:
+        return map_sample(light, 1, wp.vec2(first / light.bright_prob, u[1]))
+    first -= light.bright_prob
+    others = light.map_prob - light.bright_prob
+    if first < others or light.lobe_count == 0:
+        within = wp.clamp(first / wp.max(others, 1.0e-30), 0.0, 0.99999994)
+        return map_sample(light, 0, wp.vec2(within, u[1]))
+    first -= others
+    pick = int(0)
+    while pick < light.lobe_count - 1 and first >= light.lobe_prob[pick]:
+        first -= light.lobe_prob[pick]
+        pick += 1
+    within = wp.clamp(first / wp.max(light.lobe_prob[pick], 1.0e-30), 0.0, 0.99999994)
+    return lobe_sample(wp.vec2(within, u[1]), light.axis[pick], light.sharpness[pick])
+
+
+@wp.struct
+class DrawnLight:
+    """A direction that was drawn from the light, what comes from there, and its density."""
+
+    wi: wp.vec3
+    radiance: wp.vec3
+    pdf: float
+
+
+@wp.func
+def light_sample(light: LightArgs, u: wp.vec2) -> DrawnLight:
+    """Return one of the directions that `draw_light` left, that of the cell around ``u``."""
+    cells = light.drawn_pdf.shape[0]
+    i = wp.min(int(u[1] * float(cells)), cells - 1)
+    j = wp.min(int(u[0] * float(cells)), cells - 1)
+    out = DrawnLight()
+    out.wi = light.drawn_wi[i, j]
+    out.radiance = light.drawn_radiance[i, j]
+    out.pdf = light.drawn_pdf[i, j]
+    return out
+
+
+@wp.kernel(enable_backward=False)
+def draw_light(
+    cell: wp.array[int],
+    light: LightArgs,
+    seed: int,
+    side: int,
+    wi: wp.array[wp.vec3],
+    radiance: wp.array[wp.vec3],
+    pdf: wp.array[float],
+):
+    """Draw a direction in each of ``side`` x ``side`` strata of the unit square; a thread a cell.
+
+    All pixels of a launch share them, each in an order of its own: they are drawn and looked up
+    once and not for each sample.
+
+    Args:
+        cell: Row-major strata, shape [cell].
+        light: The light.
+        seed: Base seed.
+        side: Strata along each axis.
+        wi: Output: unit directions, shape [cell].
+        radiance: Output: what comes from there.
+        pdf: Output: density of the draw per solid angle.
+    """
+    i = wp.tid()
+    key = pixel_seed(seed, cell[i])
+    x = float(cell[i] % side) + to_unit(hash_pair(key, wp.uint32(0)))
+    y = float(cell[i] // side) + to_unit(hash_pair(key, wp.uint32(1)))
+    u = wp.vec2(wp.min(x / float(side), 0.99999994), wp.min(y / float(side), 0.99999994))
+    d = proposal_sample(light, u)
+    value = light_eval(light, d)
+    wi[i] = d
+    radiance[i] = value.radiance
+    pdf[i] = value.pdf

@@ -11,7 +11,7 @@ import warp as wp
 from warpir.kernels.bsdf import Bsdf, BsdfValue, bsdf_f, bsdf_of, bsdf_sample
 from warpir.kernels.maths.frame import Frame, to_local, to_world
 from warpir.kernels.receiver_mesh import receiver_hit, receiver_radiance, sky_visibility
-from warpir.kernels.sampling import light_eval, light_sample, power_heuristic
+from warpir.kernels.sampling import light_sample, power_heuristic
 from warpir.kernels.tracing.hit import Hit, offset_origin
 from warpir.kernels.tracing.ray import closest_hit, visibility
 from warpir.kernels.tracing.surface import Surface
@@ -53,6 +53,26 @@ class BsdfSample:
     """Where it met the object, and the path goes on."""
 
 
+@wp.struct
+class Scatter:
+    """One scattering event: both light estimates, and how the path goes on."""
+
+    direct: wp.vec3
+    """Light gathered here, both techniques [radiance]."""
+    direct_diffuse: wp.vec3
+    """The diffuse lobe's part of it."""
+    throughput: wp.vec3
+    """``f cos / pdf`` of the continued path."""
+    throughput_diffuse: wp.vec3
+    """The diffuse lobe's part of it."""
+    emitter: EmitterSample
+    bsdf: BsdfSample
+    L_bsdf: wp.vec3
+    """Radiance that arrives along the BSDF's direction, of the light or of the receiver's mesh."""
+    weight_bsdf: float
+    """``cos visible mis / pdf`` of it; 0 when it met the object."""
+
+
 @wp.func
 def surface_bsdf(surface: Surface, wo: wp.vec3, frame: Frame) -> Bsdf:
     """Return the scattering of a surface toward ``wo``, world frame; ``frame`` has its normal."""
@@ -65,7 +85,7 @@ def surface_bsdf(surface: Surface, wo: wp.vec3, frame: Frame) -> Bsdf:
     )
 
 
-@wp.func
+@wp.func(inline=True)
 def sample_emitter(
     mesh: MeshArgs,
     material: MaterialArgs,
@@ -76,7 +96,6 @@ def sample_emitter(
     bsdf: Bsdf,
     frame: Frame,
     u: wp.vec2,
-    u_part: float,
     keep_dark: int,
 ) -> EmitterSample:
     """Draw a direction from the light's proposal, weigh it and trace it.
@@ -91,32 +110,31 @@ def sample_emitter(
         bsdf: How, toward the camera.
         frame: Of the shading normal.
         u: Uniform numbers.
-        u_part: Another, which picks the lobe or the map.
         keep_dark: 1 weighs directions too that bring nothing now: a gradient needs them.
     """
     sample = EmitterSample()
     sample.valid = 0
     sample.L = wp.vec3(0.0)
     sample.weight = 0.0
-    sample.wi = light_sample(light, u, u_part)
+    drawn = light_sample(light, u)
+    sample.wi = drawn.wi
     wi = to_local(sample.wi, frame)
     if wi[2] > 0.0 and wp.dot(sample.wi, surface.ng) > 0.0 and bsdf.wo[2] > 0.0:
         f = bsdf_f(bsdf, wi)
-        Li = light_eval(light, sample.wi)
-        reflected = wp.cw_mul(f.diffuse + f.specular, Li.radiance)
-        if Li.pdf > 0.0 and (wp.max(reflected) > 0.0 or keep_dark == 1):
-            weight = wi[2] * power_heuristic(Li.pdf, f.pdf) / Li.pdf
+        reflected = wp.cw_mul(f.diffuse + f.specular, drawn.radiance)
+        if drawn.pdf > 0.0 and (wp.max(reflected) > 0.0 or keep_dark == 1):
+            weight = wi[2] * power_heuristic(drawn.pdf, f.pdf) / drawn.pdf
             origin = offset_origin(surface.position, surface.ng, sample.wi, mesh.epsilon)
             weight = weight * visibility(mesh, material, texture, origin, sample.wi)
             weight = weight * sky_visibility(receiver, origin, sample.wi)
             sample.valid = 1
             sample.f = f
-            sample.L = Li.radiance
+            sample.L = drawn.radiance
             sample.weight = weight
     return sample
 
 
-@wp.func
+@wp.func(inline=True)
 def sample_bsdf(
     mesh: MeshArgs,
     material: MaterialArgs,
@@ -176,3 +194,12 @@ def sample_bsdf(
 def bsdf_weight(sample: BsdfSample, light_pdf: float) -> float:
     """Return ``cos visible mis / pdf`` of the BSDF's direction, without f."""
     return sample.cos_over_pdf * sample.visible * power_heuristic(sample.f.pdf, light_pdf)
+
+
+@wp.func
+def limited(radiance: wp.vec3, limit: float) -> float:
+    """Return the factor that brings the largest channel down to ``limit``; 1 without a limit."""
+    largest = wp.max(radiance)
+    if limit > 0.0 and largest > limit:
+        return limit / largest
+    return 1.0

@@ -59,6 +59,11 @@ class MeshArgs:
 
     id: wp.uint64
     """Handle of the ``wp.Mesh``; 0 when there are no triangles."""
+    embree: wp.uint64
+    """Embree's scene of the same triangles; 0 on CUDA and where Embree is not installed."""
+    embree_intersect: wp.uint64
+    embree_occluded: wp.uint64
+    """Addresses of ``rtcIntersect1`` and ``rtcOccluded1``."""
     epsilon: float
     """Ray offset that depends on the scene's size alone [m]."""
     low: wp.vec3
@@ -110,6 +115,16 @@ class Layers:
     coat_roughness: float
     coat_n: wp.vec3
     """Unit normal of the coat, in the shading normal's frame (`maths.frame.basis`)."""
+    anisotropy: float
+    """Squared strength of the base's anisotropy [1]; 0: its lobe is as wide in all directions."""
+    stretch: wp.vec2
+    """Unit direction in which that lobe is wider, in the x and y of the same frame."""
+    iridescence: float
+    """Share of the base that has a thin film [1]; 0: what else is said of it is not read."""
+    film_ior: float
+    """Index of refraction."""
+    film_thickness: float
+    """Of the film [nm]."""
 
 
 @wp.struct
@@ -130,6 +145,23 @@ class Extensions:
     sheen_roughness: float
     transmission: float
     """Share of what enters the dielectric that leaves on the other side [1]."""
+    anisotropy: float
+    """Strength [1]."""
+    stretch: wp.vec2
+    """Cosine and sine of its rotation, from the tangent toward the bitangent."""
+    iridescence: float
+    """Share of the base that has a thin film [1]."""
+    film_ior: float
+    """Index of refraction."""
+    film_minimum: float
+    film_thickness: float
+    """Thickness where its texture is 0, and where it is 1 or absent; at one point, its own [nm]."""
+
+
+LAYERS = wp.constant(1)
+ANISOTROPY = wp.constant(2)
+IRIDESCENCE = wp.constant(4)
+"""Flags of `MaterialArgs.any_layers`: some material has extensions; among them is that one."""
 
 
 @wp.struct
@@ -159,7 +191,7 @@ class MaterialArgs:
     slot_v: wp.array2d[wp.vec3]
     """Rows of the affine UV transform, shape [material, slot]."""
     any_layers: int
-    """1 when some material has extensions."""
+    """What extensions some material has: 0 without any, else `LAYERS`, and what it adds."""
     any_alpha: int
     """1 when some material lets rays pass, so that they must look at what they hit."""
     any_culled: int
@@ -188,7 +220,8 @@ class TextureArgs:
 class LightArgs:
     """Light at infinity: a sum of spherical Gaussians and of one lat-long map, either may be empty.
 
-    The proposal draws a lobe with ``lobe_prob`` or the map with ``map_prob``; the sum is 1.
+    The proposal draws a lobe with ``lobe_prob``, the map's bright texels with ``bright_prob``, or
+    its others; the sum is 1. A number in [0, 1) picks them in the order bright, others, lobes.
     """
 
     lobe_count: int
@@ -201,16 +234,58 @@ class LightArgs:
     """Density of a lobe's own sampler at its axis [1/sr], shape [lobe]."""
     map_prob: float
     """Probability of sampling the map; 0 without a map or for a black one."""
+    bright_prob: float
+    """Part of it that its bright texels have."""
     map_height: int
     map_width: int
     texels: wp.array2d[wp.vec3]
     """Radiance, shape [He, We]."""
     texel_prob: wp.array2d[float]
-    """Probability of each texel given the map, shape [He, We]."""
-    row_cdf: wp.array[float]
-    """Shape [He + 1]."""
+    """Probability of each texel, shape [He, We]; the sum is ``map_prob``."""
+    row_cdf: wp.array2d[float]
+    """Of the texels that are not bright and of those that are, shape [2, He + 1]."""
     column_cdf: wp.array2d[float]
-    """Shape [He, We + 1]."""
+    """Within each row, bright texels below the others, shape [2 He, We + 1]."""
+    drawn_wi: wp.array2d[wp.vec3]
+    """Directions drawn for one launch (`warpir.render.device_light.drawn`), shape [cell, cell]."""
+    drawn_radiance: wp.array2d[wp.vec3]
+    """What comes from there, shape [cell, cell]."""
+    drawn_pdf: wp.array2d[float]
+    """Their density per solid angle, shape [cell, cell]."""
+
+
+@wp.struct
+class LampArgs:
+    """Lamps near the object, all of shape [lamp]; they shine and block nothing."""
+
+    count: int
+    """0: there is none, and nothing else is read."""
+    is_rectangle: wp.array[int]
+    """1 for a rectangle, 0 for a sphere."""
+    center: wp.array[wp.vec3]
+    """Of the sphere, or the rectangle's corner [m], recentred."""
+    radius: wp.array[float]
+    """Of the sphere [m]."""
+    edge_x: wp.array[wp.vec3]
+    edge_y: wp.array[wp.vec3]
+    """The rectangle's edges from its corner, at right angles [m]; it shines toward the side of
+    their cross product."""
+    radiance: wp.array[wp.vec3]
+    """Of every point of the lamp, in all directions."""
+    brightness: wp.array[float]
+    """Luminance of `radiance`, by which lamps are picked."""
+
+
+@wp.struct
+class GlassArgs:
+    """Solid glass (`warpir.kernels.dielectric`), shape [material] each; no arrays without any."""
+
+    share: wp.array[float]
+    """Share of a material's dielectric part that is solid glass [1]; 0: none of it."""
+    ior: wp.array[float]
+    """Index of refraction."""
+    absorption: wp.array[wp.vec3]
+    """Absorption coefficient [1/m]."""
 
 
 @wp.struct

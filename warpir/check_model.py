@@ -34,14 +34,7 @@ FLAGS = {
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Run the command line.
-
-    Args:
-        argv: Arguments without the program's name; ``sys.argv`` when absent.
-
-    Returns:
-        The exit status: 0 when all is as expected, 4 when not or when there is no usable model.
-    """
+    """Run the command line, as `run_program`: 4 when not all is as expected."""
     return run_program(_run, argv)
 
 

@@ -114,7 +114,7 @@ def _insert_one(config: InsertConfig, loaders: "Loaders | None" = None) -> Inser
             from warpir.render.device import choose_device
             from warpir.report.result import render_result, write_preview
 
-            run = run.on_device(choose_device(run.config.render.device))
+            run = run.on_device(choose_device(run.config.render.device)).with_ground_coat()
         run.take_cache_notices()
         lit = find_light(run, given)
         if given is None and not run.config.is_guided:
@@ -189,14 +189,7 @@ def _write(lit: "LitRun", rendered: "RenderedResult", asked: InsertConfig) -> di
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Run the command line.
-
-    Args:
-        argv: Arguments without the program's name; ``sys.argv`` when absent.
-
-    Returns:
-        The exit status, an `ExitCode` or 128 plus the number of a signal.
-    """
+    """Run the command line, as `run_program`."""
     return run_program(_run, argv)
 
 

@@ -148,13 +148,7 @@ def fault_of(form: Format, ended: Mapping[str, Any]) -> str:
 
 
 def survey(form: Format, count: int, reader: Reader) -> Row:
-    """Damage a format's file and read it, so many times.
-
-    Args:
-        form: The format.
-        count: How many damaged files at most; small formats may have fewer.
-        reader: Reads them.
-    """
+    """Damage a format's file and read it, so many times."""
     row = Row(form.name)
     with tempfile.TemporaryDirectory(prefix="warpir-flips-") as temporary:
         folder = Path(temporary)

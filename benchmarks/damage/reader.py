@@ -131,6 +131,18 @@ def _sequence(path: Path) -> int:
         return main([*argv, "--sequence", path.name, "--reuse", "run"])
 
 
+def _insert(path: Path) -> int:
+    from warpir.insert import main
+    from warpir.io.layers import read_layers
+
+    status = main(json.loads(path.read_text()))
+    if (path.parent / "out" / "run.json").exists():
+        layers = read_layers(path.parent / "out" / "layers.exr")
+        planes = vars(layers) | {"depth": None}  # which is infinite behind the object
+        _finite(*planes.values())
+    return status
+
+
 def _regressor(path: Path) -> None:
     from warpir.lighting.regressor import load_regressor
 
@@ -164,7 +176,7 @@ READERS: dict[str, Callable[[Path], int | None]] = {
         *(("_photo", _photo), ("_envmap", _envmap), ("_mask", _mask), ("_asset", _asset)),
         *(("_camera", _camera), ("_points", _points), ("_lobes", _lobes), ("_curves", _curves)),
         *(("_materials", _materials), ("_config", _config), ("_run", _run)),
-        *(("_sequence", _sequence), ("_regressor", _regressor)),
+        *(("_sequence", _sequence), ("_regressor", _regressor), ("_insert", _insert)),
         *(("_lora", _lora), ("_checkpoint", _checkpoint)),
     )
 }

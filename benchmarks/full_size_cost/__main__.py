@@ -54,14 +54,7 @@ EXTRA_STAGES = ("class images", "encoding", "evaluation", "training")
 
 
 def measure(config: InsertConfig, model: Path, room: Path, device: wp.Device) -> dict[str, Any]:
-    """Run the whole program and then single steps of it; return all figures.
-
-    Args:
-        config: What to run.
-        model: Folder of the model.
-        room: Folder for results and caches.
-        device: Where.
-    """
+    """Run the whole program and then single steps of it; return all figures."""
     gc.collect()
     if device.is_cuda:
         torch.cuda.empty_cache()

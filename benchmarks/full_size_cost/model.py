@@ -11,10 +11,7 @@ from tests.builders.tiny_stable_diffusion import END, START, write_pipeline, wri
 def full_size_parts(device: torch.device, start: int, end: int) -> tuple[Any, Any, Any]:
     """Return UNet, autoencoder and text encoder of Stable Diffusion 2.1-base, random, in fp16.
 
-    Args:
-        device: Where they are made.
-        start: The tokenizer's id of a prompt's start.
-        end: Of its end.
+    Start and end are the tokenizer's ids of a prompt's.
     """
     from diffusers import AutoencoderKL, UNet2DConditionModel
     from transformers import CLIPTextConfig, CLIPTextModel

@@ -29,7 +29,7 @@ from warpir.core.latlong import look_up, resize_map, rotate_map
 from warpir.demo import ASSET, LIGHT
 from warpir.io.assets import load_asset
 from warpir.io.images.photos import Photo, read_envmap
-from warpir.mitsuba.render import foreground
+from warpir.mitsuba.render import Setting, foreground
 from warpir.render.composite import Quality, make_picture, photo_radiance
 from warpir.render.device import choose_device
 from warpir.render.device_scene import Placed, Receiver, Scene
@@ -126,7 +126,7 @@ def joined(parts: list[tuple[Asset, Float64Array]]) -> Asset:
 
 def photograph(asset: Asset, camera: Camera, texels: FloatArray, samples: int) -> PixelArray:
     """Return the place's linear radiance as Mitsuba path-traces it, the sky behind it."""
-    shot = foreground(asset, np.eye(4), camera, texels, DEPTH, samples, 0)
+    shot = foreground(Setting(asset, np.eye(4), camera, texels), DEPTH, samples, 0)
     sky = look_up(texels, pixel_directions(camera))
     return np.asarray(shot.mean + (1.0 - shot.coverage)[..., None] * sky)
 
@@ -245,13 +245,9 @@ def compare(
 ) -> tuple[FloatArray, list[dict[str, Any]]]:
     """Render truth and insertions of a case; return the sheet's row and the figures.
 
-    Args:
-        case: Where the car stands.
-        yard: Where it stands in.
-        texels: The light, sun where the case wants it, shape [256, 512, 3].
-        exposure: Display-linear value of a radiance of 1.
-        empty: Radiance of the place without the car, shape [H, W, 3].
-        device: Warp device.
+    The light, texels of shape [256, 512, 3], has the sun where the case wants it. ``exposure`` is
+    the display-linear value of a radiance of 1, ``empty`` the radiance of the place without the
+    car, shape [H, W, 3].
     """
     camera, car = yard.camera, yard.car
     photo = as_photo(linear_to_gamma(np.clip(exposure * empty, 0.0, 1.0)))

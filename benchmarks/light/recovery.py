@@ -35,6 +35,7 @@ from warpir.render.device_light import light_args
 from warpir.render.device_scene import Placed, Receiver, Scene
 from warpir.render.mis.integrator import MisIntegrator
 from warpir.render.renderer import Renderer
+from warpir.render.shadow.pilot import shaded_pixels
 from warpir.render.tone_curve import Knots, ToneCurve
 from warpir.scene.asset import Asset
 from warpir.scene.light import Light, angles_from_axis
@@ -119,16 +120,9 @@ def make_truth(
     samples: int,
     device: str,
 ) -> Truth:
-    """Cut the photo and render the true composite.
+    """Cut the photo and render the true composite, both of that width and height [px].
 
-    Args:
-        scene: What stands where.
-        panorama: Lat-long radiance, shape [He, We, 3].
-        asset: The object.
-        width: Photo width [px].
-        height: Photo height [px].
-        samples: Camera samples per pixel of the truth.
-        device: Warp device.
+    The panorama is lat-long radiance, shape [He, We, 3].
     """
     camera = crop_camera(width, height, 45.0, scene.azimuth, -8.0, scene.camera_height)
     display, exposure = expose(crop_radiance(panorama, camera))
@@ -161,7 +155,7 @@ def reference(
     renderer = frame.renderer
     args = light_args(Light(texels=texels), renderer.device)
     objects = renderer.gbuffer(99).object_pixels
-    proxies = renderer.shaded_pixels(args, 99)
+    proxies = shaded_pixels(renderer, args, 99)
     mask = renderer.foreground(args, objects, 64, 1, 1, 99).mask
     mis = MisIntegrator(renderer, objects, proxies, samples, 2, frame.depth)
     light = torch.from_numpy(texels)

@@ -23,39 +23,30 @@ from benchmarks.measure import flags, report
 from benchmarks.presets import PRESETS, ScenePreset
 from benchmarks.referee import ours
 from benchmarks.referee.sheet import compare_images, write_sheet
-from warpir.core.arrays import AnyFloatArray, Float64Array, FloatArray
+from warpir.core.arrays import AnyFloatArray, Float64Array
 from warpir.core.latlong import map_directions
 from warpir.io.assets import load_asset
 from warpir.lighting.fit import fit_lobes
-from warpir.mitsuba.render import Ratio, build, foreground, passes, shadow_ratio
+from warpir.mitsuba.render import Ratio, Setting, build, foreground, passes, shadow_ratio
 from warpir.render.device import choose_device
 from warpir.render.mis.integrator import MisIntegrator
 from warpir.render.renderer import Renderer
-from warpir.scene.asset import Asset
-from warpir.scene.camera import Camera
 
 
 def foreground_gradient(
-    asset: Asset,
-    matrix: Float64Array,
-    camera: Camera,
-    texels: FloatArray,
-    depth: int,
-    spp: int,
-    seed: int,
-    d_image: Float64Array,
+    setting: Setting, depth: int, spp: int, seed: int, d_image: Float64Array
 ) -> Float64Array:
     """Gradient of ``sum(mean * d_image)`` with respect to the light, by path replay.
 
     ``d_image`` is the loss gradient of ``Foreground.mean``, shape [H, W, 3]; all other arguments
     are those of `warpir.mitsuba.render.foreground`. Returns ``d_texels``, shape [He, We, 3].
     """
-    setup = build(asset, matrix, camera, texels, depth)
+    setup = build(*setting, depth)
     parameters = mi.traverse(setup.scene)
     dr.enable_grad(parameters["light.texels"])
     parameters.update()
-    d_texels = np.zeros(texels.shape)
-    for pass_seed, pass_spp in passes(camera, spp, seed):
+    d_texels = np.zeros(setting.texels.shape)
+    for pass_seed, pass_spp in passes(setting.camera, spp, seed):
         dr.set_grad(parameters["light.texels"], 0.0)
         setup.integrator.render_backward(
             setup.scene,
@@ -84,16 +75,10 @@ def comparable(image: Ratio, seen: Float64Array, floor: float = 1e-4) -> Ratio:
 
 
 def own_gradient(
-    renderer: Renderer,
-    camera: Camera,
-    texels: FloatArray,
-    depth: int,
-    spp: int,
-    seed: int,
-    d_image: Float64Array,
+    renderer: Renderer, setting: Setting, depth: int, spp: int, seed: int, d_image: Float64Array
 ) -> Float64Array:
     """`foreground_gradient` by our `mis`, in runs of 64 samples."""
-    pixels = renderer.candidate_pixels(camera)
+    texels, pixels = setting.texels, renderer.candidate_pixels(setting.camera)
     mis = MisIntegrator(renderer, pixels, np.zeros(0, np.int32), spp=64, rays=1, depth=depth)
     weight = torch.tensor(d_image.reshape(-1, 3)[pixels], dtype=torch.float32)
     total = np.zeros(texels.shape)
@@ -139,7 +124,7 @@ def gradient_line(
     camera = preset.camera()
     row, column = np.mgrid[0 : camera.height, 0 : camera.width] / camera.height
     d_image = np.stack([0.5 + row, 0.5 + column, 1.5 - row], axis=-1)
-    setting = asset, preset.matrix(asset), camera
+    setting = Setting(asset, preset.matrix(asset), camera, texels.detach().numpy())
 
     def to_lobes(d_texels: AnyFloatArray) -> list[Float64Array]:
         grads = torch.autograd.grad(
@@ -147,18 +132,14 @@ def gradient_line(
         )
         return [g.double().numpy() for g in grads]
 
-    fixed, half = texels.detach().numpy(), spp // 2
+    half = spp // 2
     start = time.perf_counter()
     theirs = [
-        to_lobes(foreground_gradient(*setting, fixed, depth, half, seed + k, d_image))
-        for k in range(2)
+        to_lobes(foreground_gradient(setting, depth, half, seed + k, d_image)) for k in range(2)
     ]
     middle = time.perf_counter()
-    renderer = ours.renderer(*setting, device)
-    own = [
-        to_lobes(own_gradient(renderer, camera, fixed, depth, half, k + 1, d_image))
-        for k in range(2)
-    ]
+    renderer = ours.renderer(setting, device)
+    own = [to_lobes(own_gradient(renderer, setting, depth, half, k + 1, d_image)) for k in range(2)]
     end = time.perf_counter()
     return {
         "scene": preset.name,
@@ -179,13 +160,14 @@ def picture_lines(
 ) -> Iterator[dict[str, Any]]:
     """Compare foregrounds and shadow ratio of a scene; write a sheet of each."""
     asset = load_asset(options.assets / preset.asset)
-    setting = asset, preset.matrix(asset), preset.camera(), preset.texels(options.assets)
+    texels = preset.texels(options.assets)
+    setting = Setting(asset, preset.matrix(asset), preset.camera(), texels)
     spp, seed, size = options.spp, options.seed, [preset.width, preset.height]
     for depth in options.depths:
         start = time.perf_counter()
-        reference = foreground(*setting, depth, spp, seed)
+        reference = foreground(setting, depth, spp, seed)
         middle = time.perf_counter()
-        candidate = ours.foreground(*setting, depth, spp, seed + 1, device)
+        candidate = ours.foreground(setting, depth, spp, seed + 1, device)
         end = time.perf_counter()
         yield {
             "scene": preset.name,
@@ -199,8 +181,8 @@ def picture_lines(
         }
         write_sheet(options.output / f"{preset.name}_d{depth}.png", candidate, reference)
     for bounce in (0, *options.bounces):
-        ratio = shadow_ratio(*setting, spp, seed, bounce_depth=bounce)
-        own = ours.shadow_ratio(*setting, spp, seed + 1, device, bounce)
+        ratio = shadow_ratio(setting, spp, seed, bounce_depth=bounce)
+        own = ours.shadow_ratio(setting, spp, seed + 1, device, bounce)
         seen = ratio.coverage
         ratio, own = comparable(ratio, seen), comparable(own, seen)
         yield {

@@ -20,6 +20,7 @@ import mitsuba as mi
 from warpir.mitsuba import render as mitsuba_render
 from warpir.mitsuba.light import LatlongEmitter
 from warpir.mitsuba.material import GltfBSDF, Image
+from warpir.mitsuba.render import Setting
 from warpir.scene.asset import Asset, Material, Primitive, Texture, TextureSlot
 from warpir.scene.camera import Camera
 
@@ -182,13 +183,15 @@ def check_material(rng: np.random.Generator) -> None:
 
 
 def check_layers(rng: np.random.Generator) -> None:
-    """Sample coat, cloth and glass with their density; its energy by two ways of drawing."""
+    """Sample coat, cloth, anisotropy, film and glass with their density; energy by two draws."""
     count = 1_000_000
     base = Material(base_color=(0.8, 0.5, 0.2), metallic=0.3, roughness=0.6)
     coat = replace(base, clearcoat=0.9, clearcoat_roughness=0.3)
     for name, material in (
         ("coat", replace(coat, clearcoat_normal_texture=TextureSlot(0))),
         ("cloth", replace(base, sheen_color=(0.9, 0.4, 0.2), sheen_roughness=0.5)),
+        ("brushed", replace(base, anisotropy=0.7, anisotropy_texture=TextureSlot(0))),
+        ("film", replace(base, iridescence=0.9, iridescence_thickness=(100.0, 500.0))),
         ("glass", replace(base, transmission=0.8, ior=1.7, specular_color=(1.0, 0.5, 2.0))),
     ):
         bsdf = on_triangle(material)
@@ -238,7 +241,7 @@ def check_energy() -> None:
     cases = ((0.2, 0.0), (0.7, 0.0), (1.0, 1.0), (0.0, 1.0))
     for seed, (roughness, metallic) in enumerate(cases):
         asset = sphere(Material(metallic=metallic, roughness=roughness), rings=256)
-        found = mitsuba_render.foreground(asset, np.eye(4), camera, texels, 1, 512, seed)
+        found = mitsuba_render.foreground(Setting(asset, np.eye(4), camera, texels), 1, 512, seed)
         # Angle at the centre of each pixel well inside the disc; E is smooth there
         x = (columns + 0.5 - camera.cx) / camera.fx
         y = (rows + 0.5 - camera.cy) / camera.fy
@@ -312,8 +315,9 @@ def check_stock_integrators(rng: np.random.Generator) -> None:
     asset = replace(ball, primitives=(part, other))
     camera = view(7.0, width=24, height=16, fov=35.0)
     for depth in (1, 4):
-        found = mitsuba_render.foreground(asset, np.eye(4), camera, texels, depth, 1024, 5)
-        setup = mitsuba_render.build(asset, np.eye(4), camera, texels, depth)
+        setting = Setting(asset, np.eye(4), camera, texels)
+        found = mitsuba_render.foreground(setting, depth, 1024, 5)
+        setup = mitsuba_render.build(*setting, depth)
         for name in ("path", "prb"):
             stock = mi.load_dict(
                 {"type": name, "max_depth": depth + 1, "rr_depth": 1000, "hide_emitters": True}
@@ -344,9 +348,10 @@ def check_stock_integrators(rng: np.random.Generator) -> None:
 def check_gradient(asset: Asset, camera: Camera, rng: np.random.Generator, depth: int) -> None:
     """Satisfy the adjoint identity and agree with Mitsuba's `prb` up to both noises."""
     texels = rng.exponential(size=(8, 16, 3)).astype(np.float32)
-    found = mitsuba_render.foreground(asset, np.eye(4), camera, texels, depth, 1024, 5)
+    setting = Setting(asset, np.eye(4), camera, texels)
+    found = mitsuba_render.foreground(setting, depth, 1024, 5)
     d_image = rng.normal(size=found.mean.shape) + 1.0
-    setup = mitsuba_render.build(asset, np.eye(4), camera, texels, depth)
+    setup = mitsuba_render.build(*setting, depth)
     parameters = mi.traverse(setup.scene)
     dr.enable_grad(parameters["light.texels"])
     parameters.update()
@@ -355,9 +360,7 @@ def check_gradient(asset: Asset, camera: Camera, rng: np.random.Generator, depth
     )
     ours, theirs = [], []
     for seed in range(6):
-        ours.append(
-            referee.foreground_gradient(asset, np.eye(4), camera, texels, depth, 256, seed, d_image)
-        )
+        ours.append(referee.foreground_gradient(setting, depth, 256, seed, d_image))
         dr.set_grad(parameters["light.texels"], 0.0)
         stock.render_backward(
             setup.scene,
@@ -397,9 +400,8 @@ def check_coverage() -> None:
         ("double-sided from behind", Material(double_sided=True), 180.0, 1.0),
     ):
         asset = square(material, 2.0, 0.0, up=True)
-        found = mitsuba_render.foreground(
-            asset, np.eye(4), view(6.0, fov=8.0, turn=turn), texels, 2, 256, 1
-        )
+        setting = Setting(asset, np.eye(4), view(6.0, fov=8.0, turn=turn), texels)
+        found = mitsuba_render.foreground(setting, 2, 256, 1)
         report(
             f"coverage: {name}",
             found.coverage.mean(),
@@ -408,9 +410,8 @@ def check_coverage() -> None:
         )
     # Emission is seen by the camera and by a bounce; the mask hides the rest
     glow = Material(base_color=(0.0,) * 3, roughness=1.0, emission=(2.0, 1.0, 0.5))
-    found = mitsuba_render.foreground(
-        square(glow, 2.0, 0.0, up=True), np.eye(4), camera, np.zeros_like(texels), 1, 16, 1
-    )
+    lit = Setting(square(glow, 2.0, 0.0, up=True), np.eye(4), camera, np.zeros_like(texels))
+    found = mitsuba_render.foreground(lit, 1, 16, 1)
     report("emission: seen by the camera, green", found.mean[..., 1].mean(), 1.0, 1e-6)
 
 
@@ -435,14 +436,14 @@ def check_shadow() -> None:
         ("opaque, single-sided from below", Material(), 1.0 - factor),
         ("blend, alpha 0.5", Material(alpha=0.5, alpha_mode="BLEND"), 1.0 - 0.5 * factor),
     ):
-        found = mitsuba_render.shadow(
-            square(material, 2.0 * half, height), np.eye(4), camera, texels, 4096, 2
-        )
+        setting = Setting(square(material, 2.0 * half, height), np.eye(4), camera, texels)
+        found = mitsuba_render.shadow(setting, 4096, 2)
         error = float(np.sqrt(found.lit_variance[..., 0].sum())) / 64.0
         report(f"shadow: unoccluded white plane, {name}", found.unoccluded.mean(), 1.0, 1e-3)
         report(f"shadow: square above the plane, {name}", found.lit[..., 0].mean(), expected, error)
         report("shadow: share of samples that see the plane", found.seen.mean(), 1.0, 1e-9)
-    far = mitsuba_render.shadow(square(Material(), 1e-3, 40.0), np.eye(4), camera, texels, 64, 2)
+    tiny = Setting(square(Material(), 1e-3, 40.0), np.eye(4), camera, texels)
+    far = mitsuba_render.shadow(tiny, 64, 2)
     report(
         "shadow: ratio is exactly 1 far from the object",
         np.abs(far.lit / far.unoccluded - 1.0).max(),

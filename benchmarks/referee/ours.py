@@ -4,12 +4,11 @@ from typing import NamedTuple
 
 import numpy as np
 
-from warpir.core.arrays import Float64Array, FloatArray
+from warpir.core.arrays import Float64Array
+from warpir.mitsuba.render import Setting
 from warpir.render.device_light import light_args
 from warpir.render.device_scene import Placed, Receiver, Scene
 from warpir.render.renderer import Renderer
-from warpir.scene.asset import Asset
-from warpir.scene.camera import Camera
 from warpir.scene.light import Light
 
 SEED_COUNT = 32
@@ -27,16 +26,10 @@ class Estimate(NamedTuple):
     """Share of samples that see the object, or 1 where the plane is seen; shape [H, W]."""
 
 
-def renderer(
-    asset: Asset,
-    matrix: Float64Array,
-    camera: Camera,
-    device: str = "cpu",
-    bounce_depth: int = 0,
-) -> Renderer:
+def renderer(setting: Setting, device: str = "cpu", bounce_depth: int = 0) -> Renderer:
     """Set an object over the plane ``y = 0``, which it lights with a ``bounce_depth``."""
     proxy = Receiver(np.array([0.0, 1.0, 0.0]), 0.0)
-    scene = Scene([Placed(asset, matrix)], camera, proxy, device)
+    scene = Scene([Placed(setting.asset, setting.matrix)], setting.camera, proxy, device)
     return Renderer(scene, bounce_depth=bounce_depth)
 
 
@@ -45,19 +38,10 @@ def _moments(runs: list[Float64Array]) -> tuple[Float64Array, Float64Array]:
     return stack.mean(axis=0), stack.var(axis=0, ddof=1) / len(runs)
 
 
-def foreground(
-    asset: Asset,
-    matrix: Float64Array,
-    camera: Camera,
-    texels: FloatArray,
-    depth: int,
-    spp: int,
-    seed: int,
-    device: str = "cpu",
-) -> Estimate:
+def foreground(setting: Setting, depth: int, spp: int, seed: int, device: str = "cpu") -> Estimate:
     """Render the object alone; arguments are those of `warpir.mitsuba.render.foreground`."""
-    render = renderer(asset, matrix, camera, device)
-    light = light_args(Light(texels=texels), render.device)
+    render, camera = renderer(setting, device), setting.camera
+    light = light_args(Light(texels=setting.texels), render.device)
     pixels = render.candidate_pixels(camera)
     shape = (camera.height * camera.width,)
     runs, covers = [], []
@@ -75,18 +59,11 @@ def foreground(
 
 
 def shadow_ratio(
-    asset: Asset,
-    matrix: Float64Array,
-    camera: Camera,
-    texels: FloatArray,
-    spp: int,
-    seed: int,
-    device: str = "cpu",
-    bounce_depth: int = 0,
+    setting: Setting, spp: int, seed: int, device: str = "cpu", bounce_depth: int = 0
 ) -> Estimate:
     """Render the shadow ratio; each run is long, since the quotient is biased by 1 / samples."""
-    render = renderer(asset, matrix, camera, device, bounce_depth)
-    light = light_args(Light(texels=texels), render.device)
+    render, camera = renderer(setting, device, bounce_depth), setting.camera
+    light = light_args(Light(texels=setting.texels), render.device)
     pixels = np.arange(camera.height * camera.width, dtype=np.int32)
     may_see = np.ones(len(pixels), np.int32)
     lit, unoccluded = [], []

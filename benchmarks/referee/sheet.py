@@ -29,7 +29,7 @@ def compare_images(candidate: Any, reference: Any, block: int = 8) -> dict[str, 
     variance = candidate.variance + reference.variance
     noisy = variance > 0.0
     z = difference[noisy] / np.sqrt(variance[noisy])
-    total, total_variance = _block_sums(difference, block), _block_sums(variance, block)
+    total, total_variance = block_sums(difference, block), block_sums(variance, block)
     used = total_variance > 0.0
     block_z = total[used] / np.sqrt(total_variance[used])
     power = reference.mean.sum()
@@ -104,7 +104,7 @@ def _display(radiance: Float64Array) -> Float64Array:
     return np.clip(x * (1.0 + x / 16.0) / (1.0 + x) * 1.5, 0.0, 1.0) ** (1.0 / 2.2)
 
 
-def _block_sums(image: Float64Array, block: int) -> Float64Array:
+def block_sums(image: Float64Array, block: int) -> Float64Array:
     """Sums over whole blocks, shape [blocks down, blocks across, 3]."""
     rows, columns = image.shape[0] // block, image.shape[1] // block
     cut = image[: rows * block, : columns * block]

@@ -12,6 +12,8 @@ from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
 from typing import Any
 
+from benchmarks.speed.cost import cost_text, kept_runs
+
 NAME = "speed_against_error"
 STYLES = {
     "mitsuba": ("Mitsuba 3", "tab:blue", "o"),
@@ -256,6 +258,8 @@ def write_documents(docs: Path) -> None:
     results.sort(key=lambda result: result["conditions"]["threads"] is None)
     text = [INTRODUCTION, f"![Error over time of one step]({NAME}.png)"]
     text += [device_text(result) for result in results]
+    costs = kept_runs(docs / "speed" / "cost")
+    text += [cost_text(costs)] if costs else []
     (docs / f"{NAME}.md").write_text("\n\n".join(text) + "\n", encoding="utf-8")
     plot(results, docs / f"{NAME}.png")
 

@@ -10,14 +10,15 @@ from pathlib import Path
 
 import numpy as np
 
-from benchmarks.referee import ours
 from warpir.core.arrays import Float64Array, FloatArray, IntArray
 from warpir.core.latlong import resize_map
 from warpir.io.assets import load_asset
 from warpir.io.images.photos import read_envmap
 from warpir.lighting.fit import fit_lobes
 from warpir.render.device_light import light_args
+from warpir.render.device_scene import Placed, Receiver, Scene
 from warpir.render.renderer import Renderer
+from warpir.render.shadow.pilot import shaded_pixels
 from warpir.scene.asset import Asset, Material, Primitive
 from warpir.scene.camera import Camera, camera_from_fov
 from warpir.scene.light import Light, Lobes, axis_from_angles, rasterize_lobes
@@ -151,7 +152,7 @@ def make_scene(
         lobes, depth = sun_and_sky(), 3
         place, turn, size = (-0.3, 0.0, -5.5), 0.0, 1.5
     placement = place_asset(*asset.bounds(), camera, None, place=place, rotate_y=turn, size=size)
-    renderer = ours.renderer(asset, placement.asset_to_world, camera, device)
+    renderer = on_the_ground(asset, placement.asset_to_world, camera, device)
     renderer.threads = threads
     object_pixels = renderer.gbuffer(seed=1, spp=COVERAGE_SAMPLES).object_pixels
     light = light_args(Light(lobes), renderer.device)
@@ -159,7 +160,7 @@ def make_scene(
     hidden[object_pixels] = renderer.foreground(
         light, object_pixels, COVERAGE_SAMPLES, 1, 1, seed=2
     ).mask
-    shaded = renderer.shaded_pixels(light, seed=3)
+    shaded = shaded_pixels(renderer, light, seed=3)
     receiver_pixels = shaded[hidden[shaded] <= 0.5]
     weight = loss_weights(width, height)
     return SpeedScene(
@@ -176,6 +177,15 @@ def make_scene(
         weight[0].reshape(-1, 3)[object_pixels],
         weight[1].reshape(-1, 3)[receiver_pixels],
     )
+
+
+def on_the_ground(
+    asset: Asset, asset_to_world: Float64Array, camera: Camera, device: str, bounce_depth: int = 0
+) -> Renderer:
+    """Set an asset over the plane ``y = 0``."""
+    receiver = Receiver(np.array([0.0, 1.0, 0.0]), 0.0)
+    scene = Scene([Placed(asset, asset_to_world)], camera, receiver, device)
+    return Renderer(scene, bounce_depth=bounce_depth)
 
 
 def loss_weights(width: int, height: int, seed: int = 11) -> FloatArray:

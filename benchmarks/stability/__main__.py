@@ -17,7 +17,7 @@ from typing import Any
 import warp as wp
 
 from benchmarks.measure import context, flags, report
-from benchmarks.stability import brdf, geometry, light, lobes
+from benchmarks.stability import brdf, geometry, light, lobes, near
 from benchmarks.stability.case import Case
 from warpir.render.device import choose_device
 
@@ -28,12 +28,15 @@ TITLES = {
     "light": "Maps and shadow ratio",
     "tone": "Tone and encoding",
     "fusion": "Fusion of two lights",
+    "lamps": "Lamps near the object",
+    "coat": "Glossy ground",
+    "glass": "Solid glass",
 }
 
 
 def cases() -> list[Case]:
     """Return all cases, in the table's order."""
-    groups = (lobes, brdf, geometry, light)
+    groups = (lobes, brdf, geometry, light, near)
     return [case for group in groups for case in group.cases()]
 
 

@@ -9,6 +9,7 @@ from tests.builders.shapes import all_pixels, camera, constant, ground, placed, 
 from warpir.render.device_light import light_args
 from warpir.render.device_scene import Scene
 from warpir.render.renderer import Renderer
+from warpir.render.shadow.pilot import shaded_pixels
 from warpir.scene.asset import Material, Primitive
 
 CARD_VIEW = camera(16, 16, 40.0)
@@ -114,7 +115,7 @@ def one_pixel(device: str) -> Measured:
     gbuffer = renderer.gbuffer(0, 64)
     args = light_args(constant(), renderer.device)
     out = renderer.foreground(args, all_pixels(view), 65536, 1, 1, 0)
-    shaded = renderer.shaded_pixels(args, 0)
+    shaded = shaded_pixels(renderer, args, 0)
     # Mean albedo over the card's directions, Gauss-Legendre.
     x, weight_x = o.gauss_legendre([-0.4, 0.0], 12)
     y, weight_y = o.gauss_legendre([-0.4, 0.4], 12)

@@ -21,9 +21,9 @@ from benchmarks.stability.case import (
 from tests import oracles as o
 from tests.builders.shapes import all_pixels, camera, ground
 from warpir.core.latlong import resize_map
-from warpir.kernels.sampling import light_eval, light_sample
+from warpir.kernels.sampling import light_eval, proposal_sample
 from warpir.kernels.types import LightArgs
-from warpir.render.device_light import light_args
+from warpir.render.device_light import BRIGHT, light_args
 from warpir.render.device_scene import Scene
 from warpir.render.mis.integrator import MisIntegrator
 from warpir.render.renderer import Renderer
@@ -31,12 +31,10 @@ from warpir.scene.light import Light, summarize
 
 
 @wp.kernel(enable_backward=False)
-def sample_kernel(
-    light: LightArgs, u: wp.array[wp.vec2], pick: wp.array[float], wi: wp.array[wp.vec3]
-):
+def sample_kernel(light: LightArgs, u: wp.array[wp.vec2], wi: wp.array[wp.vec3]):
     """Draw from the light's proposal."""
     i = wp.tid()
-    wi[i] = light_sample(light, u[i], pick[i])
+    wi[i] = proposal_sample(light, u[i])
 
 
 @wp.kernel(enable_backward=False)
@@ -72,8 +70,7 @@ def evaluate(device: str, light: LightArgs, d: np.ndarray) -> tuple[Float64Array
 def draw(device: str, light: LightArgs, count: int = 20000) -> Float64Array:
     """Return directions that the light's proposal draws."""
     rng = np.random.default_rng(17)
-    u, pick = rng.random((count, 2), dtype=np.float32), rng.random(count, dtype=np.float32)
-    inputs = [light, upload(u, wp.vec2, device), upload(pick, float, device)]
+    inputs = [light, upload(rng.random((count, 2), dtype=np.float32), wp.vec2, device)]
     (wi,) = launch(sample_kernel, count, inputs, wp.vec3, device=device)
     return wi
 
@@ -112,16 +109,21 @@ def lookup(device: str, height: int, contrast: float) -> Measured:
     return Measured(float(error), finite(radiance, pdf))
 
 
-def importance(texels: np.ndarray) -> tuple[np.ndarray, float]:
-    """Return luminance times solid angle and its sum, row by row in float64."""
+def importance(texels: np.ndarray, bright_prob: float) -> np.ndarray:
+    """Return the probability of each texel, row by row in float64.
+
+    Luminance times solid angle, of the bright texels and of the others each, which have the
+    probabilities ``bright_prob`` and what is left.
+    """
     omega = o.texel_solid_angle(*texels.shape[:2])
-    weight = np.empty(texels.shape[:2], np.float32)
-    total = 0.0
-    for i, row in enumerate(texels):
-        exact = o.luminance(row) * omega[i]
-        weight[i] = exact
-        total += float(exact.sum())
-    return weight, total
+    levels = np.stack([o.luminance(row).astype(np.float32) for row in texels])
+    mean = sum(float(row.sum(dtype=np.float64)) * w for row, w in zip(levels, omega, strict=True))
+    is_bright = levels > BRIGHT * mean / (4.0 * np.pi)
+    weight = (levels * omega[:, None]).astype(np.float32)
+    total = [float(weight[part].sum(dtype=np.float64)) for part in (is_bright, ~is_bright)]
+    weight[is_bright] *= bright_prob / max(total[0], 1e-300)
+    weight[~is_bright] *= (1.0 - bright_prob) / total[1]
+    return weight
 
 
 def density(device: str, height: int, contrast: float) -> Measured:
@@ -130,9 +132,9 @@ def density(device: str, height: int, contrast: float) -> Measured:
     light = light_args(Light(texels=texels), wp.get_device(device))
     d = draw(device, light).astype(np.float32)
     radiance, pdf = evaluate(device, light, d)
-    weight, total = importance(texels)
+    weight = importance(texels, light.bright_prob)
     sine = np.hypot(d[:, 0].astype(np.float64), d[:, 2])
-    share = bilinear(weight, d) / total * weight.size
+    share = bilinear(weight, d) * weight.size
     truth = share / (2.0 * np.pi**2 * sine)
     # At the poles themselves the density of (u, v) over solid angle has no limit.
     away = sine > 2.0 * np.pi / height

@@ -25,11 +25,7 @@ PLAIN_STEPS = 2
 
 
 class Graphs:
-    """Recorded functions of one device.
-
-    Args:
-        device: A CUDA device.
-    """
+    """Recorded functions of one device."""
 
     def __init__(self, device: torch.device) -> None:
         self.device = device

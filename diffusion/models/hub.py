@@ -37,12 +37,10 @@ def hub_offline(offline: bool) -> Iterator[None]:
 
 
 def find_model(model: str | None, allow_download: bool, allow_pickle: bool = False) -> Path:
-    """Return the folder of a model: itself, or a hub id's in the local cache.
+    """Return the folder of a model: itself, or a hub id's, ``owner/name``, in the local cache.
 
-    Args:
-        model: A folder, or an id such as ``owner/name``.
-        allow_download: Fetch a hub id that is not in the cache; only the files that are read.
-        allow_pickle: Where a part has no other weights, those are among them.
+    With ``allow_download`` a hub id that is not in the cache is fetched, only the files that are
+    read; with ``allow_pickle`` weights are among them where a part has no other.
 
     Raises:
         ModelError: It is not there, or could not be downloaded.

@@ -7,13 +7,13 @@ configurations; every fault is one sentence that names the file. torch is not lo
 
 from __future__ import annotations
 
-import hashlib
 import os
 from collections.abc import Collection
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from warpir.core.atomic import sha256_of
 from warpir.core.errors import InputError
 from warpir.core.limits import LIMITS
 from warpir.core.strict_json import read_json_object
@@ -126,9 +126,7 @@ class ModelFolder:
 
     def file_hash(self, file: Path) -> tuple[str, str]:
         """Return a file's name within the folder and its sha256."""
-        with file.open("rb") as stream:
-            digest = hashlib.file_digest(stream, "sha256").hexdigest()
-        return file.relative_to(self.path).as_posix(), digest
+        return file.relative_to(self.path).as_posix(), sha256_of(file)
 
 
 def choose_weights(
@@ -372,12 +370,7 @@ def _check_scheduler(path: Path, config: dict[str, Any]) -> None:
 
 
 def _check_tokenizer(folder: Path, vocabulary: int) -> None:
-    """Check what describes the tokenizer: JSON and text, and no more words than the text encoder.
-
-    Args:
-        folder: The tokenizer's.
-        vocabulary: Words that the text encoder has embeddings of.
-    """
+    """Check what describes the tokenizer: JSON and text, and no more words than the vocabulary."""
     words: set[str] = set()
     for path in sorted(folder.glob("*.json")):
         content = read_json(path)

@@ -158,22 +158,14 @@ class NetworkPrior(ABC):
         steps: int,
         scale: float,
         adapter: str | None = None,
-        negative_prompt: str = "",
         batch: int = 8,
     ) -> Tensor:
         """Return pictures of the prompts, in [0, 1], shape [prompt, 3, resolution, resolution].
 
         DPM-Solver++ of second order (arXiv 2211.01095). A picture depends on its own prompt and
-        seed, not on those made with it.
-
-        Args:
-            prompts: One per picture.
-            seeds: One per picture, of its first noise.
-            steps: Denoising steps.
-            scale: Of classifier-free guidance, ``null + scale (prompt - null)``; 1: none.
-            adapter: Name of the adapter, or None for the base weights.
-            negative_prompt: What stands for null.
-            batch: Pictures made at once.
+        seed, that of its first noise, not on those made with it, ``batch`` at once. ``scale`` is
+        that of classifier-free guidance over the empty prompt; 1: none. Without an adapter the base
+        weights are used.
 
         Raises:
             ModelError: The adapter is unknown, or the text encoder was freed.
@@ -182,7 +174,7 @@ class NetworkPrior(ABC):
         if len(prompts) != len(seeds):
             raise ValueError(f"seeds: {len(seeds)} (expected {len(prompts)}, one per prompt)")
         self._check_adapters([adapter])
-        wanted, null = self.embed(prompts), self.embed([negative_prompt])
+        wanted, null = self.embed(prompts), self.embed([""])
         images: list[Tensor] = []
         for start in range(0, len(prompts), batch):
 
@@ -209,30 +201,20 @@ class NetworkPrior(ABC):
         steps: int,
         scale: float,
         adapter: str | None = None,
-        negative_prompt: str = "",
     ) -> Tensor:
         """Return a picture that was noised and denoised again (SDEdit, arXiv 2108.01073).
 
-        DDIM, which is DPM-Solver++ of first order, with all its steps below ``strength``.
+        DDIM, which is DPM-Solver++ of first order, with all its steps below ``strength``, the time
+        in [0, 1] that it is noised to; 0: only through the VAE and back. Prompt, scale and adapter
+        are as of `sample`.
 
-        Args:
-            image: Display-encoded, in [0, 1], shape [1, 3, resolution, resolution].
-            prompt: What it is to become.
-            seed: Of the noise.
-            strength: Time in [0, 1] that it is noised to; 0: only through the VAE and back.
-            steps: Denoising steps.
-            scale: Of classifier-free guidance, ``null + scale (prompt - null)``; 1: none.
-            adapter: Name of the adapter, or None for the base weights.
-            negative_prompt: What stands for null.
-
-        Returns:
-            In [0, 1], of the image's shape.
+        Picture and edit are display-encoded, in [0, 1], shape [1, 3, resolution, resolution].
 
         Raises:
             ModelError: The adapter is unknown, or the text encoder was freed.
         """
         self._check_adapters([adapter])
-        wanted, null = self.embed([prompt]), self.embed([negative_prompt])
+        wanted, null = self.embed([prompt]), self.embed([""])
         with torch.no_grad():
             latents = self.encode(image)
         t = torch.tensor([min(strength, TIME_LIMIT)])
@@ -409,13 +391,8 @@ class NetworkPrior(ABC):
     ) -> Tensor:
         """Denoise latents through the solver's timesteps, with classifier-free guidance.
 
-        Args:
-            solver: Its timesteps are set.
-            latents: At the first timestep, shape [B, 4, h, w].
-            wanted: Embeddings, shape [B, token, channel].
-            null: Embedding of the null prompt, shape [1, token, channel].
-            scale: Of the guidance.
-            adapter: For all of them.
+        Latents, shape [B, 4, h, w], are those of the first timestep. Embeddings are what is wanted,
+        shape [B, token, channel], and that of the null prompt, shape [1, token, channel].
         """
         count = len(latents)
         embeddings = wanted if scale == 1.0 else torch.cat([wanted, null.expand_as(wanted)])

@@ -255,10 +255,8 @@ def load_stable_diffusion(
 ) -> StableDiffusion:
     """Load a model from a folder, or from a hub id in the local cache.
 
-    Args:
-        settings: Which model, and how it is computed; on the CPU always in fp32.
-        device: Where UNet, VAE and text encoder go.
-        in_chunks: How larger batches are computed.
+    UNet, VAE and text encoder go to ``device``; on the CPU all is computed in fp32. ``in_chunks``
+    says how larger batches are computed.
 
     Raises:
         ModelError: The model is not there, is another one or is damaged; one sentence says how.

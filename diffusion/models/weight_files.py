@@ -153,17 +153,7 @@ def check_regressor(path: Path | None) -> WeightFile:
 
 
 def check_calibrator(path: Path | None) -> WeightFile:
-    """Check the weights of the network that estimates cameras.
-
-    Args:
-        path: The file; None: the one that is part of the package.
-
-    Returns:
-        Its header; ``config`` in it is a JSON object whose numbers are within their ranges.
-
-    Raises:
-        ModelError: Not there, damaged, or something else.
-    """
+    """Check the weights of the network that estimates cameras; see `check_regressor`."""
     file = _check_photo_network(path, "calibrator", CALIBRATOR_FORMAT, CALIBRATOR_SIZES)
     spread = _value(file, "spread")
     if spread is None or spread.ndim != 1 or not (spread > 0.0).all():
@@ -174,11 +164,7 @@ def check_calibrator(path: Path | None) -> WeightFile:
 def _check_photo_network(path: Path | None, name: str, format_: str, sizes: Sizes) -> WeightFile:
     """Check the header and the values of one of our networks that see a photo.
 
-    Args:
-        path: The file; None: the one that is part of the package.
-        name: Of that one, without its suffix.
-        format_: What the header's ``format`` must be.
-        sizes: What its ``config`` may hold.
+    Without a path it is the one of that name that is part of the package.
 
     Raises:
         ModelError: Not there, damaged, or something else.
@@ -274,7 +260,7 @@ def check_lora(path: Path, embedding_width: int | None) -> None:
 
 def beside_lora(path: Path) -> Path | None:
     """Return peft's configuration where it lies beside a LoRA that peft wrote: its alpha counts."""
-    beside = path.with_name("adapter_config.json")
+    beside = path.parent / "adapter_config.json"  # "/" and "." have no name to replace
     return beside if path.name == "adapter_model.safetensors" and beside.is_file() else None
 
 
@@ -300,12 +286,7 @@ def values_hash(values: Mapping[str, NDArray[Any]], about: str = "") -> str:
 
 
 def _check_written(file: WeightFile, expected: object, about: str = "") -> None:
-    """Check that the values of one of our networks are finite numbers, and as they were written.
-
-    Args:
-        file: The file.
-        expected: Their `values_hash`, by the header.
-        about: As of `values_hash`.
+    """Check that the values of one of our networks are finite, and have the `values_hash` expected.
 
     Raises:
         ModelError: They are not, or there are too many.

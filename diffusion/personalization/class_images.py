@@ -73,15 +73,8 @@ def make_class_images(
     """Return the class images, from disk where they are there and else from the unadapted model.
 
     Each depends on its own prompt and seed; the batch it is made in changes its last bits, so
-    batches are always the same ones, also where a stopped run goes on.
-
-    Args:
-        prior: The model.
-        prompts: Gives the noun.
-        settings: Number, sampler and batch.
-        seed: The run's seed; prompts, attributes and noise are functions of it.
-        cache: Folder that keeps the pictures, or None to keep none.
-        report: Is told "class images", the number there is, and the number wanted.
+    batches are always the same ones, also where a stopped run goes on. Prompts, attributes and
+    noise are functions of the run's seed; without a cache nothing is kept.
 
     Raises:
         NonFiniteError: A picture is not finite, in fp32 neither.
@@ -142,12 +135,7 @@ def _made(
 
 
 def _read_kept(files: Sequence[Path], images: Tensor) -> tuple[set[int], list[str]]:
-    """Fill in the pictures that are on disk; return the places of the others, and notices.
-
-    Args:
-        files: Where each picture is kept; empty: nowhere.
-        images: uint8, shape [N, 3, resolution, resolution]; changed in place.
-    """
+    """Fill in the pictures that are on disk; return the places of the others, and notices."""
     missing = set(range(len(images)))
     notices: list[str] = []
     for index, file in enumerate(files):

@@ -86,11 +86,7 @@ def _commonest(values: Iterable[float]) -> float:
 def initial_lora(prior: NetworkPrior, layers: tuple[str, ...], rank: int, seed: int) -> Lora:
     """Return a LoRA that changes nothing yet: A is Gaussian of deviation 1/rank, B is zero.
 
-    Args:
-        prior: Its UNet has the layers.
-        layers: Ends of the layers' names, such as ``to_q``.
-        rank: Rank; alpha is the same number.
-        seed: The run's seed.
+    Layers are ends of the names of the UNet's layers, such as ``to_q``; alpha is the rank.
 
     Raises:
         ModelError: The rank is below 1, or an end matches no layer.
@@ -276,13 +272,8 @@ def load_lora(prior: NetworkPrior, path: str | Path, name: str = "scene") -> Lor
 def install_lora(prior: NetworkPrior, lora: Lora, name: str, where: str = "LoRA") -> None:
     """Put a LoRA beside the UNet's weights, in place of one of the same name.
 
-    It is frozen and has the UNet's precision.
-
-    Args:
-        prior: The model; its ``adapters`` get the name.
-        lora: The LoRA.
-        name: The adapter's name.
-        where: What an error names.
+    It is frozen and has the UNet's precision. The prior's ``adapters`` get its name; an error names
+    ``where``.
 
     Raises:
         ModelError: A layer is not in the UNet, has another shape, or is missing from the LoRA.
@@ -382,16 +373,9 @@ def save_lora(
 ) -> tuple[Path, ...]:
     """Write ``lora_diffusers.safetensors`` and ``lora_kohya.safetensors``, always the same bytes.
 
-    kohya's form knows versions of Stable Diffusion alone: for another base it is not written.
-
-    Args:
-        lora: What to write; exact at any alpha.
-        folder: Where.
-        cross_attention: Width of the base model's prompt embeddings: 768 in Stable Diffusion 1,
-            1024 in 2.
-        prediction_type: Of the base model's schedule.
-        trigger: Words that call up what was learnt.
-        base: Name of the prior that it belongs to.
+    kohya's form knows versions of Stable Diffusion alone: for another base it is not written. The
+    base is told by the width of its prompts' embeddings, 768 in Stable Diffusion 1 and 1024 in 2,
+    and by what its schedule predicts; ``trigger`` are the words that call up what was learnt.
 
     Raises:
         OSError: A file cannot be written; older ones are still whole.

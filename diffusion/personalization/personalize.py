@@ -188,18 +188,10 @@ def _learn(
     resume: Mapping[str, Any] | None,
     record: Callable[[LoraTraining], Callable[[], None]] | None,
 ) -> Personalization:
-    """Train an adapter, put it to use, judge it, and keep it.
+    """Train an adapter, put it to use, judge it, and keep it where ``stored`` says, if it does.
 
-    Args:
-        training: Has not begun.
-        before: `evaluate` without the adapter.
-        class_images: What it also learns.
-        stored: Where it is kept, or None.
-        clock: Adds up the time of stages.
-        report: As of `personalize`, with its errors, and so the others.
-        on_step: Sees the training after each step.
-        resume: State to go on from.
-        record: Replaces its `update`.
+    The training has not begun; ``before`` is `evaluate` without the adapter, ``clock`` adds up the
+    time of stages. The others, and the errors, are as of `personalize`.
     """
     prior, settings, name = training.prior, training.settings, training.name
     embedding = training.embeddings[:1]
@@ -275,10 +267,8 @@ def _train(
 def photo_crops(size: tuple[int, int], settings: PersonalizeSettings, seed: int) -> list[Crop]:
     """Return the crops of the photo that are learnt: squares anywhere, of slightly varied size.
 
-    Args:
-        size: Height and width of the photo [px].
-        settings: Smallest side as a share of the shorter side.
-        seed: The run's seed.
+    The photo's size is height and width [px]; the settings have a crop's smallest side as a share
+    of the shorter.
     """
     height, width = size
     draws = torch.rand(
@@ -312,14 +302,9 @@ def evaluate(
 ) -> float:
     """Return the mean squared error of the noise on fixed draws from the photo.
 
-    Times are spread evenly, so that the few draws stand for all.
-
-    Args:
-        prior: The model, as guidance will use it.
-        crops: Latents of the photo's crops, shape [crop, C, h, w].
-        embedding: Of the photo's prompt, shape [1, token, channel].
-        seed: The run's seed.
-        adapter: Its name, or None for the base weights.
+    Times are spread evenly, so that the few draws stand for all. Crops are latents, shape
+    [crop, C, h, w], the embedding is that of the photo's prompt, shape [1, token, channel]. Without
+    an adapter the base weights are used.
 
     Raises:
         NonFiniteError: The noise is not finite.

@@ -51,17 +51,8 @@ def show_prior(
     """Return a labelled sheet of samples, shape [H, W, 3]: a row per prompt, a column per adapter.
 
     A cell has one picture per seed, side by side; the same seed starts from the same noise in every
-    cell.
-
-    Args:
-        prior: The model.
-        prompts: What is asked for.
-        adapters: Names of adapters of the prior; None is the model as it was.
-        seeds: Of the first noise.
-        steps: Denoising steps (DPM-Solver++).
-        scale: Classifier-free guidance.
-        batch: Pictures made at once.
-        report: Is told "samples", the number done and the number in all.
+    cell. The adapter None is the model as it was; ``report`` is told "samples", the number done and
+    the number in all.
 
     Raises:
         ModelError: An adapter is unknown, or the text encoder was freed.
@@ -101,16 +92,8 @@ def show_personalization(
 ) -> NDArray[np.uint8]:
     """Adapt the model to a photo with and without class images, and show what each has learnt.
 
-    Args:
-        prior: The model; it has the adapters `WITH_CLASS` and `WITHOUT_CLASS` afterwards.
-        photo: Display-encoded, in [0, 1], shape [1, 3, H, W].
-        prompts: Of the photo and the class.
-        settings: Of the training and of the samples.
-        seed: The run's seed.
-        cache: As for `personalize`: what an earlier run trained is found again.
-        shown: Prompts of the sheet's rows.
-        seeds: Of the pictures.
-        report: Is told stages, steps done and steps in all.
+    The prior has the adapters `WITH_CLASS` and `WITHOUT_CLASS` afterwards. The photo is as for
+    `personalize`, ``shown`` are the prompts of the sheet's rows.
 
     Returns:
         The sheet, shape [H, W, 3].
@@ -132,10 +115,7 @@ def contact_sheet(
 ) -> NDArray[np.uint8]:
     """Return a sheet with a row per prompt, its text on the left, and titles above the columns.
 
-    Args:
-        columns: Pictures of each column, uint8, shape [prompt, seed, 3, R, R].
-        titles: One per column.
-        prompts: One per row.
+    Pictures of a column are uint8, shape [prompt, seed, 3, R, R].
     """
     rows, seeds, _, side, _ = columns[0].shape
     font = ImageFont.load_default(LABEL_SIZE)

@@ -96,6 +96,8 @@ def show_layers(scene: Any, layers: Path) -> None:
     behind = graph.mix("MULTIPLY", 1.0, planes["plate"], planes["shadow"])
     alpha = graph.node("SeparateColor", "coverage", planes["fg"]).outputs["Alpha"]
     picture = graph.over(behind, planes["fg"], alpha)
+    if "mirror" in planes:
+        picture = graph.mix("ADD", 1.0, picture, planes["mirror"])
     if "grain" in planes:
         picture = graph.mix("ADD", 1.0, picture, planes["grain"])
     graph.show(graph.value("Gamma", "display", picture, 1.0 / GAMMA))

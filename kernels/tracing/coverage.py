@@ -2,22 +2,36 @@
 
 import warp as wp
 
-from warpir.kernels.bsdf import F0_COAT, luminance, schlick
+from warpir.kernels.bsdf import F0_COAT, luminance
+from warpir.kernels.maths.fresnel import film_fresnel, schlick
 from warpir.kernels.tracing.hit import Hit
 from warpir.kernels.tracing.texture import (
+    SLOT_ANISOTROPY,
     SLOT_BASE_COLOR,
     SLOT_CLEARCOAT,
     SLOT_CLEARCOAT_NORMAL,
     SLOT_CLEARCOAT_ROUGHNESS,
+    SLOT_IRIDESCENCE,
     SLOT_METALLIC_ROUGHNESS,
     SLOT_SHEEN_COLOR,
     SLOT_SHEEN_ROUGHNESS,
     SLOT_SPECULAR,
     SLOT_SPECULAR_COLOR,
+    SLOT_TRANSMISSION,
     sample_texture,
     slot_uv,
 )
-from warpir.kernels.types import Extensions, MaterialArgs, MeshArgs, TextureArgs
+from warpir.kernels.types import (
+    ANISOTROPY,
+    IRIDESCENCE,
+    Extensions,
+    MaterialArgs,
+    MeshArgs,
+    TextureArgs,
+)
+
+FILM_MIN = wp.constant(0.03)
+"""Below this a film fades out, as in Khronos's sample viewer [nm]."""
 
 
 @wp.func
@@ -70,8 +84,23 @@ def extensions_at(
                 e.sheen_color = wp.cw_mul(e.sheen_color, color)
             elif slot == SLOT_SHEEN_ROUGHNESS:
                 e.sheen_roughness = e.sheen_roughness * code[3]
-            else:
+            elif slot == SLOT_TRANSMISSION:
                 e.transmission = e.transmission * code[0]
+            elif slot == SLOT_ANISOTROPY:
+                e.anisotropy = e.anisotropy * code[2]
+            elif slot == SLOT_IRIDESCENCE:
+                e.iridescence = e.iridescence * code[0]
+            else:
+                e.film_thickness = wp.lerp(e.film_minimum, e.film_thickness, code[1])
+    # Compilers see that what no material has is not there.
+    if (material.any_layers & ANISOTROPY) == 0:
+        e.anisotropy = 0.0
+    if (material.any_layers & IRIDESCENCE) == 0:
+        e.iridescence = 0.0
+    if e.iridescence > 0.0:
+        # Thinner than an atom a film fades out, and leaves the base as it is.
+        x = wp.min(e.film_thickness / FILM_MIN, 1.0)
+        e.iridescence = e.iridescence * x * x * (3.0 - 2.0 * x)
     return e
 
 
@@ -107,10 +136,17 @@ def transmitted_share(
     if k >= 0:
         uv = slot_uv(mesh, material, m, SLOT_METALLIC_ROUGHNESS, hit)
         metallic *= sample_texture(texture, k, uv, 0)[2]
-    weight = schlick(wp.abs(wp.dot(wp.normalize(n), direction)))
+    cos_o = wp.abs(wp.dot(wp.normalize(n), direction))
+    weight = schlick(cos_o)
     f0 = wp.min(wp.max(e.f0), 1.0)
     reflected = e.specular * (f0 + (1.0 - f0) * weight)
     coat = e.clearcoat * (F0_COAT + (1.0 - F0_COAT) * weight)
+    if e.iridescence > 0.0:
+        # The base's diffuse lobe too gets what the largest channel leaves.
+        own = wp.min(e.f0, wp.vec3(1.0)) * e.specular
+        bare = own + (wp.vec3(e.specular) - own) * weight
+        film = film_fresnel(own, e.film_ior, e.film_thickness, cos_o)
+        reflected = wp.max(bare + (film - bare) * e.iridescence)
     share = e.transmission * (1.0 - metallic) * luminance(tint)
     return share * (1.0 - reflected) * (1.0 - coat)
 
@@ -122,6 +158,6 @@ def hit_alpha(
     """Return the share of rays that a hit stops: its coverage, less what passes the material."""
     alpha = hit_coverage(mesh, material, texture, hit)
     m = mesh.face_material[hit.face]
-    if material.any_layers == 1 and material.extensions[m].transmission > 0.0:
+    if material.any_layers > 0 and material.extensions[m].transmission > 0.0:
         alpha *= 1.0 - transmitted_share(mesh, material, texture, m, hit, ray_dir)
     return alpha

@@ -9,6 +9,7 @@ from warpir.kernels.maths.rng import hash_pair, to_unit
 from warpir.kernels.receiver_mesh import INFINITY, plane_distance, receiver_mesh_hit
 from warpir.kernels.tracing.coverage import hit_alpha
 from warpir.kernels.tracing.hit import ULP, Hit, face_normal, hit_position, offset_origin
+from warpir.kernels.tracing.triangles import any_triangle, closest_triangle
 from warpir.kernels.types import CameraArgs, MaterialArgs, MeshArgs, ReceiverArgs, TextureArgs
 
 LAYERS_MAX = wp.constant(64)
@@ -76,7 +77,7 @@ def facing_twin(mesh: MeshArgs, position: wp.vec3, ray_dir: wp.vec3) -> Hit:
 
 
 @wp.func
-def closest_hit(
+def closest_of_layers(
     mesh: MeshArgs,
     material: MaterialArgs,
     texture: TextureArgs,
@@ -86,27 +87,19 @@ def closest_hit(
     is_camera_ray: int,
     key: wp.uint32,
 ) -> Hit:
-    """Find the first surface that the ray does not pass through.
-
-    A camera ray passes the back of a single-sided material; any ray passes a point of opacity alpha
-    with probability ``1 - alpha``, drawn from ``key``.
-    """
+    """Find what `closest_hit` does where materials let rays pass."""
     hit = Hit()
     hit.valid = 0
-    if mesh.id == wp.uint64(0):
-        return hit
     origin = ray_origin
     for layer in range(LAYERS_MAX):
-        query = wp.mesh_query_ray(mesh.id, origin, ray_dir, max_t)
-        if not query.result:
+        hit = closest_triangle(mesh, origin, ray_dir, max_t)
+        if hit.valid == 0:
             return hit
-        hit.face = query.face
-        hit.u = query.u
-        hit.v = query.v
+        face = int(hit.face)
         accept = int(1)
         if is_camera_ray == 1 and material.any_culled == 1:
-            if material.double_sided[mesh.face_material[query.face]] == 0:
-                if wp.dot(face_normal(mesh, query.face), ray_dir) > 0.0:
+            if material.double_sided[mesh.face_material[face]] == 0:
+                if wp.dot(face_normal(mesh, face), ray_dir) > 0.0:
                     twin = facing_twin(mesh, hit_position(mesh, hit), ray_dir)
                     accept = twin.valid
                     if twin.valid == 1:
@@ -122,8 +115,37 @@ def closest_hit(
         # Bounds on max_t apply to the whole ray; what is left of it shrinks with each layer.
         position = hit_position(mesh, hit)
         max_t = max_t - wp.length(position - origin)
-        origin = offset_origin(position, face_normal(mesh, query.face), ray_dir, mesh.epsilon)
+        origin = offset_origin(position, face_normal(mesh, face), ray_dir, mesh.epsilon)
+    hit.valid = 0
     return hit
+
+
+@wp.func(inline=True)
+def closest_hit(
+    mesh: MeshArgs,
+    material: MaterialArgs,
+    texture: TextureArgs,
+    ray_origin: wp.vec3,
+    ray_dir: wp.vec3,
+    max_t: float,
+    is_camera_ray: int,
+    key: wp.uint32,
+) -> Hit:
+    """Find the first surface that the ray does not pass through.
+
+    A camera ray passes the back of a single-sided material; any ray passes a point of opacity alpha
+    with probability ``1 - alpha``, drawn from ``key``.
+    """
+    # A call copies all of its structs on the CPU, which takes as long as the ray.
+    hit = Hit()
+    hit.valid = 0
+    if mesh.id == wp.uint64(0):
+        return hit
+    if material.any_alpha == 1 or is_camera_ray * material.any_culled == 1:
+        return closest_of_layers(
+            mesh, material, texture, ray_origin, ray_dir, max_t, is_camera_ray, key
+        )
+    return closest_triangle(mesh, ray_origin, ray_dir, max_t)
 
 
 @wp.func
@@ -166,6 +188,51 @@ def meets_box(origin: wp.vec3, wi: wp.vec3, low: wp.vec3, high: wp.vec3) -> int:
 
 
 @wp.func
+def transmitted_within(
+    mesh: MeshArgs,
+    material: MaterialArgs,
+    texture: TextureArgs,
+    ray_origin: wp.vec3,
+    ray_dir: wp.vec3,
+    max_t: float,
+) -> float:
+    """Find what `visibility_within` does where materials let light through."""
+    transmitted = float(1.0)
+    origin = ray_origin
+    left = max_t
+    for _layer in range(LAYERS_MAX):
+        hit = closest_triangle(mesh, origin, ray_dir, left)
+        if hit.valid == 0:
+            return transmitted
+        transmitted = transmitted * (1.0 - hit_alpha(mesh, material, texture, hit, ray_dir))
+        if transmitted <= 0.0:
+            return 0.0
+        position = hit_position(mesh, hit)
+        left = left - wp.length(position - origin)
+        origin = offset_origin(position, face_normal(mesh, hit.face), ray_dir, mesh.epsilon)
+    return 0.0
+
+
+@wp.func(inline=True)
+def visibility_within(
+    mesh: MeshArgs,
+    material: MaterialArgs,
+    texture: TextureArgs,
+    ray_origin: wp.vec3,
+    ray_dir: wp.vec3,
+    max_t: float,
+) -> float:
+    """Return the share of light that comes to ``ray_origin`` from ``max_t`` [m] along the ray."""
+    if mesh.id == wp.uint64(0):
+        return 1.0
+    if material.any_alpha == 1:
+        return transmitted_within(mesh, material, texture, ray_origin, ray_dir, max_t)
+    if any_triangle(mesh, ray_origin, ray_dir, max_t):
+        return 0.0
+    return 1.0
+
+
+@wp.func(inline=True)
 def visibility(
     mesh: MeshArgs,
     material: MaterialArgs,
@@ -174,26 +241,4 @@ def visibility(
     ray_dir: wp.vec3,
 ) -> float:
     """Return the share of light that reaches ``ray_origin`` from infinity along ``ray_dir``."""
-    if mesh.id == wp.uint64(0):
-        return 1.0
-    if material.any_alpha == 0:
-        if wp.mesh_query_ray_anyhit(mesh.id, ray_origin, ray_dir, INFINITY):
-            return 0.0
-        return 1.0
-    transmitted = float(1.0)
-    origin = ray_origin
-    hit = Hit()
-    for _layer in range(LAYERS_MAX):
-        query = wp.mesh_query_ray(mesh.id, origin, ray_dir, INFINITY)
-        if not query.result:
-            return transmitted
-        hit.face = query.face
-        hit.u = query.u
-        hit.v = query.v
-        transmitted = transmitted * (1.0 - hit_alpha(mesh, material, texture, hit, ray_dir))
-        if transmitted <= 0.0:
-            return 0.0
-        origin = offset_origin(
-            hit_position(mesh, hit), face_normal(mesh, query.face), ray_dir, mesh.epsilon
-        )
-    return 0.0
+    return visibility_within(mesh, material, texture, ray_origin, ray_dir, INFINITY)

@@ -7,6 +7,7 @@ from warpir.kernels.maths.frame import basis, to_local
 from warpir.kernels.tracing.coverage import extensions_at, transmitted_share
 from warpir.kernels.tracing.hit import Hit, face_normal, hit_position
 from warpir.kernels.tracing.texture import (
+    SLOT_ANISOTROPY,
     SLOT_BASE_COLOR,
     SLOT_CLEARCOAT_NORMAL,
     SLOT_EMISSION,
@@ -15,7 +16,7 @@ from warpir.kernels.tracing.texture import (
     sample_texture,
     slot_uv,
 )
-from warpir.kernels.types import Layers, MaterialArgs, MeshArgs, TextureArgs
+from warpir.kernels.types import ANISOTROPY, Layers, MaterialArgs, MeshArgs, TextureArgs
 
 
 @wp.struct
@@ -41,7 +42,7 @@ class Surface:
 
 
 @wp.func
-def mapped_normal(
+def mapped(
     mesh: MeshArgs,
     material: MaterialArgs,
     texture: TextureArgs,
@@ -53,12 +54,16 @@ def mapped_normal(
 ) -> wp.vec3:
     """Apply a normal map of material ``m``, of that strength, to the interpolated normal ``n``.
 
-    Tangents come from the asset, or from the triangle's UVs. The map's green axis points to the top
-    of the image, that is against v.
+    In the slot of anisotropy, return its direction, or ``n`` where it has none. Tangents come from
+    the asset, or from the triangle's UVs. The map's green axis points to the top of the image,
+    that is against v.
     """
     k = material.slot_texture[m, slot]
+    uv_slot = slot
     if k < 0:
-        return n
+        if slot != SLOT_ANISOTROPY:
+            return n
+        uv_slot = SLOT_NORMAL
     a = mesh.indices[3 * hit.face]
     b = mesh.indices[3 * hit.face + 1]
     c = mesh.indices[3 * hit.face + 2]
@@ -70,7 +75,7 @@ def mapped_normal(
         uv_a = mesh.uv0[a]
         uv_b = mesh.uv0[b]
         uv_c = mesh.uv0[c]
-        if material.slot_uv_set[m, slot] == 1:
+        if material.slot_uv_set[m, uv_slot] == 1:
             uv_a = mesh.uv1[a]
             uv_b = mesh.uv1[b]
             uv_c = mesh.uv1[c]
@@ -94,14 +99,22 @@ def mapped_normal(
         return n
     t = wp.normalize(t)
     bitangent = wp.cross(n, t) * handedness
-    code = sample_texture(texture, k, slot_uv(mesh, material, m, slot, hit), 0)
+    code = wp.vec4(1.0, 0.5, 1.0, 1.0)
+    if k >= 0:
+        code = sample_texture(texture, k, slot_uv(mesh, material, m, slot, hit), 0)
     x = (2.0 * code[0] - 1.0) * strength
     y = (2.0 * code[1] - 1.0) * strength
     z = 2.0 * code[2] - 1.0
-    mapped = t * x + bitangent * y + n * z
-    if wp.dot(mapped, mapped) < 1.0e-12:
+    if slot == SLOT_ANISOTROPY:
+        turn = material.extensions[m].stretch
+        along = turn[0] * x - turn[1] * y
+        y = turn[1] * x + turn[0] * y
+        x = along
+        z = 0.0
+    direction = t * x + bitangent * y + n * z
+    if wp.dot(direction, direction) < 1.0e-12:
         return n
-    return wp.normalize(mapped)
+    return wp.normalize(direction)
 
 
 @wp.func
@@ -115,7 +128,7 @@ def facing(n: wp.vec3, ng: wp.vec3, wo: wp.vec3) -> wp.vec3:
     return n
 
 
-@wp.func
+@wp.func(inline=True)
 def surface_at(
     mesh: MeshArgs, material: MaterialArgs, texture: TextureArgs, hit: Hit, wo: wp.vec3
 ) -> Surface:
@@ -135,22 +148,33 @@ def surface_at(
     else:
         smooth_n = s.ng
     s.layers.present = 0
-    if material.any_layers == 1:
+    layer_count = int(1)
+    if material.any_layers > 0:
         s.layers.present = material.extensions[m].present
+        layer_count += s.layers.present
+        if (material.any_layers & ANISOTROPY) > 0 and material.extensions[m].anisotropy > 0.0:
+            layer_count = 3
     # One call in a loop: a function with one caller is inlined, else its arguments are copied.
     n = smooth_n
     coat_n = smooth_n
-    for layer in range(1 + s.layers.present):
+    stretch = smooth_n
+    for layer in range(layer_count):
         slot = SLOT_NORMAL
         strength = material.normal_scale[m]
         if layer == 1:
             slot = SLOT_CLEARCOAT_NORMAL
             strength = material.extensions[m].clearcoat_normal_scale
-        mapped = mapped_normal(mesh, material, texture, m, slot, strength, hit, smooth_n)
+        if layer == 2:
+            slot = SLOT_ANISOTROPY
+            strength = 1.0
+        direction = mapped(mesh, material, texture, m, slot, strength, hit, smooth_n)
         if layer == 0:
-            n = mapped
+            n = direction
+        elif layer == 1:
+            coat_n = direction
         else:
-            coat_n = mapped
+            # Nothing is left where it has no direction.
+            stretch = direction - smooth_n * wp.dot(direction, smooth_n)
     side = float(1.0)
     if wp.dot(s.ng, wo) < 0.0:
         side = -1.0
@@ -200,6 +224,11 @@ def surface_at(
             e.clearcoat,
             e.clearcoat_roughness,
             to_local(coat_n, frame),
+            e.anisotropy,
+            to_local(stretch, frame),
+            e.iridescence,
+            e.film_ior,
+            e.film_thickness,
         )
         # What shines from below the coat; all of it stands for the rays that passed too.
         s.texture_emission = s.texture_emission * s.layers.emission_scale

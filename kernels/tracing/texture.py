@@ -17,6 +17,9 @@ SLOT_CLEARCOAT_NORMAL = wp.constant(8)
 SLOT_SHEEN_COLOR = wp.constant(9)
 SLOT_SHEEN_ROUGHNESS = wp.constant(10)
 SLOT_TRANSMISSION = wp.constant(11)
+SLOT_ANISOTROPY = wp.constant(12)
+SLOT_IRIDESCENCE = wp.constant(13)
+SLOT_IRIDESCENCE_THICKNESS = wp.constant(14)
 
 
 @wp.func

@@ -94,7 +94,7 @@ def trace_points(
             points.base_color[i, count] = surface.base_color
             points.metallic[i, count] = surface.metallic
             points.roughness[i, count] = surface.roughness
-            if material.any_layers == 1:
+            if material.any_layers > 0:
                 points.layers[i, count] = surface.layers
             emitted += surface.emission
             count += 1
@@ -105,7 +105,7 @@ def trace_points(
 @wp.func
 def layers_of(points: SurfacePoints, material: MaterialArgs, p: int, s: int) -> Layers:
     """Return the extensions at point ``s`` of row ``p``."""
-    if material.any_layers == 1:
+    if material.any_layers > 0:
         return points.layers[p, s]
     layers = Layers()
     layers.present = 0
@@ -347,7 +347,7 @@ def trace_paths(
         if k > 0:
             u = sobol_pair(q, key, 3 * k + 2)
             emitter = sample_emitter(
-                mesh, material, texture, receiver, proposal, surface, bsdf, frame, u, u_parts[0], 0
+                mesh, material, texture, receiver, proposal, surface, bsdf, frame, u, 0
             )
             if emitter.weight > 0.0:
                 value = wp.cw_mul(throughput, emitter.f.diffuse + emitter.f.specular)

@@ -158,7 +158,7 @@ def test_every_value_has_a_rule() -> None:
         "device", "refine_parts", "refine_materials", "lora_layers",
         "photo", "layer", "occluder_mask", "asset", "materials", "out", "camera", "light", "lora",
         "model", "reuse", "sequence", "regressor", "frame", "ground_points", "proxy",
-        "shadow_mask",
+        "shadow_mask", "lamp", "lamps",
     }  # fmt: skip
     for name, option in OPTIONS.items():
         rule = option.rule
@@ -315,6 +315,16 @@ def test_command_reads_values(argv: list[str], name: str, value: object) -> None
         pytest.param(["--ground", "0,1e200,0,0"], "--ground", "numbers up", id="C8-ground-1e200"),
         pytest.param(["--ground-albedo", "1e-320"], "--ground-albedo", "least", id="F1-albedo"),
         (["--seed", "-1"], "--seed", "at least 0"),
+        (["--ground-roughness", "1.1"], "--ground-roughness", "at most 1"),
+        (["--ground-roughness", "-1"], "--ground-roughness", "at least 0"),
+        (["--ground-roughness", "wet"], "--ground-roughness", "off, or 0 to 1"),
+        (["--ground-roughness", "0", "--proxy", "p.ply"], "--ground-roughness", "--proxy"),
+        (["--ground-roughness", "auto", "--proxy", "p.ply"], "--ground-roughness", "--proxy"),
+        (
+            "--ground-roughness auto --sequence s.txt --reuse r".split(),
+            "--ground-roughness auto",
+            "--sequence",
+        ),
         (["--seed", str(2**64)], "--seed", "at most"),
         (["--device", "tpu"], "--device", "cuda"),
         (["--sky", "purple"], "--sky", "overcast"),
@@ -490,7 +500,18 @@ def test_config_file_of_an_older_version_replays(tmp_path: Path) -> None:
     newer -= {"guidance"}
     newer |= {"proxy", "plane", "shadow_mask", "layer", "occluder_mask", "light_convention"}
     newer |= {"strict", "detail", "visible_sun", "hand_off", "mitsuba", "usd", "asset_up"}
-    newer |= {"settle", "sink", "response", "denoise", "camera_from", "roll", "bounce"}
+    newer |= {
+        "settle",
+        "sink",
+        "response",
+        "denoise",
+        "camera_from",
+        "roll",
+        "bounce",
+        "lamp",
+        "lamps",
+        "ground_roughness",
+    }
     newer |= {f"max_{field.name}" for field in fields(Limits)} - {"max_pixels"}
     newer |= {"max_prompt_bytes"}
     config = InsertConfig(photo="p.png", asset="a.glb", out="o", sky="clear", depth=2)

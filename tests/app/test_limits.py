@@ -5,7 +5,6 @@ import os
 import struct
 import subprocess
 import sys
-import zlib
 from collections.abc import Callable
 from dataclasses import dataclass, fields
 from pathlib import Path
@@ -17,7 +16,7 @@ from PIL import Image
 
 from tests.builders.faults import Ended, assert_fails, run_case, snapshot
 from tests.builders.gltf_files import Builder
-from tests.builders.image_files import png_chunk
+from tests.builders.image_files import png_header
 from tests.builders.insertions import arguments, read_layers
 from tests.insert.test_faults import NO_POSE
 from warpir.app.config import OPTIONS, InsertConfig
@@ -304,13 +303,6 @@ def test_disk_estimate_covers_a_run(inputs: Path, tmp_path: Path) -> None:
 
 
 # -------------------------------------------------------------------------------- limits
-
-
-def png_header(width: int, height: int) -> bytes:
-    """A PNG of a few bytes that claims a size."""
-    header = struct.pack(">IIBBBBB", width, height, 8, 0, 0, 0, 0)
-    body = png_chunk(b"IHDR", header) + png_chunk(b"IDAT", zlib.compress(b""))
-    return b"\x89PNG\r\n\x1a\n" + body + png_chunk(b"IEND", b"")
 
 
 Made = dict[str, str | None]

@@ -182,13 +182,13 @@ def test_one_bad_of_a_hundred(
 
 LOADED = """
 import sys
-from warpir.render.device import load_kernels, start_warp
+from warpir.render.device import cache_kernels, start_warp
 start_warp()
 import warp
 from warpir.insert import main
 def loaded():
     return {name for name, module in warp._src.context.user_modules.items() if module.execs}
-load_kernels("cpu", [(False, False, False), (False, False, True)])
+cache_kernels("cpu", [(False, False, False, False), (False, False, True, False)])
 before = loaded()
 assert before and main(sys.argv[1:]) == 0
 assert loaded() == before, loaded() ^ before

@@ -22,7 +22,7 @@ from benchmarks.damage.mutations import exr_attributes
 from tests.builders.faults import Ended, run_case
 from tests.builders.gltf_files import Builder
 from tests.builders.image_files import matrix_profile, png_chunk, write_image
-from tests.builders.insertions import arguments, write_inputs
+from tests.builders.insertions import arguments
 from tests.builders.poses import write_json
 from warpir.core.errors import ExitCode
 
@@ -36,13 +36,6 @@ def reader() -> Iterator[Reader]:
     """One process for all formats, and its successors."""
     with Reader() as reader:
         yield reader
-
-
-@pytest.fixture(scope="module")
-def inputs(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    folder = tmp_path_factory.mktemp("inputs")
-    write_inputs(folder)
-    return folder
 
 
 @pytest.mark.parametrize("name", FORMATS)

@@ -5,7 +5,6 @@ stand on a plane, in pictures of 48 x 32 pixels under panoramas that are made in
 the demo's sky, whose sun is a real one. No diffusion model takes part.
 """
 
-from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 
@@ -53,14 +52,7 @@ TONE = 0.038
 """RMSE of the foreground curve [1]; the identity's is 0.052 and more. Measured: up to 0.029; the
 object's colours fill a part of the curve, and `bend` draws the rest toward the identity."""
 
-
-@pytest.fixture(autouse=True)
-def _one_torch_thread() -> Iterator[None]:
-    """Tensors of a few thousand numbers are slower on threads that must share cores."""
-    before = torch.get_num_threads()
-    torch.set_num_threads(1)
-    yield
-    torch.set_num_threads(before)
+pytestmark = pytest.mark.usefixtures("one_thread")
 
 
 def made_sky(azimuth: float, elevation: float, sun: float = 4.0, sigma: float = 0.1) -> FloatArray:

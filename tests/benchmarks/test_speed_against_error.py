@@ -12,8 +12,8 @@ import numpy as np
 import pytest
 
 from benchmarks.speed import __main__ as bench
+from benchmarks.speed import cost, report
 from benchmarks.speed import ratios as r
-from benchmarks.speed import report
 from benchmarks.speed.references import Reference, quiet
 from tests.builders.programs.llvm import LIBRARY, llvm
 
@@ -244,6 +244,19 @@ def test_documents_hold_every_device_that_was_kept(
     assert "## test CPU, 2 threads" in text and "## Some GPU 1" in text
     assert "400 x" in text and "ToyCar.glb is not in the folder" in text
     assert (tmp_path / "speed_against_error.png").stat().st_size < 300_000
+
+
+def test_a_picture_costs_more_with_more_samples(tmp_path: Path) -> None:
+    """Of one size and object; the table holds both, and a run that was kept is drawn."""
+    few, many = (cost.render_one(96, 2000, samples, "cpu") for samples in (1, 256))
+    assert few["triangles"] == many["triangles"] == pytest.approx(2000, rel=0.1)
+    assert 0.0 < few["seconds_picture"] < many["seconds_picture"]
+    assert many["peak_mib"] > 50.0
+    run = {"rows": [{"sweep": name, **row} for name in cost.LABELS for row in (few, many)]}
+    table = cost.cost_text([run]).splitlines()
+    assert len([line for line in table if line.startswith("| 96 |")]) == 6
+    (tmp_path / "run.json").write_text(json.dumps(run))
+    assert cost.kept_runs(tmp_path) == [run]
 
 
 def test_tables_are_rectangular(rows: list[dict[str, Any]]) -> None:

@@ -37,6 +37,13 @@ def png_chunk(name: bytes, content: bytes) -> bytes:
     return struct.pack(">I", len(content)) + body + struct.pack(">I", zlib.crc32(body))
 
 
+def png_header(width: int, height: int) -> bytes:
+    """A PNG of a few bytes that claims a size and holds no pixel."""
+    header = struct.pack(">IIBBBBB", width, height, 8, 2, 0, 0, 0)
+    body = png_chunk(b"IHDR", header) + png_chunk(b"IDAT", zlib.compress(b""))
+    return b"\x89PNG\r\n\x1a\n" + body + png_chunk(b"IEND", b"")
+
+
 def fixed(*values: float) -> bytes:
     """Numbers as a profile holds them, s15Fixed16."""
     return struct.pack(f">{len(values)}i", *(round(value * 65536) for value in values))
@@ -91,10 +98,6 @@ def four_lobes(directions: np.ndarray) -> np.ndarray:
 
 def icc_profile(space: bytes, tags: dict[bytes, bytes], pcs: bytes = b"XYZ ") -> bytes:
     """An ICC v2 display profile made from its tags; a white point and texts are added."""
-
-    def fixed(*values: float) -> bytes:
-        return struct.pack(f">{len(values)}i", *(round(value * 65536) for value in values))
-
     tags = {
         b"desc": b"desc\0\0\0\0" + struct.pack(">I", 5) + b"test\0" + bytes(82),
         b"cprt": b"text\0\0\0\0none\0\0\0\0",

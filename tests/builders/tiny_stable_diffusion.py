@@ -92,12 +92,9 @@ def make_tiny_stable_diffusion(
 
 
 def write_pipeline(folder: Path, parts: tuple[Any, Any, Any], **schedule: Any) -> None:
-    """Write a pipeline beside its tokenizer, with the schedule of Stable Diffusion.
+    """Write UNet, autoencoder and text encoder beside their tokenizer, which is in ``folder``.
 
-    Args:
-        folder: Where; the tokenizer is in it.
-        parts: UNet, autoencoder and text encoder.
-        schedule: What the scheduler has besides.
+    The schedule is Stable Diffusion's, with what is given besides.
     """
     from diffusers import DDIMScheduler, StableDiffusionPipeline
     from transformers import CLIPTokenizer

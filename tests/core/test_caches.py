@@ -300,7 +300,8 @@ DOUBLED = "[0.0, 2.0, 4.0, 6.0]"
 def start(folder: Path, **env: str) -> subprocess.Popen[str]:
     """Start a process that compiles a small kernel, or finds it."""
     script = folder / "kernel.py"
-    script.write_text(KERNEL)
+    if not script.exists():  # a process started before may be about to read it
+        script.write_text(KERNEL)
     own = {"WARP_CACHE_PATH": str(folder / "kernels"), "TMPDIR": str(folder / "tmp"), **env}
     return subprocess.Popen(
         [sys.executable, str(script)],

@@ -40,6 +40,7 @@ from warpir.render.device_light import light_args
 from warpir.render.device_scene import Scene
 from warpir.render.mis import samples
 from warpir.render.renderer import Renderer
+from warpir.render.shadow.pilot import shaded_pixels
 from warpir.render.transport import rows as transport_rows
 from warpir.render.transport.integrator import TransportIntegrator
 from warpir.scene.asset import Material
@@ -323,7 +324,7 @@ def render_all(renderer: Renderer) -> list[np.ndarray[Any, Any]]:
     light = light_args(sky(), renderer.device)
     gbuffer = renderer.gbuffer(1)
     seen = renderer.foreground(light, gbuffer.object_pixels, 8, 1, 3, 1)
-    shaded = renderer.shaded_pixels(light, 1)
+    shaded = shaded_pixels(renderer, light, 1)
     plane = renderer.receiver(light, shaded, np.zeros(len(shaded), np.int32), 8, 1, 1)
     groups = (gbuffer, seen, plane)
     return [shaded, *(array for group in groups for array in vars(group).values())]
@@ -359,7 +360,7 @@ def test_rendering_fails_with_the_flag(
 def transported(device: str) -> TransportIntegrator:
     renderer = a_scene(device)
     objects = renderer.gbuffer(1).object_pixels
-    proxies = renderer.shaded_pixels(light_args(sky(), renderer.device), 1)
+    proxies = shaded_pixels(renderer, light_args(sky(), renderer.device), 1)
     return TransportIntegrator(renderer, objects, proxies, 2, TRACED, sky(), 1)
 
 

@@ -21,7 +21,7 @@ from hypothesis import strategies as st
 from safetensors.torch import load_file, save_file
 
 from tests.builders.faults import NO_TORCH, assert_fails
-from tests.builders.insertions import arguments, write_inputs
+from tests.builders.insertions import arguments
 from tests.builders.tiny_stable_diffusion import make_tiny_stable_diffusion
 from warpir.diffusion.models.hub import find_model, hub_offline, needed_files
 from warpir.diffusion.models.model_error import ModelError
@@ -47,14 +47,6 @@ pytestmark = pytest.mark.usefixtures("one_thread")
 def whole(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A folder without fault; never changed."""
     return make_tiny_stable_diffusion(tmp_path_factory.mktemp("whole"))
-
-
-@pytest.fixture(scope="module")
-def inputs(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Photo, asset and light of a run; never changed."""
-    folder = tmp_path_factory.mktemp("inputs")
-    write_inputs(folder)
-    return folder
 
 
 @pytest.fixture

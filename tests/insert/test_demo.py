@@ -28,7 +28,7 @@ from warpir.scene.asset import Asset
 
 SHIPPED_MAX = 5_000_000
 """All shipped files together [byte]: they travel in every wheel."""
-CAR_MAX = 1_500_000
+CAR_MAX = 1_750_000
 """The car's file [byte]."""
 RADIUS_TOLERANCE = 0.002
 """Share of a sphere's radius; chords of cells a tenth of it wide sag by 0.13 %."""

@@ -11,21 +11,13 @@ import pytest
 import torch
 
 from tests.builders.faults import assert_fails, run_case
-from tests.builders.insertions import arguments, write_inputs
+from tests.builders.insertions import arguments
 from tests.builders.outcome import outcome
 from warpir.app.program import BROUGHT, EXTRA_OF
 from warpir.core.errors import ExitCode, InputError
 from warpir.render.determinism import fixed_arithmetic
 
 ROOT = Path(__file__).resolve().parents[2]
-
-
-@pytest.fixture(scope="module")
-def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The input files, made once."""
-    made = tmp_path_factory.mktemp("environment")
-    write_inputs(made)
-    return made
 
 
 # R8: devices
@@ -35,22 +27,22 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     "device",
     [pytest.param("cuda:7", id="R8-device-7"), pytest.param("cuda:64", id="R8-device-64")],
 )
-def test_device_that_is_not_there(folder: Path, device: str) -> None:
+def test_device_that_is_not_there(inputs: Path, device: str) -> None:
     lines = assert_fails(
-        arguments(folder, "out", device=device), 2, "--device", f"no device {device}", cwd=folder
+        arguments(inputs, "out", device=device), 2, "--device", f"no device {device}", cwd=inputs
     )
     assert "--device cpu" in lines[1]
 
 
 @pytest.mark.case("R8")
-def test_cuda_is_absent(folder: Path) -> None:
+def test_cuda_is_absent(inputs: Path) -> None:
     """A machine without a driver, as which CUDA_VISIBLE_DEVICES makes any."""
     lines = assert_fails(
-        arguments(folder, "out", device="cuda"),
+        arguments(inputs, "out", device="cuda"),
         2,
         "--device",
         "found cpu",
-        cwd=folder,
+        cwd=inputs,
         env={"CUDA_VISIBLE_DEVICES": ""},
     )
     assert "--device cpu" in lines[1]
@@ -76,8 +68,8 @@ warpir.render.device.choose_device = busy
 
 
 @pytest.mark.case("R8")
-def test_gpu_memory_is_taken(folder: Path) -> None:
-    lines = assert_fails(arguments(folder, "out"), 5, "memory", cwd=folder, before=BUSY)
+def test_gpu_memory_is_taken(inputs: Path) -> None:
+    lines = assert_fails(arguments(inputs, "out"), 5, "memory", cwd=inputs, before=BUSY)
     assert "--device cpu" in lines[1]
 
 
@@ -96,26 +88,26 @@ FULL = "os.dup2(os.open('/dev/full', os.O_WRONLY), {})"
         pytest.param(FULL.format(2), id="R11-stderr-full"),
     ],
 )
-def test_standard_streams(folder: Path, before: str) -> None:
+def test_standard_streams(inputs: Path, before: str) -> None:
     """Status and files are the same; nothing that is printed goes into a file of ours."""
     before = f"import os; {before}"
     for argv, status in (
         (["--help"], 0),
         (["--no-such-flag"], 2),
-        (arguments(folder, "out", validate=""), 0),
-        (arguments(folder, "out", photo="absent.png"), 3),
+        (arguments(inputs, "out", validate=""), 0),
+        (arguments(inputs, "out", photo="absent.png"), 3),
     ):
-        ended = run_case(argv, folder, before=before)
+        ended = run_case(argv, inputs, before=before)
         assert ended.status == status and "Traceback" not in ended.out + ended.err
-    assert not (folder / "out").exists()
+    assert not (inputs / "out").exists()
 
 
 @pytest.mark.slow
 @pytest.mark.case("R11")
-def test_run_without_any_stream_writes_its_files(folder: Path, tmp_path: Path) -> None:
+def test_run_without_any_stream_writes_its_files(inputs: Path, tmp_path: Path) -> None:
     """Not a line of a log is in them: the streams' numbers are not given to files."""
     closed = f"import os; {'; '.join(CLOSED.values())}"
-    argv = arguments(folder, "out")
+    argv = arguments(inputs, "out")
     (tmp_path / "a").mkdir()
     (tmp_path / "b").mkdir()
     assert run_case(argv, tmp_path / "a", before=closed).status == 0
@@ -130,16 +122,16 @@ def test_run_without_any_stream_writes_its_files(folder: Path, tmp_path: Path) -
         pytest.param(["--validate"], id="R11-head-validate"),
     ],
 )
-def test_reader_goes_away(folder: Path, argv: list[str]) -> None:
+def test_reader_goes_away(inputs: Path, argv: list[str]) -> None:
     """``| head -1``: the pipe breaks after the first line, or before it."""
     if argv == ["--validate"]:
-        argv = arguments(folder, "out", validate="")
+        argv = arguments(inputs, "out", validate="")
     for count in (0, 1):
         child = subprocess.Popen(
             [sys.executable, "-m", "warpir.insert", *argv],
             stdout=subprocess.PIPE,
             stderr=subprocess.PIPE,
-            cwd=folder,
+            cwd=inputs,
         )
         assert child.stdout is not None and child.stderr is not None
         for _ in range(count):
@@ -158,15 +150,15 @@ def test_reader_goes_away(folder: Path, argv: list[str]) -> None:
         pytest.param({"TERM": None, "COLUMNS": "0"}, id="R11-no-terminal"),
     ],
 )
-def test_locale_and_terminal(folder: Path, env: dict[str, str | None]) -> None:
+def test_locale_and_terminal(inputs: Path, env: dict[str, str | None]) -> None:
     """Names outside ASCII are printed in escapes, never a traceback; in a Python of its own."""
     own = {k: v for k, v in {**os.environ, **env}.items() if v is not None and env.get(k, v)}
     for name, status in (("schnée.png", 3), ("photo.png", 0)):
-        argv = arguments(folder, "out", photo=name, validate="")
+        argv = arguments(inputs, "out", photo=name, validate="")
         ended = subprocess.run(
             [sys.executable, "-m", "warpir.insert", *argv],
             env=own,
-            cwd=folder,
+            cwd=inputs,
             capture_output=True,
             check=False,
         )
@@ -203,13 +195,13 @@ sys.meta_path.insert(0, Hide())
     ],
 )
 def test_missing_package(
-    folder: Path, name: str, changes: dict[str, str | None], advice: str
+    inputs: Path, name: str, changes: dict[str, str | None], advice: str
 ) -> None:
     lines = assert_fails(
-        arguments(folder, "out", **changes),
+        arguments(inputs, "out", **changes),
         2,
         f"{name}: not installed",
-        cwd=folder,
+        cwd=inputs,
         before=HIDDEN.format(name=name),
     )
     assert lines[1] == f"pip install {advice} brings it"
@@ -256,7 +248,7 @@ def test_run_in_a_namespace_without_network(tmp_path: Path) -> None:
 
 @pytest.mark.case("L6")
 @pytest.mark.parametrize("allow", [False, True])
-def test_libraries_are_told_before_they_are_loaded(folder: Path, allow: bool) -> None:
+def test_libraries_are_told_before_they_are_loaded(inputs: Path, allow: bool) -> None:
     """Offline unless --allow-download; no telemetry in any case."""
     told = """
 import atexit, os, sys
@@ -272,6 +264,6 @@ warpir.insert.insert = stop
 """
     clean = dict.fromkeys(("HF_HUB_OFFLINE", "TRANSFORMERS_OFFLINE"))
     flags = {"allow_download": ""} if allow else {}
-    ended = run_case(arguments(folder, "out", **flags), folder, before=told, env=clean)
+    ended = run_case(arguments(inputs, "out", **flags), inputs, before=told, env=clean)
     assert ended.status == 130
     assert ended.out.splitlines()[-1] == ("told - - 1 1" if allow else "told 1 1 1 1")

@@ -13,7 +13,8 @@ from PIL import Image
 
 from tests.builders.faults import assert_fails
 from tests.builders.gltf_files import Builder
-from tests.builders.insertions import HEIGHT, LOBES, WIDTH, arguments, write_inputs, write_panorama
+from tests.builders.image_files import png_header
+from tests.builders.insertions import HEIGHT, LOBES, WIDTH, arguments, write_panorama
 
 
 @dataclass
@@ -59,25 +60,6 @@ def cut_light(name: str) -> Callable[[Path], dict[str, str | None]]:
         return {"light": str(folder / name)}
 
     return make
-
-
-def png_header(width: int, height: int) -> bytes:
-    """A PNG that claims a size and holds no pixel."""
-    import struct
-    import zlib
-
-    def chunk(kind: bytes, body: bytes) -> bytes:
-        return (
-            struct.pack(">I", len(body)) + kind + body + struct.pack(">I", zlib.crc32(kind + body))
-        )
-
-    header = struct.pack(">IIBBBBB", width, height, 8, 2, 0, 0, 0)
-    return (
-        b"\x89PNG\r\n\x1a\n"
-        + chunk(b"IHDR", header)
-        + chunk(b"IDAT", zlib.compress(b""))
-        + chunk(b"IEND", b"")
-    )
 
 
 def transparent(folder: Path) -> dict[str, str | None]:
@@ -281,14 +263,6 @@ BAD = {
     "F8-seed": Bad(2, ("--seed",), flags(seed="-1")),
     "R8-no-such-device": Bad(2, ("--device", "cuda:7"), flags(device="cuda:7")),
 }  # fmt: skip
-
-
-@pytest.fixture(scope="module")
-def inputs(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A folder with the good inputs; each case makes its own beside them."""
-    folder = tmp_path_factory.mktemp("inputs")
-    write_inputs(folder)
-    return folder
 
 
 @pytest.mark.parametrize("case", BAD)

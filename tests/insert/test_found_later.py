@@ -17,9 +17,19 @@ from PIL import Image
 
 from tests.builders.faults import assert_fails, run_case
 from tests.builders.gltf_files import Builder
-from tests.builders.insertions import HEIGHT, WIDTH, arguments, write_inputs
+from tests.builders.insertions import (
+    HEIGHT,
+    WIDTH,
+    arguments,
+    go,
+    read_image,
+    read_layers,
+    rgb,
+    write_inputs,
+)
 from warpir.io.assets import load_asset
 from warpir.io.images.decoder import decode_image
+from warpir.io.layers import HALF_MAX
 
 ROOT = Path(__file__).resolve().parents[2]
 SHAPE = HEIGHT, WIDTH
@@ -235,3 +245,24 @@ def test_checkout_is_taken_for_the_package(tmp_path: Path, name: str) -> None:
     done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, check=False)
     (line,) = done.stderr.splitlines()
     assert done.returncode == 2 and "is the checkout" in line and "pip install -e ." in line
+
+
+@pytest.mark.case("N17")
+def test_emitter_brighter_than_half_precision(folder: Path) -> None:
+    """The ground's ratio is the largest half there, `run.json` counts it, the picture is whole."""
+    file = Builder()
+    strength = {"KHR_materials_emissive_strength": {"emissiveStrength": 1e6}}
+    file.material.update(emissiveFactor=[1, 1, 1], extensions=strength)
+    file.json["extensionsUsed"] = list(strength)
+    (folder / "lamp.glb").write_bytes(file.glb())
+    changes = {"asset": str(folder / "lamp.glb"), "samples": "1", "device": "cpu"}
+    run = go(arguments(folder, folder / "out", no_report="", **changes), folder / "out")
+    assert run.record["measured"]["values_clamped_to_half"] > 30
+    planes = read_layers(run.out / "layers.exr")
+    assert np.isfinite(rgb(planes)).all() and rgb(planes, "shadow.").max() == HALF_MAX
+    assert read_image(run.out / "composite.png")[0].max() == 255
+
+
+@pytest.mark.case("N18")
+def test_lora_that_is_the_root_folder(folder: Path) -> None:
+    assert_fails(arguments(folder, "out", lora="/"), 4, "/: is a folder", cwd=folder)

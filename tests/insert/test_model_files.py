@@ -105,17 +105,23 @@ DAMAGES: dict[str, tuple[Callable[[Path], object], str]] = {
 }
 
 
+def refused(
+    inputs: Path, folder: Path, flag: str, spoil: Callable[[Path], object], words: str
+) -> None:
+    """Assert that a spoilt copy of a good file ends a run before torch is loaded."""
+    file = folder / "file.safetensors"
+    file.write_bytes((inputs / f"{flag}.safetensors").read_bytes())
+    spoil(file)
+    argv = run_with(inputs, flag, file)
+    assert_fails(argv, 4, str(file), words, cwd=folder, before=NO_TORCH)
+
+
 @pytest.mark.parametrize("flag", FLAGS)
 @pytest.mark.parametrize("damage", DAMAGES, ids="L2-{}".format)
 def test_files_that_are_no_weights_are_refused(
     inputs: Path, tmp_path: Path, flag: str, damage: str
 ) -> None:
-    file = tmp_path / "file.safetensors"
-    file.write_bytes((inputs / f"{flag}.safetensors").read_bytes())
-    spoil, words = DAMAGES[damage]
-    spoil(file)
-    argv = run_with(inputs, flag, file)
-    assert_fails(argv, 4, str(file), words, cwd=tmp_path, before=NO_TORCH)
+    refused(inputs, tmp_path, flag, *DAMAGES[damage])
 
 
 @pytest.mark.parametrize("flag", FLAGS)
@@ -123,11 +129,7 @@ def test_files_that_are_no_weights_are_refused(
 def test_values_that_are_not_finite_are_refused(
     inputs: Path, tmp_path: Path, flag: str, value: float
 ) -> None:
-    file = tmp_path / "file.safetensors"
-    file.write_bytes((inputs / f"{flag}.safetensors").read_bytes())
-    set_first(value)(file)
-    argv = run_with(inputs, flag, file)
-    assert_fails(argv, 4, str(file), "not finite", cwd=tmp_path, before=NO_TORCH)
+    refused(inputs, tmp_path, flag, set_first(value), "not finite")
 
 
 @pytest.mark.parametrize(
@@ -273,11 +275,7 @@ def as_written(spoil: Callable[[dict[str, Any]], object]) -> Callable[[Path], No
 def test_weights_that_say_something_else_are_refused(
     inputs: Path, tmp_path: Path, flag: str, damage: Callable[[Path], None], words: str
 ) -> None:
-    file = tmp_path / "file.safetensors"
-    file.write_bytes((inputs / f"{flag}.safetensors").read_bytes())
-    damage(file)
-    argv = run_with(inputs, flag, file)
-    assert_fails(argv, 4, str(file), words, cwd=tmp_path, before=NO_TORCH)
+    refused(inputs, tmp_path, flag, damage, words)
 
 
 @pytest.mark.case("L2")

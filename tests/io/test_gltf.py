@@ -11,6 +11,7 @@ import struct
 import time
 import tracemalloc
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -21,11 +22,12 @@ from PIL import Image
 from benchmarks.damage.mutations import places
 from tests.builders.faults import assert_fails
 from tests.builders.gltf_files import CODES, CORNERS, NORMALS, TWO, UVS, Builder, png
+from tests.builders.shapes import box
 from warpir.app.config import InsertConfig
 from warpir.core.errors import ExitCode, InputError
 from warpir.core.limits import LIMITS, Limits
 from warpir.io.assets import load_asset
-from warpir.io.gltf.reader import read_gltf
+from warpir.io.gltf.reader import glass_notices, read_gltf
 from warpir.scene.asset import Asset, Material, TextureSlot
 
 DATA = Path(__file__).parents[3] / "shared" / "data" / "mesh"
@@ -957,16 +959,17 @@ def test_G11_material_extensions(tmp_path: Path) -> None:
             "KHR_materials_ior": {"ior": 1.3},
             "KHR_materials_volume": {"thicknessFactor": 1},
             "KHR_materials_dispersion": {},
-            "KHR_materials_iridescence": {},
-            "KHR_materials_anisotropy": {},
+            "KHR_materials_iridescence": {"iridescenceIor": 1.5},
             "KHR_materials_diffuse_transmission": {},
         },
     )
     asset = load(tmp_path, builder)
     assert asset.materials[0].emission == (8.0, 4.0, 0.0)
     assert asset.materials[0].ior == 1.3
-    (notice,) = asset.notices
-    assert "lamp" in notice and "KHR_materials_volume, KHR_materials_dispersion" in notice
+    volume, others = asset.notices
+    assert "KHR_materials_volume without transmission" in volume
+    assert "lamp" in others and "KHR_materials_dispersion, KHR_materials_diffuse" in others
+    assert "iridescence" not in others and asset.materials[0].iridescence_ior == 1.3
     builder.material["extensions"] = {
         "KHR_materials_unlit": {}, "KHR_materials_clearcoat": {"clearcoatFactor": 1},
     }  # fmt: skip
@@ -994,6 +997,14 @@ def test_G11_layers_are_read(tmp_path: Path) -> None:
             "sheenColorTexture": plain, "sheenRoughnessTexture": turned,
         },
         "KHR_materials_transmission": {"transmissionFactor": 0.5, "transmissionTexture": plain},
+        "KHR_materials_anisotropy": {
+            "anisotropyStrength": 0.5, "anisotropyRotation": -1.5, "anisotropyTexture": turned,
+        },
+        "KHR_materials_iridescence": {
+            "iridescenceFactor": 0.5, "iridescenceIor": 1.75, "iridescenceThicknessMinimum": 20,
+            "iridescenceThicknessMaximum": 80, "iridescenceTexture": turned,
+            "iridescenceThicknessTexture": plain,
+        },
         "KHR_materials_specular": {
             "specularFactor": 0.25, "specularColorFactor": [2, 1, 0.5], "specularTexture": plain,
             "specularColorTexture": turned,
@@ -1010,7 +1021,10 @@ def test_G11_layers_are_read(tmp_path: Path) -> None:
         sheen_color=(0.5, 0.25, 0.0), sheen_roughness=0.5, sheen_color_texture=slot,
         sheen_roughness_texture=scaled, transmission=0.5, transmission_texture=slot,
         specular=0.25, specular_color=(2.0, 1.0, 0.5), specular_texture=slot,
-        specular_color_texture=scaled,
+        specular_color_texture=scaled, anisotropy=0.5, anisotropy_rotation=-1.5,
+        anisotropy_texture=scaled, iridescence=0.5, iridescence_ior=1.75,
+        iridescence_thickness=(20.0, 80.0), iridescence_texture=scaled,
+        iridescence_thickness_texture=slot,
     )  # fmt: skip
     assert material == expected
     assert any("not blurred" in notice for notice in asset.notices)
@@ -1023,6 +1037,12 @@ def test_G11_layers_are_clamped(tmp_path: Path) -> None:
         "KHR_materials_ior": {"ior": 0.5},
         "KHR_materials_clearcoat": {"clearcoatFactor": 2, "clearcoatRoughnessFactor": -1},
         "KHR_materials_sheen": {"sheenColorFactor": [2, 0, 0], "sheenRoughnessFactor": 3},
+        "KHR_materials_anisotropy": {"anisotropyStrength": 1.5},
+        "KHR_materials_iridescence": {
+            "iridescenceFactor": 3,
+            "iridescenceIor": 0.5,
+            "iridescenceThicknessMaximum": 1e30,
+        },
         "KHR_materials_specular": {"specularFactor": -1, "specularColorFactor": [-1, 9, 0]},
     }
     asset = load(tmp_path, builder)
@@ -1030,7 +1050,22 @@ def test_G11_layers_are_clamped(tmp_path: Path) -> None:
     assert (material.ior, material.clearcoat, material.clearcoat_roughness) == (1.0, 1.0, 0.0)
     assert (material.sheen_color, material.sheen_roughness) == ((1.0, 0.0, 0.0), 1.0)
     assert (material.specular, material.specular_color) == (0.0, (0.0, 9.0, 0.0))
-    assert sum("clamped" in notice for notice in asset.notices) == 7
+    assert (material.anisotropy, material.iridescence, material.iridescence_ior) == (1.0,) * 3
+    assert material.iridescence_thickness == (100.0, 1e5)
+    assert sum("clamped" in notice for notice in asset.notices) == 11
+
+
+def test_G11_anisotropy_needs_a_direction(tmp_path: Path) -> None:
+    """Without tangents and texture coordinates it is named; without strength it is not read."""
+    builder = Builder()
+    builder.material["extensions"] = {"KHR_materials_anisotropy": {"anisotropyStrength": 1}}
+    assert load(tmp_path, builder).notices == ()
+    del builder.primitive["attributes"]["TEXCOORD_0"]
+    (notice,) = load(tmp_path, builder).notices
+    assert "not anisotropic" in notice
+    builder.material["extensions"] = {"KHR_materials_anisotropy": {"anisotropyRotation": 1}}
+    asset = load(tmp_path, builder)
+    assert asset.notices == () and asset.materials[0].anisotropy_rotation == 0.0
 
 
 def test_G11_glass_says_what_it_does_not_do(tmp_path: Path) -> None:
@@ -1044,6 +1079,77 @@ def test_G11_glass_says_what_it_does_not_do(tmp_path: Path) -> None:
     builder.material["pbrMetallicRoughness"] = {"baseColorFactor": [0.3, 0.8, 0.3, 1]}
     (notice,) = load(tmp_path, builder).notices
     assert "tinted or blurred" in notice
+
+
+def glass(builder: Builder, **volume: object) -> Builder:
+    """Make the builder's material glass with this KHR_materials_volume."""
+    builder.material.update(
+        name="glass",
+        pbrMetallicRoughness={"metallicFactor": 0, "roughnessFactor": 0.25},
+        extensions={
+            "KHR_materials_transmission": {"transmissionFactor": 1},
+            "KHR_materials_volume": volume,
+        },
+    )
+    return builder
+
+
+def test_G11_volume_is_read(tmp_path: Path) -> None:
+    """Thickness makes solid glass, of which an open body is noted; without it glass stays thin."""
+    builder = glass(
+        Builder(), thicknessFactor=0.1, attenuationDistance=2, attenuationColor=[0.5, 0.25, 0]
+    )
+    builder.json["extensionsRequired"] = ["KHR_materials_volume"]
+    asset = load(tmp_path, builder)
+    (material,) = asset.materials
+    assert material.is_solid_glass and material.thickness == 0.1
+    assert material.attenuation_distance == 2.0
+    assert material.attenuation_color == (0.5, 0.25, 0.0)
+    (notice,) = asset.notices
+    assert "glass" in notice and "open at 4 edges" in notice
+    (thin,) = load(tmp_path, glass(Builder())).materials
+    assert not thin.is_solid_glass and thin.transmission == 1.0
+
+
+@pytest.mark.parametrize(
+    ("volume", "words"),
+    [
+        ({"attenuationDistance": 2, "attenuationColor": [0.5, 1, 1]}, "thicknessFactor of glass"),
+        (
+            {"thicknessFactor": 0, "attenuationDistance": 1, "attenuationColor": [0, 0, 0]},
+            "above 0",
+        ),
+        ({"thicknessFactor": -0.1}, "thicknessFactor out of range (found -0.1"),
+        ({"thicknessFactor": 1, "attenuationDistance": 0}, "attenuationDistance out of range"),
+        ({"thicknessFactor": 1, "attenuationDistance": "far"}, "attenuationDistance"),
+        ({"thicknessFactor": 1, "attenuationColor": [1, 1]}, "attenuationColor"),
+    ],
+)
+def test_G11_wrong_volumes_are_refused(
+    tmp_path: Path, volume: dict[str, object], words: str
+) -> None:
+    """Glass that absorbs on a way without length, and values out of range, by their place."""
+    with pytest.raises(InputError) as caught:
+        load(tmp_path, glass(Builder(), **volume))
+    assert caught.value.code == ExitCode.INPUT
+    assert words in str(caught.value)
+    assert "/materials/0/extensions/KHR_materials_volume" in str(caught.value)
+
+
+def test_G11_glass_bodies_are_looked_at() -> None:
+    """A closed body is in order also where corners are split, an inward one is told."""
+    solid = Material(name="solid", transmission=1.0, thickness=1.0)
+    ball = box((0, 0, 0), (1, 1, 1))
+    split = replace(
+        ball,
+        positions=ball.positions[ball.indices].reshape(-1, 3),
+        indices=np.arange(36).reshape(-1, 3),
+    )
+    inward = replace(ball, indices=ball.indices[:, ::-1])
+    assert glass_notices([split], [solid]) == []
+    assert "face inward" in glass_notices([inward], [solid])[0]
+    assert "open at 3 edges" in glass_notices([replace(ball, indices=ball.indices[1:])], [solid])[0]
+    assert glass_notices([inward], [replace(solid, thickness=0.0)]) == []
 
 
 def test_G11_specular_glossiness_is_converted(tmp_path: Path) -> None:

@@ -106,6 +106,26 @@ EXTENDED: dict[str, tuple[Material, dict[str, Any]]] = {
             "sheenColorTexture": {"index": 0}, "sheenRoughnessTexture": {"index": 1},
         },
     ),
+    "KHR_materials_anisotropy": (
+        Material(
+            name="m", anisotropy=0.5, anisotropy_rotation=-0.75, anisotropy_texture=TextureSlot(1)
+        ),
+        {
+            "anisotropyStrength": 0.5, "anisotropyRotation": -0.75,
+            "anisotropyTexture": {"index": 1},
+        },
+    ),
+    "KHR_materials_iridescence": (
+        Material(
+            name="m", iridescence=0.5, iridescence_ior=1.5, iridescence_thickness=(50.0, 750.0),
+            iridescence_texture=TextureSlot(1), iridescence_thickness_texture=TextureSlot(2),
+        ),
+        {
+            "iridescenceFactor": 0.5, "iridescenceIor": 1.5,
+            "iridescenceThicknessMinimum": 50.0, "iridescenceThicknessMaximum": 750.0,
+            "iridescenceTexture": {"index": 1}, "iridescenceThicknessTexture": {"index": 2},
+        },
+    ),
     "KHR_materials_transmission": (
         Material(name="m", transmission=0.5, transmission_texture=TextureSlot(0)),
         {"transmissionFactor": 0.5, "transmissionTexture": {"index": 0}},
@@ -187,6 +207,20 @@ def test_material_extension_reads_back(name: str, tmp_path: Path) -> None:
     """What our reader knows of an extension is what was written."""
     asset = extended(EXTENDED[name][0])
     assert_same_slots(asset, read_back(tmp_path, write_glb(asset, IDENTITY)))
+
+
+def test_solid_glass_reads_back(tmp_path: Path) -> None:
+    """Transmission and volume are two extensions of one material."""
+    glass = Material(
+        name="m", transmission=0.5, thickness=0.25, attenuation_distance=0.125,
+        attenuation_color=(0.5, 0.25, 1.0), ior=1.25,
+    )  # fmt: skip
+    written = write_glb(extended(glass), IDENTITY)
+    assert document(written)["materials"][0]["extensions"]["KHR_materials_volume"] == {
+        "thicknessFactor": 0.25, "attenuationDistance": 0.125,
+        "attenuationColor": [0.5, 0.25, 1.0],
+    }  # fmt: skip
+    assert read_back(tmp_path, written).materials[0] == glass
 
 
 def test_plain_asset_uses_no_extension() -> None:

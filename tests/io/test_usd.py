@@ -18,6 +18,7 @@ from warpir.io.assets import load_asset
 from warpir.scene.asset import Asset, Material, Texture, TextureSlot
 from warpir.scene.camera import Camera, camera_pose
 from warpir.scene.light import axis_from_angles
+from warpir.scene.near.lamps import RectangleLamp, SphereLamp
 
 PIXEL = 1e-3
 """Of projections by OpenUSD's own frustum [px]."""
@@ -76,6 +77,41 @@ def test_usdz_has_the_object_and_the_camera(tmp_path: Path) -> None:
     with zipfile.ZipFile(path) as package:
         name = next(name for name in package.namelist() if name.endswith(".exr"))
         assert package.read(name) == (folder / "sky.exr").read_bytes()
+
+
+def test_usdz_has_the_lamps(tmp_path: Path) -> None:
+    """Spheres and rectangles where they are, of our radiance; a rectangle shines along its -Z."""
+    pytest.importorskip("pxr", reason="OpenUSD is not installed (usd extra)")
+    from pxr import Usd, UsdGeom, UsdLux
+
+    from warpir.io.usd import write_usdz
+
+    folder = Path(demo.__file__).parent
+    asset = Asset("box", (box((0.0, 0.5, 0.0), (1.0, 1.0, 1.0)),), (Material(),), ())
+    camera = Camera(64, 40, 50.0, 50.0, 32.0, 20.0, camera_pose(-5.0, 2.0, 1.6))
+    ball = SphereLamp(np.array([1.0, 2.0, 3.0]), 0.25, np.array([40.0, 20.0, 10.0]))
+    edges = np.array([0.0, 0.0, 0.8]), np.array([-0.3, 0.4, 0.0])
+    flat = RectangleLamp(np.array([0.0, 2.0, -1.0]), *edges, np.array([9.0, 6.0, 0.0]))
+    path = tmp_path / "scene.usdz"
+    package = write_usdz(asset, np.eye(4), camera, folder / "sky.exr", (ball, flat))
+    path.write_bytes(package)
+    stage = Usd.Stage.Open(str(path))
+    round_one = UsdLux.SphereLight.Get(stage, "/scene/lamp_0")
+    square = UsdLux.RectLight.Get(stage, "/scene/lamp_1")
+    assert round_one.GetRadiusAttr().Get() == 0.25
+    for light, lamp in ((round_one, ball), (square, flat)):
+        assert light.GetNormalizeAttr().Get() is False
+        radiance = np.array(light.GetColorAttr().Get()) * light.GetIntensityAttr().Get()
+        np.testing.assert_allclose(radiance, lamp.radiance, rtol=1e-6)
+    pose = np.array(UsdGeom.XformCache().GetLocalToWorldTransform(square.GetPrim()))
+    half = np.array([square.GetWidthAttr().Get(), square.GetHeightAttr().Get()]) / 2.0
+    corners = {tuple(np.round([x, y, 0, 1] @ pose, 6)[:3]) for x in (-half[0], half[0])
+               for y in (-half[1], half[1])}  # fmt: skip
+    expected = {tuple(np.round(flat.corner + i * edges[0] + j * edges[1], 6)) for i in (0, 1)
+                for j in (0, 1)}  # fmt: skip
+    assert corners == expected
+    outward = np.cross(*edges)
+    np.testing.assert_allclose(-pose[2, :3], outward / np.linalg.norm(outward), atol=1e-9)
 
 
 def test_usdz_materials_read_the_same_texels(tmp_path: Path, rng: np.random.Generator) -> None:

@@ -24,6 +24,7 @@ from warpir.kernels.bsdf import (
     bsdf_sample,
     layers_toward,
 )
+from warpir.kernels.maths.fresnel import film_fresnel
 from warpir.kernels.types import Extensions, Layers
 from warpir.scene.sheen import TABLE_SIZE, sheen_albedo_table
 
@@ -38,10 +39,13 @@ MATERIALS = {
     "coat": LayeredMaterial(clearcoat=0.8, clearcoat_roughness=0.25, coat_n=TILTED),
     "lacquer": LayeredMaterial(clearcoat=1.0, clearcoat_roughness=0.03),
     "cloth": LayeredMaterial(sheen_color=(0.9, 0.3, 0.1), sheen_roughness=16 / 31),
+    "brushed": LayeredMaterial(anisotropy=0.7, stretch=0.9),
+    "film": LayeredMaterial(iridescence=0.8, film_ior=1.33, film_thickness=450.0),
+    "oil": LayeredMaterial(iridescence=1.0, film_ior=1.7, film_thickness=180.0, specular=0.8),
     "all": LayeredMaterial(
         ior=1.7, specular=0.8, specular_color=(1.0, 0.7, 0.4), transmission=0.3, clearcoat=0.6,
         clearcoat_roughness=0.4, coat_n=TILTED, sheen_color=(0.2, 0.6, 0.4),
-        sheen_roughness=22 / 31,
+        sheen_roughness=22 / 31, anisotropy=0.5, stretch=-1.2, iridescence=0.6, film_ior=2.2,
     ),
 }  # fmt: skip
 COS_O = float((29 / (TABLE_SIZE - 1)) ** 4)
@@ -69,6 +73,11 @@ def layers_of(
         m.clearcoat,
         m.clearcoat_roughness,
         coat_n,
+        m.anisotropy,
+        wp.vec3(m.stretch[0], m.stretch[1], 0.5),
+        m.iridescence,
+        m.film_ior,
+        m.film_thickness,
     )
 
 
@@ -123,8 +132,11 @@ def extensions(layers: LayeredMaterial, device: str) -> wp.array:
     f0 = ((1.0 - layers.ior) / (1.0 + layers.ior)) ** 2
     e.f0 = wp.vec3(*(f0 * c for c in layers.specular_color))
     e.sheen_color = wp.vec3(*layers.sheen_color)
-    names = ("specular", "transmission", "clearcoat", "clearcoat_roughness", "sheen_roughness")
-    for name in names:
+    e.stretch = wp.vec2(np.cos(layers.stretch), np.sin(layers.stretch))
+    for name in (
+        "specular", "transmission", "clearcoat", "clearcoat_roughness", "sheen_roughness",
+        "anisotropy", "iridescence", "film_ior", "film_thickness",
+    ):  # fmt: skip
         setattr(e, name, getattr(layers, name))
     return wp.array([e], dtype=Extensions, device=device)
 
@@ -223,8 +235,10 @@ def test_rays_that_stop_stand_for_those_that_pass(device: str, rng: np.random.Ge
 
 
 def test_dielectric_extensions_are_reciprocal(device: str, rng: np.random.Generator) -> None:
-    """``f(wo, wi) = f(wi, wo)`` with index, strength and colour of the reflection."""
-    layers = replace(MATERIALS["specular"], transmission=0.4)
+    """``f(wo, wi) = f(wi, wo)`` with index, strength, colour, stretch and film of the base."""
+    layers = replace(
+        MATERIALS["specular"], transmission=0.4, anisotropy=0.8, stretch=0.5, iridescence=0.9
+    )
     for _ in range(20):
         a, b = o.spherical(rng.uniform(0.1, 1.0, 2), rng.uniform(0.0, 6.28, 2)).astype(np.float32)
         there, back = (
@@ -234,33 +248,43 @@ def test_dielectric_extensions_are_reciprocal(device: str, rng: np.random.Genera
         np.testing.assert_allclose(there, back, rtol=2e-5)
 
 
-@pytest.mark.parametrize("cos_o", [COS_O, 0.25])
-@pytest.mark.parametrize("name", ["coat", "cloth", "all"])
-def test_layers_sample(device: str, rng: np.random.Generator, name: str, cos_o: float) -> None:
-    """Samples follow the density of coat, base and cosine, also beyond the coat's horizon."""
-    layers, wo = MATERIALS[name], outgoing(cos_o, 0.4)
-    u = upload(rng.random((SAMPLE_COUNT, 3)), wp.vec3, device)
+def sample(
+    layers: LayeredMaterial,
+    wo: np.ndarray,
+    base: tuple[tuple[float, float, float], float, float],
+    device: str,
+    rng: np.random.Generator,
+) -> np.ndarray:
+    """Draw `SAMPLE_COUNT` directions; ``base`` is its colour, metallic and roughness."""
     drawn = wp.zeros(SAMPLE_COUNT, dtype=wp.vec3, device=device)
     inputs = [
         wp.vec3(*map(float, wo)),
-        u,
+        upload(rng.random((SAMPLE_COUNT, 3)), wp.vec3, device),
         extensions(layers, device),
         wp.vec3(*layers.coat_n),
         upload(sheen_albedo_table(), float, device),
-        wp.vec3(0.6, 0.4, 0.3),
-        0.3,
-        0.4,
+        wp.vec3(*base[0]),
+        *base[1:],
     ]
     wp.launch(sample_kernel, SAMPLE_COUNT, inputs=inputs, outputs=[drawn], device=device)
-    wi = drawn.numpy().astype(np.float64)
-    color = (0.6, 0.4, 0.3)
+    return drawn.numpy().astype(np.float64)
+
+
+@pytest.mark.parametrize("cos_o", [COS_O, 0.25])
+@pytest.mark.parametrize("name", ["coat", "cloth", "brushed", "all"])
+def test_layers_sample(device: str, rng: np.random.Generator, name: str, cos_o: float) -> None:
+    """Samples follow the density of coat, base and cosine, also beyond the coat's horizon."""
+    layers, wo, color = MATERIALS[name], outgoing(cos_o, 0.4), (0.6, 0.4, 0.3)
+    wi = sample(layers, wo, (color, 0.3, 0.4), device, rng)
     p = Rows(layers, wi[:1], color, 0.3, 0.4, wo).evaluate(device)[3][0]
     n = np.asarray(layers.coat_n)
     x = o.normalize(np.cross([0.0, 1.0, 0.0], n))
     frame = np.stack([x, np.cross(n, x), n], axis=-1)
 
     def pdf(d: np.ndarray) -> np.ndarray:
-        base = p[1] * o.vndf_reflection_pdf(wo, d, float(o.ggx_alpha(0.4)))
+        alphas = o.stretch_alphas(0.4, layers.anisotropy)
+        turned = (o.across_stretch(w, layers.stretch) for w in (wo, d))
+        base = p[1] * o.stretch_reflection_pdf(*turned, *map(float, alphas))
         base = base + (1.0 - p[1]) * o.cosine_pdf(d)
         coat = o.vndf_reflection_pdf(
             wo @ frame, d @ frame, float(o.ggx_alpha(layers.clearcoat_roughness))
@@ -283,6 +307,74 @@ def test_layers_sample(device: str, rng: np.random.Generator, name: str, cos_o: 
         order=10,
     )
     assert verdict.passed, verdict
+
+
+@pytest.mark.parametrize("cos_o", [1.0, 0.5, 0.15])
+@pytest.mark.parametrize("stretch", [0.0, 0.5 * np.pi, 1.1])
+def test_brushed_white_metal(
+    device: str, rng: np.random.Generator, stretch: float, cos_o: float
+) -> None:
+    """The lobe's density integrates to 1, and visible normals lose what a single bounce does."""
+    layers, wo = LayeredMaterial(anisotropy=0.9, stretch=stretch), outgoing(cos_o)
+    wi = sample(layers, wo, ((1.0,) * 3, 1.0, 0.5), device, rng)
+    above = wi[wi[:, 2] > 0.0]
+    _, specular, pdf, _ = Rows(layers, above, 1.0, 1.0, 0.5, wo).evaluate(device)
+    weight = np.zeros(len(wi))
+    weight[: len(above)] = specular[:, 1] * above[:, 2] / pdf
+    assert weight.max() <= 1.0 + 1e-4
+    error = float(weight.std()) / np.sqrt(len(weight))
+    expected = albedo(layers, cos_o, 1.0, 1.0, device)
+    assert expected <= 1.0 and weight.mean() == pytest.approx(expected, abs=Z_MAX * error + 1e-4)
+    cosine, part = o.gauss_legendre(np.linspace(0, 1, 17) ** 2, 8)
+    phi = 2 * np.pi * (np.arange(512) + 0.5) / 512
+    rows = Rows(layers, o.spherical(cosine[:, None], phi).reshape(-1, 3), 1.0, 1.0, 0.5, wo)
+    density = rows.evaluate(device)[2].reshape(-1, 512).mean(axis=1)
+    share = len(above) / len(wi)
+    error = np.sqrt(share * (1.0 - share) / len(wi))
+    assert 2 * np.pi * density @ part == pytest.approx(share, abs=Z_MAX * error + 1e-4)
+
+
+@wp.kernel
+def film_kernel(
+    f0: wp.array[wp.vec3],
+    ior: wp.array[float],
+    thickness: wp.array[float],
+    cosine: wp.array[float],
+    out: wp.array[wp.vec3],
+):
+    i = wp.tid()
+    out[i] = film_fresnel(f0[i], ior[i], thickness[i], cosine[i])
+
+
+def film(f0: np.ndarray, *numbers: np.ndarray, device: str) -> np.ndarray:
+    """Return the kernel's reflectance of films; ``numbers`` are index, thickness and cosine."""
+    rows = np.broadcast_arrays(*numbers, f0[..., 0])[:3]
+    arrays = [upload(a, float, device) for a in rows]
+    out = wp.zeros(len(rows[0]), dtype=wp.vec3, device=device)
+    wp.launch(film_kernel, len(rows[0]), [upload(f0, wp.vec3, device), *arrays, out], device=device)
+    return out.numpy()
+
+
+def test_film_reflects_a_share(device: str, rng: np.random.Generator) -> None:
+    """No film takes light away or adds any, whatever its index, thickness and base."""
+    count = 20_000
+    extremes = rng.choice([0.0, 0.04, 0.5, 1.0], (count, 3))
+    thickness = 10.0 ** rng.uniform(-3.0, 5.0, count)
+    found = film(
+        extremes, 1.0 + rng.exponential(0.6, count), thickness, rng.random(count), device=device
+    )
+    assert np.isfinite(found).all() and found.min() >= 0.0 and found.max() <= 1.0
+
+
+def test_thick_film_has_no_color(device: str) -> None:
+    """Where the path is many wavelengths, the reflections of both surfaces add up as light does."""
+    cosine = np.linspace(0.1, 1.0, 20)
+    found = film(np.full((20, 3), 0.04), 1.33, 2e4, cosine, device=device)
+    first = o.schlick((0.33 / 2.33) ** 2, cosine)
+    inner = o.schlick((0.17 / 2.83) ** 2, np.sqrt(1.0 - (1.0 - cosine**2) / 1.33**2))
+    # Mean over the phase of what two surfaces reflect between them
+    expected = first + (1.0 - first) ** 2 * inner / (1.0 - first * inner)
+    np.testing.assert_allclose(found, np.tile(expected[:, None], 3), rtol=2e-5)
 
 
 def albedo(
@@ -351,7 +443,7 @@ def test_sheen_sample_weights_stay_bounded(device: str, rng: np.random.Generator
     assert np.all(pdf > 0.0) and weight.max() < 10.0
 
 
-@pytest.mark.parametrize("name", ["coat", "all"])
+@pytest.mark.parametrize("name", ["coat", "brushed", "film", "all"])
 def test_layers_gradient(device: str, rng: np.random.Generator, name: str) -> None:
     """Adjoints of the base's factors below coat and sheen, against float64 central differences."""
     rows = random_rows(MATERIALS[name], rng, 240)

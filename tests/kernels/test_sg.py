@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 import warp as wp
 
+from benchmarks.stability.case import upload
 from tests import oracles as o
 from warpir.kernels.maths.sg import sg_shape
 
@@ -15,11 +16,6 @@ VALUE_RTOL = 1e-4
 def shape_kernel(v: wp.array[wp.vec3], axis: wp.vec3, sharpness: float, shape: wp.array[float]):
     i = wp.tid()
     shape[i] = sg_shape(v[i], axis, sharpness)
-
-
-def upload(values: np.ndarray, dtype: type, device: str) -> wp.array:
-    values = np.ascontiguousarray(values, np.float32)
-    return wp.array(values, dtype=dtype, device=device)
 
 
 @pytest.mark.parametrize("sharpness", [1e-3, 0.1, 1.0, 30.0, 1e3, 1e5, 1e6])

@@ -44,7 +44,7 @@ from warpir.train.augmentation import discolour, erase, mirror, stretch
 from warpir.train.batches import PhotoBatch
 from warpir.train.light_loss import LightLoss
 from warpir.train.regressor import checkpoints_of, train_regressor
-from warpir.train.settings import TrainingSettings
+from warpir.train.stepping import TrainingSettings
 from warpir.train.validation import calibrated_temperature, measure, region_mass
 
 SMALL = RegressorConfig(

@@ -5,7 +5,7 @@ What stands in for guidance is a fixed image gradient, a target image, or one th
 
 import gc
 import resource
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from copy import deepcopy
 from dataclasses import replace
 from pathlib import Path
@@ -49,14 +49,7 @@ MEMORY_GROWTH = 4 << 20
 """Of 100 steps [byte]; measured: 0.2 MiB, and 10 (mis) to 28 MiB if every picture were kept."""
 STATM = Path("/proc/self/statm")
 
-
-@pytest.fixture(autouse=True)
-def _one_torch_thread() -> Iterator[None]:
-    """Tensors of a few hundred numbers are fifty times slower on threads that must share cores."""
-    before = torch.get_num_threads()
-    torch.set_num_threads(1)
-    yield
-    torch.set_num_threads(before)
+pytestmark = pytest.mark.usefixtures("one_thread")
 
 
 class NoisyPull(Pull):
@@ -649,7 +642,9 @@ def test_mis_takes_its_gradient_from_other_samples(device: str) -> None:
     def picture(seed: int) -> tuple[Tensor, Tensor]:
         curves = loop.unknowns.curve_fg(), loop.unknowns.curve_shadow()
         image = loop.view.image(*loop.lights(loop.fusion(2)), *curves, seed)
-        return image.detach(), torch.autograd.grad((image.cpu() * weight).sum(), leaf)[0]
+        (gradient,) = torch.autograd.grad((image.cpu() * weight).sum(), leaf)
+        with torch.no_grad():
+            return loop.view.image(*loop.lights(loop.fusion(2)), *curves, seed), gradient
 
     image = loop.composite(2).image
     (gradient,) = torch.autograd.grad((image.cpu() * weight).sum(), leaf)

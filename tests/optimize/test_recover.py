@@ -18,7 +18,9 @@ from warpir.app.command import parse
 from warpir.app.config import InsertConfig
 from warpir.app.finished import OtherRun, is_done
 from warpir.core.errors import ExitCode
+from warpir.core.limits import Limits
 from warpir.insert import main
+from warpir.io.lamps_file import read_lamps
 from warpir.lighting.scene_light import SceneLight
 from warpir.lighting.sg_light import narrowest
 from warpir.scene.light import Light, sun_lobe
@@ -31,6 +33,7 @@ GUIDED = (
 RESULTS = ("composite.png", "envmap.exr", "curves.json", *GUIDED)
 """What must not depend on whether the run was stopped."""
 CHEAP = {
+    "device": "cpu",  # whose sums have one order, so that bytes can be compared
     "guidance": "stable-diffusion",
     "prompt": "a small box",
     "class_images": "2",
@@ -321,7 +324,7 @@ def test_stopped_overwrite_resumes(folder: Path, finished: Path, tmp_path: Path)
         with pytest.raises(Killed):
             stop_hard([*argv(folder, out), "--overwrite"])
     assert results(out) == before
-    assert main([*argv(folder, out), "--resume", "--device", "cpu"]) == ExitCode.DONE
+    assert main([*argv(folder, out), "--resume"]) == ExitCode.DONE
     assert results(out) == results(finished)
 
 
@@ -389,7 +392,7 @@ def test_start_keeps_the_flux_of_a_sun_that_is_too_narrow(monkeypatch: pytest.Mo
     monkeypatch.setattr(recover, "start_level", lambda *_: 0.5)
     config = InsertConfig(sun=(30.0, 40.0), lobes=4, light_height=16)
     sun = Light(sun_lobe(30.0, 40.0, (5.0, 4.0, 3.0)))
-    run = cast(recover.Run, SimpleNamespace(config=config, inputs=None))
+    run = cast(recover.Run, SimpleNamespace(config=config, inputs=SimpleNamespace(lamps=())))
     curves = Curves.identity("reinhard")
     unknowns = recover.unknowns_of(run, recover.Start(SceneLight(sun, sun, curves, 0.0, ())))
     lobes = unknowns.light_fg.lobes()
@@ -405,6 +408,18 @@ def test_recovered_light_is_reused(folder: Path, finished: Path, tmp_path: Path)
     assert main(flags) == ExitCode.DONE
     assert digest(out)["envmap.exr"] == digest(finished)["envmap.exr"]
     assert digest(out)["curves.json"] == digest(finished)["curves.json"]
+
+
+def test_recovered_lamps_light_the_picture_and_are_written(folder: Path, tmp_path: Path) -> None:
+    out = tmp_path / "out"
+    lamp = {"lamp": "0.8,1.5,-3,0.1,20,1,0.5,0.25", "recover_lamps": ""}
+    few = {"steps": "3", "score_every": "0", "lora_steps": "1"}
+    assert main(argv(folder, out, **lamp, **few)) == ExitCode.DONE
+    (found,) = read_lamps(out / "lamps.json", Limits(), [])
+    (used,) = record(out)["measured"]["lamps"]
+    np.testing.assert_allclose(found.power, used["power"], rtol=1e-12)
+    assert not np.isclose(found.power, [20.0, 10.0, 5.0], rtol=1e-3).any()
+    np.testing.assert_allclose(found.center, [0.8, 1.5, -3.0])
 
 
 @pytest.mark.parametrize(

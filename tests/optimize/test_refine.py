@@ -20,7 +20,7 @@ from tests.builders.shapes import camera, ground, sphere
 from tests.builders.tiny_stable_diffusion import make_tiny_stable_diffusion
 from tests.conftest import devices
 from tests.statistics import compare_gradients
-from warpir.app.config import REFINE_PARTS, InsertConfig
+from warpir.app.config import REFINE_PARTS, InsertConfig, refused_refinement
 from warpir.app.settings import OptimizeSettings
 from warpir.core.errors import ExitCode, InputError
 from warpir.insert import main
@@ -771,3 +771,15 @@ def test_wrong_wishes_are_one_line(
     if "refine_materials" in changes:
         assert "(found 'red')" in line
     assert not out.exists()
+
+
+@pytest.mark.parametrize("what", ["material", "emission", "tone"])
+def test_solid_glass_keeps_its_materials(what: str) -> None:
+    """What comes through it has no gradient to materials; tone curves have one."""
+    glass = Material(name="pane", transmission=1.0, thickness=0.1)
+    given = {"photo": "room.jpg", "asset": "vase.glb", "sky": "overcast"}
+    config = InsertConfig().changed(**given, model="sd", prompt="a vase", refine=what)
+    problems = list(refused_refinement(config, Asset("vase", (), (Material(), glass))))
+    assert len(problems) == (what != "tone")
+    for problem in problems:
+        assert problem.code == ExitCode.USAGE and "'pane'" in str(problem)

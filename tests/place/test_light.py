@@ -50,6 +50,20 @@ def test_a_photo_that_shows_nothing_has_no_direction(found: Regression) -> None:
 
 
 @pytest.mark.slow
+def test_worker_prints_no_warnings(inputs: Path, capfd: pytest.CaptureFixture[str]) -> None:
+    """Numbers that overflow are an error of the page; NumPy's lines are for nobody."""
+    worker = Worker()
+    camera = camera_from_fov(480, 320, 60.0, -8.0, 1.6).record() | {"fx": 5e-324}
+    job = {"kind": "light", "config": {"photo": str(inputs / "photo.png")}, "camera": camera}
+    try:
+        with pytest.raises(InputError):
+            worker.ask(job)
+    finally:
+        worker.stop()
+    assert capfd.readouterr().err == ""
+
+
+@pytest.mark.slow
 def test_worker_answers_refuses_and_starts_again(inputs: Path) -> None:
     """A job that cannot be done is an error, one whose process was ended too; then another runs."""
     worker = Worker()

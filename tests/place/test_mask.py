@@ -3,12 +3,14 @@
 import base64
 import io
 import json
+import struct
 from pathlib import Path
 
 import numpy as np
 import pytest
 from PIL import Image
 
+from tests.builders.image_files import png_chunk
 from tests.builders.programs.browser import needs_chromium, open_browser
 from tests.builders.programs.placing import (
     HEIGHT,
@@ -30,6 +32,13 @@ def encoded(picture: Image.Image, kind: str = "PNG") -> str:
     return base64.b64encode(stream.getvalue()).decode()
 
 
+def promising(side: int) -> str:
+    """A PNG in base64 whose header promises a square of this side [px]."""
+    header = struct.pack(">II", side, side) + b"\x08\0\0\0\0"
+    content = base64.b64decode(encoded(Image.new("L", (4, 4))))
+    return base64.b64encode(content[:8] + png_chunk(b"IHDR", header) + content[33:]).decode()
+
+
 def test_mask_gets_the_size_of_the_photo() -> None:
     """Half of the page's mask is half of the photo's; one in which all is erased is none."""
     codes = np.zeros((20, 30), np.uint8)
@@ -43,9 +52,15 @@ def test_mask_gets_the_size_of_the_photo() -> None:
     assert mask_png((120, 80), {"mask": encoded(Image.new("L", (30, 20)))}) is None
 
 
+@pytest.mark.case("N21")
 @pytest.mark.parametrize(
     "mask",
-    [5, "?", base64.b64encode(b"no picture").decode(), encoded(Image.new("L", (4, 4)), "GIF")],
+    [
+        *(5, "?", base64.b64encode(b"no picture").decode()),
+        encoded(Image.new("L", (4, 4)), "GIF"),
+        promising(5000),
+        promising(60_000),  # Pillow itself refuses it, by an error of another kind
+    ],
 )
 def test_mask_that_is_none_is_refused(mask: object) -> None:
     """Whatever is no PNG in base64 is one line."""

@@ -202,12 +202,14 @@ def test_folder_replaces_its_own_only(inputs: Path, tmp_path: Path) -> None:
     assert sorted(p.name for p in (tmp_path / "out").iterdir()) == ["camera.json", "insert.json"]
 
 
+@pytest.mark.case("N19")
 @pytest.mark.parametrize(
     ("change", "words"),
     [
         ({"size": 0}, "--size"),
         ({"size": "large"}, "--size"),
         ({"fx": -3.0}, "focal length"),
+        ({"fy": 5e-324}, "focal length"),
         ({"fx": None}, "/fx"),
         ({"stance": 5}, "/x"),
         ({"stand": {"x": 0, "z": 50}}, "behind the camera"),

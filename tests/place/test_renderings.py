@@ -13,7 +13,7 @@ from tests.builders.programs.browser import needs_chromium, open_browser
 from tests.builders.programs.placing import STATE, command, open_page, serve, settle
 from warpir.core.errors import InputError
 from warpir.place.renderings import Renderings, policy_of
-from warpir.place.worker import Worker
+from warpir.place.worker import PATIENCE, Worker
 
 
 class Silent(Worker):
@@ -29,7 +29,7 @@ class Silent(Worker):
             time.sleep(0.01)
         raise InputError("the page", "stopped before it was done")
 
-    def stop(self) -> None:
+    def interrupt(self) -> None:
         """Let it go."""
         self.is_stopped = True
 
@@ -143,6 +143,34 @@ def test_preview_refuses_as_insert_does(inputs: Path, tmp_path: Path) -> None:
     try:
         with pytest.raises(InputError, match="none"):
             worker.ask(job)
-        assert worker.ask({"kind": "warm"})["device"]
+        good = {**config, "photo": str(inputs / "photo.png"), "out": "x"}
+        assert worker.ask({**job, "kind": "warm", "config": good})["device"]
+    finally:
+        worker.stop()
+
+
+@pytest.mark.slow
+def test_cancelled_job_leaves_what_is_loaded(
+    inputs: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The process lives on, and its kernels are kept though it is killed."""
+    monkeypatch.setenv("WARP_CACHE_PATH", str(tmp_path / "kernels"))
+    config = {"photo": str(inputs / "photo.png"), "asset": str(inputs / "wedge.glb")}
+    picture = tmp_path / "p.png"
+    job = {"config": {**config, "out": "x"}, "width": 64, "picture": str(picture)}
+    heard: list[str] = []
+    worker = Worker()
+    try:
+        worker.ask({**job, "kind": "warm"}, lambda said: heard.append(said["stage"]))
+        assert "compiling kernels" in heard
+        process = worker._process
+        with pytest.raises(InputError, match="stopped"):
+            worker.ask({**job, "kind": "preview"}, lambda _: worker.interrupt())
+        assert not picture.exists()
+        time.sleep(PATIENCE + 0.5)  # nothing ends the process later
+        assert worker.ask({**job, "kind": "preview"})["width"] == 64
+        assert worker._process is process and picture.exists()
+        worker.stop()
+        assert [f for f in (tmp_path / "kernels").rglob("*") if f.is_file()]
     finally:
         worker.stop()

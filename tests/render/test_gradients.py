@@ -29,6 +29,7 @@ from warpir.render.integrator import MaterialTensors, Radiance
 from warpir.render.mis.integrator import MisIntegrator
 from warpir.render.mis.samples import ObjectSamples, ReceiverSamples
 from warpir.render.renderer import Renderer
+from warpir.render.shadow.pilot import shaded_pixels
 from warpir.render.tone_curve import ToneCurve
 from warpir.scene.asset import Asset, Material, Primitive
 from warpir.scene.camera import Camera
@@ -199,7 +200,7 @@ def make_pipeline(device: str, depth: int, *materials: Material, bounce_depth: i
             raw[f"curve_{name}_{part}"] = normal(*values.shape)
     args = light_args(host_light(raw["texels"]), renderer.device)
     objects = renderer.gbuffer(0).object_pixels
-    shaded = renderer.shaded_pixels(args, 0)
+    shaded = shaded_pixels(renderer, args, 0)
     mis = MisIntegrator(renderer, objects, shaded, spp=4, rays=2, depth=depth)
     mask = renderer.foreground(args, objects, mis.spp, mis.rays, 1, SEED).mask
     photo = np.random.default_rng(0).uniform(0.2, 0.7, (HEIGHT, WIDTH, 3)).astype(np.float32)
@@ -222,17 +223,18 @@ def gradient_of(pipeline: Pipeline) -> dict[str, Tensor]:
 def test_pinned_render_equals_the_free_one(pipeline: Pipeline) -> None:
     """Records hold the picture: its light summed in float64, its materials by the kernel."""
     (radiance, light_record, vertex_record), (plane, *plane_records) = pipeline.drawn
+    light, materials = pipeline.raw["texels"], pipeline.materials(pipeline.raw)
+    leaf = light.clone().requires_grad_(True)
+    free = pipeline.mis.radiance(leaf, leaf, SEED, materials)
     with torch.no_grad():
-        light, materials = pipeline.raw["texels"], pipeline.materials(pipeline.raw)
-        free = pipeline.mis.radiance(light, light, SEED, materials)
         lit, unoccluded = receiver_sums(plane_records, light)
         reflected = object_sums(light_record, light)
         arrays = factor_arrays(pipeline.mis.renderer, plain_factors(materials))
     shaded = path_means(
         pipeline.samples[0], shade_vertices(pipeline.samples[0], vertex_record, arrays)
     )
-    np.testing.assert_array_equal(radiance, free.foreground)
-    np.testing.assert_array_equal(plane.lit, free.lit)
+    np.testing.assert_array_equal(radiance, free.foreground.detach())
+    np.testing.assert_array_equal(plane.lit, free.lit.detach())
     np.testing.assert_allclose(shaded, radiance, rtol=1e-5, atol=1e-6)
     np.testing.assert_allclose(lit, plane.lit, rtol=1e-5, atol=1e-6)
     np.testing.assert_allclose(unoccluded, plane.unoccluded, rtol=1e-5, atol=1e-6)

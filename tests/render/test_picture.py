@@ -22,6 +22,7 @@ from warpir.render.device_light import light_args
 from warpir.render.device_scene import Scene
 from warpir.render.renderer import Renderer
 from warpir.render.resizing import resize
+from warpir.render.shadow.picture import ShadowSamples, picture_ratio
 from warpir.render.tone_curve import Knots, ToneCurve
 from warpir.scene.asset import Material
 from warpir.scene.camera import Camera
@@ -105,14 +106,18 @@ def test_picture_equals_the_differentiable_composite(
     r, light = renderer(device), sunny()
     args = light_args(light, r.device)
     objects = r.gbuffer(QUALITY.seed).object_pixels
-    shaded = r.shaded_pixels(args, QUALITY.seed)
     out = r.foreground(args, objects, QUALITY.samples, QUALITY.rays, QUALITY.depth, QUALITY.seed)
-    sees = np.isin(shaded, objects).astype(np.int32)
-    plane = r.receiver(args, shaded, sees, QUALITY.samples, QUALITY.rays, QUALITY.seed)
+    coverage, sees = (
+        np.zeros(VIEW.width * VIEW.height),
+        np.zeros(VIEW.width * VIEW.height, np.int32),
+    )
+    coverage[objects], sees[objects] = out.mask, 1
+    samples = ShadowSamples(QUALITY.samples, QUALITY.rays, QUALITY.seed, QUALITY.indirect_limit)
+    shaded, ratio = picture_ratio(r, args, sees, coverage < 1.0, samples)
     constants = ComposeConstants(photo().linear(), objects, shaded, out.mask, device, is_reinhard)
     image = compose(
         constants,
-        *(torch.from_numpy(x) for x in (out.radiance, plane.lit, plane.unoccluded)),
+        *(torch.from_numpy(x) for x in (out.radiance, ratio, np.ones_like(ratio))),
         *(tensors(k) for k in curves),
     )
     found = image[0].permute(1, 2, 0).numpy()
@@ -278,8 +283,8 @@ def test_another_rendering_size_gives_the_photos_size(device: str, size: tuple[i
     other = picture(device, view=VIEW.scaled(*size))
     for field in fields(other.layers):
         plane = getattr(other.layers, field.name)
-        if field.name == "grain":
-            assert plane is None, "this picture's camera has none"
+        if field.name in {"grain", "mirror"}:
+            assert plane is None, "this picture has none"
             continue
         assert plane.shape == getattr(full.layers, field.name).shape, field.name
         assert not np.isnan(plane).any(), field.name

@@ -19,7 +19,7 @@ from tests.oracles import (
     sg_irradiance,
 )
 from tests.render.test_render import DOWN, foot, render, shadow
-from tests.render.test_transport import FLOOR, _objects, ratios_of
+from tests.render.test_transport import FLOOR, objects_of, ratios_of
 from tests.statistics import compare_gradients, z_test
 from warpir.app.command import parse
 from warpir.app.config import InsertConfig
@@ -37,6 +37,7 @@ from warpir.render.integrator import MaterialTensors
 from warpir.render.mis.integrator import MisIntegrator
 from warpir.render.mis.samples import ReceiverSamples
 from warpir.render.renderer import Renderer
+from warpir.render.shadow.pilot import shaded_pixels
 from warpir.render.transport.integrator import TransportIntegrator
 from warpir.render.transport.rows import TransportSettings
 from warpir.scene.asset import Material, Primitive
@@ -154,7 +155,7 @@ def test_ratio_is_exactly_one_where_nothing_is_blocked(device: str) -> None:
     np.testing.assert_array_equal(ratio, 1.0)
     np.testing.assert_array_equal(lit, unoccluded)
     assert unoccluded.max() > 0.0
-    assert renderer.shaded_pixels(light_args(light, renderer.device), 0).size == 0
+    assert shaded_pixels(renderer, light_args(light, renderer.device), 0).size == 0
     assert render(renderer, light).mask.max() == 0.0
 
 
@@ -309,7 +310,7 @@ def test_transport_agrees_with_mis_in_a_place(device: str) -> None:
     for seed in range(12):
         other.append(reference.radiance(light, light, 1000 + seed))
         other_gradients.append(gradient(other[-1]))
-    for mine, theirs in ((_objects(own), _objects(other)), (ratios_of(own), ratios_of(other))):
+    for mine, theirs in ((objects_of(own), objects_of(other)), (ratios_of(own), ratios_of(other))):
         variance = mine[1] + theirs[1]
         # A dozen runs: outliers of a t distribution.
         assert z_test(mine[0], theirs[0], 2.0 * variance + FLOOR**2).passed

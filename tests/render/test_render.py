@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+import warp as wp
 from numpy.typing import NDArray
 from scipy.interpolate import CubicSpline
 from scipy.ndimage import maximum_filter, minimum_filter
@@ -33,9 +34,11 @@ from tests.oracles import (
 from tests.statistics import z_test
 from warpir.core.arrays import Float64Array, FloatArray, Int64Array
 from warpir.core.color import srgb_to_linear
+from warpir.render.device import load_kernels
 from warpir.render.device_light import light_args
 from warpir.render.device_scene import Placed, Scene
 from warpir.render.renderer import Foreground, Renderer
+from warpir.render.shadow.pilot import shaded_pixels
 from warpir.scene.asset import Material, Primitive, Texture, TextureSlot
 from warpir.scene.camera import Camera
 from warpir.scene.light import Light
@@ -305,7 +308,7 @@ def test_shadow_ratio_is_exactly_one_where_nothing_is_blocked(device: str, light
         np.testing.assert_array_equal(ratio, 1.0)
         np.testing.assert_array_equal(lit, unoccluded)
         assert unoccluded.max() > 0.0
-        assert renderer.shaded_pixels(light_args(light, renderer.device), 0).size == 0
+        assert shaded_pixels(renderer, light_args(light, renderer.device), 0).size == 0
         assert render(renderer, light).mask.max() == 0.0
 
 
@@ -403,7 +406,10 @@ def test_contact_shadow_matches_the_closed_form(device: str, gap: float) -> None
 
 
 def test_box_on_the_ground_makes_no_speckle(device: str) -> None:
-    """A box whose bottom lies in the plane: 0 under it, smooth beside it, 1 on the sunny side."""
+    """A box whose bottom lies in the plane: 0 under it, smooth beside it, 1 on the sunny side.
+
+    In its shadow the ratio is what the sampled loss leaves of the open plane's light.
+    """
     rest = placed(box((0.0, 0.5, 0.0), (1.0, 1.0, 1.0)))
     view = from_above(20, 20, 0.1)
     renderer = make(rest, view, device, 0.0)
@@ -420,7 +426,7 @@ def test_box_on_the_ground_makes_no_speckle(device: str) -> None:
     ratio, _, _ = shadow(renderer, sun, 64)
     np.testing.assert_array_equal(ratio[beside & (x > 0.0)], 1.0)
     in_shadow = (x > -1.4) & (x < -0.56) & (np.abs(z) < 0.44)
-    np.testing.assert_array_equal(ratio[in_shadow], 0.0)
+    assert 0.0 <= ratio[in_shadow].min() and ratio[in_shadow].max() < 5e-4
 
 
 def test_sheet_on_the_ground_is_seen_whole(device: str) -> None:
@@ -493,7 +499,7 @@ def stages(renderer: Renderer, seed: int = 7) -> list[NDArray[np.generic]]:
     out = render(renderer, light, 4, 2, 3, seed)
     _, lit, unoccluded = shadow(renderer, light, 4, 2, seed, sees=1)
     arrays = [*vars(gbuffer).values(), *vars(out).values(), lit, unoccluded]
-    return [*arrays, renderer.shaded_pixels(args, seed)]
+    return [*arrays, shaded_pixels(renderer, args, seed)]
 
 
 @pytest.mark.parametrize("threads", [2, 5])
@@ -1026,7 +1032,7 @@ def test_one_pixel_image(device: str) -> None:
     args = light_args(light, renderer.device)
     gbuffer = renderer.gbuffer(0, 64)
     assert gbuffer.object_pixels.tolist() == [0]
-    shaded = renderer.shaded_pixels(args, 0)
+    shaded = shaded_pixels(renderer, args, 0)
     assert shaded.tolist() in ([], [0])
     out = render(renderer, light, 64, depth=2)
     ratio, _, _ = shadow(renderer, light, 64, sees=1)
@@ -1048,7 +1054,7 @@ def test_object_out_of_view_is_not_traced(device: str) -> None:
     tower = make(placed(box((0.0, 10.0, 4.0), (2.0, 20.0, 2.0))), view, device, 0.0)
     low_sun = lobe((0.0, 0.5, 1.0), 1e4)
     assert tower.gbuffer(0).object_pixels.size == 0
-    assert tower.shaded_pixels(light_args(low_sun, tower.device), 0).size > 50
+    assert shaded_pixels(tower, light_args(low_sun, tower.device), 0).size > 50
 
 
 MEMORY_CHILD = """
@@ -1078,3 +1084,13 @@ print(peaks[2] - peaks[1])
 def test_memory_is_flat_in_samples(device: str) -> None:
     """Peak memory at 1024 samples is that at 64: nothing is kept per sample (issue 2)."""
     assert int(output_of(MEMORY_CHILD.format(device=device)).split()[-1]) < MEMORY_GROWTH
+
+
+def test_load_kernels_says_how_many_are_there() -> None:
+    """The share of the modules that are there grows to 1."""
+    shares: list[float] = []
+    device = wp.get_device("cpu")
+    load_kernels(device, [(False, False, False, False)], lambda stage, share: shares.append(share))
+    assert shares == sorted(shares)
+    assert shares[-1] == 1.0
+    assert len(shares) == len(set(shares)) > 3

@@ -1,5 +1,6 @@
 """`transport` against `mis` on one map, its algebra, its gradients, its cache and its choices."""
 
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
@@ -145,7 +146,13 @@ def test_transport_agrees_with_mis(
     sun: float,
 ) -> None:
     """Object and plane have the expectation of `mis` under one map: pixels, and their sum."""
-    renderer = scene_of(device, roughness, metallic)
+    own, other = both_ways(scene_of(device, roughness, metallic), depth, sun)
+    check_equal(objects_of(own), objects_of(other), 2 * len(CASES))
+    check_equal(ratios_of(own), ratios_of(other), 2 * len(CASES))
+
+
+def both_ways(renderer: Renderer, depth: int, sun: float) -> tuple[list[Radiance], list[Radiance]]:
+    """Radiance under one light by rows of recorded directions, and by `mis`, of several seeds."""
     objects, proxies = pixels_of(renderer)
     light = Light(lobes=lights(sun))
     texels = torch.from_numpy(as_map(light, HEIGHT))
@@ -157,23 +164,28 @@ def test_transport_agrees_with_mis(
     ]
     reference = MisIntegrator(renderer, objects, proxies, spp=512, rays=1, depth=depth)
     other = [reference.radiance(texels, texels, 1000 + seed) for seed in range(RUNS)]
-    for mine, theirs in (
-        (_objects(own), _objects(other)),
-        (ratios_of(own), ratios_of(other)),
-    ):
-        variance = mine[1] + theirs[1]
-        assert z_test(mine[0], theirs[0], variance + FLOOR**2).passed
-        total = (mine[0] - theirs[0]).sum() / np.sqrt(variance.sum())
-        assert 2.0 * stats.norm.sf(abs(total)) > sidak(0.01, 2 * len(CASES)), total
+    return own, other
 
 
-def _objects(runs: list[Radiance]) -> tuple[Float64Array, Float64Array]:
+Moments = tuple[Float64Array, Float64Array]
+"""Means and their variances."""
+
+
+def check_equal(mine: Moments, theirs: Moments, tests: int) -> None:
+    """Compare pixels, and their sum, which is one of several tests."""
+    variance = mine[1] + theirs[1]
+    assert z_test(mine[0], theirs[0], variance + FLOOR**2).passed
+    total = (mine[0] - theirs[0]).sum() / np.sqrt(variance.sum())
+    assert 2.0 * stats.norm.sf(abs(total)) > sidak(0.01, tests), total
+
+
+def objects_of(runs: list[Radiance]) -> Moments:
     """Mean of the object's radiance over runs, and the variance of that mean."""
     stack = np.stack([r.foreground.detach().cpu().numpy() for r in runs]).astype(np.float64)
     return stack.mean(axis=0), stack.var(axis=0, ddof=1) / len(runs)
 
 
-def ratios_of(runs: list[Radiance]) -> tuple[Float64Array, Float64Array]:
+def ratios_of(runs: list[Radiance]) -> Moments:
     """Quotient of mean ``lit`` and ``unoccluded`` over runs, and its variance, linearised."""
     lit, unoccluded = (
         np.stack([getattr(r, name).detach().cpu().numpy() for r in runs]).astype(np.float64)
@@ -184,55 +196,50 @@ def ratios_of(runs: list[Radiance]) -> tuple[Float64Array, Float64Array]:
     return ratio, residual.var(axis=0, ddof=1) / len(runs)
 
 
-@pytest.mark.slow
-def test_transport_gradient_agrees_with_mis(device: str) -> None:
-    """The light's gradient has the direction and the size of that of `mis` on the same map."""
-    renderer = scene_of(device)
+def check_light_gradient(
+    renderer: Renderer, depth: int, tracings: int, runs: int, *, of_object: bool
+) -> None:
+    """Compare direction and size of the light's gradient with that of `mis` on the same map."""
     objects, proxies = pixels_of(renderer)
     light = Light(lobes=lights())
     texels = torch.tensor(as_map(light, HEIGHT), requires_grad=True)
     rng = np.random.default_rng(3)
-    weight_fg = torch.tensor(rng.uniform(0.5, 1.5, (len(objects), 3)), dtype=torch.float32)
-    weight_ratio = torch.tensor(rng.uniform(0.5, 1.5, (len(proxies), 3)), dtype=torch.float32)
+    weight_fg, weight_ratio = (
+        torch.tensor(rng.uniform(0.5, 1.5, (len(pixels), 3)), dtype=torch.float32)
+        for pixels in (objects, proxies)
+    )
 
     def gradient(integrator: TransportIntegrator | MisIntegrator, seed: int) -> Float64Array:
-        handed = texels
-        out = integrator.radiance(handed, handed, seed)
+        out = integrator.radiance(texels, texels, seed)
         ratio = out.lit / out.unoccluded.clamp(min=1e-6)
-        loss = (out.foreground.cpu() * weight_fg).sum() + (ratio.cpu() * weight_ratio).sum()
+        loss = (ratio.cpu() * weight_ratio).sum()
+        if of_object:
+            loss = loss + (out.foreground.cpu() * weight_fg).sum()
         (d_texels,) = torch.autograd.grad(loss, texels)
         return d_texels.double().numpy()
 
-    own = np.mean(
-        [
-            gradient(TransportIntegrator(renderer, objects, proxies, 2, EXACT, light, s), 0)
-            for s in range(8)
-        ],
-        axis=0,
-    )
-    reference = MisIntegrator(renderer, objects, proxies, spp=256, rays=1, depth=2)
-    match = compare_gradients(own, np.mean([gradient(reference, s) for s in range(16)], axis=0))
+    own = [
+        gradient(TransportIntegrator(renderer, objects, proxies, depth, EXACT, light, s), 0)
+        for s in range(tracings)
+    ]
+    reference = MisIntegrator(renderer, objects, proxies, spp=256, rays=1, depth=depth)
+    theirs = [gradient(reference, s) for s in range(runs)]
+    match = compare_gradients(np.mean(own, axis=0), np.mean(theirs, axis=0))
     assert match.cosine > COSINE and abs(match.signed_bias) < SIGNED_BIAS, match
 
 
-def test_transport_gradient_matches_central_differences(device: str) -> None:
-    """Gradients with respect to texels are those of the very function that radiance computes."""
-    renderer = scene_of(device)
-    objects, proxies = pixels_of(renderer)
-    light = Light(lobes=lights(20.0))
-    made = TransportIntegrator(renderer, objects, proxies, 2, EXACT, light)
-    texels = torch.tensor(as_map(light, HEIGHT), requires_grad=True)
+@pytest.mark.slow
+def test_transport_gradient_agrees_with_mis(device: str) -> None:
+    """Of object and shadow ratio."""
+    check_light_gradient(scene_of(device), 2, tracings=8, runs=16, of_object=True)
 
-    def loss(texels: torch.Tensor) -> torch.Tensor:
-        out = made.radiance(texels, texels, 0)
-        weight = torch.linspace(0.5, 1.5, 3)
-        ratio = out.lit / out.unoccluded
-        return ((out.foreground * weight).double() ** 2).sum() + (ratio.double() ** 3).sum()
 
+def check_map_gradient(loss: Callable[[torch.Tensor], torch.Tensor], lobes: Lobes) -> None:
+    """Compare a loss's gradient by some texels of a map with central differences."""
+    texels = torch.tensor(as_map(Light(lobes=lobes), HEIGHT), requires_grad=True)
     (gradient,) = torch.autograd.grad(loss(texels), texels)
     picked = np.linspace(0, texels.numel() - 1, 48).astype(int)
-    numeric = np.zeros(len(picked))
-    step = 0.05
+    numeric, step = np.zeros(len(picked)), 0.05
     for k, index in enumerate(picked):
         sides = []
         for sign in (1.0, -1.0):
@@ -242,6 +249,21 @@ def test_transport_gradient_matches_central_differences(device: str) -> None:
         numeric[k] = (sides[0] - sides[1]) / (2.0 * step)
     match = compare_gradients(gradient.reshape(-1)[picked].numpy(), numeric)
     assert match.relative_l2 < 0.02 and match.cosine > 0.999, match
+
+
+def test_transport_gradient_matches_central_differences(device: str) -> None:
+    """Gradients with respect to texels are those of the very function that radiance computes."""
+    renderer = scene_of(device)
+    objects, proxies = pixels_of(renderer)
+    made = TransportIntegrator(renderer, objects, proxies, 2, EXACT, Light(lobes=lights(20.0)))
+
+    def loss(texels: torch.Tensor) -> torch.Tensor:
+        out = made.radiance(texels, texels, 0)
+        weight = torch.linspace(0.5, 1.5, 3)
+        ratio = out.lit / out.unoccluded
+        return ((out.foreground * weight).double() ** 2).sum() + (ratio.double() ** 3).sum()
+
+    check_map_gradient(loss, lights(20.0))
 
 
 def test_transport_adjoint_and_linearity(device: str) -> None:

@@ -206,7 +206,7 @@ SENTENCES = {
     "C9-nested": "JSON nested too deeply (limit 100); --max-nesting raises it",
     "foreign": "not a camera that warpir reads (found keys 'camera_angle_x'; expected fx fy cx cy "
     "w h c2w, or a file of fSpy, COLMAP, nerfstudio, Waymo or glTF)",
-    "focal": "/fx: not a focal length (found -1; expected > 0)",
+    "focal": "/fx: not a focal length (found -1; expected at least 1e-06 px)",
     "focal-bool": "/fx: not a number that can be used (found True)",
     "size": "/w: not an image size (found 0; expected whole pixels)",
 }

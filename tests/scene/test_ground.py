@@ -20,7 +20,7 @@ from warpir.io.cameras.source import PhotoCamera, turned
 from warpir.io.images.photos import read_photo
 from warpir.io.meshes.point_cloud import read_point_cloud
 from warpir.scene.camera import Camera, camera_from_fov
-from warpir.scene.free_space import Cloud, find_place, points_in_way
+from warpir.scene.free_space import Cloud, Stand, find_place
 from warpir.scene.ground import fit_ground, in_view
 from warpir.scene.placement import Placement, place_asset, y_to
 
@@ -273,9 +273,10 @@ def test_points_in_way_are_those_over_the_footprint() -> None:
     inside = [[1.0, 0.5, -12.0], [3.5, 0.2, -12.0], [1.0, 1.4, -10.8]]  # the last two by the margin
     low, top, beside, front = [1, 0.14, -12], [1, 1.6, -12], [4.0, 1, -12], [1, 1, -10.5]
     points = np.array([*inside, low, top, beside, front], np.float64)
-    found = points_in_way(placed.asset_to_world, *CAR, cloud_of(points))
+    stand = Stand(placed.asset_to_world, *CAR, CAMERA)
+    found = stand.points_in_way(cloud_of(points))
     np.testing.assert_array_equal(found, inside)
-    noisy = points_in_way(placed.asset_to_world, *CAR, cloud_of(points, 0.06))
+    noisy = stand.points_in_way(cloud_of(points, 0.06))
     assert len(noisy) == 2  # a point 0.2 m up may be of a ground that is off by 0.06 m
 
 
@@ -290,13 +291,17 @@ def test_free_place_avoids_what_stands_there(rng: np.random.Generator, scale: fl
     parked = rng.uniform([-0.9, 0.0, -11.0], [0.9, 1.5, -6.0], (500, 3))
     camera = camera_from_fov(640, 480, 60.0, -8.0, 1.7 * scale)
     put = put_car(camera, scale)
-    empty = find_place(put, *CAR, camera, plane(), cloud_of(scale * road, NOISE * scale))
+
+    def stand(place: tuple[float, float, float]) -> Stand:
+        return Stand(put(place).asset_to_world, *CAR, camera)
+
+    empty = find_place(stand, camera, plane(), cloud_of(scale * road, NOISE * scale))
     assert 5.0 < -empty[2] / scale < 30.0
     assert abs(camera.project(np.array([empty]))[0, 0] - 320.0) < 30.0
     cloud = cloud_of(scale * np.concatenate([road, parked]), NOISE * scale)
-    place = find_place(put, *CAR, camera, plane(), cloud)
-    assert len(points_in_way(put(empty).asset_to_world, *CAR, cloud)) > 50
-    assert len(points_in_way(put(place).asset_to_world, *CAR, cloud)) == 0
+    place = find_place(stand, camera, plane(), cloud)
+    assert len(stand(empty).points_in_way(cloud)) > 50
+    assert len(stand(place).points_in_way(cloud)) == 0
     # Not behind it either: no point of the parked car is seen in front of the box.
     right = max(abs(place[0]) / scale, 0.0)
     assert right > 1.5
@@ -307,7 +312,13 @@ def test_no_free_place_is_refused(rng: np.random.Generator) -> None:
     """A crowd everywhere, in one line."""
     points = rng.uniform([-30, 0, -60], [30, 1.8, -1], (6000, 3))
     with pytest.raises(InputError, match="no free place") as caught:
-        find_place(put_car(), *CAR, CAMERA, plane(), cloud_of(points))
+        put = put_car()
+        find_place(
+            lambda place: Stand(put(place).asset_to_world, *CAR, CAMERA),
+            CAMERA,
+            plane(),
+            cloud_of(points),
+        )
     assert caught.value.where == "--ground-points"
 
 

@@ -336,17 +336,45 @@ def test_upload_refuses_what_is_not_finite(device: str, light: Light, words: str
     assert caught.value.code == ExitCode.NUMERIC
 
 
-def test_upload_shares_the_proposal_by_flux(device: str) -> None:
-    """Lobes and map are drawn by their luminous flux, and all probabilities sum to 1."""
+def test_upload_shares_the_proposal_by_the_root_of_the_flux(device: str) -> None:
+    """Strong parts have sixteenths in proportion to the root of their flux; the sum is 1."""
     texels = np.full((8, 16, 3), 1.0, np.float32)
     light = Light(lobe(UP, 10.0, (5.0, 5.0, 5.0)).lobes, texels)
     args = light_args(light, device)
-    lobe_flux, map_flux = 5.0 * float(sg_flux(10.0)), 4.0 * np.pi
-    assert args.map_prob == pytest.approx(map_flux / (map_flux + lobe_flux), rel=FLOAT32)
+    root = np.sqrt([4.0 * np.pi, 5.0 * float(sg_flux(10.0))])
+    assert args.map_prob == round(16.0 * root[0] / root.sum()) / 16.0 == 11.0 / 16.0
+    assert args.bright_prob == 0.0
     assert args.lobe_prob.numpy().sum() + args.map_prob == pytest.approx(1.0, rel=FLOAT32)
-    table = args.texel_prob.numpy()
+    table = args.texel_prob.numpy() / args.map_prob
     expected = texel_solid_angle(8, 16) / (4.0 * np.pi)
     np.testing.assert_allclose(table, np.tile(expected[:, None], (1, 16)), rtol=1e-4, atol=1e-8)
+    texels[2, 5] = 1000.0
+    args = light_args(Light(texels=texels), device)
+    flux = texel_solid_angle(8, 16)[2] * 1000.0
+    root = np.sqrt([4.0 * np.pi, flux])
+    assert args.bright_prob == round(16.0 * root[1] / root.sum()) / 16.0
+    assert args.texel_prob.numpy()[2, 5] == pytest.approx(args.bright_prob, rel=FLOAT32)
+
+
+def test_upload_draws_weak_lobes_by_flux_after_the_strong(device: str) -> None:
+    """Strong lobes come first, in sixteenths; forty weak ones share what is left by their flux."""
+    rng = np.random.default_rng(5)
+    axis = rng.normal(size=(42, 3))
+    axis /= np.linalg.norm(axis, axis=1, keepdims=True)
+    level = np.append(np.linspace(0.5, 1.5, 40), [400.0, 60.0])
+    amplitude = np.repeat(level[:, None], 3, axis=1)
+    lobes = Lobes(*(a.astype(np.float32) for a in (amplitude, axis, np.full(42, 30.0))))
+    args = light_args(Light(lobes), device)
+    prob = args.lobe_prob.numpy().astype(np.float64)
+    np.testing.assert_allclose(args.axis.numpy()[:2], lobes.axis[-2:])
+    np.testing.assert_array_equal(prob[:2] * 16.0, np.round(prob[:2] * 16.0))
+    np.testing.assert_allclose(prob[2:] / prob[2:].sum(), level[39::-1] / 40.0, rtol=1e-6)
+    assert prob.sum() == pytest.approx(1.0)
+
+
+def test_upload_of_a_black_light_is_a_proposal_too(device: str) -> None:
+    """Black maps and lobes are drawn all the same."""
+    texels = np.ones((8, 16, 3), np.float32)
     for black in (Light(texels=0.0 * texels), lobe(UP, 3.0, (0.0, 0.0, 0.0))):
         args = light_args(black, device)
         assert args.map_prob + args.lobe_prob.numpy().sum() == pytest.approx(1.0)

@@ -143,6 +143,20 @@ def test_finished_frames_are_left_alone(
     assert "frames: 3, of which 3 are done already" in capsys.readouterr().out
 
 
+def stop_at_the_second_picture(monkeypatch: pytest.MonkeyPatch) -> list[int]:
+    """Interrupt the second frame once; what is returned has an element for each that began."""
+    make_picture, calls = warpir.report.result.make_picture, []
+
+    def stop_at_the_second(*args: Any, **kwargs: Any) -> Any:
+        calls.append(1)
+        if len(calls) == 2:
+            raise KeyboardInterrupt
+        return make_picture(*args, **kwargs)
+
+    monkeypatch.setattr(warpir.report.result, "make_picture", stop_at_the_second)
+    return calls
+
+
 def test_interrupted_sequence_goes_on(
     frames: tuple[list[str], Path],
     tmp_path: Path,
@@ -153,15 +167,7 @@ def test_interrupted_sequence_goes_on(
     argv, finished = frames
     argv = [*argv]
     argv[argv.index("--out") + 1] = str(tmp_path / "out")
-    make_picture, calls = warpir.report.result.make_picture, []
-
-    def stop_at_the_second(*args: Any, **kwargs: Any) -> Any:
-        calls.append(1)
-        if len(calls) == 2:
-            raise KeyboardInterrupt
-        return make_picture(*args, **kwargs)
-
-    monkeypatch.setattr(warpir.report.result, "make_picture", stop_at_the_second)
+    calls = stop_at_the_second_picture(monkeypatch)
     assert main(argv) == 130
     assert (tmp_path / "out" / "0001" / "run.json").exists()
     assert not (tmp_path / "out" / "0002").exists()
@@ -214,15 +220,7 @@ def test_renewed_sequence_keeps_what_is_done(
     copy_of(frames[1], out)
     changed = [FRAMES[0], *({**frame, "seed": 9} for frame in FRAMES[1:])]
     config = parse(argv_of(inputs, first, write_lines(tmp_path / "s", changed, inputs), out)).config
-    make_picture, calls = warpir.report.result.make_picture, []
-
-    def stop_at_the_second(*args: Any, **kwargs: Any) -> Any:
-        calls.append(1)
-        if len(calls) == 2:
-            raise KeyboardInterrupt
-        return make_picture(*args, **kwargs)
-
-    monkeypatch.setattr(warpir.report.result, "make_picture", stop_at_the_second)
+    calls = stop_at_the_second_picture(monkeypatch)
     with pytest.raises(KeyboardInterrupt):
         insert_now(config, renews=True)
     insert_now(config, renews=True)

@@ -1,5 +1,6 @@
 """A study with people: its pages and its figures. All answers here are constructed."""
 
+import hashlib
 import json
 import math
 import random
@@ -720,6 +721,7 @@ def test_score_refuses_bad_answers_and_lists_them(scenes: Path, tmp_path: Path) 
     assert lines[1].startswith("also: ") and "zero.json" in lines[1]
 
 
+@pytest.mark.case("N20")
 def test_score_refuses_the_rest(scenes: Path, tmp_path: Path) -> None:
     study = make(scenes, tmp_path / "study")
     refuse(["score", "study"], 3, "no answers", cwd=tmp_path)
@@ -744,6 +746,19 @@ def test_score_refuses_the_rest(scenes: Path, tmp_path: Path) -> None:
     for damage in ({"raters": 3}, {"pairs": []}, {"format": 2}, {"seed": "x"}):
         key.write_text(json.dumps(whole | damage))
         refuse(["score", "study"], 3, "key.json", cwd=tmp_path)
+    first = whole["raters"][0]
+    for wrong in ({"token": []}, {"run": 2}, {"run": 10**100}, {"run": None}):
+        key.write_text(json.dumps(whole | {"raters": [first | wrong, *whole["raters"][1:]]}))
+        refuse(["score", "study"], 3, "key.json", "damaged", cwd=tmp_path)
+    for wrong in ({"pair": -1}, {"pair": 0.0}, {"pair": 10**9}, {"id": {}}, {"a_side": 3}):
+        trials = [first["trials"][0] | wrong, *first["trials"][1:]]
+        changed = [first | {"trials": trials}, *whole["raters"][1:]]
+        key.write_text(json.dumps(whole | {"raters": changed}))
+        refuse(["score", "study"], 3, "key.json", "damaged", cwd=tmp_path)
+    protocol.write_text(text.replace('"runs": 1', '"runs": 1000000000000'))
+    digest = hashlib.sha256(protocol.read_bytes()).hexdigest()
+    key.write_text(json.dumps(whole | {"protocol_sha256": digest}))
+    refuse(["score", "study"], 3, "key.json", "1000000000000 runs", cwd=tmp_path)
 
 
 def test_figures_replace_nothing_but_figures(

@@ -24,6 +24,7 @@ from tools.demo.body import (
     on_end,
     on_side,
 )
+from tools.demo.cabin import cabin
 from tools.demo.mesh import (
     Surface,
     both_sides,
@@ -49,7 +50,9 @@ from warpir.scene.asset import Asset, Material, Primitive, Texture, TextureSlot
 MATERIALS = (
     Material("paint", (0.006, 0.110, 0.128), metallic=0.0, roughness=0.08),
     Material("roof", (0.62, 0.59, 0.51), metallic=0.0, roughness=0.10),
-    Material("glass", (0.012, 0.015, 0.016), metallic=0.0, roughness=0.02),
+    Material("glass", metallic=0.0, roughness=0.0, transmission=1.0),
+    Material("lining", (0.16, 0.15, 0.14), metallic=0.0, roughness=0.9),
+    Material("seat", (0.20, 0.085, 0.045), metallic=0.0, roughness=0.55),
     Material("chrome", (0.76, 0.77, 0.78), metallic=1.0, roughness=0.09),
     Material("alloy", (0.66, 0.67, 0.68), metallic=1.0, roughness=0.28),
     Material("rubber", (0.022, 0.022, 0.023), metallic=0.0, roughness=0.75),
@@ -280,7 +283,7 @@ def _trim() -> list[Part]:
     glass = _disc(0.082, 0.059, -0.012)
     place = np.array([0.835, 1.055, 0.545])
     parts.append(("chrome", both_sides(shell.moved(place))))
-    parts.append(("glass", both_sides(glass.moved(place))))
+    parts.append(("reflector", both_sides(glass.moved(place))))
     parts.append(
         (
             "black",
@@ -388,6 +391,7 @@ def car() -> Asset:
     """Make the car: about 3.6 m long, standing on y = 0, front +Z."""
     parts = [
         *body(),
+        *cabin(),
         *_wells(),
         *_wheels(),
         *_head_lamps(),

@@ -1,10 +1,11 @@
 """Make the demo's files: car, light, camera and photo.
 
-    python -m tools.demo.make [--content-only] [--truth FILE] [--samples N] [--device cpu|cuda]
+    python -m tools.demo.make [--content-only] [--wet] [--truth FILE] [--samples N]
 
 The photo is the place without the car, path-traced with warpir's own renderer under the light that
 is shipped beside it, and clipped like a sensor. The truth, on request, is the same picture with
-the car really standing in the scene. Both are encoded with gamma 2.2, which `warpir.insert`
+the car really standing in the scene. With ``--wet`` both show the square after rain. Both are
+encoded with gamma 2.2, which `warpir.insert`
 undoes. Deterministic: the same seed gives the same bytes on the same device.
 """
 
@@ -22,7 +23,7 @@ from tools.demo.car import car
 from tools.demo.place import background, camera, placement
 from tools.demo.sky import sky
 from warpir.core.latlong import look_up
-from warpir.demo import ASSET, CAMERA, LIGHT, PHOTO
+from warpir.demo import ASSET, CAMERA, LIGHT, PHOTO, WET_PHOTO
 from warpir.io.gltf.writer import write_glb
 from warpir.scene.camera import Camera
 
@@ -73,14 +74,13 @@ def pixel_directions(view: Camera) -> NDArray[np.float64]:
     return directions
 
 
-def render(with_car: bool, samples: int, device: str | None, seed: int = 0) -> NDArray[np.float32]:
+def render(
+    with_car: bool, is_wet: bool, samples: int, device: str | None, seed: int = 0
+) -> NDArray[np.float32]:
     """Path-trace the place under the shipped light; on two CPU cores this takes an hour.
 
-    Args:
-        with_car: Whether the car stands in it.
-        samples: Camera samples per pixel.
-        device: ``cpu``, ``cuda``, or the best there is.
-        seed: Of all random numbers.
+    The car stands in it or not, and it has rained or not. The device is ``cpu``, ``cuda``, or the
+    best there is.
 
     Returns:
         Linear Rec.709 radiance, shape [H, W, 3].
@@ -93,7 +93,7 @@ def render(with_car: bool, samples: int, device: str | None, seed: int = 0) -> N
     from warpir.scene.light import Light
 
     view = camera()
-    objects = [Placed(background(), np.eye(4))]
+    objects = [Placed(background(is_wet), np.eye(4))]
     if with_car:
         objects.append(Placed(car(), placement().matrix()))
     # The ground is part of the place; the analytic plane is put out of the way.
@@ -130,11 +130,11 @@ def without_fireflies(batches: NDArray[np.float32]) -> NDArray[np.float64]:
 
 
 def write_photo(radiance: NDArray[np.float32], path: Path) -> None:
-    """Clip radiance, shape [H, W, 3], like a sensor, encode it and write it as PNG."""
+    """Clip radiance, shape [H, W, 3], like a sensor, encode it and write it."""
     from warpir.core.color import linear_to_gamma
 
     codes = np.round(255.0 * linear_to_gamma(np.clip(radiance, 0.0, 1.0))).astype(np.uint8)
-    Image.fromarray(codes).save(path, optimize=True)
+    Image.fromarray(codes).save(path, optimize=True, quality=95, subsampling=0)
 
 
 def main() -> None:
@@ -144,12 +144,14 @@ def main() -> None:
     parser.add_argument("--truth", type=Path, help="also render the car in the place, to this PNG")
     parser.add_argument("--samples", type=int, default=256, help="samples per pixel")
     parser.add_argument("--device", help="cpu or cuda (default: the best there is)")
+    parser.add_argument("--wet", action="store_true", help="the square after rain")
     arguments = parser.parse_args()
     write_content()
+    settings = arguments.wet, arguments.samples, arguments.device
     if not arguments.content_only:
-        write_photo(render(False, arguments.samples, arguments.device), PHOTO)
+        write_photo(render(False, *settings), WET_PHOTO if arguments.wet else PHOTO)
     if arguments.truth is not None:
-        write_photo(render(True, arguments.samples, arguments.device), arguments.truth)
+        write_photo(render(True, *settings), arguments.truth)
 
 
 if __name__ == "__main__":

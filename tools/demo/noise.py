@@ -31,15 +31,10 @@ def value_noise(a: Float64Array, b: Float64Array, seed: int) -> Float64Array:
 
 
 def blurred_noise(size: int, width: float, seed: int) -> Float64Array:
-    """Return white noise smoothed by a Gaussian of a width [px], that tiles.
+    """Return white noise smoothed by a Gaussian, that tiles, shape [size, size].
 
-    Args:
-        size: Rows and columns.
-        width: Standard deviation of the Gaussian [px]; 0 leaves the noise white.
-        seed: Which noise.
-
-    Returns:
-        Numbers of mean 0 and standard deviation 1, shape [size, size].
+    Its mean is 0, its standard deviation 1; ``width`` is the Gaussian's standard deviation [px], 0
+    leaves the noise white.
     """
     white = np.random.default_rng(seed).standard_normal((size, size))
     row = np.fft.fftfreq(size)[:, None]

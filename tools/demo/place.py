@@ -4,7 +4,7 @@ World frame: +Y up, metres, the camera above the origin looking along -Z. Nothin
 car goes; the shadows of a tree and of a lamp post lie near it.
 """
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from itertools import pairwise
 
 import numpy as np
@@ -23,7 +23,7 @@ from tools.demo.mesh import (
 )
 from tools.demo.textures import PAVED, brick_texture, paving_texture, plaster_texture
 from warpir.core.arrays import Float64Array
-from warpir.demo import PLACE, ROTATE_Y
+from warpir.demo import PLACE, ROTATE_Y, WET_ROUGHNESS
 from warpir.scene.asset import Asset, Material, Primitive, TextureSlot
 from warpir.scene.camera import Camera
 
@@ -107,15 +107,10 @@ class Builder:
         names: tuple[str, ...] = ("leaf", "leaf_dark", "leaf_light"),
         boxed: bool = False,
     ) -> None:
-        """Scatter leaves near the surface of an ellipsoid, or of a box.
+        """Scatter leaves near the surface of an ellipsoid, or, if ``boxed``, in a box.
 
-        Args:
-            center: Centre [m], shape [3].
-            half: Half axes [m], shape [3].
-            count: Number of leaves.
-            size: Length of a leaf [m].
-            names: Materials, shared out evenly.
-            boxed: Whether the leaves fill a box instead.
+        Centre and half axes have shape [3], ``size`` is the length of a leaf, all [m]. Materials
+        are shared out evenly.
         """
         rng, axes = self.rng, np.asarray(half, dtype=np.float64)
         if boxed:
@@ -382,7 +377,13 @@ def _furniture(build: Builder) -> None:
         build.box("iron", (x - 0.03, 0.40, -16.74), (x + 0.03, 0.44, -16.18))
 
 
-def background() -> Asset:
+WET = replace(
+    MATERIALS[0], base_color=(0.5, 0.5, 0.5), clearcoat=1.0, clearcoat_roughness=WET_ROUGHNESS
+)
+"""Paving after rain: darker for the water in its pores, under a film of water as a coat."""
+
+
+def background(is_wet: bool = False) -> Asset:
     """Make the place that the photo shows, in the world frame."""
     build = Builder(np.random.default_rng(20))
     build.add(
@@ -395,7 +396,8 @@ def background() -> Asset:
     # Out of the picture on the left: the tree whose shadow lies in the foreground.
     build.tree((-7.7, 0.0, -0.4), 6.6, 2.1, 14000)
     textures = (paving_texture(), brick_texture(), plaster_texture())
-    return Asset("square", build.primitives(), MATERIALS, textures)
+    materials = (WET, *MATERIALS[1:]) if is_wet else MATERIALS
+    return Asset("square", build.primitives(), materials, textures)
 
 
 def camera() -> Camera:

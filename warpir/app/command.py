@@ -213,15 +213,7 @@ def make_parser(
     epilog: str,
     flags: Mapping[str, Mapping[str, str]],
 ) -> argparse.ArgumentParser:
-    """Return a parser of some fields of `InsertConfig`, all of whose values stay texts.
-
-    Args:
-        program: Name of the module.
-        usage_line: How it is called.
-        description: What it does.
-        epilog: What follows the flags.
-        flags: As `FLAGS`.
-    """
+    """Return a parser of the fields in ``flags``, as of `FLAGS`, whose values stay texts."""
     parser = Parser(
         prog=f"python -m warpir.{program}",
         usage=usage_line,
@@ -235,7 +227,11 @@ def make_parser(
     for heading, forms in flags.items():
         group = parser.add_argument_group(heading)
         for name, form in forms.items():
-            if form:
+            if form.startswith("["):
+                group.add_argument(
+                    flag(name), dest=name, nargs="?", const=True, metavar=form.strip("[]")
+                )
+            elif form:
                 group.add_argument(flag(name), dest=name, metavar=form)
             else:
                 action = "store_false" if DEFAULTS[name] else "store_true"
@@ -277,10 +273,6 @@ def _help_of(name: str, about: str, is_whole: bool) -> str:
     return f"{about} (default: {shown})"
 
 
-def _words(value: object) -> str:
-    return str(value) if not isinstance(value, bool) else "yes" if value else "no"
-
-
 def field_docs() -> dict[str, str]:
     """Return the help of every value, from the sources of the parts."""
     docs: dict[tuple[str, str], str] = {}
@@ -295,7 +287,7 @@ def _join_minus_values(argv: Sequence[str]) -> list[str]:
 
     argparse takes ``-1,0,-3`` (and a file named ``-x.png``) for a flag of its own.
     """
-    takes_value = {flag(name) for name, form in FORMS.items() if form}
+    takes_value = {flag(name) for name, form in FORMS.items() if form and form[0] != "["}
     takes_value.add("--config")
     joined: list[str] = []
     for argument in argv:

@@ -10,7 +10,7 @@ import math
 import re
 from collections.abc import Callable, Container, Iterator, Mapping
 from dataclasses import dataclass, fields
-from typing import Any, get_type_hints
+from typing import TYPE_CHECKING, Any, get_type_hints
 
 from warpir.app.settings import (
     CameraConfig,
@@ -29,6 +29,9 @@ from warpir.core.limits import Limits
 from warpir.core.options import Rule, is_a, plain, rule_of
 from warpir.diffusion.prompts import make_prompts
 from warpir.diffusion.settings import ModelSettings, PersonalizeSettings
+
+if TYPE_CHECKING:
+    from warpir.scene.asset import Asset
 
 SKY_PRESETS = ("clear", "overcast", "sunset")
 REFINE_STEPS = {"material": 300, "emission": 300, "tone": 200}
@@ -171,6 +174,8 @@ def usage(where: str, what: str, advice: str = "") -> InputError:
 
 LARGEST = 1e9
 """Of a coordinate [m] and of a light's strength; float32 products overflow from 10^19 on."""
+LEAST_RADIUS = 1e-4
+"""Of a lamp [m], as in its file (`warpir.scene.near.lamps`), which needs NumPy."""
 LOSSES_OF_BASE = ("csd", "sds-base", "good-bad", "sds-good-bad", "dataset-update")
 """Losses that do without an adapter."""
 LOSSES_AWAY = ("lds-negative", "good-bad", "sds-good-bad")
@@ -201,7 +206,7 @@ def _values_out_of_range(config: InsertConfig) -> Iterator[InputError]:
         yield from _not_plain(name, value, config.limits.prompt_bytes)
     in_order = config.optimize.fusion_end >= config.optimize.fusion_start
     yield from check("fusion_end", in_order, "at least --fusion-start")
-    for name in ("place", "ground", "sun", "sky", "at"):
+    for name in ("place", "ground", "sun", "sky", "at", "lamp"):
         parts = values[name]
         if isinstance(parts, tuple):
             within = not any(abs(part) > LARGEST for part in parts)
@@ -226,6 +231,12 @@ def _values_out_of_range(config: InsertConfig) -> Iterator[InputError]:
 
 def _light_and_ground_problems(config: InsertConfig, check: Check) -> Iterator[InputError]:
     ground, sun, sky = config.camera.ground, config.light.sun, config.light.sky
+    lamp = config.light.lamp
+    if lamp is not None:
+        yield from check(
+            "lamp", not lamp[3] < LEAST_RADIUS, f"a radius of at least {LEAST_RADIUS:g}"
+        )
+        yield from check("lamp", not min(lamp[4:]) < 0.0, "power and colour of at least 0")
     if ground is not None and all(map(math.isfinite, ground)):
         yield from check("ground", any(ground[:3]), "a normal a,b,c that is not 0")
     if sun is not None:
@@ -313,6 +324,10 @@ def _values_that_clash(config: InsertConfig) -> Iterator[InputError]:
             "cannot be used while a model changes the light or the object",
             "recover the light first, then give the mask with --reuse",
         )
+    if config.light.has_lamps and config.is_guided and config.task.refine == "material":
+        # What of a path's radiance comes from a lamp has no gradient to the materials.
+        lamp = "--lamp" if "lamp" in given else "--lamps"
+        yield usage(lamp, "cannot be used with --refine material", "leave one of them out")
     for name, fulfilled, what in (*_needs_of_scene(config, given), *_needs_of_prior(config, given)):
         if name in given and not fulfilled:
             yield usage(flag(name), f"needs {what}")
@@ -326,6 +341,12 @@ def _values_that_clash(config: InsertConfig) -> Iterator[InputError]:
     if config.task.refine == "tone" and not config.optimize.tone_curve:
         what = "cannot be used with --refine tone, which changes nothing else"
         yield usage("--no-tone-curve", what)
+    if config.render.ground_roughness != "off" and "proxy" in given:
+        what = "cannot be used with --proxy: a plane mirrors the object, a mesh does not"
+        yield usage("--ground-roughness", what, "leave one of them out")
+    if config.render.ground_roughness == "auto" and "sequence" in given:
+        what = "cannot be used with --sequence: each frame would have a roughness of its own"
+        yield usage("--ground-roughness auto", what, "state the roughness")
     yield from _losses_that_clash(config)
 
 
@@ -355,6 +376,8 @@ def _needs_of_prior(config: InsertConfig, given: Container[str]) -> Needs:
     yield "show_prior", guided, "--model"
     yield "resume", guided, "--model: nothing else has checkpoints"
     yield "accept", guided, "--model, whose result it judges"
+    is_recovering = guided and config.task.refine is None and config.light.has_lamps
+    yield "recover_lamps", is_recovering, "--lamp or --lamps, and --model without --refine"
     yield "refine", guided, "--model, which judges the change"
     yield "refine_parts", config.task.refine == "material", "--refine material"
     with_materials = config.task.refine in ("material", "emission")
@@ -385,3 +408,19 @@ def _shown(value: object) -> str:
         value = ",".join(f"{p:g}" if isinstance(p, int | float) else str(p) for p in value)
     text = str(value)
     return text if len(text) <= 60 else text[:57] + "..."
+
+
+def refused_refinement(config: InsertConfig, asset: "Asset") -> Iterator[InputError]:
+    """Yield why ``--refine`` cannot change the asset as it is asked to."""
+    found = ", ".join(dict.fromkeys(ascii(m.name) for m in asset.materials))[:400]
+    for name in config.task.refine_materials or ():
+        if not asset.materials_named([name]):
+            what = f"no material {name[:60]!a} in {config.inputs.asset} (found {found})"
+            yield usage("--refine-materials", what, "name some of these, or leave it out for all")
+    if config.task.refine in ("material", "emission"):
+        for m in asset.materials:
+            if m.is_solid_glass:
+                # What comes through glass has no gradient to the materials.
+                what = f"cannot be used with the solid glass {m.name[:60]!a} in the object"
+                yield usage("--refine", what, "leave one of them out")
+                return

@@ -24,11 +24,8 @@ class OtherRun(InputError):
 def is_done(config: InsertConfig, filled: InsertConfig | None = None) -> bool:
     """Return whether the folder of a configuration holds its result.
 
-    With ``overwrite`` nothing is done.
-
-    Args:
-        config: As it was asked for.
-        filled: The same with the demo's files filled in, where those are asked for.
+    ``filled`` is the same with the demo's files, where those are asked for. With ``overwrite``
+    nothing is done.
 
     Raises:
         OtherRun: It holds the whole result of another one.

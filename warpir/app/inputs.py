@@ -1,6 +1,6 @@
 """All inputs of one insertion, read and checked; torch and Warp are not needed here."""
 
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterator
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from functools import lru_cache, partial
@@ -9,7 +9,7 @@ from typing import Any, TypeVar
 
 import numpy as np
 
-from warpir.app.config import InsertConfig, usage
+from warpir.app.config import InsertConfig, refused_refinement, usage
 from warpir.app.model_files import require_model
 from warpir.app.photo_world import (
     NO_PLACE,
@@ -21,7 +21,7 @@ from warpir.app.photo_world import (
     photo_camera,
     stand_on_ground,
 )
-from warpir.app.record import file_hash, input_files
+from warpir.app.record import PATHS, file_hash, input_files
 from warpir.app.reuse import EarlierRun, read_run
 from warpir.app.settings import InputConfig, LightConfig
 from warpir.core.arrays import Float64Array, FloatArray
@@ -33,12 +33,14 @@ from warpir.io.cameras.source import PhotoCamera
 from warpir.io.folder_lock import inputs_within
 from warpir.io.images.photos import Photo, read_envmap, read_mask, read_photo
 from warpir.io.images.undistort import undistort_photo, undistorted
+from warpir.io.lamps_file import given_lamps
 from warpir.io.lobes_file import read_lobes
 from warpir.io.meshes.materials_file import with_materials
 from warpir.io.meshes.point_cloud import read_point_cloud
 from warpir.scene.asset import Asset
 from warpir.scene.camera import Camera
 from warpir.scene.light import Light
+from warpir.scene.near.lamps import Lamp, notices_of
 from warpir.scene.placement import Placement, up_to_y
 from warpir.scene.receiver import ReceiverMesh, first_hit, is_in_view, mesh_of
 from warpir.scene.shadow_mask import ShadowMask, shadow_mask
@@ -71,6 +73,8 @@ class Inputs:
     """Whether the ground plane receives shadows too."""
     shadow_mask: ShadowMask | None = None
     """What --shadow-mask holds."""
+    lamps: tuple[Lamp, ...] = ()
+    """What --lamp and --lamps say, near the object."""
     assumed: tuple[str, ...] = ()
     """What was chosen because nothing was given, one line each."""
     notices: tuple[str, ...] = ()
@@ -85,7 +89,7 @@ class Inputs:
 
 
 class Loaders:
-    """Reads assets, places and earlier runs; remembers the last of each, for many insertions.
+    """Reads inputs; remembers the last asset, place and earlier run, for many insertions.
 
     Args:
         estimator: Estimates the camera of a photo; None: nothing is estimated, because the inputs
@@ -94,6 +98,7 @@ class Loaders:
 
     def __init__(self, estimator: CameraEstimator | None = None) -> None:
         self.estimator = estimator
+        self.photo: Callable[[InputConfig, Limits], Photo] = read_photo_of
         self.asset: Callable[[str, str, Limits], Asset] = lru_cache(maxsize=1)(load_asset)
         self.proxy: Callable[[str, Limits], Asset] = lru_cache(maxsize=1)(_read_proxy)
         self.run: Callable[[str, Limits], EarlierRun] = lru_cache(maxsize=1)(read_run)
@@ -112,6 +117,7 @@ class _Files:
     run: EarlierRun | None
     points: Float64Array | None
     proxy: Asset | None
+    lamps: tuple[Lamp, ...]
     hashes: dict[str, str]
     log: Log
     """What was assumed and repaired on the way, but for what photo and meshes say themselves."""
@@ -119,10 +125,6 @@ class _Files:
 
 def read_inputs(config: InsertConfig, loaders: Loaders | None = None) -> Inputs:
     """Read and check every input, so that all problems are known before anything is rendered.
-
-    Args:
-        config: Names the files.
-        loaders: Of earlier insertions; what they remember is not read again.
 
     Raises:
         InputError: The first problem; the others are in its ``also``.
@@ -183,6 +185,7 @@ def _joined(config: InsertConfig, files: _Files) -> Inputs:
         proxy=mesh,
         is_plane=config.camera.plane,
         shadow_mask=shade,
+        lamps=files.lamps,
         assumed=tuple(_assumptions(config, files, world, placement, shade)),
         notices=tuple(_notices(config, files, straight, world, placement, mesh)),
         occluder=straight.occluder,
@@ -214,12 +217,12 @@ def _read_files(config: InsertConfig, loaders: Loaders) -> _Files:
         if state is not None and name in PICTURES:  # all of it is read for its sha256
             what, size = "too large", state[1]
             attempt(partial(limits.check, "file_bytes", size, path, what, more=" bytes"))
-    photo = attempt(lambda: _read_photo(inputs, limits))
+    photo = attempt(lambda: loaders.photo(inputs, limits))
     occluder = attempt(lambda: _read_mask(inputs.occluder_mask, photo, limits, log))
     shaded = attempt(lambda: _read_mask(config.camera.shadow_mask, photo, limits, log))
     asset = attempt(lambda: read_asset(inputs, limits, loaders, log))
     if asset is not None:
-        problems += _absent_materials(config.task.refine_materials or (), asset, inputs)
+        problems += refused_refinement(config, asset)
     run = view = points = proxy = None
     if (reuse := config.light.reuse) is not None:
         run = attempt(lambda: loaders.run(reuse, limits))
@@ -235,6 +238,8 @@ def _read_files(config: InsertConfig, loaders: Loaders) -> _Files:
         points = attempt(lambda: read_point_cloud(points_path, limits))
     if (proxy_path := config.camera.proxy) is not None:
         proxy = attempt(lambda: loaders.proxy(proxy_path, limits))
+    near = config.light.lamp, config.light.lamps
+    lamps = attempt(lambda: given_lamps(*near, limits, log.notice)) or ()
     attempt(lambda: require_model(config))
     raise_all(problems)
     assert photo is not None and asset is not None and view is not None
@@ -243,7 +248,9 @@ def _read_files(config: InsertConfig, loaders: Loaders) -> _Files:
     hashes |= _hashes_beside(config, asset, proxy)
     if run is not None:
         hashes["reuse"] = run.digest
-    return _Files(photo, view, asset, occluder, shaded, light, run, points, proxy, hashes, log)
+    return _Files(
+        photo, view, asset, occluder, shaded, light, run, points, proxy, lamps, hashes, log
+    )
 
 
 def _hashes_beside(config: InsertConfig, asset: Asset, proxy: Asset | None) -> dict[str, str]:
@@ -337,6 +344,7 @@ def _notices(
     yield from camera.notices
     yield from world.notices
     yield from placement.warnings
+    yield from notices_of(files.lamps, placement.ground if config.camera.plane else None)
     if config.render.width is not None and config.render.width < camera.width:
         yield (
             f"a preview: object and shadow are rendered {config.render.width} px wide and enlarged "
@@ -375,17 +383,17 @@ def _changed(path: Path) -> InputError:
 
 def _inputs_in_out(config: InsertConfig) -> list[InputError]:
     """Refuse an --out that holds an input: --overwrite could replace it."""
-    inputs, camera, light = config.inputs, config.camera, config.light
-    named = (
-        *(inputs.photo, inputs.asset, inputs.materials, camera.file, light.file),
-        *(inputs.occluder_mask, camera.shadow_mask, camera.proxy, light.reuse),
-        *(config.diffusion.model, config.adapter.lora),
-        *(light.regressor, camera.ground_points),
-    )
+    values = config.flat()
+    named = [values[name] for name in PATHS if name not in ("sequence", "out")]
     return inputs_within(config.output.out, *(path for path in named if path is not None))
 
 
-def _read_photo(inputs: InputConfig, limits: Limits) -> Photo:
+def read_photo_of(inputs: InputConfig, limits: Limits) -> Photo:
+    """Read --photo as its flags say.
+
+    Raises:
+        InputError: It cannot be used.
+    """
     assert inputs.photo is not None
     return read_photo(
         inputs.photo,
@@ -398,12 +406,6 @@ def _read_photo(inputs: InputConfig, limits: Limits) -> Photo:
 
 def read_asset(inputs: InputConfig, limits: Limits, loaders: Loaders, log: Log) -> Asset:
     """Read --asset as its flags say: which way is up, and its materials.
-
-    Args:
-        inputs: The flags.
-        limits: How large the files may be.
-        loaders: Of earlier insertions.
-        log: What was chosen because nothing was given is added here.
 
     Raises:
         InputError: The asset or its materials cannot be used.
@@ -419,17 +421,6 @@ def read_asset(inputs: InputConfig, limits: Limits, loaders: Loaders, log: Log) 
     if inputs.materials is not None:
         asset = with_materials(asset, inputs.materials, limits)
     return asset
-
-
-def _absent_materials(
-    names: Iterable[str], asset: Asset, inputs: InputConfig
-) -> Iterator[InputError]:
-    """Yield what is wrong with --refine-materials."""
-    found = ", ".join(dict.fromkeys(ascii(m.name) for m in asset.materials))[:400]
-    for name in names:
-        if not asset.materials_named([name]):
-            what = f"no material {name[:60]!a} in {inputs.asset} (found {found})"
-            yield usage("--refine-materials", what, "name some of these, or leave it out for all")
 
 
 def _read_proxy(path: str, limits: Limits) -> Asset:

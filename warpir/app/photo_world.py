@@ -26,7 +26,7 @@ from warpir.scene.camera import (
     camera_pose,
     horizon_row,
 )
-from warpir.scene.free_space import Cloud, find_place, is_well_seen, points_in_way, share_of_height
+from warpir.scene.free_space import Cloud, Place, Stand, find_place
 from warpir.scene.ground import fit_ground
 from warpir.scene.placement import Placement, place_asset, settled, upright_plane, y_to
 from warpir.scene.receiver import ReceiverMesh
@@ -86,13 +86,9 @@ def photo_camera(
 ) -> PhotoCamera:
     """Return the camera of --camera, else of the numbers given, the photo's EXIF and an estimate.
 
-    Args:
-        asked: The file or the numbers.
-        photo: The upright photo.
-        photo_name: Its file name, which tells the images of a file apart.
-        estimator: Asked for the numbers that nothing else gives; None: the usual ones stand for
-            them, as where only the inputs are checked.
-        limits: How large the file may be.
+    ``photo_name`` tells the images of a camera file apart. The estimator is asked for the numbers
+    that nothing else gives; without one, as where only the inputs are checked, the usual ones
+    stand for them.
 
     Raises:
         InputError: The camera file cannot be used, or does not fit the photo.
@@ -147,13 +143,9 @@ def _camera_of_flags(asked: CameraConfig, photo: Photo) -> Camera:
 
 
 def _asked_pitch(asked: CameraConfig, camera: Camera, centre: float, roll: float) -> float | None:
-    """Return the pitch that flags name [deg], of a camera whose optical axis is at a row.
+    """Return the pitch that flags name [deg], of a camera whose optical axis is at a row [px].
 
-    Args:
-        asked: The flags.
-        camera: Its size and focal length.
-        centre: The row [px].
-        roll: Of the camera [deg]: the horizon's row is that of the middle column.
+    The horizon's row is that of the middle column, so the roll [deg] counts.
     """
     if asked.horizon is None:
         return asked.pitch
@@ -248,11 +240,8 @@ def make_world(
 ) -> PhotoWorld:
     """Find the ground in the points, and level a world whose up is not known by its ground.
 
-    Args:
-        asked: Names the ground.
-        place: ``--place``, in the world of the camera's file.
-        view: The camera, and how its file's world was turned.
-        points: Points of ``--ground-points``, in the world of the camera's file, shape [point, 3].
+    ``place`` and the points, shape [point, 3], are in the world of the camera's file; ``view`` says
+    how that was turned.
 
     Raises:
         InputError: No ground in the points, or nothing that tells which way is up.
@@ -299,13 +288,6 @@ def stand_on_ground(
 ) -> Placement:
     """Set the asset on the ground, so that it neither hovers nor sinks unless that is asked for.
 
-    Args:
-        asked: Place, turn, size and depth.
-        asset: The object.
-        world: Camera, ground and points.
-        mesh: What --proxy holds.
-        is_plane: Whether the object may stand on the ground plane.
-
     Raises:
         InputError: There is no such place, or no free one, or the object would be below the ground.
     """
@@ -350,7 +332,8 @@ def _stood(
     placement = put(world.place)
     if world.cloud is None:
         return placement
-    if count := len(points_in_way(placement.asset_to_world, low, high, world.cloud)):
+    stand = Stand(placement.asset_to_world, low, high, world.camera)
+    if count := len(stand.points_in_way(world.cloud)):
         warning = f"{count} points of --ground-points stand where the object does; is it free?"
         placement = replace(placement, warnings=(*placement.warnings, warning))
     return placement
@@ -365,18 +348,16 @@ def _set_free(
 ) -> Placement:
     """Place an object that was not placed: in the lower middle, else where it is seen whole.
 
-    Args:
-        put: Sets it down at a place, or at the usual pixel, with a longest side [m] or its own.
-        asset: The object.
-        world: Camera, ground and points.
-        mesh: What --proxy holds; then only the usual pixel is tried.
-        is_sized: Whether its size was asked for.
+    With a mesh and no points only the usual pixel is tried.
 
     Raises:
         InputError: There is no free place, or no ground in view.
     """
     low, high = asset.bounds()
-    view = (low, high, world.camera)
+
+    def stand(place: Place | None, size: float | None = None) -> Stand:
+        return Stand(put(place, size).asset_to_world, low, high, world.camera)
+
     if mesh is not None and world.cloud is None:
         return put(None)
     if world.cloud is None:
@@ -385,13 +366,13 @@ def _set_free(
         except InputError:
             pass  # above the horizon, or outside the photo: the search below tells
         else:
-            if is_well_seen(usual.asset_to_world, *view):
+            if Stand(usual.asset_to_world, low, high, world.camera).is_well_seen:
                 return usual
     eye = world.camera.c2w[:3, 3]
     plane = upright_plane(world.ground, eye)
     lines = []
     try:
-        place = find_place(put, *view, plane, world.cloud)
+        place = find_place(stand, world.camera, plane, world.cloud)
     except InputError:
         if is_sized or world.cloud is not None:
             raise
@@ -400,10 +381,10 @@ def _set_free(
     else:
         placement = put(place)
         away = float(np.linalg.norm(np.subtract(place, eye)))
-        seen = share_of_height(placement.asset_to_world, *view)
+        seen = stand(place).share_of_height
     if not is_sized and not SEEN[0] <= seen <= SEEN[1]:
         size = float(f"{SHOWN * away * world.camera.height / world.camera.fy:.2g}")
-        place = find_place(lambda there: put(there, size), *view, plane, world.cloud)
+        place = find_place(lambda there: stand(there, size), world.camera, plane, world.cloud)
         placement = put(place, size)
         lines.append(
             f"the object is {size:g} m large, since with its own {float((high - low).max()):.3g} m "

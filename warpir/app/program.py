@@ -50,6 +50,15 @@ def settle_environment() -> None:
         os.environ[name] = "1"
 
 
+def silence_warnings() -> None:
+    """Keep warnings of NumPy and others, which are noise to the user, from standard error.
+
+    What they tell of is checked for; ``--debug`` shows them.
+    """
+    logging.captureWarnings(True)
+    logging.getLogger("py.warnings").addHandler(logging.NullHandler())
+
+
 def _open_closed_streams() -> None:
     """Put nothing in the place of closed standard streams.
 
@@ -134,9 +143,7 @@ def run_program(run: Callable[[list[str]], int], argv: Sequence[str] | None = No
     settle_environment()
     arguments = list(sys.argv[1:] if argv is None else argv)
     debug = "--debug" in arguments
-    # Those of NumPy and others are noise to the user: what they tell of is checked for.
-    logging.captureWarnings(True)
-    logging.getLogger("py.warnings").addHandler(logging.NullHandler())
+    silence_warnings()
     if debug:
         logging.basicConfig(level=logging.DEBUG, format="debug: %(name)s: %(message)s")
     for stream in (sys.stdout, sys.stderr):

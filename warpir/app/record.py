@@ -13,6 +13,7 @@ from typing import Any
 
 import warpir
 from warpir.app.config import InsertConfig
+from warpir.core.atomic import sha256_of
 from warpir.core.errors import InputError
 from warpir.core.memory import peak_mib
 
@@ -20,14 +21,14 @@ OF_THE_RUN = ("out", "overwrite", "resume", "threads", "report")
 """Settings that change nothing in a result, so that its pictures do not hold them."""
 PATHS = (
     *("photo", "occluder_mask", "asset", "materials", "camera", "ground_points", "proxy"),
-    *("shadow_mask", "light", "regressor", "model", "lora", "reuse", "sequence", "out"),
+    *("shadow_mask", "light", "lamps", "regressor", "model", "lora", "reuse", "sequence", "out"),
 )
 """Settings that name a file or a folder."""
 RUN_FORMAT = 1
 """Layout number of ``run.json``; a newer one is refused: its keys may mean other things."""
 RECORDED_PACKAGES = (
     *("warp-lang", "torch", "numpy", "trimesh", "OpenEXR", "OpenImageIO", "pillow"),
-    *("diffusers", "transformers", "peft", "safetensors"),
+    *("embreex", "diffusers", "transformers", "peft", "safetensors"),
 )
 
 MODEL_STEMS = {"camera": ("cameras", "images"), "ground_points": ("points3D",)}
@@ -96,9 +97,6 @@ def config_of_picture(values: Mapping[str, Any]) -> dict[str, Any]:
 
     Of paths only the names are left: where somebody keeps their files is for ``run.json``. A
     model's name in the hub is no path.
-
-    Args:
-        values: From `InsertConfig.flat`.
     """
     return {
         name: name_of(value) if name in PATHS and value is not None else value
@@ -130,7 +128,7 @@ def input_files(config: InsertConfig) -> dict[str, Path]:
 
     names = (
         *("photo", "occluder_mask", "materials", "camera", "light", "lora"),
-        *("regressor", "ground_points", "shadow_mask"),
+        *("regressor", "ground_points", "shadow_mask", "lamps"),
     )
     paths = {name: Path(path) for name in names if (path := config.flat()[name]) is not None}
     for name, stems in MODEL_STEMS.items():
@@ -151,8 +149,7 @@ def file_hash(path: Path) -> str:
     from warpir.scene.asset import ABSENT
 
     try:
-        with path.open("rb") as stream:
-            return hashlib.file_digest(stream, "sha256").hexdigest()
+        return sha256_of(path)
     except FileNotFoundError:
         return ABSENT
     except OSError as error:

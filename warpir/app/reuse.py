@@ -6,7 +6,6 @@ which the run says, and ``--light-rotate`` turns it. The light is at the exposur
 photo; for a photo of another exposure ``--exposure`` scales it.
 """
 
-import hashlib
 import os
 from dataclasses import dataclass
 from pathlib import Path
@@ -16,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from warpir.app.record import RUN_FORMAT, file_hash
+from warpir.core.atomic import sha256_of
 from warpir.core.errors import InputError, shown
 from warpir.core.limits import LIMITS, Limits
 from warpir.core.strict_json import read_json_object
@@ -144,8 +144,7 @@ def check_files(path: Path, digests: dict[str, Any]) -> None:
             )
         check_regular_file(path / name)
         try:
-            with (path / name).open("rb") as stream:
-                found = hashlib.file_digest(stream, "sha256").hexdigest()
+            found = sha256_of(path / name)
         except OSError as error:
             raise InputError(path / name, f"cannot be read ({error.strerror})") from error
         if found != digest:

@@ -7,6 +7,8 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from warpir.app.config import InsertConfig
 from warpir.app.inputs import Inputs
 from warpir.app.record import Timings, run_record
@@ -77,6 +79,24 @@ class Run:
         self.log.say(f"device: {device} (the first run compiles the kernels)")
         return replace(self, device=device)
 
+    def with_ground_coat(self) -> "Run":
+        """Return the run with the ground's roughness, where the photo is to tell it."""
+        if self.config.render.ground_roughness != "auto":
+            return self
+        from warpir.look.ground_coat import estimate_coat  # loads SciPy
+
+        inputs = self.inputs
+        up = np.asarray(inputs.placement.ground, np.float64)[:3]
+        coat = estimate_coat(inputs.photo.linear(), inputs.camera, up / np.linalg.norm(up))
+        self.log.assume(coat.line)
+        return replace(
+            self,
+            config=self.config.changed(
+                ground_roughness="off" if coat.roughness is None else coat.roughness
+            ),
+            inputs=replace(inputs, measured=inputs.measured | {"ground_coat": coat.record()}),
+        )
+
     def take_cache_notices(self) -> None:
         """Add what a cache has had to say since the last call."""
         self.log.notice(*take_notices())
@@ -131,10 +151,6 @@ def needed_bytes(config: InsertConfig, inputs: Inputs) -> int:
 
 def require_space(out: str | Path, needed: int) -> None:
     """Check that there is room for a run's files.
-
-    Args:
-        out: The output folder, which need not be there yet.
-        needed: From `needed_bytes`.
 
     Raises:
         InputError: There is less (`ExitCode.RESOURCES`).

@@ -38,8 +38,8 @@ class InputConfig:
     STL are often +z"""
     materials: str | None = option(None, "FILE")
     """materials.json of a run with --refine; factors for the materials of --asset"""
-    demo: bool = option(False)
-    """Use the scene that ships with warpir; in place of --photo and --asset"""
+    demo: bool | str = option(False, "[wet]", choices=("wet",))
+    """Use the scene that ships with warpir; in place of --photo and --asset; wet: after rain"""
     alpha: str = option("refuse", "RULE", expert=True, choices=("refuse", "ignore"))
     """What to do with a photo that has transparency: refuse or ignore"""
     strict: bool = option(False)
@@ -160,6 +160,16 @@ class LightConfig:
     """Reflectance of the ground, for the exposure; which is automatic without --exposure: 0.25
     where a light is given; one that is estimated from the photo follows the ground only where this
     is stated"""
+    lamp: (
+        tuple[float, float, float, float, float]
+        | tuple[float, float, float, float, float, float, float, float]
+        | None
+    ) = option(None, "X,Y,Z,RADIUS,POWER[,R,G,B]", expert=True)
+    """A lamp near the object, a sphere; place and radius in world coordinates [m]; white that faces
+    it at a distance d shows POWER / (4 pi^2 d^2) of the photo's white; R,G,B are linear factors"""
+    lamps: str | None = option(None, "FILE", expert=True)
+    """Lamps near the object: spheres and rectangles (.json), or the point lights of a glTF file; in
+    world coordinates"""
     detail: bool = option(True)
     """Let the object reflect what the photo shows around it; where the light has no panorama's
     detail of its own"""
@@ -168,6 +178,11 @@ class LightConfig:
     def is_described(self) -> bool:
         """Whether the user stated anything about the light."""
         return any(value is not None for value in (self.file, self.sun, self.sky))
+
+    @property
+    def has_lamps(self) -> bool:
+        """Whether there are lamps near the object."""
+        return self.lamp is not None or self.lamps is not None
 
     @property
     def assumed_albedo(self) -> float:
@@ -191,6 +206,12 @@ class RenderConfig:
     bounce: bool = option(True, expert=True)
     """Let the object throw light on the ground; what it reflects and emits there is in the shadow
     ratio, which --no-bounce leaves to what the object blocks, as DiPIR does"""
+    ground_roughness: float | str = option(
+        "off", "auto|off|R", expert=True, choices=("auto", "off"), low=0, high=1
+    )
+    """Let the ground mirror the object, as wet asphalt, tiles and lacquer do; its roughness, 0 is a
+    mirror; auto: estimated where the photo shows mirror images on the ground, else off; for a plane
+    as ground, and in the picture alone: neither guidance nor preview has it"""
     denoise: str = option("auto", "auto|off", expert=True, choices=("auto", "off"))
     """Take the renderer's noise out of object and shadow; auto: where pyoidn is installed (pip
     install warpir[denoise])"""
@@ -209,6 +230,11 @@ class RenderConfig:
     def bounce_depth(self) -> int:
         """Surface hits of light that the object throws on the ground; 0 without a bounce."""
         return self.depth if self.bounce else 0
+
+    @property
+    def coat_roughness(self) -> float | None:
+        """Roughness of a ground that mirrors the object [1]; None: it is matt, or not known yet."""
+        return None if isinstance(self.ground_roughness, str) else self.ground_roughness
 
 
 @dataclass(frozen=True)
@@ -276,6 +302,8 @@ class OptimizeSettings:
     """Where in the run they are one, as a share of the steps"""
     lobe_shape: bool = option(True, expert=True)
     """Recover widths and colours of the lobes too, not their directions and strengths alone"""
+    recover_lamps: bool = option(False, expert=True)
+    """Recover powers and colours of --lamp and --lamps too, beside the light from afar"""
     tone_curve: bool = option(True, expert=True)
     """Recover tone curves for the object and its shadow"""
     integrator: str = option("transport", "NAME", expert=True, choices=("transport", "mis"))

@@ -42,14 +42,10 @@ examples:
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Run the command line.
+    """Run the command line, as `run_program`.
 
-    Args:
-        argv: Arguments without the program's name; ``sys.argv`` when absent.
-
-    Returns:
-        The exit status: 0 if all scenes are done, else that of the first that is not, in the
-        manifest's order; 128 plus the number of a signal.
+    The status is 0 if all scenes are done, else that of the first that is not, in the manifest's
+    order.
     """
     return run_program(_run, argv)
 

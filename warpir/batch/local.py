@@ -38,12 +38,7 @@ class LocalWorkers:
         return len(self._idle)
 
     def start(self, key: int, task: Task) -> None:
-        """Give a task to a free worker.
-
-        Args:
-            key: What `wait` returns with its answer.
-            task: The task.
-        """
+        """Give a task to a free worker."""
         worker = self._idle.pop()
         self._running[worker.submit(task)] = key, worker
 

@@ -62,12 +62,6 @@ class Manifest:
 def read_manifest(path: Path, out: Path, given: Mapping[str, Any], limits: Limits) -> Manifest:
     """Read all lines; no file that they name is opened.
 
-    Args:
-        path: The manifest.
-        out: Folder of the scenes' folders.
-        given: Values for all scenes by their fields, from the command line.
-        limits: How large the file may be.
-
     Raises:
         InputError: The file cannot be read or holds no lines, or too many (`ExitCode.USAGE`).
     """

@@ -22,13 +22,9 @@ SHOWN = 240
 
 
 def batch_page(manifest: Path, out: Path, scenes: Sequence[Scene], seconds: float) -> bytes:
-    """Return the page, in UTF-8.
+    """Return the page, in UTF-8, of all scenes, whose results are in ``out``.
 
-    Args:
-        manifest: The list of scenes; its name is the title.
-        out: Folder of the results.
-        scenes: All of the batch.
-        seconds: What the batch has taken [s].
+    The manifest's name is the title; ``seconds`` are what the batch has taken.
     """
     counts = [(state, sum(scene.state == state for scene in scenes)) for state in STATES]
     every = max(1, -(-len(scenes) // SHOWN))

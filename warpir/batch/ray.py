@@ -105,10 +105,6 @@ class RayWorkers:
     def prepare(self, out: Path, task: Task) -> None:
         """See on every machine that it shares the folder of the results, and compile there once.
 
-        Args:
-            out: The folder.
-            task: Compiles.
-
         Raises:
             InputError: A machine does not see the folder, or this one not what that wrote
                 (`ExitCode.USAGE`); or it cannot run warpir or compile.
@@ -157,12 +153,7 @@ class RayWorkers:
         return self.count - len(self._running)
 
     def start(self, key: int, task: Task) -> None:
-        """Hand a task to Ray.
-
-        Args:
-            key: What `wait` says of it.
-            task: The task, which says what it takes.
-        """
+        """Hand a task to Ray."""
         remote = self._ray.remote(
             num_cpus=self.threads,
             num_gpus=task.gpus,

@@ -23,6 +23,7 @@ from warpir.core.errors import ExitCode, InputError, disk_error
 from warpir.core.memory import free_host
 from warpir.core.progress import duration
 from warpir.core.signals import whole
+from warpir.core.strict_json import json_bytes
 
 FORMAT, VERSION = "warpir-batch", 1
 SUMMARY, FAILURES = "batch.json", "failures.jsonl"
@@ -178,9 +179,8 @@ class Batch:
         lines = "".join(json.dumps(scene.failure()) + "\n" for scene in failed)
         try:
             with whole():
-                content = json.dumps(summary, indent=2, allow_nan=False) + "\n"
                 # First: a list of failures without a summary is somebody else's.
-                write_file(self.options.out / SUMMARY, content.encode())
+                write_file(self.options.out / SUMMARY, json_bytes(summary))
                 write_file(self.options.out / FAILURES, lines.encode())
             seconds = time.monotonic() - self.started
             page = batch_page(self.options.manifest, self.options.out, self.scenes, seconds)
@@ -263,7 +263,7 @@ class Batch:
             # Each machine compiles for what it has: one without a GPU gets no scene that needs it.
             devices = ["cpu" if self._config(key).render.device == "cpu" else None for key in keys]
             kernels = {"devices": [*dict.fromkeys(devices)], "places": places}
-            task = Task(COMPILE, kernels | {"bounces": self._bounces(keys)})
+            task = Task(COMPILE, kernels | self._variants(keys))
             cluster.prepare(self.options.out.absolute(), task)
             memory: dict[int, int] = {}
             for key in keys:
@@ -293,18 +293,13 @@ class Batch:
     def _compile(self, keys: Sequence[int], places: Sequence[bool]) -> int:
         """Let a worker compile for one device after another; a scene fails where its device does.
 
-        Args:
-            keys: Of the scenes.
-            places: Whether a mesh of the place is among what is rendered; empty: only see that the
-                devices are there.
-
-        Returns:
-            How many CUDA devices the worker sees.
+        Without ``places``, which say whether a mesh of the place is rendered, the devices are only
+        looked for. Returns how many CUDA devices the worker sees.
         """
         found: list[Answer] = []
         for device in dict.fromkeys(self._config(key).render.device for key in keys):
             needed = {"devices": [device], "places": list(places)}
-            task = Task(COMPILE, needed | {"bounces": self._bounces(keys)})
+            task = Task(COMPILE, needed | self._variants(keys))
             run_tasks(self._workers, {0: task}, lambda *_: False, lambda _, a: found.append(a))
             if found[-1].status:
                 for key in keys:
@@ -312,9 +307,13 @@ class Batch:
                         self.scenes[key].fail(found[-1].status, found[-1].lines)
         return max((int(answer.found.get("cuda", 0)) for answer in found), default=0)
 
-    def _bounces(self, keys: Sequence[int]) -> list[bool]:
-        """Return the variants of the path tracer's ``is_from_ground`` that scenes need."""
-        return sorted({False, *(self._config(key).render.bounce for key in keys)})
+    def _variants(self, keys: Sequence[int]) -> dict[str, list[bool]]:
+        """Return the variants of the path tracer that scenes need: from the ground, with lamps."""
+        configs = [self._config(key) for key in keys]
+        return {
+            "bounces": sorted({False, *(config.render.bounce for config in configs)}),
+            "lamps": sorted({config.light.has_lamps for config in configs}),
+        }
 
     def _fail_on_cuda(self, keys: Sequence[int]) -> list[int]:
         """Let scenes fail that ask for a GPU of a cluster without one; return the others."""
@@ -348,12 +347,6 @@ def run_tasks(
 
     What is tried again comes last and has the machine for itself: what was killed may have been the
     one that took the memory.
-
-    Args:
-        workers: They do them.
-        tasks: By their keys.
-        retry: Says whether what has ended so is tried again.
-        ended: Told of every other end.
     """
     queue, later, running = deque(tasks), deque[int](), 0
     attempts = dict.fromkeys(tasks, 1)

@@ -205,12 +205,13 @@ def _compile(task: Task) -> dict[str, Any]:
 
     Where nothing is said of places, only the devices are looked for.
     """
-    from warpir.render.device import choose_device, cuda_count, load_kernels
+    from warpir.render.device import cache_kernels, choose_device, cuda_count
 
     places = task.config["places"]
     for device in [choose_device(name) for name in task.config["devices"]]:
         if places:
-            load_kernels(device, product((False, True), places, task.config["bounces"]))
+            bounces, lamps = task.config["bounces"], task.config["lamps"]
+            cache_kernels(device, product((False, True), places, bounces, lamps))
     return {"cuda": cuda_count()}
 
 

@@ -71,12 +71,8 @@ def upright_roll(
     The pitch that they tell is left out: it depends on the focal length, which is less sure, and on
     held-out places it was no better than the network's.
 
-    Args:
-        segments: As `find_segments` gives them.
-        centre: Principal point (x, y) [px].
-        focal: Focal length [px].
-        pitch_deg: First guess, which tells upright edges from others.
-        roll_deg: Likewise.
+    The segments are those of `find_segments`, centre (x, y) and focal length in pixels; pitch and
+    roll are a first guess, which tells upright edges from others.
     """
     pitch, roll = np.radians([pitch_deg, roll_deg])
     guess = np.array([np.sin(roll) * np.cos(pitch), np.cos(roll) * np.cos(pitch), -np.sin(pitch)])

@@ -15,31 +15,25 @@ Frames and signs are those of `warpir.scene.camera`: the camera looks along its 
 
 from __future__ import annotations
 
-import json
 import math
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import torch
 import torch.nn.functional as F
-from safetensors.torch import load_file, save
 from torch import Tensor, nn
 
-from warpir.calibration.blocks import ConvBlock, TokenBlock, head
-from warpir.core.atomic import write_file
-from warpir.core.errors import ExitCode, InputError
-from warpir.diffusion.models.model_error import ModelError
-from warpir.diffusion.models.weight_files import CALIBRATOR_FORMAT, check_calibrator, values_hash
+from warpir.calibration.blocks import TokenNetwork, TokenSizes, head
+from warpir.calibration.network_files import load_network, random_network, save_network
+from warpir.diffusion.models.weight_files import CALIBRATOR_FORMAT, check_calibrator
 
 HEIGHT, WIDTH = 128, 192
 """Size that the network sees [px]; photos of other shapes are stretched."""
 BLUR = 1.4
 """Standard deviation of the blur of every photo that the network sees, over the photo's height
 times `HEIGHT`: 1 is a row of what it sees."""
-GATHERINGS = 4
-"""Weighted means of the tokens that each head reads, of an equal part of the features each."""
 MIRRORED = ("roll", "x")
 """Numbers whose distribution turns over when the photo is mirrored."""
 
@@ -86,19 +80,8 @@ SHAPE = (8, 8)
 
 
 @dataclass(frozen=True)
-class CalibratorConfig:
-    """Size of the network."""
-
-    channels: tuple[int, int, int] = (48, 96, 192)
-    """Features at 1/2, 1/4 and 1/8 of the resolution."""
-    blocks: tuple[int, int] = (2, 2)
-    """Residual blocks at 1/2 and 1/4."""
-    depth: int = 4
-    """Transformer blocks over the 16 x 24 tokens."""
-    heads: int = 6
-    dropout: float = 0.1
-    skipped: float = 0.1
-    """Chance that a block is left out in training (stochastic depth)."""
+class CalibratorConfig(TokenSizes):
+    """Sizes of the network."""
 
 
 class CameraNumbers(NamedTuple):
@@ -153,42 +136,22 @@ def seen(photo: Tensor) -> Tensor:
     return soften(small, blur_sigma(rows, torch.full_like(rows, width / height)).clamp(max=WIDTH))
 
 
-class Calibrator(nn.Module):
+class Calibrator(TokenNetwork):
     """Photo, its shape and perhaps its focal length to distributions over the camera's numbers.
 
-    There are 16 x 24 tokens of 8 x 8 pixels, and a learned one for each number that asks them. Each
-    head reads its learned token plus weighted means of the others, as in
-    `warpir.lighting.regressor.Regressor`.
+    There are 16 x 24 tokens, and a head for each number.
     """
 
     spread: Tensor
     """Factor on the width of each distribution; calibrated on held-out places, shape [5]."""
 
     def __init__(self, config: CalibratorConfig) -> None:
-        super().__init__()
+        super().__init__(config, planes=5, places=5, asking=len(NUMBERS))
         self.config = config
         self.record: dict[str, Any] = {}
         """How it was trained; plain values."""
-        fine, middle, wide = config.channels
         self.register_buffer("spread", torch.ones(len(NUMBERS)))
-        # Space to depth keeps every pixel.
-        self.stem = nn.Conv2d(4 * 5, fine, 3, padding=1)
-        self.fine = nn.Sequential(*(ConvBlock(fine, 0.0) for _ in range(config.blocks[0])))
-        self.down1 = nn.Conv2d(fine, middle, 3, stride=2, padding=1)
-        self.middle = nn.Sequential(
-            *(ConvBlock(middle, config.skipped / 2.0) for _ in range(config.blocks[1]))
-        )
-        self.down2 = nn.Conv2d(middle, wide, 3, stride=2, padding=1)
-        self.norm = nn.GroupNorm(8, wide)
-        self.place = nn.Sequential(nn.Linear(5, wide), nn.GELU(), nn.Linear(wide, wide))
-        self.asking = nn.Parameter(torch.randn(len(NUMBERS), wide) * 0.02)
-        self.blocks = nn.ModuleList(
-            TokenBlock(wide, config.heads, config.dropout, config.skipped)
-            for _ in range(config.depth)
-        )
-        self.gather = nn.Linear(wide, len(NUMBERS) * GATHERINGS, bias=False)
-        # Clearly different weights from the start: an even mean tells nothing of where.
-        nn.init.normal_(self.gather.weight, std=3.0 / math.sqrt(wide))
+        wide = config.channels[-1]
         self.numbers = nn.ModuleDict(
             {name: head(wide, config.dropout, bins.number) for name, bins in NUMBERS.items()}
         )
@@ -210,27 +173,17 @@ class Calibrator(nn.Module):
             in the picture (right, up; any length) and the elevation [rad] of what a token sees.
         """
         plane = _coordinates(aspect, HEIGHT, WIDTH)
-        x = torch.cat([photo * 2.0 - 1.0, plane], dim=1)
-        x = self.fine(self.stem(F.pixel_unshuffle(x, 2)))
-        x = self.middle(self.down1(x))
-        x = self.norm(self.down2(x))
+        x = self.features(torch.cat([photo * 2.0 - 1.0, plane], dim=1))
         known = ~focal.isnan()
         given = torch.where(known, focal, torch.zeros_like(focal))
         about = torch.stack([aspect.log(), known.to(aspect.dtype), given], dim=1)
         where = _coordinates(aspect, *x.shape[2:]).flatten(2).transpose(1, 2)
         about = about[:, None].expand(-1, where.shape[1], -1)
         tokens = x.flatten(2).transpose(1, 2) + self.place(torch.cat([where, about], dim=2))
-        count = len(self.asking)
-        tokens = torch.cat([self.asking.expand(len(tokens), -1, -1), tokens], dim=1)
-        for block in self.blocks:
-            tokens = block(tokens)
+        tokens = self.mixed(tokens)
         # Softmax and exponentials of the answers need more digits than autocast leaves.
         with torch.autocast(tokens.device.type, enabled=False):
-            tokens = tokens.to(self.gather.weight.dtype)
-            asked, others = tokens[:, :count], tokens[:, count:]
-            weights = self.gather(others).softmax(dim=1).unflatten(2, (count, GATHERINGS))
-            groups = others.unflatten(2, (GATHERINGS, -1))
-            read = asked + torch.einsum("btag,btgc->bagc", weights, groups).flatten(2)
+            read, others = self.read(tokens)
             heads = zip(self.numbers.items(), read.unbind(dim=1), strict=True)
             return {name: answer(part) for (name, answer), part in heads}, self.field(others)
 
@@ -271,58 +224,19 @@ def _coordinates(aspect: Tensor, height: int, width: int) -> Tensor:
 
 
 def random_calibrator(seed: int, config: CalibratorConfig | None = None) -> Calibrator:
-    """Return a network with random weights: a start for training, and a control that must fail."""
-    with torch.random.fork_rng(devices=[]):
-        torch.manual_seed(seed)
-        return Calibrator(config or CalibratorConfig()).eval()
+    """As `random_network`."""
+    return random_network(seed, lambda: Calibrator(config or CalibratorConfig()))
 
 
 def save_calibrator(network: Calibrator, path: Path, record: Mapping[str, Any]) -> None:
-    """Write a network: fp16 weights, whole or not at all.
-
-    Args:
-        network: Its calibration goes along.
-        path: The safetensors file.
-        record: How it was trained, plain values; read back as `Calibrator.record`.
-
-    Raises:
-        OSError: The disk is full or the folder is not writable; an older file is still whole.
-    """
-    state = {k: v.half().cpu().contiguous() for k, v in network.state_dict().items()}
-    config = json.dumps(asdict(network.config))
-    about = {
-        "format": CALIBRATOR_FORMAT,
-        "config": config,
-        "weights": values_hash({name: part.numpy() for name, part in state.items()}, config),
-        "record": json.dumps(dict(record), allow_nan=False),
-    }
-    write_file(path, save(state, metadata=about))
+    """As `save_network`; the record is read back as `Calibrator.record`."""
+    save_network(network, network.config, path, record, CALIBRATOR_FORMAT)
 
 
 def load_calibrator(path: Path | None = None, device: str | torch.device = "cpu") -> Calibrator:
-    """Read a network for `warpir.calibration.estimate.estimate_camera`.
-
-    Args:
-        path: The safetensors file; None: the one in the package.
-        device: Where it shall run.
-
-    Raises:
-        InputError: The file is absent, damaged or of another kind (`ExitCode.MODEL`).
-    """
-    try:
-        file = check_calibrator(path)
-        config: dict[str, Any] = {
-            k: tuple(v) if isinstance(v, list) else v
-            for k, v in json.loads(file.about["config"]).items()
-        }
-        # Not on "meta" first: its sizes are checked, and random numbers there import the compiler.
-        network = Calibrator(CalibratorConfig(**config))
-        if {name: part.shape for name, part in network.state_dict().items()} != file.shapes:
-            what = "damaged (the weights are not those of its network)"
-            raise ModelError(str(file.path), what)
-        weights = {name: part.float() for name, part in load_file(file.path).items()}
-        network.load_state_dict(weights)
-    except ModelError as error:
-        raise InputError(error.where, error.what, error.advice, ExitCode.MODEL) from None
-    network.record = json.loads(file.about["record"])
-    return network.to(device).eval().requires_grad_(False)
+    """Read a network for `warpir.calibration.estimate.estimate_camera`; see `load_network`."""
+    network, record = load_network(
+        check_calibrator, lambda sizes: Calibrator(CalibratorConfig(**sizes)), path, device
+    )
+    network.record = record
+    return network

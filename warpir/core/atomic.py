@@ -151,6 +151,16 @@ def write_staged(path: Path, content: bytes) -> None:
         raise OSError(None, f"found {written} of {len(content)} bytes")
 
 
+def sha256_of(path: Path) -> str:
+    """Return the sha256 of a file, as hexadecimal digits.
+
+    Raises:
+        OSError: It cannot be read.
+    """
+    with path.open("rb") as stream:
+        return hashlib.file_digest(stream, "sha256").hexdigest()
+
+
 def sync(path: Path) -> None:
     """Bring a file, or the names in a folder, to the disk: they survive a power cut then."""
     descriptor = os.open(path, os.O_RDONLY)
@@ -187,10 +197,8 @@ class Checkpoint:
 class Checkpoints:
     """The checkpoints of one run or training in its output folder.
 
-    Args:
-        out: The output folder.
-        identity: Settings, input hashes and versions of the run; plain values.
-        restart: How a user starts again, for errors.
+    They are known by the run's settings, input hashes and versions, plain values; errors say by
+    ``restart`` how a user starts again.
     """
 
     def __init__(
@@ -207,11 +215,6 @@ class Checkpoints:
 
     def save(self, stage: str, step: int, state: Mapping[str, Any]) -> None:
         """Write a checkpoint, then remove those that are two older.
-
-        Args:
-            stage: Part of the run.
-            step: Number of its finished steps.
-            state: Nested mappings of tensors and plain values.
 
         Raises:
             InputError: The disk is full or cannot be written (`ExitCode.RESOURCES`).

@@ -23,6 +23,7 @@ from collections.abc import Iterable, Iterator
 from contextlib import suppress
 from pathlib import Path
 
+from warpir.core.atomic import sha256_of
 from warpir.core.errors import ExitCode, InputError
 
 CACHE_BYTES = 4 << 30
@@ -81,9 +82,7 @@ def find_kept(path: Path) -> Path | None:
     """
     for kept in sorted(path.parent.glob(f"{path.name}.*")):
         try:
-            with kept.open("rb") as stream:
-                digest = hashlib.file_digest(stream, "sha256").hexdigest()
-            if kept.suffix == f".{digest}":
+            if kept.suffix == f".{sha256_of(kept)}":
                 with suppress(OSError):  # a folder that may only be read is used all the same
                     os.utime(kept)
                 return kept
@@ -104,9 +103,7 @@ def seal(path: Path, pattern: str) -> None:
     Raises:
         OSError: It cannot be read or renamed.
     """
-    with path.open("rb") as stream:
-        digest = hashlib.file_digest(stream, "sha256").hexdigest()
-    os.rename(path, path.with_name(f"{path.name}.{digest}"))
+    os.rename(path, path.with_name(f"{path.name}.{sha256_of(path)}"))
     make_room(path.parent.glob(pattern), CACHE_BYTES)
 
 

@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from warpir.core.arrays import AnyFloatArray
+from warpir.core.arrays import AnyFloatArray, CodeArray
 
 LUMINANCE_WEIGHTS = (0.2126, 0.7152, 0.0722)
 """Luminance of linear Rec.709 red, green and blue [1]."""
@@ -129,3 +129,8 @@ def gamma_to_linear(encoded: AnyFloatArray) -> AnyFloatArray:
 def linear_to_gamma(linear: AnyFloatArray) -> AnyFloatArray:
     """Encode the composite as DiPIR does: ``linear ** (1 / 2.2)``, negative values as 0."""
     return np.maximum(linear, 0) ** linear.dtype.type(1.0 / GAMMA)
+
+
+def codes_of(encoded: AnyFloatArray) -> CodeArray:
+    """Return the nearest 8-bit codes of display-encoded values, clipped to [0, 1]."""
+    return np.round(255.0 * np.clip(encoded, 0.0, 1.0)).astype(np.uint8)

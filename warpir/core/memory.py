@@ -278,11 +278,8 @@ def needs_of_scene(vertex_count: int, triangle_count: int, texel_count: int) -> 
 def needs_of_model(file_bytes: int, side: int, pictures: int, *, is_half: bool) -> tuple[Need, ...]:
     """Return what Stable Diffusion takes of the device that guides.
 
-    Args:
-        file_bytes: Of its weights' files.
-        side: Of a picture that it judges [px].
-        pictures: Encoded at once with a backward pass.
-        is_half: Whether it computes in half precision; its files may hold more.
+    It encodes so many pictures of ``side`` pixels at once, with a backward pass. Half precision is
+    that of the computation; the files of its weights may hold more.
     """
     encoder = VAE_BYTES * side * side * pictures * (1 if is_half else 2)
     return (

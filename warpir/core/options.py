@@ -17,7 +17,8 @@ class Rule:
     """What a user may give for one field."""
 
     form: str = ""
-    """What stands for the value in ``--help``; empty for a switch."""
+    """What stands for the value in ``--help``, in brackets if the flag alone says yes; empty for a
+    switch."""
     expert: bool = False
     """Whether ``--help-all`` alone shows it."""
     name: str = ""

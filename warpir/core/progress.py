@@ -42,9 +42,6 @@ class Log:
 def progress_bar(say: Callable[[str], None]) -> Iterator[Callable[[str, float], None]]:
     """Show the stages of a render: bars on a terminal, now and then a line where there is none.
 
-    Args:
-        say: Prints a line.
-
     Yields:
         A function to be called with a stage's name and the share of it that is done.
     """
@@ -75,11 +72,7 @@ def progress_bar(say: Callable[[str], None]) -> Iterator[Callable[[str, float], 
 
 
 class StepProgress:
-    """Steps of long stages: bars on a terminal, now and then a line where there is none.
-
-    Args:
-        say: Prints a line.
-    """
+    """Steps of long stages: bars on a terminal, now and then a line where there is none."""
 
     def __init__(self, say: Callable[[str], None]) -> None:
         self.say = say
@@ -122,14 +115,7 @@ class StepProgress:
             self._bars.stop()
 
     def report(self, stage: str, done: int, total: int, words: str = "") -> None:
-        """Show how far a stage is.
-
-        Args:
-            stage: Name of the stage.
-            done: Steps that are done.
-            total: Steps in all.
-            words: What else is to be said, such as where the light comes from.
-        """
+        """Show how far a stage is."""
         if self._bars is not None:
             if stage not in self._tasks:
                 self._tasks[stage] = self._bars.add_task(stage, total=total, words=words)

@@ -4,6 +4,7 @@ import hashlib
 import json
 import math
 import re
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -131,11 +132,7 @@ def read_json_lines(
 ) -> tuple[list[tuple[int, bytes]], str]:
     """Read a file of JSON objects, one a line; `parse_json_object` parses a line.
 
-    Args:
-        path: A regular file.
-        what: What a line is, in the plural, for a person.
-        most: How many there may be.
-        limits: How large the file may be.
+    It may have ``most`` lines; ``what`` they are is in the plural, for a person.
 
     Returns:
         The number and the bytes of each line that is not blank, and the sha256 of the whole file.
@@ -156,6 +153,19 @@ def read_json_lines(
     return lines, hashlib.sha256(raw).hexdigest()
 
 
+def json_bytes(content: object, default: Callable[[Any], Any] | None = None) -> bytes:
+    """Return a file of JSON for people and programs.
+
+    Args:
+        content: Plain values.
+        default: Makes plain what is not.
+
+    Raises:
+        ValueError: A number is not finite.
+    """
+    return (json.dumps(content, indent=2, allow_nan=False, default=default) + "\n").encode()
+
+
 def _depth(root: dict[str, Any]) -> int:
     """Return how many objects and lists are within each other at most."""
     depth = 0
@@ -172,13 +182,9 @@ def _depth(root: dict[str, Any]) -> int:
 
 
 def read_numbers(path: str | Path, pointer: str, value: Any, count: int) -> list[float]:
-    """Return a list of numbers that was read from a JSON file.
+    """Return a list of ``count`` numbers, the value at a pointer of a JSON file.
 
-    Args:
-        path: The file.
-        pointer: Where the list stands in it.
-        value: What stands there.
-        count: How many are expected; one stands by itself in the file.
+    Of one, which stands by itself in the file, the value is a list too.
 
     Raises:
         InputError: It is something else.
@@ -196,16 +202,10 @@ def read_numbers(path: str | Path, pointer: str, value: Any, count: int) -> list
 def read_versioned(
     path: str | Path, what: str, version: int, limits: Limits = LIMITS
 ) -> dict[str, Any]:
-    """Read one of our own files: a JSON object whose ``format`` is ``warpir-`` and its content.
-
-    Args:
-        path: The file.
-        what: The content, such as ``lobes``.
-        version: The one that is read.
-        limits: How large it may be.
+    """Read one of our own files: a JSON object whose ``format`` is ``warpir-`` and ``what``.
 
     Raises:
-        InputError: Missing, not strict JSON, or of another format.
+        InputError: Missing, too large, not strict JSON, or of another format or version.
     """
     root = read_json_object(path, limits)
     if root.get("format") != f"warpir-{what}" or root.get("version") != version:

@@ -9,9 +9,11 @@ from pathlib import Path
 from warpir.app.config import LIGHTS, InsertConfig
 
 FOLDER = Path(__file__).parent
-PHOTO, ASSET, LIGHT, CAMERA = (
-    FOLDER / name for name in ("photo.png", "car.glb", "sky.exr", "camera.json")
+PHOTO, WET_PHOTO, ASSET, LIGHT, CAMERA = (
+    FOLDER / name for name in ("photo.png", "wet.jpg", "car.glb", "sky.exr", "camera.json")
 )
+WET_ROUGHNESS = 0.2
+"""Perceptual roughness of the film of water on the square's paving after rain [1]."""
 PLACE = (0.15, 0.0, -9.3)
 """Point on the ground under the car's origin, world frame [m]: three-quarter view, about a third of
 the picture's width."""
@@ -28,9 +30,11 @@ def demo_config(config: InsertConfig) -> InsertConfig:
     is_placed = config.placement.place is not None or config.placement.at is not None
     is_given = any(config.flat()[name] is not None for name in LIGHTS)
     is_recovered = is_given or (config.guidance.kind != "none" and config.task.refine is None)
+    is_wet, stated = config.inputs.demo == "wet", config.render.ground_roughness
     return config.changed(
         demo=False,
-        photo=str(PHOTO),
+        photo=str(WET_PHOTO if is_wet else PHOTO),
+        ground_roughness=WET_ROUGHNESS if is_wet and stated == "off" else stated,
         asset=str(ASSET),
         camera=str(CAMERA),
         place=config.placement.place if is_placed else PLACE,

@@ -42,14 +42,7 @@ SAVED = ("tables.md", "contact_sheet.png")
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Run the command line.
-
-    Args:
-        argv: Arguments without the program's name; ``sys.argv`` when absent.
-
-    Returns:
-        The exit status, as of `warpir.insert`.
-    """
+    """Run the command line, as `run_program`."""
     return run_program(_run, argv)
 
 
@@ -146,11 +139,7 @@ def _run(arguments: list[str]) -> int:
 
 
 def _check(options: argparse.Namespace, needed: Sequence[str]) -> None:
-    """Check the options.
-
-    Args:
-        options: Of the command line.
-        needed: Names of those that must be given.
+    """Check the options, and that those needed are given.
 
     Raises:
         InputError: A flag is missing or out of range (`ExitCode.USAGE`).
@@ -212,10 +201,7 @@ def evaluate(
 ) -> dict[str, Any]:
     """Make the scenes, evaluate every row, print and write the results.
 
-    Args:
-        options: Options of the command line.
-        rows: Names in `warpir.evaluate.rows.ROWS`.
-        output: For tables and contact sheet, or None.
+    Rows are names in `warpir.evaluate.rows.ROWS`, ``output`` is for tables and contact sheet.
 
     Returns:
         What the JSON file holds.

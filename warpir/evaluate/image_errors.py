@@ -58,12 +58,6 @@ def image_errors(
     ``rmse``, ``linear_rmse`` (of values decoded by the power 2.2), ``si_rmse``, ``ssim`` and
     ``flip`` are means over the region's pixels, the latter two of maps made of the whole picture.
     ``lpips`` is of the full picture alone.
-
-    Args:
-        image: Composite to judge.
-        truth: True composite.
-        regions: Regions of `make_regions`.
-        lpips: LPIPS, when its weights are there.
     """
     maps = {"ssim": ssim_map(image, truth)}
     if has_flip():

@@ -8,10 +8,11 @@ import numpy as np
 import torch
 
 from warpir.core.arrays import BoolArray, FloatArray
+from warpir.core.color import codes_of
 from warpir.evaluate.image_errors import Distance, image_errors, make_regions
 from warpir.evaluate.light_errors import light_errors
 from warpir.evaluate.report import Entry, bootstrap
-from warpir.evaluate.results import Panel, to_codes
+from warpir.evaluate.results import Panel
 from warpir.evaluate.rows import ROWS
 from warpir.evaluate.scenes import Place, Subject
 from warpir.evaluate.stage import Bench, Prediction, Stage
@@ -91,7 +92,7 @@ class Judge:
                 if name == self.sheet_row:
                     pictures = (place.photo, image, stage.truth)
                     error = figures["image.box.rmse"]
-                    panels.append(Panel(subject.name, error, *map(to_codes, pictures)))
+                    panels.append(Panel(subject.name, error, *map(codes_of, pictures)))
         return entries, panels
 
     def _judge_picture(
@@ -134,11 +135,6 @@ def light_figures(place: Place, texels: FloatArray) -> dict[str, float]:
 
 def procedural_errors(network: Regressor, count: int, seed: int) -> dict[str, dict[str, float]]:
     """Return how well the regressor finds the direction in rendered photographs never seen.
-
-    Args:
-        network: The regressor.
-        count: Photographs.
-        seed: Lights and photographs are those of no training run.
 
     Returns:
         Angle between found and true dominant direction [deg]: median, mean and 95 % interval of the

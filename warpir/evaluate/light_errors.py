@@ -296,11 +296,7 @@ def _neighbours() -> tuple[Int64Array, Int64Array]:
 
 
 def _parts(mask: BoolArray) -> IntArray:
-    """Return the number of the connected part that each texel belongs to; each other one is alone.
-
-    Args:
-        mask: Texels that count, shape [128, 256].
-    """
+    """Number the connected parts of a mask, shape [128, 256]; each other texel is alone."""
     first, second = _neighbours()
     flat = mask.ravel()
     kept = flat[first] & flat[second]
@@ -365,10 +361,7 @@ def _blobs(
 ) -> Iterator[BoolArray]:
     """Yield blobs of light, each around the brightest texel that is left.
 
-    Args:
-        values: Values that define a blob's peak and edge, shape [128, 256].
-        energy: Energy of each texel; ends the search.
-        touching: Like `_touching`.
+    Values define a blob's peak and edge, the energy ends the search; shape [128, 256] each.
     """
     left = np.ones(values.shape, bool)
     for _ in range(BLOB_COUNT_MAX):

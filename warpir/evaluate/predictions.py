@@ -16,11 +16,10 @@ from typing import Any, Protocol
 
 import numpy as np
 from numpy.lib.format import open_memmap
-from numpy.typing import NDArray
 from scipy.ndimage import uniform_filter1d
 
 from warpir.core.arrays import Float64Array, FloatArray
-from warpir.core.color import gamma_to_linear
+from warpir.core.color import codes_of, gamma_to_linear
 from warpir.core.errors import InputError, raise_all
 from warpir.core.latlong import latitudes, map_directions, rotate_map
 from warpir.core.limits import LIMITS
@@ -98,11 +97,6 @@ class Predictions:
 def export_crops(scenes: Sequence[SceneCrop], folder: str | Path, overwrite: bool = False) -> None:
     """Write ``NAME.png`` for each scene, ``NAME.public.png`` where it can be made, and the index.
 
-    Args:
-        scenes: All with different names.
-        folder: Made when missing.
-        overwrite: Whether an earlier export is replaced.
-
     Raises:
         InputError: The folder holds files, or cannot be written.
     """
@@ -110,10 +104,10 @@ def export_crops(scenes: Sequence[SceneCrop], folder: str | Path, overwrite: boo
     with OutputFolder(folder, overwrite) as output:
         for scene in scenes:
             photo = f"{scene.name}.png"
-            output.write_png(photo, _codes(scene.photo), mark=False)
+            output.write_png(photo, codes_of(scene.photo), mark=False)
             public = public_crop(scene.photo, scene.camera)
             if public is not None:
-                output.write_png(f"{scene.name}.public.png", _codes(public), mark=False)
+                output.write_png(f"{scene.name}.public.png", codes_of(public), mark=False)
             entries.append(_crop_entry(scene, photo, public is not None))
         output.write_json(
             INDEX,
@@ -275,12 +269,6 @@ def public_crop(photo: FloatArray, camera: Camera) -> Float64Array | None:
         return powered
     alpha = PUBLIC_WHITE / float(np.percentile(powered[powered > 0.0], PUBLIC_PERCENTILE))
     return np.clip(alpha * powered, 0.0, 1.0)
-
-
-def _codes(display: FloatArray | Float64Array) -> NDArray[np.uint8]:
-    """Return 8-bit codes of a picture in [0, 1]."""
-    codes = np.round(np.clip(display.astype(np.float64), 0.0, 1.0) * 255.0)
-    return codes.astype(np.uint8)
 
 
 def _options(folder: Path) -> tuple[str, float]:

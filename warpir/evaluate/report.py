@@ -82,11 +82,8 @@ def bootstrap(
 ) -> tuple[float, float]:
     """Return the percentile interval of a mean when whole groups are drawn with replacement.
 
-    Args:
-        values: One a scene.
-        groups: Group of each scene; groups are drawn whole.
-        seed: Seed of the draws; equal groups give equal draws, so intervals of rows go together.
-        rounds: Samples.
+    Values and groups are one a scene. Equal groups and seeds give equal draws, so intervals of rows
+    go together.
     """
     names = sorted(set(groups))
     where = {name: k for k, name in enumerate(names)}
@@ -108,12 +105,7 @@ def _draws(count: int, seed: int, rounds: int) -> Float64Array:
 
 
 def mean_of(by_scene: Mapping[str, float], panoramas: Mapping[str, str]) -> Mean:
-    """Return mean and intervals of one figure.
-
-    Args:
-        by_scene: The figure by scene.
-        panoramas: Panorama by scene.
-    """
+    """Return mean and intervals of one figure."""
     scenes = sorted(by_scene)
     values = [by_scene[s] for s in scenes]
     low, high = bootstrap(values, scenes)
@@ -167,12 +159,7 @@ class Pair:
 
 
 def compare(entries: Sequence[Entry], starts: Mapping[str, str]) -> list[Pair]:
-    """Compare every row with `AGAINST` and with the row that it starts from.
-
-    Args:
-        entries: Entries of all rows.
-        starts: The row that a row starts from, by name.
-    """
+    """Compare every row with `AGAINST` and with the row that it starts from."""
     panoramas = {e.scene: e.panorama for e in entries}
     rows = list(dict.fromkeys(e.row for e in entries))
     pairs = []
@@ -268,12 +255,7 @@ OF_LIGHT = ("light.", "spheres.")
 def tables(
     summary: Mapping[str, Mapping[str, Mapping[str, Mean]]], words: Mapping[str, str]
 ) -> Iterator[str]:
-    """Yield the tables as lines of Markdown.
-
-    Args:
-        summary: Summary of `summarize`.
-        words: Description of each row.
-    """
+    """Yield the tables as lines of Markdown."""
     for title, columns in TABLES:
         is_light = columns[0][1].startswith(OF_LIGHT)
         for group in ("all", "sunny", "other") if is_light else tuple(GROUPS):

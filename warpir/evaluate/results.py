@@ -15,7 +15,7 @@ from PIL import Image, ImageDraw
 
 import warpir
 from warpir.app.record import versions
-from warpir.core.arrays import CodeArray, FloatArray
+from warpir.core.arrays import CodeArray
 from warpir.evaluate.report import Entry
 from warpir.evaluate.scenes import Place, Subject
 from warpir.evaluate.stage import Bench
@@ -40,20 +40,8 @@ class Panel:
     truth: CodeArray
 
 
-def to_codes(picture: FloatArray) -> CodeArray:
-    """Return a display-encoded picture as 8-bit codes."""
-    codes: CodeArray = np.round(255.0 * np.clip(picture, 0.0, 1.0)).astype(np.uint8)
-    return codes
-
-
 def contact_sheet(panels: Sequence[Panel], row: str, count: int = 40) -> CodeArray:
-    """Return the sheet, worst scenes first.
-
-    Args:
-        panels: All of one size.
-        row: Name of the row whose pictures these are.
-        count: Most scenes that are shown.
-    """
+    """Return the sheet, worst scenes first."""
     strips = []
     for panel in sorted(panels, key=lambda p: -p.error)[:count]:
         width = panel.photo.shape[1]

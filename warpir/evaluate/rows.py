@@ -266,11 +266,8 @@ def recover_light(
 ) -> Prediction:
     """Run what `warpir.insert` runs, up to the recovered light and curves.
 
-    Args:
-        bench: Names the model.
-        subject: The object and where it stands.
-        photo: Photo for guidance, display-encoded, shape [H, W, 3].
-        changes: Settings that differ from the bench's.
+    The photo for guidance is display-encoded, shape [H, W, 3]; ``changes`` are settings that differ
+    from the bench's.
     """
     place = subject.place
     with tempfile.TemporaryDirectory() as folder:

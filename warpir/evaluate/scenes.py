@@ -102,12 +102,9 @@ def turned_to(camera: Camera, azimuth: float) -> Camera:
 
 
 def crop_radiance(texels: FloatArray, camera: Camera, side: int = 2) -> Float64Array:
-    """Return what a camera sees of a panorama, linear, shape [height, width, 3].
+    """Return what a camera sees of a lat-long map, linear, shape [height, width, 3].
 
-    Args:
-        texels: Lat-long map.
-        camera: The view.
-        side: Rows and columns of look-ups that one pixel averages.
+    A pixel averages ``side`` rows and columns of look-ups.
     """
     step = (np.arange(side) + 0.5) / side
     total = np.zeros((camera.height, camera.width, 3))
@@ -245,11 +242,6 @@ class Subject:
 
 def find_files(paths: Sequence[Path], suffixes: Sequence[str], where: str) -> list[Path]:
     """Return the files of some kinds among files and folders, by name; folders to any depth.
-
-    Args:
-        paths: Files and folders.
-        suffixes: Endings that count, in small letters.
-        where: Flag that an error names.
 
     Raises:
         InputError: A path is missing, or nothing was found.

@@ -30,6 +30,7 @@ from warpir.render.composite import Quality
 from warpir.render.device_light import light_args
 from warpir.render.device_scene import Placed, Receiver, Scene
 from warpir.render.renderer import Foreground, Renderer
+from warpir.render.shadow.pilot import shaded_pixels
 from warpir.render.tone_curve import ToneCurve
 from warpir.scene.light import Light
 from warpir.scene.tone_curves import Curves, ToneKnots
@@ -76,12 +77,6 @@ class Rendered:
 class Stage:
     """Renders one subject in its place under any light.
 
-    Args:
-        subject: The object and the photograph.
-        device: Warp device.
-        quality: Sampling, the same for every light.
-        threads: Threads on the CPU; 0 for one per core.
-
     Raises:
         InputError: The object covers no pixel.
 
@@ -122,7 +117,7 @@ class Stage:
             args, self.objects, quality.samples, quality.rays, quality.depth, seed,
             quality.indirect_limit,
         )  # fmt: skip
-        proxies = renderer.shaded_pixels(shadow, quality.seed)
+        proxies = shaded_pixels(renderer, shadow, quality.seed)
         is_object = np.zeros(self.place.photo.shape[0] * self.place.photo.shape[1], np.int32)
         is_object[self.objects] = 1
         radiance = renderer.receiver(
@@ -131,12 +126,10 @@ class Stage:
         return Rendered(foreground, proxies, renderer.ratio(radiance))
 
     def compose(self, rendered: Rendered, curves: Curves | None, gain: float = 1.0) -> FloatArray:
-        """Return the composite, display-encoded, shape [H, W, 3].
+        """Return the composite of what `render` returned, display-encoded, shape [H, W, 3].
 
-        Args:
-            rendered: Radiance of `render`.
-            curves: Tone operator and curves; None: the camera's own response.
-            gain: Factor on the object's radiance [1].
+        Without curves the camera's own response is taken; ``gain`` is a factor on the object's
+        radiance.
         """
         shown, behind = self._shown(rendered, curves, gain), self._behind(rendered, curves)
         mask = rendered.foreground.mask[:, None]
@@ -352,12 +345,7 @@ class Bench:
 
 
 def unseen_by(network: Regressor, panorama: str) -> Regressor | None:
-    """Return the mean of the networks that have not learned from a panorama; None without any.
-
-    Args:
-        network: Its record names what each of its networks has learned from.
-        panorama: Name of the file, without its ending.
-    """
+    """Return the mean of the networks that have not learned from a panorama; None without any."""
     records = network.record.get("members", [network.record])
     kept = [k for k, record in enumerate(records) if panorama not in learned_from(record)]
     if len(kept) == len(records):

@@ -272,13 +272,8 @@ def reflected(
     """Return the glTF 2.0 metallic-roughness BRDF times ``cos_i`` [1/sr], 0 below the surface.
 
     For a grey material whose `metallic` is 0 or 1; the formulas are those of
-    `warpir.kernels.bsdf`.
-
-    Args:
-        cos_o: Cosine between normal and the direction to the camera.
-        cos_i: Cosine between normal and the direction to the light.
-        cos_oi: Cosine between the two directions.
-        material: Material of the sphere.
+    `warpir.kernels.bsdf`. The cosines are those between normal and camera, normal and light, and
+    camera and light.
     """
     cos_i = np.maximum(cos_i, 0.0)
     # The half vector h = (wo + wi) / |wo + wi|: |wo + wi| = 2 (wo . h)
@@ -392,11 +387,7 @@ def bilinear_matrix(
 ) -> csr_array:
     """Return the weights of the four cells around each position; columns wrap, rows end.
 
-    Args:
-        rows: In cells, 0 at the centre of the first, shape [position].
-        columns: The same across.
-        row_count: Rows of the grid.
-        column_count: Columns of the grid.
+    Positions, shape [position], are in cells, 0 at the centre of the first.
     """
     rows = np.clip(rows, 0.0, row_count - 1.0)
     top, left = np.floor(rows).astype(np.int64), np.floor(columns).astype(np.int64)

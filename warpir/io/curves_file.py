@@ -48,10 +48,6 @@ def curves_to_json(curves: Curves, response: ToneKnots | None = None) -> dict[st
 def read_curves(path: str | Path, limits: Limits = LIMITS) -> Curves:
     """Read and check a curves file.
 
-    Args:
-        path: The JSON file.
-        limits: How large it may be.
-
     Raises:
         InputError: Missing, of another format, or not monotone curves from (0, 0) to (1, 1); names
             the curve.

@@ -55,16 +55,9 @@ def write_hand_off(
 ) -> tuple[dict[str, Any], tuple[str, ...]]:
     """Stage the files for other tools.
 
-    Args:
-        output: Where; it holds, or will hold, the map.
-        photo: The photograph.
-        asset: The object.
-        camera: Of the photo.
-        placement: Where the object stands.
-        curves: Tone curves of the picture.
-        texels: The light on the object, relative [W/(m^2 sr)], shape [He, 2 He, 3].
-        envmap: Name of the file that holds that map.
-        response: The camera's, which the picture repeats behind the curves.
+    ``texels`` are the light on the object, relative [W/(m^2 sr)], shape [He, 2 He, 3], and
+    ``envmap`` the file that holds them; ``response`` is the camera's, which the picture repeats
+    behind the curves.
 
     Returns:
         Numbers for ``run.json``, and notices.
@@ -154,15 +147,7 @@ def web_map(texels: FloatArray) -> tuple[FloatArray, int]:
 def blender_setup(
     asset: Asset, camera: Camera, placement: Placement, envmap: str, suns: Sequence[Sun]
 ) -> str:
-    """Return the script that builds the scene in Blender.
-
-    Args:
-        asset: The object.
-        camera: Of the photo.
-        placement: Where the object stands.
-        envmap: Name of the map's file.
-        suns: Lamps of that map.
-    """
+    """Return the script that builds the scene in Blender."""
     low, high = asset.bounds()
     diagonal = float(np.linalg.norm((high - low) * np.linalg.norm(placement.asset_to_world[:3, 0])))
     middle = (placement.asset_to_world @ np.append(0.5 * (low + high), 1.0))[:3]

@@ -20,11 +20,7 @@ _CONTENT = re.compile(rb"(?:[0-9]+ on [^\n]*\n?)?")
 
 
 class FolderLock:
-    """The lock of one folder, which must be there.
-
-    Args:
-        folder: The folder.
-    """
+    """The lock of one folder, which must be there."""
 
     def __init__(self, folder: Path) -> None:
         self.folder = folder

@@ -27,8 +27,8 @@ class Layers:
     """What ``layers.exr`` holds, all linear Rec.709; buffers that a run has not made are absent."""
 
     composite: PixelArray
-    """``foreground.rgb + (1 - foreground.a) * plate * shadow_ratio``, plus `grain` where there is
-    any [1], shape [H, W, 3]."""
+    """``foreground.rgb + (1 - foreground.a) * plate * shadow_ratio``, plus `mirror` and `grain`
+    where there are any [1], shape [H, W, 3]."""
     foreground: PixelArray
     """Object alone, premultiplied by coverage [1], shape [H, W, 4]."""
     shadow_ratio: PixelArray
@@ -53,6 +53,9 @@ class Layers:
     """Part of `foreground` reflected diffusely [1], shape [H, W, 3]."""
     specular: PixelArray | None = None
     """Part of `foreground` reflected specularly [1], shape [H, W, 3]."""
+    mirror: PixelArray | None = None
+    """What the object's mirror image on a glossy ground adds to the composite, of either sign [1],
+    shape [H, W, 3]."""
     grain: PixelArray | None = None
     """What grain and JPEG blocks add to the composite, of either sign [1], shape [H, W, 3]."""
 
@@ -71,11 +74,12 @@ _CHANNELS = {
     "emission": ("emission", "RGB"),
     "diffuse": ("diffuse", "RGB"),
     "specular": ("specular", "RGB"),
+    "mirror": ("mirror", "RGB"),
     "grain": ("grain", "RGB"),
 }
 """Layer and channels that each plane has in ``layers.exr``."""
 _FULL_FLOATS = {"depth", "position", "normal"}
-_DEEP = {"composite", "foreground", "shadow_ratio", "plate", "grain"}
+_DEEP = {"composite", "foreground", "shadow_ratio", "plate", "mirror", "grain"}
 """What is stored as float32: always, and of a photograph of more than 8 bits."""
 
 
@@ -135,7 +139,7 @@ def write_layers(
         inputs: sha256 of the input files by name, kept as JSON in ``warpir/inputs``.
 
     Returns:
-        How many values were beyond the half range and clamped; for ``run.json``.
+        How many values were beyond the half range and are its end; for ``run.json``.
 
     Raises:
         ValueError: Shapes disagree, or the composite is not what its layers compute.
@@ -147,6 +151,9 @@ def write_layers(
         + (1.0 - layers.foreground[..., 3:]) * layers.plate * layers.shadow_ratio
     )
     formula = "RGB = fg.RGB + (1 - fg.A) * plate.RGB * shadow.RGB"
+    if layers.mirror is not None:
+        recomputed = recomputed + layers.mirror
+        formula += " + mirror.RGB"
     if layers.grain is not None:
         recomputed = recomputed + layers.grain
         formula += " + grain.RGB"
@@ -195,7 +202,7 @@ def _stored_channels(
             raise ValueError(f"layer {name}: shape {plane.shape}, expected {expected}")
         is_float = name in _FULL_FLOATS or (is_deep and name in _DEEP)
         if not is_float:
-            clamped += int((np.isfinite(plane) & (np.abs(plane) > HALF_MAX)).sum())
+            clamped += int((np.isfinite(plane) & (np.abs(plane) >= HALF_MAX)).sum())
             # NaN and Inf pass through, and the writer refuses them.
             plane = np.where(np.isfinite(plane), np.clip(plane, -HALF_MAX, HALF_MAX), plane)
         for k, channel in enumerate(names):

@@ -32,10 +32,6 @@ SHARPNESS_LIMIT = 1e6
 def read_lobes(path: str | Path, limits: Limits = LIMITS) -> Lobes:
     """Read and check a lobes file.
 
-    Args:
-        path: The JSON file.
-        limits: How large it may be.
-
     Raises:
         InputError: Missing, of another format, or a lobe is out of range; names the lobe.
     """

@@ -8,7 +8,6 @@ removes what was half in place.
 
 import errno
 import hashlib
-import json
 import os
 import re
 import shutil
@@ -20,10 +19,10 @@ from typing import Any
 import numpy as np
 
 from warpir.core.arrays import FloatArray, PixelArray
-from warpir.core.atomic import remove_folder, sync, write_staged
+from warpir.core.atomic import remove_folder, sha256_of, sync, write_staged
 from warpir.core.errors import ExitCode, InputError, disk_error
 from warpir.core.signals import Stopped, whole
-from warpir.core.strict_json import read_json_object
+from warpir.core.strict_json import json_bytes, read_json_object
 from warpir.io.folder_lock import FolderLock, make_folder, no_folder
 from warpir.io.images import writers
 
@@ -55,12 +54,7 @@ class OutputFolder:
     """
 
     def __init__(self, path: str | Path, overwrite: bool = False) -> None:
-        """Name the folder; nothing is touched before the block is entered.
-
-        Args:
-            path: The folder; made when missing.
-            overwrite: Whether results that are already there are replaced.
-        """
+        """Name the folder; nothing is touched before the block is entered."""
         self.path = Path(path)
         self.overwrite = overwrite
         self.staging = self.path / f"{_STAGING}{os.getpid()}"
@@ -154,10 +148,6 @@ class OutputFolder:
     def write_bytes(self, name: str, content: bytes) -> None:
         """Stage one file and see that all of it reached the disk.
 
-        Args:
-            name: Of the program, never a path that leads out.
-            content: The whole file.
-
         Raises:
             InputError: The disk is full or the folder is not writable (exit 5).
         """
@@ -179,9 +169,9 @@ class OutputFolder:
         """
         if name == _RUN_JSON:
             self._run = dict(content)
-            _json_bytes(self._run)
+            json_bytes(self._run, _plain)
         else:
-            self.write_bytes(name, _json_bytes(content))
+            self.write_bytes(name, json_bytes(content, _plain))
 
     def write_png(
         self,
@@ -315,7 +305,7 @@ class OutputFolder:
                 raise InputError(target.parent, what, "remove it", ExitCode.RESOURCES)
         for name, digest in self._hashes.items():
             try:
-                found = _sha256(self.staging / name)
+                found = sha256_of(self.staging / name)
             except OSError as error:
                 raise disk_error(self.staging / name, error) from error
             if found != digest:
@@ -337,7 +327,7 @@ class OutputFolder:
         leftover = [name for name in old if name not in self._hashes]
         run = {**self._run, "files": dict(self._hashes)}
         try:
-            write_staged(self.staging / _RUN_JSON, _json_bytes(run))
+            write_staged(self.staging / _RUN_JSON, json_bytes(run, _plain))
             for folder in {(self.staging / name).parent for name in names} | {self.staging}:
                 sync(folder)
             self._put_in_place(names, leftover)
@@ -455,14 +445,9 @@ def _unchanged(run_json: Path, folder: Path) -> list[str]:
         if not _PLAIN_NAME.fullmatch(name) or not path.is_file() or path.is_symlink():
             continue
         with suppress(OSError):  # what cannot be read stays
-            if _sha256(path) == digest:
+            if sha256_of(path) == digest:
                 unchanged.append(name)
     return unchanged
-
-
-def _sha256(path: Path) -> str:
-    with path.open("rb") as stream:
-        return hashlib.file_digest(stream, "sha256").hexdigest()
 
 
 def _remove_empty_folders(path: Path, names: Iterable[str]) -> None:
@@ -481,14 +466,10 @@ def _is_there(path: Path) -> bool:
     return True
 
 
-def _json_bytes(content: Mapping[str, Any]) -> bytes:
-    """Serialise as strict JSON; NumPy scalars and arrays and paths become plain values."""
-
-    def plain(value: Any) -> Any:
-        if isinstance(value, np.generic | np.ndarray):
-            return value.tolist()
-        if isinstance(value, Path):
-            return str(value)
-        raise TypeError(f"{type(value).__name__} does not belong in JSON")
-
-    return (json.dumps(content, indent=2, allow_nan=False, default=plain) + "\n").encode()
+def _plain(value: Any) -> Any:
+    """Return NumPy's scalars and arrays, and paths, as JSON holds them."""
+    if isinstance(value, np.generic | np.ndarray):
+        return value.tolist()
+    if isinstance(value, Path):
+        return str(value)
+    raise TypeError(f"{type(value).__name__} does not belong in JSON")

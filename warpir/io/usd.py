@@ -6,9 +6,11 @@ vectors, the transpose of ours. https://openusd.org/release/spec_usdpreviewsurfa
 """
 
 import tempfile
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 from PIL import Image
 from pxr import Gf, Sdf, Usd, UsdGeom, UsdLux, UsdShade, UsdUtils, Vt
 
@@ -17,6 +19,7 @@ from warpir.core.errors import InputError
 from warpir.io.gltf.writer import float32_center, translation
 from warpir.scene.asset import Asset, Material, Primitive, TextureSlot
 from warpir.scene.camera import Camera
+from warpir.scene.near.lamps import Lamp, RectangleLamp
 
 USDZ = "scene.usdz"
 APERTURE = 0.36
@@ -26,17 +29,24 @@ Names = dict[tuple[int, tuple[float, ...]], str]
 """Primvars by the set and transform of the coordinates that they hold."""
 
 
-def write_usdz(asset: Asset, asset_to_world: Float64Array, camera: Camera, envmap: Path) -> bytes:
+def write_usdz(
+    asset: Asset,
+    asset_to_world: Float64Array,
+    camera: Camera,
+    envmap: Path,
+    lamps: Sequence[Lamp] = (),
+) -> bytes:
     """Return the scene as one ``.usdz`` file.
 
-    UsdPreviewSurface has no sheen, transmission, coloured specular or vertex colour, and no normal
-    map of the coat: those are left out.
+    UsdPreviewSurface has no sheen, anisotropy, iridescence, transmission, coloured specular or
+    vertex colour, and no normal map of the coat: those are left out.
 
     Args:
         asset: The object.
         asset_to_world: Column vectors [m], shape [4, 4].
         camera: The photo's, with its principal point.
         envmap: The map on the object, OpenEXR's orientation, an ``.exr`` file.
+        lamps: Near the object.
 
     Raises:
         InputError: The package cannot be written.
@@ -55,6 +65,8 @@ def write_usdz(asset: Asset, asset_to_world: Float64Array, camera: Camera, envma
         dome = UsdLux.DomeLight.Define(stage, "/scene/light")
         dome.CreateTextureFileAttr(Sdf.AssetPath("envmap.exr"))
         dome.CreateTextureFormatAttr(UsdLux.Tokens.latlong)
+        for k, lamp in enumerate(lamps):
+            _lamp(stage, lamp, f"/scene/lamp_{k}")
         stage.GetRootLayer().Save()
         package = folder / USDZ
         if not UsdUtils.CreateNewUsdzPackage(str(folder / "scene.usdc"), str(package)):
@@ -78,6 +90,27 @@ def _camera(stage: Usd.Stage, camera: Camera) -> None:
     written.CreateVerticalApertureOffsetAttr(vertical * (camera.cy / camera.height - 0.5))
     # USD's default of 1 m would cut off what stands near.
     written.CreateClippingRangeAttr(Gf.Vec2f(0.01, 1e6))
+
+
+def _lamp(stage: Usd.Stage, lamp: Lamp, path: str) -> None:
+    """Write a lamp; a light of USD that is not normalised has its intensity as radiance."""
+    pose = np.eye(4)
+    pose[:3, 3] = lamp.center
+    if isinstance(lamp, RectangleLamp):
+        width, height = (float(np.linalg.norm(edge)) for edge in (lamp.edge_x, lamp.edge_y))
+        written = UsdLux.RectLight.Define(stage, path)
+        written.CreateWidthAttr(width)
+        written.CreateHeightAttr(height)
+        # USD's shines toward its -Z.
+        pose[:3, 0], pose[:3, 1] = lamp.edge_x / width, -lamp.edge_y / height
+        pose[:3, 2] = np.cross(pose[:3, 0], pose[:3, 1])
+    else:
+        written = UsdLux.SphereLight.Define(stage, path)
+        written.CreateRadiusAttr(lamp.radius)
+    written.AddTransformOp().Set(_matrix(pose))
+    strength = float(lamp.radiance.max())
+    written.CreateIntensityAttr(strength)
+    written.CreateColorAttr(Gf.Vec3f(*(lamp.radiance / max(strength, 1e-30)).tolist()))
 
 
 def _object(stage: Usd.Stage, asset: Asset, asset_to_world: Float64Array) -> None:

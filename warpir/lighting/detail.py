@@ -20,7 +20,7 @@ from warpir.core.latlong import map_directions, texel_solid_angles
 from warpir.render.composite import photo_radiance
 from warpir.render.resizing import resize
 from warpir.scene.camera import Camera
-from warpir.scene.lamps import without_lamps
+from warpir.scene.lamps import lamps_alone, without_lamps
 from warpir.scene.light import Light, as_map
 from warpir.scene.tone_curves import Curves
 
@@ -47,12 +47,9 @@ class Detail:
 
 
 def detail_of(inputs: Inputs, curves: Curves, height: int = HEIGHT) -> Detail:
-    """Return what the photo shows round the object's centre.
+    """Return what the photo shows round the object's centre, as a map of ``height`` rows.
 
-    Args:
-        inputs: Photo, camera, asset and placement.
-        curves: What turns radiance into the photo's values; inverted here.
-        height: Rows of the map.
+    The curves turn radiance into the photo's values, and are inverted here.
     """
     low, high = inputs.asset.bounds()
     centre = inputs.placement.asset_to_world @ np.append((low + high) / 2.0, 1.0)
@@ -70,10 +67,10 @@ def with_detail(light: Light, detail: Detail) -> Light:
         detail: Of the same frame and exposure.
     """
     height = detail.weight.shape[0]
-    whole = as_map(light, height)
-    rest = np.minimum(as_map(without_lamps(light), height), whole)
+    rest = as_map(without_lamps(light), height)
+    lamps = as_map(lamps_alone(light), height)
     weight = detail.weight[..., None]
-    return Light(texels=whole - rest + weight * detail.radiance + (1.0 - weight) * rest)
+    return Light(texels=lamps + weight * detail.radiance + (1.0 - weight) * rest)
 
 
 def seen_from(

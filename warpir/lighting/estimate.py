@@ -37,20 +37,23 @@ class Estimate:
         return {"regression": self.regression.record(), "ground": ground}
 
 
-def estimate_light(inputs: Inputs, asked: LightConfig, tone: str, device: str) -> Estimate:
+def estimate_light(
+    inputs: Inputs,
+    asked: LightConfig,
+    tone: str,
+    device: str,
+    regression: Regression | None = None,
+) -> Estimate:
     """Estimate the light of the photo with the regressor, and check its level by the ground.
 
-    Args:
-        inputs: Photo, camera and placement.
-        asked: Weights, exposure, albedo of the ground.
-        tone: Operator that shows the light, from `InsertConfig.tone_operator`.
-        device: torch's name of it.
+    What the regressor sees in the photo may be given where it is known.
 
     Raises:
         InputError: The weights are absent or damaged (`ExitCode.MODEL`).
     """
     path = None if asked.regressor is None else Path(asked.regressor)
-    regression = regress(load_regressor(path, device), inputs.photo.srgb, inputs.camera)
+    if regression is None:
+        regression = regress(load_regressor(path, device), inputs.photo.srgb, inputs.camera)
     if asked.visible_sun:
         regression = with_visible_sun(regression, inputs.photo.srgb, inputs.camera)
     stops, ground = asked.exposure, None

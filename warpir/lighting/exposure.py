@@ -168,10 +168,8 @@ def level_log_std(regression: Regression, normal: Float64Array) -> float:
 def expected_change(excess: float, log_std: float, albedo_log_std: float) -> float:
     """Return the mean of the log factor on the light, given both witnesses [1].
 
-    Args:
-        excess: Natural logarithm of implied over expected albedo.
-        log_std: Standard deviation of the logarithm of the regressed level.
-        albedo_log_std: Scale of the logarithm of the albedo.
+    The excess is the natural logarithm of implied over expected albedo; the others are standard
+    deviation and scale of the logarithms of the regressed level and of the albedo.
     """
     change = np.linspace(-LOG_FACTOR_MAX, LOG_FACTOR_MAX, 4001)
     misfit = (excess - change) / albedo_log_std

@@ -131,10 +131,7 @@ def yaw_to_world(camera: Camera) -> Float64Array:
 def camera_rays(camera: Camera, height: int = HEIGHT, width: int = WIDTH) -> FloatArray:
     """Return the unit viewing direction of each pixel, camera-yaw frame, shape [height, width, 3].
 
-    Args:
-        camera: Of the photo at any size; the picture is stretched to the size asked for.
-        height: Rows.
-        width: Columns.
+    The photo's camera may be of any size: the picture is stretched to the size asked for.
     """
     view = camera.scaled(width, height)
     u, v = np.meshgrid(np.arange(width) + 0.5, np.arange(height) + 0.5)
@@ -145,12 +142,9 @@ def camera_rays(camera: Camera, height: int = HEIGHT, width: int = WIDTH) -> Flo
 
 
 def regress(network: Regressor, photo_srgb: AnyFloatArray, camera: Camera) -> Regression:
-    """Estimate the light of a photo.
+    """Estimate the light of a photo, display-encoded, in [0, 1], shape [H, W, 3].
 
-    Args:
-        network: Of `load_regressor`.
-        photo_srgb: Display-encoded, in [0, 1], shape [H, W, 3].
-        camera: Of the photo; of any size with the photo's aspect.
+    The network is that of `load_regressor`, the camera of any size with the photo's aspect.
     """
     device = network.directions.device
     photo = _network_photo(photo_srgb).to(device)
@@ -165,10 +159,8 @@ def mean_training_light(
 ) -> Regression:
     """Return the training set's mean light at a photo's exposure: a guess without looking.
 
-    Args:
-        network: Whose training set.
-        photo_srgb: Only its mean luminance counts; display-encoded, shape [H, W, 3].
-        camera: Only its yaw counts.
+    Only the mean luminance of the photo counts, display-encoded, shape [H, W, 3], and only the
+    camera's yaw.
     """
     luminance = float(mean_luminance(_network_photo(photo_srgb)))
     return _regression(network, network.split(network.mean_light[None]), luminance, camera)
@@ -185,14 +177,7 @@ def _network_photo(photo_srgb: AnyFloatArray) -> Tensor:
 def _regression(
     network: Regressor, prediction: Prediction, luminance: float, camera: Camera
 ) -> Regression:
-    """Turn one prediction into numbers in the world.
-
-    Args:
-        network: Holds the candidate directions.
-        prediction: Of one photo, camera-yaw frame.
-        luminance: The photo's mean decoded luminance.
-        camera: Gives the yaw.
-    """
+    """Turn one photo's prediction into numbers in the world, by the photo's mean luminance."""
     to_world = yaw_to_world(camera)
     one = Prediction(*(part.detach().cpu().double() for part in prediction))
     directions = network.directions.cpu().double()

@@ -15,28 +15,23 @@ The camera-yaw frame is the world turned about +Y so that the camera looks along
 from __future__ import annotations
 
 import itertools
-import json
 import math
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass
-from importlib.resources import as_file, files
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
 import torch
 import torch.nn.functional as F
-from safetensors.torch import load_file, save
 from torch import Tensor, nn
 
-from warpir.calibration.blocks import ConvBlock, TokenBlock, head
+from warpir.calibration.blocks import TokenNetwork, TokenSizes, head
+from warpir.calibration.network_files import load_network, random_network, save_network
 from warpir.core.arrays import Float64Array
-from warpir.core.atomic import write_file
 from warpir.core.color import GAMMA, LUMINANCE_WEIGHTS
-from warpir.core.errors import ExitCode, InputError
-from warpir.diffusion.models.model_error import ModelError
 from warpir.diffusion.models.weight_files import REGRESSOR_FORMAT as FORMAT
-from warpir.diffusion.models.weight_files import check_regressor, values_hash
+from warpir.diffusion.models.weight_files import check_regressor
 
 HEIGHT, WIDTH = 96, 144
 """Size that the network sees [px]; photos of other shapes are stretched, and the rays say so."""
@@ -44,28 +39,18 @@ AMBIENT_SHARPNESS = 4.0
 """Of the 14 ambient lobes: with equal amplitudes their sum is even within 4 %."""
 DARKEST = 1e-4
 """Mean luminance below which a photo counts as this bright."""
-GATHERINGS = 4
-"""Weighted means of the tokens that each head reads, of a quarter of the features each."""
 LOWEST = -0.25
 """Height y of the lowest direction that a dominant light may have."""
 
 
 @dataclass(frozen=True)
-class RegressorConfig:
-    """Size of the network."""
+class RegressorConfig(TokenSizes):
+    """Sizes of the network."""
 
     channels: tuple[int, int, int] = (48, 96, 160)
-    """Features at 1/2, 1/4 and 1/8 of the resolution."""
-    blocks: tuple[int, int] = (2, 2)
-    """Residual blocks at 1/2 and 1/4."""
-    depth: int = 4
-    """Transformer blocks over the 12 x 18 tokens."""
     heads: int = 5
     directions: int = 1000
     """Of the whole sphere; those that lie low are left out."""
-    dropout: float = 0.1
-    skipped: float = 0.1
-    """Chance that a block is left out in training (stochastic depth)."""
     hidden: float = 0.3
     """Share of the tokens that training hides: no single corner of a place may tell its light."""
     members: int = 1
@@ -133,42 +118,16 @@ def mean_luminance(photo: Tensor) -> Tensor:
     return (mean @ weights).clamp(min=DARKEST)
 
 
-class Member(nn.Module):
+class Member(TokenNetwork):
     """One network: photo and rays to a flat prediction.
 
-    There are 12 x 18 tokens of 8 x 8 pixels, and two learned ones that ask them. Each of the two
-    heads, for direction and for levels, reads one learned token plus weighted means of the others.
-    The means matter: without them training stays long at the one answer that fits all photos.
-
-    Args:
-        config: Of the regressor.
-        direction_count: Candidate directions.
-        level_count: All other numbers of a flat prediction.
+    There are 12 x 18 tokens, and two heads, for direction and for levels. Where a token looks takes
+    the place of a position: it holds for every field of view.
     """
 
     def __init__(self, config: RegressorConfig, direction_count: int, level_count: int) -> None:
-        super().__init__()
-        fine, middle, wide = config.channels
-        self.hidden = config.hidden
-        # Space to depth keeps every pixel: the edges of shadows are what tells the direction.
-        self.stem = nn.Conv2d(4 * 6, fine, 3, padding=1)
-        self.fine = nn.Sequential(*(ConvBlock(fine, 0.0) for _ in range(config.blocks[0])))
-        self.down1 = nn.Conv2d(fine, middle, 3, stride=2, padding=1)
-        self.middle = nn.Sequential(
-            *(ConvBlock(middle, config.skipped / 2.0) for _ in range(config.blocks[1]))
-        )
-        self.down2 = nn.Conv2d(middle, wide, 3, stride=2, padding=1)
-        self.norm = nn.GroupNorm(8, wide)
-        # Where a token looks takes the place of a position: it holds for every field of view.
-        self.place = nn.Sequential(nn.Linear(3, wide), nn.GELU(), nn.Linear(wide, wide))
-        self.asking = nn.Parameter(torch.randn(2, wide) * 0.02)
-        self.blocks = nn.ModuleList(
-            TokenBlock(wide, config.heads, config.dropout, config.skipped)
-            for _ in range(config.depth)
-        )
-        self.gather = nn.Linear(wide, 2 * GATHERINGS, bias=False)
-        # Clearly different weights from the start: an even mean tells nothing of where.
-        nn.init.normal_(self.gather.weight, std=3.0 / math.sqrt(wide))
+        super().__init__(config, planes=6, places=3, asking=2)
+        self.hidden, wide = config.hidden, config.channels[-1]
         self.direction_head = head(wide, config.dropout, direction_count)
         self.level_head = head(wide, config.dropout, level_count)
 
@@ -180,27 +139,17 @@ class Member(nn.Module):
 
     def forward(self, photo: Tensor, rays: Tensor) -> Tensor:
         """Return a flat prediction; arguments are those of `Regressor.forward`."""
-        x = torch.cat([photo * 2.0 - 1.0, rays], dim=1)
-        x = self.fine(self.stem(F.pixel_unshuffle(x, 2)))
-        x = self.middle(self.down1(x))
-        x = self.norm(self.down2(x))
-        looking = F.adaptive_avg_pool2d(rays, x.shape[2:]).flatten(2).transpose(1, 2)
+        x = self.features(torch.cat([photo * 2.0 - 1.0, rays], dim=1))
+        looking = F.adaptive_avg_pool2d(rays, (x.shape[2], x.shape[3])).flatten(2).transpose(1, 2)
         tokens = x.flatten(2).transpose(1, 2) + self.place(looking)
         if self.training and self.hidden > 0.0:
             count = max(1, round(tokens.shape[1] * (1.0 - self.hidden)))
             order = torch.rand(tokens.shape[:2], device=tokens.device).argsort(dim=1)[:, :count]
             tokens = tokens.gather(1, order[..., None].expand(-1, -1, tokens.shape[2]))
-        tokens = torch.cat([self.asking.expand(len(tokens), -1, -1), tokens], dim=1)
-        for block in self.blocks:
-            tokens = block(tokens)
+        tokens = self.mixed(tokens)
         # Softmax and exponentials of the answers need more digits than autocast leaves.
         with torch.autocast(tokens.device.type, enabled=False):
-            tokens = tokens.to(self.gather.weight.dtype)
-            asked, seen = tokens[:, :2], tokens[:, 2:]
-            weights = self.gather(seen).softmax(dim=1).unflatten(2, (2, GATHERINGS))
-            groups = seen.unflatten(2, (GATHERINGS, -1))
-            gathered = torch.einsum("btag,btgc->bagc", weights, groups).flatten(2)
-            direction, levels = (asked + gathered).unbind(dim=1)
+            direction, levels = self.read(tokens)[0].unbind(dim=1)
             return torch.cat([self.direction_head(direction), self.level_head(levels)], dim=1)
 
 
@@ -345,66 +294,20 @@ def least_angle(directions: Tensor, probability: Tensor, steps: int = 20) -> tup
 
 
 def random_regressor(seed: int, config: RegressorConfig | None = None) -> Regressor:
-    """Return a network with random weights: a start for training, and a control that must fail."""
-    with torch.random.fork_rng(devices=[]):
-        torch.manual_seed(seed)
-        return Regressor(config or RegressorConfig()).eval()
+    """As `random_network`."""
+    return random_network(seed, lambda: Regressor(config or RegressorConfig()))
 
 
 def save_regressor(network: Regressor, path: Path, record: Mapping[str, Any]) -> None:
-    """Write a network: fp16 weights, whole or not at all.
-
-    Args:
-        network: Its temperature and mean light go along.
-        path: The safetensors file.
-        record: How it was trained, plain values; read back as `Regressor.record`.
-
-    Raises:
-        OSError: The disk is full or the folder is not writable; an older file is still whole.
-    """
+    """As `save_network`; the record is read back as `Regressor.record`."""
     exact = {"temperature", "directions"}
-    state = {
-        name: (part if name in exact else part.half()).cpu().contiguous()
-        for name, part in network.state_dict().items()
-    }
-    config = json.dumps(asdict(network.config))
-    about = {
-        "format": FORMAT,
-        "config": config,
-        "weights": values_hash({name: part.numpy() for name, part in state.items()}, config),
-        "record": json.dumps(dict(record), allow_nan=False),
-    }
-    write_file(path, save(state, metadata=about))
+    save_network(network, network.config, path, record, FORMAT, exact)
 
 
 def load_regressor(path: Path | None, device: str | torch.device = "cpu") -> Regressor:
-    """Read a network for `regress`.
-
-    Args:
-        path: The safetensors file; None: the one in the package.
-        device: Where it shall run.
-
-    Raises:
-        InputError: The file is absent, damaged or of another kind (`ExitCode.MODEL`).
-    """
-    if path is None:
-        packaged = files("warpir.diffusion") / "weights" / "regressor.safetensors"
-        with as_file(packaged) as found:
-            return load_regressor(found, device)
-    try:
-        file = check_regressor(path)
-        config = json.loads(file.about["config"])
-        plain: dict[str, Any] = {
-            k: tuple(v) if isinstance(v, list) else v for k, v in config.items()
-        }
-        size = RegressorConfig(**plain)
-        # Not on "meta" first: its sizes are checked, and random numbers there import the compiler.
-        network = Regressor(size)
-        expected = {name: part.shape for name, part in network.state_dict().items()}
-        if expected != file.shapes:
-            raise ModelError(str(path), "damaged (the weights are not those of its network)")
-        network.load_state_dict({name: part.float() for name, part in load_file(path).items()})
-    except ModelError as error:
-        raise InputError(error.where, error.what, error.advice, ExitCode.MODEL) from None
-    network.record = json.loads(file.about["record"])
-    return network.to(device).eval().requires_grad_(False)
+    """Read a network for `regress`; see `load_network`."""
+    network, record = load_network(
+        check_regressor, lambda sizes: Regressor(RegressorConfig(**sizes)), path, device
+    )
+    network.record = record
+    return network

@@ -14,6 +14,7 @@ from warpir.core.errors import InputError
 from warpir.lighting.fit import LobeFit, fit_lobes
 from warpir.scene.lamps import lamp_axes, without_lamps
 from warpir.scene.light import Light, plain_sky, sun_lobe
+from warpir.scene.near.lamps import irradiance
 from warpir.scene.receiver import first_hit
 from warpir.scene.shadow_mask import values_at
 from warpir.scene.tone_curves import Curves
@@ -31,6 +32,8 @@ GROUND_PERCENTILE = 50.0
 """Of the ground round the object: the level of an even light (the authors state none)."""
 LIT_PERCENTILE = 75.0
 """The brighter quarter of the ground round the object stands for ground that is not in shadow."""
+LEAST_FROM_AFAR = 0.05
+"""Share of that ground's light which does not come from lamps near it, at least [1]."""
 LIT_SHARE = 0.1
 """Share of that ground which must be known to be out of shadow to be measured alone [1]."""
 SEEN = 0.99
@@ -69,11 +72,6 @@ class SceneLight:
 
 def make_light(inputs: Inputs, asked: LightConfig, tone: str) -> SceneLight | None:
     """Build the light and set its exposure; None: it is to be estimated from the photo.
-
-    Args:
-        inputs: Photo, camera, placement; panorama, lobes or earlier run where one is named.
-        asked: What the user stated about the light.
-        tone: Operator that shows it, from `InsertConfig.tone_operator`.
 
     Raises:
         InputError: The light is black, so no exposure can be chosen; or --tone contradicts the run
@@ -162,8 +160,8 @@ def _automatic_exposure(light: Light, inputs: Inputs, asked: LightConfig, tone: 
     value itself with ``--tone linear``.
     """
     points, light = lit_ground(_ring(inputs), light, inputs)
-    irradiance = float(luminance(light.irradiance(inputs.placement.ground[:3])))
-    if not irradiance > 0.0:
+    from_afar = float(luminance(light.irradiance(inputs.placement.ground[:3])))
+    if not from_afar > 0.0:
         raise InputError(
             asked.file or "--sun",
             "no light reaches the ground, so no exposure follows from the photo",
@@ -171,18 +169,25 @@ def _automatic_exposure(light: Light, inputs: Inputs, asked: LightConfig, tone: 
         )
     level = np.clip(_level(inputs, points, LIT_PERCENTILE), 1e-3, 0.9)
     wanted = level / (1.0 - level) if tone == "reinhard" else level
-    return float(np.log2(wanted * np.pi / (asked.assumed_albedo * irradiance)))
+    received = wanted * np.pi / asked.assumed_albedo
+    left = received - _by_lamps(inputs, points)
+    return float(np.log2(max(left, LEAST_FROM_AFAR * received) / from_afar))
+
+
+def _by_lamps(inputs: Inputs, points: Float64Array) -> float:
+    """Return the median luminance of what lamps near the object give to points of the ground."""
+    if not inputs.lamps:
+        return 0.0
+    normal = inputs.placement.ground[:3]
+    given = [sum(irradiance(lamp, point, normal) for lamp in inputs.lamps) for point in points]
+    return float(np.median(luminance(np.array(given))))
 
 
 def lit_ground(points: Float64Array, light: Light, inputs: Inputs) -> tuple[Float64Array, Light]:
     """Return those points of the ground that the lamps reach, and the light that reaches them.
 
     Where mesh and mask say that they reach too few, all points and the light without its lamps.
-
-    Args:
-        points: World frame [m], shape [point, 3].
-        light: Its lamps may be kept from the ground.
-        inputs: Hold mesh, mask and camera.
+    Points are in the world frame [m], shape [point, 3]; the inputs hold mesh, mask and camera.
     """
     reached = _reached(points, light, inputs)
     if (reached > 0.5).mean() >= LIT_SHARE:

@@ -91,13 +91,9 @@ class SGLight(torch.nn.Module):
     def uniform(
         count: int, level: float, bounds: LightBounds, width: float = WIDTH_FACTOR
     ) -> SGLight:
-        """Return grey lobes spread evenly whose map has the mean ``level``.
+        """Return grey lobes spread evenly whose map has the mean ``level`` [W/(m^2 sr)], relative.
 
-        Args:
-            count: Number of lobes.
-            level: Relative [W/(m^2 sr)].
-            bounds: What the lobes may not leave.
-            width: Sigma in spacings of the lobes [1].
+        ``width`` is sigma in spacings of the lobes.
         """
         sigma = max(width * np.sqrt(4.0 * np.pi / count), bounds.sigma_min)
         sharpness = np.full(count, 1.0 / sigma**2, np.float32)
@@ -119,9 +115,7 @@ class SGLight(torch.nn.Module):
 
     def log_ratios(self) -> Tensor:
         """Return the bounded log colour ratios, which sum to 0, shape [lobe, 3]."""
-        raw = self.chroma - self.chroma.mean(dim=1, keepdim=True)
-        size = (raw / self.bounds.chroma_length).square().sum(dim=1, keepdim=True)
-        return raw / torch.sqrt(1.0 + size)
+        return bounded_ratios(self.chroma, self.bounds)
 
     def amplitude(self) -> Tensor:
         """Return the lobes' peaks, relative [W/(m^2 sr)], shape [lobe, 3]."""
@@ -147,6 +141,13 @@ class SGLight(torch.nn.Module):
             parts = (self.amplitude(), axis, sharpness)
             amplitude, unit, concentration = (p.cpu().numpy().copy() for p in parts)
         return Lobes(amplitude, unit, concentration)
+
+
+def bounded_ratios(raw: Tensor, bounds: LightBounds) -> Tensor:
+    """Return log colour ratios that sum to 0, within their bound, of raw ones, shape [..., 3]."""
+    raw = raw - raw.mean(dim=-1, keepdim=True)
+    size = (raw / bounds.chroma_length).square().sum(dim=-1, keepdim=True)
+    return raw / torch.sqrt(1.0 + size)
 
 
 def narrowest(height: int) -> float:

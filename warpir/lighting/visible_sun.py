@@ -180,10 +180,8 @@ def with_visible_sun(
 ) -> Regression:
     """Return the light with its dominant part where the photo shows the sun, if it shows one.
 
-    Args:
-        regression: What the regressor sees in the photo.
-        photo_srgb: Display-encoded, in [0, 1], shape [H, W, 3].
-        camera: Of the photo, of any size with the photo's aspect.
+    The photo is display-encoded, in [0, 1], shape [H, W, 3]; the camera is of any size with the
+    photo's aspect.
     """
     found = [(probability(s, regression), s.axis) for s in find_spots(photo_srgb, camera)]
     best, axis = max(found, key=lambda pair: pair[0], default=(0.0, regression.axis))
@@ -263,13 +261,6 @@ def with_sun(
 
 
 def _weighed(own: float, variance: float, usual: float, usual_std: float) -> tuple[float, float]:
-    """Return mean and deviation of a logarithm by two witnesses.
-
-    Args:
-        own: The regressor's.
-        variance: What it believes of it.
-        usual: That of suns in view.
-        usual_std: Its deviation.
-    """
+    """Return a logarithm and its deviation by two witnesses: the regressor, and suns in view."""
     by_own, by_usual = 1.0 / variance, usual_std**-2
     return (by_own * own + by_usual * usual) / (by_own + by_usual), (by_own + by_usual) ** -0.5

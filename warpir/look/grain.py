@@ -66,9 +66,12 @@ class Grain:
         rng = np.random.Generator(np.random.Philox(np.random.SeedSequence(seed)))
         shared, own = rng.standard_normal((*shape, 1)), rng.standard_normal((*shape, 3))
         common = min(max(self.correlation, 0.0), 1.0)
-        noise: Float64Array = np.sqrt(common) * shared + np.sqrt(1.0 - common) * own
+        # In place: these are the largest arrays of a run with a large photo.
+        noise: Float64Array = own
+        noise *= np.sqrt(1.0 - common)
+        noise += np.sqrt(common) * shared
         if self.size > 0.0:
-            noise = ndimage.gaussian_filter(noise, (self.size, self.size, 0.0), mode="wrap")
+            ndimage.gaussian_filter(noise, (self.size, self.size, 0.0), output=noise, mode="wrap")
             impulse = np.zeros((33, 33))
             impulse[16, 16] = 1.0
             kernel = ndimage.gaussian_filter(impulse, self.size)
@@ -193,28 +196,30 @@ def grain_over(
     The object gets the grain of its level. The photo's own grain is still in the ground, scaled by
     the shadow; what its darker level lacks is added.
 
-    Args:
-        grain: Of the photo.
-        composite: Display-linear, without new grain, shape [H, W, 3].
-        plate: Display-linear photo, same shape.
-        matte: Object coverage, shape [H, W].
-        changed: Pixels that may change; the others get 0.
-        seed: Of the noise.
-        gamma: Exponent from display values to display-linear ones.
+    Composite, without new grain, and plate are display-linear too, the matte is the object's
+    coverage, shape [H, W]. Pixels that may not change get 0. ``gamma`` is the exponent from display
+    values to display-linear ones.
     """
-    shown = np.clip(composite, 0.0, 1.0) ** (1.0 / gamma)
+    added = np.zeros_like(composite, np.float32)
+    if not changed.any():
+        return added
+    rows, columns = (np.flatnonzero(changed.any(axis=axis)) for axis in (1, 0))
+    box = np.s_[rows[0] : rows[-1] + 1, columns[0] : columns[-1] + 1]
+    # Other frames of a sequence have other grain.
+    frame = zlib.crc32(np.ascontiguousarray(plate[::8, ::8], np.float32).tobytes())
+    height, width = matte[box].shape
+    noise = grain.draw((height, width), seed, frame)[changed[box]]
+    linear = np.clip(composite[changed], 0.0, 1.0)
+    shown = linear ** (1.0 / gamma)
     wanted = grain.deviation(shown)
-    before = np.clip(plate, 1e-6, 1.0) ** (1.0 / gamma)
-    share = (1.0 - matte)[..., None]
+    before = np.clip(plate[changed], 1e-6, 1.0) ** (1.0 / gamma)
+    share = (1.0 - matte[changed])[:, None]
     # Of the photo's grain the uncovered share is left, scaled as its signal is.
     kept = share * grain.deviation(before) * np.minimum(shown / before, 1.0)
     lacking = np.sqrt(np.maximum(wanted**2 - kept**2, 0.0))
-    # Other frames of a sequence have other grain.
-    frame = zlib.crc32(np.ascontiguousarray(plate[::8, ::8], np.float32).tobytes())
-    noise = grain.draw((matte.shape[0], matte.shape[1]), seed, frame)
     noisy = np.clip(shown + lacking * noise, 0.0, 1.0) ** gamma
-    added = (noisy - np.clip(composite, 0.0, 1.0)) * changed[..., None]
-    return np.asarray(added, np.float32)
+    added[changed] = noisy - linear
+    return added
 
 
 def blocks_over(
@@ -222,11 +227,8 @@ def blocks_over(
 ) -> FloatArray:
     """Return what the photo's JPEG coding adds to a composite, display-linear, shape [H, W, 3].
 
-    Args:
-        coding: Of the photo.
-        composite: Display-linear, with the grain, shape [H, W, 3].
-        changed: Pixels that may change; the others get 0.
-        gamma: Exponent from display values to display-linear ones.
+    The composite is display-linear, with the grain. Pixels that may not change get 0. ``gamma`` is
+    the exponent from display values to display-linear ones.
     """
     linear = np.clip(composite, 0.0, 1.0)
     shown = linear ** (1.0 / gamma)

@@ -3,10 +3,10 @@
 Written from appendix B of the specification alone (https://registry.khronos.org/glTF/specs/2.0,
 "BRDF implementation"): GGX, height-correlated Smith, Schlick, and a Lambert lobe damped by the
 same Fresnel term; and from the README of each KHR_materials extension: ior, specular, clearcoat,
-sheen (the form whose albedo scaling depends on the view alone) and thin transmission, whose light
-goes straight on with the luminance of its tint. Names follow warpir: ``wo`` toward the camera,
-``wi`` toward the light; Mitsuba's arguments are the other way round and are renamed at the border
-of each method.
+sheen (the form whose albedo scaling depends on the view alone), thin transmission, whose light goes
+straight on with the luminance of its tint, anisotropy and iridescence. Names follow warpir: ``wo``
+toward the camera, ``wi`` toward the light; Mitsuba's arguments are the other way round and are
+renamed at the border of each method.
 """
 
 from dataclasses import dataclass
@@ -20,6 +20,7 @@ from numpy.typing import NDArray
 from warpir.mitsuba.lobes import (
     MIN_ALPHA,
     charlie,
+    film_reflectance,
     ggx,
     read_sheen_table,
     sample_visible_normal,
@@ -27,7 +28,7 @@ from warpir.mitsuba.lobes import (
     sheen_table,
 )
 from warpir.mitsuba.texture import Image, face_tangents, wound
-from warpir.scene.asset import Asset, Primitive
+from warpir.scene.asset import Asset, Primitive, TextureSlot
 
 IS_COLOR = {
     "base_color": True,
@@ -42,6 +43,9 @@ IS_COLOR = {
     "sheen_color": True,
     "sheen_roughness": False,
     "transmission": False,
+    "anisotropy": False,
+    "iridescence": False,
+    "iridescence_thickness": False,
 }
 """Textures of a `Material` by name, and whether their RGB is sRGB."""
 
@@ -58,12 +62,16 @@ class Surface:
     """Unit geometric normal, on the side of ``wo``."""
     base_color: Any
     metallic: Any
+    frame: Any
+    """Of the shading normal; its x is the direction of anisotropy."""
     alpha: Any
-    """GGX width, perceptual roughness squared [1]."""
+    """GGX widths along x and y of `frame` [1]."""
     dielectric_f0: Any
     """Reflectance of the dielectric at normal incidence [1]."""
     dielectric_f90: Any
     """Reflectance of the dielectric at grazing incidence [1]."""
+    film: Any
+    """Share with a thin film [1], its index and thickness [nm]; None without any."""
     transmission: Any
     """Share of what enters the dielectric that goes through [1]."""
     sheen_color: Any
@@ -73,15 +81,21 @@ class Surface:
     coat: Any
     """Clear coat times its Fresnel term [1]."""
     coat_alpha: Any
-    coat_n: Any
-    """Unit normal of the coat, on the side of ``wo``."""
+    coat_frame: Any
+    """Of the coat's unit normal, which is on the side of ``wo``."""
     stopped: Any
     """Share of rays that the surface does not let through [1]."""
 
-    def reflectance(self, weight: Any) -> tuple[Any, Any]:
-        """Fresnel terms of the dielectric and of the whole base at Schlick's ``weight`` [1]."""
+    def reflectance(self, cosine: Any) -> tuple[Any, Any]:
+        """Fresnel terms of the dielectric and of the whole base [1]."""
+        weight = schlick_weight(cosine)
         dielectric = dr.lerp(self.dielectric_f0, mi.Color3f(self.dielectric_f90), weight)
         metal = dr.lerp(self.base_color, mi.Color3f(1.0), weight)
+        if self.film is not None:
+            share, *film = self.film
+            filmed = film_reflectance(self.dielectric_f0, *film, cosine)
+            dielectric = dr.lerp(dielectric, filmed, share)
+            metal = dr.lerp(metal, film_reflectance(self.base_color, *film, cosine), share)
         return dielectric, dr.lerp(dielectric, metal, self.metallic)
 
 
@@ -93,12 +107,9 @@ class GltfBSDF(mi.BSDF):
     """
 
     def __init__(self, asset: Asset, primitive: Primitive, linear: NDArray[np.float64]) -> None:
-        """Copy attributes and textures to the device.
+        """Copy attributes and textures of a primitive, and of the asset that has it, to the device.
 
-        Args:
-            asset: Owner of materials and textures.
-            primitive: Triangles that carry the material.
-            linear: Asset-to-world linear part, shape [3, 3]; turns tangents.
+        ``linear`` is the asset-to-world linear part, shape [3, 3]; it turns tangents.
         """
         super().__init__(mi.Properties())
         material = asset.materials[primitive.material]
@@ -121,7 +132,10 @@ class GltfBSDF(mi.BSDF):
         self.uvs = [_uploaded(uv) for uv in (primitive.uv0, primitive.uv1)]
         self.colors = _uploaded(primitive.colors)
         self.vertex_tangents = self.face_tangents = None
-        mapped = self.images.get("normal") or self.images.get("clearcoat_normal")
+        names = ("anisotropy", "normal", "clearcoat_normal")
+        mapped = next((self.images[name].slot for name in names if name in self.images), None)
+        if mapped is None and material.anisotropy > 0.0:
+            mapped = TextureSlot(0)
         if mapped is not None and primitive.tangents is not None:
             turned = primitive.tangents.astype(np.float64)
             turned[:, :3] = turned[:, :3] @ linear.T
@@ -129,7 +143,7 @@ class GltfBSDF(mi.BSDF):
             turned[:, 3] *= np.sign(np.linalg.det(linear))
             self.vertex_tangents = _uploaded(turned.astype(np.float32))
         elif mapped is not None:
-            self.face_tangents = _uploaded(face_tangents(primitive, mapped.slot.uv_set, linear))
+            self.face_tangents = _uploaded(face_tangents(primitive, mapped.uv_set, linear))
 
     def sample(
         self,
@@ -143,17 +157,18 @@ class GltfBSDF(mi.BSDF):
         surface = self._surface(si, active)
         coat, specular = self._shares(surface)
 
-        def mirrored(n: mi.Vector3f, alpha: mi.Float) -> mi.Vector3f:
-            frame = mi.Frame3f(n)
+        def mirrored(frame: mi.Frame3f, alpha: mi.Vector2f) -> mi.Vector3f:
             wo = frame.to_local(surface.wo)
             wm = sample_visible_normal(wo, alpha, sample2)
             return frame.to_world(2.0 * dr.dot(wo, wm) * wm - wo)
 
         diffuse = mi.Frame3f(surface.n).to_world(mi.warp.square_to_cosine_hemisphere(sample2))
         wi = dr.select(
-            sample1 < coat + (1.0 - coat) * specular, mirrored(surface.n, surface.alpha), diffuse
+            sample1 < coat + (1.0 - coat) * specular,
+            mirrored(surface.frame, surface.alpha),
+            diffuse,
         )
-        wi = dr.select(sample1 < coat, mirrored(surface.coat_n, surface.coat_alpha), wi)
+        wi = dr.select(sample1 < coat, mirrored(surface.coat_frame, surface.coat_alpha), wi)
         wi = dr.normalize(wi)
         f_cos, pdf = self._eval_pdf(surface, wi)
         pdf = dr.select(active, pdf, 0.0)
@@ -273,6 +288,11 @@ class GltfBSDF(mi.BSDF):
         wo = si.to_world(si.wi)
         n, coat_n, ng = self._oriented_normals(wo, *hit)
 
+        # KHR_materials_anisotropy
+        frame, strength = self._stretch(n, *hit)
+        across = dr.maximum(dr.square(roughness), MIN_ALPHA)
+        alpha = mi.Vector2f(dr.lerp(across, 1.0, dr.square(strength)), across)
+
         # KHR_materials_ior, _specular
         f0 = ((1.0 - material.ior) / (1.0 + material.ior)) ** 2
         f0 = f0 * self._color("specular_color", *hit)
@@ -290,31 +310,43 @@ class GltfBSDF(mi.BSDF):
             E = read_sheen_table(self.sheen_table, dr.dot(n, wo), sheen_roughness)
             sheen_scale = 1.0 - dr.max(sheen) * E
 
-        # KHR_materials_transmission, at the angle with the normal before any map
-        transmission = self._factor("transmission", "transmission", 0, *hit)
-        weight = schlick_weight(dr.abs(dr.dot(si.sh_frame.n, wo)))
-        enters = 1.0 - dr.max(f0 + (f90 - f0) * weight)
-        enters *= 1.0 - clearcoat * (0.04 + 0.96 * weight)
-        passes = transmission * (1.0 - metallic) * mi.luminance(base_color) * enters
+        # KHR_materials_iridescence
+        film = None
+        if material.iridescence > 0.0:
+            low, high = material.iridescence_thickness
+            thickness = dr.lerp(low, high, self._read("iridescence_thickness", *hit).y)
+            # Thinner than 0.03 nm it fades out
+            x = dr.clip(thickness / 0.03, 0.0, 1.0)
+            share = self._factor("iridescence", "iridescence", 0, *hit)
+            film = share * x * x * (3.0 - 2.0 * x), material.iridescence_ior, thickness
 
-        return Surface(
+        surface = Surface(
             wo=wo,
             n=n,
             ng=ng,
             base_color=base_color,
             metallic=metallic,
-            alpha=dr.maximum(dr.square(roughness), MIN_ALPHA),
+            frame=frame,
+            alpha=alpha,
             dielectric_f0=f0,
             dielectric_f90=f90,
-            transmission=transmission,
+            film=film,
+            transmission=self._factor("transmission", "transmission", 0, *hit),
             sheen_color=sheen,
             sheen_alpha=dr.maximum(dr.square(sheen_roughness), MIN_ALPHA),
             sheen_scale=sheen_scale,
             coat=coat,
-            coat_alpha=dr.maximum(dr.square(coat_roughness), MIN_ALPHA),
-            coat_n=coat_n,
-            stopped=1.0 - passes,
+            coat_alpha=mi.Vector2f(dr.maximum(dr.square(coat_roughness), MIN_ALPHA)),
+            coat_frame=mi.Frame3f(coat_n),
+            stopped=None,
         )
+        # KHR_materials_transmission, at the angle with the normal before any map
+        cosine = dr.abs(dr.dot(si.sh_frame.n, wo))
+        enters = 1.0 - dr.max(surface.reflectance(cosine)[0])
+        enters *= 1.0 - clearcoat * (0.04 + 0.96 * schlick_weight(cosine))
+        passes = surface.transmission * (1.0 - metallic) * mi.luminance(base_color) * enters
+        surface.stopped = 1.0 - passes
+        return surface
 
     def _oriented_normals(
         self, wo: mi.Vector3f, si: mi.SurfaceInteraction3f, active: mi.Bool
@@ -342,6 +374,38 @@ class GltfBSDF(mi.BSDF):
         if name not in self.images:
             return n
         texel = self._read(name, si, active) * 2.0 - 1.0
+        t, b, usable = self._tangents(n, si, active)
+        mapped = (t * texel.x + b * texel.y) * scale + n * texel.z
+        size = dr.norm(mapped)
+        usable &= size > 1e-6
+        return dr.select(usable, mapped / dr.select(usable, size, 1.0), n)
+
+    def _stretch(
+        self, n: mi.Vector3f, si: mi.SurfaceInteraction3f, active: mi.Bool
+    ) -> tuple[mi.Frame3f, mi.Float]:
+        """Frame about ``n`` whose x is the direction of anisotropy, and its strength, 0 without."""
+        frame = mi.Frame3f(n)
+        if self.vertex_tangents is None and self.face_tangents is None:
+            return frame, mi.Float(0.0)
+        t, b, usable = self._tangents(mi.Vector3f(si.sh_frame.n), si, active)
+        x, y = mi.Float(1.0), mi.Float(0.0)
+        if "anisotropy" in self.images:
+            texel = self._read("anisotropy", si, active) * 2.0 - 1.0
+            x, y = texel.x, texel.y
+        s, c = dr.sincos(mi.Float(self.material.anisotropy_rotation))
+        stretch = t * (c * x - s * y) + b * (s * x + c * y)
+        stretch = stretch - n * dr.dot(n, stretch)
+        length = dr.norm(stretch)
+        usable &= length > 1e-6
+        frame.s = dr.select(usable, stretch / dr.select(usable, length, 1.0), frame.s)
+        frame.t = dr.cross(n, frame.s)
+        strength = self._factor("anisotropy", "anisotropy", 2, si, active)
+        return frame, dr.select(usable, strength, 0.0)
+
+    def _tangents(
+        self, n: mi.Vector3f, si: mi.SurfaceInteraction3f, active: mi.Bool
+    ) -> tuple[mi.Vector3f, mi.Vector3f, mi.Bool]:
+        """Tangent and bitangent at right angles to ``n``, and whether they are known."""
         if self.vertex_tangents is not None:
             tangent = self._interpolate(self.vertex_tangents, mi.Vector4f, si, active)
         else:
@@ -351,17 +415,13 @@ class GltfBSDF(mi.BSDF):
         length = dr.norm(t)
         usable = length > 1e-6
         t = t / dr.select(usable, length, 1.0)
-        b = dr.cross(n, t) * dr.select(tangent.w < 0.0, mi.Float(-1.0), 1.0)
-        mapped = (t * texel.x + b * texel.y) * scale + n * texel.z
-        size = dr.norm(mapped)
-        usable &= size > 1e-6
-        return dr.select(usable, mapped / dr.select(usable, size, 1.0), n)
+        return t, dr.cross(n, t) * dr.select(tangent.w < 0.0, mi.Float(-1.0), 1.0), usable
 
     @staticmethod
     def _shares(surface: Surface) -> tuple[mi.Float, mi.Float]:
         """Probabilities of sampling the coat, and else the base's GGX lobe: rough shares."""
         cos_o = dr.dot(surface.n, surface.wo)
-        dielectric, whole = surface.reflectance(schlick_weight(cos_o))
+        dielectric, whole = surface.reflectance(cos_o)
         fresnel = dr.max(whole) * surface.sheen_scale
         matte = (1.0 - surface.metallic) * (1.0 - surface.transmission)
         diffuse = matte * (1.0 - dr.max(dielectric)) * dr.max(surface.base_color)
@@ -380,18 +440,18 @@ class GltfBSDF(mi.BSDF):
         wm = dr.normalize(wo + wi)
 
         # The base receives what the dielectric's Fresnel term leaves, whatever the metallic
-        dielectric, fresnel = surface.reflectance(schlick_weight(dr.abs(dr.dot(wo, wm))))
+        dielectric, fresnel = surface.reflectance(dr.abs(dr.dot(wo, wm)))
         matte = (1.0 - surface.metallic) * (1.0 - surface.transmission)
         matte *= 1.0 - dr.max(dielectric)
-        lobe, density = ggx(surface.n, surface.alpha, wo, wi)
+        lobe, density = ggx(surface.frame, surface.alpha, wo, wi)
         f_cos = (matte * surface.base_color * dr.inv_pi + fresnel * lobe) * cos_i
         f_cos *= surface.sheen_scale
         if self.sheen_table is not None:
             f_cos += surface.sheen_color * charlie(
                 dr.dot(surface.n, wm), cos_o, cos_i, surface.sheen_alpha
             )
-        coat_lobe, coat_density = ggx(surface.coat_n, surface.coat_alpha, wo, wi)
-        coat_cos = dr.maximum(dr.dot(surface.coat_n, wi), 0.0)
+        coat_lobe, coat_density = ggx(surface.coat_frame, surface.coat_alpha, wo, wi)
+        coat_cos = dr.maximum(dr.dot(surface.coat_frame.n, wi), 0.0)
         f_cos = dr.lerp(f_cos, mi.Color3f(coat_lobe * coat_cos), surface.coat)
         coat, specular = self._shares(surface)
         pdf = dr.lerp(cos_i * dr.inv_pi, density, specular)

@@ -33,13 +33,8 @@ def intersect(
 ) -> mi.SurfaceInteraction3f:
     """First surface that the ray sees, alpha decided at random.
 
-    Args:
-        scene: Scene whose materials are all `GltfBSDF`.
-        ray: Rays, unit directions.
-        sampler: Source of the coverage decisions; advanced only where ``has_alpha``.
-        camera: Whether single-sided back faces are culled.
-        has_alpha: Whether any material is transparent; false skips the test.
-        active: Lanes to trace.
+    All materials are `GltfBSDF`. Rays of the camera pass the back faces of single-sided ones. The
+    sampler is advanced only where ``has_alpha`` says that any material is transparent.
     """
     ray = mi.Ray3f(ray)
     si = dr.zeros(mi.SurfaceInteraction3f, dr.width(ray))

@@ -9,7 +9,7 @@ radiance does not notice. The environment is at infinity in both.
 """
 
 import argparse
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import NamedTuple
@@ -23,7 +23,7 @@ if mi.variant() is None:
 
 
 from warpir.core.arrays import Float64Array, FloatArray
-from warpir.core.color import linear_to_gamma
+from warpir.core.color import codes_of, linear_to_gamma
 from warpir.io.assets import load_asset
 from warpir.io.cameras.reader import read_camera
 from warpir.io.curves_file import read_curves
@@ -35,11 +35,25 @@ from warpir.mitsuba.material import GltfBSDF
 from warpir.mitsuba.plane import ObjectScene, trace_plane
 from warpir.scene.asset import Asset
 from warpir.scene.camera import Camera, mitsuba_sensor
+from warpir.scene.near.lamps import Lamp, RectangleLamp
 
 SAMPLES_PER_PASS = 1 << 21
 """Camera samples traced at once; bounds memory at about 1 GB."""
 HORIZON = 1e5
 """Where a ground of finite size ends, in radii of the object."""
+
+
+class Setting(NamedTuple):
+    """An object before a camera under one light."""
+
+    asset: Asset
+    """Object, asset frame [m]."""
+    matrix: Float64Array
+    """Asset to world, column vectors, shape [4, 4]."""
+    camera: Camera
+    """Pinhole with ``fx == fy``, world frame [m]."""
+    texels: FloatArray
+    """Lat-long radiance, relative [W/(m^2 sr)], shape [He, We, 3]."""
 
 
 class Foreground(NamedTuple):
@@ -88,6 +102,10 @@ def build(
     texels: FloatArray,
     depth: int,
     ground: tuple[float, float, float, float] | None = None,
+    albedo: float = 0.0,
+    lamps: Sequence[Lamp] = (),
+    horizon: float = HORIZON,
+    coat: float | None = None,
 ) -> ObjectScene:
     """Build the Mitsuba scene of one object under one light.
 
@@ -97,7 +115,12 @@ def build(
         camera: Pinhole with ``fx == fy``, world frame [m].
         texels: Lat-long radiance, relative [W/(m^2 sr)], shape [He, We, 3].
         depth: Surface interactions of the longest path.
-        ground: Black plane ``a x + b y + c z + d = 0`` with a unit normal, world frame [m].
+        ground: Plane ``a x + b y + c z + d = 0`` with a unit normal, world frame [m].
+        albedo: Of the plane [1].
+        lamps: Near the object, as surfaces that shine: they block light, and `GltfPath` knows none.
+        horizon: Where the plane ends, in radii of the object, which is how coarse its points are
+            over 1e7.
+        coat: Perceptual roughness of a dielectric over a black plane in place of ``albedo`` [1].
 
     Raises:
         ValueError: Mitsuba's camera has square pixels only.
@@ -121,9 +144,11 @@ def build(
         )
         parts["ground"] = {
             "type": "rectangle",
-            "to_world": to_plane @ mi.ScalarTransform4f().scale([HORIZON, HORIZON, 1.0]),
-            "bsdf": {"type": "diffuse", "reflectance": {"type": "rgb", "value": 0.0}},
+            "to_world": to_plane @ mi.ScalarTransform4f().scale([horizon, horizon, 1.0]),
+            "bsdf": _matt(albedo) if coat is None else _coat(coat),
         }
+    for k, lamp in enumerate(lamps):
+        parts[f"lamp_{k}"] = _emitter(lamp, center, radius)
     used_materials = [asset.materials[p.material] for p in asset.primitives]
     has_alpha = any(m.alpha_mode != "OPAQUE" or m.transmission > 0.0 for m in used_materials)
     integrator = mi.load_dict({"type": "gltf_path", "max_depth": depth + 1, "has_alpha": has_alpha})
@@ -132,51 +157,24 @@ def build(
     )
 
 
-def foreground(
-    asset: Asset,
-    matrix: Float64Array,
-    camera: Camera,
-    texels: FloatArray,
-    depth: int,
-    spp: int,
-    seed: int,
-) -> Foreground:
-    """Render the object alone under the light.
+def foreground(setting: Setting, depth: int, spp: int, seed: int) -> Foreground:
+    """Render the object alone under the light."""
+    setup = build(*setting, depth)
 
-    Args:
-        asset: Object, asset frame [m].
-        matrix: Asset to world, shape [4, 4].
-        camera: Pinhole camera, world frame [m].
-        texels: Lat-long radiance, relative [W/(m^2 sr)], shape [He, We, 3].
-        depth: Surface interactions of the longest path.
-        spp: Camera samples per pixel, at least 2.
-        seed: Base seed.
-    """
-    setup = build(asset, matrix, camera, texels, depth)
-    shape = (camera.height, camera.width)
-    moments = np.zeros((2, *shape, 3))
-    hits = np.zeros(shape)
-    count = 0
-    for pass_seed, pass_spp in passes(camera, spp, seed):
-        with dr.suspend_grad():
-            sampler, _ = setup.integrator.prepare(setup.sensor, pass_seed, pass_spp)
-            ray, _, _ = setup.integrator.sample_rays(setup.scene, setup.sensor, sampler)
-            L, seen, _, _ = setup.integrator.sample(
-                dr.ADMode.Primal, setup.scene, sampler, ray, active=mi.Bool(True)
-            )
-        samples = np.asarray(L, dtype=np.float64).T.reshape(*shape, pass_spp, 3)
-        moments += np.stack([samples.sum(axis=2), np.square(samples).sum(axis=2)])
-        hits += np.asarray(seen).reshape(*shape, pass_spp).sum(axis=2)
-        count += pass_spp
-    mean, variance = _mean_and_variance(moments, np.full((*shape, 1), float(count)))
-    return Foreground(mean, variance, hits / count)
+    def trace(seed: int, spp: int) -> tuple[mi.Color3f, mi.Bool]:
+        sampler, _ = setup.integrator.prepare(setup.sensor, seed, spp)
+        ray, _, _ = setup.integrator.sample_rays(setup.scene, setup.sensor, sampler)
+        L, seen, _, _ = setup.integrator.sample(
+            dr.ADMode.Primal, setup.scene, sampler, ray, active=mi.Bool(True)
+        )
+        return L, seen
+
+    moments, hits = sums(setting.camera, spp, seed, trace)
+    return Foreground(*mean_and_variance(moments, spp), hits[..., 0] / spp)
 
 
 def shadow(
-    asset: Asset,
-    matrix: Float64Array,
-    camera: Camera,
-    texels: FloatArray,
+    setting: Setting,
     spp: int,
     seed: int,
     ground: tuple[float, float, float, float] = (0.0, 1.0, 0.0, 0.0),
@@ -189,57 +187,44 @@ def shadow(
     ``bounce_depth``, by paths of that many interactions with the object over black ground.
 
     Args:
-        asset: Object, asset frame [m].
-        matrix: Asset to world, shape [4, 4].
-        camera: Pinhole camera on the side of the plane's normal, world frame [m].
-        texels: Lat-long radiance, relative [W/(m^2 sr)], shape [He, We, 3].
+        setting: The object, its light, and a camera on the side of the plane's normal.
         spp: Camera samples per pixel, at least 2.
         seed: Base seed.
         ground: Plane ``a x + b y + c z + d = 0`` with a unit normal, world frame [m].
         bounce_depth: Interactions of light that the object throws onto the plane; 0 for none.
     """
-    setup = build(asset, matrix, camera, texels, 1)
+    setup = build(*setting, 1)
     normal, offset = _in_unit_frame(ground, setup.center, setup.radius)
-    bounce = None
-    if bounce_depth:
-        bounce = build(asset, matrix, camera, texels, bounce_depth, ground)
-    shape = (camera.height, camera.width)
-    moments = np.zeros((2, *shape, 6))
-    products = np.zeros((*shape, 3))
-    hits = np.zeros((*shape, 1))
-    for pass_seed, pass_spp in passes(camera, spp, seed):
-        with dr.suspend_grad():
-            lit, unoccluded, seen = trace_plane(setup, normal, offset, pass_seed, pass_spp, bounce)
-        both = np.concatenate([np.asarray(lit), np.asarray(unoccluded)]).astype(np.float64)
-        samples = both.T.reshape(*shape, pass_spp, 6)
-        moments += np.stack([samples.sum(axis=2), np.square(samples).sum(axis=2)])
-        products += (samples[..., :3] * samples[..., 3:]).sum(axis=2)
-        hits += np.asarray(seen).reshape(*shape, pass_spp, 1).sum(axis=2)
-    mean, variance = _mean_and_variance(moments, hits)
+    bounce = build(*setting, bounce_depth, ground) if bounce_depth else None
+
+    def trace(seed: int, spp: int) -> tuple[Float64Array, mi.Bool]:
+        lit, unoccluded, seen = trace_plane(setup, normal, offset, seed, spp, bounce)
+        a, u = (np.asarray(L, np.float64) for L in (lit, unoccluded))
+        return np.concatenate([a, u, a * u]), seen
+
+    moments, hits = sums(setting.camera, spp, seed, trace)
+    mean, variance = mean_and_variance(moments, hits)
     with np.errstate(divide="ignore", invalid="ignore"):
-        covariance = (products / hits - mean[..., :3] * mean[..., 3:]) / (hits - 1.0)
+        covariance = (mean[..., 6:] - mean[..., :3] * mean[..., 3:6]) / (hits - 1.0)
     return Shadow(
         mean[..., :3],
-        mean[..., 3:],
+        mean[..., 3:6],
         variance[..., :3],
-        variance[..., 3:],
+        variance[..., 3:6],
         covariance,
         hits[..., 0] / spp,
     )
 
 
 def shadow_ratio(
-    asset: Asset,
-    matrix: Float64Array,
-    camera: Camera,
-    texels: FloatArray,
+    setting: Setting,
     spp: int,
     seed: int,
     ground: tuple[float, float, float, float] = (0.0, 1.0, 0.0, 0.0),
     bounce_depth: int = 0,
 ) -> Ratio:
     """Return the quotient of `shadow`'s two radiances; arguments are `shadow`'s."""
-    plane = shadow(asset, matrix, camera, texels, spp, seed, ground, bounce_depth)
+    plane = shadow(setting, spp, seed, ground, bounce_depth)
     seen = np.isfinite(plane.lit) & (plane.unoccluded > 0.0)
     u = np.where(seen, plane.unoccluded, 1.0)
     ratio = np.where(seen, np.where(seen, plane.lit, 0.0) / u, 1.0)
@@ -256,6 +241,43 @@ def _in_unit_frame(
     """Return normal and offset of the plane ``dot(normal, x) = offset`` in the scene's frame."""
     normal = np.asarray(ground[:3])
     return normal, float(-(ground[3] + normal @ center) / radius)
+
+
+def _matt(albedo: float) -> dict[str, object]:
+    return {"type": "diffuse", "reflectance": {"type": "rgb", "value": albedo}}
+
+
+def _coat(roughness: float) -> dict[str, object]:
+    """Return a dielectric coat over black; Mitsuba's shadowing is separable, ours correlated."""
+    coat = {"int_ior": 1.5, "ext_ior": 1.0, "diffuse_reflectance": {"type": "rgb", "value": 0.0}}
+    if roughness == 0.0:
+        return {"type": "plastic"} | coat
+    return {"type": "roughplastic", "distribution": "ggx", "alpha": roughness**2} | coat
+
+
+def _emitter(lamp: Lamp, center: Float64Array, radius: float) -> dict[str, object]:
+    """Return a black surface that shines as a lamp does, unit frame."""
+    color = {"type": "rgb", "value": [float(c) for c in lamp.radiance]}
+    to_world = np.eye(4)
+    to_world[:3, 3] = (lamp.center - center) / radius
+    kind = "sphere"
+    if isinstance(lamp, RectangleLamp):
+        kind = "rectangle"
+        to_world[:3, 0], to_world[:3, 1] = (
+            lamp.edge_x / (2.0 * radius),
+            lamp.edge_y / (2.0 * radius),
+        )
+        normal = np.cross(lamp.edge_x, lamp.edge_y)
+        to_world[:3, 2] = normal / np.linalg.norm(normal)
+    else:
+        to_world[:3, :3] *= lamp.radius / radius
+    black = {"type": "diffuse", "reflectance": {"type": "rgb", "value": 0.0}}
+    return {
+        "type": kind,
+        "to_world": mi.ScalarTransform4f(to_world),
+        "emitter": {"type": "area", "radiance": color},
+        "bsdf": black,
+    }
 
 
 def _mesh(asset: Asset, index: int, positions: Float64Array, linear: Float64Array) -> mi.Mesh:
@@ -321,8 +343,38 @@ def passes(camera: Camera, spp: int, seed: int) -> Iterator[tuple[int, int]]:
         yield (seed * 65537 + k) % (1 << 32), spp * (k + 1) // count - spp * k // count
 
 
-def _mean_and_variance(
-    moments: Float64Array, count: Float64Array
+def sums(
+    camera: Camera,
+    spp: int,
+    seed: int,
+    trace: Callable[[int, int], tuple[mi.Color3f | Float64Array, mi.Bool]],
+) -> tuple[Float64Array, Float64Array]:
+    """Add up the camera samples of each pixel.
+
+    Args:
+        camera: Whose film is traced.
+        spp: Samples per pixel.
+        seed: Base seed.
+        trace: Given the seed and the samples of a pass, returns values, shape [value, sample], and
+            whether a sample counts.
+
+    Returns:
+        Sums of the values and of their squares, shape [2, H, W, value], and the number of samples
+        that count, shape [H, W, 1].
+    """
+    shape = (camera.height, camera.width)
+    moments, hits = np.zeros(()), np.zeros((*shape, 1))
+    for pass_seed, pass_spp in passes(camera, spp, seed):
+        with dr.suspend_grad():
+            values, counts = trace(pass_seed, pass_spp)
+        samples = np.asarray(values, dtype=np.float64).T.reshape(*shape, pass_spp, -1)
+        moments = moments + np.stack([samples.sum(axis=2), np.square(samples).sum(axis=2)])
+        hits += np.asarray(counts).reshape(*shape, pass_spp, 1).sum(axis=2)
+    return moments, hits
+
+
+def mean_and_variance(
+    moments: Float64Array, count: Float64Array | float
 ) -> tuple[Float64Array, Float64Array]:
     """Mean, and variance of the mean, from sums of samples and of their squares."""
     with np.errstate(divide="ignore", invalid="ignore"):
@@ -352,24 +404,18 @@ def render_run(
 ) -> Composite:
     """Render object and shadow of a finished run and put them into its photo.
 
-    Read are its light, camera, curves, placed object and the layer ``plate``.
-
-    Args:
-        folder: The run's folder, complete with the files of its hand-off.
-        ground: Plane of the shadow, ``a x + b y + c z + d = 0``, unit normal, world frame [m].
-        depth: Surface interactions of the longest path.
-        spp: Camera samples per pixel, at least 2.
-        seed: Base seed.
-        bounce_depth: Interactions of light that the object throws on the ground; 0 for none.
+    Read are its light, camera, curves, placed object and the layer ``plate``, of a folder that is
+    complete with the files of its hand-off. Ground, samples and ``bounce_depth`` are those of
+    `shadow`; the longest path interacts with ``depth`` surfaces.
 
     Raises:
         InputError: A file of the run is missing or damaged.
     """
     plate = _plate(folder / "layers.exr")
     camera = read_camera(folder / "camera.json", (plate.shape[1], plate.shape[0]))
-    asset, matrix = load_asset(folder / OBJECT), np.eye(4)
     curves = read_curves(folder / "curves.json")
-    lit = foreground(asset, matrix, camera, _light(folder, "detail"), depth, spp, seed)
+    setting = Setting(load_asset(folder / OBJECT), np.eye(4), camera, _light(folder, "detail"))
+    lit = foreground(setting, depth, spp, seed)
     coverage = lit.coverage[..., None]
     share = np.where(coverage > 0.0, coverage, 1.0)
 
@@ -378,8 +424,8 @@ def render_run(
         return curves.foreground.evaluate(x)[..., 0]
 
     displayed, slope = _through(tone, lit.mean / share)
-    texels = _light(folder, "shadow")
-    plane = shadow_ratio(asset, matrix, camera, texels, spp, seed + 1, ground, bounce_depth)
+    setting = setting._replace(texels=_light(folder, "shadow"))
+    plane = shadow_ratio(setting, spp, seed + 1, ground, bounce_depth)
 
     ratio, ratio_slope = _through(curves.shadow_ratio.evaluate_ratio, plane.mean)
     behind = (1.0 - coverage) * plate
@@ -398,8 +444,7 @@ def write_composite(path: Path, composite: Composite) -> None:
     names = [*"RGB", *(f"error.{c}" for c in "RGB")]
     pixels = np.concatenate(composite, axis=-1).astype(np.float32)
     mi.Bitmap(pixels, channel_names=names).write(str(path.with_suffix(".exr")))
-    display = np.clip(linear_to_gamma(composite.mean), 0.0, 1.0)
-    codes = np.round(display * 255.0).astype(np.uint8)
+    codes = codes_of(linear_to_gamma(composite.mean))
     path.with_suffix(".png").write_bytes(png_bytes(codes, None, True, "Rendered by Mitsuba 3"))
 
 
@@ -411,11 +456,7 @@ def main(
 ) -> None:
     """Run ``render.py`` of a run's folder; its command line has ``--samples`` and ``--seed``.
 
-    Args:
-        folder: The run's folder.
-        ground: Plane of the shadow, world frame [m].
-        depth: Surface interactions of the longest path.
-        bounce_depth: Interactions of light that the object throws on the ground; 0 for none.
+    The other numbers are those of `render_run`.
     """
     parser = argparse.ArgumentParser(description="Render this insertion with Mitsuba 3.")
     parser.add_argument("--samples", type=int, default=256, help="camera samples per pixel")

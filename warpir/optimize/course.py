@@ -11,6 +11,7 @@ import numpy as np
 import torch
 
 from warpir.app.config import DEFAULTS
+from warpir.app.inputs import Inputs
 from warpir.app.record import versions
 from warpir.app.run import Run
 from warpir.core import signals
@@ -31,7 +32,6 @@ from warpir.render.composite import scene_of
 from warpir.render.renderer import Renderer
 from warpir.render.resizing import resize
 from warpir.render.tone_curve import ToneCurve
-from warpir.scene.asset import Asset
 from warpir.scene.tone_curves import Curves, ToneKnots
 
 SAY_EVERY = 25
@@ -50,10 +50,11 @@ are compared by their resolved value."""
 
 @dataclass(frozen=True)
 class Outcome:
-    """Light and asset after guidance, ready for the final render."""
+    """Light and inputs after guidance, ready for the final render."""
 
     light: SceneLight
-    asset: Asset
+    inputs: Inputs
+    """With what guidance changed of the object or the lamps."""
     record: dict[str, Any]
     """Entries of ``run.json`` about model and loop."""
     notices: tuple[str, ...]

@@ -20,7 +20,7 @@ class LitRun:
     """A run whose light is known."""
 
     run: Run
-    """The run, with the asset of the final render."""
+    """The run, with the asset and the lamps of the final render."""
     light: SceneLight
     measured: dict[str, Any]
     """Entries of ``run.json`` about the light's origin."""
@@ -62,8 +62,7 @@ def _guided(run: Run, given: SceneLight | None) -> LitRun:
         assert given is not None  # the configuration names it
         outcome = refine(run, given)
     run.log.notice(*outcome.notices)
-    run = replace(run, inputs=replace(run.inputs, asset=outcome.asset))
-    return LitRun(run, outcome.light, outcome.record)
+    return LitRun(replace(run, inputs=outcome.inputs), outcome.light, outcome.record)
 
 
 def _estimated(run: Run) -> tuple[SceneLight, dict[str, Any]]:

@@ -7,17 +7,19 @@ the run; a tone curve belongs to the object, three to the shadow ratio.
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import torch
 from torch import Tensor
 
 from warpir.app.settings import OptimizeSettings
+from warpir.core.color import luminance
 from warpir.lighting.fusion import fuse
 from warpir.lighting.regularizers import TrustRegion, bend, chroma, consistency, spread
-from warpir.lighting.sg_light import LightBounds, SGLight, narrowest
+from warpir.lighting.sg_light import LightBounds, SGLight, bounded_ratios, narrowest
 from warpir.optimize.loop import Composite, Guide, Optimization
 from warpir.optimize.view import Frame, View, expected_light
 from warpir.render.integrator import Radiance
@@ -25,6 +27,7 @@ from warpir.render.tone_curve import Knots, ToneCurve
 from warpir.render.transport.rows import TransportSettings
 from warpir.scene.camera import Camera
 from warpir.scene.light import Light, Lobes, describe, summarize
+from warpir.scene.near.lamps import LARGEST, Lamp
 
 RETRACE_EVERY = 25
 """Steps between two checks of the traced rows' staleness."""
@@ -34,28 +37,76 @@ Record = Callable[[torch.nn.Module], Function]
 """Returns a faster function equal to a module, such as the replay of its CUDA graph."""
 
 
+class LampPowers(torch.nn.Module):
+    """Powers of lamps near the object, as factors on those given; a lamp of power 0 stays dark.
+
+    Args:
+        lamps: Lamps with the given powers.
+        bounds: Greatest factor and log colour ratio, either way.
+    """
+
+    own: Tensor
+
+    def __init__(self, lamps: Sequence[Lamp], bounds: LightBounds) -> None:
+        super().__init__()
+        self.lamps, self.bounds = tuple(lamps), bounds
+        own = torch.tensor(np.stack([lamp.power for lamp in lamps]), dtype=torch.float32)
+        self.register_buffer("own", own, persistent=False)
+        self.log_factor = torch.nn.Parameter(torch.zeros(len(own)))
+        self.chroma = torch.nn.Parameter(torch.zeros(len(own), 3))
+
+    def forward(self) -> Tensor:
+        """Return the powers, relative [W], shape [lamp, 3]."""
+        return self.own * torch.exp(self.log_factor[:, None] + self.log_ratios())
+
+    def log_ratios(self) -> Tensor:
+        """Return the bounded log ratios to the given colours, shape [lamp, 3]."""
+        return bounded_ratios(self.chroma, self.bounds)
+
+    def project(self) -> None:
+        """Bring the factors back within their bounds."""
+        with torch.no_grad():
+            self.log_factor.clamp_(-np.log(self.bounds.intensity), np.log(self.bounds.intensity))
+
+    def found(self) -> tuple[Lamp, ...]:
+        """Return the lamps with the powers as they are."""
+        powers = self().detach().cpu().double().clamp(max=LARGEST).numpy()
+        return tuple(replace(k, power=p) for k, p in zip(self.lamps, powers, strict=True))
+
+
 class Unknowns(torch.nn.Module):
-    """The unknowns of the recovery: two lights and four tone curves.
+    """The unknowns of the recovery: two lights, four tone curves, and powers of lamps if asked.
 
     Args:
         light_fg: Light on the object.
         light_shadow: Light that casts its shadow.
         bins: Bins of each tone curve.
+        lamps: Lamps near the object whose powers are unknown.
     """
 
-    def __init__(self, light_fg: SGLight, light_shadow: SGLight, bins: int = 5) -> None:
+    def __init__(
+        self,
+        light_fg: SGLight,
+        light_shadow: SGLight,
+        bins: int = 5,
+        lamps: LampPowers | None = None,
+    ) -> None:
         super().__init__()
         self.light_fg, self.light_shadow = light_fg, light_shadow
         self.curve_fg, self.curve_shadow = ToneCurve(1, bins), ToneCurve(3, bins)
+        self.lamps = lamps
 
     @staticmethod
-    def start(lobes: Lobes | None, level: float, settings: OptimizeSettings) -> Unknowns:
+    def start(
+        lobes: Lobes | None, level: float, settings: OptimizeSettings, lamps: Sequence[Lamp] = ()
+    ) -> Unknowns:
         """Return the unknowns at their start.
 
         Args:
             lobes: A light to start from, or None for an even one.
             level: Radiance of that even light, relative [W/(m^2 sr)].
             settings: Count and bounds of the lobes.
+            lamps: Lamps near the object; their powers are unknowns if the settings say so.
         """
         bounds = LightBounds(
             narrowest(settings.light_height), settings.chroma_limit, settings.intensity_limit
@@ -66,7 +117,12 @@ class Unknowns(torch.nn.Module):
                 return SGLight(lobes, level, bounds)
             return SGLight.uniform(settings.lobes, level, bounds, settings.lobe_width)
 
-        return Unknowns(light(), light(), settings.tone_bins)
+        near = LampPowers(lamps, bounds) if settings.recover_lamps else None
+        return Unknowns(light(), light(), settings.tone_bins, near)
+
+    def lamp_powers(self) -> Tensor | None:
+        """Return the powers, shape [lamp, 3]; None where the scene's are known."""
+        return None if self.lamps is None else self.lamps()
 
 
 @dataclass(frozen=True)
@@ -176,7 +232,7 @@ class LightOptimization(Optimization):
         """Return the inputs of the composite; by torch alone with `transport`."""
         unknowns, maps = self.unknowns, self._separate(self.settings.light_height)
         curves = unknowns.curve_fg(), unknowns.curve_shadow()
-        radiance = self.view.radiance(*self._fused(maps, scale), seed)
+        radiance = self.view.radiance(*self._fused(maps, scale), seed, unknowns.lamp_powers())
         return Parts(radiance, *curves, self._terms(maps, curves))
 
     def _fused(self, maps: tuple[Tensor, Tensor], scale: float | Tensor) -> tuple[Tensor, Tensor]:
@@ -199,13 +255,18 @@ class LightOptimization(Optimization):
         """Return the regularisers: the authors' (eq. 10, 11), plain curves, the trust region."""
         fg, shadow = self.unknowns.light_fg, self.unknowns.light_shadow
         formulas: dict[str, Callable[[], Tensor]] = {
-            "chroma": lambda: 0.5 * (chroma(fg) + chroma(shadow)),
+            "chroma": lambda: 0.5 * (chroma(fg) + chroma(shadow)) + self._recolored(),
             "consistency": lambda: consistency(*maps),
             "spread": lambda: spread(maps[1]),
             "bend": lambda: bend(curves[0]) + bend(curves[1]),
             "trust": self._distance,
         }
         return {name: formulas[name]() for name in self.term_names}
+
+    def _recolored(self) -> Tensor | float:
+        """Return the mean squared log ratio of the lamps' colours to those given [1]."""
+        lamps = self.unknowns.lamps
+        return 0.0 if lamps is None else lamps.log_ratios().square().sum(dim=1).mean()
 
     def _distance(self) -> Tensor:
         """Return the distance of the lights from where they are expected."""
@@ -233,7 +294,7 @@ class LightOptimization(Optimization):
         image = self.view.compose(parts.radiance, *curves)
         if self.view.transport is None:
             with torch.no_grad():
-                shown = self.view.image(*self.lights(scale), *curves, self.seed + 2 * step + 1)
+                shown = self._image(scale, *curves, self.seed + 2 * step + 1)
             image = image + (shown - image.detach())
         terms = {name: (getattr(self.settings, name), term) for name, term in parts.terms.items()}
         return Composite(image, terms)
@@ -241,18 +302,29 @@ class LightOptimization(Optimization):
     def final_image(self, seed: int) -> Tensor:
         """Return the composite under the light as it would be delivered."""
         curves = self.unknowns.curve_fg(), self.unknowns.curve_shadow()
-        return self.view.image(*self.lights(self.final_fusion), *curves, seed)
+        return self._image(self.final_fusion, *curves, seed)
+
+    def _image(self, scale: float, curve_fg: Knots, curve_shadow: Knots, seed: int) -> Tensor:
+        powers = self.unknowns.lamp_powers()
+        return self.view.image(*self.lights(scale), curve_fg, curve_shadow, seed, powers)
 
     def describe(self, camera: Camera) -> str:
         """Return the direction of the light and its share in a few words."""
         with torch.no_grad():
             texels = self.lights(self.final_fusion)[1].cpu().numpy()
-        return describe(summarize(Light(texels=texels)), camera.c2w)
+        words = describe(summarize(Light(texels=texels)), camera.c2w)
+        lamps = self.unknowns.lamps
+        if lamps is None:
+            return words
+        powers = (f"{float(luminance(lamp.power)):.3g}" for lamp in lamps.found())
+        return f"{words}; lamps of power {', '.join(powers)}"
 
     def project(self) -> None:
         """Keep both lights within their bounds."""
         self.unknowns.light_fg.project()
         self.unknowns.light_shadow.project()
+        if self.unknowns.lamps is not None:
+            self.unknowns.lamps.project()
 
     def prepare(self, step: int) -> None:
         """Trace light transport again when its rows have become too noisy for the light."""
@@ -321,6 +393,11 @@ def _groups(unknowns: Unknowns, settings: OptimizeSettings) -> list[dict[str, An
                 groups.append({"params": [parameter], "rate": rate})
             else:
                 parameter.requires_grad_(False)
+    if unknowns.lamps is not None:
+        groups.append({"params": [unknowns.lamps.log_factor], "rate": settings.rate_intensity})
+        unknowns.lamps.chroma.requires_grad_(settings.lobe_shape)
+        if settings.lobe_shape:
+            groups.append({"params": [unknowns.lamps.chroma], "rate": settings.rate_chroma})
     curves = [*unknowns.curve_fg.parameters(), *unknowns.curve_shadow.parameters()]
     if settings.tone_curve:
         groups.append({"params": curves, "rate": settings.rate_tone})

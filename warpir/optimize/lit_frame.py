@@ -11,6 +11,7 @@ from warpir.optimize.view import Frame
 from warpir.render.bridge import ComposeConstants, compose
 from warpir.render.device_light import light_args
 from warpir.render.renderer import index_of
+from warpir.render.shadow.pilot import shaded_pixels
 from warpir.render.tone_curve import Knots
 
 STILL_SAMPLES = 64
@@ -44,7 +45,7 @@ class LitFrame:
         self.object_pixels = renderer.gbuffer(seed).object_pixels
         height, width = frame.photo_lin.shape[:2]
         is_object = (index_of(self.object_pixels, height * width) >= 0).astype(np.int32)
-        proxies = renderer.shaded_pixels(args_shadow, seed)
+        proxies = shaded_pixels(renderer, args_shadow, seed)
         plane = renderer.receiver(args_shadow, proxies, is_object[proxies], samples, 1, seed)
         seen = renderer.foreground(self.args_fg, self.object_pixels, samples, 1, frame.depth, seed)
         self.foreground, self.lit, self.unoccluded = (

@@ -355,7 +355,8 @@ def refine(run: Run, light: SceneLight) -> Outcome:
         asset = replace(asset, materials=refined)
         if run.config.task.refine == "emission":
             notices = (*notices, GROUND_IS_DARK)
-    return Outcome(light, asset, {**course.record("mis"), "refine": moves}, notices)
+    inputs = replace(run.inputs, asset=asset)
+    return Outcome(light, inputs, {**course.record("mis"), "refine": moves}, notices)
 
 
 def _loop_of(

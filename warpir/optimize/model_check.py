@@ -6,7 +6,6 @@ learning of a LoRA and the time of a step; the quality of guidance is not.
 
 from __future__ import annotations
 
-import json
 import math
 import time
 from collections.abc import Callable, Sequence
@@ -23,6 +22,7 @@ from warpir.app.config import InsertConfig
 from warpir.app.record import versions
 from warpir.core.atomic import write_file
 from warpir.core.errors import disk_error
+from warpir.core.strict_json import json_bytes
 from warpir.diffusion.crop import Crop
 from warpir.diffusion.guidance import Guidance
 from warpir.diffusion.models.network_prior import LEAST_COSINE
@@ -349,6 +349,6 @@ def write_report(path: str, report: Report) -> None:
         InputError: The file cannot be written.
     """
     try:
-        write_file(Path(path), (json.dumps(report.record(), indent=2) + "\n").encode())
+        write_file(Path(path), json_bytes(report.record()))
     except OSError as error:
         raise disk_error(path, error) from None

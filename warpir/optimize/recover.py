@@ -16,6 +16,7 @@ from warpir.app.run import Run
 from warpir.core.cache import cache_folder
 from warpir.core.memory import release
 from warpir.diffusion.guidance import Guidance
+from warpir.io.lamps_file import LAMPS, lamps_to_json
 from warpir.io.lobes_file import lobes_to_json
 from warpir.lighting.estimate import Estimate, estimate_light
 from warpir.lighting.fit import fit_lobes
@@ -62,7 +63,7 @@ def recover(run: Run, given: SceneLight | None) -> Outcome:
         given: Given or default light; None to estimate it from the photo.
 
     Returns:
-        Light and curves; those of the start where the acceptance test fails.
+        Light, curves and lamps; those of the start where the acceptance test fails.
 
     Raises:
         InputError: The model cannot be used (exit 4), memory is short (5), the numbers stayed
@@ -103,11 +104,15 @@ def recover(run: Run, given: SceneLight | None) -> Outcome:
     measured = course.record(settings.integrator) | _measured(start, light, judged)
     notices = tuple(course.notices())
     if judged is not None and not judged.verdict.is_accepted:
-        return Outcome(start.light, run.inputs.asset, measured, (*notices, judged.verdict.line))
+        return Outcome(start.light, run.inputs, measured, (*notices, judged.verdict.line))
     run.output.write_json("lobes.json", lobes_to_json(unknowns.light_fg.lobes()))
     if settings.fusion != "single":
         run.output.write_json("lobes_shadow.json", lobes_to_json(unknowns.light_shadow.lobes()))
-    return Outcome(light, run.inputs.asset, measured, notices)
+    inputs = run.inputs
+    if unknowns.lamps is not None:
+        inputs = replace(inputs, lamps=unknowns.lamps.found())
+        run.output.write_json(LAMPS, lamps_to_json(inputs.lamps))
+    return Outcome(light, inputs, measured, notices)
 
 
 def _estimated(run: Run) -> Start:
@@ -130,7 +135,8 @@ def unknowns_of(run: Run, start: Start) -> Unknowns:
     elif config.light.is_described:
         fitted = fit_lobes(as_map(start.light.light, START_HEIGHT), settings.lobes).lobes
         lobes = widened(fitted, least)
-    return Unknowns.start(lobes, start_level(run.inputs, config.tone_operator), settings)
+    level = start_level(run.inputs, config.tone_operator)
+    return Unknowns.start(lobes, level, settings, run.inputs.lamps)
 
 
 def region_of(start: Start, unknowns: Unknowns) -> TrustRegion | None:

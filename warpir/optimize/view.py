@@ -18,7 +18,9 @@ from warpir.render.bridge import ComposeConstants, compose
 from warpir.render.device_light import light_args
 from warpir.render.integrator import Integrator, Radiance
 from warpir.render.mis.integrator import MisIntegrator
+from warpir.render.near.rows import with_lamps
 from warpir.render.renderer import Renderer
+from warpir.render.shadow.pilot import shaded_pixels
 from warpir.render.tone_curve import Knots
 from warpir.render.transport.integrator import TransportIntegrator
 from warpir.render.transport.rows import TransportSettings
@@ -104,6 +106,7 @@ class View:
         curve_fg: Knots,
         curve_shadow: Knots,
         seed: int,
+        lamp_powers: Tensor | None = None,
     ) -> Tensor:
         """Return the composite, display-encoded, shape [1, 3, H, W]; differentiable.
 
@@ -113,13 +116,20 @@ class View:
             curve_fg: One tone curve.
             curve_shadow: Three tone curves.
             seed: Seed of this step's samples; `transport` has none.
+            lamp_powers: Relative [W], shape [lamp, 3]; None: those of the scene's lamps.
         """
-        radiance = self.radiance(texels_fg, texels_shadow, seed)
+        radiance = self.radiance(texels_fg, texels_shadow, seed, lamp_powers)
         return self.compose(radiance, curve_fg, curve_shadow)
 
-    def radiance(self, texels_fg: Tensor, texels_shadow: Tensor, seed: int) -> Radiance:
+    def radiance(
+        self,
+        texels_fg: Tensor,
+        texels_shadow: Tensor,
+        seed: int,
+        lamp_powers: Tensor | None = None,
+    ) -> Radiance:
         """Return the integrator's radiance; arguments are those of `image`."""
-        return self.integrator.radiance(texels_fg, texels_shadow, seed)
+        return self.integrator.radiance(texels_fg, texels_shadow, seed, lamp_powers=lamp_powers)
 
     def compose(self, radiance: Radiance, curve_fg: Knots, curve_shadow: Knots) -> Tensor:
         """Return the composite of rendered radiance, display-encoded, shape [1, 3, H, W]."""
@@ -141,15 +151,18 @@ class View:
 
 
 def _shaded(renderer: Renderer, expected: Light, seed: int) -> IntArray:
-    """Return the pixels whose ground the object may shade, under an even sky or the expected light.
+    """Return the pixels whose ground the object may shade: by a sky, the expected light, a lamp.
 
     Other pixels keep a ratio of 1 and have no gradient, so the even sky covers lights that are not
-    expected.
+    expected, and each lamp counts as if there were no other light.
     """
-    even = Light(texels=np.ones((8, 16, 3), np.float32))
-    args = (light_args(light, renderer.device) for light in (even, expected))
-    union: PixelArray = np.union1d(*(renderer.shaded_pixels(arg, seed) for arg in args))
-    return union.astype(np.int32)
+    even, dark = (Light(texels=np.full((8, 16, 3), L, np.float32)) for L in (1.0, 0.0))
+    alone = [(with_lamps(renderer, [lamp]), dark) for lamp in renderer.scene.lamps]
+    pixels: PixelArray = np.zeros(0, np.int32)
+    for lit, light in ((renderer, even), (renderer, expected), *alone):
+        found = shaded_pixels(lit, light_args(light, renderer.device), seed)
+        pixels = np.union1d(pixels, found)
+    return pixels.astype(np.int32)
 
 
 def expected_light(texels_fg: Tensor, texels_shadow: Tensor) -> Light:

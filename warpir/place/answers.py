@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import shlex
-import threading
 from collections.abc import Callable
 from functools import partial
 from pathlib import Path
@@ -29,13 +28,7 @@ from warpir.place.worker import Worker
 
 
 class Answers:
-    """One session's answers.
-
-    Args:
-        session: Photo, asset, camera.
-        folder: Where placements are saved.
-        config: Of the command line, with ``out``.
-    """
+    """One session's answers; placements are saved in ``folder``, the configuration has ``out``."""
 
     def __init__(self, session: Session, folder: PlacementFolder, config: InsertConfig) -> None:
         self.session = session
@@ -53,6 +46,7 @@ class Answers:
         self.posts: dict[str, Callable[[bytes], dict[str, Any]]] = {
             "save": self.save,
             "light": self.light,
+            "warm": self.warm,
             "preview": self.preview,
             "insert": self.insert,
             "cancel": lambda _: self.renderings.cancel(),
@@ -61,8 +55,8 @@ class Answers:
 
     def close(self) -> None:
         """End what still works for the page."""
+        self.worker.close()
         self.renderings.close()
-        self.worker.stop()
 
     def file(self, name: str) -> bytes | None:
         """Return what changes while the page is open, by its address: progress and pictures."""
@@ -82,9 +76,12 @@ class Answers:
         """Estimate the light that the photo shows, by the camera that the page sends."""
         camera = sent_camera(self.session, parse_json_object(PAGE, body))
         config = kept_values(self.asked)
-        found = self.worker.ask({"kind": "light", "config": config, "camera": camera.record()})
-        threading.Thread(target=self.renderings.warm_up, daemon=True).start()
-        return found
+        return self.worker.ask({"kind": "light", "config": config, "camera": camera.record()})
+
+    def warm(self, body: bytes) -> dict[str, Any]:
+        """Prepare for a preview of the placement that the page sends, as long as that takes."""
+        self.renderings.warm_up(self._files(body))
+        return {}
 
     def preview(self, body: bytes) -> dict[str, Any]:
         """Begin a preview of the placement that the page sends."""

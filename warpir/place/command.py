@@ -14,6 +14,7 @@ import threading
 import webbrowser
 from collections.abc import Iterator, Sequence
 from contextlib import ExitStack, contextmanager
+from dataclasses import replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
@@ -48,6 +49,8 @@ FLAGS = {
         "asset_up",
         "sun",
         "sky",
+        "lamp",
+        "lamps",
     ),
     "rules for the files": flags_of(
         "alpha",
@@ -68,14 +71,7 @@ FLAGS = {
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Run the command line.
-
-    Args:
-        argv: Arguments without the program's name; ``sys.argv`` when absent.
-
-    Returns:
-        The exit status: 0 when ``--once`` ended it, 130 after Ctrl-C.
-    """
+    """Run the command line, as `run_program`: 0 when ``--once`` ended it, 130 after Ctrl-C."""
     return run_program(_run, argv)
 
 
@@ -91,6 +87,7 @@ def _run(arguments: list[str]) -> int:
     config = InsertConfig(**read_values({name: (text, flag(name)) for name, text in texts.items()}))
     config = _with_inputs(config)
 
+    from warpir.io.lamps_file import given_lamps
     from warpir.place.answers import Answers
     from warpir.place.server import PlaceServer
     from warpir.place.session import PlacementFolder, open_session
@@ -98,7 +95,10 @@ def _run(arguments: list[str]) -> int:
     assert config.output.out is not None
     folder = PlacementFolder(config.output.out, config.output.overwrite)
     folder.check()
+    near = config.light.lamp, config.light.lamps
+    lamps = given_lamps(*near, config.limits, lambda line: say(f"notice: {line}"))
     session = open_session(config.inputs, config.camera, config.placement, config.limits)
+    session = replace(session, lamps=lamps)
     for line in session.assumed:
         say(f"assumed: {line}")
     with ExitStack() as until_end:
@@ -107,6 +107,7 @@ def _run(arguments: list[str]) -> int:
         server = PlaceServer(port, answers.contents, answers.posts, answers.file, once=once)
         until_end.enter_context(server)
         say(f"page: {server.address}")
+        answers.renderings.load()
         if not once:
             say("Ctrl-C ends it")
         if opens and _has_screen():

@@ -21,10 +21,6 @@ def preview_asset(asset: Asset, triangles: int = TRIANGLES) -> Asset:
     Triangles are thinned by clustering vertices in the cells of a grid (Rossignac and Borrel 1993):
     each cell keeps one of its vertices with all its attributes, and triangles that fall together
     are left out. No vertex moves by more than the diagonal of a cell.
-
-    Args:
-        asset: The asset.
-        triangles: Most triangles it may have.
     """
     cells = FINEST
     low, high = asset.bounds()

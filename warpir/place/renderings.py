@@ -22,6 +22,7 @@ from typing import Any
 from warpir.core.atomic import write_file
 from warpir.core.errors import InputError
 from warpir.core.strict_json import read_json_object
+from warpir.io.lamps_file import LAMPS
 from warpir.place.session import CAMERA, CONFIG, MASK, PAGE
 from warpir.place.worker import Worker
 
@@ -30,11 +31,7 @@ PREVIEW_WIDTH = 640
 
 
 class Renderings:
-    """What is rendered for one session.
-
-    Args:
-        worker: Renders previews.
-    """
+    """What is rendered for one session."""
 
     def __init__(self, worker: Worker) -> None:
         self.worker = worker
@@ -45,14 +42,12 @@ class Renderings:
         self._is_cancelled = False
         self._progress: dict[str, Any] = {"state": "idle"}
         self._count = 0
+        self._placement: Mapping[str, Any] | None = None
 
     # ------------------------------------------------------------------------ what the page asks
 
     def preview(self, files: Mapping[str, Any]) -> dict[str, Any]:
         """Begin a preview of a placement.
-
-        Args:
-            files: From `warpir.place.session.placement_files`.
 
         Raises:
             InputError: Something is rendered already.
@@ -61,10 +56,6 @@ class Renderings:
 
     def insert(self, config: Path, overwrite: bool) -> dict[str, Any]:
         """Begin the insertion of a saved placement.
-
-        Args:
-            config: The placement's configuration.
-            overwrite: Whether results that are there may be replaced; those of this session are.
 
         Raises:
             InputError: Something is rendered already.
@@ -79,7 +70,7 @@ class Renderings:
             self._is_cancelled = True
             process, kind = self._process, self._progress["kind"]
         if kind == "preview":
-            self.worker.stop()
+            self.worker.interrupt()
         elif process is not None:
             process.send_signal(signal.SIGINT)
         return self._progress
@@ -96,10 +87,21 @@ class Renderings:
             now["seconds"] = round(time.monotonic() - now.pop("began"), 1)
         return now
 
-    def warm_up(self) -> None:
-        """Load what a preview needs; returns when that is done."""
-        with suppress(InputError):  # that of the next job tells
-            self.worker.ask({"kind": "warm"})
+    def load(self) -> None:
+        """Begin to load the libraries, while the browser opens the page."""
+
+        def wait() -> None:
+            with suppress(InputError):  # that of the next job tells
+                self.worker.ask({"kind": "load"})
+
+        threading.Thread(target=wait, daemon=True).start()
+
+    def warm_up(self, files: Mapping[str, Any]) -> None:
+        """Read, load and compile what a preview of a placement needs; returns when that is done."""
+        self._placement = files
+        # What is refused the next job tells; a session that ends takes its folder along.
+        with suppress(InputError, OSError):
+            self.worker.ask(self._job("warm", "warm", files), self._hear)
 
     def file(self, name: str) -> bytes | None:
         """Return a file of what was rendered, by its address; None where there is none."""
@@ -148,27 +150,46 @@ class Renderings:
             kind, began = self._progress["kind"], self._progress["began"]
             seconds = round(time.monotonic() - began, 1)
             self._progress = {**end, "kind": kind, "seconds": seconds}
-        if end["state"] == "cancelled" and kind == "preview":
-            self.warm_up()
+        is_lost = kind == "preview" and not self.worker.is_running
+        if is_lost and self._placement is not None:
+            self.warm_up(self._placement)
 
     def _say(self, line: str, share: float | None) -> None:
         with self._lock:
             self._progress.update(line=line, share=share)
 
+    def _hear(self, said: Mapping[str, Any]) -> None:
+        """Tell a preview's progress, and that of what it waits for."""
+        with self._lock:
+            if self._progress.get("kind") == "preview" and self._progress["state"] == "running":
+                self._progress.update(line=said["stage"], share=said["share"])
+
     def _preview(self, files: Mapping[str, Any]) -> str:
-        folder = Path(self._folder.name)
-        camera, name = folder / CAMERA, f"preview-{self._count}.png"
-        write_file(camera, json.dumps(files[CAMERA]).encode())
-        config = {**files[CONFIG], "camera": str(camera), "out": str(folder / "unused")}
+        def hear(said: Mapping[str, Any]) -> None:
+            if self._is_cancelled:  # while it waited for another job
+                self.worker.interrupt()
+            self._hear(said)
+
+        self._placement = files
+        name = f"preview-{self._count}"
+        self.worker.ask(self._job("preview", name, files), hear)
+        return f"{name}.png"
+
+    def _job(self, kind: str, name: str, files: Mapping[str, Any]) -> dict[str, Any]:
+        """Write a placement's files into a folder of their own, and return the job of them."""
+        folder = Path(self._folder.name, name)
+        folder.mkdir(exist_ok=True)
+        config = {**files[CONFIG], "out": str(folder / "unused")}
+        write_file(folder / CAMERA, json.dumps(files[CAMERA]).encode())
+        config["camera"] = str(folder / CAMERA)
         if MASK in files:
             write_file(folder / MASK, files[MASK])
             config["occluder_mask"] = str(folder / MASK)
-        job = {"kind": "preview", "config": config, "width": PREVIEW_WIDTH}
-        self.worker.ask(
-            {**job, "picture": str(folder / name)},
-            lambda said: self._say(said["stage"], said["share"]),
-        )
-        return name
+        if LAMPS in files:
+            write_file(folder / LAMPS, json.dumps(files[LAMPS]).encode())
+            config["lamps"] = str(folder / LAMPS)
+        picture = str(Path(self._folder.name, f"{name}.png"))
+        return {"kind": kind, "config": config, "width": PREVIEW_WIDTH, "picture": picture}
 
     def _insert(self, config: Path, overwrite: bool) -> str:
         results = config.parent / "result"

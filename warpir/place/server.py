@@ -43,6 +43,7 @@ FILES = {
             "fields.js",
             "handles.js",
             "history.js",
+            "lamps.js",
             "light.js",
             "lines.js",
             "mask.js",

@@ -2,14 +2,13 @@
 
 A saved placement is two files in one folder: ``camera.json``, as `warpir.insert` writes it, and
 ``insert.json``, a configuration for ``--config`` that names photo, asset, camera, place and light;
-and ``occluder.png``, where a mask was painted.
+``occluder.png``, where a mask was painted; and ``lamps.json``, where there are lamps.
 """
 
 from __future__ import annotations
 
 import base64
 import io
-import json
 import os
 from collections.abc import Mapping
 from contextlib import ExitStack
@@ -37,14 +36,18 @@ from warpir.core.atomic import replacing, write_staged
 from warpir.core.errors import ExitCode, InputError, disk_error
 from warpir.core.limits import Limits
 from warpir.core.progress import Log
-from warpir.io.cameras.source import number
+from warpir.core.strict_json import json_bytes
+from warpir.io.cameras.source import focal_length, number
 from warpir.io.gltf.writer import write_glb
 from warpir.io.images.photos import Photo, read_photo
+from warpir.io.lamps_file import LAMPS
 from warpir.lighting.scene_light import SKIES, SUN_TO_SKY
+from warpir.place.lamps import lamps_file, page_lamps
 from warpir.place.preview_asset import preview_asset, triangle_count
 from warpir.place.stance import Stance, ground_to_world, stance_of
 from warpir.scene.asset import Asset
 from warpir.scene.camera import Camera
+from warpir.scene.near.lamps import Lamp
 from warpir.scene.placement import place_asset, upright_plane
 
 CAMERA, CONFIG, MASK = "camera.json", "insert.json", "occluder.png"
@@ -53,7 +56,7 @@ MASK_SIDE = 2048
 """Longest side of the page's mask [px]."""
 PHOTO_SIDE = 2048
 """Longest side of the photo for the page [px]."""
-PLACED = ("place", "at", "rotate_y", "scale", "size", "sun", "sky")
+PLACED = ("place", "at", "rotate_y", "scale", "size", "sun", "sky", "lamp", "lamps")
 """Fields that the page sets."""
 SEEN_BY = (
     *("camera", "frame", "up", "fov", "pitch", "roll", "horizon", "camera_height", "camera_from"),
@@ -84,6 +87,8 @@ class Session:
     """Initial turn about the vertical [deg]."""
     assumed: tuple[str, ...]
     """Assumed and doubtful values, one line each."""
+    lamps: tuple[Lamp, ...] = ()
+    """Initial lamps near the object, in the world frame."""
 
     @property
     def frame(self) -> Float64Array:
@@ -186,11 +191,6 @@ def start_record(session: Session, light: LightConfig, folder: str) -> dict[str,
     """Return the page's initial values, as plain values.
 
     Lengths are metres, angles degrees, pixels those of the upright photo.
-
-    Args:
-        session: Session of the page.
-        light: Sun and sky with which the page starts.
-        folder: Of the two files.
     """
     camera, asset = session.camera, session.asset
     low, high = asset.bounds()
@@ -230,6 +230,7 @@ def start_record(session: Session, light: LightConfig, folder: str) -> dict[str,
         "sun_color": sun_color,
         "sun_to_sky": SUN_TO_SKY,
         "ground_albedo": light.assumed_albedo,
+        "lamps": page_lamps(session.lamps, session.frame),
         "assumed": list(session.assumed),
         "folder": folder,
     }
@@ -262,9 +263,10 @@ def sent_camera(session: Session, sent: Mapping[str, Any]) -> Camera:
         InputError: Numbers out of range.
     """
     stance = Stance(*(number(PAGE, sent.get("stance"), f.name) for f in fields(Stance)))
-    fx, fy, cx, cy = (number(PAGE, sent, name) for name in ("fx", "fy", "cx", "cy"))
-    if min(fx, fy, stance.height) <= 0.0:
-        raise InputError(PAGE, "camera height and focal length must be more than 0")
+    fx, fy = (focal_length(PAGE, sent, name) for name in ("fx", "fy"))
+    cx, cy = (number(PAGE, sent, name) for name in ("cx", "cy"))
+    if stance.height <= 0.0:
+        raise InputError(PAGE, "camera height must be more than 0")
     pose = session.frame @ stance.c2w()
     return replace(session.camera, fx=fx, fy=fy, cx=cx, cy=cy, c2w=pose)
 
@@ -280,7 +282,7 @@ def placement_files(
             two files.
         sent: Page values: those of `sent_camera`, ``stand`` (``x`` and ``z`` in the ground frame)
             [m], ``rotate_y`` [deg], ``size`` [m], and ``sun`` and ``sky`` as the flags, or null
-            where the light is to be estimated from the photo; `mask_png`'s.
+            where the light is to be estimated from the photo; `mask_png`'s and `lamps_file`'s.
 
     Raises:
         InputError: Numbers out of range, an object that the camera does not see, or a mask that is
@@ -305,8 +307,10 @@ def placement_files(
     ground = {} if session.ground is None else {"ground": session.ground}
     mask = mask_png((camera.width, camera.height), sent)
     occluder = {} if mask is None else {"occluder_mask": str(folder / MASK)}
+    lamps = lamps_file(PAGE, sent, session.frame)
     return {
         **({} if mask is None else {MASK: mask}),
+        **({} if lamps is None else {LAMPS: lamps}),
         CAMERA: camera.record(),
         CONFIG: {
             **kept_values(asked),
@@ -315,6 +319,7 @@ def placement_files(
             "place": config.placement.place,
             **chosen,
             **occluder,
+            **({} if lamps is None else {"lamps": str(folder / LAMPS)}),
             "out": str(folder / "result"),
         },
     }
@@ -341,7 +346,7 @@ def mask_png(size: tuple[int, int], sent: Mapping[str, Any]) -> bytes | None:
         if max(picture.size) > MASK_SIDE:
             raise InputError(PAGE, f"the mask is too large (found {max(picture.size)} px)")
         mask = picture.convert("L")
-    except (TypeError, ValueError, OSError, SyntaxError):
+    except (TypeError, ValueError, OSError, SyntaxError, Image.DecompressionBombError):
         raise InputError(PAGE, "the mask is not a PNG in base64") from None
     if mask.getextrema() == (0, 0):
         return None
@@ -351,11 +356,7 @@ def mask_png(size: tuple[int, int], sent: Mapping[str, Any]) -> bytes | None:
 
 
 def kept_values(asked: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the values of the command line that a placement keeps, files by their whole paths.
-
-    Args:
-        asked: From `InsertConfig.flat`.
-    """
+    """Return the values of the command line that a placement keeps, files by their whole paths."""
     kept = {
         name: value
         for name, value in asked.items()
@@ -369,12 +370,7 @@ class PlacementFolder:
     """The folder of these files; it replaces its own, and others' where `overwrite` allows it."""
 
     def __init__(self, path: str, overwrite: bool) -> None:
-        """Name the folder, which is created with the first file.
-
-        Args:
-            path: The folder of the files.
-            overwrite: Whether a placement that is there may be replaced.
-        """
+        """Name the folder, which is created with the first file."""
         self.path = Path(path)
         self.overwrite = overwrite
         self._written: dict[str, bytes] = {}
@@ -393,7 +389,7 @@ class PlacementFolder:
         if self.path.exists() and not self.path.is_dir():
             what = "not a folder (found a file)"
             raise InputError(self.path, what, "choose another --out", ExitCode.OUTPUT)
-        for name in (CAMERA, CONFIG, MASK):
+        for name in (CAMERA, CONFIG, MASK, LAMPS):
             path = self.path / name
             if self.overwrite or not os.path.lexists(path):
                 continue
@@ -409,7 +405,7 @@ class PlacementFolder:
     def write(self, files: Mapping[str, Mapping[str, Any] | bytes]) -> Path:
         """Write the files, each whole or not at all; return the configuration's path.
 
-        The mask of an earlier placement is removed when this one has none.
+        Mask and lamps of an earlier placement are removed when this one has none.
 
         Raises:
             InputError: There is one already (`ExitCode.OUTPUT`), or it cannot be written
@@ -417,7 +413,7 @@ class PlacementFolder:
         """
         self.check()
         contents = {
-            name: content if isinstance(content, bytes) else _json_file(content)
+            name: content if isinstance(content, bytes) else json_bytes(content)
             for name, content in files.items()
         }
         config = self.path / CONFIG
@@ -427,13 +423,9 @@ class PlacementFolder:
                 for name in (CONFIG, *(other for other in contents if other != CONFIG)):
                     staged = renamed.enter_context(replacing(self.path / name))
                     write_staged(staged, contents[name])
-            if MASK not in contents:
-                (self.path / MASK).unlink(missing_ok=True)
+            for name in {MASK, LAMPS} - set(contents):
+                (self.path / name).unlink(missing_ok=True)
         except OSError as error:
             raise disk_error(error.filename or self.path, error) from error
         self._written = contents
         return Path(os.path.abspath(config))
-
-
-def _json_file(content: Mapping[str, Any]) -> bytes:
-    return (json.dumps(content, indent=2, allow_nan=False) + "\n").encode()

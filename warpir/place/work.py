@@ -1,8 +1,8 @@
 """What the page asks for that needs torch or Warp, in a process of its own.
 
 The process reads one job per line from standard input and answers on standard output, both JSON;
-`warpir.place.worker` starts it, and ends it to cancel a job. torch and Warp are loaded with the
-first job that needs them, and stay.
+`warpir.place.worker` starts it, and SIGUSR1 cancels a job at its next line of progress. torch and
+Warp are loaded with the first job that needs them, and stay.
 """
 
 from __future__ import annotations
@@ -12,9 +12,9 @@ import math
 import os
 import signal
 import sys
+import threading
 from collections.abc import Callable, Mapping
 from dataclasses import replace
-from functools import lru_cache
 from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
@@ -23,16 +23,18 @@ from PIL import Image
 
 from warpir.app.command import read_values
 from warpir.app.config import InsertConfig, flag
-from warpir.app.inputs import Inputs, Loaders, read_inputs
-from warpir.app.program import explain
-from warpir.core.arrays import FloatArray
+from warpir.app.inputs import Inputs, read_inputs
+from warpir.app.program import explain, silence_warnings
+from warpir.core.color import codes_of
 from warpir.core.errors import InputError
-from warpir.io.images.photos import Photo, read_photo
+from warpir.place.kept import Kept
 from warpir.scene.camera import Camera
 from warpir.scene.light import angles_from_axis
 
 if TYPE_CHECKING:
     from warpir.lighting.regression import Regression
+    from warpir.lighting.scene_light import SceneLight
+    from warpir.render.renderer import Renderer
 
 CLEAR_DEG = 40.0
 """Expected angle to the truth up to which a direction of the light counts as seen [deg]: that of a
@@ -59,25 +61,19 @@ def estimated_light(job: Mapping[str, Any], say: Say) -> dict[str, Any]:
     Raises:
         InputError: The photo or the weights cannot be read.
     """
-    from warpir.lighting.regression import regress
-    from warpir.lighting.regressor import load_regressor
     from warpir.lighting.visible_sun import with_visible_sun
 
-    config = config_of(job["config"])
-    photo, camera = photo_of(config), camera_of(job["camera"])
-    found = regress(load_regressor(None, "cpu"), photo.srgb, camera)
+    config, camera = config_of(job["config"]), camera_of(job["camera"])
+    found = KEPT.regression(config, camera)
+    photo = KEPT.photo(config.inputs, config.limits)
     return light_record(with_visible_sun(found, photo.srgb, camera))
 
 
 def render_preview(job: Mapping[str, Any], say: Say) -> dict[str, Any]:
     """Insert as `warpir.insert` does, at preview quality, and write the composite.
 
-    The photo is shrunk first, so that everything that follows is fast; its grain and its sharpness
-    are those of the shrunk photo.
-
     Args:
-        job: ``config`` of a placement; ``width`` of the picture [px] and ``picture``, the PNG file
-            that is written.
+        job: As for `_prepared`; ``picture`` is the PNG file that is written.
         say: Hears of the progress: ``stage``, and ``share`` of it that is done [1].
 
     Returns:
@@ -86,31 +82,13 @@ def render_preview(job: Mapping[str, Any], say: Say) -> dict[str, Any]:
     Raises:
         InputError: As `warpir.insert` refuses it.
     """
-    from warpir.lighting.detail import detail_of, with_detail
-    from warpir.lighting.estimate import estimate_light
-    from warpir.lighting.scene_light import make_light
-    from warpir.render.composite import Quality, make_picture, scene_of
-    from warpir.render.device import choose_device
-    from warpir.render.renderer import Renderer
+    from warpir.render.composite import Quality, make_picture
+    from warpir.render.device import keep_kernels
 
-    say({"stage": "reading", "share": 0.0})
     config = config_of(job["config"])
-    device, tone = choose_device(config.render.device), config.tone_operator
-    inputs = shrunk(read_inputs(config, LOADERS), int(job["width"]))
-    say({"stage": "light", "share": None})
-    lit = make_light(inputs, config.light, tone)
-    if lit is None:
-        lit = estimate_light(inputs, config.light, tone, device).light
-    detail = detail_of(inputs, lit.curves, PREVIEW_ROWS)
-    lit = replace(lit, detailed=with_detail(lit.light, detail))
-    say({"stage": "picture", "share": 0.0})
-    scene = scene_of(inputs, inputs.camera, device, lit.curves)
-
-    def report(stage: str, share: float) -> None:
-        say({"stage": stage or "picture", "share": share})
-
+    inputs, lit, renderer = _prepared(config, int(job["width"]), say)
     picture = make_picture(
-        Renderer(scene, config.render.threads or 0, report),
+        renderer,
         lit.on_object,
         lit.light_shadow,
         inputs.photo,
@@ -120,33 +98,62 @@ def render_preview(job: Mapping[str, Any], say: Say) -> dict[str, Any]:
         is_reinhard=lit.curves.tone == "reinhard",
         occluder=inputs.occluder,
     )
-    codes = np.round(np.clip(picture.image, 0.0, 1.0) * 255.0).astype(np.uint8)
-    Image.fromarray(codes).save(job["picture"], "PNG", compress_level=1)
+    keep_kernels()  # this process may be killed
+    Image.fromarray(codes_of(picture.image)).save(job["picture"], "PNG", compress_level=1)
     return {"width": inputs.camera.width, "assumed": [*inputs.assumed, *lit.assumed]}
 
 
-def shrunk(inputs: Inputs, width: int) -> Inputs:
-    """Return the inputs with the photo, its camera and its mask at most this wide [px]."""
-    photo, camera = inputs.photo, inputs.camera
-    if camera.width <= width:
-        return inputs
-    size = width, max(1, round(width * camera.height / camera.width))
+def warm_up(job: Mapping[str, Any], say: Say) -> dict[str, Any]:
+    """Read, load and compile what the preview of a placement needs, while nobody waits.
 
-    def small(plane: FloatArray) -> FloatArray:
-        return np.asarray(Image.fromarray(plane).resize(size, Image.Resampling.BOX))
+    Returns:
+        ``device``: Warp's name of it.
 
-    def each(planes: FloatArray) -> FloatArray:
-        return np.stack([small(planes[..., k]) for k in range(3)], axis=-1)
+    Raises:
+        InputError: As `warpir.insert` refuses it.
+    """
+    from warpir.render.device import keep_kernels
 
-    srgb = each(photo.srgb)
-    codes = each(photo.codes) if photo.is_linear else np.round(srgb * 255.0).astype(np.uint8)
-    occluder = inputs.occluder
-    return replace(
-        inputs,
-        photo=replace(photo, codes=codes, srgb=srgb, kind="png", icc=None, jpeg=None),
-        camera=camera.scaled(*size),
-        occluder=None if occluder is None else small(occluder),
-    )
+    _, _, renderer = _prepared(config_of(job["config"]), int(job["width"]), say)
+    renderer.load_kernels()
+    keep_kernels()
+    return {"device": str(renderer.device)}
+
+
+def _prepared(config: InsertConfig, width: int, say: Say) -> tuple[Inputs, SceneLight, Renderer]:
+    """Return inputs, light and renderer of a preview of that width [px].
+
+    The photo is shrunk first, so that everything that follows is fast; its grain and its sharpness
+    are those of the shrunk photo. A heavy object is thinned as for the browser.
+
+    Raises:
+        InputError: As `warpir.insert` refuses it.
+    """
+    from warpir.lighting.detail import detail_of, with_detail
+    from warpir.lighting.estimate import estimate_light
+    from warpir.lighting.scene_light import make_light
+    from warpir.render.composite import scene_of
+    from warpir.render.device import choose_device
+    from warpir.render.renderer import Renderer
+
+    say({"stage": "reading", "share": 0.0})
+    device, tone = choose_device(config.render.device), config.tone_operator
+    whole = KEPT.thinned(read_inputs(config, KEPT), config.inputs)
+    inputs = KEPT.shrunk(whole, width)
+    say({"stage": "light", "share": None})
+    lit = make_light(inputs, config.light, tone)
+    if lit is None:
+        seen = KEPT.regression(config, whole.camera)
+        lit = estimate_light(inputs, config.light, tone, device, seen).light
+    detail = detail_of(inputs, lit.curves, PREVIEW_ROWS)
+    lit = replace(lit, detailed=with_detail(lit.light, detail))
+    say({"stage": "picture", "share": 0.0})
+    scene = scene_of(inputs, inputs.camera, device, lit.curves)
+
+    def report(stage: str, share: float) -> None:
+        say({"stage": stage or "picture", "share": share})
+
+    return inputs, lit, Renderer(scene, config.render.threads or 0, report)
 
 
 def light_record(found: Regression) -> dict[str, Any]:
@@ -182,20 +189,8 @@ def camera_of(record: Mapping[str, Any]) -> Camera:
     return Camera(width, height, fx, fy, cx, cy, np.array(record["c2w"]))
 
 
-@lru_cache(maxsize=1)
-def _photo(path: str, layer: str | None, alpha: str, strict: bool, max_pixels: int) -> Photo:
-    return read_photo(path, layer=layer, alpha=alpha, strict=strict, max_pixels=max_pixels)
-
-
-def photo_of(config: InsertConfig) -> Photo:
-    """Return the photo of a configuration; the last one is kept."""
-    asked = config.inputs
-    assert asked.photo is not None
-    return _photo(asked.photo, asked.layer, asked.alpha, asked.strict, config.limits.pixels)
-
-
-def warm_up(job: Mapping[str, Any], say: Say) -> dict[str, Any]:
-    """Load what a preview needs, while nobody waits."""
+def load(job: Mapping[str, Any], say: Say) -> dict[str, Any]:
+    """Load the libraries that every other job needs, before the page asks for anything."""
     import_module("warpir.lighting.estimate")
     import_module("warpir.render.composite")
     from warpir.render.device import choose_device
@@ -203,10 +198,10 @@ def warm_up(job: Mapping[str, Any], say: Say) -> dict[str, Any]:
     return {"device": choose_device(None)}
 
 
-LOADERS = Loaders()
-"""Keeps the asset between two previews."""
+KEPT = Kept()
 JOBS: dict[str, Callable[[Mapping[str, Any], Say], dict[str, Any]]] = {
     "light": estimated_light,
+    "load": load,
     "preview": render_preview,
     "warm": warm_up,
 }
@@ -217,17 +212,26 @@ def serve() -> None:
     """Answer jobs until standard input ends."""
     # Ctrl-C at the terminal reaches this process too: who started it ends it.
     signal.signal(signal.SIGINT, signal.SIG_IGN)
+    is_cancelled = threading.Event()
+    signal.signal(signal.SIGUSR1, lambda *_: is_cancelled.set())
     # What libraries print must not stand between the answers.
     answers = os.fdopen(os.dup(1), "w", encoding="utf-8")
     os.dup2(2, 1)
+    silence_warnings()
 
     def say(answer: dict[str, Any]) -> None:
         print(json.dumps(answer, allow_nan=False), file=answers, flush=True)
 
+    def tell(progress: dict[str, Any]) -> None:
+        if is_cancelled.is_set():
+            raise InputError("the page", "stopped before it was done")
+        say(progress)
+
     for line in sys.stdin:
         job = json.loads(line)
+        is_cancelled.clear()
         try:
-            say({"answer": JOBS[job["kind"]](job, say)})
+            say({"answer": JOBS[job["kind"]](job, tell)})
         except InputError as error:
             say({"error": [str(error.where), error.what, error.advice]})
         except Exception as error:

@@ -1,12 +1,14 @@
 """The process that estimates and renders for the page, seen from the server.
 
-It is started with the first job; to cancel a job is to end it, and the next job starts another.
+It is started with the first job. A job is cancelled by a signal; where that is not answered, the
+process is ended, and the next job starts another.
 """
 
 from __future__ import annotations
 
 import json
 import os
+import signal
 import subprocess
 import sys
 import threading
@@ -15,6 +17,9 @@ from typing import Any
 
 from warpir.core.errors import ExitCode, InputError
 
+PATIENCE = 1.0
+"""How long a job that was cancelled may go on [s]: a kernel that is compiled cannot be left."""
+
 
 class Worker:
     """Gives jobs to `warpir.place.work`, one at a time."""
@@ -22,6 +27,8 @@ class Worker:
     def __init__(self) -> None:
         self._process: subprocess.Popen[str] | None = None
         self._is_asked = threading.Lock()
+        self._is_closed = False
+        self._job = 0
 
     def ask(
         self, job: Mapping[str, Any], heard: Callable[[dict[str, Any]], None] = lambda _: None
@@ -36,7 +43,10 @@ class Worker:
             InputError: The job cannot be done, or was cancelled (`ExitCode.RESOURCES`).
         """
         with self._is_asked:
+            if self._is_closed:
+                raise InputError("the page", "stopped before it was done", "", ExitCode.RESOURCES)
             process = self._running()
+            self._job += 1
             assert process.stdin is not None and process.stdout is not None
             try:
                 process.stdin.write(json.dumps(job) + "\n")
@@ -45,6 +55,8 @@ class Worker:
                 pass  # it has ended: nothing comes back either
             for line in process.stdout:
                 said = json.loads(line)
+                if "answer" in said or "error" in said:
+                    self._job += 1
                 if "answer" in said:
                     answer: dict[str, Any] = said["answer"]
                     return answer
@@ -53,6 +65,26 @@ class Worker:
                 heard(said)
         raise InputError("the page", "stopped before it was done", "", ExitCode.RESOURCES)
 
+    def interrupt(self) -> None:
+        """Let the process give up its job, and end it where it does not do so soon."""
+        process = self._process
+        if process is None:
+            return
+        process.send_signal(signal.SIGUSR1)
+
+        def insist(job: int) -> None:
+            if self._job == job and self._process is process:
+                self.stop()
+
+        later = threading.Timer(PATIENCE, insist, (self._job,))
+        later.daemon = True
+        later.start()
+
+    @property
+    def is_running(self) -> bool:
+        """Whether there is a process, with all that it has loaded."""
+        return self._process is not None and self._process.poll() is None
+
     def stop(self) -> None:
         """End the process, and with it the job that it works on."""
         process, self._process = self._process, None
@@ -60,8 +92,13 @@ class Worker:
             process.kill()
             process.wait()
 
+    def close(self) -> None:
+        """End the process; jobs that wait are refused."""
+        self._is_closed = True
+        self.stop()
+
     def _running(self) -> subprocess.Popen[str]:
-        if self._process is None or self._process.poll() is not None:
+        if not self.is_running:
             self._process = subprocess.Popen(
                 [sys.executable, "-m", "warpir.place.work"],
                 stdin=subprocess.PIPE,
@@ -72,4 +109,5 @@ class Worker:
                 # longer than they save. Warp's are its own.
                 env={"OMP_NUM_THREADS": "1", **os.environ},
             )
+        assert self._process is not None
         return self._process

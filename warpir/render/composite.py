@@ -11,7 +11,7 @@ from warpir.core.arrays import BoolArray, CodeArray, FloatArray, IntArray
 from warpir.core.color import GAMMA, linear_to_gamma
 from warpir.core.latlong import map_directions, texel_solid_angles, uv_of
 from warpir.io.images.photos import Photo
-from warpir.io.layers import Layers
+from warpir.io.layers import HALF_MAX, Layers
 from warpir.kernels.types import LightArgs
 from warpir.look.camera_look import CameraLook
 from warpir.look.denoise import denoised_object, denoised_ratio
@@ -19,6 +19,8 @@ from warpir.render.device_light import light_args
 from warpir.render.device_scene import Placed, Receiver, Scene
 from warpir.render.renderer import Foreground, GBuffer, Renderer
 from warpir.render.resizing import resize, resize_planes
+from warpir.render.shadow.mirror import leaving_ground, mirror_planes, shown_mirror
+from warpir.render.shadow.picture import ShadowSamples, picture_ratio
 from warpir.scene.camera import Camera
 from warpir.scene.lamps import without_lamps
 from warpir.scene.light import Light, as_map
@@ -27,6 +29,8 @@ from warpir.scene.tone_curves import Curves, ToneKnots
 
 RECEIVER_WIDTH = 1024
 """Largest width of the photo as a radiance texture of the receiver [px]."""
+BEHIND_GLASS_WIDTH = 2048
+"""The same where glass shows it [px]."""
 GREY_BALL = 0.18
 """Reflectance of the matte ball in ``balls.png``."""
 
@@ -46,6 +50,8 @@ class Quality:
     """Clamp on a path's indirect radiance; 0 for none, which is unbiased."""
     is_denoised: bool = False
     """Whether the noise of object and shadow is taken out (`warpir.look.denoise`)."""
+    ground_roughness: float | None = None
+    """Of the coat in which the ground shows the object [1]; None: the ground is matt."""
 
 
 UNCHANGED = CameraLook()
@@ -58,9 +64,11 @@ class Rendering:
 
     planes: dict[str, FloatArray]
     """``foreground`` (premultiplied), ``matte``, ``shadow_ratio``, the parts of the foreground and
-    the geometry, shape [H, W] or [H, W, 3]."""
+    the geometry, shape [H, W] or [H, W, 3]; on a glossy ground those of `mirror_planes`."""
     object_pixel_count: int
     receiver_pixel_count: int
+    curves: Curves
+    """What the planes were tone-mapped with."""
 
 
 @dataclass(frozen=True)
@@ -78,6 +86,8 @@ class Picture:
     """Pixels whose shadow was traced, at the rendering resolution."""
     look: CameraLook = UNCHANGED
     """What the camera did to the photo, repeated on object and shadow."""
+    mirror_cut_count: int = 0
+    """Pixels whose ground hid more light in the mirror than the photo shows there."""
 
 
 def make_picture(
@@ -93,6 +103,7 @@ def make_picture(
     occluder: FloatArray | None = None,
     shadow_mask: ShadowMask | None = None,
     look: CameraLook = UNCHANGED,
+    behind: Light | None = None,
 ) -> Picture:
     """Render object and shadow at the scene camera's resolution and put them into the photo.
 
@@ -107,6 +118,7 @@ def make_picture(
         curve_shadow,
         is_reinhard,
         shadow_mask=shadow_mask,
+        behind=behind,
     )
     return composite(rendering, photo, quality.seed, occluder, look)
 
@@ -121,6 +133,7 @@ def render(
     is_reinhard: bool = True,
     *,
     shadow_mask: ShadowMask | None = None,
+    behind: Light | None = None,
 ) -> Rendering:
     """Render object and shadow at the scene camera's resolution.
 
@@ -133,7 +146,9 @@ def render(
         curve_shadow: Three tone curves.
         is_reinhard: Whether Reinhard's operator precedes the foreground curve.
         shadow_mask: Mask of the ground that is in shadow already.
+        behind: What a glossy ground showed before the object came; None: ``light_fg``.
     """
+    renderer.load_kernels(quality.ground_roughness is not None)
     dimmed = light_fg if shadow_mask is None else without_lamps(light_fg, shadow_mask.at_object)
     args_fg = light_args(dimmed, renderer.device)
     args_shadow = args_fg if light_shadow is dimmed else light_args(light_shadow, renderer.device)
@@ -148,7 +163,13 @@ def render(
         quality.indirect_limit,
     )
     receiver_pixels, ratio = _shadow(
-        renderer, args_shadow, light_shadow, gbuffer.object_pixels, quality, shadow_mask
+        renderer,
+        args_shadow,
+        light_shadow,
+        gbuffer.object_pixels,
+        foreground.mask,
+        quality,
+        shadow_mask,
     )
     if quality.is_denoised:
         camera = renderer.scene.camera
@@ -156,8 +177,15 @@ def render(
         ratio = denoised_ratio(ratio, receiver_pixels, (camera.height, camera.width))
     fg, beta = renderer.tone(foreground, ratio, curve_fg, curve_shadow, is_reinhard)
     planes = _planes(renderer.scene.camera, gbuffer, foreground, fg, (receiver_pixels, beta))
+    if quality.ground_roughness is not None:
+        objects, matte = gbuffer.object_pixels, planes["matte"]
+        how = quality.ground_roughness, quality.depth, _samples(quality)
+        hidden = None if behind is None else light_args(behind, renderer.device)
+        shaded = (planes["shadow_ratio"] != 1.0).any(axis=-1)
+        planes |= mirror_planes(renderer, args_fg, objects, matte, shaded, *how, hidden)
     counts = len(gbuffer.object_pixels), len(receiver_pixels)
-    return Rendering(planes, *counts)
+    curves = Curves("reinhard" if is_reinhard else "linear", curve_fg, curve_shadow)
+    return Rendering(planes, *counts, curves)
 
 
 def composite(
@@ -182,14 +210,19 @@ def composite(
         planes = resize_planes(planes, *photo.srgb.shape[:2])
     planes = look.sharpened_like_photo(planes, enlarged)
     planes = look.shown_like_photo(planes, photo.linear())
+    cut = 0
+    if "image" in planes:
+        planes["mirror"], cut = shown_mirror(planes, photo.linear(), rendering.curves, look)
     if occluder is not None:
         planes = _behind(planes, occluder)
     layers = _layers(planes, photo)
     changed = (layers.matte > 0.0) | (layers.shadow_ratio != 1.0).any(axis=-1)
+    if layers.mirror is not None:
+        changed |= (layers.mirror != 0.0).any(axis=-1)
     layers = _with_grain(layers, look, changed, seed, photo.is_deep)
     image = linear_to_gamma(layers.composite).astype(np.float32)
     counts = rendering.object_pixel_count, rendering.receiver_pixel_count
-    return Picture(layers, image, changed, *counts, look)
+    return Picture(layers, image, changed, *counts, look, cut)
 
 
 def _denoised(foreground: Foreground, gbuffer: GBuffer, camera: Camera) -> Foreground:
@@ -212,33 +245,37 @@ def _shadow(
     args: LightArgs,
     light: Light,
     object_pixels: IntArray,
+    mask: FloatArray,
     quality: Quality,
     shadow_mask: ShadowMask | None,
 ) -> tuple[IntArray, FloatArray]:
     """Return the pixels that the object shades, and their ratio; ``args`` are those of ``light``.
 
+    ``mask`` is the coverage of ``object_pixels``.
+
     Where the photo's ground is in shadow already, the lamps do not count.
     """
     camera = renderer.scene.camera
-    is_object = np.zeros(camera.width * camera.height, np.int32)
-    is_object[object_pixels] = 1
+    samples = _samples(quality)
+    coverage = _plane((camera.height, camera.width), object_pixels, mask).reshape(-1)
+    may_see_object = _plane((camera.height, camera.width), object_pixels, np.ones_like(mask))
+    sees = may_see_object.reshape(-1).astype(np.int32)
 
     def shaded(args: LightArgs, wanted: BoolArray) -> tuple[IntArray, FloatArray]:
-        pixels, gains = renderer.changed_pixels(args, quality.seed, quality.indirect_limit)
-        pixels, gains = pixels[wanted[pixels]], gains[wanted[pixels]]
-        radiance = renderer.receiver(
-            args, pixels, is_object[pixels], quality.samples, quality.rays, quality.seed,
-            indirect_limit=quality.indirect_limit, may_gain=gains,
-        )  # fmt: skip
-        return pixels, renderer.ratio(radiance)
+        # The samples of a pixel that the object fills, as its radiance has seen, see no ground.
+        return picture_ratio(renderer, args, sees, wanted & (coverage < 1.0), samples)
 
     if shadow_mask is None:
-        return shaded(args, np.ones(len(is_object), bool))
+        return shaded(args, np.ones(len(sees), bool))
     resized = resize(shadow_mask.shares, camera.height, camera.width)
     shares = np.clip(resized, 0.0, 1.0).reshape(-1)
     lit = shaded(args, shares < 1.0)
     rest = shaded(light_args(without_lamps(light), renderer.device), shares > 0.0)
     return _mixed(lit, rest, shares)
+
+
+def _samples(quality: Quality) -> ShadowSamples:
+    return ShadowSamples(quality.samples, quality.rays, quality.seed, quality.indirect_limit)
 
 
 def _planes(
@@ -272,12 +309,17 @@ def _layers(planes: dict[str, FloatArray], photo: Photo) -> Layers:
         for name in ("foreground", "matte", "shadow_ratio"):
             planes[name] = _halves(planes[name])
     matte = planes["matte"]
-    composite = planes["foreground"] + (1.0 - matte)[..., None] * plate * planes["shadow_ratio"]
+    ground = (1.0 - matte)[..., None] * plate * planes["shadow_ratio"]
+    composite = planes["foreground"] + ground
+    if "mirror" in planes:
+        planes["mirror"] = leaving_ground(planes["mirror"], ground)
+        planes["mirror"] = planes["mirror"] if photo.is_deep else _halves(planes["mirror"])
+        composite = composite + planes["mirror"]
     return Layers(
         composite=composite,
         foreground=np.concatenate([planes["foreground"], matte[..., None]], axis=-1),
         plate=plate,
-        **{k: v for k, v in planes.items() if k != "foreground"},
+        **{k: v for k, v in planes.items() if k not in {"foreground", "image", "hidden", "kept"}},
     )
 
 
@@ -307,7 +349,7 @@ def _behind(planes: dict[str, FloatArray], occluder: FloatArray) -> dict[str, Fl
     # Exact where nothing is in front; there the object may also fill the pixel, and left is 0.
     ratio = np.where((m == 0.0)[..., None], planes["shadow_ratio"], ratio)
     behind = {**planes, "matte": free * matte, "shadow_ratio": ratio}
-    for name in ("foreground", "diffuse", "emission", "specular"):
+    for name in {"foreground", "diffuse", "emission", "specular", "mirror"} & planes.keys():
         behind[name] = free[..., None] * planes[name]
     hidden = m == 1.0
     for name in ("depth", "position", "normal", "albedo", "roughness"):
@@ -350,31 +392,43 @@ def scene_of(inputs: Inputs, camera: Camera, device: str, curves: Curves) -> Sce
     """
     ground = inputs.placement.ground
     placed = Placed(inputs.asset, inputs.placement.asset_to_world)
-    radiance = None if inputs.proxy is None else photo_radiance(inputs.photo, curves)
+    radiance = None
+    if any(m.is_solid_glass for m in inputs.asset.materials):
+        radiance = photo_radiance(inputs.photo, curves, BEHIND_GLASS_WIDTH)
+    elif inputs.proxy is not None:
+        radiance = photo_radiance(inputs.photo, curves)
     receiver = Receiver(ground[:3], -float(ground[3]), inputs.proxy, radiance, inputs.is_plane)
-    return Scene([placed], camera, receiver, device)
+    return Scene([placed], camera, receiver, device, inputs.lamps)
 
 
-def photo_radiance(photo: Photo, curves: Curves) -> FloatArray:
+def photo_radiance(photo: Photo, curves: Curves, width_max: int = RECEIVER_WIDTH) -> FloatArray:
     """Return the radiance that the picture's curves and operator would show as the photo.
 
     Args:
         photo: The photograph.
         curves: Tone curves of the picture.
+        width_max: Largest width of the result [px].
 
     Returns:
-        Relative [W/(m^2 sr)], shape [height, width, 3], at most `RECEIVER_WIDTH` wide.
+        Relative [W/(m^2 sr)], shape [height, width, 3].
     """
     linear = photo.linear()
     height, width = linear.shape[:2]
-    if width > RECEIVER_WIDTH:
-        linear = resize(linear, max(1, round(height * RECEIVER_WIDTH / width)), RECEIVER_WIDTH)
-    return curves.radiance(linear).astype(np.float32)
+    if width > width_max:
+        linear = resize(linear, max(1, round(height * width_max / width)), width_max)
+    radiance = np.empty_like(linear, np.float32)
+    # By the row: what lies between in float64 would be the largest arrays of a run.
+    for row, values in zip(radiance, linear, strict=True):
+        row[:] = curves.radiance(values)
+    return radiance
 
 
 def _halves(plane: FloatArray) -> FloatArray:
-    """Round to what half-precision numbers can hold; all values are display-linear, near [0, 1]."""
-    return plane.astype(np.float16).astype(np.float32)
+    """Round to what half-precision numbers can hold; what shines brighter is clamped there."""
+    # All values are display-linear, near [0, 1] but for strong emitters. NaN and Inf pass through.
+    held = np.where(np.isfinite(plane), np.clip(plane, -HALF_MAX, HALF_MAX), plane)
+    rounded: FloatArray = held.astype(np.float16).astype(np.float32)
+    return rounded
 
 
 def _parts(foreground: Foreground, premultiplied: FloatArray) -> dict[str, FloatArray]:

@@ -10,7 +10,7 @@ from __future__ import annotations
 import logging
 import os
 from collections.abc import Callable, Iterable, Sequence
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import ThreadPoolExecutor, as_completed
 from dataclasses import dataclass
 from functools import cache
 from itertools import product
@@ -24,10 +24,13 @@ from warpir.core.cache import KernelCache
 from warpir.core.errors import ExitCode, InputError
 from warpir.io.images.decoder import captured_stderr
 from warpir.kernels.composite import tone_foreground
-from warpir.kernels.path import foreground_kernel
-from warpir.kernels.receiver import trace_receiver
+from warpir.kernels.lamps.receiver import trace_lamps
+from warpir.kernels.path import Viewer, foreground_kernel
+from warpir.kernels.receiver import trace_plane_shadow, trace_receiver
+from warpir.kernels.sampling import draw_light
 from warpir.kernels.shadow_ratio import shadow_ratio
 from warpir.kernels.tracing.gbuffer import trace_gbuffer
+from warpir.kernels.types import LAYERS
 
 SAMPLES_PER_SLICE = 1 << 16
 """CPU work of one launch; keeps launches under half a second, so that Ctrl-C is answered."""
@@ -99,35 +102,95 @@ def cuda_count() -> int:
     return len(wp.get_cuda_devices())
 
 
-def load_kernels(device: str, variants: Iterable[tuple[bool, bool, bool]]) -> None:
+def cache_kernels(device: str, variants: Iterable[tuple[int, ...]]) -> None:
     """Compile the rendering kernels, or load them, and cache them for later processes.
-
-    A run compiles when a kernel is first launched, and fills the cache at its end.
 
     Args:
         device: Warp's name of it.
         variants: Variants of `foreground_kernel`.
     """
-    on = wp.get_device(device)
-    settle_hashes(on.is_cpu)
-    kernels = [trace_gbuffer, trace_receiver, shadow_ratio, tone_foreground]
-    for kernel in (*kernels, *(foreground_kernel(*flags) for flags in variants)):
-        # As a launch does: on the CPU there are no blocks.
-        kernel.module.load(on, 1 if on.is_cpu else kernel.module.options["block_dim"])
+    load_kernels(wp.get_device(device), variants)
+    keep_kernels()
+
+
+def keep_kernels() -> None:
+    """Cache the kernels that were compiled; a process that is not killed does so at its end."""
     for kept in _kernel_caches:
         kept.keep()
 
 
+def load_kernels(
+    device: wp.Device,
+    variants: Iterable[tuple[int, ...]],
+    progress: Callable[[str, float], None] = lambda stage, share: None,
+) -> None:
+    """Compile the rendering kernels, each module on a core of its own, or load them.
+
+    On CUDA they are compiled one after the other still: NVRTC holds a lock.
+
+    Args:
+        device: Warp's device.
+        variants: Variants of `foreground_kernel`.
+        progress: Called with the share of the modules that are there, while some are compiled.
+    """
+    wanted = list(variants)
+    has_lamps = any(flags[3] for flags in wanted)
+    settle_hashes(
+        bool(device.is_cpu),
+        has_lamps,
+        any(any(flags[4:]) for flags in wanted),
+        max((flags[0] for flags in wanted), default=0),
+    )
+    # The longest to compile come first
+    kernels = [*(foreground_kernel(*flags) for flags in wanted), trace_receiver, trace_gbuffer]
+    kernels += [trace_lamps] if has_lamps else []
+    kernels += [trace_plane_shadow, draw_light, tone_foreground, shadow_ratio]
+    modules = list(dict.fromkeys(kernel.module for kernel in kernels))
+    with ThreadPoolExecutor(default_threads()) as pool:
+        # As a launch does: on the CPU there are no blocks.
+        loads = [
+            pool.submit(module.load, device, 1 if device.is_cpu else module.options["block_dim"])
+            for module in modules
+        ]
+        for done, load in enumerate(as_completed(loads)):
+            load.result()
+            progress("compiling kernels", (done + 1) / len(modules))
+
+
 @cache
-def settle_hashes(is_cpu: bool) -> None:
+def settle_hashes(
+    is_cpu: bool, has_lamps: bool = False, has_solid_glass: bool = False, layers: int = LAYERS
+) -> None:
     """Compute the hashes by which Warp caches modules, before any is compiled.
 
     Modules share functions, and building one changes what Warp 1.19 hashes of the next: without
     this a second run finds the first run's module under another hash and compiles it again (26 s
     on an H200).
+
+    Args:
+        is_cpu: Whether they are for the CPU.
+        has_lamps: Whether those for lamps near the object are needed too (0.3 s).
+        has_solid_glass: Whether those for solid glass are.
+        layers: What extensions materials have (``MaterialArgs.any_layers``); those of most have
+            kernels of their own only where they are needed.
     """
-    kernels = [trace_gbuffer, trace_receiver, shadow_ratio, tone_foreground]
-    kernels += [foreground_kernel(*flags) for flags in product((False, True), repeat=3)]
+    kernels = [trace_gbuffer, trace_receiver, trace_plane_shadow, shadow_ratio, tone_foreground]
+    viewers = (Viewer.CAMERA, Viewer.GROUND)
+    # No ground with a mesh mirrors.
+    mirror = (False, Viewer.MIRROR)
+    variants: list[tuple[int, ...]] = []
+    for lamps in (False, True)[: 1 + has_lamps]:
+        scenes = [*product((False, True), viewers), mirror]
+        variants += [(has, *scene, lamps) for has, scene in product((0, LAYERS), scenes)]
+    if has_solid_glass:
+        seen = ((False, Viewer.CAMERA), (True, Viewer.CAMERA), mirror)
+        near = (False, True)[: 1 + has_lamps]
+        variants += [(LAYERS, *scene, lamps, True) for scene, lamps in product(seen, near)]
+    if layers > LAYERS:
+        variants += dict.fromkeys((layers, *others) for _, *others in variants)
+    kernels += [foreground_kernel(*variant) for variant in variants]
+    if has_lamps:
+        kernels.append(trace_lamps)
     for kernel in kernels:
         kernel.module.get_module_hash(1 if is_cpu else None)
 
@@ -173,6 +236,8 @@ class Launcher:
         """
         if count == 0:
             return
+        # Else a launch takes 256, and compiles a module anew that has another.
+        block_dim = 1 if self.device.is_cpu else kernel.module.options["block_dim"]
         wp.load_module(kernel.module, device=self.device)
         size = count
         if self.device.is_cpu:
@@ -184,7 +249,7 @@ class Launcher:
             stop = min(start + size, count)
             cut = [a.cut(start, stop) if isinstance(a, Rows) else a for a in args]
             dim = stop - start if width is None else (stop - start, width)
-            wp.launch(kernel, dim=dim, inputs=cut, device=self.device, record_tape=False)
+            wp.launch(kernel, dim, cut, device=self.device, record_tape=False, block_dim=block_dim)
 
         self.in_threads(one, starts, stage)
 

@@ -6,7 +6,9 @@ become float32, so an object 100 km from the origin keeps its precision.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator, Sequence
+from copy import copy
 from dataclasses import dataclass
 from typing import Any, cast
 
@@ -18,15 +20,23 @@ from warpir.core.arrays import Float64Array, FloatArray, IntArray
 from warpir.core.color import srgb_to_linear
 from warpir.kernels.receiver_mesh import trace_seen
 from warpir.kernels.types import (
+    ANISOTROPY,
+    IRIDESCENCE,
+    LAYERS,
     CameraArgs,
     Extensions,
+    GlassArgs,
     MaterialArgs,
     MeshArgs,
     ReceiverArgs,
     TextureArgs,
 )
+from warpir.render.device_light import lamp_args
+from warpir.render.glass.solid import absorption, glass_args, mean_way, straight_shares
+from warpir.render.rays.embree import EmbreeScene, library
 from warpir.scene.asset import Asset, Material, Primitive, Texture, TextureSlot
 from warpir.scene.camera import Camera
+from warpir.scene.near.lamps import Lamp
 from warpir.scene.receiver import ReceiverMesh
 from warpir.scene.sheen import sheen_albedo_table
 
@@ -34,7 +44,8 @@ ALPHA_MODES = {"OPAQUE": 0, "MASK": 1, "BLEND": 2}
 SLOTS = (
     "base_color", "metallic_roughness", "normal", "emission",
     "specular", "specular_color", "clearcoat", "clearcoat_roughness", "clearcoat_normal",
-    "sheen_color", "sheen_roughness", "transmission",
+    "sheen_color", "sheen_roughness", "transmission", "anisotropy",
+    "iridescence", "iridescence_thickness",
 )  # fmt: skip
 """Texture slots in the order of `warpir.kernels.tracing.texture`."""
 WRAP_MODES = {"repeat": 0, "clamp": 1, "mirror": 2}
@@ -47,6 +58,8 @@ FACTORS = (
     ("emission", wp.vec3),
 )
 """Material factors that can be replaced and differentiated."""
+POINTERS = ("id", "mesh", "embree", "embree_intersect", "embree_occluded")
+"""Arguments that differ from run to run."""
 RECEIVER_EPSILON = 2e-6
 """Ray offset over the diagonal of the receiver's mesh [1]; rays meet it again below 1e-7."""
 
@@ -137,10 +150,13 @@ def _slot(slot: TextureSlot | None, first_texture: int) -> tuple[int, int, list[
     return first_texture + slot.texture, slot.uv_set, list(slot.transform)
 
 
-def _extensions(material: Material) -> Extensions:
-    """Return a material's glTF extensions for the kernels."""
+def _extensions(material: Material, transmission: float) -> Extensions:
+    """Return a material's glTF extensions for the kernels, with this share of light passing it."""
     plain = Material()
-    names = ("ior", "specular", "specular_color", "clearcoat", "sheen_color", "transmission")
+    names = (
+        "ior", "specular", "specular_color", "clearcoat", "sheen_color", "transmission",
+        "anisotropy", "iridescence",
+    )  # fmt: skip
     out = Extensions()
     out.present = int(any(getattr(material, name) != getattr(plain, name) for name in names))
     if material.specular_texture or material.specular_color_texture:
@@ -151,9 +167,14 @@ def _extensions(material: Material) -> Extensions:
     out.sheen_color = wp.vec3(*material.sheen_color)
     for name in (
         "specular", "clearcoat", "clearcoat_roughness", "clearcoat_normal_scale",
-        "sheen_roughness", "transmission",
+        "sheen_roughness", "anisotropy", "iridescence",
     ):  # fmt: skip
         setattr(out, name, getattr(material, name))
+    rotation = material.anisotropy_rotation
+    out.stretch = wp.vec2(math.cos(rotation), math.sin(rotation))
+    out.film_ior = material.iridescence_ior
+    out.film_minimum, out.film_thickness = material.iridescence_thickness
+    out.transmission = transmission
     return out
 
 
@@ -167,21 +188,32 @@ class Scene:
         camera: The view.
         receiver: The ground plane, the receiver's mesh, or both.
         device: ``cpu`` or ``cuda``.
+        lamps: Lamps near the object.
 
     Attributes:
         origin: World point that is the recentred origin [m], shape [3].
         diagonal: Diagonal of the objects' bounding box [m].
-        has_glass: Whether some material lets light through that it does not reflect.
+        has_glass: Whether some material is a thin wall that light passes.
+        has_solid_glass: Whether some material is a body of glass, which bends light.
+        rays: Whose tree of the triangles finds hits, ``Embree`` or ``Warp``.
     """
 
     def __init__(
-        self, objects: Sequence[Placed], camera: Camera, receiver: Receiver, device: str
+        self,
+        objects: Sequence[Placed],
+        camera: Camera,
+        receiver: Receiver,
+        device: str,
+        lamps: Sequence[Lamp] = (),
     ) -> None:
         self.device = wp.get_device(device)
         self.camera = camera
         self.receiver = receiver
+        self.lamps = tuple(lamps)
+        self.rays = "Warp"
         parts: list[tuple[_Vertices, int]] = []
         materials: list[tuple[Material, int]] = []
+        scales: list[float] = []
         textures: list[Texture] = []
         for placed in objects:
             for primitive in placed.asset.primitives:
@@ -189,6 +221,8 @@ class Scene:
                 parts.append((vertices, len(materials) + primitive.material))
             first_texture = len(textures)
             materials += [(m, first_texture) for m in placed.asset.materials]
+            scale = abs(float(np.linalg.det(placed.asset_to_world[:3, :3]))) ** (1.0 / 3.0)
+            scales += [scale] * len(placed.asset.materials)
             textures += placed.asset.textures
         if parts:
             low = np.min([v.positions.min(axis=0) for v, _ in parts], axis=0)
@@ -202,9 +236,18 @@ class Scene:
 
         self._upload_mesh(parts)
         self._upload_materials(materials)
+        self._upload_glass([m for m, _ in materials], scales, parts)
         self._upload_textures(textures)
         self.camera_args = self.camera_args_at(camera)
         self.receiver_args = self._receiver_args()
+        self.lamp_args = lamp_args(self.lamps, self.origin, self.device)
+
+    def with_lamps(self, lamps: Sequence[Lamp]) -> Scene:
+        """Return the same scene, its uploads shared, with other lamps."""
+        other = copy(self)
+        other.lamps = tuple(lamps)
+        other.lamp_args = lamp_args(other.lamps, self.origin, self.device)
+        return other
 
     def _receiver_args(self) -> ReceiverArgs:
         receiver, camera = self.receiver, self.camera
@@ -224,6 +267,10 @@ class Scene:
         args.radiance = self._array(np.zeros((1, 1, 3), np.float32), wp.vec3)
         mesh = receiver.mesh
         if mesh is None:
+            # The ground behind glass is what the photo shows there.
+            if self.has_solid_glass and receiver.radiance is not None:
+                args.eye = wp.vec3(*(camera.c2w[:3, 3] - self.origin).astype(np.float32))
+                self._upload_radiance(args, receiver.radiance)
             return args
         positions = mesh.positions - self.origin
         args.positions = self._array(positions.astype(np.float32), wp.vec3)
@@ -278,16 +325,24 @@ class Scene:
         own = self.material_args if materials is None else materials
         return self.mesh_args, own, self.texture_args, self.receiver_args
 
+    def shadow_geometry(self) -> tuple[Any, ...]:
+        """Return `geometry` as the receiver sees it: solid glass is passed straight."""
+        return self.geometry(self.shadow_material_args)
+
     def materials_with(self, factors: Sequence[FloatArray | None]) -> MaterialArgs:
         """Return the scene's materials with other factors, in the order of `FACTORS`; None: own."""
-        args = MaterialArgs()
-        for name in cast(Any, self.material_args)._cls.vars:
-            setattr(args, name, getattr(self.material_args, name))
+        args = self._copied_materials()
         for factor, (name, dtype) in zip(factors, FACTORS, strict=True):
             if factor is not None:
                 setattr(args, name, wp.array(factor, dtype=dtype, device=self.device))
         if factors[3] is not None:
             args.any_emission = 1
+        return args
+
+    def _copied_materials(self) -> MaterialArgs:
+        args = MaterialArgs()
+        for name in cast(Any, self.material_args)._cls.vars:
+            setattr(args, name, getattr(self.material_args, name))
         return args
 
     def contents(self) -> Iterator[NDArray[np.generic]]:
@@ -299,10 +354,12 @@ class Scene:
             self.camera_args,
             self.receiver_args,
         )
+        if self.has_solid_glass:
+            structs += self.glass_args, self.shadow_material_args
         for args in structs:
             for name in args._cls.vars:
                 value = getattr(args, name)
-                if name not in ("id", "mesh"):  # pointers
+                if name not in POINTERS:
                     yield value.numpy() if isinstance(value, wp.array) else np.asarray(value)
 
     def _array(self, values: NDArray[np.generic], dtype: type) -> wp.array:
@@ -352,6 +409,11 @@ class Scene:
         # Warp's default on CUDA builds faster and traces 12 % slower; this tree is built once.
         self.mesh = wp.Mesh(points=args.positions, indices=args.indices, bvh_constructor="sah")
         args.id = self.mesh.id
+        if self.device.is_cpu and (embree := library()) is not None:
+            self.rays = "Embree"
+            self.embree = EmbreeScene(embree, args.positions.numpy(), args.indices.numpy())
+            args.embree = self.embree.handle
+            args.embree_intersect, args.embree_occluded = embree.intersect, embree.occluded
         self.mesh_args = args
 
     def _upload_materials(self, materials: Sequence[tuple[Material, int]]) -> None:
@@ -367,32 +429,55 @@ class Scene:
             setattr(args, name, self._array(values, wp.float32))
         args.base_color = self._array(np.array([m.base_color for m in plain], np.float32), wp.vec3)
         args.emission = self._array(np.array([m.emission for m in plain], np.float32), wp.vec3)
-        extensions = [_extensions(m) for m in plain]
+        # Rays stop at solid glass.
+        extensions = [_extensions(m, 0.0 if m.is_solid_glass else m.transmission) for m in plain]
         args.extensions = wp.array(extensions, dtype=Extensions, device=self.device)
-        args.any_layers = int(any(e.present for e in extensions))
+        args.any_layers = LAYERS * any(e.present for e in extensions)
+        args.any_layers |= ANISOTROPY * any(e.anisotropy > 0.0 for e in extensions)
+        args.any_layers |= IRIDESCENCE * any(e.iridescence > 0.0 for e in extensions)
         has_sheen = any(max(m.sheen_color) > 0.0 for m in plain)
         table = sheen_albedo_table() if has_sheen else np.zeros((2, 2))
         args.sheen_albedo = self._array(table.astype(np.float32), wp.float32)
-        args.alpha_mode = self._array(
-            np.array([ALPHA_MODES[m.alpha_mode] for m in plain], np.int32), wp.int32
-        )
-        args.double_sided = self._array(
-            np.array([m.double_sided for m in plain], np.int32), wp.int32
-        )
-        args.slot_texture = self._array(
-            np.array([[s[0] for s in row] for row in slots], np.int32), wp.int32
-        )
-        args.slot_uv_set = self._array(
-            np.array([[s[1] for s in row] for row in slots], np.int32), wp.int32
-        )
+        for name, numbers in (
+            ("alpha_mode", [ALPHA_MODES[m.alpha_mode] for m in plain]),
+            ("double_sided", [m.double_sided for m in plain]),
+            ("slot_texture", [[s[0] for s in row] for row in slots]),
+            ("slot_uv_set", [[s[1] for s in row] for row in slots]),
+        ):
+            setattr(args, name, self._array(np.array(numbers, np.int32), wp.int32))
         affine = np.array([[s[2] for s in row] for row in slots], np.float32)
         args.slot_u = self._array(np.ascontiguousarray(affine[:, :, :3]), wp.vec3)
         args.slot_v = self._array(np.ascontiguousarray(affine[:, :, 3:]), wp.vec3)
-        args.any_alpha = int(any(m.alpha_mode != "OPAQUE" or m.transmission > 0.0 for m in plain))
+        self.has_glass = any(e.transmission > 0.0 for e in extensions)
+        args.any_alpha = int(self.has_glass or any(m.alpha_mode != "OPAQUE" for m in plain))
         args.any_culled = int(any(not m.double_sided for m in plain))
         args.any_emission = int(any(max(m.emission) > 0.0 for m in plain))
-        self.has_glass = any(m.transmission > 0.0 for m in plain)
         self.material_args = args
+
+    def _upload_glass(
+        self,
+        materials: Sequence[Material],
+        scales: Sequence[float],
+        parts: Sequence[tuple[_Vertices, int]],
+    ) -> None:
+        """Upload solid glass, and the materials as rays of the shadow take them."""
+        self.glass_args = GlassArgs()
+        self.shadow_material_args = self.material_args
+        self.has_solid_glass = any(m.is_solid_glass for m in materials)
+        if not self.has_solid_glass:
+            return
+        absorbed = absorption(materials, scales)
+        self.glass_args = glass_args(materials, absorbed, self.device)
+        ways = [
+            mean_way([v.positions[v.indices] for v, m in parts if m == k])
+            for k in range(len(materials))
+        ]
+        shares = straight_shares(materials, absorbed, ways)
+        extensions = [_extensions(m, share) for m, share in zip(materials, shares, strict=True)]
+        args = self._copied_materials()
+        args.extensions = wp.array(extensions, dtype=Extensions, device=self.device)
+        args.any_alpha = 1
+        self.shadow_material_args = args
 
     def _upload_textures(self, textures: Sequence[Texture]) -> None:
         rows = textures or [Texture(np.full((1, 1, 4), 255, np.uint8))]

@@ -41,9 +41,11 @@ class Integrator(Protocol):
         light_shadow: Tensor,
         seed: int,
         materials: MaterialTensors | None = None,
+        lamp_powers: Tensor | None = None,
     ) -> Radiance:
         """Render the object under ``light_fg`` and the plane under ``light_shadow``.
 
-        Both are lat-long radiance, relative [W/(m^2 sr)], shape [He, We, 3].
+        Both are lat-long radiance, relative [W/(m^2 sr)], shape [He, We, 3]. ``lamp_powers``,
+        relative [W], shape [lamp, 3], take the place of the scene's own.
         """
         ...

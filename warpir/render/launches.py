@@ -12,14 +12,25 @@ from typing import TYPE_CHECKING
 import numpy as np
 import warp as wp
 
-from warpir.core.arrays import BoolArray, FloatArray, IntArray
-from warpir.kernels.path import foreground_kernel
-from warpir.kernels.receiver import trace_receiver
+from warpir.core.arrays import BoolArray, Float64Array, FloatArray, IntArray
+from warpir.kernels.dielectric.glass import GLASS_DEPTH
+from warpir.kernels.lamps.receiver import trace_lamps
+from warpir.kernels.path import Viewer, foreground_kernel
+from warpir.kernels.receiver import trace_plane_shadow, trace_receiver
 from warpir.kernels.types import CameraArgs, LightArgs, LightRecord, MaterialArgs, VertexRecord
 from warpir.render.device import Rows
 
 if TYPE_CHECKING:
+    from warpir.render.device_scene import Scene
     from warpir.render.renderer import Renderer
+
+
+def directions_of_path(scene: Scene, depth: int) -> int:
+    """Return how many directions a path of ``depth`` interactions records at most.
+
+    Two at each; at glass none goes on and sees the light.
+    """
+    return 2 * depth + (GLASS_DEPTH + 1 if scene.has_solid_glass else 0)
 
 
 @dataclass(frozen=True)
@@ -34,6 +45,10 @@ class ObjectLaunch:
     """Interactions with the object."""
     indirect_limit: float
     seed: int
+    ground_roughness: float | None = None
+    """Of the coat in which the ground shows the object; None: the ground is white."""
+    behind: LightArgs | None = None
+    """What that coat shows where the object is not; None: the light."""
 
     def sums(
         self,
@@ -65,6 +80,15 @@ class ObjectLaunch:
         radiance: FloatArray = out.numpy()[: len(pixels)]
         return radiance
 
+    def mirrored(
+        self, renderer: Renderer, pixels: IntArray, may_see_object: IntArray, spp: int
+    ) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """Return the object's image in the ground's coat, what it hides there, and what not."""
+        out = [renderer.zeros(len(pixels), wp.vec3) for _ in range(3)]
+        self._trace(renderer, pixels, may_see_object, spp, 1, out, None, None)
+        image, hidden, kept = (a.numpy()[: len(pixels)] for a in out)
+        return image, hidden, kept
+
     def _trace(
         self,
         renderer: Renderer,
@@ -78,8 +102,15 @@ class ObjectLaunch:
     ) -> None:
         """Launch the kernel; what it does not look at is None."""
         scene, is_from_ground = renderer.scene, may_see_object is not None
+        viewer, alpha = Viewer.GROUND if is_from_ground else Viewer.CAMERA, 0.0
+        if self.ground_roughness is not None:
+            viewer, alpha = Viewer.MIRROR, self.ground_roughness**2
         kernel = foreground_kernel(
-            bool(self.materials.any_layers), bool(scene.receiver_args.mesh), is_from_ground
+            self.materials.any_layers,
+            bool(scene.receiver_args.mesh),
+            viewer,
+            bool(scene.lamps),
+            scene.has_solid_glass and viewer != Viewer.GROUND,
         )
         hidden = None
         if may_see_object is not None:
@@ -93,19 +124,23 @@ class ObjectLaunch:
                 self.camera_args,
                 *scene.geometry(self.materials),
                 self.light,
+                self.light if self.behind is None else self.behind,
+                scene.lamp_args,
+                scene.glass_args,
                 spp,
                 self.rays,
                 lanes,
                 self.depth + is_from_ground,
                 self.indirect_limit,
                 self.seed,
+                alpha,
                 *map(Rows, out),
                 *[None] * (4 - len(out)),
                 LightRecord() if light_record is None else Rows(light_record),
                 VertexRecord() if vertex_record is None else Rows(vertex_record),
             ],
             spp * self.rays,
-            "bounce" if is_from_ground else "object",
+            {Viewer.CAMERA: "object", Viewer.GROUND: "bounce", Viewer.MIRROR: "mirror"}[viewer],
         )
 
 
@@ -119,6 +154,11 @@ class ReceiverLaunch:
     """Arguments of a launch over the white receiver that all pixels share."""
 
     light: LightArgs
+    """Drawn for the receiver (`warpir.render.device_light.drawn`)."""
+    object_light: LightArgs | None
+    """Drawn for the object, which throws it on; None: it throws nothing."""
+    plane_radiance: Float64Array | None
+    """Of the open receiver, shape [3]; None where that differs by place, or a record is kept."""
     camera_args: CameraArgs
     rays: int
     seed: int
@@ -142,25 +182,25 @@ class ReceiverLaunch:
         """
         count = len(pixels)
         out = [renderer.zeros(count, wp.vec3) for _ in range(2)]
-        renderer.launch(
-            trace_receiver,
-            count,
-            [
-                Rows(renderer.upload(pixels, wp.int32)),
-                Rows(renderer.upload(may_see_object, wp.int32)),
-                self.camera_args,
-                *renderer.scene.geometry(),
-                self.light,
-                spp,
-                self.rays,
-                self.seed,
-                *map(Rows, out),
-                LightRecord() if record is None else Rows(record),
-            ],
-            spp * self.rays,
-            "shadow",
-        )
+        seen = [
+            Rows(renderer.upload(pixels, wp.int32)),
+            Rows(renderer.upload(may_see_object, wp.int32)),
+            self.camera_args,
+            *renderer.scene.shadow_geometry(),
+            self.light,
+        ]
+        samples = [spp, self.rays, self.seed, *map(Rows, out)]
+        work = spp * self.rays
+        if self.plane_radiance is not None:
+            args = [*seen, wp.vec3(*map(float, self.plane_radiance)), *samples]
+            renderer.launch(trace_plane_shadow, count, args, work, "shadow")
+        else:
+            kept = LightRecord() if record is None else Rows(record)
+            renderer.launch(trace_receiver, count, [*seen, *samples, kept], work, "shadow")
         lit, unoccluded = (a.numpy()[:count] for a in out)
+        if renderer.scene.lamps:
+            near = self.by_lamps(renderer, pixels, may_see_object, spp)
+            lit, unoccluded = lit + near[0], unoccluded + near[1]
         thrown = np.zeros_like(lit)
         if self.bounce_depth and may_gain.any():
             launch = self.thrown(renderer)
@@ -169,11 +209,37 @@ class ReceiverLaunch:
             )
         return lit + thrown, unoccluded, thrown
 
+    def by_lamps(
+        self, renderer: Renderer, pixels: IntArray, may_see_object: IntArray, spp: int
+    ) -> tuple[FloatArray, FloatArray]:
+        """Return what the lamps near the object add with and without it, a row a pixel."""
+        out = [renderer.zeros(len(pixels), wp.vec3) for _ in range(2)]
+        renderer.launch(
+            trace_lamps,
+            len(pixels),
+            [
+                Rows(renderer.upload(pixels, wp.int32)),
+                Rows(renderer.upload(may_see_object, wp.int32)),
+                self.camera_args,
+                *renderer.scene.shadow_geometry(),
+                renderer.scene.lamp_args,
+                spp,
+                self.rays,
+                self.seed,
+                *map(Rows, out),
+            ],
+            spp * self.rays,
+            "shadow",
+        )
+        lit, unoccluded = (a.numpy()[: len(pixels)] for a in out)
+        return lit, unoccluded
+
     def thrown(self, renderer: Renderer) -> ObjectLaunch:
         """Return the launch that traces the object's light on the receiver."""
+        assert self.object_light is not None
         return ObjectLaunch(
-            self.light,
-            renderer.scene.material_args,
+            self.object_light,
+            renderer.scene.shadow_material_args,
             self.camera_args,
             self.rays,
             self.bounce_depth,

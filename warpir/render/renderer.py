@@ -13,18 +13,20 @@ from typing import Any
 
 import numpy as np
 import warp as wp
-from numpy.typing import NDArray
 
 from warpir.core.arrays import BoolArray, Float64Array, FloatArray, IntArray
 from warpir.core.memory import Memory
 from warpir.kernels.composite import tone_foreground, tone_shadow
+from warpir.kernels.path import Viewer
 from warpir.kernels.shadow_ratio import shadow_ratio
 from warpir.kernels.tracing.gbuffer import trace_gbuffer
 from warpir.kernels.types import CameraArgs, LightArgs, LightRecord, MaterialArgs, VertexRecord
 from warpir.render.bad_pixels import BadPixels, all_finite, first_bad_sample_of
-from warpir.render.device import Launcher, Rows
+from warpir.render.device import Launcher, Rows, load_kernels, settle_hashes
+from warpir.render.device_light import drawn, plane_radiance
 from warpir.render.device_scene import Scene
-from warpir.render.launches import ObjectLaunch, ReceiverLaunch
+from warpir.render.launches import THROWN_LIMIT, ObjectLaunch, ReceiverLaunch
+from warpir.render.shadow.pilot import dilate
 from warpir.scene.camera import Camera
 from warpir.scene.placement import box_corners
 from warpir.scene.tone_curves import ToneKnots
@@ -33,13 +35,6 @@ FULL_THREADS = 1 << 18
 """Threads that fill a CUDA device; with fewer pixels, several threads share a pixel's samples."""
 GLASS_SAMPLES = 8
 """Factor on the samples of the G-buffer for clear glass, which few samples hit."""
-PILOT_SCALE = 4
-"""Side of the pixel blocks of the pilot pass for the receiver's shadow [px]."""
-PILOT_SAMPLES = 32
-UNSEEN_SHADOW = 1e-3
-"""Loss of light below which no shadow is traced [1]: an eighth of an 8-bit code at white."""
-UNSEEN_GAIN = 2e-3
-"""Gain of light below which it is not traced [1]: a quarter of an 8-bit code at white."""
 
 
 @dataclass(frozen=True)
@@ -117,11 +112,37 @@ class Renderer(Launcher):
         bounce_depth: int = 0,
     ) -> None:
         super().__init__(scene.device, threads, progress)
+        if scene.lamps or scene.has_solid_glass:
+            settle_hashes(
+                bool(self.device.is_cpu),
+                bool(scene.lamps),
+                scene.has_solid_glass,
+                scene.material_args.any_layers,
+            )
         self.bounce_depth = bounce_depth if scene.triangle_count else 0
         self.scene = scene
         self.memory, self.lower = memory or Memory(str(self.device.alias)), lower
         self.is_ordered = is_ordered or bool(self.device.is_cpu)
         self.bad_pixels = BadPixels()
+
+    def load_kernels(self, mirrors: bool = False) -> None:
+        """Compile or load what a picture of the scene needs, all at once.
+
+        Else each kernel is compiled when it is first launched, one after the other.
+
+        Args:
+            mirrors: Whether the ground shows the object's mirror image.
+        """
+        scene = self.scene
+        flags = scene.material_args.any_layers, bool(scene.receiver_args.mesh)
+        viewers = [Viewer.CAMERA]
+        viewers += [Viewer.GROUND] if self.bounce_depth else []
+        viewers += [Viewer.MIRROR] if mirrors else []
+        variants = [
+            (*flags, viewer, bool(scene.lamps), scene.has_solid_glass and viewer != Viewer.GROUND)
+            for viewer in viewers
+        ]
+        load_kernels(self.device, variants, self._progress)
 
     def candidate_pixels(self, camera: Camera) -> IntArray:
         """Return a superset of the object's pixels by its bounding box, row-major."""
@@ -143,23 +164,41 @@ class Renderer(Launcher):
         ``object_pixels`` are those that a sample hits and their neighbours, so that a pixel whose
         corner alone is covered is still traced.
         """
-        scene, camera = self.scene, self.scene.camera
-        if scene.has_glass:
-            # Clear glass stops 1 ray in 25.
-            spp *= GLASS_SAMPLES
+        camera = self.scene.camera
         candidates = self.candidate_pixels(camera)
         names = ("coverage", "position", "normal", "base_color", "roughness", "emission")
-        vectors = {"position", "normal", "base_color", "emission"}
+        coverage, *planes = self._traced_geometry(candidates, spp, seed)
+        if self.scene.has_glass:
+            # Clear glass stops 1 ray in 25: few samples may all have missed it.
+            thin = np.flatnonzero(coverage < 1.0)
+            again = self._traced_geometry(candidates[thin], spp * GLASS_SAMPLES, seed)
+            for plane, better in zip((coverage, *planes), again, strict=True):
+                plane[thin] = better
+        traced = self.bad_pixels.blackened(tuple(planes), candidates, camera.width, "geometry")
+        host: dict[str, Any] = dict(zip(names, (coverage, *traced), strict=True))
+        hit = np.zeros((camera.height, camera.width), bool)
+        hit.reshape(-1)[candidates] = host["coverage"] > 0.0
+        near = dilate(hit)
+        keep = near.reshape(-1)[candidates]
+        host = {name: values[keep] for name, values in host.items()}
+        # In float64: float32 is 8 mm coarse 100 km from the origin, and depth follows from this.
+        host["position"] = host["position"].astype(np.float64) + self.scene.origin
+        return GBuffer(object_pixels=candidates[keep], **host)
+
+    def _traced_geometry(self, pixels: IntArray, spp: int, seed: int) -> tuple[FloatArray, ...]:
+        """Return coverage, position, normal, base colour, roughness and emission, a row a pixel."""
+        scene = self.scene
 
         def trace(start: int, stop: int) -> tuple[FloatArray, ...]:
             out = [
-                self.zeros(stop - start, wp.vec3 if name in vectors else float) for name in names
+                self.zeros(stop - start, kind)
+                for kind in (float, wp.vec3, wp.vec3, wp.vec3, float, wp.vec3)
             ]
             self.launch(
                 trace_gbuffer,
                 stop - start,
                 [
-                    Rows(self.upload(candidates[start:stop], wp.int32)),
+                    Rows(self.upload(pixels[start:stop], wp.int32)),
                     scene.camera_args,
                     *scene.geometry(),
                     spp,
@@ -169,19 +208,9 @@ class Renderer(Launcher):
                 spp,
                 "geometry",
             )
-            return tuple(array.numpy()[: stop - start] for array in out)
+            return tuple(array.numpy()[: stop - start].copy() for array in out)
 
-        coverage, *planes = self._in_chunks(trace, len(candidates), "geometry")
-        traced = self.bad_pixels.blackened(tuple(planes), candidates, camera.width, "geometry")
-        host: dict[str, Any] = dict(zip(names, (coverage, *traced), strict=True))
-        hit = np.zeros((camera.height, camera.width), bool)
-        hit.reshape(-1)[candidates] = host["coverage"] > 0.0
-        near = _dilate(hit)
-        keep = near.reshape(-1)[candidates]
-        host = {name: values[keep] for name, values in host.items()}
-        # In float64: float32 is 8 mm coarse 100 km from the origin, and depth follows from this.
-        host["position"] = host["position"].astype(np.float64) + self.scene.origin
-        return GBuffer(object_pixels=candidates[keep], **host)
+        return self._in_chunks(trace, len(pixels), "geometry")
 
     def _in_chunks(
         self, trace: Callable[[int, int], tuple[FloatArray, ...]], count: int, stage: str
@@ -229,7 +258,8 @@ class Renderer(Launcher):
         """
         own = materials or self.scene.material_args
         view = self.scene.camera_args
-        launch = ObjectLaunch(light, own, view, rays, depth, indirect_limit, seed)
+        drawn_light = drawn(self, light, seed, spp * rays)
+        launch = ObjectLaunch(drawn_light, own, view, rays, depth, indirect_limit, seed)
         lanes = self.lanes(len(pixels), spp)
 
         def trace(start: int, stop: int) -> tuple[FloatArray, ...]:
@@ -265,6 +295,7 @@ class Renderer(Launcher):
         thrown_record: LightRecord | None = None,
         indirect_limit: float = 0.0,
         may_gain: BoolArray | None = None,
+        is_recorded: bool = False,
     ) -> ReceiverRadiance:
         """Radiance of the white receiver with and without the object (both halves of DiPIR, eq. 5).
 
@@ -284,12 +315,25 @@ class Renderer(Launcher):
             thrown_record: The same of the light that the object throws there, RGB weights of `lit`.
             indirect_limit: Limit of `foreground`; `THROWN_LIMIT` of it is the most radiance that
                 one path of that light may add. 0: no limit.
-            may_gain: False where the object throws nothing, as `changed_pixels` returns it, shape
+            may_gain: False where the object throws nothing (`warpir.render.shadow.pilot`), shape
                 [receiver_pixel]; None: it may everywhere. A ``thrown_record`` needs all of them.
+            is_recorded: Draw what a record holds also where none is given. Else a plane's loss is
+                sampled, which is less noisy (`warpir.kernels.receiver.trace_plane_shadow`).
         """
         view = self.scene.camera_args if camera_args is None else camera_args
-        launch = ReceiverLaunch(light, view, rays, seed, self.bounce_depth, indirect_limit)
-
+        plane = self.scene.receiver
+        normal = plane.normal if plane.mesh is None else None
+        from_light = drawn(self, light, seed, spp * rays, normal)
+        launch = ReceiverLaunch(
+            from_light,
+            drawn(self, light, seed, spp * rays) if self.bounce_depth else None,
+            None if normal is None or is_recorded else plane_radiance(from_light, normal),
+            view,
+            rays,
+            seed,
+            self.bounce_depth,
+            indirect_limit,
+        )
         gain = np.ones(len(pixels), np.bool_) if may_gain is None else may_gain
         assert thrown_record is None or gain.all(), "rows of the record are pixels"
 
@@ -313,64 +357,87 @@ class Renderer(Launcher):
         traced = self.bad_pixels.blackened(traced, pixels, width, stage, first_bad_sample)
         return ReceiverRadiance(*traced)
 
-    def shaded_pixels(self, light: LightArgs, seed: int) -> IntArray:
-        """Return the pixels where the object may change the plane's light, row-major."""
-        return self.changed_pixels(light, seed)[0]
+    def thrown(
+        self,
+        light: LightArgs,
+        pixels: IntArray,
+        spp: int,
+        rays: int,
+        seed: int,
+        camera_args: CameraArgs,
+        indirect_limit: float,
+    ) -> FloatArray:
+        """Return the radiance that the object throws on a plane, shape [receiver_pixel, 3].
 
-    def changed_pixels(
-        self, light: LightArgs, seed: int, indirect_limit: float = 0.0
-    ) -> tuple[IntArray, BoolArray]:
-        """Return `shaded_pixels`, and which of them the object may throw light on.
+        Arguments as `receiver` has them. Where the object hides the plane, this is what it throws
+        behind itself.
+        """
+        from_light, depth = drawn(self, light, seed, spp * rays), self.bounce_depth
+        launch = ReceiverLaunch(
+            from_light, from_light, None, camera_args, rays, seed, depth, indirect_limit
+        ).thrown(self)
 
-        A pilot pass traces the same rays over blocks of `PILOT_SCALE` pixels, each sample at a
-        position of its own in the block. A block whose 3 x 3 neighbourhood loses less than
-        `UNSEEN_SHADOW` of its light and gains less than `UNSEEN_GAIN` is left alone and stays the
-        photo, bit for bit.
+        def trace(start: int, stop: int) -> tuple[FloatArray]:
+            nothing = np.zeros(stop - start, np.int32)
+            return (launch.thrown(self, pixels[start:stop], nothing, spp),)
+
+        return self._in_chunks(trace, len(pixels), "bounce in blocks")[0]
+
+    def mirrored(
+        self,
+        light: LightArgs,
+        pixels: IntArray,
+        may_see_object: IntArray,
+        roughness: float,
+        spp: int,
+        rays: int,
+        depth: int,
+        seed: int,
+        indirect_limit: float = 0.0,
+        behind: LightArgs | None = None,
+    ) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """Return the object's mirror image in a glossy plane, what it hides, and what it does not.
+
+        Radiance, ``F L`` over the coat's GGX normals, of the object, of the light behind it and of
+        that beside it; for a receiver without a mesh. Means over the samples that see the plane,
+        shape [receiver_pixel, 3] each.
 
         Args:
-            light: From `light_args`.
+            light: Light on the object.
+            pixels: Row-major pixel indices, shape [receiver_pixel].
+            may_see_object: 1 where the object may hide the receiver, shape [receiver_pixel].
+            roughness: Perceptual roughness of the coat [1]; 0 is a mirror.
+            spp: Camera samples per pixel.
+            rays: Directions per camera sample.
+            depth: Largest number of interactions with the object.
             seed: Base seed.
-            indirect_limit: As `receiver` has it.
+            indirect_limit: Limit of `foreground`; `THROWN_LIMIT` of it is the most that a path may
+                add, as in `receiver`: the sun's glint on the object, mirrored, leaves specks.
+            behind: What the coat mirrors without the object; None: the light.
         """
-        camera = self.scene.camera
-        width, height = -(-camera.width // PILOT_SCALE), -(-camera.height // PILOT_SCALE)
-        # Blocks at the right and lower border reach past the photo; the intrinsics are the photo's.
-        coarse = Camera(
-            width,
-            height,
-            camera.fx / PILOT_SCALE,
-            camera.fy / PILOT_SCALE,
-            camera.cx / PILOT_SCALE,
-            camera.cy / PILOT_SCALE,
-            camera.c2w,
-        )
-        if self.scene.triangle_count == 0:
-            return np.zeros(0, np.int32), np.zeros(0, np.bool_)
-        pixels = np.arange(width * height, dtype=np.int32)
-        pilot = self.receiver(
-            light,
-            pixels,
-            np.zeros(len(pixels), np.int32),
-            PILOT_SAMPLES,
-            1,
+        assert self.scene.receiver.mesh is None
+        scene = self.scene
+        launch = ObjectLaunch(
+            drawn(self, light, seed, spp * rays),
+            scene.material_args,
+            scene.camera_args,
+            rays,
+            depth,
+            THROWN_LIMIT * indirect_limit,
             seed,
-            self.scene.camera_args_at(coarse),
-            indirect_limit=indirect_limit,
+            roughness,
+            behind,
         )
-        lost = pilot.unoccluded - (pilot.lit - pilot.thrown)
 
-        def pixels_of(change: FloatArray, unseen: float) -> BoolArray:
-            with np.errstate(divide="ignore", invalid="ignore"):
-                share = np.where(pilot.unoccluded > 0.0, np.abs(change) / pilot.unoccluded, 0.0)
-            share = share.max(axis=1).reshape(height, width)
-            blocks = _dilate(_mean_of_neighbours(share) > unseen)
-            full = blocks.repeat(PILOT_SCALE, axis=0).repeat(PILOT_SCALE, axis=1)
-            seen: BoolArray = full[: camera.height, : camera.width].reshape(-1)
-            return seen
+        def trace(start: int, stop: int) -> tuple[FloatArray, ...]:
+            part = slice(start, stop)
+            return launch.mirrored(self, pixels[part], may_see_object[part], spp)
 
-        gains = pixels_of(pilot.thrown, UNSEEN_GAIN)
-        shaded = np.flatnonzero(pixels_of(lost, UNSEEN_SHADOW) | gains).astype(np.int32)
-        return shaded, gains[shaded]
+        traced = self._in_chunks(trace, len(pixels), "mirror image")
+        image, hidden, kept = self.bad_pixels.blackened(
+            traced, pixels, scene.camera.width, "mirror image"
+        )
+        return image, hidden, kept
 
     def ratio(self, radiance: ReceiverRadiance) -> FloatArray:
         """Return the shadow ratio per channel, shape [receiver_pixel, 3]."""
@@ -433,19 +500,3 @@ def index_of(pixels: IntArray, count: int) -> IntArray:
     index = np.full(count, -1, np.int32)
     index[pixels] = np.arange(len(pixels), dtype=np.int32)
     return index
-
-
-def _mean_of_neighbours(values: FloatArray) -> FloatArray:
-    """Average each value with its eight neighbours."""
-    return np.asarray(sum(_neighbourhood(np.pad(values, 1, mode="edge"))) / 9.0, np.float32)
-
-
-def _dilate(mask: BoolArray) -> BoolArray:
-    """Grow a mask by one pixel in all eight directions."""
-    return np.asarray(np.any(_neighbourhood(np.pad(mask, 1)), axis=0))
-
-
-def _neighbourhood(padded: NDArray[Any]) -> list[NDArray[Any]]:
-    """Return the nine shifts of an array that is padded by one on all sides."""
-    rows, columns = padded.shape[0] - 2, padded.shape[1] - 2
-    return [padded[y : y + rows, x : x + columns] for y in range(3) for x in range(3)]

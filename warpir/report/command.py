@@ -28,14 +28,7 @@ from warpir.report.page import REPORT, Results, report_page
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Run the command line.
-
-    Args:
-        argv: Arguments without the program's name; ``sys.argv`` when absent.
-
-    Returns:
-        The exit status, as of `warpir.insert`.
-    """
+    """Run the command line, as `run_program`."""
     return run_program(_run, argv)
 
 

@@ -52,6 +52,7 @@ ABOUT_FILES = (
     ("envmap_web.hdr", "The light on the object as three.js reads it"),
     ("lobes.json", "The light's spherical Gaussians: --light reads them back"),
     ("lobes_shadow.json", "Those of the shadow's light"),
+    ("lamps.json", "The lamps near the object, with the powers found: --lamps reads them back"),
     ("curves.json", "Knots of the tone curves"),
     ("tone_curve_object.cube", "The object's tone curve as a table for Nuke, Resolve, OCIO"),
     ("tone_curve_shadow.cube", "The shadow's tone curves as a table"),
@@ -85,10 +86,6 @@ def without_folders(text: str, asked: Mapping[str, Any]) -> str:
 
     Folders of configured files are removed first, as these may be relative; then those of absolute
     paths. A JSON pointer of glTF, such as ``/materials/0``, stays.
-
-    Args:
-        text: The line.
-        asked: Settings of the run by their names; those that name files are looked at.
     """
     given = {path for name in PATHS if (path := asked.get(name)) is not None}
     if is_hub_id(asked.get("model")):
@@ -141,11 +138,7 @@ _POINTER = re.compile(
 
 
 def command_line(asked: Mapping[str, Any]) -> str:
-    """Return a command that makes the same result, files by their names alone.
-
-    Args:
-        asked: Settings of the run, from `InsertConfig.flat`.
-    """
+    """Return a command that makes the same result, files by their names alone."""
     words = ["python", "-m", "warpir.insert"]
     changed = config_of_picture(asked)
     for name in FORMS:
@@ -318,6 +311,7 @@ def figures(record: Mapping[str, Any]) -> Rows:
     rows: Rows = [("device", str(record["device"]))]
     integrators = [measured.get("loop_integrator"), measured["integrator"]]
     rows.append(("integrator", " and ".join(dict.fromkeys(i for i in integrators if i))))
+    rows.append(("rays", measured["rays"]))
     rows += [
         ("triangles", f"{measured['triangles']:,}"),
         ("pixels of the object, as rendered", f"{measured['object_pixels']:,}"),
@@ -326,6 +320,7 @@ def figures(record: Mapping[str, Any]) -> Rows:
         ("exposure of the light", f"{measured['exposure_ev']:+.2f} EV"),
         *([("noise taken out by", found)] if (found := measured.get("denoiser")) else []),
         *_look(measured.get("look", {})),
+        *_coat(measured.get("ground_coat", {})),
     ]
     for key, what in (
         ("values_clamped_to_half", "values clamped to half precision"),
@@ -372,6 +367,16 @@ def _look(look: Mapping[str, Any]) -> Rows:
     if jpeg := look.get("jpeg"):
         rows.append(("JPEG coding of the object, as of the photo", f"quality {jpeg['quality']}"))
     return rows
+
+
+def _coat(coat: Mapping[str, Any]) -> Rows:
+    """Return what the photo's mirror images say of the ground, if they were asked for."""
+    if not coat:
+        return []
+    text = coat["reason"]
+    if coat["roughness"] is not None:
+        text = f"{coat['roughness']:.2f} ± {coat['spread']:.2f}"
+    return [("roughness of the ground, from its mirror images", text)]
 
 
 def stage_words(stage: str) -> str:

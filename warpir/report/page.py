@@ -112,12 +112,7 @@ def write_report(output: OutputFolder, results: Results) -> None:
 
 
 def report_page(results: Results, is_beside: bool = True) -> bytes:
-    """Return the page, in UTF-8.
-
-    Args:
-        results: The run's.
-        is_beside: Whether the page lies beside the files, so that their names can be links.
-    """
+    """Return the page, in UTF-8."""
     record, config = results.record, config_of(results.record)
     asked = config.flat()
     photo = (

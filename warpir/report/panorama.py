@@ -56,13 +56,10 @@ def panorama(
 ) -> Panorama:
     """Return a light as a person at the camera would see it, turning all the way round.
 
-    Args:
-        name: Name of the panorama on the page.
-        identifier: Identifier of the panorama's element.
-        texels: Radiance in our orientation, relative [W/(m^2 sr)], shape [He, 2 He, 3].
-        camera: Content of ``camera.json``; the photo's frame is drawn where it is known.
-        character: Character of the light; the brightest direction of direct light is marked.
-        tone: The picture's operator, ``linear`` or ``reinhard``.
+    Texels are radiance in our orientation, relative [W/(m^2 sr)], shape [He, 2 He, 3], shown by
+    the operator ``linear`` or ``reinhard``; ``identifier`` is the element's. Of the content of
+    ``camera.json`` the photo's frame is drawn where it is known, of the light's character the
+    brightest direction of direct light.
     """
     pose = pose_of(camera)
     turned = rotate_map(resize_map(texels, HEIGHT), -bearing(np.array([0.0, 0.0, -1.0]), pose))

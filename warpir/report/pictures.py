@@ -18,7 +18,7 @@ import numpy as np
 from PIL import Image
 
 from warpir.core.arrays import BoolArray, CodeArray, FloatArray
-from warpir.core.color import linear_to_gamma, luminance
+from warpir.core.color import codes_of, linear_to_gamma, luminance
 from warpir.io.images.decoder import decode_image
 from warpir.io.layers import Layers
 
@@ -93,14 +93,7 @@ def shrink(plane: FloatArray, largest: int) -> FloatArray:
 
 def encoded(linear: FloatArray) -> CodeArray:
     """Return display codes of linear values."""
-    codes: CodeArray = np.round(255.0 * np.clip(linear_to_gamma(linear), 0.0, 1.0)).astype(np.uint8)
-    return codes
-
-
-def plain(values: FloatArray) -> CodeArray:
-    """Return codes of values in [0, 1] without display encoding."""
-    codes: CodeArray = np.round(255.0 * np.clip(values, 0.0, 1.0)).astype(np.uint8)
-    return codes
+    return codes_of(linear_to_gamma(linear))
 
 
 def thumbnail(path: Path, max_pixels: int) -> Shown:
@@ -205,19 +198,25 @@ def _opaque_layers(layers: Layers) -> Iterator[Layer]:
         return jpeg(encoded(shrink(plane, LAYER_LARGEST)))
 
     about = "The picture: fg + (1 − fg.A) × plate × shadow, pixel by pixel"
-    about += "." if layers.grain is None else ", plus grain."
+    others = [name for name in ("mirror", "grain") if getattr(layers, name) is not None]
+    about += f", plus {' and '.join(others)}." if others else "."
     yield Layer("composite", about, opaque(layers.composite), has_alpha=False)
     about = "What the photo is multiplied with: white where the object changes nothing."
     if (darkest := float(luminance(layers.shadow_ratio).min())) < 1.0:
         about += f" Its darkest pixel keeps {100.0 * max(darkest, 0.0):.0f} % of the light."
     yield Layer("shadow", about, opaque(layers.shadow_ratio), has_alpha=False)
     yield Layer("plate", "The photo, linearised.", opaque(layers.plate), has_alpha=False)
+    if layers.mirror is not None:
+        about = "What the object's mirror image adds to the ground, of either sign: grey is none."
+        grey = (0.5 + layers.mirror).astype(np.float32)
+        shown = jpeg(codes_of(shrink(grey, LAYER_LARGEST)))
+        yield Layer("mirror", about, shown, has_alpha=False)
     if layers.grain is not None:
         about = "The photo's grain on what has changed, of either sign: grey is none, tenfold."
         grey = (0.5 + 10.0 * layers.grain).astype(np.float32)
-        shown = jpeg(plain(shrink(grey, LAYER_LARGEST)))
+        shown = jpeg(codes_of(shrink(grey, LAYER_LARGEST)))
         yield Layer("grain", about, shown, has_alpha=False)
-    matte = jpeg(plain(shrink(layers.matte, LAYER_LARGEST)))
+    matte = jpeg(codes_of(shrink(layers.matte, LAYER_LARGEST)))
     about = "How much of each pixel the object covers: white is all."
     yield Layer("matte", about, matte, has_alpha=False)
 
@@ -265,17 +264,17 @@ def _surface_layers(layers: Layers) -> Iterator[Layer]:
         yield Layer("albedo", about, _with_alpha(encoded(mean(layers.albedo)), share))
     if layers.roughness is not None:
         about = "Perceptual roughness: black is a mirror, white is matt."
-        yield Layer("roughness", about, _with_alpha(plain(mean(layers.roughness)), share))
+        yield Layer("roughness", about, _with_alpha(codes_of(mean(layers.roughness)), share))
     if layers.normal is not None:
         about = "Unit normal of the surface in world axes: red +X, green +Y (up), blue +Z."
-        yield Layer("normal", about, _with_alpha(plain(0.5 + 0.5 * mean(layers.normal)), share))
+        yield Layer("normal", about, _with_alpha(codes_of(0.5 + 0.5 * mean(layers.normal)), share))
     if not is_shown.any():  # the surface is in the pixels alone that shrinking cuts off
         return
     depth = mean(np.where(is_surface, layers.depth, np.float32(0.0)))
     low, high = float(depth[is_shown].min()), float(depth[is_shown].max())
     about = f"Distance along the viewing axis: white is {low:.2f} m, black is {high:.2f} m."
     nearness = (high - depth) / max(high - low, 1e-6)
-    yield Layer("depth", about, _with_alpha(plain(nearness), share))
+    yield Layer("depth", about, _with_alpha(codes_of(nearness), share))
     if layers.position is not None:
         position = mean(layers.position)
         lows, highs = position[is_shown].min(axis=0), position[is_shown].max(axis=0)
@@ -283,10 +282,10 @@ def _surface_layers(layers: Layers) -> Iterator[Layer]:
         ranges = ", ".join(f"{axis} from {a:.2f} to {b:.2f} m" for axis, a, b in axes)
         about = f"Position of the surface in the world: {ranges}."
         scaled = (position - lows) / np.maximum(highs - lows, 1e-6)
-        yield Layer("position", about, _with_alpha(plain(scaled), share))
+        yield Layer("position", about, _with_alpha(codes_of(scaled), share))
 
 
 def _with_alpha(codes: CodeArray, alpha: FloatArray) -> Shown:
     """Encode codes, shape [H, W] or [H, W, 3], under an alpha in [0, 1], shape [H, W]."""
     rgb = np.repeat(codes[..., None], 3, axis=-1) if codes.ndim == 2 else codes
-    return webp(np.concatenate([rgb, plain(alpha)[..., None]], axis=-1))
+    return webp(np.concatenate([rgb, codes_of(alpha)[..., None]], axis=-1))

@@ -32,10 +32,15 @@ from warpir.render.renderer import Renderer
 from warpir.report.page import Results
 from warpir.report.viewer import VIEWER, viewer_page
 from warpir.scene.camera import Camera
-from warpir.scene.light import LightSummary, summarize
+from warpir.scene.light import Light, LightSummary, summarize
+from warpir.scene.near.lamps import records_of
 from warpir.scene.placement import box_corners
 from warpir.scene.tone_curves import ToneKnots
 
+NOT_HANDED_OVER = (
+    "the files for Blender, three.js and Mitsuba hold the light from afar alone, not the lamps "
+    "near the object (--usd has them)"
+)
 PREVIEW_SAMPLES = 16
 """Camera samples per pixel of the preview of an unguided run."""
 
@@ -72,6 +77,7 @@ def render_result(run: Run, light: SceneLight) -> RenderedResult:
     run.log.notice(*renderer.bad_pixels.notices())
     measured = {
         "triangles": renderer.scene.triangle_count,
+        "rays": renderer.scene.rays,
         "bad_pixels": renderer.bad_pixels.count,
         "memory_retries": run.memory.retries,
         "denoiser": denoiser_version() if quality.denoise == "auto" else None,
@@ -137,6 +143,7 @@ def _picture(
             quality.seed,
             quality.indirect_limit,
             is_denoised=quality.denoise == "auto" and denoiser_version() is not None,
+            ground_roughness=quality.coat_roughness,
         ),
         light.curves.foreground,
         light.curves.shadow_ratio,
@@ -144,7 +151,17 @@ def _picture(
         occluder=inputs.occluder,
         shadow_mask=inputs.shadow_mask,
         look=look,
+        behind=_mirrored_light(run, light),
     )
+
+
+def _mirrored_light(run: Run, light: SceneLight) -> Light | None:
+    """Return what a glossy ground showed before: the photo, where it knows; None: the light."""
+    if run.config.render.coat_roughness is None or light.detailed is not None:
+        return None
+    from warpir.lighting.detail import detail_of, with_detail
+
+    return with_detail(light.on_object, detail_of(run.inputs, light.curves))
 
 
 def _rendering_camera(camera: Camera, width: int | None) -> Camera:
@@ -196,10 +213,11 @@ def write_results(run: Run, light: SceneLight, picture: Picture) -> Written:
         InputError: The disk is full (exit 5).
     """
     inputs, output, photo = run.inputs, run.output, run.inputs.photo
+    asked = run.config.output
     codes = photo.encode(picture.image, picture.changed)
     # Many shadows are too faint for a code; a linear plate has no codes of the same kind.
     changed = picture.changed if photo.is_linear else (codes != photo.codes).any(axis=-1)
-    output.write_png("composite.png", codes, icc=photo.icc, mark=run.config.output.mark)
+    output.write_png("composite.png", codes, icc=photo.icc, mark=asked.mark)
     clamped = write_layers(
         output,
         picture.layers,
@@ -214,20 +232,24 @@ def write_results(run: Run, light: SceneLight, picture: Picture) -> Written:
     output.write_json("camera.json", inputs.camera.record())
     pair = _write_balls(run, light)
     handed: dict[str, Any] = {}
-    if run.config.output.hand_off:
+    if asked.hand_off:
         handed = _hand_off(run, light, maps, response)
         _write_viewer(run, light, maps, picture)
-    if run.config.output.usd:
+    if asked.usd:
         _write_usd(run, maps.name_on_object)
     summary = summarize(light.light)
     _say_what_is_seen(run, summary, picture)
+    if inputs.lamps and (asked.hand_off or asked.mitsuba):
+        run.log.notice(NOT_HANDED_OVER)
     measured = {
         **_measured(run, light, summary),
+        **({"lamps": records_of(inputs.lamps)} if inputs.lamps else {}),
         "object_pixels": picture.object_pixel_count,
         "shadow_pixels": picture.receiver_pixel_count,
         "changed_pixels": int(changed.sum()),
         "values_clamped_to_half": clamped,
         "look": picture.look.record(),
+        **_mirror(run, picture),
         **handed,
     }
     results = Results(
@@ -291,7 +313,8 @@ def _write_usd(run: Run, envmap: str) -> None:
     from warpir.io.usd import USDZ, write_usdz
 
     inputs, light = run.inputs, run.output.staging / envmap
-    package = write_usdz(inputs.asset, inputs.placement.asset_to_world, inputs.camera, light)
+    to_world = inputs.placement.asset_to_world
+    package = write_usdz(inputs.asset, to_world, inputs.camera, light, inputs.lamps)
     run.output.write_bytes(USDZ, package)
 
 
@@ -310,6 +333,19 @@ def _write_viewer(run: Run, light: SceneLight, maps: Maps, picture: Picture) -> 
         light.curves.tone,
     )
     output.write_bytes(VIEWER, page)
+
+
+def _mirror(run: Run, picture: Picture) -> dict[str, Any]:
+    """Return the entry of ``run.json`` about the ground's mirror image, if there is one."""
+    roughness, cut = run.config.render.coat_roughness, picture.mirror_cut_count
+    if roughness is None:
+        return {}
+    if cut:
+        run.log.notice(
+            f"in {cut} pixels the ground's mirror image hides more light than the photo can have "
+            "from there, and less is taken (--ground-roughness)"
+        )
+    return {"ground_mirror": {"roughness": roughness, "cut_pixels": cut}}
 
 
 def _say_what_is_seen(run: Run, summary: LightSummary, picture: Picture) -> None:

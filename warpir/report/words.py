@@ -127,12 +127,7 @@ def _brightest(
 def light_rows(
     character: LightCharacter, shadow: LightCharacter | None = None
 ) -> list[tuple[str, str]]:
-    """Describe a light as rows of a name and a text.
-
-    Args:
-        character: Character of the light.
-        shadow: Character of the light that casts the shadow, where it has one of its own.
-    """
+    """Describe a light as rows of a name and a text."""
     direct, sky = color_words(character.direct), color_words(character.sky)
     rows = [("direction", origin_words(character))]
     if character.direct_share >= EVEN:

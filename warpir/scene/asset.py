@@ -4,6 +4,7 @@ The readers of `warpir.io.assets` fill these records after checking the file; la
 those checks. Frame: the asset's own, right-handed, +Y up, front +Z, in metres.
 """
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
@@ -81,6 +82,24 @@ class Material:
     transmission: float = 0.0
     """Share of the light that is not reflected and passes a thin wall (KHR_materials_transmission)
     instead of reaching the diffuse base [1]."""
+    thickness: float = 0.0
+    """Above 0 the triangles bound a body of glass (KHR_materials_volume), whose true thickness
+    counts; 0: thin walls that do not bend light [m]."""
+    attenuation_distance: float = math.inf
+    """Way in that body after which `attenuation_color` is left of white light [m]."""
+    attenuation_color: tuple[float, float, float] = (1.0, 1.0, 1.0)
+    """Linear [1]."""
+    anisotropy: float = 0.0
+    """Strength by which the base's specular lobe is wider in one direction than its roughness says
+    (KHR_materials_anisotropy) [1]."""
+    anisotropy_rotation: float = 0.0
+    """Of that direction, from the tangent toward the bitangent [rad]."""
+    iridescence: float = 0.0
+    """Share of the base covered by a thin film (KHR_materials_iridescence) [1]."""
+    iridescence_ior: float = 1.3
+    """Index of refraction of the film."""
+    iridescence_thickness: tuple[float, float] = (100.0, 400.0)
+    """Thickness of the film where its texture is 0, and where it is 1 or absent [nm]."""
     base_color_texture: TextureSlot | None = None
     """Factor on `base_color` and `alpha`: sRGB-encoded RGB, linear alpha."""
     metallic_roughness_texture: TextureSlot | None = None
@@ -105,6 +124,17 @@ class Material:
     """Factor on `sheen_roughness` in its alpha."""
     transmission_texture: TextureSlot | None = None
     """Factor on `transmission` in its red channel."""
+    anisotropy_texture: TextureSlot | None = None
+    """That direction in tangent space before its rotation (R, G), factor on `anisotropy` (B)."""
+    iridescence_texture: TextureSlot | None = None
+    """Factor on `iridescence` in its red channel."""
+    iridescence_thickness_texture: TextureSlot | None = None
+    """Where between its bounds the thickness is, in its green channel."""
+
+    @property
+    def is_solid_glass(self) -> bool:
+        """Whether light enters a body of this material and is bent."""
+        return self.transmission > 0.0 and self.thickness > 0.0
 
     def texture_slots(self) -> list[TextureSlot]:
         """Return the slot of each texture, in the order of the fields."""

@@ -7,13 +7,14 @@ cloud need not be metres.
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 
 from warpir.core.arrays import BoolArray, Float64Array
 from warpir.core.errors import InputError
 from warpir.scene.camera import Camera
-from warpir.scene.placement import DEFAULT_STAND, Placement, box_corners, point_on_ground
+from warpir.scene.placement import DEFAULT_STAND, box_corners, point_on_ground
 
 Place = tuple[float, float, float]
 
@@ -45,10 +46,100 @@ class Cloud:
         return max(STEP * height, 4.0 * self.noise)
 
 
+@dataclass(frozen=True)
+class Stand:
+    """The bounding box of an object where it may stand, as the camera sees it."""
+
+    asset_to_world: Float64Array
+    """Shape [4, 4]."""
+    low: Float64Array
+    """Lowest corner of the asset's bounding box, asset frame [m], shape [3]."""
+    high: Float64Array
+    """Highest corner of it, shape [3]."""
+    camera: Camera
+
+    @cached_property
+    def _scale(self) -> float:
+        return float(np.linalg.norm(self.asset_to_world[:3, 0]))
+
+    @cached_property
+    def _height(self) -> float:
+        return self._scale * float(self.high[1] - self.low[1])
+
+    @cached_property
+    def longest(self) -> float:
+        """Longest side [m]."""
+        return self._scale * float((self.high - self.low).max())
+
+    @cached_property
+    def _corners(self) -> Float64Array:
+        return self._in_world(box_corners(self.low, self.high))
+
+    @cached_property
+    def _pixels(self) -> Float64Array:
+        return self.camera.project(self._corners)
+
+    def _in_world(self, points: Float64Array) -> Float64Array:
+        found: Float64Array = points @ self.asset_to_world[:3, :3].T + self.asset_to_world[:3, 3]
+        return found
+
+    def _away(self, point: Float64Array) -> float:
+        """Return how far a point of the asset is from the camera [m]."""
+        return float(np.linalg.norm(self._in_world(point) - self.camera.c2w[:3, 3]))
+
+    @property
+    def is_cut(self) -> bool:
+        """Whether the frame cuts the box, or the box reaches behind the camera."""
+        size = (self.camera.width, self.camera.height)
+        return not ((self._pixels >= 0.0) & (self._pixels <= size)).all()
+
+    @property
+    def is_well_seen(self) -> bool:
+        """Whether the frame holds the object whole, and it is neither close nor far away."""
+        sides = self._away(0.5 * (self.low + self.high)) / self.longest
+        return NEAR <= sides <= FAR and not self.is_cut
+
+    @property
+    def share_of_height(self) -> float:
+        """How large the object is seen, by its longest side over the photo's height [1]."""
+        (x, y, z), (u, _, w) = self.low, self.high
+        away = self._away(np.array([(x + u) / 2.0, y, (z + w) / 2.0]))
+        return float(self.longest / away * self.camera.fy / self.camera.height)
+
+    def points_in_way(self, cloud: Cloud) -> Float64Array:
+        """Return the points that stand where the object does, world frame [m], shape [point, 3]."""
+        is_raised = cloud.heights > cloud.least_height(self._height)
+        above = cloud.points[is_raised & (cloud.heights <= self._height)]
+        return above[self._over_footprint(above)]
+
+    def ground_points(self, cloud: Cloud) -> int:
+        """Return how many points of the ground lie under the object."""
+        ground = cloud.points[np.abs(cloud.heights) <= cloud.least_height(self._height)]
+        return int(self._over_footprint(ground).sum())
+
+    def hiding_points(self, cloud: Cloud) -> int:
+        """Return how many points are between the box and the camera."""
+        raised = cloud.points[cloud.heights > 4.0 * cloud.noise]
+        pixels, box = self.camera.project(raised), self._pixels
+        within = (pixels >= box.min(axis=0)) & (pixels <= box.max(axis=0))
+        nearer = self._depths(raised) < self._depths(self._corners).min()
+        return int((within.all(axis=1) & nearer).sum())
+
+    def _over_footprint(self, points: Float64Array) -> BoolArray:
+        """Return which points lie above or below the footprint and its margin, shape [point]."""
+        inverse = np.linalg.inv(self.asset_to_world)
+        local = points @ inverse[:3, :3].T + inverse[:3, 3]
+        margin = MARGIN * float((self.high - self.low).max())
+        inside = (local >= self.low - margin) & (local <= self.high + margin)
+        return np.asarray(inside[:, 0] & inside[:, 2])
+
+    def _depths(self, points: Float64Array) -> Float64Array:
+        depths: Float64Array = (self.camera.c2w[:3, 3] - points) @ self.camera.c2w[:3, 2]
+        return depths
+
+
 def find_place(
-    put: Callable[[Place], Placement],
-    low: Float64Array,
-    high: Float64Array,
+    put: Callable[[Place], Stand],
     camera: Camera,
     plane: Float64Array,
     cloud: Cloud | None = None,
@@ -62,8 +153,6 @@ def find_place(
 
     Args:
         put: Sets the object down at a place; refuses those that the camera cannot see.
-        low: Lowest corner of the asset's bounding box, asset frame [m], shape [3].
-        high: Highest corner of it, shape [3].
         camera: The camera.
         plane: The ground, unit normal on the camera's side, shape [4].
         cloud: The points, if there are any.
@@ -71,15 +160,14 @@ def find_place(
     Raises:
         InputError: Every place is occupied or hidden, or the photo shows no ground.
     """
-    candidates = _candidates(put, low, high, camera, plane)
+    candidates = _candidates(put, camera, plane)
     fallback: tuple[int, Place] | None = None
-    for _, place, matrix in candidates:
-        box = _Box(matrix, low, high, camera)
-        rank = 2 * box.is_cut
+    for _, place, stand in candidates:
+        rank = 2 * stand.is_cut
         if cloud is not None:
-            if len(points_in_way(matrix, low, high, cloud)) > STRAY or box.hidden(cloud) > STRAY:
+            if len(stand.points_in_way(cloud)) > STRAY or stand.hiding_points(cloud) > STRAY:
                 continue
-            rank += _ground_points(matrix, low, high, cloud) <= STRAY
+            rank += stand.ground_points(cloud) <= STRAY
         if rank == 0:
             return place
         if fallback is None or rank < fallback[0]:
@@ -100,125 +188,20 @@ def find_place(
 
 
 def _candidates(
-    put: Callable[[Place], Placement],
-    low: Float64Array,
-    high: Float64Array,
-    camera: Camera,
-    plane: Float64Array,
-) -> list[tuple[float, Place, Float64Array]]:
-    """Return (cost, place, pose) on a grid over the photo, cheapest first."""
-    found: list[tuple[float, Place, Float64Array]] = []
+    put: Callable[[Place], Stand], camera: Camera, plane: Float64Array
+) -> list[tuple[float, Place, Stand]]:
+    """Return (cost, place, stand) on a grid over the photo, cheapest first."""
+    found: list[tuple[float, Place, Stand]] = []
     for v in (np.arange(GRID[1]) + 0.5) / GRID[1]:
         for u in (np.arange(GRID[0]) + 0.5) / GRID[0]:
             try:
-                stand = point_on_ground((u * camera.width, v * camera.height), camera, plane)
-                place = (float(stand[0]), float(stand[1]), float(stand[2]))
-                matrix = put(place).asset_to_world
+                point = point_on_ground((u * camera.width, v * camera.height), camera, plane)
+                place = (float(point[0]), float(point[1]), float(point[2]))
+                stand = put(place)
             except InputError:
                 continue
-            sides = float(np.linalg.norm(stand - camera.c2w[:3, 3])) / _longest(matrix, low, high)
+            sides = float(np.linalg.norm(point - camera.c2w[:3, 3])) / stand.longest
             off = max(np.log(NEAR / sides), np.log(sides / FAR), 0.0)
             cost = float(np.hypot(u - DEFAULT_STAND[0], v - DEFAULT_STAND[1]) + off)
-            found.append((cost, place, matrix))
+            found.append((cost, place, stand))
     return sorted(found, key=lambda entry: entry[0])
-
-
-def is_well_seen(
-    matrix: Float64Array, low: Float64Array, high: Float64Array, camera: Camera
-) -> bool:
-    """Return whether the frame holds an object whole, and it is neither close nor far away.
-
-    Args:
-        matrix: Asset to world, shape [4, 4].
-        low: Lowest corner of the asset's bounding box, asset frame [m], shape [3].
-        high: Highest corner of it, shape [3].
-        camera: The camera.
-    """
-    middle = matrix[:3, :3] @ (0.5 * (low + high)) + matrix[:3, 3]
-    away = float(np.linalg.norm(middle - camera.c2w[:3, 3]))
-    sides = away / _longest(matrix, low, high)
-    return NEAR <= sides <= FAR and not _Box(matrix, low, high, camera).is_cut
-
-
-def share_of_height(
-    matrix: Float64Array, low: Float64Array, high: Float64Array, camera: Camera
-) -> float:
-    """Return how large an object is seen, by its longest side over the photo's height [1].
-
-    Args:
-        matrix: Asset to world, shape [4, 4].
-        low: Lowest corner of the asset's bounding box, asset frame [m], shape [3].
-        high: Highest corner of it, shape [3].
-        camera: The camera.
-    """
-    foot = np.array([(low[0] + high[0]) / 2.0, low[1], (low[2] + high[2]) / 2.0])
-    away = np.linalg.norm(matrix[:3, :3] @ foot + matrix[:3, 3] - camera.c2w[:3, 3])
-    return float(_longest(matrix, low, high) / away * camera.fy / camera.height)
-
-
-def points_in_way(
-    asset_to_world: Float64Array, low: Float64Array, high: Float64Array, cloud: Cloud
-) -> Float64Array:
-    """Return the points that stand where the object does, world frame [m], shape [point, 3]."""
-    height = _scale(asset_to_world) * float(high[1] - low[1])
-    is_raised = cloud.heights > cloud.least_height(height)
-    above = cloud.points[is_raised & (cloud.heights <= height)]
-    return above[_over_footprint(asset_to_world, low, high, above)]
-
-
-def _over_footprint(
-    asset_to_world: Float64Array, low: Float64Array, high: Float64Array, points: Float64Array
-) -> BoolArray:
-    """Return which points lie above or below the footprint and its margin, shape [point]."""
-    inverse = np.linalg.inv(asset_to_world)
-    local = points @ inverse[:3, :3].T + inverse[:3, 3]
-    margin = MARGIN * float((high - low).max())
-    inside = (local >= low - margin) & (local <= high + margin)
-    return np.asarray(inside[:, 0] & inside[:, 2])
-
-
-def _ground_points(
-    asset_to_world: Float64Array, low: Float64Array, high: Float64Array, cloud: Cloud
-) -> int:
-    """Return how many points of the ground lie under the object."""
-    height = _scale(asset_to_world) * float(high[1] - low[1])
-    ground = cloud.points[np.abs(cloud.heights) <= cloud.least_height(height)]
-    return int(_over_footprint(asset_to_world, low, high, ground).sum())
-
-
-class _Box:
-    """The object's bounding box as the camera sees it."""
-
-    def __init__(
-        self, asset_to_world: Float64Array, low: Float64Array, high: Float64Array, camera: Camera
-    ) -> None:
-        world = box_corners(low, high) @ asset_to_world[:3, :3].T + asset_to_world[:3, 3]
-        self.camera = camera
-        self.pixels = camera.project(world)
-        self.depth = float(_depths(world, camera).min())
-
-    @property
-    def is_cut(self) -> bool:
-        """Whether the frame cuts the box, or the box reaches behind the camera."""
-        size = (self.camera.width, self.camera.height)
-        return not ((self.pixels >= 0.0) & (self.pixels <= size)).all()
-
-    def hidden(self, cloud: Cloud) -> int:
-        """Return the number of points between the box and the camera."""
-        raised = cloud.points[cloud.heights > 4.0 * cloud.noise]
-        pixels = self.camera.project(raised)
-        within = (pixels >= self.pixels.min(axis=0)) & (pixels <= self.pixels.max(axis=0))
-        return int((within.all(axis=1) & (_depths(raised, self.camera) < self.depth)).sum())
-
-
-def _depths(points: Float64Array, camera: Camera) -> Float64Array:
-    depths: Float64Array = (camera.c2w[:3, 3] - points) @ camera.c2w[:3, 2]
-    return depths
-
-
-def _scale(asset_to_world: Float64Array) -> float:
-    return float(np.linalg.norm(asset_to_world[:3, 0]))
-
-
-def _longest(asset_to_world: Float64Array, low: Float64Array, high: Float64Array) -> float:
-    return _scale(asset_to_world) * float((high - low).max())

@@ -69,9 +69,7 @@ class GroundFit:
         }
 
 
-def fit_ground(
-    points: Float64Array, camera: Camera, *, has_up: bool = True, where: str = "--ground-points"
-) -> GroundFit:
+def fit_ground(points: Float64Array, camera: Camera, *, has_up: bool = True) -> GroundFit:
     """Fit a plane below the camera, about level, to the points that the camera sees.
 
     The same points give the same plane.
@@ -80,7 +78,6 @@ def fit_ground(
         points: World frame [m], shape [point, 3].
         camera: The camera.
         has_up: Whether +Y of the world is up; if not, the camera's up replaces it.
-        where: Location in errors.
 
     Raises:
         InputError: Too few points in view, or no plane that enough of them lie on.
@@ -89,7 +86,7 @@ def fit_ground(
     seen = points[in_view(points, camera)]
     if len(seen) < LEAST_INLIERS:
         raise InputError(
-            where,
+            "--ground-points",
             f"no ground (found {len(seen)} of {len(points)} points in view of the camera; expected "
             f"at least {LEAST_INLIERS})",
             "camera and points must be in one world: check --up, or give --ground",
@@ -101,7 +98,7 @@ def fit_ground(
     fit = _fit(seen, origin, up, limit, threshold)
     if fit is None:
         raise InputError(
-            where,
+            "--ground-points",
             f"no ground found (the {len(seen)} points in view hold no plane below the camera, "
             f"within {limit:.0f} degrees of level, with at least {100 * LEAST_SHARE:.0f} % of "
             "them)",

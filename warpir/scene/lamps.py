@@ -78,12 +78,7 @@ def lamps_of(texels: FloatArray, limit: int = LAMP_COUNT_MAX) -> MapLamps:
 
 
 def without_lamps(light: Light, share: float = 1.0) -> Light:
-    """Return the light with this share of its lamps taken away [1]; the same object without lamps.
-
-    Args:
-        light: Lobes, a map or both.
-        share: 0 leaves the light as it is, 1 leaves its surroundings alone.
-    """
+    """Return the light less a share [1] of its lamps; the same object where it has none."""
     lobes, texels = light.lobes, light.texels
     is_lamp = _lamp_lobes(light)
     if lobes is not None and is_lamp.any():
@@ -98,6 +93,17 @@ def without_lamps(light: Light, share: float = 1.0) -> Light:
             texels = (texels * kept[..., None]).astype(np.float32)
     if lobes is light.lobes and texels is light.texels:
         return light
+    return Light(lobes, texels)
+
+
+def lamps_alone(light: Light) -> Light:
+    """Return what `without_lamps` takes away."""
+    rest = without_lamps(light)
+    lobes, texels = light.lobes, light.texels
+    if lobes is not None and rest.lobes is not None:
+        lobes = replace(lobes, amplitude=lobes.amplitude - rest.lobes.amplitude)
+    if texels is not None and rest.texels is not None:
+        texels = np.maximum(texels - rest.texels, 0.0)
     return Light(lobes, texels)
 
 

@@ -159,12 +159,7 @@ def sun_lobe(
 
 
 def plain_sky(sky: tuple[float, float, float], ground: tuple[float, float, float]) -> FloatArray:
-    """Return a map of one colour above the horizon and another below, shape [64, 128, 3].
-
-    Args:
-        sky: Radiance of the upper hemisphere, linear RGB.
-        ground: Radiance of the lower hemisphere, linear RGB.
-    """
+    """Return a map of one colour above the horizon and another below, shape [64, 128, 3]."""
     texels = np.empty((64, 128, 3), np.float32)
     texels[:32] = sky
     texels[32:] = ground
@@ -193,15 +188,11 @@ def rasterize_lobes(lobes: Lobes, height: int, width: int, side: int = 6) -> Flo
     """Return the mean radiance of the lobes in each texel, shape [height, width, 3].
 
     For files and summaries; power within 1 %. A lobe whose standard deviation is below a quarter of
-    a texel is put into its texel with its flux.
-
-    Args:
-        lobes: The lobes.
-        height: Rows of the map.
-        width: Columns of the map.
-        side: Directions along a texel's side, even.
+    a texel is put into its texel with its flux. Along a texel's side lie ``side`` directions, an
+    even number.
     """
     texels = np.zeros((height, width, 3))
+    lobes = _some(lobes, lobes.amplitude.max(axis=1) > 0.0)
     # A lobe of two texels and more is as good with a ninth of the directions.
     broad = lobes.sharpness <= (height / (2.0 * np.pi)) ** 2
     if side > 2 and broad.any():

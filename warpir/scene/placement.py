@@ -164,13 +164,9 @@ def gap_below(
 ) -> float:
     """Return the least height of points above the receiver below them [m]; negative if below it.
 
-    What is higher than the highest point is no ground: an object may stand under a table.
-
-    Args:
-        points: Vertices of the object, world frame [m], shape [point, 3].
-        plane: Ground plane of `upright_plane`, shape [4].
-        mesh: Of the photo's place.
-        is_plane: Whether the plane is a receiver; with neither the gap is infinite.
+    What is higher than the highest point is no ground: an object may stand under a table. Points,
+    world frame [m], shape [point, 3], are vertices of the object, the plane is of `upright_plane`;
+    without plane and mesh the gap is infinite.
     """
     up = y_to(plane[:3])
     local = points @ up  # +Y is the ground's normal

@@ -147,6 +147,15 @@ class Curves:
             return shown / (1.0 - shown)
         return np.where(photo_lin > 1.0, photo_lin, shown)
 
+    def shown(self, radiance: Float64Array) -> Float64Array:
+        """Return the display-linear values that operator and curve show of radiance, any shape.
+
+        As `radiance` reads them: without an operator, values above 1 stay what they are.
+        """
+        if self.tone == "reinhard":
+            return self.foreground.evaluate(radiance / (1.0 + radiance))[..., 0]
+        return np.where(radiance > 1.0, radiance, self.foreground.evaluate(radiance)[..., 0])
+
     @staticmethod
     def identity(tone: str) -> Curves:
         """Return curves that change nothing."""

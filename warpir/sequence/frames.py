@@ -28,7 +28,12 @@ from warpir.app.record import file_hash
 from warpir.core.atomic import write_file
 from warpir.core.errors import ExitCode, InputError, disk_error, raise_all, shown
 from warpir.core.signals import whole
-from warpir.core.strict_json import parse_json_object, read_json_lines, read_json_object
+from warpir.core.strict_json import (
+    json_bytes,
+    parse_json_object,
+    read_json_lines,
+    read_json_object,
+)
 from warpir.lighting.scene_light import make_light
 from warpir.sequence.video import VIDEO, NoVideo, write_video
 
@@ -146,17 +151,9 @@ def write_summary(
 ) -> dict[str, Any]:
     """Write ``sequence.json`` and, beside it, the frames' video, unless that is there.
 
-    The summary holds every frame's folder, line, changes and the sha256 of its run. It tells of a
-    video before that gets its name, and an earlier one is gone by then: whenever the run is killed,
-    a video that is there is one that the summary knows.
-
-    Args:
-        config: Of the sequence.
-        frames: All of them, rendered.
-        say: Told why there is no video; one decides nothing.
-
-    Returns:
-        The summary's content.
+    The summary, which is returned, holds every frame's folder, line, changes and the sha256 of its
+    run. It tells of a video before that gets its name, and an earlier one is gone by then: whenever
+    the run is killed, a video that is there is one that the summary knows.
 
     Raises:
         InputError: The disk is full or the folder is not writable (exit 5).
@@ -177,7 +174,7 @@ def write_summary(
         with whole():
             if made.exists():
                 video.unlink(missing_ok=True)
-            write_file(path, (json.dumps(content, indent=2, allow_nan=False) + "\n").encode())
+            write_file(path, json_bytes(content))
             if made.exists():
                 os.replace(made, video)
     except OSError as error:
@@ -209,17 +206,7 @@ def is_whole(config: InsertConfig, frames: Sequence[Frame]) -> bool:
 def _make_video(
     config: InsertConfig, frames: Sequence[Frame], made: Path, say: Callable[[str], None]
 ) -> dict[str, Any]:
-    """Make the video where the one that is there is another one.
-
-    Args:
-        config: Of the sequence.
-        frames: All of them, rendered.
-        made: Where it is written.
-        say: Told why there is none.
-
-    Returns:
-        Its entry in the summary, by its name; empty where there is none.
-    """
+    """Make the video where another one, or none, is there; return its entry in the summary."""
     before, digest = _made_before(config), _video_digest(config)
     video = Path(str(config.output.out)) / VIDEO
     if digest is not None and before.get("sha256") == digest:

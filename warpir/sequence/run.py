@@ -34,10 +34,7 @@ def insert_frames(
 ) -> tuple[Path, tuple[str, ...], dict[str, Any]]:
     """Insert into every frame that is not done, then write summary, page and video.
 
-    Args:
-        config: Of the sequence.
-        insert_one: Inserts into one photograph.
-        renews: Whether a frame of other settings or other files is replaced.
+    With ``renews`` a frame of other settings or other files is replaced.
 
     Returns:
         The folder, the names of the composites, video and summary in it, and the summary.

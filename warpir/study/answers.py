@@ -53,11 +53,6 @@ class Sheet:
 def check_sheet(where: str | Path, record: Mapping[str, Any], plan: Plan) -> Sheet:
     """Check the content of a file of answers.
 
-    Args:
-        where: The file, named in errors.
-        record: Its content.
-        plan: The study it must belong to.
-
     Raises:
         InputError: It is of another study or rater, incomplete, or holds anything unexpected.
     """
@@ -105,11 +100,6 @@ def read_sheets(
     paths: Iterable[Path], plan: Plan, *, include_automated: bool = False
 ) -> list[Sheet]:
     """Read files of answers.
-
-    Args:
-        paths: The files.
-        plan: The study they must belong to.
-        include_automated: Take what a program answered, too.
 
     Raises:
         InputError: One is bad, automated, or of a rater whose answers another one holds; all that

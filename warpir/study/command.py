@@ -42,14 +42,7 @@ LARGEST = 10_000
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Run the command line.
-
-    Args:
-        argv: Arguments without the program's name; ``sys.argv`` when absent.
-
-    Returns:
-        The exit status, as of `warpir.insert`.
-    """
+    """Run the command line, as `run_program`."""
     return run_program(_run, argv)
 
 
@@ -306,10 +299,6 @@ def _without_answers(path: Path) -> InputError:
 
 def _require_targets(options: argparse.Namespace, inputs: Sequence[Path]) -> None:
     """Refuse to write over anything but earlier figures.
-
-    Args:
-        options: With the targets, the study, and the files and folders of answers.
-        inputs: The files of answers.
 
     Raises:
         InputError: A file exists, is an input, belongs to the study, or is to hold both the figures

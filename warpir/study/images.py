@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from warpir.core.arrays import PixelArray
+from warpir.core.color import codes_of
 from warpir.core.errors import InputError
 from warpir.core.limits import LIMITS
 from warpir.io.images.photos import read_photo
@@ -39,8 +40,7 @@ def read_image(path: Path, *, max_pixels: int = LIMITS.pixels, alpha: str = "ref
         raise InputError(
             path, f"scene-linear ({photo.kind}; expected a picture as it is displayed)"
         )
-    codes: PixelArray = np.round(255.0 * photo.srgb).astype(np.uint8)
-    return codes
+    return codes_of(photo.srgb)
 
 
 def require_same_size(first: Path, image: PixelArray, second: Path, other: PixelArray) -> None:

@@ -134,19 +134,32 @@ def _study(key: Mapping[str, Any], protocol: Mapping[str, Any]) -> Study:
         Rater(entry["token"], int(entry["run"]), tuple(Trial(**t) for t in entry["trials"]))
         for entry in key["raters"]
     )
-    for trial in (trial for rater in raters for trial in rater.trials):
-        if trial.kind not in ("pair", "repeat", "catch") or trial.a_side not in (1, 2):
-            raise ValueError(f"trial {trial.id}")
-        if (trial.kind == "catch") != pairs[trial.pair].is_catch:
-            raise ValueError(f"pair of trial {trial.id}")
+    runs = int(protocol["runs"])
+    if not 1 <= runs <= len(raters):  # each has raters of its own
+        raise ValueError(f"{runs} runs of {len(raters)} raters")
+    for rater in raters:
+        if not isinstance(rater.token, str) or not 1 <= rater.run <= runs:
+            raise ValueError(f"rater {rater.token}")
+        for trial in rater.trials:
+            _check_trial(trial, pairs)
     return Study(
         Plan(key["study"], int(key["seed"]), pairs, raters),
         str(key["method"]),
         int(protocol["raters"]),
-        int(protocol["runs"]),
+        runs,
         int(protocol["exclusion"]["most_catches_missed"]),
         str(protocol["title"]),
     )
+
+
+def _check_trial(trial: Trial, pairs: Sequence[Pair]) -> None:
+    """Check what a trial of the key holds; raises `ValueError`."""
+    if not isinstance(trial.id, str) or trial.kind not in ("pair", "repeat", "catch"):
+        raise ValueError(f"trial {trial.id}")
+    if trial.a_side not in (1, 2) or type(trial.pair) is not int:
+        raise ValueError(f"trial {trial.id}")
+    if not 0 <= trial.pair < len(pairs) or pairs[trial.pair].is_catch != (trial.kind == "catch"):
+        raise ValueError(f"pair of trial {trial.id}")
 
 
 def _json(content: Mapping[str, Any]) -> bytes:

@@ -29,14 +29,7 @@ class Images:
 
 
 def page(plan: Plan, rater: Rater, images: Sequence[Images], words: Words) -> bytes:
-    """Return the page of one rater.
-
-    Args:
-        plan: The study.
-        rater: Whose page it is.
-        images: Of each pair of the plan.
-        words: What is read on it.
-    """
+    """Return the page of one rater."""
     trials = []
     for trial in rater.trials:
         files = images[trial.pair]

@@ -9,7 +9,7 @@ import math
 import statistics
 from collections import Counter, defaultdict
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from typing import Any
 
 from warpir.study.answers import Answer, Sheet
@@ -48,12 +48,9 @@ class Proportion:
 
 
 def proportion(count: int, total: int, ties: int = 0) -> Proportion:
-    """Return a proportion with its intervals (`scipy.stats.binomtest`).
+    """Return the proportion of ``count`` with its intervals (`scipy.stats.binomtest`).
 
-    Args:
-        count: Of which it is the share.
-        total: Ties included.
-        ties: Neither counted nor not.
+    The total includes ties, which are neither counted nor not.
     """
     from scipy.stats import binomtest
 
@@ -102,12 +99,7 @@ def fleiss_kappa(counts: Sequence[Sequence[int]]) -> float | None:
 
 
 def score(study: Study, sheets: Sequence[Sheet]) -> dict[str, Any]:
-    """Return all figures of a study, as plain JSON.
-
-    Args:
-        study: The study.
-        sheets: What came back.
-    """
+    """Return all figures of a study, as plain JSON."""
     excluded = [s for s in sheets if s.catches_missed > study.most_catches_missed]
     kept = [s for s in sheets if s not in excluded]
     catches = sum(pair.is_catch for pair in study.plan.pairs)
@@ -236,15 +228,4 @@ def _spread(shares: Sequence[float]) -> dict[str, float | None]:
 
 
 def _plain(found: Proportion) -> dict[str, Any]:
-    def interval(ends: tuple[float, float] | None) -> list[float] | None:
-        return None if ends is None else list(ends)
-
-    return {
-        "share": found.share,
-        "count": found.count,
-        "total": found.total,
-        "ties": found.ties,
-        "clopper_pearson": interval(found.clopper_pearson),
-        "wilson": interval(found.wilson),
-        "p_value": found.p_value,
-    }
+    return {"share": found.share, **asdict(found)}

@@ -10,7 +10,7 @@ from torch import Tensor
 
 from warpir.core.color import GAMMA, LUMINANCE_WEIGHTS
 from warpir.train.batches import PhotoBatch
-from warpir.train.settings import TrainingSettings
+from warpir.train.stepping import TrainingSettings
 
 
 def mirror(batch: PhotoBatch, chosen: Tensor) -> PhotoBatch:
@@ -42,12 +42,8 @@ def stretch(batch: PhotoBatch, chosen: Tensor, generator: torch.Generator) -> Ph
     """Replace the chosen photos by a random part of them, brought to the full size.
 
     The rays come along, so the light stays what it is. It stands for other fields of view, other
-    shapes of photo and principal points off the centre.
-
-    Args:
-        batch: Photos and light.
-        chosen: Which, bool, shape [B].
-        generator: Of the photos' device.
+    shapes of photo and principal points off the centre. ``chosen`` is bool, shape [B], the
+    generator of the photos' device.
     """
     count, device = len(batch.photo), batch.photo.device
 
@@ -92,10 +88,8 @@ def discolour(batch: PhotoBatch, chosen: Tensor) -> PhotoBatch:
 def erase(photo: Tensor, share: float, generator: torch.Generator) -> Tensor:
     """Paint up to three random rectangles of each photo in one colour each (1708.04896).
 
-    Args:
-        photo: Display-encoded, shape [B, 3, H, W].
-        share: Chance of each rectangle.
-        generator: Of the photos' device.
+    The photo is display-encoded, shape [B, 3, H, W], ``share`` the chance of each rectangle, the
+    generator of the photos' device.
     """
     count, _, height, width = photo.shape
     device = photo.device
@@ -115,13 +109,7 @@ def erase(photo: Tensor, share: float, generator: torch.Generator) -> Tensor:
 def augment(
     batch: PhotoBatch, settings: TrainingSettings, generator: torch.Generator
 ) -> PhotoBatch:
-    """Vary a batch in ways that keep photo and light consistent.
-
-    Args:
-        batch: Photos and light.
-        settings: How often.
-        generator: Of the photos' device.
-    """
+    """Vary a batch in ways that keep photo and light consistent."""
     device = batch.photo.device
 
     def chosen(share: float) -> Tensor:

@@ -42,7 +42,7 @@ take longer to render than to learn from, and each is varied anew."""
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Run the command line; return the exit status."""
+    """Run the command line, as `run_program`."""
     return run_program(_run, argv)
 
 
@@ -143,9 +143,10 @@ def _train_camera(options: argparse.Namespace, panoramas: Sequence[Path]) -> dic
     from warpir.calibration.network import load_calibrator, random_calibrator
     from warpir.lighting.regressor import load_regressor
     from warpir.train.camera.crops import read_panoramas
-    from warpir.train.camera.loop import CameraSettings, begin_with_trunk, train_camera
+    from warpir.train.camera.loop import begin_with_trunk, train_camera
     from warpir.train.lights import SKY_ONLY
     from warpir.train.places import of_fold
+    from warpir.train.stepping import CameraSettings
 
     device = torch.device(options.device or ("cuda" if torch.cuda.is_available() else "cpu"))
     # What shows no ground shows no camera.
@@ -267,13 +268,7 @@ def _counted(
 
 
 class Replay:
-    """Batches of photos drawn at random from the newest that were rendered.
-
-    Args:
-        batches: Renders new ones.
-        uses: Of each photo, on average.
-        kept: Batches to draw from.
-    """
+    """Batches of photos drawn from the newest ``kept`` ones; each is used so often on average."""
 
     def __init__(
         self, batches: Callable[[int, torch.Generator], PhotoBatch], uses: int, kept: int
@@ -312,7 +307,7 @@ def _train_on(
     from warpir.lighting.regressor import load_regressor
     from warpir.train.regressor import PANORAMAS, train_regressor
     from warpir.train.scenes.generator import Mixture, SceneGenerator
-    from warpir.train.settings import TrainingSettings
+    from warpir.train.stepping import TrainingSettings
 
     learned, unseen = pools
     scenes = SceneGenerator(learned, seed)

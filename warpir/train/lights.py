@@ -146,10 +146,6 @@ class LightPool:
 def load_panoramas(paths: list[Path], device: torch.device | str) -> LightPool:
     """Read panoramas; each is scaled to mean luminance 1, which changes nothing in a photograph.
 
-    Args:
-        paths: Files; sky-only ones are put last.
-        device: Of the tensors.
-
     Raises:
         InputError: A file cannot be used.
     """
@@ -187,13 +183,7 @@ def load_panoramas(paths: list[Path], device: torch.device | str) -> LightPool:
 
 
 def make_lights(count: int, generator: torch.Generator, device: torch.device | str) -> LightPool:
-    """Draw lights: CIE skies with a sun over a ground, and rooms with lamps and windows.
-
-    Args:
-        count: How many.
-        generator: Of this device.
-        device: Of the tensors.
-    """
+    """Draw lights: CIE skies with a sun over a ground, and rooms with lamps and windows."""
     draw = Sampler(count, generator)
     directions = tensors.map_directions(HEIGHT, 2 * HEIGHT, torch.device(device))
     omega = tensors.solid_angles(directions)

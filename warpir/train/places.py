@@ -15,9 +15,6 @@ def place_of(name: str) -> str:
     """Return what panoramas of one place share: the first word of their names.
 
     Unlike places may share one; then they are held out together, which does no harm.
-
-    Args:
-        name: Of the file, without its ending.
     """
     word = name.lower().partition("_")[0]
     return next((group[0] for group in SAME_SKY if word in group), word)
@@ -48,13 +45,7 @@ def of_fold(
 
 
 def some_places(names: Sequence[str], count: int | None, known: Collection[str]) -> set[str]:
-    """Return about that many panoramas, whole places each, the known ones first.
-
-    Args:
-        names: To choose from.
-        count: How many, or None for all.
-        known: As of `of_fold`.
-    """
+    """Return about that many panoramas, whole places each, the known ones of `of_fold` first."""
     if count is None:
         return set(names)
     fresh = set(_shuffled(names, known))

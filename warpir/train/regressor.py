@@ -34,7 +34,7 @@ from warpir.lighting.regressor import (
 from warpir.train.augmentation import augment
 from warpir.train.batches import PhotoBatch
 from warpir.train.light_loss import TERM_WEIGHTS, LightLoss, MeanLight
-from warpir.train.settings import TrainingSettings
+from warpir.train.stepping import TrainingSettings, follow, left_to_fall, make_optimizer, warmed_up
 from warpir.train.validation import calibrate, measure, score
 from warpir.train.worker import Worker
 
@@ -148,9 +148,8 @@ def join_members(paths: Sequence[Path], out: Path) -> Regressor:
 
 def _rate(settings: TrainingSettings, progress: float, steps: int) -> float:
     """Return the learning rate: warm-up by steps of this call, then constant, then linear down."""
-    left = min((1.0 - progress) / (1.0 - settings.constant_share), 1.0)
-    share = settings.final_rate + (1.0 - settings.final_rate) * left
-    return settings.learning_rate * share * min((steps + 1) / settings.warmup_steps, 1.0)
+    left = left_to_fall(settings, progress)
+    return warmed_up(settings, settings.final_rate + (1.0 - settings.final_rate) * left, steps)
 
 
 def checkpoints_of(out: Path) -> Checkpoints:
@@ -169,18 +168,7 @@ class _Run:
         self.average = copy.deepcopy(network).eval().requires_grad_(False)
         self.loss = LightLoss(self.network, settings.label_sigma_deg)
         self.mean = MeanLight(self.loss)
-        # Norms, biases and tokens are not pulled toward 0.
-        named = list(network.named_parameters())
-        is_plain = [p.dim() < 2 or name.endswith("asking") for name, p in named]
-        pulled = [p for (_, p), plain in zip(named, is_plain, strict=True) if not plain]
-        plain = [p for (_, p), plain in zip(named, is_plain, strict=True) if plain]
-        self.optimizer = torch.optim.AdamW(
-            [
-                {"params": pulled, "weight_decay": settings.weight_decay},
-                {"params": plain, "weight_decay": 0.0},
-            ],
-            betas=(0.9, 0.99),
-        )
+        self.optimizer = make_optimizer(network, settings)
         self.settings, self.device = settings, torch.device(device)
         self.checkpoints = checkpoints_of(out)
         self.step, self.minutes, self.best = 0, 0.0, math.inf
@@ -301,18 +289,12 @@ class _Run:
             torch.nn.utils.clip_grad_norm_(self.network.parameters(), self.settings.clip)
             self.optimizer.step()
             self.step += 1
-            self.follow(self.settings.average)
+            follow(self.average, self.network, self.step, self.settings.average)
             for name, term in terms.items():
                 kept = self.losses.get(name, term.detach())
                 self.losses[name] = 0.98 * kept + 0.02 * term.detach()
 
         return step
-
-    def follow(self, decay: float) -> None:
-        """Move the average toward the weights; at first it follows closely."""
-        share = 1.0 - min(decay, (1.0 + self.step) / (10.0 + self.step))
-        average = [p.detach() for p in self.average.parameters()]
-        torch._foreach_lerp_(average, [p.detach() for p in self.network.parameters()], share)
 
     def validate(self, validation: Mapping[str, Sequence[PhotoBatch]]) -> None:
         """Measure the average, write a line of the curve, and keep it if it is the best so far."""

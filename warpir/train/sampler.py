@@ -9,12 +9,7 @@ from torch import Tensor
 
 
 class Sampler:
-    """Draws for the rows of a batch.
-
-    Args:
-        count: Rows.
-        generator: On whose device the tensors are.
-    """
+    """Draws for the rows of a batch."""
 
     def __init__(self, count: int, generator: torch.Generator) -> None:
         self.count, self.generator, self.device = count, generator, generator.device

@@ -45,11 +45,6 @@ def measure(network: Regressor, loss: LightLoss, batches: Sequence[PhotoBatch]) 
     """Return how well a network reads one validation set.
 
     Angles, their likelihood and coverage are over sunny photos with a cue.
-
-    Args:
-        network: In evaluation mode.
-        loss: Of that network.
-        batches: The set.
     """
     return _measure(_answers(network, loss, batches), loss)
 
@@ -150,11 +145,6 @@ def calibrate(
 
     A variance is scaled so that one standard deviation covers 68 %, by its head's bias; the sets'
     factors are averaged as logs.
-
-    Args:
-        network: In evaluation mode; changed in place.
-        loss: Of that network.
-        validation: Sets by name.
     """
     network.temperature.fill_(1.0)
     sets = [_answers(network, loss, batches) for batches in validation.values()]

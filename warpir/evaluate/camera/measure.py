@@ -77,11 +77,8 @@ def photograph(
 ) -> FloatArray:
     """Return one photograph as a camera would store it, display-encoded, shape [H, W, 3].
 
-    Args:
-        panorama: One, on the CPU.
-        cameras: One camera; its aspect is that of whole multiples of `SIDE`.
-        width: Longer side [px].
-        generator: On the CPU: of azimuth, look and faults.
+    There is one panorama, on the CPU like the generator, which draws azimuth, look and faults, and
+    one camera, whose aspect is that of whole multiples of `SIDE`; ``width`` is the longer side.
     """
     draw = Sampler(1, generator)
     size = _size(float(cameras.aspect[0]), width)

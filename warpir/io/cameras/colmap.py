@@ -21,7 +21,7 @@ from warpir.io.cameras.colmap_model import (
     read_cameras,
     read_images,
 )
-from warpir.io.cameras.source import CAMERA, StoredCamera, choose_frame
+from warpir.io.cameras.source import CAMERA, SHORTEST, StoredCamera, choose_frame
 from warpir.io.gltf.nodes import from_trs
 from warpir.scene.camera import Camera
 from warpir.scene.lens import Lens
@@ -34,13 +34,9 @@ UNIT_TOLERANCE = 1e-3
 def read_colmap(
     path: Path, frame: str | None, photo: str | None, limits: Limits = LIMITS
 ) -> StoredCamera:
-    """Read the camera of one image of a model.
+    """Read the camera of one image of a model, given its folder or one of its files.
 
-    Args:
-        path: The model's folder, or one of its files.
-        frame: The image's name; default: the photo's, or the only one.
-        photo: File name of the photograph.
-        limits: How large the files may be.
+    ``frame`` is the image's name; default: the photo's, or the only one.
 
     Raises:
         InputError: Damaged, of a camera model that is not understood, or without that image.
@@ -73,7 +69,7 @@ def _pinhole(
     focal_count = 2 if model in ("PINHOLE", "OPENCV") else 1
     fx, fy = numbers[0], numbers[focal_count - 1]
     cx, cy, *bends = numbers[focal_count:]
-    if not (fx > 0.0 and fy > 0.0):
+    if not min(fx, fy) >= SHORTEST:
         raise CAMERA.error(path, "focal_length", pointer=f"camera {camera_id}", found=min(fx, fy))
     k1, k2, p1, p2 = (*bends, 0.0, 0.0, 0.0, 0.0)[:4]
     size = (intrinsics.width, intrinsics.height)

@@ -92,10 +92,8 @@ def is_model(path: Path) -> bool:
 def model_files(path: Path, *stems: str, limits: Limits = LIMITS) -> list[Path]:
     """Return the files of a model, binary ones first, as COLMAP looks for them.
 
-    Args:
-        path: The model's folder, or one of its files, whose kind is then taken.
-        stems: ``cameras``, ``images`` or ``points3D``.
-        limits: How large each may be.
+    The path is the model's folder, or one of its files, whose kind is then taken; stems are
+    ``cameras``, ``images`` or ``points3D``.
 
     Raises:
         InputError: A file is missing or too large.
@@ -133,10 +131,6 @@ def read_images(path: Path) -> list[Image]:
 
 def read_points(path: Path, limits: Limits = LIMITS) -> Float64Array:
     """Read the points of a model, world of the file, shape [point, 3].
-
-    Args:
-        path: The model's folder, or one of its files.
-        limits: How many they may be, and how large their file.
 
     Raises:
         InputError: Missing, damaged or too large.

@@ -36,12 +36,8 @@ def read_nerfstudio(
 ) -> StoredCamera:
     """Read the camera of one frame; what the frame says goes before what the file says.
 
-    Args:
-        path: The file.
-        content: Its JSON.
-        photo_size: Width and height of the photograph [px], for files that give only an angle.
-        frame: Name of the frame's picture; default: the photo's, or the only one.
-        photo: File name of the photograph.
+    ``frame`` is the name of the frame's picture; default: the photo's, or the only one. Files that
+    give only an angle need the photo's width and height [px].
 
     Raises:
         InputError: Damaged, fisheye, or without that frame.

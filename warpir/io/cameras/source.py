@@ -16,6 +16,8 @@ RIGID_TOLERANCE = 1e-4
 """How far R^T R may be from the identity; smaller errors are removed."""
 LARGEST = 1e15
 """Largest number of a camera: of a matrix, an offset, a focal length."""
+SHORTEST = 1e-6
+"""Shortest focal length [px]: one pixel sees 179.9999 degrees, and squares of rays are finite."""
 NAMES_SHOWN = 8
 CAMERA = Faults(
     "camera",
@@ -113,12 +115,7 @@ def choose_frame(
 ) -> int:
     """Return which of a file's images is meant: by ``--frame``, else by the photo's file name.
 
-    Args:
-        path: The camera file, for the error.
-        names: Names of its images; folders and suffixes in them may be left out.
-        frame: What the user names.
-        photo: File name of the photograph.
-        noun: What a name stands for.
+    Folders and suffixes may be left out of the names. A name stands for a ``noun``.
 
     Raises:
         InputError: None or several fit; lists the first names.
@@ -225,8 +222,9 @@ def number(path: Path, content: Any, key: str) -> float:
 def focal_length(path: Path, content: Any, key: str) -> float:
     """Return a focal length of an object [px], or refuse the file."""
     value = number(path, content, key)
-    if value <= 0.0:
-        raise CAMERA.error(path, "focal_length", pointer=f"/{key}", found=value, expected="> 0")
+    if value < SHORTEST:
+        expected = f"at least {SHORTEST:g} px"
+        raise CAMERA.error(path, "focal_length", pointer=f"/{key}", found=value, expected=expected)
     return value
 
 

@@ -11,7 +11,15 @@ from typing import Any
 import numpy as np
 
 from warpir.core.strict_json import read_numbers
-from warpir.io.cameras.source import CAMERA, StoredCamera, choose_frame, count, member, rigid
+from warpir.io.cameras.source import (
+    CAMERA,
+    SHORTEST,
+    StoredCamera,
+    choose_frame,
+    count,
+    member,
+    rigid,
+)
 from warpir.scene.camera import Camera
 from warpir.scene.lens import Lens
 
@@ -24,10 +32,8 @@ NAMES = ("UNKNOWN", "FRONT", "FRONT_LEFT", "FRONT_RIGHT", "SIDE_LEFT", "SIDE_RIG
 def read_waymo(path: Path, content: dict[str, Any], frame: str | None) -> StoredCamera:
     """Read one calibration, by itself or out of ``camera_calibrations``.
 
-    Args:
-        path: The file.
-        content: Its JSON, names as in the proto or in protobuf's JSON form (camelCase).
-        frame: Name of the camera, such as FRONT; default: the only one.
+    The content is JSON, names as in the proto or in protobuf's JSON form (camelCase); ``frame`` is
+    the name of the camera, such as FRONT; default: the only one.
 
     Raises:
         InputError: Damaged, or without that camera.
@@ -40,7 +46,7 @@ def read_waymo(path: Path, content: dict[str, Any], frame: str | None) -> Stored
     entry = listed[choose_frame(path, names, frame, None, noun="camera")]
     numbers = read_numbers(path, "/intrinsic", entry.get("intrinsic"), 9)
     fx, fy, cx, cy, k1, k2, p1, p2, k3 = numbers
-    if not (fx > 0.0 and fy > 0.0):
+    if not min(fx, fy) >= SHORTEST:
         raise CAMERA.error(path, "focal_length", pointer="/intrinsic", found=min(fx, fy))
     transform = member(path, entry, "extrinsic").get("transform")
     flat = read_numbers(path, "/extrinsic/transform", transform, 16)

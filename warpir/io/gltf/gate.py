@@ -69,13 +69,7 @@ GLTF = Faults(
 
 
 class Entry:
-    """One JSON value of the file together with the pointer that names it.
-
-    Args:
-        path: The file.
-        pointer: JSON pointer, empty at the root.
-        value: What `json` made of it.
-    """
+    """One JSON value of the file together with the pointer that names it."""
 
     def __init__(self, path: Path, pointer: str, value: Any) -> None:
         self.path = path
@@ -163,11 +157,7 @@ class Entry:
     def item(self, key: str, index: int, user: "Entry", what: str) -> "Entry":
         """Return object ``index`` of list ``key``.
 
-        Args:
-            key: Name of the list.
-            index: Which one.
-            user: The entry that asked; it is blamed when the index is out of range.
-            what: The member of ``user`` that holds the index.
+        Where the index, member ``what`` of ``user``, is out of range, that entry is blamed.
         """
         count = self.size(key)
         if not 0 <= index < count:
@@ -298,12 +288,6 @@ class GltfFile:
 
     def accessor(self, index: int, user: Entry, what: str, types: tuple[str, ...]) -> NDArray[Any]:
         """Return the elements of accessor ``index`` as the file stores them.
-
-        Args:
-            index: Which accessor.
-            user: The primitive that refers to it.
-            what: The attribute, for errors.
-            types: Accessor types that are allowed here.
 
         Returns:
             A read-only view of the file, shape [count, width], or a copy where elements are

@@ -6,6 +6,7 @@ numbers. Occlusion maps are not read, since a path tracer makes its own.
 
 import math
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 
@@ -20,23 +21,23 @@ from warpir.scene.asset import Material, Texture, TextureSlot
 HONOURED = {
     "EXT_mesh_gpu_instancing",
     "EXT_texture_webp",
+    "KHR_materials_anisotropy",
     "KHR_materials_clearcoat",
     "KHR_materials_emissive_strength",
     "KHR_materials_ior",
+    "KHR_materials_iridescence",
     "KHR_materials_pbrSpecularGlossiness",
     "KHR_materials_sheen",
     "KHR_materials_specular",
     "KHR_materials_transmission",
     "KHR_materials_unlit",
+    "KHR_materials_volume",
     "KHR_mesh_quantization",
     "KHR_node_visibility",
     "KHR_texture_transform",
 }
 """Extensions whose meaning reaches the picture."""
-BASE_MATERIAL = {
-    f"KHR_materials_{name}"
-    for name in ("anisotropy", "diffuse_transmission", "dispersion", "iridescence", "volume")
-}
+BASE_MATERIAL = {f"KHR_materials_{name}" for name in ("diffuse_transmission", "dispersion")}
 """Extensions that refine a material; the material below them is used, with a notice."""
 LEFT_OUT = {
     "KHR_animation_pointer": "animations are not played",
@@ -55,6 +56,8 @@ ADVICE = {
 
 SPECULAR_LIMIT = 1e6
 """Largest factor on the reflectance at normal incidence, which is cut at 1 [1]."""
+FILM_LIMIT = 1e5
+"""Greatest thickness of a film [nm] and of its index; interference is gone long before."""
 WRAPS = {10497: "repeat", 33071: "clamp", 33648: "mirror"}
 NEAREST = (9728, 9984, 9986)
 
@@ -191,6 +194,7 @@ class MaterialReader:
             else:
                 material = self._add_reflection(material, entry)
             material = self._add_layers(material, entry)
+            material = self._add_film(material, entry)
             material = self._add_transmission(material, entry)
         left_out = [name for name in entry.child("extensions").value if name not in HONOURED]
         if left_out:
@@ -253,7 +257,7 @@ class MaterialReader:
         )
 
     def _add_layers(self, material: Material, entry: Entry) -> Material:
-        """Read KHR_materials_clearcoat and KHR_materials_sheen; textures of absent layers are not.
+        """Read KHR_materials_clearcoat, _sheen and _anisotropy; textures of absent ones are not.
 
         A normal map keeps its own scale.
         """
@@ -279,14 +283,54 @@ class MaterialReader:
                 sheen_color_texture=self._slot(sheen, "sheenColorTexture"),
                 sheen_roughness_texture=self._slot(sheen, "sheenRoughnessTexture"),
             )
+        stretched = entry.child("extensions").child("KHR_materials_anisotropy")
+        anisotropy = self._factor(stretched, "anisotropyStrength", 0.0)
+        if anisotropy > 0.0:
+            material = replace(
+                material,
+                anisotropy=anisotropy,
+                anisotropy_rotation=stretched.number("anisotropyRotation", 0.0),
+                anisotropy_texture=self._slot(stretched, "anisotropyTexture"),
+            )
         return material
 
+    def _add_film(self, material: Material, entry: Entry) -> Material:
+        """Read KHR_materials_iridescence."""
+        film = entry.child("extensions").child("KHR_materials_iridescence")
+        iridescence = self._factor(film, "iridescenceFactor", 0.0)
+        if iridescence == 0.0:
+            return material
+        low = self._within(film, "iridescenceThicknessMinimum", 100.0, 0.0, FILM_LIMIT)
+        high = self._within(film, "iridescenceThicknessMaximum", 400.0, 0.0, FILM_LIMIT)
+        return replace(
+            material,
+            iridescence=iridescence,
+            iridescence_ior=self._within(film, "iridescenceIor", 1.3, 1.0, FILM_LIMIT),
+            iridescence_thickness=(low, high),
+            iridescence_texture=self._slot(film, "iridescenceTexture"),
+            iridescence_thickness_texture=self._slot(film, "iridescenceThicknessTexture"),
+        )
+
     def _add_transmission(self, material: Material, entry: Entry) -> Material:
-        """Read KHR_materials_transmission; say what the glass will not do."""
+        """Read KHR_materials_transmission and _volume; say what thin glass will not do."""
         glass = entry.child("extensions").child("KHR_materials_transmission")
         transmission = self._factor(glass, "transmissionFactor", 0.0)
+        volume = self._volume(entry)
         if transmission == 0.0:
+            if volume:
+                self.notices.append(
+                    f"material {material.name!r}: KHR_materials_volume without transmission, "
+                    "its base material is used"
+                )
             return material
+        glassy = replace(
+            material,
+            transmission=transmission,
+            transmission_texture=self._slot(glass, "transmissionTexture"),
+            **volume,
+        )
+        if glassy.is_solid_glass:
+            return glassy
         missing = []
         slot = material.base_color_texture
         if slot is not None and slot.texture not in self._is_colored:
@@ -300,17 +344,50 @@ class MaterialReader:
             self.notices.append(
                 f"material {material.name!r}: light that passes it is not {' or '.join(missing)}"
             )
-        return replace(
-            material,
-            transmission=transmission,
-            transmission_texture=self._slot(glass, "transmissionTexture"),
-        )
+        return glassy
+
+    def _volume(self, entry: Entry) -> dict[str, Any]:
+        """Read KHR_materials_volume; how thick the body is, its triangles say.
+
+        Raises:
+            InputError: Something is to be absorbed on a way that has no length.
+        """
+        volume = entry.extension("KHR_materials_volume")
+        if volume is None:
+            return {}
+        thickness = volume.number("thicknessFactor", 0.0)
+        distance = math.inf
+        if "attenuationDistance" in volume:
+            distance = volume.number("attenuationDistance", math.inf)
+        color = self._factors(volume, "attenuationColor", (1.0,) * 3, 0.0, 1.0)
+        for name, value, is_right in (
+            ("thicknessFactor", thickness, thickness >= 0.0),
+            ("attenuationDistance", distance, distance > 0.0),
+        ):
+            if not is_right:
+                raise volume.error("range", what=name, found=value, expected="above 0")
+        if thickness == 0.0 and distance < math.inf and min(color) < 1.0:
+            raise volume.error(
+                "range",
+                what="thicknessFactor of glass that absorbs",
+                found=thickness,
+                expected="above 0",
+                advice="set a thickness above 0, or remove attenuationDistance",
+            )
+        return {
+            "thickness": thickness,
+            "attenuation_distance": distance,
+            "attenuation_color": color,
+        }
 
     def _factor(self, entry: Entry, key: str, default: float) -> float:
+        return self._within(entry, key, default, 0.0, 1.0)
+
+    def _within(self, entry: Entry, key: str, default: float, low: float, high: float) -> float:
         value = entry.number(key, default)
-        if not 0.0 <= value <= 1.0:
-            self.notices.append(f"{entry.pointer}: {key} {value:g} clamped to 0 ... 1")
-        return min(max(value, 0.0), 1.0)
+        if not low <= value <= high:
+            self.notices.append(f"{entry.pointer}: {key} {value:g} clamped to {low:g} ... {high:g}")
+        return min(max(value, low), high)
 
     def _factors(
         self, entry: Entry, key: str, default: tuple[float, ...], low: float, high: float

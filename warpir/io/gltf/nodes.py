@@ -140,13 +140,7 @@ def read_instances(file: GltfFile, node: Entry, world: Float64Array) -> list[Flo
 
 
 class Skins:
-    """The joints of a file's skins, each read once.
-
-    Args:
-        file: The file.
-        nodes: All nodes.
-        parents: The parent of each node that has one.
-    """
+    """The joints of a file's skins, each read once."""
 
     def __init__(self, file: GltfFile, nodes: list[Entry], parents: dict[int, int]) -> None:
         self._file = file

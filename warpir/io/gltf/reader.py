@@ -7,7 +7,7 @@ Skinned meshes stand as their joints do in the file; lights, cameras, morph targ
 are not read.
 """
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -34,7 +34,7 @@ from warpir.io.meshes.triangles import (
     unit,
     unit_normals,
 )
-from warpir.scene.asset import Asset, Primitive
+from warpir.scene.asset import Asset, Material, Primitive
 
 POINTS_OR_LINES = (0, 1, 2, 3)
 STRIP, FAN = 5, 6
@@ -80,6 +80,8 @@ def read_gltf(path: str | Path, missing_textures: str = "error", limits: Limits 
             geometry = pose(file, entry, geometry, joints)
         if geometry is not None:
             primitives.append(place(geometry, world, material_of[key]))
+    notices += glass_notices(primitives, materials.materials)
+    notices += direction_notices(primitives, materials.materials)
     check_drawable(path, primitives, f"{len(placed)} placed primitives, none with triangles")
     return Asset(
         name=path.stem,
@@ -91,14 +93,45 @@ def read_gltf(path: str | Path, missing_textures: str = "error", limits: Limits 
     )
 
 
+def direction_notices(primitives: Sequence[Primitive], materials: Sequence[Material]) -> list[str]:
+    """Return which anisotropic materials are used where nothing gives a direction."""
+    vague = {p.material for p in primitives if p.tangents is p.uv0 is p.uv1 is None}
+    return [
+        f"material {m.name!r}: no TANGENT or TEXCOORD_0, without a direction it is not anisotropic"
+        for k, m in enumerate(materials)
+        if m.anisotropy > 0.0 and k in vague
+    ]
+
+
+def glass_notices(primitives: Sequence[Primitive], materials: Sequence[Material]) -> list[str]:
+    """Return what is odd about the bodies of solid glass, a line a material."""
+    notices = []
+    for k, material in enumerate(materials):
+        own = [p.positions[p.indices] for p in primitives if p.material == k]
+        if not material.is_solid_glass or not own:
+            continue
+        triangles = np.concatenate(own)
+        corners = np.unique(triangles.reshape(-1, 3), axis=0, return_inverse=True)[1].reshape(-1, 3)
+        edges = np.sort(np.concatenate([corners[:, [i, (i + 1) % 3]] for i in range(3)]))
+        count = int((np.unique(edges, axis=0, return_counts=True)[1] == 1).sum())
+        a, b, c = np.moveaxis(triangles - triangles.mean(axis=(0, 1)), 1, 0)
+        if count:
+            notices.append(
+                f"material {material.name!r}: a body of glass that is open at {count} edges: light "
+                "that misses its far side is not bent or dimmed there"
+            )
+        elif np.einsum("tk,tk->", a, np.cross(b, c)) < 0.0:
+            notices.append(
+                f"material {material.name!r}: a body of glass whose triangles face inward: inside "
+                "and outside are swapped"
+            )
+    return notices
+
+
 def placed_primitives(
     file: GltfFile, notices: list[str]
 ) -> Iterator[tuple[Entry, Float64Array, Float64Array | None]]:
     """Walk the scene and yield every drawable primitive with its matrix.
-
-    Args:
-        file: The file.
-        notices: Receives what is left out.
 
     Yields:
         The primitive and the matrix from its frame to the asset's, shape [4, 4]; for a skinned one
@@ -181,16 +214,10 @@ class Geometry:
 def read_geometry(
     file: GltfFile, entry: Entry, uv_sets: set[int], notices: list[str]
 ) -> Geometry | None:
-    """Read the triangles of a primitive.
+    """Read the triangles of a primitive; None when none has an area.
 
-    Args:
-        file: The file.
-        entry: The primitive.
-        uv_sets: Texture coordinate sets that its material reads; absent ones become zero.
-        notices: Receives what was repaired.
-
-    Returns:
-        The geometry, or None when no triangle has an area.
+    ``uv_sets`` are the texture coordinate sets that its material reads; absent ones become zero.
+    ``notices`` receives what was repaired.
     """
     attributes = entry.child("attributes")
     positions = file.accessor(attributes.integer("POSITION"), entry, "POSITION", ("VEC3",))
@@ -280,11 +307,8 @@ def read_colors(stored: PixelArray | None, entry: Entry, notices: list[str]) -> 
 def pose(file: GltfFile, entry: Entry, geometry: Geometry, joints: Float64Array) -> Geometry:
     """Move the vertices of a skinned primitive as its joints stand (linear blend skinning).
 
-    Args:
-        file: The file.
-        entry: The primitive, with JOINTS_n and WEIGHTS_n.
-        geometry: The primitive as stored.
-        joints: Matrices of `Skins.read`, shape [joint, 4, 4].
+    The primitive has JOINTS_n and WEIGHTS_n; the geometry is as stored, the matrices are those of
+    `Skins.read`, shape [joint, 4, 4].
     """
     moved = _blended_joints(file, entry, len(geometry.positions), joints)
     linear = moved[:, :3, :3]

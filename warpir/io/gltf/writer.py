@@ -276,6 +276,18 @@ def _material_extensions(file: _Glb, m: Material, strength: float) -> Members:
         | _texture(file, m, "sheen_roughness", "sheenRoughnessTexture"),
         "KHR_materials_transmission": _unless(0.0, transmissionFactor=m.transmission)
         | _texture(file, m, "transmission", "transmissionTexture"),
+        "KHR_materials_anisotropy": _unless(0.0, anisotropyStrength=m.anisotropy)
+        | _unless(0.0, anisotropyRotation=m.anisotropy_rotation)
+        | _texture(file, m, "anisotropy", "anisotropyTexture"),
+        "KHR_materials_iridescence": _unless(0.0, iridescenceFactor=m.iridescence)
+        | _unless(1.3, iridescenceIor=m.iridescence_ior)
+        | _unless(100.0, iridescenceThicknessMinimum=m.iridescence_thickness[0])
+        | _unless(400.0, iridescenceThicknessMaximum=m.iridescence_thickness[1])
+        | _texture(file, m, "iridescence", "iridescenceTexture")
+        | _texture(file, m, "iridescence_thickness", "iridescenceThicknessTexture"),
+        "KHR_materials_volume": _unless(0.0, thicknessFactor=m.thickness)
+        | _unless(math.inf, attenuationDistance=m.attenuation_distance)
+        | _unless([1.0] * 3, attenuationColor=list(m.attenuation_color)),
     }
     used: Members = {}
     for name, members in extensions.items():

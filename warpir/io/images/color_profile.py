@@ -41,10 +41,6 @@ def png_profile(path: Path, icc: bytes | None) -> tuple[bytes | None, list[str]]
 
     The PNG specification (third edition, 4.3) ranks cICP, iCCP, sRGB, gAMA with cHRM.
 
-    Args:
-        path: A PNG that was decoded.
-        icc: Its iCCP profile.
-
     Returns:
         The profile, and what is not followed, one line each.
 

@@ -55,14 +55,10 @@ class JpegCoding:
 
 
 def read_coding(path: Path, orientation: int) -> JpegCoding | None:
-    """Return how a JPEG file was coded; None where it is neither grey nor YCbCr in 8 bits.
-
-    Args:
-        path: A file that `decode_image` has read.
-        orientation: Of its EXIF data.
-    """
+    """Return how a JPEG file was coded; None where it is neither grey nor YCbCr in 8 bits."""
     from PIL import Image, JpegImagePlugin
 
+    Image.MAX_IMAGE_PIXELS = None  # ours, which --max-pixels raises, was checked before
     with Image.open(path) as image:
         if not isinstance(image, JpegImagePlugin.JpegImageFile) or image.mode not in ("RGB", "L"):
             return None

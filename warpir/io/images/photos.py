@@ -352,13 +352,7 @@ def _check_brightness(path: Path, texels: FloatArray, notices: list[str]) -> Non
 
 
 def _repair_radiance(path: Path, texels: FloatArray, strict: bool, notices: list[str]) -> None:
-    """Put finite, non-negative numbers in place of others, with a notice.
-
-    Args:
-        path: The file.
-        texels: Radiance, changed in place, shape [height, width, 3].
-        strict: Refuse instead.
-        notices: Receives how many there were.
+    """Put finite, non-negative numbers in place of others, in the array given, with a notice.
 
     Raises:
         InputError: ``strict``, or no light is left.

@@ -19,12 +19,6 @@ def source_positions(
 ) -> tuple[Float64Array, Float64Array, BoolArray]:
     """Return where the distorted photograph shows what a pinhole would show at some rows.
 
-    Args:
-        camera: The pinhole, whose intrinsics are also the lens's.
-        lens: The lens.
-        first: First row.
-        last: Row after the last.
-
     Returns:
         Columns and rows [px], and whether they lie outside the photograph or beyond the lens's
         reach, shape [last - first, width] each. Beyond the reach the position stays at it.

@@ -37,13 +37,8 @@ def read_regular(
 ) -> bytes:
     """Return the content of a regular file, refusing folders, devices, pipes and giants.
 
-    Args:
-        path: The file to read.
-        where: The asset that is named in an error.
-        pointer: The place in the asset that refers to ``path``, ending in ``: ``, or empty.
-        limits: How large it may be.
-        limit: Which of them counts here.
-        hashes: Receives the sha256 of what was read; see `warpir.scene.asset.Asset.hashes`.
+    ``where`` is the asset that an error names, and ``pointer`` the place in it that refers to the
+    file; ``hashes`` receives the sha256, see `warpir.scene.asset.Asset.hashes`.
 
     Raises:
         InputError: It cannot be read, is empty, or is too large.
@@ -74,11 +69,8 @@ def read_regular(
 def inside(folder: Path, uri: str, where: Path, pointer: str = "") -> Path:
     """Resolve a relative file name, links included, and insist that it stays in ``folder``.
 
-    Args:
-        folder: The folder of the asset.
-        uri: Relative path with ``/``, already percent-decoded.
-        where: The asset that is named in an error.
-        pointer: The place in the asset, ending in ``: ``, or empty.
+    The name has ``/`` and is already percent-decoded. An error names the asset ``where`` and the
+    place in it, which is empty or ends in ``: ``.
 
     Raises:
         InputError: The name is empty, absolute, a URL, or leads out of the folder.
@@ -148,13 +140,10 @@ def locate(uri: str, where: Path, pointer: str) -> Path:
 
 
 class TextureDecoder:
-    """Decodes the images of one asset and keeps count of their pixels.
+    """Decodes the images of one asset and keeps count of their pixels, which are limited together.
 
-    Args:
-        where: The asset that is named in an error.
-        notices: Receives one line per repair.
-        limits: How many pixels all images may have together.
-        measures: Only count the pixels: what is decoded is one grey texel.
+    ``notices`` receives one line per repair. One that ``measures`` only counts the pixels: what is
+    decoded is one grey texel.
     """
 
     def __init__(

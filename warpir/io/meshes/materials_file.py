@@ -33,12 +33,7 @@ FACTORS = {
 
 
 def with_materials(asset: Asset, path: str | Path, limits: Limits = LIMITS) -> Asset:
-    """Return an asset whose material factors are those of a file.
-
-    Args:
-        asset: Of the same materials as the asset that the file was made for.
-        path: The JSON file.
-        limits: How large it may be.
+    """Return an asset whose material factors are those of a file, made for the same materials.
 
     Raises:
         InputError: Missing, of another format, made for another asset, or a factor is out of range;
@@ -83,12 +78,7 @@ def _read(path: str | Path, pointer: str, entry: Any, material: Material) -> Mat
 
 
 def materials_to_json(before: Sequence[Material], after: Sequence[Material]) -> dict[str, Any]:
-    """Return what `with_materials` reads.
-
-    Args:
-        before: The asset's own materials.
-        after: The same, refined.
-    """
+    """Return what `with_materials` reads."""
 
     def factors(material: Material) -> dict[str, Any]:
         return {name: getattr(material, name) for name in FACTORS}

@@ -104,12 +104,8 @@ class Layer:
 class MaterialLibrary:
     """The materials of one OBJ file; only those asked for are built.
 
-    Args:
-        path: The OBJ file.
-        missing_textures: ``error``, or ``grey``.
-        notices: Receives what was assumed or left out.
-        hashes: Receives the sha256 of every file that is read.
-        limits: How many pixels the textures may have.
+    Missing textures are an ``error``, or ``grey``. ``notices`` receives what was assumed or left
+    out, ``hashes`` the sha256 of every file that is read.
     """
 
     def __init__(

@@ -267,15 +267,10 @@ def _no_such(path: Path, line: int, found: str, k: int, counts: tuple[int, int, 
 def _vertex_colors(
     stated: dict[int, list[float]], count: int, notices: list[str]
 ) -> FloatArray | None:
-    """Return the colours after the positions (``v x y z r g b``), white where there are none.
+    """Return the colours after the positions (``v x y z r g b``), linear RGBA, shape [position, 4].
 
-    Args:
-        stated: By index of the position; whole numbers up to 255 are codes of 8 bits.
-        count: How many positions there are.
-        notices: Receives how they were read.
-
-    Returns:
-        Linear RGBA, shape [position, 4]; None where no position has a colour.
+    Whole numbers up to 255 are codes of 8 bits; positions without a colour are white, and where
+    none has one it is None.
     """
     if not stated:
         return None

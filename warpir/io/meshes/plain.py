@@ -86,15 +86,6 @@ def _asset(
 ) -> Asset:
     """Return an asset of one material, which the file does not state.
 
-    Args:
-        path: The file.
-        positions: Shape [vertex, 3].
-        indices: Shape [triangle, 3].
-        normals: Of any length, shape [vertex, 3].
-        colors: Linear RGBA, shape [vertex, 4].
-        notices: What was noted on reading.
-        hashes: Of what was read.
-
     Raises:
         InputError: No triangle has an area.
     """

@@ -90,10 +90,6 @@ class Ply:
 def read_ply(path: Path, content: bytes) -> Ply:
     """Read all elements of a PLY file.
 
-    Args:
-        path: The file, for errors.
-        content: What it holds.
-
     Raises:
         InputError: The header is not PLY's, or the body is shorter or longer than it promises.
     """
@@ -177,12 +173,7 @@ def read_header(path: Path, content: bytes) -> tuple[Ply, str, int]:
 def _read_element(element: Element, body: bytes, at: int, order: str, cell: str) -> int:
     """Fill the columns and lists of an element and return where the next one begins [byte].
 
-    Args:
-        element: What to fill.
-        body: The binary content.
-        at: Where the element begins [byte].
-        order: ``<`` or ``>``.
-        cell: What replaces all types, or empty.
+    ``cell`` replaces all types where it is not empty.
 
     Raises:
         ValueError: The body is too short; `struct.error` likewise.

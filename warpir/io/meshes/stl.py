@@ -30,11 +30,6 @@ LONGEST = 64
 def read_stl(path: Path, content: bytes, notices: list[str]) -> NDArray[np.float64]:
     """Return the corners of all triangles, shape [triangle, 3, 3].
 
-    Args:
-        path: The file, for errors.
-        content: What it holds.
-        notices: Receives what is not read.
-
     Raises:
         InputError: The file is damaged, or neither kind of STL.
     """

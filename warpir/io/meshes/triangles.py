@@ -36,11 +36,8 @@ def triangulate(
 ) -> IntArray:
     """Cut polygons into triangles: fans where convex, ears where not.
 
-    Args:
-        path: The file.
-        points: Shape [vertex, 3].
-        polygons: Vertex indices by number of corners, shape [polygon, corner].
-        notices: Receives the number of concave polygons.
+    Polygons, vertex indices of shape [polygon, corner], are given by number of corners; ``notices``
+    receives the number of concave ones.
 
     Returns:
         Shape [triangle, 3], the winding kept.
@@ -127,11 +124,8 @@ def corner_within(
 ) -> int:
     """Return what keeps a corner of a polygon from being an ear.
 
-    Args:
-        x: Of all corners, shape [corner].
-        y: Likewise.
-        left: Which of them were not cut off.
-        triangle: The corner in the middle, its neighbours around it.
+    ``left`` are the corners that were not cut off, ``triangle`` the corner in the middle, its
+    neighbours around it.
 
     Returns:
         Another corner in the triangle, its own where it is concave, -1 where it is an ear.
@@ -242,12 +236,6 @@ def unit(vectors: Float64Array) -> FloatArray:
 def check_triangle_count(where: Path, count: int, limits: Limits, more: str = "") -> None:
     """Refuse more triangles than the limit.
 
-    Args:
-        where: The asset.
-        count: How many triangles it has.
-        limits: How many it may have.
-        more: What the number stands for, to be added to it.
-
     Raises:
         InputError: There are more.
     """
@@ -258,11 +246,6 @@ def check_triangle_count(where: Path, count: int, limits: Limits, more: str = ""
 
 def check_drawable(where: Path, primitives: list[Primitive], found: str) -> None:
     """Refuse an asset without triangles, or beyond what float32 kernels can place.
-
-    Args:
-        where: The asset.
-        primitives: What was read.
-        found: What the file has instead of triangles.
 
     Raises:
         InputError: ``primitives`` is empty or a coordinate is not below ``EXTENT``.

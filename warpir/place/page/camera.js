@@ -51,7 +51,7 @@ export function project(camera, stance, point) {
 }
 
 // Direction through a pixel, not of unit length.
-function ray(camera, stance, u, v) {
+export function ray(camera, stance, u, v) {
   const local = [(u - camera.cx) / camera.fx, -(v - camera.cy) / camera.fy, -1];
   return rotation(stance).map((row) => row[0] * local[0] + row[1] * local[1] + row[2] * local[2]);
 }
@@ -62,6 +62,16 @@ export function groundPoint(camera, stance, u, v) {
   if (direction[1] >= -1e-9) return null;
   const reach = -stance.height / direction[1];
   return [stance.x + reach * direction[0], stance.z + reach * direction[2]];
+}
+
+// The point that a pixel shows at a distance from the camera [m]; nearer where the ray would come
+// lower than `least` above the ground.
+export function pointSeen(camera, stance, [u, v], distance, least) {
+  const direction = ray(camera, stance, u, v);
+  const down = -direction[1] / Math.hypot(...direction);
+  const most = down > 0 && stance.height > least ? (stance.height - least) / down : Infinity;
+  const reach = Math.min(distance, most) / Math.hypot(...direction);
+  return [stance.x, stance.height, stance.z].map((part, k) => part + reach * direction[k]);
 }
 
 // Length of what a segment of the photo shows [m]: of ground between its ends, or of something upright

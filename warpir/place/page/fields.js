@@ -26,10 +26,13 @@ export function fromPolar(before, { ahead, right }) {
 const posed = (change) => (before, value) => withCamera(before, before.camera, { ...before.stance, ...change(value) });
 
 // Each field: its range, how it is read from a state and what it makes of one; `name` is read aloud.
-function described(start, lighting) {
+function described(start, lighting, lamps) {
   const lit = (name) => ({
     get: (now) => lighting.shown(now)[name],
     set: (before, value) => lighting.set(before, { [name]: value }),
+  });
+  const ofLamp = (name) => ({
+    log: true, get: (now) => lamps.get(now, name), set: (before, value) => lamps.set(before, name, value),
   });
   const { size, stance: { height } } = start;
   return {
@@ -59,6 +62,11 @@ function described(start, lighting) {
       sunStrength: { label: 'Sun', name: 'Strength of the sun', unit: '×', low: 0, high: 20, digits: 1, ...lit('sunStrength') },
       skyStrength: { label: 'Sky', name: 'Strength of the sky', unit: '×', low: 0.05, high: 4, digits: 2, ...lit('skyStrength') },
     },
+    lamp: {
+      distance: { label: 'Distance', name: 'Distance of the lamp from the camera', unit: 'm', low: 0.1 * height, high: 60 * height, ...ofLamp('distance') },
+      radius: { label: 'Radius', name: 'Radius of the lamp', unit: 'm', low: 0.003 * height, high: height, ...ofLamp('radius') },
+      power: { label: 'Power', name: 'Power of the lamp, 40 is white at 1 m', unit: '', low: 0.01 * height ** 2, high: 1e4 * height ** 2, ...ofLamp('power') },
+    },
   };
 }
 
@@ -67,9 +75,9 @@ function made(tag, attributes) {
 }
 
 export class Fields {
-  constructor(start, lighting, history) {
+  constructor(start, lighting, lamps, history) {
     Object.assign(this, { start, history });
-    const groups = described(start, lighting);
+    const groups = described(start, lighting, lamps);
     this.byName = Object.assign({}, ...Object.values(groups));
     for (const [group, members] of Object.entries(groups)) {
       const parent = document.getElementById(`${group}-fields`);
@@ -82,7 +90,7 @@ export class Fields {
     const slide = made('input', { type: 'range', min: 0, max: 1000, step: 1, id: `${name}-slide` });
     slide.setAttribute('aria-label', field.name);
     const entry = made('input', { type: 'number', id: name, step: 'any' });
-    entry.setAttribute('aria-label', `${field.name} [${field.unit}]`);
+    entry.setAttribute('aria-label', field.unit ? `${field.name} [${field.unit}]` : field.name);
     Object.assign(field, { slide, entry });
     const { low, high, log } = field;
     field.share = (value) => 1000 * clamp(log ? Math.log(value / low) / Math.log(high / low) : (value - low) / (high - low), 0, 1);

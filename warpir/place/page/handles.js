@@ -1,6 +1,6 @@
 // What is dragged over the photo: horizon, ring, size, foot. Positions are pixels of the stage.
 
-import { corners, groundPoint, horizonRow, levelled, lowered, placed, project, zoomed } from './camera.js';
+import { corners, groundPoint, horizonRow, levelled, lowered, placed, pointSeen, project, zoomed } from './camera.js';
 
 const SVG = 'http://www.w3.org/2000/svg';
 const RIM = 14; // handles stay this far inside the stage
@@ -47,7 +47,8 @@ function above([x, y], [u, v]) {
 // The same with the camera changed: what stood at a pixel of the ground goes on standing there, so
 // far as that does not carry it off: then it stands lower in the photo, at `CARRIED` times its
 // distance. Null where the photo shows no such ground: the change is not for this object.
-export function withCamera(before, camera, stance) {
+export function withCamera(unchanged, camera, stance) {
+  const before = { ...unchanged, lamps: carriedLamps(unchanged, camera, stance) };
   const { stand } = before;
   const foot = project(before.camera, before.stance, [stand.x, 0, stand.z]);
   const isSeen = foot && foot[0] >= 0 && foot[0] <= camera.width && foot[1] >= 0 && foot[1] <= camera.height;
@@ -71,6 +72,18 @@ export function withCamera(before, camera, stance) {
     point = pointAt(near);
   }
   return { ...before, camera, stance, stand: { x: point[0], z: point[1] } };
+}
+
+// Lamps that the photo shows stay where it shows them, as many camera heights away as they were.
+function carriedLamps(before, camera, stance) {
+  const { x, z, height } = before.stance;
+  return before.lamps.map((lamp) => {
+    const pixel = project(before.camera, before.stance, lamp.center);
+    const isSeen = pixel && pixel[0] >= 0 && pixel[0] <= camera.width && pixel[1] >= 0 && pixel[1] <= camera.height;
+    if (!isSeen) return lamp;
+    const away = Math.hypot(lamp.center[0] - x, lamp.center[1] - height, lamp.center[2] - z);
+    return { ...lamp, center: pointSeen(camera, stance, pixel, (away * stance.height) / height, lamp.radius ?? 0) };
+  });
 }
 
 // The same with the object's foot at a pixel of the photo; as it was where that shows no ground.
@@ -108,9 +121,9 @@ function tilted(before, one, other) {
   return withCamera(before, { ...camera, cy: camera.cy + one[1] - horizonRow(camera, level, one[0]) }, level);
 }
 
-// Let an element follow the pointer that was pressed on it; returns whether it does. Other buttons
-// do nothing, nor do other fingers while a gesture goes on.
-export function follow(element, pressed, gesture, name, moved) {
+// Let an element follow the pointer that was pressed on it until it is released; returns whether it
+// does. Other buttons do nothing, nor do other fingers while a gesture goes on.
+export function follow(element, pressed, gesture, name, moved, released = () => {}) {
   if (pressed.button !== 0 || gesture.isOn) return false;
   element.setPointerCapture(pressed.pointerId);
   gesture.begin(name);
@@ -122,6 +135,7 @@ export function follow(element, pressed, gesture, name, moved) {
     element.removeEventListener('pointermove', move);
     for (const kind of ['pointerup', 'pointercancel']) element.removeEventListener(kind, end);
     gesture.end();
+    released();
   };
   element.addEventListener('pointermove', move);
   for (const kind of ['pointerup', 'pointercancel']) element.addEventListener(kind, end);

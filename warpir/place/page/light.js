@@ -6,10 +6,32 @@ import { follow } from './handles.js';
 const LUMINANCE = [0.2126, 0.7152, 0.0722];
 const ELEVATION = 45; // of a sun whose azimuth alone was typed
 const RADIUS = 46; // of the dial
+const LEAST_FROM_AFAR = 0.05; // of the ground's light, whatever lamps near it give
 const PATIENCE = 1200; // ms that a camera must rest before the light is estimated for it
 
 const dot = (a, b) => a.reduce((sum, part, k) => sum + part * b[k], 0);
 const clamp = (x, low, high) => Math.min(Math.max(x, low), high);
+
+// What a lamp near the object sends toward a point: the irradiance of what faces it at 1 m, RGB. A
+// rectangle shines on one side, and less aslant.
+export function lampStrength({ center, edge_x: a, edge_y: b, power, color }, point) {
+  const all = color.map((part) => (part * power) / (4 * Math.PI));
+  if (!a) return all;
+  const offset = point.map((part, k) => part - center[k]);
+  const normal = [a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]];
+  const cosine = dot(normal, offset) / (Math.hypot(...normal) * Math.hypot(...offset) || 1);
+  return all.map((part) => 4 * part * Math.max(cosine, 0));
+}
+
+// Luminance of what they give the ground at the object's foot.
+function fromLamps({ lamps, stand }) {
+  const given = lamps.map((lamp) => {
+    const foot = [stand.x, 0, stand.z];
+    const away = Math.hypot(...foot.map((part, k) => part - lamp.center[k]));
+    return (dot(lampStrength(lamp, foot), LUMINANCE) * Math.max(lamp.center[1], 0)) / away ** 3 || 0;
+  });
+  return given.reduce((sum, part) => sum + part, 0);
+}
 
 export function shape(tag, attributes, text = '') {
   const element = document.createElementNS('http://www.w3.org/2000/svg', tag);
@@ -98,7 +120,7 @@ export class Lighting {
       const axis = this.#inGround(sunAxis(...(direction ?? [0, 90])));
       const fromSun = dot(sun, LUMINANCE) * Math.max(axis[1], 0);
       const total = Math.PI * dot(sky, LUMINANCE) + fromSun || 1;
-      return { axis, sun, sky, bounce, sunShare: fromSun / total };
+      return { axis, sun, sky, bounce, sunShare: fromSun / (total + fromLamps(state)) };
     }
     return this.#described(state);
   }
@@ -120,15 +142,18 @@ export class Lighting {
     const axis = this.#inGround(world);
     const fromSun = dot(sun, LUMINANCE) * Math.max(axis[1], 0);
     const total = Math.PI * dot(radiance, LUMINANCE) + fromSun || 1; // of no light there are no shares
-    const gain = (this.#groundLevel(state) * Math.PI) / (albedo * total);
+    const received = (this.groundLevel(state) * Math.PI) / albedo;
+    const near = fromLamps(state);
+    const left = Math.max(received - near, LEAST_FROM_AFAR * received);
+    const gain = left / total;
     const bounce = [0, 1, 2].map((k) =>
       (albedo / Math.PI) * (Math.PI * radiance[k] + sun[k] * Math.max(world[1], 0)));
     const scaled = (parts) => parts.map((part) => part * gain);
-    return { axis, sun: scaled(sun), sky: scaled(radiance), bounce: scaled(bounce), sunShare: fromSun / total };
+    return { axis, sun: scaled(sun), sky: scaled(radiance), bounce: scaled(bounce), sunShare: ((fromSun / total) * left) / (left + near) };
   }
 
   // Luminance of the photo's lit ground round the object, as warpir/lighting/scene_light.py measures it.
-  #groundLevel({ camera, stance, stand, size }) {
+  groundLevel({ camera, stance, stand, size }) {
     const { asset } = this.start;
     const { width, height, codes } = this.pixels;
     const sides = asset.high.map((top, k) => top - asset.low[k]);

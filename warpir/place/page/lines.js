@@ -20,7 +20,7 @@ const movedEnd = (segment, end, by) => segment.map((point, k) => (k === end ? po
 
 // A knob of an `owner` with group, history and scale, that is dragged and moved by the arrow keys;
 // `moved` gives the state with its end moved by some photo pixels.
-function endOf(owner, kind, handle, name, moved) {
+export function endOf(owner, kind, handle, name, moved) {
   const knob = owner.group.appendChild(shape('g', {
     class: `knob end ${kind}`, tabindex: 0, role: 'button', 'data-handle': handle, 'aria-label': `${name}; arrow keys move it`,
   }));

@@ -3,6 +3,7 @@
 import { Fields, clamp, fromPolar, plain, polar, wrapped } from './fields.js';
 import { Handles, shifted, stoodAt, withCamera } from './handles.js';
 import { History } from './history.js';
+import { Lamps } from './lamps.js';
 import { Dial, Lighting, photoPixels } from './light.js';
 import { Lines, Ruler } from './lines.js';
 import { Mask } from './mask.js';
@@ -27,7 +28,7 @@ const lighting = new Lighting(start, await photoPixels($('photo')), {
   ask: (camera) => post('light', sentCamera(camera)),
 });
 const { camera, stance, stand, rotate_y: turn, size } = start;
-const history = new History({ camera, stance, stand, turn, size, light: lighting.opening(), lines: null, ruler: null, mask: [], isUpright: looksUpright() }, {
+const history = new History({ camera, stance, stand, turn, size, light: lighting.opening(), lamps: start.lamps, lines: null, ruler: null, mask: [], isUpright: looksUpright() }, {
   show,
   begun: () => $('stage').classList.add('dragging'),
   moved: readOut,
@@ -45,7 +46,11 @@ function looksUpright() {
 
 const once = (name, change) => history.once(name, change);
 state = history.state;
-const fields = new Fields(start, lighting, history);
+const lamps = new Lamps($('handles'), $('stage'), history, lighting, {
+  toggle: $('add-lamp'), options: $('lamp-options'), which: $('lamp-which'), remove: $('remove-lamp'), words: $('lamp-words'), chosen: draw,
+  added: (now) => now.lamps.length === 1 && warm(now), // the kernels for lamps
+});
+const fields = new Fields(start, lighting, lamps, history);
 const dial = new Dial($('dial'), lighting, history);
 const lines = new Lines($('handles'), $('stage'), history, {
   toggle: $('lines'), upright: $('upright'), options: $('axes'), words: $('lines-words'),
@@ -102,10 +107,12 @@ function draw() {
     spacing = stage.setCamera(state.camera, state.stance);
     stage.setObject(state.stand, state.turn, state.size);
     stage.setLight(lighting.onStage(state));
+    stage.setLamps(state.lamps);
     const more = stage.render();
     handles.draw(state, seen);
     lines.draw(state);
     ruler.draw(state);
+    lamps.draw(state);
     mask.draw(state);
     pictures.draw(state);
     handles.say(fields.spoken(state));
@@ -164,7 +171,7 @@ const view = new View($('room'), $('stage'), canvas, start.photo, {
     $('zoom-fit').textContent = `${Math.round(100 * view.scale)} %`;
     draw();
   },
-  pressed: (event) => history.isOn || mask.press(event) || (handles.isOnObject(event) && handles.drag(event, canvas, 'foot')),
+  pressed: (event) => history.isOn || lamps.press(event, canvas) || mask.press(event) || (handles.isOnObject(event) && handles.drag(event, canvas, 'foot')),
   cancel: () => history.cancel(),
 });
 $('zoom-in').addEventListener('click', () => view.step(1));
@@ -172,7 +179,7 @@ $('zoom-out').addEventListener('click', () => view.step(-1));
 $('zoom-fit').addEventListener('click', () => view.fit());
 canvas.addEventListener('pointermove', (event) => canvas.classList.toggle('grabs', Boolean(handles.isOnObject(event))));
 canvas.addEventListener('dblclick', (event) => {
-  if (mask.isPainting) return;
+  if (mask.isPainting || event.timeStamp - lamps.addedAt < 1000) return;
   const box = $('stage').getBoundingClientRect();
   const scale = start.photo.width / box.width;
   once('double click', (before) => stoodAt(before, (event.clientX - box.left) * scale, (event.clientY - box.top) * scale));
@@ -267,8 +274,13 @@ function sentCamera({ camera: { fx, fy, cx, cy }, stance: pose }) {
 
 function sentPlacement(now) {
   return {
-    ...sentCamera(now), stand: now.stand, rotate_y: wrapped(now.turn), size: now.size, ...lighting.saved(now), mask: mask.sent(now),
+    ...sentCamera(now), stand: now.stand, rotate_y: wrapped(now.turn), size: now.size, ...lighting.saved(now), lamps: now.lamps, mask: mask.sent(now),
   };
+}
+
+// So that the next preview does not wait: read, loaded and compiled is what it needs.
+function warm(now) {
+  post('warm', sentPlacement(now)).catch(() => {}); // the preview tells
 }
 
 let saved = state;
@@ -309,6 +321,7 @@ try {
   $('loading').hidden = true;
   $('save').disabled = $('preview').disabled = $('insert').disabled = false;
   new ResizeObserver(() => view.show()).observe($('room'));
+  warm(state);
 } catch (error) {
   $('loading').textContent = `The object cannot be shown: ${error.message}`;
 }

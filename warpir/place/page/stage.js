@@ -3,6 +3,7 @@
 import * as THREE from 'three';
 import { GLTFLoader } from './vendor/loaders/GLTFLoader.js';
 import { placed, pose, projection } from './camera.js';
+import { lampStrength } from './light.js';
 
 const SHADOW_SIDE = 2048;
 const SKY_DIRECTIONS = 48; // from which the ground's view of the sky is measured
@@ -65,6 +66,7 @@ export class Stage {
     this.sun.castShadow = true;
     this.sun.shadow.mapSize.set(SHADOW_SIDE, SHADOW_SIDE);
     this.sun.shadow.radius = 2;
+    this.lamps = [];
     this.scene.add(this.object, this.sun, this.sun.target);
     this.pmrem = new THREE.PMREMGenerator(this.renderer);
     this.skyTarget = new THREE.WebGLRenderTarget(SKY_SIDE, SKY_SIDE, { type: THREE.HalfFloatType });
@@ -187,6 +189,21 @@ export class Stage {
     const key = colors.map((part) => part.toFixed(2)).join();
     if (key !== this.skyKey) this.#makeEnvironment(colors);
     this.skyKey = key;
+  }
+
+  // Lamps near the object, as the page's state has them: they light it without a shadow.
+  setLamps(lamps) {
+    while (this.lamps.length < lamps.length) this.lamps.push(new THREE.PointLight());
+    for (const [k, light] of this.lamps.entries()) {
+      const lamp = lamps[k];
+      if (!lamp) {
+        this.scene.remove(light);
+        continue;
+      }
+      this.scene.add(light);
+      light.position.set(...lamp.center);
+      light.color.setRGB(...lampStrength(lamp, this.middle.toArray()));
+    }
   }
 
   #makeEnvironment(colors) {

@@ -25,6 +25,7 @@ from warpir.kernels.types import (
 )
 from warpir.render.device import SAMPLES_PER_SLICE, Rows
 from warpir.render.device_scene import FACTORS
+from warpir.render.launches import directions_of_path
 from warpir.render.renderer import ReceiverRadiance, Renderer
 
 if TYPE_CHECKING:
@@ -39,7 +40,7 @@ RECORD_BYTES = 1 << 30
 Unused records cost no physical memory: four fifths of a convex object's at five interactions."""
 ENTRY_BYTES = 24
 VERTEX_BYTES = 112
-LAYERS_BYTES = 72
+LAYERS_BYTES = 96
 PART_PATHS = 4096
 """Least paths of a part: a path costs about 1 us, the launches of a part about 1 ms."""
 RECORDING, LOWER = "the samples of mis", "--mis-samples or --guidance-width"
@@ -71,9 +72,11 @@ class ObjectSamples:
         self.materials = mis.renderer.scene.materials_with(factors)
         self.factors = [getattr(self.materials, name) for name, _ in FACTORS]
         self.path_count = mis.spp * mis.rays
-        self.entries = 2 * self.path_count * mis.depth * free[0]
+        scene = mis.renderer.scene
+        assert not (scene.has_solid_glass and any(free[1:])), "glass has no gradient to materials"
+        self.entries = directions_of_path(scene, mis.depth) * self.path_count * free[0]
         self.vertices = self.path_count * (mis.depth + 1) * any(free[1:])
-        self.has_layers = self.materials.any_layers == 1
+        self.has_layers = self.materials.any_layers > 0
         vertex_bytes = VERTEX_BYTES + LAYERS_BYTES * self.has_layers
         row_bytes = ENTRY_BYTES * self.entries + vertex_bytes * self.vertices
         self.parts = _parts(len(mis.object_pixels), row_bytes)
@@ -262,6 +265,7 @@ class ReceiverSamples:
             self.seed,
             record=record,
             thrown_record=thrown,
+            is_recorded=self.free[0],
         )
         return out, record, thrown
 

@@ -6,7 +6,8 @@ the share of it that the object blocks from the ground plane (``T_shadow``). A s
 and its gradient ``T^T d``; no ray is cast. The kernels are `warpir.kernels.transport`.
 
 The irradiance of an open plane is one analytic row. If the receiver is a mesh, each pixel has a row
-for it (``T_receiver``), and the radiance of the mesh is a constant, as emission is.
+for it (``T_receiver``), and the radiance of the mesh is a constant, as emission is. Each lamp near
+the object has a row of its own (`warpir.render.near.rows`).
 
 The numbers are unbiased for the given map, at the resolution of the rows.
 """
@@ -26,7 +27,9 @@ from warpir.core.arrays import Float64Array, FloatArray, IntArray
 from warpir.core.errors import ExitCode, InputError
 from warpir.core.latlong import row_edges
 from warpir.core.memory import Need
+from warpir.render.glass.rows import glass_rows
 from warpir.render.integrator import MaterialTensors, Radiance
+from warpir.render.near.rows import LampRows, lamp_rows, with_lamps
 from warpir.render.renderer import Renderer, index_of
 from warpir.render.transport.cache import content_key, load_rows, save_rows
 from warpir.render.transport.matrix import DenseRows, SparseRows, product
@@ -47,7 +50,7 @@ DTYPES = {"bfloat16": torch.bfloat16, "float32": torch.float32}
 
 
 class TransportIntegrator:
-    """Light transport as stored rows; gradients to the light alone.
+    """Light transport as stored rows; gradients to the light and the lamps' powers alone.
 
     Args:
         renderer: The scene to trace.
@@ -81,7 +84,7 @@ class TransportIntegrator:
         seed: int = 0,
         cache: Path | None = None,
     ) -> None:
-        self.renderer = renderer
+        self.renderer = with_lamps(renderer, ())
         self.object_pixels = object_pixels
         self.receiver_pixels = receiver_pixels
         self.depth = depth
@@ -120,6 +123,10 @@ class TransportIntegrator:
             if file is not None:
                 save_rows(file, stored)
         self._hold(stored)
+        self.lamps: LampRows | None = None
+        if renderer.scene.lamps:
+            pixels = object_pixels, receiver_pixels
+            self.lamps = lamp_rows(renderer, *pixels, depth, seed, self.device)
         wp.synchronize_device(renderer.device)
         self.seconds_traced = time.perf_counter() - start
 
@@ -197,7 +204,8 @@ class TransportIntegrator:
         )
         emission = torch.empty((count, 3), device=self.device)
         mask = torch.empty(count, device=self.device)
-        for part in object_rows(
+        trace = glass_rows if self.renderer.scene.has_solid_glass else object_rows
+        for part in trace(
             self.renderer, self.object_pixels, self.depth, settings, self.expected[0], seed
         ):
             rows = torch.from_numpy(part.rows.astype(np.int64)).to(self.device)
@@ -327,8 +335,9 @@ class TransportIntegrator:
         light_shadow: Tensor,
         seed: int,
         materials: MaterialTensors | None = None,
+        lamp_powers: Tensor | None = None,
     ) -> Radiance:
-        """Render the object under ``light_fg`` and the plane under ``light_shadow``.
+        """Render the object under ``light_fg`` and the plane under ``light_shadow``, and the lamps.
 
         ``seed`` is unused: the stored rows are fixed.
 
@@ -353,7 +362,8 @@ class TransportIntegrator:
             texels = self._texels(light_shadow, settings.height_fg)[self.above_object]
             lit = lit + product(self.T_thrown, texels) + self.emission_thrown
         where = light_fg.device
-        return Radiance(foreground.to(where), lit.to(where), unoccluded.to(where))
+        whole = Radiance(foreground.to(where), lit.to(where), unoccluded.to(where))
+        return whole if self.lamps is None else self.lamps.added(whole, lamp_powers)
 
     def _texels(self, light: Tensor, height: int) -> Tensor:
         """Return a map at ``height`` rows on our device, shape [texel, 3]; differentiable."""

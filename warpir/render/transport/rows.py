@@ -27,7 +27,7 @@ from warpir.kernels.transport.receiver import (
 from warpir.kernels.transport.texels import TexelArgs
 from warpir.kernels.types import Layers, LightArgs
 from warpir.render.device import Rows
-from warpir.render.device_light import light_args
+from warpir.render.device_light import FINE_FROM, drawn, light_args
 from warpir.render.renderer import Renderer
 from warpir.render.transport.tents import direction_counts, texel_args
 from warpir.scene.light import Light
@@ -144,7 +144,8 @@ def object_rows(
     counts = direction_counts(expected, settings.bright_directions)
     every = np.arange(2 * height * height, dtype=np.int32)
     texels = texel_args(counts, height, renderer, every)
-    proposal = light_args(proposal_of(expected), renderer.device)
+    light = light_args(proposal_of(expected), renderer.device)
+    proposal = drawn(renderer, light, seed, FINE_FROM)
     trace = _ObjectTrace(renderer, texels, proposal, depth, seed, int(counts.sum()))
     for group, factor in _groups(renderer, pixels, settings, seed):
         subsamples, paths = factor * settings.subsamples, factor * settings.paths
@@ -209,7 +210,7 @@ def _surface_points(
         setattr(points, name, wp.empty((count, subsamples), dtype=wp.vec3, device=device))
     for name in ("metallic", "roughness"):
         setattr(points, name, wp.zeros((count, subsamples), dtype=float, device=device))
-    columns = subsamples * scene.material_args.any_layers
+    columns = subsamples * (scene.material_args.any_layers > 0)
     points.layers = wp.empty((count, columns), dtype=Layers, device=device)
     emission = wp.zeros(count, dtype=wp.vec3, device=device)
     renderer.launch(
@@ -265,7 +266,7 @@ def _receiver_points(
             points.pixels,
             Rows(wp.array(may_see_object, dtype=int, device=device)),
             scene.camera_args,
-            *scene.geometry(),
+            *scene.shadow_geometry(),
             subsamples,
             seed,
             points.count,
@@ -300,7 +301,7 @@ def plane_rows(
     size = max(1, CHUNK_BYTES // (4 * len(columns)))
     if scene.triangle_count == 0:
         return
-    geometry = scene.geometry()
+    geometry = scene.shadow_geometry()
     wp_columns = wp.array(columns, dtype=int, device=device)
 
     def trace(first: int, last: int) -> wp.array:
@@ -374,7 +375,7 @@ def mesh_rows(
     counts = direction_counts(expected, settings.bright_directions)
     texels = texel_args(counts, height, renderer, np.arange(texel_count, dtype=np.int32))
     size = max(1, CHUNK_BYTES // (8 * texel_count))
-    geometry = scene.geometry()
+    geometry = scene.shadow_geometry()
 
     def trace(first: int, last: int) -> MeshRows:
         chunk, count = slice(first, last), last - first

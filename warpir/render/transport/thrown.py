@@ -14,7 +14,7 @@ import warp as wp
 from warpir.core.arrays import FloatArray, IntArray
 from warpir.kernels.transport.foreground import spread_record
 from warpir.render.device import Rows
-from warpir.render.device_light import light_args
+from warpir.render.device_light import FINE_FROM, drawn, light_args
 from warpir.render.launches import ObjectLaunch
 from warpir.render.mis.samples import new_light_record
 from warpir.render.renderer import Renderer
@@ -53,9 +53,12 @@ def thrown_rows(
     light = light_args(proposal_of(expected), device)
     # Directions alone are asked for; what is left is what the object emits.
     light.texels = wp.zeros((height, width), dtype=wp.vec3, device=device)
+    light = drawn(renderer, light, seed, FINE_FROM)
     spp = min(settings.subsamples, settings.paths)
     rays = settings.paths // spp
-    launch = ObjectLaunch(light, scene.material_args, scene.camera_args, rays, depth, 0.0, seed)
+    launch = ObjectLaunch(
+        light, scene.shadow_material_args, scene.camera_args, rays, depth, 0.0, seed
+    )
     capacity = 2 * spp * rays * depth
     size = max(1, CHUNK_BYTES // (24 * capacity + 12 * height * width))
 

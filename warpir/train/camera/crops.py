@@ -133,10 +133,6 @@ class CameraBatch(NamedTuple):
 def read_panoramas(paths: Sequence[Path], device: torch.device | str) -> Panoramas:
     """Read panoramas; each is scaled to mean luminance 1.
 
-    Args:
-        paths: Files of lat-long radiance, at least one.
-        device: Of the tensors.
-
     Raises:
         InputError: A file cannot be used.
     """
@@ -192,12 +188,8 @@ def cut(
 ) -> Tensor:
     """Return the radiance that cameras see, looking anywhere around, shape [B, 3, H, W].
 
-    Args:
-        panoramas: To photograph.
-        cameras: The cameras.
-        which: Panorama of each, shape [B].
-        draw: Of the azimuths, and of which panoramas are mirrored.
-        size: Height and width of the photos [px].
+    ``which`` is the panorama of each, shape [B]; the azimuths, and which panoramas are mirrored,
+    are drawn. The size is height and width [px].
     """
     plane = cameras.plane(SAMPLES * size[0], SAMPLES * size[1])
     x, y, z = cameras.world(plane).unbind(-1)
@@ -232,11 +224,6 @@ def draw_batch(panoramas: Panoramas, count: int, generator: torch.Generator) -> 
 
     All are brought to blurs drawn alike for all fields of view: what is narrow is magnified from a
     panorama of few texels, and sharpness must not tell that.
-
-    Args:
-        panoramas: To photograph.
-        count: Photos.
-        generator: Of the panoramas' device.
     """
     draw = Sampler(count, generator)
     cameras, which = draw_cameras(draw), draw.index(panoramas.texels.shape[2])

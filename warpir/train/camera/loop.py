@@ -12,7 +12,7 @@ import math
 import time
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import nullcontext
-from dataclasses import asdict, dataclass
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -28,6 +28,7 @@ from warpir.calibration.network import (
 )
 from warpir.lighting.regressor import Regressor
 from warpir.train.camera.crops import CameraBatch, Panoramas, draw_batch
+from warpir.train.stepping import CameraSettings, follow, left_to_fall, make_optimizer, warmed_up
 
 WEIGHTS, CURVE = "calibrator.safetensors", "curve.jsonl"
 NUMBER_WEIGHTS = {"pitch": 1.0, "roll": 1.0, "focal": 1.0, "x": 0.3, "y": 0.6}
@@ -39,24 +40,6 @@ GOALS = {"pitch": 3.0, "roll": 1.5, "vfov": 6.0}
 COVERAGE = 0.68
 """Share of errors within one standard deviation."""
 VALIDATION_SEED = 10**6
-
-
-@dataclass(frozen=True)
-class CameraSettings:
-    """How the network is trained."""
-
-    batch: int = 256
-    learning_rate: float = 1.2e-3
-    weight_decay: float = 0.05
-    warmup_steps: int = 150
-    constant_share: float = 0.4
-    """Share of the time at full rate; then it falls along a cosine to 0."""
-    clip: float = 1.0
-    """Largest norm of a step's gradient."""
-    average: float = 0.998
-    """Decay of the moving average of the weights."""
-    validate_minutes: float = 0.5
-    validation_photos: int = 1536
 
 
 def train_camera(
@@ -130,11 +113,9 @@ class _Course:
         self.loss = torch.full((), math.nan, device=network.spread.device)
 
     def follow(self, loss: Tensor, decay: float) -> None:
-        """Move the average toward the weights after a step; at first it follows closely."""
+        """Move the average toward the weights after a step."""
         self.loss = torch.where(self.loss.isnan(), loss, self.loss.lerp(loss, 0.05))
-        average = [p.detach() for p in self.average.parameters()]
-        share = 1.0 - min(decay, (1.0 + self.steps) / (10.0 + self.steps))
-        torch._foreach_lerp_(average, [p.detach() for p in self.network.parameters()], share)
+        follow(self.average, self.network, self.steps, decay)
         self.steps += 1
 
     def validate(self, minutes: float) -> None:
@@ -149,9 +130,8 @@ class _Course:
 
 def _rate(settings: CameraSettings, progress: float, steps: int) -> float:
     """Return the learning rate: warm-up by steps, then constant, then a cosine down to 0."""
-    left = min((1.0 - progress) / (1.0 - settings.constant_share), 1.0)
-    share = 0.5 - 0.5 * math.cos(math.pi * left)
-    return settings.learning_rate * share * min((steps + 1) / settings.warmup_steps, 1.0)
+    share = 0.5 - 0.5 * math.cos(math.pi * left_to_fall(settings, progress))
+    return warmed_up(settings, share, steps)
 
 
 def _step_of(
@@ -161,14 +141,7 @@ def _step_of(
     is_cuda = network.spread.is_cuda
     if is_cuda:
         network.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
-    # Norms, biases and tokens are not pulled toward 0.
-    pulled = [p for p in network.parameters() if p.dim() > 1 and p is not network.asking]
-    plain = [p for p in network.parameters() if p.dim() < 2 or p is network.asking]
-    groups = [
-        {"params": pulled, "weight_decay": settings.weight_decay},
-        {"params": plain, "weight_decay": 0.0},
-    ]
-    optimizer = torch.optim.AdamW(groups, betas=(0.9, 0.99), fused=is_cuda)
+    optimizer = make_optimizer(network, settings, fused=is_cuda)
     network.train()
 
     def step(batch: CameraBatch, rate: float) -> Tensor:

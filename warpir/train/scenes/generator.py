@@ -52,10 +52,8 @@ class Mixture:
 class SceneGenerator:
     """Draws and renders batches; batch k is a function of the seed and k alone.
 
-    Args:
-        panoramas: From `warpir.train.lights.load_panoramas`; may be none. Their device is used.
-        seed: Of everything that is drawn.
-        mixture: Shares of what is drawn.
+    Panoramas, of `warpir.train.lights.load_panoramas`, may be none; their device is used. The
+    mixture has the shares of what is drawn.
     """
 
     def __init__(self, panoramas: LightPool, seed: int, mixture: Mixture | None = None) -> None:
@@ -78,12 +76,7 @@ class SceneGenerator:
         return self._pool[1]
 
     def photo_batch(self, index: int, count: int) -> PhotoBatch:
-        """Return photos and their light.
-
-        Args:
-            index: Which batch.
-            count: Photos in it.
-        """
+        """Return photos and their light."""
         generator = self._generator(3, index)
         scenes = self._draw(index, count, generator)
         made = render(scenes, PHOTO_SIZE)

@@ -144,10 +144,6 @@ def draw_views(draw: Sampler, place_kind: Tensor) -> Views:
 def draw_stands(draw: Sampler, views: Views) -> tuple[Tensor, Tensor]:
     """Draw what the solids of each scene stand around: a point on the ground, below the horizon.
 
-    Args:
-        draw: For the scenes of the batch.
-        views: Their cameras.
-
     Returns:
         Points, world frame [m], shape [B, 3], and the size of what could stand there [m], [B].
     """
@@ -172,12 +168,9 @@ def draw_grounds(
 ) -> dict[str, Tensor]:
     """Draw the grounds, columns of the kernel's ``GroundTable``.
 
-    Args:
-        draw: For the scenes of the batch.
-        is_panorama: Scenes whose photo is a panorama crop: their ground is only assumed.
-        seen: Panorama behind each scene, -1 for none, shape [B].
-        camera_height: Above the ground [m], shape [B].
-        texture_count: Panoramas whose texels may cover a ground.
+    Scenes whose photo is a panorama crop only assume their ground. ``seen``, the panorama behind
+    each scene, -1 for none, and the cameras' heights above the ground [m] have shape [B]; texels of
+    ``texture_count`` panoramas may cover a ground.
     """
     zero = torch.zeros_like(camera_height)
     albedo = draw_colours(draw, 0.06, 0.55)

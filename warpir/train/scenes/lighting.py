@@ -71,15 +71,11 @@ def lighting_of(pool: LightPool, index: Tensor, yaw: Tensor, is_mirrored: Tensor
 
 
 def draw_directions(light: Lighting, maps: Tensor, generator: torch.Generator) -> dict[str, Tensor]:
-    """Draw directions that stand for the lights, and the flux of each.
+    """Draw directions that stand for the lights, one for each scene, and the flux of each.
 
     Half of them follow the luminance, half the solid angle; drawn systematically over the
-    texels, so every fourth one of them covers the whole sphere too.
-
-    Args:
-        light: One for each scene.
-        maps: Of the pool, without suns, shape [light, He, We, 3].
-        generator: Of the maps' device.
+    texels, so every fourth one of them covers the whole sphere too. The pool's maps, without suns,
+    have shape [light, He, We, 3]; the generator is of their device.
     """
     fine = maps[light.map.long()]
     count, height, width, _ = fine.shape

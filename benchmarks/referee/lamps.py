@@ -1,0 +1,257 @@
+"""Do lamps near the object light it, and the ground, as Mitsuba's own emitters do?
+
+    python -m benchmarks.referee.lamps --spp 4096
+
+Mitsuba's lamps are surfaces and block light, ours do not: they stand where that changes nothing,
+outside the object's convex hull where paths have more than one interaction. Light from afar is a
+render of its own in Mitsuba, and is added. Mitsuba's own ``path`` traces all of it.
+"""
+
+import argparse
+import json
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import mitsuba as mi
+import numpy as np
+
+from benchmarks.referee.sheet import block_sums
+from benchmarks.referee.subjects import ball, sun_and_sky
+from warpir.core.arrays import Float64Array, FloatArray
+from warpir.mitsuba.render import ObjectScene, build, mean_and_variance, sums
+from warpir.render.device_light import light_args
+from warpir.render.device_scene import Placed, Receiver, Scene
+from warpir.render.renderer import Renderer
+from warpir.scene.asset import Asset, Material, Primitive
+from warpir.scene.camera import Camera
+from warpir.scene.light import Light
+from warpir.scene.near.lamps import Lamp, RectangleLamp, SphereLamp
+
+SEED_COUNT = 32
+"""Independent runs behind each variance."""
+GROUND = (0.0, 1.0, 0.0, 0.0)
+DARK = np.zeros((8, 16, 3), np.float32)
+HORIZON = 150.0
+"""Where Mitsuba's ground ends, in radii of the object: further than the pictures show."""
+FLOOR = 1e-3
+"""Error that is granted, over the root mean square of a picture [1]."""
+BLOCK = 8
+"""Side of the blocks of pixels that are compared as one [px]."""
+POWER = np.array([60.0, 45.0, 30.0])
+GLOSS = Material(base_color=(0.7, 0.4, 0.2), metallic=0.3, roughness=0.35)
+PAPER = Material(base_color=(0.8, 0.8, 0.7), metallic=0.0, roughness=0.8, double_sided=True)
+
+
+def camera(width: int = 96, height: int = 64) -> Camera:
+    """Look down at the object from before it."""
+    pose, a = np.eye(4), np.radians(-20.0)
+    pose[1:3, 1:3] = [[np.cos(a), -np.sin(a)], [np.sin(a), np.cos(a)]]
+    pose[:3, 3] = (0.0, 2.0, 4.5)
+    return Camera(width, height, 96.0, 96.0, width / 2.0, height / 2.0, pose)
+
+
+def card(corner: tuple[float, ...], x: tuple[float, ...], y: tuple[float, ...]) -> Primitive:
+    """Return a flat parallelogram in the second material."""
+    c, a, b = (np.array(v) for v in (corner, x, y))
+    faces = np.array([[0, 1, 2], [0, 2, 3]], np.int32)
+    return Primitive(np.array([c, c + a, c + a + b, c + b]), faces, 1)
+
+
+def pair() -> Asset:
+    """Return a glossy ball before an upright card."""
+    small = ball()
+    round_one = Primitive(0.4 * small.positions + [0.0, 0.41, 0.0], small.indices, 0, small.normals)
+    return Asset(
+        "pair", (round_one, card((-0.8, 0.01, -0.6), (1.6, 0, 0), (0, 1.0, 0))), (GLOSS, PAPER)
+    )
+
+
+def shade() -> Asset:
+    """Return four walls around a lamp, open above and just off the ground."""
+    walls = (
+        card((-0.4, 0.1, 0.4), (0.8, 0, 0), (0, 0.7, 0)),
+        card((0.4, 0.1, 0.4), (0, 0, -0.8), (0, 0.7, 0)),
+        card((0.4, 0.1, -0.4), (-0.8, 0, 0), (0, 0.7, 0)),
+        card((-0.4, 0.1, -0.4), (0, 0, 0.8), (0, 0.7, 0)),
+    )
+    return Asset("shade", walls, (GLOSS, PAPER))
+
+
+@dataclass(frozen=True)
+class Case:
+    """An object among lamps."""
+
+    asset: Asset
+    lamps: tuple[Lamp, ...]
+    depths: tuple[int, ...] = (1, 4)
+    """Of the object."""
+    texels: FloatArray | None = None
+    """Light from afar."""
+    is_cut: bool = False
+    """Whether a lamp is partly below the ground."""
+    ground_depths: tuple[int, ...] = (1, 2)
+    """Of the ground, itself included; 1 where Mitsuba's lamp hides it from the object."""
+
+
+def cases() -> dict[str, Case]:
+    """Return what is compared, by name."""
+    beside = SphereLamp(np.array([-1.1, 1.3, 0.9]), 0.2, POWER)
+    touching = SphereLamp(np.array([-0.65, 0.31, 0.55]), 0.3, POWER)
+    flat = RectangleLamp(
+        np.array([1.2, 1.5, 0.8]), np.array([0.0, 0.0, 0.7]), np.array([-0.4, 0.5, 0.0]), POWER
+    )
+    sunk = SphereLamp(np.array([-0.9, 0.0, 0.6]), 0.25, POWER)
+    within = SphereLamp(np.array([0.05, 0.4, 0.0]), 0.1, POWER)
+    sky = sun_and_sky(np.random.default_rng(5), 16) / 8.0
+    return {
+        "sphere": Case(pair(), (beside,)),
+        "rectangle": Case(pair(), (flat,)),
+        "both_and_sky": Case(pair(), (beside, flat), texels=sky.astype(np.float32)),
+        "close": Case(pair(), (touching,), (1,), ground_depths=(1,)),
+        "on_the_ground": Case(pair(), (sunk,), (1,), is_cut=True, ground_depths=(1,)),
+        "in_the_object": Case(shade(), (within,), (1,), ground_depths=(1,)),
+    }
+
+
+class Runs(NamedTuple):
+    """Mean and its variance over runs, shape [H, W, 3] each."""
+
+    mean: Float64Array
+    variance: Float64Array
+
+
+def runs_of(pictures: list[Float64Array]) -> Runs:
+    """Return the moments of independent pictures."""
+    stack = np.stack(pictures)
+    return Runs(stack.mean(axis=0), stack.var(axis=0, ddof=1) / len(stack))
+
+
+def paths_of(
+    made: ObjectScene, integrator: mi.Integrator, scene: mi.Scene | None = None
+) -> Callable[[int, int], tuple[mi.Color3f, mi.Bool]]:
+    """Return what traces a pass through a scene, or one like it, by an integrator of Mitsuba's."""
+
+    def trace(seed: int, spp: int) -> tuple[mi.Color3f, mi.Bool]:
+        sampler, _ = made.integrator.prepare(made.sensor, seed, spp)
+        ray, _, _ = made.integrator.sample_rays(made.scene, made.sensor, sampler)
+        L, seen, *_ = integrator.sample(scene or made.scene, sampler, ray)
+        return L, seen
+
+    return trace
+
+
+def theirs(case: Case, view: Camera, depth: int, spp: int, is_ground: bool) -> Runs:
+    """Render by Mitsuba's path tracer: the object over black ground, or white ground beside it."""
+    integrator = mi.load_dict({"type": "path", "max_depth": depth + 1, "hide_emitters": True})
+    parts: list[tuple[FloatArray, tuple[Lamp, ...]]] = [(DARK, case.lamps)]
+    if case.texels is not None:
+        parts.append((case.texels, ()))
+    ground = GROUND if is_ground or case.is_cut else None
+    shape = (view.height, view.width)
+    mean, variance = np.zeros((*shape, 3)), np.zeros((*shape, 3))
+    for k, (texels, lamps) in enumerate(parts):
+        lit = float(is_ground), lamps, HORIZON
+        made = build(case.asset, np.eye(4), view, texels, depth, ground, *lit)
+        moments, _ = sums(view, spp, 7 + k, paths_of(made, integrator))
+        parts_of = mean_and_variance(moments, spp)
+        mean, variance = mean + parts_of[0], variance + parts_of[1]
+    return Runs(mean, variance)
+
+
+def renderer(case: Case, view: Camera, bounce_depth: int) -> Renderer:
+    """Return ours, over the plane ``y = 0``."""
+    receiver = Receiver(np.array(GROUND[:3]), 0.0)
+    scene = Scene([Placed(case.asset, np.eye(4))], view, receiver, "cpu", case.lamps)
+    return Renderer(scene, bounce_depth=bounce_depth)
+
+
+def ours(case: Case, view: Camera, depth: int, spp: int, is_ground: bool) -> Runs:
+    """Render the same; the ground by paths of ``depth`` interactions, that with it included."""
+    r = renderer(case, view, depth - 1 if is_ground else 0)
+    texels = DARK if case.texels is None else case.texels
+    light, pixels = light_args(Light(texels=texels), r.device), np.arange(view.width * view.height)
+    pixels, each = pixels.astype(np.int32), spp // SEED_COUNT
+    pictures = []
+    for seed in range(SEED_COUNT):
+        if is_ground:
+            picture = r.receiver(light, pixels, np.ones_like(pixels), each, 1, seed).lit
+        else:
+            picture = r.foreground(light, pixels, each, 1, depth, seed).radiance
+        pictures.append(picture.reshape(view.height, view.width, 3).astype(np.float64))
+    return runs_of(pictures)
+
+
+def clear_of(lamps: tuple[Lamp, ...], view: Camera) -> Float64Array:
+    """Return False in pixels that Mitsuba's spheres may cover, shape [H, W, 1]."""
+    u, v = np.meshgrid(np.arange(view.width) + 0.5, np.arange(view.height) + 0.5)
+    local = np.stack([(u - view.cx) / view.fx, (view.cy - v) / view.fy, -np.ones_like(u)], axis=-1)
+    rays = local @ view.c2w[:3, :3].T
+    rays /= np.linalg.norm(rays, axis=-1, keepdims=True)
+    clear = np.ones((view.height, view.width, 1), bool)
+    for lamp in lamps:
+        if isinstance(lamp, SphereLamp):
+            toward = lamp.center - view.c2w[:3, 3]
+            beside = np.linalg.norm(np.cross(rays, toward), axis=-1)
+            pixel = np.linalg.norm(toward) / view.fx
+            clear[..., 0] &= beside > lamp.radius + pixel
+    return clear
+
+
+def compare(a: Runs, b: Runs, counts: Float64Array) -> dict[str, float]:
+    """Return z scores of pixels and of blocks, over pixels that count."""
+    # Where hardly a path brings light, the spread of samples says nothing of their error.
+    floor = FLOOR * np.sqrt(np.square(b.mean[counts & (b.mean != 0.0)]).mean())
+    variance = a.variance + b.variance + floor**2
+    seen = counts & ((a.mean != 0.0) | (b.mean != 0.0))
+    z = (a.mean - b.mean)[seen] / np.sqrt(variance[seen])
+    off, spread = (
+        block_sums(np.where(seen, plane, 0.0), BLOCK) for plane in (a.mean - b.mean, variance)
+    )
+    of_blocks = off[spread > 0.0] / np.sqrt(spread[spread > 0.0])
+    level = np.sqrt(np.square(b.mean[seen]).mean())
+    difference = (a.mean - b.mean)[seen]
+    return {
+        "pixels": int(seen.any(axis=-1).sum()),
+        "z_mean": float(z.mean()),
+        "z_std": float(z.std()),
+        "beyond_3": float((np.abs(z) > 3.0).mean()),
+        "block_z_std": float(of_blocks.std()),
+        "block_z_max": float(np.abs(of_blocks).max()),
+        "relative_rmse": float(np.sqrt(np.square(difference).mean()) / level),
+        "expected_rmse": float(np.sqrt(variance[seen].mean()) / level),
+        "relative_bias": float(difference.sum() / np.abs(b.mean[seen]).sum()),
+        "relative_bias_error": float(np.sqrt(variance[seen].sum()) / np.abs(b.mean[seen]).sum()),
+    }
+
+
+def main() -> None:
+    """Print one line of JSON a comparison."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--spp", type=int, default=4096)
+    parser.add_argument("--cases", nargs="*", default=list(cases()))
+    options = parser.parse_args()
+    view = camera()
+    for name in options.cases:
+        case = cases()[name]
+        pixels = np.arange(view.width * view.height, dtype=np.int32)
+        r = renderer(case, view, 0)
+        mask = r.foreground(light_args(Light(texels=DARK), r.device), pixels, 64, 1, 1, 7).mask
+        covered = np.zeros(len(pixels), bool)
+        covered[r.gbuffer(3, 64).object_pixels] = True
+        everywhere = np.ones((view.height, view.width, 3), bool)
+        open_ground = everywhere & ~(covered | (mask > 0.0)).reshape(view.height, view.width, 1)
+        everywhere &= clear_of(case.lamps, view)
+        open_ground &= everywhere
+        for what, depths in (("object", case.depths), ("ground", case.ground_depths)):
+            for depth in depths:
+                is_ground = what == "ground"
+                found = ours(case, view, depth, options.spp, is_ground)
+                true = theirs(case, view, depth, options.spp, is_ground)
+                line = {"case": name, "what": what, "depth": depth, "spp": options.spp}
+                counts = open_ground if is_ground else everywhere
+                print(json.dumps(line | compare(found, true, counts)), flush=True)
+
+
+if __name__ == "__main__":
+    main()

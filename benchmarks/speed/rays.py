@@ -1,0 +1,90 @@
+"""Rays per second through the demo's car, by Embree and by Warp's tree: the bound of a render.
+
+python -m benchmarks.speed.rays [--device cpu]
+"""
+
+from __future__ import annotations
+
+import argparse
+import time
+from importlib.resources import files
+from pathlib import Path
+
+import numpy as np
+import warp as wp
+
+from warpir.io.assets import load_asset
+from warpir.kernels.tracing.triangles import any_triangle, closest_triangle
+from warpir.kernels.types import MeshArgs
+from warpir.render.device_scene import Placed, Receiver, Scene
+from warpir.scene.camera import Camera
+
+RAYS = 1 << 19
+
+
+@wp.kernel(module="unique", enable_backward=False)
+def cast_any(mesh: MeshArgs, origin: wp.array[wp.vec3], wi: wp.array[wp.vec3], hits: wp.array[int]):
+    """Count rays that meet a triangle."""
+    i = wp.tid()
+    hits[i] = int(any_triangle(mesh, origin[i], wi[i], 1.0e30))
+
+
+@wp.kernel(module="unique", enable_backward=False)
+def cast_closest(
+    mesh: MeshArgs, origin: wp.array[wp.vec3], wi: wp.array[wp.vec3], hits: wp.array[int]
+):
+    """Count rays that meet a triangle, each at its first."""
+    i = wp.tid()
+    hits[i] = closest_triangle(mesh, origin[i], wi[i], 1.0e30).valid
+
+
+def rays_of(scene: Scene, rng: np.random.Generator) -> dict[str, tuple[np.ndarray, np.ndarray]]:
+    """Return origins and unit directions, from the ground to the car and from its surface."""
+    low, high = (np.asarray(corner) - scene.origin for corner in scene.bounds)
+    ground = rng.normal(size=(RAYS, 3)) * [3.0, 0.0, 3.0] + 0.5 * (low + high)
+    ground[:, 1] = low[1]
+    toward = low + (high - low) * rng.random((RAYS, 3)) - ground
+    toward /= np.linalg.norm(toward, axis=1, keepdims=True)
+    corners = scene.mesh_args.indices.numpy().reshape(-1, 3)
+    corners = corners[rng.integers(len(corners), size=RAYS)]
+    weights = rng.dirichlet([1.0, 1.0, 1.0], size=RAYS)[..., None]
+    surface = (scene.mesh_args.positions.numpy()[corners] * weights).sum(axis=1)
+    away = rng.normal(size=(RAYS, 3))
+    away /= np.linalg.norm(away, axis=1, keepdims=True)
+    return {"ground": (ground, toward), "surface": (surface + 1e-3 * away, away)}
+
+
+def main() -> None:
+    """Print a line per tree and kind of ray."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--device", default="cpu")
+    device = wp.get_device(parser.parse_args().device)
+    asset = load_asset(Path(str(files("warpir.demo") / "car.glb")))
+    camera = Camera(64, 64, 64.0, 64.0, 32.0, 32.0, np.eye(4))
+    ground = Receiver(np.array([0.0, 1.0, 0.0]), 0.0)
+    scene = Scene([Placed(asset, np.eye(4))], camera, ground, device.alias)
+    trees = {"Warp": MeshArgs(), "Embree": scene.mesh_args}
+    trees["Warp"].id = scene.mesh_args.id
+    if not scene.mesh_args.embree:
+        del trees["Embree"]
+    for where, (origin, wi) in rays_of(scene, np.random.default_rng(0)).items():
+        arrays = [
+            wp.array(a.astype(np.float32), dtype=wp.vec3, device=device) for a in (origin, wi)
+        ]
+        for kind, kernel in (("any", cast_any), ("closest", cast_closest)):
+            for tree, mesh in trees.items():
+                hits = wp.zeros(RAYS, dtype=int, device=device)
+                wp.launch(kernel, 1, [mesh, *arrays, hits], device=device)
+                wp.synchronize_device(device)
+                start = time.perf_counter()
+                wp.launch(kernel, RAYS, [mesh, *arrays, hits], device=device)
+                wp.synchronize_device(device)
+                seconds = time.perf_counter() - start
+                share = hits.numpy().mean()
+                print(
+                    f"{where:8} {kind:8} {tree:7} {RAYS / seconds / 1e6:7.1f} M/s, {share:.3f} hit"
+                )
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,1 @@
+"""Solid glass: an interface that reflects and refracts, and what light loses behind it."""

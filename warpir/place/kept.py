@@ -1,0 +1,107 @@
+"""What the process for the page keeps between two jobs."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from functools import lru_cache
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+from PIL import Image
+
+from warpir.app.config import InsertConfig
+from warpir.app.inputs import Inputs, Loaders, read_photo_of
+from warpir.app.settings import InputConfig
+from warpir.core.arrays import FloatArray
+from warpir.core.limits import Limits
+from warpir.io.images.photos import Photo
+from warpir.place.preview_asset import preview_asset
+from warpir.scene.asset import Asset
+from warpir.scene.camera import Camera
+
+if TYPE_CHECKING:
+    from warpir.lighting.regression import Regression
+
+LIGHTS = 4
+"""Estimated lights that are kept: undo goes back to cameras of before."""
+
+PhotoKey = tuple[InputConfig, Limits]
+
+
+class Kept(Loaders):
+    """Reads as `Loaders` do, and remembers the photo too, and what follows from it and the object.
+
+    Photo and object are those of one session: what was read is not read again.
+    """
+
+    def __init__(self) -> None:
+        super().__init__()
+        self._read = lru_cache(maxsize=1)(read_photo_of)
+        self.photo = lambda asked, limits: self._read(*_key(asked, limits))
+        self._small: tuple[Photo, tuple[int, int], Photo] | None = None
+        self._thin: tuple[InputConfig, Asset] | None = None
+        self._light = lru_cache(maxsize=LIGHTS)(self._regression)
+
+    def shrunk(self, inputs: Inputs, width: int) -> Inputs:
+        """Return the inputs with photo, camera and mask at most this wide [px]."""
+        photo, camera, occluder = inputs.photo, inputs.camera, inputs.occluder
+        if camera.width <= width:
+            return inputs
+        size = width, max(1, round(width * camera.height / camera.width))
+        if self._small is None or self._small[0] is not photo or self._small[1] != size:
+            self._small = photo, size, _small_photo(photo, size)
+        occluder = None if occluder is None else _small_plane(occluder, size)
+        photo = self._small[2]
+        return replace(inputs, photo=photo, camera=camera.scaled(*size), occluder=occluder)
+
+    def thinned(self, inputs: Inputs, asked: InputConfig) -> Inputs:
+        """Return the inputs with the object as the browser has it, where it is that heavy."""
+        key = replace(asked, occluder_mask=None)
+        if self._thin is None or self._thin[0] != key:
+            self._thin = key, preview_asset(inputs.asset)
+        return replace(inputs, asset=self._thin[1])
+
+    def regression(self, config: InsertConfig, camera: Camera) -> Regression:
+        """Return the light that the regressor sees in the photo, by a camera of its size.
+
+        Raises:
+            InputError: The photo or the weights cannot be read.
+        """
+        lens = camera.width, camera.height, camera.fx, camera.fy, camera.cx, camera.cy
+        # From the page and through a file it is the same camera but for the last digits.
+        pose = tuple(float(part) for part in np.round(camera.c2w, 9).ravel())
+        key = _key(config.inputs, config.limits)
+        return self._light(key, config.light.regressor, lens, pose)
+
+    def _regression(
+        self,
+        photo: PhotoKey,
+        weights: str | None,
+        lens: tuple[int, int, float, float, float, float],
+        pose: tuple[float, ...],
+    ) -> Regression:
+        from warpir.lighting.regression import regress
+        from warpir.lighting.regressor import load_regressor
+
+        camera = Camera(*lens, np.reshape(pose, (4, 4)))
+        network = load_regressor(None if weights is None else Path(weights), "cpu")
+        return regress(network, self._read(*photo).srgb, camera)
+
+
+def _key(asked: InputConfig, limits: Limits) -> PhotoKey:
+    """Return what says which photo it is, and how it is read."""
+    return replace(asked, asset=None, asset_up=None, materials=None, occluder_mask=None), limits
+
+
+def _small_photo(photo: Photo, size: tuple[int, int]) -> Photo:
+    def each(planes: FloatArray) -> FloatArray:
+        return np.stack([_small_plane(planes[..., k], size) for k in range(3)], axis=-1)
+
+    srgb = each(photo.srgb)
+    codes = each(photo.codes) if photo.is_linear else np.round(srgb * 255.0).astype(np.uint8)
+    return replace(photo, codes=codes, srgb=srgb, kind="png", icc=None, jpeg=None)
+
+
+def _small_plane(plane: FloatArray, size: tuple[int, int]) -> FloatArray:
+    return np.asarray(Image.fromarray(plane).resize(size, Image.Resampling.BOX))
