@@ -27,7 +27,7 @@ from warpir.app.config import (
     flag,
 )
 from warpir.app.record import RUN_FORMAT
-from warpir.app.settings import OptimizeSettings
+from warpir.app.settings import OptimizeSettings, RenderConfig
 from warpir.core.errors import ExitCode, InputError, raise_all
 from warpir.core.limits import Limits
 from warpir.diffusion.settings import GuidanceSettings, ModelSettings, PersonalizeSettings
@@ -547,6 +547,24 @@ def test_config_file_yields_to_flags(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
+    ("asked", "size", "samples"),
+    [
+        (None, (1280, 853), 64),
+        (None, (2000, 1500), 64),
+        (None, (4000, 1500), 32),
+        (None, (4000, 3000), 16),
+        (None, (20000, 10000), 16),
+        (7, (4000, 3000), 7),
+    ],
+)
+def test_large_pictures_have_fewer_samples(
+    asked: int | None, size: tuple[int, int], samples: int
+) -> None:
+    """Unless their number is given."""
+    assert RenderConfig(samples=asked).samples_at(*size) == samples
+
+
+@pytest.mark.parametrize(
     ("name", "text", "words"),
     [
         ("c.yaml", "sampels: 3\n", "unknown key 'sampels'"),
@@ -555,7 +573,7 @@ def test_config_file_yields_to_flags(tmp_path: Path) -> None:
         ("c.yaml", "fov: 1e400\n", "finite"),
         ("c.yaml", "samples: true\n", "whole number"),
         ("c.yaml", "samples: -3\n", "at least 1"),
-        ("c.yaml", "samples: null\n", "whole number"),
+        ("c.yaml", "depth: null\n", "whole number"),
         ("c.yaml", "seed: 1.5\n", "whole number"),
         ("c.yaml", "overwrite: 1\n", "true or false"),
         ("c.yaml", "place: {x: 1}\n", "X,Y,Z"),

@@ -565,6 +565,21 @@ def test_demo_runs_small(tmp_path: Path, device: str) -> None:
     assert checked.found == {"is_done": True}, "a batch knows it by the files of the package"
 
 
+def test_preview_of_a_large_photo_is_small(inputs: Path, tmp_path: Path, device: str) -> None:
+    """With what stays in front of the object; the result has the photo's size."""
+    large = {"photo": tmp_path / "photo.png", "mask": tmp_path / "mask.png"}
+    Image.fromarray(read_image(inputs / "photo.png")[0]).resize((1728, 1152)).save(large["photo"])
+    Image.new("L", (1728, 1152)).save(large["mask"])
+    argv = arguments(
+        inputs, tmp_path / "out", photo=str(large["photo"]), occluder_mask=str(large["mask"]),
+        light=None, at="860,800", place=None, width="64", device=device, samples=None,
+    )  # fmt: skip
+    run = go(argv, tmp_path / "out")
+    assert run.image().shape == (1152, 1728, 3)
+    assert run.image("progress/preview-000000.png").shape == (576, 864, 3)
+    assert run.record["measured"]["samples"] == 64
+
+
 @pytest.mark.parametrize("change", ["replaced", "removed"])
 def test_inputs_that_change_while_it_renders(
     inputs: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, change: str

@@ -6,7 +6,13 @@ from scipy import ndimage
 
 from warpir.core.arrays import FloatArray
 from warpir.look.camera_look import CameraLook, region_around
-from warpir.look.sharpness import PIXEL_SIGMA, EdgeBlur, blurred_layers, estimate_blur
+from warpir.look.sharpness import (
+    PIXEL_SIGMA,
+    EdgeBlur,
+    _blurred,
+    blurred_layers,
+    estimate_blur,
+)
 
 FINER = 6
 """Rows and columns of the ideal picture in a pixel."""
@@ -75,6 +81,25 @@ def test_layers_are_blurred_alike() -> None:
     assert blurred["shadow_ratio"][41, 30].max() < 0.25
     assert (blurred["shadow_ratio"][:10] == 1.0).all()
     assert blurred_layers(planes, 0.0, ("foreground",)) is planes
+
+
+@pytest.mark.parametrize("middle", [(40, 50), (2, 3), (79, 118), (40, 0)])
+@pytest.mark.parametrize("sigma", [0.3, 1.2, 4.0])
+def test_a_part_is_blurred_as_the_whole(middle: tuple[int, int], sigma: float) -> None:
+    """Pixels far from the object cost nothing, and no byte of any plane knows."""
+    rng = np.random.default_rng(4)
+    row, column = np.mgrid[0:80, 0:120]
+    seen = np.hypot(row - middle[0], column - middle[1]) < 9
+    matte = np.where(seen, rng.uniform(0.0, 1.0, seen.shape), 0.0).astype(np.float32)
+    ratio = np.ones((80, 120, 3), np.float32)
+    shaded = np.roll(seen, 4, axis=0)
+    ratio[shaded] = rng.uniform(0.1, 1.0, (int(shaded.sum()), 3))
+    planes = {"matte": matte, "foreground": matte[..., None] * ratio, "shadow_ratio": ratio}
+    part, whole = blurred_layers(planes, sigma, ("foreground",)), _blurred(planes, sigma)
+    for name in planes:
+        np.testing.assert_array_equal(part[name], whole[name], err_msg=name)
+    bare = {"matte": 0.0 * matte, "shadow_ratio": np.ones_like(ratio)}
+    assert blurred_layers(bare, sigma, ()) is bare
 
 
 def test_nothing_is_sharpened() -> None:

@@ -327,7 +327,7 @@ def test_a_scene_without_solid_glass_has_todays_materials(device: str) -> None:
     assert not thin.scene.has_solid_glass
     assert thin.scene.shadow_material_args is thin.scene.material_args
     solid = renderer(placed(BODIES["box"](), GLASS), DOWN, device)
-    assert solid.scene.has_solid_glass and not solid.scene.has_glass
+    assert solid.scene.has_solid_glass and solid.scene.glass_bounds is None
     assert len(list(solid.scene.contents())) > len(list(thin.scene.contents()))
 
 

@@ -190,12 +190,17 @@ class LightConfig:
         return 0.25 if self.ground_albedo is None else self.ground_albedo
 
 
+SAMPLED_PIXELS = 3_000_000
+"""Pixels above which a picture has fewer samples in each: seen whole, it has the same noise."""
+
+
 @dataclass(frozen=True)
 class RenderConfig:
     """How the picture is rendered, and on what."""
 
-    samples: int = option(64, "N", low=1, high=2**20)
-    """Samples per pixel"""
+    samples: int | None = option(None, "N", low=1, high=2**20)
+    """Samples per pixel (default: 64; above 3 megapixels the fewer, the more pixels share what is
+    seen, down to 16)"""
     rays: int = option(1, "N", low=1, high=2**10)
     """Rays per sample, of light and of surface each"""
     depth: int = option(5, "D", low=1, high=2**10)
@@ -225,6 +230,12 @@ class RenderConfig:
     """Seed of all random numbers"""
     deterministic: bool = option(False)
     """Repeat the same bytes on a GPU too, slower; on the CPU every run does"""
+
+    def samples_at(self, width: int, height: int) -> int:
+        """Return the samples of each pixel of a picture of this size [px]."""
+        if self.samples is not None:
+            return self.samples
+        return min(64, max(16, round(64 * SAMPLED_PIXELS / (width * height))))
 
     @property
     def bounce_depth(self) -> int:

@@ -201,7 +201,7 @@ def _stored_channels(
             expected = (height, width, len(names))
             raise ValueError(f"layer {name}: shape {plane.shape}, expected {expected}")
         is_float = name in _FULL_FLOATS or (is_deep and name in _DEEP)
-        if not is_float:
+        if not is_float and not np.abs(plane).max(initial=0.0) < HALF_MAX:
             clamped += int((np.isfinite(plane) & (np.abs(plane) >= HALF_MAX)).sum())
             # NaN and Inf pass through, and the writer refuses them.
             plane = np.where(np.isfinite(plane), np.clip(plane, -HALF_MAX, HALF_MAX), plane)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -25,6 +26,8 @@ CLIPPED = 0.97
 """Display-linear value from which a channel may be clipped, which makes edges look sharper."""
 PIXEL_SIGMA = 12.0**-0.5
 """Standard deviation of a square pixel, the blur that a rendered edge has already [px]."""
+TRUNCATE = 3.5
+"""Standard deviations at which a Gaussian that blurs a picture is cut."""
 
 
 @dataclass(frozen=True)
@@ -124,14 +127,31 @@ def blurred_layers(
     """
     if sigma <= 0.0:
         return planes
-    result = dict(planes)
+    shown = (planes["matte"] > 0.0) | (planes["shadow_ratio"] != 1.0).any(axis=-1)
+    if not shown.any():
+        return planes
+    reach = math.ceil(TRUNCATE * sigma) + 1
+    box = tuple(
+        # Twice as far as the blur reaches, so that its own border has nothing to mirror.
+        slice(max(0, int(where.min()) - 2 * reach), int(where.max()) + 2 * reach + 1)
+        for where in np.nonzero(shown)
+    )
+    names = (*summed, "matte", "shadow_ratio")
+    part = _blurred({name: planes[name][box] for name in names}, sigma)
+    result = planes | {name: planes[name].copy() for name in names}
+    for name in names:
+        result[name][box] = part[name]
+    return result
+
+
+def _blurred(planes: dict[str, FloatArray], sigma: float) -> dict[str, FloatArray]:
+    """Blur every plane, shape [H, W] or [H, W, 3]; ``shadow_ratio`` as `blurred_layers` says."""
 
     def blur(plane: FloatArray) -> FloatArray:
         widths = (sigma, sigma, 0.0)[: plane.ndim]
-        return np.asarray(ndimage.gaussian_filter(plane, widths, truncate=3.5), np.float32)
+        return np.asarray(ndimage.gaussian_filter(plane, widths, truncate=TRUNCATE), np.float32)
 
-    for name in (*summed, "matte"):
-        result[name] = blur(planes[name])
+    result = {name: blur(plane) for name, plane in planes.items() if name != "shadow_ratio"}
     seen = 1.0 - planes["matte"]
     weight = blur(seen)[..., None]
     # In differences from 1, so that ground beyond the shadow stays exactly 1.

@@ -426,8 +426,9 @@ def photo_radiance(photo: Photo, curves: Curves, width_max: int = RECEIVER_WIDTH
 def _halves(plane: FloatArray) -> FloatArray:
     """Round to what half-precision numbers can hold; what shines brighter is clamped there."""
     # All values are display-linear, near [0, 1] but for strong emitters. NaN and Inf pass through.
-    held = np.where(np.isfinite(plane), np.clip(plane, -HALF_MAX, HALF_MAX), plane)
-    rounded: FloatArray = held.astype(np.float16).astype(np.float32)
+    if not np.abs(plane).max(initial=0.0) < HALF_MAX:
+        plane = np.where(np.isfinite(plane), np.clip(plane, -HALF_MAX, HALF_MAX), plane)
+    rounded: FloatArray = plane.astype(np.float16).astype(np.float32)
     return rounded
 
 

@@ -7,7 +7,7 @@ become float32, so an object 100 km from the origin keeps its precision.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from copy import copy
 from dataclasses import dataclass
 from typing import Any, cast
@@ -178,6 +178,19 @@ def _extensions(material: Material, transmission: float) -> Extensions:
     return out
 
 
+Corners = tuple[Float64Array, Float64Array]
+"""Lowest and highest corner of a box, world frame [m], shape [3] each."""
+
+
+def _corners(parts: Iterable[_Vertices]) -> Corners | None:
+    """Return the box of some triangles; None without any."""
+    boxes = [(v.positions.min(axis=0), v.positions.max(axis=0)) for v in parts]
+    if not boxes:
+        return None
+    lows, highs = zip(*boxes, strict=True)
+    return np.min(lows, axis=0), np.max(highs, axis=0)
+
+
 class Scene:
     """Geometry, materials, plane and camera on one device; owns every Warp handle for the run.
 
@@ -193,7 +206,8 @@ class Scene:
     Attributes:
         origin: World point that is the recentred origin [m], shape [3].
         diagonal: Diagonal of the objects' bounding box [m].
-        has_glass: Whether some material is a thin wall that light passes.
+        bounds: Of the objects.
+        glass_bounds: Of what is a thin wall that light passes; None: nothing is.
         has_solid_glass: Whether some material is a body of glass, which bends light.
         rays: Whose tree of the triangles finds hits, ``Embree`` or ``Warp``.
     """
@@ -224,12 +238,11 @@ class Scene:
             scale = abs(float(np.linalg.det(placed.asset_to_world[:3, :3]))) ** (1.0 / 3.0)
             scales += [scale] * len(placed.asset.materials)
             textures += placed.asset.textures
-        if parts:
-            low = np.min([v.positions.min(axis=0) for v, _ in parts], axis=0)
-            high = np.max([v.positions.max(axis=0) for v, _ in parts], axis=0)
-        else:
-            low = high = camera.c2w[:3, 3]
-        self.bounds = (low, high)
+        thin = {k for k, (m, _) in enumerate(materials) if m.transmission and not m.is_solid_glass}
+        eye = camera.c2w[:3, 3]
+        self.bounds = _corners(v for v, _ in parts) or (eye, eye)
+        self.glass_bounds = _corners(v for v, material in parts if material in thin)
+        low, high = self.bounds
         self.origin: Float64Array = 0.5 * (low + high)
         self.diagonal = float(np.linalg.norm(high - low))
         self.triangle_count = sum(len(v.indices) for v, _ in parts)
@@ -448,8 +461,8 @@ class Scene:
         affine = np.array([[s[2] for s in row] for row in slots], np.float32)
         args.slot_u = self._array(np.ascontiguousarray(affine[:, :, :3]), wp.vec3)
         args.slot_v = self._array(np.ascontiguousarray(affine[:, :, 3:]), wp.vec3)
-        self.has_glass = any(e.transmission > 0.0 for e in extensions)
-        args.any_alpha = int(self.has_glass or any(m.alpha_mode != "OPAQUE" for m in plain))
+        has_glass = any(e.transmission > 0.0 for e in extensions)
+        args.any_alpha = int(has_glass or any(m.alpha_mode != "OPAQUE" for m in plain))
         args.any_culled = int(any(not m.double_sided for m in plain))
         args.any_emission = int(any(max(m.emission) > 0.0 for m in plain))
         self.material_args = args

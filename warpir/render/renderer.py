@@ -24,7 +24,7 @@ from warpir.kernels.types import CameraArgs, LightArgs, LightRecord, MaterialArg
 from warpir.render.bad_pixels import BadPixels, all_finite, first_bad_sample_of
 from warpir.render.device import Launcher, Rows, load_kernels, settle_hashes
 from warpir.render.device_light import drawn, plane_radiance
-from warpir.render.device_scene import Scene
+from warpir.render.device_scene import Corners, Scene
 from warpir.render.launches import THROWN_LIMIT, ObjectLaunch, ReceiverLaunch
 from warpir.render.shadow.pilot import dilate
 from warpir.scene.camera import Camera
@@ -144,9 +144,9 @@ class Renderer(Launcher):
         ]
         load_kernels(self.device, variants, self._progress)
 
-    def candidate_pixels(self, camera: Camera) -> IntArray:
-        """Return a superset of the object's pixels by its bounding box, row-major."""
-        uv = camera.project(box_corners(*self.scene.bounds))
+    def candidate_pixels(self, camera: Camera, bounds: Corners | None = None) -> IntArray:
+        """Return a superset of the pixels of a box, row-major; default: the object's."""
+        uv = camera.project(box_corners(*(bounds or self.scene.bounds)))
         if np.isnan(uv).any():
             left, top, right, bottom = 0, 0, camera.width, camera.height
         else:
@@ -168,9 +168,11 @@ class Renderer(Launcher):
         candidates = self.candidate_pixels(camera)
         names = ("coverage", "position", "normal", "base_color", "roughness", "emission")
         coverage, *planes = self._traced_geometry(candidates, spp, seed)
-        if self.scene.has_glass:
+        if self.scene.glass_bounds is not None:
             # Clear glass stops 1 ray in 25: few samples may all have missed it.
-            thin = np.flatnonzero(coverage < 1.0)
+            is_glass = np.zeros(camera.height * camera.width, bool)
+            is_glass[self.candidate_pixels(camera, self.scene.glass_bounds)] = True
+            thin = np.flatnonzero((coverage < 1.0) & is_glass[candidates])
             again = self._traced_geometry(candidates[thin], spp * GLASS_SAMPLES, seed)
             for plane, better in zip((coverage, *planes), again, strict=True):
                 plane[thin] = better

@@ -2,17 +2,19 @@
 
 from __future__ import annotations
 
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from typing import Any
 
 import numpy as np
 
+from warpir.app.inputs import Inputs
 from warpir.app.record import config_of_picture
 from warpir.app.run import Run
 from warpir.core.arrays import CodeArray, FloatArray
 from warpir.core.progress import progress_bar
 from warpir.io.curves_file import curves_to_json
 from warpir.io.export import OBJECT, write_hand_off
+from warpir.io.images.photos import Photo
 from warpir.io.layers import write_layers
 from warpir.io.lobes_file import lobes_to_json
 from warpir.io.results import OutputFolder
@@ -30,6 +32,7 @@ from warpir.render.composite import (
 )
 from warpir.render.renderer import Renderer
 from warpir.report.page import Results
+from warpir.report.pictures import shrink
 from warpir.report.viewer import VIEWER, viewer_page
 from warpir.scene.camera import Camera
 from warpir.scene.light import Light, LightSummary, summarize
@@ -43,6 +46,8 @@ NOT_HANDED_OVER = (
 )
 PREVIEW_SAMPLES = 16
 """Camera samples per pixel of the preview of an unguided run."""
+PREVIEW_SIDE = 1600
+"""Longer side of that preview, at most [px]."""
 
 
 # ------------------------------------------------------------------------------ the picture
@@ -56,7 +61,7 @@ class RenderedResult:
     device: str
     """Name of the Warp device that rendered it."""
     measured: dict[str, Any]
-    """Triangles, bad pixels and repeated launches, for ``run.json``."""
+    """Samples, triangles, bad pixels and repeated launches, for ``run.json``."""
 
 
 def render_result(run: Run, light: SceneLight) -> RenderedResult:
@@ -72,10 +77,12 @@ def render_result(run: Run, light: SceneLight) -> RenderedResult:
         renderer = Renderer(
             placed, quality.threads or 0, report, run.memory, bounce_depth=quality.bounce_depth
         )
-        picture = _picture(run, light, renderer, quality.samples, quality.rays, look)
+        samples = quality.samples_at(camera.width, camera.height)
+        picture = _picture(run, light, renderer, samples, quality.rays, look)
     run.log.notices += run.memory.notices()  # printed when it happened
     run.log.notice(*renderer.bad_pixels.notices())
     measured = {
+        "samples": samples,
         "triangles": renderer.scene.triangle_count,
         "rays": renderer.scene.rays,
         "bad_pixels": renderer.bad_pixels.count,
@@ -90,6 +97,7 @@ def write_preview(run: Run, light: SceneLight) -> None:
     settings = run.config.optimize
     if not settings.preview_every:
         return
+    run = replace(run, inputs=_small_inputs(run.inputs))
     camera = _rendering_camera(run.inputs.camera, run.config.render.width)
     camera = _rendering_camera(run.inputs.camera, min(settings.guidance_width, camera.width))
     placed = scene_of(run.inputs, camera, run.device, light.curves)
@@ -98,6 +106,17 @@ def write_preview(run: Run, light: SceneLight) -> None:
     picture = _picture(run, light, renderer, PREVIEW_SAMPLES, 1)
     codes = run.inputs.photo.encode(picture.image, picture.changed)
     run.log.say(f"preview: {run.output.write_preview(0, codes, run.inputs.photo.icc)}")
+
+
+def _small_inputs(inputs: Inputs) -> Inputs:
+    """Return the inputs with a photo of `PREVIEW_SIDE` at most, in 8 bits if that is smaller."""
+    if max(inputs.photo.srgb.shape[:2]) <= PREVIEW_SIDE:
+        return inputs
+    srgb = shrink(inputs.photo.srgb, PREVIEW_SIDE)
+    photo = Photo(np.round(255.0 * srgb).astype(np.uint8), srgb, "png")
+    occluder = None if inputs.occluder is None else shrink(inputs.occluder, PREVIEW_SIDE)
+    camera = inputs.camera.scaled(srgb.shape[1], srgb.shape[0])
+    return replace(inputs, photo=photo, camera=camera, occluder=occluder)
 
 
 def _look(run: Run, light: SceneLight) -> CameraLook:
