@@ -49,6 +49,7 @@ def remedies(
         matte: Where the object is seen, shape [H, W]; None where that is not known.
     """
     asked, measured = config.flat(), record["measured"]
+    samples = measured.get("samples", asked["samples"])  # older records state the asked number
     found = [] if config.is_guided else [*_light(asked, measured)]
     if asked["camera"] is None and not asked["demo"]:
         found += _camera(asked, measured)
@@ -61,8 +62,8 @@ def remedies(
         ),
         Remedy(
             "The object or its shadow is noisy",
-            again(asked, samples=4 * asked["samples"]),
-            f"this run took {asked['samples']}; four times as many halve the noise",
+            again(asked, samples=4 * samples),
+            f"this run took {samples}; four times as many halve the noise",
         ),
         Remedy(
             "The object is softer, grainier or flatter than the photo",
