@@ -36,10 +36,6 @@ LORA_COPIES = 2 + 3 * 3
 """Two files; three checkpoints, one being written, of weights and both moments of the optimiser."""
 
 
-def _silent() -> StepProgress:
-    return StepProgress(lambda _: None)
-
-
 @dataclass(frozen=True)
 class Run:
     """What is asked, what was read for it, where it goes, and the records that stages add to."""
@@ -51,7 +47,7 @@ class Run:
     timings: Timings = field(default_factory=Timings)
     memory: Memory = field(default_factory=Memory)
     """Counts what was tried again where memory was short."""
-    progress: StepProgress = field(default_factory=_silent)
+    progress: StepProgress = field(default_factory=lambda: StepProgress(lambda _: None))
     """Of long stages."""
     device: str = "cpu"
     """Warp device, once it is chosen; torch uses the same."""
