@@ -48,7 +48,6 @@ from warpir.scene.light import Light
 
 pytestmark = pytest.mark.usefixtures("one_thread")
 
-MIB = 1 << 20
 ADDRESS_SPACE = 2 << 30
 """Room for Python and Warp with its kernels, which a small photo's run just fits into; the layers
 of 12 megapixels take as much again (3.9 GB resident without a limit)."""

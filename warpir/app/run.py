@@ -14,7 +14,7 @@ from warpir.app.inputs import Inputs
 from warpir.app.record import Timings, run_record
 from warpir.core.cache import take_notices
 from warpir.core.errors import ExitCode, InputError
-from warpir.core.memory import Memory, Need, needs_of_photo, needs_of_scene, share_device
+from warpir.core.memory import PHOTO_BYTES, Memory, Need, needs_of_scene, share_device
 from warpir.core.progress import Log, StepProgress
 from warpir.io.results import OutputFolder
 
@@ -174,4 +174,4 @@ def memory_needs(inputs: Inputs) -> tuple[Need, tuple[Need, ...]]:
         sum(len(part.indices) for part in asset.primitives),
         sum(texture.pixels[..., 0].size for texture in asset.textures),
     )
-    return needs_of_photo(height * width), scene
+    return Need("photo and layers", PHOTO_BYTES * height * width, "--photo (fewer pixels)"), scene
