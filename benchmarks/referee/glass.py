@@ -18,7 +18,7 @@ import mitsuba as mi
 import numpy as np
 import trimesh
 
-from benchmarks.referee.lamps import SEED_COUNT, Runs, compare, runs_of
+from benchmarks.referee.lamps import SEED_COUNT, Runs, camera, compare, runs_of
 from warpir.core.arrays import Float64Array, FloatArray, IntArray
 from warpir.kernels.dielectric.glass import GLASS_DEPTH
 from warpir.mitsuba.light import LatlongEmitter
@@ -103,14 +103,6 @@ def cases() -> dict[str, Case]:
         "rough_ball": Case((ball,), roughness=0.45),
         "rough_box": Case((box,), roughness=0.7, ior=1.33, absorption=green),
     }
-
-
-def camera(width: int = 64, height: int = 64) -> Camera:
-    """Look down at the object from before it."""
-    pose, a = np.eye(4), np.radians(-20.0)
-    pose[1:3, 1:3] = [[np.cos(a), -np.sin(a)], [np.sin(a), np.cos(a)]]
-    pose[:3, 3] = (0.0, 1.6, 4.5)
-    return Camera(width, height, 96.0, 96.0, width / 2.0, height / 2.0, pose)
 
 
 def mesh_of(
@@ -208,7 +200,7 @@ def compare_cases(
     parser.add_argument("--spp", type=int, default=4096)
     parser.add_argument("--cases", nargs="*", default=list(known))
     options = parser.parse_args()
-    view = camera()
+    view = camera(64, 64, 1.6)
     # Every direction differs, and none is so bright that noise would hide an error.
     texels = (2.0 * np.random.default_rng(5).random((16, 32, 3)) ** 3).astype(np.float32)
     everywhere = np.ones((view.height, view.width, 3), bool)
