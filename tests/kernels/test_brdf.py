@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 import warp as wp
 
+from benchmarks.stability.case import upload
 from tests import oracles as o
 from tests.statistics import chi_square, compare_gradients, graded_edges
 from warpir.kernels.bsdf import bsdf_f, bsdf_of, bsdf_sample
@@ -70,11 +71,6 @@ def sample_kernel(
 ):
     i = wp.tid()
     wi[i] = bsdf_sample(bsdf_of(wo, base_color, metallic, roughness, Layers()), u[i], u_lobe[i])
-
-
-def upload(values: np.ndarray, dtype: type, device: str, requires_grad: bool = False) -> wp.array:
-    values = np.ascontiguousarray(values, np.float32)
-    return wp.array(values, dtype=dtype, device=device, requires_grad=requires_grad)
 
 
 class Case:
