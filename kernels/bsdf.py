@@ -14,10 +14,9 @@ The coat's lobe goes with the cosine to its own normal. Anisotropy stretches the
 lobe in one direction: GGX of two widths is that of one in coordinates of which one is scaled (Heitz
 2014, 5.3). Iridescence replaces its Fresnel term (`warpir.kernels.maths.fresnel`).
 
-A `Bsdf` is a point's scattering as seen from one direction. As in pbrt it has three functions:
-`bsdf_f`, the value (with the density, since both share half of their terms), `bsdf_sample` and
-`bsdf_pdf`. Sampling draws visible normals (Heitz 2018; Dupuy & Benyoub 2023, "Sampling Visible GGX
-Normals with Spherical Caps").
+A `Bsdf` is a point's scattering as seen from one direction. `bsdf_f` returns its value and, since
+both share half of their terms, the density of `bsdf_sample`. Sampling draws visible normals (Heitz
+2018; Dupuy & Benyoub 2023, "Sampling Visible GGX Normals with Spherical Caps").
 """
 
 import warp as wp
@@ -423,12 +422,6 @@ def bsdf_sample(bsdf: Bsdf, u: wp.vec2, u_lobe: float) -> wp.vec3:
         wm = from_stretch(wm, layers, wide)
         return wp.normalize(wm * (2.0 * wp.dot(wo, wm)) - wo)
     return cosine_sample(u)
-
-
-@wp.func
-def bsdf_pdf(bsdf: Bsdf, wi: wp.vec3) -> float:
-    """Return the density of `bsdf_sample` at ``wi`` [1/sr]; zero outside its support."""
-    return bsdf_f(bsdf, wi).pdf
 
 
 @wp.func

@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 import warp as wp
 
+from tests.builders.guided_runs import write_guided_inputs
 from tests.builders.insertions import write_inputs
 from tests.cases import CaseReport
 from warpir.render.device import start_warp
@@ -63,6 +64,14 @@ def inputs(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Photo, asset, camera and light of a small insertion, written once for a test module."""
     folder = tmp_path_factory.mktemp("inputs")
     write_inputs(folder)
+    return folder
+
+
+@pytest.fixture(scope="module")
+def guided_inputs(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Photo, asset, tiny model and weights of a small guided insertion."""
+    folder = tmp_path_factory.mktemp("guided")
+    write_guided_inputs(folder)
     return folder
 
 

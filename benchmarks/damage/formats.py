@@ -46,7 +46,7 @@ class Format:
 
     name: str
     reader: str
-    """Of `byte_flips_reader.READERS`."""
+    """Of `benchmarks.damage.reader.READERS`."""
     file: str
     """Name of the file that is damaged; folders are made."""
     sound: bytes

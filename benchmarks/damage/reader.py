@@ -149,11 +149,6 @@ def _regressor(path: Path) -> None:
     load_regressor(path)
 
 
-def _told(error: Any) -> InputError:
-    """Return what the program makes of an error of a model (`warpir.optimize.model`)."""
-    return InputError(error.where, error.what, error.advice, ExitCode.MODEL)
-
-
 def _lora(path: Path) -> None:
     from warpir.diffusion.models.model_error import ModelError
     from warpir.diffusion.personalization.lora_files import read_lora
@@ -161,7 +156,8 @@ def _lora(path: Path) -> None:
     try:
         read_lora(path)
     except ModelError as error:
-        raise _told(error) from error
+        # What the program makes of it (`warpir.optimize.model`).
+        raise InputError(error.where, error.what, error.advice, ExitCode.MODEL) from error
 
 
 def _checkpoint(path: Path) -> None:
@@ -171,14 +167,10 @@ def _checkpoint(path: Path) -> None:
 
 
 READERS: dict[str, Callable[[Path], int | None]] = {
-    name.removeprefix("_"): reader
-    for name, reader in (
-        *(("_photo", _photo), ("_envmap", _envmap), ("_mask", _mask), ("_asset", _asset)),
-        *(("_camera", _camera), ("_points", _points), ("_lobes", _lobes), ("_curves", _curves)),
-        *(("_materials", _materials), ("_config", _config), ("_run", _run)),
-        *(("_sequence", _sequence), ("_regressor", _regressor), ("_insert", _insert)),
-        *(("_lora", _lora), ("_checkpoint", _checkpoint)),
-    )
+    **{"photo": _photo, "envmap": _envmap, "mask": _mask, "asset": _asset, "camera": _camera},
+    **{"points": _points, "lobes": _lobes, "curves": _curves, "materials": _materials},
+    **{"config": _config, "run": _run, "sequence": _sequence, "insert": _insert},
+    **{"regressor": _regressor, "lora": _lora, "checkpoint": _checkpoint},
 }
 
 

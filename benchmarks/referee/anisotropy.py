@@ -8,8 +8,6 @@ shadowing are independent of each other, glTF's are correlated in height: a fact
 Mitsuba's own ``smith_g1`` turns one into the other. All faces are flat.
 """
 
-import argparse
-import json
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -17,10 +15,10 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from benchmarks.referee.glass import camera, mesh_of, pictures_of, rendered
-from benchmarks.referee.lamps import Runs, compare
+from benchmarks.referee.glass import Pair, compare_cases, mesh_of, pictures_of, rendered
+from benchmarks.referee.lamps import Runs
 from benchmarks.referee.subjects import ball
-from warpir.core.arrays import Float64Array
+from warpir.core.arrays import Float64Array, FloatArray
 from warpir.mitsuba.light import LatlongEmitter
 from warpir.scene.asset import Asset, Material, Primitive
 from warpir.scene.camera import Camera
@@ -121,22 +119,11 @@ def theirs(case: Case, view: Camera, texels: Float64Array, spp: int) -> Runs:
     return rendered(mi.load_dict(parts), mi.load_dict(kind), view, spp)
 
 
-def main() -> None:
-    """Print one line of JSON a comparison."""
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--spp", type=int, default=4096)
-    parser.add_argument("--cases", nargs="*", default=list(cases()))
-    options = parser.parse_args()
-    view = camera()
-    texels = (2.0 * np.random.default_rng(5).random((16, 32, 3)) ** 3).astype(np.float32)
-    for name in options.cases:
-        case = cases()[name]
-        true = theirs(case, view, texels, options.spp)
-        found = pictures_of(case.asset(), view, texels, options.spp, case.depth)
-        everywhere = np.ones((view.height, view.width, 3), bool)
-        line = {"case": name, "spp": options.spp}
-        print(json.dumps(line | compare(found, true, everywhere)), flush=True)
+def both(case: Case, view: Camera, texels: FloatArray, spp: int) -> Pair:
+    """Return our picture and theirs."""
+    ours = pictures_of(case.asset(), view, texels, spp, case.depth)
+    return ours, theirs(case, view, texels, spp)
 
 
 if __name__ == "__main__":
-    main()
+    compare_cases(__doc__, cases(), both)

@@ -5,19 +5,19 @@
 Mitsuba has no BSDF with a thin film: its side is `warpir.mitsuba`, the specification written again.
 """
 
-import argparse
-import json
 from dataclasses import replace
 
 import numpy as np
 
 from benchmarks.referee import ours
-from benchmarks.referee.glass import camera
-from benchmarks.referee.lamps import compare
+from benchmarks.referee.glass import Pair, compare_cases
+from benchmarks.referee.lamps import Runs
 from benchmarks.referee.subjects import ball
+from warpir.core.arrays import FloatArray
 from warpir.mitsuba import render as theirs
 from warpir.mitsuba.render import Setting
 from warpir.scene.asset import Asset, Material, Texture, TextureSlot
+from warpir.scene.camera import Camera
 
 DEPTH = 8
 """Interactions; the inside of what passes light is seen."""
@@ -63,24 +63,12 @@ def cases() -> dict[str, Asset]:
     }
 
 
-def main() -> None:
-    """Print one line of JSON a comparison."""
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--spp", type=int, default=4096)
-    parser.add_argument("--cases", nargs="*", default=list(cases()))
-    options = parser.parse_args()
-    view = camera()
-    texels = (2.0 * np.random.default_rng(5).random((16, 32, 3)) ** 3).astype(np.float32)
-    for name in options.cases:
-        asset = cases()[name]
-        found, true = (
-            side.foreground(Setting(asset, ABOVE, view, texels), DEPTH, options.spp, 7)
-            for side in (ours, theirs)
-        )
-        everywhere = np.ones((view.height, view.width, 3), bool)
-        line = {"case": name, "spp": options.spp}
-        print(json.dumps(line | compare(found, true, everywhere)), flush=True)
+def both(asset: Asset, view: Camera, texels: FloatArray, spp: int) -> Pair:
+    """Return our picture and theirs."""
+    setting = Setting(asset, ABOVE, view, texels)
+    found, true = (Runs(*side.foreground(setting, DEPTH, spp, 7)[:2]) for side in (ours, theirs))
+    return found, true
 
 
 if __name__ == "__main__":
-    main()
+    compare_cases(__doc__, cases(), both)

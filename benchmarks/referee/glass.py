@@ -9,23 +9,25 @@ what interpolated normals do at an interface is a convention that differs.
 
 import argparse
 import json
+from collections.abc import Callable
 from dataclasses import dataclass
+from typing import TypeVar
 
 import drjit as dr
 import mitsuba as mi
 import numpy as np
 import trimesh
 
-from benchmarks.referee.lamps import SEED_COUNT, Runs, compare, runs_of
+from benchmarks.referee.lamps import SEED_COUNT, Runs, camera, compare, runs_of
 from warpir.core.arrays import Float64Array, FloatArray, IntArray
 from warpir.kernels.dielectric.glass import GLASS_DEPTH
 from warpir.mitsuba.light import LatlongEmitter
-from warpir.mitsuba.render import passes
+from warpir.mitsuba.render import passes, sensor_of
 from warpir.render.device_light import light_args
 from warpir.render.device_scene import Placed, Receiver, Scene
 from warpir.render.renderer import Renderer
 from warpir.scene.asset import Asset, Material, Primitive
-from warpir.scene.camera import Camera, mitsuba_sensor
+from warpir.scene.camera import Camera
 from warpir.scene.light import Light
 
 LENGTH = int(GLASS_DEPTH) + 1
@@ -33,6 +35,9 @@ LENGTH = int(GLASS_DEPTH) + 1
 DEPTH = 24
 """Interactions with what is not glass; a matte card in glass gets light that often."""
 MATTE = (0.6, 0.3, 0.2)
+CaseT = TypeVar("CaseT")
+Pair = tuple[Runs, Runs]
+"""Our picture and theirs."""
 
 
 @dataclass(frozen=True)
@@ -100,14 +105,6 @@ def cases() -> dict[str, Case]:
     }
 
 
-def camera(width: int = 64, height: int = 64) -> Camera:
-    """Look down at the object from before it."""
-    pose, a = np.eye(4), np.radians(-20.0)
-    pose[1:3, 1:3] = [[np.cos(a), -np.sin(a)], [np.sin(a), np.cos(a)]]
-    pose[:3, 3] = (0.0, 1.6, 4.5)
-    return Camera(width, height, 96.0, 96.0, width / 2.0, height / 2.0, pose)
-
-
 def mesh_of(
     name: str,
     positions: Float64Array,
@@ -167,22 +164,7 @@ def theirs(case: Case, view: Camera, texels: Float64Array, spp: int) -> Runs:
 
 def rendered(scene: mi.Scene, integrator: mi.Integrator, view: Camera, spp: int) -> Runs:
     """Render Mitsuba's scene by its integrator in independent runs."""
-    film = {
-        "type": "hdrfilm",
-        "width": view.width,
-        "height": view.height,
-        "rfilter": {"type": "box"},
-    }
-    seen = mitsuba_sensor(view)
-    sensor = mi.load_dict(
-        {
-            "type": "perspective",
-            "to_world": mi.ScalarTransform4f(seen["to_world"]),
-            "fov_axis": "x",
-            "fov": seen["fov_deg"],
-            "film": film | {"pixel_format": "rgb", "component_format": "float32"},
-        }
-    )
+    sensor = sensor_of(view, np.zeros(3), 1.0)
     pictures = []
     for seed in range(SEED_COUNT):
         total = np.zeros((view.height, view.width, 3))
@@ -210,23 +192,29 @@ def pictures_of(asset: Asset, view: Camera, texels: Float64Array, spp: int, dept
     return runs_of(pictures)
 
 
-def main() -> None:
-    """Print one line of JSON a comparison."""
-    parser = argparse.ArgumentParser(description=__doc__)
+def compare_cases(
+    about: str, known: dict[str, CaseT], render: Callable[[CaseT, Camera, FloatArray, int], Pair]
+) -> None:
+    """Print one line of JSON a comparison; ``render`` returns our picture of a case and theirs."""
+    parser = argparse.ArgumentParser(description=about)
     parser.add_argument("--spp", type=int, default=4096)
-    parser.add_argument("--cases", nargs="*", default=list(cases()))
+    parser.add_argument("--cases", nargs="*", default=list(known))
     options = parser.parse_args()
-    view = camera()
+    view = camera(64, 64, 1.6)
     # Every direction differs, and none is so bright that noise would hide an error.
     texels = (2.0 * np.random.default_rng(5).random((16, 32, 3)) ** 3).astype(np.float32)
+    everywhere = np.ones((view.height, view.width, 3), bool)
     for name in options.cases:
-        case = cases()[name]
-        found = pictures_of(case.asset(), view, texels, options.spp, DEPTH)
-        true = theirs(case, view, texels, options.spp)
-        everywhere = np.ones((view.height, view.width, 3), bool)
         line = {"case": name, "spp": options.spp}
+        found, true = render(known[name], view, texels, options.spp)
         print(json.dumps(line | compare(found, true, everywhere)), flush=True)
 
 
+def both(case: Case, view: Camera, texels: FloatArray, spp: int) -> Pair:
+    """Return our picture and theirs."""
+    ours = pictures_of(case.asset(), view, texels, spp, DEPTH)
+    return ours, theirs(case, view, texels, spp)
+
+
 if __name__ == "__main__":
-    main()
+    compare_cases(__doc__, cases(), both)

@@ -43,11 +43,11 @@ GLOSS = Material(base_color=(0.7, 0.4, 0.2), metallic=0.3, roughness=0.35)
 PAPER = Material(base_color=(0.8, 0.8, 0.7), metallic=0.0, roughness=0.8, double_sided=True)
 
 
-def camera(width: int = 96, height: int = 64) -> Camera:
+def camera(width: int = 96, height: int = 64, eye: float = 2.0) -> Camera:
     """Look down at the object from before it."""
     pose, a = np.eye(4), np.radians(-20.0)
     pose[1:3, 1:3] = [[np.cos(a), -np.sin(a)], [np.sin(a), np.cos(a)]]
-    pose[:3, 3] = (0.0, 2.0, 4.5)
+    pose[:3, 3] = (0.0, eye, 4.5)
     return Camera(width, height, 96.0, 96.0, width / 2.0, height / 2.0, pose)
 
 

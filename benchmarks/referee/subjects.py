@@ -53,10 +53,9 @@ def view(
     width: int = 32,
     height: int = 32,
     fov: float = 25.0,
-    lift: float = 0.0,
     turn: float = 0.0,
 ) -> Camera:
-    """Camera at ``(0, lift, distance)`` turned about +Y to look from another side, along -Z."""
+    """Camera at ``(0, 0, distance)`` turned about +Y to look from another side, along -Z."""
     focal = 0.5 * width / np.tan(np.radians(0.5 * fov))
     angle = np.radians(turn)
     c2w = np.eye(4)
@@ -65,7 +64,7 @@ def view(
         [0.0, 1.0, 0.0],
         [-np.sin(angle), 0.0, np.cos(angle)],
     ]
-    c2w[:3, 3] = c2w[:3, :3] @ [0.0, lift, distance]
+    c2w[:3, 3] = c2w[:3, :3] @ [0.0, 0.0, distance]
     return Camera(width, height, focal, focal, 0.5 * width, 0.5 * height, c2w)
 
 

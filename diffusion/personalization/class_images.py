@@ -153,11 +153,6 @@ def to_bytes(pictures: Tensor) -> Tensor:
     return (pictures.detach().float().clamp(0.0, 1.0) * 255.0).round().to("cpu", torch.uint8)
 
 
-def from_bytes(pictures: Tensor, device: torch.device) -> Tensor:
-    """Return uint8 pictures as float32 in [0, 1] on the device."""
-    return pictures.to(device).float() / 255.0
-
-
 def encode_pictures(
     prior: NetworkPrior, pictures: Tensor, batch: int, report: Report | None = None
 ) -> Tensor:
@@ -172,7 +167,7 @@ def encode_pictures(
     latents = [torch.zeros(0, *prior.latent_shape)]
     with torch.no_grad():
         for start in range(0, len(pictures), batch):
-            part = from_bytes(pictures[start : start + batch], prior.device)
+            part = pictures[start : start + batch].to(prior.device).float() / 255.0
             latents.append(prior.finite(partial(prior.encode, part), "latents").cpu())
             if report:
                 report("class latents", start + len(part), len(pictures))

@@ -127,7 +127,6 @@ def personalize(
     report: Report | None = None,
     on_step: Callable[[LoraTraining], None] | None = None,
     resume: Mapping[str, Any] | None = None,
-    record: Callable[[LoraTraining], Callable[[], None]] | None = None,
 ) -> Personalization:
     """Adapt the prior to a photo, or find the adapter of an earlier run on the same photo.
 
@@ -145,8 +144,6 @@ def personalize(
             step or class image that it was told of is lost.
         on_step: Sees the training after each step and before the report, to keep its `state_dict`.
         resume: `LoraTraining.state_dict` of a run that was stopped.
-        record: Given the training, returns what replaces its `update`; by default a CUDA graph,
-            where the prior has them.
 
     Raises:
         ModelError: The LoRA cannot be loaded, or ``resume`` is another training's.
@@ -174,7 +171,7 @@ def personalize(
     lora = initial_lora(prior, settings.lora_layers, settings.lora_rank, seed)
     clock.stop("evaluation")
     training = LoraTraining(prior, lora, crops, kept, embeddings, settings, seed, key, name)
-    return _learn(training, before, class_images, stored, clock, report, on_step, resume, record)
+    return _learn(training, before, class_images, stored, clock, report, on_step, resume)
 
 
 def _learn(
@@ -186,7 +183,6 @@ def _learn(
     report: Report | None,
     on_step: Callable[[LoraTraining], None] | None,
     resume: Mapping[str, Any] | None,
-    record: Callable[[LoraTraining], Callable[[], None]] | None,
 ) -> Personalization:
     """Train an adapter, put it to use, judge it, and keep it where ``stored`` says, if it does.
 
@@ -198,7 +194,7 @@ def _learn(
     with training:
         if resume is not None:
             training.load_state_dict(resume)
-        _train(training, report, on_step, record)
+        _train(training, report, on_step)
         lora, losses = training.lora(), training.losses()
     install_lora(prior, lora, name)
     clock.stop("training")
@@ -232,7 +228,6 @@ def _train(
     training: LoraTraining,
     report: Report | None,
     on_step: Callable[[LoraTraining], None] | None,
-    record: Callable[[LoraTraining], Callable[[], None]] | None,
 ) -> None:
     """Take the steps that are left; arguments as in `personalize`.
 
@@ -247,9 +242,7 @@ def _train(
         prior.spare_memory()
         training.part_count, update = len(training.timesteps), training.update
 
-    if record:
-        update = record(training)
-    elif prior.graphs is not None:
+    if prior.graphs is not None:
         update = prior.graphs.recorded_step(training.update)
     while training.step_count < step_count:
         training.prepare(training.step_count)

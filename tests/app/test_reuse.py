@@ -33,8 +33,6 @@ from warpir.io.images.photos import read_envmap
 from warpir.lighting.scene_light import make_light
 from warpir.scene.tone_curves import Curves, ToneKnots
 
-ROUNDING = 1e-6
-"""float32 values in [0, 1]."""
 CHEAP = {"samples": "2", "depth": "2"}
 
 

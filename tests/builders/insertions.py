@@ -166,4 +166,10 @@ def rgb(planes: dict[str, FloatArray], prefix: str = "") -> FloatArray:
 def go(argv: list[str], out: Path) -> Run:
     """Run in-process, expecting success."""
     assert main(argv) == ExitCode.DONE
-    return Run(out, argv, json.loads((out / "run.json").read_text()))
+    return Run(out, argv, record_of(out))
+
+
+def record_of(out: Path) -> dict[str, Any]:
+    """The ``run.json`` of a finished run."""
+    record: dict[str, Any] = json.loads((out / "run.json").read_text())
+    return record

@@ -20,7 +20,7 @@ import warp as wp
 from PIL import Image
 
 from tests.builders.faults import run_case, snapshot
-from tests.builders.guided_runs import guided_flags, write_guided_inputs
+from tests.builders.guided_runs import guided_flags
 from tests.builders.insertions import arguments, write_inputs
 from tests.builders.loops import SETTINGS, TRACED, a_loop, bent, values
 from tests.builders.shapes import camera, ground, placed, sphere
@@ -48,7 +48,6 @@ from warpir.scene.light import Light
 
 pytestmark = pytest.mark.usefixtures("one_thread")
 
-MIB = 1 << 20
 ADDRESS_SPACE = 2 << 30
 """Room for Python and Warp with its kernels, which a small photo's run just fits into; the layers
 of 12 megapixels take as much again (3.9 GB resident without a limit)."""
@@ -90,18 +89,6 @@ def failing(
 # ------------------------------------------------------------------------ how it is told
 
 
-def from_torch() -> None:
-    torch.empty(10**15)
-
-
-def from_numpy() -> None:
-    np.empty(10**15)
-
-
-def from_warp() -> None:
-    wp.empty((2**24, 2**24), dtype=wp.vec3, device="cpu")
-
-
 def while_cleaning_up() -> None:
     try:
         short()
@@ -113,10 +100,12 @@ def while_cleaning_up() -> None:
     "fail",
     [
         pytest.param(short, id="R7-torch-cuda"),
-        pytest.param(from_torch, id="R7-torch-cpu"),
-        pytest.param(from_numpy, id="R7-numpy"),
+        pytest.param(lambda: torch.empty(10**15), id="R7-torch-cpu"),
+        pytest.param(lambda: np.empty(10**15), id="R7-numpy"),
         pytest.param(warp_short, id="R7-warp-cuda"),
-        pytest.param(from_warp, id="R7-warp-cpu"),
+        pytest.param(
+            lambda: wp.empty((2**24, 2**24), dtype=wp.vec3, device="cpu"), id="R7-warp-cpu"
+        ),
         pytest.param(while_cleaning_up, id="R7-recording"),
     ],
 )
@@ -556,22 +545,15 @@ def test_lora_step_in_parts_is_the_same(device: str, folder: Path) -> None:
 # ---------------------------------------------------------------------------- whole runs
 
 
-@pytest.fixture(scope="module")
-def inputs(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    made = tmp_path_factory.mktemp("inputs")
-    write_guided_inputs(made)
-    return made
-
-
 @pytest.mark.slow
 @pytest.mark.skipif(wp.is_cuda_available(), reason="CUDA's libraries alone take more than that")
 @pytest.mark.case("R7")
-def test_address_space_of_2_gb_ends_with_5(inputs: Path, tmp_path: Path) -> None:
+def test_address_space_of_2_gb_ends_with_5(guided_inputs: Path, tmp_path: Path) -> None:
     """Doubted before the work, then one line, and nothing is left of the run."""
     photo = tmp_path / "large.png"
     Image.new("RGB", (4096, 3072)).save(photo)
     before = snapshot(tmp_path)
-    flags = arguments(inputs, tmp_path / "out", photo=str(photo), width="64")
+    flags = arguments(guided_inputs, tmp_path / "out", photo=str(photo), width="64")
     ended = run_case(flags, tmp_path, address_space=ADDRESS_SPACE)
     assert ended.status == ExitCode.RESOURCES, ended
     lines = ended.err.splitlines()
@@ -591,7 +573,7 @@ def test_address_space_of_2_gb_ends_with_5(inputs: Path, tmp_path: Path) -> None
     ],
 )
 def test_short_run_leaves_the_old_result_whole(
-    inputs: Path,
+    guided_inputs: Path,
     tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch,
     capsys: pytest.CaptureFixture[str],
@@ -601,7 +583,7 @@ def test_short_run_leaves_the_old_result_whole(
 ) -> None:
     """Once too little: the same picture, counted in run.json. Twice: exit code 5, all as it was."""
     out = tmp_path / "out"
-    flags = [*arguments(inputs, out), "--overwrite"]
+    flags = [*arguments(guided_inputs, out), "--overwrite"]
     assert main(flags) == ExitCode.DONE
     before = snapshot(tmp_path)
 
@@ -632,7 +614,7 @@ def test_short_run_leaves_the_old_result_whole(
 @pytest.mark.slow
 @pytest.mark.case("R7")
 def test_short_guided_run_keeps_its_checkpoint(
-    inputs: Path,
+    guided_inputs: Path,
     tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch,
     capsys: pytest.CaptureFixture[str],
@@ -641,7 +623,7 @@ def test_short_guided_run_keeps_its_checkpoint(
     monkeypatch.setenv("WARPIR_CACHE", str(tmp_path / "cache"))
     out = tmp_path / "out"
     unadapted = {"loss": "csd", "no_personalize": ""}  # so that all steps are the light's
-    flags = guided_flags(inputs, out, steps="4", checkpoint_every="2", **unadapted)
+    flags = guided_flags(guided_inputs, out, steps="4", checkpoint_every="2", **unadapted)
     calls = [0]
 
     def later(*_: object, **__: object) -> bool:

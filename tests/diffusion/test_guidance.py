@@ -691,19 +691,19 @@ def test_loss_of_another_name_is_refused() -> None:
         coefficients(replace(ASKED, loss="vsd"))
 
 
-def test_negative_prompt_defaults_to_the_null_prompt() -> None:
-    """It is asked for where it is named."""
-    for asked in ("a wrong shadow", ""):
-        settings = GuidanceSettings(loss="lds-negative", negative_prompt=asked)
-        made = Guidance(GaussianPrior(), "p", settings, MASK, 10, 0, "scene")
-        assert [term.prompt for term in made.terms] == ["p", asked]
-
-
-def test_base_prompt_defaults_to_the_prompt() -> None:
-    """The unadapted model is asked for the same, unless told otherwise."""
-    settings = GuidanceSettings(loss="csd")
-    made = Guidance(GaussianPrior(), "p", settings, MASK, 10, 0, None)
-    assert [term.prompt for term in made.terms] == ["p", ""]
+@pytest.mark.parametrize(
+    ("settings", "adapter", "second"),
+    [
+        ({"loss": "lds-negative", "negative_prompt": "a wrong shadow"}, "scene", "a wrong shadow"),
+        ({"loss": "lds-negative", "negative_prompt": ""}, "scene", ""),
+        ({"loss": "csd"}, None, ""),
+    ],
+)
+def test_second_prompt_is_the_null_prompt_unless_named(
+    settings: dict[str, str], adapter: str | None, second: str
+) -> None:
+    made = Guidance(GaussianPrior(), "p", GuidanceSettings(**settings), MASK, 10, 0, adapter)
+    assert [term.prompt for term in made.terms] == ["p", second]
 
 
 @dataclass

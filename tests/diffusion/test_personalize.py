@@ -6,6 +6,7 @@ import weakref
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -462,12 +463,15 @@ def test_another_trainings_checkpoint_is_refused(epsilon: StableDiffusion) -> No
             personalize(epsilon, photo, PROMPTS, settings, seed, None, resume=kept)
 
 
-def test_an_update_can_be_replaced(epsilon: StableDiffusion) -> None:
-    """By a graph that replays it: same memory in every step, same bytes."""
+def test_an_update_can_be_replayed(
+    epsilon: StableDiffusion, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """By a graph: same memory in every step, same bytes."""
     addresses = set()
 
-    def record(training: LoraTraining) -> Any:
+    def recorded_step(update: Any) -> Any:
         # A recorder runs it once to warm up, and puts all back where it was.
+        training = update.__self__
         state = training.state_dict()
         training.prepare(0)
         training.update()
@@ -484,7 +488,9 @@ def test_an_update_can_be_replaced(epsilon: StableDiffusion) -> None:
         return replay
 
     expected = personalize(epsilon, PHOTO, PROMPTS, SETTINGS, 0, None)
-    found = personalize(epsilon, PHOTO, PROMPTS, SETTINGS, 0, None, record=record)
+    graphs = {"run": lambda _, do, *given: do(*given), "clear": lambda: None}
+    monkeypatch.setattr(epsilon, "graphs", SimpleNamespace(recorded_step=recorded_step, **graphs))
+    found = personalize(epsilon, PHOTO, PROMPTS, SETTINGS, 0, None)
     assert content(found.lora) == content(expected.lora)
     assert len(addresses) == 1
 

@@ -24,7 +24,6 @@ from warpir.render.determinism import (
 )
 
 MANY = {"OMP_NUM_THREADS": "8", "MKL_NUM_THREADS": "8", "OPENBLAS_NUM_THREADS": "8"}
-TWO = {"OMP_NUM_THREADS": "2", "MKL_NUM_THREADS": "2", "OPENBLAS_NUM_THREADS": "2"}
 ONE = dict.fromkeys(MANY, "1")
 LOWER = {
     "ATEN_CPU_CAPABILITY": "avx2",

@@ -16,6 +16,8 @@ from tests.builders.gltf_files import Builder
 from tests.builders.image_files import png_header
 from tests.builders.insertions import HEIGHT, LOBES, WIDTH, arguments, write_panorama
 
+Make = Callable[[Path], dict[str, str | None]]
+
 
 @dataclass
 class Bad:
@@ -23,80 +25,56 @@ class Bad:
 
     code: int
     words: tuple[str, ...]
-    make: Callable[[Path], dict[str, str | None]]
+    make: Make
 
 
-def named(name: str, content: bytes | str, flag: str) -> Callable[[Path], dict[str, str | None]]:
-    """Write one file and give it to a flag."""
+def written(name: str, flag: str, write: Callable[[Path], object], **more: str | None) -> Make:
+    """Make one file and give it to a flag."""
 
     def make(folder: Path) -> dict[str, str | None]:
-        (folder / name).write_bytes(content.encode() if isinstance(content, str) else content)
-        return {flag: str(folder / name)}
+        write(folder / name)
+        return {flag: str(folder / name), **more}
 
     return make
 
 
-def truncated_photo(kind: str) -> Callable[[Path], dict[str, str | None]]:
+def named(name: str, content: bytes | str, flag: str, **more: str | None) -> Make:
+    """Write one file's content and give it to a flag."""
+    data = content.encode() if isinstance(content, str) else content
+    return written(name, flag, lambda path: path.write_bytes(data), **more)
+
+
+def truncated_photo(kind: str) -> Make:
     """The first 60 percent of a photo's file."""
 
-    def make(folder: Path) -> dict[str, str | None]:
+    def write(path: Path) -> None:
         rng = np.random.default_rng(0)
-        path = folder / f"cut.{kind}"
         Image.fromarray(rng.integers(0, 255, (64, 64, 3), dtype=np.uint8)).save(path)
-        content = path.read_bytes()
-        path.write_bytes(content[: len(content) * 6 // 10])
-        return {"photo": str(path)}
+        os.truncate(path, path.stat().st_size * 6 // 10)
 
-    return make
+    return written(f"cut.{kind}", "photo", write)
 
 
-def cut_light(name: str) -> Callable[[Path], dict[str, str | None]]:
+def cut_light(name: str) -> Make:
     """A panorama cut in the middle."""
 
-    def make(folder: Path) -> dict[str, str | None]:
-        write_panorama(folder / name)
-        content = (folder / name).read_bytes()
-        (folder / name).write_bytes(content[: len(content) // 2])
-        return {"light": str(folder / name)}
+    def write(path: Path) -> None:
+        write_panorama(path)
+        os.truncate(path, path.stat().st_size // 2)
 
-    return make
+    return written(name, "light", write)
 
 
-def transparent(folder: Path) -> dict[str, str | None]:
-    Image.new("RGBA", (WIDTH, HEIGHT), (9, 9, 9, 100)).save(folder / "glass.png")
-    return {"photo": str(folder / "glass.png")}
-
-
-def gif(folder: Path) -> dict[str, str | None]:
-    Image.new("P", (WIDTH, HEIGHT)).save(folder / "moving.gif")
-    return {"photo": str(folder / "moving.gif")}
-
-
-def fifo(folder: Path) -> dict[str, str | None]:
-    os.mkfifo(folder / "pipe.png")
-    return {"photo": str(folder / "pipe.png")}
-
-
-def link_loop(folder: Path) -> dict[str, str | None]:
-    (folder / "loop.png").symlink_to(folder / "loop.png")
-    return {"photo": str(folder / "loop.png")}
-
-
-def glb(change: Callable[[Builder], None], cut: int = 0) -> Callable[[Path], dict[str, str | None]]:
+def glb(change: Callable[[Builder], None], cut: int = 0) -> Make:
     """A GLB with a planted fault, ``cut`` bytes short."""
 
-    def make(folder: Path) -> dict[str, str | None]:
+    def write(path: Path) -> None:
         builder = Builder()
         change(builder)
         content = builder.glb()
-        (folder / "bad.glb").write_bytes(content[: len(content) - cut])
-        return {"asset": str(folder / "bad.glb")}
+        path.write_bytes(content[: len(content) - cut])
 
-    return make
-
-
-def far_index(builder: Builder) -> None:
-    builder.primitive["indices"] = builder.accessor(np.array([0, 1, 999], np.uint16))
+    return written("bad.glb", "asset", write)
 
 
 def not_a_number(builder: Builder) -> None:
@@ -105,43 +83,24 @@ def not_a_number(builder: Builder) -> None:
     builder.attribute("POSITION", corners)
 
 
-def needs_draco(builder: Builder) -> None:
-    builder.json["extensionsRequired"] = ["KHR_draco_mesh_compression"]
-    builder.json["extensionsUsed"] = ["KHR_draco_mesh_compression"]
-
-
-def own_camera(**changes: object) -> Callable[[Path], dict[str, str | None]]:
+def own_camera(**changes: object) -> Make:
     """A camera file with some members replaced."""
-
-    def make(folder: Path) -> dict[str, str | None]:
-        pose = np.eye(4)
-        pose[1, 3] = 1.5
-        content = {
-            "w": WIDTH, "h": HEIGHT, "fx": 40.0, "fy": 40.0, "cx": 24.0, "cy": 16.0,
-            "c2w": pose.tolist(), **changes,
-        }  # fmt: skip
-        (folder / "camera.json").write_text(json.dumps(content))
-        return {"camera": str(folder / "camera.json"), **NO_POSE}
-
-    return make
+    pose = np.eye(4)
+    pose[1, 3] = 1.5
+    content = {
+        "w": WIDTH, "h": HEIGHT, "fx": 40.0, "fy": 40.0, "cx": 24.0, "cy": 16.0,
+        "c2w": pose.tolist(), **changes,
+    }  # fmt: skip
+    return camera_text(json.dumps(content))
 
 
-def camera_text(text: str) -> Callable[[Path], dict[str, str | None]]:
-    def make(folder: Path) -> dict[str, str | None]:
-        (folder / "camera.json").write_text(text)
-        return {"camera": str(folder / "camera.json"), **NO_POSE}
-
-    return make
+def camera_text(text: str) -> Make:
+    return named("camera.json", text, "camera", **NO_POSE)
 
 
-def flags(**changes: str | None) -> Callable[[Path], dict[str, str | None]]:
+def flags(**changes: str | None) -> Make:
     """Only flags change."""
     return lambda folder: changes
-
-
-def out_file(folder: Path) -> dict[str, str | None]:
-    (folder / "plain").write_text("text")
-    return {"out": str(folder / "plain")}
 
 
 def emitting_obj(folder: Path) -> dict[str, str | None]:
@@ -155,7 +114,7 @@ def far_texture(builder: Builder) -> None:
     builder.pbr["baseColorTexture"] = {"index": builder.texture(), "extensions": transform}
 
 
-def lobes_with(**changes: object) -> Callable[[Path], dict[str, str | None]]:
+def lobes_with(**changes: object) -> Make:
     """A lobes file with some members replaced."""
     return named("bad.json", json.dumps({**LOBES, **changes}), "light")
 
@@ -169,6 +128,7 @@ def four_channels(folder: Path) -> dict[str, str | None]:
     return {"light": str(folder / "uv.exr")}
 
 
+DRACO = "KHR_draco_mesh_compression"
 NO_POSE: dict[str, str | None] = {"fov": None, "pitch": None, "camera_height": None}
 SHEARED = np.eye(4)
 SHEARED[0, 1] = 0.5
@@ -189,10 +149,13 @@ BAD = {
     "I5-max-pixels": Bad(3, ("photo.png", "48 x 32", "--max-pixels"), flags(max_pixels="100")),
     "I6-text-as-jpeg": Bad(3, ("note.jpg",), named("note.jpg", "hello\n" * 99, "photo")),
     "I6-eps-as-png": Bad(3, ("x.png",), named("x.png", "%!PS-Adobe-3.0 EPSF-3.0\n", "photo")),
-    "I10-transparent": Bad(3, ("glass.png", "transparen"), transparent),
-    "I13-gif": Bad(3, ("moving.gif",), gif),
-    "I18-fifo": Bad(3, ("pipe.png", "regular file"), fifo),
-    "I18-symlink-loop": Bad(3, ("loop.png",), link_loop),
+    "I10-transparent": Bad(3, ("glass.png", "transparen"), written(
+        "glass.png", "photo", Image.new("RGBA", (WIDTH, HEIGHT), (9, 9, 9, 100)).save)),
+    "I13-gif": Bad(3, ("moving.gif",), written(
+        "moving.gif", "photo", Image.new("P", (WIDTH, HEIGHT)).save)),
+    "I18-fifo": Bad(3, ("pipe.png", "regular file"), written("pipe.png", "photo", os.mkfifo)),
+    "I18-symlink-loop": Bad(3, ("loop.png",), written(
+        "loop.png", "photo", lambda path: path.symlink_to(path))),
     "I18-device": Bad(3, ("/dev/zero", "regular file"), flags(photo="/dev/zero")),
     # Light
     "E1-truncated-exr": Bad(3, ("cut.exr",), cut_light("cut.exr")),
@@ -219,7 +182,8 @@ BAD = {
         "accessors": [{"bufferView": 0, "componentType": 5126, "count": 3, "type": "VEC3"}],
         "bufferViews": [{"buffer": 0, "byteLength": 36}],
         "buffers": [{"uri": "none.bin", "byteLength": 36}]}), "asset")),
-    "M7-index": Bad(3, ("bad.glb", "999"), glb(far_index)),
+    "M7-index": Bad(3, ("bad.glb", "999"), glb(
+        lambda b: b.primitive.update(indices=b.accessor(np.array([0, 1, 999], np.uint16))))),
     "M8-nan": Bad(3, ("bad.glb",), glb(not_a_number)),
     "M18-emission": Bad(3, ("bad.glb", "emission out of range (found 1e+38"), glb(
         lambda b: b.material.update(emissiveFactor=[1e38, 1, 1]))),
@@ -228,7 +192,8 @@ BAD = {
     "M8-texture-coordinates": Bad(3, ("t.obj", "texture coordinates of 1e+30"), named(
         "t.obj", "v 0 0 0\nv 1 0 0\nv 0 1 0\nvt 1e30 0\nf 1/1 2/1 3/1\n", "asset")),
     "M12-points-only": Bad(3, ("p.obj",), named("p.obj", "v 0 0 0\nv 1 0 0\np 1 2\n", "asset")),
-    "M17-draco": Bad(3, ("bad.glb", "draco"), glb(needs_draco)),
+    "M17-draco": Bad(3, ("bad.glb", "draco"), glb(
+        lambda b: b.json.update(extensionsRequired=[DRACO], extensionsUsed=[DRACO]))),
     "M20-index-zero": Bad(3, ("z.obj",), named("z.obj", "v 0 0 0\nf 0 1 1\n", "asset")),
     "M20-missing-mtl": Bad(3, ("m.obj", "none.mtl"), named(
         "m.obj", "mtllib none.mtl\nv 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 3\n", "asset")),
@@ -257,7 +222,7 @@ BAD = {
     "C-missing": Bad(3, ("none.json",), flags(camera="none.json", **NO_POSE)),
     # Flags and device
     "F1-samples": Bad(2, ("--samples",), flags(samples="0")),
-    "F5-out-is-a-file": Bad(7, ("plain",), out_file),
+    "F5-out-is-a-file": Bad(7, ("plain",), named("plain", "text", "out")),
     "F5-out-holds-the-photo": Bad(2, ("--out", "photo.png"), lambda f: {"out": str(f.parent)}),
     "F5-out-is-the-root": Bad(2, ("--out",), flags(out="/")),
     "F8-seed": Bad(2, ("--seed",), flags(seed="-1")),

@@ -8,6 +8,7 @@ import subprocess
 import sys
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import OpenImageIO as oiio
@@ -58,15 +59,14 @@ def test_white_is_zero(tmp_path: Path, depth: int) -> None:
     np.testing.assert_array_equal(found, np.iinfo(stored.dtype).max - stored)
 
 
-def exr(*channels: str, tile: int = 0) -> Callable[[Path], dict[str, str | None]]:
+def exr(*channels: str, tile: int = 0) -> Callable[[Path], None]:
     """An EXR of the photo's size with some channels; one whose header tells of larger tiles."""
 
-    def make(folder: Path) -> dict[str, str | None]:
+    def write(path: Path) -> None:
         spec = oiio.ImageSpec(WIDTH, HEIGHT, len(channels), "float")
         spec.channelnames = channels
         picture = oiio.ImageBuf(spec)
         picture.set_write_tiles(16 if tile else 0, 16 if tile else 0)
-        path = folder / "a.exr"
         picture.set_pixels(oiio.ROI(), np.full((*SHAPE, len(channels)), 0.3, np.float32))
         assert picture.write(str(path)), picture.geterror()
         if tile:
@@ -74,24 +74,21 @@ def exr(*channels: str, tile: int = 0) -> Callable[[Path], dict[str, str | None]
             place = content.index(b"tiledesc\0") + 13
             sizes = struct.pack("<II", tile, tile)
             path.write_bytes(content[:place] + sizes + content[place + 8 :])
-        return {"photo": str(path)}
 
-    return make
+    return write
 
 
-def tiff(photometric: int, channels: int = 1) -> Callable[[Path], dict[str, str | None]]:
+def tiff(photometric: int, channels: int = 1) -> Callable[[Path], None]:
     """A TIFF of 8 bits that says to be something else."""
 
-    def make(folder: Path) -> dict[str, str | None]:
-        path = folder / "a.tif"
+    def write(path: Path) -> None:
         shape = SHAPE if channels == 1 else (*SHAPE, channels)
         values = np.full(shape, 90, np.uint8)
         kind = "rgb" if channels == 3 else "minisblack"
         tifffile.imwrite(path, values, photometric=kind)
         change_tag(path, 262, photometric)
-        return {"photo": str(path)}
 
-    return make
+    return write
 
 
 def change_tag(path: Path, tag: int, value: int) -> None:
@@ -105,89 +102,80 @@ def change_tag(path: Path, tag: int, value: int) -> None:
     path.write_bytes(content)
 
 
-def large_tile(folder: Path) -> dict[str, str | None]:
-    path = folder / "tile.tif"
+def large_tile(path: Path) -> None:
     values = np.full((16, 16, 3), 90, np.uint8)
     tifffile.imwrite(path, values, photometric="rgb", tile=(16, 16))
     for tag in (322, 323):
         change_tag(path, tag, 36_000)
-    return {"photo": str(path)}
 
 
-def palette_of_bytes(folder: Path) -> dict[str, str | None]:
-    path = folder / "palette.tif"
+def palette_of_bytes(path: Path) -> None:
     colors = np.random.default_rng(0).integers(1, 256, (3, 256)).astype(np.uint16)
     tifffile.imwrite(path, codes(8), photometric="palette", colormap=colors)
-    return {"photo": str(path)}
 
 
-def many_scans(folder: Path) -> dict[str, str | None]:
-    path = folder / "scans.jpg"
+def many_scans(path: Path) -> None:
     Image.new("RGB", (WIDTH, HEIGHT), (90, 80, 70)).save(path, progressive=True)
     content = path.read_bytes()
     start = content.rindex(b"\xff\xda")
     (length,) = struct.unpack_from(">H", content, start + 2)
     scan = content[start : start + 2 + length] + b"\x7f"
     path.write_bytes(content[:start] + 500 * scan + content[start:])
-    return {"photo": str(path)}
 
 
-def sparse_tail(folder: Path) -> dict[str, str | None]:
-    os.truncate(folder / "photo.png", 20 << 30)
-    return {}
-
-
-def large_face(folder: Path) -> dict[str, str | None]:
+def large_face(path: Path) -> None:
     corners = " ".join(str(1 + k % 3) for k in range(10**6))
-    (folder / "face.obj").write_text(f"v 0 0 0\nv 1 0 0\nv 0 1 0\nf {corners}\n")
-    return {"asset": str(folder / "face.obj")}
+    path.write_text(f"v 0 0 0\nv 1 0 0\nv 0 1 0\nf {corners}\n")
 
 
-def newer_gltf(folder: Path) -> dict[str, str | None]:
+def newer_gltf(path: Path) -> None:
     builder = Builder()
     builder.json["asset"]["minVersion"] = "2.9"
-    (folder / "new.glb").write_bytes(builder.glb())
-    return {"asset": str(folder / "new.glb")}
+    path.write_bytes(builder.glb())
 
 
-def millimetres(folder: Path) -> dict[str, str | None]:
-    corners = 1e3 * np.array([[0, 0, 0], [8, 0, 0], [0, 8, 0], [0, 0, 8]], np.float32)
-    content = bytes(80) + struct.pack("<I", 4)
-    for face in ((0, 1, 2), (0, 1, 3), (0, 2, 3), (1, 2, 3)):
-        content += bytes(12) + (corners[list(face)] - 2e3).astype(np.float32).tobytes() + bytes(2)
-    (folder / "chair.stl").write_bytes(content)
-    return {"asset": str(folder / "chair.stl")}
-
-
-FOUND = {
-    "N2-xyz": (("neither RGB nor luminance alone (found X, Y, Z",), exr("X", "Y", "Z")),
-    "N2-depth": (("found Y, Z",), exr("Y", "Z")),
-    "N3-tiff": (("tiles of 36000 x 36000", "--max-pixels"), large_tile),
-    "N3-exr": (("tiles of 18000 x 18000", "--max-pixels"), exr("R", "G", "B", tile=18_000)),
-    "N4": (("too many scans (found 5",), many_scans),
-    "N5-face": (("line 4: face with more corners", "1000000"), large_face),
-    "N6": (("too large (found 21474836480 bytes", "--max-file-bytes"), sparse_tail),
-    "N7-filter": (("a colour filter array",), tiff(32803)),
-    "N7-raw": (("linear raw values",), tiff(34892, 3)),
-    "N7-mask": (("a transparency mask",), tiff(4)),
-    "N7-palette": (("entries have 8 bits",), palette_of_bytes),
-    "N11": (("needs a reader of glTF '2.9'",), newer_gltf),
+FOUND: dict[str, tuple[Any, ...]] = {
+    "N2-xyz": ("a.exr", exr("X", "Y", "Z"), "neither RGB nor luminance alone (found X, Y, Z"),
+    "N2-depth": ("a.exr", exr("Y", "Z"), "found Y, Z"),
+    "N3-tiff": ("tile.tif", large_tile, "tiles of 36000 x 36000", "--max-pixels"),
+    "N3-exr": (
+        *("a.exr", exr("R", "G", "B", tile=18_000)),
+        *("tiles of 18000 x 18000", "--max-pixels"),
+    ),
+    "N4": ("scans.jpg", many_scans, "too many scans (found 5"),
+    "N5-face": ("face.obj", large_face, "line 4: face with more corners", "1000000"),
+    "N6": (
+        *("photo.png", lambda path: os.truncate(path, 20 << 30)),
+        *("too large (found 21474836480 bytes", "--max-file-bytes"),
+    ),
+    "N7-filter": ("a.tif", tiff(32803), "a colour filter array"),
+    "N7-raw": ("a.tif", tiff(34892, 3), "linear raw values"),
+    "N7-mask": ("a.tif", tiff(4), "a transparency mask"),
+    "N7-palette": ("palette.tif", palette_of_bytes, "entries have 8 bits"),
+    "N11": ("new.glb", newer_gltf, "needs a reader of glTF '2.9'"),
 }
+"""File, what writes it, and the words of the refusal."""
 
 
-@pytest.mark.parametrize("name", FOUND)
-def test_found_inputs_are_refused(name: str, folder: Path) -> None:
+@pytest.mark.parametrize("case", FOUND)
+def test_found_inputs_are_refused(case: str, folder: Path) -> None:
     """Within seconds, in one line that names what was found."""
-    words, make = FOUND[name]
-    argv = arguments(folder, "out", **make(folder))
+    name, write, *words = FOUND[case]
+    write(folder / name)
+    flag = "asset" if name.endswith(("obj", "glb")) else "photo"
+    argv = arguments(folder, "out", **{flag: str(folder / name)})
     assert_fails(argv, 3, *words, cwd=folder)
 
 
 @pytest.mark.case("N16")
 def test_hint_about_the_unit_is_by_the_size(folder: Path) -> None:
-    lines = assert_fails(
-        arguments(folder, "out", **millimetres(folder)), 3, "the camera is inside", cwd=folder
-    )
+    corners = 1e3 * np.array([[0, 0, 0], [8, 0, 0], [0, 8, 0], [0, 0, 8]], np.float32)
+    content = bytes(80) + struct.pack("<I", 4)
+    for face in ((0, 1, 2), (0, 1, 3), (0, 2, 3), (1, 2, 3)):
+        content += bytes(12) + (corners[list(face)] - 2e3).astype(np.float32).tobytes() + bytes(2)
+    (folder / "chair.stl").write_bytes(content)
+    argv = arguments(folder, "out", asset=str(folder / "chair.stl"))
+    lines = assert_fails(argv, 3, "the camera is inside", cwd=folder)
     assert ".001 for millimetres" in lines[1]
 
 

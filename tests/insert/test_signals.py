@@ -12,7 +12,7 @@ from pathlib import Path
 import pytest
 
 from tests.builders.faults import Ended, assert_fails, run_case, snapshot
-from tests.builders.guided_runs import guided_argv, results_of, write_guided_inputs
+from tests.builders.guided_runs import guided_argv, results_of
 from warpir.core import signals
 from warpir.core.atomic import manifest_digest
 from warpir.core.errors import ExitCode
@@ -103,13 +103,6 @@ def test_what_the_parent_ignores_stays_ignored() -> None:
 # -------------------------------------------------------------------------------- runs that stop
 
 
-@pytest.fixture(scope="module")
-def inputs(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    made = tmp_path_factory.mktemp("inputs")
-    write_guided_inputs(made)
-    return made
-
-
 HOOK = """
 import importlib, os, signal, sys
 def at(place, turn, act):
@@ -147,12 +140,12 @@ COMMIT = "warpir.io.results:OutputFolder:_put_in_place"
 
 
 def guided(
-    inputs: Path, folder: Path, *more: str, before: str = "", file_size: int | None = None
+    guided_inputs: Path, folder: Path, *more: str, before: str = "", file_size: int | None = None
 ) -> Ended:
     """Run what `guided_argv` describes, into ``folder/out``, with a cache of its own."""
     cache = folder.parent / f"{folder.name}-cache"
     return run_case(
-        [*guided_argv(inputs), *more],
+        [*guided_argv(guided_inputs), *more],
         folder,
         env={"WARPIR_CACHE": str(cache)},
         before=before,
@@ -162,10 +155,10 @@ def guided(
 
 
 @pytest.fixture(scope="module")
-def finished(inputs: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+def finished(guided_inputs: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The folder of a run that nothing stopped."""
     folder = tmp_path_factory.mktemp("finished")
-    ended = guided(inputs, folder)
+    ended = guided(guided_inputs, folder)
     assert ended.status == ExitCode.DONE, ended.err
     return folder / "out"
 
@@ -213,7 +206,7 @@ STOPS = [
 @pytest.mark.slow
 @pytest.mark.parametrize(("place", "turn", "numbers", "kept"), STOPS)
 def test_stopped_run_keeps_what_it_had(
-    inputs: Path,
+    guided_inputs: Path,
     finished: Path,
     tmp_path: Path,
     place: str,
@@ -224,7 +217,7 @@ def test_stopped_run_keeps_what_it_had(
     """A checkpoint at the border of the step, the old results as they were, no lock."""
     old = old_results(finished, tmp_path) if kept else {}
     before = hook(place, turn, f"send{(*map(int, numbers),)}")
-    ended = guided(inputs, tmp_path, "--overwrite", before=before)
+    ended = guided(guided_inputs, tmp_path, "--overwrite", before=before)
     assert ended.status == 128 + numbers[0], ended.err
     assert "Traceback" not in ended.err and "error:" not in ended.err
     last = ended.err.splitlines()[-1]
@@ -237,24 +230,24 @@ def test_stopped_run_keeps_what_it_had(
 @pytest.mark.slow
 @pytest.mark.case("R2")
 def test_results_that_are_being_put_in_place_are_finished(
-    inputs: Path, finished: Path, tmp_path: Path
+    guided_inputs: Path, finished: Path, tmp_path: Path
 ) -> None:
     old_results(finished, tmp_path)
     before = hook(COMMIT, 1, f"send({int(TERM)}, {int(TERM)})")
-    ended = guided(inputs, tmp_path, "--overwrite", before=before)
+    ended = guided(guided_inputs, tmp_path, "--overwrite", before=before)
     assert ended.status == 143
     assert ended.err.splitlines()[-1] == "stopped by SIGTERM; the results in out are complete"
     assert results_of(tmp_path / "out") == results_of(finished)
 
 
 @pytest.mark.parametrize("number", [INT, TERM, HUP], ids=["R2-read-int", "R2-read", "R2-read-hup"])
-def test_run_stops_while_it_reads(inputs: Path, tmp_path: Path, number: int) -> None:
+def test_run_stops_while_it_reads(guided_inputs: Path, tmp_path: Path, number: int) -> None:
     """At once, without a file; and a folder with results is as it was."""
     (tmp_path / "out").mkdir()
     (tmp_path / "out" / "run.json").write_text("{}")
     before = hook("warpir.app.inputs:read_inputs", 1, f"send({int(number)})")
     was = snapshot(tmp_path)
-    ended = run_case([*guided_argv(inputs), "--overwrite"], tmp_path, before=before)
+    ended = run_case([*guided_argv(guided_inputs), "--overwrite"], tmp_path, before=before)
     assert (ended.status, snapshot(tmp_path)) == (128 + number, was)
     assert ended.err.startswith(f"stopped by {signal.Signals(number).name}; ")
     assert ended.seconds < 5.0
@@ -262,9 +255,11 @@ def test_run_stops_while_it_reads(inputs: Path, tmp_path: Path, number: int) -> 
 
 @pytest.mark.slow
 @pytest.mark.case("R2")
-def test_stopped_sequence_says_how_many_frames_are_kept(inputs: Path, tmp_path: Path) -> None:
+def test_stopped_sequence_says_how_many_frames_are_kept(
+    guided_inputs: Path, tmp_path: Path
+) -> None:
     """The second frame stops; the same command then makes the rest only."""
-    argv = lit(inputs, tmp_path)
+    argv = lit(guided_inputs, tmp_path)
     assert run_case([*argv, "--out", "first"], tmp_path, warm=True).status == ExitCode.DONE
     lines = "".join(json.dumps({"place": [x, 0, -5]}) + "\n" for x in (0.0, 0.2))
     (tmp_path / "frames.jsonl").write_text(lines)
@@ -282,11 +277,11 @@ def test_stopped_sequence_says_how_many_frames_are_kept(inputs: Path, tmp_path: 
     assert ended.out.count("done already") == 1
 
 
-def lit(inputs: Path, folder: Path) -> list[str]:
+def lit(guided_inputs: Path, folder: Path) -> list[str]:
     """Return a cheap run under a known light, but for its --out."""
     from tests.builders.insertions import arguments
 
-    argv = arguments(inputs, "", samples="1", depth="1", device="cpu", no_hand_off="")
+    argv = arguments(guided_inputs, "", samples="1", depth="1", device="cpu", no_hand_off="")
     place = argv.index("--out")
     return argv[:place] + argv[place + 1 + (argv[place + 1] == "") :]
 
@@ -365,11 +360,11 @@ def small_disk(tmp_path: Path) -> Iterator[Callable[[str], Path]]:
     "limit", [pytest.param(n, id=f"R4-{n}") for n in (1_000, 10_000, 100_000, 500_000)]
 )
 def test_full_disk_keeps_old_results_and_checkpoints(
-    inputs: Path, finished: Path, tmp_path: Path, limit: int
+    guided_inputs: Path, finished: Path, tmp_path: Path, limit: int
 ) -> None:
     """Wherever the disk is full first: preview, checkpoint, LoRA, EXR."""
     old = old_results(finished, tmp_path)
-    ended = guided(inputs, tmp_path, "--overwrite", file_size=limit)
+    ended = guided(guided_inputs, tmp_path, "--overwrite", file_size=limit)
     assert ended.status == ExitCode.RESOURCES, ended.err
     errors = [line for line in ended.err.splitlines() if line.startswith("error:")]
     assert len(errors) == 1 and errors[0].startswith("error: out/")
@@ -378,7 +373,7 @@ def test_full_disk_keeps_old_results_and_checkpoints(
     assert bool(kept) == (limit >= 500_000)
     if kept:
         assert f"{kept}; the same command with --resume" in ended.out
-        ended = guided(inputs, tmp_path, "--resume")
+        ended = guided(guided_inputs, tmp_path, "--resume")
         assert ended.status == ExitCode.DONE, ended.err
         assert results_of(tmp_path / "out") == results_of(finished)
 
@@ -386,17 +381,17 @@ def test_full_disk_keeps_old_results_and_checkpoints(
 @pytest.mark.slow
 @pytest.mark.case("R4", "R5")
 def test_full_file_system(
-    inputs: Path, finished: Path, tmp_path: Path, small_disk: Callable[[str], Path]
+    guided_inputs: Path, finished: Path, tmp_path: Path, small_disk: Callable[[str], Path]
 ) -> None:
     """A real one, another than that of temporary files, which others fill meanwhile."""
     disk = small_disk("64m")
     fill = "lambda: open('filler', 'wb').write(bytes(shutil.disk_usage('.').free - 1_420_000))"
-    ended = guided(inputs, disk, before="import shutil\n" + hook(WRITE, 1, fill))
+    ended = guided(guided_inputs, disk, before="import shutil\n" + hook(WRITE, 1, fill))
     assert ended.status == ExitCode.RESOURCES, ended.err
     assert ended.err.startswith("error: out/envmap.hdr: written incompletely")
     (disk / "filler").unlink()
     assert what_is_kept(disk / "out", {}) == "000005-optimize-6"
-    ended = guided(inputs, disk, "--resume")
+    ended = guided(guided_inputs, disk, "--resume")
     assert ended.status == ExitCode.DONE, ended.err
     assert results_of(disk / "out") == results_of(finished)
 
@@ -413,11 +408,11 @@ GONE = [
 @pytest.mark.slow
 @pytest.mark.parametrize(("place", "turn", "act"), GONE)
 def test_output_folder_that_vanishes(
-    inputs: Path, tmp_path: Path, place: str, turn: int, act: str
+    guided_inputs: Path, tmp_path: Path, place: str, turn: int, act: str
 ) -> None:
     """The run ends with one line, and does not make the folder anew."""
     before = "import shutil\n" + hook(place, turn, act)
-    ended = guided(inputs, tmp_path, before=before)
+    ended = guided(guided_inputs, tmp_path, before=before)
     assert ended.status == ExitCode.RESOURCES, ended.err
     assert ended.err.startswith("error: out/") and "Traceback" not in ended.err
     assert not (tmp_path / "out").is_dir()
@@ -426,7 +421,7 @@ def test_output_folder_that_vanishes(
 @pytest.mark.slow
 @pytest.mark.case("R6")
 def test_output_folder_that_becomes_read_only(
-    inputs: Path, finished: Path, tmp_path: Path, small_disk: Callable[[str], Path]
+    guided_inputs: Path, finished: Path, tmp_path: Path, small_disk: Callable[[str], Path]
 ) -> None:
     old = old_results(finished, tmp_path)
     # What is open for writing cannot become read-only, so that another disk comes on top.
@@ -435,7 +430,7 @@ def test_output_folder_that_becomes_read_only(
     act = f"lambda: subprocess.run({command!r}, check=True)"
     try:
         before = "import subprocess\n" + hook(STEP, 3, act)
-        ended = guided(inputs, tmp_path, "--overwrite", before=before)
+        ended = guided(guided_inputs, tmp_path, "--overwrite", before=before)
     finally:
         subprocess.run(["umount", str(tmp_path / "out")], check=True)
     assert ended.status == ExitCode.RESOURCES, ended.err
@@ -446,11 +441,11 @@ def test_output_folder_that_becomes_read_only(
 
 
 @pytest.mark.case("F6")
-def test_second_run_into_a_folder_is_locked_out(inputs: Path, tmp_path: Path) -> None:
+def test_second_run_into_a_folder_is_locked_out(guided_inputs: Path, tmp_path: Path) -> None:
     """It says whose the folder is, and leaves that run alone."""
     with OutputFolder(tmp_path / "out"):
         words = ("out: locked by pid", str(os.getpid()))
-        argv = [*guided_argv(inputs), "--overwrite"]
+        argv = [*guided_argv(guided_inputs), "--overwrite"]
         assert_fails(argv, ExitCode.OUTPUT, *words, cwd=tmp_path)
 
 
@@ -458,10 +453,10 @@ def test_second_run_into_a_folder_is_locked_out(inputs: Path, tmp_path: Path) ->
 
 
 @pytest.fixture(scope="module")
-def stopped(inputs: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+def stopped(guided_inputs: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Inputs, and ``run/out`` with two checkpoints of a run that was stopped."""
     folder = tmp_path_factory.mktemp("stopped")
-    shutil.copytree(inputs, folder / "inputs")
+    shutil.copytree(guided_inputs, folder / "inputs")
     (folder / "run").mkdir()
     ended = guided(folder / "inputs", folder / "run", before=hook(STEP, 3, f"send({int(TERM)})"))
     assert ended.status == 143, ended.err

@@ -4,9 +4,10 @@ import numpy as np
 import pytest
 import warp as wp
 
+from benchmarks.stability.case import upload
 from tests import oracles as o
 from tests.statistics import chi_square, compare_gradients, graded_edges
-from warpir.kernels.bsdf import bsdf_f, bsdf_of, bsdf_pdf, bsdf_sample
+from warpir.kernels.bsdf import bsdf_f, bsdf_of, bsdf_sample
 from warpir.kernels.types import Layers
 
 VALUE_RTOL = 1e-4
@@ -53,8 +54,9 @@ def pdf_kernel(
     p_specular: wp.array[float],
 ):
     i = wp.tid()
-    pdf[i] = bsdf_pdf(bsdf_of(wo[i], base_color[i], metallic[i], roughness[i], Layers()), wi[i])
-    p_specular[i] = bsdf_of(wo[i], base_color[i], metallic[i], roughness[i], Layers()).p[1]
+    bsdf = bsdf_of(wo[i], base_color[i], metallic[i], roughness[i], Layers())
+    pdf[i] = bsdf_f(bsdf, wi[i]).pdf
+    p_specular[i] = bsdf.p[1]
 
 
 @wp.kernel
@@ -69,11 +71,6 @@ def sample_kernel(
 ):
     i = wp.tid()
     wi[i] = bsdf_sample(bsdf_of(wo, base_color, metallic, roughness, Layers()), u[i], u_lobe[i])
-
-
-def upload(values: np.ndarray, dtype: type, device: str, requires_grad: bool = False) -> wp.array:
-    values = np.ascontiguousarray(values, np.float32)
-    return wp.array(values, dtype=dtype, device=device, requires_grad=requires_grad)
 
 
 class Case:

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 import warp as wp
 
+from benchmarks.stability.case import upload
 from tests import oracles as o
 from tests.kernels.test_brdf import (
     GRADIENT_RELATIVE_L2,
@@ -14,7 +15,6 @@ from tests.kernels.test_brdf import (
     Z_MAX,
     outgoing,
     random_case,
-    upload,
 )
 from tests.oracles import LayeredMaterial
 from tests.statistics import chi_square, compare_gradients

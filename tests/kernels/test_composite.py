@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 import warp as wp
 
+from benchmarks.stability.case import upload
 from tests import oracles as o
 from tests.statistics import central_differences, compare_gradients, warp_agrees
 from warpir.kernels.composite import compose, tone_foreground, tone_shadow
@@ -13,16 +14,6 @@ VALUE_ABS = 2e-6
 """float32 values in [0, 1] after a curve, a product and a power."""
 GRADIENT_RELATIVE_L2 = 1e-3
 """float32 adjoint against central differences of the float64 oracle."""
-
-
-def vec3s(values: np.ndarray, device: str, requires_grad: bool = False) -> wp.array:
-    values = np.ascontiguousarray(values, np.float32)
-    return wp.array(values, dtype=wp.vec3, device=device, requires_grad=requires_grad)
-
-
-def floats(values: np.ndarray, device: str, requires_grad: bool = False) -> wp.array:
-    values = np.ascontiguousarray(values, np.float32)
-    return wp.array(values, dtype=float, device=device, requires_grad=requires_grad)
 
 
 def ints(values: np.ndarray, device: str) -> wp.array:
@@ -78,10 +69,10 @@ class Scene:
 
     def launch(self, device: str, is_reinhard: int = 1) -> tuple[list[wp.array], wp.array, wp.Tape]:
         """Run the four kernels; return the free arrays, the image and the tape."""
-        free = [vec3s(a, device, True) for a in self.free()[:3]]
-        free += [floats(a, device, True) for a in self.free()[3:]]
+        free = [upload(a, wp.vec3, device, True) for a in self.free()[:3]]
+        free += [upload(a, float, device, True) for a in self.free()[3:]]
         foreground, lit, unoccluded = free[:3]
-        mask = floats(self.mask, device)
+        mask = upload(self.mask, float, device)
         ratio, ratio_display = empty(56, device), empty(56, device)
         display, image = empty(40, device), empty(96, device)
         with wp.Tape() as tape:
@@ -104,7 +95,7 @@ class Scene:
             wp.launch(
                 compose,
                 96,
-                inputs=[vec3s(self.photo, device), *index, mask, display, ratio_display],
+                inputs=[upload(self.photo, wp.vec3, device), *index, mask, display, ratio_display],
                 outputs=[image],
                 device=device,
             )
@@ -126,7 +117,7 @@ def test_composite_gradient(device: str, rng: np.random.Generator) -> None:
     scene = Scene(rng)
     free, image, tape = scene.launch(device)
     y = rng.normal(size=(96, 3)).astype(np.float32)
-    tape.backward(grads={image: vec3s(y, device)})
+    tape.backward(grads={image: upload(y, wp.vec3, device)})
     values = [a.astype(np.float64) for a in scene.free()]
 
     def loss(k: int, x: np.ndarray) -> float:
@@ -157,7 +148,7 @@ def test_composite_gradient(device: str, rng: np.random.Generator) -> None:
 def test_copies_of_the_curves_count_together(device: str, rng: np.random.Generator) -> None:
     """Threads take turns with equal copies: same image, and their gradients sum up to the same."""
     scene = Scene(rng)
-    y = vec3s(rng.normal(size=(96, 3)), device)
+    y = upload(rng.normal(size=(96, 3)), wp.vec3, device)
     alone, image, tape = scene.launch(device)
     tape.backward(grads={image: y})
     scene.knots_fg = tuple(np.tile(k, (4, 1)) for k in scene.knots_fg)
@@ -219,12 +210,12 @@ def test_shadow_ratio_of_special_values(device: str) -> None:
         [[1.0, 0.3, 7e4], [1.0, 2.0, 1e9], [0.0, 0.0, 1.0], [1e-30, 0.0, 1e30]], np.float32
     )
     expected = [[1, 1, 1], [0, 0, 0], [1, 1, 0.5], [1, 1, 1]]
-    arrays = [vec3s(lit, device, True), vec3s(unoccluded, device, True)]
+    arrays = [upload(lit, wp.vec3, device, True), upload(unoccluded, wp.vec3, device, True)]
     out = empty(4, device)
     with wp.Tape() as tape:
         wp.launch(shadow_ratio, 4, inputs=arrays, outputs=[out], device=device)
     assert np.array_equal(out.numpy(), np.array(expected, np.float32))
-    tape.backward(grads={out: vec3s(np.ones((4, 3)), device)})
+    tape.backward(grads={out: upload(np.ones((4, 3)), wp.vec3, device)})
     d_lit, d_unoccluded = (a.grad.numpy() for a in arrays)
     assert np.all(np.isfinite(d_lit)) and np.all(np.isfinite(d_unoccluded[:3]))
     assert d_lit[2, 2] == 1.0 and d_unoccluded[2, 2] == -0.5
@@ -234,11 +225,11 @@ def test_shadow_ratio_of_special_values(device: str) -> None:
 def test_shadow_ratio_of_underflowing_light_is_one(device: str) -> None:
     """What underflow leaves of a lobe's tail is no light: ratio 1, gradients 0 and not infinite."""
     unoccluded = np.repeat(np.array([[1e-45], [1e-40], [1e-38], [1e-31]], np.float32), 3, axis=1)
-    arrays = [vec3s(x, device, True) for x in (0.5 * unoccluded, unoccluded)]
+    arrays = [upload(x, wp.vec3, device, True) for x in (0.5 * unoccluded, unoccluded)]
     out = empty(4, device)
     with wp.Tape() as tape:
         wp.launch(shadow_ratio, 4, inputs=arrays, outputs=[out], device=device)
-    tape.backward(grads={out: vec3s(np.ones((4, 3)), device)})
+    tape.backward(grads={out: upload(np.ones((4, 3)), wp.vec3, device)})
     assert np.all(out.numpy() == 1.0)
     assert all(np.all(a.grad.numpy() == 0.0) for a in arrays)
 
@@ -250,7 +241,7 @@ def test_shadow_ratio_ignores_the_scale_of_the_light(device: str, rng: np.random
     ratios = []
     for scale in (1.0, 2.0**20, 2.0**-20):
         out = empty(64, device)
-        inputs = [vec3s(lit * scale, device), vec3s(unoccluded * scale, device)]
+        inputs = [upload(lit * scale, wp.vec3, device), upload(unoccluded * scale, wp.vec3, device)]
         wp.launch(shadow_ratio, 64, inputs=inputs, outputs=[out], device=device)
         ratios.append(out.numpy())
     assert np.array_equal(ratios[0], ratios[1]) and np.array_equal(ratios[0], ratios[2])
@@ -260,12 +251,12 @@ def test_shadow_ratio_ignores_the_scale_of_the_light(device: str, rng: np.random
 def photo_only(photo: np.ndarray, device: str) -> tuple[wp.array, wp.array, wp.Tape]:
     """Encode a photo by the composite kernel without object or plane."""
     count = len(photo)
-    source, image = vec3s(photo, device, True), empty(count, device)
+    source, image = upload(photo, wp.vec3, device, True), empty(count, device)
     none = ints(np.full(count, -1), device)
     dummy = [
-        floats(np.zeros(1), device),
-        vec3s(np.zeros((1, 3)), device),
-        vec3s(np.zeros((1, 3)), device),
+        upload(np.zeros(1), float, device),
+        upload(np.zeros((1, 3)), wp.vec3, device),
+        upload(np.zeros((1, 3)), wp.vec3, device),
     ]
     with wp.Tape() as tape:
         wp.launch(
@@ -290,7 +281,7 @@ def test_encode_is_finite_and_monotone(device: str) -> None:
     y = image.numpy()[:, 0].astype(np.float64)
     assert np.all(y[:3] == 0.0) and y[-1] == 1.0
     assert np.diff(y).min() >= -1e-7
-    tape.backward(grads={image: vec3s(np.ones((len(x), 3)), device)})
+    tape.backward(grads={image: upload(np.ones((len(x), 3)), wp.vec3, device)})
     gradient = source.grad.numpy()[:, 0]
     assert np.all(np.isfinite(gradient)) and np.all(gradient >= 0.0)
     # Half of one 8-bit code is the most that the linear foot may change.
@@ -307,21 +298,24 @@ def test_gradcheck(device: str, rng: np.random.Generator, kernel: str) -> None:
     middle = lambda knots, c: 0.5 * (knots[0][c, 1:] + knots[0][c, :-1])  # noqa: E731
     out = empty(5, device)
     if kernel == "shadow_ratio":
-        inputs = [vec3s(scene.lit[:5], device, True), vec3s(scene.unoccluded[:5], device, True)]
+        inputs = [
+            upload(scene.lit[:5], wp.vec3, device, True),
+            upload(scene.unoccluded[:5], wp.vec3, device, True),
+        ]
     elif kernel == "tone_shadow":
         ratio = np.stack([middle(scene.knots_shadow, c) for c in range(3)], axis=-1)
         inputs = [
-            vec3s(ratio, device, True),
-            *(floats(k, device, True) for k in scene.knots_shadow),
+            upload(ratio, wp.vec3, device, True),
+            *(upload(k, float, device, True) for k in scene.knots_shadow),
             5,
         ]
     else:
         x = np.repeat(middle(scene.knots_fg, 0)[:, None], 3, axis=1)
         inputs = [
-            vec3s(x * 0.5, device, True),
-            floats(np.full(5, 0.5), device),
+            upload(x * 0.5, wp.vec3, device, True),
+            upload(np.full(5, 0.5), float, device),
             0,
-            *(floats(k, device, True) for k in scene.knots_fg),
+            *(upload(k, float, device, True) for k in scene.knots_fg),
             5,
         ]
     function = {

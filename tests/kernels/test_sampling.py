@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 import warp as wp
 
+from benchmarks.stability.case import upload
 from benchmarks.stability.maps import eval_kernel, sample_kernel
 from tests import oracles as o
 from tests.statistics import ChiSquare, chi_square, graded_edges
@@ -64,10 +65,6 @@ def lobe_kernel(u: wp.array[wp.vec2], axis: wp.vec3, sharpness: float, wi: wp.ar
     wi[i] = lobe_sample(u[i], axis, sharpness)
 
 
-def vec3s(values: np.ndarray, device: str) -> wp.array:
-    return wp.array(np.ascontiguousarray(values, np.float32), dtype=wp.vec3, device=device)
-
-
 def uniform2(rng: np.random.Generator, count: int, device: str) -> wp.array:
     return wp.array(rng.random((count, 2), dtype=np.float32), dtype=wp.vec2, device=device)
 
@@ -90,7 +87,7 @@ def eval_light(light: LightArgs, wi: np.ndarray, device: str) -> tuple[np.ndarra
     count = wi.size // 3
     radiance = wp.zeros(count, dtype=wp.vec3, device=device)
     pdf = wp.zeros(count, dtype=float, device=device)
-    source = vec3s(wi.reshape(-1, 3), device)
+    source = upload(wi.reshape(-1, 3), wp.vec3, device)
     wp.launch(eval_kernel, count, inputs=[light, source], outputs=[radiance, pdf], device=device)
     return (
         radiance.numpy().astype(np.float64).reshape(wi.shape),
@@ -138,7 +135,7 @@ def test_frame_is_orthonormal_and_right_handed(device: str, rng: np.random.Gener
     wp.launch(
         frame_kernel,
         len(n),
-        inputs=[vec3s(n, device), vec3s(v, device)],
+        inputs=[upload(n, wp.vec3, device), upload(v, wp.vec3, device)],
         outputs=out,
         device=device,
     )

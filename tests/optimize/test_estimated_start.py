@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from tests.builders.insertions import arguments, digest, write_inputs
+from tests.builders.insertions import arguments, digest, record_of, write_inputs
 from tests.builders.tiny_stable_diffusion import make_tiny_stable_diffusion
 from warpir.app.config import InsertConfig
 from warpir.app.inputs import read_inputs
@@ -66,11 +66,6 @@ UNGUIDED = dict.fromkeys(
 """Flags that a run without a model leaves out."""
 
 
-def record(out: Path) -> dict[str, Any]:
-    read: dict[str, Any] = json.loads((out / "run.json").read_text())
-    return read
-
-
 def judged_as(monkeypatch: pytest.MonkeyPatch, is_accepted: bool) -> None:
     verdict = Verdict(is_accepted, -3.0 if is_accepted else 2.0, 1.0, 16)
     monkeypatch.setattr(recover, "judge", lambda *_: verdict)
@@ -85,7 +80,7 @@ def test_default_run_is_the_estimated_light(
     assert main([*flags, "--validate"]) == ExitCode.DONE
     assert main(flags) == ExitCode.DONE
     said = capsys.readouterr().out
-    measured = record(out)["measured"]
+    measured = record_of(out)["measured"]
     spread = measured["regression"]["spread_deg"]
     assert f"light regressed from the photo, +- {spread:.0f} degrees" in said
     assert measured["prior"] == "none" and "acceptance" not in measured
@@ -127,7 +122,7 @@ def test_guided_run_says_where_it_began(
     assert "accepted: guidance, asked anew, prefers the end (dU = -3 +- 1)" in said
     previews = [f"preview-{step:06d}.png" for step in (0, 2, 4)]
     assert sorted(p.name for p in (out / "progress").iterdir()) == previews
-    run = record(out)
+    run = record_of(out)
     measured = run["measured"]
     assert len(measured["prior_sha256"]) == 64 and "regressor" in run["inputs"]
     assert any("what the regressor sees in the photo" in line for line in run["assumed"])
@@ -159,7 +154,7 @@ def test_refused_end_is_the_start(
     for name in ("lobes.json", "curves.json", "envmap.exr", "composite.png"):
         assert digest(out)[name] == digest(alone)[name]
     assert not (out / "lobes_shadow.json").exists()
-    run = record(out)
+    run = record_of(out)
     assert line in run["notices"] and run["measured"]["acceptance"]["is_accepted"] is False
     measured = run["measured"]
     assert measured["start_light"] == measured["light"] != measured["end_light"]
@@ -171,10 +166,10 @@ def test_judging_leaves_the_end_as_it_was(folder: Path, tmp_path: Path) -> None:
     judged, plain = tmp_path / "judged", tmp_path / "plain"
     assert main(argv(folder, judged, accept="")) == ExitCode.DONE
     assert main(argv(folder, plain)) == ExitCode.DONE
-    assert "acceptance" not in record(plain)["measured"]
-    numbers = record(judged)["measured"]["acceptance"]
+    assert "acceptance" not in record_of(plain)["measured"]
+    numbers = record_of(judged)["measured"]["acceptance"]
     assert math.isfinite(numbers["rise"]) and numbers["error"] > 0.0
-    assert record(judged)["measured"]["end_light"] == record(plain)["measured"]["end_light"]
+    assert record_of(judged)["measured"]["end_light"] == record_of(plain)["measured"]["end_light"]
     same = digest(judged)["envmap.exr"] == digest(plain)["envmap.exr"]
     assert same == numbers["is_accepted"]
 
@@ -242,6 +237,6 @@ def test_demo_does_the_real_job(folder: Path, tmp_path: Path) -> None:
     flags += ["--model", str(folder / "model"), "--prompt", "a car", "--class-images", "0"]
     flags += ["--lora-steps", "2", "--regressor", str(folder / "regressor.safetensors")]
     assert main(flags) == ExitCode.DONE
-    run = record(out)
+    run = record_of(out)
     assert run["measured"]["prior"] == "stable-diffusion" and "light" not in run["inputs"]
     assert demo_config(InsertConfig(demo=True, out="o")).light.file is None

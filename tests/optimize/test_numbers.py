@@ -5,7 +5,7 @@ else, or end with exit code 6 and its last good state.
 """
 
 import json
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -17,8 +17,8 @@ import warp as wp
 from torch import Tensor
 
 from tests.builders.faults import snapshot
-from tests.builders.guided_runs import guided_flags, write_guided_inputs
-from tests.builders.insertions import arguments
+from tests.builders.guided_runs import guided_flags
+from tests.builders.insertions import arguments, record_of
 from tests.builders.loops import SETTINGS, Pull, a_loop, bent, values
 from tests.builders.tiny_stable_diffusion import make_tiny_stable_diffusion
 from tests.core.test_memory import a_scene, sky
@@ -481,18 +481,6 @@ def test_lora_ends_after_five_bad_steps(training: LoraTraining) -> None:
 # ----------------------------------------------------------------------------- whole runs
 
 
-@pytest.fixture(scope="module")
-def inputs(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    made = tmp_path_factory.mktemp("inputs")
-    write_guided_inputs(made)
-    return made
-
-
-def record(out: Path) -> Mapping[str, Any]:
-    read: dict[str, Any] = json.loads((out / "run.json").read_text())
-    return read
-
-
 def spoil_render(monkeypatch: pytest.MonkeyPatch, count: int) -> None:
     """Let the first pixels of every rendered object be bad, on any device."""
     launch = Renderer.launch
@@ -510,7 +498,7 @@ def spoil_render(monkeypatch: pytest.MonkeyPatch, count: int) -> None:
 
 @pytest.mark.slow
 def test_bad_radiance_is_told_or_ends_with_6(
-    inputs: Path,
+    guided_inputs: Path,
     tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch,
     capsys: pytest.CaptureFixture[str],
@@ -518,15 +506,15 @@ def test_bad_radiance_is_told_or_ends_with_6(
     """One bad pixel: done, black, counted in run.json. All: exit code 6, old results whole."""
     out = tmp_path / "out"
     spoil_render(monkeypatch, 1)
-    assert main(arguments(inputs, out)) == ExitCode.DONE
-    run = record(out)
+    assert main(arguments(guided_inputs, out)) == ExitCode.DONE
+    run = record_of(out)
     assert run["measured"]["bad_pixels"] == 1
     (notice,) = (n for n in run["notices"] if "not finite" in n)
     assert "x " in notice and f"notice: {notice}" in capsys.readouterr().out
     before = snapshot(tmp_path)
     monkeypatch.undo()
     spoil_render(monkeypatch, 1 << 20)
-    assert main([*arguments(inputs, out), "--overwrite"]) == ExitCode.NUMERIC
+    assert main([*arguments(guided_inputs, out), "--overwrite"]) == ExitCode.NUMERIC
     lines = capsys.readouterr().err.splitlines()
     assert lines[0].startswith("error: object:") and len(lines) == 2
     assert snapshot(tmp_path) == before
@@ -543,7 +531,7 @@ def test_bad_radiance_is_told_or_ends_with_6(
 def test_guided_run_counts_bad_steps(
     bad: set[int],
     status: int,
-    inputs: Path,
+    guided_inputs: Path,
     tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch,
     capsys: pytest.CaptureFixture[str],
@@ -557,12 +545,12 @@ def test_guided_run_counts_bad_steps(
 
     monkeypatch.setattr(Guidance, "_gradient", gradient)
     out = tmp_path / "out"
-    flags = guided_flags(inputs, out, steps="7", checkpoint_every="0")
+    flags = guided_flags(guided_inputs, out, steps="7", checkpoint_every="0")
     assert main(flags) == status
     captured = capsys.readouterr()
     if status == ExitCode.DONE:
-        assert record(out)["measured"]["optimization"]["skipped_steps"] == 1
-        assert any("were skipped" in notice for notice in record(out)["notices"])
+        assert record_of(out)["measured"]["optimization"]["skipped_steps"] == 1
+        assert any("were skipped" in notice for notice in record_of(out)["notices"])
         return
     lines = captured.err.splitlines()
     assert sum(line.startswith("error:") for line in lines) == 1 and "5 steps in a row" in lines[0]

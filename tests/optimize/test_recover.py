@@ -4,14 +4,14 @@ import json
 import shutil
 from pathlib import Path
 from types import SimpleNamespace
-from typing import Any, cast
+from typing import cast
 
 import numpy as np
 import pytest
 import torch
 from safetensors.torch import load_file, save_file
 
-from tests.builders.insertions import ALWAYS, DETAIL, arguments, digest, write_inputs
+from tests.builders.insertions import ALWAYS, DETAIL, arguments, digest, record_of, write_inputs
 from tests.builders.programs.stops import Killed, stop_at, stop_hard
 from tests.builders.tiny_stable_diffusion import make_tiny_stable_diffusion
 from warpir.app.command import parse
@@ -84,17 +84,12 @@ def results(out: Path) -> dict[str, str]:
     return {name: found[name] for name in RESULTS if name in found}
 
 
-def record(out: Path) -> dict[str, Any]:
-    read: dict[str, Any] = json.loads((out / "run.json").read_text())
-    return read
-
-
 def test_guided_run_writes_every_file_and_says_who_spoke(finished: Path) -> None:
     assert {p.name for p in finished.iterdir()} == {
         *(*ALWAYS, *DETAIL, *GUIDED),
         *("progress", "run.json"),
     }
-    run = record(finished)
+    run = record_of(finished)
     measured = run["measured"]
     assert measured["prior"] == "stable-diffusion" and measured["loop_integrator"] == "transport"
     assert set(measured["model"]["sha256"]) > {
@@ -123,7 +118,7 @@ def test_guided_run_again_reuses_the_lora_and_gives_the_same_bytes(
     monkeypatch.setenv("WARPIR_CACHE", str(finished.parent / "cache"))
     out = tmp_path / "again"
     assert main(argv(folder, out)) == ExitCode.DONE
-    assert record(out)["measured"]["personalization"]["reused"] is True
+    assert record_of(out)["measured"]["personalization"]["reused"] is True
     assert results(out) == results(finished)
 
 
@@ -293,7 +288,7 @@ def test_pickles_are_read_by_a_run_that_allows_them(folder: Path, tmp_path: Path
     asked = argv(folder, out, model=str(model), **few)
     assert main(asked) == ExitCode.MODEL
     assert main([*asked, "--allow-pickle"]) == ExitCode.DONE
-    assert any("--allow-pickle" in notice for notice in record(out)["notices"])
+    assert any("--allow-pickle" in notice for notice in record_of(out)["notices"])
 
 
 def test_a_finished_run_is_not_resumed(
@@ -345,7 +340,7 @@ def test_every_loss_runs(folder: Path, tmp_path: Path, loss: str) -> None:
     assert len(by_step["gradient"]) == 3 and all(v > 0.0 for v in by_step["gradient"])
     asks_base_alone = loss in ("csd", "sds-base")
     assert (out / "lora_kohya.safetensors").exists() != asks_base_alone
-    assert any("does without a LoRA" in x for x in record(out)["notices"]) == asks_base_alone
+    assert any("does without a LoRA" in x for x in record_of(out)["notices"]) == asks_base_alone
 
 
 @pytest.mark.slow
@@ -363,7 +358,7 @@ def test_ablations(folder: Path, tmp_path: Path) -> None:
     assert not (out / "envmap_shadow.exr").exists() and not (out / "lobes_shadow.json").exists()
     out = tmp_path / "concept"
     assert main(argv(folder, out, class_images="0", **few)) == ExitCode.DONE
-    assert record(out)["measured"]["personalization"]["class_prompts"] == []
+    assert record_of(out)["measured"]["personalization"]["class_prompts"] == []
     out = tmp_path / "base"
     changes = {"no_personalize": "", "loss": "csd", "integrator": "mis", "mis_samples": "2"}
     assert main(argv(folder, out, **few, **changes)) == ExitCode.DONE
@@ -381,8 +376,8 @@ def test_start_from_a_given_light_preview_and_prior(folder: Path, tmp_path: Path
         "preview-000004.png",
     ]
     assert (out / "prior.png").exists()
-    assert record(out)["measured"]["personalization"]["reused"] is False
-    assert not any("even one" in line for line in record(out)["assumed"])
+    assert record_of(out)["measured"]["personalization"]["reused"] is False
+    assert not any("even one" in line for line in record_of(out)["assumed"])
 
 
 def test_start_keeps_the_flux_of_a_sun_that_is_too_narrow(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -416,7 +411,7 @@ def test_recovered_lamps_light_the_picture_and_are_written(folder: Path, tmp_pat
     few = {"steps": "3", "score_every": "0", "lora_steps": "1"}
     assert main(argv(folder, out, **lamp, **few)) == ExitCode.DONE
     (found,) = read_lamps(out / "lamps.json", Limits(), [])
-    (used,) = record(out)["measured"]["lamps"]
+    (used,) = record_of(out)["measured"]["lamps"]
     np.testing.assert_allclose(found.power, used["power"], rtol=1e-12)
     assert not np.isclose(found.power, [20.0, 10.0, 5.0], rtol=1e-3).any()
     np.testing.assert_allclose(found.center, [0.8, 1.5, -3.0])

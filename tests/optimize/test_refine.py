@@ -12,7 +12,7 @@ from torch import Tensor
 
 from benchmarks.light.recovery import TowardTruth
 from tests import oracles as o
-from tests.builders.insertions import ALWAYS, arguments, digest, write_inputs
+from tests.builders.insertions import ALWAYS, arguments, digest, record_of, write_inputs
 from tests.builders.programs.stops import Killed, stop_at, stop_hard
 from tests.builders.records import factor_arrays, path_means, plain_factors, shade_vertices
 from tests.builders.refusals import assert_fails
@@ -611,11 +611,6 @@ def argv(folder: Path, out: Path, refine: str, **changes: str | None) -> list[st
     return arguments(folder, out, **{**flags, **changes})
 
 
-def record(out: Path) -> dict[str, Any]:
-    read: dict[str, Any] = json.loads((out / "run.json").read_text())
-    return read
-
-
 @pytest.fixture(scope="module")
 def refined(folder: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A material refinement that nothing stopped."""
@@ -633,7 +628,7 @@ def test_refined_material_is_written_and_rendered(
     """All files are there, light and curves are the earlier run's, and --materials repeats it."""
     files = {*ALWAYS, *LORA, "materials.json", "optimization.json", "run.json"}
     assert {p.name for p in refined.iterdir()} == files
-    run, found = record(refined), digest(refined)
+    run, found = record_of(refined), digest(refined)
     measured = run["measured"]
     assert measured["refine"] == {
         "what": "material",
@@ -658,19 +653,19 @@ def test_refined_material_is_written_and_rendered(
     capsys.readouterr()
     assert main(arguments(folder, plain, device="cpu", **flags)) == ExitCode.DONE
     said = f"--materials {refined / 'materials.json'}"
-    assert sum(said in line for line in record(plain)["notices"]) == 1
+    assert sum(said in line for line in record_of(plain)["notices"]) == 1
     assert said in capsys.readouterr().out
     assert digest(plain)["composite.png"] == earlier["composite.png"]
     flags["materials"] = str(refined / "materials.json")
     assert main(arguments(folder, again, device="cpu", **flags)) == ExitCode.DONE
     assert digest(again)["composite.png"] == found["composite.png"]
-    assert not any("--materials" in line for line in record(again)["notices"])
-    assert record(again)["inputs"]["materials"] == found["materials.json"]
+    assert not any("--materials" in line for line in record_of(again)["notices"])
+    assert record_of(again)["inputs"]["materials"] == found["materials.json"]
     # A run that was given them says so in its turn.
     flags |= {"reuse": str(again), "materials": None}
     third = tmp_path / "third"
     assert main(arguments(folder, third, device="cpu", **flags)) == ExitCode.DONE
-    assert any(said in line for line in record(third)["notices"])
+    assert any(said in line for line in record_of(third)["notices"])
 
 
 def test_refinement_replays(refined: Path, tmp_path: Path) -> None:
@@ -722,7 +717,7 @@ def test_emission_refinement_runs(folder: Path, tmp_path: Path) -> None:
     out = tmp_path / "out"
     light = {"reuse": None, "sky": "overcast", "refine_materials": "red"}
     assert main(argv(folder, out, "emission", no_personalize="", loss="csd", **light)) == 0
-    run = record(out)
+    run = record_of(out)
     assert run["measured"]["refine"]["free"] == ["emission"]
     assert refine_module.GROUND_IS_DARK in run["notices"]
     (entry,) = json.loads((out / "materials.json").read_text())["materials"]
@@ -741,7 +736,7 @@ def test_tone_refinement_runs_on_an_altered_photo(folder: Path, tmp_path: Path) 
     assert found["envmap.exr"] == earlier["envmap.exr"]
     assert found["curves.json"] != earlier["curves.json"]
     assert json.loads((out / "curves.json").read_text())["tone"] == "reinhard"
-    moves = record(out)["measured"]["refine"]
+    moves = record_of(out)["measured"]["refine"]
     assert moves["free"] == ["tone curves"] and moves["materials"] == []
 
 

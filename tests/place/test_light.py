@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from tests.builders.programs.browser import needs_chromium, open_browser
-from tests.builders.programs.placing import STATE, command, open_page, serve, settle
+from tests.builders.programs.browser import needs_chromium
+from tests.builders.programs.placing import STATE, command, placing, settle
 from warpir.core.errors import InputError
 from warpir.lighting.regression import Regression, regress
 from warpir.lighting.regressor import load_regressor
@@ -84,8 +84,7 @@ def test_worker_answers_refuses_and_starts_again(inputs: Path) -> None:
 def test_page_opens_with_the_estimated_light(tmp_path: Path) -> None:
     """Of the demo's photo: marked as an estimate, drawn with its doubt, saved only when changed."""
     argv = ["--demo", "--out", str(tmp_path / "out"), "--no-browser"]
-    with serve(argv) as served, open_browser() as opened:
-        open_page(opened, served)
+    with placing(argv) as opened:
         page = opened.page
         page.wait_for_selector("#light[data-source=estimate]", timeout=60_000)
         words = page.inner_text("#light-words")
@@ -109,7 +108,6 @@ def test_page_opens_with_the_estimated_light(tmp_path: Path) -> None:
         page.check("#keep-light")
         page.click("#save")
         page.wait_for_selector("#done:not([hidden])")
-        assert opened.errors == []
     saved = json.loads((tmp_path / "out" / "insert.json").read_text())
     assert saved["sun"][:2] == pytest.approx([azimuth, elevation], abs=0.6)
     assert len(saved["sky"]) == 3
@@ -123,9 +121,8 @@ def test_page_draws_no_sun_at_night(inputs: Path, tmp_path: Path) -> None:
     Image.fromarray(np.clip(noise, 0, 255).astype(np.uint8)).save(tmp_path / "night.png")
     argv = command(inputs, tmp_path / "out")
     argv[argv.index("--photo") + 1] = str(tmp_path / "night.png")
-    with serve(argv) as served, open_browser(390, 844) as opened:
+    with placing(argv, 390, 844) as opened:
         page = opened.page
-        open_page(opened, served)
         assert page.locator("#dial .sun").is_hidden()  # nor before anything is known
         page.wait_for_selector("#light[data-source=unclear]", timeout=60_000)
         assert "no clear direction" in page.inner_text("#light-words")
@@ -136,4 +133,3 @@ def test_page_draws_no_sun_at_night(inputs: Path, tmp_path: Path) -> None:
         settle(opened)
         assert page.is_checked("#keep-light") and page.evaluate(sun) is True
         assert page.locator("#dial .sun").is_visible()
-        assert opened.errors == []

@@ -11,14 +11,13 @@ import pytest
 from PIL import Image
 
 from tests.builders.image_files import png_chunk
-from tests.builders.programs.browser import needs_chromium, open_browser
+from tests.builders.programs.browser import needs_chromium
 from tests.builders.programs.placing import (
     HEIGHT,
     STATE,
     WIDTH,
     command,
-    open_page,
-    serve,
+    placing,
     settle,
 )
 from warpir.core.errors import InputError
@@ -76,9 +75,8 @@ def test_page_paints_and_saves_what_stands_in_front(
 ) -> None:
     """A stroke hides the object, the eraser takes it back, undo both; the file is the photo's."""
     out = tmp_path / "out"
-    with serve(command(inputs, out)) as served, open_browser(width, 800) as opened:
+    with placing(command(inputs, out), width, 800, known="willReadFrequently") as opened:
         page = opened.page
-        open_page(opened, served)
         before = page.evaluate(STATE)
         page.click("#paint")
         box = page.locator("#photo").bounding_box()
@@ -132,4 +130,3 @@ def test_page_paints_and_saves_what_stands_in_front(
         assert "occluder_mask" not in json.loads((out / "insert.json").read_text())
         assert not (out / "occluder.png").exists()
         # The test reads the canvas; the page does not.
-        assert [e for e in opened.errors if "willReadFrequently" not in e] == []

@@ -144,15 +144,15 @@ def test_preview_asset_thins_a_heavy_one(tmp_path: Path) -> None:
 # ---------------------------------------------------------------------------------------- saving
 
 
-def placed_files(inputs: Path, out: Path) -> dict[str, dict[str, Any]]:
-    """The files of a placement that is as it started."""
+def placed_files(inputs: Path, out: Path, **change: Any) -> dict[str, dict[str, Any]]:
+    """The files of a placement that is as it started but for what is changed."""
     config = InsertConfig(
         photo=str(inputs / "photo.png"), asset=str(inputs / "wedge.glb"), out=str(out)
     )
     session = session_of(config)
     start = start_record(session, config.light, str(config.output.out))
     said = {**start["camera"], **{k: start[k] for k in ("stance", "stand", "rotate_y", "size")}}
-    return placement_files(session, config.flat(), {**said, **SAID})
+    return placement_files(session, config.flat(), {**said, **SAID, **change})
 
 
 def test_page_starts_with_the_estimated_camera(
@@ -222,12 +222,6 @@ def test_placement_refuses_wrong_numbers(
     inputs: Path, tmp_path: Path, change: dict[str, Any], words: str
 ) -> None:
     """What insert would refuse is refused when it is saved, and told."""
-    config = InsertConfig(
-        photo=str(inputs / "photo.png"), asset=str(inputs / "wedge.glb"), out=str(tmp_path / "o")
-    )
-    session = session_of(config)
-    start = start_record(session, config.light, str(config.output.out))
-    said = {**start["camera"], **{k: start[k] for k in ("stance", "stand", "rotate_y", "size")}}
     with pytest.raises(InputError) as error:
-        placement_files(session, config.flat(), {**said, **SAID, **change})
+        placed_files(inputs, tmp_path / "o", **change)
     assert words in str(error.value)

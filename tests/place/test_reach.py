@@ -7,14 +7,13 @@ from typing import Any
 import numpy as np
 import pytest
 
-from tests.builders.programs.browser import needs_chromium, open_browser
+from tests.builders.programs.browser import needs_chromium
 from tests.builders.programs.placing import (
     STATE,
     command,
     drag,
     handle_at,
-    open_page,
-    serve,
+    placing,
     settle,
 )
 
@@ -31,9 +30,8 @@ def away(state: dict[str, Any]) -> float:
 def test_horizon_never_throws_the_object_away(inputs: Path, tmp_path: Path, width: int) -> None:
     """Dragged to the foot, below it and below the photo: the object stays in it, and comes back."""
     argv = command(inputs, tmp_path / "out", "--size", "2")
-    with serve(argv) as served, open_browser(width, 800) as opened:
+    with placing(argv, width, 800) as opened:
         page = opened.page
-        open_page(opened, served)
         photo = page.locator("#photo").bounding_box()
         assert photo is not None
         before = page.evaluate(STATE)
@@ -62,7 +60,6 @@ def test_horizon_never_throws_the_object_away(inputs: Path, tmp_path: Path, widt
         settle(opened)
         assert page.evaluate(STATE) == before
         assert float(page.input_value("#pitch")) == pytest.approx(before["stance"]["pitch"])
-        assert opened.errors == []
 
 
 @needs_chromium
@@ -70,9 +67,8 @@ def test_horizon_never_throws_the_object_away(inputs: Path, tmp_path: Path, widt
 def test_handles_stand_beside_the_object_on_a_phone(inputs: Path, tmp_path: Path) -> None:
     """None covers it, they are apart, and each does what it does elsewhere."""
     argv = command(inputs, tmp_path / "out", "--size", "2.5")
-    with serve(argv) as served, open_browser(390, 844) as opened:
+    with placing(argv, 390, 844) as opened:
         page = opened.page
-        open_page(opened, served)
         for place in ((0.0, 0.0), (-120.0, 20.0), (200.0, 10.0)):
             if place != (0.0, 0.0):
                 drag(opened, "foot", place)
@@ -96,4 +92,3 @@ def test_handles_stand_beside_the_object_on_a_phone(inputs: Path, tmp_path: Path
         assert turned["turn"] - before["turn"] > 5.0 and turned["stand"] == before["stand"]
         drag(opened, "size", (0.0, -20.0))
         assert page.evaluate(STATE)["size"] > 1.1 * before["size"]
-        assert opened.errors == []

@@ -53,7 +53,6 @@ LINEAR = Curves.identity("linear")
 SPP = 1024
 NOISE = 4.5 * np.sqrt(0.25 / SPP)
 """Largest error of a few dozen binomial ratios."""
-FLOAT32 = 2e-6
 HEIGHT = 8
 SETTINGS = TransportSettings(
     height_fg=HEIGHT,

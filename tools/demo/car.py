@@ -5,6 +5,7 @@ along curves into paint, roof, glass, seams and lamps; everything else is bolted
 """
 
 from collections.abc import Iterable
+from dataclasses import replace
 
 import numpy as np
 from PIL import Image, ImageDraw, ImageFont
@@ -374,16 +375,9 @@ def _joined(parts: Iterable[Part]) -> tuple[Primitive, ...]:
     primitives = []
     for name, surfaces in groups.items():
         whole = weld(merge(surfaces))
-        textured = MATERIALS[NUMBER[name]].base_color_texture is not None
-        primitives.append(
-            Primitive(
-                whole.positions,
-                whole.triangles.astype(np.int32),
-                NUMBER[name],
-                whole.normals.astype(np.float32),
-                uv0=whole.uv.astype(np.float32) if textured and whole.uv is not None else None,
-            )
-        )
+        if MATERIALS[NUMBER[name]].base_color_texture is None:
+            whole = replace(whole, uv=None)
+        primitives.append(whole.primitive(NUMBER[name]))
     return tuple(primitives)
 
 

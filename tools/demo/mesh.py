@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from warpir.core.arrays import BoolArray, Float64Array, Int64Array
+from warpir.scene.asset import Primitive
 
 Distance = Callable[[Float64Array, Float64Array, Float64Array], Float64Array]
 
@@ -34,6 +35,16 @@ class Surface:
     def moved(self, offset: ArrayLike) -> "Surface":
         """Return the surface shifted by an offset [m], shape [3]."""
         return replace(self, positions=self.positions + np.asarray(offset, dtype=np.float64))
+
+    def primitive(self, material: int) -> Primitive:
+        """Return the surface as an asset holds it."""
+        return Primitive(
+            self.positions,
+            self.triangles.astype(np.int32),
+            material,
+            self.normals.astype(np.float32),
+            uv0=None if self.uv is None else self.uv.astype(np.float32),
+        )
 
     def turned(self, rotation: Float64Array) -> "Surface":
         """Return the surface turned by a rotation matrix, shape [3, 3]."""

@@ -195,19 +195,7 @@ class Builder:
 
     def primitives(self) -> tuple[Primitive, ...]:
         """Return one primitive per material."""
-        made = []
-        for name, surfaces in self.parts.items():
-            whole = merge(surfaces)
-            made.append(
-                Primitive(
-                    whole.positions,
-                    whole.triangles.astype(np.int32),
-                    NUMBER[name],
-                    whole.normals.astype(np.float32),
-                    uv0=None if whole.uv is None else whole.uv.astype(np.float32),
-                )
-            )
-        return tuple(made)
+        return tuple(merge(own).primitive(NUMBER[name]) for name, own in self.parts.items())
 
 
 def _wall(

@@ -7,6 +7,7 @@ so that ``--place -1,0,-3``, ``place: [-1, 0, -3]`` and ``"place": "-1,0,-3"`` m
 import argparse
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
 from typing import Any, NoReturn, get_args
 
 import warpir
@@ -94,7 +95,7 @@ def parse(argv: Sequence[str]) -> Command:
     if path is not None:
         filed = read_config_file(path, _limits_for_config(texts))
         raise_all([_not_by_hand(path, n) for n in BY_HAND if filed.get(n) and n not in texts])
-    config = _make_config({name: (text, flag(name)) for name, text in texts.items()}, filed)
+    config = InsertConfig(**read_values({n: (v, flag(n)) for n, v in (filed | texts).items()}))
     notices = tuple(
         f"{flag(name)} given at the command line replaces the value in {path}"
         for name in texts
@@ -114,11 +115,6 @@ def _limits_for_config(texts: Mapping[str, Any]) -> Limits:
     names = ("max_json_bytes", "max_json_values", "max_nesting")
     values = read_values({name: (texts[name], flag(name)) for name in names if name in texts})
     return InsertConfig(**values).limits
-
-
-def _make_config(given: Mapping[str, tuple[Any, str]], filed: Mapping[str, Any]) -> InsertConfig:
-    """Convert each value by its field's type; ``given`` wins over ``filed``."""
-    return InsertConfig(**read_values({**{n: (v, flag(n)) for n, v in filed.items()}, **given}))
 
 
 def read_values(given: Mapping[str, tuple[Any, str]]) -> dict[str, Any]:
@@ -188,10 +184,6 @@ class _HelpAll(argparse.Action):
         parser.exit()
 
 
-def _help_format(prog: str) -> argparse.HelpFormatter:
-    return argparse.RawDescriptionHelpFormatter(prog, max_help_position=30, width=100)
-
-
 def _make_parser() -> argparse.ArgumentParser:
     parser = make_parser("insert", USAGE, DESCRIPTION, EXAMPLES, FLAGS)
     group = parser.add_argument_group("the run itself")
@@ -219,7 +211,9 @@ def make_parser(
         usage=usage_line,
         description=description,
         epilog=epilog,
-        formatter_class=_help_format,
+        formatter_class=partial(
+            argparse.RawDescriptionHelpFormatter, max_help_position=30, width=100
+        ),
         argument_default=argparse.SUPPRESS,
         allow_abbrev=False,
         exit_on_error=False,

@@ -37,7 +37,8 @@ def require_model(config: InsertConfig) -> None:
             problems.append(InputError(error.where, error.what, error.advice, ExitCode.MODEL))
             return None
 
-    lora, regressor = (_path(f) for f in (config.adapter.lora, config.light.regressor))
+    lora = None if config.adapter.lora is None else Path(config.adapter.lora)
+    regressor = None if config.light.regressor is None else Path(config.light.regressor)
     is_told = config.light.is_described or config.light.reuse is not None
     embedding_width: int | None = None
     if config.is_guided:
@@ -90,7 +91,3 @@ def _hash(folder: "ModelFolder", file: Path, state: tuple[int, ...]) -> tuple[st
     if (file, state) not in _hashes:
         _hashes[file, state] = folder.file_hash(file)
     return _hashes[file, state]
-
-
-def _path(name: str | None) -> Path | None:
-    return None if name is None else Path(name)

@@ -98,7 +98,7 @@ def read_run(path: str | Path, limits: Limits = LIMITS) -> EarlierRun:
         )
     digest = file_hash(path / "run.json")
     curves = read_curves(path / CURVES, limits)
-    pose = _read_pose(path / CAMERA, limits)
+    pose = rigid(path / CAMERA, "c2w", read_json_object(path / CAMERA, limits).get("c2w"))
     return EarlierRun(path, light_fg, light_shadow, curves, pose, materials, digest)
 
 
@@ -153,7 +153,3 @@ def check_files(path: Path, digests: dict[str, Any]) -> None:
                 "changed since the run wrote it (its sha256 is not the one in run.json)",
                 "give a light of your own with --light",
             )
-
-
-def _read_pose(path: Path, limits: Limits) -> NDArray[np.float64]:
-    return rigid(path, "c2w", read_json_object(path, limits).get("c2w"))

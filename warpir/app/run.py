@@ -14,7 +14,7 @@ from warpir.app.inputs import Inputs
 from warpir.app.record import Timings, run_record
 from warpir.core.cache import take_notices
 from warpir.core.errors import ExitCode, InputError
-from warpir.core.memory import Memory, Need, needs_of_photo, needs_of_scene, share_device
+from warpir.core.memory import PHOTO_BYTES, Memory, Need, needs_of_scene, share_device
 from warpir.core.progress import Log, StepProgress
 from warpir.io.results import OutputFolder
 
@@ -36,10 +36,6 @@ LORA_COPIES = 2 + 3 * 3
 """Two files; three checkpoints, one being written, of weights and both moments of the optimiser."""
 
 
-def _silent() -> StepProgress:
-    return StepProgress(lambda _: None)
-
-
 @dataclass(frozen=True)
 class Run:
     """What is asked, what was read for it, where it goes, and the records that stages add to."""
@@ -51,7 +47,7 @@ class Run:
     timings: Timings = field(default_factory=Timings)
     memory: Memory = field(default_factory=Memory)
     """Counts what was tried again where memory was short."""
-    progress: StepProgress = field(default_factory=_silent)
+    progress: StepProgress = field(default_factory=lambda: StepProgress(lambda _: None))
     """Of long stages."""
     device: str = "cpu"
     """Warp device, once it is chosen; torch uses the same."""
@@ -178,4 +174,4 @@ def memory_needs(inputs: Inputs) -> tuple[Need, tuple[Need, ...]]:
         sum(len(part.indices) for part in asset.primitives),
         sum(texture.pixels[..., 0].size for texture in asset.textures),
     )
-    return needs_of_photo(height * width), scene
+    return Need("photo and layers", PHOTO_BYTES * height * width, "--photo (fewer pixels)"), scene

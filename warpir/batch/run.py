@@ -2,6 +2,7 @@
 
 import json
 import os
+import shutil
 import time
 from collections import deque
 from collections.abc import Callable, Sequence
@@ -132,7 +133,7 @@ class Batch:
         if not keys:
             return
         disk = sum(self.scenes[key].needs["disk"] for key in keys)
-        free = _free_disk(self.options.out)
+        free = shutil.disk_usage(self.options.out).free
         if disk > free:
             say(f"notice: about {disk >> 20} MiB will be written, and {free >> 20} MiB are free")
         gpus = self._prepare(keys)
@@ -372,11 +373,6 @@ def run_tasks(
             if answer.status == ExitCode.DONE:  # its last moment was enough
                 ended(key, answer)
         raise
-
-
-def _free_disk(folder: Path) -> int:
-    status = os.statvfs(folder)
-    return status.f_bavail * status.f_frsize
 
 
 def _cores() -> int:

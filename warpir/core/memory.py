@@ -261,11 +261,6 @@ def share_device(alias: str) -> None:
 # ------------------------------------------------------------------- before the work
 
 
-def needs_of_photo(pixel_count: int) -> Need:
-    """Return what a photo and the layers of its composite take of the host."""
-    return Need("photo and layers", PHOTO_BYTES * pixel_count, "--photo (fewer pixels)")
-
-
 def needs_of_scene(vertex_count: int, triangle_count: int, texel_count: int) -> tuple[Need, ...]:
     """Return what an object takes of the device that renders it."""
     geometry = VERTEX_BYTES * vertex_count + TRIANGLE_BYTES * triangle_count

@@ -110,7 +110,7 @@ def _even(inputs: Inputs, tone: str) -> SceneLight:
 
 def start_level(inputs: Inputs, tone: str) -> float:
     """Return the radiance of an even light under which white ground looks as the photo's does."""
-    level = float(np.clip(ground_level(inputs, GROUND_PERCENTILE), 1e-3, 0.9))
+    level = float(np.clip(_level(inputs, _ring(inputs), GROUND_PERCENTILE), 1e-3, 0.9))
     return level / (1.0 - level) if tone == "reinhard" else level
 
 
@@ -193,16 +193,6 @@ def lit_ground(points: Float64Array, light: Light, inputs: Inputs) -> tuple[Floa
     if (reached > 0.5).mean() >= LIT_SHARE:
         return points[reached > 0.5], light
     return points, without_lamps(light, 1.0 - float(reached.mean()))
-
-
-def ground_level(inputs: Inputs, percentile: float) -> float:
-    """Return the photo's linear luminance of the ground round the object's foot [1].
-
-    Args:
-        inputs: Photo, camera and placement.
-        percentile: Of the ground's pixels [%].
-    """
-    return _level(inputs, _ring(inputs), percentile)
 
 
 def _ring(inputs: Inputs) -> Float64Array:

@@ -153,7 +153,7 @@ def build(
     has_alpha = any(m.alpha_mode != "OPAQUE" or m.transmission > 0.0 for m in used_materials)
     integrator = mi.load_dict({"type": "gltf_path", "max_depth": depth + 1, "has_alpha": has_alpha})
     return ObjectScene(
-        mi.load_dict(parts), _sensor(camera, center, radius), integrator, center, radius
+        mi.load_dict(parts), sensor_of(camera, center, radius), integrator, center, radius
     )
 
 
@@ -309,7 +309,7 @@ def _mesh(asset: Asset, index: int, positions: Float64Array, linear: Float64Arra
     return mesh
 
 
-def _sensor(camera: Camera, center: Float64Array, radius: float) -> mi.Sensor:
+def sensor_of(camera: Camera, center: Float64Array, radius: float) -> mi.Sensor:
     """Mitsuba camera in the unit frame, box filter."""
     c2w = camera.c2w.copy()
     c2w[:3, 3] = (c2w[:3, 3] - center) / radius

@@ -47,14 +47,13 @@ class ToneKnots:
         """Return the arrays in the kernels' order."""
         return self.x, self.y, self.slope
 
-    def invert(self, y: AnyFloatArray, curve: int = 0) -> Float64Array:
-        """Return where a curve has these values in [0, 1] (Durkan et al. 2019, eqs. 6 to 8).
+    def invert(self, y: AnyFloatArray) -> Float64Array:
+        """Return where the first curve has these values (Durkan et al. 2019, eqs. 6 to 8).
 
         Args:
             y: Values; clamped to [0, 1]. Any shape.
-            curve: Index of the curve.
         """
-        knot_x, knot_y, slope = (k[curve].astype(np.float64) for k in self.arrays())
+        knot_x, knot_y, slope = (k[0].astype(np.float64) for k in self.arrays())
         y = np.clip(np.asarray(y, np.float64), 0.0, 1.0)
         b = np.clip(np.searchsorted(knot_y, y, side="right") - 1, 0, self.bin_count - 1)
         width, rise = np.diff(knot_x)[b], np.diff(knot_y)[b]

@@ -87,7 +87,7 @@ def read_material(source: Path, method: str | None) -> Material:
         return _read_folder(source, method)
     if method is not None:
         raise usage("--method", "a manifest names its method itself", "leave it out")
-    return _read_manifest(source)
+    return _material(source, source.parent, read_json_object(source))
 
 
 def _read_folder(folder: Path, method: str) -> Material:
@@ -109,10 +109,6 @@ def _scenes_of(folder: Path) -> dict[str, Any]:
         photo = images.pop(PHOTO, None)
         scenes[place.name] = {"images": images, **({"photo": photo} if photo else {})}
     return scenes
-
-
-def _read_manifest(path: Path) -> Material:
-    return _material(path, path.parent, read_json_object(path))
 
 
 def _material(where: Path, folder: Path, root: Mapping[str, Any]) -> Material:

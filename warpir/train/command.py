@@ -47,7 +47,9 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 
 def _parser() -> argparse.ArgumentParser:
-    parser = argparse.ArgumentParser("python -m warpir.train", description=_first_line())
+    parser = argparse.ArgumentParser(
+        "python -m warpir.train", description=__doc__.partition("\n")[0]
+    )
     parser.add_argument("network", choices=("camera", "regressor"))
     parser.add_argument("--panoramas", type=Path, nargs="+", required=True, metavar="DIR")
     parser.add_argument("--without", nargs="*", default=[], metavar="NAME", help="not learned from")
@@ -74,10 +76,6 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument("--places", type=int, metavar="N", help=words)
     parser.add_argument("--no-compile", action="store_true", help="do without torch.compile")
     return parser
-
-
-def _first_line() -> str:
-    return (__doc__ or "").partition("\n")[0]
 
 
 def _run(arguments: list[str]) -> int:

@@ -9,7 +9,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 
-from tests.builders.programs.browser import Opened
+from tests.builders.programs.browser import Opened, open_browser
 from warpir.place.stance import Stance
 
 WIDTH, HEIGHT = 480, 320
@@ -74,6 +74,17 @@ def serve(argv: Sequence[str]) -> Iterator[Served]:
         if process.poll() is None:
             process.send_signal(signal.SIGINT)
         process.communicate(timeout=30)
+
+
+@contextmanager
+def placing(
+    argv: Sequence[str], width: int = 1280, height: int = 800, known: str | None = None
+) -> Iterator[Opened]:
+    """Serve the page and open it; nothing goes wrong in it but what has the known words."""
+    with serve(argv) as served, open_browser(width, height) as opened:
+        open_page(opened, served)
+        yield opened
+        assert [e for e in opened.errors if known is None or known not in e] == []
 
 
 def open_page(opened: Opened, served: Served) -> None:
