@@ -110,7 +110,7 @@ def _insert_one(config: InsertConfig, loaders: "Loaders | None" = None) -> Inser
     with run.output as output:
         run.require_room()
         with run.timings.stage("load"):  # loads torch and Warp
-            from warpir.optimize.find_light import find_light
+            from warpir.optimize.find_light import find_light, with_photo_detail
             from warpir.render.device import choose_device
             from warpir.report.result import render_result, write_preview
 
@@ -120,6 +120,7 @@ def _insert_one(config: InsertConfig, loaders: "Loaders | None" = None) -> Inser
         if given is None and not run.config.is_guided:
             with lit.run.timings.stage("preview"):
                 write_preview(lit.run, lit.light)
+        lit = with_photo_detail(lit)
         rendered = render_result(lit.run, lit.light)
         record = _write(lit, rendered, config)
     say(summary_line(record))

@@ -27,7 +27,7 @@ class LitRun:
 
 
 def find_light(run: Run, given: SceneLight | None) -> LitRun:
-    """Return the run with its light.
+    """Return the run with its light, without the photo's detail.
 
     Args:
         run: On its device.
@@ -41,13 +41,13 @@ def find_light(run: Run, given: SceneLight | None) -> LitRun:
             lit = _guided(run, given)
         with run.timings.stage("scene"):  # frees the memory of guidance
             release()
-        return _with_detail(lit)
+        return lit
     light, measured = given, dict[str, Any]()
     if light is None:
         light, measured = _estimated(run)
     if run.inputs.shadow_mask is not None and not light.has_lamps:
         run.log.notice("the light has no lamp that --shadow-mask could take")
-    return _with_detail(LitRun(run, light, measured))
+    return LitRun(run, light, measured)
 
 
 def _guided(run: Run, given: SceneLight | None) -> LitRun:
@@ -77,8 +77,8 @@ def _estimated(run: Run) -> tuple[SceneLight, dict[str, Any]]:
     return estimate.light, estimate.record()
 
 
-def _with_detail(lit: LitRun) -> LitRun:
-    """Add the photo's detail to the light, unless a panorama has its own."""
+def with_photo_detail(lit: LitRun) -> LitRun:
+    """Return the run with the photo's detail in its light, unless a panorama has its own."""
     run, light = lit.run, lit.light
     has_own = run.config.light.file is not None and light.light.lobes is None
     if run.inputs.run is not None:  # the earlier run's light may have detail of its own
