@@ -200,7 +200,10 @@ def _strange(rows: list[dict[str, Any]]) -> list[str]:
         "keys of studies by a script that is not kept. Not mended are runs of more than 10 s: one "
         "of 12.5 s beside other work (3.8 s of CPU time when run again), and, of 92 inputs with "
         "seed 41 that are not in the table, two of 24 and 34 s, which compiled kernels (3.4 and "
-        "3.7 s of CPU time since) "
+        "3.7 s of CPU time since); those of 12 to 21 s under seeds 51 and 53 compiled "
+        "kernels too: a process that has rendered plain scenes compiles those of its first scene "
+        "with lamps, glass or layers once more, for Warp hashes them otherwise than in a new "
+        "process (where two of these runs take 4 s); that of seed 54 was not looked into "
         "(`python -m benchmarks.damage.strange --only KIND --seed N --minutes M`, "
         "`python -m benchmarks.damage.page --seed N --minutes M`; the lines that they print are "
         "docs/strange.json).",
