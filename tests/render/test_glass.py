@@ -331,6 +331,37 @@ def test_a_scene_without_solid_glass_has_todays_materials(device: str) -> None:
     assert len(list(solid.scene.contents())) > len(list(thin.scene.contents()))
 
 
+@pytest.mark.parametrize("place", ["in view", "beside the view", "before the whole view"])
+def test_thin_glass_is_looked_for_where_it_is(place: str, device: str) -> None:
+    """Its pixels have 64 samples, those of what is beside it 8; glass out of sight costs none."""
+    glass = {
+        "in view": box((1.5, 0.0, -4.0), (1.0, 1.0, 0.02), 1),
+        "beside the view": box((20.0, 0.0, -4.0), (1.0, 1.0, 0.02), 1),
+        "before the whole view": box((0.0, 0.0, -1.0), (8.0, 8.0, 0.02), 1),
+    }[place]
+    solid = box((-1.0, 0.0, -4.0), (0.93, 0.93, 0.02))
+    view = camera(64, 32, 40.0)
+    clear = replace(GLASS, thickness=0.0, transmission=1.0)
+    r = Renderer(Scene([placed((solid, glass), Material(), clear)], view, ground(), device))
+    found = r.gbuffer(seed=3)
+    column = found.object_pixels % view.width
+    is_left = column < 32
+    eighths = 8.0 * found.coverage[is_left]
+    assert (found.coverage[is_left] == 1.0).any()
+    if place == "before the whole view":
+        assert len(found.object_pixels) == view.width * view.height
+        assert not np.allclose(eighths, np.round(eighths))
+        return
+    np.testing.assert_allclose(eighths, np.round(eighths), atol=1e-5)
+    if place == "in view":
+        # Clear glass reflects .08 of what comes straight; 8 samples would have missed many pixels.
+        middle = found.coverage[(column >= 48) & (column < 57)]
+        assert 0.0 < np.mean(middle) < 0.3
+        assert not np.allclose(8.0 * middle, np.round(8.0 * middle))
+    else:
+        assert is_left.all()
+
+
 SETTINGS = TransportSettings(
     height_fg=16, height_shadow=16, subsamples=16, paths=32, dtype="float32"
 )
