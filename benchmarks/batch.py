@@ -23,6 +23,7 @@ from typing import Any
 import warp as wp
 
 from benchmarks.measure import context, report
+from warpir.core.memory import core_count
 
 WORKERS = (1, 2)
 wp.config.log_level = wp.LOG_ERROR
@@ -83,7 +84,7 @@ def measure(folder: Path, count: int, samples: int, path: Path | None) -> None:
     for name, spent in seconds.items():
         rate = f"{60.0 * count / spent:.1f} | {first / spent:.2f} x"
         print(f"| {name} | {spent:.1f} | {cpu[name]:.1f} | {rate} |")
-    cores = len(os.sched_getaffinity(0))
+    cores = core_count()
     figures: dict[str, Any] = {"question": "batch", "scenes": count, "samples": samples}
     spent_by = {
         name.replace("`", ""): [round(seconds[name], 2), round(cpu[name], 2)] for name in seconds

@@ -40,7 +40,8 @@ from benchmarks.speed.ratios import combined, ratios
 from benchmarks.speed.references import References
 from benchmarks.speed.report import keep_run, summary, write_documents
 from benchmarks.speed.scenes import NAMES, SpeedScene, make_scene
-from warpir.render.device import choose_device, default_threads
+from warpir.core.memory import core_count
+from warpir.render.device import choose_device
 
 RUN_SEED = 100
 """First seed of what is measured; references and warm-up have others."""
@@ -438,7 +439,7 @@ def main(arguments: list[str] | None = None) -> None:
     options = parse(arguments)
     plan = plan_of(options)
     device = choose_device(options.device)
-    threads = options.threads or default_threads()
+    threads = options.threads or core_count()
     use_device("cpu" if device == "cpu" else "cuda", threads)
 
     import drjit as dr

@@ -50,8 +50,8 @@ def render_one(width: int, triangles: int, samples: int, device: str) -> dict[st
 
     from benchmarks.measure import context, peak_mib
     from benchmarks.speed.scenes import on_the_ground, sun_and_sky, uv_ball
+    from warpir.core.memory import core_count
     from warpir.render.composite import Quality, render
-    from warpir.render.device import default_threads
     from warpir.scene.asset import Asset, Material
     from warpir.scene.camera import camera_from_fov
     from warpir.scene.light import Light, rasterize_lobes
@@ -87,7 +87,7 @@ def render_one(width: int, triangles: int, samples: int, device: str) -> dict[st
         "seconds_picture": time.perf_counter() - start,
         "peak_mib": peak_mib(own.device),
         "rays": own.scene.rays,
-        **context(own.device, default_threads()),
+        **context(own.device, core_count()),
     }
 
 

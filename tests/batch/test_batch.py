@@ -736,7 +736,7 @@ def test_the_check_takes_no_more_than_the_machine_has(
         return Devices(environments)
 
     monkeypatch.setattr(batch, "LocalWorkers", workers)
-    monkeypatch.setattr(batch, "_cores", lambda: 8)
+    monkeypatch.setattr(batch, "core_count", lambda: 8)
     for free in (100 << 30, 1 << 30, 1):
         monkeypatch.setattr(batch, "free_host", lambda free=free: free)
         made.check()
@@ -756,7 +756,7 @@ def test_workers_by_cores_memory_and_devices(
             found.append(environments)
 
     monkeypatch.setattr(batch, "LocalWorkers", Noted)
-    monkeypatch.setattr(batch, "_cores", lambda: 8)
+    monkeypatch.setattr(batch, "core_count", lambda: 8)
     monkeypatch.setattr(batch, "free_host", lambda: 100 << 30)
     monkeypatch.setattr(made, "_compile", lambda *_: 2)
     monkeypatch.delenv("CUDA_VISIBLE_DEVICES", raising=False)

@@ -21,7 +21,7 @@ from warpir.batch.scene import LOGS, STATES, Scene
 from warpir.batch.task import CHECK, COMPILE, DONE_BEFORE, INSERT, Answer, Task
 from warpir.core.atomic import write_file
 from warpir.core.errors import ExitCode, InputError, disk_error
-from warpir.core.memory import free_host
+from warpir.core.memory import core_count, free_host
 from warpir.core.progress import duration
 from warpir.core.signals import whole
 from warpir.core.strict_json import json_bytes
@@ -111,7 +111,7 @@ class Batch:
 
         tasks = {key: self._task(CHECK, key) for key in keys}
         # --workers may be those of a cluster.
-        most = max(1, min(_cores(), free_host() // CHECKER_BYTES))
+        most = max(1, min(core_count(), free_host() // CHECKER_BYTES))
         count = min(self.options.workers or most, most, len(keys))
         self._workers = LocalWorkers(self._environments(count))
         run_tasks(self._workers, tasks, self._retry, ended)
@@ -280,9 +280,9 @@ class Batch:
             return gpus
         on_cuda = any(self._on_cuda(key, gpus) for key in keys)
         by_memory = max(1, free_host() // max(map(self._memory, keys)))
-        count = self.options.workers or min(gpus if on_cuda else _cores(), by_memory)
+        count = self.options.workers or min(gpus if on_cuda else core_count(), by_memory)
         self.worker_count = min(count, len(keys))
-        self.threads = max(1, _cores() // self.worker_count)
+        self.threads = max(1, core_count() // self.worker_count)
         say(f"workers: {self.worker_count}, of {self.threads} threads each")
         if on_cuda or self.worker_count != self._workers.free:
             self._workers.stop()
@@ -373,8 +373,3 @@ def run_tasks(
             if answer.status == ExitCode.DONE:  # its last moment was enough
                 ended(key, answer)
         raise
-
-
-def _cores() -> int:
-    """Return the number of cores that this process may use."""
-    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1

@@ -16,6 +16,7 @@ from __future__ import annotations
 
 import errno
 import gc
+import os
 import resource
 import sys
 from collections.abc import Callable, Iterator, Sequence
@@ -290,6 +291,11 @@ def free_host(proc: Path = Path("/proc"), groups: Path = Path("/sys/fs/cgroup"))
     much where the system tells none of them.
     """
     return min(_available(proc), _left_in_group(proc, groups), _left_to_map(proc))
+
+
+def core_count() -> int:
+    """Return how many cores this process may use."""
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
 def free_device(alias: str) -> int | None:

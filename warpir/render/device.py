@@ -8,7 +8,6 @@ slices and threads do not change a result.
 from __future__ import annotations
 
 import logging
-import os
 from collections.abc import Callable, Iterable, Sequence
 from concurrent.futures import ThreadPoolExecutor, as_completed
 from dataclasses import dataclass
@@ -22,6 +21,7 @@ from numpy.typing import NDArray
 
 from warpir.core.cache import KernelCache
 from warpir.core.errors import ExitCode, InputError
+from warpir.core.memory import core_count
 from warpir.io.images.decoder import captured_stderr
 from warpir.kernels.composite import tone_foreground
 from warpir.kernels.lamps.receiver import trace_lamps
@@ -91,11 +91,6 @@ def choose_device(name: str | None) -> str:
     return alias
 
 
-def default_threads() -> int:
-    """Return the number of cores this process may use."""
-    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
-
-
 def cuda_count() -> int:
     """Return how many CUDA devices this process may use."""
     start_warp()
@@ -146,7 +141,7 @@ def load_kernels(
     kernels += [trace_lamps] if has_lamps else []
     kernels += [trace_plane_shadow, draw_light, tone_foreground, shadow_ratio]
     modules = list(dict.fromkeys(kernel.module for kernel in kernels))
-    with ThreadPoolExecutor(default_threads()) as pool:
+    with ThreadPoolExecutor(core_count()) as pool:
         # As a launch does: on the CPU there are no blocks.
         loads = [
             pool.submit(module.load, device, 1 if device.is_cpu else module.options["block_dim"])
@@ -211,7 +206,7 @@ class Launcher:
         progress: Callable[[str, float], None] | None = None,
     ) -> None:
         self.device = device
-        self.threads = threads or default_threads()
+        self.threads = threads or core_count()
         self._progress = progress or (lambda stage, share: None)
         settle_hashes(bool(device.is_cpu))
 
