@@ -9,10 +9,10 @@ from tests import oracles
 from warpir.core.arrays import BoolArray, Float64Array, FloatArray
 from warpir.kernels.shade import shade_vertex
 from warpir.kernels.types import LightRecord, VertexRecord
-from warpir.render.device_scene import FACTORS
 from warpir.render.integrator import MaterialTensors
 from warpir.render.mis.samples import ObjectSamples
 from warpir.render.renderer import Renderer
+from warpir.render.upload.materials import FACTORS
 
 
 def plain_factors(materials: MaterialTensors) -> list[FloatArray | None]:

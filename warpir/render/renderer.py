@@ -24,9 +24,10 @@ from warpir.kernels.types import CameraArgs, LightArgs, LightRecord, MaterialArg
 from warpir.render.bad_pixels import BadPixels, all_finite, first_bad_sample_of
 from warpir.render.device import Launcher, Rows, load_kernels, settle_hashes
 from warpir.render.device_light import drawn, plane_radiance
-from warpir.render.device_scene import Corners, Scene
+from warpir.render.device_scene import Scene
 from warpir.render.launches import THROWN_LIMIT, ObjectLaunch, ReceiverLaunch
 from warpir.render.shadow.pilot import dilate
+from warpir.render.upload.triangles import Corners
 from warpir.scene.camera import Camera
 from warpir.scene.placement import box_corners
 from warpir.scene.tone_curves import ToneKnots

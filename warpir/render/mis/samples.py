@@ -24,9 +24,9 @@ from warpir.kernels.types import (
     VertexRecord,
 )
 from warpir.render.device import SAMPLES_PER_SLICE, Rows
-from warpir.render.device_scene import FACTORS
 from warpir.render.launches import directions_of_path
 from warpir.render.renderer import ReceiverRadiance, Renderer
+from warpir.render.upload.materials import FACTORS
 
 if TYPE_CHECKING:
     from warpir.render.mis.integrator import MisIntegrator
