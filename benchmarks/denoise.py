@@ -18,8 +18,9 @@ import numpy as np
 from benchmarks.look import photo_of
 from warpir.core.arrays import FloatArray
 from warpir.evaluate.scenes import Place, Places, Subject, find_files
-from warpir.render.composite import Picture, Quality, make_picture
+from warpir.render.composite import Picture, make_picture
 from warpir.render.device_scene import Placed, Receiver, Scene
+from warpir.render.picture.planes import Quality
 from warpir.render.renderer import Renderer
 from warpir.scene.light import Light
 from warpir.scene.tone_curves import Curves

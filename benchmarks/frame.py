@@ -15,9 +15,10 @@ from benchmarks.measure import context, flags, peak_mib, report
 from warpir.core.color import linear_to_gamma
 from warpir.io.assets import load_asset
 from warpir.io.images.photos import Photo, read_envmap
-from warpir.render.composite import Quality, make_picture
+from warpir.render.composite import make_picture
 from warpir.render.device import choose_device
 from warpir.render.device_scene import Placed, Receiver, Scene
+from warpir.render.picture.planes import Quality
 from warpir.render.renderer import Renderer
 from warpir.scene.camera import camera_from_fov
 from warpir.scene.light import Light

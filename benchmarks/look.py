@@ -31,8 +31,9 @@ from warpir.look.camera_look import CameraLook, estimate_look
 from warpir.look.grain import Grain
 from warpir.look.response import Response
 from warpir.look.sharpness import PIXEL_SIGMA, EdgeBlur
-from warpir.render.composite import Quality, Rendering, composite, render
+from warpir.render.composite import composite
 from warpir.render.device_scene import Placed, Receiver, Scene
+from warpir.render.picture.planes import Quality, Rendering, render
 from warpir.render.renderer import Renderer
 from warpir.scene.light import Light
 from warpir.scene.tone_curves import Curves

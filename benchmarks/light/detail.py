@@ -27,8 +27,8 @@ from warpir.lighting.detail import HEIGHT, Detail, seen_from, with_detail
 from warpir.lighting.fit import fit_lobes
 from warpir.lighting.regression import regress
 from warpir.lighting.regressor import load_regressor
-from warpir.render.composite import Quality
 from warpir.render.device import choose_device
+from warpir.render.picture.planes import Quality
 from warpir.scene.asset import Asset, Material
 from warpir.scene.camera import Camera
 from warpir.scene.light import Light, as_map

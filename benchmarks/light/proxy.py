@@ -30,9 +30,11 @@ from warpir.demo import ASSET, LIGHT
 from warpir.io.assets import load_asset
 from warpir.io.images.photos import Photo, read_envmap
 from warpir.mitsuba.render import Setting, foreground
-from warpir.render.composite import Quality, make_picture, photo_radiance
+from warpir.render.composite import make_picture
 from warpir.render.device import choose_device
 from warpir.render.device_scene import Placed, Receiver, Scene
+from warpir.render.picture.photo_scene import photo_radiance
+from warpir.render.picture.planes import Quality
 from warpir.render.renderer import Renderer
 from warpir.scene.asset import Asset, Material, Primitive, Texture, TextureSlot
 from warpir.scene.camera import Camera, camera_from_fov

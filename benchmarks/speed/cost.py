@@ -51,7 +51,7 @@ def render_one(width: int, triangles: int, samples: int, device: str) -> dict[st
     from benchmarks.measure import context, peak_mib
     from benchmarks.speed.scenes import on_the_ground, sun_and_sky, uv_ball
     from warpir.core.memory import core_count
-    from warpir.render.composite import Quality, render
+    from warpir.render.picture.planes import Quality, render
     from warpir.scene.asset import Asset, Material
     from warpir.scene.camera import camera_from_fov
     from warpir.scene.light import Light, rasterize_lobes

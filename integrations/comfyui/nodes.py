@@ -106,7 +106,7 @@ class EstimateLight:
         from warpir.lighting.regression import regress
         from warpir.lighting.regressor import load_regressor
         from warpir.lighting.visible_sun import with_visible_sun
-        from warpir.render.composite import balls
+        from warpir.render.picture.light_preview import balls
         from warpir.scene.light import Light, angles_from_axis, as_map
 
         photo = _photo(image)

@@ -44,9 +44,10 @@ from warpir.optimize.materials import (
 )
 from warpir.optimize.view import Frame
 from warpir.render.bridge import ShadeForeground
-from warpir.render.composite import Quality, make_picture
+from warpir.render.composite import make_picture
 from warpir.render.device_scene import Placed, Scene
 from warpir.render.mis.samples import ObjectSamples
+from warpir.render.picture.planes import Quality
 from warpir.render.renderer import Renderer
 from warpir.render.tone_curve import ToneCurve
 from warpir.scene.asset import Asset, Material

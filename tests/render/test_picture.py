@@ -17,9 +17,11 @@ from warpir.look.grain import Grain
 from warpir.look.response import Response
 from warpir.look.sharpness import EdgeBlur
 from warpir.render.bridge import ComposeConstants, compose
-from warpir.render.composite import Picture, Quality, as_file_map, balls, make_picture
+from warpir.render.composite import Picture, make_picture
 from warpir.render.device_light import light_args
 from warpir.render.device_scene import Scene
+from warpir.render.picture.light_preview import balls
+from warpir.render.picture.planes import Quality
 from warpir.render.renderer import Renderer
 from warpir.render.resizing import resize
 from warpir.render.shadow.picture import ShadowSamples, picture_ratio
@@ -428,21 +430,6 @@ def test_balls_turn_with_the_camera() -> None:
         y, x = np.mgrid[:192, :192]
         lit = luminance(ball) > 0.9 * luminance(ball).max()
         assert abs(x[lit].mean() - 95.5) < 2 and abs(y[lit].mean() - 95.5) < 2
-
-
-def test_file_map_keeps_a_given_maps_texels() -> None:
-    """A panorama is written as it was given; lobes come on 512 rows; both are summed."""
-    texels = np.random.default_rng(1).uniform(0, 2, (32, 64, 3)).astype(np.float32)
-    np.testing.assert_array_equal(as_file_map(Light(texels=texels)), texels)
-    lobes = lobe((0.2, 0.9, 0.1), 20.0).lobes
-    assert as_file_map(Light(lobes)).shape == (512, 1024, 3)
-    both = as_file_map(Light(lobes, texels))
-    np.testing.assert_allclose(
-        both,
-        as_file_map(Light(lobes)) + np.repeat(np.repeat(texels, 16, axis=0), 16, axis=1),
-        rtol=1e-4,
-        atol=1e-5,
-    )
 
 
 def test_card_in_front_of_its_own_shadow(device: str) -> None:

@@ -30,12 +30,14 @@ from warpir.core.errors import ExitCode, InputError
 from warpir.insert import main
 from warpir.lighting.scene_light import make_light
 from warpir.render.bridge import host_light
-from warpir.render.composite import Quality, make_picture, scene_of
+from warpir.render.composite import make_picture
 from warpir.render.device_light import light_args
 from warpir.render.device_scene import Placed, Scene
 from warpir.render.integrator import MaterialTensors
 from warpir.render.mis.integrator import MisIntegrator
 from warpir.render.mis.samples import ReceiverSamples
+from warpir.render.picture.photo_scene import scene_of
+from warpir.render.picture.planes import Quality
 from warpir.render.renderer import Renderer
 from warpir.render.shadow.pilot import shaded_pixels
 from warpir.render.transport.integrator import TransportIntegrator

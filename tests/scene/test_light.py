@@ -29,6 +29,7 @@ from warpir.scene.light import (
     Light,
     Lobes,
     angles_from_axis,
+    as_file_map,
     as_map,
     axis_from_angles,
     lobe_cosine,
@@ -299,6 +300,21 @@ def test_summary_finds_the_brightest_direction() -> None:
 
 
 # --------------------------------------------------------------------------------- upload
+
+
+def test_file_map_keeps_a_given_maps_texels() -> None:
+    """A panorama is written as it was given; lobes come on 512 rows; both are summed."""
+    texels = np.random.default_rng(1).uniform(0, 2, (32, 64, 3)).astype(np.float32)
+    np.testing.assert_array_equal(as_file_map(Light(texels=texels)), texels)
+    lobes = lobe((0.2, 0.9, 0.1), 20.0).lobes
+    assert as_file_map(Light(lobes)).shape == (512, 1024, 3)
+    both = as_file_map(Light(lobes, texels))
+    np.testing.assert_allclose(
+        both,
+        as_file_map(Light(lobes)) + np.repeat(np.repeat(texels, 16, axis=0), 16, axis=1),
+        rtol=1e-4,
+        atol=1e-5,
+    )
 
 
 @pytest.mark.parametrize(

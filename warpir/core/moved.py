@@ -25,7 +25,7 @@ MOVED = {
     "light": "scene.light",
     "lobe_fit": "lighting.fit",
     "photo_files": "io.images.photos",
-    "picture": "render.composite",
+    "picture": "render.picture.photo_scene",
     "sg_light": "lighting.sg_light",
     "tone": "render.tone_curve",
     "transport": "render.transport.integrator",

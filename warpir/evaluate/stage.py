@@ -26,9 +26,9 @@ from warpir.core.errors import ExitCode, InputError
 from warpir.evaluate.scenes import RESPONSES, Place, Subject
 from warpir.lighting.regressor import Regressor, random_regressor
 from warpir.render.bridge import ComposeConstants, compose
-from warpir.render.composite import Quality
 from warpir.render.device_light import light_args
 from warpir.render.device_scene import Placed, Receiver, Scene
+from warpir.render.picture.planes import Quality, spread
 from warpir.render.renderer import Foreground, Renderer
 from warpir.render.shadow.pilot import shaded_pixels
 from warpir.render.tone_curve import ToneCurve
@@ -97,8 +97,9 @@ class Stage:
             raise InputError(subject.asset_path, f"nothing of it is seen in {self.place.name}")
         self.true = self.render(self.true_prediction())
         self.truth = self.compose(self.true, None)
-        self.mask = self._plane(self.objects, self.true.foreground.mask, 0.0)
-        self.ratio = self._plane(self.true.receiver_pixels, self.true.ratio, 1.0)
+        size = self.place.photo.shape[:2]
+        self.mask = spread(size, self.objects, self.true.foreground.mask)
+        self.ratio = spread(size, self.true.receiver_pixels, self.true.ratio, outside=1.0)
 
     def true_prediction(self) -> Prediction:
         """Return the place's true light with the camera's own response."""
@@ -231,12 +232,6 @@ class Stage:
 
         optimizer.step(error)
         return Curves("reinhard", ToneKnots(*curve_fg.arrays()), ToneKnots(*curve_shadow.arrays()))
-
-    def _plane(self, pixels: IntArray, values: FloatArray, outside: float) -> FloatArray:
-        height, width = self.place.photo.shape[:2]
-        plane = np.full((height * width, *values.shape[1:]), outside, np.float32)
-        plane[pixels] = values
-        return plane.reshape(height, width, *values.shape[1:])
 
 
 def _encoded(linear: FloatArray) -> FloatArray:

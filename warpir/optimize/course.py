@@ -28,7 +28,7 @@ from warpir.optimize.lit_frame import LitFrame
 from warpir.optimize.loop import Optimization
 from warpir.optimize.model import Guided
 from warpir.optimize.view import Frame
-from warpir.render.composite import scene_of
+from warpir.render.picture.photo_scene import scene_of
 from warpir.render.renderer import Renderer
 from warpir.render.resizing import resize
 from warpir.render.tone_curve import ToneCurve

@@ -82,8 +82,9 @@ def render_preview(job: Mapping[str, Any], say: Say) -> dict[str, Any]:
     Raises:
         InputError: As `warpir.insert` refuses it.
     """
-    from warpir.render.composite import Quality, make_picture
+    from warpir.render.composite import make_picture
     from warpir.render.device import keep_kernels
+    from warpir.render.picture.planes import Quality
 
     config = config_of(job["config"])
     inputs, lit, renderer = _prepared(config, int(job["width"]), say)
@@ -132,8 +133,8 @@ def _prepared(config: InsertConfig, width: int, say: Say) -> tuple[Inputs, Scene
     from warpir.lighting.detail import detail_of, with_detail
     from warpir.lighting.estimate import estimate_light
     from warpir.lighting.scene_light import make_light
-    from warpir.render.composite import scene_of
     from warpir.render.device import choose_device
+    from warpir.render.picture.photo_scene import scene_of
     from warpir.render.renderer import Renderer
 
     say({"stage": "reading", "share": 0.0})

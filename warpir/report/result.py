@@ -21,21 +21,16 @@ from warpir.io.results import OutputFolder
 from warpir.lighting.scene_light import SceneLight
 from warpir.look.camera_look import CameraLook, estimate_look, region_around
 from warpir.look.denoise import denoiser_version
-from warpir.render.composite import (
-    UNCHANGED,
-    Picture,
-    Quality,
-    as_file_map,
-    balls,
-    make_picture,
-    scene_of,
-)
+from warpir.render.composite import UNCHANGED, Picture, make_picture
+from warpir.render.picture.light_preview import balls
+from warpir.render.picture.photo_scene import scene_of
+from warpir.render.picture.planes import Quality
 from warpir.render.renderer import Renderer
 from warpir.report.page import Results
 from warpir.report.pictures import shrink
 from warpir.report.viewer import VIEWER, viewer_page
 from warpir.scene.camera import Camera
-from warpir.scene.light import Light, LightSummary, summarize
+from warpir.scene.light import Light, LightSummary, as_file_map, summarize
 from warpir.scene.near.lamps import records_of
 from warpir.scene.placement import box_corners
 from warpir.scene.tone_curves import ToneKnots

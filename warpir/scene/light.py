@@ -257,6 +257,18 @@ def as_map(light: Light, height: int) -> FloatArray:
     return texels
 
 
+def as_file_map(light: Light) -> FloatArray:
+    """Return the light as a map for files: a given map's own size, lobes on 512 rows or more."""
+    height = 256
+    if light.texels is not None:
+        height = max(light.texels.shape[0], 16)
+    if light.lobes is not None:
+        height = max(height, 512)
+    if light.texels is not None and light.lobes is None:
+        return light.texels
+    return as_map(light, height)
+
+
 def summarize(light: Light) -> LightSummary:
     """Measure a light for printing and ``run.json``."""
     texels = as_map(light, 128).astype(np.float64)

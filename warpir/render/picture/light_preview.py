@@ -1,0 +1,54 @@
+"""A mirror ball and a grey ball under a light, as on a film set."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from warpir.core.arrays import CodeArray
+from warpir.core.color import linear_to_gamma
+from warpir.core.latlong import map_directions, texel_solid_angles, uv_of
+from warpir.scene.camera import Camera
+from warpir.scene.light import Light, as_map
+
+GREY_BALL = 0.18
+"""Reflectance of the matte ball in ``balls.png``."""
+
+
+def balls(light: Light, camera: Camera, is_reinhard: bool, size: int = 192) -> CodeArray:
+    """Return a mirror ball and a grey diffuse ball under the light, as the camera sees them.
+
+    As on a film set: `GREY_BALL` keeps the lit side of a sunny light below the photo's white.
+
+    Args:
+        light: At the photo's exposure.
+        camera: Gives the viewing direction.
+        is_reinhard: The tone operator of the picture.
+        size: Height of the preview [px]; it is twice as wide.
+
+    Returns:
+        Display codes, shape [size, 2 size, 3].
+    """
+    axis = (np.arange(size) + 0.5) / size * 2.0 - 1.0
+    x, y = np.meshgrid(axis * 1.06, -axis * 1.06)
+    inside = x * x + y * y < 1.0
+    z = np.sqrt(np.maximum(1.0 - x * x - y * y, 0.0))
+    normal = np.stack([x, y, z], axis=-1) @ camera.c2w[:3, :3].T
+    view = camera.c2w[:3, 2]
+    reflected = 2.0 * (normal @ view)[..., None] * normal - view
+    sharp = as_map(light, 256)
+    u, v = uv_of(reflected)
+    column = (u * sharp.shape[1]).astype(int) % sharp.shape[1]
+    row = np.minimum(v * sharp.shape[0], sharp.shape[0] - 1).astype(int)
+    mirror = sharp[row, column].astype(np.float64)
+    coarse = as_map(light, 32).astype(np.float64)
+    weighted = (coarse * texel_solid_angles(32, 64)[:, None, None]).reshape(-1, 3)
+    toward = map_directions(32, 64).reshape(-1, 3).T
+    # One row at a time: the cosines of all pixels with all texels would take gigabytes.
+    diffuse = np.stack([np.maximum(row @ toward, 0.0) @ weighted / np.pi for row in normal])
+    diffuse *= GREY_BALL
+    pair = []
+    for ball in (mirror, diffuse):
+        shown = ball / (1.0 + ball) if is_reinhard else np.minimum(ball, 1.0)
+        shown = np.where(inside[..., None], shown, 0.03)
+        pair.append(linear_to_gamma(shown))
+    return np.round(np.concatenate(pair, axis=1) * 255.0).astype(np.uint8)
