@@ -29,6 +29,7 @@ from warpir.render.bridge import ComposeConstants, compose
 from warpir.render.device_light import light_args
 from warpir.render.device_scene import Placed, Receiver, Scene
 from warpir.render.picture.planes import Quality, spread
+from warpir.render.picture.tone import tone_mapped
 from warpir.render.renderer import Foreground, Renderer
 from warpir.render.shadow.pilot import shaded_pixels
 from warpir.render.tone_curve import ToneCurve
@@ -146,7 +147,8 @@ class Stage:
             linear = radiance / np.where(seen, foreground.mask[:, None], 1.0)
             response = RESPONSES[self.place.response]
             return response.show(linear.astype(np.float64)).astype(np.float32)
-        shown, _ = self.renderer.tone(
+        shown, _ = tone_mapped(
+            self.renderer,
             replace(foreground, radiance=radiance),
             rendered.ratio[:0],
             curves.foreground,
@@ -165,7 +167,8 @@ class Stage:
             lit = response.invert(behind[proxies].astype(np.float64))
             behind[proxies] = response.show(lit * rendered.ratio).astype(np.float32)
         else:
-            _, ratio = self.renderer.tone(
+            _, ratio = tone_mapped(
+                self.renderer,
                 rendered.foreground,
                 rendered.ratio,
                 curves.foreground,

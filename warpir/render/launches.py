@@ -17,6 +17,7 @@ from warpir.kernels.dielectric.glass import GLASS_DEPTH
 from warpir.kernels.lamps.receiver import trace_lamps
 from warpir.kernels.path import Viewer, foreground_kernel
 from warpir.kernels.receiver import trace_plane_shadow, trace_receiver
+from warpir.kernels.tracing.gbuffer import trace_gbuffer
 from warpir.kernels.types import CameraArgs, LightArgs, LightRecord, MaterialArgs, VertexRecord
 from warpir.render.device import Rows
 
@@ -31,6 +32,33 @@ def directions_of_path(scene: Scene, depth: int) -> int:
     Two at each; at glass none goes on and sees the light.
     """
     return 2 * depth + (GLASS_DEPTH + 1 if scene.has_solid_glass else 0)
+
+
+def geometry_of(
+    renderer: Renderer, pixels: IntArray, spp: int, seed: int
+) -> tuple[FloatArray, ...]:
+    """Return coverage, position, normal, base colour, roughness and emission, a row a pixel.
+
+    Means over the samples that hit the object; positions in the scene's recentred frame [m].
+    """
+    scene, count = renderer.scene, len(pixels)
+    kinds = (float, wp.vec3, wp.vec3, wp.vec3, float, wp.vec3)
+    out = [renderer.zeros(count, kind) for kind in kinds]
+    renderer.launch(
+        trace_gbuffer,
+        count,
+        [
+            Rows(renderer.upload(pixels, wp.int32)),
+            scene.camera_args,
+            *scene.geometry(),
+            spp,
+            seed,
+            *map(Rows, out),
+        ],
+        spp,
+        "geometry",
+    )
+    return tuple(array.numpy()[:count].copy() for array in out)
 
 
 @dataclass(frozen=True)

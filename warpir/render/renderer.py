@@ -1,4 +1,4 @@
-"""Renderer of the object's G-buffer, its radiance and shadow ratio, and their tone mapping.
+"""Renderer of the object's G-buffer, its radiance and the shadow ratio.
 
 Pure Warp, no torch. A pixel's numbers depend on (seed, pixel, sample) alone. Pixels that do not fit
 into memory at once are traced in two halves (`warpir.core.memory`), those whose radiance is not
@@ -16,21 +16,18 @@ import warp as wp
 
 from warpir.core.arrays import BoolArray, Float64Array, FloatArray, IntArray
 from warpir.core.memory import Memory
-from warpir.kernels.composite import tone_foreground, tone_shadow
 from warpir.kernels.path import Viewer
 from warpir.kernels.shadow_ratio import shadow_ratio
-from warpir.kernels.tracing.gbuffer import trace_gbuffer
 from warpir.kernels.types import CameraArgs, LightArgs, LightRecord, MaterialArgs, VertexRecord
 from warpir.render.bad_pixels import BadPixels, all_finite, first_bad_sample_of
 from warpir.render.device import Launcher, Rows, load_kernels, settle_hashes
 from warpir.render.device_light import drawn, plane_radiance
 from warpir.render.device_scene import Scene
-from warpir.render.launches import THROWN_LIMIT, ObjectLaunch, ReceiverLaunch
+from warpir.render.launches import THROWN_LIMIT, ObjectLaunch, ReceiverLaunch, geometry_of
 from warpir.render.shadow.pilot import dilate
 from warpir.render.upload.triangles import Corners
 from warpir.scene.camera import Camera
 from warpir.scene.placement import box_corners
-from warpir.scene.tone_curves import ToneKnots
 
 FULL_THREADS = 1 << 18
 """Threads that fill a CUDA device; with fewer pixels, several threads share a pixel's samples."""
@@ -190,28 +187,9 @@ class Renderer(Launcher):
 
     def _traced_geometry(self, pixels: IntArray, spp: int, seed: int) -> tuple[FloatArray, ...]:
         """Return coverage, position, normal, base colour, roughness and emission, a row a pixel."""
-        scene = self.scene
 
         def trace(start: int, stop: int) -> tuple[FloatArray, ...]:
-            out = [
-                self.zeros(stop - start, kind)
-                for kind in (float, wp.vec3, wp.vec3, wp.vec3, float, wp.vec3)
-            ]
-            self.launch(
-                trace_gbuffer,
-                stop - start,
-                [
-                    Rows(self.upload(pixels[start:stop], wp.int32)),
-                    scene.camera_args,
-                    *scene.geometry(),
-                    spp,
-                    seed,
-                    *map(Rows, out),
-                ],
-                spp,
-                "geometry",
-            )
-            return tuple(array.numpy()[: stop - start].copy() for array in out)
+            return geometry_of(self, pixels[start:stop], spp, seed)
 
         return self._in_chunks(trace, len(pixels), "geometry")
 
@@ -339,10 +317,23 @@ class Renderer(Launcher):
         )
         gain = np.ones(len(pixels), np.bool_) if may_gain is None else may_gain
         assert thrown_record is None or gain.all(), "rows of the record are pixels"
+        rows, records = (pixels, may_see_object, gain), (record, thrown_record)
+        return self._white_radiance(launch, rows, spp, records, camera_args)
+
+    def _white_radiance(
+        self,
+        launch: ReceiverLaunch,
+        rows: tuple[IntArray, IntArray, BoolArray],
+        spp: int,
+        records: tuple[LightRecord | None, LightRecord | None],
+        camera_args: CameraArgs | None,
+    ) -> ReceiverRadiance:
+        """Trace what `receiver` has set up; ``rows`` are its pixels, and what they see and gain."""
+        pixels, may_see_object, gain = rows
 
         def trace(start: int, stop: int) -> tuple[FloatArray, ...]:
             part = slice(start, stop)
-            cut = (r if r is None else Rows(r).cut(start, stop) for r in (record, thrown_record))
+            cut = (r if r is None else Rows(r).cut(start, stop) for r in records)
             return launch.sums(self, pixels[part], may_see_object[part], gain[part], spp, *cut)
 
         def first_bad_sample(pixel: int) -> int | None:
@@ -458,44 +449,6 @@ class Renderer(Launcher):
         )
         ratio: FloatArray = out.numpy()[:count]
         return ratio
-
-    def tone(
-        self,
-        foreground: Foreground,
-        ratio: FloatArray,
-        curve_fg: ToneKnots,
-        curve_shadow: ToneKnots,
-        is_reinhard: bool,
-    ) -> tuple[FloatArray, FloatArray]:
-        """Map object radiance and shadow ratio to display-linear values, shapes [row, 3]."""
-        objects, receivers = len(foreground.mask), len(ratio)
-        fg = self.zeros(objects, wp.vec3)
-        shadow = self.zeros(receivers, wp.vec3)
-        self.launch(
-            tone_foreground,
-            objects,
-            [
-                Rows(self.upload(foreground.radiance, wp.vec3)),
-                Rows(self.upload(foreground.mask, wp.float32)),
-                int(is_reinhard),
-                *(self.upload(k, wp.float32) for k in curve_fg.arrays()),
-                curve_fg.bin_count,
-                Rows(fg),
-            ],
-            1,
-        )
-        self.launch(
-            tone_shadow,
-            receivers,
-            [
-                Rows(self.upload(ratio, wp.vec3)),
-                *(self.upload(k, wp.float32) for k in curve_shadow.arrays()),
-                curve_shadow.bin_count,
-                Rows(shadow),
-            ],
-            1,
-        )
-        return fg.numpy()[:objects], shadow.numpy()[:receivers]
 
 
 def index_of(pixels: IntArray, count: int) -> IntArray:

@@ -10,6 +10,7 @@ from warpir.core.arrays import BoolArray, FloatArray, IntArray
 from warpir.kernels.types import LightArgs
 from warpir.look.denoise import denoised_object, denoised_ratio
 from warpir.render.device_light import light_args
+from warpir.render.picture.tone import tone_mapped
 from warpir.render.renderer import Foreground, GBuffer, Renderer
 from warpir.render.resizing import resize
 from warpir.render.shadow.mirror import mirror_planes
@@ -105,7 +106,7 @@ def render(
         camera = renderer.scene.camera
         foreground = _denoised(foreground, gbuffer, camera)
         ratio = denoised_ratio(ratio, receiver_pixels, (camera.height, camera.width))
-    fg, beta = renderer.tone(foreground, ratio, curve_fg, curve_shadow, is_reinhard)
+    fg, beta = tone_mapped(renderer, foreground, ratio, curve_fg, curve_shadow, is_reinhard)
     planes = _planes(renderer.scene.camera, gbuffer, foreground, fg, (receiver_pixels, beta))
     if quality.ground_roughness is not None:
         planes |= _mirror(renderer, args_fg, behind, gbuffer.object_pixels, planes, quality)

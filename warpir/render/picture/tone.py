@@ -1,0 +1,63 @@
+"""Tone mapping of what a renderer has traced."""
+
+from __future__ import annotations
+
+import warp as wp
+
+from warpir.core.arrays import FloatArray
+from warpir.kernels.composite import tone_foreground, tone_shadow
+from warpir.render.device import Rows
+from warpir.render.renderer import Foreground, Renderer
+from warpir.scene.tone_curves import ToneKnots
+
+
+def tone_mapped(
+    renderer: Renderer,
+    foreground: Foreground,
+    ratio: FloatArray,
+    curve_fg: ToneKnots,
+    curve_shadow: ToneKnots,
+    is_reinhard: bool,
+) -> tuple[FloatArray, FloatArray]:
+    """Map object radiance and shadow ratio to display-linear values.
+
+    Args:
+        renderer: Launches the kernels.
+        foreground: Radiance of the object, premultiplied.
+        ratio: Shadow ratio, shape [receiver_pixel, 3].
+        curve_fg: One tone curve.
+        curve_shadow: Three tone curves.
+        is_reinhard: Whether Reinhard's operator precedes the foreground curve.
+
+    Returns:
+        The object, not premultiplied [1], shape [object_pixel, 3], and what the plate is multiplied
+        by [1], shape [receiver_pixel, 3].
+    """
+    objects, receivers = len(foreground.mask), len(ratio)
+    fg = renderer.zeros(objects, wp.vec3)
+    shadow = renderer.zeros(receivers, wp.vec3)
+    renderer.launch(
+        tone_foreground,
+        objects,
+        [
+            Rows(renderer.upload(foreground.radiance, wp.vec3)),
+            Rows(renderer.upload(foreground.mask, wp.float32)),
+            int(is_reinhard),
+            *(renderer.upload(k, wp.float32) for k in curve_fg.arrays()),
+            curve_fg.bin_count,
+            Rows(fg),
+        ],
+        1,
+    )
+    renderer.launch(
+        tone_shadow,
+        receivers,
+        [
+            Rows(renderer.upload(ratio, wp.vec3)),
+            *(renderer.upload(k, wp.float32) for k in curve_shadow.arrays()),
+            curve_shadow.bin_count,
+            Rows(shadow),
+        ],
+        1,
+    )
+    return fg.numpy()[:objects], shadow.numpy()[:receivers]
