@@ -146,20 +146,7 @@ def write_layers(
         InputError: A value is not finite (exit 6), or the disk is full (exit 5).
     """
     height, width = camera.height, camera.width
-    recomputed = (
-        layers.foreground[..., :3]
-        + (1.0 - layers.foreground[..., 3:]) * layers.plate * layers.shadow_ratio
-    )
-    formula = "RGB = fg.RGB + (1 - fg.A) * plate.RGB * shadow.RGB"
-    if layers.mirror is not None:
-        recomputed = recomputed + layers.mirror
-        formula += " + mirror.RGB"
-    if layers.grain is not None:
-        recomputed = recomputed + layers.grain
-        formula += " + grain.RGB"
-    if not np.allclose(layers.composite, recomputed, rtol=2e-3, atol=2e-3, equal_nan=True):
-        worst = float(np.nanmax(np.abs(layers.composite - recomputed)))
-        raise ValueError(f"composite differs from its layers by up to {worst:g}")
+    formula = _checked_formula(layers)
     channels, clamped = _stored_channels(layers, height, width, is_deep)
     channels["A"] = np.ones((height, width), np.float16)
 
@@ -177,6 +164,29 @@ def write_layers(
         },
     )
     return clamped
+
+
+def _checked_formula(layers: Layers) -> str:
+    """Return how the composite follows from the other layers, by the names of their channels.
+
+    Raises:
+        ValueError: It does not.
+    """
+    recomputed = (
+        layers.foreground[..., :3]
+        + (1.0 - layers.foreground[..., 3:]) * layers.plate * layers.shadow_ratio
+    )
+    formula = "RGB = fg.RGB + (1 - fg.A) * plate.RGB * shadow.RGB"
+    if layers.mirror is not None:
+        recomputed = recomputed + layers.mirror
+        formula += " + mirror.RGB"
+    if layers.grain is not None:
+        recomputed = recomputed + layers.grain
+        formula += " + grain.RGB"
+    if not np.allclose(layers.composite, recomputed, rtol=2e-3, atol=2e-3, equal_nan=True):
+        worst = float(np.nanmax(np.abs(layers.composite - recomputed)))
+        raise ValueError(f"composite differs from its layers by up to {worst:g}")
+    return formula
 
 
 def _stored_channels(
