@@ -310,16 +310,6 @@ class GltfBSDF(mi.BSDF):
             E = read_sheen_table(self.sheen_table, dr.dot(n, wo), sheen_roughness)
             sheen_scale = 1.0 - dr.max(sheen) * E
 
-        # KHR_materials_iridescence
-        film = None
-        if material.iridescence > 0.0:
-            low, high = material.iridescence_thickness
-            thickness = dr.lerp(low, high, self._read("iridescence_thickness", *hit).y)
-            # Thinner than 0.03 nm it fades out
-            x = dr.clip(thickness / 0.03, 0.0, 1.0)
-            share = self._factor("iridescence", "iridescence", 0, *hit)
-            film = share * x * x * (3.0 - 2.0 * x), material.iridescence_ior, thickness
-
         surface = Surface(
             wo=wo,
             n=n,
@@ -330,7 +320,7 @@ class GltfBSDF(mi.BSDF):
             alpha=alpha,
             dielectric_f0=f0,
             dielectric_f90=f90,
-            film=film,
+            film=self._film(*hit),
             transmission=self._factor("transmission", "transmission", 0, *hit),
             sheen_color=sheen,
             sheen_alpha=dr.maximum(dr.square(sheen_roughness), MIN_ALPHA),
@@ -347,6 +337,20 @@ class GltfBSDF(mi.BSDF):
         passes = surface.transmission * (1.0 - metallic) * mi.luminance(base_color) * enters
         surface.stopped = 1.0 - passes
         return surface
+
+    def _film(
+        self, si: mi.SurfaceInteraction3f, active: mi.Bool
+    ) -> tuple[mi.Float, float, mi.Float] | None:
+        """Share with a thin film [1], its index and thickness [nm] (KHR_materials_iridescence)."""
+        material = self.material
+        if material.iridescence <= 0.0:
+            return None
+        low, high = material.iridescence_thickness
+        thickness = dr.lerp(low, high, self._read("iridescence_thickness", si, active).y)
+        # Thinner than 0.03 nm it fades out
+        x = dr.clip(thickness / 0.03, 0.0, 1.0)
+        share = self._factor("iridescence", "iridescence", 0, si, active)
+        return share * x * x * (3.0 - 2.0 * x), material.iridescence_ior, thickness
 
     def _oriented_normals(
         self, wo: mi.Vector3f, si: mi.SurfaceInteraction3f, active: mi.Bool
