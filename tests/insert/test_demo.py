@@ -6,8 +6,9 @@ import numpy as np
 import pytest
 
 from tools.demo.car import car
+from tools.demo.distance import mesh_distance
 from tools.demo.make import without_fireflies
-from tools.demo.mesh import ellipsoid, lathe, mesh_distance, rounded_box, split, tube
+from tools.demo.mesh import ellipsoid, lathe, rounded_box, split, tube
 from tools.demo.place import HEIGHT, WIDTH, camera, placement
 from tools.demo.sky import (
     LUMINANCE,

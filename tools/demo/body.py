@@ -2,16 +2,8 @@
 
 import numpy as np
 
-from tools.demo.mesh import (
-    Surface,
-    merge,
-    mesh_distance,
-    polygon_distance,
-    round_intersection,
-    round_union,
-    spline,
-    split,
-)
+from tools.demo.distance import mesh_distance, polygon_distance, round_intersection, round_union
+from tools.demo.mesh import Surface, merge, spline, split
 from warpir.core.arrays import Float64Array
 
 CELL = 0.040

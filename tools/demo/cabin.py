@@ -10,16 +10,8 @@ from tools.demo.body import (
     Part,
     body_distance,
 )
-from tools.demo.mesh import (
-    Surface,
-    merge,
-    mesh_distance,
-    polygon_distance,
-    rotation,
-    rounded_box,
-    split,
-    tube,
-)
+from tools.demo.distance import mesh_distance, polygon_distance
+from tools.demo.mesh import Surface, merge, rotation, rounded_box, split, tube
 from warpir.core.arrays import Float64Array
 
 LINING = 0.014

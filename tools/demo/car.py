@@ -26,17 +26,16 @@ from tools.demo.body import (
     on_side,
 )
 from tools.demo.cabin import cabin
+from tools.demo.distance import gradient, project
 from tools.demo.mesh import (
     Surface,
     both_sides,
     ellipsoid,
     flat,
-    gradient,
     grid,
     lathe,
     merge,
     normalized,
-    project,
     quad,
     rotation,
     rounded_box,
