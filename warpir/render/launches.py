@@ -1,4 +1,4 @@
-"""Arguments of the launches that trace pixels: the object, and the receiver under it.
+"""Launches that trace pixels: the object's G-buffer and radiance, and the receiver under it.
 
 A launch's numbers depend on its arguments alone; `warpir.render.renderer` cuts the pixels where
 memory is short.
