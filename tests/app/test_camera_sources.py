@@ -206,6 +206,15 @@ def test_doubtful_estimate_asks_for_flags(folder: Path) -> None:
     assert not any("hardly shows" in line for line in read(folder, Asked()).notices)
 
 
+def test_notice_says_what_the_photo_looks_like(folder: Path) -> None:
+    collage = Asked(pitch_sigma_deg=30.0, vfov_sigma_deg=30.0, looks_like="a collage")
+    (line,) = [line for line in read(folder, collage).notices if "hardly shows" in line]
+    assert line.startswith("the photo looks like a collage and hardly shows the camera's pitch")
+    assert "--horizon and --fov" in line
+    known = read(folder, collage, pitch=-5.0, fov=60.0)
+    assert not any("collage" in line for line in known.notices)
+
+
 @pytest.mark.parametrize("given", [{}, {"at": (48.0, 50.0)}], ids=["free", "at"])
 def test_estimate_that_sees_no_ground_gives_way_to_a_level_camera(
     folder: Path, given: dict[str, Any]

@@ -104,15 +104,15 @@ def photo_camera(
             undistort=asked.undistort,
             limits=limits,
         )
-    camera = _camera_of_flags(asked, photo)
+    camera, seen_as = _camera_of_flags(asked, photo), ""
     if asked.source == "estimate" and any(
         camera.sources[name].name == ASSUMED for name in ("pitch_deg", "vfov_deg")
     ):
         if estimator is None:
             camera = _pending(camera)
         else:
-            camera = _estimated(camera, asked, photo, estimator)
-    assumed, doubtful = _about_sources(camera)
+            camera, seen_as = _estimated(camera, asked, photo, estimator)
+    assumed, doubtful = _about_sources(camera, seen_as)
     if asked.height is None:
         line = f"the camera is {DEFAULT_CAMERA_HEIGHT} m above the ground (--camera-height)"
         assumed.insert(0, line)
@@ -161,11 +161,11 @@ def _pending(camera: Camera) -> Camera:
 
 def _estimated(
     camera: Camera, asked: CameraConfig, photo: Photo, estimator: CameraEstimator
-) -> Camera:
-    """Return a camera with estimates in place of its assumed numbers.
+) -> tuple[Camera, str]:
+    """Return a camera with estimates for its assumed numbers, and what the photo looks like.
 
-    They are rounded to a tenth of a degree, far less than their errors: other processors add up in
-    another order, and shall give the same camera.
+    That is `CameraEstimate.looks_like`. The estimates are rounded to a tenth of a degree, far less
+    than their errors: other processors add up in another order, and shall give the same camera.
     """
     sources = dict(camera.sources)
     is_known = sources["vfov_deg"].name != ASSUMED
@@ -189,11 +189,14 @@ def _estimated(
         pitch = round(found.pitch_deg, 1)
         sources["pitch_deg"] = Source(ESTIMATE, found.pitch_sigma_deg)
     pose = camera_pose(pitch, roll, float(camera.c2w[1, 3]))
-    return replace(camera, c2w=pose, sources=sources)
+    return replace(camera, c2w=pose, sources=sources), found.looks_like
 
 
-def _about_sources(camera: Camera) -> tuple[list[str], list[str]]:
-    """Return what is assumed and estimated of a camera, and which estimates are doubtful."""
+def _about_sources(camera: Camera, seen_as: str) -> tuple[list[str], list[str]]:
+    """Return what is assumed and estimated of a camera, and which estimates are doubtful.
+
+    ``seen_as`` is `CameraEstimate.looks_like`.
+    """
     assumed, doubtful = [], []
     numbers = camera.numbers()
     estimated = [k for k in WORDS if camera.sources[k].name == ESTIMATE]
@@ -207,9 +210,10 @@ def _about_sources(camera: Camera) -> tuple[list[str], list[str]]:
         assumed.append(f"camera {line} (--pitch, --roll, --horizon, --fov; --camera-from assume)")
     wide = [WORDS[k] for k in estimated if numbers[k]["sigma"] > WIDE[k]]
     if wide:
+        looks = f"looks like {seen_as} and " if seen_as else ""
         doubtful.append(
-            f"the photo hardly shows the camera's {' and '.join(wide)}: give --horizon and --fov, "
-            "or place the object by hand (python -m warpir.place)"
+            f"the photo {looks}hardly shows the camera's {' and '.join(wide)}: "
+            "give --horizon and --fov, or place the object by hand (python -m warpir.place)"
         )
     pending = [WORDS[k] for k in WORDS if camera.sources[k].name == PENDING]
     if pending:

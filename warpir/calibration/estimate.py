@@ -13,6 +13,7 @@ import torch.nn.functional as F
 
 from warpir.calibration import lines
 from warpir.calibration.network import NUMBERS, Calibrator, load_calibrator, seen
+from warpir.calibration.not_pinhole import looks_like
 from warpir.core.arrays import FloatArray
 from warpir.core.errors import InputError
 from warpir.scene.camera import CameraEstimate
@@ -22,9 +23,9 @@ NETWORK = "network"
 CORRECTED_SHIFT = 0.08
 """Distance of the estimated principal point from the middle, over the height, from which a photo
 counts as corrected to upright."""
-CIRCLE_SIGMA_DEG = 30.0
-"""Standard deviation of pitch and field of view of a circular fisheye picture, which the network
-has never seen and answers as confidently as any other [deg]."""
+NOT_PINHOLE_SIGMA_DEG = 30.0
+"""Least standard deviation of pitch and field of view of a picture that no pinhole camera takes,
+which the network has never seen and answers as confidently as any other [deg]."""
 LINES = "vanishing point of upright edges"
 """Name of the second witness."""
 
@@ -34,8 +35,8 @@ def estimate_camera(
 ) -> CameraEstimate:
     """Estimate the camera of a photo, by the network and by upright edges where enough agree.
 
-    The principal point is the middle, unless the photo looks corrected to upright (`decided`). A
-    circular fisheye picture, which no pinhole camera takes, has a wide uncertainty.
+    The principal point is the middle, unless the photo looks corrected to upright (`decided`). What
+    looks like a picture that no pinhole camera takes (`looks_like`) has a wide uncertainty.
 
     Args:
         photo: Display-encoded (sRGB) in [0, 1], shape [H, W, 3].
@@ -50,10 +51,12 @@ def estimate_camera(
     with _one_thread():
         alone = network_estimate(photo, network or load_calibrator(), vfov_deg)
         found = decided(with_lines(alone, photo))
-    if has_image_circle(photo):
-        fov_sigma = 0.0 if vfov_deg is not None else CIRCLE_SIGMA_DEG
-        return replace(found, pitch_sigma_deg=CIRCLE_SIGMA_DEG, vfov_sigma_deg=fov_sigma)
-    return found
+    seen_as = looks_like(photo)
+    if not seen_as:
+        return found
+    pitch_sigma = max(found.pitch_sigma_deg, NOT_PINHOLE_SIGMA_DEG)
+    fov_sigma = max(found.vfov_sigma_deg, NOT_PINHOLE_SIGMA_DEG) if vfov_deg is None else 0.0
+    return replace(found, pitch_sigma_deg=pitch_sigma, vfov_sigma_deg=fov_sigma, looks_like=seen_as)
 
 
 @contextmanager
@@ -112,23 +115,6 @@ def network_estimate(
         principal_sigma=(sigma["x"], sigma["y"]),
         witnesses=(NETWORK,),
     )
-
-
-def has_image_circle(photo: FloatArray) -> bool:
-    """Tell whether a photo is a circle in corners of one colour, as a circular fisheye's.
-
-    Args:
-        photo: Display-encoded in [0, 1], shape [H, W, 3].
-    """
-    photo = photo[:: max(1, photo.shape[0] // 256), :: max(1, photo.shape[1] // 256)]
-    height, width = photo.shape[:2]
-    v, u = np.ogrid[:height, :width]
-    radius = np.hypot(v + 0.5 - height / 2.0, u + 0.5 - width / 2.0) / (min(height, width) / 2.0)
-    outside, rim = photo[radius > 1.1], photo[(radius > 0.8) & (radius < 0.95)]
-    if not (len(outside) and len(rim)):
-        return False
-    # JPEG leaves a code or two of noise in what was one colour.
-    return bool(outside.std(axis=0).max() < 0.01 and rim.std(axis=0).max() > 0.05)
 
 
 def decided(estimate: CameraEstimate) -> CameraEstimate:

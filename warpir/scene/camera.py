@@ -219,6 +219,9 @@ class CameraEstimate:
     """Standard deviations of the principal point, in the same shares."""
     witnesses: tuple[str, ...]
     """What the estimate rests on, one name each."""
+    looks_like: str = ""
+    """What the picture looks like that no pinhole camera takes, as "a collage"; empty for a
+    photo."""
 
     @property
     def is_upright_corrected(self) -> bool:
