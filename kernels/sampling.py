@@ -12,7 +12,7 @@ from warpir.kernels.maths.latlong import (
 )
 from warpir.kernels.maths.rng import hash_pair, pixel_seed, to_unit
 from warpir.kernels.maths.sg import sg_shape
-from warpir.kernels.types import LightArgs
+from warpir.kernels.types import DrawnLight, LightArgs
 
 PI = wp.constant(3.14159265358979)
 
@@ -171,26 +171,13 @@ def proposal_sample(light: LightArgs, u: wp.vec2) -> wp.vec3:
     return lobe_sample(wp.vec2(within, u[1]), light.axis[pick], light.sharpness[pick])
 
 
-@wp.struct
-class DrawnLight:
-    """A direction that was drawn from the light, what comes from there, and its density."""
-
-    wi: wp.vec3
-    radiance: wp.vec3
-    pdf: float
-
-
 @wp.func
 def light_sample(light: LightArgs, u: wp.vec2) -> DrawnLight:
     """Return one of the directions that `draw_light` left, that of the cell around ``u``."""
-    cells = light.drawn_pdf.shape[0]
+    cells = light.drawn.shape[0]
     i = wp.min(int(u[1] * float(cells)), cells - 1)
     j = wp.min(int(u[0] * float(cells)), cells - 1)
-    out = DrawnLight()
-    out.wi = light.drawn_wi[i, j]
-    out.radiance = light.drawn_radiance[i, j]
-    out.pdf = light.drawn_pdf[i, j]
-    return out
+    return light.drawn[i, j]
 
 
 @wp.kernel(enable_backward=False)
@@ -199,9 +186,7 @@ def draw_light(
     light: LightArgs,
     seed: int,
     side: int,
-    wi: wp.array[wp.vec3],
-    radiance: wp.array[wp.vec3],
-    pdf: wp.array[float],
+    drawn: wp.array[DrawnLight],
 ):
     """Draw a direction in each of ``side`` x ``side`` strata of the unit square; a thread a cell.
 
@@ -213,17 +198,16 @@ def draw_light(
         light: The light.
         seed: Base seed.
         side: Strata along each axis.
-        wi: Output: unit directions, shape [cell].
-        radiance: Output: what comes from there.
-        pdf: Output: density of the draw per solid angle.
+        drawn: Output, shape [cell].
     """
     i = wp.tid()
     key = pixel_seed(seed, cell[i])
     x = float(cell[i] % side) + to_unit(hash_pair(key, wp.uint32(0)))
     y = float(cell[i] // side) + to_unit(hash_pair(key, wp.uint32(1)))
     u = wp.vec2(wp.min(x / float(side), 0.99999994), wp.min(y / float(side), 0.99999994))
-    d = proposal_sample(light, u)
-    value = light_eval(light, d)
-    wi[i] = d
-    radiance[i] = value.radiance
-    pdf[i] = value.pdf
+    out = DrawnLight()
+    out.wi = proposal_sample(light, u)
+    value = light_eval(light, out.wi)
+    out.radiance = value.radiance
+    out.pdf = value.pdf
+    drawn[i] = out

@@ -217,6 +217,21 @@ class TextureArgs:
 
 
 @wp.struct
+class DrawnLight:
+    """A direction that was drawn from the light, what comes from there, and its density.
+
+    32 bytes, so that looking one up at random reads one line of the cache.
+    """
+
+    wi: wp.vec3
+    """Unit, world frame."""
+    pdf: float
+    """Per solid angle."""
+    radiance: wp.vec3
+    padding: float
+
+
+@wp.struct
 class LightArgs:
     """Light at infinity: a sum of spherical Gaussians and of one lat-long map, either may be empty.
 
@@ -246,12 +261,8 @@ class LightArgs:
     """Of the texels that are not bright and of those that are, shape [2, He + 1]."""
     column_cdf: wp.array2d[float]
     """Within each row, bright texels below the others, shape [2 He, We + 1]."""
-    drawn_wi: wp.array2d[wp.vec3]
+    drawn: wp.array2d[DrawnLight]
     """Directions drawn for one launch (`warpir.render.device_light.drawn`), shape [cell, cell]."""
-    drawn_radiance: wp.array2d[wp.vec3]
-    """What comes from there, shape [cell, cell]."""
-    drawn_pdf: wp.array2d[float]
-    """Their density per solid angle, shape [cell, cell]."""
 
 
 @wp.struct

@@ -19,7 +19,7 @@ from warpir.core.color import luminance
 from warpir.core.errors import ExitCode, InputError
 from warpir.core.latlong import map_directions, texel_solid_angles
 from warpir.kernels.sampling import draw_light
-from warpir.kernels.types import LampArgs, LightArgs
+from warpir.kernels.types import DrawnLight, LampArgs, LightArgs
 from warpir.render.device import Launcher, Rows
 from warpir.scene.light import Light, Lobes
 from warpir.scene.near.lamps import Lamp, RectangleLamp
@@ -150,19 +150,19 @@ def drawn(
         propose(out, normal)
     side = FINE_SIDE if samples >= FINE_FROM else SIDE
     count = side * side
-    arrays = [launcher.zeros(count, kind) for kind in (wp.vec3, wp.vec3, float)]
+    table = launcher.zeros(count, DrawnLight)
     cells = Rows(launcher.upload(np.arange(count, dtype=np.int32), wp.int32))
-    launcher.launch(draw_light, count, [cells, out, seed, side, *map(Rows, arrays)], 1, "")
-    table = (a[:count].reshape((side, side)) for a in arrays)
-    out.drawn_wi, out.drawn_radiance, out.drawn_pdf = table
+    launcher.launch(draw_light, count, [cells, out, seed, side, Rows(table)], 1, "")
+    out.drawn = table.reshape((side, side))
     return out
 
 
 def plane_radiance(light: LightArgs, normal: Float64Array) -> Float64Array:
     """Return the radiance of an open white plane under a drawn light, shape [3]."""
-    pdf = light.drawn_pdf.numpy()[..., None].astype(np.float64)
-    cosine = np.maximum(light.drawn_wi.numpy() @ normal, 0.0)[..., None]
-    radiance = light.drawn_radiance.numpy()
+    drawn = light.drawn.numpy()
+    pdf = drawn["pdf"][..., None].astype(np.float64)
+    cosine = np.maximum(drawn["wi"] @ normal, 0.0)[..., None]
+    radiance = drawn["radiance"]
     with np.errstate(divide="ignore", invalid="ignore"):
         arriving = np.where(pdf == 0.0, 0.0, radiance * cosine / (np.pi * pdf))
     return np.asarray(arriving.mean(axis=(0, 1)))
