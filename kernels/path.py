@@ -79,6 +79,7 @@ def scatter(
     surface: Surface,
     wo: wp.vec3,
     is_last: int,
+    candidates: int,
     keep_dark: int,
     index: int,
     key: wp.uint32,
@@ -86,7 +87,7 @@ def scatter(
 ) -> Scatter:
     """Draw, weigh and trace the two directions of one path vertex.
 
-    ``is_last`` and ``keep_dark`` are those of `sample_bsdf` and `sample_emitter`.
+    ``is_last`` is that of `sample_bsdf`, ``candidates`` and ``keep_dark`` are `sample_emitter`'s.
     """
     out = Scatter()
     out.direct = wp.vec3(0.0)
@@ -100,10 +101,10 @@ def scatter(
     u_parts = sobol_pair(index, key, 3 * vertex + 1)
 
     # Sample the emitter
-    u = sobol_pair(index, key, 3 * vertex + 2)
     emitter = sample_emitter(
-        mesh, material, texture, receiver, light, surface, bsdf, frame, u, keep_dark
-    )
+        mesh, material, texture, receiver, light, surface, bsdf, frame,
+        candidates, u_parts[0], keep_dark, index, key, vertex,
+    )  # fmt: skip
     out.emitter = emitter
     if emitter.valid == 1:
         f = emitter.f
@@ -125,7 +126,7 @@ def scatter(
     if sample.visible > 0.0:
         Li = light_eval(light, sample.wi)
         out.L_bsdf = Li.radiance
-        out.weight_bsdf = bsdf_weight(sample, Li.pdf)
+        out.weight_bsdf = bsdf_weight(sample, float(candidates) * Li.pdf)
     if sample.from_receiver == 1 or sample.visible > 0.0:
         out.direct += wp.cw_mul(f_sample, out.L_bsdf) * out.weight_bsdf
         out.direct_diffuse += wp.cw_mul(sample.f.diffuse, out.L_bsdf) * out.weight_bsdf
@@ -155,6 +156,7 @@ def scatter_with_glass(
     point: GlassPoint,
     is_glass: int,
     wo: wp.vec3,
+    candidates: int,
     keep_dark: int,
     index: int,
     key: wp.uint32,
@@ -175,7 +177,7 @@ def scatter_with_glass(
         rest.metallic = metallic_beside(surface.metallic, point)
         event = scatter(
             mesh, material, texture, receiver, light, lamps,
-            rest, wo, 0, keep_dark, index, key, vertex,
+            rest, wo, 0, candidates, keep_dark, index, key, vertex,
         )  # fmt: skip
     if event.bsdf.next.valid == 1:
         left = transmittance(mesh, glass, surface, point, event.bsdf)
@@ -262,6 +264,7 @@ def foreground_kernel(
         rays: int,
         lanes: int,
         depth: int,
+        candidates: int,
         indirect_limit: float,
         seed: int,
         ground_alpha: float,
@@ -305,6 +308,8 @@ def foreground_kernel(
             lanes: Rows per pixel; the launch starts with a pixel's first.
             depth: Surface interactions, that with the receiver included; with solid glass those
                 with other materials, and `GLASS_DEPTH` in all at most.
+            candidates: Directions of the light among which the object's first vertex picks one
+                (`sample_emitter`); 1 with a record.
             indirect_limit: Most radiance that one path may add behind its first vertex; 0 for no
                 limit. It takes the fireflies of light that a mirror throws onto a matte surface,
                 and with them some of that light.
@@ -424,6 +429,9 @@ def foreground_kernel(
                 if vertex_record.material.shape[1] > 0:
                     keep_surface(vertex_record, i, index, surface, wo)
 
+            among = int(1)
+            if k == wp.static(int(not from_camera)):
+                among = candidates
             if wp.static(has_solid_glass):
                 is_glass = meets_glass(glassy, before * rays + index, key, k)
                 if is_glass == 0 and k - interfaces >= depth:
@@ -433,7 +441,8 @@ def foreground_kernel(
                 interfaces += is_glass
                 event = scatter_with_glass(
                     mesh, material, texture, receiver, light, lamps, glass,
-                    surface, glassy, is_glass, wo, keep_dark, before * rays + index, key, k,
+                    surface, glassy, is_glass, wo, among, keep_dark,
+                    before * rays + index, key, k,
                 )  # fmt: skip
             else:
                 is_last = int(0)
@@ -441,7 +450,7 @@ def foreground_kernel(
                     is_last = 1  # lamps in front of a hit are seen by the closest alone
                 event = scatter(
                     mesh, material, texture, receiver, light, lamps,
-                    surface, wo, is_last, keep_dark, before * rays + index, key, k,
+                    surface, wo, is_last, among, keep_dark, before * rays + index, key, k,
                 )  # fmt: skip
             if vertex_record.material.shape[1] > 0:
                 keep_event(vertex_record, i, k * spp * rays + index, event)

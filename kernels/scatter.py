@@ -8,8 +8,9 @@ both the shading and the geometric surface. Detached: no backward pass.
 
 import warp as wp
 
-from warpir.kernels.bsdf import Bsdf, BsdfValue, bsdf_f, bsdf_of, bsdf_sample
+from warpir.kernels.bsdf import Bsdf, BsdfValue, bsdf_f, bsdf_of, bsdf_sample, luminance
 from warpir.kernels.maths.frame import Frame, to_local, to_world
+from warpir.kernels.maths.rng import sobol_pair
 from warpir.kernels.receiver_mesh import receiver_hit, receiver_radiance, sky_visibility
 from warpir.kernels.sampling import light_sample, power_heuristic
 from warpir.kernels.tracing.hit import Hit, offset_origin
@@ -95,10 +96,19 @@ def sample_emitter(
     surface: Surface,
     bsdf: Bsdf,
     frame: Frame,
-    u: wp.vec2,
+    candidates: int,
+    u_pick: float,
     keep_dark: int,
+    index: int,
+    key: wp.uint32,
+    vertex: int,
 ) -> EmitterSample:
-    """Draw a direction from the light's proposal, weigh it and trace it.
+    """Draw directions from the light's proposal, pick one and trace it.
+
+    One is picked by the luminance that each brings if nothing stands in its way, and it stands for
+    all of them (resampled importance sampling: Talbot, Cline & Egbert 2005, "Importance Resampling
+    for Global Illumination", eq. 5, in one pass over the candidates). All are weighed against the
+    BSDF's direction by the power heuristic with their number as the sample count (Veach 1997).
 
     Args:
         mesh: The object's triangles.
@@ -109,28 +119,55 @@ def sample_emitter(
         surface: Where light is scattered.
         bsdf: How, toward the camera.
         frame: Of the shading normal.
-        u: Uniform numbers.
+        candidates: How many directions are drawn; 1 with ``keep_dark``.
+        u_pick: Uniform number that picks one.
         keep_dark: 1 weighs directions too that bring nothing now: a gradient needs them.
+        index: Of the path.
+        key: Of the pixel.
+        vertex: Number of the vertex.
     """
     sample = EmitterSample()
     sample.valid = 0
     sample.L = wp.vec3(0.0)
     sample.weight = 0.0
-    drawn = light_sample(light, u)
-    sample.wi = drawn.wi
-    wi = to_local(sample.wi, frame)
-    if wi[2] > 0.0 and wp.dot(sample.wi, surface.ng) > 0.0 and bsdf.wo[2] > 0.0:
-        f = bsdf_f(bsdf, wi)
-        reflected = wp.cw_mul(f.diffuse + f.specular, drawn.radiance)
-        if drawn.pdf > 0.0 and (wp.max(reflected) > 0.0 or keep_dark == 1):
-            weight = wi[2] * power_heuristic(drawn.pdf, f.pdf) / drawn.pdf
-            origin = offset_origin(surface.position, surface.ng, sample.wi, mesh.epsilon)
-            weight = weight * visibility(mesh, material, texture, origin, sample.wi)
-            weight = weight * sky_visibility(receiver, origin, sample.wi)
-            sample.valid = 1
-            sample.f = f
-            sample.L = drawn.radiance
-            sample.weight = weight
+    count = float(candidates)
+    total = float(0.0)
+    picked = float(0.0)
+    for c in range(candidates):
+        drawn = light_sample(light, sobol_pair(candidates * index + c, key, 3 * vertex + 2))
+        if c == 0:
+            sample.wi = drawn.wi
+        wi = to_local(drawn.wi, frame)
+        if wi[2] > 0.0 and wp.dot(drawn.wi, surface.ng) > 0.0 and bsdf.wo[2] > 0.0:
+            f = bsdf_f(bsdf, wi)
+            reflected = wp.cw_mul(f.diffuse + f.specular, drawn.radiance)
+            if drawn.pdf > 0.0 and (wp.max(reflected) > 0.0 or keep_dark == 1):
+                pdf = count * drawn.pdf
+                weight = wi[2] * power_heuristic(pdf, f.pdf) / pdf
+                gain = weight * luminance(reflected)
+                total += gain
+                is_picked = int(1)
+                if candidates > 1:
+                    # What is left of the number is uniform again. A NaN is picked, and is seen.
+                    if u_pick * total >= gain:
+                        is_picked = 0
+                        if gain > 0.0:
+                            u_pick = (u_pick * total - gain) / (total - gain)
+                    else:
+                        u_pick = u_pick * total / gain
+                if is_picked == 1:
+                    picked = gain
+                    sample.valid = 1
+                    sample.wi = drawn.wi
+                    sample.f = f
+                    sample.L = drawn.radiance
+                    sample.weight = weight
+    if sample.valid == 1:
+        if candidates > 1:
+            sample.weight = sample.weight * (total / picked)
+        origin = offset_origin(surface.position, surface.ng, sample.wi, mesh.epsilon)
+        sample.weight = sample.weight * visibility(mesh, material, texture, origin, sample.wi)
+        sample.weight = sample.weight * sky_visibility(receiver, origin, sample.wi)
     return sample
 
 

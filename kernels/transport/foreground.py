@@ -345,10 +345,10 @@ def trace_paths(
 
         # Sample the emitter: where light is expected; the first vertex has its directions already
         if k > 0:
-            u = sobol_pair(q, key, 3 * k + 2)
             emitter = sample_emitter(
-                mesh, material, texture, receiver, proposal, surface, bsdf, frame, u, 0
-            )
+                mesh, material, texture, receiver, proposal, surface, bsdf, frame,
+                1, 0.0, 0, q, key, k,
+            )  # fmt: skip
             if emitter.weight > 0.0:
                 value = wp.cw_mul(throughput, emitter.f.diffuse + emitter.f.specular)
                 add_to_texels(T, p, texels, emitter.wi, value * emitter.weight, wp.vec3(0.0), 0.0)

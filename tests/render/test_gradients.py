@@ -239,8 +239,7 @@ def test_pinned_render_equals_the_free_one(pipeline: Pipeline) -> None:
     np.testing.assert_allclose(lit, plane.lit, rtol=1e-5, atol=1e-6)
     np.testing.assert_allclose(unoccluded, plane.unoccluded, rtol=1e-5, atol=1e-6)
     dark = replace(materials, emission=torch.zeros_like(pipeline.raw["emission"]))
-    with torch.no_grad():
-        unlit = pipeline.mis.radiance(light, light, SEED, dark).foreground
+    unlit = pipeline.mis.radiance(leaf, leaf, SEED, dark).foreground.detach()
     np.testing.assert_allclose(reflected, unlit, rtol=1e-5, atol=1e-6)
 
 

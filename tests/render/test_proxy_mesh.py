@@ -198,8 +198,12 @@ def test_room_lights_what_stands_in_it(device: str) -> None:
     np.testing.assert_array_equal(bright.radiance, dark.radiance)
     seen = dark.mask == 1.0
     open_air = make(ball, view, device, mesh(quad((0, 0, 90.0), (1, 0, 0), (0, 1, 0))), None)
-    furnace = render(open_air, constant((0.5,) * 3), 1024, depth=2)
-    assert dark.radiance[seen].mean() == pytest.approx(furnace.radiance[seen].mean(), rel=1e-3)
+    # Pixels share the directions that are drawn from the light, so seeds are averaged.
+    furnace = [
+        render(open_air, constant((0.5,) * 3), 256, depth=2, seed=seed).radiance[seen].mean()
+        for seed in range(16)
+    ]
+    assert dark.radiance[seen].mean() == pytest.approx(np.mean(furnace), rel=1e-3)
     _, lit, unoccluded = shadow(renderer, constant(), 64)
     np.testing.assert_allclose(unoccluded, 0.5, rtol=1e-5)
     assert lit.min() < 0.5 and bool((lit <= unoccluded).all())

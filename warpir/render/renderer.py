@@ -220,6 +220,7 @@ class Renderer(Launcher):
         light_record: LightRecord | None = None,
         vertex_record: VertexRecord | None = None,
         materials: MaterialArgs | None = None,
+        is_recorded: bool = False,
     ) -> Foreground:
         """Path-trace the object alone (DiPIR, eq. 4).
 
@@ -236,11 +237,17 @@ class Renderer(Launcher):
                 Without a limit only.
             vertex_record: The same.
             materials: In place of the scene's own (`Scene.materials_with`).
+            is_recorded: Draw what a record holds also where none is given. Else the first vertex
+                picks among several directions of the light, which is less noisy.
         """
+        if len(pixels) == 0:
+            return Foreground(*np.zeros((3, 0, 3), np.float32), np.zeros(0, np.float32))
         own = materials or self.scene.material_args
         view = self.scene.camera_args
         drawn_light = drawn(self, light, seed, spp * rays)
-        launch = ObjectLaunch(drawn_light, own, view, rays, depth, indirect_limit, seed)
+        launch = ObjectLaunch(
+            drawn_light, own, view, rays, depth, indirect_limit, seed, is_recorded=is_recorded
+        )
         lanes = self.lanes(len(pixels), spp)
 
         def trace(start: int, stop: int) -> tuple[FloatArray, ...]:
@@ -301,6 +308,8 @@ class Renderer(Launcher):
             is_recorded: Draw what a record holds also where none is given. Else a plane's loss is
                 sampled, which is less noisy (`warpir.kernels.receiver.trace_plane_shadow`).
         """
+        if len(pixels) == 0:
+            return ReceiverRadiance(*np.zeros((3, 0, 3), np.float32))
         view = self.scene.camera_args if camera_args is None else camera_args
         plane = self.scene.receiver
         normal = plane.normal if plane.mesh is None else None
@@ -314,6 +323,7 @@ class Renderer(Launcher):
             seed,
             self.bounce_depth,
             indirect_limit,
+            is_recorded,
         )
         gain = np.ones(len(pixels), np.bool_) if may_gain is None else may_gain
         assert thrown_record is None or gain.all(), "rows of the record are pixels"

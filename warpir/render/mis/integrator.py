@@ -89,7 +89,9 @@ class MisIntegrator:
         scene = self.renderer.scene
         with torch.no_grad():
             args_fg = light_args(host_light(light_fg), scene.device)
-            args_shadow = light_args(host_light(light_shadow), scene.device)
+            args_shadow = args_fg
+            if light_shadow is not light_fg:
+                args_shadow = light_args(host_light(light_shadow), scene.device)
         is_recording = torch.is_grad_enabled()
         foreground: Tensor = ShadeForeground.apply(
             self, args_fg, seed, is_recording, light_fg, *_material(materials)

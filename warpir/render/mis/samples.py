@@ -120,6 +120,7 @@ class ObjectSamples:
             light_record=light,
             vertex_record=vertex,
             materials=self.materials,
+            is_recorded=any(self.free),
         )
         return out.radiance, light, vertex
 
