@@ -77,9 +77,12 @@ class MitsubaScene:
         self.plane_height = float(-self.setup.center[1] / self.setup.radius)
         self.crop_offset = (left, top)
         self.width = scene.camera.width
-        self.integrator = mi.load_dict(
-            {"type": integrator, "max_depth": scene.depth + 1, "hide_emitters": True}
-        )
+        # The referee's, which knows whether rays pass through glass
+        self.integrator = self.setup.integrator
+        if integrator != "gltf_path":
+            self.integrator = mi.load_dict(
+                {"type": integrator, "max_depth": scene.depth + 1, "hide_emitters": True}
+            )
         self.plane_count = len(scene.receiver_pixels)
         self.parameters = mi.traverse(self.setup.scene)
         dr.enable_grad(self.parameters["light.texels"])

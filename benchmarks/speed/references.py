@@ -178,7 +178,8 @@ class References:
         if part == "foreground":
             arrays = [scene.object_pixels, scene.weight_fg]
             materials = [
-                (m.base_color, m.metallic, m.roughness, m.emission) for m in scene.asset.materials
+                (m.base_color, m.metallic, m.roughness, m.emission, m.transmission)
+                for m in scene.asset.materials
             ]
             settings += (scene.depth, materials, self.bench.mitsuba_integrator)
         else:
