@@ -233,17 +233,16 @@ class Renderer(Launcher):
             seed: Base seed.
             indirect_limit: Most radiance that one path may add behind its first vertex, or 0: no
                 limit, unbiased.
-            light_record: Filled on the way where given; rows are ``pixels``, `lanes` of each.
-                Without a limit only.
+            light_record: Filled where given, without a limit; rows are ``pixels``, `lanes` of each.
             vertex_record: The same.
             materials: In place of the scene's own (`Scene.materials_with`).
             is_recorded: Draw what a record holds also where none is given. Else the first vertex
                 picks among several directions of the light, which is less noisy.
         """
         if len(pixels) == 0:
-            return Foreground(*np.zeros((3, 0, 3), np.float32), np.zeros(0, np.float32))
-        own = materials or self.scene.material_args
-        view = self.scene.camera_args
+            none = np.zeros((0, 3), np.float32)
+            return Foreground(none, none, none, none[:, 0])
+        own, view = materials or self.scene.material_args, self.scene.camera_args
         drawn_light = drawn(self, light, seed, spp * rays)
         launch = ObjectLaunch(
             drawn_light, own, view, rays, depth, indirect_limit, seed, is_recorded=is_recorded
@@ -309,7 +308,8 @@ class Renderer(Launcher):
                 sampled, which is less noisy (`warpir.kernels.receiver.trace_plane_shadow`).
         """
         if len(pixels) == 0:
-            return ReceiverRadiance(*np.zeros((3, 0, 3), np.float32))
+            none = np.zeros((0, 3), np.float32)
+            return ReceiverRadiance(none, none, none)
         view = self.scene.camera_args if camera_args is None else camera_args
         plane = self.scene.receiver
         normal = plane.normal if plane.mesh is None else None
