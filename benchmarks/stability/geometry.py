@@ -46,7 +46,7 @@ FLAT = 1e-6
 FACETS = 1e-2
 """A sphere of 20 480 flat facets at 4096 samples a pixel against its curved truth, RMS."""
 ALBEDO = 2e-3
-"""Noise of 64 x 1024 low-discrepancy samples."""
+"""Three deviations of the mean of eight times 65536 low-discrepancy samples."""
 SAGITTA = 4e-6
 """Facets of 2 pi / 1000 lie ``(pi / 1000)^2 / 2 = 5e-6`` of the radius deep at most, share of the
 diagonal 1.5e-6, and eight roundings more."""
