@@ -16,7 +16,7 @@ import gc
 import json
 import sys
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from importlib.metadata import version
 from pathlib import Path
@@ -30,6 +30,7 @@ from benchmarks.speed.candidates import (
     PARTS,
     Bench,
     Candidate,
+    Images,
     MisPart,
     MitsubaPart,
     Step,
@@ -45,7 +46,7 @@ from warpir.render.device import choose_device
 
 RUN_SEED = 100
 """First seed of what is measured; references and warm-up have others."""
-ERRORS = ("rmse_image", "rmse_image_all", "rmse_gradient")
+ERRORS = ("rmse_forward", "rmse_image", "rmse_image_all", "rmse_gradient")
 TRANSPORT_STEPS = 10
 """Steps timed on each traced transport."""
 
@@ -123,21 +124,26 @@ class Runs:
         """All timed seconds."""
         return sum(self.seconds_forward) + sum(self.seconds_step) + sum(self.seconds_traced)
 
-    def time(self, candidate: Candidate, seed: int) -> Callable[[], Step]:
+    def time(self, candidate: Candidate, seed: int) -> tuple[Images, Step]:
         """Run the candidate forward and for one step."""
         start = time.perf_counter()
-        candidate.forward(seed)
+        images = candidate.forward(seed)
         middle = time.perf_counter()
         download = candidate.step(seed + 1000)
         end = time.perf_counter()
         self.seconds_forward.append(middle - start)
         self.seconds_step.append(end - middle)
-        return download
+        return images(), download()
 
-    def judge(self, step: Step, references: References, heights: dict[str, int]) -> None:
-        """Add the errors of a step's image and gradient."""
-        for part, values in step.items():
-            errors = references.by_map[part, heights[part]].rmse(values)
+    def judge(
+        self, found: tuple[Images, Step], references: References, heights: dict[str, int]
+    ) -> None:
+        """Add the errors of the forward image and of a step's image and gradient."""
+        images, step = found
+        for part, (image, gradient) in step.items():
+            reference = references.by_map[part, heights[part]]
+            errors = reference.rmse((image, gradient))
+            errors["forward"] = reference.rmse((images[part], gradient))["image"]
             self.rmse.setdefault(part, []).append(errors)
 
     def errors(self, part: str) -> dict[str, float]:
@@ -191,10 +197,10 @@ def measure_scene(
                 continue
             if k == 0:
                 bench.memory.start()
-            step = runs.time(candidate, RUN_SEED + k)()
+            found = runs.time(candidate, RUN_SEED + k)
             if k == 0:
                 runs.peak_mib = bench.memory.stop()
-            runs.judge(step, references, {candidate.part: candidate.height})
+            runs.judge(found, references, {candidate.part: candidate.height})
         if k < plan.transport_rounds:
             for (heights, settings), runs in zip(wholes, whole_runs, strict=True):
                 _measure_transport(bench, heights, settings, references, RUN_SEED + k, runs)
@@ -231,10 +237,10 @@ def _measure_transport(
     runs.bytes = transport.bytes
     transport.warm()
     for k in range(TRANSPORT_STEPS):
-        download = runs.time(transport, seed + k)
+        found = runs.time(transport, seed + k)
     runs.peak_mib = max(runs.peak_mib, bench.memory.stop())
-    runs.judge(download(), references, dict(zip(PARTS, heights, strict=True)))
-    del transport, download
+    runs.judge(found, references, dict(zip(PARTS, heights, strict=True)))
+    del transport, found
     gc.collect()
 
 

@@ -23,6 +23,8 @@ from warpir.scene.light import Light
 PARTS = ("foreground", "ratio")
 WARM_SEED = 1
 
+Images = dict[str, Float64Array]
+"""By part: the image [pixel, 3]."""
 Step = dict[str, tuple[Float64Array, Float64Array]]
 """By part: the image [pixel, 3] and the gradient of its weighted sum [He, We, 3]."""
 
@@ -86,8 +88,12 @@ class Candidate(Protocol):
     def warm(self) -> None:
         """Compile everything that the timed calls use."""
 
-    def forward(self, seed: int) -> None:
-        """Render, to the end."""
+    def forward(self, seed: int) -> Callable[[], Images]:
+        """Render, to the end; calling what is returned downloads the image.
+
+        `mis` samples an image without a gradient in other ways than one with, so each has an error
+        of its own.
+        """
 
     def step(self, seed: int) -> Callable[[], Step]:
         """Render and differentiate, to the end; calling what is returned downloads the result."""
@@ -116,10 +122,11 @@ class MisPart:
         """Compile."""
         MisPart(self.bench, self.part, self.height, 1).step(WARM_SEED)
 
-    def forward(self, seed: int) -> None:
+    def forward(self, seed: int) -> Callable[[], Images]:
         """Render."""
-        self._forward(seed)
+        image = self._forward(seed)
         self.bench.synchronize()
+        return lambda: {self.part: numpy(image)}
 
     def image(self, seed: int) -> Float64Array:
         """Return what `forward` renders, shape [pixel, 3]."""
@@ -160,11 +167,15 @@ class MitsubaPart:
             one.forward(seed)
             one.step(seed)
 
-    def forward(self, seed: int) -> None:
+    def forward(self, seed: int) -> Callable[[], Images]:
         """Render."""
-        render = self.target.foreground if self.part == "foreground" else self.target.ratio
-        render(self.spp, seed)
+        if self.part == "foreground":
+            image = self.target.foreground(self.spp, seed)
+            mitsuba_synchronize()
+            return lambda: {self.part: self.target.objects(image)}
+        ratio = self.target.ratio(self.spp, seed)
         mitsuba_synchronize()
+        return lambda: {self.part: np.asarray(ratio, np.float64).T}
 
     def step(self, seed: int) -> Callable[[], Step]:
         """Render and differentiate; the foreground's two passes have seeds of their own."""
@@ -225,12 +236,14 @@ class Transport:
         self.forward(WARM_SEED)
         self.step(WARM_SEED)
 
-    def forward(self, seed: int) -> None:
+    def forward(self, seed: int) -> Callable[[], Images]:
         """Render."""
         with torch.no_grad():
             lights = (self.bench.leaf(h, grad=False) for h in self.heights)
-            shadow_ratio(self.traced.radiance(*lights, seed))
+            out = self.traced.radiance(*lights, seed)
+            images = (out.foreground, shadow_ratio(out))
         self.bench.synchronize()
+        return lambda: dict(zip(PARTS, map(numpy, images), strict=True))
 
     def step(self, seed: int) -> Callable[[], Step]:
         """Render and differentiate."""

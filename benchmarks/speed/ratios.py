@@ -100,10 +100,14 @@ def curves(rows: Sequence[dict[str, Any]], seconds: str, rmse: str) -> tuple[Cur
     Args:
         rows: Rows of one scene, map and integrator, each with ``parts``.
         seconds: ``seconds_forward`` or ``seconds_step``.
-        rmse: ``rmse_image`` or ``rmse_gradient``.
+        rmse: ``rmse_forward``, ``rmse_image`` or ``rmse_gradient``; runs of before 2026-11-25
+            have no ``rmse_forward``, and sampled that image as the step's.
     """
     made = [
-        Curve([r["parts"][part][seconds] for r in rows], [r["parts"][part][rmse] for r in rows])
+        Curve(
+            [r["parts"][part][seconds] for r in rows],
+            [r["parts"][part].get(rmse, r["parts"][part]["rmse_image"]) for r in rows],
+        )
         for part in ("foreground", "ratio")
     ]
     return made[0], made[1]
@@ -145,7 +149,7 @@ def mis_ratio(
     """Compare two sweeps at the smallest error both reach: forward by image, step by both."""
     found = {}
     for name, seconds, rmse in (
-        ("forward_image", "seconds_forward", "rmse_image"),
+        ("forward_image", "seconds_forward", "rmse_forward"),
         ("step_image", "seconds_step", "rmse_image"),
         ("step_gradient", "seconds_step", "rmse_gradient"),
     ):

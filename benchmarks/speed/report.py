@@ -45,6 +45,12 @@ ratio, `gradient` the gradients of their weighted sums with respect to the texel
 are left out of `image`: a handful of mirrored suns holds 99 % of ToyCar's squared error in every
 renderer. The error with them is the column `all`.
 
+Without a gradient `mis` samples otherwise: it picks a direction toward the light among four, and
+gives more samples to pixels where a pilot finds noise (`warpir.render.allocation`), here by the
+error of linear radiance, by which it is judged. So the forward image has an error of its own.
+Pictures are shared out by the error that is shown, in which highlights hardly count: the gain on
+metal below is theirs.
+
 The ratios say how many times longer Mitsuba takes when its error has come down to ours, in image or
 in gradient, whichever it reaches sooner. It may split its samples between object and plane as suits
 it best. `>=`: its longest run has not come down that far. `600 steps` includes tracing `transport`.
@@ -154,6 +160,7 @@ def row_table(result: dict[str, Any]) -> str:
         "settings",
         "tracing",
         "forward",
+        "its image",
         "step",
         "image",
         "all",
@@ -175,6 +182,7 @@ def row_table(result: dict[str, Any]) -> str:
             settings_text(row["settings"]),
             "" if traced is None else f"{number(traced)} s",
             f"{number(1000.0 * row['seconds_forward'])} ms",
+            percent(row.get("rmse_forward", row["rmse_image"])),
             f"{number(1000.0 * row['seconds_step'])} ms",
             percent(row["rmse_image"]),
             percent(row["rmse_image_all"]),

@@ -31,6 +31,7 @@ def sweep_row(integrator: str, spp: int, seconds: float, scale: float = 1.0) -> 
     part = {
         "seconds_forward": 0.2 * seconds,
         "seconds_step": 0.5 * seconds,
+        "rmse_forward": scale * 0.08 * seconds**HALF,
         "rmse_image": scale * 0.1 * seconds**HALF,
         "rmse_image_all": scale * 0.2 * seconds**HALF,
         "rmse_gradient": scale * 0.4 * seconds**HALF,
@@ -43,6 +44,7 @@ def sweep_row(integrator: str, spp: int, seconds: float, scale: float = 1.0) -> 
         "settings": {"spp": spp},
         "seconds_forward": 0.4 * seconds,
         "seconds_step": seconds,
+        "rmse_forward": part["rmse_forward"],
         "rmse_image": part["rmse_image"],
         "rmse_image_all": part["rmse_image_all"],
         "rmse_gradient": part["rmse_gradient"],
@@ -293,6 +295,7 @@ def test_a_quick_run_holds_what_it_promises(tmp_path: Path) -> None:
         "settings",
         "seconds_forward",
         "seconds_step",
+        "rmse_forward",
         "rmse_image",
         "rmse_gradient",
         "rmse_resolution",

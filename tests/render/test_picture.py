@@ -22,8 +22,8 @@ from warpir.render.device_light import light_args
 from warpir.render.device_scene import Scene
 from warpir.render.picture.light_preview import balls
 from warpir.render.picture.planes import Quality
+from warpir.render.picture.resizing import resize
 from warpir.render.renderer import Renderer
-from warpir.render.resizing import resize
 from warpir.render.shadow.picture import ShadowSamples, picture_ratio
 from warpir.render.tone_curve import Knots, ToneCurve
 from warpir.scene.asset import Material

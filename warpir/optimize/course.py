@@ -29,8 +29,8 @@ from warpir.optimize.loop import Optimization
 from warpir.optimize.model import Guided
 from warpir.optimize.view import Frame
 from warpir.render.picture.photo_scene import scene_of
+from warpir.render.picture.resizing import resize
 from warpir.render.renderer import Renderer
-from warpir.render.resizing import resize
 from warpir.render.tone_curve import ToneCurve
 from warpir.scene.tone_curves import Curves, ToneKnots
 

@@ -12,8 +12,8 @@ from warpir.io.images.photos import Photo
 from warpir.io.layers import HALF_MAX, Layers
 from warpir.look.camera_look import CameraLook
 from warpir.render.picture.planes import Quality, Rendering, render
+from warpir.render.picture.resizing import resize_planes
 from warpir.render.renderer import Renderer
-from warpir.render.resizing import resize_planes
 from warpir.render.shadow.mirror import leaving_ground, shown_mirror
 from warpir.scene.light import Light
 from warpir.scene.shadow_mask import ShadowMask

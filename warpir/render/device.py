@@ -197,6 +197,9 @@ class Launcher:
         device: Warp device.
         threads: CPU threads; 0 means one per core. Ignored on CUDA.
         progress: Called with the share of a stage that is done, 0 to 1, from worker threads.
+
+    Attributes:
+        span: What shares of a stage are done before and after a launch.
     """
 
     def __init__(
@@ -208,6 +211,7 @@ class Launcher:
         self.device = device
         self.threads = threads or core_count()
         self._progress = progress or (lambda stage, share: None)
+        self.span = 0.0, 1.0
         settle_hashes(bool(device.is_cpu))
 
     def launch(
@@ -253,17 +257,22 @@ class Launcher:
 
         Within ``one``, launches go with ``record_tape=False``: a tape belongs to one thread.
         """
+        before, after = self.span
+
+        def report(done: int) -> None:
+            self._progress(stage, before + (after - before) * done / len(starts))
+
         if len(starts) == 1 or self.threads == 1:
-            for done, start in enumerate(starts):
+            for done, start in enumerate(starts, 1):
                 one(start)
-                self._progress(stage, (done + 1) / len(starts))
+                report(done)
             return
         with ThreadPoolExecutor(self.threads) as pool:
             futures = [pool.submit(one, start) for start in starts]
             try:
-                for done, future in enumerate(futures):
+                for done, future in enumerate(futures, 1):
                     future.result()
-                    self._progress(stage, (done + 1) / len(futures))
+                    report(done)
             except BaseException:
                 pool.shutdown(cancel_futures=True)
                 raise

@@ -8,7 +8,7 @@ finite are black (`warpir.render.bad_pixels`).
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -19,6 +19,7 @@ from warpir.core.memory import Memory
 from warpir.kernels.path import Viewer
 from warpir.kernels.shadow_ratio import shadow_ratio
 from warpir.kernels.types import CameraArgs, LightArgs, LightRecord, MaterialArgs, VertexRecord
+from warpir.render.allocation import Judged, by_noise, pilot_seed
 from warpir.render.bad_pixels import BadPixels, all_finite, first_bad_sample_of
 from warpir.render.device import Launcher, Rows, load_kernels, settle_hashes
 from warpir.render.device_light import drawn, plane_radiance
@@ -221,6 +222,7 @@ class Renderer(Launcher):
         vertex_record: VertexRecord | None = None,
         materials: MaterialArgs | None = None,
         is_recorded: bool = False,
+        judged: Judged | None = None,
     ) -> Foreground:
         """Path-trace the object alone (DiPIR, eq. 4).
 
@@ -238,6 +240,9 @@ class Renderer(Launcher):
             materials: In place of the scene's own (`Scene.materials_with`).
             is_recorded: Draw what a record holds also where none is given. Else the first vertex
                 picks among several directions of the light, which is less noisy.
+            judged: Where given, ``spp`` is a mean, and samples go where this function of radiance
+                is noisy (`warpir.render.allocation`): a pixel's depend on the others, and no record
+                is kept.
         """
         if len(pixels) == 0:
             none = np.zeros((0, 3), np.float32)
@@ -247,15 +252,19 @@ class Renderer(Launcher):
         launch = ObjectLaunch(
             drawn_light, own, view, rays, depth, indirect_limit, seed, is_recorded=is_recorded
         )
-        lanes = self.lanes(len(pixels), spp)
 
-        def trace(start: int, stop: int) -> tuple[FloatArray, ...]:
-            # As many lanes as all pixels have together: sums keep their order.
-            records = (
-                r if r is None else Rows(r).cut(start * lanes, stop * lanes)
-                for r in (light_record, vertex_record)
-            )
-            return launch.sums(self, pixels[start:stop], spp, lanes, *records)
+        def rows_of(rows: IntArray, spp: int, number: int) -> tuple[FloatArray, ...]:
+            own, lanes = replace(launch, seed=pilot_seed(seed, number)), self.lanes(len(rows), spp)
+
+            def trace(start: int, stop: int) -> tuple[FloatArray, ...]:
+                # As many lanes as all rows have together: sums keep their order.
+                records = (
+                    r if r is None else Rows(r).cut(start * lanes, stop * lanes)
+                    for r in (light_record, vertex_record)
+                )
+                return own.sums(self, pixels[rows[start:stop]], spp, lanes, *records)
+
+            return self._in_chunks(trace, len(rows), "object")
 
         def first_bad_sample(pixel: int) -> int | None:
             alone = np.array([pixel], np.int32)
@@ -263,8 +272,8 @@ class Renderer(Launcher):
                 lambda spp: not all_finite(launch.sums(self, alone, spp, 1)), spp
             )
 
-        *planes, mask = self._in_chunks(trace, len(pixels), "object")
         width = self.scene.camera.width
+        *planes, mask = by_noise(self, rows_of, judged, pixels, width, (spp, rays))
         traced = self.bad_pixels.blackened(tuple(planes), pixels, width, "object", first_bad_sample)
         radiance, diffuse, emission = traced
         return Foreground(radiance, diffuse, emission, mask)
@@ -283,6 +292,7 @@ class Renderer(Launcher):
         indirect_limit: float = 0.0,
         may_gain: BoolArray | None = None,
         is_recorded: bool = False,
+        judged: Judged | None = None,
     ) -> ReceiverRadiance:
         """Radiance of the white receiver with and without the object (both halves of DiPIR, eq. 5).
 
@@ -306,6 +316,7 @@ class Renderer(Launcher):
                 [receiver_pixel]; None: it may everywhere. A ``thrown_record`` needs all of them.
             is_recorded: Draw what a record holds also where none is given. Else a plane's loss is
                 sampled, which is less noisy (`warpir.kernels.receiver.trace_plane_shadow`).
+            judged: As in `foreground`, a function of the ratio.
         """
         if len(pixels) == 0:
             none = np.zeros((0, 3), np.float32)
@@ -328,7 +339,7 @@ class Renderer(Launcher):
         gain = np.ones(len(pixels), np.bool_) if may_gain is None else may_gain
         assert thrown_record is None or gain.all(), "rows of the record are pixels"
         rows, records = (pixels, may_see_object, gain), (record, thrown_record)
-        return self._white_radiance(launch, rows, spp, records, camera_args)
+        return self._white_radiance(launch, rows, spp, records, camera_args, judged)
 
     def _white_radiance(
         self,
@@ -337,14 +348,28 @@ class Renderer(Launcher):
         spp: int,
         records: tuple[LightRecord | None, LightRecord | None],
         camera_args: CameraArgs | None,
+        judged: Judged | None,
     ) -> ReceiverRadiance:
         """Trace what `receiver` has set up; ``rows`` are its pixels, and what they see and gain."""
         pixels, may_see_object, gain = rows
 
-        def trace(start: int, stop: int) -> tuple[FloatArray, ...]:
-            part = slice(start, stop)
-            cut = (r if r is None else Rows(r).cut(start, stop) for r in records)
-            return launch.sums(self, pixels[part], may_see_object[part], gain[part], spp, *cut)
+        stage, width = "shadow", self.scene.camera.width
+        if camera_args is not None:
+            stage, width = "shadow in another resolution", int(camera_args.width)
+
+        def rows_of(chosen: IntArray, spp: int, number: int) -> tuple[FloatArray, ...]:
+            own = replace(launch, seed=pilot_seed(launch.seed, number))
+
+            def trace(start: int, stop: int) -> tuple[FloatArray, ...]:
+                part = chosen[start:stop]
+                cut = (r if r is None else Rows(r).cut(start, stop) for r in records)
+                return own.sums(self, pixels[part], may_see_object[part], gain[part], spp, *cut)
+
+            traced = self._in_chunks(trace, len(chosen), stage)
+            if number:
+                lit, unoccluded, _ = traced
+                return (np.asarray(lit / np.maximum(unoccluded, 1e-12), np.float32),)
+            return traced
 
         def first_bad_sample(pixel: int) -> int | None:
             alone = np.array([pixel], np.int32)
@@ -353,10 +378,7 @@ class Renderer(Launcher):
                 lambda spp: not all_finite(launch.sums(self, alone, hidden, gains, spp)), spp
             )
 
-        stage, width = "shadow", self.scene.camera.width
-        if camera_args is not None:
-            stage, width = "shadow in another resolution", int(camera_args.width)
-        traced = self._in_chunks(trace, len(pixels), stage)
+        traced = by_noise(self, rows_of, judged, pixels, width, (spp, launch.rays))
         # Black with and without the object: there the photo stays as it is.
         traced = self.bad_pixels.blackened(traced, pixels, width, stage, first_bad_sample)
         return ReceiverRadiance(*traced)

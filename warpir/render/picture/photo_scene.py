@@ -8,7 +8,7 @@ from warpir.app.inputs import Inputs
 from warpir.core.arrays import FloatArray
 from warpir.io.images.photos import Photo
 from warpir.render.device_scene import Placed, Receiver, Scene
-from warpir.render.resizing import resize
+from warpir.render.picture.resizing import resize
 from warpir.scene.camera import Camera
 from warpir.scene.tone_curves import Curves
 

@@ -9,10 +9,11 @@ import numpy as np
 from warpir.core.arrays import BoolArray, FloatArray, IntArray
 from warpir.kernels.types import LightArgs
 from warpir.look.denoise import denoised_object, denoised_ratio
+from warpir.render.allocation import as_shown
 from warpir.render.device_light import light_args
+from warpir.render.picture.resizing import resize
 from warpir.render.picture.tone import tone_mapped
 from warpir.render.renderer import Foreground, GBuffer, Renderer
-from warpir.render.resizing import resize
 from warpir.render.shadow.mirror import mirror_planes
 from warpir.render.shadow.picture import ShadowSamples, picture_ratio
 from warpir.scene.camera import Camera
@@ -92,6 +93,7 @@ def render(
         quality.depth,
         quality.seed,
         quality.indirect_limit,
+        judged=as_shown,
     )
     receiver_pixels, ratio = _shadow(
         renderer,

@@ -18,8 +18,9 @@ import numpy as np
 
 from warpir.core.arrays import BoolArray, Float64Array, FloatArray, IntArray
 from warpir.kernels.types import LightArgs
+from warpir.render.allocation import as_shown
+from warpir.render.picture.resizing import resize
 from warpir.render.renderer import Renderer
-from warpir.render.resizing import resize
 from warpir.render.shadow.pilot import BLOCK, Pilot, dilate, neighbourhood, run_pilot
 
 BEND = 8e-3
@@ -89,6 +90,7 @@ def picture_ratio(
         samples.seed,
         indirect_limit=samples.indirect_limit,
         may_gain=gain_bends[whole],
+        judged=as_shown,
     )
     ratio[whole] = renderer.ratio(traced)
     return pixels, np.where(gain_bends[:, None], ratio, ratio + thrown)

@@ -1,0 +1,170 @@
+"""Samples shared out by a pilot's noise: no bias, less error, even where that promises nothing."""
+
+from dataclasses import dataclass, field
+
+import numpy as np
+import pytest
+import torch
+import warp as wp
+
+from tests.builders.shapes import camera, ground, placed, sphere
+from tests.statistics import z_test
+from warpir.core.arrays import Float64Array, FloatArray, IntArray
+from warpir.render import allocation
+from warpir.render.allocation import as_it_is, as_shown, by_noise
+from warpir.render.device import Launcher
+from warpir.render.device_light import light_args
+from warpir.render.device_scene import Scene
+from warpir.render.mis.integrator import MisIntegrator
+from warpir.render.renderer import Renderer
+from warpir.scene.asset import Material
+from warpir.scene.light import Light, Lobes
+
+WIDTH, HEIGHT = 64, 48
+PIXELS = np.arange(WIDTH * HEIGHT, dtype=np.int32)
+
+
+@dataclass
+class Noise:
+    """Traces pixels of mean 1 whose noise is known, and counts their samples."""
+
+    deviation: Float64Array
+    seed: int = 0
+    counts: IntArray = field(default_factory=lambda: np.zeros(len(PIXELS), np.int32))
+    pilots: int = 0
+
+    def __call__(self, rows: IntArray, spp: int, number: int) -> tuple[FloatArray, ...]:
+        rng = np.random.default_rng([self.seed, spp, number])
+        noise = rng.normal(size=(len(rows), 3)) * self.deviation[rows, None] / np.sqrt(spp)
+        if number:
+            self.pilots += spp * len(rows)
+        else:
+            self.counts[rows] += spp
+        return (1.0 + noise).astype(np.float32), np.full(len(rows), spp, np.float32)
+
+
+def spread(noise: Noise, spp: int = 64) -> tuple[FloatArray, ...]:
+    """Share ``spp`` samples out."""
+    launcher = Launcher(wp.get_device("cpu"), 1)
+    return by_noise(launcher, noise, as_it_is, PIXELS, WIDTH, (spp, 1))
+
+
+def a_spot() -> Float64Array:
+    """Deviation 1 in a disc of a tenth of the picture, else .02."""
+    x, y = PIXELS % WIDTH - 20, PIXELS // WIDTH - 24
+    return np.where(x * x + y * y < 100, 1.0, 0.02)
+
+
+def test_samples_go_where_noise_is() -> None:
+    """Their mean is what was asked for, pilot included; the spot has most, no pixel under half."""
+    noise = Noise(a_spot())
+    values, counts = spread(noise)
+    assert (counts == noise.counts).all()
+    assert 0.8 * 64 < (noise.counts.sum() + noise.pilots) / len(PIXELS) <= 64
+    assert noise.counts.min() == 32
+    assert np.median(noise.counts[noise.deviation == 1.0]) == 256
+    error = ((values - 1.0) ** 2).mean()
+    assert error < 0.4 * (noise.deviation**2).mean() / 64
+
+
+def test_even_noise_has_even_samples() -> None:
+    """So has none at all, and a firefly in one pixel of the pilot."""
+    for deviation in (np.ones(len(PIXELS)), np.zeros(len(PIXELS)), 1e-3 + 9.0 * (PIXELS == 130)):
+        noise = Noise(deviation)
+        spread(noise)
+        assert (noise.counts == 64).all()
+
+
+def test_small_pictures_have_no_pilot() -> None:
+    """Nor do pictures of few samples."""
+    noise = Noise(a_spot())
+    spread(noise, 16)
+    assert noise.pilots == 0 and (noise.counts == 16).all()
+
+
+def test_bad_pilots_are_no_reason_to_fail() -> None:
+    """NaN and infinity of a pilot say nothing of the noise."""
+    deviation = a_spot()
+    deviation[[0, 2]] = np.nan, np.inf
+    noise = Noise(deviation)
+    with np.errstate(invalid="ignore"):
+        spread(noise)
+    assert noise.counts.min() == 32 and (noise.counts[deviation == 1.0] >= 128).all()
+
+
+def test_shared_out_samples_have_no_bias() -> None:
+    """Over 400 seeds, by noise that differs from pixel to pixel."""
+    deviation = np.random.default_rng(5).lognormal(0.0, 1.0, len(PIXELS)) * (a_spot() + 0.05)
+    runs = np.array([spread(Noise(deviation, seed))[0].mean(axis=1) for seed in range(400)])
+    truth, variance = np.ones(len(PIXELS)), runs.var(axis=0, ddof=1) / len(runs)
+    verdict = z_test(runs.mean(axis=0), truth, variance)
+    assert verdict.passed, verdict
+
+
+def test_judged_as_shown() -> None:
+    """A picture's error of radiance: highlights are pressed together, darkness is spread."""
+    values = np.array([1e-3, 0.1, 1.0, 100.0], np.float32)
+    slope = (as_shown(values * 1.01) - as_shown(values)) / (0.01 * values)
+    assert (np.diff(slope) < 0.0).all() and slope[-1] < 1e-3 * slope[1]
+
+
+def metal(device: str, **about: object) -> Renderer:
+    """A metal ball on the ground."""
+    thing = placed(sphere((0.0, 0.5, -3.0), 0.5), Material(metallic=1.0, roughness=0.3))
+    view = camera(192, 128, 360.0, (0.0, 0.9, 0.0), pitch=-8.0)
+    return Renderer(Scene([thing], view, ground(0.0), device), **about)  # type: ignore[arg-type]
+
+
+def sun() -> Light:
+    """A sun in a grey sky."""
+    axis = np.array([[0.5, 0.7, 0.5], [0.0, 1.0, 0.0]])
+    axis /= np.linalg.norm(axis, axis=1, keepdims=True)
+    peak = np.array([[300.0, 280.0, 250.0], [0.3, 0.35, 0.4]])
+    lobes = (a.astype(np.float32) for a in (peak, axis, np.array([600.0, 1.0])))
+    return Light(lobes=Lobes(*lobes))
+
+
+def test_highlights_of_metal(device: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Less than half of the variance at as many samples; the same mean; shares of the work in order.
+
+    On CUDA such small pictures have no pilot otherwise.
+    """
+    monkeypatch.setattr(allocation, "LEAST_WORK", {"cpu": 0, "cuda": 0})
+    shares: list[float] = []
+
+    def report(stage: str, share: float) -> None:
+        shares.extend([share] if stage == "object" else [])
+
+    renderer = metal(device, progress=report)
+    light = light_args(sun(), renderer.device)
+    pixels = renderer.gbuffer(0, 16).object_pixels
+
+    def render(seed: int, **more: object) -> Float64Array:
+        out = renderer.foreground(light, pixels, 64, 1, 1, seed, **more)  # type: ignore[arg-type]
+        return out.radiance.astype(np.float64)
+
+    even = np.array([render(seed) for seed in range(8)])
+    del shares[:]
+    shared = np.array([render(seed, judged=as_it_is) for seed in range(8)])
+    ones = [k for k, share in enumerate(shares) if share == pytest.approx(1.0)]
+    assert len(ones) == 8 and renderer.span == (0.0, 1.0)
+    first = shares[: ones[0] + 1]
+    assert first == sorted(first)
+    assert shared.var(axis=0, ddof=1).sum() < 0.5 * even.var(axis=0, ddof=1).sum()
+    variance = (shared.var(axis=0, ddof=1) + even.var(axis=0, ddof=1)) / 8
+    # Eight runs: outliers of a t distribution.
+    assert z_test(shared.mean(axis=0), even.mean(axis=0), 2.0 * variance + 1e-6).passed
+    np.testing.assert_array_equal(shared[3], render(3, judged=as_it_is))
+
+
+def test_gradients_take_even_samples(device: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A record holds as many of each pixel, so the image beside a gradient has them too."""
+    monkeypatch.setattr(allocation, "LEAST_WORK", {"cpu": 0, "cuda": 0})
+    calls: list[object] = []
+    monkeypatch.setattr(allocation, "_pilot", lambda *a: calls.append(a))
+    renderer = metal(device)
+    pixels = renderer.gbuffer(0, 16).object_pixels
+    mis = MisIntegrator(renderer, pixels, np.zeros(0, np.int32), spp=64, rays=1, depth=1)
+    texels = torch.full((8, 16, 3), 0.5, requires_grad=True)
+    mis.radiance(texels, texels, 0).foreground.sum().backward()  # type: ignore[no-untyped-call]
+    assert texels.grad is not None and not calls

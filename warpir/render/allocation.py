@@ -1,0 +1,177 @@
+"""Samples of a picture shared out among its pixels by the noise that a pilot sees.
+
+Of a given number of samples the mean squared error is least where each pixel takes them in
+proportion to its deviation (Neyman 1934, "On the Two Different Aspects of the Representative
+Method"). A mirrored sun's pixels and those of a shadow's edge have ten times the deviation of the
+rest. The pilot is thrown away, so that a pixel's mean is that of as many samples as it was given,
+whatever the pilot saw: no bias (Kirk and Arvo 1991, "Unbiased Sampling Techniques for Image
+Synthesis").
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+from scipy import ndimage
+
+from warpir.core.arrays import Float64Array, FloatArray, IntArray
+from warpir.render.device import Launcher
+
+Judged = Callable[[FloatArray], FloatArray]
+"""What of a radiance or a ratio is to have little noise."""
+Rows = tuple[FloatArray, ...]
+"""What is traced of some pixels, a row each."""
+Trace = Callable[[IntArray, int, int], Rows]
+"""Traces rows of the pixels with so many samples; the last number is 0 for the picture, 1 or 2 for
+a pilot, whose samples are others than the picture's."""
+
+LEAST_SAMPLES = 32
+"""Mean samples of a pixel from which on a pilot is worth its time."""
+LEAST_WORK = {"cpu": 1 << 16, "cuda": 1 << 24}
+"""Samples of a picture from which on: each launch costs about 1 ms on the CPU, 20 ms on CUDA."""
+PILOT_SHARE, PILOT_SAMPLES = 16, (4, 8)
+"""A pilot takes a sixteenth of the samples, within these bounds, of every second pixel of every
+second row."""
+SIDE = 7
+"""Side of the square over which the pilots' variance is averaged [px]: of a few samples one pixel's
+says little."""
+STEPS = (-1, 3)
+"""Samples of a pixel over their mean, as powers of two: a Sobol' sequence is cut at those alone. No
+pixel has less than half of them, whatever the pilot has missed."""
+FIREFLY = 0.3
+"""Share of the pilots' variance in one pixel from which on the samples stay even: where the next
+path of that kind goes, it does not say."""
+PILOT_SEED = 0x2F6E2B1
+"""Distance of the pilots' seeds from the picture's."""
+WORTH = 1.25
+"""Predicted gain from which on the samples are shared out."""
+
+
+def as_it_is(values: FloatArray) -> FloatArray:
+    """Judge radiance, or a ratio, by its own error: highlights count most."""
+    return values
+
+
+def as_shown(values: FloatArray) -> FloatArray:
+    """Judge radiance by its error in a picture: Reinhard's operator, then gamma 2.2.
+
+    Of a ratio, which multiplies what the photo shows, the second alone is in the picture, and
+    nearly what this is below 1.
+    """
+    with np.errstate(invalid="ignore"):
+        return np.asarray((values / (1.0 + values)) ** (1.0 / 2.2), np.float32)
+
+
+def by_noise(
+    launcher: Launcher,
+    trace: Trace,
+    judged: Judged | None,
+    pixels: IntArray,
+    width: int,
+    samples: tuple[int, int],
+) -> Rows:
+    """Trace pixels with so many samples on average, more where noise is.
+
+    Those of the pilot count, but where it finds that all pixels should have as many. Small pictures
+    and few samples are traced evenly.
+
+    Args:
+        launcher: Is told of the share of the work that each launch does.
+        trace: See `Trace`.
+        judged: Of the first of what it traces this has the noise that counts; None: all pixels have
+            as many samples.
+        pixels: Row-major pixel indices, shape [pixel].
+        width: Of the picture [px].
+        samples: Camera samples per pixel, and rays of each.
+    """
+    spp, rays = samples
+    work = spp * rays * len(pixels)
+    least = LEAST_WORK["cpu" if launcher.device.is_cpu else "cuda"]
+    if judged is None or spp < LEAST_SAMPLES or work < least:
+        return trace(np.arange(len(pixels), dtype=np.int32), spp, 0)
+    try:
+        steps, cost = _pilot(launcher, trace, judged, pixels, width, spp)
+        out: Rows = ()
+        done, left = cost, (1.0 - cost) / (2.0**steps).sum()
+        for step in np.unique(steps):
+            rows = np.flatnonzero(steps == step).astype(np.int32)
+            share = left * 2.0**step * len(rows)
+            launcher.span = done, done + share
+            done += share
+            part = trace(rows, max(1, int(spp * 2.0**step)), 0)
+            out = out or tuple(np.empty((len(pixels), *p.shape[1:]), p.dtype) for p in part)
+            for whole, values in zip(out, part, strict=True):
+                whole[rows] = values
+        return out
+    finally:
+        launcher.span = 0.0, 1.0
+
+
+def _pilot(
+    launcher: Launcher, trace: Trace, judged: Judged, pixels: IntArray, width: int, spp: int
+) -> tuple[IntArray, float]:
+    """Return `_steps` of the pixels, and the share of the picture's samples that the pilot took."""
+    count = int(np.clip(spp // PILOT_SHARE, *PILOT_SAMPLES))
+    seen = np.flatnonzero((pixels % width | pixels // width) % 2 == 0).astype(np.int32)
+    cost = count * len(seen) / (spp * len(pixels))
+    pilots = []
+    for number in (1, 2):
+        launcher.span = (number - 1) * cost, number * cost
+        pilots.append(judged(trace(seen, count, number)[0]).astype(np.float64))
+    squares = np.nan_to_num(((pilots[0] - pilots[1]) ** 2).sum(axis=-1), posinf=0.0)
+    budget = 1.0 - 2.0 * cost
+    if squares.max(initial=0.0) > FIREFLY * squares.sum():
+        return np.zeros(len(pixels), np.int32), 2.0 * cost
+    return _steps(_deviation(squares, seen, pixels, width), budget), 2.0 * cost
+
+
+def pilot_seed(seed: int, number: int) -> int:
+    """Return the seed of a pilot; number 0 is the picture."""
+    return (seed + PILOT_SEED * number) % (1 << 31) if number else seed
+
+
+def _deviation(squares: Float64Array, seen: IntArray, pixels: IntArray, width: int) -> Float64Array:
+    """Return a pixel's deviation up to a factor, from those in its neighbourhood, shape [pixel].
+
+    Args:
+        squares: Squared differences of two pilots, shape [seen].
+        seen: Their rows among ``pixels``.
+        pixels: Row-major pixel indices, shape [pixel].
+        width: Of the picture [px].
+    """
+    top = int(pixels.min()) // width
+    height = int(pixels.max()) // width - top + 1
+    index = pixels - top * width
+    planes = np.zeros((2, height * width))
+    planes[:, index[seen]] = squares, np.ones(len(seen))
+    total, count = (
+        ndimage.uniform_filter(plane.reshape(height, width), SIDE, mode="constant").reshape(-1)
+        for plane in planes
+    )
+    # The filter's running sums leave rounding, also below zero.
+    mean = np.maximum(total[index], 0.0) / np.maximum(count[index], 0.5 / SIDE**2)
+    return np.asarray(np.sqrt(mean))
+
+
+def _steps(deviation: Float64Array, budget: float) -> IntArray:
+    """Return the binary logarithm of each pixel's samples over the mean, shape [pixel].
+
+    Their mean is ``budget`` at most; all are 0 where that promises too little.
+    """
+    mean = deviation.mean()
+    even = np.zeros(len(deviation), np.int32)
+    if mean == 0.0 or budget * (deviation**2).mean() < WORTH * mean**2:
+        return even
+    relative = np.log2(np.maximum(deviation / mean, 2.0**-20))
+
+    def steps_of(shift: float) -> IntArray:
+        steps: IntArray = np.clip(np.round(relative + shift), *STEPS).astype(np.int32)
+        return steps
+
+    low, high = -20.0, 20.0
+    for _ in range(30):
+        middle = 0.5 * (low + high)
+        is_over = np.mean(2.0 ** steps_of(middle)) > budget
+        low, high = (low, middle) if is_over else (middle, high)
+    return steps_of(low)
