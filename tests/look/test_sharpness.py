@@ -1,10 +1,13 @@
 """The blur of edges: pictures blurred by a known Gaussian, and layers behind it."""
 
+from collections.abc import Callable
+
 import numpy as np
 import pytest
+import skimage.data
 from scipy import ndimage
 
-from warpir.core.arrays import FloatArray
+from warpir.core.arrays import CodeArray, FloatArray
 from warpir.look.camera_look import CameraLook, region_around
 from warpir.look.sharpness import (
     PIXEL_SIGMA,
@@ -38,15 +41,33 @@ def boxes(sigma: float, seed: int = 0, height: int = 160, width: int = 240) -> F
     return np.repeat(pixels[..., None], 3, axis=2)
 
 
+@pytest.mark.parametrize("photo", [skimage.data.astronaut, skimage.data.rocket])
 @pytest.mark.parametrize("sigma", [0.0, 0.5, 1.0, 1.6])
-@pytest.mark.parametrize("noise", [0.0, 2.0])
-def test_known_blur_is_found(sigma: float, noise: float) -> None:
-    """Within .2 px, with two codes of noise too: corners of boxes are no steps."""
-    linear = boxes(sigma)
-    codes = linear ** (1 / 2.2) + noise / 255.0 * np.random.default_rng(1).normal(size=linear.shape)
-    found = estimate_blur(np.clip(codes, 0.0, 1.0) ** 2.2)
+def test_known_blur_of_a_photo_is_found(photo: Callable[[], CodeArray], sigma: float) -> None:
+    """Photographs made half as large, and so as sharp as pixels are, blurred and noisy again."""
+    codes = photo()
+    height, width = codes.shape[0] // 2, codes.shape[1] // 2
+    linear = (codes[: 2 * height, : 2 * width, :3] / 255.0) ** 2.2
+    linear = linear.reshape(height, 2, width, 2, 3).mean(axis=(1, 3))
+    shown = ndimage.gaussian_filter(linear, (sigma, sigma, 0)) ** (1 / 2.2)
+    shown += np.random.default_rng(1).normal(size=shown.shape) / 255.0
+    found = estimate_blur(np.clip(np.round(255.0 * shown) / 255.0, 0.0, 1.0) ** 2.2)
     assert found is not None and found.edges > 300
     assert found.sigma == pytest.approx(np.hypot(sigma, PIXEL_SIGMA), abs=0.2)
+
+
+@pytest.mark.parametrize("noise", [0.0, 2.0])
+def test_more_blur_is_told_as_more(noise: float) -> None:
+    """Hard steps of high contrast count as sharper than they are, as a photo's would be."""
+    estimates = []
+    for sigma in (0.0, 0.5, 1.0, 1.6, 2.4):
+        linear = boxes(sigma)
+        grain = np.random.default_rng(1).normal(size=linear.shape) / 255.0
+        found = estimate_blur(np.clip(linear ** (1 / 2.2) + noise * grain, 0.0, 1.0) ** 2.2)
+        assert found is not None and found.edges > 300
+        assert -0.3 < found.sigma - np.hypot(sigma, PIXEL_SIGMA) < 0.1
+        estimates.append(found.sigma)
+    assert estimates == sorted(estimates)
 
 
 def test_region_decides_where_it_has_edges() -> None:
