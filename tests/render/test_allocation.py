@@ -125,7 +125,7 @@ def sun() -> Light:
 
 
 def test_highlights_of_metal(device: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Less than half of the variance at as many samples; the same mean; shares of the work in order.
+    """Less than half of the variance, the same mean, shares of the work in order.
 
     On CUDA such small pictures have no pilot otherwise.
     """
