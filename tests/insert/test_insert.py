@@ -578,7 +578,7 @@ def test_preview_of_a_large_photo_is_small(inputs: Path, tmp_path: Path, device:
     assert run.image().shape == (1152, 1728, 3)
     assert run.image("progress/preview-000000.png").shape == (576, 864, 3)
     assert run.record["measured"]["samples"] == 48
-    assert "--samples 256" in (run.out / "report.html").read_text()
+    assert "--samples 192" in (run.out / "report.html").read_text()
 
 
 @pytest.mark.parametrize("change", ["replaced", "removed"])

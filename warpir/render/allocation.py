@@ -119,7 +119,9 @@ def _pilot(
     for number in (1, 2):
         launcher.span = (number - 1) * cost, number * cost
         pilots.append(judged(trace(seen, count, number)[0]).astype(np.float64))
-    squares = np.nan_to_num(((pilots[0] - pilots[1]) ** 2).sum(axis=-1), posinf=0.0)
+    squares = ((pilots[0] - pilots[1]) ** 2).sum(axis=-1)
+    # What is not finite says nothing of the noise; in the picture it is seen and counted.
+    squares[~np.isfinite(squares)] = 0.0
     budget = 1.0 - 2.0 * cost
     if squares.max(initial=0.0) > FIREFLY * squares.sum():
         return np.zeros(len(pixels), np.int32), 2.0 * cost
