@@ -253,16 +253,28 @@ class Renderer(Launcher):
             drawn_light, own, view, rays, depth, indirect_limit, seed, is_recorded=is_recorded
         )
 
+        return self._object(launch, pixels, spp, (light_record, vertex_record), judged)
+
+    def _object(
+        self,
+        launch: ObjectLaunch,
+        pixels: IntArray,
+        spp: int,
+        records: tuple[LightRecord | VertexRecord | None, ...],
+        judged: Judged | None,
+    ) -> Foreground:
+        """Trace what `foreground` has set up."""
+
         def rows_of(rows: IntArray, spp: int, number: int) -> tuple[FloatArray, ...]:
-            own, lanes = replace(launch, seed=pilot_seed(seed, number)), self.lanes(len(rows), spp)
+            own = replace(launch, seed=pilot_seed(launch.seed, number))
+            lanes = self.lanes(len(rows), spp)
 
             def trace(start: int, stop: int) -> tuple[FloatArray, ...]:
                 # As many lanes as all rows have together: sums keep their order.
-                records = (
-                    r if r is None else Rows(r).cut(start * lanes, stop * lanes)
-                    for r in (light_record, vertex_record)
+                cut = (
+                    r if r is None else Rows(r).cut(start * lanes, stop * lanes) for r in records
                 )
-                return own.sums(self, pixels[rows[start:stop]], spp, lanes, *records)
+                return own.sums(self, pixels[rows[start:stop]], spp, lanes, *cut)
 
             return self._in_chunks(trace, len(rows), "object")
 
@@ -273,7 +285,7 @@ class Renderer(Launcher):
             )
 
         width = self.scene.camera.width
-        *planes, mask = by_noise(self, rows_of, judged, pixels, width, (spp, rays))
+        *planes, mask = by_noise(self, rows_of, judged, pixels, width, (spp, launch.rays))
         traced = self.bad_pixels.blackened(tuple(planes), pixels, width, "object", first_bad_sample)
         radiance, diffuse, emission = traced
         return Foreground(radiance, diffuse, emission, mask)
@@ -310,8 +322,7 @@ class Renderer(Launcher):
             camera_args: Another resolution of the view, or the scene's own.
             record: Filled on the way where given; rows are ``pixels``.
             thrown_record: The same of the light that the object throws there, RGB weights of `lit`.
-            indirect_limit: Limit of `foreground`; `THROWN_LIMIT` of it is the most radiance that
-                one path of that light may add. 0: no limit.
+            indirect_limit: Of `foreground`; what is thrown has `THROWN_LIMIT` of it. 0: no limit.
             may_gain: False where the object throws nothing (`warpir.render.shadow.pilot`), shape
                 [receiver_pixel]; None: it may everywhere. A ``thrown_record`` needs all of them.
             is_recorded: Draw what a record holds also where none is given. Else a plane's loss is
@@ -322,8 +333,7 @@ class Renderer(Launcher):
             none = np.zeros((0, 3), np.float32)
             return ReceiverRadiance(none, none, none)
         view = self.scene.camera_args if camera_args is None else camera_args
-        plane = self.scene.receiver
-        normal = plane.normal if plane.mesh is None else None
+        normal = self.scene.receiver.normal if self.scene.receiver.mesh is None else None
         from_light = drawn(self, light, seed, spp * rays, normal)
         launch = ReceiverLaunch(
             from_light,
