@@ -1,21 +1,16 @@
 """The blur of edges: pictures blurred by a known Gaussian, and layers behind it."""
 
-from collections.abc import Callable
-
 import numpy as np
 import pytest
-import skimage.data
 from scipy import ndimage
 
-from warpir.core.arrays import CodeArray, FloatArray
+from warpir.core.arrays import FloatArray
 from warpir.look.camera_look import CameraLook, region_around
 from warpir.look.sharpness import (
     PIXEL_SIGMA,
-    SCALES,
     EdgeBlur,
     _blurred,
     blurred_layers,
-    edge_statistics,
     estimate_blur,
 )
 
@@ -41,33 +36,15 @@ def boxes(sigma: float, seed: int = 0, height: int = 160, width: int = 240) -> F
     return np.repeat(pixels[..., None], 3, axis=2)
 
 
-@pytest.mark.parametrize("photo", [skimage.data.astronaut, skimage.data.rocket])
 @pytest.mark.parametrize("sigma", [0.0, 0.5, 1.0, 1.6])
-def test_known_blur_of_a_photo_is_found(photo: Callable[[], CodeArray], sigma: float) -> None:
-    """Photographs made half as large, and so as sharp as pixels are, blurred and noisy again."""
-    codes = photo()
-    height, width = codes.shape[0] // 2, codes.shape[1] // 2
-    linear = (codes[: 2 * height, : 2 * width, :3] / 255.0) ** 2.2
-    linear = linear.reshape(height, 2, width, 2, 3).mean(axis=(1, 3))
-    shown = ndimage.gaussian_filter(linear, (sigma, sigma, 0)) ** (1 / 2.2)
-    shown += np.random.default_rng(1).normal(size=shown.shape) / 255.0
-    found = estimate_blur(np.clip(np.round(255.0 * shown) / 255.0, 0.0, 1.0) ** 2.2)
-    assert found is not None and found.edges > 300
-    assert found.sigma == pytest.approx(np.hypot(sigma, PIXEL_SIGMA), abs=0.2)
-
-
 @pytest.mark.parametrize("noise", [0.0, 2.0])
-def test_more_blur_is_told_as_more(noise: float) -> None:
-    """Hard steps of high contrast count as sharper than they are, as a photo's would be."""
-    estimates = []
-    for sigma in (0.0, 0.5, 1.0, 1.6, 2.4):
-        linear = boxes(sigma)
-        grain = np.random.default_rng(1).normal(size=linear.shape) / 255.0
-        found = estimate_blur(np.clip(linear ** (1 / 2.2) + noise * grain, 0.0, 1.0) ** 2.2)
-        assert found is not None and found.edges > 300
-        assert -0.3 < found.sigma - np.hypot(sigma, PIXEL_SIGMA) < 0.1
-        estimates.append(found.sigma)
-    assert estimates == sorted(estimates)
+def test_known_blur_is_found(sigma: float, noise: float) -> None:
+    """Within .12 px, with two codes of noise too."""
+    linear = boxes(sigma)
+    codes = linear ** (1 / 2.2) + noise / 255.0 * np.random.default_rng(1).normal(size=linear.shape)
+    found = estimate_blur(np.clip(codes, 0.0, 1.0) ** 2.2)
+    assert found is not None and found.edges > 300
+    assert found.sigma == pytest.approx(np.hypot(sigma, PIXEL_SIGMA), abs=0.12)
 
 
 def test_region_decides_where_it_has_edges() -> None:
@@ -75,9 +52,7 @@ def test_region_decides_where_it_has_edges() -> None:
     image = np.concatenate([boxes(0.2), boxes(1.8)], axis=1)
     left = np.zeros(image.shape[:2], bool)
     left[:, :230] = True
-    right = np.zeros_like(left)
-    right[:, 250:] = True
-    sharp, soft = estimate_blur(image, left), estimate_blur(image, right)
+    sharp, soft = estimate_blur(image, left), estimate_blur(image, ~left)
     assert sharp is not None and soft is not None
     assert sharp.sigma < 0.6 and soft.sigma > 1.4
     nowhere = estimate_blur(image, np.zeros_like(left))
@@ -88,36 +63,6 @@ def test_region_decides_where_it_has_edges() -> None:
 def test_no_edges_tell_nothing(value: float) -> None:
     """An even picture, black and white ones too."""
     assert estimate_blur(np.full((64, 64, 3), value)) is None
-
-
-def test_noise_and_clouds_tell_nothing() -> None:
-    """Grain has no edges, and soft weak ones are not the lens's: the object stays sharp."""
-    rng = np.random.default_rng(2)
-    grain = 0.5 + 4.0 / 255.0 * rng.normal(size=(240, 360, 3))
-    assert estimate_blur(grain**2.2) is None
-    clouds = ndimage.gaussian_filter(rng.normal(size=(240, 360)), 8.0)
-    clouds = 0.6 + 0.05 * clouds / clouds.std()
-    assert estimate_blur(np.repeat(clouds[..., None], 3, axis=2) ** 2.2) is None
-
-
-def test_brightness_changes_little() -> None:
-    """The same picture a stop darker is as sharp."""
-    image = boxes(0.9)
-    bright, dark = estimate_blur(image), estimate_blur(image / 2.0)
-    assert bright is not None and dark is not None
-    assert dark.sigma == pytest.approx(bright.sigma, abs=0.15)
-
-
-def test_closed_form_of_ideal_steps() -> None:
-    """One vertical step: the energies fall as the closed form says."""
-    x = np.arange(200) - 99.5
-    lum = 0.4 + 0.3 * ndimage.gaussian_filter1d((x > 0).astype(float), 1.2)
-    image = np.tile(lum, (200, 1))
-    image[:10, :10] = 0.9
-    found = edge_statistics(np.repeat(image[..., None], 3, axis=2) ** 2.2)
-    assert found is not None
-    variance = 1.2**2 + np.array(SCALES) ** 2
-    np.testing.assert_allclose(found[0][:4], np.diff(np.log(variance)), atol=0.04)
 
 
 def test_layers_are_blurred_alike() -> None:
