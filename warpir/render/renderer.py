@@ -252,7 +252,6 @@ class Renderer(Launcher):
         launch = ObjectLaunch(
             drawn_light, own, view, rays, depth, indirect_limit, seed, is_recorded=is_recorded
         )
-
         return self._object(launch, pixels, spp, (light_record, vertex_record), judged)
 
     def _object(
