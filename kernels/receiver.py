@@ -14,6 +14,7 @@ import warp as wp
 from warpir.kernels.bsdf import smith_lambda, visible_normal_sample
 from warpir.kernels.light_gradient import keep_direction
 from warpir.kernels.maths.frame import Frame, basis, to_local, to_world
+from warpir.kernels.maths.lanes import lane_sum
 from warpir.kernels.maths.rng import hash_pair, pixel_seed, sobol_pair
 from warpir.kernels.receiver_mesh import (
     plane_distance,
@@ -376,7 +377,9 @@ def trace_receiver(
             record.weight[i, j] = record.weight[i, j] * scale
 
 
-@wp.kernel
+# On an H200 twice as many threads at a time are worth more than registers: 19 in place of 27 ms for
+# the shadow of a ball, 30 in place of 26 for that of a car with glass.
+@wp.kernel(cuda_max_registers=128)
 def trace_plane_shadow(
     pixels: wp.array[int],
     may_see_object: wp.array[int],
@@ -389,11 +392,14 @@ def trace_plane_shadow(
     open_radiance: wp.vec3,
     spp: int,
     rays: int,
+    lanes: int,
     seed: int,
     lit: wp.array[wp.vec3],
     unoccluded: wp.array[wp.vec3],
 ):
     """Do what `trace_receiver` does, for a plane without a mesh, where no gradient is asked for.
+
+    Indices are the pixel's row and one of its ``lanes`` threads, which share its samples.
 
     What the open plane receives is the same everywhere, and the object takes a part of it: each
     sample draws one direction from the light times the cosine and one from `object_window`, looks
@@ -411,13 +417,14 @@ def trace_plane_shadow(
         receiver: The plane.
         light: The light, its directions drawn for the plane.
         open_radiance: Radiance of the plane without the object.
-        spp: Camera samples per pixel.
+        spp: Camera samples per thread.
         rays: Directions per technique that share one camera sample.
+        lanes: Threads per pixel (`warpir.kernels.maths.lanes`).
         seed: Base seed.
         lit: Mean radiance with the object over the samples that see the plane.
         unoccluded: The same without the object.
     """
-    i = wp.tid()
+    i, lane = wp.tid()
     pixel = pixels[i]
     key = pixel_seed(seed, pixel)
     lit_near = wp.vec3(0.0)
@@ -425,7 +432,7 @@ def trace_plane_shadow(
     lost_far = wp.vec3(0.0)
     far = float(0.0)
     count = float(0.0)
-    for s in range(spp):
+    for s in range(lane * spp, (lane + 1) * spp):
         point = receiver_point(
             camera, mesh, material, texture, receiver, pixel, may_see_object[i], s, key
         )
@@ -460,7 +467,14 @@ def trace_plane_shadow(
                         open_near += value * near
                         lit_near += value * (near * (1.0 - dark))
                         lost_far += value * ((1.0 - near) * dark)
-    count = wp.max(count, 1.0)
+    lit_near = lane_sum(lit_near, lanes)
+    open_near = lane_sum(open_near, lanes)
+    lost_far = lane_sum(lost_far, lanes)
+    counts = lane_sum(wp.vec3(count, far, 0.0), lanes)
+    if lane > 0:
+        return
+    count = wp.max(counts[0], 1.0)
+    far = counts[1]
     open_far = wp.vec3(0.0)
     if far > 0.0:
         open_far = open_radiance * far

@@ -211,3 +211,24 @@ def draw_light(
     out.radiance = value.radiance
     out.pdf = value.pdf
     drawn[i] = out
+
+
+@wp.kernel(enable_backward=False)
+def sum_plane(drawn: wp.array2d[DrawnLight], normal: wp.vec3, sums: wp.array[wp.vec3d]):
+    """Sum what each row of drawn directions says of the radiance of an open white plane.
+
+    Args:
+        drawn: From `draw_light`, shape [side, side].
+        normal: Unit normal of the plane.
+        sums: Output: ``sum(L cos / (pi pdf))``, shape [side].
+    """
+    i = wp.tid()
+    total = wp.vec3d()
+    for j in range(drawn.shape[1]):
+        sample = drawn[i, j]
+        # A NaN counts, and is seen.
+        if sample.pdf != 0.0:
+            cosine = wp.max(wp.dot(sample.wi, normal), 0.0)
+            arriving = sample.radiance * (cosine / (PI * sample.pdf))
+            total += wp.vec3d(arriving)
+    sums[i] = total

@@ -58,9 +58,14 @@ class MeshArgs:
     """All triangles of the object, with their attributes."""
 
     id: wp.uint64
-    """Handle of the ``wp.Mesh``; 0 when there are no triangles."""
+    """Handle of the ``wp.Mesh`` of the triangles that stop every ray; 0 when there are none."""
+    passing: wp.uint64
+    """The same of those that may let rays pass, by their alpha or as glass."""
+    passing_start: int
+    """First triangle of `passing`; all that follow are of it."""
     embree: wp.uint64
-    """Embree's scene of the same triangles; 0 on CUDA and where Embree is not installed."""
+    embree_passing: wp.uint64
+    """Embree's scenes of the same triangles; 0 on CUDA and where Embree is not installed."""
     embree_intersect: wp.uint64
     embree_occluded: wp.uint64
     """Addresses of ``rtcIntersect1`` and ``rtcOccluded1``."""
@@ -192,8 +197,6 @@ class MaterialArgs:
     """Rows of the affine UV transform, shape [material, slot]."""
     any_layers: int
     """What extensions some material has: 0 without any, else `LAYERS`, and what it adds."""
-    any_alpha: int
-    """1 when some material lets rays pass, so that they must look at what they hit."""
     any_culled: int
     """1 when some material is single sided."""
     any_emission: int

@@ -26,7 +26,7 @@ RAYS = 1 << 19
 def cast_any(mesh: MeshArgs, origin: wp.array[wp.vec3], wi: wp.array[wp.vec3], hits: wp.array[int]):
     """Count rays that meet a triangle."""
     i = wp.tid()
-    hits[i] = int(any_triangle(mesh, origin[i], wi[i], 1.0e30))
+    hits[i] = int(any_triangle(mesh, 0, origin[i], wi[i], 1.0e30))
 
 
 @wp.kernel(module="unique", enable_backward=False)

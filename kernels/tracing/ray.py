@@ -9,7 +9,12 @@ from warpir.kernels.maths.rng import hash_pair, to_unit
 from warpir.kernels.receiver_mesh import INFINITY, plane_distance, receiver_mesh_hit
 from warpir.kernels.tracing.coverage import hit_alpha
 from warpir.kernels.tracing.hit import ULP, Hit, face_normal, hit_position, offset_origin
-from warpir.kernels.tracing.triangles import any_triangle, closest_triangle
+from warpir.kernels.tracing.triangles import (
+    any_triangle,
+    closest_triangle,
+    first_triangle,
+    hit_of,
+)
 from warpir.kernels.types import CameraArgs, MaterialArgs, MeshArgs, ReceiverArgs, TextureArgs
 
 LAYERS_MAX = wp.constant(64)
@@ -44,21 +49,37 @@ def camera_reach(receiver: ReceiverArgs, origin: wp.vec3, direction: wp.vec3) ->
     return reach
 
 
+@wp.func(inline=True)
+def is_culled(mesh: MeshArgs, material: MaterialArgs, face: int, ray_dir: wp.vec3) -> int:
+    """Return 1 where the ray meets the back of a single-sided material."""
+    if material.double_sided[mesh.face_material[face]] == 1:
+        return 0
+    return int(wp.dot(face_normal(mesh, face), ray_dir) > 0.0)
+
+
 @wp.func
-def facing_twin(mesh: MeshArgs, position: wp.vec3, ray_dir: wp.vec3) -> Hit:
+def facing_twin(mesh: MeshArgs, passing: int, position: wp.vec3, ray_dir: wp.vec3) -> Hit:
     """Find a triangle in the place of a culled one that faces the ray; ``valid`` is 0 without one.
 
     Sheets are often modelled as two single-sided ones in one place, and a query returns either. A
-    ray that goes on from the culled one starts beyond both.
+    ray that goes on from the culled one starts beyond both. ``passing`` is that of `any_triangle`.
     """
     twin = Hit()
     twin.valid = 0
     largest = wp.max(wp.max(wp.abs(position[0]), wp.abs(position[1])), wp.abs(position[2]))
     reach = 4.0 * ULP * largest + mesh.epsilon
     margin = wp.vec3(reach, reach, reach)
-    query = wp.mesh_query_aabb(mesh.id, position - margin, position + margin)
-    face = int(0)
-    while wp.mesh_query_aabb_next(query, face):
+    tree = mesh.id
+    start = int(0)
+    if passing == 1:
+        tree = mesh.passing
+        start = mesh.passing_start
+    if tree == wp.uint64(0):
+        return twin
+    query = wp.mesh_query_aabb(tree, position - margin, position + margin)
+    found = int(0)
+    while wp.mesh_query_aabb_next(query, found):
+        face = start + found
         a = mesh.positions[mesh.indices[3 * face]]
         b = mesh.positions[mesh.indices[3 * face + 1]]
         c = mesh.positions[mesh.indices[3 * face + 2]]
@@ -98,13 +119,14 @@ def closest_of_layers(
         face = int(hit.face)
         accept = int(1)
         if is_camera_ray == 1 and material.any_culled == 1:
-            if material.double_sided[mesh.face_material[face]] == 0:
-                if wp.dot(face_normal(mesh, face), ray_dir) > 0.0:
-                    twin = facing_twin(mesh, hit_position(mesh, hit), ray_dir)
-                    accept = twin.valid
-                    if twin.valid == 1:
-                        hit = twin
-        if accept == 1 and material.any_alpha == 1:
+            if is_culled(mesh, material, face, ray_dir) == 1:
+                twin = facing_twin(mesh, 0, hit_position(mesh, hit), ray_dir)
+                if twin.valid == 0:
+                    twin = facing_twin(mesh, 1, hit_position(mesh, hit), ray_dir)
+                accept = twin.valid
+                if twin.valid == 1:
+                    hit = twin
+        if accept == 1 and hit.face >= mesh.passing_start:
             alpha = hit_alpha(mesh, material, texture, hit, ray_dir)
             if alpha < 1.0:
                 if to_unit(hash_pair(key, wp.uint32(layer))) >= alpha:
@@ -137,15 +159,18 @@ def closest_hit(
     with probability ``1 - alpha``, drawn from ``key``.
     """
     # A call copies all of its structs on the CPU, which takes as long as the ray.
-    hit = Hit()
-    hit.valid = 0
-    if mesh.id == wp.uint64(0):
-        return hit
-    if material.any_alpha == 1 or is_camera_ray * material.any_culled == 1:
+    hit = closest_triangle(mesh, ray_origin, ray_dir, max_t)
+    may_pass = int(0)
+    if hit.valid == 1:
+        if hit.face >= mesh.passing_start:
+            may_pass = 1
+        elif is_camera_ray == 1 and material.any_culled == 1:
+            may_pass = is_culled(mesh, material, hit.face, ray_dir)
+    if may_pass == 1:
         return closest_of_layers(
             mesh, material, texture, ray_origin, ray_dir, max_t, is_camera_ray, key
         )
-    return closest_triangle(mesh, ray_origin, ray_dir, max_t)
+    return hit
 
 
 @wp.func
@@ -196,12 +221,12 @@ def transmitted_within(
     ray_dir: wp.vec3,
     max_t: float,
 ) -> float:
-    """Find what `visibility_within` does where materials let light through."""
+    """Find what `visibility_within` does behind triangles that may let light pass."""
     transmitted = float(1.0)
     origin = ray_origin
     left = max_t
     for _layer in range(LAYERS_MAX):
-        hit = closest_triangle(mesh, origin, ray_dir, left)
+        hit = hit_of(first_triangle(mesh, 1, origin, ray_dir, left))
         if hit.valid == 0:
             return transmitted
         transmitted = transmitted * (1.0 - hit_alpha(mesh, material, texture, hit, ray_dir))
@@ -223,12 +248,11 @@ def visibility_within(
     max_t: float,
 ) -> float:
     """Return the share of light that comes to ``ray_origin`` from ``max_t`` [m] along the ray."""
-    if mesh.id == wp.uint64(0):
-        return 1.0
-    if material.any_alpha == 1:
-        return transmitted_within(mesh, material, texture, ray_origin, ray_dir, max_t)
-    if any_triangle(mesh, ray_origin, ray_dir, max_t):
+    if any_triangle(mesh, 0, ray_origin, ray_dir, max_t):
         return 0.0
+    # Most rays meet no glass, and a call takes as long as a ray.
+    if any_triangle(mesh, 1, ray_origin, ray_dir, max_t):
+        return transmitted_within(mesh, material, texture, ray_origin, ray_dir, max_t)
     return 1.0
 
 

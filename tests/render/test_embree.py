@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 import warp as wp
 
-from tests.builders.shapes import all_pixels, camera, constant, ground, placed, sphere
+from tests.builders.shapes import all_pixels, camera, constant, ground, placed, quad, sphere
 from warpir.core.arrays import Float64Array, IntArray
 from warpir.kernels.tracing.triangles import any_triangle, closest_triangle
 from warpir.kernels.types import MeshArgs
@@ -16,6 +16,7 @@ from warpir.render.device_light import light_args
 from warpir.render.device_scene import Scene
 from warpir.render.rays.embree import EmbreeScene, library
 from warpir.render.renderer import Renderer
+from warpir.scene.asset import Material
 
 pytestmark = pytest.mark.skipif(find_spec("embreex") is None, reason="embreex is not installed")
 
@@ -38,7 +39,7 @@ def cast_rays(
     hit = closest_triangle(mesh, origin[i], direction[i], reach[i])
     triangle[i] = hit.face
     weights[i] = wp.vec2(hit.u, hit.v)
-    blocked[i] = int(any_triangle(mesh, origin[i], direction[i], reach[i]))
+    blocked[i] = int(any_triangle(mesh, 0, origin[i], direction[i], reach[i]))
 
 
 def cast(
@@ -55,7 +56,7 @@ def cast(
 
 def warp_alone(mesh: MeshArgs) -> MeshArgs:
     args = MeshArgs()
-    args.id = mesh.id
+    args.id, args.passing, args.passing_start = mesh.id, mesh.passing, mesh.passing_start
     return args
 
 
@@ -141,6 +142,28 @@ def test_degenerate_triangles_are_passed_by():
     )
     assert triangle[0] == 1 and blocked[0] == 1
     np.testing.assert_allclose(weights[0], [0.5, 0.2], atol=1e-6)
+
+
+def test_triangles_that_may_be_passed_have_a_tree_of_their_own():
+    """A sheet of alpha .25 before a wall, on whichever place of the asset's list each stands."""
+    sheet = Material(alpha=0.25, alpha_mode="BLEND", double_sided=True)
+    clear, solid = (quad((0, 0, z), (1, 0, 0), (0, 1, 0), material=m) for z, m in ((1, 0), (0, 1)))
+    origin = np.array([[0.1, 0.2, 5.0]] * 2 + [[3.0, 0.0, 5.0]])
+    direction = np.array([[0.0, 0.0, -1.0], [0.0, 0.0, 1.0], [0.0, 0.0, -1.0]])
+    for parts in ((clear, solid), (solid, clear)):
+        scene = Scene([placed(parts, sheet, Material())], VIEW, ground(-9.0), "cpu")
+        args = scene.mesh_args
+        assert args.id and args.passing and args.embree and args.embree_passing
+        assert args.passing_start == 2
+        assert args.face_material.numpy().tolist() == [1, 1, 0, 0]
+        for mesh in (args, warp_alone(args)):
+            triangle, _, blocked = cast(mesh, origin, direction)
+            assert triangle[0] in (2, 3) and triangle[1:].tolist() == [-1, -1]
+            assert blocked.tolist() == [1, 0, 0], "by the wall alone"
+    for material in (sheet, Material()):
+        scene = Scene([placed(solid, material, material)], VIEW, ground(-9.0), "cpu")
+        trees = bool(scene.mesh_args.id), bool(scene.mesh_args.passing)
+        assert trees == (not material.may_be_passed, material.may_be_passed)
 
 
 def test_the_tree_is_released_with_its_scene():

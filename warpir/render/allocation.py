@@ -28,8 +28,8 @@ a pilot, whose samples are others than the picture's."""
 
 LEAST_SAMPLES = 32
 """Mean samples of a pixel from which on a pilot is worth its time."""
-LEAST_WORK = {"cpu": 1 << 16, "cuda": 1 << 24}
-"""Samples of a picture from which on: each launch costs about 1 ms on the CPU, 20 ms on CUDA."""
+LEAST_WORK = {"cpu": 1 << 16, "cuda": 1 << 22}
+"""Samples of a picture from which on: each launch costs about 1 ms, which is little beside them."""
 PILOT_SHARE, PILOT_SAMPLES = 16, (4, 8)
 """A pilot takes a sixteenth of the samples, within these bounds, of every second pixel of every
 second row."""

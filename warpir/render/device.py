@@ -246,7 +246,12 @@ class Launcher:
 
         def one(start: int) -> None:
             stop = min(start + size, count)
-            cut = [a.cut(start, stop) if isinstance(a, Rows) else a for a in args]
+            # What is launched whole may have more rows: those of a record are its threads'.
+            whole = stop - start == count
+            cut = [
+                a if not isinstance(a, Rows) else a.array if whole else a.cut(start, stop)
+                for a in args
+            ]
             dim = stop - start if width is None else (stop - start, width)
             wp.launch(kernel, dim, cut, device=self.device, record_tape=False, block_dim=block_dim)
 

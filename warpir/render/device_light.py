@@ -18,7 +18,7 @@ from warpir.core.arrays import AnyFloatArray, Float64Array, FloatArray
 from warpir.core.color import luminance
 from warpir.core.errors import ExitCode, InputError
 from warpir.core.latlong import map_directions, texel_solid_angles
-from warpir.kernels.sampling import draw_light
+from warpir.kernels.sampling import draw_light, sum_plane
 from warpir.kernels.types import DrawnLight, LampArgs, LightArgs
 from warpir.render.device import Launcher, Rows
 from warpir.scene.light import Light, Lobes
@@ -157,15 +157,13 @@ def drawn(
     return out
 
 
-def plane_radiance(light: LightArgs, normal: Float64Array) -> Float64Array:
+def plane_radiance(launcher: Launcher, light: LightArgs, normal: Float64Array) -> Float64Array:
     """Return the radiance of an open white plane under a drawn light, shape [3]."""
-    drawn = light.drawn.numpy()
-    pdf = drawn["pdf"][..., None].astype(np.float64)
-    cosine = np.maximum(drawn["wi"] @ normal, 0.0)[..., None]
-    radiance = drawn["radiance"]
-    with np.errstate(divide="ignore", invalid="ignore"):
-        arriving = np.where(pdf == 0.0, 0.0, radiance * cosine / (np.pi * pdf))
-    return np.asarray(arriving.mean(axis=(0, 1)))
+    side = light.drawn.shape[0]
+    sums = launcher.zeros(side, wp.vec3d)
+    normal_args = wp.vec3(*map(float, normal))
+    launcher.launch(sum_plane, side, [Rows(light.drawn), normal_args, Rows(sums)], side, "")
+    return np.asarray(sums.numpy().sum(axis=0) / light.drawn.size)
 
 
 def lamp_args(lamps: Sequence[Lamp], origin: Float64Array, device: wp.Device) -> LampArgs:

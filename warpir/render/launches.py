@@ -89,12 +89,13 @@ class ObjectLaunch:
         light_record: LightRecord | None = None,
         vertex_record: VertexRecord | None = None,
     ) -> tuple[FloatArray, ...]:
-        """Return radiance, its diffuse and emitted parts, and coverage, a row a pixel."""
-        out = [renderer.zeros(len(pixels) * lanes, t) for t in (wp.vec3, wp.vec3, wp.vec3, float)]
-        repeated = np.repeat(pixels, lanes)
-        self._trace(renderer, repeated, None, spp // lanes, lanes, out, light_record, vertex_record)
-        parts = (a.numpy()[: len(repeated)] for a in out)
-        return tuple(p.reshape(-1, lanes, *p.shape[1:]).sum(axis=1) for p in parts)
+        """Return radiance, its diffuse and emitted parts, and coverage, a row a pixel.
+
+        ``lanes`` threads share a pixel's samples; each has a row of the records.
+        """
+        out = [renderer.zeros(len(pixels), t) for t in (wp.vec3, wp.vec3, wp.vec3, float)]
+        self._trace(renderer, pixels, None, spp, lanes, out, light_record, vertex_record)
+        return tuple(a.numpy()[: len(pixels)] for a in out)
 
     def thrown(
         self,
@@ -106,7 +107,8 @@ class ObjectLaunch:
     ) -> FloatArray:
         """Return what the object throws onto the white receiver, a row a pixel."""
         out = renderer.zeros(len(pixels), wp.vec3)
-        self._trace(renderer, pixels, may_see_object, spp, 1, [out], record, None)
+        lanes = renderer.lanes(len(pixels), spp) if record is None else 1
+        self._trace(renderer, pixels, may_see_object, spp, lanes, [out], record, None)
         radiance: FloatArray = out.numpy()[: len(pixels)]
         return radiance
 
@@ -115,7 +117,8 @@ class ObjectLaunch:
     ) -> tuple[FloatArray, FloatArray, FloatArray]:
         """Return the object's image in the ground's coat, what it hides there, and what not."""
         out = [renderer.zeros(len(pixels), wp.vec3) for _ in range(3)]
-        self._trace(renderer, pixels, may_see_object, spp, 1, out, None, None)
+        lanes = renderer.lanes(len(pixels), spp)
+        self._trace(renderer, pixels, may_see_object, spp, lanes, out, None, None)
         image, hidden, kept = (a.numpy()[: len(pixels)] for a in out)
         return image, hidden, kept
 
@@ -158,7 +161,7 @@ class ObjectLaunch:
                 self.light if self.behind is None else self.behind,
                 scene.lamp_args,
                 scene.glass_args,
-                spp,
+                spp // lanes,
                 self.rays,
                 lanes,
                 self.depth + is_from_ground,
@@ -173,6 +176,7 @@ class ObjectLaunch:
             ],
             spp * self.rays,
             {Viewer.CAMERA: "object", Viewer.GROUND: "bounce", Viewer.MIRROR: "mirror"}[viewer],
+            lanes,
         )
 
 
@@ -227,14 +231,22 @@ class ReceiverLaunch:
             *renderer.scene.shadow_geometry(),
             self.light,
         ]
-        samples = [spp, self.rays, self.seed, *map(Rows, out)]
-        work = spp * self.rays
+        rows, work = map(Rows, out), spp * self.rays
         if self.plane_radiance is not None:
-            args = [*seen, wp.vec3(*map(float, self.plane_radiance)), *samples]
-            renderer.launch(trace_plane_shadow, count, args, work, "shadow")
+            lanes = renderer.lanes(count, spp)
+            args = [
+                *seen,
+                wp.vec3(*map(float, self.plane_radiance)),
+                spp // lanes,
+                self.rays,
+                lanes,
+            ]
+            args += [self.seed, *rows]
+            renderer.launch(trace_plane_shadow, count, args, work, "shadow", lanes)
         else:
             kept = LightRecord() if record is None else Rows(record)
-            renderer.launch(trace_receiver, count, [*seen, *samples, kept], work, "shadow")
+            args = [*seen, spp, self.rays, self.seed, *rows, kept]
+            renderer.launch(trace_receiver, count, args, work, "shadow")
         lit, unoccluded = (a.numpy()[:count] for a in out)
         if renderer.scene.lamps:
             near = self.by_lamps(renderer, pixels, may_see_object, spp)

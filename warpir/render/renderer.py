@@ -16,6 +16,7 @@ import warp as wp
 
 from warpir.core.arrays import BoolArray, Float64Array, FloatArray, IntArray
 from warpir.core.memory import Memory
+from warpir.kernels.maths.lanes import LANES_MAX
 from warpir.kernels.path import Viewer
 from warpir.kernels.shadow_ratio import shadow_ratio
 from warpir.kernels.types import CameraArgs, LightArgs, LightRecord, MaterialArgs, VertexRecord
@@ -203,10 +204,9 @@ class Renderer(Launcher):
 
     def lanes(self, count: int, spp: int) -> int:
         """Return the number of threads that share the samples of each of ``count`` pixels."""
-        lanes = 1
-        if self.device.is_cuda:
-            while 0 < count * lanes * 2 <= FULL_THREADS and spp % (2 * lanes) == 0:
-                lanes *= 2
+        lanes, most = 1, FULL_THREADS // max(count, 1) if self.device.is_cuda else 1
+        while 2 * lanes <= min(most, LANES_MAX) and spp % (2 * lanes) == 0:
+            lanes *= 2
         return lanes
 
     def foreground(
@@ -337,7 +337,7 @@ class Renderer(Launcher):
         launch = ReceiverLaunch(
             from_light,
             drawn(self, light, seed, spp * rays) if self.bounce_depth else None,
-            None if normal is None or is_recorded else plane_radiance(from_light, normal),
+            None if normal is None or is_recorded else plane_radiance(self, from_light, normal),
             view,
             rays,
             seed,

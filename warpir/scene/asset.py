@@ -136,6 +136,11 @@ class Material:
         """Whether light enters a body of this material and is bent."""
         return self.transmission > 0.0 and self.thickness > 0.0
 
+    @property
+    def may_be_passed(self) -> bool:
+        """Whether some rays that meet this material go on behind it."""
+        return self.transmission > 0.0 or self.alpha_mode != "OPAQUE"
+
     def texture_slots(self) -> list[TextureSlot]:
         """Return the slot of each texture, in the order of the fields."""
         return [value for value in vars(self).values() if isinstance(value, TextureSlot)]

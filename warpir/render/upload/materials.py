@@ -68,8 +68,6 @@ def material_args(materials: Sequence[tuple[Material, int]], device: wp.Device) 
     has_sheen = any(max(m.sheen_color) > 0.0 for m in plain)
     args.sheen_albedo = array(sheen_albedo_table() if has_sheen else np.zeros((2, 2)), wp.float32)
 
-    has_glass = any(e.transmission > 0.0 for e in extensions)
-    args.any_alpha = int(has_glass or any(m.alpha_mode != "OPAQUE" for m in plain))
     args.any_culled = int(any(not m.double_sided for m in plain))
     args.any_emission = int(any(max(m.emission) > 0.0 for m in plain))
     return args
@@ -102,7 +100,6 @@ def passed_straight(
     extensions = [_extensions(m, share) for m, share in zip(materials, shares, strict=True)]
     args = _copied(own)
     args.extensions = wp.array(extensions, dtype=Extensions, device=device)
-    args.any_alpha = 1
     return args
 
 
