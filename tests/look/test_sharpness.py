@@ -12,6 +12,7 @@ from warpir.look.sharpness import (
     _blurred,
     blurred_layers,
     estimate_blur,
+    gaussian,
 )
 
 FINER = 6
@@ -45,6 +46,17 @@ def test_known_blur_is_found(sigma: float, noise: float) -> None:
     found = estimate_blur(np.clip(codes, 0.0, 1.0) ** 2.2)
     assert found is not None and found.edges > 300
     assert found.sigma == pytest.approx(np.hypot(sigma, PIXEL_SIGMA), abs=0.12)
+
+
+@pytest.mark.parametrize("sigma", [0.0, 0.1, 0.3, 0.5, 1.6])
+def test_blur_has_its_variance(sigma: float) -> None:
+    """However small; a point keeps its sum."""
+    point = np.zeros((31, 31), np.float32)
+    point[15, 15] = 1.0
+    seen = gaussian(point, sigma).astype(np.float64)
+    assert seen.sum() == pytest.approx(1.0, abs=1e-5)
+    rows = seen.sum(axis=1)
+    assert (rows * (np.arange(31) - 15) ** 2).sum() == pytest.approx(sigma**2, rel=0.02)
 
 
 def test_region_decides_where_it_has_edges() -> None:
