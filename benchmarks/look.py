@@ -6,14 +6,18 @@ Panorama crops pass through a camera that is drawn: blur, response, grain by lev
 them the blocks of JPEG; the responses are those that the regressor trains with
 (`warpir.train.photo_look`). The truth is the object in the crop under the crop's own light, through
 the same camera. The light is given, so all that is left between truth and composite is what the
-camera did. The places are those that `benchmarks.response` does not fit its estimate to.
+camera did. A camera blurs scene and object alike, and so is it here: the crop is soft by its
+look-up between texels (`softness`), and so is the object before the camera takes both. The places
+are those that `benchmarks.response` does not fit its estimate to.
 """
 
 import argparse
 import json
+import math
 import tempfile
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
@@ -26,15 +30,16 @@ from warpir.core.color import luminance
 from warpir.evaluate.image_errors import image_errors, make_regions
 from warpir.evaluate.scenes import Place, Places, Subject, find_files
 from warpir.io.images.jpeg import JpegCoding, read_coding
-from warpir.io.images.photos import Photo
-from warpir.look.camera_look import CameraLook, estimate_look
+from warpir.io.images.photos import Photo, read_envmap
+from warpir.look.camera_look import CameraLook, estimate_look, region_around
 from warpir.look.grain import Grain
 from warpir.look.response import Response
-from warpir.look.sharpness import PIXEL_SIGMA, EdgeBlur
+from warpir.look.sharpness import PIXEL_SIGMA, EdgeBlur, gaussian
 from warpir.render.composite import composite
 from warpir.render.device_scene import Placed, Receiver, Scene
 from warpir.render.picture.planes import Quality, Rendering, render
 from warpir.render.renderer import Renderer
+from warpir.scene.camera import Camera
 from warpir.scene.light import Light
 from warpir.scene.tone_curves import Curves
 from warpir.train.photo_look import Look, draw_looks
@@ -56,6 +61,8 @@ QUALITY = (40, 95)
 """Least and most quality of the JPEG files that half of the cameras write."""
 BLUR, GRAIN = (0.0, 1.6), (0.0, 6.0)
 """Least and most deviation of the drawn blur [px] and of the drawn grain [codes of 255]."""
+Errors = dict[str, dict[str, float]]
+"""Figures of one object by row."""
 
 
 @dataclass(frozen=True)
@@ -74,8 +81,7 @@ class Shot:
 
     def shoot(self, linear: FloatArray) -> FloatArray:
         """Return codes of 255 over 255, [H, W, 3]."""
-        blur = (self.blur, self.blur, 0.0)
-        seen = ndimage.gaussian_filter(linear, blur) if self.blur > 0.0 else linear
+        seen = gaussian(linear, self.blur)
         shown = self.response.show(torch.from_numpy(seen).permute(2, 0, 1)[None].float())
         shown = shown[0].permute(1, 2, 0).numpy()
         noisy = shown + self.grain.deviation(shown) * self.noise
@@ -113,66 +119,119 @@ def photo_of(shown: FloatArray) -> Photo:
     return Photo(np.round(255.0 * shown).astype(np.uint8), shown, "png")
 
 
-def measure(place: Place, subject: Subject, samples: int) -> dict[str, dict[str, float]]:
-    """Return the errors of every row for one object."""
-    rng = np.random.default_rng([9, *place.seed])
-    blur, strength = float(rng.uniform(*BLUR)), float(rng.uniform(*GRAIN)) / 255.0
+def draw_camera(photo_lin: FloatArray, rng: np.random.Generator) -> Shot:
+    """Draw a camera that takes a photo, shape [H, W, 3]."""
+    sigma, strength = float(rng.uniform(*BLUR)), float(rng.uniform(*GRAIN)) / 255.0
     grain = Grain((0.0, 1.0), ((strength,) * 3, (0.6 * strength,) * 3), 0.5, 0.2)
-    noise = grain.draw(place.photo.shape[:2], int(rng.integers(2**31)))
+    noise = grain.draw(photo_lin.shape[:2], int(rng.integers(2**31)))
     generator = torch.Generator().manual_seed(int(rng.integers(2**31)))
-    response = draw_looks(torch.from_numpy(place.photo_lin).permute(2, 0, 1)[None], generator)
+    response = draw_looks(torch.from_numpy(photo_lin).permute(2, 0, 1)[None], generator)
     plain = replace(response, gain=torch.ones_like(response.gain))
     quality = int(rng.integers(*QUALITY)) if rng.random() < 0.5 else None
-    camera = Shot(blur, grain, noise, plain, quality)
-    ground = subject.placement.ground
-    receiver = Receiver(ground[:3], -float(ground[3]))
-    placed = Placed(subject.asset, subject.placement.asset_to_world)
-    renderer = Renderer(Scene([placed], place.camera, receiver, "cpu"), 0)
-    light, curves = Light(texels=place.texels), Curves.identity("linear")
+    return Shot(sigma, grain, noise, plain, quality)
 
-    def rendered(seed: int) -> Rendering:
-        quality = Quality(samples, 1, 5, seed, 8.0)
-        knots = curves.foreground, curves.shadow_ratio
-        return render(renderer, light, light, quality, *knots, is_reinhard=False)
 
-    clean, again = composite(rendered(1), photo_of(place.photo), 1), rendered(2)
-    truth = camera.shoot(clean.layers.composite)
+def softness(camera: Camera, columns: int) -> Float64Array:
+    """Return how much softer a crop is than what is rendered into it [px], shape [H, W].
+
+    The weights of a bilinear look-up between texels are a triangle, whose variance is a sixth of
+    the texel's square. A pixel of the crop is the mean of two by two look-ups, whose variance is
+    1/16, a rendered one of a whole square, 1/12. What blurred the panorama itself comes on top, and
+    is not known.
+
+    Args:
+        camera: That of the crop.
+        columns: Of the panorama.
+    """
+    u, v = np.meshgrid(np.arange(camera.width) + 0.5, np.arange(camera.height) + 0.5)
+    local = np.stack([(u - camera.cx) / camera.fx, (camera.cy - v) / camera.fy, -np.ones_like(u)])
+    distance = np.linalg.norm(local, axis=0)
+    upward = np.einsum("k,khw->hw", camera.c2w[1, :3], local) / distance
+    pixel = 1.0 / (camera.fx * camera.fy * distance**3)
+    texel = (2.0 * np.pi / columns) ** 2 * np.sqrt(1.0 - upward**2)
+    variance = texel / pixel / 6.0 + 1.0 / 16.0 - PIXEL_SIGMA**2
+    return np.asarray(np.sqrt(np.maximum(variance, 0.0)), np.float64)
+
+
+def measure(place: Place, subject: Subject, samples: int, columns: int) -> Errors:
+    """Return the errors of every row for one object.
+
+    Args:
+        place: Where the object stands.
+        subject: The object.
+        samples: Per pixel.
+        columns: Of the panorama, by whose texels the crop is soft.
+    """
+    rng = np.random.default_rng([9, *place.seed])
+    camera = draw_camera(place.photo_lin, rng)
+    first, second = _rendered(place, subject, samples)
+    crisp = composite(first, photo_of(place.photo), 1).layers
+    soft = float(softness(place.camera, columns)[crisp.matte > 0.0].mean())
+    as_crop = CameraLook(blur=EdgeBlur(float(np.hypot(soft, PIXEL_SIGMA)), 0))
+    clean = composite(first, photo_of(place.photo), 1, look=as_crop).layers.composite
+    truth = camera.shoot(clean)
     photo = photo_of(camera.shoot(place.photo_lin))
-    coding = None if quality is None else jpeg_of(photo.codes, quality)[1]
-    regions = make_regions(clean.layers.matte, clean.layers.shadow_ratio)
-    detail = laplacian(truth, clean.layers.matte)
+    coding = None if camera.quality is None else jpeg_of(photo.codes, camera.quality)[1]
+    regions = make_regions(crisp.matte, crisp.shadow_ratio)
+    detail = laplacian(truth, crisp.matte)
+    around = region_around(_positions(crisp.matte), *crisp.matte.shape)
 
     def errors(shown: FloatArray) -> dict[str, float]:
         of_box = image_errors(shown, truth, regions)["box"]
         return {
             "rmse": of_box["rmse"],
             "flip": of_box.get("flip", float("nan")),
-            "laplacian": laplacian(shown, clean.layers.matte) / detail,
-            "blacks": blacks(shown, clean.layers.matte) - blacks(truth, clean.layers.matte),
+            "laplacian": laplacian(shown, crisp.matte) / detail,
+            "blacks": blacks(shown, crisp.matte) - blacks(truth, crisp.matte),
         }
 
     found = {}
     for name, words in ROWS.items():
         jpeg = None if name == "grain" else coding
-        look = estimate_look(photo.srgb, photo.linear(), regions["box"], *words, jpeg)
+        look = estimate_look(photo.srgb, photo.linear(), around, *words, jpeg)
         if name == "blocks":
             look = replace(look, grain=None)
         if name == "true blur":
-            look = replace(look, blur=EdgeBlur(float(np.hypot(blur, PIXEL_SIGMA)), 0))
-        picture = composite(again, photo, 2, look=look)
+            look = replace(look, blur=EdgeBlur(math.hypot(camera.blur, soft, PIXEL_SIGMA), 0))
+        picture = composite(second, photo, 2, look=look)
         shown = photo.encode(picture.image, picture.changed).astype(np.float32) / 255.0
         found[name] = errors(shown) | _estimates(look)
-    other = replace(camera, noise=grain.draw(place.photo.shape[:2], int(rng.integers(2**31))))
-    perfect = composite(again, photo_of(place.photo), 2).layers.composite
-    found[TRUE] = errors(other.shoot(perfect))
-    grey = codes_of(plain, LEVELS) - curve(Response(1.0), LEVELS)
-    found["camera"] = {
-        "blur": blur,
-        "grain": 255.0 * float(grain.deviation(np.full(3, 0.4))[0]),
-        "quality": float(quality or 100),
+    again = camera.grain.draw(place.photo.shape[:2], int(rng.integers(2**31)))
+    perfect = composite(second, photo_of(place.photo), 2, look=as_crop).layers.composite
+    found[TRUE] = errors(replace(camera, noise=again).shoot(perfect))
+    found["camera"] = _drawn(camera) | {"softness": soft}
+    return found
+
+
+def _positions(matte: FloatArray) -> Float64Array:
+    """Return the image positions of the object's pixels [px], shape [N, 2]."""
+    return np.argwhere(matte > 0.0)[:, ::-1].astype(np.float64) + 0.5
+
+
+def _rendered(place: Place, subject: Subject, samples: int) -> tuple[Rendering, Rendering]:
+    """Return the object under the place's own light, twice, by other samples."""
+    ground = subject.placement.ground
+    receiver = Receiver(ground[:3], -float(ground[3]))
+    placed = Placed(subject.asset, subject.placement.asset_to_world)
+    renderer = Renderer(Scene([placed], place.camera, receiver, "cpu"), 0)
+    light, curves = Light(texels=place.texels), Curves.identity("linear")
+    knots = curves.foreground, curves.shadow_ratio
+    first, second = (
+        render(renderer, light, light, Quality(samples, 1, 5, seed, 8.0), *knots, is_reinhard=False)
+        for seed in (1, 2)
+    )
+    return first, second
+
+
+def _drawn(camera: Shot) -> dict[str, float]:
+    """Return the figures of a drawn camera: blur [px], grain [codes of 255], quality, codes."""
+    grey = codes_of(camera.response, LEVELS) - curve(Response(1.0), LEVELS)
+    return {
+        "blur": camera.blur,
+        "grain": 255.0 * float(camera.grain.deviation(np.full(3, 0.4))[0]),
+        "quality": float(camera.quality or 100),
         "response at .003": float(grey[0]),
     }
-    return found
 
 
 def _estimates(look: CameraLook) -> dict[str, float]:
@@ -203,10 +262,13 @@ def main() -> None:
         options.seed,
         options.width,
     )
-    measured = []
+    files = {p.stem: p for p in panoramas}
+    measured: list[dict[str, Any]] = []
     for place, subjects in places.make(options.scenes):
         for subject in subjects:
-            measured.append({"scene": subject.name, **measure(place, subject, options.samples)})
+            columns = read_envmap(files[place.panorama]).shape[1]
+            found = measure(place, subject, options.samples, columns)
+            measured.append({"scene": subject.name, **found})
             print(subject.name, json.dumps({k: measured[-1][k] for k in ("camera", "auto")}))
     print("row           RMSE    FLIP    Laplacian: median, within 25 %; blacks: off by, within 3")
     for name in (*ROWS, TRUE):

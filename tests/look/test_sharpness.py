@@ -8,10 +8,12 @@ from warpir.core.arrays import FloatArray
 from warpir.look.camera_look import CameraLook, region_around
 from warpir.look.sharpness import (
     PIXEL_SIGMA,
+    TYPICAL,
     EdgeBlur,
     _blurred,
     blurred_layers,
     estimate_blur,
+    gaussian,
 )
 
 FINER = 6
@@ -47,6 +49,17 @@ def test_known_blur_is_found(sigma: float, noise: float) -> None:
     assert found.sigma == pytest.approx(np.hypot(sigma, PIXEL_SIGMA), abs=0.12)
 
 
+@pytest.mark.parametrize("sigma", [0.0, 0.1, 0.3, 0.5, 1.6])
+def test_blur_has_its_variance(sigma: float) -> None:
+    """However small; a point keeps its sum."""
+    point = np.zeros((31, 31), np.float32)
+    point[15, 15] = 1.0
+    seen = gaussian(point, sigma).astype(np.float64)
+    assert seen.sum() == pytest.approx(1.0, abs=1e-5)
+    rows = seen.sum(axis=1)
+    assert (rows * (np.arange(31) - 15) ** 2).sum() == pytest.approx(sigma**2, rel=0.02)
+
+
 def test_region_decides_where_it_has_edges() -> None:
     """Sharp left, soft right: each half has its own blur, and an empty region asks the photo."""
     image = np.concatenate([boxes(0.2), boxes(1.8)], axis=1)
@@ -57,6 +70,23 @@ def test_region_decides_where_it_has_edges() -> None:
     assert sharp.sigma < 0.6 and soft.sigma > 1.4
     nowhere = estimate_blur(image, np.zeros_like(left))
     assert nowhere == estimate_blur(image)
+
+
+def test_soft_scene_is_not_a_soft_lens() -> None:
+    """Where edges differ the lens is not the softer ones; where they agree it is, however soft."""
+    scene = np.concatenate([boxes(s, seed) for seed, s in enumerate((1.0, 2.0, 3.0))], axis=1)
+    found, lens = estimate_blur(scene), estimate_blur(boxes(2.0))
+    assert found is not None and lens is not None
+    assert TYPICAL < found.sigma < 1.3
+    assert lens.sigma == pytest.approx(2.0, abs=0.12)
+
+
+def test_part_with_few_steps_asks_the_whole_photo() -> None:
+    """Some 70 edges of a soft part tell less than the hundreds beside it."""
+    image = np.concatenate([boxes(0.2), boxes(1.8)], axis=1)
+    part = np.zeros(image.shape[:2], bool)
+    part[:60, 240:300] = True
+    assert estimate_blur(image, part) == estimate_blur(image)
 
 
 @pytest.mark.parametrize("value", [0.0, 0.5, 1.0])

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from scipy import ndimage
+from scipy.special import ive
 
 from warpir.core.arrays import AnyFloatArray, BoolArray, FloatArray
 from warpir.core.color import luminance
@@ -15,11 +16,21 @@ FINE, COARSE, WIDE = 1.0, 2.0, 3.0
 """Standard deviations of the Gaussian derivatives [px]; the ratio of the first two tells the blur,
 the third tells steps from lines and from crowded edges."""
 CLEAR, FAINT = (10.0, 0.06, 60), (6.0, 0.15, 20)
-"""Least slope over the noise's, how far the third slope may be from that of a step [1], and edge
-pixels below which a photo, or a part of it, tells no blur: of clear edges, and of the fainter ones
-that count where these are too few."""
-SHARP_SHARE = 0.35
-"""Quantile of the blurs of all edges that counts as the lens's: most edges of a scene are soft."""
+"""Least slope over the noise's, how far the third slope may be from that of a step [1], and steps
+below which a photo tells no blur: of clear edges, and of the fainter ones that count where these
+are too few."""
+AROUND = 100
+"""Clear steps below which a part of a photo tells no blur, and the whole photo is asked."""
+LENS = 0.4
+"""Quantile of the blurs of all steps that counts as the lens's: many edges of a scene are soft."""
+LOW, HIGH, SPREAD = 0.15, 0.6, 1.25
+"""Quantiles whose distance tells how far the steps agree, and the distance at which they tell half
+of the blur [px]."""
+WEAK = 0.2
+"""Median contrast of the steps at which their spread counts twice [1]: clouds, haze and shadows are
+weak, and soft by themselves."""
+TYPICAL = 0.58
+"""Mean of six photographs' blurs, the pixel included [px]."""
 LEAST_CONTRAST = 0.03
 """Luminance step over the photo's 99th percentile from which an edge counts [1]."""
 CLIPPED = 0.97
@@ -71,21 +82,41 @@ def estimate_blur(linear: AnyFloatArray, region: BoolArray | None = None) -> Edg
     ridge = _is_ridge(fine, gx, gy) & ~clipped
     border = np.zeros_like(ridge)
     border[6:-6, 6:-6] = True
-    for over_noise, step_error, count in (CLEAR, FAINT):
-        edge = ridge & border & (fine > max(least, over_noise * noise))
-        if region is not None and int((edge & region).sum()) >= count:
-            edge &= region
-        sigmas = _step_blurs(fine[edge], coarse[edge], wide[edge], step_error)
-        if len(sigmas) >= count:
-            sigma = float(np.quantile(sigmas, SHARP_SHARE))
-            return EdgeBlur(max(sigma, PIXEL_SIGMA), len(sigmas))
+    mean = ndimage.gaussian_filter(lum, WIDE)
+    everywhere = ridge & border
+    asked = [(everywhere, CLEAR), (everywhere, FAINT)]
+    if region is not None:
+        asked.insert(0, (everywhere & region, (*CLEAR[:2], AROUND)))
+    for where, (over_noise, step_error, count) in asked:
+        edge = where & (fine > max(least, over_noise * noise))
+        sigmas, is_step = _step_blurs(fine[edge], coarse[edge], wide[edge], step_error)
+        if int(is_step.sum()) >= count:
+            heights = fine[edge] * np.sqrt(2.0 * np.pi * (sigmas**2 + FINE**2))
+            contrast = heights / np.maximum(mean[edge], 1e-3)
+            sigma = _of_lens(sigmas[is_step], float(np.median(contrast[is_step])))
+            return EdgeBlur(sigma, int(is_step.sum()))
     return None
+
+
+def _of_lens(sigmas: FloatArray, contrast: float) -> float:
+    """Return the blur of the lens, by the steps that it blurred [px].
+
+    Steps that differ, or are weak, are soft by themselves; the more so, the more the blur is drawn
+    toward that of other photographs.
+
+    Args:
+        sigmas: Blurs of the steps [px], shape [N].
+        contrast: Median height of a step over the mean value around it [1].
+    """
+    low, middle, high = np.quantile(sigmas, (LOW, LENS, HIGH))
+    doubt = (high - low) / SPREAD * (1.0 + WEAK / contrast)
+    return max(float(TYPICAL + (middle - TYPICAL) / (1.0 + doubt**4)), PIXEL_SIGMA)
 
 
 def _step_blurs(
     fine: FloatArray, coarse: FloatArray, wide: FloatArray, step_error: float
-) -> FloatArray:
-    """Return the blurs of those edges that are steps [px], from their three slopes [N]."""
+) -> tuple[FloatArray, BoolArray]:
+    """Return the blurs of edges [px], and which of them are steps, from their slopes [N]."""
     ratio = (fine / np.maximum(coarse, 1e-12)) ** 2
     limit = (COARSE / FINE) ** 2
     variance = (COARSE**2 - ratio * FINE**2) / np.maximum(ratio - 1.0, 1e-3)
@@ -94,7 +125,7 @@ def _step_blurs(
     expected = fine * np.sqrt((plain + FINE**2) / (plain + WIDE**2))
     is_step = np.abs(wide / np.maximum(expected, 1e-12) - 1.0) < step_error
     is_step &= (ratio > 1.02) & (ratio < 1.05 * limit)
-    return np.asarray(np.sqrt(plain[is_step]))
+    return np.asarray(np.sqrt(plain)), is_step
 
 
 def _is_ridge(slope: FloatArray, gx: FloatArray, gy: FloatArray) -> BoolArray:
@@ -106,6 +137,18 @@ def _is_ridge(slope: FloatArray, gx: FloatArray, gy: FloatArray) -> BoolArray:
     second = np.where(across, right, below)
     ridge: BoolArray = (slope >= first) & (slope > second)
     return ridge
+
+
+def gaussian(plane: FloatArray, sigma: float) -> FloatArray:
+    """Return a plane behind a Gaussian, shape [H, W] or [H, W, 3].
+
+    The kernel is the discrete analogue (Lindeberg 1990, "Scale-space for discrete signals"), whose
+    variance is that of ``sigma`` [px] however small; samples of a Gaussian of .3 px blur by .09.
+    """
+    reach = math.ceil(TRUNCATE * sigma) + 1
+    kernel = ive(np.abs(np.arange(-reach, reach + 1)), sigma**2)
+    across = ndimage.correlate1d(plane, kernel / kernel.sum(), axis=1)
+    return np.asarray(ndimage.correlate1d(across, kernel / kernel.sum(), axis=0), np.float32)
 
 
 def blurred_layers(
@@ -146,16 +189,11 @@ def blurred_layers(
 
 def _blurred(planes: dict[str, FloatArray], sigma: float) -> dict[str, FloatArray]:
     """Blur every plane, shape [H, W] or [H, W, 3]; ``shadow_ratio`` as `blurred_layers` says."""
-
-    def blur(plane: FloatArray) -> FloatArray:
-        widths = (sigma, sigma, 0.0)[: plane.ndim]
-        return np.asarray(ndimage.gaussian_filter(plane, widths, truncate=TRUNCATE), np.float32)
-
-    result = {name: blur(plane) for name, plane in planes.items() if name != "shadow_ratio"}
+    result = {n: gaussian(plane, sigma) for n, plane in planes.items() if n != "shadow_ratio"}
     seen = 1.0 - planes["matte"]
-    weight = blur(seen)[..., None]
+    weight = gaussian(seen, sigma)[..., None]
     # In differences from 1, so that ground beyond the shadow stays exactly 1.
-    change = blur((planes["shadow_ratio"] - 1.0) * seen[..., None])
+    change = gaussian((planes["shadow_ratio"] - 1.0) * seen[..., None], sigma)
     ratio = 1.0 + change / np.maximum(weight, 1e-6)
     inside = weight[..., 0] < 1e-3
     ratio[inside] = planes["shadow_ratio"][inside]
