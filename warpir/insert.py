@@ -27,7 +27,7 @@ from warpir.app.config import InsertConfig, usage
 from warpir.app.program import attempt, require_packages, run_program, say, stay_offline
 from warpir.core.errors import ExitCode
 from warpir.core.limits import LIMITS
-from warpir.core.memory import Memory
+from warpir.core.memory import Memory, no_collection
 
 if TYPE_CHECKING:
     from warpir.app.inputs import Loaders
@@ -109,7 +109,7 @@ def _insert_one(config: InsertConfig, loaders: "Loaders | None" = None) -> Inser
     run, given = _read(config, loaders or Loaders(estimate_photo))
     with run.output as output:
         run.require_room()
-        with run.timings.stage("load"):  # loads torch and Warp
+        with no_collection(), run.timings.stage("load"):  # loads torch and Warp
             from warpir.optimize.find_light import find_light, with_photo_detail
             from warpir.render.device import choose_device
             from warpir.report.result import render_result, write_preview
@@ -118,7 +118,7 @@ def _insert_one(config: InsertConfig, loaders: "Loaders | None" = None) -> Inser
         run.take_cache_notices()
         lit = find_light(run, given)
         if given is None and not run.config.is_guided:
-            with lit.run.timings.stage("preview"):
+            with no_collection(), lit.run.timings.stage("preview"):
                 write_preview(lit.run, lit.light)
         lit = with_photo_detail(lit)
         rendered = render_result(lit.run, lit.light)
@@ -145,7 +145,7 @@ def _read(
 
     log, timings = Log(say), Timings()
     require_packages(*(("pxr",) if config.output.usd else ()))
-    with timings.stage("read"):
+    with no_collection(), timings.stage("read"):
         if config.inputs.demo:
             from warpir.demo import demo_config
 

@@ -177,6 +177,7 @@ class References:
         settings: tuple[Any, ...] = (scene.camera.width, scene.camera.fx)
         if part == "foreground":
             arrays = [scene.object_pixels, scene.weight_fg]
+            arrays += [texture.pixels for texture in scene.asset.textures]
             materials = [
                 (m.base_color, m.metallic, m.roughness, m.emission, m.transmission)
                 for m in scene.asset.materials

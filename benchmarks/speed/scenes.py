@@ -10,6 +10,7 @@ from pathlib import Path
 
 import numpy as np
 
+from benchmarks.speed.textured import textured_heap
 from warpir.core.arrays import Float64Array, FloatArray, IntArray
 from warpir.core.latlong import resize_map
 from warpir.io.assets import load_asset
@@ -24,7 +25,14 @@ from warpir.scene.camera import Camera, camera_from_fov
 from warpir.scene.light import Light, Lobes, axis_from_angles, rasterize_lobes
 from warpir.scene.placement import place_asset
 
-NAMES = ("ball", "toycar", "metal")
+NAMES = ("ball", "toycar", "metal", "textured")
+PLACES = {
+    "ball": ((-0.3, 0.0, -5.5), 0.0, 1.5),
+    "toycar": ((0.0, 0.0, -5.5), -35.0, 2.0),
+    "textured": ((-0.3, 0.0, -5.5), 30.0, 1.6),
+}
+"""Where the object stands [m], its turn about +Y [deg], and its longest side [m]; others stand as
+the ball does."""
 TOYCAR = "mesh/ToyCar.glb"
 PANORAMA = "hdri/modern_buildings_2_1k.hdr"
 PANORAMA_HEIGHT = 256
@@ -135,22 +143,8 @@ def make_scene(
         FileNotFoundError: A file of the scene is absent.
     """
     camera = camera_from_fov(width, height, 40.0, -12.0, 1.4)
-    if name == "toycar":
-        for file in (TOYCAR, PANORAMA):
-            if not (assets / file).exists():
-                raise FileNotFoundError(f"{file} is not in the folder of assets")
-        asset, lobes, depth = load_asset(assets / TOYCAR), panorama_lobes(assets / PANORAMA), 5
-        place, turn, size = (0.0, 0.0, -5.5), -35.0, 2.0
-    else:
-        metal = name == "metal"
-        material = Material(
-            base_color=(0.95, 0.75, 0.45) if metal else (0.8, 0.35, 0.2),
-            metallic=1.0 if metal else 0.0,
-            roughness=0.3 if metal else 0.6,
-        )
-        asset = Asset(name, (uv_ball(),), (material,))
-        lobes, depth = sun_and_sky(), 3
-        place, turn, size = (-0.3, 0.0, -5.5), 0.0, 1.5
+    asset, lobes, depth = _contents(name, assets)
+    place, turn, size = PLACES.get(name, PLACES["ball"])
     placement = place_asset(*asset.bounds(), camera, None, place=place, rotate_y=turn, size=size)
     renderer = on_the_ground(asset, placement.asset_to_world, camera, device)
     renderer.threads = threads
@@ -177,6 +171,24 @@ def make_scene(
         weight[0].reshape(-1, 3)[object_pixels],
         weight[1].reshape(-1, 3)[receiver_pixels],
     )
+
+
+def _contents(name: str, assets: Path) -> tuple[Asset, Lobes, int]:
+    """Return the object, the light, and how many surfaces the longest path meets."""
+    if name == "toycar":
+        for file in (TOYCAR, PANORAMA):
+            if not (assets / file).exists():
+                raise FileNotFoundError(f"{file} is not in the folder of assets")
+        return load_asset(assets / TOYCAR), panorama_lobes(assets / PANORAMA), 5
+    if name == "textured":
+        return textured_heap(), sun_and_sky(), 3
+    metal = name == "metal"
+    material = Material(
+        base_color=(0.95, 0.75, 0.45) if metal else (0.8, 0.35, 0.2),
+        metallic=1.0 if metal else 0.0,
+        roughness=0.3 if metal else 0.6,
+    )
+    return Asset(name, (uv_ball(),), (material,)), sun_and_sky(), 3
 
 
 def on_the_ground(

@@ -20,6 +20,7 @@ import os
 import resource
 import sys
 from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TypeVar
@@ -215,6 +216,21 @@ class Memory:
         for what, count in self.retries.items():
             times = "" if count == 1 else f" ({count} times)"
             yield f"memory was short for {what}: made in smaller parts, with the same result{times}"
+
+
+@contextmanager
+def no_collection() -> Iterator[None]:
+    """Within this context cycles of Python are not looked for: where modules are loaded, all stays.
+
+    Of torch and Warp alone there is so much that looking takes half a second.
+    """
+    was_enabled = gc.isenabled()
+    gc.disable()
+    try:
+        yield
+    finally:
+        if was_enabled:
+            gc.enable()
 
 
 def release() -> None:

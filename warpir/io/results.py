@@ -205,7 +205,7 @@ class OutputFolder:
         staged = self.staging / path.name
         try:
             path.parent.mkdir(exist_ok=True)
-            write_staged(staged, writers.png_bytes(codes, icc))
+            write_staged(staged, writers.png_bytes(codes, icc, level=1))
             os.replace(staged, path)
         except OSError as error:
             raise disk_error(path, error) from error

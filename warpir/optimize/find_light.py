@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from warpir.app.run import Run
-from warpir.core.memory import release
+from warpir.core.memory import no_collection, release
 from warpir.lighting.scene_light import SceneLight
 from warpir.render.determinism import fixed_arithmetic
 
@@ -68,7 +68,8 @@ def _guided(run: Run, given: SceneLight | None) -> LitRun:
 def _estimated(run: Run) -> tuple[SceneLight, dict[str, Any]]:
     """Estimate the light from the photo; return it and its entry in ``run.json``."""
     is_fixed = run.config.render.deterministic
-    with run.timings.stage("regress"), fixed_arithmetic(run.device, is_fixed):
+    arithmetic = fixed_arithmetic(run.device, is_fixed)
+    with no_collection(), run.timings.stage("regress"), arithmetic:
         from warpir.lighting.estimate import estimate_light
 
         config = run.config

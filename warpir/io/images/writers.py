@@ -34,7 +34,11 @@ http://cv.iptc.org/newscodes/digitalsourcetype/compositeSynthetic\
 
 
 def png_bytes(
-    codes: PixelArray, icc: bytes | None = None, mark: bool = False, description: str = ""
+    codes: PixelArray,
+    icc: bytes | None = None,
+    mark: bool = False,
+    description: str = "",
+    level: int = 6,
 ) -> bytes:
     """Serialise a PNG.
 
@@ -47,6 +51,7 @@ def png_bytes(
         mark: Whether to say in XMP that the picture is a composite (IPTC digital source type
             ``compositeSynthetic``).
         description: Text for the ``Description`` field.
+        level: Of zlib; photos at 1 take a quarter of the time and a sixteenth more bytes.
     """
     if (
         codes.dtype not in (np.uint8, np.uint16)
@@ -81,7 +86,7 @@ def png_bytes(
     for keyword, text in texts.items():
         if text:
             parts.append(chunk(b"iTXt", keyword.encode() + b"\0\0\0\0\0" + text.encode()))
-    parts += [chunk(b"IDAT", zlib.compress(filtered.data, 6)), chunk(b"IEND", b"")]
+    parts += [chunk(b"IDAT", zlib.compress(filtered.data, level)), chunk(b"IEND", b"")]
     return b"".join(parts)
 
 
