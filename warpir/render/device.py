@@ -68,11 +68,10 @@ class SharedHasher(warp_context.ModuleHasher):  # type: ignore[misc]
 
     def hash_function(self, func: wp.Function) -> bytes:
         """Return what Warp's does."""
-        if not func.module.name.startswith("warpir."):
-            return super().hash_function(func)
-        if func not in self.known:
-            self.known[func] = super().hash_function(func)
-        return self.known[func]
+        known = self.known if func.module.name.startswith("warpir.") else {}
+        if func not in known:
+            known[func] = super().hash_function(func)
+        return known[func]
 
 
 def start_warp() -> None:
