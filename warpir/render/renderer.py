@@ -31,7 +31,7 @@ from warpir.render.upload.triangles import Corners
 from warpir.scene.camera import Camera
 from warpir.scene.placement import box_corners
 
-FULL_THREADS = 1 << 18
+FULL_THREADS = 1 << 20
 """Threads that fill a CUDA device; with fewer pixels, several threads share a pixel's samples."""
 GLASS_SAMPLES = 8
 """Factor on the samples of the G-buffer for clear glass, which few samples hit."""
