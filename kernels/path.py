@@ -373,6 +373,8 @@ def foreground_kernel(
             glassy = GlassPoint()
             interfaces = int(0)
         while index < spp * rays:
+            # Among all samples of the pixel
+            path = before * rays + index
             if alive == 0:
                 s = before + index // rays
                 if wp.static(not from_camera):
@@ -386,7 +388,7 @@ def foreground_kernel(
                         index += rays
                         continue
                     origin = receiver_origin(mesh, receiver, point)
-                    u = sobol_pair(index, key, 3)
+                    u = sobol_pair(path, key, 3)
                     if wp.static(from_ground):
                         window = object_window(mesh, origin, point.normal)
                         ray = object_ray(window, u)
@@ -396,7 +398,7 @@ def foreground_kernel(
                     first.valid = 0
                     if ray.weight > 0.0:
                         reach = receiver_mesh_hit(receiver, origin, ray.direction).t
-                        ray_key = hash_pair(hash_pair(key, wp.uint32(index)), wp.uint32(1))
+                        ray_key = hash_pair(hash_pair(key, wp.uint32(path)), wp.uint32(1))
                         first = closest_hit(
                             mesh, material, texture, origin, ray.direction, reach, 0, ray_key
                         )
@@ -440,7 +442,7 @@ def foreground_kernel(
             if k == wp.static(int(not from_camera)):
                 among = candidates
             if wp.static(has_solid_glass):
-                is_glass = meets_glass(glassy, before * rays + index, key, k)
+                is_glass = meets_glass(glassy, path, key, k)
                 if is_glass == 0 and k - interfaces >= depth:
                     alive = 0
                     index += 1
@@ -449,7 +451,7 @@ def foreground_kernel(
                 event = scatter_with_glass(
                     mesh, material, texture, receiver, light, lamps, glass,
                     surface, glassy, is_glass, wo, among, keep_dark,
-                    before * rays + index, key, k,
+                    path, key, k,
                 )  # fmt: skip
             else:
                 is_last = int(0)
@@ -457,7 +459,7 @@ def foreground_kernel(
                     is_last = 1  # lamps in front of a hit are seen by the closest alone
                 event = scatter(
                     mesh, material, texture, receiver, light, lamps,
-                    surface, wo, is_last, among, keep_dark, before * rays + index, key, k,
+                    surface, wo, is_last, among, keep_dark, path, key, k,
                 )  # fmt: skip
             if vertex_record.material.shape[1] > 0:
                 keep_event(vertex_record, record_row, k * spp * rays + index, event)

@@ -107,8 +107,7 @@ class ObjectLaunch:
     ) -> FloatArray:
         """Return what the object throws onto the white receiver, a row a pixel."""
         out = renderer.zeros(len(pixels), wp.vec3)
-        lanes = renderer.lanes(len(pixels), spp) if record is None else 1
-        self._trace(renderer, pixels, may_see_object, spp, lanes, [out], record, None)
+        self._trace(renderer, pixels, may_see_object, spp, 1, [out], record, None)
         radiance: FloatArray = out.numpy()[: len(pixels)]
         return radiance
 
@@ -117,8 +116,7 @@ class ObjectLaunch:
     ) -> tuple[FloatArray, FloatArray, FloatArray]:
         """Return the object's image in the ground's coat, what it hides there, and what not."""
         out = [renderer.zeros(len(pixels), wp.vec3) for _ in range(3)]
-        lanes = renderer.lanes(len(pixels), spp)
-        self._trace(renderer, pixels, may_see_object, spp, lanes, out, None, None)
+        self._trace(renderer, pixels, may_see_object, spp, 1, out, None, None)
         image, hidden, kept = (a.numpy()[: len(pixels)] for a in out)
         return image, hidden, kept
 
