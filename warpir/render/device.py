@@ -68,10 +68,11 @@ class SharedHasher(warp_context.ModuleHasher):  # type: ignore[misc]
 
     def hash_function(self, func: wp.Function) -> bytes:
         """Return what Warp's does."""
-        known = self.known if func.module.name.startswith("warpir.") else {}
-        if func not in known:
-            known[func] = super().hash_function(func)
-        return known[func]
+        if not func.module.name.startswith("warpir."):
+            return super().hash_function(func)
+        if func not in self.known:
+            self.known[func] = super().hash_function(func)
+        return self.known[func]
 
 
 def start_warp() -> None:
