@@ -13,11 +13,10 @@ from concurrent.futures import ThreadPoolExecutor, as_completed
 from dataclasses import dataclass
 from functools import cache
 from itertools import product
-from typing import Any, ClassVar
+from typing import Any
 
 import numpy as np
 import warp as wp
-import warp._src.context as warp_context
 from numpy.typing import NDArray
 
 from warpir.core.cache import KernelCache
@@ -56,23 +55,6 @@ class Rows:
             # One that is not there has no rows, and Warp cannot slice nothing.
             setattr(part, name, array[start:stop] if array.size else array)
         return part
-
-
-class SharedHasher(warp_context.ModuleHasher):  # type: ignore[misc]
-    """Warp's, which hashes each of our functions once, not once for each kernel that calls it.
-
-    Functions of others may still get overloads, with which their hash changes.
-    """
-
-    known: ClassVar[dict[object, bytes]] = {}
-
-    def hash_function(self, func: wp.Function) -> bytes:
-        """Return what Warp's does."""
-        if not func.module.name.startswith("warpir."):
-            return super().hash_function(func)
-        if func not in self.known:
-            self.known[func] = super().hash_function(func)
-        return self.known[func]
 
 
 def start_warp() -> None:
@@ -187,7 +169,6 @@ def settle_hashes(
         layers: What extensions materials have (``MaterialArgs.any_layers``); those of most have
             kernels of their own only where they are needed.
     """
-    warp_context.ModuleHasher = SharedHasher
     kernels = [trace_gbuffer, trace_receiver, trace_plane_shadow, shadow_ratio, tone_foreground]
     viewers = (Viewer.CAMERA, Viewer.GROUND)
     # No ground with a mesh mirrors.
