@@ -17,7 +17,6 @@ from __future__ import annotations
 import itertools
 import math
 from collections.abc import Mapping
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -243,22 +242,13 @@ class Regressor(nn.Module):
     def predict(self, photo: Tensor, rays: Tensor) -> Prediction:
         """Return the mean over photo and mirror image, with calibrated logits.
 
-        Each is looked at in a thread of its own: torch has only one here
-        (`warpir.render.determinism`).
-
         Args:
             photo: Display-encoded, shape [B, 3, 96, 144].
             rays: Unit viewing directions, camera-yaw frame, shape [B, 3, 96, 144].
         """
         turned = rays.flip(-1) * rays.new_tensor([-1.0, 1.0, 1.0]).view(1, 3, 1, 1)
-
-        def look(photo: Tensor, rays: Tensor) -> Prediction:
-            with torch.no_grad():  # which holds for one thread
-                return self.split(self(photo, rays))
-
-        with ThreadPoolExecutor(2) as pool:
-            seen, reflected = pool.map(look, (photo, photo.flip(-1)), (rays, turned))
-        reflected = self.mirrored(reflected)
+        seen = self.split(self(photo, rays))
+        reflected = self.mirrored(self.split(self(photo.flip(-1), turned)))
         both = (0.5 * (a + b) for a, b in zip(seen, reflected, strict=True))
         mean = Prediction(*both)
         return mean._replace(logits=mean.logits / self.temperature)
