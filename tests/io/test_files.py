@@ -644,6 +644,43 @@ def test_previews_of_an_earlier_result_stay_until_it_is_replaced(
     assert not (out / "progress-new").exists()
 
 
+def test_kill_between_two_results_loses_no_preview(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Killed when it moves its folder of previews, or removes it; then it goes on to write one."""
+    out, codes = tmp_path / "out", np.zeros((2, 2, 3), np.uint8)
+    with OutputFolder(out) as folder:
+        folder.write_preview(0, codes)
+        folder.write_json("run.json", {})
+    replace, rmdir = os.replace, Path.rmdir
+
+    def replace_or_die(source: Path, target: Path) -> None:
+        if Path(source).name == "progress-new":
+            raise RuntimeError("killed")
+        replace(source, target)
+
+    def remove_or_die(self: Path) -> None:
+        if self.name == "progress-new":
+            raise RuntimeError("killed")
+        rmdir(self)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(os, "replace", replace_or_die)
+        patch.setattr(Path, "rmdir", remove_or_die)
+        with (
+            pytest.raises(RuntimeError, match="killed"),
+            OutputFolder(out, overwrite=True) as folder,
+        ):
+            folder.write_preview(0, codes + 255)
+            folder.write_json("run.json", {})
+    with OutputFolder(out, overwrite=True) as folder:
+        folder.write_preview(50, codes + 255)
+        folder.write_json("run.json", {})
+    shown = sorted(p.name for p in (out / "progress").iterdir())
+    assert shown == ["preview-000000.png", "preview-000050.png"]
+    assert not (out / "progress-new").exists()
+
+
 @pytest.mark.case("R6")
 @pytest.mark.parametrize("what", ["gone", "changed", "another", "lock"])
 def test_folder_that_somebody_disturbs_is_not_committed(tmp_path: Path, what: str) -> None:

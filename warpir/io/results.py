@@ -200,7 +200,9 @@ class OutputFolder:
         Raises:
             InputError: The disk is full or the folder is not writable (exit 5).
         """
-        folder = _NEW_PREVIEWS if self._holds_a_result() else _PREVIEWS
+        # A run that was killed while it replaced the earlier result has left its own there.
+        is_new = self._holds_a_result() or (self.path / _NEW_PREVIEWS).is_dir()
+        folder = _NEW_PREVIEWS if is_new else _PREVIEWS
         path = self.path / folder / f"preview-{step:06d}.png"
         staged = self.staging / path.name
         try:
@@ -363,13 +365,18 @@ class OutputFolder:
     def _show_previews(self) -> None:
         """Put the previews of a run that replaces an earlier result in place of the earlier ones.
 
+        All in one step: a run that is killed here and goes on must know whose previews it sees.
+
         Raises:
             OSError: A file cannot be removed or moved.
         """
         new, shown = self.path / _NEW_PREVIEWS, self.path / _PREVIEWS
         if new.is_dir():
             remove_unfinished(shown)
-            shown.mkdir(exist_ok=True)
+            if not shown.is_dir():
+                os.replace(new, shown)
+                return
+            # It holds what is not ours, and stays.
             for preview in sorted(new.iterdir()):
                 os.replace(preview, shown / preview.name)
             new.rmdir()
