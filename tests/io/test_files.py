@@ -681,6 +681,19 @@ def test_kill_between_two_results_loses_no_preview(
     assert not (out / "progress-new").exists()
 
 
+def test_run_resumed_beside_its_own_result_keeps_its_previews(tmp_path: Path) -> None:
+    """Killed between its result and the end of its checkpoints; the last step is done again."""
+    out, codes = tmp_path / "out", np.zeros((2, 2, 3), np.uint8)
+    for kept in ([0, 50], [50]):
+        with OutputFolder(out, overwrite=True, is_resumed=kept == [50]) as folder:
+            for step in kept:
+                folder.write_preview(step, codes)
+            folder.write_json("run.json", {})
+    shown = sorted(p.name for p in (out / "progress").iterdir())
+    assert shown == ["preview-000000.png", "preview-000050.png"]
+    assert not (out / "progress-new").exists()
+
+
 @pytest.mark.case("R6")
 @pytest.mark.parametrize("what", ["gone", "changed", "another", "lock"])
 def test_folder_that_somebody_disturbs_is_not_committed(tmp_path: Path, what: str) -> None:

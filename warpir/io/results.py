@@ -53,10 +53,19 @@ class OutputFolder:
     second run out (`warpir.io.folder_lock`).
     """
 
-    def __init__(self, path: str | Path, overwrite: bool = False) -> None:
-        """Name the folder; nothing is touched before the block is entered."""
+    def __init__(
+        self, path: str | Path, overwrite: bool = False, is_resumed: bool = False
+    ) -> None:
+        """Name the folder; nothing is touched before the block is entered.
+
+        Args:
+            path: Made when it is not there.
+            overwrite: Whether results in it may be replaced.
+            is_resumed: Whether a run goes on in it that has shown its first preview there.
+        """
         self.path = Path(path)
         self.overwrite = overwrite
+        self.is_resumed = is_resumed
         self.staging = self.path / f"{_STAGING}{os.getpid()}"
         """On the file system of the results; what lies there is removed at the end."""
         self._lock = FolderLock(self.path)
@@ -200,9 +209,10 @@ class OutputFolder:
         Raises:
             InputError: The disk is full or the folder is not writable (exit 5).
         """
-        # A run that was killed while it replaced the earlier result has left its own there.
-        is_new = self._holds_a_result() or (self.path / _NEW_PREVIEWS).is_dir()
-        folder = _NEW_PREVIEWS if is_new else _PREVIEWS
+        # A run that was killed while it replaced the earlier result has left its own there. One
+        # that was killed after it, before its checkpoints were gone, goes on beside its own result.
+        is_new = self._holds_a_result() and not self.is_resumed
+        folder = _NEW_PREVIEWS if is_new or (self.path / _NEW_PREVIEWS).is_dir() else _PREVIEWS
         path = self.path / folder / f"preview-{step:06d}.png"
         staged = self.staging / path.name
         try:

@@ -75,4 +75,5 @@ def output_folder(asked: OutputConfig, is_guided: bool) -> OutputFolder:
             ExitCode.OUTPUT,
         )
     # A run that is resumed was allowed to replace these results, or wrote them itself.
-    return OutputFolder(out, overwrite=overwrite or (resume and newest is not None))
+    is_resumed = resume and newest is not None
+    return OutputFolder(out, overwrite=overwrite or is_resumed, is_resumed=is_resumed)
