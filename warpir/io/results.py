@@ -53,9 +53,7 @@ class OutputFolder:
     second run out (`warpir.io.folder_lock`).
     """
 
-    def __init__(
-        self, path: str | Path, overwrite: bool = False, is_resumed: bool = False
-    ) -> None:
+    def __init__(self, path: str | Path, overwrite: bool = False, is_resumed: bool = False) -> None:
         """Name the folder; nothing is touched before the block is entered.
 
         Args:
