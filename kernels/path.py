@@ -4,8 +4,9 @@ The object is seen by the camera, or from the ground: what it throws on the rece
 that the receiver gains by it, the part of differential rendering that DiPIR's ratio leaves out
 (`warpir.kernels.receiver`). Or it is seen in a glossy ground, as a mirror image.
 
-Each vertex draws one direction from the light and one from the BSDF (`warpir.kernels.scatter`); the
-BSDF's direction continues the path. `trace_foreground` sums radiance and, if
+Each vertex traces one direction toward the light, picked among candidates, and one of the BSDF
+(`warpir.kernels.scatter`); the BSDF's direction continues the path. What all candidates of the
+first vertex would bring is a control variate for the one. `trace_foreground` sums radiance and, if
 asked, writes down what the two adjoints need: `warpir.kernels.light_gradient` for the light,
 `warpir.kernels.shade` for the materials. Detached: no backward pass.
 """
@@ -28,7 +29,7 @@ from warpir.kernels.lamps.gather import gather_lamps
 from warpir.kernels.light_gradient import keep_direction
 from warpir.kernels.maths.frame import basis
 from warpir.kernels.maths.lanes import lane_sum
-from warpir.kernels.maths.rng import hash_pair, pixel_seed, sobol_pair
+from warpir.kernels.maths.rng import hash_pair, pixel_seed, sobol_pair, to_unit
 from warpir.kernels.receiver import (
     ReceiverPoint,
     mirrored_ray,
@@ -41,6 +42,7 @@ from warpir.kernels.receiver_mesh import receiver_mesh_hit
 from warpir.kernels.sampling import light_eval
 from warpir.kernels.scatter import (
     Scatter,
+    arrived_share,
     bsdf_weight,
     limited,
     sample_bsdf,
@@ -69,6 +71,11 @@ BLOCK_DIM = 128
 """Threads of a block on CUDA: 1.2 times as many paths a second as with 256 on an H100. Twice as
 many blocks at a time, of half the registers each, are a tenth faster on an H200 without layers, and
 a seventh slower with them."""
+LATER_CANDIDATES = wp.constant(2)
+"""Most directions of the light among which a vertex behind the first picks one. Four take a tenth
+more time for no less noise; the one alone leaves fireflies."""
+PICK = wp.constant(wp.uint32(0x9E3779B9))
+"""Sets the number that picks one apart from others of the same vertex."""
 
 
 @wp.func(inline=True)
@@ -104,9 +111,10 @@ def scatter(
     u_parts = sobol_pair(index, key, 3 * vertex + 1)
 
     # Sample the emitter
+    pick = hash_pair(hash_pair(key, wp.uint32(index)), wp.uint32(vertex) + PICK)
     emitter = sample_emitter(
         mesh, material, texture, receiver, light, surface, bsdf, frame,
-        candidates, u_parts[0], keep_dark, index, key, vertex,
+        candidates, to_unit(pick), keep_dark, index, key, vertex,
     )  # fmt: skip
     out.emitter = emitter
     if emitter.valid == 1:
@@ -357,6 +365,9 @@ def foreground_kernel(
         radiance_diffuse = wp.vec3(0.0)
         radiance_emission = wp.vec3(0.0)
         count = float(0.0)
+        if wp.static(from_camera):
+            picks = float(0.0)
+            arrived = float(0.0)
 
         # One loop over vertices rather than one over paths: a thread whose path has ended starts
         # the next one at once instead of waiting for the longest path among its neighbours (1.5 x
@@ -438,9 +449,9 @@ def foreground_kernel(
                 if vertex_record.material.shape[1] > 0:
                     keep_surface(vertex_record, record_row, index, surface, wo)
 
-            among = int(1)
-            if k == wp.static(int(not from_camera)):
-                among = candidates
+            among = candidates
+            if k > wp.static(int(not from_camera)):
+                among = wp.min(candidates, LATER_CANDIDATES)
             if wp.static(has_solid_glass):
                 is_glass = meets_glass(glassy, path, key, k)
                 if is_glass == 0 and k - interfaces >= depth:
@@ -476,15 +487,25 @@ def foreground_kernel(
                     entries += keep_direction(
                         light_record, record_row, entries, event.bsdf.wi, gain
                     )
+            if wp.static(from_camera):
+                if k == 0 and candidates > 1 and event.emitter.valid == 1:
+                    # Before this path's own light is added: the share must not depend on its pick.
+                    kept = arrived_share(event.emitter, radiance, arrived / wp.max(picks, 1.0))
+                    radiance += wp.cw_mul(event.emitter.all_open - event.emitter.picked_open, kept)
+                    radiance_diffuse += wp.cw_mul(
+                        event.emitter.all_open_diffuse - event.emitter.picked_open_diffuse, kept
+                    )
+                    picks += 1.0
+                    arrived += event.emitter.visible
             if k == 0:
                 radiance += event.direct
                 radiance_diffuse += event.direct_diffuse
                 throughput_diffuse = event.throughput_diffuse
             else:
                 gathered = wp.cw_mul(throughput, event.direct)
-                kept = limited(gathered, indirect_limit)
-                radiance += gathered * kept
-                radiance_diffuse += wp.cw_mul(throughput_diffuse, event.direct) * kept
+                limit = limited(gathered, indirect_limit)
+                radiance += gathered * limit
+                radiance_diffuse += wp.cw_mul(throughput_diffuse, event.direct) * limit
                 throughput_diffuse = wp.cw_mul(throughput_diffuse, event.throughput)
             k += 1
             alive = event.bsdf.next.valid
@@ -522,7 +543,8 @@ def foreground_kernel(
                     light_record.weight[record_row, j] = light_record.weight[record_row, j] * seen
         radiance = lane_sum(radiance, lanes)
         if wp.static(from_camera):
-            radiance_diffuse = lane_sum(radiance_diffuse, lanes)
+            # A part of the radiance, which is bounded, may fall below 0 by a control variate.
+            radiance_diffuse = wp.max(lane_sum(radiance_diffuse, lanes), wp.vec3(0.0))
             radiance_emission = lane_sum(radiance_emission, lanes)
         elif wp.static(in_mirror):
             radiance_diffuse = lane_sum(hidden, lanes)

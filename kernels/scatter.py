@@ -8,7 +8,7 @@ both the shading and the geometric surface. Detached: no backward pass.
 
 import warp as wp
 
-from warpir.kernels.bsdf import Bsdf, BsdfValue, bsdf_f, bsdf_of, bsdf_sample, luminance
+from warpir.kernels.bsdf import Bsdf, BsdfValue, bsdf_f, bsdf_of, bsdf_sample
 from warpir.kernels.maths.frame import Frame, to_local, to_world
 from warpir.kernels.maths.rng import sobol_pair
 from warpir.kernels.receiver_mesh import receiver_hit, receiver_radiance, sky_visibility
@@ -34,6 +34,18 @@ class EmitterSample:
     """Radiance from there."""
     weight: float
     """``cos visible mis / pdf``, without f."""
+    visible: float
+    """Share of light from infinity that arrives along it; ``weight`` has it."""
+    all_open: wp.vec3
+    """What all candidates would bring if nothing stood in the light's way [radiance]."""
+    all_open_diffuse: wp.vec3
+    """The diffuse lobe's part of it."""
+    picked_open: wp.vec3
+    """What this direction, in the name of all, would bring if nothing stood in the light's way."""
+    picked_open_diffuse: wp.vec3
+    """The diffuse lobe's part of it."""
+    most_open: wp.vec3
+    """The most that ``picked_open`` could have been, by channel."""
 
 
 @wp.struct
@@ -105,10 +117,11 @@ def sample_emitter(
 ) -> EmitterSample:
     """Draw directions from the light's proposal, pick one and trace it.
 
-    One is picked by the luminance that each brings if nothing stands in its way, and it stands for
-    all of them (resampled importance sampling: Talbot, Cline & Egbert 2005, "Importance Resampling
-    for Global Illumination", eq. 5, in one pass over the candidates). All are weighed against the
-    BSDF's direction by the power heuristic with their number as the sample count (Veach 1997).
+    One is picked by the sum of channels that each brings if nothing stands in its way, and it
+    stands for all of them (resampled importance sampling: Talbot, Cline & Egbert 2005, "Importance
+    Resampling for Global Illumination", eq. 5, in one pass over the candidates). All are weighed
+    against the BSDF's direction by the power heuristic with their number as the sample count (Veach
+    1997).
 
     Args:
         mesh: The object's triangles.
@@ -120,7 +133,7 @@ def sample_emitter(
         bsdf: How, toward the camera.
         frame: Of the shading normal.
         candidates: How many directions are drawn; 1 with ``keep_dark``.
-        u_pick: Uniform number that picks one.
+        u_pick: Uniform number that picks one; `arrived_share` asks that it depends on no other.
         keep_dark: 1 weighs directions too that bring nothing now: a gradient needs them.
         index: Of the path.
         key: Of the pixel.
@@ -130,6 +143,9 @@ def sample_emitter(
     sample.valid = 0
     sample.L = wp.vec3(0.0)
     sample.weight = 0.0
+    sample.all_open = wp.vec3(0.0)
+    sample.all_open_diffuse = wp.vec3(0.0)
+    sample.most_open = wp.vec3(0.0)
     count = float(candidates)
     total = float(0.0)
     picked = float(0.0)
@@ -144,10 +160,13 @@ def sample_emitter(
             if drawn.pdf > 0.0 and (wp.max(reflected) > 0.0 or keep_dark == 1):
                 pdf = count * drawn.pdf
                 weight = wi[2] * power_heuristic(pdf, f.pdf) / pdf
-                gain = weight * luminance(reflected)
+                gain = weight * (reflected[0] + reflected[1] + reflected[2])
                 total += gain
                 is_picked = int(1)
                 if candidates > 1:
+                    sample.all_open += reflected * weight
+                    sample.all_open_diffuse += wp.cw_mul(f.diffuse, drawn.radiance) * weight
+                    sample.most_open = wp.max(sample.most_open, reflected * (weight / gain))
                     # What is left of the number is uniform again. A NaN is picked, and is seen.
                     if u_pick * total >= gain:
                         is_picked = 0
@@ -165,10 +184,38 @@ def sample_emitter(
     if sample.valid == 1:
         if candidates > 1:
             sample.weight = sample.weight * (total / picked)
+            sample.most_open = sample.most_open * total
+            f = sample.f
+            sample.picked_open = wp.cw_mul(f.diffuse + f.specular, sample.L) * sample.weight
+            sample.picked_open_diffuse = wp.cw_mul(f.diffuse, sample.L) * sample.weight
         origin = offset_origin(surface.position, surface.ng, sample.wi, mesh.epsilon)
-        sample.weight = sample.weight * visibility(mesh, material, texture, origin, sample.wi)
-        sample.weight = sample.weight * sky_visibility(receiver, origin, sample.wi)
+        sample.visible = visibility(mesh, material, texture, origin, sample.wi)
+        sample.visible = sample.visible * sky_visibility(receiver, origin, sample.wi)
+        sample.weight = sample.weight * sample.visible
     return sample
+
+
+@wp.func
+def arrived_share(sample: EmitterSample, gathered: wp.vec3, arrived: float) -> wp.vec3:
+    """Return how much of ``all_open - picked_open`` to add to a sum of samples, by channel.
+
+    That difference has the mean 0 over ``u_pick``, so any factor that does not depend on ``u_pick``
+    leaves the sum unbiased; the share of light that arrives takes the most of the noise of picking,
+    and all of it where nothing stands in the light's way (a control variate: Owen 2013, "Monte
+    Carlo Theory, Methods and Examples", section 8.9). It is bounded so that no pick can take more
+    than a half of what was gathered before: no sum falls below 0.
+
+    Args:
+        sample: Of the emitter.
+        gathered: The sum of the samples before this one.
+        arrived: The share of their picked directions along which light arrived.
+    """
+    taken = arrived * (sample.most_open - sample.all_open)
+    share = wp.vec3(arrived)
+    for c in range(3):
+        if taken[c] > 0.5 * gathered[c]:
+            share[c] = arrived * (0.5 * gathered[c] / taken[c])
+    return share
 
 
 @wp.func(inline=True)

@@ -50,9 +50,10 @@ ratio, `gradient` the gradients of their weighted sums with respect to the texel
 are left out of `image`: a handful of mirrored suns holds 99 % of ToyCar's squared error in every
 renderer. The error with them is the column `all`.
 
-Without a gradient `mis` samples otherwise: it picks a direction toward the light among four, and
-gives more samples to pixels where a pilot finds noise (`warpir.render.allocation`), here by the
-error of linear radiance, by which it is judged. So the forward image has an error of its own.
+Without a gradient `mis` samples otherwise: it picks a direction toward the light among eight, with
+what all would bring as its control variate, and gives more samples to pixels where a pilot finds
+noise (`warpir.render.allocation`), here by the error of linear radiance, by which it is judged. So
+the forward image has an error of its own.
 Pictures are shared out by the error that is shown, in which highlights hardly count: the gain on
 metal below is theirs.
 

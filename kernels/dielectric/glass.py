@@ -154,6 +154,11 @@ def glass_emitter(
     sample.valid = 0
     sample.L = wp.vec3(0.0)
     sample.weight = 0.0
+    sample.all_open = wp.vec3(0.0)
+    sample.all_open_diffuse = wp.vec3(0.0)
+    sample.picked_open = wp.vec3(0.0)
+    sample.picked_open_diffuse = wp.vec3(0.0)
+    sample.most_open = wp.vec3(0.0)
     if is_smooth(interface):
         return sample
     drawn = light_sample(light, u)
