@@ -160,13 +160,14 @@ def sample_emitter(
             if drawn.pdf > 0.0 and (wp.max(reflected) > 0.0 or keep_dark == 1):
                 pdf = count * drawn.pdf
                 weight = wi[2] * power_heuristic(pdf, f.pdf) / pdf
-                gain = weight * (reflected[0] + reflected[1] + reflected[2])
+                channels = reflected[0] + reflected[1] + reflected[2]
+                gain = weight * channels
                 total += gain
                 is_picked = int(1)
                 if candidates > 1:
                     sample.all_open += reflected * weight
                     sample.all_open_diffuse += wp.cw_mul(f.diffuse, drawn.radiance) * weight
-                    sample.most_open = wp.max(sample.most_open, reflected * (weight / gain))
+                    sample.most_open = wp.max(sample.most_open, reflected / channels)
                     # What is left of the number is uniform again. A NaN is picked, and is seen.
                     if u_pick * total >= gain:
                         is_picked = 0

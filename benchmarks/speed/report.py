@@ -53,9 +53,8 @@ renderer. The error with them is the column `all`.
 Without a gradient `mis` samples otherwise: it picks a direction toward the light among eight, with
 what all would bring as its control variate, and gives more samples to pixels where a pilot finds
 noise (`warpir.render.allocation`), here by the error of linear radiance, by which it is judged. So
-the forward image has an error of its own.
-Pictures are shared out by the error that is shown, in which highlights hardly count: the gain on
-metal below is theirs.
+the forward image has an error of its own. Pictures are shared out by the error that is shown, in
+which highlights hardly count: the gain on metal below is theirs.
 
 The ratios say how many times longer Mitsuba takes when its error has come down to ours, in image or
 in gradient, whichever it reaches sooner. It may split its samples between object and plane as suits

@@ -154,11 +154,6 @@ def glass_emitter(
     sample.valid = 0
     sample.L = wp.vec3(0.0)
     sample.weight = 0.0
-    sample.all_open = wp.vec3(0.0)
-    sample.all_open_diffuse = wp.vec3(0.0)
-    sample.picked_open = wp.vec3(0.0)
-    sample.picked_open_diffuse = wp.vec3(0.0)
-    sample.most_open = wp.vec3(0.0)
     if is_smooth(interface):
         return sample
     drawn = light_sample(light, u)
@@ -170,17 +165,18 @@ def glass_emitter(
         if drawn.pdf > 0.0 and (wp.max(drawn.radiance) > 0.0 or keep_dark == 1):
             origin = offset_origin(surface.position, surface.ng, drawn.wi, mesh.epsilon)
             weight = power_heuristic(drawn.pdf, value[3]) / drawn.pdf
-            weight = weight * visibility(mesh, material, texture, origin, drawn.wi)
+            visible = visibility(mesh, material, texture, origin, drawn.wi)
             start = receiver_start(mesh, receiver, surface, point, drawn.wi)
-            weight = weight * receiver_visibility(receiver, start, drawn.wi)
-            if weight > 0.0 and receiver.shines == 1:
-                weight = weight * (1.0 - photo_behind(receiver, origin, drawn.wi)[3])
+            visible = visible * receiver_visibility(receiver, start, drawn.wi)
+            if visible > 0.0 and receiver.shines == 1:
+                visible = visible * (1.0 - photo_behind(receiver, origin, drawn.wi)[3])
             sample.valid = 1
             sample.f.diffuse = wp.vec3(0.0)
             sample.f.specular = wp.vec3(value[0], value[1], value[2])
             sample.f.pdf = value[3]
             sample.L = drawn.radiance
-            sample.weight = weight
+            sample.visible = visible
+            sample.weight = weight * visible
     return sample
 
 
