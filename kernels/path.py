@@ -5,10 +5,11 @@ that the receiver gains by it, the part of differential rendering that DiPIR's r
 (`warpir.kernels.receiver`). Or it is seen in a glossy ground, as a mirror image.
 
 Each vertex traces one direction toward the light, picked among candidates, and one of the BSDF
-(`warpir.kernels.scatter`); the BSDF's direction continues the path. What all candidates of the
-first vertex would bring is a control variate for the one. `trace_foreground` sums radiance and, if
-asked, writes down what the two adjoints need: `warpir.kernels.light_gradient` for the light,
-`warpir.kernels.shade` for the materials. Detached: no backward pass.
+(`warpir.kernels.scatter`); the BSDF's direction continues the path. At the first vertex a thread
+knows from its samples before how often light arrives, by where it comes from: what of it is
+expected is a control variate, and what is uncertain is traced. `trace_foreground` sums radiance
+and, if asked, writes down what the two adjoints need: `warpir.kernels.light_gradient` for the
+light, `warpir.kernels.shade` for the materials. Detached: no backward pass.
 """
 
 from enum import IntEnum
@@ -41,13 +42,18 @@ from warpir.kernels.receiver import (
 from warpir.kernels.receiver_mesh import receiver_mesh_hit
 from warpir.kernels.sampling import light_eval
 from warpir.kernels.scatter import (
+    Arrival,
+    ArrivalBins,
     Scatter,
-    arrived_share,
     bsdf_weight,
+    expected_arrival,
+    light_count,
     limited,
     sample_bsdf,
     sample_emitter,
     surface_bsdf,
+    unknown_arrival,
+    variate_share,
 )
 from warpir.kernels.tracing.hit import Hit
 from warpir.kernels.tracing.ray import camera_hit, camera_ray, closest_hit
@@ -90,6 +96,7 @@ def scatter(
     wo: wp.vec3,
     is_last: int,
     candidates: int,
+    arrival: Arrival,
     keep_dark: int,
     index: int,
     key: wp.uint32,
@@ -97,7 +104,8 @@ def scatter(
 ) -> Scatter:
     """Draw, weigh and trace the two directions of one path vertex.
 
-    ``is_last`` is that of `sample_bsdf`, ``candidates`` and ``keep_dark`` are `sample_emitter`'s.
+    ``is_last`` is that of `sample_bsdf`, ``candidates``, ``arrival`` and ``keep_dark`` are
+    `sample_emitter`'s.
     """
     out = Scatter()
     out.direct = wp.vec3(0.0)
@@ -114,7 +122,7 @@ def scatter(
     pick = hash_pair(hash_pair(key, wp.uint32(index)), wp.uint32(vertex) + PICK)
     emitter = sample_emitter(
         mesh, material, texture, receiver, light, surface, bsdf, frame,
-        candidates, to_unit(pick), keep_dark, index, key, vertex,
+        candidates, arrival, to_unit(pick), keep_dark, index, key, vertex,
     )  # fmt: skip
     out.emitter = emitter
     if emitter.valid == 1:
@@ -137,7 +145,7 @@ def scatter(
     if sample.visible > 0.0:
         Li = light_eval(light, sample.wi)
         out.L_bsdf = Li.radiance
-        out.weight_bsdf = bsdf_weight(sample, float(candidates) * Li.pdf)
+        out.weight_bsdf = bsdf_weight(sample, light_count(candidates) * Li.pdf)
     if sample.from_receiver == 1 or sample.visible > 0.0:
         out.direct += wp.cw_mul(f_sample, out.L_bsdf) * out.weight_bsdf
         out.direct_diffuse += wp.cw_mul(sample.f.diffuse, out.L_bsdf) * out.weight_bsdf
@@ -168,6 +176,7 @@ def scatter_with_glass(
     is_glass: int,
     wo: wp.vec3,
     candidates: int,
+    arrival: Arrival,
     keep_dark: int,
     index: int,
     key: wp.uint32,
@@ -188,7 +197,7 @@ def scatter_with_glass(
         rest.metallic = metallic_beside(surface.metallic, point)
         event = scatter(
             mesh, material, texture, receiver, light, lamps,
-            rest, wo, 0, candidates, keep_dark, index, key, vertex,
+            rest, wo, 0, candidates, arrival, keep_dark, index, key, vertex,
         )  # fmt: skip
     if event.bsdf.next.valid == 1:
         left = transmittance(mesh, glass, surface, point, event.bsdf)
@@ -366,8 +375,8 @@ def foreground_kernel(
         radiance_emission = wp.vec3(0.0)
         count = float(0.0)
         if wp.static(from_camera):
-            picks = float(0.0)
-            arrived = float(0.0)
+            picks = ArrivalBins(0.0)
+            arrived = ArrivalBins(0.0)
 
         # One loop over vertices rather than one over paths: a thread whose path has ended starts
         # the next one at once instead of waiting for the longest path among its neighbours (1.5 x
@@ -450,6 +459,10 @@ def foreground_kernel(
                     keep_surface(vertex_record, record_row, index, surface, wo)
 
             among = candidates
+            arrival = unknown_arrival()
+            if wp.static(from_camera):
+                if k == 0:
+                    arrival = expected_arrival(picks, arrived)
             if k > wp.static(int(not from_camera)):
                 among = wp.min(candidates, LATER_CANDIDATES)
             if wp.static(has_solid_glass):
@@ -461,7 +474,7 @@ def foreground_kernel(
                 interfaces += is_glass
                 event = scatter_with_glass(
                     mesh, material, texture, receiver, light, lamps, glass,
-                    surface, glassy, is_glass, wo, among, keep_dark,
+                    surface, glassy, is_glass, wo, among, arrival, keep_dark,
                     path, key, k,
                 )  # fmt: skip
             else:
@@ -470,7 +483,7 @@ def foreground_kernel(
                     is_last = 1  # lamps in front of a hit are seen by the closest alone
                 event = scatter(
                     mesh, material, texture, receiver, light, lamps,
-                    surface, wo, is_last, among, keep_dark, path, key, k,
+                    surface, wo, is_last, among, arrival, keep_dark, path, key, k,
                 )  # fmt: skip
             if vertex_record.material.shape[1] > 0:
                 keep_event(vertex_record, record_row, k * spp * rays + index, event)
@@ -490,13 +503,14 @@ def foreground_kernel(
             if wp.static(from_camera):
                 if k == 0 and candidates > 1 and event.emitter.valid == 1:
                     # Before this path's own light is added: the share must not depend on its pick.
-                    kept = arrived_share(event.emitter, radiance, arrived / wp.max(picks, 1.0))
-                    radiance += wp.cw_mul(event.emitter.all_open - event.emitter.picked_open, kept)
+                    emitter = event.emitter
+                    kept = variate_share(emitter, radiance)
+                    radiance += wp.cw_mul(emitter.all_expected - emitter.picked_expected, kept)
                     radiance_diffuse += wp.cw_mul(
-                        event.emitter.all_open_diffuse - event.emitter.picked_open_diffuse, kept
+                        emitter.all_expected_diffuse - emitter.picked_expected_diffuse, kept
                     )
-                    picks += 1.0
-                    arrived += event.emitter.visible
+                    picks[emitter.bin] = picks[emitter.bin] + 1.0
+                    arrived[emitter.bin] = arrived[emitter.bin] + emitter.visible
             if k == 0:
                 radiance += event.direct
                 radiance_diffuse += event.direct_diffuse

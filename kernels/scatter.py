@@ -20,6 +20,28 @@ from warpir.kernels.types import LightArgs, MaterialArgs, MeshArgs, ReceiverArgs
 
 wp.set_module_options({"enable_backward": False})
 
+BINS = 5
+ArrivalBins = wp.types.vector(length=BINS, dtype=float)
+"""A number for each kind of direction (`arrival_bin`)."""
+BRIGHT_BIN = wp.constant(4)
+BRIGHT_PDF = wp.constant(1.0)
+"""Density of the light's proposal from which on a direction is bright; an even light's is .08
+[1/sr]."""
+LIGHT_COUNT = wp.constant(6.0)
+"""Most directions of the light as which picking one of many counts in the power heuristic: the one
+ray leaves the noise of what stands in its way. On an object with highlights and shadows 8 of 8
+leave up to 6 % more noise; 2 twice as much where a metal mirrors the sun."""
+
+
+@wp.struct
+class Arrival:
+    """Whether light arrives, by the kind of direction it comes from."""
+
+    share: ArrivalBins
+    """What is expected to arrive of it."""
+    deviation: ArrivalBins
+    """Of whether it does, up to a factor; above 0."""
+
 
 @wp.struct
 class EmitterSample:
@@ -36,16 +58,18 @@ class EmitterSample:
     """``cos visible mis / pdf``, without f."""
     visible: float
     """Share of light from infinity that arrives along it; ``weight`` has it."""
-    all_open: wp.vec3
-    """What all candidates would bring if nothing stood in the light's way [radiance]."""
-    all_open_diffuse: wp.vec3
+    bin: int
+    """What kind of direction it is (`arrival_bin`)."""
+    all_expected: wp.vec3
+    """What all candidates would bring if of each the share arrived that is expected [radiance]."""
+    all_expected_diffuse: wp.vec3
     """The diffuse lobe's part of it."""
-    picked_open: wp.vec3
-    """What this direction, in the name of all, would bring if nothing stood in the light's way."""
-    picked_open_diffuse: wp.vec3
+    picked_expected: wp.vec3
+    """What this direction, in the name of all, would bring if the expected share arrived."""
+    picked_expected_diffuse: wp.vec3
     """The diffuse lobe's part of it."""
-    most_open: wp.vec3
-    """The most that ``picked_open`` could have been, by channel."""
+    most_expected: wp.vec3
+    """The most that ``picked_expected`` could have been, by channel."""
 
 
 @wp.struct
@@ -98,6 +122,69 @@ def surface_bsdf(surface: Surface, wo: wp.vec3, frame: Frame) -> Bsdf:
     )
 
 
+@wp.func
+def arrival_bin(wi: wp.vec3, pdf: float) -> int:
+    """Return the kind of a direction of the light, by which light arrives more or less often.
+
+    The bright ones are one kind, a sun; the others are told by their quarter of the compass.
+
+    Args:
+        wi: World frame.
+        pdf: Of the light's proposal [1/sr].
+    """
+    kind = int(0)
+    if wi[0] > 0.0:
+        kind += 1
+    if wi[2] > 0.0:
+        kind += 2
+    if pdf > BRIGHT_PDF:
+        kind = BRIGHT_BIN
+    return kind
+
+
+@wp.func
+def expected_arrival(picks: ArrivalBins, arrived: ArrivalBins) -> Arrival:
+    """Return what to expect of each kind of direction.
+
+    One more pick of each kind is taken to be as all kinds are together, so that few picks are not
+    believed. If light has always arrived, or never, all of it or none is expected, and of that
+    there is no noise; but no deviation is 0, for then no direction of the kind would be picked (a
+    rule of succession: Laplace 1814).
+
+    Args:
+        picks: Directions traced before.
+        arrived: The sum of the shares of light that arrived along them.
+    """
+    all_picks = float(0.0)
+    all_arrived = float(0.0)
+    for kind in range(wp.static(BINS)):
+        all_picks += picks[kind]
+        all_arrived += arrived[kind]
+    pooled = all_arrived / wp.max(all_picks, 1.0)
+    doubted = (all_arrived + 0.5) / (all_picks + 1.0)
+    out = Arrival()
+    for kind in range(wp.static(BINS)):
+        out.share[kind] = (arrived[kind] + pooled) / (picks[kind] + 1.0)
+        p = (arrived[kind] + doubted) / (picks[kind] + 1.0)
+        out.deviation[kind] = wp.sqrt(p * (1.0 - p))
+    return out
+
+
+@wp.func
+def unknown_arrival() -> Arrival:
+    """Return what to expect where nothing was traced: every kind of direction is as uncertain."""
+    out = Arrival()
+    out.share = ArrivalBins(0.0)
+    out.deviation = ArrivalBins(1.0)
+    return out
+
+
+@wp.func
+def light_count(candidates: int) -> float:
+    """Return as how many directions of the light picking one of so many counts in MIS."""
+    return wp.min(float(candidates), LIGHT_COUNT)
+
+
 @wp.func(inline=True)
 def sample_emitter(
     mesh: MeshArgs,
@@ -109,6 +196,7 @@ def sample_emitter(
     bsdf: Bsdf,
     frame: Frame,
     candidates: int,
+    arrival: Arrival,
     u_pick: float,
     keep_dark: int,
     index: int,
@@ -117,11 +205,12 @@ def sample_emitter(
 ) -> EmitterSample:
     """Draw directions from the light's proposal, pick one and trace it.
 
-    One is picked by the sum of channels that each brings if nothing stands in its way, and it
-    stands for all of them (resampled importance sampling: Talbot, Cline & Egbert 2005, "Importance
-    Resampling for Global Illumination", eq. 5, in one pass over the candidates). All are weighed
-    against the BSDF's direction by the power heuristic with their number as the sample count (Veach
-    1997).
+    One is picked, and stands for all of them (resampled importance sampling: Talbot, Cline & Egbert
+    2005, "Importance Resampling for Global Illumination", eq. 5, in one pass over the candidates).
+    The number that decides is the deviation of what each brings: its sum of channels if nothing
+    stands in its way, times that of whether light arrives, ``sqrt(p (1 - p))``. What is expected of
+    it is in the control variate (`variate_share`), and needs no ray. All are weighed against the
+    BSDF's direction by the power heuristic with `light_count` as the sample count (Veach 1997).
 
     Args:
         mesh: The object's triangles.
@@ -133,7 +222,8 @@ def sample_emitter(
         bsdf: How, toward the camera.
         frame: Of the shading normal.
         candidates: How many directions are drawn; 1 with ``keep_dark``.
-        u_pick: Uniform number that picks one; `arrived_share` asks that it depends on no other.
+        arrival: From `expected_arrival`.
+        u_pick: Uniform number that picks one; `variate_share` asks that it depends on no other.
         keep_dark: 1 weighs directions too that bring nothing now: a gradient needs them.
         index: Of the path.
         key: Of the pixel.
@@ -143,10 +233,10 @@ def sample_emitter(
     sample.valid = 0
     sample.L = wp.vec3(0.0)
     sample.weight = 0.0
-    sample.all_open = wp.vec3(0.0)
-    sample.all_open_diffuse = wp.vec3(0.0)
-    sample.most_open = wp.vec3(0.0)
-    count = float(candidates)
+    sample.all_expected = wp.vec3(0.0)
+    sample.all_expected_diffuse = wp.vec3(0.0)
+    sample.most_expected = wp.vec3(0.0)
+    count = light_count(candidates)
     total = float(0.0)
     picked = float(0.0)
     for c in range(candidates):
@@ -158,16 +248,20 @@ def sample_emitter(
             f = bsdf_f(bsdf, wi)
             reflected = wp.cw_mul(f.diffuse + f.specular, drawn.radiance)
             if drawn.pdf > 0.0 and (wp.max(reflected) > 0.0 or keep_dark == 1):
-                pdf = count * drawn.pdf
-                weight = wi[2] * power_heuristic(pdf, f.pdf) / pdf
+                weight = wi[2] * power_heuristic(count * drawn.pdf, f.pdf)
+                weight = weight / (float(candidates) * drawn.pdf)
+                kind = arrival_bin(drawn.wi, drawn.pdf)
+                deviation = arrival.deviation[kind]
                 channels = reflected[0] + reflected[1] + reflected[2]
-                gain = weight * channels
+                gain = weight * channels * deviation
                 total += gain
                 is_picked = int(1)
                 if candidates > 1:
-                    sample.all_open += reflected * weight
-                    sample.all_open_diffuse += wp.cw_mul(f.diffuse, drawn.radiance) * weight
-                    sample.most_open = wp.max(sample.most_open, reflected / channels)
+                    expected = weight * arrival.share[kind]
+                    sample.all_expected += reflected * expected
+                    sample.all_expected_diffuse += wp.cw_mul(f.diffuse, drawn.radiance) * expected
+                    most = (reflected / channels) * (arrival.share[kind] / deviation)
+                    sample.most_expected = wp.max(sample.most_expected, most)
                     # What is left of the number is uniform again. A NaN is picked, and is seen.
                     if u_pick * total >= gain:
                         is_picked = 0
@@ -179,16 +273,18 @@ def sample_emitter(
                     picked = gain
                     sample.valid = 1
                     sample.wi = drawn.wi
+                    sample.bin = kind
                     sample.f = f
                     sample.L = drawn.radiance
                     sample.weight = weight
     if sample.valid == 1:
         if candidates > 1:
             sample.weight = sample.weight * (total / picked)
-            sample.most_open = sample.most_open * total
+            sample.most_expected = sample.most_expected * total
             f = sample.f
-            sample.picked_open = wp.cw_mul(f.diffuse + f.specular, sample.L) * sample.weight
-            sample.picked_open_diffuse = wp.cw_mul(f.diffuse, sample.L) * sample.weight
+            expected = sample.weight * arrival.share[sample.bin]
+            sample.picked_expected = wp.cw_mul(f.diffuse + f.specular, sample.L) * expected
+            sample.picked_expected_diffuse = wp.cw_mul(f.diffuse, sample.L) * expected
         origin = offset_origin(surface.position, surface.ng, sample.wi, mesh.epsilon)
         sample.visible = visibility(mesh, material, texture, origin, sample.wi)
         sample.visible = sample.visible * sky_visibility(receiver, origin, sample.wi)
@@ -197,25 +293,24 @@ def sample_emitter(
 
 
 @wp.func
-def arrived_share(sample: EmitterSample, gathered: wp.vec3, arrived: float) -> wp.vec3:
-    """Return how much of ``all_open - picked_open`` to add to a sum of samples, by channel.
+def variate_share(sample: EmitterSample, gathered: wp.vec3) -> wp.vec3:
+    """Return how much of ``all_expected - picked_expected`` to add to a sum, by channel.
 
     That difference has the mean 0 over ``u_pick``, so any factor that does not depend on ``u_pick``
-    leaves the sum unbiased; the share of light that arrives takes the most of the noise of picking,
-    and all of it where nothing stands in the light's way (a control variate: Owen 2013, "Monte
-    Carlo Theory, Methods and Examples", section 8.9). It is bounded so that no pick can take more
-    than a half of what was gathered before: no sum falls below 0.
+    leaves the sum unbiased. The whole of it leaves the noise of what arrives beside what was
+    expected to (a control variate: Owen 2013, "Monte Carlo Theory, Methods and Examples", section
+    8.9). It is bounded so that no pick can take more than a half of what was gathered before: no
+    sum falls below 0.
 
     Args:
         sample: Of the emitter.
         gathered: The sum of the samples before this one.
-        arrived: The share of their picked directions along which light arrived.
     """
-    taken = arrived * (sample.most_open - sample.all_open)
-    share = wp.vec3(arrived)
+    taken = sample.most_expected - sample.all_expected
+    share = wp.vec3(1.0)
     for c in range(3):
         if taken[c] > 0.5 * gathered[c]:
-            share[c] = arrived * (0.5 * gathered[c] / taken[c])
+            share[c] = 0.5 * gathered[c] / taken[c]
     return share
 
 

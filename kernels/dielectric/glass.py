@@ -28,7 +28,7 @@ from warpir.kernels.receiver_mesh import (
     receiver_visibility,
 )
 from warpir.kernels.sampling import light_eval, light_sample, power_heuristic
-from warpir.kernels.scatter import BsdfSample, EmitterSample, Scatter
+from warpir.kernels.scatter import BsdfSample, EmitterSample, Scatter, arrival_bin
 from warpir.kernels.tracing.hit import Hit, face_normal, hit_position, offset_origin
 from warpir.kernels.tracing.ray import closest_hit, visibility
 from warpir.kernels.tracing.surface import Surface
@@ -174,6 +174,7 @@ def glass_emitter(
             sample.f.diffuse = wp.vec3(0.0)
             sample.f.specular = wp.vec3(value[0], value[1], value[2])
             sample.f.pdf = value[3]
+            sample.bin = arrival_bin(drawn.wi, drawn.pdf)
             sample.L = drawn.radiance
             sample.visible = visible
             sample.weight = weight * visible

@@ -11,7 +11,13 @@ from warpir.kernels.maths.latlong import bilinear_tap, direction_to_uv
 from warpir.kernels.maths.rng import hash_pair, hash_uint, pixel_seed, sobol_pair, to_unit
 from warpir.kernels.receiver_mesh import receiver_visibility
 from warpir.kernels.sampling import light_eval, power_heuristic
-from warpir.kernels.scatter import bsdf_weight, sample_bsdf, sample_emitter, surface_bsdf
+from warpir.kernels.scatter import (
+    bsdf_weight,
+    sample_bsdf,
+    sample_emitter,
+    surface_bsdf,
+    unknown_arrival,
+)
 from warpir.kernels.tracing.hit import offset_origin
 from warpir.kernels.tracing.ray import camera_hit, camera_ray, visibility
 from warpir.kernels.tracing.surface import Surface, surface_at
@@ -347,7 +353,7 @@ def trace_paths(
         if k > 0:
             emitter = sample_emitter(
                 mesh, material, texture, receiver, proposal, surface, bsdf, frame,
-                1, 0.0, 0, q, key, k,
+                1, unknown_arrival(), 0.0, 0, q, key, k,
             )  # fmt: skip
             if emitter.weight > 0.0:
                 value = wp.cw_mul(throughput, emitter.f.diffuse + emitter.f.specular)

@@ -180,9 +180,9 @@ class ObjectLaunch:
 
 CANDIDATES = 8
 """Directions of the light among which the object's first vertex picks the one that it traces, with
-what all would bring as its control variate. Seconds times squared error on two cores: a quarter of
-that of four without it on a matte ball, and two thirds on a metal one. Sixteen gain a fifth on the
-ball and lose as much on an object in its own shadow."""
+what is expected of all as its control variate. Seconds times squared error on two cores: a quarter
+of that of four without it on a matte ball, and two thirds on a metal one. Sixteen gain a fifth on
+the ball and lose as much on an object in its own shadow."""
 THROWN_LIMIT = 0.125
 """Of `ReceiverLaunch.indirect_limit`, for light on the ground: there 64 samples of a path of
 radiance 8 leave a speck of a tenth, and the whole bounce is a few hundredths."""
