@@ -161,12 +161,17 @@ def expected_arrival(picks: ArrivalBins, arrived: ArrivalBins) -> Arrival:
         all_picks += picks[kind]
         all_arrived += arrived[kind]
     pooled = all_arrived / wp.max(all_picks, 1.0)
-    doubted = (all_arrived + 0.5) / (all_picks + 1.0)
+    # The complement of a share is counted, not subtracted from 1: of many samples, which nearly
+    # all see the light, the difference would round to 0.
+    missed = (wp.max(all_picks - all_arrived, 0.0) + 0.5) / (all_picks + 1.0)
+    seen = (all_arrived + 0.5) / (all_picks + 1.0)
     out = Arrival()
     for kind in range(wp.static(BINS)):
-        out.share[kind] = (arrived[kind] + pooled) / (picks[kind] + 1.0)
-        p = (arrived[kind] + doubted) / (picks[kind] + 1.0)
-        out.deviation[kind] = wp.sqrt(p * (1.0 - p))
+        one_more = picks[kind] + 1.0
+        out.share[kind] = (arrived[kind] + pooled) / one_more
+        p = (arrived[kind] + seen) / one_more
+        q = (wp.max(picks[kind] - arrived[kind], 0.0) + missed) / one_more
+        out.deviation[kind] = wp.sqrt(p * q)
     return out
 
 
