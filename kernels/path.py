@@ -461,7 +461,7 @@ def foreground_kernel(
             among = candidates
             arrival = unknown_arrival()
             if wp.static(from_camera):
-                if k == 0:
+                if k == 0 and candidates > 1:
                     arrival = expected_arrival(picks, arrived)
             if k > wp.static(int(not from_camera)):
                 among = wp.min(candidates, LATER_CANDIDATES)
