@@ -184,50 +184,52 @@ FAINTEST = 40.0
 """Exponent of a lobe's faintest part that a map holds [1]: below, float32 beside any light is 0."""
 
 
-def rasterize_lobes(lobes: Lobes, height: int, width: int, side: int = 6) -> FloatArray:
+def rasterize_lobes(lobes: Lobes, height: int, width: int) -> FloatArray:
     """Return the mean radiance of the lobes in each texel, shape [height, width, 3].
 
     For files and summaries; power within 1 %. A lobe whose standard deviation is below a quarter of
-    a texel is put into its texel with its flux. Along a texel's side lie ``side`` directions, an
-    even number.
+    a texel is put into its texel with its flux.
     """
     texels = np.zeros((height, width, 3))
     lobes = _some(lobes, lobes.amplitude.max(axis=1) > 0.0)
-    # A lobe of two texels and more is as good with a ninth of the directions.
-    broad = lobes.sharpness <= (height / (2.0 * np.pi)) ** 2
-    if side > 2 and broad.any():
-        texels += rasterize_lobes(_some(lobes, broad), height, width, 2)
-        lobes = _some(lobes, ~broad)
-        if not len(lobes.sharpness):
-            return texels.astype(np.float32)
-    omega = texel_solid_angles(height, width)
     narrow = lobes.sharpness > (4.0 * height / np.pi) ** 2
-    # Rows at the two-point Gauss-Legendre nodes of even bands: midpoints misjudge a lobe at a pole
-    # by up to 4 %.
-    step = np.pi / (height * side)
-    theta = (np.arange(height * side) // 2 * 2 + 1.0) * step
-    theta += np.tile([-1.0, 1.0], height * side // 2) * step / np.sqrt(3.0)
-    lon = longitudes(width * side)
-    # Within the texels at a pole, the points nearer to it stand for less of the sphere.
-    share = np.sin(theta).reshape(height, side)
-    share /= share.sum(axis=1, keepdims=True)
-    for amplitude, axis, s in zip(
-        lobes.amplitude[~narrow], lobes.axis[~narrow], lobes.sharpness[~narrow], strict=True
-    ):
-        rows = _rows_near(axis, s, height)
-        part = theta[rows.start * side : rows.stop * side]
-        x, y, z = axis.astype(np.float64)
-        cosine = np.outer(np.sin(part), x * np.sin(lon) + z * np.cos(lon))
-        cosine += (y * np.cos(part))[:, None]
-        shape = np.exp(s * (cosine - 1.0))
-        fine = shape.reshape(-1, side, width, side).mean(axis=3)
-        fine = (fine * share[rows, :, None]).sum(axis=1)
-        texels[rows] += fine[..., None] * amplitude
+    # A lobe of two texels and more is as good with few directions.
+    broad = lobes.sharpness <= (height / (2.0 * np.pi)) ** 2
+    _add_lobes(texels, _some(lobes, broad), 2, 1)
+    _add_lobes(texels, _some(lobes, ~broad & ~narrow), 6, 6)
+    omega = texel_solid_angles(height, width)
     for flux, axis in zip(lobes.flux()[narrow], lobes.axis[narrow], strict=True):
         u, v = uv_of(axis.astype(np.float64))
         i, j = min(int(v * height), height - 1), int(u * width) % width
         texels[i, j] += flux / omega[i]
     return texels.astype(np.float32)
+
+
+def _add_lobes(texels: Float64Array, lobes: Lobes, along: int, across: int) -> None:
+    """Add the mean of so many directions in each texel, an even number of rows and some columns."""
+    height, width = texels.shape[:2]
+    # Rows at the two-point Gauss-Legendre nodes of even bands: midpoints misjudge a lobe at a pole
+    # by up to 4 %.
+    step = np.pi / (height * along)
+    theta = (np.arange(height * along) // 2 * 2 + 1.0) * step
+    theta += np.tile([-1.0, 1.0], height * along // 2) * step / np.sqrt(3.0)
+    sin_theta, cos_theta = np.sin(theta), np.cos(theta)
+    lon = longitudes(width * across)
+    sin_lon, cos_lon = np.sin(lon), np.cos(lon)
+    # Within the texels at a pole, the points nearer to it stand for less of the sphere.
+    share = sin_theta.reshape(height, along, 1)
+    share = (share / share.sum(axis=1, keepdims=True)).astype(np.float32)
+    for amplitude, axis, s in zip(lobes.amplitude, lobes.axis, lobes.sharpness, strict=True):
+        rows = _rows_near(axis, s, height)
+        part = slice(rows.start * along, rows.stop * along)
+        x, y, z = s * axis.astype(np.float64)
+        exponent = np.outer(sin_theta[part], x * sin_lon + z * cos_lon)
+        exponent += (y * cos_theta[part] - s)[:, None]
+        fine = np.exp(exponent.astype(np.float32))
+        if across > 1:
+            fine = fine.reshape(-1, width, across).mean(axis=2)
+        mean = (fine.reshape(-1, along, width) * share[rows]).sum(axis=1)
+        texels[rows] += mean[..., None] * amplitude
 
 
 def _rows_near(axis: FloatArray, sharpness: float, height: int) -> slice:
