@@ -191,7 +191,7 @@ def test_estimate_follows_the_ground_where_its_albedo_is_stated(
 
     def estimated(**values: object) -> tuple[estimate.Estimate, FloatArray]:
         config = InsertConfig(photo="p", asset="a", out="o", tone="linear", **values)
-        made = estimate_light(inputs_of(0.3), config.light, config.tone_operator, "cpu")
+        made = estimate_light(inputs_of(0.3), config.light, config.tone_operator)
         assert made.light.light.lobes is not None
         return made, made.light.light.lobes.amplitude
 

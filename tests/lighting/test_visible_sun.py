@@ -277,11 +277,11 @@ def test_run_says_that_it_saw_the_sun(is_wanted: bool, monkeypatch: pytest.Monke
     """The estimate takes the sun over and prints it; ``--no-visible-sun`` leaves the regression."""
     view, regression = camera_of(), regression_of()
     _, axis = view.ray(0.3 * WIDTH, 0.22 * HEIGHT)
-    monkeypatch.setattr(estimate, "load_regressor", lambda path, device: None)
+    monkeypatch.setattr(estimate, "load_regressor", lambda path: None)
     monkeypatch.setattr(estimate, "regress", lambda network, photo, camera: regression)
     config = InsertConfig(out="o", demo=True, visible_sun=is_wanted)
     inputs = inputs_of(sunny(view, axis), view)
-    seen = estimate.estimate_light(inputs, config.light, config.tone_operator, "cpu")
+    seen = estimate.estimate_light(inputs, config.light, config.tone_operator)
     assert ("the photo shows the sun" in seen.light.assumed[0]) == is_wanted
     assert (seen.regression is regression) != is_wanted
     assert (seen.regression.record()["sun_in_view"] is not None) == is_wanted

@@ -208,7 +208,7 @@ def test_start_is_the_regressed_light(folder: Path, tmp_path: Path) -> None:
 
     for tone, albedo in (("linear", None), ("reinhard", None), ("linear", 0.9)):
         run = made_run(config_of(folder, tone=tone, ground_albedo=albedo), tmp_path)
-        estimate = estimate_light(run.inputs, run.config.light, run.config.tone_operator, "cpu")
+        estimate = estimate_light(run.inputs, run.config.light, run.config.tone_operator)
         start = recover.Start(estimate.light, estimate)
         unknowns = recover.unknowns_of(run, start)
         found = estimate.regression

@@ -41,19 +41,19 @@ def estimate_light(
     inputs: Inputs,
     asked: LightConfig,
     tone: str,
-    device: str,
     regression: Regression | None = None,
 ) -> Estimate:
     """Estimate the light of the photo with the regressor, and check its level by the ground.
 
-    What the regressor sees in the photo may be given where it is known.
+    On the CPU, which is done before torch has started on a GPU. What the regressor sees in the
+    photo may be given where it is known.
 
     Raises:
         InputError: The weights are absent or damaged (`ExitCode.MODEL`).
     """
     path = None if asked.regressor is None else Path(asked.regressor)
     if regression is None:
-        regression = regress(load_regressor(path, device), inputs.photo.srgb, inputs.camera)
+        regression = regress(load_regressor(path), inputs.photo.srgb, inputs.camera)
     if asked.visible_sun:
         regression = with_visible_sun(regression, inputs.photo.srgb, inputs.camera)
     stops, ground = asked.exposure, None

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import copy
 import math
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from typing import Any
 
@@ -150,7 +151,9 @@ def regress(network: Regressor, photo_srgb: AnyFloatArray, camera: Camera) -> Re
     photo = _network_photo(photo_srgb).to(device)
     rays = torch.from_numpy(camera_rays(camera)).to(device).permute(2, 0, 1)[None].double()
     # In float64, so that kinds of processors, which round sums differently, agree on the light.
-    prediction = copy.deepcopy(network).double().predict(photo, rays)
+    exact = copy.deepcopy(network).double()
+    with ThreadPoolExecutor(2) as pool:  # torch itself has one thread
+        prediction = exact.predict(photo, rays, pool.map)
     return _regression(network, prediction, float(mean_luminance(photo)), camera)
 
 

@@ -16,7 +16,7 @@ from __future__ import annotations
 
 import itertools
 import math
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -239,16 +239,19 @@ class Regressor(nn.Module):
         )
 
     @torch.no_grad()
-    def predict(self, photo: Tensor, rays: Tensor) -> Prediction:
+    def predict(self, photo: Tensor, rays: Tensor, call: Callable[..., Any] = map) -> Prediction:
         """Return the mean over photo and mirror image, with calibrated logits.
 
         Args:
             photo: Display-encoded, shape [B, 3, 96, 144].
             rays: Unit viewing directions, camera-yaw frame, shape [B, 3, 96, 144].
+            call: As `map`; that of a pool looks at both at once.
         """
         turned = rays.flip(-1) * rays.new_tensor([-1.0, 1.0, 1.0]).view(1, 3, 1, 1)
-        seen = self.split(self(photo, rays))
-        reflected = self.mirrored(self.split(self(photo.flip(-1), turned)))
+        look = torch.no_grad()(self)  # which is a thread's own
+        flat = call(look, (photo, photo.flip(-1)), (rays, turned))
+        seen, reflected = map(self.split, flat)
+        reflected = self.mirrored(reflected)
         both = (0.5 * (a + b) for a, b in zip(seen, reflected, strict=True))
         mean = Prediction(*both)
         return mean._replace(logits=mean.logits / self.temperature)

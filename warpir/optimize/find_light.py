@@ -67,13 +67,12 @@ def _guided(run: Run, given: SceneLight | None) -> LitRun:
 
 def _estimated(run: Run) -> tuple[SceneLight, dict[str, Any]]:
     """Estimate the light from the photo; return it and its entry in ``run.json``."""
-    is_fixed = run.config.render.deterministic
-    arithmetic = fixed_arithmetic(run.device, is_fixed)
+    arithmetic = fixed_arithmetic("cpu", run.config.render.deterministic)
     with no_collection(), run.timings.stage("regress"), arithmetic:
         from warpir.lighting.estimate import estimate_light
 
         config = run.config
-        estimate = estimate_light(run.inputs, config.light, config.tone_operator, run.device)
+        estimate = estimate_light(run.inputs, config.light, config.tone_operator)
     run.log.assume(*estimate.light.assumed)
     return estimate.light, estimate.record()
 

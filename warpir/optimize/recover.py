@@ -118,9 +118,7 @@ def recover(run: Run, given: SceneLight | None) -> Outcome:
 def _estimated(run: Run) -> Start:
     """Return the regressor's estimate from the photo; log its assumptions."""
     with run.timings.stage("regress"):
-        estimate = estimate_light(
-            run.inputs, run.config.light, run.config.tone_operator, run.device
-        )
+        estimate = estimate_light(run.inputs, run.config.light, run.config.tone_operator)
     run.log.assume(*estimate.light.assumed)
     return Start(estimate.light, estimate)
 

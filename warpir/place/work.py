@@ -145,7 +145,7 @@ def _prepared(config: InsertConfig, width: int, say: Say) -> tuple[Inputs, Scene
     lit = make_light(inputs, config.light, tone)
     if lit is None:
         seen = KEPT.regression(config, whole.camera)
-        lit = estimate_light(inputs, config.light, tone, device, seen).light
+        lit = estimate_light(inputs, config.light, tone, seen).light
     detail = detail_of(inputs, lit.curves, PREVIEW_ROWS)
     lit = replace(lit, detailed=with_detail(lit.light, detail))
     say({"stage": "picture", "share": 0.0})
