@@ -549,9 +549,9 @@ def test_config_file_yields_to_flags(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("asked", "size", "samples"),
     [
-        (None, (1280, 853), 48),
-        (None, (2000, 1500), 48),
-        (None, (4000, 1500), 24),
+        (None, (1280, 853), 40),
+        (None, (2000, 1500), 40),
+        (None, (4000, 1500), 20),
         (None, (4000, 3000), 16),
         (None, (20000, 10000), 16),
         (7, (4000, 3000), 7),

@@ -577,8 +577,8 @@ def test_preview_of_a_large_photo_is_small(inputs: Path, tmp_path: Path, device:
     run = go(argv, tmp_path / "out")
     assert run.image().shape == (1152, 1728, 3)
     assert run.image("progress/preview-000000.png").shape == (576, 864, 3)
-    assert run.record["measured"]["samples"] == 48
-    assert "--samples 192" in (run.out / "report.html").read_text()
+    assert run.record["measured"]["samples"] == 40
+    assert "--samples 160" in (run.out / "report.html").read_text()
 
 
 @pytest.mark.parametrize("change", ["replaced", "removed"])

@@ -199,7 +199,7 @@ class RenderConfig:
     """How the picture is rendered, and on what."""
 
     samples: int | None = option(None, "N", low=1, high=2**20)
-    """Mean samples per pixel, more where noise is (default: 48; above 3 megapixels the fewer, the
+    """Mean samples per pixel, more where noise is (default: 40; above 3 megapixels the fewer, the
     more pixels share what is seen, down to 16)"""
     rays: int = option(1, "N", low=1, high=2**10)
     """Rays per sample, of light and of surface each"""
@@ -235,7 +235,7 @@ class RenderConfig:
         """Return the samples of each pixel of a picture of this size [px]."""
         if self.samples is not None:
             return self.samples
-        return min(48, max(16, round(48 * SAMPLED_PIXELS / (width * height))))
+        return min(40, max(16, round(40 * SAMPLED_PIXELS / (width * height))))
 
     @property
     def bounce_depth(self) -> int:

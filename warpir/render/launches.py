@@ -186,6 +186,10 @@ the ball and lose as much on an object in its own shadow."""
 THROWN_LIMIT = 0.125
 """Of `ReceiverLaunch.indirect_limit`, for light on the ground: there 64 samples of a path of
 radiance 8 leave a speck of a tenth, and the whole bounce is a few hundredths."""
+THROWN_SHARE = 3
+"""Samples of the receiver for one of the light that the object throws there: with as many it takes
+three fifths of the time and holds a seventh of the squared error. Not in blocks of pixels, where
+noise would bend what is interpolated."""
 
 
 @dataclass(frozen=True)
@@ -253,8 +257,9 @@ class ReceiverLaunch:
         thrown = np.zeros_like(lit)
         if self.bounce_depth and may_gain.any():
             launch = self.thrown(renderer)
+            few = spp if self.is_recorded else max(1, spp // THROWN_SHARE)
             thrown[may_gain] = launch.thrown(
-                renderer, pixels[may_gain], may_see_object[may_gain], spp, thrown_record
+                renderer, pixels[may_gain], may_see_object[may_gain], few, thrown_record
             )
         return lit + thrown, unoccluded, thrown
 
