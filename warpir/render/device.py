@@ -13,6 +13,7 @@ from concurrent.futures import ThreadPoolExecutor, as_completed
 from dataclasses import dataclass
 from functools import cache
 from itertools import product
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -32,6 +33,8 @@ from warpir.kernels.shadow_ratio import shadow_ratio
 from warpir.kernels.tracing.gbuffer import trace_gbuffer
 from warpir.kernels.types import LAYERS
 
+PLAIN_KERNELS = trace_gbuffer, trace_receiver, trace_plane_shadow, shadow_ratio, tone_foreground
+"""Kernels without variants."""
 SAMPLES_PER_SLICE = 1 << 16
 """CPU work of one launch; keeps launches under half a second, so that Ctrl-C is answered."""
 
@@ -130,26 +133,34 @@ def load_kernels(
     """
     wanted = list(variants)
     has_lamps = any(flags[3] for flags in wanted)
-    settle_hashes(
-        bool(device.is_cpu),
-        has_lamps,
-        any(any(flags[4:]) for flags in wanted),
-        max((flags[0] for flags in wanted), default=0),
-    )
     # The longest to compile come first
     kernels = [*(foreground_kernel(*flags) for flags in wanted), trace_receiver, trace_gbuffer]
     kernels += [trace_lamps] if has_lamps else []
     kernels += [trace_plane_shadow, draw_light, tone_foreground, shadow_ratio]
     modules = list(dict.fromkeys(kernel.module for kernel in kernels))
+    if not all(is_cached(module, device) for module in modules):
+        settle_hashes(
+            bool(device.is_cpu),
+            has_lamps,
+            any(any(flags[4:]) for flags in wanted),
+            max((flags[0] for flags in wanted), default=0),
+        )
     with ThreadPoolExecutor(core_count()) as pool:
-        # As a launch does: on the CPU there are no blocks.
-        loads = [
-            pool.submit(module.load, device, 1 if device.is_cpu else module.options["block_dim"])
-            for module in modules
-        ]
+        loads = [pool.submit(m.load, device, _block_dim(m, device)) for m in modules]
         for done, load in enumerate(as_completed(loads)):
             load.result()
             progress("compiling kernels", (done + 1) / len(modules))
+
+
+def _block_dim(module: wp.Module, device: wp.Device) -> int:
+    """Return the threads of a block in a launch; on the CPU there are no blocks."""
+    return 1 if device.is_cpu else int(module.options["block_dim"])
+
+
+def is_cached(module: wp.Module, device: wp.Device) -> bool:
+    """Whether a module was compiled before, by this process or another."""
+    name = module.get_module_identifier(_block_dim(module, device))
+    return Path(wp.config.kernel_cache_dir, name).is_dir()
 
 
 @cache
@@ -160,7 +171,7 @@ def settle_hashes(
 
     Modules share functions, and building one changes what Warp 1.19 hashes of the next: without
     this a second run finds the first run's module under another hash and compiles it again (26 s
-    on an H200).
+    on an H200). Where all that a run loads is cached, nothing is built, and this saves its time.
 
     Args:
         is_cpu: Whether they are for the CPU.
@@ -169,7 +180,7 @@ def settle_hashes(
         layers: What extensions materials have (``MaterialArgs.any_layers``); those of most have
             kernels of their own only where they are needed.
     """
-    kernels = [trace_gbuffer, trace_receiver, trace_plane_shadow, shadow_ratio, tone_foreground]
+    kernels = list(PLAIN_KERNELS)
     viewers = (Viewer.CAMERA, Viewer.GROUND)
     # No ground with a mesh mirrors.
     mirror = (False, Viewer.MIRROR)
@@ -212,7 +223,12 @@ class Launcher:
         self.threads = threads or core_count()
         self._progress = progress or (lambda stage, share: None)
         self.span = 0.0, 1.0
-        settle_hashes(bool(device.is_cpu))
+        if not all(is_cached(kernel.module, device) for kernel in PLAIN_KERNELS):
+            self.settle()
+
+    def settle(self) -> None:
+        """Compute hashes before something is compiled (`settle_hashes`)."""
+        settle_hashes(bool(self.device.is_cpu))
 
     def launch(
         self,
@@ -236,7 +252,9 @@ class Launcher:
         if count == 0:
             return
         # Else a launch takes 256, and compiles a module anew that has another.
-        block_dim = 1 if self.device.is_cpu else kernel.module.options["block_dim"]
+        block_dim = _block_dim(kernel.module, self.device)
+        if not is_cached(kernel.module, self.device):
+            self.settle()
         wp.load_module(kernel.module, device=self.device)
         size = count
         if self.device.is_cpu:

@@ -111,19 +111,22 @@ class Renderer(Launcher):
         is_ordered: bool = False,
         bounce_depth: int = 0,
     ) -> None:
-        super().__init__(scene.device, threads, progress)
-        if scene.lamps or scene.has_solid_glass:
-            settle_hashes(
-                bool(self.device.is_cpu),
-                bool(scene.lamps),
-                scene.has_solid_glass,
-                scene.material_args.any_layers,
-            )
-        self.bounce_depth = bounce_depth if scene.triangle_count else 0
         self.scene = scene
+        super().__init__(scene.device, threads, progress)
+        self.bounce_depth = bounce_depth if scene.triangle_count else 0
         self.memory, self.lower = memory or Memory(str(self.device.alias)), lower
         self.is_ordered = is_ordered or bool(self.device.is_cpu)
         self.bad_pixels = BadPixels()
+
+    def settle(self) -> None:
+        """Do `Launcher.settle` for the scene."""
+        scene = self.scene
+        settle_hashes(
+            bool(self.device.is_cpu),
+            bool(scene.lamps),
+            scene.has_solid_glass,
+            scene.material_args.any_layers,
+        )
 
     def load_kernels(self, mirrors: bool = False) -> None:
         """Compile or load what a picture of the scene needs, all at once.
