@@ -172,20 +172,19 @@ def _checked_formula(layers: Layers) -> str:
     Raises:
         ValueError: It does not.
     """
-    recomputed = (
-        layers.foreground[..., :3]
-        + (1.0 - layers.foreground[..., 3:]) * layers.plate * layers.shadow_ratio
-    )
     formula = "RGB = fg.RGB + (1 - fg.A) * plate.RGB * shadow.RGB"
-    if layers.mirror is not None:
-        recomputed = recomputed + layers.mirror
-        formula += " + mirror.RGB"
-    if layers.grain is not None:
-        recomputed = recomputed + layers.grain
-        formula += " + grain.RGB"
-    if not np.allclose(layers.composite, recomputed, rtol=2e-3, atol=2e-3, equal_nan=True):
-        worst = float(np.nanmax(np.abs(layers.composite - recomputed)))
-        raise ValueError(f"composite differs from its layers by up to {worst:g}")
+    added = []
+    for name, plane in (("mirror", layers.mirror), ("grain", layers.grain)):
+        if plane is not None:
+            added.append(plane)
+            formula += f" + {name}.RGB"
+    planes = layers.composite, layers.foreground, layers.plate, layers.shadow_ratio, *added
+    # By the row: what lies between would be the largest arrays of a run.
+    for composite, foreground, plate, ratio, *more in zip(*planes, strict=True):
+        recomputed = foreground[:, :3] + (1.0 - foreground[:, 3:]) * plate * ratio + sum(more)
+        if not np.allclose(composite, recomputed, rtol=2e-3, atol=2e-3, equal_nan=True):
+            worst = float(np.nanmax(np.abs(composite - recomputed)))
+            raise ValueError(f"composite differs from its layers by up to {worst:g}")
     return formula
 
 

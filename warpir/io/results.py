@@ -11,7 +11,9 @@ import hashlib
 import os
 import re
 import shutil
-from collections.abc import Iterable, Mapping
+import threading
+from collections.abc import Callable, Iterable, Mapping
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
 from pathlib import Path
 from typing import Any
@@ -21,6 +23,7 @@ import numpy as np
 from warpir.core.arrays import FloatArray, PixelArray
 from warpir.core.atomic import remove_folder, sha256_of, sync, write_staged
 from warpir.core.errors import ExitCode, InputError, disk_error
+from warpir.core.memory import core_count
 from warpir.core.signals import Stopped, whole
 from warpir.core.strict_json import json_bytes, read_json_object
 from warpir.io.folder_lock import FolderLock, make_folder, no_folder
@@ -70,6 +73,7 @@ class OutputFolder:
         self._is_new = False
         self._superseded: list[Path] = []
         self._hashes: dict[str, str] = {}
+        self._of_writer = threading.local()  # within `write_together`, what a writer stages
         self._run: dict[str, Any] = {}
 
     def __enter__(self) -> "OutputFolder":
@@ -166,7 +170,8 @@ class OutputFolder:
             write_staged(path, content)
         except OSError as error:
             raise disk_error(self.path / name, error) from error
-        self._hashes[name] = hashlib.sha256(content).hexdigest()
+        hashes = getattr(self._of_writer, "hashes", self._hashes)
+        hashes[name] = hashlib.sha256(content).hexdigest()
 
     def write_json(self, name: str, content: Mapping[str, Any]) -> None:
         """Stage a JSON file; ``run.json`` gets the sha256 of all others and is written last.
@@ -251,6 +256,25 @@ class OutputFolder:
             description="Preview: rolled by half its width, so that -Z is in the "
             "middle; scaled and clipped to 8 bits",
         )
+
+    def write_together(self, *writers: Callable[[], Any]) -> list[Any]:
+        """Call writers side by side, one per core, and return what they return.
+
+        Their files are listed, and the first error is raised, in the writers' order.
+        """
+
+        def call(writer: Callable[[], Any]) -> tuple[Any, dict[str, str]]:
+            self._of_writer.hashes = hashes = dict[str, str]()
+            return writer(), hashes
+
+        with ThreadPoolExecutor(core_count()) as pool:
+            calls = [pool.submit(call, writer) for writer in writers]
+        results = []
+        for done in calls:
+            result, hashes = done.result()
+            results.append(result)
+            self._hashes |= hashes
+        return results
 
     # What keeps a run out.
 

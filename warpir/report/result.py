@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import asdict, dataclass, replace
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -41,7 +42,7 @@ NOT_HANDED_OVER = (
 )
 PREVIEW_SAMPLES = 16
 """Camera samples per pixel of the preview of an unguided run."""
-PREVIEW_SIDE = 1600
+PREVIEW_SIDE = 900
 """Longer side of that preview, at most [px]."""
 
 
@@ -231,8 +232,12 @@ def write_results(run: Run, light: SceneLight, picture: Picture) -> Written:
     codes = photo.encode(picture.image, picture.changed)
     # Many shadows are too faint for a code; a linear plate has no codes of the same kind.
     changed = picture.changed if photo.is_linear else (codes != photo.codes).any(axis=-1)
-    output.write_png("composite.png", codes, icc=photo.icc, mark=asked.mark)
-    clamped = write_layers(
+    maps = _maps_of(light)
+    response = None if picture.look.response is None else picture.look.response.knots()
+    output.write_json("curves.json", curves_to_json(light.curves, response))
+    output.write_json("camera.json", inputs.camera.record())
+    stored = partial(
+        write_layers,
         output,
         picture.layers,
         inputs.camera,
@@ -240,15 +245,22 @@ def write_results(run: Run, light: SceneLight, picture: Picture) -> Written:
         config=config_of_picture(run.config.flat()),
         inputs=inputs.hashes,
     )
-    maps = _write_light(output, light)
-    response = None if picture.look.response is None else picture.look.response.knots()
-    output.write_json("curves.json", curves_to_json(light.curves, response))
-    output.write_json("camera.json", inputs.camera.record())
-    pair = _write_balls(run, light)
-    handed: dict[str, Any] = {}
-    if asked.hand_off:
+
+    def hand_off() -> dict[str, Any]:
+        if not asked.hand_off:
+            return {}
         handed = _hand_off(run, light, maps, response)
         _write_viewer(run, light, maps, picture)
+        return handed
+
+    # Compression takes most of the time.
+    _, clamped, _, pair, handed = output.write_together(
+        lambda: output.write_png("composite.png", codes, icc=photo.icc, mark=asked.mark),
+        stored,
+        lambda: _write_light(output, light, maps),
+        lambda: _write_balls(run, light),
+        hand_off,
+    )
     if asked.usd:
         _write_usd(run, maps.name_on_object)
     summary = summarize(light.light)
@@ -278,20 +290,24 @@ def write_results(run: Run, light: SceneLight, picture: Picture) -> Written:
     return Written(results, maps, measured)
 
 
-def _write_light(output: OutputFolder, light: SceneLight) -> Maps:
-    """Write the maps of the lights, and the lobes if there are any."""
+def _maps_of(light: SceneLight) -> Maps:
     shadow = detail = None
-    texels = as_file_map(light.light)
-    output.write_envmap(texels)
     if light.light_shadow is not light.light:
         shadow = as_file_map(light.light_shadow)
-        output.write_envmap(shadow, "envmap_shadow")
     if light.detailed is not None:
         detail = as_file_map(light.on_object)
-        output.write_envmap(detail, "envmap_detail")
+    return Maps(as_file_map(light.light), shadow, detail)
+
+
+def _write_light(output: OutputFolder, light: SceneLight, maps: Maps) -> None:
+    """Write the maps of the lights, and the lobes if there are any."""
+    output.write_envmap(maps.light)
+    if maps.shadow is not None:
+        output.write_envmap(maps.shadow, "envmap_shadow")
+    if maps.detail is not None:
+        output.write_envmap(maps.detail, "envmap_detail")
     if light.light.lobes is not None:
         output.write_json("lobes.json", lobes_to_json(light.light.lobes))
-    return Maps(texels, shadow, detail)
 
 
 def _write_balls(run: Run, light: SceneLight) -> CodeArray:

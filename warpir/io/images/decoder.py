@@ -10,8 +10,9 @@ import logging
 import os
 import re
 import tempfile
+import threading
 from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -26,6 +27,8 @@ from warpir.io.images.kinds import KINDS, check_regular_file, check_scans, sniff
 from warpir.io.images.tiff import check_tiff, tiff_codes
 
 _LOG = logging.getLogger(__name__)
+_STDERR = threading.RLock()
+"""The process has one."""
 
 
 @dataclass(frozen=True)
@@ -471,12 +474,13 @@ def one_line(text: str) -> str:
 @contextmanager
 def captured_stderr() -> Iterator[None]:
     """Keep what C libraries print (libpng does) off the terminal; it goes to the debug log."""
-    try:
-        saved = os.dup(2)
-    except OSError:  # no stderr at all
-        yield
-        return
-    with tempfile.TemporaryFile() as sink:
+    with _STDERR, ExitStack() as stack:
+        try:
+            saved = os.dup(2)
+        except OSError:  # no stderr at all
+            yield
+            return
+        sink = stack.enter_context(tempfile.TemporaryFile())
         os.dup2(sink.fileno(), 2)
         try:
             yield

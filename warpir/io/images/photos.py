@@ -96,8 +96,10 @@ class Photo:
             assert in_profile is not None, "read_photo keeps only profiles that work both ways"
             own = in_profile
         top = np.iinfo(self.codes.dtype).max
-        edited = np.round(np.clip(own.astype(np.float64), 0.0, 1.0) * top).astype(self.codes.dtype)
-        return np.where(changed[..., None], edited, self.codes)
+        codes = self.codes.copy()
+        edited = np.clip(own[changed].astype(np.float64), 0.0, 1.0)
+        codes[changed] = np.round(edited * top).astype(codes.dtype)
+        return codes
 
 
 LABELS = 0.05

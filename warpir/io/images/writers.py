@@ -17,6 +17,7 @@ import warpir
 from warpir.core import color
 from warpir.core.arrays import CodeArray, FloatArray, PixelArray
 from warpir.core.errors import ExitCode, InputError, disk_error
+from warpir.core.memory import core_count
 from warpir.io.images.decoder import decode_image, library_error
 
 _XMP = """<?xpacket begin="\ufeff" id="W5M0MpCehiHzreSzNTczkc9d"?>
@@ -126,6 +127,7 @@ def exr_bytes(
         # OpenEXR reads a matrix's memory in order, whatever its strides say.
         is_array = isinstance(value, np.ndarray)
         attributes[key] = np.ascontiguousarray(value) if is_array else value
+    OpenEXR.set_global_thread_count(core_count())
     # In memory first: a stream cannot run full, and the size to check is known.
     stream = io.BytesIO()
     OpenEXR.File(attributes, planes).write(stream)
