@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import asdict, dataclass, replace
 from typing import Any
 
@@ -165,13 +166,15 @@ def estimate_look(
         jpeg: How the photo's file was coded, or None.
     """
     look = CameraLook(jpeg=None if grain == "off" else jpeg)
-    if sharpness == "auto":
-        look = replace(look, blur=estimate_blur(linear, region))
+    with ThreadPoolExecutor(1) as pool:
+        blur = pool.submit(estimate_blur, linear, region) if sharpness == "auto" else None
+        if grain == "auto":
+            look = replace(look, grain=estimate_grain(srgb))
+    if blur is not None:
+        look = replace(look, blur=blur.result())
     elif sharpness != "off":
         look = replace(look, blur=EdgeBlur(float(sharpness), 0))
-    if grain == "auto":
-        look = replace(look, grain=estimate_grain(srgb))
-    elif grain != "off":
+    if grain not in ("auto", "off"):
         strength = float(grain) / 255.0
         look = replace(look, grain=Grain((0.5,), ((strength,) * 3,), 0.0, 0.0))
     if response == "auto":

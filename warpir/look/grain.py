@@ -208,17 +208,19 @@ def grain_over(
     # Other frames of a sequence have other grain.
     frame = zlib.crc32(np.ascontiguousarray(plate[::8, ::8], np.float32).tobytes())
     height, width = matte[box].shape
-    noise = grain.draw((height, width), seed, frame)[changed[box]]
-    linear = np.clip(composite[changed], 0.0, 1.0)
-    shown = linear ** (1.0 / gamma)
-    wanted = grain.deviation(shown)
-    before = np.clip(plate[changed], 1e-6, 1.0) ** (1.0 / gamma)
-    share = (1.0 - matte[changed])[:, None]
-    # Of the photo's grain the uncovered share is left, scaled as its signal is.
-    kept = share * grain.deviation(before) * np.minimum(shown / before, 1.0)
-    lacking = np.sqrt(np.maximum(wanted**2 - kept**2, 0.0))
-    noisy = np.clip(shown + lacking * noise, 0.0, 1.0) ** gamma
-    added[changed] = noisy - linear
+    # By the row: what lies between would be the largest arrays of a run.
+    for y, noise in enumerate(grain.draw((height, width), seed, frame), rows[0]):
+        here = changed[y]
+        linear = np.clip(composite[y, here], 0.0, 1.0)
+        shown = linear ** (1.0 / gamma)
+        wanted = grain.deviation(shown)
+        before = np.clip(plate[y, here], 1e-6, 1.0) ** (1.0 / gamma)
+        share = (1.0 - matte[y, here])[:, None]
+        # Of the photo's grain the uncovered share is left, scaled as its signal is.
+        kept = share * grain.deviation(before) * np.minimum(shown / before, 1.0)
+        lacking = np.sqrt(np.maximum(wanted**2 - kept**2, 0.0))
+        noisy = np.clip(shown + lacking * noise[here[box[1]]], 0.0, 1.0) ** gamma
+        added[y, here] = noisy - linear
     return added
 
 

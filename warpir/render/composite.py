@@ -61,18 +61,23 @@ def make_picture(
 
     The arguments are those of `render` and `composite`.
     """
-    rendering = render(
-        renderer,
-        light_fg,
-        light_shadow,
-        quality,
-        curve_fg,
-        curve_shadow,
-        is_reinhard,
-        shadow_mask=shadow_mask,
-        behind=behind,
+    return composite(
+        render(
+            renderer,
+            light_fg,
+            light_shadow,
+            quality,
+            curve_fg,
+            curve_shadow,
+            is_reinhard,
+            shadow_mask=shadow_mask,
+            behind=behind,
+        ),
+        photo,
+        quality.seed,
+        occluder,
+        look,
     )
-    return composite(rendering, photo, quality.seed, occluder, look)
 
 
 def composite(
@@ -91,7 +96,9 @@ def composite(
         occluder: Share of the photo that stays in front of the object [1], shape [H, W].
         look: What the camera did to the photo, to be repeated on object and shadow.
     """
-    planes = dict(rendering.planes)
+    planes, curves = dict(rendering.planes), rendering.curves
+    counts = rendering.object_pixel_count, rendering.receiver_pixel_count
+    del rendering  # of whose planes some are replaced now, the largest arrays of a run
     enlarged = photo.srgb.shape[1] / planes["matte"].shape[1]
     if planes["matte"].shape != photo.srgb.shape[:2]:
         planes = resize_planes(planes, *photo.srgb.shape[:2])
@@ -99,7 +106,7 @@ def composite(
     planes = look.shown_like_photo(planes, photo.linear())
     cut = 0
     if "image" in planes:
-        planes["mirror"], cut = shown_mirror(planes, photo.linear(), rendering.curves, look)
+        planes["mirror"], cut = shown_mirror(planes, photo.linear(), curves, look)
     if occluder is not None:
         planes = _behind(planes, occluder)
     layers = _layers(planes, photo)
@@ -108,7 +115,6 @@ def composite(
         changed |= (layers.mirror != 0.0).any(axis=-1)
     layers = _with_grain(layers, look, changed, seed, photo.is_deep)
     image = linear_to_gamma(layers.composite).astype(np.float32)
-    counts = rendering.object_pixel_count, rendering.receiver_pixel_count
     return Picture(layers, image, changed, *counts, look, cut)
 
 
