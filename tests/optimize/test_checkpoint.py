@@ -8,7 +8,7 @@ import torch
 
 from warpir.core.atomic import FORMAT, MANIFEST, STATE, Checkpoints
 from warpir.core.errors import ExitCode, InputError
-from warpir.io.results import remove_unfinished
+from warpir.io.unfinished import remove_unfinished
 
 IDENTITY = {"config": {"steps": 10, "sun": (1.0, 2.0)}, "inputs": {"photo": "ab"}}
 

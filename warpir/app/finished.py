@@ -14,7 +14,7 @@ from warpir.app.model_files import model_hashes
 from warpir.app.record import file_hash, input_files
 from warpir.app.reuse import check_files, run_record
 from warpir.core.errors import ExitCode, InputError
-from warpir.io.results import results_in
+from warpir.io.unfinished import results_in
 
 
 class OtherRun(InputError):

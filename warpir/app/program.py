@@ -158,10 +158,10 @@ def run_program(run: Callable[[list[str]], int], argv: Sequence[str] | None = No
 def _leave(status: int) -> None:
     """End the process without taking torch and Warp down, which takes them half a second.
 
-    Where a stream cannot be written any more, or a thread still runs, nothing is done: Python's own
-    way to the end waits, and tells of it.
+    Where a stream cannot be written any more, a thread still runs, or a profiler is to tell what it
+    saw, nothing is done: Python's own way to the end waits, and tells of it.
     """
-    if threading.active_count() > 1:
+    if threading.active_count() > 1 or sys.getprofile() is not None or sys.flags.interactive:
         return
     atexit._run_exitfuncs()
     try:

@@ -179,7 +179,7 @@ def _checked_formula(layers: Layers) -> str:
             added.append(plane)
             formula += f" + {name}.RGB"
     planes = layers.composite, layers.foreground, layers.plate, layers.shadow_ratio, *added
-    # By the row: what lies between would be the largest arrays of a run.
+    # By the row, for memory
     for composite, foreground, plate, ratio, *more in zip(*planes, strict=True):
         recomputed = foreground[:, :3] + (1.0 - foreground[:, 3:]) * plate * ratio + sum(more)
         if not np.allclose(composite, recomputed, rtol=2e-3, atol=2e-3, equal_nan=True):

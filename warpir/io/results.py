@@ -9,10 +9,9 @@ removes what was half in place.
 import errno
 import hashlib
 import os
-import re
 import shutil
 import threading
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
 from pathlib import Path
@@ -21,29 +20,29 @@ from typing import Any
 import numpy as np
 
 from warpir.core.arrays import FloatArray, PixelArray
-from warpir.core.atomic import remove_folder, sha256_of, sync, write_staged
+from warpir.core.atomic import sha256_of, sync, write_staged
 from warpir.core.errors import ExitCode, InputError, disk_error
 from warpir.core.memory import core_count
 from warpir.core.signals import Stopped, whole
-from warpir.core.strict_json import json_bytes, read_json_object
+from warpir.core.strict_json import json_bytes
 from warpir.io.folder_lock import FolderLock, make_folder, no_folder
 from warpir.io.images import writers
+from warpir.io.unfinished import (
+    NEW_PREVIEWS,
+    PLAIN_NAME,
+    PREVIEWS,
+    RUN_JSON,
+    STAGING,
+    UNFINISHED,
+    half_in_place,
+    remove_empty_folders,
+    remove_unfinished,
+    results_in,
+    unchanged_files,
+)
 
-_PREVIEWS, _NEW_PREVIEWS = "progress", "progress-new"
-"""The second holds those of a run that is to replace an earlier result, until it does."""
-_PREVIEW = re.compile(r"preview-[0-9]{6,}\.png")
-UNFINISHED = {
-    "checkpoints": re.compile(r"[0-9]{6,}-[a-z-]+-[0-9]+|\.partial-.*"),
-    _PREVIEWS: _PREVIEW,
-    _NEW_PREVIEWS: _PREVIEW,
-}
-"""Folders of an output folder that hold what a run needs, or shows, before it has results."""
 _OWN_FOLDERS = (*UNFINISHED, "mitsuba")
 """Folders that a run makes."""
-_PLAIN_NAME = re.compile(r"(?:[A-Za-z0-9][A-Za-z0-9_.-]{0,99}/)?[A-Za-z0-9][A-Za-z0-9_.-]{0,99}")
-"""A file, or a file in a folder of the output folder."""
-_RUN_JSON = "run.json"
-_STAGING = ".partial-"
 
 
 class OutputFolder:
@@ -67,7 +66,7 @@ class OutputFolder:
         self.path = Path(path)
         self.overwrite = overwrite
         self.is_resumed = is_resumed
-        self.staging = self.path / f"{_STAGING}{os.getpid()}"
+        self.staging = self.path / f"{STAGING}{os.getpid()}"
         """On the file system of the results; what lies there is removed at the end."""
         self._lock = FolderLock(self.path)
         self._is_new = False
@@ -162,7 +161,7 @@ class OutputFolder:
         Raises:
             InputError: The disk is full or the folder is not writable (exit 5).
         """
-        if not _PLAIN_NAME.fullmatch(name):
+        if not PLAIN_NAME.fullmatch(name):
             raise ValueError(f"not a plain file name: {name!r}")
         path = self.staging / name
         try:
@@ -179,7 +178,7 @@ class OutputFolder:
         Raises:
             ValueError: A number is not finite.
         """
-        if name == _RUN_JSON:
+        if name == RUN_JSON:
             self._run = dict(content)
             json_bytes(self._run, _plain)
         else:
@@ -215,7 +214,7 @@ class OutputFolder:
         # A run that was killed while it replaced the earlier result has left its own there. One
         # that was killed after it, before its checkpoints were gone, goes on beside its own result.
         is_new = self._holds_a_result() and not self.is_resumed
-        folder = _NEW_PREVIEWS if is_new or (self.path / _NEW_PREVIEWS).is_dir() else _PREVIEWS
+        folder = NEW_PREVIEWS if is_new or (self.path / NEW_PREVIEWS).is_dir() else PREVIEWS
         path = self.path / folder / f"preview-{step:06d}.png"
         staged = self.staging / path.name
         try:
@@ -260,7 +259,8 @@ class OutputFolder:
     def write_together(self, *writers: Callable[[], Any]) -> list[Any]:
         """Call writers side by side, one per core, and return what they return.
 
-        Their files are listed, and the first error is raised, in the writers' order.
+        Their files are listed, and the first error is raised, in the writers' order, when all have
+        ended: nothing is staged behind a signal.
         """
 
         def call(writer: Callable[[], Any]) -> tuple[Any, dict[str, str]]:
@@ -268,13 +268,10 @@ class OutputFolder:
             return writer(), hashes
 
         with ThreadPoolExecutor(core_count()) as pool:
-            calls = [pool.submit(call, writer) for writer in writers]
-        results = []
-        for done in calls:
-            result, hashes = done.result()
-            results.append(result)
+            done = list(pool.map(call, writers))
+        for _, hashes in done:
             self._hashes |= hashes
-        return results
+        return [result for result, _ in done]
 
     # What keeps a run out.
 
@@ -300,7 +297,7 @@ class OutputFolder:
         """Refuse a folder in use; hidden files and an unfinished run's do not count as results."""
         found = results_in(self.path)
         if found and not self.overwrite:
-            shown = _RUN_JSON if _RUN_JSON in found else found[0]
+            shown = RUN_JSON if RUN_JSON in found else found[0]
             more = f" and {len(found) - 1} more" if len(found) > 1 else ""
             raise InputError(
                 self.path,
@@ -326,7 +323,7 @@ class OutputFolder:
                 ExitCode.OUTPUT,
                 reason="output.lock_deleted",
             )
-        for name in (_RUN_JSON, *self._hashes):
+        for name in (RUN_JSON, *self._hashes):
             target = self.path / name
             if not self.overwrite and os.path.lexists(target):
                 what = "came while the run was under way"
@@ -357,11 +354,11 @@ class OutputFolder:
         """
         self._require_whole()
         names = sorted(self._hashes)
-        old = _unchanged(self.path / _RUN_JSON, self.path)
+        old = unchanged_files(self.path / RUN_JSON, self.path)
         leftover = [name for name in old if name not in self._hashes]
         run = {**self._run, "files": dict(self._hashes)}
         try:
-            write_staged(self.staging / _RUN_JSON, json_bytes(run, _plain))
+            write_staged(self.staging / RUN_JSON, json_bytes(run, _plain))
             for folder in {(self.staging / name).parent for name in names} | {self.staging}:
                 sync(folder)
             self._put_in_place(names, leftover)
@@ -370,7 +367,7 @@ class OutputFolder:
         for folder in self._superseded:
             with suppress(OSError):  # nothing but room is lost when it stays
                 remove_unfinished(folder)
-        _remove_empty_folders(self.path, leftover)
+        remove_empty_folders(self.path, leftover)
 
     def _put_in_place(self, names: list[str], leftover: list[str]) -> None:
         """Remove ``run.json`` and what only the old result had; move the new files in.
@@ -378,7 +375,7 @@ class OutputFolder:
         Raises:
             OSError: A file cannot be removed or moved.
         """
-        (self.path / _RUN_JSON).unlink(missing_ok=True)
+        (self.path / RUN_JSON).unlink(missing_ok=True)
         sync(self.path)  # nothing is mixed under its name, not by a power cut
         self._show_previews()
         for name in leftover:
@@ -388,11 +385,11 @@ class OutputFolder:
             os.replace(self.staging / name, self.path / name)
         for folder in {(self.path / name).parent for name in names} | {self.path}:
             sync(folder)
-        os.replace(self.staging / _RUN_JSON, self.path / _RUN_JSON)
+        os.replace(self.staging / RUN_JSON, self.path / RUN_JSON)
         sync(self.path)
 
     def _holds_a_result(self) -> bool:
-        return (self.path / _RUN_JSON).exists()
+        return (self.path / RUN_JSON).exists()
 
     def _show_previews(self) -> None:
         """Put the previews of a run that replaces an earlier result in place of the earlier ones.
@@ -402,7 +399,7 @@ class OutputFolder:
         Raises:
             OSError: A file cannot be removed or moved.
         """
-        new, shown = self.path / _NEW_PREVIEWS, self.path / _PREVIEWS
+        new, shown = self.path / NEW_PREVIEWS, self.path / PREVIEWS
         if new.is_dir():
             remove_unfinished(shown)
             if not shown.is_dir():
@@ -415,11 +412,11 @@ class OutputFolder:
 
     def _remove_staging(self) -> None:
         """Remove what was staged, here or by a killed run, and what of it is half in place."""
-        names = _half_in_place(self.path)
+        names = half_in_place(self.path)
         for name in names:
             (self.path / name).unlink()
-        _remove_empty_folders(self.path, names)
-        for abandoned in self.path.glob(f"{_STAGING}*"):  # of killed runs: the lock is ours
+        remove_empty_folders(self.path, names)
+        for abandoned in self.path.glob(f"{STAGING}*"):  # of killed runs: the lock is ours
             shutil.rmtree(abandoned, ignore_errors=True)
 
     def _release(self) -> None:
@@ -427,73 +424,6 @@ class OutputFolder:
         if self._is_new:
             with suppress(OSError):
                 self.path.rmdir()  # only succeeds when nothing was written
-
-
-def results_in(path: Path) -> list[str]:
-    """Return the names of what counts as somebody's results in an output folder, sorted.
-
-    Hidden files do not, nor what an unfinished run has left.
-    """
-    half = set(_half_in_place(path))
-    names: set[str] = set()
-    for entry in path.iterdir():
-        own = UNFINISHED.get(entry.name)
-        is_mixed = any(name.startswith(f"{entry.name}/") for name in half)
-        if entry.is_dir() and (own or is_mixed):
-            others = (other.name for other in entry.iterdir())
-            names |= {f"{entry.name}/{n}" for n in others if not (own and own.fullmatch(n))}
-        elif not entry.name.startswith("."):
-            names.add(entry.name)
-    return sorted(names - half)
-
-
-def remove_unfinished(folder: Path) -> None:
-    """Remove what an unfinished run has left in one of its folders; what is not ours stays.
-
-    Raises:
-        OSError: The folder around it is not writable.
-    """
-    if not folder.is_dir():
-        return
-    entries = sorted(folder.iterdir())
-    ours = [entry for entry in entries if UNFINISHED[folder.name].fullmatch(entry.name)]
-    if len(ours) == len(entries):
-        remove_folder(folder)
-        return
-    for entry in ours:  # the newest last: what is left is whole at every moment
-        remove_folder(entry)
-
-
-def _half_in_place(path: Path) -> list[str]:
-    """Return the files that a run which did not get to its ``run.json`` has moved into a folder."""
-    if (path / _RUN_JSON).exists():
-        return []
-    staged = path.glob(f"{_STAGING}*/{_RUN_JSON}")
-    return sorted({name for run_json in staged for name in _unchanged(run_json, path)})
-
-
-def _unchanged(run_json: Path, folder: Path) -> list[str]:
-    """Return the files that a ``run.json`` lists, as far as they are in a folder and unchanged."""
-    try:
-        listed = read_json_object(run_json).get("files")
-    except InputError:
-        return []
-    unchanged = []
-    for name, digest in listed.items() if isinstance(listed, dict) else ():
-        path = folder / name
-        if not _PLAIN_NAME.fullmatch(name) or not path.is_file() or path.is_symlink():
-            continue
-        with suppress(OSError):  # what cannot be read stays
-            if sha256_of(path) == digest:
-                unchanged.append(name)
-    return unchanged
-
-
-def _remove_empty_folders(path: Path, names: Iterable[str]) -> None:
-    """Remove the folders of files that are gone, as far as nothing else is in them."""
-    for folder in {(path / name).parent for name in names} - {path}:
-        with suppress(OSError):
-            folder.rmdir()
 
 
 def _is_there(path: Path) -> bool:

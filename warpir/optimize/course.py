@@ -21,7 +21,7 @@ from warpir.diffusion.dataset_update import DatasetUpdate
 from warpir.diffusion.guidance import Guidance
 from warpir.diffusion.personalization.lora_files import save_lora
 from warpir.diffusion.prior import NonFiniteError
-from warpir.io.results import remove_unfinished
+from warpir.io.unfinished import remove_unfinished
 from warpir.lighting.scene_light import SceneLight
 from warpir.optimize.checkpoint import is_due
 from warpir.optimize.lit_frame import LitFrame

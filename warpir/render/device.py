@@ -208,6 +208,7 @@ class Launcher:
         device: Warp device.
         threads: CPU threads; 0 means one per core. Ignored on CUDA.
         progress: Called with the share of a stage that is done, 0 to 1, from worker threads.
+        needs: What else there is to compile: the last arguments of `settle_hashes`.
 
     Attributes:
         span: What shares of a stage are done before and after a launch.
@@ -218,17 +219,22 @@ class Launcher:
         device: wp.Device,
         threads: int = 0,
         progress: Callable[[str, float], None] | None = None,
+        needs: tuple[bool, bool, int] = (False, False, LAYERS),
     ) -> None:
         self.device = device
         self.threads = threads or core_count()
         self._progress = progress or (lambda stage, share: None)
         self.span = 0.0, 1.0
-        if not all(is_cached(kernel.module, device) for kernel in PLAIN_KERNELS):
-            self.settle()
+        self._needs = needs
+        self._ready: set[wp.Module] = set()
+        for kernel in PLAIN_KERNELS:
+            self._settle_before(kernel.module)
 
-    def settle(self) -> None:
-        """Compute hashes before something is compiled (`settle_hashes`)."""
-        settle_hashes(bool(self.device.is_cpu))
+    def _settle_before(self, module: wp.Module) -> None:
+        """Compute all hashes before a module is compiled, if it must be."""
+        if module not in self._ready and not is_cached(module, self.device):
+            settle_hashes(bool(self.device.is_cpu), *self._needs)
+        self._ready.add(module)
 
     def launch(
         self,
@@ -253,8 +259,7 @@ class Launcher:
             return
         # Else a launch takes 256, and compiles a module anew that has another.
         block_dim = _block_dim(kernel.module, self.device)
-        if not is_cached(kernel.module, self.device):
-            self.settle()
+        self._settle_before(kernel.module)
         wp.load_module(kernel.module, device=self.device)
         size = count
         if self.device.is_cpu:

@@ -22,7 +22,7 @@ from warpir.kernels.shadow_ratio import shadow_ratio
 from warpir.kernels.types import CameraArgs, LightArgs, LightRecord, MaterialArgs, VertexRecord
 from warpir.render.allocation import Judged, by_noise, pilot_seed
 from warpir.render.bad_pixels import BadPixels, all_finite, first_bad_sample_of
-from warpir.render.device import Launcher, Rows, load_kernels, settle_hashes
+from warpir.render.device import Launcher, Rows, load_kernels
 from warpir.render.device_light import drawn, plane_radiance
 from warpir.render.device_scene import Scene
 from warpir.render.launches import THROWN_LIMIT, ObjectLaunch, ReceiverLaunch, geometry_of
@@ -111,22 +111,13 @@ class Renderer(Launcher):
         is_ordered: bool = False,
         bounce_depth: int = 0,
     ) -> None:
-        self.scene = scene
-        super().__init__(scene.device, threads, progress)
+        needs = bool(scene.lamps), scene.has_solid_glass, scene.material_args.any_layers
+        super().__init__(scene.device, threads, progress, needs)
         self.bounce_depth = bounce_depth if scene.triangle_count else 0
+        self.scene = scene
         self.memory, self.lower = memory or Memory(str(self.device.alias)), lower
         self.is_ordered = is_ordered or bool(self.device.is_cpu)
         self.bad_pixels = BadPixels()
-
-    def settle(self) -> None:
-        """Do `Launcher.settle` for the scene."""
-        scene = self.scene
-        settle_hashes(
-            bool(self.device.is_cpu),
-            bool(scene.lamps),
-            scene.has_solid_glass,
-            scene.material_args.any_layers,
-        )
 
     def load_kernels(self, mirrors: bool = False) -> None:
         """Compile or load what a picture of the scene needs, all at once.

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import asdict, dataclass, replace
-from functools import partial
 from typing import Any
 
 import numpy as np
@@ -232,34 +231,17 @@ def write_results(run: Run, light: SceneLight, picture: Picture) -> Written:
     codes = photo.encode(picture.image, picture.changed)
     # Many shadows are too faint for a code; a linear plate has no codes of the same kind.
     changed = picture.changed if photo.is_linear else (codes != photo.codes).any(axis=-1)
-    maps = _maps_of(light)
-    response = None if picture.look.response is None else picture.look.response.knots()
-    output.write_json("curves.json", curves_to_json(light.curves, response))
+    maps, response = _maps_of(light), picture.look.response
+    knots = None if response is None else response.knots()
+    output.write_json("curves.json", curves_to_json(light.curves, knots))
     output.write_json("camera.json", inputs.camera.record())
-    stored = partial(
-        write_layers,
-        output,
-        picture.layers,
-        inputs.camera,
-        is_deep=photo.is_deep,
-        config=config_of_picture(run.config.flat()),
-        inputs=inputs.hashes,
-    )
-
-    def hand_off() -> dict[str, Any]:
-        if not asked.hand_off:
-            return {}
-        handed = _hand_off(run, light, maps, response)
-        _write_viewer(run, light, maps, picture)
-        return handed
-
     # Compression takes most of the time.
     _, clamped, _, pair, handed = output.write_together(
         lambda: output.write_png("composite.png", codes, icc=photo.icc, mark=asked.mark),
-        stored,
+        lambda: _write_layers(run, picture),
         lambda: _write_light(output, light, maps),
         lambda: _write_balls(run, light),
-        hand_off,
+        lambda: _hand_off(run, light, maps, picture, knots) if asked.hand_off else {},
     )
     if asked.usd:
         _write_usd(run, maps.name_on_object)
@@ -290,6 +272,17 @@ def write_results(run: Run, light: SceneLight, picture: Picture) -> Written:
     return Written(results, maps, measured)
 
 
+def _write_layers(run: Run, picture: Picture) -> int:
+    return write_layers(
+        run.output,
+        picture.layers,
+        run.inputs.camera,
+        is_deep=run.inputs.photo.is_deep,
+        config=config_of_picture(run.config.flat()),
+        inputs=run.inputs.hashes,
+    )
+
+
 def _maps_of(light: SceneLight) -> Maps:
     shadow = detail = None
     if light.light_shadow is not light.light:
@@ -318,7 +311,7 @@ def _write_balls(run: Run, light: SceneLight) -> CodeArray:
 
 
 def _hand_off(
-    run: Run, light: SceneLight, maps: Maps, response: ToneKnots | None
+    run: Run, light: SceneLight, maps: Maps, picture: Picture, response: ToneKnots | None
 ) -> dict[str, Any]:
     """Write the files for Blender, three.js and colour tools; return entries of ``run.json``."""
     inputs = run.inputs
@@ -335,6 +328,7 @@ def _hand_off(
     )
     for line in notices:
         run.log.say(f"notice: {line}")
+    _write_viewer(run, light, maps, picture)
     return handed
 
 
