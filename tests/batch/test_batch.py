@@ -48,16 +48,17 @@ if any(word.endswith(("--multiprocessing-fork", "/default_worker.py")) for word 
     from warpir.io.results import OutputFolder
     here, pid = Path(os.environ["HOOKED"]), os.getpid()
     (here / f"worker-{pid}").touch()
-    write = OutputFolder.write_envmap
-    def hooked(self, *arguments, **named):
-        write(self, *arguments, **named)
+    write = OutputFolder.write_together
+    def hooked(self, *writers):
+        done = write(self, *writers)
         (here / f"wrote-{self.path.name}").touch()
         if (here / f"kill-{self.path.name}").exists():
             (here / f"kill-{self.path.name}").unlink()
             os.kill(pid, signal.SIGKILL)
         while (here / f"wait-{self.path.name}").exists():
             time.sleep(0.01)
-    OutputFolder.write_envmap = hooked
+        return done
+    OutputFolder.write_together = hooked
 """
 """In each worker, Ray's too: files in a folder tell who is there, and what is to happen."""
 

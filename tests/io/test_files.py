@@ -7,6 +7,8 @@ import os
 import signal
 import subprocess
 import sys
+import threading
+import time
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -548,6 +550,26 @@ def test_folder_that_cannot_be_listed_is_no_output(
             enter()
         assert caught.value.code == ExitCode.RESOURCES and caught.value.where == str(tmp_path)
     assert os.listdir(tmp_path) == []
+
+
+def test_a_signal_ends_writers_with_the_file_they_are_at(tmp_path: Path) -> None:
+    """It comes while one of two has a file to go, and nothing is left of either."""
+    went_on = threading.Event()
+
+    def write(folder: OutputFolder, first: str, second: str) -> None:
+        folder.write_bytes(first, b"1")
+        if first == "a.bin":
+            os.kill(os.getpid(), signal.SIGTERM)
+        while not signals.is_pending():
+            time.sleep(0.001)
+        folder.write_bytes(second, b"2")
+        went_on.set()
+
+    with pytest.raises(signals.Stopped), signals.handled(), OutputFolder(tmp_path / "out") as out:
+        out.write_together(
+            lambda: write(out, "a.bin", "b.bin"), lambda: write(out, "c.bin", "d.bin")
+        )
+    assert not went_on.is_set() and os.listdir(tmp_path) == []
 
 
 # ------------------------------------------------------------------- folders that are replaced

@@ -12,6 +12,7 @@ from tests.render.test_transport import (
     EXACT,
     FLOOR,
     HEIGHT,
+    RUNS,
     both_ways,
     check_equal,
     check_light_gradient,
@@ -24,6 +25,7 @@ from tests.render.test_transport import (
 from warpir.core.arrays import Float64Array
 from warpir.render.device_light import light_args
 from warpir.render.device_scene import Placed, Receiver, Scene
+from warpir.render.launches import THROWN_SHARE
 from warpir.render.mis.integrator import MisIntegrator
 from warpir.render.renderer import Renderer
 from warpir.render.shadow.pilot import shaded_pixels
@@ -193,7 +195,9 @@ def test_bounce_of_transport_agrees_with_mis(
     device: str, roughness: tuple[float, float], sun: float
 ) -> None:
     """Rows of recorded directions have the expectation of `mis`: each pixel, and their sum."""
-    own, other = both_ways(bouncing(device, 2, roughness=roughness), 1, sun)
+    # As many samples of what is thrown as the object has.
+    runs = THROWN_SHARE * RUNS
+    own, other = both_ways(bouncing(device, 2, roughness=roughness), 1, sun, runs)
     check_equal(ratios_of(own), ratios_of(other), 2)
 
 

@@ -151,7 +151,9 @@ def test_transport_agrees_with_mis(
     check_equal(ratios_of(own), ratios_of(other), 2 * len(CASES))
 
 
-def both_ways(renderer: Renderer, depth: int, sun: float) -> tuple[list[Radiance], list[Radiance]]:
+def both_ways(
+    renderer: Renderer, depth: int, sun: float, runs: int = RUNS
+) -> tuple[list[Radiance], list[Radiance]]:
     """Radiance under one light by rows of recorded directions, and by `mis`, of several seeds."""
     objects, proxies = pixels_of(renderer)
     light = Light(lobes=lights(sun))
@@ -163,7 +165,7 @@ def both_ways(renderer: Renderer, depth: int, sun: float) -> tuple[list[Radiance
         for seed in range(TRACINGS)
     ]
     reference = MisIntegrator(renderer, objects, proxies, spp=512, rays=1, depth=depth)
-    other = [reference.radiance(texels, texels, 1000 + seed) for seed in range(RUNS)]
+    other = [reference.radiance(texels, texels, 1000 + seed) for seed in range(runs)]
     return own, other
 
 

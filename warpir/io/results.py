@@ -19,11 +19,11 @@ from typing import Any
 
 import numpy as np
 
+from warpir.core import signals
 from warpir.core.arrays import FloatArray, PixelArray
 from warpir.core.atomic import sha256_of, sync, write_staged
 from warpir.core.errors import ExitCode, InputError, disk_error
 from warpir.core.memory import core_count
-from warpir.core.signals import Stopped, whole
 from warpir.core.strict_json import json_bytes
 from warpir.io.folder_lock import FolderLock, make_folder, no_folder
 from warpir.io.images import writers
@@ -102,7 +102,7 @@ class OutputFolder:
         """Move the staged files into place, or on an exception remove them."""
         is_complete = False
         try:
-            with whole():
+            with signals.whole():
                 try:
                     if kind is None:
                         self._commit()
@@ -113,7 +113,7 @@ class OutputFolder:
                             self._remove_staging()
                     shutil.rmtree(self.staging, ignore_errors=True)
                     self._release()
-        except Stopped as stopped:
+        except signals.Stopped as stopped:
             if is_complete:
                 stopped.kept = f"the results in {self.path} are complete"
             raise
@@ -169,8 +169,10 @@ class OutputFolder:
             write_staged(path, content)
         except OSError as error:
             raise disk_error(self.path / name, error) from error
-        hashes = getattr(self._of_writer, "hashes", self._hashes)
-        hashes[name] = hashlib.sha256(content).hexdigest()
+        hashes = getattr(self._of_writer, "hashes", None)
+        if hashes is not None:
+            signals.check()  # it interrupts the main thread only, which waits for this one
+        (self._hashes if hashes is None else hashes)[name] = hashlib.sha256(content).hexdigest()
 
     def write_json(self, name: str, content: Mapping[str, Any]) -> None:
         """Stage a JSON file; ``run.json`` gets the sha256 of all others and is written last.
@@ -260,7 +262,11 @@ class OutputFolder:
         """Call writers side by side, one per core, and return what they return.
 
         Their files are listed, and the first error is raised, in the writers' order, when all have
-        ended: nothing is staged behind a signal.
+        ended: nothing is staged behind a signal, which ends each of them with the file it is at.
+
+        Raises:
+            InputError: The disk is full or the folder is not writable (exit 5).
+            signals.Stopped: A signal came.
         """
 
         def call(writer: Callable[[], Any]) -> tuple[Any, dict[str, str]]:
