@@ -13,6 +13,7 @@ from tests.builders.shapes import all_pixels, box, camera, ground, placed, quad,
 from warpir.core.arrays import Float64Array
 from warpir.render.device_scene import Placed, Scene
 from warpir.render.integrator import MaterialTensors, Radiance
+from warpir.render.launches import THROWN_SHARE
 from warpir.render.mis.integrator import MisIntegrator
 from warpir.render.near import rows as rows_of_lamps
 from warpir.render.near.places import place_slopes
@@ -92,7 +93,8 @@ def test_power_of_a_lamp_has_a_gradient_in_each_channel(
 
     def anew(factor: float) -> Float64Array:
         brighter = replace(lamp, power=factor * lamp.power)
-        paths = MisIntegrator(renderer([brighter], device), PIXELS, PIXELS, 512, 1, 3)
+        samples = 512 * THROWN_SHARE  # so 512 of what the object throws
+        paths = MisIntegrator(renderer([brighter], device), PIXELS, PIXELS, samples, 1, 3)
         with torch.no_grad():
             return sums(paths.radiance(SKY, SKY, 3), shadow).double().cpu().numpy()
 

@@ -281,6 +281,9 @@ class Renderer(Launcher):
         *planes, mask = by_noise(self, rows_of, judged, pixels, width, (spp, launch.rays))
         traced = self.bad_pixels.blackened(tuple(planes), pixels, width, "object", first_bad_sample)
         radiance, diffuse, emission = traced
+        # The whole is bounded by what was gathered, its parts are not (`variate_share`).
+        emission = np.minimum(emission, radiance)
+        diffuse = np.minimum(diffuse, radiance - emission)
         return Foreground(radiance, diffuse, emission, mask)
 
     def receiver(
