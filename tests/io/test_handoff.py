@@ -30,7 +30,7 @@ from tests.builders.insertions import (
     write_inputs,
 )
 from tests.builders.programs.llvm import LIBRARY, llvm
-from tests.io.test_envmap_conventions import radiance, read, threejs
+from tests.io.images.test_envmap_conventions import radiance, read, threejs
 from warpir.app.config import InsertConfig
 from warpir.app.inputs import Inputs, read_inputs
 from warpir.core.errors import InputError

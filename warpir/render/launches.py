@@ -61,21 +61,6 @@ def geometry_of(
     return tuple(array.numpy()[:count].copy() for array in out)
 
 
-def candidates(is_cpu: bool, layers: int) -> int:
-    """Return among how many directions of the light a path's first vertex picks one to trace.
-
-    What is expected of all is its control variate. On two cores 16 lower seconds times squared
-    error to .64 of that of 8 on a metal ball and to .67 on a matte one; an object that shades
-    itself has 1.03 times as much, and one with layers, where a candidate costs twice as much, 1.15
-    times. On a GPU 16 have not been measured.
-
-    Args:
-        is_cpu: Whether the CPU renders.
-        layers: Of the materials (``MaterialArgs.any_layers``).
-    """
-    return 16 if is_cpu and not layers else 8
-
-
 @dataclass(frozen=True)
 class ObjectLaunch:
     """Arguments of a path-tracing launch over the object that all pixels share."""
@@ -178,7 +163,7 @@ class ObjectLaunch:
                 self.rays,
                 lanes,
                 self.depth + is_from_ground,
-                1 if is_recorded else candidates(renderer.device.is_cpu, self.materials.any_layers),
+                1 if is_recorded else CANDIDATES,
                 self.indirect_limit,
                 self.seed,
                 alpha,
@@ -193,6 +178,11 @@ class ObjectLaunch:
         )
 
 
+CANDIDATES = 8
+"""Directions of the light among which the object's first vertex picks the one that it traces, with
+what is expected of all as its control variate. Seconds times squared error on two cores: a quarter
+of that of four without it on a matte ball, and two thirds on a metal one. Sixteen gain a fifth on
+the ball and lose as much on an object in its own shadow."""
 THROWN_LIMIT = 0.125
 """Of `ReceiverLaunch.indirect_limit`, for light on the ground: there 64 samples of a path of
 radiance 8 leave a speck of a tenth, and the whole bounce is a few hundredths."""

@@ -29,7 +29,7 @@ from warpir.core.errors import ExitCode, InputError
 from warpir.io.images import color_profile
 from warpir.io.images.photos import Photo, read_envmap, read_mask, read_photo
 
-SHARED = Path(__file__).resolve().parents[3] / "shared" / "data"
+SHARED = Path(__file__).resolve().parents[4] / "shared" / "data"
 needs_shared = pytest.mark.skipif(not SHARED.is_dir(), reason=f"no development data at {SHARED}")
 
 

@@ -15,7 +15,7 @@ from warpir.core.latlong import rotate_map
 from warpir.io.images.envmap_conventions import IN_CAMERA_AXES, SEAM_SHIFTS
 from warpir.io.images.photos import read_envmap, read_photo
 
-SHARED = Path(__file__).resolve().parents[3] / "shared" / "data"
+SHARED = Path(__file__).resolve().parents[4] / "shared" / "data"
 needs_shared = pytest.mark.skipif(not SHARED.is_dir(), reason=f"no development data at {SHARED}")
 
 
