@@ -169,10 +169,10 @@ class OutputFolder:
             write_staged(path, content)
         except OSError as error:
             raise disk_error(self.path / name, error) from error
-        hashes = getattr(self._of_writer, "hashes", None)
-        if hashes is not None:
-            signals.check()  # it interrupts the main thread only, which waits for this one
-        (self._hashes if hashes is None else hashes)[name] = hashlib.sha256(content).hexdigest()
+        hashes = getattr(self._of_writer, "hashes", self._hashes)
+        if hashes is not self._hashes:
+            signals.check()  # a signal interrupts the main thread only, which waits for this one
+        hashes[name] = hashlib.sha256(content).hexdigest()
 
     def write_json(self, name: str, content: Mapping[str, Any]) -> None:
         """Stage a JSON file; ``run.json`` gets the sha256 of all others and is written last.
