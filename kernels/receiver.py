@@ -44,6 +44,10 @@ wp.set_module_options({"enable_backward": False})
 
 INV_PI = wp.constant(0.318309886183791)
 
+LIGHT_RAYS = wp.constant(2)
+"""Directions of the light for each from `object_window` in `trace_plane_shadow`: half shadows hold
+most of the noise, and what the light sends there is cheap to draw."""
+
 GROUND_IOR = wp.constant(1.5)
 """Refractive index of a glossy ground's coat [1]."""
 
@@ -402,10 +406,10 @@ def trace_plane_shadow(
     Indices are the pixel's row and one of its ``lanes`` threads, which share its samples.
 
     What the open plane receives is the same everywhere, and the object takes a part of it: each
-    sample draws one direction from the light times the cosine and one from `object_window`, looks
-    what light the object blocks there, and combines both with the power heuristic. Near the object,
-    where the window holds all directions, the same directions say what both sums are, whose noise
-    cancels in the ratio.
+    sample draws `LIGHT_RAYS` directions from the light times the cosine and one from
+    `object_window`, looks what light the object blocks there, and combines them with the power
+    heuristic. Near the object, where the window holds all directions, the same directions say what
+    both sums are, whose noise cancels in the ratio.
 
     Args:
         pixels: Row-major pixel indices, shape [receiver_pixel].
@@ -418,7 +422,7 @@ def trace_plane_shadow(
         light: The light, its directions drawn for the plane.
         open_radiance: Radiance of the plane without the object.
         spp: Camera samples per thread.
-        rays: Directions per technique that share one camera sample.
+        rays: Directions from the window that share one camera sample.
         lanes: Threads per pixel (`warpir.kernels.maths.lanes`).
         seed: Base seed.
         lit: Mean radiance with the object over the samples that see the plane.
@@ -427,6 +431,7 @@ def trace_plane_shadow(
     i, lane = wp.tid()
     pixel = pixels[i]
     key = pixel_seed(seed, pixel)
+    light_rays = float(LIGHT_RAYS)
     lit_near = wp.vec3(0.0)
     open_near = wp.vec3(0.0)
     lost_far = wp.vec3(0.0)
@@ -442,20 +447,21 @@ def trace_plane_shadow(
             window = object_window(mesh, origin, point.normal)
             near = float(window.is_whole)
             far += (1.0 - near) * float(rays)
-            for r in range(rays):
-                index = s * rays + r
-                drawn = light_sample(light, sobol_pair(index, key, 2))
+            for r in range(s * rays * LIGHT_RAYS, (s + 1) * rays * LIGHT_RAYS):
+                drawn = light_sample(light, sobol_pair(r, key, 2))
                 cos_i = wp.dot(drawn.wi, point.normal)
                 if cos_i > 0.0 and drawn.pdf > 0.0:
                     dark = float(0.0)
                     if meets_box(origin, drawn.wi, mesh.low, mesh.high) == 1:
                         dark = 1.0 - visibility(mesh, material, texture, origin, drawn.wi)
-                    share = power_heuristic(drawn.pdf, cos_i / window.area)
-                    value = drawn.radiance * (cos_i * INV_PI * share / drawn.pdf)
+                    pdf = light_rays * drawn.pdf
+                    share = power_heuristic(pdf, cos_i / window.area)
+                    value = drawn.radiance * (cos_i * INV_PI * share / pdf)
                     open_near += value * near
                     lit_near += value * (near * (1.0 - dark))
                     lost_far += value * ((1.0 - near) * dark)
-                ray = object_ray(window, sobol_pair(index, key, 3))
+            for r in range(s * rays, (s + 1) * rays):
+                ray = object_ray(window, sobol_pair(r, key, 3))
                 if ray.weight > 0.0:
                     dark = float(0.0)
                     if meets_box(origin, ray.direction, mesh.low, mesh.high) == 1:
@@ -463,7 +469,8 @@ def trace_plane_shadow(
                     if dark > 0.0 or window.is_whole == 1:
                         Li = light_eval(light, ray.direction)
                         pdf = wp.dot(ray.direction, point.normal) / window.area
-                        value = Li.radiance * (ray.weight * power_heuristic(pdf, Li.pdf))
+                        share = power_heuristic(pdf, light_rays * Li.pdf)
+                        value = Li.radiance * (ray.weight * share)
                         open_near += value * near
                         lit_near += value * (near * (1.0 - dark))
                         lost_far += value * ((1.0 - near) * dark)
