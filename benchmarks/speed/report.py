@@ -51,10 +51,11 @@ are left out of `image`: a handful of mirrored suns holds 99 % of ToyCar's squar
 renderer. The error with them is the column `all`.
 
 Without a gradient `mis` samples otherwise: it picks a direction toward the light among eight, with
-what all would bring as its control variate, and gives more samples to pixels where a pilot finds
-noise (`warpir.render.allocation`), here by the error of linear radiance, by which it is judged. So
-the forward image has an error of its own. Pictures are shared out by the error that is shown, in
-which highlights hardly count: the gain on metal below is theirs.
+what all would bring as its control variate, and on the CPU gives more samples to pixels where a
+pilot finds noise (`warpir.render.allocation`), here by the error of linear radiance, by which it is
+judged. So the forward image has an error of its own. Pictures are shared out by the error that is
+shown, in which highlights hardly count: the gain on metal below is theirs. A GPU is not filled by a
+few noisy pixels, whose rays are long besides: below 2^26 samples it takes as many of each pixel.
 
 The ratios say how many times longer Mitsuba takes when its error has come down to ours, in image or
 in gradient, whichever it reaches sooner. It may split its samples between object and plane as suits
