@@ -86,9 +86,15 @@ def test_page_renders_what_insert_does(inputs: Path, tmp_path: Path) -> None:
     argv = command(inputs, out, "--size", "2", "--sun=-60,45,3", "--sky", "clear")
     with placing(argv, 1000, 640) as opened:
         page = opened.page
-        page.click("#preview")
-        page.wait_for_selector("#cancel:not([hidden])")
-        page.click("#cancel")
+        # A preview may be done before a pointer has come to the button, so the page itself clicks.
+        page.evaluate("""async () => {
+          const [preview, cancel] = ['preview', 'cancel'].map((id) => document.getElementById(id));
+          preview.click();
+          if (cancel.hidden) throw new Error('a preview cannot be cancelled');
+          const state = async () => (await (await fetch('progress.json')).json()).state;
+          while (await state() === 'idle');
+          cancel.click();
+        }""")
         page.wait_for_selector("#cancel", state="hidden", timeout=30_000)
         assert page.inner_text("#rendering-words") == "Cancelled."
         page.click("#preview")
