@@ -250,7 +250,7 @@ def foreground_kernel(
     has_receiver_mesh: bool,
     viewer: int,
     has_lamps: bool,
-    has_solid_glass: bool = False,
+    has_solid_glass: bool,
 ) -> wp.Kernel:
     """Return `trace_foreground` for scenes with or without these; what is not there costs nothing.
 

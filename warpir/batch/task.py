@@ -211,7 +211,7 @@ def _compile(task: Task) -> dict[str, Any]:
     for device in [choose_device(name) for name in task.config["devices"]]:
         if places:
             bounces, lamps = task.config["bounces"], task.config["lamps"]
-            cache_kernels(device, product((False, True), places, bounces, lamps))
+            cache_kernels(device, product((False, True), places, bounces, lamps, (False,)))
     return {"cuda": cuda_count()}
 
 

@@ -142,7 +142,7 @@ def load_kernels(
         settle_hashes(
             bool(device.is_cpu),
             has_lamps,
-            any(any(flags[4:]) for flags in wanted),
+            any(flags[4] for flags in wanted),
             max((flags[0] for flags in wanted), default=0),
         )
     with ThreadPoolExecutor(core_count()) as pool:
@@ -187,7 +187,7 @@ def settle_hashes(
     variants: list[tuple[int, ...]] = []
     for lamps in (False, True)[: 1 + has_lamps]:
         scenes = [*product((False, True), viewers), mirror]
-        variants += [(has, *scene, lamps) for has, scene in product((0, LAYERS), scenes)]
+        variants += [(has, *scene, lamps, False) for has, scene in product((0, LAYERS), scenes)]
     if has_solid_glass:
         seen = ((False, Viewer.CAMERA), (True, Viewer.CAMERA), mirror)
         near = (False, True)[: 1 + has_lamps]
