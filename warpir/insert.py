@@ -27,7 +27,7 @@ from warpir.app.config import InsertConfig, usage
 from warpir.app.program import attempt, require_packages, run_program, say, stay_offline
 from warpir.core.errors import ExitCode
 from warpir.core.limits import LIMITS
-from warpir.core.memory import Memory, no_collection
+from warpir.core.memory import Memory, no_collection, trim
 
 if TYPE_CHECKING:
     from warpir.app.inputs import Loaders
@@ -117,6 +117,7 @@ def _insert_one(config: InsertConfig, loaders: "Loaders | None" = None) -> Inser
             run = run.on_device(choose_device(run.config.render.device)).with_ground_coat()
         run.take_cache_notices()
         lit = find_light(run, given)
+        trim()
         if given is None and not run.config.is_guided:
             with no_collection(), lit.run.timings.stage("preview"):
                 write_preview(lit.run, lit.light)
@@ -168,6 +169,7 @@ def _write(lit: "LitRun", rendered: "RenderedResult", asked: InsertConfig) -> di
     from warpir.report.result import write_results
 
     run = lit.run
+    trim()
     with run.timings.stage("write"):
         written = write_results(run, lit.light, rendered.picture)
         if run.config.output.mitsuba:

@@ -10,10 +10,10 @@ from warpir.look.sharpness import (
     PIXEL_SIGMA,
     TYPICAL,
     EdgeBlur,
-    _blurred,
     blurred_layers,
     estimate_blur,
     gaussian,
+    shown_box,
 )
 
 FINER = 6
@@ -125,11 +125,19 @@ def test_a_part_is_blurred_as_the_whole(middle: tuple[int, int], sigma: float) -
     shaded = np.roll(seen, 4, axis=0)
     ratio[shaded] = rng.uniform(0.1, 1.0, (int(shaded.sum()), 3))
     planes = {"matte": matte, "foreground": matte[..., None] * ratio, "shadow_ratio": ratio}
-    part, whole = blurred_layers(planes, sigma, ("foreground",)), _blurred(planes, sigma)
-    for name in planes:
-        np.testing.assert_array_equal(part[name], whole[name], err_msg=name)
+    box = shown_box(planes, sigma)
+    part, whole = (
+        blurred_layers(given, sigma, ("foreground",))
+        for given in ({name: plane[box] for name, plane in planes.items()}, planes)
+    )
+    for name, plane in planes.items():
+        np.testing.assert_array_equal(part[name], whole[name][box], err_msg=name)
+        whole[name][box] = plane[box]
+        np.testing.assert_array_equal(whole[name], plane, err_msg=name)
     bare = {"matte": 0.0 * matte, "shadow_ratio": np.ones_like(ratio)}
-    assert blurred_layers(bare, sigma, ()) is bare
+    nothing = {name: plane[shown_box(bare, sigma)] for name, plane in bare.items()}
+    assert nothing["matte"].size == 0
+    assert blurred_layers(nothing, sigma, ()) is nothing
 
 
 def test_nothing_is_sharpened() -> None:

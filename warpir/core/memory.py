@@ -14,13 +14,14 @@ here: what was not loaded holds nothing.
 
 from __future__ import annotations
 
+import ctypes
 import errno
 import gc
 import os
 import resource
 import sys
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TypeVar
@@ -46,6 +47,8 @@ CERTAIN = 2.0
 SHORT = "memory.short"
 """Reason of an `InputError` that another run's end, or a smaller task, would remove."""
 MIB = 1 << 20
+M_MMAP_THRESHOLD = -3
+"""Of glibc's ``mallopt``."""
 _RSS_UNIT = 1 if sys.platform == "darwin" else 1024
 """What the system counts resident memory in [byte]."""
 
@@ -231,6 +234,19 @@ def no_collection() -> Iterator[None]:
     finally:
         if was_enabled:
             gc.enable()
+
+
+def trim() -> None:
+    """Give back what the C library keeps of freed memory: after the networks 100 MiB.
+
+    From then on arrays of a megabyte and more lie beside its heap, so that they go back when they
+    are freed, and pages of zeros that nothing is written to take no room. Networks, which ask for
+    the same again and again, would be slower so.
+    """
+    with suppress(OSError, AttributeError):  # another one than glibc
+        library = ctypes.CDLL(None)
+        library.mallopt(M_MMAP_THRESHOLD, MIB)
+        library.malloc_trim(0)
 
 
 def release() -> None:

@@ -34,6 +34,8 @@ EXCESS = 1.3
 the noise of a sensor changes little over the display values of a picture."""
 WIDEST = 2.0
 """Largest standard deviation of the blur that stands for the grain's size [px]."""
+NEAR = 32
+"""What is farther off changes nothing in JPEG [px]: two blocks of subsampled chroma."""
 
 
 @dataclass(frozen=True)
@@ -232,9 +234,18 @@ def blocks_over(
     The composite is display-linear, with the grain. Pixels that may not change get 0. ``gamma`` is
     the exponent from display values to display-linear ones.
     """
-    linear = np.clip(composite, 0.0, 1.0)
+    added = np.zeros_like(composite, np.float32)
+    if not changed.any():
+        return added
+    rows, columns = (np.flatnonzero(changed.any(axis=axis)) for axis in (1, 0))
+    box = tuple(
+        slice(max(0, int(where[0]) - NEAR), int(where[-1]) + NEAR + 1) for where in (rows, columns)
+    )
+    linear = np.clip(composite[box], 0.0, 1.0)
     shown = linear ** (1.0 / gamma)
-    codes = np.round(255.0 * shown).astype(np.uint8)
-    off = (coding.recoded(codes).astype(np.float32) - codes) / np.float32(255.0)
+    codes = np.zeros(composite.shape, np.uint8)
+    codes[box] = np.round(255.0 * shown)
+    off = (coding.recoded(codes)[box].astype(np.float32) - codes[box]) / np.float32(255.0)
     coded = np.clip(shown + off, 0.0, 1.0) ** gamma
-    return np.asarray((coded - linear) * changed[..., None], np.float32)
+    added[box] = (coded - linear) * changed[box][..., None]
+    return added

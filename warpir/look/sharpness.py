@@ -151,6 +151,33 @@ def gaussian(plane: FloatArray, sigma: float) -> FloatArray:
     return np.asarray(ndimage.correlate1d(across, kernel / kernel.sum(), axis=0), np.float32)
 
 
+def shown_box(planes: dict[str, FloatArray], sigma: float) -> tuple[slice, slice]:
+    """Return the rows and columns beyond which planes show nothing, even behind a Gaussian.
+
+    Args:
+        planes: ``shadow_ratio``, which is 1 where it shows nothing, and planes that are 0 there,
+            shape [H, W] or [H, W, 3].
+        sigma: Standard deviation [px].
+    """
+    height, width = planes["matte"].shape
+    rows, columns = np.zeros(height, np.bool_), np.zeros(width, np.bool_)
+    for name, plane in planes.items():
+        shows = plane != (1.0 if name == "shadow_ratio" else 0.0)
+        shows = shows.any(axis=-1) if shows.ndim == 3 else shows
+        rows |= shows.any(axis=1)
+        columns |= shows.any(axis=0)
+    # Twice as far as the blur reaches, so that its own border has nothing to mirror.
+    reach = 2 * (math.ceil(TRUNCATE * sigma) + 1)
+
+    def around(shows: BoolArray) -> slice:
+        where = np.flatnonzero(shows)
+        if not len(where):
+            return slice(0, 0)
+        return slice(max(0, int(where[0]) - reach), int(where[-1]) + reach + 1)
+
+    return around(rows), around(columns)
+
+
 def blurred_layers(
     planes: dict[str, FloatArray], sigma: float, summed: tuple[str, ...]
 ) -> dict[str, FloatArray]:
@@ -168,28 +195,9 @@ def blurred_layers(
     Returns:
         All planes; pixels without any share of the object or its shadow keep their values.
     """
-    if sigma <= 0.0:
+    if sigma <= 0.0 or planes["matte"].size == 0:
         return planes
-    shown = (planes["matte"] > 0.0) | (planes["shadow_ratio"] != 1.0).any(axis=-1)
-    if not shown.any():
-        return planes
-    reach = math.ceil(TRUNCATE * sigma) + 1
-    box = tuple(
-        # Twice as far as the blur reaches, so that its own border has nothing to mirror.
-        slice(max(0, int(where.min()) - 2 * reach), int(where.max()) + 2 * reach + 1)
-        for where in np.nonzero(shown)
-    )
-    names = (*summed, "matte", "shadow_ratio")
-    part = _blurred({name: planes[name][box] for name in names}, sigma)
-    result = planes | {name: planes[name].copy() for name in names}
-    for name in names:
-        result[name][box] = part[name]
-    return result
-
-
-def _blurred(planes: dict[str, FloatArray], sigma: float) -> dict[str, FloatArray]:
-    """Blur every plane, shape [H, W] or [H, W, 3]; ``shadow_ratio`` as `blurred_layers` says."""
-    result = {n: gaussian(plane, sigma) for n, plane in planes.items() if n != "shadow_ratio"}
+    result = {name: gaussian(planes[name], sigma) for name in (*summed, "matte")}
     seen = 1.0 - planes["matte"]
     weight = gaussian(seen, sigma)[..., None]
     # In differences from 1, so that ground beyond the shadow stays exactly 1.
@@ -198,4 +206,4 @@ def _blurred(planes: dict[str, FloatArray], sigma: float) -> dict[str, FloatArra
     inside = weight[..., 0] < 1e-3
     ratio[inside] = planes["shadow_ratio"][inside]
     result["shadow_ratio"] = np.maximum(ratio, 0.0).astype(np.float32)
-    return result
+    return planes | result

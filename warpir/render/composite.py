@@ -11,7 +11,8 @@ from warpir.core.color import GAMMA, linear_to_gamma
 from warpir.io.images.photos import Photo
 from warpir.io.layers import HALF_MAX, Layers
 from warpir.look.camera_look import CameraLook
-from warpir.render.picture.planes import Quality, Rendering, render
+from warpir.look.sharpness import shown_box
+from warpir.render.picture.planes import Quality, Rendering, blank, render
 from warpir.render.picture.resizing import resize_planes
 from warpir.render.renderer import Renderer
 from warpir.render.shadow.mirror import leaving_ground, shown_mirror
@@ -21,6 +22,14 @@ from warpir.scene.tone_curves import ToneKnots
 
 UNCHANGED = CameraLook()
 """Look of a camera that neither blurs nor has noise."""
+SHOWN = ("matte", "shadow_ratio", "normal", "image", "hidden", "kept")
+"""Planes that tell where there is something."""
+SUMMED_UP = ("foreground", "matte", "shadow_ratio")
+"""Planes that the composite is made of."""
+NOT_LAYERS = {"foreground", "image", "hidden", "kept"}
+"""Planes of a rendering that are no layers of their own."""
+OUTSIDE = {"shadow_ratio": 1.0, "depth": np.inf}
+"""What planes hold where there is nothing, if not 0."""
 
 
 @dataclass(frozen=True)
@@ -102,44 +111,67 @@ def composite(
     enlarged = photo.srgb.shape[1] / planes["matte"].shape[1]
     if planes["matte"].shape != photo.srgb.shape[:2]:
         planes = resize_planes(planes, *photo.srgb.shape[:2])
-    planes = look.sharpened_like_photo(planes, enlarged)
-    planes = look.shown_like_photo(planes, photo.linear())
+    plate = photo.linear()
+    shows = {name: planes[name] for name in SHOWN if name in planes}
+    box = shown_box(shows, look.blur_to_add(enlarged))
+    before = {name: plane[box] for name, plane in planes.items()}
+    after = dict(look.shown_like_photo(look.sharpened_like_photo(before, enlarged), plate[box]))
     cut = 0
     if "image" in planes:
-        planes["mirror"], cut = shown_mirror(planes, photo.linear(), curves, look)
+        after["mirror"], cut = shown_mirror(after, plate[box], curves, look)
     if occluder is not None:
-        planes = _behind(planes, occluder)
-    layers = _layers(planes, photo)
+        after = _behind(after, occluder[box])
+    after = {name: plane for name, plane in after.items() if plane is not before.get(name)}
+    del before
+    if not photo.is_deep:
+        plate = _halves(plate)
+    layers = _layers(planes, after, box, plate, photo.is_deep)
     changed = (layers.matte > 0.0) | (layers.shadow_ratio != 1.0).any(axis=-1)
     if layers.mirror is not None:
         changed |= (layers.mirror != 0.0).any(axis=-1)
     layers = _with_grain(layers, look, changed, seed, photo.is_deep)
-    image = linear_to_gamma(layers.composite).astype(np.float32)
+    image = linear_to_gamma(layers.composite).astype(np.float32, copy=False)
     return Picture(layers, image, changed, *counts, look, cut)
 
 
-def _layers(planes: dict[str, FloatArray], photo: Photo) -> Layers:
-    """Put the planes over the photo, both of one size."""
-    plate = photo.linear()
-    if not photo.is_deep:
+def _layers(
+    planes: dict[str, FloatArray],
+    after: dict[str, FloatArray],
+    box: tuple[slice, slice],
+    plate: FloatArray,
+    is_deep: bool,
+) -> Layers:
+    """Put the planes over the photo.
+
+    Args:
+        planes: Those of the rendering, of the photo's size; left are those that nothing replaces.
+        after: What is in place of some of them within the box; beyond it nothing is shown.
+        box: Rows and columns of these.
+        plate: Display-linear photo as in its layer, shape [H, W, 3].
+        is_deep: Whether the photo has more than 8 bits.
+    """
+    after = {name: planes[name][box] for name in SUMMED_UP} | after
+    if not is_deep:
         # Rounded as in the file of layers, so that they recompose exactly; rounding to
         # half changes 8-bit codes by .06 at most.
-        plate = _halves(plate)
-        for name in ("foreground", "matte", "shadow_ratio"):
-            planes[name] = _halves(planes[name])
-    matte = planes["matte"]
-    ground = (1.0 - matte)[..., None] * plate * planes["shadow_ratio"]
-    composite = planes["foreground"] + ground
-    if "mirror" in planes:
-        planes["mirror"] = leaving_ground(planes["mirror"], ground)
-        planes["mirror"] = planes["mirror"] if photo.is_deep else _halves(planes["mirror"])
-        composite = composite + planes["mirror"]
-    return Layers(
-        composite=composite,
-        foreground=np.concatenate([planes["foreground"], matte[..., None]], axis=-1),
-        plate=plate,
-        **{k: v for k, v in planes.items() if k not in {"foreground", "image", "hidden", "kept"}},
-    )
+        after |= {name: _halves(after[name]) for name in SUMMED_UP}
+    ground = (1.0 - after["matte"])[..., None] * plate[box] * after["shadow_ratio"]
+    shown = after["foreground"] + ground
+    if "mirror" in after:
+        after["mirror"] = leaving_ground(after["mirror"], ground)
+        after["mirror"] = after["mirror"] if is_deep else _halves(after["mirror"])
+        shown = shown + after["mirror"]
+    composite = plate.copy()
+    composite[box] = shown
+    object_alone = blank((*plate.shape[:2], 4), 0.0)
+    object_alone[box][..., :3], object_alone[box][..., 3] = after["foreground"], after["matte"]
+    for name in NOT_LAYERS | after.keys():
+        planes.pop(name, None)
+    for name in after.keys() - NOT_LAYERS:
+        part = after[name]
+        planes[name] = blank((*plate.shape[:2], *part.shape[2:]), OUTSIDE.get(name, 0.0))
+        planes[name][box] = part
+    return Layers(composite, object_alone, plate=plate, **planes)
 
 
 def _with_grain(

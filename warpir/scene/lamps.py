@@ -60,13 +60,13 @@ def lamps_of(texels: FloatArray, limit: int = LAMP_COUNT_MAX) -> MapLamps:
         near = cosine > np.cos(np.radians(LAMP_RADIUS_DEG))
         ring = ~near & (cosine > np.cos(np.radians(2.0 * LAMP_RADIUS_DEG)))
         level = float(np.median(lum[ring])) if ring.any() else 0.0
-        excess = np.where(near, np.maximum(left - level, 0.0), 0.0) * omega
+        excess = np.maximum(left[near] - level, 0.0) * omega[near]
         if excess.sum() < LAMP_SHARE * total:
             break
-        resultant = (excess[..., None] * directions).sum(axis=(0, 1))
+        resultant = excess @ directions[near]
         axis = resultant / np.linalg.norm(resultant)
         # Mean of 1 - cos is 1 / sharpness for a sharp lobe.
-        spread = float((excess * 0.5 * ((directions - axis) ** 2).sum(axis=-1)).sum())
+        spread = float(excess @ (0.5 * ((directions[near] - axis) ** 2).sum(axis=-1)))
         spread /= float(excess.sum())
         axes.append(axis)
         sharpnesses.append(min(1.0 / max(spread, 1e-9), LAMP_SHARPNESS_MAX))
@@ -134,7 +134,7 @@ def suns_of(texels: FloatArray) -> list[Sun]:
         texels = resize_map(texels, SUN_ROWS)
     lamps = lamps_of(texels)
     directions = map_directions(*texels.shape[:2])
-    omega = texel_solid_angles(*texels.shape[:2])[:, None, None]
+    omega = np.broadcast_to(texel_solid_angles(*texels.shape[:2])[:, None], texels.shape[:2])
     near, far = np.cos(np.radians((LAMP_RADIUS_DEG, 2.0 * LAMP_RADIUS_DEG)))
     left = texels.astype(np.float64)
     suns = []
@@ -142,8 +142,9 @@ def suns_of(texels: FloatArray) -> list[Sun]:
         cosine = directions @ axis
         ring = (cosine > far) & (cosine <= near)
         behind = np.median(left[ring], axis=0) if ring.any() else np.zeros(3)
-        excess = ((left - behind) * omega)[cosine > near].sum(axis=0)
-        left[cosine > near] = behind
+        inside = cosine > near
+        excess = omega[inside] @ (left[inside] - behind)
+        left[inside] = behind
         # A disc of radius r, small: mean 1 - cos = r^2 / 4.
         if excess.max() > 0.0:
             angle = 4.0 / float(np.sqrt(sharpness))

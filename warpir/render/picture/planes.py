@@ -281,6 +281,13 @@ def spread(
     Returns:
         Shape [height, width, ...], float32.
     """
-    plane = np.full((size[0] * size[1], *values.shape[1:]), outside, np.float32)
+    plane = blank((size[0] * size[1], *values.shape[1:]), outside)
     plane[pixels] = values
     return plane.reshape(*size, *values.shape[1:])
+
+
+def blank(shape: tuple[int, ...], value: float) -> FloatArray:
+    """Return an array of one value, float32; what is left 0 takes no memory."""
+    if value == 0.0:
+        return np.zeros(shape, np.float32)
+    return np.full(shape, value, np.float32)
