@@ -19,6 +19,8 @@ UPSAMPLED = 2.5
 """Variance of a rendered edge that was enlarged bilinearly, over that of its own pixel [1]."""
 FAINT = 1e-4
 """Coverage and darkening below which the blurred object and shadow end [1]."""
+BAND = 64
+"""Rows of a picture that the response is applied to at once."""
 SUMMED = ("foreground", "diffuse", "specular", "emission")
 """Premultiplied planes of the object."""
 
@@ -74,19 +76,28 @@ class CameraLook:
             return planes
         changed = (*SUMMED, "shadow_ratio")
         planes = planes | {name: planes[name].copy() for name in changed}
+        # In bands: what lies between would be the largest arrays of a run.
+        for top in range(0, len(plate), BAND):
+            rows = slice(top, top + BAND)
+            band = {name: planes[name][rows] for name in (*changed, "matte")}
+            self._show(self.response, band, plate[rows])
+        return planes
+
+    @staticmethod
+    def _show(response: Response, planes: dict[str, FloatArray], plate: FloatArray) -> None:
+        """Put planes behind the response, in place."""
         seen = planes["matte"] > 0.0
         coverage = planes["matte"][seen][:, None]
         before = planes["foreground"][seen]
-        after = self.response.colour(before / coverage) * coverage
+        after = response.colour(before / coverage) * coverage
         share = after / np.maximum(before, 1e-30)
         for name in ("diffuse", "specular", "emission"):
             planes[name][seen] *= share
         planes["foreground"][seen] = after
         shaded = (planes["shadow_ratio"] != 1.0).any(axis=-1)
         ratio = planes["shadow_ratio"][shaded]
-        bent = self.response.shadow_ratio(ratio, plate[shaded])
+        bent = response.shadow_ratio(ratio, plate[shaded])
         planes["shadow_ratio"][shaded] = np.where(ratio == 1.0, ratio, bent)
-        return planes
 
     def grain_on(
         self,
