@@ -21,6 +21,8 @@ from warpir.io.images.photos import read_photo
 from warpir.io.layers import read_layers
 from warpir.look.camera_look import region_around
 
+SHADED = 0.02
+"""Darkening from which a pixel is the object's shadow [1]: two codes."""
 HALF_WIDTH = 400
 """Width of each half of the picture [px]."""
 
@@ -46,7 +48,8 @@ def main() -> None:
     height, width = matte.shape
     seen = np.argwhere(matte > 0.5)[:, ::-1].astype(np.float64)
     around = region_around(seen, height, width)
-    around &= ~ndimage.binary_dilation((matte > 0.0) | (ratio != 1.0).any(axis=-1), iterations=2)
+    shaded = (np.abs(ratio - 1.0) > SHADED).any(axis=-1)
+    around &= ~ndimage.binary_dilation((matte > 0.0) | shaded, iterations=2)
     print("                      blacks  fine contrast")
     for name, image, where in (
         ("photo around it", before, around),
