@@ -6,6 +6,8 @@ import os
 import shutil
 import signal
 import subprocess
+import sys
+import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
@@ -78,8 +80,45 @@ def test_what_must_be_whole_is_finished_first() -> None:
     assert len(done) == 3
 
 
+class Finalised:
+    """Meets a signal where Python can raise nothing, and where it only prints other faults."""
+
+    def __init__(self, fault: Exception | None = None) -> None:
+        self.fault = fault
+
+    def __del__(self) -> None:
+        if self.fault is not None:
+            raise self.fault
+        send()
+        pytest.fail("went on")
+
+
+def test_a_signal_that_a_destructor_swallowed_is_raised_again(
+    capfd: pytest.CaptureFixture[str],
+) -> None:
+    """Without waiting for a border, and without a word; other faults are still reported."""
+    others: list[object] = []
+
+    def report(fault: "sys.UnraisableHookArgs") -> None:
+        others.append(fault.exc_type)
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(sys, "unraisablehook", report)
+        with pytest.raises(Stopped, match="SIGTERM"), signals.handled():
+            Finalised(ValueError("another"))
+            for _ in range(3):  # as several objects of a frame that ends
+                Finalised()
+            began = time.monotonic()
+            while time.monotonic() < began + 10.0:
+                time.sleep(0.001)
+            pytest.fail("went on")
+        assert sys.unraisablehook is report
+    assert others == [ValueError]
+    assert capfd.readouterr().err == ""
+
+
 def test_a_swallowed_signal_is_raised_again_at_the_border() -> None:
-    """As when it comes in a finaliser, whose exceptions Python only prints."""
+    """As when a library catches whatever comes."""
     with pytest.raises(Stopped), signals.handled():
         try:
             send()

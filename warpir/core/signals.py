@@ -5,14 +5,17 @@
     with deferred():      the first waits for `check`, at the border of a step; the second raises
     with whole():         all wait for the end of the block, which is short and leaves nothing half
 
-Python handles a signal when the call into native code that it met has returned. A library may
-swallow an exception that a handler raises; a signal that came is therefore remembered, and the next
-`check` raises again.
+Python handles a signal when the call into native code that it met has returned. Nothing can be
+raised out of a destructor; what is raised in one is raised again as soon as it has ended. A library
+may swallow an exception that a handler raises; a signal that came is therefore remembered, and the
+next `check` raises again.
 """
 
+import _thread
 import math
 import os
 import signal
+import sys
 import threading
 import time
 from collections.abc import Iterator
@@ -23,6 +26,9 @@ from types import FrameType
 STOPPING = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 UNWINDING_SECONDS = 2.0
 """After that long a `Stopped` has been swallowed, or waits for something: a signal raises again."""
+
+AGAIN_SECONDS = 0.01
+"""How soon after a destructor swallowed a `Stopped` another one is raised."""
 
 
 class Stopped(KeyboardInterrupt):
@@ -68,9 +74,22 @@ def handled() -> Iterator[None]:
     own = {n: old for n, old in before.items() if old not in (signal.SIG_IGN, None)}
     for number in own:
         signal.signal(number, _receive)
+    other_faults = sys.unraisablehook
+
+    def report(fault: "sys.UnraisableHookArgs") -> None:
+        if fault.exc_type is not Stopped:
+            other_faults(fault)
+            return
+        _state.raised = -math.inf
+        again = threading.Timer(AGAIN_SECONDS, _thread.interrupt_main, (_state.number,))
+        again.daemon = True
+        again.start()
+
+    sys.unraisablehook = report
     try:
         yield
     finally:
+        sys.unraisablehook = other_faults
         for number, old in own.items():
             signal.signal(number, old)
         _forget()

@@ -30,12 +30,13 @@ def resize_planes(planes: dict[str, FloatArray], height: int, width: int) -> dic
 
 def resize(plane: FloatArray, height: int, width: int) -> FloatArray:
     """Bring a plane to the photo's size: bilinear up, area-filtered down."""
-    from skimage.transform import resize as resize_image
     from torch import from_numpy
     from torch.nn.functional import interpolate
 
     finite = np.where(np.isfinite(plane), plane, np.float32(0.0))
     if plane.shape[0] > height:
+        from skimage.transform import resize as resize_image
+
         shape = (height, width, *plane.shape[2:])
         resized = resize_image(  # type: ignore[no-untyped-call]
             finite, shape, order=1, anti_aliasing=True, preserve_range=True
