@@ -27,7 +27,7 @@ from warpir.app.config import InsertConfig, usage
 from warpir.app.program import attempt, require_packages, run_program, say, stay_offline
 from warpir.core.errors import ExitCode
 from warpir.core.limits import LIMITS
-from warpir.core.memory import Memory, no_collection, trim
+from warpir.core.memory import Memory, no_collection, sparing, trim
 
 if TYPE_CHECKING:
     from warpir.app.inputs import Loaders
@@ -117,13 +117,13 @@ def _insert_one(config: InsertConfig, loaders: "Loaders | None" = None) -> Inser
             run = run.on_device(choose_device(run.config.render.device)).with_ground_coat()
         run.take_cache_notices()
         lit = find_light(run, given)
-        trim()
-        if given is None and not run.config.is_guided:
-            with no_collection(), lit.run.timings.stage("preview"):
-                write_preview(lit.run, lit.light)
-        lit = with_photo_detail(lit)
-        rendered = render_result(lit.run, lit.light)
-        record = _write(lit, rendered, config)
+        with sparing():
+            if given is None and not run.config.is_guided:
+                with no_collection(), lit.run.timings.stage("preview"):
+                    write_preview(lit.run, lit.light)
+            lit = with_photo_detail(lit)
+            rendered = render_result(lit.run, lit.light)
+            record = _write(lit, rendered, config)
     say(summary_line(record))
     record = read_json_object(output.path / "run.json")
     return Insertion(output.path, (*record["files"], "run.json"), record)

@@ -49,6 +49,8 @@ SHORT = "memory.short"
 MIB = 1 << 20
 M_MMAP_THRESHOLD = -3
 """Of glibc's ``mallopt``."""
+HEAP_MOST = 32 * MIB
+"""Largest block in its heap, up to which glibc goes by itself [byte]."""
 _RSS_UNIT = 1 if sys.platform == "darwin" else 1024
 """What the system counts resident memory in [byte]."""
 
@@ -237,16 +239,29 @@ def no_collection() -> Iterator[None]:
 
 
 def trim() -> None:
-    """Give back what the C library keeps of freed memory: after the networks 100 MiB.
-
-    From then on arrays of a megabyte and more lie beside its heap, so that they go back when they
-    are freed, and pages of zeros that nothing is written to take no room. Networks, which ask for
-    the same again and again, would be slower so.
-    """
+    """Give back what the C library keeps of freed memory: after the networks 100 MiB."""
     with suppress(OSError, AttributeError):  # another one than glibc
-        library = ctypes.CDLL(None)
-        library.mallopt(M_MMAP_THRESHOLD, MIB)
-        library.malloc_trim(0)
+        ctypes.CDLL(None).malloc_trim(0)
+
+
+@contextmanager
+def sparing() -> Iterator[None]:
+    """Let large arrays lie beside the C library's heap within the block.
+
+    They go back when they are freed, and pages of zeros that nothing is written to take no room.
+    Networks, which ask for the same again and again, would take half as long again.
+    """
+    _set_largest_in_heap(MIB)
+    trim()
+    try:
+        yield
+    finally:
+        _set_largest_in_heap(HEAP_MOST)
+
+
+def _set_largest_in_heap(size: int) -> None:
+    with suppress(OSError, AttributeError):
+        ctypes.CDLL(None).mallopt(M_MMAP_THRESHOLD, size)
 
 
 def release() -> None:
