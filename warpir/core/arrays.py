@@ -1,4 +1,4 @@
-"""The kinds of NumPy array that annotations name, one alias each; shapes stand in docstrings."""
+"""The kinds of NumPy array that annotations name, one alias each, and the box of a mask."""
 
 from typing import Any
 
@@ -15,3 +15,18 @@ CodeArray = NDArray[np.uint8]
 """Pixels as a file stores them, 8 bits a channel."""
 PixelArray = NDArray[Any]
 """Pixels of any kind: codes of 8 or 16 bits, or floats."""
+
+
+def mask_box(mask: BoolArray, margin: int = 0) -> tuple[slice, slice]:
+    """Return the rows and columns that hold what a mask, shape [H, W], marks; empty for nothing.
+
+    Args:
+        mask: What is marked.
+        margin: How much farther they reach, as far as the mask does [px].
+    """
+    marked = np.flatnonzero(mask.any(axis=1)), np.flatnonzero(mask.any(axis=0))
+    rows, columns = (
+        slice(max(0, int(k[0]) - margin), int(k[-1]) + margin + 1) if len(k) else slice(0, 0)
+        for k in marked
+    )
+    return rows, columns

@@ -81,7 +81,7 @@ def handled() -> Iterator[None]:
             other_faults(fault)
             return
         _state.raised = -math.inf
-        again = threading.Timer(AGAIN_SECONDS, _thread.interrupt_main, (_state.number,))
+        again = threading.Timer(AGAIN_SECONDS, _raise_again, (_state,))
         again.daemon = True
         again.start()
 
@@ -159,6 +159,12 @@ def ignore() -> None:
 def _forget() -> None:
     global _state
     _state = _State()
+
+
+def _raise_again(state: _State) -> None:
+    """Let the main thread receive a block's signal once more, if the block has not ended."""
+    if state is _state:
+        _thread.interrupt_main(signal.Signals(state.number))
 
 
 def _receive(number: int, frame: FrameType | None) -> None:

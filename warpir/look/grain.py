@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import ndimage
 
-from warpir.core.arrays import AnyFloatArray, BoolArray, Float64Array, FloatArray
+from warpir.core.arrays import AnyFloatArray, BoolArray, Float64Array, FloatArray, mask_box
 from warpir.io.images.jpeg import JpegCoding
 
 SIDE = 12
@@ -205,13 +205,12 @@ def grain_over(
     added = np.zeros_like(composite, np.float32)
     if not changed.any():
         return added
-    rows, columns = (np.flatnonzero(changed.any(axis=axis)) for axis in (1, 0))
-    box = np.s_[rows[0] : rows[-1] + 1, columns[0] : columns[-1] + 1]
+    box = mask_box(changed)
     # Other frames of a sequence have other grain.
     frame = zlib.crc32(np.ascontiguousarray(plate[::8, ::8], np.float32).tobytes())
     height, width = matte[box].shape
     # By the row: what lies between would be the largest arrays of a run.
-    for y, noise in enumerate(grain.draw((height, width), seed, frame), rows[0]):
+    for y, noise in enumerate(grain.draw((height, width), seed, frame), box[0].start):
         here = changed[y]
         linear = np.clip(composite[y, here], 0.0, 1.0)
         shown = linear ** (1.0 / gamma)
@@ -237,10 +236,7 @@ def blocks_over(
     added = np.zeros_like(composite, np.float32)
     if not changed.any():
         return added
-    rows, columns = (np.flatnonzero(changed.any(axis=axis)) for axis in (1, 0))
-    box = tuple(
-        slice(max(0, int(where[0]) - NEAR), int(where[-1]) + NEAR + 1) for where in (rows, columns)
-    )
+    box = mask_box(changed, NEAR)
     linear = np.clip(composite[box], 0.0, 1.0)
     shown = linear ** (1.0 / gamma)
     codes = np.zeros(composite.shape, np.uint8)

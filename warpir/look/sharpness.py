@@ -9,7 +9,7 @@ import numpy as np
 from scipy import ndimage
 from scipy.special import ive
 
-from warpir.core.arrays import AnyFloatArray, BoolArray, FloatArray
+from warpir.core.arrays import AnyFloatArray, BoolArray, FloatArray, mask_box
 from warpir.core.color import luminance
 
 FINE, COARSE, WIDE = 1.0, 2.0, 3.0
@@ -159,23 +159,12 @@ def shown_box(planes: dict[str, FloatArray], sigma: float) -> tuple[slice, slice
             shape [H, W] or [H, W, 3].
         sigma: Standard deviation [px].
     """
-    height, width = planes["matte"].shape
-    rows, columns = np.zeros(height, np.bool_), np.zeros(width, np.bool_)
+    shows = np.zeros(planes["matte"].shape, np.bool_)
     for name, plane in planes.items():
-        shows = plane != (1.0 if name == "shadow_ratio" else 0.0)
-        shows = shows.any(axis=-1) if shows.ndim == 3 else shows
-        rows |= shows.any(axis=1)
-        columns |= shows.any(axis=0)
+        here = plane != (1.0 if name == "shadow_ratio" else 0.0)
+        shows |= here.any(axis=-1) if here.ndim == 3 else here
     # Twice as far as the blur reaches, so that its own border has nothing to mirror.
-    reach = 2 * (math.ceil(TRUNCATE * sigma) + 1)
-
-    def around(shows: BoolArray) -> slice:
-        where = np.flatnonzero(shows)
-        if not len(where):
-            return slice(0, 0)
-        return slice(max(0, int(where[0]) - reach), int(where[-1]) + reach + 1)
-
-    return around(rows), around(columns)
+    return mask_box(shows, 2 * (math.ceil(TRUNCATE * sigma) + 1))
 
 
 def blurred_layers(
