@@ -385,12 +385,11 @@ def foreground_kernel(
         k = int(0)
         alive = int(0)
         first = Hit()
-        surface = Surface()
+        hit = Hit()
         wo = wp.vec3(0.0)
         throughput = wp.vec3(0.0)
         throughput_diffuse = wp.vec3(0.0)
         if wp.static(has_solid_glass):
-            glassy = GlassPoint()
             interfaces = int(0)
         while index < spp * rays:
             # Among all samples of the pixel
@@ -448,15 +447,32 @@ def foreground_kernel(
                     throughput = wp.vec3(1.0, 1.0, 1.0)
                     k = 0
                 alive = 1
-                surface = surface_at(mesh, material, texture, first, wo)
-                if wp.static(has_solid_glass):
-                    glassy = glass_at(mesh, material, texture, glass, first, surface.metallic, wo)
-                    interfaces = 0
+                hit = first
                 throughput_diffuse = wp.vec3(0.0)
-                radiance += wp.cw_mul(throughput, surface.emission)
+                if wp.static(has_solid_glass):
+                    interfaces = 0
+
+            # The one place where surfaces are read, of first and of later vertices: half the code.
+            surface = surface_at(mesh, material, texture, hit, wo)
+            radiance += wp.cw_mul(throughput, surface.emission)
+            if k == 0:
                 radiance_emission += surface.emission
-                if vertex_record.material.shape[1] > 0:
-                    keep_surface(vertex_record, record_row, index, surface, wo)
+            else:
+                radiance_diffuse += wp.cw_mul(throughput_diffuse, surface.emission)
+            if vertex_record.material.shape[1] > 0:
+                keep_surface(vertex_record, record_row, k * spp * rays + index, surface, wo)
+            if wp.static(has_solid_glass):
+                glassy = glass_at(mesh, material, texture, glass, hit, surface.metallic, wo)
+                # Light comes through glass that follows the last other surface.
+                if k - interfaces >= depth and glassy.share == 0.0:
+                    alive = 0
+                if k == wp.max(depth, GLASS_DEPTH):
+                    alive = 0
+            elif k == depth:
+                alive = 0
+            if alive == 0:
+                index += 1
+                continue
 
             among = candidates
             arrival = unknown_arrival()
@@ -526,24 +542,8 @@ def foreground_kernel(
             if alive == 1:
                 throughput = wp.cw_mul(throughput, event.throughput)
                 wo = -event.bsdf.wi
-                surface = surface_at(mesh, material, texture, event.bsdf.next, wo)
-                radiance += wp.cw_mul(throughput, surface.emission)
-                radiance_diffuse += wp.cw_mul(throughput_diffuse, surface.emission)
-                if wp.static(has_solid_glass):
-                    glassy = glass_at(
-                        mesh, material, texture, glass, event.bsdf.next, surface.metallic, wo
-                    )
-                if vertex_record.material.shape[1] > 0:
-                    keep_surface(vertex_record, record_row, k * spp * rays + index, surface, wo)
-            if wp.static(has_solid_glass):
-                # Light comes through glass that follows the last other surface.
-                if k - interfaces >= depth and glassy.share == 0.0:
-                    alive = 0
-                if k == wp.max(depth, GLASS_DEPTH):
-                    alive = 0
-            elif k == depth:
-                alive = 0
-            if alive == 0:
+                hit = event.bsdf.next
+            else:
                 index += 1
 
         counted = lane_sum(wp.vec3(count, 0.0, 0.0), lanes)[0]

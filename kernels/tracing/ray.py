@@ -97,7 +97,7 @@ def facing_twin(mesh: MeshArgs, passing: int, position: wp.vec3, ray_dir: wp.vec
     return twin
 
 
-@wp.func
+@wp.func(inline=False)
 def closest_of_layers(
     mesh: MeshArgs,
     material: MaterialArgs,
@@ -108,7 +108,11 @@ def closest_of_layers(
     is_camera_ray: int,
     key: wp.uint32,
 ) -> Hit:
-    """Find what `closest_hit` does where materials let rays pass."""
+    """Find what `closest_hit` does where materials let rays pass.
+
+    Not inlined, as `transmitted_within`: few rays come here, and CUDA's compiler takes three times
+    as long for kernels that hold this code at each of their rays.
+    """
     hit = Hit()
     hit.valid = 0
     origin = ray_origin
@@ -158,7 +162,7 @@ def closest_hit(
     A camera ray passes the back of a single-sided material; any ray passes a point of opacity alpha
     with probability ``1 - alpha``, drawn from ``key``.
     """
-    # A call copies all of its structs on the CPU, which takes as long as the ray.
+    # A call copies all of its structs, which takes as long as the ray.
     hit = closest_triangle(mesh, ray_origin, ray_dir, max_t)
     may_pass = int(0)
     if hit.valid == 1:
@@ -212,7 +216,7 @@ def meets_box(origin: wp.vec3, wi: wp.vec3, low: wp.vec3, high: wp.vec3) -> int:
     return 0
 
 
-@wp.func
+@wp.func(inline=False)
 def transmitted_within(
     mesh: MeshArgs,
     material: MaterialArgs,
