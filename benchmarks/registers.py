@@ -20,14 +20,15 @@ from warpir.render.device import start_warp
 
 ALL_LAYERS = int(LAYERS | ANISOTROPY | IRIDESCENCE)
 VARIANTS = {
-    "plain": (0, False, Viewer.CAMERA, False, False),
-    "coats, cloth, thin glass": (int(LAYERS), False, Viewer.CAMERA, False, False),
-    "the same, brushed metal, thin films": (ALL_LAYERS, False, Viewer.CAMERA, False, False),
-    "plain, a mesh as receiver": (0, True, Viewer.CAMERA, False, False),
-    "plain, lamps": (0, False, Viewer.CAMERA, True, False),
-    "solid glass": (int(LAYERS), False, Viewer.CAMERA, False, True),
-    "what is thrown on the ground, plain": (0, False, Viewer.GROUND, False, False),
-    "what a glossy ground mirrors, plain": (0, False, Viewer.MIRROR, False, False),
+    "plain": (0, False, Viewer.CAMERA, False, False, False),
+    "coats, cloth, thin glass": (int(LAYERS), False, Viewer.CAMERA, False, False, True),
+    "the same, brushed metal, thin films": (ALL_LAYERS, False, Viewer.CAMERA, False, False, True),
+    "plain, triangles that let rays pass": (0, False, Viewer.CAMERA, False, False, True),
+    "plain, a mesh as receiver": (0, True, Viewer.CAMERA, False, False, False),
+    "plain, lamps": (0, False, Viewer.CAMERA, True, False, False),
+    "solid glass": (int(LAYERS), False, Viewer.CAMERA, False, True, True),
+    "what is thrown on the ground, plain": (0, False, Viewer.GROUND, False, False, False),
+    "what a glossy ground mirrors, plain": (0, False, Viewer.MIRROR, False, False, False),
 }
 """Arguments of `foreground_kernel` by what the scene has."""
 

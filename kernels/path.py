@@ -251,6 +251,7 @@ def foreground_kernel(
     viewer: int,
     has_lamps: bool,
     has_solid_glass: bool,
+    has_passing: bool,
 ) -> wp.Kernel:
     """Return `trace_foreground` for scenes with or without these; what is not there costs nothing.
 
@@ -263,6 +264,7 @@ def foreground_kernel(
         viewer: From where the object is seen (`Viewer`).
         has_lamps: Whether there are lamps near the object (`LampArgs`).
         has_solid_glass: Whether some material is solid glass (`GlassArgs`); not on the ground.
+        has_passing: Whether some triangle may let rays pass (``MeshArgs.passing``).
     """
     from_camera, from_ground = viewer == Viewer.CAMERA, viewer == Viewer.GROUND
     in_mirror = viewer == Viewer.MIRROR
@@ -353,6 +355,9 @@ def foreground_kernel(
             receiver.mesh = wp.uint64(0)
         if wp.static(not has_lamps):
             lamps.count = 0
+        if wp.static(not has_passing):
+            mesh.passing = wp.uint64(0)
+            mesh.embree_passing = wp.uint64(0)
         receiver.is_solid = wp.static(int(from_ground))
         if wp.static(from_ground):
             receiver.shines = 0

@@ -166,7 +166,7 @@ def closest_hit(
     hit = closest_triangle(mesh, ray_origin, ray_dir, max_t)
     may_pass = int(0)
     if hit.valid == 1:
-        if hit.face >= mesh.passing_start:
+        if mesh.passing != wp.uint64(0) and hit.face >= mesh.passing_start:
             may_pass = 1
         elif is_camera_ray == 1 and material.any_culled == 1:
             may_pass = is_culled(mesh, material, hit.face, ray_dir)

@@ -189,7 +189,7 @@ import warp
 from warpir.insert import main
 def loaded():
     return {name for name, module in warp._src.context.user_modules.items() if module.execs}
-cache_kernels("cpu", [(0, 0, 0, 0, 0), (0, 0, 1, 0, 0)])
+cache_kernels("cpu", [(0, 0, 0, 0, 0, 0), (0, 0, 1, 0, 0, 0)])
 before = loaded()
 assert before and main(sys.argv[1:]) == 0
 assert loaded() == before, loaded() ^ before

@@ -1090,7 +1090,7 @@ def test_load_kernels_says_how_many_are_there() -> None:
     """The share of the modules that are there grows to 1."""
     shares: list[float] = []
     device = wp.get_device("cpu")
-    load_kernels(device, [(0, 0, 0, 0, 0)], lambda stage, share: shares.append(share))
+    load_kernels(device, [(0, 0, 0, 0, 0, 0)], lambda stage, share: shares.append(share))
     assert shares == sorted(shares)
     assert shares[-1] == 1.0
     assert len(shares) == len(set(shares)) > 3

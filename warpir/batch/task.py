@@ -211,7 +211,8 @@ def _compile(task: Task) -> dict[str, Any]:
     for device in [choose_device(name) for name in task.config["devices"]]:
         if places:
             bounces, lamps = task.config["bounces"], task.config["lamps"]
-            cache_kernels(device, product((False, True), places, bounces, lamps, (False,)))
+            both = (False, True)
+            cache_kernels(device, product(both, places, bounces, lamps, (False,), both))
     return {"cuda": cuda_count()}
 
 

@@ -27,13 +27,13 @@ from warpir.io.images.decoder import captured_stderr
 from warpir.kernels.composite import tone_foreground
 from warpir.kernels.lamps.receiver import trace_lamps
 from warpir.kernels.path import Viewer, foreground_kernel
-from warpir.kernels.receiver import trace_plane_shadow, trace_receiver
+from warpir.kernels.receiver import plane_shadow_kernel, trace_receiver
 from warpir.kernels.sampling import draw_light
 from warpir.kernels.shadow_ratio import shadow_ratio
 from warpir.kernels.tracing.gbuffer import trace_gbuffer
 from warpir.kernels.types import LAYERS
 
-PLAIN_KERNELS = trace_gbuffer, trace_receiver, trace_plane_shadow, shadow_ratio, tone_foreground
+PLAIN_KERNELS = trace_gbuffer, trace_receiver, shadow_ratio, tone_foreground
 """Kernels without variants."""
 SAMPLES_PER_SLICE = 1 << 16
 """CPU work of one launch; keeps launches under half a second, so that Ctrl-C is answered."""
@@ -136,7 +136,8 @@ def load_kernels(
     # The longest to compile come first
     kernels = [*(foreground_kernel(*flags) for flags in wanted), trace_receiver, trace_gbuffer]
     kernels += [trace_lamps] if has_lamps else []
-    kernels += [trace_plane_shadow, draw_light, tone_foreground, shadow_ratio]
+    kernels += [plane_shadow_kernel(has) for has in sorted({flags[5] for flags in wanted})]
+    kernels += [draw_light, tone_foreground, shadow_ratio]
     modules = list(dict.fromkeys(kernel.module for kernel in kernels))
     if not all(is_cached(module, device) for module in modules):
         settle_hashes(
@@ -180,18 +181,21 @@ def settle_hashes(
         layers: What extensions materials have (``MaterialArgs.any_layers``); those of most have
             kernels of their own only where they are needed.
     """
-    kernels = list(PLAIN_KERNELS)
+    kernels = [*PLAIN_KERNELS, *map(plane_shadow_kernel, (False, True))]
     viewers = (Viewer.CAMERA, Viewer.GROUND)
     # No ground with a mesh mirrors.
     mirror = (False, Viewer.MIRROR)
     variants: list[tuple[int, ...]] = []
     for lamps in (False, True)[: 1 + has_lamps]:
         scenes = [*product((False, True), viewers), mirror]
-        variants += [(has, *scene, lamps, False) for has, scene in product((0, LAYERS), scenes)]
+        variants += [
+            (has, *scene, lamps, False, passing)
+            for has, scene, passing in product((0, LAYERS), scenes, (False, True))
+        ]
     if has_solid_glass:
         seen = ((False, Viewer.CAMERA), (True, Viewer.CAMERA), mirror)
         near = (False, True)[: 1 + has_lamps]
-        variants += [(LAYERS, *scene, lamps, True) for scene, lamps in product(seen, near)]
+        variants += [(LAYERS, *scene, lamps, True, True) for scene, lamps in product(seen, near)]
     if layers > LAYERS:
         variants += dict.fromkeys((layers, *others) for _, *others in variants)
     kernels += [foreground_kernel(*variant) for variant in variants]

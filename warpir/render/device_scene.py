@@ -258,6 +258,7 @@ class Scene:
         self.trees: list[wp.Mesh | EmbreeScene] = []
         args.id, args.embree = self._upload_tree(0, passing_start)
         args.passing, args.embree_passing = self._upload_tree(passing_start, self.triangle_count)
+        self.has_passing = passing_start < self.triangle_count
 
     def _upload_tree(self, start: int, stop: int) -> tuple[int, int]:
         """Build the trees of some triangles; return the handles of Warp's and of Embree's, or 0."""

@@ -16,7 +16,7 @@ from warpir.core.arrays import BoolArray, Float64Array, FloatArray, IntArray
 from warpir.kernels.dielectric.glass import GLASS_DEPTH
 from warpir.kernels.lamps.receiver import trace_lamps
 from warpir.kernels.path import Viewer, foreground_kernel
-from warpir.kernels.receiver import trace_plane_shadow, trace_receiver
+from warpir.kernels.receiver import plane_shadow_kernel, trace_receiver
 from warpir.kernels.tracing.gbuffer import trace_gbuffer
 from warpir.kernels.types import CameraArgs, LightArgs, LightRecord, MaterialArgs, VertexRecord
 from warpir.render.device import Rows
@@ -142,6 +142,7 @@ class ObjectLaunch:
             viewer,
             bool(scene.lamps),
             scene.has_solid_glass and viewer != Viewer.GROUND,
+            scene.has_passing,
         )
         is_recorded = self.is_recorded or bool(light_record or vertex_record)
         hidden = None
@@ -245,7 +246,8 @@ class ReceiverLaunch:
                 lanes,
             ]
             args += [self.seed, *rows]
-            renderer.launch(trace_plane_shadow, count, args, work, "shadow", lanes)
+            kernel = plane_shadow_kernel(renderer.scene.has_passing)
+            renderer.launch(kernel, count, args, work, "shadow", lanes)
         else:
             kept = LightRecord() if record is None else Rows(record)
             args = [*seen, spp, self.rays, self.seed, *rows, kept]

@@ -133,7 +133,13 @@ class Renderer(Launcher):
         viewers += [Viewer.GROUND] if self.bounce_depth else []
         viewers += [Viewer.MIRROR] if mirrors else []
         variants = [
-            (*flags, viewer, bool(scene.lamps), scene.has_solid_glass and viewer != Viewer.GROUND)
+            (
+                *flags,
+                viewer,
+                bool(scene.lamps),
+                scene.has_solid_glass and viewer != Viewer.GROUND,
+                scene.has_passing,
+            )
             for viewer in viewers
         ]
         load_kernels(self.device, variants, self._progress)
