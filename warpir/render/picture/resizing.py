@@ -29,20 +29,14 @@ def resize_planes(planes: dict[str, FloatArray], height: int, width: int) -> dic
 
 
 def resize(plane: FloatArray, height: int, width: int) -> FloatArray:
-    """Bring a plane to the photo's size: bilinear up, area-filtered down."""
+    """Bring a plane to the photo's size: bilinear, by as many pixels as each new one covers."""
     from torch import from_numpy
     from torch.nn.functional import interpolate
 
     finite = np.where(np.isfinite(plane), plane, np.float32(0.0))
-    if plane.shape[0] > height:
-        from skimage.transform import resize as resize_image
-
-        shape = (height, width, *plane.shape[2:])
-        resized = resize_image(  # type: ignore[no-untyped-call]
-            finite, shape, order=1, anti_aliasing=True, preserve_range=True
-        )
-        return np.asarray(resized, dtype=np.float32)
-    # scikit-image's, with mode="edge", within 1e-4 in a tenth of the time
     channels = np.ascontiguousarray(np.atleast_3d(finite).transpose(2, 0, 1)[None])
-    larger = interpolate(from_numpy(channels), (height, width), mode="bilinear")[0].numpy()
-    return np.ascontiguousarray(larger.transpose(1, 2, 0)).reshape(height, width, *plane.shape[2:])
+    is_smaller = height < plane.shape[0]
+    resized = interpolate(
+        from_numpy(channels), (height, width), mode="bilinear", antialias=is_smaller
+    )[0].numpy()
+    return np.ascontiguousarray(resized.transpose(1, 2, 0)).reshape(height, width, *plane.shape[2:])
