@@ -2,6 +2,7 @@
 
 import json
 import struct
+from itertools import product
 from pathlib import Path
 from typing import Any
 
@@ -409,3 +410,33 @@ def test_square_pixel_error_is_the_worst_row(rng: np.random.Generator) -> None:
     replaced = Camera(640, 480, 505.0, 505.0, 320.0, 200.0, np.eye(4))
     off = abs(replaced.project(corner) - camera.project(corner))[0, 1]
     assert square_pixel_error(camera) == pytest.approx(off) == pytest.approx(2.8)
+
+
+def test_tiles_of_triangles_hold_all_that_they_show() -> None:
+    """Whatever pixel a point of a triangle falls into, it and its neighbours are among them."""
+    rng = np.random.default_rng(5)
+    camera = Camera(203, 117, 220.0, 210.0, 80.0, 70.0, np.eye(4))
+    places = rng.uniform((-6.0, -4.0, -9.0), (6.0, 4.0, -3.0), (12, 1, 3))
+    points = (places + rng.normal(scale=0.4, size=(12, 3, 3))).reshape(-1, 3)
+    triangles = np.arange(36, dtype=np.int32).reshape(-1, 3)
+    near = camera.tiles_of(points, triangles)
+    assert near.shape == (117, 203)
+    assert 0.02 < near.mean() < 0.7
+    inside = rng.dirichlet(np.ones(3), (len(triangles), 500))
+    shown = camera.project((inside @ points[triangles]).reshape(-1, 3))
+    for dx, dy in product((-1, 0, 1), repeat=2):
+        column, row = np.floor(shown + np.array([dx, dy])).astype(int).T
+        held = (column >= 0) & (column < 203) & (row >= 0) & (row < 117)
+        assert held.any()
+        assert near[row[held], column[held]].all()
+
+
+def test_tiles_of_triangles_beside_and_behind_the_camera() -> None:
+    """What lies beside the picture takes no pixel of it; a point behind the camera takes all."""
+    camera = Camera(64, 48, 55.0, 55.0, 32.0, 24.0, np.eye(4))
+    points = np.array([[50.0, 0.0, -5.0], [51.0, 0.0, -5.0], [50.0, 1.0, -5.0]])
+    one = np.array([[0, 1, 2]], np.int32)
+    for axis in (1.0, -1.0):
+        assert not camera.tiles_of(points * (axis, 1.0, 1.0), one).any()
+    points[2, 2] = 1.0
+    assert camera.tiles_of(points, one).all()

@@ -15,7 +15,7 @@ import numpy as np
 import warp as wp
 from numpy.typing import NDArray
 
-from warpir.core.arrays import Float64Array, FloatArray
+from warpir.core.arrays import Float64Array, FloatArray, IntArray
 from warpir.kernels.receiver_mesh import trace_seen
 from warpir.kernels.types import (
     CameraArgs,
@@ -208,6 +208,11 @@ class Scene:
         args.fx, args.fy, args.cx, args.cy = camera.fx, camera.fy, camera.cx, camera.cy
         args.width = camera.width
         return args
+
+    def triangles(self) -> tuple[Float64Array, IntArray]:
+        """Return all vertices in the world [m], shape [vertex, 3], and triangles of them."""
+        points = self.mesh_args.positions.numpy() + self.origin
+        return points, self.mesh_args.indices.numpy().reshape(-1, 3)
 
     def geometry(self, materials: MaterialArgs | None = None) -> tuple[Any, ...]:
         """Return triangles, materials, textures, receiver, in the order of the kernels' arguments.

@@ -27,7 +27,6 @@ from warpir.render.device_light import drawn, plane_radiance
 from warpir.render.device_scene import Scene
 from warpir.render.launches import THROWN_LIMIT, ObjectLaunch, ReceiverLaunch, geometry_of
 from warpir.render.shadow.pilot import dilate
-from warpir.render.upload.triangles import Corners
 from warpir.scene.camera import Camera
 from warpir.scene.placement import box_corners
 
@@ -144,19 +143,15 @@ class Renderer(Launcher):
         ]
         load_kernels(self.device, variants, self._progress)
 
-    def candidate_pixels(self, camera: Camera, bounds: Corners | None = None) -> IntArray:
-        """Return a superset of the pixels of a box, row-major; default: the object's."""
-        uv = camera.project(box_corners(*(bounds or self.scene.bounds)))
-        if np.isnan(uv).any():
-            left, top, right, bottom = 0, 0, camera.width, camera.height
-        else:
-            left, top = np.maximum(np.floor(uv.min(axis=0)).astype(int) - 1, 0)
-            right, bottom = np.ceil(uv.max(axis=0)).astype(int) + 1
-            right, bottom = min(right, camera.width), min(bottom, camera.height)
-        if right <= left or bottom <= top or self.scene.triangle_count == 0:
+    def candidate_pixels(self, camera: Camera) -> IntArray:
+        """Return a superset of the object's pixels and their neighbours, row-major."""
+        count = self.scene.triangle_count
+        if not count:
             return np.zeros(0, np.int32)
-        rows = np.arange(top, bottom, dtype=np.int64)[:, None] * camera.width
-        return (rows + np.arange(left, right)[None]).reshape(-1).astype(np.int32)
+        pixels = camera.pixels_of_box(box_corners(*self.scene.bounds))
+        if count < len(pixels):  # else rays that miss are as cheap
+            pixels = pixels[camera.tiles_of(*self.scene.triangles()).reshape(-1)[pixels]]
+        return pixels
 
     def gbuffer(self, seed: int, spp: int = 8) -> GBuffer:
         """Trace the object's geometry and materials.
@@ -171,7 +166,7 @@ class Renderer(Launcher):
         if self.scene.glass_bounds is not None:
             # Clear glass stops 1 ray in 25: few samples may all have missed it.
             is_glass = np.zeros(camera.height * camera.width, bool)
-            is_glass[self.candidate_pixels(camera, self.scene.glass_bounds)] = True
+            is_glass[camera.pixels_of_box(box_corners(*self.scene.glass_bounds))] = True
             thin = np.flatnonzero((coverage < 1.0) & is_glass[candidates])
             again = self._traced_geometry(candidates[thin], spp * GLASS_SAMPLES, seed)
             for plane, better in zip((coverage, *planes), again, strict=True):

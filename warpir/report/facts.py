@@ -391,6 +391,7 @@ _STAGES = {
     "detail": "take reflections from the photo",
     "preview": "preview",
     "scene": "build the scene",
+    "look": "see what the camera did to the photo",
     "model": "load the prior",
     "personalize": "adapt the prior to the photo",
     "trace": "trace the transport",

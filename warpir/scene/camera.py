@@ -7,15 +7,19 @@ Pixel (column j, row i) has its centre at (j + 0.5, i + 0.5), origin top left, y
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from itertools import product
 from typing import Any, NamedTuple
 
 import numpy as np
 
-from warpir.core.arrays import Float64Array
+from warpir.core.arrays import BoolArray, Float64Array, IntArray
 from warpir.core.errors import ExitCode, InputError
 
 FILM_DIAGONAL_35MM = 43.267
 """Diagonal of the 36 x 24 mm frame that EXIF's equivalent focal length refers to [mm]."""
+
+TILE = 16
+"""Side of the tiles of `Camera.tiles_of` [px]."""
 
 
 class Source(NamedTuple):
@@ -82,6 +86,52 @@ class Camera:
             [self.cx + self.fx * local[:, 0] / depth, self.cy - self.fy * local[:, 1] / depth],
             axis=1,
         )
+
+    def pixels_of_box(self, corners: Float64Array) -> IntArray:
+        """Return a superset of the pixels that a box covers and their neighbours, row-major.
+
+        ``corners`` are in the world [m], shape [8, 3]. All pixels if one is behind the camera.
+        """
+        uv = self.project(corners)
+        if np.isnan(uv).any():
+            left, top, right, bottom = 0, 0, self.width, self.height
+        else:
+            left, top = np.maximum(np.floor(uv.min(axis=0)).astype(int) - 1, 0)
+            right, bottom = np.ceil(uv.max(axis=0)).astype(int) + 1
+            right, bottom = min(right, self.width), min(bottom, self.height)
+        if right <= left or bottom <= top:
+            return np.zeros(0, np.int32)
+        rows = np.arange(top, bottom, dtype=np.int64)[:, None] * self.width
+        return (rows + np.arange(left, right)[None]).reshape(-1).astype(np.int32)
+
+    def tiles_of(self, points: Float64Array, triangles: IntArray) -> BoolArray:
+        """Return the pixels of all tiles that the box of a triangle's image meets, and 2 px around.
+
+        All pixels if a point is behind the camera.
+
+        Args:
+            points: World [m], shape [point, 3].
+            triangles: Their points, shape [triangle, 3].
+
+        Returns:
+            Shape [height, width].
+        """
+        uv = self.project(points)
+        if np.isnan(uv).any():
+            return np.ones((self.height, self.width), bool)
+        low, high = uv[triangles].min(axis=1) - 2.0, uv[triangles].max(axis=1) + 2.0
+        tiles = -(-np.array([self.width, self.height]) // TILE)
+        first = np.clip(np.floor(low / TILE), 0, tiles).astype(int)
+        past = np.clip(np.floor(high / TILE) + 1.0, first, tiles).astype(int)
+        # A rectangle of tiles is a sum over both axes of its four corners.
+        columns, rows = tiles + 1
+        starts = np.zeros(rows * columns)
+        for (a, x), (b, y) in product(enumerate((first, past)), repeat=2):
+            at = y[:, 1] * columns + x[:, 0]
+            starts += (-1.0) ** (a + b) * np.bincount(at, minlength=rows * columns)
+        near = starts.reshape(rows, columns).cumsum(axis=0).cumsum(axis=1)[:-1, :-1] > 0.0
+        mask: BoolArray = near.repeat(TILE, axis=0).repeat(TILE, axis=1)
+        return mask[: self.height, : self.width]
 
     def ray(self, u: float, v: float) -> tuple[Float64Array, Float64Array]:
         """Return origin [m] and unit direction, world frame, through pixel position (u, v)."""
