@@ -24,6 +24,9 @@ FLAT_SHARE = 0.08
 """Share of a bin's patches, the flattest, that are taken to show nothing but grain."""
 LEAST_PATCHES = 6
 """Flat patches that a bin needs."""
+MOST_PATCHES = 12000
+"""Patches of a photo that are looked at, or up to twice as many. Of two photographs a third of all
+gives the grain within 2 %."""
 UNCLIPPED = (0.02, 0.98)
 """Display values between which a patch lies: beyond, grain is cut off."""
 LEAST = 0.4 / 255.0
@@ -96,7 +99,8 @@ def estimate_grain(srgb: AnyFloatArray) -> Grain | None:
     Returns:
         The grain, or None where no level has flat patches enough, or less than `LEAST` of it.
     """
-    patches = _patches(np.asarray(srgb, np.float64))
+    every = _patches(srgb)
+    patches = every[:: max(1, len(every) // MOST_PATCHES)].astype(np.float64)
     means = patches.mean(axis=(1, 2))
     inside = ((patches > UNCLIPPED[0]) & (patches < UNCLIPPED[1])).all(axis=(1, 2, 3))
     rest = _without_plane(patches[inside])
@@ -141,7 +145,7 @@ def estimate_grain(srgb: AnyFloatArray) -> Grain | None:
     )
 
 
-def _patches(srgb: Float64Array) -> Float64Array:
+def _patches(srgb: AnyFloatArray) -> AnyFloatArray:
     """Return the photo's whole patches, shape [N, SIDE, SIDE, 3]."""
     rows, columns = srgb.shape[0] // SIDE, srgb.shape[1] // SIDE
     tiles = srgb[: rows * SIDE, : columns * SIDE].reshape(rows, SIDE, columns, SIDE, 3)
