@@ -66,7 +66,6 @@ def render_result(run: Run, light: SceneLight) -> RenderedResult:
         placed = run.memory.again(
             lambda: scene_of(run.inputs, camera, run.device, light.curves), "the scene", "--asset"
         )
-    with run.timings.stage("look"):
         look = _look(run, light)
     with run.timings.stage("render"), progress_bar(run.log.say) as report:
         quality = run.config.render
