@@ -1,9 +1,13 @@
-"""The kinds of NumPy array that annotations name, one alias each, and the box of a mask."""
+"""The kinds of NumPy array that annotations name, one alias each; boxes and bands of rows."""
 
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+
+from warpir.core.memory import core_count
 
 FloatArray = NDArray[np.float32]
 Float64Array = NDArray[np.float64]
@@ -15,6 +19,9 @@ CodeArray = NDArray[np.uint8]
 """Pixels as a file stores them, 8 bits a channel."""
 PixelArray = NDArray[Any]
 """Pixels of any kind: codes of 8 or 16 bits, or floats."""
+
+BAND = 64
+"""Rows of a picture that are computed at once."""
 
 
 def mask_box(mask: BoolArray, margin: int = 0) -> tuple[slice, slice]:
@@ -30,3 +37,29 @@ def mask_box(mask: BoolArray, margin: int = 0) -> tuple[slice, slice]:
         for k in marked
     )
     return rows, columns
+
+
+def in_bands(work: Callable[[slice], object], height: int) -> None:
+    """Call for the rows of a picture, band by band, on every core.
+
+    In bands, since what lies between would be the largest arrays of a run; NumPy leaves other
+    threads the interpreter while it computes.
+
+    Args:
+        work: Takes the rows of a band, which it alone writes.
+        height: Of the picture [px].
+    """
+    bands = [slice(top, min(top + BAND, height)) for top in range(0, height, BAND)]
+    with ThreadPoolExecutor(core_count()) as pool:
+        list(pool.map(work, bands))
+
+
+def by_pixel(function: Callable[[FloatArray], AnyFloatArray], plane: FloatArray) -> FloatArray:
+    """Return what a function makes of every pixel of a picture, float32, `in_bands`."""
+    result = np.empty(plane.shape, np.float32)
+
+    def fill(rows: slice) -> None:
+        result[rows] = function(plane[rows])
+
+    in_bands(fill, len(plane))
+    return result

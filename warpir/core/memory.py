@@ -348,7 +348,10 @@ def core_count() -> int:
 def free_device(alias: str) -> int | None:
     """Return what is free on a Warp device [byte], or None where it is the host."""
     device = sys.modules["warp"].get_device(alias) if alias != "cpu" else None
-    return int(device.free_memory) if device is not None and device.is_cuda else None
+    if device is None or not device.is_cuda:
+        return None
+    # The context is made first, and kept: asked without one, the driver makes one and drops it.
+    return int(device.free_memory) if device.context is not None else None
 
 
 def _available(proc: Path) -> int:

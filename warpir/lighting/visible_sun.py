@@ -96,8 +96,9 @@ def find_spots(photo_srgb: AnyFloatArray, camera: Camera) -> list[Spot]:
         photo_srgb: Display-encoded, in [0, 1], shape [H, W, 3].
         camera: Of the photo, of any size with the photo's aspect.
     """
-    # Without the largest and the least channel.
-    shown, view = _shrunk(np.sort(photo_srgb, axis=-1)[..., 1], camera)
+    red, green, blue = (photo_srgb[..., k] for k in range(3))
+    low, high = np.minimum(red, green), np.maximum(red, green)
+    shown, view = _shrunk(np.clip(blue, low, high), camera)  # the middle channel
     rays, omega = _pixel_rays(view)
     parts, count = label(shown >= CLIPPED, np.ones((3, 3)))
     sizes = np.bincount(parts.ravel(), omega.ravel(), count + 1)

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from warpir.core.arrays import AnyFloatArray, BoolArray, Float64Array, FloatArray
+from warpir.core.arrays import AnyFloatArray, BoolArray, Float64Array, FloatArray, in_bands
 from warpir.core.color import GAMMA
 from warpir.io.images.jpeg import JpegCoding
 from warpir.look.grain import Grain, blocks_over, estimate_grain, grain_over
@@ -19,8 +19,6 @@ UPSAMPLED = 2.5
 """Variance of a rendered edge that was enlarged bilinearly, over that of its own pixel [1]."""
 FAINT = 1e-4
 """Coverage and darkening below which the blurred object and shadow end [1]."""
-BAND = 64
-"""Rows of a picture that the response is applied to at once."""
 SUMMED = ("foreground", "diffuse", "specular", "emission")
 """Premultiplied planes of the object."""
 
@@ -72,15 +70,17 @@ class CameraLook:
             planes: Those of `blurred_layers`.
             plate: Display-linear photo, shape [H, W, 3].
         """
-        if self.response is None:
+        response = self.response
+        if response is None:
             return planes
         changed = (*SUMMED, "shadow_ratio")
         planes = planes | {name: planes[name].copy() for name in changed}
-        # In bands: what lies between would be the largest arrays of a run.
-        for top in range(0, len(plate), BAND):
-            rows = slice(top, top + BAND)
+
+        def show(rows: slice) -> None:
             band = {name: planes[name][rows] for name in (*changed, "matte")}
-            self._show(self.response, band, plate[rows])
+            self._show(response, band, plate[rows])
+
+        in_bands(show, len(plate))
         return planes
 
     @staticmethod

@@ -13,7 +13,14 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import ndimage
 
-from warpir.core.arrays import AnyFloatArray, BoolArray, Float64Array, FloatArray, mask_box
+from warpir.core.arrays import (
+    AnyFloatArray,
+    BoolArray,
+    Float64Array,
+    FloatArray,
+    in_bands,
+    mask_box,
+)
 from warpir.io.images.jpeg import JpegCoding
 
 SIDE = 12
@@ -213,19 +220,22 @@ def grain_over(
     # Other frames of a sequence have other grain.
     frame = zlib.crc32(np.ascontiguousarray(plate[::8, ::8], np.float32).tobytes())
     height, width = matte[box].shape
-    # By the row: what lies between would be the largest arrays of a run.
-    for y, noise in enumerate(grain.draw((height, width), seed, frame), box[0].start):
-        here = changed[y]
-        linear = np.clip(composite[y, here], 0.0, 1.0)
+    noise = grain.draw((height, width), seed, frame)
+
+    def add(rows: slice) -> None:
+        here = changed[box][rows]
+        linear = np.clip(composite[box][rows][here], 0.0, 1.0)
         shown = linear ** (1.0 / gamma)
         wanted = grain.deviation(shown)
-        before = np.clip(plate[y, here], 1e-6, 1.0) ** (1.0 / gamma)
-        share = (1.0 - matte[y, here])[:, None]
+        before = np.clip(plate[box][rows][here], 1e-6, 1.0) ** (1.0 / gamma)
+        share = (1.0 - matte[box][rows][here])[:, None]
         # Of the photo's grain the uncovered share is left, scaled as its signal is.
         kept = share * grain.deviation(before) * np.minimum(shown / before, 1.0)
         lacking = np.sqrt(np.maximum(wanted**2 - kept**2, 0.0))
-        noisy = np.clip(shown + lacking * noise[here[box[1]]], 0.0, 1.0) ** gamma
-        added[y, here] = noisy - linear
+        noisy = np.clip(shown + lacking * noise[rows][here], 0.0, 1.0) ** gamma
+        added[box][rows][here] = noisy - linear
+
+    in_bands(add, height)
     return added
 
 

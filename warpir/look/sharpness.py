@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 
 import numpy as np
@@ -11,6 +12,7 @@ from scipy.special import ive
 
 from warpir.core.arrays import AnyFloatArray, BoolArray, FloatArray, mask_box
 from warpir.core.color import luminance
+from warpir.core.memory import core_count
 
 FINE, COARSE, WIDE = 1.0, 2.0, 3.0
 """Standard deviations of the Gaussian derivatives [px]; the ratio of the first two tells the blur,
@@ -68,12 +70,14 @@ def estimate_blur(linear: AnyFloatArray, region: BoolArray | None = None) -> Edg
         The blur, or None where the photo has too few edges.
     """
     lum = luminance(np.asarray(linear, np.float32))
-    gy, gx = (ndimage.gaussian_filter(lum, FINE, order=order) for order in ((1, 0), (0, 1)))
-    fine = np.hypot(gx, gy)
-    coarse, wide = (
-        np.hypot(*(ndimage.gaussian_filter(lum, s, order=order) for order in ((1, 0), (0, 1))))
-        for s in (COARSE, WIDE)
-    )
+    with ThreadPoolExecutor(core_count()) as pool:
+        (fine, gx, gy), (coarse, *_), (wide, *_), mean = (
+            future.result()
+            for future in [
+                *(pool.submit(_slope, lum, deviation) for deviation in (FINE, COARSE, WIDE)),
+                pool.submit(ndimage.gaussian_filter, lum, WIDE),
+            ]
+        )
     clipped = ndimage.binary_dilation(linear.max(axis=-1) > CLIPPED, iterations=4)
     white = max(float(np.quantile(lum, 0.99)), 1e-6)
     noise = 1.4826 * float(np.median(np.abs(fine - np.median(fine))))
@@ -82,7 +86,6 @@ def estimate_blur(linear: AnyFloatArray, region: BoolArray | None = None) -> Edg
     ridge = _is_ridge(fine, gx, gy) & ~clipped
     border = np.zeros_like(ridge)
     border[6:-6, 6:-6] = True
-    mean = ndimage.gaussian_filter(lum, WIDE)
     everywhere = ridge & border
     asked = [(everywhere, CLEAR), (everywhere, FAINT)]
     if region is not None:
@@ -96,6 +99,12 @@ def estimate_blur(linear: AnyFloatArray, region: BoolArray | None = None) -> Edg
             sigma = _of_lens(sigmas[is_step], float(np.median(contrast[is_step])))
             return EdgeBlur(sigma, int(is_step.sum()))
     return None
+
+
+def _slope(lum: FloatArray, deviation: float) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Return the slope through Gaussian derivatives, and its parts along x and y."""
+    gy, gx = (ndimage.gaussian_filter(lum, deviation, order=order) for order in ((1, 0), (0, 1)))
+    return np.hypot(gx, gy), gx, gy
 
 
 def _of_lens(sigmas: FloatArray, contrast: float) -> float:
@@ -186,11 +195,17 @@ def blurred_layers(
     """
     if sigma <= 0.0 or planes["matte"].size == 0:
         return planes
-    result = {name: gaussian(planes[name], sigma) for name in (*summed, "matte")}
     seen = 1.0 - planes["matte"]
-    weight = gaussian(seen, sigma)[..., None]
     # In differences from 1, so that ground beyond the shadow stays exactly 1.
-    change = gaussian((planes["shadow_ratio"] - 1.0) * seen[..., None], sigma)
+    hidden = (planes["shadow_ratio"] - 1.0) * seen[..., None]
+    names = (*summed, "matte")
+    with ThreadPoolExecutor(core_count()) as pool:
+        blurred = pool.map(
+            lambda plane: gaussian(plane, sigma), [*(planes[name] for name in names), seen, hidden]
+        )
+        *shown, weight, change = blurred
+    result = dict(zip(names, shown, strict=True))
+    weight = weight[..., None]
     ratio = 1.0 + change / np.maximum(weight, 1e-6)
     inside = weight[..., 0] < 1e-3
     ratio[inside] = planes["shadow_ratio"][inside]

@@ -6,7 +6,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from warpir.core.arrays import BoolArray, FloatArray
+from warpir.core.arrays import BoolArray, FloatArray, by_pixel
 from warpir.core.color import GAMMA, linear_to_gamma
 from warpir.io.images.photos import Photo
 from warpir.io.layers import HALF_MAX, Layers
@@ -124,13 +124,13 @@ def composite(
     after = {name: plane for name, plane in after.items() if plane is not before.get(name)}
     del before
     if not photo.is_deep:
-        plate = _halves(plate)
+        plate = by_pixel(_halves, plate)
     layers = _layers(planes, after, box, plate, photo.is_deep)
     changed = (layers.matte > 0.0) | (layers.shadow_ratio != 1.0).any(axis=-1)
     if layers.mirror is not None:
         changed |= (layers.mirror != 0.0).any(axis=-1)
     layers = _with_grain(layers, look, changed, seed, photo.is_deep)
-    image = linear_to_gamma(layers.composite).astype(np.float32, copy=False)
+    image = by_pixel(linear_to_gamma, layers.composite)
     return Picture(layers, image, changed, *counts, look, cut)
 
 
@@ -154,12 +154,12 @@ def _layers(
     if not is_deep:
         # Rounded as in the file of layers, so that they recompose exactly; rounding to
         # half changes 8-bit codes by .06 at most.
-        after |= {name: _halves(after[name]) for name in SUMMED_UP}
+        after |= {name: by_pixel(_halves, after[name]) for name in SUMMED_UP}
     ground = (1.0 - after["matte"])[..., None] * plate[box] * after["shadow_ratio"]
     shown = after["foreground"] + ground
     if "mirror" in after:
         after["mirror"] = leaving_ground(after["mirror"], ground)
-        after["mirror"] = after["mirror"] if is_deep else _halves(after["mirror"])
+        after["mirror"] = after["mirror"] if is_deep else by_pixel(_halves, after["mirror"])
         shown = shown + after["mirror"]
     composite = plate.copy()
     composite[box] = shown
@@ -181,7 +181,7 @@ def _with_grain(
     grain = look.grain_on(layers.composite, layers.plate, layers.matte, changed, seed, GAMMA)
     if grain is None:
         return layers
-    grain = grain if is_deep else _halves(grain)
+    grain = grain if is_deep else by_pixel(_halves, grain)
     return replace(layers, composite=layers.composite + grain, grain=grain)
 
 

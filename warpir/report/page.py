@@ -7,6 +7,7 @@ security policy.
 from __future__ import annotations
 
 from collections.abc import Mapping
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import PurePath
@@ -19,6 +20,7 @@ from warpir.app.finished import config_of_record
 from warpir.app.record import name_of
 from warpir.core.arrays import CodeArray, FloatArray
 from warpir.core.limits import LIMITS
+from warpir.core.memory import core_count
 from warpir.core.strict_json import read_json_object
 from warpir.io.layers import Layers
 from warpir.io.results import OutputFolder
@@ -34,7 +36,7 @@ from warpir.report.facts import (
 )
 from warpir.report.html import render_page
 from warpir.report.panorama import Panorama, panorama, pose_of
-from warpir.report.pictures import before_and_after, jpeg, layers_shown, object_box
+from warpir.report.pictures import Layer, before_and_after, jpeg, layers_shown, object_box
 from warpir.report.plots import Plot, Series, line_plot
 from warpir.report.remedies import again, remedies
 from warpir.report.words import LightCharacter, characterize, light_rows, origin_words
@@ -120,6 +122,10 @@ def report_page(results: Results, is_beside: bool = True) -> bytes:
     )
     asset = "A car" if config.inputs.demo else PurePath(config.inputs.asset or "object").name
     character = results.character
+    with ThreadPoolExecutor(core_count()) as pool:  # encoding pictures takes most of the time
+        comparison, layers, skies = pool.map(
+            lambda make: make(results), (_comparison, _layers, _skies)
+        )
     return render_page(
         "report",
         kind="warpir, report of a run",
@@ -127,9 +133,9 @@ def report_page(results: Results, is_beside: bool = True) -> bytes:
         lead=_lead(results),
         missing=results.missing,
         is_beside=is_beside,
-        comparison=_comparison(results) if results.layers is not None else None,
-        layers=layers_shown(results.layers) if results.layers is not None else [],
-        skies=_skies(results),
+        comparison=comparison,
+        layers=layers,
+        skies=skies,
         light=light_rows(character, results.character_shadow) if character is not None else [],
         balls=jpeg(results.balls) if results.balls is not None else None,
         camera_sources=camera_sources(record),
@@ -178,10 +184,11 @@ def _lead(results: Results) -> str:
     return ". ".join(part[:1].upper() + part[1:] for part in parts) + ("." if parts else "")
 
 
-def _comparison(results: Results) -> dict[str, Any]:
+def _comparison(results: Results) -> dict[str, Any] | None:
     """Return photo and result, whole and around the object, and the slider's start."""
     layers = results.layers
-    assert layers is not None
+    if layers is None:
+        return None
     height, width = layers.matte.shape
     views = [("view-whole", "Whole picture", before_and_after(layers))]
     start, focus = 50.0, (0.5, 0.5)
@@ -205,6 +212,10 @@ def _comparison(results: Results) -> dict[str, Any]:
         "there": [name for name in results.files if name in results.sizes],
         "is_seen": bool((layers.matte > 0.0).any()),
     }
+
+
+def _layers(results: Results) -> list[Layer]:
+    return layers_shown(results.layers) if results.layers is not None else []
 
 
 def _skies(results: Results) -> list[Panorama]:

@@ -10,6 +10,7 @@ import base64
 import io
 import math
 from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Any
@@ -19,6 +20,7 @@ from PIL import Image
 
 from warpir.core.arrays import BoolArray, CodeArray, FloatArray
 from warpir.core.color import codes_of, linear_to_gamma, luminance
+from warpir.core.memory import core_count
 from warpir.io.images.decoder import decode_image
 from warpir.io.layers import Layers
 
@@ -186,9 +188,11 @@ def layers_shown(layers: Layers) -> list[Layer]:
     box = _box_of((layers.matte > 0.0) | (layers.shadow_ratio[..., 1] < SHADED))
     if box is not None:
         layers = _cropped(layers, box)
-    composite, *others = _opaque_layers(layers)
-    foreground, *parts = _object_layers(layers)
-    return [composite, foreground, *others, *parts, *_surface_layers(layers)]
+    with ThreadPoolExecutor(core_count()) as pool:  # encoding takes most of the time
+        opaque, of_object, of_surface = pool.map(
+            lambda kind: list(kind(layers)), (_opaque_layers, _object_layers, _surface_layers)
+        )
+    return [opaque[0], of_object[0], *opaque[1:], *of_object[1:], *of_surface]
 
 
 def _opaque_layers(layers: Layers) -> Iterator[Layer]:

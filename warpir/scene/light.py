@@ -10,7 +10,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from warpir.core.arrays import BoolArray, Float64Array, FloatArray
+from warpir.core.arrays import BoolArray, Float64Array, FloatArray, in_bands
 from warpir.core.color import luminance
 from warpir.core.latlong import (
     latitudes,
@@ -219,17 +219,24 @@ def _add_lobes(texels: Float64Array, lobes: Lobes, along: int, across: int) -> N
     # Within the texels at a pole, the points nearer to it stand for less of the sphere.
     share = sin_theta.reshape(height, along, 1)
     share = (share / share.sum(axis=1, keepdims=True)).astype(np.float32)
-    for amplitude, axis, s in zip(lobes.amplitude, lobes.axis, lobes.sharpness, strict=True):
-        rows = _rows_near(axis, s, height)
-        part = slice(rows.start * along, rows.stop * along)
-        x, y, z = s * axis.astype(np.float64)
-        exponent = np.outer(sin_theta[part], x * sin_lon + z * cos_lon)
-        exponent += (y * cos_theta[part] - s)[:, None]
-        fine = np.exp(exponent.astype(np.float32))
-        if across > 1:
-            fine = fine.reshape(-1, width, across).mean(axis=2)
-        mean = (fine.reshape(-1, along, width) * share[rows]).sum(axis=1)
-        texels[rows] += mean[..., None] * amplitude
+
+    def add(band: slice) -> None:
+        for amplitude, axis, s in zip(lobes.amplitude, lobes.axis, lobes.sharpness, strict=True):
+            near = _rows_near(axis, s, height)
+            rows = slice(max(near.start, band.start), min(near.stop, band.stop))
+            if rows.start >= rows.stop:
+                continue
+            part = slice(rows.start * along, rows.stop * along)
+            x, y, z = s * axis.astype(np.float64)
+            exponent = np.outer(sin_theta[part], x * sin_lon + z * cos_lon)
+            exponent += (y * cos_theta[part] - s)[:, None]
+            fine = np.exp(exponent.astype(np.float32))
+            if across > 1:
+                fine = fine.reshape(-1, width, across).mean(axis=2)
+            mean = (fine.reshape(-1, along, width) * share[rows]).sum(axis=1)
+            texels[rows] += mean[..., None] * amplitude
+
+    in_bands(add, height)
 
 
 def _rows_near(axis: FloatArray, sharpness: float, height: int) -> slice:

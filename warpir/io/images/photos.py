@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from warpir.core import color
-from warpir.core.arrays import Float64Array, FloatArray, PixelArray
+from warpir.core.arrays import Float64Array, FloatArray, PixelArray, by_pixel
 from warpir.core.errors import InputError
 from warpir.core.limits import LIMITS
 from warpir.io.images.color_profile import (
@@ -72,6 +72,8 @@ class Photo:
         if self.is_linear:
             plate: FloatArray = self.codes[where].astype(np.float32, copy=False)
             return plate
+        if where is ...:
+            return by_pixel(color.gamma_to_linear, self.srgb)
         linear: FloatArray = color.gamma_to_linear(self.srgb[where])
         return linear
 

@@ -40,12 +40,13 @@ def balls(light: Light, camera: Camera, is_reinhard: bool, size: int = 192) -> C
     column = (u * sharp.shape[1]).astype(int) % sharp.shape[1]
     row = np.minimum(v * sharp.shape[0], sharp.shape[0] - 1).astype(int)
     mirror = sharp[row, column].astype(np.float64)
-    coarse = as_map(light, 32).astype(np.float64)
-    weighted = (coarse * texel_solid_angles(32, 64)[:, None, None]).reshape(-1, 3)
-    toward = map_directions(32, 64).reshape(-1, 3).T
+    weighted = as_map(light, 32) * texel_solid_angles(32, 64)[:, None, None] * GREY_BALL / np.pi
+    flux = weighted.reshape(-1, 3).astype(np.float32)
+    toward = map_directions(32, 64).reshape(-1, 3).T.astype(np.float32)
+    diffuse = np.zeros_like(mirror)
     # One row at a time: the cosines of all pixels with all texels would take gigabytes.
-    diffuse = np.stack([np.maximum(row @ toward, 0.0) @ weighted / np.pi for row in normal])
-    diffuse *= GREY_BALL
+    for row, facing, seen in zip(diffuse, normal.astype(np.float32), inside, strict=True):
+        row[seen] = np.maximum(facing[seen] @ toward, 0.0) @ flux
     pair = []
     for ball in (mirror, diffuse):
         shown = ball / (1.0 + ball) if is_reinhard else np.minimum(ball, 1.0)

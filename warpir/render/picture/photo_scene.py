@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-import numpy as np
-
 from warpir.app.inputs import Inputs
-from warpir.core.arrays import FloatArray
+from warpir.core.arrays import FloatArray, by_pixel
 from warpir.io.images.photos import Photo
 from warpir.render.device_scene import Placed, Receiver, Scene
 from warpir.render.picture.resizing import resize
@@ -53,8 +51,4 @@ def photo_radiance(photo: Photo, curves: Curves, width_max: int = RECEIVER_WIDTH
     height, width = linear.shape[:2]
     if width > width_max:
         linear = resize(linear, max(1, round(height * width_max / width)), width_max)
-    radiance = np.empty_like(linear, np.float32)
-    # By the row: what lies between in float64 would be the largest arrays of a run.
-    for row, values in zip(radiance, linear, strict=True):
-        row[:] = curves.radiance(values)
-    return radiance
+    return by_pixel(curves.radiance, linear)
