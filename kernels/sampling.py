@@ -174,10 +174,30 @@ def proposal_sample(light: LightArgs, u: wp.vec2) -> wp.vec3:
 @wp.func
 def light_sample(light: LightArgs, u: wp.vec2) -> DrawnLight:
     """Return one of the directions that `draw_light` left, that of the cell around ``u``."""
+    at = light_cell(light, u)
+    return light.drawn[at[0], at[1]]
+
+
+@wp.func
+def light_cell(light: LightArgs, u: wp.vec2) -> wp.vec2i:
+    """Return row and column of the cell around ``u`` among what `draw_light` left."""
     cells = light.drawn.shape[0]
     i = wp.min(int(u[1] * float(cells)), cells - 1)
     j = wp.min(int(u[0] * float(cells)), cells - 1)
-    return light.drawn[i, j]
+    return wp.vec2i(i, j)
+
+
+_FETCH = """
+#if !defined(__CUDA_ARCH__)
+__builtin_prefetch(drawn.data + row * drawn.shape[1] + column);
+#endif
+"""
+
+
+@wp.func_native(_FETCH)
+def fetch(drawn: wp.array2d[DrawnLight], row: int, column: int):
+    """Bring an entry into the CPU's cache ahead of its use; CUDA's threads wait side by side."""
+    ...
 
 
 @wp.kernel(enable_backward=False)

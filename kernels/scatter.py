@@ -10,9 +10,9 @@ import warp as wp
 
 from warpir.kernels.bsdf import Bsdf, BsdfValue, bsdf_f, bsdf_of, bsdf_sample
 from warpir.kernels.maths.frame import Frame, to_local, to_world
-from warpir.kernels.maths.rng import sobol_pair
+from warpir.kernels.maths.rng import sobol_point, sobol_shuffled
 from warpir.kernels.receiver_mesh import receiver_hit, receiver_radiance, sky_visibility
-from warpir.kernels.sampling import light_sample, power_heuristic
+from warpir.kernels.sampling import fetch, light_cell, power_heuristic
 from warpir.kernels.tracing.hit import Hit, offset_origin
 from warpir.kernels.tracing.ray import closest_hit, visibility
 from warpir.kernels.tracing.surface import Surface
@@ -244,8 +244,14 @@ def sample_emitter(
     count = light_count(candidates)
     total = float(0.0)
     picked = float(0.0)
+    pair = 3 * vertex + 2
+    run = sobol_shuffled(index, key, pair) * wp.uint32(candidates)
+    ahead = light_cell(light, sobol_point(run, key, pair))
     for c in range(candidates):
-        drawn = light_sample(light, sobol_pair(candidates * index + c, key, 3 * vertex + 2))
+        drawn = light.drawn[ahead[0], ahead[1]]
+        if c + 1 < candidates:
+            ahead = light_cell(light, sobol_point(run + wp.uint32(c + 1), key, pair))
+            fetch(light.drawn, ahead[0], ahead[1])
         if c == 0:
             sample.wi = drawn.wi
         wi = to_local(drawn.wi, frame)

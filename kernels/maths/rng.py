@@ -93,10 +93,26 @@ def sobol_pair(index: int, seed: wp.uint32, pair: int) -> wp.vec2:
     Owen scrambling of a fraction is the Laine-Karras permutation of its reversed bits. The reversed
     bits of the first coordinate are the index itself, those of the second are `pascal` of it.
     """
-    key = hash_pair(seed, wp.uint32(pair))
+    return sobol_point(sobol_shuffled(index, seed, pair), seed, pair)
+
+
+@wp.func
+def sobol_shuffled(index: int, seed: wp.uint32, pair: int) -> wp.uint32:
+    """Return which unshuffled point of a pair of dimensions an index stands for.
+
+    Where an index takes k points together, a power of two, the points ``k n`` to ``k n + k - 1`` of
+    its n are as good as those of shuffled ``k index`` and on, and are shuffled once.
+    """
     # Scrambling the index as an integer lets each bit depend on the higher bits only, which maps
     # every aligned block of 2^k indices onto an aligned block.
-    shuffled = reverse_bits(laine_karras(reverse_bits(wp.uint32(index)), key))
+    key = hash_pair(seed, wp.uint32(pair))
+    return reverse_bits(laine_karras(reverse_bits(wp.uint32(index)), key))
+
+
+@wp.func
+def sobol_point(shuffled: wp.uint32, seed: wp.uint32, pair: int) -> wp.vec2:
+    """Return an unshuffled point of a pair of dimensions, in [0, 1)^2."""
+    key = hash_pair(seed, wp.uint32(pair))
     first = laine_karras(shuffled, hash_uint(key ^ MIX_1))
     second = laine_karras(pascal(shuffled), hash_uint(key ^ MIX_2))
     return wp.vec2(to_unit(reverse_bits(first)), to_unit(reverse_bits(second)))

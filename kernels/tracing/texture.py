@@ -25,6 +25,8 @@ SLOT_IRIDESCENCE_THICKNESS = wp.constant(14)
 @wp.func
 def wrap(x: int, count: int, mode: int) -> int:
     """Bring a texel index into range: 0 repeat, 1 clamp, 2 mirror."""
+    if x >= 0 and x < count:
+        return x  # without a division
     if mode == 1:
         return wp.clamp(x, 0, count - 1)
     if mode == 2:

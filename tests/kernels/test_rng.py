@@ -6,7 +6,7 @@ import warp as wp
 from scipy import stats
 
 from tests.statistics import SIGNIFICANCE, chi_square_counts, sidak
-from warpir.kernels.maths.rng import pixel_seed, sobol_pair
+from warpir.kernels.maths.rng import pixel_seed, sobol_pair, sobol_point, sobol_shuffled
 
 SEED_COUNT = 1 << 15
 """Independent scrambles of a uniformity test; 128 expected in each of 16 x 16 cells."""
@@ -27,6 +27,14 @@ def sobol_kernel(
 ):
     i = wp.tid()
     u[i] = sobol_pair(index[i], pixel_seed(seed[i], pixel[i]), pair[i])
+
+
+@wp.kernel
+def run_kernel(index: wp.array[int], count: int, pair: int, u: wp.array2d[wp.vec2]):
+    i, c = wp.tid()
+    key = pixel_seed(1, 7)
+    run = sobol_shuffled(index[i], key, pair) * wp.uint32(count)
+    u[i, c] = sobol_point(run + wp.uint32(c), key, pair)
 
 
 def draw(
@@ -74,6 +82,19 @@ def test_sobol_aligned_runs_are_nets(device: str) -> None:
     """So is any aligned run of 2^k indices, beyond the first 2^16 too."""
     for first in (64, 5 * 64, 65536 - 64, 65536, 65536 * 3 + 128):
         assert_is_net(draw(device, first + np.arange(64), pair=3), 6)
+
+
+@pytest.mark.parametrize("count", [1, 2, 8])
+def test_sobol_runs_of_points_are_nets(device: str, count: int) -> None:
+    """So are the points of an aligned run of indices that take several points each."""
+    for first in (0, 5 * 64, 65536 - 64, 65536 * 3 + 128):
+        index = wp.array(np.arange(first, first + 64, dtype=np.int32), dtype=int, device=device)
+        u = wp.zeros((64, count), dtype=wp.vec2, device=device)
+        wp.launch(run_kernel, u.shape, inputs=[index, count, 3], outputs=[u], device=device)
+        points = u.numpy().astype(np.float64)
+        for one in points:
+            assert_is_net(one, count.bit_length() - 1)
+        assert_is_net(points.reshape(-1, 2), 6 + count.bit_length() - 1)
 
 
 def test_sobol_wrap_does_not_repeat(device: str) -> None:
