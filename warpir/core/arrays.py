@@ -20,8 +20,9 @@ CodeArray = NDArray[np.uint8]
 PixelArray = NDArray[Any]
 """Pixels of any kind: codes of 8 or 16 bits, or floats."""
 
-BAND = 64
-"""Rows of a picture that are computed at once."""
+BAND = 1 << 15
+"""Pixels that are computed at once: their float64 colours take less than the MiB from which memory
+is asked of the system anew (`warpir.core.memory.sparing`)."""
 
 
 def mask_box(mask: BoolArray, margin: int = 0) -> tuple[slice, slice]:
@@ -39,7 +40,7 @@ def mask_box(mask: BoolArray, margin: int = 0) -> tuple[slice, slice]:
     return rows, columns
 
 
-def in_bands(work: Callable[[slice], object], height: int) -> None:
+def in_bands(work: Callable[[slice], object], height: int, width: int) -> None:
     """Call for the rows of a picture, band by band, on every core.
 
     In bands, since what lies between would be the largest arrays of a run; NumPy leaves other
@@ -48,8 +49,10 @@ def in_bands(work: Callable[[slice], object], height: int) -> None:
     Args:
         work: Takes the rows of a band, which it alone writes.
         height: Of the picture [px].
+        width: Of the picture [px].
     """
-    bands = [slice(top, min(top + BAND, height)) for top in range(0, height, BAND)]
+    rows = max(1, BAND // max(1, width))
+    bands = [slice(top, min(top + rows, height)) for top in range(0, height, rows)]
     with ThreadPoolExecutor(core_count()) as pool:
         list(pool.map(work, bands))
 
@@ -61,5 +64,5 @@ def by_pixel(function: Callable[[FloatArray], AnyFloatArray], plane: FloatArray)
     def fill(rows: slice) -> None:
         result[rows] = function(plane[rows])
 
-    in_bands(fill, len(plane))
+    in_bands(fill, *plane.shape[:2])
     return result

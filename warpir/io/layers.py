@@ -2,7 +2,9 @@
 
 import json
 from collections.abc import Mapping
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import MISSING, dataclass, fields
+from itertools import repeat
 from pathlib import Path
 from typing import Any
 
@@ -11,6 +13,7 @@ import numpy as np
 from warpir.core.arrays import PixelArray
 from warpir.core.errors import InputError
 from warpir.core.limits import LIMITS
+from warpir.core.memory import core_count
 from warpir.io.images.decoder import read_exr_channels
 from warpir.io.images.writers import color_header
 from warpir.io.results import OutputFolder
@@ -214,6 +217,8 @@ def _stored_channels(
             clamped += int((np.isfinite(plane) & (np.abs(plane) >= HALF_MAX)).sum())
             # NaN and Inf pass through, and the writer refuses them.
             plane = np.where(np.isfinite(plane), np.clip(plane, -HALF_MAX, HALF_MAX), plane)
-        for k, channel in enumerate(names):
-            channels[channel] = plane[..., k].astype(np.float32 if is_float else np.float16)
+        kind = np.float32 if is_float else np.float16
+        with ThreadPoolExecutor(core_count()) as pool:
+            stored = pool.map(np.ndarray.astype, np.moveaxis(plane, -1, 0), repeat(kind))
+            channels |= dict(zip(names, stored, strict=True))
     return channels, clamped

@@ -80,7 +80,7 @@ class CameraLook:
             band = {name: planes[name][rows] for name in (*changed, "matte")}
             self._show(response, band, plate[rows])
 
-        in_bands(show, len(plate))
+        in_bands(show, *plate.shape[:2])
         return planes
 
     @staticmethod

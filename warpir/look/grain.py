@@ -235,7 +235,7 @@ def grain_over(
         noisy = np.clip(shown + lacking * noise[rows][here], 0.0, 1.0) ** gamma
         added[box][rows][here] = noisy - linear
 
-    in_bands(add, height)
+    in_bands(add, height, width)
     return added
 
 

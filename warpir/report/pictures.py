@@ -9,9 +9,10 @@ from __future__ import annotations
 import base64
 import io
 import math
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, fields
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -188,44 +189,53 @@ def layers_shown(layers: Layers) -> list[Layer]:
     box = _box_of((layers.matte > 0.0) | (layers.shadow_ratio[..., 1] < SHADED))
     if box is not None:
         layers = _cropped(layers, box)
+    composite, *others = _opaque_layers(layers)
+    foreground, *parts = _object_layers(layers)
+    entries = [composite, foreground, *others, *parts, *_surface_layers(layers)]
     with ThreadPoolExecutor(core_count()) as pool:  # encoding takes most of the time
-        opaque, of_object, of_surface = pool.map(
-            lambda kind: list(kind(layers)), (_opaque_layers, _object_layers, _surface_layers)
-        )
-    return [opaque[0], of_object[0], *opaque[1:], *of_object[1:], *of_surface]
+        return list(pool.map(lambda entry: entry(), entries))
 
 
-def _opaque_layers(layers: Layers) -> Iterator[Layer]:
+def _entry(
+    name: str, about: str, picture: Callable[[], Shown], has_alpha: bool = True
+) -> Callable[[], Layer]:
+    """Return what makes a layer; its picture is made by the call."""
+    return lambda: Layer(name, about, picture(), has_alpha)
+
+
+def _opaque_layers(layers: Layers) -> Iterator[Callable[[], Layer]]:
     """Yield the layers that have a value in every pixel."""
 
     def opaque(plane: FloatArray) -> Shown:
         return jpeg(encoded(shrink(plane, LAYER_LARGEST)))
 
+    def of_either_sign(plane: FloatArray, factor: float) -> Shown:
+        return jpeg(codes_of(shrink((0.5 + factor * plane).astype(np.float32), LAYER_LARGEST)))
+
     about = "The picture: fg + (1 − fg.A) × plate × shadow, pixel by pixel"
     others = [name for name in ("mirror", "grain") if getattr(layers, name) is not None]
     about += f", plus {' and '.join(others)}." if others else "."
-    yield Layer("composite", about, opaque(layers.composite), has_alpha=False)
+    yield _entry("composite", about, partial(opaque, layers.composite), has_alpha=False)
     about = "What the photo is multiplied with: white where the object changes nothing."
     if (darkest := float(luminance(layers.shadow_ratio).min())) < 1.0:
         about += f" Its darkest pixel keeps {100.0 * max(darkest, 0.0):.0f} % of the light."
-    yield Layer("shadow", about, opaque(layers.shadow_ratio), has_alpha=False)
-    yield Layer("plate", "The photo, linearised.", opaque(layers.plate), has_alpha=False)
+    yield _entry("shadow", about, partial(opaque, layers.shadow_ratio), has_alpha=False)
+    about = "The photo, linearised."
+    yield _entry("plate", about, partial(opaque, layers.plate), has_alpha=False)
     if layers.mirror is not None:
         about = "What the object's mirror image adds to the ground, of either sign: grey is none."
-        grey = (0.5 + layers.mirror).astype(np.float32)
-        shown = jpeg(codes_of(shrink(grey, LAYER_LARGEST)))
-        yield Layer("mirror", about, shown, has_alpha=False)
+        shown = partial(of_either_sign, layers.mirror, 1.0)
+        yield _entry("mirror", about, shown, has_alpha=False)
     if layers.grain is not None:
         about = "The photo's grain on what has changed, of either sign: grey is none, tenfold."
-        grey = (0.5 + 10.0 * layers.grain).astype(np.float32)
-        shown = jpeg(codes_of(shrink(grey, LAYER_LARGEST)))
-        yield Layer("grain", about, shown, has_alpha=False)
-    matte = jpeg(codes_of(shrink(layers.matte, LAYER_LARGEST)))
+        shown = partial(of_either_sign, layers.grain, 10.0)
+        yield _entry("grain", about, shown, has_alpha=False)
     about = "How much of each pixel the object covers: white is all."
-    yield Layer("matte", about, matte, has_alpha=False)
+    matte = shrink(layers.matte, LAYER_LARGEST)
+    yield _entry("matte", about, lambda: jpeg(codes_of(matte)), has_alpha=False)
 
 
-def _object_layers(layers: Layers) -> Iterator[Layer]:
+def _object_layers(layers: Layers) -> Iterator[Callable[[], Layer]]:
     """Yield the object's own light and its parts, which are premultiplied by the coverage."""
     matte = shrink(layers.matte, LAYER_LARGEST)
 
@@ -235,21 +245,21 @@ def _object_layers(layers: Layers) -> Iterator[Layer]:
         return _with_alpha(encoded(covered.astype(np.float32, copy=False)), matte)
 
     about = "The object alone, lit and tone-mapped, premultiplied by its coverage (RGBA)."
-    yield Layer("fg", about, straight(layers.foreground[..., :3]))
+    yield _entry("fg", about, partial(straight, layers.foreground[..., :3]))
     if layers.diffuse is not None:
         about = "Part of fg that the object scatters in all directions."
-        yield Layer("diffuse", about, straight(layers.diffuse))
+        yield _entry("diffuse", about, partial(straight, layers.diffuse))
     if layers.specular is not None:
         about = "Part of fg that the object mirrors: highlights and reflections."
-        yield Layer("specular", about, straight(layers.specular))
+        yield _entry("specular", about, partial(straight, layers.specular))
     if layers.emission is not None:
         about = "Part of fg that the object emits."
         if not layers.emission.any():
             about += " This one emits nothing."
-        yield Layer("emission", about, straight(layers.emission))
+        yield _entry("emission", about, partial(straight, layers.emission))
 
 
-def _surface_layers(layers: Layers) -> Iterator[Layer]:
+def _surface_layers(layers: Layers) -> Iterator[Callable[[], Layer]]:
     """Yield what describes the surface, averaged over the object alone."""
     if layers.depth is None:
         return
@@ -263,22 +273,25 @@ def _surface_layers(layers: Layers) -> Iterator[Layer]:
         average: FloatArray = shrunk / (weight if shrunk.ndim == 2 else weight[..., None])
         return average
 
+    def surface(codes: CodeArray) -> Callable[[], Shown]:
+        return partial(_with_alpha, codes, share)
+
     if layers.albedo is not None:
         about = "Base colour of the surface, without any light."
-        yield Layer("albedo", about, _with_alpha(encoded(mean(layers.albedo)), share))
+        yield _entry("albedo", about, surface(encoded(mean(layers.albedo))))
     if layers.roughness is not None:
         about = "Perceptual roughness: black is a mirror, white is matt."
-        yield Layer("roughness", about, _with_alpha(codes_of(mean(layers.roughness)), share))
+        yield _entry("roughness", about, surface(codes_of(mean(layers.roughness))))
     if layers.normal is not None:
         about = "Unit normal of the surface in world axes: red +X, green +Y (up), blue +Z."
-        yield Layer("normal", about, _with_alpha(codes_of(0.5 + 0.5 * mean(layers.normal)), share))
+        yield _entry("normal", about, surface(codes_of(0.5 + 0.5 * mean(layers.normal))))
     if not is_shown.any():  # the surface is in the pixels alone that shrinking cuts off
         return
     depth = mean(np.where(is_surface, layers.depth, np.float32(0.0)))
     low, high = float(depth[is_shown].min()), float(depth[is_shown].max())
     about = f"Distance along the viewing axis: white is {low:.2f} m, black is {high:.2f} m."
     nearness = (high - depth) / max(high - low, 1e-6)
-    yield Layer("depth", about, _with_alpha(codes_of(nearness), share))
+    yield _entry("depth", about, surface(codes_of(nearness)))
     if layers.position is not None:
         position = mean(layers.position)
         lows, highs = position[is_shown].min(axis=0), position[is_shown].max(axis=0)
@@ -286,7 +299,7 @@ def _surface_layers(layers: Layers) -> Iterator[Layer]:
         ranges = ", ".join(f"{axis} from {a:.2f} to {b:.2f} m" for axis, a, b in axes)
         about = f"Position of the surface in the world: {ranges}."
         scaled = (position - lows) / np.maximum(highs - lows, 1e-6)
-        yield Layer("position", about, _with_alpha(codes_of(scaled), share))
+        yield _entry("position", about, surface(codes_of(scaled)))
 
 
 def _with_alpha(codes: CodeArray, alpha: FloatArray) -> Shown:
