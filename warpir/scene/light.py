@@ -236,7 +236,7 @@ def _add_lobes(texels: Float64Array, lobes: Lobes, along: int, across: int) -> N
             mean = (fine.reshape(-1, along, width) * share[rows]).sum(axis=1)
             texels[rows] += mean[..., None] * amplitude
 
-    in_bands(add, height, width * along * across)
+    in_bands(add, height, width)
 
 
 def _rows_near(axis: FloatArray, sharpness: float, height: int) -> slice:
