@@ -158,11 +158,13 @@ def plot(runs: Sequence[dict[str, Any]], path: Path) -> None:
             x = [row[name] for row in rows]
             title = f"{rows[0]['device']}, {rows[0]['threads'] or 'one card'}"
             title += " threads" if rows[0]["threads"] else ""
-            axis.plot(x, [row["seconds_picture"] for row in rows], marker="o", label=title)
+            seconds = [row["seconds_picture"] for row in rows]
+            (line,) = axis.plot(x, seconds, marker="o", label=title)
             if name == "triangles":
                 seconds = [row["seconds_scene"] for row in rows]
-                axis.plot(x, seconds, "--", marker="o", label="building the scene")
-        axis.set_xscale("log")
+                of_scene = {"color": line.get_color(), "label": "its scene, built once"}
+                axis.plot(x, seconds, "--", marker="o", **of_scene)
+        axis.set_xscale("log", base=2.0 if name == "width" else 10.0)
         axis.set_yscale("log")
         axis.set_xlabel(label)
         axis.grid(True, alpha=0.4)
