@@ -5,7 +5,6 @@ network's batch is: libraries sum in another order then.
 """
 
 import errno
-import gc
 import json
 import resource
 from collections.abc import Callable
@@ -22,7 +21,7 @@ from PIL import Image
 from tests.builders.faults import run_case, snapshot
 from tests.builders.guided_runs import guided_flags
 from tests.builders.insertions import arguments, write_inputs
-from tests.builders.loops import SETTINGS, TRACED, a_loop, bent, values
+from tests.builders.loops import SETTINGS, STATM, TRACED, a_loop, bent, growth, values
 from tests.builders.shapes import camera, ground, placed, sphere
 from tests.builders.tiny_stable_diffusion import make_tiny_stable_diffusion
 from warpir.core import memory as memory_module
@@ -55,7 +54,6 @@ GROWTH_BYTES = 6 << 20
 """Of 180 steps: what an allocator rounds up and keeps, not what each step would add."""
 CUDA_ROUNDING = 1e-4
 """Of the largest value, after sums in another order (float32) and up to three steps of Adam."""
-STATM = Path("/proc/self/statm")
 
 
 def short(*_: object, **__: object) -> NoReturn:
@@ -432,21 +430,9 @@ def test_step_without_memory_changes_nothing(device: str, monkeypatch: pytest.Mo
 @pytest.mark.parametrize("integrator", ["transport", "mis"])
 def test_memory_is_flat_over_200_steps(device: str, integrator: str) -> None:
     """Resident memory after step 200 is that after step 20."""
-
-    def resident() -> int:
-        gc.collect()
-        return int(STATM.read_text().split()[1]) * resource.getpagesize()
-
     settings = replace(SETTINGS, steps=200, integrator=integrator, score_every=20)
-    loop = a_loop(device, settings=settings)
-    for _ in range(20):
-        loop.step()
-    before = resident()
-    on_device = torch.cuda.memory_allocated() if device != "cpu" else 0
-    loop.run()
-    assert loop.state.step == 200 and resident() - before < GROWTH_BYTES
-    if device != "cpu":
-        assert torch.cuda.memory_allocated() <= on_device + GROWTH_BYTES
+    steps, host, on_device = growth(device, settings)
+    assert steps == 200 and host < GROWTH_BYTES and on_device <= GROWTH_BYTES
 
 
 # ---------------------------------------------------------------------------- the model

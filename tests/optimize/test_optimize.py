@@ -3,8 +3,6 @@
 What stands in for guidance is a fixed image gradient, a target image, or one that fails on purpose.
 """
 
-import gc
-import resource
 from collections.abc import Mapping
 from copy import deepcopy
 from dataclasses import replace
@@ -22,12 +20,14 @@ from tests.builders.loops import (
     RATES,
     ROWS,
     SETTINGS,
+    STATM,
     TRACED,
     WIDTH,
     Pull,
     a_frame,
     a_loop,
     bent,
+    growth,
     values,
 )
 from tests.statistics import central_differences, compare_gradients
@@ -47,7 +47,6 @@ MIS_COSINE, MIS_BIAS = 0.99, 0.02
 """Asked of `transport` against `mis`, as in `tests.render.test_transport`; three runs of each."""
 MEMORY_GROWTH = 4 << 20
 """Of 100 steps [byte]; measured: 0.2 MiB, and 10 (mis) to 28 MiB if every picture were kept."""
-STATM = Path("/proc/self/statm")
 
 pytestmark = pytest.mark.usefixtures("one_thread")
 
@@ -334,18 +333,8 @@ def test_run_does_not_depend_on_threads(device: str, integrator: str) -> None:
 @pytest.mark.slow
 def test_run_takes_flat_memory(device: str, integrator: str) -> None:
     """After the first steps, a hundred more keep nothing but their numbers."""
-
-    def resident() -> int:
-        gc.collect()
-        return int(STATM.read_text().split()[1]) * resource.getpagesize()
-
-    settings = replace(SETTINGS, steps=120, integrator=integrator)
-    loop = a_loop(device, settings=settings)
-    for _ in range(20):
-        loop.step()
-    before = resident()
-    loop.run()
-    assert loop.state.step == 120 and resident() - before < MEMORY_GROWTH
+    steps, host, _ = growth(device, replace(SETTINGS, steps=120, integrator=integrator))
+    assert steps == 120 and host < MEMORY_GROWTH
 
 
 # ------------------------------------------------------------------------- what goes wrong
