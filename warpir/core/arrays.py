@@ -1,13 +1,15 @@
 """The kinds of NumPy array that annotations name, one alias each; boxes and bands of rows."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from concurrent.futures import ThreadPoolExecutor
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
 from warpir.core.memory import core_count
+
+Result = TypeVar("Result")
 
 FloatArray = NDArray[np.float32]
 Float64Array = NDArray[np.float64]
@@ -40,6 +42,12 @@ def mask_box(mask: BoolArray, margin: int = 0) -> tuple[slice, slice]:
     return rows, columns
 
 
+def on_cores(function: Callable[[Any], Result], items: Iterable[Any]) -> list[Result]:
+    """Return what a function makes of each item, by as many threads as there are cores."""
+    with ThreadPoolExecutor(core_count()) as pool:
+        return list(pool.map(function, items))
+
+
 def in_bands(work: Callable[[slice], object], height: int, width: int) -> None:
     """Call for the rows of a picture, band by band, on every core.
 
@@ -52,9 +60,7 @@ def in_bands(work: Callable[[slice], object], height: int, width: int) -> None:
         width: Of the picture [px].
     """
     rows = max(1, BAND // max(1, width))
-    bands = [slice(top, min(top + rows, height)) for top in range(0, height, rows)]
-    with ThreadPoolExecutor(core_count()) as pool:
-        list(pool.map(work, bands))
+    on_cores(work, [slice(top, min(top + rows, height)) for top in range(0, height, rows)])
 
 
 def by_pixel(function: Callable[[FloatArray], AnyFloatArray], plane: FloatArray) -> FloatArray:

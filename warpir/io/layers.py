@@ -2,18 +2,16 @@
 
 import json
 from collections.abc import Mapping
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import MISSING, dataclass, fields
-from itertools import repeat
+from operator import methodcaller
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from warpir.core.arrays import PixelArray
+from warpir.core.arrays import PixelArray, on_cores
 from warpir.core.errors import InputError
 from warpir.core.limits import LIMITS
-from warpir.core.memory import core_count
 from warpir.io.images.decoder import read_exr_channels
 from warpir.io.images.writers import color_header
 from warpir.io.results import OutputFolder
@@ -218,7 +216,6 @@ def _stored_channels(
             # NaN and Inf pass through, and the writer refuses them.
             plane = np.where(np.isfinite(plane), np.clip(plane, -HALF_MAX, HALF_MAX), plane)
         kind = np.float32 if is_float else np.float16
-        with ThreadPoolExecutor(core_count()) as pool:
-            stored = pool.map(np.ndarray.astype, np.moveaxis(plane, -1, 0), repeat(kind))
-            channels |= dict(zip(names, stored, strict=True))
+        stored = on_cores(methodcaller("astype", kind), np.moveaxis(plane, -1, 0))
+        channels |= dict(zip(names, stored, strict=True))
     return channels, clamped

@@ -10,7 +10,7 @@ import numpy as np
 from scipy import ndimage
 from scipy.special import ive
 
-from warpir.core.arrays import AnyFloatArray, BoolArray, FloatArray, mask_box
+from warpir.core.arrays import AnyFloatArray, BoolArray, FloatArray, mask_box, on_cores
 from warpir.core.color import luminance
 from warpir.core.memory import core_count
 
@@ -199,11 +199,8 @@ def blurred_layers(
     # In differences from 1, so that ground beyond the shadow stays exactly 1.
     hidden = (planes["shadow_ratio"] - 1.0) * seen[..., None]
     names = (*summed, "matte")
-    with ThreadPoolExecutor(core_count()) as pool:
-        blurred = pool.map(
-            lambda plane: gaussian(plane, sigma), [*(planes[name] for name in names), seen, hidden]
-        )
-        *shown, weight, change = blurred
+    clear = [*(planes[name] for name in names), seen, hidden]
+    *shown, weight, change = on_cores(lambda plane: gaussian(plane, sigma), clear)
     result = dict(zip(names, shown, strict=True))
     weight = weight[..., None]
     ratio = 1.0 + change / np.maximum(weight, 1e-6)

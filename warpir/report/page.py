@@ -6,8 +6,7 @@ security policy.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from concurrent.futures import ThreadPoolExecutor
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import PurePath
@@ -18,9 +17,8 @@ import numpy as np
 from warpir.app.config import DEFAULTS, InsertConfig
 from warpir.app.finished import config_of_record
 from warpir.app.record import name_of
-from warpir.core.arrays import CodeArray, FloatArray
+from warpir.core.arrays import CodeArray, FloatArray, on_cores
 from warpir.core.limits import LIMITS
-from warpir.core.memory import core_count
 from warpir.core.strict_json import read_json_object
 from warpir.io.layers import Layers
 from warpir.io.results import OutputFolder
@@ -122,10 +120,9 @@ def report_page(results: Results, is_beside: bool = True) -> bytes:
     )
     asset = "A car" if config.inputs.demo else PurePath(config.inputs.asset or "object").name
     character = results.character
-    with ThreadPoolExecutor(core_count()) as pool:  # encoding pictures takes most of the time
-        comparison, layers, skies = pool.map(
-            lambda make: make(results), (_comparison, _layers, _skies)
-        )
+    # Encoding pictures takes most of the time.
+    parts: tuple[Callable[[Results], Any], ...] = (_comparison, _layers, _skies)
+    comparison, layers, skies = on_cores(lambda make: make(results), parts)
     return render_page(
         "report",
         kind="warpir, report of a run",

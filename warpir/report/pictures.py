@@ -10,7 +10,6 @@ import base64
 import io
 import math
 from collections.abc import Callable, Iterator
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, fields
 from functools import partial
 from pathlib import Path
@@ -19,9 +18,8 @@ from typing import Any
 import numpy as np
 from PIL import Image
 
-from warpir.core.arrays import BoolArray, CodeArray, FloatArray
+from warpir.core.arrays import BoolArray, CodeArray, FloatArray, on_cores
 from warpir.core.color import codes_of, linear_to_gamma, luminance
-from warpir.core.memory import core_count
 from warpir.io.images.decoder import decode_image
 from warpir.io.layers import Layers
 
@@ -192,8 +190,7 @@ def layers_shown(layers: Layers) -> list[Layer]:
     composite, *others = _opaque_layers(layers)
     foreground, *parts = _object_layers(layers)
     entries = [composite, foreground, *others, *parts, *_surface_layers(layers)]
-    with ThreadPoolExecutor(core_count()) as pool:  # encoding takes most of the time
-        return list(pool.map(lambda entry: entry(), entries))
+    return on_cores(lambda entry: entry(), entries)  # encoding takes most of the time
 
 
 def _entry(

@@ -8,7 +8,6 @@ import struct
 import tempfile
 import zlib
 from collections.abc import Mapping
-from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 
@@ -16,7 +15,7 @@ import numpy as np
 
 import warpir
 from warpir.core import color
-from warpir.core.arrays import CodeArray, FloatArray, PixelArray
+from warpir.core.arrays import CodeArray, FloatArray, PixelArray, on_cores
 from warpir.core.errors import ExitCode, InputError, disk_error
 from warpir.core.memory import core_count
 from warpir.io.images.decoder import decode_image, library_error
@@ -105,8 +104,7 @@ def _deflated(content: memoryview, level: int) -> bytes:
         end = zlib.Z_FINISH if last >= len(content) else zlib.Z_SYNC_FLUSH
         return packed + packer.flush(end)
 
-    with ThreadPoolExecutor(core_count()) as pool:
-        blocks = list(pool.map(block, range(0, len(content), BLOCK)))
+    blocks = on_cores(block, range(0, len(content), BLOCK))
     return b"".join([b"\x78\x9c", *blocks, struct.pack(">I", zlib.adler32(content))])
 
 
