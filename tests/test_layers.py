@@ -35,7 +35,6 @@ PACKAGES = {
     "warp": {"kernels", *KERNELS_IN},
     "torch": {
         "diffusion",
-        "calibration",
         "render",
         "lighting",
         "optimize",

@@ -10,8 +10,8 @@ or from Python, where the module itself can be called:
     insertion = insert(InsertConfig(photo="street.jpg", asset="car.glb", out="out"))
 
 Checked in this order: arguments, all inputs and the models' files, the output folder and its lock,
-disk space. torch and Warp are imported after these checks, so ``--help``, wrong arguments and
-``--validate`` answer without them; a camera that is to be estimated needs torch with the inputs.
+disk space. Warp is imported after these checks, so ``--help``, wrong arguments and ``--validate``
+answer without it. torch is imported where a diffusion model guides, and by nothing else.
 """
 
 import sys
@@ -109,7 +109,7 @@ def _insert_one(config: InsertConfig, loaders: "Loaders | None" = None) -> Inser
     run, given = _read(config, loaders or Loaders(estimate_photo))
     with run.output as output:
         run.require_room()
-        with no_collection(), run.timings.stage("load"):  # loads torch and Warp
+        with no_collection(), run.timings.stage("load"):  # loads Warp
             from warpir.optimize.find_light import find_light, with_photo_detail
             from warpir.render.device import choose_device
             from warpir.report.result import render_result, write_preview

@@ -405,7 +405,7 @@ def weights() -> Iterator[Format]:
     from safetensors.torch import save
 
     from warpir.core.atomic import Checkpoints
-    from warpir.lighting.regressor import RegressorConfig, random_regressor, save_regressor
+    from warpir.train.networks.regressor import RegressorConfig, random_regressor, save_regressor
 
     def file(name: str, reader: str, sound: bytes) -> Format:
         damage = damaged_safetensors(sound)

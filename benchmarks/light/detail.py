@@ -148,7 +148,7 @@ def main() -> None:
     device = choose_device(options.device)
     panoramas = find_files(options.panoramas, PANORAMA_SUFFIXES, "--panoramas")
     assets = find_files(options.assets, (".glb", ".gltf", ".obj", ".ply", ".stl"), "--assets")
-    regressor = load_regressor(None, device)
+    regressor = load_regressor(None)
     errors: dict[tuple[str, str, str, str], list[float]] = {}
     tiles = []
     for place, subjects in Places(panoramas, assets, options.seed).make(options.places):

@@ -18,8 +18,8 @@ from torch import Tensor
 from warpir.evaluate.scenes import Places
 from warpir.evaluate.stage import unseen_by
 from warpir.lighting.regression import regress, yaw_to_world
-from warpir.lighting.regressor import load_regressor, save_regressor
 from warpir.scene.light import Light, axis_from_angles, summarize
+from warpir.train.networks.regressor import read_regressor, save_regressor
 from warpir.train.validation import COVERAGE, calibrated_temperature, region_mass
 
 
@@ -32,9 +32,10 @@ def main() -> None:
     parser.add_argument("--seed", type=int, default=31, help="seed (default: 31)")
     parser.add_argument("--write", type=Path, help="the weights file to change")
     options = parser.parse_args()
-    network = load_regressor(options.write)
-    network.temperature.fill_(1.0)
-    directions = network.directions.double()
+    trained = read_regressor(options.write)
+    trained.temperature.fill_(1.0)
+    network = trained.regressor()
+    directions = trained.directions.double()
     logits, axes = defaultdict[str, list[Tensor]](list), defaultdict[str, list[Tensor]](list)
     for place, _ in Places(options.panoramas, [options.asset], options.seed).make(options.scenes):
         if unseen_by(network, place.panorama) is not network:
@@ -62,8 +63,8 @@ def main() -> None:
     best = calibrated_temperature(directions, list(sets.values()))
     print(f"all: {best:.2f}")
     if options.write is not None:
-        network.temperature.fill_(best)
-        save_regressor(network, options.write, {**network.record, "mean_calibrated_on": list(sets)})
+        trained.temperature.fill_(best)
+        save_regressor(trained, options.write, {**trained.record, "mean_calibrated_on": list(sets)})
 
 
 if __name__ == "__main__":

@@ -361,7 +361,7 @@ def main() -> None:
     parser.add_argument("--device")
     parser.add_argument("--json", type=Path)
     options = parser.parse_args()
-    network = load_regressor(None, "cpu")
+    network = load_regressor(None)
     judged = []
     for path in find_files(options.panoramas, PANORAMA_SUFFIXES, "--panoramas"):
         truth, unseen = truth_of(path), unseen_by(network, path.stem)

@@ -36,14 +36,14 @@ REGRESSOR_SIZES: Sizes = {
     "hidden": (1, 1, float, 0, 0.99),
     "members": (1, 1, int, 1, 16),
 }
-"""Of each field of a `warpir.lighting.regressor.RegressorConfig`: the least and the greatest count
-of numbers, which are a list where there may be several; their kind, and the least and the greatest.
-"""
+"""Of each field of a `warpir.train.networks.regressor.RegressorConfig`: the least and the greatest
+count of numbers, which are a list where there may be several; their kind, and the least and the
+greatest."""
 CALIBRATOR_SIZES: Sizes = {
     name: REGRESSOR_SIZES[name]
     for name in ("channels", "blocks", "depth", "heads", "dropout", "skipped")
 }
-"""The same of a `warpir.calibration.network.CalibratorConfig`."""
+"""The same of a `warpir.train.networks.calibrator.CalibratorConfig`."""
 
 EXPONENTS = {
     "F16": ("<u2", 0x7C00),

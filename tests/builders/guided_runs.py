@@ -31,7 +31,7 @@ def write_guided_inputs(folder: Path) -> None:
     """Write photo, box, a tiny model, and random weights of the regressor."""
     from tests.builders.insertions import write_inputs
     from tests.builders.tiny_stable_diffusion import make_tiny_stable_diffusion
-    from warpir.lighting.regressor import random_regressor, save_regressor
+    from warpir.train.networks.regressor import random_regressor, save_regressor
 
     write_inputs(folder)
     make_tiny_stable_diffusion(folder / "model")

@@ -7,16 +7,7 @@ import pytest
 import torch
 import torch.nn.functional as F
 
-from warpir.calibration.network import (
-    HEIGHT,
-    NUMBERS,
-    SHAPE,
-    WIDTH,
-    CalibratorConfig,
-    load_calibrator,
-    random_calibrator,
-)
-from warpir.lighting.regressor import RegressorConfig, random_regressor
+from warpir.calibration.network import HEIGHT, NUMBERS, WIDTH, load_calibrator
 from warpir.scene.camera import Camera, camera_from_fov
 from warpir.train.camera.crops import (
     DrawnCameras,
@@ -26,6 +17,8 @@ from warpir.train.camera.crops import (
     with_blur,
 )
 from warpir.train.camera.loop import CameraSettings, begin_with_trunk, train_camera
+from warpir.train.networks.calibrator import SHAPE, CalibratorConfig, random_calibrator
+from warpir.train.networks.regressor import RegressorConfig, random_regressor
 from warpir.train.sampler import Sampler
 
 

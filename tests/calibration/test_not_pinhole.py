@@ -10,9 +10,9 @@ from PIL import Image
 import warpir.demo
 from warpir.calibration import not_pinhole
 from warpir.calibration.estimate import NOT_PINHOLE_SIGMA_DEG, estimate_camera
-from warpir.calibration.network import CalibratorConfig, random_calibrator
 from warpir.calibration.not_pinhole import has_image_circle, has_seam, looks_like
 from warpir.core.arrays import FloatArray
+from warpir.train.networks.calibrator import CalibratorConfig, random_calibrator
 
 SMALL = CalibratorConfig(channels=(8, 8, 16), blocks=(1, 1), depth=1, heads=2)
 
@@ -123,7 +123,7 @@ def test_circle_in_even_corners_is_a_fisheye_picture() -> None:
 def test_estimate_of_a_collage_is_unsure_and_otherwise_as_before(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    network, collage = random_calibrator(0, SMALL), side_by_side(0)
+    network, collage = random_calibrator(0, SMALL).calibrator(), side_by_side(0)
     found = estimate_camera(collage, network)
     assert found.looks_like == "a collage"
     assert min(found.pitch_sigma_deg, found.vfov_sigma_deg) >= NOT_PINHOLE_SIGMA_DEG

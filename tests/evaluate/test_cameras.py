@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 import torch
 
-from warpir.calibration.network import CalibratorConfig, random_calibrator, save_calibrator
 from warpir.evaluate.camera.measure import (
     constant_camera,
     corrected_to_upright,
@@ -20,6 +19,7 @@ from warpir.evaluate.command import main
 from warpir.io.results import OutputFolder
 from warpir.scene.camera import camera_from_fov
 from warpir.train.camera.crops import DrawnCameras, read_panoramas
+from warpir.train.networks.calibrator import CalibratorConfig, random_calibrator, save_calibrator
 from warpir.train.sampler import Sampler
 
 SMALL = CalibratorConfig(channels=(8, 8, 16), blocks=(1, 1), depth=1, heads=2)
@@ -110,7 +110,8 @@ def test_corrected_photograph_shows_the_horizon_at_its_axis(panoramas: Path) -> 
 def test_panoramas_that_were_learned_from_are_left_out(tmp_path: Path) -> None:
     network = random_calibrator(0, SMALL)
     network.record = {"panoramas": ["a"]}
-    fresh, notices = unlearned([tmp_path / "a.exr", tmp_path / "b.exr"], network)
+    asked = network.calibrator()
+    fresh, notices = unlearned([tmp_path / "a.exr", tmp_path / "b.exr"], asked)
     assert [path.stem for path in fresh] == ["b"] and "1 panoramas" in notices[0]
-    known, notices = unlearned([tmp_path / "a.exr"], network)
+    known, notices = unlearned([tmp_path / "a.exr"], asked)
     assert [path.stem for path in known] == ["a"] and "learned from all" in notices[0]

@@ -37,11 +37,11 @@ from warpir.evaluate.scenes import (
 )
 from warpir.evaluate.stage import Bench, Prediction, Stage
 from warpir.io.results import OutputFolder
-from warpir.lighting.regressor import random_regressor, save_regressor
 from warpir.render.picture.planes import Quality
 from warpir.scene.camera import CameraEstimate
 from warpir.scene.light import Light, Lobes, as_map, axis_from_angles, rasterize_lobes
 from warpir.scene.tone_curves import Curves
+from warpir.train.networks.regressor import random_regressor, save_regressor
 
 SUNS = {"east": (70.0, 35.0), "west": (-110.0, 50.0), "north": (10.0, 20.0)}
 """Azimuth and elevation of the made-up panoramas' suns [deg]."""
@@ -97,7 +97,7 @@ def sunlit(subject: Subject, samples: int = 32) -> Stage:
 def make_bench(scenes: list[tuple[Place, list[Subject]]]) -> Bench:
     from warpir.app.config import InsertConfig
 
-    return Bench(scenes, "cpu", 0, InsertConfig(), random_regressor(3))
+    return Bench(scenes, "cpu", 0, InsertConfig(), random_regressor(3).regressor())
 
 
 # ---------------------------------------------------------------------------------------- scenes

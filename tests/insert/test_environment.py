@@ -207,6 +207,31 @@ def test_missing_package(
     assert lines[1] == f"pip install {advice} brings it"
 
 
+UNUSED = """
+import sys
+from importlib.machinery import ModuleSpec
+for name in [n for n in sys.modules if n.split(".")[0] == "torch"]:
+    del sys.modules[name]
+class Refuse:
+    def find_spec(self, name, path=None, target=None):
+        return ModuleSpec(name, self) if name == "torch" else None
+    def create_module(self, spec):
+        raise AssertionError("torch is imported")
+sys.meta_path.insert(0, Refuse())
+"""
+"""torch is there, and must not be imported."""
+
+
+def test_run_without_a_model_does_not_import_torch(inputs: Path) -> None:
+    """Camera and light are estimated and the picture is written without it: seconds, 200 MB."""
+    argv = arguments(inputs, "out", light=None, camera=None, horizon=None, fov=None)
+    ended = run_case(argv, inputs, before=UNUSED)
+    assert ended.status == 0, ended.err
+    assert "torch is imported" not in ended.err + ended.out
+    for needed in ("estimated", "regressor"):
+        assert needed in ended.out
+
+
 @pytest.mark.case("R15")
 def test_advice_about_packages_is_true() -> None:
     """What an error says is brought by an install is in pyproject.toml, there and nowhere else."""

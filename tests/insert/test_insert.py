@@ -39,9 +39,9 @@ from warpir.io.cameras.reader import read_camera
 from warpir.io.images.photos import read_envmap, read_photo
 from warpir.io.images.undistort import undistort_photo
 from warpir.io.lobes_file import read_lobes
-from warpir.lighting.regressor import random_regressor, save_regressor
 from warpir.scene.lens import Lens
 from warpir.scene.light import as_map
+from warpir.train.networks.regressor import random_regressor, save_regressor
 
 RGBE = 0.01
 """Relative to the pixel's largest channel: 8-bit mantissas."""

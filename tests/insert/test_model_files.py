@@ -26,7 +26,7 @@ from tests.lighting.test_regressor import SMALL
 from warpir.app.config import InsertConfig
 from warpir.app.record import input_files
 from warpir.diffusion.models.weight_files import values_hash
-from warpir.lighting.regressor import random_regressor, save_regressor
+from warpir.train.networks.regressor import random_regressor, save_regressor
 
 WRITTEN = "damaged (its weights are not those that were written)"
 LAYER = "mid_block.attentions.0.transformer_blocks.0.attn2.to_k"

@@ -510,7 +510,7 @@ def edit(path: Path) -> None:
     """Change a file so that it is still one of its kind."""
     import trimesh
 
-    from warpir.lighting.regressor import random_regressor, save_regressor
+    from warpir.train.networks.regressor import random_regressor, save_regressor
 
     if path.stem == "regressor":
         save_regressor(random_regressor(2), path, {})

@@ -3,7 +3,7 @@
 import json
 import math
 from collections.abc import Callable
-from dataclasses import fields, replace
+from dataclasses import asdict, fields, replace
 from pathlib import Path
 
 import numpy as np
@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from safetensors.torch import load_file, save_file
 from scipy.integrate import quad
 
+from warpir.calibration.forward import softmax
 from warpir.core.errors import ExitCode, InputError
 from warpir.core.latlong import map_directions
 from warpir.diffusion.models.weight_files import read_header, values_hash
@@ -28,21 +29,28 @@ from warpir.lighting.regression import (
 from warpir.lighting.regressor import (
     AMBIENT_SHARPNESS,
     Prediction,
-    Regressor,
-    RegressorConfig,
     ambient_axes,
     candidates,
     least_angle,
     load_regressor,
-    mean_luminance,
-    random_regressor,
-    save_regressor,
+    mirrored,
+    shapes,
+    split,
 )
+from warpir.lighting.regressor import mean_luminance as mean_luminance_of
 from warpir.scene.camera import Camera, camera_from_fov
 from warpir.scene.light import Light, Lobes, fibonacci, rasterize_lobes
 from warpir.train.augmentation import discolour, erase, mirror, stretch
 from warpir.train.batches import PhotoBatch
 from warpir.train.light_loss import LightLoss
+from warpir.train.networks.regressor import (
+    RegressorConfig,
+    RegressorModule,
+    mean_luminance,
+    random_regressor,
+    read_regressor,
+    save_regressor,
+)
 from warpir.train.regressor import checkpoints_of, train_regressor
 from warpir.train.stepping import TrainingSettings
 from warpir.train.validation import calibrated_temperature, measure, region_mass
@@ -110,8 +118,8 @@ def test_regressor_parts_use_every_number() -> None:
     """`split` names each number of the flat answer once."""
     network = random_regressor(0, SMALL)
     batch = photo_batch(2)
-    flat = network(batch.photo, batch.rays)
-    parts = network.split(flat)
+    (flat,) = network(batch.photo, batch.rays)
+    parts = split(flat)
     assert parts.logits.shape == (2, len(network.directions))
     assert parts.ambient.shape == (2, 14, 3) and parts.tint.shape == (2, 2)
     assert sum(part[0].numel() for part in parts) == flat.shape[1]
@@ -136,14 +144,38 @@ def test_prediction_mirrors_exactly() -> None:
     reflected = mirror(batch, torch.tensor([True, True]))
     seen = network.predict(batch.photo, batch.rays)
     other = network.predict(reflected.photo, reflected.rays)
-    for a, b in zip(network.mirrored(seen), other, strict=True):
+    for a, b in zip(mirrored(seen), other, strict=True):
         assert torch.equal(a, b)
     assert not torch.allclose(seen.logits, other.logits)
 
 
+@pytest.mark.parametrize("members", [1, 3])
+def test_numpy_gives_the_answers_of_torch(rng: np.random.Generator, members: int) -> None:
+    """What asks one photo without torch, against the module that is trained, in float64."""
+    config = replace(SMALL, blocks=(2, 1), depth=2, members=members)
+    network = random_regressor(6, config).double()
+    for parameter in network.parameters():
+        torch.nn.init.normal_(parameter, std=0.2, generator=torch.Generator().manual_seed(1))
+    network.temperature.fill_(1.3)
+    photo = rng.random((96, 144, 3))
+    rays = camera_rays(camera_from_fov(144, 96, 60.0, -10.0, 1.6)).astype(np.float64)
+    planes = (torch.from_numpy(part).permute(2, 0, 1)[None] for part in (photo, rays))
+    expected = network.predict(*planes)
+    for found, part in zip(network.regressor().predict(photo, rays), expected, strict=True):
+        np.testing.assert_allclose(found, part[0], rtol=1e-9, atol=1e-9)
+
+
+def test_sizes_tell_the_shapes_of_the_weights() -> None:
+    """The shapes that a file must have are those that torch gives the network."""
+    for config in (SMALL, replace(SMALL, blocks=(2, 1), depth=3, members=2)):
+        state = random_regressor(0, config).state_dict()
+        assert shapes(asdict(config)) == {name: tuple(part.shape) for name, part in state.items()}
+
+
 def test_regression_flips_with_the_photo(rng: np.random.Generator) -> None:
     """Direction, distribution and ambient light of a flipped photo have the other sign of x."""
-    network, camera = random_regressor(1, SMALL), camera_from_fov(120, 80, 60.0, -15.0, 1.6)
+    network = random_regressor(1, SMALL).regressor()
+    camera = camera_from_fov(120, 80, 60.0, -15.0, 1.6)
     photo = photo_of(rng, 80, 120)
     photo[:, :40] *= 0.2
     seen, other = regress(network, photo, camera), regress(network, photo[:, ::-1], camera)
@@ -157,7 +189,8 @@ def test_regression_flips_with_the_photo(rng: np.random.Generator) -> None:
 
 def test_regression_turns_with_the_camera(rng: np.random.Generator) -> None:
     """The same photo from a camera turned about +Y: the whole light turns along."""
-    network, camera = random_regressor(1, SMALL), camera_from_fov(120, 80, 60.0, -15.0, 1.6)
+    network = random_regressor(1, SMALL).regressor()
+    camera = camera_from_fov(120, 80, 60.0, -15.0, 1.6)
     photo = photo_of(rng, 80, 120)
     still, moved = regress(network, photo, camera), regress(network, photo, turned(camera, 70.0))
     expected = Light(still.lobes()).rotated(70.0).lobes
@@ -241,7 +274,9 @@ def test_lobes_give_the_irradiance_stated(sigma: float, sigma_min: float) -> Non
 def test_regression_record_is_plain(rng: np.random.Generator) -> None:
     """What goes into ``run.json`` is JSON without NaN, and says the same."""
     light = regress(
-        random_regressor(0, SMALL), photo_of(rng, 60, 90), camera_from_fov(90, 60, 50.0, 0.0, 1.6)
+        random_regressor(0, SMALL).regressor(),
+        photo_of(rng, 60, 90),
+        camera_from_fov(90, 60, 50.0, 0.0, 1.6),
     )
     record = json.loads(json.dumps(light.record(), allow_nan=False))
     assert record["axis"] == light.axis.tolist() and record["share"] == light.share
@@ -250,12 +285,14 @@ def test_regression_record_is_plain(rng: np.random.Generator) -> None:
 
 def test_level_follows_the_luminance_of_the_photo() -> None:
     """The same answer for a photo half as bright means half the light, in photo-linear units."""
-    network, camera = random_regressor(0, SMALL), camera_from_fov(90, 60, 50.0, 0.0, 1.6)
+    network = random_regressor(0, SMALL).regressor()
+    camera = camera_from_fov(90, 60, 50.0, 0.0, 1.6)
     bright = np.full((60, 90, 3), 0.8, np.float32)
     dim = (bright.astype(np.float64) ** 2.2 / 2.0) ** (1.0 / 2.2)
     a, b = (mean_training_light(network, photo, camera) for photo in (bright, dim))
     np.testing.assert_allclose(b.lobes().amplitude, a.lobes().amplitude / 2.0, rtol=FLOAT32)
     assert float(mean_luminance(torch.full((1, 3, 8, 8), 0.8))) == pytest.approx(0.8**2.2)
+    assert mean_luminance_of(np.full((8, 8, 3), 0.8)) == pytest.approx(0.8**2.2)
 
 
 # ------------------------------------------------------------------------------- distributions
@@ -263,14 +300,15 @@ def test_level_follows_the_luminance_of_the_photo() -> None:
 
 def test_least_angle_finds_the_centre_between_candidates() -> None:
     """The centre of a broad lobe comes back within a sixth of the 6-degree grid."""
-    directions = torch.from_numpy(candidates(1000))
+    directions = candidates(1000)
     g = torch.Generator().manual_seed(2)
     truth = F.normalize(torch.randn(50, 3, generator=g, dtype=torch.float64), dim=1)
     truth[:, 1] = truth[:, 1].abs()
     truth = F.normalize(truth + torch.tensor([0.0, 0.5, 0.0]), dim=1)
-    axis, spread = least_angle(directions, (90.0 * truth @ directions.T).softmax(1))
-    angle = torch.rad2deg(torch.acos((axis * truth).sum(1).clamp(max=1.0)))
-    assert float(angle.max()) < 1.0
+    logits = 90.0 * truth.numpy() @ directions.T
+    axis, spread = least_angle(directions, softmax(logits))
+    angle = np.degrees(np.arccos((axis * truth.numpy()).sum(axis=1).clip(max=1.0)))
+    assert angle.max() < 1.0
     # The mean angle of a narrow Gaussian on the plane is sigma sqrt(pi / 2).
     expected = math.sqrt(1.0 / 90.0) * math.sqrt(math.pi / 2.0)
     np.testing.assert_allclose(spread, expected, rtol=0.05)
@@ -278,13 +316,13 @@ def test_least_angle_finds_the_centre_between_candidates() -> None:
 
 def test_least_angle_stays_with_the_majority() -> None:
     """Of two far modes the heavier one is the answer: no compromise between them."""
-    directions = torch.from_numpy(candidates(1000)).float()
-    modes = F.normalize(torch.tensor([[0.9, 0.5, 0.2], [-0.9, 0.5, 0.2]]), dim=1)
-    lobes = (200.0 * modes @ directions.T).softmax(1)
-    axis, spread = least_angle(directions, 0.65 * lobes[:1] + 0.35 * lobes[1:])
-    assert float(axis @ modes[0]) > math.cos(math.radians(5.0))
-    apart = float(torch.rad2deg(torch.acos(modes[0] @ modes[1])))
-    assert float(torch.rad2deg(spread)) > 0.35 * apart - 5.0
+    directions = candidates(1000)
+    modes = np.array([[0.9, 0.5, 0.2], [-0.9, 0.5, 0.2]]) / math.sqrt(1.1)
+    lobes = softmax(200.0 * modes @ directions.T)
+    (axis,), (spread,) = least_angle(directions, 0.65 * lobes[:1] + 0.35 * lobes[1:])
+    assert axis @ modes[0] > math.cos(math.radians(5.0))
+    apart = math.degrees(math.acos(modes[0] @ modes[1]))
+    assert math.degrees(spread) > 0.35 * apart - 5.0
 
 
 def drawn_from(logits: torch.Tensor, seed: int) -> torch.Tensor:
@@ -332,7 +370,7 @@ def test_file_keeps_the_network(tmp_path: Path) -> None:
     network.mean_light.fill_(0.25)
     path = tmp_path / "regressor.safetensors"
     save_regressor(network, path, {"steps": 12})
-    found = load_regressor(path)
+    found = read_regressor(path)
     assert found.config == SMALL and found.record == {"steps": 12} and not found.training
     assert torch.equal(found.directions, network.directions)
     assert float(found.temperature) == pytest.approx(1.7) and found.mean_light[0] == 0.25
@@ -396,7 +434,7 @@ def test_file_faults_are_named(tmp_path: Path, fault: Callable[[Path], None]) ->
 # ---------------------------------------------------------------------------------------- loss
 
 
-def true_prediction(network: Regressor, loss: LightLoss, batch: PhotoBatch) -> Prediction:
+def true_prediction(network: RegressorModule, loss: LightLoss, batch: PhotoBatch) -> Prediction:
     """What a network would have to say to be right."""
     targets = loss.targets(batch)
     zero = torch.zeros(len(batch.photo))
@@ -568,7 +606,7 @@ def test_training_learns_where_the_blob_is(tmp_path: Path) -> None:
     before = measure(start, loss, HELD_OUT["blobs"])
     end = train_regressor(blobs, HELD_OUT, tmp_path, TOY, "cpu", 5.0, 5.0, network=start)
     assert end.is_complete and end.steps == TOY.step_limit
-    found = load_regressor(tmp_path / "regressor.safetensors")
+    found = read_regressor(tmp_path / "regressor.safetensors")
     after = measure(found, loss, HELD_OUT["blobs"])
     assert before["angle_median"] > 30.0 and after["angle_median"] < 8.0
     assert after["sun_error"] < 0.1 and after["ambient_error"] < 0.1

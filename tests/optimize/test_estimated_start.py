@@ -21,11 +21,11 @@ from warpir.demo import demo_config
 from warpir.insert import main
 from warpir.io.images.photos import read_photo
 from warpir.io.results import OutputFolder
-from warpir.lighting.regressor import random_regressor, save_regressor
 from warpir.lighting.regularizers import SPREAD_MAX
 from warpir.lighting.sg_light import narrowest
 from warpir.optimize import recover
 from warpir.optimize.acceptance import Verdict
+from warpir.train.networks.regressor import random_regressor, save_regressor
 
 CHEAP = {
     "guidance_width": "32",

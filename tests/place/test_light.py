@@ -24,7 +24,7 @@ FLAT = np.full((64, 96, 3), 0.4)
 @pytest.fixture(scope="module")
 def found() -> Regression:
     """An estimate of the shipped networks."""
-    return regress(load_regressor(None, "cpu"), FLAT, camera_from_fov(96, 64, 60.0, -8.0, 1.6))
+    return regress(load_regressor(None), FLAT, camera_from_fov(96, 64, 60.0, -8.0, 1.6))
 
 
 def test_light_record_keeps_the_light_of_the_ground(found: Regression) -> None:

@@ -11,6 +11,7 @@ from tests.builders.shapes import box, camera, constant, ground, lobe, placed, q
 from tests.oracles import composite, encode, luminance, reinhard, spline
 from warpir.core.arrays import CodeArray, Int64Array
 from warpir.io.images.photos import Photo
+from warpir.io.images.resize import resize
 from warpir.look.camera_look import CameraLook
 from warpir.look.denoise import denoiser_version
 from warpir.look.grain import Grain
@@ -22,7 +23,6 @@ from warpir.render.device_light import light_args
 from warpir.render.device_scene import Scene
 from warpir.render.picture.light_preview import balls
 from warpir.render.picture.planes import Quality
-from warpir.render.picture.resizing import resize
 from warpir.render.renderer import Renderer
 from warpir.render.shadow.picture import ShadowSamples, picture_ratio
 from warpir.render.tone_curve import Knots, ToneCurve

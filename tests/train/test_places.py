@@ -1,6 +1,7 @@
 """Folds of whole places, replayed photos and joined networks."""
 
 import itertools
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -8,9 +9,10 @@ import torch
 
 from tests.lighting.test_regressor import SMALL
 from warpir.evaluate.stage import unseen_by
-from warpir.lighting.regressor import load_regressor, random_regressor, save_regressor
+from warpir.lighting.regressor import Prediction, load_regressor, mixture, split
 from warpir.train.batches import PhotoBatch
 from warpir.train.command import Replay
+from warpir.train.networks.regressor import random_regressor, read_regressor, save_regressor
 from warpir.train.places import of_fold, place_of, some_places
 from warpir.train.regressor import join_members
 from warpir.train.sampler import Sampler
@@ -81,16 +83,17 @@ def test_joined_networks_answer_with_the_mean_and_its_doubt(tmp_path: Path) -> N
         torch.nn.init.normal_(network.members[0].level_head[-1].weight)
         paths.append(tmp_path / f"{seed}.safetensors")
         save_regressor(network, paths[-1], {"panoramas": [f"place_{seed}"]})
-        networks.append(load_regressor(paths[-1]))
+        networks.append(read_regressor(paths[-1]))
     join_members(paths, tmp_path / "joined.safetensors")
-    joined = load_regressor(tmp_path / "joined.safetensors")
+    joined = read_regressor(tmp_path / "joined.safetensors")
     assert joined.config.members == 2 and float(joined.temperature) == 1.0
     assert [m["panoramas"] for m in joined.record["members"]] == [["place_0"], ["place_1"]]
     torch.testing.assert_close(joined.directions, networks[0].directions)
     photo = torch.rand(3, 3, 96, 144)
     rays = torch.nn.functional.normalize(torch.randn(3, 3, 96, 144), dim=1)
-    each = [n.split(n(photo, rays)) for n in networks]
-    both = joined.split(joined(photo, rays))
+    each = [split(n(photo, rays)[0].detach()) for n in networks]
+    flats = joined(photo, rays).detach().numpy()
+    both = Prediction(*map(torch.from_numpy, mixture(flats)))
     logits = [p.logits / n.temperature for p, n in zip(each, networks, strict=True)]
     torch.testing.assert_close(both.logits, sum(logits) / 2.0, atol=2e-2, rtol=2e-2)
     torch.testing.assert_close(both.level, sum(p.level for p in each) / 2.0, atol=1e-3, rtol=1e-3)
@@ -115,17 +118,16 @@ def test_a_panorama_is_judged_by_the_networks_that_have_not_learned_from_it(
         two = ["two"] if k < 2 else []
         record = {"panoramas": ["all", f"p{k}", *two], "started_from": {"panoramas": ["old"]}}
         save_regressor(random_regressor(k, SMALL), paths[-1], record)
-    joined = join_members(paths, tmp_path / "joined.safetensors")
-    joined.record = load_regressor(tmp_path / "joined.safetensors").record
-    joined.temperature.fill_(0.5)
+    join_members(paths, tmp_path / "joined.safetensors")
+    joined = replace(load_regressor(tmp_path / "joined.safetensors"), temperature=0.5)
     assert unseen_by(joined, "new") is joined
     assert unseen_by(joined, "old") is None and unseen_by(joined, "all") is None
     part = unseen_by(joined, "p1")
-    assert part is not None and len(part.members) == part.config.members == 2
-    assert float(part.temperature) == 0.5  # that of the mean
+    assert part is not None and part.members == (0, 2)
+    assert part.temperature == 0.5  # that of the mean
     single = unseen_by(joined, "two")
-    assert single is not None and len(single.members) == 1
-    assert float(single.temperature) == 1.0  # a network's own is in its logits
-    photo, rays = torch.rand(1, 3, 96, 144), torch.zeros(1, 3, 96, 144)
+    assert single is not None and single.members == (2,)
+    assert single.temperature == 1.0  # a network's own is in its logits
+    photo, rays = torch.rand(96, 144, 3).double().numpy(), torch.zeros(96, 144, 3).numpy()
     alone = [load_regressor(paths[k]).predict(photo, rays).level for k in (0, 2)]
-    torch.testing.assert_close(part.predict(photo, rays).level, sum(alone) / 2.0)
+    assert part.predict(photo, rays).level == pytest.approx(sum(alone) / 2.0)

@@ -19,7 +19,7 @@ torch.set_num_threads(1)
 from dataclasses import replace
 from pathlib import Path
 from tests.lighting.test_regressor import HELD_OUT, SMALL, TOY, blobs
-from warpir.lighting.regressor import random_regressor
+from warpir.train.networks.regressor import random_regressor
 from warpir.train.regressor import train_regressor
 from warpir.train.worker import Worker
 out, worker = Path({out!r}), Worker.this()

@@ -3,19 +3,14 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
-from contextlib import contextmanager
 from dataclasses import replace
-
-import numpy as np
-import torch
-import torch.nn.functional as F
 
 from warpir.calibration import lines
 from warpir.calibration.network import NUMBERS, Calibrator, load_calibrator, seen
 from warpir.calibration.not_pinhole import looks_like
 from warpir.core.arrays import FloatArray
 from warpir.core.errors import InputError
+from warpir.io.images.resize import resize
 from warpir.scene.camera import CameraEstimate
 
 NETWORK = "network"
@@ -48,30 +43,14 @@ def estimate_camera(
         InputError: The photo has no pixels, or the network's file cannot be used
             (`ExitCode.MODEL`).
     """
-    with _one_thread():
-        alone = network_estimate(photo, network or load_calibrator(), vfov_deg)
-        found = decided(with_lines(alone, photo))
+    alone = network_estimate(photo, network or load_calibrator(), vfov_deg)
+    found = decided(with_lines(alone, photo))
     seen_as = looks_like(photo)
     if not seen_as:
         return found
     pitch_sigma = max(found.pitch_sigma_deg, NOT_PINHOLE_SIGMA_DEG)
     fov_sigma = max(found.vfov_sigma_deg, NOT_PINHOLE_SIGMA_DEG) if vfov_deg is None else 0.0
     return replace(found, pitch_sigma_deg=pitch_sigma, vfov_sigma_deg=fov_sigma, looks_like=seen_as)
-
-
-@contextmanager
-def _one_thread() -> Iterator[None]:
-    """Run torch on one thread of the CPU.
-
-    The network is small: more threads gain .1 s on free cores and lose seconds on busy ones, where
-    they wait for each other; and one thread gives the same digits on every machine of a kind.
-    """
-    before = torch.get_num_threads()
-    torch.set_num_threads(1)
-    try:
-        yield
-    finally:
-        torch.set_num_threads(before)
 
 
 def network_estimate(
@@ -84,19 +63,13 @@ def network_estimate(
     """
     if photo.ndim != 3 or photo.shape[2] != 3 or 0 in photo.shape:
         raise InputError("--photo", f"no pixels (found an array of shape {list(photo.shape)})")
-    device = network.spread.device
     height, width = photo.shape[:2]
     known = math.nan
     if vfov_deg is not None:
         known = -math.log(2.0 * math.tan(math.radians(vfov_deg) / 2.0))
-    picture = torch.from_numpy(np.ascontiguousarray(photo, np.float32)).to(device)
-    answer = network.predict(
-        seen(picture.permute(2, 0, 1)[None].clamp(0.0, 1.0)),
-        torch.tensor([width / height], device=device),
-        torch.tensor([known], device=device),
-    )
-    value = dict(zip(NUMBERS, answer.value[0].tolist(), strict=True))
-    sigma = dict(zip(NUMBERS, answer.sigma[0].tolist(), strict=True))
+    answer = network.predict(seen(photo.clip(0.0, 1.0)), width / height, known)
+    value = dict(zip(NUMBERS, answer.value.tolist(), strict=True))
+    sigma = dict(zip(NUMBERS, answer.sigma.tolist(), strict=True))
     if vfov_deg is None:
         fov = 2.0 * math.atan(0.5 * math.exp(-value["focal"]))
         # d fov / d log f = -2 t / (1 + t^2) = -sin(fov), with t = tan(fov / 2) = 1 / (2 f).
@@ -149,11 +122,9 @@ def with_lines(estimate: CameraEstimate, photo: FloatArray) -> CameraEstimate:
     size = (max(1, round(height * factor)), max(1, round(width * factor)))
     if min(size) < lines.SHORTEST:
         return estimate
-    whole = torch.from_numpy(np.ascontiguousarray(photo, np.float32)).permute(2, 0, 1)[None]
-    small = F.interpolate(whole, size, mode="bilinear", antialias=True)
     camera = estimate.camera(size[1], size[0], 1.0)
     found = lines.upright_roll(
-        lines.find_segments(small[0].permute(1, 2, 0).numpy()),
+        lines.find_segments(resize(photo, *size)),
         (camera.cx, camera.cy),
         camera.fx,
         estimate.pitch_deg,

@@ -2,10 +2,7 @@
 
 A photo is stretched to 128 x 192 pixels; the coordinates of its pixels, in units of its height,
 come along and say how it was stretched. A distribution is a histogram, so that "looks up" and "was
-corrected to upright" can both stay open. In training each token of 8 x 8 pixels also answers where
-up is in the picture and how high above the horizon it looks (the perspective field of Jin et al.
-2023, arXiv:2212.03239), which teaches the tokens far faster than one answer for the whole photo.
-
+corrected to upright" can both stay open.
 Photos are blurred alike before they are seen. The panoramas that it learned from are coarse beside
 photos, so sharpness would otherwise tell the field of view in training and mislead afterwards.
 
@@ -21,19 +18,22 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NamedTuple
 
-import torch
-import torch.nn.functional as F
-from torch import Tensor, nn
+import numpy as np
+from scipy.ndimage import gaussian_filter1d
 
-from warpir.calibration.blocks import TokenNetwork, TokenSizes, head
-from warpir.calibration.network_files import load_network, random_network, save_network
-from warpir.diffusion.models.weight_files import CALIBRATOR_FORMAT, check_calibrator
+from warpir.calibration.forward import Forward, head_shapes, softmax, token_shapes
+from warpir.calibration.weights import Shapes, Weights, read_weights
+from warpir.core.arrays import AnyFloatArray, Float64Array, on_cores
+from warpir.diffusion.models.weight_files import check_calibrator
+from warpir.io.images.resize import resize
 
 HEIGHT, WIDTH = 128, 192
 """Size that the network sees [px]; photos of other shapes are stretched."""
 BLUR = 1.4
 """Standard deviation of the blur of every photo that the network sees, over the photo's height
 times `HEIGHT`: 1 is a row of what it sees."""
+BLUR_REACH = 3.0
+"""Standard deviations at which a blur is cut."""
 MIRRORED = ("roll", "x")
 """Numbers whose distribution turns over when the photo is mirrored."""
 
@@ -45,25 +45,25 @@ class Bins(NamedTuple):
     high: float
     number: int
 
-    def centres(self, like: Tensor) -> Tensor:
+    def centres(self) -> Float64Array:
         """Return the middle of each bin, shape [K]."""
         step = (self.high - self.low) / self.number
-        return self.low + step * (torch.arange(self.number, device=like.device) + 0.5)
+        return np.linspace(self.low + 0.5 * step, self.high - 0.5 * step, self.number)
 
-    def quantile(self, probability: Tensor, share: float) -> Tensor:
-        """Return the value below which a share of each distribution lies, shape [B].
+    def quantile(self, probability: Float64Array, share: float) -> Float64Array:
+        """Return the value below which a share of each distribution lies, shape [...].
 
         Args:
-            probability: Of each bin, spread evenly within it; rows sum to 1; shape [B, K].
+            probability: Of each bin, spread evenly within it; rows sum to 1; shape [..., K].
             share: In (0, 1).
         """
-        above = probability.cumsum(dim=1)
-        index = (above < share).sum(dim=1, keepdim=True).clamp(max=self.number - 1)
-        inside = probability.gather(1, index).clamp(min=1e-12)
-        below = above.gather(1, index) - inside
-        step = (self.high - self.low) / self.number
-        position = index + ((share - below) / inside).clamp(0.0, 1.0)
-        return self.low + step * position[:, 0]
+        above = probability.cumsum(axis=-1)
+        index = np.minimum((above < share).sum(axis=-1, keepdims=True), self.number - 1)
+        inside = np.maximum(np.take_along_axis(probability, index, axis=-1), 1e-12)
+        below = np.take_along_axis(above, index, axis=-1) - inside
+        position = index + np.clip((share - below) / inside, 0.0, 1.0)
+        value: Float64Array = self.low + (self.high - self.low) / self.number * position[..., 0]
+        return value
 
 
 NUMBERS = {
@@ -75,168 +75,122 @@ NUMBERS = {
 }
 """Pitch [deg], roll [deg], natural logarithm of the focal length over the photo's height, and the
 principal point as shares of width and height from the top left; the order of the heads."""
-SHAPE = (8, 8)
-"""Pixels of a token, rows and columns."""
-
-
-@dataclass(frozen=True)
-class CalibratorConfig(TokenSizes):
-    """Sizes of the network."""
+PLANES, PLACES = 5, 5
+"""Numbers of a pixel, and numbers that say where a token looks."""
 
 
 class CameraNumbers(NamedTuple):
-    """Most likely cameras of B photos, and how wrong they may be; shape [B, 5], as `NUMBERS`."""
+    """Most likely cameras, and how wrong they may be; shape [..., 5], as `NUMBERS`."""
 
-    value: Tensor
-    sigma: Tensor
+    value: Float64Array
+    sigma: Float64Array
     """Standard deviations in the same units; 68 % of errors lie within one."""
 
 
-def soften(photo: Tensor, sigma: Tensor) -> Tensor:
-    """Blur pictures by Gaussians of their own.
+def medians(
+    plain: Mapping[str, Float64Array], mirrored: Mapping[str, Float64Array], spread: Float64Array
+) -> CameraNumbers:
+    """Return the medians of distributions and their calibrated standard deviations.
+
+    The distributions for a photo and for its mirror image are averaged: a mirrored photo gives the
+    mirrored camera by construction.
 
     Args:
-        photo: Shape [B, C, H, W].
-        sigma: Standard deviation down and across [px], shape [B, 2]; 0 leaves a picture as it is.
+        plain: Logits of each number's bins for a photo, shape [..., K].
+        mirrored: The same for its mirror image.
+        spread: Factor on the width of each distribution, shape [5].
     """
-    for axis in (0, 1):
-        # The kernel is cut at three standard deviations of the widest picture of the batch.
-        reach = max(1, math.ceil(3.0 * float(sigma[:, axis].max())))
-        offsets = torch.arange(-reach, reach + 1, device=photo.device, dtype=photo.dtype)
-        weights = torch.exp(-0.5 * (offsets / sigma[:, axis : axis + 1].clamp(min=1e-3)) ** 2)
-        weights = weights / weights.sum(dim=1, keepdim=True)
-        size = photo.shape[2 + axis]
-        padding = (0, 0, reach, reach) if axis == 0 else (reach, reach, 0, 0)
-        padded = F.pad(photo, padding, mode="replicate")
-        photo = torch.zeros_like(photo)
-        for k, weight in enumerate(weights.unbind(dim=1)):
-            photo.addcmul_(padded.narrow(2 + axis, k, size), weight[:, None, None, None])
-    return photo
+    value, sigma = [], []
+    for name, bins in NUMBERS.items():
+        turned = softmax(mirrored[name])
+        turned = turned[..., ::-1] if name in MIRRORED else turned
+        probability = 0.5 * (softmax(plain[name]) + turned)
+        value.append(bins.quantile(probability, 0.5))
+        # A Gaussian has 68 % between these two, one standard deviation to either side.
+        low, high = (bins.quantile(probability, share) for share in (0.16, 0.84))
+        sigma.append(0.5 * (high - low))
+    return CameraNumbers(np.stack(value, axis=-1), np.stack(sigma, axis=-1) * spread)
 
 
-def blur_sigma(rows: Tensor, aspect: Tensor) -> Tensor:
-    """Return the blur [px] down and across of stretched photos, shape [B, 2].
+def seen(photo: AnyFloatArray) -> Float64Array:
+    """Return a photo as the network sees it: stretched to 128 x 192 and blurred.
 
     Args:
-        rows: The blur, over the photo's height times `HEIGHT`, shape [B].
-        aspect: Width of the photo over its height before it was stretched, shape [B].
+        photo: Display-encoded, shape [H, W, 3].
     """
-    return torch.stack([rows, rows * (WIDTH / HEIGHT) / aspect], dim=1)
+    height, width = photo.shape[:2]
+    small = resize(photo, HEIGHT, WIDTH).astype(np.float64)
+    for axis, sigma in enumerate(blur_sigma(BLUR, width / height)):
+        sigma = min(sigma, WIDTH)
+        reach = math.ceil(BLUR_REACH * sigma)
+        small = gaussian_filter1d(small, sigma, axis, mode="nearest", radius=reach)
+    return small
 
 
-def seen(photo: Tensor) -> Tensor:
-    """Return photos as the network sees them: stretched to 128 x 192 and blurred.
+def blur_sigma(rows: Any, aspect: Any) -> tuple[Any, Any]:
+    """Return the blur of stretched photos down and across [px], numbers or tensors.
 
     Args:
-        photo: Display-encoded, shape [B, 3, H, W].
+        rows: The blur, over the photo's height times `HEIGHT`.
+        aspect: Width of the photo over its height before it was stretched.
     """
-    height, width = photo.shape[2:]
-    small = F.interpolate(photo, (HEIGHT, WIDTH), mode="bilinear", antialias=True)
-    rows = torch.full((len(photo),), BLUR, device=photo.device)
-    return soften(small, blur_sigma(rows, torch.full_like(rows, width / height)).clamp(max=WIDTH))
+    return rows, rows * (WIDTH / HEIGHT) / aspect
 
 
-class Calibrator(TokenNetwork):
-    """Photo, its shape and perhaps its focal length to distributions over the camera's numbers.
+@dataclass(frozen=True)
+class Calibrator:
+    """Photo, its shape and perhaps its focal length to the camera's numbers."""
 
-    There are 16 x 24 tokens, and a head for each number.
-    """
+    weights: Weights
 
-    spread: Tensor
-    """Factor on the width of each distribution; calibrated on held-out places, shape [5]."""
-
-    def __init__(self, config: CalibratorConfig) -> None:
-        super().__init__(config, planes=5, places=5, asking=len(NUMBERS))
-        self.config = config
-        self.record: dict[str, Any] = {}
+    @property
+    def record(self) -> Mapping[str, Any]:
         """How it was trained; plain values."""
-        self.register_buffer("spread", torch.ones(len(NUMBERS)))
-        wide = config.channels[-1]
-        self.numbers = nn.ModuleDict(
-            {name: head(wide, config.dropout, bins.number) for name, bins in NUMBERS.items()}
-        )
-        self.field = head(wide, 0.0, 3)
+        return self.weights.record
 
-    def forward(
-        self, photo: Tensor, aspect: Tensor, focal: Tensor
-    ) -> tuple[dict[str, Tensor], Tensor]:
-        """Return the logits of each number's bins, and the perspective field of the tokens.
+    def predict(self, photo: Float64Array, aspect: float, focal: float) -> CameraNumbers:
+        """Return the most likely camera of a photo, shape [5], asked for its mirror image too.
 
         Args:
-            photo: As `seen` gives it, shape [B, 3, 128, 192].
-            aspect: Width over height before it was stretched, shape [B].
-            focal: Logarithm of the focal length over the height where it is known, else NaN,
-                shape [B].
-
-        Returns:
-            Logits of shape [B, K] by the names of `NUMBERS`; and, shape [B, 384, 3], where up is
-            in the picture (right, up; any length) and the elevation [rad] of what a token sees.
+            photo: As `seen` gives it, shape [128, 192, 3].
+            aspect: Width over height before it was stretched.
+            focal: Logarithm of the focal length over the height where it is known, else NaN.
         """
-        plane = _coordinates(aspect, HEIGHT, WIDTH)
-        x = self.features(torch.cat([photo * 2.0 - 1.0, plane], dim=1))
-        known = ~focal.isnan()
-        given = torch.where(known, focal, torch.zeros_like(focal))
-        about = torch.stack([aspect.log(), known.to(aspect.dtype), given], dim=1)
-        where = _coordinates(aspect, *x.shape[2:]).flatten(2).transpose(1, 2)
-        about = about[:, None].expand(-1, where.shape[1], -1)
-        tokens = x.flatten(2).transpose(1, 2) + self.place(torch.cat([where, about], dim=2))
-        tokens = self.mixed(tokens)
-        # Softmax and exponentials of the answers need more digits than autocast leaves.
-        with torch.autocast(tokens.device.type, enabled=False):
-            read, others = self.read(tokens)
-            heads = zip(self.numbers.items(), read.unbind(dim=1), strict=True)
-            return {name: answer(part) for (name, answer), part in heads}, self.field(others)
+        network = Forward(self.weights)
+        known = not math.isnan(focal)
+        about = np.array([math.log(aspect), known, focal if known else 0.0])
 
-    @torch.no_grad()
-    def predict(self, photo: Tensor, aspect: Tensor, focal: Tensor) -> CameraNumbers:
-        """Return the medians of the distributions and their calibrated standard deviations.
+        def asked(view: Float64Array) -> dict[str, Float64Array]:
+            plane = _coordinates(aspect, HEIGHT, WIDTH)
+            x = network.features(np.concatenate([view * 2.0 - 1.0, plane], axis=2))
+            where = _coordinates(aspect, *x.shape[:2]).reshape(-1, 2)
+            places = np.concatenate([where, np.tile(about, (len(where), 1))], axis=1)
+            read = network.read(network.tokens(x, places))
+            return {
+                name: network.head(f"numbers.{name}", read[k]) for k, name in enumerate(NUMBERS)
+            }
 
-        The network is asked twice, for the photo and for its mirror image, and the distributions
-        are averaged: a mirrored photo gives the mirrored camera by construction.
-
-        Args:
-            photo: As `seen` gives it, shape [B, 3, 128, 192].
-            aspect: Width over height before it was stretched, shape [B].
-            focal: Logarithm of the focal length over the height where it is known, else NaN,
-                shape [B].
-        """
-        both = torch.cat([photo, photo.flip(-1)])
-        logits, _ = self(both, aspect.repeat(2), focal.repeat(2))
-        value, sigma = [], []
-        for name, bins in NUMBERS.items():
-            plain, mirrored = logits[name].softmax(dim=1).chunk(2)
-            turned = mirrored.flip(-1) if name in MIRRORED else mirrored
-            probability = 0.5 * (plain + turned)
-            value.append(bins.quantile(probability, 0.5))
-            # A Gaussian has 68 % between these two, one standard deviation to either side.
-            low, high = (bins.quantile(probability, share) for share in (0.16, 0.84))
-            sigma.append(0.5 * (high - low))
-        return CameraNumbers(torch.stack(value, 1), torch.stack(sigma, 1) * self.spread)
+        plain, mirrored = on_cores(asked, (photo, photo[:, ::-1]))
+        return medians(plain, mirrored, self.weights.float64("spread"))
 
 
-def _coordinates(aspect: Tensor, height: int, width: int) -> Tensor:
-    """Return right and down from the middle, in units of the photo's height, [B, 2, H, W]."""
-    across = (torch.arange(width, device=aspect.device) + 0.5) / width - 0.5
-    down = (torch.arange(height, device=aspect.device) + 0.5) / height - 0.5
-    x = (aspect[:, None] * across)[:, None, :].expand(-1, height, -1)
-    y = down[None, :, None].expand(len(aspect), -1, width)
-    return torch.stack([x, y.to(x.dtype)], dim=1)
+def _coordinates(aspect: float, height: int, width: int) -> Float64Array:
+    """Return right and down from the middle, in units of the photo's height, [H, W, 2]."""
+    across = aspect * ((np.arange(width) + 0.5) / width - 0.5)
+    down = (np.arange(height) + 0.5) / height - 0.5
+    return np.stack(np.meshgrid(across, down), axis=2)
 
 
-def random_calibrator(seed: int, config: CalibratorConfig | None = None) -> Calibrator:
-    """As `random_network`."""
-    return random_network(seed, lambda: Calibrator(config or CalibratorConfig()))
+def shapes(sizes: Mapping[str, Any]) -> Shapes:
+    """Return the shapes of the weights of a calibrator of these sizes."""
+    wide = sizes["channels"][-1]
+    heads = {f"numbers.{name}": bins.number for name, bins in NUMBERS.items()} | {"field": 3}
+    found = {"spread": (len(NUMBERS),), **token_shapes(sizes, PLANES, PLACES, len(NUMBERS))}
+    for name, count in heads.items():
+        found |= head_shapes(name, wide, count)
+    return found
 
 
-def save_calibrator(network: Calibrator, path: Path, record: Mapping[str, Any]) -> None:
-    """As `save_network`; the record is read back as `Calibrator.record`."""
-    save_network(network, network.config, path, record, CALIBRATOR_FORMAT)
-
-
-def load_calibrator(path: Path | None = None, device: str | torch.device = "cpu") -> Calibrator:
-    """Read a network for `warpir.calibration.estimate.estimate_camera`; see `load_network`."""
-    network, record = load_network(
-        check_calibrator, lambda sizes: Calibrator(CalibratorConfig(**sizes)), path, device
-    )
-    network.record = record
-    return network
+def load_calibrator(path: Path | None = None) -> Calibrator:
+    """Read a network for `warpir.calibration.estimate.estimate_camera`; see `read_weights`."""
+    return Calibrator(read_weights(check_calibrator, shapes, path))

@@ -1,4 +1,4 @@
-"""Asks for the cameras of photos, one after another; torch is loaded with the first."""
+"""Asks for the cameras of photos, one after another; the network is read with the first."""
 
 from __future__ import annotations
 

@@ -210,6 +210,7 @@ def evaluate(
     from warpir.evaluate.judge import Judge, procedural_errors
     from warpir.evaluate.results import run_record
     from warpir.render.device import choose_device
+    from warpir.train.networks.regressor import read_regressor
 
     lpips = _load_lpips(options)
     notices = _missing_measures(lpips)
@@ -234,7 +235,8 @@ def evaluate(
         say(f"{place.name}: {sheet_row}, RMSE of the box {float(error):.4f}")
     record = run_record(options, bench, scenes, notices)
     if options.procedural:
-        record["procedural"] = procedural_errors(bench.network, options.procedural, options.seed)
+        network = read_regressor(options.regressor, device)
+        record["procedural"] = procedural_errors(network, options.procedural, options.seed)
     record["seconds"] = round(time.perf_counter() - started, 1)
     lines = _summarize(record, entries, rows)
     for line in lines:
@@ -379,7 +381,7 @@ def _make_bench(
 
     network, missing = None, None
     try:
-        network = load_regressor(options.regressor, device)
+        network = load_regressor(options.regressor)
     except InputError as error:
         if options.regressor is not None:
             raise

@@ -17,12 +17,13 @@ from warpir.evaluate.rows import ROWS
 from warpir.evaluate.scenes import Place, Subject
 from warpir.evaluate.stage import Bench, Prediction, Stage
 from warpir.evaluate.three_spheres import sphere_errors
-from warpir.lighting.regressor import Regressor, least_angle
+from warpir.lighting.regressor import split
 from warpir.render.picture.planes import Quality
 from warpir.scene.light import as_map
 from warpir.train.lights import load_panoramas
+from warpir.train.networks.regressor import RegressorModule
 from warpir.train.scenes.generator import Mixture, SceneGenerator
-from warpir.train.validation import COVERAGE
+from warpir.train.validation import COVERAGE, centres
 
 LIGHT_HEIGHT = 128
 """Rows of the maps that are compared."""
@@ -133,7 +134,9 @@ def light_figures(place: Place, texels: FloatArray) -> dict[str, float]:
     return _flat("", {"light": errors, "spheres": sphere_errors(predicted, true)})
 
 
-def procedural_errors(network: Regressor, count: int, seed: int) -> dict[str, dict[str, float]]:
+def procedural_errors(
+    network: RegressorModule, count: int, seed: int
+) -> dict[str, dict[str, float]]:
     """Return how well the regressor finds the direction in rendered photographs never seen.
 
     Returns:
@@ -145,15 +148,14 @@ def procedural_errors(network: Regressor, count: int, seed: int) -> dict[str, di
     scenes = SceneGenerator(
         load_panoramas([], where), UNSEEN_SEED + seed, Mixture(made_up=1.0, hybrid=0.0)
     )
-    guess, _ = least_angle(
-        network.directions, network.split(network.mean_light[None]).logits.softmax(dim=1)
-    )
+    mean_light = split(network.mean_light[None])
+    guess, _ = centres(network.directions, mean_light.logits.softmax(dim=1))
     angles: dict[str, list[float]] = {"found": [], "guessed": []}
     cues: list[bool] = []
     for index, first in enumerate(range(0, count, PROCEDURAL_BATCH)):
         batch = scenes.photo_batch(index, PROCEDURAL_BATCH)
         prediction = network.predict(batch.photo, batch.rays)
-        axis, _ = least_angle(network.directions, prediction.logits.softmax(dim=1))
+        axis, _ = centres(network.directions, prediction.logits.softmax(dim=1))
         wanted = min(PROCEDURAL_BATCH, count - first)
         cues += batch.has_cue[:wanted].tolist()
         for name, directions in (("found", axis), ("guessed", guess.expand_as(axis))):

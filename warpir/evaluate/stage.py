@@ -15,7 +15,6 @@ from typing import Any
 
 import numpy as np
 import torch
-from torch import nn
 
 from warpir.app.config import InsertConfig
 from warpir.app.model_files import require_model
@@ -24,7 +23,7 @@ from warpir.core.arrays import FloatArray, IntArray
 from warpir.core.color import linear_to_gamma
 from warpir.core.errors import ExitCode, InputError
 from warpir.evaluate.scenes import RESPONSES, Place, Subject
-from warpir.lighting.regressor import Regressor, random_regressor
+from warpir.lighting.regressor import Regressor
 from warpir.render.bridge import ComposeConstants, compose
 from warpir.render.device_light import light_args
 from warpir.render.device_scene import Placed, Receiver, Scene
@@ -35,6 +34,7 @@ from warpir.render.shadow.pilot import shaded_pixels
 from warpir.render.tone_curve import ToneCurve
 from warpir.scene.light import Light
 from warpir.scene.tone_curves import Curves, ToneKnots
+from warpir.train.networks.regressor import random_regressor
 from warpir.train.places import learned_from
 
 FLOOR_EVALUATIONS = 60
@@ -326,7 +326,7 @@ class Bench:
     @cached_property
     def random_network(self) -> Regressor:
         """A regressor with random weights."""
-        return random_regressor(self.seed).to(torch.device(self.device))
+        return random_regressor(self.seed).regressor()
 
     def other(self, place: Place) -> Place:
         """Return the next place of another panorama.
@@ -350,13 +350,6 @@ def unseen_by(network: Regressor, panorama: str) -> Regressor | None:
         return network
     if not kept:
         return None
-    device = network.directions.device
-    part = Regressor(replace(network.config, members=len(kept))).to(device)
-    # Means and temperature are buffers of the whole; the networks themselves are shared.
-    part.load_state_dict(network.state_dict(), strict=False)
-    if len(kept) == 1:
-        # The temperature is that of the mean; each network's own is in its logits.
-        part.temperature.fill_(1.0)
-    part.members = nn.ModuleList(network.members[k] for k in kept)
-    part.record = {"members": [records[k] for k in kept]}
-    return part.eval().requires_grad_(False)
+    # The temperature is that of the mean; each network's own is in its logits.
+    temperature = network.temperature if len(kept) > 1 else 1.0
+    return replace(network, members=tuple(kept), temperature=temperature)

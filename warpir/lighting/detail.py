@@ -17,8 +17,8 @@ import numpy as np
 from warpir.app.inputs import Inputs
 from warpir.core.arrays import Float64Array, FloatArray
 from warpir.core.latlong import map_directions, texel_solid_angles
+from warpir.io.images.resize import resize
 from warpir.render.picture.photo_scene import photo_radiance
-from warpir.render.picture.resizing import resize
 from warpir.scene.camera import Camera
 from warpir.scene.lamps import lamps_alone, without_lamps
 from warpir.scene.light import Light, as_map

@@ -45,8 +45,7 @@ def estimate_light(
 ) -> Estimate:
     """Estimate the light of the photo with the regressor, and check its level by the ground.
 
-    On the CPU, which is done before torch has started on a GPU. What the regressor sees in the
-    photo may be given where it is known.
+    What the regressor sees in the photo may be given where it is known.
 
     Raises:
         InputError: The weights are absent or damaged (`ExitCode.MODEL`).

@@ -23,8 +23,7 @@ import numpy as np
 from warpir.app.inputs import Inputs
 from warpir.core.arrays import Float64Array
 from warpir.core.color import luminance
-from warpir.lighting.regression import Regression
-from warpir.lighting.regularizers import LOG_STD_MAX
+from warpir.lighting.regression import LOG_STD_MAX, Regression
 from warpir.lighting.scene_light import (
     GROUND_PERCENTILE,
     foot_of,

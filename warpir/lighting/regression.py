@@ -2,19 +2,17 @@
 
 from __future__ import annotations
 
-import copy
 import math
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-import torch
-import torch.nn.functional as F
-from torch import Tensor
+from scipy.special import expit
 
+from warpir.calibration.forward import softmax
 from warpir.core.arrays import AnyFloatArray, Float64Array, FloatArray
 from warpir.core.color import LUMINANCE_WEIGHTS
+from warpir.io.images.resize import resize
 from warpir.lighting.regressor import (
     AMBIENT_SHARPNESS,
     HEIGHT,
@@ -27,6 +25,11 @@ from warpir.lighting.regressor import (
 )
 from warpir.scene.camera import Camera
 from warpir.scene.light import Light, Lobes, angles_from_axis
+
+LOG_STD_MIN, LOG_STD_MAX = 0.1, 0.7
+"""Least and greatest standard deviation that a log intensity is believed to have: without the
+greatest one, guidance puts out a sun that the regressor is not sure of, for soft light is never
+quite wrong."""
 
 
 @dataclass(frozen=True)
@@ -147,14 +150,9 @@ def regress(network: Regressor, photo_srgb: AnyFloatArray, camera: Camera) -> Re
 
     The network is that of `load_regressor`, the camera of any size with the photo's aspect.
     """
-    device = network.directions.device
-    photo = _network_photo(photo_srgb).to(device)
-    rays = torch.from_numpy(camera_rays(camera)).to(device).permute(2, 0, 1)[None].double()
-    # In float64, so that kinds of processors, which round sums differently, agree on the light.
-    exact = copy.deepcopy(network).double()
-    with ThreadPoolExecutor(2) as pool:  # torch itself has one thread
-        prediction = exact.predict(photo, rays, pool.map)
-    return _regression(network, prediction, float(mean_luminance(photo)), camera)
+    photo = _network_photo(photo_srgb)
+    prediction = network.predict(photo, camera_rays(camera))
+    return _regression(network, prediction, mean_luminance(photo), camera)
 
 
 def mean_training_light(
@@ -165,48 +163,44 @@ def mean_training_light(
     Only the mean luminance of the photo counts, display-encoded, shape [H, W, 3], and only the
     camera's yaw.
     """
-    luminance = float(mean_luminance(_network_photo(photo_srgb)))
-    return _regression(network, network.split(network.mean_light[None]), luminance, camera)
+    level = mean_luminance(_network_photo(photo_srgb))
+    return _regression(network, network.mean_light, level, camera)
 
 
-def _network_photo(photo_srgb: AnyFloatArray) -> Tensor:
-    """Bring a photo to the network's size by area, float64, shape [1, 3, 96, 144]."""
-    photo = torch.from_numpy(np.ascontiguousarray(photo_srgb, np.float64)).permute(2, 0, 1)[None]
-    return F.interpolate(
-        photo, (HEIGHT, WIDTH), mode="bilinear", align_corners=False, antialias=True
-    ).clamp(0.0, 1.0)
+def _network_photo(photo_srgb: AnyFloatArray) -> Float64Array:
+    """Bring a photo to the network's size by area, shape [96, 144, 3]."""
+    return resize(photo_srgb, HEIGHT, WIDTH).clip(0.0, 1.0).astype(np.float64)
 
 
 def _regression(
-    network: Regressor, prediction: Prediction, luminance: float, camera: Camera
+    network: Regressor, one: Prediction, luminance: float, camera: Camera
 ) -> Regression:
-    """Turn one photo's prediction into numbers in the world, by the photo's mean luminance."""
+    """Turn a photo's prediction into numbers in the world, by the photo's mean luminance."""
     to_world = yaw_to_world(camera)
-    one = Prediction(*(part.detach().cpu().double() for part in prediction))
-    directions = network.directions.cpu().double()
-    probability = one.logits.softmax(dim=1)
-    axis, spread = least_angle(directions, probability)
+    directions = network.directions
+    probability = softmax(one.logits)
+    (axis,), (spread,) = least_angle(directions, probability[None])
     # Most likely kappa for samples about a known mean direction: coth(kappa) - 1 / kappa = R; the
     # inverse is Banerjee et al. 2005, eq. 4 in 3 dimensions.
-    resultant = min(max(float(probability[0] @ directions @ axis[0]), 0.0), 1.0 - 1e-6)
-    log_red, log_blue = one.tint[0].tolist()
+    resultant = min(max(float(probability @ directions @ axis), 0.0), 1.0 - 1e-6)
+    log_red, log_blue = one.tint
     ratios = np.exp([log_red, 0.0, log_blue])
-    level = luminance * math.exp(float(one.level[0]))
+    level = luminance * math.exp(one.level)
     ambient_axis = ambient_axes() @ to_world.T
     return Regression(
-        axis=to_world @ axis[0].numpy(),
-        spread_deg=math.degrees(float(spread)),
+        axis=to_world @ axis,
+        spread_deg=math.degrees(spread),
         concentration=resultant * (3.0 - resultant**2) / (1.0 - resultant**2),
-        directions=directions.numpy() @ to_world.T,
-        probability=probability[0].numpy(),
+        directions=directions @ to_world.T,
+        probability=probability,
         sun=level * ratios / float(ratios @ LUMINANCE_WEIGHTS),
-        sun_log_std=math.exp(0.5 * float(one.level_log_var)),
-        sigma=min(math.exp(float(one.softness)), 1.0),
-        share=float(one.share.sigmoid()),
+        sun_log_std=math.exp(0.5 * one.level_log_var),
+        sigma=min(math.exp(one.softness), 1.0),
+        share=float(expit(one.share)),
         ambient=Lobes(
-            (luminance * one.ambient[0].exp().numpy()).astype(np.float32),
+            (luminance * np.exp(one.ambient)).astype(np.float32),
             ambient_axis.astype(np.float32),
             np.full(len(ambient_axis), AMBIENT_SHARPNESS, np.float32),
         ),
-        ambient_log_std=math.exp(0.5 * float(one.ambient_log_var)),
+        ambient_log_std=math.exp(0.5 * one.ambient_log_var),
     )

@@ -16,68 +16,181 @@ from __future__ import annotations
 
 import itertools
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
+from functools import lru_cache
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
-import torch
-import torch.nn.functional as F
-from torch import Tensor, nn
 
-from warpir.calibration.blocks import TokenNetwork, TokenSizes, head
-from warpir.calibration.network_files import load_network, random_network, save_network
-from warpir.core.arrays import Float64Array
-from warpir.core.color import GAMMA, LUMINANCE_WEIGHTS
-from warpir.diffusion.models.weight_files import REGRESSOR_FORMAT as FORMAT
+from warpir.calibration.forward import Forward, head_shapes, token_shapes
+from warpir.calibration.weights import Shapes, Weights, read_weights
+from warpir.core.arrays import AnyFloatArray, Float64Array, on_cores
+from warpir.core.color import GAMMA, luminance
 from warpir.diffusion.models.weight_files import check_regressor
 
 HEIGHT, WIDTH = 96, 144
 """Size that the network sees [px]; photos of other shapes are stretched, and the rays say so."""
 AMBIENT_SHARPNESS = 4.0
 """Of the 14 ambient lobes: with equal amplitudes their sum is even within 4 %."""
+LEVEL_COUNT = 10 + 3 * 14
+"""Numbers of a prediction beside the logits."""
 DARKEST = 1e-4
 """Mean luminance below which a photo counts as this bright."""
 LOWEST = -0.25
 """Height y of the lowest direction that a dominant light may have."""
-
-
-@dataclass(frozen=True)
-class RegressorConfig(TokenSizes):
-    """Sizes of the network."""
-
-    channels: tuple[int, int, int] = (48, 96, 160)
-    heads: int = 5
-    directions: int = 1000
-    """Of the whole sphere; those that lie low are left out."""
-    hidden: float = 0.3
-    """Share of the tokens that training hides: no single corner of a place may tell its light."""
-    members: int = 1
-    """Networks whose answers are averaged."""
+PLANES, PLACES, ASKING = 6, 3, 2
+"""Numbers of a pixel, numbers that say where a token looks, and heads; as of `TokenNetwork`."""
 
 
 class Prediction(NamedTuple):
-    """The network's output for B photos, camera-yaw frame; levels are natural logarithms."""
+    """The network's output, camera-yaw frame; levels are natural logarithms.
 
-    logits: Tensor
-    """Of the candidate directions, shape [B, K]."""
-    level: Tensor
+    Arrays, or tensors in training; ``...`` stands for photos, where there are several.
+    """
+
+    logits: Any
+    """Of the candidate directions, shape [..., K]."""
+    level: Any
     """Log luminance of the irradiance that faces the dominant light, over the photo's mean
-    luminance, shape [B]."""
-    level_log_var: Tensor
-    tint: Tensor
-    """Log ratios red / green and blue / green of that irradiance, shape [B, 2]."""
-    tint_log_var: Tensor
-    softness: Tensor
-    """Log angular standard deviation of the dominant light [log rad], shape [B]."""
-    softness_log_var: Tensor
-    share: Tensor
-    """Logit of the dominant light's share of a sphere's mean irradiance, shape [B]."""
-    ambient: Tensor
-    """Log amplitudes of the ambient lobes over the photo's mean luminance, shape [B, 14, 3]."""
-    ambient_log_var: Tensor
-    """Of the log irradiance of the ambient light, shape [B]."""
+    luminance, shape [...]."""
+    level_log_var: Any
+    tint: Any
+    """Log ratios red / green and blue / green of that irradiance, shape [..., 2]."""
+    tint_log_var: Any
+    softness: Any
+    """Log angular standard deviation of the dominant light [log rad], shape [...]."""
+    softness_log_var: Any
+    share: Any
+    """Logit of the dominant light's share of a sphere's mean irradiance, shape [...]."""
+    ambient: Any
+    """Log amplitudes of the ambient lobes over the photo's mean luminance, shape [..., 14, 3]."""
+    ambient_log_var: Any
+    """Of the log irradiance of the ambient light, shape [...]."""
+
+
+def split(flat: Any) -> Prediction:
+    """Name the parts of a flat prediction, an array or a tensor, shape [..., K + LEVEL_COUNT]."""
+    levels = flat[..., -LEVEL_COUNT:]
+    return Prediction(
+        logits=flat[..., :-LEVEL_COUNT],
+        level=levels[..., 0],
+        level_log_var=levels[..., 1].clip(-8.0, 6.0),
+        tint=levels[..., 2:4],
+        tint_log_var=levels[..., 4:6].clip(-8.0, 6.0),
+        # The offset is where most lights lie: between the sun and a window.
+        softness=levels[..., 6] - 3.0,
+        softness_log_var=levels[..., 7].clip(-8.0, 6.0),
+        share=levels[..., 8],
+        ambient=levels[..., 9:-1].reshape(*levels.shape[:-1], -1, 3),
+        ambient_log_var=levels[..., -1].clip(-8.0, 6.0),
+    )
+
+
+def mirrored(prediction: Prediction) -> Prediction:
+    """Return what a prediction says of the mirror image: x of every direction negated."""
+    count = prediction.logits.shape[-1]
+    turned = (np.arange(count) + count // 2) % count
+    return prediction._replace(
+        logits=prediction.logits[..., turned],
+        ambient=prediction.ambient[..., _ambient_mirror(), :],
+    )
+
+
+def averaged(seen: Float64Array, reflected: Float64Array, temperature: float) -> Prediction:
+    """Return the mean over members, photo and mirror image, with calibrated logits.
+
+    Args:
+        seen: Flat predictions of the members, shape [M, ..., K + LEVEL_COUNT].
+        reflected: The same for the mirror image.
+        temperature: Divides the mean logits.
+    """
+    both = zip(mixture(seen), mirrored(mixture(reflected)), strict=True)
+    mean = Prediction(*(0.5 * (a + b) for a, b in both))
+    return mean._replace(logits=mean.logits / temperature)
+
+
+def mixture(flats: Float64Array) -> Prediction:
+    """Return the mean over members; the variance of a level is that of the mixture.
+
+    That is the mean of the members' variances plus the variance of their answers.
+    """
+    mean = split(flats.mean(axis=0))
+    if len(flats) == 1:
+        return mean
+    each = split(flats)
+
+    def spread(levels: Float64Array, log_var: Float64Array) -> Float64Array:
+        total: Float64Array = np.exp(log_var).mean(axis=0) + levels.var(axis=0)
+        return np.log(total).clip(-8.0, 6.0)
+
+    brightness = np.log(np.exp(each.ambient).sum(axis=(-2, -1)))
+    return mean._replace(
+        level_log_var=spread(each.level, each.level_log_var),
+        tint_log_var=spread(each.tint, each.tint_log_var),
+        softness_log_var=spread(each.softness, each.softness_log_var),
+        ambient_log_var=spread(brightness, each.ambient_log_var),
+    )
+
+
+@dataclass(frozen=True)
+class Regressor:
+    """Photo and rays to `Prediction`, by one network or by several whose answers are averaged."""
+
+    weights: Weights
+    members: tuple[int, ...]
+    """Which of the networks are asked, by their numbers in the weights."""
+    temperature: float
+    """Divides the mean logits; calibrated on places held out of every network."""
+
+    @classmethod
+    def of(cls, weights: Weights) -> Regressor:
+        """Return what asks all networks of these weights."""
+        members = tuple(range(weights.sizes["members"]))
+        return cls(weights, members, float(weights.values["temperature"]))
+
+    @property
+    def directions(self) -> Float64Array:
+        """Candidates, camera-yaw frame, shape [K, 3]; in the file: weights keep their own."""
+        return self.weights.float64("directions")
+
+    @property
+    def mean_light(self) -> Prediction:
+        """The training set's mean light as one constant prediction."""
+        return split(self.weights.float64("mean_light"))
+
+    @property
+    def record(self) -> Mapping[str, Any]:
+        """How it was trained; plain values."""
+        return self.weights.record
+
+    def predict(self, photo: Float64Array, rays: AnyFloatArray) -> Prediction:
+        """Return the mean over the members, the photo and its mirror image, on every core.
+
+        Args:
+            photo: Display-encoded, shape [96, 144, 3].
+            rays: Unit viewing directions, camera-yaw frame, shape [96, 144, 3].
+        """
+        rays = rays.astype(np.float64)
+        views = (photo, rays), (photo[:, ::-1], rays[:, ::-1] * (-1.0, 1.0, 1.0))
+
+        def asked(question: tuple[int, tuple[Float64Array, Float64Array]]) -> Float64Array:
+            member, view = question
+            return self._asked(member, *view)
+
+        flats = on_cores(asked, [(member, view) for member in self.members for view in views])
+        return averaged(np.stack(flats[::2]), np.stack(flats[1::2]), self.temperature)
+
+    def _asked(self, member: int, photo: Float64Array, rays: Float64Array) -> Float64Array:
+        """Return the flat prediction of one network."""
+        network = Forward(self.weights, f"members.{member}.")
+        x = network.features(np.concatenate([photo * 2.0 - 1.0, rays], axis=2))
+        rows, columns = x.shape[:2]
+        looking = rays.reshape(rows, -1, columns, rays.shape[1] // columns, 3).mean(axis=(1, 3))
+        direction, levels = network.read(network.tokens(x, looking.reshape(-1, 3)))
+        answers = network.head("direction_head", direction), network.head("level_head", levels)
+        return np.concatenate(answers)
 
 
 def candidates(count: int) -> Float64Array:
@@ -110,163 +223,22 @@ def ambient_axes() -> Float64Array:
     return axes
 
 
-def mean_luminance(photo: Tensor) -> Tensor:
-    """Return the mean decoded luminance of display-encoded photos [B, 3, H, W], shape [B]."""
-    photo = photo.to(torch.promote_types(photo.dtype, torch.float32))
-    weights = photo.new_tensor(LUMINANCE_WEIGHTS)
-    mean = photo.clamp(min=0.0).pow(GAMMA).mean(dim=(2, 3))
-    return (mean @ weights).clamp(min=DARKEST)
-
-
-class Member(TokenNetwork):
-    """One network: photo and rays to a flat prediction.
-
-    There are 12 x 18 tokens, and two heads, for direction and for levels. Where a token looks takes
-    the place of a position: it holds for every field of view.
-    """
-
-    def __init__(self, config: RegressorConfig, direction_count: int, level_count: int) -> None:
-        super().__init__(config, planes=6, places=3, asking=2)
-        self.hidden, wide = config.hidden, config.channels[-1]
-        self.direction_head = head(wide, config.dropout, direction_count)
-        self.level_head = head(wide, config.dropout, level_count)
-
-    def last_layers(self) -> tuple[nn.Linear, nn.Linear]:
-        """Return what gives the logits of the directions, and what gives the levels."""
-        direction, levels = self.direction_head[-1], self.level_head[-1]
-        assert isinstance(direction, nn.Linear) and isinstance(levels, nn.Linear)
-        return direction, levels
-
-    def forward(self, photo: Tensor, rays: Tensor) -> Tensor:
-        """Return a flat prediction; arguments are those of `Regressor.forward`."""
-        x = self.features(torch.cat([photo * 2.0 - 1.0, rays], dim=1))
-        looking = F.adaptive_avg_pool2d(rays, (x.shape[2], x.shape[3])).flatten(2).transpose(1, 2)
-        tokens = x.flatten(2).transpose(1, 2) + self.place(looking)
-        if self.training and self.hidden > 0.0:
-            count = max(1, round(tokens.shape[1] * (1.0 - self.hidden)))
-            order = torch.rand(tokens.shape[:2], device=tokens.device).argsort(dim=1)[:, :count]
-            tokens = tokens.gather(1, order[..., None].expand(-1, -1, tokens.shape[2]))
-        tokens = self.mixed(tokens)
-        # Softmax and exponentials of the answers need more digits than autocast leaves.
-        with torch.autocast(tokens.device.type, enabled=False):
-            direction, levels = self.read(tokens)[0].unbind(dim=1)
-            return torch.cat([self.direction_head(direction), self.level_head(levels)], dim=1)
-
-
-class Regressor(nn.Module):
-    """Photo and rays to `Prediction`, by one network or by several whose answers are averaged."""
-
-    directions: Tensor
-    """Candidates, camera-yaw frame, shape [K, 3]; in the file, so that weights keep their own."""
-    temperature: Tensor
-    """Divides the mean logits; calibrated on places held out of every network, shape []."""
-    mean_light: Tensor
-    """The training set's mean light as one constant prediction, flat as `split` takes it."""
-
-    def __init__(self, config: RegressorConfig) -> None:
-        super().__init__()
-        self.config = config
-        self.record: dict[str, Any] = {}
-        """How it was trained; plain values."""
-        directions = torch.from_numpy(candidates(config.directions)).float()
-        self.register_buffer("directions", directions)
-        self.register_buffer("temperature", torch.ones(()))
-        self.level_count = 10 + 3 * len(ambient_axes())
-        self.register_buffer("mean_light", torch.zeros(len(directions) + self.level_count))
-        self.members = nn.ModuleList(
-            Member(config, len(directions), self.level_count) for _ in range(config.members)
-        )
-
-    def last_layers(self) -> list[tuple[nn.Linear, nn.Linear]]:
-        """Return `Member.last_layers` of each member."""
-        return [m.last_layers() for m in self.members if isinstance(m, Member)]
-
-    def forward(self, photo: Tensor, rays: Tensor) -> Tensor:
-        """Return flat predictions, shape [B, K + level_count]; `split` names the parts.
-
-        Logits and levels are means over the members. The variance of a level is that of the
-        mixture: the mean of the members' variances plus the variance of their answers.
-
-        Args:
-            photo: Display-encoded, shape [B, 3, 96, 144].
-            rays: Unit viewing directions, camera-yaw frame, shape [B, 3, 96, 144].
-        """
-        flats = torch.stack([member(photo, rays) for member in self.members])
-        mean = flats.mean(dim=0)
-        if len(self.members) == 1:
-            return mean
-        each = self.split(flats.flatten(0, 1))
-
-        def mixture(levels: Tensor, log_var: Tensor) -> Tensor:
-            levels, log_var = (part.unflatten(0, flats.shape[:2]) for part in (levels, log_var))
-            return torch.log(log_var.exp().mean(dim=0) + levels.var(dim=0, correction=0))
-
-        of_level = mixture(each.level, each.level_log_var)
-        of_tint = mixture(each.tint, each.tint_log_var)
-        of_softness = mixture(each.softness, each.softness_log_var)
-        brightness = each.ambient.logsumexp(dim=(1, 2))
-        of_ambient = mixture(brightness, each.ambient_log_var)
-        mean = mean.clone()
-        first = len(self.directions)
-        mean[:, first + 1], mean[:, first + 4 : first + 6] = of_level, of_tint
-        mean[:, first + 7], mean[:, -1] = of_softness, of_ambient
-        return mean
-
-    def split(self, flat: Tensor) -> Prediction:
-        """Name the parts of a flat prediction, shape [B, K + level_count]."""
-        count = len(self.directions)
-        levels = flat[:, count:]
-        return Prediction(
-            logits=flat[:, :count],
-            level=levels[:, 0],
-            level_log_var=levels[:, 1].clamp(-8.0, 6.0),
-            tint=levels[:, 2:4],
-            tint_log_var=levels[:, 4:6].clamp(-8.0, 6.0),
-            # The offset is where most lights lie: between the sun and a window.
-            softness=levels[:, 6] - 3.0,
-            softness_log_var=levels[:, 7].clamp(-8.0, 6.0),
-            share=levels[:, 8],
-            ambient=levels[:, 9:-1].unflatten(1, (-1, 3)),
-            ambient_log_var=levels[:, -1].clamp(-8.0, 6.0),
-        )
-
-    def mirrored(self, prediction: Prediction) -> Prediction:
-        """Return what a prediction says of the mirror image: x of every direction negated."""
-        half = len(self.directions) // 2
-        return prediction._replace(
-            logits=prediction.logits.roll(half, dims=1),
-            ambient=prediction.ambient[:, _AMBIENT_MIRROR],
-        )
-
-    @torch.no_grad()
-    def predict(self, photo: Tensor, rays: Tensor, call: Callable[..., Any] = map) -> Prediction:
-        """Return the mean over photo and mirror image, with calibrated logits.
-
-        Args:
-            photo: Display-encoded, shape [B, 3, 96, 144].
-            rays: Unit viewing directions, camera-yaw frame, shape [B, 3, 96, 144].
-            call: As `map`; that of a pool looks at both at once.
-        """
-        turned = rays.flip(-1) * rays.new_tensor([-1.0, 1.0, 1.0]).view(1, 3, 1, 1)
-        look = torch.no_grad()(self)  # which is a thread's own
-        flat = call(look, (photo, photo.flip(-1)), (rays, turned))
-        seen, reflected = map(self.split, flat)
-        reflected = self.mirrored(reflected)
-        both = (0.5 * (a + b) for a, b in zip(seen, reflected, strict=True))
-        mean = Prediction(*both)
-        return mean._replace(logits=mean.logits / self.temperature)
-
-
+@lru_cache(maxsize=1)
 def _ambient_mirror() -> list[int]:
+    """Return which ambient lobe takes the place of each when the photo is mirrored."""
     axes = ambient_axes()
     return [int(np.argmax(axes @ (axis * (-1.0, 1.0, 1.0)))) for axis in axes]
 
 
-_AMBIENT_MIRROR = _ambient_mirror()
-"""Which ambient lobe takes the place of each when the photo is mirrored."""
+def mean_luminance(photo: AnyFloatArray) -> float:
+    """Return the mean decoded luminance of a display-encoded photo, shape [H, W, 3]."""
+    decoded = np.maximum(photo, 0.0).astype(np.float64) ** GAMMA
+    return max(float(luminance(decoded.mean(axis=(0, 1)))), DARKEST)
 
 
-def least_angle(directions: Tensor, probability: Tensor, steps: int = 20) -> tuple[Tensor, Tensor]:
+def least_angle(
+    directions: Float64Array, probability: Float64Array, steps: int = 20
+) -> tuple[Float64Array, Float64Array]:
     """Return the directions of least expected angle, shape [B, 3], and that angle [rad], [B].
 
     The geometric median: the best candidate, refined by Weiszfeld's steps on the sphere. A
@@ -278,39 +250,42 @@ def least_angle(directions: Tensor, probability: Tensor, steps: int = 20) -> tup
         probability: Of each, rows sum to 1, shape [B, K].
         steps: Of the refinement.
     """
-    cosines = (directions @ directions.T).clamp(-1.0, 1.0)
-    axis = directions[(probability @ torch.acos(cosines).T).argmin(dim=1)]
+
+    def angles(axes: Float64Array) -> Float64Array:
+        found: Float64Array = np.arccos((axes @ directions.T).clip(-1.0, 1.0))
+        return found
+
+    axis = directions[(probability @ angles(directions).T).argmin(axis=1)]
     # Of about K / (solid angle share of the candidates) cells on the whole sphere.
     half_spacing = 0.5 * math.sqrt(4.0 * math.pi * (1.0 - LOWEST) / 2.0 / len(directions))
     for _ in range(steps):
-        cosine = (axis @ directions.T).clamp(-1.0, 1.0)
-        angle = torch.acos(cosine)
-        pull = probability / torch.sqrt(angle**2 + half_spacing**2)
-        # log map: the tangent toward a candidate, as long as the angle; sin as float32 can.
-        scale = pull * angle / torch.sqrt((1.0 - cosine**2).clamp(min=1e-12))
-        tangent = scale @ directions - (scale * cosine).sum(1, keepdim=True) * axis
-        tangent = tangent / pull.sum(1, keepdim=True)
-        length = tangent.norm(dim=1, keepdim=True).clamp(min=1e-12)
-        axis = F.normalize(axis * torch.cos(length) + tangent / length * torch.sin(length), dim=1)
-    angle = torch.acos((axis @ directions.T).clamp(-1.0, 1.0))
-    return axis, (probability * angle).sum(dim=1)
+        angle = angles(axis)
+        pull = probability / np.sqrt(angle**2 + half_spacing**2)
+        # log map: the tangent toward a candidate, as long as the angle.
+        scale = pull * angle / np.maximum(np.sin(angle), 1e-6)
+        tangent = scale @ directions - (scale * np.cos(angle)).sum(axis=1, keepdims=True) * axis
+        tangent = tangent / pull.sum(axis=1, keepdims=True)
+        length = np.maximum(np.linalg.norm(tangent, axis=1, keepdims=True), 1e-12)
+        axis = axis * np.cos(length) + tangent / length * np.sin(length)
+        axis = axis / np.linalg.norm(axis, axis=1, keepdims=True)
+    return axis, (probability * angles(axis)).sum(axis=1)
 
 
-def random_regressor(seed: int, config: RegressorConfig | None = None) -> Regressor:
-    """As `random_network`."""
-    return random_network(seed, lambda: Regressor(config or RegressorConfig()))
+def shapes(sizes: Mapping[str, Any]) -> Shapes:
+    """Return the shapes of the weights of a regressor of these sizes."""
+    count, wide = len(candidates(sizes["directions"])), sizes["channels"][-1]
+    member = {
+        **token_shapes(sizes, PLANES, PLACES, ASKING),
+        **head_shapes("direction_head", wide, count),
+        **head_shapes("level_head", wide, LEVEL_COUNT),
+    }
+    of_all = {"directions": (count, 3), "temperature": (), "mean_light": (count + LEVEL_COUNT,)}
+    numbers = range(sizes["members"])
+    return of_all | {
+        f"members.{k}.{name}": shape for k in numbers for name, shape in member.items()
+    }
 
 
-def save_regressor(network: Regressor, path: Path, record: Mapping[str, Any]) -> None:
-    """As `save_network`; the record is read back as `Regressor.record`."""
-    exact = {"temperature", "directions"}
-    save_network(network, network.config, path, record, FORMAT, exact)
-
-
-def load_regressor(path: Path | None, device: str | torch.device = "cpu") -> Regressor:
-    """Read a network for `regress`; see `load_network`."""
-    network, record = load_network(
-        check_regressor, lambda sizes: Regressor(RegressorConfig(**sizes)), path, device
-    )
-    network.record = record
-    return network
+def load_regressor(path: Path | None) -> Regressor:
+    """Read a network for `regress`; see `read_weights`."""
+    return Regressor.of(read_weights(check_regressor, shapes, path))

@@ -13,6 +13,7 @@ import torch
 from torch import Tensor
 
 from warpir.lighting.latlong_tensors import luminance, solid_angles
+from warpir.lighting.regression import LOG_STD_MAX, LOG_STD_MIN
 from warpir.lighting.sg_light import SGLight
 from warpir.render.tone_curve import Knots
 
@@ -24,10 +25,6 @@ SPREAD_MIN = float(torch.pi) / 36.0
 """Least spread that a direction is believed to have [rad]: 5 degrees."""
 SPREAD_MAX = float(torch.pi) / 9.0
 """Greatest spread of it [rad]: 20 degrees. Where nobody knows, a small network is no guide."""
-LOG_STD_MIN, LOG_STD_MAX = 0.1, 0.7
-"""Least and greatest standard deviation that a log intensity is believed to have: without the
-greatest one, guidance puts out a sun that the regressor is not sure of, for soft light is never
-quite wrong."""
 SHAPE_STD = 0.2
 """How far the other lobes may leave their common change: logs of flux, or chords of directions."""
 SMALL = 1e-4

@@ -13,12 +13,11 @@ import math
 from dataclasses import dataclass, replace
 
 import numpy as np
-import torch
-import torch.nn.functional as F
 from scipy.ndimage import label
 
 from warpir.core.arrays import AnyFloatArray, BoolArray, Float64Array
 from warpir.core.color import GAMMA, luminance
+from warpir.io.images.resize import resize
 from warpir.lighting.regression import Regression
 from warpir.scene.camera import Camera
 from warpir.scene.light import SUN_RADIUS_DEG
@@ -162,9 +161,7 @@ def _shrunk(shown: AnyFloatArray, camera: Camera) -> tuple[Float64Array, Camera]
     focal = camera.fx * width / camera.width
     share = min(1.0, math.degrees(1.0 / focal) / PIXEL_DEG)
     size = (max(2, round(height * share)), max(2, round(width * share)))
-    plane = torch.from_numpy(np.ascontiguousarray(shown, np.float64))[None, None]
-    small = F.interpolate(plane, size, mode="bilinear", align_corners=False, antialias=True)
-    return small[0, 0].numpy(), camera.scaled(size[1], size[0])
+    return resize(shown, *size).astype(np.float64), camera.scaled(size[1], size[0])
 
 
 def _pixel_rays(view: Camera) -> tuple[Float64Array, Float64Array]:

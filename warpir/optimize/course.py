@@ -21,6 +21,7 @@ from warpir.diffusion.dataset_update import DatasetUpdate
 from warpir.diffusion.guidance import Guidance
 from warpir.diffusion.personalization.lora_files import save_lora
 from warpir.diffusion.prior import NonFiniteError
+from warpir.io.images.resize import resize
 from warpir.io.unfinished import remove_unfinished
 from warpir.lighting.scene_light import SceneLight
 from warpir.optimize.checkpoint import is_due
@@ -29,7 +30,6 @@ from warpir.optimize.loop import Optimization
 from warpir.optimize.model import Guided
 from warpir.optimize.view import Frame
 from warpir.render.picture.photo_scene import scene_of
-from warpir.render.picture.resizing import resize
 from warpir.render.renderer import Renderer
 from warpir.render.tone_curve import ToneCurve
 from warpir.scene.tone_curves import Curves, ToneKnots

@@ -67,8 +67,7 @@ def _guided(run: Run, given: SceneLight | None) -> LitRun:
 
 def _estimated(run: Run) -> tuple[SceneLight, dict[str, Any]]:
     """Estimate the light from the photo; return it and its entry in ``run.json``."""
-    arithmetic = fixed_arithmetic("cpu", run.config.render.deterministic)
-    with no_collection(), run.timings.stage("regress"), arithmetic:
+    with no_collection(), run.timings.stage("regress"):
         from warpir.lighting.estimate import estimate_light
 
         config = run.config

@@ -85,7 +85,7 @@ class Kept(Loaders):
         from warpir.lighting.regressor import load_regressor
 
         camera = Camera(*lens, np.reshape(pose, (4, 4)))
-        network = load_regressor(None if weights is None else Path(weights), "cpu")
+        network = load_regressor(None if weights is None else Path(weights))
         return regress(network, self._read(*photo).srgb, camera)
 
 

@@ -138,11 +138,11 @@ def _train_camera(options: argparse.Namespace, panoramas: Sequence[Path]) -> dic
     """Train the network that estimates cameras; photographs are cut without Warp."""
     import torch
 
-    from warpir.calibration.network import load_calibrator, random_calibrator
-    from warpir.lighting.regressor import load_regressor
     from warpir.train.camera.crops import read_panoramas
     from warpir.train.camera.loop import begin_with_trunk, train_camera
     from warpir.train.lights import SKY_ONLY
+    from warpir.train.networks.calibrator import random_calibrator, read_calibrator
+    from warpir.train.networks.regressor import read_regressor
     from warpir.train.places import of_fold
     from warpir.train.stepping import CameraSettings
 
@@ -156,10 +156,10 @@ def _train_camera(options: argparse.Namespace, panoramas: Sequence[Path]) -> dic
     if not learned:
         raise InputError("--panoramas", "none to learn from")
     say(f"device: {device}; {len(learned)} panoramas; validation on {len(watched)}")
-    start = None if options.start is None else load_calibrator(options.start, device)
+    start = None if options.start is None else read_calibrator(options.start, device)
     started_from = None if start is None else start.record
     if options.regressor is not None:
-        regressor = load_regressor(options.regressor)
+        regressor = read_regressor(options.regressor)
         start = start or random_calibrator(options.seed)
         begin_with_trunk(start, regressor)
         started_from = {"regressor": regressor.record}
@@ -302,7 +302,7 @@ def _train_on(
     record: dict[str, Any],
 ) -> dict[str, Any]:
     """Train on the first panoramas, validate on the second ones; return how it ended."""
-    from warpir.lighting.regressor import load_regressor
+    from warpir.train.networks.regressor import read_regressor
     from warpir.train.regressor import PANORAMAS, train_regressor
     from warpir.train.scenes.generator import Mixture, SceneGenerator
     from warpir.train.stepping import TrainingSettings
@@ -323,7 +323,7 @@ def _train_on(
         learning_rate=options.rate or TrainingSettings.learning_rate,
         compile=not options.no_compile,
     )
-    start = None if options.start is None else load_regressor(options.start, device)
+    start = None if options.start is None else read_regressor(options.start, device)
     if start is not None:
         record = record | {"started_from": start.record}
     end = train_regressor(

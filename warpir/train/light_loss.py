@@ -12,15 +12,10 @@ from torch import Tensor
 
 from warpir.core.color import LUMINANCE_WEIGHTS
 from warpir.core.latlong import map_directions, texel_solid_angles
-from warpir.lighting.regressor import (
-    AMBIENT_SHARPNESS,
-    Prediction,
-    Regressor,
-    ambient_axes,
-    mean_luminance,
-)
+from warpir.lighting.regressor import AMBIENT_SHARPNESS, Prediction, ambient_axes
 from warpir.scene.light import fibonacci
 from warpir.train.batches import PhotoBatch
+from warpir.train.networks.regressor import RegressorModule, mean_luminance
 
 NORMALS = 32
 """Directions of surfaces whose irradiance is compared."""
@@ -49,7 +44,7 @@ class LightLoss:
         label_sigma_deg: Width of the direction's soft label [deg].
     """
 
-    def __init__(self, network: Regressor, label_sigma_deg: float) -> None:
+    def __init__(self, network: RegressorModule, label_sigma_deg: float) -> None:
         device = network.directions.device
         self.directions = network.directions
         self.kappa = 1.0 / math.radians(label_sigma_deg) ** 2
@@ -176,7 +171,7 @@ class MeanLight:
             self.sums[name] = part.double() if kept is None else kept + part
 
     def flat(self) -> Tensor:
-        """Return the mean as `Regressor.mean_light` holds it, shape [K + level_count].
+        """Return the mean as `RegressorModule.mean_light` holds it, shape [K + LEVEL_COUNT].
 
         Levels are means of logarithms; the ambient lobes are fitted to the mean log map.
         """

@@ -24,16 +24,17 @@ from torch import Tensor
 
 from warpir.core.atomic import Checkpoints
 from warpir.core.errors import ExitCode, InputError
-from warpir.lighting.regressor import (
-    Regressor,
-    RegressorConfig,
-    load_regressor,
-    random_regressor,
-    save_regressor,
-)
+from warpir.lighting.regressor import split
 from warpir.train.augmentation import augment
 from warpir.train.batches import PhotoBatch
 from warpir.train.light_loss import TERM_WEIGHTS, LightLoss, MeanLight
+from warpir.train.networks.regressor import (
+    RegressorConfig,
+    RegressorModule,
+    random_regressor,
+    read_regressor,
+    save_regressor,
+)
 from warpir.train.stepping import TrainingSettings, follow, left_to_fall, make_optimizer, warmed_up
 from warpir.train.validation import calibrate, measure, score
 from warpir.train.worker import Worker
@@ -71,7 +72,7 @@ def train_regressor(
     total_minutes: float,
     resume: bool = False,
     seed: int = 0,
-    network: Regressor | None = None,
+    network: RegressorModule | None = None,
     record: Mapping[str, Any] | None = None,
 ) -> TrainingEnd:
     """Train a regressor until the time is over, and write its weights and its curve.
@@ -116,7 +117,7 @@ def train_regressor(
     return TrainingEnd(run.step, run.minutes, is_complete, finished)
 
 
-def join_members(paths: Sequence[Path], out: Path) -> Regressor:
+def join_members(paths: Sequence[Path], out: Path) -> RegressorModule:
     """Join networks of one size into one regressor that averages their answers, and write it.
 
     Args:
@@ -126,12 +127,12 @@ def join_members(paths: Sequence[Path], out: Path) -> Regressor:
     Raises:
         InputError: A file cannot be used (`ExitCode.MODEL`).
     """
-    networks = [load_regressor(path) for path in paths]
+    networks = [read_regressor(path) for path in paths]
     for path, network in zip(paths, networks, strict=True):
         if not torch.equal(network.directions, networks[0].directions):
             what = f"its candidate directions are not those of {paths[0]}"
             raise InputError(path, what, code=ExitCode.MODEL)
-    joined = Regressor(replace(networks[0].config, members=len(networks))).eval()
+    joined = RegressorModule(replace(networks[0].config, members=len(networks))).eval()
     with torch.no_grad():
         for place, network in enumerate(networks):
             # Each network's own temperature goes into its logits, since these are averaged.
@@ -161,7 +162,11 @@ class _Run:
     """Everything that a training carries from step to step and from call to call."""
 
     def __init__(
-        self, out: Path, network: Regressor, settings: TrainingSettings, device: str | torch.device
+        self,
+        out: Path,
+        network: RegressorModule,
+        settings: TrainingSettings,
+        device: str | torch.device,
     ) -> None:
         self.out = out
         self.network = network.to(device).requires_grad_(True)
@@ -179,7 +184,7 @@ class _Run:
     def begun(
         cls,
         out: Path,
-        network: Regressor,
+        network: RegressorModule,
         settings: TrainingSettings,
         device: torch.device,
         worker: Worker,
@@ -207,7 +212,7 @@ class _Run:
         config: dict[str, Any] = {
             k: tuple(v) if isinstance(v, list) else v for k, v in held["config"].items()
         }
-        run = cls(out, Regressor(RegressorConfig(**config)), settings, device)
+        run = cls(out, RegressorModule(RegressorConfig(**config)), settings, device)
         run.network.load_state_dict(held["weights"])
         run.average.load_state_dict(held["average"])
         run.step, run.minutes = held["step"], held["minutes"]
@@ -280,8 +285,8 @@ class _Run:
                 targets = self.loss.targets(batch)
                 self.mean.add(targets)
             with torch.autocast("cuda", torch.bfloat16) if is_cuda else nullcontext():
-                flat = trained(batch.photo, batch.rays)
-            terms = self.loss.terms(self.network.split(flat.float()), targets)
+                (flat,) = trained(batch.photo, batch.rays)
+            terms = self.loss.terms(split(flat.float()), targets)
             weighted = [TERM_WEIGHTS[name] * term for name, term in terms.items()]
             self.optimizer.zero_grad(set_to_none=True)
             torch.stack(weighted).sum().backward()
@@ -334,7 +339,7 @@ class _Run:
     ) -> dict[str, dict[str, float]]:
         """Calibrate the best average, write it, and return what it reaches."""
         device = self.network.directions.device
-        network = load_regressor(self.out / BEST, device)
+        network = read_regressor(self.out / BEST, device)
         network.mean_light.copy_(self.mean.flat())
         # By real places where there are some: made-up ones are easier to read.
         real = {name: v for name, v in validation.items() if name == PANORAMAS}

@@ -10,9 +10,10 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from warpir.lighting.regressor import Prediction, Regressor, least_angle
+from warpir.lighting.regressor import LEVEL_COUNT, Prediction, least_angle
 from warpir.train.batches import PhotoBatch
 from warpir.train.light_loss import SUNNY_SHARE, LightLoss
+from warpir.train.networks.regressor import RegressorModule
 
 COVERAGE = 0.68
 """Share of the truth that the region of this probability shall hold."""
@@ -29,7 +30,7 @@ class _Answers:
     """Whether a photo's direction is judged: sunny, with a cue; bool, shape [B]."""
 
 
-def _answers(network: Regressor, loss: LightLoss, batches: Sequence[PhotoBatch]) -> _Answers:
+def _answers(network: RegressorModule, loss: LightLoss, batches: Sequence[PhotoBatch]) -> _Answers:
     predictions = [network.predict(b.photo, b.rays) for b in batches]
     targets = [loss.targets(b) for b in batches]
     return _Answers(
@@ -41,7 +42,9 @@ def _answers(network: Regressor, loss: LightLoss, batches: Sequence[PhotoBatch])
 
 
 @torch.no_grad()
-def measure(network: Regressor, loss: LightLoss, batches: Sequence[PhotoBatch]) -> dict[str, float]:
+def measure(
+    network: RegressorModule, loss: LightLoss, batches: Sequence[PhotoBatch]
+) -> dict[str, float]:
     """Return how well a network reads one validation set.
 
     Angles, their likelihood and coverage are over sunny photos with a cue.
@@ -61,7 +64,7 @@ def _measure(answers: _Answers, loss: LightLoss) -> dict[str, float]:
     if not chosen.any():
         return measured
     probability = prediction.logits[chosen].softmax(dim=1)
-    axis, spread = least_angle(loss.directions, probability)
+    axis, spread = centres(loss.directions, probability)
     angle = torch.rad2deg(torch.acos((axis * answers.axis[chosen]).sum(1).clamp(-1.0, 1.0)))
     labels = targets["labels"][chosen]
     level = (prediction.level - targets["level"])[chosen]
@@ -94,6 +97,13 @@ def score(validation: Mapping[str, Mapping[str, float]]) -> float:
         for m in validation.values()
     ]
     return sum(marks) / len(marks)
+
+
+def centres(directions: Tensor, probability: Tensor) -> tuple[Tensor, Tensor]:
+    """Return `least_angle` of tensors, float32."""
+    arrays = directions.double().cpu().numpy(), probability.double().cpu().numpy()
+    axis, spread = (torch.from_numpy(part).to(directions) for part in least_angle(*arrays))
+    return axis, spread
 
 
 def region_mass(directions: Tensor, probability: Tensor, axis: Tensor) -> Tensor:
@@ -139,7 +149,7 @@ def calibrated_temperature(directions: Tensor, sets: Sequence[tuple[Tensor, Tens
 
 @torch.no_grad()
 def calibrate(
-    network: Regressor, loss: LightLoss, validation: Mapping[str, Sequence[PhotoBatch]]
+    network: RegressorModule, loss: LightLoss, validation: Mapping[str, Sequence[PhotoBatch]]
 ) -> None:
     """Set the network's temperature and scale its variances, on sunny validation photos.
 
@@ -161,7 +171,7 @@ def calibrate(
             (5, p.tint[:, 1] - t["tint"][:, 1], p.tint_log_var[:, 1], a.counts),
             (7, p.softness - t["softness"], p.softness_log_var, a.counts),
             (
-                network.level_count - 1,
+                LEVEL_COUNT - 1,
                 loss.irradiance_error(loss.ambient(p), t["ambient"]).mean(dim=(1, 2)),
                 p.ambient_log_var,
                 torch.ones_like(a.counts),

@@ -5,8 +5,8 @@ from __future__ import annotations
 from warpir.app.inputs import Inputs
 from warpir.core.arrays import FloatArray, by_pixel
 from warpir.io.images.photos import Photo
+from warpir.io.images.resize import resize
 from warpir.render.device_scene import Placed, Receiver, Scene
-from warpir.render.picture.resizing import resize
 from warpir.scene.camera import Camera
 from warpir.scene.tone_curves import Curves
 

@@ -7,11 +7,11 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from warpir.core.arrays import BoolArray, FloatArray, IntArray
+from warpir.io.images.resize import resize
 from warpir.kernels.types import LightArgs
 from warpir.look.denoise import denoised_object, denoised_ratio
 from warpir.render.allocation import as_shown
 from warpir.render.device_light import light_args
-from warpir.render.picture.resizing import resize
 from warpir.render.picture.tone import tone_mapped
 from warpir.render.renderer import Foreground, GBuffer, Renderer
 from warpir.render.shadow.mirror import mirror_planes

@@ -3,6 +3,7 @@
 import numpy as np
 
 from warpir.core.arrays import FloatArray
+from warpir.io.images.resize import resize
 
 SLIVER = 1e-4
 """Share of a pixel below which its surface layers are left empty [1]."""
@@ -26,17 +27,3 @@ def resize_planes(planes: dict[str, FloatArray], height: int, width: int) -> dic
     length = np.linalg.norm(resized["normal"], axis=-1, keepdims=True)
     resized["normal"] /= np.where(length > 0.0, length, 1.0)
     return resized
-
-
-def resize(plane: FloatArray, height: int, width: int) -> FloatArray:
-    """Bring a plane to the photo's size: bilinear, by as many pixels as each new one covers."""
-    from torch import from_numpy
-    from torch.nn.functional import interpolate
-
-    finite = np.where(np.isfinite(plane), plane, np.float32(0.0))
-    channels = np.ascontiguousarray(np.atleast_3d(finite).transpose(2, 0, 1)[None])
-    is_smaller = height < plane.shape[0]
-    resized = interpolate(
-        from_numpy(channels), (height, width), mode="bilinear", antialias=is_smaller
-    )[0].numpy()
-    return np.ascontiguousarray(resized.transpose(1, 2, 0)).reshape(height, width, *plane.shape[2:])

@@ -17,9 +17,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from warpir.core.arrays import BoolArray, Float64Array, FloatArray, IntArray
+from warpir.io.images.resize import resize
 from warpir.kernels.types import LightArgs
 from warpir.render.allocation import as_shown
-from warpir.render.picture.resizing import resize
 from warpir.render.renderer import Renderer
 from warpir.render.shadow.pilot import BLOCK, Pilot, dilate, neighbourhood, run_pilot
 

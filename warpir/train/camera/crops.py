@@ -13,11 +13,12 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from warpir.calibration.network import HEIGHT, SHAPE, WIDTH, blur_sigma, soften
+from warpir.calibration.network import HEIGHT, WIDTH, blur_sigma
 from warpir.core.color import luminance
 from warpir.core.latlong import resize_map, texel_solid_angles
 from warpir.io.images.photos import read_envmap
 from warpir.train.augmentation import erase
+from warpir.train.networks.calibrator import SHAPE, soften
 from warpir.train.photo_look import draw_faults, draw_looks
 from warpir.train.sampler import Sampler
 
@@ -216,7 +217,7 @@ def with_blur(photo: Tensor, cameras: DrawnCameras, coarseness: Tensor, rows: Te
     """
     texel = cameras.focal * HEIGHT * math.pi / ROWS * coarseness
     missing = (rows**2 - (OWN_BLUR * texel) ** 2).clamp(min=0.0).sqrt()
-    return soften(photo, blur_sigma(missing, cameras.aspect))
+    return soften(photo, torch.stack(blur_sigma(missing, cameras.aspect), dim=1))
 
 
 def draw_batch(panoramas: Panoramas, count: int, generator: torch.Generator) -> CameraBatch:

@@ -20,14 +20,14 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from warpir.calibration.network import (
-    NUMBERS,
-    Calibrator,
+from warpir.calibration.network import NUMBERS
+from warpir.train.camera.crops import CameraBatch, Panoramas, draw_batch
+from warpir.train.networks.calibrator import (
+    CalibratorModule,
     random_calibrator,
     save_calibrator,
 )
-from warpir.lighting.regressor import Regressor
-from warpir.train.camera.crops import CameraBatch, Panoramas, draw_batch
+from warpir.train.networks.regressor import RegressorModule
 from warpir.train.stepping import CameraSettings, follow, left_to_fall, make_optimizer, warmed_up
 
 WEIGHTS, CURVE = "calibrator.safetensors", "curve.jsonl"
@@ -50,7 +50,7 @@ def train_camera(
     device: torch.device,
     minutes: float,
     seed: int = 0,
-    start: Calibrator | None = None,
+    start: CalibratorModule | None = None,
     record: Mapping[str, Any] | None = None,
 ) -> dict[str, float]:
     """Train until the time is over; write ``calibrator.safetensors`` and ``curve.jsonl`` to out.
@@ -106,7 +106,9 @@ def train_camera(
 class _Course:
     """A training as it goes: the moving average of the weights, and the best one so far."""
 
-    def __init__(self, network: Calibrator, validation: Sequence[CameraBatch], curve: Path) -> None:
+    def __init__(
+        self, network: CalibratorModule, validation: Sequence[CameraBatch], curve: Path
+    ) -> None:
         self.network, self.validation, self.curve = network, validation, curve
         self.average = copy.deepcopy(network).eval().requires_grad_(False)
         self.kept, self.best, self.steps = self.average, math.inf, 0
@@ -135,7 +137,7 @@ def _rate(settings: CameraSettings, progress: float, steps: int) -> float:
 
 
 def _step_of(
-    network: Calibrator, settings: CameraSettings
+    network: CalibratorModule, settings: CameraSettings
 ) -> Callable[[CameraBatch, float], Tensor]:
     """Return what takes a step of the optimiser on a batch, at a rate, and returns the loss."""
     is_cuda = network.spread.is_cuda
@@ -166,7 +168,7 @@ def camera_loss(logits: Mapping[str, Tensor], field: Tensor, batch: CameraBatch)
     """
     total = torch.zeros((), device=field.device)
     for (name, bins), truth in zip(NUMBERS.items(), batch.numbers.T, strict=True):
-        centres = bins.centres(truth)
+        centres = torch.from_numpy(bins.centres()).to(truth)
         step = centres[1] - centres[0]
         labels = (-0.5 * ((centres - truth[:, None]) / step) ** 2).softmax(dim=1)
         entropy = -(labels * logits[name].float().log_softmax(dim=1)).sum(dim=1)
@@ -190,7 +192,7 @@ def validation_batches(
 
 
 def errors_of(
-    network: Calibrator, batches: Sequence[CameraBatch]
+    network: CalibratorModule, batches: Sequence[CameraBatch]
 ) -> tuple[dict[str, Tensor], dict[str, Tensor]]:
     """Return errors and standard deviations, by number, shape [count] each.
 
@@ -198,8 +200,7 @@ def errors_of(
     shares.
     """
     answers = [network.predict(b.photo, b.aspect, b.focal) for b in batches]
-    value = torch.cat([a.value for a in answers]).T
-    sigma = torch.cat([a.sigma for a in answers]).T
+    value, sigma = (torch.cat(parts).T for parts in zip(*answers, strict=True))
     truth = torch.cat([b.numbers for b in batches]).T
     error, spread = {}, {}
     for name, found, true, width in zip(NUMBERS, value, truth, sigma, strict=True):
@@ -212,7 +213,7 @@ def errors_of(
     return error, spread
 
 
-def measure(network: Calibrator, batches: Sequence[CameraBatch]) -> dict[str, float]:
+def measure(network: CalibratorModule, batches: Sequence[CameraBatch]) -> dict[str, float]:
     """Return median errors, the share within one standard deviation, and a score, by name."""
     error, spread = errors_of(network, batches)
     found = {f"{name}_median": float(e.median()) for name, e in error.items()}
@@ -222,7 +223,7 @@ def measure(network: Calibrator, batches: Sequence[CameraBatch]) -> dict[str, fl
     return found | {"score": score}
 
 
-def calibrate(network: Calibrator, batches: Sequence[CameraBatch]) -> None:
+def calibrate(network: CalibratorModule, batches: Sequence[CameraBatch]) -> None:
     """Set the network's spread, so that 68 % of errors of each angle lie within one sigma.
 
     The principal point keeps its distribution's own width: most photos are centred, and a factor
@@ -236,7 +237,7 @@ def calibrate(network: Calibrator, batches: Sequence[CameraBatch]) -> None:
             network.spread[place] = torch.quantile(ratio, COVERAGE)
 
 
-def begin_with_trunk(network: Calibrator, regressor: Regressor) -> None:
+def begin_with_trunk(network: CalibratorModule, regressor: RegressorModule) -> None:
     """Copy the convolutions of a light regressor into a network, as far as both have them.
 
     What the regressor has learned to see of a photo teaches the camera too: from random weights the

@@ -9,8 +9,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-GATHERINGS = 4
-"""Weighted means of the tokens that each head reads, of an equal part of the features each."""
+from warpir.calibration.forward import GATHERINGS, GROUPS
 
 
 @dataclass(frozen=True)
@@ -50,10 +49,10 @@ class ConvBlock(Skippable):
     def __init__(self, channels: int, skipped: float) -> None:
         super().__init__(skipped)
         self.branch = nn.Sequential(
-            nn.GroupNorm(8, channels),
+            nn.GroupNorm(GROUPS, channels),
             nn.SiLU(),
             nn.Conv2d(channels, channels, 3, padding=1),
-            nn.GroupNorm(8, channels),
+            nn.GroupNorm(GROUPS, channels),
             nn.SiLU(),
             nn.Conv2d(channels, channels, 3, padding=1),
         )
@@ -119,7 +118,7 @@ class TokenNetwork(nn.Module):
             *(ConvBlock(middle, config.skipped / 2.0) for _ in range(config.blocks[1]))
         )
         self.down2 = nn.Conv2d(middle, wide, 3, stride=2, padding=1)
-        self.norm = nn.GroupNorm(8, wide)
+        self.norm = nn.GroupNorm(GROUPS, wide)
         self.place = nn.Sequential(nn.Linear(places, wide), nn.GELU(), nn.Linear(wide, wide))
         self.asking = nn.Parameter(torch.randn(asking, wide) * 0.02)
         self.blocks = nn.ModuleList(

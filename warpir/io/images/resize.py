@@ -1,0 +1,28 @@
+"""Pictures of another size."""
+
+import numpy as np
+from PIL import Image
+
+from warpir.core.arrays import AnyFloatArray, FloatArray, on_cores
+
+
+def resize(picture: AnyFloatArray, height: int, width: int) -> FloatArray:
+    """Return a picture of another size: bilinear, over as many pixels as each new one covers.
+
+    Args:
+        picture: Shape [H, W] or [H, W, C]; what is not finite counts as 0.
+        height: Of the result [px].
+        width: Of the result [px].
+
+    Returns:
+        Shape [height, width] or [height, width, C].
+    """
+    finite = np.where(np.isfinite(picture), picture, 0.0).astype(np.float32)
+
+    def each(plane: FloatArray) -> FloatArray:
+        whole = Image.fromarray(np.ascontiguousarray(plane))
+        return np.asarray(whole.resize((width, height), Image.Resampling.BILINEAR))
+
+    if picture.ndim == 2:
+        return each(finite).copy()  # what Pillow gives is read-only
+    return np.stack(on_cores(each, np.moveaxis(finite, 2, 0)), axis=2)
