@@ -17,6 +17,7 @@ answer without it. torch is imported where a diffusion model guides, and by noth
 import sys
 import threading
 from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from pathlib import Path
 from types import ModuleType
@@ -110,11 +111,16 @@ def _insert_one(config: InsertConfig, loaders: "Loaders | None" = None) -> Inser
     with run.output as output:
         run.require_room()
         with no_collection(), run.timings.stage("load"):  # loads Warp
-            from warpir.optimize.find_light import find_light, with_photo_detail
             from warpir.render.device import choose_device
-            from warpir.report.result import render_result, write_preview
 
-            run = run.on_device(choose_device(run.config.render.device)).with_ground_coat()
+            # Warp and the driver start in C, which leaves the interpreter to other imports.
+            with ThreadPoolExecutor(1) as pool:
+                device = pool.submit(choose_device, run.config.render.device)
+
+                from warpir.optimize.find_light import find_light, with_photo_detail
+                from warpir.report.result import render_result, write_preview
+
+            run = run.on_device(device.result()).with_ground_coat()
         run.take_cache_notices()
         lit = find_light(run, given)
         with sparing():

@@ -81,9 +81,8 @@ def choose_device(name: str | None) -> str:
     """
     start_warp()
     known = [d.alias for d in wp.get_devices()]
-    if name is None:
-        return "cuda:0" if wp.is_cuda_available() else "cpu"
-    alias = "cuda:0" if name == "cuda" else name
+    chosen = ("cuda" if wp.is_cuda_available() else "cpu") if name is None else name
+    alias = "cuda:0" if chosen == "cuda" else chosen
     if alias not in known:
         raise InputError(
             "--device",
@@ -91,6 +90,7 @@ def choose_device(name: str | None) -> str:
             "use --device cpu",
             ExitCode.USAGE,
         )
+    _ = wp.get_device(alias).context  # a card's is made when it is first asked for
     return alias
 
 
