@@ -188,7 +188,32 @@ def _check_photo_network(path: Path | None, name: str, format_: str, sizes: Size
         if _object(str(shipped), ours.about["config"]) == config:
             _check_shapes(file, ours)
     _check_written(file, file.about.get("weights"), file.about["config"])
+    _check_built(file, config)
     return file
+
+
+def _check_built(file: WeightFile, config: Mapping[str, Any]) -> None:
+    """Check that the weights are of a network of these sizes, by their names and widths.
+
+    The answers' own sizes are checked when the weights are read.
+
+    Raises:
+        ModelError: They are not.
+    """
+    members = {name.split(".")[1] for name in file.shapes if name.startswith("members.")}
+    fine, middle = config["blocks"]
+    expected = {"fine": fine, "middle": middle, "blocks": config["depth"]}
+    fits = len(members) == config.get("members", 0)
+    for prefix in [f"members.{k}." for k in members] or [""]:
+        own = [name for name in file.shapes if name.startswith(prefix)]
+        parts = [name.removeprefix(prefix).split(".") for name in own]
+        found = {kind: len({p[1] for p in parts if p[0] == kind}) for kind in expected}
+        layers = (f"{prefix}{layer}.bias" for layer in ("stem", "down1", "down2"))
+        widths = [file.shapes.get(layer) for layer in layers]
+        fits = fits and found == expected and widths == [(w,) for w in config["channels"]]
+    if not fits:
+        what = "damaged (the weights are not those of its network)"
+        raise ModelError(str(file.path), what)
 
 
 def _check_sizes(where: str, config: Mapping[str, Any], sizes: Sizes) -> None:

@@ -245,6 +245,31 @@ def test_check_without_estimator_says_what_will_be_estimated(folder: Path) -> No
         read(folder, None, at=(48.0, 500.0))
 
 
+@pytest.mark.parametrize("size", [(20, 400), (1, 500), (400, 20)], ids=str)
+def test_check_without_estimator_passes_photos_of_all_shapes(
+    folder: Path, tmp_path: Path, size: tuple[int, int]
+) -> None:
+    """What the assumed camera does not see of a narrow photo, the estimated one may."""
+    Image.new("RGB", size, (90, 100, 110)).save(tmp_path / "photo.png")
+    config = InsertConfig(
+        photo=str(tmp_path / "photo.png"), asset=str(folder / "box.glb"), sky="clear", out="out"
+    )
+    assert read_inputs(config).camera.width == size[0]
+
+
+def test_width_that_makes_too_many_pixels_is_refused(folder: Path, tmp_path: Path) -> None:
+    Image.new("RGB", (2, 900), (90, 100, 110)).save(tmp_path / "photo.png")
+    config = InsertConfig(
+        photo=str(tmp_path / "photo.png"),
+        asset=str(folder / "box.glb"),
+        sky="clear",
+        out="out",
+        width=500,
+    )
+    with pytest.raises(InputError, match=r"--width: too many pixels to render .*--max-pixels"):
+        read_inputs(config)
+
+
 # ------------------------------------------------------------------------- where nothing is placed
 
 

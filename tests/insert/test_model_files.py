@@ -176,6 +176,32 @@ def as_written(spoil: Callable[[dict[str, Any]], object]) -> Callable[[Path], No
     return edited(change)
 
 
+def resized(**sizes: object) -> Callable[[Path], None]:
+    """State other sizes than the weights have, and hash them as if they were true."""
+
+    def change(tensors: dict[str, Any], about: dict[str, str]) -> None:
+        about["config"] = json.dumps(json.loads(about["config"]) | sizes)
+        about["weights"] = values_hash(tensors, about["config"])
+
+    return edited(change)
+
+
+@pytest.mark.parametrize("sizes", [{"members": 2}, {"depth": 9}, {"blocks": [1, 2]}], ids=str)
+def test_sizes_that_the_weights_do_not_have_are_refused(
+    inputs: Path, tmp_path: Path, sizes: dict[str, object]
+) -> None:
+    refused(inputs, tmp_path, "regressor", resized(**sizes), "not those of its network")
+
+
+def test_answers_that_are_no_light_are_refused(inputs: Path, tmp_path: Path) -> None:
+    """Weights that are finite, and answer with logarithms of thousands."""
+    file = tmp_path / "regressor.safetensors"
+    file.write_bytes((inputs / "regressor.safetensors").read_bytes())
+    as_written(lambda t: t["members.0.level_head.2.bias"].fill(3e4))(file)
+    argv = run_with(inputs, "regressor", file)
+    assert_fails(argv, 4, "--regressor", "logarithms beyond 60", cwd=tmp_path)
+
+
 @pytest.mark.parametrize(
     ("flag", "damage", "words"),
     [

@@ -1,5 +1,6 @@
 """All inputs of one insertion, read and checked; torch and Warp are not needed here."""
 
+import math
 from collections.abc import Callable, Iterator
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
@@ -47,6 +48,8 @@ from warpir.scene.shadow_mask import ShadowMask, shadow_mask
 
 LOOKING_DOWN = -30.0
 """Pitch of a camera that sees ground nearly everywhere [deg]."""
+USUAL_VFOV = 60.0
+"""Its vertical field of view, where the photo's is not known [deg]."""
 STATED_UP = (".glb", ".gltf")
 """Kinds of asset whose format says which way is up."""
 
@@ -155,7 +158,12 @@ def _other_camera(config: InsertConfig, camera: Camera) -> tuple[dict[str, Any],
     if is_estimated(camera):
         return {}, NO_PLACE
     if camera.sources and camera.sources["pitch_deg"].name == PENDING:
-        return {"pitch": LOOKING_DOWN}, (
+        changed = {"pitch": LOOKING_DOWN}
+        # The assumed field is horizontal: of a tall, narrow photo the vertical one is absurd.
+        if camera.sources["vfov_deg"].name == PENDING:
+            across = math.tan(math.radians(USUAL_VFOV / 2.0)) * camera.width / camera.height
+            changed["fov"] = math.degrees(2.0 * math.atan(across))
+        return changed, (
             "whether there is a place for the object is known when the camera is estimated"
         )
     return None
@@ -218,6 +226,11 @@ def _read_files(config: InsertConfig, loaders: Loaders) -> _Files:
             what, size = "too large", state[1]
             attempt(partial(limits.check, "file_bytes", size, path, what, more=" bytes"))
     photo = attempt(lambda: loaders.photo(inputs, limits))
+    if photo is not None and (width := config.render.width) is not None:
+        rows, columns = photo.codes.shape[:2]
+        if width > columns:
+            rendered, what = width * round(width * rows / columns), "too many pixels to render"
+            attempt(partial(limits.check, "pixels", rendered, "--width", what))
     occluder = attempt(lambda: _read_mask(inputs.occluder_mask, photo, limits, log))
     shaded = attempt(lambda: _read_mask(config.camera.shadow_mask, photo, limits, log))
     asset = attempt(lambda: read_asset(inputs, limits, loaders, log))

@@ -21,7 +21,7 @@ GRACE_SECONDS = 60.0
 
 
 class LocalWorkers:
-    """Processes that load torch, Warp and the kernels once.
+    """Processes that load Warp and the kernels once, and torch where a model guides.
 
     Args:
         environments: Of each process, what differs from this one's.

@@ -30,7 +30,7 @@ FORMAT, VERSION = "warpir-batch", 1
 SUMMARY, FAILURES = "batch.json", "failures.jsonl"
 WORKER_BYTES = 700 << 20
 """Of a worker's process with torch, Warp and the regressor, and the largest maps that it writes:
-measured."""
+measured. Without a model it holds no torch, and less."""
 CHECKER_BYTES = 300 << 20
 """Of a process that reads and checks inputs, without torch and Warp."""
 NONE_STARTED = "cannot be used, so none was started (--all-or-nothing)"

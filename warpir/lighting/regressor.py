@@ -28,6 +28,7 @@ from warpir.calibration.forward import Forward, head_shapes, token_shapes
 from warpir.calibration.weights import Shapes, Weights, read_weights
 from warpir.core.arrays import AnyFloatArray, Float64Array, on_cores
 from warpir.core.color import GAMMA, luminance
+from warpir.core.errors import ExitCode, InputError
 from warpir.diffusion.models.weight_files import check_regressor
 
 HEIGHT, WIDTH = 96, 144
@@ -36,6 +37,8 @@ AMBIENT_SHARPNESS = 4.0
 """Of the 14 ambient lobes: with equal amplitudes their sum is even within 4 %."""
 LEVEL_COUNT = 10 + 3 * 14
 """Numbers of a prediction beside the logits."""
+LARGEST = 60.0
+"""What no logarithm of a sensible prediction reaches."""
 DARKEST = 1e-4
 """Mean luminance below which a photo counts as this bright."""
 LOWEST = -0.25
@@ -171,6 +174,9 @@ class Regressor:
         Args:
             photo: Display-encoded, shape [96, 144, 3].
             rays: Unit viewing directions, camera-yaw frame, shape [96, 144, 3].
+
+        Raises:
+            InputError: The weights give no light that floats can hold (`ExitCode.MODEL`).
         """
         rays = rays.astype(np.float64)
         views = (photo, rays), (photo[:, ::-1], rays[:, ::-1] * (-1.0, 1.0, 1.0))
@@ -180,7 +186,14 @@ class Regressor:
             return self._asked(member, *view)
 
         flats = on_cores(asked, [(member, view) for member in self.members for view in views])
-        return averaged(np.stack(flats[::2]), np.stack(flats[1::2]), self.temperature)
+        found = averaged(np.stack(flats[::2]), np.stack(flats[1::2]), self.temperature)
+        # Of larger numbers light would be made that no float holds; NaN is not smaller either.
+        if not (
+            np.isfinite(found.logits).all() and all(np.abs(x).max() < LARGEST for x in found[1:])
+        ):
+            what = f"answers with logarithms beyond {LARGEST:g} (its weights were not trained)"
+            raise InputError("--regressor", what, code=ExitCode.MODEL)
+        return found
 
     def _asked(self, member: int, photo: Float64Array, rays: Float64Array) -> Float64Array:
         """Return the flat prediction of one network."""

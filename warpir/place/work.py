@@ -1,8 +1,8 @@
-"""What the page asks for that needs torch or Warp, in a process of its own.
+"""What the page asks for that needs Warp or a network, in a process of its own.
 
 The process reads one job per line from standard input and answers on standard output, both JSON;
-`warpir.place.worker` starts it, and SIGUSR1 cancels a job at its next line of progress. torch and
-Warp are loaded with the first job that needs them, and stay.
+`warpir.place.worker` starts it, and SIGUSR1 cancels a job at its next line of progress. Warp and
+the networks are loaded with the first job that needs them, and stay.
 """
 
 from __future__ import annotations

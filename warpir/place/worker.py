@@ -105,9 +105,9 @@ class Worker:
                 stdout=subprocess.PIPE,
                 text=True,
                 encoding="utf-8",
-                # Its networks are small: beside other work, threads of torch wait for each other
-                # longer than they save. Warp's are its own.
-                env={"OMP_NUM_THREADS": "1", **os.environ},
+                # Beside other work, threads of a library wait for each other longer than they
+                # save. Those that matter, Warp's and the networks', are started by us.
+                env={"OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1", **os.environ},
             )
         assert self._process is not None
         return self._process

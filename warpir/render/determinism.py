@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     from torch import nn
 
 THREADS = 1
-"""Number of torch's threads on the CPU; the shipped networks are too small for more."""
+"""Number of torch's threads on the CPU, unless a network is large."""
 LARGE_THREADS = 8
 """Number of threads for a network of Stable Diffusion's size; with fewer cores it takes no longer
 than with as many threads as cores."""

@@ -94,7 +94,9 @@ def write_preview(run: Run, light: SceneLight) -> None:
         return
     run = replace(run, inputs=_small_inputs(run.inputs))
     camera = _rendering_camera(run.inputs.camera, run.config.render.width)
-    camera = _rendering_camera(run.inputs.camera, min(settings.guidance_width, camera.width))
+    # Of a photo that is enlarged, no more than the photo has.
+    width = min(settings.guidance_width, camera.width, run.inputs.camera.width)
+    camera = _rendering_camera(run.inputs.camera, width)
     placed = scene_of(run.inputs, camera, run.device, light.curves)
     asked = run.config.render
     renderer = Renderer(placed, asked.threads or 0, bounce_depth=asked.bounce_depth)
