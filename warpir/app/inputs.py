@@ -1,6 +1,5 @@
 """All inputs of one insertion, read and checked; torch and Warp are not needed here."""
 
-import math
 from collections.abc import Callable, Iterator
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
@@ -13,12 +12,10 @@ import numpy as np
 from warpir.app.config import InsertConfig, refused_refinement, usage
 from warpir.app.model_files import require_model
 from warpir.app.photo_world import (
-    NO_PLACE,
-    PENDING,
     CameraEstimator,
     PhotoWorld,
-    is_estimated,
     make_world,
+    other_camera,
     photo_camera,
     stand_on_ground,
 )
@@ -46,10 +43,6 @@ from warpir.scene.placement import Placement, up_to_y
 from warpir.scene.receiver import ReceiverMesh, first_hit, is_in_view, mesh_of
 from warpir.scene.shadow_mask import ShadowMask, shadow_mask
 
-LOOKING_DOWN = -30.0
-"""Pitch of a camera that sees ground nearly everywhere [deg]."""
-USUAL_VFOV = 60.0
-"""Its vertical field of view, where the photo's is not known [deg]."""
 STATED_UP = (".glb", ".gltf")
 """Kinds of asset whose format says which way is up."""
 
@@ -138,7 +131,7 @@ def read_inputs(config: InsertConfig, loaders: Loaders | None = None) -> Inputs:
     try:
         return _joined(config, files)
     except InputError as error:
-        other = _other_camera(config, files.view.camera)
+        other = other_camera(files.view.camera)
         if other is None:
             raise
         changed, notice = other
@@ -147,26 +140,6 @@ def read_inputs(config: InsertConfig, loaders: Loaders | None = None) -> Inputs:
         except InputError:
             raise error from None
         return replace(inputs, notices=(f"{notice} ({error.what})", *inputs.notices))
-
-
-def _other_camera(config: InsertConfig, camera: Camera) -> tuple[dict[str, Any], str] | None:
-    """Return what to try where a camera sees no place for the object, and what to say of it.
-
-    None where the camera is not an estimate. What would be estimated may look down: an object
-    above a level camera's horizon is no reason yet to refuse the inputs.
-    """
-    if is_estimated(camera):
-        return {}, NO_PLACE
-    if camera.sources and camera.sources["pitch_deg"].name == PENDING:
-        changed = {"pitch": LOOKING_DOWN}
-        # The assumed field is horizontal: of a tall, narrow photo the vertical one is absurd.
-        if camera.sources["vfov_deg"].name == PENDING:
-            across = math.tan(math.radians(USUAL_VFOV / 2.0)) * camera.width / camera.height
-            changed["fov"] = math.degrees(2.0 * math.atan(across))
-        return changed, (
-            "whether there is a place for the object is known when the camera is estimated"
-        )
-    return None
 
 
 def _joined(config: InsertConfig, files: _Files) -> Inputs:
@@ -226,11 +199,7 @@ def _read_files(config: InsertConfig, loaders: Loaders) -> _Files:
             what, size = "too large", state[1]
             attempt(partial(limits.check, "file_bytes", size, path, what, more=" bytes"))
     photo = attempt(lambda: loaders.photo(inputs, limits))
-    if photo is not None and (width := config.render.width) is not None:
-        rows, columns = photo.codes.shape[:2]
-        if width > columns:
-            rendered, what = width * round(width * rows / columns), "too many pixels to render"
-            attempt(partial(limits.check, "pixels", rendered, "--width", what))
+    attempt(lambda: _check_width(config.render.width, photo, limits))
     occluder = attempt(lambda: _read_mask(inputs.occluder_mask, photo, limits, log))
     shaded = attempt(lambda: _read_mask(config.camera.shadow_mask, photo, limits, log))
     asset = attempt(lambda: read_asset(inputs, limits, loaders, log))
@@ -264,6 +233,20 @@ def _read_files(config: InsertConfig, loaders: Loaders) -> _Files:
     return _Files(
         photo, view, asset, occluder, shaded, light, run, points, proxy, lamps, hashes, log
     )
+
+
+def _check_width(width: int | None, photo: Photo | None, limits: Limits) -> None:
+    """Refuse a width that enlarges the photo beyond what a photo may have.
+
+    Raises:
+        InputError: It would be rendered at too many pixels.
+    """
+    if photo is None or width is None:
+        return
+    rows, columns = photo.codes.shape[:2]
+    if width > columns:
+        rendered = width * round(width * rows / columns)
+        limits.check("pixels", rendered, "--width", "too many pixels to render")
 
 
 def _hashes_beside(config: InsertConfig, asset: Asset, proxy: Asset | None) -> dict[str, str]:

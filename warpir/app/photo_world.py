@@ -44,6 +44,10 @@ SEEN = (0.04, 1.0)
 its own: smaller ones are hardly seen, larger ones not whole."""
 SHOWN = 0.25
 """The same where it does not."""
+LOOKING_DOWN = -30.0
+"""Pitch of a camera that sees ground nearly everywhere [deg]."""
+USUAL_VFOV = 60.0
+"""Its vertical field of view, where the photo's is not known [deg]."""
 PENDING = "to be estimated"
 """Name of the source of numbers that a run would estimate, where nothing may be estimated yet."""
 NO_PLACE = (
@@ -226,6 +230,26 @@ def _about_sources(camera: Camera, seen_as: str) -> tuple[list[str], list[str]]:
     if camera.sources["vfov_deg"].name == ASSUMED:
         assumed.append(f"the horizontal field of view is {DEFAULT_FOV:g} degrees (--fov)")
     return assumed, doubtful
+
+
+def other_camera(camera: Camera) -> tuple[dict[str, Any], str] | None:
+    """Return what to try where a camera sees no place for the object, and what to say of it.
+
+    None where the camera is not an estimate. What would be estimated may look down: an object
+    above a level camera's horizon is no reason yet to refuse the inputs.
+    """
+    if is_estimated(camera):
+        return {}, NO_PLACE
+    if camera.sources and camera.sources["pitch_deg"].name == PENDING:
+        changed = {"pitch": LOOKING_DOWN}
+        # The assumed field is horizontal: of a tall, narrow photo the vertical one is absurd.
+        if camera.sources["vfov_deg"].name == PENDING:
+            across = math.tan(math.radians(USUAL_VFOV / 2.0)) * camera.width / camera.height
+            changed["fov"] = math.degrees(2.0 * math.atan(across))
+        return changed, (
+            "whether there is a place for the object is known when the camera is estimated"
+        )
+    return None
 
 
 def is_estimated(camera: Camera) -> bool:

@@ -86,7 +86,7 @@ def choose_device(name: str | None) -> str:
     if alias not in known:
         raise InputError(
             "--device",
-            f"no device {name} here (found {', '.join(known)})",
+            f"no device {chosen} here (found {', '.join(known)})",
             "use --device cpu",
             ExitCode.USAGE,
         )
