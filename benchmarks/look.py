@@ -119,9 +119,11 @@ def photo_of(shown: FloatArray) -> Photo:
     return Photo(np.round(255.0 * shown).astype(np.uint8), shown, "png")
 
 
-def draw_camera(photo_lin: FloatArray, rng: np.random.Generator) -> Shot:
-    """Draw a camera that takes a photo, shape [H, W, 3]."""
-    sigma, strength = float(rng.uniform(*BLUR)), float(rng.uniform(*GRAIN)) / 255.0
+def draw_camera(
+    photo_lin: FloatArray, rng: np.random.Generator, blur: tuple[float, float] = BLUR
+) -> Shot:
+    """Draw a camera that takes a photo, shape [H, W, 3], its blur between two deviations [px]."""
+    sigma, strength = float(rng.uniform(*blur)), float(rng.uniform(*GRAIN)) / 255.0
     grain = Grain((0.0, 1.0), ((strength,) * 3, (0.6 * strength,) * 3), 0.5, 0.2)
     noise = grain.draw(photo_lin.shape[:2], int(rng.integers(2**31)))
     generator = torch.Generator().manual_seed(int(rng.integers(2**31)))

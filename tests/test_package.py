@@ -61,6 +61,7 @@ def test_wheel_holds_the_weights_and_their_card(wheel: zipfile.ZipFile) -> None:
     names = {
         "warpir/diffusion/weights/calibrator.safetensors",
         "warpir/diffusion/weights/regressor.safetensors",
+        "warpir/diffusion/weights/texture.safetensors",
         "warpir/diffusion/weights/MODEL_CARD.md",
     }
     assert names <= set(sizes)

@@ -1,12 +1,13 @@
 """How well does one photo tell its camera's blur?
 
-    python -m benchmarks.sharpness --panoramas DIR [--photos DIR]
+    python -m benchmarks.sharpness --panoramas DIR [--photos DIR] [--fit]
 
 Crops of panoramas pass through the cameras of `benchmarks.look`, and edges are looked for round
 where an object might stand. What is to be found is the camera's blur with the crop's own
 (`benchmarks.look.softness`). Places are halved as in `benchmarks.response`: the numbers of
 `warpir.look.sharpness` were chosen by the one half, and both are judged. Photographs are made 3, 4
-and 5 times smaller, hence sharp, and are then blurred by a known Gaussian.
+and 5 times smaller, hence sharp, and are then blurred by a known Gaussian. ``--fit`` trains the
+networks of `warpir.look.texture` first (`benchmarks.sharpness.fit`).
 """
 
 import argparse
@@ -20,6 +21,7 @@ from PIL import Image
 
 from benchmarks.look import draw_camera, softness
 from benchmarks.response import is_for_fitting
+from benchmarks.sharpness.fit import fit
 from warpir.core.arrays import BoolArray, FloatArray
 from warpir.core.color import gamma_to_linear
 from warpir.evaluate.scenes import (
@@ -113,8 +115,12 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
     parser.add_argument("--panoramas", type=Path, nargs="+", required=True)
     parser.add_argument("--photos", type=Path, nargs="+")
+    about = "train the networks of `warpir.look.texture` on the half that numbers are chosen by"
+    parser.add_argument("--fit", action="store_true", help=about)
     options = parser.parse_args()
     places = find_files(options.panoramas, PANORAMA_SUFFIXES, "--panoramas")
+    if options.fit:
+        fit([p for p in places if is_for_fitting(p.stem)])
     for name, is_fitted in (("places chosen by", True), ("other places", False)):
         paths = [p for p in places if is_for_fitting(p.stem) == is_fitted]
         judge(name, itertools.chain.from_iterable(map(crops, paths)))

@@ -8,7 +8,6 @@ from warpir.core.arrays import FloatArray
 from warpir.look.camera_look import CameraLook, region_around
 from warpir.look.sharpness import (
     PIXEL_SIGMA,
-    TYPICAL,
     EdgeBlur,
     blurred_layers,
     estimate_blur,
@@ -77,7 +76,7 @@ def test_soft_scene_is_not_a_soft_lens() -> None:
     scene = np.concatenate([boxes(s, seed) for seed, s in enumerate((1.0, 2.0, 3.0))], axis=1)
     found, lens = estimate_blur(scene), estimate_blur(boxes(2.0))
     assert found is not None and lens is not None
-    assert TYPICAL < found.sigma < 1.3
+    assert 0.58 < found.sigma < 1.3
     assert lens.sigma == pytest.approx(2.0, abs=0.12)
 
 

@@ -13,6 +13,7 @@ from scipy.special import ive
 from warpir.core.arrays import AnyFloatArray, BoolArray, FloatArray, mask_box, on_cores
 from warpir.core.color import luminance
 from warpir.core.memory import core_count
+from warpir.look.texture import texture_blur
 
 FINE, COARSE, WIDE = 1.0, 2.0, 3.0
 """Standard deviations of the Gaussian derivatives [px]; the ratio of the first two tells the blur,
@@ -25,14 +26,12 @@ AROUND = 100
 """Clear steps below which a part of a photo tells no blur, and the whole photo is asked."""
 LENS = 0.4
 """Quantile of the blurs of all steps that counts as the lens's: many edges of a scene are soft."""
-LOW, HIGH, SPREAD = 0.15, 0.6, 1.25
+LOW, HIGH, SPREAD = 0.15, 0.6, 0.33
 """Quantiles whose distance tells how far the steps agree, and the distance at which they tell half
-of the blur [px]."""
+of the blur, the texture the other half [px]."""
 WEAK = 0.2
 """Median contrast of the steps at which their spread counts twice [1]: clouds, haze and shadows are
 weak, and soft by themselves."""
-TYPICAL = 0.58
-"""Mean of six photographs' blurs, the pixel included [px]."""
 LEAST_CONTRAST = 0.03
 """Luminance step over the photo's 99th percentile from which an edge counts [1]."""
 CLIPPED = 0.97
@@ -96,7 +95,9 @@ def estimate_blur(linear: AnyFloatArray, region: BoolArray | None = None) -> Edg
         if int(is_step.sum()) >= count:
             heights = fine[edge] * np.sqrt(2.0 * np.pi * (sigmas**2 + FINE**2))
             contrast = heights / np.maximum(mean[edge], 1e-3)
-            sigma = _of_lens(sigmas[is_step], float(np.median(contrast[is_step])))
+            texture = texture_blur(linear, None if where is everywhere else region)
+            typical = float(np.hypot(texture, PIXEL_SIGMA))
+            sigma = _of_lens(sigmas[is_step], float(np.median(contrast[is_step])), typical)
             return EdgeBlur(sigma, int(is_step.sum()))
     return None
 
@@ -107,19 +108,20 @@ def _slope(lum: FloatArray, deviation: float) -> tuple[FloatArray, FloatArray, F
     return np.hypot(gx, gy), gx, gy
 
 
-def _of_lens(sigmas: FloatArray, contrast: float) -> float:
+def _of_lens(sigmas: FloatArray, contrast: float, texture: float) -> float:
     """Return the blur of the lens, by the steps that it blurred [px].
 
-    Steps that differ, or are weak, are soft by themselves; the more so, the more the blur is drawn
-    toward that of other photographs.
+    Steps that differ, or are weak, are soft by themselves; the more so, the more the blur is that
+    of the texture.
 
     Args:
         sigmas: Blurs of the steps [px], shape [N].
         contrast: Median height of a step over the mean value around it [1].
+        texture: Blur by the texture, the pixel included [px].
     """
     low, middle, high = np.quantile(sigmas, (LOW, LENS, HIGH))
     doubt = (high - low) / SPREAD * (1.0 + WEAK / contrast)
-    return max(float(TYPICAL + (middle - TYPICAL) / (1.0 + doubt**4)), PIXEL_SIGMA)
+    return max(float(texture + (middle - texture) / (1.0 + doubt**6)), PIXEL_SIGMA)
 
 
 def _step_blurs(

@@ -1,0 +1,197 @@
+"""Trains the networks of `warpir.look.texture` on pictures whose blur is known.
+
+Three kinds: crops of the places that numbers are chosen by, photographs that scikit-image brings
+and that are made smaller, hence sharp, and made-up leaves (Lee, Mumford and Huang 2001, "Occlusion
+models for natural images"). All pass through the cameras of `benchmarks.look`.
+"""
+
+import itertools
+import zlib
+from collections.abc import Iterable, Iterator
+from concurrent.futures import ProcessPoolExecutor
+from multiprocessing import get_context
+from pathlib import Path
+
+import numpy as np
+import skimage
+import torch
+from PIL import Image
+from safetensors.numpy import save_file
+from scipy import ndimage
+
+from benchmarks.look import draw_camera, softness
+from warpir.core.arrays import BoolArray, Float64Array, FloatArray
+from warpir.core.color import gamma_to_linear
+from warpir.evaluate.scenes import CAMERA_HEIGHT, PITCH, crop_camera, crop_radiance, expose
+from warpir.io.images.photos import read_envmap
+from warpir.look.sharpness import gaussian
+from warpir.look.texture import FARTHEST, WEIGHTS, statistics
+
+CROPS, SMALLER, LEAVES = 96, 300, 24
+"""Of a place, of a photograph, and of a set of made-up pictures."""
+SETS = 48
+"""Of made-up pictures."""
+BLURS = ((0.0, 1.6), (1.2, 3.0))
+"""Of the cameras [px], the second with a chance of `SOFT`."""
+SOFT = 0.12
+PHOTOGRAPHS = ("astronaut", "chelsea", "motorcycle_left", "camera", "brick", "grass", "gravel")
+"""In `skimage.data`; none of them is in the pictures that judge."""
+NETWORKS, HIDDEN = 4, (48, 24)
+STEPS, BATCH, RATE, DECAY = 2200, 128, 2e-3, 0.7 / 128
+Sample = tuple[float, Float64Array]
+"""Blur [px] and the statistics of a picture."""
+
+
+def seen_by_camera(
+    linear: FloatArray, own: float, region: BoolArray, rng: np.random.Generator
+) -> Sample:
+    """Return what a drawn camera makes of a picture that is softer than a render by ``own``."""
+    shot = draw_camera(linear, rng, BLURS[int(rng.random() < SOFT)])
+    photo = gamma_to_linear(shot.shoot(linear))
+    return float(np.hypot(shot.blur, own)), statistics(photo, region)
+
+
+def draw_region(rng: np.random.Generator, height: int, width: int) -> BoolArray:
+    """Draw a box in a picture."""
+    high, wide = rng.uniform(0.25, 0.8, 2)
+    top, left = int(rng.uniform(0, 1 - high) * height), int(rng.uniform(0, 1 - wide) * width)
+    region = np.zeros((height, width), bool)
+    region[top : top + int(high * height), left : left + int(wide * width)] = True
+    return region
+
+
+def of_place(path: Path) -> list[Sample]:
+    """Return crops of a panorama."""
+    texels = read_envmap(path)
+    rng = np.random.default_rng(zlib.crc32(path.stem.encode()) + 77)
+    found = []
+    for _ in range(CROPS):
+        width = int(rng.choice((128, 192, 256, 320)))
+        height, pitch = 2 * width // 3, float(rng.uniform(*PITCH))
+        fov, azimuth = rng.uniform((45, 0), (95, 360))
+        camera = crop_camera(width, height, fov, azimuth, pitch, CAMERA_HEIGHT)
+        seen = crop_radiance(texels, camera)
+        region = draw_region(rng, height, width)
+        own = float(softness(camera, texels.shape[1])[region].mean())
+        if not seen.any() or own > 0.6:
+            continue
+        linear = gamma_to_linear((np.round(255.0 * expose(seen)[0]) / 255.0).astype(np.float32))
+        found += [seen_by_camera(linear, own, region, rng) for _ in range(2)]
+    return found
+
+
+def of_photograph(name: str) -> list[Sample]:
+    """Return a photograph, 2 to 6 times smaller."""
+    rng = np.random.default_rng(zlib.crc32(name.encode()) + 5)
+    with Image.open(Path(skimage.__file__).parent / "data" / f"{name}.png") as image:
+        codes = np.asarray(image.convert("RGB"))
+    linear = gamma_to_linear((codes / np.float32(255.0)).astype(np.float32))
+    found = []
+    for _ in range(SMALLER):
+        times = min(rng.uniform(2.0, 6.0), min(codes.shape[:2]) / rng.uniform(90.0, 130.0))
+        height, width = (int(n / times) for n in codes.shape[:2])
+        planes = (Image.fromarray(linear[..., c]) for c in range(3))
+        small = [np.asarray(p.resize((width, height), Image.Resampling.BOX)) for p in planes]
+        region = draw_region(rng, height, width)
+        found.append(seen_by_camera(np.stack(small, axis=-1), 0.0, region, rng))
+    return found
+
+
+def of_leaves(seed: int) -> list[Sample]:
+    """Return made-up pictures: discs and boxes of all sizes, half of them with a texture.
+
+    Some are seen through a plain camera: steps without any other fault.
+    """
+    rng = np.random.default_rng(seed)
+    found = []
+    for _ in range(LEAVES):
+        height, width = int(rng.integers(80, 200)), int(rng.integers(100, 260))
+        linear, region = leaves(height, width, rng), draw_region(rng, height, width)
+        if rng.random() < 0.4:
+            blur = float(rng.uniform(*BLURS[int(rng.random() < SOFT)]))
+            shown = gaussian(linear, blur) ** (1.0 / 2.2)
+            shown = shown + rng.uniform(0.0, 3.0) / 255.0 * rng.normal(size=shown.shape)
+            codes = (np.round(255.0 * np.clip(shown, 0.0, 1.0)) / 255.0).astype(np.float32)
+            found.append((blur, statistics(gamma_to_linear(codes), region)))
+        else:
+            found.append(seen_by_camera(linear, 0.0, region, rng))
+    return found
+
+
+def leaves(height: int, width: int, rng: np.random.Generator, finer: int = 4) -> FloatArray:
+    """Return a made-up picture, shape [H, W, 3]."""
+    high, wide = height * finer, width * finer
+    image = np.full((high, wide, 3), rng.uniform(0.02, 0.8), np.float32)
+    largest, smallest = rng.uniform(0.1, 0.5) * min(high, wide), rng.uniform(3.0, 20.0) * finer
+    grain = rng.uniform(0.0, 0.3) * (rng.random() < 0.5)
+    for _ in range(int(rng.integers(8, 60))):
+        radius = min(largest, smallest * rng.random() ** -0.7)
+        x, y, turn = rng.uniform(0.0, (wide, high, np.pi))
+        rows, columns = (
+            slice(*(int(np.clip(c + k * 1.5 * radius, 0, n)) for k in (-1, 1)))
+            for c, n in ((y, high), (x, wide))
+        )
+        v, u = np.mgrid[rows, columns].astype(np.float32)
+        along = (u - x) * np.cos(turn) + (v - y) * np.sin(turn)
+        across = (v - y) * np.cos(turn) - (u - x) * np.sin(turn)
+        inside = np.hypot(along, across) < radius
+        if rng.random() < 0.6:
+            inside = (np.abs(along) < radius) & (np.abs(across) < radius * rng.uniform(0.2, 1.0))
+        colour = rng.uniform(0.01, 0.95) * rng.uniform(0.8, 1.2, 3) * np.ones((*v.shape, 1))
+        if grain > 0.0:
+            few = [-(-n // finer) + 1 for n in v.shape]
+            noise = ndimage.zoom(rng.normal(size=few), finer, order=1)[: v.shape[0], : v.shape[1]]
+            colour *= 1.0 + grain * noise[..., None]
+        image[rows, columns][inside] = np.clip(colour, 0.0, 1.0)[inside]
+    return image.reshape(height, finer, width, finer, 3).mean(axis=(1, 3))
+
+
+def samples(places: Iterable[Path]) -> Iterator[Sample]:
+    """Yield all pictures, made on every core."""
+    # Processes that are forked hang where torch has threads already.
+    with ProcessPoolExecutor(mp_context=get_context("spawn")) as pool:
+        jobs = [pool.submit(of_place, path) for path in places]
+        jobs += [pool.submit(of_photograph, name) for name in PHOTOGRAPHS]
+        jobs += [pool.submit(of_leaves, seed) for seed in range(SETS)]
+        for job in jobs:
+            yield from job.result()
+
+
+def trained(given: torch.Tensor, blur: torch.Tensor, seed: int) -> list[torch.nn.Linear]:
+    """Return the layers of a network, trained on statistics [N, S] and blurs [N]."""
+    generator = torch.manual_seed(seed)
+    sizes = (given.shape[1], *HIDDEN, 1)
+    layers = [torch.nn.Linear(a, b) for a, b in itertools.pairwise(sizes)]
+    network = torch.nn.Sequential(
+        layers[0], torch.nn.ReLU(), layers[1], torch.nn.ReLU(), layers[2], torch.nn.Flatten(0)
+    )
+    optimizer = torch.optim.Adam(network.parameters(), lr=RATE, weight_decay=DECAY)
+    schedule = torch.optim.lr_scheduler.CosineAnnealingLR(optimizer, STEPS)
+    for _ in range(STEPS):
+        drawn = torch.randint(len(blur), (BATCH,), generator=generator)
+        loss = 0.5 * torch.nn.functional.mse_loss(network(given[drawn]), blur[drawn])
+        optimizer.zero_grad()
+        loss.backward()  # type: ignore[no-untyped-call]
+        optimizer.step()
+        schedule.step()
+    return layers
+
+
+def fit(places: list[Path], path: Path = WEIGHTS) -> None:
+    """Train the networks and write their weights."""
+    blurs, rows = zip(*samples(places), strict=True)
+    given, blur = np.array(rows), torch.tensor(blurs, dtype=torch.float32)
+    mean, spread = given.mean(axis=0), np.maximum(given.std(axis=0), 1e-3)
+    x = torch.from_numpy(np.clip((given - mean) / spread, -FARTHEST, FARTHEST)).float()
+    networks = [trained(x, blur, seed) for seed in range(NETWORKS)]
+    weights = {"mean": mean, "spread": spread}
+    for k in range(len(networks[0])):
+        weights[f"weight.{k}"] = np.stack([n[k].weight.detach().numpy().T for n in networks])
+        weights[f"bias.{k}"] = np.stack([n[k].bias.detach().numpy()[None] for n in networks])
+    names = ", ".join(p.stem for p in places)
+    about = {"record": f"{len(blurs)} pictures, {len(places)} places: {names}"}
+    # As they lie in memory they are written, whatever their strides.
+    half = {name: np.ascontiguousarray(v, np.float16) for name, v in weights.items()}
+    save_file(half, path, about)
+    path.chmod(0o644)
+    print(f"{path}: {about['record']}")
