@@ -21,7 +21,7 @@ from PIL import Image
 
 from benchmarks.look import draw_camera, softness
 from benchmarks.response import is_for_fitting
-from benchmarks.sharpness.fit import fit
+from benchmarks.sharpness.fit import fit, shown_crop
 from warpir.core.arrays import BoolArray, FloatArray
 from warpir.core.color import gamma_to_linear
 from warpir.evaluate.scenes import (
@@ -32,8 +32,6 @@ from warpir.evaluate.scenes import (
     PANORAMA_SUFFIXES,
     PITCH,
     crop_camera,
-    crop_radiance,
-    expose,
     find_files,
 )
 from warpir.io.images.photos import read_envmap
@@ -59,10 +57,9 @@ def crops(path: Path) -> Iterator[Sample]:
         height, pitch = 2 * width // 3, float(rng.uniform(*PITCH))
         fov, azimuth = rng.uniform((55, 0), (82, 360))
         camera = crop_camera(width, height, fov, azimuth, pitch, CAMERA_HEIGHT)
-        seen = crop_radiance(texels, camera)
-        if not seen.any():
+        linear = shown_crop(texels, camera)
+        if linear is None:
             continue
-        linear = gamma_to_linear((np.round(255.0 * expose(seen)[0]) / 255.0).astype(np.float32))
         horizon = camera.cy + camera.fy * np.tan(np.radians(pitch))
         foot = horizon + rng.uniform(*FOOT_ROW) * (height - horizon)
         middle, size = rng.uniform(*FOOT_COLUMN) * width, rng.uniform(*HEIGHT_SHARE) * height

@@ -21,11 +21,12 @@ from scipy import ndimage
 
 from benchmarks.look import draw_camera, softness
 from warpir.core.arrays import BoolArray, Float64Array, FloatArray
-from warpir.core.color import gamma_to_linear
+from warpir.core.color import codes_of, gamma_to_linear, linear_to_gamma
 from warpir.evaluate.scenes import CAMERA_HEIGHT, PITCH, crop_camera, crop_radiance, expose
 from warpir.io.images.photos import read_envmap
 from warpir.look.sharpness import gaussian
 from warpir.look.texture import FARTHEST, WEIGHTS, statistics
+from warpir.scene.camera import Camera
 
 CROPS, SMALLER, LEAVES = 96, 300, 24
 """Of a place, of a photograph, and of a set of made-up pictures."""
@@ -33,7 +34,8 @@ SETS = 48
 """Of made-up pictures."""
 BLURS = ((0.0, 1.6), (1.2, 3.0))
 """Of the cameras [px], the second with a chance of `SOFT`."""
-SOFT = 0.12
+SOFT, SOFTEST = 0.12, 0.6
+"""The chance, and the softness from which a crop is left out [px]."""
 PHOTOGRAPHS = ("astronaut", "chelsea", "motorcycle_left", "camera", "brick", "grass", "gravel")
 """In `skimage.data`; none of them is in the pictures that judge."""
 NETWORKS, HIDDEN = 4, (48, 24)
@@ -49,6 +51,14 @@ def seen_by_camera(
     shot = draw_camera(linear, rng, BLURS[int(rng.random() < SOFT)])
     photo = gamma_to_linear(shot.shoot(linear))
     return float(np.hypot(shot.blur, own)), statistics(photo, region)
+
+
+def shown_crop(texels: FloatArray, camera: Camera) -> FloatArray | None:
+    """Return a crop of a panorama in 8 bits, display-linear, [H, W, 3]; None where it is black."""
+    seen = crop_radiance(texels, camera)
+    if not seen.any():
+        return None
+    return gamma_to_linear((codes_of(expose(seen)[0]) / np.float32(255.0)).astype(np.float32))
 
 
 def draw_region(rng: np.random.Generator, height: int, width: int) -> BoolArray:
@@ -70,12 +80,10 @@ def of_place(path: Path) -> list[Sample]:
         height, pitch = 2 * width // 3, float(rng.uniform(*PITCH))
         fov, azimuth = rng.uniform((45, 0), (95, 360))
         camera = crop_camera(width, height, fov, azimuth, pitch, CAMERA_HEIGHT)
-        seen = crop_radiance(texels, camera)
-        region = draw_region(rng, height, width)
+        linear, region = shown_crop(texels, camera), draw_region(rng, height, width)
         own = float(softness(camera, texels.shape[1])[region].mean())
-        if not seen.any() or own > 0.6:
+        if linear is None or own > SOFTEST:
             continue
-        linear = gamma_to_linear((np.round(255.0 * expose(seen)[0]) / 255.0).astype(np.float32))
         found += [seen_by_camera(linear, own, region, rng) for _ in range(2)]
     return found
 
@@ -109,7 +117,7 @@ def of_leaves(seed: int) -> list[Sample]:
         linear, region = leaves(height, width, rng), draw_region(rng, height, width)
         if rng.random() < 0.4:
             blur = float(rng.uniform(*BLURS[int(rng.random() < SOFT)]))
-            shown = gaussian(linear, blur) ** (1.0 / 2.2)
+            shown = linear_to_gamma(gaussian(linear, blur))
             shown = shown + rng.uniform(0.0, 3.0) / 255.0 * rng.normal(size=shown.shape)
             codes = (np.round(255.0 * np.clip(shown, 0.0, 1.0)) / 255.0).astype(np.float32)
             found.append((blur, statistics(gamma_to_linear(codes), region)))

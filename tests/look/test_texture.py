@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 from benchmarks.sharpness import fit
+from warpir.core.errors import ExitCode, InputError
 from warpir.look import texture
 from warpir.look.sharpness import gaussian
 from warpir.look.texture import answers, statistics, texture_blur
@@ -56,6 +57,16 @@ def test_large_photo_is_seen_in_parts() -> None:
 def test_nothing_to_see_is_no_fault(value: float, size: tuple[int, int]) -> None:
     """Even, clipped and tiny pictures give a finite blur."""
     assert 0.0 <= texture_blur(np.full((*size, 3), value, np.float32)) < 4.0
+
+
+@pytest.mark.parametrize("content", [None, b"", b"no weights"])
+def test_damaged_package_is_told_in_a_line(other_weights: Path, content: bytes | None) -> None:
+    """Weights that are absent or cut: their file, and the status of a faulty model."""
+    if content is not None:
+        other_weights.write_bytes(content)
+    with pytest.raises(InputError, match=r"texture\.safetensors") as raised:
+        texture_blur(np.full((64, 64, 3), 0.5, np.float32))
+    assert raised.value.code == ExitCode.MODEL
 
 
 def test_written_weights_are_those_that_were_trained(

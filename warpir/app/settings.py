@@ -253,8 +253,8 @@ class LookConfig:
     """What the photo's camera did to the scene, and is done to the object."""
 
     sharpness: float | str = option("auto", "auto|off|PX", choices=AUTO, low=0, high=32)
-    """Blur of the object [px]; auto: that of the photo's sharpest edges around it; a value is the
-    standard deviation"""
+    """Blur of the object [px]; auto: that of the photo, by edges and texture around it; a value is
+    the standard deviation"""
     response: float | str = option(
         "auto", "auto|off|EXPONENT", expert=True, choices=AUTO, low=0.25, high=4
     )

@@ -28,7 +28,7 @@ class CameraLook:
     """Blur, response, grain and JPEG blocks of a photo, where they are repeated on the object."""
 
     blur: EdgeBlur | None = None
-    """Of the sharpest edges, given or estimated."""
+    """Of the lens, given or estimated."""
     grain: Grain | None = None
     response: Response | None = None
     jpeg: JpegCoding | None = None
@@ -130,7 +130,7 @@ class CameraLook:
             )
         if self.blur is not None:
             found.append(
-                f"the photo's sharpest edges are blurred by {self.blur.sigma:.2f} px, and so is "
+                f"the photo is blurred by {self.blur.sigma:.2f} px, and so is "
                 "the object (--sharpness)"
             )
         if self.grain is not None:

@@ -1,4 +1,4 @@
-"""The blur of a photo's sharpest edges, by which an object is as sharp as what stands around it."""
+"""The blur of a photo's lens, by which an object is as sharp as what stands around it."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from scipy.special import ive
 from warpir.core.arrays import AnyFloatArray, BoolArray, FloatArray, mask_box, on_cores
 from warpir.core.color import luminance
 from warpir.core.memory import core_count
-from warpir.look.texture import texture_blur
+from warpir.look.texture import CLIPPED, texture_blur
 
 FINE, COARSE, WIDE = 1.0, 2.0, 3.0
 """Standard deviations of the Gaussian derivatives [px]; the ratio of the first two tells the blur,
@@ -34,8 +34,6 @@ WEAK = 0.2
 weak, and soft by themselves."""
 LEAST_CONTRAST = 0.03
 """Luminance step over the photo's 99th percentile from which an edge counts [1]."""
-CLIPPED = 0.97
-"""Display-linear value from which a channel may be clipped, which makes edges look sharper."""
 PIXEL_SIGMA = 12.0**-0.5
 """Standard deviation of a square pixel, the blur that a rendered edge has already [px]."""
 TRUNCATE = 3.5
@@ -44,7 +42,7 @@ TRUNCATE = 3.5
 
 @dataclass(frozen=True)
 class EdgeBlur:
-    """How blurred the sharpest edges of a picture are."""
+    """How blurred a picture is."""
 
     sigma: float
     """Standard deviation of the Gaussian that blurred an ideal step, the pixel included [px]."""
@@ -53,7 +51,7 @@ class EdgeBlur:
 
 
 def estimate_blur(linear: AnyFloatArray, region: BoolArray | None = None) -> EdgeBlur | None:
-    """Estimate the blur of the sharpest edges.
+    """Estimate the blur of the lens, by edges and, where they do not agree, by the texture.
 
     A step of height A behind a Gaussian of deviation s has, seen through a Gaussian derivative of
     deviation t, the largest slope ``A / sqrt(2 pi (s^2 + t^2))``; the ratio R of two such slopes
@@ -70,6 +68,7 @@ def estimate_blur(linear: AnyFloatArray, region: BoolArray | None = None) -> Edg
     """
     lum = luminance(np.asarray(linear, np.float32))
     with ThreadPoolExecutor(core_count()) as pool:
+        texture = pool.submit(texture_blur, linear, region)
         (fine, gx, gy), (coarse, *_), (wide, *_), mean = (
             future.result()
             for future in [
@@ -95,9 +94,10 @@ def estimate_blur(linear: AnyFloatArray, region: BoolArray | None = None) -> Edg
         if int(is_step.sum()) >= count:
             heights = fine[edge] * np.sqrt(2.0 * np.pi * (sigmas**2 + FINE**2))
             contrast = heights / np.maximum(mean[edge], 1e-3)
-            texture = texture_blur(linear, None if where is everywhere else region)
-            typical = float(np.hypot(texture, PIXEL_SIGMA))
-            sigma = _of_lens(sigmas[is_step], float(np.median(contrast[is_step])), typical)
+            is_whole = where is everywhere and region is not None
+            told = texture_blur(linear) if is_whole else texture.result()
+            soft = float(np.hypot(told, PIXEL_SIGMA))
+            sigma = _of_lens(sigmas[is_step], float(np.median(contrast[is_step])), soft)
             return EdgeBlur(sigma, int(is_step.sum()))
     return None
 

@@ -7,17 +7,25 @@ statistics of the photo's bands (`python -m benchmarks.sharpness --fit` trained 
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from functools import cache
 from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
+from safetensors import SafetensorError
 from safetensors.numpy import load_file
 from scipy import ndimage
 
-from warpir.core.arrays import AnyFloatArray, BoolArray, Float64Array, FloatArray, mask_box
-from warpir.core.color import GAMMA, luminance
+from warpir.core.arrays import (
+    AnyFloatArray,
+    BoolArray,
+    Float64Array,
+    FloatArray,
+    mask_box,
+    on_cores,
+)
+from warpir.core.color import linear_to_gamma, luminance
+from warpir.core.errors import ExitCode, InputError
 from warpir.diffusion.models.weight_files import SHIPPED
 
 SIGMAS = (0.5, 0.75, 1.1, 1.6, 2.3, 3.3, 4.8)
@@ -54,6 +62,9 @@ def texture_blur(linear: AnyFloatArray, region: BoolArray | None = None) -> floa
 
     Returns:
         Standard deviation of the Gaussian, the pixel left out [px].
+
+    Raises:
+        InputError: The weights in the package are absent or damaged (`ExitCode.MODEL`).
     """
     return max(float(answers(statistics(linear, region)[None])[0]), 0.0)
 
@@ -72,7 +83,12 @@ def answers(given: Float64Array) -> Float64Array:
 @cache
 def _network() -> dict[str, NDArray[np.float64]]:
     """Return the weights: ``mean``, ``spread`` [S], of each layer [networks, in, out]."""
-    return {name: value.astype(np.float64) for name, value in load_file(WEIGHTS).items()}
+    try:
+        weights = load_file(WEIGHTS)
+    except (OSError, SafetensorError) as error:
+        what = f"absent or damaged weights ({error})"
+        raise InputError(str(WEIGHTS), what, "install warpir again", ExitCode.MODEL) from None
+    return {name: value.astype(np.float64) for name, value in weights.items()}
 
 
 def statistics(linear: AnyFloatArray, region: BoolArray | None) -> Float64Array:
@@ -85,7 +101,7 @@ def statistics(linear: AnyFloatArray, region: BoolArray | None) -> Float64Array:
     height, width = linear.shape[:2]
     whole = (slice(0, height), slice(0, width))
     first = whole if region is None or not region.any() else mask_box(region)
-    return np.concatenate([_of_area(linear, area) for area in (first, whole)])
+    return np.concatenate(on_cores(lambda area: _of_area(linear, area), (first, whole)))
 
 
 def _of_area(linear: AnyFloatArray, area: tuple[slice, slice]) -> Float64Array:
@@ -108,8 +124,8 @@ def _of_area(linear: AnyFloatArray, area: tuple[slice, slice]) -> Float64Array:
     return np.concatenate([*found, [value.mean(), value.std()]]).astype(np.float64)
 
 
-def _windows(area: tuple[slice, slice]) -> Iterator[tuple[slice, slice]]:
-    """Yield the parts of a box that are seen: all of it, or some that lie evenly in it."""
+def _windows(area: tuple[slice, slice]) -> list[tuple[slice, slice]]:
+    """Return the parts of a box that are seen: all of it, or some that lie evenly in it."""
     along = []
     for side in area:
         starts = [side.start]
@@ -118,7 +134,7 @@ def _windows(area: tuple[slice, slice]) -> Iterator[tuple[slice, slice]]:
             starts = [int(s) for s in np.linspace(side.start, side.stop - WINDOW, WINDOWS)]
             length = WINDOW
         along.append([slice(start, start + length) for start in starts])
-    return ((rows, columns) for rows in along[0] for columns in along[1])
+    return [(rows, columns) for rows in along[0] for columns in along[1]]
 
 
 def _seen(
@@ -128,7 +144,7 @@ def _seen(
     height, width = linear.shape[:2]
     top, left = max(rows.start - MARGIN, 0), max(columns.start - MARGIN, 0)
     wide = np.asarray(linear[top : rows.stop + MARGIN, left : columns.stop + MARGIN], np.float32)
-    value = np.clip(luminance(wide), 0.0, 1.0) ** np.float32(1.0 / GAMMA)
+    value = linear_to_gamma(np.minimum(luminance(wide), 1.0))
     levels = [value, *(ndimage.gaussian_filter(value, s, truncate=3.0) for s in SIGMAS)]
     bands = [np.abs(a - b) for a, b in pairwise(levels)]
     near = [ndimage.uniform_filter(band, NEAR) + FLOOR for band in bands]
