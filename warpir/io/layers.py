@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from warpir.core.arrays import PixelArray, on_cores
+from warpir.core.arrays import PixelArray, in_bands, on_cores
 from warpir.core.errors import InputError
 from warpir.core.limits import LIMITS
 from warpir.io.images.decoder import read_exr_channels
@@ -180,12 +180,15 @@ def _checked_formula(layers: Layers) -> str:
             added.append(plane)
             formula += f" + {name}.RGB"
     planes = layers.composite, layers.foreground, layers.plate, layers.shadow_ratio, *added
-    # By the row, for memory
-    for composite, foreground, plate, ratio, *more in zip(*planes, strict=True):
-        recomputed = foreground[:, :3] + (1.0 - foreground[:, 3:]) * plate * ratio + sum(more)
+
+    def check(rows: slice) -> None:
+        composite, foreground, plate, ratio, *more = (plane[rows] for plane in planes)
+        recomputed = foreground[..., :3] + (1.0 - foreground[..., 3:]) * plate * ratio + sum(more)
         if not np.allclose(composite, recomputed, rtol=2e-3, atol=2e-3, equal_nan=True):
             worst = float(np.nanmax(np.abs(composite - recomputed)))
             raise ValueError(f"composite differs from its layers by up to {worst:g}")
+
+    in_bands(check, *layers.composite.shape[:2])
     return formula
 
 

@@ -16,7 +16,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from PIL import Image
+from PIL import Image, WebPImagePlugin
 
 from warpir.core.arrays import BoolArray, CodeArray, FloatArray, on_cores
 from warpir.core.color import codes_of, linear_to_gamma, luminance
@@ -59,7 +59,9 @@ def jpeg(codes: CodeArray, quality: int = 88) -> Shown:
 def webp(codes: CodeArray) -> Shown:
     """Encode 8-bit codes with alpha, shape [H, W, 4]."""
     stream = io.BytesIO()
-    Image.fromarray(codes).save(stream, "WEBP", quality=88, method=1, alpha_quality=90)
+    # By its plugin, which is imported above: for a mere name Pillow would import all it has.
+    kind = WebPImagePlugin.WebPImageFile.format
+    Image.fromarray(codes).save(stream, kind, quality=88, method=1, alpha_quality=90)
     return Shown(_uri("image/webp", stream.getvalue()), codes.shape[1], codes.shape[0])
 
 

@@ -208,35 +208,38 @@ def rasterize_lobes(lobes: Lobes, height: int, width: int) -> FloatArray:
 def _add_lobes(texels: Float64Array, lobes: Lobes, along: int, across: int) -> None:
     """Add the mean of so many directions in each texel, an even number of rows and some columns."""
     height, width = texels.shape[:2]
+    if len(lobes.sharpness) == 0:
+        return
     # Rows at the two-point Gauss-Legendre nodes of even bands: midpoints misjudge a lobe at a pole
     # by up to 4 %.
     step = np.pi / (height * along)
     theta = (np.arange(height * along) // 2 * 2 + 1.0) * step
     theta += np.tile([-1.0, 1.0], height * along // 2) * step / np.sqrt(3.0)
-    sin_theta, cos_theta = np.sin(theta), np.cos(theta)
-    lon = longitudes(width * across)
-    sin_lon, cos_lon = np.sin(lon), np.cos(lon)
+    sin_theta, cos_theta = (f(theta).reshape(height, along, 1) for f in (np.sin, np.cos))
     # Within the texels at a pole, the points nearer to it stand for less of the sphere.
-    share = sin_theta.reshape(height, along, 1)
-    share = (share / share.sum(axis=1, keepdims=True)).astype(np.float32)
+    share = sin_theta / sin_theta.sum(axis=1, keepdims=True)
+    lon = longitudes(width * across)
+    sharpness = lobes.sharpness.astype(np.float64)
+    x, y, z = sharpness * lobes.axis.T.astype(np.float64)
+    level = np.outer(x, np.sin(lon)) + np.outer(z, np.cos(lon))
+    near = [_rows_near(*lobe, height) for lobe in zip(lobes.axis, sharpness, strict=True)]
+    first, last = (np.array([getattr(rows, end) for rows in near]) for end in ("start", "stop"))
 
     def add(band: slice) -> None:
-        for amplitude, axis, s in zip(lobes.amplitude, lobes.axis, lobes.sharpness, strict=True):
-            near = _rows_near(axis, s, height)
-            rows = slice(max(near.start, band.start), min(near.stop, band.stop))
-            if rows.start >= rows.stop:
-                continue
-            part = slice(rows.start * along, rows.stop * along)
-            x, y, z = s * axis.astype(np.float64)
-            exponent = np.outer(sin_theta[part], x * sin_lon + z * cos_lon)
-            exponent += (y * cos_theta[part] - s)[:, None]
-            fine = np.exp(exponent.astype(np.float32))
-            if across > 1:
-                fine = fine.reshape(-1, width, across).mean(axis=2)
-            mean = (fine.reshape(-1, along, width) * share[rows]).sum(axis=1)
-            texels[rows] += mean[..., None] * amplitude
+        here = np.flatnonzero((first < band.stop) & (last > band.start))
+        if len(here) == 0:
+            return
+        # Shapes [rows, along, lobes, columns]; all lobes in one product with their colours.
+        exponent = sin_theta[band, ..., None] * level[here]
+        exponent += (cos_theta[band] * y[here] - sharpness[here])[..., None]
+        fine = np.exp(exponent.astype(np.float32))
+        if across > 1:
+            fine = fine.reshape(*fine.shape[:-1], width, across).mean(axis=-1)
+        weight = (share[band, ..., None] * lobes.amplitude[here]).reshape(len(fine), -1, 3)
+        mean = weight.swapaxes(1, 2).astype(np.float32) @ fine.reshape(len(fine), -1, width)
+        texels[band] += mean.swapaxes(1, 2)
 
-    in_bands(add, height, width)
+    in_bands(add, height, width * along * across * len(sharpness) // 8)
 
 
 def _rows_near(axis: FloatArray, sharpness: float, height: int) -> slice:

@@ -131,7 +131,7 @@ def exr_bytes(
                 f"{channel}: float16 or float32 planes [H, W] are needed, got "
                 f"{plane.dtype} {plane.shape}"
             )
-        bad = int(plane.size - np.isfinite(plane).sum())
+        bad = plane.size - np.count_nonzero(np.isfinite(plane))
         if bad:
             what = f"channel {channel} is not finite (found {bad} bad values)"
             raise InputError(where, what, code=ExitCode.NUMERIC)
