@@ -1,4 +1,4 @@
-"""How well does one photo tell its camera's blur?
+"""How well does one photo tell its camera's blur and grain?
 
     python -m benchmarks.sharpness --panoramas DIR [--photos DIR] [--fit]
 
@@ -6,8 +6,9 @@ Crops of panoramas pass through the cameras of `benchmarks.look`, and edges are 
 where an object might stand. What is to be found is the camera's blur with the crop's own
 (`benchmarks.look.softness`). Places are halved as in `benchmarks.response`: the numbers of
 `warpir.look.sharpness` were chosen by the one half, and both are judged. Photographs are made 3, 4
-and 5 times smaller, hence sharp, and are then blurred by a known Gaussian. ``--fit`` trains the
-networks of `warpir.look.texture` first (`benchmarks.sharpness.fit`).
+and 5 times smaller, hence sharp, and are then blurred by a known Gaussian. The grain is the
+luminance's, in codes of 255 in the middle of the range. ``--fit`` trains the networks of
+`warpir.look.texture` first (`benchmarks.sharpness.fit`).
 """
 
 import argparse
@@ -23,7 +24,7 @@ from benchmarks.look import draw_camera, softness
 from benchmarks.response import is_for_fitting
 from benchmarks.sharpness.fit import fit, shown_crop
 from warpir.core.arrays import BoolArray, FloatArray
-from warpir.core.color import gamma_to_linear
+from warpir.core.color import gamma_to_linear, linear_to_gamma
 from warpir.evaluate.scenes import (
     CAMERA_HEIGHT,
     FOOT_COLUMN,
@@ -36,7 +37,9 @@ from warpir.evaluate.scenes import (
 )
 from warpir.io.images.photos import read_envmap
 from warpir.look.camera_look import region_around
+from warpir.look.grain import Grain, estimate_grain
 from warpir.look.sharpness import PIXEL_SIGMA, estimate_blur, gaussian
+from warpir.look.texture import read_texture
 
 WIDTHS, CROPS, CAMERAS = (192, 288), 4, 2
 """Of the crops [px]; crops of a place for each width, and cameras of a crop."""
@@ -45,8 +48,9 @@ SMALLER, BLURS, NOISES = (3, 4, 5), (0.0, 0.4, 0.7, 1.0, 1.3, 1.6), (1.0, 3.0)
 noises [codes of 255]."""
 BINS = (0.0, 0.5, 1.0, 1.5, 3.0)
 """Edges of the true blurs by which errors are told [px]."""
-Sample = tuple[FloatArray, BoolArray | None, float]
-"""Display-linear photo [H, W, 3], where to look [H, W], and the true blur, the pixel left out."""
+Sample = tuple[FloatArray, BoolArray | None, float, float]
+"""Display-linear photo [H, W, 3], where to look [H, W], the true blur, the pixel left out [px], and
+the true grain [1]."""
 
 
 def crops(path: Path) -> Iterator[Sample]:
@@ -68,7 +72,8 @@ def crops(path: Path) -> Iterator[Sample]:
         own = float(softness(camera, texels.shape[1])[around].mean())
         for _ in range(CAMERAS):
             shot = draw_camera(linear, rng)
-            yield gamma_to_linear(shot.shoot(linear)), around, float(np.hypot(shot.blur, own))
+            blur, grain = float(np.hypot(shot.blur, own)), shot.grain.of_luminance
+            yield gamma_to_linear(shot.shoot(linear)), around, blur, grain
 
 
 def photographs(path: Path) -> Iterator[Sample]:
@@ -85,16 +90,20 @@ def photographs(path: Path) -> Iterator[Sample]:
             shown = 255.0 * gaussian(sharp, blur) ** (1.0 / 2.2)
             shown += noise * np.random.default_rng(3).normal(size=shown.shape)
             photo = (np.clip(np.round(shown), 0.0, 255.0) / 255.0).astype(np.float32)
-            yield gamma_to_linear(photo), None, blur
+            grain = Grain((0.5,), ((noise / 255.0,) * 3,), 0.0, 0.0).of_luminance
+            yield gamma_to_linear(photo), None, blur, grain
 
 
 def judge(name: str, samples: Iterator[Sample]) -> None:
-    """Print the errors of some photos that tell their blur, by true blur."""
-    rows = []
-    for linear, region, blur in samples:
-        found = estimate_blur(linear, region)
+    """Print the errors of some photos that tell their blur, by true blur, and of their grain."""
+    rows, grains = [], []
+    for linear, region, blur, grain in samples:
+        texture = read_texture(linear, region)
+        found = estimate_blur(linear, region, lambda told=texture: told)
         own = np.nan if found is None else np.sqrt(found.sigma**2 - PIXEL_SIGMA**2 + 1e-12)
         rows.append((blur, own))
+        flat = estimate_grain(linear_to_gamma(linear))
+        grains.append((grain, texture.grain, 0.0 if flat is None else flat.of_luminance))
     true, estimate = np.array(rows).T
     told = np.isfinite(estimate)
     print(f"{name}: {len(rows)} photos, {told.mean():.0%} tell their blur")
@@ -105,6 +114,11 @@ def judge(name: str, samples: Iterator[Sample]) -> None:
             f"  {low:.1f} to {high:.1f} px: {len(error):4d}  bias {error.mean():+.2f}  "
             f"mean error {np.abs(error).mean():.3f}  RMS {spread:.3f}"
         )
+    grain, *guesses = 255.0 * np.array(grains).T
+    guesses.append(np.median(grain))
+    by_whom = zip(("texture", "flat patches", "one guess"), guesses, strict=True)
+    errors = [f"{by} {np.abs(guess - grain).mean():.2f}" for by, guess in by_whom]
+    print(f"  grain, mean error in codes: {', '.join(errors)}")
 
 
 def main() -> None:

@@ -1,4 +1,4 @@
-"""Trains the networks of `warpir.look.texture` on pictures whose blur is known.
+"""Trains the networks of `warpir.look.texture` on pictures whose blur and grain are known.
 
 Three kinds: crops of the places that numbers are chosen by, photographs that scikit-image brings
 and that are made smaller, hence sharp, and made-up leaves (Lee, Mumford and Huang 2001, "Occlusion
@@ -9,6 +9,7 @@ import itertools
 import zlib
 from collections.abc import Iterable, Iterator
 from concurrent.futures import ProcessPoolExecutor
+from dataclasses import replace
 from multiprocessing import get_context
 from pathlib import Path
 
@@ -24,8 +25,9 @@ from warpir.core.arrays import BoolArray, Float64Array, FloatArray
 from warpir.core.color import codes_of, gamma_to_linear, linear_to_gamma
 from warpir.evaluate.scenes import CAMERA_HEIGHT, PITCH, crop_camera, crop_radiance, expose
 from warpir.io.images.photos import read_envmap
+from warpir.look.grain import Grain
 from warpir.look.sharpness import gaussian
-from warpir.look.texture import FARTHEST, WEIGHTS, statistics
+from warpir.look.texture import FARTHEST, UNITS, WEIGHTS, statistics
 from warpir.scene.camera import Camera
 
 CROPS, SMALLER, LEAVES = 96, 300, 24
@@ -38,19 +40,37 @@ SOFT, SOFTEST = 0.12, 0.6
 """The chance, and the softness from which a crop is left out [px]."""
 PHOTOGRAPHS = ("astronaut", "chelsea", "motorcycle_left", "camera", "brick", "grass", "gravel")
 """In `skimage.data`; none of them is in the pictures that judge."""
-NETWORKS, HIDDEN = 4, (48, 24)
-STEPS, BATCH, RATE, DECAY = 2200, 128, 2e-3, 0.7 / 128
-Sample = tuple[float, Float64Array]
-"""Blur [px] and the statistics of a picture."""
+GRAINLESS, SIZES, CORRELATIONS = 0.15, (0.0, 1.2), (0.0, 0.8)
+"""Of the cameras: the chance that one has no grain, its size [px] and its correlation between
+channels [1]: sensors, their noise reduction and files that were made smaller differ in both."""
+UNEVEN, FARTHER = 0.2, (0.5, 2.5)
+"""The chance that a picture is softer in its region than beyond, or beyond than there, and by how
+much [px]: the lens is in focus at one distance, and it is the region that is asked about."""
+NETWORKS, HIDDEN, DROPPED = 4, (128, 48), 0.1
+STEPS, BATCH, RATE, DECAY = 5000, 512, 2e-3, 0.01
+LARGE = 0.2
+"""Error from which it counts as it is and no more by its square, of `UNITS`."""
+Sample = tuple[tuple[float, float], Float64Array]
+"""Blur and grain, as in `Texture`, and the statistics of a picture."""
 
 
 def seen_by_camera(
     linear: FloatArray, own: float, region: BoolArray, rng: np.random.Generator
 ) -> Sample:
     """Return what a drawn camera makes of a picture that is softer than a render by ``own``."""
+    if rng.random() < UNEVEN:
+        more = float(rng.uniform(*FARTHER))
+        is_here = rng.random() < 0.5
+        linear = np.where((region == is_here)[..., None], gaussian(linear, more), linear)
+        own = float(np.hypot(own, more)) if is_here else own
     shot = draw_camera(linear, rng, BLURS[int(rng.random() < SOFT)])
-    photo = gamma_to_linear(shot.shoot(linear))
-    return float(np.hypot(shot.blur, own)), statistics(photo, region)
+    size, correlation = (float(rng.uniform(*ends)) for ends in (SIZES, CORRELATIONS))
+    grain = replace(shot.grain, size=size, correlation=correlation)
+    if rng.random() < GRAINLESS:
+        grain = replace(grain, strength=((0.0,) * 3,) * len(grain.level))
+    noise = grain.draw(linear.shape[:2], int(rng.integers(2**31)))
+    photo = gamma_to_linear(replace(shot, grain=grain, noise=noise).shoot(linear))
+    return (float(np.hypot(shot.blur, own)), grain.of_luminance), statistics(photo, region)
 
 
 def shown_crop(texels: FloatArray, camera: Camera) -> FloatArray | None:
@@ -118,9 +138,11 @@ def of_leaves(seed: int) -> list[Sample]:
         if rng.random() < 0.4:
             blur = float(rng.uniform(*BLURS[int(rng.random() < SOFT)]))
             shown = linear_to_gamma(gaussian(linear, blur))
-            shown = shown + rng.uniform(0.0, 3.0) / 255.0 * rng.normal(size=shown.shape)
+            noise = float(rng.uniform(0.0, 3.0)) / 255.0
+            shown = shown + noise * rng.normal(size=shown.shape)
             codes = (np.round(255.0 * np.clip(shown, 0.0, 1.0)) / 255.0).astype(np.float32)
-            found.append((blur, statistics(gamma_to_linear(codes), region)))
+            told = blur, Grain((0.5,), ((noise,) * 3,), 0.0, 0.0).of_luminance
+            found.append((told, statistics(gamma_to_linear(codes), region)))
         else:
             found.append(seen_by_camera(linear, 0.0, region, rng))
     return found
@@ -165,19 +187,18 @@ def samples(places: Iterable[Path]) -> Iterator[Sample]:
             yield from job.result()
 
 
-def trained(given: torch.Tensor, blur: torch.Tensor, seed: int) -> list[torch.nn.Linear]:
-    """Return the layers of a network, trained on statistics [N, S] and blurs [N]."""
+def trained(given: torch.Tensor, told: torch.Tensor, seed: int) -> list[torch.nn.Linear]:
+    """Return the layers of a network, trained on statistics [N, S] and what they tell [N, 2]."""
     generator = torch.manual_seed(seed)
-    sizes = (given.shape[1], *HIDDEN, 1)
+    sizes = (given.shape[1], *HIDDEN, told.shape[1])
     layers = [torch.nn.Linear(a, b) for a, b in itertools.pairwise(sizes)]
-    network = torch.nn.Sequential(
-        layers[0], torch.nn.ReLU(), layers[1], torch.nn.ReLU(), layers[2], torch.nn.Flatten(0)
-    )
-    optimizer = torch.optim.Adam(network.parameters(), lr=RATE, weight_decay=DECAY)
+    between = torch.nn.ReLU(), torch.nn.Dropout(DROPPED)
+    network = torch.nn.Sequential(layers[0], *between, layers[1], *between, layers[2])
+    optimizer = torch.optim.AdamW(network.parameters(), lr=RATE, weight_decay=DECAY)
     schedule = torch.optim.lr_scheduler.CosineAnnealingLR(optimizer, STEPS)
     for _ in range(STEPS):
-        drawn = torch.randint(len(blur), (BATCH,), generator=generator)
-        loss = 0.5 * torch.nn.functional.mse_loss(network(given[drawn]), blur[drawn])
+        drawn = torch.randint(len(told), (BATCH,), generator=generator)
+        loss = torch.nn.functional.smooth_l1_loss(network(given[drawn]), told[drawn], beta=LARGE)
         optimizer.zero_grad()
         loss.backward()  # type: ignore[no-untyped-call]
         optimizer.step()
@@ -187,17 +208,17 @@ def trained(given: torch.Tensor, blur: torch.Tensor, seed: int) -> list[torch.nn
 
 def fit(places: list[Path], path: Path = WEIGHTS) -> None:
     """Train the networks and write their weights."""
-    blurs, rows = zip(*samples(places), strict=True)
-    given, blur = np.array(rows), torch.tensor(blurs, dtype=torch.float32)
+    answers, rows = zip(*samples(places), strict=True)
+    given, told = np.array(rows), torch.from_numpy(np.array(answers) / UNITS).float()
     mean, spread = given.mean(axis=0), np.maximum(given.std(axis=0), 1e-3)
     x = torch.from_numpy(np.clip((given - mean) / spread, -FARTHEST, FARTHEST)).float()
-    networks = [trained(x, blur, seed) for seed in range(NETWORKS)]
+    networks = [trained(x, told, seed) for seed in range(NETWORKS)]
     weights = {"mean": mean, "spread": spread}
     for k in range(len(networks[0])):
         weights[f"weight.{k}"] = np.stack([n[k].weight.detach().numpy().T for n in networks])
         weights[f"bias.{k}"] = np.stack([n[k].bias.detach().numpy()[None] for n in networks])
     names = ", ".join(p.stem for p in places)
-    about = {"record": f"{len(blurs)} pictures, {len(places)} places: {names}"}
+    about = {"record": f"{len(told)} pictures, {len(places)} places: {names}"}
     # As they lie in memory they are written, whatever their strides.
     half = {name: np.ascontiguousarray(v, np.float16) for name, v in weights.items()}
     save_file(half, path, about)

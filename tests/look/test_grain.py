@@ -4,8 +4,9 @@ import numpy as np
 import pytest
 
 from warpir.core.arrays import Float64Array
+from warpir.core.color import gamma_to_linear, linear_to_gamma, luminance
 from warpir.look.camera_look import estimate_look
-from warpir.look.grain import Grain, estimate_grain, grain_over
+from warpir.look.grain import Grain, as_told, estimate_grain, grain_over
 
 
 def clean(height: int = 300, width: int = 400) -> Float64Array:
@@ -50,6 +51,27 @@ def test_a_clean_picture_has_none() -> None:
     """Eight bits of a smooth ramp show rounding alone."""
     assert estimate_grain(np.round(255.0 * clean()) / 255.0) is None
     assert estimate_grain(np.zeros((8, 8, 3))) is None
+
+
+def test_texture_decides_the_strength() -> None:
+    """Levels, channels and size stay; grain that no patch shows is told too, none is none."""
+    flat = Grain((0.2, 0.8), ((0.01, 0.02, 0.03), (0.02, 0.02, 0.02)), 0.7, 0.4)
+    told = as_told(flat, 0.5 * flat.of_luminance)
+    assert told is not None and told.of_luminance == pytest.approx(0.5 * flat.of_luminance)
+    assert told.strength[0] == pytest.approx((0.005, 0.01, 0.015))
+    assert (told.level, told.size, told.correlation) == (flat.level, 0.7, 0.4)
+    alone = as_told(None, 0.012)
+    assert alone is not None and alone.of_luminance == pytest.approx(0.012)
+    assert as_told(flat, 0.0005) is None
+
+
+@pytest.mark.parametrize("correlation", [0.0, 0.3, 1.0])
+def test_luminance_has_its_share_of_the_grain(correlation: float) -> None:
+    """Of drawn noise on mid grey, within 3 %."""
+    grain = Grain((0.5,), ((0.01,) * 3,), 0.4, correlation)
+    shown = 0.4 + 0.01 * grain.draw((300, 300), 2)
+    seen = linear_to_gamma(luminance(gamma_to_linear(shown)))
+    assert seen.std() == pytest.approx(grain.of_luminance, rel=0.03)
 
 
 def test_drawn_grain_has_unit_variance() -> None:

@@ -261,8 +261,8 @@ class LookConfig:
     """Contrast of the object's dark and bright tones; auto: as the photo's values suggest, where no
     tone curve was recovered; a value is the slope at mid grey over that of gamma 2.2"""
     grain: float | str = option("auto", "auto|off|CODES", choices=AUTO, low=0, high=64)
-    """Noise on object and shadow; auto: the photo's; a value is the standard deviation in codes of
-    255"""
+    """Noise on object and shadow; auto: the photo's, by its flat patches and its texture; a value
+    is the standard deviation in codes of 255"""
 
 
 @dataclass(frozen=True)

@@ -11,9 +11,10 @@ import numpy as np
 from warpir.core.arrays import AnyFloatArray, BoolArray, Float64Array, FloatArray, in_bands
 from warpir.core.color import GAMMA
 from warpir.io.images.jpeg import JpegCoding
-from warpir.look.grain import Grain, blocks_over, estimate_grain, grain_over
+from warpir.look.grain import Grain, as_told, blocks_over, estimate_grain, grain_over
 from warpir.look.response import PLACED, Response, estimate_response
 from warpir.look.sharpness import PIXEL_SIGMA, EdgeBlur, blurred_layers, estimate_blur
+from warpir.look.texture import read_texture
 
 UPSAMPLED = 2.5
 """Variance of a rendered edge that was enlarged bilinearly, over that of its own pixel [1]."""
@@ -177,11 +178,14 @@ def estimate_look(
         jpeg: How the photo's file was coded, or None.
     """
     look = CameraLook(jpeg=None if grain == "off" else jpeg)
-    with ThreadPoolExecutor(1) as pool:
-        blur = pool.submit(estimate_blur, linear, region) if sharpness == "auto" else None
+    with ThreadPoolExecutor(2) as pool:
+        if "auto" in (sharpness, grain):
+            texture = pool.submit(read_texture, linear, region)
+        if sharpness == "auto":
+            blur = pool.submit(estimate_blur, linear, region, texture.result)
         if grain == "auto":
-            look = replace(look, grain=estimate_grain(srgb))
-    if blur is not None:
+            look = replace(look, grain=as_told(estimate_grain(srgb), texture.result().grain))
+    if sharpness == "auto":
         look = replace(look, blur=blur.result())
     elif sharpness != "off":
         look = replace(look, blur=EdgeBlur(float(sharpness), 0))

@@ -1,13 +1,14 @@
 """The grain of a photo: its strength by level and channel, its size, and grain drawn like it.
 
-The blocks of the photo's JPEG coding are repeated too.
+Flat patches tell levels, channels and size, the texture the strength (`warpir.look.texture`). The
+blocks of the photo's JPEG coding are repeated too.
 """
 
 from __future__ import annotations
 
 import itertools
 import zlib
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,6 +22,7 @@ from warpir.core.arrays import (
     in_bands,
     mask_box,
 )
+from warpir.core.color import LUMINANCE_WEIGHTS
 from warpir.io.images.jpeg import JpegCoding
 
 SIDE = 12
@@ -73,6 +75,12 @@ class Grain:
         """Standard deviation of the luminous middle of the range, over channels [1]."""
         return float(np.mean(self.deviation(np.full(3, 0.4))))
 
+    @property
+    def of_luminance(self) -> float:
+        """Standard deviation of the luminance there: channels that differ cancel each other [1]."""
+        own = sum(weight**2 for weight in LUMINANCE_WEIGHTS)
+        return self.typical * float(np.sqrt(self.correlation + (1.0 - self.correlation) * own))
+
     def draw(self, shape: tuple[int, int], *seed: int) -> Float64Array:
         """Return noise of unit variance with the grain's size and correlation, shape [H, W, 3]."""
         rng = np.random.Generator(np.random.Philox(np.random.SeedSequence(seed)))
@@ -92,7 +100,7 @@ class Grain:
 
 
 def estimate_grain(srgb: AnyFloatArray) -> Grain | None:
-    """Estimate a photo's grain from its flattest patches.
+    """Estimate a photo's grain from its flattest patches, as if these showed nothing else.
 
     Each patch loses its best plane; what is left in the flattest patches of each level is taken for
     grain (after Liu et al. 2008, "Automatic estimation and removal of noise from a single image",
@@ -159,14 +167,28 @@ def _patches(srgb: AnyFloatArray) -> AnyFloatArray:
     return tiles.transpose(0, 2, 1, 3, 4).reshape(-1, SIDE, SIDE, 3)
 
 
+def as_told(grain: Grain | None, luminance: float) -> Grain | None:
+    """Return a grain with the strength that the texture tells, or None below `LEAST`.
+
+    Args:
+        grain: That of flat patches, whose levels, channels and size are kept; None: without any.
+        luminance: Standard deviation of the luminance in the middle of the range [1].
+    """
+    if luminance < LEAST:
+        return None
+    found = grain or Grain((0.5,), ((LEAST,) * 3,), 0.0, 0.0)
+    times = luminance / found.of_luminance
+    told = tuple((times * r, times * g, times * b) for r, g, b in found.strength)
+    return replace(found, strength=told)
+
+
 def _without_plane(patches: Float64Array) -> Float64Array:
     """Return patches less their least-squares planes."""
     y, x = np.mgrid[0:SIDE, 0:SIDE] - (SIDE - 1) / 2.0
     basis = np.stack([np.ones(SIDE**2), x.ravel(), y.ravel()], axis=1)
     basis /= np.linalg.norm(basis, axis=0)
     flat = patches.reshape(len(patches), SIDE**2, 3)
-    planes = np.einsum("pk,nkc->npc", basis, np.einsum("pk,npc->nkc", basis, flat))
-    rest: Float64Array = (flat - planes).reshape(patches.shape)
+    rest: Float64Array = (flat - basis @ (basis.T @ flat)).reshape(patches.shape)
     return rest
 
 

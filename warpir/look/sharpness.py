@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 
@@ -13,7 +14,7 @@ from scipy.special import ive
 from warpir.core.arrays import AnyFloatArray, BoolArray, FloatArray, mask_box, on_cores
 from warpir.core.color import luminance
 from warpir.core.memory import core_count
-from warpir.look.texture import CLIPPED, texture_blur
+from warpir.look.texture import CLIPPED, Texture, read_texture
 
 FINE, COARSE, WIDE = 1.0, 2.0, 3.0
 """Standard deviations of the Gaussian derivatives [px]; the ratio of the first two tells the blur,
@@ -50,7 +51,11 @@ class EdgeBlur:
     """Edge pixels it was estimated from."""
 
 
-def estimate_blur(linear: AnyFloatArray, region: BoolArray | None = None) -> EdgeBlur | None:
+def estimate_blur(
+    linear: AnyFloatArray,
+    region: BoolArray | None = None,
+    texture: Callable[[], Texture] | None = None,
+) -> EdgeBlur | None:
     """Estimate the blur of the lens, by edges and, where they do not agree, by the texture.
 
     A step of height A behind a Gaussian of deviation s has, seen through a Gaussian derivative of
@@ -62,13 +67,13 @@ def estimate_blur(linear: AnyFloatArray, region: BoolArray | None = None) -> Edg
     Args:
         linear: Display-linear photo, shape [H, W, 3].
         region: Where to look, shape [H, W]; everywhere where that has too few edges.
+        texture: Gives what is read of the texture there, if that is known.
 
     Returns:
         The blur, or None where the photo has too few edges.
     """
     lum = luminance(np.asarray(linear, np.float32))
     with ThreadPoolExecutor(core_count()) as pool:
-        texture = pool.submit(texture_blur, linear, region)
         (fine, gx, gy), (coarse, *_), (wide, *_), mean = (
             future.result()
             for future in [
@@ -94,9 +99,9 @@ def estimate_blur(linear: AnyFloatArray, region: BoolArray | None = None) -> Edg
         if int(is_step.sum()) >= count:
             heights = fine[edge] * np.sqrt(2.0 * np.pi * (sigmas**2 + FINE**2))
             contrast = heights / np.maximum(mean[edge], 1e-3)
-            is_whole = where is everywhere and region is not None
-            told = texture_blur(linear) if is_whole else texture.result()
-            soft = float(np.hypot(told, PIXEL_SIGMA))
+            around = None if where is everywhere else region
+            told = texture() if texture and around is region else read_texture(linear, around)
+            soft = float(np.hypot(told.blur, PIXEL_SIGMA))
             sigma = _of_lens(sigmas[is_step], float(np.median(contrast[is_step])), soft)
             return EdgeBlur(sigma, int(is_step.sum()))
     return None

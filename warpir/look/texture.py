@@ -1,12 +1,15 @@
-"""How soft a photo's texture is: the lens's blur where edges do not agree on it.
+"""How soft and how grainy a photo's texture is.
 
-Blur takes fine detail and leaves coarse. How much a photo had of each nobody knows, but scenes are
-alike: so a small network, which has seen places and pictures behind known blurs, reads the
-statistics of the photo's bands (`python -m benchmarks.sharpness --fit` trained it).
+Blur takes fine detail and leaves coarse; grain comes after it, so that no blur takes it. How much
+detail a scene had nobody knows, but scenes are alike: so small networks, which have seen places and
+pictures through known cameras, read the statistics of the photo's bands (`python -m
+benchmarks.sharpness --fit` trained them). The lens's blur is asked where edges do not agree on it,
+the strength of the grain always: what flat patches show is grain or asphalt.
 """
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from functools import cache
 from itertools import pairwise
 
@@ -50,33 +53,43 @@ MARGIN = 15
 """Seen round a part, so that its own border blurs nothing [px]."""
 FARTHEST = 6.0
 """Standardised statistics are clipped there: a picture unlike all others."""
+UNITS = np.array([1.0, 4.0 / 255.0])
+"""Of the networks' answers: blur [px], and grain in display values [1]."""
 WEIGHTS = SHIPPED / "texture.safetensors"
 
 
-def texture_blur(linear: AnyFloatArray, region: BoolArray | None = None) -> float:
-    """Estimate the blur of the lens by the texture of a photo.
+@dataclass(frozen=True)
+class Texture:
+    """What the texture of a photo tells of its camera."""
+
+    blur: float
+    """Standard deviation of the lens's Gaussian, the pixel left out [px]."""
+    grain: float
+    """Standard deviation of the luminance's grain in the middle of the range, in display values,
+    before the photo's file was coded [1]."""
+
+
+def read_texture(linear: AnyFloatArray, region: BoolArray | None = None) -> Texture:
+    """Estimate blur and grain of a photo by its texture.
 
     Args:
         linear: Display-linear photo, shape [H, W, 3].
         region: Where to look first, shape [H, W]; None or empty: everywhere.
 
-    Returns:
-        Standard deviation of the Gaussian, the pixel left out [px].
-
     Raises:
         InputError: The weights in the package are absent or damaged (`ExitCode.MODEL`).
     """
-    return max(float(answers(statistics(linear, region)[None])[0]), 0.0)
+    return Texture(*np.maximum(answers(statistics(linear, region)[None])[0], 0.0).tolist())
 
 
 def answers(given: Float64Array) -> Float64Array:
-    """Return the mean answers of the networks to statistics, shape [N, S] -> [N] [px]."""
+    """Return the mean answers of the networks to statistics [N, S]: fields of `Texture`, [N, 2]."""
     net = _network()
     x = np.clip((given - net["mean"]) / net["spread"], -FARTHEST, FARTHEST)
     hidden = np.broadcast_to(x, (len(net["bias.0"]), *x.shape))
     for layer in (0, 1):
         hidden = np.maximum(hidden @ net[f"weight.{layer}"] + net[f"bias.{layer}"], 0.0)
-    told: Float64Array = (hidden @ net["weight.2"] + net["bias.2"])[..., 0].mean(axis=0)
+    told: Float64Array = (hidden @ net["weight.2"] + net["bias.2"]).mean(axis=0) * UNITS
     return told
 
 
