@@ -54,13 +54,13 @@ class ToneKnots:
             y: Values; clamped to [0, 1]. Any shape.
         """
         knot_x, knot_y, slope = (k[0].astype(np.float64) for k in self.arrays())
-        y = np.clip(np.asarray(y, np.float64), 0.0, 1.0)
+        value: Float64Array = np.clip(np.asarray(y, np.float64), 0.0, 1.0)
         if np.array_equal(knot_x, knot_y) and (slope == 1.0).all():  # one that was not recovered
-            return y
-        b = np.clip(np.searchsorted(knot_y, y, side="right") - 1, 0, self.bin_count - 1)
+            return value
+        b = np.clip(np.searchsorted(knot_y, value, side="right") - 1, 0, self.bin_count - 1)
         width, rise = np.diff(knot_x)[b], np.diff(knot_y)[b]
         d0, d1, m = slope[b], slope[b + 1], rise / width
-        above, bend = y - knot_y[b], d0 + d1 - 2.0 * m
+        above, bend = value - knot_y[b], d0 + d1 - 2.0 * m
         a = rise * (m - d0) + above * bend
         half = rise * d0 - above * bend
         root = np.sqrt(np.maximum(half * half + 4.0 * a * m * above, 0.0))
