@@ -1,5 +1,7 @@
 """Grain: drawn with known strength, size and correlation, found again, and put on the object."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -54,12 +56,17 @@ def test_a_clean_picture_has_none() -> None:
 
 
 def test_texture_decides_the_strength() -> None:
-    """Levels, channels and size stay; grain that no patch shows is told too, none is none."""
+    """Levels, channels and size stay; grain that patches do not show is told too, none is none."""
     flat = Grain((0.2, 0.8), ((0.01, 0.02, 0.03), (0.02, 0.02, 0.02)), 0.7, 0.4)
-    told = as_told(flat, 0.5 * flat.of_luminance)
-    assert told is not None and told.of_luminance == pytest.approx(0.5 * flat.of_luminance)
+    told = as_told(flat, 0.01 * flat.luminance_share)
+    assert told is not None and told.of_luminance == pytest.approx(0.01 * flat.luminance_share)
     assert told.strength[0] == pytest.approx((0.005, 0.01, 0.015))
     assert (told.level, told.size, told.correlation) == (flat.level, 0.7, 0.4)
+    posterised = replace(
+        flat, level=(0.2, 0.4, 0.8), strength=((0.01,) * 3, (0.0,) * 3, (0.01,) * 3)
+    )
+    told = as_told(posterised, 0.02 * flat.luminance_share)
+    assert told is not None and np.max(told.strength) == pytest.approx(0.02)
     alone = as_told(None, 0.012)
     assert alone is not None and alone.of_luminance == pytest.approx(0.012)
     assert as_told(flat, 0.0005) is None

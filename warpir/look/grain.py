@@ -76,10 +76,15 @@ class Grain:
         return float(np.mean(self.deviation(np.full(3, 0.4))))
 
     @property
-    def of_luminance(self) -> float:
-        """Standard deviation of the luminance there: channels that differ cancel each other [1]."""
+    def luminance_share(self) -> float:
+        """Standard deviation of the luminance over a channel's: what differs cancels out [1]."""
         own = sum(weight**2 for weight in LUMINANCE_WEIGHTS)
-        return self.typical * float(np.sqrt(self.correlation + (1.0 - self.correlation) * own))
+        return float(np.sqrt(self.correlation + (1.0 - self.correlation) * own))
+
+    @property
+    def of_luminance(self) -> float:
+        """Standard deviation of the luminance in the middle of the range [1]."""
+        return self.typical * self.luminance_share
 
     def draw(self, shape: tuple[int, int], *seed: int) -> Float64Array:
         """Return noise of unit variance with the grain's size and correlation, shape [H, W, 3]."""
@@ -171,13 +176,16 @@ def as_told(grain: Grain | None, luminance: float) -> Grain | None:
     """Return a grain with the strength that the texture tells, or None below `LEAST`.
 
     Args:
-        grain: That of flat patches, whose levels, channels and size are kept; None: without any.
-        luminance: Standard deviation of the luminance in the middle of the range [1].
+        grain: That of flat patches, whose levels, channels and size are kept, its median level
+            at the strength; None: without any.
+        luminance: Standard deviation of the luminance [1].
     """
     if luminance < LEAST:
         return None
     found = grain or Grain((0.5,), ((LEAST,) * 3,), 0.0, 0.0)
-    times = luminance / found.of_luminance
+    # Not that in the middle of the range, where a posterised picture may have none.
+    median = float(np.median(np.mean(found.strength, axis=1)))
+    times = luminance / (median * found.luminance_share)
     told = tuple((times * r, times * g, times * b) for r, g, b in found.strength)
     return replace(found, strength=told)
 
