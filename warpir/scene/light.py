@@ -222,8 +222,8 @@ def _add_lobes(texels: Float64Array, lobes: Lobes, along: int, across: int) -> N
     sharpness = lobes.sharpness.astype(np.float64)
     x, y, z = sharpness * lobes.axis.T.astype(np.float64)
     level = np.outer(x, np.sin(lon)) + np.outer(z, np.cos(lon))
-    near = [_rows_near(*lobe, height) for lobe in zip(lobes.axis, sharpness, strict=True)]
-    first, last = (np.array([getattr(rows, end) for rows in near]) for end in ("start", "stop"))
+    near = (_rows_near(*lobe, height) for lobe in zip(lobes.axis, sharpness, strict=True))
+    first, last = np.array([(rows.start, rows.stop) for rows in near]).T
 
     def add(band: slice) -> None:
         here = np.flatnonzero((first < band.stop) & (last > band.start))
