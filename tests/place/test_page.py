@@ -289,6 +289,25 @@ def test_page_keeps_what_was_given(inputs: Path, tmp_path: Path) -> None:
 
 @needs_chromium
 @pytest.mark.slow
+def test_redraw_leaves_what_is_being_typed(inputs: Path, tmp_path: Path) -> None:
+    """An estimate that arrives, or any other redraw, does not take a number back."""
+    with placing(command(inputs, tmp_path / "out"), 1000, 700) as opened:
+        page = opened.page
+        for name, typed in (("size", "1.25"), ("metres", "0.75")):
+            if name == "metres":
+                page.click("#ruler")
+            page.fill(f"#{name}", typed)
+            page.evaluate("document.getElementById('keep-light').click()")  # takes no focus
+            settle(opened)
+            assert page.input_value(f"#{name}") == typed
+            page.keyboard.press("Enter")
+            settle(opened)
+        state = page.evaluate(STATE)
+        assert state["size"] == 1.25 and state["ruler"]["metres"] == 0.75
+
+
+@needs_chromium
+@pytest.mark.slow
 def test_page_serves_small_windows_and_fingers(inputs: Path, tmp_path: Path) -> None:
     """Save and the last field can be reached, and a second finger does not break a drag."""
     with placing(command(inputs, tmp_path / "out"), 640, 360) as opened:

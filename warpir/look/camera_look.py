@@ -184,7 +184,8 @@ def estimate_look(
         if sharpness == "auto":
             blur = pool.submit(estimate_blur, linear, region, texture.result)
         if grain == "auto":
-            look = replace(look, grain=as_told(estimate_grain(srgb), texture.result().grain))
+            flat, told = estimate_grain(srgb), texture.result().grain
+            look = replace(look, grain=flat if told is None else as_told(flat, told))
     if sharpness == "auto":
         look = replace(look, blur=blur.result())
     elif sharpness != "off":

@@ -51,6 +51,8 @@ WINDOWS, WINDOW = 4, 128
 their size [px]; a full photo has no more to tell than these."""
 MARGIN = 15
 """Seen round a part, so that its own border blurs nothing [px]."""
+SMALLEST = 64
+"""Side of a photo from which its grain is told [px]: the networks have seen none below 80."""
 FARTHEST = 6.0
 """Standardised statistics are clipped there: a picture unlike all others."""
 UNITS = np.array([1.0, 4.0 / 255.0])
@@ -64,9 +66,9 @@ class Texture:
 
     blur: float
     """Standard deviation of the lens's Gaussian, the pixel left out [px]."""
-    grain: float
+    grain: float | None
     """Standard deviation of the luminance's grain in the middle of the range, in display values,
-    before the photo's file was coded [1]."""
+    before the photo's file was coded [1]; None where the photo is smaller than `SMALLEST`."""
 
 
 def read_texture(linear: AnyFloatArray, region: BoolArray | None = None) -> Texture:
@@ -79,7 +81,8 @@ def read_texture(linear: AnyFloatArray, region: BoolArray | None = None) -> Text
     Raises:
         InputError: The weights in the package are absent or damaged (`ExitCode.MODEL`).
     """
-    return Texture(*np.maximum(answers(statistics(linear, region)[None])[0], 0.0).tolist())
+    blur, grain = np.maximum(answers(statistics(linear, region)[None])[0], 0.0).tolist()
+    return Texture(blur, None if min(linear.shape[:2]) < SMALLEST else grain)
 
 
 def answers(given: Float64Array) -> Float64Array:

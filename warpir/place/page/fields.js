@@ -95,7 +95,11 @@ export class Fields {
     const { low, high, log } = field;
     field.share = (value) => 1000 * clamp(log ? Math.log(value / low) / Math.log(high / low) : (value - low) / (high - low), 0, 1);
     this.#slides(name, field);
+    // A redraw, as when an estimate arrives, leaves what is being typed.
+    entry.addEventListener('input', () => { field.isTyped = true; });
+    entry.addEventListener('blur', () => { field.isTyped = false; });
     entry.addEventListener('change', () => {
+      field.isTyped = false;
       const typed = entry.valueAsNumber;
       const isGood = Number.isFinite(typed) && (!log || typed > 0) && (log || field.wrap || (typed >= low && typed <= high));
       if (isGood) this.history.once(`${name} typed`, (before) => field.set(before, typed));
@@ -134,7 +138,7 @@ export class Fields {
       else field.text = field.log ? String(plain(value, clamp(2 - Math.floor(Math.log10(Math.abs(value) || 1)), 0, 5))) : String(plain(value, field.digits));
       if (document.activeElement !== field.slide) field.slide.value = field.share(value ?? field.low);
       field.slide.setAttribute('aria-valuetext', `${field.text} ${field.unit}`);
-      if (document.activeElement !== field.entry || field.entry.validity.valid) field.entry.value = field.text;
+      if (!field.isTyped) field.entry.value = field.text;
     }
   }
 

@@ -135,7 +135,10 @@ export class Ruler {
     this.ends = [0, 1].map((end) => endOf(this, 'r', `r${end}`, `End ${end + 1} of the known length`, (before, by) => (
       measured(before, { ...before.ruler, ends: movedEnd(before.ruler.ends, end, by) }))));
     page.toggle.addEventListener('click', () => history.once('ruler', (before) => ({ ...before, ruler: before.ruler ? null : this.#begun(before) })));
+    page.metres.addEventListener('input', () => { this.isTyped = true; });
+    page.metres.addEventListener('blur', () => { this.isTyped = false; });
     page.metres.addEventListener('change', () => {
+      this.isTyped = false;
       const metres = page.metres.valueAsNumber;
       if (metres > 0) history.once('metres', (before) => measured(before, { ...before.ruler, metres }));
       this.draw(history.state);
@@ -158,7 +161,7 @@ export class Ruler {
     options.hidden = !ruler;
     this.group.style.display = ruler ? '' : 'none';
     if (!ruler) return;
-    if (document.activeElement !== metres || metres.validity.valid) metres.value = Number(ruler.metres.toFixed(3));
+    if (!this.isTyped) metres.value = Number(ruler.metres.toFixed(3));
     upright.checked = ruler.isUpright;
     words.textContent = lengthSeen(camera, stance, ruler.ends, ruler.isUpright) ? ''
       : 'The lower end must lie on the ground, below the horizon; of a length on the ground both.';
