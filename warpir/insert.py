@@ -97,9 +97,6 @@ def insert(config: InsertConfig, *, renews: bool = False) -> Insertion:
             raise
 
 
-# ---------------------------------------------------------------------------- the story
-
-
 def _insert_one(config: InsertConfig, loaders: "Loaders | None" = None) -> Insertion:
     """Insert into one photograph: read, find the light, render, write."""
     from warpir.app.inputs import Loaders
@@ -118,17 +115,23 @@ def _insert_one(config: InsertConfig, loaders: "Loaders | None" = None) -> Inser
                 device = pool.submit(choose_device, run.config.render.device)
 
                 from warpir.optimize.find_light import find_light, with_photo_detail
-                from warpir.report.result import render_result, write_preview
+                from warpir.report.result import look_of, render_result, write_preview
 
-            run = run.on_device(device.result()).with_ground_coat()
+        run = run.on_device(device.result()).with_ground_coat()
         run.take_cache_notices()
         lit = find_light(run, given)
         with sparing():
-            if given is None and not run.config.is_guided:
-                with no_collection(), lit.run.timings.stage("preview"):
+            has_preview = given is None and not run.config.is_guided
+            with no_collection(), lit.run.timings.stage("preview"), ThreadPoolExecutor(2) as pool:
+                # On the host the preview has all cores, and comes first.
+                if has_preview and run.device == "cpu":
                     write_preview(lit.run, lit.light)
-            lit = with_photo_detail(lit)
-            rendered = render_result(lit.run, lit.light)
+                detailed = pool.submit(with_photo_detail, lit)
+                look = pool.submit(look_of, lit.run, lit.light)
+                if has_preview and run.device != "cpu":
+                    write_preview(lit.run, lit.light)
+            lit = detailed.result()
+            rendered = render_result(lit.run, lit.light, look.result())
             record = _write(lit, rendered, config)
     say(summary_line(record))
     record = read_json_object(output.path / "run.json")
@@ -140,8 +143,7 @@ def _read(
 ) -> "tuple[Run, SceneLight | None]":
     """Read and check all inputs and print the assumptions; the demo has inputs of its own.
 
-    The light is None where it is to be estimated from the photo. Nothing is written, and the output
-    folder is not entered.
+    The light is None where it is to be estimated. The output folder is not entered.
     """
     from warpir.app.inputs import read_inputs
     from warpir.app.record import Timings
@@ -192,9 +194,6 @@ def _write(lit: "LitRun", rendered: "RenderedResult", asked: InsertConfig) -> di
         record["seconds"] = run.timings.rounded()
     run.output.write_json("run.json", record)
     return record
-
-
-# ------------------------------------------------------------------------- the command line
 
 
 def main(argv: Sequence[str] | None = None) -> int:

@@ -84,11 +84,10 @@ def with_photo_detail(lit: LitRun) -> LitRun:
         has_own = not Path(run.inputs.run.path, "envmap_detail.exr").exists()
     if not run.config.light.detail or has_own:
         return lit
-    with run.timings.stage("detail"):
-        from warpir.lighting.detail import detail_of, with_detail
+    from warpir.lighting.detail import detail_of, with_detail
 
-        detail = detail_of(run.inputs, light.curves)
-        light = replace(light, detailed=with_detail(light.light, detail))
+    detail = detail_of(run.inputs, light.curves)
+    light = replace(light, detailed=with_detail(light.light, detail))
     run.log.say(
         f"detail: the photo shows {100.0 * detail.seen:.0f} % of what is round the object, which "
         "may be reflected in it (--no-detail)"

@@ -59,14 +59,13 @@ class RenderedResult:
     """Samples, triangles, bad pixels and repeated launches, for ``run.json``."""
 
 
-def render_result(run: Run, light: SceneLight) -> RenderedResult:
-    """Render object and shadow, and composite them into the photo."""
+def render_result(run: Run, light: SceneLight, look: CameraLook) -> RenderedResult:
+    """Render object and shadow, and composite them into the photo with the camera's look."""
     with run.timings.stage("scene"):
         camera = _rendering_camera(run.inputs.camera, run.config.render.width)
         placed = run.memory.again(
             lambda: scene_of(run.inputs, camera, run.device, light.curves), "the scene", "--asset"
         )
-        look = _look(run, light)
     with run.timings.stage("render"), progress_bar(run.log.say) as report:
         quality = run.config.render
         renderer = Renderer(
@@ -116,7 +115,7 @@ def _small_inputs(inputs: Inputs) -> Inputs:
     return replace(inputs, photo=photo, camera=camera, occluder=occluder)
 
 
-def _look(run: Run, light: SceneLight) -> CameraLook:
+def look_of(run: Run, light: SceneLight) -> CameraLook:
     """Return what the camera did to the photo, as far as the object is to share it.
 
     A recovered tone curve was judged beside the photo, so it holds the response already; Reinhard's
