@@ -18,6 +18,7 @@ import xml.etree.ElementTree as ET
 from pathlib import Path
 from typing import Any
 
+from benchmarks.measure import table
 from warpir.core.errors import InputError
 from warpir.io.assets import load_asset
 
@@ -56,14 +57,14 @@ def loads(folder: Path, repeats: int) -> dict[str, Any]:
         if path.suffix.lower() in SUFFIXES
     }
     columns = ("seconds", "triangles", "primitives", "textures", "megapixels", "notices")
-    print("| asset | " + " | ".join(columns) + " |")
-    print("|---|" + "---|" * len(columns))
+    rows = []
     for name, row in found.items():
         if "seconds" in row:
             shown = [f"{row['seconds']:.3f}", *(str(row[key]) for key in columns[1:])]
         else:
-            shown = [row["refused"]]
-        print(f"| {name} | " + " | ".join(shown + [""] * (len(columns) - len(shown))) + " |")
+            shown = [row["refused"], *[""] * (len(columns) - 1)]
+        rows.append([name, *shown])
+    print(table(("asset", *columns), rows))
     return found
 
 
@@ -84,9 +85,8 @@ def cases() -> dict[str, Any]:
         for case in set(re.findall(r"(?<![A-Za-z0-9])([GM]\d+)(?![0-9])", name.replace("_", " "))):
             if case in counts:
                 counts[case][kind] += 1
-    print("| case | passed | failed | skipped |\n|---|---|---|---|")
-    for case, numbers in counts.items():
-        print(f"| {case} | " + " | ".join(map(str, numbers)) + " |")
+    rows = ([case, *map(str, numbers)] for case, numbers in counts.items())
+    print(table(("case", "passed", "failed", "skipped"), rows))
     passed = [case for case, (good, bad, _) in counts.items() if good and not bad]
     return {
         "cases_passed": len(passed),

@@ -85,14 +85,16 @@ def measure(folder: Path, count: int, samples: int, path: Path | None) -> None:
         rate = f"{60.0 * count / spent:.1f} | {first / spent:.2f} x"
         print(f"| {name} | {spent:.1f} | {cpu[name]:.1f} | {rate} |")
     cores = core_count()
-    figures: dict[str, Any] = {"question": "batch", "scenes": count, "samples": samples}
-    spent_by = {
-        name.replace("`", ""): [round(seconds[name], 2), round(cpu[name], 2)] for name in seconds
-    }
-    figures |= {
+    figures: dict[str, Any] = {
+        "question": "batch",
+        "scenes": count,
+        "samples": samples,
         "cores": cores,
         "load": round(os.getloadavg()[0], 1),
-        "seconds and CPU seconds": spent_by,
+        "seconds and CPU seconds": {
+            name.replace("`", ""): [round(seconds[name], 2), round(cpu[name], 2)]
+            for name in seconds
+        },
     }
     report({**figures, **context(wp.get_device("cpu"), cores)}, path)
 

@@ -12,14 +12,13 @@ import time
 import numpy as np
 
 from benchmarks.measure import context, flags, peak_mib, report
+from benchmarks.scenes import on_the_ground, write_picture
 from warpir.core.color import linear_to_gamma
 from warpir.io.assets import load_asset
 from warpir.io.images.photos import Photo, read_envmap
 from warpir.render.composite import make_picture
 from warpir.render.device import choose_device
-from warpir.render.device_scene import Placed, Receiver, Scene
 from warpir.render.picture.planes import Quality
-from warpir.render.renderer import Renderer
 from warpir.scene.camera import camera_from_fov
 from warpir.scene.light import Light
 from warpir.scene.placement import place_asset
@@ -49,14 +48,7 @@ def main() -> None:
     photo = Photo(codes=np.round(grey * 255.0).astype(np.uint8), srgb=grey, kind="png")
     start = time.perf_counter()
     device = choose_device(options.device)
-    ground = placement.ground
-    scene = Scene(
-        [Placed(asset, placement.asset_to_world)],
-        camera,
-        Receiver(ground[:3], -float(ground[3])),
-        device,
-    )
-    renderer = Renderer(scene)
+    renderer = on_the_ground(asset, placement.asset_to_world, camera, device)
     quality = Quality(options.samples, 1, options.depth, 0)
     curves = ToneKnots.identity(1), ToneKnots.identity(3)
     times = []
@@ -75,16 +67,13 @@ def main() -> None:
             "shadow_pixels": picture.receiver_pixel_count,
             "first_s": round(times[0], 3),
             "warm_s": [round(t, 3) for t in times[1:]],
-            "peak_mib": round(peak_mib(scene.device)),
-            **context(scene.device, renderer.threads),
+            "peak_mib": round(peak_mib(renderer.device)),
+            **context(renderer.device, renderer.threads),
         },
         options.json,
     )
     if options.preview is not None:
-        from PIL import Image
-
-        codes = np.round(np.clip(linear_to_gamma(picture.layers.composite), 0, 1) * 255)
-        Image.fromarray(codes.astype(np.uint8)).save(options.preview)
+        write_picture(options.preview, linear_to_gamma(picture.layers.composite))
 
 
 if __name__ == "__main__":

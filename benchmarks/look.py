@@ -11,7 +11,6 @@ look-up between texels (`softness`), and so is the object before the camera take
 are those that `benchmarks.response` does not fit its estimate to.
 """
 
-import argparse
 import json
 import math
 import tempfile
@@ -24,21 +23,21 @@ import torch
 from PIL import Image
 from scipy import ndimage
 
+from benchmarks.measure import flags, write_json
 from benchmarks.response import LEVELS, codes_of, curve, is_for_fitting
+from benchmarks.scenes import panoramas_of, photo_of, places_of, renderer_of
 from warpir.core.arrays import CodeArray, Float64Array, FloatArray
 from warpir.core.color import luminance
 from warpir.evaluate.image_errors import image_errors, make_regions
-from warpir.evaluate.scenes import Place, Places, Subject, find_files
+from warpir.evaluate.scenes import Subject
 from warpir.io.images.jpeg import JpegCoding, read_coding
-from warpir.io.images.photos import Photo, read_envmap
+from warpir.io.images.photos import read_envmap
 from warpir.look.camera_look import CameraLook, estimate_look, region_around
 from warpir.look.grain import Grain
 from warpir.look.response import Response
 from warpir.look.sharpness import PIXEL_SIGMA, EdgeBlur, gaussian
 from warpir.render.composite import composite
-from warpir.render.device_scene import Placed, Receiver, Scene
 from warpir.render.picture.planes import Quality, Rendering, render
-from warpir.render.renderer import Renderer
 from warpir.scene.camera import Camera
 from warpir.scene.light import Light
 from warpir.scene.tone_curves import Curves
@@ -114,11 +113,6 @@ def blacks(image: FloatArray, matte: FloatArray) -> float:
     return 255.0 * float(np.quantile(luminance(image)[matte > 0.99], 0.01))
 
 
-def photo_of(shown: FloatArray) -> Photo:
-    """Return a picture as the file of a photo."""
-    return Photo(np.round(255.0 * shown).astype(np.uint8), shown, "png")
-
-
 def draw_camera(
     photo_lin: FloatArray, rng: np.random.Generator, blur: tuple[float, float] = BLUR
 ) -> Shot:
@@ -155,28 +149,29 @@ def softness(camera: Camera, columns: int) -> Float64Array:
     return np.asarray(np.sqrt(np.maximum(variance, 0.0)), np.float64)
 
 
-def measure(place: Place, subject: Subject, samples: int, columns: int) -> Errors:
+def measure(subject: Subject, samples: int, columns: int) -> Errors:
     """Return the errors of every row for one object.
 
     Args:
-        place: Where the object stands.
-        subject: The object.
+        subject: The object in its place.
         samples: Per pixel.
         columns: Of the panorama, by whose texels the crop is soft.
     """
-    rng = np.random.default_rng([9, *place.seed])
+    place = subject.place
+    rng, crop = np.random.default_rng([9, *place.seed]), photo_of(place.photo)
     camera = draw_camera(place.photo_lin, rng)
-    first, second = _rendered(place, subject, samples)
-    crisp = composite(first, photo_of(place.photo), 1).layers
+    first, second = _rendered(subject, samples)
+    crisp = composite(first, crop, 1).layers
     soft = float(softness(place.camera, columns)[crisp.matte > 0.0].mean())
     as_crop = CameraLook(blur=EdgeBlur(float(np.hypot(soft, PIXEL_SIGMA)), 0))
-    clean = composite(first, photo_of(place.photo), 1, look=as_crop).layers.composite
+    clean = composite(first, crop, 1, look=as_crop).layers.composite
     truth = camera.shoot(clean)
     photo = photo_of(camera.shoot(place.photo_lin))
     coding = None if camera.quality is None else jpeg_of(photo.codes, camera.quality)[1]
     regions = make_regions(crisp.matte, crisp.shadow_ratio)
     detail = laplacian(truth, crisp.matte)
-    around = region_around(_positions(crisp.matte), *crisp.matte.shape)
+    positions = np.argwhere(crisp.matte > 0.0)[:, ::-1].astype(np.float64) + 0.5
+    around = region_around(positions, *crisp.matte.shape)
 
     def errors(shown: FloatArray) -> dict[str, float]:
         of_box = image_errors(shown, truth, regions)["box"]
@@ -199,24 +194,16 @@ def measure(place: Place, subject: Subject, samples: int, columns: int) -> Error
         shown = photo.encode(picture.image, picture.changed).astype(np.float32) / 255.0
         found[name] = errors(shown) | _estimates(look)
     again = camera.grain.draw(place.photo.shape[:2], int(rng.integers(2**31)))
-    perfect = composite(second, photo_of(place.photo), 2, look=as_crop).layers.composite
+    perfect = composite(second, crop, 2, look=as_crop).layers.composite
     found[TRUE] = errors(replace(camera, noise=again).shoot(perfect))
     found["camera"] = _drawn(camera) | {"softness": soft}
     return found
 
 
-def _positions(matte: FloatArray) -> Float64Array:
-    """Return the image positions of the object's pixels [px], shape [N, 2]."""
-    return np.argwhere(matte > 0.0)[:, ::-1].astype(np.float64) + 0.5
-
-
-def _rendered(place: Place, subject: Subject, samples: int) -> tuple[Rendering, Rendering]:
+def _rendered(subject: Subject, samples: int) -> tuple[Rendering, Rendering]:
     """Return the object under the place's own light, twice, by other samples."""
-    ground = subject.placement.ground
-    receiver = Receiver(ground[:3], -float(ground[3]))
-    placed = Placed(subject.asset, subject.placement.asset_to_world)
-    renderer = Renderer(Scene([placed], place.camera, receiver, "cpu"), 0)
-    light, curves = Light(texels=place.texels), Curves.identity("linear")
+    renderer = renderer_of(subject)
+    light, curves = Light(texels=subject.place.texels), Curves.identity("linear")
     knots = curves.foreground, curves.shadow_ratio
     first, second = (
         render(renderer, light, light, Quality(samples, 1, 5, seed, 8.0), *knots, is_reinhard=False)
@@ -247,29 +234,20 @@ def _estimates(look: CameraLook) -> dict[str, float]:
 
 def main() -> None:
     """Print a table over all scenes."""
-    parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
-    parser.add_argument("--panoramas", type=Path, nargs="+", required=True)
-    parser.add_argument("--assets", type=Path, nargs="+", required=True)
+    parser = flags(__doc__, "panoramas", "objects", "json")
     parser.add_argument("--scenes", type=int, default=20)
     parser.add_argument("--samples", type=int, default=64)
     about = "of the photographs [px]; panoramas of 1024 columns are soft in wider ones"
     parser.add_argument("--width", type=int, default=192, help=about)
     parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("--json", type=Path)
     options = parser.parse_args()
-    panoramas = find_files(options.panoramas, (".hdr", ".exr"), "--panoramas")
-    places = Places(
-        [p for p in panoramas if not is_for_fitting(p.stem)],
-        find_files(options.assets, (".glb", ".gltf", ".obj"), "--assets"),
-        options.seed,
-        options.width,
-    )
-    files = {p.stem: p for p in panoramas}
+    files = {p.stem: p for p in panoramas_of(options) if not is_for_fitting(p.stem)}
+    places = places_of(options, list(files.values()), options.width)
     measured: list[dict[str, Any]] = []
     for place, subjects in places.make(options.scenes):
         for subject in subjects:
             columns = read_envmap(files[place.panorama]).shape[1]
-            found = measure(place, subject, options.samples, columns)
+            found = measure(subject, options.samples, columns)
             measured.append({"scene": subject.name, **found})
             print(subject.name, json.dumps({k: measured[-1][k] for k in ("camera", "auto")}))
     print("row           RMSE    FLIP    Laplacian: median, within 25 %; blacks: off by, within 3")
@@ -281,8 +259,7 @@ def main() -> None:
         off = np.abs([r["blacks"] for r in rows])
         errors = f"{mean['rmse']:.4f}  {mean['flip']:.4f}  {np.median(ratio):.2f}  {within:.2f}"
         print(f"{name:11s} {errors}  {off.mean():.1f}  {(off < 3.0).mean():.2f}")
-    if options.json:
-        options.json.write_text(json.dumps(measured, indent=1) + "\n", encoding="utf-8")
+    write_json(options.json, measured)
 
 
 if __name__ == "__main__":

@@ -1,4 +1,4 @@
-"""What benchmarks share: flags, timing, peak memory, and the line that says what was measured."""
+"""What benchmarks share: flags, timing, peak memory, and how figures are written."""
 
 import argparse
 import json
@@ -6,27 +6,38 @@ import platform
 import resource
 import subprocess
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterable, Sequence
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import warp as wp
+from numpy.typing import ArrayLike
+
+PATHS = {"type": Path, "nargs": "+", "required": True}
+FOLDER = Path("../shared/data")
+FLAGS: dict[str, tuple[str, dict[str, Any]]] = {
+    "assets": (
+        "--assets",
+        {"type": Path, "default": FOLDER, "help": "folder that holds mesh/ and hdri/"},
+    ),
+    "objects": ("--assets", PATHS),
+    "panoramas": ("--panoramas", PATHS),
+    "device": ("--device", {"help": "cpu or cuda"}),
+    "json": ("--json", {"type": Path, "help": "file for the figures"}),
+}
+"""What several benchmarks ask for."""
 
 
-def flags(doc: str | None, *, has_assets: bool = True) -> argparse.ArgumentParser:
-    """Return a parser with the flags that benchmarks share; ``doc`` is the module's docstring."""
-    parser = argparse.ArgumentParser(description=(doc or "").partition("\n")[0])
-    if has_assets:
-        parser.add_argument(
-            "--assets",
-            type=Path,
-            default=Path("../shared/data"),
-            help="folder that holds mesh/ and hdri/",
-        )
-    parser.add_argument("--device", default=None, help="cpu or cuda")
-    parser.add_argument("--json", type=Path, default=None, help="file for the figures")
+def flags(doc: str | None, *names: str) -> argparse.ArgumentParser:
+    """Return a parser with some of `FLAGS`; ``doc`` is the module's docstring."""
+    parser = argparse.ArgumentParser(
+        description=doc, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    for name in names or ("assets", "device", "json"):
+        flag, options = FLAGS[name]
+        parser.add_argument(flag, **options)
     return parser
 
 
@@ -73,3 +84,21 @@ def report(line: dict[str, Any], path: Path | None) -> None:
     if path is not None:
         with open(path, "a", encoding="utf-8") as stream:
             stream.write(text + "\n")
+
+
+def rms(values: ArrayLike) -> float:
+    """Return the root of the mean square."""
+    return float(np.sqrt(np.square(values).mean()))
+
+
+def write_json(path: Path | None, content: Any, indent: int | None = 1) -> None:
+    """Write figures to a file, where one is named."""
+    if path is not None:
+        path.write_text(json.dumps(content, indent=indent) + "\n", encoding="utf-8")
+
+
+def table(head: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
+    """Return a Markdown table."""
+    lines = ["| " + " | ".join(head) + " |", "|" + "---|" * len(head)]
+    lines += ["| " + " | ".join(row) + " |" for row in rows]
+    return "\n".join(lines)

@@ -9,7 +9,6 @@ faults. Places are halved by the checksum of their names; ``--fit`` prints the c
 curves in codes of 255, at radiances from blacks to half of white.
 """
 
-import argparse
 import zlib
 from collections.abc import Iterator
 from dataclasses import replace
@@ -18,16 +17,11 @@ from pathlib import Path
 import numpy as np
 import torch
 
+from benchmarks.measure import flags
+from benchmarks.scenes import panoramas_of
 from warpir.core.arrays import Float64Array, FloatArray
 from warpir.core.color import GAMMA
-from warpir.evaluate.scenes import (
-    CAMERA_HEIGHT,
-    PANORAMA_SUFFIXES,
-    crop_camera,
-    crop_radiance,
-    expose,
-    find_files,
-)
+from warpir.evaluate.scenes import CAMERA_HEIGHT, crop_camera, crop_radiance, expose
 from warpir.io.images.photos import read_envmap
 from warpir.look.response import PLACED, Response, estimate_response, statistics
 from warpir.train.photo_look import Look, draw_faults, draw_looks
@@ -84,8 +78,7 @@ def judge(found: list[Response], truth: Float64Array) -> str:
 
 def main() -> None:
     """Print the fit and a table."""
-    parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
-    parser.add_argument("--panoramas", type=Path, nargs="+", required=True)
+    parser = flags(__doc__, "panoramas")
     parser.add_argument("--fit", action="store_true", help="print new coefficients")
     options = parser.parse_args()
     generator = torch.Generator().manual_seed(5)
@@ -93,7 +86,7 @@ def main() -> None:
     table = np.stack([curve(c, RAMP) for c in curves])
     placed = np.array(PLACED)
     rows, best, shown, own, fits, wanted = [], [], [], [], [], []
-    for path in find_files(options.panoramas, PANORAMA_SUFFIXES, "--panoramas"):
+    for path in panoramas_of(options):
         for radiance in crops(path):
             seen = torch.from_numpy(radiance).permute(2, 0, 1)[None]
             for _ in range(CAMERAS):

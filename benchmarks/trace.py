@@ -11,6 +11,7 @@ import numpy as np
 import warp as wp
 
 from benchmarks.measure import context, flags, report, seconds
+from benchmarks.scenes import on_the_ground
 from warpir.io.assets import load_asset
 from warpir.kernels.maths.frame import basis, to_world
 from warpir.kernels.maths.rng import hash_pair, pixel_seed, sobol_pair
@@ -21,12 +22,12 @@ from warpir.kernels.tracing.ray import camera_ray, closest_hit, visibility
 from warpir.kernels.tracing.surface import surface_at
 from warpir.kernels.types import CameraArgs, MaterialArgs, MeshArgs, TextureArgs
 from warpir.render.device import Rows, choose_device
-from warpir.render.device_scene import Placed, Receiver, Scene
 from warpir.render.renderer import Renderer
 from warpir.scene.camera import Camera
 
 wp.set_module_options({"enable_backward": False})
 
+ASSETS = ("mesh/ToyCar.glb", "mesh/spot/spot.obj", "mesh/kenney_trucks/vehicle-truck-red.glb")
 SIDE = 768
 SHADOW_RAYS = 8
 """Per primary ray; the primary ray's time is subtracted."""
@@ -47,16 +48,8 @@ def cast(
     pixel = pixels[i]
     key = pixel_seed(0, pixel)
     ray_dir = camera_ray(camera, pixel, sobol_pair(0, key, 0))
-    hit = closest_hit(
-        mesh,
-        material,
-        texture,
-        camera.origin,
-        ray_dir,
-        INFINITY,
-        1,
-        hash_pair(key, wp.uint32(0)),
-    )
+    draw = hash_pair(key, wp.uint32(0))
+    hit = closest_hit(mesh, material, texture, camera.origin, ray_dir, INFINITY, 1, draw)
     total = float(hit.valid)
     if hit.valid == 1 and shadow_rays > 0:
         surface = surface_at(mesh, material, texture, hit, -ray_dir)
@@ -68,15 +61,19 @@ def cast(
     hits[i] = total
 
 
+def launch(renderer: Renderer, pixels: wp.array, hits: wp.array, shadow_rays: int) -> None:
+    """Cast the rays of all pixels."""
+    scene = renderer.scene
+    inputs = [scene.camera_args, scene.mesh_args, scene.material_args, scene.texture_args]
+    arguments = [Rows(pixels), *inputs, shadow_rays, Rows(hits)]
+    renderer.launch(cast, SIDE * SIDE, arguments, 1 + shadow_rays)
+
+
 def main() -> None:
     """Measure the assets of the referee's presets."""
     options = flags(__doc__).parse_args()
     device = choose_device(options.device)
-    for name in (
-        "mesh/ToyCar.glb",
-        "mesh/spot/spot.obj",
-        "mesh/kenney_trucks/vehicle-truck-red.glb",
-    ):
+    for name in ASSETS:
         asset = load_asset(options.assets / name)
         low, high = asset.bounds()
         radius = 0.5 * float(np.linalg.norm(high - low))
@@ -84,23 +81,13 @@ def main() -> None:
         pose[:3, 3] = 0.5 * (low + high) + [0.0, 0.0, 4.0 * radius]
         focal = 0.5 * SIDE * 3.9
         camera = Camera(SIDE, SIDE, focal, focal, 0.5 * SIDE, 0.5 * SIDE, pose)
-        proxy = Receiver(np.array([0.0, 1.0, 0.0]), float(low[1]) - radius)
-        renderer = Renderer(Scene([Placed(asset, np.eye(4))], camera, proxy, device))
+        height = float(low[1]) - radius
+        renderer = on_the_ground(asset, np.eye(4), camera, device, height=height)
         scene = renderer.scene
         pixels = wp.array(np.arange(SIDE * SIDE, dtype=np.int32), dtype=int, device=device)
         hits = wp.zeros(SIDE * SIDE, dtype=float, device=device)
 
-        def run(
-            shadow_rays: int,
-            renderer: Renderer = renderer,
-            pixels: wp.array = pixels,
-            hits: wp.array = hits,
-        ) -> None:
-            scene = renderer.scene
-            inputs = [scene.camera_args, scene.mesh_args, scene.material_args, scene.texture_args]
-            arguments = [Rows(pixels), *inputs, shadow_rays, Rows(hits)]
-            renderer.launch(cast, SIDE * SIDE, arguments, 1 + shadow_rays)
-
+        run = partial(launch, renderer, pixels, hits)
         primary, primary_spread = seconds(partial(run, 0), scene.device)
         share = float(hits.numpy().mean())
         both, both_spread = seconds(partial(run, SHADOW_RAYS), scene.device)

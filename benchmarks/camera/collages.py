@@ -10,23 +10,22 @@ parts, most of them through JPEG and some resized. Places are halved by the chec
 constants were chosen on the first half.
 """
 
-import argparse
 import io
 import zlib
 from collections import defaultdict
 from dataclasses import replace
 from itertools import pairwise
-from pathlib import Path
 
 import numpy as np
 import torch
 from PIL import Image
 
+from benchmarks.measure import flags
+from benchmarks.scenes import panoramas_of
 from warpir.calibration.not_pinhole import has_seam
 from warpir.core.arrays import FloatArray
 from warpir.core.errors import InputError
 from warpir.evaluate.camera.measure import corrected_to_upright, even_cameras, photograph
-from warpir.evaluate.scenes import PANORAMA_SUFFIXES, find_files
 from warpir.train.camera.crops import DrawnCameras, draw_cameras, read_panoramas
 from warpir.train.lights import SKY_ONLY
 from warpir.train.sampler import Sampler
@@ -54,10 +53,9 @@ def cameras(kind: str, draw: Sampler) -> DrawnCameras:
     drawn = even_cameras(draw)
     if kind == "even":
         return drawn
-    level = torch.zeros(1)
     if float(draw.unit()) < 0.5:
         return corrected_to_upright(drawn, draw)
-    return replace(drawn, pitch=0.3 * drawn.pitch, roll=level)
+    return replace(drawn, pitch=0.3 * drawn.pitch, roll=torch.zeros(1))
 
 
 def parts(count: int, length: int, gutter: int, rng: np.random.Generator) -> list[tuple[int, int]]:
@@ -71,13 +69,12 @@ def cells(
     layout: str, size: tuple[int, int], gutter: int, rng: np.random.Generator
 ) -> list[tuple[int, int, int, int]]:
     """Return left, top, right and bottom of the pictures of a collage [px]."""
-    width, height = size
     rows = LAYOUTS[layout]
-    across = parts(len(rows), width, gutter, rng)
+    across = parts(len(rows), size[0], gutter, rng)
     return [
         (left, top, right, bottom)
         for (left, right), count in zip(across, rows, strict=True)
-        for top, bottom in parts(count, height, gutter, rng)
+        for top, bottom in parts(count, size[1], gutter, rng)
     ]
 
 
@@ -111,15 +108,14 @@ def collage(
 
 def main() -> None:
     """Print a table."""
-    parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
-    parser.add_argument("--panoramas", type=Path, nargs="+", required=True)
+    parser = flags(__doc__, "panoramas")
     parser.add_argument("--photos", type=int, default=8, help="of each kind and place")
     parser.add_argument("--seed", type=int, default=1)
     options = parser.parse_args()
     torch.set_num_threads(1)
     found: dict[tuple[str, int], list[bool]] = defaultdict(list)
     photos: tuple[list[FloatArray], list[FloatArray]] = ([], [])
-    files = find_files(options.panoramas, PANORAMA_SUFFIXES, "--panoramas")
+    files = panoramas_of(options)
     for path in [p for p in files if SKY_ONLY not in p.stem]:
         name = zlib.crc32(path.stem.encode())
         try:

@@ -8,7 +8,6 @@ The truth is the panorama with its lower half laid on the ground plane, as the o
 for comparison the panorama at infinity. Error: RMSE over the sphere, display-encoded.
 """
 
-import json
 from dataclasses import replace
 from itertools import product
 from pathlib import Path
@@ -16,12 +15,13 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from PIL import Image
 
-from benchmarks.measure import flags
+from benchmarks.measure import flags, table, write_json
 from benchmarks.referee.subjects import ball
+from benchmarks.scenes import panoramas_of, places_of, write_picture
 from warpir.core.latlong import look_up, map_directions, resize_map, texel_solid_angles
-from warpir.evaluate.scenes import PANORAMA_SUFFIXES, Place, Places, Subject, find_files
+from warpir.evaluate.image_errors import rmse
+from warpir.evaluate.scenes import Place, Subject
 from warpir.evaluate.stage import Prediction, Stage
 from warpir.lighting.detail import HEIGHT, Detail, seen_from, with_detail
 from warpir.lighting.fit import fit_lobes
@@ -44,7 +44,8 @@ MATERIALS = {
 }
 COARSE, SIGMA_DEG = 32, 20.0
 """Rows and width of the low pass of `keeping_low_frequencies`."""
-TILE = 96
+WIDTH, TILE = 384, 96
+"""Of the photographs, and of what is cut out of them for the sheet [px]."""
 
 
 def on_the_ground(place: Place, centre: NDArray[np.float64]) -> Light:
@@ -127,31 +128,28 @@ def tile(pictures: list[NDArray[np.float32]], covered: NDArray[np.bool_]) -> NDA
 
 def print_table(rows: list[dict[str, Any]]) -> None:
     """Print the mean errors, three designs a line."""
-    print("| material | light | truth | without | detail | low frequencies kept |")
-    print("|---|---|---|---|---|---|")
-    for k in range(0, len(rows), 3):
-        first = rows[k]
-        cells = " | ".join(f"{r['rmse']:.4f}" for r in rows[k : k + 3])
-        print(f"| {first['material']} | {first['light']} | {first['truth']} | {cells} |")
+    names = ("material", "light", "truth")
+    lines = [
+        [*(rows[k][name] for name in names), *(f"{r['rmse']:.4f}" for r in rows[k : k + 3])]
+        for k in range(0, len(rows), 3)
+    ]
+    print(table((*names, "without", "detail", "low frequencies kept"), lines))
 
 
 def main() -> None:
     """Run it."""
-    parser = flags(__doc__, has_assets=False)
-    parser.add_argument("--panoramas", type=Path, nargs="+", required=True)
-    parser.add_argument("--assets", type=Path, nargs="+", required=True, help="give their places")
+    parser = flags(__doc__, "panoramas", "objects", "device", "json")
     parser.add_argument("--places", type=int, default=8)
     parser.add_argument("--seed", type=int, default=3)
     parser.add_argument("--samples", type=int, default=16)
     parser.add_argument("--sheet", type=Path)
     options = parser.parse_args()
     device = choose_device(options.device)
-    panoramas = find_files(options.panoramas, PANORAMA_SUFFIXES, "--panoramas")
-    assets = find_files(options.assets, (".glb", ".gltf", ".obj", ".ply", ".stl"), "--assets")
     regressor = load_regressor(None)
     errors: dict[tuple[str, str, str, str], list[float]] = {}
     tiles = []
-    for place, subjects in Places(panoramas, assets, options.seed).make(options.places):
+    places = places_of(options, panoramas_of(options), WIDTH)
+    for place, subjects in places.make(options.places):
         subject, centre = stand(subjects[0], place.camera)
         lights = {
             "regressed": Light(lobes=regress(regressor, place.photo, place.camera).lobes()),
@@ -165,7 +163,7 @@ def main() -> None:
             covered = stage.mask > 0.5
             for kind, truth in product(lights, truths):
                 for which, image in pictures[kind].items():
-                    error = float(np.sqrt(((image - truths[truth])[covered] ** 2).mean()))
+                    error = rmse(image[covered], truths[truth][covered])
                     errors.setdefault((name, kind, truth, which), []).append(error)
             if name in ("mirror", "paint"):
                 two = [image for by in pictures.values() for image in list(by.values())[:2]]
@@ -176,12 +174,10 @@ def main() -> None:
         for key, values in errors.items()
     ]
     print_table(rows)
-    if options.json is not None:
-        record = {"device": device, "places": options.places, "seed": options.seed, "rows": rows}
-        options.json.write_text(json.dumps(record) + "\n")
+    record = {"device": device, "places": options.places, "seed": options.seed, "rows": rows}
+    write_json(options.json, record, indent=None)
     if options.sheet is not None:
-        sheet = np.clip(np.concatenate(tiles), 0.0, 1.0)
-        Image.fromarray(np.round(255.0 * sheet).astype(np.uint8)).save(options.sheet)
+        write_picture(options.sheet, np.concatenate(tiles))
 
 
 if __name__ == "__main__":

@@ -11,31 +11,20 @@ are fitted on the first, and the second says how far the level of the regressed 
 and after the ground is asked (`warpir.lighting.exposure`).
 """
 
-from __future__ import annotations
-
-import argparse
 import json
-from collections.abc import Iterator
 from dataclasses import asdict, dataclass
-from pathlib import Path
 
 import numpy as np
 from scipy.stats import t as student
 
+from benchmarks.measure import flags, rms
+from benchmarks.scenes import panoramas_of, photo_of
 from warpir.app.inputs import Inputs
 from warpir.core.arrays import Float64Array, FloatArray
 from warpir.core.color import luminance
 from warpir.core.latlong import map_directions, resize_map, texel_solid_angles
-from warpir.evaluate.scenes import (
-    ASSET_SUFFIXES,
-    PANORAMA_SUFFIXES,
-    Place,
-    Places,
-    Subject,
-    find_files,
-)
+from warpir.evaluate.scenes import ASSET_SUFFIXES, Places, Subject, find_files
 from warpir.evaluate.stage import unseen_by
-from warpir.io.images.photos import Photo
 from warpir.lighting.exposure import ALBEDO, ask_ground, level_log_std
 from warpir.lighting.regression import regress
 from warpir.lighting.regressor import Regressor, load_regressor
@@ -68,19 +57,10 @@ class Crop:
     """Of the factor that both witnesses give."""
 
 
-def crops_of(path: Path, assets: list[Path], network: Regressor, count: int) -> Iterator[Crop]:
-    """Yield the crops of one panorama whose ground is in view and not black."""
-    for place, subjects in Places([path], assets, seed=3, width=192).make(count):
-        crop = crop_of(place, subjects[0], network)
-        if crop is not None:
-            yield crop
-
-
-def crop_of(place: Place, subject: Subject, network: Regressor) -> Crop | None:
-    """Return the figures of one photograph; None where its ground is not seen."""
-    codes = np.round(255.0 * place.photo).astype(np.uint8)
-    photo = Photo(codes, place.photo, "png")
-    inputs = Inputs(photo, subject.asset, place.camera, subject.placement)
+def crop_of(subject: Subject, network: Regressor) -> Crop | None:
+    """Return the figures of one photograph; None where its ground is not seen or is black."""
+    place = subject.place
+    inputs = Inputs(photo_of(place.photo), subject.asset, place.camera, subject.placement)
     regression = regress(network, place.photo, place.camera)
     ground = ask_ground(regression, inputs)
     if ground is None:
@@ -140,28 +120,22 @@ def describe(crops: list[Crop], name: str) -> None:
         )
 
 
-def rms(values: Float64Array) -> float:
-    """Return the root of the mean square."""
-    return float(np.sqrt(np.square(values).mean()))
-
-
 def main() -> None:
     """Measure, and print."""
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--panoramas", type=Path, nargs="+", required=True)
-    parser.add_argument("--assets", type=Path, nargs="+", required=True)
+    parser = flags(__doc__, "panoramas", "objects", "json")
     parser.add_argument("--crops", type=int, default=8, help="of each panorama")
-    parser.add_argument("--json", type=Path, help="write all figures to this file")
     options = parser.parse_args()
     assets = find_files(options.assets, ASSET_SUFFIXES, "--assets")
     network = load_regressor(None)
     halves: list[list[Crop]] = [[], []]
-    for k, path in enumerate(find_files(options.panoramas, PANORAMA_SUFFIXES, "--panoramas")):
+    for k, path in enumerate(panoramas_of(options)):
         unseen = unseen_by(network, path.stem)
         if unseen is None:
             print(f"{path.stem}: left out, all networks have learned from it")
             continue
-        halves[k % 2] += crops_of(path, assets, unseen, options.crops)
+        places = Places([path], assets, seed=3, width=192)
+        crops = (crop_of(subjects[0], unseen) for _, subjects in places.make(options.crops))
+        halves[k % 2] += [crop for crop in crops if crop is not None]
     freedom, location, scale = student.fit(np.array([c.albedo for c in halves[0]]))
     print(
         f"first half: the albedo's logarithm is Student's t with {freedom:.1f} degrees of freedom "

@@ -13,7 +13,6 @@ per pixel mirror of the whole panorama, unclipped and infinitely distant.
 ``--pitch-error`` turns the camera that the estimate is told away from the true one.
 """
 
-import argparse
 import json
 import zlib
 from collections.abc import Iterator
@@ -22,23 +21,17 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from benchmarks.measure import flags, write_json
+from benchmarks.scenes import panoramas_of
+from warpir.core.arrays import Float64Array, FloatArray
 from warpir.core.color import gamma_to_linear
 from warpir.core.errors import InputError
 from warpir.core.latlong import look_up
-from warpir.evaluate.scenes import (
-    CAMERA_HEIGHT,
-    PANORAMA_SUFFIXES,
-    crop_camera,
-    crop_radiance,
-    expose,
-    find_files,
-)
+from warpir.evaluate.scenes import CAMERA_HEIGHT, crop_camera, crop_radiance, expose
 from warpir.io.images.photos import read_envmap
 from warpir.look.ground_coat import GroundCoat, estimate_coat
-
-Doubles = NDArray[np.float64]
+from warpir.scene.camera import Camera
 
 WIDTH, HEIGHT, VIEWS = 288, 192, 8
 UP = np.array([0.0, 1.0, 0.0])
@@ -103,7 +96,7 @@ def kind_of(place: str, view: int) -> str:
     return "unclear" if place in UNCLEAR else "matt"
 
 
-def coat_light(texels: NDArray[np.float32], rays: Doubles, roughness: float, seed: int) -> Doubles:
+def coat_light(texels: FloatArray, rays: Float64Array, roughness: float, seed: int) -> Float64Array:
     """Return what a rough coat sends toward the camera, by random normals, shape [N, 3].
 
     Normals are drawn from GGX's distribution D cos; a normal counts by Fresnel's share, Smith's
@@ -118,7 +111,7 @@ def coat_light(texels: NDArray[np.float32], rays: Doubles, roughness: float, see
     rng, alpha, light = np.random.default_rng(seed), roughness**2, np.zeros_like(rays)
     out = -rays[:, 1]
 
-    def masking(cos: Doubles) -> Doubles:
+    def masking(cos: Float64Array) -> Float64Array:
         tan = np.sqrt(np.maximum(1.0 / np.maximum(cos, 1e-4) ** 2 - 1.0, 0.0))
         return np.asarray(2.0 / (1.0 + np.sqrt(1.0 + (alpha * tan) ** 2)))
 
@@ -139,6 +132,21 @@ def coat_light(texels: NDArray[np.float32], rays: Doubles, roughness: float, see
     return light / NORMALS
 
 
+def coated(
+    radiance: Float64Array, texels: FloatArray, camera: Camera, roughness: float, seed: int
+) -> Float64Array:
+    """Return what the camera sees when the ground has a coat, shape [H, W, 3]."""
+    v, u = np.mgrid[:HEIGHT, :WIDTH] + 0.5
+    rays = np.stack([u - camera.cx, camera.cy - v, np.full_like(u, -camera.fx)], -1)
+    rays = rays @ camera.c2w[:3, :3].T
+    rays /= np.linalg.norm(rays, axis=-1, keepdims=True)
+    below = rays[..., 1] < -0.03
+    shown = radiance.copy()
+    shown[below] *= LEFT
+    shown[below] += coat_light(texels, rays[below], roughness, seed)
+    return shown
+
+
 def judged(path: Path, seed: int, pitch_error: float) -> Iterator[Judged]:
     """Yield what is found in the crops of one panorama."""
     place = path.name.split(".")[0].removesuffix("_1k")
@@ -155,16 +163,7 @@ def judged(path: Path, seed: int, pitch_error: float) -> Iterator[Judged]:
         if place in COATED and view in COATED_VIEWS:
             cases += [("coated", roughness) for roughness in ROUGHNESSES]
         for kind, truth in cases:
-            shown = radiance
-            if truth is not None:
-                v, u = np.mgrid[:HEIGHT, :WIDTH] + 0.5
-                rays = np.stack([u - camera.cx, camera.cy - v, np.full_like(u, -camera.fx)], -1)
-                rays = rays @ camera.c2w[:3, :3].T
-                rays /= np.linalg.norm(rays, axis=-1, keepdims=True)
-                below = rays[..., 1] < -0.03
-                shown = radiance.copy()
-                shown[below] *= LEFT
-                shown[below] += coat_light(texels, rays[below], truth, view)
+            shown = radiance if truth is None else coated(radiance, texels, camera, truth, view)
             codes = np.round(255.0 * expose(shown)[0]) / 255.0
             found = estimate_coat(gamma_to_linear(codes.astype(np.float32)), as_told, UP)
             yield Judged(place, view, kind, truth, found)
@@ -187,26 +186,19 @@ def summary(results: list[Judged]) -> dict[str, Any]:
 
 def main() -> None:
     """Print the table, and write every crop's figures."""
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawTextHelpFormatter
-    )
-    parser.add_argument("--panoramas", nargs="+", type=Path, required=True)
+    parser = flags(__doc__, "panoramas", "json")
     parser.add_argument("--seed", type=int, default=1)
     parser.add_argument("--pitch-error", type=float, default=0.0, help="standard deviation [deg]")
-    parser.add_argument("--json", type=Path)
     asked = parser.parse_args()
-    files = find_files(asked.panoramas, PANORAMA_SUFFIXES, "--panoramas")
     results: list[Judged] = []
-    for path in (path for path in files if SKY_ONLY not in path.name):
+    for path in (path for path in panoramas_of(asked) if SKY_ONLY not in path.name):
         try:
             results += judged(path, asked.seed, asked.pitch_error)
         except InputError as error:
             print(f"left out: {error}")
     table = summary(results)
     print(json.dumps(table))
-    if asked.json is not None:
-        crops = [asdict(result) for result in results]
-        asked.json.write_text(json.dumps({"table": table, "crops": crops}, indent=1) + "\n")
+    write_json(asked.json, {"table": table, "crops": [asdict(result) for result in results]})
 
 
 if __name__ == "__main__":

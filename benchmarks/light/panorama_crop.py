@@ -9,9 +9,7 @@ import json
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-from PIL import Image
-
+from benchmarks.scenes import write_picture
 from warpir.evaluate.scenes import crop_camera, crop_radiance, expose
 from warpir.io.images.photos import read_envmap
 from warpir.scene.camera import Camera
@@ -23,7 +21,7 @@ def write_crop(panorama: Path, camera: Camera, out: Path) -> dict[str, Any]:
     # A configuration of warpir.insert; the panorama itself is the light, unturned.
     light = {"light": str(panorama), "exposure": exposure, "tone": "linear"}
     out.mkdir(parents=True, exist_ok=True)
-    Image.fromarray(np.round(display * 255.0).astype(np.uint8)).save(out / "photo.png")
+    write_picture(out / "photo.png", display)
     for name, content in (("camera.json", camera.record()), ("light.json", light)):
         (out / name).write_text(json.dumps(content, indent=2) + "\n", encoding="utf-8")
     return light
@@ -41,14 +39,8 @@ def main() -> None:
     parser.add_argument("--height", type=int, default=427)
     parser.add_argument("--out", type=Path, required=True, help="folder for the three files")
     options = parser.parse_args()
-    camera = crop_camera(
-        options.width,
-        options.height,
-        options.fov,
-        options.azimuth,
-        options.pitch,
-        options.camera_height,
-    )
+    view = options.fov, options.azimuth, options.pitch, options.camera_height
+    camera = crop_camera(options.width, options.height, *view)
     write_crop(options.panorama, camera, options.out)
     names = {"photo": "photo.png", "camera": "camera.json", "config": "light.json"}
     print(*(f"--{flag} {options.out / name}" for flag, name in names.items()))

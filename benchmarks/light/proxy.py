@@ -18,15 +18,16 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from PIL import Image
 
 from benchmarks.measure import flags
+from benchmarks.scenes import on_the_ground, photo_of, write_picture
 from tools.demo.make import pixel_directions
 from tools.demo.textures import paving_texture
-from warpir.core.arrays import Float64Array, FloatArray, IntArray, PixelArray
+from warpir.core.arrays import Float64Array, FloatArray, PixelArray, mask_box
 from warpir.core.color import linear_to_gamma
 from warpir.core.latlong import look_up, resize_map, rotate_map
 from warpir.demo import ASSET, LIGHT
+from warpir.evaluate.image_errors import rmse
 from warpir.io.assets import load_asset
 from warpir.io.images.photos import Photo, read_envmap
 from warpir.mitsuba.render import Setting, foreground
@@ -98,30 +99,24 @@ def joined(parts: list[tuple[Asset, Float64Array]]) -> Asset:
     primitives: list[Primitive] = []
     materials: list[Material] = []
     textures: list[Texture] = []
-    slots = [name for name in vars(Material()) if name.endswith("_texture")]
     for asset, matrix in parts:
-        linear = matrix[:3, :3]
+        linear, offset = matrix[:3, :3], matrix[:3, 3]
         for p in asset.primitives:
-            normals = None if p.normals is None else p.normals @ np.linalg.inv(linear)
+            normals = p.normals
             if normals is not None:
-                normals = normals / np.linalg.norm(normals, axis=1, keepdims=True)
-            primitives.append(
-                replace(
-                    p,
-                    positions=p.positions @ linear.T + matrix[:3, 3],
-                    normals=None if normals is None else normals.astype(np.float32),
-                    tangents=None,
-                    material=p.material + len(materials),
-                )
-            )
+                turned = normals @ np.linalg.inv(linear)
+                length = np.linalg.norm(turned, axis=1, keepdims=True)
+                normals = (turned / length).astype(np.float32)
+            positions, material = p.positions @ linear.T + offset, p.material + len(materials)
+            moved = {"positions": positions, "normals": normals, "material": material}
+            primitives.append(replace(p, **moved, tangents=None))
         for m in asset.materials:
-            used = {name: getattr(m, name) for name in slots}
-            moved = {
+            slots = {
                 name: replace(slot, texture=slot.texture + len(textures))
-                for name, slot in used.items()
-                if slot is not None
+                for name, slot in vars(m).items()
+                if isinstance(slot, TextureSlot)
             }
-            materials.append(replace(m, **moved))
+            materials.append(replace(m, **slots))
         textures += asset.textures
     return Asset("place", tuple(primitives), tuple(materials), tuple(textures))
 
@@ -144,70 +139,6 @@ def painted_mask(wall: ReceiverMesh, camera: Camera, sun: Float64Array) -> Float
     shaded = np.isfinite(first_hit(wall, points, np.broadcast_to(sun, points.shape))[0])
     mask = shaded & (to_ground < to_wall)
     return mask.reshape(camera.height, camera.width).astype(np.float32)
-
-
-def as_photo(display: PixelArray) -> Photo:
-    """Return 8-bit codes of display values as a photo."""
-    codes = np.round(255.0 * np.clip(display, 0.0, 1.0)).astype(np.uint8)
-    return Photo(codes=codes, srgb=codes.astype(np.float32) / np.float32(255.0), kind="png")
-
-
-def insertions(
-    car: Asset,
-    placement: Placement,
-    camera: Camera,
-    light: Light,
-    photo: Photo,
-    meshes: tuple[ReceiverMesh, ReceiverMesh],
-    mask: FloatArray,
-    samples: int,
-    device: str,
-) -> dict[str, tuple[FloatArray, float]]:
-    """Return the composites by what was known of the place, and seconds of the second render.
-
-    ``meshes`` are the wall, and the wall with the ground, which makes the plane needless.
-    """
-    up = np.array([0.0, 1.0, 0.0])
-    plain = Receiver(up, 0.0)
-    wall, whole = (
-        replace(plain, mesh=m, radiance=photo_radiance(photo, Curves.identity("linear")))
-        for m in meshes
-    )
-    shade = shadow_mask(mask, *car.bounds(), placement.asset_to_world, camera)
-    curves = ToneKnots.identity(1), ToneKnots.identity(3)
-    found = {}
-    for name, proxy, own_mask in (
-        ("plane", plain, None),
-        ("plane and mask", plain, shade),
-        ("plane and mesh", wall, None),
-        ("mesh alone", replace(whole, is_plane=False), None),
-    ):
-        scene = Scene([Placed(car, placement.asset_to_world)], camera, proxy, device)
-        quality = Quality(samples, 1, DEPTH, 0)
-        for _ in range(2):
-            start = time.perf_counter()
-            picture = make_picture(
-                Renderer(scene), light, light, photo, quality, *curves, False, shadow_mask=own_mask
-            )
-            seconds = time.perf_counter() - start
-        found[name] = (np.clip(picture.image, 0.0, 1.0), seconds)
-    return found
-
-
-def rmse(a: PixelArray, b: PixelArray, box: tuple[slice, slice]) -> float:
-    """Root of the mean squared difference of display values in a box."""
-    return float(np.sqrt(np.square(a[box].astype(np.float64) - b[box]).mean()))
-
-
-def changed_box(truth: PixelArray, photo: PixelArray, seen_car: IntArray) -> tuple[slice, slice]:
-    """Return rows and columns of what the car changes clearly, its own pixels included."""
-    difference = np.abs(truth - photo).mean(axis=-1)
-    for axis in (0, 1):  # one path that meets the car far away is no change
-        difference = sum(np.roll(difference, k, axis) for k in range(-2, 3)) / 5.0
-    marked = difference > CHANGE
-    marked |= seen_car.reshape(marked.shape) > 0
-    rows, columns = np.flatnonzero(marked.any(axis=1)), np.flatnonzero(marked.any(axis=0))
-    return slice(rows[0], rows[-1] + 1), slice(columns[0], columns[-1] + 1)
 
 
 @dataclass(frozen=True)
@@ -241,6 +172,49 @@ class Yard:
         lit = np.percentile(radiance[-self.camera.height // 4 :].mean(axis=-1), 60.0)
         return LIT_LEVEL / float(lit), radiance
 
+    def changed_box(
+        self, truth: PixelArray, photo: PixelArray, placement: Placement, device: str
+    ) -> tuple[slice, slice]:
+        """Return rows and columns of what the car changes clearly, its own pixels included."""
+        difference = np.abs(truth - photo).mean(axis=-1)
+        for axis in (0, 1):  # one path that meets the car far away is no change
+            difference = sum(np.roll(difference, k, axis) for k in range(-2, 3)) / 5.0
+        renderer = on_the_ground(self.car, placement.asset_to_world, self.camera, device)
+        gbuffer = renderer.gbuffer(0)
+        marked = difference > CHANGE
+        marked.reshape(-1)[gbuffer.object_pixels[gbuffer.coverage > 0.0]] = True
+        return mask_box(marked)
+
+    def insertions(
+        self, placement: Placement, light: Light, photo: Photo, mask: FloatArray, device: str
+    ) -> dict[str, tuple[FloatArray, float]]:
+        """Return the composites by what was known of the place, and seconds of the second render.
+
+        Wall and ground together make the plane needless.
+        """
+        plain = Receiver(np.array([0.0, 1.0, 0.0]), 0.0)
+        radiance = photo_radiance(photo, Curves.identity("linear"))
+        wall, whole = (replace(plain, mesh=mesh, radiance=radiance) for mesh in self.meshes)
+        placed = Placed(self.car, placement.asset_to_world)
+        shade = shadow_mask(mask, *self.car.bounds(), placed.asset_to_world, self.camera)
+        curves = ToneKnots.identity(1), ToneKnots.identity(3)
+        quality = Quality(self.samples // 2, 1, DEPTH, 0)
+        found = {}
+        for name, proxy, own_mask in (
+            ("plane", plain, None),
+            ("plane and mask", plain, shade),
+            ("plane and mesh", wall, None),
+            ("mesh alone", replace(whole, is_plane=False), None),
+        ):
+            scene = Scene([placed], self.camera, proxy, device)
+            for _ in range(2):
+                start = time.perf_counter()
+                given = light, light, photo, quality, *curves, False
+                picture = make_picture(Renderer(scene), *given, shadow_mask=own_mask)
+                seconds = time.perf_counter() - start
+            found[name] = (np.clip(picture.image, 0.0, 1.0), seconds)
+        return found
+
 
 def compare(
     case: Case, yard: Yard, texels: FloatArray, exposure: float, empty: PixelArray, device: str
@@ -252,7 +226,7 @@ def compare(
     car, shape [H, W, 3].
     """
     camera, car = yard.camera, yard.car
-    photo = as_photo(linear_to_gamma(np.clip(exposure * empty, 0.0, 1.0)))
+    photo = photo_of(linear_to_gamma(np.clip(exposure * empty, 0.0, 1.0)))
     placement = place_asset(
         *car.bounds(), camera, None, place=case.place, rotate_y=case.rotate_y, size=2.2
     )
@@ -264,17 +238,14 @@ def compare(
     lower[128:] = np.mean(empty[-camera.height // 8 :], axis=(0, 1))
     light = Light(texels=lower).scaled(exposure)
     mask = painted_mask(yard.meshes[0], camera, lamp_axes(Light(texels=texels))[0])
-    found = insertions(
-        car, placement, camera, light, photo, yard.meshes, mask, yard.samples // 2, device
-    )
-    box = changed_box(truth, photo.srgb, _coverage(car, placement, camera, device))
-    whole = (slice(None), slice(None))
+    found = yard.insertions(placement, light, photo, mask, device)
+    box = yard.changed_box(truth, photo.srgb, placement, device)
     figures = [
         {
             "case": case.name,
             "known": name,
-            "rmse_box": round(rmse(image, truth, box), 4),
-            "rmse_picture": round(rmse(image, truth, whole), 4),
+            "rmse_box": round(rmse(image[box].astype(np.float64), truth[box]), 4),
+            "rmse_picture": round(rmse(image.astype(np.float64), truth), 4),
             "seconds": round(seconds, 2),
         }
         for name, (image, seconds) in found.items()
@@ -285,7 +256,7 @@ def compare(
 
 def main() -> None:
     """Render truth and insertions of every case; write the sheet and the figures."""
-    parser = flags(__doc__, has_assets=False)
+    parser = flags(__doc__, "device", "json")
     parser.add_argument("--out", type=Path, required=True)
     parser.add_argument("--panorama", type=Path, default=LIGHT, help="default: the demo's sky")
     parser.add_argument("--samples", type=int, default=256, help="of truth and photo, per pixel")
@@ -309,20 +280,9 @@ def main() -> None:
         figures += lines
         for line in lines:
             print(line, flush=True)
-    sheet = np.round(255.0 * np.clip(np.concatenate(rows, axis=0), 0.0, 1.0)).astype(np.uint8)
-    Image.fromarray(sheet).save(options.out / "proxy.png")
+    write_picture(options.out / "proxy.png", np.concatenate(rows, axis=0))
     if options.json is not None:
         options.json.write_text("".join(json.dumps(f) + "\n" for f in figures))
-
-
-def _coverage(car: Asset, placement: Placement, camera: Camera, device: str) -> IntArray:
-    """Return 1 in pixels that show the car."""
-    up = np.array([0.0, 1.0, 0.0])
-    scene = Scene([Placed(car, placement.asset_to_world)], camera, Receiver(up, 0.0), device)
-    seen_pixels = np.zeros(camera.width * camera.height, np.int32)
-    gbuffer = Renderer(scene).gbuffer(0)
-    seen_pixels[gbuffer.object_pixels[gbuffer.coverage > 0.0]] = 1
-    return seen_pixels
 
 
 if __name__ == "__main__":

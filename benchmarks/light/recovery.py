@@ -20,7 +20,8 @@ import torch
 import warp as wp
 from torch import Tensor
 
-from benchmarks.measure import context, flags
+from benchmarks.measure import context, flags, rms, table, write_json
+from benchmarks.scenes import on_the_ground, write_picture
 from warpir.app.settings import OptimizeSettings
 from warpir.core.arrays import Float64Array, FloatArray
 from warpir.core.color import gamma_to_linear, luminance
@@ -32,9 +33,7 @@ from warpir.optimize.light import LightOptimization, Unknowns
 from warpir.optimize.view import Frame
 from warpir.render.bridge import ComposeConstants, compose
 from warpir.render.device_light import light_args
-from warpir.render.device_scene import Placed, Receiver, Scene
 from warpir.render.mis.integrator import MisIntegrator
-from warpir.render.renderer import Renderer
 from warpir.render.shadow.pilot import shaded_pixels
 from warpir.render.tone_curve import Knots, ToneCurve
 from warpir.scene.asset import Asset
@@ -130,16 +129,9 @@ def make_truth(
     texels = (panorama * 2.0**exposure).astype(np.float32)
     forward = -camera.c2w[:3, 2] * np.array([1.0, 0.0, 1.0])
     x, y, z = (float(c) for c in scene.distance * forward / np.linalg.norm(forward))
-    placement = place_asset(
-        *asset.bounds(),
-        camera,
-        None,
-        place=(x, y, z),
-        rotate_y=scene.rotate_y,
-        size=scene.size,
-    )
-    placed = Placed(asset, placement.asset_to_world)
-    renderer = Renderer(Scene([placed], camera, Receiver(np.array([0.0, 1.0, 0.0]), 0.0), device))
+    stand = {"place": (x, y, z), "rotate_y": scene.rotate_y, "size": scene.size}
+    placement = place_asset(*asset.bounds(), camera, None, **stand)
+    renderer = on_the_ground(asset, placement.asset_to_world, camera, device)
     frame = Frame(renderer, photo_lin, True, 3, seed=1)
     curves = true_curves(scene.contrast)
     with torch.no_grad():
@@ -163,14 +155,8 @@ def reference(
     constants = ComposeConstants(
         frame.photo_lin, objects, proxies, mask, str(renderer.device.alias), frame.is_reinhard
     )
-    return compose(
-        constants,
-        radiance.foreground,
-        radiance.lit,
-        radiance.unoccluded,
-        curve_fg,
-        curve_shadow,
-    )
+    planes = radiance.foreground, radiance.lit, radiance.unoccluded
+    return compose(constants, *planes, curve_fg, curve_shadow)
 
 
 class TowardTruth:
@@ -288,9 +274,9 @@ def measure(truth: Truth, loop: LightOptimization) -> dict[str, Any]:
         "name": truth.scene.name,
         "angle_deg": float(np.degrees(np.arccos(np.clip(axis @ true_axis, -1.0, 1.0)))),
         "sun_sky_log_error": float(abs(np.log(max(ratios[0], 1e-6) / max(ratios[1], 1e-6)))),
-        "rmse": float(np.sqrt(np.square(error).mean())),
-        "rmse_changed": float(np.sqrt(np.square(error[:, changed]).mean())),
-        "tone_rmse": float(np.sqrt(np.square(curves).mean())),
+        "rmse": rms(error),
+        "rmse_changed": rms(error[:, changed]),
+        "tone_rmse": rms(curves),
         "direction_deg": angles_from_axis(axis),
         "true_direction_deg": angles_from_axis(true_axis),
         "sun_sky": ratios[0],
@@ -324,43 +310,45 @@ def recover(
 
 def show(truth: Truth, loop: LightOptimization, path: Path) -> None:
     """Write truth, result and five times their difference side by side."""
-    from PIL import Image
-
-    image = delivered(truth, loop).cpu().numpy()[0].transpose(1, 2, 0)
-    true = truth.image.cpu().numpy()[0].transpose(1, 2, 0)
-    difference = np.clip(0.5 + 5.0 * (image - true), 0.0, 1.0)
-    panel = np.concatenate([true, image, difference], axis=1)
-    Image.fromarray(np.round(255.0 * panel).astype(np.uint8)).save(path)
+    pictures = truth.image, delivered(truth, loop)
+    true, image = (p.cpu().numpy()[0].transpose(1, 2, 0) for p in pictures)
+    write_picture(path, np.concatenate([true, image, 0.5 + 5.0 * (image - true)], axis=1))
 
 
-def table(record: Mapping[str, Any]) -> str:
+HEAD = (
+    *("scene", "angle to the true sun [deg]", "log error of sun/sky", "true sun/sky"),
+    *("RMSE of the composite", "RMSE where it differs from the photo"),
+    *("RMSE of the tone curve", "seconds"),
+)
+PAGE = """# Recovery of light and tone curves with guidance that is right
+
+Made by `python -m benchmarks.light.recovery --markdown docs/recovery.md`: the
+optimisation is guided by the squared distance to the true composite in place of a
+diffusion model. The truth is path-traced under the full panorama, through tone curves
+that the loop does not know; the result is path-traced too, at an unseen seed.
+
+{date}, {device}, commit {commit}; {width} x {height}
+pixels, {steps} steps, {lobes} lobes.
+
+{table}
+
+Largest angle: {max_angle_deg:.2f} degrees (target 3).
+"""
+
+
+def page(record: Mapping[str, Any]) -> str:
     """Return the figures as a page."""
-    settings = record["settings"]
     width, height = record["size"]
-    lines = [
-        "# Recovery of light and tone curves with guidance that is right",
-        "",
-        "Made by `python -m benchmarks.light.recovery --markdown docs/recovery.md`: the",
-        "optimisation is guided by the squared distance to the true composite in place of a",
-        "diffusion model. The truth is path-traced under the full panorama, through tone curves",
-        "that the loop does not know; the result is path-traced too, at an unseen seed.",
-        "",
-        f"{record['date']}, {record['device']}, commit {record['commit']}; {width} x {height}",
-        f"pixels, {settings['steps']} steps, {settings['lobes']} lobes.",
-        "",
-        "| scene | angle to the true sun [deg] | log error of sun/sky | true sun/sky "
-        "| RMSE of the composite | RMSE where it differs from the photo | RMSE of the tone curve "
-        "| seconds |",
-        "|---|---|---|---|---|---|---|---|",
-    ]
-    lines += [
-        f"| {x['name']} | {x['angle_deg']:.2f} | {x['sun_sky_log_error']:.2f} "
-        f"| {x['true_sun_sky']:.2f} | {x['rmse']:.4f} | {x['rmse_changed']:.4f} "
-        f"| {x['tone_rmse']:.4f} | {x['seconds']['recovery']:.0f} |"
+    rows = [
+        (
+            *(x["name"], f"{x['angle_deg']:.2f}", f"{x['sun_sky_log_error']:.2f}"),
+            *(f"{x['true_sun_sky']:.2f}", f"{x['rmse']:.4f}", f"{x['rmse_changed']:.4f}"),
+            *(f"{x['tone_rmse']:.4f}", f"{x['seconds']['recovery']:.0f}"),
+        )
         for x in record["scenes"]
     ]
-    lines += ["", f"Largest angle: {record['max_angle_deg']:.2f} degrees (target 3).", ""]
-    return "\n".join(lines)
+    known = {**record, **record["settings"], "width": width, "height": height}
+    return PAGE.format(**known, table=table(HEAD, rows))
 
 
 def main() -> None:
@@ -375,10 +363,10 @@ def main() -> None:
     parser.add_argument("--set", action="append", default=[], help="field=value of the settings")
     options = parser.parse_args()
     settings = OptimizeSettings(steps=600)
-    width, height, samples = 384, 256, 128
+    width, height = 384, 256
     if options.quick:
         settings = replace(settings, steps=200, lobes=48, light_height=48, object_light_height=24)
-        width, height, samples = 96, 64, 128
+        width, height = 96, 64
     for text in options.set:
         name, _, value = text.partition("=")
         kind = type(getattr(settings, name))
@@ -389,7 +377,7 @@ def main() -> None:
         started = time.perf_counter()
         panorama = read_envmap(options.assets / "hdri" / f"{scene.panorama}.hdr")
         asset = load_asset(options.assets / scene.asset)
-        truth = make_truth(scene, panorama, asset, width, height, samples, options.device)
+        truth = make_truth(scene, panorama, asset, width, height, 128, options.device)
         made = time.perf_counter()
         loop = recover(truth, settings, noise=options.noise)
         line = measure(truth, loop)
@@ -411,10 +399,9 @@ def main() -> None:
         "max_angle_deg": max(line["angle_deg"] for line in lines),
         "max_sun_sky_log_error": max(line["sun_sky_log_error"] for line in lines),
     }
-    if options.json is not None:
-        options.json.write_text(json.dumps(record, indent=1) + "\n", encoding="utf-8")
+    write_json(options.json, record)
     if options.markdown is not None:
-        options.markdown.write_text(table(record), encoding="utf-8")
+        options.markdown.write_text(page(record), encoding="utf-8")
 
 
 if __name__ == "__main__":

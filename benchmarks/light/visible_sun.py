@@ -19,23 +19,23 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.optimize import minimize
 
+from benchmarks.measure import flags, write_json
+from benchmarks.scenes import panoramas_of, photo_of
+from warpir.core.arrays import Float64Array, FloatArray
 from warpir.core.color import linear_to_gamma, luminance
 from warpir.core.latlong import map_directions, resize_map, texel_solid_angles
 from warpir.evaluate.image_errors import image_errors, make_regions
 from warpir.evaluate.light_errors import light_errors
 from warpir.evaluate.scenes import (
     CAMERA_HEIGHT,
-    PANORAMA_SUFFIXES,
     RESPONSES,
     Place,
     Subject,
     crop_camera,
     crop_radiance,
     expose,
-    find_files,
     with_surface,
 )
 from warpir.evaluate.stage import Prediction, Quality, Stage, unseen_by
@@ -49,8 +49,6 @@ from warpir.scene.asset import Asset
 from warpir.scene.light import Light, as_map
 from warpir.scene.placement import place_asset
 from warpir.train.lights import SPLIT_HEIGHT, split_sun
-
-Doubles = NDArray[np.float64]
 
 WIDTH, HEIGHT = 288, 192
 INSIDE, OUTSIDE = 4, 7
@@ -76,13 +74,13 @@ class Truth:
     """The brightest light of a panorama."""
 
     name: str
-    axis: Doubles
+    axis: Float64Array
     """Unit direction, shape [3]."""
     share: float
     """Of the flux, within `CAP_DEG` [1]."""
     is_sun: bool
     """Unclouded and above the horizon; a lamp may be one too."""
-    texels: NDArray[np.float32]
+    texels: FloatArray
 
     @property
     def is_for_tuning(self) -> bool:
@@ -107,12 +105,12 @@ class Judged:
     crop: Crop
     regression: Regression | None
     """Where the regressor was asked."""
-    features: Doubles
+    features: Float64Array
     """Of each spot, shape [spot, 6]; the regressor's opinion is 0 where it was not asked."""
-    angles_deg: Doubles
+    angles_deg: Float64Array
     """Between each spot and the true peak, shape [spot]."""
 
-    def best(self, weights: Doubles, bias: float) -> tuple[float, float]:
+    def best(self, weights: Float64Array, bias: float) -> tuple[float, float]:
         """Return the log odds of the likeliest spot, and its angle [deg]."""
         if not len(self.features):
             return -np.inf, 180.0
@@ -138,7 +136,7 @@ def truth_of(path: Path) -> Truth:
     return Truth(path.stem, axis, share, is_sun, texels.astype(np.float32))
 
 
-def with_glare(radiance: Doubles, share: float, pixel_deg: float) -> Doubles:
+def with_glare(radiance: Float64Array, share: float, pixel_deg: float) -> Float64Array:
     """Spread a share of the radiance as lenses do: by the angle to the power of -2.2."""
     height, width = radiance.shape[:2]
     rows, columns = np.mgrid[-height:height, -width:width]
@@ -174,7 +172,7 @@ def crops_of(truth: Truth) -> Iterator[Crop]:
         gain = 2.0 ** (expose(seen)[1] + np.clip(0.5 * rng.normal(), -1.2, 1.2))
         response = "gamma" if rng.random() < 0.6 else "filmic"
         shown = linear_to_gamma(RESPONSES[response].show(seen * gain))
-        photo = (np.round(255.0 * np.clip(shown, 0.0, 1.0)) / 255.0).astype(np.float32)
+        photo = photo_of(shown).srgb
         name = f"{truth.name}-{sum(wanted.values())}"
         place = Place(
             name, truth.name, camera, turn, pitch, photo, float(gain), response, truth.texels, seed
@@ -198,7 +196,7 @@ def judge(crop: Crop, network: Regressor) -> Judged:
     return Judged(crop, regression, features, np.degrees(np.arccos(cosine)))
 
 
-def fit(judged: list[Judged]) -> tuple[Doubles, float]:
+def fit(judged: list[Judged]) -> tuple[Float64Array, float]:
     """Fit the rule: first what spots look like, then how much the regressor's opinion adds."""
     x, sign = [], []
     for j in judged:
@@ -218,11 +216,13 @@ def fit(judged: list[Judged]) -> tuple[Doubles, float]:
     return np.append(scale * weights, opinion), float(scale * bias + shift)
 
 
-def logistic(x: Doubles, sign: Doubles, ridge: float = 0.15) -> tuple[Doubles, float]:
+def logistic(
+    x: Float64Array, sign: Float64Array, ridge: float = 0.15
+) -> tuple[Float64Array, float]:
     """Return the weights and the bias of a logistic regression."""
     scale = x.std(axis=0)
 
-    def loss(w: Doubles) -> float:
+    def loss(w: Float64Array) -> float:
         odds = (x / scale) @ w[1:] + w[0]
         return float(np.logaddexp(0.0, -sign * odds).sum() + ridge * (w[1:] ** 2).sum())
 
@@ -235,7 +235,7 @@ def is_sun_crop(judged: Judged) -> bool:
     return judged.crop.truth.is_sun and judged.crop.is_inside
 
 
-def detection(judged: list[Judged], weights: Doubles, bias: float) -> dict[str, float]:
+def detection(judged: list[Judged], weights: Float64Array, bias: float) -> dict[str, float]:
     """Return how many suns are found, and how often something else is taken for one."""
     least = float(np.log(visible_sun.PROBABILITY_MIN / (1.0 - visible_sun.PROBABILITY_MIN)))
     best = [(j, *j.best(weights, bias)) for j in judged]
@@ -305,24 +305,24 @@ def light_before_and_after(judged: list[Judged]) -> dict[str, dict[str, float]]:
     }
 
 
-def composite_errors(
-    crop: Crop, regression: Regression, asset: Asset, path: Path, device: str, samples: int
-) -> dict[str, float]:
+def subject_of(crop: Crop, asset: Asset, path: Path) -> Subject:
+    """Return an object on the ground of a crop, matt."""
+    size = OBJECT_SIZE * CAMERA_HEIGHT / steepness(crop)
+    camera = crop.place.camera
+    placement = place_asset(*asset.bounds(), camera, at=STAND, rotate_y=30.0, size=size)
+    return Subject(crop.place, with_surface(asset, 0.0, 1.0), path, "diffuse", placement)
+
+
+def composite_errors(stage: Stage, light: Light) -> dict[str, float]:
     """Return the errors of a light and of the composite under it."""
-    place = crop.place
-    light = Light(lobes=regression.lobes())
-    errors = light_errors(as_map(light, 128), place.texels)
+    errors = light_errors(as_map(light, 128), stage.subject.place.texels)
     figures = {
         "peak_angle_deg": errors["peak_angle_deg"],
         "log_sun_sky": abs(errors["log_own_sun_sky_ratio_error"]),
         "log_flux": abs(errors["log_flux_error"]),
     }
-    low, high = asset.bounds()
-    size = OBJECT_SIZE * CAMERA_HEIGHT / steepness(crop)
-    placement = place_asset(low, high, place.camera, at=STAND, rotate_y=30.0, size=size)
-    subject = Subject(place, with_surface(asset, 0.0, 1.0), path, "diffuse", placement)
-    stage = Stage(subject, device, Quality(samples=samples), 0)
-    image = stage.compose(stage.render(Prediction.of(light)), Prediction.of(light).curves)
+    prediction = Prediction.of(light)
+    image = stage.compose(stage.render(prediction), prediction.curves)
     regions = image_errors(image, stage.truth, make_regions(stage.mask, stage.ratio))
     return figures | {f"rmse_{k}": v["rmse"] for k, v in regions.items() if v}
 
@@ -339,10 +339,10 @@ def before_and_after(judged: list[Judged], options: argparse.Namespace) -> dict[
         seen.add(j.crop.truth.name)
         place = j.crop.place
         after = visible_sun.with_visible_sun(j.regression, place.photo, place.camera)
+        subject = subject_of(j.crop, asset, options.asset)
+        stage = Stage(subject, device, Quality(samples=options.samples), 0)
         for name, regression in (("before", j.regression), ("after", after)):
-            rows[name].append(
-                composite_errors(j.crop, regression, asset, options.asset, device, options.samples)
-            )
+            rows[name].append(composite_errors(stage, Light(lobes=regression.lobes())))
     return {
         name: {k: float(np.mean([r[k] for r in found if k in r])) for k in found[0]}
         | {"places": len(found)}
@@ -353,17 +353,14 @@ def before_and_after(judged: list[Judged], options: argparse.Namespace) -> dict[
 
 def main() -> None:
     """Print and write what is found, and what it does to light and composites."""
-    parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
-    parser.add_argument("--panoramas", type=Path, nargs="+", required=True)
+    parser = flags(__doc__, "panoramas", "device", "json")
     parser.add_argument("--asset", type=Path, help="object of the composites; none without it")
     parser.add_argument("--fit", action="store_true", help="fit the rule to one half of the places")
     parser.add_argument("--samples", type=int, default=32)
-    parser.add_argument("--device")
-    parser.add_argument("--json", type=Path)
     options = parser.parse_args()
     network = load_regressor(None)
     judged = []
-    for path in find_files(options.panoramas, PANORAMA_SUFFIXES, "--panoramas"):
+    for path in panoramas_of(options):
         truth, unseen = truth_of(path), unseen_by(network, path.stem)
         if unseen is None:
             print(f"{path.stem}: left out, all networks have learned from it")
@@ -382,10 +379,8 @@ def main() -> None:
     record["light"] = light_before_and_after(halves["held out"])
     if options.asset is not None:
         record["composites"] = before_and_after(halves["held out"], options)
-    text = json.dumps(record, indent=2)
-    print(text)
-    if options.json is not None:
-        options.json.write_text(text + "\n", encoding="utf-8")
+    print(json.dumps(record, indent=2))
+    write_json(options.json, record, indent=2)
 
 
 if __name__ == "__main__":

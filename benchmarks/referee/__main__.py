@@ -20,8 +20,8 @@ import numpy as np
 import torch
 
 from benchmarks.measure import flags, report
-from benchmarks.presets import PRESETS, ScenePreset
 from benchmarks.referee import ours
+from benchmarks.referee.presets import PRESETS, ScenePreset
 from benchmarks.referee.sheet import compare_images, write_sheet
 from warpir.core.arrays import AnyFloatArray, Float64Array
 from warpir.core.latlong import map_directions

@@ -11,7 +11,6 @@ luminance's, in codes of 255 in the middle of the range. ``--fit`` trains the ne
 `warpir.look.texture` first (`benchmarks.sharpness.fit`).
 """
 
-import argparse
 import itertools
 import zlib
 from collections.abc import Iterator
@@ -21,7 +20,9 @@ import numpy as np
 from PIL import Image
 
 from benchmarks.look import draw_camera, softness
+from benchmarks.measure import flags
 from benchmarks.response import is_for_fitting
+from benchmarks.scenes import panoramas_of
 from benchmarks.sharpness.fit import fit, shown_crop
 from warpir.core.arrays import BoolArray, FloatArray
 from warpir.core.color import gamma_to_linear, linear_to_gamma
@@ -30,7 +31,6 @@ from warpir.evaluate.scenes import (
     FOOT_COLUMN,
     FOOT_ROW,
     HEIGHT_SHARE,
-    PANORAMA_SUFFIXES,
     PITCH,
     crop_camera,
     find_files,
@@ -123,13 +123,12 @@ def judge(name: str, samples: Iterator[Sample]) -> None:
 
 def main() -> None:
     """Print tables."""
-    parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
-    parser.add_argument("--panoramas", type=Path, nargs="+", required=True)
+    parser = flags(__doc__, "panoramas")
     parser.add_argument("--photos", type=Path, nargs="+")
     about = "train the networks of `warpir.look.texture` on the half that numbers are chosen by"
     parser.add_argument("--fit", action="store_true", help=about)
     options = parser.parse_args()
-    places = find_files(options.panoramas, PANORAMA_SUFFIXES, "--panoramas")
+    places = panoramas_of(options)
     if options.fit:
         fit([p for p in places if is_for_fitting(p.stem)])
     for name, is_fitted in (("places chosen by", True), ("other places", False)):
