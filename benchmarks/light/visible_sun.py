@@ -65,6 +65,8 @@ STEEP = 0.07
 """Least sine of the angle at which the camera looks down on it [1]."""
 OBJECT_SIZE = 0.25
 """Longest side of the object over its distance from the camera [1]."""
+RIDGE = 0.15
+"""Weight of the squared weights in the fit."""
 LIKELY, OPINION_MAX = -1.5, 1.5
 """Log odds that a spot must reach with the best opinion of the regressor for it to be asked."""
 
@@ -216,15 +218,13 @@ def fit(judged: list[Judged]) -> tuple[Float64Array, float]:
     return np.append(scale * weights, opinion), float(scale * bias + shift)
 
 
-def logistic(
-    x: Float64Array, sign: Float64Array, ridge: float = 0.15
-) -> tuple[Float64Array, float]:
+def logistic(x: Float64Array, sign: Float64Array) -> tuple[Float64Array, float]:
     """Return the weights and the bias of a logistic regression."""
     scale = x.std(axis=0)
 
     def loss(w: Float64Array) -> float:
         odds = (x / scale) @ w[1:] + w[0]
-        return float(np.logaddexp(0.0, -sign * odds).sum() + ridge * (w[1:] ** 2).sum())
+        return float(np.logaddexp(0.0, -sign * odds).sum() + RIDGE * (w[1:] ** 2).sum())
 
     w = minimize(loss, np.zeros(x.shape[1] + 1)).x
     return w[1:] / scale, float(w[0])
@@ -315,7 +315,7 @@ def subject_of(crop: Crop, asset: Asset, path: Path) -> Subject:
 
 def composite_errors(stage: Stage, light: Light) -> dict[str, float]:
     """Return the errors of a light and of the composite under it."""
-    errors = light_errors(as_map(light, 128), stage.subject.place.texels)
+    errors = light_errors(as_map(light, 128), stage.place.texels)
     figures = {
         "peak_angle_deg": errors["peak_angle_deg"],
         "log_sun_sky": abs(errors["log_own_sun_sky_ratio_error"]),
