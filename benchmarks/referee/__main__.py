@@ -25,7 +25,6 @@ from benchmarks.referee.presets import PRESETS, ScenePreset
 from benchmarks.referee.sheet import compare_images, write_sheet
 from warpir.core.arrays import AnyFloatArray, Float64Array
 from warpir.core.latlong import map_directions
-from warpir.io.assets import load_asset
 from warpir.lighting.fit import fit_lobes
 from warpir.mitsuba.render import Ratio, Setting, build, foreground, passes, shadow_ratio
 from warpir.render.device import choose_device
@@ -45,16 +44,11 @@ def foreground_gradient(
     parameters = mi.traverse(setup.scene)
     dr.enable_grad(parameters["light.texels"])
     parameters.update()
-    d_texels = np.zeros(setting.texels.shape)
+    d, d_texels = np.asarray(d_image, np.float32), np.zeros(setting.texels.shape)
     for pass_seed, pass_spp in passes(setting.camera, spp, seed):
         dr.set_grad(parameters["light.texels"], 0.0)
         setup.integrator.render_backward(
-            setup.scene,
-            parameters,
-            mi.TensorXf(np.asarray(d_image, dtype=np.float32)),
-            setup.sensor,
-            pass_seed,
-            pass_spp,
+            setup.scene, parameters, mi.TensorXf(d), setup.sensor, pass_seed, pass_spp
         )
         d_texels += np.asarray(dr.grad(parameters["light.texels"]), dtype=np.float64) * pass_spp
     return d_texels / spp
@@ -112,8 +106,8 @@ def gradient_line(
     The loss is ``sum(foreground * d_image)`` with colour ramps for ``d_image``; the map's gradient
     of both is carried to the lobes by the same adjoint, of the lobes at the texels' centres.
     """
-    asset = load_asset(assets / preset.asset)
-    lobes = fit_lobes(preset.texels(assets), 32).lobes
+    given = preset.setting(assets)
+    camera, lobes = given.camera, fit_lobes(given.texels, 32).lobes
     leaves = [
         torch.tensor(a, requires_grad=True)
         for a in (lobes.amplitude, lobes.axis, np.minimum(lobes.sharpness, 2000.0))
@@ -121,10 +115,9 @@ def gradient_line(
     amplitude, axis, sharpness = leaves
     toward = torch.tensor(map_directions(64, 128), dtype=torch.float32)
     texels = torch.exp((toward @ axis.T - 1.0) * sharpness) @ amplitude
-    camera = preset.camera()
     row, column = np.mgrid[0 : camera.height, 0 : camera.width] / camera.height
     d_image = np.stack([0.5 + row, 0.5 + column, 1.5 - row], axis=-1)
-    setting = Setting(asset, preset.matrix(asset), camera, texels.detach().numpy())
+    setting = given._replace(texels=texels.detach().numpy())
 
     def to_lobes(d_texels: AnyFloatArray) -> list[Float64Array]:
         grads = torch.autograd.grad(
@@ -159,10 +152,8 @@ def picture_lines(
     preset: ScenePreset, options: argparse.Namespace, device: str
 ) -> Iterator[dict[str, Any]]:
     """Compare foregrounds and shadow ratio of a scene; write a sheet of each."""
-    asset = load_asset(options.assets / preset.asset)
-    texels = preset.texels(options.assets)
-    setting = Setting(asset, preset.matrix(asset), preset.camera(), texels)
-    spp, seed, size = options.spp, options.seed, [preset.width, preset.height]
+    setting, spp, seed = preset.setting(options.assets), options.spp, options.seed
+    size = [setting.camera.width, setting.camera.height]
     for depth in options.depths:
         start = time.perf_counter()
         reference = foreground(setting, depth, spp, seed)

@@ -15,8 +15,9 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from benchmarks.referee.glass import Pair, compare_cases, mesh_of, pictures_of, rendered
-from benchmarks.referee.lamps import Runs
+from benchmarks.referee.glass import mesh_of, pictures_of, rendered
+from benchmarks.referee.ours import Runs
+from benchmarks.referee.sheet import Pair, compare_cases
 from benchmarks.referee.subjects import ball
 from warpir.core.arrays import Float64Array, FloatArray
 from warpir.mitsuba.light import LatlongEmitter

@@ -10,8 +10,8 @@ from dataclasses import replace
 import numpy as np
 
 from benchmarks.referee import ours
-from benchmarks.referee.glass import Pair, compare_cases
-from benchmarks.referee.lamps import Runs
+from benchmarks.referee.ours import Runs
+from benchmarks.referee.sheet import Pair, compare_cases
 from benchmarks.referee.subjects import ball
 from warpir.core.arrays import FloatArray
 from warpir.mitsuba import render as theirs

@@ -7,25 +7,21 @@ that absorbs alone, and ``volpath``; only the light is that of `warpir.mitsuba`.
 what interpolated normals do at an interface is a convention that differs.
 """
 
-import argparse
-import json
-from collections.abc import Callable
 from dataclasses import dataclass
-from typing import TypeVar
 
 import drjit as dr
 import mitsuba as mi
 import numpy as np
 import trimesh
 
-from benchmarks.referee.lamps import SEED_COUNT, Runs, camera, compare, runs_of
+from benchmarks.referee.ours import SEED_COUNT, Runs, over_seeds
+from benchmarks.referee.sheet import Pair, compare_cases
+from benchmarks.scenes import on_the_ground
 from warpir.core.arrays import Float64Array, FloatArray, IntArray
 from warpir.kernels.dielectric.glass import GLASS_DEPTH
 from warpir.mitsuba.light import LatlongEmitter
 from warpir.mitsuba.render import passes, sensor_of
 from warpir.render.device_light import light_args
-from warpir.render.device_scene import Placed, Receiver, Scene
-from warpir.render.renderer import Renderer
 from warpir.scene.asset import Asset, Material, Primitive
 from warpir.scene.camera import Camera
 from warpir.scene.light import Light
@@ -35,9 +31,6 @@ LENGTH = int(GLASS_DEPTH) + 1
 DEPTH = 24
 """Interactions with what is not glass; a matte card in glass gets light that often."""
 MATTE = (0.6, 0.3, 0.2)
-CaseT = TypeVar("CaseT")
-Pair = tuple[Runs, Runs]
-"""Our picture and theirs."""
 
 
 @dataclass(frozen=True)
@@ -164,50 +157,27 @@ def theirs(case: Case, view: Camera, texels: Float64Array, spp: int) -> Runs:
 
 def rendered(scene: mi.Scene, integrator: mi.Integrator, view: Camera, spp: int) -> Runs:
     """Render Mitsuba's scene by its integrator in independent runs."""
-    sensor = sensor_of(view, np.zeros(3), 1.0)
-    pictures = []
-    for seed in range(SEED_COUNT):
+    sensor, each = sensor_of(view, np.zeros(3), 1.0), spp // SEED_COUNT
+    given = {"sensor": sensor, "integrator": integrator}
+
+    def picture(seed: int) -> Float64Array:
         total = np.zeros((view.height, view.width, 3))
-        for own, count in passes(view, spp // SEED_COUNT, 7 + seed):
+        for own, count in passes(view, each, 7 + seed):
             with dr.suspend_grad():
-                picture = mi.render(
-                    scene, sensor=sensor, integrator=integrator, seed=own, spp=count
-                )
-            total += count * np.array(picture, np.float64)[..., :3]
-        pictures.append(total / (spp // SEED_COUNT))
-    return runs_of(pictures)
+                shot = mi.render(scene, **given, seed=own, spp=count)
+            total += count * np.array(shot, np.float64)[..., :3]
+        return total / each
+
+    return over_seeds(view, picture)
 
 
-def pictures_of(asset: Asset, view: Camera, texels: Float64Array, spp: int, depth: int) -> Runs:
+def pictures_of(asset: Asset, view: Camera, texels: FloatArray, spp: int, depth: int) -> Runs:
     """Render an asset by ours in as many runs."""
-    receiver = Receiver(np.array([0.0, 1.0, 0.0]), -1e3)
-    scene = Scene([Placed(asset, np.eye(4))], view, receiver, "cpu")
-    r = Renderer(scene)
-    light = light_args(Light(texels=texels.astype(np.float32)), r.device)
-    pixels, each = np.arange(view.width * view.height, dtype=np.int32), spp // SEED_COUNT
-    pictures = []
-    for seed in range(SEED_COUNT):
-        picture = r.foreground(light, pixels, each, 1, depth, seed).radiance
-        pictures.append(picture.reshape(view.height, view.width, 3).astype(np.float64))
-    return runs_of(pictures)
-
-
-def compare_cases(
-    about: str, known: dict[str, CaseT], render: Callable[[CaseT, Camera, FloatArray, int], Pair]
-) -> None:
-    """Print one line of JSON a comparison; ``render`` returns our picture of a case and theirs."""
-    parser = argparse.ArgumentParser(description=about)
-    parser.add_argument("--spp", type=int, default=4096)
-    parser.add_argument("--cases", nargs="*", default=list(known))
-    options = parser.parse_args()
-    view = camera(64, 64, 1.6)
-    # Every direction differs, and none is so bright that noise would hide an error.
-    texels = (2.0 * np.random.default_rng(5).random((16, 32, 3)) ** 3).astype(np.float32)
-    everywhere = np.ones((view.height, view.width, 3), bool)
-    for name in options.cases:
-        line = {"case": name, "spp": options.spp}
-        found, true = render(known[name], view, texels, options.spp)
-        print(json.dumps(line | compare(found, true, everywhere)), flush=True)
+    r = on_the_ground(asset, np.eye(4), view, height=-1e3)
+    light = light_args(Light(texels=texels), r.device)
+    pixels = np.arange(view.width * view.height, dtype=np.int32)
+    each = spp // SEED_COUNT
+    return over_seeds(view, lambda seed: r.foreground(light, pixels, each, 1, depth, seed).radiance)
 
 
 def both(case: Case, view: Camera, texels: FloatArray, spp: int) -> Pair:

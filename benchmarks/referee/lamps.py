@@ -9,46 +9,34 @@ render of its own in Mitsuba, and is added. Mitsuba's own ``path`` traces all of
 
 import argparse
 import json
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
-from typing import NamedTuple
 
 import mitsuba as mi
 import numpy as np
 
-from benchmarks.referee.sheet import block_sums
-from benchmarks.referee.subjects import ball, sun_and_sky
+from benchmarks.referee.ours import SEED_COUNT, Runs, over_seeds
+from benchmarks.referee.sheet import compare_runs
+from benchmarks.referee.subjects import ball, from_above, sun_and_sky
+from benchmarks.scenes import on_the_ground
 from warpir.core.arrays import Float64Array, FloatArray
 from warpir.mitsuba.render import ObjectScene, build, mean_and_variance, sums
 from warpir.render.device_light import light_args
-from warpir.render.device_scene import Placed, Receiver, Scene
 from warpir.render.renderer import Renderer
 from warpir.scene.asset import Asset, Material, Primitive
 from warpir.scene.camera import Camera
 from warpir.scene.light import Light
 from warpir.scene.near.lamps import Lamp, RectangleLamp, SphereLamp
 
-SEED_COUNT = 32
-"""Independent runs behind each variance."""
 GROUND = (0.0, 1.0, 0.0, 0.0)
 DARK = np.zeros((8, 16, 3), np.float32)
 HORIZON = 150.0
 """Where Mitsuba's ground ends, in radii of the object: further than the pictures show."""
-FLOOR = 1e-3
-"""Error that is granted, over the root mean square of a picture [1]."""
-BLOCK = 8
-"""Side of the blocks of pixels that are compared as one [px]."""
 POWER = np.array([60.0, 45.0, 30.0])
+Traced = tuple[mi.Color3f, mi.Bool]
+"""Radiance of a pass's samples, and which of them count."""
 GLOSS = Material(base_color=(0.7, 0.4, 0.2), metallic=0.3, roughness=0.35)
 PAPER = Material(base_color=(0.8, 0.8, 0.7), metallic=0.0, roughness=0.8, double_sided=True)
-
-
-def camera(width: int = 96, height: int = 64, eye: float = 2.0) -> Camera:
-    """Look down at the object from before it."""
-    pose, a = np.eye(4), np.radians(-20.0)
-    pose[1:3, 1:3] = [[np.cos(a), -np.sin(a)], [np.sin(a), np.cos(a)]]
-    pose[:3, 3] = (0.0, eye, 4.5)
-    return Camera(width, height, 96.0, 96.0, width / 2.0, height / 2.0, pose)
 
 
 def card(corner: tuple[float, ...], x: tuple[float, ...], y: tuple[float, ...]) -> Primitive:
@@ -114,25 +102,12 @@ def cases() -> dict[str, Case]:
     }
 
 
-class Runs(NamedTuple):
-    """Mean and its variance over runs, shape [H, W, 3] each."""
-
-    mean: Float64Array
-    variance: Float64Array
-
-
-def runs_of(pictures: list[Float64Array]) -> Runs:
-    """Return the moments of independent pictures."""
-    stack = np.stack(pictures)
-    return Runs(stack.mean(axis=0), stack.var(axis=0, ddof=1) / len(stack))
-
-
 def paths_of(
     made: ObjectScene, integrator: mi.Integrator, scene: mi.Scene | None = None
-) -> Callable[[int, int], tuple[mi.Color3f, mi.Bool]]:
+) -> Callable[[int, int], Traced]:
     """Return what traces a pass through a scene, or one like it, by an integrator of Mitsuba's."""
 
-    def trace(seed: int, spp: int) -> tuple[mi.Color3f, mi.Bool]:
+    def trace(seed: int, spp: int) -> Traced:
         sampler, _ = made.integrator.prepare(made.sensor, seed, spp)
         ray, _, _ = made.integrator.sample_rays(made.scene, made.sensor, sampler)
         L, seen, *_ = integrator.sample(scene or made.scene, sampler, ray)
@@ -141,45 +116,52 @@ def paths_of(
     return trace
 
 
+def traced(
+    view: Camera, spp: int, parts: Iterable[tuple[float, int, Callable[[int, int], Traced]]]
+) -> Runs:
+    """Return the sum of several scenes' pictures, each with its sign, seed and paths."""
+    mean, variance = np.zeros((2, view.height, view.width, 3))
+    for sign, seed, trace in parts:
+        moments, _ = sums(view, spp, seed, trace)
+        own = mean_and_variance(moments, spp)
+        mean, variance = mean + sign * own[0], variance + own[1]
+    return Runs(mean, variance)
+
+
 def theirs(case: Case, view: Camera, depth: int, spp: int, is_ground: bool) -> Runs:
     """Render by Mitsuba's path tracer: the object over black ground, or white ground beside it."""
     integrator = mi.load_dict({"type": "path", "max_depth": depth + 1, "hide_emitters": True})
-    parts: list[tuple[FloatArray, tuple[Lamp, ...]]] = [(DARK, case.lamps)]
+    lights: list[tuple[FloatArray, tuple[Lamp, ...]]] = [(DARK, case.lamps)]
     if case.texels is not None:
-        parts.append((case.texels, ()))
+        lights.append((case.texels, ()))
     ground = GROUND if is_ground or case.is_cut else None
-    shape = (view.height, view.width)
-    mean, variance = np.zeros((*shape, 3)), np.zeros((*shape, 3))
-    for k, (texels, lamps) in enumerate(parts):
+
+    def paths(texels: FloatArray, lamps: tuple[Lamp, ...]) -> Callable[[int, int], Traced]:
         lit = float(is_ground), lamps, HORIZON
-        made = build(case.asset, np.eye(4), view, texels, depth, ground, *lit)
-        moments, _ = sums(view, spp, 7 + k, paths_of(made, integrator))
-        parts_of = mean_and_variance(moments, spp)
-        mean, variance = mean + parts_of[0], variance + parts_of[1]
-    return Runs(mean, variance)
+        return paths_of(build(case.asset, np.eye(4), view, texels, depth, ground, *lit), integrator)
+
+    return traced(view, spp, ((1.0, 7 + k, paths(*light)) for k, light in enumerate(lights)))
 
 
 def renderer(case: Case, view: Camera, bounce_depth: int) -> Renderer:
     """Return ours, over the plane ``y = 0``."""
-    receiver = Receiver(np.array(GROUND[:3]), 0.0)
-    scene = Scene([Placed(case.asset, np.eye(4))], view, receiver, "cpu", case.lamps)
-    return Renderer(scene, bounce_depth=bounce_depth)
+    given = {"lamps": case.lamps, "bounce_depth": bounce_depth}
+    return on_the_ground(case.asset, np.eye(4), view, **given)
 
 
 def ours(case: Case, view: Camera, depth: int, spp: int, is_ground: bool) -> Runs:
     """Render the same; the ground by paths of ``depth`` interactions, that with it included."""
     r = renderer(case, view, depth - 1 if is_ground else 0)
-    texels = DARK if case.texels is None else case.texels
-    light, pixels = light_args(Light(texels=texels), r.device), np.arange(view.width * view.height)
-    pixels, each = pixels.astype(np.int32), spp // SEED_COUNT
-    pictures = []
-    for seed in range(SEED_COUNT):
+    light = light_args(Light(texels=DARK if case.texels is None else case.texels), r.device)
+    pixels = np.arange(view.width * view.height, dtype=np.int32)
+    may_see, each = np.ones_like(pixels), spp // SEED_COUNT
+
+    def picture(seed: int) -> FloatArray:
         if is_ground:
-            picture = r.receiver(light, pixels, np.ones_like(pixels), each, 1, seed).lit
-        else:
-            picture = r.foreground(light, pixels, each, 1, depth, seed).radiance
-        pictures.append(picture.reshape(view.height, view.width, 3).astype(np.float64))
-    return runs_of(pictures)
+            return r.receiver(light, pixels, may_see, each, 1, seed).lit
+        return r.foreground(light, pixels, each, 1, depth, seed).radiance
+
+    return over_seeds(view, picture)
 
 
 def clear_of(lamps: tuple[Lamp, ...], view: Camera) -> Float64Array:
@@ -198,40 +180,13 @@ def clear_of(lamps: tuple[Lamp, ...], view: Camera) -> Float64Array:
     return clear
 
 
-def compare(a: Runs, b: Runs, counts: Float64Array) -> dict[str, float]:
-    """Return z scores of pixels and of blocks, over pixels that count."""
-    # Where hardly a path brings light, the spread of samples says nothing of their error.
-    floor = FLOOR * np.sqrt(np.square(b.mean[counts & (b.mean != 0.0)]).mean())
-    variance = a.variance + b.variance + floor**2
-    seen = counts & ((a.mean != 0.0) | (b.mean != 0.0))
-    z = (a.mean - b.mean)[seen] / np.sqrt(variance[seen])
-    off, spread = (
-        block_sums(np.where(seen, plane, 0.0), BLOCK) for plane in (a.mean - b.mean, variance)
-    )
-    of_blocks = off[spread > 0.0] / np.sqrt(spread[spread > 0.0])
-    level = np.sqrt(np.square(b.mean[seen]).mean())
-    difference = (a.mean - b.mean)[seen]
-    return {
-        "pixels": int(seen.any(axis=-1).sum()),
-        "z_mean": float(z.mean()),
-        "z_std": float(z.std()),
-        "beyond_3": float((np.abs(z) > 3.0).mean()),
-        "block_z_std": float(of_blocks.std()),
-        "block_z_max": float(np.abs(of_blocks).max()),
-        "relative_rmse": float(np.sqrt(np.square(difference).mean()) / level),
-        "expected_rmse": float(np.sqrt(variance[seen].mean()) / level),
-        "relative_bias": float(difference.sum() / np.abs(b.mean[seen]).sum()),
-        "relative_bias_error": float(np.sqrt(variance[seen].sum()) / np.abs(b.mean[seen]).sum()),
-    }
-
-
 def main() -> None:
     """Print one line of JSON a comparison."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--spp", type=int, default=4096)
     parser.add_argument("--cases", nargs="*", default=list(cases()))
     options = parser.parse_args()
-    view = camera()
+    view = from_above()
     for name in options.cases:
         case = cases()[name]
         pixels = np.arange(view.width * view.height, dtype=np.int32)
@@ -250,7 +205,7 @@ def main() -> None:
                 true = theirs(case, view, depth, options.spp, is_ground)
                 line = {"case": name, "what": what, "depth": depth, "spp": options.spp}
                 counts = open_ground if is_ground else everywhere
-                print(json.dumps(line | compare(found, true, counts)), flush=True)
+                print(json.dumps(line | compare_runs(found, true, counts)), flush=True)
 
 
 if __name__ == "__main__":

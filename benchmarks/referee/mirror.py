@@ -15,23 +15,14 @@ from typing import Any
 import mitsuba as mi
 import numpy as np
 
-from benchmarks.referee.lamps import (
-    GROUND,
-    HORIZON,
-    SEED_COUNT,
-    Runs,
-    camera,
-    compare,
-    pair,
-    paths_of,
-    runs_of,
-)
-from benchmarks.referee.subjects import sun_and_sky
+from benchmarks.referee.lamps import GROUND, HORIZON, pair, paths_of, traced
+from benchmarks.referee.ours import SEED_COUNT, Runs, over_seeds
+from benchmarks.referee.sheet import compare_runs
+from benchmarks.referee.subjects import from_above, sun_and_sky
+from benchmarks.scenes import on_the_ground
 from warpir.core.arrays import FloatArray
-from warpir.mitsuba.render import build, mean_and_variance, sums
+from warpir.mitsuba.render import build
 from warpir.render.device_light import light_args
-from warpir.render.device_scene import Placed, Receiver, Scene
-from warpir.render.renderer import Renderer
 from warpir.scene.asset import Asset
 from warpir.scene.camera import Camera
 from warpir.scene.light import Light
@@ -43,15 +34,12 @@ ROUGHNESSES = (0.0, 0.1, 0.3)
 def theirs(asset: Asset, view: Camera, texels: FloatArray, roughness: float, spp: int) -> Runs:
     """Render the coat with the object and without it by Mitsuba's path tracer; the difference."""
     integrator = mi.load_dict({"type": "path", "max_depth": 3, "hide_emitters": True})
-    shape = (view.height, view.width)
-    mean, variance = np.zeros((*shape, 3)), np.zeros((*shape, 3))
+    parts = []
     for sign, is_there in ((1.0, True), (-1.0, False)):
         made = build(asset, np.eye(4), view, texels, 1, GROUND, 0.0, (), HORIZON, roughness)
         scene = made.scene if is_there else without_object(made.scene)
-        moments, _ = sums(view, spp, 7 + is_there, paths_of(made, integrator, scene))
-        parts = mean_and_variance(moments, spp)
-        mean, variance = mean + sign * parts[0], variance + parts[1]
-    return Runs(mean, variance)
+        parts.append((sign, 7 + is_there, paths_of(made, integrator, scene)))
+    return traced(view, spp, parts)
 
 
 def without_object(scene: mi.Scene) -> mi.Scene:
@@ -61,25 +49,18 @@ def without_object(scene: mi.Scene) -> mi.Scene:
     return mi.load_dict(kept)
 
 
-def renderer(asset: Asset, view: Camera) -> Renderer:
-    """Return ours, over the plane ``y = 0``."""
-    receiver = Receiver(np.array(GROUND[:3]), 0.0)
-    return Renderer(Scene([Placed(asset, np.eye(4))], view, receiver, "cpu"))
-
-
 def ours(asset: Asset, view: Camera, texels: FloatArray, roughness: float, spp: int) -> Runs:
     """Render image less what it hides."""
-    r = renderer(asset, view)
+    r = on_the_ground(asset, np.eye(4), view)
     light = light_args(Light(texels=texels), r.device)
     pixels = np.arange(view.width * view.height, dtype=np.int32)
-    pictures = []
-    for seed in range(SEED_COUNT):
-        image, hidden, _ = r.mirrored(
-            light, pixels, np.ones_like(pixels), roughness, spp // SEED_COUNT, 1, 1, seed
-        )
-        change = (image - hidden).reshape(view.height, view.width, 3)
-        pictures.append(change.astype(np.float64))
-    return runs_of(pictures)
+    may_see, each = np.ones_like(pixels), spp // SEED_COUNT
+
+    def picture(seed: int) -> FloatArray:
+        image, hidden, _ = r.mirrored(light, pixels, may_see, roughness, each, 1, 1, seed)
+        return image - hidden
+
+    return over_seeds(view, picture)
 
 
 def main() -> None:
@@ -88,17 +69,18 @@ def main() -> None:
     parser.add_argument("--spp", type=int, default=4096)
     parser.add_argument("--save", default=None, help="also write both pictures to this file (npz)")
     options = parser.parse_args()
-    asset, view = pair(), camera()
+    asset, view = pair(), from_above()
     texels = (sun_and_sky(np.random.default_rng(5), 16) / 8.0).astype(np.float32)
     # Our ground hides no light from the object: what comes from below stands for the ground's own.
     texels[len(texels) // 2 - 1 :] = 0.0
     open_ground = np.ones((view.height, view.width, 3), bool)
-    open_ground.reshape(-1, 3)[renderer(asset, view).gbuffer(3, 64).object_pixels] = False
+    gbuffer = on_the_ground(asset, np.eye(4), view).gbuffer(3, 64)
+    open_ground.reshape(-1, 3)[gbuffer.object_pixels] = False
     for roughness in ROUGHNESSES:
         found = ours(asset, view, texels, roughness, options.spp)
         true = theirs(asset, view, texels, roughness, options.spp)
         line = {"roughness": roughness, "spp": options.spp}
-        print(json.dumps(line | compare(found, true, open_ground)), flush=True)
+        print(json.dumps(line | compare_runs(found, true, open_ground)), flush=True)
         if options.save is not None:
             np.savez(f"{options.save}-{roughness}.npz", ours=found.mean, theirs=true.mean)
 

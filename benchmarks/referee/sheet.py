@@ -1,14 +1,29 @@
 """Statistics of two noisy renders of one scene, and a picture of both."""
 
+import argparse
+import json
+from collections.abc import Callable
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 
-from warpir.core.arrays import Float64Array
+from benchmarks.referee.ours import Runs
+from benchmarks.referee.subjects import from_above
+from benchmarks.scenes import write_picture
+from warpir.core.arrays import BoolArray, Float64Array, FloatArray
+from warpir.scene.camera import Camera
+
+FLOOR = 1e-3
+"""Error that is granted to runs, over the root mean square of a picture [1]."""
+BLOCK = 8
+"""Side of the blocks of pixels that are compared as one [px]."""
+CaseT = TypeVar("CaseT")
+Pair = tuple[Runs, Runs]
+"""Our picture and theirs."""
 
 
-def compare_images(candidate: Any, reference: Any, block: int = 8) -> dict[str, float | int]:
+def compare_images(candidate: Any, reference: Any) -> dict[str, float | int]:
     """Test whether two unbiased estimates share one mean.
 
     Single pixels show a local fault, blocks of pixels a small bias that noise hides in one.
@@ -18,7 +33,6 @@ def compare_images(candidate: Any, reference: Any, block: int = 8) -> dict[str, 
     Args:
         candidate: Mean, variance of the mean and coverage, as `warpir.mitsuba.render.Foreground`.
         reference: The same from the other renderer, independent samples.
-        block: Side of the blocks [px].
 
     Returns:
         Statistics of the z scores per pixel and channel (``z_*``, ``beyond_3``) and per block
@@ -29,7 +43,7 @@ def compare_images(candidate: Any, reference: Any, block: int = 8) -> dict[str, 
     variance = candidate.variance + reference.variance
     noisy = variance > 0.0
     z = difference[noisy] / np.sqrt(variance[noisy])
-    total, total_variance = block_sums(difference, block), block_sums(variance, block)
+    total, total_variance = block_sums(difference), block_sums(variance)
     used = total_variance > 0.0
     block_z = total[used] / np.sqrt(total_variance[used])
     power = reference.mean.sum()
@@ -56,6 +70,49 @@ def compare_images(candidate: Any, reference: Any, block: int = 8) -> dict[str, 
         "silent_differences": int(silent.sum()),
         "coverage_difference": float(np.abs(candidate.coverage - reference.coverage).max()),
     }
+
+
+def compare_runs(a: Runs, b: Runs, counts: BoolArray) -> dict[str, float]:
+    """Return z scores of pixels and of blocks, over pixels that count."""
+    # Where hardly a path brings light, the spread of samples says nothing of their error.
+    floor = FLOOR * np.sqrt(np.square(b.mean[counts & (b.mean != 0.0)]).mean())
+    variance = a.variance + b.variance + floor**2
+    seen = counts & ((a.mean != 0.0) | (b.mean != 0.0))
+    z = (a.mean - b.mean)[seen] / np.sqrt(variance[seen])
+    off, spread = (block_sums(np.where(seen, plane, 0.0)) for plane in (a.mean - b.mean, variance))
+    of_blocks = off[spread > 0.0] / np.sqrt(spread[spread > 0.0])
+    level = np.sqrt(np.square(b.mean[seen]).mean())
+    difference = (a.mean - b.mean)[seen]
+    return {
+        "pixels": int(seen.any(axis=-1).sum()),
+        "z_mean": float(z.mean()),
+        "z_std": float(z.std()),
+        "beyond_3": float((np.abs(z) > 3.0).mean()),
+        "block_z_std": float(of_blocks.std()),
+        "block_z_max": float(np.abs(of_blocks).max()),
+        "relative_rmse": float(np.sqrt(np.square(difference).mean()) / level),
+        "expected_rmse": float(np.sqrt(variance[seen].mean()) / level),
+        "relative_bias": float(difference.sum() / np.abs(b.mean[seen]).sum()),
+        "relative_bias_error": float(np.sqrt(variance[seen].sum()) / np.abs(b.mean[seen]).sum()),
+    }
+
+
+def compare_cases(
+    about: str, known: dict[str, CaseT], render: Callable[[CaseT, Camera, FloatArray, int], Pair]
+) -> None:
+    """Print one line of JSON a comparison; ``render`` returns our picture of a case and theirs."""
+    parser = argparse.ArgumentParser(description=about)
+    parser.add_argument("--spp", type=int, default=4096)
+    parser.add_argument("--cases", nargs="*", default=list(known))
+    options = parser.parse_args()
+    view = from_above(64, 64, 1.6)
+    # Every direction differs, and none is so bright that noise would hide an error.
+    texels = (2.0 * np.random.default_rng(5).random((16, 32, 3)) ** 3).astype(np.float32)
+    everywhere = np.ones((view.height, view.width, 3), bool)
+    for name in options.cases:
+        line = {"case": name, "spp": options.spp}
+        found, true = render(known[name], view, texels, options.spp)
+        print(json.dumps(line | compare_runs(found, true, everywhere)), flush=True)
 
 
 def display_rmse(candidate: Float64Array, reference: Float64Array) -> float:
@@ -86,16 +143,13 @@ def write_sheet(path: Path, candidate: Any, reference: Any) -> None:
         candidate: Left third, as `compare_images` takes it.
         reference: Middle third.
     """
-    from PIL import Image
-
     covered = reference.mean[reference.coverage > 0.5]
     white = float(np.percentile(covered, 95.0)) if covered.size else 1.0
     white = white or 1.0
     panels = [_display(image.mean / white) for image in (candidate, reference)]
-    panels.append(np.clip(0.5 + 5.0 * (candidate.mean - reference.mean) / white, 0.0, 1.0))
-    codes = np.round(255.0 * np.concatenate(panels, axis=1)).astype(np.uint8)
-    enlarged = np.repeat(np.repeat(codes, 3, axis=0), 3, axis=1)
-    Image.fromarray(enlarged).save(path)
+    panels.append(0.5 + 5.0 * (candidate.mean - reference.mean) / white)
+    sheet = np.concatenate(panels, axis=1)
+    write_picture(path, sheet.repeat(3, axis=0).repeat(3, axis=1))
 
 
 def _display(radiance: Float64Array) -> Float64Array:
@@ -104,8 +158,8 @@ def _display(radiance: Float64Array) -> Float64Array:
     return np.clip(x * (1.0 + x / 16.0) / (1.0 + x) * 1.5, 0.0, 1.0) ** (1.0 / 2.2)
 
 
-def block_sums(image: Float64Array, block: int) -> Float64Array:
+def block_sums(image: Float64Array) -> Float64Array:
     """Sums over whole blocks, shape [blocks down, blocks across, 3]."""
-    rows, columns = image.shape[0] // block, image.shape[1] // block
-    cut = image[: rows * block, : columns * block]
-    return cut.reshape(rows, block, columns, block, 3).sum(axis=(1, 3))
+    rows, columns = image.shape[0] // BLOCK, image.shape[1] // BLOCK
+    cut = image[: rows * BLOCK, : columns * BLOCK]
+    return cut.reshape(rows, BLOCK, columns, BLOCK, 3).sum(axis=(1, 3))

@@ -49,11 +49,7 @@ def square(material: Material, side: float, height: float, up: bool = False) -> 
 
 
 def view(
-    distance: float,
-    width: int = 32,
-    height: int = 32,
-    fov: float = 25.0,
-    turn: float = 0.0,
+    distance: float, width: int = 32, height: int = 32, fov: float = 25.0, turn: float = 0.0
 ) -> Camera:
     """Camera at ``(0, 0, distance)`` turned about +Y to look from another side, along -Z."""
     focal = 0.5 * width / np.tan(np.radians(0.5 * fov))
@@ -66,6 +62,14 @@ def view(
     ]
     c2w[:3, 3] = c2w[:3, :3] @ [0.0, 0.0, distance]
     return Camera(width, height, focal, focal, 0.5 * width, 0.5 * height, c2w)
+
+
+def from_above(width: int = 96, height: int = 64, eye: float = 2.0) -> Camera:
+    """Look down at the object from before it."""
+    pose, a = np.eye(4), np.radians(-20.0)
+    pose[1:3, 1:3] = [[np.cos(a), -np.sin(a)], [np.sin(a), np.cos(a)]]
+    pose[:3, 3] = (0.0, eye, 4.5)
+    return Camera(width, height, 96.0, 96.0, width / 2.0, height / 2.0, pose)
 
 
 def sun_and_sky(rng: np.random.Generator, rows: int = 32) -> FloatArray:

@@ -8,47 +8,49 @@ import sys
 from pathlib import Path
 from typing import Any
 
+from benchmarks.measure import table
+
+PERCENT = ("beyond_3", "relative_rmse", "expected_rmse", "display_rmse")
+
 
 def images(lines: list[dict[str, Any]]) -> str:
     """Return the table of foregrounds and shadow ratios."""
-    rows = [
-        "| scene | quantity | samples | z mean / std | beyond 3 | block z std / max "
-        "| relative RMSE (expected from noise) | display RMSE | bias |",
-        "|---|---|---|---|---|---|---|---|---|",
-    ]
+    head = ("scene", "quantity", "samples", "z mean / std", "beyond 3", "block z std / max")
+    head += ("relative RMSE (expected from noise)", "display RMSE", "bias")
+    rows = []
     for line in lines:
         if line["what"] == "gradient":
             continue
-        what = f"object, D = {line['depth']}"
-        if line["what"] == "shadow_ratio":
-            bounce = line.get("depth", 0)
-            what = "shadow ratio" + f", bounce of D = {bounce}" * bool(bounce)
+        depth = line.get("depth", 0)
+        what = "shadow ratio" + f", bounce of D = {depth}" * bool(depth)
+        if line["what"] == "foreground":
+            what = f"object, D = {depth}"
+        share = {name: f"{100 * line[name]:.2f} %" for name in PERCENT}
         rows.append(
-            f"| {line['scene']} | {what} | {line['spp']} | {line['z_mean']:.2f} / "
-            f"{line['z_std']:.2f} | {100 * line['beyond_3']:.2f} % | {line['block_z_std']:.2f} / "
-            f"{line['block_z_max']:.1f} | {100 * line['relative_rmse']:.2f} % "
-            f"({100 * line['expected_rmse']:.2f} %) | {100 * line['display_rmse']:.2f} % | "
-            f"{line['relative_bias']:+.1e} ± {line['relative_bias_error']:.0e} |"
+            (
+                *(line["scene"], what, str(line["spp"])),
+                f"{line['z_mean']:.2f} / {line['z_std']:.2f}",
+                share["beyond_3"],
+                f"{line['block_z_std']:.2f} / {line['block_z_max']:.1f}",
+                f"{share['relative_rmse']} ({share['expected_rmse']})",
+                share["display_rmse"],
+                f"{line['relative_bias']:+.1e} ± {line['relative_bias_error']:.0e}",
+            )
         )
-    return "\n".join(rows)
+    return table(head, rows)
 
 
 def gradients(lines: list[dict[str, Any]]) -> str:
     """Return the table of lobe gradients."""
-    rows = [
-        "| scene | D | samples | parameter | relative L2 (noise of both) | cosine |",
-        "|---|---|---|---|---|---|",
-    ]
-    for line in lines:
-        if line["what"] != "gradient":
-            continue
+    head = ("scene", "D", "samples", "parameter", "relative L2 (noise of both)", "cosine")
+    rows = []
+    for line in (line for line in lines if line["what"] == "gradient"):
         for name in ("amplitude", "axis", "sharpness"):
             match = line[name]
-            rows.append(
-                f"| {line['scene']} | {line['depth']} | {line['spp']} | {name} | "
-                f"{match['relative_l2']:.1e} ({match['noise_l2']:.1e}) | {match['cosine']:.7f} |"
-            )
-    return "\n".join(rows)
+            errors = f"{match['relative_l2']:.1e} ({match['noise_l2']:.1e})"
+            where = line["scene"], str(line["depth"]), str(line["spp"])
+            rows.append((*where, name, errors, f"{match['cosine']:.7f}"))
+    return table(head, rows)
 
 
 if __name__ == "__main__":
