@@ -4,6 +4,8 @@ Run as ``python -m benchmarks.referee.checks``; prints one line per check with t
 value, the expected one and the error in standard errors, and fails at the first that is wrong.
 """
 
+import io
+from contextlib import redirect_stdout
 from dataclasses import replace
 
 import numpy as np
@@ -49,19 +51,15 @@ def check_light(rng: np.random.Generator) -> None:
     j, i = np.floor(x).astype(int), np.floor(y).astype(int)
     a, b = (x - j)[:, None], (y - i)[:, None]
     k = np.minimum(i + 1, rows - 1)
-    truth = (texels[i, j % columns] * (1 - a) + texels[i, (j + 1) % columns] * a) * (1 - b) + (
-        texels[k, j % columns] * (1 - a) + texels[k, (j + 1) % columns] * a
-    ) * b
-    found = np.asarray(
-        emitter.radiance(mi.Vector3f(directions.T.astype(np.float32)), mi.Bool(True))
-    ).T
-    # One float32 rounding of u moves the reading by 6e-8 of a slope of peak * columns
-    report(
-        "light: largest difference to bilinear float64, of peak",
-        np.abs(found - truth).max() / texels.max(),
-        0.0,
-        6e-8 * columns,
+    upper, lower = (
+        texels[row, j % columns] * (1 - a) + texels[row, (j + 1) % columns] * a for row in (i, k)
     )
+    truth = upper * (1 - b) + lower * b
+    toward = mi.Vector3f(directions.T.astype(np.float32))
+    found = np.asarray(emitter.radiance(toward, mi.Bool(True))).T
+    # One float32 rounding of u moves the reading by 6e-8 of a slope of peak * columns
+    error = np.abs(found - truth).max() / texels.max()
+    report("light: largest difference to bilinear float64, of peak", error, 0.0, 6e-8 * columns)
 
     # Without the sun, whose density the test's own quadrature cannot integrate
     emitter = LatlongEmitter(rng.exponential(size=(8, 16, 3)).astype(np.float32) ** 3)
@@ -89,11 +87,8 @@ def chi2(name: str, draw: object, density: object, dimensions: int) -> None:
         res=101,
         ires=16,
     )
-    with open("/dev/null", "w") as sink:
-        from contextlib import redirect_stdout
-
-        with redirect_stdout(sink):
-            accepted = test.run(0.001)
+    with redirect_stdout(io.StringIO()):
+        accepted = test.run(0.001)
     print(f"{name:58s} chi-square p = {test.p_value:.3f}", flush=True)
     if not accepted:
         raise AssertionError(f"{name}: {test.messages}")
@@ -209,19 +204,12 @@ def check_textures(rng: np.random.Generator) -> None:
     """Read textures as Mitsuba's bitmap does, where that has the wrap mode."""
     codes = rng.integers(0, 256, size=(5, 7, 4), dtype=np.uint8)
     uv = mi.Point2f(rng.uniform(-3.0, 3.0, size=(2, 10000)).astype(np.float32))
-    for mode, theirs in (("repeat", "repeat"), ("clamp", "clamp"), ("mirror", "mirror")):
+    for mode in ("repeat", "clamp", "mirror"):
         image = Image(Texture(codes, mode, mode), TextureSlot(0), is_color=True)
         found = np.asarray(image.read(uv, mi.Bool(True)))[:3]
         linear = np.asarray(image.texels).reshape(5, 7, 4)[..., :3]
-        bitmap = mi.load_dict(
-            {
-                "type": "bitmap",
-                "data": mi.TensorXf(linear),
-                "raw": True,
-                "format": "variant",
-                "wrap_mode": theirs,
-            }
-        )
+        raw = {"data": mi.TensorXf(linear), "raw": True, "format": "variant"}
+        bitmap = mi.load_dict({"type": "bitmap", "wrap_mode": mode, **raw})
         si = dr.zeros(mi.SurfaceInteraction3f, 10000)
         si.uv = uv
         error = np.abs(np.asarray(bitmap.eval(si)) - found).max()
@@ -255,20 +243,12 @@ def check_energy() -> None:
         table = [furnace.directional_albedo(c, roughness, 1.0, metallic) for c in grid]
         expected = np.interp(cos_o, grid, table)
         error = float(np.sqrt(found.variance[inside][:, 0].sum())) / inside.sum()
-        report(
-            f"furnace: sphere, roughness {roughness}, metallic {metallic}",
-            found.mean[inside][:, 0].mean(),
-            expected.mean(),
-            error + 1e-4,
-        )
+        name = f"furnace: sphere, roughness {roughness}, metallic {metallic}"
+        report(name, found.mean[inside][:, 0].mean(), expected.mean(), error + 1e-4)
         if metallic == 1.0:
             margin = found.mean[..., 0] - 6.0 * np.sqrt(found.variance[..., 0])
-            report(
-                "furnace: white metal stays at or below 1, excess",
-                max(margin.max(), 1.0),
-                1.0,
-                1e-4,
-            )
+            excess = max(margin.max(), 1.0)
+            report("furnace: white metal stays at or below 1, excess", excess, 1.0, 1e-4)
 
 
 def check_lambert() -> None:
@@ -277,25 +257,19 @@ def check_lambert() -> None:
     camera = view(6.0)
     texels = np.ones((8, 16, 3), dtype=np.float32)
     setup = mitsuba_render.build(asset, np.eye(4), camera, texels, 1)
-    stock = mi.load_dict(
-        {
-            "type": "scene",
-            "light": LatlongEmitter(texels),
-            "sphere": {
-                "type": "sphere",
-                "bsdf": {"type": "diffuse", "reflectance": {"type": "rgb", "value": 1.0}},
-            },
-        }
-    )
-    image = np.asarray(
-        mi.render(
-            stock,
-            sensor=setup.sensor,
-            spp=1024,
-            integrator=mi.load_dict({"type": "path", "max_depth": 2, "hide_emitters": True}),
-        )
-    )
+    white = {"type": "diffuse", "reflectance": {"type": "rgb", "value": 1.0}}
+    ball = {"type": "sphere", "bsdf": white}
+    stock = mi.load_dict({"type": "scene", "light": LatlongEmitter(texels), "sphere": ball})
+    shot = mi.render(stock, sensor=setup.sensor, spp=1024, integrator=stock_integrator("path", 1))
+    image = np.asarray(shot)
     report("lambert: white sphere under uniform light", image[12:20, 12:20].mean(), 1.0, 1e-3)
+
+
+def stock_integrator(name: str, depth: int) -> mi.Integrator:
+    """Return Mitsuba's own integrator of that name, without Russian roulette."""
+    return mi.load_dict(
+        {"type": name, "max_depth": depth + 1, "rr_depth": 1000, "hide_emitters": True}
+    )
 
 
 def check_stock_integrators(rng: np.random.Generator) -> None:
@@ -319,19 +293,9 @@ def check_stock_integrators(rng: np.random.Generator) -> None:
         found = mitsuba_render.foreground(setting, depth, 1024, 5)
         setup = mitsuba_render.build(*setting, depth)
         for name in ("path", "prb"):
-            stock = mi.load_dict(
-                {"type": name, "max_depth": depth + 1, "rr_depth": 1000, "hide_emitters": True}
-            )
-            images = np.stack(
-                [
-                    np.asarray(
-                        mi.render(
-                            setup.scene, sensor=setup.sensor, spp=256, seed=k, integrator=stock
-                        )
-                    )
-                    for k in range(4)
-                ]
-            )
+            given = {"sensor": setup.sensor, "integrator": stock_integrator(name, depth)}
+            runs = (mi.render(setup.scene, **given, spp=256, seed=k) for k in range(4))
+            images = np.stack([np.asarray(run) for run in runs])
             sums = images.sum(axis=(1, 2, 3), dtype=np.float64)
             error = np.hypot(sums.std(ddof=1) / 2.0, np.sqrt(found.variance.sum()))
             # Mitsuba's ray offset is 20 times ours; 2e-4 of a length moves little light
@@ -355,21 +319,12 @@ def check_gradient(asset: Asset, camera: Camera, rng: np.random.Generator, depth
     parameters = mi.traverse(setup.scene)
     dr.enable_grad(parameters["light.texels"])
     parameters.update()
-    stock = mi.load_dict(
-        {"type": "prb", "max_depth": depth + 1, "rr_depth": 1000, "hide_emitters": True}
-    )
+    stock, d = stock_integrator("prb", depth), mi.TensorXf(d_image.astype(np.float32))
     ours, theirs = [], []
     for seed in range(6):
         ours.append(referee.foreground_gradient(setting, depth, 256, seed, d_image))
         dr.set_grad(parameters["light.texels"], 0.0)
-        stock.render_backward(
-            setup.scene,
-            parameters,
-            mi.TensorXf(d_image.astype(np.float32)),
-            setup.sensor,
-            100 + seed,
-            256,
-        )
+        stock.render_backward(setup.scene, parameters, d, setup.sensor, 100 + seed, 256)
         theirs.append(np.asarray(dr.grad(parameters["light.texels"]), dtype=np.float64))
     sums = np.array([(d_texels * texels).sum() for d_texels in ours])
     spread = float(np.sqrt((found.variance * d_image**2).sum()))
@@ -402,12 +357,8 @@ def check_coverage() -> None:
         asset = square(material, 2.0, 0.0, up=True)
         setting = Setting(asset, np.eye(4), view(6.0, fov=8.0, turn=turn), texels)
         found = mitsuba_render.foreground(setting, 2, 256, 1)
-        report(
-            f"coverage: {name}",
-            found.coverage.mean(),
-            expected,
-            np.sqrt(expected * (1.0 - expected) / 256.0 / 1024.0) + 1e-9,
-        )
+        error = np.sqrt(expected * (1.0 - expected) / 256.0 / 1024.0) + 1e-9
+        report(f"coverage: {name}", found.coverage.mean(), expected, error)
     # Emission is seen by the camera and by a bounce; the mask hides the rest
     glow = Material(base_color=(0.0,) * 3, roughness=1.0, emission=(2.0, 1.0, 0.5))
     lit = Setting(square(glow, 2.0, 0.0, up=True), np.eye(4), camera, np.zeros_like(texels))
@@ -444,12 +395,8 @@ def check_shadow() -> None:
         report("shadow: share of samples that see the plane", found.seen.mean(), 1.0, 1e-9)
     tiny = Setting(square(Material(), 1e-3, 40.0), np.eye(4), camera, texels)
     far = mitsuba_render.shadow(tiny, 64, 2)
-    report(
-        "shadow: ratio is exactly 1 far from the object",
-        np.abs(far.lit / far.unoccluded - 1.0).max(),
-        0.0,
-        1e-30,
-    )
+    off = np.abs(far.lit / far.unoccluded - 1.0).max()
+    report("shadow: ratio is exactly 1 far from the object", off, 0.0, 1e-30)
 
 
 def main() -> None:

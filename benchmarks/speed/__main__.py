@@ -13,7 +13,6 @@ A step is foreground and shadow ratio, forward and backward to the map. What is 
 
 import argparse
 import gc
-import json
 import sys
 import time
 from collections.abc import Sequence
@@ -25,11 +24,10 @@ from typing import Any
 import numpy as np
 import warp as wp
 
-from benchmarks.measure import context, flags
+from benchmarks.measure import context, flags, write_json
 from benchmarks.speed.candidates import (
     PARTS,
     Bench,
-    Candidate,
     Images,
     MisPart,
     MitsubaPart,
@@ -91,18 +89,17 @@ FULL = Plan(
     2,
     30.0,
 )
-QUICK = Plan(
-    96,
-    64,
-    ((32, 32),),
-    (4, 16, 64),
-    (4, 64, 1024),
-    ({},),
-    2048,
-    512,
-    3,
-    1,
-    2.0,
+QUICK = replace(
+    FULL,
+    width=96,
+    height=64,
+    maps=((32, 32),),
+    mis_spp=(4, 16, 64),
+    mitsuba_spp=(4, 64, 1024),
+    transport=({},),
+    rounds=3,
+    transport_rounds=1,
+    budget_s=2.0,
 )
 WARM_TRANSPORT = {"subsamples": 1, "bright_directions": 0, "paths": 1}
 
@@ -124,7 +121,7 @@ class Runs:
         """All timed seconds."""
         return sum(self.seconds_forward) + sum(self.seconds_step) + sum(self.seconds_traced)
 
-    def time(self, candidate: Candidate, seed: int) -> tuple[Images, Step]:
+    def time(self, candidate: MisPart | MitsubaPart | Transport, seed: int) -> tuple[Images, Step]:
         """Run the candidate forward and for one step."""
         start = time.perf_counter()
         images = candidate.forward(seed)
@@ -163,9 +160,7 @@ def log(text: str) -> None:
 STARTED = time.perf_counter()
 
 
-def measure_scene(
-    bench: Bench, plan: Plan, references: References, reasons: list[str]
-) -> list[dict[str, Any]]:
+def measure_scene(bench: Bench, plan: Plan, references: References) -> list[dict[str, Any]]:
     """Run every candidate of a scene in turn; return its rows."""
     parts: list[MisPart | MitsubaPart] = []
     for part in PARTS:
@@ -177,11 +172,7 @@ def measure_scene(
     wholes = [(plan.maps[0], settings) for settings in plan.transport]
     wholes += [(heights, plan.transport[0]) for heights in plan.maps[1:]]
     name = bench.scene.name
-    try:
-        Transport(bench, plan.maps[0], WARM_TRANSPORT, seed=0).warm()
-    except ImportError as error:
-        reasons.append(f"transport: {error}")
-        wholes = []
+    Transport(bench, plan.maps[0], WARM_TRANSPORT, seed=0).warm()
     warmed: set[tuple[Any, ...]] = set()
     for candidate in parts:
         if candidate.warm_key not in warmed:
@@ -233,8 +224,8 @@ def _measure_transport(
     """Trace once and time several steps; the frozen samples have one error, whatever the step."""
     bench.memory.start()
     transport = Transport(bench, heights, settings, seed)
-    runs.seconds_traced.append(transport.seconds_traced)
-    runs.bytes = transport.bytes
+    runs.seconds_traced.append(transport.traced.seconds_traced)
+    runs.bytes = transport.traced.bytes
     transport.warm()
     for k in range(TRANSPORT_STEPS):
         found = runs.time(transport, seed + k)
@@ -278,27 +269,16 @@ def _sweep_rows(
         if not all((part, spp) in found for part in PARTS):
             continue
         by_part = {part: _part(found[part, spp], part) for part in PARTS}
+        fg, ratio = by_part.values()
         settings: dict[str, Any] = {"spp": spp}
         if which == MitsubaPart.integrator:
             settings |= {"integrator": bench.mitsuba_integrator, "sampler": bench.sampler}
-        rows.append(
-            {
-                "integrator": which,
-                "settings": settings,
-                "heights": heights,
-                **{
-                    key: by_part["foreground"][key] + by_part["ratio"][key]
-                    for key in ("seconds_forward", "seconds_step")
-                },
-                **{
-                    key: combined(by_part["foreground"][key], by_part["ratio"][key])
-                    for key in ERRORS
-                },
-                # One after the other: the larger of the two
-                "peak_mib": round(max(found[part, spp].peak_mib for part in PARTS), 1),
-                "parts": by_part,
-            }
-        )
+        row = {"integrator": which, "settings": settings, "heights": heights}
+        row |= {key: fg[key] + ratio[key] for key in ("seconds_forward", "seconds_step")}
+        row |= {key: combined(fg[key], ratio[key]) for key in ERRORS}
+        # One after the other: the larger of the two
+        peak = max(found[part, spp].peak_mib for part in PARTS)
+        rows.append({**row, "peak_mib": round(peak, 1), "parts": by_part})
     return rows
 
 
@@ -376,18 +356,17 @@ def parse(arguments: list[str] | None) -> argparse.Namespace:
 
 def plan_of(options: argparse.Namespace) -> Plan:
     """Return the plan with what the options change in it."""
-    plan = QUICK if options.quick else FULL
-    plan = replace(
-        plan,
-        reference_spp=options.reference_spp or plan.reference_spp,
-        own_reference_spp=options.own_reference_spp or plan.own_reference_spp,
-        rounds=options.rounds or plan.rounds,
-        budget_s=options.budget or plan.budget_s,
-    )
+    asked = {
+        "reference_spp": options.reference_spp,
+        "own_reference_spp": options.own_reference_spp,
+        "rounds": options.rounds,
+        "budget_s": options.budget,
+    }
     if options.maps:
         pairs = [tuple(int(h) for h in pair.split(":")) for pair in options.maps]
-        plan = replace(plan, maps=tuple((pair[0], pair[-1]) for pair in pairs))
-    return plan
+        asked["maps"] = tuple((pair[0], pair[-1]) for pair in pairs)
+    plan = QUICK if options.quick else FULL
+    return replace(plan, **{name: value for name, value in asked.items() if value})
 
 
 @dataclass
@@ -407,7 +386,7 @@ class Found:
         bench = Bench(scene, plan.maps, options.sampler, not options.no_freeze)
         spp = plan.reference_spp, plan.own_reference_spp
         references = References(bench, *spp, options.cache, log)
-        self.rows += measure_scene(bench, plan, references, self.reasons)
+        self.rows += measure_scene(bench, plan, references)
         self.agreement += [
             {"scene": scene.name, "part": part, "height": height, **reference.agreement()}
             for (part, height), reference in references.by_map.items()
@@ -472,8 +451,7 @@ def main(arguments: list[str] | None = None) -> None:
         "seconds": round(time.perf_counter() - STARTED, 1),
     }
     result = found.result(conditions)
-    if options.json is not None:
-        options.json.write_text(json.dumps(result, indent=1) + "\n", encoding="utf-8")
+    write_json(options.json, result)
     print(summary(result))
     docs = options.docs or (None if options.quick else Path("docs"))
     if docs is not None:

@@ -1,12 +1,16 @@
 """What competes in `benchmarks.speed`, behind one interface each.
 
 `mis` and Mitsuba render foreground and shadow ratio apart, so that each part has a sweep of its
-own; `transport` makes both at once.
+own; `transport` makes both at once. Of each, ``warm`` compiles all that the timed calls use, and
+candidates of one ``warm_key`` compile the same kernels; ``forward`` and ``step`` render to the end,
+the latter with the gradient, and calling what they return downloads the result. `mis` samples an
+image without a gradient in other ways than one with, so each has an error of its own.
 """
 
+import os
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 import torch
@@ -16,8 +20,9 @@ from torch import Tensor
 from benchmarks.speed.memory import PeakMemory
 from benchmarks.speed.scenes import SpeedScene
 from warpir.core.arrays import Float64Array
-from warpir.render.integrator import Integrator, Radiance
+from warpir.render.integrator import Radiance
 from warpir.render.mis.integrator import MisIntegrator
+from warpir.render.transport.integrator import TransportIntegrator, TransportSettings
 from warpir.scene.light import Light
 
 PARTS = ("foreground", "ratio")
@@ -40,11 +45,7 @@ class Bench:
     """
 
     def __init__(
-        self,
-        scene: SpeedScene,
-        maps: Sequence[tuple[int, int]],
-        sampler: str = "ldsampler",
-        freeze: bool = True,
+        self, scene: SpeedScene, maps: Sequence[tuple[int, int]], sampler: str, freeze: bool
     ) -> None:
         from benchmarks.speed.mitsuba import MitsubaScene
 
@@ -62,10 +63,8 @@ class Bench:
         }
         self.memory = PeakMemory(scene.renderer.device)
         self.device = torch.device("cuda" if scene.renderer.device.is_cuda else "cpu")
-        self.weights = {
-            "foreground": torch.tensor(scene.weight_fg, device=self.device),
-            "ratio": torch.tensor(scene.weight_ratio, device=self.device),
-        }
+        weights = zip(PARTS, (scene.weight_fg, scene.weight_ratio), strict=True)
+        self.weights = {part: torch.tensor(w, device=self.device) for part, w in weights}
 
     def leaf(self, height: int, grad: bool = True) -> Tensor:
         """Upload a map as the optimiser holds it."""
@@ -76,27 +75,6 @@ class Bench:
         wp.synchronize_device(self.scene.renderer.device)
         if self.device.type == "cuda":
             torch.cuda.synchronize()
-
-
-class Candidate(Protocol):
-    """One renderer with its settings on one scene."""
-
-    integrator: str
-    warm_key: tuple[Any, ...]
-    """Candidates of one key compile the same kernels."""
-
-    def warm(self) -> None:
-        """Compile everything that the timed calls use."""
-
-    def forward(self, seed: int) -> Callable[[], Images]:
-        """Render, to the end; calling what is returned downloads the image.
-
-        `mis` samples an image without a gradient in other ways than one with, so each has an error
-        of its own.
-        """
-
-    def step(self, seed: int) -> Callable[[], Step]:
-        """Render and differentiate, to the end; calling what is returned downloads the result."""
 
 
 class MisPart:
@@ -124,18 +102,11 @@ class MisPart:
 
     def forward(self, seed: int) -> Callable[[], Images]:
         """Render."""
-        image = self._forward(seed)
-        self.bench.synchronize()
-        return lambda: {self.part: numpy(image)}
-
-    def image(self, seed: int) -> Float64Array:
-        """Return what `forward` renders, shape [pixel, 3]."""
-        return numpy(self._forward(seed))
-
-    def _forward(self, seed: int) -> Tensor:
         light = self.bench.leaf(self.height, grad=False)
         with torch.no_grad():
-            return self._image(self.mis.radiance(light, light, seed))
+            image = self._image(self.mis.radiance(light, light, seed))
+        self.bench.synchronize()
+        return lambda: {self.part: numpy(image)}
 
     def step(self, seed: int) -> Callable[[], Step]:
         """Render and differentiate."""
@@ -169,28 +140,26 @@ class MitsubaPart:
 
     def forward(self, seed: int) -> Callable[[], Images]:
         """Render."""
-        if self.part == "foreground":
-            image = self.target.foreground(self.spp, seed)
-            mitsuba_synchronize()
-            return lambda: {self.part: self.target.objects(image)}
-        ratio = self.target.ratio(self.spp, seed)
+        render = self.target.foreground if self.part == "foreground" else self.target.ratio
+        image = render(self.spp, seed)
         mitsuba_synchronize()
-        return lambda: {self.part: np.asarray(ratio, np.float64).T}
+        return lambda: {self.part: self._rows(image)}
 
     def step(self, seed: int) -> Callable[[], Step]:
         """Render and differentiate; the foreground's two passes have seeds of their own."""
         if self.part == "foreground":
             image = self.target.foreground(self.spp, seed)
             gradient = self.target.foreground_gradient(self.spp, seed + 50_000)
-            mitsuba_synchronize()
-            return lambda: {
-                self.part: (self.target.objects(image), np.asarray(gradient, dtype=np.float64))
-            }
-        ratio, gradient = self.target.ratio_step(self.spp, seed)
+        else:
+            image, gradient = self.target.ratio_step(self.spp, seed)
         mitsuba_synchronize()
-        return lambda: {
-            self.part: (np.asarray(ratio, np.float64).T, np.asarray(gradient, dtype=np.float64))
-        }
+        return lambda: {self.part: (self._rows(image), np.asarray(gradient, np.float64))}
+
+    def _rows(self, image: Any) -> Float64Array:
+        """Download an image of Mitsuba's, shape [pixel, 3]."""
+        if self.part == "foreground":
+            return self.target.objects(image)
+        return np.asarray(image, np.float64).T
 
 
 class Transport:
@@ -202,9 +171,6 @@ class Transport:
         settings: Fields of ``TransportSettings``, and ``expects_light``: whether tracing puts
             directions where this scene's light is, or evenly everywhere.
         seed: Base seed of the frozen samples.
-
-    Raises:
-        ImportError: This checkout has no `transport`.
     """
 
     integrator = "transport"
@@ -212,14 +178,11 @@ class Transport:
     def __init__(
         self, bench: Bench, heights: tuple[int, int], settings: dict[str, Any], seed: int
     ) -> None:
-        from warpir.render.transport.integrator import TransportIntegrator, TransportSettings
-
         self.bench, self.heights = bench, heights
         self.warm_key = (self.integrator,)
         fields = {k: v for k, v in settings.items() if k != "expects_light"}
         scene = bench.scene
-        self.traced: Integrator
-        self.traced = made = TransportIntegrator(
+        self.traced = TransportIntegrator(
             scene.renderer,
             scene.object_pixels,
             scene.receiver_pixels,
@@ -228,8 +191,6 @@ class Transport:
             expected=Light(scene.lobes) if settings.get("expects_light", True) else None,
             seed=seed,
         )
-        self.seconds_traced = float(made.seconds_traced)
-        self.bytes = int(made.bytes)
 
     def warm(self) -> None:
         """Touch everything once."""
@@ -285,8 +246,6 @@ def use_device(device: str, threads: int) -> None:
 
     Must come before anything imports `benchmarks.speed.mitsuba`.
     """
-    import os
-
     if device == "cpu" and "DRJIT_LIBLLVM_PATH" not in os.environ:
         # LLVM 15, which Dr.Jit may find first, aborts in code generation
         found = sorted(Path("/usr/lib").glob("*/libLLVM.so.2?.*"))

@@ -8,8 +8,6 @@ memory is; kernels are compiled before. Writes ``docs/speed/cost/DEVICE.json`` a
 ``docs/speed_cost.png``, which ``docs/speed_against_error.md`` shows; ``--quick`` writes nothing.
 """
 
-from __future__ import annotations
-
 import json
 import subprocess
 import sys
@@ -19,6 +17,19 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import warp as wp
+
+from benchmarks.measure import context, flags, peak_mib, table, write_json
+from benchmarks.scenes import on_the_ground
+from benchmarks.speed.scenes import sun_and_sky, uv_ball
+from warpir.core.memory import core_count
+from warpir.render.device import choose_device
+from warpir.render.picture.planes import Quality, render
+from warpir.scene.asset import Asset, Material
+from warpir.scene.camera import camera_from_fov
+from warpir.scene.light import Light, rasterize_lobes
+from warpir.scene.placement import place_asset
+from warpir.scene.tone_curves import Curves
 
 BASE = {"width": 1024, "triangles": 65_000, "samples": 64}
 SWEEPS: dict[str, tuple[int, ...]] = {
@@ -46,24 +57,10 @@ def render_one(width: int, triangles: int, samples: int, device: str) -> dict[st
 
     Memory is that of the process [MiB], of the card on CUDA.
     """
-    import warp as wp
-
-    from benchmarks.measure import context, peak_mib
-    from benchmarks.speed.scenes import on_the_ground, sun_and_sky, uv_ball
-    from warpir.core.memory import core_count
-    from warpir.render.picture.planes import Quality, render
-    from warpir.scene.asset import Asset, Material
-    from warpir.scene.camera import camera_from_fov
-    from warpir.scene.light import Light, rasterize_lobes
-    from warpir.scene.placement import place_asset
-    from warpir.scene.tone_curves import Curves
-
     camera = camera_from_fov(width, width * 2 // 3, 40.0, -12.0, 1.4)
     rows = max(8, round(np.sqrt(triangles / 4.0)))
     asset = Asset("ball", (uv_ball(rows, 2 * rows),), (Material(roughness=0.4),))
-    placement = place_asset(
-        *asset.bounds(), camera, None, place=(-0.3, 0.0, -5.5), rotate_y=0.0, size=1.5
-    )
+    pose = place_asset(*asset.bounds(), camera, place=(-0.3, 0.0, -5.5), size=1.5).asset_to_world
     curves = Curves.identity("reinhard")
     light = Light(None, rasterize_lobes(sun_and_sky(), 256, 512))
 
@@ -73,7 +70,7 @@ def render_one(width: int, triangles: int, samples: int, device: str) -> dict[st
         wp.synchronize_device(own.device)
 
     start = time.perf_counter()
-    own = on_the_ground(asset, placement.asset_to_world, camera, device, BOUNCE_DEPTH)
+    own = on_the_ground(asset, pose, camera, device, bounce_depth=BOUNCE_DEPTH)
     wp.synchronize_device(own.device)
     built = time.perf_counter() - start
     picture(1, 1)
@@ -106,17 +103,15 @@ def sweep(device: str, sweeps: dict[str, tuple[int, ...]]) -> list[dict[str, Any
             if done.returncode:
                 sys.exit(f"{point}: {done.stderr.strip()[-400:]}")
             rows.append({"sweep": name, **json.loads(done.stdout.splitlines()[-1])})
-            print(cost_line(rows[-1]), flush=True)
+            print(f"| {' | '.join(cost_cells(rows[-1]))} |", flush=True)
     return rows
 
 
-def cost_line(row: dict[str, Any]) -> str:
+def cost_cells(row: dict[str, Any]) -> tuple[str, ...]:
     """Return a row of the table."""
-    return (
-        f"| {row['width']} | {row['triangles']:,} | {row['samples']} "
-        f"| {row['seconds_scene']:.3g} s | {row['seconds_picture']:.3g} s "
-        f"| {row['peak_mib']:.0f} MiB |"
-    )
+    what = str(row["width"]), f"{row['triangles']:,}", str(row["samples"])
+    seconds = f"{row['seconds_scene']:.3g} s", f"{row['seconds_picture']:.3g} s"
+    return (*what, *seconds, f"{row['peak_mib']:.0f} MiB")
 
 
 def cost_text(runs: Sequence[dict[str, Any]]) -> str:
@@ -129,16 +124,12 @@ def cost_text(runs: Sequence[dict[str, Any]]) -> str:
         f"![Seconds of a picture]({PLOT.name})",
     ]
     for run in runs:
-        rows = run["rows"]
-        here = rows[0]
+        rows, here = run["rows"], run["rows"][0]
         text.append(
             f"{here['device']}, {here['date']}, commit {here['commit']}, rays: {here['rays']}"
         )
-        head = [
-            "| width | triangles | samples | scene | picture | peak |",
-            "|---|---|---|---|---|---|",
-        ]
-        text.append("\n".join([*head, *map(cost_line, rows)]))
+        head = ("width", "triangles", "samples", "scene", "picture", "peak")
+        text.append(table(head, map(cost_cells, rows)))
     return "\n\n".join(text)
 
 
@@ -181,10 +172,7 @@ def kept_runs(folder: Path) -> list[dict[str, Any]]:
 
 def main() -> None:
     """Measure and, unless it is to be quick, keep the run and draw the plot."""
-    from benchmarks.measure import flags
-    from warpir.render.device import choose_device
-
-    parser = flags(__doc__, has_assets=False)
+    parser = flags(__doc__, "device", "json")
     parser.add_argument("--quick", action="store_true", help="two small pictures a sweep")
     parser.add_argument("--one", type=int, nargs=3, metavar=("WIDTH", "TRIANGLES", "SAMPLES"))
     options = parser.parse_args()
@@ -194,12 +182,11 @@ def main() -> None:
         print(json.dumps(render_one(width, triangles, samples, device)))
         return
     rows = sweep(device, QUICK if options.quick else SWEEPS)
-    if options.json:
-        options.json.write_text(json.dumps({"rows": rows}, indent=1) + "\n", encoding="utf-8")
+    write_json(options.json, {"rows": rows})
     if not options.quick:
         RUNS.mkdir(parents=True, exist_ok=True)
         name = rows[0]["device"].lower().replace(" ", "_")
-        (RUNS / f"{name}.json").write_text(json.dumps({"rows": rows}, indent=1) + "\n", "utf-8")
+        write_json(RUNS / f"{name}.json", {"rows": rows})
         plot(kept_runs(RUNS), PLOT)
 
 

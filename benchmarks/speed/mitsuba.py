@@ -6,7 +6,7 @@ is blocked. Set the variant before importing this module.
 """
 
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import drjit as dr
@@ -19,7 +19,7 @@ from warpir.core.arrays import Float64Array, FloatArray, PixelArray
 from warpir.mitsuba.light import LatlongEmitter
 from warpir.mitsuba.plane import ObjectScene
 from warpir.mitsuba.render import build
-from warpir.scene.camera import Camera
+from warpir.scene.camera import Camera, mitsuba_sensor
 
 PASS_SAMPLES = {"llvm_ad_rgb": 1 << 25, "cuda_ad_rgb": 1 << 28}
 """Camera samples traced at once; bounds memory. Passes are long, as only samples of one pass are
@@ -28,20 +28,18 @@ stratified together."""
 
 @dataclass
 class ReceiverSamples:
-    """What the lookups of one pass need: two directions per camera sample, detached."""
+    """What the lookups of one pass need: two directions per camera sample, detached.
 
-    d_light: Any
-    """Direction of the emitter sample, world frame."""
-    weight_light: Any
-    """Factor on its radiance without the object [1]."""
-    free_light: Any
-    """Whether it passes the object."""
-    d_cosine: Any
-    """Direction of the cosine sample, world frame."""
-    weight_cosine: Any
-    """Factor on its radiance without the object [1]."""
-    free_cosine: Any
-    """Whether it passes the object."""
+    Of each the direction in the world frame, the factor on its radiance without the object [1], and
+    whether it passes the object.
+    """
+
+    d_light: mi.Vector3f
+    weight_light: mi.Float
+    free_light: mi.Bool
+    d_cosine: mi.Vector3f
+    weight_cosine: mi.Float
+    free_cosine: mi.Bool
 
 
 class MitsubaScene:
@@ -62,9 +60,9 @@ class MitsubaScene:
         self,
         scene: SpeedScene,
         texels: FloatArray,
-        integrator: str = "prb",
-        sampler: str = "ldsampler",
-        freeze: bool = True,
+        integrator: str,
+        sampler: str,
+        freeze: bool,
     ) -> None:
         self.sampler = sampler
         self.setup = build(scene.asset, scene.matrix, scene.camera, texels, scene.depth)
@@ -76,7 +74,7 @@ class MitsubaScene:
         self.rows_of_objects = (rows - top) * self.crop[1] + columns - left
         self.plane_height = float(-self.setup.center[1] / self.setup.radius)
         self.crop_offset = (left, top)
-        self.width = scene.camera.width
+        self.width = width
         # The referee's, which knows whether rays pass through glass
         self.integrator = self.setup.integrator
         if integrator != "gltf_path":
@@ -274,11 +272,8 @@ class MitsubaScene:
         ds, _ = emitter.sample_direction(it, sampler.next_2d(), seen)
         cos_i = dr.maximum(ds.d.y, 0.0)
         active = seen & (cos_i > 0.0) & (ds.pdf > 0.0)
-        by_light = dr.select(
-            active,
-            cos_i * dr.inv_pi / ds.pdf * mis_weight(ds.pdf, cos_i * dr.inv_pi),
-            0.0,
-        )
+        by_light = cos_i * dr.inv_pi / ds.pdf * mis_weight(ds.pdf, cos_i * dr.inv_pi)
+        by_light = dr.select(active, by_light, 0.0)
         free_light = free(ds.d, active)
 
         local = mi.warp.square_to_cosine_hemisphere(sampler.next_2d())
@@ -301,31 +296,22 @@ def _passes(pixels: int, spp: int, seed: int) -> Iterator[tuple[mi.UInt32, int]]
 def _sensor(
     camera: Camera, setup: ObjectScene, crop: tuple[int, int, int, int], sampler: str
 ) -> mi.Sensor:
-    """Mitsuba camera in the unit frame, see `benchmarks.referee`; crop is left, top, size."""
+    """Mitsuba camera in the unit frame, see `warpir.mitsuba.render`; crop is left, top, size."""
     c2w = camera.c2w.copy()
     c2w[:3, 3] = (c2w[:3, 3] - setup.center) / setup.radius
-    width, height = camera.width, camera.height
-    left, top, crop_width, crop_height = crop
+    view = mitsuba_sensor(replace(camera, c2w=c2w))
+    names = ("crop_offset_x", "crop_offset_y", "crop_width", "crop_height")
+    film = {"type": "hdrfilm", "width": camera.width, "height": camera.height}
+    film |= {"pixel_format": "rgb", "component_format": "float32", "rfilter": {"type": "box"}}
     return mi.load_dict(
         {
             "type": "perspective",
-            "to_world": mi.ScalarTransform4f(c2w @ np.diag([-1.0, 1.0, -1.0, 1.0])),
+            "to_world": mi.ScalarTransform4f(view["to_world"]),
             "fov_axis": "x",
-            "fov": float(np.degrees(2.0 * np.arctan(0.5 * width / camera.fx))),
-            "principal_point_offset_x": (0.5 * width - camera.cx) / width,
-            "principal_point_offset_y": (0.5 * height - camera.cy) / height,
-            "film": {
-                "type": "hdrfilm",
-                "width": width,
-                "height": height,
-                "crop_offset_x": left,
-                "crop_offset_y": top,
-                "crop_width": crop_width,
-                "crop_height": crop_height,
-                "pixel_format": "rgb",
-                "component_format": "float32",
-                "rfilter": {"type": "box"},
-            },
+            "fov": view["fov_deg"],
+            "principal_point_offset_x": view["principal_point_offset_x"],
+            "principal_point_offset_y": view["principal_point_offset_y"],
+            "film": {**film, **dict(zip(names, crop, strict=True))},
             "sampler": {"type": sampler},
         }
     )

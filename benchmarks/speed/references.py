@@ -143,14 +143,8 @@ class References:
             ).reshape(2, -1, 3)
             for height in self.bench.heights[part]:
                 reference = self.by_map[part, height]
-                own, other, *lobes = (
-                    image[reference.kept]
-                    for image in (
-                        reference.own[0].mean(axis=0),
-                        reference.mitsuba[0].mean(axis=0),
-                        *exact,
-                    )
-                )
+                images = (k[0].mean(axis=0) for k in (reference.own, reference.mitsuba))
+                own, other, *lobes = (image[reference.kept] for image in (*images, *exact))
                 apart = float(((own - lobes[0]) * (other - lobes[1])).mean())
                 size = float((lobes[0] * lobes[1]).mean())
                 found[part, height] = float(np.sqrt(max(apart, 0.0) / size))
@@ -196,16 +190,15 @@ class References:
 def quiet(variance: Float64Array) -> BoolArray:
     """Return which pixels are not among the noisiest, shape [pixel]."""
     kept = np.ones(len(variance), bool)
-    kept[np.argsort(variance, kind="stable")[len(variance) - int(TRIMMED * len(variance)) :]] = (
-        False
-    )
+    noisiest = len(variance) - int(TRIMMED * len(variance))
+    kept[np.argsort(variance, kind="stable")[noisiest:]] = False
     return kept
 
 
 def _variance(bench: Bench, part: str, height: int) -> Float64Array:
     """Variance of `mis` over seeds, summed over channels, shape [pixel]."""
     run = MisPart(bench, part, height, PILOT_SPP)
-    images = np.stack([run.image(SEED // 2 + k) for k in range(PILOT_RUNS)])
+    images = np.stack([run.forward(SEED // 2 + k)()[part] for k in range(PILOT_RUNS)])
     variance: Float64Array = images.var(axis=0).sum(axis=-1)
     return variance
 

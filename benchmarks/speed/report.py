@@ -8,11 +8,13 @@ writes both again from ``DOCS/speed/*.json``, after another device's file was pu
 import json
 import re
 import sys
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
+from benchmarks.measure import table, write_json
 from benchmarks.speed.cost import cost_text, kept_runs
+from benchmarks.speed.ratios import STEPS
 
 NAME = "speed_against_error"
 STYLES = {
@@ -20,7 +22,6 @@ STYLES = {
     "mis": ("mis", "tab:orange", "s"),
     "transport": ("transport, one step", "tab:green", "*"),
 }
-STEPS = 600
 
 INTRODUCTION = """# Speed against error: `mis`, `transport` and Mitsuba 3
 
@@ -85,13 +86,6 @@ def settings_text(settings: dict[str, Any]) -> str:
     return ", ".join(f"{k} {v}" for k, v in settings.items())
 
 
-def table(head: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
-    """Write a Markdown table."""
-    lines = ["| " + " | ".join(head) + " |", "|" + "---|" * len(head)]
-    lines += ["| " + " | ".join(row) + " |" for row in rows]
-    return "\n".join(lines)
-
-
 def times(value: float | None, at_least: bool) -> str:
     """Write a ratio."""
     return "-" if value is None else f"{'>= ' if at_least else ''}{number(value)} x"
@@ -99,42 +93,26 @@ def times(value: float | None, at_least: bool) -> str:
 
 def transport_table(result: dict[str, Any]) -> str:
     """Write the ratios of `transport`."""
-    head = (
-        "scene",
-        "map",
-        "transport",
-        "tracing",
-        "step",
-        "Mitsuba's step at equal image / gradient",
-        "**step**",
-        "**600 steps**",
-        "level after",
-    )
+    head = ("scene", "map", "transport", "tracing", "step")
+    head += ("Mitsuba's step at equal image / gradient", "**step**", "**600 steps**", "level after")
 
     def seconds(entry: dict[str, Any], name: str) -> str:
         bound = ">= " if entry[f"mitsuba_at_least_by_{name}"] else ""
         return f"{bound}{number(entry[f'mitsuba_seconds_step_by_{name}'])} s"
 
-    return table(
-        head,
-        (
-            (
-                record["scene"],
-                record["map"],
-                settings_text(entry["settings"]),
-                f"{number(entry['seconds_traced'])} s",
-                f"{number(1000.0 * entry['seconds_step'])} ms",
-                f"{seconds(entry, 'image')} / {seconds(entry, 'gradient')}",
-                times(entry["step"], entry["at_least"]),
-                times(entry["run_600"], entry["at_least"]),
-                "never"
-                if entry["break_even_steps"] is None
-                else f"{number(entry['break_even_steps'], 2)} steps",
-            )
-            for record in result["ratios"]
-            for entry in record["transport"]
-        ),
-    )
+    def cells(record: dict[str, Any], entry: dict[str, Any]) -> tuple[str, ...]:
+        level = entry["break_even_steps"]
+        return (
+            *(record["scene"], record["map"], settings_text(entry["settings"])),
+            f"{number(entry['seconds_traced'])} s",
+            f"{number(1000.0 * entry['seconds_step'])} ms",
+            f"{seconds(entry, 'image')} / {seconds(entry, 'gradient')}",
+            *(times(entry[name], entry["at_least"]) for name in ("step", "run_600")),
+            "never" if level is None else f"{number(level, 2)} steps",
+        )
+
+    rows = (cells(record, entry) for record in result["ratios"] for entry in record["transport"])
+    return table(head, rows)
 
 
 def mis_table(result: dict[str, Any]) -> str:
@@ -143,38 +121,19 @@ def mis_table(result: dict[str, Any]) -> str:
     def cell(entry: dict[str, float]) -> str:
         return f"{times(entry['ratio'], False)} at {percent(entry['rmse'])}"
 
-    return table(
-        ("scene", "map", "forward, image", "step, image", "step, gradient"),
-        (
-            (
-                record["scene"],
-                record["map"],
-                *(cell(record["mis"][k]) for k in ("forward_image", "step_image", "step_gradient")),
-            )
-            for record in result["ratios"]
-            if record["mis"]
-        ),
+    names = ("forward_image", "step_image", "step_gradient")
+    rows = (
+        (record["scene"], record["map"], *(cell(record["mis"][name]) for name in names))
+        for record in result["ratios"]
+        if record["mis"]
     )
+    return table(("scene", "map", "forward, image", "step, image", "step, gradient"), rows)
 
 
 def row_table(result: dict[str, Any]) -> str:
     """Write what was measured."""
-    head = (
-        "scene",
-        "map",
-        "integrator",
-        "settings",
-        "tracing",
-        "forward",
-        "its image",
-        "step",
-        "image",
-        "all",
-        "gradient",
-        "object / ratio",
-        "gradient of object / ratio",
-        "MiB",
-    )
+    head = ("scene", "map", "integrator", "settings", "tracing", "forward", "its image", "step")
+    head += ("image", "all", "gradient", "object / ratio", "gradient of object / ratio", "MiB")
 
     def pair(row: dict[str, Any], name: str) -> str:
         return " / ".join(percent(row["parts"][p][name]) for p in ("foreground", "ratio"))
@@ -182,19 +141,13 @@ def row_table(result: dict[str, Any]) -> str:
     def cells(row: dict[str, Any]) -> tuple[str, ...]:
         traced = row.get("seconds_traced")
         return (
-            row["scene"],
-            row["map"],
-            row["integrator"],
-            settings_text(row["settings"]),
+            *(row["scene"], row["map"], row["integrator"], settings_text(row["settings"])),
             "" if traced is None else f"{number(traced)} s",
             f"{number(1000.0 * row['seconds_forward'])} ms",
             percent(row.get("rmse_forward", row["rmse_image"])),
             f"{number(1000.0 * row['seconds_step'])} ms",
-            percent(row["rmse_image"]),
-            percent(row["rmse_image_all"]),
-            percent(row["rmse_gradient"]),
-            pair(row, "rmse_image"),
-            pair(row, "rmse_gradient"),
+            *(percent(row[f"rmse_{name}"]) for name in ("image", "image_all", "gradient")),
+            *(pair(row, name) for name in ("rmse_image", "rmse_gradient")),
             number(row["peak_mib"]),
         )
 
@@ -259,7 +212,7 @@ def keep_run(result: dict[str, Any], docs: Path) -> Path:
     slug = re.sub(r"[^a-z0-9]+", "_", result["conditions"]["device"].lower()).strip("_")
     path = docs / "speed" / f"{slug}.json"
     path.parent.mkdir(parents=True, exist_ok=True)
-    path.write_text(json.dumps(result, indent=1) + "\n", encoding="utf-8")
+    write_json(path, result)
     return path
 
 
@@ -336,23 +289,16 @@ def _panel(axis: Any, rows: list[dict[str, Any]], key: str) -> None:
             for a, b, e in zip(x, whole, y, strict=True):
                 axis.plot([a, b], [e, e], color=color, linewidth=0.8, alpha=0.6)
             axis.plot(x, y, marker, color=color, markersize=11, label=label)
-            axis.plot(
-                whole,
-                y,
-                marker,
-                color=color,
-                markersize=11,
-                markerfacecolor="white",
-                label=f"transport, mean of {STEPS} steps and tracing",
-            )
+            hollow = {"markersize": 11, "markerfacecolor": "white"}
+            label = f"transport, mean of {STEPS} steps and tracing"
+            axis.plot(whole, y, marker, color=color, label=label, **hollow)
         else:
             axis.plot(x, y, marker=marker, color=color, markersize=5, label=label)
     axis.set_xscale("log")
     axis.set_yscale("log")
     axis.grid(True, which="major", alpha=0.4)
     axis.grid(True, which="minor", alpha=0.12)
-    ticks: Callable[..., Any] = axis.tick_params
-    ticks(labelsize=8)
+    axis.tick_params(labelsize=8)
     from matplotlib.ticker import FuncFormatter, LogLocator
 
     axis.yaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))

@@ -10,6 +10,7 @@ from pathlib import Path
 
 import numpy as np
 
+from benchmarks.scenes import on_the_ground
 from benchmarks.speed.textured import textured_heap
 from warpir.core.arrays import Float64Array, FloatArray, IntArray
 from warpir.core.latlong import resize_map
@@ -17,7 +18,6 @@ from warpir.io.assets import load_asset
 from warpir.io.images.photos import read_envmap
 from warpir.lighting.fit import fit_lobes
 from warpir.render.device_light import light_args
-from warpir.render.device_scene import Placed, Receiver, Scene
 from warpir.render.renderer import Renderer
 from warpir.render.shadow.pilot import shaded_pixels
 from warpir.scene.asset import Asset, Material, Primitive
@@ -129,15 +129,7 @@ def panorama_lobes(path: Path) -> Lobes:
 def make_scene(
     name: str, width: int, height: int, assets: Path, device: str, threads: int
 ) -> SpeedScene:
-    """Build a scene.
-
-    Args:
-        name: One of `NAMES`.
-        width: Image width [px].
-        height: Image height [px].
-        assets: Folder that holds ``mesh/`` and ``hdri/``.
-        device: Warp device.
-        threads: CPU threads.
+    """Build one of `NAMES`, in pictures of that width and height [px].
 
     Raises:
         FileNotFoundError: A file of the scene is absent.
@@ -151,9 +143,8 @@ def make_scene(
     object_pixels = renderer.gbuffer(seed=1, spp=COVERAGE_SAMPLES).object_pixels
     light = light_args(Light(lobes), renderer.device)
     hidden = np.zeros(width * height)
-    hidden[object_pixels] = renderer.foreground(
-        light, object_pixels, COVERAGE_SAMPLES, 1, 1, seed=2
-    ).mask
+    seen = renderer.foreground(light, object_pixels, COVERAGE_SAMPLES, 1, 1, seed=2)
+    hidden[object_pixels] = seen.mask
     shaded = shaded_pixels(renderer, light, seed=3)
     receiver_pixels = shaded[hidden[shaded] <= 0.5]
     weight = loss_weights(width, height)
@@ -189,15 +180,6 @@ def _contents(name: str, assets: Path) -> tuple[Asset, Lobes, int]:
         roughness=0.3 if metal else 0.6,
     )
     return Asset(name, (uv_ball(),), (material,)), sun_and_sky(), 3
-
-
-def on_the_ground(
-    asset: Asset, asset_to_world: Float64Array, camera: Camera, device: str, bounce_depth: int = 0
-) -> Renderer:
-    """Set an asset over the plane ``y = 0``."""
-    receiver = Receiver(np.array([0.0, 1.0, 0.0]), 0.0)
-    scene = Scene([Placed(asset, asset_to_world)], camera, receiver, device)
-    return Renderer(scene, bounce_depth=bounce_depth)
 
 
 def loss_weights(width: int, height: int, seed: int = 11) -> FloatArray:
