@@ -95,7 +95,6 @@ class Reader:
         assert process is not None and process.stdin is not None and process.stdout is not None
         process.stdin.write(json.dumps(request) + "\n")
         process.stdin.flush()
-        answer = ""
         if select.select([process.stdout], [], [], seconds)[0]:
             answer = process.stdout.readline()
             if answer:
@@ -147,8 +146,8 @@ def fault_of(form: Format, ended: Mapping[str, Any]) -> str:
     return ""
 
 
-def survey(form: Format, count: int, reader: Reader) -> Row:
-    """Damage a format's file and read it, so many times."""
+def survey(form: Format, count: int, reader: Reader, keep: Path | None = None) -> Row:
+    """Damage a format's file and read it, so many times; keep what makes a fault in a folder."""
     row = Row(form.name)
     with tempfile.TemporaryDirectory(prefix="warpir-flips-") as temporary:
         folder = Path(temporary)
@@ -177,17 +176,12 @@ def survey(form: Format, count: int, reader: Reader) -> Row:
             fault = fault_of(form, ended)
             if fault and fault not in row.faults:
                 row.faults.append(fault)
-                if KEPT is not None:
-                    KEPT.mkdir(parents=True, exist_ok=True)
+                if keep is not None:
                     name = f"{form.name.replace(' ', '_').replace('/', '_')}-{len(row.faults)}"
-                    write(form, content, KEPT / name)
+                    write(form, content, keep / name)
 
         meet()
     return row
-
-
-KEPT: Path | None = None
-"""Where files that make a fault are kept."""
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -198,15 +192,13 @@ def main(argv: Sequence[str] | None = None) -> int:
     parser.add_argument("--json", type=Path, help="where the table is written")
     parser.add_argument("--keep", type=Path, help="folder for files that make a fault")
     options = parser.parse_args(argv)
-    global KEPT
-    KEPT = options.keep
     rows = []
     print(f"{'format':26} {'tried':>6} {'s':>6} {'MB':>6}  exit codes")
     with Reader() as reader:
         for form in [*formats(), *weights()]:
             if options.only not in form.name:
                 continue
-            row = survey(form, options.count, reader)
+            row = survey(form, options.count, reader, options.keep)
             rows.append(row.record())
             codes = ", ".join(f"{code}: {count}" for code, count in sorted(row.codes.items()))
             print(f"{row.name:26} {row.tried:6} {row.seconds:6.2f} {row.bytes / 1e6:6.1f}  {codes}",
@@ -214,9 +206,8 @@ def main(argv: Sequence[str] | None = None) -> int:
             for fault in row.faults[:FAULTS_SHOWN]:
                 print(f"    {fault}", flush=True)
     if options.json is not None:
-        options.json.write_text(
-            json.dumps({"count": options.count, "formats": rows}, indent=1) + "\n"
-        )
+        found = {"count": options.count, "formats": rows}
+        options.json.write_text(json.dumps(found, indent=1) + "\n")
     return int(any(row["faults"] for row in rows))
 
 

@@ -15,6 +15,9 @@ from typing import Any
 
 from hypothesis import strategies as st
 
+from tests.builders.gltf_files import pack_glb
+from tests.builders.image_files import png_chunk
+
 Bytes = st.SearchStrategy[bytes]
 
 HEAD = 300
@@ -46,9 +49,8 @@ def _damaged_once(draw: st.DrawFn, content: bytes) -> bytes:
     end = draw(st.sampled_from((min(HEAD, len(content)), len(content))))
     at = draw(st.integers(0, max(end - 1, 0)))
     size = draw(st.sampled_from((1, 2, 4, 8, 16, 100)))
-    match draw(
-        st.sampled_from(("flip", "byte", "number", "cut", "insert", "drop", "swap", "copy"))
-    ):
+    kinds = ("flip", "byte", "number", "cut", "insert", "drop", "swap", "copy")
+    match draw(st.sampled_from(kinds)):
         case "flip" if content:
             flipped = content[at] ^ (1 << draw(st.integers(0, 7)))
             return content[:at] + bytes([flipped]) + content[at + 1 :]
@@ -62,11 +64,8 @@ def _damaged_once(draw: st.DrawFn, content: bytes) -> bytes:
         case "cut":
             return content[:at]
         case "insert":
-            return (
-                content[:at]
-                + bytes([draw(st.sampled_from((0, 255, 65, 10)))]) * size
-                + content[at:]
-            )
+            inserted = bytes([draw(st.sampled_from((0, 255, 65, 10)))]) * size
+            return content[:at] + inserted + content[at:]
         case "drop":
             return content[:at] + content[at + size :]
         case "swap":
@@ -186,11 +185,7 @@ def png_chunks(content: bytes) -> list[tuple[bytes, bytes]]:
 
 def pack_png(chunks: list[tuple[bytes, bytes]]) -> bytes:
     """Put chunks together, with lengths and checksums that are right."""
-    packed = b"\x89PNG\r\n\x1a\n"
-    for name, body in chunks:
-        packed += struct.pack(">I", len(body)) + name + body
-        packed += struct.pack(">I", zlib.crc32(name + body))
-    return packed
+    return b"\x89PNG\r\n\x1a\n" + b"".join(png_chunk(name, body) for name, body in chunks)
 
 
 @st.composite
@@ -248,14 +243,6 @@ def damaged_exr(draw: st.DrawFn, sound: bytes) -> bytes:
         case _:
             value = draw(damaged(value)) if size else b"\xff"
     return sound[: at - 4] + struct.pack("<i", len(value)) + value + sound[at + size :]
-
-
-def pack_glb(text: bytes, binary: bytes) -> bytes:
-    """Return a GLB with lengths that are right."""
-    text, binary = text + b" " * (-len(text) % 4), binary + b"\0" * (-len(binary) % 4)
-    chunks = struct.pack("<I4s", len(text), b"JSON") + text
-    chunks += struct.pack("<I4s", len(binary), b"BIN\0") + binary
-    return struct.pack("<4sII", b"glTF", 2, 12 + len(chunks)) + chunks
 
 
 def damaged_glb(sound: bytes) -> Bytes:

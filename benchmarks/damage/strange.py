@@ -211,10 +211,8 @@ class Inputs(Photos):
         """Write lamps near the object, or give one, and return a command line."""
         kind = self.one(("json", "json", "glb", "flag"))
         if kind == "flag":
-            return [
-                *run_of(folder),
-                "--lamp=" + shown([self.near() for _ in range(self.one((5, 8)))]),
-            ]
+            numbers = [self.near() for _ in range(self.one((5, 8)))]
+            return [*run_of(folder), "--lamp=" + shown(numbers)]
         path = folder / f"lamps.{kind}"
         rows = [self._lamp(kind) for _ in range(self.one((1, 1, 2, 9, 70)))]
         if kind == "json":
@@ -244,11 +242,8 @@ class Inputs(Photos):
         else:
             lamp = {**vectors, "power": abs(self.near()), "color": color}
             if self.odd(0.5):
-                lamp = {
-                    "center": lamp["center"],
-                    "radius": abs(self.near()),
-                    "power": lamp["power"],
-                }
+                radius = abs(self.near())
+                lamp = {"center": lamp["center"], "radius": radius, "power": lamp["power"]}
         if self.odd(0.1):
             lamp[self.one(tuple(lamp))] = self.value()
         return lamp
@@ -283,7 +278,7 @@ def survey(kind: str, minutes: float, seed: int, keep: Path | None) -> dict[str,
     make: Callable[[Path], list[str]] = getattr(draw, kind)
     codes: Counter[int] = Counter()
     faults: list[str] = []
-    longest, start = 0.0, time.monotonic()
+    longest = 0.0
     with tempfile.TemporaryDirectory(prefix="warpir-strange-") as temporary, Reader() as reader:
         folder = Path(temporary)
         write_inputs(folder)
@@ -303,8 +298,9 @@ def survey(kind: str, minutes: float, seed: int, keep: Path | None) -> dict[str,
                 faults.append(fault)
                 print(f"    {fault[:600]}", flush=True)
                 if keep is not None:
-                    shutil.rmtree(keep / f"{kind}-{seed}-{len(faults)}", ignore_errors=True)
-                    shutil.copytree(folder, keep / f"{kind}-{seed}-{len(faults)}")
+                    kept = keep / f"{kind}-{seed}-{len(faults)}"
+                    shutil.rmtree(kept, ignore_errors=True)
+                    shutil.copytree(folder, kept)
     minutes = round((time.monotonic() - start) / 60.0, 1)
     return {"kind": kind, "seed": seed, "inputs": codes.total(), "minutes": minutes,
             "ends": {str(code): count for code, count in sorted(codes.items())},

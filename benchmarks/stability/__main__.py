@@ -12,11 +12,12 @@ import math
 import time
 from importlib.metadata import version
 from importlib.util import find_spec
+from pathlib import Path
 from typing import Any
 
 import warp as wp
 
-from benchmarks.measure import context, flags, report
+from benchmarks.measure import context, flags, report, table
 from benchmarks.stability import brdf, geometry, light, lobes, near
 from benchmarks.stability.case import Case
 from warpir.render.device import choose_device
@@ -85,58 +86,66 @@ def number(x: float | None) -> str:
     return "0" if x == 0.0 else f"{x:.1e}"
 
 
+PAGE = """# Numerical stability: hard cases against float64
+
+Measured on {date} with warp-lang {warp} on {device}{theirs}.
+
+    {command}
+
+How to read it: *error* is ours against float64, formed as *measure* says; *gradient* is
+the relative L2 distance of our gradient, the worst parameter's, from central
+differences in float64. After the slash stands the bound that
+`tests/benchmarks/test_stability.py` asserts, together with the absence of NaN and
+infinity; the constants in `benchmarks/stability/` say where each bound comes from.
+Mitsuba's error is formed in the same way against the
+formula that Mitsuba implements. For hits and needles an
+error of 1 is a ray that met another triangle than in float64, or none. Rows on shadows
+and white planes are sampled, so their errors are mostly noise; ours averages whole
+pixels with two techniques, Mitsuba's are single points with one sequence of directions,
+so only errors far above 1e-3 differ in precision. Mitsuba takes the scene in float32
+world coordinates, so an object 100 km from the origin is 8 mm coarse, and it moves the
+start of a ray by about 9e-5 (1 + |p|) m, a tenth of a scene of 1 mm.
+
+{count} cases, {kept} within their bounds and finite. Nearest to its bound: {worst}.
+
+{table}
+"""
+
+
 def document(records: list[dict[str, Any]], where: dict[str, Any], command: str) -> str:
     """Return ``docs/stability.md``: one table of all records."""
-    worst = max(
-        (r for r in records if r["bound"] > 0.0), key=lambda r: float(r["error"] / r["bound"])
-    )
-    lines = [
-        "# Numerical stability: hard cases against float64",
-        "",
-        f"Measured on {where['date']} with warp-lang {where['warp']} on {where['device']}"
-        + (f"; Mitsuba {where['mitsuba']} (`llvm_ad_rgb`)." if where["mitsuba"] else "."),
-        "",
-        f"    {command}",
-        "",
-        "How to read it: *error* is ours against float64, formed as *measure* says; *gradient* is",
-        "the relative L2 distance of our gradient, the worst parameter's, from central",
-        "differences in float64. After the slash stands the bound that",
-        "`tests/benchmarks/test_stability.py` asserts, together with the absence of NaN and",
-        "infinity; the constants in `benchmarks/stability/` say where each bound comes from.",
-        "Mitsuba's error is formed in the same way against the",
-        "formula that Mitsuba implements. For hits and needles an",
-        "error of 1 is a ray that met another triangle than in float64, or none. Rows on shadows",
-        "and white planes are sampled, so their errors are mostly noise; ours averages whole",
-        "pixels with two techniques, Mitsuba's are single points with one sequence of directions,",
-        "so only errors far above 1e-3 differ in precision. Mitsuba takes the scene in float32",
-        "world coordinates, so an object 100 km from the origin is 8 mm coarse, and it moves the",
-        "start of a ray by about 9e-5 (1 + |p|) m, a tenth of a scene of 1 mm.",
-        "",
-        f"{len(records)} cases, {sum(map(is_kept, records))} within their bounds and finite. "
-        f"Nearest to its bound: {worst['case']}, {worst['quantity']}.",
-        "",
-        "| group | case | quantity | measure | error / bound | gradient / bound | finite "
-        "| Mitsuba |",
-        "|---|---|---|---|---|---|---|---|",
-    ]
+    head = ("group", "case", "quantity", "measure", "error / bound", "gradient / bound", "finite")
+    rows = []
     for r in records:
         gradient = ""
         if r["gradient_error"] is not None:
             gradient = f"{number(r['gradient_error'])} / {number(r['gradient_bound'])}"
         mitsuba = r["mitsuba"] if isinstance(r["mitsuba"], str) else number(r["mitsuba"])
-        lines.append(
-            f"| {TITLES[r['group']]} | {r['case']} | {r['quantity']} | {r['measure']} "
-            f"| {number(r['error'])} / {number(r['bound'])} | {gradient} "
-            f"| {'yes' if r['finite'] else '**no**'} | {mitsuba.replace('|', '/')} |"
+        rows.append(
+            (
+                *(TITLES[r["group"]], r["case"], r["quantity"], r["measure"]),
+                *(f"{number(r['error'])} / {number(r['bound'])}", gradient),
+                *("yes" if r["finite"] else "**no**", mitsuba.replace("|", "/")),
+            )
         )
-    return "\n".join(lines) + "\n"
+    worst = max((r for r in records if r["bound"] > 0.0), key=lambda r: r["error"] / r["bound"])
+    version_of = where["mitsuba"]
+    return PAGE.format(
+        **where,
+        theirs=f"; Mitsuba {version_of} (`llvm_ad_rgb`)" if version_of else "",
+        command=command,
+        count=len(records),
+        kept=sum(map(is_kept, records)),
+        worst=f"{worst['case']}, {worst['quantity']}",
+        table=table((*head, "Mitsuba"), rows),
+    )
 
 
 def main() -> None:
     """Run the cases, print one JSON line each, and write the table."""
-    parser = flags(__doc__, has_assets=False)
+    parser = flags(__doc__, "device", "json")
     parser.add_argument("--quick", action="store_true", help="only cases of less than a second")
-    parser.add_argument("--docs", default=None, help="write the table to this file")
+    parser.add_argument("--docs", type=Path, help="write the table to this file")
     args = parser.parse_args()
     device = choose_device(args.device)
     has_mitsuba = find_spec("mitsuba") is not None
@@ -155,8 +164,7 @@ def main() -> None:
         records.append(record)
     if args.docs is not None:
         command = f"python -m benchmarks.stability --device {args.device or 'cpu'} --docs FILE"
-        with open(args.docs, "w", encoding="utf-8") as stream:
-            stream.write(document(records, where, command))
+        args.docs.write_text(document(records, where, command), encoding="utf-8")
     outside = [f"{r['group']}: {r['case']}, {r['quantity']}" for r in records if not is_kept(r)]
     print(f"{len(records)} cases, {len(outside)} outside their bounds", *outside, sep="\n")
 

@@ -17,6 +17,7 @@ from benchmarks.stability.case import (
     finite,
     from_mitsuba,
     launch,
+    lit,
     max_relative,
     table,
     to_mitsuba,
@@ -24,13 +25,10 @@ from benchmarks.stability.case import (
     worst_l2,
 )
 from tests import oracles as o
-from tests.builders.shapes import all_pixels, camera, constant, ground, placed, quad
+from tests.builders.shapes import all_pixels, camera, placed, quad
 from warpir.kernels.bsdf import bsdf_f, bsdf_of, bsdf_sample
 from warpir.kernels.maths.frame import basis
 from warpir.kernels.types import Layers
-from warpir.render.device_light import light_args
-from warpir.render.device_scene import Scene
-from warpir.render.renderer import Renderer
 from warpir.scene.asset import Material, Primitive
 
 CLAMP = 0.0317
@@ -111,9 +109,8 @@ def pairs(roughness: float, count: int = 20000) -> tuple[np.ndarray, np.ndarray]
     wo, wi = (o.spherical(c, rng.uniform(0.0, 2.0 * np.pi, count)) for c in cos)
     alpha = float(o.ggx_alpha(roughness))
     half = count // 2
-    wm = o.spherical(
-        np.cos(np.arctan(alpha * rng.uniform(0.0, 3.0, half))), rng.uniform(0.0, 6.28, half)
-    )
+    cosine = np.cos(np.arctan(alpha * rng.uniform(0.0, 3.0, half)))
+    wm = o.spherical(cosine, rng.uniform(0.0, 6.28, half))
     mirrored = 2.0 * o.dot(wo[:half], wm)[:, None] * wm - wo[:half]
     wi[:half] = np.where(mirrored[:, 2:] > 1e-3, mirrored, wi[:half])
     return wo.astype(np.float32), wi.astype(np.float32)
@@ -133,9 +130,8 @@ def value(device: str, roughness: float) -> Measured:
     rough = np.full(len(wo), roughness, np.float32)
     truth = o.gltf_brdf(wo, wi, base, metallic, rough)
     # Peaks would drown everything else: each row is scaled to a value of about 1.
-    y = (rng.uniform(0.5, 1.5, wo.shape) / (1e-3 + truth.max(axis=1, keepdims=True))).astype(
-        np.float32
-    )
+    y = rng.uniform(0.5, 1.5, wo.shape) / (1e-3 + truth.max(axis=1, keepdims=True))
+    y = y.astype(np.float32)
     f, _, gradients = evaluate(device, wo, wi, base, metallic, rough, y)
 
     def rows(b: Any, m: Any, r: Any) -> Float64Array:
@@ -245,8 +241,7 @@ def shading_normal(device: str, tilt_deg: float) -> Measured:
     normals = np.tile(np.array([np.sin(tilt), 0.0, np.cos(tilt)], np.float32), (4, 1))
     leaning = Primitive(plain.positions, plain.indices, 0, normals=normals)
     view = camera(4, 4, 2e4)
-    renderer = Renderer(Scene([placed(leaning, TILTED)], view, ground(), device))
-    args = light_args(constant(), renderer.device)
+    renderer, args = lit(device, [placed(leaning, TILTED)], view)
     out = renderer.foreground(args, all_pixels(view), 4096, 1, 1, 0)
     # A shading normal that faces away from the viewer gives way to the geometric one.
     truth = tilted_truth(tilt if tilt_deg < 90.0 else 0.0)
@@ -285,14 +280,8 @@ def conductor(roughness: float) -> Any:
     """Return Mitsuba's GGX conductor with F = 1 and visible-normal sampling."""
     import mitsuba as mi
 
-    return mi.load_dict(
-        {
-            "type": "roughconductor",
-            "distribution": "ggx",
-            "alpha": float(o.ggx_alpha(np.float32(roughness))),
-            "material": "none",
-        }
-    )
+    metal = {"type": "roughconductor", "distribution": "ggx", "material": "none"}
+    return mi.load_dict({**metal, "alpha": float(o.ggx_alpha(np.float32(roughness)))})
 
 
 def interaction(wo: np.ndarray) -> Any:
@@ -350,9 +339,8 @@ def mitsuba_own_samples(roughness: float) -> float:
     errors = []
     for cos_o in (1.0, 0.3, 0.02, 1e-3):
         wo = np.broadcast_to(eye(cos_o), (len(u), 3))
-        sample, _ = bsdf.sample(
-            mi.BSDFContext(), interaction(wo), mi.Float(0.5), mi.Point2f(np.ascontiguousarray(u.T))
-        )
+        numbers = mi.Float(0.5), mi.Point2f(np.ascontiguousarray(u.T))
+        sample, _ = bsdf.sample(mi.BSDFContext(), interaction(wo), *numbers)
         d = from_mitsuba(sample.wo)
         truth = o.vndf_reflection_pdf(wo, d, o.ggx_alpha(np.float32(roughness)))
         above = d[:, 2] > 0.0
@@ -378,29 +366,29 @@ def cases() -> list[Case]:
         *table(
             "brdf",
             {f"roughness {r:g}": (r,) for r in ROUGHNESS},
-            Quantity("value", MAX_RELATIVE, value, VALUE, GRADIENT, mitsuba_value),
-            Quantity("density", MAX_RELATIVE, density, VALUE, None, mitsuba_density),
-            Quantity(own, MAX_RELATIVE, own_samples, VALUE, None, mitsuba_own_samples),
+            Quantity("value", MAX_RELATIVE, value, VALUE, mitsuba_value, GRADIENT),
+            Quantity("density", MAX_RELATIVE, density, VALUE, mitsuba_density),
+            Quantity(own, MAX_RELATIVE, own_samples, VALUE, mitsuba_own_samples),
         ),
         *table(
             "brdf",
             {f"both cosines {c:g}": (c,) for c in GRAZING},
-            Quantity("value and density", MAX_RELATIVE, grazing, VALUE, None, mitsuba_grazing),
+            Quantity("value and density", MAX_RELATIVE, grazing, VALUE, mitsuba_grazing),
         ),
         *table(
             "brdf",
             {"directions below the surface": ()},
-            Quantity("value, density, gradient", MAX_ABSOLUTE, facing_away, 0.0, None, below),
+            Quantity("value, density, gradient", MAX_ABSOLUTE, facing_away, 0.0, below),
         ),
         *table(
             "brdf",
             {f"shading normal {t:g} deg off": (t,) for t in (30.0, 60.0, 85.0, 100.0, 180.0)},
-            Quantity("radiance", RELATIVE, shading_normal, NORMALS, None, through),
+            Quantity("radiance", RELATIVE, shading_normal, NORMALS, through),
             cost="medium",
         ),
         *table(
             "brdf",
             {"normals next to -Z and +Z": ()},
-            Quantity("frame", MAX_ABSOLUTE, frame, FRAME, None, mitsuba_frame),
+            Quantity("frame", MAX_ABSOLUTE, frame, FRAME, mitsuba_frame),
         ),
     ]

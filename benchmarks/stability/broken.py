@@ -2,13 +2,11 @@
 
 import numpy as np
 
-from benchmarks.stability.case import Measured, finite
+from benchmarks.stability.case import Measured, finite, lit
 from benchmarks.stability.rays import leave, mitsuba_scene, mitsuba_trace
 from tests import oracles as o
-from tests.builders.shapes import all_pixels, camera, constant, ground, placed, quad, sphere
-from warpir.render.device_light import light_args
+from tests.builders.shapes import all_pixels, camera, ground, placed, quad, sphere
 from warpir.render.device_scene import Scene
-from warpir.render.renderer import Renderer
 from warpir.render.shadow.pilot import shaded_pixels
 from warpir.scene.asset import Material, Primitive
 
@@ -18,7 +16,7 @@ CARD_VIEW = camera(16, 16, 40.0)
 
 def card_error(device: str, parts: list[Primitive], *materials: Material) -> Measured:
     """Coverage, position and normal of a card that faces the camera, largest absolute error."""
-    renderer = Renderer(Scene([placed(parts, *materials)], CARD_VIEW, ground(), device))
+    renderer, args = lit(device, [placed(parts, *materials)], CARD_VIEW)
     gbuffer = renderer.gbuffer(0, 64)
     assert len(gbuffer.object_pixels) == 256
     errors = [
@@ -26,11 +24,9 @@ def card_error(device: str, parts: list[Primitive], *materials: Material) -> Mea
         np.abs(gbuffer.normal - [0.0, 0.0, 1.0]).max(),
         np.abs(gbuffer.position[:, 2] + 5.0).max(),
     ]
-    args = light_args(constant(), renderer.device)
     out = renderer.foreground(args, gbuffer.object_pixels, 16, 1, 2, 0)
-    return Measured(
-        float(np.max(errors)), finite(gbuffer.normal, gbuffer.position, out.radiance, out.mask)
-    )
+    is_finite = finite(gbuffer.normal, gbuffer.position, out.radiance, out.mask)
+    return Measured(float(np.max(errors)), is_finite)
 
 
 def degenerate_card() -> Primitive:
@@ -65,15 +61,11 @@ def twins(device: str, opposite: bool, double_sided: bool) -> Measured:
 def blended_twins(device: str) -> Measured:
     """Sunlight through two sheets of opacity 0.25 in one place: they count as one."""
     sheets = [quad((0, 1.0, 0), (5.0, 0, 0), (0, 0, -5.0))] * 2
-    scene = Scene(
-        [placed(sheets, Material(alpha_mode="BLEND", alpha=0.25))],
-        camera(1, 1, 1.0),
-        ground(0.0),
-        device,
-    )
+    pale = placed(sheets, Material(alpha_mode="BLEND", alpha=0.25))
+    scene = Scene([pale], camera(1, 1, 1.0), ground(0.0), device)
     rng = np.random.default_rng(14)
-    points = np.concatenate([rng.uniform(-1, 1, (1000, 1)), -np.ones((1000, 1))], axis=1)
-    points = np.concatenate([points, rng.uniform(-1, 1, (1000, 1))], axis=1)
+    x, z = rng.uniform(-1, 1, (2, 1000))
+    points = np.stack([x, -np.ones(1000), z], axis=1)
     up = np.broadcast_to([0.0, 1.0, 0.0], points.shape)
     visible = leave(scene, points, up, up)
     return Measured(float(np.abs(visible - 0.75).max()), finite(visible))
@@ -86,8 +78,7 @@ def inside_out(device: str, reverse: bool) -> Measured:
     part = Primitive(round_one.positions, indices, 0, normals=round_one.normals)
     material = Material(metallic=0.0, base_color=(0.8, 0.8, 0.8), double_sided=True)
     view = camera(12, 12, 30.0)
-    renderer = Renderer(Scene([placed(part, material)], view, ground(), device))
-    args = light_args(constant(), renderer.device)
+    renderer, args = lit(device, [placed(part, material)], view)
     out = renderer.foreground(args, all_pixels(view), 1024, 1, 2, 0)
     # Closed form at 8 x 8 points of each pixel.
     side = (np.arange(12 * 8) + 0.5) / 8
@@ -111,9 +102,8 @@ def one_pixel(device: str) -> Measured:
     card = quad((-1.0, 0.0, -5.0), (1, 0, 0), (0, 1, 0))
     view = camera(1, 1, 2.5)
     material = Material(metallic=0.0, base_color=(0.8, 0.8, 0.8))
-    renderer = Renderer(Scene([placed(card, material)], view, ground(), device))
+    renderer, args = lit(device, [placed(card, material)], view)
     gbuffer = renderer.gbuffer(0, 64)
-    args = light_args(constant(), renderer.device)
     runs = [renderer.foreground(args, all_pixels(view), 65536, 1, 1, seed) for seed in range(8)]
     shaded = shaded_pixels(renderer, args, 0)
     # Mean albedo over the card's directions, Gauss-Legendre.
@@ -127,10 +117,8 @@ def one_pixel(device: str) -> Measured:
     found = float(np.mean([out.radiance[0, 0] for out in runs]))
     coverage = float(np.mean([out.mask[0] for out in runs]))
     error = max(abs(found / truth - 1.0), abs(coverage / 0.5 - 1.0))
-    return Measured(
-        error if gbuffer.object_pixels.tolist() == [0] else 1.0,
-        finite(*(out.radiance for out in runs), gbuffer.normal, shaded),
-    )
+    is_finite = finite(*(out.radiance for out in runs), gbuffer.normal, shaded)
+    return Measured(error if gbuffer.object_pixels.tolist() == [0] else 1.0, is_finite)
 
 
 def mitsuba_degenerate() -> float:

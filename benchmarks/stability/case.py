@@ -1,6 +1,6 @@
 """What a hard case is: a measurement against float64, its bound, and Mitsuba's error on it."""
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 from typing import Any, NamedTuple
@@ -9,7 +9,15 @@ import numpy as np
 import warp as wp
 from numpy.typing import ArrayLike
 
+from tests.builders.shapes import DEEP, constant, ground
 from warpir.core.arrays import Float64Array
+from warpir.kernels.types import LightArgs
+from warpir.render.device_light import light_args
+from warpir.render.device_scene import Placed, Scene
+from warpir.render.renderer import Renderer
+from warpir.scene.camera import Camera
+from warpir.scene.light import Light
+from warpir.scene.near.lamps import Lamp
 
 MAX_RELATIVE = "max relative"
 MAX_ABSOLUTE = "max absolute"
@@ -64,12 +72,8 @@ class Quantity(NamedTuple):
     run: Callable[..., Measured]
     """Takes the Warp device, then the input's values."""
     bound: float | Callable[..., float]
-    gradient_bound: float | None
     mitsuba: Callable[..., float] | str
-
-
-def _on_device(run: Callable[..., Measured], values: tuple[Any, ...], device: str) -> Measured:
-    return run(device, *values)
+    gradient_bound: float | None = None
 
 
 def table(
@@ -82,7 +86,7 @@ def table(
             name,
             quantity.name,
             quantity.measure,
-            partial(_on_device, quantity.run, values),
+            lambda device, quantity=quantity, values=values: quantity.run(device, *values),
             quantity.bound(*values) if callable(quantity.bound) else quantity.bound,
             quantity.gradient_bound,
             partial(quantity.mitsuba, *values) if callable(quantity.mitsuba) else quantity.mitsuba,
@@ -91,6 +95,20 @@ def table(
         for name, values in inputs.items()
         for quantity in quantities
     ]
+
+
+def lit(
+    device: str,
+    objects: Sequence[Placed],
+    view: Camera,
+    light: Light | None = None,
+    *,
+    height: float = DEEP,
+    lamps: Sequence[Lamp] = (),
+) -> tuple[Renderer, LightArgs]:
+    """Return objects over the ground ``y = height``, and a light for them; the constant one."""
+    renderer = Renderer(Scene(objects, view, ground(height), device, lamps))
+    return renderer, light_args(light or constant(), renderer.device)
 
 
 def upload(values: ArrayLike, dtype: Any, device: str, grad: bool = False) -> wp.array:

@@ -69,23 +69,15 @@ def in_places() -> list[Case]:
     return table(
         GROUP,
         PLACES,
+        Quantity("first hits", "max over the diagonal", rays.hits, POSITION, rays.mitsuba_hits),
         Quantity(
-            "first hits", "max over the diagonal", rays.hits, POSITION, None, rays.mitsuba_hits
-        ),
-        Quantity(
-            "rays that leave a ball",
-            SHARE,
-            rays.self_hits,
-            SELF_HITS,
-            None,
-            rays.mitsuba_self_hits,
+            "rays that leave a ball", SHARE, rays.self_hits, SELF_HITS, rays.mitsuba_self_hits
         ),
         Quantity(
             "shadow of a square",
             "RMS absolute",
             shadows.square_shadow,
             SHADOW,
-            None,
             shadows.mitsuba_square,
         ),
     )
@@ -93,16 +85,9 @@ def in_places() -> list[Case]:
 
 def near_the_plane() -> list[Case]:
     """Return the rows on contact."""
-    shadow = Quantity(
-        "shadow", "RMS absolute", shadows.contact, SHADOW, None, shadows.mitsuba_contact
-    )
+    shadow = Quantity("shadow", "RMS absolute", shadows.contact, SHADOW, shadows.mitsuba_contact)
     below = Quantity(
-        "light below it",
-        MAX_ABSOLUTE,
-        shadows.contact_leak,
-        LEAKS,
-        None,
-        shadows.mitsuba_contact_leak,
+        "light below it", MAX_ABSOLUTE, shadows.contact_leak, LEAKS, shadows.mitsuba_contact_leak
     )
     on, sunk = TOUCHING
     domes = {
@@ -117,7 +102,7 @@ def near_the_plane() -> list[Case]:
         *table(
             GROUP,
             domes,
-            Quantity("light within it", SHARE, rays.dome_leaks, LEAKS, None, rays.mitsuba_dome),
+            Quantity("light within it", SHARE, rays.dome_leaks, LEAKS, rays.mitsuba_dome),
         ),
     ]
 
@@ -134,25 +119,23 @@ def of_meshes() -> list[Case]:
         for double in (False, True)
     }
     needles = Quantity(
-        "position, normal", MAX_ABSOLUTE, rays.needles, needle_bound, None, rays.mitsuba_needles
+        "position, normal", MAX_ABSOLUTE, rays.needles, needle_bound, rays.mitsuba_needles
     )
     return [
         *table(
             GROUP,
             {"triangles of no area": ()},
-            Quantity(
-                surface, MAX_ABSOLUTE, broken.degenerate, FLAT, None, broken.mitsuba_degenerate
-            ),
+            Quantity(surface, MAX_ABSOLUTE, broken.degenerate, FLAT, broken.mitsuba_degenerate),
         ),
         *table(
             GROUP,
             cards,
-            Quantity(surface, MAX_ABSOLUTE, broken.twins, FLAT, None, "culls no faces"),
+            Quantity(surface, MAX_ABSOLUTE, broken.twins, FLAT, "culls no faces"),
         ),
         *table(
             GROUP,
             {"two sheets of opacity 0.25 in one place": ()},
-            Quantity(sheets, MAX_ABSOLUTE, broken.blended_twins, FLAT, None, opaque),
+            Quantity(sheets, MAX_ABSOLUTE, broken.blended_twins, FLAT, opaque),
         ),
         *table(GROUP, {needle_name(w): (w,) for w in (1e-2, 1e-3)}, needles),
         *table(GROUP, {needle_name(w): (w,) for w in (1e-4, 1e-5)}, needles, cost="medium"),
@@ -166,15 +149,13 @@ def of_shading() -> list[Case]:
         *table(
             GROUP,
             {f"ball, triangles {name}": reverse for name, reverse in wound.items()},
-            Quantity("radiance", "RMS relative", broken.inside_out, FACETS, None, OTHER_MATERIAL),
+            Quantity("radiance", "RMS relative", broken.inside_out, FACETS, OTHER_MATERIAL),
             cost="medium",
         ),
         *table(
             GROUP,
             {"a view of one pixel": ()},
-            Quantity(
-                "coverage, radiance", RELATIVE, broken.one_pixel, ALBEDO, None, OTHER_MATERIAL
-            ),
+            Quantity("coverage, radiance", RELATIVE, broken.one_pixel, ALBEDO, OTHER_MATERIAL),
             cost="medium",
         ),
         *table(
@@ -185,7 +166,6 @@ def of_shading() -> list[Case]:
                 "max over the diagonal, share",
                 rays.many_triangles,
                 SAGITTA,
-                None,
                 rays.mitsuba_many_triangles,
             ),
             cost="slow",

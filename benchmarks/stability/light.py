@@ -109,36 +109,32 @@ def of_maps() -> list[Case]:
     noise = "its noise, not its precision, would be compared: benchmarks.speed"
     other = "samples other densities: constant between its texels' centres"
     peak = "max over the peak"
-    lookup = Quantity("radiance", peak, maps.lookup, lookup_bound, None, maps.mitsuba_lookup)
-    density = Quantity(
-        "density at own samples", MAX_RELATIVE, maps.density, density_bound, None, other
-    )
-    under = Quantity("white plane", RELATIVE, sky_plane, PLANE, None, noise)
-    power = Quantity(
-        "power averaged to 128 x 64", RELATIVE, maps.energy, ENERGY, None, NO_COUNTERPART
-    )
+    lookup = Quantity("radiance", peak, maps.lookup, lookup_bound, maps.mitsuba_lookup)
+    density = Quantity("density at own samples", MAX_RELATIVE, maps.density, density_bound, other)
+    under = Quantity("white plane", RELATIVE, sky_plane, PLANE, noise)
+    power = Quantity("power averaged to 128 x 64", RELATIVE, maps.energy, ENERGY, NO_COUNTERPART)
     black = "radiance, samples, summary"
     return [
         *table(LIGHT, PLAIN | SUN, lookup, density, under),
         *table(LIGHT, GLARE, lookup, under),
         *table(LIGHT, LARGE, lookup, density, cost="slow"),
-        *table(LIGHT, PLANES, Quantity("white plane", RELATIVE, maps.plane, PLANE, None, noise)),
+        *table(LIGHT, PLANES, Quantity("white plane", RELATIVE, maps.plane, PLANE, noise)),
         *table(
             LIGHT,
             SMALL_PLANES,
-            Quantity("white plane", RELATIVE, maps.plane, PLANE, TEXEL_GRADIENT, noise),
+            Quantity("white plane", RELATIVE, maps.plane, PLANE, noise, TEXEL_GRADIENT),
         ),
         *table(
             LIGHT,
             {"black map": ()},
-            Quantity(black, MAX_ABSOLUTE, maps.dark, 0.0, None, maps.mitsuba_dark),
+            Quantity(black, MAX_ABSOLUTE, maps.dark, 0.0, maps.mitsuba_dark),
         ),
         *table(LIGHT, SUN, power),
         *table(LIGHT, LARGE, power, cost="slow"),
         *table(
             LIGHT,
             {f"plane of radiance {level:g}": (level,) for level in LEVELS},
-            Quantity("shadow ratio", MAX_ABSOLUTE, tone.ratio, VALUE, GRADIENT, NO_COUNTERPART),
+            Quantity("shadow ratio", MAX_ABSOLUTE, tone.ratio, VALUE, NO_COUNTERPART, GRADIENT),
         ),
     ]
 
@@ -149,26 +145,24 @@ def of_tone() -> list[Case]:
     none = NO_COUNTERPART
     alone = {
         "curves at and beyond their ends": Quantity(
-            "value, gradient", MAX_ABSOLUTE, tone.beyond, 0.0, None, none
+            "value, gradient", MAX_ABSOLUTE, tone.beyond, 0.0, none
         ),
         "bins of no width or height": Quantity(
-            "fall, excess", MAX_ABSOLUTE, tone.empty_bins, VALUE, None, none
+            "fall, excess", MAX_ABSOLUTE, tone.empty_bins, VALUE, none
         ),
-        "raw parameters up to 1e30": Quantity(
-            "knots", MAX_ABSOLUTE, tone.raw_curve, VALUE, None, none
-        ),
+        "raw parameters up to 1e30": Quantity("knots", MAX_ABSOLUTE, tone.raw_curve, VALUE, none),
         "Reinhard from 0 to 1e30": Quantity(
-            "value", MAX_RELATIVE, tone.bright, VALUE, GRADIENT, none
+            "value", MAX_RELATIVE, tone.bright, VALUE, none, GRADIENT
         ),
         "encoding from 0 to 1e30": Quantity(
-            "display value", MAX_ABSOLUTE, tone.encoding, ENCODING, GRADIENT, none
+            "display value", MAX_ABSOLUTE, tone.encoding, ENCODING, none, GRADIENT
         ),
     }
     return [
         *table(
             TONE,
             {f"curve: {name}": (raw,) for name, raw in tone.COLLAPSED.items()},
-            Quantity("value", over_slope, tone.curve, CURVE, CURVE_GRADIENT, none),
+            Quantity("value", over_slope, tone.curve, CURVE, none, CURVE_GRADIENT),
         ),
         *(case for name, quantity in alone.items() for case in table(TONE, {name: ()}, quantity)),
     ]
@@ -180,11 +174,6 @@ def of_fusion() -> list[Case]:
         FUSION,
         LIGHT_PAIRS,
         Quantity(
-            "primed maps",
-            "max over the peak",
-            tone.fusion,
-            FUSED,
-            FUSED_GRADIENT,
-            NO_COUNTERPART,
+            "primed maps", "max over the peak", tone.fusion, FUSED, NO_COUNTERPART, FUSED_GRADIENT
         ),
     )

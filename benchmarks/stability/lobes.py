@@ -13,6 +13,7 @@ from benchmarks.stability.case import (
     finite,
     from_mitsuba,
     launch,
+    lit,
     max_relative,
     table,
     to_mitsuba,
@@ -20,11 +21,9 @@ from benchmarks.stability.case import (
 )
 from benchmarks.stability.maps import evaluate
 from tests import oracles as o
-from tests.builders.shapes import all_pixels, camera, ground, lobe
+from tests.builders.shapes import all_pixels, camera, lobe
 from warpir.kernels.sampling import lobe_sample
 from warpir.render.device_light import light_args
-from warpir.render.device_scene import Scene
-from warpir.render.renderer import Renderer
 from warpir.scene.light import Light, Lobes, rasterize_lobes
 
 SHARPNESS = (1e-3, 1e-1, 1.0, 30.0, 1e3, 6e3, 1e5, 1e6)
@@ -148,10 +147,9 @@ def host_irradiance(device: str, sharpness: float) -> Measured:
 def plane(device: str, sharpness: float) -> Measured:
     """Radiance of a white plane under a slanted lobe."""
     view = camera(8, 8, 500.0, (0.0, 50.0, 0.0), -90.0)
-    renderer = Renderer(Scene([], view, ground(0.0), device))
     pixels = all_pixels(view)
     axis = o.normalize([0.5, 0.6, 0.2]).astype(np.float32)
-    args = light_args(lobe(axis, sharpness), renderer.device)
+    renderer, args = lit(device, [], view, lobe(axis, sharpness), height=0.0)
     white = renderer.receiver(args, pixels, np.zeros(len(pixels), np.int32), 256, 1, 5)
     truth = o.sg_irradiance([0.0, 1.0, 0.0], axis, float(np.float32(sharpness))) / np.pi
     found = white.unoccluded.astype(np.float64).mean(axis=0)
@@ -207,11 +205,11 @@ def cases() -> list[Case]:
     return table(
         "lobes",
         {f"sharpness {s:g}": (s,) for s in SHARPNESS},
-        Quantity("radiance", MAX_RELATIVE, radiance, VALUE, None, mitsuba_radiance),
-        Quantity("sampling", "max CDF distance", sampling, cdf_bound, None, mitsuba_sampling),
-        Quantity("density", MAX_RELATIVE, density, VALUE, None, mitsuba_density),
-        Quantity("integral", RELATIVE, flux, FLUX, None, NO_LOBES),
-        Quantity("power on a 64 x 128 map, host", RELATIVE, host_map, POWER, None, NO_LOBES),
-        Quantity("irradiance, host", "max over the flux", host_irradiance, HOST, None, NO_LOBES),
-        Quantity("white plane", RELATIVE, plane, PLANE, None, NO_LOBES),
+        Quantity("radiance", MAX_RELATIVE, radiance, VALUE, mitsuba_radiance),
+        Quantity("sampling", "max CDF distance", sampling, cdf_bound, mitsuba_sampling),
+        Quantity("density", MAX_RELATIVE, density, VALUE, mitsuba_density),
+        Quantity("integral", RELATIVE, flux, FLUX, NO_LOBES),
+        Quantity("power on a 64 x 128 map, host", RELATIVE, host_map, POWER, NO_LOBES),
+        Quantity("irradiance, host", "max over the flux", host_irradiance, HOST, NO_LOBES),
+        Quantity("white plane", RELATIVE, plane, PLANE, NO_LOBES),
     )

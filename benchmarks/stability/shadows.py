@@ -1,16 +1,12 @@
 """Shadows in hard places: tiny and huge scenes, far away, boxes on, above and in the plane."""
 
-from typing import Any
-
 import numpy as np
 
-from benchmarks.stability.case import Float64Array, Measured, finite
+from benchmarks.measure import rms
+from benchmarks.stability.case import Float64Array, Measured, finite, lit
 from benchmarks.stability.rays import AWAY, mitsuba_visible
 from tests import oracles as o
-from tests.builders.shapes import all_pixels, box, camera, constant, placed, quad
-from warpir.render.device_light import light_args
-from warpir.render.device_scene import Receiver, Scene
-from warpir.render.renderer import Renderer
+from tests.builders.shapes import all_pixels, box, camera, placed, quad
 from warpir.scene.asset import Primitive
 from warpir.scene.camera import Camera
 
@@ -41,18 +37,11 @@ def ratio_of(
     Returns:
         The ratio, shape [pixel], and whether it and both radiances are finite.
     """
-    plane = Receiver(np.array([0.0, 1.0, 0.0]), height)
-    renderer = Renderer(Scene([placed(part)], view, plane, device))
+    renderer, args = lit(device, [placed(part)], view, height=height)
     pixels = all_pixels(view)
-    args = light_args(constant(), renderer.device)
     radiance = renderer.receiver(args, pixels, np.zeros(len(pixels), np.int32), SHADOW_SPP, 1, 0)
     ratio = renderer.ratio(radiance)[:, 0].astype(np.float64)
     return ratio, finite(ratio, radiance.lit, radiance.unoccluded)
-
-
-def rms(difference: Any) -> float:
-    """Return the root of the mean square."""
-    return float(np.sqrt(np.mean(np.square(difference))))
 
 
 def roof(size: float, away: float) -> Primitive:

@@ -38,6 +38,14 @@ def png(color: tuple[int, ...] = (200, 100, 50), size: int = 2, kind: str = "PNG
     return stream.getvalue()
 
 
+def pack_glb(text: bytes, binary: bytes) -> bytes:
+    """Return a GLB with lengths that are right."""
+    text, binary = text + b" " * (-len(text) % 4), binary + b"\0" * (-len(binary) % 4)
+    chunks = struct.pack("<I4s", len(text), b"JSON") + text
+    chunks += struct.pack("<I4s", len(binary), b"BIN\0") + binary
+    return struct.pack("<4sII", b"glTF", 2, 12 + len(chunks)) + chunks
+
+
 class Builder:
     """A correct one-square glTF file; a test changes ``json`` or ``binary`` to plant a fault."""
 
@@ -127,12 +135,7 @@ class Builder:
 
     def glb(self) -> bytes:
         """Return the file as ``.glb``."""
-        text = json.dumps(self.json).encode()
-        text += b" " * (-len(text) % 4)
-        binary = bytes(self.binary) + b"\0" * (-len(self.binary) % 4)
-        chunks = struct.pack("<I4s", len(text), b"JSON") + text
-        chunks += struct.pack("<I4s", len(binary), b"BIN\0") + binary
-        return struct.pack("<4sII", b"glTF", 2, 12 + len(chunks)) + chunks
+        return pack_glb(json.dumps(self.json).encode(), bytes(self.binary))
 
     def gltf(self) -> str:
         """Return the file as ``.gltf`` with its buffer inside."""
