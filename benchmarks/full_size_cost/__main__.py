@@ -9,7 +9,6 @@ steps, ``--tiny`` also a tiny model, within seconds on the CPU. The same program
 runs first, so that no compilation is measured.
 """
 
-import argparse
 import gc
 import json
 import os
@@ -19,14 +18,15 @@ import tempfile
 import time
 from pathlib import Path
 from typing import Any
+from unittest import mock
 
 import torch
 import warp as wp
 
 from benchmarks.full_size_cost.model import write_model
 from benchmarks.full_size_cost.steps import measure_steps
-from benchmarks.full_size_cost.watch import Memory, Watch, own_cache
-from benchmarks.measure import context
+from benchmarks.full_size_cost.watch import Memory, Watch
+from benchmarks.measure import context, flags, write_json
 from tests.builders.tiny_stable_diffusion import make_tiny_stable_diffusion
 from warpir.app.config import InsertConfig
 from warpir.app.record import versions
@@ -62,7 +62,8 @@ def measure(config: InsertConfig, model: Path, room: Path, device: wp.Device) ->
     memory = Memory(device)
     watch = Watch(memory)
     config = config.changed(model=str(model), out=str(room / "out"), device=str(device.alias))
-    with own_cache(room / "cache"), watch.installed():
+    own_cache = mock.patch.dict(os.environ, {"WARPIR_CACHE": str(room / "cache")})
+    with own_cache, watch.installed():
         start = time.perf_counter()
         record = insert(config).record
         total = time.perf_counter() - start
@@ -150,15 +151,12 @@ def _what_ran(
 
 def main(argv: list[str] | None = None) -> None:
     """Measure and write the figures."""
-    parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
+    parser = flags(__doc__, "device", "json")
     size = parser.add_mutually_exclusive_group()
     size.add_argument("--quick", action="store_true", help="a tenth of the steps")
     size.add_argument("--tiny", action="store_true", help="a tiny model, within seconds")
-    parser.add_argument("--device", default=None, help="cpu or cuda")
-    parser.add_argument(
-        "--set", action="append", default=[], help="setting=value, such as noises=4"
-    )
-    parser.add_argument("--json", type=Path, help="file for the figures")
+    about = "setting=value, such as noises=4"
+    parser.add_argument("--set", action="append", default=[], help=about)
     options = parser.parse_args(argv)
     config = TINY if options.tiny else QUICK if options.quick else AUTHORS
     for text in options.set:
@@ -170,11 +168,11 @@ def main(argv: list[str] | None = None) -> None:
     with tempfile.TemporaryDirectory() as folder:
         room = Path(folder)
         start = time.perf_counter()
-        make_tiny_stable_diffusion(room / "tiny")
-        if not options.tiny:
-            measure(TINY.changed(width=None), room / "tiny", room / "warm", device)
-        warmed = time.perf_counter()
         model = room / "tiny"
+        make_tiny_stable_diffusion(model)
+        if not options.tiny:
+            measure(TINY.changed(width=None), model, room / "warm", device)
+        warmed = time.perf_counter()
         if not options.tiny:
             model = room / "model"
             write_model(model, torch.device(wp.device_to_torch(device)))
@@ -188,10 +186,8 @@ def main(argv: list[str] | None = None) -> None:
         "seconds_before": {"warm_up": warmed - start, "write_model": written - warmed},
         **figures,
     }
-    text = json.dumps(line, indent=1)
-    print(text)
-    if options.json is not None:
-        options.json.write_text(text + "\n", encoding="utf-8")
+    print(json.dumps(line, indent=1))
+    write_json(options.json, line)
 
 
 if __name__ == "__main__":

@@ -1,9 +1,10 @@
 """Time of single steps of LoRA and loop, and of the parts of one."""
 
 import time
-from collections.abc import Iterator
-from contextlib import ExitStack, contextmanager
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import replace
+from functools import partial
 from typing import Any
 from unittest import mock
 
@@ -90,15 +91,13 @@ def with_graphs(prior: StableDiffusion, loop: LightOptimization, wanted: bool) -
 
 def lora_step_ms(prior: StableDiffusion, config: InsertConfig) -> float:
     """Return the time of a training step on random latents [ms]."""
-    watch = Stopwatch(prior.device)
     latents = torch.randn(8, *prior.latent_shape)
     assert config.guidance.prompt is not None
     prompts = make_prompts(config.guidance.prompt, config.adapter)
     embeddings = prior.embed([prompts.photo, prompts.class_])
     lora = initial_lora(prior, config.adapter.lora_layers, config.adapter.lora_rank, 0)
-    with LoraTraining(
-        prior, lora, latents, latents, embeddings, config.adapter, 0, name="timed"
-    ) as made:
+    given = latents, latents, embeddings, config.adapter, 0
+    with LoraTraining(prior, lora, *given, name="timed") as made:
         update = prior.graphs.recorded_step(made.update) if prior.graphs else made.update
 
         def steps(count: int) -> None:
@@ -106,10 +105,16 @@ def lora_step_ms(prior: StableDiffusion, config: InsertConfig) -> float:
                 made.prepare(step)
                 update()
 
-        steps(WARM_STEPS)
-        start = watch.now()
-        steps(TIMED_STEPS)
-        return 1e3 * (watch.now() - start) / TIMED_STEPS
+        return mean_ms(prior.device, steps)
+
+
+def mean_ms(device: torch.device, steps: Callable[[int], None]) -> float:
+    """Return the mean time of a step, after some that are not counted [ms]."""
+    watch = Stopwatch(device)
+    steps(WARM_STEPS)
+    start = watch.now()
+    steps(TIMED_STEPS)
+    return 1e3 * (watch.now() - start) / TIMED_STEPS
 
 
 def light_steps(loop: LightOptimization, count: int) -> None:
@@ -122,28 +127,17 @@ def light_steps(loop: LightOptimization, count: int) -> None:
         loop.step()
 
 
-def light_step_ms(loop: LightOptimization, device: torch.device) -> float:
-    """Return the time of an optimisation step [ms]."""
-    watch = Stopwatch(device)
-    light_steps(loop, WARM_STEPS)
-    start = watch.now()
-    light_steps(loop, TIMED_STEPS)
-    return 1e3 * (watch.now() - start) / TIMED_STEPS
-
-
 def light_step_split(loop: LightOptimization, prior: StableDiffusion) -> dict[str, float]:
     """Return the parts of an optimisation step, each measured between two waits [ms]."""
     watch = Stopwatch(prior.device)
-    with ExitStack() as stack:
-        for part in (
-            watch.around_gradient(prior, "encode", "vae_backward"),
-            watch.around(prior, "encode", "vae_forward"),
-            watch.around(prior, "predict", "unet"),
-            watch.around(loop.guide, "gradient", "guidance"),
-            watch.around(loop, "composite", "render_forward"),
-            watch.around(loop, "step", "step"),
-        ):
-            stack.enter_context(part)
+    with (
+        watch.around_gradient(prior, "encode", "vae_backward"),
+        watch.around(prior, "encode", "vae_forward"),
+        watch.around(prior, "predict", "unet"),
+        watch.around(loop.guide, "gradient", "guidance"),
+        watch.around(loop, "composite", "render_forward"),
+        watch.around(loop, "step", "step"),
+    ):
         light_steps(loop, WARM_STEPS)
         watch.seconds.clear()
         light_steps(loop, TIMED_STEPS)
@@ -175,7 +169,7 @@ def measure_steps(watch: Watch, config: InsertConfig) -> dict[str, Any]:
         if wanted and prior.graphs is None:
             continue
         with with_graphs(prior, loop, wanted):
-            found["light"][word] = light_step_ms(loop, prior.device)
+            found["light"][word] = mean_ms(prior.device, partial(light_steps, loop))
             found["light_split"][word] = light_step_split(loop, prior)
         with with_graphs(prior, loop, wanted):
             found["lora"][word] = lora_step_ms(prior, config)

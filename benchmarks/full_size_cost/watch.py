@@ -1,10 +1,8 @@
 """What the program reports of itself while it runs: memory by stage, and its prior and its loop."""
 
-import os
 from collections.abc import Callable, Iterator
-from contextlib import ExitStack, contextmanager
+from contextlib import contextmanager
 from dataclasses import dataclass, field
-from pathlib import Path
 from typing import Any
 from unittest import mock
 
@@ -72,22 +70,11 @@ class Watch:
 
             return keep
 
-        with ExitStack() as stack:
-            for name, substitute in (
-                ("warpir.app.record.Timings", WatchedTimings),
-                ("warpir.core.progress.StepProgress", WatchedProgress),
-                (
-                    "warpir.optimize.model.load_stable_diffusion",
-                    kept("prior", load_stable_diffusion),
-                ),
-                ("warpir.optimize.recover.LightOptimization", kept("loop", LightOptimization)),
-            ):
-                stack.enter_context(mock.patch(name, substitute))
+        load, loop = kept("prior", load_stable_diffusion), kept("loop", LightOptimization)
+        with (
+            mock.patch("warpir.app.record.Timings", WatchedTimings),
+            mock.patch("warpir.core.progress.StepProgress", WatchedProgress),
+            mock.patch("warpir.optimize.model.load_stable_diffusion", load),
+            mock.patch("warpir.optimize.recover.LightOptimization", loop),
+        ):
             yield
-
-
-@contextmanager
-def own_cache(folder: Path) -> Iterator[None]:
-    """Within this context nothing of earlier runs is found."""
-    with mock.patch.dict(os.environ, {"WARPIR_CACHE": str(folder)}):
-        yield

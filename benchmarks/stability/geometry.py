@@ -3,7 +3,7 @@
 from benchmarks.stability import broken, rays, shadows
 from benchmarks.stability.case import MAX_ABSOLUTE, RELATIVE, SHARE, Case, Quantity, table
 
-GROUP = "geometry"
+GROUP, RMS = "geometry", "RMS absolute"
 PLACES = {
     "1 mm wide": (1e-3, 0.0),
     "1 m wide": (1.0, 0.0),
@@ -66,29 +66,22 @@ def cases() -> list[Case]:
 
 def in_places() -> list[Case]:
     """Return the rows on size and distance."""
+    away, shadow = rays.mitsuba_self_hits, shadows.square_shadow
     return table(
         GROUP,
         PLACES,
         Quantity("first hits", "max over the diagonal", rays.hits, POSITION, rays.mitsuba_hits),
-        Quantity(
-            "rays that leave a ball", SHARE, rays.self_hits, SELF_HITS, rays.mitsuba_self_hits
-        ),
-        Quantity(
-            "shadow of a square",
-            "RMS absolute",
-            shadows.square_shadow,
-            SHADOW,
-            shadows.mitsuba_square,
-        ),
+        Quantity("rays that leave a ball", SHARE, rays.self_hits, SELF_HITS, away),
+        Quantity("shadow of a square", RMS, shadow, SHADOW, shadows.mitsuba_square),
     )
 
 
 def near_the_plane() -> list[Case]:
     """Return the rows on contact."""
-    shadow = Quantity("shadow", "RMS absolute", shadows.contact, SHADOW, shadows.mitsuba_contact)
-    below = Quantity(
-        "light below it", MAX_ABSOLUTE, shadows.contact_leak, LEAKS, shadows.mitsuba_contact_leak
-    )
+    leak, theirs = shadows.contact_leak, shadows.mitsuba_contact_leak
+    shadow = Quantity("shadow", RMS, shadows.contact, SHADOW, shadows.mitsuba_contact)
+    below = Quantity("light below it", MAX_ABSOLUTE, leak, LEAKS, theirs)
+    within = Quantity("light within it", SHARE, rays.dome_leaks, LEAKS, rays.mitsuba_dome)
     on, sunk = TOUCHING
     domes = {
         f"open dome of {size:g} m{', inside out' if reverse else ''}": (size, reverse)
@@ -99,44 +92,33 @@ def near_the_plane() -> list[Case]:
         *table(GROUP, on, shadow, below),
         *table(GROUP, ABOVE, shadow),
         *table(GROUP, sunk, shadow, below),
-        *table(
-            GROUP,
-            domes,
-            Quantity("light within it", SHARE, rays.dome_leaks, LEAKS, rays.mitsuba_dome),
-        ),
+        *table(GROUP, domes, within),
     ]
 
 
 def of_meshes() -> list[Case]:
     """Return the rows on broken and thin meshes."""
-    surface = "coverage, position, normal"
     opaque = "has no ray query with transparency apart from its integrators"
-    sheets = "sunlight through both, as one"
     cards = {
         f"two cards in one place, {'against each other' if opposite else 'alike'}, "
         f"{'double' if double else 'single'} sided": (opposite, double)
         for opposite in (False, True)
         for double in (False, True)
     }
-    needles = Quantity(
-        "position, normal", MAX_ABSOLUTE, rays.needles, needle_bound, rays.mitsuba_needles
+    flat, twins, sheets = (
+        Quantity(name, MAX_ABSOLUTE, run, FLAT, mitsuba)
+        for name, run, mitsuba in (
+            ("coverage, position, normal", broken.degenerate, broken.mitsuba_degenerate),
+            ("coverage, position, normal", broken.twins, "culls no faces"),
+            ("sunlight through both, as one", broken.blended_twins, opaque),
+        )
     )
+    theirs = rays.mitsuba_needles
+    needles = Quantity("position, normal", MAX_ABSOLUTE, rays.needles, needle_bound, theirs)
     return [
-        *table(
-            GROUP,
-            {"triangles of no area": ()},
-            Quantity(surface, MAX_ABSOLUTE, broken.degenerate, FLAT, broken.mitsuba_degenerate),
-        ),
-        *table(
-            GROUP,
-            cards,
-            Quantity(surface, MAX_ABSOLUTE, broken.twins, FLAT, "culls no faces"),
-        ),
-        *table(
-            GROUP,
-            {"two sheets of opacity 0.25 in one place": ()},
-            Quantity(sheets, MAX_ABSOLUTE, broken.blended_twins, FLAT, opaque),
-        ),
+        *table(GROUP, {"triangles of no area": ()}, flat),
+        *table(GROUP, cards, twins),
+        *table(GROUP, {"two sheets of opacity 0.25 in one place": ()}, sheets),
         *table(GROUP, {needle_name(w): (w,) for w in (1e-2, 1e-3)}, needles),
         *table(GROUP, {needle_name(w): (w,) for w in (1e-4, 1e-5)}, needles, cost="medium"),
     ]
@@ -145,31 +127,15 @@ def of_meshes() -> list[Case]:
 def of_shading() -> list[Case]:
     """Return the rows on radiance, and on a mesh of two million triangles."""
     wound = {"wound as they should be": (False,), "inside out": (True,)}
+    balls = {f"ball, triangles {name}": reverse for name, reverse in wound.items()}
+    matt = Quantity("radiance", "RMS relative", broken.inside_out, FACETS, OTHER_MATERIAL)
+    half = Quantity("coverage, radiance", RELATIVE, broken.one_pixel, ALBEDO, OTHER_MATERIAL)
+    name, measure = "first hits, rays that leave", "max over the diagonal, share"
+    many = Quantity(name, measure, rays.many_triangles, SAGITTA, rays.mitsuba_many_triangles)
     return [
-        *table(
-            GROUP,
-            {f"ball, triangles {name}": reverse for name, reverse in wound.items()},
-            Quantity("radiance", "RMS relative", broken.inside_out, FACETS, OTHER_MATERIAL),
-            cost="medium",
-        ),
-        *table(
-            GROUP,
-            {"a view of one pixel": ()},
-            Quantity("coverage, radiance", RELATIVE, broken.one_pixel, ALBEDO, OTHER_MATERIAL),
-            cost="medium",
-        ),
-        *table(
-            GROUP,
-            {"two million triangles": ()},
-            Quantity(
-                "first hits, rays that leave",
-                "max over the diagonal, share",
-                rays.many_triangles,
-                SAGITTA,
-                rays.mitsuba_many_triangles,
-            ),
-            cost="slow",
-        ),
+        *table(GROUP, balls, matt, cost="medium"),
+        *table(GROUP, {"a view of one pixel": ()}, half, cost="medium"),
+        *table(GROUP, {"two million triangles": ()}, many, cost="slow"),
     ]
 
 

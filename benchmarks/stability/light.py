@@ -15,6 +15,7 @@ from benchmarks.stability.case import (
     table,
 )
 
+PEAK = "max over the peak"
 LIGHT, TONE, FUSION = "light", "tone", "fusion"
 
 LOOKUP_ULPS = 4.0
@@ -108,72 +109,50 @@ def of_maps() -> list[Case]:
     """Return the rows on maps and on the shadow ratio."""
     noise = "its noise, not its precision, would be compared: benchmarks.speed"
     other = "samples other densities: constant between its texels' centres"
-    peak = "max over the peak"
-    lookup = Quantity("radiance", peak, maps.lookup, lookup_bound, maps.mitsuba_lookup)
+    none, name = NO_COUNTERPART, "power averaged to 128 x 64"
+    lookup = Quantity("radiance", PEAK, maps.lookup, lookup_bound, maps.mitsuba_lookup)
     density = Quantity("density at own samples", MAX_RELATIVE, maps.density, density_bound, other)
     under = Quantity("white plane", RELATIVE, sky_plane, PLANE, noise)
-    power = Quantity("power averaged to 128 x 64", RELATIVE, maps.energy, ENERGY, NO_COUNTERPART)
-    black = "radiance, samples, summary"
+    power = Quantity(name, RELATIVE, maps.energy, ENERGY, none)
+    plane = Quantity("white plane", RELATIVE, maps.plane, PLANE, noise)
+    small = plane._replace(gradient_bound=TEXEL_GRADIENT)
+    dark = Quantity("radiance, samples, summary", MAX_ABSOLUTE, maps.dark, 0.0, maps.mitsuba_dark)
+    ratio = Quantity("shadow ratio", MAX_ABSOLUTE, tone.ratio, VALUE, none, GRADIENT)
+    levels = {f"plane of radiance {level:g}": (level,) for level in LEVELS}
     return [
         *table(LIGHT, PLAIN | SUN, lookup, density, under),
         *table(LIGHT, GLARE, lookup, under),
         *table(LIGHT, LARGE, lookup, density, cost="slow"),
-        *table(LIGHT, PLANES, Quantity("white plane", RELATIVE, maps.plane, PLANE, noise)),
-        *table(
-            LIGHT,
-            SMALL_PLANES,
-            Quantity("white plane", RELATIVE, maps.plane, PLANE, noise, TEXEL_GRADIENT),
-        ),
-        *table(
-            LIGHT,
-            {"black map": ()},
-            Quantity(black, MAX_ABSOLUTE, maps.dark, 0.0, maps.mitsuba_dark),
-        ),
+        *table(LIGHT, PLANES, plane),
+        *table(LIGHT, SMALL_PLANES, small),
+        *table(LIGHT, {"black map": ()}, dark),
         *table(LIGHT, SUN, power),
         *table(LIGHT, LARGE, power, cost="slow"),
-        *table(
-            LIGHT,
-            {f"plane of radiance {level:g}": (level,) for level in LEVELS},
-            Quantity("shadow ratio", MAX_ABSOLUTE, tone.ratio, VALUE, NO_COUNTERPART, GRADIENT),
-        ),
+        *table(LIGHT, levels, ratio),
     ]
 
 
 def of_tone() -> list[Case]:
     """Return the rows on tone curves and on the display encoding."""
-    over_slope = "max over 1 + slope"
     none = NO_COUNTERPART
-    alone = {
-        "curves at and beyond their ends": Quantity(
-            "value, gradient", MAX_ABSOLUTE, tone.beyond, 0.0, none
-        ),
-        "bins of no width or height": Quantity(
-            "fall, excess", MAX_ABSOLUTE, tone.empty_bins, VALUE, none
-        ),
-        "raw parameters up to 1e30": Quantity("knots", MAX_ABSOLUTE, tone.raw_curve, VALUE, none),
-        "Reinhard from 0 to 1e30": Quantity(
-            "value", MAX_RELATIVE, tone.bright, VALUE, none, GRADIENT
-        ),
-        "encoding from 0 to 1e30": Quantity(
-            "display value", MAX_ABSOLUTE, tone.encoding, ENCODING, none, GRADIENT
-        ),
-    }
+    curves = {f"curve: {name}": (raw,) for name, raw in tone.COLLAPSED.items()}
+    slope = Quantity("value", "max over 1 + slope", tone.curve, CURVE, none, CURVE_GRADIENT)
+    ends = Quantity("value, gradient", MAX_ABSOLUTE, tone.beyond, 0.0, none)
+    bins = Quantity("fall, excess", MAX_ABSOLUTE, tone.empty_bins, VALUE, none)
+    knots = Quantity("knots", MAX_ABSOLUTE, tone.raw_curve, VALUE, none)
+    bright = Quantity("value", MAX_RELATIVE, tone.bright, VALUE, none, GRADIENT)
+    display = Quantity("display value", MAX_ABSOLUTE, tone.encoding, ENCODING, none, GRADIENT)
     return [
-        *table(
-            TONE,
-            {f"curve: {name}": (raw,) for name, raw in tone.COLLAPSED.items()},
-            Quantity("value", over_slope, tone.curve, CURVE, none, CURVE_GRADIENT),
-        ),
-        *(case for name, quantity in alone.items() for case in table(TONE, {name: ()}, quantity)),
+        *table(TONE, curves, slope),
+        *table(TONE, {"curves at and beyond their ends": ()}, ends),
+        *table(TONE, {"bins of no width or height": ()}, bins),
+        *table(TONE, {"raw parameters up to 1e30": ()}, knots),
+        *table(TONE, {"Reinhard from 0 to 1e30": ()}, bright),
+        *table(TONE, {"encoding from 0 to 1e30": ()}, display),
     ]
 
 
 def of_fusion() -> list[Case]:
     """Return the rows on the fusion of two lights."""
-    return table(
-        FUSION,
-        LIGHT_PAIRS,
-        Quantity(
-            "primed maps", "max over the peak", tone.fusion, FUSED, NO_COUNTERPART, FUSED_GRADIENT
-        ),
-    )
+    primed = Quantity("primed maps", PEAK, tone.fusion, FUSED, NO_COUNTERPART, FUSED_GRADIENT)
+    return table(FUSION, LIGHT_PAIRS, primed)
