@@ -68,16 +68,11 @@ def cabin() -> list[Part]:
     angle = 2.0 * np.pi * np.arange(32) / 32
     rim = np.stack([0.175 * np.cos(angle), 0.175 * np.sin(angle), np.zeros(32)], axis=1)
     spokes = [
-        tube(
-            [(0.02 * np.cos(a), 0.02 * np.sin(a), 0.0), (0.17 * np.cos(a), 0.17 * np.sin(a), 0.0)],
-            0.010,
-            6,
-        )
+        tube([(r * np.cos(a), r * np.sin(a), 0.0) for r in (0.02, 0.17)], 0.010, 6)
         for a in np.radians([-90.0, 30.0, 150.0])
     ]
-    wheel = merge([tube(rim, 0.014, 8, up=(0.0, 0.0, 1.0), closed=True), *spokes]).turned(
-        rotation("x", 24.0)
-    )
+    wheel = merge([tube(rim, 0.014, 8, up=(0.0, 0.0, 1.0), closed=True), *spokes])
+    wheel = wheel.turned(rotation("x", 24.0))
     column = tube([(0.33, 0.92, 0.45), (0.33, 0.86, 0.66)], 0.022, 8)
     parts: list[Part] = [
         ("lining", _lining()),

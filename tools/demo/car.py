@@ -89,6 +89,8 @@ TURNED = (
     ("chrome", 24, [(0.058, 0.034), (0.070, 0.032), (0.077, 0.025), (0.081, 0.012), (0.082, 0.0)]),
 )
 """What a wheel is turned from: material, facets around, profile of (x, radius) [m]."""
+FROM_RIM = np.linspace(0.0, 1.0, 6)[::-1]
+"""Where bowls and lenses of lamps are sampled, from the rim to the middle [1]."""
 # fmt: on
 
 
@@ -129,14 +131,11 @@ def _wheel() -> list[Part]:
         width = np.linspace(0.024, 0.017, len(path))
         spokes.append(tube(path, width, 8, up=(1.0, 0.0, 0.0), aspect=0.55).turned(turn))
     parts.append(("alloy", merge(spokes)))
+    nut = lathe([(0.055, 0.008), (0.066, 0.008), (0.069, 0.005), (0.069, 0.0)], 8)
     nuts = []
     for k in range(4):
         c, s = np.cos(np.pi * (0.5 * k + 0.25)), np.sin(np.pi * (0.5 * k + 0.25))
-        nuts.append(
-            lathe([(0.055, 0.008), (0.066, 0.008), (0.069, 0.005), (0.069, 0.0)], 8).moved(
-                (0.0, 0.048 * c, 0.048 * s)
-            )
-        )
+        nuts.append(nut.moved((0.0, 0.048 * c, 0.048 * s)))
     parts.append(("chrome", merge(nuts)))
     return parts
 
@@ -144,13 +143,11 @@ def _wheel() -> list[Part]:
 def _wheels() -> list[Part]:
     """Return all four wheels; the front ones are turned a little to the left."""
     parts: list[Part] = []
-    for name, surface in _wheel():
+    for name, left in _wheel():
+        right = left.mirrored()
         for axle in (FRONT_AXLE, REAR_AXLE):
-            left, right = surface, surface.mirrored()
-            parts += [
-                (name, left.moved((TRACK, WHEEL_Y, axle))),
-                (name, right.moved((-TRACK, WHEEL_Y, axle))),
-            ]
+            parts.append((name, left.moved((TRACK, WHEEL_Y, axle))))
+            parts.append((name, right.moved((-TRACK, WHEEL_Y, axle))))
     return parts
 
 
@@ -158,39 +155,20 @@ def _head_lamps() -> list[Part]:
     """Return both round head lamps: rim, bowl, bulb and lens."""
     turn = rotation("y", -90.0)
     pod = lathe([(-0.20, LAMP_RADIUS + 0.002), (0.0, LAMP_RADIUS + 0.010)], 40)
-    rim = lathe(
-        [
-            (0.0, LAMP_RADIUS + 0.010),
-            (0.004, LAMP_RADIUS + 0.014),
-            (0.016, LAMP_RADIUS + 0.011),
-            (0.021, LAMP_RADIUS + 0.003),
-            (0.018, LAMP_RADIUS - 0.006),
-            (0.006, LAMP_RADIUS - 0.010),
-        ],
-        40,
-    )
-    depth = np.linspace(0.0, 1.0, 6)
-    bowl = lathe(
-        [(0.008 - 0.075 * (1.0 - q * q), (LAMP_RADIUS - 0.008) * q) for q in depth[::-1]], 40
-    )
-    lens = lathe(
-        [(0.008 + 0.030 * (1.0 - q * q), (LAMP_RADIUS - 0.008) * q) for q in depth[::-1]], 40
+    profile = ((0.0, 0.010), (0.004, 0.014), (0.016, 0.011))
+    profile += ((0.021, 0.003), (0.018, -0.006), (0.006, -0.010))
+    rim = lathe([(x, LAMP_RADIUS + wider) for x, wider in profile], 40)
+    bowl, lens = (
+        lathe([(0.008 + deep * (1.0 - q * q), (LAMP_RADIUS - 0.008) * q) for q in FROM_RIM], 40)
+        for deep in (-0.075, 0.030)
     )
     bulb = ellipsoid((-0.03, 0.0, 0.0), (0.030, 0.022, 0.022), 7)
     ring = lathe(
         [(-0.012, 0.040), (0.006, 0.038), (0.008, 0.034), (0.006, 0.030), (-0.012, 0.030)], 32
     )
-    parts: list[Part] = []
-    for name, surface in (
-        ("paint", pod),
-        ("chrome", rim),
-        ("reflector", bowl),
-        ("lens", lens),
-        ("bulb", bulb),
-        ("chrome", ring),
-    ):
-        parts.append((name, both_sides(surface.turned(turn).moved(LAMP))))
-    return parts
+    parts = ("paint", pod), ("chrome", rim), ("reflector", bowl)
+    parts += ("lens", lens), ("bulb", bulb), ("chrome", ring)
+    return [(name, both_sides(surface.turned(turn).moved(LAMP))) for name, surface in parts]
 
 
 def _bumper(end: float, height: float) -> list[Part]:
@@ -202,9 +180,9 @@ def _bumper(end: float, height: float) -> list[Part]:
     path = path + 0.030 * out
     path[:, 1] = height
     bar = tube(path, 0.022, 12, aspect=1.75)
-    guards = []
-    for k in (10, 30):
-        guards.append(rounded_box(path[k] + 0.016 * out[k], (0.026, 0.072, 0.022), 0.02, 4))
+    guards = (
+        rounded_box(path[k] + 0.016 * out[k], (0.026, 0.072, 0.022), 0.02, 4) for k in (10, 30)
+    )
     return [("chrome", merge([bar, *guards]))]
 
 
@@ -225,11 +203,8 @@ def _nose() -> list[Part]:
         x = np.linspace(-0.355, 0.355, 25)
         slat = on_end(x, np.full_like(x, height), 1.0) + np.array([0.0, 0.0, 0.002])
         parts.append(("chrome", tube(slat, 0.006, 8)))
-    for x_lamp, y_lamp, size, name in (
-        (0.585, 0.545, 0.036, "amber"),
-        (0.50, 0.335, 0.050, "reflector"),
-    ):
-        spot = on_end(np.array([x_lamp]), np.array([y_lamp]), 1.0)
+    for at, size, name in (((0.585, 0.545), 0.036, "amber"), ((0.50, 0.335), 0.050, "reflector")):
+        spot = on_end(np.array(at[:1]), np.array(at[1:]), 1.0)
         parts += _button(spot, size, name)
     return parts
 
@@ -239,18 +214,10 @@ def _button(spot: Float64Array, size: float, name: str) -> list[Part]:
     place, out = spot[0], normalized(gradient(body_distance, spot))[0]
     side = normalized(np.cross([0.0, 1.0, 0.0], out))
     frame = np.stack([out, np.cross(side, out), side], axis=1)
-    rim = lathe(
-        [
-            (-0.03, size + 0.004),
-            (0.006, size + 0.007),
-            (0.011, size + 0.002),
-            (0.006, size - 0.003),
-        ],
-        22,
-    )
-    dome = lathe(
-        [(0.006 + 0.014 * (1.0 - q * q), (size - 0.002) * q) for q in np.linspace(1.0, 0.0, 6)], 28
-    )
+    profile = (-0.03, 0.004), (0.006, 0.007), (0.011, 0.002), (0.006, -0.003)
+    rim = lathe([(x, size + wider) for x, wider in profile], 22)
+    steps = np.linspace(1.0, 0.0, 6)
+    dome = lathe([(0.006 + 0.014 * (1.0 - q * q), (size - 0.002) * q) for q in steps], 28)
     return [
         ("chrome", both_sides(rim.turned(frame).moved(place))),
         (name, both_sides(dome.turned(frame).moved(place))),
@@ -260,11 +227,8 @@ def _button(spot: Float64Array, size: float, name: str) -> list[Part]:
 def _tail() -> list[Part]:
     """Return the rear lamps, the tailgate handle and the exhaust pipe."""
     parts: list[Part] = []
-    for height, size, name in (
-        (0.795, 0.062, "tail"),
-        (0.655, 0.050, "amber"),
-        (0.545, 0.045, "tail"),
-    ):
+    lamps = (0.795, 0.062, "tail"), (0.655, 0.050, "amber"), (0.545, 0.045, "tail")
+    for height, size, name in lamps:
         spot = on_end(np.array([0.585]), np.array([height]), -1.0)
         parts += _button(spot, size, name)
     handle = on_end(np.linspace(-0.13, 0.13, 9), np.full(9, 0.80), -1.0)
@@ -284,14 +248,8 @@ def _trim() -> list[Part]:
     place = np.array([0.835, 1.055, 0.545])
     parts.append(("chrome", both_sides(shell.moved(place))))
     parts.append(("reflector", both_sides(glass.moved(place))))
-    parts.append(
-        (
-            "black",
-            both_sides(
-                tube([(0.69, 1.005, 0.56), (0.75, 1.015, 0.56), (0.80, 1.035, 0.55)], 0.016, 8)
-            ),
-        )
-    )
+    stalk = tube([(0.69, 1.005, 0.56), (0.75, 1.015, 0.56), (0.80, 1.035, 0.55)], 0.016, 8)
+    parts.append(("black", both_sides(stalk)))
     # Handles and the chrome belt line under the windows.
     z = np.linspace(-0.20, -0.385, 7)
     grip = on_side(np.full_like(z, 0.855), z) + np.array([0.020, 0.0, 0.0])
@@ -312,16 +270,8 @@ def _trim() -> list[Part]:
             np.linspace(start[1] - 0.05, 0.5 * (start[1] + end[1]), 9),
         )
         parts.append(("black", tube(arm + np.array([0.0, 0.006, 0.004]), 0.006, 6)))
-    parts.append(
-        (
-            "black",
-            tube(
-                [(0.0, 1.49, -0.05), (0.0, 1.53, -0.08), (0.0, 1.78, -0.32)],
-                [0.010, 0.005, 0.003],
-                8,
-            ),
-        )
-    )
+    path = [(0.0, 1.49, -0.05), (0.0, 1.53, -0.08), (0.0, 1.78, -0.32)]
+    parts.append(("black", tube(path, [0.010, 0.005, 0.003], 8)))
     return parts
 
 
@@ -348,9 +298,8 @@ def _plates() -> list[Part]:
         right = np.array([0.46 * end, 0.0, 0.0])
         corner = np.array([0.0, height + 0.05, z]) - 0.5 * right
         parts.append(("plate", quad(corner, right, (0.0, -0.10, 0.0))))
-        parts.append(
-            ("black", rounded_box((0.0, height, z - end * 0.014), (0.24, 0.06, 0.0125), 0.01, 2))
-        )
+        carrier = rounded_box((0.0, height, z - end * 0.014), (0.24, 0.06, 0.0125), 0.01, 2)
+        parts.append(("black", carrier))
     return parts
 
 
@@ -360,9 +309,8 @@ def plate_texture() -> Texture:
     draw = ImageDraw.Draw(image)
     draw.rounded_rectangle((2, 2, 253, 61), 6, outline=(25, 25, 28, 255), width=3)
     draw.rectangle((4, 4, 24, 59), fill=(24, 62, 150, 255))
-    draw.text(
-        (140, 32), "WARP \u00b7 1R", (25, 25, 28, 255), ImageFont.load_default(42), anchor="mm"
-    )
+    font = ImageFont.load_default(42)
+    draw.text((140, 32), "WARP \u00b7 1R", (25, 25, 28, 255), font, anchor="mm")
     return Texture(np.asarray(image))
 
 

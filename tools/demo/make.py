@@ -5,8 +5,8 @@
 The photo is the place without the car, path-traced with warpir's own renderer under the light that
 is shipped beside it, and clipped like a sensor. The truth, on request, is the same picture with
 the car really standing in the scene. With ``--wet`` both show the square after rain. Both are
-encoded with gamma 2.2, which `warpir.insert`
-undoes. Deterministic: the same seed gives the same bytes on the same device.
+encoded with gamma 2.2, which `warpir.insert` undoes. Deterministic: the same seed gives the same
+bytes on the same device.
 """
 
 import argparse
@@ -22,6 +22,7 @@ from PIL import Image
 from tools.demo.car import car
 from tools.demo.place import background, camera, placement
 from tools.demo.sky import sky
+from warpir.core.color import codes_of, linear_to_gamma
 from warpir.core.latlong import look_up
 from warpir.demo import ASSET, CAMERA, LIGHT, PHOTO, WET_PHOTO
 from warpir.io.gltf.writer import write_glb
@@ -66,9 +67,7 @@ def write_light(texels: NDArray[np.float32], path: Path) -> None:
 def pixel_directions(view: Camera) -> NDArray[np.float64]:
     """Return unit directions through the pixel centres, world frame, shape [H, W, 3]."""
     v, u = np.mgrid[0 : view.height, 0 : view.width] + 0.5
-    local = np.stack(
-        [(u - view.cx) / view.fx, -(v - view.cy) / view.fy, np.full_like(u, -1.0)], axis=2
-    )
+    local = np.stack([(u - view.cx) / view.fx, -(v - view.cy) / view.fy, -np.ones_like(u)], axis=2)
     world = local @ view.c2w[:3, :3].T
     directions: NDArray[np.float64] = world / np.linalg.norm(world, axis=2, keepdims=True)
     return directions
@@ -131,9 +130,7 @@ def without_fireflies(batches: NDArray[np.float32]) -> NDArray[np.float64]:
 
 def write_photo(radiance: NDArray[np.float32], path: Path) -> None:
     """Clip radiance, shape [H, W, 3], like a sensor, encode it and write it."""
-    from warpir.core.color import linear_to_gamma
-
-    codes = np.round(255.0 * linear_to_gamma(np.clip(radiance, 0.0, 1.0))).astype(np.uint8)
+    codes = codes_of(linear_to_gamma(np.clip(radiance, 0.0, 1.0)))
     Image.fromarray(codes).save(path, optimize=True, quality=95, subsampling=0)
 
 

@@ -176,16 +176,13 @@ def split(surface: Surface, values: Float64Array) -> tuple[Surface, Surface]:
     added = {(int(a), int(b)): start + k for k, (a, b) in enumerate(edges)}
     a, b = edges[:, 0], edges[:, 1]
     s = (values[a] / (values[a] - values[b]))[:, None]
-    positions = np.concatenate(
-        [surface.positions, (1.0 - s) * surface.positions[a] + s * surface.positions[b]]
-    )
-    normals = np.concatenate(
-        [surface.normals, normalized((1.0 - s) * surface.normals[a] + s * surface.normals[b])]
-    )
 
-    uv = None
-    if surface.uv is not None:
-        uv = np.concatenate([surface.uv, (1.0 - s) * surface.uv[a] + s * surface.uv[b]])
+    def between(values: Float64Array) -> Float64Array:
+        return (1.0 - s) * values[a] + s * values[b]
+
+    positions = np.concatenate([surface.positions, between(surface.positions)])
+    normals = np.concatenate([surface.normals, normalized(between(surface.normals))])
+    uv = None if surface.uv is None else np.concatenate([surface.uv, between(surface.uv)])
 
     # Each crossed triangle becomes a polygon on either side, cut into a fan.
     pieces: tuple[list[list[int]], list[list[int]]] = ([], [])

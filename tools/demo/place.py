@@ -116,9 +116,8 @@ class Builder:
         if boxed:
             inside = rng.uniform(-1.0, 1.0, (count, 3))
             side = rng.integers(0, 3, count)
-            inside[np.arange(count), side] = rng.choice([-1.0, 1.0], count) * (
-                1.0 - 0.12 * rng.random(count)
-            )
+            sign = rng.choice([-1.0, 1.0], count)
+            inside[np.arange(count), side] = sign * (1.0 - 0.12 * rng.random(count))
             out = normalized(np.sign(inside) * np.abs(inside) ** 8)
         else:
             out = normalized(rng.standard_normal((count, 3)))
@@ -128,26 +127,16 @@ class Builder:
         along = normalized(np.cross(normal, rng.standard_normal((count, 3))))
         across = np.cross(normal, along)
         length = size * rng.uniform(0.7, 1.2, (count, 1))
-        corners = np.stack(
-            [
-                place - 0.5 * length * along,
-                place + 0.27 * length * across,
-                place + 0.5 * length * along,
-                place - 0.27 * length * across,
-            ],
-            axis=1,
-        )
+        half_long, half_wide = 0.5 * length * along, 0.27 * length * across
+        corners = (place - half_long, place + half_wide, place + half_long, place - half_wide)
+        leaves = np.stack(corners, axis=1)
         kind = rng.integers(0, len(names), count)
         for k, name in enumerate(names):
             chosen = kind == k
             start = 4 * np.arange(np.count_nonzero(chosen))[:, None]
             triangles = np.concatenate([start + np.array([0, 1, 2]), start + np.array([0, 2, 3])])
-            self.add(
-                name,
-                Surface(
-                    corners[chosen].reshape(-1, 3), np.repeat(normal[chosen], 4, axis=0), triangles
-                ),
-            )
+            normals = np.repeat(normal[chosen], 4, axis=0)
+            self.add(name, Surface(leaves[chosen].reshape(-1, 3), normals, triangles))
 
     def tree(
         self, foot: ArrayLike, height: float, spread: float, leaves: int, size: float = 0.13
@@ -164,15 +153,9 @@ class Builder:
         base = np.asarray(foot, dtype=np.float64)
         top = base + np.array([0.0, 0.62 * height, 0.0])
         bend = self.rng.normal(0.0, 0.05 * height, 3) * [1.0, 0.0, 1.0]
-        self.add(
-            "bark",
-            tube(
-                [base, 0.5 * (base + top) + 0.3 * bend, top + bend],
-                [0.035 * height, 0.026 * height, 0.012 * height],
-                10,
-                up=(1.0, 0.0, 0.0),
-            ),
-        )
+        trunk = [base, 0.5 * (base + top) + 0.3 * bend, top + bend]
+        radii = [0.035 * height, 0.026 * height, 0.012 * height]
+        self.add("bark", tube(trunk, radii, 10, up=(1.0, 0.0, 0.0)))
         clumps = 11
         for k in range(clumps):
             turn = 2.4 * k
@@ -182,15 +165,9 @@ class Builder:
                 [reach * np.cos(turn), height * (0.42 + 0.46 * lift), reach * np.sin(turn)]
             )
             half = spread * self.rng.uniform(0.38, 0.55) * np.array([1.0, 0.78, 1.0])
-            self.add(
-                "bark",
-                tube(
-                    [top * 0.6 + base * 0.4, 0.5 * (top + middle), middle],
-                    [0.009 * height, 0.006 * height, 0.003 * height],
-                    6,
-                    up=(0.31, 0.0, 0.95),
-                ),
-            )
+            branch = [top * 0.6 + base * 0.4, 0.5 * (top + middle), middle]
+            radii = [0.009 * height, 0.006 * height, 0.003 * height]
+            self.add("bark", tube(branch, radii, 6, up=(0.31, 0.0, 0.95)))
             self.foliage(middle, half, leaves // clumps, size)
 
     def primitives(self) -> tuple[Primitive, ...]:
@@ -217,10 +194,7 @@ def _wall(
                 continue
             piece = quad((x0, y1, HOUSE_Z), (x1 - x0, 0.0, 0.0), (0.0, y0 - y1, 0.0), tile)
             assert piece.uv is not None
-            offset = np.array([x0 / tile, -y1 / tile])
-            build.add(
-                name, Surface(piece.positions, piece.normals, piece.triangles, piece.uv + offset)
-            )
+            build.add(name, replace(piece, uv=piece.uv + np.array([x0 / tile, -y1 / tile])))
 
 
 def _window(build: Builder, left: float, right: float, bottom: float, top: float) -> None:
@@ -284,12 +258,8 @@ def _garden(build: Builder) -> None:
     )
     for k in range(int((right - left) / 0.8)):
         x = left + 0.8 * k
-        build.box(
-            "stone",
-            (x + 0.004, height, HOUSE_Z - 0.34),
-            (x + 0.796, height + 0.08, HOUSE_Z + 0.05),
-            0.015,
-        )
+        low, high = (x + 0.004, height, HOUSE_Z - 0.34), (x + 0.796, height + 0.08, HOUSE_Z + 0.05)
+        build.box("stone", low, high, 0.015)
     middle = 0.5 * (left + right)
     build.box("leaf_dark", (left, 0.0, HOUSE_Z - 1.55), (right, 1.42, HOUSE_Z - 0.82))
     build.foliage(
@@ -311,23 +281,15 @@ def _garden(build: Builder) -> None:
 def _planter(build: Builder, x: float, z: float, bush: float) -> None:
     """Add a square concrete planter with a bush and a few flowers."""
     half, height = 0.46, 0.62
-    build.box("concrete", (x - half, 0.03, z - half), (x + half, height, z + half), 0.02)
-    build.box(
-        "concrete",
-        (x - half + 0.06, 0.0, z - half + 0.06),
-        (x + half - 0.06, 0.04, z + half - 0.06),
-    )
-    build.box(
-        "concrete",
-        (x - half - 0.03, height - 0.10, z - half - 0.03),
-        (x + half + 0.03, height + 0.02, z + half + 0.03),
-        0.015,
-    )
-    build.box(
-        "soil",
-        (x - half + 0.06, height, z - half + 0.06),
-        (x + half - 0.06, height + 0.05, z + half - 0.06),
-    )
+
+    def block(name: str, wider: float, bottom: float, top: float, radius: float = 0.01) -> None:
+        low = x - half - wider, bottom, z - half - wider
+        build.box(name, low, (x + half + wider, top, z + half + wider), radius)
+
+    block("concrete", 0.0, 0.03, height, 0.02)
+    block("concrete", -0.06, 0.0, 0.04)
+    block("concrete", 0.03, height - 0.10, height + 0.02, 0.015)
+    block("soil", -0.06, height, height + 0.05)
     build.add("soil", ellipsoid((x, height + 0.6 * bush, z), np.full(3, 0.62 * bush), 10))
     build.foliage((x, height + 0.62 * bush, z), np.array([1.0, 0.95, 1.0]) * bush, 5200, 0.07)
     build.foliage((x, height + 0.12, z), (half, 0.16, half), 240, 0.06, ("flower", "leaf_light"))
@@ -335,25 +297,20 @@ def _planter(build: Builder, x: float, z: float, bush: float) -> None:
 
 def _furniture(build: Builder) -> None:
     """Add bollards, planters, a lamp post and a bench."""
+    upright = rotation("z", 90.0)
+    post = lathe(BOLLARD, 24).turned(upright)
+    band = lathe([(0.54, 0.0595), (0.62, 0.0590)], 24).turned(upright)
     for k in range(5):
-        post = lathe(BOLLARD, 24)
-        band = lathe([(0.54, 0.0595), (0.62, 0.0590)], 24)
         place = (2.9 + 1.55 * k, 0.0, -13.6)
-        build.add("iron", post.turned(rotation("z", 90.0)).moved(place))
-        build.add("white", band.turned(rotation("z", 90.0)).moved(place))
+        build.add("iron", post.moved(place))
+        build.add("white", band.moved(place))
     _planter(build, -5.5, -13.4, 0.58)
     _planter(build, -2.1, -15.6, 0.50)
     # The lamp post: its long shadow runs behind the car.
     x, z = -3.3, -11.0
-    pole = lathe(LAMP_POST, 24)
-    build.add("iron", pole.turned(rotation("z", 90.0)).moved((x, 0.0, z)))
+    cap = lathe([(4.17, 0.13), (4.19, 0.12), (4.24, 0.05), (4.30, 0.0)], 24)
+    build.add("iron", *(p.turned(upright).moved((x, 0.0, z)) for p in (lathe(LAMP_POST, 24), cap)))
     build.add("globe", ellipsoid((x, 3.98, z), (0.21, 0.22, 0.21), 16))
-    build.add(
-        "iron",
-        lathe([(4.17, 0.13), (4.19, 0.12), (4.24, 0.05), (4.30, 0.0)], 24)
-        .turned(rotation("z", 90.0))
-        .moved((x, 0.0, z)),
-    )
     # A bench before the garden wall.
     for k in range(4):
         build.box("bark", (3.6, 0.44, -16.62 + 0.115 * k), (5.3, 0.475, -16.52 + 0.115 * k), 0.008)

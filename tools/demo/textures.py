@@ -5,6 +5,7 @@ from numpy.typing import NDArray
 
 from tools.demo.noise import blurred_noise
 from warpir.core.arrays import Float64Array
+from warpir.core.color import codes_of, linear_to_srgb
 from warpir.scene.asset import Texture
 
 PAVED = 18.0
@@ -13,11 +14,8 @@ PAVED = 18.0
 
 def _encoded(reflectance: Float64Array) -> Texture:
     """Encode linear reflectance, shape [H, W, 3], as an sRGB texture."""
-    c = np.clip(reflectance, 0.0, 1.0)
-    code = np.where(c <= 0.0031308, 12.92 * c, 1.055 * c ** (1.0 / 2.4) - 0.055)
-    pixels = np.full((*c.shape[:2], 4), 255, dtype=np.uint8)
-    pixels[..., :3] = np.round(255.0 * code)
-    return Texture(pixels)
+    codes = codes_of(linear_to_srgb(np.clip(reflectance, 0.0, 1.0)))
+    return Texture(np.pad(codes, ((0, 0), (0, 0), (0, 1)), constant_values=255))
 
 
 def _courses(
