@@ -146,6 +146,18 @@ def fault_of(form: Format, ended: Mapping[str, Any]) -> str:
     return ""
 
 
+def tried(count: int) -> settings:
+    """Return the settings of so many draws, the same in every run."""
+    return settings(
+        max_examples=count,
+        derandomize=True,
+        database=None,
+        deadline=None,
+        phases=[Phase.generate],  # all faults of a run are told, none is made smaller
+        suppress_health_check=list(HealthCheck),
+    )
+
+
 def survey(form: Format, count: int, reader: Reader, keep: Path | None = None) -> Row:
     """Damage a format's file and read it, so many times; keep what makes a fault in a folder."""
     row = Row(form.name)
@@ -157,14 +169,7 @@ def survey(form: Format, count: int, reader: Reader, keep: Path | None = None) -
             row.faults.append(f"the sound file is not read: {first}")
             return row
 
-        @settings(
-            max_examples=count,
-            derandomize=True,
-            database=None,
-            deadline=None,
-            phases=[Phase.generate],  # all faults of a run are told, none is made smaller
-            suppress_health_check=list(HealthCheck),
-        )
+        @tried(count)
         @given(form.damage)
         def meet(content: bytes) -> None:
             write(form, content, folder / "damaged")

@@ -31,6 +31,9 @@ from warpir.render.device import choose_device
 from warpir.render.mis.integrator import MisIntegrator
 from warpir.render.renderer import Renderer
 
+FLOOR = 1e-4
+"""Added to the standard errors of ratios: a handful of rare events has no honest variance [1]."""
+
 
 def foreground_gradient(
     setting: Setting, depth: int, spp: int, seed: int, d_image: Float64Array
@@ -54,16 +57,13 @@ def foreground_gradient(
     return d_texels / spp
 
 
-def comparable(image: Ratio, seen: Float64Array, floor: float = 1e-4) -> Ratio:
-    """Keep the pixels that see the plane with half of their samples or more.
-
-    ``floor`` is added to the standard errors: a handful of rare events has no honest variance.
-    """
+def comparable(image: Ratio, seen: Float64Array) -> Ratio:
+    """Keep the pixels that see the plane with half of their samples or more."""
     used = (seen >= 0.5)[..., None]
     touched = image.variance > 0.0
     return image._replace(
         mean=np.where(used, image.mean, 1.0),
-        variance=np.where(used, image.variance + touched * floor**2, 0.0),
+        variance=np.where(used, image.variance + touched * FLOOR**2, 0.0),
         coverage=used[..., 0].astype(float),
     )
 
@@ -108,10 +108,8 @@ def gradient_line(
     """
     given = preset.setting(assets)
     camera, lobes = given.camera, fit_lobes(given.texels, 32).lobes
-    leaves = [
-        torch.tensor(a, requires_grad=True)
-        for a in (lobes.amplitude, lobes.axis, np.minimum(lobes.sharpness, 2000.0))
-    ]
+    parts = lobes.amplitude, lobes.axis, np.minimum(lobes.sharpness, 2000.0)
+    leaves = [torch.tensor(part, requires_grad=True) for part in parts]
     amplitude, axis, sharpness = leaves
     toward = torch.tensor(map_directions(64, 128), dtype=torch.float32)
     texels = torch.exp((toward @ axis.T - 1.0) * sharpness) @ amplitude
@@ -120,9 +118,8 @@ def gradient_line(
     setting = given._replace(texels=texels.detach().numpy())
 
     def to_lobes(d_texels: AnyFloatArray) -> list[Float64Array]:
-        grads = torch.autograd.grad(
-            texels, leaves, torch.tensor(d_texels, dtype=torch.float32), retain_graph=True
-        )
+        d = torch.tensor(d_texels, dtype=torch.float32)
+        grads = torch.autograd.grad(texels, leaves, d, retain_graph=True)
         return [g.double().numpy() for g in grads]
 
     half = spp // 2
@@ -154,36 +151,25 @@ def picture_lines(
     """Compare foregrounds and shadow ratio of a scene; write a sheet of each."""
     setting, spp, seed = preset.setting(options.assets), options.spp, options.seed
     size = [setting.camera.width, setting.camera.height]
+
+    def line(what: str, depth: int) -> dict[str, Any]:
+        return {"scene": preset.name, "what": what, "depth": depth, "spp": spp, "size": size}
+
     for depth in options.depths:
         start = time.perf_counter()
         reference = foreground(setting, depth, spp, seed)
         middle = time.perf_counter()
         candidate = ours.foreground(setting, depth, spp, seed + 1, device)
-        end = time.perf_counter()
-        yield {
-            "scene": preset.name,
-            "what": "foreground",
-            "depth": depth,
-            "spp": spp,
-            "size": size,
-            "mitsuba_s": round(middle - start, 2),
-            "ours_s": round(end - middle, 2),
-            **compare_images(candidate, reference),
-        }
+        taken = {"mitsuba_s": middle - start, "ours_s": time.perf_counter() - middle}
+        taken = {name: round(seconds, 2) for name, seconds in taken.items()}
+        yield line("foreground", depth) | taken | compare_images(candidate, reference)
         write_sheet(options.output / f"{preset.name}_d{depth}.png", candidate, reference)
     for bounce in (0, *options.bounces):
         ratio = shadow_ratio(setting, spp, seed, bounce_depth=bounce)
         own = ours.shadow_ratio(setting, spp, seed + 1, device, bounce)
         seen = ratio.coverage
         ratio, own = comparable(ratio, seen), comparable(own, seen)
-        yield {
-            "scene": preset.name,
-            "what": "shadow_ratio",
-            "depth": bounce,
-            "spp": spp,
-            "size": size,
-            **compare_images(own, ratio),
-        }
+        yield line("shadow_ratio", bounce) | compare_images(own, ratio)
         name = f"{preset.name}_ratio" + f"_b{bounce}" * bool(bounce)
         write_sheet(options.output / f"{name}.png", own, ratio)
 

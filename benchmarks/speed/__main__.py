@@ -51,56 +51,34 @@ TRANSPORT_STEPS = 10
 
 @dataclass(frozen=True)
 class Plan:
-    """What a run measures."""
+    """What a run measures; by default all of it."""
 
-    width: int
-    height: int
-    maps: tuple[tuple[int, int], ...]
+    width: int = 384
+    height: int = 256
+    maps: tuple[tuple[int, int], ...] = ((32, 32), (16, 16), (48, 48))
     """Rows of the map for the foreground and for the shadow; the first pair is the main one."""
-    mis_spp: tuple[int, ...]
-    mitsuba_spp: tuple[int, ...]
-    transport: tuple[dict[str, Any], ...]
-    """Settings beside the map, see `Transport`; maps after the first take the first alone."""
-    reference_spp: int
-    own_reference_spp: int
-    rounds: int
-    """Runs of each candidate, in turn with all others."""
-    transport_rounds: int
-    """Rounds in which transport is traced again."""
-    budget_s: float
-    """A candidate that would take longer than this in all is not run again."""
-
-
-FULL = Plan(
-    384,
-    256,
-    ((32, 32), (16, 16), (48, 48)),
-    (4, 16, 64, 256),
-    (4, 16, 64, 256, 1024),
-    (
+    mis_spp: tuple[int, ...] = (4, 16, 64, 256)
+    mitsuba_spp: tuple[int, ...] = (4, 16, 64, 256, 1024)
+    transport: tuple[dict[str, Any], ...] = (
         {},
         {"subsamples": 16, "paths": 32, "bright_directions": 256},
         {"subsamples": 64, "paths": 128, "bright_directions": 4096},
         {"expects_light": False},
-    ),
-    2048,
-    512,
-    5,
-    2,
-    30.0,
-)
-QUICK = replace(
-    FULL,
-    width=96,
-    height=64,
-    maps=((32, 32),),
-    mis_spp=(4, 16, 64),
-    mitsuba_spp=(4, 64, 1024),
-    transport=({},),
-    rounds=3,
-    transport_rounds=1,
-    budget_s=2.0,
-)
+    )
+    """Settings beside the map, see `Transport`; maps after the first take the first alone."""
+    reference_spp: int = 2048
+    own_reference_spp: int = 512
+    rounds: int = 5
+    """Runs of each candidate, in turn with all others."""
+    transport_rounds: int = 2
+    """Rounds in which transport is traced again."""
+    budget_s: float = 30.0
+    """A candidate that would take longer than this in all is not run again."""
+
+
+SMALL = {"width": 96, "height": 64, "maps": ((32, 32),), "transport": ({},)}
+SHORT = {"mis_spp": (4, 16, 64), "mitsuba_spp": (4, 64, 1024), "rounds": 3, "transport_rounds": 1}
+QUICK = Plan(**SMALL, **SHORT, budget_s=2.0)
 WARM_TRANSPORT = {"subsamples": 1, "bright_directions": 0, "paths": 1}
 
 
@@ -309,19 +287,15 @@ def disagreements(agreement: Sequence[dict[str, Any]], rows: Sequence[dict[str, 
     """
     found = []
     for entry in agreement:
-        part, height = entry["part"], entry["height"]
+        scene, part, height = entry["scene"], entry["part"], entry["height"]
         k = PARTS.index(part)
-        here = [
-            r
-            for r in rows
-            if r["scene"] == entry["scene"] and int(r["map"].split(":")[k]) == height
-        ]
+        here = [r for r in rows if (r["scene"], int(r["map"].split(":")[k])) == (scene, height)]
         for quantity in ("image", "gradient"):
             least = min((r["parts"][part][f"rmse_{quantity}"] for r in here), default=np.inf)
             apart = entry[quantity]["without_noise"]
             if apart > max(0.1 * least, entry[quantity]["resolved"]):
                 found.append(
-                    f"{entry['scene']}, {part} {quantity}, map {height}: the references differ by "
+                    f"{scene}, {part} {quantity}, map {height}: the references differ by "
                     f"{100 * apart:.3f} % beyond their noise; the smallest error compared is "
                     f"{100 * least:.3f} %"
                 )
@@ -335,22 +309,19 @@ def parse(arguments: list[str] | None) -> argparse.Namespace:
     parser.add_argument("--scenes", nargs="*", default=list(NAMES), choices=NAMES)
     parser.add_argument("--threads", type=int, default=0, help="CPU threads of every renderer")
     parser.add_argument("--sampler", default="ldsampler", help="of Mitsuba")
+    about = "let Mitsuba's Python trace every call anew"
+    parser.add_argument("--no-freeze", action="store_true", help=about)
+    about = "of Mitsuba's reference, twice a power of 4"
+    parser.add_argument("--reference-spp", type=int, help=about)
+    parser.add_argument("--own-reference-spp", type=int, help="of mis's reference")
     parser.add_argument(
-        "--no-freeze", action="store_true", help="let Mitsuba's Python trace every call anew"
+        "--maps", nargs="*", help="rows of the object's map and the shadow's: 32:32"
     )
-    parser.add_argument(
-        "--reference-spp", type=int, default=None, help="of Mitsuba's reference, twice a power of 4"
-    )
-    parser.add_argument("--own-reference-spp", type=int, default=None, help="of mis's reference")
-    parser.add_argument(
-        "--maps", nargs="*", default=None, help="rows of the object's map and the shadow's: 32:32"
-    )
-    parser.add_argument("--rounds", type=int, default=None)
-    parser.add_argument("--budget", type=float, default=None, help="seconds per candidate")
+    parser.add_argument("--rounds", type=int)
+    parser.add_argument("--budget", type=float, help="seconds per candidate")
     parser.add_argument("--cache", type=Path, default=Path("out/speed"), help="of references")
-    parser.add_argument(
-        "--docs", type=Path, default=None, help="write table and plot here (docs, unless --quick)"
-    )
+    about = "write table and plot here (docs, unless --quick)"
+    parser.add_argument("--docs", type=Path, help=about)
     return parser.parse_args(arguments)
 
 
@@ -365,58 +336,28 @@ def plan_of(options: argparse.Namespace) -> Plan:
     if options.maps:
         pairs = [tuple(int(h) for h in pair.split(":")) for pair in options.maps]
         asked["maps"] = tuple((pair[0], pair[-1]) for pair in pairs)
-    plan = QUICK if options.quick else FULL
+    plan = QUICK if options.quick else Plan()
     return replace(plan, **{name: value for name, value in asked.items() if value})
 
 
-@dataclass
-class Found:
-    """What was measured of all scenes."""
+def measured(
+    scene: SpeedScene, plan: Plan, options: argparse.Namespace
+) -> tuple[list[dict[str, Any]], list[dict[str, Any]]]:
+    """Return the rows of a scene, and how far its references agree."""
+    import drjit as dr
 
-    rows: list[dict[str, Any]] = field(default_factory=list)
-    agreement: list[dict[str, Any]] = field(default_factory=list)
-    scenes: list[dict[str, Any]] = field(default_factory=list)
-    reasons: list[str] = field(default_factory=list)
-    """Why something was left out."""
-
-    def add(self, scene: SpeedScene, plan: Plan, options: argparse.Namespace) -> None:
-        """Measure a scene."""
-        import drjit as dr
-
-        bench = Bench(scene, plan.maps, options.sampler, not options.no_freeze)
-        spp = plan.reference_spp, plan.own_reference_spp
-        references = References(bench, *spp, options.cache, log)
-        self.rows += measure_scene(bench, plan, references)
-        self.agreement += [
-            {"scene": scene.name, "part": part, "height": height, **reference.agreement()}
-            for (part, height), reference in references.by_map.items()
-        ]
-        self.scenes.append(
-            {
-                "name": scene.name,
-                "triangles": scene.triangles,
-                "depth": scene.depth,
-                "object_pixels": len(scene.object_pixels),
-                "receiver_pixels": len(scene.receiver_pixels),
-            }
-        )
-        del bench, references
-        gc.collect()
-        dr.flush_malloc_cache()
-
-    def result(self, conditions: dict[str, Any]) -> dict[str, Any]:
-        """Return the record of the run."""
-        for row in self.rows:
-            row["device"] = conditions["device"]
-        return {
-            "conditions": conditions,
-            "scenes": self.scenes,
-            "skipped": self.reasons,
-            "ratios": ratios(self.rows),
-            "references": self.agreement,
-            "disagreements": disagreements(self.agreement, self.rows),
-            "rows": self.rows,
-        }
+    bench = Bench(scene, plan.maps, options.sampler, not options.no_freeze)
+    spp = plan.reference_spp, plan.own_reference_spp
+    references = References(bench, *spp, options.cache, log)
+    rows = measure_scene(bench, plan, references)
+    agreement = [
+        {"scene": scene.name, "part": part, "height": height, **reference.agreement()}
+        for (part, height), reference in references.by_map.items()
+    ]
+    del bench, references
+    gc.collect()
+    dr.flush_malloc_cache()
+    return rows, agreement
 
 
 def main(arguments: list[str] | None = None) -> None:
@@ -430,15 +371,21 @@ def main(arguments: list[str] | None = None) -> None:
     import drjit as dr
     import mitsuba as mi
 
-    found = Found()
+    rows: list[dict[str, Any]] = []
+    agreement: list[dict[str, Any]] = []
+    scenes: list[dict[str, Any]] = []
+    skipped = []
     for name in options.scenes:
         try:
             scene = make_scene(name, plan.width, plan.height, options.assets, device, threads)
         except FileNotFoundError as error:
-            found.reasons.append(f"{name}: {error} (--assets)")
-            log(f"skipped {found.reasons[-1]}")
+            skipped.append(f"{name}: {error} (--assets)")
+            log(f"skipped {skipped[-1]}")
             continue
-        found.add(scene, plan, options)
+        found = measured(scene, plan, options)
+        rows += found[0]
+        agreement += found[1]
+        scenes.append(scene.record())
     conditions = {
         **context(wp.get_device(device), threads),
         "mitsuba": mi.__version__,
@@ -450,7 +397,17 @@ def main(arguments: list[str] | None = None) -> None:
         "command": "python -m benchmarks.speed " + " ".join(arguments or sys.argv[1:]),
         "seconds": round(time.perf_counter() - STARTED, 1),
     }
-    result = found.result(conditions)
+    for row in rows:
+        row["device"] = conditions["device"]
+    result = {
+        "conditions": conditions,
+        "scenes": scenes,
+        "skipped": skipped,
+        "ratios": ratios(rows),
+        "references": agreement,
+        "disagreements": disagreements(agreement, rows),
+        "rows": rows,
+    }
     write_json(options.json, result)
     print(summary(result))
     docs = options.docs or (None if options.quick else Path("docs"))

@@ -207,13 +207,17 @@ def _flat(image: Float64Array, gradient: Float64Array) -> Float64Array:
     return np.concatenate([image.ravel(), gradient.ravel()])
 
 
+def _seeds(first: int, count: int) -> list[list[int]]:
+    """Return the seeds of two halves' runs."""
+    return [[SEED * (half + first) + k for k in range(count)] for half in range(2)]
+
+
 def _own(bench: Bench, part: str, height: int, spp: int) -> Float64Array:
     """Converge `mis`: two halves of image and gradient, shape [2, image + gradient]."""
     chunk = min(CHUNK, spp // 2)
     run = MisPart(bench, part, height, chunk)
     halves = []
-    for half in range(2):
-        seeds = [SEED * (half + 1) + k for k in range(spp // 2 // chunk)]
+    for seeds in _seeds(1, spp // 2 // chunk):
         if part == "foreground":
             steps = [run.step(seed)()[part] for seed in seeds]
             image = np.mean([s[0] for s in steps], axis=0)
@@ -261,14 +265,10 @@ def _own_lobes(bench: Bench, part: str, spp: int) -> Float64Array:
     scene, renderer = bench.scene, bench.scene.renderer
     light = light_args(Light(scene.lobes), renderer.device)
     halves = []
-    for half in range(2):
-        seeds = [SEED * (half + 5) + k for k in range(spp // 2 // chunk)]
+    for seeds in _seeds(5, spp // 2 // chunk):
         if part == "ratio":
-            mis = run.mis
-            runs = [
-                renderer.receiver(light, mis.receiver_pixels, mis.may_see_object, chunk, 1, seed)
-                for seed in seeds
-            ]
+            seen_by = run.mis.receiver_pixels, run.mis.may_see_object
+            runs = [renderer.receiver(light, *seen_by, chunk, 1, seed) for seed in seeds]
             lit = np.mean([r.lit.astype(np.float64) for r in runs], axis=0)
             unoccluded = np.mean([r.unoccluded.astype(np.float64) for r in runs], axis=0)
             seen = unoccluded > 0.0
@@ -297,7 +297,6 @@ def _mitsuba(bench: Bench, part: str, height: int, spp: int) -> Float64Array:
             sums = target.plane(spp // 2, seed)
             d_lit, d_unoccluded, ratio = ratio_adjoint(*sums, target.weight_ratio)
             made = target.plane_gradient(spp // 2, seed + 5_000, d_lit, d_unoccluded)
-            image = np.asarray(ratio, np.float64).T
-            gradient = np.asarray(made, dtype=np.float64)
+            image, gradient = np.asarray(ratio, np.float64).T, np.asarray(made, np.float64)
         halves.append(_flat(image, gradient))
     return np.stack(halves)

@@ -7,6 +7,7 @@ the shadow ratio, with weights that are part smooth and part noise, as a guidanc
 
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -67,6 +68,16 @@ class SpeedScene:
     """Loss gradient of the foreground, shape [object_pixel, 3]."""
     weight_ratio: FloatArray
     """Loss gradient of the shadow ratio, shape [receiver_pixel, 3]."""
+
+    def record(self) -> dict[str, Any]:
+        """Return its sizes."""
+        return {
+            "name": self.name,
+            "triangles": self.triangles,
+            "depth": self.depth,
+            "object_pixels": len(self.object_pixels),
+            "receiver_pixels": len(self.receiver_pixels),
+        }
 
     def texels(self, height: int) -> FloatArray:
         """Return the light as a map, relative [W/(m^2 sr)], shape [height, 2 height, 3]."""

@@ -359,36 +359,29 @@ def mitsuba_frame() -> float:
 
 def cases() -> list[Case]:
     """Return the rows of this group."""
+    group = "brdf"
     below = "zero by definition there as well"
-    own = "density at own samples"
     through = "another integral: it lets light through below the geometric surface"
+    widths = {f"roughness {r:g}": (r,) for r in ROUGHNESS}
+    flat = {f"both cosines {c:g}": (c,) for c in GRAZING}
+    leaning = {f"shading normal {t:g} deg off": (t,) for t in (30.0, 60.0, 85.0, 100.0, 180.0)}
+    away = Quantity("value, density, gradient", MAX_ABSOLUTE, facing_away, 0.0, below)
+    tilted = Quantity("radiance", RELATIVE, shading_normal, NORMALS, through)
+    round_it = Quantity("frame", MAX_ABSOLUTE, frame, FRAME, mitsuba_frame)
+    of_pairs, of_density, of_samples, of_grazing = (
+        Quantity(name, MAX_RELATIVE, run, VALUE, mitsuba)
+        for name, run, mitsuba in (
+            ("value", value, mitsuba_value),
+            ("density", density, mitsuba_density),
+            ("density at own samples", own_samples, mitsuba_own_samples),
+            ("value and density", grazing, mitsuba_grazing),
+        )
+    )
+    of_pairs = of_pairs._replace(gradient_bound=GRADIENT)
     return [
-        *table(
-            "brdf",
-            {f"roughness {r:g}": (r,) for r in ROUGHNESS},
-            Quantity("value", MAX_RELATIVE, value, VALUE, mitsuba_value, GRADIENT),
-            Quantity("density", MAX_RELATIVE, density, VALUE, mitsuba_density),
-            Quantity(own, MAX_RELATIVE, own_samples, VALUE, mitsuba_own_samples),
-        ),
-        *table(
-            "brdf",
-            {f"both cosines {c:g}": (c,) for c in GRAZING},
-            Quantity("value and density", MAX_RELATIVE, grazing, VALUE, mitsuba_grazing),
-        ),
-        *table(
-            "brdf",
-            {"directions below the surface": ()},
-            Quantity("value, density, gradient", MAX_ABSOLUTE, facing_away, 0.0, below),
-        ),
-        *table(
-            "brdf",
-            {f"shading normal {t:g} deg off": (t,) for t in (30.0, 60.0, 85.0, 100.0, 180.0)},
-            Quantity("radiance", RELATIVE, shading_normal, NORMALS, through),
-            cost="medium",
-        ),
-        *table(
-            "brdf",
-            {"normals next to -Z and +Z": ()},
-            Quantity("frame", MAX_ABSOLUTE, frame, FRAME, mitsuba_frame),
-        ),
+        *table(group, widths, of_pairs, of_density, of_samples),
+        *table(group, flat, of_grazing),
+        *table(group, {"directions below the surface": ()}, away),
+        *table(group, leaning, tilted, cost="medium"),
+        *table(group, {"normals next to -Z and +Z": ()}, round_it),
     ]

@@ -182,27 +182,20 @@ def furnace(device: str, body: Primitive, ior: float) -> Measured:
 
 def cases() -> list[Case]:
     """Return the cases of this module."""
-    name, lit = "ground below", RELATIVE
+    sphere_lit, panel_lit = (
+        Quantity("ground below", RELATIVE, run, NOISE, REFEREE, SLOPE)
+        for run in (below_sphere, below_panel)
+    )
+    outside = Quantity("light outside", "max share", leak, 0.0, REFEREE)
+    weight = Quantity("mirror", MAX_RELATIVE, mirror, MIRROR, REFEREE)
+    direction = Quantity("direction", MAX_ABSOLUTE, mirror_direction, MIRROR, REFEREE)
+    kept = Quantity("furnace", RELATIVE, furnace, MIRROR, REFEREE)
     return [
-        *table(
-            LAMPS, BELOW, Quantity(name, lit, below_sphere, NOISE, REFEREE, SLOPE), cost="medium"
-        ),
-        *table(
-            LAMPS, PANELS, Quantity(name, lit, below_panel, NOISE, REFEREE, SLOPE), cost="medium"
-        ),
-        *table(
-            LAMPS,
-            {"lamp in a closed box": ()},
-            Quantity("light outside", "max share", leak, 0.0, REFEREE),
-            cost="medium",
-        ),
-        *table(
-            COAT,
-            GRAZING,
-            Quantity("mirror", MAX_RELATIVE, mirror, MIRROR, REFEREE),
-            Quantity("direction", MAX_ABSOLUTE, mirror_direction, MIRROR, REFEREE),
-        ),
+        *table(LAMPS, BELOW, sphere_lit, cost="medium"),
+        *table(LAMPS, PANELS, panel_lit, cost="medium"),
+        *table(LAMPS, {"lamp in a closed box": ()}, outside, cost="medium"),
+        *table(COAT, GRAZING, weight, direction),
         *table(COAT, ROUGH, Quantity("albedo", RELATIVE, albedo, ALBEDO, REFEREE)),
-        *table(GLASS, BODIES, Quantity("furnace", RELATIVE, furnace, MIRROR, REFEREE)),
-        *table(GLASS, TRAPS, Quantity("furnace", RELATIVE, furnace, KEPT, REFEREE)),
+        *table(GLASS, BODIES, kept),
+        *table(GLASS, TRAPS, kept._replace(bound=KEPT)),
     ]

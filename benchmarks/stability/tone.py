@@ -1,6 +1,7 @@
 """Shadow ratio, tone, encoding and fusion at the ends of their ranges."""
 
 from functools import partial
+from itertools import pairwise
 
 import numpy as np
 import torch
@@ -51,9 +52,8 @@ def ratio(device: str, level: float) -> Measured:
     unoccluded = np.full((33, 3), level, np.float32)
     lit = (unoccluded * share[:, None]).astype(np.float32)
     arrays = [upload(a, wp.vec3, device, True) for a in (lit, unoccluded)]
-    (out,), gradients = differentiate(
-        shadow_ratio, arrays, np.ones((33, 3)), wp.vec3, device=device
-    )
+    even = np.ones((33, 3))
+    (out,), gradients = differentiate(shadow_ratio, arrays, even, wp.vec3, device=device)
     a, b = lit.astype(np.float64), unoccluded.astype(np.float64)
     # Below 1e-30 the plane counts as dark.
     if level < 1e-30:
@@ -61,15 +61,10 @@ def ratio(device: str, level: float) -> Measured:
     else:
         truth = a / b
         h = 1e-4 * b
-        slopes = [
-            ((a + h) / b - (a - h) / b) / (2.0 * h),
-            (a / (b + h) - a / (b - h)) / (2.0 * h),
-        ]
-    return Measured(
-        float(np.abs(out - truth).max()),
-        finite(out, *gradients),
-        worst_l2([g * level for g in gradients], [s * level for s in slopes]),
-    )
+        by_lit, by_unoccluded = (a + h) / b - (a - h) / b, a / (b + h) - a / (b - h)
+        slopes = [by_lit / (2.0 * h), by_unoccluded / (2.0 * h)]
+    gradient_error = worst_l2([g * level for g in gradients], [s * level for s in slopes])
+    return Measured(float(np.abs(out - truth).max()), finite(out, *gradients), gradient_error)
 
 
 def run_curve(
@@ -85,10 +80,8 @@ def run_curve(
 
 COLLAPSED = {
     "identity": np.zeros(16),
-    "widths at their least": np.concatenate([[12.0, -12, -12, -12, -12], np.zeros(11)]),
-    "heights at their least": np.concatenate(
-        [np.zeros(5), [-12.0, -12, 12, -12, -12], np.zeros(6)]
-    ),
+    "widths at their least": np.array([12.0, *[-12] * 4, *[0] * 11]),
+    "heights at their least": np.array([*[0.0] * 5, -12, -12, 12, -12, -12, *[0] * 6]),
     "slopes at their least": np.concatenate([np.zeros(10), np.full(6, -12.0)]),
     "slopes of 30": np.concatenate([np.zeros(10), np.full(6, 30.0)]),
 }
@@ -99,9 +92,7 @@ def curve(device: str, raw: np.ndarray) -> Measured:
     """A curve within its ends: values over one plus the slope, and gradients."""
     knots = tuple(k.astype(np.float32) for k in o.spline_knots(raw))
     wide = [k.astype(np.float64) for k in knots]
-    inside = np.concatenate(
-        [np.linspace(a, b, 41)[1:-1] for a, b in zip(wide[0][:-1], wide[0][1:], strict=True)]
-    )
+    inside = np.concatenate([np.linspace(a, b, 41)[1:-1] for a, b in pairwise(wide[0])])
     x = np.concatenate([inside, wide[0]]).astype(np.float32)
     y = np.concatenate([np.ones(len(inside)), np.zeros(len(wide[0]))])
     values, gradients = run_curve(device, x, knots, y)
@@ -138,15 +129,9 @@ def beyond(device: str) -> Measured:
 def empty_bins(device: str) -> Measured:
     """Bins of no width or no height at all, at their knots too: finite, monotone, in [0, 1]."""
     worst, values = 0.0, []
-    shapes = (
-        ([0.0, 0.5, 0.5, 1.0], [0.0, 0.3, 0.7, 1.0]),
-        ([0.0, 0.5, 1.0, 1.0], [0.0, 0.3, 0.7, 1.0]),
-        ([0.0, 0.0, 0.5, 1.0], [0.0, 0.3, 0.7, 1.0]),
-        ([0.0, 0.3, 0.7, 1.0], [0.0, 0.5, 0.5, 1.0]),
-        ([0.0, 0.3, 0.7, 1.0], [0.0, 0.0, 0.5, 1.0]),
-        ([0.0, 0.3, 0.7, 1.0], [0.0, 0.5, 1.0, 1.0]),
-    )
-    for knot_x, knot_y in shapes:
+    plain = [0.0, 0.3, 0.7, 1.0]
+    empty = [0.0, 0.5, 0.5, 1.0], [0.0, 0.5, 1.0, 1.0], [0.0, 0.0, 0.5, 1.0]
+    for knot_x, knot_y in (*((k, plain) for k in empty), *((plain, k) for k in empty)):
         knots = tuple(np.array(k, np.float32) for k in (knot_x, knot_y, np.ones(4)))
         x = np.sort(np.concatenate([np.linspace(0, 1, 101), knots[0]])).astype(np.float32)
         found, gradients = run_curve(device, x, knots, np.ones(len(x)))
@@ -183,18 +168,14 @@ def bright(device: str) -> Measured:
     """Reinhard's operator from black to 1e30, and its gradient."""
     x = np.concatenate([[0.0], np.geomspace(1e-30, 1e30, 241)]).astype(np.float32)
     inputs = [upload(x, float, device, True)]
-    (out,), (gradient,) = differentiate(
-        reinhard_kernel, inputs, np.ones(len(x)), float, device=device
-    )
+    even = np.ones(len(x))
+    (out,), (gradient,) = differentiate(reinhard_kernel, inputs, even, float, device=device)
     x64 = x.astype(np.float64)
     # Beyond 1e19 the slope, 1 / x^2, leaves float32's normal numbers, and CUDA makes it 0: what
     # is below 1e-32 is compared absolutely, to 1e-37.
     slope = 1.0 / (1.0 + x64) ** 2
-    return Measured(
-        max_relative(out, o.reinhard(x64)),
-        finite(out, gradient),
-        max_relative(gradient, slope, 1e-32),
-    )
+    error, gradient_error = max_relative(out, o.reinhard(x64)), max_relative(gradient, slope, 1e-32)
+    return Measured(error, finite(out, gradient), gradient_error)
 
 
 def encoding(device: str) -> Measured:
@@ -207,19 +188,15 @@ def encoding(device: str) -> Measured:
     blank = upload(np.zeros((count, 3)), wp.vec3, device)
     mask = upload(np.ones(count), float, device)
     inputs = [blank, row, none, mask, display, blank]
-    (out,), (by_display,) = differentiate(
-        compose, inputs, np.ones((count, 3)), wp.vec3, device=device
-    )
+    even = np.ones((count, 3))
+    (out,), (by_display,) = differentiate(compose, inputs, even, wp.vec3, device=device)
     gradient = by_display[:, 0]
     x64 = x.astype(np.float64)
     power = (x64 > 1.1e-6) & (x64 < 1.0)
     h = 1e-4 * x64[power]
     slope = (o.encode(x64[power] + h) - o.encode(x64[power] - h)) / (2.0 * h)
-    return Measured(
-        float(np.abs(out[:, 0] - np.minimum(o.encode(x64), 1.0)).max()),
-        finite(out, gradient),
-        max_relative(gradient[power], slope),
-    )
+    error = float(np.abs(out[:, 0] - np.minimum(o.encode(x64), 1.0)).max())
+    return Measured(error, finite(out, gradient), max_relative(gradient[power], slope))
 
 
 def fusion(device: str, fg_level: float, shadow_level: float, black: str) -> Measured:

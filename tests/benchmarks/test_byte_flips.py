@@ -14,9 +14,9 @@ from typing import Any
 import numpy as np
 import OpenEXR
 import pytest
-from hypothesis import HealthCheck, Phase, given, settings
+from hypothesis import given
 
-from benchmarks.damage.__main__ import BYTES, SECONDS, Reader, survey, write
+from benchmarks.damage.__main__ import BYTES, SECONDS, Reader, survey, tried, write
 from benchmarks.damage.formats import formats, weights
 from benchmarks.damage.mutations import exr_attributes
 from tests.builders.faults import Ended, run_case
@@ -84,14 +84,7 @@ def test_damaged_files_at_the_command_line(inputs: Path, tmp_path: Path, name: s
     """Through the whole command with --validate, each in a process of its own."""
     form, flag = FORMATS[name], FLAGS[name]
 
-    @settings(
-        max_examples=6,
-        derandomize=True,
-        database=None,
-        deadline=None,
-        phases=[Phase.generate],
-        suppress_health_check=list(HealthCheck),
-    )
+    @tried(6)
     @given(form.damage)
     def meet(content: bytes) -> None:
         write(form, content, tmp_path / "bad")
@@ -268,11 +261,9 @@ PROMISES: dict[str, tuple[str, int, Callable[[Path], Path]]] = {
         "photo", INPUT,
         named("bad.jpg", b"\xff\xd8\xff\xc0\0\x11\x08\xff\xdc\xff\xdc\x03\x01\x22\0\x02\x11\x01"
               b"\x03\x11\x01" + bytes(200))),
-    "I8-icc-inflates": (
-        "photo", DONE, png_with(b"iCCP")),
+    "I8-icc-inflates": ("photo", DONE, png_with(b"iCCP")),
     "I8-icc-text-of-a-gigabyte": ("photo", DONE, profile_bomb),
-    "I19-png-text-inflates": (
-        "photo", DONE, png_with(b"zTXt")),
+    "I19-png-text-inflates": ("photo", DONE, png_with(b"zTXt")),
     "E3-exr-chunk-of-a-gigabyte": ("photo", INPUT, exr_bomb),
     "E4-exr-data-window": (
         "photo", INPUT,
