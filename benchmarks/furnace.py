@@ -11,25 +11,18 @@ import numpy as np
 
 from warpir.core.arrays import Float64Array
 
+NODES = 96
+"""Along each axis."""
 
-def directional_albedo(
-    cos_o: float, roughness: float, base_color: float, metallic: float, order: int = 96
-) -> float:
-    """Return ``E(cos_o)`` of one channel [1].
 
-    Args:
-        cos_o: Cosine between view and normal, in (0, 1].
-        roughness: Perceptual roughness [1].
-        base_color: Albedo parameter [1].
-        metallic: 0 dielectric to 1 metal [1].
-        order: Nodes along each axis.
-    """
+def directional_albedo(cos_o: float, roughness: float, base_color: float, metallic: float) -> float:
+    """Return ``E(cos_o)`` of one channel [1], with the perceptual roughness."""
     f0 = 0.04 + (base_color - 0.04) * metallic
     c_diff = base_color * (1.0 - metallic)
     wo = np.array([np.sqrt(1.0 - cos_o**2), 0.0, cos_o])
-    node, weight = np.polynomial.legendre.leggauss(order)
+    node, weight = np.polynomial.legendre.leggauss(NODES)
     node, weight = 0.5 * (node + 1.0), 0.5 * weight
-    phi = 2.0 * np.pi * (np.arange(order) + 0.5) / order
+    phi = 2.0 * np.pi * (np.arange(NODES) + 0.5) / NODES
     specular = specular_ring(wo, max(roughness**2, 1e-3), f0, node, phi) @ weight
     return float(specular + c_diff * (diffuse_ring(wo, node, phi) @ weight))
 

@@ -132,12 +132,8 @@ def softness(camera: Camera, columns: int) -> Float64Array:
 
     The weights of a bilinear look-up between texels are a triangle, whose variance is a sixth of
     the texel's square. A pixel of the crop is the mean of two by two look-ups, whose variance is
-    1/16, a rendered one of a whole square, 1/12. What blurred the panorama itself comes on top, and
-    is not known.
-
-    Args:
-        camera: That of the crop.
-        columns: Of the panorama.
+    1/16, a rendered one of a whole square, 1/12. What blurred the panorama, of so many columns,
+    itself comes on top, and is not known.
     """
     u, v = np.meshgrid(np.arange(camera.width) + 0.5, np.arange(camera.height) + 0.5)
     local = np.stack([(u - camera.cx) / camera.fx, (camera.cy - v) / camera.fy, -np.ones_like(u)])
@@ -150,13 +146,7 @@ def softness(camera: Camera, columns: int) -> Float64Array:
 
 
 def measure(subject: Subject, samples: int, columns: int) -> Errors:
-    """Return the errors of every row for one object.
-
-    Args:
-        subject: The object in its place.
-        samples: Per pixel.
-        columns: Of the panorama, by whose texels the crop is soft.
-    """
+    """Return the errors of every row for one object in a panorama of so many columns."""
     place = subject.place
     rng, crop = np.random.default_rng([9, *place.seed]), photo_of(place.photo)
     camera = draw_camera(place.photo_lin, rng)

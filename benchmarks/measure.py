@@ -41,12 +41,12 @@ def flags(doc: str | None, *names: str) -> argparse.ArgumentParser:
     return parser
 
 
-def seconds(work: Callable[[], object], device: wp.Device, repeats: int = 7) -> tuple[float, float]:
+def seconds(work: Callable[[], object], device: wp.Device) -> tuple[float, float]:
     """Return median and half the interquartile range of run times [s], after a warm-up."""
     work()
     wp.synchronize_device(device)
     times = []
-    for _ in range(repeats):
+    for _ in range(7):
         start = time.perf_counter()
         work()
         wp.synchronize_device(device)

@@ -169,8 +169,8 @@ def _lights_and_masks() -> Iterator[Format]:
 
 def _metadata() -> Iterator[Format]:
     photo, p3 = _codes(), matrix_profile("p3")
-    tables = table_profile(primaries_to_xyz((0.68, 0.32, 0.265, 0.69, 0.15, 0.06, 0.3127, 0.329),
-                                            D50), 2.2)  # fmt: skip
+    primaries = (0.68, 0.32, 0.265, 0.69, 0.15, 0.06, 0.3127, 0.329)
+    tables = table_profile(primaries_to_xyz(primaries, D50))
     curve = b"curv\0\0\0\0" + struct.pack(">IHxx", 1, 460)
     of_grey = icc_profile(b"GRAY", {b"kTRC": curve})
     tiny = photo[::8, ::8]

@@ -100,13 +100,9 @@ def coat_light(texels: FloatArray, rays: Float64Array, roughness: float, seed: i
     """Return what a rough coat sends toward the camera, by random normals, shape [N, 3].
 
     Normals are drawn from GGX's distribution D cos; a normal counts by Fresnel's share, Smith's
-    masking and the projected areas (Walter et al. 2007, equation 41).
-
-    Args:
-        texels: Light, as a lat-long map.
-        rays: Unit directions from the camera down to the ground, shape [N, 3].
-        roughness: Perceptual [1].
-        seed: Of the normals.
+    masking and the projected areas (Walter et al. 2007, equation 41). The light is a lat-long map,
+    ``rays`` are unit directions from the camera down to the ground, shape [N, 3], and the roughness
+    is perceptual.
     """
     rng, alpha, light = np.random.default_rng(seed), roughness**2, np.zeros_like(rays)
     out = -rays[:, 1]

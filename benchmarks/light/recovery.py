@@ -286,24 +286,20 @@ def measure(truth: Truth, loop: LightOptimization) -> dict[str, Any]:
     }
 
 
-def delivered(truth: Truth, loop: LightOptimization, samples: int = 64) -> Tensor:
+def delivered(truth: Truth, loop: LightOptimization) -> Tensor:
     """Return the composite as a user gets it: by `mis`, under finer maps, at an unseen seed."""
     texels = loop.final_lights(256)[0].texels
     assert texels is not None
     with torch.no_grad():
         curves = loop.unknowns.curve_fg(), loop.unknowns.curve_shadow()
-        return reference(truth.frame, texels, *curves, samples)
+        return reference(truth.frame, texels, *curves, 64)
 
 
-def recover(
-    truth: Truth, settings: OptimizeSettings, cache: Path | None = None, noise: float = 0.0
-) -> LightOptimization:
+def recover(truth: Truth, settings: OptimizeSettings, noise: float = 0.0) -> LightOptimization:
     """Run the loop toward the truth from an even light at the photo's level."""
     level = float(np.median(luminance(truth.frame.photo_lin)))
     unknowns = Unknowns.start(None, level / (1.0 - min(level, 0.95)), settings)
-    loop = LightOptimization(
-        truth.frame, TowardTruth(truth.image, noise), settings, unknowns, cache
-    )
+    loop = LightOptimization(truth.frame, TowardTruth(truth.image, noise), settings, unknowns)
     loop.run()
     return loop
 

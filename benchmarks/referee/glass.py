@@ -65,9 +65,10 @@ def _primitive(body: trimesh.Trimesh, material: int) -> Primitive:
     return Primitive(np.array(body.vertices), np.array(body.faces, np.int32), material)
 
 
-def bottle(outer: float = 0.6, wall: float = 0.12) -> trimesh.Trimesh:
-    """Return a tumbler: a wall around an inside that is open above."""
-    h, r = 0.8, outer - wall
+def tumbler() -> trimesh.Trimesh:
+    """Return a wall around an inside that is open above."""
+    h, outer, wall = 0.8, 0.6, 0.12
+    r = outer - wall
     profile = [[0, -h], [outer, -h], [outer, h], [r, h], [r, wall - h], [0, wall - h]]
     body = trimesh.creation.revolve(np.array(profile), sections=24)
     body.fix_normals()
@@ -92,7 +93,7 @@ def cases() -> dict[str, Case]:
         "diamond_box": Case((box,), ior=2.4),
         "lens_before_card": Case((lens,), matte=card),
         "card_in_ball": Case((ball,), absorption=green, matte=core),
-        "tumbler": Case((bottle(),), absorption=green),
+        "tumbler": Case((tumbler(),), absorption=green),
         "rough_ball": Case((ball,), roughness=0.45),
         "rough_box": Case((box,), roughness=0.7, ior=1.33, absorption=green),
     }

@@ -19,6 +19,7 @@ from benchmarks.referee.ours import SEED_COUNT, Runs, over_seeds
 from benchmarks.referee.sheet import compare_runs
 from benchmarks.referee.subjects import ball, from_above, sun_and_sky
 from benchmarks.scenes import on_the_ground
+from tools.demo.make import pixel_directions
 from warpir.core.arrays import Float64Array, FloatArray
 from warpir.mitsuba.render import ObjectScene, build, mean_and_variance, sums
 from warpir.render.device_light import light_args
@@ -166,10 +167,7 @@ def ours(case: Case, view: Camera, depth: int, spp: int, is_ground: bool) -> Run
 
 def clear_of(lamps: tuple[Lamp, ...], view: Camera) -> Float64Array:
     """Return False in pixels that Mitsuba's spheres may cover, shape [H, W, 1]."""
-    u, v = np.meshgrid(np.arange(view.width) + 0.5, np.arange(view.height) + 0.5)
-    local = np.stack([(u - view.cx) / view.fx, (view.cy - v) / view.fy, -np.ones_like(u)], axis=-1)
-    rays = local @ view.c2w[:3, :3].T
-    rays /= np.linalg.norm(rays, axis=-1, keepdims=True)
+    rays = pixel_directions(view)
     clear = np.ones((view.height, view.width, 1), bool)
     for lamp in lamps:
         if isinstance(lamp, SphereLamp):

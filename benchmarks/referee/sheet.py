@@ -28,11 +28,8 @@ def compare_images(candidate: Any, reference: Any) -> dict[str, float | int]:
 
     Single pixels show a local fault, blocks of pixels a small bias that noise hides in one.
     Two estimates of one integral give ``z_std`` near 1, ``z_mean`` near 0 and
-    ``beyond_3`` near 0.0027 (more where the samples' tails are heavy).
-
-    Args:
-        candidate: Mean, variance of the mean and coverage, as `warpir.mitsuba.render.Foreground`.
-        reference: The same from the other renderer, independent samples.
+    ``beyond_3`` near 0.0027 (more where the samples' tails are heavy). Both hold mean, variance of
+    the mean and coverage, as `warpir.mitsuba.render.Foreground`, of independent samples.
 
     Returns:
         Statistics of the z scores per pixel and channel (``z_*``, ``beyond_3``) and per block
@@ -137,11 +134,6 @@ def write_sheet(path: Path, candidate: Any, reference: Any) -> None:
 
     The first two share one exposure and Reinhard's curve; the difference is signed, grey for
     none, black and white at 10 % of the reference's 95th percentile.
-
-    Args:
-        path: PNG to write.
-        candidate: Left third, as `compare_images` takes it.
-        reference: Middle third.
     """
     covered = reference.mean[reference.coverage > 0.5]
     white = float(np.percentile(covered, 95.0)) if covered.size else 1.0

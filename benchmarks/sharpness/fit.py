@@ -148,8 +148,9 @@ def of_leaves(seed: int) -> list[Sample]:
     return found
 
 
-def leaves(height: int, width: int, rng: np.random.Generator, finer: int = 4) -> FloatArray:
-    """Return a made-up picture, shape [H, W, 3]."""
+def leaves(height: int, width: int, rng: np.random.Generator) -> FloatArray:
+    """Return a made-up picture, drawn four times finer, shape [H, W, 3]."""
+    finer = 4
     high, wide = height * finer, width * finer
     image = np.full((high, wide, 3), rng.uniform(0.02, 0.8), np.float32)
     largest, smallest = rng.uniform(0.1, 0.5) * min(high, wide), rng.uniform(3.0, 20.0) * finer

@@ -37,11 +37,8 @@ Step = dict[str, tuple[Float64Array, Float64Array]]
 class Bench:
     """One scene, its maps, and what all candidates share.
 
-    Args:
-        scene: What is rendered.
-        maps: Rows of the map for the foreground and for the shadow, by pair.
-        sampler: Of Mitsuba.
-        freeze: Whether Mitsuba's functions are traced once.
+    ``maps`` are rows of the map for the foreground and for the shadow, by pair; ``freeze`` says
+    whether Mitsuba's functions are traced once.
     """
 
     def __init__(
@@ -165,12 +162,9 @@ class MitsubaPart:
 class Transport:
     """`transport` on both parts, traced when made.
 
-    Args:
-        bench: The scene.
-        heights: Rows of the map for the foreground and for the shadow.
-        settings: Fields of ``TransportSettings``, and ``expects_light``: whether tracing puts
-            directions where this scene's light is, or evenly everywhere.
-        seed: Base seed of the frozen samples.
+    ``heights`` are rows of the map for the foreground and for the shadow; ``settings`` are fields
+    of ``TransportSettings``, and ``expects_light``: whether tracing puts directions where this
+    scene's light is, or evenly everywhere.
     """
 
     integrator = "transport"

@@ -34,13 +34,9 @@ class Time:
 
 
 class Curve:
-    """Time over error of one renderer and one quantity.
+    """Times [s] over errors, relative RMSE [1], of one renderer and one quantity.
 
     Points that are beaten in both by another are dropped, so that error falls as time grows.
-
-    Args:
-        seconds: Times [s], shape [point].
-        errors: Relative RMSE [1], shape [point].
 
     Raises:
         ValueError: No point has a finite error above 0.
@@ -87,30 +83,20 @@ def best_split(foreground: Curve, ratio: Curve, error: float) -> Time:
 
 def least_common_error(ours: tuple[Curve, Curve], theirs: tuple[Curve, Curve]) -> float:
     """Return the smallest combined error that both renderers' sweeps reach."""
-    reached = [
-        float(np.sqrt(0.5 * (fg.errors[-1] ** 2 + ratio.errors[-1] ** 2)))
-        for fg, ratio in (ours, theirs)
-    ]
-    return max(reached)
+    return max(combined(fg.errors[-1], ratio.errors[-1]) for fg, ratio in (ours, theirs))
 
 
 def curves(rows: Sequence[dict[str, Any]], seconds: str, rmse: str) -> tuple[Curve, Curve]:
-    """Return foreground's and ratio's curve of one renderer's sweep.
+    """Return foreground's and ratio's curve of one renderer's sweep, by the names of its fields.
 
-    Args:
-        rows: Rows of one scene, map and integrator, each with ``parts``.
-        seconds: ``seconds_forward`` or ``seconds_step``.
-        rmse: ``rmse_forward``, ``rmse_image`` or ``rmse_gradient``; runs of before 2026-11-25
-            have no ``rmse_forward``, and sampled that image as the step's.
+    Runs of before 2026-11-25 have no ``rmse_forward``, and sampled that image as the step's.
     """
-    made = [
-        Curve(
-            [r["parts"][part][seconds] for r in rows],
-            [r["parts"][part].get(rmse, r["parts"][part]["rmse_image"]) for r in rows],
-        )
-        for part in ("foreground", "ratio")
-    ]
-    return made[0], made[1]
+
+    def curve(name: str) -> Curve:
+        parts = [row["parts"][name] for row in rows]
+        return Curve([p[seconds] for p in parts], [p.get(rmse, p["rmse_image"]) for p in parts])
+
+    return curve("foreground"), curve("ratio")
 
 
 def transport_ratio(row: dict[str, Any], theirs: Sequence[dict[str, Any]]) -> dict[str, Any]:
@@ -203,12 +189,8 @@ def rmse(values: Float64Array, references: Float64Array, weights: Float64Array) 
 
     A product of differences to two references with independent noise, ``(x - a)(x - b)``, is the
     squared error of x free of their noise; all pairs are averaged, and ``a b`` is the truth's own
-    square likewise.
-
-    Args:
-        values: What is judged, any shape.
-        references: Unbiased estimates of the truth, shape [reference, ...].
-        weights: How much each is trusted [1], shape [reference].
+    square likewise. ``references`` are unbiased, shape [reference, ...], and trusted by weights,
+    shape [reference].
     """
 
     def square(x: Float64Array | float) -> float:

@@ -86,14 +86,10 @@ class Reference:
 
 
 class References:
-    """Makes references of one scene, or reads them from the cache.
+    """Makes references of one scene, or reads them from the folder of the cache.
 
-    Args:
-        bench: The scene.
-        spp: Mitsuba's samples per pixel under the main map; others have a quarter.
-        own_spp: Samples per pixel of `mis`, likewise.
-        cache: Folder of the files.
-        log: Told what was made.
+    Under the main map Mitsuba takes ``spp`` samples per pixel and `mis` ``own_spp``, a quarter
+    under the others. ``log`` is told what was made.
     """
 
     def __init__(

@@ -193,9 +193,9 @@ def _contents(name: str, assets: Path) -> tuple[Asset, Lobes, int]:
     return Asset(name, (uv_ball(),), (material,)), sun_and_sky(), 3
 
 
-def loss_weights(width: int, height: int, seed: int = 11) -> FloatArray:
+def loss_weights(width: int, height: int) -> FloatArray:
     """Return colour ramps plus noise for foreground and ratio, shape [2, height, width, 3]."""
-    rng = np.random.default_rng(seed)
+    rng = np.random.default_rng(11)
     row, column = np.mgrid[0:height, 0:width] / height
     smooth = np.stack([0.5 + row, 0.5 + column, 1.5 - row], axis=-1)
     return (smooth + rng.normal(0.0, 0.5, (2, height, width, 3))).astype(np.float32)

@@ -102,9 +102,9 @@ def evaluate(
     return f, pdf, gradients
 
 
-def pairs(roughness: float, count: int = 20000) -> tuple[np.ndarray, np.ndarray]:
+def pairs(roughness: float) -> tuple[np.ndarray, np.ndarray]:
     """Return float32 directions above the surface, half of them within the mirror lobe."""
-    rng = np.random.default_rng(4)
+    rng, count = np.random.default_rng(4), 20000
     cos = np.exp(rng.uniform(np.log(1e-3), 0.0, (2, count)))
     wo, wi = (o.spherical(c, rng.uniform(0.0, 2.0 * np.pi, count)) for c in cos)
     alpha = float(o.ggx_alpha(roughness))

@@ -134,18 +134,13 @@ def launch(
 def differentiate(
     kernel: wp.Kernel, inputs: list[Any], y: ArrayLike, dtype: Any, *others: Any, device: str
 ) -> tuple[list[Float64Array], list[Float64Array]]:
-    """Run a kernel forward and backward.
+    """Run a kernel forward and backward, whose thread i writes element i of every output.
 
-    Args:
-        kernel: Its thread i writes element i of every output.
-        inputs: Its inputs; an array that wants its gradient has ``requires_grad``.
-        y: Weights of the first output's elements in the loss.
-        dtype: Element type of the first output.
-        *others: Those of the other outputs, which are not differentiated.
-        device: Warp device.
+    ``y`` weighs the elements of the first output, of type ``dtype``, in the loss; the other outputs
+    are not differentiated.
 
     Returns:
-        The outputs, and the gradients of the inputs that want one.
+        The outputs, and the gradients of the input arrays that have ``requires_grad``.
     """
     weights = upload(y, dtype, device)
     count = len(weights)

@@ -57,9 +57,9 @@ def sample_kernel(u: wp.array[wp.vec2], axis: wp.vec3, sharpness: float, wi: wp.
     wi[i] = lobe_sample(u[i], axis, sharpness)
 
 
-def directions(sharpness: float, axis: np.ndarray, count: int = 20000) -> np.ndarray:
+def directions(sharpness: float, axis: np.ndarray) -> np.ndarray:
     """Return float32 unit directions out to `EXPONENT`, as far as the sphere goes."""
-    rng = np.random.default_rng(1)
+    rng, count = np.random.default_rng(1), 20000
     t = rng.uniform(0.0, min(EXPONENT / sharpness, 2.0), count)
     # Through the sine, which keeps the digits of a small angle.
     sine, phi = np.sqrt(t * (2.0 - t)), rng.uniform(0.0, 2.0 * np.pi, count)
@@ -83,9 +83,9 @@ def sampling_error(wi: Float64Array, u: Float64Array, axis: np.ndarray, sharpnes
     return float(np.max(np.abs(np.expm1(-sharpness * t) / np.expm1(-2.0 * sharpness) - u)))
 
 
-def numbers(count: int = 20000) -> np.ndarray:
+def numbers() -> np.ndarray:
     """Return uniform float32 pairs, the ends of the interval among them."""
-    u = np.random.default_rng(3).random((count, 2), dtype=np.float32)
+    u = np.random.default_rng(3).random((20000, 2), dtype=np.float32)
     u[:4, 0] = [0.0, 2.0**-24, 0.5, 1.0 - 2.0**-24]
     return u
 

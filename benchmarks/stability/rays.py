@@ -25,7 +25,7 @@ from warpir.kernels.tracing.hit import face_normal, hit_position, offset_origin
 from warpir.kernels.tracing.ray import closest_hit, visibility
 from warpir.kernels.types import MaterialArgs, MeshArgs, TextureArgs
 from warpir.render.device_scene import Scene
-from warpir.scene.asset import Material, Primitive
+from warpir.scene.asset import Primitive
 
 wp.set_module_options({"enable_backward": False})
 
@@ -70,9 +70,9 @@ def leave_kernel(
     visible[i] = visibility(mesh, material, texture, origin, direction[i])
 
 
-def scene_of(part: Primitive, device: str, material: Material | None = None) -> Scene:
+def scene_of(part: Primitive, device: str) -> Scene:
     """A scene of one primitive; the view does not matter."""
-    return Scene([placed(part, material or Material())], camera(1, 1, 1.0), ground(), device)
+    return Scene([placed(part)], camera(1, 1, 1.0), ground(), device)
 
 
 def trace(
@@ -82,9 +82,8 @@ def trace(
     device = str(scene.device)
     inputs = [scene.mesh_args, scene.material_args, scene.texture_args]
     inputs += [upload(a, wp.vec3, device) for a in (origin, direction)]
-    face, position, normal = launch(
-        hit_kernel, len(origin), inputs, int, wp.vec3, wp.vec3, device=device
-    )
+    kinds = int, wp.vec3, wp.vec3
+    face, position, normal = launch(hit_kernel, len(origin), inputs, *kinds, device=device)
     return face.astype(np.int32), position, normal
 
 
@@ -111,11 +110,11 @@ def soup(size: float, away: float) -> Primitive:
     return Primitive(positions, np.arange(600, dtype=np.int32).reshape(-1, 3), 0)
 
 
-def rays(count: int = 4000) -> tuple[Float64Array, Float64Array]:
+def rays() -> tuple[Float64Array, Float64Array]:
     """Return rays toward a unit cube about the origin from a sphere of radius 1.5."""
     rng = np.random.default_rng(9)
-    origin = 1.5 * o.normalize(rng.normal(size=(count, 3)))
-    return origin, o.normalize(rng.uniform(-0.4, 0.4, (count, 3)) - origin)
+    origin = 1.5 * o.normalize(rng.normal(size=(4000, 3)))
+    return origin, o.normalize(rng.uniform(-0.4, 0.4, (4000, 3)) - origin)
 
 
 def moller_trumbore(
@@ -159,9 +158,8 @@ def hit_error(
 ) -> float:
     """Return the largest distance of a hit from its truth over the diagonal; 1 for a wrong one."""
     face_64, point_64, clear = truth
-    wrong = face != face_64
     distance = np.where(face_64 >= 0, np.linalg.norm(point - point_64, axis=1) / diagonal, 0.0)
-    return float(np.where(wrong, 1.0, distance)[clear].max())
+    return float(np.where(face != face_64, 1.0, distance)[clear].max())
 
 
 def hits(device: str, size: float, away: float) -> Measured:
@@ -177,9 +175,9 @@ def hits(device: str, size: float, away: float) -> Measured:
     return Measured(hit_error(face, position, truth, scene.diagonal), finite(position, normal))
 
 
-def leaving(count: int = 20000) -> tuple[Float64Array, Float64Array]:
+def leaving() -> tuple[Float64Array, Float64Array]:
     """Return directions from the surface of a unit ball and, as local frames do, toward it."""
-    rng = np.random.default_rng(10)
+    rng, count = np.random.default_rng(10), 20000
     cos = np.concatenate([rng.uniform(1e-3, 1.0, count // 2), np.geomspace(1e-3, 1, count // 2)])
     local = o.spherical(cos, rng.uniform(0.0, 2.0 * np.pi, count))
     return o.normalize(rng.normal(size=(count, 3))), local
@@ -213,15 +211,12 @@ def self_hits(device: str, size: float, away: float) -> Measured:
 def lathe(theta: Float64Array, count: int) -> tuple[Float64Array, NDArray[np.int32]]:
     """Return rings of a unit sphere below its pole at (0, 1, 0), the first vertex, and their faces.
 
-    Args:
-        theta: Angles of the rings from +Y, growing [rad].
-        count: Vertices of each ring.
+    Each of ``count`` vertices lies at an angle ``theta`` from +Y, growing [rad].
     """
     phi = 2.0 * np.pi * np.arange(count) / count
     sine, cosine = np.sin(theta)[:, None], np.cos(theta)[:, None]
-    rings = np.stack(
-        np.broadcast_arrays(sine * np.cos(phi), cosine, sine * np.sin(phi)), axis=-1
-    ).reshape(-1, 3)
+    axes = np.broadcast_arrays(sine * np.cos(phi), cosine, sine * np.sin(phi))
+    rings = np.stack(axes, axis=-1).reshape(-1, 3)
     k = np.arange(count)
     j = (k + 1) % count
     base = 1 + count * np.arange(len(theta) - 1)[:, None]
@@ -384,9 +379,8 @@ def mitsuba_visible(
 ) -> Float64Array:
     """Return 1 where a ray from the plane gets past the mesh; ``points`` are x and z at size 1."""
     middle = AWAY * away
-    plane = quad(
-        (middle[0], height, middle[2]), (100.0 * size, 0.0, 0.0), (0.0, 0.0, -100.0 * size)
-    )
+    wide = 100.0 * size
+    plane = quad((middle[0], height, middle[2]), (wide, 0.0, 0.0), (0.0, 0.0, -wide))
     eye = middle + size * np.stack([points[:, 0], 0.0 * points[:, 0], points[:, 1]], axis=-1)
     eye[:, 1] = height + 20.0 * size
     down = np.broadcast_to([0.0, -1.0, 0.0], eye.shape)

@@ -113,12 +113,8 @@ def run_case(
 def assert_fails(argv: Sequence[str], code: int, *words: str, cwd: Path, **same: Any) -> list[str]:
     """Check all that is promised of a refused run; see `run_case`.
 
-    Args:
-        argv: Arguments.
-        code: The exit status it must have.
-        words: What the ``error:`` line must hold.
-        cwd: Working directory: no file below it may change, appear or vanish.
-        **same: As of `run_case`.
+    Its exit status must be the code, its ``error:`` line must hold the words, and no file below the
+    working directory may change, appear or vanish.
 
     Returns:
         The lines on standard error, the ``error:`` line first.

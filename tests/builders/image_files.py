@@ -96,7 +96,7 @@ def four_lobes(directions: np.ndarray) -> np.ndarray:
     return texels + np.float32(0.125) * (directions[..., 1:2] > 0)  # brighter sky: up is up
 
 
-def icc_profile(space: bytes, tags: dict[bytes, bytes], pcs: bytes = b"XYZ ") -> bytes:
+def icc_profile(space: bytes, tags: dict[bytes, bytes]) -> bytes:
     """An ICC v2 display profile made from its tags; a white point and texts are added."""
     tags = {
         b"desc": b"desc\0\0\0\0" + struct.pack(">I", 5) + b"test\0" + bytes(82),
@@ -109,14 +109,14 @@ def icc_profile(space: bytes, tags: dict[bytes, bytes], pcs: bytes = b"XYZ ") ->
         table += name + struct.pack(">II", offset + len(body), len(content))
         body += content + bytes(-len(content) % 4)
     size = offset + len(body)
-    head = struct.pack(">I4xI4s4s4s", size, 0x02400000, b"mntr", space, pcs)
+    head = struct.pack(">I4xI4s4s4s", size, 0x02400000, b"mntr", space, b"XYZ ")
     head += struct.pack(">6H4s", 2026, 1, 1, 0, 0, 0, b"acsp") + bytes(28)
     return (head + fixed(0.9642, 1.0, 0.8249)).ljust(128, b"\0") + table + body
 
 
-def table_profile(columns: np.ndarray, gamma: float) -> bytes:
-    """A profile whose tables (lut16Type) say what a matrix profile of these columns says."""
-    curve = np.round((np.arange(256) / 255.0) ** gamma * 65535.0).astype(int).tolist()
+def table_profile(columns: np.ndarray) -> bytes:
+    """A profile of gamma 2.2 whose tables (lut16Type) say what a matrix profile would say."""
+    curve = np.round((np.arange(256) / 255.0) ** 2.2 * 65535.0).astype(int).tolist()
     corners = [
         round(float(columns[k] @ (r, g, b)) / (1.0 + 32767.0 / 32768.0) * 65535.0)
         for r in (0, 1) for g in (0, 1) for b in (0, 1) for k in range(3)

@@ -66,12 +66,11 @@ def write_photo(path: Path, bits: int = 8) -> PixelArray:
     return codes
 
 
-def write_panorama(path: Path, scale: float = 1.0) -> PixelArray:
+def write_panorama(path: Path) -> PixelArray:
     """A small panorama: a blue sky, dark ground and a sun."""
     texels = np.full((16, 32, 3), (0.3, 0.5, 1.0), np.float32)
     texels[8:] = 0.1
     texels[3, 20] = 60.0
-    texels *= np.float32(scale)
     buffer = oiio.ImageBuf(texels)
     assert buffer.write(str(path)), buffer.geterror()
     return texels

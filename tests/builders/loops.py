@@ -59,14 +59,14 @@ TRACED = TransportSettings(
 )
 
 
-def a_frame(device: str, threads: int = 0, depth: int = 2) -> Frame:
+def a_frame(device: str, threads: int = 0) -> Frame:
     """A ball on the ground before noise."""
     view = camera(WIDTH, HEIGHT, 1.4 * WIDTH, (0.0, 1.2, 0.0), pitch=-12.0)
     material = Material(base_color=(0.7, 0.5, 0.4), roughness=0.4)
     ball = placed(sphere((0.0, 0.5, -3.5), 0.5, detail=3), material)
     photo = np.random.default_rng(5).uniform(0.2, 0.6, (HEIGHT, WIDTH, 3)).astype(np.float32)
     renderer = Renderer(Scene([ball], view, ground(0.0), device), threads=threads)
-    return Frame(renderer, photo, True, depth, seed=3)
+    return Frame(renderer, photo, True, 2, seed=3)
 
 
 def bent(count: int = 3) -> Unknowns:

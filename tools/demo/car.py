@@ -171,9 +171,9 @@ def _head_lamps() -> list[Part]:
     return [(name, both_sides(surface.turned(turn).moved(LAMP))) for name, surface in parts]
 
 
-def _bumper(end: float, height: float) -> list[Part]:
+def _bumper(end: float) -> list[Part]:
     """Return a chrome bar that follows the nose (``end`` 1) or the tail (-1), with overriders."""
-    x = np.linspace(-0.70, 0.70, 41)
+    x, height = np.linspace(-0.70, 0.70, 41), 0.455
     path = on_end(x, np.full_like(x, height), end)
     path = project(body_distance, path, 2)
     out = normalized(gradient(body_distance, path) * np.array([1.0, 0.0, 1.0]))
@@ -336,8 +336,8 @@ def car() -> Asset:
         *_wells(),
         *_wheels(),
         *_head_lamps(),
-        *_bumper(1.0, 0.455),
-        *_bumper(-1.0, 0.455),
+        *_bumper(1.0),
+        *_bumper(-1.0),
         *_nose(),
         *_tail(),
         *_trim(),

@@ -78,9 +78,9 @@ def paving_texture(size: int = 4096) -> Texture:
     return _encoded(inside[..., None] * stone + (1.0 - inside[..., None]) * sand)
 
 
-def brick_texture(size: int = 1024) -> Texture:
+def brick_texture() -> Texture:
     """Draw red bricks with pale mortar; the tile is 1.92 m wide."""
-    rows, columns = 24, 8
+    size, rows, columns = 1024, 24, 8
     block, depth, _ = _courses(size, rows, columns, 0.0062, seed=8)
     rng = np.random.default_rng(9)
     tone = np.exp(0.20 * rng.standard_normal(rows * columns))
@@ -98,9 +98,8 @@ def brick_texture(size: int = 1024) -> Texture:
     return _encoded(inside * level[..., None] * tint + (1.0 - inside) * mortar)
 
 
-def plaster_texture(size: int = 512) -> Texture:
+def plaster_texture() -> Texture:
     """Draw a warm white rendered wall."""
-    level = 0.60 * (
-        1.0 + 0.02 * blurred_noise(size, 1.0, 13) + 0.025 * blurred_noise(size, 30.0, 14)
-    )
+    fine, coarse = blurred_noise(512, 1.0, 13), blurred_noise(512, 30.0, 14)
+    level = 0.60 * (1.0 + 0.02 * fine + 0.025 * coarse)
     return _encoded(level[..., None] * np.array([1.0, 0.93, 0.80]))

@@ -28,11 +28,8 @@ SEVERITIES = ("error", "warning", "information", "hint")
 def validate(folder: Path, files: dict[str, bytes]) -> dict[str, dict[str, list[str]]]:
     """Return what the validator says of each file: codes and pointers by severity.
 
-    Skips the test where Node.js or the package is absent.
-
-    Args:
-        folder: Where the files may be put.
-        files: Content of ``.glb`` files by name.
+    Skips the test where Node.js or the package is absent. ``files`` holds the content of ``.glb``
+    files by name; they are put into the folder.
     """
     node = shutil.which("node")
     if node is None or not PACKAGE.is_dir():

@@ -704,7 +704,7 @@ def test_wide_profiles_against_little_cms(
 def test_i8_profile_with_tables(tmp_path: Path, rng: np.random.Generator) -> None:
     columns = color.primaries_to_xyz(P3, color_profile.D50)
     codes = codes8(rng)
-    icc = table_profile(columns, 2.2)
+    icc = table_profile(columns)
     Image.fromarray(codes).save(tmp_path / "p.png", icc_profile=icc)
     photo = read_photo(tmp_path / "p.png")
     assert any("in 8 bits" in notice for notice in photo.notices)
