@@ -168,9 +168,9 @@ def main() -> None:
             if name in ("mirror", "paint"):
                 two = [image for by in pictures.values() for image in list(by.values())[:2]]
                 tiles.append(tile([*truths.values(), *two], covered))
+    names = ("material", "light", "truth", "which", "rmse")
     rows = [
-        dict(zip(("material", "light", "truth", "which"), key, strict=True))
-        | {"rmse": float(np.mean(values))}
+        dict(zip(names, (*key, float(np.mean(values))), strict=True))
         for key, values in errors.items()
     ]
     print_table(rows)

@@ -39,24 +39,11 @@ def cases() -> dict[str, Asset]:
         iridescence_thickness=(150.0, 600.0),
         iridescence_thickness_texture=TextureSlot(0),
     )
-    metal = replace(
-        oil,
-        base_color=(0.9, 0.6, 0.4),
-        metallic=1.0,
-        iridescence=0.8,
-        iridescence_ior=1.8,
-        anisotropy=0.7,
-        anisotropy_rotation=0.5,
-        anisotropy_texture=TextureSlot(0),
-    )
-    soap = replace(
-        oil,
-        base_color=(1.0, 1.0, 1.0),
-        transmission=1.0,
-        ior=1.0,
-        iridescence_ior=1.33,
-        double_sided=True,
-    )
+    copper = replace(oil, base_color=(0.9, 0.6, 0.4), metallic=1.0, iridescence=0.8)
+    brushed = {"anisotropy": 0.7, "anisotropy_rotation": 0.5, "anisotropy_texture": TextureSlot(0)}
+    metal = replace(copper, iridescence_ior=1.8, **brushed)
+    clear = replace(oil, base_color=(1.0, 1.0, 1.0), transmission=1.0, ior=1.0)
+    soap = replace(clear, iridescence_ior=1.33, double_sided=True)
     return {
         name: Asset(name, (body,), (material,), (Texture(codes),))
         for name, material in (("oil", oil), ("metal", metal), ("soap", soap))

@@ -130,13 +130,9 @@ def mitsuba_scene(case: Case, texels: Float64Array) -> mi.Scene:
         properties = mi.Properties()
         properties["material"] = mi.load_dict(glass)
         if any(case.absorption):
-            properties["interior"] = mi.load_dict(
-                {
-                    "type": "homogeneous",
-                    "albedo": 0.0,
-                    "sigma_t": {"type": "rgb", "value": list(case.absorption)},
-                }
-            )
+            sigma_t = {"type": "rgb", "value": list(case.absorption)}
+            interior = {"type": "homogeneous", "albedo": 0.0, "sigma_t": sigma_t}
+            properties["interior"] = mi.load_dict(interior)
         parts[f"glass_{k}"] = mesh_of(f"glass_{k}", body.vertices, body.faces, properties)
     if case.matte is not None:
         properties = mi.Properties()

@@ -51,9 +51,8 @@ def pair() -> Asset:
     """Return a glossy ball before an upright card."""
     small = ball()
     round_one = Primitive(0.4 * small.positions + [0.0, 0.41, 0.0], small.indices, 0, small.normals)
-    return Asset(
-        "pair", (round_one, card((-0.8, 0.01, -0.6), (1.6, 0, 0), (0, 1.0, 0))), (GLOSS, PAPER)
-    )
+    upright = card((-0.8, 0.01, -0.6), (1.6, 0, 0), (0, 1.0, 0))
+    return Asset("pair", (round_one, upright), (GLOSS, PAPER))
 
 
 def shade() -> Asset:
@@ -87,9 +86,8 @@ def cases() -> dict[str, Case]:
     """Return what is compared, by name."""
     beside = SphereLamp(np.array([-1.1, 1.3, 0.9]), 0.2, POWER)
     touching = SphereLamp(np.array([-0.65, 0.31, 0.55]), 0.3, POWER)
-    flat = RectangleLamp(
-        np.array([1.2, 1.5, 0.8]), np.array([0.0, 0.0, 0.7]), np.array([-0.4, 0.5, 0.0]), POWER
-    )
+    edges = np.array([0.0, 0.0, 0.7]), np.array([-0.4, 0.5, 0.0])
+    flat = RectangleLamp(np.array([1.2, 1.5, 0.8]), *edges, POWER)
     sunk = SphereLamp(np.array([-0.9, 0.0, 0.6]), 0.25, POWER)
     within = SphereLamp(np.array([0.05, 0.4, 0.0]), 0.1, POWER)
     sky = sun_and_sky(np.random.default_rng(5), 16) / 8.0

@@ -2,7 +2,10 @@
 
 import ctypes
 import gc
+import re
+from pathlib import Path
 
+import torch
 import warp as wp
 
 
@@ -22,7 +25,6 @@ class PeakMemory:
     def start(self) -> None:
         """Empty caches and set the marks back."""
         import drjit as dr
-        import torch
 
         gc.collect()
         dr.sync_thread()
@@ -36,8 +38,7 @@ class PeakMemory:
             self.before = self._cuda_bytes()
         else:
             ctypes.CDLL(None).malloc_trim(0)
-            with open("/proc/self/clear_refs", "w", encoding="ascii") as stream:
-                stream.write("5")
+            Path("/proc/self/clear_refs").write_text("5")
             self.before = _status("VmRSS")
 
     def stop(self) -> float:
@@ -47,23 +48,16 @@ class PeakMemory:
 
     def _cuda_bytes(self) -> float:
         import drjit as dr
-        import torch
 
         # Warp's mark cannot be set back: below the old one only what is held now is known
         warp = wp.get_mempool_used_mem_high(self.device)
         if warp <= self.warp_mark:
             warp = max(wp.get_mempool_used_mem_current(self.device), self.warp_before)
-        return float(
-            dr.detail.malloc_watermark(dr.JitBackend.CUDA)
-            + torch.cuda.max_memory_allocated()
-            + warp
-        )
+        mitsuba = dr.detail.malloc_watermark(dr.JitBackend.CUDA)
+        return float(mitsuba + torch.cuda.max_memory_allocated() + warp)
 
 
 def _status(name: str) -> float:
     """Return one line of the process's status [byte]."""
-    with open("/proc/self/status", encoding="ascii") as stream:
-        for line in stream:
-            if line.startswith(name + ":"):
-                return float(line.split()[1]) * 1024.0
-    return 0.0
+    found = re.search(rf"{name}:\s+(\d+) kB", Path("/proc/self/status").read_text())
+    return 1024.0 * int(found[1]) if found else 0.0

@@ -3,20 +3,18 @@
 python -m benchmarks.speed.rays [--device cpu]
 """
 
-from __future__ import annotations
-
 import argparse
 import time
-from importlib.resources import files
-from pathlib import Path
 
 import numpy as np
 import warp as wp
 
+from benchmarks.scenes import on_the_ground
+from warpir.demo import ASSET
 from warpir.io.assets import load_asset
 from warpir.kernels.tracing.triangles import any_triangle, closest_triangle
 from warpir.kernels.types import MeshArgs
-from warpir.render.device_scene import Placed, Receiver, Scene
+from warpir.render.device_scene import Scene
 from warpir.scene.camera import Camera
 
 RAYS = 1 << 19
@@ -59,18 +57,15 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--device", default="cpu")
     device = wp.get_device(parser.parse_args().device)
-    asset = load_asset(Path(str(files("warpir.demo") / "car.glb")))
     camera = Camera(64, 64, 64.0, 64.0, 32.0, 32.0, np.eye(4))
-    ground = Receiver(np.array([0.0, 1.0, 0.0]), 0.0)
-    scene = Scene([Placed(asset, np.eye(4))], camera, ground, device.alias)
+    scene = on_the_ground(load_asset(ASSET), np.eye(4), camera, device.alias).scene
     trees = {"Warp": MeshArgs(), "Embree": scene.mesh_args}
     trees["Warp"].id = scene.mesh_args.id
     if not scene.mesh_args.embree:
         del trees["Embree"]
     for where, (origin, wi) in rays_of(scene, np.random.default_rng(0)).items():
-        arrays = [
-            wp.array(a.astype(np.float32), dtype=wp.vec3, device=device) for a in (origin, wi)
-        ]
+        rays = (a.astype(np.float32) for a in (origin, wi))
+        arrays = [wp.array(a, dtype=wp.vec3, device=device) for a in rays]
         for kind, kernel in (("any", cast_any), ("closest", cast_closest)):
             for tree, mesh in trees.items():
                 hits = wp.zeros(RAYS, dtype=int, device=device)
@@ -80,10 +75,8 @@ def main() -> None:
                 wp.launch(kernel, RAYS, [mesh, *arrays, hits], device=device)
                 wp.synchronize_device(device)
                 seconds = time.perf_counter() - start
-                share = hits.numpy().mean()
-                print(
-                    f"{where:8} {kind:8} {tree:7} {RAYS / seconds / 1e6:7.1f} M/s, {share:.3f} hit"
-                )
+                rate, share = RAYS / seconds / 1e6, hits.numpy().mean()
+                print(f"{where:8} {kind:8} {tree:7} {rate:7.1f} M/s, {share:.3f} hit")
 
 
 if __name__ == "__main__":
