@@ -183,11 +183,6 @@ def png_chunks(content: bytes) -> list[tuple[bytes, bytes]]:
     return found
 
 
-def pack_png(chunks: list[tuple[bytes, bytes]]) -> bytes:
-    """Put chunks together, with lengths and checksums that are right."""
-    return b"\x89PNG\r\n\x1a\n" + b"".join(png_chunk(name, body) for name, body in chunks)
-
-
 @st.composite
 def damaged_png(draw: st.DrawFn, sound: bytes) -> bytes:
     """Yield a PNG whose chunks are damaged, in their compressed contents too; checksums fit."""
@@ -208,7 +203,7 @@ def damaged_png(draw: st.DrawFn, sound: bytes) -> bytes:
             del chunks[k]
         case _:
             chunks.insert(k, chunks[k])
-    return pack_png(chunks)
+    return b"\x89PNG\r\n\x1a\n" + b"".join(png_chunk(name, body) for name, body in chunks)
 
 
 def exr_attributes(content: bytes) -> list[tuple[int, int]]:

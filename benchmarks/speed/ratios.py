@@ -81,11 +81,6 @@ def best_split(foreground: Curve, ratio: Curve, error: float) -> Time:
     return Time(float(total[k]), bool(bound[k]))
 
 
-def least_common_error(ours: tuple[Curve, Curve], theirs: tuple[Curve, Curve]) -> float:
-    """Return the smallest combined error that both renderers' sweeps reach."""
-    return max(combined(fg.errors[-1], ratio.errors[-1]) for fg, ratio in (ours, theirs))
-
-
 def curves(rows: Sequence[dict[str, Any]], seconds: str, rmse: str) -> tuple[Curve, Curve]:
     """Return foreground's and ratio's curve of one renderer's sweep, by the names of its fields.
 
@@ -140,7 +135,8 @@ def mis_ratio(
         ("step_gradient", "seconds_step", "rmse_gradient"),
     ):
         own, other = curves(ours, seconds, rmse), curves(theirs, seconds, rmse)
-        error = least_common_error(own, other)
+        # The smallest that both sweeps reach
+        error = max(combined(fg.errors[-1], ratio.errors[-1]) for fg, ratio in (own, other))
         t_own, t_other = best_split(*own, error), best_split(*other, error)
         found[name] = {
             "ratio": t_other.seconds / t_own.seconds,

@@ -120,12 +120,14 @@ class References:
     def _quiet(self, part: str) -> BoolArray:
         """Return which pixels are not among the noisiest, shape [pixel]."""
         height = self.bench.heights[part][0]
-        variance = self._cached(
-            f"noise, {part}",
-            {"pilot": [PILOT_RUNS, PILOT_SPP], "part": part, "map": self._hash(part, height)},
-            lambda: _variance(self.bench, part, height),
-        )
-        return quiet(variance)
+
+        def variance() -> Float64Array:  # of `mis` over seeds, summed over channels
+            run = MisPart(self.bench, part, height, PILOT_SPP)
+            images = [run.forward(SEED // 2 + k)()[part] for k in range(PILOT_RUNS)]
+            return np.asarray(np.stack(images).var(axis=0).sum(axis=-1))
+
+        key = {"pilot": [PILOT_RUNS, PILOT_SPP], "part": part, "map": self._hash(part, height)}
+        return quiet(self._cached(f"noise, {part}", key, variance))
 
     def resolution(self) -> dict[tuple[str, int], float]:
         """Relative RMSE between images under the map and under the lobes it was made of."""
@@ -189,14 +191,6 @@ def quiet(variance: Float64Array) -> BoolArray:
     noisiest = len(variance) - int(TRIMMED * len(variance))
     kept[np.argsort(variance, kind="stable")[noisiest:]] = False
     return kept
-
-
-def _variance(bench: Bench, part: str, height: int) -> Float64Array:
-    """Variance of `mis` over seeds, summed over channels, shape [pixel]."""
-    run = MisPart(bench, part, height, PILOT_SPP)
-    images = np.stack([run.forward(SEED // 2 + k)()[part] for k in range(PILOT_RUNS)])
-    variance: Float64Array = images.var(axis=0).sum(axis=-1)
-    return variance
 
 
 def _flat(image: Float64Array, gradient: Float64Array) -> Float64Array:

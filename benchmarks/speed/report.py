@@ -154,12 +154,6 @@ def row_table(result: dict[str, Any]) -> str:
     return table(head, map(cells, result["rows"]))
 
 
-def resolution_text(result: dict[str, Any]) -> str:
-    """Say what the map itself costs, by scene and map."""
-    seen = {(r["scene"], r["map"]): r["rmse_resolution"] for r in result["rows"]}
-    return ", ".join(f"{scene} {size} {percent(e)}" for (scene, size), e in seen.items())
-
-
 def summary(result: dict[str, Any]) -> str:
     """Return what a run prints."""
     parts = [
@@ -176,6 +170,8 @@ def summary(result: dict[str, Any]) -> str:
 def device_text(result: dict[str, Any]) -> str:
     """Return one device's chapter."""
     c = result["conditions"]
+    resolution = {(r["scene"], r["map"]): r["rmse_resolution"] for r in result["rows"]}
+    costs = ", ".join(f"{scene} {size} {percent(e)}" for (scene, size), e in resolution.items())
     threads = f", {c['threads']} threads" if c["threads"] else ""
     pixels = "; ".join(
         f"{s['name']}: {s['triangles']} triangles, D = {s['depth']}, {s['object_pixels']} object "
@@ -192,7 +188,7 @@ def device_text(result: dict[str, Any]) -> str:
         "and than `mis`, at the smallest error that both sweeps reach:",
         mis_table(result),
         "What rasterising the lobes to the map costs, relative RMSE of the image to that under the "
-        f"lobes themselves: {resolution_text(result)}.",
+        f"lobes themselves: {costs}.",
         "<details><summary>All that was measured</summary>",
         row_table(result),
         "</details>",

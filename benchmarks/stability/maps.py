@@ -141,17 +141,9 @@ def density(device: str, height: int, contrast: float) -> Measured:
     return Measured(max_relative(pdf[away], truth[away]), finite(radiance, pdf, d))
 
 
-def level_plane(device: str) -> MisIntegrator:
-    """`mis` on an empty level plane, 64 pixels and 256 samples."""
-    view = camera(8, 8, 500.0, (0.0, 50.0, 0.0), -90.0)
-    renderer = Renderer(Scene([], view, ground(0.0), device))
-    return MisIntegrator(renderer, np.zeros(0, np.int32), all_pixels(view), 256, 1, 1)
-
-
 def texel_weights(height: int, width: int) -> Float64Array:
     """Return the plane's radiance per radiance of each texel: its tent times cosine over pi."""
     theta, weight_t = o.gauss_legendre(np.linspace(0.0, 0.5 * np.pi, height + 1), 12)
-    u, weight_u = o.gauss_legendre(np.linspace(0.0, 1.0, 2 * width + 1), 4)
     # Tents are products, so the integral is one too.
     value = np.cos(theta) * np.sin(theta) * weight_t / np.pi
     y = theta / np.pi * height - 0.5
@@ -160,16 +152,16 @@ def texel_weights(height: int, width: int) -> Float64Array:
     np.add.at(rows, np.clip(low, 0, height - 1), value * (1.0 - (y - low)))
     np.add.at(rows, np.clip(low + 1, 0, height - 1), value * (y - low))
     columns = np.full(width, 2.0 * np.pi / width)
-    assert abs(weight_u.sum() - 1.0) < 1e-12 and len(u)
     return np.asarray(rows[:, None] * columns[None])
 
 
 def plane(device: str, make: Callable[[], np.ndarray], has_gradient: bool = False) -> Measured:
     """Radiance of a white plane under a map; its gradient by every texel where the map is small."""
     texels = make()
-    integrator = level_plane(device)
-    if has_gradient:
-        integrator.spp = 4096
+    view = camera(8, 8, 500.0, (0.0, 50.0, 0.0), -90.0)
+    renderer = Renderer(Scene([], view, ground(0.0), device))
+    spp = 4096 if has_gradient else 256
+    integrator = MisIntegrator(renderer, np.zeros(0, np.int32), all_pixels(view), spp, 1, 1)
     light = torch.tensor(texels, requires_grad=has_gradient)
     with torch.set_grad_enabled(has_gradient):
         unoccluded = integrator.radiance(light, light, 3).unoccluded
