@@ -16,7 +16,7 @@ import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -56,34 +56,31 @@ def measure(folder: Path, count: int, samples: int, path: Path | None) -> None:
             scene = ["--seed", str(seed), "--out", str(out / f"scene-{seed}")]
             run("warpir.insert", [*flags, *scene])
 
-    def batch(workers: int) -> Callable[[Path], None]:
+    def batch(out: Path, workers: int) -> None:
         argv = [str(folder / "scenes.jsonl"), *flags, "--workers", str(workers)]
-        return lambda out: run("warpir.batch", [*argv, "--out", str(out)])
+        run("warpir.batch", [*argv, "--out", str(out)])
 
     singly(folder / "warm", range(1))  # no compilation is measured
-    ways: dict[str, Callable[[Path], None]] = {
-        "`insert`, one process after another": lambda out: singly(out, range(count)),
-        **{f"`batch --workers {n}`": batch(n) for n in WORKERS},
-    }
-    seconds: dict[str, float] = {}
-    cpu: dict[str, float] = {}
+    ways = {"`insert`, one process after another": partial(singly, seeds=range(count))}
+    ways |= {f"`batch --workers {n}`": partial(batch, workers=n) for n in WORKERS}
+    spent: dict[str, tuple[float, float]] = {}
     written = []
     for number, (name, do) in enumerate(ways.items()):
         out = folder / str(number)
         start, before = time.perf_counter(), cpu_seconds()
         do(out)
-        seconds[name], cpu[name] = time.perf_counter() - start, cpu_seconds() - before
+        spent[name] = time.perf_counter() - start, cpu_seconds() - before
         records = [out / f"scene-{seed}" / "run.json" for seed in range(count)]
         written.append([json.loads(record.read_text())["files"] for record in records])
         for files in written[-1]:
             files.pop("report.html", None)  # which tells the seconds
     assert written[1:] == written[:-1], "the bytes differ"
-    first = next(iter(seconds.values()))
     print(f"{count} scenes of {samples} samples, {len(written[0][0])} files each, the same bytes")
     print("\n| | s | CPU s | scenes a minute | |\n|---|---|---|---|---|")
-    for name, spent in seconds.items():
-        rate = f"{60.0 * count / spent:.1f} | {first / spent:.2f} x"
-        print(f"| {name} | {spent:.1f} | {cpu[name]:.1f} | {rate} |")
+    first = next(iter(spent.values()))[0]
+    for name, (seconds, cpu) in spent.items():
+        rate = f"{60.0 * count / seconds:.1f} | {first / seconds:.2f} x"
+        print(f"| {name} | {seconds:.1f} | {cpu:.1f} | {rate} |")
     cores = core_count()
     figures: dict[str, Any] = {
         "question": "batch",
@@ -92,8 +89,7 @@ def measure(folder: Path, count: int, samples: int, path: Path | None) -> None:
         "cores": cores,
         "load": round(os.getloadavg()[0], 1),
         "seconds and CPU seconds": {
-            name.replace("`", ""): [round(seconds[name], 2), round(cpu[name], 2)]
-            for name in seconds
+            name.replace("`", ""): [round(s, 2) for s in both] for name, both in spent.items()
         },
     }
     report({**figures, **context(wp.get_device("cpu"), cores)}, path)

@@ -21,7 +21,7 @@ from benchmarks.damage.formats import formats, weights
 from benchmarks.damage.mutations import exr_attributes
 from tests.builders.faults import Ended, run_case
 from tests.builders.gltf_files import Builder
-from tests.builders.image_files import matrix_profile, png_chunk, write_image
+from tests.builders.image_files import matrix_profile, png_chunk, png_of, write_image
 from tests.builders.insertions import arguments
 from tests.builders.poses import write_json
 from warpir.core.errors import ExitCode
@@ -127,7 +127,7 @@ def check(ended: Ended, *codes: int) -> None:
 
 # ------------------------------------------------------- files that promise more than they hold
 
-GIGA = 2**30
+GIGA, LARGEST = 2**30, (2**31 - 1, 2**31 - 1)
 
 
 def deflated(size: int) -> bytes:
@@ -136,11 +136,6 @@ def deflated(size: int) -> bytes:
     block = packer.compress(bytes(2**20)) + packer.flush(zlib.Z_FULL_FLUSH)
     checksum = (size % 65521) << 16 | 1  # Adler-32 of zeros
     return b"\x78\xda" + block * (size // 2**20) + b"\x03\0" + struct.pack(">I", checksum)
-
-
-def png(*chunks: bytes, size: tuple[int, int] = (48, 32), depth: int = 8, kind: int = 2) -> bytes:
-    header = struct.pack(">IIBBBBB", *size, depth, kind, 0, 0, 0)
-    return b"\x89PNG\r\n\x1a\n" + png_chunk(b"IHDR", header) + b"".join(chunks)
 
 
 ROWS = zlib.compress((b"\0" + bytes(3 * 48)) * 32)
@@ -205,7 +200,7 @@ def texture_bomb(folder: Path) -> Path:
     """A texture in a GLB whose profile inflates to a gigabyte."""
     builder = Builder()
     chunk = png_chunk(b"iCCP", b"x\0\0" + deflated(GIGA // 4))
-    builder.base_color({"bufferView": builder.view(png(chunk, PIXELS)), "mimeType": "image/png"})
+    builder.base_color({"bufferView": builder.view(png_of(chunk, PIXELS)), "mimeType": "image/png"})
     return named("bad.glb", builder.glb())(folder)
 
 
@@ -220,9 +215,13 @@ def counted(folder: Path, count: int, **fields: Any) -> Path:
     return named("bad.glb", builder.glb())(folder)
 
 
-def png_with(chunk: bytes) -> Callable[[Path], Path]:
+def png_with(*chunks: bytes) -> Callable[[Path], Path]:
+    return named("bad.png", png_of(*chunks))
+
+
+def inflating(name: bytes) -> Callable[[Path], Path]:
     """A picture with a gigabyte of a profile or a text."""
-    return lambda f: named("bad.png", png(png_chunk(chunk, b"x\0\0" + deflated(GIGA)), PIXELS))(f)
+    return lambda f: png_with(png_chunk(name, b"x\0\0" + deflated(GIGA)), PIXELS)(f)
 
 
 PLY = "ply\nformat binary_little_endian 1.0\nelement vertex 1\nproperty float x\nproperty float y\n"
@@ -251,9 +250,9 @@ DONE, USAGE, INPUT = ExitCode.DONE, ExitCode.USAGE, ExitCode.INPUT
 PROMISES: dict[str, tuple[str, int, Callable[[Path], Path]]] = {
     "I3-png-too-many-pixels": (
         "photo", DONE,
-        lambda f: named("bad.png", png(png_chunk(b"IDAT", deflated(GIGA // 4)), PIXELS[-12:]))(f)),
+        lambda f: png_with(png_chunk(b"IDAT", deflated(GIGA // 4)), PIXELS[-12:])(f)),
     "I3-tiff-strip-of-a-gigabyte": ("photo", INPUT, tiff_bomb),
-    "I4-png-2^31": ("photo", INPUT, named("bad.png", png(PIXELS, size=(2**31 - 1, 2**31 - 1)))),
+    "I4-png-2^31": ("photo", INPUT, named("bad.png", png_of(PIXELS, size=LARGEST))),
     "I4-webp-16383": (
         "photo", INPUT,
         named("bad.webp", b"RIFF\x1e\0\0\0WEBPVP8L\x11\0\0\0/\xff\xff\xff\x0f" + bytes(13))),
@@ -261,9 +260,9 @@ PROMISES: dict[str, tuple[str, int, Callable[[Path], Path]]] = {
         "photo", INPUT,
         named("bad.jpg", b"\xff\xd8\xff\xc0\0\x11\x08\xff\xdc\xff\xdc\x03\x01\x22\0\x02\x11\x01"
               b"\x03\x11\x01" + bytes(200))),
-    "I8-icc-inflates": ("photo", DONE, png_with(b"iCCP")),
+    "I8-icc-inflates": ("photo", DONE, inflating(b"iCCP")),
     "I8-icc-text-of-a-gigabyte": ("photo", DONE, profile_bomb),
-    "I19-png-text-inflates": ("photo", DONE, png_with(b"zTXt")),
+    "I19-png-text-inflates": ("photo", DONE, inflating(b"zTXt")),
     "E3-exr-chunk-of-a-gigabyte": ("photo", INPUT, exr_bomb),
     "E4-exr-data-window": (
         "photo", INPUT,

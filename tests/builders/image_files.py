@@ -37,11 +37,16 @@ def png_chunk(name: bytes, content: bytes) -> bytes:
     return struct.pack(">I", len(content)) + body + struct.pack(">I", zlib.crc32(body))
 
 
+def png_of(*chunks: bytes, size: tuple[int, int] = (48, 32)) -> bytes:
+    """A PNG of 8-bit RGB of that width and height whose other chunks are given."""
+    header = struct.pack(">IIBBBBB", *size, 8, 2, 0, 0, 0)
+    return b"\x89PNG\r\n\x1a\n" + png_chunk(b"IHDR", header) + b"".join(chunks)
+
+
 def png_header(width: int, height: int) -> bytes:
     """A PNG of a few bytes that claims a size and holds no pixel."""
-    header = struct.pack(">IIBBBBB", width, height, 8, 2, 0, 0, 0)
-    body = png_chunk(b"IHDR", header) + png_chunk(b"IDAT", zlib.compress(b""))
-    return b"\x89PNG\r\n\x1a\n" + body + png_chunk(b"IEND", b"")
+    rest = png_chunk(b"IDAT", zlib.compress(b"")), png_chunk(b"IEND", b"")
+    return png_of(*rest, size=(width, height))
 
 
 def fixed(*values: float) -> bytes:
