@@ -2,32 +2,38 @@
 
 import numpy as np
 
-from warpir.core.arrays import FloatArray
+from warpir.core.arrays import Float64Array, FloatArray
 from warpir.scene.asset import Asset, Material, Primitive, Texture
 from warpir.scene.camera import Camera
 
 
-def ball(rings: int = 64) -> Primitive:
-    """Return the unit sphere about the origin, poles on the Y axis, shading normals exact."""
-    polar = np.linspace(0.0, np.pi, rings + 1)
-    azimuth = np.linspace(0.0, 2.0 * np.pi, 2 * rings + 1)
+def grid_ball(polar: Float64Array, azimuth: Float64Array) -> Primitive:
+    """Return the unit sphere about the origin, poles on the Y axis, shading normals exact.
+
+    Its vertices are a grid over angles from +Y and about it [rad], each from end to end.
+    """
     theta, phi = np.meshgrid(polar, azimuth, indexing="ij")
-    positions = np.stack(
-        [np.sin(theta) * np.sin(phi), np.cos(theta), np.sin(theta) * np.cos(phi)], axis=-1
-    ).reshape(-1, 3)
+    axes = [np.sin(theta) * np.sin(phi), np.cos(theta), np.sin(theta) * np.cos(phi)]
+    positions = np.stack(axes, axis=-1).reshape(-1, 3)
     uv = np.stack([phi / (2.0 * np.pi), theta / np.pi], axis=-1).reshape(-1, 2)
-    i, j = np.meshgrid(np.arange(rings), np.arange(2 * rings), indexing="ij")
-    a = (i * (2 * rings + 1) + j).ravel()
-    b, c, d = a + 1, a + 2 * rings + 1, a + 2 * rings + 2
-    upper = np.stack([a, c, b], axis=1)[i.ravel() > 0]
-    lower = np.stack([b, c, d], axis=1)[i.ravel() < rings - 1]
+    row, column = np.mgrid[0 : len(polar) - 1, 0 : len(azimuth) - 1]
+    a = row * len(azimuth) + column
+    b, c, d = a + 1, a + len(azimuth), a + len(azimuth) + 1
+    # At the poles one triangle of each cell has no area
+    upper, lower = np.stack([a, c, b], axis=-1)[1:], np.stack([b, c, d], axis=-1)[:-1]
     return Primitive(
         positions,
-        np.concatenate([upper, lower]).astype(np.int32),
+        np.concatenate([upper.reshape(-1, 3), lower.reshape(-1, 3)]).astype(np.int32),
         0,
         normals=positions.astype(np.float32),
         uv0=uv.astype(np.float32),
     )
+
+
+def ball(rings: int = 64) -> Primitive:
+    """Return `grid_ball` of as many rings and twice as many sides."""
+    azimuth = np.linspace(0.0, 2.0 * np.pi, 2 * rings + 1)
+    return grid_ball(np.linspace(0.0, np.pi, rings + 1), azimuth)
 
 
 def sphere(material: Material, textures: tuple[Texture, ...] = (), rings: int = 64) -> Asset:

@@ -4,8 +4,11 @@ Each ball has a material with textures of its own for base colour, metal and rou
 so that rays in hardly any order read fifteen of them.
 """
 
+from dataclasses import replace
+
 import numpy as np
 
+from benchmarks.referee.subjects import grid_ball
 from warpir.core.arrays import CodeArray, Float64Array
 from warpir.scene.asset import Asset, Material, Primitive, Texture, TextureSlot
 
@@ -30,22 +33,9 @@ def textured_heap() -> Asset:
 
 def _ball(center: Float64Array, material: int) -> Primitive:
     """Return a unit ball whose vertices are a grid over its texture coordinates."""
-    v, u = np.mgrid[0:SIDE, 0:SIDE] / (SIDE - 1)
-    polar, around = np.pi * v, 2.0 * np.pi * u
-    unit = np.stack(
-        [np.sin(polar) * np.sin(around), np.cos(polar), np.sin(polar) * np.cos(around)], axis=-1
-    ).reshape(-1, 3)
-    row, column = np.mgrid[0 : SIDE - 1, 0 : SIDE - 1]
-    corner = row * SIDE + column
-    upper = np.stack([corner, corner + SIDE, corner + 1], axis=-1)[1:]
-    lower = np.stack([corner + 1, corner + SIDE, corner + SIDE + 1], axis=-1)[:-1]
-    return Primitive(
-        unit + center,
-        np.concatenate([upper.reshape(-1, 3), lower.reshape(-1, 3)]).astype(np.int32),
-        material,
-        normals=unit.astype(np.float32),
-        uv0=np.stack([u, v], axis=-1).reshape(-1, 2).astype(np.float32),
-    )
+    share = np.arange(SIDE) / (SIDE - 1)
+    ball = grid_ball(np.pi * share, 2.0 * np.pi * share)
+    return replace(ball, positions=ball.positions + center, material=material)
 
 
 def _material(k: int) -> Material:
