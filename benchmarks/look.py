@@ -24,8 +24,8 @@ from PIL import Image
 from scipy import ndimage
 
 from benchmarks.measure import flags, write_json
-from benchmarks.response import LEVELS, codes_of, curve, is_for_fitting
-from benchmarks.scenes import panoramas_of, photo_of, places_of, renderer_of
+from benchmarks.response import LEVELS, codes_of, curve
+from benchmarks.scenes import is_for_fitting, panoramas_of, photo_of, places_of, renderer_of
 from warpir.core.arrays import CodeArray, Float64Array, FloatArray
 from warpir.core.color import luminance
 from warpir.evaluate.image_errors import image_errors, make_regions

@@ -18,7 +18,7 @@ import numpy as np
 import torch
 
 from benchmarks.measure import flags
-from benchmarks.scenes import panoramas_of
+from benchmarks.scenes import is_for_fitting, panoramas_of
 from warpir.core.arrays import Float64Array, FloatArray
 from warpir.core.color import GAMMA
 from warpir.evaluate.scenes import CAMERA_HEIGHT, crop_camera, crop_radiance, expose
@@ -37,11 +37,6 @@ EXPONENTS, TOES = np.linspace(0.75, 1.6, 35), (0.0, 0.001, 0.002, 0.004, 0.006, 
 """Of the best curve."""
 RIDGE = 10.0
 """Weight of a coefficient's square, of standardised statistics."""
-
-
-def is_for_fitting(name: str) -> bool:
-    """Return which half of the places this is in."""
-    return zlib.crc32(name.encode()) % 2 == 0
 
 
 def crops(path: Path) -> Iterator[FloatArray]:
@@ -115,17 +110,12 @@ def main() -> None:
     plain = Response(1.0)
     off, auto = [plain] * len(own), [r or plain for r in own]
     print(f"{len(judged)} photos of places not fitted, {len(told)} of them with blacks")
-    print(
-        "codes at           " + "  ".join(f"{x:5g}" for x in LEVELS) + "   within 3 in the blacks"
-    )
-    for name, guess, of in (
-        ("off", off, judged),
-        ("auto", auto, judged),
-        ("best curve", best, judged),
-        ("off, with blacks", off, told),
-        ("auto, with blacks", auto, told),
-    ):
-        print(f"{name:18s} {judge([guess[k] for k in of], truth[of])}")
+    levels = "  ".join(f"{x:5g}" for x in LEVELS)
+    print(f"codes at           {levels}   within 3 in the blacks")
+    for name, guess in (("off", off), ("auto", auto), ("best curve", best)):
+        print(f"{name:18s} {judge([guess[k] for k in judged], truth[judged])}")
+    for name, guess in (("off, with blacks", off), ("auto, with blacks", auto)):
+        print(f"{name:18s} {judge([guess[k] for k in told], truth[told])}")
 
 
 if __name__ == "__main__":

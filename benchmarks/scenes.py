@@ -1,5 +1,6 @@
 """What benchmarks render: objects on the ground, photographs of places, and pictures as files."""
 
+import zlib
 from argparse import Namespace
 from collections.abc import Sequence
 from pathlib import Path
@@ -42,6 +43,11 @@ def renderer_of(subject: Subject) -> Renderer:
 def panoramas_of(options: Namespace) -> list[Path]:
     """Return the panoramas that a command line names."""
     return find_files(options.panoramas, PANORAMA_SUFFIXES, "--panoramas")
+
+
+def is_for_fitting(name: str) -> bool:
+    """Return which half of the places this is in: numbers are fitted to one."""
+    return zlib.crc32(name.encode()) % 2 == 0
 
 
 def places_of(options: Namespace, panoramas: list[Path], width: int) -> Places:

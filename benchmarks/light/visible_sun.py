@@ -22,7 +22,7 @@ import numpy as np
 from scipy.optimize import minimize
 
 from benchmarks.measure import flags, write_json
-from benchmarks.scenes import panoramas_of, photo_of
+from benchmarks.scenes import is_for_fitting, panoramas_of, photo_of
 from warpir.core.arrays import Float64Array, FloatArray
 from warpir.core.color import linear_to_gamma, luminance
 from warpir.core.latlong import map_directions, resize_map, texel_solid_angles
@@ -83,11 +83,6 @@ class Truth:
     is_sun: bool
     """Unclouded and above the horizon; a lamp may be one too."""
     texels: FloatArray
-
-    @property
-    def is_for_tuning(self) -> bool:
-        """Which half of the places this is in."""
-        return zlib.crc32(self.name.encode()) % 2 == 0
 
 
 @dataclass(frozen=True)
@@ -366,10 +361,9 @@ def main() -> None:
             print(f"{path.stem}: left out, all networks have learned from it")
             continue
         judged += [judge(crop, unseen) for crop in crops_of(truth)]
-    halves = {
-        "tuned on": [j for j in judged if j.crop.truth.is_for_tuning],
-        "held out": [j for j in judged if not j.crop.truth.is_for_tuning],
-    }
+    halves: dict[str, list[Judged]] = {"tuned on": [], "held out": []}
+    for j in judged:
+        halves["tuned on" if is_for_fitting(j.crop.truth.name) else "held out"].append(j)
     weights, bias = visible_sun.WEIGHTS, visible_sun.BIAS
     if options.fit:
         weights, bias = fit(halves["tuned on"])

@@ -21,8 +21,7 @@ from PIL import Image
 
 from benchmarks.look import draw_camera, softness
 from benchmarks.measure import flags
-from benchmarks.response import is_for_fitting
-from benchmarks.scenes import panoramas_of
+from benchmarks.scenes import is_for_fitting, panoramas_of
 from benchmarks.sharpness.fit import fit, shown_crop
 from warpir.core.arrays import BoolArray, FloatArray
 from warpir.core.color import gamma_to_linear, linear_to_gamma
