@@ -17,6 +17,7 @@ import trimesh
 from benchmarks.referee.ours import SEED_COUNT, Runs, over_seeds
 from benchmarks.referee.sheet import Pair, compare_cases
 from benchmarks.scenes import on_the_ground
+from tests.builders.shapes import all_pixels
 from warpir.core.arrays import Float64Array, FloatArray, IntArray
 from warpir.kernels.dielectric.glass import GLASS_DEPTH
 from warpir.mitsuba.light import LatlongEmitter
@@ -172,8 +173,7 @@ def pictures_of(asset: Asset, view: Camera, texels: FloatArray, spp: int, depth:
     """Render an asset by ours in as many runs."""
     r = on_the_ground(asset, np.eye(4), view, height=-1e3)
     light = light_args(Light(texels=texels), r.device)
-    pixels = np.arange(view.width * view.height, dtype=np.int32)
-    each = spp // SEED_COUNT
+    pixels, each = all_pixels(view), spp // SEED_COUNT
     return over_seeds(view, lambda seed: r.foreground(light, pixels, each, 1, depth, seed).radiance)
 
 

@@ -19,6 +19,7 @@ from benchmarks.referee.ours import SEED_COUNT, Runs, over_seeds
 from benchmarks.referee.sheet import compare_runs
 from benchmarks.referee.subjects import ball, from_above, sun_and_sky
 from benchmarks.scenes import on_the_ground
+from tests.builders.shapes import all_pixels
 from tools.demo.make import pixel_directions
 from warpir.core.arrays import Float64Array, FloatArray
 from warpir.mitsuba.render import ObjectScene, build, mean_and_variance, sums
@@ -152,7 +153,7 @@ def ours(case: Case, view: Camera, depth: int, spp: int, is_ground: bool) -> Run
     """Render the same; the ground by paths of ``depth`` interactions, that with it included."""
     r = renderer(case, view, depth - 1 if is_ground else 0)
     light = light_args(Light(texels=DARK if case.texels is None else case.texels), r.device)
-    pixels = np.arange(view.width * view.height, dtype=np.int32)
+    pixels = all_pixels(view)
     may_see, each = np.ones_like(pixels), spp // SEED_COUNT
 
     def picture(seed: int) -> FloatArray:
@@ -185,7 +186,7 @@ def main() -> None:
     view = from_above()
     for name in options.cases:
         case = cases()[name]
-        pixels = np.arange(view.width * view.height, dtype=np.int32)
+        pixels = all_pixels(view)
         r = renderer(case, view, 0)
         mask = r.foreground(light_args(Light(texels=DARK), r.device), pixels, 64, 1, 1, 7).mask
         covered = np.zeros(len(pixels), bool)

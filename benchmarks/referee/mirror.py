@@ -20,6 +20,7 @@ from benchmarks.referee.ours import SEED_COUNT, Runs, over_seeds
 from benchmarks.referee.sheet import compare_runs
 from benchmarks.referee.subjects import from_above, sun_and_sky
 from benchmarks.scenes import on_the_ground
+from tests.builders.shapes import all_pixels
 from warpir.core.arrays import FloatArray
 from warpir.mitsuba.render import build
 from warpir.render.device_light import light_args
@@ -53,7 +54,7 @@ def ours(asset: Asset, view: Camera, texels: FloatArray, roughness: float, spp: 
     """Render image less what it hides."""
     r = on_the_ground(asset, np.eye(4), view)
     light = light_args(Light(texels=texels), r.device)
-    pixels = np.arange(view.width * view.height, dtype=np.int32)
+    pixels = all_pixels(view)
     may_see, each = np.ones_like(pixels), spp // SEED_COUNT
 
     def picture(seed: int) -> FloatArray:

@@ -6,6 +6,7 @@ from typing import NamedTuple
 import numpy as np
 
 from benchmarks.scenes import on_the_ground
+from tests.builders.shapes import all_pixels
 from warpir.core.arrays import AnyFloatArray, Float64Array
 from warpir.mitsuba.render import Setting
 from warpir.render.device_light import light_args
@@ -74,7 +75,7 @@ def shadow_ratio(
     """
     render, camera = renderer(setting, device, bounce_depth), setting.camera
     light = light_args(Light(texels=setting.texels), render.device)
-    pixels = np.arange(camera.height * camera.width, dtype=np.int32)
+    pixels = all_pixels(camera)
     may_see, each = np.ones(len(pixels), np.int32), max(1, spp // SEED_COUNT)
     runs = [
         render.receiver(light, pixels, may_see, each, 1, SEED_COUNT * seed + k)

@@ -2,6 +2,7 @@
 
 import numpy as np
 
+from tests.builders.shapes import camera, quad
 from warpir.core.arrays import Float64Array, FloatArray
 from warpir.scene.asset import Asset, Material, Primitive, Texture
 from warpir.scene.camera import Camera
@@ -44,14 +45,8 @@ def sphere(material: Material, textures: tuple[Texture, ...] = (), rings: int = 
 def square(material: Material, side: float, height: float, up: bool = False) -> Asset:
     """Square in the plane y = ``height`` (or standing in z = 0), facing +Y (or +Z)."""
     h = 0.5 * side
-    corners = np.array([[-h, -h], [h, -h], [h, h], [-h, h]])
-    if up:
-        positions = np.column_stack([corners[:, 0], corners[:, 1] + height, np.zeros(4)])
-    else:
-        positions = np.column_stack([corners[:, 0], np.full(4, height), -corners[:, 1]])
-    uv = np.array([[0.0, 1.0], [1.0, 1.0], [1.0, 0.0], [0.0, 0.0]], dtype=np.float32)
-    primitive = Primitive(positions, np.array([[0, 1, 2], [0, 2, 3]], dtype=np.int32), 0, uv0=uv)
-    return Asset("square", (primitive,), (material,))
+    edge = (0.0, h, 0.0) if up else (0.0, 0.0, -h)
+    return Asset("square", (quad((0.0, height, 0.0), (h, 0.0, 0.0), edge),), (material,))
 
 
 def view(
@@ -72,10 +67,7 @@ def view(
 
 def from_above(width: int = 96, height: int = 64, eye: float = 2.0) -> Camera:
     """Look down at the object from before it."""
-    pose, a = np.eye(4), np.radians(-20.0)
-    pose[1:3, 1:3] = [[np.cos(a), -np.sin(a)], [np.sin(a), np.cos(a)]]
-    pose[:3, 3] = (0.0, eye, 4.5)
-    return Camera(width, height, 96.0, 96.0, width / 2.0, height / 2.0, pose)
+    return camera(width, height, 96.0, (0.0, eye, 4.5), pitch=-20.0)
 
 
 def sun_and_sky(rng: np.random.Generator, rows: int = 32) -> FloatArray:

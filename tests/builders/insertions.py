@@ -40,7 +40,7 @@ DETAIL = ("envmap_detail.exr", "envmap_detail.hdr", "envmap_detail_preview.png")
 
 
 HALF = 2e-3
-"""The same of linear values in [0, 1]; the writer's own limit."""
+"""Error of linear values in [0, 1] as half floats; the writer's own limit."""
 
 
 WIDTH, HEIGHT = 48, 32
