@@ -13,7 +13,7 @@ import numpy as np
 
 from benchmarks.measure import context, flags, peak_mib, report
 from benchmarks.scenes import on_the_ground, write_picture
-from warpir.core.color import linear_to_gamma
+from warpir.core.color import codes_of, linear_to_gamma
 from warpir.io.assets import load_asset
 from warpir.io.images.photos import Photo, read_envmap
 from warpir.render.composite import make_picture
@@ -30,9 +30,8 @@ def main() -> None:
     parser = flags(__doc__)
     parser.add_argument("--samples", type=int, default=64)
     parser.add_argument("--depth", type=int, default=5)
-    parser.add_argument(
-        "--size", type=float, default=2.0, help="2 m fills half of the width, 3.2 m nearly all"
-    )
+    about = "2 m fills half of the width, 3.2 m nearly all"
+    parser.add_argument("--size", type=float, default=2.0, help=about)
     parser.add_argument("--repeats", type=int, default=3)
     parser.add_argument("--preview", default=None, help="write the measured image here (PNG)")
     parser.add_argument("--width", type=int, default=1280, help="4243: 12 megapixels")
@@ -41,11 +40,10 @@ def main() -> None:
     asset = load_asset(options.assets / "mesh/ToyCar.glb")
     light = Light(texels=read_envmap(options.assets / "hdri/modern_buildings_2_1k.hdr"))
     camera = camera_from_fov(width, height, 40.0, -12.0, 1.4)
-    placement = place_asset(
-        *asset.bounds(), camera, None, place=(0.0, 0.0, -5.5), rotate_y=-35.0, size=options.size
-    )
+    stand = {"place": (0.0, 0.0, -5.5), "rotate_y": -35.0, "size": options.size}
+    placement = place_asset(*asset.bounds(), camera, **stand)
     grey = np.full((height, width, 3), 0.45, np.float32)
-    photo = Photo(codes=np.round(grey * 255.0).astype(np.uint8), srgb=grey, kind="png")
+    photo = Photo(codes=codes_of(grey), srgb=grey, kind="png")
     start = time.perf_counter()
     device = choose_device(options.device)
     renderer = on_the_ground(asset, placement.asset_to_world, camera, device)

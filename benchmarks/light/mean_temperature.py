@@ -56,10 +56,9 @@ def main() -> None:
     for name in sets:
         others = [pair for other, pair in sets.items() if other != name]
         found = calibrated_temperature(directions, others)
-        print(
-            f"{name:28s} {found:5.2f} of the others: {100 * coverage(name, found):3.0f} %", end=""
-        )
-        print(f" of {len(sets[name][0])} photographs (1.00: {100 * coverage(name, 1.0):3.0f} %)")
+        own, plain = (100 * coverage(name, temperature) for temperature in (found, 1.0))
+        told = f"{own:3.0f} % of {len(sets[name][0])} photographs (1.00: {plain:3.0f} %)"
+        print(f"{name:28s} {found:5.2f} of the others: {told}")
     best = calibrated_temperature(directions, list(sets.values()))
     print(f"all: {best:.2f}")
     if options.write is not None:

@@ -266,9 +266,8 @@ def measure(truth: Truth, loop: LightOptimization) -> dict[str, Any]:
     # The scale of the light and the curve are one unknown: radiances are matched by total flux.
     ratio = float(_measured(light)[2].sum() / _measured(truth.texels)[2].sum())
     radiance = np.geomspace(0.02, 2.0, 64)
-    curves = response(loop.unknowns.curve_fg(), ratio * radiance) - response(
-        truth.curve_fg, radiance
-    )
+    shown = response(loop.unknowns.curve_fg(), ratio * radiance)
+    curves = shown - response(truth.curve_fg, radiance)
     ratios = sun_sky_ratio(light, axis), sun_sky_ratio(truth.texels, true_axis)
     return {
         "name": truth.scene.name,
