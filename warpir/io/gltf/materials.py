@@ -129,11 +129,6 @@ class MaterialReader:
             self.materials.append(material)
         return self._material_index[stated]
 
-    def uv_sets(self, index: int) -> set[int]:
-        """Return the texture coordinate sets that material ``index`` reads."""
-        material = self.materials[index]
-        return {slot.uv_set for slot in material.texture_slots()}
-
     def _read(self, entry: Entry) -> Material:
         name = entry.text("name", "") or entry.pointer
         pbr = entry.child("pbrMetallicRoughness")

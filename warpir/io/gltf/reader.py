@@ -8,7 +8,7 @@ are not read.
 """
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -66,20 +66,16 @@ def read_gltf(path: str | Path, missing_textures: str = "error", limits: Limits 
     for entry, _, _ in placed:  # too many pixels are refused before the first is decoded
         sizes.index(entry)
     materials = MaterialReader(file, missing_textures, notices, limits)
-    geometries: dict[str, Geometry | None] = {}
-    material_of: dict[str, int] = {}
+    read: dict[str, Primitive | None] = {}
     primitives: list[Primitive] = []
     for entry, world, joints in placed:
-        key = entry.pointer
-        if key not in geometries:
-            material_of[key] = materials.index(entry)
-            uv_sets = materials.uv_sets(material_of[key])
-            geometries[key] = read_geometry(file, entry, uv_sets, notices)
-        geometry = geometries[key]
-        if geometry is not None and joints is not None:
-            geometry = pose(file, entry, geometry, joints)
-        if geometry is not None:
-            primitives.append(place(geometry, world, material_of[key]))
+        if entry.pointer not in read:
+            read[entry.pointer] = read_primitive(file, entry, materials, notices)
+        primitive = read[entry.pointer]
+        if primitive is not None and joints is not None:
+            primitive = pose(file, entry, primitive, joints)
+        if primitive is not None:
+            primitives.append(place(primitive, world))
     notices += glass_notices(primitives, materials.materials)
     notices += direction_notices(primitives, materials.materials)
     check_drawable(path, primitives, f"{len(placed)} placed primitives, none with triangles")
@@ -198,27 +194,16 @@ def check_counts(
     check_triangle_count(file.path, max(triangle_count, vertex_count // 3), limits, counted)
 
 
-@dataclass(frozen=True)
-class Geometry:
-    """A primitive in its own frame; the fields are those of `Primitive`."""
+def read_primitive(
+    file: GltfFile, entry: Entry, materials: MaterialReader, notices: list[str]
+) -> Primitive | None:
+    """Read the triangles of a primitive, in its own frame; None when none has an area.
 
-    positions: Float64Array
-    indices: IntArray
-    normals: FloatArray | None
-    tangents: FloatArray | None
-    uv0: FloatArray | None
-    uv1: FloatArray | None
-    colors: FloatArray | None
-
-
-def read_geometry(
-    file: GltfFile, entry: Entry, uv_sets: set[int], notices: list[str]
-) -> Geometry | None:
-    """Read the triangles of a primitive; None when none has an area.
-
-    ``uv_sets`` are the texture coordinate sets that its material reads; absent ones become zero.
-    ``notices`` receives what was repaired.
+    Texture coordinates that its material reads and that are absent become zero. ``notices``
+    receives what was repaired.
     """
+    material = materials.index(entry)
+    uv_sets = {slot.uv_set for slot in materials.materials[material].texture_slots()}
     attributes = entry.child("attributes")
     positions = file.accessor(attributes.integer("POSITION"), entry, "POSITION", ("VEC3",))
     positions = positions.astype(np.float64)
@@ -250,7 +235,7 @@ def read_geometry(
     if entry.size("targets"):
         notices.append(f"{entry.pointer}: morph targets ignored, the rest pose is used")
     colors = read_colors(read("COLOR_0", ("VEC3", "VEC4")), entry, notices)
-    return Geometry(positions, indices, normals, tangents, uvs[0], uvs[1], colors)
+    return Primitive(positions, indices, material, normals, tangents, *uvs, colors)
 
 
 def _attribute(
@@ -304,33 +289,35 @@ def read_colors(stored: PixelArray | None, entry: Entry, notices: list[str]) -> 
     return colors
 
 
-def pose(file: GltfFile, entry: Entry, geometry: Geometry, joints: Float64Array) -> Geometry:
+def pose(file: GltfFile, entry: Entry, bound: Primitive, joints: Float64Array) -> Primitive:
     """Move the vertices of a skinned primitive as its joints stand (linear blend skinning).
 
-    The primitive has JOINTS_n and WEIGHTS_n; the geometry is as stored, the matrices are those of
+    ``entry`` has JOINTS_n and WEIGHTS_n; the primitive is as stored, the matrices are those of
     `Skins.read`, shape [joint, 4, 4].
     """
-    moved = _blended_joints(file, entry, len(geometry.positions), joints)
+    moved = _blended_joints(file, entry, len(bound.positions), joints)
     linear = moved[:, :3, :3]
     with np.errstate(over="ignore", invalid="ignore"):  # such sizes are refused below
         volume = np.linalg.norm(linear, axis=1).prod(axis=1)
         sign = np.linalg.det(linear)
     if not ((np.abs(moved) < EXTENT).all() and (np.abs(sign) > 1e-9 * volume).all()):
         raise entry.error("singular", what="transforms of the joints, or beyond all bounds")
-    mirrored = bool(np.median(sign) < 0)
-    normals, tangents = geometry.normals, geometry.tangents
+    normals, tangents = bound.normals, bound.tangents
     if normals is not None:
         normals = unit(np.einsum("vk,vkj->vj", normals, np.linalg.inv(linear)))
     if tangents is not None:
         turned = unit(np.einsum("vjk,vk->vj", linear, tangents[:, :3]))
-        tangents = np.column_stack([turned, tangents[:, 3] * (-1 if mirrored else 1)])
-    return replace(
-        geometry,
-        positions=np.einsum("vjk,vk->vj", linear, geometry.positions) + moved[:, :3, 3],
-        indices=np.ascontiguousarray(geometry.indices[:, ::-1]) if mirrored else geometry.indices,
-        normals=normals,
-        tangents=None if tangents is None else tangents.astype(np.float32),
-    )
+        tangents = np.column_stack([turned, tangents[:, 3]])
+    positions = np.einsum("vjk,vk->vj", linear, bound.positions) + moved[:, :3, 3]
+    posed = replace(bound, positions=positions, normals=normals, tangents=tangents)
+    return _mirrored(posed) if np.median(sign) < 0 else posed
+
+
+def _mirrored(p: Primitive) -> Primitive:
+    """Return a primitive that a mirroring matrix has moved with its triangles turned round."""
+    indices = np.ascontiguousarray(p.indices[:, ::-1])
+    tangents = None if p.tangents is None else p.tangents * np.array([1, 1, 1, -1], np.float32)
+    return replace(p, indices=indices, tangents=tangents)
 
 
 def _blended_joints(file: GltfFile, entry: Entry, count: int, joints: Float64Array) -> Float64Array:
@@ -359,24 +346,14 @@ def _blended_joints(file: GltfFile, entry: Entry, count: int, joints: Float64Arr
     return moved
 
 
-def place(geometry: Geometry, world: Float64Array, material: int) -> Primitive:
-    """Move a geometry into the asset's frame; a mirroring matrix turns the triangles round."""
+def place(p: Primitive, world: Float64Array) -> Primitive:
+    """Move a primitive into the asset's frame; a mirroring matrix turns the triangles round."""
     linear = world[:3, :3]
-    mirrored = bool(np.linalg.det(linear) < 0)
-    indices, normals, tangents = geometry.indices, geometry.normals, geometry.tangents
+    normals, tangents = p.normals, p.tangents
     if normals is not None:
         normals = unit(normals @ np.linalg.inv(linear))
     if tangents is not None:
-        tangents = np.column_stack(
-            [unit(tangents[:, :3] @ linear.T), tangents[:, 3] * (-1 if mirrored else 1)]
-        ).astype(np.float32)
-    return Primitive(
-        positions=geometry.positions @ linear.T + world[:3, 3],
-        indices=np.ascontiguousarray(indices[:, ::-1]) if mirrored else indices,
-        material=material,
-        normals=normals,
-        tangents=tangents,
-        uv0=geometry.uv0,
-        uv1=geometry.uv1,
-        colors=geometry.colors,
-    )
+        tangents = np.column_stack([unit(tangents[:, :3] @ linear.T), tangents[:, 3]])
+    positions = p.positions @ linear.T + world[:3, 3]
+    placed = replace(p, positions=positions, normals=normals, tangents=tangents)
+    return _mirrored(placed) if np.linalg.det(linear) < 0 else placed
