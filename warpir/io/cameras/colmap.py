@@ -21,7 +21,7 @@ from warpir.io.cameras.colmap_model import (
     read_cameras,
     read_images,
 )
-from warpir.io.cameras.source import CAMERA, SHORTEST, StoredCamera, choose_frame
+from warpir.io.cameras.source import CAMERA, SHORTEST, PhotoCamera, choose_frame
 from warpir.io.gltf.nodes import from_trs
 from warpir.scene.camera import Camera
 from warpir.scene.lens import Lens
@@ -33,7 +33,7 @@ UNIT_TOLERANCE = 1e-3
 
 def read_colmap(
     path: Path, frame: str | None, photo: str | None, limits: Limits = LIMITS
-) -> StoredCamera:
+) -> PhotoCamera:
     """Read the camera of one image of a model, given its folder or one of its files.
 
     ``frame`` is the image's name; default: the photo's, or the only one.
@@ -52,8 +52,7 @@ def read_colmap(
         "the scale of a COLMAP world is arbitrary: lengths are in its units, not in metres (--size)"
     )
     c2w = _pose(images_path, image)
-    stored = Camera(*camera, c2w, (notice,))
-    return StoredCamera(stored, None, lens)
+    return PhotoCamera(Camera(*camera, c2w, (notice,)), lens, has_up=False)
 
 
 def _pinhole(

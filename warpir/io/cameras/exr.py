@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from warpir.core.arrays import Float64Array
-from warpir.io.cameras.source import CAMERA, StoredCamera, rigid
+from warpir.io.cameras.source import CAMERA, PhotoCamera, rigid
 from warpir.io.images.decoder import read_exr_header
 from warpir.scene.camera import Camera
 
@@ -18,7 +18,7 @@ AFFINE_TOLERANCE = 1e-3
 """How far a projection may be from a pinhole's, relative to its focal lengths."""
 
 
-def read_exr_camera(path: Path) -> StoredCamera:
+def read_exr_camera(path: Path) -> PhotoCamera:
     """Read the camera of an EXR file.
 
     Raises:
@@ -46,7 +46,7 @@ def read_exr_camera(path: Path) -> StoredCamera:
         float(-projection[1, 2] * height),
         c2w,
     )
-    return StoredCamera(camera, np.eye(3))
+    return PhotoCamera(camera)
 
 
 def _matrix(path: Path, header: dict[str, Any], name: str) -> Float64Array:

@@ -9,12 +9,12 @@ from typing import Any
 
 import numpy as np
 
-from warpir.core.limits import LIMITS, Limits
+from warpir.core.limits import Limits
 from warpir.core.strict_json import parse_json_object
 from warpir.io.cameras.source import (
     CAMERA,
     UP_TO_Y,
-    StoredCamera,
+    PhotoCamera,
     angle,
     count,
     member,
@@ -24,7 +24,7 @@ from warpir.io.cameras.source import (
 from warpir.scene.camera import Camera
 
 
-def read_fspy_project(path: Path, limits: Limits = LIMITS) -> StoredCamera:
+def read_fspy_project(path: Path, limits: Limits) -> PhotoCamera:
     """Read a binary fSpy project: magic, three u32, JSON, image."""
     with path.open("rb") as stream:
         header = stream.read(16)
@@ -43,7 +43,7 @@ def read_fspy_project(path: Path, limits: Limits = LIMITS) -> StoredCamera:
     return read_fspy(path, parse_json_object(path, state, limits))
 
 
-def read_fspy(path: Path, content: dict[str, Any]) -> StoredCamera:
+def read_fspy(path: Path, content: dict[str, Any]) -> PhotoCamera:
     """Read fSpy's camera parameters; its camera axes are ours, its world may stand otherwise."""
     parameters = content.get("cameraParameters", content)
     if parameters is None:
@@ -64,8 +64,6 @@ def read_fspy(path: Path, content: dict[str, Any]) -> StoredCamera:
     camera_up = c2w[:3, 1]
     k = int(np.argmax(np.abs(camera_up)))
     axis = f"{'+' if camera_up[k] > 0.0 else '-'}{'xyz'[k]}"
-    return StoredCamera(
-        Camera(width, height, focal, focal, cx, cy, c2w),
-        np.array(UP_TO_Y[axis], dtype=np.float64),
-        assumed_up=f"{axis} of the fSpy world points up; --up overrides",
-    )
+    assumed = (f"{axis} of the fSpy world points up; --up overrides",)
+    camera = Camera(width, height, focal, focal, cx, cy, c2w, assumed=assumed)
+    return PhotoCamera(camera, world=UP_TO_Y[axis])

@@ -6,7 +6,7 @@ import numpy as np
 
 from warpir.core.arrays import Float64Array
 from warpir.core.limits import LIMITS, Limits
-from warpir.io.cameras.source import LARGEST, StoredCamera, choose_frame, rigid
+from warpir.io.cameras.source import LARGEST, PhotoCamera, choose_frame, rigid
 from warpir.io.gltf.gate import Entry, GltfFile
 from warpir.io.gltf.nodes import local_matrix, read_forest
 from warpir.scene.camera import Camera
@@ -17,7 +17,7 @@ ASPECT_TOLERANCE = 0.01
 
 def read_gltf_camera(
     path: Path, photo_size: tuple[int, int], frame: str | None, limits: Limits = LIMITS
-) -> StoredCamera:
+) -> PhotoCamera:
     """Read a camera; its axes and the world's are ours.
 
     Args:
@@ -64,7 +64,7 @@ def read_gltf_camera(
     focal = height / 2.0 / float(np.tan(yfov / 2.0))
     c2w = _unscaled(placed[k], _world(nodes, parents, nodes.index(placed[k])))
     camera = Camera(width, height, focal, focal, width / 2.0, height / 2.0, c2w, tuple(notices))
-    return StoredCamera(camera, np.eye(3))
+    return PhotoCamera(camera)
 
 
 def _world(nodes: list[Entry], parents: dict[int, int], index: int) -> Float64Array:

@@ -12,7 +12,7 @@ import numpy as np
 from warpir.io.cameras.source import (
     CAMERA,
     UP_TO_Y,
-    StoredCamera,
+    PhotoCamera,
     angle,
     choose_frame,
     count,
@@ -25,6 +25,7 @@ from warpir.scene.lens import Lens
 
 PERSPECTIVE = ("SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV", "PERSPECTIVE")
 """Values of ``camera_model`` that share the distortion model of `Lens`."""
+BENDS = ("k1", "k2", "k3", "k4", "p1", "p2")
 
 
 def read_nerfstudio(
@@ -33,7 +34,7 @@ def read_nerfstudio(
     photo_size: tuple[int, int],
     frame: str | None,
     photo: str | None,
-) -> StoredCamera:
+) -> PhotoCamera:
     """Read the camera of one frame; what the frame says goes before what the file says.
 
     ``frame`` is the name of the frame's picture; default: the photo's, or the only one. Files that
@@ -60,7 +61,7 @@ def read_nerfstudio(
     fy = _focal(path, said, "y", height)
     if fx is None:
         raise CAMERA.error(path, "no_focal_length", expected="fl_x or camera_angle_x")
-    coefficients = [number(path, said, key) if key in said else 0.0 for key in BENDS]
+    k1, k2, k3, k4, p1, p2 = (number(path, said, key) if key in said else 0.0 for key in BENDS)
     matrix = f"frames/{k}/transform_matrix"
     camera = Camera(
         width,
@@ -70,18 +71,12 @@ def read_nerfstudio(
         number(path, said, "cx") if "cx" in said else width / 2.0,
         number(path, said, "cy") if "cy" in said else height / 2.0,
         rigid(path, matrix, frames[k].get("transform_matrix")),
+        assumed=(
+            "+z of the transforms.json points up, as nerfstudio has it; only its exporter "
+            "knows whether gravity agrees (--up, --ground)",
+        ),
     )
-    k1, k2, k3, k4, p1, p2 = coefficients
-    return StoredCamera(
-        camera,
-        np.array(UP_TO_Y["+z"], dtype=np.float64),
-        Lens((k1, k2, k3, k4), (p1, p2)),
-        "+z of the transforms.json points up, as nerfstudio has it; only its exporter "
-        "knows whether gravity agrees (--up, --ground)",
-    )
-
-
-BENDS = ("k1", "k2", "k3", "k4", "p1", "p2")
+    return PhotoCamera(camera, Lens((k1, k2, k3, k4), (p1, p2)), UP_TO_Y["+z"])
 
 
 def _focal(path: Path, said: dict[str, Any], axis: str, side: int) -> float | None:

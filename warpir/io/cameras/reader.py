@@ -8,8 +8,6 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
 from warpir.core.errors import ExitCode, InputError, shown
 from warpir.core.limits import LIMITS, Limits
 from warpir.core.strict_json import read_json_object
@@ -23,7 +21,6 @@ from warpir.io.cameras.source import (
     CAMERA,
     UP_TO_Y,
     PhotoCamera,
-    StoredCamera,
     count,
     focal_length,
     number,
@@ -68,18 +65,15 @@ def read_photo_camera(
     """
     path = Path(path)
     axis = None if up is None else _up_axis(up)
-    stored = _read(path, photo_size, frame, photo_name, limits)
-    if not (stored.lens.is_straight or undistort):
-        worst = max((*stored.lens.radial, *stored.lens.tangential), key=abs)
+    view = _read(path, photo_size, frame, photo_name, limits)
+    if not (view.lens.is_straight or undistort):
+        worst = max((*view.lens.radial, *view.lens.tangential), key=abs)
         raise CAMERA.error(path, "distorted", found=worst, expected=0)
-    world = stored.world if axis is None else np.array(UP_TO_Y[axis], dtype=np.float64)
-    has_up = world is not None
-    if world is None:
-        world = np.eye(3)
-    assumed = (stored.assumed_up,) if axis is None and stored.assumed_up else ()
-    camera = replace(stored.camera, c2w=turned(stored.camera.c2w, world), assumed=assumed)
-    camera = _fit(path, camera, photo_size)
-    return PhotoCamera(camera, stored.lens, world, has_up)
+    if axis is not None:
+        camera = replace(view.camera, assumed=())
+        view = replace(view, camera=camera, world=UP_TO_Y[axis], has_up=True)
+    camera = replace(view.camera, c2w=turned(view.camera.c2w, view.world))
+    return replace(view, camera=_fit(path, camera, photo_size))
 
 
 def read_camera(path: str | Path, photo_size: tuple[int, int], up: str | None = None) -> Camera:
@@ -103,7 +97,7 @@ def _read(
     frame: str | None,
     photo_name: str | None,
     limits: Limits,
-) -> StoredCamera:
+) -> PhotoCamera:
     """Recognise a file and read it."""
     if is_model(path):
         return read_colmap(path, frame, photo_name, limits)
@@ -130,7 +124,7 @@ def _read(
     raise CAMERA.error(path, "kind", found=f"keys {', '.join(keys) or 'none'}", expected=expected)
 
 
-def _read_own(path: Path, content: dict[str, Any]) -> StoredCamera:
+def _read_own(path: Path, content: dict[str, Any]) -> PhotoCamera:
     """Read our own ``camera.json``."""
     focal = {key: focal_length(path, content, key) for key in ("fx", "fy")}
     c2w = rigid(path, "c2w", content.get("c2w"))
@@ -143,7 +137,7 @@ def _read_own(path: Path, content: dict[str, Any]) -> StoredCamera:
         number(path, content, "cy"),
         c2w,
     )
-    return StoredCamera(camera, np.eye(3))
+    return PhotoCamera(camera)
 
 
 def _fit(path: Path, camera: Camera, photo_size: tuple[int, int]) -> Camera:

@@ -63,29 +63,15 @@ CAMERA = Faults(
 )
 """What a camera file may have wrong; ``pointer`` is the place in it."""
 
-UP_TO_Y = {
-    "+x": [[0, -1, 0], [1, 0, 0], [0, 0, 1]],
-    "-x": [[0, 1, 0], [-1, 0, 0], [0, 0, 1]],
-    "+y": [[1, 0, 0], [0, 1, 0], [0, 0, 1]],
-    "-y": [[1, 0, 0], [0, -1, 0], [0, 0, -1]],
-    "+z": [[1, 0, 0], [0, 0, 1], [0, -1, 0]],
-    "-z": [[1, 0, 0], [0, 0, -1], [0, 1, 0]],
+UP_TO_Y: dict[str, Float64Array] = {
+    "+x": np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]]),
+    "-x": np.array([[0.0, 1.0, 0.0], [-1.0, 0.0, 0.0], [0.0, 0.0, 1.0]]),
+    "+y": np.array([[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]]),
+    "-y": np.array([[1.0, 0.0, 0.0], [0.0, -1.0, 0.0], [0.0, 0.0, -1.0]]),
+    "+z": np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]]),
+    "-z": np.array([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]]),
 }
 """Rotations that turn a world whose up axis is the key into ours."""
-
-
-@dataclass(frozen=True)
-class StoredCamera:
-    """A camera as its file has it: our camera axes, in the file's own world."""
-
-    camera: Camera
-    world: Float64Array | None
-    """Rotation from the file's world to ours that the format implies, shape [3, 3]; None: which
-    way is up is not known."""
-    lens: Lens = STRAIGHT
-    """What bent the photograph."""
-    assumed_up: str = ""
-    """What `world` rests on when the user does not say which way is up; empty: the format says."""
 
 
 @dataclass(frozen=True)
@@ -93,7 +79,8 @@ class PhotoCamera:
     """The camera of a photograph, and what else its file says."""
 
     camera: Camera
-    """At the photograph's resolution, in our world."""
+    """As its reader returns it, in the world of the file; then in ours, at the photograph's
+    resolution. What `world` rests on, unless the user says which way is up, is in `assumed`."""
     lens: Lens = STRAIGHT
     """What bent the photograph; undone with ``--undistort``."""
     world: Float64Array = field(default_factory=lambda: np.eye(3))

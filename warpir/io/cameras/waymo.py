@@ -14,7 +14,7 @@ from warpir.core.strict_json import read_numbers
 from warpir.io.cameras.source import (
     CAMERA,
     SHORTEST,
-    StoredCamera,
+    PhotoCamera,
     choose_frame,
     count,
     member,
@@ -29,7 +29,7 @@ NAMES = ("UNKNOWN", "FRONT", "FRONT_LEFT", "FRONT_RIGHT", "SIDE_LEFT", "SIDE_RIG
 """``CameraName.Name`` by number."""
 
 
-def read_waymo(path: Path, content: dict[str, Any], frame: str | None) -> StoredCamera:
+def read_waymo(path: Path, content: dict[str, Any], frame: str | None) -> PhotoCamera:
     """Read one calibration, by itself or out of ``camera_calibrations``.
 
     The content is JSON, names as in the proto or in protobuf's JSON form (camelCase); ``frame`` is
@@ -55,7 +55,7 @@ def read_waymo(path: Path, content: dict[str, Any], frame: str | None) -> Stored
     axes[:3, :3] = OURS_TO_WAYMO
     size = count(path, entry, "width"), count(path, entry, "height")
     camera = Camera(*size, fx, fy, cx, cy, camera_to_vehicle @ axes)
-    return StoredCamera(camera, OURS_TO_WAYMO.T, Lens((k1, k2, k3, 0.0), (p1, p2)))
+    return PhotoCamera(camera, Lens((k1, k2, k3, 0.0), (p1, p2)), OURS_TO_WAYMO.T)
 
 
 def _name(value: Any) -> str:

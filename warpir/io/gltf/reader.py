@@ -235,7 +235,7 @@ def read_primitive(
     if entry.size("targets"):
         notices.append(f"{entry.pointer}: morph targets ignored, the rest pose is used")
     colors = read_colors(read("COLOR_0", ("VEC3", "VEC4")), entry, notices)
-    return Primitive(positions, indices, material, normals, tangents, *uvs, colors)
+    return Primitive(positions, indices, material, normals, tangents, uvs[0], uvs[1], colors)
 
 
 def _attribute(
