@@ -1,6 +1,8 @@
-"""What a refused command line must look like."""
+"""What a refused command line, or a refused file, must look like."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -31,3 +33,15 @@ def refused(argv: Sequence[str]) -> InputError:
         parse(argv)
     assert caught.value.code == ExitCode.USAGE
     return caught.value
+
+
+def unreadable(read: Callable[..., object], path: Path, *words: str, **options: Any) -> InputError:
+    """Check that reading ends in one sentence with the file and the words."""
+    with pytest.raises(InputError) as caught:
+        read(path, **options)
+    error = caught.value
+    assert (error.where, error.code) == (str(path), ExitCode.INPUT)
+    assert "\n" not in str(error)
+    text = f"{error.what} / {error.advice}"
+    assert all(word in text for word in words), text
+    return error

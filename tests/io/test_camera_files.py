@@ -1,6 +1,5 @@
 """COLMAP, nerfstudio, Waymo, glTF and EXR cameras against their own formulas, and bad files."""
 
-import json
 import struct
 from collections.abc import Callable
 from pathlib import Path
@@ -9,6 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from tests.builders.gltf_files import pack_glb
 from tests.builders.poses import points_in_view, pose, write_json
 from warpir.core.errors import ExitCode, InputError
 from warpir.io.cameras.reader import read_photo_camera
@@ -451,10 +451,7 @@ def gltf_scene(c2w: np.ndarray, yfov: float = 0.8, **changes: Any) -> dict[str, 
 
 
 def write_glb(path: Path, content: dict[str, Any]) -> Path:
-    text = json.dumps(content).encode()
-    text += b" " * (-len(text) % 4)
-    chunk = struct.pack("<I4s", len(text), b"JSON") + text
-    path.write_bytes(struct.pack("<4sII", b"glTF", 2, 12 + len(chunk)) + chunk)
+    path.write_bytes(pack_glb(json.dumps(content).encode()))
     return path
 
 

@@ -9,7 +9,7 @@ import subprocess
 import sys
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -473,6 +473,14 @@ def test_importing_loads_no_heavy_library() -> None:
     assert (child.returncode, child.stdout) == (0, "\n"), child.stderr
 
 
+def refuses_entry(folder: OutputFolder) -> Iterator[InputError]:
+    """Yield what `check` finds, and the same on entering."""
+    for enter in (folder.check, folder.__enter__):
+        with pytest.raises(InputError) as caught:
+            enter()
+        yield caught.value
+
+
 @pytest.mark.case("F5")
 @pytest.mark.parametrize(
     "name",
@@ -483,10 +491,9 @@ def test_folder_of_somebody_else_is_a_result(tmp_path: Path, name: str) -> None:
     path = tmp_path / "out" / name
     path.parent.mkdir(parents=True)
     path.write_text("mine")
-    for enter in (OutputFolder(tmp_path / "out").check, OutputFolder(tmp_path / "out").__enter__):
-        with pytest.raises(InputError, match="already holds files") as caught:
-            enter()
-        assert caught.value.code == ExitCode.OUTPUT and name in caught.value.what
+    for error in refuses_entry(OutputFolder(tmp_path / "out")):
+        assert "already holds files" in error.what and name in error.what
+        assert error.code == ExitCode.OUTPUT
     assert path.read_text() == "mine" and len(list((tmp_path / "out").iterdir())) == 1
 
 
@@ -504,11 +511,8 @@ def test_lock_of_somebody_else_is_left_alone(tmp_path: Path) -> None:
 def test_lock_that_is_no_file_is_refused(tmp_path: Path, make: Callable[[Path], None]) -> None:
     """At once: who opens a FIFO waits for its other end."""
     make(tmp_path / ".lock")
-    folder = OutputFolder(tmp_path, overwrite=True)
-    for enter in (folder.check, folder.__enter__):
-        with pytest.raises(InputError) as caught:
-            enter()
-        assert caught.value.code in (ExitCode.OUTPUT, ExitCode.RESOURCES)
+    for error in refuses_entry(OutputFolder(tmp_path, overwrite=True)):
+        assert error.code in (ExitCode.OUTPUT, ExitCode.RESOURCES)
     assert os.listdir(tmp_path) == [".lock"]
 
 
@@ -545,10 +549,9 @@ def test_folder_that_cannot_be_listed_is_no_output(
         raise PermissionError(errno.EACCES, "Permission denied", str(path))
 
     monkeypatch.setattr(files, "results_in", denied)
-    for enter in (OutputFolder(tmp_path).check, OutputFolder(tmp_path).__enter__):
-        with pytest.raises(InputError, match="Permission denied") as caught:
-            enter()
-        assert caught.value.code == ExitCode.RESOURCES and caught.value.where == str(tmp_path)
+    for error in refuses_entry(OutputFolder(tmp_path)):
+        assert "Permission denied" in error.what
+        assert error.code == ExitCode.RESOURCES and error.where == str(tmp_path)
     assert os.listdir(tmp_path) == []
 
 
@@ -626,11 +629,8 @@ def test_link_in_place_of_a_folder_is_refused(tmp_path: Path, name: str) -> None
     (tmp_path / "else").mkdir()
     (tmp_path / "out").mkdir()
     (tmp_path / "out" / name).symlink_to(tmp_path / "else")
-    folder = OutputFolder(tmp_path / "out", overwrite=True)
-    for enter in (folder.check, folder.__enter__):
-        with pytest.raises(InputError, match="a link in place") as caught:
-            enter()
-        assert caught.value.code == ExitCode.OUTPUT
+    for error in refuses_entry(OutputFolder(tmp_path / "out", overwrite=True)):
+        assert "a link in place" in error.what and error.code == ExitCode.OUTPUT
     assert not list((tmp_path / "else").iterdir()) and (tmp_path / "out" / name).is_symlink()
 
 

@@ -12,6 +12,7 @@ import time
 import tracemalloc
 from collections.abc import Callable
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -20,17 +21,20 @@ import pytest
 from PIL import Image
 
 from benchmarks.damage.mutations import places
+from tests.builders.development_data import MESHES, needs_shared
 from tests.builders.faults import assert_fails
 from tests.builders.gltf_files import CODES, CORNERS, NORMALS, TWO, UVS, Builder, png
+from tests.builders.image_files import png_header, write_image
+from tests.builders.insertions import arguments
+from tests.builders.refusals import unreadable
 from tests.builders.shapes import box
 from warpir.app.config import InsertConfig
 from warpir.core.errors import ExitCode, InputError
 from warpir.core.limits import LIMITS, Limits
 from warpir.io.assets import load_asset
 from warpir.io.gltf.reader import glass_notices, read_gltf
+from warpir.io.meshes.asset_files import TextureDecoder
 from warpir.scene.asset import Asset, Material, TextureSlot
-
-DATA = Path(__file__).parents[3] / "shared" / "data" / "mesh"
 
 TANGENTS = np.tile(np.array([1, 0, 0, 1], dtype="f"), (4, 1))
 
@@ -38,25 +42,17 @@ TANGENTS = np.tile(np.array([1, 0, 0, 1], dtype="f"), (4, 1))
 FLOAT32_RTOL = 1e-6
 
 
-def load(folder: Path, builder: Builder, **options: str) -> Asset:
+def written(folder: Path, builder: Builder) -> Path:
     path = folder / "asset.glb"
     path.write_bytes(builder.glb())
-    return read_gltf(path, **options)
+    return path
 
 
-def fails(path: Path, *words: str, **options: str) -> InputError:
-    """Assert that loading ends in one sentence with the file and the words."""
-    with pytest.raises(InputError) as caught:
-        load_asset(path, **options)
-    error = caught.value
-    assert error.code == ExitCode.INPUT
-    assert error.where == str(path)
-    assert "\n" not in str(error)
-    for word in words:
-        assert word in f"{error.what} / {error.advice}"
-    return error
+def load(folder: Path, builder: Builder, **options: Any) -> Asset:
+    return read_gltf(written(folder, builder), **options)
 
 
+fails = partial(unreadable, load_asset)
 Plant = Callable[[Builder], object]
 FAULTS: dict[str, tuple[Plant, str, str, dict[str, object]]] = {}
 """By case: what is planted; and of the error the reason, the start of the pointer, and fields."""
@@ -387,9 +383,7 @@ def planted(case: str, folder: Path) -> Path:
     """Write the correct file with a fault in it."""
     builder = Builder()
     FAULTS[case][0](builder)
-    path = folder / "asset.glb"
-    path.write_bytes(builder.glb())
-    return path
+    return written(folder, builder)
 
 
 @pytest.mark.parametrize("case", FAULTS)
@@ -463,8 +457,6 @@ COSTLY = [
 @pytest.mark.parametrize("case", COSTLY)
 def test_fault_costs_nothing(case: str, inputs: Path, tmp_path: Path) -> None:
     """What asks for much memory or time ends the program at once, and with little of both."""
-    from tests.builders.insertions import arguments
-
     planted(case, tmp_path)
     argv = arguments(inputs, "out", asset="asset.glb", device="cpu")
     assert_fails(argv, 3, "asset.glb", FAULTS[case][2], cwd=tmp_path)
@@ -484,8 +476,6 @@ URIS = {
 @pytest.mark.parametrize("case", URIS, ids="M4-{}".format)
 def test_uri_opens_nothing_outside(case: str, what: str, inputs: Path, tmp_path: Path) -> None:
     """Of images and of buffers: refused by the program, without a socket."""
-    from tests.builders.insertions import arguments
-
     folder = tmp_path / "asset"
     folder.mkdir()
     builder = Builder()
@@ -521,8 +511,6 @@ def test_huge_file_is_not_read(
     name: str, start: bytes, size: int, inputs: Path, tmp_path: Path
 ) -> None:
     """A sparse file takes no room on the disk; it must take none in memory either."""
-    from tests.builders.insertions import arguments
-
     with (tmp_path / name).open("wb") as stream:
         stream.write(start)
         stream.truncate(size)
@@ -624,8 +612,7 @@ def test_G24_uri_outside_the_folder_is_not_read(uri: str, policy: str, tmp_path:
     (folder / "loop.png").symlink_to(folder / "loop.png")
     builder = Builder()
     builder.base_color({"uri": uri})
-    path = folder / "asset.glb"
-    path.write_bytes(builder.glb())
+    path = written(folder, builder)
     if uri == "loop.png" and policy == "grey":
         return  # a loop inside the folder is a missing file
     fails(path, "/images/0", *(() if uri == "loop.png" else ("outside",)), missing_textures=policy)
@@ -637,9 +624,7 @@ def test_G24_no_fallback_to_the_base_name(tmp_path: Path) -> None:
     (tmp_path / "x.png").write_bytes(png())
     builder = Builder()
     builder.base_color({"uri": "a/b/x.png"})
-    path = tmp_path / "asset.glb"
-    path.write_bytes(builder.glb())
-    fails(path, "/images/0", "x.png")
+    fails(written(tmp_path, builder), "/images/0", "x.png")
 
 
 @pytest.mark.case("M3")
@@ -1219,52 +1204,30 @@ def test_image_kinds_become_rgba(kind: str, tmp_path: Path) -> None:
     """Every kind of PNG becomes 8-bit RGBA without rescaling its codes."""
     image, expected = {
         "16-bit grey": (Image.fromarray(np.full((2, 2), 200 * 257, "H")), [200, 200, 200, 255]),
-        "16-bit rgb": (None, [200, 100, 50, 255]),
+        "16-bit rgb": (np.full((2, 2, 3), (51400, 25700, 12850), "H"), [200, 100, 50, 255]),
         "palette": (Image.new("RGB", (2, 2), (200, 100, 50)).quantize(4), [200, 100, 50, 255]),
         "grey": (Image.new("L", (2, 2), 200), [200, 200, 200, 255]),
         "rgba": (Image.new("RGBA", (2, 2), (200, 100, 50, 7)), [200, 100, 50, 7]),
     }[kind]
-    stream = io.BytesIO()
-    if image is None:
-        stream.write(png16([200 * 257, 100 * 257, 50 * 257]))
+    path = tmp_path / "image.png"
+    if isinstance(image, np.ndarray):  # which Pillow cannot write
+        write_image(path, image)
     else:
-        image.save(stream, "PNG")
+        image.save(path)
     builder = Builder()
-    builder.base_color({"bufferView": builder.view(stream.getvalue())})
+    builder.base_color({"bufferView": builder.view(path.read_bytes())})
     asset = load(tmp_path, builder)
     assert asset.textures[0].pixels[1, 1].tolist() == expected
     assert any("16-bit" in notice for notice in asset.notices) == ("16-bit" in kind)
 
 
-def png16(color: list[int]) -> bytes:
-    """Return a 2 x 2 PNG with 16 bits per channel, which Pillow cannot write."""
-    import zlib
-
-    def chunk(kind: bytes, body: bytes) -> bytes:
-        check = struct.pack(">I", zlib.crc32(kind + body))
-        return struct.pack(">I", len(body)) + kind + body + check
-
-    row = b"\0" + struct.pack(">3H", *color) * 2
-    header = struct.pack(">IIBBBBB", 2, 2, 16, 2, 0, 0, 0)
-    return b"\x89PNG\r\n\x1a\n" + b"".join(
-        (chunk(b"IHDR", header), chunk(b"IDAT", zlib.compress(row * 2)), chunk(b"IEND", b""))
-    )
-
-
 @pytest.mark.case("M14")
 def test_M14_texture_pixels_are_limited(tmp_path: Path) -> None:
     """A header that promises 8000 x 8000 x 9 pixels stops before decoding."""
-    small = bytearray(png())
-    small[16:24] = struct.pack(">II", 8000, 8000)
-    import zlib
-
-    small[29:33] = struct.pack(">I", zlib.crc32(small[12:29]))
-    from warpir.io.meshes import asset_files
-
-    decoder = asset_files.TextureDecoder(tmp_path / "asset.glb", [])
+    decoder = TextureDecoder(tmp_path / "asset.glb", [])
     decoder.pixel_count = decoder.limits.texture_pixels - 10
     with pytest.raises(InputError, match="too many texture pixels"):
-        decoder.decode(bytes(small), "/images/0: ")
+        decoder.decode(png_header(8000, 8000), "/images/0: ")
 
 
 @pytest.mark.case("M14")
@@ -1588,11 +1551,10 @@ def test_M14_images_of_one_buffer_view_are_counted(tmp_path: Path) -> None:
     del builder.json["images"][1:-5]
     for k in range(5):
         builder.json["textures"][-5 + k]["source"] = k + 1
-    path = tmp_path / "asset.glb"
-    path.write_bytes(builder.glb())
     with pytest.raises(InputError, match=r"too many bytes of textures .*--max-file-bytes"):
-        read_gltf(path, limits=Limits(file_bytes=5 * len(content)))
-    assert len(read_gltf(path, limits=Limits(file_bytes=7 * len(content))).materials) == 6
+        load(tmp_path, builder, limits=Limits(file_bytes=5 * len(content)))
+    limits = Limits(file_bytes=7 * len(content))
+    assert len(load(tmp_path, builder, limits=limits).materials) == 6
 
 
 @pytest.mark.case("M14")
@@ -1610,11 +1572,9 @@ def test_M14_textures_made_of_others_are_shared_and_counted(tmp_path: Path) -> N
             {"extensions": {"KHR_materials_pbrSpecularGlossiness": extension}}
         )
         primitives.append({**builder.primitive, "material": k + 1})
-    path = tmp_path / "asset.glb"
-    path.write_bytes(builder.glb())
-    assert len(read_gltf(path, limits=Limits(texture_pixels=3 * 64)).textures) == 3
+    assert len(load(tmp_path, builder, limits=Limits(texture_pixels=3 * 64)).textures) == 3
     with pytest.raises(InputError, match="too many texture pixels"):
-        read_gltf(path, limits=Limits(texture_pixels=2 * 64))
+        load(tmp_path, builder, limits=Limits(texture_pixels=2 * 64))
 
 
 @pytest.mark.case("M14")
@@ -1752,20 +1712,18 @@ REAL = {  # triangles placed, those of zero area, primitives, textures read
 }
 
 
+@needs_shared
 @pytest.mark.parametrize("name", REAL)
 def test_real_file_has_the_published_counts(name: str) -> None:
     """Files of the development data have the triangles that their table states."""
-    if not DATA.is_dir():
-        pytest.skip("no development data beside the repository")
-    asset = load_asset(DATA / name)
+    asset = load_asset(MESHES / name)
     triangle_count, flat_count, primitive_count, texture_count = REAL[name]
     assert sum(len(p.indices) for p in asset.primitives) == triangle_count - flat_count
     assert (len(asset.primitives), len(asset.textures)) == (primitive_count, texture_count)
 
 
+@needs_shared
 @pytest.mark.parametrize("name", ["ToyCar_meshopt.glb", "mug_draco.gltf"])
 def test_real_compressed_file_is_refused(name: str) -> None:
     """Compressed originals are refused by the name of their compression."""
-    if not DATA.is_dir():
-        pytest.skip("no development data beside the repository")
-    fails(DATA / "compressed_originals" / name, "_compression", "re-export")
+    fails(MESHES / "compressed_originals" / name, "_compression", "re-export")

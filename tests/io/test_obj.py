@@ -8,19 +8,20 @@ import io
 import struct
 import time
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 
 import numpy as np
 import pytest
 from PIL import Image
 
-from warpir.core.errors import ExitCode, InputError
+from tests.builders.development_data import MESHES, needs_shared
+from tests.builders.refusals import unreadable
+from warpir.core.errors import InputError
 from warpir.core.limits import Limits
 from warpir.io.assets import load_asset
 from warpir.io.meshes.triangles import clip_ears
 from warpir.scene.asset import Asset
-
-DATA = Path(__file__).parents[3] / "shared" / "data" / "mesh"
 
 SQUARE = """\
 v 0 0 0
@@ -47,15 +48,7 @@ def write(folder: Path, text: str | bytes, name: str = "asset.obj") -> Path:
     return path
 
 
-def fails(path: Path, *words: str) -> None:
-    """Assert that loading ends in one sentence with the file and the words."""
-    with pytest.raises(InputError) as caught:
-        load_asset(path)
-    error = caught.value
-    assert (error.code, error.where) == (ExitCode.INPUT, str(path))
-    assert "\n" not in str(error)
-    for word in words:
-        assert word in f"{error.what} / {error.advice}"
+fails = partial(unreadable, load_asset)
 
 
 def area(asset: Asset) -> np.ndarray:
@@ -820,12 +813,11 @@ REAL = {  # triangles, textures
 }
 
 
+@needs_shared
 @pytest.mark.parametrize("name", REAL)
 def test_real_file_has_the_published_counts(name: str) -> None:
     """Files of the development data have the triangles that their table states."""
-    if not DATA.is_dir():
-        pytest.skip("no development data beside the repository")
-    asset = load_asset(DATA / name)
+    asset = load_asset(MESHES / name)
     assert all(p.indices.flags.c_contiguous for p in asset.primitives)
     counts = sum(len(p.indices) for p in asset.primitives), len(asset.textures)
     assert counts == REAL[name]

@@ -8,16 +8,13 @@ import OpenEXR
 import pytest
 from PIL import Image
 
+from tests.builders.development_data import SHARED, needs_shared
 from tests.builders.image_files import LOBES, codes8, directions, four_lobes, write_image
+from tests.io.images.test_envmap_conventions import TOOLS
 from warpir.core import color
 from warpir.core.errors import InputError
-from warpir.core.latlong import rotate_map
 from warpir.io.images.envmap_conventions import IN_CAMERA_AXES, SEAM_SHIFTS
 from warpir.io.images.photos import read_envmap, read_photo
-
-SHARED = Path(__file__).resolve().parents[4] / "shared" / "data"
-needs_shared = pytest.mark.skipif(not SHARED.is_dir(), reason=f"no development data at {SHARED}")
-
 
 # --------------------------------------------------------------------------- environment maps
 
@@ -45,51 +42,13 @@ def test_orientation_and_chirality(tmp_path: Path, suffix: str) -> None:
 
 @pytest.mark.parametrize("convention", sorted(SEAM_SHIFTS.keys() - IN_CAMERA_AXES))
 def test_foreign_conventions_by_their_own_formula(tmp_path: Path, convention: str) -> None:
-    height, width = 32, 64
-    u = (np.arange(width) + 0.5) / width
-    azimuth = {  # direction (x, z) in our axes of each column, from each tool's own definition
-        "openexr": 2 * np.pi * u,
-        "nvdiffrec": 2 * np.pi * (u - 0.5),
-    }.get(convention)
-    if azimuth is not None:  # u = atan2(x, -z) / 2 pi (+ 1/2)
-        x, z = np.sin(azimuth), -np.cos(azimuth)
-    elif convention == "threejs":  # u = atan2(z, x) / 2 pi + 1/2
-        x, z = np.cos(2 * np.pi * (u - 0.5)), np.sin(2 * np.pi * (u - 0.5))
-    else:  # Cycles, Z up: u = 1/2 - atan2(yb, xb) / 2 pi, (xb, yb, zb) = (x, -z, y)
-        x, z = np.cos(2 * np.pi * (0.5 - u)), -np.sin(2 * np.pi * (0.5 - u))
-    lat = np.pi * (0.5 - (np.arange(height) + 0.5) / height)
-    foreign = np.stack(
-        [
-            np.cos(lat)[:, None] * x,
-            np.repeat(np.sin(lat)[:, None], width, axis=1),
-            np.cos(lat)[:, None] * z,
-        ],
-        axis=-1,
-    )
-    path = write_image(tmp_path / "m.exr", four_lobes(foreign))
-    texels = read_envmap(path, convention=convention)
-    np.testing.assert_allclose(texels, four_lobes(directions(height)), atol=1e-5)
-
-
-def test_rotation_is_counter_clockwise_from_above(tmp_path: Path) -> None:
-    path = write_image(tmp_path / "m.exr", four_lobes(directions(32)))
-    turned = rotate_map(read_envmap(path), 90.0)
-    for axis, rgb in LOBES.items():
-        x, _, z = axis
-        # Seen from above +X is right and +Z is down: a quarter turn takes +X to -Z, +Z to +X.
-        assert brightest(turned, rgb) @ (z, 0, -x) > 0.99
-    np.testing.assert_array_equal(turned, np.roll(read_envmap(path), -16, axis=1))
-    np.testing.assert_array_equal(rotate_map(read_envmap(path), -270.0), turned)
-    np.testing.assert_array_equal(rotate_map(read_envmap(path), 720.0), read_envmap(path))
-
-
-@pytest.mark.parametrize("degrees", [1.0, 33.3, -187.77])
-def test_rotation_by_part_columns_keeps_energy(
-    tmp_path: Path, rng: np.random.Generator, degrees: float
-) -> None:
-    texels = (rng.random((16, 32, 3)) ** 8 * 1e5).astype(np.float32)
-    turned = rotate_map(read_envmap(write_image(tmp_path / "m.exr", texels)), degrees)
-    np.testing.assert_allclose(turned.sum(axis=1), texels.sum(axis=1), rtol=1e-5)
+    """Each texel is where the tool's formula looks for its direction."""
+    texels = four_lobes(directions(32))
+    u, v = TOOLS[convention](directions(32))
+    foreign = np.empty_like(texels)
+    foreign[(v * 32).astype(int), (u % 1.0 * 64).astype(int)] = texels
+    path = write_image(tmp_path / "m.exr", foreign)
+    np.testing.assert_array_equal(read_envmap(path, convention=convention), texels)
 
 
 @pytest.mark.case("E5", "E6")

@@ -4,7 +4,7 @@ import io
 import os
 import struct
 import tracemalloc
-import zlib
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -14,33 +14,25 @@ import OpenImageIO as oiio
 import pytest
 from PIL import Image, ImageCms, ImageOps
 
+from tests.builders.development_data import SHARED, needs_shared
 from tests.builders.image_files import (
     codes8,
     fixed,
     icc_profile,
     matrix_profile,
     png_chunk,
+    png_header,
     table_profile,
     with_chunks,
     write_image,
 )
+from tests.builders.refusals import unreadable
 from warpir.core import color
 from warpir.core.errors import ExitCode, InputError
 from warpir.io.images import color_profile
 from warpir.io.images.photos import Photo, read_envmap, read_mask, read_photo
 
-SHARED = Path(__file__).resolve().parents[4] / "shared" / "data"
-needs_shared = pytest.mark.skipif(not SHARED.is_dir(), reason=f"no development data at {SHARED}")
-
-
-def fails(path: Path, *words: str, code: ExitCode = ExitCode.INPUT, **options: Any) -> None:
-    with pytest.raises(InputError) as caught:
-        read_photo(path, **options)
-    text = f"{caught.value.what} {caught.value.advice}"
-    assert all(word in text for word in words), text
-    assert caught.value.where == str(path)
-    assert caught.value.code == code
-    assert "\n" not in str(caught.value)
+fails = partial(unreadable, read_photo)
 
 
 # ------------------------------------------------------------------------------- photographs
@@ -363,10 +355,7 @@ def test_i1_i2_i18_things_that_are_not_files(tmp_path: Path) -> None:
 @pytest.mark.case("I4", "E4")
 def test_i4_e4_size_limit_before_decoding(tmp_path: Path, rng: np.random.Generator) -> None:
     path = tmp_path / "p.png"
-    header = struct.pack(">IIBBBBB", 20000, 20000, 8, 2, 0, 0, 0)
-    path.write_bytes(
-        b"\x89PNG\r\n\x1a\n" + png_chunk(b"IHDR", header) + png_chunk(b"IDAT", zlib.compress(b""))
-    )
+    path.write_bytes(png_header(20000, 20000))
     fails(path, "--max-pixels")
     Image.fromarray(codes8(rng)).save(path)
     fails(path, "36 x 24", "--max-pixels", max_pixels=800)
