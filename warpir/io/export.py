@@ -182,6 +182,7 @@ def blender_setup(
 
 
 def _tuples(*vectors: Float64Array) -> tuple[tuple[float, ...], ...]:
+    """Return vectors as plain numbers; minus zero is zero."""
     return tuple(tuple(float(value) + 0.0 for value in vector) for vector in vectors)
 
 
@@ -192,6 +193,5 @@ def _z_up(matrix: Float64Array) -> Float64Array:
 
 
 def _rows(matrix: Float64Array) -> str:
-    """Return a matrix as Python writes a tuple of rows; minus zero is zero."""
-    rows = (", ".join(repr(float(v) + 0.0) for v in row) for row in matrix)
-    return "(" + ",\n    ".join(f"({row})" for row in rows) + ")"
+    """Return a matrix as Python writes a tuple of rows."""
+    return "(" + ",\n    ".join(map(repr, _tuples(*matrix))) + ")"

@@ -313,11 +313,13 @@ class GltfFile:
         if "sparse" in entry:
             elements = self._replaced(entry.child("sparse"), elements)
         if dtype.kind == "f":
-            self._check_finite(elements, entry)
+            bad = np.flatnonzero(~np.isfinite(elements).all(axis=1))
+            if len(bad):
+                what = f"{len(bad)} elements, first {bad[0]}, are"
+                raise entry.error("not_finite", what=what, found=len(bad))
         elif entry.flag("normalized"):
             if component == 5125:
-                what = "normalized 32-bit integers are"
-                raise entry.error("component_type", what=what)
+                raise entry.error("component_type", what="normalized 32-bit integers are")
             elements = np.maximum(elements / np.float32(np.iinfo(dtype).max), np.float32(-1.0))
         return elements
 
@@ -350,9 +352,3 @@ class GltfFile:
         replaced = elements.copy()
         replaced[where] = self._stored(values, count, width, elements.dtype)
         return replaced
-
-    def _check_finite(self, elements: NDArray[Any], entry: Entry) -> None:
-        bad = np.flatnonzero(~np.isfinite(elements).all(axis=1))
-        if len(bad):
-            what = f"{len(bad)} elements, first {bad[0]}, are"
-            raise entry.error("not_finite", what=what, found=len(bad))

@@ -132,7 +132,7 @@ class MaterialReader:
     def _read(self, entry: Entry) -> Material:
         name = entry.text("name", "") or entry.pointer
         pbr = entry.child("pbrMetallicRoughness")
-        *base_color, alpha = self._factors(pbr, "baseColorFactor", (1.0,) * 4, 0.0, 1.0)
+        *base, alpha = self._factors(pbr, "baseColorFactor", (1.0,) * 4, 0.0, 1.0)
         mode = entry.text("alphaMode", "OPAQUE")
         if mode not in ("OPAQUE", "MASK", "BLEND"):
             expected = "OPAQUE, MASK or BLEND"
@@ -141,21 +141,19 @@ class MaterialReader:
         gain = 1.0 if strength is None else strength.number("emissiveStrength", 1.0)
         if gain < 0:
             self.notices.append(f"{entry.pointer}: emissiveStrength {gain:g} clamped to 0")
-        emission = self._factors(entry, "emissiveFactor", (0.0,) * 3, 0.0, math.inf)
-        if max(emission) * max(gain, 0.0) > EMISSION_LIMIT:
-            found = max(emission) * gain
+            gain = 0.0
+        red, green, blue = color = self._color(entry, "emissiveFactor", 0.0, math.inf)
+        emission = (red * gain, green * gain, blue * gain)
+        if max(emission) > EMISSION_LIMIT:
+            found = max(emission)
             raise entry.error("range", what="emission", found=found, limit=EMISSION_LIMIT)
         material = Material(
             name=name,
-            base_color=(base_color[0], base_color[1], base_color[2]),
+            base_color=(base[0], base[1], base[2]),
             alpha=alpha,
             metallic=self._factor(pbr, "metallicFactor", 1.0),
             roughness=self._factor(pbr, "roughnessFactor", 1.0),
-            emission=(
-                emission[0] * max(gain, 0.0),
-                emission[1] * max(gain, 0.0),
-                emission[2] * max(gain, 0.0),
-            ),
+            emission=emission,
             alpha_mode=mode,
             alpha_cutoff=self._factor(entry, "alphaCutoff", 0.5),
             double_sided=entry.flag("doubleSided"),
@@ -163,7 +161,7 @@ class MaterialReader:
             base_color_texture=self._slot(pbr, "baseColorTexture"),
             metallic_roughness_texture=self._slot(pbr, "metallicRoughnessTexture"),
             normal_texture=self._slot(entry, "normalTexture"),
-            emission_texture=self._slot(entry, "emissiveTexture") if any(emission) else None,
+            emission_texture=self._slot(entry, "emissiveTexture") if any(color) else None,
         )
         if "occlusionTexture" in entry:
             self.notices.append("occlusion textures are not used: occlusion is traced")
@@ -205,7 +203,7 @@ class MaterialReader:
         The dielectric's reflectance is the specular colour itself, at an infinite index.
         """
         *diffuse, alpha = self._factors(entry, "diffuseFactor", (1.0,) * 4, 0.0, 1.0)
-        specular = self._factors(entry, "specularFactor", (1.0,) * 3, 0.0, 1.0)
+        specular = self._color(entry, "specularFactor", 1.0)
         glossiness = self._factor(entry, "glossinessFactor", 1.0)
         slot = self._slot(entry, "specularGlossinessTexture")
         roughness_slot = None
@@ -227,7 +225,7 @@ class MaterialReader:
             metallic=0.0,
             roughness=1.0 - glossiness if slot is None else 1.0,
             ior=0.0,
-            specular_color=(specular[0], specular[1], specular[2]),
+            specular_color=specular,
             base_color_texture=self._slot(entry, "diffuseTexture"),
             specular_color_texture=slot,
             metallic_roughness_texture=roughness_slot,
@@ -241,12 +239,12 @@ class MaterialReader:
             self.notices.append(f"{entry.pointer}: ior {ior:g} clamped to 1")
             ior = 1.0
         specular = extensions.child("KHR_materials_specular")
-        color = self._factors(specular, "specularColorFactor", (1.0,) * 3, 0.0, SPECULAR_LIMIT)
+        color = self._color(specular, "specularColorFactor", 1.0, SPECULAR_LIMIT)
         return replace(
             material,
             ior=ior,
             specular=self._factor(specular, "specularFactor", 1.0),
-            specular_color=(color[0], color[1], color[2]),
+            specular_color=color,
             specular_texture=self._slot(specular, "specularTexture"),
             specular_color_texture=self._slot(specular, "specularColorTexture"),
         )
@@ -256,7 +254,8 @@ class MaterialReader:
 
         A normal map keeps its own scale.
         """
-        coat = entry.child("extensions").child("KHR_materials_clearcoat")
+        extensions = entry.child("extensions")
+        coat = extensions.child("KHR_materials_clearcoat")
         clearcoat = self._factor(coat, "clearcoatFactor", 0.0)
         if clearcoat > 0.0:
             material = replace(
@@ -268,17 +267,17 @@ class MaterialReader:
                 clearcoat_roughness_texture=self._slot(coat, "clearcoatRoughnessTexture"),
                 clearcoat_normal_texture=self._slot(coat, "clearcoatNormalTexture"),
             )
-        sheen = entry.child("extensions").child("KHR_materials_sheen")
-        color = self._factors(sheen, "sheenColorFactor", (0.0,) * 3, 0.0, 1.0)
+        sheen = extensions.child("KHR_materials_sheen")
+        color = self._color(sheen, "sheenColorFactor", 0.0)
         if any(color):
             material = replace(
                 material,
-                sheen_color=(color[0], color[1], color[2]),
+                sheen_color=color,
                 sheen_roughness=self._factor(sheen, "sheenRoughnessFactor", 0.0),
                 sheen_color_texture=self._slot(sheen, "sheenColorTexture"),
                 sheen_roughness_texture=self._slot(sheen, "sheenRoughnessTexture"),
             )
-        stretched = entry.child("extensions").child("KHR_materials_anisotropy")
+        stretched = extensions.child("KHR_materials_anisotropy")
         anisotropy = self._factor(stretched, "anisotropyStrength", 0.0)
         if anisotropy > 0.0:
             material = replace(
@@ -354,7 +353,7 @@ class MaterialReader:
         distance = math.inf
         if "attenuationDistance" in volume:
             distance = volume.number("attenuationDistance", math.inf)
-        color = self._factors(volume, "attenuationColor", (1.0,) * 3, 0.0, 1.0)
+        color = self._color(volume, "attenuationColor", 1.0)
         for name, value, is_right in (
             ("thicknessFactor", thickness, thickness >= 0.0),
             ("attenuationDistance", distance, distance > 0.0),
@@ -391,6 +390,12 @@ class MaterialReader:
         if any(not low <= value <= high for value in values):
             self.notices.append(f"{entry.pointer}: {key} clamped to {low:g} ... {high:g}")
         return tuple(min(max(value, low), high) for value in values)
+
+    def _color(
+        self, entry: Entry, key: str, default: float, high: float = 1.0
+    ) -> tuple[float, float, float]:
+        red, green, blue = self._factors(entry, key, (default,) * 3, 0.0, high)
+        return red, green, blue
 
     def _slot(self, owner: Entry, key: str) -> TextureSlot | None:
         """Return how ``owner`` reads texture ``key``, or None when it has none."""

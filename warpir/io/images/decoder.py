@@ -169,8 +169,8 @@ class _File:
 
     def check_size(self, spec: Any) -> None:
         """Refuse an image or a part that is too large, before a pixel is decoded."""
-        sizes = [(spec.width, spec.height, "")]
-        sizes += [
+        sizes = [
+            (spec.width, spec.height, ""),
             (spec.full_width, spec.full_height, ""),
             (spec.tile_width, spec.tile_height, "tiles of "),
         ]
@@ -210,8 +210,14 @@ class _File:
         )
 
 
-_ARTICLES = {"exr": "an EXR", "hdr": "a Radiance HDR", "jpeg": "a JPEG", "png": "a PNG"}
-_ARTICLES |= {"tiff": "a TIFF", "webp": "a WebP"}
+_NAMES = {
+    "exr": "an EXR",
+    "hdr": "a Radiance HDR",
+    "jpeg": "a JPEG",
+    "png": "a PNG",
+    "tiff": "a TIFF",
+    "webp": "a WebP",
+}
 
 
 @contextmanager
@@ -247,7 +253,7 @@ def _opened(
         try:
             name = reader.format_name()
             if name != {"exr": "openexr"}.get(file.kind, file.kind):
-                what = f"not {_ARTICLES[file.kind]} file (the library reads it as {name})"
+                what = f"not {_NAMES[file.kind]} file (the library reads it as {name})"
                 raise InputError(file.path, what, reason="image.kind", found=name)
             yield reader
         finally:

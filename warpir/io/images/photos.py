@@ -23,7 +23,7 @@ from warpir.io.images.color_profile import (
     srgb_to_profile,
 )
 from warpir.io.images.decoder import DecodedImage, decode_image, upright
-from warpir.io.images.envmap_conventions import SEAM_SHIFTS, to_ours
+from warpir.io.images.envmap_conventions import to_ours
 from warpir.io.images.jpeg import JpegCoding, read_coding
 
 RADIANCE_LIMIT = 1e12
@@ -182,7 +182,7 @@ def read_envmap(
 
     Args:
         path: A 2:1 file, recognised by content: ``.hdr`` or ``.exr``.
-        convention: Who made the map: a key of `SEAM_SHIFTS`.
+        convention: Who made the map: a key of `envmap_conventions.SEAM_SHIFTS`.
         camera_to_world: Pose of the camera, shape [4, 4], for a map in camera axes.
         pictures: Whether JPEG, PNG, TIFF and WebP are read too; codes of 8 and 16 bits are
             decoded as sRGB and lack what is brighter than white, floats are radiance.
@@ -197,8 +197,6 @@ def read_envmap(
         InputError: Missing, damaged, not 2:1, not of these formats, or (strict) not clean.
     """
     path = Path(path)
-    if convention not in SEAM_SHIFTS:
-        raise ValueError(f"convention {convention!r} is not one of {', '.join(SEAM_SHIFTS)}")
     kinds = ("exr", "hdr", "jpeg", "png", "tiff", "webp") if pictures else ("exr", "hdr")
     image = decode_image(path, max_width * max_width // 2, kinds, flag="--max-envmap-width")
     messages = list(image.notices)

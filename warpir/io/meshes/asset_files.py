@@ -21,7 +21,9 @@ from warpir.core.errors import InputError
 from warpir.core.limits import LIMITS, Limits
 from warpir.scene.asset import ABSENT, Material
 
-GREY = 188
+GREY = (0.8, 0.8, 0.8)
+"""Base colour where the file states none."""
+GREY_CODE = 188
 """sRGB code that stands for a missing base colour texture: linear 0.5."""
 NOTICES = 40
 """Most notices of an asset."""
@@ -223,7 +225,7 @@ class TextureDecoder:
 
 def grey_pixels() -> CodeArray:
     """Return the one texel that replaces a missing base colour texture, shape [1, 1, 4]."""
-    return np.array([[[GREY, GREY, GREY, 255]]], dtype=np.uint8)
+    return np.array([[[GREY_CODE, GREY_CODE, GREY_CODE, 255]]], dtype=np.uint8)
 
 
 def plain_material(name: str, base_color: tuple[float, float, float]) -> Material:

@@ -18,6 +18,7 @@ from warpir.core.arrays import CodeArray
 from warpir.core.errors import Faults, InputError, shown
 from warpir.core.limits import LIMITS, Limits
 from warpir.io.meshes.asset_files import (
+    GREY,
     TextureDecoder,
     grey_pixels,
     inside,
@@ -36,8 +37,6 @@ MTL = Faults(
     },
 )
 """What a file may have wrong; ``pointer`` is the file and the line, or the material."""
-GREY = (0.8, 0.8, 0.8)
-"""Base colour where the file states none."""
 ROUGHNESS = 0.5
 """Roughness where the file states none."""
 OPTION_WIDTHS = {

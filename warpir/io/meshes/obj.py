@@ -43,8 +43,8 @@ OBJ = Faults(
     },
 )
 """What a file may have wrong."""
-WORDS = ("v", "vt", "vn")
-"""Statements that the three indices of a corner count."""
+WIDTHS = {"v": 3, "vt": 2, "vn": 3}
+"""Statements that the three indices of a corner count, and how many numbers they have."""
 MOST_CORNERS = 1 << 16
 """Corners of a face, which take a second; a concave one may have fewer (`triangulate`)."""
 NAMED = ("usemtl", "mtllib")
@@ -76,20 +76,17 @@ def read_obj(path: Path, missing_textures: str = "error", limits: Limits = LIMIT
     triangle_count = sum(len(c) - 2 for faces in text.faces.values() for _, c in faces)
     check_triangle_count(path, triangle_count, limits)
     positions, uvs, normals = (
-        np.array(rows, dtype=np.float64).reshape(-1, n) for rows, n in text.tables()
+        np.array(text.tables[word], dtype=np.float64).reshape(-1, width)
+        for word, width in WIDTHS.items()
     )
-    vertices = Vertices(
-        positions,
-        uvs,
-        normals,
-        _vertex_colors(text.colors, len(text.positions), notices),
-    )
+    colors = _vertex_colors(text.colors, len(positions), notices)
+    vertices = Vertices(positions, uvs, normals, colors)
     primitives = []
     for name, faces in text.faces.items():
         primitive = _read_primitive(path, name, faces, vertices, library, notices)
         if primitive is not None:
             primitives.append(primitive)
-    check_drawable(path, primitives, f"{len(text.positions)} vertices")
+    check_drawable(path, primitives, f"{len(positions)} vertices")
     return Asset(
         name=path.stem,
         primitives=tuple(primitives),
@@ -108,35 +105,17 @@ Face = tuple[int, list[str]]
 class Statements:
     """What an OBJ file states, sorted by kind; line numbers start at 1."""
 
-    positions: list[list[float]] = field(default_factory=list)
-    uvs: list[list[float]] = field(default_factory=list)
-    normals: list[list[float]] = field(default_factory=list)
+    tables: dict[str, list[list[float]]] = field(default_factory=lambda: {w: [] for w in WIDTHS})
+    """Rows of positions, texture coordinates and normals, by their word."""
     colors: dict[int, list[float]] = field(default_factory=dict)
     """Red, green and blue of the positions that have them, by index of the position."""
     faces: dict[str, list[Face]] = field(default_factory=dict)
     """By name of the material."""
     libraries: list[str] = field(default_factory=list)
 
-    def add_position(self, path: Path, line: int, values: list[str]) -> None:
-        """Add the numbers of a ``v`` statement: a position, or a position and a colour.
-
-        Raises:
-            InputError: They are of another count, or not numbers.
-        """
-        if len(values) > 6:  # a weight before the colour, or an opacity behind it
-            raise OBJ.error(path, "color", line=line, found=len(values))
-        if len(values) == 6:
-            color = _numbers(path, line, "v", values[3:], 3)
-            self.colors[len(self.positions)] = color
-        self.positions.append(_numbers(path, line, "v", values, 3))
-
-    def tables(self) -> tuple[tuple[list[list[float]], int], ...]:
-        """Return positions, texture coordinates and normals with their numbers a row."""
-        return (self.positions, 3), (self.uvs, 2), (self.normals, 3)
-
-    def counts(self) -> tuple[int, int, int]:
+    def counts(self) -> list[int]:
         """Return how many positions, texture coordinates and normals there are so far."""
-        return len(self.positions), len(self.uvs), len(self.normals)
+        return [len(rows) for rows in self.tables.values()]
 
 
 @dataclass(frozen=True)
@@ -171,14 +150,15 @@ def _read_statements(path: Path, content: bytes, notices: list[str]) -> Statemen
     for line, statement in _logical_lines(whole):
         word, *values = statement.split()
         match word:
-            case "v":
-                text.add_position(path, line, values)
-            case "vt":
-                # v is optional; the format says 0.
-                padded = [*values, "0"] if len(values) == 1 else values
-                text.uvs.append(_numbers(path, line, word, padded, 2))
-            case "vn":
-                text.normals.append(_numbers(path, line, word, values, 3))
+            case "v" | "vt" | "vn":
+                rows = text.tables[word]
+                if word == "v" and len(values) > 6:  # a weight, or an opacity, beside the colour
+                    raise OBJ.error(path, "color", line=line, found=len(values))
+                if word == "v" and len(values) == 6:
+                    text.colors[len(rows)] = _numbers(path, line, word, values[3:], 3)
+                if word == "vt" and len(values) == 1:
+                    values.append("0")  # v is optional; the format says 0
+                rows.append(_numbers(path, line, word, values, WIDTHS[word]))
             case "f":
                 if len(values) < 3:
                     raise OBJ.error(path, "face", line=line, found=len(values))
@@ -195,7 +175,7 @@ def _read_statements(path: Path, content: bytes, notices: list[str]) -> Statemen
                 text.libraries.append(statement[len(word) :].strip())
             case _ if word not in IGNORED:
                 left_out[word] += 1
-    if not (text.positions or text.faces):
+    if not (text.tables["v"] or text.faces):
         raise OBJ.error(path, "kind", found="no v and no f statements")
     notices += [f"{count} {word[:20]!r} statements ignored" for word, count in left_out.items()]
     return text
@@ -244,7 +224,7 @@ def _numbers(path: Path, line: int, word: str, values: list[str], width: int) ->
     return numbers
 
 
-def _absolute(path: Path, line: int, corner: str, counts: tuple[int, int, int]) -> str:
+def _absolute(path: Path, line: int, corner: str, counts: list[int]) -> str:
     """Rewrite ``-1/-2/-3`` as indices from 1, counted from the statements read so far."""
     parts = corner.split("/")
     for k, part in enumerate(parts[:3]):
@@ -256,12 +236,10 @@ def _absolute(path: Path, line: int, corner: str, counts: tuple[int, int, int]) 
     return "/".join(parts)
 
 
-def _no_such(path: Path, line: int, found: str, k: int, counts: tuple[int, int, int]) -> InputError:
+def _no_such(path: Path, line: int, found: str, k: int, counts: list[int]) -> InputError:
     """Return the error of a corner's index ``k`` that counts none of its statements."""
-    limit = counts[k % 3]
-    return OBJ.error(
-        path, "index_out_of_range", line=line, found=found, limit=limit, word=WORDS[k % 3]
-    )
+    limit, word = counts[k % 3], list(WIDTHS)[k % 3]
+    return OBJ.error(path, "index_out_of_range", line=line, found=found, limit=limit, word=word)
 
 
 def _vertex_colors(
@@ -332,7 +310,7 @@ def _unique_corners(
     Raises:
         InputError: With the line at fault.
     """
-    counts = len(vertices.positions), len(vertices.uvs), len(vertices.normals)
+    counts = [len(vertices.positions), len(vertices.uvs), len(vertices.normals)]
     seen: dict[str, int] = {}
     by_size: dict[int, list[list[int]]] = {}
     for _, corners in faces:

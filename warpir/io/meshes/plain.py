@@ -11,7 +11,7 @@ import numpy as np
 
 from warpir.core.arrays import Float64Array, FloatArray, IntArray
 from warpir.core.limits import LIMITS, Limits
-from warpir.io.meshes.asset_files import concise, plain_material, read_regular
+from warpir.io.meshes.asset_files import GREY, concise, plain_material, read_regular
 from warpir.io.meshes.ply import PLY, Element, Lists, read_ply
 from warpir.io.meshes.stl import read_stl
 from warpir.io.meshes.triangles import (
@@ -24,9 +24,6 @@ from warpir.io.meshes.triangles import (
     unit_normals,
 )
 from warpir.scene.asset import Asset, Primitive
-
-GREY = (0.8, 0.8, 0.8)
-"""Base colour where the vertices have none."""
 
 
 def read_ply_mesh(path: Path, limits: Limits = LIMITS) -> Asset:

@@ -50,26 +50,22 @@ def _read_ply(path: Path, content: bytes, limits: Limits) -> Float64Array:
 
 
 def _read_text(path: Path, content: bytes, limits: Limits) -> Float64Array:
-    """Read lines of numbers; the first three are the position."""
+    """Read lines of numbers, blanks and comments (#) left out; the first three are the position."""
     limits.check("points", content.count(b"\n"), path, "too many points", more=" lines")
     text = content.removeprefix(b"\xef\xbb\xbf").replace(b",", b" ")
-    return _rows(path, text.split(b"\n"), [0, 1, 2], 1)
-
-
-def _rows(path: Path, lines: list[bytes], columns: list[int], first: int) -> Float64Array:
-    """Return three columns of lines of numbers; blank lines and comments (#) are passed over."""
     rows = []
-    for number, line in enumerate(lines, first):
+    for number, line in enumerate(text.split(b"\n"), 1):
         words = line.split()
         if not words or words[0].startswith((b"#", b"//")):
             continue
         try:
-            rows.append([float(words[column]) for column in columns])
-        except (ValueError, IndexError):
-            rows.append([math.nan])
-        if not all(map(math.isfinite, rows[-1])):
+            x, y, z = map(float, words[:3])
+        except ValueError:
+            x = y = z = math.nan
+        if not all(map(math.isfinite, (x, y, z))):
             shown = ascii(line[:40].decode("ascii", "replace"))
             raise InputError(
                 path, f"line {number}: not a point (found {shown}; expected numbers x y z)"
             )
+        rows.append([x, y, z])
     return np.array(rows, dtype=np.float64).reshape(-1, 3)
