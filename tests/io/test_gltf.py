@@ -1224,7 +1224,7 @@ def test_image_kinds_become_rgba(kind: str, tmp_path: Path) -> None:
 @pytest.mark.case("M14")
 def test_M14_texture_pixels_are_limited(tmp_path: Path) -> None:
     """A header that promises 8000 x 8000 x 9 pixels stops before decoding."""
-    decoder = TextureDecoder(tmp_path / "asset.glb", [])
+    decoder = TextureDecoder(tmp_path / "asset.glb", [], LIMITS)
     decoder.pixel_count = decoder.limits.texture_pixels - 10
     with pytest.raises(InputError, match="too many texture pixels"):
         decoder.decode(png_header(8000, 8000), "/images/0: ")

@@ -14,18 +14,16 @@ TEXTURE_LIMIT = 1e6
 
 
 def load_asset(path: str | Path, missing_textures: str = "error", limits: Limits = LIMITS) -> Asset:
-    """Read an asset of any supported kind.
+    """Read a ``.glb``, ``.gltf``, ``.obj``, ``.ply`` or ``.stl`` file.
 
-    Args:
-        path: A ``.glb``, ``.gltf``, ``.obj``, ``.ply`` or ``.stl`` file.
-        missing_textures: ``error``, or ``grey`` to put mid grey in a missing texture's place.
-        limits: How large it may be.
+    A missing texture is an ``error``, or mid ``grey`` takes its place.
 
     Raises:
         InputError: The file is missing, of another kind, or cannot be represented faithfully.
     """
-    asset = _read(Path(path), missing_textures, limits)
-    _check_numbers(Path(path), asset)
+    path = Path(path)
+    asset = _read(path, missing_textures, limits)
+    _check_numbers(path, asset)
     return asset
 
 

@@ -112,9 +112,7 @@ def tone_curve_cube(knots: ToneKnots, about: str) -> bytes:
     The domain is [0, 1] in three columns, values are linear on both sides. Written out here because
     it is a few lines; colour-science's reader is the test.
 
-    Args:
-        knots: One curve, which serves all channels, or three.
-        about: What the table maps to what, one line.
+    One curve serves all channels, or there are three; ``about`` says what is mapped to what.
     """
     x = np.linspace(0.0, 1.0, CUBE_SIZE)
     table = np.broadcast_to(knots.evaluate(x), (CUBE_SIZE, 3))

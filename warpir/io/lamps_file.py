@@ -59,29 +59,21 @@ def given_lamps(
 
 
 def read_lamps(path: str | Path, limits: Limits, notices: list[str]) -> tuple[Lamp, ...]:
-    """Read and check lamps.
+    """Read the lamps of a ``.json`` list or of a ``.glb`` or ``.gltf`` file.
 
-    Args:
-        path: A ``.json`` list, or a ``.glb`` or ``.gltf`` file.
-        limits: How large it may be.
-        notices: Receives what was left out or assumed.
+    ``notices`` receives what was left out or assumed.
 
     Raises:
         InputError: Missing, of another format, without a lamp, or a lamp is out of range.
     """
     path = Path(path)
-    is_gltf = path.suffix.lower() in (".glb", ".gltf")
-    if is_gltf:
+    if path.suffix.lower() in (".glb", ".gltf"):
         return _checked(path, _of_gltf(path, limits, notices))
     return lamps_of(path, read_versioned(path, "lamps", VERSION, limits).get("lamps"))
 
 
 def lamps_of(path: Path, rows: Any) -> tuple[Lamp, ...]:
-    """Return the lamps of a list's plain values.
-
-    Args:
-        path: Where they are from, for errors.
-        rows: The value of ``lamps``.
+    """Return the lamps of a list's plain values, the value of ``lamps``.
 
     Raises:
         InputError: It is no such list, or a lamp is out of range.

@@ -90,11 +90,7 @@ def _channel_names(plane: str) -> list[str]:
 
 
 def read_layers(path: str | Path, max_pixels: int = LIMITS.pixels) -> Layers:
-    """Read ``layers.exr`` back, as far as its own precision goes; all planes are float32.
-
-    Args:
-        path: A file that `write_layers` made.
-        max_pixels: Largest image decoded [px].
+    """Read what `write_layers` made, as far as its own precision goes; all planes are float32.
 
     Raises:
         InputError: Missing, too large, truncated, or without the layers that every such file has.

@@ -240,9 +240,7 @@ class OutputFolder:
     def write_envmap(self, texels: FloatArray, stem: str = "envmap") -> None:
         """Stage an environment map: ``.exr`` (float32), ``.hdr`` (RGBE) and ``_preview.png``.
 
-        Args:
-            texels: Radiance in our orientation, relative [W/(m^2 sr)], shape [He, 2 He, 3].
-            stem: First part of the names.
+        Texels are radiance in our orientation, relative [W/(m^2 sr)], shape [He, 2 He, 3].
 
         Raises:
             InputError: A value is negative or not finite (exit 6), or the disk is full (exit 5).

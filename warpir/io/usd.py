@@ -41,12 +41,8 @@ def write_usdz(
     UsdPreviewSurface has no sheen, anisotropy, iridescence, transmission, coloured specular or
     vertex colour, and no normal map of the coat: those are left out.
 
-    Args:
-        asset: The object.
-        asset_to_world: Column vectors [m], shape [4, 4].
-        camera: The photo's, with its principal point.
-        envmap: The map on the object, OpenEXR's orientation, an ``.exr`` file.
-        lamps: Near the object.
+    ``asset_to_world`` are column vectors [m], shape [4, 4]; ``envmap`` is the map on the object, an
+    ``.exr`` file in OpenEXR's orientation; the camera keeps its principal point.
 
     Raises:
         InputError: The package cannot be written.

@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 
 from warpir.core.arrays import Float64Array
-from warpir.core.limits import LIMITS, Limits
+from warpir.core.limits import Limits
 from warpir.io.cameras.colmap_model import (
     COLMAP,
     MODELS,
@@ -31,9 +31,7 @@ UNIT_TOLERANCE = 1e-3
 """How far the length of a quaternion may be from 1 before it is not taken for one."""
 
 
-def read_colmap(
-    path: Path, frame: str | None, photo: str | None, limits: Limits = LIMITS
-) -> PhotoCamera:
+def read_colmap(path: Path, frame: str | None, photo: str | None, limits: Limits) -> PhotoCamera:
     """Read the camera of one image of a model, given its folder or one of its files.
 
     ``frame`` is the image's name; default: the photo's, or the only one.

@@ -129,7 +129,7 @@ def read_images(path: Path) -> list[Image]:
     return list(_binary_images(path) if path.suffix == ".bin" else _text_images(path))
 
 
-def read_points(path: Path, limits: Limits = LIMITS) -> Float64Array:
+def read_points(path: Path, limits: Limits) -> Float64Array:
     """Read the points of a model, world of the file, shape [point, 3].
 
     Raises:

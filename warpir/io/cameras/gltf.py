@@ -5,7 +5,7 @@ from pathlib import Path
 import numpy as np
 
 from warpir.core.arrays import Float64Array
-from warpir.core.limits import LIMITS, Limits
+from warpir.core.limits import Limits
 from warpir.io.cameras.source import LARGEST, PhotoCamera, choose_frame, rigid
 from warpir.io.gltf.gate import Entry, GltfFile
 from warpir.io.gltf.nodes import local_matrix, read_forest
@@ -16,16 +16,13 @@ ASPECT_TOLERANCE = 0.01
 
 
 def read_gltf_camera(
-    path: Path, photo_size: tuple[int, int], frame: str | None, limits: Limits = LIMITS
+    path: Path, photo_size: tuple[int, int], frame: str | None, limits: Limits
 ) -> PhotoCamera:
     """Read a camera; its axes and the world's are ours.
 
-    Args:
-        path: A ``.glb`` or ``.gltf`` file.
-        photo_size: Width and height of the photograph [px]: glTF knows angles only.
-        frame: Name of the camera or of its node; where neither fits, its number among the nodes
-            with a camera, from 0; default: the only one.
-        limits: How large the file may be.
+    ``frame`` is the name of the camera or of its node; where neither fits, its number among the
+    nodes with a camera, from 0; default: the only one. GlTF knows angles only, so the photo's width
+    and height [px] are needed.
 
     Raises:
         InputError: Damaged, without that camera, or orthographic.

@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from warpir.core.errors import Faults, InputError
-from warpir.core.limits import LIMITS, Limits
+from warpir.core.limits import Limits
 from warpir.core.strict_json import parse_json_object
 from warpir.io.meshes.asset_files import read_regular, read_uri
 
@@ -180,17 +180,13 @@ class Entry:
 
 
 class GltfFile:
-    """A glTF 2.0 file whose container has been checked.
-
-    Args:
-        path: A ``.glb`` or ``.gltf`` file.
-        limits: How large it may be.
+    """A glTF 2.0 file, ``.glb`` or ``.gltf``, whose container has been checked.
 
     Raises:
         InputError: The container or the JSON is damaged.
     """
 
-    def __init__(self, path: Path, limits: Limits = LIMITS) -> None:
+    def __init__(self, path: Path, limits: Limits) -> None:
         self.path = path
         self.limits = limits
         self.hashes: dict[str, str] = {}

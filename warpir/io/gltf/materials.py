@@ -12,7 +12,6 @@ import numpy as np
 
 from warpir.core.arrays import PixelArray
 from warpir.core.errors import InputError
-from warpir.core.limits import LIMITS, Limits
 from warpir.io.gltf.gate import RE_EXPORT_MESH, Entry, GltfFile
 from warpir.io.meshes.asset_files import TextureDecoder, grey_pixels, locate, read_uri
 from warpir.io.meshes.materials_file import EMISSION_LIMIT
@@ -85,12 +84,8 @@ def check_extensions(root: Entry, notices: list[str]) -> None:
 class MaterialReader:
     """Reads the materials that are drawn, and their textures, each once.
 
-    Args:
-        file: The file.
-        missing_textures: ``error`` or ``grey``.
-        notices: Receives what was assumed or left out.
-        limits: How many pixels the textures may have.
-        measures: Only count them, and decode nothing.
+    Missing textures are an ``error`` or ``grey``; ``notices`` receives what was assumed or left
+    out. One that ``measures`` only counts pixels, and decodes nothing.
     """
 
     def __init__(
@@ -98,7 +93,6 @@ class MaterialReader:
         file: GltfFile,
         missing_textures: str,
         notices: list[str],
-        limits: Limits = LIMITS,
         measures: bool = False,
     ) -> None:
         self.file = file
@@ -106,7 +100,7 @@ class MaterialReader:
         self.notices = notices
         self.materials: list[Material] = []
         self.textures: list[Texture] = []
-        self._decoder = TextureDecoder(file.path, notices, limits, measures)
+        self._decoder = TextureDecoder(file.path, notices, file.limits, measures)
         self._material_index: dict[int, int] = {}
         self._texture_index: dict[tuple[int, str, str], int] = {}
         self._roughness_index: dict[tuple[int, float], int] = {}

@@ -86,10 +86,7 @@ def from_trs(
 ) -> Float64Array:
     """Return translation * rotation * scale as a matrix, shape [4, 4].
 
-    Args:
-        translation: Shift [m].
-        rotation: Quaternion x, y, z, w of any length but 0.
-        scale: Factors [1].
+    The translation is in metres, the rotation a quaternion x, y, z, w of any length but 0.
     """
     length = math.hypot(*rotation)
     x, y, z, w = (component / length for component in rotation)

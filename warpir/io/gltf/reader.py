@@ -43,11 +43,9 @@ STRIP, FAN = 5, 6
 def read_gltf(path: str | Path, missing_textures: str = "error", limits: Limits = LIMITS) -> Asset:
     """Read a ``.glb`` or ``.gltf`` file.
 
-    Args:
-        path: The file; everything it refers to must lie in its folder.
-        missing_textures: ``error``, or ``grey``: a base colour texture that cannot be read becomes
-            grey, any other is left out, with a notice.
-        limits: How large it may be.
+    Everything it refers to must lie in its folder. With missing textures ``grey`` instead of an
+    ``error``, a base colour texture that cannot be read becomes grey, any other is left out, with a
+    notice.
 
     Returns:
         The drawn scene, instances flattened, rest pose.
@@ -61,11 +59,11 @@ def read_gltf(path: str | Path, missing_textures: str = "error", limits: Limits 
     file = GltfFile(path, limits)
     check_extensions(file.root, notices)
     placed = list(placed_primitives(file, notices))
-    check_counts(file, placed, limits)
-    sizes = MaterialReader(file, missing_textures, [], limits, measures=True)
+    check_counts(file, placed)
+    sizes = MaterialReader(file, missing_textures, [], measures=True)
     for entry, _, _ in placed:  # too many pixels are refused before the first is decoded
         sizes.index(entry)
-    materials = MaterialReader(file, missing_textures, notices, limits)
+    materials = MaterialReader(file, missing_textures, notices)
     read: dict[str, Primitive | None] = {}
     primitives: list[Primitive] = []
     for entry, world, joints in placed:
@@ -178,7 +176,7 @@ def placed_primitives(
 
 
 def check_counts(
-    file: GltfFile, placed: list[tuple[Entry, Float64Array, Float64Array | None]], limits: Limits
+    file: GltfFile, placed: list[tuple[Entry, Float64Array, Float64Array | None]]
 ) -> None:
     """Refuse more triangles or vertices than the limit, before any is read."""
     triangle_count = vertex_count = 0
@@ -191,7 +189,7 @@ def check_counts(
         triangle_count += corners if entry.integer("mode", 4) in (STRIP, FAN) else corners // 3
         vertex_count += vertices
     counted = f" with {vertex_count} vertices, instances counted"
-    check_triangle_count(file.path, max(triangle_count, vertex_count // 3), limits, counted)
+    check_triangle_count(file.path, max(triangle_count, vertex_count // 3), file.limits, counted)
 
 
 def read_primitive(

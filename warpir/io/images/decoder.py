@@ -140,10 +140,6 @@ def read_exr_header(path: Path, names: Sequence[str]) -> dict[str, Any]:
 def read_exr_channels(path: Path, max_pixels: int) -> dict[str, FloatArray]:
     """Read every channel of an EXR file's first part by its full name, shape [H, W] each.
 
-    Args:
-        path: The file.
-        max_pixels: Largest image decoded [px].
-
     Raises:
         InputError: Missing, not an EXR file, too large, deep, truncated or corrupt.
     """
@@ -226,10 +222,7 @@ def _opened(
 ) -> Iterator[Any]:
     """Yield the library's reader of a file; what C libraries print meanwhile is not shown.
 
-    Args:
-        file: Which; its name must be UTF-8.
-        bytes_per_pixel: Most that the image may take.
-        hints: Of OpenImageIO, by name.
+    ``bytes_per_pixel`` is the most that the image may take; the hints are OpenImageIO's.
 
     Raises:
         InputError: The library does not know it, or takes it for another kind.

@@ -36,11 +36,7 @@ class JpegCoding:
         return int(np.clip(round(quality), 1, 100))
 
     def recoded(self, codes: CodeArray) -> CodeArray:
-        """Return a picture as this coding leaves it.
-
-        Args:
-            codes: Upright, 8 bits, of the photo's size, shape [H, W, 3].
-        """
+        """Return a picture as this coding leaves it; upright, of the photo's size, [H, W, 3]."""
         from PIL import Image
 
         stored = upright(codes, BACK.get(self.orientation, self.orientation))

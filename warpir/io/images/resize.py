@@ -7,15 +7,9 @@ from warpir.core.arrays import AnyFloatArray, FloatArray, on_cores
 
 
 def resize(picture: AnyFloatArray, height: int, width: int) -> FloatArray:
-    """Return a picture of another size: bilinear, over as many pixels as each new one covers.
+    """Return a picture, shape [H, W] or [H, W, C], in another size [px].
 
-    Args:
-        picture: Shape [H, W] or [H, W, C]; what is not finite counts as 0.
-        height: Of the result [px].
-        width: Of the result [px].
-
-    Returns:
-        Shape [height, width] or [height, width, C].
+    Bilinear, over as many pixels as each new one covers; what is not finite counts as 0.
     """
     finite = np.where(np.isfinite(picture), picture, 0.0).astype(np.float32)
 

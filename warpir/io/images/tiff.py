@@ -22,11 +22,7 @@ _WHITE_IS_ZERO, _PALETTE = 0, 3
 
 
 def check_tiff(path: Path, spec: Any) -> None:
-    """Refuse a TIFF that is no picture of RGB or grey; files of other kinds pass.
-
-    Args:
-        path: The file, for the error.
-        spec: Its header, an ``OpenImageIO.ImageSpec``.
+    """Refuse a TIFF that is no picture of RGB or grey, by its ``OpenImageIO.ImageSpec``.
 
     Raises:
         InputError: Camera raw, a mask, a depth map or CIE Lab.

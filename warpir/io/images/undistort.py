@@ -41,11 +41,7 @@ def undistorted(
 ) -> tuple[list[PixelArray], BoolArray]:
     """Resample images to the pinhole of the same intrinsics, bilinear, as OpenCV does.
 
-    Args:
-        images: Of the camera's size, shape [H, W] or [H, W, C]; their types are kept, integers
-            rounded.
-        camera: The pinhole.
-        lens: What bent the images.
+    They are of the camera's size, shape [H, W] or [H, W, C]; types are kept, integers rounded.
 
     Returns:
         The images, and where they show nothing that was photographed, shape [H, W]: the nearest

@@ -152,11 +152,9 @@ def exr_bytes(
 
 
 def envmap_exr_bytes(where: Path, texels: FloatArray) -> bytes:
-    """Serialise an environment map as EXR, float32.
+    """Serialise an environment map as EXR, float32; ``where`` is the file that an error names.
 
-    Args:
-        where: The file, for errors.
-        texels: Radiance in our orientation, relative [W/(m^2 sr)], shape [He, 2 He, 3].
+    Texels are radiance in our orientation, relative [W/(m^2 sr)], shape [He, 2 He, 3].
 
     Raises:
         InputError: A value is negative or not finite (exit 6).
@@ -174,11 +172,7 @@ def envmap_exr_bytes(where: Path, texels: FloatArray) -> bytes:
 def envmap_preview(texels: FloatArray) -> CodeArray:
     """Return an environment map as a person expects it: the viewing direction -Z in the middle.
 
-    Args:
-        texels: As of `envmap_exr_bytes`.
-
-    Returns:
-        sRGB codes, scaled and clipped, shape [He, 2 He, 3].
+    Texels are those of `envmap_exr_bytes`, the result sRGB codes, scaled and clipped.
     """
     seen = np.roll(texels.astype(np.float32), texels.shape[1] // 2, axis=1)
     white = float(np.percentile(color.luminance(seen), 95.0)) / 0.8

@@ -31,7 +31,7 @@ NOTICES = 40
 
 def read_regular(
     path: Path,
-    where: str | Path,
+    where: Path,
     pointer: str = "",
     limits: Limits = LIMITS,
     limit: str = "file_bytes",
@@ -46,23 +46,20 @@ def read_regular(
         InputError: It cannot be read, is empty, or is too large.
     """
     if hashes is not None:
-        name = "" if Path(where) == path else os.path.relpath(path, Path(where).parent.resolve())
+        name = "" if path == where else os.path.relpath(path, where.parent.resolve())
         hashes[name] = ABSENT
-    named = "" if Path(where) == path else f"{path.name}: "
+    place = pointer if path == where else f"{pointer}{path.name}: "
     try:
         status = path.stat()
         if not stat.S_ISREG(status.st_mode):
-            raise InputError(
-                where, f"{pointer}{named}not a regular file", reason="file.not_regular"
-            )
-        what = f"{pointer}{named}too large"
-        limits.check(limit, status.st_size, where, what, more=" bytes")
+            raise InputError(where, f"{place}not a regular file", reason="file.not_regular")
+        limits.check(limit, status.st_size, where, f"{place}too large", more=" bytes")
         content = path.read_bytes()
     except (OSError, ValueError) as error:  # ValueError: a name that no file can have
         reason = error.strerror if isinstance(error, OSError) else "not a file name"
-        raise InputError(where, f"{pointer}{named}{reason}", reason="file.unreadable") from None
+        raise InputError(where, f"{place}{reason}", reason="file.unreadable") from None
     if not content:
-        raise InputError(where, f"{pointer}{named}empty file", reason="file.empty")
+        raise InputError(where, f"{place}empty file", reason="file.empty")
     if hashes is not None:
         hashes[name] = hashlib.sha256(content).hexdigest()
     return content
@@ -105,8 +102,8 @@ def read_uri(
     uri: str,
     where: Path,
     pointer: str,
-    limits: Limits = LIMITS,
-    hashes: dict[str, str] | None = None,
+    limits: Limits,
+    hashes: dict[str, str],
 ) -> bytes:
     """Return the bytes behind a glTF URI: a base64 ``data:`` URI or a file next to the asset.
 
@@ -149,7 +146,7 @@ class TextureDecoder:
     """
 
     def __init__(
-        self, where: Path, notices: list[str], limits: Limits = LIMITS, measures: bool = False
+        self, where: Path, notices: list[str], limits: Limits, measures: bool = False
     ) -> None:
         self.where = where
         self.measures = measures
@@ -162,11 +159,7 @@ class TextureDecoder:
         """Decode a PNG, JPEG or WebP image to RGBA codes, shape [height, width, 4].
 
         Colour profiles and orientation tags are ignored, as the glTF specification demands;
-        16-bit images are reduced to 8 bits.
-
-        Args:
-            encoded: The image file's content.
-            pointer: The place in the asset, ending in ``: ``.
+        16-bit images are reduced to 8 bits. ``pointer`` is the place in the asset, with ``: ``.
 
         Raises:
             InputError: Another format, damaged, or beyond a limit of all textures.

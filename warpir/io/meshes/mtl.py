@@ -16,7 +16,7 @@ import numpy as np
 
 from warpir.core.arrays import CodeArray
 from warpir.core.errors import Faults, InputError, shown
-from warpir.core.limits import LIMITS, Limits
+from warpir.core.limits import Limits
 from warpir.io.meshes.asset_files import (
     GREY,
     TextureDecoder,
@@ -113,7 +113,7 @@ class MaterialLibrary:
         missing_textures: str,
         notices: list[str],
         hashes: dict[str, str],
-        limits: Limits = LIMITS,
+        limits: Limits,
     ) -> None:
         self.path = path
         self.missing_textures = missing_textures
@@ -152,11 +152,9 @@ class MaterialLibrary:
             self._parse(content, name)
 
     def index(self, name: str, white: bool = False) -> int:
-        """Return the index in ``materials`` of a ``usemtl`` name.
+        """Return the index in ``materials`` of a ``usemtl`` name, empty when the OBJ states none.
 
-        Args:
-            name: The name, empty when the OBJ states none.
-            white: Whether vertex colours take the place of the grey of an unstated material.
+        An unstated material is grey, or ``white`` where vertex colours are.
         """
         if name not in self._index:
             entry = self._entries.get(name)

@@ -15,7 +15,7 @@ import numpy as np
 
 from warpir.core.arrays import Float64Array, FloatArray, Int64Array, IntArray
 from warpir.core.errors import Faults, InputError
-from warpir.core.limits import LIMITS, Limits
+from warpir.core.limits import Limits
 from warpir.io.meshes.asset_files import concise, read_regular
 from warpir.io.meshes.mtl import MaterialLibrary
 from warpir.io.meshes.triangles import (
@@ -52,14 +52,11 @@ NAMED = ("usemtl", "mtllib")
 IGNORED = {"o", "g", "s", "vp", "shadow_obj", "trace_obj", "lod", "bevel", "c_interp", "d_interp"}
 
 
-def read_obj(path: Path, missing_textures: str = "error", limits: Limits = LIMITS) -> Asset:
+def read_obj(path: Path, missing_textures: str, limits: Limits) -> Asset:
     """Read an ``.obj`` file; its material files and textures must lie in its folder.
 
-    Args:
-        path: The file.
-        missing_textures: ``error``, or ``grey``: a missing material file or base colour texture
-            becomes grey, other textures are left out, with a notice.
-        limits: How large it may be.
+    With missing textures ``grey`` instead of an ``error``, a missing material file or base colour
+    texture becomes grey, other textures are left out, with a notice.
 
     Returns:
         Double-sided materials; grey, rough and dielectric where the file states none.

@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from warpir.core.arrays import Float64Array, FloatArray, IntArray
-from warpir.core.limits import LIMITS, Limits
+from warpir.core.limits import Limits
 from warpir.io.meshes.asset_files import GREY, concise, plain_material, read_regular
 from warpir.io.meshes.ply import PLY, Element, Lists, read_ply
 from warpir.io.meshes.stl import read_stl
@@ -26,7 +26,7 @@ from warpir.io.meshes.triangles import (
 from warpir.scene.asset import Asset, Primitive
 
 
-def read_ply_mesh(path: Path, limits: Limits = LIMITS) -> Asset:
+def read_ply_mesh(path: Path, limits: Limits) -> Asset:
     """Read the faces of a PLY file with the normals and colours of its vertices.
 
     Raises:
@@ -56,7 +56,7 @@ def read_ply_mesh(path: Path, limits: Limits = LIMITS) -> Asset:
     return _asset(path, positions, indices, normals, colors, notices, hashes)
 
 
-def read_stl_mesh(path: Path, limits: Limits = LIMITS) -> Asset:
+def read_stl_mesh(path: Path, limits: Limits) -> Asset:
     """Read an STL file; flat shading, since its normals are those of the faces.
 
     Raises:

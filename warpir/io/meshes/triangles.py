@@ -76,11 +76,8 @@ def clip_ears(points: Float64Array) -> IntArray:
     A corner that was no ear is looked at again only when a neighbour of it, or the corner that was
     found within it, is gone: for most polygons the time grows as the square of the corners.
 
-    Args:
-        points: Corners in order, shape [corner, 3].
-
-    Returns:
-        Indices of the corners, shape [corner - 2, 3].
+    ``points`` are the corners in order, shape [corner, 3]; the triangles are indices of them, shape
+    [corner - 2, 3].
     """
     normal = np.cross(points, np.roll(points, -1, axis=0)).sum(axis=0)
     axis = int(np.abs(normal).argmax())
@@ -147,13 +144,10 @@ def corner_within(
 def drop_without_area(
     positions: Float64Array, indices: IntArray, notices: list[str], where: str = ""
 ) -> IntArray:
-    """Drop triangles that no ray can hit, and exact repetitions.
+    """Drop triangles that no ray can hit, and exact repetitions, and note how many.
 
-    Args:
-        positions: Any frame [m], shape [vertex, 3].
-        indices: Shape [triangle, 3].
-        notices: Receives how many were dropped.
-        where: The place in the file, ending in ``: ``, or empty.
+    Positions [m] are of shape [vertex, 3], triangles of shape [triangle, 3]; ``where`` is the place
+    in the file, ending in ``: ``, or empty.
 
     Returns:
         The remaining triangles, C-contiguous. A repetition has the same three vertices in the same
@@ -193,17 +187,9 @@ def unit_normals(
     notices: list[str],
     where: str = "",
 ) -> FloatArray:
-    """Normalise shading normals; those of length zero become the mean of their triangles.
+    """Normalise shading normals, shape [vertex, 3]; note how many have no length.
 
-    Args:
-        normals: Any length, shape [vertex, 3].
-        positions: The same frame [m], shape [vertex, 3].
-        indices: Shape [triangle, 3].
-        notices: Receives how many had no length.
-        where: The place in the file, ending in ``: ``, or empty.
-
-    Returns:
-        Shape [vertex, 3].
+    Those become the mean of their triangles. The other arguments are as of `drop_without_area`.
     """
     lost = np.linalg.norm(normals, axis=1) < 1e-20
     if not lost.any():
