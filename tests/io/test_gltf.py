@@ -772,33 +772,26 @@ def test_G5_missing_textures_become_grey_on_request(image: str, tmp_path: Path) 
     assert any("/images/0" in notice and "grey" in notice for notice in asset.notices)
 
 
-NORMALISED: dict[str, tuple[np.ndarray, int]] = {
-    "u8": (np.array([[0, 255], [255, 255], [255, 0], [51, 0]], "B"), 255),
-    "u16": (np.array([[0, 65535], [65535, 65535], [65535, 0], [13107, 0]], "H"), 65535),
-}
-
-
 @pytest.mark.case("M9")
-@pytest.mark.parametrize("kind", NORMALISED)
-def test_G6_M9_normalised_uv_equals_float(kind: str, tmp_path: Path) -> None:
+@pytest.mark.parametrize(
+    ("codes", "values"),
+    [
+        (np.array([[0, 255], [255, 255], [255, 0], [51, 0]], "B"), [0, 1, 1, 1, 1, 0, 0.2, 0]),
+        (np.array([[0, 65535], [65535, 0], [13107, 0], [0, 0]], "H"), [0, 1, 1, 0, 0.2, 0, 0, 0]),
+        # The two lowest signed codes both mean -1: max(c / 127, -1).
+        (np.array([[-128, -127], [0, 127]] * 2, "b"), [-1, -1, 0, 1] * 2),
+        (np.array([[-32768, -32767], [0, 32767]] * 2, "h"), [-1, -1, 0, 1] * 2),
+    ],
+    ids="BHbh",
+)
+def test_G6_M9_normalised_uv_equals_float(
+    codes: np.ndarray, values: list[float], tmp_path: Path
+) -> None:
     """Normalised integer texture coordinates equal their float version."""
-    codes, scale = NORMALISED[kind]
     builder = Builder()
     builder.attribute("TEXCOORD_0", codes, normalized=True)
     uv0 = load(tmp_path, builder).primitives[0].uv0
-    assert uv0 is not None
-    np.testing.assert_allclose(uv0, np.asarray(codes / scale), rtol=FLOAT32_RTOL)
-
-
-@pytest.mark.case("M9")
-@pytest.mark.parametrize(("code", "lowest"), [("b", -128), ("h", -32768)])
-def test_G6_lowest_signed_code_is_minus_one(code: str, lowest: int, tmp_path: Path) -> None:
-    """The two lowest signed codes both mean -1: max(c / 127, -1)."""
-    builder = Builder()
-    codes = np.array([[lowest, lowest + 1], [0, -1 - lowest]] * 2, code)
-    builder.attribute("TEXCOORD_0", codes, normalized=True)
-    uv0 = load(tmp_path, builder).primitives[0].uv0
-    np.testing.assert_array_equal(uv0, [[-1, -1], [0, 1]] * 2)
+    np.testing.assert_array_equal(uv0, np.array(values, "f").reshape(4, 2))
 
 
 @pytest.mark.case("M9")

@@ -9,6 +9,7 @@ import subprocess
 import sys
 import xml.etree.ElementTree as ET
 from pathlib import Path
+from typing import Any
 
 import colour
 import numpy as np
@@ -116,6 +117,15 @@ def inputs_of(folder: Path, **changes: object) -> Inputs:
             **{**fields, **changes},
         )
     )
+
+
+def output_of(*command: str, **env: str) -> str:
+    """What a program prints that must end well."""
+    done = subprocess.run(
+        command, capture_output=True, text=True, check=False, env={**os.environ, **env}
+    )
+    assert done.returncode == 0, done.stdout + done.stderr
+    return done.stdout
 
 
 def planes_of(path: Path) -> dict[str, NDArray[np.float64]]:
@@ -251,7 +261,7 @@ def bent(curves: int) -> ToneKnots:
     return ToneKnots(*(k.astype(np.float32) for k in oracles.spline_knots(raw)))
 
 
-def read_cube(path: Path) -> "object":
+def read_cube(path: Path) -> Any:
     return colour.read_LUT(str(path))
 
 
@@ -261,9 +271,9 @@ def test_cube_reads_back_as_the_curve(tmp_path: Path, knots: ToneKnots) -> None:
     path = tmp_path / "curve.cube"
     path.write_bytes(tone_curve_cube(knots, "about"))
     lut = read_cube(path)
-    table = np.asarray(lut.table)  # type: ignore[attr-defined]
-    np.testing.assert_array_equal(lut.domain, [[0, 0, 0], [1, 1, 1]])  # type: ignore[attr-defined]
-    assert table.shape == (CUBE_SIZE, 3) and lut.comments == ["about"]  # type: ignore[attr-defined]
+    table = np.asarray(lut.table)
+    np.testing.assert_array_equal(lut.domain, [[0, 0, 0], [1, 1, 1]])
+    assert table.shape == (CUBE_SIZE, 3) and lut.comments == ["about"]
     x = np.linspace(0.0, 1.0, CUBE_SIZE)
     for k in range(3):
         row = min(k, len(knots.x) - 1)
@@ -273,7 +283,7 @@ def test_cube_reads_back_as_the_curve(tmp_path: Path, knots: ToneKnots) -> None:
     exact = np.stack(
         [knots.evaluate(between[:, k])[:, min(k, len(knots.x) - 1)] for k in range(3)], axis=-1
     )
-    np.testing.assert_allclose(lut.apply(between), exact, atol=CUBE_ABS)  # type: ignore[attr-defined]
+    np.testing.assert_allclose(lut.apply(between), exact, atol=CUBE_ABS)
 
 
 def test_cube_of_a_run_is_the_identity_and_says_what_it_maps(folder: Path) -> None:
@@ -281,8 +291,8 @@ def test_cube_of_a_run_is_the_identity_and_says_what_it_maps(folder: Path) -> No
     for name, layer in (("object", "fg.RGB"), ("shadow", "shadow.RGB")):
         lut = read_cube(folder / "out" / f"tone_curve_{name}.cube")
         x = np.linspace(0.0, 1.0, CUBE_SIZE)
-        np.testing.assert_allclose(lut.table, np.stack([x] * 3, -1), atol=CUBE_ABS)  # type: ignore[attr-defined]
-        assert layer in lut.comments[0] and "clipped" in lut.comments[0]  # type: ignore[attr-defined]
+        np.testing.assert_allclose(lut.table, np.stack([x] * 3, -1), atol=CUBE_ABS)
+        assert layer in lut.comments[0] and "clipped" in lut.comments[0]
 
 
 def test_response_is_a_step_of_its_own(folder: Path) -> None:
@@ -297,7 +307,7 @@ def test_response_is_a_step_of_its_own(folder: Path) -> None:
     np.testing.assert_array_equal(before["fg.A"], after["fg.A"])
     lut = read_cube(folder / "bent" / "response.cube")
     share = before["fg.A"][seen][:, None]
-    bent = lut.apply(rgb(before, "fg.")[seen] / share) * share  # type: ignore[attr-defined]
+    bent = lut.apply(rgb(before, "fg.")[seen] / share) * share
     np.testing.assert_allclose(rgb(after, "fg.")[seen], bent, atol=1e-3)
     assert np.abs(rgb(after, "fg.")[seen] - rgb(before, "fg.")[seen]).max() > 0.01
     knots = json.loads((folder / "bent" / "curves.json").read_text())["response"]
@@ -340,29 +350,27 @@ def test_web_map_fits_half_precision() -> None:
 # ------------------------------------------------------------------------------------ Blender
 
 
-def constants(script: str) -> dict[str, object]:
+def constants(script: str) -> dict[str, Any]:
     """Values of the names in capitals that the script assigns."""
-    found: dict[str, object] = {}
+    found: dict[str, Any] = {}
     for node in ast.parse(script).body:
         if isinstance(node, ast.Assign) and not isinstance(node.value, ast.Call):
-            names = node.targets[0]
-            names = names.elts if isinstance(names, ast.Tuple) else [names]  # type: ignore[assignment]
-            if all(isinstance(n, ast.Name) and n.id.isupper() for n in names):  # type: ignore[attr-defined]
+            names = ast.unparse(node.targets[0]).strip("()").split(", ")
+            if all(name.isupper() for name in names):
                 value = ast.literal_eval(node.value)
-                values = value if len(names) > 1 else [value]  # type: ignore[arg-type]
-                found.update(zip((n.id for n in names), values, strict=True))  # type: ignore[attr-defined]
+                found.update(zip(names, value if len(names) > 1 else [value], strict=True))
     return found
 
 
-def seen_by_blender(values: dict[str, object], points: NDArray[np.float64]) -> NDArray[np.float64]:
+def seen_by_blender(values: dict[str, Any], points: NDArray[np.float64]) -> NDArray[np.float64]:
     """Pixels of Z-up points by Blender's own camera: BKE_camera_params_compute_viewplane, AUTO."""
-    width, height = float(values["WIDTH"]), float(values["HEIGHT"])  # type: ignore[arg-type]
+    width, height = values["WIDTH"], values["HEIGHT"]
     c2w = np.array(values["CAMERA_TO_WORLD"])
     local = np.c_[points, np.ones(len(points))] @ np.linalg.inv(c2w).T
     longer = max(width, height)
-    focal = 0.5 * longer / np.tan(0.5 * float(values["ANGLE"]))  # type: ignore[arg-type]
-    x = focal * local[:, 0] / -local[:, 2] - float(values["SHIFT_X"]) * longer  # type: ignore[arg-type]
-    y = focal * local[:, 1] / -local[:, 2] - float(values["SHIFT_Y"]) * longer  # type: ignore[arg-type]
+    focal = 0.5 * longer / np.tan(0.5 * values["ANGLE"])
+    x = focal * local[:, 0] / -local[:, 2] - values["SHIFT_X"] * longer
+    y = focal * local[:, 1] / -local[:, 2] - values["SHIFT_Y"] * longer
     return np.stack([0.5 * width + x, 0.5 * height - y], axis=-1)
 
 
@@ -395,7 +403,7 @@ def test_blender_script_is_short_and_its_numbers_are_ours(
     np.testing.assert_allclose(
         seen_by_blender(values, z_up), inputs.camera.project(world), atol=PIXEL
     )
-    half = 0.5 * float(values["GROUND_SIZE"])  # type: ignore[arg-type]
+    half = 0.5 * values["GROUND_SIZE"]
     corners = np.array([[x, y, 0.0, 1.0] for x in (-half, half) for y in (-half, half)])
     x, y, z, _ = np.array(values["GROUND_TO_WORLD"]) @ corners.T
     plane = inputs.placement.ground
@@ -458,13 +466,7 @@ def test_blender_shows_the_same_insertion(folder: Path, tmp_path: Path) -> None:
     d = np.concatenate([AROUND, fibonacci(3)])
     z_up = [(float(x), float(-z), float(y)) for x, y, z in d]
     script = folder / "out" / "blender_setup.py"
-    done = subprocess.run(
-        [BLENDER, "-c", DRIVER, str(script), str(tmp_path), repr(z_up)],
-        capture_output=True,
-        text=True,
-        check=False,
-    )
-    assert done.returncode == 0, done.stdout + done.stderr
+    output_of(BLENDER, "-c", DRIVER, str(script), str(tmp_path), repr(z_up))
     # Light: the map read by the file's own convention, 2 % of reading and of a camera's 0.6 degrees
     texels = read_image(folder / "out" / "envmap.exr")[0]
     x, y, z = d.T
@@ -550,17 +552,11 @@ def test_mitsuba_reads_light_layers_and_scene(folder: Path) -> None:
     """In a process of its own: the real emitter, the real EXR reader, the real scene parser."""
     d = np.concatenate([AROUND, fibonacci(30)])
     out = folder / "out"
-    done = subprocess.run(
-        [sys.executable, "-c", IN_MITSUBA, str(out), json.dumps(d.tolist())],
-        capture_output=True,
-        text=True,
-        check=False,
-    )
-    assert done.returncode == 0, done.stderr
+    printed = output_of(sys.executable, "-c", IN_MITSUBA, str(out), json.dumps(d.tolist()))
     texels = read_image(out / "envmap.exr")[0]
     x, y, z = d.T
     u, v = np.arctan2(x, -z) / (2.0 * np.pi), np.arccos(np.clip(y, -1.0, 1.0)) / np.pi
-    seen = np.array(json.loads(done.stdout.splitlines()[-1]))
+    seen = np.array(json.loads(printed.splitlines()[-1]))
     # Bilinear of bilinear, on rows 16 times as fine: only the kinks at our texel centres are cut
     np.testing.assert_allclose(seen, read(texels, u, v), rtol=0.003, atol=1e-4 * texels.max())
     for wrong in (texels[:, ::-1], np.roll(texels, 16, axis=1), texels[::-1]):
@@ -592,14 +588,8 @@ def test_mitsuba_reads_light_layers_and_scene(folder: Path) -> None:
 def test_mitsuba_renders_our_insertion_to_within_its_noise(folder: Path) -> None:
     """``python mitsuba/render.py``: no pixel differs by more than both renderers' noise."""
     out = folder / "out"
-    done = subprocess.run(
-        [sys.executable, str(out / "mitsuba" / "render.py"), "--samples", str(SAMPLES)],
-        capture_output=True,
-        text=True,
-        check=False,
-        env={**os.environ, LIBRARY: str(llvm())},
-    )
-    assert done.returncode == 0, done.stderr
+    script = str(out / "mitsuba" / "render.py")
+    output_of(sys.executable, script, "--samples", str(SAMPLES), **{LIBRARY: str(llvm())})
     theirs = planes_of(out / "mitsuba" / "composite.exr")
     first, second = (planes_of(folder / name / "layers.exr") for name in ("out", "again"))
 

@@ -116,14 +116,6 @@ def test_other_layouts_are_expanded(tmp_path: Path, rng: np.random.Generator, mo
     np.testing.assert_array_equal(photo.codes, np.asarray(picture.convert("RGB")))
 
 
-@pytest.mark.case("I9")
-def test_i9_cmyk_is_noted(tmp_path: Path, rng: np.random.Generator) -> None:
-    Image.fromarray(codes8(rng)).convert("CMYK").save(tmp_path / "p.jpg")
-    photo = read_photo(tmp_path / "p.jpg")
-    assert photo.codes.shape == (24, 36, 3)
-    assert any("CMYK" in notice for notice in photo.notices)
-
-
 @pytest.mark.case("I10")
 def test_i10_alpha_is_refused_unless_asked(tmp_path: Path, rng: np.random.Generator) -> None:
     rgba = np.dstack([codes8(rng), np.full((24, 36), 255, np.uint8)])
@@ -807,19 +799,26 @@ def test_hdr_signals_in_png_are_refused(
     fails(with_chunks(tmp_path / "p.png", codes8(rng), chunk), word, "sRGB")
 
 
-@pytest.mark.case("I8")
-def test_i8_uncalibrated_exif_is_noted(tmp_path: Path, rng: np.random.Generator) -> None:
-    exif = Image.Exif()
-    exif.get_ifd(0x8769)[0xA001] = 65535
-    Image.fromarray(codes8(rng)).save(tmp_path / "p.jpg", exif=exif)
-    assert any("uncalibrated" in notice for notice in read_photo(tmp_path / "p.jpg").notices)
+UNCALIBRATED = Image.Exif()
+UNCALIBRATED.get_ifd(0x8769)[0xA001] = 65535
+GAIN_MAP = b"<x:xmpmeta xmlns:x='adobe:ns:meta/' hdrgm:Version='1.0'></x:xmpmeta>"
 
 
-@pytest.mark.case("I19")
-def test_i19_gain_map_is_noted(tmp_path: Path, rng: np.random.Generator) -> None:
-    xmp = b"<x:xmpmeta xmlns:x='adobe:ns:meta/' hdrgm:Version='1.0'></x:xmpmeta>"
-    Image.fromarray(codes8(rng)).save(tmp_path / "p.jpg", xmp=xmp)
-    assert any("gain map" in notice for notice in read_photo(tmp_path / "p.jpg").notices)
+@pytest.mark.parametrize(
+    ("mode", "options", "words"),
+    [
+        pytest.param("CMYK", {}, "CMYK", id="I9-CMYK"),
+        pytest.param("RGB", {"exif": UNCALIBRATED}, "uncalibrated", id="I8-uncalibrated"),
+        pytest.param("RGB", {"xmp": GAIN_MAP}, "gain map", id="I19-gain-map"),
+    ],
+)
+def test_what_a_jpeg_says_is_noted(
+    tmp_path: Path, rng: np.random.Generator, mode: str, options: dict[str, Any], words: str
+) -> None:
+    Image.fromarray(codes8(rng)).convert(mode).save(tmp_path / "p.jpg", **options)
+    photo = read_photo(tmp_path / "p.jpg")
+    assert photo.codes.shape == (24, 36, 3)
+    assert any(words in notice for notice in photo.notices)
 
 
 @pytest.mark.parametrize("case", ["I9-LAB", "I9-uint16-1-bit", "I9-CMYK", "I9-P", "I9-planar"])

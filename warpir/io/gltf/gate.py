@@ -194,7 +194,7 @@ class GltfFile:
         content = read_regular(
             path,
             path,
-            limits=limits,
+            limits,
             limit="gltf_json_bytes" if is_text else "file_bytes",
             hashes=self.hashes,
         )

@@ -18,7 +18,7 @@ import numpy as np
 
 from warpir.core.arrays import CodeArray
 from warpir.core.errors import InputError
-from warpir.core.limits import LIMITS, Limits
+from warpir.core.limits import Limits
 from warpir.scene.asset import ABSENT, Material
 
 GREY = (0.8, 0.8, 0.8)
@@ -32,8 +32,8 @@ NOTICES = 40
 def read_regular(
     path: Path,
     where: Path,
+    limits: Limits,
     pointer: str = "",
-    limits: Limits = LIMITS,
     limit: str = "file_bytes",
     hashes: dict[str, str] | None = None,
 ) -> bytes:
@@ -120,7 +120,7 @@ def read_uri(
             raise InputError(
                 where, f"{pointer}data: URI is damaged ({error})", reason="file.data_uri"
             ) from None
-    return read_regular(locate(uri, where, pointer), where, pointer, limits, hashes=hashes)
+    return read_regular(locate(uri, where, pointer), where, limits, pointer, hashes=hashes)
 
 
 def locate(uri: str, where: Path, pointer: str) -> Path:

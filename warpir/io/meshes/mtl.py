@@ -142,7 +142,7 @@ class MaterialLibrary:
         for name in [names] if os.path.exists(whole) else names.split():
             file = inside(self.path.parent, name, self.path, "mtllib ")
             try:
-                content = read_regular(file, self.path, "mtllib ", self._limits, hashes=self.hashes)
+                content = read_regular(file, self.path, self._limits, "mtllib ", hashes=self.hashes)
             except InputError as error:
                 if self.missing_textures != "grey":
                     error.advice = "add it, or pass --missing-textures grey"
@@ -437,7 +437,7 @@ class MaterialLibrary:
             file = inside(self.path.parent, name, self.path)
             try:
                 encoded = read_regular(
-                    file, self.path, "texture ", self._limits, hashes=self.hashes
+                    file, self.path, self._limits, "texture ", hashes=self.hashes
                 )
                 self._pixels[name] = self._decoder.decode(encoded, where)
             except InputError as error:

@@ -66,7 +66,7 @@ def read_obj(path: Path, missing_textures: str, limits: Limits) -> Asset:
     """
     notices: list[str] = []
     hashes: dict[str, str] = {}
-    text = _read_statements(path, read_regular(path, path, limits=limits, hashes=hashes), notices)
+    text = _read_statements(path, read_regular(path, path, limits, hashes=hashes), notices)
     library = MaterialLibrary(path, missing_textures, notices, hashes, limits)
     for name in text.libraries:
         library.add(name)

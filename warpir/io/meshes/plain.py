@@ -34,7 +34,7 @@ def read_ply_mesh(path: Path, limits: Limits) -> Asset:
     """
     notices: list[str] = []
     hashes: dict[str, str] = {}
-    ply = read_ply(path, read_regular(path, path, limits=limits, hashes=hashes))
+    ply = read_ply(path, read_regular(path, path, limits, hashes=hashes))
     vertex, face = ply.element("vertex"), ply.element("face")
     positions = _finite(path, vertex, ("x", "y", "z"))
     if positions is None:
@@ -64,7 +64,7 @@ def read_stl_mesh(path: Path, limits: Limits) -> Asset:
     """
     notices: list[str] = []
     hashes: dict[str, str] = {}
-    corners = read_stl(path, read_regular(path, path, limits=limits, hashes=hashes), notices)
+    corners = read_stl(path, read_regular(path, path, limits, hashes=hashes), notices)
     check_triangle_count(path, len(corners), limits)
     if not np.isfinite(corners).all():
         raise MESH.error(path, "not_finite", what="vertices")

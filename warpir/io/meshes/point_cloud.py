@@ -29,7 +29,7 @@ def read_point_cloud(path: str | Path, limits: Limits = LIMITS) -> Float64Array:
     if is_model(path):
         points = read_points(path, limits)
     else:
-        content = read_regular(path, path, limits=limits)
+        content = read_regular(path, path, limits)
         is_ply = re.match(rb"ply\s", content) is not None
         points = (_read_ply if is_ply else _read_text)(path, content, limits)
     if not len(points):
