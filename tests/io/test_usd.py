@@ -5,6 +5,7 @@ import io
 import zipfile
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -20,10 +21,24 @@ from warpir.scene.camera import Camera, camera_pose
 from warpir.scene.light import axis_from_angles
 from warpir.scene.near.lamps import RectangleLamp, SphereLamp
 
+needs_usd = pytest.mark.skipif(
+    importlib.util.find_spec("pxr") is None, reason="OpenUSD is not installed (usd extra)"
+)
+SKY = Path(demo.__file__).with_name("sky.exr")
 PIXEL = 1e-3
 """Of projections by OpenUSD's own frustum [px]."""
 SUN = (60.0, 40.0)
 """Azimuth and elevation of the run's sun [deg]: to the right, ahead, above."""
+
+
+def stage_of(path: Path, *scene: Any) -> Any:
+    """Return what OpenUSD finds in the package of a scene, the arguments of `write_usdz`."""
+    from pxr import Usd
+
+    from warpir.io.usd import write_usdz
+
+    path.write_bytes(write_usdz(*scene))
+    return Usd.Stage.Open(str(path))
 
 
 def test_usd_that_is_not_installed_is_named(
@@ -43,21 +58,17 @@ def test_usd_that_is_not_installed_is_named(
     ]
 
 
+@needs_usd
 def test_usdz_has_the_object_and_the_camera(tmp_path: Path) -> None:
     """Every vertex falls on the photo's pixel, also with a lens shift and pixels not square."""
-    pytest.importorskip("pxr", reason="OpenUSD is not installed (usd extra)")
-    from pxr import Gf, Usd, UsdGeom
+    from pxr import Gf, UsdGeom
 
-    from warpir.io.usd import write_usdz
-
-    folder = Path(demo.__file__).parent
-    asset = load_asset(folder / "car.glb")
+    asset = load_asset(demo.ASSET)
     camera = Camera(640, 400, 500.0, 520.0, 300.0, 220.0, camera_pose(-5.0, 2.0, 1.6))
     to_world = np.diag([2.0, 2.0, 2.0, 1.0])
     to_world[:3, 3] = 1.0, 0.0, -9.0
     path = tmp_path / "scene.usdz"
-    path.write_bytes(write_usdz(asset, to_world, camera, folder / "sky.exr"))
-    stage = Usd.Stage.Open(str(path))
+    stage = stage_of(path, asset, to_world, camera, SKY)
     frustum = UsdGeom.Camera.Get(stage, "/scene/camera").GetCamera().frustum
     to_film = frustum.ComputeViewMatrix() * frustum.ComputeProjectionMatrix()
     for k, p in enumerate(asset.primitives):
@@ -76,26 +87,20 @@ def test_usdz_has_the_object_and_the_camera(tmp_path: Path) -> None:
             np.testing.assert_allclose(np.array(mesh.GetNormalsAttr().Get()), p.normals, atol=1e-6)
     with zipfile.ZipFile(path) as package:
         name = next(name for name in package.namelist() if name.endswith(".exr"))
-        assert package.read(name) == (folder / "sky.exr").read_bytes()
+        assert package.read(name) == SKY.read_bytes()
 
 
+@needs_usd
 def test_usdz_has_the_lamps(tmp_path: Path) -> None:
     """Spheres and rectangles where they are, of our radiance; a rectangle shines along its -Z."""
-    pytest.importorskip("pxr", reason="OpenUSD is not installed (usd extra)")
-    from pxr import Usd, UsdGeom, UsdLux
+    from pxr import UsdGeom, UsdLux
 
-    from warpir.io.usd import write_usdz
-
-    folder = Path(demo.__file__).parent
     asset = Asset("box", (box((0.0, 0.5, 0.0), (1.0, 1.0, 1.0)),), (Material(),), ())
     camera = Camera(64, 40, 50.0, 50.0, 32.0, 20.0, camera_pose(-5.0, 2.0, 1.6))
     ball = SphereLamp(np.array([1.0, 2.0, 3.0]), 0.25, np.array([40.0, 20.0, 10.0]))
     edges = np.array([0.0, 0.0, 0.8]), np.array([-0.3, 0.4, 0.0])
     flat = RectangleLamp(np.array([0.0, 2.0, -1.0]), *edges, np.array([9.0, 6.0, 0.0]))
-    path = tmp_path / "scene.usdz"
-    package = write_usdz(asset, np.eye(4), camera, folder / "sky.exr", (ball, flat))
-    path.write_bytes(package)
-    stage = Usd.Stage.Open(str(path))
+    stage = stage_of(tmp_path / "scene.usdz", asset, np.eye(4), camera, SKY, (ball, flat))
     round_one = UsdLux.SphereLight.Get(stage, "/scene/lamp_0")
     square = UsdLux.RectLight.Get(stage, "/scene/lamp_1")
     assert round_one.GetRadiusAttr().Get() == 0.25
@@ -114,12 +119,10 @@ def test_usdz_has_the_lamps(tmp_path: Path) -> None:
     np.testing.assert_allclose(-pose[2, :3], outward / np.linalg.norm(outward), atol=1e-9)
 
 
+@needs_usd
 def test_usdz_materials_read_the_same_texels(tmp_path: Path, rng: np.random.Generator) -> None:
     """Each connected input by UsdUVTexture's definition, at every vertex, against ours."""
-    pytest.importorskip("pxr", reason="OpenUSD is not installed (usd extra)")
-    from pxr import Usd, UsdGeom, UsdShade
-
-    from warpir.io.usd import write_usdz
+    from pxr import UsdGeom, UsdShade
 
     pixels = [rng.integers(0, 256, (8, 16, 4), dtype=np.uint8) for _ in range(2)]
     moved = TextureSlot(1, 1, (0.5, 0.25, 0.1, -0.25, 0.5, 0.4))
@@ -143,9 +146,7 @@ def test_usdz_materials_read_the_same_texels(tmp_path: Path, rng: np.random.Gene
     asset = Asset("box", (replace(mesh, uv0=uvs[0], uv1=uvs[1]),), (material,), textures)
     path = tmp_path / "scene.usdz"
     camera = Camera(64, 40, 50.0, 50.0, 32.0, 20.0, np.eye(4))
-    sky = Path(demo.__file__).parent / "sky.exr"
-    path.write_bytes(write_usdz(asset, np.eye(4), camera, sky))
-    stage = Usd.Stage.Open(str(path))
+    stage = stage_of(path, asset, np.eye(4), camera, SKY)
     written = UsdGeom.Mesh.Get(stage, "/scene/object/mesh_0")
     bound = UsdShade.MaterialBindingAPI(written).ComputeBoundMaterial()[0]
     surface = bound.ComputeSurfaceSource()[0]
@@ -186,12 +187,7 @@ def test_usdz_materials_read_the_same_texels(tmp_path: Path, rng: np.random.Gene
         ("metallic", first[:, 2:3] * 0.3, "raw", "repeat repeat"),
         ("roughness", first[:, 1:2] * 0.4, "raw", "repeat repeat"),
         ("emissiveColor", first[:, :3] * (2.0, 1.0, 0.5), "sRGB", "repeat repeat"),
-        (
-            "normal",
-            (2.0 * second[:, :3] - 1.0) * (0.5, 0.5, 1.0),
-            "raw",
-            "mirror clamp",
-        ),
+        ("normal", (2.0 * second[:, :3] - 1.0) * (0.5, 0.5, 1.0), "raw", "mirror clamp"),
     ):
         found = read(name)
         np.testing.assert_allclose(found[0], values, atol=1e-6)
@@ -200,9 +196,9 @@ def test_usdz_materials_read_the_same_texels(tmp_path: Path, rng: np.random.Gene
     assert surface.GetInput("ior").Get() == pytest.approx(1.5)
 
 
+@needs_usd
 def test_usdz_of_a_run_has_its_sun_where_it_is(tmp_path: Path) -> None:
     """The dome light by OpenEXR's definition, which UsdLux names, on a stage whose +Y is up."""
-    pytest.importorskip("pxr", reason="OpenUSD is not installed (usd extra)")
     from pxr import Gf, Usd, UsdGeom, UsdLux
 
     write_inputs(tmp_path)

@@ -22,7 +22,6 @@ from warpir.core.limits import LIMITS, Limits
 from warpir.core.strict_json import read_versioned
 from warpir.scene.tone_curves import CURVE_COUNTS, TONES, Curves, ToneKnots
 
-FORMAT = "warpir-curves"
 VERSION = 1
 BIN_COUNT_LIMIT = 256
 SLOPE_LIMIT = 1e6
@@ -32,7 +31,7 @@ END_TOLERANCE = 1e-6
 
 def curves_to_json(curves: Curves, response: ToneKnots | None = None) -> dict[str, Any]:
     """Return what `read_curves` reads, and the response that follows the curves."""
-    content: dict[str, Any] = {"format": FORMAT, "version": VERSION, "tone": curves.tone}
+    content: dict[str, Any] = {"format": "warpir-curves", "version": VERSION, "tone": curves.tone}
     written = {name: getattr(curves, name) for name in CURVE_COUNTS}
     if response is not None:
         written["response"] = response
@@ -89,14 +88,9 @@ def _read_knots(path: str | Path, pointer: str, value: Any) -> ToneKnots:
 
 def _numbers(path: str | Path, pointer: str, value: Any) -> FloatArray:
     """Return a list of lists of numbers as it will be used, in float32, shape [curve, knot]."""
-    rows = value if isinstance(value, list) and value else [None]
+    rows = value if isinstance(value, list) else []
     lengths = {len(row) if isinstance(row, list) else 0 for row in rows}
-    plain = len(lengths) == 1 and all(
-        isinstance(number, int | float) and not isinstance(number, bool)
-        for row in rows
-        for number in (row if isinstance(row, list) else [None])
-    )
-    if not plain or lengths == {0}:
+    if len(lengths) != 1 or lengths == {0} or not all(_is_number(n) for row in rows for n in row):
         raise InputError(path, f"{pointer}: lists of numbers expected, one for each curve")
     try:
         numbers = np.asarray(rows, np.float64)
@@ -104,3 +98,7 @@ def _numbers(path: str | Path, pointer: str, value: Any) -> FloatArray:
         raise InputError(path, f"{pointer}: a number beyond every use") from None
     with np.errstate(over="ignore"):
         return numbers.astype(np.float32)
+
+
+def _is_number(value: Any) -> bool:
+    return isinstance(value, int | float) and not isinstance(value, bool)

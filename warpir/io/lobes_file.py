@@ -18,7 +18,6 @@ from warpir.core.limits import LIMITS, Limits
 from warpir.core.strict_json import read_numbers, read_versioned
 from warpir.scene.light import Lobes
 
-FORMAT = "warpir-lobes"
 VERSION = 1
 LOBE_COUNT_LIMIT = 4096
 AMPLITUDE_LIMIT = 1e12
@@ -63,8 +62,9 @@ def read_lobes(path: str | Path, limits: Limits = LIMITS) -> Lobes:
 
 def lobes_to_json(lobes: Lobes) -> dict[str, Any]:
     """Return what `read_lobes` reads."""
+    numbers = lobes.amplitude.tolist(), lobes.axis.tolist(), lobes.sharpness.tolist()
     rows = [
-        {"amplitude": [float(c) for c in a], "axis": [float(c) for c in v], "sharpness": float(s)}
-        for a, v, s in zip(lobes.amplitude, lobes.axis, lobes.sharpness, strict=True)
+        {"amplitude": amplitude, "axis": axis, "sharpness": sharpness}
+        for amplitude, axis, sharpness in zip(*numbers, strict=True)
     ]
-    return {"format": FORMAT, "version": VERSION, "lobes": rows}
+    return {"format": "warpir-lobes", "version": VERSION, "lobes": rows}

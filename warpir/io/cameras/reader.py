@@ -126,13 +126,13 @@ def _read(
 
 def _read_own(path: Path, content: dict[str, Any]) -> PhotoCamera:
     """Read our own ``camera.json``."""
-    focal = {key: focal_length(path, content, key) for key in ("fx", "fy")}
+    fx, fy = (focal_length(path, content, key) for key in ("fx", "fy"))
     c2w = rigid(path, "c2w", content.get("c2w"))
     camera = Camera(
         count(path, content, "w"),
         count(path, content, "h"),
-        focal["fx"],
-        focal["fy"],
+        fx,
+        fy,
         number(path, content, "cx"),
         number(path, content, "cy"),
         c2w,

@@ -404,10 +404,8 @@ class MaterialReader:
         transform = entry.extension("KHR_texture_transform")
         if transform is not None:
             uv_set = transform.integer("texCoord", uv_set)
-            (ox, oy), (sx, sy) = (
-                transform.numbers("offset", (0.0, 0.0)),
-                transform.numbers("scale", (1.0, 1.0)),
-            )
+            ox, oy = transform.numbers("offset", (0.0, 0.0))
+            sx, sy = transform.numbers("scale", (1.0, 1.0))
             angle = transform.number("rotation", 0.0)
             c, s = math.cos(angle), math.sin(angle)
             # translation * rotation * scale, as in the extension's own GLSL.

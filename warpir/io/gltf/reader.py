@@ -122,14 +122,13 @@ def glass_notices(primitives: Sequence[Primitive], materials: Sequence[Material]
     return notices
 
 
-def placed_primitives(
-    file: GltfFile, notices: list[str]
-) -> Iterator[tuple[Entry, Float64Array, Float64Array | None]]:
-    """Walk the scene and yield every drawable primitive with its matrix.
+Placed = tuple[Entry, Float64Array, Float64Array | None]
+"""A primitive and the matrix from its frame to the asset's, shape [4, 4]; for a skinned one the
+identity and the matrices of its joints, shape [joint, 4, 4]."""
 
-    Yields:
-        The primitive and the matrix from its frame to the asset's, shape [4, 4]; for a skinned one
-        the identity and the matrices of its joints, shape [joint, 4, 4].
+
+def placed_primitives(file: GltfFile, notices: list[str]) -> Iterator[Placed]:
+    """Walk the scene and yield every drawable primitive with its matrix.
 
     Raises:
         InputError: The nodes are not a forest, or a drawn transform is singular.
@@ -175,9 +174,7 @@ def placed_primitives(
                 yield primitive, matrix, joints
 
 
-def check_counts(
-    file: GltfFile, placed: list[tuple[Entry, Float64Array, Float64Array | None]]
-) -> None:
+def check_counts(file: GltfFile, placed: list[Placed]) -> None:
     """Refuse more triangles or vertices than the limit, before any is read."""
     triangle_count = vertex_count = 0
     for entry, _, _ in placed:

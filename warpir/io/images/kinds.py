@@ -6,7 +6,15 @@ from pathlib import Path
 
 from warpir.core.errors import InputError
 
-KINDS = ("jpeg", "png", "tiff", "webp", "exr", "hdr")
+_MAGIC = {
+    "jpeg": (b"\xff\xd8\xff",),
+    "png": (b"\x89PNG\r\n\x1a\n",),
+    "tiff": (b"II*\0", b"MM\0*", b"II+\0", b"MM\0+"),
+    "webp": (b"RIFF",),
+    "exr": (b"\x76\x2f\x31\x01",),
+    "hdr": (b"#?RADIANCE", b"#?RGBE"),
+}
+KINDS = tuple(_MAGIC)
 """Kinds that are read."""
 _MOST_SCANS = 100
 """Scans of a JPEG; encoders write about 10, and each of them costs a pass over the picture."""
@@ -47,22 +55,13 @@ def sniff(path: Path) -> tuple[str, bytes]:
     except OSError as error:
         what = f"cannot be read ({error.strerror})"
         raise InputError(path, what, reason="file.unreadable") from error
-    if head.startswith(b"\xff\xd8\xff"):
-        return "jpeg", head
-    if head.startswith(b"\x89PNG\r\n\x1a\n"):
-        return "png", head
-    if head[:4] in (b"II*\0", b"MM\0*", b"II+\0", b"MM\0+"):
-        if _is_raw_tiff(head):
-            what = "a camera raw file (what it holds as a picture is a thumbnail)"
-            advice = "export it as JPEG or 16-bit TIFF"
-            raise InputError(path, what, advice, reason="image.kind", found="camera raw")
-        return "tiff", head
-    if head.startswith(b"RIFF") and head[8:12] == b"WEBP":
-        return "webp", head
-    if head.startswith(b"\x76\x2f\x31\x01"):
-        return "exr", head
-    if head.startswith((b"#?RADIANCE", b"#?RGBE")):
-        return "hdr", head
+    for kind, starts in _MAGIC.items():
+        if head.startswith(starts) and (kind != "webp" or head[8:12] == b"WEBP"):
+            if kind == "tiff" and _is_raw_tiff(head):
+                what = "a camera raw file (what it holds as a picture is a thumbnail)"
+                advice = "export it as JPEG or 16-bit TIFF"
+                raise InputError(path, what, advice, reason="image.kind", found="camera raw")
+            return kind, head
     found = _foreign_kind(head)
     raise InputError(
         path,

@@ -18,7 +18,6 @@ from warpir.core.limits import LIMITS, Limits
 from warpir.core.strict_json import read_numbers, read_versioned
 from warpir.scene.asset import Asset, Material
 
-FORMAT = "warpir-materials"
 VERSION = 1
 MATERIALS = "materials.json"
 EMISSION_LIMIT = 1e12
@@ -87,4 +86,4 @@ def materials_to_json(before: Sequence[Material], after: Sequence[Material]) -> 
         {"name": new.name, **factors(new), "before": factors(old)}
         for old, new in zip(before, after, strict=True)
     ]
-    return {"format": FORMAT, "version": VERSION, "materials": entries}
+    return {"format": "warpir-materials", "version": VERSION, "materials": entries}
