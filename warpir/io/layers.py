@@ -164,11 +164,7 @@ def write_layers(
 
 
 def _checked_formula(layers: Layers) -> str:
-    """Return how the composite follows from the other layers, by the names of their channels.
-
-    Raises:
-        ValueError: It does not.
-    """
+    """Check how the composite follows from the other layers; return it, by channels' names."""
     formula = "RGB = fg.RGB + (1 - fg.A) * plate.RGB * shadow.RGB"
     added = []
     for name, plane in (("mirror", layers.mirror), ("grain", layers.grain)):
@@ -191,11 +187,7 @@ def _checked_formula(layers: Layers) -> str:
 def _stored_channels(
     layers: Layers, height: int, width: int, is_deep: bool
 ) -> tuple[dict[str, PixelArray], int]:
-    """Return the channels as they are stored, shape [height, width], and how many were clamped.
-
-    Raises:
-        ValueError: A layer is of another shape.
-    """
+    """Return the channels as they are stored, shape [height, width], and how many were clamped."""
     channels: dict[str, PixelArray] = {}
     clamped = 0
     for name in _CHANNELS:

@@ -159,11 +159,7 @@ def rigid(path: Path, name: str, rows: Any) -> Float64Array:
 
 
 def _affine(path: Path, pointer: str, rows: Any) -> Float64Array:
-    """Return a finite matrix whose last row is 0 0 0 1, [4, 4].
-
-    Raises:
-        InputError: The rows are no such matrix, or it is transposed.
-    """
+    """Return a finite matrix whose last row is 0 0 0 1, [4, 4], or refuse the file."""
     try:
         matrix = np.array(rows)
         if matrix.dtype.kind not in "if":

@@ -316,11 +316,7 @@ def _mirrored(p: Primitive) -> Primitive:
 
 
 def _blended_joints(file: GltfFile, entry: Entry, count: int, joints: Float64Array) -> Float64Array:
-    """Return the weighted mean of the joints of each vertex, shape [vertex, 4, 4].
-
-    Raises:
-        InputError: Joints or weights are damaged, or a vertex has no weight.
-    """
+    """Return the weighted mean of the joints of each vertex, shape [vertex, 4, 4]."""
     attributes = entry.child("attributes")
     moved = np.zeros((count, 4, 4))
     total = np.zeros(count)

@@ -280,11 +280,7 @@ def read_mask(
 
 
 def _check_grey(path: Path, codes: PixelArray) -> None:
-    """Refuse what is no mask: colours, floats beyond 0 to 1, and labels.
-
-    Raises:
-        InputError: With what was found.
-    """
+    """Refuse what is no mask: colours, floats beyond 0 to 1, and labels."""
     if codes.dtype.kind == "f" and not bool(((codes >= 0.0) & (codes <= 1.0)).all()):
         what = "not a mask (found floats outside 0 to 1, or not finite)"
         raise InputError(path, what, reason="mask.range")
@@ -334,11 +330,7 @@ def _radiance(path: Path, codes: PixelArray, image: DecodedImage, notices: list[
 
 
 def _check_brightness(path: Path, texels: FloatArray, notices: list[str]) -> None:
-    """Refuse radiance whose products would overflow; note a map that is black.
-
-    Raises:
-        InputError: The brightest value is beyond `RADIANCE_LIMIT`.
-    """
+    """Refuse radiance above `RADIANCE_LIMIT`; note a map that is black."""
     brightest = float(texels.max())
     if not brightest <= RADIANCE_LIMIT:
         raise InputError(
@@ -354,11 +346,7 @@ def _check_brightness(path: Path, texels: FloatArray, notices: list[str]) -> Non
 
 
 def _repair_radiance(path: Path, texels: FloatArray, strict: bool, notices: list[str]) -> None:
-    """Put finite, non-negative numbers in place of others, in the array given, with a notice.
-
-    Raises:
-        InputError: ``strict``, or no light is left.
-    """
+    """Put finite, non-negative numbers in place of others, in the array given, with a notice."""
     bad = ~np.isfinite(texels)
     negative = texels < 0.0
     negative &= ~bad

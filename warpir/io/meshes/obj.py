@@ -130,11 +130,7 @@ class Vertices:
 
 
 def _read_statements(path: Path, content: bytes, notices: list[str]) -> Statements:
-    """Read the lines of an OBJ file.
-
-    Raises:
-        InputError: A number or face is damaged, or this is no OBJ file.
-    """
+    """Read the lines of an OBJ file, or refuse it with the line at fault."""
     if b"\0" in content[:4096]:
         raise OBJ.error(path, "kind", found="no text")
     try:
@@ -202,11 +198,7 @@ def _logical_lines(text: str) -> Iterator[tuple[int, str]]:
 
 
 def _numbers(path: Path, line: int, word: str, values: list[str], width: int) -> list[float]:
-    """Return the first numbers of a statement.
-
-    Raises:
-        InputError: They are fewer, or not numbers that float32 holds.
-    """
+    """Return the first numbers of a statement, all of which float32 holds, or refuse it."""
     try:
         numbers = [float(value) for value in values[:width]]
         sound = len(numbers) == width and all(abs(number) < LARGEST for number in numbers)

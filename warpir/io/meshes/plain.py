@@ -81,11 +81,7 @@ def _asset(
     notices: list[str],
     hashes: dict[str, str],
 ) -> Asset:
-    """Return an asset of one material, which the file does not state.
-
-    Raises:
-        InputError: No triangle has an area.
-    """
+    """Return an asset of one material, which the file does not state."""
     indices = drop_without_area(positions, indices, notices)
     shading = None
     if normals is None:
@@ -113,11 +109,7 @@ def _asset(
 def _polygons(
     path: Path, corners: Lists, vertex_count: int, notices: list[str]
 ) -> dict[int, IntArray]:
-    """Return the faces as vertex indices, by number of corners, shape [polygon, corner].
-
-    Raises:
-        InputError: An index is out of range.
-    """
+    """Return the faces as vertex indices, by number of corners, shape [polygon, corner]."""
     used = corners.values
     if (used != np.round(used)).any():
         raise PLY.error(path, "index", found=float(used[used != np.round(used)][0]))
@@ -130,11 +122,7 @@ def _polygons(
 
 
 def _finite(path: Path, element: Element, names: tuple[str, ...]) -> Float64Array | None:
-    """Return columns of a PLY element, shape [row, column]; None when one is absent.
-
-    Raises:
-        InputError: One of the numbers is not finite.
-    """
+    """Return finite columns of a PLY element, shape [row, column]; None when one is absent."""
     table = element.table(*names)
     if table is not None and not (usable := np.abs(table) < LARGEST).all():
         row = int(np.flatnonzero(~usable.all(axis=1))[0])
