@@ -21,13 +21,13 @@ import pytest
 from PIL import Image
 
 from benchmarks.damage.mutations import places
-from tests.builders.development_data import MESHES, needs_shared
 from tests.builders.faults import assert_fails
 from tests.builders.gltf_files import CODES, CORNERS, NORMALS, TWO, UVS, Builder, png
 from tests.builders.image_files import png_header, write_image
 from tests.builders.insertions import arguments
 from tests.builders.refusals import unreadable
 from tests.builders.shapes import box
+from tests.development_data import MESHES, needs_shared
 from warpir.app.config import InsertConfig
 from warpir.core.errors import InputError
 from warpir.core.limits import LIMITS, Limits

@@ -11,9 +11,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from tests.builders.development_data import MESHES, needs_shared
 from tests.builders.gltf_files import CORNERS, NORMALS, UVS, Builder, png
 from tests.builders.programs.khronos import validate
+from tests.development_data import MESHES, needs_shared
 from tests.io.test_gltf import REAL, TANGENTS, instanced, node, skinned, sparse
 from tests.io.test_gltf_writer import EXTENDED, IDENTITY, everything, extended, patch, placed
 from warpir import demo

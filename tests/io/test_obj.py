@@ -15,8 +15,8 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from tests.builders.development_data import MESHES, needs_shared
 from tests.builders.refusals import unreadable
+from tests.development_data import MESHES, needs_shared
 from warpir.core.errors import InputError
 from warpir.core.limits import Limits
 from warpir.io.assets import load_asset

@@ -8,9 +8,9 @@ import OpenEXR
 import pytest
 from PIL import Image
 
-from tests.builders.development_data import SHARED, needs_shared
 from tests.builders.image_files import LOBES, codes8, directions, four_lobes, write_image
 from tests.builders.refusals import unreadable
+from tests.development_data import SHARED, needs_shared
 from tests.io.images.test_envmap_conventions import TOOLS
 from warpir.core import color
 from warpir.core.errors import InputError

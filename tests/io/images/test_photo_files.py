@@ -14,7 +14,6 @@ import OpenImageIO as oiio
 import pytest
 from PIL import Image, ImageCms, ImageOps
 
-from tests.builders.development_data import SHARED, needs_shared
 from tests.builders.image_files import (
     codes8,
     fixed,
@@ -27,6 +26,7 @@ from tests.builders.image_files import (
     write_image,
 )
 from tests.builders.refusals import unreadable
+from tests.development_data import SHARED, needs_shared
 from warpir.core import color
 from warpir.core.errors import InputError
 from warpir.io.images import color_profile
