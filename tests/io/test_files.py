@@ -634,22 +634,37 @@ def test_link_in_place_of_a_folder_is_refused(tmp_path: Path, name: str) -> None
     assert not list((tmp_path / "else").iterdir()) and (tmp_path / "out" / name).is_symlink()
 
 
+BLACK = np.zeros((2, 2, 3), np.uint8)
+
+
+def write_previews(out: Path, *steps: int, codes: np.ndarray = BLACK, **options: bool) -> None:
+    """Make a run that shows previews and has a result."""
+    with OutputFolder(out, **options) as folder:
+        for step in steps:
+            folder.write_preview(step, codes)
+        folder.write_json("run.json", {})
+
+
+def assert_shown(out: Path, *steps: int) -> None:
+    """Check that these previews stand in their place, and no others anywhere."""
+    names = [f"preview-{step:06d}.png" for step in steps]
+    assert sorted(p.name for p in (out / "progress").iterdir()) == names
+    assert not (out / "progress-new").exists()
+
+
 @pytest.mark.case("N8")
 @pytest.mark.parametrize("turn", ["killed before", "killed at the commit", "not killed"])
 def test_previews_of_an_earlier_result_stay_until_it_is_replaced(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, turn: str
 ) -> None:
     """Those of the new run stand beside them, and come with its result, also after a kill."""
-    out, codes = tmp_path / "out", np.zeros((2, 2, 3), np.uint8)
-    with OutputFolder(out) as folder:
-        folder.write_preview(0, codes)
-        folder.write_preview(50, codes)
-        folder.write_json("run.json", {})
+    out = tmp_path / "out"
+    write_previews(out, 0, 50)
     old = (out / "progress" / "preview-000000.png").read_bytes()
     killed = RuntimeError("stands for a kill: nothing of ours runs after it")
     try:
         with OutputFolder(out, overwrite=True) as folder:
-            assert folder.write_preview(0, codes + 255).parent.name == "progress-new"
+            assert folder.write_preview(0, BLACK + 255).parent.name == "progress-new"
             assert (out / "progress" / "preview-000000.png").read_bytes() == old
             folder.write_json("run.json", {})
             if turn == "killed before":
@@ -659,21 +674,17 @@ def test_previews_of_an_earlier_result_stay_until_it_is_replaced(
     except RuntimeError as error:
         assert error is killed
         assert (out / "progress" / "preview-000000.png").read_bytes() == old
-        with OutputFolder(out, overwrite=True) as folder:
-            folder.write_json("run.json", {})
-    assert [p.name for p in (out / "progress").iterdir()] == ["preview-000000.png"]
+        write_previews(out, overwrite=True)
+    assert_shown(out, 0)
     assert (out / "progress" / "preview-000000.png").read_bytes() != old
-    assert not (out / "progress-new").exists()
 
 
 def test_kill_between_two_results_loses_no_preview(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Killed when it moves its folder of previews, or removes it; then it goes on to write one."""
-    out, codes = tmp_path / "out", np.zeros((2, 2, 3), np.uint8)
-    with OutputFolder(out) as folder:
-        folder.write_preview(0, codes)
-        folder.write_json("run.json", {})
+    out = tmp_path / "out"
+    write_previews(out, 0)
     replace, rmdir = os.replace, Path.rmdir
 
     def replace_or_die(source: Path, target: Path) -> None:
@@ -689,31 +700,17 @@ def test_kill_between_two_results_loses_no_preview(
     with monkeypatch.context() as patch:
         patch.setattr(os, "replace", replace_or_die)
         patch.setattr(Path, "rmdir", remove_or_die)
-        with (
-            pytest.raises(RuntimeError, match="killed"),
-            OutputFolder(out, overwrite=True) as folder,
-        ):
-            folder.write_preview(0, codes + 255)
-            folder.write_json("run.json", {})
-    with OutputFolder(out, overwrite=True) as folder:
-        folder.write_preview(50, codes + 255)
-        folder.write_json("run.json", {})
-    shown = sorted(p.name for p in (out / "progress").iterdir())
-    assert shown == ["preview-000000.png", "preview-000050.png"]
-    assert not (out / "progress-new").exists()
+        with pytest.raises(RuntimeError, match="killed"):
+            write_previews(out, 0, codes=BLACK + 255, overwrite=True)
+    write_previews(out, 50, codes=BLACK + 255, overwrite=True)
+    assert_shown(out, 0, 50)
 
 
 def test_run_resumed_beside_its_own_result_keeps_its_previews(tmp_path: Path) -> None:
     """Killed between its result and the end of its checkpoints; the last step is done again."""
-    out, codes = tmp_path / "out", np.zeros((2, 2, 3), np.uint8)
-    for kept in ([0, 50], [50]):
-        with OutputFolder(out, overwrite=True, is_resumed=kept == [50]) as folder:
-            for step in kept:
-                folder.write_preview(step, codes)
-            folder.write_json("run.json", {})
-    shown = sorted(p.name for p in (out / "progress").iterdir())
-    assert shown == ["preview-000000.png", "preview-000050.png"]
-    assert not (out / "progress-new").exists()
+    write_previews(tmp_path, 0, 50)
+    write_previews(tmp_path, 50, overwrite=True, is_resumed=True)
+    assert_shown(tmp_path, 0, 50)
 
 
 @pytest.mark.case("R6")

@@ -50,8 +50,8 @@ def write_hand_off(
     placement: Placement,
     curves: Curves,
     texels: FloatArray,
-    envmap: str = "envmap.exr",
-    response: ToneKnots | None = None,
+    envmap: str,
+    response: ToneKnots | None,
 ) -> tuple[dict[str, Any], tuple[str, ...]]:
     """Stage the files for other tools.
 

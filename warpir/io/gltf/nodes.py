@@ -191,7 +191,7 @@ class Skins:
         return self._worlds[joint]
 
 
-def check_invertible(node: Entry, world: Float64Array, which: str = "") -> None:
+def check_invertible(node: Entry, world: Float64Array, which: str) -> None:
     """Refuse a transform that flattens the mesh or overflows."""
     linear = world[:3, :3]
     if not (np.abs(world) < EXTENT).all():

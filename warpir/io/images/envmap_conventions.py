@@ -36,6 +36,8 @@ SEAM_SHIFTS = {
 
 IN_CAMERA_AXES = frozenset({"diffusionlight"})
 """Conventions whose directions refer to the camera instead of the world."""
+SIDE = 3
+"""Directions along a texel's side that are averaged where a map is tilted."""
 
 
 def to_ours(
@@ -80,24 +82,23 @@ def _rotation(convention: str, camera_to_world: Float64Array | None) -> Float64A
     return np.asarray(camera_to_world, np.float64)[:3, :3]
 
 
-def rotate_directions(texels: FloatArray, rotation: Float64Array, side: int = 3) -> FloatArray:
+def rotate_directions(texels: FloatArray, rotation: Float64Array) -> FloatArray:
     """Turn a map by any rotation; one about +Y is left to `rotate_map`, which keeps each row's sum.
 
     Args:
         texels: Radiance in our orientation, shape [He, 2 He, 3].
         rotation: Takes a direction of the given map to one of the result, shape [3, 3].
-        side: Directions along a texel's side that are averaged.
     """
     if np.allclose(rotation[1], (0.0, 1.0, 0.0), atol=1e-7):
         return rotate_map(texels, float(np.degrees(np.arctan2(rotation[0, 2], rotation[0, 0]))))
     height, width = texels.shape[:2]
     turned = np.zeros(texels.shape)
-    fine = map_directions(height * side, width * side).reshape(height, side, width, side, 3)
+    fine = map_directions(height * SIDE, width * SIDE).reshape(height, SIDE, width, SIDE, 3)
     # Within a texel, the points nearer to a pole stand for less of the sphere.
-    share = np.cos(latitudes(height * side)).reshape(height, side)
+    share = np.cos(latitudes(height * SIDE)).reshape(height, SIDE)
     share = share / share.sum(axis=1, keepdims=True)
-    for i in range(side):
-        for j in range(side):
+    for i in range(SIDE):
+        for j in range(SIDE):
             seen = look_up(texels, fine[:, i, :, j] @ rotation)
-            turned += (share[:, i] / side)[:, None, None] * seen
+            turned += (share[:, i] / SIDE)[:, None, None] * seen
     return turned.astype(np.float32)
