@@ -10,7 +10,7 @@ import sys
 from collections.abc import Sequence
 
 from warpir.app.command import flags_of, make_parser, read_arguments, read_values
-from warpir.app.config import InsertConfig, flag, usage
+from warpir.app.config import InsertConfig, usage
 from warpir.app.program import run_program, say, stay_offline
 from warpir.core.errors import ExitCode
 
@@ -43,8 +43,7 @@ def _run(arguments: list[str]) -> int:
     parser.add_argument("--json", metavar="FILE", help="Write the figures to this file too")
     texts = read_arguments(parser, arguments)
     path = texts.pop("json", None)
-    values = read_values({name: (text, flag(name)) for name, text in texts.items()})
-    config = InsertConfig(**values)
+    config = InsertConfig(**read_values(texts))
     if config.diffusion.model is None:
         raise usage("--model", "needed", "a folder in diffusers' layout, or a hub id")
 

@@ -5,7 +5,7 @@ so that ``--place -1,0,-3``, ``place: [-1, 0, -3]`` and ``"place": "-1,0,-3"`` m
 """
 
 import argparse
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 from typing import Any, NoReturn, get_args
@@ -95,7 +95,7 @@ def parse(argv: Sequence[str]) -> Command:
     if path is not None:
         filed = read_config_file(path, _limits_for_config(texts))
         raise_all([_not_by_hand(path, n) for n in BY_HAND if filed.get(n) and n not in texts])
-    config = InsertConfig(**read_values({n: (v, flag(n)) for n, v in (filed | texts).items()}))
+    config = InsertConfig(**read_values(filed | texts))
     notices = tuple(
         f"{flag(name)} given at the command line replaces the value in {path}"
         for name in texts
@@ -113,27 +113,28 @@ def _not_by_hand(path: str, name: str) -> InputError:
 def _limits_for_config(texts: Mapping[str, Any]) -> Limits:
     """Return the limits of the configuration file itself, which flags alone can set."""
     names = ("max_json_bytes", "max_json_values", "max_nesting")
-    values = read_values({name: (texts[name], flag(name)) for name in names if name in texts})
-    return InsertConfig(**values).limits
+    given = {name: texts[name] for name in names if name in texts}
+    return InsertConfig(**read_values(given)).limits
 
 
-def read_values(given: Mapping[str, tuple[Any, str]]) -> dict[str, Any]:
+def read_values(given: Mapping[str, Any], where: Callable[[str], str] = flag) -> dict[str, Any]:
     """Convert flags' texts or a file's plain values by the types of their fields.
 
     Args:
-        given: By the field's name, the value and where it stands.
+        given: Values by their fields' names.
+        where: What a field is called in errors: by default its flag, for a file's keys ``str``.
 
     Raises:
         InputError: A value cannot be read as its field's type (`ExitCode.USAGE`).
     """
     values, problems = {}, []
-    for name, (value, where) in given.items():
+    for name, value in given.items():
         option = OPTIONS[name]
         try:
             values[name] = convert(value, option.kind, option.rule.separator)
         except ValueError:
             expected = _expected(option)
-            problems.append(usage(where, f"expected {expected} (found {_shown(value)})"))
+            problems.append(usage(where(name), f"expected {expected} (found {_shown(value)})"))
     raise_all(problems)
     return values
 

@@ -31,8 +31,7 @@ def is_done(config: InsertConfig, filled: InsertConfig | None = None) -> bool:
         OtherRun: It holds the whole result of another one.
         InputError: It holds something else.
     """
-    assert config.output.out is not None
-    out = Path(config.output.out)
+    out = config.output.folder
     if out.is_symlink():
         raise _something_else(out, "a link")
     if config.output.overwrite or not out.is_dir():
@@ -58,7 +57,7 @@ def config_of_record(values: dict[str, Any]) -> InsertConfig:
     Raises:
         InputError: A value is none of its field's.
     """
-    return InsertConfig(**read_values({name: (value, name) for name, value in values.items()}))
+    return InsertConfig(**read_values(values, str))
 
 
 def _same(config: InsertConfig, filled: InsertConfig, record: dict[str, Any]) -> bool:

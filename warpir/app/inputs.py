@@ -148,7 +148,7 @@ def _joined(config: InsertConfig, files: _Files) -> Inputs:
     Raises:
         InputError: There is no place for it, or no ground.
     """
-    straight = _straightened(files)
+    straight, undistorted_by = _straightened(files)
     world = make_world(config.camera, config.placement.place, files.view, files.points)
     mesh = None if files.proxy is None else mesh_of(files.proxy)
     placement = stand_on_ground(config.placement, files.asset, world, mesh, config.camera.plane)
@@ -168,9 +168,9 @@ def _joined(config: InsertConfig, files: _Files) -> Inputs:
         shadow_mask=shade,
         lamps=files.lamps,
         assumed=tuple(_assumptions(config, files, world, placement, shade)),
-        notices=tuple(_notices(config, files, straight, world, placement, mesh)),
+        notices=tuple(_notices(config, straight, world, placement, mesh)),
         occluder=straight.occluder,
-        measured=straight.measured | world.measured | {"camera": world.camera.numbers()},
+        measured=undistorted_by | world.measured | {"camera": world.camera.numbers()},
         hashes=files.hashes,
     )
 
@@ -270,30 +270,17 @@ def _hashes_beside(config: InsertConfig, asset: Asset, proxy: Asset | None) -> d
     return hashes
 
 
-@dataclass(frozen=True)
-class _Straight:
-    """Photo and masks without the lens' distortion."""
-
-    photo: Photo
-    occluder: FloatArray | None
-    shaded: FloatArray | None
-    measured: dict[str, Any]
-    """What ``run.json`` says of it."""
-
-
-def _straightened(files: _Files) -> _Straight:
+def _straightened(files: _Files) -> tuple[_Files, dict[str, Any]]:
+    """Undo the lens' distortion in photo and masks; return also what ``run.json`` says of it."""
     view = files.view
     if view.lens.is_straight:
-        return _Straight(files.photo, files.occluder, files.shaded, {})
+        return files, {}
     photo, border = undistort_photo(files.photo, view.camera, view.lens)
-    masks = [mask for mask in (files.occluder, files.shaded) if mask is not None]
-    bent = iter(undistorted(masks, view.camera, view.lens)[0])
-    return _Straight(
-        photo,
-        None if files.occluder is None else next(bent),
-        None if files.shaded is None else next(bent),
-        {"undistorted": {**view.lens.record(), "border_share": border}},
-    )
+    masks = {"occluder": files.occluder, "shaded": files.shaded}
+    given = {name: mask for name, mask in masks.items() if mask is not None}
+    bent, _ = undistorted([*given.values()], view.camera, view.lens)
+    measured = {"undistorted": {**view.lens.record(), "border_share": border}}
+    return replace(files, photo=photo, **dict(zip(given, bent, strict=True))), measured
 
 
 def _assumptions(
@@ -322,7 +309,6 @@ def _assumptions(
 def _notices(
     config: InsertConfig,
     files: _Files,
-    straight: _Straight,
     world: PhotoWorld,
     placement: Placement,
     mesh: ReceiverMesh | None,
@@ -330,7 +316,7 @@ def _notices(
     """Yield what was repaired, converted, left out or looks odd."""
     assert config.inputs.photo is not None and config.inputs.asset is not None
     camera, run = world.camera, files.run
-    yield from _about(config.inputs.photo, straight.photo.notices)
+    yield from _about(config.inputs.photo, files.photo.notices)
     yield from _about(config.inputs.asset, files.asset.notices)
     if config.camera.proxy and files.proxy:
         yield from _about(config.camera.proxy, files.proxy.notices)

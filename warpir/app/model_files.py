@@ -52,15 +52,18 @@ def require_model(config: InsertConfig) -> None:
 
 def _model_width(asked: ModelSettings) -> int | None:
     """Check the folder of Stable Diffusion; return the width of its prompts' embeddings."""
+    if asked.allow_download and not os.path.isdir(asked.model or ""):
+        return None
+    width: int = _checked_folder(asked).configs["unet"]["cross_attention_dim"]
+    return width
+
+
+def _checked_folder(asked: ModelSettings) -> "ModelFolder":
     from warpir.diffusion.models.hub import find_model
     from warpir.diffusion.models.model_folder import check_model_folder
 
-    if asked.allow_download and not os.path.isdir(asked.model or ""):
-        return None
     found = find_model(asked.model, allow_download=False, allow_pickle=asked.allow_pickle)
-    folder = check_model_folder(found, asked.allow_pickle)
-    width: int = folder.configs["unet"]["cross_attention_dim"]
-    return width
+    return check_model_folder(found, asked.allow_pickle)
 
 
 def model_hashes(asked: ModelSettings) -> dict[str, str] | None:
@@ -68,12 +71,8 @@ def model_hashes(asked: ModelSettings) -> dict[str, str] | None:
 
     None: there is no such model now, or it is damaged.
     """
-    from warpir.diffusion.models.hub import find_model
-    from warpir.diffusion.models.model_folder import check_model_folder
-
     try:
-        found = find_model(asked.model, allow_download=False, allow_pickle=asked.allow_pickle)
-        folder = check_model_folder(found, asked.allow_pickle)
+        folder = _checked_folder(asked)
         states = [(file, file.stat()) for file in folder.files]
         return dict(
             _hash(folder, file, (state.st_ino, state.st_size, state.st_mtime_ns))

@@ -192,10 +192,8 @@ def _status_of(run: Callable[[list[str]], int], arguments: list[str]) -> int:
             signals.ignore()
             status, lines = explain(error)
             with suppress(OSError):  # nobody can read it: the status says it all
-                if debug and not isinstance(error, SystemExit):
-                    traceback.print_exc()
-                elif status == ExitCode.BUG:
-                    # Without --debug too: without it nobody could repair what is our fault.
+                # Without --debug too what is our fault, which nobody could repair without it.
+                if status == ExitCode.BUG or (debug and not isinstance(error, SystemExit)):
                     traceback.print_exc()
                 for line in lines:
                     print(line, file=sys.stderr, flush=True)

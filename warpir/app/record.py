@@ -6,7 +6,7 @@ import os
 import platform
 import sys
 import time
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -15,7 +15,6 @@ import warpir
 from warpir.app.config import InsertConfig
 from warpir.core.atomic import sha256_of
 from warpir.core.errors import InputError
-from warpir.core.memory import peak_mib
 
 OF_THE_RUN = ("out", "overwrite", "resume", "threads", "report")
 """Settings that change nothing in a result, so that its pictures do not hold them."""
@@ -54,42 +53,6 @@ class Timings:
     def rounded(self) -> dict[str, float]:
         """Return seconds by stage as they are told, to the millisecond."""
         return {name: round(spent, 3) for name, spent in self.seconds.items()}
-
-
-def run_record(
-    values: Mapping[str, Any],
-    *,
-    inputs: Mapping[str, str],
-    device: str,
-    timings: Timings,
-    assumed: Sequence[str] = (),
-    notices: Sequence[str] = (),
-    measured: Mapping[str, Any] | None = None,
-) -> dict[str, Any]:
-    """Return the content of ``run.json``; ``--config run.json`` runs it again.
-
-    Args:
-        values: What was asked for, from `InsertConfig.flat`.
-        inputs: sha256 of the files that were read, from `warpir.app.inputs.Inputs.hashes`.
-        device: What computed it, such as ``cpu`` or the name of a card.
-        timings: Seconds by stage.
-        assumed: What was chosen because nothing was given, one line each.
-        notices: What was repaired, converted or left out, one line each.
-        measured: Plain numbers about the result, such as photometry and clamped pixels.
-    """
-    return {
-        "format": RUN_FORMAT,
-        "warpir": warpir.__version__,
-        "config": dict(values),
-        "inputs": dict(inputs),
-        "assumed": list(assumed),
-        "notices": list(notices),
-        "measured": dict(measured or {}),
-        "device": device,
-        "versions": versions(),
-        "seconds": timings.rounded(),
-        "peak_mib": peak_mib(),
-    }
 
 
 def config_of_picture(values: Mapping[str, Any]) -> dict[str, Any]:

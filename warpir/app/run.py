@@ -9,12 +9,20 @@ from typing import Any
 
 import numpy as np
 
+import warpir
 from warpir.app.config import InsertConfig
 from warpir.app.inputs import Inputs
-from warpir.app.record import Timings, run_record
+from warpir.app.record import RUN_FORMAT, Timings, versions
 from warpir.core.cache import take_notices
 from warpir.core.errors import ExitCode, InputError
-from warpir.core.memory import PHOTO_BYTES, Memory, Need, needs_of_scene, share_device
+from warpir.core.memory import (
+    PHOTO_BYTES,
+    Memory,
+    Need,
+    needs_of_scene,
+    peak_mib,
+    share_device,
+)
 from warpir.core.progress import Log, StepProgress
 from warpir.io.results import OutputFolder
 
@@ -100,24 +108,28 @@ class Run:
     def record(
         self, asked: Mapping[str, Any], device: str, measured: Mapping[str, Any]
     ) -> dict[str, Any]:
-        """Return the content of ``run.json``; see `warpir.app.record.run_record`.
+        """Return the content of ``run.json``; ``--config run.json`` runs it again.
 
         Args:
             asked: What was asked for, from `InsertConfig.flat`; how the folder was found is left
                 out, as a resumed run leaves what an uninterrupted one does. The demo's files are no
                 part of it.
-            device: Name of what computed it.
-            measured: Plain numbers about the result.
+            device: Name of what computed it, such as ``cpu`` or that of a card.
+            measured: Plain numbers about the result, such as photometry and clamped pixels.
         """
-        return run_record(
-            {**asked, "resume": False, "overwrite": False},
-            inputs=self.inputs.hashes,
-            device=device,
-            timings=self.timings,
-            assumed=self.log.assumed,
-            notices=self.log.notices,
-            measured=measured,
-        )
+        return {
+            "format": RUN_FORMAT,
+            "warpir": warpir.__version__,
+            "config": {**asked, "resume": False, "overwrite": False},
+            "inputs": dict(self.inputs.hashes),
+            "assumed": list(self.log.assumed),
+            "notices": list(self.log.notices),
+            "measured": dict(measured),
+            "device": device,
+            "versions": versions(),
+            "seconds": self.timings.rounded(),
+            "peak_mib": peak_mib(),
+        }
 
 
 def needed_bytes(config: InsertConfig, inputs: Inputs) -> int:

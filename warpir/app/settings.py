@@ -8,6 +8,7 @@ they state one, else ours. What is None is open: it follows from other values.
 """
 
 from dataclasses import dataclass
+from pathlib import Path
 
 from warpir.core.options import option
 from warpir.diffusion.settings import GuidanceSettings
@@ -413,3 +414,9 @@ class OutputConfig:
     """Write a scene of Mitsuba 3 as well; the insertion, into a folder of its own"""
     usd: bool = option(False)
     """Write scene.usdz for OpenUSD as well; object, light and camera (pip install 'warpir[usd]')"""
+
+    @property
+    def folder(self) -> Path:
+        """`out` of a configuration that names it, as `InsertConfig.require_inputs` demands."""
+        assert self.out is not None
+        return Path(self.out)

@@ -16,7 +16,7 @@ from pathlib import Path
 from typing import Any
 
 from warpir.app.command import FLAGS, make_parser, read_arguments, read_values
-from warpir.app.config import InsertConfig, flag, usage
+from warpir.app.config import InsertConfig, usage
 from warpir.app.program import require_packages, run_program, say
 from warpir.batch.manifest import read_manifest
 from warpir.batch.page import PAGE
@@ -131,7 +131,7 @@ def _read_arguments(arguments: list[str]) -> tuple[Options, dict[str, Any]]:
         texts.pop("all_or_nothing", False),
         texts.pop("overwrite", False),
     )
-    return options, read_values({name: (text, flag(name)) for name, text in texts.items()})
+    return options, read_values(texts)
 
 
 def _refuse_other_files(options: Options) -> None:

@@ -1,6 +1,5 @@
 """Worker processes on this machine: each does one scene after another; the dead are replaced."""
 
-import logging
 import multiprocessing
 import os
 import signal
@@ -12,6 +11,7 @@ from concurrent.futures.process import BrokenProcessPool
 from contextlib import contextmanager, suppress
 from multiprocessing.process import BaseProcess
 
+from warpir.app.program import silence_warnings
 from warpir.batch.task import Answer, Task, do_task
 from warpir.core.errors import ExitCode
 
@@ -142,8 +142,7 @@ def _begin() -> None:
     os.setpgid(0, 0)
     signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGINT})
     os.dup2(2, 1)  # what libraries print outside of a scene is no line of the batch's
-    logging.captureWarnings(True)
-    logging.getLogger("py.warnings").addHandler(logging.NullHandler())
+    silence_warnings()
     threading.Thread(target=_end_with_parent, daemon=True).start()
 
 

@@ -118,7 +118,7 @@ def _config(
         [usage(where, f"{key}: not for a line", OF_THE_BATCH[key]) for key in given
          if key in OF_THE_BATCH]
     )  # fmt: skip
-    changes = read_values({name: (value, name) for name, value in given.items()})
+    changes = read_values(given, str)
     changes = {name: _absolute(folder, name, value) for name, value in changes.items()}
     values = {**shared, **replaced_by(changes, DEFAULTS), **changes}
     if str(values.get("device")).startswith("cuda:"):

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 from urllib.parse import quote
 
 from warpir.batch.scene import LOGS, STATES, Scene
+from warpir.batch.task import DONE_BEFORE
 from warpir.core.errors import InputError
-from warpir.core.limits import LIMITS
 from warpir.core.progress import duration
 from warpir.report.facts import without_folders
 from warpir.report.html import render_page
@@ -38,7 +39,7 @@ def batch_page(manifest: Path, out: Path, scenes: Sequence[Scene], seconds: floa
         scenes=[
             _card(scene, out, k % every == 0)
             for k, scene in enumerate(scenes)
-            if scene.state in ("done", "done before")
+            if scene.state in ("done", DONE_BEFORE)
         ],
     )
 
@@ -61,15 +62,14 @@ def _card(scene: Scene, out: Path, has_picture: bool) -> dict[str, Any]:
     folder = out / str(scene.row.name)
     pages = (REPORT, "sequence.html", "composite.png", "sequence.json")
     target = next((name for name in pages if (folder / name).is_file()), "run.json")
-    picture = None
     path = folder / "composite.png"
     if target == "sequence.html" or not path.is_file():
         path = next(iter(sorted(folder.glob("[0-9]*/composite.png"))), path)
+    picture = None
     if has_picture:
-        try:
-            picture = thumbnail(path, _limit(scene))
-        except InputError:  # removed meanwhile: the link is what is left
-            picture = None
+        assert scene.row.config is not None
+        with suppress(InputError):  # removed meanwhile: the link is what is left
+            picture = thumbnail(path, scene.row.config.limits.pixels)
     return {
         "name": scene.title,
         "target": quote(f"{scene.row.name}/{target}"),
@@ -78,8 +78,3 @@ def _card(scene: Scene, out: Path, has_picture: bool) -> dict[str, Any]:
         "seconds": f"{scene.seconds:.1f} s" if scene.seconds else "",
         "retries": len(scene.retries),
     }
-
-
-def _limit(scene: Scene) -> int:
-    config = scene.row.config
-    return LIMITS.pixels if config is None else config.limits.pixels

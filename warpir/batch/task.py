@@ -109,7 +109,6 @@ def do_task(task: Task) -> Answer:
 
 def _check(task: Task) -> dict[str, Any]:
     config = config_of_record(task.config)
-    assert config.output.out is not None
     if config.task.sequence is not None:
         return _check_sequence(config)
     filled = _filled(config)
@@ -121,9 +120,9 @@ def _check(task: Task) -> dict[str, Any]:
     config = filled
     inputs = read_inputs(config)
     make_light(inputs, config.light, config.tone_operator)
-    OutputFolder(str(config.output.out), overwrite=True).check()  # what is in it was looked at
+    OutputFolder(config.output.folder, overwrite=True).check()  # what is in it was looked at
     disk = needed_bytes(config, inputs)
-    require_space(str(config.output.out), disk)
+    require_space(config.output.folder, disk)
     return {
         "is_done": False,
         "memory": _memory(config, inputs),
@@ -151,7 +150,6 @@ def _memory(config: InsertConfig, inputs: Inputs) -> int:
 
 
 def _check_sequence(config: InsertConfig) -> dict[str, Any]:
-    assert config.output.out is not None
     memory, disk = [0], [0]
 
     def look_at(frame: Frame, inputs: Inputs) -> None:
@@ -161,7 +159,7 @@ def _check_sequence(config: InsertConfig) -> dict[str, Any]:
 
     frames = read_sequence(config, Loaders(), renews=True, look_at=look_at)
     refuse_other_page(config)
-    OutputFolder(config.output.out, overwrite=True).check()
+    OutputFolder(config.output.folder, overwrite=True).check()
     return {
         "is_done": is_whole(config, frames),
         "memory": max(memory),
@@ -172,13 +170,12 @@ def _check_sequence(config: InsertConfig) -> dict[str, Any]:
 
 def _insert(task: Task) -> dict[str, Any]:
     config = config_of_record(task.config)
-    assert config.output.out is not None
     if not config.diffusion.allow_download:
         stay_offline()
     if config.task.sequence is not None:
         insert(config, renews=True)
         return {"how": "done"}
-    out = Path(config.output.out)
+    out = config.output.folder
     is_fresh = replaces = config.output.overwrite
     try:
         if is_done(config, _filled(config)):

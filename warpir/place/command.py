@@ -84,8 +84,7 @@ def _run(arguments: list[str]) -> int:
     texts = read_arguments(parser, arguments)
     port = _port(texts.pop("port", "0"))
     opens, once = not texts.pop("no_browser", False), texts.pop("once", False)
-    config = InsertConfig(**read_values({name: (text, flag(name)) for name, text in texts.items()}))
-    config = _with_inputs(config)
+    config = _with_inputs(InsertConfig(**read_values(texts)))
 
     from warpir.io.lamps_file import given_lamps
     from warpir.place.answers import Answers

@@ -20,7 +20,7 @@ import numpy as np
 
 from warpir.app.command import read_values
 from warpir.app.config import DEFAULTS, SKY_PRESETS, InsertConfig
-from warpir.app.inputs import Loaders, read_asset
+from warpir.app.inputs import Loaders, read_asset, read_photo_of
 from warpir.app.photo_world import (
     NO_PLACE,
     PhotoWorld,
@@ -39,7 +39,7 @@ from warpir.core.progress import Log
 from warpir.core.strict_json import json_bytes
 from warpir.io.cameras.source import focal_length, number
 from warpir.io.gltf.writer import write_glb
-from warpir.io.images.photos import Photo, read_photo
+from warpir.io.images.photos import Photo
 from warpir.io.lamps_file import LAMPS
 from warpir.lighting.scene_light import SKIES, SUN_TO_SKY
 from warpir.place.lamps import lamps_file, page_lamps
@@ -106,21 +106,31 @@ def open_session(
     """
     assert inputs.photo is not None and inputs.asset is not None
     log = Log()
-    photo = read_photo(
-        inputs.photo,
-        max_pixels=limits.pixels,
-        alpha=inputs.alpha,
-        layer=inputs.layer,
-        strict=inputs.strict,
-    )
-    name = Path(inputs.photo).name
+    photo, name = read_photo_of(inputs, limits), Path(inputs.photo).name
     asset = read_asset(inputs, limits, Loaders(), log)
-    start = _Start(photo, name, asset, placement, limits)
-    world, asset_to_world, lines = start.seen_by(camera)
+
+    def seen_by(asked: CameraConfig) -> tuple[PhotoWorld, Float64Array, list[str]]:
+        view = photo_camera(asked, photo, name, estimate_photo, limits)
+        world = make_world(asked, placement.place, view, None)
+        try:
+            placed = stand_on_ground(placement, asset, world)
+        except InputError as error:
+            if is_estimated(view.camera):
+                world, pose, lines = seen_by(replace(asked, source="assume"))
+                return world, pose, [NO_PLACE, *lines]
+            named = (placement.place, placement.at, placement.scale, placement.size)
+            if any(value is not None for value in named):
+                raise
+            # It is here that this can be put right: begin with something that is seen.
+            pose = _in_view(asset, world.camera, world.ground, placement.rotate_y)
+            return world, pose, [f"{error.what}: it starts in front of the camera, and smaller"]
+        return world, placed.asset_to_world, [*placed.assumed, *placed.warnings]
+
+    world, asset_to_world, lines = seen_by(camera)
     assumed = [*log.assumed, *world.camera.assumed, *world.camera.notices, *lines]
     return Session(
         photo,
-        Path(inputs.photo).name,
+        name,
         asset,
         Path(inputs.asset).name,
         world.camera,
@@ -129,40 +139,6 @@ def open_session(
         placement.rotate_y,
         tuple(assumed),
     )
-
-
-@dataclass(frozen=True)
-class _Start:
-    """What the page starts with, but for the camera."""
-
-    photo: Photo
-    photo_name: str
-    asset: Asset
-    placement: PlacementConfig
-    limits: Limits
-
-    def seen_by(self, asked: CameraConfig) -> tuple[PhotoWorld, Float64Array, list[str]]:
-        """Return camera and ground, the asset's pose, and what is to be said of it.
-
-        Raises:
-            InputError: The camera cannot be used, or the place that was named is not in the photo.
-        """
-        view = photo_camera(asked, self.photo, self.photo_name, estimate_photo, self.limits)
-        world = make_world(asked, self.placement.place, view, None)
-        try:
-            placed = stand_on_ground(self.placement, self.asset, world)
-        except InputError as error:
-            if is_estimated(view.camera):
-                world, pose, lines = self.seen_by(replace(asked, source="assume"))
-                return world, pose, [NO_PLACE, *lines]
-            asked_for = self.placement
-            named = (asked_for.place, asked_for.at, asked_for.scale, asked_for.size)
-            if any(value is not None for value in named):
-                raise
-            # It is here that this can be put right: begin with something that is seen.
-            pose = _in_view(self.asset, world.camera, world.ground, asked_for.rotate_y)
-            return world, pose, [f"{error.what}: it starts in front of the camera, and smaller"]
-        return world, placed.asset_to_world, [*placed.assumed, *placed.warnings]
 
 
 def _in_view(
@@ -293,7 +269,7 @@ def placement_files(
     x, y, z = (float(c) for c in (session.frame @ (stand[0], 0.0, stand[1], 1.0))[:3])
     sets = ("rotate_y", "size", "sun", "sky")
     given = {name: sent[name] for name in sets if sent.get(name) is not None}
-    chosen = read_values({k: (v, f"--{k.replace('_', '-')}") for k, v in given.items()})
+    chosen = read_values(given)
     config = InsertConfig(place=(x, y, z), **chosen)
     place_asset(
         *session.asset.bounds(),

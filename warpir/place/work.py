@@ -22,7 +22,7 @@ import numpy as np
 from PIL import Image
 
 from warpir.app.command import read_values
-from warpir.app.config import InsertConfig, flag
+from warpir.app.config import InsertConfig
 from warpir.app.inputs import Inputs, read_inputs
 from warpir.app.program import explain, silence_warnings
 from warpir.core.color import codes_of
@@ -63,7 +63,7 @@ def estimated_light(job: Mapping[str, Any], say: Say) -> dict[str, Any]:
     """
     from warpir.lighting.visible_sun import with_visible_sun
 
-    config, camera = config_of(job["config"]), camera_of(job["camera"])
+    config, camera = InsertConfig(**read_values(job["config"])), camera_of(job["camera"])
     found = KEPT.regression(config, camera)
     photo = KEPT.photo(config.inputs, config.limits)
     return light_record(with_visible_sun(found, photo.srgb, camera))
@@ -86,7 +86,7 @@ def render_preview(job: Mapping[str, Any], say: Say) -> dict[str, Any]:
     from warpir.render.device import keep_kernels
     from warpir.render.picture.planes import Quality
 
-    config = config_of(job["config"])
+    config = InsertConfig(**read_values(job["config"]))
     inputs, lit, renderer = _prepared(config, int(job["width"]), say)
     picture = make_picture(
         renderer,
@@ -115,7 +115,7 @@ def warm_up(job: Mapping[str, Any], say: Say) -> dict[str, Any]:
     """
     from warpir.render.device import keep_kernels
 
-    _, _, renderer = _prepared(config_of(job["config"]), int(job["width"]), say)
+    _, _, renderer = _prepared(InsertConfig(**read_values(job["config"])), int(job["width"]), say)
     renderer.load_kernels()
     keep_kernels()
     return {"device": str(renderer.device)}
@@ -177,11 +177,6 @@ def light_record(found: Regression) -> dict[str, Any]:
         "bounce": below.tolist(),
         "sun_in_view": found.sun_in_view,
     }
-
-
-def config_of(values: Mapping[str, Any]) -> InsertConfig:
-    """Return the configuration of plain values, as a configuration file has them."""
-    return InsertConfig(**read_values({name: (v, flag(name)) for name, v in values.items()}))
 
 
 def camera_of(record: Mapping[str, Any]) -> Camera:

@@ -47,7 +47,7 @@ def _run(arguments: list[str]) -> int:
     parser.add_argument("--debug", action="store_true", help="show tracebacks")
     given = parser.parse_args(arguments)
     texts = {name: text for name in raised if (text := getattr(given, name)) is not None}
-    values = read_values({name: (text, flag(name)) for name, text in texts.items()})
+    values = read_values(texts)
     results = read_results(given.folder, InsertConfig(**values).limits)
     try:
         path = given.to or given.folder / REPORT

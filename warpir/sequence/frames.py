@@ -67,8 +67,7 @@ class Frame:
     @property
     def folder(self) -> Path:
         """Where the frame is written."""
-        assert self.config.output.out is not None
-        return Path(self.config.output.out)
+        return self.config.output.folder
 
 
 def read_sequence(
@@ -89,15 +88,12 @@ def read_sequence(
     Raises:
         InputError: A line cannot be used; all problems are listed, each with ``FILE:line``.
     """
-    assert config.task.sequence is not None and config.output.out is not None
-    if (Path(config.output.out) / "run.json").exists():
-        raise InputError(
-            config.output.out,
-            "holds the result of one run",
-            "choose another --out",
-            ExitCode.OUTPUT,
-        )
-    _refuse_other_summary(Path(config.output.out) / SUMMARY, config)
+    assert config.task.sequence is not None
+    out = config.output.folder
+    if (out / "run.json").exists():
+        what, advice = "holds the result of one run", "choose another --out"
+        raise InputError(str(config.output.out), what, advice, ExitCode.OUTPUT)
+    _refuse_other_summary(out / SUMMARY, config)
     if config.light.reuse is not None:  # once, not as a problem of every line
         loaders.run(config.light.reuse, config.limits)
     frames, problems = [], []
@@ -158,8 +154,7 @@ def write_summary(
     Raises:
         InputError: The disk is full or the folder is not writable (exit 5).
     """
-    assert config.output.out is not None
-    path, video = Path(config.output.out) / SUMMARY, Path(config.output.out) / VIDEO
+    path, video = config.output.folder / SUMMARY, config.output.folder / VIDEO
     made = video.with_name(f".{VIDEO}.{os.getpid()}.made")
     try:
         content = {
@@ -194,7 +189,7 @@ def is_whole(config: InsertConfig, frames: Sequence[Frame]) -> bool:
     if not all(frame.is_done for frame in frames):
         return False
     try:
-        found = read_json_object(Path(str(config.output.out)) / SUMMARY)
+        found = read_json_object(config.output.folder / SUMMARY)
     except InputError:
         return False
     if found.get("frames") != json.loads(json.dumps(_records(frames))):
@@ -208,7 +203,7 @@ def _make_video(
 ) -> dict[str, Any]:
     """Make the video where another one, or none, is there; return its entry in the summary."""
     before, digest = _made_before(config), _video_digest(config)
-    video = Path(str(config.output.out)) / VIDEO
+    video = config.output.folder / VIDEO
     if digest is not None and before.get("sha256") == digest:
         if before == _video_record(config, frames, digest):
             return {VIDEO: before}
@@ -232,14 +227,14 @@ def _video_record(
 
 
 def _video_digest(config: InsertConfig) -> str | None:
-    path = Path(str(config.output.out)) / VIDEO
+    path = config.output.folder / VIDEO
     return file_hash(path) if path.is_file() else None
 
 
 def _made_before(config: InsertConfig) -> dict[str, Any]:
     """Return the summary's entry of an earlier video."""
     try:
-        found = read_json_object(Path(str(config.output.out)) / SUMMARY).get("video")
+        found = read_json_object(config.output.folder / SUMMARY).get("video")
     except InputError:
         return {}
     video = found.get(VIDEO) if isinstance(found, dict) else None
@@ -264,7 +259,6 @@ def _run_digest(frame: Frame) -> str:
 
 
 def _read_line(config: InsertConfig, number: int, line: int, raw: bytes) -> Frame:
-    assert config.output.out is not None
     where = f"{config.task.sequence}:{line}"
     try:
         content = parse_json_object(where, raw, config.limits)
@@ -279,9 +273,9 @@ def _read_line(config: InsertConfig, number: int, line: int, raw: bytes) -> Fram
             if name not in FRAME_FIELDS
         ]
     )
-    changes = read_values({name: (value, name) for name, value in given.items()})
+    changes = read_values(given, str)
     changes |= replaced_by(changes, FRAME_FIELDS)
-    out = str(Path(config.output.out) / f"{number:04d}")
+    out = str(config.output.folder / f"{number:04d}")
     of_one: dict[str, Any] = {"sequence": None, "fps": DEFAULTS["fps"], "out": out}
     frame = config.changed(**changes, **of_one)
     frame.require_inputs()

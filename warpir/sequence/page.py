@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import os
 from collections.abc import Sequence
-from pathlib import Path
 from typing import Any
 
 from warpir.app.config import InsertConfig
@@ -30,8 +29,7 @@ def refuse_other_page(config: InsertConfig) -> None:
     Raises:
         InputError: There is one, and --overwrite is not given (`ExitCode.OUTPUT`).
     """
-    assert config.output.out is not None
-    path = Path(config.output.out) / PAGE
+    path = config.output.folder / PAGE
     if not config.output.report or config.output.overwrite or not os.path.lexists(path):
         return
     try:
@@ -54,7 +52,7 @@ def write_sequence_report(config: InsertConfig, frames: Sequence[Frame]) -> None
     Raises:
         InputError: A result is not readable, or the disk is full (exit 5).
     """
-    assert config.output.out is not None and config.task.sequence is not None
+    assert config.task.sequence is not None
     every = max(1, -(-len(frames) // SHOWN))
     content = render_page(
         "sequence",
@@ -64,7 +62,7 @@ def write_sequence_report(config: InsertConfig, frames: Sequence[Frame]) -> None
         lead=f"Lit by {name_of(config.light.reuse)}." if config.light.reuse else "",
         frames=[_card(frame, k % every == 0) for k, frame in enumerate(frames)],
     )
-    path = Path(config.output.out) / PAGE
+    path = config.output.folder / PAGE
     try:
         with whole():
             write_file(path, content)

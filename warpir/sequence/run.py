@@ -24,8 +24,7 @@ def check_frames(config: InsertConfig) -> None:
     """
     frames = read_sequence(config, Loaders())
     refuse_other_page(config)
-    assert config.output.out is not None
-    OutputFolder(config.output.out, overwrite=True).check()  # the frames' folders were looked at
+    OutputFolder(config.output.folder, overwrite=True).check()  # the frames' folders were looked at
     say(f"frames: {len(frames)}, of which {sum(f.is_done for f in frames)} are done already")
 
 
@@ -42,8 +41,6 @@ def insert_frames(
     Raises:
         InputError: A line or a frame cannot be used, or the disk is full.
     """
-    assert config.output.out is not None
-    out = Path(config.output.out)
     loaders = Loaders(FirstPhoto())
     frames = read_sequence(config, loaders, renews=renews)
     refuse_other_page(config)
@@ -67,4 +64,4 @@ def insert_frames(
         attempt(PAGE, lambda: write_sequence_report(config, frames))
     record = write_summary(config, frames, say)
     composites = (f"{frame.folder.name}/composite.png" for frame in frames)
-    return out, (*composites, *record["video"], SUMMARY), record
+    return config.output.folder, (*composites, *record["video"], SUMMARY), record
