@@ -4,7 +4,8 @@
 
 const RADIANS = Math.PI / 180;
 export const STEEPEST = 89;
-const steep = (pitch) => Math.min(Math.max(pitch, -STEEPEST), STEEPEST);
+export const clamp = (x, low, high) => Math.min(Math.max(x, low), high);
+const steep = (pitch) => clamp(pitch, -STEEPEST, STEEPEST);
 
 // Camera to ground frame, rows of turn_y(heading) turn_x(pitch) turn_z(roll).
 export function rotation(stance) {

@@ -1,11 +1,10 @@
 // The panel's fields: a slider and a number for each value of the state.
 
-import { fieldOfView, focalLength, STEEPEST, zoomed } from './camera.js';
+import { clamp, fieldOfView, focalLength, STEEPEST, zoomed } from './camera.js';
 import { withCamera } from './handles.js';
 
 const FILM_DIAGONAL = 43.267; // of 36 x 24 mm
 
-export const clamp = (x, low, high) => Math.min(Math.max(x, low), high);
 export const wrapped = (angle) => ((((angle + 180) % 360) + 360) % 360) - 180;
 export const plain = (x, digits) => Number(x.toFixed(digits));
 

@@ -1,8 +1,7 @@
 // What is dragged over the photo: horizon, ring, size, foot. Positions are pixels of the stage.
 
-import { corners, groundPoint, horizonRow, levelled, lowered, placed, pointSeen, project, zoomed } from './camera.js';
+import { clamp, corners, groundPoint, horizonRow, levelled, lowered, placed, pointSeen, project, zoomed } from './camera.js';
 
-const SVG = 'http://www.w3.org/2000/svg';
 const RIM = 14; // handles stay this far inside the stage
 const APART = 26; // between the middles of an object's knobs
 const LEAST_RING = 44; // radius on the screen, however small the object is
@@ -24,10 +23,10 @@ const NAMES = {
   fov: 'Field of view', size: 'Size of the object', turn: 'Turn of the object', foot: 'Place of the object',
 };
 
-function make(tag, attributes, parent) {
-  const element = document.createElementNS(SVG, tag);
+export function shape(tag, attributes, text = '') {
+  const element = document.createElementNS('http://www.w3.org/2000/svg', tag);
   for (const [name, value] of Object.entries(attributes)) element.setAttribute(name, value);
-  parent?.append(element);
+  element.textContent = text;
   return element;
 }
 
@@ -156,8 +155,8 @@ export class Handles {
   }
 
   #line(kind, width) {
-    const group = make('g', { class: kind }, this.svg);
-    const part = (name, extra) => make('path', { class: name, ...extra }, group);
+    const group = this.svg.appendChild(shape('g', { class: kind }));
+    const part = (name, extra) => group.appendChild(shape('path', { class: name, ...extra }));
     return {
       group,
       rim: part('rim', { 'stroke-width': width + 2.5 }),
@@ -167,12 +166,11 @@ export class Handles {
   }
 
   #knob(name) {
-    const group = make('g', {
+    const group = this.svg.appendChild(shape('g', {
       class: 'knob', tabindex: 0, role: 'slider', 'aria-label': NAMES[name], 'data-handle': name,
-    }, this.svg);
-    make('circle', { class: 'reach', r: 20 }, group);
-    make('circle', { r: 11 }, group);
-    make('path', { d: ICONS[name === 'tilt' ? 'roll' : name] }, group);
+    }));
+    const icon = shape('path', { d: ICONS[name === 'tilt' ? 'roll' : name] });
+    group.append(shape('circle', { class: 'reach', r: 20 }), shape('circle', { r: 11 }), icon);
     this.knobs[name] = group;
     this.#drags(group, name);
   }
@@ -214,7 +212,7 @@ export class Handles {
       // What is under the pointer goes with it: away from the principal point the view narrows.
       const reach = Math.max(Math.abs(from[0] - camera.cx), camera.width / 10);
       const factor = Math.max((reach + du * (from[0] < camera.cx ? -1 : 1)) / reach, 0.1);
-      const fx = Math.min(Math.max(camera.fx * factor, camera.width / 20), camera.width * 20);
+      const fx = clamp(camera.fx * factor, camera.width / 20, camera.width * 20);
       const changed = zoomed(camera, stance, fx);
       return withCamera(before, changed.camera, changed.stance);
     }
@@ -251,7 +249,7 @@ export class Handles {
     const onStage = (pixel) => pixel && pixel.map((part) => part * this.scale);
     const low = [seen.x, seen.y].map((part) => part * this.scale + RIM);
     const high = [seen.x + seen.width, seen.y + seen.height].map((part) => part * this.scale - RIM);
-    const inside = (at) => at.map((part, k) => Math.min(Math.max(part, low[k]), high[k]));
+    const inside = (at) => at.map((part, k) => clamp(part, low[k], high[k]));
     const put = (name, pixel) => {
       this.knobs[name].style.display = pixel ? '' : 'none';
       if (pixel) this.knobs[name].setAttribute('transform', `translate(${inside(pixel)})`);
@@ -317,7 +315,7 @@ export class Handles {
     const [left, top, right, bottom] = this.bounds.map((part) => part * this.scale);
     const x = right + BESIDE <= high[0] || left - BESIDE < low[0] ? right + BESIDE : left - BESIDE;
     const step = 42;
-    const middle = Math.min(Math.max((top + bottom) / 2, low[1] + step), high[1] - step);
+    const middle = clamp((top + bottom) / 2, low[1] + step, high[1] - step);
     for (const [k, name] of ['size', 'turn', 'foot'].entries()) put(name, [x, middle + (k - 1) * step]);
   }
 

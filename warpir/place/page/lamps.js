@@ -1,9 +1,8 @@
 // Lamps near the object: clicked in the photo, shown with a line down to the ground below them. Their
 // places are in the ground frame; a photo does not tell how far away they are.
 
-import { groundPoint, pointSeen, project, ray } from './camera.js';
-import { follow } from './handles.js';
-import { shape } from './light.js';
+import { clamp, groundPoint, pointSeen, project, ray } from './camera.js';
+import { follow, shape } from './handles.js';
 import { endOf } from './lines.js';
 
 const CEILING = 2.4; // where a lamp hangs that is above the horizon [m]
@@ -17,7 +16,6 @@ const BESIDE = 30; // from the lamp to its knob on the screen: the knob would hi
 const BELOW = 24; // from the ground below it to that knob
 const LEVEL_LEAST = 0.1; // camera heights: a lamp that is nearer, seen from above, is not dragged along its ray
 
-const clamp = (x, low, high) => Math.min(Math.max(x, low), high);
 const away = ({ stance }, { center }) => Math.hypot(center[0] - stance.x, center[1] - stance.height, center[2] - stance.z);
 const replaced = (before, index, change) => ({
   ...before, lamps: before.lamps.map((lamp, k) => (k === index ? { ...lamp, ...change(lamp) } : lamp)),

@@ -1,7 +1,7 @@
 // The light on the page: the user's sun and sky, else what is estimated from the photo.
 
-import { project, sunAxis } from './camera.js';
-import { follow } from './handles.js';
+import { clamp, project, sunAxis } from './camera.js';
+import { follow, shape } from './handles.js';
 
 const LUMINANCE = [0.2126, 0.7152, 0.0722];
 const ELEVATION = 45; // of a sun whose azimuth alone was typed
@@ -10,7 +10,6 @@ const LEAST_FROM_AFAR = 0.05; // of the ground's light, whatever lamps near it g
 const PATIENCE = 1200; // ms that a camera must rest before the light is estimated for it
 
 const dot = (a, b) => a.reduce((sum, part, k) => sum + part * b[k], 0);
-const clamp = (x, low, high) => Math.min(Math.max(x, low), high);
 
 // What a lamp near the object sends toward a point: the irradiance of what faces it at 1 m, RGB. A
 // rectangle shines on one side, and less aslant.
@@ -31,13 +30,6 @@ function fromLamps({ lamps, stand }) {
     return (dot(lampStrength(lamp, foot), LUMINANCE) * Math.max(lamp.center[1], 0)) / away ** 3 || 0;
   });
   return given.reduce((sum, part) => sum + part, 0);
-}
-
-export function shape(tag, attributes, text = '') {
-  const element = document.createElementNS('http://www.w3.org/2000/svg', tag);
-  for (const [name, value] of Object.entries(attributes)) element.setAttribute(name, value);
-  element.textContent = text;
-  return element;
 }
 
 // Codes of the photo, small.

@@ -2,8 +2,7 @@
 // something of known length, which tells its height.
 
 import { lengthSeen } from './camera.js';
-import { follow, withCamera } from './handles.js';
-import { shape } from './light.js';
+import { follow, shape, withCamera } from './handles.js';
 import { linesOf, meeting, solved, uprighted } from './vanishing.js';
 
 const NAMES = { a: 'level lines', b: 'level lines across', c: 'upright lines' };

@@ -1,6 +1,8 @@
 // What stands in front of the object: painted over the photo with a brush and an eraser. Strokes are
 // part of the state; the photo's own pixels are shown where they lie, as warpir shows them.
 
+import { follow } from './handles.js';
+
 const SIDE = 2048; // longest side of the mask [pixels]; warpir brings it to the photo's size
 const TINT = 'rgb(255 70 40 / 0.4)';
 
@@ -38,7 +40,7 @@ export class Mask {
 
   // Begin a stroke where a pointer was pressed; returns whether it paints.
   press(pressed) {
-    if (!this.isPainting || pressed.button !== 0 || this.history.isOn) return false;
+    if (!this.isPainting) return false;
     const box = this.stage.getBoundingClientRect();
     const at = ({ clientX, clientY }) => [
       ((clientX - box.left) / box.width) * this.size.width, ((clientY - box.top) / box.height) * this.size.height,
@@ -47,26 +49,15 @@ export class Mask {
     const radius = ((Number(this.width.value) / 2) * this.size.width) / box.width;
     const points = [at(pressed)];
     const isErased = this.eraser.getAttribute('aria-pressed') === 'true';
-    const target = pressed.target;
     const paint = () => this.history.move((before) => ({
       ...before, mask: [...before.mask, { points: [...points], radius, isErased }],
     }));
-    const move = (event) => {
-      if (event.pointerId !== pressed.pointerId) return;
+    const isOn = follow(pressed.target, pressed, this.history, 'mask', (event) => {
       points.push(at(event));
       paint();
-    };
-    const end = (event) => {
-      if (event.pointerId !== pressed.pointerId) return;
-      target.removeEventListener('pointermove', move);
-      for (const kind of ['pointerup', 'pointercancel']) target.removeEventListener(kind, end);
-      this.history.end();
-    };
-    this.history.begin('mask');
-    paint();
-    target.addEventListener('pointermove', move);
-    for (const kind of ['pointerup', 'pointercancel']) target.addEventListener(kind, end);
-    return true;
+    });
+    if (isOn) paint();
+    return isOn;
   }
 
   #stroke(brush, { points, radius, isErased }) {

@@ -1,6 +1,7 @@
 // The page: one state, changed by handles, keys and fields, drawn by the stage, saved by warpir.
 
-import { Fields, clamp, fromPolar, plain, polar, wrapped } from './fields.js';
+import { clamp } from './camera.js';
+import { Fields, fromPolar, plain, polar, wrapped } from './fields.js';
 import { Handles, shifted, stoodAt, withCamera } from './handles.js';
 import { History } from './history.js';
 import { Lamps } from './lamps.js';

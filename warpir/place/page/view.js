@@ -1,13 +1,13 @@
 // Which part of the photo the room shows: zoom and pan, by wheel, fingers, buttons and keys. It is
 // no part of the state: undo leaves it alone, and 0 shows the whole photo again.
 
+import { clamp } from './camera.js';
+
 const CLOSEST = 16; // times as large as where the whole photo is seen
 const NOTCH = 1.0015; // factor of a wheel's unit
 const PINCH = 1.01; // of a touchpad's, which comes as a wheel with Ctrl
 const STEP = 1.25; // of a key or a button
 const SHIFT = 0.1; // of the room, by a key
-
-const clamp = (x, low, high) => Math.min(Math.max(x, low), high);
 
 export class View {
   zoom = 1;
