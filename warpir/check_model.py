@@ -18,19 +18,10 @@ USAGE = "python -m warpir.check_model --model DIR|ID [FLAG ...]"
 DESCRIPTION = "Check that a Stable Diffusion works and guides as a trained one should."
 FLAGS = {
     "the check": flags_of(
-        "model",
-        "allow_download",
-        "allow_pickle",
-        "photo",
-        "prompt",
-        "device",
-        "precision",
-        "vae_precision",
-        "vae_checkpointing",
-        "graphs",
-        "seed",
-    ),
-}
+        "model", "allow_download", "allow_pickle", "photo", "prompt", "device", "precision",
+        "vae_precision", "vae_checkpointing", "graphs", "seed",
+    )
+}  # fmt: skip
 
 
 def main(argv: Sequence[str] | None = None) -> int:

@@ -11,16 +11,7 @@ from functools import partial
 from typing import Any, NoReturn, get_args
 
 import warpir
-from warpir.app.config import (
-    DEFAULTS,
-    DOTTED,
-    OPTIONS,
-    PARTS,
-    InsertConfig,
-    Option,
-    flag,
-    usage,
-)
+from warpir.app.config import DEFAULTS, DOTTED, OPTIONS, PARTS, InsertConfig, Option, flag, usage
 from warpir.app.config_file import closest, kind_of, read_config_file
 from warpir.core.errors import InputError, raise_all, shown
 from warpir.core.limits import Limits

@@ -328,7 +328,7 @@ def _values_that_clash(config: InsertConfig) -> Iterator[InputError]:
         # What of a path's radiance comes from a lamp has no gradient to the materials.
         lamp = "--lamp" if "lamp" in given else "--lamps"
         yield usage(lamp, "cannot be used with --refine material", "leave one of them out")
-    for name, fulfilled, what in (*_needs_of_scene(config, given), *_needs_of_prior(config, given)):
+    for name, fulfilled, what in (*_needs_of_scene(config, given), *_needs_of_prior(config)):
         if name in given and not fulfilled:
             yield usage(flag(name), f"needs {what}")
     if not config.adapter.personalize:
@@ -370,7 +370,7 @@ def _needs_of_scene(config: InsertConfig, given: Container[str]) -> Needs:
     yield "refine", is_lit, "a known light: --reuse, --light, --sun or --sky"
 
 
-def _needs_of_prior(config: InsertConfig, given: Container[str]) -> Needs:
+def _needs_of_prior(config: InsertConfig) -> Needs:
     """As `_needs_of_scene`, of what a model is asked."""
     guided = config.is_guided
     yield "show_prior", guided, "--model"

@@ -276,11 +276,12 @@ def _straightened(files: _Files) -> tuple[_Files, dict[str, Any]]:
     if view.lens.is_straight:
         return files, {}
     photo, border = undistort_photo(files.photo, view.camera, view.lens)
-    masks = {"occluder": files.occluder, "shaded": files.shaded}
-    given = {name: mask for name, mask in masks.items() if mask is not None}
-    bent, _ = undistorted([*given.values()], view.camera, view.lens)
+    masks = [mask for mask in (files.occluder, files.shaded) if mask is not None]
+    bent = iter(undistorted(masks, view.camera, view.lens)[0])
+    occluder = None if files.occluder is None else next(bent)
+    shaded = None if files.shaded is None else next(bent)
     measured = {"undistorted": {**view.lens.record(), "border_share": border}}
-    return replace(files, photo=photo, **dict(zip(given, bent, strict=True))), measured
+    return replace(files, photo=photo, occluder=occluder, shaded=shaded), measured
 
 
 def _assumptions(

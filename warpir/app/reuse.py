@@ -27,12 +27,8 @@ from warpir.io.meshes.materials_file import MATERIALS
 from warpir.scene.light import Light
 from warpir.scene.tone_curves import Curves
 
-LIGHT, SHADOW_LIGHT, CURVES, CAMERA = (
-    "envmap.exr",
-    "envmap_shadow.exr",
-    "curves.json",
-    "camera.json",
-)
+LIGHT, SHADOW_LIGHT = "envmap.exr", "envmap_shadow.exr"
+CURVES, CAMERA = "curves.json", "camera.json"
 SAME_POSE = 1e-6
 """Largest difference of two poses that are one [1, m]."""
 

@@ -32,32 +32,19 @@ LARGEST_REQUEST = 1 << 23
 PAGE = Path(__file__).parent / "page"
 VENDOR = Path(warpir.report.__file__).parent / "vendor"
 """Folder of three.js."""
+OWN = (
+    "page.css", "icon.svg", "camera.js", "fields.js", "handles.js", "history.js", "lamps.js",
+    "light.js", "lines.js", "mask.js", "page.js", "pictures.js", "stage.js", "vanishing.js",
+    "view.js",
+)  # fmt: skip
+LIBRARY = (
+    "vendor/three.core.min.js", "vendor/three.module.min.js", "vendor/loaders/GLTFLoader.js",
+    "vendor/utils/BufferGeometryUtils.js",
+)  # fmt: skip
 FILES = {
-    "": "index.html",
-    **{
-        name: name
-        for name in (
-            "page.css",
-            "icon.svg",
-            "camera.js",
-            "fields.js",
-            "handles.js",
-            "history.js",
-            "lamps.js",
-            "light.js",
-            "lines.js",
-            "mask.js",
-            "page.js",
-            "pictures.js",
-            "stage.js",
-            "vanishing.js",
-            "view.js",
-            "vendor/three.core.min.js",
-            "vendor/three.module.min.js",
-            "vendor/loaders/GLTFLoader.js",
-            "vendor/utils/BufferGeometryUtils.js",
-        )
-    },
+    "": PAGE / "index.html",
+    **{name: PAGE / name for name in OWN},
+    **{name: VENDOR.parent / name for name in LIBRARY},
 }
 """Files of the page by their addresses behind the token."""
 KINDS = {
@@ -151,10 +138,8 @@ class PlaceServer(ThreadingHTTPServer):
         """Return the file at an address behind the token; None where there is none."""
         with self.working:
             if name not in self._made:
-                if name.startswith("vendor/") and name in FILES:
-                    self._made[name] = (VENDOR.parent / name).read_bytes()
-                elif name in FILES:
-                    self._made[name] = (PAGE / FILES[name]).read_bytes()
+                if name in FILES:
+                    self._made[name] = FILES[name].read_bytes()
                 elif name in self._makers:
                     self._made[name] = self._makers[name]()
             return self._made.get(name)
@@ -176,7 +161,7 @@ class _Handler(BaseHTTPRequestHandler):
         if content is None:
             self._refuse(404)
             return
-        suffix = FILES.get(name, name).rpartition(".")[2]
+        suffix = "html" if name == "" else name.rpartition(".")[2]
         self._answer(200, KINDS.get(suffix, "application/octet-stream"), content, policy)
 
     def do_POST(self) -> None:

@@ -202,12 +202,7 @@ def _files(
     Raises:
         InputError: An image cannot be used.
     """
-    from warpir.study.images import (
-        neutral_png,
-        read_image,
-        require_same_size,
-        upside_down,
-    )
+    from warpir.study.images import neutral_png, read_image, require_same_size, upside_down
     from warpir.study.pages import Images, page
 
     plan, known, files = study.plan, [], []

@@ -48,7 +48,7 @@ def rows_of(figures: Mapping[str, Any]) -> list[list[str]]:
     return rows
 
 
-def lines_of(report: Mapping[str, Any], figures: Mapping[str, Any]) -> list[str]:
+def lines_of(figures: Mapping[str, Any]) -> list[str]:
     """Return what is said of some raters below their table."""
     repeats, side = figures["repeats_consistent"], figures["side_1_chosen"]
     catches, zoomed = figures["catches_right"], figures["zoomed_share"]
@@ -112,7 +112,7 @@ def print_report(report: Mapping[str, Any]) -> None:
             table.add_row(*map(Text, row))
         console.print()
         console.print(table)
-        for line in lines_of(report, figures):
+        for line in lines_of(figures):
             console.print(line, soft_wrap=True)
     console.print()
     console.print(NOTE, soft_wrap=True)
@@ -130,7 +130,7 @@ def markdown_of(report: Mapping[str, Any]) -> str:
         lines += ["", f"## {heading[0].upper()}{heading[1:]}", "", _row(HEADINGS)]
         lines.append("|---|" + "--:|" * (len(HEADINGS) - 1))
         lines += [_row(row) for row in rows_of(figures)]
-        lines += ["", *(f"* {_markdown(line)}" for line in lines_of(report, figures))]
+        lines += ["", *(f"* {_markdown(line)}" for line in lines_of(figures))]
     return "\n".join([*lines, "", NOTE, ""])
 
 
