@@ -1,5 +1,6 @@
 """Photo and assets of the tests of placing."""
 
+from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
@@ -8,6 +9,15 @@ import trimesh
 from PIL import Image
 
 from tests.builders.programs.placing import HEIGHT, WIDTH
+from warpir.place.worker import Worker
+
+
+@pytest.fixture
+def worker() -> Iterator[Worker]:
+    """A process that estimates and renders; it is ended with the test."""
+    made = Worker()
+    yield made
+    made.stop()
 
 
 def write_wedge(path: Path) -> None:

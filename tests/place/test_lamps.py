@@ -15,9 +15,13 @@ from tests.builders.programs.placing import (
     STATE,
     TILTED,
     WIDTH,
+    begun,
+    box_of,
     command,
     drag,
     placing,
+    press,
+    save,
     settle,
 )
 from warpir.app.config import InsertConfig
@@ -27,7 +31,7 @@ from warpir.core.strict_json import parse_json_object
 from warpir.io.lamps_file import read_lamps
 from warpir.place.lamps import lamps_file, page_lamps
 from warpir.place.renderings import Renderings
-from warpir.place.session import open_session, placement_files, start_record
+from warpir.place.session import placement_files
 from warpir.place.worker import Worker
 from warpir.scene.near.lamps import RectangleLamp, SphereLamp
 
@@ -80,8 +84,7 @@ def test_lamps_out_of_range_are_refused(change: dict[str, Any]) -> None:
 
 def click_photo(opened: Opened, u: float, v: float) -> None:
     """Click a pixel of the photo."""
-    box = opened.page.locator("#photo").bounding_box()
-    assert box is not None
+    box = box_of(opened, "#photo")
     scale = box["width"] / WIDTH
     opened.page.mouse.click(box["x"] + scale * u, box["y"] + scale * v)
     settle(opened)
@@ -143,8 +146,7 @@ def test_lamp_is_clicked_dragged_set_and_saved(inputs: Path, tmp_path: Path, wid
         page.keyboard.press("Enter")
         step()
         np.testing.assert_allclose(page.evaluate(SEEN)[0], moved, atol=1e-6)
-        page.click("#save")
-        page.wait_for_selector("#done:not([hidden])")
+        save(opened)
         saved = json.loads((out / "insert.json").read_text())
         assert saved["lamps"] == str(out / "lamps.json")
         (read,) = read_lamps(saved["lamps"], LIMITS, [])
@@ -180,8 +182,7 @@ def test_two_fingers_zoom_and_add_no_lamp(inputs: Path, tmp_path: Path) -> None:
         page = opened.page
         assert [lamp["power"] for lamp in page.evaluate(STATE)["lamps"]] == [20.0]
         page.click("#add-lamp")
-        box = page.locator("#photo").bounding_box()
-        assert box is not None
+        box = box_of(opened, "#photo")
         x, y = box["x"] + 100.0, box["y"] + 50.0
         fingers = Fingers(page)
         fingers.press(1, x, y)
@@ -202,13 +203,12 @@ def test_two_fingers_zoom_and_add_no_lamp(inputs: Path, tmp_path: Path) -> None:
         settle(opened)
         assert float(page.input_value("#power")) == 20.0
         page.locator("[data-handle=lamp1]").focus()
-        page.keyboard.press("Delete")
-        settle(opened)
+        press(opened, "Delete")
         assert [lamp["power"] for lamp in page.evaluate(STATE)["lamps"]] == [20.0]
 
 
 @pytest.mark.slow
-def test_preview_shows_the_lamp(inputs: Path, tmp_path: Path) -> None:
+def test_preview_shows_the_lamp(inputs: Path, worker: Worker, tmp_path: Path) -> None:
     """It lights the shadow that the sky casts on its side, and the object; its own is opposite."""
     config = InsertConfig(
         photo=str(inputs / "photo.png"),
@@ -217,12 +217,10 @@ def test_preview_shows_the_lamp(inputs: Path, tmp_path: Path) -> None:
         size=3.0,
         sky="overcast",
     )
-    session = open_session(config.inputs, config.camera, config.placement, config.limits)
-    start = start_record(session, config.light, str(config.output.out))
-    said = {**start["camera"], **{k: start[k] for k in ("stance", "stand", "rotate_y", "size")}}
+    session, start, said = begun(config)
     stand = start["stand"]
     left = {"center": [stand["x"] - 2.0, 1.0, stand["z"] + 1.0], "radius": 0.05, "power": 400.0}
-    renderings = Renderings(Worker())
+    renderings = Renderings(worker)
     pictures = []
     try:
         for k, lamps in enumerate(([], [{**left, "color": [1.0, 1.0, 1.0]}])):
@@ -236,7 +234,6 @@ def test_preview_shows_the_lamp(inputs: Path, tmp_path: Path) -> None:
             pictures.append(np.asarray(Image.open(tmp_path / "p.png"), np.float64).mean(axis=-1))
     finally:
         renderings.close()
-        renderings.worker.stop()
     assert pictures[0].shape == (HEIGHT, WIDTH)
     change = pictures[1] - pictures[0]
     beside = {side: change[225:255, first : first + 30].mean() for side, first in SIDES.items()}

@@ -9,7 +9,7 @@ import pytest
 from PIL import Image
 
 from tests.builders.programs.browser import needs_chromium
-from tests.builders.programs.placing import STATE, command, placing, settle
+from tests.builders.programs.placing import STATE, command, enter, placing, press, save, settle
 from warpir.core.errors import InputError
 from warpir.lighting.regression import Regression, regress
 from warpir.lighting.regressor import load_regressor
@@ -50,33 +50,28 @@ def test_a_photo_that_shows_nothing_has_no_direction(found: Regression) -> None:
 
 
 @pytest.mark.slow
-def test_worker_prints_no_warnings(inputs: Path, capfd: pytest.CaptureFixture[str]) -> None:
+def test_worker_prints_no_warnings(
+    inputs: Path, worker: Worker, capfd: pytest.CaptureFixture[str]
+) -> None:
     """Numbers that overflow are an error of the page; NumPy's lines are for nobody."""
-    worker = Worker()
     camera = camera_from_fov(480, 320, 60.0, -8.0, 1.6).record() | {"fx": 5e-324}
     job = {"kind": "light", "config": {"photo": str(inputs / "photo.png")}, "camera": camera}
-    try:
-        with pytest.raises(InputError):
-            worker.ask(job)
-    finally:
-        worker.stop()
+    with pytest.raises(InputError):
+        worker.ask(job)
+    worker.stop()
     assert capfd.readouterr().err == ""
 
 
 @pytest.mark.slow
-def test_worker_answers_refuses_and_starts_again(inputs: Path) -> None:
+def test_worker_answers_refuses_and_starts_again(inputs: Path, worker: Worker) -> None:
     """A job that cannot be done is an error, one whose process was ended too; then another runs."""
-    worker = Worker()
     camera = camera_from_fov(480, 320, 60.0, -8.0, 1.6).record()
     job = {"kind": "light", "config": {"photo": str(inputs / "photo.png")}, "camera": camera}
-    try:
-        with pytest.raises(InputError, match="none"):
-            worker.ask({**job, "config": {"photo": "none.png"}})
-        assert worker.ask(job)["spread_deg"] > 0.0
-        worker.stop()
-        assert worker.ask(job)["spread_deg"] > 0.0
-    finally:
-        worker.stop()
+    with pytest.raises(InputError, match="none"):
+        worker.ask({**job, "config": {"photo": "none.png"}})
+    assert worker.ask(job)["spread_deg"] > 0.0
+    worker.stop()
+    assert worker.ask(job)["spread_deg"] > 0.0
 
 
 @needs_chromium
@@ -97,17 +92,13 @@ def test_page_opens_with_the_estimated_light(tmp_path: Path) -> None:
         a, e = np.radians([azimuth, elevation])
         wanted = [np.cos(e) * np.sin(a), np.sin(e), -np.cos(e) * np.cos(a)]
         np.testing.assert_allclose(axis, wanted, atol=0.02)  # shown in whole degrees
-        page.fill("#elevation", "30")
-        page.keyboard.press("Enter")
-        settle(opened)
+        enter(opened, "elevation", "30")
         assert page.is_checked("#keep-light") and page.locator(".doubt").is_hidden()
         assert page.evaluate(STATE)["light"]["azimuth"] == pytest.approx(azimuth, abs=0.6)
-        page.keyboard.press("Control+z")
-        settle(opened)
+        press(opened, "Control+z")
         assert not page.is_checked("#keep-light") and page.locator(".doubt").is_visible()
         page.check("#keep-light")
-        page.click("#save")
-        page.wait_for_selector("#done:not([hidden])")
+        save(opened)
     saved = json.loads((tmp_path / "out" / "insert.json").read_text())
     assert saved["sun"][:2] == pytest.approx([azimuth, elevation], abs=0.6)
     assert len(saved["sky"]) == 3

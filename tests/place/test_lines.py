@@ -13,9 +13,14 @@ from tests.builders.programs.placing import (
     HEIGHT,
     STATE,
     WIDTH,
+    box_of,
     command,
+    enter,
     handle_at,
     placing,
+    press,
+    pull,
+    save,
     serve,
     settle,
 )
@@ -95,19 +100,14 @@ def test_lines_tell_known_cameras(inputs: Path, tmp_path: Path) -> None:
 def lay(opened: Opened, lines: dict[str, Any]) -> None:
     """Drag the ends of the lines where they belong; those that lie under others by keys."""
     page = opened.page
-    box = page.locator("#photo").bounding_box()
-    assert box is not None
+    box = box_of(opened, "#photo")
     scale = box["width"] / WIDTH
     under = "([x, y]) => document.elementFromPoint(x, y).closest('[data-handle]')?.dataset.handle"
     for axis, which, end in ((a, *k) for a in lines if lines[a] for k in np.ndindex(2, 2)):
         name, (u, v) = f"{axis}{which}{end}", lines[axis][which][end]
         x, y = handle_at(opened, name)
         if page.evaluate(under, [x, y]) == name:
-            page.mouse.move(x, y)
-            page.mouse.down()
-            page.mouse.move(box["x"] + scale * u, box["y"] + scale * v, steps=3)
-            page.mouse.up()
-            settle(opened)
+            pull(opened, (x, y), (box["x"] + scale * u, box["y"] + scale * v), steps=3)
             continue
         at = page.evaluate(STATE)["lines"][axis][which][end]
         page.locator(f"[data-handle={name}]").focus()
@@ -150,11 +150,9 @@ def test_lines_are_dragged_and_saved(inputs: Path, tmp_path: Path, width: int) -
         assert found["stance"]["pitch"] == pytest.approx(-9.0, abs=40.0 * coarse)
         assert found["stance"]["roll"] == pytest.approx(3.0, abs=40.0 * coarse)
         page.locator("[data-handle=a00]").focus()
-        page.keyboard.press("Shift+ArrowUp")
-        settle(opened)
+        press(opened, "Shift+ArrowUp")
         assert page.evaluate(STATE)["camera"] != found["camera"]
-        page.keyboard.press("Control+z")
-        settle(opened)
+        press(opened, "Control+z")
         assert page.evaluate(STATE) == found
         # An upright photo keeps its horizon, without a pitch.
         page.check("#upright")
@@ -169,8 +167,7 @@ def test_lines_are_dragged_and_saved(inputs: Path, tmp_path: Path, width: int) -
         page.click("#lines")
         settle(opened)
         assert page.locator("[data-handle=pitch]").is_visible()
-        page.click("#save")
-        page.wait_for_selector("#done:not([hidden])")
+        save(opened)
     saved = json.loads((out / "camera.json").read_text())
     assert saved["cy"] == pytest.approx(upright["camera"]["cy"])
     assert saved["fx"] == pytest.approx(upright["camera"]["fx"])
@@ -205,20 +202,14 @@ def test_known_length_tells_the_height(inputs: Path, tmp_path: Path, width: int)
         begun = page.evaluate(STATE)
         assert begun["stance"] == before["stance"]
         length = begun["ruler"]["metres"]
-        page.fill("#metres", str(2.0 * length))
-        page.keyboard.press("Enter")
-        settle(opened)
+        enter(opened, "metres", str(2.0 * length))
         doubled = page.evaluate(STATE)
         assert doubled["stance"]["height"] == pytest.approx(2.0 * before["stance"]["height"])
         assert doubled["size"] == before["size"]
         # Half of the line for the same length: twice as high again, nearly.
         x, y = handle_at(opened, "r1")
         _, foot = handle_at(opened, "r0")
-        page.mouse.move(x, y)
-        page.mouse.down()
-        page.mouse.move(x, (y + foot) / 2.0, steps=3)
-        page.mouse.up()
-        settle(opened)
+        pull(opened, (x, y), (x, (y + foot) / 2.0), steps=3)
         higher = page.evaluate(STATE)["stance"]["height"]
         assert 1.7 < higher / doubled["stance"]["height"] < 2.3
         for _ in range(3):

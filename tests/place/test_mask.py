@@ -16,8 +16,11 @@ from tests.builders.programs.placing import (
     HEIGHT,
     STATE,
     WIDTH,
+    box_of,
     command,
     placing,
+    press,
+    save,
     settle,
 )
 from warpir.core.errors import InputError
@@ -79,8 +82,7 @@ def test_page_paints_and_saves_what_stands_in_front(
         page = opened.page
         before = page.evaluate(STATE)
         page.click("#paint")
-        box = page.locator("#photo").bounding_box()
-        assert box is not None
+        box = box_of(opened, "#photo")
         scale = box["width"] / WIDTH
 
         def stroke(*points: tuple[float, float]) -> None:
@@ -107,15 +109,12 @@ def test_page_paints_and_saves_what_stands_in_front(
         stroke((220.0, 120.0), (220.0, 280.0))
         assert page.evaluate(alpha, [220.0, 200.0]) == 0
         assert page.evaluate(alpha, [120.0, 200.0]) == 255
-        page.keyboard.press("Control+z")
-        settle(opened)
+        press(opened, "Control+z")
         assert page.evaluate(alpha, [220.0, 200.0]) == 255
-        page.keyboard.press("Control+Shift+z")
-        settle(opened)
+        press(opened, "Control+Shift+z")
         assert page.evaluate(alpha, [220.0, 200.0]) == 0
         page.click("#paint")
-        page.click("#save")
-        page.wait_for_selector("#done:not([hidden])")
+        save(opened)
         saved = json.loads((out / "insert.json").read_text())
         assert saved["occluder_mask"] == str(out / "occluder.png")
         mask = np.asarray(Image.open(out / "occluder.png"))

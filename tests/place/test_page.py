@@ -18,11 +18,15 @@ from tests.builders.programs.placing import (
     STATE,
     TILTED,
     WIDTH,
+    box_of,
     command,
     drag,
+    enter,
     handle_at,
     open_page,
     placing,
+    press,
+    save,
     serve,
     settle,
 )
@@ -129,8 +133,7 @@ def test_page_places_what_insert_renders(inputs: Path, tmp_path: Path) -> None:
                 for key in ("q", "q", "ArrowLeft", "Shift+ArrowUp", "+"):
                     opened.page.keyboard.press(key)
                 settle(opened)
-            opened.page.click("#save")
-            opened.page.wait_for_selector("#done:not([hidden])")
+            save(opened)
             shown = opened.page.inner_text("#command")
             assert shown.startswith("python -m warpir.insert --config ")
             masks.append((silhouette(opened), (out / "insert.json").read_bytes()))
@@ -236,28 +239,22 @@ def check_arrows(opened: Opened) -> None:
         page.locator(f"[data-handle={knob}]").focus()
         for keys, way in ((("ArrowUp", "ArrowRight"), 1.0), (("ArrowDown", "ArrowLeft"), -1.0)):
             for key in keys:
-                page.keyboard.press(key)
-                settle(opened)
+                press(opened, key)
                 moved = page.evaluate(STATE)[group][name] - held[group][name]
                 assert moved * sign * way > 0.1, (knob, key)
-                page.keyboard.press("Control+z")
-                settle(opened)
+                press(opened, "Control+z")
                 assert page.evaluate(STATE) == held
 
 
 def check_behind(opened: Opened) -> None:
     """A box that reaches behind the camera is nowhere under the pointer, and no fault."""
     page = opened.page
-    page.fill("#ahead", "0.5")
-    page.keyboard.press("Enter")
-    settle(opened)
-    box = page.locator("#canvas").bounding_box()
-    assert box is not None
+    enter(opened, "ahead", "0.5")
+    box = box_of(opened, "#canvas")
     page.mouse.move(box["x"] + 0.3 * box["width"], box["y"] + 0.8 * box["height"])
     settle(opened)
     assert opened.errors == []
-    page.keyboard.press("Control+z")
-    settle(opened)
+    press(opened, "Control+z")
 
 
 @needs_chromium
@@ -271,16 +268,14 @@ def test_page_keeps_what_was_given(inputs: Path, tmp_path: Path) -> None:
         start = opened.page.evaluate(STATE)
         assert start["stance"]["pitch"] == pytest.approx(-90.0)
         opened.page.locator("#stage").focus()
-        opened.page.keyboard.press("q")
-        settle(opened)
+        press(opened, "q")
         changed = opened.page.evaluate(STATE)
         assert changed["stance"] == start["stance"] and changed["turn"] != start["turn"]
         light = "import('./page.js').then(({ stage: { sun, scene, groundUniforms } }) =>"
         light += " [sun.intensity, ...sun.color, scene.environmentIntensity,"
         light += " groundUniforms.sunShare.value])"
         assert np.isfinite(np.array(opened.page.evaluate(light), dtype=float)).all()
-        opened.page.click("#save")
-        opened.page.wait_for_selector("#done:not([hidden])")
+        save(opened)
     saved = json.loads((out / "insert.json").read_text())
     assert saved["sun"] == pytest.approx([-60.0, 45.0, 3.0]) and saved["sky"] == [0.0, 0.0, 0.0]
     pose = np.array(json.loads((out / "camera.json").read_text())["c2w"])
@@ -300,8 +295,7 @@ def test_redraw_leaves_what_is_being_typed(inputs: Path, tmp_path: Path) -> None
             page.evaluate("document.getElementById('keep-light').click()")  # takes no focus
             settle(opened)
             assert page.input_value(f"#{name}") == typed
-            page.keyboard.press("Enter")
-            settle(opened)
+            press(opened, "Enter")
         state = page.evaluate(STATE)
         assert state["size"] == 1.25 and state["ruler"]["metres"] == 0.75
 
@@ -320,8 +314,7 @@ def test_page_serves_small_windows_and_fingers(inputs: Path, tmp_path: Path) -> 
             for name in ("#skyStrength", "#save"):
                 # To the middle: at an edge, the browser rounds and may hide half a pixel.
                 page.locator(name).evaluate("e => e.scrollIntoView({ block: 'center' })")
-                box = page.locator(name).bounding_box()
-                assert box is not None
+                box = box_of(opened, name)
                 assert 0 <= box["x"] <= box["x"] + box["width"] <= width, (name, width, height)
                 assert 0 <= box["y"] <= box["y"] + box["height"] <= height, (name, width, height)
             page.click("#save", timeout=5000)
@@ -344,18 +337,13 @@ def test_page_serves_small_windows_and_fingers(inputs: Path, tmp_path: Path) -> 
         page.locator("#dial").click(position={"x": 60.0, "y": 40.0}, button="right")
         settle(opened)
         assert page.evaluate(STATE)["light"] == before["light"]
-        page.keyboard.press("Control+z")
-        settle(opened)
+        press(opened, "Control+z")
         assert page.evaluate(STATE) == before
         # Of something flat and far away the knobs are apart, however it is turned.
         for field, value in (("size", "0.05"), ("ahead", "12")):
-            page.fill(f"#{field}", value)
-            page.keyboard.press("Enter")
-            settle(opened)
+            enter(opened, field, value)
         for turn in (0, 70, 180, -90):
-            page.fill("#turn", str(turn))
-            page.keyboard.press("Enter")
-            settle(opened)
+            enter(opened, "turn", str(turn))
             knobs = [np.array(handle_at(opened, name)) for name in ("size", "foot", "turn")]
             apart = [np.linalg.norm(a - b) for a, b in combinations(knobs, 2)]
             assert min(apart) > 25.5, (turn, apart)
@@ -376,30 +364,23 @@ def test_page_undoes_and_tells_what_is_wrong(inputs: Path, tmp_path: Path) -> No
         page.fill("#size", "1.25")
         page.keyboard.press("Enter")
         page.locator("#stage").focus()
-        page.keyboard.press("e")
-        settle(opened)
+        press(opened, "e")
         changed = page.evaluate(STATE)
         assert changed["size"] == 1.25 and changed["turn"] == pytest.approx(before["turn"] - 5.0)
-        page.keyboard.press("Control+z")
-        page.keyboard.press("Control+z")
-        settle(opened)
+        press(opened, "Control+z", "Control+z")
         assert page.evaluate(STATE) == before
-        page.keyboard.press("Control+Shift+z")
-        settle(opened)
+        press(opened, "Control+Shift+z")
         assert page.evaluate(STATE)["size"] == 1.25
         check_arrows(opened)
         check_behind(opened)
         drag_away_and_back(opened, "#turn-slide")
         page.locator("#stage").focus()
         held = page.evaluate(STATE)
-        page.keyboard.press("q")
-        settle(opened)
+        press(opened, "q")
         assert page.evaluate(STATE)["turn"] == pytest.approx(held["turn"] + 5.0)
-        page.keyboard.press("Control+z")
-        settle(opened)
+        press(opened, "Control+z")
         assert page.evaluate(STATE) == held
-        box = page.locator("#canvas").bounding_box()
-        assert box is not None
+        box = box_of(opened, "#canvas")
         page.mouse.dblclick(box["x"] + 100.0, box["y"] + 0.9 * box["height"])
         settle(opened)
         foot = page.evaluate(FOOT_ON_CANVAS)
@@ -418,8 +399,7 @@ def test_page_undoes_and_tells_what_is_wrong(inputs: Path, tmp_path: Path) -> No
         assert (out / "camera.json").read_text() == "somebody's"
         assert [e for e in opened.errors if "422" not in e] == []
         (out / "camera.json").unlink()
-        page.click("#save")
-        page.wait_for_selector("#done:not([hidden])")
+        save(opened)
         saved = json.loads((out / "insert.json").read_text())
         assert saved["size"] == 1.25 and "sun" not in saved and "sky" not in saved
         said, _ = served.process.communicate(timeout=20)

@@ -9,29 +9,18 @@ import numpy as np
 import pytest
 import trimesh
 
-from tests.builders.programs.placing import EXACT, HEIGHT, TILTED, WIDTH
+from tests.builders.programs.placing import EXACT, HEIGHT, TILTED, WIDTH, begun
 from warpir.app.config import InsertConfig
 from warpir.core.errors import ExitCode, InputError
 from warpir.io.assets import load_asset
 from warpir.place.preview_asset import preview_asset, triangle_count
-from warpir.place.session import (
-    PlacementFolder,
-    Session,
-    open_session,
-    placement_files,
-    start_record,
-)
+from warpir.place.session import PlacementFolder, placement_files
 from warpir.place.stance import Stance, ground_to_world, stance_of
 from warpir.scene.camera import Camera, CameraEstimate, camera_from_fov
 from warpir.scene.placement import place_asset
 
 # What is sent for a placement, from what the page starts with.
 SAID = {"sun": [-40, 50, 8], "sky": "clear"}
-
-
-def session_of(config: InsertConfig) -> Session:
-    """A session of this configuration."""
-    return open_session(config.inputs, config.camera, config.placement, config.limits)
 
 
 # --------------------------------------------------------------------------- numbers of a camera
@@ -87,9 +76,7 @@ def test_placement_in_the_world_of_the_camera_file(inputs: Path, tmp_path: Path)
         rotate_y=70.0,
         size=1.5,
     )
-    session = session_of(config)
-    start = start_record(session, config.light, str(config.output.out))
-    said = {**start["camera"], **{k: start[k] for k in ("stance", "stand", "rotate_y", "size")}}
+    session, _, said = begun(config)
     files = placement_files(session, config.flat(), said)
     np.testing.assert_allclose(files["camera.json"]["c2w"], pose, atol=EXACT)
     saved = files["insert.json"]
@@ -107,14 +94,12 @@ def test_start_shows_what_insert_would_refuse(inputs: Path, tmp_path: Path) -> N
     photo, asset = str(inputs / "photo.png"), str(tmp_path / "huge.stl")
     for pitch in (0.0, 30.0, -60.0, -90.0):
         config = InsertConfig(photo=photo, asset=asset, out=str(tmp_path / "o"), pitch=pitch)
-        session = session_of(config)
-        start = start_record(session, config.light, str(config.output.out))
-        said = {**start["camera"], **{k: start[k] for k in ("stance", "stand", "rotate_y", "size")}}
+        session, start, said = begun(config)
         assert 0.01 < start["size"] < 20.0
         if pitch < 30.0:
             assert placement_files(session, config.flat(), said)
     with pytest.raises(InputError, match="camera is inside"):
-        session_of(config.changed(pitch=0.0, place=(0.0, 0.0, -5.0)))
+        begun(config.changed(pitch=0.0, place=(0.0, 0.0, -5.0)))
 
 
 # ---------------------------------------------------------------------------- what the page gets
@@ -149,9 +134,7 @@ def placed_files(inputs: Path, out: Path, **change: Any) -> dict[str, dict[str, 
     config = InsertConfig(
         photo=str(inputs / "photo.png"), asset=str(inputs / "wedge.glb"), out=str(out)
     )
-    session = session_of(config)
-    start = start_record(session, config.light, str(config.output.out))
-    said = {**start["camera"], **{k: start[k] for k in ("stance", "stand", "rotate_y", "size")}}
+    session, _, said = begun(config)
     return placement_files(session, config.flat(), {**said, **SAID, **change})
 
 
@@ -173,14 +156,14 @@ def test_page_starts_with_the_estimated_camera(
     photo, asset = str(inputs / "photo.png"), str(inputs / "wedge.glb")
     config = InsertConfig(photo=photo, asset=asset, out=str(tmp_path / "o"))
     monkeypatch.setattr("warpir.place.session.estimate_photo", lambda *_: found)
-    start = start_record(session_of(config), config.light, "o")
+    _, start, _ = begun(config)
     assert start["stance"]["pitch"] == pytest.approx(-8.0)
     assert start["stance"]["roll"] == pytest.approx(3.0)
     assert start["camera"]["fy"] == pytest.approx(HEIGHT / 2.0 / np.tan(np.radians(20.0)))
     assert any("estimated from the photo" in line for line in start["assumed"])
     up = replace(found, pitch_deg=60.0)
     monkeypatch.setattr("warpir.place.session.estimate_photo", lambda *_: up)
-    start = start_record(session_of(config), config.light, "o")
+    _, start, _ = begun(config)
     assert start["stance"]["pitch"] == pytest.approx(0.0)
     assert any("assumed, not estimated" in line for line in start["assumed"])
 

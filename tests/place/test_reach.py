@@ -10,11 +10,14 @@ import pytest
 from tests.builders.programs.browser import needs_chromium
 from tests.builders.programs.placing import (
     STATE,
+    box_of,
     command,
     drag,
+    enter,
     handle_at,
     placing,
-    settle,
+    press,
+    pull,
 )
 
 
@@ -32,17 +35,12 @@ def test_horizon_never_throws_the_object_away(inputs: Path, tmp_path: Path, widt
     argv = command(inputs, tmp_path / "out", "--size", "2")
     with placing(argv, width, 800) as opened:
         page = opened.page
-        photo = page.locator("#photo").bounding_box()
-        assert photo is not None
+        photo = box_of(opened, "#photo")
         before = page.evaluate(STATE)
         for share in (0.3, 0.5, 1.5):
             # The line itself: the knob in its middle may lie below the object's.
             x, y = photo["x"] + 0.25 * photo["width"], handle_at(opened, "tilt")[1]
-            page.mouse.move(x, y)
-            page.mouse.down()
-            page.mouse.move(x, y + share * photo["height"], steps=2)
-            page.mouse.up()
-            settle(opened)
+            pull(opened, (x, y), (x, y + share * photo["height"]), steps=2)
             state = page.evaluate(STATE)
             assert state["stance"]["pitch"] > before["stance"]["pitch"]
             bounds = page.evaluate("import('./page.js').then(({ handles }) => handles.bounds)")
@@ -51,13 +49,10 @@ def test_horizon_never_throws_the_object_away(inputs: Path, tmp_path: Path, widt
             assert bounds[3] < 330.0 and bounds[1] > 0.0 and bounds[3] - bounds[1] > 12.0
             assert away(state) <= 4.0 * away(before) * (1.0 + 1e-6)
             page.locator("#stage").focus()
-            page.keyboard.press("Control+z")
-            settle(opened)
+            press(opened, "Control+z")
             assert page.evaluate(STATE) == before
         # A field does no more than the handle.
-        page.fill("#pitch", "80")
-        page.keyboard.press("Enter")
-        settle(opened)
+        enter(opened, "pitch", "80")
         assert page.evaluate(STATE) == before
         assert float(page.input_value("#pitch")) == pytest.approx(before["stance"]["pitch"])
 
@@ -74,8 +69,7 @@ def test_handles_stand_beside_the_object_on_a_phone(inputs: Path, tmp_path: Path
                 drag(opened, "foot", place)
             bounds = "import('./page.js').then(({ handles }) => [handles.bounds, handles.scale])"
             box, scale = page.evaluate(bounds)
-            photo = page.locator("#photo").bounding_box()
-            assert photo is not None
+            photo = box_of(opened, "#photo")
             left, right = photo["x"] + scale * box[0], photo["x"] + scale * box[2]
             top, bottom = photo["y"] + scale * box[1], photo["y"] + scale * box[3]
             knobs = {

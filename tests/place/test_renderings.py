@@ -10,7 +10,7 @@ import pytest
 from PIL import Image
 
 from tests.builders.programs.browser import needs_chromium
-from tests.builders.programs.placing import STATE, command, placing, settle
+from tests.builders.programs.placing import STATE, command, placing, press
 from warpir.core.errors import InputError
 from warpir.place.renderings import Renderings, policy_of
 from warpir.place.worker import PATIENCE, Worker
@@ -102,11 +102,9 @@ def test_page_renders_what_insert_does(inputs: Path, tmp_path: Path) -> None:
         assert "Preview" in page.inner_text("#rendering-words")
         source = page.get_attribute("#picture", "src")
         page.locator("#stage").focus()
-        page.keyboard.press("q")
-        settle(opened)
+        press(opened, "q")
         assert page.locator("#picture").is_hidden()
-        page.keyboard.press("Control+z")
-        settle(opened)
+        press(opened, "Control+z")
         assert page.locator("#picture").is_visible()
         before = page.evaluate(STATE)
         # The pixels of the preview, through a canvas of the page.
@@ -139,23 +137,19 @@ def test_page_renders_what_insert_does(inputs: Path, tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
-def test_preview_refuses_as_insert_does(inputs: Path, tmp_path: Path) -> None:
+def test_preview_refuses_as_insert_does(inputs: Path, worker: Worker, tmp_path: Path) -> None:
     """A photo that went away is one line, and the next preview is answered again."""
-    worker = Worker()
     config = {"photo": str(tmp_path / "none.png"), "asset": str(inputs / "wedge.glb")}
     job = {"kind": "preview", "config": {**config, "out": "x"}, "width": 64, "picture": "y.png"}
-    try:
-        with pytest.raises(InputError, match="none"):
-            worker.ask(job)
-        good = {**config, "photo": str(inputs / "photo.png"), "out": "x"}
-        assert worker.ask({**job, "kind": "warm", "config": good})["device"]
-    finally:
-        worker.stop()
+    with pytest.raises(InputError, match="none"):
+        worker.ask(job)
+    good = {**config, "photo": str(inputs / "photo.png"), "out": "x"}
+    assert worker.ask({**job, "kind": "warm", "config": good})["device"]
 
 
 @pytest.mark.slow
 def test_cancelled_job_leaves_what_is_loaded(
-    inputs: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    inputs: Path, worker: Worker, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """The process lives on, and its kernels are kept though it is killed."""
     monkeypatch.setenv("WARP_CACHE_PATH", str(tmp_path / "kernels"))
@@ -163,18 +157,14 @@ def test_cancelled_job_leaves_what_is_loaded(
     picture = tmp_path / "p.png"
     job = {"config": {**config, "out": "x"}, "width": 64, "picture": str(picture)}
     heard: list[str] = []
-    worker = Worker()
-    try:
-        worker.ask({**job, "kind": "warm"}, lambda said: heard.append(said["stage"]))
-        assert "compiling kernels" in heard
-        process = worker._process
-        with pytest.raises(InputError, match="stopped"):
-            worker.ask({**job, "kind": "preview"}, lambda _: worker.interrupt())
-        assert not picture.exists()
-        time.sleep(PATIENCE + 0.5)  # nothing ends the process later
-        assert worker.ask({**job, "kind": "preview"})["width"] == 64
-        assert worker._process is process and picture.exists()
-        worker.stop()
-        assert [f for f in (tmp_path / "kernels").rglob("*") if f.is_file()]
-    finally:
-        worker.stop()
+    worker.ask({**job, "kind": "warm"}, lambda said: heard.append(said["stage"]))
+    assert "compiling kernels" in heard
+    process = worker._process
+    with pytest.raises(InputError, match="stopped"):
+        worker.ask({**job, "kind": "preview"}, lambda _: worker.interrupt())
+    assert not picture.exists()
+    time.sleep(PATIENCE + 0.5)  # nothing ends the process later
+    assert worker.ask({**job, "kind": "preview"})["width"] == 64
+    assert worker._process is process and picture.exists()
+    worker.stop()
+    assert [f for f in (tmp_path / "kernels").rglob("*") if f.is_file()]

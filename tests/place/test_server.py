@@ -12,11 +12,7 @@ from pathlib import Path
 import pytest
 
 from tests.builders.programs.children import output_of
-from tests.builders.programs.placing import (
-    Served,
-    command,
-    serve,
-)
+from tests.builders.programs.placing import Served, command, serve
 from warpir.app.config import InsertConfig
 
 
@@ -157,16 +153,13 @@ def test_address_leaves_out_the_port_of_http() -> None:
         assert server.host == host
 
 
-def test_demo_starts_where_the_user_says(tmp_path: Path) -> None:
+def test_demo_starts_where_the_user_says() -> None:
     """A pixel, a turn and the folder replace the demo's own."""
     from warpir.place.command import _with_inputs
 
     config = _with_inputs(InsertConfig(demo=True, at=(600.0, 700.0), rotate_y=10.0, out="mine"))
-    assert (config.placement.at, config.placement.place, config.placement.rotate_y) == (
-        (600.0, 700.0),
-        None,
-        10.0,
-    )
+    stands = config.placement
+    assert (stands.at, stands.place, stands.rotate_y) == ((600.0, 700.0), None, 10.0)
     assert config.output.out == "mine"
 
 
@@ -183,10 +176,8 @@ def test_server_knows_every_file_of_the_page() -> None:
     """Nothing is in the folder that no address leads to, but for what is said of three.js."""
     from warpir.place.server import FILES, PAGE, VENDOR
 
-    files = [(path, path.relative_to(PAGE)) for path in PAGE.rglob("*")]
-    files += [(path, path.relative_to(VENDOR.parent)) for path in VENDOR.rglob("*")]
-    there = {name.as_posix() for path, name in files if path.is_file()}
-    assert there == set(FILES.values()) | {"vendor/LICENSE", "vendor/README.md"}
+    there = {path for folder in (PAGE, VENDOR) for path in folder.rglob("*") if path.is_file()}
+    assert there == set(FILES.values()) | {VENDOR / "LICENSE", VENDOR / "README.md"}
 
 
 RESETS = """

@@ -11,18 +11,20 @@ from tests.builders.programs.placing import (
     HEIGHT,
     STATE,
     WIDTH,
+    box_of,
     command,
     drag,
     handle_at,
     placing,
+    press,
+    pull,
     settle,
 )
 
 
 def photo_box(opened: Opened) -> tuple[float, float, float, float]:
     """Left, top, width and height of the photo, in pixels of the window."""
-    box = opened.page.locator("#photo").bounding_box()
-    assert box is not None
+    box = box_of(opened, "#photo")
     return box["x"], box["y"], box["width"], box["height"]
 
 
@@ -72,24 +74,17 @@ def test_page_zooms_where_the_pointer_is(inputs: Path, tmp_path: Path) -> None:
         drag(opened, "foot", (40.0, 15.0))
         assert handle_at(opened, "foot") == pytest.approx((x + 40.0, y + 15.0), abs=0.6)
         assert photo_box(opened) == zoomed
-        page.keyboard.press("Control+z")
-        settle(opened)
+        press(opened, "Control+z")
         assert page.evaluate(STATE) == before and photo_box(opened) == zoomed
         # Beside the object the photo is dragged, never past its edge.
-        room = page.locator("#room").bounding_box()
-        assert room is not None
-        page.mouse.move(40.0, 40.0)
-        page.mouse.down()
-        page.mouse.move(100.0, 60.0)
-        page.mouse.up()
-        settle(opened)
+        room = box_of(opened, "#room")
+        pull(opened, (40.0, 40.0), (100.0, 60.0))
         panned = photo_box(opened)
         assert panned[0] - zoomed[0] == pytest.approx(min(60.0, room["x"] - zoomed[0]), abs=0.6)
         assert panned[0] <= room["x"] + 0.5
         assert page.evaluate(STATE) == before
         check_agreement(opened)
-        page.keyboard.press("0")
-        settle(opened)
+        press(opened, "0")
         assert photo_box(opened) == pytest.approx(whole, abs=0.5)
         # Keys; the closest is 16 times.
         for key in ("z", "z", "l", "k"):

@@ -8,8 +8,13 @@ from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
+
+from playwright.sync_api import FloatRect
 
 from tests.builders.programs.browser import Opened, open_browser
+from warpir.app.config import InsertConfig
+from warpir.place.session import Session, open_session, start_record
 from warpir.place.stance import Stance
 
 WIDTH, HEIGHT = 480, 320
@@ -28,6 +33,14 @@ FOOT_ON_CANVAS = """import('./page.js').then(async ({ stage, state }) => {
   return [box.left + (at.x + 1) / 2 * box.width, box.top + (1 - at.y) / 2 * box.height];
 })"""
 """Where the canvas draws the object's foot, in pixels of the window."""
+
+
+def begun(config: InsertConfig) -> tuple[Session, dict[str, Any], dict[str, Any]]:
+    """A session, what its page starts with, and what that sends of an unchanged placement."""
+    session = open_session(config.inputs, config.camera, config.placement, config.limits)
+    start = start_record(session, config.light, str(config.output.out))
+    said = {**start["camera"], **{k: start[k] for k in ("stance", "stand", "rotate_y", "size")}}
+    return session, start, said
 
 
 def command(folder: Path, out: Path, *more: str, asset: str = "wedge.glb") -> list[str]:
@@ -101,19 +114,51 @@ def settle(opened: Opened) -> None:
     )
 
 
-def handle_at(opened: Opened, name: str) -> tuple[float, float]:
-    """Where a handle is, in pixels of the window."""
-    box = opened.page.locator(f"[data-handle={name}]").bounding_box()
+def box_of(opened: Opened, selector: str) -> FloatRect:
+    """Where an element is, in pixels of the window."""
+    box = opened.page.locator(selector).bounding_box()
     assert box is not None
+    return box
+
+
+def handle_at(opened: Opened, name: str) -> tuple[float, float]:
+    """Where the middle of a handle is, in pixels of the window."""
+    box = box_of(opened, f"[data-handle={name}]")
     return box["x"] + box["width"] / 2.0, box["y"] + box["height"] / 2.0
+
+
+def pull(
+    opened: Opened, start: tuple[float, float], end: tuple[float, float], steps: int = 1
+) -> None:
+    """Drag with the mouse from one place of the window to another."""
+    mouse = opened.page.mouse
+    mouse.move(*start)
+    mouse.down()
+    mouse.move(*end, steps=steps)
+    mouse.up()
+    settle(opened)
 
 
 def drag(opened: Opened, name: str, by: tuple[float, float]) -> None:
     """Drag a handle by some pixels."""
-    mouse, (x, y) = opened.page.mouse, handle_at(opened, name)
-    mouse.move(x, y)
-    mouse.down()
-    mouse.move(x + by[0] / 2.0, y + by[1] / 2.0)
-    mouse.move(x + by[0], y + by[1])
-    mouse.up()
+    x, y = handle_at(opened, name)
+    pull(opened, (x, y), (x + by[0], y + by[1]), steps=2)
+
+
+def press(opened: Opened, *keys: str) -> None:
+    """Press keys, one after another."""
+    for key in keys:
+        opened.page.keyboard.press(key)
     settle(opened)
+
+
+def enter(opened: Opened, field: str, value: object) -> None:
+    """Type a value into a field."""
+    opened.page.fill(f"#{field}", str(value))
+    press(opened, "Enter")
+
+
+def save(opened: Opened) -> None:
+    """Save the placement."""
+    opened.page.click("#save")
+    opened.page.wait_for_selector("#done:not([hidden])")
